@@ -1,0 +1,33 @@
+.PHONY: .venv demo test test-all bench lint clean
+
+PYTHON ?= python3
+BIN := .venv/bin
+
+# The stamp, not the folder, is the target: a folder's own time changes with every file put into it.
+STAMP := .venv/.installed
+
+demo: $(STAMP)
+	$(BIN)/python demos/lightmap.py
+
+test: lint
+	$(BIN)/pytest -n 2
+
+test-all: lint
+	$(BIN)/pytest -n 2 -m ""
+
+bench: $(STAMP)
+	$(BIN)/wlm bench
+
+lint: $(STAMP)
+	$(BIN)/ruff check
+
+.venv: $(STAMP)
+
+$(STAMP): pyproject.toml setup.py constraints.txt
+	$(PYTHON) -m venv .venv
+	$(BIN)/pip install -c constraints.txt -e '.[test,baselines]'
+	touch $@
+
+clean:
+	rm -rf .venv .cache .pytest_cache .ruff_cache build *.egg-info
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,35 @@
+"""What every test shares: the devices, and a Warp kernel cache that outlasts the run."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+# One folder a worker: two that compile the same module at once would race for its files. Set before anything
+# imports Warp, which reads it when it starts.
+_WORKER = os.environ.get("PYTEST_XDIST_WORKER", "main")
+os.environ["WARP_CACHE_PATH"] = str(Path(__file__).resolve().parents[1] / ".cache" / f"warp-{_WORKER}")
+
+
+def _devices() -> list[str]:
+    """Lists the devices to test on: those that Warp finds, narrowed by WLM_TEST_DEVICES."""
+    import warp as wp
+
+    # Its banner and compile notes would drown a failing test's output.
+    wp.config.log_level = wp.LOG_WARNING
+    found = ["cpu", "cuda:0"] if wp.is_cuda_available() else ["cpu"]
+    asked = os.environ.get("WLM_TEST_DEVICES")
+    if not asked:
+        return found
+    names = [name.strip() for name in asked.split(",") if name.strip()]
+    missing = [name for name in names if name not in found]
+    # Asked for and absent must not pass as tested.
+    if missing or not names:
+        raise pytest.UsageError(f"WLM_TEST_DEVICES={asked}: expected some of {', '.join(found)}")
+    return names
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    """Runs each test that takes `device` on every device."""
+    if "device" in metafunc.fixturenames:
+        metafunc.parametrize("device", _devices())

@@ -1,0 +1,288 @@
+import hashlib
+import json
+import os
+import struct
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import safetensors
+import safetensors.numpy
+
+from wlm.errors import WlmError
+from wlm.formats.artifact import FORMAT_VERSION, read_artifact, write_artifact
+
+SOURCE = "0123456789abcdef" * 2
+SETTINGS = {
+    "profile": "M",
+    "tile": 128,
+    "channels": [16, 12],
+    "rate": 0.01,
+    "emissive": False,
+    "note": 'it\'s "quoted" \\ and ü, \u2028 too',
+    "nested": {"none": None, "text": "'"},
+}
+
+
+def _tensors() -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(3)
+    return {
+        "codes": rng.integers(0, 256, (3, 5, 16), np.uint8),
+        "weights": rng.standard_normal((7, 3)).astype(np.float16),
+        "times": rng.random(5, np.float32),
+        "offsets": rng.integers(0, 2**40, 3, np.int64),
+        "on": np.array([True, False, True]),
+        "scalar": np.float32(2.5).reshape(()),
+        "empty": np.empty((0, 4), np.uint16),
+    }
+
+
+@pytest.fixture
+def artifact(tmp_path: Path) -> Path:
+    path = tmp_path / "a.wlm"
+    write_artifact(path, "lightmap", SETTINGS, _tensors(), SOURCE)
+    return path
+
+
+def _refusal(path: Path, content: bytes | bytearray | None = None, system: str | None = None) -> str:
+    """Reads what must be refused and gives the line, without the path at its start."""
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(WlmError) as caught:
+        read_artifact(path, system)
+    line = str(caught.value)
+    assert "\n" not in line and line.startswith(f"{path}: ")
+    return line.removeprefix(f"{path}: ")
+
+
+def _split(whole: bytes) -> tuple[dict, bytes]:
+    (length,) = struct.unpack_from("<Q", whole)
+    return json.loads(whole[8 : 8 + length]), whole[8 + length :]
+
+
+def _join(header: dict, payload: bytes) -> bytes:
+    encoded = json.dumps(header, separators=(",", ":")).encode()
+    return struct.pack("<Q", len(encoded)) + encoded + payload
+
+
+def _signed(header: dict, payload: bytes) -> bytes:
+    """A file with a right digest, made by the documented rule and not by the writer's code."""
+    zeros = "0" * 32
+    words = header["__metadata__"]["wlm"].split(" ")
+    header["__metadata__"]["wlm"] = " ".join([*words[:3], zeros])
+    digest = hashlib.blake2b(_join(header, payload), digest_size=16).hexdigest()
+    header["__metadata__"]["wlm"] = " ".join([*words[:3], digest])
+    return _join(header, payload)
+
+
+def test_what_was_written_is_read(artifact):
+    found = read_artifact(artifact, "lightmap")
+    assert (found.system, found.version, found.source) == ("lightmap", FORMAT_VERSION, SOURCE)
+    assert found.settings == SETTINGS
+    assert found.tensors.keys() == _tensors().keys()
+    for name, tensor in _tensors().items():
+        assert found.tensors[name].dtype == tensor.dtype
+        assert found.tensors[name].shape == tensor.shape
+        assert np.array_equal(found.tensors[name], tensor)
+        assert found.parts[name] == tensor.nbytes
+        assert found.tensors[name].flags.aligned
+        with pytest.raises(ValueError, match="read-only"):
+            found.tensors[name][...] = 0
+    assert found.file_bytes == artifact.stat().st_size == found.header_bytes + sum(found.parts.values())
+
+
+def test_the_safetensors_library_reads_it(artifact):
+    loaded = safetensors.numpy.load_file(artifact)
+    assert loaded.keys() == _tensors().keys()
+    assert all(np.array_equal(loaded[name], tensor) for name, tensor in _tensors().items())
+    with safetensors.safe_open(artifact, "numpy") as file:
+        settings = file.metadata()["settings"]
+    swap = str.maketrans("'\"", "\"'")
+    assert json.loads(settings.translate(swap)) == SETTINGS
+
+
+def test_the_digest_follows_its_documented_rule(artifact):
+    whole = artifact.read_bytes()
+    stated = _split(whole)[0]["__metadata__"]["wlm"].split(" ")[3].encode()
+    zeroed = whole.replace(stated, b"0" * 32, 1)
+    assert hashlib.blake2b(zeroed, digest_size=16).hexdigest().encode() == stated
+
+
+def test_the_same_arguments_give_the_same_bytes(tmp_path, artifact):
+    again = tmp_path / "b.wlm"
+    size = write_artifact(again, "lightmap", SETTINGS, dict(reversed(_tensors().items())), SOURCE)
+    assert again.read_bytes() == artifact.read_bytes() and size == len(artifact.read_bytes())
+
+
+def test_a_source_of_zeros_is_not_taken_for_the_digest(tmp_path):
+    path = tmp_path / "z.wlm"
+    write_artifact(path, "probe", {"text": "0" * 32}, {}, "0" * 32)
+    found = read_artifact(path)
+    assert found.source == "0" * 32 and found.tensors == {} and found.settings == {"text": "0" * 32}
+
+
+def test_strided_and_big_endian_arrays_are_stored_as_their_values(tmp_path):
+    path = tmp_path / "s.wlm"
+    base = np.arange(24, dtype=np.float32).reshape(4, 6)
+    write_artifact(path, "probe", {}, {"t": base.T, "step": base[:, ::2], "big": base.astype(">f4")}, "x")
+    found = read_artifact(path).tensors
+    assert np.array_equal(found["t"], base.T) and np.array_equal(found["step"], base[:, ::2])
+    assert np.array_equal(found["big"], base)
+
+
+def test_the_header_is_small(tmp_path):
+    tensors = {f"part_{i}": np.zeros((64, 32, 32, 2 + i), np.uint8) for i in range(7)}
+    settings = {f"setting_{i:02}": i * 0.125 for i in range(16)}
+    text = json.dumps(settings, separators=(",", ":"))
+    assert 290 <= len(text) <= 310
+    write_artifact(tmp_path / "a.wlm", "lightmap", settings, tensors, SOURCE)
+    found = read_artifact(tmp_path / "a.wlm")
+    # safetensors itself takes 48 bytes a tensor before its name and numbers; the settings cost no escapes.
+    assert found.header_bytes <= len(text) + 660
+    assert found.header_bytes % 8 == 0
+
+
+def test_a_mapped_artifact_outlives_its_replacement(artifact):
+    found = read_artifact(artifact)
+    write_artifact(artifact, "lightmap", {}, {}, "other")
+    assert np.array_equal(found.tensors["codes"], _tensors()["codes"])
+    assert read_artifact(artifact).source == "other"
+
+
+def test_other_files_are_refused(tmp_path):
+    path = tmp_path / "a.wlm"
+    assert "No such file" in _refusal(path)
+    assert "found a folder" in _refusal(tmp_path)
+    assert "found a file of 0 bytes" in _refusal(path, b"")
+    assert "found a file of 7 bytes" in _refusal(path, b"x" * 7)
+    assert "found other content" in _refusal(path, b"\x89PNG" + b"x" * 100)
+    assert "found other content" in _refusal(path, struct.pack("<Q", 2**63) + b"{}")
+    assert "cut short" in _refusal(path, struct.pack("<Q", 10) + b"{}")
+    assert "header is damaged" in _refusal(path, struct.pack("<Q", 2) + b"{x")
+    assert "header is damaged" in _refusal(path, struct.pack("<Q", 9000) + b'{"":' * 2250)
+    safetensors.numpy.save_file({"a": np.zeros(3)}, path)
+    assert "without its metadata" in _refusal(path)
+    safetensors.numpy.save_file({"a": np.zeros(3)}, path, {"wlm": "one"})
+    assert "expected an integer" in _refusal(path)
+    safetensors.numpy.save_file({"a": np.zeros(3)}, path, {"wlm": "1 x"})
+    assert "expected four words and settings" in _refusal(path)
+
+
+def test_a_file_cut_anywhere_is_refused(artifact):
+    whole = artifact.read_bytes()
+    for length in [*range(0, len(whole), 5), *range(len(whole) - 20, len(whole))]:
+        line = _refusal(artifact, whole[:length])
+        assert "cut short" in line or "found a file of" in line, (length, line)
+    assert "expected the end of the file, found 1 more" in _refusal(artifact, whole + b"\0")
+
+
+def test_any_changed_byte_is_found(artifact):
+    whole = artifact.read_bytes()
+    rng = np.random.default_rng(11)
+    # Every byte once with a random other value, and every bit of the length and the metadata.
+    changes = [(place, int(rng.integers(1, 256))) for place in range(len(whole))]
+    changes += [(place, 1 << bit) for place in range(120) for bit in range(8)]
+    for place, change in changes:
+        damaged = bytearray(whole)
+        damaged[place] ^= change
+        _refusal(artifact, damaged)
+    artifact.write_bytes(whole)
+    read_artifact(artifact)
+
+
+def test_a_changed_payload_or_name_is_told_by_the_digest(artifact):
+    whole = artifact.read_bytes()
+    message = "the artifact is damaged: its content does not match its digest"
+    assert _refusal(artifact, whole[:-1] + bytes([whole[-1] ^ 1])) == message
+    assert _refusal(artifact, whole.replace(b'"codes"', b'"coder"')) == message
+    assert _refusal(artifact, whole.replace(b"'tile':128", b"'tile':129")) == message
+    assert _refusal(artifact, whole.replace(SOURCE.encode(), SOURCE[::-1].encode())) == message
+    stated = _split(whole)[0]["__metadata__"]["wlm"].split(" ")[3].encode()
+    assert stated.upper() != stated
+    assert _refusal(artifact, whole.replace(stated, stated.upper())) == message
+
+
+def test_a_newer_version_and_another_system_are_named(artifact):
+    whole = artifact.read_bytes()
+    newer = whole.replace(b'"1 lightmap', b'"2 lightmap')
+    assert _refusal(artifact, newer) == "artifact version 2: expected at most 1; update wlm"
+    # A newer version may well say other things after its number.
+    header, payload = _split(whole)
+    header["__metadata__"] = {"wlm": "12"}
+    assert "artifact version 12: expected at most 1" in _refusal(artifact, _join(header, payload))
+    older = whole.replace(b'"1 lightmap', b'"0 lightmap')
+    assert _refusal(artifact, older) == "artifact version 0: expected 1"
+    line = _refusal(artifact, whole, system="probe")
+    assert line == "expected an artifact of probe, found one of lightmap"
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"shape": [3, 5, 15]}, "expected 225 bytes, found 240"),
+        ({"dtype": "F16"}, "expected 480 bytes, found 240"),
+        ({"dtype": "BF16"}, "expected a type, a shape and two offsets"),
+        ({"dtype": ["U8"]}, "expected a type, a shape and two offsets"),
+        ({"shape": [-3, -5, 16]}, "expected a type, a shape and two offsets"),
+        ({"shape": [3.0, 5, 16]}, "expected a type, a shape and two offsets"),
+        ({"shape": 240}, "expected a type, a shape and two offsets"),
+        ({"shape": [240, True]}, "expected a type, a shape and two offsets"),
+        ({"data_offsets": [0]}, "expected a type, a shape and two offsets"),
+        ({"data_offsets": [None, 240]}, "expected a type, a shape and two offsets"),
+        ({"data_offsets": [0, 240]}, "expected it at byte"),
+        ({"data_offsets": [10000, 10240]}, "expected it at byte"),
+    ],
+)
+def test_wrong_part_sizes_are_named_even_under_a_right_digest(artifact, change, words):
+    header, payload = _split(artifact.read_bytes())
+    header["codes"].update(change)
+    line = _refusal(artifact, _signed(header, payload))
+    assert words in line and line.startswith("part ")
+
+
+def test_wrong_settings_under_a_right_digest_are_refused(artifact):
+    header, payload = _split(artifact.read_bytes())
+    assert read_artifact(artifact) and _signed(header, payload)
+    for text in ("{", "[1]", ""):
+        header["__metadata__"]["settings"] = text
+        assert "settings is damaged" in _refusal(artifact, _signed(header, payload))
+    header["__metadata__"]["settings"] = "{}"
+    artifact.write_bytes(_signed(header, payload))
+    assert read_artifact(artifact).settings == {}
+
+
+@pytest.mark.parametrize(
+    ("system", "settings", "tensors", "source"),
+    [
+        ("", {}, {}, "x"),
+        ("light map", {}, {}, "x"),
+        ("lightmap", {}, {}, ""),
+        ("lightmap", {}, {}, "é"),
+        ("lightmap", {"a": float("nan")}, {}, "x"),
+        ("lightmap", {}, {"__metadata__": np.zeros(1)}, "x"),
+        ("lightmap", {}, {"a": np.zeros(1, np.complex64)}, "x"),
+        ("lightmap", {}, {"a": np.array(["s"])}, "x"),
+    ],
+)
+def test_what_the_format_cannot_hold_is_a_value_error(tmp_path, system, settings, tensors, source):
+    with pytest.raises(ValueError):
+        write_artifact(tmp_path / "a.wlm", system, settings, tensors, source)
+    assert os.listdir(tmp_path) == []
+
+
+def test_a_full_disk_leaves_the_old_artifact(artifact):
+    pytest.importorskip("resource")
+    before = artifact.read_bytes()
+    code = (
+        "import resource, sys, numpy\n"
+        "from wlm.errors import WlmError\n"
+        "from wlm.formats.artifact import write_artifact\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000))\n"
+        "try:\n    write_artifact(sys.argv[1], 'probe', {}, {'a': numpy.zeros(9999)}, 'x')\n"
+        "except WlmError as error:\n    print(error)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code, str(artifact)], capture_output=True, text=True)
+    assert done.stdout.strip() == f"{artifact}: cannot write: File too large", done.stderr
+    assert artifact.read_bytes() == before and os.listdir(artifact.parent) == [artifact.name]

@@ -1,0 +1,149 @@
+import errno
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from wlm.errors import WlmError
+from wlm.formats.atomic import atomic_path, atomic_write
+
+
+@pytest.fixture
+def target(tmp_path: Path) -> Path:
+    """A file that already holds something."""
+    path = tmp_path / "file.bin"
+    path.write_bytes(b"before")
+    return path
+
+
+def _assert_untouched(target: Path) -> None:
+    assert target.read_bytes() == b"before"
+    assert os.listdir(target.parent) == [target.name]
+
+
+def test_bytes_and_pieces_are_written(tmp_path, target):
+    assert atomic_write(target, b"after!!") == 7
+    assert target.read_bytes() == b"after!!"
+    pieces = [b"a", bytearray(b"b"), memoryview(b"c"), np.array([[1, 2]], np.uint16), np.empty((0, 3)), b""]
+    assert atomic_write(tmp_path / "new.bin", iter(pieces)) == 7
+    assert (tmp_path / "new.bin").read_bytes() == b"abc\x01\x00\x02\x00"
+    assert atomic_write(tmp_path / "new.bin", b"") == 0
+    assert (tmp_path / "new.bin").read_bytes() == b""
+    assert sorted(os.listdir(tmp_path)) == ["file.bin", "new.bin"]
+
+
+def test_a_write_that_takes_less_than_given_goes_on(target, monkeypatch):
+    whole_write = os.write
+    monkeypatch.setattr(os, "write", lambda handle, data: whole_write(handle, data[:3]))
+    atomic_write(target, [b"0123456789", b"abcdef"])
+    assert target.read_bytes() == b"0123456789abcdef"
+
+
+@pytest.mark.parametrize("call", ["write", "fsync", "replace", "open"])
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EIO])
+def test_a_refusing_system_leaves_nothing_behind(target, monkeypatch, call, number):
+    def refuse(*args, **kwargs):
+        raise OSError(number, os.strerror(number))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, call, refuse)
+        with pytest.raises(WlmError) as caught:
+            atomic_write(target, b"after")
+    assert str(caught.value) == f"{target}: cannot write: {os.strerror(number)}"
+    _assert_untouched(target)
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")
+def test_a_full_disk_in_the_middle(target, monkeypatch):
+    whole_write = os.write
+    calls = []
+    with open("/dev/full", "wb", buffering=0) as full, monkeypatch.context() as patch:
+
+        def second_fails(handle, data):
+            calls.append(len(data))
+            return whole_write(handle if len(calls) == 1 else full.fileno(), data)
+
+        patch.setattr(os, "write", second_fails)
+        with pytest.raises(WlmError, match="No space left on device"):
+            atomic_write(target, [b"a" * 1000, b"b" * 1000])
+    assert calls == [1000, 1000]
+    _assert_untouched(target)
+
+
+def test_a_limit_on_the_file_size_leaves_nothing_behind(target):
+    pytest.importorskip("resource")
+    code = (
+        "import resource, sys\n"
+        "from wlm.errors import WlmError\n"
+        "from wlm.formats.atomic import atomic_write\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (5000, 5000))\n"
+        "try:\n    atomic_write(sys.argv[1], [b'x' * 3000] * 3)\n"
+        "except WlmError as error:\n    print(error)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code, str(target)], capture_output=True, text=True)
+    assert done.stdout.strip() == f"{target}: cannot write: File too large", done.stderr
+    _assert_untouched(target)
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError])
+def test_an_interrupted_source_leaves_nothing_behind(target, error):
+    def pieces():
+        yield b"half"
+        raise error
+
+    with pytest.raises(error):
+        atomic_write(target, pieces())
+    _assert_untouched(target)
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")
+def test_a_device_is_not_replaced():
+    with pytest.raises(WlmError, match="not a regular file"):
+        atomic_write("/dev/full", b"x")
+    assert Path("/dev/full").is_char_device()
+
+
+def test_a_folder_or_a_missing_folder_is_refused(tmp_path, target):
+    with pytest.raises(WlmError, match="not a regular file"):
+        atomic_write(tmp_path, b"x")
+    with pytest.raises(WlmError, match="the folder .*none does not exist"):
+        atomic_write(tmp_path / "none" / "f", b"x")
+    with pytest.raises(WlmError, match="the folder .*file.bin does not exist"):
+        atomic_write(target / "f", b"x")
+    _assert_untouched(target)
+
+
+def test_a_link_stays_a_link(tmp_path, target):
+    link = tmp_path / "link"
+    link.symlink_to(target.name)
+    atomic_write(link, b"after")
+    assert link.is_symlink() and target.read_bytes() == b"after"
+    broken = tmp_path / "broken"
+    broken.symlink_to("made")
+    atomic_write(broken, b"new")
+    assert broken.is_symlink() and (tmp_path / "made").read_bytes() == b"new"
+
+
+def test_the_longest_name_and_the_usual_mode(tmp_path):
+    path = tmp_path / ("n" * 255)
+    mask = os.umask(0o027)
+    try:
+        atomic_write(path, b"x")
+    finally:
+        os.umask(mask)
+    assert path.read_bytes() == b"x" and path.stat().st_mode & 0o777 == 0o640
+    with pytest.raises(WlmError, match="name too long"):
+        atomic_write(tmp_path / ("n" * 256), b"x")
+    assert len(os.listdir(tmp_path)) == 1
+
+
+def test_a_path_for_others_to_write(target):
+    with atomic_path(target) as temporary:
+        assert temporary.parent == target.parent
+        temporary.write_bytes(b"after")
+        assert target.read_bytes() == b"before"
+    assert target.read_bytes() == b"after"
+    assert os.listdir(target.parent) == [target.name]

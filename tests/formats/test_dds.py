@@ -1,0 +1,124 @@
+import os
+import struct
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from wlm.errors import WlmError
+from wlm.formats.bc7 import decode_image
+from wlm.formats.dds import DXGI_FORMATS, DdsTexture, read_dds, write_dds
+
+# Byte offsets, from Microsoft's description of DDS_HEADER and DDS_HEADER_DXT10.
+FLAGS, HEIGHT, WIDTH, PITCH, DEPTH, MIPS = 8, 12, 16, 20, 24, 28
+PIXEL_FLAGS, FOUR_CC, CAPS, CAPS2 = 80, 84, 108, 112
+FORMAT, DIMENSION, MISC, ARRAY, ALPHA = 128, 132, 136, 140, 144
+
+
+def _blocks(count: int) -> bytes:
+    blocks = np.random.default_rng(9).integers(0, 256, (count, 16), np.uint8)
+    blocks[:, 0] = blocks[:, 0] & 0x80 | 0x40
+    return blocks.tobytes()
+
+
+def _field(data: bytes, at: int) -> int:
+    return struct.unpack_from("<I", data, at)[0]
+
+
+def test_pillow_reads_the_same_picture(tmp_path):
+    path = tmp_path / "a.dds"
+    write_dds(path, _blocks(6 * 4), width=24, height=16)
+    expected = decode_image(np.frombuffer(_blocks(24), np.uint8).reshape(4, 6, 16))
+    with Image.open(path) as image:
+        assert image.mode == "RGBA" and np.array_equal(np.asarray(image), expected)
+
+
+def test_the_header_of_a_picture(tmp_path):
+    path = tmp_path / "a.dds"
+    write_dds(path, _blocks(6 * 4), width=22, height=13, fmt="BC7_UNORM_SRGB")
+    data = path.read_bytes()
+    assert len(data) == 148 + 24 * 16 and data[:4] == b"DDS " and data[FOUR_CC : FOUR_CC + 4] == b"DX10"
+    values = [_field(data, at) for at in (4, FLAGS, HEIGHT, WIDTH, PITCH, DEPTH, MIPS, 76, PIXEL_FLAGS)]
+    assert values == [124, 0x81007, 13, 22, 384, 0, 1, 32, 4]
+    assert [_field(data, at) for at in (CAPS, CAPS2)] == [0x1000, 0]
+    assert [_field(data, at) for at in (FORMAT, DIMENSION, MISC, ARRAY, ALPHA)] == [99, 3, 0, 1, 0]
+
+
+def test_the_header_of_a_volume(tmp_path):
+    path = tmp_path / "a.dds"
+    write_dds(path, _blocks(2 * 3 * 5), width=8, height=12, depth=5)
+    data = path.read_bytes()
+    assert [_field(data, at) for at in (FLAGS, PITCH, DEPTH)] == [0x881007, 96, 5]
+    assert [_field(data, at) for at in (CAPS, CAPS2, DIMENSION)] == [0x1008, 0x200000, 4]
+    assert data[148:] == _blocks(30)
+
+
+@pytest.mark.parametrize("fmt", DXGI_FORMATS)
+@pytest.mark.parametrize("depth", [1, 3])
+def test_what_was_written_is_read(tmp_path, fmt, depth):
+    path = tmp_path / "a.dds"
+    blocks = _blocks(2 * 1 * depth)
+    write_dds(path, blocks, width=5, height=4, depth=depth, fmt=fmt)
+    assert read_dds(path) == DdsTexture(5, 4, depth, fmt, depth > 1, blocks)
+    assert os.listdir(tmp_path) == ["a.dds"]
+
+
+@pytest.mark.parametrize(
+    ("at", "value", "words"),
+    [
+        (4, 125, "header size: expected 124, found 125"),
+        (FLAGS, 0x1003, "flags: expected at least 0x1007, found 0x1003"),
+        (76, 24, "pixel format size: expected 32, found 24"),
+        (PIXEL_FLAGS, 0x40, "pixel format: expected DX10"),
+        (FOUR_CC, 0x31545844, "pixel format: expected DX10, found b'DXT1'"),
+        (FORMAT, 71, "DXGI format: expected one of"),
+        (DIMENSION, 2, "dimension: expected 3 (2D) or 4 (volume), found 2"),
+        (DIMENSION, 4, "volume flag: expected that of the dimension"),
+        (CAPS2, 0x200000, "volume flag: expected that of the dimension"),
+        (WIDTH, 0, "width: expected 1 to 16384, found 0"),
+        (HEIGHT, 0xFFFFFFFF, "height: expected 1 to 16384"),
+        (DEPTH, 2, "depth: expected that of the dimension, found 2"),
+        (MIPS, 4, "mip levels: expected one, found 4"),
+        (MISC, 4, "DX10 flags: expected none (no cube), found 0x4"),
+        (ARRAY, 6, "array size: expected 1, found 6"),
+        (ALPHA, 5, "alpha mode: expected 0 to 4, found 5"),
+        (WIDTH, 9, "expected 48 bytes of blocks, found 32"),
+    ],
+)
+def test_a_wrong_field_is_named(tmp_path, at, value, words):
+    path = tmp_path / "a.dds"
+    write_dds(path, _blocks(2), width=8, height=4)
+    data = bytearray(path.read_bytes())
+    struct.pack_into("<I", data, at, value)
+    path.write_bytes(data)
+    with pytest.raises(WlmError) as caught:
+        read_dds(path)
+    assert str(caught.value).startswith(f"{path}: {words}")
+
+
+def test_other_files_and_other_lengths_are_refused(tmp_path):
+    path = tmp_path / "a.dds"
+    with pytest.raises(WlmError, match="No such file"):
+        read_dds(path)
+    path.write_bytes(b"\x89PNG")
+    with pytest.raises(WlmError, match="expected a DDS file, found other content"):
+        read_dds(path)
+    write_dds(path, _blocks(2), width=8, height=4)
+    whole = path.read_bytes()
+    for length in range(len(whole)):
+        path.write_bytes(whole[:length])
+        with pytest.raises(WlmError):
+            read_dds(path)
+    path.write_bytes(whole + b"\0")
+    with pytest.raises(WlmError, match="expected 32 bytes of blocks, found 33"):
+        read_dds(path)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"fmt": "BC1_UNORM"}, {"width": 0}, {"height": 20000}, {"depth": 0}, {"depth": 2}, {"width": 9}],
+)
+def test_what_does_not_fit_is_a_value_error(tmp_path, change):
+    with pytest.raises(ValueError):
+        write_dds(tmp_path / "a.dds", _blocks(2), **{"width": 8, "height": 4, **change})
+    assert os.listdir(tmp_path) == []

@@ -1,0 +1,218 @@
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+import pytest
+
+from wlm.errors import WlmError
+from wlm.formats.exr import HALF_MAX, read_exr, write_exr
+
+SCANLINES = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+
+
+def _pixels(channels: int, height: int = 37, width: int = 21) -> np.ndarray:
+    """Noise that half floats hold exactly."""
+    rng = np.random.default_rng(channels)
+    return (rng.random((height, width, channels)) * 4 - 1).astype(np.float16).astype(np.float32)
+
+
+def _planes(names: str, dtype: type = np.float32) -> dict[str, np.ndarray]:
+    pixels = _pixels(len(names)).astype(dtype)
+    return {name: np.ascontiguousarray(pixels[..., i]) for i, name in enumerate(names)}
+
+
+@pytest.mark.parametrize("half", [True, False])
+@pytest.mark.parametrize("channels", [3, 4])
+def test_what_was_written_is_read(tmp_path, half, channels):
+    path = tmp_path / "a.exr"
+    write_exr(path, _pixels(channels), half=half)
+    pixels, names = read_exr(path)
+    assert names == tuple("RGBA"[:channels])
+    assert pixels.dtype == np.float32 and np.array_equal(pixels, _pixels(channels))
+    stored = OpenEXR.File(str(path), separate_channels=True).channels()
+    assert stored["R"].pixels.dtype == (np.float16 if half else np.float32)
+    assert os.listdir(tmp_path) == ["a.exr"]
+
+
+def test_floats_are_kept_and_halves_are_clamped(tmp_path):
+    pixels = np.array([[[1e6, -1e6, np.inf], [65504.0, 65519.0, 1 / 3]]], np.float32)
+    write_exr(tmp_path / "half.exr", pixels)
+    write_exr(tmp_path / "float.exr", pixels, half=False)
+    expected = [[[HALF_MAX, -HALF_MAX, HALF_MAX], [HALF_MAX, HALF_MAX, np.float16(1 / 3)]]]
+    assert np.array_equal(read_exr(tmp_path / "half.exr")[0], expected)
+    assert np.array_equal(read_exr(tmp_path / "float.exr")[0], pixels)
+    write_exr(tmp_path / "nan.exr", np.full((2, 2, 3), np.nan))
+    assert np.isnan(read_exr(tmp_path / "nan.exr")[0]).all()
+
+
+@pytest.mark.parametrize("name", ["RGB", "RGBA"])
+@pytest.mark.parametrize("dtype", [np.float16, np.float32])
+def test_a_joined_array_is_read(tmp_path, name, dtype):
+    path = tmp_path / "a.exr"
+    OpenEXR.File(SCANLINES, {name: _pixels(len(name)).astype(dtype)}).write(str(path))
+    pixels, names = read_exr(path)
+    assert names == tuple(name) and np.array_equal(pixels, _pixels(len(name)))
+
+
+def test_channels_are_ordered_by_name_and_others_left_out(tmp_path):
+    path = tmp_path / "a.exr"
+    planes = _planes("RGBZ")
+    shuffled = {name: planes[name] for name in "ZBGR"}
+    OpenEXR.File(SCANLINES, {**shuffled, "diffuse.R": planes["Z"]}).write(str(path))
+    pixels, names = read_exr(path)
+    assert names == ("R", "G", "B")
+    assert np.array_equal(pixels, np.stack([planes[name] for name in "RGB"], -1))
+
+
+def test_tiles_and_a_moved_window_are_read(tmp_path):
+    path = tmp_path / "a.exr"
+    header = {
+        "compression": OpenEXR.PIZ_COMPRESSION,
+        "type": OpenEXR.tiledimage,
+        "tiles": OpenEXR.TileDescription(),
+    }
+    OpenEXR.File(header, _planes("RGB")).write(str(path))
+    assert np.array_equal(read_exr(path)[0], _pixels(3))
+    window = (np.array([5, 7], np.int32), np.array([25, 43], np.int32))
+    OpenEXR.File({**SCANLINES, "dataWindow": window}, _planes("RGB")).write(str(path))
+    assert np.array_equal(read_exr(path)[0], _pixels(3))
+
+
+@pytest.mark.parametrize("names", ["XYZ", "Y", "RG", "rgb", "RGA"])
+def test_misnamed_channels_are_listed(tmp_path, names):
+    path = tmp_path / "a.exr"
+    OpenEXR.File(SCANLINES, _planes(names)).write(str(path))
+    found = ",".join(sorted(names))
+    with pytest.raises(WlmError) as caught:
+        read_exr(path)
+    assert str(caught.value) == f"{path}: expected channels R,G,B or R,G,B,A, found {found}"
+
+
+def test_integers_and_several_parts_are_refused(tmp_path):
+    path = tmp_path / "a.exr"
+    planes = _planes("RGB")
+    OpenEXR.File(SCANLINES, {**planes, "G": np.ones((37, 21), np.uint32)}).write(str(path))
+    with pytest.raises(WlmError, match="channel G: expected half or float, found uint32"):
+        read_exr(path)
+    parts = [OpenEXR.Part({}, planes, name=name) for name in ("one", "two")]
+    OpenEXR.File(parts).write(str(path))
+    with pytest.raises(WlmError, match="expected an EXR file of one part, found 2"):
+        read_exr(path)
+
+
+def test_a_missing_file_or_other_content_is_refused(tmp_path, capfd):
+    path = tmp_path / "a.exr"
+    with pytest.raises(WlmError, match="cannot read the EXR file: No such file"):
+        read_exr(path)
+    with pytest.raises(WlmError, match="found a folder"):
+        read_exr(tmp_path)
+    for content in (b"", b"\x76\x2f", b"\x89PNG" + b"x" * 500):
+        path.write_bytes(content)
+        with pytest.raises(WlmError, match="a.exr: expected an EXR file, found other content$"):
+            read_exr(path)
+    path.write_bytes(b"\x76\x2f\x31\x01" + b"x" * 500)
+    with pytest.raises(WlmError, match="cut short or damaged"):
+        read_exr(path)
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("kind", [OpenEXR.scanlineimage, OpenEXR.tiledimage])
+def test_a_file_cut_anywhere_is_refused_in_silence(tmp_path, kind, capfd):
+    path = tmp_path / "a.exr"
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": kind}
+    if kind == OpenEXR.tiledimage:
+        header["tiles"] = OpenEXR.TileDescription()
+    OpenEXR.File(header, {"RGB": _pixels(3, 40, 9).astype(np.float16)}).write(str(path))
+    whole = path.read_bytes()
+    read_exr(path)
+    # Every length near the ends, where the header, the chunk table and the last chunk end, and some between.
+    lengths = [*range(0, 420, 7), *range(420, len(whole) - 20, 97), *range(len(whole) - 20, len(whole))]
+    for length in lengths:
+        path.write_bytes(whole[:length])
+        with pytest.raises(WlmError) as caught:
+            read_exr(path)
+        line = str(caught.value)
+        assert line.startswith(f"{path}: ") and "\n" not in line, length
+    assert capfd.readouterr() == ("", "")
+
+
+def test_damage_is_an_error_or_other_pixels_never_noise_on_the_terminal(tmp_path, capfd):
+    path = tmp_path / "a.exr"
+    write_exr(path, _pixels(3))
+    whole = bytearray(path.read_bytes())
+    rng = np.random.default_rng(7)
+    refused = 0
+    for place in rng.integers(0, len(whole), 150):
+        damaged = bytearray(whole)
+        damaged[place] ^= 1 << int(rng.integers(8))
+        path.write_bytes(damaged)
+        try:
+            read_exr(path)
+        except WlmError as error:
+            refused += 1
+            assert str(error).startswith(f"{path}: ")
+    # ZIP's check sum finds what hits the pixels, which are most of the file.
+    assert refused > 100
+    assert capfd.readouterr() == ("", "")
+
+
+def test_lines_of_others_on_stderr_pass(tmp_path, capfd, monkeypatch):
+    path = tmp_path / "a.exr"
+    path.write_bytes(b"\x76\x2f\x31\x01")
+    opened = OpenEXR.File
+
+    def chatty(*args, **kwargs):
+        os.write(2, b"a line of another thread\n")
+        return opened(*args, **kwargs)
+
+    monkeypatch.setattr(OpenEXR, "File", chatty)
+    with pytest.raises(WlmError):
+        read_exr(path)
+    assert capfd.readouterr() == ("", "a line of another thread\n")
+
+
+def test_a_write_that_fails_leaves_what_was_there(tmp_path, capfd):
+    resource = pytest.importorskip("resource")
+    path = tmp_path / "a.exr"
+    write_exr(path, _pixels(3))
+    before = path.read_bytes()
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4000, hard))
+    try:
+        with pytest.raises(WlmError) as caught:
+            write_exr(path, _pixels(4, 100, 100))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert str(caught.value).startswith(f"{path}: cannot write: ") and "File too large" in str(caught.value)
+    assert path.read_bytes() == before and os.listdir(tmp_path) == ["a.exr"]
+    with pytest.raises(WlmError, match="does not exist"):
+        write_exr(tmp_path / "none" / "a.exr", _pixels(3))
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("shape", [(4, 4), (4, 4, 2), (4, 4, 5), (0, 4, 3), (2, 4, 4, 3)])
+def test_other_shapes_are_a_value_error(tmp_path, shape):
+    with pytest.raises(ValueError, match="expected pixels"):
+        write_exr(tmp_path / "a.exr", np.zeros(shape, np.float32))
+    assert os.listdir(tmp_path) == []
+
+
+def test_a_closed_stderr_does_no_harm(tmp_path):
+    path = tmp_path / "a.exr"
+    write_exr(path, _pixels(3))
+    code = (
+        "import os, sys; os.close(2)\n"
+        "from wlm.formats.exr import read_exr\n"
+        "print(read_exr(sys.argv[1])[0].shape)"
+    )
+    done = subprocess.run([sys.executable, "-c", code, str(path)], stdout=subprocess.PIPE, text=True)
+    assert done.stdout.strip() == "(37, 21, 3)"
+
+
+def test_a_unicode_path(tmp_path):
+    path = Path(tmp_path) / "kärtchen ✓.exr"
+    write_exr(path, _pixels(3))
+    assert np.array_equal(read_exr(path)[0], _pixels(3))

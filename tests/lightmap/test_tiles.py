@@ -1,0 +1,305 @@
+"""Cutting into tiles, putting back together, and what each tile needs."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from wlm.errors import WlmError
+from wlm.lightmap.data import LightmapSet, from_arrays
+from wlm.lightmap.tiles import (
+    TILE,
+    TileData,
+    TileGrid,
+    TileKind,
+    assemble,
+    channel_means,
+    classify,
+    parse_tiles,
+    split,
+    static_pattern,
+)
+
+HEIGHT, WIDTH, GAMMA = 200, 300, 2.2  # 2 rows and 3 columns of tiles, both cut at the end
+
+
+def _half(values: np.ndarray) -> np.ndarray:
+    return np.asarray(values, np.float16).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def lightmaps() -> LightmapSet:
+    random = np.random.default_rng(1)
+    frames = random.uniform(0.0, 4.0, (3, HEIGHT, WIDTH, 3)).astype(np.float32)
+    mask = random.random((HEIGHT, WIDTH)) < 0.4
+    mask[:TILE, TILE : 2 * TILE] = False
+    return from_arrays(frames, [0, 1, 2], mask)
+
+
+def _tile(linear: np.ndarray, mask: np.ndarray | None = None) -> TileData:
+    """Makes one tile of linear colours that broadcast to [T, 128, 128, 3]."""
+    colour = np.broadcast_to(linear, (len(linear), TILE, TILE, 3)).astype(np.float32) ** np.float32(1 / GAMMA)
+    mask = np.ones((TILE, TILE), bool) if mask is None else mask
+    return TileData(index=np.array([0]), colour=colour[None], mask=mask[None])
+
+
+def _kind(linear: np.ndarray, mask: np.ndarray | None = None, budget: float = 60.0) -> TileKind:
+    return TileKind(classify(_tile(linear, mask), GAMMA, budget)[0])
+
+
+def test_grid():
+    grid = TileGrid.of(HEIGHT, WIDTH)
+    assert grid == TileGrid(HEIGHT, WIDTH, 2, 3) and grid.count == 6
+    assert [grid.origin(i) for i in range(6)] == [
+        (0, 0),
+        (0, 128),
+        (0, 256),
+        (128, 0),
+        (128, 128),
+        (128, 256),
+    ]
+    assert (
+        TileGrid.of(1, 1).count == 1 and TileGrid.of(128, 256).count == 2 and TileGrid.of(129, 1).count == 2
+    )
+    for index in (-1, 6):
+        with pytest.raises(WlmError, match="outside the grid"):
+            grid.origin(index)
+    with pytest.raises(WlmError, match="at least 1x1"):
+        TileGrid.of(0, 5)
+
+
+def test_split_and_assemble_are_inverse(lightmaps):
+    grid = TileGrid.of(HEIGHT, WIDTH)
+    tiles = split(lightmaps, 1.0)
+    np.testing.assert_array_equal(tiles.index, range(6))
+    assert tiles.colour.shape == (6, 3, TILE, TILE, 3) and tiles.colour.dtype == np.float32
+    np.testing.assert_array_equal(assemble(tiles.mask[..., None], tiles.index, grid)[..., 0], lightmaps.mask)
+    for t in range(3):
+        image = assemble(tiles.colour[:, t], tiles.index, grid)
+        np.testing.assert_array_equal(image[lightmaps.mask], lightmaps.frames[t][lightmaps.mask])
+
+
+def test_split_encodes_gamma(lightmaps):
+    plain, encoded = split(lightmaps, 1.0, [0]), split(lightmaps, GAMMA, [0])
+    np.testing.assert_allclose(encoded.colour.astype(np.float64) ** GAMMA, plain.colour, rtol=1e-5)
+    valid = plain.mask[0]
+    np.testing.assert_allclose(
+        encoded.colour[0][:, valid], plain.colour[0][:, valid] ** (1 / GAMMA), rtol=1e-5
+    )
+
+
+def test_split_takes_tiles_in_the_order_given(lightmaps):
+    tiles, all_tiles = split(lightmaps, GAMMA, [4, 0]), split(lightmaps, GAMMA)
+    np.testing.assert_array_equal(tiles.index, [4, 0])
+    np.testing.assert_array_equal(tiles.colour, all_tiles.colour[[4, 0]])
+    np.testing.assert_array_equal(tiles.mask, all_tiles.mask[[4, 0]])
+
+
+def test_gaps_hold_the_nearest_valid_texel_of_the_tile():
+    frames = np.zeros((1, TILE, 2 * TILE, 3), np.float32)
+    mask = np.zeros((TILE, 2 * TILE), bool)
+    for (y, x), value in {(10, 10): 1.0, (10, 100): 2.0, (10, 129): 9.0}.items():
+        mask[y, x], frames[0, y, x] = True, value
+    colour = split(from_arrays(frames, [0], mask), 1.0).colour
+    assert (colour[0, 0, :, :55] == 1.0).all()
+    # Texel (10, 129) is nearer to column 127, but belongs to another tile, which may be absent.
+    assert (colour[0, 0, :, 56:] == 2.0).all()
+    assert (colour[1] == 9.0).all()
+
+
+def test_map_end_is_edge_padded_and_not_valid(lightmaps):
+    tiles = split(lightmaps, GAMMA, [5])
+    rows, columns = HEIGHT - TILE, WIDTH - 2 * TILE
+    assert not tiles.mask[0, rows:].any() and not tiles.mask[0, :, columns:].any()
+    assert tiles.mask[0, :rows, :columns].any()
+    colour = tiles.colour[0]
+    inside = colour[:, :rows, :columns]
+    expected = np.pad(inside, ((0, 0), (0, TILE - rows), (0, TILE - columns), (0, 0)), mode="edge")
+    np.testing.assert_array_equal(colour, expected)
+    assert (inside > 0).all()
+
+
+def test_one_texel_fills_its_tile():
+    tiles = split(from_arrays(np.full((2, 1, 1, 3), 0.25), [0, 1]), 2.0)
+    assert tiles.mask.sum() == 1 and (tiles.colour == 0.5).all()
+
+
+def test_split_refuses(lightmaps):
+    for wanted, text in (
+        ([6], "outside the grid"),
+        ([-1], "outside the grid"),
+        ([1, 1], "twice"),
+        ([], "none"),
+    ):
+        with pytest.raises(WlmError, match=text):
+            split(lightmaps, GAMMA, wanted)
+    for gamma in (0.0, -1.0, float("nan"), float("inf")):
+        with pytest.raises(WlmError, match="gamma"):
+            split(lightmaps, gamma)
+
+
+def test_assemble_fills_what_is_absent_and_keeps_the_type():
+    grid = TileGrid.of(HEIGHT, WIDTH)
+    image = assemble(np.full((1, TILE, TILE, 2), 7, np.uint8), np.array([4]), grid, fill=3)
+    assert image.shape == (HEIGHT, WIDTH, 2) and image.dtype == np.uint8
+    assert (image[TILE:, TILE : 2 * TILE] == 7).all()
+    assert (image == 7).sum() == (HEIGHT - TILE) * TILE * 2 and (image == 3).sum() == image.size - (
+        image == 7
+    ).sum()
+    with pytest.raises(WlmError, match="twice"):
+        assemble(np.zeros((2, TILE, TILE, 3)), np.array([1, 1]), grid)
+    with pytest.raises(WlmError, match="expected tiles"):
+        assemble(np.zeros((2, TILE, TILE, 3)), np.array([1]), grid)
+    with pytest.raises(WlmError, match="outside"):
+        assemble(np.zeros((1, TILE, TILE, 3)), np.array([6]), grid)
+
+
+def test_channel_means_count_valid_texels_only(lightmaps):
+    tiles = split(lightmaps, 1.0)
+    means = channel_means(tiles.colour, tiles.mask)
+    assert means.shape == (6, 3, 3) and means.dtype == np.float64
+    valid = lightmaps.mask[TILE:, :TILE]
+    expected = lightmaps.frames[:, TILE:, :TILE][:, valid].astype(np.float64).mean(axis=1)
+    np.testing.assert_allclose(means[3], expected, rtol=1e-12)
+    np.testing.assert_array_equal(means[1], 0.0)
+
+
+def test_channel_means_are_summed_in_double():
+    colour = np.full((1, 1, TILE, TILE, 3), 0.1, np.float32)
+    means = channel_means(colour, np.ones((1, TILE, TILE), bool))
+    np.testing.assert_allclose(means, np.float64(np.float32(0.1)), rtol=1e-13)
+
+
+def test_static_pattern_recovers_a_product():
+    random = np.random.default_rng(2)
+    pattern = random.uniform(0.2, 2.0, (1, TILE, TILE, 3))
+    pattern /= pattern.mean(axis=(1, 2), keepdims=True)
+    strength = np.array([[0.5, 1.0, 0.0], [0.0, 3.0, 0.0]])  # blue never, red not at the second time
+    colour = (strength[None, :, None, None] * pattern[:, None]).astype(np.float32)
+    means = channel_means(colour, np.ones((1, TILE, TILE), bool))
+    found = static_pattern(colour, means)
+    np.testing.assert_allclose(found[..., :2], pattern[..., :2], rtol=1e-5)
+    assert (found[..., 2] == 0).all()
+
+
+def test_empty_tile_ignores_its_colour():
+    random = np.random.default_rng(3)
+    linear = random.random((2, TILE, TILE, 3))
+    assert _kind(linear, np.zeros((TILE, TILE), bool)) is TileKind.EMPTY
+
+
+def test_all_zero_tile_is_constant():
+    assert _kind(np.zeros((3, 1, 1, 3))) is TileKind.CONSTANT
+
+
+@pytest.mark.parametrize("value", [1e-6, 6e-5, 0.01, 0.3, 1.0, 1.999, 900.0, 60_000.0])
+def test_constant_is_one_half_float_step_and_no_more(value):
+    base = np.float16(value)
+    step, two = np.nextafter(base, np.float16(np.inf)), np.float16(base)
+    for _ in range(2):
+        two = np.nextafter(two, np.float16(np.inf))
+    linear = np.full((2, TILE, TILE, 3), np.float32(base))
+    assert _kind(linear) is TileKind.CONSTANT
+    linear[1, 5, 5, 1] = step
+    assert _kind(linear) is TileKind.CONSTANT
+    linear[1, 5, 5, 1] = two
+    # gap.
+    assert _kind(linear) is not TileKind.CONSTANT
+
+
+def test_constant_may_change_over_time_and_differ_between_channels():
+    linear = np.array([[0.0, 1.0, 7.0], [3.0, 0.1, 0.0], [60_000.0, 0.0, 1e-5]])[:, None, None]
+    assert _kind(_half(linear)) is TileKind.CONSTANT
+
+
+def test_only_valid_texels_count():
+    linear = np.full((2, TILE, TILE, 3), 0.5, np.float32)
+    mask = np.ones((TILE, TILE), bool)
+    mask[7] = False
+    linear[0, 7] = 4.0
+    assert _kind(linear, mask) is TileKind.CONSTANT
+    assert _kind(linear) is TileKind.DYNAMIC
+
+
+def _pattern() -> np.ndarray:
+    return np.random.default_rng(4).uniform(0.25, 1.0, (1, TILE, TILE, 3))
+
+
+def test_product_of_a_colour_a_time_and_a_pattern_is_static():
+    strength = np.array([[1.0, 0.5, 0.25], [0.02, 8.0, 1.0], [0.0, 1.0, 0.0], [0.0, 0.0, 0.0]])[:, None, None]
+    assert _kind(_pattern() * strength) is TileKind.STATIC
+
+
+def test_one_time_needs_no_more_than_static():
+    assert _kind(np.random.default_rng(5).random((1, TILE, TILE, 3)), budget=np.inf) is TileKind.STATIC
+
+
+def test_budget_is_the_psnr_at_the_worst_time():
+    random = np.random.default_rng(6)
+    linear = np.repeat(_pattern(), 40, axis=0)
+    # Noise of 1/1,000 of the range at one time of forty: 60 dB there, less the little that it moves the
+    # pattern.
+    noise = random.normal(0.0, 1e-3 * np.ptp(linear[0]), linear[0].shape)
+    linear[7] += noise
+    assert _kind(linear, budget=59.0) is TileKind.STATIC
+    assert _kind(linear, budget=61.0) is TileKind.DYNAMIC
+
+
+def test_lamp_that_lights_one_corner_is_dynamic():
+    linear = np.repeat(_pattern(), 3, axis=0)
+    linear[1, :20, :20] += 0.5
+    assert _kind(linear) is TileKind.DYNAMIC
+
+
+def test_dark_time_within_a_half_float_step_does_not_make_a_tile_dynamic():
+    dim = _half(_pattern() * 2e-7)  # three or four steps of half float: its PSNR measures the rounding
+    linear = np.concatenate([_pattern(), dim])
+    assert _kind(linear) is TileKind.STATIC
+
+
+def test_grey_time_of_no_range_but_another_light_is_dynamic():
+    linear = np.concatenate([_pattern(), np.full((1, TILE, TILE, 3), 0.5)])
+    assert _kind(linear, budget=1.0) is TileKind.DYNAMIC
+
+
+def test_classify_takes_a_batch_in_order(lightmaps):
+    kinds = classify(split(lightmaps, GAMMA), GAMMA)
+    assert kinds.tolist() == [3, 0, 3, 3, 3, 3] and kinds.dtype == np.int64
+
+
+def test_classify_refuses():
+    tile = _tile(np.zeros((1, 1, 1, 3)))
+    with pytest.raises(WlmError, match="static_budget_db"):
+        classify(tile, GAMMA, float("nan"))
+    with pytest.raises(WlmError, match="gamma"):
+        classify(tile, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [("0-3,7", [0, 1, 2, 3, 7]), ("5", [5]), (" 7 , 0 - 1 ", [7, 0, 1]), ("2-2", [2])],
+)
+def test_parse_tiles(text, expected):
+    assert parse_tiles(text, 8) == expected
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("", "expected a number or first-last"),
+        ("1,", "expected a number or first-last"),
+        ("a", "got 'a'"),
+        ("-1", "got '-1'"),
+        ("1-2-3", "got '1-2-3'"),
+        ("1.5", "got '1.5'"),
+        ("9" * 5000, "expected a number"),
+        ("3-1", "runs down"),
+        ("8", "tile 8 is out of range; expected 0 to 7"),
+        ("0-999999999", "out of range"),
+        ("1,0-2", "tile 1 is given twice"),
+    ],
+)
+def test_parse_tiles_refuses(text, expected):
+    with pytest.raises(WlmError) as caught:
+        parse_tiles(text, 8)
+    assert expected in str(caught.value) and "\n" not in str(caught.value)

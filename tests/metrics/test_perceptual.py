@@ -1,0 +1,166 @@
+"""SSIM and FLIP against the libraries called directly."""
+
+import math
+
+import flip_evaluator
+import numpy as np
+import pytest
+from skimage.metrics import structural_similarity
+
+from wlm.errors import WlmError
+from wlm.metrics import flip_exposures, flip_map, ssim
+
+
+def make_pair(height=48, width=40, seed=0):
+    """A smooth HDR image and a noisy copy, float32."""
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[:height, :width] / 12.0
+    base = 0.2 + (np.sin(y) * np.cos(x) + 1.0) ** 3
+    ref = base[..., None] * np.array([1.0, 0.8, 0.5])
+    return ref.astype(np.float32), (ref * (1.0 + 0.05 * rng.standard_normal(ref.shape))).astype(np.float32)
+
+
+def half_mask(shape):
+    mask = np.ones(shape, bool)
+    mask[:, shape[1] // 2 :] = False
+    return mask
+
+
+def test_ssim_of_a_full_mask_is_scikit_images():
+    ref, test = (image.astype(np.float64) for image in make_pair())
+    expected = structural_similarity(
+        ref,
+        test,
+        data_range=float(np.ptp(ref)),
+        channel_axis=2,
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+    )
+    assert 0.5 < expected < 0.999
+    assert ssim(ref, test) == pytest.approx(expected, abs=1e-12)
+    assert ssim(ref, test, np.ones(ref.shape[:2])) == pytest.approx(expected, abs=1e-12)
+
+
+def test_ssim_in_one_window_by_its_definition():
+    """The centre of an 11x11 image: equation 13 of Wang et al. 2004 written out."""
+    rng = np.random.default_rng(3)
+    a, b = rng.random((11, 11, 1)), rng.random((11, 11, 1))
+    g = np.exp(-np.square(np.arange(-5, 6)) / (2 * 1.5**2))
+    w = np.outer(g, g) / g.sum() ** 2
+    x, y = a[..., 0], b[..., 0]
+    mx, my = (w * x).sum(), (w * y).sum()
+    vx, vy, cov = (w * x * x).sum() - mx**2, (w * y * y).sum() - my**2, (w * x * y).sum() - mx * my
+    span = np.ptp(a)
+    c1, c2 = (0.01 * span) ** 2, (0.03 * span) ** 2
+    expected = (2 * mx * my + c1) * (2 * cov + c2) / ((mx**2 + my**2 + c1) * (vx + vy + c2))
+    assert ssim(a, b) == pytest.approx(expected, abs=1e-12)
+
+
+def test_ssim_ignores_what_lies_outside_the_mask():
+    ref, test = make_pair()
+    mask = half_mask(ref.shape[:2])
+    expected = ssim(ref, test, mask)
+    rng = np.random.default_rng(1)
+    for image in (ref, test):
+        image[~mask] = 1e4 * rng.random(image[~mask].shape)
+    test[~mask] = np.nan
+    assert ssim(ref, test, mask) == expected
+    assert ssim(ref, ref, mask) == pytest.approx(1.0, abs=1e-12)
+
+
+def test_ssim_where_it_does_not_exist():
+    ref, test = make_pair(10, 40)
+    assert math.isnan(ssim(ref, test))
+    ref, test = make_pair()
+    edge = np.zeros(ref.shape[:2], bool)
+    edge[:5] = True
+    assert math.isnan(ssim(ref, test, edge))
+    assert math.isnan(ssim(ref, test, np.zeros_like(edge)))
+    flat = np.full_like(ref, 2.0)
+    assert math.isnan(ssim(flat, test))
+
+
+def test_flip_of_identical_images_is_zero_and_of_a_pair_the_librarys():
+    ref, test = make_pair()
+    assert flip_map(ref, ref).max() == 0.0
+    start, stop = flip_exposures(ref)
+    expected, _, _ = flip_evaluator.evaluate(
+        ref, test, "HDR", applyMagma=False,
+        parameters={"startExposure": start, "stopExposure": stop, "numExposures": 3},
+    )  # fmt: skip
+    ours = flip_map(ref, test, exposures=3)
+    assert expected.mean() > 0.01
+    # The library keeps exposures as float32, and ours reach it moved by a whole number of stops.
+    np.testing.assert_allclose(ours, expected[..., 0], atol=2e-5)
+
+
+def test_exposures_are_the_librarys_where_its_definition_is_ours():
+    """Grey levels of which the brightest is so frequent that the 99th percentile is the maximum."""
+    levels = np.concatenate([np.linspace(0.1, 4.0, 101), np.full(20, 4.0)]).astype(np.float32)
+    ref = np.repeat(levels[None, :, None], 3, axis=2)
+    _, _, library = flip_evaluator.evaluate(ref, ref, "HDR", applyMagma=False)
+    start, stop = flip_exposures(ref)
+    assert start == pytest.approx(library["startExposure"], abs=1e-5)
+    # Its median takes a neighbour, ours interpolates.
+    assert stop == pytest.approx(library["stopExposure"], abs=0.03)
+
+
+def test_exposures_follow_the_scale_and_ignore_black():
+    ref, _ = make_pair()
+    start, stop = flip_exposures(ref)
+    scaled = flip_exposures(ref * 8.0)
+    assert scaled == pytest.approx((start - 3.0, stop - 3.0), abs=1e-5)
+    night = np.concatenate([ref, np.zeros((200, ref.shape[1], 3), np.float32)])
+    assert flip_exposures(night) == pytest.approx((start, stop), abs=1e-9)
+    assert flip_exposures(np.zeros((4, 4, 3))) is None
+
+
+@pytest.mark.parametrize("scale", [2.0**-14, 1000.0, 1e30])
+def test_flip_does_not_change_with_brightness(scale):
+    ref, test = (image.astype(np.float64) for image in make_pair())
+    np.testing.assert_allclose(flip_map(ref * scale, test * scale), flip_map(ref, test), atol=1e-4)
+
+
+def test_flip_ignores_what_lies_outside_the_mask():
+    ref, test = make_pair()
+    mask = half_mask(ref.shape[:2])
+    expected = flip_map(ref, test, mask)
+    ref[~mask] = 1e4
+    test[~mask] = np.nan
+    np.testing.assert_array_equal(flip_map(ref, test, mask), expected)
+    assert expected[mask].mean() > 0.01
+
+
+def test_flip_of_a_black_reference():
+    black = np.zeros((8, 8, 3))
+    assert flip_map(black, black).max() == 0.0
+    dim, bright = flip_map(black, black + 0.01).mean(), flip_map(black, black + 1.0).mean()
+    assert 0.0 < dim < bright <= 1.0
+    # A reference that is black where it counts is black.
+    ref = np.ones((8, 8, 3))
+    mask = np.zeros((8, 8), bool)
+    mask[2:4, 2:4] = True
+    ref[mask] = 0.0
+    assert flip_map(ref, black, mask).max() == 0.0
+
+
+def test_flip_survives_a_test_that_explodes():
+    ref, _ = make_pair()
+    error = flip_map(ref, np.full_like(ref, 1e38))
+    assert np.isfinite(error).all()
+    # As far from the reference as any white: not the small number that an overflow gives.
+    np.testing.assert_allclose(error, flip_map(ref, np.full_like(ref, 1e9)), atol=1e-3)
+    assert np.isfinite(flip_map(ref, -ref)).all()
+    np.testing.assert_array_equal(flip_map(ref, -ref), flip_map(ref, np.zeros_like(ref)))
+
+
+def test_flip_rejects_what_the_library_would_answer_wrongly():
+    ref, test = make_pair()
+    with pytest.raises(WlmError, match="exposures"):
+        flip_map(ref, test, exposures=1)
+    test[3, 3, 0] = np.inf
+    with pytest.raises(WlmError, match="infinite"):
+        flip_map(ref, test)
+    with pytest.raises(WlmError, match="RGB"):
+        flip_map(ref[..., :2], ref[..., :2])

@@ -1,0 +1,129 @@
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Literal
+
+import pytest
+from pydantic import BaseModel, Field
+
+import wlm.config
+from wlm.config import load_settings, profile_names, profile_path
+from wlm.errors import WlmError
+
+
+class Net(BaseModel):
+    width: int = Field(16, ge=1, le=64)
+    activation: Literal["gelu", "relu"] = "gelu"
+
+
+class Settings(BaseModel):
+    steps: int
+    rate: float = 0.01
+    net: Net = Net()
+    sizes: tuple[int, ...] = ()
+
+
+def _load(tmp_path: Path, text: str | bytes) -> Settings:
+    path = tmp_path / "s.yaml"
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    return load_settings(Settings, path)
+
+
+def test_settings_are_read_and_typed(tmp_path):
+    # YAML 1.1 reads 1e-3, without a dot, as text: it must still arrive as a number.
+    settings = _load(tmp_path, "steps: 10\nrate: 1e-3\nnet: {width: 32, activation: relu}\nsizes: [1, 2]\n")
+    assert settings == Settings(steps=10, rate=0.001, net=Net(width=32, activation="relu"), sizes=(1, 2))
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", ["empty"]),
+        ("# only a comment\n", ["empty"]),
+        ("- 1\n- 2\n", ["mapping", "[1, 2]"]),
+        ("just text", ["mapping", "just text"]),
+        ("steps: [1\n", ["expected YAML", "line 2"]),
+        ("steps: !!python/object:os.system x\n", ["expected YAML", "line 1"]),
+        ("steps: 1\nsteps: 2\n", ["expected YAML", "'steps' is given twice", "line 2"]),
+        (b"steps: \xff\xfe\n", ["UTF-8"]),
+        ("rate: 1.0\n", ["steps: expected a value"]),
+        ("steps: many\n", ["steps: expected a valid integer", "'many'"]),
+        ("steps: 1.5\n", ["steps: expected a valid integer", "1.5"]),
+        ("steps: 1\nstepps: 2\n", ["unknown key 'stepps'", "did you mean 'steps'"]),
+        ("steps: 1\nqqq: 2\n", ["unknown key 'qqq'", "steps, rate, net, sizes"]),
+        ("steps: 1\nnet: {widht: 2}\n", ["unknown key 'net.widht'", "did you mean 'width'"]),
+        ("steps: 1\nnet: {width: 0}\n", ["net.width: expected greater than or equal to 1", "got 0"]),
+        ("steps: 1\nnet: {width: 65}\n", ["net.width: expected less than or equal to 64", "got 65"]),
+        ("steps: 1\nnet: {activation: tanh}\n", ["net.activation: expected 'gelu' or 'relu'", "'tanh'"]),
+        ("steps: 1\nnet: 3\n", ["net: expected", "got 3"]),
+        ("steps: 1\nsizes: [1, x]\n", ["sizes.1: expected a valid integer", "'x'"]),
+        ("1: 2\nsteps: 1\n", ["1: "]),
+        ("steps: x\nrate: y\nnet: 1\n", ["steps: expected", "(and 2 more)"]),
+        ("steps: " + "x" * 5000, ["steps: expected", "..."]),
+    ],
+)
+def test_a_wrong_file_is_one_line(tmp_path, text, words):
+    with pytest.raises(WlmError) as caught:
+        _load(tmp_path, text)
+    line = str(caught.value)
+    assert "\n" not in line and len(line) < 400
+    assert line.startswith(f"{tmp_path / 's.yaml'}: ")
+    for word in words:
+        assert word in line
+
+
+def test_a_missing_file_or_a_folder_is_one_line(tmp_path):
+    with pytest.raises(WlmError, match="no.yaml: cannot read the settings: No such file"):
+        load_settings(Settings, tmp_path / "no.yaml")
+    with pytest.raises(WlmError, match="Is a directory"):
+        load_settings(Settings, tmp_path)
+
+
+@pytest.fixture
+def checkout(tmp_path, monkeypatch):
+    """A checkout's layout with two profiles, and no installed ones."""
+    (tmp_path / "configs").mkdir()
+    (tmp_path / "wlm").mkdir()
+    for name in ("lightmap-M", "lightmap-S", "probe-M"):
+        (tmp_path / "configs" / f"{name}.yaml").write_text("steps: 1\n")
+    (tmp_path / "pyproject.toml").touch()
+    (tmp_path / "secret.yaml").touch()
+    monkeypatch.setattr(wlm.config, "__file__", str(tmp_path / "wlm" / "config.py"))
+    monkeypatch.setattr(wlm.config.resources, "files", _not_installed)
+    return tmp_path
+
+
+def _not_installed(package: str) -> None:
+    raise ModuleNotFoundError(package)
+
+
+def test_a_profile_is_found_in_a_checkout(checkout):
+    assert profile_path("lightmap", "M") == checkout / "configs" / "lightmap-M.yaml"
+    assert profile_names("lightmap") == ["M", "S"]
+
+
+@pytest.mark.parametrize("name", ["XL", "", "*", "../secret", "M.yaml", "m"])
+def test_an_unknown_profile_lists_the_known_ones(checkout, name):
+    with pytest.raises(WlmError, match="known profiles: M, S$"):
+        profile_path("lightmap", name)
+    with pytest.raises(WlmError, match="known profiles: none$"):
+        profile_path("smoke", "M")
+
+
+def test_a_profile_is_found_in_the_installed_package(tmp_path, monkeypatch):
+    site = tmp_path / "site-packages"
+    (site / "wlm" / "configs").mkdir(parents=True)
+    (site / "wlm" / "configs" / "atlas-M.yaml").touch()
+    # Of another package: a folder of this name beside `wlm` means nothing without a pyproject.toml.
+    (site / "configs").mkdir()
+    (site / "configs" / "atlas-X.yaml").touch()
+    source = Path(wlm.config.__file__)
+    for file in ("__init__.py", "config.py", "errors.py"):
+        (site / "wlm" / file).write_bytes(source.with_name(file).read_bytes())
+    code = "import wlm.config as c; print(c.profile_names('atlas'), c.profile_path('atlas', 'M'))"
+    environment = {**os.environ, "PYTHONPATH": str(site)}
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True
+    )
+    assert done.stdout.strip() == f"['M'] {site / 'wlm' / 'configs' / 'atlas-M.yaml'}", done.stderr

@@ -1,0 +1,151 @@
+import pytest
+import torch
+import warp as wp
+
+from wlm import interop
+from wlm.errors import WlmError
+from wlm.interop import StepGraph, available_devices, check_device, stream, to_warp
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def _add(
+    # in:
+    amount: wp.array[float],
+    # out:
+    total: wp.array[float],
+):
+    i = wp.tid()
+    total[i] = total[i] + amount[i]
+
+
+def test_the_cpu_and_every_found_device_are_named(device):
+    assert check_device(device) == device
+    assert device in available_devices()
+
+
+def test_cuda_means_the_first_gpu(monkeypatch):
+    monkeypatch.setattr(wp, "get_cuda_device_count", lambda: 2)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    assert check_device("cuda") == "cuda:0"
+    assert check_device("cuda:1") == "cuda:1"
+    with pytest.raises(WlmError, match="device 'cuda:2': expected one of: cpu, cuda:0, cuda:1$"):
+        check_device("cuda:2")
+
+
+@pytest.mark.parametrize("name", ["gpu", "", "CPU", "cpu:0", "cuda:", "cuda:x", "cuda:99", "mps"])
+def test_an_unknown_device_lists_the_known_ones(name):
+    with pytest.raises(WlmError, match=f"^device '{name}': expected one of: cpu"):
+        check_device(name)
+
+
+def test_a_gpu_that_only_warp_sees_is_refused_with_the_reason(monkeypatch):
+    monkeypatch.setattr(wp, "get_cuda_device_count", lambda: 1)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
+    with pytest.raises(WlmError, match="this build of torch does not"):
+        check_device("cuda")
+
+
+def test_a_wrapped_tensor_shares_memory_and_has_no_gradient(device):
+    tensor = torch.arange(6.0, device=device).reshape(2, 3).requires_grad_()
+    array = to_warp(tensor)
+    assert array.ptr == tensor.data_ptr() and array.shape == (2, 3) and array.dtype == wp.float32
+    assert not array.requires_grad and array.grad is None and tensor.grad is None
+    assert to_warp(tensor, wp.vec3).shape == (2,)
+
+
+def test_a_wrapped_tensor_keeps_its_memory_alive(device):
+    array = to_warp(torch.full((1000,), 7.0, device=device))
+    torch.zeros(1000, device=device)
+    assert (array.numpy() == 7.0).all()
+
+
+def test_a_tensor_that_does_not_fit_the_type_is_a_value_error():
+    with pytest.raises(ValueError, match=r"tensor \(2, 4\) of torch.float32"):
+        to_warp(torch.zeros(2, 4), wp.vec3)
+    with pytest.raises(ValueError, match="torch.float32"):
+        to_warp(torch.zeros(2), wp.int32)
+
+
+def test_the_stream_orders_torch_and_warp(device):
+    n = 1 << 20
+    ones = torch.ones(n, device=device)
+    total = torch.zeros(n, device=device)
+    amount, sums = to_warp(ones), to_warp(total)
+    for _ in range(20):
+        ones.add_(1.0)  # outside, on the default stream
+        with stream(device) as side:
+            assert (side is None) == (device == "cpu")
+            wp.launch(_add, dim=n, inputs=[amount], outputs=[sums], device=device)
+            total.mul_(0.5)
+            with stream(device) as inner:
+                assert inner == side
+                wp.launch(_add, dim=n, inputs=[amount], outputs=[sums], device=device)
+        total.sub_(1.0)  # outside again
+    expected = 0.0
+    for step in range(20):
+        expected = (expected + step + 2) * 0.5 + step + 2 - 1
+    assert torch.all(total == expected)
+
+
+def test_an_error_inside_the_stream_passes_through(device):
+    with pytest.raises(KeyError), stream(device):
+        raise KeyError("x")
+    with stream(device) as side:
+        assert device == "cpu" or side is not None
+
+
+@pytest.mark.parametrize("warmup", [1, 3])
+def test_each_call_of_a_step_graph_is_one_step(device, warmup):
+    total = torch.zeros(8, device=device)
+    amount = torch.zeros(8, device=device)
+    wrapped_amount, wrapped_total = to_warp(amount), to_warp(total)
+
+    def step() -> None:
+        amount.add_(1.0)
+        wp.launch(_add, dim=8, inputs=[wrapped_amount], outputs=[wrapped_total], device=device)
+
+    graph = StepGraph(step, device, warmup=warmup)
+    for count in range(1, 8):
+        graph()
+        assert torch.all(total == count * (count + 1) / 2)
+        assert graph.captured == (device != "cpu" and count > warmup)
+
+
+def test_a_captured_optimiser_step_equals_an_eager_one(device):
+    def train(captured: bool) -> torch.Tensor:
+        weight = torch.full((16,), 2.0, device=device, requires_grad=True)
+        gradient = torch.zeros(16, device=device)
+        weight.grad = gradient
+        optimiser = torch.optim.Adam([weight], lr=0.1, capturable=device != "cpu")
+        array, grad = to_warp(weight), to_warp(gradient)
+
+        def step() -> None:
+            gradient.zero_()
+            wp.launch(_add, dim=16, inputs=[array], outputs=[grad], device=device)
+            optimiser.step()
+
+        run = StepGraph(step, device) if captured else step
+        for _ in range(10):
+            run()
+        return weight.detach().clone()
+
+    assert torch.equal(train(True), train(False))
+    assert torch.all(train(True) < 1.5)
+
+
+def test_a_step_graph_passes_an_error_on_and_wants_a_warm_up(device):
+    def broken() -> None:
+        raise KeyError("x")
+
+    with pytest.raises(KeyError):
+        StepGraph(broken, device)()
+    with pytest.raises(ValueError, match="warmup"):
+        StepGraph(broken, device, warmup=0)
+
+
+def test_one_side_stream_a_device(device):
+    if device == "cpu":
+        with stream(device) as side:
+            assert side is None
+    else:
+        assert interop._side_stream(device) is interop._side_stream(device)

@@ -1,0 +1,171 @@
+"""How long a call takes, on the CPU or on a CUDA device.
+
+A number here is the time of one call among many made back to back, after a warm-up that compiles kernels and
+fills caches. On CUDA that includes the launch wherever launching takes longer than the kernels; capture the
+call in a graph to leave it out.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from wlm.errors import WlmError
+
+__all__ = ["Timing", "cpu_threads", "time_call", "time_together"]
+
+# One sample lasts at least this long: CUDA events resolve half a microsecond, and an event pair around one
+# short kernel measures mostly the pair.
+_MIN_SAMPLE_MS = 1.0
+_MAX_CALLS_PER_SAMPLE = 1000
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Distribution of the time of one call, in milliseconds.
+
+    Attributes:
+        median_ms: Median over the samples.
+        p10_ms: 10th percentile.
+        p90_ms: 90th percentile.
+        n: Number of samples; each is the mean of as many calls as fill a millisecond.
+    """
+
+    median_ms: float
+    p10_ms: float
+    p90_ms: float
+    n: int
+
+
+def time_call(fn: Callable[[], object], device: str = "cpu", warmup: int = 5, repeats: int = 30) -> Timing:
+    """Time one function; see `time_together`, which compares several fairly.
+
+    Args:
+        fn: Called without arguments; its result is dropped.
+        device: `"cpu"` or `"cuda:0"`.
+        warmup: Calls before the first that is timed, at least 1.
+        repeats: Samples to take, at least 1.
+
+    Returns:
+        The distribution of the time of one call.
+
+    Raises:
+        WlmError: The device is unknown or absent, or a number is below 1.
+    """
+    return time_together({"": fn}, device, warmup, repeats)[""]
+
+
+def time_together(
+    calls: Mapping[str, Callable[[], object]], device: str = "cpu", warmup: int = 5, repeats: int = 30
+) -> dict[str, Timing]:
+    """Time peers in one run, in turns, so that a drifting clock or a busy neighbour slows all alike.
+
+    Each round takes one sample of every peer, and each round starts with the next peer. On CUDA all of them
+    run on the stream of `wlm.interop.stream`, which the events are recorded on; a function that launches on a
+    stream of its own must make that stream wait for this one and this one for it.
+
+    Args:
+        calls: Functions without arguments, by name; their results are dropped.
+        device: `"cpu"` or `"cuda:0"`.
+        warmup: Calls of each before the first that is timed, at least 1.
+        repeats: Samples of each, at least 1.
+
+    Returns:
+        The distribution of the time of one call, by name.
+
+    Raises:
+        WlmError: The device is unknown or absent, or a number is below 1.
+    """
+    if warmup < 1 or repeats < 1:
+        raise WlmError(f"timing: expected warmup and repeats of at least 1, got {warmup} and {repeats}")
+    with _clock(device) as sample:
+        batch = {}
+        for name, fn in calls.items():
+            sample(fn, warmup)
+            batch[name] = _calls_per_sample(sample(fn, 1))
+        times: dict[str, list[float]] = {name: [] for name in calls}
+        names = list(calls)
+        for turn in range(repeats):
+            first = turn % max(len(names), 1)
+            for name in names[first:] + names[:first]:
+                times[name].append(sample(calls[name], batch[name]))
+    return {name: _timing(samples) for name, samples in times.items()}
+
+
+@contextlib.contextmanager
+def cpu_threads(count: int) -> Iterator[None]:
+    """Run torch's CPU operators on `count` threads inside the block, and as before after it.
+
+    This is torch's own pool alone. A Warp launch on the CPU is one serial loop whatever this says, and the
+    pools of NumPy's BLAS and of OpenMP libraries (FLIP's among them) are fixed when they are loaded: set
+    `OMP_NUM_THREADS` before the process starts for those. `describe_environment` records both.
+
+    Args:
+        count: Threads, at least 1.
+
+    Raises:
+        WlmError: The number is below 1.
+    """
+    import torch
+
+    if count < 1:
+        raise WlmError(f"timing: expected at least 1 thread, got {count}")
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+_Sampler = Callable[[Callable[[], object], int], float]
+
+
+@contextlib.contextmanager
+def _clock(device: str) -> Iterator[_Sampler]:
+    """A function `(fn, calls) -> milliseconds a call` for the device."""
+    # Imported here so that reading results needs neither torch nor Warp.
+    from wlm import interop
+
+    device = interop.check_device(device)
+    if device == "cpu":
+        yield _sample_cpu
+        return
+    import torch
+
+    with torch.cuda.device(device), interop.stream(device) as stream:
+        start = torch.cuda.Event(enable_timing=True)
+        end = torch.cuda.Event(enable_timing=True)
+
+        def sample(fn: Callable[[], object], calls: int) -> float:
+            start.record(stream)
+            for _ in range(calls):
+                fn()
+            end.record(stream)
+            end.synchronize()
+            return start.elapsed_time(end) / calls
+
+        yield sample
+
+
+def _sample_cpu(fn: Callable[[], object], calls: int) -> float:
+    start = time.perf_counter()
+    for _ in range(calls):
+        fn()
+    return (time.perf_counter() - start) * 1e3 / calls
+
+
+def _calls_per_sample(call_ms: float) -> int:
+    if call_ms * _MAX_CALLS_PER_SAMPLE <= _MIN_SAMPLE_MS:
+        return _MAX_CALLS_PER_SAMPLE
+    return max(1, math.ceil(_MIN_SAMPLE_MS / call_ms))
+
+
+def _timing(samples: list[float]) -> Timing:
+    p10, median, p90 = np.percentile(samples, [10, 50, 90])
+    return Timing(float(median), float(p10), float(p90), len(samples))

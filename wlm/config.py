@@ -1,0 +1,154 @@
+"""YAML to checked settings, and where the profiles are."""
+
+import difflib
+import os
+from collections.abc import Iterator
+from contextlib import suppress
+from importlib import resources
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+from pydantic import BaseModel, ValidationError
+
+from wlm.errors import WlmError, one_line
+
+__all__ = ["load_settings", "profile_names", "profile_path"]
+
+_Settings = TypeVar("_Settings", bound=BaseModel)
+
+_SHOWN_VALUE = 60  # characters of a wrong value that an error repeats
+
+
+def load_settings(cls: type[_Settings], path: str | os.PathLike[str]) -> _Settings:
+    """Reads a YAML file into a settings model. Unknown keys are errors, whatever the model's own policy.
+
+    Args:
+        cls: The pydantic model; every key of the file must be one of its fields.
+        path: The YAML file, one mapping.
+
+    Returns:
+        The checked settings.
+
+    Raises:
+        WlmError: One line with the file, the field, what was expected and what was found.
+    """
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except OSError as error:
+        raise WlmError(f"{path}: cannot read the settings: {error.strerror or error}") from error
+    except UnicodeDecodeError as error:
+        raise WlmError(f"{path}: expected YAML in UTF-8, found another byte at {error.start}") from error
+    try:
+        values = yaml.load(text, _Loader)
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise WlmError(f"{path}: expected YAML: {_yaml_problem(error)}") from error
+    if values is None:
+        raise WlmError(f"{path}: expected a mapping of settings, found an empty file")
+    if not isinstance(values, dict):
+        raise WlmError(f"{path}: expected a mapping of settings, found {_shown(values)}")
+    try:
+        return cls.model_validate(values, extra="forbid")
+    except ValidationError as error:
+        raise WlmError(f"{path}: {_first_problem(cls, error)}") from error
+
+
+def profile_path(system: str, name: str) -> Path:
+    """Finds a profile, `configs/<system>-<name>.yaml`, in a checkout or in the installed package.
+
+    Args:
+        system: `lightmap`, `atlas`, `probe` or `smoke`.
+        name: The profile's name, `M` for example.
+
+    Returns:
+        The path of the YAML file.
+
+    Raises:
+        WlmError: There is no such profile; the line lists those that there are.
+    """
+    wanted = f"{system}-{name}.yaml"
+    for folder in _profile_folders():
+        # Compared with the listing, not joined: a name such as `../x` can't leave the folder.
+        for candidate in folder.glob("*.yaml"):
+            if candidate.name == wanted:
+                return candidate
+    known = ", ".join(profile_names(system)) or "none"
+    raise WlmError(f"profile '{name}' of {system}: expected one of the known profiles: {known}")
+
+
+def profile_names(system: str) -> list[str]:
+    """Lists the profiles of a system, sorted.
+
+    Args:
+        system: `lightmap`, `atlas`, `probe` or `smoke`.
+    """
+    prefix = f"{system}-"
+    files = {file.stem for folder in _profile_folders() for file in folder.glob(f"{prefix}*.yaml")}
+    return sorted(stem.removeprefix(prefix) for stem in files)
+
+
+def _profile_folders() -> Iterator[Path]:
+    """Yields the folders that hold profiles: the checkout's, then the one installed with the package."""
+    root = Path(__file__).resolve().parents[1]
+    # Beside an installed package lies all of site-packages; only a checkout has its pyproject.toml there.
+    if (root / "pyproject.toml").is_file() and (root / "configs").is_dir():
+        yield root / "configs"
+    with suppress(ModuleNotFoundError):
+        installed = resources.files("wlm.configs")
+        for folder in getattr(installed, "_paths", [installed]):
+            yield Path(str(folder))
+
+
+class _Loader(yaml.SafeLoader):
+    """A safe loader that refuses a key given twice, of which YAML would silently keep the last."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        seen = set()
+        for key_node, _ in node.value:
+            if isinstance(key_node, yaml.ScalarNode):
+                if key_node.value in seen:
+                    raise yaml.constructor.ConstructorError(
+                        None, None, f"the key '{key_node.value}' is given twice", key_node.start_mark
+                    )
+                seen.add(key_node.value)
+        return super().construct_mapping(node, deep)
+
+
+def _yaml_problem(error: Exception) -> str:
+    problem = getattr(error, "problem", None)
+    mark = getattr(error, "problem_mark", None)
+    if problem is None:
+        return one_line(error)
+    return problem if mark is None else f"{problem} (line {mark.line + 1}, column {mark.column + 1})"
+
+
+def _first_problem(cls: type[BaseModel], error: ValidationError) -> str:
+    problems = error.errors(include_url=False)
+    problem = problems[0]
+    field = ".".join(str(part) for part in problem["loc"]) or "settings"
+    if problem["type"] == "extra_forbidden":
+        text = f"unknown key '{field}'{_suggestion(cls, problem['loc'])}"
+    elif problem["type"] == "missing":
+        text = f"{field}: expected a value, found none"
+    else:
+        expected = problem["msg"].replace("Input should be", "expected", 1)
+        text = f"{field}: {expected}, got {_shown(problem['input'])}"
+    return text if len(problems) == 1 else f"{text} (and {len(problems) - 1} more)"
+
+
+def _suggestion(cls: type[BaseModel], location: tuple[int | str, ...]) -> str:
+    """Says which keys the mapping at a location knows, or the one that was likely meant."""
+    model: Any = cls
+    for part in location[:-1]:
+        field = model.model_fields.get(part)
+        model = None if field is None else field.annotation
+        # A union, a list or a dict of models: its keys would need a guess.
+        if not (isinstance(model, type) and issubclass(model, BaseModel)):
+            return ""
+    known = [field.alias or name for name, field in model.model_fields.items()]
+    close = difflib.get_close_matches(str(location[-1]), known, n=1)
+    return f"; did you mean '{close[0]}'?" if close else f"; expected one of: {', '.join(known)}"
+
+
+def _shown(value: object) -> str:
+    return one_line(repr(value), _SHOWN_VALUE)

@@ -1,0 +1,1 @@
+"""Files: EXR pictures, BC7 blocks, DDS textures and the artifact."""

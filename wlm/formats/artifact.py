@@ -1,0 +1,291 @@
+"""The artifact: everything that one system's fit produced, in one safetensors file.
+
+The file is a valid safetensors file: an 8-byte length, a JSON header, the tensors. The header's
+`__metadata__`, whose values must be strings, has two keys:
+
+- `wlm`: "<format version> <system> <source> <digest>", where the digest is the BLAKE2b-128 (hex) of the whole
+  file with the digest's own 32 characters as zeros;
+- `settings`: JSON, with `"` and `'` exchanged, because each `"` inside a JSON string would cost an escape.
+
+A part is a tensor; its byte count is what its type and shape say, and its offsets must say the same.
+"""
+
+import hashlib
+import json
+import math
+import mmap
+import os
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from wlm.errors import WlmError, one_line
+from wlm.formats.atomic import atomic_write
+
+__all__ = ["FORMAT_VERSION", "Artifact", "read_artifact", "write_artifact"]
+
+FORMAT_VERSION = 1
+
+_LENGTH = struct.Struct("<Q")
+_NO_DIGEST = "0" * 32
+_EXCHANGED_QUOTES = str.maketrans({'"': "'", "'": '"'})
+_ALIGNMENT = 8  # of the first tensor, in bytes: that of the widest type
+_HEADER_LIMIT = 100_000_000  # bytes; the safetensors library refuses a longer header too
+
+_TYPES = {
+    "BOOL": np.bool_,
+    "U8": np.uint8,
+    "I8": np.int8,
+    "U16": np.uint16,
+    "I16": np.int16,
+    "F16": np.float16,
+    "U32": np.uint32,
+    "I32": np.int32,
+    "F32": np.float32,
+    "U64": np.uint64,
+    "I64": np.int64,
+    "F64": np.float64,
+}
+_TYPE_NAMES = {np.dtype(kind): name for name, kind in _TYPES.items()}
+
+
+@dataclass(frozen=True)
+class Artifact:
+    """What an artifact holds.
+
+    Attributes:
+        system: The system that wrote it, "lightmap" for example.
+        version: The format's version.
+        settings: What it was made with.
+        source: A hash of what it was made from, as the writer gave it.
+        tensors: The parts by name: read-only views of the mapped file.
+        parts: The parts' sizes by name, bytes.
+        file_bytes: The size on disk: the header and all parts.
+        header_bytes: What isn't a part: the length, the header and its padding.
+    """
+
+    system: str
+    version: int
+    settings: dict[str, Any]
+    source: str
+    tensors: dict[str, np.ndarray]
+    parts: dict[str, int]
+    file_bytes: int
+    header_bytes: int
+
+
+def write_artifact(
+    path: str | os.PathLike[str],
+    system: str,
+    settings: Mapping[str, Any],
+    tensors: Mapping[str, np.ndarray],
+    source: str,
+) -> int:
+    """Writes an artifact, whole or not at all. The same arguments give the same bytes.
+
+    Args:
+        path: The file to write; its folder must exist.
+        system: The system's name, without spaces.
+        settings: Plain JSON values; NaN and Inf are none.
+        tensors: The parts by name: any shape; a bool, an integer of 8 to 64 bits or a float of 16 to 64.
+        source: A hash of the input, without spaces, not empty.
+
+    Returns:
+        The size of the file, bytes.
+
+    Raises:
+        ValueError: A name, a setting or a type that the format can't hold.
+        WlmError: The file can't be written; what was there before stays.
+    """
+    for what, word in (("system", system), ("source", source)):
+        if not word or not word.isascii() or not word.isprintable() or " " in word:
+            raise ValueError(f"{what}: expected one ASCII word, got {word!r}")
+    if "__metadata__" in tensors:
+        raise ValueError("'__metadata__' is no name for a tensor: the format keeps it for itself")
+    # Wide types first, so that every tensor begins at a multiple of its item's size with no padding between.
+    arrays = {
+        name: _little_endian(name, array)
+        for name, array in sorted(tensors.items(), key=lambda item: (-item[1].dtype.itemsize, item[0]))
+    }
+    text = json.dumps(dict(settings), separators=(",", ":"), allow_nan=False, ensure_ascii=False)
+    metadata = {
+        "wlm": f"{FORMAT_VERSION} {system} {source} {_NO_DIGEST}",
+        "settings": text.translate(_EXCHANGED_QUOTES),
+    }
+    header: dict[str, Any] = {"__metadata__": metadata}
+    offset = 0
+    for name, array in arrays.items():
+        end = offset + array.nbytes
+        header[name] = {
+            "dtype": _TYPE_NAMES[array.dtype],
+            "shape": list(array.shape),
+            "data_offsets": [offset, end],
+        }
+        offset = end
+    encoded = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
+    encoded += b" " * (-len(encoded) % _ALIGNMENT)
+    head = _LENGTH.pack(len(encoded)) + encoded
+    digest = hashlib.blake2b(head, digest_size=16)
+    for array in arrays.values():
+        digest.update(array)
+    # With its quote, the first match is the placeholder: a source of zeros is followed by a space.
+    head = head.replace(f' {_NO_DIGEST}"'.encode(), f' {digest.hexdigest()}"'.encode(), 1)
+    return atomic_write(path, [head, *arrays.values()])
+
+
+def read_artifact(path: str | os.PathLike[str], system: str | None = None) -> Artifact:
+    """Maps an artifact and checks every byte of it against its digest.
+
+    Args:
+        path: The file.
+        system: The system that must have written it; default any.
+
+    Returns:
+        The artifact; its tensors stay valid while they are referenced, even if the file is replaced.
+
+    Raises:
+        WlmError: The file is missing, not an artifact, cut short, damaged, from a newer version or from
+            another system.
+    """
+    mapped = _map(path)
+    size = len(mapped)
+    if size < _LENGTH.size:
+        raise WlmError(f"{path}: expected an artifact (safetensors), found a file of {size} bytes")
+    (length,) = _LENGTH.unpack_from(mapped)
+    start = _LENGTH.size + length
+    if length > _HEADER_LIMIT or mapped[_LENGTH.size : _LENGTH.size + 1] not in (b"{", b""):
+        raise WlmError(f"{path}: expected an artifact (safetensors), found other content")
+    if start > size:
+        raise WlmError(f"{path}: the artifact is cut short: expected a header of {length} bytes, found fewer")
+    encoded = mapped[_LENGTH.size : start]
+    header = _parse_json(path, encoded, "header")
+    stated, settings_text = _metadata(path, header)
+    version, found_system, source, digest = stated
+    # The version comes first: what a newer one means by the rest isn't for this reader to say.
+    if version > FORMAT_VERSION:
+        raise WlmError(f"{path}: artifact version {version}: expected at most {FORMAT_VERSION}; update wlm")
+    if version < FORMAT_VERSION:
+        raise WlmError(f"{path}: artifact version {version}: expected {FORMAT_VERSION}")
+    entries = {name: _entry(path, name, entry) for name, entry in header.items() if name != "__metadata__"}
+    _check_extents(path, entries, size - start)
+    _check_digest(path, mapped, encoded, digest)
+    if system is not None and found_system != system:
+        raise WlmError(f"{path}: expected an artifact of {system}, found one of {found_system}")
+    settings = _parse_json(path, settings_text.translate(_EXCHANGED_QUOTES), "settings")
+    tensors = {name: _view(mapped, start, *entry) for name, entry in entries.items()}
+    return Artifact(
+        system=found_system,
+        version=version,
+        settings=settings,
+        source=source,
+        tensors=tensors,
+        parts={name: array.nbytes for name, array in tensors.items()},
+        file_bytes=size,
+        header_bytes=start,
+    )
+
+
+def _little_endian(name: str, array: np.ndarray) -> np.ndarray:
+    dtype = array.dtype.newbyteorder("<")
+    if dtype not in _TYPE_NAMES:
+        raise ValueError(f"tensor {name}: expected one of {', '.join(_TYPES)}, got {array.dtype}")
+    return np.asarray(array, dtype=dtype, order="C")
+
+
+def _map(path: str | os.PathLike[str]) -> mmap.mmap | bytes:
+    try:
+        if Path(path).exists() and not Path(path).is_file():
+            raise WlmError(f"{path}: expected an artifact, found a folder or a device")
+        with open(path, "rb") as file:
+            # An empty file can't be mapped.
+            if os.fstat(file.fileno()).st_size == 0:
+                return b""
+            return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+    except OSError as error:
+        raise WlmError(f"{path}: cannot read the artifact: {error.strerror or error}") from error
+
+
+def _parse_json(path: str | os.PathLike[str], text: bytes | str, what: str) -> dict[str, Any]:
+    try:
+        value = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise WlmError(f"{path}: the artifact's {what} is damaged: {one_line(error, 120)}") from error
+    if not isinstance(value, dict):
+        raise WlmError(f"{path}: the artifact's {what} is damaged: expected a JSON object")
+    return value
+
+
+def _metadata(path: str | os.PathLike[str], header: dict[str, Any]) -> tuple[tuple[int, str, str, str], str]:
+    """Splits the metadata into (version, system, source, digest) and the settings' text."""
+    metadata = header.get("__metadata__")
+    if not isinstance(metadata, dict) or "wlm" not in metadata:
+        raise WlmError(f"{path}: expected an artifact of wlm, found a safetensors file without its metadata")
+    words = str(metadata["wlm"]).split(" ")
+    if not (words[0].isascii() and words[0].isdecimal()):
+        raise WlmError(f"{path}: the artifact's version is damaged: expected an integer, found {words[0]!r}")
+    version = int(words[0][:9])
+    if version <= FORMAT_VERSION and (len(words) != 4 or not isinstance(metadata.get("settings"), str)):
+        raise WlmError(f"{path}: the artifact's metadata is damaged: expected four words and settings")
+    system, source, digest = (*words[1:], "", "", "")[:3]
+    return (version, system, source, digest), str(metadata.get("settings"))
+
+
+def _entry(path: str | os.PathLike[str], name: str, entry: Any) -> tuple[str, tuple[int, ...], int, int]:
+    """Checks one tensor's line of the header and gives its type, shape, begin and end."""
+    try:
+        kind, shape, (begin, end) = entry["dtype"], tuple(entry["shape"]), entry["data_offsets"]
+        numbers = (*shape, begin, end)
+        valid = kind in _TYPES and all(type(number) is int and number >= 0 for number in numbers)
+    except (KeyError, TypeError, ValueError):
+        valid = False
+    if not valid:
+        raise WlmError(f"{path}: part {one_line(name, 60)}: expected a type, a shape and two offsets")
+    expected = math.prod(shape) * np.dtype(_TYPES[kind]).itemsize
+    if end - begin != expected:
+        raise WlmError(f"{path}: part {one_line(name, 60)}: expected {expected} bytes, found {end - begin}")
+    return kind, shape, begin, end
+
+
+def _check_extents(
+    path: str | os.PathLike[str], entries: dict[str, tuple[str, tuple[int, ...], int, int]], payload: int
+) -> None:
+    """Checks that the parts fill what follows the header, with no gap and no overlap."""
+    reached = 0
+    for name, (_, _, begin, end) in sorted(entries.items(), key=lambda item: item[1][2:]):
+        if begin != reached:
+            raise WlmError(f"{path}: part {one_line(name, 60)}: expected it at byte {reached}, found {begin}")
+        reached = end
+    if payload < reached:
+        raise WlmError(f"{path}: the artifact is cut short: expected {reached} bytes of parts, not {payload}")
+    if payload > reached:
+        raise WlmError(f"{path}: expected the end of the file, found {payload - reached} more bytes")
+
+
+def _check_digest(path: str | os.PathLike[str], mapped: Any, encoded: bytes, digest: str) -> None:
+    stated = digest.encode(errors="replace")
+    # Exactly as the writer spells it, at its one place: anything else is a change that it did not make.
+    place = encoded.find(b" " + stated + b'"') + 1
+    actual = None
+    if place > 0 and len(stated) == len(_NO_DIGEST):
+        at = _LENGTH.size + place
+        hasher = hashlib.blake2b(digest_size=16)
+        with memoryview(mapped) as view:
+            hasher.update(view[:at])
+            hasher.update(_NO_DIGEST.encode())
+            hasher.update(view[at + len(stated) :])
+        actual = hasher.hexdigest()
+    if actual != digest:
+        raise WlmError(f"{path}: the artifact is damaged: its content does not match its digest")
+
+
+def _view(mapped: Any, start: int, kind: str, shape: tuple[int, ...], begin: int, end: int) -> np.ndarray:
+    dtype = np.dtype(_TYPES[kind]).newbyteorder("<")
+    if begin == end:
+        empty = np.empty(shape, dtype)
+        empty.flags.writeable = False
+        return empty
+    return np.frombuffer(mapped, dtype, math.prod(shape), start + begin).reshape(shape)

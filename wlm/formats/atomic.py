@@ -1,0 +1,97 @@
+"""Writing a file whole or not at all."""
+
+import os
+import secrets
+import stat
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from wlm.errors import WlmError
+
+__all__ = ["atomic_path", "atomic_write"]
+
+
+@contextmanager
+def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Gives a temporary name beside `path`, and moves what was written there onto `path` at the end.
+
+    If the block raises, the temporary file is removed and `path` keeps what it held. A link is followed: the
+    file that it points to is replaced.
+
+    Args:
+        path: The file to write; its folder must exist.
+
+    Yields:
+        The temporary name, of an empty file in the same folder.
+
+    Raises:
+        WlmError: The folder is missing, `path` is not a regular file, or the system refused (a full disk).
+    """
+    # Resolved first: os.replace would put a file in place of the link.
+    target = Path(os.path.realpath(path))
+    with _as_wlm_error(path):
+        # Renaming over a device such as /dev/null would destroy it.
+        if os.path.lexists(target) and not stat.S_ISREG(os.stat(target).st_mode):
+            raise WlmError(f"{path}: cannot write: it exists and is not a regular file")
+        if not target.parent.is_dir():
+            raise WlmError(f"{path}: cannot write: the folder {target.parent} does not exist")
+        # A short name of its own: the destination's may already be as long as the system allows.
+        temporary = target.parent / f".wlm-{secrets.token_hex(8)}.tmp"
+        os.close(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
+    try:
+        with _as_wlm_error(path):
+            yield temporary
+            # Without it a crash of the machine after the rename could leave an empty file.
+            handle = os.open(temporary, os.O_RDWR)
+            try:
+                os.fsync(handle)
+            finally:
+                os.close(handle)
+            os.replace(temporary, target)
+    except BaseException:
+        with suppress(OSError):
+            os.unlink(temporary)
+        raise
+
+
+def atomic_write(path: str | os.PathLike[str], data: bytes | Iterable[bytes]) -> int:
+    """Writes a file whole or not at all.
+
+    Args:
+        path: The file to write; its folder must exist.
+        data: The content, or its pieces in order; any object with the buffer protocol counts as bytes.
+
+    Returns:
+        The number of bytes written.
+
+    Raises:
+        WlmError: As `atomic_path` raises it.
+    """
+    chunks = [data] if isinstance(data, bytes | bytearray | memoryview) else data
+    total = 0
+    with atomic_path(path) as temporary:
+        handle = os.open(temporary, os.O_WRONLY)
+        try:
+            for chunk in chunks:
+                view = memoryview(chunk)
+                if view.nbytes == 0:
+                    continue
+                view = view.cast("B")
+                # The system may take less than it was given, as it does when a disk fills up.
+                while view:
+                    written = os.write(handle, view)
+                    view = view[written:]
+                    total += written
+        finally:
+            os.close(handle)
+    return total
+
+
+@contextmanager
+def _as_wlm_error(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Turns an `OSError` into a line that names the file that was to be written."""
+    try:
+        yield
+    except OSError as error:
+        raise WlmError(f"{path}: cannot write: {error.strerror or error}") from error

@@ -1,0 +1,146 @@
+"""BC7 blocks of mode 6, exactly: one line in RGBA a block, 7-bit endpoints and a P bit for each, 16 levels.
+
+Bits from the lowest: 0-6 the mode (only bit 6 set); the endpoints' upper 7 bits R0 R1 G0 G1 B0 B1 A0 A1 from
+bit 7 on; P0 at 63, P1 at 64; the indices from 65, 3 bits for texel 0 and 4 for the others, row-major. An
+endpoint's byte is its 7 bits and then its P. A block is two 64-bit words here: P1 is bit 0 of the second.
+"""
+
+import numpy as np
+
+from wlm.errors import WlmError
+
+__all__ = ["BLOCK_BYTES", "WEIGHTS", "decode_image", "decode_mode6", "pack_mode6", "unpack_mode6"]
+
+BLOCK_BYTES = 16
+"""Bytes of a block of 4 x 4 texels."""
+
+WEIGHTS = np.array([0, 4, 9, 13, 17, 21, 26, 30, 34, 38, 43, 47, 51, 55, 60, 64], np.uint8)
+"""The share of endpoint 1 at each index, in 64ths."""
+WEIGHTS.flags.writeable = False
+
+_MODE_BITS = 7
+_MODE_6 = 1 << 6
+# Bit 7 + 14 c + 7 e of the first word: channel c of endpoint e.
+_ENDPOINT_SHIFTS = (7 + 14 * np.arange(4)[None, :] + 7 * np.arange(2)[:, None]).astype(np.uint64)
+# Texel 0 has its missing top bit below it: it begins at 1, the others at 4 i.
+_INDEX_SHIFTS = np.maximum(4 * np.arange(16), 1).astype(np.uint64)
+
+
+def pack_mode6(endpoints: np.ndarray, indices: np.ndarray) -> np.ndarray:
+    """Packs endpoints and indices into blocks.
+
+    Texel 0's index must be below 8 in the file: where it isn't, the endpoints change places and the indices
+    become 15 - index, which decodes to the same texels.
+
+    Args:
+        endpoints: uint8 [..., 2, 4], RGBA; the four bytes of an endpoint share their lowest bit.
+        indices: uint8 [..., 16] in 0..15, row-major.
+
+    Returns:
+        The blocks, uint8 [..., 16].
+
+    Raises:
+        ValueError: Wrong shapes or types, an index above 15, or an endpoint without a shared lowest bit.
+    """
+    if endpoints.dtype != np.uint8 or indices.dtype != np.uint8:
+        raise ValueError(f"expected uint8 endpoints and indices, got {endpoints.dtype} and {indices.dtype}")
+    if endpoints.shape[-2:] != (2, 4) or indices.shape != (*endpoints.shape[:-2], 16):
+        raise ValueError(
+            f"expected endpoints [..., 2, 4] and indices [..., 16], got {endpoints.shape}, {indices.shape}"
+        )
+    if indices.size and indices.max() > 15:
+        raise ValueError(f"expected indices in 0..15, got {indices.max()}")
+    parity = endpoints & 1
+    if np.any(parity != parity[..., :1]):
+        raise ValueError("expected the four bytes of every endpoint to share their lowest bit")
+    swapped = indices[..., :1] >= 8
+    endpoints = np.where(swapped[..., None], endpoints[..., ::-1, :], endpoints)
+    indices = np.where(swapped, 15 - indices, indices)
+    low, high = _words(endpoints, indices)
+    words = np.stack([low, high], axis=-1).astype("<u8")
+    return words.view(np.uint8)
+
+
+def unpack_mode6(blocks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Reads the endpoints and indices of blocks; `pack_mode6` gives the same blocks back.
+
+    Args:
+        blocks: uint8 [..., 16].
+
+    Returns:
+        The endpoints, uint8 [..., 2, 4], and the indices, uint8 [..., 16].
+
+    Raises:
+        ValueError: Wrong shape or type.
+        WlmError: A block is of another mode.
+    """
+    if blocks.dtype != np.uint8 or blocks.shape[-1:] != (BLOCK_BYTES,):
+        raise ValueError(f"expected blocks uint8 [..., 16], got {blocks.dtype} {blocks.shape}")
+    words = np.ascontiguousarray(blocks).view("<u8").astype(np.uint64)
+    low, high = words[..., 0], words[..., 1]
+    other = (low & np.uint64((1 << _MODE_BITS) - 1)) != _MODE_6
+    if np.any(other):
+        place = int(np.flatnonzero(other)[0])
+        raise WlmError(f"BC7 block {place}: expected mode 6, found {_mode_name(int(low.flat[place]))}")
+    parity = np.stack([low >> np.uint64(63), high & np.uint64(1)], axis=-1)
+    upper = (low[..., None, None] >> _ENDPOINT_SHIFTS) & np.uint64(0x7F)
+    endpoints = (upper << np.uint64(1)) | parity[..., None]
+    indices = (high[..., None] >> _INDEX_SHIFTS) & np.uint64(0xF)
+    indices[..., 0] &= np.uint64(0x7)
+    return endpoints.astype(np.uint8), indices.astype(np.uint8)
+
+
+def decode_mode6(blocks: np.ndarray) -> np.ndarray:
+    """Decodes blocks to texels, bit for bit as the format says.
+
+    Args:
+        blocks: uint8 [..., 16].
+
+    Returns:
+        The texels, uint8 [..., 16, 4], row-major, RGBA.
+
+    Raises:
+        ValueError: Wrong shape or type.
+        WlmError: A block is of another mode.
+    """
+    endpoints, indices = unpack_mode6(blocks)
+    # 16 bits hold the sum: at most 64 * 255 + 32.
+    share = WEIGHTS[indices].astype(np.uint16)[..., None]
+    ends = endpoints.astype(np.uint16)
+    mixed = (64 - share) * ends[..., None, 0, :] + share * ends[..., None, 1, :]
+    return ((mixed + 32) >> 6).astype(np.uint8)
+
+
+def decode_image(blocks: np.ndarray) -> np.ndarray:
+    """Decodes the blocks of a picture.
+
+    Args:
+        blocks: uint8 [H/4, W/4, 16].
+
+    Returns:
+        The picture, uint8 [H, W, 4], RGBA.
+
+    Raises:
+        ValueError: Wrong shape or type.
+        WlmError: A block is of another mode.
+    """
+    if blocks.ndim != 3:
+        raise ValueError(f"expected blocks [H/4, W/4, 16], got {blocks.shape}")
+    rows, columns = blocks.shape[:2]
+    texels = decode_mode6(blocks).reshape(rows, columns, 4, 4, 4)
+    return texels.transpose(0, 2, 1, 3, 4).reshape(4 * rows, 4 * columns, 4)
+
+
+def _words(endpoints: np.ndarray, indices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Gives the two 64-bit words of blocks whose anchor index is below 8."""
+    wide = endpoints.astype(np.uint64)
+    low = np.bitwise_or.reduce((wide >> np.uint64(1)) << _ENDPOINT_SHIFTS, axis=(-2, -1))
+    low |= np.uint64(_MODE_6) | ((wide[..., 0, 0] & np.uint64(1)) << np.uint64(63))
+    high = np.bitwise_or.reduce(indices.astype(np.uint64) << _INDEX_SHIFTS, axis=-1)
+    return low, high | (wide[..., 1, 0] & np.uint64(1))
+
+
+def _mode_name(low: int) -> str:
+    """Names the mode of a block by its first set bit; a first byte of zero is reserved."""
+    byte = low & 0xFF
+    return f"mode {(byte & -byte).bit_length() - 1}" if byte else "a reserved mode"

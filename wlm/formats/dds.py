@@ -1,0 +1,169 @@
+"""DDS files of block-compressed textures, with the DX10 header: a 2D texture or a volume, one mip level.
+
+A volume's slices follow each other, each a 2D grid of blocks.
+"""
+
+import os
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+
+from wlm.errors import WlmError
+from wlm.formats.atomic import atomic_write
+
+__all__ = ["DXGI_FORMATS", "DdsTexture", "read_dds", "write_dds"]
+
+DXGI_FORMATS = {"BC6H_UF16": 95, "BC6H_SF16": 96, "BC7_UNORM": 98, "BC7_UNORM_SRGB": 99}
+"""The formats that can be written, all with 16 bytes a block of 4 x 4 texels, and their DXGI numbers."""
+
+_BLOCK_BYTES = 16
+_MAX_SIDE = 16384  # texels; the limit of a 2D texture in Direct3D 11 and 12
+_MAX_DEPTH = 2048
+
+_MAGIC = b"DDS "
+# Size, flags, height, width, linear size, depth, mip levels, 11 reserved; pixel format: size, flags, code,
+# bits, 4 masks; caps 1 to 4, reserved. Then DX10: format, dimension, flags, array size, alpha mode.
+_HEADER = struct.Struct("<4s 7I 44x 2I 4s 5I 4I 4x 5I")
+_HEADER_SIZE = 124
+_PIXEL_FORMAT_SIZE = 32
+
+_CAPS, _HEIGHT, _WIDTH, _PIXEL_FORMAT, _LINEAR_SIZE, _DEPTH = 0x1, 0x2, 0x4, 0x1000, 0x80000, 0x800000
+_REQUIRED = _CAPS | _HEIGHT | _WIDTH | _PIXEL_FORMAT
+_FOUR_CC = 0x4
+_CAPS_COMPLEX, _CAPS_TEXTURE = 0x8, 0x1000
+_CAPS2_VOLUME = 0x200000
+_DIMENSION_2D, _DIMENSION_3D = 3, 4
+_ALPHA_MODES = range(5)
+
+
+@dataclass(frozen=True)
+class DdsTexture:
+    """What a DDS file holds.
+
+    Attributes:
+        width: Texels.
+        height: Texels.
+        depth: Slices; 1 for a 2D texture.
+        fmt: A key of `DXGI_FORMATS`.
+        volume: Whether it is a volume, which may have just one slice.
+        blocks: The payload: slice by slice, rows of blocks.
+    """
+
+    width: int
+    height: int
+    depth: int
+    fmt: str
+    volume: bool
+    blocks: bytes
+
+
+def write_dds(
+    path: str | os.PathLike[str],
+    blocks: bytes,
+    width: int,
+    height: int,
+    depth: int = 1,
+    fmt: str = "BC7_UNORM",
+) -> None:
+    """Writes blocks as a DDS file, whole or not at all: a volume if `depth` is above 1, else a 2D texture.
+
+    Args:
+        path: The file to write; its folder must exist.
+        blocks: 16 bytes a block, ceil(width / 4) * ceil(height / 4) blocks a slice, slices one after another.
+        width: Texels, 1 to 16384.
+        height: Texels, 1 to 16384.
+        depth: Slices, 1 to 2048.
+        fmt: A key of `DXGI_FORMATS`.
+
+    Raises:
+        ValueError: An unknown format, a size out of range, or blocks that don't fill the texture.
+        WlmError: The file can't be written; what was there before stays.
+    """
+    if fmt not in DXGI_FORMATS:
+        raise ValueError(f"fmt: expected one of {', '.join(DXGI_FORMATS)}, got {fmt}")
+    if not (1 <= width <= _MAX_SIDE and 1 <= height <= _MAX_SIDE and 1 <= depth <= _MAX_DEPTH):
+        raise ValueError(f"expected sides of 1 to {_MAX_SIDE} and a depth of 1 to {_MAX_DEPTH} texels")
+    slice_bytes = _slice_bytes(width, height)
+    if len(blocks) != depth * slice_bytes:
+        raise ValueError(f"blocks: expected {depth * slice_bytes} bytes, got {len(blocks)}")
+    volume = depth > 1
+    header = _HEADER.pack(
+        _MAGIC,
+        _HEADER_SIZE,
+        _REQUIRED | _LINEAR_SIZE | (_DEPTH if volume else 0),
+        height,
+        width,
+        slice_bytes,
+        depth if volume else 0,
+        1,
+        _PIXEL_FORMAT_SIZE,
+        _FOUR_CC,
+        b"DX10",
+        *(0, 0, 0, 0, 0),
+        _CAPS_TEXTURE | (_CAPS_COMPLEX if volume else 0),
+        _CAPS2_VOLUME if volume else 0,
+        *(0, 0),
+        DXGI_FORMATS[fmt],
+        _DIMENSION_3D if volume else _DIMENSION_2D,
+        *(0, 1, 0),
+    )
+    atomic_write(path, [header, blocks])
+
+
+def read_dds(path: str | os.PathLike[str]) -> DdsTexture:
+    """Reads a DDS file of the kind that `write_dds` writes.
+
+    Args:
+        path: The file.
+
+    Returns:
+        The texture.
+
+    Raises:
+        WlmError: The file is missing, not a DDS with a DX10 header, of another format, with mip levels, an
+            array or a cube, or not of the length that its header says.
+    """
+    try:
+        data = Path(path).read_bytes()
+    except OSError as error:
+        raise WlmError(f"{path}: cannot read the DDS file: {error.strerror or error}") from error
+    if data[:4] != _MAGIC:
+        raise WlmError(f"{path}: expected a DDS file, found other content")
+    if len(data) < _HEADER.size:
+        raise WlmError(f"{path}: expected a DX10 header of {_HEADER.size} bytes, found {len(data)}")
+    fields = _HEADER.unpack_from(data)
+    size, flags, height, width, _, depth, mips, pixel_size, pixel_flags, code = fields[1:11]
+    caps2 = fields[17]
+    number, dimension, misc, array_size, alpha_mode = fields[20:]
+    volume = dimension == _DIMENSION_3D
+    names = {value: name for name, value in DXGI_FORMATS.items()}
+    checks = (
+        ("header size", size, size == _HEADER_SIZE, _HEADER_SIZE),
+        ("flags", hex(flags), flags & _REQUIRED == _REQUIRED, f"at least {_REQUIRED:#x}"),
+        ("pixel format size", pixel_size, pixel_size == _PIXEL_FORMAT_SIZE, _PIXEL_FORMAT_SIZE),
+        ("pixel format", code, bool(pixel_flags & _FOUR_CC) and code == b"DX10", "DX10"),
+        ("DXGI format", number, number in names, f"one of {sorted(names)}"),
+        ("dimension", dimension, dimension in (_DIMENSION_2D, _DIMENSION_3D), "3 (2D) or 4 (volume)"),
+        ("volume flag", hex(caps2), bool(caps2 & _CAPS2_VOLUME) == volume, "that of the dimension"),
+        ("width", width, 1 <= width <= _MAX_SIDE, f"1 to {_MAX_SIDE}"),
+        ("height", height, 1 <= height <= _MAX_SIDE, f"1 to {_MAX_SIDE}"),
+        ("depth", depth, 1 <= depth <= _MAX_DEPTH if volume else depth <= 1, "that of the dimension"),
+        ("mip levels", mips, mips <= 1, "one"),
+        ("DX10 flags", hex(misc), misc == 0, "none (no cube)"),
+        ("array size", array_size, array_size == 1, 1),
+        ("alpha mode", alpha_mode, alpha_mode in _ALPHA_MODES, "0 to 4"),
+    )
+    for field, found, fits, expected in checks:
+        if not fits:
+            raise WlmError(f"{path}: {field}: expected {expected}, found {found}")
+    slices = depth if volume else 1
+    blocks = data[_HEADER.size :]
+    if len(blocks) != slices * _slice_bytes(width, height):
+        raise WlmError(
+            f"{path}: expected {slices * _slice_bytes(width, height)} bytes of blocks, found {len(blocks)}"
+        )
+    return DdsTexture(width, height, slices, names[number], volume, blocks)
+
+
+def _slice_bytes(width: int, height: int) -> int:
+    return -(-width // 4) * -(-height // 4) * _BLOCK_BYTES

@@ -1,0 +1,367 @@
+"""What comes in: a set of lightmaps over time, read from EXR files or arrays and checked.
+
+The stated behaviours. "Inside" is inside the mask; counts are of texels, in any channel, and are given in
+`LightmapSet.warnings`, one line a file and kind.
+
+====================================  ================================================================
+input                                 behaviour
+====================================  ================================================================
+NaN, Inf inside                       the texel takes the value of the nearest finite texel inside the
+                                      mask at that time; warning
+a frame with no finite texel inside   error
+negative inside                       the channel is clamped to 0; warning
+above 65,504 inside (half's maximum)  the channel is clamped to 65,504; warning
+any of these outside                  0, 0 and 65,504, without a warning: nobody sees those texels
+all zero                              fine
+an empty mask                         error
+one time                              fine
+times out of order                    sorted, with their frames; warning
+two equal times                       error that names both files
+a time outside [0, period)            error: 24 h is 0 h, and wrapping would hide a slip in the list
+a NaN or infinite time                error
+frames, mask or `set.json` that       error that names both files
+disagree in size
+a file missing or damaged, a          error that names the file, and the field
+malformed `set.json`
+====================================  ================================================================
+
+Layout of a set and its evaluation: neural-dynamic-gi, section 10.1.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from wlm.errors import WlmError
+from wlm.formats.exr import HALF_MAX, read_exr
+from wlm.imageops import fill_gaps
+from wlm.lightmap.listing import SET_FILE, Listing, list_folder, parse_set
+
+__all__ = ["LightmapSet", "from_arrays", "load_set", "parse_times"]
+
+_READERS = 2  # decompression releases the GIL; more threads than this only fight over the disk
+_MAX_TIMES = 100_000  # far above any real set; "0:24:1e-9" must not fill the memory
+
+
+@dataclass(frozen=True, eq=False)
+class LightmapSet:
+    """Lightmaps of one texture atlas at several times, checked and repaired as the module's table says.
+
+    Attributes:
+        name: The set's name.
+        times: `[T]` float64, strictly increasing, in hours or any other unit.
+        frames: `[T, H, W, 3]` float32, linear RGB irradiance, finite, in [0, 65504]. Row 0 is v = 0.
+        mask: `[H, W]` bool, true where a texel belongs to a chart; at least one is.
+        period: Length of the day in the unit of `times`, all of which are then in [0, period); None where the
+            set is not periodic and times outside its ends are clamped.
+        source: 16 hexadecimal digits of BLAKE2b over the checked pixels, the times and the mask.
+        warnings: What was repaired, one line each.
+    """
+
+    name: str
+    times: np.ndarray
+    frames: np.ndarray
+    mask: np.ndarray
+    period: float | None
+    source: str
+    warnings: tuple[str, ...]
+
+
+def load_set(
+    path: str | os.PathLike[str],
+    *,
+    times: Sequence[float] | None = None,
+    mask: str | os.PathLike[str] | None = None,
+    period: float | None = None,
+) -> LightmapSet:
+    """Read a lightmap set: a `set.json`, a folder that holds one, or a plain folder of EXR files.
+
+    `set.json` is an object with `width`, `height` and `lightmaps` (a list of `{"time_hours", "file"}`), and
+    may have `name`, `period_hours` and `mask` (a PNG's name, or "alpha"; absent means that all texels are
+    valid). Other keys are ignored. Names of files are relative to it.
+
+    The files of a plain folder are taken in natural order of their names ("2" before "10"). Without `times`,
+    the hours are read from the names if every one ends like `_18_55h`, `_18.55h`, `_18h` or `_18.55`, the
+    digits after the second separator being decimals, not minutes. A `mask.png` among them is the mask unless
+    `mask` says otherwise.
+
+    Args:
+        path: The `set.json` or the folder.
+        times: One time for each lightmap in the order of the list or the names; replaces those of `set.json`.
+        mask: A PNG (a texel is valid where any colour channel is above 0), "alpha" (valid where the alpha
+            channel of every frame is above 0) or "all"; None takes what the set says.
+        period: Length of the day in the unit of the times; None takes the set's `period_hours`, if any.
+
+    Returns:
+        The set, repaired as the module's table says.
+
+    Raises:
+        WlmError: One line that names the file and the field, for each error of the module's table.
+    """
+    path = Path(path)
+    if path.is_dir() and (path / SET_FILE).is_file():
+        path = path / SET_FILE
+    if path.is_dir():
+        listing = list_folder(path, times)
+    elif path.is_file():
+        listing = parse_set(path, times)
+    else:
+        raise WlmError(f"{path}: no such file or folder; expected a {SET_FILE} or a folder of EXR files")
+
+    which = str(mask) if mask is not None else listing.mask
+    need_alpha = which == "alpha"
+    frames, alpha = _read_frames(listing, need_alpha)
+    height, width = frames.shape[1:3]
+    if need_alpha:
+        valid = alpha
+    elif which == "all":
+        valid = np.ones((height, width), bool)
+    else:
+        valid = _read_mask(Path(which), listing.files[0], (height, width))
+    return _check(
+        listing.name,
+        [file.name for file in listing.files],
+        np.asarray(listing.times, np.float64),
+        frames,
+        valid,
+        listing.period if period is None else period,
+        where=str(path),
+        mask_from="the alpha channels" if need_alpha else which,
+        warn_order=listing.warn_order,
+    )
+
+
+def from_arrays(
+    frames: np.ndarray,
+    times: Sequence[float] | np.ndarray,
+    mask: np.ndarray | None = None,
+    period: float | None = None,
+    name: str = "array",
+) -> LightmapSet:
+    """Make a checked set of arrays, under the same rules as `load_set`.
+
+    Args:
+        frames: `[T, H, W, 3]` of numbers, linear RGB irradiance; copied.
+        times: `[T]`, in any order.
+        mask: `[H, W]`, true where a texel is valid; None for all.
+        period: Length of the day in the unit of the times; None for a set that is not periodic.
+        name: The set's name, used in messages too.
+
+    Returns:
+        The set, repaired as the module's table says; a frame is called "frame 3 (time 5)" in its warnings.
+
+    Raises:
+        WlmError: A shape is wrong, or an error of the module's table.
+    """
+    frames = np.asarray(frames)
+    stamps = np.asarray(times, np.float64)
+    if frames.ndim != 4 or frames.shape[3] != 3 or 0 in frames.shape:
+        raise WlmError(f"{name}: expected frames [T, H, W, 3], none of them 0, got {frames.shape}")
+    if stamps.shape != frames.shape[:1]:
+        raise WlmError(f"{name}: expected {len(frames)} times, one a frame, got shape {stamps.shape}")
+    valid = np.ones(frames.shape[1:3], bool) if mask is None else np.asarray(mask).astype(bool)
+    if valid.shape != frames.shape[1:3]:
+        raise WlmError(f"{name}: expected a mask of {frames.shape[1:3]}, got {valid.shape}")
+    labels = [f"frame {i} (time {time:g})" for i, time in enumerate(stamps)]
+    with np.errstate(over="ignore"):  # float64 beyond float32 becomes Inf and is repaired as Inf
+        copied = np.array(frames, dtype=np.float32, order="C")
+    return _check(name, labels, stamps, copied, valid.copy(), period, where=name, mask_from="the mask")
+
+
+def parse_times(text: str) -> list[float]:
+    """Read a list of times: numbers and `start:stop:step` ranges, separated by commas.
+
+    A range leaves `stop` out, as Python's do: "0:24:1" is 0, 1, ... 23, one day without its first hour twice.
+
+    Args:
+        text: Such as "0,1,2.5", "0:24:1" or "0:18:1,18.45,18.55,19:24:1".
+
+    Returns:
+        The times in the order written, at least one.
+
+    Raises:
+        WlmError: A part that is no number or range, a step that never reaches the stop, or more than 100,000
+            times.
+    """
+    times: list[float] = []
+    for part in text.split(","):
+        try:
+            numbers = [float(piece) for piece in part.split(":")]
+        except ValueError:
+            numbers = []
+        if len(numbers) not in (1, 3) or not all(map(math.isfinite, numbers)):
+            raise WlmError(f"times: expected a number or start:stop:step, got {part.strip()!r} in {text!r}")
+        if len(numbers) == 1:
+            times.append(numbers[0])
+            continue
+        start, stop, step = numbers
+        # The small slack keeps 0.1:0.4:0.1 at three times, although (0.4 - 0.1) / 0.1 is a little above 3.
+        steps = (stop - start) / step - 1e-9 if step else 0.0
+        if not 0.0 < steps < math.inf:
+            raise WlmError(f"times: the range {part.strip()!r} holds no time before its stop")
+        if len(times) + steps > _MAX_TIMES:
+            raise WlmError(f"times: the range {part.strip()!r} holds more than {_MAX_TIMES:,} times")
+        times.extend(start + i * step for i in range(math.ceil(steps)))
+    return times
+
+
+def _read_frames(listing: Listing, need_alpha: bool) -> tuple[np.ndarray, np.ndarray | None]:
+    """Reads all files into one array [T, H, W, 3]; if asked for, also where every alpha is above 0 [H, W]."""
+    first, covered = _read_rgb(listing.files[0], need_alpha)
+    size = first.shape[:2]
+    if listing.size is not None and size != listing.size:
+        raise WlmError(
+            f"{listing.files[0]}: is {_size(size)}, but {listing.stated_by} states {_size(listing.size)}"
+        )
+    # One array from the start: a list of frames stacked at the end would need twice the memory.
+    frames = np.empty((len(listing.files), *first.shape), np.float32)
+    frames[0] = first
+
+    def read(index: int) -> np.ndarray | None:
+        rgb, alpha = _read_rgb(listing.files[index], need_alpha)
+        if rgb.shape[:2] != size:
+            raise WlmError(
+                f"{listing.files[index]}: is {_size(rgb.shape)}, but {listing.files[0]} is {_size(size)}; "
+                "expected one size"
+            )
+        frames[index] = rgb
+        return alpha
+
+    pool = ThreadPoolExecutor(_READERS)
+    try:
+        # In order, so that of several bad files the first is the one named.
+        for alpha in pool.map(read, range(1, len(listing.files))):
+            if covered is not None:
+                covered &= alpha
+    finally:
+        pool.shutdown(cancel_futures=True)
+    return frames, covered
+
+
+def _read_rgb(path: Path, need_alpha: bool) -> tuple[np.ndarray, np.ndarray | None]:
+    """Reads one file: colour [H, W, 3] and, if asked for, where its alpha is above 0 [H, W]."""
+    pixels, names = read_exr(path)
+    if need_alpha and "A" not in names:
+        raise WlmError(
+            f"{path}: expected a channel A, which the mask is to come from, found {', '.join(names)}"
+        )
+    return pixels[..., :3], pixels[..., 3] > 0 if need_alpha else None
+
+
+def _size(shape: Sequence[int]) -> str:
+    """Writes [H, W, ...] as people do: width first."""
+    return f"{shape[1]}x{shape[0]}"
+
+
+def _read_mask(path: Path, beside: Path, size: tuple[int, int]) -> np.ndarray:
+    """Reads a PNG as [H, W] bool: valid where any colour channel is above 0."""
+    if not path.is_file():
+        raise WlmError(f'{path}: no such mask; expected a PNG of {_size(size)}, "alpha" or "all"')
+    try:
+        with Image.open(path) as image:
+            # The header's size first: a wrong one need not be decoded.
+            if (image.height, image.width) != size:
+                raise WlmError(
+                    f"{path}: the mask is {_size((image.height, image.width))}, but {beside} is {_size(size)}"
+                )
+            # A palette's index says nothing; an alpha channel is not coverage here.
+            colour = np.asarray(image.convert("RGB") if image.mode in ("P", "PA", "RGBA", "LA") else image)
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise WlmError(f"{path}: cannot read the mask: {error}") from error
+    return colour > 0 if colour.ndim == 2 else (colour > 0).any(axis=2)
+
+
+def _check(
+    name: str,
+    labels: Sequence[str],
+    times: np.ndarray,  # [T]
+    frames: np.ndarray,  # [T, H, W, 3], repaired in place
+    mask: np.ndarray,  # [H, W]
+    period: float | None,
+    *,
+    where: str,
+    mask_from: str,
+    warn_order: bool = True,
+) -> LightmapSet:
+    """Applies the module's table to what was read."""
+    if not mask.any():
+        raise WlmError(f"{where}: the mask is empty: no texel is valid ({mask_from})")
+    if period is not None and not (math.isfinite(period) and period > 0):
+        raise WlmError(f"{where}: expected a finite period above 0, got {period:g}")
+    warnings = []
+    for label, time in zip(labels, times, strict=True):
+        if not math.isfinite(time):
+            raise WlmError(f"{where}: the time of {label} is {time:g}; expected a finite number")
+        if period is not None and not 0 <= time < period:
+            raise WlmError(
+                f"{where}: the time of {label} is {time:g}; expected 0 to below {period:g}, the period"
+            )
+    order = np.argsort(times, kind="stable")
+    if (np.diff(order) < 0).any():
+        if warn_order:
+            warnings.append(f"{where}: the times were not in order: sorted, with their frames")
+        times, frames, labels = times[order], frames[order], [labels[i] for i in order]
+    for i in range(len(times) - 1):
+        if times[i] == times[i + 1]:
+            raise WlmError(f"{where}: {labels[i]} and {labels[i + 1]} have the same time, {times[i]:g}")
+    for label, frame in zip(labels, frames, strict=True):
+        warnings += [f"{label}: {text}" for text in _repair(frame, mask, f"{where}: {label}")]
+    return LightmapSet(
+        name=name,
+        times=times,
+        frames=frames,
+        mask=mask,
+        period=None if period is None else float(period),
+        source=_hash(frames, times, mask),
+        warnings=tuple(warnings),
+    )
+
+
+def _repair(frame: np.ndarray, mask: np.ndarray, where: str) -> list[str]:
+    """Makes one frame [H, W, 3] finite and in [0, HALF_MAX], in place; returns what changed inside."""
+    notes = []
+    finite = np.isfinite(frame).all(axis=2)
+    all_finite = bool(finite.all())
+    good = mask if all_finite else mask & finite
+    if not good.any():
+        raise WlmError(f"{where}: no texel inside the mask is finite")
+    if not all_finite:
+        broken = np.count_nonzero(mask & ~finite)
+        if broken:
+            notes.append(f"{_texels(broken)} NaN or infinite: replaced by the nearest finite one in the mask")
+            frame[mask & ~finite] = fill_gaps(frame, good)[mask & ~finite]
+        frame[~mask & ~finite] = 0.0
+    if frame.min() < 0:
+        negative = np.count_nonzero((frame < 0).any(axis=2) & good)
+        if negative:
+            notes.append(f"{_texels(negative)} negative: clamped to 0")
+    if frame.max() > HALF_MAX:
+        bright = np.count_nonzero((frame > HALF_MAX).any(axis=2) & good)
+        if bright:
+            notes.append(f"{_texels(bright)} above {HALF_MAX:,.0f}: clamped to it")
+    np.clip(frame, 0.0, HALF_MAX, out=frame)
+    return notes
+
+
+def _texels(count: int) -> str:
+    return f"{count} {'texel' if count == 1 else 'texels'}"
+
+
+def _hash(frames: np.ndarray, times: np.ndarray, mask: np.ndarray) -> str:
+    """Names the input by 16 hexadecimal digits, the same on every machine."""
+    digest = hashlib.blake2b(digest_size=8)
+    digest.update(np.asarray(frames.shape, "<i8").tobytes())
+    digest.update(np.asarray(times, "<f8").tobytes())
+    digest.update(np.packbits(mask).tobytes())
+    for frame in frames:
+        digest.update(np.ascontiguousarray(frame, "<f4"))
+    return digest.hexdigest()

@@ -1,0 +1,202 @@
+"""Where the frames of a lightmap set lie and when they belong: a `set.json`, or the names in a folder.
+
+No pixel is read here. The layout follows the scene configuration of neural-dynamic-gi, section 10.1.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from wlm.errors import WlmError
+
+__all__ = ["SET_FILE", "Listing", "list_folder", "parse_set"]
+
+SET_FILE = "set.json"
+
+# The hour at the end of a file's name: `_18_55h` and `_18.55h` are 18.55, `_18h` is 18. A bare `_18` may just
+# as well be a frame's number and is not taken for an hour.
+_NAME_TIME = re.compile(r"_([0-9]+)(?:[_.]([0-9]+))?h$|_([0-9]+\.[0-9]+)$", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class Listing:
+    """What is to be read, and what the set says of itself.
+
+    Attributes:
+        name: The set's name.
+        files: The EXR files, as ordered by the list or by name.
+        times: One for each file, not yet checked.
+        mask: "all", "alpha" or the path of a PNG.
+        period: Length of the day in the unit of the times, or None.
+        size: Height and width in texels where the set states them, else None.
+        stated_by: The file that states the size, or the folder.
+        warn_order: Whether times out of order are somebody's slip, and worth a warning.
+    """
+
+    name: str
+    files: list[Path]
+    times: Sequence[float]
+    mask: str
+    period: float | None
+    size: tuple[int, int] | None
+    stated_by: Path
+    warn_order: bool
+
+
+def list_folder(folder: Path, times: Sequence[float] | None) -> Listing:
+    """Lists a folder of EXR files without a `set.json`, as `load_set` states.
+
+    Args:
+        folder: The folder.
+        times: One for each file in natural order of the names; None reads them from the names.
+
+    Returns:
+        The listing; "mask.png" of the folder is its mask, else all texels are valid.
+
+    Raises:
+        WlmError: There is no EXR file, their number is not that of the times, a name tells no hour, or the
+            folder cannot be read.
+    """
+    try:
+        files = [f for f in folder.iterdir() if f.suffix.lower() == ".exr" and f.is_file()]
+    except OSError as error:
+        raise WlmError(f"{folder}: cannot read: {error.strerror or error}") from error
+    # A hidden name is another program's: macOS writes one beside every file on a foreign disk.
+    files = sorted((f for f in files if f.name[0] != "."), key=lambda f: (_natural(f.name), f.name))
+    if not files:
+        raise WlmError(f"{folder}: expected a {SET_FILE} or EXR files, found neither")
+    given = times
+    if times is None:
+        found = [_time_of_name(f.stem) for f in files]
+        if None in found:
+            raise WlmError(
+                f"{folder}: {_count(files, 'EXR file')} and no {SET_FILE}: give {_count(files, 'time')} with "
+                f"--times ({files[found.index(None)].name} does not end in an hour such as _18_55h)"
+            )
+        times = found
+    _check_count(folder, files, times)
+    own_mask = folder / "mask.png"
+    mask = str(own_mask) if own_mask.is_file() else "all"
+    # Names need not sort by their hours ("_5.5h" before "_5.45h"): only an order that somebody gave is worth
+    # a warning.
+    return Listing(folder.resolve().name, files, times, mask, None, None, folder, given is not None)
+
+
+def _natural(name: str) -> list[str | int]:
+    """Splits digits from text, so that names compare as people count."""
+    return [int(part) if i % 2 else part.lower() for i, part in enumerate(re.split(r"([0-9]+)", name))]
+
+
+def _time_of_name(stem: str) -> float | None:
+    """Returns the hour that a file's name ends in, or None."""
+    found = _NAME_TIME.search(stem)
+    if not found:
+        return None
+    whole, decimals, bare = found.groups()
+    return float(bare or f"{whole}.{decimals or 0}")
+
+
+def _count(items: Sequence[object], noun: str) -> str:
+    return f"{len(items)} {noun}{'' if len(items) == 1 else 's'}"
+
+
+def _check_count(where: Path, files: Sequence[Path], times: Sequence[float]) -> None:
+    if len(times) != len(files):
+        raise WlmError(f"{where}: {_count(times, 'time')} for {_count(files, 'lightmap')}; expected one each")
+
+
+def parse_set(path: Path, times: Sequence[float] | None) -> Listing:
+    """Reads and checks a `set.json`, as `load_set` states.
+
+    Args:
+        path: The file.
+        times: One for each lightmap, in place of those of the file; None takes those of the file.
+
+    Returns:
+        The listing, with paths relative to the file resolved.
+
+    Raises:
+        WlmError: The file cannot be read, is not JSON, or a field is missing or of a wrong kind; the message
+            names the file and the field.
+    """
+    try:
+        content = json.loads(path.read_bytes())
+    except OSError as error:
+        raise WlmError(f"{path}: cannot read: {error.strerror or error}") from error
+    except (ValueError, RecursionError) as error:
+        raise WlmError(f"{path}: not valid JSON: {error}") from error
+    if not isinstance(content, dict):
+        raise WlmError(f"{path}: expected a JSON object, got {_kind(content)}")
+
+    def field(holder: dict, key: str, place: str, ok: Callable[[object], bool], expected: str) -> object:
+        if key not in holder:
+            raise WlmError(f"{path}: {place}{key} is missing; expected {expected}")
+        if not ok(holder[key]):
+            raise WlmError(f"{path}: {place}{key}: expected {expected}, got {_kind(holder[key])}")
+        return holder[key]
+
+    width = field(content, "width", "", _is_size, "a whole number of texels above 0")
+    height = field(content, "height", "", _is_size, "a whole number of texels above 0")
+    entries = field(content, "lightmaps", "", _is_list, "a list of lightmaps")
+    name = path.resolve().parent.name
+    if content.get("name") is not None:
+        name = field(content, "name", "", _is_text, "a name")
+    period = None
+    if content.get("period_hours") is not None:
+        period = float(field(content, "period_hours", "", _is_positive, "a number above 0"))
+    mask = "all"
+    if content.get("mask") is not None:
+        mask = field(content, "mask", "", _is_text, 'the name of a PNG, "alpha" or "all"')
+        if mask not in ("all", "alpha"):
+            mask = str(path.parent / mask)
+
+    files, stamps = [], []
+    for i, entry in enumerate(entries):
+        place = f"lightmaps[{i}]"
+        if not isinstance(entry, dict):
+            raise WlmError(f"{path}: {place}: expected an object (time_hours, file), got {_kind(entry)}")
+        files.append(path.parent / field(entry, "file", f"{place}.", _is_text, "the name of an EXR file"))
+        if times is None:
+            stamps.append(float(field(entry, "time_hours", f"{place}.", _is_number, "a finite number")))
+    if times is not None:
+        _check_count(path, files, times)
+        stamps = times
+    return Listing(name, files, stamps, mask, period, (height, width), path, True)
+
+
+def _is_text(value: object) -> bool:
+    # A NUL makes open() raise ValueError, not OSError.
+    return isinstance(value, str) and bool(value.strip()) and "\0" not in value
+
+
+def _is_number(value: object) -> bool:
+    # True is an int to Python, and JSON as Python reads it has NaN, Infinity and integers of any length.
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return False
+    return abs(value) <= 1e300
+
+
+def _is_positive(value: object) -> bool:
+    return _is_number(value) and value > 0
+
+
+def _is_list(value: object) -> bool:
+    return isinstance(value, list) and bool(value)
+
+
+def _is_size(value: object) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and value > 0
+
+
+def _kind(value: object) -> str:
+    """Names a JSON value shortly: its kind where it is long, else itself."""
+    if isinstance(value, dict):
+        return "an object"
+    if isinstance(value, list):
+        return f"a list of {len(value)}" if value else "an empty list"
+    shown = json.dumps(value) if not isinstance(value, int) or abs(value) < 1e300 else "a very large number"
+    return shown if len(shown) <= 60 else shown[:57] + "..."

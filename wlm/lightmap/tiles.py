@@ -1,0 +1,363 @@
+"""Cutting a lightmap set into tiles, and telling which of them need a model.
+
+A tile is the unit of streaming and of fitting, one model each (neural-dynamic-gi, sections 3.5 and 9).
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+
+from wlm.errors import WlmError
+from wlm.imageops import fill_gaps
+from wlm.lightmap.data import LightmapSet
+
+__all__ = [
+    "TILE",
+    "TileData",
+    "TileGrid",
+    "TileKind",
+    "assemble",
+    "channel_means",
+    "classify",
+    "parse_tiles",
+    "split",
+    "static_pattern",
+]
+
+TILE = 128  # texels a side: the paper's tile (Table 1)
+
+# A colour that was encoded and decoded again in float32 is a few parts in 10^6 off; a half float's step is at
+# least 488 such parts, so a step and this slack is never taken for two.
+_STEP_SLACK = 1.01
+_HALF_MIN_EXPONENT = -14  # below 2**-14 half floats are subnormal and their step no longer shrinks
+_HALF_MANTISSA_BITS = 10
+
+
+@dataclass(frozen=True)
+class TileGrid:
+    """How tiles cover a map: row-major, the last row and column reaching past its end where it is no
+    multiple.
+
+    Attributes:
+        height: Height of the map in texels.
+        width: Width of the map in texels.
+        rows: Tiles from top to bottom.
+        cols: Tiles from left to right.
+    """
+
+    height: int
+    width: int
+    rows: int
+    cols: int
+
+    @classmethod
+    def of(cls, height: int, width: int) -> TileGrid:
+        """Makes the grid of a map.
+
+        Args:
+            height: In texels, at least 1.
+            width: In texels, at least 1.
+
+        Raises:
+            WlmError: A size is below 1.
+        """
+        if height < 1 or width < 1:
+            raise WlmError(f"tiles: expected a map of at least 1x1 texels, got {width}x{height}")
+        return cls(height, width, -(-height // TILE), -(-width // TILE))
+
+    @property
+    def count(self) -> int:
+        """Number of tiles, empty ones included."""
+        return self.rows * self.cols
+
+    def origin(self, index: int) -> tuple[int, int]:
+        """Returns row and column of a tile's first texel.
+
+        Args:
+            index: Number of the tile, row-major, in [0, count).
+
+        Raises:
+            WlmError: The number is outside the grid.
+        """
+        if not 0 <= index < self.count:
+            raise WlmError(f"tiles: tile {index} is outside the grid of {self.rows}x{self.cols} tiles")
+        row, column = divmod(int(index), self.cols)
+        return row * TILE, column * TILE
+
+
+@dataclass(frozen=True, eq=False)
+class TileData:
+    """A batch of N tiles, ready for fitting.
+
+    Attributes:
+        index: `[N]` int64, number of each tile in its grid, row-major.
+        colour: `[N, T, 128, 128, 3]` float32, `irradiance ** (1 / gamma)`. Texels outside the mask hold the
+            nearest valid one of the tile; where the map ends its last row and column go on. All zero in an
+            empty tile.
+        mask: `[N, 128, 128]` bool, true where a texel is valid; false past the map's end.
+    """
+
+    index: np.ndarray
+    colour: np.ndarray
+    mask: np.ndarray
+
+
+class TileKind(IntEnum):
+    """The least that a tile needs; the numbers are written in files and stay."""
+
+    EMPTY = 0
+    """No valid texel: nothing is stored."""
+    CONSTANT = 1
+    """One colour a time."""
+    STATIC = 2
+    """One colour a time and one pattern for all times."""
+    DYNAMIC = 3
+    """The full model."""
+
+
+def split(lightmaps: LightmapSet, gamma: float, tiles: Sequence[int] | None = None) -> TileData:
+    """Cut a set into tiles of gamma-encoded colour (neural-dynamic-gi, section 4).
+
+    Args:
+        lightmaps: The set, `[T, H, W, 3]`.
+        gamma: Colours are stored as `x ** (1 / gamma)`, which spends precision on the dark; above 0.
+        tiles: Numbers of the tiles wanted, in the order wanted; None for all. `N × T × 192 KiB` is the
+            memory.
+
+    Returns:
+        The N tiles.
+
+    Raises:
+        WlmError: A number is outside the grid or given twice, there is none, or gamma is not above 0.
+    """
+    _check_gamma(gamma)
+    times, height, width = lightmaps.frames.shape[:3]
+    grid = TileGrid.of(height, width)
+    index = np.arange(grid.count) if tiles is None else np.asarray(list(tiles), np.int64)
+    _check_index(index, grid)
+    colour = np.zeros((len(index), times, TILE, TILE, 3), np.float32)
+    mask = np.zeros((len(index), TILE, TILE), bool)
+    for n, tile in enumerate(index):
+        y, x = grid.origin(tile)
+        inside = (slice(y, min(y + TILE, height)), slice(x, min(x + TILE, width)))
+        valid = lightmaps.mask[inside]
+        if not valid.any():
+            continue
+        rows, columns = valid.shape
+        mask[n, :rows, :columns] = valid
+        out = colour[n]
+        out[:, :rows, :columns] = fill_gaps(lightmaps.frames[:, *inside], valid)
+        out[:, :rows, columns:] = out[:, :rows, columns - 1 : columns]
+        out[:, rows:] = out[:, rows - 1 : rows]
+        if gamma != 1.0:
+            np.power(out, np.float32(1.0 / gamma), out=out)
+    return TileData(index=index, colour=colour, mask=mask)
+
+
+def channel_means(colour: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Mean of each channel of each tile at each time, over the valid texels (neural-dynamic-gi, section 4).
+
+    Args:
+        colour: `[N, T, 128, 128, 3]`, as in `TileData`.
+        mask: `[N, 128, 128]` bool.
+
+    Returns:
+        `[N, T, 3]` float64, summed in float64; 0 for an empty tile.
+    """
+    means = np.zeros((*colour.shape[:2], 3))
+    for n, valid in enumerate(mask):
+        if valid.any():
+            # [T, K, 3]: only the valid texels are summed, so what the gaps hold has no weight.
+            means[n] = colour[n][:, valid].mean(axis=1, dtype=np.float64)
+    return means
+
+
+def static_pattern(colour: np.ndarray, means: np.ndarray) -> np.ndarray:
+    """Pattern of each tile that, times its means, is the best guess of a tile whose light only changes in
+    strength.
+
+    It is `sum over t of colour / sum over t of means`: weighted by the means, so that a nearly black time,
+    whose texels are a few steps of half float apart, has next to no say, and no division by a mean of 0 takes
+    place. `means * pattern` is exact where the tile is the product of a colour a time and a pattern, in
+    gamma-encoded and so in linear space.
+
+    Args:
+        colour: `[N, T, 128, 128, 3]`, as in `TileData`.
+        means: `[N, T, 3]`, from `channel_means`.
+
+    Returns:
+        `[N, 128, 128, 3]` float64 with a mean of 1 over the valid texels; 0 in a channel that is black at
+        every time.
+    """
+    total = means.sum(axis=1)[:, None, None, :]
+    pattern = np.zeros((len(colour), *colour.shape[2:]))
+    np.divide(colour.sum(axis=1, dtype=np.float64), total, out=pattern, where=total > 0)
+    return pattern
+
+
+def classify(tiles: TileData, gamma: float, static_budget_db: float = 60.0) -> np.ndarray:
+    """Find the least that each tile needs, from a stated error budget.
+
+    In linear space, over the valid texels:
+
+    - `EMPTY`: there is none.
+    - `CONSTANT`: at every time no channel spans more than one step of half float, as wide as it is at the
+      channel's least value. A half-float source holds nothing finer. An all-zero tile is one.
+    - `STATIC`: `means * static_pattern` is good enough at every time: its PSNR, with the range of the tile at
+      that time as the peak (neural-dynamic-gi, section 10.2), is at least the budget, or no channel of any
+      texel is more than one step of half float off. The second covers times of a range so small, or none,
+      that the PSNR would measure the half float. One time is such a product exactly.
+    - `DYNAMIC`: the rest.
+
+    Args:
+        tiles: From `split`.
+        gamma: The one given to `split`.
+        static_budget_db: The least PSNR in decibels at which a static tile will do; infinite admits only what
+            is within a step of half float.
+
+    Returns:
+        `[N]` int64 of `TileKind`.
+
+    Raises:
+        WlmError: Gamma is not above 0, or the budget is NaN.
+    """
+    _check_gamma(gamma)
+    if math.isnan(static_budget_db):
+        raise WlmError("tiles: expected static_budget_db in decibels, got NaN")
+    means = channel_means(tiles.colour, tiles.mask)
+    kinds = np.empty(len(tiles.index), np.int64)
+    for n, valid in enumerate(tiles.mask):
+        colour = tiles.colour[n]
+        if not valid.any():
+            kinds[n] = TileKind.EMPTY
+        elif _is_constant(colour, valid, gamma):
+            kinds[n] = TileKind.CONSTANT
+        elif _is_static(colour, valid, means[n], gamma, static_budget_db):
+            kinds[n] = TileKind.STATIC
+        else:
+            kinds[n] = TileKind.DYNAMIC
+    return kinds
+
+
+def parse_tiles(text: str, count: int) -> list[int]:
+    """Read a list of tiles: numbers and closed ranges, separated by commas.
+
+    Args:
+        text: Such as "0-3,7".
+        count: Number of tiles in the grid.
+
+    Returns:
+        The numbers in the order written.
+
+    Raises:
+        WlmError: A part that is neither, a range that runs down, a number outside [0, count) or given twice.
+    """
+    tiles: list[int] = []
+    for part in text.split(","):
+        # At most 9 digits: a longer number is outside any grid, and int() refuses very long ones in its own
+        # words.
+        found = re.fullmatch(r"\s*([0-9]{1,9})\s*(?:-\s*([0-9]{1,9})\s*)?", part)
+        if not found:
+            raise WlmError(f"tiles: expected a number or first-last, got {part.strip()!r} in {text!r}")
+        first = int(found[1])
+        last = first if found[2] is None else int(found[2])
+        if last < first:
+            raise WlmError(f"tiles: the range {part.strip()!r} runs down; expected first-last")
+        if last >= count:
+            raise WlmError(f"tiles: tile {last} is out of range; expected 0 to {count - 1}")
+        tiles.extend(range(first, last + 1))
+    seen: set[int] = set()
+    for tile in tiles:
+        if tile in seen:
+            raise WlmError(f"tiles: tile {tile} is given twice in {text!r}")
+        seen.add(tile)
+    return tiles
+
+
+def assemble(tiles: np.ndarray, index: np.ndarray, grid: TileGrid, fill: float = 0.0) -> np.ndarray:
+    """Put tiles back into a map; the inverse of cutting.
+
+    Args:
+        tiles: `[N, 128, 128, C]`, any dtype.
+        index: `[N]`, number of each tile in the grid.
+        grid: The map's.
+        fill: Value of the texels of tiles that are not given.
+
+    Returns:
+        `[H, W, C]`, of the tiles' dtype. What the tiles hold past the map's end is dropped.
+
+    Raises:
+        WlmError: Shapes do not fit, or a number is outside the grid or given twice.
+    """
+    tiles = np.asarray(tiles)
+    index = np.asarray(index)
+    if tiles.ndim != 4 or tiles.shape[1:3] != (TILE, TILE) or index.shape != tiles.shape[:1]:
+        raise WlmError(
+            f"tiles: expected tiles [N, {TILE}, {TILE}, C] and N numbers, got {tiles.shape} and {index.shape}"
+        )
+    _check_index(index, grid)
+    image = np.full((grid.height, grid.width, tiles.shape[3]), fill, tiles.dtype)
+    for tile, number in zip(tiles, index, strict=True):
+        y, x = grid.origin(number)
+        part = image[y : y + TILE, x : x + TILE]
+        part[...] = tile[: part.shape[0], : part.shape[1]]
+    return image
+
+
+def _check_gamma(gamma: float) -> None:
+    if not (math.isfinite(gamma) and gamma > 0):
+        raise WlmError(f"tiles: expected a finite gamma above 0, got {gamma}")
+
+
+def _check_index(index: np.ndarray, grid: TileGrid) -> None:
+    """Refuses no tile at all, a tile outside the grid and one that is given twice."""
+    if not index.size:
+        raise WlmError("tiles: expected at least one tile, got none")
+    for tile in (index.min(), index.max()):
+        grid.origin(tile)
+    numbers, counts = np.unique(index, return_counts=True)
+    if (counts > 1).any():
+        raise WlmError(f"tiles: tile {numbers[counts > 1][0]} is given twice")
+
+
+def _half_step(value: np.ndarray) -> np.ndarray:
+    """Distance from each non-negative value to the next larger half float, at any magnitude."""
+    # frexp gives value = m 2^e with m in [0.5, 1): the leading bit is worth 2^(e - 1).
+    exponent = np.frexp(value)[1] - 1
+    exponent = np.where(value > 0, np.maximum(exponent, _HALF_MIN_EXPONENT), _HALF_MIN_EXPONENT)
+    return np.ldexp(1.0, exponent - _HALF_MANTISSA_BITS)
+
+
+def _is_constant(colour: np.ndarray, valid: np.ndarray, gamma: float) -> bool:
+    """Whether no channel of [T, 128, 128, 3] spans more than a step of half float at any time."""
+    encoded = colour[:, valid].astype(np.float64)  # [T, K, 3]
+    # Decoding keeps the order, so the extremes are found before it.
+    low, high = encoded.min(axis=1) ** gamma, encoded.max(axis=1) ** gamma
+    return bool((high - low <= _STEP_SLACK * _half_step(low)).all())
+
+
+def _is_static(
+    colour: np.ndarray,  # [T, 128, 128, 3]
+    valid: np.ndarray,  # [128, 128]
+    means: np.ndarray,  # [T, 3]
+    gamma: float,
+    budget_db: float,
+) -> bool:
+    """Whether a tile is a colour a time times one pattern, within the budget at every time."""
+    pattern = static_pattern(colour[None], means[None])[0][valid] ** gamma  # [K, 3]
+    for frame, mean in zip(colour, means, strict=True):
+        linear = frame[valid].astype(np.float64) ** gamma
+        error = np.abs(mean**gamma * pattern - linear)
+        if (error <= _STEP_SLACK * _half_step(linear)).all():
+            continue
+        peak = np.ptp(linear)
+        # A range of zero means one grey over all channels; the error above is then more than a step: no.
+        if peak == 0.0 or 10.0 * math.log10(peak * peak / np.mean(np.square(error))) < budget_db:
+            return False
+    return True

@@ -1,0 +1,379 @@
+"""One batch of tiles being fitted on a device: its parameters, its optimisers and its steps."""
+
+import math
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import torch
+import warp as wp
+
+from wlm import interop
+from wlm.lightmap.model import TILE, Profile, TimeAxis, encode_time
+from wlm_kernels import blocks, mlp, temporal
+
+__all__ = ["Targets", "Trainer"]
+
+CPU_LANES = 2  # ranges of samples with sums of their own; fixed, so that results don't depend on the cores
+
+
+class Targets:
+    """What N tiles are fitted to, on the host.
+
+    Attributes:
+        number: int [N], numbers of the tiles in their grid.
+        colour: float32 [N, T, 128 * 128, 3], (colour / scale - shift) / spread.
+        texels: int32 [N, K], valid texels, padded; ``count`` int32 [N] are in use.
+        weight: float32 [N, T, 3]; ``emphasis``: see ``wlm_kernels.temporal.Batch``.
+        shift, spread: float32 [N, 3].
+    """
+
+    def __init__(
+        self,
+        number: np.ndarray,
+        colour: np.ndarray,
+        mask: np.ndarray,
+        scale: np.ndarray,
+        affine: np.ndarray,
+        gamma: float,
+        metric_weight: float,
+    ):
+        """Normalises and weights gamma-space colour [N, T, 128, 128, 3] by the rounded scale [N, T, 3] and affine."""
+        n, times = colour.shape[:2]
+        self.number = number.astype(np.int32)
+        self.shift = affine[:, 0].astype(np.float32)
+        self.spread = affine[:, 1].astype(np.float32)
+        factor = np.divide(1.0, scale, out=np.zeros_like(scale), where=scale > 0)
+        flat = colour.reshape(n, times, TILE * TILE, 3)
+        self.colour = (flat * factor[:, :, None] - self.shift[:, None, None]) / self.spread[:, None, None]
+        valid = mask.reshape(n, -1)
+        self.count = valid.sum(1).astype(np.int32)
+        self.texels = np.zeros((n, max(int(self.count.max()), 1)), np.int32)
+        self.weight = np.ones((n, times, 3), np.float32)
+        for i in range(n):
+            self.texels[i, : self.count[i]] = np.flatnonzero(valid[i])
+            if metric_weight > 0:
+                values = flat[i][:, valid[i]]
+                span = values.max((1, 2)) ** gamma - values.min((1, 2)) ** gamma  # [T] of linear radiance
+                # d radiance / d y = gamma (colour / scale)^(gamma - 1) scale^gamma spread; the middle factor is
+                # the texel's emphasis. A tile without range is not scored: any weight will do.
+                slope = gamma * scale[i] ** gamma * self.spread[i] / np.where(span > 0, span, 1.0)[:, None]
+                self.weight[i] = np.where(span[:, None] > 0, slope, 0.0) ** (2.0 * metric_weight)
+        # A black channel has no scale: whatever the network says, it decodes to 0.
+        self.weight *= scale > 0
+        self.emphasis = 2.0 * (gamma - 1.0) * metric_weight
+
+
+class Trainer:
+    """Fits N tiles of one kind together; see ``Profile`` for the stages.
+
+    The state (``state`` and ``load``) is all that a later step depends on, so that a resumed fit goes on exactly.
+    """
+
+    def __init__(
+        self, profile: Profile, axis: TimeAxis, targets: Targets, temporal_maps: bool, seed: int, device: str
+    ):
+        """Uploads the targets and draws the first parameters; ``device`` as ``interop.check_device`` returns it."""
+        self.profile, self.axis, self.device, self.temporal = profile, axis, device, temporal_maps
+        self.tiles = len(targets.number)
+        self.inputs = profile.inputs(temporal_maps)
+        self._cuda = device != "cpu"
+        self._kernels = temporal.step_kernels(
+            temporal_maps, profile.hidden, profile.gelu, "cuda" if self._cuda else "cpu"
+        )
+        self._pool = None if self._cuda else ThreadPoolExecutor(CPU_LANES)
+        with interop.stream(device):
+            self._allocate()
+            self._upload(targets, seed)
+            self._draw(targets.number, seed)
+        self._stages = [
+            interop.StepGraph(lambda: self._step(False, True), device, warmup=2),
+            interop.StepGraph(lambda: self._step(True, True), device, warmup=1),
+            interop.StepGraph(lambda: self._step(True, False), device, warmup=1),
+        ]
+
+    def _shapes(self) -> dict[str, tuple[int, ...]]:
+        p, n, r = self.profile, self.tiles, self.profile.uvt_resolution
+        shapes = {"uv_endpoints": (n, 32, 32, 2, 4), "uv_weights": (n, TILE, TILE)}
+        if self.temporal:
+            shapes |= {
+                "uvt_endpoints": (n * p.uvt_slices, r // 4, r // 4, 2, 4),
+                "uvt_weights": (n * p.uvt_slices, r, r),
+                "ut": (n, p.plane_rows, p.plane_columns, 2),
+                "vt": (n, p.plane_rows, p.plane_columns, 2),
+            }
+        return shapes
+
+    def _allocate(self) -> None:
+        shapes = self._shapes()
+        device, n, hidden = self.device, self.tiles, self.profile.hidden
+        lengths = {key: math.prod(shape) for key, shape in shapes.items()}
+        total = sum(lengths.values())
+
+        def zeros(*shape, dtype=torch.float32):
+            return torch.zeros(shape, dtype=dtype, device=device)
+
+        self.maps = zeros(total).requires_grad_()
+        self.hidden = zeros(n, self.inputs + hidden + 2, hidden).requires_grad_()
+        self.output = zeros(n, hidden + 1, 3).requires_grad_()
+        for parameter in (self.maps, self.hidden, self.output):
+            parameter.grad = torch.zeros_like(parameter)
+        self.views, at = {}, 0
+        self._offsets = temporal.Offsets()
+        for key, shape in shapes.items():
+            self.views[key] = self.maps.detach()[at : at + lengths[key]].view(shape)
+            setattr(self._offsets, key, at)
+            at += lengths[key]
+        maps = temporal.Maps()
+        types = {"uv_endpoints": wp.vec4, "uvt_endpoints": wp.vec4, "ut": wp.vec2, "vt": wp.vec2}
+        for key, view in self.views.items():
+            setattr(maps, key, interop.to_warp(view, types.get(key, wp.float32)))
+        self._maps = maps
+
+        lanes = 1 if self._cuda else CPU_LANES
+        parts = self.profile.samples // temporal.BLOCK if self._cuda else CPU_LANES
+        self._acc = zeros(lanes, total, dtype=torch.int64 if self._cuda else torch.float32)
+        self._partial = zeros(parts, *self.hidden.shape)
+        self._partial_out = zeros(parts, *self.output.shape)
+        self._loss_parts = zeros(parts, n)
+        self.loss = zeros(n)
+        self.control = zeros(1, dtype=torch.int32)
+        rates = zeros(2)
+        self._rates = rates
+        fused = {
+            "betas": (0.9, 0.999),
+            "eps": self.profile.adam_epsilon,
+            "fused": True,
+            "capturable": self._cuda,
+        }
+        self._adam_maps = torch.optim.Adam(self._pieces(), lr=rates[0] if self._cuda else 1.0, **fused)
+        self._adam_net = torch.optim.Adam(
+            [self.hidden, self.output], lr=rates[1] if self._cuda else 1.0, **fused
+        )
+
+        wrap = interop.to_warp
+        vec = self._kernels.net.vec_hidden
+        # CUDA stores whole tiles of scalars; the CPU adds whole columns.
+        shaped = (
+            (
+                wrap(self._partial.view(-1, hidden)),
+                wrap(self._partial_out.view(-1, 3)),
+                wrap(self._loss_parts.view(-1)),
+            )
+            if self._cuda
+            else (wrap(self._partial, vec), wrap(self._partial_out, wp.vec3), wrap(self._loss_parts))
+        )
+        self._launch_args = (wrap(self.hidden, vec), wrap(self.output, wp.vec3))
+        self._launch_sums = (wrap(self._acc), *shaped)
+        self._gather_args = (
+            wrap(self._acc),
+            wrap(self.maps),
+            wrap(self.maps.grad),
+            wrap(self._partial.view(parts, -1)),
+            wrap(self._partial_out.view(parts, -1)),
+            wrap(self._loss_parts),
+        )
+        self._gather_outs = (
+            wrap(self.hidden.grad.view(-1)),
+            wrap(self.output.grad.view(-1)),
+            wrap(self.loss),
+            wrap(rates),
+        )
+
+    def _pieces(self) -> list[torch.Tensor]:
+        """The maps as views, the optimiser's parameters.
+
+        A fused Adam gives a block of threads 65,536 numbers of one tensor: one long tensor would leave most of a
+        GPU idle. 36 is as many tensors as one of its launches takes.
+        """
+        pieces = 36 if self._cuda else 1
+        size = -(-self.maps.numel() // pieces)
+        result = []
+        for values, grad in zip(self.maps.detach().split(size), self.maps.grad.split(size), strict=True):
+            values.requires_grad_()
+            values.grad = grad
+            result.append(values)
+        return result
+
+    def _upload(self, targets: Targets, seed: int) -> None:
+        tau, encoding = encode_time(self.axis)
+        self._schedule = self._rates_over_steps()
+
+        def put(values, dtype):
+            return wp.array(np.ascontiguousarray(values), dtype=dtype, device=self.device)
+
+        batch = temporal.Batch()
+        batch.targets = put(targets.colour, wp.vec3)
+        batch.texels = put(targets.texels, wp.int32)
+        batch.texel_count = put(targets.count, wp.int32)
+        batch.tau = put(tau, wp.float32)
+        batch.encoding = put(encoding, wp.vec4)
+        batch.weight = put(targets.weight, wp.vec3)
+        batch.number = put(targets.number, wp.int32)
+        batch.shift = put(targets.shift, wp.vec3)
+        batch.spread = put(targets.spread, wp.vec3)
+        batch.control = interop.to_warp(self.control)
+        batch.slices = self.profile.uvt_slices
+        batch.seed = seed
+        batch.emphasis = targets.emphasis
+        batch.periodic = int(self.axis.periodic)
+        batch.quantised = 0
+        self.batch = batch
+
+    def _rates_over_steps(self) -> wp.array:
+        p = self.profile
+        share = np.linspace(0.0, 1.0, p.steps)
+        values = p.final_rate + (1.0 - p.final_rate) * 0.5 * (1.0 + np.cos(np.pi * share))
+        return wp.array(values.astype(np.float32), dtype=float, device=self.device)
+
+    def _draw(self, number: np.ndarray, seed: int) -> None:
+        """First parameters; each tile draws from a generator of its own, so that it is the same in any batch."""
+        hidden, inputs = self.profile.hidden, self.inputs
+        maps = {key: np.empty(view.shape, np.float32) for key, view in self.views.items()}
+        w = np.zeros(tuple(self.hidden.shape), np.float32)
+        o = np.zeros(tuple(self.output.shape), np.float32)
+        for i, tile in enumerate(number):
+            random = np.random.default_rng([seed, int(tile)])
+            for values in maps.values():
+                part = values.reshape(self.tiles, -1)
+                part[i] = random.uniform(0.25, 0.75, part.shape[1])
+            w[i, :inputs] = random.uniform(-1, 1, (inputs, hidden)) / math.sqrt(inputs)
+            w[i, inputs + 1 : inputs + 1 + hidden] = random.uniform(-1, 1, (hidden, hidden)) / math.sqrt(
+                hidden
+            )
+            o[i, :hidden] = random.uniform(-1, 1, (hidden, 3)) / math.sqrt(hidden)
+        for key, values in maps.items():
+            self.views[key].copy_(torch.from_numpy(values))
+        with torch.no_grad():
+            self.hidden.copy_(torch.from_numpy(w))
+            self.output.copy_(torch.from_numpy(o))
+
+    @property
+    def step(self) -> int:
+        """Steps done."""
+        return int(self.control.item())
+
+    def stage(self, step: int) -> int:
+        """0: continuous maps with noise, 1: maps on their exact levels, 2: maps frozen."""
+        p = self.profile
+        return int(step >= round(p.quantise_from * p.steps)) + int(step >= round(p.freeze_from * p.steps))
+
+    def run(self, steps: int) -> None:
+        """Queues the next steps."""
+        first = self.step
+        with interop.stream(self.device):
+            for step in range(first, first + steps):
+                self._stages[self.stage(step)]()
+
+    def _step(self, quantised: bool, move_maps: bool) -> None:
+        self.batch.quantised = int(quantised)
+        hidden, output = self._launch_args
+        args = (
+            self._maps,
+            self._offsets,
+            hidden,
+            output,
+            self.batch,
+            self.profile.samples,
+            *self._launch_sums,
+        )
+        if self._cuda:
+            self._kernels.launch(*args)
+        else:
+            span = self.profile.samples // CPU_LANES
+            # Once alone, so that two threads don't compile the kernel at the same time.
+            list(
+                self._pool.map(lambda lane: self._kernels.launch(*args, lane * span, span), range(CPU_LANES))
+            )
+        rates = (self.profile.map_rate, self.profile.net_rate)
+        temporal.gather(
+            *self._gather_args, self._schedule, rates, self.batch.control, *self._gather_outs
+        )
+        if not self._cuda:
+            self._adam_maps.param_groups[0]["lr"] = float(self._rates[0])
+            self._adam_net.param_groups[0]["lr"] = float(self._rates[1])
+        if move_maps:
+            self._adam_maps.step()
+        self._adam_net.step()
+
+    def losses(self) -> np.ndarray:
+        """Running mean of each tile's loss over about 50 steps, float32 [N]."""
+        return self.loss.cpu().numpy()
+
+    def quantised(self) -> dict[str, np.ndarray]:
+        """The maps and networks as stored.
+
+        Returns:
+            ``uv_endpoints`` uint8 [N, 32, 32, 2, 4] and ``uv_index`` uint8 [N, 128, 128], the same for ``uvt`` with
+            [N * S, ...]; ``ut``, ``vt`` uint8; ``net`` float16 [N, P].
+        """
+        result = {}
+        with interop.stream(self.device):
+            for key in ("uv", "uvt") if self.temporal else ("uv",):
+                endpoints, weights = (
+                    getattr(self._maps, f"{key}_endpoints"),
+                    getattr(self._maps, f"{key}_weights"),
+                )
+                bytes_out = wp.empty(endpoints.shape, dtype=wp.vec4ub, device=self.device)
+                index_out = wp.empty(weights.shape, dtype=wp.uint8, device=self.device)
+                blocks.quantise(endpoints, weights, bytes_out, index_out)
+                result[f"{key}_endpoints"], result[f"{key}_index"] = bytes_out, index_out
+        result = {key: value.numpy() for key, value in result.items()}
+        for key in ("ut", "vt") if self.temporal else ():
+            plane = np.clip(self.views[key].cpu().numpy(), 0.0, 1.0)
+            result[key] = np.floor(plane * np.float32(255.0) + np.float32(0.5)).astype(np.uint8)
+        net = torch.cat([self.hidden.detach().flatten(1), self.output.detach().flatten(1)], 1)
+        result["net"] = net.cpu().numpy().astype(np.float16)
+        assert result["net"].shape[1] == mlp.parameter_count(self.inputs, self.profile.hidden)
+        return result
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Everything that later steps depend on."""
+        named = {
+            "maps": self.maps,
+            "hidden": self.hidden,
+            "output": self.output,
+            "loss": self.loss,
+            "control": self.control,
+        }
+        result = {key: value.detach().cpu().numpy() for key, value in named.items()}
+        for name, adam in (("adam_maps", self._adam_maps), ("adam_net", self._adam_net)):
+            for i, values in enumerate(adam.state.values()):
+                for key in ("step", "exp_avg", "exp_avg_sq"):
+                    result[f"{name}.{i}.{key}"] = values[key].detach().cpu().numpy()
+        return {key: np.ascontiguousarray(value) for key, value in result.items()}
+
+    def load(self, state: dict[str, np.ndarray]) -> None:
+        """Goes back to a ``state``; arrays of other shapes raise ValueError."""
+        named = {
+            "maps": self.maps,
+            "hidden": self.hidden,
+            "output": self.output,
+            "loss": self.loss,
+            "control": self.control,
+        }
+
+        def put(target: torch.Tensor, key: str) -> None:
+            value = torch.from_numpy(np.array(state[key]))
+            if value.shape != target.shape:
+                raise ValueError(f"{key}: expected shape {tuple(target.shape)}, got {tuple(value.shape)}")
+            target.copy_(value)
+
+        with interop.stream(self.device), torch.no_grad():
+            for key, value in named.items():
+                put(value, key)
+            for name, adam in (("adam_maps", self._adam_maps), ("adam_net", self._adam_net)):
+                for i, parameter in enumerate(adam.param_groups[0]["params"]):
+                    if f"{name}.{i}.step" in state:
+                        slot = adam.state[parameter]
+                        slot["step"] = torch.zeros((), device=self.device)
+                        slot["exp_avg"], slot["exp_avg_sq"] = (
+                            torch.zeros_like(parameter),
+                            torch.zeros_like(parameter),
+                        )
+                        for key in ("step", "exp_avg", "exp_avg_sq"):
+                            put(slot[key], f"{name}.{i}.{key}")
+
+    def close(self) -> None:
+        """Ends the CPU's threads."""
+        if self._pool is not None:
+            self._pool.shutdown()

@@ -1,0 +1,35 @@
+"""Error of HDR lightmaps: PSNR, SSIM and HDR-FLIP, masked, and in tiles as the paper scores them."""
+
+from wlm.metrics.error import PSNR_CAP_DB, dynamic_range, half_ulp, max_abs_error, mse, psnr
+from wlm.metrics.flip import flip_exposures, flip_map
+from wlm.metrics.structural import SSIM_WINDOW, ssim, ssim_map
+from wlm.metrics.tiled import (
+    FORMAT_LIMITED_ULPS,
+    METRICS,
+    MIN_VALID_TEXELS,
+    FrameMetrics,
+    Summary,
+    evaluate_frame,
+    summarise,
+)
+
+__all__ = [
+    "FORMAT_LIMITED_ULPS",
+    "METRICS",
+    "MIN_VALID_TEXELS",
+    "PSNR_CAP_DB",
+    "SSIM_WINDOW",
+    "FrameMetrics",
+    "Summary",
+    "dynamic_range",
+    "evaluate_frame",
+    "flip_exposures",
+    "flip_map",
+    "half_ulp",
+    "max_abs_error",
+    "mse",
+    "psnr",
+    "ssim",
+    "ssim_map",
+    "summarise",
+]

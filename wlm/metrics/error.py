@@ -1,0 +1,154 @@
+"""Pointwise error over the valid texels of linear HDR images, accumulated in float64."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from wlm.errors import WlmError
+
+__all__ = ["PSNR_CAP_DB", "dynamic_range", "half_ulp", "max_abs_error", "mse", "psnr"]
+
+# An exact reconstruction has infinite PSNR and would swallow every mean. Rounding to half float alone leaves,
+# in a tile that reaches down to black, 70 to 90 dB, so no lossy half-float codec comes near 120; a float32
+# path within rounding of its reference does, and counts as exact.
+PSNR_CAP_DB = 120.0
+
+
+def check_pair(
+    ref: np.ndarray, test: np.ndarray, mask: np.ndarray | None, where: str
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Check a reference, a test image and a mask; return them as float64, float64 and bool.
+
+    Args:
+        ref: `[H, W, C]`, linear.
+        test: `[H, W, C]`, linear.
+        mask: `[H, W]`, or None for all texels.
+        where: What to call this pair in a message ("city 12 h").
+
+    Raises:
+        WlmError: Shapes differ, or a valid texel of either image is NaN or infinite; the message names the
+            image, the first such texel and their number. Texels outside the mask may hold anything.
+    """
+    ref = np.asarray(ref, np.float64)
+    test = np.asarray(test, np.float64)
+    if ref.ndim != 3 or ref.shape != test.shape:
+        shapes = f"{ref.shape} and {test.shape}"
+        raise WlmError(f"{where}: expected two images [H, W, C] of one shape, got {shapes}")
+    valid = np.ones(ref.shape[:2], bool) if mask is None else np.asarray(mask).astype(bool)
+    if valid.shape != ref.shape[:2]:
+        raise WlmError(f"{where}: expected a mask of {ref.shape[:2]}, got {valid.shape}")
+    for label, image in (("reference", ref), ("test image", test)):
+        bad = valid & ~np.isfinite(image).all(axis=2)
+        if bad.any():
+            y, x = np.argwhere(bad)[0]
+            raise WlmError(
+                f"{where}: the {label} is NaN or infinite at {np.count_nonzero(bad)} valid texels, "
+                f"first at row {y}, column {x}"
+            )
+    return ref, test, valid
+
+
+def mse(ref: np.ndarray, test: np.ndarray, mask: np.ndarray | None = None) -> float:
+    """Mean squared error over the valid texels and all channels.
+
+    Args:
+        ref: `[H, W, C]`, linear.
+        test: `[H, W, C]`, linear.
+        mask: `[H, W]`, true where a texel counts; None for all.
+
+    Returns:
+        The mean in squared units of the images; NaN with an empty mask.
+
+    Raises:
+        WlmError: Shapes differ, or a valid texel is NaN or infinite.
+    """
+    ref, test, valid = check_pair(ref, test, mask, "mse")
+    if not valid.any():
+        return math.nan
+    return float(np.mean(np.square(ref[valid] - test[valid])))
+
+
+def max_abs_error(ref: np.ndarray, test: np.ndarray, mask: np.ndarray | None = None) -> float:
+    """Largest absolute difference over the valid texels and all channels; NaN with an empty mask.
+
+    Args:
+        ref: `[H, W, C]`, linear.
+        test: `[H, W, C]`, linear.
+        mask: `[H, W]`, true where a texel counts; None for all.
+
+    Raises:
+        WlmError: Shapes differ, or a valid texel is NaN or infinite.
+    """
+    ref, test, valid = check_pair(ref, test, mask, "max_abs_error")
+    return float(np.max(np.abs(ref[valid] - test[valid]))) if valid.any() else math.nan
+
+
+def dynamic_range(ref: np.ndarray, mask: np.ndarray | None = None) -> float:
+    """Maximum less minimum over the valid texels and all channels (neural-dynamic-gi, section 10.2).
+
+    Args:
+        ref: `[H, W, C]`, linear.
+        mask: `[H, W]`, true where a texel counts; None for all.
+
+    Returns:
+        The range in the image's units; NaN with an empty mask.
+
+    Raises:
+        WlmError: The mask does not fit, or a valid texel is NaN or infinite.
+    """
+    ref, _, valid = check_pair(ref, ref, mask, "dynamic_range")
+    return float(np.ptp(ref[valid])) if valid.any() else math.nan
+
+
+def psnr(
+    ref: np.ndarray, test: np.ndarray, mask: np.ndarray | None = None, peak: float | None = None
+) -> float:
+    """Peak signal-to-noise ratio `10 log10(peak² / mse)` over the valid texels and all channels.
+
+    Args:
+        ref: `[H, W, C]`, linear.
+        test: `[H, W, C]`, linear.
+        mask: `[H, W]`, true where a texel counts; None for all.
+        peak: The signal's peak in the images' units; None takes the reference's `dynamic_range`.
+
+    Returns:
+        Decibels, at most `PSNR_CAP_DB` (an exact reconstruction scores that); NaN with an empty mask or a
+        peak of zero, which give no scale to measure against.
+
+    Raises:
+        WlmError: Shapes differ, a valid texel is NaN or infinite, or the peak is negative or not finite.
+    """
+    error = mse(ref, test, mask)
+    peak = dynamic_range(ref, mask) if peak is None else float(peak)
+    if math.isnan(error):
+        return math.nan
+    if not (math.isfinite(peak) and peak >= 0.0):
+        raise WlmError(f"psnr: expected a finite peak of at least 0, got {peak}")
+    return psnr_from_mse(error, peak)
+
+
+def psnr_from_mse(error: float, peak: float) -> float:
+    """`psnr` for a mean squared error that is known already, with the same cap and the same NaN."""
+    if peak == 0.0:
+        return math.nan
+    if error == 0.0:
+        return PSNR_CAP_DB
+    # Two logarithms and no square: a range of 1e-7 squared is still fine, but 1e-200 would underflow to zero.
+    return min(PSNR_CAP_DB, 20.0 * math.log10(peak) - 10.0 * math.log10(error))
+
+
+def half_ulp(value: float) -> float:
+    """Step between neighbouring half floats at `value`: the resolution of a stored lightmap.
+
+    Args:
+        value: Any finite number; magnitudes above 65,504 take the largest half float's step.
+
+    Returns:
+        The step in the units of `value`, at least 2**-24.
+    """
+    magnitude = np.float16(min(abs(float(value)), float(np.finfo(np.float16).max)))
+    if magnitude == np.finfo(np.float16).max:
+        return 32.0  # np.spacing looks upwards, and above the largest half float there is only infinity
+    return float(np.spacing(magnitude))

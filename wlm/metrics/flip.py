@@ -1,0 +1,135 @@
+"""HDR-FLIP over a whole frame, with exposures that follow from the reference alone.
+
+FLIP: Andersson et al. 2020, "FLIP: A Difference Evaluator for Alternating Images". HDR-FLIP: Andersson et al.
+2021, "Visualizing Errors in Rendered High Dynamic Range Images": the largest LDR-FLIP over a range of
+exposures, each tone mapped. The computation is NVIDIA's `flip_evaluator`; what is here is what it needs to be
+safe on lightmaps.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from wlm.errors import WlmError
+from wlm.imageops import fill_gaps
+from wlm.metrics.error import check_pair
+
+__all__ = ["flip_exposures", "flip_map"]
+
+# HDR-FLIP chooses the exposures so that the reference's brightest luminance (at the first) and its median (at
+# the last) are tone mapped to 0.85. With the ACES curve that flip_evaluator takes by default, this is the
+# input that gives 0.85.
+_TONE_MAPPED_TARGET_INPUT = 2.118873
+_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # linear sRGB, as flip_evaluator weighs it
+# The brightest texel of a bake is often a firefly; the paper's maximum would then spend an exposure on one
+# texel.
+_BRIGHT_PERCENTILE = 99.0
+_MEDIAN_PERCENTILE = 50.0
+# flip_evaluator returns 0 for one exposure, whatever the images, so a range of exposures needs at least two.
+_MIN_EXPOSURES = 2
+# Half float's normal numbers span 30 stops; a wider span only spends exposures on what the format can't hold.
+_MAX_SPAN = 30.0
+# The tone mapper squares its input in float32, so an exposed value must stay under 2**63; it is white long
+# before 2**60.
+_EXPOSED_LIMIT = 60.0
+
+
+def flip_exposures(ref: np.ndarray, mask: np.ndarray | None = None) -> tuple[float, float] | None:
+    """First and last exposure for HDR-FLIP, from percentiles of the valid reference's luminance.
+
+    As in HDR-FLIP, but from the 99th percentile and the median of the texels that are lit at all: at night
+    most of a lightmap is black, and a median of zero has no exposure.
+
+    Args:
+        ref: `[H, W, 3]`, linear RGB.
+        mask: `[H, W]`, true where a texel counts; None for all.
+
+    Returns:
+        `(start, stop)` in stops (log2), start <= stop; None where no valid texel is above zero.
+
+    Raises:
+        WlmError: The image is not RGB, the mask does not fit, or a valid texel is NaN or infinite.
+    """
+    ref, _, valid = check_pair(ref, ref, mask, "flip_exposures")
+    _check_rgb(ref)
+    luminance = np.maximum(ref[valid], 0.0) @ _LUMINANCE
+    lit = luminance[luminance > 0.0]
+    if lit.size == 0:
+        return None
+    bright, median = np.percentile(lit, [_BRIGHT_PERCENTILE, _MEDIAN_PERCENTILE])
+    start = math.log2(_TONE_MAPPED_TARGET_INPUT) - math.log2(bright)
+    return start, start + min(math.log2(bright) - math.log2(median), _MAX_SPAN)
+
+
+def flip_map(
+    ref: np.ndarray, test: np.ndarray, mask: np.ndarray | None = None, exposures: int = 2
+) -> np.ndarray:
+    """FLIP error at every texel, at flip_evaluator's default of 67 pixels a degree.
+
+    Outside the mask both images take the reference's nearest valid value: the error there is zero but for
+    what the filters carry over an edge. Negative values, which no display shows, count as zero. Where no
+    valid texel of the reference is lit there is no exposure to choose: the error is zero if the test is black
+    too, else LDR-FLIP between black and the test clipped to [0, 1].
+
+    Args:
+        ref: `[H, W, 3]`, linear RGB.
+        test: `[H, W, 3]`, linear RGB.
+        mask: `[H, W]`, true where a texel counts; None for all.
+        exposures: Number of exposures, at least 2; the time grows with it.
+
+    Returns:
+        `[H, W]` float64 in [0, 1], 0 where nothing is seen to differ.
+
+    Raises:
+        WlmError: Shapes differ, the images are not RGB, a valid texel is NaN or infinite, or there are fewer
+            than two exposures.
+    """
+    ref, test, valid = check_pair(ref, test, mask, "flip")
+    if not valid.any():
+        return np.zeros(valid.shape)
+    filled = fill_gaps(ref, valid)
+    same_outside = np.where(valid[..., None], test, filled)
+    return flip_filled(filled, same_outside, flip_exposures(ref, valid), exposures)
+
+
+def flip_filled(
+    ref: np.ndarray, test: np.ndarray, span: tuple[float, float] | None, exposures: int
+) -> np.ndarray:
+    """`flip_map` for images that are checked and equal outside the mask; `span` is `flip_exposures`'."""
+    import flip_evaluator  # here for the same reason as scikit-image in structural.py
+
+    _check_rgb(ref)
+    if exposures < _MIN_EXPOSURES:
+        raise WlmError(f"flip: expected at least {_MIN_EXPOSURES} exposures, got {exposures}")
+    test = np.maximum(test, 0.0)
+    if span is None:
+        if not test.any():
+            return np.zeros(ref.shape[:2])
+        black = np.zeros(ref.shape, np.float32)
+        shown = np.clip(test, 0.0, 1.0).astype(np.float32)
+        error, _, _ = flip_evaluator.evaluate(
+            black, shown, "LDR", inputsRGB=False, applyMagma=False, computeMeanError=False
+        )
+        return error[..., 0].astype(np.float64)
+    start, stop = span
+    # One power of two moves the images and the exposures alike, so the result is the same, while float32
+    # inputs stay far from overflow and from subnormals however bright or dim the scene is.
+    shift = round(start)
+    scale = 2.0**shift
+    ceiling = 2.0 ** (_EXPOSED_LIMIT - (stop - shift))
+    error, _, _ = flip_evaluator.evaluate(
+        np.minimum(np.maximum(ref, 0.0) * scale, ceiling).astype(np.float32),
+        np.minimum(test * scale, ceiling).astype(np.float32),
+        "HDR",
+        applyMagma=False,
+        computeMeanError=False,
+        parameters={"startExposure": start - shift, "stopExposure": stop - shift, "numExposures": exposures},
+    )
+    return error[..., 0].astype(np.float64)
+
+
+def _check_rgb(image: np.ndarray) -> None:
+    if image.shape[2] != 3:
+        raise WlmError(f"flip: expected RGB images [H, W, 3], got {image.shape}")

@@ -1,0 +1,264 @@
+"""The protocol of neural-dynamic-gi, section 10.2: scores for each tile, averaged over tiles and lightmaps.
+
+Each lightmap is cut into non-overlapping tiles (128x128). In each tile the metric is taken over the texels
+that the mask calls valid, with the tile's own dynamic range (maximum less minimum of the valid reference, all
+channels) as the scale, in linear RGB. The report is the mean over all tiles of all lightmaps of a scene.
+
+What the paper leaves open is settled so: a tile with fewer than `MIN_VALID_TEXELS` valid texels or a range of
+zero has no score, and is counted; PSNR is capped at `PSNR_CAP_DB`; a tile whose range is a few half-float
+steps is in the mean, and the mean without such tiles stands beside it; FLIP, which depends on a neighbourhood
+and on the display and not on a range, is computed over the whole lightmap and its map averaged in each tile;
+the paper's LPIPS, a network trained on display-referred photographs, gives way to FLIP.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from wlm.errors import WlmError
+from wlm.imageops import fill_gaps
+from wlm.metrics.error import check_pair, half_ulp, psnr_from_mse
+from wlm.metrics.flip import flip_exposures, flip_filled
+from wlm.metrics.structural import ssim_filled
+
+__all__ = [
+    "FORMAT_LIMITED_ULPS",
+    "METRICS",
+    "MIN_VALID_TEXELS",
+    "FrameMetrics",
+    "Summary",
+    "evaluate_frame",
+    "summarise",
+]
+
+METRICS = ("psnr", "ssim", "flip")
+# Four 4x4 blocks: below that one bad block is the tile's whole score.
+MIN_VALID_TEXELS = 64
+# A tile that spans up to this many half-float steps at its own brightest value can't score better than
+# rounding to half lets it (about 29 dB at 8 steps), however good the codec is.
+FORMAT_LIMITED_ULPS = 8
+
+
+@dataclass(frozen=True)
+class FrameMetrics:
+    """Scores of one lightmap, one entry a tile; every array is `[ny, nx]`, tile rows from the top.
+
+    Attributes:
+        psnr: Decibels; NaN where the tile is not scored or the metric was not asked for.
+        ssim: In [-1, 1]; NaN likewise, and where the tile is too small for the window.
+        flip: Mean FLIP error in [0, 1]; NaN likewise.
+        max_abs_error: Largest absolute error in the images' units, for every tile with a valid texel, scored
+            or not; NaN without one.
+        range: Dynamic range in the images' units; NaN without a valid texel.
+        half_step: Half float's step at the tile's largest magnitude, in the images' units; NaN without a
+            valid texel.
+        valid: Number of valid texels.
+        metrics: The metrics that were asked for.
+    """
+
+    psnr: np.ndarray
+    ssim: np.ndarray
+    flip: np.ndarray
+    max_abs_error: np.ndarray
+    range: np.ndarray
+    half_step: np.ndarray
+    valid: np.ndarray
+    metrics: tuple[str, ...]
+
+    @property
+    def scored(self) -> np.ndarray:
+        """`[ny, nx]` bool: tiles that count in the means."""
+        return (self.valid >= MIN_VALID_TEXELS) & (self.range > 0.0)
+
+    @property
+    def format_limited(self) -> np.ndarray:
+        """`[ny, nx]` bool: scored tiles whose range is at most `FORMAT_LIMITED_ULPS` half-float steps."""
+        return self.scored & (self.range <= FORMAT_LIMITED_ULPS * self.half_step)
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Means over the scored tiles of all lightmaps of a scene. A mean over no tile is NaN.
+
+    Attributes:
+        psnr, ssim, flip: Mean over every scored tile of every lightmap.
+        psnr_unlimited: The same mean of PSNR without the tiles in `format_limited`.
+        psnr_by_tile, ssim_by_tile, flip_by_tile: `[ny, nx]`, mean over the lightmaps.
+        psnr_by_time, ssim_by_time, flip_by_time: `[T]`, mean over the tiles of one lightmap.
+        worst_psnr: Lowest PSNR of a tile.
+        worst_tile: `(lightmap, tile row, tile column)` of it; None where nothing is scored.
+        max_abs_error: Largest absolute error of a valid texel, scored or not, in the images' units.
+        max_abs_error_unscored: The same over the tiles left out, so that an error there does not hide.
+        tiles: Number of tiles in all lightmaps.
+        scored: Number that count in the means.
+        few_texels: Number left out with fewer than `MIN_VALID_TEXELS` valid texels, empty ones among them.
+        zero_range: Number left out because the reference is constant.
+        no_ssim: Scored tiles without an SSIM (no valid texel has its window inside the tile); 0 if not asked
+            for.
+        format_limited: `(lightmap, tile row, tile column)` of each scored tile that spans only a few
+            half-float steps.
+    """
+
+    psnr: float
+    ssim: float
+    flip: float
+    psnr_unlimited: float
+    psnr_by_tile: np.ndarray
+    ssim_by_tile: np.ndarray
+    flip_by_tile: np.ndarray
+    psnr_by_time: np.ndarray
+    ssim_by_time: np.ndarray
+    flip_by_time: np.ndarray
+    worst_psnr: float
+    worst_tile: tuple[int, int, int] | None
+    max_abs_error: float
+    max_abs_error_unscored: float
+    tiles: int
+    scored: int
+    few_texels: int
+    zero_range: int
+    no_ssim: int
+    format_limited: list[tuple[int, int, int]]
+
+
+def evaluate_frame(
+    ref: np.ndarray,
+    test: np.ndarray,
+    mask: np.ndarray,
+    tile: int = 128,
+    metrics: Sequence[str] = METRICS,
+    flip_exposure_count: int = 2,
+    name: str = "lightmap",
+) -> FrameMetrics:
+    """Score one lightmap tile by tile (neural-dynamic-gi, section 10.2, as this module settles it).
+
+    Args:
+        ref: `[H, W, 3]`, linear RGB, any float dtype. Texels outside the mask are ignored.
+        test: `[H, W, 3]`, linear RGB.
+        mask: `[H, W]`, true where a texel is valid.
+        tile: Side of a tile in texels; tiles at the right and the bottom edge are smaller where it does not
+            divide.
+        metrics: Any of `METRICS`. FLIP takes most of the time.
+        flip_exposure_count: Exposures for HDR-FLIP, at least 2.
+        name: What to call this lightmap in a message.
+
+    Returns:
+        Scores for each tile.
+
+    Raises:
+        WlmError: Shapes differ, a valid texel of either image is NaN or infinite, or an argument is out of
+            range.
+    """
+    unknown = [metric for metric in metrics if metric not in METRICS]
+    if unknown:
+        raise WlmError(f"{name}: unknown metric {unknown[0]!r}, expected some of {', '.join(METRICS)}")
+    if tile < 1:
+        raise WlmError(f"{name}: expected a tile of at least 1 texel, got {tile}")
+    ref, test, valid = check_pair(ref, test, mask, name)
+    if "ssim" in metrics or "flip" in metrics:
+        ref = fill_gaps(ref, valid)
+    test = np.where(valid[..., None], test, ref)
+
+    height, width = valid.shape
+    shape = (-(-height // tile), -(-width // tile))
+    result = FrameMetrics(
+        *(np.full(shape, math.nan) for _ in range(6)),
+        valid=np.zeros(shape, np.int64),
+        metrics=tuple(metrics),
+    )
+    error = None
+    if "flip" in metrics and valid.any():
+        error = flip_filled(ref, test, flip_exposures(ref, valid), flip_exposure_count)
+
+    for index in np.ndindex(shape):
+        area = tuple(slice(i * tile, (i + 1) * tile) for i in index)
+        inside = valid[area]
+        count = np.count_nonzero(inside)
+        result.valid[index] = count
+        if count == 0:
+            continue
+        a, b = ref[area][inside], test[area][inside]
+        span = float(np.ptp(a))
+        result.range[index] = span
+        result.half_step[index] = half_ulp(np.abs(a).max())
+        result.max_abs_error[index] = np.abs(a - b).max()
+        if count < MIN_VALID_TEXELS or span == 0.0:
+            continue
+        if "psnr" in metrics:
+            result.psnr[index] = psnr_from_mse(float(np.mean(np.square(a - b))), span)
+        if "ssim" in metrics:
+            result.ssim[index] = ssim_filled(ref[area], test[area], inside, span)
+        if error is not None:
+            result.flip[index] = error[area][inside].mean()
+    return result
+
+
+def summarise(frames: Sequence[FrameMetrics]) -> Summary:
+    """Average the scores of a scene's lightmaps over all tiles and lightmaps.
+
+    Args:
+        frames: One `FrameMetrics` a lightmap, all of one grid of tiles and the same metrics, in the order of
+            time.
+
+    Returns:
+        Means, means by tile and by time, the worst tile, and what was left out and why.
+
+    Raises:
+        WlmError: No frames, or frames of different grids or metrics.
+    """
+    if not frames:
+        raise WlmError("summarise: expected at least one lightmap's metrics")
+    first = frames[0]
+    if any(f.valid.shape != first.valid.shape or set(f.metrics) != set(first.metrics) for f in frames):
+        raise WlmError("summarise: lightmaps differ in size or metrics; summarise each kind on its own")
+
+    psnr, ssim, flip, errors = (
+        np.stack([getattr(f, field) for f in frames]) for field in ("psnr", "ssim", "flip", "max_abs_error")
+    )
+    valid = np.stack([f.valid for f in frames])
+    scored = np.stack([f.scored for f in frames])
+    limited = np.stack([f.format_limited for f in frames])
+    enough = valid >= MIN_VALID_TEXELS
+
+    worst_tile = None
+    if not np.isnan(psnr).all():
+        worst_tile = tuple(int(i) for i in np.unravel_index(np.nanargmin(psnr), psnr.shape))
+    return Summary(
+        psnr=float(_nanmean(psnr)),
+        ssim=float(_nanmean(ssim)),
+        flip=float(_nanmean(flip)),
+        psnr_unlimited=float(_nanmean(np.where(limited, math.nan, psnr))),
+        psnr_by_tile=_nanmean(psnr, axis=0),
+        ssim_by_tile=_nanmean(ssim, axis=0),
+        flip_by_tile=_nanmean(flip, axis=0),
+        psnr_by_time=_nanmean(psnr, axis=(1, 2)),
+        ssim_by_time=_nanmean(ssim, axis=(1, 2)),
+        flip_by_time=_nanmean(flip, axis=(1, 2)),
+        worst_psnr=math.nan if worst_tile is None else float(psnr[worst_tile]),
+        worst_tile=worst_tile,
+        max_abs_error=_nanmax(errors),
+        max_abs_error_unscored=_nanmax(errors[~scored]),
+        tiles=scored.size,
+        scored=int(scored.sum()),
+        few_texels=int((~enough).sum()),
+        zero_range=int((enough & ~scored).sum()),
+        no_ssim=int((scored & np.isnan(ssim)).sum()) if "ssim" in first.metrics else 0,
+        format_limited=[tuple(int(i) for i in where) for where in np.argwhere(limited)],
+    )
+
+
+def _nanmean(values: np.ndarray, axis: int | tuple[int, ...] | None = None) -> np.ndarray:
+    """`np.nanmean` without its warning: a mean over nothing is NaN and is expected here."""
+    known = ~np.isnan(values)
+    count = known.sum(axis=axis)
+    total = np.where(known, values, 0.0).sum(axis=axis)
+    return np.where(count > 0, total / np.maximum(count, 1), math.nan)
+
+
+def _nanmax(values: np.ndarray) -> float:
+    known = values[~np.isnan(values)]
+    return float(known.max()) if known.size else math.nan

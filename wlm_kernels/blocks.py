@@ -1,0 +1,279 @@
+"""Feature maps stored as BC7 mode 6 blocks: endpoints and weights, their exact levels, and sampling.
+
+A map of 4 channels is cut into blocks of 4x4 texels. A block holds two endpoints ``e0, e1`` in [0, 1]^4 and one
+weight in [0, 1] a texel; a texel is ``(1 - w) e0 + w e1`` (neural-dynamic-gi, eq. 7 and 8). BC7 mode 6 stores the
+endpoints with 7 bits a channel plus one lowest bit shared by the four channels, and the weights with 4 bits.
+
+``quantised=1`` evaluates the map on exactly those levels, so that what is trained is what the file decodes to; the
+adjoint is straight-through: each rounding has derivative 1, and values outside [0, 1] keep their gradient, so that
+Adam can bring them back.
+
+Arrays: endpoints ``[S, H/4, W/4, 2]`` of vec4, weights ``[S, H, W]``, where S counts slices (tiles, or tiles x
+times). Blocks of the file are ``[S, H/4, W/4, 2]`` of uint64, the low and the high half of 16 little-endian bytes.
+"""
+
+import warp as wp
+
+__all__ = ["quantise", "reconstruct", "sample"]
+
+WEIGHT_LEVELS = 15  # highest 4-bit index of a texel
+WEIGHT_UNIT = 64.0  # BC7 interpolates with weights of 1/64
+
+
+@wp.func
+def weight_index(w: float) -> int:
+    """The 4-bit index of a weight; index i stands for the level (64 i + 7) // 15 of 64."""
+    return int(wp.floor(wp.clamp(w, 0.0, 1.0) * 15.0 + 0.5))
+
+
+@wp.func
+def index_level(index: int) -> int:
+    return (index * 64 + 7) // 15
+
+
+@wp.func
+def ste_weight(w: float, quantised: int) -> float:
+    """The weight as used: clamped, or on its exact level of 64ths. Straight-through."""
+    if quantised == 0:
+        return wp.clamp(w, 0.0, 1.0)
+    return float(index_level(weight_index(w))) / 64.0
+
+
+@wp.func_grad(ste_weight)
+def _adj_ste_weight(w: float, quantised: int, adj_ret: float):
+    wp.adjoint[w] += adj_ret
+
+
+@wp.func
+def endpoint_with_bit(v: wp.vec4, bit: float) -> wp.vec4:
+    q = wp.vec4()
+    for c in range(4):
+        q[c] = wp.clamp(wp.floor((v[c] - bit) * 0.5 + 0.5), 0.0, 127.0) * 2.0 + bit
+    return q
+
+
+@wp.func
+def endpoint_byte(e: wp.vec4) -> wp.vec4:
+    """The stored bytes (as floats 0..255) of an endpoint: the better of the two shared lowest bits."""
+    v = wp.vec4(
+        wp.clamp(e[0], 0.0, 1.0) * 255.0,
+        wp.clamp(e[1], 0.0, 1.0) * 255.0,
+        wp.clamp(e[2], 0.0, 1.0) * 255.0,
+        wp.clamp(e[3], 0.0, 1.0) * 255.0,
+    )
+    even = endpoint_with_bit(v, 0.0)
+    odd = endpoint_with_bit(v, 1.0)
+    if wp.length_sq(odd - v) < wp.length_sq(even - v):
+        return odd
+    return even
+
+
+@wp.func
+def ste_endpoint(e: wp.vec4, quantised: int) -> wp.vec4:
+    """The endpoint as used, in [0, 1]: clamped, or on its exact bytes over 255. Straight-through."""
+    if quantised == 0:
+        return wp.vec4(
+            wp.clamp(e[0], 0.0, 1.0),
+            wp.clamp(e[1], 0.0, 1.0),
+            wp.clamp(e[2], 0.0, 1.0),
+            wp.clamp(e[3], 0.0, 1.0),
+        )
+    return endpoint_byte(e) / 255.0
+
+
+@wp.func_grad(ste_endpoint)
+def _adj_ste_endpoint(e: wp.vec4, quantised: int, adj_ret: wp.vec4):
+    wp.adjoint[e] += adj_ret
+
+
+@wp.func
+def byte_mix(a: float, b: float, w: float) -> float:
+    """BC7's integer interpolation of two bytes with a weight in 64ths, exact in float32."""
+    return wp.floor(((64.0 - w) * a + w * b + 32.0) / 64.0)
+
+
+@wp.func
+def ste_mix(e0: wp.vec4, e1: wp.vec4, w: float, quantised: int) -> wp.vec4:
+    """(1 - w) e0 + w e1 (eq. 8); when quantised, rounded to bytes as the hardware decoder does."""
+    if quantised == 0:
+        return (1.0 - w) * e0 + w * e1
+    a = e0 * 255.0
+    b = e1 * 255.0
+    k = wp.floor(w * 64.0 + 0.5)
+    # e * 255 is an integer up to float rounding: round first, so that the floor below can't slip.
+    return (
+        wp.vec4(
+            byte_mix(wp.floor(a[0] + 0.5), wp.floor(b[0] + 0.5), k),
+            byte_mix(wp.floor(a[1] + 0.5), wp.floor(b[1] + 0.5), k),
+            byte_mix(wp.floor(a[2] + 0.5), wp.floor(b[2] + 0.5), k),
+            byte_mix(wp.floor(a[3] + 0.5), wp.floor(b[3] + 0.5), k),
+        )
+        / 255.0
+    )
+
+
+@wp.func_grad(ste_mix)
+def _adj_ste_mix(e0: wp.vec4, e1: wp.vec4, w: float, quantised: int, adj_ret: wp.vec4):
+    wp.adjoint[e0] += (1.0 - w) * adj_ret
+    wp.adjoint[e1] += w * adj_ret
+    wp.adjoint[w] += wp.dot(e1 - e0, adj_ret)
+
+
+@wp.func
+def texel(
+    endpoints: wp.array4d[wp.vec4], weights: wp.array3d[float], s: int, y: int, x: int, quantised: int
+) -> wp.vec4:
+    """The texel (y, x) of slice s of a map in training."""
+    e0 = ste_endpoint(endpoints[s, y // 4, x // 4, 0], quantised)
+    e1 = ste_endpoint(endpoints[s, y // 4, x // 4, 1], quantised)
+    return ste_mix(e0, e1, ste_weight(weights[s, y, x], quantised), quantised)
+
+
+@wp.func
+def bits7(word: wp.uint64, at: int) -> float:
+    return float(int(wp.rshift(word, wp.uint64(at)) & wp.uint64(127)))
+
+
+@wp.func
+def stored_texel(blocks: wp.array4d[wp.uint64], s: int, y: int, x: int) -> wp.vec4:
+    """The texel (y, x) of slice s of a map in the file's bytes: BC7 mode 6, in [0, 1]."""
+    low = blocks[s, y // 4, x // 4, 0]
+    high = blocks[s, y // 4, x // 4, 1]
+    p0 = float(int(wp.rshift(low, wp.uint64(63))))
+    p1 = float(int(high & wp.uint64(1)))
+    i = (y % 4) * 4 + x % 4
+    index = int(wp.rshift(high, wp.uint64(4 * i)) & wp.uint64(15))
+    if i == 0:  # the anchor has 3 bits, its top bit is always 0; bit 0 of the word is P1
+        index = int(wp.rshift(high, wp.uint64(1)) & wp.uint64(7))
+    k = float(index_level(index))
+    return (
+        wp.vec4(
+            byte_mix(bits7(low, 7) * 2.0 + p0, bits7(low, 14) * 2.0 + p1, k),
+            byte_mix(bits7(low, 21) * 2.0 + p0, bits7(low, 28) * 2.0 + p1, k),
+            byte_mix(bits7(low, 35) * 2.0 + p0, bits7(low, 42) * 2.0 + p1, k),
+            byte_mix(bits7(low, 49) * 2.0 + p0, bits7(low, 56) * 2.0 + p1, k),
+        )
+        / 255.0
+    )
+
+
+@wp.kernel
+def _reconstruct(
+    # in:
+    endpoints: wp.array4d[wp.vec4],
+    weights: wp.array3d[float],
+    quantised: int,
+    # out:
+    out: wp.array3d[wp.vec4],
+):
+    s, y, x = wp.tid()
+    out[s, y, x] = texel(endpoints, weights, s, y, x, quantised)
+
+
+@wp.kernel
+def _sample(
+    # in:
+    endpoints: wp.array4d[wp.vec4],
+    weights: wp.array3d[float],
+    slices: wp.array1d[int],
+    points: wp.array1d[wp.vec2],
+    quantised: int,
+    # out:
+    out: wp.array1d[wp.vec4],
+):
+    i = wp.tid()
+    s = slices[i]
+    height = weights.shape[1]
+    width = weights.shape[2]
+    p = points[i]
+    x = p[0] * float(width) - 0.5
+    y = p[1] * float(height) - 0.5
+    x0 = int(wp.floor(x))
+    y0 = int(wp.floor(y))
+    fx = x - float(x0)
+    fy = y - float(y0)
+    xa = wp.clamp(x0, 0, width - 1)
+    xb = wp.clamp(x0 + 1, 0, width - 1)
+    ya = wp.clamp(y0, 0, height - 1)
+    yb = wp.clamp(y0 + 1, 0, height - 1)
+    top = (1.0 - fx) * texel(endpoints, weights, s, ya, xa, quantised) + fx * texel(
+        endpoints, weights, s, ya, xb, quantised
+    )
+    bottom = (1.0 - fx) * texel(endpoints, weights, s, yb, xa, quantised) + fx * texel(
+        endpoints, weights, s, yb, xb, quantised
+    )
+    out[i] = (1.0 - fy) * top + fy * bottom
+
+
+@wp.kernel(enable_backward=False)
+def _quantise(
+    # in:
+    endpoints: wp.array4d[wp.vec4],
+    weights: wp.array3d[float],
+    # out:
+    bytes_out: wp.array4d[wp.vec4ub],
+    index_out: wp.array3d[wp.uint8],
+):
+    s, y, x = wp.tid()
+    index_out[s, y, x] = wp.uint8(weight_index(weights[s, y, x]))
+    if x % 4 == 0 and y % 4 < 2:  # two of a block's texels write one endpoint each
+        q = endpoint_byte(endpoints[s, y // 4, x // 4, y % 4])
+        bytes_out[s, y // 4, x // 4, y % 4] = wp.vec4ub(
+            wp.uint8(q[0]), wp.uint8(q[1]), wp.uint8(q[2]), wp.uint8(q[3])
+        )
+
+
+def reconstruct(endpoints, weights, out, quantised: bool = False) -> None:
+    """Writes a whole map from its endpoints and weights (eq. 8); recorded by an open ``wp.Tape``.
+
+    Args:
+        endpoints: vec4 [S, H/4, W/4, 2], in [0, 1].
+        weights: float [S, H, W], in [0, 1].
+        out: vec4 [S, H, W].
+        quantised: Evaluate on the exact levels of BC7 mode 6; the adjoint is straight-through.
+    """
+    wp.launch(
+        _reconstruct,
+        weights.shape,
+        inputs=[endpoints, weights, int(quantised)],
+        outputs=[out],
+        device=weights.device,
+    )
+
+
+def sample(endpoints, weights, slices, points, out, quantised: bool = False) -> None:
+    """Samples a map bilinearly, clamped at its border; recorded by an open ``wp.Tape``.
+
+    Args:
+        endpoints: vec4 [S, H/4, W/4, 2], in [0, 1].
+        weights: float [S, H, W], in [0, 1].
+        slices: int [N], the slice of each point.
+        points: vec2 [N], (u, v) in [0, 1]; the centre of texel (y, x) is ((x + 1/2) / W, (y + 1/2) / H).
+        out: vec4 [N].
+        quantised: Evaluate on the exact levels of BC7 mode 6; the adjoint is straight-through.
+    """
+    wp.launch(
+        _sample,
+        len(points),
+        inputs=[endpoints, weights, slices, points, int(quantised)],
+        outputs=[out],
+        device=weights.device,
+    )
+
+
+def quantise(endpoints, weights, bytes_out, index_out) -> None:
+    """The integers that the file stores: the levels on which ``quantised=True`` evaluates.
+
+    Args:
+        endpoints: vec4 [S, H/4, W/4, 2].
+        weights: float [S, H, W].
+        bytes_out: vec4ub [S, H/4, W/4, 2], each endpoint's bytes with their shared lowest bit.
+        index_out: uint8 [S, H, W], 0 to 15.
+    """
+    wp.launch(
+        _quantise,
+        weights.shape,
+        inputs=[endpoints, weights],
+        outputs=[bytes_out, index_out],
+        device=weights.device,
+    )
