@@ -16,9 +16,6 @@ import warp as wp
 
 __all__ = ["quantise", "reconstruct", "sample"]
 
-WEIGHT_LEVELS = 15  # highest 4-bit index of a texel
-WEIGHT_UNIT = 64.0  # BC7 interpolates with weights of 1/64
-
 
 @wp.func
 def weight_index(w: float) -> int:
@@ -218,9 +215,7 @@ def _quantise(
     index_out[s, y, x] = wp.uint8(weight_index(weights[s, y, x]))
     if x % 4 == 0 and y % 4 < 2:  # two of a block's texels write one endpoint each
         q = endpoint_byte(endpoints[s, y // 4, x // 4, y % 4])
-        bytes_out[s, y // 4, x // 4, y % 4] = wp.vec4ub(
-            wp.uint8(q[0]), wp.uint8(q[1]), wp.uint8(q[2]), wp.uint8(q[3])
-        )
+        bytes_out[s, y // 4, x // 4, y % 4] = wp.vec4ub(wp.uint8(q[0]), wp.uint8(q[1]), wp.uint8(q[2]), wp.uint8(q[3]))
 
 
 def reconstruct(endpoints, weights, out, quantised: bool = False) -> None:

@@ -24,14 +24,7 @@ __all__ = ["GELUS", "MlpKernels", "activate", "kernels", "linear", "parameter_co
 GELUS = ("exact", "tanh", "fast")
 
 
-@wp.func
-def gelu_exact(x: float) -> float:
-    return 0.5 * x * (1.0 + wp.erf(x * 0.7071067811865476))
-
-
-@wp.func
-def gelu_exact_slope(x: float) -> float:
-    return 0.5 * (1.0 + wp.erf(x * 0.7071067811865476)) + x * 0.3989422804014327 * wp.exp(-0.5 * x * x)
+# GELU is x gate(x). Its derivative is made of the same gate, so that training evaluates each erf or tanh once.
 
 
 @wp.func_native("""
@@ -46,35 +39,39 @@ def gelu_exact_slope(x: float) -> float:
 def fast_tanh(x: float) -> float: ...
 
 
+@wp.func
+def gate_exact(x: float) -> float:
+    return 0.5 + 0.5 * wp.erf(x * 0.7071067811865476)
+
+
+@wp.func
+def slope_exact(x: float, gate: float) -> float:
+    return gate + x * 0.3989422804014327 * wp.exp(-0.5 * x * x)
+
+
 # In the tanh form x (0.79788 + 0.035677 x^2) is sqrt(2 / pi) (x + 0.044715 x^3).
 
 
 @wp.func
-def gelu_tanh(x: float) -> float:
-    return 0.5 * x * (1.0 + wp.tanh(x * (0.7978845608028654 + 0.035677408136300125 * x * x)))
+def gate_tanh(x: float) -> float:
+    return 0.5 + 0.5 * wp.tanh(x * (0.7978845608028654 + 0.035677408136300125 * x * x))
 
 
 @wp.func
-def gelu_tanh_slope(x: float) -> float:
-    t = wp.tanh(x * (0.7978845608028654 + 0.035677408136300125 * x * x))
-    return 0.5 * (1.0 + t) + 0.5 * x * (1.0 - t * t) * (0.7978845608028654 + 0.10703222440890037 * x * x)
+def gate_fast(x: float) -> float:
+    return 0.5 + 0.5 * fast_tanh(x * (0.7978845608028654 + 0.035677408136300125 * x * x))
 
 
 @wp.func
-def gelu_fast(x: float) -> float:
-    return 0.5 * x * (1.0 + fast_tanh(x * (0.7978845608028654 + 0.035677408136300125 * x * x)))
-
-
-@wp.func
-def gelu_fast_slope(x: float) -> float:
-    t = fast_tanh(x * (0.7978845608028654 + 0.035677408136300125 * x * x))
-    return 0.5 * (1.0 + t) + 0.5 * x * (1.0 - t * t) * (0.7978845608028654 + 0.10703222440890037 * x * x)
+def slope_tanh(x: float, gate: float) -> float:
+    # 1 - tanh^2 is 4 gate (1 - gate).
+    return gate + 2.0 * x * gate * (1.0 - gate) * (0.7978845608028654 + 0.10703222440890037 * x * x)
 
 
 _GELU = {
-    "exact": (gelu_exact, gelu_exact_slope),
-    "tanh": (gelu_tanh, gelu_tanh_slope),
-    "fast": (gelu_fast, gelu_fast_slope),
+    "exact": (gate_exact, slope_exact),
+    "tanh": (gate_tanh, slope_tanh),
+    "fast": (gate_fast, slope_tanh),
 }
 
 
@@ -88,7 +85,8 @@ class MlpKernels:
         vec_in: vec of I floats.
         vec_hidden: vec of H floats.
         first, second, third: ``wp.func`` of each layer before its activation.
-        act, act_slope: ``wp.func`` vecH -> vecH, GELU and its derivative.
+        act: ``wp.func`` vecH -> vecH, GELU.
+        gate, slope: ``wp.func``s with act(a) = a gate(a), and its derivative slope(a, gate(a)).
         back_hidden: ``wp.func``: delta of the second layer -> gradient of its input.
         back_output: ``wp.func``: delta of the third layer -> gradient of its input.
         back_input: ``wp.func``: delta of the first layer -> gradient of the network's input.
@@ -102,7 +100,8 @@ class MlpKernels:
     second: Any
     third: Any
     act: Any
-    act_slope: Any
+    gate: Any
+    slope: Any
     back_hidden: Any
     back_output: Any
     back_input: Any
@@ -170,7 +169,7 @@ def kernels(inputs: int, hidden: int, gelu: str = "exact") -> MlpKernels:
         raise ValueError(f"no MLP of {inputs} inputs, {hidden} units and GELU {gelu!r}")
     vec_in = wp.types.vector(inputs, float)
     vec_hidden = wp.types.vector(hidden, float)
-    gelu_of, slope_of = _GELU[gelu]
+    gate_of, slope_of = _GELU[gelu]
     bias_1 = inputs
     columns_2 = inputs + 1
     bias_2 = inputs + 1 + hidden
@@ -197,18 +196,22 @@ def kernels(inputs: int, hidden: int, gelu: str = "exact") -> MlpKernels:
         return y
 
     @wp.func
-    def act(a: vec_hidden) -> vec_hidden:
-        h = vec_hidden()
+    def gate(a: vec_hidden) -> vec_hidden:
+        g = vec_hidden()
         for j in range(wp.static(hidden)):
-            h[j] = gelu_of(a[j])
-        return h
+            g[j] = gate_of(a[j])
+        return g
 
     @wp.func
-    def act_slope(a: vec_hidden) -> vec_hidden:
-        h = vec_hidden()
+    def act(a: vec_hidden) -> vec_hidden:
+        return wp.cw_mul(a, gate(a))
+
+    @wp.func
+    def slope(a: vec_hidden, g: vec_hidden) -> vec_hidden:
+        s = vec_hidden()
         for j in range(wp.static(hidden)):
-            h[j] = slope_of(a[j])
-        return h
+            s[j] = slope_of(a[j], g[j])
+        return s
 
     @wp.func
     def back_hidden(w: wp.array2d[vec_hidden], n: int, delta: vec_hidden) -> vec_hidden:
@@ -263,13 +266,15 @@ def kernels(inputs: int, hidden: int, gelu: str = "exact") -> MlpKernels:
     ):
         n, b = wp.tid()
         a1 = first(w, n, x[n, b])
-        h1 = act(a1)
+        g1 = gate(a1)
+        h1 = wp.cw_mul(a1, g1)
         a2 = second(w, n, h1)
-        d2 = wp.cw_mul(back_output(o, n, grad_y[n, b]), act_slope(a2))
-        d1 = wp.cw_mul(back_hidden(w, n, d2), act_slope(a1))
+        g2 = gate(a2)
+        d2 = wp.cw_mul(back_output(o, n, grad_y[n, b]), slope(a2, g2))
+        d1 = wp.cw_mul(back_hidden(w, n, d2), slope(a1, g1))
         grad_x[n, b] = back_input(w, n, d1)
         h1_out[n, b] = h1
-        h2_out[n, b] = act(a2)
+        h2_out[n, b] = wp.cw_mul(a2, g2)
         d1_out[n, b] = d1
         d2_out[n, b] = d2
 
@@ -322,7 +327,8 @@ def kernels(inputs: int, hidden: int, gelu: str = "exact") -> MlpKernels:
         second,
         third,
         act,
-        act_slope,
+        gate,
+        slope,
         back_hidden,
         back_output,
         back_input,
@@ -355,7 +361,7 @@ def _linear(
 @wp.kernel
 def _gelu(x: wp.array2d[float], y: wp.array2d[float]):
     i, j = wp.tid()
-    y[i, j] = gelu_exact(x[i, j])
+    y[i, j] = x[i, j] * gate_exact(x[i, j])
 
 
 def linear(weights, first_row: int, bias_row: int, x, groups, y) -> None:

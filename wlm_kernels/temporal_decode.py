@@ -2,8 +2,8 @@
 
 ``exact_kernels`` evaluates a texel a thread, in the same order of operations as training. ``StripKernels`` is the
 runtime path: what depends on the time alone is done once a frame (the two slices of F_uvt are mixed, the planes and
-the encoded time pass the first layer for each column and row), and a thread decodes four texels in a row, so that each
-weight is loaded once for four.
+the encoded time pass the first layer for each column), and a thread decodes four texels, so that each weight is loaded
+once for four.
 """
 
 import functools
@@ -15,7 +15,7 @@ import warp as wp
 from wlm_kernels import mlp
 from wlm_kernels.blocks import bits7, byte_mix, index_level, stored_texel
 from wlm_kernels.grids import axis_index, cell, fraction
-from wlm_kernels.temporal import STATIC_INPUTS, TEMPORAL_INPUTS
+from wlm_kernels.temporal import CENTRE, STATIC_INPUTS, TEMPORAL_INPUTS
 
 __all__ = ["Look", "Stored", "StripKernels", "exact_kernels", "strip_kernels"]
 
@@ -122,8 +122,9 @@ def exact_kernels(temporal: bool, hidden: int, gelu: str) -> tuple[Any, Any]:
         gelu: One of ``mlp.GELUS``.
 
     Returns:
-        Two kernels over (tiles, 128, 128) with inputs ``Stored``, hidden vecH [N, I + H + 2], output vec3 [N, H + 1],
-        ``Look``, rows int [N] (each tile's place in ``Look``) and tiles int [n], and one output [n, 128, 128]: linear radiance as vec3, or 8-bit colour as vec4ub.
+        Two kernels over (tiles, 128, 128). Their inputs are ``Stored``, hidden vecH [N, I + H + 2], output vec3
+        [N, H + 1], ``Look``, rows int [N] (each tile's place in ``Look``) and tiles int [n]. Their one output is
+        [n, 128, 128]: linear radiance as vec3, or 8-bit colour as vec4ub.
     """
     inputs = TEMPORAL_INPUTS if temporal else STATIC_INPUTS
     centred = 12 if temporal else 4
@@ -152,7 +153,7 @@ def exact_kernels(temporal: bool, hidden: int, gelu: str) -> tuple[Any, Any]:
                 f[8 + c] = ut[c]
                 f[10 + c] = vt[c]
         for c in range(wp.static(centred)):
-            f[c] = (f[c] + 0.0 - 0.5) * 3.4641016151377544
+            f[c] = (f[c] + 0.0 - 0.5) * CENTRE
         return third(o, n, act(second(w, n, act(first(w, n, f)))))
 
     options = {"enable_backward": False}
@@ -208,12 +209,12 @@ def _frame_volume(
     sa = n * stored.slices + axis_index(t, stored.slices, stored.periodic)
     sb = n * stored.slices + axis_index(t + 1, stored.slices, stored.periodic)
     f = (1.0 - ft) * stored_texel(stored.uvt, sa, y, x) + ft * stored_texel(stored.uvt, sb, y, x)
-    volume[n, y, x] = (f - wp.vec4(0.5)) * 3.4641016151377544
+    volume[n, y, x] = (f - wp.vec4(0.5)) * CENTRE
 
 
 @dataclass(frozen=True)
 class StripKernels:
-    """The runtime path of one network shape: ``frame`` once a frame, then ``decode``."""
+    """The runtime path of one network shape; see ``decode``."""
 
     hidden: int
     vec_hidden: Any
@@ -224,12 +225,13 @@ class StripKernels:
         """Decodes tiles to 8-bit colour at one time.
 
         Args:
-            stored: ``Stored``.
+            stored: ``Stored``, dynamic tiles.
             hidden: vecH [N, I + H + 2].
             output: vec3 [N, H + 1].
             look: ``Look``.
             volume: vec4 [N, R, R], scratch.
-            columns, rows: vecH [N, 128], scratch.
+            columns: float [N, H, 128], scratch.
+            rows: vec2 [N, 128], scratch.
             places: int [N], each tile's place in ``look``.
             tiles: int [n], the tiles wanted. The scratch of all N is filled.
             out: uint32 [n, 128, 128], RGBA from the lowest byte.
@@ -238,14 +240,14 @@ class StripKernels:
         wp.launch(_frame_volume, volume.shape, inputs=[stored, look.tau], outputs=[volume], device=device)
         wp.launch(
             self._frame_lines,
-            columns.shape,
+            rows.shape,
             inputs=[stored, hidden, look],
             outputs=[columns, rows],
             device=device,
         )
         wp.launch(
             self._decode,
-            (out.shape[0], 128, 32),
+            (out.shape[0], 32, 128),
             inputs=[stored, hidden, output, look, volume, columns, rows, places, tiles],
             outputs=[out],
             device=device,
@@ -253,9 +255,56 @@ class StripKernels:
         )
 
 
+@wp.func
+def pack(v: wp.vec4ub) -> wp.uint32:
+    return (
+        wp.uint32(v[0])
+        | wp.lshift(wp.uint32(v[1]), wp.uint32(8))
+        | wp.lshift(wp.uint32(v[2]), wp.uint32(16))
+        | wp.lshift(wp.uint32(v[3]), wp.uint32(24))
+    )
+
+
+@wp.func
+def centred_texel(a: wp.vec4, b: wp.vec4, high: wp.uint64, i: int) -> wp.vec4:
+    """Texel i of a block with endpoint bytes a and b, as it enters the network."""
+    index = int(wp.rshift(high, wp.uint64(4 * i)) & wp.uint64(15))
+    if i == 0:
+        index = int(wp.rshift(high, wp.uint64(1)) & wp.uint64(7))
+    k = float(index_level(index))
+    f = wp.vec4(byte_mix(a[0], b[0], k), byte_mix(a[1], b[1], k), byte_mix(a[2], b[2], k), byte_mix(a[3], b[3], k))
+    return f * 0.013584712361323677 - wp.vec4(1.7320508075688772)  # (f / 255 - 1/2) sqrt(12)
+
+
+@wp.func
+def frame_volume_at(volume: wp.array3d[wp.vec4], n: int, y: int, x: int) -> wp.vec4:
+    size = volume.shape[1]
+    u = (float(x) + 0.5) / 128.0
+    v = (float(y) + 0.5) / 128.0
+    x0 = cell(u, size)
+    y0 = cell(v, size)
+    fx = fraction(u, size)
+    fy = fraction(v, size)
+    xa = wp.max(x0, 0)
+    xb = wp.min(x0 + 1, size - 1)
+    ya = wp.max(y0, 0)
+    yb = wp.min(y0 + 1, size - 1)
+    top = (1.0 - fx) * volume[n, ya, xa] + fx * volume[n, ya, xb]
+    bottom = (1.0 - fx) * volume[n, yb, xa] + fx * volume[n, yb, xb]
+    return (1.0 - fy) * top + fy * bottom
+
+
+STRIP_BOUNDS = (128, 3)  # threads of a block, blocks of a multiprocessor: 168 registers a thread, no spills
+
+
 @functools.cache
 def strip_kernels(hidden: int, gelu: str) -> StripKernels:
-    """Builds (once) the runtime path for dynamic tiles of a hidden width."""
+    """Builds (once) the runtime path for dynamic tiles of a hidden width.
+
+    Args:
+        hidden: H, width of the hidden layers.
+        gelu: One of ``mlp.GELUS``.
+    """
     net = mlp.kernels(TEMPORAL_INPUTS, hidden, gelu)
     vec_hidden = net.vec_hidden
     act = net.act
@@ -268,10 +317,10 @@ def strip_kernels(hidden: int, gelu: str) -> StripKernels:
         w: wp.array2d[vec_hidden],
         look: Look,
         # out:
-        columns: wp.array2d[vec_hidden],
-        rows: wp.array2d[vec_hidden],
+        columns: wp.array3d[float],
+        rows: wp.array2d[wp.vec2],
     ):
-        """What the planes and the time add to the first layer, for each column and row."""
+        """What F_ut and the time add to the first layer of each column, and F_vt of each row, centred."""
         n, i = wp.tid()
         p = (float(i) + 0.5) / 128.0
         ut = stored_plane_at(stored.ut, n, p, look.tau, stored.periodic)
@@ -280,50 +329,12 @@ def strip_kernels(hidden: int, gelu: str) -> StripKernels:
         for c in range(4):
             h += w[n, 12 + c] * look.encoding[c]
         for c in range(2):
-            h += w[n, 8 + c] * ((ut[c] - 0.5) * 3.4641016151377544)
-        columns[n, i] = h
-        rows[n, i] = w[n, 10] * ((vt[0] - 0.5) * 3.4641016151377544) + w[n, 11] * (
-            (vt[1] - 0.5) * 3.4641016151377544
-        )
+            h += w[n, 8 + c] * ((ut[c] - 0.5) * CENTRE)
+        for j in range(wp.static(hidden)):
+            columns[n, j, i] = h[j]
+        rows[n, i] = (vt - wp.vec2(0.5)) * CENTRE
 
-    @wp.func
-    def volume_at(volume: wp.array3d[wp.vec4], n: int, y: int, x: int) -> wp.vec4:
-        size = volume.shape[1]
-        u = (float(x) + 0.5) / 128.0
-        v = (float(y) + 0.5) / 128.0
-        x0 = cell(u, size)
-        y0 = cell(v, size)
-        fx = fraction(u, size)
-        fy = fraction(v, size)
-        xa = wp.max(x0, 0)
-        xb = wp.min(x0 + 1, size - 1)
-        ya = wp.max(y0, 0)
-        yb = wp.min(y0 + 1, size - 1)
-        top = (1.0 - fx) * volume[n, ya, xa] + fx * volume[n, ya, xb]
-        bottom = (1.0 - fx) * volume[n, yb, xa] + fx * volume[n, yb, xb]
-        return (1.0 - fy) * top + fy * bottom
-
-    @wp.func
-    def pack(v: wp.vec4ub) -> wp.uint32:
-        return (
-            wp.uint32(v[0])
-            | wp.lshift(wp.uint32(v[1]), wp.uint32(8))
-            | wp.lshift(wp.uint32(v[2]), wp.uint32(16))
-            | wp.lshift(wp.uint32(v[3]), wp.uint32(24))
-        )
-
-    @wp.func
-    def mixed(a: wp.vec4, b: wp.vec4, high: wp.uint64, i: int) -> wp.vec4:
-        index = int(wp.rshift(high, wp.uint64(4 * i)) & wp.uint64(15))
-        if i == 0:
-            index = int(wp.rshift(high, wp.uint64(1)) & wp.uint64(7))
-        k = float(index_level(index))
-        f = wp.vec4(
-            byte_mix(a[0], b[0], k), byte_mix(a[1], b[1], k), byte_mix(a[2], b[2], k), byte_mix(a[3], b[3], k)
-        )
-        return f * 0.013584712361323677 - wp.vec4(1.7320508075688772)  # (f / 255 - 1/2) sqrt(12)
-
-    @wp.kernel(module="unique", module_options=options)
+    @wp.kernel(module="unique", module_options=options, launch_bounds=STRIP_BOUNDS)
     def decode(
         # in:
         stored: Stored,
@@ -331,58 +342,69 @@ def strip_kernels(hidden: int, gelu: str) -> StripKernels:
         o: wp.array2d[wp.vec3],
         look: Look,
         volume: wp.array3d[wp.vec4],
-        columns: wp.array2d[vec_hidden],
-        rows: wp.array2d[vec_hidden],
+        columns: wp.array3d[float],
+        rows: wp.array2d[wp.vec2],
         places: wp.array1d[int],
         tiles: wp.array1d[int],
         # out:
         out: wp.array3d[wp.uint32],
     ):
-        i, y, strip = wp.tid()
+        """A thread decodes the four texels of one column of a block; a warp's threads are neighbours in x."""
+        i, block, x = wp.tid()
         n = tiles[i]
         place = places[n]
-        x = strip * 4
-        low = stored.uv[n, y // 4, strip, 0]
-        high = stored.uv[n, y // 4, strip, 1]
+        y = block * 4
+        low = stored.uv[n, block, x // 4, 0]
+        high = stored.uv[n, block, x // 4, 1]
         p0 = float(int(wp.rshift(low, wp.uint64(63))))
         p1 = float(int(high & wp.uint64(1)))
         a = wp.vec4(bits7(low, 7), bits7(low, 21), bits7(low, 35), bits7(low, 49)) * 2.0 + wp.vec4(p0)
         b = wp.vec4(bits7(low, 14), bits7(low, 28), bits7(low, 42), bits7(low, 56)) * 2.0 + wp.vec4(p1)
-        at = (y % 4) * 4
-        f0 = mixed(a, b, high, at)
-        f1 = mixed(a, b, high, at + 1)
-        f2 = mixed(a, b, high, at + 2)
-        f3 = mixed(a, b, high, at + 3)
-        g0 = volume_at(volume, n, y, x)
-        g1 = volume_at(volume, n, y, x + 1)
-        g2 = volume_at(volume, n, y, x + 2)
-        g3 = volume_at(volume, n, y, x + 3)
-        line = rows[n, y]
-        h0 = line + columns[n, x]
-        h1 = line + columns[n, x + 1]
-        h2 = line + columns[n, x + 2]
-        h3 = line + columns[n, x + 3]
+        at = x % 4
+        f0 = centred_texel(a, b, high, at)
+        f1 = centred_texel(a, b, high, at + 4)
+        f2 = centred_texel(a, b, high, at + 8)
+        f3 = centred_texel(a, b, high, at + 12)
+        h0 = vec_hidden()
+        for j in range(wp.static(hidden)):
+            h0[j] = columns[n, j, x]
+        h1 = h0
+        h2 = h0
+        h3 = h0
         for c in range(4):
             column = w[n, c]
             h0 += column * f0[c]
             h1 += column * f1[c]
             h2 += column * f2[c]
             h3 += column * f3[c]
+        f0 = frame_volume_at(volume, n, y, x)
+        f1 = frame_volume_at(volume, n, y + 1, x)
+        f2 = frame_volume_at(volume, n, y + 2, x)
+        f3 = frame_volume_at(volume, n, y + 3, x)
         for c in range(4):
             column = w[n, 4 + c]
-            h0 += column * g0[c]
-            h1 += column * g1[c]
-            h2 += column * g2[c]
-            h3 += column * g3[c]
+            h0 += column * f0[c]
+            h1 += column * f1[c]
+            h2 += column * f2[c]
+            h3 += column * f3[c]
+        r0 = rows[n, y]
+        r1 = rows[n, y + 1]
+        r2 = rows[n, y + 2]
+        r3 = rows[n, y + 3]
+        for c in range(2):
+            column = w[n, 10 + c]
+            h0 += column * r0[c]
+            h1 += column * r1[c]
+            h2 += column * r2[c]
+            h3 += column * r3[c]
         h0 = act(h0)
         h1 = act(h1)
         h2 = act(h2)
         h3 = act(h3)
-        bias = w[n, wp.static(17 + hidden)]
-        k0 = bias
-        k1 = bias
-        k2 = bias
-        k3 = bias
+        k0 = w[n, wp.static(17 + hidden)]
+        k1 = k0
+        k2 = k0
+        k3 = k0
         for c in range(wp.static(hidden)):
             column = w[n, 17 + c]
             k0 += column * h0[c]
@@ -393,11 +415,10 @@ def strip_kernels(hidden: int, gelu: str) -> StripKernels:
         k1 = act(k1)
         k2 = act(k2)
         k3 = act(k3)
-        last = o[n, wp.static(hidden)]
-        y0 = last
-        y1 = last
-        y2 = last
-        y3 = last
+        y0 = o[n, wp.static(hidden)]
+        y1 = y0
+        y2 = y0
+        y3 = y0
         for c in range(wp.static(hidden)):
             colour = o[n, c]
             y0 += colour * k0[c]
@@ -405,8 +426,8 @@ def strip_kernels(hidden: int, gelu: str) -> StripKernels:
             y2 += colour * k2[c]
             y3 += colour * k3[c]
         out[i, y, x] = pack(finish_bytes(look, place, y0))
-        out[i, y, x + 1] = pack(finish_bytes(look, place, y1))
-        out[i, y, x + 2] = pack(finish_bytes(look, place, y2))
-        out[i, y, x + 3] = pack(finish_bytes(look, place, y3))
+        out[i, y + 1, x] = pack(finish_bytes(look, place, y1))
+        out[i, y + 2, x] = pack(finish_bytes(look, place, y2))
+        out[i, y + 3, x] = pack(finish_bytes(look, place, y3))
 
     return StripKernels(hidden, vec_hidden, frame_lines, decode)

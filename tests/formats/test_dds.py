@@ -53,11 +53,36 @@ def test_the_header_of_a_volume(tmp_path):
     assert data[148:] == _blocks(30)
 
 
+def test_a_volume_of_one_slice(tmp_path):
+    path = tmp_path / "a.dds"
+    write_dds(path, _blocks(2), width=8, height=4, volume=True)
+    data = path.read_bytes()
+    assert [_field(data, at) for at in (FLAGS, DEPTH, DIMENSION)] == [0x881007, 1, 4]
+    assert read_dds(path) == DdsTexture(8, 4, 1, "BC7_UNORM", True, _blocks(2))
+
+
+def test_two_bytes_a_texel(tmp_path):
+    path = tmp_path / "a.dds"
+    texels = bytes(range(2 * 3 * 5))
+    write_dds(path, texels, width=3, height=5, fmt="R8G8_UNORM")
+    data = path.read_bytes()
+    # DDSD_PITCH and the bytes of a row take the place of DDSD_LINEARSIZE and those of the texture.
+    assert [_field(data, at) for at in (FLAGS, PITCH, FORMAT, DIMENSION)] == [0x100F, 6, 49, 3]
+    assert data[148:] == texels
+    with pytest.raises(ValueError, match="expected 32 bytes, got 30"):
+        write_dds(path, texels, width=4, height=4, fmt="R8G8_UNORM")
+    path.write_bytes(data[:-1])
+    with pytest.raises(WlmError, match="expected 30 bytes of blocks, found 29"):
+        read_dds(path)
+
+
 @pytest.mark.parametrize("fmt", DXGI_FORMATS)
 @pytest.mark.parametrize("depth", [1, 3])
 def test_what_was_written_is_read(tmp_path, fmt, depth):
     path = tmp_path / "a.dds"
     blocks = _blocks(2 * 1 * depth)
+    if fmt == "R8G8_UNORM":
+        blocks = _blocks(3 * depth)[: 2 * 5 * 4 * depth]
     write_dds(path, blocks, width=5, height=4, depth=depth, fmt=fmt)
     assert read_dds(path) == DdsTexture(5, 4, depth, fmt, depth > 1, blocks)
     assert os.listdir(tmp_path) == ["a.dds"]
@@ -72,6 +97,7 @@ def test_what_was_written_is_read(tmp_path, fmt, depth):
         (PIXEL_FLAGS, 0x40, "pixel format: expected DX10"),
         (FOUR_CC, 0x31545844, "pixel format: expected DX10, found b'DXT1'"),
         (FORMAT, 71, "DXGI format: expected one of"),
+        (FORMAT, 49, "expected 64 bytes of blocks, found 32"),
         (DIMENSION, 2, "dimension: expected 3 (2D) or 4 (volume), found 2"),
         (DIMENSION, 4, "volume flag: expected that of the dimension"),
         (CAPS2, 0x200000, "volume flag: expected that of the dimension"),
@@ -116,7 +142,16 @@ def test_other_files_and_other_lengths_are_refused(tmp_path):
 
 @pytest.mark.parametrize(
     "change",
-    [{"fmt": "BC1_UNORM"}, {"width": 0}, {"height": 20000}, {"depth": 0}, {"depth": 2}, {"width": 9}],
+    [
+        {"fmt": "BC1_UNORM"},
+        {"width": 0},
+        {"height": 20000},
+        {"depth": 0},
+        {"depth": 2},
+        {"width": 9},
+        {"fmt": "R8G8_UNORM"},
+        {"width": 4, "depth": 2, "volume": False},
+    ],
 )
 def test_what_does_not_fit_is_a_value_error(tmp_path, change):
     with pytest.raises(ValueError):

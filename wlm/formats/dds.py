@@ -1,6 +1,7 @@
-"""DDS files of block-compressed textures, with the DX10 header: a 2D texture or a volume, one mip level.
+"""DDS files of block-compressed textures and of two bytes a texel, with the DX10 header: a 2D texture or a
+volume, one mip level.
 
-A volume's slices follow each other, each a 2D grid of blocks.
+A volume's slices follow each other, each a 2D grid of blocks (or of texels, row by row without padding).
 """
 
 import os
@@ -13,10 +14,12 @@ from wlm.formats.atomic import atomic_write
 
 __all__ = ["DXGI_FORMATS", "DdsTexture", "read_dds", "write_dds"]
 
-DXGI_FORMATS = {"BC6H_UF16": 95, "BC6H_SF16": 96, "BC7_UNORM": 98, "BC7_UNORM_SRGB": 99}
-"""The formats that can be written, all with 16 bytes a block of 4 x 4 texels, and their DXGI numbers."""
+DXGI_FORMATS = {"R8G8_UNORM": 49, "BC6H_UF16": 95, "BC6H_SF16": 96, "BC7_UNORM": 98, "BC7_UNORM_SRGB": 99}
+"""The formats that can be written and their DXGI numbers: all with 16 bytes a block of 4 x 4 texels, except
+R8G8_UNORM with two bytes a texel."""
 
 _BLOCK_BYTES = 16
+_TEXEL_BYTES = {"R8G8_UNORM": 2}  # of the formats without blocks
 _MAX_SIDE = 16384  # texels; the limit of a 2D texture in Direct3D 11 and 12
 _MAX_DEPTH = 2048
 
@@ -27,7 +30,8 @@ _HEADER = struct.Struct("<4s 7I 44x 2I 4s 5I 4I 4x 5I")
 _HEADER_SIZE = 124
 _PIXEL_FORMAT_SIZE = 32
 
-_CAPS, _HEIGHT, _WIDTH, _PIXEL_FORMAT, _LINEAR_SIZE, _DEPTH = 0x1, 0x2, 0x4, 0x1000, 0x80000, 0x800000
+_CAPS, _HEIGHT, _WIDTH, _PIXEL_FORMAT, _DEPTH = 0x1, 0x2, 0x4, 0x1000, 0x800000
+_PITCH, _LINEAR_SIZE = 0x8, 0x80000  # which of the two the size field holds: bytes of a row, or of a slice
 _REQUIRED = _CAPS | _HEIGHT | _WIDTH | _PIXEL_FORMAT
 _FOUR_CC = 0x4
 _CAPS_COMPLEX, _CAPS_TEXTURE = 0x8, 0x1000
@@ -46,7 +50,7 @@ class DdsTexture:
         depth: Slices; 1 for a 2D texture.
         fmt: A key of `DXGI_FORMATS`.
         volume: Whether it is a volume, which may have just one slice.
-        blocks: The payload: slice by slice, rows of blocks.
+        blocks: The payload: slice by slice, rows of blocks or of texels.
     """
 
     width: int
@@ -64,36 +68,46 @@ def write_dds(
     height: int,
     depth: int = 1,
     fmt: str = "BC7_UNORM",
+    volume: bool | None = None,
 ) -> None:
-    """Writes blocks as a DDS file, whole or not at all: a volume if `depth` is above 1, else a 2D texture.
+    """Writes blocks or texels as a DDS file, whole or not at all.
 
     Args:
         path: The file to write; its folder must exist.
-        blocks: 16 bytes a block, ceil(width / 4) * ceil(height / 4) blocks a slice, slices one after another.
+        blocks: 16 bytes a block, ceil(width / 4) * ceil(height / 4) blocks a slice, slices one after another;
+            of R8G8_UNORM two bytes a texel, row by row.
         width: Texels, 1 to 16384.
         height: Texels, 1 to 16384.
         depth: Slices, 1 to 2048.
         fmt: A key of `DXGI_FORMATS`.
+        volume: Whether it is a volume, which a shader reads through another sampler; None: if `depth` is
+            above 1.
 
     Raises:
-        ValueError: An unknown format, a size out of range, or blocks that don't fill the texture.
+        ValueError: An unknown format, a size out of range, several slices of what is no volume, or blocks
+            that don't fill the texture.
         WlmError: The file can't be written; what was there before stays.
     """
     if fmt not in DXGI_FORMATS:
         raise ValueError(f"fmt: expected one of {', '.join(DXGI_FORMATS)}, got {fmt}")
     if not (1 <= width <= _MAX_SIDE and 1 <= height <= _MAX_SIDE and 1 <= depth <= _MAX_DEPTH):
         raise ValueError(f"expected sides of 1 to {_MAX_SIDE} and a depth of 1 to {_MAX_DEPTH} texels")
-    slice_bytes = _slice_bytes(width, height)
+    slice_bytes = _slice_bytes(fmt, width, height)
     if len(blocks) != depth * slice_bytes:
         raise ValueError(f"blocks: expected {depth * slice_bytes} bytes, got {len(blocks)}")
-    volume = depth > 1
+    volume = depth > 1 if volume is None else volume
+    if depth > 1 and not volume:
+        raise ValueError(f"depth: expected 1 of a 2D texture, got {depth}")
+    size_flag, size = _LINEAR_SIZE, slice_bytes
+    if fmt in _TEXEL_BYTES:
+        size_flag, size = _PITCH, width * _TEXEL_BYTES[fmt]
     header = _HEADER.pack(
         _MAGIC,
         _HEADER_SIZE,
-        _REQUIRED | _LINEAR_SIZE | (_DEPTH if volume else 0),
+        _REQUIRED | size_flag | (_DEPTH if volume else 0),
         height,
         width,
-        slice_bytes,
+        size,
         depth if volume else 0,
         1,
         _PIXEL_FORMAT_SIZE,
@@ -158,12 +172,13 @@ def read_dds(path: str | os.PathLike[str]) -> DdsTexture:
             raise WlmError(f"{path}: {field}: expected {expected}, found {found}")
     slices = depth if volume else 1
     blocks = data[_HEADER.size :]
-    if len(blocks) != slices * _slice_bytes(width, height):
-        raise WlmError(
-            f"{path}: expected {slices * _slice_bytes(width, height)} bytes of blocks, found {len(blocks)}"
-        )
+    expected_bytes = slices * _slice_bytes(names[number], width, height)
+    if len(blocks) != expected_bytes:
+        raise WlmError(f"{path}: expected {expected_bytes} bytes of blocks, found {len(blocks)}")
     return DdsTexture(width, height, slices, names[number], volume, blocks)
 
 
-def _slice_bytes(width: int, height: int) -> int:
+def _slice_bytes(fmt: str, width: int, height: int) -> int:
+    if fmt in _TEXEL_BYTES:
+        return width * height * _TEXEL_BYTES[fmt]
     return -(-width // 4) * -(-height // 4) * _BLOCK_BYTES

@@ -75,7 +75,7 @@ def read(path: str | os.PathLike[str]) -> LightmapModel:
     artifact = read_artifact(path, SYSTEM)
     try:
         return _model(path, artifact)
-    except (KeyError, TypeError, ValueError, ValidationError) as error:
+    except (LookupError, TypeError, ValueError, ValidationError) as error:
         raise WlmError(f"{path}: the file's parts do not fit its settings: {error}") from error
 
 

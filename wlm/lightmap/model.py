@@ -45,7 +45,7 @@ class Profile(BaseModel):
         uvt_resolution: Texels of F_uvt along u and along v.
         uvt_slices: Slices of F_uvt along time.
         plane_columns, plane_rows: Size of F_ut and F_vt: along u or v, and along time.
-        gelu: "exact", or "tanh": cheaper, within 4.8e-4 of it.
+        gelu: "exact", or its "tanh" form, which the GPU has an instruction for.
         gamma: The maps hold radiance ** (1 / gamma).
         time_axis: "paper": the features' time axis is the hour over the period, clamped at its ends. "frames": every
             interval between stored times gets an equal part of it, so that a lamp switched within minutes has as much
@@ -54,10 +54,11 @@ class Profile(BaseModel):
         map_rate, net_rate: Adam's first learning rate of the maps and of the network.
         final_rate: Both end here, on half a cosine, as a share of the first.
         adam_epsilon: Adam's epsilon; the loss is a mean over a tile's samples and channels.
-        init: "random": uniform in [0.25, 0.75]; "pca": the maps start as the tile's own principal components.
         metric_weight: 0: the squared error in normalised gamma space, as the paper; 1: each texel, channel and time
             weighted so that the loss is the squared error of linear radiance over the tile's range at that time,
             which is what PSNR measures; between: the geometric mean.
+        between: Share of the samples that are drawn at times between two stored ones, where the fit follows their
+            interpolation (eq. 2); 0 leaves those times to the network.
         quantise_from: Share of the steps after which the maps are used on the exact levels of the file.
         freeze_from: Share of the steps after which the maps stand still and the network alone is tuned.
         static_budget_db, see ``wlm.lightmap.tiles.classify``.
@@ -71,18 +72,18 @@ class Profile(BaseModel):
     uvt_slices: int = Field(12, ge=1, le=64)
     plane_columns: int = Field(64, ge=1, le=128)
     plane_rows: int = Field(24, ge=1, le=64)
-    gelu: Literal["exact", "tanh", "fast"] = "exact"
+    gelu: Literal["exact", "tanh"] = "tanh"
     gamma: float = Field(2.2, ge=1.0, le=4.0)
     time_axis: Literal["paper", "frames"] = "frames"
     steps: int = Field(20000, ge=10)
     samples: int = Field(4096, ge=128, multiple_of=128)
-    map_rate: float = Field(1e-2, gt=0.0, lt=1.0)
+    map_rate: float = Field(2e-2, gt=0.0, lt=1.0)
     net_rate: float = Field(1e-2, gt=0.0, lt=1.0)
     final_rate: float = Field(1e-3, ge=0.0, le=1.0)
     adam_epsilon: float = Field(1e-8, gt=0.0)
-    init: Literal["random", "pca"] = "random"
-    metric_weight: float = Field(0.0, ge=0.0, le=1.0)
-    quantise_from: float = Field(0.7, ge=0.0, le=1.0)
+    metric_weight: float = Field(0.5, ge=0.0, le=1.0)
+    between: float = Field(0.25, ge=0.0, lt=1.0)
+    quantise_from: float = Field(0.5, ge=0.0, le=1.0)
     freeze_from: float = Field(0.95, ge=0.0, le=1.0)
     static_budget_db: float = Field(60.0, gt=0.0)
 
@@ -133,6 +134,11 @@ class TimeAxis:
         """Whether the features' time axis wraps round."""
         return self.period is not None and self.kind == "frames" and len(self.times) > 1
 
+    @property
+    def turn(self) -> float:
+        """gamma(t) is sine and cosine of turn tau and of 2 turn tau: whole turns where the axis wraps."""
+        return (2.0 if self.periodic else 1.0) * math.pi
+
     def wrap(self, t: float) -> float:
         """The time in the set's own range: modulo the period, or clamped to the first and last stored time."""
         if self.period is not None:
@@ -168,8 +174,8 @@ class TimeAxis:
         )
 
     def encode(self, t: float) -> np.ndarray:
-        """gamma(t) of eq. 4, float32 [4]; whole turns where the axis wraps, so that midnight is no jump."""
-        turn = (2.0 if self.periodic else 1.0) * math.pi * self.place(t)
+        """gamma(t) of eq. 4, float32 [4]."""
+        turn = self.turn * self.place(t)
         return np.array([math.sin(turn), math.cos(turn), math.sin(2 * turn), math.cos(2 * turn)], np.float32)
 
 

@@ -9,7 +9,8 @@ import warp as wp
 
 from wlm import interop
 from wlm.lightmap.model import TILE, Profile, TimeAxis, encode_time
-from wlm_kernels import blocks, mlp, temporal
+from wlm_kernels import blocks, mlp, temporal, temporal_step
+from wlm_kernels.temporal_gather import gather
 
 __all__ = ["Targets", "Trainer"]
 
@@ -24,7 +25,7 @@ class Targets:
         colour: float32 [N, T, 128 * 128, 3], (colour / scale - shift) / spread.
         texels: int32 [N, K], valid texels, padded; ``count`` int32 [N] are in use.
         weight: float32 [N, T, 3]; ``emphasis``: see ``wlm_kernels.temporal.Batch``.
-        shift, spread: float32 [N, 3].
+        shift, spread: float32 [N, 3]; scale: float32 [N, T, 3].
     """
 
     def __init__(
@@ -40,6 +41,7 @@ class Targets:
         """Normalises and weights gamma-space colour [N, T, 128, 128, 3] by the rounded scale [N, T, 3] and affine."""
         n, times = colour.shape[:2]
         self.number = number.astype(np.int32)
+        self.scale = scale
         self.shift = affine[:, 0].astype(np.float32)
         self.spread = affine[:, 1].astype(np.float32)
         factor = np.divide(1.0, scale, out=np.zeros_like(scale), where=scale > 0)
@@ -69,15 +71,13 @@ class Trainer:
     The state (``state`` and ``load``) is all that a later step depends on, so that a resumed fit goes on exactly.
     """
 
-    def __init__(
-        self, profile: Profile, axis: TimeAxis, targets: Targets, temporal_maps: bool, seed: int, device: str
-    ):
+    def __init__(self, profile: Profile, axis: TimeAxis, targets: Targets, temporal_maps: bool, seed: int, device: str):
         """Uploads the targets and draws the first parameters; ``device`` as ``interop.check_device`` returns it."""
         self.profile, self.axis, self.device, self.temporal = profile, axis, device, temporal_maps
         self.tiles = len(targets.number)
         self.inputs = profile.inputs(temporal_maps)
         self._cuda = device != "cpu"
-        self._kernels = temporal.step_kernels(
+        self._kernels = temporal_step.step_kernels(
             temporal_maps, profile.hidden, profile.gelu, "cuda" if self._cuda else "cpu"
         )
         self._pool = None if self._cuda else ThreadPoolExecutor(CPU_LANES)
@@ -112,15 +112,15 @@ class Trainer:
         def zeros(*shape, dtype=torch.float32):
             return torch.zeros(shape, dtype=dtype, device=device)
 
-        self.maps = zeros(total).requires_grad_()
+        self.maps, self.maps_grad = zeros(total), zeros(total)
         self.hidden = zeros(n, self.inputs + hidden + 2, hidden).requires_grad_()
         self.output = zeros(n, hidden + 1, 3).requires_grad_()
-        for parameter in (self.maps, self.hidden, self.output):
+        for parameter in (self.hidden, self.output):
             parameter.grad = torch.zeros_like(parameter)
         self.views, at = {}, 0
         self._offsets = temporal.Offsets()
         for key, shape in shapes.items():
-            self.views[key] = self.maps.detach()[at : at + lengths[key]].view(shape)
+            self.views[key] = self.maps[at : at + lengths[key]].view(shape)
             setattr(self._offsets, key, at)
             at += lengths[key]
         maps = temporal.Maps()
@@ -130,7 +130,7 @@ class Trainer:
         self._maps = maps
 
         lanes = 1 if self._cuda else CPU_LANES
-        parts = self.profile.samples // temporal.BLOCK if self._cuda else CPU_LANES
+        parts = self.profile.samples // temporal_step.BLOCK if self._cuda else CPU_LANES
         self._acc = zeros(lanes, total, dtype=torch.int64 if self._cuda else torch.float32)
         self._partial = zeros(parts, *self.hidden.shape)
         self._partial_out = zeros(parts, *self.output.shape)
@@ -146,9 +146,7 @@ class Trainer:
             "capturable": self._cuda,
         }
         self._adam_maps = torch.optim.Adam(self._pieces(), lr=rates[0] if self._cuda else 1.0, **fused)
-        self._adam_net = torch.optim.Adam(
-            [self.hidden, self.output], lr=rates[1] if self._cuda else 1.0, **fused
-        )
+        self._adam_net = torch.optim.Adam([self.hidden, self.output], lr=rates[1] if self._cuda else 1.0, **fused)
 
         wrap = interop.to_warp
         vec = self._kernels.net.vec_hidden
@@ -167,7 +165,7 @@ class Trainer:
         self._gather_args = (
             wrap(self._acc),
             wrap(self.maps),
-            wrap(self.maps.grad),
+            wrap(self.maps_grad),
             wrap(self._partial.view(parts, -1)),
             wrap(self._partial_out.view(parts, -1)),
             wrap(self._loss_parts),
@@ -188,10 +186,10 @@ class Trainer:
         pieces = 36 if self._cuda else 1
         size = -(-self.maps.numel() // pieces)
         result = []
-        for values, grad in zip(self.maps.detach().split(size), self.maps.grad.split(size), strict=True):
-            values.requires_grad_()
-            values.grad = grad
-            result.append(values)
+        for values, grad in zip(self.maps.split(size), self.maps_grad.split(size), strict=True):
+            piece = values.detach().requires_grad_()
+            piece.grad = grad
+            result.append(piece)
         return result
 
     def _upload(self, targets: Targets, seed: int) -> None:
@@ -211,6 +209,9 @@ class Trainer:
         batch.number = put(targets.number, wp.int32)
         batch.shift = put(targets.shift, wp.vec3)
         batch.spread = put(targets.spread, wp.vec3)
+        batch.scale = put(targets.scale, wp.vec3)
+        batch.turn = self.axis.turn
+        batch.between = self.profile.between
         batch.control = interop.to_warp(self.control)
         batch.slices = self.profile.uvt_slices
         batch.seed = seed
@@ -237,9 +238,7 @@ class Trainer:
                 part = values.reshape(self.tiles, -1)
                 part[i] = random.uniform(0.25, 0.75, part.shape[1])
             w[i, :inputs] = random.uniform(-1, 1, (inputs, hidden)) / math.sqrt(inputs)
-            w[i, inputs + 1 : inputs + 1 + hidden] = random.uniform(-1, 1, (hidden, hidden)) / math.sqrt(
-                hidden
-            )
+            w[i, inputs + 1 : inputs + 1 + hidden] = random.uniform(-1, 1, (hidden, hidden)) / math.sqrt(hidden)
             o[i, :hidden] = random.uniform(-1, 1, (hidden, 3)) / math.sqrt(hidden)
         for key, values in maps.items():
             self.views[key].copy_(torch.from_numpy(values))
@@ -281,13 +280,9 @@ class Trainer:
         else:
             span = self.profile.samples // CPU_LANES
             # Once alone, so that two threads don't compile the kernel at the same time.
-            list(
-                self._pool.map(lambda lane: self._kernels.launch(*args, lane * span, span), range(CPU_LANES))
-            )
+            list(self._pool.map(lambda lane: self._kernels.launch(*args, lane * span, span), range(CPU_LANES)))
         rates = (self.profile.map_rate, self.profile.net_rate)
-        temporal.gather(
-            *self._gather_args, self._schedule, rates, self.batch.control, *self._gather_outs
-        )
+        gather(*self._gather_args, self._schedule, rates, self.batch.control, *self._gather_outs)
         if not self._cuda:
             self._adam_maps.param_groups[0]["lr"] = float(self._rates[0])
             self._adam_net.param_groups[0]["lr"] = float(self._rates[1])
@@ -340,7 +335,8 @@ class Trainer:
             for i, values in enumerate(adam.state.values()):
                 for key in ("step", "exp_avg", "exp_avg_sq"):
                     result[f"{name}.{i}.{key}"] = values[key].detach().cpu().numpy()
-        return {key: np.ascontiguousarray(value) for key, value in result.items()}
+        # Copies, and numbers stay without a dimension.
+        return {key: np.array(value) for key, value in result.items()}
 
     def load(self, state: dict[str, np.ndarray]) -> None:
         """Goes back to a ``state``; arrays of other shapes raise ValueError."""

@@ -1,0 +1,347 @@
+import json
+import os
+import re
+import resource
+import signal
+import subprocess
+import sys
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from PIL import Image
+from small_sets import HOURS, moving_light, tiny_profile
+from typer.testing import CliRunner
+
+import wlm
+import wlm.cli.lightmap
+from wlm.cli import app
+from wlm.formats.exr import read_exr, write_exr
+from wlm.lightmap import codec, fit
+from wlm.lightmap.data import load_set
+from wlm.lightmap.decode import Decoder
+from wlm.lightmap.evaluate import evaluate
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def call(*words, code=0):
+    """Runs the command in this process; what it printed to stdout."""
+    result = CliRunner().invoke(app, [str(word) for word in words])
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    assert result.exit_code == code, result.output
+    assert "\x1b" not in result.output, "no control codes where there is no terminal"
+    call.stderr = result.stderr
+    return result.stdout
+
+
+def fails(*words):
+    """Runs a command that must end with one line and exit code 2; the line."""
+    assert call(*words, code=2) == ""
+    lines = call.stderr.splitlines()
+    assert len(lines) == 1 and lines[0].startswith("error: "), call.stderr
+    return lines[0]
+
+
+def spawn(*words, code="from wlm.cli import main\nmain()", **options):
+    """Starts a command as a process of its own."""
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "env": environment}
+    return subprocess.Popen([sys.executable, "-c", code, *map(str, words)], **pipes | options)
+
+
+@pytest.fixture(scope="session")
+def folder(tmp_path_factory):
+    """A set of five times as a plain folder, and a profile of few steps."""
+    folder = tmp_path_factory.mktemp("set")
+    for hour, frame in zip(HOURS, moving_light(40, 24).frames, strict=True):
+        write_exr(folder / f"light_{hour:g}h.exr", frame)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def profile(tmp_path_factory):
+    path = tmp_path_factory.mktemp("profile") / "tiny.yaml"
+    path.write_text(yaml.safe_dump(tiny_profile().model_dump(mode="json")))
+    return path
+
+
+@pytest.fixture(scope="session")
+def fitted(folder, profile, tmp_path_factory):
+    path = tmp_path_factory.mktemp("fitted") / "a.wlm"
+    call("lightmap", "compress", folder, "-o", path, "--profile", profile, "--period", 24)
+    return path
+
+
+def test_the_version_is_quick_to_tell():
+    assert call("--version") == f"wlm {wlm.__version__}\n"
+    # Neither torch nor Warp nor NumPy is imported for it: they take seconds.
+    code = (
+        "import sys\nfrom wlm.cli import main\nsys.argv = ['wlm', '--version']\n"
+        "try:\n    main()\nexcept SystemExit as end:\n    assert not end.code\n"
+        "sys.exit(', '.join({'torch', 'warp', 'numpy', 'pydantic'} & set(sys.modules)) or None)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], env=os.environ | {"PYTHONPATH": str(ROOT)}, check=False)
+    assert done.returncode == 0
+
+
+def test_help_lists_the_commands():
+    assert {"lightmap", "bench", "doctor"} <= set(call().split())
+    assert {"compress", "decode", "evaluate", "info", "export"} <= set(call("lightmap", "--help").split())
+
+
+def test_doctor_names_the_devices_and_the_cache():
+    text = call("doctor")
+    for word in ("python", "warp", "torch", "cpu", "extra", "kernel cache"):
+        assert word in text
+    assert call.stderr == ""
+
+
+def test_compress_prints_one_table(folder, profile, tmp_path):
+    out = tmp_path / "a.wlm"
+    text = call("lightmap", "compress", folder, "-o", out, "--profile", profile, "--steps", 10, "--seed", 4)
+    size = out.stat().st_size
+    assert f"{size:,}" in text and f"{size * 8 / (40 * 24 * 5):.3f}" in text
+    assert re.search(r"fit: 10 of 10, loss [\d.]+, PSNR about -?[\d.]+ dB", call.stderr)
+    model = codec.read(out)
+    assert (model.profile.steps, model.profile.samples, model.period) == (10, 128, None)
+    assert [path.name for path in tmp_path.iterdir()] == ["a.wlm"], "no checkpoint is left"
+
+
+def test_the_options_of_compress_reach_the_fit(folder, profile, tmp_path):
+    out = tmp_path / "a.wlm"
+    mask = np.zeros((40, 24), np.uint8)
+    mask[:9] = 255
+    Image.fromarray(mask).save(tmp_path / "mask.png")
+    options = ["--times", "0:10:2", "--mask", tmp_path / "mask.png", "--period", 12, "--tiles", "0"]
+    options += ["--steps", 12, "--samples", 256]
+    call("lightmap", "compress", folder, "-o", out, "--profile", profile, *options)
+    model = codec.read(out)
+    assert model.times.tolist() == [0, 2, 4, 6, 8] and model.period == 12
+    assert (model.profile.steps, model.profile.samples) == (12, 256)
+    again = load_set(folder, times=[0, 2, 4, 6, 8], mask=tmp_path / "mask.png", period=12)
+    assert model.source == again.source
+    # The seed of the command is the seed of the fit.
+    for seed, same in ((0, True), (1, False)):
+        other = tmp_path / "b.wlm"
+        call("lightmap", "compress", folder, "-o", other, "--profile", profile, *options, "--seed", seed)
+        assert (other.read_bytes() == out.read_bytes()) is same
+
+
+def test_warnings_of_the_set_are_shown(folder, profile, tmp_path):
+    write_exr(tmp_path / "light_0h.exr", np.full((8, 8, 3), -1.0, np.float32))
+    write_exr(tmp_path / "light_1h.exr", np.ones((8, 8, 3), np.float32))
+    call("lightmap", "compress", tmp_path, "-o", tmp_path / "a.wlm", "--profile", profile)
+    assert "warning: light_0h.exr: 64 texels negative: clamped to 0" in call.stderr
+
+
+def test_decode_writes_the_frame(fitted, tmp_path):
+    text = call(
+        "lightmap",
+        "decode",
+        fitted,
+        "--time",
+        18.5,
+        "-o",
+        tmp_path / "f.exr",
+        "--eight-bit",
+        tmp_path / "f.png",
+    )
+    assert "18.5" in text and "24x40" in text
+    decoder = Decoder(codec.read(fitted))
+    np.testing.assert_allclose(read_exr(tmp_path / "f.exr")[0], decoder.frame(18.5), rtol=1e-3, atol=1e-6)
+    with Image.open(tmp_path / "f.png") as image:
+        np.testing.assert_array_equal(np.asarray(image), decoder.frame_8bit(18.5)[0])
+        about = json.loads(image.text["wlm"])
+    assert about["gamma"] == 2.2
+    np.testing.assert_allclose(about["bounds"], decoder.frame_8bit(18.5)[1])
+
+
+def test_evaluate_prints_and_writes_the_report(fitted, folder, tmp_path):
+    words = ["lightmap", "evaluate", fitted, folder, "--json", tmp_path / "r.json", "--period", 24]
+    text = call(*words, "--baselines")
+    report = evaluate(codec.read(fitted), load_set(folder, period=24.0), fitted.stat().st_size)
+    stored = json.loads((tmp_path / "r.json").read_text())
+    baselines = stored.pop("baselines")
+    assert {**stored, "seconds": 0} == {**report.to_json(), "seconds": 0}
+    assert f"{report.psnr:.2f}" in text and f"{report.bpp:.3f}" in text and "tile 0" in text
+    for hour, psnr in zip(HOURS, report.psnr_by_time, strict=True):
+        assert re.search(rf"time {hour:g} .*{psnr:.2f}", text)
+    names = ["bc6h", "bc7", "astc12", "astc10", "8bit"]
+    assert [row["name"] for row in baselines] == names
+    for name in ("BC6H", "BC7", "ASTC 12x12", "ASTC 10x10", "8 bits"):
+        assert name in text
+    assert "worst:" in call.stderr
+    call(*words)
+    assert "baselines" not in json.loads((tmp_path / "r.json").read_text())
+
+
+def test_info_says_what_is_in_the_file(fitted):
+    facts = json.loads(call("lightmap", "info", fitted, "--json"))
+    assert facts["bytes"] == fitted.stat().st_size == sum(facts["parts"].values())
+    assert facts["times"] == list(HOURS) and facts["period"] == 24.0
+    assert facts["tiles"] == {"empty": 0, "constant": 0, "static": 0, "dynamic": 1}
+    assert facts["profile"]["name"] == "tiny"
+    text = call("lightmap", "info", fitted)
+    assert f"{facts['bytes']:,}" in text and facts["source"] in text and "24x40" in text
+
+
+def test_export_lists_what_it_wrote(fitted, tmp_path):
+    pytest.importorskip("wlm.lightmap.export")
+    text = call("lightmap", "export", fitted, "-o", tmp_path / "out")
+    files = list((tmp_path / "out").iterdir())
+    assert files and all(file.name in text for file in files)
+
+
+def test_names_that_look_like_markup_are_shown_as_they_are(fitted, tmp_path):
+    odd = tmp_path / "[red]a[b].wlm"
+    odd.write_bytes(fitted.read_bytes())
+    assert "[red]a[b].wlm" in call("lightmap", "info", odd).replace("\n", "")
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["compress", "absent", "-o", "{tmp}/a.wlm"], "absent: no such file or folder"),
+        (["compress", "{set}", "-o", "{tmp}/absent/a.wlm"], "does not exist"),
+        (["compress", "{set}", "-o", "{set}/light_0h.exr"], "ends in .wlm"),
+        (["compress", "{set}"], "--output"),
+        (["compress", "{set}", "-o", "{tmp}/a.wlm", "--steps", "9"], "--steps: expected"),
+        (["compress", "{set}", "-o", "{tmp}/a.wlm", "--steps", "many"], "'--steps'"),
+        (["compress", "{set}", "-o", "{tmp}/a.wlm", "--samples", "100"], "--samples: expected"),
+        (["compress", "{set}", "-o", "{tmp}/a.wlm", "--seed", "-1"], "--seed"),
+        (["compress", "{set}", "-o", "{tmp}/a.wlm", "--tiles", "0-9"], "tile 9 is out of range"),
+        (["compress", "{set}", "-o", "{tmp}/a.wlm", "--tiles", "x"], "expected a number or first-last"),
+        (["compress", "{set}", "-o", "{tmp}/a.wlm", "--times", "1,2"], "2 times for 5"),
+        (["compress", "{set}", "-o", "{tmp}/a.wlm", "--times", "noon"], "expected a number or start"),
+        (["compress", "{set}", "-o", "{tmp}/a.wlm", "--mask", "absent.png"], "absent.png"),
+        (["compress", "{set}", "-o", "{tmp}/a.wlm", "--period", "nan"], "period"),
+        (["compress", "{set}", "-o", "{tmp}/a.wlm", "--profile", "XXL"], "profile 'XXL'"),
+        (["compress", "{set}", "-o", "{tmp}/a.wlm", "--profile", "{tmp}/x.yaml"], "x.yaml"),
+        (["compress", "{set}", "-o", "{tmp}/a.wlm", "--device", "cuda:9"], "device 'cuda:9'"),
+        (["compress", "{set}", "-o", "{tmp}/a.wlm", "--colour"], "--colour"),
+        (["decode", "{fit}", "--time", "nan", "-o", "{tmp}/f.exr"], "time: expected a finite number"),
+        (["decode", "{fit}", "--time", "1", "-o", "{tmp}/f.png"], "ends in .exr"),
+        (["decode", "{set}/light_0h.exr", "--time", "1", "-o", "{tmp}/f.exr"], "expected an artifact"),
+        (["decode", "absent.wlm", "--time", "1", "-o", "{tmp}/f.exr"], "absent.wlm"),
+        (["evaluate", "{fit}", "{set}", "--times", "1,2,3,4,5"], "time 0 is 1"),
+        (["evaluate", "{fit}", "{set}", "--json", "{tmp}"], "ends in .json"),
+        (["info", "{tmp}"], "expected an artifact"),
+        (["info"], "Missing argument"),
+        (["frobnicate"], "frobnicate"),
+        ([], "Missing command"),
+    ],
+    ids=lambda value: "-".join(value[:1] + value[-2:]).replace("/", "_") if isinstance(value, list) else "",
+)
+def test_bad_input_is_one_line_and_exit_code_2(words, says, folder, fitted, tmp_path):
+    places = {"set": folder, "fit": fitted, "tmp": tmp_path}
+    assert says in fails("lightmap", *(word.format(**places) for word in words))
+    assert not list(tmp_path.iterdir()), "nothing is left behind"
+
+
+def test_an_unknown_exception_is_a_bug_and_shows(fitted, monkeypatch):
+    def broken(path):
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(codec, "read", broken)
+    with pytest.raises(ZeroDivisionError):
+        call("lightmap", "info", fitted)
+
+
+def test_a_full_disk_is_one_line_and_keeps_what_was_there(fitted, folder, profile, tmp_path):
+    out, report = tmp_path / "a.wlm", tmp_path / "r.json"
+    for path in (out, report):
+        path.write_bytes(b"old")
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (200, limits[1]))
+    try:
+        call("lightmap", "compress", folder, "-o", out, "--profile", profile, code=2)
+        assert re.search(r"^error: \S+a\.wlm\.partial: cannot write: ", call.stderr.splitlines()[-1])
+        call("lightmap", "evaluate", fitted, folder, "--json", report, code=2)
+        assert re.search(r"^error: \S+r\.json: cannot write: ", call.stderr.splitlines()[-1])
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.wlm", "r.json"]
+    assert out.read_bytes() == report.read_bytes() == b"old"
+
+
+def test_a_ctrl_c_is_kept_and_resumed_to_the_same_bytes(folder, profile, tmp_path, monkeypatch):
+    words = ["lightmap", "compress", folder, "--profile", profile, "--steps", 40]
+    whole, out = tmp_path / "whole.wlm", tmp_path / "a.wlm"
+    call(*words, "-o", whole)
+
+    @contextmanager
+    def press_ctrl_c(what):
+        yield lambda done, total, text: os.kill(os.getpid(), signal.SIGINT)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(fit, "REPORT_EVERY", 0.0)
+        patched.setattr(wlm.cli.lightmap, "progress_bar", press_ctrl_c)
+        assert call(*words, "-o", out, code=130) == ""
+    assert call.stderr.splitlines() == [f"stopped at step 5: the same command with --resume goes on from {out}.partial"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.wlm.partial", "whole.wlm"]
+
+    assert "made with seed 0, not 1" in fails(*words, "-o", out, "--resume", "--seed", 1)
+    call(*words, "-o", out, "--resume")
+    assert out.read_bytes() == whole.read_bytes()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.wlm", "whole.wlm"]
+    call(*words, "-o", out, "--resume")
+    assert "there is nothing to resume; starting at step 0" in call.stderr
+
+
+def test_a_ctrl_c_in_a_terminal_ends_with_130(folder, profile, tmp_path):
+    # Ten thousand times more steps than can be done before the signal comes.
+    words = ["lightmap", "compress", folder, "--profile", profile, "--steps", 3_000_000]
+    code = (
+        "import sys\nfrom wlm.cli import main\nfrom wlm.cli import console\n"
+        "console._PLAIN_REPORTS = 10**7\nmain()\n"  # a line at every report
+    )
+    with spawn(*words, "-o", tmp_path / "a.wlm", code=code) as process:
+        for line in process.stderr:
+            if line.startswith("fit: "):
+                process.send_signal(signal.SIGINT)
+                break
+        text, errors = process.communicate()
+    assert process.returncode == 130 and text == ""
+    assert re.search(r"^stopped at step \d+: .* --resume goes on from \S+a\.wlm\.partial$", errors, re.MULTILINE)
+    assert "Traceback" not in errors
+    assert [path.name for path in tmp_path.iterdir()] == ["a.wlm.partial"]
+
+
+def test_a_damaged_checkpoint_is_one_line(folder, profile, tmp_path):
+    (tmp_path / "a.wlm.partial").write_bytes(b"nonsense, and enough of it")
+    line = fails("lightmap", "compress", folder, "--profile", profile, "-o", tmp_path / "a.wlm", "--resume")
+    assert "a.wlm.partial" in line
+
+
+def test_a_closed_pipe_is_no_traceback(fitted):
+    read, write = os.pipe()
+    os.close(read)
+    with spawn("lightmap", "info", fitted, "--json", stdout=write) as process:
+        os.close(write)
+        _, errors = process.communicate()
+    assert process.returncode == 1 and errors == ""
+
+
+def test_bench_writes_what_it_was_given(monkeypatch, tmp_path):
+    module = pytest.importorskip("wlm.bench.lightmap")
+    from wlm.bench import Row, read_json
+
+    asked = []
+
+    def run(*, quick, device, set_path, progress):
+        asked.append((quick, device, set_path))
+        progress("one of one")
+        return [Row("lightmap", "city", "wlm", "M", bytes=10, bpp=0.7, decode_ms=1.0, psnr=40.0)]
+
+    monkeypatch.setattr(module, "run", run)
+    text = call("bench", "lightmap", "--quick", "--json", tmp_path / "r.json", "--plot", tmp_path / "p.png")
+    assert asked == [(True, "cpu", None)] and "one of one" in call.stderr
+    assert "| lightmap | city | wlm |" in text
+    rows, environment = read_json(tmp_path / "r.json")
+    assert rows[0].psnr == 40.0 and environment
+    assert (tmp_path / "p.png").read_bytes().startswith(b"\x89PNG")
+    assert "ends in" in fails("bench", "lightmap", "--plot", tmp_path / "p.txt")

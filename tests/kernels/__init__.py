@@ -1,0 +1,1 @@
+"""The kernels against ``reference``, on every device."""

@@ -1,0 +1,287 @@
+"""Small trainers on synthetic targets: the fused step as it is used, and all that a reference needs of it."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+import warp as wp
+from reference import temporal as reference
+from reference.network import mlp
+
+from wlm import interop
+from wlm.lightmap.model import Profile, TimeAxis, encode_time
+from wlm.lightmap.trainer import Targets, Trainer
+
+TILE = 128
+
+
+@dataclass(frozen=True)
+class Case:
+    """What a trainer is made of.
+
+    Attributes:
+        temporal: Whether the tiles have temporal maps.
+        hidden, gelu, samples: As in ``Profile``.
+        shape: Resolution and slices of F_uvt, columns and rows of the planes.
+        periodic: A periodic axis of evenly spaced frames, or a clamped one from 0 to 1 in uneven steps.
+        emphasis: See ``wlm_kernels.temporal.Batch``; the weights are random where it isn't 0.
+        numbers: Of the tiles in their grid.
+        texels: How many texels of each tile are valid.
+        settings: Other fields of ``Profile``.
+    """
+
+    temporal: bool = True
+    hidden: int = 16
+    gelu: str = "exact"
+    samples: int = 256
+    shape: tuple[int, int, int, int] = (12, 3, 7, 4)
+    periodic: bool = True
+    emphasis: float = 0.0
+    numbers: tuple[int, ...] = (4, 9)
+    texels: tuple[int, ...] = (TILE * TILE, 700)
+    settings: dict = field(default_factory=dict)
+
+    def profile(self) -> Profile:
+        """The settings, of ten steps where nothing else is said."""
+        resolution, slices, columns, rows = self.shape
+        given = {"steps": 10, "between": 0.0} | self.settings
+        return Profile(
+            name="test",
+            hidden=self.hidden,
+            gelu=self.gelu,
+            samples=self.samples,
+            uvt_resolution=resolution,
+            uvt_slices=slices,
+            plane_columns=columns,
+            plane_rows=rows,
+            time_axis="frames" if self.periodic else "paper",
+            **given,
+        )
+
+    def axis(self) -> TimeAxis:
+        """Five times; the clamped axis reads its features at exactly 0 and 1, too."""
+        times = np.array([0.0, 3.0, 8.0, 13.0, 20.0])
+        return TimeAxis(times, 24.0, "frames") if self.periodic else TimeAxis(times, None, "paper")
+
+    def targets(self) -> Targets:
+        """Random colours on random masks; a tile's own depend on its number alone."""
+        times = len(self.axis().times)
+        colour, mask, scale, affine, weight = [], [], [], [], []
+        for number, count in zip(self.numbers, self.texels, strict=True):
+            random = np.random.default_rng(number)
+            colour.append(random.uniform(0.2, 2.0, (times, TILE, TILE, 3)))
+            chosen = np.zeros(TILE * TILE, bool)
+            chosen[random.permutation(TILE * TILE)[:count]] = True
+            mask.append(chosen.reshape(TILE, TILE))
+            scale.append(random.uniform(0.5, 1.5, (times, 3)))
+            affine.append([random.uniform(0.7, 1.0, 3), random.uniform(0.3, 0.6, 3)])
+            weight.append(random.uniform(0.5, 2.0, (times, 3)))
+        f32 = [np.array(values, np.float32) for values in (colour, scale, affine, weight)]
+        result = Targets(np.array(self.numbers), f32[0], np.array(mask), f32[1], f32[2], 2.2, 0.0)
+        if self.emphasis != 0.0:
+            result.weight, result.emphasis = f32[3], self.emphasis
+        return result
+
+
+def trainer(case: Case, device: str, seed: int = 3, spread: bool = True) -> Trainer:
+    """A trainer; ``spread`` maps and networks are random with values out of range, not the first draw."""
+    result = Trainer(case.profile(), case.axis(), case.targets(), case.temporal, seed, device)
+    if spread:
+        for key, values in _clear_values(result).items():
+            result.views[key].copy_(torch.from_numpy(values))
+        random = np.random.default_rng(8)
+        with torch.no_grad():
+            for values in (result.hidden, result.output):
+                noise = random.uniform(-0.3, 0.3, tuple(values.shape)).astype(np.float32)
+                values += torch.from_numpy(noise).to(values.device)
+    return result
+
+
+def _clear_values(trainer: Trainer) -> dict[str, np.ndarray]:
+    """Random maps, near levels that can be stored: which level is nearest is beyond float32's doubt.
+
+    A value half-way between two levels may be rounded either way, and one such value would be an error of a whole
+    level against the reference. One in thirty weights and plane values lies out of range.
+    """
+    random = np.random.default_rng(7)
+    result = {}
+    for key, view in trainer.views.items():
+        shape = tuple(view.shape)
+        levels = 15 if key.endswith("weights") else 255
+        base = random.integers(0, levels + 1, shape)
+        if key.endswith("endpoints"):
+            base = base // 2 * 2 + random.integers(0, 2, (*shape[:-1], 1))  # one lowest bit for four channels
+        values = (base + random.uniform(-0.3, 0.3, shape)) / levels
+        if not key.endswith("endpoints"):
+            values += (random.random(shape) < 1 / 60) * 1.3 - (random.random(shape) < 1 / 60) * 1.3
+        result[key] = values.astype(np.float32)
+    return result
+
+
+def draw(trainer: Trainer, quantised: bool) -> tuple[np.ndarray, np.ndarray]:
+    """The samples of the coming step: places int [N, B, 3] as (y, x, time) and features float32 [N, B, I]."""
+    kernels, samples = trainer._kernels, trainer.profile.samples
+    shape = (trainer.tiles, samples)
+    with interop.stream(trainer.device):
+        trainer.batch.quantised = int(quantised)
+        place = wp.zeros(shape, dtype=wp.vec3i, device=trainer.device)
+        features = wp.zeros(shape, dtype=kernels.net.vec_in, device=trainer.device)
+        wp.launch(
+            kernels.draw,
+            shape,
+            inputs=[trainer._maps, trainer.batch, samples],
+            outputs=[place, features],
+            device=trainer.device,
+        )
+    return place.numpy(), features.numpy()
+
+
+def drawn_noise(trainer: Trainer, quantised: bool) -> np.ndarray:
+    """The noise of the coming step, centred as the features are: what it draws where all maps are 1/2."""
+    kept = trainer.maps.detach().clone()
+    with torch.no_grad():
+        trainer.maps.fill_(0.5)
+    noise = draw(trainer, False)[1]
+    with torch.no_grad():
+        trainer.maps.copy_(kept)
+    noise[..., 12:] = 0.0  # the encoded time, which has none
+    return np.zeros_like(noise) if quantised else noise
+
+
+@dataclass
+class Step:
+    """One step's loss [N] and gradients, by the name of the parameter."""
+
+    loss: np.ndarray
+    grads: dict[str, np.ndarray]
+
+
+def fused_step(trainer: Trainer, quantised: bool) -> Step:
+    """Does one step; the parameters move only after their gradients are taken."""
+    before = trainer.losses().astype(np.float64)
+    with interop.stream(trainer.device):
+        trainer._step(quantised, True)
+    grads, at = {}, 0
+    flat = trainer.maps_grad.cpu().numpy()
+    for key, view in trainer.views.items():
+        grads[key] = flat[at : at + view.numel()].reshape(tuple(view.shape)).copy()
+        at += view.numel()
+    grads["hidden"] = trainer.hidden.grad.cpu().numpy().copy()
+    grads["output"] = trainer.output.grad.cpu().numpy().copy()
+    # A running mean that takes a fiftieth of each step.
+    return Step((trainer.losses() - before) * 50.0 + before, grads)
+
+
+@dataclass
+class Problem:
+    """A step's samples and parameters in float64, taken before the step."""
+
+    maps: dict[str, torch.Tensor]
+    hidden: torch.Tensor
+    output: torch.Tensor
+    place: torch.Tensor  # [N, B, 3]
+    noise: torch.Tensor  # [N, B, I]
+    tau: torch.Tensor  # [N, B]
+    encoding: torch.Tensor  # [N, B, 4]
+    share: torch.Tensor  # [N, B], of the next stored time in the sample's colour
+    target: torch.Tensor  # [N, B, 3]
+    weight: torch.Tensor  # [N, B, 3]
+    quantised: bool
+    periodic: bool
+    gelu: str
+
+    @property
+    def tile(self) -> torch.Tensor:
+        """The tile of each sample, [N * B]."""
+        return torch.arange(len(self.place)).repeat_interleave(self.place.shape[1])
+
+    def features(self) -> torch.Tensor:
+        """The network's inputs, centred and with the noise, [N, B, I]."""
+        flat = self.place.reshape(-1, 3)
+        found = reference.train_features(
+            self.maps,
+            self.tile,
+            flat[:, :2],
+            self.tau.flatten(),
+            self.encoding.reshape(-1, 4),
+            self.periodic,
+            self.quantised,
+        )
+        return reference.centre(found).reshape(self.noise.shape) + self.noise
+
+    def losses(self) -> torch.Tensor:
+        """Each tile's loss."""
+        answer = mlp(self.hidden, self.output, self.features(), self.gelu)
+        return reference.losses(answer, self.target, self.weight)
+
+    def step(self) -> Step:
+        """The loss and all gradients, by autograd."""
+        loss = self.losses()
+        loss.sum().backward()
+        named = self.maps | {"hidden": self.hidden, "output": self.output}
+        return Step(loss.detach().numpy(), {key: value.grad.numpy() for key, value in named.items()})
+
+
+def _between(
+    axis: TimeAxis, tau: torch.Tensor, k: torch.Tensor, encoding: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """The next time, its share and the place of samples between times, read back from their encoded time."""
+    place = torch.atan2(encoding[..., 0], encoding[..., 1]) % (2.0 * np.pi) / axis.turn
+    after = (k + 1) % len(tau) if axis.periodic else (k + 1).clamp(max=len(tau) - 1)
+    way, gap = place - tau[k], tau[after] - tau[k]
+    if axis.periodic:
+        way, gap = (way + 1e-4) % 1.0 - 1e-4, gap % 1.0
+    share = torch.where(gap > 0, way / gap.clamp(min=1e-12), 0.0)
+    assert float(share.min()) > -1e-5 and float(share.max()) < 1.0 + 1e-5
+    return after, torch.where(share.abs() < 1e-5, 0.0, share), place
+
+
+def problem(trainer: Trainer, case: Case, quantised: bool) -> Problem:
+    """The coming step of a trainer as a ``Problem``."""
+    place, features = draw(trainer, quantised)
+    place = torch.from_numpy(place).long()
+    targets = case.targets()
+    tau, encoding = (torch.from_numpy(values).double() for values in encode_time(trainer.axis))
+    k = place[..., 2]
+    after, share, tau_at, encoding_at = k, torch.zeros(k.shape).double(), tau[k], encoding[k]
+    if trainer.profile.between > 0.0:
+        encoding_at = torch.from_numpy(features[..., 12:]).double()
+        after, share, tau_at = _between(trainer.axis, tau, k, encoding_at)
+    n = torch.arange(trainer.tiles)[:, None]
+    shift, spread = (torch.from_numpy(v).double()[:, None] for v in (targets.shift, targets.spread))
+    texel = place[..., 0] * TILE + place[..., 1]
+
+    def mixed(values: np.ndarray, *rest: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """The shares of a sample's two times of an array [N, T, ...]."""
+        values = torch.from_numpy(values).double()
+        return (1.0 - share[..., None]) * values[n, k, *rest], share[..., None] * values[n, after, *rest]
+
+    scale, weight = mixed(targets.scale), mixed(targets.weight)
+    scales = torch.from_numpy(targets.scale).double()[:, :, None]
+    colour = mixed(
+        (
+            (shift + spread * torch.from_numpy(targets.colour).flatten(1, 2)).reshape(targets.colour.shape)
+            * scales
+        ).numpy(),
+        texel,
+    )
+    target = (sum(colour) / sum(scale) - shift) / spread
+
+    def leaf(values: torch.Tensor) -> torch.Tensor:
+        return values.detach().cpu().double().clone().requires_grad_()
+
+    return Problem(
+        maps={key: leaf(view) for key, view in trainer.views.items()},
+        hidden=leaf(trainer.hidden),
+        output=leaf(trainer.output),
+        place=place,
+        noise=torch.from_numpy(drawn_noise(trainer, quantised)).double(),
+        tau=tau_at,
+        encoding=encoding_at,
+        share=share,
+        target=target,
+        weight=reference.emphasised(sum(weight), shift, spread, target, targets.emphasis),
+        quantised=quantised,
+        periodic=case.periodic,
+        gelu=case.gelu,
+    )

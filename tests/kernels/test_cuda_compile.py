@@ -1,0 +1,70 @@
+"""Every kernel is compiled for a GPU (sm_90), which needs none: what a machine without one can say of that half."""
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import pytest
+import warp as wp
+
+from wlm_kernels import mlp, temporal_decode, temporal_step
+
+ARCHITECTURE = 90
+MODULES = ("blocks", "grids", "mlp", "temporal_gather", "temporal_decode")
+WIDTHS = (8, 17, 32, 64)
+
+
+def _compile(module: object, folder: Path) -> None:
+    made = wp.compile_aot_module(module, arch=[ARCHITECTURE], module_dir=folder)
+    binaries = [path for path in made if path.suffix in (".ptx", ".cubin")]
+    assert binaries and all(path.stat().st_size > 0 for path in binaries)
+
+
+def _kernels_of(built: Iterable[object]) -> list[wp.Kernel]:
+    """The kernels among what a factory gives; each is a module of its own."""
+    found = [value for value in built if isinstance(value, wp.Kernel)]
+    assert found, "the factory builds kernels"
+    return found
+
+
+def _compile_all(built: Iterable[object], folder: Path) -> None:
+    for i, kernel in enumerate(_kernels_of(built)):
+        _compile(kernel.module, folder / str(i))
+
+
+def _slow_but(first: object, others: Iterable[object]) -> list:
+    """One value for every run, the others for the long one."""
+    return [first, *(pytest.param(value, marks=pytest.mark.slow) for value in others)]
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_modules(name: str, tmp_path: Path):
+    """The kernels that have one form."""
+    _compile(f"wlm_kernels.{name}", tmp_path)
+
+
+@pytest.mark.parametrize("gelu", _slow_but("fast", ["exact", "tanh"]))
+@pytest.mark.parametrize("hidden", _slow_but(16, WIDTHS))
+def test_mlp(hidden: int, gelu: str, tmp_path: Path):
+    """ "fast" has an instruction that only a GPU has."""
+    _compile_all(vars(mlp.kernels(16, hidden, gelu)).values(), tmp_path)
+
+
+@pytest.mark.parametrize("gelu", _slow_but("tanh", ["exact"]))
+@pytest.mark.parametrize("hidden", _slow_but(16, WIDTHS))
+@pytest.mark.parametrize("dynamic", _slow_but(True, [False]))
+def test_step(dynamic: bool, hidden: int, gelu: str, tmp_path: Path):
+    """The fused training step, whose CUDA form the CPU never runs."""
+    _compile_all(vars(temporal_step.step_kernels(dynamic, hidden, gelu, "cuda")).values(), tmp_path)
+
+
+@pytest.mark.parametrize("hidden", _slow_but(16, WIDTHS))
+@pytest.mark.parametrize("dynamic", _slow_but(True, [False]))
+def test_exact_decode(dynamic: bool, hidden: int, tmp_path: Path):
+    """Decoding a texel a thread."""
+    _compile_all(temporal_decode.exact_kernels(dynamic, hidden, "tanh"), tmp_path)
+
+
+@pytest.mark.parametrize("hidden", _slow_but(16, WIDTHS))
+def test_strip_decode(hidden: int, tmp_path: Path):
+    """Decoding four texels a thread."""
+    _compile_all(vars(temporal_decode.strip_kernels(hidden, "fast")).values(), tmp_path)

@@ -1,0 +1,198 @@
+"""Decoding from stored bytes: against float64, the runtime path against the plain one, the file against the fit."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+from reference import temporal as reference
+from synthetic import random_model
+
+from kernels.compare import array, close, exact
+from kernels.stepping import TILE, Case, draw, trainer
+from wlm.formats.bc7 import decode_image, pack_mode6
+from wlm.lightmap.decode import Decoder
+from wlm.lightmap.model import LightmapModel, decode_scale
+from wlm.lightmap.runtime import StripDecoder
+from wlm.lightmap.tiles import TileKind
+
+KINDS = (3, 2, 3, 1)  # dynamic, static, dynamic, constant
+STORED, BETWEEN = (0.0, 13.0), (3.3, 21.7)  # 21.7 lies between the last stored time and the next day's first
+SHAPES = [
+    pytest.param(hidden, gelu, marks=[] if hidden in (16, 17) else pytest.mark.slow)
+    for hidden, gelu in ((8, "exact"), (16, "tanh"), (17, "exact"), (32, "exact"), (64, "tanh"))
+]
+
+
+def _model(hidden: int, gelu: str, periodic: bool = True, **settings) -> LightmapModel:
+    """A random model whose colours use most of the 8 bits: a scale of about 1 and a bound of about 1.5."""
+    random = np.random.default_rng(hidden)
+    model = random_model(
+        KINDS,
+        period=24.0 if periodic else None,
+        hidden=hidden,
+        gelu=gelu,
+        time_axis="frames" if periodic else "paper",
+        **settings,
+    )
+    span = (-1.0, 1.0)
+    scale = random.integers(110, 145, model.scale.shape, np.uint8)
+    scale[0, 1, 2] = 0  # a channel that is black at the second time
+    peak = random.integers(200, 215, model.peak.shape, np.uint8)
+    affine = np.stack([np.full((3, 3), 0.8), random.uniform(0.6, 1.0, (3, 3))], 1).astype(np.float16)
+    return dataclasses.replace(model, span=span, scale=scale, peak=peak, affine=affine)
+
+
+def _reference_colour(model: LightmapModel, number: int, time: float, gelu: str) -> np.ndarray:
+    """Colour in gamma space, float64 [128, 128, 3], from the bytes that the model holds."""
+    row = int((model.kind[:number] >= TileKind.STATIC).sum())
+    of_kind = int((model.kind[:number] == model.kind[number]).sum())
+    temporal, net = None, model.net_static
+    if model.kind[number] == TileKind.DYNAMIC:
+        slices = [decode_image(blocks) for blocks in model.uvt[of_kind]]
+        planes = (exact(plane[of_kind] / 255.0)[None] for plane in (model.ut, model.vt))
+        temporal, net = (exact(np.stack(slices) / 255.0)[None], *planes), model.net
+    width, inputs = model.profile.hidden, model.profile.inputs(temporal is not None)
+    weights = exact(net[of_kind])
+    split = (inputs + width + 2) * width
+    place = torch.cartesian_prod(torch.arange(TILE), torch.arange(TILE))
+    tau = torch.full((len(place),), model.axis.place(time), dtype=torch.float64)
+    features = reference.features_of(
+        exact(decode_image(model.uv[row]) / 255.0)[None],
+        temporal,
+        torch.zeros(len(place), dtype=torch.long),
+        place,
+        tau,
+        exact(model.axis.encode(time)).expand(len(place), 4),
+        model.axis.periodic,
+    )
+    before, after, share = model.axis.neighbours(time)
+    scale = decode_scale(model.scale[row], model.span).astype(np.float64)
+    colour = reference.decode(
+        features,
+        weights[:split].reshape(-1, width),
+        weights[split:].reshape(-1, 3),
+        gelu,
+        exact(model.affine[row]),
+        exact((1.0 - share) * scale[before] + share * scale[after]),
+    )
+    return colour.reshape(TILE, TILE, 3).numpy()
+
+
+@pytest.mark.parametrize("periodic", [True, False], ids=["periodic", "clamped"])
+@pytest.mark.parametrize(("hidden", "gelu"), SHAPES)
+def test_exact_against_reference(device: str, hidden: int, gelu: str, periodic: bool):
+    """Radiance and 8-bit colour of dynamic and static tiles at stored times and between."""
+    model = _model(hidden, gelu, periodic)
+    decoder = Decoder(model, device)
+    numbers = [2, 0, 1]
+    for time in (*STORED, *BETWEEN, float(model.times[-1])):
+        radiance = decoder.tiles(numbers, time)
+        codes, bounds = decoder.tiles_8bit(numbers, time)
+        for i, number in enumerate(numbers):
+            colour = _reference_colour(model, number, time, gelu)
+            close(radiance[i], colour**model.profile.gamma, 2e-5, f"tile {number} at {time}")
+            wanted = np.floor(np.clip(colour / bounds[i], 0, 1) * 255.0 + 0.5)
+            assert wanted.std() > 10, "a picture of one colour tests nothing"
+            off = np.abs(codes[i, ..., :3] - wanted)
+            assert off.max() <= 1 and (off == 0).mean() > 0.999
+            assert (codes[i, ..., 3] == 255).all()
+
+
+@pytest.mark.parametrize(("resolution", "slices", "columns", "rows"), [(4, 1, 1, 1), (128, 2, 128, 3)])
+def test_extreme_sizes(device: str, resolution: int, slices: int, columns: int, rows: int):
+    """Maps of one cell on each axis, and maps as fine as the tile, by both paths."""
+    sizes = {"uvt_resolution": resolution, "uvt_slices": slices, "plane_columns": columns, "plane_rows": rows}
+    model = _model(16, "tanh", **sizes)
+    radiance = Decoder(model, device).tiles([2], BETWEEN[1])[0]
+    close(radiance, _reference_colour(model, 2, BETWEEN[1], "tanh") ** model.profile.gamma, 2e-5)
+    _hold_strip(model, device, BETWEEN)
+
+
+def _hold_strip(model: LightmapModel, device: str, times: tuple[float, ...]) -> None:
+    """The runtime path: within one code of the plain path, and equal in 99 of 100."""
+    strip, decoder = StripDecoder(model, device), Decoder(model, device)
+    for time in times:
+        strip.set_time(time)
+        strip.decode()
+        off = np.abs(strip.numpy().astype(int) - decoder.tiles_8bit(list(strip.numbers), time)[0])
+        assert off.max() <= 1
+        assert (off == 0).mean() >= 0.99, f"{(off == 0).mean():.4f} of the codes are equal"
+
+
+@pytest.mark.parametrize(("hidden", "gelu"), SHAPES)
+def test_strip_against_exact(device: str, hidden: int, gelu: str):
+    """The runtime path at stored times and between."""
+    _hold_strip(_model(hidden, gelu), device, STORED + BETWEEN)
+
+
+def _in_blocks(index: np.ndarray) -> np.ndarray:
+    """Texels [S, H, W] as [S, H/4, W/4, 16]."""
+    s, h, w = index.shape
+    return index.reshape(s, h // 4, 4, w // 4, 4).transpose(0, 1, 3, 2, 4).reshape(s, h // 4, w // 4, 16)
+
+
+def _stored(fit, case: Case) -> LightmapModel:
+    """A trainer's tiles as the file holds them, with scales of their own."""
+    parts, n = fit.quantised(), fit.tiles
+    kind = TileKind.DYNAMIC if case.temporal else TileKind.STATIC
+    base = random_model([int(kind)] * n, columns=n, times=tuple(fit.axis.times), hidden=case.hidden)
+    random = np.random.default_rng(1)
+    fields = {"uv": pack_mode6(parts["uv_endpoints"], _in_blocks(parts["uv_index"]))}
+    fields["net" if case.temporal else "net_static"] = parts["net"]
+    if case.temporal:
+        uvt = pack_mode6(parts["uvt_endpoints"], _in_blocks(parts["uvt_index"]))
+        fields |= {"uvt": uvt.reshape(n, -1, *uvt.shape[1:]), "ut": parts["ut"], "vt": parts["vt"]}
+    return dataclasses.replace(
+        base,
+        profile=fit.profile,
+        period=fit.axis.period,
+        span=(-1.0, 1.0),
+        scale=random.integers(110, 145, base.scale.shape, np.uint8),
+        peak=random.integers(200, 215, base.peak.shape, np.uint8),
+        **fields,
+    )
+
+
+@pytest.mark.parametrize("temporal", [True, False], ids=["dynamic", "static"])
+@pytest.mark.parametrize("periodic", [True, False], ids=["periodic", "clamped"])
+def test_file_is_what_was_trained(device: str, temporal: bool, periodic: bool):
+    """The features of quantised training through the rounded network give the codes that the file decodes to.
+
+    Bit for bit on the CPU; a GPU's compiler may contract the same operations differently in two kernels.
+    """
+    case = Case(temporal=temporal, periodic=periodic, gelu="tanh", samples=8192)
+    fit = trainer(case, device)
+    fit.run(6)
+    model = _stored(fit, case)
+    place, features = draw(fit, True)
+    net = fit._kernels.net
+    split = (fit.inputs + case.hidden + 2) * case.hidden
+    half = (model.net if temporal else model.net_static).astype(np.float32)
+    hidden = array(half[:, :split].reshape(fit.tiles, -1, case.hidden), net.vec_hidden, device)
+    output = array(half[:, split:].reshape(fit.tiles, -1, 3), wp.vec3, device)
+    answer = wp.zeros(place.shape[:2], dtype=wp.vec3, device=device)
+    net.forward(hidden, output, array(features, net.vec_in, device), answer)
+    y = answer.numpy()
+
+    decoder = Decoder(model, device)
+    wrong = total = 0
+    seen = set()
+    for k, time in enumerate(model.times):
+        codes, _ = decoder.tiles_8bit(list(range(fit.tiles)), time)
+        look = decoder.look(time)
+        for n in range(fit.tiles):
+            chosen = place[n, :, 2] == k
+            shift, spread, scale = (v.numpy()[n] for v in (look.shift, look.spread, look.scale))
+            colour = np.maximum((shift + spread * y[n, chosen]) * scale, np.float32(0))
+            share = np.clip(colour * look.inverse_peak.numpy()[n], np.float32(0), np.float32(1))
+            wanted = (share * np.float32(255) + np.float32(0.5)).astype(np.uint8)
+            found = codes[n, place[n, chosen, 0], place[n, chosen, 1], :3]
+            off = np.abs(wanted.astype(int) - found)
+            assert off.max() <= 1
+            wrong, total = wrong + int((off > 0).sum()), total + off.size
+            seen.update(np.unique(found).tolist())
+    assert len(seen) > 50
+    assert wrong <= (0 if device == "cpu" else 1e-3 * total), f"{wrong} of {total} codes differ"
+    fit.close()

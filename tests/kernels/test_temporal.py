@@ -1,0 +1,163 @@
+"""The fused training step: samples, loss and all gradients, against the whole model in float64 and against a tape."""
+
+import numpy as np
+import pytest
+
+from kernels.compare import close
+from kernels.stepping import TILE, Case, Step, draw, drawn_noise, fused_step, problem, trainer
+from kernels.taped import taped_step
+from wlm import interop
+
+TOLERANCE = 2e-5  # of the largest gradient of an array; float32 gives 1e-6
+WIDTHS = (8, 16, 17, 32, 64)
+# Each axis and shape at its least, and both ends of a clamped time axis.
+VARIANTS = {
+    "periodic": {"periodic": True},
+    "clamped-weighted": {"periodic": False, "emphasis": 1.2},
+    "one-cell": {"shape": (4, 1, 1, 1), "emphasis": -0.5},
+}
+
+
+def _hold(got: Step, want: Step) -> None:
+    close(got.loss, want.loss, TOLERANCE, "loss")
+    assert got.grads.keys() == want.grads.keys()
+    for key, grad in want.grads.items():
+        close(got.grads[key], grad, TOLERANCE, f"gradient of {key}")
+
+
+@pytest.mark.parametrize("quantised", [False, True], ids=["continuous", "quantised"])
+@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("hidden", WIDTHS)
+def test_temporal_step(device: str, hidden: int, variant: str, quantised: bool):
+    """Loss, maps and network of dynamic tiles, against autograd and against the tape of the public kernels."""
+    case = Case(hidden=hidden, **VARIANTS[variant])
+    fit = trainer(case, device)
+    want = problem(fit, case, quantised)
+    _, features = draw(fit, quantised)
+    close(features, want.features(), 2e-6, "features")
+    got = fused_step(fit, quantised)
+    expected = want.step()
+    _hold(got, expected)
+    # A gradient that is 0 everywhere would hold anything: one slice or cell moves nothing only by design.
+    assert all(np.abs(grad).max() > 0 for grad in expected.grads.values())
+    with interop.stream(device):
+        taped = taped_step(want, device)
+    _hold(got, taped)
+    fit.close()
+
+
+@pytest.mark.parametrize("quantised", [False, True], ids=["continuous", "quantised"])
+@pytest.mark.parametrize("hidden", [16, *(pytest.param(w, marks=pytest.mark.slow) for w in (8, 17, 32, 64))])
+def test_static_step(device: str, hidden: int, quantised: bool):
+    """Tiles without temporal maps, one of them of three valid texels."""
+    case = Case(temporal=False, hidden=hidden, emphasis=0.7, texels=(5000, 3))
+    fit = trainer(case, device)
+    want = problem(fit, case, quantised)
+    close(draw(fit, quantised)[1], want.features(), 2e-6, "features")
+    _hold(fused_step(fit, quantised), want.step())
+    fit.close()
+
+
+def test_tanh_step(device: str):
+    """The cheaper GELU that a fit may use."""
+    case = Case(gelu="tanh", emphasis=1.0)
+    fit = trainer(case, device)
+    want = problem(fit, case, False)
+    _hold(fused_step(fit, False), want.step())
+    fit.close()
+
+
+@pytest.mark.parametrize("periodic", [True, False], ids=["periodic", "clamped"])
+@pytest.mark.parametrize("emphasis", [0.0, 1.2])
+def test_samples_between_times(device: str, emphasis: float, periodic: bool):
+    """A share of the samples lies between two times and follows their interpolated colour (eq. 2)."""
+    case = Case(samples=1024, periodic=periodic, emphasis=emphasis, settings={"between": 0.4})
+    fit = trainer(case, device)
+    want = problem(fit, case, False)
+    close(draw(fit, False)[1], want.features(), 5e-6, "features")
+    moved = want.share > 0
+    drawn = moved.double().mean()
+    # Nothing follows the last time of a clamped axis; five standard deviations of 2,048 draws.
+    assert abs(drawn - 0.4 * (1.0 if periodic else 0.8)) < 5 * (0.24 / 2048) ** 0.5
+    assert abs(want.share[moved].mean() - 0.5) < 5 * (1 / 12 / (0.3 * 2048)) ** 0.5
+    _hold(fused_step(fit, False), want.step())
+    fit.close()
+
+
+def test_later_steps(device: str):
+    """Five steps on, with sums cleared and parameters moved, a step is still the reference's."""
+    case = Case()
+    fit = trainer(case, device)
+    for _ in range(5):
+        fused_step(fit, False)
+    want = problem(fit, case, False)
+    _hold(fused_step(fit, False), want.step())
+    fit.close()
+
+
+def test_draws_are_valid_and_even(device: str):
+    """Only valid texels, all of them in turn, all times alike; other samples at the next step."""
+    case = Case(samples=4096, texels=(20, 3))
+    fit = trainer(case, device)
+    place, _ = draw(fit, False)
+    fused_step(fit, False)
+    later, _ = draw(fit, False)
+    assert (place != later).any()
+    targets = case.targets()
+    for i, count in enumerate(case.texels):
+        drawn, times = np.unique(place[i, :, 0] * TILE + place[i, :, 1], return_counts=True)
+        np.testing.assert_array_equal(drawn, targets.texels[i, :count])
+        # Five standard deviations of an even draw.
+        share = 1 / count
+        assert np.abs(times / 4096 - share).max() < 5 * (share * (1 - share) / 4096) ** 0.5
+        _, hours = np.unique(place[i, :, 2], return_counts=True)
+        assert len(hours) == 5 and np.abs(hours / 4096 - 0.2).max() < 5 * (0.16 / 4096) ** 0.5
+    fit.close()
+
+
+def test_noise_is_one_step_of_8_bits(device: str):
+    """Eq. 6: uniform in +-1/512 on each map feature, independent; none on exact levels and on the time."""
+    fit = trainer(Case(samples=4096), device)
+    noise = drawn_noise(fit, False)[..., :12].reshape(-1, 12) / 12**0.5
+    assert 0.99 / 512 < np.abs(noise).max() <= 1.001 / 512
+    assert np.abs(noise.mean(0)).max() < 5 / 256 / (12 * len(noise)) ** 0.5
+    np.testing.assert_allclose(noise.std(0), 1 / 256 / 12**0.5, rtol=0.05)
+    correlation = np.corrcoef(noise.T) - np.eye(12)
+    assert np.abs(correlation).max() < 6 / len(noise) ** 0.5
+    fit.close()
+
+
+def test_tile_is_the_same_alone_and_in_a_batch(device: str):
+    """A tile's samples, loss and gradients do not depend on its neighbours in a batch."""
+    numbers, texels = (2, 7, 30), (900, TILE * TILE, 40)
+    batch = trainer(Case(numbers=numbers, texels=texels), device, spread=False)
+    together = fused_step(batch, False)
+    batch.close()
+    for i, number in enumerate(numbers):
+        fit = trainer(Case(numbers=(number,), texels=(texels[i],)), device, spread=False)
+        alone = fused_step(fit, False)
+        fit.close()
+        np.testing.assert_array_equal(together.loss[i : i + 1], alone.loss)
+        for key, grad in alone.grads.items():
+            part = together.grads[key].reshape(3, -1)[i]
+            np.testing.assert_array_equal(part, grad.ravel(), err_msg=key)
+
+
+def test_two_lanes_equal_one():
+    """On the CPU two threads sum halves of the samples in buffers of their own; one lane gives the same sum."""
+    case = Case()
+    one, two = (trainer(case, "cpu") for _ in range(2))
+    lanes = fused_step(two, False)
+    hidden, output = one._launch_args
+    acc, partial, partial_out, loss = one._launch_sums
+    one._kernels.launch(
+        one._maps, one._offsets, hidden, output, one.batch, case.samples, *one._launch_sums, 0, case.samples
+    )
+    flat = np.concatenate([grad.ravel() for key, grad in lanes.grads.items() if key in one.views])
+    assert not acc.numpy()[1].any()
+    close(flat, acc.numpy()[0], 1e-6, "maps")
+    close(lanes.grads["hidden"], partial.numpy()[0], 1e-6, "hidden")
+    close(lanes.grads["output"], partial_out.numpy()[0], 1e-6, "output")
+    close(lanes.loss, loss.numpy()[0], 1e-5, "loss")
+    one.close()
+    two.close()

@@ -1,0 +1,158 @@
+import dataclasses
+import resource
+
+import numpy as np
+import pytest
+from synthetic import random_model
+
+from wlm.errors import WlmError
+from wlm.formats.artifact import read_artifact, write_artifact
+from wlm.lightmap import codec
+from wlm.lightmap.model import LightmapModel, Profile
+
+ARRAYS = [field.name for field in dataclasses.fields(LightmapModel) if field.type is np.ndarray]
+
+
+def assert_same(a: LightmapModel, b: LightmapModel) -> None:
+    for field in dataclasses.fields(LightmapModel):
+        x, y = getattr(a, field.name), getattr(b, field.name)
+        if isinstance(x, np.ndarray):
+            assert x.shape == y.shape and x.dtype == y.dtype, field.name
+            np.testing.assert_array_equal(x, y, err_msg=field.name)
+        else:
+            assert x == y, field.name
+
+
+@pytest.mark.parametrize("kinds", [(3, 2, 1, 0), (3, 3), (2, 2), (1, 1), (0, 0), (0, 3)])
+@pytest.mark.parametrize("period", [24.0, None])
+def test_what_is_written_comes_back(tmp_path, kinds, period):
+    model = random_model(kinds, period=period, metric_weight=0.25, time_axis="paper")
+    size = codec.write(tmp_path / "a.wlm", model)
+    assert size == (tmp_path / "a.wlm").stat().st_size
+    assert_same(codec.read(tmp_path / "a.wlm"), model)
+
+
+def test_the_arrays_are_all_tested():
+    assert len(ARRAYS) == 12
+
+
+@pytest.mark.parametrize("times", [(0.0, 1e-9), (18.45, 18.55), (7.0,), (1e6, 1e6 + 1e-4)])
+def test_times_stay_apart_and_close(tmp_path, times):
+    model = random_model((3, 0), times=times, period=None)
+    codec.write(tmp_path / "a.wlm", model)
+    back = codec.read(tmp_path / "a.wlm").times
+    np.testing.assert_allclose(back, times, rtol=2e-7)
+    assert (np.diff(back) > 0).all()
+
+
+@pytest.mark.parametrize("kind", [3, 2])
+def test_the_size_is_the_arithmetic_of_table_3(tmp_path, kind):
+    sizes = {"hidden": 16, "uvt_resolution": 32, "uvt_slices": 12}
+    times = tuple(float(hour) for hour in range(24))
+    tiles = 16
+    size = codec.write(tmp_path / "a.wlm", random_model((kind,) * tiles, columns=4, times=times, **sizes))
+    profile = Profile(name="", **sizes)
+    # Codes of scale and bound, shift and spread in half float, the kind.
+    scales = len(times) * (3 + 1) + 2 * 3 * 2 + 1
+    header = size - tiles * (profile.tile_bytes(kind == 3) + scales) - 4 * len(times)
+    assert 0 < header <= 1024 * tiles
+    assert header == read_artifact(tmp_path / "a.wlm").header_bytes
+    # Table 3 of the paper: 34 KiB of maps for profile M, and 16 KiB for F_uv alone.
+    networks = (
+        2
+        * (
+            random_model((kind, kind), **sizes).net if kind == 3 else random_model((kind, kind), **sizes).net_static
+        ).shape[1]
+    )
+    assert profile.tile_bytes(kind == 3) - networks == (34 if kind == 3 else 16) * 1024
+
+
+def test_the_same_model_gives_the_same_bytes(tmp_path):
+    for name in ("a.wlm", "b.wlm"):
+        codec.write(tmp_path / name, random_model())
+    assert (tmp_path / "a.wlm").read_bytes() == (tmp_path / "b.wlm").read_bytes()
+
+
+def test_every_flipped_byte_and_every_cut_is_refused(tmp_path):
+    codec.write(tmp_path / "a.wlm", random_model())
+    content = (tmp_path / "a.wlm").read_bytes()
+    for place in [*range(0, 200, 7), *range(200, len(content), 997), len(content) - 1]:
+        damaged = bytearray(content)
+        damaged[place] ^= 0x41
+        for text in (bytes(damaged), content[:place]):
+            (tmp_path / "b.wlm").write_bytes(text)
+            with pytest.raises(WlmError, match="b.wlm") as error:
+                codec.read(tmp_path / "b.wlm")
+            assert "\n" not in str(error.value)
+
+
+def rewritten(path, **changes):
+    """The artifact with parts or settings replaced, and a digest that fits: damage that only the codec can see."""
+    artifact = read_artifact(path)
+    settings, tensors = dict(artifact.settings), dict(artifact.tensors)
+    for key, value in changes.items():
+        held = settings if key in settings else tensors
+        if value is None:
+            del held[key]
+        else:
+            held[key] = value(held[key]) if callable(value) else value
+    write_artifact(path, codec.SYSTEM, settings, tensors, artifact.source)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"uv": None},
+        {"uv": lambda v: v[:1]},
+        {"uv": lambda v: v.astype(np.int16)},
+        {"net": lambda v: v[:, :-1]},
+        {"net": lambda v: v.astype(np.float32)},
+        {"ut": lambda v: v[..., 0]},
+        {"scale": lambda v: v[:, :2]},
+        {"constant": None},
+        {"kind": lambda v: v[:3]},
+        {"kind": lambda v: np.full_like(v, 9)},
+        {"kind": lambda v: v[::-1] * 0 + 3},
+        {"times": lambda v: v[::-1].copy()},
+        {"times": lambda v: v * np.nan},
+        {"times": None},
+        {"size": [10, 10]},
+        {"size": "big"},
+        {"span": []},
+        {"period": "a day"},
+        {"profile": {"hidden": 8}},
+        {"profile": {"name": "x", "hidden": 9999}},
+        {"profile": {"name": "x", "colour": "blue"}},
+        {"profile": None},
+    ],
+    ids=lambda changes: "-".join(changes),
+)
+def test_parts_that_do_not_fit_are_one_line(tmp_path, changes):
+    codec.write(tmp_path / "a.wlm", random_model())
+    rewritten(tmp_path / "a.wlm", **changes)
+    with pytest.raises(WlmError, match="a.wlm: the file's parts do not fit") as error:
+        codec.read(tmp_path / "a.wlm")
+    assert "\n" not in str(error.value)
+
+
+def test_other_files_are_refused(tmp_path):
+    with pytest.raises(WlmError, match="cannot read"):
+        codec.read(tmp_path / "absent.wlm")
+    write_artifact(tmp_path / "a.wlm", "probe", {}, {}, "0")
+    with pytest.raises(WlmError, match="expected an artifact of lightmap, found one of probe"):
+        codec.read(tmp_path / "a.wlm")
+
+
+def test_a_full_disk_leaves_the_old_file(tmp_path):
+    codec.write(tmp_path / "a.wlm", random_model(seed=1))
+    old = (tmp_path / "a.wlm").read_bytes()
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, limits[1]))
+    try:
+        with pytest.raises(WlmError, match="a.wlm: cannot write") as error:
+            codec.write(tmp_path / "a.wlm", random_model(seed=2))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert "\n" not in str(error.value)
+    assert (tmp_path / "a.wlm").read_bytes() == old
+    assert [path.name for path in tmp_path.iterdir()] == ["a.wlm"]

@@ -1,0 +1,151 @@
+import json
+import math
+
+import numpy as np
+import pytest
+from small_sets import moving_light, static_light, tiny_profile
+
+from wlm.errors import WlmError
+from wlm.lightmap import codec
+from wlm.lightmap.data import from_arrays
+from wlm.lightmap.decode import Decoder
+from wlm.lightmap.evaluate import bits_per_texel, evaluate, evaluate_baselines, part_bytes
+from wlm.lightmap.fit import compress
+from wlm.metrics import evaluate_frame, summarise
+
+NAMES = ("psnr", "ssim", "flip", "bpp", "bytes", "tiles", "times", "device", "seconds")
+SUFFIXED = [f"{name}_by_{what}" for name in ("psnr", "ssim", "flip") for what in ("tile", "time")]
+
+
+def four_tiles():
+    """Dynamic, static, constant and empty, in a map that ends inside its last row and column."""
+    moving, static = moving_light(128, 128), static_light(128, 100)
+    frames = np.zeros((5, 200, 228, 3), np.float32)
+    frames[:, :128, :128], frames[:, :128, 128:] = moving.frames, static.frames
+    frames[:, 128:, :128] = 0.5
+    mask = np.ones((200, 228), bool)
+    mask[128:, 128:] = False
+    return from_arrays(frames, moving.times, mask, 24.0, name="four")
+
+
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory):
+    lightmaps = four_tiles()
+    path = tmp_path_factory.mktemp("fitted") / "a.wlm"
+    size = codec.write(path, compress(lightmaps, tiny_profile(steps=60)))
+    return lightmaps, codec.read(path), size
+
+
+@pytest.fixture(scope="module")
+def report(fitted):
+    lightmaps, model, size = fitted
+    return evaluate(model, lightmaps, size)
+
+
+def test_the_scores_are_those_of_the_protocol(fitted, report):
+    lightmaps, model, _ = fitted
+    decoder = Decoder(model)
+    frames = [
+        evaluate_frame(ref, decoder.frame(stamp), lightmaps.mask)
+        for ref, stamp in zip(lightmaps.frames, lightmaps.times, strict=True)
+    ]
+    expected = summarise(frames)
+    assert math.isfinite(report.psnr)
+    for name in ("psnr", "ssim", "flip", "worst_psnr", "max_abs_error", "psnr_unlimited"):
+        assert getattr(report, name) == getattr(expected, name)
+    for name in SUFFIXED:
+        np.testing.assert_array_equal(getattr(report, name), getattr(expected, name))
+    time, row, column = expected.worst_tile
+    assert report.worst_tile == {
+        "time": lightmaps.times[time],
+        "tile": row * 2 + column,
+        "row": row,
+        "column": column,
+    }
+
+
+def test_what_is_held_and_left_out_is_counted(fitted, report):
+    _, model, size = fitted
+    assert report.kinds == {"empty": 1, "constant": 1, "static": 1, "dynamic": 1}
+    assert (report.tiles, report.times, report.bytes) == (3, 5, size)
+    assert report.not_scored == {"empty": 5, "not_held": 0, "few_texels": 0, "zero_range": 5}
+    assert report.scored == 10
+    assert report.bpp == size * 8 / (200 * 228 * 5)
+    assert sum(report.parts.values()) == size == sum(part_bytes(model, size).values())
+    assert report.parts["uv"] == 2 * 16384 and report.parts["constant"] == 2 * 3 * 5
+    assert report.warnings == [] and report.profile == "tiny"
+
+
+def test_the_report_is_json_without_nan(report):
+    document = report.to_json()
+    assert json.loads(json.dumps(document, allow_nan=False)) == document
+    assert set(NAMES) <= set(document) and set(SUFFIXED) <= set(document)
+    # The empty tile and the constant one have no PSNR.
+    assert document["psnr_by_tile"][1] == [None, None]
+    assert all(isinstance(value, float) for value in document["psnr_by_tile"][0])
+    assert len(document["flip_by_time"]) == document["times"] == len(document["time_values"])
+
+
+def test_only_the_held_tiles_are_scored(fitted):
+    lightmaps, whole, _ = fitted
+    model = compress(lightmaps, tiny_profile(steps=60), tiles=[1, 2])
+    report = evaluate(model, lightmaps, 50_000)
+    assert report.not_scored == {"empty": 5, "not_held": 5, "few_texels": 0, "zero_range": 5}
+    assert report.tiles == 2 and "1 tiles with valid texels" in report.warnings[0]
+    assert math.isnan(report.psnr_by_tile[0, 0]) and math.isfinite(report.psnr_by_tile[0, 1])
+    # The part of the map that tiles 1 and 2 cover.
+    assert report.bpp == 50_000 * 8 / ((128 * 100 + 72 * 128) * 5)
+    assert bits_per_texel(whole, lightmaps.mask, 50_000) == 50_000 * 8 / (200 * 228 * 5)
+
+
+def test_metrics_not_asked_for_are_null(fitted):
+    lightmaps, model, size = fitted
+    calls = []
+    report = evaluate(model, lightmaps, size, metrics=("psnr",), progress=lambda *now: calls.append(now))
+    document = report.to_json()
+    assert document["ssim"] is None and document["flip"] is None and document["psnr"] == report.psnr
+    assert calls == [(i, 5) for i in range(1, 6)]
+
+
+def test_another_source_is_scored_with_a_warning(fitted):
+    lightmaps, model, size = fitted
+    other = from_arrays(lightmaps.frames * 1.5, lightmaps.times, lightmaps.mask, 24.0)
+    report = evaluate(model, other, size, metrics=("psnr",))
+    assert model.source in report.warnings[0] and other.source in report.warnings[0]
+    assert report.psnr < evaluate(model, lightmaps, size, metrics=("psnr",)).psnr
+
+
+def test_a_set_that_does_not_fit_is_one_line(fitted):
+    lightmaps, model, size = fitted
+    frames, times, mask = lightmaps.frames, lightmaps.times, lightmaps.mask
+    for other, says in (
+        (from_arrays(frames[:, :-1], times, mask[:-1]), "is 228x199, but the file four holds 228x200"),
+        (from_arrays(frames[:3], times[:3], mask), "has 3 times, but the file four holds 5"),
+        (from_arrays(frames, times + 0.1, mask), "time 0 is 0.1, but in the file four it is 0"),
+        (from_arrays(frames, times, ~mask), "no tile of the file four has a valid texel"),
+    ):
+        with pytest.raises(WlmError, match=says):
+            evaluate(model, other, size)
+    with pytest.raises(WlmError, match="unknown metric"):
+        evaluate(model, lightmaps, size, metrics=("lpips",))
+    with pytest.raises(WlmError, match="device"):
+        evaluate(model, lightmaps, size, device="tpu")
+    with pytest.raises(ValueError, match="file_bytes"):
+        evaluate(model, lightmaps, 100, metrics=("psnr",))
+
+
+def test_baselines_are_scored_over_the_same_texels(fitted):
+    lightmaps, _, _ = fitted
+    model = compress(lightmaps, tiny_profile(steps=10), tiles=[1])
+    (plain, bc6h) = evaluate_baselines(model, lightmaps, ("8bit", "bc6h"), metrics=("psnr",))
+    assert plain.bytes == 5 * (200 * 228 * 3 + 4) and plain.bpp == pytest.approx(24.0, abs=0.01)
+    assert bc6h.bpp == pytest.approx(8.0, abs=0.1) and math.isnan(plain.ssim)
+    assert plain.to_json()["ssim"] is None
+    # Not scored where the model holds nothing: noise there changes nothing.
+    frames = lightmaps.frames.copy()
+    frames[:, :, :128] *= 1.0 / np.random.default_rng(0).uniform(1.0, 9.0, frames[:, :, :128].shape)
+    noisy = from_arrays(frames, lightmaps.times, lightmaps.mask, 24.0)
+    (again,) = evaluate_baselines(model, noisy, ("bc6h",), metrics=("psnr",))
+    assert again.psnr == bc6h.psnr
+    with pytest.raises(WlmError, match="unknown codec"):
+        evaluate_baselines(model, lightmaps, ("jpeg",))

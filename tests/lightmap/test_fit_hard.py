@@ -1,0 +1,268 @@
+"""Hard input from end to end: fitted, written, read, decoded."""
+
+import numpy as np
+import pytest
+from small_sets import HOURS, moving_light, static_light, tiny_profile
+
+from wlm.errors import WlmError
+from wlm.lightmap import codec
+from wlm.lightmap.data import from_arrays
+from wlm.lightmap.decode import Decoder
+from wlm.lightmap.evaluate import count_kinds, evaluate
+from wlm.lightmap.fit import compress
+from wlm.lightmap.model import TimeAxis
+
+PROFILE = tiny_profile()
+
+
+def through_file(tmp_path, lightmaps, profile=PROFILE, **options):
+    """Compresses, writes and reads; the decoder of the file, which gives finite light that isn't negative."""
+    codec.write(tmp_path / "a.wlm", compress(lightmaps, profile, **options))
+    decoder = Decoder(codec.read(tmp_path / "a.wlm"))
+    for stamp in lightmaps.times:
+        frame = decoder.frame(stamp)
+        assert frame.shape == lightmaps.frames.shape[1:]
+        assert np.isfinite(frame).all() and (frame >= 0).all()
+    return decoder
+
+
+def decoded(decoder):
+    return np.stack([decoder.frame(stamp) for stamp in decoder.model.times])
+
+
+def file_bytes(tmp_path, lightmaps, **options):
+    codec.write(tmp_path / "bytes.wlm", compress(lightmaps, PROFILE, **options))
+    return (tmp_path / "bytes.wlm").read_bytes()
+
+
+def only(decoder, kind):
+    kinds = count_kinds(decoder.model)
+    return kinds[kind] == sum(kinds.values())
+
+
+def test_an_all_zero_set_is_constant_and_exact(tmp_path):
+    decoder = through_file(tmp_path, from_arrays(np.zeros((5, 128, 128, 3)), HOURS, period=24.0))
+    assert only(decoder, "constant") and not decoded(decoder).any()
+    assert (tmp_path / "a.wlm").stat().st_size < 1024
+
+
+def test_a_constant_tile_is_within_half_a_step_of_half_float(tmp_path):
+    levels = np.array([[0.1, 2.0, 300.0], [1e-4, 0.0, 1.0], [7.0, 7.0, 7.0]])
+    frames = np.broadcast_to(levels[:, None, None], (3, 128, 128, 3))
+    decoder = through_file(tmp_path, from_arrays(frames, (0.0, 1.0, 2.0)))
+    assert only(decoder, "constant")
+    np.testing.assert_allclose(decoded(decoder), frames, rtol=2**-10)
+    # Between two times a constant tile is interpolated as light is.
+    np.testing.assert_allclose(decoder.frame(0.25)[5, 5], 0.75 * levels[0] + 0.25 * levels[1], rtol=2**-10)
+    pixels, peak = decoder.frame_8bit(2.0)
+    np.testing.assert_allclose((pixels[3, 3, :3] / 255.0 * peak[0]) ** 2.2, levels[2], rtol=1e-3)
+
+
+def test_a_static_tile_stores_no_temporal_maps_and_follows_the_brightness(tmp_path):
+    lightmaps = static_light()
+    decoder = through_file(tmp_path, lightmaps, tiny_profile(steps=60))
+    model = decoder.model
+    assert only(decoder, "static")
+    assert model.uvt.size == model.ut.size == model.vt.size == model.net.size == 0
+    out = decoded(decoder)
+    np.testing.assert_allclose(out.mean((1, 2)), lightmaps.frames.mean((1, 2)), rtol=0.1)
+    # One pattern: any two times differ by a factor alone, up to the rounding of the scale's codes.
+    np.testing.assert_allclose(out[3] / out[3].mean((0, 1)), out[1] / out[1].mean((0, 1)), rtol=1e-3, atol=1e-4)
+
+
+def test_one_valid_texel(tmp_path):
+    mask = np.zeros((128, 128), bool)
+    mask[77, 3] = True
+    lightmaps = moving_light(mask=mask)
+    decoder = through_file(tmp_path, lightmaps)
+    # A texel alone is a constant at every time, whatever the light does.
+    assert only(decoder, "constant")
+    np.testing.assert_allclose(decoded(decoder)[:, 77, 3], lightmaps.frames[:, 77, 3], rtol=2**-10)
+    report = evaluate(decoder.model, lightmaps, (tmp_path / "a.wlm").stat().st_size)
+    assert report.scored == 0 and report.to_json()["psnr"] is None
+
+
+def test_two_valid_texels_are_fitted(tmp_path):
+    mask = np.zeros((128, 128), bool)
+    mask[0, 0] = mask[127, 127] = True
+    decoder = through_file(tmp_path, moving_light(mask=mask), tiny_profile(steps=30))
+    assert only(decoder, "dynamic")
+
+
+def test_one_time_only_is_static_and_the_same_at_any_hour(tmp_path):
+    for period in (24.0, None):
+        decoder = through_file(tmp_path, moving_light(hours=(6.0,), period=period))
+        assert only(decoder, "static")
+        for hour in (0.0, 6.0, 23.9, -5.0, 100.0):
+            # Up to the rounding of (1 - share) x + share x.
+            np.testing.assert_allclose(decoder.frame(hour), decoder.frame(6.0), rtol=1e-5)
+
+
+@pytest.mark.parametrize(("height", "width", "tiles"), [(130, 70, 2), (1, 1, 1), (1, 300, 3)])
+def test_maps_that_are_no_multiple_of_a_tile(tmp_path, height, width, tiles):
+    lightmaps = moving_light(height, width)
+    decoder = through_file(tmp_path, lightmaps)
+    assert len(decoder.model.kind) == tiles
+    assert decoder.tile(tiles - 1, 3.0).shape == (128, 128, 3)
+    assert decoder.tile(0, 3.0, border=4).shape == (136, 136, 3)
+    pixels, peak = decoder.frame_8bit(3.0)
+    assert pixels.shape == (height, width, 4) and peak.shape == (tiles,)
+    report = evaluate(decoder.model, lightmaps, (tmp_path / "a.wlm").stat().st_size, metrics=("psnr",))
+    assert report.bpp == report.bytes * 8 / (height * width * len(HOURS))
+
+
+def test_light_up_to_60000(tmp_path):
+    lightmaps = moving_light(gain=60_000 / 1.2)
+    assert lightmaps.frames.max() > 50_000
+    decoder = through_file(tmp_path, lightmaps, tiny_profile(steps=60))
+    out = decoded(decoder)
+    assert out.max() > 10_000
+    np.testing.assert_allclose(out.mean((1, 2)), lightmaps.frames.mean((1, 2)), rtol=0.3)
+    # The scale is the same path for any brightness: the fit is as good as that of the dim set.
+    dim = evaluate(compress(moving_light(), tiny_profile(steps=60)), moving_light(), 10**6, metrics=("psnr",))
+    bright = evaluate(decoder.model, lightmaps, 10**6, metrics=("psnr",))
+    assert bright.psnr == pytest.approx(dim.psnr, abs=2.0)
+
+
+def test_dark_and_bright_tiles_side_by_side(tmp_path):
+    frames = moving_light(128, 256).frames.copy()
+    frames[:, :, :128] *= 1e-4
+    frames[:, :, 128:] *= 2e4
+    lightmaps = from_arrays(frames, HOURS, period=24.0)
+    out = decoded(through_file(tmp_path, lightmaps, tiny_profile(steps=60)))
+    for half in (slice(0, 128), slice(128, 256)):
+        np.testing.assert_allclose(out[:, :, half].mean((1, 2)), frames[:, :, half].mean((1, 2)), rtol=0.3)
+
+
+def test_nan_texels_take_their_neighbours_light(tmp_path):
+    frames = moving_light().frames.copy()
+    broken = frames.copy()
+    broken[2, 40:43, 50] = np.nan
+    broken[3, 7, 7, 1] = np.inf
+    lightmaps = from_arrays(broken, HOURS, period=24.0)
+    assert len(lightmaps.warnings) == 2
+    out = decoded(through_file(tmp_path, lightmaps))
+    assert out[2, 41, 50].max() < 4 * frames[2].max()
+
+
+def test_an_empty_mask_is_one_line():
+    with pytest.raises(WlmError, match="the mask is empty"):
+        moving_light(mask=np.zeros((128, 128), bool))
+
+
+def test_a_channel_that_is_black_at_one_time_stays_black(tmp_path):
+    frames = moving_light().frames.copy()
+    frames[1, ..., 2] = 0.0
+    frames[3] = 0.0
+    decoder = through_file(tmp_path, from_arrays(frames, HOURS, period=24.0))
+    out = decoded(decoder)
+    assert not out[1, ..., 2].any() and not out[3].any()
+    assert out[1, ..., 0].mean() > 0.05 and out[2, ..., 2].mean() > 0.05
+    pixels, peak = decoder.frame_8bit(HOURS[3])
+    assert peak[0] == 0 and not pixels[..., :3].any()
+
+
+def test_a_channel_that_is_always_black(tmp_path):
+    frames = moving_light().frames.copy()
+    frames[..., 1] = 0.0
+    out = decoded(through_file(tmp_path, from_arrays(frames, HOURS, period=24.0)))
+    assert not out[..., 1].any() and out[..., 0].mean() > 0.05
+
+
+def test_a_subset_of_the_tiles(tmp_path):
+    lightmaps = moving_light(200, 256)
+    decoder = through_file(tmp_path, lightmaps, tiles=[3, 0])
+    assert decoder.model.kind.tolist() == [3, 0, 0, 3]
+    frame = decoder.frame(5.0)
+    assert frame[:128, :128].any() and frame[128:, 128:].any()
+    assert not frame[:128, 128:].any() and not frame[128:, :128].any()
+    # The order asked for changes nothing.
+    assert file_bytes(tmp_path, lightmaps, tiles=[3, 0]) == file_bytes(tmp_path, lightmaps, tiles=[0, 3])
+
+
+@pytest.mark.parametrize("tiles", [[4], [-1], [0, 0], []])
+def test_tiles_that_are_not_there_are_one_line(tiles):
+    with pytest.raises(WlmError, match="tile"):
+        compress(moving_light(130, 130), PROFILE, tiles=tiles)
+
+
+def test_one_seed_gives_one_file_and_another_seed_another(tmp_path):
+    lightmaps = moving_light()
+    first = file_bytes(tmp_path, lightmaps, seed=1)
+    assert file_bytes(tmp_path, lightmaps, seed=1) == first
+    assert file_bytes(tmp_path, lightmaps, seed=2) != first
+
+
+@pytest.mark.parametrize("make", [moving_light, static_light])
+def test_a_tile_alone_is_the_tile_of_a_batch(make):
+    narrow, lightmaps = make(128, 128), make(128, 256)
+    frames = lightmaps.frames.copy()
+    # The codes of the scales span the file's range; with the darkest and the brightest in tile 0, it spans both.
+    frames[:, :, :128] = narrow.frames
+    frames[:, :, 128:] = frames[:, :, 128:] * 0.01 + frames[:, :, :128].mean((1, 2))[:, None, None]
+    lightmaps = from_arrays(frames, HOURS, period=24.0)
+    batch = compress(lightmaps, PROFILE, seed=5)
+    alone = compress(lightmaps, PROFILE, seed=5, tiles=[0])
+    assert len(batch.uv) == 2 and batch.span == alone.span
+    for name in ("uv", "uvt", "ut", "vt", "net", "net_static", "scale", "peak", "affine"):
+        # A part that the tile hasn't is empty in both.
+        np.testing.assert_array_equal(getattr(batch, name)[:1], getattr(alone, name)[:1], err_msg=name)
+    np.testing.assert_array_equal(Decoder(batch).tile(0, 9.0), Decoder(alone).tile(0, 9.0))
+
+
+# Not the paper's axis over a day: it is clamped at midnight, and the jump there is its own.
+@pytest.mark.parametrize(("period", "time_axis"), [(24.0, "frames"), (None, "frames"), (None, "paper")])
+def test_light_moves_smoothly_between_stored_times(tmp_path, period, time_axis):
+    lightmaps = moving_light(period=period)
+    decoder = through_file(tmp_path, lightmaps, tiny_profile(steps=100, time_axis=time_axis))
+    frames = decoded(decoder)
+    neighbours = np.abs(np.diff(frames, axis=0))
+    if period is not None:
+        neighbours = np.concatenate([neighbours, np.abs(frames[:1] - frames[-1:])])
+    largest = neighbours.max(0)
+    hours = np.arange(-0.5, 25.0, 0.5)
+    steps = np.abs(np.diff(np.stack([decoder.frame(hour) for hour in hours]), axis=0)).max(0)
+    assert (steps <= largest + 0.02 * frames.max()).all()
+    # And it does move: the day is not a row of stills.
+    middle = decoder.frame(8.0)
+    assert np.abs(middle - frames[1]).max() > 0.02 and np.abs(middle - frames[2]).max() > 0.02
+
+
+def test_at_stored_times_the_interpolated_light_is_the_stored_light(tmp_path):
+    decoder = through_file(tmp_path, moving_light())
+    for hour in HOURS:
+        for near in (hour - 1e-6, hour + 1e-6):
+            np.testing.assert_allclose(decoder.frame(near), decoder.frame(hour), atol=1e-3)
+
+
+def test_times_outside_the_range_wrap_or_stop(tmp_path):
+    wrapped = through_file(tmp_path, moving_light(period=24.0))
+    for hour in (-3.0, 21.0, 24.0, 47.5, -240.0):
+        np.testing.assert_allclose(wrapped.frame(hour), wrapped.frame(hour % 24.0), atol=1e-5)
+    stopped = through_file(tmp_path, moving_light(period=None))
+    np.testing.assert_array_equal(stopped.frame(-100.0), stopped.frame(HOURS[0]))
+    np.testing.assert_array_equal(stopped.frame(1e9), stopped.frame(HOURS[-1]))
+    for bad in (np.nan, np.inf):
+        with pytest.raises(WlmError, match="time"):
+            stopped.frame(bad)
+
+
+def test_midnight_lies_between_the_last_and_the_first_time():
+    axis = TimeAxis(np.array(HOURS), 24.0, "frames")
+    assert axis.neighbours(22.0) == (4, 0, 0.5)
+    assert axis.place(24.0 - 1e-9) == pytest.approx(axis.place(0.0), abs=1e-6)
+
+
+def test_the_eight_bit_path_is_the_float_path_rounded(tmp_path):
+    decoder = through_file(tmp_path, moving_light(), tiny_profile(steps=60))
+    pixels, peak = decoder.frame_8bit(5.0)
+    colour = np.minimum(decoder.frame(5.0) ** (1.0 / 2.2) / peak[0], 1.0)
+    np.testing.assert_allclose(pixels[..., :3] / 255.0, colour, atol=0.51 / 255.0)
+    assert (pixels[..., 3] == 255).all()
+
+
+def test_a_missing_device_and_a_missing_gelu_are_one_line():
+    with pytest.raises(WlmError, match="device 'tpu'"):
+        compress(moving_light(8, 8), PROFILE, device="tpu")
+    with pytest.raises(WlmError, match="gelu"):
+        Decoder(compress(static_light(8, 8), PROFILE), gelu="relu")

@@ -1,0 +1,33 @@
+"""Lightmap sets of one to four tiles and settings so small that a fit takes a moment."""
+
+import numpy as np
+
+from wlm.lightmap.data import LightmapSet, from_arrays
+from wlm.lightmap.model import Profile
+
+HOURS = (0.0, 5.0, 11.0, 13.5, 20.0)
+
+
+def tiny_profile(**settings) -> Profile:
+    """The sizes that all these tests share, so that each kernel is compiled once."""
+    sizes = {"hidden": 16, "uvt_resolution": 8, "uvt_slices": 4, "plane_columns": 16, "plane_rows": 8}
+    return Profile(name="tiny", **sizes | {"steps": 20, "samples": 128} | settings)
+
+
+def moving_light(height=128, width=128, hours=HOURS, period=24.0, mask=None, seed=0, gain=1.0) -> LightmapSet:
+    """A spot that wanders with the hour over a rough wall, so that no tile is static."""
+    v, u = np.mgrid[:height, :width] / 128.0
+    wall = np.random.default_rng(seed).uniform(0.6, 1.0, (height, width, 3))
+    frames = []
+    for hour in hours:
+        turn = 2.0 * np.pi * hour / 24.0
+        spot = np.exp(-8.0 * ((u % 1.0 - 0.5 - 0.3 * np.cos(turn)) ** 2 + (v % 1.0 - 0.5 - 0.3 * np.sin(turn)) ** 2))
+        frames.append(gain * (0.2 + spot[..., None] * [1.0, 0.8, 0.5]) * wall)
+    return from_arrays(np.stack(frames), hours, mask, period, name="moving")
+
+
+def static_light(height=128, width=128, hours=HOURS, period=24.0) -> LightmapSet:
+    """One pattern whose brightness alone changes with the hour."""
+    pattern = np.random.default_rng(1).uniform(0.1, 1.0, (height, width, 3))
+    frames = np.stack([pattern * (1.0 + hour) for hour in hours])
+    return from_arrays(frames, hours, period=period, name="static")

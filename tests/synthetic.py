@@ -1,0 +1,60 @@
+"""Lightmap models of random maps and networks: as good as fitted ones for whoever only decodes them."""
+
+import numpy as np
+
+from wlm.formats.bc7 import pack_mode6
+from wlm.lightmap.model import LightmapModel, Profile
+from wlm.lightmap.tiles import TileGrid, TileKind
+from wlm_kernels import mlp
+
+
+def random_model(
+    kinds=(3, 2, 1, 0), columns=2, times=(0.0, 7.5, 13.0, 19.0), period=24.0, seed=0, **settings
+) -> LightmapModel:
+    """Makes a model of `columns` tiles in a row, of the given kinds; `settings` are the profile's."""
+    rng = np.random.default_rng(seed)
+    profile = Profile(name="random", **{"hidden": 8, "uvt_resolution": 8, "uvt_slices": 3} | settings)
+    kind = np.array(kinds, np.uint8)
+    rows = len(kind) // columns
+    dynamic, static, constant = (int((kind == k).sum()) for k in (3, 2, 1))
+    mapped, r = dynamic + static, profile.uvt_resolution // 4
+    # The map ends inside its last row and column of tiles.
+    height, width = rows * 128 - 20, columns * 128 - 9
+    assert TileGrid.of(height, width).count == len(kind) and max(kinds) <= TileKind.DYNAMIC
+
+    def blocks(*shape):
+        lowest = rng.integers(0, 2, (*shape, 2, 1))
+        ends = (rng.integers(0, 128, (*shape, 2, 4)) * 2 + lowest).astype(np.uint8)
+        return pack_mode6(ends, rng.integers(0, 16, (*shape, 16), np.uint8))
+
+    def nets(count, temporal):
+        parameters = mlp.parameter_count(profile.inputs(temporal), profile.hidden)
+        return (rng.standard_normal((count, parameters)) * profile.hidden**-0.5).astype(np.float16)
+
+    plane = (dynamic, profile.plane_rows, profile.plane_columns, 2)
+    affine = np.stack([rng.uniform(0.8, 1.2, (mapped, 3)), rng.uniform(0.1, 0.3, (mapped, 3))], axis=1)
+    # A channel's code 0 is black at that time; the bound, 255, is far above every mean.
+    scale = rng.integers(60, 200, (mapped, len(times), 3), np.uint8)
+    if mapped:
+        scale[0, -1, 2] = 0
+    return LightmapModel(
+        name="random",
+        width=width,
+        height=height,
+        times=np.array(times, np.float64),
+        period=period,
+        source="0123456789abcdef",
+        profile=profile,
+        kind=kind,
+        uv=blocks(mapped, 32, 32),
+        uvt=blocks(dynamic, profile.uvt_slices, r, r),
+        ut=rng.integers(0, 256, plane, np.uint8),
+        vt=rng.integers(0, 256, plane, np.uint8),
+        net=nets(dynamic, True),
+        net_static=nets(static, False),
+        scale=scale,
+        peak=rng.integers(200, 256, (mapped, len(times)), np.uint8),
+        affine=affine.astype(np.float16),
+        constant=rng.uniform(0.0, 3.0, (constant, len(times), 3)).astype(np.float16),
+        span=(-6.0, 3.0),
+    )

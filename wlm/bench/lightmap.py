@@ -1,0 +1,352 @@
+"""The lightmap system against itself and against block codecs: size, speed and error in one run.
+
+Four kinds of rows:
+
+- method "ours", a profile each: the file, the fit, the errors of the float decode against the input, and the decode
+  time of the whole map to 8 bits on the fast path.
+- methods "exact" (a texel a thread) and "strip" (the fast path), a GELU each, of profile M: the 8-bit output against
+  the input, and its largest error against the float64 path. Half a level of 8 bits, 0.00196, is the rounding itself.
+- the block codecs of ``wlm.baselines``, on the same lightmaps.
+- method "fit", a profile each: the speed of the fit alone.
+
+A decode on CUDA is timed as the replay of a graph, so that gaps between launches do not count; block codecs decode on
+the CPU alone, and in a texture unit on a GPU, so that they have a decode time on the CPU alone.
+"""
+
+import os
+import tempfile
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+
+import wlm
+from wlm import interop
+from wlm.baselines import BASELINES
+from wlm.bench.runner import Row, run_peers
+from wlm.errors import WlmError
+from wlm.lightmap import codec
+from wlm.lightmap.data import LightmapSet, load_set
+from wlm.lightmap.decode import Decoder
+from wlm.lightmap.evaluate import bits_per_texel
+from wlm.lightmap.fit import compress
+from wlm.lightmap.model import TILE, LightmapModel, Profile, load_profile
+from wlm.lightmap.reference import bound64, colour_tile64, decode_tile64
+from wlm.lightmap.runtime import ExactDecoder, StripDecoder
+from wlm.lightmap.tiles import TileGrid, TileKind, assemble
+from wlm.metrics import METRICS, Summary, evaluate_frame, summarise
+
+__all__ = ["PROFILES", "QUICK_PROFILES", "run", "run_rows"]
+
+PROFILES = ("L", "M", "H", "M64", "M-paper")
+"""Profiles of a full run: the paper's table 3, and M as the paper fits it."""
+
+QUICK_PROFILES = ("L", "M", "M-paper")
+"""Profiles of a quick run."""
+
+# A quick fit is worth this many steps of one tile, however many tiles there are: under a minute on two CPU cores.
+_QUICK_TILE_STEPS = 10_000
+_QUICK_SAMPLES = 2048
+_QUICK_HOURS = (9.0, 12.0, 21.0)  # morning, noon and lamps
+_ERROR_TIMES = 3  # the float64 path takes 30 ms a tile and time
+
+# GELU by its gate, which is shorter to read in a plot.
+_GELUS = {"exact": "erf", "tanh": "tanh", "fast": "fast tanh"}
+
+# Method, option and the packages that each codec needs.
+_CODECS = {
+    "bc6h": ("BC6H", "", ("ispc_texcomp", "imagecodecs")),
+    "bc7": ("BC7", "", ("ispc_texcomp", "imagecodecs")),
+    "astc12": ("ASTC", "12x12", ("astc_encoder",)),
+    "astc10": ("ASTC", "10x10", ("astc_encoder",)),
+    "8bit": ("8 bits", "", ()),
+}
+
+Report = Callable[[str], None]
+
+
+def run(
+    *,
+    quick: bool,
+    device: str,
+    set_path: str | os.PathLike[str] | None = None,
+    progress: Report | None = None,
+) -> list[Row]:
+    """Measures the lightmap system on one set.
+
+    Args:
+        quick: Three profiles with short fits, scored at three times (9, 12 and 21 h if the set has them): four
+            minutes on two CPU cores for 16 tiles. Its errors are those of unfinished fits.
+        device: "cpu" or "cuda:0", for fits and decodes.
+        set_path: A set as ``wlm.lightmap.data.load_set`` reads it; None: the checkout's ``demos/data/city``, two
+            tiles of the city.
+        progress: Called with a line before each part of the work.
+
+    Returns:
+        The rows, in the order of the module's list.
+
+    Raises:
+        WlmError: The set or the device isn't there, or a fit diverged.
+    """
+    if set_path is None:
+        set_path = Path(wlm.__file__).resolve().parents[1] / "demos" / "data" / "city"
+        if not set_path.is_dir():
+            raise WlmError("bench lightmap: the demo's set comes with a checkout alone; expected --set PATH")
+    lightmaps = load_set(set_path)
+    profiles = [load_profile(name) for name in (QUICK_PROFILES if quick else PROFILES)]
+    chosen = np.arange(len(lightmaps.times))
+    if quick:
+        tiles = TileGrid.of(*lightmaps.mask.shape).count
+        steps = max(200, _QUICK_TILE_STEPS // tiles)
+        profiles = [
+            profile.model_copy(update={"steps": min(steps, profile.steps), "samples": _QUICK_SAMPLES})
+            for profile in profiles
+        ]
+        chosen = _quick_times(lightmaps.times)
+    return run_rows(lightmaps, profiles, device=device, chosen=chosen, progress=progress)
+
+
+def run_rows(
+    lightmaps: LightmapSet,
+    profiles: Sequence[Profile],
+    *,
+    device: str,
+    chosen: Sequence[int] | np.ndarray,
+    repeats: int | None = None,
+    progress: Report | None = None,
+) -> list[Row]:
+    """Measures given profiles on a given set.
+
+    Args:
+        lightmaps: The set.
+        profiles: At least one. The rows of decode options are of the one named "M", else of the first.
+        device: "cpu" or "cuda:0".
+        chosen: Places of the times that are scored, int [K].
+        repeats: Samples of each decode time; None: 30 on CUDA, 7 on the CPU, where a sample is a whole map.
+        progress: As for ``run``.
+
+    Returns:
+        The rows.
+
+    Raises:
+        WlmError: As ``run``.
+        ValueError: No profile, or no time.
+    """
+    if not profiles or len(chosen) == 0:
+        raise ValueError("expected at least one profile and one time")
+    device = interop.check_device(device)
+    report = progress or (lambda line: None)
+    bench = _Bench(lightmaps, device, np.asarray(chosen), report)
+    with tempfile.TemporaryDirectory() as folder:
+        fits = [bench.fit(profile, Path(folder)) for profile in profiles]
+    peers = [bench.profile_row(fit) for fit in fits]
+    best = next((fit for fit in fits if fit.profile.name == "M"), fits[0])
+    if (best.model.kind >= TileKind.STATIC).any():
+        # On the CPU "fast" is "tanh".
+        gelus = [gelu for gelu in _GELUS if device != "cpu" or gelu != "fast"]
+        for path in ("exact", "strip"):
+            peers += [bench.option_row(best, path, gelu) for gelu in gelus]
+    report("timing the decoders, in turns")
+    few = device == "cpu"
+    rows = run_peers(
+        peers, device, warmup=1 if few else 5, repeats=repeats if repeats is not None else 7 if few else 30
+    )
+    rows += [bench.codec_row(name) for name in _CODECS]
+    return rows + [bench.fit_row(fit) for fit in fits]
+
+
+def _quick_times(times: np.ndarray) -> np.ndarray:
+    """Places of the three hours, or of three times spread evenly."""
+    if np.isin(_QUICK_HOURS, times).all():
+        return np.searchsorted(times, _QUICK_HOURS)
+    return np.unique(np.linspace(0, len(times) - 1, 3).round().astype(int))
+
+
+@dataclass(frozen=True)
+class _Fit:
+    profile: Profile
+    model: LightmapModel  # as read back from the file
+    bytes: int
+    fit_seconds: float
+    write_seconds: float
+
+
+class _Bench:
+    """A set, where it is decoded, and the times that are scored."""
+
+    def __init__(self, lightmaps: LightmapSet, device: str, chosen: np.ndarray, report: Report):
+        self.lightmaps, self.device, self.chosen, self.report = lightmaps, device, chosen, report
+        self.times = [float(t) for t in lightmaps.times[chosen]]
+        self.grid = TileGrid.of(*lightmaps.mask.shape)
+        count = len(lightmaps.times)
+        if len(chosen) == count:
+            self.scored = f"scored at all {count} times"
+        else:
+            self.scored = f"scored at {', '.join(f'{t:g}' for t in self.times)} of {count} times"
+
+    def fit(self, profile: Profile, folder: Path) -> _Fit:
+        """Fits and writes a profile; compiling its kernels is no part of either time."""
+        self.report(f"{profile.name}: fitting {self.grid.count} tiles, {profile.steps:,} steps")
+        compress(self.lightmaps, profile.model_copy(update={"steps": 10}), device=self.device)
+        start = time.perf_counter()
+        model = compress(self.lightmaps, profile, device=self.device)
+        fitted = time.perf_counter()
+        path = folder / f"{profile.name}.wlm"
+        size = codec.write(path, model)
+        written = time.perf_counter()
+        return _Fit(profile, codec.read(path), size, fitted - start, written - fitted)
+
+    def profile_row(self, fit: _Fit) -> tuple[Row, Callable[[], object]]:
+        """What a profile costs and gives, but for the time of its decode, which is the function's."""
+        self.report(f"{fit.profile.name}: scoring")
+        model = fit.model
+        decoder = Decoder(model, self.device)
+        frames = {t: decoder.frame(t) for t in self.times}
+        error = 0.0
+        for t in self._error_times():
+            tiles = np.stack([decode_tile64(model, number, t) for number in range(self.grid.count)])
+            exact = assemble(tiles, np.arange(self.grid.count), self.grid)
+            error = max(error, float(np.abs(frames[t] - exact).max()))
+        row = self._row(
+            "ours",
+            fit.profile.name,
+            self._score(frames.values(), fit.profile.name),
+            bytes=fit.bytes,
+            bpp=bits_per_texel(model, self.lightmaps.mask, fit.bytes),
+            encode_seconds=fit.fit_seconds + fit.write_seconds,
+            max_error=error,
+            notes=f"{self._kinds(model)}; {fit.profile.steps:,} steps; {self.scored}; errors of the float decode, "
+            f"max error in radiance; {self._timed('the whole map to 8 bits')}",
+        )
+        return row, self._decode(self._decoders(model, "strip", None))
+
+    def option_row(self, fit: _Fit, path: str, gelu: str) -> tuple[Row, Callable[[], object]]:
+        """One way to decode a profile to 8 bits."""
+        self.report(f"{fit.profile.name}: {path} decode with {gelu} GELU")
+        model = fit.model
+        decoders = self._decoders(model, path, gelu)
+        frames, error = [], 0.0
+        for t in self.times:
+            tiles, worst = self._tiles_8bit(model, decoders, t, compare=t in self._error_times())
+            frames.append(assemble(tiles, np.arange(self.grid.count), self.grid))
+            error = max(error, worst)
+        own = ", the model's own" if gelu == model.profile.gelu else ""
+        row = self._row(
+            path,
+            _GELUS[gelu],
+            self._score(frames, path),
+            max_error=error,
+            notes=f"profile {fit.profile.name}, GELU by {_GELUS[gelu]}{own}; {self.scored}; errors of the 8-bit "
+            f"output, max error as a share of 255; {self._timed('the whole map')}",
+        )
+        return row, self._decode(decoders)
+
+    def codec_row(self, name: str) -> Row:
+        """A block codec on the same lightmaps, each time on its own."""
+        method, option, packages = _CODECS[name]
+        missing = [package for package in packages if find_spec(package) is None]
+        if missing:
+            notes = f"not measured: {missing[0]} is missing; needs the extra: pip install 'wlm[baselines]'"
+            return Row("lightmap", self.lightmaps.name, method, option, notes=notes)
+        self.report(f"{method} {option}".strip())
+        encode = BASELINES[name]
+        results = [encode(self.lightmaps.frames[i], self.lightmaps.mask) for i in self.chosen]
+        count, used = len(self.lightmaps.times), len(results)
+        p10, median, p90 = np.percentile([1e3 * result.decode_seconds for result in results], [10, 50, 90])
+        size = count * results[0].bytes  # a fixed rate: every time weighs the same
+        row = self._row(
+            method,
+            option,
+            self._score([result.decoded for result in results], method),
+            bytes=size,
+            bpp=size * 8 / (self.lightmaps.mask.size * count),
+            encode_seconds=sum(result.encode_seconds for result in results) * count / used,
+            notes=f"{self.scored}, sizes of all {count}; one CPU thread"
+            + ("" if used == count else f"; encode time of {used} scaled to {count}"),
+        )
+        if self.device == "cpu":
+            row = replace(row, decode_ms=float(median), decode_ms_spread=float(p90 - p10))
+        return row
+
+    def fit_row(self, fit: _Fit) -> Row:
+        """The speed of a fit."""
+        profile = fit.profile
+        step_ms = 1e3 * fit.fit_seconds / profile.steps
+        return Row(
+            "lightmap",
+            self.lightmaps.name,
+            "fit",
+            f"{profile.name} {profile.steps:,} steps",
+            encode_seconds=fit.fit_seconds,
+            notes=f"{self._kinds(fit.model)} together, {profile.samples:,} samples each: {step_ms:.3g} ms a step",
+        )
+
+    def _row(self, method: str, option: str, summary: Summary, **values) -> Row:
+        scores = {"psnr": summary.psnr, "ssim": summary.ssim, "flip": summary.flip}
+        return Row("lightmap", self.lightmaps.name, method, option, **scores, **values)
+
+    def _kinds(self, model: LightmapModel) -> str:
+        kinds = [
+            (int((model.kind == kind).sum()), kind.name.lower())
+            for kind in reversed(TileKind)
+            if kind != TileKind.EMPTY
+        ]
+        return ", ".join(f"{count} {name}" for count, name in kinds if count) + " tiles"
+
+    def _timed(self, what: str) -> str:
+        return f"time of {what}, {'one thread' if self.device == 'cpu' else 'replayed as a graph'}"
+
+    def _error_times(self) -> list[float]:
+        places = np.linspace(0, len(self.times) - 1, min(_ERROR_TIMES, len(self.times))).round().astype(int)
+        return [self.times[i] for i in places]
+
+    def _score(self, frames: Iterable[np.ndarray], name: str) -> Summary:
+        return summarise(
+            [
+                evaluate_frame(self.lightmaps.frames[i], frame, self.lightmaps.mask, TILE, METRICS, name=name)
+                for i, frame in zip(self.chosen, frames, strict=True)
+            ]
+        )
+
+    def _decoders(self, model: LightmapModel, path: str, gelu: str | None) -> list[StripDecoder | ExactDecoder]:
+        """What decodes the tiles with maps; a constant tile needs no launch."""
+        decoders: list[StripDecoder | ExactDecoder] = []
+        if (model.kind == TileKind.DYNAMIC).any():
+            make = StripDecoder if path == "strip" else ExactDecoder
+            decoders.append(make(model, self.device, gelu))
+        if (model.kind == TileKind.STATIC).any():
+            decoders.append(ExactDecoder(model, self.device, gelu, TileKind.STATIC))
+        for decoder in decoders:
+            decoder.set_time(self.times[0])
+        return decoders
+
+    def _decode(self, decoders: Sequence[StripDecoder | ExactDecoder]) -> Callable[[], object]:
+        def decode() -> None:
+            for decoder in decoders:
+                decoder.decode()
+
+        # Without any launch there is nothing to capture.
+        return interop.StepGraph(decode, self.device, warmup=1) if decoders else decode
+
+    def _tiles_8bit(
+        self, model: LightmapModel, decoders: Sequence[StripDecoder | ExactDecoder], t: float, compare: bool
+    ) -> tuple[np.ndarray, float]:
+        """Radiance of all tiles through 8 bits, and the largest error of a byte over 255 if it is to be compared."""
+        tiles = np.zeros((self.grid.count, TILE, TILE, 3))
+        worst = 0.0
+        for number in np.flatnonzero(model.kind == TileKind.CONSTANT).tolist():
+            tiles[number] = decode_tile64(model, number, t)
+        for decoder in decoders:
+            decoder.set_time(t)
+            decoder.decode()
+            shares = decoder.numpy()[..., :3] / 255.0
+            for number, share, bound in zip(decoder.numbers.tolist(), shares, decoder.bounds, strict=True):
+                tiles[number] = (share * bound) ** model.profile.gamma
+                peak = bound64(model, number, t)
+                if compare and peak > 0:
+                    exact = np.minimum(colour_tile64(model, number, t) / peak, 1.0)
+                    worst = max(worst, float(np.abs(share - exact).max()))
+        return tiles, worst

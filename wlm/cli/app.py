@@ -1,0 +1,92 @@
+"""The command's root: its groups, its version, and what becomes of an error.
+
+Exit codes: 0 done; 1 the reader of our output went away; 2 bad input or an unwritable output, with one line on
+stderr that starts with `error:`; 130 interrupted by Ctrl-C. Any other exception is a bug and shows its traceback.
+
+What takes long to import (torch, Warp) is imported by the commands that need it, so that `wlm --version` answers at
+once.
+"""
+
+import errno
+import os
+import sys
+from collections.abc import Sequence
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from wlm import __version__
+from wlm.cli import bench, doctor, lightmap
+from wlm.errors import WlmError, one_line
+
+__all__ = ["BAD_INPUT", "INTERRUPTED", "app", "main"]
+
+BAD_INPUT = 2
+INTERRUPTED = 130  # 128 and the number of SIGINT, as shells have it
+
+# The base of all that the parser says of an argument; typer names only this child of it.
+_UsageError = typer.BadParameter.__base__
+
+
+class _Group(TyperGroup):
+    """Turns errors that are meant for the user into one line and an exit code."""
+
+    def main(self, args: Sequence[str] | None = None, **extra: Any) -> Any:
+        args = list(sys.argv[1:] if args is None else args)
+        extra["standalone_mode"] = False
+        try:
+            # A returned number is that of an `Exit`, which an interrupt becomes too.
+            sys.exit(super().main(args=args or ["--help"], **extra))
+        except WlmError as error:
+            line = str(error)
+        except _UsageError as error:
+            line = f"{one_line(error.format_message())} ({_command_path(error)} --help tells more)"
+        except OSError as error:
+            if error.errno == errno.EPIPE:
+                # What Python still holds for the closed pipe must not fail again when it ends.
+                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+                sys.exit(1)
+            if error.errno is None:
+                raise
+            line = one_line(f"{error.filename or 'the system'}: {error.strerror}")
+        sys.stderr.write(f"error: {line}\n")
+        sys.exit(BAD_INPUT)
+
+
+app = typer.Typer(
+    cls=_Group,
+    help="Compressed precomputed lighting on NVIDIA Warp kernels.",
+    # A bug's traceback is for a report: plain, whole, without the values of locals.
+    pretty_exceptions_enable=False,
+    add_completion=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+app.add_typer(lightmap.app, name="lightmap")
+app.add_typer(bench.app, name="bench")
+app.command()(doctor.doctor)
+
+
+def main() -> None:
+    """Runs the command line; the entry point of `wlm`."""
+    app()
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        sys.stdout.write(f"wlm {__version__}\n")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    version: Annotated[
+        bool,
+        typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version and exit."),
+    ] = False,
+) -> None:
+    pass
+
+
+def _command_path(error: Any) -> str:
+    return error.ctx.command_path if error.ctx is not None else "wlm"

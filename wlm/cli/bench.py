@@ -1,0 +1,52 @@
+"""`wlm bench`: speed against error, ours and the baselines."""
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from wlm.cli.console import check_output, note, quiet_warp
+
+__all__ = ["app"]
+
+app = typer.Typer(help="Speed against error, ours and the baselines.")
+
+
+@app.callback()
+def _group() -> None:
+    # With one command alone, typer would make it the group itself.
+    pass
+
+
+@app.command()
+def lightmap(
+    quick: Annotated[bool, typer.Option("--quick", help="Fewer steps and rows, for a check in minutes.")] = False,
+    device: Annotated[str, typer.Option(help='Where it computes: "cpu", "cuda" or "cuda:N".')] = "cpu",
+    set_path: Annotated[
+        Path | None, typer.Option("--set", metavar="SET", help="A lightmap set; default the demo's.")
+    ] = None,
+    json_path: Annotated[
+        Path | None, typer.Option("--json", metavar="FILE.json", help="Write the rows and the environment.")
+    ] = None,
+    plot_path: Annotated[
+        Path | None, typer.Option("--plot", metavar="FILE.png", help="Draw PSNR against time and size.")
+    ] = None,
+) -> None:
+    """Lightmaps over time: PSNR, bits a texel and decode time of the profiles and of block codecs."""
+    if json_path is not None:
+        check_output(json_path, ".json")
+    if plot_path is not None:
+        check_output(plot_path, ".png", ".svg", ".pdf")
+    quiet_warp()
+    from wlm.bench import describe_environment, plot, table, write_json
+    from wlm.bench.lightmap import run
+    from wlm.interop import check_device
+
+    device = check_device(device)
+    rows = run(quick=quick, device=device, set_path=set_path, progress=note)
+    if json_path is not None:
+        write_json(json_path, rows, describe_environment(device, "wlm bench lightmap"))
+    if plot_path is not None:
+        plot(rows, plot_path)
+    sys.stdout.write(table(rows))

@@ -1,0 +1,212 @@
+"""What the commands share: tables, notes, progress, and a Ctrl-C that waits for a whole step."""
+
+import json
+import os
+import signal
+import stat
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
+from rich.table import Table
+
+from wlm.errors import WlmError
+
+__all__ = [
+    "check_output",
+    "deferred_interrupt",
+    "escape",
+    "note",
+    "number",
+    "progress_bar",
+    "quiet_warp",
+    "show",
+    "show_json",
+    "table",
+    "write_json",
+]
+
+_PLAIN_WIDTH = 120  # of a table that goes to a file or a pipe, in characters
+_PLAIN_REPORTS = 10  # lines of progress that a log gets in all
+_STDERR = 2
+_MISSING_DRIVER = b"Could not find or load the NVIDIA CUDA driver"
+
+
+def _console(stderr: bool = False) -> Console:
+    # Made at each use: it binds the stream that is there now, which a test or a caller may have replaced.
+    console = Console(stderr=stderr, highlight=False)
+    return console if console.is_terminal else Console(stderr=stderr, highlight=False, width=_PLAIN_WIDTH)
+
+
+def table(title: str, columns: Sequence[str], text: Sequence[str] = ()) -> Table:
+    """Starts a table: the first column and those named in ``text`` hold text, the others numbers."""
+    made = Table(title=escape(title), title_justify="left", title_style="bold", header_style="bold")
+    for i, heading in enumerate(columns):
+        made.add_column(heading, justify="right" if i and heading not in text else "left", overflow="fold")
+    return made
+
+
+def show(content: Table) -> None:
+    """Prints a table to stdout."""
+    _console().print(content)
+
+
+def note(text: str) -> None:
+    """Prints a line to stderr, as it is: paths may hold what rich takes for markup."""
+    _console(stderr=True).print(text, markup=False, soft_wrap=True)
+
+
+def number(value: float | None, form: str) -> str:
+    """Formats a number; a dash where there is none (None or NaN)."""
+    return "–" if value is None or value != value else format(value, form)
+
+
+def show_json(value: Any) -> None:
+    """Prints JSON to stdout, unwrapped and uncoloured."""
+    _console().out(json.dumps(value, indent=1, allow_nan=False), highlight=False)
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Writes JSON to a file, whole or not at all.
+
+    Raises:
+        WlmError: The file can't be written.
+    """
+    from wlm.formats.atomic import atomic_write
+
+    atomic_write(path, (json.dumps(value, indent=1, allow_nan=False) + "\n").encode())
+
+
+def check_output(path: Path, *suffixes: str) -> None:
+    """Checks, before long work, that a file can be written at its end.
+
+    Args:
+        path: The file.
+        suffixes: What its name may end in: a slip between input and output must not replace an input.
+
+    Raises:
+        WlmError: The name ends otherwise, the folder is missing or read-only, or something else is in its place.
+    """
+    if path.suffix.lower() not in suffixes:
+        raise WlmError(f"{path}: expected a name that ends in {' or '.join(suffixes)}")
+    folder = path.resolve().parent
+    if not folder.is_dir():
+        raise WlmError(f"{path}: cannot write: the folder {folder} does not exist")
+    if path.exists() and not stat.S_ISREG(path.stat().st_mode):
+        raise WlmError(f"{path}: cannot write: it exists and is not a regular file")
+    if not os.access(folder, os.W_OK):
+        raise WlmError(f"{path}: cannot write: the folder {folder} is read-only")
+
+
+def quiet_warp() -> None:
+    """Starts Warp without its banner, its notes on compiling, and its line on a missing GPU driver.
+
+    That the driver is missing is no news to who computes on the CPU, and `--device cuda` has an error of its own.
+    """
+    import warp as wp
+
+    wp.config.log_level = wp.LOG_WARNING
+    # Its C library writes to the process's stderr, past any setting.
+    with tempfile.TemporaryFile() as sink:
+        sys.stderr.flush()
+        saved = os.dup(_STDERR)
+        os.dup2(sink.fileno(), _STDERR)
+        try:
+            wp.init()
+        finally:
+            os.dup2(saved, _STDERR)
+            sink.seek(0)
+            for line in sink.read().splitlines(keepends=True):
+                if _MISSING_DRIVER not in line:
+                    os.write(saved, line)
+            os.close(saved)
+
+
+@contextmanager
+def progress_bar(what: str) -> Iterator[Callable[[int, int, str], None]]:
+    """Shows progress on stderr: a bar on a terminal, else a plain line about every tenth of the work.
+
+    Args:
+        what: The work, in a word or two.
+
+    Yields:
+        A function to call with what is done, what there is in all, and a text to show with it.
+    """
+    console = _console(stderr=True)
+    start = time.perf_counter()
+    if not console.is_terminal:
+        shown = 0
+
+        def line(done: int, total: int, text: str) -> None:
+            nonlocal shown
+            if (part := done * _PLAIN_REPORTS // max(total, 1)) > shown:
+                shown = part
+                note(f"{what}: {done} of {total}{text and ', '}{text}, {_left(start, done, total)}")
+
+        yield line
+        return
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TaskProgressColumn(),
+        TextColumn("{task.fields[note]}"),
+    )
+    with Progress(*columns, console=console, transient=True) as bar:
+        task = bar.add_task(what, total=None, note="")
+
+        def update(done: int, total: int, text: str) -> None:
+            fields = ", ".join(filter(None, (text, _left(start, done, total))))
+            bar.update(task, completed=done, total=total, note=fields)
+
+        yield update
+
+
+@contextmanager
+def deferred_interrupt() -> Iterator[Callable[[], None]]:
+    """Holds the first Ctrl-C back until the work says that it is between two steps.
+
+    An interrupt in the middle of a step would leave half of it done, and a fit that went on from there would not be
+    the fit that was not interrupted. The second one ends the command at once, and nothing is saved.
+
+    Yields:
+        A function to call between steps; it raises KeyboardInterrupt if there was a Ctrl-C.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        # Only the main thread gets signals: here nothing can interrupt.
+        yield lambda: None
+        return
+    asked = False
+
+    def handle(_signal: int, _frame: object) -> None:
+        nonlocal asked
+        if asked:
+            # Not KeyboardInterrupt: that would be saved as if it came between two steps.
+            raise SystemExit(128 + signal.SIGINT)
+        asked = True
+
+    def check() -> None:
+        if asked:
+            raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGINT, handle)
+    try:
+        yield check
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _left(start: float, done: int, total: int) -> str:
+    """Writes the time left, if the rest goes as the work so far did."""
+    if done <= 0:
+        return ""
+    seconds = round((time.perf_counter() - start) * (total - done) / done)
+    minutes, seconds = divmod(seconds, 60)
+    return f"{minutes}:{seconds:02d} left"

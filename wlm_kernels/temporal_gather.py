@@ -1,0 +1,125 @@
+"""Turns the sums of ``temporal_step`` into gradients, and moves the schedule on."""
+
+import warp as wp
+
+__all__ = ["gather"]
+
+
+@wp.kernel(enable_backward=False)
+def _gather_maps_cpu(
+    # in and out:
+    acc: wp.array2d[float],
+    parameters: wp.array1d[float],
+    # out:
+    grad: wp.array1d[float],
+):
+    i = wp.tid()
+    s = float(0.0)
+    for lane in range(acc.shape[0]):
+        s += acc[lane, i]
+        acc[lane, i] = 0.0
+    grad[i] = s
+    parameters[i] = wp.clamp(parameters[i], 0.0, 1.0)
+
+
+@wp.kernel(enable_backward=False)
+def _gather_maps_cuda(
+    # in and out:
+    acc: wp.array2d[wp.int64],
+    parameters: wp.array1d[float],
+    # out:
+    grad: wp.array1d[float],
+):
+    i = wp.tid()
+    grad[i] = float(acc[0, i]) * 9.094947017729282e-13
+    acc[0, i] = wp.int64(0)
+    parameters[i] = wp.clamp(parameters[i], 0.0, 1.0)
+
+
+@wp.kernel(enable_backward=False)
+def _gather_net(
+    # in and out:
+    partial: wp.array2d[float],
+    partial_out: wp.array2d[float],
+    loss: wp.array2d[float],
+    clear: int,
+    schedule: wp.array1d[float],
+    first_rates: wp.vec2,
+    control: wp.array1d[int],
+    # out:
+    grad: wp.array1d[float],
+    grad_out: wp.array1d[float],
+    mean_loss: wp.array1d[float],
+    rates: wp.array1d[float],
+):
+    i = wp.tid()
+    parts = partial.shape[0]
+    if i < grad.shape[0]:
+        s = float(0.0)
+        for p in range(parts):
+            s += partial[p, i]
+            if clear != 0:
+                partial[p, i] = 0.0
+        grad[i] = s
+    if i < grad_out.shape[0]:
+        s = float(0.0)
+        for p in range(parts):
+            s += partial_out[p, i]
+            if clear != 0:
+                partial_out[p, i] = 0.0
+        grad_out[i] = s
+    if i < mean_loss.shape[0]:
+        s = float(0.0)
+        for p in range(parts):
+            s += loss[p, i]
+            if clear != 0:
+                loss[p, i] = 0.0
+        mean_loss[i] = mean_loss[i] + (s - mean_loss[i]) * 0.02  # a running mean over about 50 steps
+    if i == 0:
+        share = schedule[wp.min(control[0], schedule.shape[0] - 1)]
+        rates[0] = share * first_rates[0]
+        rates[1] = share * first_rates[1]
+        control[0] = control[0] + 1
+
+
+def gather(
+    acc,
+    parameters,
+    grad,
+    partial,
+    partial_out,
+    loss,
+    schedule,
+    first_rates,
+    control,
+    grad_net,
+    grad_out,
+    mean_loss,
+    rates,
+):
+    """Turns what ``StepKernels.launch`` left into gradients, clears it, and moves on by one step.
+
+    Args:
+        acc: [lanes, M], the maps' sums; cleared.
+        parameters: float [M], the maps; put back into [0, 1].
+        grad: float [M], written.
+        partial, partial_out, loss: The networks' sums as float [P, ...]; cleared on the CPU.
+        schedule: float [steps], share of the first learning rates at each step.
+        first_rates: The first learning rates of the maps and of the networks.
+        control: int [1], the step; increased.
+        grad_net, grad_out: float, the networks' gradients, written.
+        mean_loss: float [N], running mean of each tile's loss, updated.
+        rates: float [2], the learning rates of this step, written.
+    """
+    device = parameters.device
+    on_cpu = device.is_cpu
+    kernel = _gather_maps_cpu if on_cpu else _gather_maps_cuda
+    wp.launch(kernel, parameters.shape, inputs=[acc, parameters], outputs=[grad], device=device)
+    dim = max(grad_net.shape[0], grad_out.shape[0], mean_loss.shape[0])
+    wp.launch(
+        _gather_net,
+        dim,
+        inputs=[partial, partial_out, loss, int(on_cpu), schedule, wp.vec2(*first_rates), control],
+        outputs=[grad_net, grad_out, mean_loss, rates],
+        device=device,
+    )
