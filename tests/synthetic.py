@@ -34,9 +34,8 @@ def random_model(
     plane = (dynamic, profile.plane_rows, profile.plane_columns, 2)
     affine = np.stack([rng.uniform(0.8, 1.2, (mapped, 3)), rng.uniform(0.1, 0.3, (mapped, 3))], axis=1)
     # A channel's code 0 is black at that time; the bound, 255, is far above every mean.
-    scale = rng.integers(60, 200, (mapped, len(times), 3), np.uint8)
-    if mapped:
-        scale[0, -1, 2] = 0
+    scale = rng.integers(86, 161, (dynamic, len(times), 3), np.uint8)
+    scale[:1, -1, 2] = 0
     return LightmapModel(
         name="random",
         width=width,
@@ -53,8 +52,8 @@ def random_model(
         net=nets(dynamic, True),
         net_static=nets(static, False),
         scale=scale,
-        peak=rng.integers(200, 256, (mapped, len(times)), np.uint8),
+        scale_static=rng.uniform(0.05, 2.0, (static, len(times), 3)).astype(np.float16),
+        peak=rng.integers(161, 191, (mapped, len(times)), np.uint8),
         affine=affine.astype(np.float16),
         constant=rng.uniform(0.0, 3.0, (constant, len(times), 3)).astype(np.float16),
-        span=(-6.0, 3.0),
     )

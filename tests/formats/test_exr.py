@@ -216,3 +216,28 @@ def test_a_unicode_path(tmp_path):
     path = Path(tmp_path) / "kärtchen ✓.exr"
     write_exr(path, _pixels(3))
     assert np.array_equal(read_exr(path)[0], _pixels(3))
+
+
+@pytest.mark.parametrize("short", [1, 100])
+def test_disk_that_fills_while_writing(tmp_path, short):
+    path = tmp_path / "frame.exr"
+    pixels = np.random.default_rng(0).random((8, 8, 3), np.float32)
+    write_exr(path, pixels)
+    limit = path.stat().st_size - short
+    path.write_bytes(b"what was there")
+    # A limit on the size of files stands in for the disk: a process of its own, since it can't be taken back.
+    script = f"""
+import resource, signal, numpy as np
+from wlm.errors import WlmError
+from wlm.formats.exr import write_exr
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, ({limit}, {limit}))
+try:
+    write_exr({str(path)!r}, np.random.default_rng(0).random((8, 8, 3), np.float32))
+except WlmError as error:
+    raise SystemExit(str(error))
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert done.returncode == 1 and "cannot write" in done.stderr and done.stderr.count("\n") == 1
+    assert path.read_bytes() == b"what was there"
+    assert [entry.name for entry in tmp_path.iterdir()] == ["frame.exr"]

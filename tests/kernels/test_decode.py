@@ -13,7 +13,7 @@ from kernels.compare import array, close, exact
 from kernels.stepping import TILE, Case, draw, trainer
 from wlm.formats.bc7 import decode_image, pack_mode6
 from wlm.lightmap.decode import Decoder
-from wlm.lightmap.model import LightmapModel, decode_scale
+from wlm.lightmap.model import LightmapModel
 from wlm.lightmap.runtime import StripDecoder
 from wlm.lightmap.tiles import TileKind
 
@@ -36,12 +36,11 @@ def _model(hidden: int, gelu: str, periodic: bool = True, **settings) -> Lightma
         time_axis="frames" if periodic else "paper",
         **settings,
     )
-    span = (-1.0, 1.0)
-    scale = random.integers(110, 145, model.scale.shape, np.uint8)
+    scale = random.integers(143, 148, model.scale.shape, np.uint8)
     scale[0, 1, 2] = 0  # a channel that is black at the second time
-    peak = random.integers(200, 215, model.peak.shape, np.uint8)
+    peak = random.integers(153, 157, model.peak.shape, np.uint8)
     affine = np.stack([np.full((3, 3), 0.8), random.uniform(0.6, 1.0, (3, 3))], 1).astype(np.float16)
-    return dataclasses.replace(model, span=span, scale=scale, peak=peak, affine=affine)
+    return dataclasses.replace(model, scale=scale, peak=peak, affine=affine)
 
 
 def _reference_colour(model: LightmapModel, number: int, time: float, gelu: str) -> np.ndarray:
@@ -68,7 +67,7 @@ def _reference_colour(model: LightmapModel, number: int, time: float, gelu: str)
         model.axis.periodic,
     )
     before, after, share = model.axis.neighbours(time)
-    scale = decode_scale(model.scale[row], model.span).astype(np.float64)
+    scale = model.scales[row].astype(np.float64)
     colour = reference.decode(
         features,
         weights[:split].reshape(-1, width),
@@ -148,9 +147,8 @@ def _stored(fit, case: Case) -> LightmapModel:
         base,
         profile=fit.profile,
         period=fit.axis.period,
-        span=(-1.0, 1.0),
-        scale=random.integers(110, 145, base.scale.shape, np.uint8),
-        peak=random.integers(200, 215, base.peak.shape, np.uint8),
+        scale=random.integers(143, 148, base.scale.shape, np.uint8),
+        peak=random.integers(153, 157, base.peak.shape, np.uint8),
         **fields,
     )
 

@@ -56,15 +56,15 @@ def test_a_network_that_passes_its_features_through():
     hidden[-3] = -64.0  # the bias taken off again
     affine = np.zeros_like(model.affine)
     affine[0, :, 0] = 2.0, 1.0
-    scale = np.full_like(model.scale, 255)
-    model = replace(model, net_static=net, affine=affine, scale=scale)
+    scale = np.full_like(model.scale_static, 8.0)
+    model = replace(model, net_static=net, affine=affine, scale_static=scale)
     red = np.array([[64, 192]], np.float64) / 255.0
     endpoints = np.zeros((1, 32, 32, 2, 4), np.uint8)
     endpoints[..., 0, 0], endpoints[..., 1, 0] = 64, 192
     indices = np.zeros((1, 32, 32, 16), np.uint8)
     indices[..., 1::2] = 15
     model = replace(model, uv=pack_mode6(endpoints, indices))
-    expected = 8.0 * (2.0 + (red - 0.5) * math.sqrt(12.0))  # the largest scale is 2 ** 3
+    expected = 8.0 * (2.0 + (red - 0.5) * math.sqrt(12.0))
     colour = colour_tile64(model, 0, 5.0)
     np.testing.assert_allclose(colour[:, :, 0], np.tile(expected, (128, 64)), rtol=1e-12)
     assert not colour[..., 1:].any()

@@ -48,7 +48,7 @@ QUICK_PROFILES = ("L", "M", "M-paper")
 """Profiles of a quick run."""
 
 # A quick fit is worth this many steps of one tile, however many tiles there are: under a minute on two CPU cores.
-_QUICK_TILE_STEPS = 10_000
+_QUICK_TILE_STEPS = 8_000
 _QUICK_SAMPLES = 2048
 _QUICK_HOURS = (9.0, 12.0, 21.0)  # morning, noon and lamps
 _ERROR_TIMES = 3  # the float64 path takes 30 ms a tile and time
@@ -125,7 +125,7 @@ def run_rows(
         profiles: At least one. The rows of decode options are of the one named "M", else of the first.
         device: "cpu" or "cuda:0".
         chosen: Places of the times that are scored, int [K].
-        repeats: Samples of each decode time; None: 30 on CUDA, 7 on the CPU, where a sample is a whole map.
+        repeats: Samples of each decode time; None: 30 on CUDA, 5 on the CPU, where a sample is a whole map.
         progress: As for ``run``.
 
     Returns:
@@ -152,7 +152,7 @@ def run_rows(
     report("timing the decoders, in turns")
     few = device == "cpu"
     rows = run_peers(
-        peers, device, warmup=1 if few else 5, repeats=repeats if repeats is not None else 7 if few else 30
+        peers, device, warmup=1 if few else 5, repeats=repeats if repeats is not None else 5 if few else 30
     )
     rows += [bench.codec_row(name) for name in _CODECS]
     return rows + [bench.fit_row(fit) for fit in fits]

@@ -45,8 +45,11 @@ def lightmap(
 
     device = check_device(device)
     rows = run(quick=quick, device=device, set_path=set_path, progress=note)
+    command = f"wlm bench lightmap{' --quick' if quick else ''} --device {device}"
+    if set_path is not None:
+        command += f" --set {rows[0].scene}"
     if json_path is not None:
-        write_json(json_path, rows, describe_environment(device, "wlm bench lightmap"))
+        write_json(json_path, rows, describe_environment(device, command))
     if plot_path is not None:
         plot(rows, plot_path)
     sys.stdout.write(table(rows))

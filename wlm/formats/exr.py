@@ -96,6 +96,12 @@ def write_exr(path: str | os.PathLike[str], pixels: np.ndarray, half: bool = Tru
                 raise WlmError(f"{path}: cannot write: {reason}") from error
         if chatter.text:
             raise WlmError(f"{path}: cannot write: {chatter.text}")
+        # The library says nothing where a full disk swallows what it still held when it closed the file.
+        try:
+            read_exr(temporary)
+        except WlmError as error:
+            reason = str(error).replace(str(temporary), "the file as written")
+            raise WlmError(f"{path}: cannot write: {reason}; is the disk full?") from error
 
 
 def _check_magic(path: str | os.PathLike[str]) -> None:

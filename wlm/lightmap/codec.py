@@ -26,6 +26,7 @@ _PARTS = {
     "net": np.float16,
     "net_static": np.float16,
     "scale": np.uint8,
+    "scale_static": np.float16,
     "peak": np.uint8,
     "affine": np.float16,
     "constant": np.float16,
@@ -47,7 +48,6 @@ def write(path: str | os.PathLike[str], model: LightmapModel) -> int:
         "name": model.name,
         "size": [model.width, model.height],
         "period": model.period,
-        "span": list(model.span),
         "profile": {key: value for key, value in profile.items() if value != defaults[key]},
     }
     tensors = {key: np.ascontiguousarray(getattr(model, key)) for key in _PARTS}
@@ -98,7 +98,8 @@ def _model(path, artifact: Artifact) -> LightmapModel:
         "vt": plane,
         "net": (dynamic, mlp.parameter_count(profile.inputs(True), profile.hidden)),
         "net_static": (static, mlp.parameter_count(profile.inputs(False), profile.hidden)),
-        "scale": (mapped, t, 3),
+        "scale": (dynamic, t, 3),
+        "scale_static": (static, t, 3),
         "peak": (mapped, t),
         "affine": (mapped, 2, 3),
         "constant": (constant, t, 3),
@@ -124,6 +125,5 @@ def _model(path, artifact: Artifact) -> LightmapModel:
         source=artifact.source,
         profile=profile,
         kind=kind,
-        span=(float(settings["span"][0]), float(settings["span"][1])),
         **parts,
     )

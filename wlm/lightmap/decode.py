@@ -39,8 +39,8 @@ class Decoder:
             raise WlmError(f"gelu: expected one of {', '.join(GELUS)}, got {self.gelu!r}")
         self._axis = model.axis
         self._grid = TileGrid.of(model.height, model.width)
-        self._scale = decode_scale(model.scale, model.span)
-        self._peak = decode_scale(model.peak, model.span)
+        self._scale = model.scales
+        self._peak = decode_scale(model.peak, model.profile.gamma)
         mapped = np.flatnonzero(model.kind >= TileKind.STATIC)
         kinds = model.kind[mapped]
         self._groups = {}

@@ -31,7 +31,7 @@ __all__ = [
 # Stored times are float32 where that keeps them apart; see ``wlm.lightmap.codec``.
 _TIME_TOLERANCE = 1e-6
 
-_PARTS = ("uv", "uvt", "ut", "vt", "net", "net_static", "scale", "peak", "affine", "constant", "kind")
+_PARTS = ("uv", "uvt", "ut", "vt", "net", "net_static", "scale", "scale_static", "peak", "affine", "constant", "kind")
 
 
 @dataclass(frozen=True)

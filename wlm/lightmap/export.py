@@ -128,8 +128,8 @@ def _finish(model: LightmapModel, place: int) -> dict[str, Any]:
     return {
         "shift": _numbers(shift),
         "spread": _numbers(spread),
-        "scale": _numbers(decode_scale(model.scale[place], model.span)),
-        "peak": _numbers(decode_scale(model.peak[place], model.span)),
+        "scale": _numbers(model.scales[place]),
+        "peak": _numbers(decode_scale(model.peak[place], model.profile.gamma)),
     }
 
 

@@ -16,7 +16,6 @@ from wlm.lightmap.model import (
     TimeAxis,
     decode_scale,
     encode_scale,
-    scale_range,
 )
 from wlm.lightmap.tiles import TILE, TileData, TileGrid, TileKind, channel_means, classify, split
 from wlm.lightmap.trainer import Targets, Trainer
@@ -64,7 +63,7 @@ def compress(
 
     Raises:
         WlmError: On a device that isn't there, or tiles that aren't.
-        KeyboardInterrupt: After the checkpoint, if there is one, has been written.
+        KeyboardInterrupt: Raised by ``progress``, after the checkpoint, if there is one, has been written.
     """
     device = interop.check_device(device)
     axis = TimeAxis(lightmaps.times, lightmaps.period, profile.time_axis)
@@ -75,7 +74,7 @@ def compress(
     data = TileData(data.index[order], data.colour[order], data.mask[order])
     kinds = kinds[order]
 
-    scales = _Scales(data, kinds)
+    scales = _Scales(data, kinds, profile.gamma)
     jobs = _batches(kinds, lightmaps.frames.shape[0])
     results: dict[int, dict[str, np.ndarray]] = {}
     meter = _Meter(progress, profile.steps * len(jobs))
@@ -105,17 +104,20 @@ def compress(
 class _Scales:
     """The rounded scale, bound, shift and spread of the tiles that have maps; rows follow ``data``."""
 
-    def __init__(self, data: TileData, kinds: np.ndarray):
+    def __init__(self, data: TileData, kinds: np.ndarray, gamma: float):
         n, times = data.colour.shape[:2]
         self.mapped = np.flatnonzero(kinds >= TileKind.STATIC)
         means = channel_means(data.colour, data.mask)[self.mapped]
         peaks = np.zeros((len(self.mapped), times))
         for i, row in enumerate(self.mapped):
             peaks[i] = data.colour[row][:, data.mask[row]].max((1, 2))
-        self.span = scale_range(np.concatenate([means.ravel(), peaks.ravel()]))
-        self.scale_code = encode_scale(means, self.span)
-        self.peak_code = encode_scale(peaks, self.span, up=True)
-        self.scale = decode_scale(self.scale_code, self.span)  # [N_m, T, 3]
+        self.dynamic = kinds[self.mapped] == TileKind.DYNAMIC
+        self.scale_code = encode_scale(means[self.dynamic], gamma)
+        self.scale_static = means[~self.dynamic].astype(np.float16)
+        self.peak_code = encode_scale(peaks, gamma, up=True)
+        self.scale = np.empty(means.shape, np.float32)  # [N_m, T, 3], as rounded
+        self.scale[self.dynamic] = decode_scale(self.scale_code, gamma)
+        self.scale[~self.dynamic] = self.scale_static
         self.affine = np.zeros((len(self.mapped), 2, 3), np.float16)
         self.place = {int(row): i for i, row in enumerate(self.mapped)}
         for i, row in enumerate(self.mapped):
@@ -194,17 +196,19 @@ def _fit_batch(
             count = min(chunk, profile.steps - step)
             trainer.run(count)
             step += count
-            meter.at(step, trainer, now=step == profile.steps)
+            try:
+                meter.at(step, trainer, now=step == profile.steps)
+            except KeyboardInterrupt:
+                # Between two steps, so that what is kept is whole; anywhere else an interrupt keeps nothing.
+                if checkpoint is not None:
+                    checkpoint.save_running(number, trainer.state())
+                raise
         if not np.isfinite(trainer.losses()).all():
             bad = data.index[rows][~np.isfinite(trainer.losses())]
             raise WlmError(
                 f"tile {bad[0]}: the fit diverged; expected a smaller map_rate or net_rate than {profile.name}'s"
             )
         parts = trainer.quantised()
-    except KeyboardInterrupt:
-        if checkpoint is not None:
-            checkpoint.save_running(number, trainer.state())
-        raise
     finally:
         trainer.close()
     result = {
@@ -261,8 +265,8 @@ def _assemble(lightmaps, profile, grid, data, kinds, scales, results) -> Lightma
         net=stack(dynamic, "net", (0,), np.float16),
         net_static=stack(static, "net", (0,), np.float16),
         scale=scales.scale_code,
+        scale_static=scales.scale_static,
         peak=scales.peak_code,
         affine=scales.affine,
         constant=constant,
-        span=scales.span,
     )

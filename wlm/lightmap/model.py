@@ -19,6 +19,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from wlm.config import load_settings, profile_path
+from wlm.lightmap.tiles import TILE, TileKind
 from wlm_kernels import mlp
 from wlm_kernels.temporal import STATIC_INPUTS, TEMPORAL_INPUTS
 
@@ -30,10 +31,9 @@ __all__ = [
     "encode_scale",
     "encode_time",
     "load_profile",
-    "scale_range",
 ]
 
-TILE = 128
+SCALE_SPAN = (-21.0, 16.0)  # log2 of radiance: from half float's small numbers to its largest
 
 
 class Profile(BaseModel):
@@ -179,34 +179,29 @@ class TimeAxis:
         return np.array([math.sin(turn), math.cos(turn), math.sin(2 * turn), math.cos(2 * turn)], np.float32)
 
 
-def scale_range(values: np.ndarray) -> tuple[float, float]:
-    """log2 of the least and the largest positive value, as the codes of ``encode_scale`` span; (0, 0) without any."""
-    positive = values[values > 0]
-    if positive.size == 0:
-        return 0.0, 0.0
-    return float(np.float32(np.log2(positive.min()))), float(np.float32(np.log2(positive.max())))
+def encode_scale(values: np.ndarray, gamma: float, up: bool = False) -> np.ndarray:
+    """8-bit logarithmic codes of values >= 0: 0 is exactly 0, codes 1 to 255 share ``SCALE_SPAN`` evenly.
 
-
-def encode_scale(values: np.ndarray, span: tuple[float, float], up: bool = False) -> np.ndarray:
-    """8-bit logarithmic codes of values >= 0: 0 is exactly 0, 1 to 255 span ``span`` evenly in log2.
+    That makes steps of 4.7% at gamma 2.2. The span is fixed, so that a tile's bytes don't depend on its
+    neighbours'. Smaller values take code 1.
 
     Args:
-        values: Any shape.
-        span: From ``scale_range``.
+        values: Any shape, in gamma space.
+        gamma: Of that space.
         up: Round up rather than to the nearest, for bounds.
     """
-    low, high = span
+    low, high = (bound / gamma for bound in SCALE_SPAN)
     with np.errstate(divide="ignore"):
-        position = (np.log2(np.maximum(values, 0.0)) - low) / max(high - low, 1e-9) * 254.0
+        position = (np.log2(np.maximum(values, 0.0)) - low) / (high - low) * 254.0
     position = np.where(values > 0, position, 0.0)
     code = np.ceil(position - 1e-6) if up else np.rint(position)
     return np.where(values > 0, 1 + np.clip(code, 0, 254), 0).astype(np.uint8)
 
 
-def decode_scale(codes: np.ndarray, span: tuple[float, float]) -> np.ndarray:
+def decode_scale(codes: np.ndarray, gamma: float) -> np.ndarray:
     """The values that ``encode_scale`` stands for, float32."""
-    low, high = span
-    value = np.exp2(low + (codes.astype(np.float64) - 1.0) * (max(high - low, 1e-9) / 254.0))
+    low, high = (bound / gamma for bound in SCALE_SPAN)
+    value = np.exp2(low + (codes.astype(np.float64) - 1.0) * ((high - low) / 254.0))
     return np.where(codes > 0, value, 0.0).astype(np.float32)
 
 
@@ -226,11 +221,12 @@ class LightmapModel:
         ut, vt: uint8 [N_d, rows, columns, 2].
         net: float16 [N_d, P], the networks of dynamic tiles, ``hidden`` rows and then ``output`` rows.
         net_static: float16 [N_m - N_d, P'], those of static tiles.
-        scale: uint8 [N_m, T, 3], codes of the mean of each channel at each time, in gamma space.
+        scale: uint8 [N_d, T, 3], codes of the mean of each channel at each time, in gamma space.
+        scale_static: float16 [N_m - N_d, T, 3], the means themselves in static tiles: their network doesn't know the
+            time, so that it can't make up for rounding.
         peak: uint8 [N_m, T], codes of a bound of the tile at each time, in gamma space: 255 of the 8-bit output.
         affine: float16 [N_m, 2, 3], shift and spread.
         constant: float16 [N_c, T, 3], the radiance of constant tiles.
-        span: log2 of the least and largest value of the codes.
     """
 
     name: str
@@ -248,15 +244,24 @@ class LightmapModel:
     net: np.ndarray
     net_static: np.ndarray
     scale: np.ndarray
+    scale_static: np.ndarray
     peak: np.ndarray
     affine: np.ndarray
     constant: np.ndarray
-    span: tuple[float, float]
 
     @property
     def axis(self) -> TimeAxis:
         """The time axis of the features."""
         return TimeAxis(self.times, self.period, self.profile.time_axis)
+
+    @property
+    def scales(self) -> np.ndarray:
+        """The scale of every mapped tile, float32 [N_m, T, 3]."""
+        kinds = self.kind[self.kind >= TileKind.STATIC]
+        result = np.empty((len(kinds), len(self.times), 3), np.float32)
+        result[kinds == TileKind.DYNAMIC] = decode_scale(self.scale, self.profile.gamma)
+        result[kinds == TileKind.STATIC] = self.scale_static
+        return result
 
     @property
     def tile_columns(self) -> int:

@@ -47,7 +47,7 @@ def colour_tile64(model: LightmapModel, number: int, time: float) -> np.ndarray:
         return _spread_out(_constant(model, number, time) ** (1.0 / model.profile.gamma))
     before, after, share = model.axis.neighbours(time)
     place = _place(model, number)
-    scale = decode_scale(model.scale[place], model.span).astype(np.float64)  # [T, 3]
+    scale = model.scales[place].astype(np.float64)  # [T, 3]
     shift, spread = model.affine[place].astype(np.float64)
     answer = _answer(model, number, place, time)
     colour = (shift + spread * answer) * ((1.0 - share) * scale[before] + share * scale[after])
@@ -71,7 +71,7 @@ def bound64(model: LightmapModel, number: int, time: float) -> float:
     if model.kind[number] == TileKind.CONSTANT:
         return float(_constant(model, number, time).max() ** (1.0 / model.profile.gamma))
     before, after, share = model.axis.neighbours(time)
-    peak = decode_scale(model.peak[_place(model, number)], model.span)
+    peak = decode_scale(model.peak[_place(model, number)], model.profile.gamma)
     return float(peak[before] if share == 0 else max(peak[before], peak[after]))
 
 
