@@ -16,7 +16,8 @@ test-all: lint
 	$(BIN)/pytest -n 2 -m ""
 
 bench: $(STAMP)
-	$(BIN)/wlm bench
+	mkdir -p out
+	$(BIN)/wlm bench lightmap --quick --json out/bench.json --plot out/bench.png
 
 lint: $(STAMP)
 	$(BIN)/ruff check

@@ -118,6 +118,9 @@ class Batch:
     slices: int  # S of F_uvt
     turn: float  # gamma(t) is sine and cosine of turn tau and of 2 turn tau
     between: float  # share of the samples at times between two stored ones
+    gamma: float
+    inverse_range: wp.array2d[float]  # [N, T] 1 / the squared range of radiance; 0 where there is none
+    tracked: wp.array4d[float]  # [lanes, N, T, 2] sum and count of squared errors of radiance, or empty: not wanted
     seed: int
     shift: wp.array1d[wp.vec3]  # [N] colour over scale = shift + spread * target
     spread: wp.array1d[wp.vec3]  # [N]
@@ -207,3 +210,22 @@ def texel_weight(batch: Batch, n: int, m: Moment, target: wp.vec3) -> wp.vec3:
             wp.pow(wp.max(colour[2], least), batch.emphasis),
         ),
     )
+
+
+@wp.func
+def radiance_of(batch: Batch, n: int, k: int, y: wp.vec3) -> wp.vec3:
+    c = wp.cw_mul(batch.shift[n] + wp.cw_mul(batch.spread[n], y), batch.scale[n, k])
+    return wp.vec3(
+        wp.pow(wp.max(c[0], 0.0), batch.gamma),
+        wp.pow(wp.max(c[1], 0.0), batch.gamma),
+        wp.pow(wp.max(c[2], 0.0), batch.gamma),
+    )
+
+
+@wp.func
+def track_error(batch: Batch, lane: int, n: int, m: Moment, target: wp.vec3, error: wp.vec3):
+    """Adds a sample's error as PSNR measures it, for progress reports; the sums take no part in the fit."""
+    if batch.tracked.shape[0] > 0 and m.share == 0.0:
+        e = radiance_of(batch, n, m.k, target + error) - radiance_of(batch, n, m.k, target)
+        wp.atomic_add(batch.tracked, lane, n, m.k, 0, wp.dot(e, e) / 3.0 * batch.inverse_range[n, m.k])
+        wp.atomic_add(batch.tracked, lane, n, m.k, 1, 1.0)

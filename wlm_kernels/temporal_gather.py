@@ -2,7 +2,7 @@
 
 import warp as wp
 
-__all__ = ["gather"]
+__all__ = ["gather_maps", "gather_net"]
 
 
 @wp.kernel(enable_backward=False)
@@ -10,10 +10,11 @@ def _gather_maps_cpu(
     # in and out:
     acc: wp.array2d[float],
     parameters: wp.array1d[float],
+    base: int,
     # out:
     grad: wp.array1d[float],
 ):
-    i = wp.tid()
+    i = base + wp.tid()
     s = float(0.0)
     for lane in range(acc.shape[0]):
         s += acc[lane, i]
@@ -82,27 +83,29 @@ def _gather_net(
         control[0] = control[0] + 1
 
 
-def gather(
-    acc,
-    parameters,
-    grad,
-    partial,
-    partial_out,
-    loss,
-    schedule,
-    first_rates,
-    control,
-    grad_net,
-    grad_out,
-    mean_loss,
-    rates,
-):
-    """Turns what ``StepKernels.launch`` left into gradients, clears it, and moves on by one step.
+def gather_maps(acc, parameters, grad, base: int = 0, count: int | None = None) -> None:
+    """Turns the maps' sums that ``StepKernels.launch`` left into gradients, and clears them.
 
     Args:
-        acc: [lanes, M], the maps' sums; cleared.
+        acc: [lanes, M], the sums; cleared.
         parameters: float [M], the maps; put back into [0, 1].
         grad: float [M], written.
+        base, count: On the CPU, the part from base on that this launch takes; default the whole.
+    """
+    device = parameters.device
+    if device.is_cpu:
+        dim = parameters.shape[0] - base if count is None else count
+        wp.launch(_gather_maps_cpu, dim, inputs=[acc, parameters, base], outputs=[grad], device=device)
+    else:
+        wp.launch(_gather_maps_cuda, parameters.shape, inputs=[acc, parameters], outputs=[grad], device=device)
+
+
+def gather_net(
+    partial, partial_out, loss, schedule, first_rates, control, grad_net, grad_out, mean_loss, rates
+) -> None:
+    """Turns the networks' sums into gradients, and moves on by one step.
+
+    Args:
         partial, partial_out, loss: The networks' sums as float [P, ...]; cleared on the CPU.
         schedule: float [steps], share of the first learning rates at each step.
         first_rates: The first learning rates of the maps and of the networks.
@@ -111,15 +114,11 @@ def gather(
         mean_loss: float [N], running mean of each tile's loss, updated.
         rates: float [2], the learning rates of this step, written.
     """
-    device = parameters.device
-    on_cpu = device.is_cpu
-    kernel = _gather_maps_cpu if on_cpu else _gather_maps_cuda
-    wp.launch(kernel, parameters.shape, inputs=[acc, parameters], outputs=[grad], device=device)
-    dim = max(grad_net.shape[0], grad_out.shape[0], mean_loss.shape[0])
+    device = partial.device
     wp.launch(
         _gather_net,
-        dim,
-        inputs=[partial, partial_out, loss, int(on_cpu), schedule, wp.vec2(*first_rates), control],
+        max(grad_net.shape[0], grad_out.shape[0], mean_loss.shape[0]),
+        inputs=[partial, partial_out, loss, int(device.is_cpu), schedule, wp.vec2(*first_rates), control],
         outputs=[grad_net, grad_out, mean_loss, rates],
         device=device,
     )

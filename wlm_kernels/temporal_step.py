@@ -30,6 +30,7 @@ from wlm_kernels.temporal import (
     stored_moment,
     target_at,
     texel_weight,
+    track_error,
     volume_at,
 )
 from wlm_kernels.temporal_adjoint import scatters
@@ -52,6 +53,10 @@ class StepKernels:
     scalar: Any
     draw: Any
     _step: Any
+
+    def load(self, device) -> None:
+        """Compiles the step for a device now rather than at its first launch."""
+        self._step.module.load(wp.get_device(device))
 
     def launch(
         self,
@@ -243,6 +248,7 @@ def step_kernels(temporal: bool, hidden: int, gelu: str, device_kind: str) -> St
             h2 = wp.cw_mul(a2, g2)
             target = target_at(batch, n, m, flat)
             error = third(o, n, h2) - target
+            track_error(batch, lane, n, m, target, error)
             d3 = wp.cw_mul(texel_weight(batch, n, m, target), error) / (3.0 * float(samples))
             loss[lane, n] += wp.dot(d3, error)
             d3 = 2.0 * d3
@@ -297,6 +303,7 @@ def step_kernels(temporal: bool, hidden: int, gelu: str, device_kind: str) -> St
             h2 = wp.cw_mul(a2, g2)
             target = target_at(batch, n, m, flat)
             error = third(o, n, h2) - target
+            track_error(batch, 0, n, m, target, error)
             d3 = wp.cw_mul(texel_weight(batch, n, m, target), error) / (3.0 * float(samples))
             value = wp.dot(d3, error)
             d3 = 2.0 * d3

@@ -124,9 +124,7 @@ def encode_bc7(frame: np.ndarray, mask: np.ndarray, profile: str = "basic") -> B
     return _result("bc7", image, len(data) + _SCALE_BYTES, encode_seconds, decode_seconds, decoded)
 
 
-def encode_astc(
-    frame: np.ndarray, mask: np.ndarray, block: int = 12, quality: float = ASTC_MEDIUM
-) -> BlockResult:
+def encode_astc(frame: np.ndarray, mask: np.ndarray, block: int = 12, quality: float = ASTC_MEDIUM) -> BlockResult:
     """ASTC HDR in square blocks of 16 bytes, with astcenc: 0.89 bits a texel at 12x12, 1.28 at 10x10.
 
     The HDR profile has no early stop on decibels (astcenc ignores `tune_db_limit` there); in an LDR profile

@@ -7,7 +7,8 @@ Four kinds of rows:
 - methods "exact" (a texel a thread) and "strip" (the fast path), a GELU each, of profile M: the 8-bit output against
   the input, and its largest error against the float64 path. Half a level of 8 bits, 0.00196, is the rounding itself.
 - the block codecs of ``wlm.baselines``, on the same lightmaps.
-- method "fit", a profile each: the speed of the fit alone.
+- method "fit", a profile each: the speed of the fit alone; and the same fit in plain torch, all of it on CUDA in a
+  full run, else a few steps.
 
 A decode on CUDA is timed as the replay of a graph, so that gaps between launches do not count; block codecs decode on
 the CPU alone, and in a texture unit on a GPU, so that they have a decode time on the CPU alone.
@@ -26,14 +27,15 @@ import numpy as np
 import wlm
 from wlm import interop
 from wlm.baselines import BASELINES
+from wlm.baselines.plain_torch import PlainFit
 from wlm.bench.runner import Row, run_peers
 from wlm.errors import WlmError
 from wlm.lightmap import codec
 from wlm.lightmap.data import LightmapSet, load_set
 from wlm.lightmap.decode import Decoder
 from wlm.lightmap.evaluate import bits_per_texel
-from wlm.lightmap.fit import compress
-from wlm.lightmap.model import TILE, LightmapModel, Profile, load_profile
+from wlm.lightmap.fit import compress, dynamic_targets
+from wlm.lightmap.model import TILE, LightmapModel, Profile, TimeAxis, encode_time, load_profile
 from wlm.lightmap.reference import bound64, colour_tile64, decode_tile64
 from wlm.lightmap.runtime import ExactDecoder, StripDecoder
 from wlm.lightmap.tiles import TileGrid, TileKind, assemble
@@ -51,6 +53,7 @@ QUICK_PROFILES = ("L", "M", "M-paper")
 _QUICK_TILE_STEPS = 8_000
 _QUICK_SAMPLES = 2048
 _QUICK_HOURS = (9.0, 12.0, 21.0)  # morning, noon and lamps
+_PLAIN_STEPS = 10  # of the fit in plain torch, where it isn't run to its end
 _ERROR_TIMES = 3  # the float64 path takes 30 ms a tile and time
 
 # GELU by its gate, which is shorter to read in a plot.
@@ -155,7 +158,9 @@ def run_rows(
         peers, device, warmup=1 if few else 5, repeats=repeats if repeats is not None else 5 if few else 30
     )
     rows += [bench.codec_row(name) for name in _CODECS]
-    return rows + [bench.fit_row(fit) for fit in fits]
+    rows += [bench.fit_row(fit) for fit in fits]
+    plain = bench.plain_row(best, whole=device != "cpu" and len(chosen) == len(lightmaps.times))
+    return rows + ([plain] if plain else [])
 
 
 def _quick_times(times: np.ndarray) -> np.ndarray:
@@ -282,6 +287,50 @@ class _Bench:
             f"{profile.name} {profile.steps:,} steps",
             encode_seconds=fit.fit_seconds,
             notes=f"{self._kinds(fit.model)} together, {profile.samples:,} samples each: {step_ms:.3g} ms a step",
+        )
+
+    def plain_row(self, fit: _Fit, whole: bool) -> Row | None:
+        """The same fit in plain torch, all of its steps or a few; None where no tile is dynamic."""
+        profile = fit.profile.model_copy(update={"metric_weight": 0.0})
+        targets = dynamic_targets(self.lightmaps, profile)
+        if targets is None:
+            return None
+        self.report(f"{profile.name}: the fit in plain torch")
+        tau, encoding = encode_time(TimeAxis(self.lightmaps.times, self.lightmaps.period, profile.time_axis))
+        peer = PlainFit(
+            tau=tau,
+            encoding=encoding,
+            colour=targets.colour,
+            texels=targets.texels,
+            count=targets.count,
+            weight=targets.weight,
+            sizes=(
+                profile.hidden,
+                profile.uvt_resolution,
+                profile.uvt_slices,
+                profile.plane_columns,
+                profile.plane_rows,
+            ),
+            rates=(profile.samples, profile.steps, profile.map_rate, profile.net_rate, profile.final_rate),
+            seed=0,
+            device=self.device,
+        )
+        peer.step().item()
+        steps = profile.steps if whole else min(profile.steps, _PLAIN_STEPS)
+        start = time.perf_counter()
+        for _ in range(steps):
+            loss = peer.step()
+        loss.item()  # waits for the device
+        seconds = time.perf_counter() - start
+        ours = fit.fit_seconds / fit.profile.steps
+        return Row(
+            "lightmap",
+            self.lightmaps.name,
+            "fit in plain torch",
+            f"{profile.name} {steps:,} steps",
+            encode_seconds=seconds,
+            notes=f"maps stay continuous, no file; {1e3 * seconds / steps:.3g} ms a step, {seconds / steps / ours:.3g} "
+            f"times ours",
         )
 
     def _row(self, method: str, option: str, summary: Summary, **values) -> Row:

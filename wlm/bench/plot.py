@@ -180,9 +180,7 @@ def _draw_panel(axes: Axes, rows: Sequence[Row], quantity: str, methods: Sequenc
     )
 
 
-def _label_points(
-    figure: Figure, axes: Axes, rows: Sequence[Row], quantity: str, methods: Sequence[str]
-) -> None:
+def _label_points(figure: Figure, axes: Axes, rows: Sequence[Row], quantity: str, methods: Sequence[str]) -> None:
     """Put each row's name beside its marker, where it covers least of what else is drawn."""
     if not rows:
         return

@@ -82,7 +82,7 @@ def compress(
             def report(now: Progress) -> None:
                 nonlocal seconds, at
                 seconds, at = now.seconds, now.step
-                bar(now.step, now.steps, f"loss {now.loss:.3g}, PSNR about {now.psnr:.1f} dB")
+                bar(now.step, now.steps, f"loss {now.loss:.3g}, PSNR {now.psnr:.1f} dB")
                 check_interrupt()
 
             model = compress(

@@ -112,9 +112,7 @@ def _model(path, artifact: Artifact) -> LightmapModel:
     for key, shape in shapes.items():
         value = tensors.get(key, np.zeros(shape, _PARTS[key])) if 0 in shape else tensors[key]
         if value.shape != shape or value.dtype != _PARTS[key]:
-            raise ValueError(
-                f"part {key} is {value.dtype} {value.shape}, expected {np.dtype(_PARTS[key])} {shape}"
-            )
+            raise ValueError(f"part {key} is {value.dtype} {value.shape}, expected {np.dtype(_PARTS[key])} {shape}")
         parts[key] = value
     return LightmapModel(
         name=str(settings["name"]),

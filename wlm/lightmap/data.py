@@ -219,9 +219,7 @@ def _read_frames(listing: Listing, need_alpha: bool) -> tuple[np.ndarray, np.nda
     first, covered = _read_rgb(listing.files[0], need_alpha)
     size = first.shape[:2]
     if listing.size is not None and size != listing.size:
-        raise WlmError(
-            f"{listing.files[0]}: is {_size(size)}, but {listing.stated_by} states {_size(listing.size)}"
-        )
+        raise WlmError(f"{listing.files[0]}: is {_size(size)}, but {listing.stated_by} states {_size(listing.size)}")
     # One array from the start: a list of frames stacked at the end would need twice the memory.
     frames = np.empty((len(listing.files), *first.shape), np.float32)
     frames[0] = first
@@ -251,9 +249,7 @@ def _read_rgb(path: Path, need_alpha: bool) -> tuple[np.ndarray, np.ndarray | No
     """Reads one file: colour [H, W, 3] and, if asked for, where its alpha is above 0 [H, W]."""
     pixels, names = read_exr(path)
     if need_alpha and "A" not in names:
-        raise WlmError(
-            f"{path}: expected a channel A, which the mask is to come from, found {', '.join(names)}"
-        )
+        raise WlmError(f"{path}: expected a channel A, which the mask is to come from, found {', '.join(names)}")
     return pixels[..., :3], pixels[..., 3] > 0 if need_alpha else None
 
 
@@ -302,9 +298,7 @@ def _check(
         if not math.isfinite(time):
             raise WlmError(f"{where}: the time of {label} is {time:g}; expected a finite number")
         if period is not None and not 0 <= time < period:
-            raise WlmError(
-                f"{where}: the time of {label} is {time:g}; expected 0 to below {period:g}, the period"
-            )
+            raise WlmError(f"{where}: the time of {label} is {time:g}; expected 0 to below {period:g}, the period")
     order = np.argsort(times, kind="stable")
     if (np.diff(order) < 0).any():
         if warn_order:

@@ -48,9 +48,7 @@ class Decoder:
             rows = np.flatnonzero(kinds == kind)
             if len(rows):
                 self._groups[kind] = _Group(model, kind, mapped[rows], rows, self.device, self.gelu)
-        self._constants = {
-            int(tile): i for i, tile in enumerate(np.flatnonzero(model.kind == TileKind.CONSTANT))
-        }
+        self._constants = {int(tile): i for i, tile in enumerate(np.flatnonzero(model.kind == TileKind.CONSTANT))}
 
     def tile(self, number: int, time: float, border: int = 0) -> np.ndarray:
         """Decodes one tile.
@@ -129,9 +127,7 @@ class Decoder:
     def _bounds(self, time: float) -> np.ndarray:
         """Bound of each mapped tile; between two times the larger, since a texel may follow either."""
         before, after, share = self._neighbours(time)
-        return (
-            self._peak[:, before] if share == 0 else np.maximum(self._peak[:, before], self._peak[:, after])
-        )
+        return self._peak[:, before] if share == 0 else np.maximum(self._peak[:, before], self._peak[:, after])
 
     def look(self, time: float) -> temporal_decode.Look:
         """The kernel's view of a time; its arrays cover the mapped tiles in order of their numbers."""
@@ -174,9 +170,7 @@ class _Group:
     def decode(self, places: list[int], look: temporal_decode.Look, as_bytes: bool) -> np.ndarray:
         tiles = wp.array(np.array(places, np.int32), dtype=int, device=self.device)
         rows = wp.array(self.rows.astype(np.int32), dtype=int, device=self.device)
-        out = wp.empty(
-            (len(places), TILE, TILE), dtype=wp.vec4ub if as_bytes else wp.vec3, device=self.device
-        )
+        out = wp.empty((len(places), TILE, TILE), dtype=wp.vec4ub if as_bytes else wp.vec3, device=self.device)
         wp.launch(
             self._kernels[int(as_bytes)],
             out.shape,

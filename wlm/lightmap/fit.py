@@ -20,7 +20,7 @@ from wlm.lightmap.model import (
 from wlm.lightmap.tiles import TILE, TileData, TileGrid, TileKind, channel_means, classify, split
 from wlm.lightmap.trainer import Targets, Trainer
 
-__all__ = ["Progress", "compress"]
+__all__ = ["Progress", "compress", "dynamic_targets"]
 
 BATCH_TEXELS = 64 * 26 * TILE * TILE  # texel-times of a batch: 64 tiles of 26 times, 330 MB of targets
 REPORT_EVERY = 0.5  # seconds between two reports
@@ -28,7 +28,14 @@ REPORT_EVERY = 0.5  # seconds between two reports
 
 @dataclass(frozen=True)
 class Progress:
-    """Where a fit is: steps done and in all, over all batches; the mean loss and tiles; seconds so far."""
+    """Where a fit is.
+
+    Attributes:
+        step, steps: Done and in all, over all batches.
+        loss: Mean over the tiles of the current batch.
+        psnr: dB, of the samples since the last report, by the tiled protocol.
+        seconds: So far.
+    """
 
     step: int
     steps: int
@@ -131,6 +138,27 @@ class _Scales:
                 self.affine[i, :, c] = shift, max(spread, 1e-4)
 
 
+def _targets(data: TileData, scales: _Scales, profile: Profile, rows: np.ndarray) -> Targets:
+    place = np.array([scales.place[int(row)] for row in rows])
+    return Targets(
+        data.index[rows],
+        data.colour[rows],
+        data.mask[rows],
+        scales.scale[place],
+        scales.affine[place].astype(np.float32),
+        profile.gamma,
+        profile.metric_weight,
+    )
+
+
+def dynamic_targets(lightmaps: LightmapSet, profile: Profile) -> Targets | None:
+    """What the dynamic tiles of a set are fitted to, for other ways to fit them; None where there are none."""
+    data = split(lightmaps, profile.gamma)
+    kinds = classify(data, profile.gamma, profile.static_budget_db)
+    rows = np.flatnonzero(kinds == TileKind.DYNAMIC)
+    return _targets(data, _Scales(data, kinds, profile.gamma), profile, rows) if len(rows) else None
+
+
 def _batches(kinds: np.ndarray, times: int) -> list[tuple[TileKind, np.ndarray]]:
     most = max(1, BATCH_TEXELS // (times * TILE * TILE))
     jobs = []
@@ -147,16 +175,18 @@ class _Meter:
         self._report, self._steps, self._before = report, steps, 0
         self._start = self._last = time.perf_counter()
 
+    @property
+    def wanted(self) -> bool:
+        """Whether there is somebody to report to."""
+        return self._report is not None
+
     def at(self, step: int, trainer: Trainer, now: bool = False) -> None:
         moment = time.perf_counter()
         if self._report is None or not (now or moment - self._last >= REPORT_EVERY):
             return
         self._last = moment
-        losses = trainer.losses()
-        psnr = float(np.mean(-10.0 * np.log10(np.maximum(losses, 1e-12))))
-        self._report(
-            Progress(self._before + step, self._steps, float(losses.mean()), psnr, moment - self._start)
-        )
+        loss, psnr = float(trainer.losses().mean()), trainer.psnr()
+        self._report(Progress(self._before + step, self._steps, loss, psnr, moment - self._start))
 
     def finish_batch(self, steps: int) -> None:
         self._before += steps
@@ -175,17 +205,8 @@ def _fit_batch(
     number,
     meter,
 ) -> dict[str, np.ndarray]:
-    place = np.array([scales.place[int(row)] for row in rows])
-    targets = Targets(
-        data.index[rows],
-        data.colour[rows],
-        data.mask[rows],
-        scales.scale[place],
-        scales.affine[place].astype(np.float32),
-        profile.gamma,
-        profile.metric_weight,
-    )
-    trainer = Trainer(profile, axis, targets, dynamic, seed, device)
+    targets = _targets(data, scales, profile, rows)
+    trainer = Trainer(profile, axis, targets, dynamic, seed, device, track=meter.wanted)
     del targets
     try:
         if checkpoint is not None and (state := checkpoint.running(number)) is not None:
@@ -246,9 +267,7 @@ def _assemble(lightmaps, profile, grid, data, kinds, scales, results) -> Lightma
     constant = np.zeros((len(constants), times, 3), np.float16)
     for i, row in enumerate(constants):
         values = data.colour[row][:, data.mask[row]].astype(np.float64) ** profile.gamma
-        constant[i] = 0.5 * (
-            values.min(1) + values.max(1)
-        )  # the middle: at most half a step of half float off
+        constant[i] = 0.5 * (values.min(1) + values.max(1))  # the middle: at most half a step of half float off
     return LightmapModel(
         name=lightmaps.name,
         width=grid.width,

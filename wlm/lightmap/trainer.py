@@ -9,8 +9,8 @@ import warp as wp
 
 from wlm import interop
 from wlm.lightmap.model import TILE, Profile, TimeAxis, encode_time
-from wlm_kernels import blocks, mlp, temporal, temporal_step
-from wlm_kernels.temporal_gather import gather
+from wlm_kernels import blocks, mlp, temporal, temporal_gather, temporal_step
+from wlm_kernels.temporal_gather import gather_maps, gather_net
 
 __all__ = ["Targets", "Trainer"]
 
@@ -26,6 +26,7 @@ class Targets:
         texels: int32 [N, K], valid texels, padded; ``count`` int32 [N] are in use.
         weight: float32 [N, T, 3]; ``emphasis``: see ``wlm_kernels.temporal.Batch``.
         shift, spread: float32 [N, 3]; scale: float32 [N, T, 3].
+        range: float32 [N, T], of radiance.
     """
 
     def __init__(
@@ -51,11 +52,13 @@ class Targets:
         self.count = valid.sum(1).astype(np.int32)
         self.texels = np.zeros((n, max(int(self.count.max()), 1)), np.int32)
         self.weight = np.ones((n, times, 3), np.float32)
+        self.range = np.zeros((n, times), np.float32)
         for i in range(n):
             self.texels[i, : self.count[i]] = np.flatnonzero(valid[i])
+            values = flat[i][:, valid[i]]
+            span = values.max((1, 2)) ** gamma - values.min((1, 2)) ** gamma  # [T] of linear radiance
+            self.range[i] = span
             if metric_weight > 0:
-                values = flat[i][:, valid[i]]
-                span = values.max((1, 2)) ** gamma - values.min((1, 2)) ** gamma  # [T] of linear radiance
                 # d radiance / d y = gamma (colour / scale)^(gamma - 1) scale^gamma spread; the middle factor is
                 # the texel's emphasis. A tile without range is not scored: any weight will do.
                 slope = gamma * scale[i] ** gamma * self.spread[i] / np.where(span > 0, span, 1.0)[:, None]
@@ -71,8 +74,28 @@ class Trainer:
     The state (``state`` and ``load``) is all that a later step depends on, so that a resumed fit goes on exactly.
     """
 
-    def __init__(self, profile: Profile, axis: TimeAxis, targets: Targets, temporal_maps: bool, seed: int, device: str):
-        """Uploads the targets and draws the first parameters; ``device`` as ``interop.check_device`` returns it."""
+    def __init__(
+        self,
+        profile: Profile,
+        axis: TimeAxis,
+        targets: Targets,
+        temporal_maps: bool,
+        seed: int,
+        device: str,
+        track: bool = False,
+    ):
+        """Uploads the targets and draws the first parameters.
+
+        Args:
+            profile: The settings.
+            axis: The time axis.
+            targets: What to fit.
+            temporal_maps: Whether the tiles are DYNAMIC rather than STATIC.
+            seed: Of everything random.
+            device: As ``interop.check_device`` returns it.
+            track: Whether ``psnr`` will be asked for.
+        """
+        self._track = track
         self.profile, self.axis, self.device, self.temporal = profile, axis, device, temporal_maps
         self.tiles = len(targets.number)
         self.inputs = profile.inputs(temporal_maps)
@@ -81,6 +104,10 @@ class Trainer:
             temporal_maps, profile.hidden, profile.gelu, "cuda" if self._cuda else "cpu"
         )
         self._pool = None if self._cuda else ThreadPoolExecutor(CPU_LANES)
+        if not self._cuda:
+            # Before two threads ask for them at once, which would compile them twice into one place.
+            self._kernels.load(device)
+            wp.load_module(temporal_gather, device)
         with interop.stream(device):
             self._allocate()
             self._upload(targets, seed)
@@ -137,6 +164,7 @@ class Trainer:
         self._loss_parts = zeros(parts, n)
         self.loss = zeros(n)
         self.control = zeros(1, dtype=torch.int32)
+        self._tracked = zeros(lanes if self._track else 0, n, len(self.axis.times), 2)
         rates = zeros(2)
         self._rates = rates
         fused = {
@@ -162,15 +190,13 @@ class Trainer:
         )
         self._launch_args = (wrap(self.hidden, vec), wrap(self.output, wp.vec3))
         self._launch_sums = (wrap(self._acc), *shaped)
-        self._gather_args = (
-            wrap(self._acc),
-            wrap(self.maps),
-            wrap(self.maps_grad),
+        self._maps_sums = (wrap(self._acc), wrap(self.maps), wrap(self.maps_grad))
+        self._net_sums = (
             wrap(self._partial.view(parts, -1)),
             wrap(self._partial_out.view(parts, -1)),
             wrap(self._loss_parts),
         )
-        self._gather_outs = (
+        self._net_outs = (
             wrap(self.hidden.grad.view(-1)),
             wrap(self.output.grad.view(-1)),
             wrap(self.loss),
@@ -212,6 +238,11 @@ class Trainer:
         batch.scale = put(targets.scale, wp.vec3)
         batch.turn = self.axis.turn
         batch.between = self.profile.between
+        batch.gamma = self.profile.gamma
+        squared = np.square(targets.range, dtype=np.float32)
+        batch.inverse_range = put(np.divide(1.0, squared, out=np.zeros_like(squared), where=squared > 0), wp.float32)
+        self._scored = torch.from_numpy(targets.range > 0)
+        batch.tracked = interop.to_warp(self._tracked)
         batch.control = interop.to_warp(self.control)
         batch.slices = self.profile.uvt_slices
         batch.seed = seed
@@ -259,9 +290,16 @@ class Trainer:
     def run(self, steps: int) -> None:
         """Queues the next steps."""
         first = self.step
-        with interop.stream(self.device):
-            for step in range(first, first + steps):
-                self._stages[self.stage(step)]()
+        threads = torch.get_num_threads()
+        try:
+            if not self._cuda:
+                # Between its own calls torch's second thread would spin on the core that a lane needs.
+                torch.set_num_threads(1)
+            with interop.stream(self.device):
+                for step in range(first, first + steps):
+                    self._stages[self.stage(step)]()
+        finally:
+            torch.set_num_threads(threads)
 
     def _step(self, quantised: bool, move_maps: bool) -> None:
         self.batch.quantised = int(quantised)
@@ -277,12 +315,15 @@ class Trainer:
         )
         if self._cuda:
             self._kernels.launch(*args)
+            gather_maps(*self._maps_sums)
         else:
             span = self.profile.samples // CPU_LANES
-            # Once alone, so that two threads don't compile the kernel at the same time.
-            list(self._pool.map(lambda lane: self._kernels.launch(*args, lane * span, span), range(CPU_LANES)))
+            self._share(lambda lane: self._kernels.launch(*args, lane * span, span))
+            part = -(-self.maps.numel() // CPU_LANES)
+            counts = [min(part, self.maps.numel() - lane * part) for lane in range(CPU_LANES)]
+            self._share(lambda lane: gather_maps(*self._maps_sums, lane * part, counts[lane]))
         rates = (self.profile.map_rate, self.profile.net_rate)
-        gather(*self._gather_args, self._schedule, rates, self.batch.control, *self._gather_outs)
+        gather_net(*self._net_sums, self._schedule, rates, self.batch.control, *self._net_outs)
         if not self._cuda:
             self._adam_maps.param_groups[0]["lr"] = float(self._rates[0])
             self._adam_net.param_groups[0]["lr"] = float(self._rates[1])
@@ -290,9 +331,22 @@ class Trainer:
             self._adam_maps.step()
         self._adam_net.step()
 
+    def _share(self, work) -> None:
+        """Runs ``work(lane)`` for each lane on the CPU's threads; a launch releases the interpreter's lock."""
+        list(self._pool.map(work, range(CPU_LANES)))
+
     def losses(self) -> np.ndarray:
         """Running mean of each tile's loss over about 50 steps, float32 [N]."""
         return self.loss.cpu().numpy()
+
+    def psnr(self) -> float:
+        """Mean PSNR over tiles and stored times of the samples since the last call; NaN without ``track``."""
+        with interop.stream(self.device):
+            sums = self._tracked.sum(0).cpu()
+            self._tracked.zero_()
+        seen = (sums[..., 1] > 0) & self._scored
+        mean = sums[..., 0][seen] / sums[..., 1][seen]
+        return float((-10.0 * torch.log10(mean.clamp_min(1e-12))).mean())
 
     def quantised(self) -> dict[str, np.ndarray]:
         """The maps and networks as stored.

@@ -102,9 +102,7 @@ def dynamic_range(ref: np.ndarray, mask: np.ndarray | None = None) -> float:
     return float(np.ptp(ref[valid])) if valid.any() else math.nan
 
 
-def psnr(
-    ref: np.ndarray, test: np.ndarray, mask: np.ndarray | None = None, peak: float | None = None
-) -> float:
+def psnr(ref: np.ndarray, test: np.ndarray, mask: np.ndarray | None = None, peak: float | None = None) -> float:
     """Peak signal-to-noise ratio `10 log10(peak² / mse)` over the valid texels and all channels.
 
     Args:

@@ -63,9 +63,7 @@ def flip_exposures(ref: np.ndarray, mask: np.ndarray | None = None) -> tuple[flo
     return start, start + min(math.log2(bright) - math.log2(median), _MAX_SPAN)
 
 
-def flip_map(
-    ref: np.ndarray, test: np.ndarray, mask: np.ndarray | None = None, exposures: int = 2
-) -> np.ndarray:
+def flip_map(ref: np.ndarray, test: np.ndarray, mask: np.ndarray | None = None, exposures: int = 2) -> np.ndarray:
     """FLIP error at every texel, at flip_evaluator's default of 67 pixels a degree.
 
     Outside the mask both images take the reference's nearest valid value: the error there is zero but for
@@ -94,9 +92,7 @@ def flip_map(
     return flip_filled(filled, same_outside, flip_exposures(ref, valid), exposures)
 
 
-def flip_filled(
-    ref: np.ndarray, test: np.ndarray, span: tuple[float, float] | None, exposures: int
-) -> np.ndarray:
+def flip_filled(ref: np.ndarray, test: np.ndarray, span: tuple[float, float] | None, exposures: int) -> np.ndarray:
     """`flip_map` for images that are checked and equal outside the mask; `span` is `flip_exposures`'."""
     import flip_evaluator  # here for the same reason as scikit-image in structural.py
 

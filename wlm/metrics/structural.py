@@ -53,9 +53,7 @@ def ssim_map(ref: np.ndarray, test: np.ndarray, data_range: float) -> np.ndarray
     return similarity.mean(axis=2)
 
 
-def ssim(
-    ref: np.ndarray, test: np.ndarray, mask: np.ndarray | None = None, data_range: float | None = None
-) -> float:
+def ssim(ref: np.ndarray, test: np.ndarray, mask: np.ndarray | None = None, data_range: float | None = None) -> float:
     """Mean SSIM over the valid texels whose window lies inside the image (Wang et al. 2004).
 
     Outside the mask both images take the reference's nearest valid value, so that what a codec leaves there
