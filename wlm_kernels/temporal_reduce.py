@@ -19,7 +19,6 @@ def reload():
 
     They are hundreds of registers, which it would spill to memory; loading them again hits the cache.
     """
-    ...
 
 
 def block_reduction(net: mlp.MlpKernels):

@@ -353,3 +353,16 @@ def test_bench_writes_what_it_was_given(monkeypatch, tmp_path):
     assert rows[0].psnr == 40.0 and environment
     assert (tmp_path / "p.png").read_bytes().startswith(b"\x89PNG")
     assert "ends in" in fails("bench", "lightmap", "--plot", tmp_path / "p.txt")
+
+
+def test_bench_report_makes_a_page(tmp_path):
+    from wlm.bench import Row, describe_environment, write_json
+
+    file, page = tmp_path / "here.json", tmp_path / "page.md"
+    write_json(file, [Row("lightmap", "city", "ours", "M", psnr=45.98)], describe_environment("cpu", "wlm bench"))
+    text = call("bench", "report", file)
+    assert "`here.json`" in text and "| 45.98 |" in text
+    call("bench", "report", file, "-o", page)
+    assert page.read_text(encoding="utf-8") == text
+    assert "ends in" in fails("bench", "report", file, "-o", tmp_path / "page.txt")
+    assert "absent.json" in fails("bench", "report", tmp_path / "absent.json")

@@ -56,7 +56,6 @@ class _Group(TyperGroup):
 
 app = typer.Typer(
     cls=_Group,
-    help="Compressed precomputed lighting on NVIDIA Warp kernels.",
     # A bug's traceback is for a report: plain, whole, without the values of locals.
     pretty_exceptions_enable=False,
     add_completion=False,
@@ -85,7 +84,7 @@ def _root(
         typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version and exit."),
     ] = False,
 ) -> None:
-    pass
+    """Compressed precomputed lighting on NVIDIA Warp kernels."""
 
 
 def _command_path(error: Any) -> str:

@@ -13,12 +13,6 @@ __all__ = ["app"]
 app = typer.Typer(help="Speed against error, ours and the baselines.")
 
 
-@app.callback()
-def _group() -> None:
-    # With one command alone, typer would make it the group itself.
-    pass
-
-
 @app.command()
 def lightmap(
     quick: Annotated[bool, typer.Option("--quick", help="Fewer steps and rows, for a check in minutes.")] = False,
@@ -53,3 +47,21 @@ def lightmap(
     if plot_path is not None:
         plot(rows, plot_path)
     sys.stdout.write(table(rows))
+
+
+@app.command()
+def report(
+    files: Annotated[list[Path], typer.Argument(metavar="FILE.json...", help="What `wlm bench ... --json` wrote.")],
+    output: Annotated[Path | None, typer.Option("--output", "-o", metavar="PAGE.md", help="Default: print it.")] = None,
+) -> None:
+    """Make a Markdown page of benchmark files."""
+    from wlm.bench.report import report as make
+
+    page = make(files)
+    if output is None:
+        sys.stdout.write(page)
+        return
+    check_output(output, ".md")
+    from wlm.formats.atomic import atomic_write
+
+    atomic_write(output, page.encode())
