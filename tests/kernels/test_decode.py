@@ -26,7 +26,7 @@ SHAPES = [
 
 
 def _model(hidden: int, gelu: str, periodic: bool = True, **settings) -> LightmapModel:
-    """A random model whose colours use most of the 8 bits: a scale of about 1 and a bound of about 1.5."""
+    """A random model whose colours use most of the 8 bits: a scale of about 1 and a bound of about 1.3."""
     random = np.random.default_rng(hidden)
     model = random_model(
         KINDS,
@@ -38,7 +38,7 @@ def _model(hidden: int, gelu: str, periodic: bool = True, **settings) -> Lightma
     )
     scale = random.integers(143, 148, model.scale.shape, np.uint8)
     scale[0, 1, 2] = 0  # a channel that is black at the second time
-    peak = random.integers(153, 157, model.peak.shape, np.uint8)
+    peak = random.integers(149, 153, model.peak.shape, np.uint8)
     affine = np.stack([np.full((3, 3), 0.8), random.uniform(0.6, 1.0, (3, 3))], 1).astype(np.float16)
     return dataclasses.replace(model, scale=scale, peak=peak, affine=affine)
 
@@ -148,7 +148,7 @@ def _stored(fit, case: Case) -> LightmapModel:
         profile=fit.profile,
         period=fit.axis.period,
         scale=random.integers(143, 148, base.scale.shape, np.uint8),
-        peak=random.integers(153, 157, base.peak.shape, np.uint8),
+        peak=random.integers(149, 153, base.peak.shape, np.uint8),
         **fields,
     )
 
