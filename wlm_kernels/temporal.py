@@ -13,7 +13,7 @@ import warp as wp
 from wlm_kernels.blocks import texel
 from wlm_kernels.grids import axis_index, cell, fraction
 
-__all__ = ["CENTRE", "STATIC_INPUTS", "TEMPORAL_INPUTS", "Batch", "Maps", "Moment", "Offsets"]
+__all__ = ["CENTRE", "STATIC_INPUTS", "TEMPORAL_INPUTS", "Batch", "Maps", "Moment", "Offsets", "Sample"]
 
 TEMPORAL_INPUTS = 16
 STATIC_INPUTS = 4
@@ -173,6 +173,31 @@ def moment_between(batch: Batch, k: int, share: float) -> Moment:
         a = batch.turn * m.tau
         m.encoding = wp.vec4(wp.sin(a), wp.cos(a), wp.sin(2.0 * a), wp.cos(2.0 * a))
     return m
+
+
+@wp.struct
+class Sample:
+    """A random sample of a tile."""
+
+    flat: int  # index of its texel
+    moment: Moment
+    state: wp.uint32  # of the generator, for what is drawn next
+
+
+@wp.func
+def draw_sample(batch: Batch, n: int, b: int, samples: int) -> Sample:
+    """Sample b of tile n at this step: a valid texel and a time."""
+    state = draw_state(batch, n, b, samples)
+    s = Sample()
+    s.flat = batch.texels[n, wp.randi(state, 0, batch.texel_count[n])]
+    k = wp.randi(state, 0, batch.tau.shape[0])
+    s.moment = stored_moment(batch, k)
+    if batch.between > 0.0:  # not drawn for nothing: profiles without it keep their samples
+        share = wp.randf(state)
+        if wp.randf(state) < batch.between:
+            s.moment = moment_between(batch, k, share)
+    s.state = state
+    return s
 
 
 @wp.func

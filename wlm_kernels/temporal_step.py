@@ -24,10 +24,9 @@ from wlm_kernels.temporal import (
     Maps,
     Moment,
     Offsets,
-    draw_state,
-    moment_between,
+    Sample,
+    draw_sample,
     plane_at,
-    stored_moment,
     target_at,
     texel_weight,
     track_error,
@@ -154,17 +153,17 @@ def step_kernels(temporal: bool, hidden: int, gelu: str, device_kind: str) -> St
         maps: Maps,
         batch: Batch,
         n: int,
-        y: int,
-        x: int,
-        m: Moment,
+        sample: Sample,
         g: vec_in,
     ):
         c = CENTRE
+        y = sample.flat // 128
+        x = sample.flat % 128
         scatter_texel(acc, lane, offsets, maps, n, y, x, batch.quantised, c * wp.vec4(g[0], g[1], g[2], g[3]))
         if wp.static(temporal):
             u = (float(x) + 0.5) / 128.0
             v = (float(y) + 0.5) / 128.0
-            tau = m.tau
+            tau = sample.moment.tau
             scatter_volume(
                 acc,
                 lane,
@@ -184,6 +183,56 @@ def step_kernels(temporal: bool, hidden: int, gelu: str, device_kind: str) -> St
             scatter_plane(acc, lane, offsets.ut, rows, columns, n, u, tau, batch.periodic, c * wp.vec2(g[8], g[9]))
             scatter_plane(acc, lane, offsets.vt, rows, columns, n, v, tau, batch.periodic, c * wp.vec2(g[10], g[11]))
 
+    @wp.struct
+    class Pass:
+        """What the gradients are made of: each layer's input and the delta behind it, and the sample's loss."""
+
+        f: vec_in
+        h1: vec_hidden
+        h2: vec_hidden
+        d1: vec_hidden
+        d2: vec_hidden
+        d3: wp.vec3
+        loss: float
+
+    @wp.func
+    def forward_backward(
+        maps: Maps,
+        w: wp.array2d[vec_hidden],
+        o: wp.array2d[wp.vec3],
+        batch: Batch,
+        lane: int,
+        n: int,
+        sample: Sample,
+        samples: int,
+    ) -> Pass:
+        m = sample.moment
+        f = features(maps, batch, n, sample.flat // 128, sample.flat % 128, m, sample.state)
+        a1 = first(w, n, f)
+        g1 = gate(a1)
+        h1 = wp.cw_mul(a1, g1)
+        a2 = second(w, n, h1)
+        g2 = gate(a2)
+        h2 = wp.cw_mul(a2, g2)
+        target = target_at(batch, n, m, sample.flat)
+        error = third(o, n, h2) - target
+        track_error(batch, lane, n, m, target, error)
+        half = wp.cw_mul(texel_weight(batch, n, m, target), error) / (3.0 * float(samples))
+        d3 = 2.0 * half
+        reload()
+        d2 = wp.cw_mul(back_output(o, n, d3), slope(a2, g2))
+        reload()
+        d1 = wp.cw_mul(back_hidden(w, n, d2), slope(a1, g1))
+        p = Pass()
+        p.f = f
+        p.h1 = h1
+        p.h2 = h2
+        p.d1 = d1
+        p.d2 = d2
+        p.d3 = d3
+        p.loss = wp.dot(half, error)
+        return p
+
     options = {"enable_backward": False}
 
     @wp.kernel(module="unique", module_options=options)
@@ -197,16 +246,11 @@ def step_kernels(temporal: bool, hidden: int, gelu: str, device_kind: str) -> St
         f: wp.array2d[vec_in],
     ):
         n, b = wp.tid()
-        state = draw_state(batch, n, b, samples)
-        flat = batch.texels[n, wp.randi(state, 0, batch.texel_count[n])]
-        k = wp.randi(state, 0, batch.tau.shape[0])
-        m = stored_moment(batch, k)
-        if batch.between > 0.0:  # not drawn for nothing: profiles without it keep their samples
-            share = wp.randf(state)
-            if wp.randf(state) < batch.between:
-                m = moment_between(batch, k, share)
-        place[n, b] = wp.vec3i(flat // 128, flat % 128, k)
-        f[n, b] = features(maps, batch, n, flat // 128, flat % 128, m, state)
+        sample = draw_sample(batch, n, b, samples)
+        y = sample.flat // 128
+        x = sample.flat % 128
+        place[n, b] = wp.vec3i(y, x, sample.moment.k)
+        f[n, b] = features(maps, batch, n, y, x, sample.moment, sample.state)
 
     if device_kind == "cpu":
 
@@ -229,40 +273,18 @@ def step_kernels(temporal: bool, hidden: int, gelu: str, device_kind: str) -> St
             n, i = wp.tid()
             b = base + i
             lane = wp.where(base == 0, 0, 1)
-            state = draw_state(batch, n, b, samples)
-            flat = batch.texels[n, wp.randi(state, 0, batch.texel_count[n])]
-            k = wp.randi(state, 0, batch.tau.shape[0])
-            m = stored_moment(batch, k)
-            if batch.between > 0.0:  # not drawn for nothing: profiles without it keep their samples
-                share = wp.randf(state)
-                if wp.randf(state) < batch.between:
-                    m = moment_between(batch, k, share)
-            y = flat // 128
-            x = flat % 128
-            f = features(maps, batch, n, y, x, m, state)
-            a1 = first(w, n, f)
-            g1 = gate(a1)
-            h1 = wp.cw_mul(a1, g1)
-            a2 = second(w, n, h1)
-            g2 = gate(a2)
-            h2 = wp.cw_mul(a2, g2)
-            target = target_at(batch, n, m, flat)
-            error = third(o, n, h2) - target
-            track_error(batch, lane, n, m, target, error)
-            d3 = wp.cw_mul(texel_weight(batch, n, m, target), error) / (3.0 * float(samples))
-            loss[lane, n] += wp.dot(d3, error)
-            d3 = 2.0 * d3
-            d2 = wp.cw_mul(back_output(o, n, d3), slope(a2, g2))
-            d1 = wp.cw_mul(back_hidden(w, n, d2), slope(a1, g1))
+            sample = draw_sample(batch, n, b, samples)
+            p = forward_backward(maps, w, o, batch, lane, n, sample, samples)
+            loss[lane, n] += p.loss
             for c in range(wp.static(inputs)):
-                partial[lane, n, c] += d1 * f[c]
-            partial[lane, n, wp.static(inputs)] += d1
+                partial[lane, n, c] += p.d1 * p.f[c]
+            partial[lane, n, wp.static(inputs)] += p.d1
             for c in range(wp.static(hidden)):
-                partial[lane, n, wp.static(columns_2) + c] += d2 * h1[c]
-                partial_out[lane, n, c] += d3 * h2[c]
-            partial[lane, n, wp.static(columns_2 + hidden)] += d2
-            partial_out[lane, n, wp.static(hidden)] += d3
-            scatter(acc, lane, offsets, maps, batch, n, y, x, m, back_input(w, n, d1))
+                partial[lane, n, wp.static(columns_2) + c] += p.d2 * p.h1[c]
+                partial_out[lane, n, c] += p.d3 * p.h2[c]
+            partial[lane, n, wp.static(columns_2 + hidden)] += p.d2
+            partial_out[lane, n, wp.static(hidden)] += p.d3
+            scatter(acc, lane, offsets, maps, batch, n, sample, back_input(w, n, p.d1))
 
     else:
         reduce = block_reduction(net)
@@ -284,36 +306,10 @@ def step_kernels(temporal: bool, hidden: int, gelu: str, device_kind: str) -> St
             loss: wp.array1d[float],
         ):
             n, b = wp.tid()
-            state = draw_state(batch, n, b, samples)
-            flat = batch.texels[n, wp.randi(state, 0, batch.texel_count[n])]
-            k = wp.randi(state, 0, batch.tau.shape[0])
-            m = stored_moment(batch, k)
-            if batch.between > 0.0:  # not drawn for nothing: profiles without it keep their samples
-                share = wp.randf(state)
-                if wp.randf(state) < batch.between:
-                    m = moment_between(batch, k, share)
-            y = flat // 128
-            x = flat % 128
-            f = features(maps, batch, n, y, x, m, state)
-            a1 = first(w, n, f)
-            g1 = gate(a1)
-            h1 = wp.cw_mul(a1, g1)
-            a2 = second(w, n, h1)
-            g2 = gate(a2)
-            h2 = wp.cw_mul(a2, g2)
-            target = target_at(batch, n, m, flat)
-            error = third(o, n, h2) - target
-            track_error(batch, 0, n, m, target, error)
-            d3 = wp.cw_mul(texel_weight(batch, n, m, target), error) / (3.0 * float(samples))
-            value = wp.dot(d3, error)
-            d3 = 2.0 * d3
-            reload()
-            d2 = wp.cw_mul(back_output(o, n, d3), slope(a2, g2))
-            reload()
-            d1 = wp.cw_mul(back_hidden(w, n, d2), slope(a1, g1))
-
+            sample = draw_sample(batch, n, b, samples)
+            p = forward_backward(maps, w, o, batch, 0, n, sample, samples)
             row = (b // wp.static(BLOCK)) * w.shape[0] + n
-            reduce(f, h1, h2, d1, d2, d3, value, row, partial, partial_out, loss)
-            scatter(acc, 0, offsets, maps, batch, n, y, x, m, back_input(w, n, d1))
+            reduce(p.f, p.h1, p.h2, p.d1, p.d2, p.d3, p.loss, row, partial, partial_out, loss)
+            scatter(acc, 0, offsets, maps, batch, n, sample, back_input(w, n, p.d1))
 
     return StepKernels(inputs, hidden, device_kind, net, scalar, draw, step)
