@@ -195,6 +195,10 @@ def test_info_says_what_is_in_the_file(fitted):
     assert facts["profile"]["name"] == "tiny"
     text = call("lightmap", "info", fitted)
     assert f"{facts['bytes']:,}" in text and facts["source"] in text and "24x40" in text
+    # The maps as stored, the network in float32.
+    stored = sum(facts["parts"][part] for part in ("uv", "uvt", "ut", "vt")) + 2 * facts["parts"]["net"]
+    assert facts["device"] == "cpu" and facts["device_bytes"] == stored
+    assert "device 'tpu'" in fails("lightmap", "info", fitted, "--device", "tpu")
 
 
 def test_export_lists_what_it_wrote(fitted, tmp_path):
@@ -202,6 +206,13 @@ def test_export_lists_what_it_wrote(fitted, tmp_path):
     text = call("lightmap", "export", fitted, "-o", tmp_path / "out")
     files = list((tmp_path / "out").iterdir())
     assert files and all(file.name in text for file in files)
+    call("lightmap", "decode", fitted, "--time", str(HOURS[0]), "-o", tmp_path / "same.exr")
+    np.testing.assert_allclose(
+        read_exr(tmp_path / "out" / "frame.exr")[0], read_exr(tmp_path / "same.exr")[0], rtol=2**-10, atol=1e-6
+    )
+    call("lightmap", "export", fitted, "-o", tmp_path / "out", "--device", "cpu")  # over an earlier one
+    assert "device 'tpu'" in fails("lightmap", "export", fitted, "-o", tmp_path / "none", "--device", "tpu")
+    assert not (tmp_path / "none").exists()
 
 
 def test_names_that_look_like_markup_are_shown_as_they_are(fitted, tmp_path):

@@ -190,13 +190,16 @@ def evaluate(
 def info(
     file: _File,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
+    device: Annotated[str, typer.Option(help="Where to load it, to say what memory its maps take there.")] = "cpu",
 ) -> None:
     """Say what a file holds, without decoding it."""
     quiet_warp()
     from wlm.lightmap import codec
+    from wlm.lightmap.decode import Decoder
     from wlm.lightmap.evaluate import count_kinds, part_bytes
 
     model = codec.read(file)
+    decoder = Decoder(model, device)
     size = file.stat().st_size
     facts: dict[str, Any] = {
         "name": model.name,
@@ -208,6 +211,8 @@ def info(
         "source": model.source,
         "tiles": count_kinds(model),
         "parts": part_bytes(model, size),
+        "device": decoder.device,
+        "device_bytes": decoder.device_bytes,
         "profile": model.profile.model_dump(mode="json"),
     }
     if as_json:
@@ -227,6 +232,8 @@ def info(
     rows.add_section()
     for part, count in facts["parts"].items():
         rows.add_row(f"bytes of {part}", f"{count:,}")
+    rows.add_section()
+    rows.add_row(f"bytes on {decoder.device}", f"{decoder.device_bytes:,}")
     show(rows)
 
 
@@ -234,13 +241,23 @@ def info(
 def export(
     file: _File,
     output: Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="The folder to write to.")],
+    device: Annotated[str, typer.Option(help="Where the frame to compare with is decoded.")] = "cpu",
 ) -> None:
-    """Write the maps as textures and the rest as plain files, for an engine."""
+    """Write the maps as textures and the rest as plain files, for an engine.
+
+    frame.exr is the map at the first stored time: what the shader should make of the rest.
+    """
     quiet_warp()
+    from wlm.formats.exr import write_exr
     from wlm.lightmap import codec
+    from wlm.lightmap.decode import Decoder
     from wlm.lightmap.export import export
 
-    paths = export(codec.read(file), output)
+    model = codec.read(file)
+    decoder = Decoder(model, device)
+    frame = output / "frame.exr"
+    paths = [*export(model, output), frame]
+    write_exr(frame, decoder.frame(float(model.times[0])), half=False)
     rows = table(str(output), ["file", "bytes"])
     for path in map(Path, paths):
         rows.add_row(escape(path.name), f"{path.stat().st_size:,}")

@@ -50,6 +50,11 @@ class Decoder:
                 self._groups[kind] = _Group(model, kind, mapped[rows], rows, self.device, self.gelu)
         self._constants = {int(tile): i for i, tile in enumerate(np.flatnonzero(model.kind == TileKind.CONSTANT))}
 
+    @property
+    def device_bytes(self) -> int:
+        """Memory that the maps and networks take up on the device, in bytes: what a runtime keeps resident."""
+        return sum(array.capacity for group in self._groups.values() for array in group.arrays)
+
     def tile(self, number: int, time: float, border: int = 0) -> np.ndarray:
         """Decodes one tile.
 
@@ -165,6 +170,8 @@ class _Group:
         self.place = {int(number): i for i, number in enumerate(numbers)}
         self.stored, self.hidden, self.output = upload(model, kind, rows, device)
         dynamic = kind == TileKind.DYNAMIC
+        maps = ("uv", "uvt", "ut", "vt") if dynamic else ("uv",)
+        self.arrays = [*(getattr(self.stored, name) for name in maps), self.hidden, self.output]
         self._kernels = temporal_decode.exact_kernels(dynamic, model.profile.hidden, gelu)
 
     def decode(self, places: list[int], look: temporal_decode.Look, as_bytes: bool) -> np.ndarray:
