@@ -4,8 +4,9 @@ from small_sets import moving_light, static_light, tiny_profile
 
 from wlm.errors import WlmError
 from wlm.formats.artifact import read_artifact, write_artifact
+from wlm.formats.checkpoint import Checkpoint
 from wlm.lightmap import codec, fit
-from wlm.lightmap.checkpoint import SYSTEM, Checkpoint
+from wlm.lightmap.checkpoint import open_checkpoint
 from wlm.lightmap.data import from_arrays
 
 PROFILE = tiny_profile(steps=40)
@@ -31,7 +32,7 @@ def stop_after(step):
 
 
 def interrupted(path, lightmaps, step, profile=PROFILE, **options):
-    checkpoint = Checkpoint(path, lightmaps, profile, **options)
+    checkpoint = open_checkpoint(path, lightmaps, profile, **options)
     with pytest.raises(KeyboardInterrupt):
         fit.compress(lightmaps, profile, progress=stop_after(step), checkpoint=checkpoint, **options)
     return checkpoint
@@ -51,7 +52,7 @@ def whole(tmp_path_factory):
 def test_a_resumed_fit_gives_the_bytes_of_one_that_was_not_interrupted(tmp_path, whole, step):
     lightmaps = both_kinds()
     interrupted(tmp_path / "resumed.wlm", lightmaps, step, seed=3)
-    checkpoint = Checkpoint(tmp_path / "resumed.wlm", lightmaps, PROFILE, seed=3, resume=True)
+    checkpoint = open_checkpoint(tmp_path / "resumed.wlm", lightmaps, PROFILE, seed=3, resume=True)
     steps = []
     model = fit.compress(lightmaps, PROFILE, seed=3, progress=lambda now: steps.append(now.step), checkpoint=checkpoint)
     codec.write(tmp_path / "resumed.wlm", model)
@@ -67,7 +68,7 @@ def test_a_fit_may_be_interrupted_again_and_again(tmp_path):
     whole = fit.compress(lightmaps, PROFILE)
     for step in (5, 10, 30):
         interrupted(tmp_path / "a.wlm", lightmaps, step)
-        checkpoint = Checkpoint(tmp_path / "a.wlm", lightmaps, PROFILE, resume=True)
+        checkpoint = open_checkpoint(tmp_path / "a.wlm", lightmaps, PROFILE, resume=True)
         assert checkpoint.running(0)["control"] == step
     resumed = fit.compress(lightmaps, PROFILE, checkpoint=checkpoint)
     np.testing.assert_array_equal(resumed.uv, whole.uv)
@@ -76,13 +77,13 @@ def test_a_fit_may_be_interrupted_again_and_again(tmp_path):
 
 def test_what_is_kept_comes_back(tmp_path):
     lightmaps = moving_light(40, 24)
-    checkpoint = Checkpoint(tmp_path / "a.wlm", lightmaps, PROFILE)
+    checkpoint = open_checkpoint(tmp_path / "a.wlm", lightmaps, PROFILE)
     assert checkpoint.finished(0) is None and checkpoint.running(0) is None
     parts = {"uv": np.arange(24, dtype=np.uint8).reshape(2, 3, 4), "net": np.ones((2, 5), np.float16)}
     checkpoint.add_finished(0, parts)
     checkpoint.save_running(1, {"maps": np.arange(5.0, dtype=np.float32), "adam.0.step": np.array(7.0, np.float32)})
 
-    back = Checkpoint(tmp_path / "a.wlm", lightmaps, PROFILE, resume=True)
+    back = open_checkpoint(tmp_path / "a.wlm", lightmaps, PROFILE, resume=True)
     assert back.resumed
     for name, value in parts.items():
         np.testing.assert_array_equal(back.finished(0)[name], value)
@@ -91,21 +92,21 @@ def test_what_is_kept_comes_back(tmp_path):
     assert back.finished(1) is None and back.running(0) is None
 
     back.add_finished(1, parts)
-    assert Checkpoint(tmp_path / "a.wlm", lightmaps, PROFILE, resume=True).running(1) is None
+    assert open_checkpoint(tmp_path / "a.wlm", lightmaps, PROFILE, resume=True).running(1) is None
 
 
 def test_without_resume_an_old_checkpoint_is_left_out_and_replaced(tmp_path):
     lightmaps = moving_light(40, 24)
-    old = Checkpoint(tmp_path / "a.wlm", lightmaps, PROFILE, seed=1)
+    old = open_checkpoint(tmp_path / "a.wlm", lightmaps, PROFILE, seed=1)
     old.add_finished(0, {"uv": np.zeros(4, np.uint8)})
-    new = Checkpoint(tmp_path / "a.wlm", lightmaps, PROFILE, seed=2)
+    new = open_checkpoint(tmp_path / "a.wlm", lightmaps, PROFILE, seed=2)
     assert not new.resumed and new.finished(0) is None
     new.add_finished(0, {"uv": np.ones(4, np.uint8)})
-    assert Checkpoint(tmp_path / "a.wlm", lightmaps, PROFILE, seed=2, resume=True).finished(0)["uv"].all()
+    assert open_checkpoint(tmp_path / "a.wlm", lightmaps, PROFILE, seed=2, resume=True).finished(0)["uv"].all()
 
 
 def test_nothing_to_resume_is_a_fresh_start(tmp_path):
-    checkpoint = Checkpoint(tmp_path / "a.wlm", moving_light(40, 24), PROFILE, resume=True)
+    checkpoint = open_checkpoint(tmp_path / "a.wlm", moving_light(40, 24), PROFILE, resume=True)
     assert not checkpoint.resumed and checkpoint.running(0) is None
 
 
@@ -122,43 +123,54 @@ def test_nothing_to_resume_is_a_fresh_start(tmp_path):
 )
 def test_another_fit_is_refused_by_name(tmp_path, change, says):
     fit_of = {"lightmaps": moving_light(40, 24), "profile": PROFILE}
-    Checkpoint(tmp_path / "a.wlm", **fit_of).add_finished(0, {"uv": np.zeros(4, np.uint8)})
+    open_checkpoint(tmp_path / "a.wlm", **fit_of).add_finished(0, {"uv": np.zeros(4, np.uint8)})
     with pytest.raises(WlmError) as error:
-        Checkpoint(tmp_path / "a.wlm", **fit_of | change, resume=True)
+        open_checkpoint(tmp_path / "a.wlm", **fit_of | change, resume=True)
     assert says in str(error.value) and "another fit" in str(error.value)
     assert "\n" not in str(error.value)
 
 
 def test_the_order_of_tiles_and_the_number_of_the_gpu_do_not_matter(tmp_path):
     lightmaps = moving_light(40, 24)
-    first = Checkpoint(tmp_path / "a.wlm", lightmaps, PROFILE, tiles=[2, 0], device="cuda:1")
+    first = open_checkpoint(tmp_path / "a.wlm", lightmaps, PROFILE, tiles=[2, 0], device="cuda:1")
     first.add_finished(0, {"uv": np.zeros(4, np.uint8)})
-    assert Checkpoint(tmp_path / "a.wlm", lightmaps, PROFILE, tiles=[0, 2], device="cuda:0", resume=True).finished(0)
+    same = open_checkpoint(tmp_path / "a.wlm", lightmaps, PROFILE, tiles=[0, 2], device="cuda:0", resume=True)
+    assert same.finished(0)
+
+
+def test_a_checkpoint_of_another_system_is_refused(tmp_path):
+    fit_of = {"input": "0f", "levels": (1, 2)}
+    Checkpoint(tmp_path / "a.wlm", "probe", fit_of, "0f").save_running(0, {"step": np.array(3)})
+    assert Checkpoint(tmp_path / "a.wlm", "probe", fit_of, "0f", resume=True).running(0)["step"] == 3
+    with pytest.raises(WlmError, match="expected an artifact of lightmap-checkpoint, found one of probe-checkpoint"):
+        open_checkpoint(tmp_path / "a.wlm", moving_light(40, 24), PROFILE, resume=True)
+    with pytest.raises(ValueError):
+        Checkpoint(tmp_path / "a.wlm", "probe", {"rate": float("nan")}, "0f")
 
 
 @pytest.mark.parametrize("damage", ["flipped", "cut", "empty", "other"])
 def test_a_damaged_checkpoint_is_one_line(tmp_path, damage):
     lightmaps = moving_light(40, 24)
-    checkpoint = Checkpoint(tmp_path / "a.wlm", lightmaps, PROFILE)
+    checkpoint = open_checkpoint(tmp_path / "a.wlm", lightmaps, PROFILE)
     checkpoint.add_finished(0, {"uv": np.zeros(400, np.uint8)})
     content = bytearray(checkpoint.path.read_bytes())
     if damage == "flipped":
         content[-7] ^= 1
     checkpoint.path.write_bytes({"flipped": content, "cut": content[:-9], "empty": b"", "other": b"a text"}[damage])
     with pytest.raises(WlmError, match="a.wlm.partial") as error:
-        Checkpoint(tmp_path / "a.wlm", lightmaps, PROFILE, resume=True)
+        open_checkpoint(tmp_path / "a.wlm", lightmaps, PROFILE, resume=True)
     assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize("part", ["uv", "finished.x.uv", "other.0.uv"])
 def test_unknown_parts_are_refused(tmp_path, part):
     lightmaps = moving_light(40, 24)
-    checkpoint = Checkpoint(tmp_path / "a.wlm", lightmaps, PROFILE)
+    checkpoint = open_checkpoint(tmp_path / "a.wlm", lightmaps, PROFILE)
     checkpoint.add_finished(0, {"uv": np.zeros(4, np.uint8)})
     settings = read_artifact(checkpoint.path).settings
-    write_artifact(checkpoint.path, SYSTEM, settings, {part: np.zeros(4, np.uint8)}, lightmaps.source)
+    write_artifact(checkpoint.path, checkpoint.system, settings, {part: np.zeros(4, np.uint8)}, lightmaps.source)
     with pytest.raises(WlmError, match="expected one of a finished or a running batch"):
-        Checkpoint(tmp_path / "a.wlm", lightmaps, PROFILE, resume=True)
-    write_artifact(checkpoint.path, SYSTEM, {}, {}, lightmaps.source)
+        open_checkpoint(tmp_path / "a.wlm", lightmaps, PROFILE, resume=True)
+    write_artifact(checkpoint.path, checkpoint.system, {}, {}, lightmaps.source)
     with pytest.raises(WlmError, match="does not say which fit"):
-        Checkpoint(tmp_path / "a.wlm", lightmaps, PROFILE, resume=True)
+        open_checkpoint(tmp_path / "a.wlm", lightmaps, PROFILE, resume=True)

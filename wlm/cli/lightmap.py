@@ -65,14 +65,14 @@ def compress(
     quiet_warp()
     from wlm.interop import check_device
     from wlm.lightmap import codec
-    from wlm.lightmap.checkpoint import Checkpoint
+    from wlm.lightmap.checkpoint import open_checkpoint
     from wlm.lightmap.fit import Progress, compress
     from wlm.lightmap.tiles import TileGrid, parse_tiles
 
     device = check_device(device)
     lightmaps = _load(set_path, times, mask, period)
     numbers = None if tiles is None else parse_tiles(tiles, TileGrid.of(*lightmaps.mask.shape).count)
-    checkpoint = Checkpoint(output, lightmaps, settings, tiles=numbers, seed=seed, device=device, resume=resume)
+    checkpoint = open_checkpoint(output, lightmaps, settings, tiles=numbers, seed=seed, device=device, resume=resume)
     if resume and not checkpoint.resumed:
         note(f"{checkpoint.path}: there is nothing to resume; starting at step 0")
     seconds, at = 0.0, 0

@@ -1,167 +1,47 @@
-"""Where an interrupted fit is kept: finished batches as they will be stored, and the running one's exact state.
-
-One file beside the output, an artifact of its own system, so that it is written whole or not at all and every byte
-of it is checked when it is read. It names what the fit depends on, and goes on with no other fit.
-"""
+"""What a lightmap fit depends on, and so what its checkpoint must name."""
 
 import os
-from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import Any
+from collections.abc import Sequence
 
-import numpy as np
-
-from wlm import __version__
-from wlm.errors import WlmError
-from wlm.formats.artifact import read_artifact, write_artifact
+from wlm.formats.checkpoint import Checkpoint
 from wlm.lightmap.data import LightmapSet
 from wlm.lightmap.model import Profile
 
-__all__ = ["SUFFIX", "SYSTEM", "Checkpoint"]
-
-SYSTEM = "lightmap-checkpoint"
-SUFFIX = ".partial"
-
-_FINISHED, _RUNNING = "finished", "running"
+__all__ = ["open_checkpoint"]
 
 
-class Checkpoint:
-    """The state of one fit, in the file ``OUTPUT.partial``.
+def open_checkpoint(
+    output: str | os.PathLike[str],
+    lightmaps: LightmapSet,
+    profile: Profile,
+    *,
+    tiles: Sequence[int] | None = None,
+    seed: int = 0,
+    device: str = "cpu",
+    resume: bool = False,
+) -> Checkpoint:
+    """Opens the checkpoint of a fit; the arguments are those of ``wlm.lightmap.fit.compress``.
 
-    Made for ``wlm.lightmap.fit.compress``, which asks it for what is done already and hands it what gets done.
-    Batches are numbered from 0; at most one is running.
+    Args:
+        output: The file that the fit is for; the checkpoint lies beside it.
+        lightmaps: The set.
+        profile: The settings.
+        tiles: Numbers of the tiles, None for all.
+        seed: The seed.
+        device: "cpu", "cuda" or "cuda:N"; only the kind matters, a fit may go on on another GPU.
+        resume: Whether to go on from the file, if there is one. Otherwise it is ignored, and replaced at the
+            first save.
 
-    Attributes:
-        path: The file.
-        resumed: Whether anything was read from it.
+    Raises:
+        WlmError: With ``resume``: the file is damaged, or of another fit; the line names what differs.
     """
-
-    def __init__(
-        self,
-        output: str | os.PathLike[str],
-        lightmaps: LightmapSet,
-        profile: Profile,
-        *,
-        tiles: Sequence[int] | None = None,
-        seed: int = 0,
-        device: str = "cpu",
-        resume: bool = False,
-    ) -> None:
-        """Opens the checkpoint of a fit; the arguments are those of ``fit.compress``.
-
-        Args:
-            output: The file that the fit is for; the checkpoint lies beside it.
-            lightmaps: The set.
-            profile: The settings.
-            tiles: Numbers of the tiles, None for all.
-            seed: The seed.
-            device: "cpu", "cuda" or "cuda:N"; only the kind matters, a fit may go on on another GPU.
-            resume: Whether to go on from the file, if there is one. Otherwise it is ignored, and replaced at the
-                first save.
-
-        Raises:
-            WlmError: With ``resume``: the file is damaged, or of another fit; the line names what differs.
-        """
-        self.path = Path(f"{os.fspath(output)}{SUFFIX}")
-        self.resumed = False
-        self._source = lightmaps.source
-        # JSON's own types, since they are compared with what JSON gave back.
-        self._key: dict[str, Any] = {
-            "input": lightmaps.source,
-            # Not in the input's hash, and yet the time axis wraps by it.
-            "period": lightmaps.period,
-            "profile": profile.model_dump(mode="json"),
-            "tiles": None if tiles is None else sorted(int(tile) for tile in tiles),
-            "seed": int(seed),
-            "device": "cpu" if device == "cpu" else "cuda",
-            "wlm": __version__,
-        }
-        self._finished: dict[int, dict[str, np.ndarray]] = {}
-        self._running: tuple[int, dict[str, np.ndarray]] | None = None
-        if resume and self.path.exists():
-            self._read()
-            self.resumed = True
-
-    def finished(self, number: int) -> dict[str, np.ndarray] | None:
-        """The stored parts of a finished batch, or None if it isn't finished."""
-        return self._finished.get(number)
-
-    def running(self, number: int) -> dict[str, np.ndarray] | None:
-        """The state of the batch that was running when the fit was stopped, or None if it was another or none."""
-        return self._running[1] if self._running is not None and self._running[0] == number else None
-
-    def save_running(self, number: int, state: Mapping[str, np.ndarray]) -> None:
-        """Writes the state of the running batch, in place of an older one.
-
-        Raises:
-            WlmError: The file can't be written; what was there before stays.
-        """
-        self._running = (number, dict(state))
-        self._write()
-
-    def add_finished(self, number: int, result: Mapping[str, np.ndarray]) -> None:
-        """Writes the parts of a finished batch; its running state is dropped.
-
-        Raises:
-            WlmError: The file can't be written; what was there before stays.
-        """
-        self._finished[number] = dict(result)
-        self._running = None
-        self._write()
-
-    def remove(self) -> None:
-        """Removes the file, if there is one: the output has been written.
-
-        Raises:
-            WlmError: It can't be removed.
-        """
-        try:
-            self.path.unlink(missing_ok=True)
-        except OSError as error:
-            raise WlmError(f"{self.path}: cannot remove: {error.strerror or error}") from error
-
-    def _write(self) -> None:
-        tensors = {
-            f"{_FINISHED}.{number}.{key}": value
-            for number, parts in self._finished.items()
-            for key, value in parts.items()
-        }
-        if self._running is not None:
-            number, state = self._running
-            tensors |= {f"{_RUNNING}.{number}.{key}": value for key, value in state.items()}
-        write_artifact(self.path, SYSTEM, {"fit": self._key}, tensors, self._source)
-
-    def _read(self) -> None:
-        artifact = read_artifact(self.path, SYSTEM)
-        stored = artifact.settings.get("fit")
-        if not isinstance(stored, dict):
-            raise WlmError(f"{self.path}: the checkpoint does not say which fit it is of")
-        if difference := _difference(stored, self._key):
-            raise WlmError(
-                f"{self.path}: a checkpoint of another fit: {difference}; resume with what it was started with, or "
-                "start anew without --resume"
-            )
-        for name, value in artifact.tensors.items():
-            state, number, key = (*name.split(".", 2), "", "")[:3]
-            if state not in (_FINISHED, _RUNNING) or not number.isdecimal() or not key:
-                raise WlmError(f"{self.path}: part {name!r}: expected one of a finished or a running batch")
-            # A copy: the file is replaced at the next save, and a mapped one would stay on the disk.
-            if state == _FINISHED:
-                self._finished.setdefault(int(number), {})[key] = np.array(value)
-            else:
-                if self._running is None:
-                    self._running = (int(number), {})
-                self._running[1][key] = np.array(value)
-
-
-def _difference(stored: Mapping[str, Any], wanted: Mapping[str, Any]) -> str:
-    """Names the first thing in which two fits differ; empty if they are one."""
-    for key, value in wanted.items():
-        other = stored.get(key)
-        if isinstance(value, dict) and isinstance(other, dict):
-            for name in sorted({*value, *other}):
-                if value.get(name) != other.get(name):
-                    return f"it was made with {key} {name}={other.get(name)}, not {value.get(name)}"
-        elif value != other:
-            return f"it was made with {key} {other}, not {value}"
-    return ""
+    fit = {
+        "input": lightmaps.source,
+        # Not in the input's hash, and yet the time axis wraps by it.
+        "period": lightmaps.period,
+        "profile": profile.model_dump(mode="json"),
+        "tiles": None if tiles is None else sorted(int(tile) for tile in tiles),
+        "seed": int(seed),
+        "device": "cpu" if device == "cpu" else "cuda",
+    }
+    return Checkpoint(output, "lightmap", fit, lightmaps.source, resume=resume)

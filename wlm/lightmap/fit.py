@@ -63,7 +63,7 @@ def compress(
         seed: One seed gives one result on one device.
         device: "cpu" or "cuda:0".
         progress: Called about twice a second.
-        checkpoint: ``wlm.lightmap.checkpoint.Checkpoint``, or None: where an interrupted fit is kept and resumed.
+        checkpoint: from ``wlm.lightmap.checkpoint``, or None: where an interrupted fit is kept and resumed.
 
     Returns:
         The model, ready for ``wlm.lightmap.codec.write``.

@@ -1,0 +1,186 @@
+"""Blocks in slots: writing them, putting them in order, and reading the light at any point."""
+
+import itertools
+
+import numpy as np
+import pytest
+import warp as wp
+from reference import volume as reference
+
+from kernels.compare import array, close
+from wlm_kernels import volume
+
+SIDE = 4
+SIZES = (0.5, 1.0, 4.0)
+# Windows on both sides of 0, one across it, and one far out.
+BASES = np.array([[-9, 3, -2], [-6, 0, -1], [1000000, -1000000, -2]], np.int32)
+
+
+class Grid:
+    """A volume on a device, and the same blocks by name."""
+
+    def __init__(self, bases: np.ndarray, sizes: tuple[float, ...], side: int, channels: int, device: str):
+        self.bases, self.sizes, self.side, self.device = bases, np.array(sizes), side, device
+        self.blocks: dict[tuple[int, int, int, int], np.ndarray] = {}
+        slots = len(sizes) * side**3
+        # What no block was written to must not matter.
+        self.values = array(np.full((slots, channels), np.nan), float, device)
+        self.held = wp.full(slots, wp.vec3i(volume.NOTHING), dtype=wp.vec3i, device=device)
+
+    def window(self, level: int) -> list[tuple[int, int, int, int]]:
+        ranges = [range(first, first + self.side) for first in self.bases[level]]
+        return [(level, *block) for block in itertools.product(*ranges)]
+
+    def slot(self, level: int, x: int, y: int, z: int) -> int:
+        return ((level * self.side + x % self.side) * self.side + y % self.side) * self.side + z % self.side
+
+    def write(self, blocks: dict[tuple[int, int, int, int], np.ndarray]) -> None:
+        self.blocks.update(blocks)
+        volume.scatter(
+            array(np.array([self.slot(*name) for name in blocks], np.int32), int, self.device),
+            array(np.array([name[1:] for name in blocks], np.int32), wp.vec3i, self.device),
+            array(np.array(list(blocks.values()), np.float32), float, self.device),
+            self.values,
+            self.held,
+        )
+
+    def read(self, points: np.ndarray, origin: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """At points in float64."""
+        place = origin / self.sizes[:, None] - (self.bases + self.side // 2) - 0.5
+        views = np.concatenate([place, 1.0 / self.sizes[:, None]], 1).astype(np.float32)
+        out = array(np.full((len(points), self.values.shape[1]), np.nan), float, self.device)
+        level = wp.empty(len(points), dtype=int, device=self.device)
+        weight = wp.empty(len(points), dtype=float, device=self.device)
+        where = array((points - origin).astype(np.float32), wp.vec3, self.device)
+        bases = array(self.bases, wp.vec3i, self.device)
+        views = array(views, wp.vec4, self.device)
+        volume.read(self.values, self.held, bases, views, self.side, where, out, level, weight)
+        return out.numpy(), level.numpy(), weight.numpy()
+
+    def unscroll(self) -> tuple[np.ndarray, np.ndarray]:
+        out = array(np.full(self.values.shape, np.nan), float, self.device)
+        valid = wp.empty(len(self.held), dtype=wp.uint8, device=self.device)
+        volume.unscroll(self.values, self.held, array(self.bases, wp.vec3i, self.device), self.side, out, valid)
+        return out.numpy(), valid.numpy()
+
+
+def _filled(channels: int, device: str, share: float = 0.6, bases: np.ndarray = BASES) -> Grid:
+    """A grid with a random share of its blocks; the other slots hold NaN, for blocks that lie one window further on."""
+    random = np.random.default_rng(channels)
+    grid = Grid(bases, SIZES, SIDE, channels, device)
+    blocks = {}
+    for level in range(len(SIZES)):
+        for name in grid.window(level):
+            stale = (level, name[1] + SIDE * int(random.choice([-1, 1])), *name[2:])
+            there = random.random() < share
+            blocks[name if there else stale] = random.normal(size=channels) if there else np.full(channels, np.nan)
+    grid.write(blocks)
+    return grid
+
+
+def _near(grid: Grid, level: int, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points in and round a level's window, and its middle; on centres, corners and sides of blocks too."""
+    random = np.random.default_rng(level)
+    size = grid.sizes[level]
+    low = grid.bases[level] * size
+    points = low + random.uniform(-1.5, SIDE + 1.5, (count, 3)) * size
+    points[: count // 4] = low + random.integers(-2, 2 * SIDE + 2, (count // 4, 3)) * size / 2
+    return points, low + SIDE / 2 * size
+
+
+@pytest.mark.parametrize("channels", [1, 3, 8, 27])
+def test_read_against_reference(device: str, channels: int):
+    grid = _filled(channels, device)
+    for level in range(len(SIZES)):
+        points, origin = _near(grid, level, 200)
+        got, answered, weight = grid.read(points, origin)
+        want, shares = reference.read(grid.blocks, BASES, SIZES, SIDE, points, channels)
+        covered = shares.sum(1)
+        assert (covered > 0.0).any() and (covered == 0.0).any()
+        close(weight, covered, 2e-6, "weight")
+        # Divided by a small weight, a rounding of the place counts for more.
+        close(got * covered[:, None], want * covered[:, None], 5e-6, "values")
+        assert not got[covered == 0.0].any()
+        first, second = np.sort(shares, 1)[:, -1], np.sort(shares, 1)[:, -2]
+        clear = first - second > 1e-5
+        np.testing.assert_array_equal(answered[clear], shares.argmax(1)[clear])
+        np.testing.assert_array_equal(answered[covered == 0.0], -1)
+
+
+def test_points_that_nothing_covers(device: str):
+    """NaN, infinity and what is far outside are black, not an index out of range."""
+    grid = _filled(3, device, share=1.0, bases=np.full((3, 3), -SIDE // 2, np.int32))
+    points = np.array([[np.nan, 0, 0], [0, np.inf, 0], [0, 0, -np.inf], [3e38, 0, 0], [0, -1e20, 0], [11, 0, 0]])
+    values, level, weight = grid.read(points, np.zeros(3))
+    assert not values.any() and not weight.any() and (level == -1).all()
+    assert grid.read(np.zeros((1, 3)), np.zeros(3))[2][0] == pytest.approx(1.0, abs=1e-6)
+    assert grid.read(np.zeros((0, 3)), np.zeros(3))[0].shape == (0, 3)
+
+
+def test_linear_field_is_exact(device: str):
+    """Where a level has all 8 blocks round a point, and no finer one has any, the level reproduces it."""
+    bases = np.full((3, 3), -SIDE // 2, np.int32)
+    grid = Grid(bases, SIZES, SIDE, 5, device)
+    slope, constant = np.random.default_rng(3).normal(size=(3, 5)), np.arange(5.0)
+    for level, size in enumerate(SIZES):
+        grid.write({name: (np.array(name[1:]) + 0.5) * size @ slope + constant for name in grid.window(level)})
+    origin = np.array([0.1, -0.1, 0.05])
+    points = np.random.default_rng(4).uniform(-1.0, 1.0, (3000, 3)) * np.repeat([0.75, 1.5, 6.0], 1000)[:, None]
+    values, level, weight = grid.read(points, origin)
+    close(weight, np.ones(len(points)), 1e-6, "weight")
+    # The outermost centres lie 1.5 blocks from the middle, and reach one block further.
+    away = np.abs(points).max(1)
+    for which, (first, last) in enumerate([(0.0, 0.75), (1.25, 1.5), (2.5, 6.0)]):
+        alone = (away >= first) & (away <= last)
+        close(values[alone], (points @ slope + constant)[alone], 1e-6, f"field at level {which}")
+        assert alone.sum() > 100 and (level[alone] == which).all()
+    # The finest answers alone: another field in the others changes not one bit.
+    grid.write({name: np.full(5, 1e6) for coarse in (1, 2) for name in grid.window(coarse)})
+    inner = away <= 0.75
+    np.testing.assert_array_equal(grid.read(points, origin)[0][inner], values[inner])
+
+
+def test_continuous_across_missing_blocks(device: str):
+    """Over holes and borders of windows a small step never jumps, as long as some level has all."""
+    bases = np.full((3, 3), -SIDE // 2, np.int32)
+    grid = _filled(2, device, bases=bases)
+    rest = {name: np.zeros(2) for name in grid.window(2) if name not in grid.blocks}
+    grid.write(rest)
+    way = np.linspace([-5.0, -1.0, -2.0], [5.0, 2.0, 1.5], 20001)
+    values, level, weight = grid.read(way, np.zeros(3))
+    close(weight, np.ones(len(way)), 1e-6, "weight")
+    assert set(level) == {0, 1, 2}
+    values_there = np.array([v for name, v in grid.blocks.items() if name in set(grid.window(name[0]))])
+    # Each level's share and value change by at most 3 sides of difference per side of a block, in each axis.
+    bound = 2 * np.ptp(values_there) * 3 * np.abs(np.diff(way, axis=0)).max() / min(SIZES) * 2
+    assert np.abs(np.diff(values, axis=0)).max() < bound < 0.1 * np.ptp(values)
+
+
+def test_scatter_changes_its_slots_alone(device: str):
+    grid = _filled(3, device)
+    before, held = grid.values.numpy(), grid.held.numpy()
+    name = (1, -6, 3, 2)
+    grid.write({name: np.array([7.0, 8.0, 9.0])})
+    slot = grid.slot(*name)
+    after, held_after = grid.values.numpy(), grid.held.numpy()
+    np.testing.assert_array_equal(after[slot], [7.0, 8.0, 9.0])
+    np.testing.assert_array_equal(held_after[slot], name[1:])
+    others = np.arange(len(after)) != slot
+    np.testing.assert_array_equal(after[others], before[others])
+    np.testing.assert_array_equal(held_after[others], held[others])
+
+
+def test_unscroll(device: str):
+    """In the order of space; blocks of another window, and none at all, are invalid and 0."""
+    grid = _filled(3, device)
+    values, valid = grid.unscroll()
+    names = [name for level in range(len(SIZES)) for name in grid.window(level)]
+    there = np.array([name in grid.blocks for name in names])
+    assert 0 < there.sum() < len(there)
+    np.testing.assert_array_equal(valid.astype(bool), there)
+    want = np.array([grid.blocks[name] for name in names if name in grid.blocks], np.float32)
+    np.testing.assert_array_equal(values[there], want)
+    assert not values[~there].any()
+    empty = Grid(BASES, SIZES, SIDE, 2, device)
+    values, valid = empty.unscroll()
+    assert not values.any() and not valid.any()

@@ -1,0 +1,181 @@
+"""Scores of decoded probes, against plain sums and light whose score is known."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from wlm.errors import WlmError
+from wlm.probe import evaluate as module
+from wlm.probe.data import ProbeSet
+from wlm.probe.evaluate import NORMALS, evaluate
+from wlm.probe.sphere import fibonacci_sphere, irradiance
+
+
+def probe_set(values, live=None, position=None):
+    """A set without the checks of its reader, so that it may be odd."""
+    values = np.asarray(values, np.float32)
+    live = np.ones(len(values), bool) if live is None else np.asarray(live)
+    position = np.arange(3.0 * len(values)).reshape(-1, 3) if position is None else position
+    return ProbeSet("room", position, values, "sh", live, "0f", ())
+
+
+@pytest.fixture
+def pair():
+    rng = np.random.default_rng(2)
+    values = rng.normal(size=(50, 27)).astype(np.float32)
+    values[[3, 40]] = 0.0
+    live = np.ones(50, bool)
+    live[[3, 40]] = False
+    decoded = values + (0.1 * rng.normal(size=values.shape)).astype(np.float32)
+    decoded[~live] = 0.0
+    return decoded, probe_set(values, live)
+
+
+def decibels(error, peak):
+    return 10 * math.log10(peak**2 / np.mean(np.square(error, dtype=np.float64)))
+
+
+def test_the_scores_are_those_of_plain_sums(pair):
+    decoded, probes = pair
+    report = evaluate(decoded, probes, 1000)
+    error = decoded.astype(np.float64) - probes.values
+    peak = float(probes.values.max()) - float(probes.values.min())
+    assert report.peak == peak
+    assert report.psnr == pytest.approx(decibels(error, peak))
+    assert report.psnr_live == pytest.approx(decibels(error[probes.live], peak))
+    assert report.psnr_live < report.psnr, "the dead are exact"
+    assert report.mse == pytest.approx(np.mean(error**2))
+    assert report.mean_abs_error == pytest.approx(np.mean(np.abs(error)))
+    assert report.max_abs_error == np.abs(error).max()
+    worst = int(np.argmax((error**2).mean(1)))
+    assert report.worst_probe["probe"] == worst
+    assert report.worst_probe["psnr"] == pytest.approx(decibels(error[worst], peak))
+    assert report.worst_probe["position"] == probes.position[worst].tolist()
+    for band, part in enumerate((slice(0, 3), slice(3, 12), slice(12, 27))):
+        assert report.psnr_by_band[band] == pytest.approx(decibels(error[:, part], peak))
+    expected = [decibels(error[:, i], peak) for i in range(27)]
+    np.testing.assert_allclose(report.psnr_by_coefficient, expected)
+    assert (report.name, report.probes, report.live, report.outputs) == ("room", 50, 48, 27)
+
+
+def test_irradiance_is_scored_where_light_falls(pair):
+    decoded, probes = pair
+    normals, live = fibonacci_sphere(NORMALS), probes.live
+    wanted = irradiance(probes.values[live].reshape(-1, 9, 3), normals)
+    got = irradiance(decoded[live].reshape(-1, 9, 3), normals)
+    report = evaluate(decoded, probes, 1000)
+    assert report.irradiance_psnr == pytest.approx(decibels(got - wanted, np.ptp(wanted)))
+
+
+def test_an_error_that_no_diffuse_surface_sees_costs_no_irradiance():
+    rng = np.random.default_rng(3)
+    probes = probe_set(rng.normal(size=(8, 48)))
+    decoded = probes.values.copy()
+    decoded[:, 27:] += 1.0  # the third band
+    report = evaluate(decoded, probes, 100)
+    assert report.psnr < 20 and report.psnr_by_band[:3] == [math.inf] * 3
+    assert report.irradiance_psnr == math.inf
+
+
+def test_noise_of_a_known_size_has_a_known_score():
+    values = np.zeros((4, 27), np.float32)
+    values[0, 0], values[1, 0] = 2.0, -2.0
+    report = evaluate(values + np.float32(0.25), probe_set(values), 54)
+    assert report.psnr == pytest.approx(20 * math.log10(4 / 0.25))
+    assert (report.mse, report.mean_abs_error, report.max_abs_error) == (0.0625, 0.25, 0.25)
+    assert report.bits_per_probe == 54 * 8 / 4 and report.ratio == 54 / (4 * 27 * 4)
+
+
+def test_an_exact_copy_is_infinite_and_null_in_json(pair):
+    _, probes = pair
+    report = evaluate(probes.values, probes, 1000)
+    assert report.psnr == report.psnr_live == report.irradiance_psnr == math.inf
+    assert report.worst_probe is None and report.max_abs_error == 0.0
+    document = report.to_json()
+    assert json.loads(json.dumps(document, allow_nan=False)) == document
+    assert document["psnr"] is None and document["psnr_by_band"] == [None] * 3 and document["mse"] == 0.0
+
+
+def test_the_report_is_json(pair):
+    report = evaluate(*pair, 1000)
+    document = report.to_json()
+    assert json.loads(json.dumps(document, allow_nan=False)) == document
+    assert document["psnr"] == report.psnr and len(document["psnr_by_coefficient"]) == 27
+    assert document["worst_probe"]["position"] == report.worst_probe["position"]
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.5])
+def test_without_a_range_there_is_no_psnr(offset):
+    probes = probe_set(np.full((3, 27), 0.25))
+    report = evaluate(probes.values + np.float32(offset), probes, 100)
+    assert math.isnan(report.psnr) and math.isnan(report.psnr_live) and report.to_json()["psnr"] is None
+    assert all(math.isnan(score) for score in report.psnr_by_band)
+    assert report.max_abs_error == offset
+
+
+def test_light_from_everywhere_has_no_range_of_irradiance():
+    values = np.zeros((3, 27), np.float32)
+    values[:, :3] = 1.0
+    report = evaluate(values * np.float32(0.5), probe_set(values), 100)
+    assert math.isfinite(report.psnr) and math.isnan(report.irradiance_psnr)
+
+
+@pytest.mark.parametrize("outputs", [1, 2, 6, 28])
+def test_numbers_that_are_no_bands_have_no_irradiance(outputs):
+    values = np.arange(5.0 * outputs).reshape(5, outputs)
+    report = evaluate(values.astype(np.float32) + 1, probe_set(values), 10)
+    assert report.psnr_by_band is None and report.irradiance_psnr is None
+    assert report.psnr == pytest.approx(20 * math.log10(5 * outputs - 1))
+    assert len(report.psnr_by_coefficient) == outputs
+
+
+def test_one_probe():
+    values = np.arange(27.0)[None]
+    report = evaluate(values.astype(np.float32), probe_set(values), 10)
+    assert report.psnr == math.inf and report.bits_per_probe == 80
+    report = evaluate(np.ones((1, 1), np.float32), probe_set([[3.0]]), 10)
+    assert math.isnan(report.psnr) and report.mse == 4.0 and report.worst_probe["probe"] == 0
+
+
+def test_no_live_probe():
+    probes = probe_set(np.zeros((2, 27)), live=[False, False])
+    report = evaluate(probes.values, probes, 10)
+    assert math.isnan(report.psnr_live) and math.isnan(report.irradiance_psnr) and report.live == 0
+
+
+def test_many_probes_are_scored_in_pieces(pair, monkeypatch):
+    whole = evaluate(*pair, 1000).to_json()
+    monkeypatch.setattr(module, "_ROWS", 7)
+    pieces = evaluate(*pair, 1000).to_json()
+    for name, value in whole.items():
+        assert pieces[name] == (value if isinstance(value, str | dict | None) else pytest.approx(value, rel=1e-12))
+
+
+def test_large_and_tiny_values_keep_their_score(pair):
+    decoded, probes = pair
+    middle = evaluate(decoded, probes, 1000)
+    for scale in (1e-30, 1e18):
+        other = probe_set(probes.values.astype(np.float64) * scale, probes.live)
+        report = evaluate((decoded.astype(np.float64) * scale).astype(np.float32), other, 1000)
+        assert report.psnr == pytest.approx(middle.psnr, abs=1e-4)
+        assert report.irradiance_psnr == pytest.approx(middle.irradiance_psnr, abs=1e-4)
+
+
+def test_what_cannot_be_scored_is_one_line(pair):
+    decoded, probes = pair
+    for spoilt in (np.nan, np.inf):
+        broken = decoded.copy()
+        broken[[7, 20], 4] = spoilt
+        with pytest.raises(WlmError, match="2 probes decode to NaN or infinity, first probe 7"):
+            evaluate(broken, probes, 1000)
+    with pytest.raises(WlmError, match="room: has 50 probes of 27 numbers, but 49 of 27 were decoded"):
+        evaluate(decoded[:-1], probes, 1000)
+    with pytest.raises(WlmError, match="of 12 were decoded"):
+        evaluate(decoded[:, :12], probes, 1000)
+    for size in (0, -1):
+        with pytest.raises(ValueError, match="file_bytes"):
+            evaluate(decoded, probes, size)
+    with pytest.raises(ValueError, match=r"\[N, D\]"):
+        evaluate(decoded.reshape(50, 9, 3), probes, 1000)

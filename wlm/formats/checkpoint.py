@@ -1,0 +1,156 @@
+"""Where an interrupted fit is kept: finished batches as they will be stored, and the running one's exact state.
+
+One file beside the output, an artifact of its own system, so that it is written whole or not at all and every byte
+of it is checked when it is read. It names what the fit depends on, and goes on with no other fit.
+"""
+
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from wlm import __version__
+from wlm.errors import WlmError
+from wlm.formats.artifact import read_artifact, write_artifact
+
+__all__ = ["SUFFIX", "Checkpoint"]
+
+SUFFIX = ".partial"
+
+_FINISHED, _RUNNING = "finished", "running"
+
+
+class Checkpoint:
+    """The state of one fit, in the file ``OUTPUT.partial``.
+
+    Made for a system's fit, which asks it for what is done already and hands it what gets done. Batches are
+    numbered from 0; at most one is running. A fit of one batch calls it number 0.
+
+    Attributes:
+        path: The file.
+        system: The artifact's system, "lightmap-checkpoint" for example.
+        resumed: Whether anything was read from it.
+    """
+
+    def __init__(
+        self,
+        output: str | os.PathLike[str],
+        system: str,
+        fit: Mapping[str, Any],
+        source: str,
+        *,
+        resume: bool = False,
+    ) -> None:
+        """Opens the checkpoint of a fit.
+
+        Args:
+            output: The file that the fit is for; the checkpoint lies beside it.
+            system: The system whose fit it is, "lightmap" for example.
+            fit: What the fit depends on, each by the name that a message gives it: the input's hash, the settings,
+                the seed. JSON values; the version of this package is added.
+            source: A hash of the input, one ASCII word.
+            resume: Whether to go on from the file, if there is one. Otherwise it is ignored, and replaced at the
+                first save.
+
+        Raises:
+            WlmError: With ``resume``: the file is damaged, or of another fit; the line names what differs.
+            ValueError: ``fit`` holds NaN or Inf, which JSON has not.
+        """
+        self.path = Path(f"{os.fspath(output)}{SUFFIX}")
+        self.system = f"{system}-checkpoint"
+        self.resumed = False
+        self._source = source
+        # Compared with what JSON gives back, which has no tuples.
+        self._key: dict[str, Any] = json.loads(json.dumps({**fit, "wlm": __version__}, allow_nan=False))
+        self._finished: dict[int, dict[str, np.ndarray]] = {}
+        self._running: tuple[int, dict[str, np.ndarray]] | None = None
+        if resume and self.path.exists():
+            self._read()
+            self.resumed = True
+
+    def finished(self, number: int) -> dict[str, np.ndarray] | None:
+        """The stored parts of a finished batch, or None if it isn't finished."""
+        return self._finished.get(number)
+
+    def running(self, number: int) -> dict[str, np.ndarray] | None:
+        """The state of the batch that was running when the fit was stopped, or None if it was another or none."""
+        return self._running[1] if self._running is not None and self._running[0] == number else None
+
+    def save_running(self, number: int, state: Mapping[str, np.ndarray]) -> None:
+        """Writes the state of the running batch, in place of an older one.
+
+        Raises:
+            WlmError: The file can't be written; what was there before stays.
+        """
+        self._running = (number, dict(state))
+        self._write()
+
+    def add_finished(self, number: int, result: Mapping[str, np.ndarray]) -> None:
+        """Writes the parts of a finished batch; its running state is dropped.
+
+        Raises:
+            WlmError: The file can't be written; what was there before stays.
+        """
+        self._finished[number] = dict(result)
+        self._running = None
+        self._write()
+
+    def remove(self) -> None:
+        """Removes the file, if there is one: the output has been written.
+
+        Raises:
+            WlmError: It can't be removed.
+        """
+        try:
+            self.path.unlink(missing_ok=True)
+        except OSError as error:
+            raise WlmError(f"{self.path}: cannot remove: {error.strerror or error}") from error
+
+    def _write(self) -> None:
+        tensors = {
+            f"{_FINISHED}.{number}.{key}": value
+            for number, parts in self._finished.items()
+            for key, value in parts.items()
+        }
+        if self._running is not None:
+            number, state = self._running
+            tensors |= {f"{_RUNNING}.{number}.{key}": value for key, value in state.items()}
+        write_artifact(self.path, self.system, {"fit": self._key}, tensors, self._source)
+
+    def _read(self) -> None:
+        artifact = read_artifact(self.path, self.system)
+        stored = artifact.settings.get("fit")
+        if not isinstance(stored, dict):
+            raise WlmError(f"{self.path}: the checkpoint does not say which fit it is of")
+        if difference := _difference(stored, self._key):
+            raise WlmError(
+                f"{self.path}: a checkpoint of another fit: {difference}; resume with what it was started with, or "
+                "start anew without --resume"
+            )
+        for name, value in artifact.tensors.items():
+            state, number, key = (*name.split(".", 2), "", "")[:3]
+            if state not in (_FINISHED, _RUNNING) or not number.isdecimal() or not key:
+                raise WlmError(f"{self.path}: part {name!r}: expected one of a finished or a running batch")
+            # A copy: the file is replaced at the next save, and a mapped one would stay on the disk.
+            if state == _FINISHED:
+                self._finished.setdefault(int(number), {})[key] = np.array(value)
+            else:
+                if self._running is None:
+                    self._running = (int(number), {})
+                self._running[1][key] = np.array(value)
+
+
+def _difference(stored: Mapping[str, Any], wanted: Mapping[str, Any]) -> str:
+    """Names the first thing in which two fits differ; empty if they are one."""
+    for key, value in wanted.items():
+        other = stored.get(key)
+        if isinstance(value, dict) and isinstance(other, dict):
+            for name in sorted({*value, *other}):
+                if value.get(name) != other.get(name):
+                    return f"it was made with {key} {name}={other.get(name)}, not {value.get(name)}"
+        elif value != other:
+            return f"it was made with {key} {other}, not {value}"
+    return ""

@@ -1,0 +1,334 @@
+"""Reading the light probes of a Godot 4 lightmap bake (`.lmbake`).
+
+The file is Godot's binary resource (`RSRC`, or `RSCC` where it was saved compressed) of the type `LightmapGIData`.
+Its property `probe_data` is a dictionary with `points` and, for each of them, nine colours `sh`; everything else (the
+textures' names, the users, the tetrahedra and the BSP tree) is stepped over.
+
+Those nine are spherical harmonics L0 to L2 in the order 1; y, z, x; xy, yz, 3z2-1, xz, x2-y2, all signs plus, in the
+scene's axes (right-handed, y up, metres). They hold the incoming radiance, not convolved with the cosine, divided by
+pi: see "godot" in `wlm.probe.conventions`. Probes inside walls are often all zero.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from wlm.errors import WlmError
+
+__all__ = ["read_lmbake"]
+
+COEFFICIENTS = 9
+_TYPE = "LightmapGIData"
+_PROPERTY = "probe_data"
+
+# Versions of the container: 4 came with Godot 4.0, 6 with 4.3.
+_ENGINE = 4
+_FORMATS = (4, 5, 6)
+_HAS_UIDS, _IS_DOUBLE, _HAS_SCRIPT_CLASS = 2, 4, 8
+_RESERVED = 11
+
+# Compressed files: Zstandard in blocks of 4096 bytes. The limit keeps a damaged size from filling the memory.
+_ZSTD = 2
+_LARGEST_BLOCK = 1 << 20
+
+# Types of values. A real has 4 bytes, or 8 in a file of a double-precision build.
+_STRING, _STRING_NAME, _NODE_PATH, _OBJECT, _DICTIONARY, _ARRAY = 5, 44, 22, 24, 26, 30
+_BYTES, _STRINGS, _VECTOR3S, _COLOURS = 31, 34, 35, 36
+# Those of a fixed size: reals, and bytes.
+_FIXED = {
+    1: (0, 0),  # nil
+    2: (0, 4),  # bool
+    3: (0, 4),  # int
+    4: (1, 0),  # float
+    10: (2, 0),  # Vector2
+    11: (4, 0),  # Rect2
+    12: (3, 0),  # Vector3
+    13: (4, 0),  # Plane
+    14: (4, 0),  # Quaternion
+    15: (6, 0),  # AABB
+    16: (9, 0),  # Basis
+    17: (12, 0),  # Transform3D
+    18: (6, 0),  # Transform2D
+    20: (0, 16),  # Color, always single
+    23: (0, 4),  # RID
+    40: (0, 8),  # 64-bit int
+    41: (0, 8),  # double
+    42: (0, 0),  # Callable, not stored
+    43: (0, 0),  # Signal, not stored
+    45: (0, 8),  # Vector2i
+    46: (0, 16),  # Rect2i
+    47: (0, 12),  # Vector3i
+    50: (4, 0),  # Vector4
+    51: (0, 16),  # Vector4i
+    52: (16, 0),  # Projection
+}
+# Packed arrays: reals and bytes of one element.
+_PACKED = {
+    _BYTES: (0, 1),
+    32: (0, 4),  # 32-bit ints
+    33: (0, 4),  # floats
+    _VECTOR3S: (3, 0),
+    _COLOURS: (0, 16),
+    37: (2, 0),  # Vector2
+    48: (0, 8),  # 64-bit ints
+    49: (0, 8),  # doubles
+    53: (4, 0),  # Vector4
+}
+# Numbers that follow a reference to a resource: none; an old file's two strings; an index.
+_EMPTY, _EXTERNAL_PATH, _INTERNAL, _EXTERNAL = range(4)
+
+# Real files nest two deep. A damaged one must not exhaust the stack.
+_DEEPEST = 32
+
+
+def read_lmbake(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray]:
+    """Reads the light probes of a Godot 4 lightmap bake.
+
+    Args:
+        path: The `.lmbake` file.
+
+    Returns:
+        The positions, float64 [N, 3] in metres, and the coefficients, float32 [N, 9, 3] in RGB, as the file has them
+        (the module's notes say what they are); N is at least 1.
+
+    Raises:
+        WlmError: The file is missing, not a Godot resource, of another version or type, cut short or damaged, has no
+            probes, or is compressed and imagecodecs is not installed.
+    """
+    try:
+        data = Path(path).read_bytes()
+    except OSError as error:
+        raise WlmError(f"{path}: cannot read: {error.strerror or error}") from error
+    magic = data[:4]
+    if magic == b"RSCC":
+        # A compressed resource has no magic of its own inside, and its offsets count from there.
+        reader = _Reader(path, _decompress(_Reader(path, data, 4)), 0)
+    elif magic == b"RSRC":
+        reader = _Reader(path, data, 4)
+    else:
+        raise WlmError(f"{path}: expected a Godot binary resource (RSRC or RSCC), found {magic!r} at its start")
+    names = _open(reader)
+    points = colours = None
+    for _ in range(reader.u32()):
+        if reader.name(names) != _PROPERTY:
+            reader.skip()
+            continue
+        reader.expect(_PROPERTY, _DICTIONARY, "a dictionary")
+        for _ in range(reader.u32() & 0x7FFFFFFF):
+            key = reader.key()
+            if key == "points":
+                points = reader.vectors()
+            elif key == "sh":
+                colours = reader.colours()
+            else:
+                reader.skip()
+    if points is None or colours is None or len(points) == 0:
+        raise WlmError(f"{path}: {_PROPERTY} holds no probes: bake with LightmapProbe nodes or with generated probes")
+    if len(colours) != COEFFICIENTS * len(points):
+        raise WlmError(
+            f"{path}: {_PROPERTY}.sh: expected {COEFFICIENTS} colours for each of {len(points)} points, "
+            f"found {len(colours)}"
+        )
+    return points, colours.reshape(len(points), COEFFICIENTS, 4)[..., :3].copy()
+
+
+def _open(reader: _Reader) -> list[str]:
+    """Reads the header and goes to the main resource's properties; returns the table of names."""
+    path = reader.path
+    big = reader.u32()
+    if big > 1:
+        raise WlmError(f"{path}: byte order: expected 0 or 1, found {big}: the file is damaged")
+    reader.order = "<>"[big]
+    reader.u32()  # for doubles, never set
+    major, minor, version = reader.u32(), reader.u32(), reader.u32()
+    if major != _ENGINE or version not in _FORMATS:
+        raise WlmError(
+            f"{path}: expected a resource of Godot {_ENGINE}, format {_FORMATS[0]} to {_FORMATS[-1]}, "
+            f"found Godot {major}.{minor}, format {version}"
+        )
+    kind = reader.string()
+    if kind != _TYPE:
+        raise WlmError(f"{path}: expected a resource of the type {_TYPE}, found {kind!r}")
+    reader.take(8)  # offset of import metadata
+    flags = reader.u32()
+    reader.real = 8 if flags & _IS_DOUBLE else 4
+    reader.take(8)  # the resource's own UID
+    if flags & _HAS_SCRIPT_CLASS:
+        reader.string()
+    reader.take(4 * _RESERVED)
+    names = [reader.string() for _ in range(reader.u32())]
+    for _ in range(reader.u32()):
+        reader.string()  # type of an external resource
+        reader.string()  # and its path
+        if flags & _HAS_UIDS:
+            reader.take(8)
+    offset = None
+    for _ in range(reader.u32()):
+        reader.string()
+        offset = reader.u64()  # the last is the main resource
+    if offset is None:
+        raise WlmError(f"{path}: expected at least one resource inside, found none")
+    reader.seek(offset)
+    reader.string()  # the type once more
+    return names
+
+
+class _Reader:
+    """Numbers and values from bytes; whatever reaches past their end is an error.
+
+    No length that the file states is used to allocate: it is first held against the bytes that are left.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], data: bytes, start: int) -> None:
+        self.path = path
+        self.data = memoryview(data)
+        self.position = start
+        self.order = "<"
+        self.real = 4
+
+    def take(self, count: int) -> memoryview:
+        left = len(self.data) - self.position
+        if count > left:
+            raise WlmError(
+                f"{self.path}: cut short or damaged: expected {count} bytes at {self.position}, found {left}"
+            )
+        piece = self.data[self.position : self.position + count]
+        self.position += count
+        return piece
+
+    def seek(self, offset: int) -> None:
+        self.position = 0
+        self.take(offset)
+
+    def u32(self) -> int:
+        return struct.unpack(self.order + "I", self.take(4))[0]
+
+    def u64(self) -> int:
+        return struct.unpack(self.order + "Q", self.take(8))[0]
+
+    def string(self) -> str:
+        """A length in bytes, then UTF-8 that ends in a NUL."""
+        return self._text(self.u32())
+
+    def name(self, names: list[str]) -> str:
+        """An entry of the table of names, or text in place of one where the highest bit is set."""
+        index = self.u32()
+        if index & 0x80000000:
+            return self._text(index & 0x7FFFFFFF)
+        if index >= len(names):
+            raise WlmError(f"{self.path}: damaged: expected a name below {len(names)}, found {index}")
+        return names[index]
+
+    def key(self) -> str | None:
+        """A key of a dictionary; None if it isn't text."""
+        start = self.position
+        if self.u32() in (_STRING, _STRING_NAME):
+            return self.string()
+        self.position = start
+        self.skip()
+        return None
+
+    def expect(self, field: str, kind: int, text: str) -> None:
+        found = self.u32()
+        if found != kind:
+            raise WlmError(f"{self.path}: {field}: expected {text} (type {kind}), found type {found}")
+
+    def vectors(self) -> np.ndarray:
+        """A packed array of Vector3, float64 [N, 3]."""
+        self.expect(f"{_PROPERTY}.points", _VECTOR3S, "a packed array of Vector3")
+        values = np.frombuffer(self.take(self.u32() * 3 * self.real), f"{self.order}f{self.real}")
+        return values.reshape(-1, 3).astype(np.float64)
+
+    def colours(self) -> np.ndarray:
+        """A packed array of Color, float32 [N, 4]."""
+        self.expect(f"{_PROPERTY}.sh", _COLOURS, "a packed array of Color")
+        values = np.frombuffer(self.take(self.u32() * 16), f"{self.order}f4")
+        return values.reshape(-1, 4).astype(np.float32)
+
+    def skip(self, depth: int = 0) -> None:
+        """Steps over one value of any type."""
+        if depth > _DEEPEST:
+            raise WlmError(f"{self.path}: damaged: values inside values, more than {_DEEPEST} deep")
+        kind = self.u32()
+        if kind in _FIXED:
+            reals, size = _FIXED[kind]
+            self.take(reals * self.real + size)
+        elif kind in _PACKED:
+            reals, size = _PACKED[kind]
+            count = self.u32() * (reals * self.real + size)
+            self.take(count + (-count % 4 if kind == _BYTES else 0))
+        elif kind in (_STRING, _STRING_NAME):
+            self.string()
+        elif kind == _STRINGS:
+            self._repeat(self.u32(), self.string)
+        elif kind == _NODE_PATH:
+            names, subnames = struct.unpack(self.order + "HH", self.take(4))
+            self._repeat(names + (subnames & 0x7FFF), self._skip_name)
+        elif kind == _OBJECT:
+            self._skip_object()
+        elif kind == _DICTIONARY:
+            self._repeat(2 * (self.u32() & 0x7FFFFFFF), lambda: self.skip(depth + 1))
+        elif kind == _ARRAY:
+            self._repeat(self.u32() & 0x7FFFFFFF, lambda: self.skip(depth + 1))
+        else:
+            raise WlmError(f"{self.path}: expected a value of a known type, found type {kind}")
+
+    def _text(self, length: int) -> str:
+        return bytes(self.take(length)).rstrip(b"\0").decode("utf-8", "replace")
+
+    def _skip_name(self) -> None:
+        index = self.u32()
+        if index & 0x80000000:
+            self.take(index & 0x7FFFFFFF)
+
+    def _skip_object(self) -> None:
+        kind = self.u32()
+        if kind == _EXTERNAL_PATH:
+            self._repeat(2, self.string)
+        elif kind in (_INTERNAL, _EXTERNAL):
+            self.take(4)
+        elif kind != _EMPTY:
+            raise WlmError(f"{self.path}: damaged: expected a reference of kind 0 to 3, found {kind}")
+
+    def _repeat(self, count: int, read: Callable[[], object]) -> None:
+        # Each call takes at least four bytes, so the file's size bounds the loop.
+        for _ in range(count):
+            read()
+
+
+def _decompress(reader: _Reader) -> bytes:
+    """Unpacks the blocks of a compressed resource."""
+    path = reader.path
+    mode, block, total = reader.u32(), reader.u32(), reader.u32()
+    if mode != _ZSTD:
+        raise WlmError(f"{path}: compression: expected Zstandard ({_ZSTD}), found {mode}: save it in Godot without")
+    if not 0 < block <= _LARGEST_BLOCK:
+        raise WlmError(f"{path}: compression: expected blocks of 1 to {_LARGEST_BLOCK} bytes, found {block}")
+    try:
+        import imagecodecs
+    except ImportError as error:
+        raise WlmError(
+            f"{path}: is compressed: needs the extra: pip install 'wlm[baselines]', or save it in Godot without"
+        ) from error
+    # The last block, of what is left, is stored even where nothing is.
+    full, rest = divmod(total, block)
+    sizes = np.frombuffer(reader.take(4 * (full + 1)), "<u4")
+    pieces = []
+    for i, size in enumerate(sizes.tolist()):
+        expected = block if i < full else rest
+        packed = bytes(reader.take(size))
+        if expected == 0:
+            continue
+        try:
+            piece = imagecodecs.zstd_decode(packed, out=expected)
+        except (RuntimeError, ValueError) as error:
+            raise WlmError(f"{path}: compressed block {i} is damaged: {error}") from error
+        if len(piece) != expected:
+            raise WlmError(f"{path}: compressed block {i}: expected {expected} bytes, found {len(piece)}")
+        pieces.append(piece)
+    return b"".join(pieces)

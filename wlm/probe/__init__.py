@@ -1,0 +1,1 @@
+"""Light probes as 3D Gaussians and a small network (gaussian-probe-compression)."""

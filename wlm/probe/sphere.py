@@ -1,0 +1,140 @@
+"""Light over the sphere of directions from spherical harmonics (SH): the basis, radiance and irradiance.
+
+The convention of this package: orthonormal real SH, band by band, in a band from m = -l to l, all signs plus (no
+Condon-Shortley phase), so 1, y, z, x, xy, yz, 3z²-1, xz, x²-y², ... times positive constants. A probe's coefficients
+are those of the radiance that arrives from each direction (gaussian-probe-compression, eq. 1). The axes are those of
+the scene, whichever of them is up.
+"""
+
+import math
+
+import numpy as np
+
+__all__ = ["basis", "coefficient_bands", "cosine_factor", "fibonacci_sphere", "irradiance", "radiance", "sh_count"]
+
+_UNIT_TOLERANCE = 1e-3  # of a direction's length; float16 normals are within 6e-4
+
+
+def sh_count(outputs: int) -> int | None:
+    """Coefficients C of a probe of ``outputs`` numbers, if it holds whole bands in RGB (3, 12, 27, 48, ...)."""
+    count = outputs // 3
+    return count if count > 0 and outputs == 3 * count and math.isqrt(count) ** 2 == count else None
+
+
+def coefficient_bands(coefficients: int) -> np.ndarray:
+    """Band l of each coefficient, int64 [C]: 0, 1, 1, 1, 2, ...
+
+    Raises:
+        ValueError: C is not the square of a positive number.
+    """
+    if coefficients < 1 or math.isqrt(coefficients) ** 2 != coefficients:
+        raise ValueError(f"coefficients: expected whole bands (1, 4, 9, 16, ...), got {coefficients}")
+    order = np.arange(math.isqrt(coefficients))
+    return np.repeat(order, 2 * order + 1)
+
+
+def cosine_factor(band: int) -> float:
+    """What convolving with a clamped cosine multiplies a band by: pi, 2 pi/3, pi/4, 0, -pi/24, 0, ...
+
+    Ramamoorthi and Hanrahan, An Efficient Representation for Irradiance Environment Maps, 2001, eq. 8. Odd bands
+    above the first can't be seen on a diffuse surface.
+    """
+    if band == 1:
+        return 2.0 * math.pi / 3.0
+    if band % 2:
+        return 0.0
+    half = band // 2
+    return math.pi * (-1.0) ** (half + 1) * 2.0 / ((band + 2) * (band - 1)) * math.comb(band, half) / 2.0**band
+
+
+def basis(directions: np.ndarray, coefficients: int) -> np.ndarray:
+    """The SH basis in some directions.
+
+    Args:
+        directions: [M, 3], of unit length.
+        coefficients: C, the square of the number of bands.
+
+    Returns:
+        float64 [M, C]. Any number of bands is exact to rounding: each column is a polynomial in x, y, z from the
+        three-term recurrence of the normalised Legendre functions.
+
+    Raises:
+        ValueError: A shape, a length that isn't 1, or C that isn't a square.
+    """
+    directions = np.asarray(directions, np.float64)
+    if directions.ndim != 2 or directions.shape[1] != 3:
+        raise ValueError(f"directions: expected [M, 3], got {directions.shape}")
+    if not (np.abs(np.linalg.norm(directions, axis=1) - 1.0) <= _UNIT_TOLERANCE).all():
+        raise ValueError("directions: expected unit length")
+    order = int(coefficient_bands(coefficients)[-1]) + 1
+    z = directions[:, 2]
+    turned = np.ones(len(z), np.complex128)  # (x + iy)^m: sin^m theta with the cosine and the sine of m phi
+    result = np.empty((len(z), coefficients))
+    start = math.sqrt(0.25 / math.pi)  # of band m = order m
+    for m in range(order):
+        if m > 0:
+            turned = turned * (directions[:, 0] + 1j * directions[:, 1])
+            start *= math.sqrt((2 * m + 1) / (2 * m))
+        before, legendre = np.zeros_like(z), np.full_like(z, start)
+        for band in range(m, order):
+            if band > m:
+                low = ((band - 1) ** 2 - m * m) / (4 * (band - 1) ** 2 - 1)
+                factor = math.sqrt((4 * band * band - 1) / (band * band - m * m))
+                before, legendre = legendre, factor * (z * legendre - math.sqrt(low) * before)
+            middle = band * band + band
+            if m == 0:
+                result[:, middle] = legendre
+            else:
+                result[:, middle + m] = math.sqrt(2.0) * legendre * turned.real
+                result[:, middle - m] = math.sqrt(2.0) * legendre * turned.imag
+    return result
+
+
+def radiance(values: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """The radiance that arrives from some directions; it may dip below zero, as a series that ends does.
+
+    Args:
+        values: [..., C, 3].
+        directions: [M, 3], of unit length, from the probe towards the light.
+
+    Returns:
+        float64 [..., M, 3].
+
+    Raises:
+        ValueError: As ``basis``.
+    """
+    values = _checked(values)
+    return basis(directions, values.shape[-2]) @ values
+
+
+def irradiance(values: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """The irradiance of surfaces at the probe; divided by pi, what a white diffuse surface shows.
+
+    Args:
+        values: [..., C, 3].
+        normals: [M, 3], of unit length.
+
+    Returns:
+        float64 [..., M, 3], pi times the radiance where that is the same from everywhere.
+
+    Raises:
+        ValueError: As ``basis``.
+    """
+    values = _checked(values)
+    factors = [cosine_factor(band) for band in coefficient_bands(values.shape[-2]).tolist()]
+    return (basis(normals, values.shape[-2]) * factors) @ values
+
+
+def fibonacci_sphere(count: int) -> np.ndarray:
+    """Directions spread evenly over the sphere, float64 [count, 3]: a spiral with the golden angle about z."""
+    z = 1.0 - (2.0 * np.arange(count) + 1.0) / count
+    phi = np.arange(count) * (math.pi * (3.0 - math.sqrt(5.0)))
+    radius = np.sqrt(1.0 - z * z)
+    return np.stack([radius * np.cos(phi), radius * np.sin(phi), z], axis=1)
+
+
+def _checked(values: np.ndarray) -> np.ndarray:
+    values = np.asarray(values, np.float64)
+    if values.ndim < 2 or values.shape[-1] != 3:
+        raise ValueError(f"values: expected [..., C, 3], got {values.shape}")
+    return values
