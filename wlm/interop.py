@@ -1,5 +1,6 @@
 """Warp and torch together: devices, arrays, streams and CUDA graphs."""
 
+import gc
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
@@ -145,11 +146,18 @@ class StepGraph:
         warp_side = _side_stream(self._device)[1]
         # torch opens the capture; Warp is told of it, so that it frees nothing in the middle of it. Both use
         # the thread-local mode, which lets other threads (a loader, say) allocate meanwhile.
-        with (
-            torch.cuda.graph(graph, stream=side, capture_error_mode="thread_local"),
-            wp.ScopedCapture(stream=warp_side, external=True),
-        ):
-            self._step()
+        # A collection in the middle could free an older graph, which breaks the capture.
+        collecting = gc.isenabled()
+        gc.disable()
+        try:
+            with (
+                torch.cuda.graph(graph, stream=side, capture_error_mode="thread_local"),
+                wp.ScopedCapture(stream=warp_side, external=True),
+            ):
+                self._step()
+        finally:
+            if collecting:
+                gc.enable()
         return graph
 
 

@@ -1,0 +1,462 @@
+"""Affine subspaces for parts of a probe set: how the parts are found, and what is stored.
+
+A probe of part c is its mean and a few of its basis vectors, y ~ m_c + sum_j w_j b_cj. How the set is divided is all
+that differs between the PCA family of gaussian-probe-compression, section 5.1. What is stored, in this order and
+little-endian:
+
+====================  =====================================================================================
+part                  content
+====================  =====================================================================================
+header                kind of the partition, bits of a weight (0: half float), D, K, parts C, scale (float32)
+partition             nothing (one part); the cubes' side (float64); the centres (uint16 [C, 3] over the box);
+                      or each probe's part in ceil(log2 C) bits
+means, bases          float16 [C, D] and [C, K, D], in units of the scale
+lowest, highest       float16 [C, K, 2], only with weights in bits
+weights               [N, K], float16 or in bits
+====================  =====================================================================================
+
+The positions are the engine's own, so parts that follow from them cost no index a probe. Values are divided by the
+largest magnitude among them first: no half float overflows, and values near 1e-6 keep their digits.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from wlm.errors import WlmError
+
+__all__ = [
+    "BLOCKS",
+    "HALF_MAX",
+    "MAX_CELLS",
+    "PLACE",
+    "SIGNAL",
+    "WHOLE",
+    "Partition",
+    "by_blocks",
+    "by_place",
+    "by_signal",
+    "cell_keys",
+    "compact",
+    "decode",
+    "encode",
+    "extent_of",
+    "fit_subspaces",
+    "pack_bits",
+    "part_count",
+    "payload_bytes",
+    "read_weights",
+    "rescale",
+    "scale_of",
+    "unpack_bits",
+    "weight_bytes",
+    "whole",
+    "windows",
+    "write_weights",
+]
+
+HEADER = struct.Struct("<BBHHIf")
+HALF_MAX = 65504.0
+# How the parts are found again by a decoder.
+WHOLE, BLOCKS, PLACE, SIGNAL = range(4)
+_CENTRE_LEVELS = 65535
+# Cells along the longest side of the box, at most: three such numbers fit into one 64-bit key.
+MAX_CELLS = 1 << 20
+_PLACE_ROUNDS = 30
+_SIGNAL_ROUNDS = 12
+# A round that lowers the error by less than this share is the last.
+_SETTLED = 1e-3
+# Numbers at once in a comparison of probes with all parts: 32 MiB, whatever the set's size.
+_CHUNK = 1 << 22
+
+
+@dataclass(frozen=True, eq=False)
+class Partition:
+    """Probes divided into parts, none of them empty.
+
+    Attributes:
+        kind: How a decoder finds the parts.
+        label: int64 [N], the part of each probe, from 0.
+        count: C, the number of parts.
+        stored: What a decoder needs besides the positions.
+    """
+
+    kind: int
+    label: np.ndarray
+    count: int
+    stored: bytes
+
+    @property
+    def members(self) -> list[np.ndarray]:
+        """The probes of each part, in order."""
+        return _members(self.label, self.count)
+
+
+def whole(position: np.ndarray) -> Partition:
+    """All probes as one part."""
+    return Partition(WHOLE, np.zeros(len(position), np.int64), 1, b"")
+
+
+def by_blocks(position: np.ndarray, blocks: int) -> tuple[Partition, float]:
+    """Cubes of one size from the lowest corner of the probes' box; those that hold no probe do not count.
+
+    Args:
+        position: float64 [N, 3].
+        blocks: The most cubes, at least 1. Halving a side splits cubes, so a little fewer may come out; no more
+            than there are distinct positions.
+
+    Returns:
+        The partition, and the cubes' side in the unit of the positions.
+    """
+    extent = extent_of(position)
+    # The count falls as the side grows, not strictly so: what counts is the smallest side seen that is allowed.
+    side, low, high = extent * 1.01, 0.0, np.log2(MAX_CELLS)
+    for _ in range(24):
+        middle = 0.5 * (low + high)
+        tried = extent * 1.01 / 2.0**middle
+        if len(np.unique(_cubes(position, tried))) <= blocks:
+            side, low = tried, middle
+        else:
+            high = middle
+    label, count = compact(_cubes(position, side))
+    return Partition(BLOCKS, label, count, struct.pack("<d", side)), side
+
+
+def windows(position: np.ndarray, partition: Partition, side: float, overlap: float) -> list[np.ndarray]:
+    """The probes in each cube of ``by_blocks`` widened on all sides.
+
+    Args:
+        position: float64 [N, 3].
+        partition: Of ``by_blocks``.
+        side: Of the cubes.
+        overlap: How far a window reaches over its cube, in sides; 1 takes in the 26 cubes around it.
+
+    Returns:
+        For each part the indices of its window, its own probes among them.
+    """
+    low = position.min(0)
+    first = [own[0] for own in partition.members]
+    centre = low + (np.floor((position[first] - low) / side) + 0.5) * side
+    # The slack keeps a probe on a cube's face in that cube's window.
+    radius = side * (0.5 + overlap) * (1.0 + 1e-9)
+    found = cKDTree(position).query_ball_point(centre, radius, p=np.inf, return_sorted=True)
+    return [np.asarray(near, np.int64) for near in found]
+
+
+def by_place(position: np.ndarray, clusters: int, seed: int) -> Partition:
+    """K-means on the positions (gaussian-probe-compression, section 5.1); a probe belongs to the nearest centre.
+
+    Args:
+        position: float64 [N, 3].
+        clusters: The most parts; fewer where there are fewer distinct positions, or where two centres or an
+            empty one fall away.
+        seed: Of the first centres.
+    """
+    low, extent = position.min(0), extent_of(position)
+    points = (position - low) / extent
+    centre = _seeds(points, clusters, np.random.default_rng(seed))
+    label = cKDTree(centre).query(points)[1]
+    for _ in range(_PLACE_ROUNDS):
+        label, count = compact(label)
+        centre = _sums(points, label, count) / np.bincount(label, minlength=count)[:, None]
+        before, label = label, cKDTree(centre).query(points)[1]
+        if np.array_equal(before, label):
+            break
+    # The parts are those of the centres as stored, and a centre that nobody is nearest to changes no part.
+    code = np.rint(centre * _CENTRE_LEVELS).astype("<u2")
+    label = _nearest(position, code)
+    used = np.unique(label)
+    return Partition(PLACE, np.searchsorted(used, label), len(used), code[used].tobytes())
+
+
+def by_signal(values: np.ndarray, clusters: int, components: int, seed: int) -> Partition:
+    """Clustered PCA (Sloan et al. 2003): a probe belongs to the affine subspace that reconstructs it best.
+
+    Lloyd's iteration with subspaces in place of centres, first with none of the basis vectors, which is k-means on
+    the values, then with all of them. A cluster that loses all its probes falls away.
+
+    Args:
+        values: float64 [N, D].
+        clusters: The most parts; fewer where there are fewer distinct probes.
+        components: K, basis vectors of a subspace.
+        seed: Of the first centres.
+    """
+    values = values / scale_of(values)
+    centre = _seeds(values, clusters, np.random.default_rng(seed))
+    label, _ = _closest(values, centre, np.empty((len(centre), 0, values.shape[1])))
+    for rank in (0, components):
+        error = np.inf
+        for _ in range(_SIGNAL_ROUNDS):
+            label, count = compact(label)
+            mean, basis = fit_subspaces(values, _members(label, count), rank)
+            label, now = _closest(values, mean, basis)
+            if now >= error * (1.0 - _SETTLED):
+                break
+            error = now
+    label, count = compact(label)
+    return Partition(SIGNAL, label, count, pack_bits(label, _index_bits(count)))
+
+
+def fit_subspaces(values: np.ndarray, members: Sequence[np.ndarray], components: int) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and principal directions of each part.
+
+    Args:
+        values: float64 [N, D].
+        members: For each of C parts the indices of its probes, at least one; parts may share probes.
+        components: K, 0 to D.
+
+    Returns:
+        float64 [C, D] means and [C, K, D] orthonormal directions, the strongest first. A part with no spread left
+        gets any directions that complete the set.
+    """
+    width = values.shape[1]
+    mean = np.empty((len(members), width))
+    basis = np.empty((len(members), components, width))
+    for part, own in enumerate(members):
+        mean[part] = values[own].mean(0)
+        if components:
+            centred = values[own] - mean[part]
+            # Ascending eigenvalues, and a whole orthonormal set even of a matrix of zeros.
+            basis[part] = np.linalg.eigh(centred.T @ centred)[1].T[::-1][:components]
+    return mean, basis
+
+
+def encode(
+    values: np.ndarray, partition: Partition, components: int, bits: int | None, members: Sequence[np.ndarray] = ()
+) -> bytes:
+    """Fits and packs.
+
+    Args:
+        values: float64 [N, D].
+        partition: Of the N probes.
+        components: K, 1 to D.
+        bits: Of a weight, 1 to 16, over the range of each part and component; None for half floats.
+        members: The probes that each part's subspace is fitted to, where those are not its own.
+
+    Returns:
+        The layout of this module.
+    """
+    scale = scale_of(values)
+    values = values / scale
+    mean, basis = fit_subspaces(values, members or partition.members, components)
+    mean, basis = mean.astype("<f2"), basis.astype("<f2")
+    # Weights for the subspace as it is read back: the rounding of means and bases is no error of its own then.
+    inverse = np.linalg.pinv(basis.astype(np.float64))
+    weight = np.empty((len(values), components))
+    for part, own in enumerate(partition.members):
+        weight[own] = (values[own] - mean[part].astype(np.float64)) @ inverse[part]
+    weights = write_weights(weight, partition.label, partition.count, bits)
+    head = HEADER.pack(partition.kind, bits or 0, values.shape[1], components, partition.count, scale)
+    return b"".join((head, partition.stored, mean.tobytes(), basis.tobytes(), weights))
+
+
+def decode(payload: bytes, position: np.ndarray) -> np.ndarray:
+    """Reads what ``encode`` wrote.
+
+    Args:
+        payload: The layout of this module.
+        position: float64 [N, 3], of the probes that were encoded.
+
+    Returns:
+        float32 [N, D].
+
+    Raises:
+        WlmError: The payload is no such layout for this number of probes.
+    """
+    probes = len(position)
+    try:
+        kind, bits, width, components, count, scale = HEADER.unpack_from(payload)
+        size = payload_bytes(kind, probes, width, components, count, bits or None)
+    except (struct.error, KeyError) as error:
+        raise WlmError(f"probes: not a payload of the PCA family: {len(payload)} bytes") from error
+    if size != len(payload):
+        raise WlmError(f"probes: expected a payload of {size} bytes for {probes} probes, got {len(payload)}")
+    start = HEADER.size + _PARTITION_BYTES[kind](probes, count)
+    label = _read_partition(kind, payload[HEADER.size : start], position, count)
+    mean = np.frombuffer(payload, "<f2", count * width, start).reshape(count, width).astype(np.float32)
+    start += mean.size * 2
+    basis = np.frombuffer(payload, "<f2", count * components * width, start).reshape(count, components, width)
+    start += basis.size * 2
+    weight = read_weights(payload[start:], label, count, components, bits or None)
+    decoded = mean[label]
+    for part, own in enumerate(_members(label, count)):
+        decoded[own] += weight[own] @ basis[part].astype(np.float32)
+    return rescale(decoded, scale)
+
+
+def part_count(payload: bytes) -> int:
+    """C of a payload."""
+    return HEADER.unpack_from(payload)[4]
+
+
+def payload_bytes(kind: int, probes: int, width: int, components: int, count: int, bits: int | None) -> int:
+    """Length of a payload, from the kind of ``Partition``, N, D, K, C and the bits of a weight."""
+    size = HEADER.size + _PARTITION_BYTES[kind](probes, count) + count * (components + 1) * width * 2
+    return size + weight_bytes(probes, components, count, bits)
+
+
+def scale_of(values: np.ndarray) -> float:
+    """The largest magnitude, as float32 holds it; 1 where all is zero."""
+    return float(np.float32(np.abs(values).max())) or 1.0
+
+
+def rescale(decoded: np.ndarray, scale: float) -> np.ndarray:
+    """Decoded values [N, D] times the scale, as float32 and within its range."""
+    limit = float(np.finfo(np.float32).max)
+    return np.clip(decoded.astype(np.float64) * scale, -limit, limit).astype(np.float32)
+
+
+def weight_bytes(probes: int, components: int, count: int, bits: int | None) -> int:
+    """Bytes of ``write_weights`` for N probes in C parts."""
+    if bits is None:
+        return probes * components * 2
+    return count * components * 4 + -(-probes * components * bits // 8)
+
+
+def write_weights(weight: np.ndarray, label: np.ndarray, count: int, bits: int | None) -> bytes:
+    """Packs weights as half floats, or in bits with the range of each part and component before them.
+
+    Args:
+        weight: float64 [N, K]. Magnitudes above half float's largest become that.
+        label: int [N], each probe's part.
+        count: C, the number of parts.
+        bits: 1 to 16, or None.
+
+    Returns:
+        ``weight_bytes`` bytes.
+    """
+    weight = np.clip(weight, -HALF_MAX, HALF_MAX)
+    if bits is None:
+        return weight.astype("<f2").tobytes()
+    bounds = np.empty((count, 2, weight.shape[1]), "<f2")
+    for bound, reduce, outside in ((0, np.minimum, -np.inf), (1, np.maximum, np.inf)):
+        edge = np.full((count, weight.shape[1]), -outside)
+        reduce.at(edge, label, weight)
+        near = edge.astype(np.float16)
+        # Rounded outwards: an end that is rounded inwards would cut off the weights there.
+        bounds[:, bound] = np.where(reduce(near, edge) == near, near, np.nextafter(near, np.float16(outside)))
+    low, step = _levels(bounds, bits)
+    # A range of zero has steps of zero, and level 0 is its value.
+    level = np.divide(weight - low[label], step[label], out=np.zeros_like(weight), where=step[label] > 0)
+    level = np.clip(np.rint(level), 0, 2**bits - 1).astype(np.int64)
+    return bounds.tobytes() + pack_bits(level.ravel(), bits)
+
+
+def read_weights(data: bytes, label: np.ndarray, count: int, components: int, bits: int | None) -> np.ndarray:
+    """Reads what ``write_weights`` wrote, float32 [N, K]."""
+    probes = len(label)
+    if bits is None:
+        return np.frombuffer(data, "<f2", probes * components).reshape(probes, components).astype(np.float32)
+    bounds = np.frombuffer(data, "<f2", count * 2 * components).reshape(count, 2, components)
+    level = unpack_bits(data[bounds.nbytes :], probes * components, bits).reshape(probes, components)
+    low, step = _levels(bounds, bits)
+    return (low[label] + level * step[label]).astype(np.float32)
+
+
+def pack_bits(numbers: np.ndarray, bits: int) -> bytes:
+    """Packs whole numbers below 2 ** bits one behind the other, the lowest bit first; bits may be 0."""
+    spread = (np.asarray(numbers)[:, None] >> np.arange(bits)) & 1
+    return np.packbits(spread.astype(np.uint8).ravel(), bitorder="little").tobytes()
+
+
+def unpack_bits(data: bytes, count: int, bits: int) -> np.ndarray:
+    """Reads ``count`` numbers that ``pack_bits`` wrote, int64."""
+    spread = np.unpackbits(np.frombuffer(data, np.uint8), count=count * bits, bitorder="little")
+    return spread.reshape(count, bits).astype(np.int64) @ (1 << np.arange(bits, dtype=np.int64))
+
+
+_PARTITION_BYTES = {
+    WHOLE: lambda probes, count: 0,
+    BLOCKS: lambda probes, count: 8,
+    PLACE: lambda probes, count: 6 * count,
+    SIGNAL: lambda probes, count: -(-probes * _index_bits(count) // 8),
+}
+
+
+def _read_partition(kind: int, data: bytes, position: np.ndarray, count: int) -> np.ndarray:
+    if kind == WHOLE:
+        return np.zeros(len(position), np.int64)
+    if kind == BLOCKS:
+        return compact(_cubes(position, struct.unpack("<d", data)[0]))[0]
+    if kind == PLACE:
+        return _nearest(position, np.frombuffer(data, "<u2").reshape(count, 3))
+    return unpack_bits(data, len(position), _index_bits(count))
+
+
+def _levels(bounds: np.ndarray, bits: int) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest value and step [C, K] of bounds [C, 2, K]."""
+    low, high = bounds.astype(np.float64).transpose(1, 0, 2)
+    return low, (high - low) / (2**bits - 1)
+
+
+def _index_bits(count: int) -> int:
+    return (count - 1).bit_length()
+
+
+def extent_of(position: np.ndarray) -> float:
+    """Longest side of the probes' box; 1 where all are in one place."""
+    return float(np.ptp(position, axis=0).max()) or 1.0
+
+
+def cell_keys(cell: np.ndarray) -> np.ndarray:
+    """One int64 for each cell [..., 3] of a grid, whose three numbers are whole, 0 to MAX_CELLS."""
+    x, y, z = np.moveaxis(cell.astype(np.int64), -1, 0)
+    return (x << 42) | (y << 21) | z
+
+
+def _cubes(position: np.ndarray, side: float) -> np.ndarray:
+    """The cube that each probe lies in, int64 [N]."""
+    return cell_keys(np.floor((position - position.min(0)) / side))
+
+
+def _members(label: np.ndarray, count: int) -> list[np.ndarray]:
+    order = np.argsort(label, kind="stable")
+    return np.split(order, np.cumsum(np.bincount(label, minlength=count))[:-1])
+
+
+def compact(label: np.ndarray) -> tuple[np.ndarray, int]:
+    """Numbers the labels in use from 0 in their order."""
+    used, compact = np.unique(label, return_inverse=True)
+    return compact.astype(np.int64), len(used)
+
+
+def _nearest(position: np.ndarray, code: np.ndarray) -> np.ndarray:
+    """The nearest of the stored centres, int64 [N]."""
+    centre = position.min(0) + code.astype(np.float64) * (extent_of(position) / _CENTRE_LEVELS)
+    return cKDTree(centre).query(position)[1].astype(np.int64)
+
+
+def _sums(values: np.ndarray, label: np.ndarray, count: int) -> np.ndarray:
+    return np.stack([np.bincount(label, column, count) for column in values.T], 1)
+
+
+def _seeds(points: np.ndarray, count: int, random: np.random.Generator) -> np.ndarray:
+    """k-means++: points drawn with the square of their distance to those drawn so far as the chance."""
+    chosen = [points[random.integers(len(points))]]
+    distance = np.square(points - chosen[0]).sum(1)
+    while len(chosen) < count and distance.sum() > 0.0:
+        chosen.append(points[random.choice(len(points), p=distance / distance.sum())])
+        distance = np.minimum(distance, np.square(points - chosen[-1]).sum(1))
+    return np.array(chosen)
+
+
+def _closest(values: np.ndarray, mean: np.ndarray, basis: np.ndarray) -> tuple[np.ndarray, float]:
+    """The subspace that reconstructs each of [N, D] best, int64 [N], and the sum of their squared errors."""
+    count, rank, width = basis.shape
+    flat = basis.reshape(count * rank, width)
+    offset = np.einsum("ckd,cd->ck", basis, mean)
+    label, total = np.empty(len(values), np.int64), 0.0
+    chunk = max(1, _CHUNK // (count * (rank + 1)))
+    for start in range(0, len(values), chunk):
+        part = values[start : start + chunk]
+        inside = (part @ flat.T).reshape(len(part), count, rank) - offset
+        away = np.square(part).sum(1)[:, None] - 2.0 * part @ mean.T + np.square(mean).sum(1)
+        error = away - np.square(inside).sum(2)
+        label[start : start + chunk] = error.argmin(1)
+        total += float(np.maximum(error.min(1), 0.0).sum())
+    return label, total

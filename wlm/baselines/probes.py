@@ -1,0 +1,494 @@
+"""What a compressed probe set is compared with: the PCA family, a moving basis, and an engine's 8-bit packing.
+
+Each function takes N probes and returns what they weigh, how long it took and what comes back out of the bytes
+(gaussian-probe-compression, sections 2.2 and 5.1). The positions are an engine's own and cost nothing here, as in
+the paper. The paper gives its rivals no bits to choose; weights of 4 or 5 bits leave room for more components and
+gain several decibels at the same size, so ``at_bytes`` tries them too. Times are wall-clock on the CPU.
+"""
+
+from __future__ import annotations
+
+import bisect
+import functools
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from wlm.baselines import probe_mbd, probe_pca
+from wlm.errors import WlmError
+
+__all__ = [
+    "PROBE_BASELINES",
+    "WEIGHT_BITS",
+    "Result",
+    "at_bytes",
+    "block_pca",
+    "clustered_pca",
+    "global_pca",
+    "moving_basis",
+    "pack_unreal",
+    "unpack_unreal",
+    "unreal_packing",
+    "window_pca",
+]
+
+# Bits of a weight that `at_bytes` tries; None for half floats. Below 4 the rounding is the larger error.
+WEIGHT_BITS = (4, 5, 6, 8, 10, None)
+# `at_bytes` stops here: more parts are slow to find, and twice as many gain little.
+MAX_PARTS = 512
+MAX_GRID = 64
+# Component counts that may follow the best so far without an improvement.
+_PATIENCE = 2
+# Rounds of the moving basis while `at_bytes` searches: the order of the settings is clear after these.
+_SEARCH_ROUNDS = 4
+_ROUNDS = 10
+# Range of coefficients 1 to 8 over the ambient one, as the engine sets it: sqrt(3) for L1, which light reaches but
+# never passes, and twice what light can reach for L2.
+_UNREAL_RANGE = np.sqrt([3.0, 3.0, 3.0, 15.0, 15.0, 20.0, 15.0, 15.0])
+# Largest finite numbers with 6, 6 and 5 bits of mantissa and half float's exponent.
+_PACKED_MAX = np.array([65024.0, 65024.0, 64512.0])
+# Bits of a half float's mantissa that R11G11B10F has no room for.
+_DROPPED = np.array([4, 4, 5], np.uint32)
+_SHIFT = np.array([0, 11, 22], np.uint32)
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """A probe set through one method.
+
+    Attributes:
+        name: The method, as in ``PROBE_BASELINES``.
+        option: Its settings, for a table.
+        decoded: float32 [N, D].
+        bytes: Length of the byte string that ``decoded`` was read from; positions are not in it.
+        encode_seconds: Wall-clock time from values to bytes.
+        decode_seconds: Wall-clock time from bytes and positions to values.
+    """
+
+    name: str
+    option: str
+    decoded: np.ndarray
+    bytes: int
+    encode_seconds: float
+    decode_seconds: float
+
+
+def global_pca(position: np.ndarray, values: np.ndarray, components: int, *, bits: int | None = None) -> Result:
+    """Principal components of all probes (GPCA).
+
+    Args:
+        position: [N, 3].
+        values: [N, D], any unit.
+        components: Basis vectors, 1 to D.
+        bits: Of a weight, 1 to 16, over the range of each component; None for half floats. Means and bases are half
+            floats always.
+
+    Raises:
+        WlmError: No probes, or NaN or infinite numbers.
+        ValueError: Wrong shapes, or a setting out of range.
+    """
+    position, values = _checked(position, values, components, bits)
+    return _pca("global_pca", "part", position, values, components, bits, lambda: (probe_pca.whole(position), ()))
+
+
+def block_pca(
+    position: np.ndarray, values: np.ndarray, components: int, blocks: int, *, bits: int | None = None
+) -> Result:
+    """Principal components of each cube of a regular grid (BPCA, Nishino et al. 2005).
+
+    Args:
+        position: [N, 3].
+        values: [N, D].
+        components: Basis vectors of a block, 1 to D.
+        blocks: The most cubes that hold a probe, at least 1. They have one size, so a few fewer come out.
+        bits: As ``global_pca``, over the range of each block and component.
+
+    Raises:
+        WlmError, ValueError: As ``global_pca``.
+    """
+    position, values = _checked(position, values, components, bits)
+    _in_range("blocks", blocks, 1)
+
+    def divide() -> tuple[probe_pca.Partition, Sequence[np.ndarray]]:
+        return probe_pca.by_blocks(position, blocks)[0], ()
+
+    return _pca("block_pca", "blocks", position, values, components, bits, divide)
+
+
+def window_pca(
+    position: np.ndarray,
+    values: np.ndarray,
+    components: int,
+    blocks: int,
+    *,
+    overlap: float = 1.0,
+    bits: int | None = None,
+) -> Result:
+    """Block PCA with the basis of a block and its surroundings (WBPCA, Nishino et al. 2005).
+
+    Neighbouring blocks then have similar bases and smaller seams, at the cost of a larger error; each probe is coded
+    once, in its own block's basis.
+
+    Args:
+        position: [N, 3].
+        values: [N, D].
+        components: Basis vectors of a block, 1 to D.
+        blocks: As ``block_pca``.
+        overlap: How far the window reaches over its block on all sides, in sides of a block, at least 0.
+        bits: As ``block_pca``.
+
+    Raises:
+        WlmError, ValueError: As ``global_pca``.
+    """
+    position, values = _checked(position, values, components, bits)
+    _in_range("blocks", blocks, 1)
+    _in_range("overlap", overlap, 0)
+
+    def divide() -> tuple[probe_pca.Partition, list[np.ndarray]]:
+        partition, side = probe_pca.by_blocks(position, blocks)
+        return partition, probe_pca.windows(position, partition, side, overlap)
+
+    return _pca("window_pca", f"blocks, overlap {overlap:g}", position, values, components, bits, divide)
+
+
+def clustered_pca(
+    position: np.ndarray,
+    values: np.ndarray,
+    components: int,
+    clusters: int,
+    seed: int = 0,
+    *,
+    signal: bool = False,
+    bits: int | None = None,
+) -> Result:
+    """Principal components of each cluster (CPCA).
+
+    Args:
+        position: [N, 3].
+        values: [N, D].
+        components: Basis vectors of a cluster, 1 to D.
+        clusters: At least 1. Fewer come out where there are fewer distinct probes, or where a cluster ends empty.
+        seed: Of the first centres.
+        signal: False clusters the positions with k-means, as gaussian-probe-compression, section 5.1, has it: the
+            centres are stored, and a probe needs no index. True puts each probe where it is reconstructed best, as
+            Sloan et al. 2003 do: an index of ceil(log2 clusters) bits a probe is stored and counted.
+        bits: As ``block_pca``.
+
+    Raises:
+        WlmError, ValueError: As ``global_pca``.
+    """
+    position, values = _checked(position, values, components, bits)
+    _in_range("clusters", clusters, 1)
+    if signal:
+        name, divide = "clustered_pca_signal", lambda: probe_pca.by_signal(values, clusters, components, seed)
+    else:
+        name, divide = "clustered_pca", lambda: probe_pca.by_place(position, clusters, seed)
+    return _pca(name, "clusters", position, values, components, bits, lambda: (divide(), ()))
+
+
+def moving_basis(
+    position: np.ndarray,
+    values: np.ndarray,
+    components: int,
+    grid: int,
+    iterations: int = _ROUNDS,
+    *,
+    bits: int | None = None,
+) -> Result:
+    """Moving basis decomposition (MBD, Silvennoinen and Sloan 2021) at free positions.
+
+    Args:
+        position: [N, 3].
+        values: [N, D].
+        components: Basis vectors at a corner of the grid, 1 to D.
+        grid: Cells along the longest side of the probes' box, 1 to 2**20.
+        iterations: Rounds of alternating least squares from the PCA of all probes, at least 0.
+        bits: As ``block_pca``, over the range of each cell and component.
+
+    Raises:
+        WlmError, ValueError: As ``global_pca``.
+    """
+    position, values = _checked(position, values, components, bits)
+    _in_range("grid", grid, 1, probe_pca.MAX_CELLS)
+    _in_range("iterations", iterations, 0)
+    return _run(
+        "moving_basis",
+        lambda payload: f"K={components}, grid {grid}, {_weights(bits)}",
+        lambda: probe_mbd.encode(position, values, components, grid, iterations, bits),
+        lambda payload: probe_mbd.decode(payload, position),
+    )
+
+
+def unreal_packing(position: np.ndarray, values: np.ndarray, bands: int | None = None) -> Result:
+    """SH as the bricks of Unreal's volumetric lightmap store it, without sky occlusion: 28 bytes a probe at L2.
+
+    The ambient colour L0 is R11G11B10F; every other coefficient is divided by it and by the range that light can
+    have, and takes 8 bits. A ratio beyond that range is clamped to it. Light that is nowhere negative stays within,
+    but for the rounding of L0; a coefficient over an ambient of zero or less decodes to zero, and an ambient above
+    65,024 (64,512 in blue) becomes that. Ambient and ratios are rounded to nearest; the ratio is that to the ambient
+    as it is decoded, which costs nothing and is closer than the engine's own ratio.
+
+    Args:
+        position: [N, 3]; only their number counts.
+        values: [N, D], D = 3, 12 or 27: SH coefficients from L00, for each its red, green and blue.
+        bands: 1 to 3, SH bands that are kept, 4, 13 or 28 bytes a probe; the rest decode to zero. None for all.
+
+    Raises:
+        WlmError: As ``global_pca``, or D is none of these.
+        ValueError: Wrong shapes, or more bands than there are.
+    """
+    position, values = _checked(position, values)
+    most = _unreal_bands(values.shape[1])
+    bands = most if bands is None else bands
+    _in_range("bands", bands, 1, most)
+    width = values.shape[1]
+    return _run(
+        "unreal",
+        lambda payload: f"L{bands - 1}",
+        lambda: pack_unreal(values, bands),
+        lambda payload: unpack_unreal(payload, width, bands),
+    )
+
+
+def pack_unreal(values: np.ndarray, bands: int) -> bytes:
+    """The bytes of ``unreal_packing``: uint32 [N] ambient colours, then uint8 [N, 3, bands² - 1] ratios."""
+    sh = np.asarray(values, np.float64).reshape(len(values), -1, 3)
+    colour = np.clip(sh[:, 0], 0.0, _PACKED_MAX)
+    step = np.exp2(np.maximum(np.frexp(colour)[1] - 1, -14) - 10.0 + _DROPPED)
+    code = (np.rint(colour / step) * step).astype(np.float16).view(np.uint16).astype(np.uint32) >> _DROPPED
+    ambient = np.bitwise_or.reduce(code << _SHIFT, axis=1).astype("<u4")
+    others = sh[:, 1 : bands**2].transpose(0, 2, 1)
+    unit = _ambient(ambient)[:, :, None] * _UNREAL_RANGE[: bands**2 - 1]
+    ratio = np.divide(others, unit, out=np.zeros_like(others), where=unit > 0.0)
+    level = np.rint((np.clip(ratio, -1.0, 1.0) * 0.5 + 0.5) * 255.0).astype(np.uint8)
+    return ambient.tobytes() + level.tobytes()
+
+
+def unpack_unreal(payload: bytes, width: int, bands: int) -> np.ndarray:
+    """Reads what ``pack_unreal`` wrote, float32 [N, D]."""
+    probes = len(payload) // (4 + 3 * (bands**2 - 1))
+    ambient = _ambient(np.frombuffer(payload, "<u4", probes))
+    level = np.frombuffer(payload, np.uint8, offset=4 * probes).reshape(probes, 3, bands**2 - 1)
+    sh = np.zeros((probes, width // 3, 3))
+    sh[:, 0] = ambient
+    others = (level / 127.5 - 1.0) * ambient[:, :, None] * _UNREAL_RANGE[: bands**2 - 1]
+    sh[:, 1 : bands**2] = others.transpose(0, 2, 1)
+    return sh.reshape(probes, width).astype(np.float32)
+
+
+def at_bytes(
+    name: str,
+    position: np.ndarray,
+    values: np.ndarray,
+    budget_bytes: int,
+    bits: Sequence[int | None] = WEIGHT_BITS,
+) -> Result:
+    """The settings of one method with the least squared error that a size allows, by a small search.
+
+    For each number of bits the component counts are tried from the largest downwards until two in a row gain
+    nothing, each with as many parts as fit, at most ``MAX_PARTS`` or ``MAX_GRID`` cells.
+
+    Args:
+        name: A key of ``PROBE_BASELINES``.
+        position: [N, 3].
+        values: [N, D].
+        budget_bytes: The largest size.
+        bits: Bits of a weight to try; ``(None,)`` keeps to half floats as gaussian-probe-compression's table has them.
+            The engine's packing has its own.
+
+    Returns:
+        The best result; its times are those of its settings alone, without the search.
+
+    Raises:
+        WlmError: Unknown name, a budget that nothing fits, or as ``global_pca``.
+        ValueError: Wrong shapes, or bits out of range.
+    """
+    if name not in PROBE_BASELINES:
+        raise WlmError(f"probes: unknown baseline {name!r}, expected one of {', '.join(PROBE_BASELINES)}")
+    for number in bits:
+        _check_bits(number)
+    position, values = _checked(position, values)
+    best = PROBE_BASELINES[name](position, values, budget_bytes, bits)
+    if best is None:
+        raise WlmError(f"probes: {name}: nothing fits into {budget_bytes} bytes for {len(values)} probes")
+    return best
+
+
+def _search(
+    values: np.ndarray,
+    bits: Sequence[int | None],
+    largest: Callable[[int, int | None], int],
+    make: Callable[[int, int, int | None], Result],
+) -> tuple[Result, tuple[int, int, int | None]] | None:
+    """``at_bytes`` for a method with components, parts and bits.
+
+    ``largest`` gives the most parts for components and bits, 0 where nothing fits; ``make`` a result for all three.
+    Returns the best result with its three settings, or None.
+    """
+    tried: list[tuple[float, Result, tuple[int, int, int | None]]] = []
+    for number in bits:
+        least, waited = np.inf, 0
+        for components in range(values.shape[1], 0, -1):
+            parts = largest(components, number)
+            if not parts:
+                continue
+            result = make(components, parts, number)
+            error = _error(values, result)
+            tried.append((error, result, (components, parts, number)))
+            waited = 0 if error < least else waited + 1
+            least = min(least, error)
+            if waited == _PATIENCE:
+                break
+    return min(tried, key=lambda one: (one[0], one[1].bytes))[1:] if tried else None
+
+
+def _pca_at(
+    kind: int,
+    make: Callable[..., Result],
+    position: np.ndarray,
+    values: np.ndarray,
+    budget: int,
+    bits: Sequence[int | None],
+) -> Result | None:
+    probes, width = values.shape
+    most = 1 if kind == probe_pca.WHOLE else min(probes, MAX_PARTS)
+
+    def largest(components: int, number: int | None) -> int:
+        size = functools.partial(probe_pca.payload_bytes, kind, probes, width, components, bits=number)
+        return bisect.bisect_right(range(1, most + 1), budget, key=lambda parts: size(count=parts))
+
+    def build(components: int, parts: int, number: int | None) -> Result:
+        divided = () if kind == probe_pca.WHOLE else (parts,)
+        return make(position, values, components, *divided, bits=number)
+
+    found = _search(values, bits, largest, build)
+    return found[0] if found else None
+
+
+def _moving_at(position: np.ndarray, values: np.ndarray, budget: int, bits: Sequence[int | None]) -> Result | None:
+    probes, width = values.shape
+    grids: list[tuple[int, int]] = []
+    while len(grids) < MAX_GRID:
+        parts = probe_mbd.grid_parts(position, len(grids) + 1)
+        # A finer grid has more corners, so none after this one would fit.
+        if parts[0] * 4 * width > budget:
+            break
+        grids.append(parts)
+
+    def largest(components: int, number: int | None) -> int:
+        size = functools.partial(probe_mbd.payload_bytes, probes, width, components, bits=number)
+        return max((g for g, parts in enumerate(grids, 1) if size(parts=parts) <= budget), default=0)
+
+    def build(components: int, grid: int, number: int | None) -> Result:
+        return moving_basis(position, values, components, grid, _SEARCH_ROUNDS, bits=number)
+
+    found = _search(values, bits, largest, build)
+    if found is None:
+        return None
+    first, (components, grid, number) = found
+    longer = moving_basis(position, values, components, grid, bits=number)
+    return min((first, longer), key=lambda result: _error(values, result))
+
+
+def _unreal_at(position: np.ndarray, values: np.ndarray, budget: int, bits: Sequence[int | None]) -> Result | None:
+    for bands in range(_unreal_bands(values.shape[1]), 0, -1):
+        if len(values) * (4 + 3 * (bands**2 - 1)) <= budget:
+            return unreal_packing(position, values, bands)
+    return None
+
+
+# By name, each as `at_bytes` calls it: positions, values, bytes, bits to try.
+PROBE_BASELINES: dict[str, Callable[[np.ndarray, np.ndarray, int, Sequence[int | None]], Result | None]] = {
+    "global_pca": functools.partial(_pca_at, probe_pca.WHOLE, global_pca),
+    "block_pca": functools.partial(_pca_at, probe_pca.BLOCKS, block_pca),
+    "window_pca": functools.partial(_pca_at, probe_pca.BLOCKS, window_pca),
+    "clustered_pca": functools.partial(_pca_at, probe_pca.PLACE, clustered_pca),
+    "clustered_pca_signal": functools.partial(_pca_at, probe_pca.SIGNAL, functools.partial(clustered_pca, signal=True)),
+    "moving_basis": _moving_at,
+    "unreal": _unreal_at,
+}
+
+
+def _pca(
+    name: str,
+    parts: str,
+    position: np.ndarray,
+    values: np.ndarray,
+    components: int,
+    bits: int | None,
+    divide: Callable[[], tuple[probe_pca.Partition, Sequence[np.ndarray]]],
+) -> Result:
+    def encode() -> bytes:
+        partition, members = divide()
+        return probe_pca.encode(values, partition, components, bits, members)
+
+    return _run(
+        name,
+        lambda payload: f"K={components}, {probe_pca.part_count(payload)} {parts}, {_weights(bits)}",
+        encode,
+        lambda payload: probe_pca.decode(payload, position),
+    )
+
+
+def _run(
+    name: str, option: Callable[[bytes], str], encode: Callable[[], bytes], decode: Callable[[bytes], np.ndarray]
+) -> Result:
+    start = time.perf_counter()
+    payload = encode()
+    middle = time.perf_counter()
+    decoded = decode(payload)
+    end = time.perf_counter()
+    return Result(name, option(payload), decoded, len(payload), middle - start, end - middle)
+
+
+def _error(values: np.ndarray, result: Result) -> float:
+    return float(np.square(result.decoded - values).sum())
+
+
+def _weights(bits: int | None) -> str:
+    return "half floats" if bits is None else f"{bits} bits"
+
+
+def _ambient(code: np.ndarray) -> np.ndarray:
+    """R11G11B10F to float64 [N, 3]."""
+    part = (code[:, None] >> _SHIFT) & ((1 << (15 - _DROPPED)) - 1)
+    return (part << _DROPPED).astype(np.uint16).view(np.float16).astype(np.float64)
+
+
+def _unreal_bands(width: int) -> int:
+    bands = {3: 1, 12: 2, 27: 3}.get(width)
+    if bands is None:
+        raise WlmError(f"probes: unreal: expected 3, 12 or 27 numbers a probe (L0, L1 or L2 in RGB), got {width}")
+    return bands
+
+
+def _checked(
+    position: np.ndarray, values: np.ndarray, components: int = 1, bits: int | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Both as float64, the values as float32 holds them."""
+    position = np.asarray(position, np.float64)
+    with np.errstate(over="ignore"):  # beyond float32 becomes infinite, and is refused as that
+        values = np.asarray(values).astype(np.float32).astype(np.float64)
+    if values.ndim != 2 or position.shape != (len(values), 3):
+        raise ValueError(f"expected positions [N, 3] and values [N, D], got {position.shape} and {values.shape}")
+    if 0 in values.shape:
+        raise WlmError(f"probes: expected at least one probe with at least one number, got {values.shape}")
+    for name, numbers in (("positions", position), ("values", values)):
+        bad = np.count_nonzero(~np.isfinite(numbers).all(1))
+        if bad:
+            raise WlmError(f"probes: the {name} of {bad} of {len(numbers)} probes are NaN or infinite")
+    _in_range("components", components, 1, values.shape[1])
+    _check_bits(bits)
+    return position, values
+
+
+def _check_bits(bits: int | None) -> None:
+    if bits is not None:
+        _in_range("bits", bits, 1, 16)
+
+
+def _in_range(name: str, value: float, low: float, high: float = np.inf) -> None:
+    if not low <= value <= high or not np.isfinite(value):
+        raise ValueError(f"expected {name} from {low} to {high}, got {value}")
