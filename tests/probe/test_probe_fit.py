@@ -1,0 +1,212 @@
+"""The fit: that it learns, repeats, resumes, prunes, and lives through hard sets."""
+
+import numpy as np
+import pytest
+from probe_sets import synthetic
+
+from wlm.errors import WlmError
+from wlm.probe.data import from_arrays
+from wlm.probe.fit import Progress, compress, open_checkpoint
+from wlm.probe.model import Profile
+from wlm.probe.start import first_gaussians, local_spread, morton_order
+from wlm.probe.trainer import Trainer
+
+SMALL = Profile(name="small", ratio=0.1, latent=3, hidden=16, steps=60)
+RANDOM = np.random.default_rng(7)
+
+
+def psnr(model, probes):
+    from wlm.probe.decode import Decoder
+
+    decoded = Decoder(model).decode_probes(probes.position).astype(np.float64)
+    assert np.isfinite(decoded).all()
+    peak = float(np.ptp(probes.values))
+    return 10 * np.log10(peak**2 / np.mean((decoded - probes.values) ** 2))
+
+
+def arrays(model):
+    return [getattr(model, key) for key in ("centre", "code", "bounds", "net")]
+
+
+def test_it_learns_and_says_how_well():
+    probes = synthetic(300)
+    seen: list[Progress] = []
+    model = compress(probes, SMALL.model_copy(update={"steps": 600}), progress=seen.append)
+    flat = 10 * np.log10(np.ptp(probes.values) ** 2 / np.mean((probes.values - probes.values.mean(0)) ** 2))
+    assert psnr(model, probes) > flat + 8
+    assert seen[-1].step == seen[-1].steps == 600
+    # The last report is of the model before its network is rounded to half floats.
+    assert seen[-1].psnr == pytest.approx(psnr(model, probes), abs=0.1)
+
+
+def test_one_seed_gives_one_result():
+    probes = synthetic(130, dead=9)
+    first, second = compress(probes, SMALL, seed=3), compress(probes, SMALL, seed=3)
+    assert all(np.array_equal(a, b) for a, b in zip(arrays(first), arrays(second), strict=True))
+    other = compress(probes, SMALL, seed=4)
+    assert not np.array_equal(first.net, other.net)
+
+
+@pytest.mark.parametrize("stop", [20, 52, 58])  # in each of the stages, which begin at 0, 50 and 55
+def test_a_stopped_fit_goes_on_exactly(tmp_path, stop):
+    probes = synthetic(130)
+    whole = compress(probes, SMALL)
+    trainer = Trainer(*_input(probes), SMALL, 0, "cpu")
+    trainer.run(stop)
+    checkpoint = open_checkpoint(tmp_path / "a.wlm", probes, SMALL)
+    checkpoint.save_running(0, trainer.state())
+    trainer.close()
+    again = compress(probes, SMALL, checkpoint=open_checkpoint(tmp_path / "a.wlm", probes, SMALL, resume=True))
+    assert all(np.array_equal(a, b) for a, b in zip(arrays(whole), arrays(again), strict=True))
+
+
+def test_an_interrupt_is_kept(tmp_path):
+    probes = synthetic(130)
+    checkpoint = open_checkpoint(tmp_path / "a.wlm", probes, SMALL)
+
+    def stop(now):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        compress(probes, SMALL, progress=stop, checkpoint=checkpoint)
+    with pytest.raises(WlmError, match="seed"):
+        open_checkpoint(tmp_path / "a.wlm", probes, SMALL, seed=1, resume=True)
+    kept = open_checkpoint(tmp_path / "a.wlm", probes, SMALL, resume=True)
+    assert kept.running(0)["control"][0] == 60  # a short fit reports at its end
+
+
+def _input(probes):
+    from wlm.probe.fit import _frame
+
+    origin, extent, _ = _frame(probes.position)
+    x = ((probes.position - origin) / extent).astype(np.float32)
+    return x[probes.live], probes.values[probes.live]
+
+
+def hard(kind):
+    values = RANDOM.normal(size=(40, 27)).astype(np.float32)
+    position = RANDOM.random((40, 3)) * 4
+    if kind == "one probe":
+        return position[:1], values[:1]
+    if kind == "two probes":
+        return position[:2], values[:2]
+    if kind == "coincident":
+        return np.repeat(position[:1], 40, 0), values
+    if kind == "pairs":
+        return np.repeat(position[:20], 2, 0), values
+    if kind == "a plane":
+        return position * [1, 0, 1], values
+    if kind == "a line":
+        return position * [1, 0, 0] + 5, values
+    if kind == "far away":
+        return position + 1e6, values
+    if kind == "very far":
+        return position * 1e9, values
+    if kind == "tiny":
+        return position * 1e-6, values
+    if kind == "constant":
+        return position, np.full((40, 27), 0.25, np.float32)
+    if kind == "one constant channel":
+        values[:, 5] = 3.0
+        return position, values
+    if kind == "huge values":
+        return position, values * np.float32(1e17)
+    if kind == "tiny values":
+        return position, values * np.float32(1e-20)
+    if kind == "one number":
+        return position, values[:, :1]
+    if kind == "most dead":
+        values[3:] = 0
+        return position, values
+    if kind == "NaN":
+        values[7, 3] = np.nan
+        return position, values
+    raise AssertionError(kind)
+
+
+KINDS = [
+    "one probe",
+    "two probes",
+    "coincident",
+    "pairs",
+    "a plane",
+    "a line",
+    "far away",
+    "very far",
+    "tiny",
+    "constant",
+    "one constant channel",
+    "huge values",
+    "tiny values",
+    "one number",
+    "most dead",
+    "NaN",
+]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_hard_sets(kind, tmp_path):
+    from wlm.probe import codec
+    from wlm.probe.decode import Decoder
+
+    position, values = hard(kind)
+    probes = from_arrays(position, values)
+    profile = SMALL.model_copy(update={"steps": 240, "ratio": 0.5})
+    codec.write(tmp_path / "a.wlm", compress(probes, profile, positions=True))
+    model = codec.read(tmp_path / "a.wlm")
+    decoded = Decoder(model).decode_probes(probes.position)
+    assert decoded.shape == probes.values.shape and np.isfinite(decoded).all()
+    assert (decoded[~probes.live] == 0).all()
+    live = probes.values[probes.live].astype(np.float64)
+    error = np.sqrt(np.mean((decoded[probes.live] - live) ** 2))
+    # Half floats are 1e-3 off at most; but for them no fit may be worse than the mean.
+    mean = np.sqrt(np.mean((live - live.mean(0)) ** 2))
+    assert error <= mean * 1.05 + 2e-3 * np.abs(live).max()
+    if kind == "coincident":
+        assert np.ptp(decoded, axis=0).max() == 0
+    np.testing.assert_allclose(Decoder(model).decode_probes(), decoded, rtol=0, atol=0.3 * np.abs(live).max())
+
+
+def test_more_gaussians_than_places_are_not_made():
+    probes = from_arrays(np.repeat(RANDOM.random((6, 3)), 5, 0), RANDOM.normal(size=(30, 3)).astype(np.float32))
+    model = compress(probes, SMALL.model_copy(update={"ratio": 1.0}))
+    assert model.count + model.dropped == 6
+
+
+def test_useless_gaussians_are_dropped_within_the_bound():
+    probes = synthetic(200)
+    profile = SMALL.model_copy(update={"steps": 300, "ratio": 0.3, "prune": 0.03})
+    x, values = _input(probes)
+    trainer = Trainer(x, values, profile, 0, "cpu")
+    try:
+        trainer.run(profile.steps)
+        dropped = int((~trainer.kept).sum())
+        # The trainer measured the change itself; here the features are summed by other kernels.
+        assert dropped > 0 and 0 < trainer.dropped_change <= 0.03 * np.ptp(values) * 1.2
+    finally:
+        trainer.close()
+    model = compress(probes, profile)
+    assert model.dropped == dropped and model.count == 60 - dropped
+    # Nothing but what no probe feels goes where nothing may change.
+    assert compress(probes, profile.model_copy(update={"prune": 0.0})).dropped < dropped
+
+
+def test_a_fit_that_diverges_is_an_error(monkeypatch):
+    monkeypatch.setattr(Trainer, "mse", lambda self: float("nan"))
+    with pytest.raises(WlmError, match="room: the fit diverged; expected smaller rates"):
+        compress(synthetic(60), SMALL)
+
+
+def test_first_places():
+    x = RANDOM.random((500, 3)).astype(np.float32)
+    values = np.where(x[:, :1] > 0.8, RANDOM.normal(size=(500, 3)), 0.5)
+    order = morton_order(x)
+    assert sorted(order) == list(range(500))
+    steps = np.linalg.norm(np.diff(x[order], axis=0), axis=1).mean()
+    assert steps < 0.5 * np.linalg.norm(np.diff(x, axis=0), axis=1).mean()
+    spread = local_spread(x, values)
+    assert spread[x[:, 0] > 0.9].mean() > 5 * spread[x[:, 0] < 0.5].mean()
+    plain, scale = first_gaussians(x, values, 50, 0.0, 1.0, np.random.default_rng(0))
+    keen, _ = first_gaussians(x, values, 50, 1.0, 1.0, np.random.default_rng(0))
+    assert plain.shape == keen.shape == (50, 3) and (scale > 0).all()
+    assert (keen[:, 0] > 0.75).sum() > 1.5 * (plain[:, 0] > 0.75).sum()

@@ -1,0 +1,187 @@
+"""The runtime path: light at points from a compressed model (gaussian-probe-compression, eq. 5 to 7, section 5.3.2)."""
+
+from typing import Literal
+
+import numpy as np
+import warp as wp
+
+from wlm import interop
+from wlm.errors import WlmError
+from wlm.probe.model import ProbeModel
+from wlm.probe.start import morton_order
+from wlm_kernels import gaussian_cubes, probe_network
+from wlm_kernels.gaussians import Shape
+from wlm_kernels.probe_decode import decode_kernels
+from wlm_kernels.probe_step import step_kernels
+
+__all__ = ["CULLINGS", "Decoder", "Points"]
+
+Culling = Literal["box", "sphere", "exact", "none"]
+CULLINGS = ("exact", "box", "sphere", "none")
+"""How the Gaussians of a cube are found; see ``Decoder``."""
+
+
+class Points:
+    """Points on a device, in the order in which decoding them is quickest.
+
+    Attributes:
+        x: vec3 [M], normalised, along a Z-curve.
+        order: int [M], the place that each had.
+        out: float [M, D], filled by ``Decoder.run``.
+    """
+
+    def __init__(self, position: np.ndarray, model: ProbeModel, device: str):
+        x = model.normalise(position)
+        self.order = morton_order(x)
+        self.x = wp.array(x[self.order], dtype=wp.vec3, device=device)
+        self.out = wp.zeros((len(x), model.outputs), dtype=float, device=device)
+
+    def values(self) -> np.ndarray:
+        """What was decoded, float32 [M, D], in the points' own order."""
+        result = np.empty(self.out.shape, np.float32)
+        result[self.order] = self.out.numpy()
+        return result
+
+
+class Decoder:
+    """A model on a device.
+
+    The lists of Gaussians by cube are made once, here. All ways to make them give the same values but for rounding,
+    for what a Gaussian reaches is tested again at each point; they differ in how many Gaussians a list has in vain.
+
+    Attributes:
+        model, device: As given.
+        pairs: Entries in all lists.
+    """
+
+    def __init__(
+        self,
+        model: ProbeModel,
+        device: str = "cpu",
+        *,
+        culling: Culling = "exact",
+        cut: float | None = None,
+        support: Literal["ellipsoid", "sphere"] | None = None,
+        cube: float | None = None,
+    ):
+        """Loads a model.
+
+        Args:
+            model: The model.
+            device: "cpu" or "cuda:0".
+            culling: Which cubes list a Gaussian: those that its ellipsoid meets ("exact"), that the box round it
+                meets ("box"), that the sphere of its longest axis meets ("sphere", the paper's); "none": one list of
+                all.
+            cut, support: Where a Gaussian ends; None: where the fit took it to end. Others cost accuracy.
+            cube: Side of a cube, normalised; None: chosen from the Gaussians' sizes.
+
+        Raises:
+            WlmError: No such device.
+        """
+        self.model, self.device = model, interop.check_device(device)
+        kind = "cpu" if self.device == "cpu" else "cuda"
+        p, count = model.profile, model.count
+        self._cut = p.cut if cut is None else cut
+        sphere = (p.support if support is None else support) == "sphere"
+        if sphere and culling != "none":
+            # What is reached is a sphere; the box round it is no smaller, and its ellipsoid would lose some of it.
+            culling = "sphere"
+        rows = model.rows()
+        self._rows = wp.array(rows, dtype=float, device=self.device)
+        self._shapes = wp.zeros(count, dtype=Shape, device=self.device)
+        unused = wp.zeros_like(self._rows)
+        step_kernels(p.latent, kind).shapes(
+            self._rows,
+            wp.zeros((2, rows.shape[1]), dtype=float, device=self.device),
+            0,
+            wp.zeros(rows.shape[1], dtype=float, device=self.device),
+            self._cut,
+            int(sphere),
+            unused,
+            self._shapes,
+        )
+        low, high = np.zeros(3, np.float32), model.size.astype(np.float32)
+        if culling == "none":
+            self._cubes = gaussian_cubes.everything(count, self.device)
+        else:
+            self._cubes = gaussian_cubes.build(self._shapes, low, high, cube, test=culling)
+        self.pairs = self._cubes.item.shape[0]
+        self._net = wp.array(self._padded_net(), dtype=float, device=self.device)
+        self._kernels = decode_kernels(p.latent, p.hidden, model.outputs, kind)
+
+    def _padded_net(self) -> np.ndarray:
+        """The network as the kernels take it: float32, rows of the last layer padded."""
+        p, d = self.model.profile, self.model.outputs
+        before = (p.latent + 4) * p.hidden + (p.hidden + 1) * p.hidden
+        third = np.zeros((p.hidden + 1, probe_network.padded(d)), np.float32)
+        third[:, :d] = self.model.net[before:].reshape(p.hidden + 1, d)
+        return np.concatenate([self.model.net[:before].astype(np.float32), third.ravel()])
+
+    @property
+    def device_bytes(self) -> int:
+        """Memory that the model takes on the device."""
+        arrays = (self._rows, self._shapes, self._net, self._cubes.start, self._cubes.item)
+        return sum(array.size * wp.types.type_size_in_bytes(array.dtype) for array in arrays)
+
+    def points(self, position: np.ndarray) -> Points:
+        """Puts points on the device, to be decoded often.
+
+        Args:
+            position: [M, 3], in the unit of the probes' positions; those outside the probes' box are moved to its
+                nearest point.
+
+        Raises:
+            WlmError: A position that isn't finite.
+            ValueError: Another shape.
+        """
+        position = np.asarray(position, np.float64)
+        if position.ndim != 2 or position.shape[1] != 3:
+            raise ValueError(f"position: expected [M, 3], got {position.shape}")
+        bad = np.flatnonzero(~np.isfinite(position).all(1))
+        if len(bad):
+            raise WlmError(f"position {bad[0]}: expected finite numbers, got {position[bad[0]].tolist()}")
+        return Points(position, self.model, self.device)
+
+    def run(self, points: Points) -> None:
+        """Decodes points where they lie; on CUDA it is queued, not awaited."""
+        if points.x.shape[0]:
+            self._kernels.launch(
+                self._rows,
+                self._shapes,
+                self._cubes,
+                self._cut,
+                self._net,
+                self.model.gain,
+                points.x,
+                points.out,
+            )
+
+    def decode(self, position: np.ndarray) -> np.ndarray:
+        """Light at any points, float32 [M, D]; arguments and errors are those of ``points``."""
+        points = self.points(position)
+        self.run(points)
+        return points.values()
+
+    def decode_probes(self, position: np.ndarray | None = None) -> np.ndarray:
+        """The model's own probes.
+
+        Args:
+            position: [N, 3], as they were compressed and in that order; None: those stored with the model.
+
+        Returns:
+            float32 [N, D], zero where a probe is dead.
+
+        Raises:
+            WlmError: Another number of positions, or none stored.
+        """
+        model = self.model
+        if position is None:
+            if not len(model.positions):
+                raise WlmError(f"{model.name}: the model has no positions stored; expected them to be given")
+            position = model.stored_positions()
+        if len(position) != model.probes:
+            raise WlmError(f"{model.name}: expected the positions of {model.probes} probes, got {len(position)}")
+        values = self.decode(position)
+        if len(model.dead):
+            values[model.dead] = 0.0
+        return values

@@ -1,0 +1,157 @@
+"""Fitting a probe set: from checked input to a compressed model (gaussian-probe-compression, section 3.2 and 3.3)."""
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from wlm import interop
+from wlm.errors import WlmError
+from wlm.formats.checkpoint import Checkpoint
+from wlm.probe.codec import SYSTEM
+from wlm.probe.data import ProbeSet
+from wlm.probe.model import ProbeModel, Profile
+from wlm.probe.trainer import Trainer
+
+__all__ = ["Progress", "compress", "open_checkpoint"]
+
+REPORT_EVERY = 0.5  # seconds between two reports
+_CHUNK = {"cpu": 5, "cuda": 500}  # steps between two looks at the clock
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where a fit is.
+
+    Attributes:
+        step, steps: Done and in all.
+        psnr: dB, over all numbers of all probes, their range as the peak; NaN where the range is zero.
+        seconds: So far.
+    """
+
+    step: int
+    steps: int
+    psnr: float
+    seconds: float
+
+
+def open_checkpoint(output, probes: ProbeSet, profile: Profile, *, seed=0, device="cpu", resume=False) -> Checkpoint:
+    """Opens the checkpoint of a fit, the file ``OUTPUT.partial``; the arguments are those of ``compress``.
+
+    Args:
+        output: The file that the fit is for.
+        probes, profile, seed: What the fit depends on.
+        device: Only its kind matters: a fit may go on on another GPU.
+        resume: Whether to go on from the file, if there is one.
+
+    Raises:
+        WlmError: With ``resume``: the file is damaged, or of another fit; the line names what differs.
+    """
+    fit = {
+        "input": probes.source,
+        "profile": profile.model_dump(mode="json"),
+        "seed": int(seed),
+        "device": "cpu" if device == "cpu" else "cuda",
+    }
+    return Checkpoint(output, SYSTEM, fit, probes.source, resume=resume)
+
+
+def compress(
+    probes: ProbeSet,
+    profile: Profile,
+    *,
+    seed: int = 0,
+    device: str = "cpu",
+    progress: Callable[[Progress], None] | None = None,
+    checkpoint: Checkpoint | None = None,
+    positions: bool = False,
+) -> ProbeModel:
+    """Compresses a probe set.
+
+    Dead probes take no part: the model has a bit for each, if there are any.
+
+    Args:
+        probes: The set.
+        profile: The settings.
+        seed: One seed gives one result on one device.
+        device: "cpu" or "cuda:0".
+        progress: Called about twice a second.
+        checkpoint: From ``open_checkpoint``, or None: where an interrupted fit is kept and resumed.
+        positions: Whether the model carries the probes' positions, 16 bits an axis; an engine has them anyway.
+
+    Returns:
+        The model, ready for ``wlm.probe.codec.write``.
+
+    Raises:
+        WlmError: On a device that isn't there, or a fit that diverged.
+        KeyboardInterrupt: Raised by ``progress``, after the checkpoint, if there is one, has been written.
+    """
+    device = interop.check_device(device)
+    origin, extent, size = _frame(probes.position)
+    x = ((probes.position - origin) / extent).astype(np.float32)
+    trainer = Trainer(x[probes.live], probes.values[probes.live], profile, seed, device)
+    try:
+        if checkpoint is not None and (state := checkpoint.running(0)) is not None:
+            trainer.load(state)
+        _run(trainer, probes, profile, device, progress, checkpoint)
+        trainer.finish()
+        mse = trainer.mse()
+        parts = trainer.quantised()
+    finally:
+        trainer.close()
+    if not (math.isfinite(mse) and all(np.isfinite(part).all() for part in parts.values())):
+        raise WlmError(f"{probes.name}: the fit diverged; expected smaller rates than those of {profile.name}")
+    stored = np.zeros((0, 3), np.uint16)
+    if positions:
+        stored = np.rint((probes.position - origin) / extent / np.where(size > 0, size, 1.0) * 65535.0)
+        stored = np.clip(stored, 0, 65535).astype(np.uint16)
+    return ProbeModel(
+        name=probes.name,
+        source=probes.source,
+        profile=profile,
+        probes=probes.probes,
+        outputs=probes.outputs,
+        origin=origin,
+        extent=extent,
+        size=size,
+        dead=np.zeros(0, bool) if probes.live.all() else ~probes.live,
+        positions=stored,
+        dropped=int((~trainer.kept).sum()),
+        **parts,
+    )
+
+
+def _frame(position: np.ndarray) -> tuple[np.ndarray, float, np.ndarray]:
+    """Origin, extent and normalised size of the probes' box."""
+    low, high = position.min(0), position.max(0)
+    extent = float((high - low).max())
+    if not extent > 0:
+        # One probe, or all at one place: any unit will do.
+        extent = 1.0
+    return low, extent, np.minimum((high - low) / extent, 1.0)
+
+
+def _run(trainer: Trainer, probes: ProbeSet, profile: Profile, device: str, progress, checkpoint) -> None:
+    start = last = time.perf_counter()
+    peak = float(probes.values.max()) - float(probes.values.min())
+    # Dead probes decode exactly, and count.
+    share = probes.live.mean()
+    step = trainer.step
+    while step < profile.steps:
+        count = min(_CHUNK["cpu" if device == "cpu" else "cuda"], profile.steps - step)
+        trainer.run(count)
+        step += count
+        now = time.perf_counter()
+        if progress is None or (now - last < REPORT_EVERY and step < profile.steps):
+            continue
+        last = now
+        mse = trainer.mse() * share
+        psnr = 10 * math.log10(peak * peak / mse) if peak > 0 and mse > 0 else math.nan
+        try:
+            progress(Progress(step, profile.steps, psnr, now - start))
+        except KeyboardInterrupt:
+            if checkpoint is not None:
+                checkpoint.save_running(0, trainer.state())
+            raise

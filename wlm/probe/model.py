@@ -1,0 +1,207 @@
+"""The model of a probe set: its settings and its arrays, as stored and as used.
+
+The light at a position p is a small network of the Gaussians' sum and the position (gaussian-probe-compression,
+eq. 2 to 7):
+
+    x = (p - origin) / extent                        in [0, 1]^3
+    F(x) = sum_j F_j exp(-d_j^2 / 2),  d_j = |S_j^-1 R_j^T (x - mu_j)|,  over the Gaussians j that reach x
+    sh(p) = gain * MLP([F(x), x])
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from wlm.config import load_settings, profile_path
+
+__all__ = [
+    "CENTRE",
+    "CENTRE_BITS",
+    "LATENT",
+    "ROTATION",
+    "SCALE",
+    "Gaussians",
+    "ProbeModel",
+    "Profile",
+    "load_profile",
+    "network_size",
+]
+
+# Channels of a Gaussian, in the order of ``ProbeModel.bounds``; the last three groups share ``Profile.bits``.
+CENTRE = slice(0, 3)
+SCALE = slice(3, 6)
+ROTATION = slice(6, 10)
+LATENT = slice(10, None)
+CENTRE_BITS = 16
+
+
+class Profile(BaseModel):
+    """Settings of a fit.
+
+    Attributes:
+        name: Shown in reports.
+        ratio: Gaussians as a share of the live probes.
+        bits: Bits of each number of a Gaussian's scale, rotation and latent.
+        latent: Numbers in a Gaussian's latent.
+        hidden: Width of both hidden layers.
+        support: What a Gaussian reaches: its own "ellipsoid" out to ``cut``, or the "sphere" of its longest axis
+            (eq. 6).
+        cut: How far it reaches, in standard deviations.
+        optimiser: Of the Gaussians: "adam" or "adan". The network's is Adam.
+        steps: Of the whole fit.
+        centre_rate, scale_rate, rotation_rate, latent_rate, net_rate: First learning rates; centres and the log of
+            the scales in the normalised frame.
+        final_rate: All rates end here, on half a cosine, as a share of the first.
+        detail: The first centres are drawn from the probes with odds of their local spread to this power, so that
+            Gaussians begin where the light varies; 0: from all alike, as k-means does.
+        first_scale: The first scales, as a share of the distance to the nearest other centre.
+        first_latent: Spread of the first latents.
+        gain: Of the first weights of the network, over those of a uniform draw of variance 1 / (3 inputs).
+        quantise_from: Share of the steps after which the Gaussians are used on the levels of the file (section 3.3).
+        freeze_from: Share of the steps after which they stand still and the network alone is tuned.
+        prune: Bound on what dropping useless Gaussians may change, as a share of the range of the probes' numbers.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    name: str
+    ratio: float = Field(0.05, gt=0.0, le=1.0)
+    bits: int = Field(10, ge=4, le=16)
+    latent: int = Field(9, ge=1, le=32)
+    hidden: int = Field(64, ge=8, le=128, multiple_of=8)
+    support: Literal["ellipsoid", "sphere"] = "ellipsoid"
+    cut: float = Field(3.0, ge=1.0, le=6.0)
+    optimiser: Literal["adam", "adan"] = "adam"
+    steps: int = Field(12000, ge=10)
+    centre_rate: float = Field(1e-3, gt=0.0, lt=1.0)
+    scale_rate: float = Field(1e-2, gt=0.0, lt=1.0)
+    rotation_rate: float = Field(1e-2, gt=0.0, lt=1.0)
+    latent_rate: float = Field(3e-2, gt=0.0, lt=1.0)
+    net_rate: float = Field(2e-2, gt=0.0, lt=1.0)
+    final_rate: float = Field(1e-3, ge=0.0, le=1.0)
+    detail: float = Field(1.0, ge=0.0, le=4.0)
+    first_scale: float = Field(0.7, gt=0.0, le=4.0)
+    first_latent: float = Field(0.1, gt=0.0, le=4.0)
+    gain: float = Field(3.0, gt=0.0, le=10.0)
+    quantise_from: float = Field(5 / 6, ge=0.0, le=1.0)
+    freeze_from: float = Field(11 / 12, ge=0.0, le=1.0)
+    prune: float = Field(1e-4, ge=0.0, le=0.1)
+
+    @model_validator(mode="after")
+    def _stages_in_order(self) -> "Profile":
+        if self.quantise_from > self.freeze_from:
+            raise ValueError("quantise_from must not be later than freeze_from")
+        return self
+
+    def gaussian_bits(self) -> int:
+        """Bits of one Gaussian in the file."""
+        return 3 * CENTRE_BITS + (7 + self.latent) * self.bits
+
+
+def load_profile(name: str) -> Profile:
+    """Loads ``configs/probe-NAME.yaml``, or a YAML file of one's own.
+
+    Raises:
+        WlmError: Unknown profile, unreadable file, or a wrong setting.
+    """
+    path = name if name.endswith((".yaml", ".yml")) else profile_path("probe", name)
+    return load_settings(Profile, path)
+
+
+def network_size(latent: int, hidden: int, outputs: int) -> int:
+    """Scalars in the network: latent + 3 inputs, two hidden layers, ``outputs`` outputs."""
+    return (latent + 3 + 1) * hidden + (hidden + 1) * hidden + (hidden + 1) * outputs
+
+
+@dataclass(frozen=True, eq=False)
+class Gaussians:
+    """Gaussians in the normalised frame, as the kernels take them.
+
+    Attributes:
+        centre: float32 [K, 3].
+        scale: float32 [K, 3], standard deviations along the Gaussian's own axes, positive.
+        rotation: float32 [K, 4], quaternions w, x, y, z of any length; one of length zero stands for no rotation.
+        latent: float32 [K, L].
+    """
+
+    centre: np.ndarray
+    scale: np.ndarray
+    rotation: np.ndarray
+    latent: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class ProbeModel:
+    """A compressed probe set; N probes of D numbers, K Gaussians with latents of L.
+
+    Attributes:
+        name: The set's name.
+        source: Hash of the input.
+        profile: The settings.
+        probes: N.
+        outputs: D, 27 for L2 in RGB.
+        origin: float64 [3], in the unit of the positions.
+        extent: Of the box of the probes along its longest axis; positive.
+        size: float64 [3], of the box of the probes, normalised: each in [0, 1].
+        gain: Factor behind the network.
+        centre: uint16 [K, 3].
+        code: uint16 [K, 7 + L], below 2 ** bits: log of the scale, rotation, latent.
+        bounds: float32 [2, 10 + L], lowest and highest value of each channel.
+        net: float16 [P], the network: for each layer a row of weights for every input, then the biases.
+        dead: bool [N], probes that decode to zero: all their numbers are, or they were none. Empty if there are none.
+        positions: uint16 [N, 3] over the box, where they are stored with the model; else empty.
+        dropped: Gaussians that no probe felt and that are not stored.
+    """
+
+    name: str
+    source: str
+    profile: Profile
+    probes: int
+    outputs: int
+    origin: np.ndarray
+    extent: float
+    size: np.ndarray
+    gain: float
+    centre: np.ndarray
+    code: np.ndarray
+    bounds: np.ndarray
+    net: np.ndarray
+    dead: np.ndarray
+    positions: np.ndarray
+    dropped: int
+
+    @property
+    def count(self) -> int:
+        """K, Gaussians that are stored."""
+        return len(self.centre)
+
+    def normalise(self, position: np.ndarray) -> np.ndarray:
+        """Positions in the normalised frame, moved to the nearest point of the probes' box.
+
+        Args:
+            position: [M, 3], in the unit of the probes' positions.
+
+        Returns:
+            float32 [M, 3]. The difference is taken in float64, so that a box far from the origin loses nothing.
+        """
+        x = (np.asarray(position, np.float64) - self.origin) / self.extent
+        return np.clip(x, 0.0, self.size).astype(np.float32)
+
+    def stored_positions(self) -> np.ndarray:
+        """The positions stored with the model, float64 [N, 3], to 1/65535 of the box."""
+        return self.origin + self.extent * self.size * (self.positions / 65535.0)
+
+    def rows(self) -> np.ndarray:
+        """The Gaussians' numbers restored from their codes (eq. 14), float32 [K, 10 + L]; scales as logarithms."""
+        low, high = self.bounds
+        levels = np.full(len(low), 2**self.profile.bits - 1, np.float32)
+        levels[CENTRE] = 2**CENTRE_BITS - 1
+        whole = np.concatenate([self.centre, self.code], 1).astype(np.float32)
+        return low + whole * ((high - low) / levels)
+
+    def gaussians(self) -> Gaussians:
+        """The Gaussians as decoding uses them."""
+        rows = self.rows()
+        return Gaussians(rows[:, CENTRE], np.exp(rows[:, SCALE]), rows[:, ROTATION], rows[:, LATENT].copy())

@@ -1,0 +1,361 @@
+"""The training of Gaussians and network on a device (gaussian-probe-compression, section 3.2 and 3.3)."""
+
+import math
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import torch
+import warp as wp
+
+from wlm import interop
+from wlm.probe.model import CENTRE, CENTRE_BITS, LATENT, ROTATION, SCALE, Profile
+from wlm.probe.start import first_gaussians, morton_order
+from wlm_kernels import probe_network, probe_step
+from wlm_kernels.gaussians import SHAPE_NUMBERS, Shape
+from wlm_kernels.probe_network import CPU_LANES
+from wlm_kernels.probe_optimiser import Optimiser
+from wlm_kernels.probe_step import GROUP
+
+__all__ = ["Trainer"]
+
+_STATE = ("rows", "net", "moments", "net_moments", "bounds", "control", "loss")
+_BOX_MARGIN = 1e-6  # of the unit cube: rounding must not lose a probe at the edge of its group's box
+
+
+class Trainer:
+    """A fit under way.
+
+    A step runs over all probes (eq. 8). There are three stages: the Gaussians are free, then used on the levels of
+    the file, then fixed, with the network alone going on.
+
+    Attributes:
+        count: K, Gaussians.
+        kept: bool [K], false where a Gaussian is useless, known from the last stage on.
+        dropped_change: Largest change of a probe's number by leaving those out.
+    """
+
+    def __init__(self, x: np.ndarray, values: np.ndarray, profile: Profile, seed: int, device: str):
+        """Begins a fit.
+
+        Args:
+            x: float32 [N, 3], normalised positions of the live probes.
+            values: float32 [N, D].
+            profile: The settings.
+            seed: One seed gives one result on one device.
+            device: "cpu" or "cuda:0".
+        """
+        self.profile, self.device = profile, device
+        self._cuda = device != "cpu"
+        kind = "cuda" if self._cuda else "cpu"
+        self._step_kernels = probe_step.step_kernels(profile.latent, kind)
+        self._network = probe_network.network_kernels(profile.latent, profile.hidden, values.shape[1], kind)
+        random = np.random.default_rng(seed)
+        order = morton_order(x)
+        x, values = x[order], values[order]
+        self._probes, self._outputs = values.shape
+        self._upload(x, values)
+        self._allocate(*self._first(x, values, random))
+        self._optimiser = self._settings()
+        self.kept = np.ones(self.count, bool)
+        self.dropped_change = 0.0
+        self._pool = None if self._cuda else ThreadPoolExecutor(CPU_LANES)
+        self._stages = [interop.StepGraph(lambda stage=s: self._step(stage), device, warmup=1) for s in range(3)]
+        self._entered = 0
+        # Before two threads launch: loading a module is not for two at once.
+        self._step_kernels.load(device)
+        self._network.load(device)
+
+    def _upload(self, x: np.ndarray, values: np.ndarray) -> None:
+        n, d = values.shape
+        padded = -(-n // GROUP) * GROUP
+        boxes = np.concatenate([x, np.repeat(x[-1:], padded - n, 0)]).astype(np.float32)
+        groups = boxes.reshape(-1, GROUP, 3)
+        low, high = groups.min(1), groups.max(1)
+        self._groups = probe_step.Groups()
+        self._groups.x = self._put(boxes, wp.vec3)
+        self._groups.middle = self._put((low + high) / 2, wp.vec3)
+        self._groups.half = self._put((high - low) / 2 + _BOX_MARGIN, wp.vec3)
+        self._groups.count = n
+        exact = values.astype(np.float64)
+        self.mean, self.spread = exact.mean(0), exact.std(0)
+        spread = self.spread
+        target = np.zeros((d, padded), np.float32)
+        # A channel that never changes is its mean: nothing to learn, and nothing is made of what the network says.
+        target[:, :n] = np.divide(exact - self.mean, spread, out=np.zeros_like(exact), where=spread > 0).T
+        self._target = self._put(target, float)
+        # The squared error of the numbers themselves, in units of the most varied channel's variance.
+        self._unit = float(max(spread.max() ** 2, np.finfo(np.float64).tiny))
+        self._weight = self._put(spread**2 / self._unit / (n * d), float)
+
+    def _first(self, x: np.ndarray, values: np.ndarray, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        """The first Gaussians and network."""
+        p = self.profile
+        wanted = max(1, round(p.ratio * len(x)))
+        centre, scale = first_gaussians(x, values, wanted, p.detail, p.first_scale, random)
+        rows = np.zeros((len(centre), LATENT.start + p.latent), np.float32)
+        rows[:, CENTRE] = centre
+        rows[:, SCALE] = np.log(scale)[:, None]
+        rows[:, ROTATION.start] = 1.0
+        rows[:, LATENT] = random.normal(size=(len(centre), p.latent)) * p.first_latent
+        inputs, hidden, wide = p.latent + 3, p.hidden, probe_network.padded(self._outputs)
+        first = random.uniform(-1, 1, (inputs + 1, hidden)) * p.gain / math.sqrt(inputs)
+        first[inputs] /= p.gain
+        first[inputs] -= x.mean(0) @ first[p.latent : inputs]
+        second = np.zeros((hidden + 1, hidden))
+        second[:hidden] = random.uniform(-1, 1, (hidden, hidden)) * p.gain / math.sqrt(hidden)
+        third = np.zeros((hidden + 1, wide))
+        third[:hidden, : self._outputs] = random.uniform(-1, 1, (hidden, self._outputs)) / math.sqrt(hidden)
+        # A sigmoid is 1/2 on average, and a layer's inputs should be 0 on average.
+        second[hidden] = -0.5 * second[:hidden].sum(0)
+        third[hidden] = -0.5 * third[:hidden].sum(0)
+        return rows, np.concatenate([first.ravel(), second.ravel(), third.ravel()]).astype(np.float32)
+
+    def _allocate(self, rows: np.ndarray, net: np.ndarray) -> None:
+        count, channels = rows.shape
+        padded = self._groups.x.shape[0]
+        groups, parts = padded // GROUP, self._network.parts(padded)
+        latent = self.profile.latent
+
+        def zeros(*shape: int) -> torch.Tensor:
+            return torch.zeros(shape, device=self.device)
+
+        self.count = count
+        self._tensors = {
+            "rows": torch.from_numpy(rows).to(self.device),
+            "net": torch.from_numpy(net).to(self.device),
+            "moments": zeros(4, count, channels),
+            "net_moments": zeros(2, len(net)),
+            "bounds": zeros(2, channels),
+            "control": torch.zeros(1, dtype=torch.int32, device=self.device),
+            "used": zeros(count, channels),
+            "f": zeros(probe_step.SPLITS if self._cuda else 1, latent, padded),
+            "grad_f": zeros(latent, padded),
+            "sums": zeros(count, SHAPE_NUMBERS + latent),
+            "partial": zeros(parts, len(net)),
+            "loss": zeros(parts),
+        }
+        self._arrays = {key: interop.to_warp(value) for key, value in self._tensors.items()}
+        self._shapes = wp.zeros(count, dtype=Shape, device=self.device)
+        self._by_group = wp.zeros((groups, -(-count // 32)), dtype=wp.uint32, device=self.device)
+        self._by_gaussian = wp.zeros((count, -(-groups // 32)), dtype=wp.uint32, device=self.device)
+        levels = np.full(channels, 2**self.profile.bits - 1)
+        levels[CENTRE] = 2**CENTRE_BITS - 1
+        self._levels = self._put(levels, float)
+
+    def _settings(self) -> Optimiser:
+        p = self.profile
+        share = np.linspace(0.0, 1.0, p.steps)
+        rates = np.empty(LATENT.start + p.latent)
+        rates[CENTRE], rates[SCALE], rates[ROTATION] = p.centre_rate, p.scale_rate, p.rotation_rate
+        rates[LATENT] = p.latent_rate
+        optimiser = Optimiser()
+        optimiser.control = self._arrays["control"]
+        optimiser.schedule = self._put(p.final_rate + (1 - p.final_rate) * 0.5 * (1 + np.cos(np.pi * share)), float)
+        optimiser.rates = self._put(rates, float)
+        optimiser.net_rate = p.net_rate
+        optimiser.bounds = self._arrays["bounds"]
+        optimiser.adan = int(p.optimiser == "adan")
+        return optimiser
+
+    def _put(self, values: np.ndarray, dtype) -> wp.array:
+        return wp.array(np.ascontiguousarray(values, np.float32), dtype=dtype, device=self.device)
+
+    @property
+    def step(self) -> int:
+        """Steps done."""
+        return int(self._tensors["control"].item())
+
+    def stage(self, step: int) -> int:
+        """0: Gaussians free, 1: on their levels, 2: fixed."""
+        p = self.profile
+        return int(step >= round(p.quantise_from * p.steps)) + int(step >= round(p.freeze_from * p.steps))
+
+    def run(self, steps: int) -> None:
+        """Queues the next steps."""
+        first = self.step
+        with interop.stream(self.device):
+            for step in range(first, first + steps):
+                stage = self.stage(step)
+                while self._entered < stage:
+                    self._enter(self._entered + 1)
+                self._stages[stage]()
+
+    def _enter(self, stage: int) -> None:
+        """Begins a stage: sets the levels' range, or fixes the Gaussians."""
+        t = self._tensors
+        if stage == 1:
+            t["bounds"].copy_(torch.stack([t["rows"].amin(0), t["rows"].amax(0)]))
+        else:
+            self._make_shapes(quantised=True)
+            self._prune()
+        self._entered = stage
+
+    def finish(self) -> None:
+        """Enters the stages that a short fit has left out, so that the Gaussians are on their levels."""
+        with interop.stream(self.device):
+            while self._entered < 2:
+                self._enter(self._entered + 1)
+
+    def _make_shapes(self, quantised: bool) -> None:
+        p, a = self.profile, self._arrays
+        self._step_kernels.shapes(
+            a["rows"],
+            a["bounds"],
+            int(quantised),
+            self._levels,
+            p.cut,
+            int(p.support == "sphere"),
+            a["used"],
+            self._shapes,
+        )
+        probe_step.touch(self._groups, self._shapes, self._by_group, self._by_gaussian)
+
+    def _step(self, stage: int) -> None:
+        k, a, t, cut = self._step_kernels, self._arrays, self._tensors, self.profile.cut
+        move = stage < 2
+        probe_step.count_step(a["control"])
+        if move:
+            self._make_shapes(quantised=stage > 0)
+        if not self._cuda:
+            # The lanes add to these.
+            t["partial"].zero_()
+            t["loss"].zero_()
+        if move:
+            self._features()
+        network = (self._groups, a["f"], self._target, self._weight, a["net"], a["grad_f"], a["partial"], a["loss"])
+        self._share(self._groups.x.shape[0], lambda *lane: self._network.launch(*network, *lane))
+        if move:
+            collect = (self._groups, self._shapes, a["used"], self._by_gaussian, a["grad_f"], cut, a["sums"])
+            self._share(self.count, lambda *lane: k.collect(*collect, *lane))
+        self._optimiser.keep, self._optimiser.move = int(stage > 0), int(move)
+        k.update(
+            self._optimiser,
+            a["rows"],
+            a["used"],
+            self._shapes,
+            a["sums"],
+            a["moments"],
+            a["net"],
+            a["net_moments"],
+            a["partial"],
+        )
+
+    def _features(self) -> None:
+        a = self._arrays
+        args = (self._groups, self._shapes, a["used"], self._by_group, self.profile.cut, a["f"])
+        self._share(self._groups.x.shape[0], lambda *lane: self._step_kernels.features(*args, *lane))
+
+    def _share(self, total: int, work) -> None:
+        """Runs ``work`` over all rows: at once on CUDA, in two halves on the CPU's threads."""
+        if self._cuda:
+            work()
+            return
+        half = total // 2
+        lanes = [(base, count) for base, count in ((0, half), (half, total - half)) if count]
+        list(self._pool.map(lambda lane: work(*lane), lanes))
+
+    def _prune(self) -> None:
+        """Finds the Gaussians whose absence changes no decoded number by more than the profile allows.
+
+        They are taken in the order of what the probes feel of them, at most; the longest run of them that together
+        stays within the bound is dropped. One always stays.
+        """
+        t, latent = self._tensors, self._tensors["used"][:, LATENT]
+        # With a gradient of one in one channel, the first of the latent's sums is the sum of the Gaussian's weights.
+        t["grad_f"].zero_()
+        t["grad_f"][0, : self._probes] = 1.0
+        a = self._arrays
+        collect = (self._groups, self._shapes, a["used"], self._by_gaussian, a["grad_f"], self.profile.cut, a["sums"])
+        self._share(self.count, lambda *lane: self._step_kernels.collect(*collect, *lane))
+        felt = t["sums"][:, SHAPE_NUMBERS] * latent.norm(dim=1)
+        order = felt.argsort(stable=True)
+        stored = latent.clone()
+        self._features()
+        whole = self._decoded()
+        scale = torch.from_numpy(self.spread).to(whole)
+        exact = torch.from_numpy(self.mean).to(whole) + whole * scale
+        allowed = self.profile.prune * float(exact.max() - exact.min())
+
+        def change(count: int) -> float:
+            latent.copy_(stored)
+            latent[order[:count]] = 0.0
+            self._features()
+            return float(((self._decoded() - whole) * scale).abs().max())
+
+        low, high = 0, self.count - 1
+        while low < high:
+            middle = (low + high + 1) // 2
+            if change(middle) <= allowed:
+                low = middle
+            else:
+                high = middle - 1
+        self.dropped_change = change(low)
+        self.kept = np.ones(self.count, bool)
+        self.kept[order[:low].cpu().numpy()] = False
+
+    def _decoded(self) -> torch.Tensor:
+        """What the network makes of the features, normalised, float32 [N, D]."""
+        p, d = self.profile, self._outputs
+        inputs, hidden, wide = p.latent + 3, p.hidden, probe_network.padded(d)
+        sizes = [(inputs + 1, hidden), (hidden + 1, hidden), (hidden + 1, wide)]
+        parts = self._tensors["net"].split([rows * columns for rows, columns in sizes])
+        first, second, third = (part.view(size) for part, size in zip(parts, sizes, strict=True))
+        x = wp.to_torch(self._groups.x)[: self._probes]
+        h = torch.cat([self._tensors["f"].sum(0).T[: self._probes], x], 1)
+        h = torch.sigmoid(h @ first[:inputs] + first[inputs])
+        h = torch.sigmoid(h @ second[:hidden] + second[hidden])
+        return (h @ third[:hidden] + third[hidden])[:, :d]
+
+    def mse(self) -> float:
+        """Mean squared error of the live probes' numbers at the last step; NaN before the first."""
+        return float(self._tensors["loss"].sum()) * self._unit if self.step else math.nan
+
+    def quantised(self) -> dict[str, np.ndarray]:
+        """The fit as stored: ``centre``, ``code``, ``bounds`` and ``net`` of ``wlm.probe.model.ProbeModel``.
+
+        The network's last layer gives the probes' own numbers over ``gain``, its largest weight.
+        """
+        p, d = self.profile, self._outputs
+        t = {key: self._tensors[key].cpu().numpy().astype(np.float64) for key in ("used", "bounds", "net")}
+        low, high = t["bounds"]
+        span = np.where(high > low, high - low, 1.0)
+        code = np.rint((t["used"][self.kept] - low) / span * self._levels.numpy())
+        code = np.where(high > low, code, 0).astype(np.uint16)
+        inputs, hidden, wide = p.latent + 3, p.hidden, probe_network.padded(d)
+        before = (inputs + 1) * hidden + (hidden + 1) * hidden
+        third = t["net"][before:].reshape(hidden + 1, wide)[:, :d] * self.spread
+        third[hidden] += self.mean
+        gain = float(np.abs(third).max()) or 1.0
+        net = np.concatenate([t["net"][:before], (third / gain).ravel()])
+        return {
+            "centre": code[:, CENTRE],
+            "code": code[:, SCALE.start :],
+            "bounds": t["bounds"].astype(np.float32),
+            "net": np.clip(net, -65504, 65504).astype(np.float16),
+            "gain": gain,
+        }
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Everything that later steps depend on."""
+        result = {key: self._tensors[key].cpu().numpy().copy() for key in _STATE}
+        return result | {"kept": self.kept.copy(), "entered": np.array(self._entered)}
+
+    def load(self, state: dict[str, np.ndarray]) -> None:
+        """Goes back to a ``state``; arrays of other shapes raise ValueError."""
+        for key in _STATE:
+            value, target = torch.from_numpy(np.array(state[key])), self._tensors[key]
+            if value.shape != target.shape:
+                raise ValueError(f"{key}: expected shape {tuple(target.shape)}, got {tuple(value.shape)}")
+            target.copy_(value)
+        self.kept, self._entered = np.array(state["kept"]), int(state["entered"])
+        if self._entered == 2:
+            with interop.stream(self.device):
+                self._make_shapes(quantised=True)
+                self._tensors["used"][torch.from_numpy(~self.kept).to(self.device), LATENT] = 0.0
+                self._features()
+
+    def close(self) -> None:
+        """Ends the CPU's threads and frees the graphs, which hold the trainer."""
+        self._stages = []
+        if self._pool is not None:
+            self._pool.shutdown()

@@ -1,0 +1,221 @@
+"""3D Gaussians with latents, summed at points (gaussian-probe-compression, eq. 2 to 6), and the gradients of the sum.
+
+A Gaussian is a row of 10 + L numbers: centre (3), log of the scale (3), quaternion w x y z (4), latent (L). With
+S = diag(scale), R the rotation and W = S^-1 R^T,
+
+    F(x) = sum_k F_k w_k(x),   w_k(x) = exp(-|u|^2 / 2),   u = W_k (x - centre_k),   over the k that reach x.
+
+``Shape`` is what a row comes to. The backward pass sums, over the points, the symmetric a w u u^T and the vector a w u
+with a = dL/dF . F_k, and ``chain`` makes gradients of the row of them. No difference of large numbers is left in it.
+Where a Gaussian is a needle or a sheet, u itself is one: it is then computed in float64, for these Gaussians alone.
+"""
+
+import functools
+from dataclasses import dataclass
+from typing import Any
+
+import warp as wp
+
+__all__ = ["LATENT", "SHAPE_NUMBERS", "GaussianFunctions", "Shape", "functions", "shape_of", "touches"]
+
+# Where the latent begins in a row, behind centre, log of the scale and rotation.
+LATENT = 10
+SHAPE_NUMBERS = 9  # sums for the gradients of centre (3), scale and rotation (6)
+
+# A quaternion shorter than this has no direction left in float32: it stands for no rotation, and gets no gradient.
+_SHORTEST = wp.constant(1.0e-12)
+# Longest over shortest scale from which on u is computed in float64: float32 loses about 1e-7 times this.
+_SLENDER = wp.constant(100.0)
+
+
+@wp.struct
+class Shape:
+    """A Gaussian without its latent.
+
+    Attributes:
+        centre: In the frame of the points.
+        whiten: W = S^-1 R^T.
+        rest: What rounding took from W; zero where it isn't needed.
+        reach: Half the size, along each axis, of the box round the points that it reaches.
+        radius: Of the sphere round its centre that it reaches, squared; 0 where it reaches the ellipsoid alone.
+        slender: 1 where u needs float64.
+    """
+
+    centre: wp.vec3
+    whiten: wp.mat33
+    rest: wp.mat33
+    reach: wp.vec3
+    radius: float
+    slender: int
+
+
+@wp.func
+def _unit(q: Any) -> Any:
+    n = wp.length(q)
+    if n < type(n)(_SHORTEST):
+        return type(q)(type(n)(1.0), type(n)(0.0), type(n)(0.0), type(n)(0.0))
+    return q / n
+
+
+@wp.func
+def _rotation(q: wp.vec4) -> wp.mat33:
+    return wp.quat_to_matrix(wp.quat(q[1], q[2], q[3], q[0]))
+
+
+@wp.func
+def _rotation(q: wp.vec4d) -> wp.mat33d:
+    return wp.quat_to_matrix(wp.quatd(q[1], q[2], q[3], q[0]))
+
+
+@wp.func
+def shape_of(centre: wp.vec3, log_scale: wp.vec3, q: wp.vec4, cut: float, sphere: int) -> Shape:
+    """What a row comes to.
+
+    Args:
+        centre, log_scale, q: The row's first ten numbers.
+        cut: How far it reaches, in standard deviations.
+        sphere: 1: in every direction as far as along its longest axis (eq. 6); 0: its own ellipsoid.
+    """
+    s = wp.vec3(wp.exp(log_scale[0]), wp.exp(log_scale[1]), wp.exp(log_scale[2]))
+    shape = Shape()
+    shape.centre = centre
+    r = wp.mat33()
+    if wp.max(log_scale) - wp.min(log_scale) > wp.log(_SLENDER):
+        one = wp.float64(1.0)
+        turn = _rotation(_unit(wp.vec4d(q)))
+        exact = wp.mat33d()
+        for a in range(3):
+            factor = one / wp.exp(wp.float64(log_scale[a]))
+            for b in range(3):
+                exact[a, b] = turn[b, a] * factor
+        shape.slender = 1
+        shape.whiten = wp.mat33(exact)
+        shape.rest = wp.mat33(exact - wp.mat33d(shape.whiten))
+        r = wp.mat33(turn)
+    else:
+        r = _rotation(_unit(q))
+        shape.whiten = wp.diag(wp.vec3(1.0 / s[0], 1.0 / s[1], 1.0 / s[2])) * wp.transpose(r)
+    longest = wp.max(s)
+    if sphere != 0:
+        shape.reach = cut * wp.vec3(longest, longest, longest)
+        shape.radius = cut * cut * longest * longest
+    else:
+        axes = r * wp.diag(s)
+        shape.reach = cut * wp.vec3(wp.length(axes[0]), wp.length(axes[1]), wp.length(axes[2]))
+    return shape
+
+
+@wp.func
+def _whitened(shape: Shape, x: wp.vec3) -> wp.vec3:
+    if shape.slender != 0:
+        r = wp.vec3d(x) - wp.vec3d(shape.centre)
+        return wp.vec3((wp.mat33d(shape.whiten) + wp.mat33d(shape.rest)) * r)
+    return shape.whiten * (x - shape.centre)
+
+
+@wp.func
+def _reaches(shape: Shape, x: wp.vec3, d2: float, cut: float) -> bool:
+    if shape.radius > 0.0:
+        return wp.length_sq(x - shape.centre) < shape.radius
+    return d2 < cut * cut
+
+
+@wp.func
+def touches(shape: Shape, middle: wp.vec3, half: wp.vec3) -> bool:
+    """Whether the box round what a Gaussian reaches meets another box.
+
+    Args:
+        shape: The Gaussian.
+        middle, half: The other box's centre and half its size.
+    """
+    d = wp.abs(middle - shape.centre) - half
+    return d[0] <= shape.reach[0] and d[1] <= shape.reach[1] and d[2] <= shape.reach[2]
+
+
+@dataclass(frozen=True)
+class GaussianFunctions:
+    """``wp.func``s for latents of one length. ``rows`` is float [K, 10 + L], ``cut`` in standard deviations.
+
+    Attributes:
+        latent: L.
+        vec_latent: vec of L floats.
+        vec_sums: vec of 9 + L floats, what ``accumulate`` adds up over points.
+        add: (f, shape, rows, k, x, cut) -> f with Gaussian k at x added.
+        accumulate: (sums, shape, rows, k, x, grad_f, cut) -> sums with the point x added.
+        chain: (sums, shape, log_scale, q) -> gradient of the first ten numbers of a row; that of the latent is the
+            sums' rest.
+    """
+
+    latent: int
+    vec_latent: Any
+    vec_sums: Any
+    add: Any
+    accumulate: Any
+    chain: Any
+
+
+_vec10 = wp.types.vector(LATENT, float)
+
+
+@functools.cache
+def functions(latent: int) -> GaussianFunctions:
+    """Builds (once) the functions for latents of length L."""
+    vec_latent = wp.types.vector(latent, float)
+    vec_sums = wp.types.vector(SHAPE_NUMBERS + latent, float)
+
+    @wp.func
+    def add(f: vec_latent, shape: Shape, rows: wp.array2d[float], k: int, x: wp.vec3, cut: float) -> vec_latent:
+        u = _whitened(shape, x)
+        d2 = wp.dot(u, u)
+        if _reaches(shape, x, d2, cut):
+            w = wp.exp(-0.5 * d2)
+            for c in range(wp.static(latent)):
+                f[c] = f[c] + w * rows[k, LATENT + c]
+        return f
+
+    @wp.func
+    def accumulate(
+        sums: vec_sums, shape: Shape, rows: wp.array2d[float], k: int, x: wp.vec3, g: vec_latent, cut: float
+    ) -> vec_sums:
+        u = _whitened(shape, x)
+        d2 = wp.dot(u, u)
+        if _reaches(shape, x, d2, cut):
+            w = wp.exp(-0.5 * d2)
+            a = float(0.0)
+            for c in range(wp.static(latent)):
+                a += g[c] * rows[k, LATENT + c]
+                sums[SHAPE_NUMBERS + c] = sums[SHAPE_NUMBERS + c] + w * g[c]
+            v = a * w * u
+            for c in range(3):
+                sums[c] = sums[c] + v[c]
+                sums[3 + c] = sums[3 + c] + v[c] * u[c]
+            sums[6] = sums[6] + v[1] * u[2]
+            sums[7] = sums[7] + v[2] * u[0]
+            sums[8] = sums[8] + v[0] * u[1]
+        return sums
+
+    @wp.func
+    def chain(sums: vec_sums, shape: Shape, log_scale: wp.vec3, q: wp.vec4) -> _vec10:
+        centre = wp.transpose(shape.whiten) * wp.vec3(sums[0], sums[1], sums[2])
+        # A turn by omega in the Gaussian's own axes moves u by -S^-1 [omega] S u.
+        xy = wp.exp(log_scale[0] - log_scale[1])
+        yz = wp.exp(log_scale[1] - log_scale[2])
+        zx = wp.exp(log_scale[2] - log_scale[0])
+        turn = wp.vec3(sums[6] * (yz - 1.0 / yz), sums[7] * (zx - 1.0 / zx), sums[8] * (xy - 1.0 / xy))
+        n = wp.length(q)
+        dq = wp.vec4()
+        if n >= _SHORTEST:
+            # A unit q turns by dq = q (0, omega) / 2; the gradient has no part along q.
+            h = q / n
+            v = wp.vec3(h[1], h[2], h[3])
+            vector = h[0] * turn + wp.cross(v, turn)
+            dq = wp.vec4(-wp.dot(v, turn), vector[0], vector[1], vector[2]) * (2.0 / n)
+        g = _vec10()
+        for c in range(3):
+            g[c] = centre[c]
+            g[3 + c] = sums[3 + c]
+        for c in range(4):
+            g[6 + c] = dq[c]
+        return g
+
+    return GaussianFunctions(latent, vec_latent, vec_sums, add, accumulate, chain)
