@@ -8,6 +8,7 @@ STAMP := .venv/.installed
 
 demo: $(STAMP)
 	$(BIN)/python demos/lightmap.py
+	$(BIN)/python demos/probe.py
 
 test: lint
 	$(BIN)/pytest -n 2
@@ -18,6 +19,7 @@ test-all: lint
 bench: $(STAMP)
 	mkdir -p out
 	$(BIN)/wlm bench lightmap --quick --json out/bench.json --plot out/bench.png
+	$(BIN)/wlm bench probe --quick --json out/bench.json --plot out/bench-probe.png
 
 lint: $(STAMP)
 	$(BIN)/ruff check
@@ -26,7 +28,7 @@ lint: $(STAMP)
 
 $(STAMP): pyproject.toml setup.py constraints.txt
 	$(PYTHON) -m venv .venv
-	$(BIN)/pip install -c constraints.txt -e '.[test,baselines]'
+	$(BIN)/pip install -c constraints.txt -e '.[test,baselines,view]'
 	touch $@
 
 clean:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 from PIL import Image
 
-from wlm.bench import Row, pareto_front, plot
+from wlm.bench import Panel, Row, pareto_front, plot
 from wlm.errors import WlmError
 
 NAN = math.nan
@@ -83,6 +83,27 @@ def test_rows_without_a_value_are_left_out_of_that_panel(tmp_path, as_text):
     assert texts.count("not measured") == 1
 
 
+def test_a_panel_of_errors_shows_its_methods_and_falls(tmp_path, as_text, monkeypatch):
+    from matplotlib.figure import Figure
+
+    seen = []
+    original = Figure.savefig
+    monkeypatch.setattr(Figure, "savefig", lambda self, *a, **k: (seen.extend(self.axes), original(self, *a, **k))[1])
+    path = tmp_path / "p.svg"
+    costs = [(4.0, 1e-7), (2.0, 1e-6), (3.0, 1e-5), (1.0, 1e-2)]
+    rows = [Row("probe", "city", "decode", f"way {i}", decode_ms=x, max_error=y) for i, (x, y) in enumerate(costs)]
+    other = Row("probe", "city", "ours", "standard", decode_ms=0.5, max_error=1e-9, psnr=40.0, bpp=5.0)
+    plot([*rows, other], path, x=(Panel("bpp"), Panel("decode_ms", "max_error", ("decode",))))
+    texts = svg_texts(path)
+    assert texts.count("ours standard") == 1 and texts.count("largest error") == 1
+    assert all(texts.count(f"decode way {i}") == 1 for i in range(4))
+    axes = seen[1]
+    assert axes.get_yscale() == "log" and seen[0].get_yscale() == "linear"
+    # The front passes the three that no other beats, from the quickest to the most exact, and way 2 lies above it.
+    front = next(line for line in axes.lines if len(line.get_xdata()) == 4)
+    assert front.get_xydata()[:3].tolist() == [[1.0, 1e-2], [2.0, 1e-6], [4.0, 1e-7]]
+
+
 def test_picture_size_suits_a_readme_and_repeats(tmp_path):
     first, second = tmp_path / "a.png", tmp_path / "b.PNG"
     plot(ROWS, first)
@@ -127,8 +148,10 @@ def test_labels_of_a_crowd_do_not_overlap(tmp_path, monkeypatch):
         (ROWS, "p.png", "speed", "unknown quantity 'speed'"),
         (ROWS, "p.gif", "bpp", r"\.gif.*ends in"),
         ([], "p.png", "bpp", "no row"),
-        ([Row("l", "c", "m", psnr=1.0)], "p.png", "bpp", "no row has both a PSNR and a bpp"),
+        ([Row("l", "c", "m", psnr=1.0)], "p.png", "bpp", "no row has both a psnr and a bpp"),
         (ROWS, "nowhere/p.png", "bpp", "nowhere"),
+        (ROWS, "p.png", Panel("bpp", "max_error"), "no row has both a max_error and a bpp"),
+        (ROWS, "p.png", Panel("bpp", methods=("PCA",)), "no row has both a psnr and a bpp"),
     ],
 )
 def test_what_cannot_be_drawn_is_one_clear_line(tmp_path, rows, name, x, message):
@@ -140,7 +163,9 @@ def test_what_cannot_be_drawn_is_one_clear_line(tmp_path, rows, name, x, message
 def test_zero_cost_one_point_and_equal_points(tmp_path):
     """No logarithm of zero, no empty range."""
     for rows in ([replace(ROWS[0], bpp=0.0), ROWS[1]], ROWS[:1], [ROWS[0]] * 3):
+        errors = [replace(row, max_error=0.1 * i) for i, row in enumerate(rows)]
         path = tmp_path / "p.png"
-        plot(rows, path, x="bpp")
-        with Image.open(path) as picture:
-            assert picture.size == (750, 585)
+        for x in ("bpp", Panel("bpp", "max_error")):
+            plot(errors, path, x=x)
+            with Image.open(path) as picture:
+                assert picture.size == (750, 585)

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import pytest
 
-from wlm.bench import Row, Timing, describe_environment, read_json, run_peers, table, write_json
+from wlm.bench import Row, Run, Timing, describe_environment, read_json, read_runs, run_peers, table, write_json
 from wlm.errors import WlmError
 
 FULL = Row(
@@ -56,6 +56,45 @@ def test_nan_is_written_as_null_and_infinity_refused(tmp_path):
         write_json(tmp_path / "nowhere" / "r.json", [FULL], {})
 
 
+def test_a_run_keeps_what_other_systems_left(tmp_path):
+    path = tmp_path / "results.json"
+    write_json(path, [FULL, replace(FULL, option="H")], {"date": "1"})
+    write_json(path, [BARE], {"date": "2"})
+    assert read_runs(path) == [Run({"date": "1"}, [FULL, replace(FULL, option="H")]), Run({"date": "2"}, [BARE])]
+    assert read_json(path) == ([FULL, replace(FULL, option="H"), BARE], {"date": "2"})
+    # A run of a system replaces the one before.
+    write_json(path, [replace(FULL, psnr=50.0)], {"date": "3"})
+    assert read_runs(path) == [Run({"date": "2"}, [BARE]), Run({"date": "3"}, [replace(FULL, psnr=50.0)])]
+    write_json(path, [FULL, BARE], {"date": "4"})
+    assert read_runs(path) == [Run({"date": "4"}, [FULL, BARE])]
+    # Of a run of both, the other system's rows stay with its environment.
+    write_json(path, [replace(BARE, psnr=1.0)], {"date": "5"})
+    assert read_runs(path) == [Run({"date": "4"}, [FULL]), Run({"date": "5"}, [replace(BARE, psnr=1.0)])]
+
+
+def test_what_is_no_result_file_is_not_replaced(tmp_path):
+    path = tmp_path / "mine.json"
+    path.write_text('{"mine": 1}')
+    with pytest.raises(WlmError, match="mine.json: not a result file"):
+        write_json(path, [FULL], {})
+    assert path.read_text() == '{"mine": 1}'
+
+
+def first_version(path):
+    """A file of one run as the version before wrote it."""
+    document = json.loads(path.read_text())
+    return {"format": document["format"], "version": 1} | document["runs"][0]
+
+
+def test_the_version_before_is_read_and_kept(tmp_path):
+    path = tmp_path / "results.json"
+    write_json(path, [FULL], {"threads": 2})
+    path.write_text(json.dumps(first_version(path)))
+    assert read_json(path) == ([FULL], {"threads": 2})
+    write_json(path, [BARE], {})
+    assert read_runs(path) == [Run({"threads": 2}, [FULL]), Run({}, [BARE])]
+
+
 def change(document, **values):
     return document | values
 
@@ -65,7 +104,14 @@ def change(document, **values):
     [
         (lambda d: change(d, format="other"), "not a result file"),
         (lambda d: [], "not a result file"),
-        (lambda d: change(d, version=2), "expected version 1, got 2"),
+        (lambda d: change(d, version=3), "expected version 1 or 2, got 3"),
+        (lambda d: change(d, version=2), "expected a list 'runs'"),
+        (lambda d: change(d, version=2, runs=[]), "expected a list 'runs'"),
+        (lambda d: change(d, version=2, runs=[7]), "expected a list 'rows'"),
+        (
+            lambda d: change(d, version=2, runs=[{"rows": [], "environment": {}}, {"rows": [3], "environment": {}}]),
+            "run 1: row 0",
+        ),
         (lambda d: change(d, rows={}), "'rows'"),
         (lambda d: change(d, environment=[]), "'environment'"),
         (lambda d: change(d, rows=[3]), "row 0: expected an object"),
@@ -80,7 +126,7 @@ def change(document, **values):
 def test_a_broken_file_is_named_with_its_fault(tmp_path, edit, message):
     path = tmp_path / "results.json"
     write_json(path, [FULL], {})
-    path.write_text(json.dumps(edit(json.loads(path.read_text()))))
+    path.write_text(json.dumps(edit(first_version(path))))
     with pytest.raises(WlmError, match=message) as caught:
         read_json(path)
     assert "results.json" in str(caught.value)

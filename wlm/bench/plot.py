@@ -1,10 +1,11 @@
-"""Plots of error against decode time and against size, with the Pareto front."""
+"""Plots of quality or error against decode time or size, with the Pareto front."""
 
 from __future__ import annotations
 
 import itertools
 import math
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.transforms import Bbox
 
-__all__ = ["pareto_front", "plot"]
+__all__ = ["Panel", "pareto_front", "plot"]
 
 # Okabe and Ito 2008, "Color Universal Design": told apart with any common colour vision. Its yellow is too
 # pale for white.
@@ -28,6 +29,7 @@ _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#
 # colours'.
 _MARKERS = ("o", "s", "^", "D", "v", "P")
 _AXES = {"decode_ms": "decode time (ms)", "bpp": "size (bpp)"}
+_UPRIGHT = {"psnr": "PSNR (dB)", "max_error": "largest error"}
 # Above this ratio of largest to smallest, a linear axis squeezes the small ones together.
 _LOG_RATIO = 8.0
 _MARKER_POINTS = 7.0
@@ -38,6 +40,33 @@ _RINGS = (0.0, 14.0, 30.0, 48.0, 70.0, 96.0)
 # enough.
 _INK = 0.75
 _FRONT_COLOUR = "#707070"
+
+
+@dataclass(frozen=True)
+class Panel:
+    """What a panel shows.
+
+    Attributes:
+        x: `"decode_ms"` or `"bpp"`.
+        y: `"psnr"`, or `"max_error"`, of which less is better.
+        methods: The methods that it shows; None for all.
+    """
+
+    x: str
+    y: str = "psnr"
+    methods: tuple[str, ...] | None = None
+
+    def __post_init__(self) -> None:
+        for quantity, known in ((self.x, _AXES), (self.y, _UPRIGHT)):
+            if quantity not in known:
+                raise WlmError(f"plot: unknown quantity {quantity!r}, expected {' or '.join(known)}")
+
+    def position(self, row: Row) -> tuple[float, float] | None:
+        """Where a row stands; None if it doesn't belong here, or lacks one of the two."""
+        x, y = getattr(row, self.x), getattr(row, self.y)
+        if self.methods is not None and row.method not in self.methods:
+            return None
+        return (x, y) if x is not None and y is not None and math.isfinite(x) and math.isfinite(y) else None
 
 
 def pareto_front(points: Iterable[tuple[float, float]]) -> list[int]:
@@ -59,16 +88,16 @@ def pareto_front(points: Iterable[tuple[float, float]]) -> list[int]:
     return front
 
 
-def plot(rows: Sequence[Row], path: str | Path, x: str | Sequence[str] = ("decode_ms", "bpp")) -> None:
-    """Draw PSNR against decode time, size or both: one line of panels a scene, one panel an axis.
+def plot(rows: Sequence[Row], path: str | Path, x: str | Panel | Sequence[str | Panel] = ("decode_ms", "bpp")) -> None:
+    """Draw quality against cost: one line of panels a scene.
 
     Rows of one method share a colour and a marker; each is labelled where it stands; the Pareto front is
-    drawn as steps. Rows without a PSNR or without the panel's quantity are left out of that panel.
+    drawn as steps. Rows without one of a panel's two quantities are left out of it.
 
     Args:
         rows: The results.
         path: Picture to write, `.png`, `.svg` or `.pdf`.
-        x: `"decode_ms"`, `"bpp"`, or several of them.
+        x: One panel or several; a name stands for the PSNR of all methods against that.
 
     Raises:
         WlmError: The quantity or the file's suffix is unknown, no row has what a panel needs, or the file
@@ -78,43 +107,33 @@ def plot(rows: Sequence[Row], path: str | Path, x: str | Sequence[str] = ("decod
     from matplotlib.figure import Figure
 
     path = Path(path)
-    quantities = (x,) if isinstance(x, str) else tuple(x)
-    for quantity in quantities:
-        if quantity not in _AXES:
-            raise WlmError(f"plot: unknown quantity {quantity!r}, expected {' or '.join(_AXES)}")
+    panels = [Panel(one) if isinstance(one, str) else one for one in ((x,) if isinstance(x, str | Panel) else x)]
     if path.suffix.lower() not in (".png", ".svg", ".pdf"):
         raise WlmError(f"{path}: expected a picture's name that ends in .png, .svg or .pdf")
     scenes = list(dict.fromkeys(row.scene for row in rows))
     methods = list(dict.fromkeys(row.method for row in rows))
-    for quantity in quantities:
-        if not any(_position(row, quantity) for row in rows):
-            raise WlmError(f"plot: no row has both a PSNR and a {quantity}")
+    for panel in panels:
+        if not any(panel.position(row) for row in rows):
+            raise WlmError(f"plot: no row has both a {panel.y} and a {panel.x}")
 
     # A Figure of its own canvas, not pyplot: no global state, no window, nothing to close.
-    figure = Figure(figsize=(5.0 * len(quantities), 3.9 * len(scenes)), dpi=150, layout="constrained")
+    figure = Figure(figsize=(5.0 * len(panels), 3.9 * len(scenes)), dpi=150, layout="constrained")
     FigureCanvasAgg(figure)
-    grid = figure.subplots(len(scenes), len(quantities), squeeze=False)
+    grid = figure.subplots(len(scenes), len(panels), squeeze=False)
     drawn = []
     for i, scene in enumerate(scenes):
-        for j, quantity in enumerate(quantities):
-            mine = [row for row in rows if row.scene == scene and _position(row, quantity)]
-            _draw_panel(grid[i, j], mine, quantity, methods)
+        for j, panel in enumerate(panels):
+            mine = [row for row in rows if row.scene == scene and panel.position(row)]
+            _draw_panel(grid[i, j], mine, panel, methods)
             grid[i, j].set_title(scene, fontsize=11)
-            drawn.append((grid[i, j], mine, quantity))
+            drawn.append((grid[i, j], mine, panel))
     # The layout must be settled before labels can be placed in pixels, and must not move afterwards.
     figure.draw_without_rendering()
     figure.set_layout_engine("none")
-    for axes, mine, quantity in drawn:
-        _label_points(figure, axes, mine, quantity, methods)
+    for axes, mine, panel in drawn:
+        _label_points(figure, axes, mine, panel, methods)
     with atomic_path(path) as part:
         figure.savefig(part, format=path.suffix[1:].lower())
-
-
-def _position(row: Row, quantity: str) -> tuple[float, float] | None:
-    value = getattr(row, quantity)
-    if value is None or row.psnr is None or not (math.isfinite(value) and math.isfinite(row.psnr)):
-        return None
-    return value, row.psnr
 
 
 def _style(method: str, methods: Sequence[str]) -> tuple[str, str]:
@@ -129,30 +148,33 @@ def _ink(colour: str) -> tuple[float, ...]:
     return tuple(_INK * channel for channel in to_rgb(colour))
 
 
-def _draw_panel(axes: Axes, rows: Sequence[Row], quantity: str, methods: Sequence[str]) -> None:
+def _draw_panel(axes: Axes, rows: Sequence[Row], panel: Panel, methods: Sequence[str]) -> None:
     from matplotlib.ticker import LogLocator, NullFormatter
 
-    points = [_position(row, quantity) for row in rows]
-    axes.set_xlabel(_AXES[quantity])
-    axes.set_ylabel("PSNR (dB)")
+    points = [panel.position(row) for row in rows]
+    axes.set_xlabel(_AXES[panel.x])
+    axes.set_ylabel(_UPRIGHT[panel.y])
     axes.grid(True, color="#e4e4e4", linewidth=0.7)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
     if not points:
         axes.text(0.5, 0.5, "not measured", transform=axes.transAxes, ha="center", color=_FRONT_COLOUR)
         return
-    costs = [cost for cost, _ in points]
-    if min(costs) > 0.0 and max(costs) / min(costs) > _LOG_RATIO:
+    costs, heights = zip(*points, strict=True)
+    if _wide(costs):
         axes.set_xscale("log")
         axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
         axes.xaxis.set_minor_formatter(NullFormatter())
+    falling = panel.y == "max_error"
+    if falling and _wide(heights):
+        axes.set_yscale("log")
     # Room around the points for their labels.
     axes.margins(x=0.2, y=0.14)
     for row, (cost, quality) in zip(rows, points, strict=True):
         colour, marker = _style(row.method, methods)
         axes.plot(cost, quality, marker, color=colour, ms=_MARKER_POINTS, mec="white", mew=0.8, zorder=3)
-    front = [points[i] for i in pareto_front(points)]
+    front = [points[i] for i in pareto_front([(cost, -height if falling else height) for cost, height in points])]
     # To the right of its best point a front goes on level: more cost buys nothing.
     axes.autoscale_view()
     right = axes.get_xlim()[1]
@@ -180,14 +202,19 @@ def _draw_panel(axes: Axes, rows: Sequence[Row], quantity: str, methods: Sequenc
     )
 
 
-def _label_points(figure: Figure, axes: Axes, rows: Sequence[Row], quantity: str, methods: Sequence[str]) -> None:
+def _wide(values: Sequence[float]) -> bool:
+    """Whether numbers are too far apart for a linear axis."""
+    return min(values) > 0.0 and max(values) / min(values) > _LOG_RATIO
+
+
+def _label_points(figure: Figure, axes: Axes, rows: Sequence[Row], panel: Panel, methods: Sequence[str]) -> None:
     """Put each row's name beside its marker, where it covers least of what else is drawn."""
     if not rows:
         return
     pixels = figure.dpi / 72.0
     renderer = figure.canvas.get_renderer()
     frame = axes.get_window_extent(renderer)
-    centres = axes.transData.transform([_position(row, quantity) for row in rows])
+    centres = axes.transData.transform([panel.position(row) for row in rows])
     half = 0.5 * _MARKER_POINTS * pixels
     taken = [(cx - half, cy - half, cx + half, cy + half) for cx, cy in centres]
     taken += [_box(text.get_window_extent(renderer)) for text in axes.texts]
@@ -273,7 +300,7 @@ def _leader(x: float, y: float, box: _Box) -> list[_Box]:
 
 
 def _corners(points: np.ndarray) -> list[tuple[float, float]]:
-    """The points of a step line that goes right before it goes up."""
+    """The points of a step line that goes right before it goes up or down."""
     corners = [tuple(points[0])]
     for (x0, y0), (x1, y1) in itertools.pairwise(points):
         del x0

@@ -1,8 +1,9 @@
 """The rows that every system reports, how peers are run into them, and how they are kept.
 
 A row is one method with one option on one scene: what it weighs, how long it takes, how wrong it is. A result
-file is JSON: `{"format": "wlm-bench", "version": 1, "environment": {...}, "rows": [{...}, ...]}`, with null
-for what was not measured.
+file is of one machine, and its runs are of different systems. It is JSON: `{"format": "wlm-bench", "version": 2,
+"runs": [{"environment": {...}, "rows": [{...}, ...]}, ...]}`, with null for what was not measured. In version 1 the
+environment and the rows of the one run stood in the place of the runs.
 """
 
 from __future__ import annotations
@@ -23,10 +24,10 @@ from wlm.bench.timing import Timing, time_together
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_write
 
-__all__ = ["Row", "describe_environment", "read_json", "run_peers", "table", "write_json"]
+__all__ = ["Row", "Run", "describe_environment", "read_json", "read_runs", "run_peers", "table", "write_json"]
 
 _FORMAT = "wlm-bench"
-_VERSION = 1
+_VERSION = 2
 
 
 @dataclass(frozen=True)
@@ -68,6 +69,19 @@ class Row:
     def with_timing(self, timing: Timing) -> Row:
         """A copy with the decode time filled in."""
         return replace(self, decode_ms=timing.median_ms, decode_ms_spread=timing.p90_ms - timing.p10_ms)
+
+
+@dataclass(frozen=True)
+class Run:
+    """Rows that were measured together.
+
+    Attributes:
+        environment: As `describe_environment` gives it.
+        rows: The results.
+    """
+
+    environment: dict[str, object]
+    rows: list[Row]
 
 
 def run_peers(
@@ -134,7 +148,9 @@ _PACKAGES = {"numpy": "numpy", "torch": "torch", "warp": "warp-lang"}
 
 
 def write_json(path: str | Path, rows: Sequence[Row], environment: Mapping[str, object]) -> None:
-    """Write a result file atomically: a reader sees the old file or the whole new one.
+    """Write a run to a result file, atomically: a reader sees the old file or the whole new one.
+
+    What the file holds of other systems is kept; what it holds of these systems is replaced.
 
     Args:
         path: File to write; its folder must exist.
@@ -142,14 +158,23 @@ def write_json(path: str | Path, rows: Sequence[Row], environment: Mapping[str, 
         environment: As `describe_environment` gives it.
 
     Raises:
-        WlmError: A number is infinite, the environment does not fit JSON, or the file can't be written.
+        WlmError: A number is infinite, the environment does not fit JSON, the file can't be written, or what is
+            there is no result file.
     """
     path = Path(path)
+    new = Run(dict(environment), list(rows))
+    systems = {row.system for row in rows}
+    kept = []
+    for run in read_runs(path) if path.exists() else []:
+        others = [row for row in run.rows if row.system not in systems]
+        if others:
+            kept.append(Run(run.environment, others))
     document = {
         "format": _FORMAT,
         "version": _VERSION,
-        "environment": dict(environment),
-        "rows": [_row_values(row) for row in rows],
+        "runs": [
+            {"environment": run.environment, "rows": [_row_values(row) for row in run.rows]} for run in [*kept, new]
+        ],
     }
     try:
         text = json.dumps(document, indent=1, allow_nan=False) + "\n"
@@ -158,17 +183,17 @@ def write_json(path: str | Path, rows: Sequence[Row], environment: Mapping[str, 
     atomic_write(path, text.encode())
 
 
-def read_json(path: str | Path) -> tuple[list[Row], dict[str, object]]:
+def read_runs(path: str | Path) -> list[Run]:
     """Read a result file.
 
     Args:
-        path: File that `write_json` wrote.
+        path: File that `write_json` wrote, in this version or the one before.
 
     Returns:
-        The rows and the environment.
+        Its runs, from the oldest; at least one.
 
     Raises:
-        WlmError: The file can't be read, is no result file of this version, or a row has an unknown, missing
+        WlmError: The file can't be read, is no result file of these versions, or a row has an unknown, missing
             or mistyped field; the message names it.
     """
     path = Path(path)
@@ -178,12 +203,33 @@ def read_json(path: str | Path) -> tuple[list[Row], dict[str, object]]:
         raise WlmError(f"{path}: can't read the results: {error}") from error
     if not isinstance(document, dict) or document.get("format") != _FORMAT:
         raise WlmError(f"{path}: not a result file, expected format {_FORMAT!r}")
-    if document.get("version") != _VERSION:
-        raise WlmError(f"{path}: expected version {_VERSION}, got {document.get('version')!r}")
-    rows, environment = document.get("rows"), document.get("environment")
-    if not isinstance(rows, list) or not isinstance(environment, dict):
-        raise WlmError(f"{path}: expected a list 'rows' and an object 'environment'")
-    return [_row_from(values, f"{path}: row {index}") for index, values in enumerate(rows)], environment
+    version = document.get("version")
+    if version not in (1, _VERSION):
+        raise WlmError(f"{path}: expected version 1 or {_VERSION}, got {version!r}")
+    runs = [document] if version == 1 else document.get("runs")
+    if not isinstance(runs, list) or not runs:
+        raise WlmError(f"{path}: expected a list 'runs' of at least one run")
+    result = []
+    for number, run in enumerate(runs):
+        where = f"{path}: " + (f"run {number}: " if len(runs) > 1 else "")
+        rows, environment = (run.get("rows"), run.get("environment")) if isinstance(run, dict) else (None, None)
+        if not isinstance(rows, list) or not isinstance(environment, dict):
+            raise WlmError(f"{where}expected a list 'rows' and an object 'environment'")
+        result.append(Run(environment, [_row_from(values, f"{where}row {index}") for index, values in enumerate(rows)]))
+    return result
+
+
+def read_json(path: str | Path) -> tuple[list[Row], dict[str, object]]:
+    """Read the rows of all runs of a result file, and the environment of the newest.
+
+    Args:
+        path: As for `read_runs`.
+
+    Raises:
+        WlmError: As `read_runs`.
+    """
+    runs = read_runs(path)
+    return [row for run in runs for row in run.rows], runs[-1].environment
 
 
 def table(rows: Sequence[Row]) -> str:

@@ -28,12 +28,8 @@ def lightmap(
     ] = None,
 ) -> None:
     """Lightmaps over time: PSNR, bits a texel and decode time of the profiles and of block codecs."""
-    if json_path is not None:
-        check_output(json_path, ".json")
-    if plot_path is not None:
-        check_output(plot_path, ".png", ".svg", ".pdf")
+    _check_outputs(json_path, plot_path)
     quiet_warp()
-    from wlm.bench import describe_environment, plot, table, write_json
     from wlm.bench.lightmap import run
     from wlm.interop import check_device
 
@@ -42,11 +38,39 @@ def lightmap(
     command = f"wlm bench lightmap{' --quick' if quick else ''} --device {device}"
     if set_path is not None:
         command += f" --set {rows[0].scene}"
-    if json_path is not None:
-        write_json(json_path, rows, describe_environment(device, command))
-    if plot_path is not None:
-        plot(rows, plot_path)
-    sys.stdout.write(table(rows))
+    _finish(rows, device, command, json_path, plot_path, ("decode_ms", "bpp"))
+
+
+@app.command()
+def probe(
+    quick: Annotated[bool, typer.Option("--quick", help="Fewer steps and rows, for a check in minutes.")] = False,
+    device: Annotated[str, typer.Option(help='Where it computes: "cpu", "cuda" or "cuda:N".')] = "cpu",
+    probes_path: Annotated[
+        Path | None, typer.Option("--probes", metavar="FILE", help="Light probes; default the demo's.")
+    ] = None,
+    keys: Annotated[
+        list[str] | None, typer.Option("--key", help="Which of the file's arrays; may be given several times.")
+    ] = None,
+    json_path: Annotated[
+        Path | None, typer.Option("--json", metavar="FILE.json", help="Write the rows and the environment.")
+    ] = None,
+    plot_path: Annotated[
+        Path | None, typer.Option("--plot", metavar="FILE.png", help="Draw PSNR against size, error against time.")
+    ] = None,
+) -> None:
+    """Light probes: PSNR, size and decode time of the profiles, of their decodes and of the PCA family."""
+    _check_outputs(json_path, plot_path)
+    quiet_warp()
+    from wlm.bench.probe import PANELS, run
+    from wlm.interop import check_device
+
+    device = check_device(device)
+    rows = run(quick=quick, device=device, probes_path=probes_path, keys=keys or (), progress=note)
+    command = f"wlm bench probe{' --quick' if quick else ''} --device {device}"
+    if probes_path is not None:
+        command += f" --probes {probes_path.name}"
+    command += "".join(f" --key {key}" for key in keys or ())
+    _finish(rows, device, command, json_path, plot_path, PANELS)
 
 
 @app.command()
@@ -65,3 +89,26 @@ def report(
     from wlm.formats.atomic import atomic_write
 
     atomic_write(output, page.encode())
+
+
+def _check_outputs(json_path: Path | None, plot_path: Path | None) -> None:
+    """Checks, before long work, that its results can be written."""
+    if json_path is not None:
+        check_output(json_path, ".json")
+        if json_path.exists():
+            from wlm.bench import read_runs
+
+            read_runs(json_path)  # what other systems left there is kept, so it has to be whole
+    if plot_path is not None:
+        check_output(plot_path, ".png", ".svg", ".pdf")
+
+
+def _finish(rows: list, device: str, command: str, json_path: Path | None, plot_path: Path | None, panels) -> None:
+    """Writes what was asked for, and prints the table."""
+    from wlm.bench import describe_environment, plot, table, write_json
+
+    if json_path is not None:
+        write_json(json_path, rows, describe_environment(device, command))
+    if plot_path is not None:
+        plot(rows, plot_path, panels)
+    sys.stdout.write(table(rows))

@@ -9,10 +9,8 @@ from wlm import interop
 from wlm.errors import WlmError
 from wlm.probe.model import ProbeModel
 from wlm.probe.start import morton_order
-from wlm_kernels import gaussian_cubes, probe_network
-from wlm_kernels.gaussians import Shape
+from wlm_kernels import gaussian_cubes, gaussian_sum, probe_network
 from wlm_kernels.probe_decode import decode_kernels
-from wlm_kernels.probe_step import step_kernels
 
 __all__ = ["CULLINGS", "Decoder", "Points"]
 
@@ -86,20 +84,8 @@ class Decoder:
         if sphere and culling != "none":
             # What is reached is a sphere; the box round it is no smaller, and its ellipsoid would lose some of it.
             culling = "sphere"
-        rows = model.rows()
-        self._rows = wp.array(rows, dtype=float, device=self.device)
-        self._shapes = wp.zeros(count, dtype=Shape, device=self.device)
-        unused = wp.zeros_like(self._rows)
-        step_kernels(p.latent, kind).shapes(
-            self._rows,
-            wp.zeros((2, rows.shape[1]), dtype=float, device=self.device),
-            0,
-            wp.zeros(rows.shape[1], dtype=float, device=self.device),
-            self._cut,
-            int(sphere),
-            unused,
-            self._shapes,
-        )
+        self._rows = wp.array(model.rows(), dtype=float, device=self.device)
+        self._shapes = gaussian_sum.shapes(self._rows, self._cut, "sphere" if sphere else "ellipsoid")
         low, high = np.zeros(3, np.float32), model.size.astype(np.float32)
         if culling == "none":
             self._cubes = gaussian_cubes.everything(count, self.device)

@@ -1,0 +1,371 @@
+import json
+import os
+import re
+import signal
+from contextlib import contextmanager
+from functools import partial
+
+import numpy as np
+import pytest
+import yaml
+from probe_sets import synthetic
+from test_cli import call, fails
+
+import wlm.cli.probe
+from wlm.baselines import probes as baselines
+from wlm.probe import codec, data, fit
+from wlm.probe.data import load_probes, save_probes
+from wlm.probe.decode import Decoder
+from wlm.probe.evaluate import evaluate
+
+PROBES, DEAD = 160, 5
+
+
+@pytest.fixture(scope="session")
+def room(tmp_path_factory):
+    """A probe set with five dead probes, in a file."""
+    path = tmp_path_factory.mktemp("room") / "room.npz"
+    probes = synthetic(PROBES, dead=DEAD)
+    save_probes(path, probes.position, probes.values)
+    return path
+
+
+@pytest.fixture(scope="session")
+def profile(tmp_path_factory):
+    path = tmp_path_factory.mktemp("profile") / "tiny.yaml"
+    path.write_text(yaml.safe_dump({"name": "tiny", "ratio": 0.1, "hidden": 16, "latent": 4, "steps": 30}))
+    return path
+
+
+@pytest.fixture(scope="session")
+def fitted(room, profile, tmp_path_factory):
+    """The set compressed, without its positions."""
+    path = tmp_path_factory.mktemp("fitted") / "a.wlm"
+    call("probe", "compress", room, "-o", path, "--profile", profile)
+    return path
+
+
+@pytest.fixture(scope="session")
+def carrying(room, profile, tmp_path_factory):
+    """The set compressed, with its positions."""
+    path = tmp_path_factory.mktemp("carrying") / "a.wlm"
+    call("probe", "compress", room, "-o", path, "--profile", profile, "--positions")
+    return path
+
+
+def test_help_lists_the_commands():
+    assert "probe" in call().split()
+    commands = {"compress", "decode", "evaluate", "info", "export", "walk"}
+    assert commands <= set(call("probe", "--help").split())
+
+
+def test_compress_prints_one_table(room, profile, tmp_path):
+    out = tmp_path / "a.wlm"
+    text = call("probe", "compress", room, "-o", out, "--profile", profile)
+    size, model = out.stat().st_size, codec.read(out)
+    for word in (f"{size:,}", f"{size * 8 / PROBES:.2f}", f"{size / (PROBES * 27 * 4):.2%}"):
+        assert word in text
+    assert re.search(rf"│ +{model.count} │ +{model.dropped} │", text)
+    assert model.count + model.dropped == round(0.1 * (PROBES - DEAD))
+    assert re.search(r"fit: 30 of 30, PSNR \d+\.\d dB", call.stderr)
+    assert (model.profile.name, model.profile.steps, len(model.positions)) == ("tiny", 30, 0)
+    assert [path.name for path in tmp_path.iterdir()] == ["a.wlm"], "no checkpoint is left"
+
+
+def test_the_options_of_compress_reach_the_fit(room, profile, tmp_path):
+    out, other = tmp_path / "a.wlm", tmp_path / "b.wlm"
+    options = ["--profile", profile, "--ratio", 0.2, "--bits", 8, "--latent", 3, "--steps", 12, "--positions"]
+    call("probe", "compress", room, "-o", out, *options, "--key", "sh", "--convention", "threejs")
+    model = codec.read(out)
+    settings = model.profile
+    assert (settings.ratio, settings.bits, settings.latent, settings.steps) == (0.2, 8, 3, 12)
+    assert model.source == load_probes(room).source
+    slack = model.extent * model.size.max() / 65535
+    np.testing.assert_allclose(model.stored_positions(), load_probes(room).position, rtol=0, atol=slack)
+    # The seed of the command is the seed of the fit.
+    for seed, same in ((0, True), (1, False)):
+        call("probe", "compress", room, "-o", other, *options, "--seed", seed)
+        assert (other.read_bytes() == out.read_bytes()) is same
+    # Another convention is other light.
+    call("probe", "compress", room, "-o", other, *options, "--convention", "godot")
+    assert codec.read(other).source == load_probes(room, convention="godot").source != model.source
+
+
+def test_warnings_of_the_set_are_shown(profile, tmp_path):
+    probes = synthetic(20)
+    values = probes.values.reshape(-1, 9, 3).copy()
+    values[3, 2, 1] = np.nan
+    np.savez(tmp_path / "a.npz", position=probes.position, sh_noon=values, sh_night=values)
+    words = ["probe", "compress", tmp_path / "a.npz", "-o", tmp_path / "a.wlm", "--profile", profile]
+    call(*words, "--key", "noon")
+    assert re.search(r"^warning: .*1 probe", call.stderr, re.MULTILINE)
+    assert "several sets of values" in fails(*words)
+
+
+def decoded(path, *words):
+    """The values that decode wrote, in the convention that the file states."""
+    call("probe", "decode", *words, "-o", path)
+    return load_probes(path)
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".json"])
+def test_decode_at_the_probes(suffix, fitted, carrying, room, tmp_path):
+    probes, decoder = load_probes(room), Decoder(codec.read(fitted))
+    given = decoded(tmp_path / f"a{suffix}", fitted, "--positions", room)
+    expected = decoder.decode_probes(probes.position)
+    np.testing.assert_array_equal(given.values, expected)
+    np.testing.assert_array_equal(given.position, probes.position)
+    assert np.count_nonzero(~given.live) == DEAD
+    stored = decoded(tmp_path / f"b{suffix}", carrying)
+    np.testing.assert_array_equal(stored.values, Decoder(codec.read(carrying)).decode_probes())
+    assert not stored.values[~probes.live].any()
+
+
+def test_decode_anywhere(fitted, tmp_path):
+    points = np.random.default_rng(0).random((PROBES, 3)) * [8, 3, 6]
+    expected = Decoder(codec.read(fitted)).decode(points)
+    assert expected.any(1).all(), "as many points as probes, and none of them is dead"
+    np.savez(tmp_path / "a.npz", position=points)
+    (tmp_path / "b.json").write_text(json.dumps(points.tolist()))
+    (tmp_path / "c.json").write_text(json.dumps({"position": points.tolist()}))
+    (tmp_path / "d.json").write_text(json.dumps({"probes": [{"position": point} for point in points.tolist()]}))
+    for name in "abcd":
+        path = next(tmp_path.glob(f"{name}.*"))
+        np.testing.assert_array_equal(decoded(tmp_path / "out.npz", fitted, "--positions", path).values, expected)
+    one = decoded(tmp_path / "out.json", fitted, "--positions", write_json(tmp_path / "e.json", [[1, 2, 3]]))
+    assert one.probes == 1
+
+
+def write_json(path, content):
+    path.write_text(json.dumps(content))
+    return path
+
+
+def test_decode_in_an_engines_convention(fitted, room, tmp_path):
+    text = call("probe", "decode", fitted, "--positions", room, "-o", tmp_path / "a.npz", "--convention", "unity")
+    assert "its probes" in text and f"{PROBES}" in text
+    with np.load(tmp_path / "a.npz") as arrays:
+        assert arrays["convention"] == "unity"
+    expected = Decoder(codec.read(fitted)).decode_probes(load_probes(room).position)
+    np.testing.assert_allclose(load_probes(tmp_path / "a.npz").values, expected, rtol=1e-5, atol=1e-6)
+
+
+def test_positions_of_a_godot_bake(fitted, monkeypatch, tmp_path):
+    points = np.random.default_rng(0).random((7, 3))
+    monkeypatch.setattr("wlm.formats.godot.read_lmbake", lambda path: (points.astype(np.float32), None))
+    (tmp_path / "a.lmbake").write_bytes(b"any")
+    found = decoded(tmp_path / "a.npz", fitted, "--positions", tmp_path / "a.lmbake")
+    np.testing.assert_array_equal(found.values, Decoder(codec.read(fitted)).decode(points.astype(np.float32)))
+
+
+def test_evaluate_prints_and_writes_the_report(fitted, room, tmp_path, monkeypatch):
+    # Two of the rivals, for time; one of them has no room.
+    few = {name: baselines.PROBE_BASELINES[name] for name in ("global_pca", "unreal")}
+    monkeypatch.setattr(baselines, "PROBE_BASELINES", few)
+    monkeypatch.setattr(baselines, "at_bytes", partial(baselines.at_bytes, bits=(8,)))
+    words = ["probe", "evaluate", fitted, room, "--json", tmp_path / "r.json"]
+    text = call(*words, "--baselines")
+    probes, size = load_probes(room), fitted.stat().st_size
+    report = evaluate(Decoder(codec.read(fitted)).decode_probes(probes.position), probes, size)
+    stored = json.loads((tmp_path / "r.json").read_text())
+    rivals = stored.pop("baselines")
+    assert stored == report.to_json()
+    for word in (f"{report.psnr:.2f}", f"{report.irradiance_psnr:.2f}", f"{size:,}", "wlm tiny", "band 2"):
+        assert word in text
+    assert "worst:" in call.stderr and "warning" not in call.stderr
+    names = [rival["method"] for rival in rivals]
+    assert names == [name for name in few if f"probes: {name}: nothing fits" not in call.stderr]
+    assert "global_pca" in names and "PCA, K=" in text
+    for rival in rivals:
+        assert rival["bytes"] <= size and rival["probes"] == PROBES and rival["encode_seconds"] >= 0
+        assert f"{rival['psnr']:.2f}" in text
+    call(*words)
+    assert "baselines" not in json.loads((tmp_path / "r.json").read_text())
+
+
+def test_rivals_without_room_are_named(fitted, room, monkeypatch):
+    monkeypatch.setattr(baselines, "PROBE_BASELINES", {"unreal": lambda position, values, size, bits: None})
+    text = call("probe", "evaluate", fitted, room, "--baselines")
+    assert "nothing fits into" in call.stderr and "Unreal" not in text
+
+
+def test_evaluate_against_another_set(fitted, tmp_path):
+    probes = synthetic(PROBES, seed=3, dead=DEAD)
+    save_probes(tmp_path / "a.npz", probes.position, probes.values)
+    call("probe", "evaluate", fitted, tmp_path / "a.npz")
+    assert f"warning: {tmp_path / 'a.npz'}: not what {fitted} was made of" in call.stderr.replace("\n", " ")
+    save_probes(tmp_path / "b.npz", probes.position[1:], probes.values[1:])
+    line = fails("probe", "evaluate", fitted, tmp_path / "b.npz")
+    assert f"expected the positions of {PROBES} probes, got {PROBES - 1}" in line
+
+
+def test_info_says_what_is_in_the_file(fitted, carrying):
+    facts = json.loads(call("probe", "info", fitted, "--json"))
+    model = codec.read(fitted)
+    assert facts["bytes"] == fitted.stat().st_size == sum(facts["parts"].values())
+    assert (facts["probes"], facts["dead"], facts["outputs"], facts["positions"]) == (PROBES, DEAD, 27, False)
+    assert facts["gaussians"] == model.count and facts["gaussian_bits"] == 48 + 11 * 10
+    assert facts["bits_per_probe"] == facts["bytes"] * 8 / PROBES
+    np.testing.assert_allclose(facts["size"], np.ptp(synthetic(PROBES).position, axis=0))
+    assert facts["profile"]["name"] == "tiny"
+    assert facts["device"] == "cpu" and facts["device_bytes"] == Decoder(model).device_bytes
+    text = call("probe", "info", fitted)
+    assert f"{facts['bytes']:,}" in text and facts["source"] in text and "not stored" in text
+    assert json.loads(call("probe", "info", carrying, "--json"))["positions"] is True
+    assert "device 'tpu'" in fails("probe", "info", fitted, "--device", "tpu")
+
+
+def test_export_lists_what_it_wrote(fitted, tmp_path):
+    text = call("probe", "export", fitted, "-o", tmp_path / "out")
+    files = list((tmp_path / "out").iterdir())
+    assert files and all(file.name in text and f"{file.stat().st_size:,}" in text for file in files)
+    call("probe", "export", fitted, "-o", tmp_path / "out")  # over an earlier one
+    assert "device 'tpu'" in fails("probe", "export", fitted, "-o", tmp_path / "none", "--device", "tpu")
+    assert not (tmp_path / "none").exists()
+
+
+def test_walk_prints_and_writes_the_report(fitted, carrying, room, tmp_path):
+    words = ["--frames", 20, "--scale", 0.1, "--budget", 5, "--json", tmp_path / "r.json"]
+    text = call("probe", "walk", fitted, room, *words)
+    report = json.loads((tmp_path / "r.json").read_text())
+    assert report["frames"] == 20 and report["budget"] == 5 and report["updated"]["max"] == 5
+    np.testing.assert_allclose(report["sizes"], [0.2, 0.4, 0.8, 3.2])
+    # Blocks of D floats and their places.
+    assert report["volume_bytes"] >= 4 * 16**3 * (27 + 3) * 4
+    for word in ("20 frames", f"{report['coverage']['mean']:.2%}", f"{report['volume_bytes']:,}", "update ms"):
+        assert word in text
+    assert "walk: 20 of 20" in call.stderr
+    call("probe", "walk", carrying, *words)
+    again = json.loads((tmp_path / "r.json").read_text())
+    assert again["coverage"]["mean"] == pytest.approx(report["coverage"]["mean"], abs=0.05)
+
+
+def test_walk_along_a_path(carrying, tmp_path):
+    path = write_json(tmp_path / "path.json", [[1, 1, 1], [2, 1, 1], [1e6, 0, 0]])
+    call("probe", "walk", carrying, "--path", path, "--json", tmp_path / "r.json")
+    report = json.loads((tmp_path / "r.json").read_text())
+    assert report["frames"] == 3 and report["coverage"]["min"] <= 1.0
+
+
+def test_walk_with_another_axis_up(carrying, monkeypatch):
+    asked = []
+
+    def path(position, frames, eye_height, up):
+        asked.append((len(position), frames, eye_height, up))
+        return position[:2]
+
+    monkeypatch.setattr("wlm.probe.walk.camera_path", path)
+    call("probe", "walk", carrying, "--up", "z", "--scale", 0.5, "--frames", 7)
+    # Live probes alone, and eyes as high as the scale says.
+    assert asked == [(PROBES - DEAD, 7, 0.8, 2)]
+
+
+def test_names_that_look_like_markup_are_shown_as_they_are(fitted, tmp_path):
+    odd = tmp_path / "[red]a[b].wlm"
+    odd.write_bytes(fitted.read_bytes())
+    assert "[red]a[b].wlm" in call("probe", "info", odd).replace("\n", "")
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["compress", "absent.npz", "-o", "{tmp}/a.wlm"], "absent.npz: no such file"),
+        (["compress", "{set}", "-o", "{tmp}/absent/a.wlm"], "does not exist"),
+        (["compress", "{set}", "-o", "{set}"], "ends in .wlm"),
+        (["compress", "{set}"], "--output"),
+        (["compress", "{set}", "-o", "{tmp}/a.wlm", "--steps", "9"], "--steps: expected"),
+        (["compress", "{set}", "-o", "{tmp}/a.wlm", "--ratio", "0"], "--ratio: expected"),
+        (["compress", "{set}", "-o", "{tmp}/a.wlm", "--ratio", "nan"], "--ratio: expected"),
+        (["compress", "{set}", "-o", "{tmp}/a.wlm", "--bits", "17"], "--bits: expected"),
+        (["compress", "{set}", "-o", "{tmp}/a.wlm", "--latent", "0"], "--latent: expected"),
+        (["compress", "{set}", "-o", "{tmp}/a.wlm", "--seed", "-1"], "--seed"),
+        (["compress", "{set}", "-o", "{tmp}/a.wlm", "--profile", "XXL"], "profile 'XXL'"),
+        (["compress", "{set}", "-o", "{tmp}/a.wlm", "--key", "noon"], "expected values named noon"),
+        (["compress", "{set}", "-o", "{tmp}/a.wlm", "--convention", "quake"], "convention"),
+        (["compress", "{set}", "-o", "{tmp}/a.wlm", "--device", "cuda:9"], "device 'cuda:9'"),
+        (["decode", "{fit}", "-o", "{tmp}/f.npz"], "holds no positions"),
+        (["decode", "{fit}", "-o", "{tmp}/f.exr", "--positions", "{set}"], "ends in .npz or .json"),
+        (["decode", "{fit}", "-o", "{tmp}/f.npz", "--positions", "absent.npz"], "absent.npz: no such file"),
+        (["decode", "{fit}", "-o", "{tmp}/f.npz", "--positions", "{fit}"], "ends in .npz, .json or .lmbake"),
+        (["decode", "{fit}", "-o", "{tmp}/f.npz", "--positions", "{set}", "--convention", "quake"], "convention"),
+        (["decode", "{set}", "-o", "{tmp}/f.npz"], "expected an artifact"),
+        (["decode", "absent.wlm", "-o", "{tmp}/f.npz"], "absent.wlm"),
+        (["evaluate", "{fit}", "absent.npz"], "absent.npz: no such file"),
+        (["evaluate", "{fit}", "{set}", "--json", "{tmp}"], "ends in .json"),
+        (["info", "{tmp}"], "expected an artifact"),
+        (["walk", "{fit}"], "holds no positions"),
+        (["walk", "{fit}", "{other}"], "expected the 160 probes that"),
+        (["walk", "{fit}", "{set}", "--up", "w"], "--up: expected x, y or z"),
+        (["walk", "{fit}", "{set}", "--frames", "0"], "camera path: expected at least 1 frame"),
+        (["walk", "{fit}", "{set}", "--scale", "-1"], "volume sizes"),
+        (["walk", "{fit}", "{set}", "--budget", "0"], "volume budget"),
+        (["walk", "{fit}", "{set}", "--path", "absent.json"], "absent.json"),
+        (["frobnicate"], "frobnicate"),
+        ([], "Missing command"),
+    ],
+    ids=lambda value: "-".join(value[:1] + value[-2:]).replace("/", "_") if isinstance(value, list) else "",
+)
+def test_bad_input_is_one_line_and_exit_code_2(words, says, room, fitted, tmp_path, tmp_path_factory):
+    other = tmp_path_factory.mktemp("other") / "other.npz"
+    points = synthetic(PROBES, seed=9)
+    save_probes(other, points.position, points.values)
+    places = {"set": room, "fit": fitted, "tmp": tmp_path, "other": other}
+    assert says in fails("probe", *(word.format(**places) for word in words))
+    assert not list(tmp_path.iterdir()), "nothing is left behind"
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        ("", "expected JSON"),
+        ("{}", "expected JSON with a position"),
+        ("[]", "expected numbers [M, 3]"),
+        ("[[1, 2]]", "expected numbers [M, 3]"),
+        ("[[1, 2, 3], [1, 2]]", "expected JSON with a position"),
+        ('[["a", "b", "c"]]', "expected numbers [M, 3]"),
+        ("[[true, true, false]]", "expected numbers [M, 3]"),
+        ("[[1, 2, NaN]]", "position 0: expected finite"),
+        ("[[1, 2, 1e999]]", "position 0: expected finite"),
+        ('{"position": null}', "expected numbers [M, 3]"),
+        ('{"probes": 3}', "expected JSON with a position"),
+        ('{"probes": [{"sh": 3}]}', "expected JSON with a position"),
+        ('{"probes": []}', "expected numbers [M, 3]"),
+    ],
+)
+def test_positions_that_are_none(content, says, fitted, tmp_path):
+    (tmp_path / "a.json").write_text(content)
+    line = fails("probe", "decode", fitted, "-o", tmp_path / "f.npz", "--positions", tmp_path / "a.json")
+    assert "a.json" in line and says in line
+
+
+def test_a_ctrl_c_is_kept_and_resumed_to_the_same_bytes(room, profile, tmp_path, monkeypatch):
+    words = ["probe", "compress", room, "--profile", profile]
+    whole, out = tmp_path / "whole.wlm", tmp_path / "a.wlm"
+    call(*words, "-o", whole)
+
+    @contextmanager
+    def press_ctrl_c(what):
+        yield lambda done, total, text: os.kill(os.getpid(), signal.SIGINT)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(fit, "REPORT_EVERY", 0.0)
+        patched.setattr(wlm.cli.probe, "progress_bar", press_ctrl_c)
+        assert call(*words, "-o", out, code=130) == ""
+    assert call.stderr.splitlines() == [f"stopped at step 5: the same command with --resume goes on from {out}.partial"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.wlm.partial", "whole.wlm"]
+
+    assert "made with seed 0, not 1" in fails(*words, "-o", out, "--resume", "--seed", 1)
+    call(*words, "-o", out, "--resume")
+    assert out.read_bytes() == whole.read_bytes()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.wlm", "whole.wlm"]
+    call(*words, "-o", out, "--resume")
+    assert "there is nothing to resume; starting at step 0" in call.stderr
+
+
+def test_an_unknown_exception_is_a_bug_and_shows(room, profile, monkeypatch, tmp_path):
+    def broken(path, **options):
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(data, "load_probes", broken)
+    with pytest.raises(ZeroDivisionError):
+        call("probe", "compress", room, "-o", tmp_path / "a.wlm", "--profile", profile)

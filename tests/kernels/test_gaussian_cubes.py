@@ -1,0 +1,238 @@
+"""The lists of Gaussians by cube: who is in them, that nobody is missing, and that they can always be made."""
+
+import itertools
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+from reference import gaussians as reference
+
+from kernels.compare import array
+from wlm_kernels import gaussian_cubes, gaussian_sum
+from wlm_kernels.gaussian_cubes import TESTS, Cubes, cube_of
+
+CUT = 3.0
+LOW, HIGH = [-0.2, 0.0, 0.1], [1.0, 0.7, 0.9]
+LOOSE = 3e-4  # of a reach: what a list may hold beyond what meets its cube
+
+
+@wp.kernel(enable_backward=False)
+def _cube_of(cubes: Cubes, x: wp.array1d[wp.vec3], out: wp.array1d[int]):
+    out[wp.tid()] = cube_of(cubes, x[wp.tid()])
+
+
+def _gaussians(count: int, anisotropy: float, longest: float = 0.2, seed: int = 1) -> np.ndarray:
+    """Rows with latents of 1, some of them centred outside of the grid."""
+    random = np.random.default_rng(seed)
+    rows = random.normal(size=(count, 11)).astype(np.float32)
+    rows[:, :3] = LOW + (random.random((count, 3)) * 1.6 - 0.3) * (np.array(HIGH) - LOW)
+    rows[:, 3:6] = np.log(longest) - np.log(anisotropy) * random.permuted(np.tile([1.0, 0.0, 0.4], (count, 1)), axis=1)
+    return rows
+
+
+def _shapes(rows: np.ndarray, device: str, support: str = "ellipsoid") -> wp.array:
+    return gaussian_sum.shapes(array(rows, float, device), CUT, support)
+
+
+def _lists(cubes: Cubes) -> list[np.ndarray]:
+    start, item = cubes.start.numpy(), cubes.item.numpy()
+    assert len(start) == np.prod([*cubes.counts]) + 1 and start[0] == 0 and start[-1] == len(item)
+    return np.split(item, start[1:-1])
+
+
+def _table(cubes: Cubes, gaussians: int) -> np.ndarray:
+    """Who is listed where, bool [C, K]; the lists must rise."""
+    table = np.zeros((len(cubes.start) - 1, gaussians), bool)
+    for row, items in zip(table, _lists(cubes), strict=True):
+        assert (np.diff(items) > 0).all()
+        row[items] = True
+    return table
+
+
+def _boxes(cubes: Cubes) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest corners [C, 3], infinite at the border."""
+    counts = np.array([*cubes.counts])
+    cell = np.stack(np.unravel_index(np.arange(counts.prod()), counts), 1)
+    low = np.array([*cubes.low]) + cubes.size * cell
+    return np.where(cell == 0, -np.inf, low), np.where(cell == counts - 1, np.inf, low + cubes.size)
+
+
+def _distances(rows: np.ndarray, cubes: Cubes, test: str, support: str) -> np.ndarray:
+    """How far each cube is from each Gaussian, [C, K], in units of what the test says that it reaches."""
+    low, high = _boxes(cubes)
+    centre = rows[:, :3].astype(np.float64)
+    apart = np.maximum(low[:, None] - centre, 0.0) + np.minimum(high[:, None] - centre, 0.0)
+    if test == "box":
+        return np.abs(apart / reference.reach(rows, CUT, support)).max(2)
+    if test == "sphere" or support == "sphere":
+        return np.linalg.norm(apart, axis=2) / reference.reach(rows, CUT, "sphere").max(1)
+    whiten = reference.whitening(torch.tensor(rows, dtype=torch.float64)).numpy()
+    found = [
+        reference.nearest(w, c, a, b) if (c < a).any() or (c > b).any() else 0.0
+        for a, b in zip(low, high, strict=True)
+        for w, c in zip(whiten, centre, strict=True)
+    ]
+    return np.array(found).reshape(len(low), len(rows)) / CUT
+
+
+@pytest.mark.parametrize("support", ["ellipsoid", "sphere"])
+@pytest.mark.parametrize("test", TESTS)
+def test_lists_hold_what_meets_the_cube(device: str, test: str, support: str):
+    """Against float64; "exact" against a solver of bounded least squares."""
+    rows = _gaussians(30, 20.0)
+    cubes = gaussian_cubes.build(_shapes(rows, device, support), LOW, HIGH, 0.3, test=test)
+    assert [*cubes.counts] == [4, 3, 3]
+    far = _distances(rows, cubes, test, support)
+    listed = _table(cubes, len(rows))
+    assert listed[far <= 1.0].all()
+    assert not listed[far > 1.0 + LOOSE].any()
+    assert 0.02 < listed.mean() < 0.98
+
+
+@pytest.mark.parametrize(("anisotropy", "longest"), [(1.0, 0.1), (300.0, 0.4), (30000.0, 0.4)])
+def test_exact_lists_of_needles_and_sheets(device: str, anisotropy: float, longest: float):
+    """The nearest point of a cube, where the ellipsoid's axes differ by more than float32 can tell."""
+    rows = _gaussians(16, anisotropy, longest)
+    rows[::2, 4] = rows[::2, 3]
+    cubes = gaussian_cubes.build(_shapes(rows, device), LOW, HIGH, 0.25, test="exact")
+    far = _distances(rows, cubes, "exact", "ellipsoid")
+    listed = _table(cubes, len(rows))
+    assert listed[far <= 1.0].all()
+    # A cube is a little larger than it should be; to a sheet of 1e-5 that is far.
+    slack = LOOSE + 4e-6 / (CUT * np.exp(rows[:, 3:6].min(1)))
+    assert not listed[far > 1.0 + slack].any()
+    assert 0.02 < listed.mean() < 0.9
+
+
+def _reached(row: np.ndarray, random: np.random.Generator, count: int = 60) -> np.ndarray:
+    """Points at the border of what a Gaussian reaches, on either side of it by rounding."""
+    turn = reference.rotations(torch.tensor(row[None, 6:10], dtype=torch.float64))[0].numpy()
+    u = random.normal(size=(count, 3))
+    u *= CUT * (1.0 + 1e-6 * random.normal(size=(count, 1))) / np.linalg.norm(u, axis=1, keepdims=True)
+    return row[:3] + (u * np.exp(row[3:6].astype(np.float64))) @ turn.T
+
+
+@pytest.mark.parametrize("anisotropy", [1.0, 90.0, 30000.0])
+@pytest.mark.parametrize("offset", [0.0, 300.0])
+def test_no_list_lacks_a_gaussian_that_reaches(device: str, anisotropy: float, offset: float):
+    """Sums over lists are those over all Gaussians to the last bit, at points that they barely reach, in and outside
+    of the grid, and where float32 is coarse."""
+    random = np.random.default_rng(3)
+    rows = _gaussians(60, anisotropy)
+    x = np.concatenate([*(_reached(row, random) for row in rows), random.random((500, 3)) * 3 - 1, [LOW, HIGH]])
+    rows[:, :3] += offset
+    x = array((x + offset).astype(np.float32), wp.vec3, device)
+    used = array(rows, float, device)
+    low, high = np.add(LOW, offset), np.add(HIGH, offset)
+    for support in ("ellipsoid", "sphere"):
+        shapes = gaussian_sum.shapes(used, CUT, support)
+        want = wp.zeros((1, len(x)), dtype=float, device=device)
+        gaussian_sum.sum(used, shapes, None, x, want, CUT)
+        for test, size in itertools.product(TESTS, (0.03, 0.31)):
+            f = wp.zeros_like(want)
+            gaussian_sum.sum(used, shapes, gaussian_cubes.build(shapes, low, high, size, test=test), x, f, CUT)
+            np.testing.assert_array_equal(f.numpy(), want.numpy())
+
+
+def test_exact_lists_are_the_shortest(device: str):
+    shapes = _shapes(_gaussians(200, 20.0), device)
+    box, sphere, exact = (_table(gaussian_cubes.build(shapes, LOW, HIGH, 0.1, test=t), 200) for t in TESTS)
+    assert not (exact & ~box).any() and not (exact & ~sphere).any()
+    assert exact.sum() < 0.6 * box.sum() and box.sum() < 0.6 * sphere.sum()
+
+
+def test_cube_of_points(device: str):
+    """The cube of a point, the nearest one outside of the grid, and some cube for a NaN."""
+    cubes = gaussian_cubes.build(_shapes(_gaussians(3, 2.0), device), LOW, HIGH, 0.3)
+    random = np.random.default_rng(2)
+    x = np.concatenate([random.random((200, 3)) * 4 - 2, [LOW, HIGH, [np.inf, -np.inf, 1e30], [np.nan] * 3]])
+    x = x.astype(np.float32)
+    out = wp.zeros(len(x), dtype=int, device=device)
+    wp.launch(_cube_of, len(x), inputs=[cubes, array(x, wp.vec3, device)], outputs=[out], device=device)
+    place = np.clip(np.floor((x[:-1] - np.float32(LOW)) / np.float32(0.3)), 0, np.array([3, 2, 2])).astype(int)
+    np.testing.assert_array_equal(out.numpy()[:-1], np.ravel_multi_index(tuple(place.T), (4, 3, 3)))
+    assert 0 <= out.numpy()[-1] < 36
+
+
+@pytest.mark.parametrize("test", TESTS)
+def test_hard_gaussians(device: str, test: str):
+    """Collapsed: one cube. As large as all: every cube. Far off: the cubes at the border that face it. Not a number:
+    every cube, for no test can say."""
+    rows = np.tile(np.array([0.35, 0.35, 0.35, 0, 0, 0, 1, 0, 0, 0, 1], np.float32), (5, 1))
+    rows[0, 3:6] = np.log(1e-4)
+    rows[1, 3:6] = np.log(4.0)
+    rows[2, :3], rows[2, 3:6] = [9.0, 0.35, 0.35], np.log(1e-2)
+    rows[3, 0] = np.nan
+    rows[4, 4] = np.nan
+    cubes = gaussian_cubes.build(_shapes(rows, device), [0, 0, 0], [1, 1, 1], 0.1, test=test)
+    listed = _table(cubes, 5).reshape(10, 10, 10, 5)
+    assert np.argwhere(listed[..., 0]).tolist() == [[3, 3, 3]]
+    assert listed[..., [1, 3, 4]].all()
+    assert np.argwhere(listed[..., 2]).tolist() == [[9, 3, 3]]
+
+
+@pytest.mark.parametrize("test", TESTS)
+def test_no_gaussians(device: str, test: str):
+    """Empty lists; one cube where its size is left to us."""
+    for size, count in ((0.5, 12), (None, 1)):
+        cubes = gaussian_cubes.build(_shapes(np.zeros((0, 11), np.float32), device), LOW, HIGH, size, test=test)
+        assert cubes.start.numpy().tolist() == [0] * (count + 1) and cubes.item.shape == (0,)
+
+
+@pytest.mark.parametrize("test", TESTS)
+def test_flat_boxes(device: str, test: str):
+    """Probes in a plane, in a line, or in one point."""
+    rows = _gaussians(40, 5.0, longest=0.05)
+    for axes in (1, 2, 3):
+        high = np.array(HIGH)
+        high[:axes] = LOW[:axes]
+        for size in (0.05, None):
+            cubes = gaussian_cubes.build(_shapes(rows, device), LOW, high, size, test=test)
+            counts = [*cubes.counts]
+            assert counts[:axes] == [1] * axes and all(count > 1 for count in counts[axes:])
+            assert _table(cubes, 40).any(0).all()
+
+
+def test_chosen_size(device: str):
+    """A quarter of the median reach, or coarser by powers of two where that makes too much."""
+    rows = _gaussians(100, 1.0, longest=0.1)
+    cubes = gaussian_cubes.build(_shapes(rows, device), LOW, HIGH)
+    assert cubes.size == pytest.approx(0.25 * CUT * 0.1)
+    rows[:, 3:6] = np.log(1e-3)
+    cubes = gaussian_cubes.build(_shapes(rows, device), LOW, HIGH)
+    most = 4096 + 8 * 100
+    assert most / 8 < np.prod([*cubes.counts]) <= most
+    doubled = np.log2(cubes.size / (0.25 * CUT * 1e-3))
+    assert doubled == pytest.approx(round(doubled), abs=1e-3)
+    # A few small ones don't make the lists of many large ones long.
+    rows[:45, 3:6] = np.log(0.5)
+    cubes = gaussian_cubes.build(_shapes(rows, device), LOW, HIGH)
+    assert len(cubes.item) <= 4096 + 256 * 100
+
+
+def test_everything_is_one_list(device: str):
+    cubes = gaussian_cubes.everything(5, device)
+    assert [items.tolist() for items in _lists(cubes)] == [[0, 1, 2, 3, 4]]
+    assert gaussian_cubes.everything(0, device).start.numpy().tolist() == [0, 0]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "options", "message"),
+    [
+        (([0, 0, 0], [1, 1, 1]), {"test": "ball"}, "test: expected one of box, sphere, exact, got 'ball'"),
+        (([0, 0, 0], [1, -1, 1]), {}, "expected two corners of a box"),
+        (([0, 0, 0], [1, np.nan, 1]), {}, "expected two corners of a box"),
+        (([0, 0], [1, 1]), {}, "expected two corners of a box"),
+        (([0, 0, 0], [1, 1, 1], 0.0), {}, "size: expected a positive number, got 0.0"),
+        (([0, 0, 0], [1, 1, 1], np.inf), {}, "size: expected a positive number, got inf"),
+        (([0, 0, 0], [1, 1, 1], 1e-4), {}, r"makes 10+ cubes, expected at most 1073741823"),
+        # Three Gaussians over half of what is allowed each.
+        (([0, 0, 0], [1, 1, 1], 1 / 800), {}, "makes 1536000000 pairs to test, expected at most 1073741823"),
+        (([0, 0, 0], [1, 1, 1], 1 / 800), {"test": "exact"}, "makes 1536000000 pairs to test"),
+    ],
+)
+def test_wrong_arguments(arguments: tuple, options: dict, message: str):
+    rows = np.tile(np.array([0.5, 0.5, 0.5, 1, 1, 1, 1, 0, 0, 0, 1], np.float32), (3, 1))
+    with pytest.raises(ValueError, match=message):
+        gaussian_cubes.build(_shapes(rows, "cpu"), *arguments, **options)

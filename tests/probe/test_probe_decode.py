@@ -1,0 +1,111 @@
+"""The decode: against float64, at any points, by any lists, and with hard input."""
+
+import numpy as np
+import pytest
+from probe_models import EXTENT, ORIGIN, SIZE, random_model
+
+from wlm.errors import WlmError
+from wlm.probe.decode import CULLINGS, Decoder
+from wlm.probe.reference import decode64
+
+RANDOM = np.random.default_rng(11)
+
+
+def points(count, model):
+    return model.origin + EXTENT * SIZE * RANDOM.random((count, 3))
+
+
+def close(decoded, model, position):
+    """Within float32's rounding of the float64 decode, but for points at the very edge of a Gaussian."""
+    exact = decode64(model, position)
+    error = np.abs(decoded - exact).max(1)
+    assert np.median(error) < 2e-6 * np.abs(exact).max()
+    assert (error > 2e-5 * np.abs(exact).max()).mean() < 0.01
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {},
+        {"outputs": 3, "latent": 1},
+        {"outputs": 75, "hidden": 64, "latent": 12},
+        {"support": "sphere"},
+        {"cut": 2.0},
+        {"turn": 0.0},
+        {"count": 1},
+    ],
+    ids=str,
+)
+def test_against_float64(settings, device):
+    model = random_model(**settings)
+    position = points(130, model)
+    close(Decoder(model, device).decode(position), model, position)
+
+
+def test_far_from_the_origin(device):
+    model = random_model(origin=np.array([1e6, -2e6, 5e5]))
+    position = points(100, model)
+    close(Decoder(model, device).decode(position), model, position)
+
+
+def test_all_lists_give_the_same(device):
+    model = random_model(count=60)
+    position = points(200, model)
+    decoders = [Decoder(model, device, culling=culling, cube=cube) for culling in CULLINGS for cube in (None, 0.07)]
+    decoded = [decoder.decode(position) for decoder in decoders]
+    for other in decoded[1:]:
+        np.testing.assert_allclose(other, decoded[0], rtol=0, atol=3e-6 * np.abs(decoded[0]).max())
+    fewest, boxes, spheres, everything = (decoders[i].pairs for i in (1, 3, 5, 7))
+    assert everything == 60 and fewest < boxes < spheres
+
+
+def test_a_tighter_cut_costs_what_is_cut(device):
+    model = random_model(count=60)
+    position = points(200, model)
+    whole = Decoder(model, device).decode(position)
+    errors = [np.abs(Decoder(model, device, cut=cut).decode(position) - whole).mean() for cut in (2.5, 2.0, 1.5)]
+    assert 0 < errors[0] < errors[1] < errors[2]
+
+
+def test_outside_is_the_nearest_point_of_the_box(device):
+    model = random_model()
+    inside = points(20, model)
+    high = ORIGIN + EXTENT * SIZE
+    outside, nearest = inside.copy(), inside.copy()
+    outside[:, 0], nearest[:, 0] = high[0] + 1e9, high[0]
+    outside[:10, 2], nearest[:10, 2] = ORIGIN[2] - 0.5, ORIGIN[2]
+    decoder = Decoder(model, device)
+    np.testing.assert_array_equal(decoder.decode(outside), decoder.decode(nearest))
+
+
+def test_the_models_own_probes(device):
+    model = random_model(positions=True, dead=5)
+    decoder = Decoder(model, device)
+    decoded = decoder.decode_probes()
+    assert decoded.shape == (200, 27) and (decoded[model.dead] == 0).all() and (decoded[~model.dead] != 0).any(1).all()
+    np.testing.assert_array_equal(decoder.decode_probes(model.stored_positions()), decoded)
+    # The order in which points lie on the device is none of the caller's business.
+    turned = decoder.decode(model.stored_positions()[::-1])[::-1]
+    np.testing.assert_array_equal(turned[~model.dead], decoded[~model.dead])
+
+
+def test_wrong_positions():
+    decoder = Decoder(random_model())
+    with pytest.raises(WlmError, match="random: the model has no positions stored"):
+        decoder.decode_probes()
+    with pytest.raises(WlmError, match="expected the positions of 200 probes, got 7"):
+        decoder.decode_probes(np.zeros((7, 3)))
+    bad = np.zeros((4, 3))
+    bad[2, 1] = np.nan
+    with pytest.raises(WlmError, match="position 2: expected finite"):
+        decoder.decode(bad)
+    with pytest.raises(ValueError, match=r"expected \[M, 3\]"):
+        decoder.decode(np.zeros(3))
+    with pytest.raises(WlmError, match="device 'cuda:9'"):
+        Decoder(random_model(), "cuda:9")
+    assert decoder.decode(np.zeros((0, 3))).shape == (0, 27)
+
+
+def test_it_says_what_memory_it_takes():
+    model = random_model()
+    assert Decoder(model).device_bytes > 4 * (40 * 19 + len(model.net))

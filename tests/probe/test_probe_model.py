@@ -1,0 +1,134 @@
+"""The settings' limits, and what stored codes, bounds and positions come to."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from probe_models import EXTENT, ORIGIN, SIZE, random_model
+from pydantic import ValidationError
+
+from wlm.config import profile_names
+from wlm.errors import WlmError
+from wlm.probe.model import CENTRE, LATENT, ROTATION, SCALE, Profile, load_profile, network_size
+
+
+@pytest.mark.parametrize("bits", [4, 10, 16])
+def test_codes_reach_from_the_lowest_to_the_highest_value(bits):
+    model = random_model(count=3, bits=bits)
+    centre, code = model.centre.copy(), model.code.copy()
+    centre[0], centre[1], code[0], code[1] = 0, 65535, 0, 2**bits - 1
+    model = replace(model, centre=centre, code=code)
+    found = model.gaussians()
+    low, high = model.bounds
+    parts = ((CENTRE, found.centre), (SCALE, np.log(found.scale)), (ROTATION, found.rotation), (LATENT, found.latent))
+    for channels, values in parts:
+        assert values.dtype == np.float32
+        np.testing.assert_allclose(values[0], low[channels], rtol=1e-6)
+        np.testing.assert_allclose(values[1], high[channels], rtol=1e-6)
+
+
+def test_codes_in_between_are_those_of_the_equation():
+    model = random_model()
+    found = model.gaussians()
+    low, high = model.bounds.astype(np.float64)
+    # Eq. 14 in float64: two roundings of float32 at values up to 3 wide.
+    expected = low[LATENT] + model.code[:, 7:] * (high - low)[LATENT] / 1023.0
+    np.testing.assert_allclose(found.latent, expected, rtol=0, atol=1e-6)
+    expected = low[CENTRE] + model.centre * (high - low)[CENTRE] / 65535.0
+    np.testing.assert_allclose(found.centre, expected, rtol=0, atol=1e-6)
+    assert (found.scale > 0).all() and found.latent.flags.c_contiguous
+
+
+def test_a_channel_of_one_value_is_that_value():
+    model = random_model()
+    bounds = model.bounds.copy()
+    bounds[:, 12] = 0.1
+    np.testing.assert_array_equal(replace(model, bounds=bounds).gaussians().latent[:, 2], np.float32(0.1))
+
+
+def test_positions_are_normalised_and_moved_into_the_box():
+    model = random_model()
+    corners = np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0], [0.5, 0.25, 0.75]]) * SIZE * EXTENT + ORIGIN
+    inside = model.normalise(corners)
+    assert inside.dtype == np.float32
+    np.testing.assert_allclose(inside, np.array([[0, 0, 0], [1, 1, 1], [0.5, 0.25, 0.75]]) * SIZE, atol=1e-7)
+    outside = model.normalise(np.array([[-100.0, 2.0, 100.0], [1e300, -1e300, 21.0]]))
+    np.testing.assert_allclose(outside, [[0.0, 0.125, 0.75], [1.0, 0.0, 0.125]], atol=1e-7)
+    assert model.normalise(np.zeros((0, 3))).shape == (0, 3)
+
+
+def test_a_box_far_from_the_origin_loses_nothing():
+    near, far = random_model(origin=(0, 0, 0)), random_model(origin=(2.0**30, 0, -(2.0**30)))
+    points = np.random.default_rng(0).random((50, 3)) * SIZE * EXTENT
+    # 2**30 leaves float64 23 bits behind the point.
+    np.testing.assert_allclose(far.normalise(points + far.origin), near.normalise(points), rtol=0, atol=2e-7)
+
+
+def test_a_box_without_a_width():
+    model = replace(random_model(positions=True), size=np.array([1.0, 0.0, 0.0]))
+    flat = model.stored_positions()
+    np.testing.assert_array_equal(flat[:, 1:], np.broadcast_to(ORIGIN[1:], (200, 2)))
+    np.testing.assert_array_equal(model.normalise(flat + 1.0)[:, 1:], 0.0)
+
+
+def test_stored_positions_span_the_box():
+    model = random_model(probes=3, dead=0, positions=True)
+    codes = np.array([[0, 0, 0], [65535, 65535, 65535], [1, 2, 65534]], np.uint16)
+    found = replace(model, positions=codes).stored_positions()
+    assert found.dtype == np.float64
+    np.testing.assert_array_equal(found[0], ORIGIN)
+    np.testing.assert_allclose(found[1], ORIGIN + EXTENT * SIZE, rtol=1e-15)
+    np.testing.assert_allclose(found[2], ORIGIN + EXTENT * SIZE * np.array([1, 2, 65534]) / 65535, rtol=1e-15)
+
+
+def test_sizes_are_those_of_the_paper():
+    # 9 + 3 inputs, two layers of 64, 27 numbers, a bias each.
+    assert network_size(9, 64, 27) == 12 * 64 + 64 + 64 * 64 + 64 + 64 * 27 + 27
+    assert Profile(name="x").gaussian_bits() == 208
+    assert Profile(name="x", bits=8, latent=12).gaussian_bits() == 3 * 16 + 19 * 8
+    # As half floats, table 3: 19 numbers a Gaussian for 5% of 15,000 probes and the network, within 10% of 50.1 KB.
+    assert (2 * 19 * 750 + 2 * network_size(9, 64, 27)) / 1024 == pytest.approx(50.1, rel=0.2)
+
+
+def test_the_profiles_that_are_there():
+    assert {"compact", "paper", "standard"} <= set(profile_names("probe"))
+    for name in ("compact", "paper", "standard"):
+        assert load_profile(name).name == name
+    paper = load_profile("paper")
+    assert (paper.ratio, paper.bits, paper.latent, paper.hidden, paper.cut) == (0.05, 10, 9, 64, 3.0)
+    assert (paper.support, paper.optimiser, paper.steps) == ("sphere", "adan", 12000)
+
+
+def test_a_profile_of_ones_own(tmp_path):
+    (tmp_path / "mine.yaml").write_text("name: mine\nbits: 8\n")
+    assert load_profile(str(tmp_path / "mine.yaml")).bits == 8
+    (tmp_path / "mine.yaml").write_text("name: mine\nbitts: 8\n")
+    with pytest.raises(WlmError, match="mine.yaml: unknown key 'bitts'; did you mean 'bits'"):
+        load_profile(str(tmp_path / "mine.yaml"))
+    with pytest.raises(WlmError, match="profile 'tiny' of probe: expected one of"):
+        load_profile("tiny")
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"ratio": 0.0},
+        {"ratio": 1.1},
+        {"ratio": float("nan")},
+        {"bits": 3},
+        {"bits": 17},
+        {"latent": 0},
+        {"hidden": 20},
+        {"support": "cube"},
+        {"optimiser": "sgd"},
+        {"steps": 9},
+        {"net_rate": 0.0},
+        {"quantise_from": 0.95},
+        {"prune": -1.0},
+        {"colour": 1},
+    ],
+    ids=str,
+)
+def test_settings_out_of_range(settings):
+    with pytest.raises(ValidationError):
+        Profile(name="x", **settings)

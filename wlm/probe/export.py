@@ -1,0 +1,228 @@
+"""Probe models for engines: Gaussians, network and shader as plain files, which together need nothing of this package.
+
+A runtime keeps Gaussians and network at 16 bits a number (gaussian-probe-compression, section 5.3.2 and table 3). The
+paper's numbers are half floats. Here those of the Gaussians are the file's own codes, in as many bytes: they decode to
+exactly what was trained, where a half float may move a centre by a 4096th of the box.
+"""
+
+import json
+import os
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from wlm.errors import WlmError
+from wlm.formats.atomic import atomic_write
+from wlm.probe.conventions import HOUSE
+from wlm.probe.data import save_probes
+from wlm.probe.decode import Decoder
+from wlm.probe.model import CENTRE, CENTRE_BITS, ProbeModel
+from wlm.probe.shader import HEAD_WORDS, gaussian_words, probe_glsl
+from wlm.probe.sphere import sh_count
+
+__all__ = [
+    "FORMAT",
+    "GAUSSIANS_FILE",
+    "INFO_FILE",
+    "NETWORK_FILE",
+    "POSITIONS_FILE",
+    "REFERENCE_FILE",
+    "SHADER_FILE",
+    "export",
+]
+
+FORMAT = "wlm-probe-export"
+_VERSION = 1
+INFO_FILE = "probe.json"
+GAUSSIANS_FILE = "gaussians.bin"
+NETWORK_FILE = "network.bin"
+POSITIONS_FILE = "positions.bin"
+SHADER_FILE = "probe.glsl"
+REFERENCE_FILE = "reference.json"
+
+_REFERENCES = 64  # positions in reference.json, and one outside the box
+_FOUR = 4
+_LIST_OF_NUMBERS = re.compile(r"\[\n([^\[\]{}\"]*)\]")
+
+_ABOUT = {
+    "place": "x = (position - origin) / extent, then each coordinate of x clamped to 0 ... size. The Gaussians and the "
+    "network take x.",
+    "gaussian": "A number is low + code * step. 10 + latent of them: centre, log of the scale s, quaternion q = w x y "
+    "z of any length (zero stands for no rotation), latent. u = R(q)^T (x - centre) / s; the weight at x is "
+    "exp(-|u|^2 / 2). It reaches x where |u| < cut, or for the support 'sphere' where |x - centre| < cut * max(s). "
+    "The sum of weight * latent over the Gaussians that reach x is F.",
+    "network": "h1 = sigmoid(W1 [F, x] + b1), h2 = sigmoid(W2 h1 + b2), values = gain * (W3 h2 + b3).",
+    "lists": "To leave out Gaussians that don't reach x, make lists of them when the files are loaded: cut the box "
+    "0 ... size into cubes, 4 to 16 along its longest side, and list a Gaussian with each cube that meets "
+    "centre +- reach, where reach along axis a is cut * sqrt(sum over b of (R_ab s_b)^2), or for the support 'sphere' "
+    "cut * max(s). Widen the cubes by a millionth, for rounding. The list of the cube that x lies in has all that "
+    "reach x; the shader tests each again.",
+    "values": "Of a probe, outputs numbers. Spherical harmonics: coefficient after coefficient, of each red, green and "
+    "blue; orthonormal real basis in the order 1; y, z, x; xy, yz, 3z2-1, xz, x2-y2; all signs plus, of radiance.",
+    "dead": "Probes that are zero, by number from 0 in the order of compression: engines leave them inside walls. "
+    "Gaussians and network know nothing of them.",
+    "positions": "If positions.bin is there: 3 unsigned 16-bit codes a probe, position = origin + extent * size * code "
+    "/ 65535.",
+    "reference": "reference.json has positions of the scene, the last one outside the box, and the values there.",
+    "precision": "The shader computes in floats. For Gaussians far longer than thin the reference uses doubles in "
+    "places: slenderness is the largest ratio of a Gaussian's scales, and 1e-7 times it is about the error of u.",
+}
+
+
+def export(model: ProbeModel, directory: str | os.PathLike[str], *, device: str = "cpu") -> list[Path]:
+    """Writes a model as buffers, numbers and a shader.
+
+    ``gaussians.bin`` and ``network.bin`` are laid out as ``probe.glsl`` says at its head, ``positions.bin`` is written
+    if the model has positions, ``reference.json`` has the light at some places to compare with, and ``probe.json``
+    explains itself under "about".
+
+    Each file is written whole or not at all, ``probe.json`` last. Into a folder of an earlier export the new one is
+    written over the old; other files there stay.
+
+    Args:
+        model: From ``codec.read`` or ``fit.compress``.
+        directory: The folder; made if it isn't there.
+        device: Where the reference is decoded.
+
+    Returns:
+        The files written, in the order of writing.
+
+    Raises:
+        WlmError: The folder holds something other than an earlier export, or can't be written; no such device; or a
+            number of the model isn't finite.
+    """
+    folder = Path(directory)
+    for part in (model.net, model.bounds, model.origin, model.size, np.array([model.extent, model.gain])):
+        if not np.isfinite(part).all():
+            raise WlmError(f"{model.name}: cannot export: a number is NaN or infinite")
+    position = _reference_positions(model)
+    values = Decoder(model, device).decode(position)
+    if not np.isfinite(values).all():
+        raise WlmError(f"{model.name}: cannot export: it decodes to NaN or infinity")
+    files = {
+        GAUSSIANS_FILE: _gaussian_bytes(model),
+        NETWORK_FILE: _network_bytes(model),
+        SHADER_FILE: probe_glsl(model).encode(),
+    }
+    if len(model.positions):
+        files[POSITIONS_FILE] = np.ascontiguousarray(model.positions, "<u2").tobytes()
+    text = _document(model, {name: len(content) for name, content in files.items()})
+    _claim(folder)
+    for name, content in files.items():
+        atomic_write(folder / name, content)
+    save_probes(folder / REFERENCE_FILE, position, values)
+    atomic_write(folder / INFO_FILE, text.encode())
+    if POSITIONS_FILE not in files:
+        try:
+            (folder / POSITIONS_FILE).unlink(missing_ok=True)
+        except OSError as error:
+            raise WlmError(f"{folder}: cannot remove the old export: {error.strerror or error}") from error
+    return [folder / name for name in (*files, REFERENCE_FILE, INFO_FILE)]
+
+
+def _claim(folder: Path) -> None:
+    """Makes the folder, or checks that it is empty or of an earlier export."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        empty = not any(folder.iterdir())
+    except OSError as error:
+        raise WlmError(f"{folder}: cannot export there: {error.strerror or error}") from error
+    if empty:
+        return
+    try:
+        found = json.loads((folder / INFO_FILE).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        found = None
+    if not isinstance(found, dict) or found.get("format") != FORMAT:
+        raise WlmError(f"{folder}: expected an empty folder or one of an earlier export, found other files")
+
+
+def _steps(model: ProbeModel) -> np.ndarray:
+    """What a code counts, of each number; float32 [10 + L], as ``ProbeModel.gaussians`` has it."""
+    low, high = model.bounds
+    levels = np.full(len(low), 2**model.profile.bits - 1, np.float32)
+    levels[CENTRE] = 2**CENTRE_BITS - 1
+    return (high - low) / levels
+
+
+def _gaussian_bytes(model: ProbeModel) -> bytes:
+    words = gaussian_words(model.profile.latent)
+    codes = np.zeros((model.count, 2 * words), "<u2")
+    whole = np.concatenate([model.centre, model.code], 1)
+    codes[:, : whole.shape[1]] = whole
+    with np.errstate(over="ignore"):
+        head = np.array([*model.origin, model.extent, *model.size, model.gain, model.profile.cut], "<f4")
+    if not (np.isfinite(head).all() and head[3] > 0):
+        raise WlmError(f"{model.name}: cannot export: the probes' box is too large or too small for floats")
+    count = np.array([model.count], "<u4")
+    numbers = np.concatenate([model.bounds[0], _steps(model)]).astype("<f4")
+    return head.tobytes() + count.tobytes() + numbers.tobytes() + codes.tobytes()
+
+
+def _network_bytes(model: ProbeModel) -> bytes:
+    """The network in 4 x 4 blocks, as the shader reads it."""
+    profile = model.profile
+    sizes = [profile.latent + 3, profile.hidden, profile.hidden, model.outputs]
+    pieces, at = [], 0
+    for inputs, outputs in zip(sizes, sizes[1:], strict=False):
+        layer = model.net[at : at + (inputs + 1) * outputs].reshape(inputs + 1, outputs)
+        at += layer.size
+        # The biases first, then a row for each input.
+        padded = np.zeros((1 + _up(inputs), _up(outputs)), "<f2")
+        padded[0, :outputs], padded[1 : inputs + 1, :outputs] = layer[-1], layer[:-1]
+        # [1 + I, O / 4, 4] to [O / 4, 1 + I, 4].
+        pieces.append(padded.reshape(len(padded), -1, _FOUR).swapaxes(0, 1).tobytes())
+    return b"".join(pieces)
+
+
+def _up(count: int) -> int:
+    return -(-count // _FOUR) * _FOUR
+
+
+def _reference_positions(model: ProbeModel) -> np.ndarray:
+    """Centres of Gaussians, spread evenly over their numbers, and a place outside the box; float64 [M, 3]."""
+    chosen = np.unique(np.linspace(0, model.count - 1, min(model.count, _REFERENCES)).astype(int))
+    inside = model.gaussians().centre[chosen].astype(np.float64)
+    return model.origin + model.extent * np.concatenate([inside, model.size[None] + 0.25])
+
+
+def _document(model: ProbeModel, sizes: dict[str, int]) -> str:
+    profile = model.profile
+    scale = model.gaussians().scale.astype(np.float64)
+    document: dict[str, Any] = {
+        "format": FORMAT,
+        "version": _VERSION,
+        "about": _ABOUT,
+        "name": model.name,
+        "source": model.source,
+        "bytes": sizes,
+        "probes": model.probes,
+        "outputs": model.outputs,
+        "coefficients": sh_count(model.outputs),
+        "convention": HOUSE,
+        "gaussians": model.count,
+        "latent": profile.latent,
+        "hidden": profile.hidden,
+        "support": profile.support,
+        "cut": profile.cut,
+        "origin": model.origin.tolist(),
+        "extent": model.extent,
+        "size": model.size.tolist(),
+        "gain": model.gain,
+        "low": _numbers(model.bounds[0]),
+        "step": _numbers(_steps(model)),
+        "first_gaussian_word": HEAD_WORDS + 2 * model.bounds.shape[1],
+        "words_per_gaussian": gaussian_words(profile.latent),
+        "slenderness": float(f"{(scale.max(1) / scale.min(1)).max():.3g}"),
+        "dead": np.flatnonzero(model.dead).tolist(),
+    }
+    text = json.dumps(document, indent=1, allow_nan=False)
+    # One number a line would be most of the file. Strings hold no raw line break, so that none is touched.
+    return _LIST_OF_NUMBERS.sub(lambda found: "[" + " ".join(found[1].split()) + "]", text) + "\n"
+
+
+def _numbers(values: np.ndarray) -> list[float]:
+    """With the 9 digits that tell every float32 from its neighbours."""
+    return [float(f"{value:.9g}") for value in values.tolist()]
