@@ -56,7 +56,7 @@ def test_nan_is_written_as_null_and_infinity_refused(tmp_path):
         write_json(tmp_path / "nowhere" / "r.json", [FULL], {})
 
 
-def test_a_run_keeps_what_other_systems_left(tmp_path):
+def test_a_run_keeps_what_other_systems_and_scenes_left(tmp_path):
     path = tmp_path / "results.json"
     write_json(path, [FULL, replace(FULL, option="H")], {"date": "1"})
     write_json(path, [BARE], {"date": "2"})
@@ -70,6 +70,8 @@ def test_a_run_keeps_what_other_systems_left(tmp_path):
     # Of a run of both, the other system's rows stay with its environment.
     write_json(path, [replace(BARE, psnr=1.0)], {"date": "5"})
     assert read_runs(path) == [Run({"date": "4"}, [FULL]), Run({"date": "5"}, [replace(BARE, psnr=1.0)])]
+    write_json(path, [replace(FULL, scene="another")], {"date": "6"})
+    assert [run.environment["date"] for run in read_runs(path)] == ["4", "5", "6"]
 
 
 def test_what_is_no_result_file_is_not_replaced(tmp_path):

@@ -1,15 +1,35 @@
 """Every kernel is compiled for a GPU (sm_90), which needs none: what a machine without one can say of that half."""
 
+import importlib
 from collections.abc import Iterable
 from pathlib import Path
 
 import pytest
 import warp as wp
 
-from wlm_kernels import mlp, temporal_decode, temporal_step
+from wlm_kernels import (
+    gaussian_sum,
+    mlp,
+    probe_decode,
+    probe_network,
+    probe_optimiser,
+    probe_step,
+    temporal_decode,
+    temporal_step,
+)
 
 ARCHITECTURE = 90
-MODULES = ("blocks", "grids", "mlp", "temporal_gather", "temporal_decode")
+MODULES = (
+    "blocks",
+    "gaussian_cubes",
+    "gaussian_sum",
+    "grids",
+    "mlp",
+    "probe_step",
+    "temporal_decode",
+    "temporal_gather",
+    "volume",
+)
 WIDTHS = (8, 17, 32, 64)
 
 
@@ -39,7 +59,7 @@ def _slow_but(first: object, others: Iterable[object]) -> list:
 @pytest.mark.parametrize("name", MODULES)
 def test_modules(name: str, tmp_path: Path):
     """The kernels that have one form."""
-    _compile(f"wlm_kernels.{name}", tmp_path)
+    _compile(importlib.import_module(f"wlm_kernels.{name}"), tmp_path)
 
 
 @pytest.mark.parametrize("gelu", _slow_but("fast", ["exact", "tanh"]))
@@ -68,3 +88,24 @@ def test_exact_decode(dynamic: bool, hidden: int, tmp_path: Path):
 def test_strip_decode(hidden: int, tmp_path: Path):
     """Decoding four texels a thread."""
     _compile_all(vars(temporal_decode.strip_kernels(hidden, "fast")).values(), tmp_path)
+
+
+@pytest.mark.parametrize("latent", _slow_but(9, [1, 12, 32]))
+def test_gaussians(latent: int, tmp_path: Path):
+    """The sum of Gaussians at any point, a training step's, and the update."""
+    _compile_all(vars(gaussian_sum.sum_kernels(latent)).values(), tmp_path / "sum")
+    _compile_all(vars(probe_step.step_kernels(latent, "cuda")).values(), tmp_path / "step")
+    _compile_all([probe_optimiser.update_kernel(latent)], tmp_path / "update")
+
+
+@pytest.mark.parametrize(
+    ("latent", "hidden", "outputs"),
+    [
+        (9, 64, 27),
+        *(pytest.param(*shape, marks=pytest.mark.slow) for shape in [(1, 8, 3), (12, 48, 12), (12, 128, 75)]),
+    ],
+)
+def test_probe_network(latent: int, hidden: int, outputs: int, tmp_path: Path):
+    """The network in training and in decode, whose CUDA forms the CPU never runs."""
+    _compile_all(vars(probe_network.network_kernels(latent, hidden, outputs, "cuda")).values(), tmp_path / "network")
+    _compile_all(vars(probe_decode.decode_kernels(latent, hidden, outputs, "cuda")).values(), tmp_path / "decode")

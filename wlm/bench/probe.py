@@ -1,6 +1,6 @@
 """The probe system against itself, plain torch, the PCA family and an engine's packing: size, speed and error.
 
-For each set these kinds of rows:
+For each set these kinds of rows, but where another is named:
 
 - method "ours", a profile each, and the first profile over the ratios of gaussian-probe-compression, tables 2 and 3:
   the file, the fit with the writing, the errors of the decode against the input, and the decode time of all live
@@ -8,8 +8,8 @@ For each set these kinds of rows:
 - method "decode", the first profile, a way to find and to bound the Gaussians each: what they cost and what they get
   wrong. "sphere" is the paper's way (eq. 6), another fit, in which Gaussians reach a sphere; "sphere lists" only finds
   the ellipsoids of the first fit by their spheres. The cuts below the profile's are those of the decode alone.
-- method "fit", the first profile: the speed of the fit alone, and method "dense torch": as many steps in plain torch,
-  all of them on CUDA, else a few.
+- method "fit", the first profile on the first set alone: the speed of the fit, and method "dense torch": as many steps
+  in plain torch, all of them on CUDA, else a few.
 - the rivals of ``wlm.baselines.probes`` at the bytes of the first profile's file and at three times as many, and
   Unreal's packing, which has one size. A bit a probe for the dead ones is counted for them too.
 - method "volume": a walk with the cascaded volume over the decoder, and a teleport into an empty one.
@@ -35,7 +35,7 @@ from wlm import interop
 from wlm.baselines.dense_gaussians import DenseFit
 from wlm.baselines.probes import Result, at_bytes, unreal_packing
 from wlm.bench.plot import Panel
-from wlm.bench.runner import Row, run_peers
+from wlm.bench.runner import Row, read_json, run_peers
 from wlm.errors import WlmError
 from wlm.probe import codec
 from wlm.probe.data import ProbeSet, load_probes
@@ -47,7 +47,7 @@ from wlm.probe.reference import decode64
 from wlm.probe.volume import SIZES, Volume
 from wlm.probe.walk import EYE_HEIGHT, camera_path, summary, walk
 
-__all__ = ["PANELS", "PROFILES", "RATIOS", "run", "run_rows"]
+__all__ = ["PANELS", "PROFILES", "RATIOS", "run", "run_rivals", "run_rows"]
 
 PROFILES = ("standard", "compact", "paper")
 """Profiles of a run; the first is the one that the other rows are about."""
@@ -86,6 +86,7 @@ def run(
     device: str,
     probes_path: str | os.PathLike[str] | None = None,
     keys: Sequence[str] = (),
+    rivals: bool = True,
     progress: Note | None = None,
 ) -> list[Row]:
     """Measures the probe system on one file.
@@ -97,6 +98,8 @@ def run(
         probes_path: A file as ``wlm.probe.data.load_probes`` reads it; None: the checkout's
             ``demos/data/probes/street.npz``.
         keys: Which of the file's arrays, one set of rows each; none: the only one, or noon and night of the demo's.
+        rivals: With the PCA family and Unreal's packing, which take minutes on the CPU and no GPU: ``run_rivals``
+            has them alone.
         progress: Called with a line before each part of the work.
 
     Returns:
@@ -105,12 +108,7 @@ def run(
     Raises:
         WlmError: The file, a key or the device isn't there, or a fit diverged.
     """
-    if probes_path is None:
-        probes_path = Path(wlm.__file__).resolve().parents[1] / "demos" / "data" / "probes" / "street.npz"
-        if not probes_path.is_file():
-            raise WlmError("bench probe: the demo's probes come with a checkout alone; expected --probes FILE")
-        keys = keys or _DEMO_KEYS[: 1 if quick else None]
-    sets = [load_probes(probes_path, key=key) for key in keys or (None,)]
+    sets = _load(probes_path, keys or (_DEMO_KEYS[: 1 if quick else None] if probes_path is None else ()))
     profiles = [load_profile(name) for name in PROFILES]
     if quick:
         steps = max(200, _QUICK_PROBE_STEPS // max(int(one.live.sum()) for one in sets))
@@ -120,10 +118,48 @@ def run(
         profiles,
         device=device,
         ratios=() if quick else RATIOS,
-        sizes=(1,) if quick else tuple(_SIZES),
+        sizes=() if not rivals else (1,) if quick else tuple(_SIZES),
         frames=_QUICK_FRAMES if quick else _FRAMES,
         progress=progress,
     )
+
+
+def run_rivals(
+    results: str | os.PathLike[str],
+    *,
+    probes_path: str | os.PathLike[str] | None = None,
+    keys: Sequence[str] = (),
+    progress: Note | None = None,
+) -> list[Row]:
+    """Measures the rivals alone, at the bytes that our first profile took on another machine.
+
+    Args:
+        results: What a former run wrote, maybe without rivals.
+        probes_path: As for ``run``.
+        keys: As for ``run``.
+        progress: As for ``run``.
+
+    Returns:
+        The rows of the rivals, computed on the CPU.
+
+    Raises:
+        WlmError: As ``run``, or ``results`` lacks the first profile of a set.
+    """
+    ours = {row.scene: row.bytes for row in read_json(results)[0] if (row.method, row.option) == ("ours", PROFILES[0])}
+    sets = _load(probes_path, keys or (_DEMO_KEYS if probes_path is None else ()))
+    benches = [_Bench(probes, "cpu", progress or (lambda line: None)) for probes in sets]
+    missing = [bench.scene for bench in benches if not ours.get(bench.scene)]
+    if missing:
+        raise WlmError(f"{results}: expected a row of profile {PROFILES[0]} of {missing[0]}")
+    return [row for bench in benches for row in bench.rival_rows(ours[bench.scene], tuple(_SIZES))]
+
+
+def _load(path: str | os.PathLike[str] | None, keys: Sequence[str]) -> list[ProbeSet]:
+    if path is None:
+        path = Path(wlm.__file__).resolve().parents[1] / "demos" / "data" / "probes" / "street.npz"
+        if not path.is_file():
+            raise WlmError("bench probe: the demo's probes come with a checkout alone; expected --probes FILE")
+    return [load_probes(path, key=key) for key in keys or (None,)]
 
 
 def run_rows(
@@ -144,7 +180,7 @@ def run_rows(
         profiles: At least one; all but the rows "ours" are about the first.
         device: "cpu" or "cuda:0".
         ratios: Further ratios of the first profile; its own is left out.
-        sizes: Of the rivals, in bytes of the first profile's file: 1, 3.
+        sizes: Of the rivals, in bytes of the first profile's file: 1, 3; none: no rivals.
         frames: Of the walk.
         repeats: Samples of each decode time; None: 30 on CUDA, 5 on the CPU, where a sample is a whole set.
         progress: As for ``run``.
@@ -173,9 +209,10 @@ def run_rows(
         peers += bench.decode_rows(first)
         bench.note("timing the decoders, in turns")
         rows += run_peers(peers, device, warmup=1 if few else 5, repeats=repeats)
-        rows += bench.fit_rows(first)
-        rows += [bench.rival_row(name, first.bytes, times) for times in sizes for name in _RIVALS]
-        rows.append(bench.unreal_row())
+        if probes is sets[0]:
+            rows += bench.fit_rows(first)
+        if sizes:
+            rows += bench.rival_rows(first.bytes, sizes)
         rows += bench.volume_rows(first.model, frames)
     return rows
 
@@ -308,6 +345,10 @@ class _Bench:
         if whole:
             row = replace(row, psnr=_finite(evaluate(self._all(peer.decoded()), self.probes, fit.bytes).psnr))
         return [ours, row]
+
+    def rival_rows(self, size: int, sizes: Sequence[int]) -> list[Row]:
+        """The rivals at some times the size of a file, and Unreal's packing."""
+        return [*(self.rival_row(name, size, times) for times in sizes for name in _RIVALS), self.unreal_row()]
 
     def rival_row(self, name: str, size: int, times: int) -> Row:
         """A rival at some times the size of a file."""

@@ -24,13 +24,13 @@ def report(paths: Sequence[str | os.PathLike[str]]) -> str:
     parts = ["# Results\n", "Made from the files under `benchmarks/` by `wlm bench report`.\n"]
     for path in paths:
         # By name, so that a part stays in its place when it is measured again.
-        runs = sorted(read_runs(path), key=_systems)
+        runs = sorted(read_runs(path), key=lambda run: (_systems(run), _scenes(run)))
         first = runs[0].environment
         parts.append(f"## {first['device_name'] or first['device']}: `{Path(path).name}`\n")
         for run in runs:
             environment = run.environment
             if len(runs) > 1:
-                parts.append(f"### {', '.join(_systems(run))}\n")
+                parts.append(f"### {', '.join(_systems(run))}: {', '.join(_scenes(run))}\n")
             cuda = f", CUDA {environment['cuda']}" if environment.get("cuda") else ""
             parts.append(
                 f"`{environment['command']}`, {environment['date'][:10]}; {environment['threads']} threads, Python "
@@ -38,6 +38,10 @@ def report(paths: Sequence[str | os.PathLike[str]]) -> str:
             )
             parts.append(table(run.rows))
     return "\n".join(parts)
+
+
+def _scenes(run: Run) -> list[str]:
+    return sorted({row.scene for row in run.rows})
 
 
 def _systems(run: Run) -> list[str]:

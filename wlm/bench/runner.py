@@ -1,9 +1,9 @@
 """The rows that every system reports, how peers are run into them, and how they are kept.
 
 A row is one method with one option on one scene: what it weighs, how long it takes, how wrong it is. A result
-file is of one machine, and its runs are of different systems. It is JSON: `{"format": "wlm-bench", "version": 2,
-"runs": [{"environment": {...}, "rows": [{...}, ...]}, ...]}`, with null for what was not measured. In version 1 the
-environment and the rows of the one run stood in the place of the runs.
+file is of one machine, and its runs are of different systems or scenes. It is JSON: `{"format": "wlm-bench",
+"version": 2, "runs": [{"environment": {...}, "rows": [{...}, ...]}, ...]}`, with null for what was not measured. In
+version 1 the environment and the rows of the one run stood in the place of the runs.
 """
 
 from __future__ import annotations
@@ -150,7 +150,7 @@ _PACKAGES = {"numpy": "numpy", "torch": "torch", "warp": "warp-lang"}
 def write_json(path: str | Path, rows: Sequence[Row], environment: Mapping[str, object]) -> None:
     """Write a run to a result file, atomically: a reader sees the old file or the whole new one.
 
-    What the file holds of other systems is kept; what it holds of these systems is replaced.
+    What the file holds of other systems and scenes is kept; what it holds of a system's scene is replaced.
 
     Args:
         path: File to write; its folder must exist.
@@ -163,10 +163,10 @@ def write_json(path: str | Path, rows: Sequence[Row], environment: Mapping[str, 
     """
     path = Path(path)
     new = Run(dict(environment), list(rows))
-    systems = {row.system for row in rows}
+    measured = {(row.system, row.scene) for row in rows}
     kept = []
     for run in read_runs(path) if path.exists() else []:
-        others = [row for row in run.rows if row.system not in systems]
+        others = [row for row in run.rows if (row.system, row.scene) not in measured]
         if others:
             kept.append(Run(run.environment, others))
     document = {

@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from wlm.cli.console import check_output, note, quiet_warp
+from wlm.errors import WlmError
 
 __all__ = ["app"]
 
@@ -51,6 +52,17 @@ def probe(
     keys: Annotated[
         list[str] | None, typer.Option("--key", help="Which of the file's arrays; may be given several times.")
     ] = None,
+    rivals: Annotated[
+        bool, typer.Option("--rivals/--no-rivals", help="With the PCA family, which takes minutes on the CPU.")
+    ] = True,
+    rivals_at: Annotated[
+        Path | None,
+        typer.Option(
+            "--rivals-at",
+            metavar="FILE.json",
+            help="The PCA family alone, at the bytes that our files have in this result file.",
+        ),
+    ] = None,
     json_path: Annotated[
         Path | None, typer.Option("--json", metavar="FILE.json", help="Write the rows and the environment.")
     ] = None,
@@ -61,16 +73,27 @@ def probe(
     """Light probes: PSNR, size and decode time of the profiles, of their decodes and of the PCA family."""
     _check_outputs(json_path, plot_path)
     quiet_warp()
-    from wlm.bench.probe import PANELS, run
+    from wlm.bench import read_json
+    from wlm.bench.probe import PANELS, run, run_rivals
     from wlm.interop import check_device
 
     device = check_device(device)
-    rows = run(quick=quick, device=device, probes_path=probes_path, keys=keys or (), progress=note)
-    command = f"wlm bench probe{' --quick' if quick else ''} --device {device}"
+    beside: list = []  # what the plot shows besides the rows
+    common = {"probes_path": probes_path, "keys": keys or (), "progress": note}
+    if rivals_at is not None:
+        if quick or not rivals or device != "cpu":
+            raise WlmError("--rivals-at: expected without --quick, --no-rivals and --device: the rivals need no GPU")
+        rows = run_rivals(rivals_at, **common)
+        scenes = {row.scene for row in rows}
+        beside = [row for row in read_json(rivals_at)[0] if row.system == "probe" and row.scene in scenes]
+        command = f"wlm bench probe --rivals-at {rivals_at.name}"
+    else:
+        rows = run(quick=quick, device=device, rivals=rivals, **common)
+        command = f"wlm bench probe{' --quick' if quick else ''}{'' if rivals else ' --no-rivals'} --device {device}"
     if probes_path is not None:
         command += f" --probes {probes_path.name}"
     command += "".join(f" --key {key}" for key in keys or ())
-    _finish(rows, device, command, json_path, plot_path, PANELS)
+    _finish(rows, device, command, json_path, plot_path, PANELS, beside)
 
 
 @app.command()
@@ -103,12 +126,14 @@ def _check_outputs(json_path: Path | None, plot_path: Path | None) -> None:
         check_output(plot_path, ".png", ".svg", ".pdf")
 
 
-def _finish(rows: list, device: str, command: str, json_path: Path | None, plot_path: Path | None, panels) -> None:
+def _finish(
+    rows: list, device: str, command: str, json_path: Path | None, plot_path: Path | None, panels, beside=()
+) -> None:
     """Writes what was asked for, and prints the table."""
     from wlm.bench import describe_environment, plot, table, write_json
 
     if json_path is not None:
         write_json(json_path, rows, describe_environment(device, command))
     if plot_path is not None:
-        plot(rows, plot_path, panels)
+        plot([*beside, *rows], plot_path, panels)
     sys.stdout.write(table(rows))

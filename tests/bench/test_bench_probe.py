@@ -1,0 +1,94 @@
+"""The probe benchmark on a small room: every row has its figures, and they agree with the systems that they are of."""
+
+import numpy as np
+import pytest
+
+import wlm.bench.probe as bench
+from wlm.bench import plot, read_json, table, write_json
+from wlm.bench.probe import PANELS, run, run_rivals, run_rows
+from wlm.errors import WlmError
+from wlm.probe.data import from_arrays
+from wlm.probe.model import Profile
+
+STEPS = 120
+PROFILES = [
+    Profile(name="standard", ratio=0.1, latent=3, hidden=8, steps=STEPS),
+    Profile(name="other", ratio=0.1, latent=3, hidden=8, steps=STEPS, support="sphere"),
+]
+RIVALS = ["global PCA", "block PCA", "window PCA", "clustered PCA", "CPCA by signal", "moving basis"]
+
+
+def room(seed: int, name: str):
+    """300 probes in a room with a lamp, a tenth of them inside a wall."""
+    random = np.random.default_rng(seed)
+    position = random.uniform([0, 0, 0], [6, 2.5, 5], (300, 3))
+    near = np.exp(-((position - [2, 2, 3]) ** 2).sum(1) / 4)
+    values = near[:, None] * random.uniform(0.5, 1.0, 27) + 0.2 * np.sin(position @ random.normal(size=(3, 27)))
+    values[:30] = 0.0
+    return from_arrays(position, values.astype(np.float32), name=name)
+
+
+@pytest.fixture(scope="module")
+def sets():
+    return [room(0, "room"), room(1, "hall")]
+
+
+@pytest.fixture(scope="module")
+def rows(sets):
+    return run_rows(sets, PROFILES, device="cpu", ratios=(0.1, 0.2), sizes=(1, 3), frames=4, repeats=1)
+
+
+def test_every_row_has_its_figures(rows):
+    ours = [("ours", "standard"), ("ours", "other"), ("ours", "ratio 0.20")]
+    ways = ["none", "sphere", "sphere lists", "box", "exact", "exact, given order", "cut 2.5", "cut 2"]
+    fits = [("fit", f"standard {STEPS} steps"), ("dense torch", f"standard {STEPS} steps")]
+    rivals = [(name, size) for size in ("same bytes", "3x bytes") for name in RIVALS] + [("Unreal packing", "")]
+    volume = [("volume", "walk of 4 frames"), ("volume", "teleport")]
+    for scene, speed in (("room", fits), ("hall", [])):
+        names = [(row.method, row.option) for row in rows if row.scene == scene]
+        assert names == [*ours, *(("decode", way) for way in ways), *speed, *rivals, *volume]
+    for row in rows:
+        assert row.system == "probe" and row.notes
+        if row.method in ("ours", "decode"):
+            assert row.psnr > 10.0 and row.decode_ms > 0.0 and row.max_error < (1.0 if "cut" in row.option else 1e-4)
+        if row.method == "ours":
+            assert row.bpp == pytest.approx(row.bytes * 8 / 300) and row.encode_seconds > 0.0
+            assert "for 270 live probes" in row.notes
+
+
+def test_rivals_keep_to_the_bytes(rows):
+    ours = {row.scene: row for row in rows if (row.method, row.option) == ("ours", "standard")}
+    for row in rows:
+        if row.method in RIVALS and row.bytes is not None:
+            times = 3 if row.option == "3x bytes" else 1
+            assert row.bytes <= times * ours[row.scene].bytes and row.psnr > 5.0
+
+
+def test_rivals_alone_are_the_same(sets, rows, tmp_path, monkeypatch):
+    write_json(tmp_path / "rows.json", rows, {})
+    monkeypatch.setattr(bench, "_load", lambda path, keys: sets[:1])
+    alone = run_rivals(tmp_path / "rows.json", probes_path="room.npz")
+    beside = [row for row in rows if row.scene == "room" and row.method in [*RIVALS, "Unreal packing"]]
+    assert [(row.method, row.option, row.bytes, row.psnr) for row in alone] == [
+        (row.method, row.option, row.bytes, row.psnr) for row in beside
+    ]
+    write_json(tmp_path / "hall.json", [row for row in rows if row.scene == "hall"], {})
+    with pytest.raises(WlmError, match="expected a row of profile standard of room"):
+        run_rivals(tmp_path / "hall.json", probes_path="room.npz")
+
+
+def test_rows_make_a_file_a_table_and_a_plot(rows, tmp_path):
+    write_json(tmp_path / "rows.json", rows, {})
+    assert read_json(tmp_path / "rows.json")[0] == rows
+    assert len(table(rows).splitlines()) == 2 + len(rows)
+    plot(rows, tmp_path / "rows.png", PANELS)
+    assert (tmp_path / "rows.png").stat().st_size > 10_000
+
+
+def test_what_is_refused(sets, tmp_path):
+    with pytest.raises(WlmError, match="no such file"):
+        run(quick=True, device="cpu", probes_path=tmp_path / "absent.npz")
+    with pytest.raises(WlmError, match="device 'tpu'"):
+        run_rows(sets, PROFILES, device="tpu", ratios=(), sizes=(), frames=1)
+    with pytest.raises(ValueError, match="at least one set and one profile"):
+        run_rows(sets, [], device="cpu", ratios=(), sizes=(), frames=1)

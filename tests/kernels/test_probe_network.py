@@ -1,0 +1,180 @@
+"""The probes' network there and back: loss and every gradient against autograd in float64."""
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+from reference import probe_network as reference
+
+from kernels.compare import array, close, exact
+from wlm_kernels import probe_network, probe_step
+from wlm_kernels.probe_step import GROUP
+
+TOLERANCE = 1e-4  # of an array's largest gradient; float32 gives 3e-6 on the CPU, the GPU's own exp a little more
+# Latent, units, outputs: the standard profile, the least of each, and what no multiple of 4 or 8 fits; for the long
+# run the paper's alternatives and the largest.
+SHAPES = [
+    (9, 64, 27),
+    (1, 8, 3),
+    *(pytest.param(shape, marks=pytest.mark.slow) for shape in ((12, 48, 12), (9, 128, 75), (1, 128, 27), (12, 64, 3))),
+]
+BEHIND = 1e3  # what the padding holds: it must not matter
+
+
+def _layers(net: np.ndarray, shape: tuple[int, int, int]) -> list[np.ndarray]:
+    latent, hidden, outputs = shape
+    return [layer.numpy() for layer in reference.layers(torch.as_tensor(net), latent + 3, hidden, outputs)]
+
+
+class Pass:
+    """Probes, weights and targets on a device, and what a launch writes."""
+
+    def __init__(self, shape: tuple[int, int, int], count: int, device: str, parts: int = 1, seed: int = 1):
+        latent, hidden, outputs = self.shape = shape
+        self.count, self.device = count, device
+        self.padded = -(-count // GROUP) * GROUP
+        random = np.random.default_rng(seed)
+        self.launches = probe_network.network_kernels(latent, hidden, outputs, "cpu" if device == "cpu" else "cuda")
+        self.net = random.normal(size=self.launches.size).astype(np.float32)
+        for layer in _layers(self.net, shape):
+            layer[:-1] *= 1.5 / np.sqrt(len(layer) - 1)
+        # The last layer's unused columns hold no weights.
+        _layers(self.net, shape)[2][:, outputs:] = 0.0
+        self.x = random.random((self.padded, 3)).astype(np.float32)
+        self.f = random.normal(size=(parts, latent, self.padded)).astype(np.float32)
+        self.target = random.normal(size=(outputs, self.padded)).astype(np.float32)
+        self.target[:, count:] = BEHIND
+        self.f[:, :, count:] = BEHIND
+        self.weight = random.random(outputs).astype(np.float32)
+        groups = self.groups = probe_step.Groups()
+        groups.x, groups.count = array(self.x, wp.vec3, device), count
+        self.arrays = [array(v, float, device) for v in (self.f, self.target, self.weight, self.net)]
+        lanes = self.launches.parts(self.padded)
+        self.grad_f = wp.full((latent, self.padded), np.nan, dtype=float, device=device)
+        self.partial = wp.zeros((lanes, len(self.net)), dtype=float, device=device)
+        self.loss = wp.zeros(lanes, dtype=float, device=device)
+
+    def launch(self, *lane: int) -> None:
+        self.launches.launch(self.groups, *self.arrays, self.grad_f, self.partial, self.loss, *lane)
+
+    def found(self) -> tuple[float, np.ndarray, np.ndarray]:
+        """The loss, the gradient of f [L, N] with the padding, and that of the weights."""
+        return self.loss.numpy().sum(dtype=np.float64), self.grad_f.numpy(), self.partial.numpy().sum(0, np.float64)
+
+    def expected(self) -> tuple[float, np.ndarray, np.ndarray]:
+        """The same over the probes alone."""
+        net, f = exact(self.net, grad=True), exact(self.f.astype(np.float64).sum(0)[:, : self.count], grad=True)
+        x, target = exact(self.x[: self.count]), exact(self.target[:, : self.count])
+        loss = reference.loss(net, f, x, target, exact(self.weight), self.shape[1])
+        loss.backward()
+        return float(loss), f.grad.numpy(), net.grad.numpy()
+
+
+def _hold(run: Pass) -> None:
+    (loss, grad_f, grad), (want_loss, want_f, want) = run.found(), run.expected()
+    assert loss == pytest.approx(want_loss, rel=1e-5)
+    close(grad_f[:, : run.count], want_f, TOLERANCE, "gradient of the sums")
+    assert not grad_f[:, run.count :].any(), "probes behind the last one give nothing"
+    for i, (got_layer, want_layer) in enumerate(zip(_layers(grad, run.shape), _layers(want, run.shape), strict=True)):
+        assert np.abs(want_layer[:-1]).max() > 0 and np.abs(want_layer[-1]).max() > 0
+        close(got_layer[:-1], want_layer[:-1], TOLERANCE, f"weights of layer {i + 1}")
+        close(got_layer[-1], want_layer[-1], TOLERANCE, f"biases of layer {i + 1}")
+    assert not _layers(grad, run.shape)[2][:, run.shape[2] :].any(), "unused columns stay as they are"
+
+
+@pytest.mark.parametrize("shape", SHAPES, ids=lambda shape: "-".join(map(str, shape)))
+def test_against_autograd(device: str, shape: tuple[int, int, int]):
+    """Loss, gradient of the sums and of all weights, with a last group that is only half full."""
+    run = Pass(shape, 5 * GROUP + 29, device)
+    run.launch()
+    _hold(run)
+
+
+@pytest.mark.parametrize("count", [1, GROUP - 1, GROUP])
+def test_few_probes(device: str, count: int):
+    """One probe alone, and groups with one place or none left over."""
+    run = Pass((9, 64, 27), count, device)
+    run.launch()
+    _hold(run)
+
+
+def test_all_probes_are_padding(device: str):
+    """Nothing comes of no probes."""
+    run = Pass((9, 64, 27), 1, device)
+    run.groups.count = 0
+    run.launch()
+    loss, grad_f, grad = run.found()
+    assert loss == 0.0 and not grad_f.any() and not grad.any()
+
+
+def test_sums_in_parts(device: str):
+    """On CUDA the Gaussians' sum comes in parts."""
+    if device == "cpu":
+        pytest.skip("the CPU takes the sum whole")
+    run = Pass((9, 64, 27), 2 * GROUP, device, parts=probe_step.SPLITS)
+    run.launch()
+    _hold(run)
+
+
+def test_two_lanes_equal_one():
+    """On the CPU two threads add halves of the probes in buffers of their own."""
+    one, two = (Pass((9, 64, 27), 3 * GROUP - 5, "cpu") for _ in range(2))
+    one.launch()
+    assert not one.partial.numpy()[1].any() and one.loss.numpy()[1] == 0.0
+    two.launch(0, 70)
+    assert not two.partial.numpy()[1].any() and np.isnan(two.grad_f.numpy()[:, 70:]).all()
+    two.launch(70, two.padded - 70)
+    assert two.partial.numpy().any(1).all() and two.loss.numpy().all()
+    np.testing.assert_array_equal(two.grad_f.numpy(), one.grad_f.numpy())
+    close(two.partial.numpy().sum(0), one.partial.numpy().sum(0), 1e-6, "weights")
+    close(two.loss.numpy().sum(), one.loss.numpy().sum(), 1e-6, "loss")
+
+
+def test_lanes_add():
+    """On the CPU a launch adds to what its buffers hold."""
+    run = Pass((9, 64, 27), GROUP, "cpu")
+    run.launch()
+    loss, _, grad = run.found()
+    run.launch()
+    assert run.found()[0] == pytest.approx(2 * loss, rel=1e-6)
+    close(run.found()[2], 2 * grad, 1e-6)
+
+
+def test_same_bits_every_time(device: str):
+    """Nothing is added in an order that changes."""
+    first, second = (Pass((9, 64, 27), 300, device) for _ in range(2))
+    first.launch()
+    second.launch()
+    for a, b in zip(first.found(), second.found(), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_by_differences(device: str):
+    """The slope of the loss along a random direction of all weights and sums."""
+    run = Pass((9, 64, 27), 100, device)
+    run.launch()
+    _, grad_f, grad = run.found()
+    random = np.random.default_rng(4)
+    by_f, by_net = (random.normal(size=v.shape).astype(np.float32) for v in (run.f, run.net))
+    by_net = np.where(run.net != 0, by_net, 0).astype(np.float32)
+    along = (grad * by_net).sum() + (grad_f * by_f[0]).sum(dtype=np.float64)
+
+    def loss(step: float) -> float:
+        moved = Pass((9, 64, 27), 100, device)
+        moved.arrays[0].assign(run.f + np.float32(step) * by_f)
+        moved.arrays[3].assign(run.net + np.float32(step) * by_net)
+        moved.launch()
+        return moved.found()[0]
+
+    h = 2e-3
+    slope = (8.0 * (loss(h) - loss(-h)) - (loss(2 * h) - loss(-2 * h))) / (12.0 * h)
+    assert slope == pytest.approx(along, rel=1e-3)
+
+
+def test_sizes():
+    """How many weights there are, and that a block's probes fill a group."""
+    kernels = probe_network.network_kernels(9, 64, 27, "cpu")
+    assert kernels.size == 13 * 64 + 65 * 64 + 65 * 28 and kernels.parts(640) == probe_network.CPU_LANES
+    assert [probe_network.padded(n) for n in (1, 4, 27)] == [4, 4, 28]
+    for latent, hidden, outputs in ((1, 8, 3), (9, 64, 27), (12, 48, 12), (9, 128, 75), (32, 128, 75)):
+        assert GROUP % probe_network.probes_at_once(latent, hidden, outputs) == 0
