@@ -15,7 +15,7 @@ PROFILES = [
     Profile(name="standard", ratio=0.1, latent=3, hidden=8, steps=STEPS),
     Profile(name="other", ratio=0.1, latent=3, hidden=8, steps=STEPS, support="sphere"),
 ]
-RIVALS = ["global PCA", "block PCA", "window PCA", "clustered PCA", "CPCA by signal", "moving basis"]
+RIVALS = ["CPCA in halves", "global PCA", "block PCA", "window PCA", "clustered PCA", "CPCA by signal", "moving basis"]
 
 
 def room(seed: int, name: str):
