@@ -26,8 +26,11 @@ MODULES = (
     "grids",
     "mlp",
     "probe_step",
+    "raster",
+    "raster_gradient",
     "temporal_decode",
     "temporal_gather",
+    "texture",
     "volume",
 )
 WIDTHS = (8, 17, 32, 64)

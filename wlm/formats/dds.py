@@ -1,5 +1,5 @@
-"""DDS files of block-compressed textures and of two bytes a texel, with the DX10 header: a 2D texture or a
-volume, one mip level.
+"""DDS files of block-compressed textures and of a few uncompressed formats, with the DX10 header: a 2D texture or
+a volume, one mip level.
 
 A volume's slices follow each other, each a 2D grid of blocks (or of texels, row by row without padding).
 """
@@ -14,12 +14,22 @@ from wlm.formats.atomic import atomic_write
 
 __all__ = ["DXGI_FORMATS", "DdsTexture", "read_dds", "write_dds"]
 
-DXGI_FORMATS = {"R8G8_UNORM": 49, "BC6H_UF16": 95, "BC6H_SF16": 96, "BC7_UNORM": 98, "BC7_UNORM_SRGB": 99}
-"""The formats that can be written and their DXGI numbers: all with 16 bytes a block of 4 x 4 texels, except
-R8G8_UNORM with two bytes a texel."""
+DXGI_FORMATS = {
+    "R16G16B16A16_FLOAT": 10,
+    "R16G16_FLOAT": 34,
+    "R16G16_UNORM": 35,
+    "R8G8_UNORM": 49,
+    "BC6H_UF16": 95,
+    "BC6H_SF16": 96,
+    "BC7_UNORM": 98,
+    "BC7_UNORM_SRGB": 99,
+}
+"""The formats that can be written and their DXGI numbers: those of BC with 16 bytes a block of 4 x 4 texels, the
+others with a texel's channels one after another, little-endian."""
 
 _BLOCK_BYTES = 16
-_TEXEL_BYTES = {"R8G8_UNORM": 2}  # of the formats without blocks
+# Of the formats without blocks.
+_TEXEL_BYTES = {"R16G16B16A16_FLOAT": 8, "R16G16_FLOAT": 4, "R16G16_UNORM": 4, "R8G8_UNORM": 2}
 _MAX_SIDE = 16384  # texels; the limit of a 2D texture in Direct3D 11 and 12
 _MAX_DEPTH = 2048
 
@@ -75,7 +85,7 @@ def write_dds(
     Args:
         path: The file to write; its folder must exist.
         blocks: 16 bytes a block, ceil(width / 4) * ceil(height / 4) blocks a slice, slices one after another;
-            of R8G8_UNORM two bytes a texel, row by row.
+            of a format without blocks the texels, row by row.
         width: Texels, 1 to 16384.
         height: Texels, 1 to 16384.
         depth: Slices, 1 to 2048.

@@ -1,0 +1,387 @@
+"""What comes in: every stated behaviour of `wlm.atlas.data`, the coverage of texels, and a mesh with new UVs."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from wlm.atlas.coverage import covered_texels, touched_texels
+from wlm.atlas.data import from_arrays, load_mesh, write_mesh
+from wlm.errors import WlmError
+from wlm.formats.exr import HALF_MAX, write_exr
+from wlm.formats.gltf import document_from_arrays, read_gltf
+from wlm.formats.gltf_writer import Replacement, write_glb
+
+HEIGHT, WIDTH = 6, 8
+POSITION = np.array([[0, 0, 0], [2, 0, 0], [0, 3, 0], [2, 3, 0]], np.float64)
+TRIANGLE = np.array([[0, 1, 2], [2, 1, 3]])
+# Columns 2 to 5 and rows 0 to 2.
+UV = np.array([[0.25, 0], [0.75, 0], [0.25, 0.5], [0.75, 0.5]], np.float64)
+OBJ = """v 0 0 0\nv 2 0 0\nv 0 3 0\nv 2 3 0
+vt 0.25 1\nvt 0.75 1\nvt 0.25 0.5\nvt 0.75 0.5
+f 1/1 2/2 3/3\nf 3/3 2/2 4/4\n"""
+
+
+def _lightmap() -> np.ndarray:
+    """Texels that half floats hold exactly, no two alike."""
+    return np.arange(1, HEIGHT * WIDTH * 3 + 1, dtype=np.float32).reshape(HEIGHT, WIDTH, 3) / 64
+
+
+def _chart() -> np.ndarray:
+    mask = np.zeros((HEIGHT, WIDTH), bool)
+    mask[0:3, 2:6] = True
+    return mask
+
+
+def _files(folder: Path, second: np.ndarray | None = None) -> tuple[Path, Path]:
+    """Writes a mesh, with a second UV set if one is given, and its lightmap."""
+    document, primitive = document_from_arrays(POSITION, TRIANGLE, UV, "square")
+    new = [] if second is None else [Replacement(primitive, np.arange(4), TRIANGLE, second)]
+    write_glb(folder / "square.glb", document, new, 1)
+    write_exr(folder / "light.exr", _lightmap())
+    return folder / "square.glb", folder / "light.exr"
+
+
+def _message(call, *args: object, **options: object) -> str:
+    with pytest.raises(WlmError) as caught:
+        call(*args, **options)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def _with(array: np.ndarray, at: object, value: object) -> np.ndarray:
+    changed = array.copy()
+    changed[at] = value
+    return changed
+
+
+@pytest.mark.parametrize("kind", ["glb", "obj", "arrays"])
+def test_a_mesh_from_files_and_arrays(tmp_path, kind):
+    glb, light = _files(tmp_path)
+    (tmp_path / "square.obj").write_text(OBJ)
+    if kind == "arrays":
+        mesh = from_arrays(POSITION, TRIANGLE, UV, _lightmap(), name="square")
+    else:
+        mesh = load_mesh(glb.with_suffix(f".{kind}"), light)
+    assert (mesh.name, mesh.uv_set, mesh.warnings) == ("square", 0, ())
+    np.testing.assert_array_equal(mesh.position, POSITION)
+    np.testing.assert_array_equal(mesh.triangle, TRIANGLE)
+    np.testing.assert_array_equal(mesh.uv, UV)
+    np.testing.assert_array_equal(mesh.lightmap, _lightmap())
+    np.testing.assert_array_equal(mesh.mask, _chart())
+    assert mesh.active.all() and [mesh.position.dtype, mesh.uv.dtype] == [np.float64] * 2
+    assert [mesh.triangle.dtype, mesh.lightmap.dtype, mesh.mask.dtype] == [np.int32, np.float32, bool]
+    assert mesh.source == from_arrays(POSITION, TRIANGLE, UV, _lightmap()).source
+
+
+def test_source_names_all_that_counts():
+    base = (POSITION, TRIANGLE, UV, _lightmap(), _chart())
+    sources = {from_arrays(*base).source}
+    changes = ((0, (1, 1), 0.5), (1, 1, [2, 3, 1]), (2, (1, 0), 0.8), (3, (5, 0, 1), 7.0), (4, (5, 5), True))
+    for which, at, value in changes:
+        arrays = list(base)
+        arrays[which] = _with(arrays[which], at, value)
+        sources.add(from_arrays(*arrays).source)
+    assert len(sources) == 6 and all(len(source) == 16 for source in sources)
+
+
+def test_the_second_set_is_the_lightmaps_unless_told(tmp_path):
+    files = _files(tmp_path, UV + 0.125)
+    mesh = load_mesh(*files)
+    assert mesh.uv_set == 1
+    np.testing.assert_array_equal(mesh.uv, UV + 0.125)
+    mesh = load_mesh(*files, uv_set=0)
+    assert mesh.uv_set == 0
+    np.testing.assert_array_equal(mesh.uv, UV)
+    assert "expected the UV set TEXCOORD_2, found TEXCOORD_0, TEXCOORD_1" in _message(load_mesh, *files, uv_set=2)
+    write_mesh(files[0], mesh, mesh.uv[mesh.triangle] * 0.5)
+    assert sorted(load_mesh(*files).parts[0].primitive.uv) == [0, 1, 2] and load_mesh(*files).uv_set == 1
+
+
+def test_several_primitives_nodes_and_one_without_the_set(tmp_path):
+    glb, light = _files(tmp_path, UV)
+    document, _ = read_gltf(glb)
+    (primitive,) = document.content["meshes"][0]["primitives"]
+    bare = {**primitive, "attributes": {"POSITION": primitive["attributes"]["POSITION"]}}
+    document.content["meshes"][0]["primitives"] = [bare, primitive]
+    document.content["nodes"].append({"mesh": 0, "translation": [5, 0, 0]})
+    document.content["scenes"][0]["nodes"] = [0, 1]
+    write_glb(glb, document, [], 1)
+    mesh = load_mesh(glb, light)
+    np.testing.assert_array_equal(mesh.position, np.concatenate([POSITION, POSITION + [5, 0, 0]]))
+    np.testing.assert_array_equal(mesh.triangle, np.concatenate([TRIANGLE, TRIANGLE + 4]))
+    assert [(part.vertex, part.triangle, part.primitive.node) for part in mesh.parts] == [(0, 0, 0), (4, 2, 1)]
+    np.testing.assert_array_equal(mesh.mask, _chart())
+    left_out, overlap = mesh.warnings
+    assert "2 primitives of 4 without TEXCOORD_1, first node 0, mesh 0, primitive 0: left out" in left_out
+    assert overlap == "square: 12 texels in several triangles: their UVs overlap"
+    corner_uv = np.random.default_rng(2).integers(0, 64, (4, 3, 2)) / 64
+    assert write_mesh(tmp_path / "out.glb", mesh, corner_uv) == 2
+    again = load_mesh(tmp_path / "out.glb", light, uv_set=2)
+    np.testing.assert_array_equal(again.uv[again.triangle], corner_uv)
+    np.testing.assert_array_equal(again.position[again.triangle], mesh.position[mesh.triangle])
+    unchanged = read_gltf(tmp_path / "out.glb")[1][0]
+    assert list(unchanged.uv) == [] and np.array_equal(unchanged.triangle, TRIANGLE)
+
+
+def test_no_uvs_no_triangles_and_other_names(tmp_path):
+    glb, light = _files(tmp_path)
+    document, _ = read_gltf(glb)
+    del document.content["meshes"][0]["primitives"][0]["attributes"]["TEXCOORD_0"]
+    write_glb(glb, document, [], 1)
+    assert "the mesh has no UVs: expected TEXCOORD_0 or TEXCOORD_1" in _message(load_mesh, glb, light)
+    (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3")
+    assert "the mesh has no UVs: expected vt" in _message(load_mesh, tmp_path / "a.obj", light)
+    (tmp_path / "a.gltf").write_text(json.dumps({"asset": {"version": "2.0"}}))
+    assert "a.gltf: has no triangles" in _message(load_mesh, tmp_path / "a.gltf", light)
+    (tmp_path / "a.obj").write_text("v 0 0 0\nvt 0 0\n")
+    assert "a.obj: has no triangles" in _message(load_mesh, tmp_path / "a.obj", light)
+    assert "expected a name that ends in .glb" in _message(load_mesh, tmp_path / "a.fbx", light)
+    assert "has no triangles" in _message(from_arrays, POSITION, TRIANGLE[:0], UV, _lightmap())
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"position": POSITION[:, :2]}, "position: expected numbers [N, 3], got float64 (4, 2)"),
+        ({"uv": POSITION}, "uv: expected numbers [N, 2]"),
+        ({"uv": UV[:3]}, "uv: expected 4 rows, one a position, got 3"),
+        ({"triangle": TRIANGLE * 1.0}, "triangle: expected numbers [N, 3], got float64"),
+        ({"triangle": TRIANGLE + 1}, "triangle: expected vertices 0 to 3, found 1 to 4"),
+        ({"triangle": TRIANGLE - 1}, "triangle: expected vertices 0 to 3, found -1 to 2"),
+        ({"lightmap": _lightmap()[..., :2]}, "expected a lightmap [H, W, 3]"),
+        ({"lightmap": _lightmap()[:0]}, "expected a lightmap [H, W, 3]"),
+        ({"mask": _chart()[:3]}, "expected a mask of (6, 8), got (3, 8)"),
+        ({"mask": np.zeros((HEIGHT, WIDTH))}, "thing: mask: the mask is empty"),
+        (
+            {"position": _with(POSITION, (3, 1), np.nan)},
+            "POSITION of vertex 3: expected finite numbers, got (2, nan, 0)",
+        ),
+        ({"position": _with(POSITION, (1, 0), 1e39)}, "POSITION of vertex 1: expected finite numbers, got (inf, 0, 0)"),
+        ({"uv": _with(UV, (0, 1), -np.inf)}, "TEXCOORD_0 of vertex 0: expected finite numbers, got (0.25, -inf)"),
+        ({"lightmap": _with(_lightmap(), np.s_[:3], np.nan)}, "lightmap: no texel inside the mask is finite"),
+    ],
+)
+def test_what_is_refused(change, words):
+    arrays = {"position": POSITION, "triangle": TRIANGLE, "uv": UV, "lightmap": _lightmap(), **change}
+    text = _message(from_arrays, **arrays, name="thing")
+    assert words in text and text.startswith("thing")
+
+
+def test_uvs_outside_are_clamped():
+    uv = UV.copy()
+    uv[[1, 3], 0] = 1.5
+    uv[0, 1] = -1e-3
+    mesh = from_arrays(POSITION, TRIANGLE, uv, _lightmap())
+    np.testing.assert_array_equal(mesh.uv, np.clip(uv, 0, 1))
+    assert mesh.warnings == ("array: 3 vertices with UVs outside [0, 1], by up to 0.5: clamped",)
+    assert np.array_equal(mesh.mask, np.pad(np.ones((3, 6), bool), ((0, 3), (2, 0))))
+
+
+def test_triangles_without_area_are_kept_and_take_no_part():
+    position = np.concatenate([POSITION, POSITION[:1], [[1, 0, 0]]])
+    uv = np.concatenate([UV, [[1, 1], [1, 0]]])
+    # None in space (one point twice, three in a line); none in UV; one whose corners are one vertex.
+    triangle = np.concatenate([TRIANGLE, [[0, 4, 1], [0, 5, 1], [1, 1, 1]]])
+    mesh = from_arrays(position, triangle, uv, _lightmap())
+    assert mesh.active.tolist() == [True, True, False, False, False] and len(mesh.triangle) == 5
+    assert mesh.warnings == ("array: 3 triangles without area in space or in UV: left out",)
+    np.testing.assert_array_equal(mesh.mask, _chart())
+    flat = from_arrays(POSITION, np.array([[0, 1, 2], [0, 1, 3]]), _with(UV, 3, [0.5, 0]), _lightmap())
+    assert flat.active.tolist() == [True, False]
+    assert "no triangle has an area" in _message(from_arrays, POSITION, TRIANGLE, UV * 0, _lightmap())
+
+
+@pytest.mark.parametrize("scale", [1e-30, 1e-12, 1e30])
+def test_small_and_huge_triangles_have_area(scale):
+    mesh = from_arrays(POSITION * scale, TRIANGLE, UV * min(scale, 1.0), _lightmap())
+    assert mesh.active.all() and mesh.warnings == ()
+    assert mesh.mask[0, 2 if scale > 1 else 0]
+
+
+def test_one_triangle_within_a_texel():
+    uv = np.array([[0.51, 0.52], [0.52, 0.52], [0.51, 0.53]])
+    mesh = from_arrays(POSITION[:3], TRIANGLE[:1], uv, _lightmap())
+    assert np.argwhere(mesh.mask).tolist() == [[3, 4]]
+
+
+def test_broken_texels_are_repaired_as_stated():
+    lightmap = _lightmap()
+    lightmap[0, 2, 1], lightmap[2, 5, 0] = np.nan, np.inf  # inside
+    lightmap[1, 3], lightmap[1, 4, 2] = -1, 1e6
+    lightmap[5, 0], lightmap[5, 1], lightmap[5, 2] = np.nan, -1, 1e6  # outside
+    before = lightmap.copy()
+    mesh = from_arrays(POSITION, TRIANGLE, UV, lightmap)
+    np.testing.assert_array_equal(lightmap, before)
+    assert any(np.array_equal(mesh.lightmap[0, 2], before[at]) for at in ((0, 3), (1, 2)))
+    assert any(np.array_equal(mesh.lightmap[2, 5], before[at]) for at in ((2, 4), (1, 5)))
+    assert (mesh.lightmap[1, 3] == 0).all() and mesh.lightmap[1, 4, 2] == HALF_MAX
+    assert [mesh.lightmap[5, i].max() for i in range(3)] == [0, 0, HALF_MAX]
+    assert mesh.warnings == (
+        "array: lightmap: 2 texels NaN or infinite: replaced by the nearest finite one in the mask",
+        "array: lightmap: 1 texel negative: clamped to 0",
+        "array: lightmap: 1 texel above 65,504: clamped to it",
+    )
+
+
+def test_a_mask_that_is_given(tmp_path):
+    files = _files(tmp_path)
+    mask = _with(_chart(), (5, 5), True)
+    path = tmp_path / "mask.png"
+    Image.fromarray(mask.astype(np.uint8)).save(path)
+    mesh = load_mesh(*files, mask_path=path)
+    np.testing.assert_array_equal(mesh.mask, mask)
+    assert mesh.warnings == ()
+    Image.fromarray(mask[::-1].astype(np.uint8)).save(path)
+    (warning,) = load_mesh(*files, mask_path=path).warnings
+    assert "square: 11 texels of 12 that triangles cover are outside the mask: is it of another UV set" in warning
+
+
+def test_a_mask_that_is_derived_leaves_out_what_was_never_baked():
+    # Columns 1.75 to 6.25: of columns 1 and 6 no centre is covered.
+    uv = np.where(UV == 0.25, 1.75 / WIDTH, np.where(UV == 0.75, 6.25 / WIDTH, UV))
+    uv[:, 1] = UV[:, 1]
+    lightmap = _lightmap()
+    lightmap[:, 0:3] = 0
+    lightmap[1, 1] = np.nan
+    expected = np.zeros((HEIGHT, WIDTH), bool)
+    expected[0:3, 2:7] = expected[1, 1] = True
+    np.testing.assert_array_equal(from_arrays(POSITION, TRIANGLE, uv, lightmap).mask, expected)
+    tiny = np.array([[0.51, 0.52], [0.52, 0.52], [0.51, 0.53]])
+    dark = from_arrays(POSITION[:3], TRIANGLE[:1], tiny, lightmap * 0)
+    assert np.argwhere(dark.mask).tolist() == [[3, 4]]
+
+
+def test_masks_that_do_not_fit(tmp_path):
+    files = _files(tmp_path)
+    path = tmp_path / "mask.png"
+    assert "no such mask; expected a PNG of 8x6" in _message(load_mesh, *files, mask_path=path)
+    Image.fromarray(np.ones((WIDTH, HEIGHT), np.uint8)).save(path)
+    assert _message(load_mesh, *files, mask_path=path) == f"{path}: the mask is 6x8, but {files[1]} is 8x6"
+    Image.fromarray(np.zeros((HEIGHT, WIDTH), np.uint8)).save(path)
+    assert _message(load_mesh, *files, mask_path=path).startswith(f"{path}: the mask is empty")
+    path.write_bytes(b"no picture")
+    assert "cannot read the mask" in _message(load_mesh, *files, mask_path=path)
+
+
+def test_a_mesh_is_written_with_new_uvs(tmp_path):
+    files = _files(tmp_path)
+    mesh = load_mesh(*files)
+    corner_uv = np.zeros((2, 3, 2))
+    corner_uv[0] = [[0, 0], [1, 0], [0, 1]]
+    corner_uv[1] = [[-0.0, 1], [1, 0], [0.5, 0.5]]  # shares both of its old vertices with the first
+    assert write_mesh(tmp_path / "out.glb", mesh, corner_uv) == 1
+    again = load_mesh(tmp_path / "out.glb", files[1])
+    assert again.uv_set == 1 and len(again.position) == 4
+    np.testing.assert_array_equal(again.uv[again.triangle], corner_uv + 0.0)
+    np.testing.assert_array_equal(again.position[again.triangle], POSITION[TRIANGLE])
+    kept = load_mesh(tmp_path / "out.glb", files[1], uv_set=0)
+    np.testing.assert_array_equal(kept.uv[kept.triangle], UV[TRIANGLE])
+    corner_uv[1, 0] = 0.25
+    assert write_mesh(tmp_path / "out.glb", again, corner_uv) == 2
+    assert len(load_mesh(tmp_path / "out.glb", files[1], uv_set=2).position) == 5
+    with pytest.raises(ValueError, match="has not yet, got 0"):
+        write_mesh(tmp_path / "out.glb", mesh, corner_uv, uv_set=0)
+    for wrong in (corner_uv[:1], _with(corner_uv, (0, 0, 0), np.nan)):
+        with pytest.raises(ValueError, match="corner_uv: expected finite numbers"):
+            write_mesh(tmp_path / "out.glb", mesh, wrong)
+
+
+def test_what_came_from_an_obj_is_written_as_glb(tmp_path):
+    (tmp_path / "a.obj").write_text(OBJ)
+    write_exr(tmp_path / "light.exr", _lightmap())
+    mesh = load_mesh(tmp_path / "a.obj", tmp_path / "light.exr")
+    write_mesh(tmp_path / "out.glb", mesh, mesh.uv[mesh.triangle] * 0.5)
+    again = load_mesh(tmp_path / "out.glb", tmp_path / "light.exr")
+    np.testing.assert_array_equal(again.uv, UV * 0.5)
+    trimesh = pytest.importorskip("trimesh")
+    (other,) = trimesh.load(tmp_path / "out.glb").geometry.values()
+    np.testing.assert_array_equal(other.vertices[other.faces], POSITION[TRIANGLE])
+
+
+def test_texels_touched_and_covered_as_by_cutting_polygons():
+    generator = np.random.default_rng(5)
+    # Corners on texel corners, on centres, and anywhere.
+    for step, count in ((1.0, 40), (0.5, 40), (1e-6, 40)):
+        for _ in range(count):
+            corner = np.round(generator.random((3, 2)) * (WIDTH, HEIGHT) / step) * step
+            if abs(_twice_area(corner)) < 1e-3:
+                continue
+            uv, triangle = corner / (WIDTH, HEIGHT), np.array([[0, 1, 2]])
+            texel = uv * (WIDTH, HEIGHT)
+            area = np.array([[_area_within(texel, x, y) for x in range(WIDTH)] for y in range(HEIGHT)])
+            touched = touched_texels(uv, triangle, HEIGHT, WIDTH)
+            assert touched[area > 1e-9].all() and not touched[area <= 0].any()
+            strict, loose = (_holds_centres(texel, margin) for margin in (1e-9, -1e-9))
+            covered = covered_texels(uv, triangle, HEIGHT, WIDTH)
+            assert (covered[strict] == 1).all() and (covered[~loose] == 0).all()
+
+
+def test_every_centre_of_a_cut_square_is_covered_once():
+    generator = np.random.default_rng(6)
+    for shift in (0.0, 0.5, 0.25, 1 / 3):
+        # A grid of vertices on texel corners, centres or between; half of the inner ones moved; diagonals at random.
+        y, x = np.mgrid[0:7, 0:9].astype(np.float64)
+        moved = (generator.random(x.shape) < 0.5) & (x > 0) & (x < 8) & (y > 0) & (y < 6)
+        x[moved] += shift * generator.choice([-1, 1], moved.sum()) * 0.5
+        uv = np.stack([x.ravel() / 8, y.ravel() / 6], axis=1)
+        triangle = []
+        for row in range(6):
+            for column in range(8):
+                a = row * 9 + column
+                b, c, d = a + 1, a + 9, a + 10
+                triangle += [[a, b, c], [c, b, d]] if generator.random() < 0.5 else [[a, b, d], [d, c, a]]
+        for height, width in ((6, 8), (12, 16), (7, 5), (1, 1), (30, 40)):
+            assert (covered_texels(uv, np.array(triangle), height, width) == 1).all()
+            assert touched_texels(uv, np.array(triangle), height, width).all()
+
+
+def test_many_rows_are_worked_on_in_pieces(monkeypatch):
+    generator = np.random.default_rng(7)
+    uv, triangle = generator.random((60, 2)), np.arange(60).reshape(-1, 3)
+    whole = touched_texels(uv, triangle, 37, 41), covered_texels(uv, triangle, 37, 41)
+    monkeypatch.setattr("wlm.atlas.coverage._SPANS_AT_ONCE", 7)
+    np.testing.assert_array_equal(touched_texels(uv, triangle, 37, 41), whole[0])
+    np.testing.assert_array_equal(covered_texels(uv, triangle, 37, 41), whole[1])
+    # Between 1 - 1e-16 and 1, which times 37 are one number.
+    thin = np.array([[0.2, 1.0], [0.4, 1.0], [0.2, 1.0 - 2**-53]])
+    assert np.argwhere(touched_texels(thin, triangle[:1], 37, 10)).tolist() == [[36, 2], [36, 3]]
+    assert not touched_texels(uv, triangle[:0], 3, 4).any() and not covered_texels(uv, triangle[:0], 3, 4).any()
+
+
+def _twice_area(corner: np.ndarray) -> float:
+    (ax, ay), (bx, by) = corner[1:] - corner[0]
+    return ax * by - ay * bx
+
+
+def _area_within(corner: np.ndarray, x: int, y: int) -> float:
+    """Area of a triangle within the unit square at (x, y), by cutting it along the square's four sides."""
+    polygon = list(corner)
+    for axis, sign, limit in ((0, 1, x), (0, -1, -x - 1), (1, 1, y), (1, -1, -y - 1)):
+        kept = []
+        for a, b in zip(polygon, polygon[1:] + polygon[:1], strict=True):
+            inside_a, inside_b = sign * a[axis] - limit, sign * b[axis] - limit
+            if inside_a >= 0:
+                kept.append(a)
+            if inside_a * inside_b < 0:
+                kept.append(a + (b - a) * inside_a / (inside_a - inside_b))
+        polygon = kept
+        if not polygon:
+            return 0.0
+    px, py = np.array(polygon).T
+    return abs(np.dot(px, np.roll(py, -1)) - np.dot(py, np.roll(px, -1))) / 2
+
+
+def _holds_centres(corner: np.ndarray, margin: float) -> np.ndarray:
+    """Which centres lie further within a triangle than the margin, bool [HEIGHT, WIDTH]."""
+    y, x = np.mgrid[0:HEIGHT, 0:WIDTH] + 0.5
+    (ax, ay), (bx, by), (cx, cy) = corner if _twice_area(corner) > 0 else corner[::-1]
+    sides = [
+        (qx - px) * (y - py) - (qy - py) * (x - px)
+        for (px, py), (qx, qy) in (((ax, ay), (bx, by)), ((bx, by), (cx, cy)), ((cx, cy), (ax, ay)))
+    ]
+    return np.min(sides, axis=0) > margin

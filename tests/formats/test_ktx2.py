@@ -1,0 +1,123 @@
+"""KTX2 files: the header's and descriptor's numbers, and what is refused."""
+
+from __future__ import annotations
+
+import os
+import struct
+
+import numpy as np
+import pytest
+
+from wlm.errors import WlmError
+from wlm.formats.ktx2 import VK_FORMATS, Ktx2Texture, read_ktx2, write_ktx2
+
+# Byte offsets, from the KTX specification's section on the file's structure.
+FORMAT, TYPE_SIZE, WIDTH, HEIGHT, DEPTH, LAYERS, FACES, LEVELS, SCHEME = range(12, 48, 4)
+DESCRIPTOR, DESCRIPTOR_BYTES, PAIRS, PAIRS_BYTES, LEVEL, LEVEL_BYTES = 48, 52, 56, 60, 80, 88
+TEXEL = {"R16G16_UNORM": 4, "R16G16_SFLOAT": 4, "R16G16B16_SFLOAT": 6, "R16G16B16A16_SFLOAT": 8}
+ONE, MINUS_ONE = 0x3F800000, 0xBF800000
+
+
+def _data(fmt: str, width: int = 5, height: int = 3) -> bytes:
+    size = width * height * TEXEL[fmt] if fmt in TEXEL else -(-width // 4) * -(-height // 4) * 16
+    return np.random.default_rng(size).integers(0, 256, size, np.uint8).tobytes()
+
+
+def _word(data: bytes, at: int) -> int:
+    return struct.unpack_from("<I", data, at)[0]
+
+
+@pytest.mark.parametrize("fmt", VK_FORMATS)
+def test_the_header_and_the_way_back(tmp_path, fmt):
+    path = tmp_path / "a.ktx2"
+    assert write_ktx2(path, _data(fmt), 5, 3, fmt) == path.stat().st_size
+    data = path.read_bytes()
+    assert data[:12] == bytes([0xAB, 0x4B, 0x54, 0x58, 0x20, 0x32, 0x30, 0xBB, 0x0D, 0x0A, 0x1A, 0x0A])
+    found = [_word(data, at) for at in (FORMAT, TYPE_SIZE, WIDTH, HEIGHT, DEPTH, LAYERS, FACES, LEVELS, SCHEME)]
+    assert found == [VK_FORMATS[fmt], 2 if fmt in TEXEL else 1, 5, 3, 0, 0, 1, 1, 0]
+    assert struct.unpack_from("<2Q", data, 64) == (0, 0)
+    start, length, plain = struct.unpack_from("<3Q", data, LEVEL)
+    assert length == plain == len(_data(fmt)) and data[start:] == _data(fmt)
+    assert start % TEXEL.get(fmt, 16) == 0 and start % 4 == 0
+    # Descriptor, pairs and level follow each other with less than one element of padding.
+    assert _word(data, DESCRIPTOR) == 104 and _word(data, PAIRS) == 104 + _word(data, DESCRIPTOR_BYTES)
+    assert 0 <= start - _word(data, PAIRS) - _word(data, PAIRS_BYTES) < 16
+    pairs = data[_word(data, PAIRS) :][: _word(data, PAIRS_BYTES)]
+    assert pairs == b"\x12\0\0\0KTXorientation\0rd\0\0\0\x0e\0\0\0KTXwriter\0wlm\0\0\0"
+    assert read_ktx2(path) == Ktx2Texture(5, 3, fmt, _data(fmt))
+    assert os.listdir(tmp_path) == ["a.ktx2"]
+
+
+@pytest.mark.parametrize(
+    ("fmt", "model", "sides", "plane", "samples"),
+    [
+        ("R16G16_UNORM", 1, 0, 4, [(0, 15, 0, 0, 0xFFFF), (16, 15, 1, 0, 0xFFFF)]),
+        ("R16G16_SFLOAT", 1, 0, 4, [(0, 15, 0xC0, MINUS_ONE, ONE), (16, 15, 0xC1, MINUS_ONE, ONE)]),
+        ("R16G16B16_SFLOAT", 1, 0, 6, [(16 * i, 15, 0xC0 + i, MINUS_ONE, ONE) for i in range(3)]),
+        ("R16G16B16A16_SFLOAT", 1, 0, 8, [(16 * i, 15, 0xC0 + (i, 15)[i == 3], MINUS_ONE, ONE) for i in range(4)]),
+        ("BC6H_UFLOAT_BLOCK", 133, 0x303, 16, [(0, 127, 0x80, 0, ONE)]),
+        ("ASTC_4x4_SFLOAT_BLOCK", 162, 0x303, 16, [(0, 127, 0xC0, MINUS_ONE, ONE)]),
+    ],
+)
+def test_the_data_format_descriptor(tmp_path, fmt, model, sides, plane, samples):
+    path = tmp_path / "a.ktx2"
+    write_ktx2(path, _data(fmt), 5, 3, fmt)
+    data = path.read_bytes()
+    size = _word(data, DESCRIPTOR_BYTES)
+    words = struct.unpack_from(f"<{size // 4}I", data, _word(data, DESCRIPTOR))
+    block = 24 + 16 * len(samples)
+    # Total; vendor and type; version and size; model, BT.709, linear; sides; bytes of planes.
+    assert words[:7] == (size, 0, 2 | block << 16, model | 1 << 8 | 1 << 16, sides, plane, 0) and size == 4 + block
+    for i, (offset, bits, channel, lower, upper) in enumerate(samples):
+        assert words[7 + 4 * i :][:4] == (offset | bits << 16 | channel << 24, 0, lower, upper)
+
+
+@pytest.mark.parametrize(
+    ("at", "value", "words"),
+    [
+        (FORMAT, 43, "vkFormat: expected one of [77, 83, 90, 97, 143, 1000066000], found 43"),
+        (FORMAT, 83, "the data format descriptor: expected that of R16G16_SFLOAT, found another"),
+        (WIDTH, 0, "pixelWidth: expected 1 to 16384, found 0"),
+        (WIDTH, 6, "byteLength of level 0: expected 72, found 60"),
+        (HEIGHT, 2**31, "pixelHeight: expected 1 to 16384"),
+        (DEPTH, 1, "pixelDepth: expected 0 (no volume), found 1"),
+        (LAYERS, 1, "layerCount: expected 0 (no array), found 1"),
+        (FACES, 6, "faceCount: expected 1 (no cube), found 6"),
+        (LEVELS, 0, "levelCount: expected 1, found 0"),
+        (SCHEME, 2, "supercompressionScheme: expected 0 (none), found 2"),
+        (LEVEL, 500, "the file is cut short: expected 560 bytes"),
+        (LEVEL_BYTES, 64, "byteLength of level 0: expected 60, found 64"),
+    ],
+)
+def test_a_wrong_field_is_named(tmp_path, at, value, words):
+    path = tmp_path / "a.ktx2"
+    write_ktx2(path, _data("R16G16_UNORM"), 5, 3, "R16G16_UNORM")
+    data = bytearray(path.read_bytes())
+    struct.pack_into("<I", data, at, value)
+    path.write_bytes(data)
+    with pytest.raises(WlmError) as caught:
+        read_ktx2(path)
+    assert str(caught.value).startswith(f"{path}: {words}")
+
+
+def test_other_files_and_other_lengths_are_refused(tmp_path):
+    path = tmp_path / "a.ktx2"
+    with pytest.raises(WlmError, match="No such file"):
+        read_ktx2(path)
+    path.write_bytes(b"\xabKTX 11\xbb\r\n\x1a\n")
+    with pytest.raises(WlmError, match="expected a KTX2 file, found other content"):
+        read_ktx2(path)
+    write_ktx2(path, _data("R16G16_UNORM"), 5, 3, "R16G16_UNORM")
+    whole = path.read_bytes()
+    for length in range(len(whole)):
+        path.write_bytes(whole[:length])
+        with pytest.raises(WlmError):
+            read_ktx2(path)
+
+
+@pytest.mark.parametrize("change", [{"fmt": "R8_UNORM"}, {"width": 0}, {"height": 16385}, {"data": b"\0" * 61}])
+def test_what_does_not_fit_is_a_value_error(tmp_path, change):
+    fields = {"data": _data("R16G16_UNORM"), "width": 5, "height": 3, "fmt": "R16G16_UNORM", **change}
+    with pytest.raises(ValueError):
+        write_ktx2(tmp_path / "a.ktx2", **fields)
+    assert os.listdir(tmp_path) == []

@@ -1,0 +1,118 @@
+"""Which texels of a lightmap a mesh's UV triangles touch or cover, exactly and in bounded memory.
+
+Texel (row, column) is the square [column, column + 1] x [row, row + 1] of UVs times (W, H), its centre in the
+middle. Each triangle is cut into the rows of texels that it meets; a row of it is a span of texels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+__all__ = ["covered_texels", "touched_texels"]
+
+_SPANS_AT_ONCE = 1 << 20  # about 200 bytes each while they are worked on
+
+
+def touched_texels(uv: np.ndarray, triangle: np.ndarray, height: int, width: int) -> np.ndarray:
+    """Find the texels whose square some triangle's inside meets, however small the part.
+
+    Args:
+        uv: float64 [V, 2] in [0, 1]; u right, v down from the top row.
+        triangle: int [F, 3], with area in UV.
+        height: Texels.
+        width: Texels.
+
+    Returns:
+        bool [height, width]. A triangle that ends exactly at a texel's side doesn't touch the texel.
+    """
+    change = np.zeros((height, width + 1), np.int32)
+    for corner, row in _rows(uv, triangle, height, width, centres=False):
+        low, high = np.full(len(row), np.inf), np.full(len(row), -np.inf)
+        for k in range(3):
+            start, end = _directed(corner[:, k], corner[:, (k + 1) % 3])
+            # The edge's part within the row. Both ends of a level edge are ends of the other two edges.
+            top, bottom = np.maximum(start[:, 1], row), np.minimum(end[:, 1], row + 1)
+            meets = top <= bottom
+            for y in (top, bottom):
+                x = _crossing(start, end, y)
+                np.minimum(low, x, out=low, where=meets)
+                np.maximum(high, x, out=high, where=meets)
+        # In rounding a part of no width may become one of none; it lies in the texel of its left end.
+        first = np.clip(np.floor(low).astype(np.int64), 0, width - 1)
+        stop = np.clip(np.ceil(high).astype(np.int64), first + 1, width)
+        _add_spans(change, row, first, stop)
+    return np.cumsum(change, axis=1)[:, :width] > 0
+
+
+def covered_texels(uv: np.ndarray, triangle: np.ndarray, height: int, width: int) -> np.ndarray:
+    """Count for every texel the triangles that hold its centre.
+
+    A centre on an edge that two triangles share is in exactly one of them.
+
+    Args:
+        uv: float64 [V, 2] in [0, 1]; u right, v down from the top row.
+        triangle: int [F, 3].
+        height: Texels.
+        width: Texels.
+
+    Returns:
+        int32 [height, width].
+    """
+    change = np.zeros((height, width + 1), np.int32)
+    for corner, row in _rows(uv, triangle, height, width, centres=True):
+        y = row + 0.5
+        low, high = np.full(len(row), np.inf), np.full(len(row), -np.inf)
+        for k in range(3):
+            start, end = _directed(corner[:, k], corner[:, (k + 1) % 3])
+            meets = (start[:, 1] <= y) & (y < end[:, 1])
+            x = _crossing(start, end, y)
+            np.minimum(low, x, out=low, where=meets)
+            np.maximum(high, x, out=high, where=meets)
+        there = low <= high
+        first, stop = (np.ceil(x[there] - 0.5).astype(np.int64).clip(0, width) for x in (low, high))
+        _add_spans(change, row[there], first, stop)
+    return np.cumsum(change, axis=1, dtype=np.int32)[:, :width]
+
+
+def _rows(
+    uv: np.ndarray, triangle: np.ndarray, height: int, width: int, centres: bool
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yields triangles' corners [N, 3, 2] in texels and rows [N] that they may meet, a bounded number at a time."""
+    texel = uv * (width, height)
+    v = texel[:, 1][triangle]  # [F, 3]
+    if centres:
+        first, stop = np.ceil(v.min(axis=1) - 0.5), np.floor(v.max(axis=1) - 0.5) + 1
+    else:
+        # In rounding a triangle's height may become none.
+        first, stop = np.floor(v.min(axis=1)).clip(0, height - 1), np.ceil(v.max(axis=1))
+        stop = np.maximum(stop, first + 1)
+    first = first.astype(np.int64).clip(0, height)
+    count = (stop.astype(np.int64).clip(0, height) - first).clip(0)
+    ends = np.cumsum(count)
+    total = int(ends[-1]) if len(ends) else 0
+    for at in range(0, total, _SPANS_AT_ONCE):
+        item = np.arange(at, min(at + _SPANS_AT_ONCE, total))
+        owner = np.searchsorted(ends, item, side="right")
+        yield texel[triangle[owner]], first[owner] + item - (ends[owner] - count[owner])
+
+
+def _directed(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Puts each edge's upper end first (of a level one the left), so that both its triangles compute alike."""
+    swap = (a[:, 1] > b[:, 1]) | ((a[:, 1] == b[:, 1]) & (a[:, 0] > b[:, 0]))
+    return np.where(swap[:, None], b, a), np.where(swap[:, None], a, b)
+
+
+def _crossing(start: np.ndarray, end: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """The edges' x at height y: start's for a level edge, and never beyond the ends."""
+    drop = end[:, 1] - start[:, 1]
+    share = np.divide(y - start[:, 1], drop, out=np.zeros_like(drop), where=drop > 0).clip(0.0, 1.0)
+    return start[:, 0] + share * (end[:, 0] - start[:, 0])
+
+
+def _add_spans(change: np.ndarray, row: np.ndarray, first: np.ndarray, stop: np.ndarray) -> None:
+    """Adds 1 to the texels first <= column < stop of each row, as differences along the row."""
+    flat, step = change.reshape(-1), change.shape[1]
+    flat += np.bincount(row * step + first, minlength=flat.size).astype(np.int32)
+    flat -= np.bincount(row * step + stop, minlength=flat.size).astype(np.int32)

@@ -1,0 +1,417 @@
+"""What comes in: a mesh with lightmap UVs and its lightmap, read from files or arrays and checked; a mesh with new UVs.
+
+The stated behaviours. "Inside" is inside the mask. What is repaired or odd is given in `LightmappedMesh.warnings`, one
+line a kind, with its count.
+
+====================================  ================================================================
+input                                 behaviour
+====================================  ================================================================
+no triangle, no UVs                   error
+a primitive without the UV set        left out, and unchanged in what is written; warning
+a position or UV NaN or infinite,     error that names the primitive and the vertex
+a position beyond float32
+a UV outside [0, 1]                   clamped to it, as a lightmap is read clamped; warning
+triangles without area, in space or   kept, but not `active`: they take no part; warning
+in UV
+no triangle with area                 error
+overlapping UVs, a mesh drawn twice   fine: what shares texels is lit alike; warning
+NaN, Inf inside                       the texel takes the value of the nearest finite one inside; warning
+no finite texel inside                error
+negative inside                       the channel is clamped to 0; warning
+above 65,504 inside (half's maximum)  the channel is clamped to 65,504; warning
+any of these outside                  0, 0 and 65,504, without a warning
+a mask of another size                error that names both files
+an empty mask                         error
+a mask that misses over 1% of the     warning: it may be of another UV set
+texels whose centres are in triangles
+no mask                               derived: texels whose centre is in a triangle, and those that a
+                                      triangle touches at all if they aren't 0, as what was never baked is
+====================================  ================================================================
+
+Inputs of the method: lightmap-uv-clustering-cascade, section 3 (there mesh, UVs and an HDR lightmap).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from wlm.atlas.coverage import covered_texels, touched_texels
+from wlm.errors import WlmError
+from wlm.formats.exr import HALF_MAX, read_exr
+from wlm.formats.gltf import GltfDocument, GltfPrimitive, document_from_arrays, read_gltf
+from wlm.formats.gltf_writer import Replacement, write_glb
+from wlm.formats.obj import read_obj
+from wlm.imageops import fill_gaps
+
+__all__ = ["LightmappedMesh", "Part", "from_arrays", "load_mesh", "write_mesh"]
+
+_FLAT = 1e-12  # of a triangle's area to its longest side squared: below, float64 can't tell it from none
+_MISSED = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """Where one primitive's vertices and triangles begin in the mesh; they follow each other in its order.
+
+    Attributes:
+        primitive: The primitive.
+        vertex: Number of its first vertex in the mesh.
+        triangle: Number of its first triangle in the mesh.
+    """
+
+    primitive: GltfPrimitive
+    vertex: int
+    triangle: int
+
+
+@dataclass(frozen=True, eq=False)
+class LightmappedMesh:
+    """A mesh and its lightmap, checked and repaired as the module's table says.
+
+    Attributes:
+        name: The mesh's name.
+        position: float64 [V, 3], in the scene's space and unit, finite.
+        triangle: int32 [F, 3], at least one; each vertex is of one primitive.
+        uv: float64 [V, 2] in [0, 1]; u right, v down from the lightmap's top row.
+        active: bool [F], false where a triangle has no area; at least one is true.
+        lightmap: float32 [H, W, 3], linear, finite, in [0, 65504].
+        mask: bool [H, W], true where a texel belongs to a chart; at least one is.
+        uv_set: n of the `TEXCOORD_n` that was read; 0 for what is no glTF.
+        source: 16 hexadecimal digits of BLAKE2b over the mesh, the lightmap and the mask.
+        warnings: What was repaired or is odd, one line each.
+        document: The file that the mesh came from, or one made for it.
+        parts: Which primitives the mesh is made of, in order.
+    """
+
+    name: str
+    position: np.ndarray
+    triangle: np.ndarray
+    uv: np.ndarray
+    active: np.ndarray
+    lightmap: np.ndarray
+    mask: np.ndarray
+    uv_set: int
+    source: str
+    warnings: tuple[str, ...]
+    document: GltfDocument
+    parts: tuple[Part, ...]
+
+
+def load_mesh(
+    mesh_path: str | os.PathLike[str],
+    lightmap_path: str | os.PathLike[str],
+    *,
+    mask_path: str | os.PathLike[str] | None = None,
+    uv_set: int | None = None,
+) -> LightmappedMesh:
+    """Read a mesh (`.glb`, `.gltf`, `.obj`) and its lightmap (EXR).
+
+    Args:
+        mesh_path: The mesh. All primitives that its scene draws and that have the UV set make one mesh.
+        lightmap_path: Linear RGB; row 0 is v = 0 of glTF, v = 1 of an `.obj`.
+        mask_path: A PNG of the lightmap's size; a texel belongs to a chart where any colour channel is above 0. None
+            derives it from the triangles.
+        uv_set: n of `TEXCOORD_n`, the lightmap's UVs. None takes 1, where engines and viewers look for them, if any
+            primitive has it, else 0. An `.obj` has only 0.
+
+    Returns:
+        The mesh, repaired as the module's table says.
+
+    Raises:
+        WlmError: One line that names the file and the field, for each error of the module's table, and where a file
+            is missing or damaged.
+    """
+    path = Path(mesh_path)
+    suffix = path.suffix.lower()
+    if suffix not in (".glb", ".gltf", ".obj"):
+        raise WlmError(f"{path}: expected a name that ends in .glb, .gltf or .obj, found {suffix or 'none'}")
+    if suffix == ".obj":
+        arrays = read_obj(path)
+        if not len(arrays.triangle):
+            raise WlmError(f"{path}: has no triangles")
+        if arrays.uv is None:
+            raise WlmError(f"{path}: the mesh has no UVs: expected vt, and f with them")
+        document, primitive = _document(str(path), path.stem, arrays.position, arrays.triangle, arrays.uv)
+        primitives = [primitive]
+    else:
+        document, primitives = read_gltf(path)
+    lightmap, _ = read_exr(lightmap_path)
+    lightmap = np.array(lightmap[..., :3], np.float32, order="C")
+    mask = None if mask_path is None else _read_mask(Path(mask_path), lightmap_path, lightmap.shape[:2])
+    return _check(
+        str(path), path.stem, document, primitives, uv_set, lightmap, mask, str(lightmap_path), str(mask_path)
+    )
+
+
+def from_arrays(
+    position: np.ndarray,
+    triangle: np.ndarray,
+    uv: np.ndarray,
+    lightmap: np.ndarray,
+    mask: np.ndarray | None = None,
+    name: str = "array",
+) -> LightmappedMesh:
+    """Make a checked mesh of arrays, under the same rules as `load_mesh`.
+
+    Args:
+        position: [V, 3] of numbers, in any unit; rounded to float32, as files hold it.
+        triangle: [F, 3] of integers, 0 to V - 1.
+        uv: [V, 2] of numbers; u right, v down from the lightmap's top row; rounded to float32.
+        lightmap: [H, W, 3] of numbers, linear RGB; copied.
+        mask: [H, W], true where a texel belongs to a chart. None derives it from the triangles.
+        name: The mesh's name, used in messages too.
+
+    Returns:
+        The mesh, repaired as the module's table says. Vertices that no triangle uses are left out.
+
+    Raises:
+        WlmError: A shape is wrong, or an error of the module's table.
+    """
+    lightmap = np.asarray(lightmap)
+    if lightmap.ndim != 3 or lightmap.shape[2] != 3 or 0 in lightmap.shape:
+        raise WlmError(f"{name}: expected a lightmap [H, W, 3], none of them 0, got {lightmap.shape}")
+    valid = None if mask is None else np.array(mask).astype(bool)
+    if valid is not None and valid.shape != lightmap.shape[:2]:
+        raise WlmError(f"{name}: expected a mask of {lightmap.shape[:2]}, got {valid.shape}")
+    document, primitive = _document(name, name, np.asarray(position), np.asarray(triangle), np.asarray(uv))
+    with np.errstate(over="ignore"):  # float64 beyond float32 becomes Inf and is repaired as Inf
+        copied = np.array(lightmap, np.float32, order="C")
+    return _check(name, name, document, [primitive], 0, copied, valid, f"{name}: lightmap", f"{name}: mask")
+
+
+def write_mesh(
+    path: str | os.PathLike[str], mesh: LightmappedMesh, corner_uv: np.ndarray, uv_set: int | None = None
+) -> int:
+    """Write the mesh's file again, with one more UV set and all else as it was, whole or not at all.
+
+    Corners of one vertex that have the same new UV stay one vertex; the others become vertices of their own with the
+    same attributes.
+
+    Args:
+        path: The `.glb` to write; its folder must exist.
+        mesh: The mesh.
+        corner_uv: [F, 3, 2], the new UV of each triangle's corners; u right, v down; stored as float32.
+        uv_set: n of the new `TEXCOORD_n`; None takes the first that no primitive of the mesh has.
+
+    Returns:
+        n of the new set.
+
+    Raises:
+        ValueError: The shape is wrong, a UV isn't finite, or a primitive has that set already.
+        WlmError: The file can't be written.
+    """
+    corner_uv = np.asarray(corner_uv, np.float32)
+    if corner_uv.shape != (len(mesh.triangle), 3, 2) or not np.isfinite(corner_uv).all():
+        raise ValueError(f"corner_uv: expected finite numbers [{len(mesh.triangle)}, 3, 2], got {corner_uv.shape}")
+    if uv_set is None:
+        uv_set = 1 + max(number for part in mesh.parts for number in part.primitive.uv)
+    replacements = []
+    for part in mesh.parts:
+        vertex = part.primitive.triangle.reshape(-1)
+        uv = corner_uv[part.triangle : part.triangle + len(part.primitive.triangle)].reshape(-1, 2) + np.float32(0.0)
+        # Compared by their bits; adding 0 above made -0 into 0.
+        key = np.stack([vertex.astype(np.uint32), *uv.view(np.uint32).T], axis=1)
+        distinct, corner = np.unique(key, axis=0, return_inverse=True)
+        new_uv = np.ascontiguousarray(distinct[:, 1:]).view(np.float32)
+        replacements.append(Replacement(part.primitive, distinct[:, 0].astype(np.int64), corner.reshape(-1, 3), new_uv))
+    write_glb(path, mesh.document, replacements, uv_set)
+    return uv_set
+
+
+def _document(
+    where: str, name: str, position: np.ndarray, triangle: np.ndarray, uv: np.ndarray
+) -> tuple[GltfDocument, GltfPrimitive]:
+    """Checks arrays' shapes and ranges, and makes a document of what the triangles use."""
+    for field, array, kinds in (("position", position, "iuf"), ("triangle", triangle, "iu"), ("uv", uv, "iuf")):
+        width = 2 if field == "uv" else 3
+        if array.ndim != 2 or array.shape[1] != width or array.dtype.kind not in kinds:
+            raise WlmError(f"{where}: {field}: expected numbers [N, {width}], got {array.dtype} {array.shape}")
+    if len(uv) != len(position):
+        raise WlmError(f"{where}: uv: expected {len(position)} rows, one a position, got {len(uv)}")
+    if not len(triangle):
+        raise WlmError(f"{where}: has no triangles")
+    if triangle.min() < 0 or triangle.max() >= len(position):
+        raise WlmError(
+            f"{where}: triangle: expected vertices 0 to {len(position) - 1}, found {triangle.min()} to {triangle.max()}"
+        )
+    used, corner = np.unique(triangle, return_inverse=True)
+    with np.errstate(over="ignore"):  # named below as infinite
+        return document_from_arrays(position[used], corner.reshape(-1, 3), uv[used], name)
+
+
+def _read_mask(path: Path, lightmap_path: str | os.PathLike[str], size: tuple[int, int]) -> np.ndarray:
+    """Reads a PNG as [H, W] bool: valid where any colour channel is above 0."""
+    if not path.is_file():
+        raise WlmError(f"{path}: no such mask; expected a PNG of {size[1]}x{size[0]}")
+    try:
+        with Image.open(path) as image:
+            # The header's size first: a wrong one need not be decoded.
+            if (image.height, image.width) != size:
+                raise WlmError(
+                    f"{path}: the mask is {image.width}x{image.height}, but {lightmap_path} is {size[1]}x{size[0]}"
+                )
+            # A palette's index says nothing; an alpha channel is not coverage here.
+            colour = np.asarray(image.convert("RGB") if image.mode in ("P", "PA", "RGBA", "LA") else image)
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise WlmError(f"{path}: cannot read the mask: {error}") from error
+    return colour > 0 if colour.ndim == 2 else (colour > 0).any(axis=2)
+
+
+def _check(
+    where: str,
+    name: str,
+    document: GltfDocument,
+    primitives: list[GltfPrimitive],
+    uv_set: int | None,
+    lightmap: np.ndarray,  # [H, W, 3], repaired in place
+    mask: np.ndarray | None,  # [H, W]
+    lightmap_name: str,
+    mask_name: str,
+) -> LightmappedMesh:
+    """Applies the module's table to what was read."""
+    warnings: list[str] = []
+    chosen, uv_set = _choose(where, primitives, uv_set, warnings)
+    parts, vertices, triangles = [], 0, 0
+    for each in chosen:
+        _check_finite(where, each, uv_set)
+        parts.append(Part(each, vertices, triangles))
+        vertices, triangles = vertices + len(each.position), triangles + len(each.triangle)
+    position = np.concatenate([part.primitive.position for part in parts])
+    triangle = np.concatenate([part.primitive.triangle + part.vertex for part in parts], dtype=np.int32)
+    uv = np.concatenate([part.primitive.uv[uv_set] for part in parts]).astype(np.float64)
+
+    beyond = np.maximum(-uv, uv - 1.0).max(axis=1)
+    outside = np.count_nonzero(beyond > 0)
+    if outside:
+        warnings.append(
+            f"{name}: {_count(outside, 'vertex', 'vertices')} with UVs outside [0, 1], by up to {beyond.max():.3g}: "
+            "clamped"
+        )
+        uv = uv.clip(0.0, 1.0)
+    active = _has_area(position, triangle) & _has_area(uv, triangle)
+    flat = len(active) - np.count_nonzero(active)
+    if flat == len(active):
+        raise WlmError(f"{where}: no triangle has an area in space and in TEXCOORD_{uv_set}")
+    if flat:
+        warnings.append(f"{name}: {_count(flat, 'triangle')} without area in space or in UV: left out")
+
+    height, width = lightmap.shape[:2]
+    times = covered_texels(uv, triangle[active], height, width)
+    overlaps = np.count_nonzero(times > 1)
+    if overlaps:
+        warnings.append(f"{name}: {_count(overlaps, 'texel')} in several triangles: their UVs overlap")
+    if mask is None:
+        touched = touched_texels(uv, triangle[active], height, width)
+        # A baker that asks for centres leaves the fringe of a chart at 0: such a texel is a gap to fill, not darkness.
+        mask = touched & ((times > 0) | (lightmap != 0).any(axis=2))
+        if not mask.any():
+            mask = touched
+    else:
+        if not mask.any():
+            raise WlmError(f"{mask_name}: the mask is empty: no texel belongs to a chart")
+        missed, covered = np.count_nonzero((times > 0) & ~mask), np.count_nonzero(times)
+        if missed > _MISSED * covered:
+            warnings.append(
+                f"{name}: {_count(missed, 'texel')} of {covered} that triangles cover are outside the mask: "
+                f"is it of another UV set than TEXCOORD_{uv_set}, or upside down?"
+            )
+    warnings += [f"{lightmap_name}: {text}" for text in _repair(lightmap, mask, lightmap_name)]
+    source = _hash(position, triangle, uv, lightmap, mask)
+    return LightmappedMesh(
+        name, position, triangle, uv, active, lightmap, mask, uv_set, source, tuple(warnings), document, tuple(parts)
+    )
+
+
+def _choose(
+    where: str, primitives: list[GltfPrimitive], uv_set: int | None, warnings: list[str]
+) -> tuple[list[GltfPrimitive], int]:
+    """Picks the UV set and the primitives that have it."""
+    if not primitives:
+        raise WlmError(f"{where}: has no triangles")
+    sets = sorted({number for each in primitives for number in each.uv})
+    if not sets:
+        raise WlmError(f"{where}: the mesh has no UVs: expected TEXCOORD_0 or TEXCOORD_1")
+    if uv_set is None:
+        uv_set = 1 if 1 in sets else 0
+    chosen = [each for each in primitives if uv_set in each.uv]
+    if not chosen:
+        found = ", ".join(f"TEXCOORD_{number}" for number in sets)
+        raise WlmError(f"{where}: expected the UV set TEXCOORD_{uv_set}, found {found}")
+    others = [each for each in primitives if uv_set not in each.uv]
+    if others:
+        warnings.append(
+            f"{where}: {_count(len(others), 'primitive')} of {len(primitives)} without TEXCOORD_{uv_set}, first "
+            f"{others[0].name}: left out"
+        )
+    return chosen, uv_set
+
+
+def _check_finite(where: str, primitive: GltfPrimitive, uv_set: int) -> None:
+    limit = float(np.finfo(np.float32).max)
+    for field, values in (("POSITION", primitive.position), (f"TEXCOORD_{uv_set}", primitive.uv[uv_set])):
+        bad = np.flatnonzero(~(np.abs(values) <= limit).all(axis=1))
+        if len(bad):
+            text = ", ".join(f"{x:g}" for x in values[bad[0]])
+            raise WlmError(
+                f"{where}: {primitive.name}: {field} of vertex {primitive.row[bad[0]]}: expected finite numbers, "
+                f"got ({text})"
+            )
+
+
+def _has_area(point: np.ndarray, triangle: np.ndarray) -> np.ndarray:
+    """Says of each triangle of points [V, 2 or 3] whether it has an area, whatever its size."""
+    a, b, c = (point[triangle[:, k]] for k in range(3))
+    one, two = b - a, c - a
+    longest = np.sqrt(np.maximum.reduce([(edge * edge).sum(axis=1) for edge in (one, two, c - b)]))
+    # Scaled to a longest side of 1, so that neither tiny nor huge triangles leave float64's range.
+    scale = np.divide(1.0, longest, out=np.zeros_like(longest), where=longest > 0)[:, None]
+    one, two = one * scale, two * scale
+    if point.shape[1] == 2:
+        twice = np.abs(one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0])
+    else:
+        twice = np.linalg.norm(np.cross(one, two), axis=1)
+    return twice > 2 * _FLAT
+
+
+def _repair(lightmap: np.ndarray, mask: np.ndarray, where: str) -> list[str]:
+    """Makes the lightmap [H, W, 3] finite and in [0, HALF_MAX], in place; returns what changed inside."""
+    notes = []
+    finite = np.isfinite(lightmap).all(axis=2)
+    good = mask & finite
+    if not good.any():
+        raise WlmError(f"{where}: no texel inside the mask is finite")
+    broken = mask & ~finite
+    if broken.any():
+        lightmap[broken] = fill_gaps(lightmap, good)[broken]
+        notes.append(
+            f"{_count(np.count_nonzero(broken), 'texel')} NaN or infinite: replaced by the nearest finite one in the "
+            "mask"
+        )
+    lightmap[~mask & ~finite] = 0.0
+    negative = np.count_nonzero((lightmap < 0).any(axis=2) & good)
+    if negative:
+        notes.append(f"{_count(negative, 'texel')} negative: clamped to 0")
+    bright = np.count_nonzero((lightmap > HALF_MAX).any(axis=2) & good)
+    if bright:
+        notes.append(f"{_count(bright, 'texel')} above {HALF_MAX:,.0f}: clamped to it")
+    np.clip(lightmap, 0.0, HALF_MAX, out=lightmap)
+    return notes
+
+
+def _count(number: int, one: str, many: str | None = None) -> str:
+    return f"{number} {one if number == 1 else many or one + 's'}"
+
+
+def _hash(*arrays: np.ndarray) -> str:
+    """Names the input by 16 hexadecimal digits, the same on every machine."""
+    digest = hashlib.blake2b(digest_size=8)
+    for array in arrays:
+        digest.update(np.asarray(array.shape, "<i8").tobytes())
+        digest.update(np.ascontiguousarray(array, array.dtype.newbyteorder("<")))
+    return digest.hexdigest()

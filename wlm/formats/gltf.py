@@ -1,0 +1,473 @@
+"""glTF 2.0, `.glb` and `.gltf`: the triangles that a scene draws, and copies of the file with one more UV set.
+
+A file is kept as the JSON tree that it is, and only the primitives that get new UVs are touched. A library of typed
+classes, such as pygltflib, is longer to use here and drops the fields that it has no class for.
+
+====================================  ================================================================
+in the file                           behaviour
+====================================  ================================================================
+points, lines; no `POSITION`          left out; kept in copies
+strips, fans                          read; a list of triangles in copies
+no `indices`                          vertices in their order
+integer UVs and positions             read, normalised or not (KHR_mesh_quantization)
+strided, sparse, absent (zero) data   read
+a mesh under two nodes                given twice; in copies each node has a mesh of its own, and equal
+                                      data is stored once
+a node that mirrors                   vertices keep the file's order: such triangles face the other way
+skins, morph targets, animations      left out: the mesh is given at rest, under its node's transform
+nodes outside the scene               left out; kept in copies
+external `.bin`, `data:` URIs         read; in copies all in the one `.glb`
+external images                       in copies inside the `.glb`; one that is missing keeps its URI
+Draco, meshopt, GPU instances         error that names the extension
+a file missing or damaged             error that names the file, and the field
+====================================  ================================================================
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import json
+import os
+import re
+import struct
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from urllib.parse import unquote, unquote_to_bytes
+
+import numpy as np
+
+from wlm.errors import WlmError
+
+__all__ = ["GltfDocument", "GltfPrimitive", "components", "document_from_arrays", "elements", "read_gltf"]
+
+MAGIC = b"glTF"
+JSON_CHUNK, BINARY_CHUNK = 0x4E4F534A, 0x004E4942
+TRIANGLES, STRIP, FAN = 4, 5, 6
+
+COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+"""NumPy's names of glTF's component types."""
+
+_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+_MATRIX_SIDES = {"MAT2": 2, "MAT3": 3, "MAT4": 4}
+_UV_NAME = re.compile(r"TEXCOORD_(0|[1-9]\d{0,3})")
+_URI_SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:")
+_REFUSED = {
+    "KHR_draco_mesh_compression": "decompress the mesh first",
+    "EXT_meshopt_compression": "decompress the mesh first",
+    "KHR_meshopt_compression": "decompress the mesh first",
+    "EXT_mesh_gpu_instancing": "make its instances nodes first",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class GltfDocument:
+    """A glTF file as it was read.
+
+    Attributes:
+        path: Its name, for messages and for what it refers to.
+        content: The JSON tree; not to be changed.
+        buffers: The bytes of each of its buffers.
+    """
+
+    path: str
+    content: dict
+    buffers: tuple[bytes, ...]
+
+    def item(self, kind: str, number: object) -> dict:
+        """Gives an entry of one of the tree's lists, `accessors` for example.
+
+        Raises:
+            WlmError: There is none of this number.
+        """
+        entries = self.content.get(kind, [])
+        if not isinstance(number, int) or not 0 <= number < len(entries):
+            raise WlmError(f"{self.path}: {kind}[{number}]: expected one of {len(entries)}")
+        return entries[number]
+
+
+@dataclass(frozen=True, eq=False)
+class GltfPrimitive:
+    """Triangles of one primitive under one node, with the vertices that they use.
+
+    Attributes:
+        node: Number of the node.
+        mesh: Number of its mesh.
+        primitive: Number of the primitive in the mesh.
+        name: What messages call it.
+        position: float64 [V, 3], in the scene's space.
+        triangle: int32 [F, 3].
+        uv: For each set n that the file has as `TEXCOORD_n`, float32 [V, 2]; u right, v down.
+        row: int64 [V], where each vertex is in the primitive's accessors.
+    """
+
+    node: int
+    mesh: int
+    primitive: int
+    name: str
+    position: np.ndarray
+    triangle: np.ndarray
+    uv: dict[int, np.ndarray]
+    row: np.ndarray
+
+
+def read_gltf(path: str | os.PathLike[str]) -> tuple[GltfDocument, list[GltfPrimitive]]:
+    """Read a `.glb` or `.gltf` file; its first bytes tell which it is.
+
+    Args:
+        path: The file.
+
+    Returns:
+        The document, and the primitives with triangles that its scene draws (the default scene, else the first,
+        else all nodes), in the order of the nodes, depth first.
+
+    Raises:
+        WlmError: One line that names the file and the field, for each error of the module's table.
+    """
+    try:
+        data = Path(path).read_bytes()
+    except OSError as error:
+        raise WlmError(f"{path}: cannot read the glTF file: {error.strerror or error}") from error
+    with reported(path):
+        text, binary = _split_glb(path, data) if data[:4] == MAGIC else (data, None)
+        content = json.loads(text.decode("utf-8-sig"))
+        if not isinstance(content, dict) or not isinstance(content.get("asset"), dict):
+            raise WlmError(f"{path}: expected a glTF file, found other content")
+        version = str(content["asset"].get("version"))
+        if version.partition(".")[0] != "2":
+            raise WlmError(f"{path}: asset.version: expected 2.0, found {version}")
+        for name in (*content.get("extensionsUsed", []), *content.get("extensionsRequired", [])):
+            if name in _REFUSED:
+                raise WlmError(f"{path}: uses the extension {name}, which is not read here: {_REFUSED[name]}")
+        buffers = [_load_buffer(path, i, each, binary) for i, each in enumerate(content.get("buffers", []))]
+        document = GltfDocument(str(path), content, tuple(buffers))
+        for i, view in enumerate(content.get("bufferViews", [])):
+            _check_view(document, i, view)
+        return document, _read_primitives(document)
+
+
+def document_from_arrays(
+    position: np.ndarray, triangle: np.ndarray, uv: np.ndarray, name: str
+) -> tuple[GltfDocument, GltfPrimitive]:
+    """Make a document of one mesh, for geometry that came from elsewhere.
+
+    Args:
+        position: [V, 3], in any unit; stored as float32.
+        triangle: int [F, 3], at least one.
+        uv: [V, 2]; u right, v down; stored as float32, as `TEXCOORD_0`.
+        name: What the mesh is called.
+
+    Returns:
+        The document and its one primitive.
+    """
+    points, places = np.asarray(position, "<f4"), np.asarray(uv, "<f4")
+    corners = np.asarray(triangle, "<u4")
+    views, accessors, start = [], [], 0
+    for array, target, kind, component in (
+        (points, 34962, "VEC3", 5126),
+        (places, 34962, "VEC2", 5126),
+        (corners.reshape(-1), 34963, "SCALAR", 5125),
+    ):
+        views.append({"buffer": 0, "byteOffset": start, "byteLength": array.nbytes, "target": target})
+        accessors.append({"bufferView": len(accessors), "componentType": component, "count": len(array), "type": kind})
+        start += array.nbytes
+    accessors[0] |= {"min": points.min(axis=0).tolist(), "max": points.max(axis=0).tolist()}
+    content = {
+        "asset": {"version": "2.0", "generator": "wlm"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, "name": name}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0, "TEXCOORD_0": 1}, "indices": 2}]}],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": start}],
+    }
+    document = GltfDocument(name, content, (points.tobytes() + places.tobytes() + corners.tobytes(),))
+    row = np.arange(len(points))
+    corners = corners.astype(np.int32)
+    return document, GltfPrimitive(0, 0, 0, name, points.astype(np.float64), corners, {0: places}, row)
+
+
+def elements(document: GltfDocument, number: int) -> np.ndarray:
+    """Reads an accessor as it is encoded, its sparse part applied.
+
+    Args:
+        document: The document.
+        number: Of the accessor.
+
+    Returns:
+        uint8 [count, bytes of an element], columns of small matrices padded as glTF pads them; maybe a view of
+        the file's bytes.
+
+    Raises:
+        WlmError: The accessor lies outside its view or buffer, or has an unknown type.
+    """
+    accessor = document.item("accessors", number)
+    where = f"{document.path}: accessors[{number}]"
+    component, kind, count = accessor.get("componentType"), accessor.get("type"), accessor.get("count")
+    if component not in COMPONENTS or kind not in (*_WIDTHS, *_MATRIX_SIDES):
+        raise WlmError(f"{where}: expected a componentType and a type of glTF, found {component} and {kind}")
+    if not isinstance(count, int) or count < 1:
+        raise WlmError(f"{where}: count: expected at least 1, found {count}")
+    size = np.dtype(COMPONENTS[component]).itemsize
+    if kind in _WIDTHS:
+        size *= _WIDTHS[kind]
+    else:  # each column begins at a multiple of 4 bytes
+        size = -(-size * _MATRIX_SIDES[kind] // 4) * 4 * _MATRIX_SIDES[kind]
+    if "bufferView" in accessor:
+        rows = _rows(document, where, accessor, count, size, strided=True)
+    else:
+        rows = np.zeros((count, size), np.uint8)
+    if "sparse" in accessor:
+        sparse = accessor["sparse"]
+        places = sparse["indices"]
+        wide = np.dtype(COMPONENTS[places["componentType"]])
+        at = _rows(document, f"{where}.sparse.indices", places, sparse["count"], wide.itemsize)
+        at = np.ascontiguousarray(at).view(wide)[:, 0]
+        if at.max() >= count:
+            raise WlmError(f"{where}.sparse.indices: expected numbers below {count}, found {at.max()}")
+        rows = rows.copy()
+        rows[at] = _rows(document, f"{where}.sparse.values", sparse["values"], sparse["count"], size)
+    return rows
+
+
+def components(document: GltfDocument, number: int, kind: str) -> np.ndarray:
+    """Reads an accessor's numbers in their own type.
+
+    Args:
+        document: The document.
+        number: Of the accessor.
+        kind: The type that it must have, "VEC3" for example.
+
+    Returns:
+        [count, components].
+
+    Raises:
+        WlmError: It has another type, or an error of `elements`.
+    """
+    accessor = document.item("accessors", number)
+    if accessor.get("type") != kind:
+        raise WlmError(f"{document.path}: accessors[{number}].type: expected {kind}, found {accessor.get('type')}")
+    return np.ascontiguousarray(elements(document, number)).view(COMPONENTS[accessor["componentType"]])
+
+
+def local_file(document_path: str, uri: str) -> Path | None:
+    """Gives the file that a URI names relative to the document; None for one with a scheme or an absolute path."""
+    name = unquote(uri)
+    if _URI_SCHEME.match(uri) or Path(name).is_absolute():
+        return None
+    return Path(document_path).parent / name
+
+
+@contextmanager
+def reported(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Turns what Python raises on a malformed tree into one line."""
+    try:
+        yield
+    except KeyError as error:
+        raise WlmError(f"{path}: malformed glTF: the field {error} is missing") from error
+    except (ValueError, TypeError, AttributeError, IndexError, OverflowError, RecursionError) as error:
+        raise WlmError(f"{path}: malformed glTF: {error}") from error
+    except MemoryError as error:
+        raise WlmError(f"{path}: malformed glTF: a count too large for the memory") from error
+
+
+def _split_glb(path: str | os.PathLike[str], data: bytes) -> tuple[bytes, bytes | None]:
+    """Gives the JSON and the binary chunk of a `.glb`."""
+    if len(data) < 12:
+        raise WlmError(f"{path}: the file is cut short: expected a header of 12 bytes, found {len(data)}")
+    version, length = struct.unpack_from("<2I", data, 4)
+    if version != 2:
+        raise WlmError(f"{path}: expected version 2 of the .glb format, found {version}")
+    if length > len(data):
+        raise WlmError(f"{path}: the file is cut short: expected {length} bytes, found {len(data)}")
+    chunks: dict[int, bytes] = {}
+    at = 12
+    while at + 8 <= length:
+        size, kind = struct.unpack_from("<2I", data, at)
+        if at + 8 + size > length:
+            raise WlmError(f"{path}: a chunk at byte {at} of {size} bytes goes beyond the file's {length}")
+        chunks.setdefault(kind, data[at + 8 : at + 8 + size])
+        at += 8 + size
+    if JSON_CHUNK not in chunks:
+        raise WlmError(f"{path}: the .glb file has no JSON chunk")
+    return chunks[JSON_CHUNK], chunks.get(BINARY_CHUNK)
+
+
+def _load_buffer(path: str | os.PathLike[str], number: int, buffer: dict, binary: bytes | None) -> bytes:
+    uri, length = buffer.get("uri"), buffer["byteLength"]
+    where = f"{path}: buffers[{number}]"
+    if uri is None:
+        if number or binary is None:
+            raise WlmError(f"{where}: has no uri, and the file no binary chunk for it")
+        data = binary
+    elif uri.startswith("data:"):
+        head, comma, body = uri.partition(",")
+        if not comma:
+            raise WlmError(f"{where}.uri: expected data: with a comma before its content")
+        data = unquote_to_bytes(body)
+        if head.endswith(";base64"):
+            try:
+                data = base64.b64decode(data, validate=True)
+            except binascii.Error as error:
+                raise WlmError(f"{where}.uri: expected base64: {error}") from error
+    else:
+        file = local_file(str(path), uri)
+        if file is None:
+            raise WlmError(f"{where}.uri: expected a file relative to it, found {uri}")
+        try:
+            data = file.read_bytes()
+        except OSError as error:
+            raise WlmError(f"{where}.uri: cannot read {file}: {error.strerror or error}") from error
+    if len(data) < length:
+        raise WlmError(f"{where}: expected {length} bytes, found {len(data)}")
+    return data
+
+
+def _check_view(document: GltfDocument, number: int, view: dict) -> None:
+    """Says where a buffer view is not within its buffer."""
+    where = f"{document.path}: bufferViews[{number}]"
+    document.item("buffers", view["buffer"])
+    start, length, held = view.get("byteOffset", 0), view["byteLength"], len(document.buffers[view["buffer"]])
+    if not (isinstance(start, int) and isinstance(length, int) and start >= 0 and length >= 0):
+        raise WlmError(f"{where}: expected whole numbers of 0 or more, found byteOffset {start}, byteLength {length}")
+    if start + length > held:
+        raise WlmError(f"{where}: needs {start + length} bytes of buffers[{view['buffer']}], which has {held}")
+
+
+def _rows(document: GltfDocument, where: str, place: dict, count: int, size: int, strided: bool = False) -> np.ndarray:
+    """Views `count` elements of `size` bytes at a place, an object with a bufferView and maybe a byteOffset."""
+    view = document.item("bufferViews", place["bufferView"])
+    offset, length = place.get("byteOffset", 0), view["byteLength"]
+    stride = view.get("byteStride", size) if strided else size
+    if not all(isinstance(each, int) and each >= least for each, least in ((count, 1), (offset, 0), (stride, 0))):
+        raise WlmError(f"{where}: expected whole numbers of 0 or more as count, byteOffset and byteStride")
+    needed = offset + (count - 1) * stride + size
+    if needed > length:
+        raise WlmError(f"{where}: needs {needed} bytes of bufferViews[{place['bufferView']}], which has {length}")
+    start = view.get("byteOffset", 0) + offset
+    data = np.frombuffer(document.buffers[view["buffer"]], np.uint8, needed - offset, start)
+    return np.lib.stride_tricks.as_strided(data, (count, size), (stride, 1), writeable=False)
+
+
+def _read_primitives(document: GltfDocument) -> list[GltfPrimitive]:
+    found = []
+    cache: dict[tuple[int, str], np.ndarray] = {}  # primitives often share their accessors
+
+    def floats(number: int, kind: str) -> np.ndarray:
+        if (number, kind) not in cache:
+            cache[number, kind] = _floats(document, number, kind)
+        return cache[number, kind]
+
+    for node, transform in _walk(document):
+        mesh_number = document.content["nodes"][node].get("mesh")
+        if mesh_number is None:
+            continue
+        mesh = document.item("meshes", mesh_number)
+        for i, primitive in enumerate(mesh["primitives"]):
+            mode, attributes = primitive.get("mode", TRIANGLES), primitive["attributes"]
+            if mode not in (TRIANGLES, STRIP, FAN) or "POSITION" not in attributes:
+                continue
+            local = floats(attributes["POSITION"], "VEC3")
+            where = f"{document.path}: meshes[{mesh_number}].primitives[{i}]"
+            triangle = _triangles(_corners(document, where, primitive, len(local)), mode, where)
+            if not len(triangle):
+                continue
+            row, triangle = np.unique(triangle, return_inverse=True)
+            sets = {int(match[1]): name for name in attributes if (match := _UV_NAME.fullmatch(name))}
+            uv = {}
+            for number, name in sorted(sets.items()):
+                values = floats(attributes[name], "VEC2")
+                if len(values) != len(local):
+                    raise WlmError(f"{where}: {name}: expected {len(local)} vertices as POSITION, found {len(values)}")
+                uv[number] = values[row]
+            found.append(
+                GltfPrimitive(
+                    node=node,
+                    mesh=mesh_number,
+                    primitive=i,
+                    name=f"node {node}, mesh {mesh_number}, primitive {i}",
+                    position=local[row].astype(np.float64) @ transform[:3, :3].T + transform[:3, 3],
+                    triangle=triangle.reshape(-1, 3).astype(np.int32),
+                    uv=uv,
+                    row=row,
+                )
+            )
+    return found
+
+
+def _floats(document: GltfDocument, number: int, kind: str) -> np.ndarray:
+    """Reads an accessor as float32 [count, components], integers scaled where it says so."""
+    values = components(document, number, kind)
+    if values.dtype.kind != "f" and document.content["accessors"][number].get("normalized", False):
+        scaled = values.astype(np.float64) / np.iinfo(values.dtype).max
+        return np.maximum(scaled, -1.0).astype(np.float32)
+    return values.astype(np.float32)
+
+
+def _corners(document: GltfDocument, where: str, primitive: dict, vertices: int) -> np.ndarray:
+    """Gives the vertex of every corner, int64 [N]."""
+    if "indices" not in primitive:
+        return np.arange(vertices)
+    index = components(document, primitive["indices"], "SCALAR")[:, 0]
+    if index.dtype.kind != "u":
+        raise WlmError(f"{where}.indices: expected unsigned integers, found {index.dtype}")
+    if index.max() >= vertices:
+        raise WlmError(f"{where}.indices: expected numbers below {vertices}, found {index.max()}")
+    return index.astype(np.int64)
+
+
+def _triangles(corner: np.ndarray, mode: int, where: str) -> np.ndarray:
+    """Makes triangles [F, 3] of corners [N], as the specification's section on primitive topology orders them."""
+    if mode == TRIANGLES:
+        if len(corner) % 3:
+            raise WlmError(f"{where}: expected three corners a triangle, found {len(corner)} corners")
+        return corner.reshape(-1, 3)
+    first = np.arange(max(len(corner) - 2, 0))
+    if mode == FAN:
+        return np.stack([corner[first + 1], corner[first + 2], np.full_like(first, corner[0])], axis=1)
+    odd = first % 2
+    return np.stack([corner[first], corner[first + 1 + odd], corner[first + 2 - odd]], axis=1)
+
+
+def _walk(document: GltfDocument) -> Iterator[tuple[int, np.ndarray]]:
+    """Yields the scene's nodes, depth first, each with its transform [4, 4] to the scene's space."""
+    content = document.content
+    nodes = content.get("nodes", [])
+    if content.get("scenes"):
+        roots: Sequence[int] = document.item("scenes", content.get("scene", 0)).get("nodes", [])
+    else:
+        children = {child for node in nodes for child in node.get("children", [])}
+        roots = [number for number in range(len(nodes)) if number not in children]
+    seen = set()
+    stack = [(root, np.eye(4)) for root in reversed(roots)]
+    while stack:
+        number, above = stack.pop()
+        node = document.item("nodes", number)
+        if number in seen:
+            raise WlmError(f"{document.path}: nodes[{number}]: expected one parent, found it twice in the scene")
+        seen.add(number)
+        transform = above @ _transform(node)
+        yield number, transform
+        stack += [(child, transform) for child in reversed(node.get("children", []))]
+
+
+def _transform(node: dict) -> np.ndarray:
+    """The node's own transform [4, 4]: its matrix, else translation * rotation * scale."""
+    if "matrix" in node:
+        return np.array(node["matrix"], np.float64).reshape(4, 4).T  # stored by columns
+    transform = np.eye(4)
+    x, y, z, w = np.array(node.get("rotation", (0, 0, 0, 1)), np.float64)
+    norm = x * x + y * y + z * z + w * w
+    if norm > 0:  # exporters round quaternions; of an all-zero one nothing can be made
+        s = 2.0 / norm
+        transform[:3, :3] = [
+            [1 - s * (y * y + z * z), s * (x * y - z * w), s * (x * z + y * w)],
+            [s * (x * y + z * w), 1 - s * (x * x + z * z), s * (y * z - x * w)],
+            [s * (x * z - y * w), s * (y * z + x * w), 1 - s * (x * x + y * y)],
+        ]
+    transform[:3, :3] *= np.array(node.get("scale", (1, 1, 1)), np.float64)
+    transform[:3, 3] = node.get("translation", (0, 0, 0))
+    return transform

@@ -1,0 +1,291 @@
+"""Copies of a glTF file, as `.glb`, in which some primitives have other vertices and one more UV set."""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+import json
+import os
+import struct
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from wlm.errors import WlmError
+from wlm.formats.atomic import atomic_write
+from wlm.formats.gltf import (
+    BINARY_CHUNK,
+    COMPONENTS,
+    JSON_CHUNK,
+    MAGIC,
+    TRIANGLES,
+    GltfDocument,
+    GltfPrimitive,
+    elements,
+    local_file,
+    reported,
+)
+
+__all__ = ["Replacement", "write_glb"]
+
+_VERTICES, _INDICES = 34962, 34963  # targets of buffer views
+_FLOAT, _UINT16, _UINT32 = 5126, 5123, 5125
+_MAX_GLB = 2**32 - 1
+_IMAGE_TYPES = {
+    ".png": "image/png",
+    ".jpg": "image/jpeg",
+    ".jpeg": "image/jpeg",
+    ".webp": "image/webp",
+    ".ktx2": "image/ktx2",
+    ".dds": "image/vnd-ms.dds",
+}
+# Extensions that number a primitive's vertices and would be wrong for the new ones.
+_OF_VERTICES = ("CESIUM_primitive_outline", "EXT_mesh_primitive_edge_visibility")
+# Extensions that name no accessor and no buffer view, so that unused ones are known to be so.
+_HARMLESS = ("KHR_materials_", "KHR_texture_", "KHR_lights_", "KHR_mesh_quantization", "EXT_texture_")
+
+
+@dataclass(frozen=True, eq=False)
+class Replacement:
+    """New vertices and triangles of a primitive.
+
+    Attributes:
+        primitive: The primitive, as it was read.
+        gather: int [V'], for each new vertex the vertex of `primitive` whose attributes it has.
+        triangle: int [F', 3], at least one, numbers of new vertices.
+        uv: [V', 2], the new UV; u right, v down; stored as float32.
+    """
+
+    primitive: GltfPrimitive
+    gather: np.ndarray
+    triangle: np.ndarray
+    uv: np.ndarray
+
+
+def write_glb(
+    path: str | os.PathLike[str], document: GltfDocument, replacements: Sequence[Replacement], uv_set: int
+) -> int:
+    """Write a document as `.glb` with some primitives replaced and all else as it was, whole or not at all.
+
+    Attributes and morph targets keep their encoding. Where a primitive lacks sets below `uv_set`, which glTF wants in
+    a row, they are given the new UVs too. Data that nothing uses any more is left out, unless the file has an
+    extension that may refer to it in a way unknown here. Extensions of a replaced primitive that number its vertices
+    (CESIUM_primitive_outline, EXT_mesh_primitive_edge_visibility) are dropped.
+
+    Args:
+        path: The file to write; its folder must exist.
+        document: As it was read.
+        replacements: At most one for each of its primitives.
+        uv_set: n of the new `TEXCOORD_n`, the same for all of them.
+
+    Returns:
+        The number of bytes written.
+
+    Raises:
+        ValueError: A primitive replaced twice or with that set already, a shape that is wrong or a number out of range.
+        WlmError: What isn't drawn, and so wasn't checked when it was read, is malformed; the file can't be written,
+            or would be beyond the 4 GiB that the format allows.
+    """
+    for each in replacements:
+        _check(each, uv_set)
+    keys = [(each.primitive.node, each.primitive.primitive) for each in replacements]
+    if len(set(keys)) < len(keys):
+        raise ValueError("replacements: expected at most one for each primitive")
+    with reported(document.path):
+        tree = _Tree(document)
+        for node in sorted({node for node, _ in keys}):
+            primitives = tree.own_mesh(node)["primitives"]
+            for each in replacements:
+                if each.primitive.node == node:
+                    tree.replace(primitives[each.primitive.primitive], each, uv_set)
+        tree.embed_images()
+        tree.drop_unused()
+    return atomic_write(path, _pack(path, tree.content, tree.payloads))
+
+
+class _Tree:
+    """A copy of a document that grows: its JSON, and the bytes of each of its buffer views.
+
+    Attributes:
+        content: The JSON tree.
+        payloads: The bytes of each buffer view.
+    """
+
+    def __init__(self, document: GltfDocument) -> None:
+        self._document = document
+        self.content = copy.deepcopy(document.content)
+        self.payloads: list[bytes | memoryview] = []
+        for view in self.content.setdefault("bufferViews", []):
+            start = view.get("byteOffset", 0)
+            self.payloads.append(memoryview(document.buffers[view["buffer"]])[start : start + view["byteLength"]])
+        self.content.setdefault("accessors", [])
+        self._users = Counter(node["mesh"] for node in self.content.get("nodes", []) if "mesh" in node)
+        self._known: dict[object, int] = {}  # new views and accessors by their content
+
+    def own_mesh(self, node: int) -> dict:
+        """Gives a node's mesh, made its alone if others use it too."""
+        number = self.content["nodes"][node]["mesh"]
+        if self._users[number] > 1:
+            self._users[number] -= 1
+            self.content["meshes"].append(copy.deepcopy(self._document.content["meshes"][number]))
+            number = self.content["nodes"][node]["mesh"] = len(self.content["meshes"]) - 1
+        return self.content["meshes"][number]
+
+    def replace(self, primitive: dict, new: Replacement, uv_set: int) -> None:
+        """Gives a primitive of the tree its new vertices and triangles."""
+        rows = new.primitive.row[new.gather]
+        for attributes in (primitive["attributes"], *primitive.get("targets", [])):
+            for name, number in attributes.items():
+                attributes[name] = self._gathered(number, rows, bounds=name == "POSITION")
+        uv = self._accessor(np.ascontiguousarray(new.uv, "<f4").view(np.uint8), _FLOAT, "VEC2", _VERTICES)
+        for number in range(uv_set + 1):
+            primitive["attributes"].setdefault(f"TEXCOORD_{number}", uv)
+        # 65535 would restart the primitive.
+        component, name = (_UINT16, "<u2") if len(new.gather) < 65536 else (_UINT32, "<u4")
+        corners = np.ascontiguousarray(new.triangle, name).reshape(-1, 1)
+        primitive["indices"] = self._accessor(corners.view(np.uint8), component, "SCALAR", _INDICES)
+        primitive["mode"] = TRIANGLES
+        for name in _OF_VERTICES:
+            primitive.get("extensions", {}).pop(name, None)
+        if primitive.get("extensions") == {}:
+            del primitive["extensions"]
+
+    def embed_images(self) -> None:
+        """Takes images of files into the tree; what can't be read keeps its URI."""
+        for image in self.content.get("images", []):
+            file = local_file(self._document.path, image["uri"]) if "uri" in image else None
+            kind = None if file is None else _IMAGE_TYPES.get(file.suffix.lower())
+            if kind is None:
+                continue
+            try:
+                data = file.read_bytes()
+            except (OSError, ValueError):  # ValueError: a zero byte in the name
+                continue
+            del image["uri"]
+            image |= {"bufferView": self._view(data, {}), "mimeType": kind}
+
+    def drop_unused(self) -> None:
+        """Leaves out accessors and buffer views that nothing refers to, if that is sure."""
+        used = self.content.get("extensionsUsed", [])
+        if all(name.startswith(_HARMLESS) for name in used):
+            self._keep("accessors", _accessor_slots)
+            kept = self._keep("bufferViews", _view_slots)
+            self.payloads = [self.payloads[number] for number in kept]
+
+    def _keep(self, kind: str, slots: Callable[[dict], Iterable[tuple[dict, str]]]) -> list[int]:
+        """Keeps those entries of a list that the slots refer to, and numbers them anew; returns the old numbers."""
+        places = list(slots(self.content))
+        kept = sorted({holder[key] for holder, key in places})
+        new = {old: number for number, old in enumerate(kept)}
+        for holder, key in places:
+            holder[key] = new[holder[key]]
+        self.content[kind] = [self.content[kind][number] for number in kept]
+        return kept
+
+    def _gathered(self, number: int, rows: np.ndarray, bounds: bool) -> int:
+        """Adds an accessor with some rows of another one in the same encoding."""
+        old = self._document.content["accessors"][number]
+        values = elements(self._document, number)[rows]
+        extra = {"normalized": True} if old.get("normalized", False) else {}
+        if bounds:
+            numbers = np.ascontiguousarray(values).view(COMPONENTS[old["componentType"]])
+            extra |= {"min": numbers.min(axis=0).tolist(), "max": numbers.max(axis=0).tolist()}
+        return self._accessor(values, old["componentType"], old["type"], _VERTICES, **extra)
+
+    def _accessor(self, values: np.ndarray, component: int, kind: str, target: int, **extra: object) -> int:
+        """Adds an accessor of encoded elements, uint8 [count, size], or finds an equal one."""
+        head: dict[str, object] = {"target": target}
+        if target == _VERTICES:  # each vertex begins at a multiple of 4 bytes
+            values = np.pad(values, ((0, 0), (0, -values.shape[1] % 4)))
+            head["byteStride"] = values.shape[1]
+        accessor = {
+            "bufferView": self._view(values.tobytes(), head),
+            "componentType": component,
+            "count": len(values),
+            "type": kind,
+            **extra,
+        }
+        key = json.dumps(accessor)
+        if key not in self._known:
+            self.content["accessors"].append(accessor)
+            self._known[key] = len(self.content["accessors"]) - 1
+        return self._known[key]
+
+    def _view(self, data: bytes, head: dict) -> int:
+        """Adds a buffer view, or finds one that was added with the same bytes."""
+        key = (hashlib.blake2b(data).digest(), tuple(head.items()))
+        if key not in self._known:
+            self.content["bufferViews"].append({"buffer": 0, "byteLength": len(data), **head})
+            self.payloads.append(data)
+            self._known[key] = len(self.payloads) - 1
+        return self._known[key]
+
+
+def _check(new: Replacement, uv_set: int) -> None:
+    """Says what of a replacement is wrong."""
+    where = new.primitive.name
+    if uv_set < 0 or uv_set in new.primitive.uv:
+        raise ValueError(f"uv_set: expected a number that {where} has not yet, got {uv_set}")
+    count = len(new.gather)
+    if new.uv.shape != (count, 2) or new.triangle.ndim != 2 or new.triangle.shape[1] != 3 or not len(new.triangle):
+        raise ValueError(f"{where}: expected uv [{count}, 2] and triangles, got {new.uv.shape}, {new.triangle.shape}")
+    for field, numbers, limit in (
+        ("gather", new.gather, len(new.primitive.row)),
+        ("triangle", new.triangle, count),
+    ):
+        if numbers.min() < 0 or numbers.max() >= limit:
+            raise ValueError(f"{where}: {field}: expected 0 to {limit - 1}, got {numbers.min()} to {numbers.max()}")
+
+
+def _accessor_slots(content: dict) -> Iterator[tuple[dict, str]]:
+    """Every place in core glTF that holds the number of an accessor, as an object and its key."""
+    for mesh in content.get("meshes", []):
+        for primitive in mesh["primitives"]:
+            for attributes in (primitive["attributes"], *primitive.get("targets", [])):
+                for name in attributes:
+                    yield attributes, name
+            if "indices" in primitive:
+                yield primitive, "indices"
+    for skin in content.get("skins", []):
+        if "inverseBindMatrices" in skin:
+            yield skin, "inverseBindMatrices"
+    for animation in content.get("animations", []):
+        for sampler in animation["samplers"]:
+            yield sampler, "input"
+            yield sampler, "output"
+
+
+def _view_slots(content: dict) -> Iterator[tuple[dict, str]]:
+    """Every place in core glTF that holds the number of a buffer view."""
+    for accessor in content["accessors"]:
+        sparse = accessor.get("sparse", {})
+        for holder in (accessor, sparse.get("indices", {}), sparse.get("values", {})):
+            if "bufferView" in holder:
+                yield holder, "bufferView"
+    for image in content.get("images", []):
+        if "bufferView" in image:
+            yield image, "bufferView"
+
+
+def _pack(path: str | os.PathLike[str], content: dict, payloads: Sequence[bytes | memoryview]) -> list[bytes]:
+    """Lays the views one after another in one buffer, and gives the file's pieces."""
+    pieces: list[bytes | memoryview] = []
+    start = 0
+    for view, data in zip(content["bufferViews"], payloads, strict=True):
+        view |= {"buffer": 0, "byteOffset": start}
+        padding = bytes(-len(data) % 4)
+        pieces += [data, padding]
+        start += len(data) + len(padding)
+    content["buffers"] = [{"byteLength": start}]
+    for kind in ("accessors", "bufferViews"):  # glTF has no empty lists
+        if not content[kind]:
+            del content[kind]
+    text = json.dumps(content, ensure_ascii=False, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    length = 12 + 8 + len(text) + 8 + start
+    if length > _MAX_GLB:
+        raise WlmError(f"{path}: cannot write: {length} bytes are beyond the 4 GiB of the .glb format")
+    head = struct.pack("<4s4I", MAGIC, 2, length, len(text), JSON_CHUNK)
+    return [head, text, struct.pack("<2I", start, BINARY_CHUNK), *pieces]

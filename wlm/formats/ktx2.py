@@ -1,0 +1,194 @@
+"""KTX2 files of the textures that the atlas is exported to: 2D, one mip level, not supercompressed.
+
+Layout: the KTX file format specification 2.0; the data format descriptor: Khronos Data Format specification 1.3, the
+basic descriptor block.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+
+from wlm.errors import WlmError
+from wlm.formats.atomic import atomic_write
+
+__all__ = ["VK_FORMATS", "Ktx2Texture", "read_ktx2", "write_ktx2"]
+
+VK_FORMATS = {
+    "R16G16_UNORM": 77,
+    "R16G16_SFLOAT": 83,
+    "R16G16B16_SFLOAT": 90,
+    "R16G16B16A16_SFLOAT": 97,
+    "BC6H_UFLOAT_BLOCK": 143,
+    "ASTC_4x4_SFLOAT_BLOCK": 1000066000,
+}
+"""The formats that can be written and their Vulkan numbers: 16 bits a channel, or 16 bytes a block of 4 x 4 texels."""
+
+_IDENTIFIER = b"\xabKTX 20\xbb\r\n\x1a\n"
+# Identifier; format, bytes of a channel, width, height, depth, layers, faces, levels, supercompression; offset and
+# length of the descriptor and of the key/value data; of the supercompression's data; then the level's offset, length
+# and length without supercompression.
+_HEADER = struct.Struct("<12s 9I 4I 2Q 3Q")
+_BLOCK_BYTES = 16
+_MAX_SIDE = 16384  # texels; the limit of desktop GPUs
+
+_CHANNELS = {"R16G16_UNORM": 2, "R16G16_SFLOAT": 2, "R16G16B16_SFLOAT": 3, "R16G16B16A16_SFLOAT": 4}
+_RGBSDA, _BC6H, _ASTC = 1, 133, 162  # colour models
+_CHANNEL_IDS = (0, 1, 2, 15)  # red, green, blue, alpha
+_VERSION, _BT709, _LINEAR = 2, 1, 1
+_FLOAT, _SIGNED = 0x80, 0x40  # a sample's qualifiers
+
+
+@dataclass(frozen=True)
+class Ktx2Texture:
+    """What a KTX2 file holds.
+
+    Attributes:
+        width: Texels.
+        height: Texels.
+        fmt: A key of `VK_FORMATS`.
+        data: Rows of texels or of blocks from the top, without padding.
+    """
+
+    width: int
+    height: int
+    fmt: str
+    data: bytes
+
+
+def write_ktx2(path: str | os.PathLike[str], data: bytes, width: int, height: int, fmt: str) -> int:
+    """Writes texels or blocks as a KTX2 file, whole or not at all.
+
+    Args:
+        path: The file to write; its folder must exist.
+        data: Rows from the top: texels of 16-bit channels, little-endian, or ceil(width / 4) * ceil(height / 4)
+            blocks of 16 bytes.
+        width: Texels, 1 to 16384.
+        height: Texels, 1 to 16384.
+        fmt: A key of `VK_FORMATS`.
+
+    Returns:
+        The number of bytes written.
+
+    Raises:
+        ValueError: An unknown format, a size out of range, or data that doesn't fill the texture.
+        WlmError: The file can't be written; what was there before stays.
+    """
+    if fmt not in VK_FORMATS:
+        raise ValueError(f"fmt: expected one of {', '.join(VK_FORMATS)}, got {fmt}")
+    if not (1 <= width <= _MAX_SIDE and 1 <= height <= _MAX_SIDE):
+        raise ValueError(f"expected sides of 1 to {_MAX_SIDE} texels, got {width}x{height}")
+    if len(data) != _size(fmt, width, height):
+        raise ValueError(f"data: expected {_size(fmt, width, height)} bytes, got {len(data)}")
+    descriptor = _descriptor(fmt)
+    # In the order of their keys; r and d: to the right and down.
+    pairs = _pair("KTXorientation", "rd") + _pair("KTXwriter", "wlm")
+    end = _HEADER.size + len(descriptor) + len(pairs)
+    # A level begins at a multiple of both 4 and the bytes of a texel or block.
+    start = end + -end % math.lcm(4, _texel_bytes(fmt))
+    header = _HEADER.pack(
+        _IDENTIFIER,
+        VK_FORMATS[fmt],
+        2 if fmt in _CHANNELS else 1,
+        width,
+        height,
+        *(0, 0, 1, 1, 0),
+        _HEADER.size,
+        len(descriptor),
+        _HEADER.size + len(descriptor),
+        len(pairs),
+        *(0, 0),
+        *(start, len(data), len(data)),
+    )
+    return atomic_write(path, [header, descriptor, pairs, bytes(start - end), data])
+
+
+def read_ktx2(path: str | os.PathLike[str]) -> Ktx2Texture:
+    """Reads a KTX2 file of the kind that `write_ktx2` writes.
+
+    Args:
+        path: The file.
+
+    Returns:
+        The texture.
+
+    Raises:
+        WlmError: The file is missing, not a KTX2, of another format, a volume, an array, a cube, with several mip
+            levels or supercompressed, or has another descriptor or length than its format and size say.
+    """
+    try:
+        content = Path(path).read_bytes()
+    except OSError as error:
+        raise WlmError(f"{path}: cannot read the KTX2 file: {error.strerror or error}") from error
+    if content[: len(_IDENTIFIER)] != _IDENTIFIER:
+        raise WlmError(f"{path}: expected a KTX2 file, found other content")
+    if len(content) < _HEADER.size:
+        raise WlmError(f"{path}: the file is cut short: expected {_HEADER.size} bytes, found {len(content)}")
+    fields = _HEADER.unpack_from(content)
+    number, _, width, height, depth, layers, faces, levels, scheme, describes, describes_bytes = fields[1:12]
+    start, length = fields[16:18]
+    names = {value: name for name, value in VK_FORMATS.items()}
+    checks = (
+        ("vkFormat", number, number in names, f"one of {sorted(names)}"),
+        ("pixelWidth", width, 1 <= width <= _MAX_SIDE, f"1 to {_MAX_SIDE}"),
+        ("pixelHeight", height, 1 <= height <= _MAX_SIDE, f"1 to {_MAX_SIDE}"),
+        ("pixelDepth", depth, depth == 0, "0 (no volume)"),
+        ("layerCount", layers, layers == 0, "0 (no array)"),
+        ("faceCount", faces, faces == 1, "1 (no cube)"),
+        ("levelCount", levels, levels == 1, 1),
+        ("supercompressionScheme", scheme, scheme == 0, "0 (none)"),
+    )
+    for field, found, fits, expected in checks:
+        if not fits:
+            raise WlmError(f"{path}: {field}: expected {expected}, found {found}")
+    fmt = names[number]
+    if content[describes : describes + describes_bytes] != _descriptor(fmt):
+        raise WlmError(f"{path}: the data format descriptor: expected that of {fmt}, found another")
+    size = _size(fmt, width, height)
+    if length != size:
+        raise WlmError(f"{path}: byteLength of level 0: expected {size}, found {length}")
+    if start + length > len(content):
+        raise WlmError(f"{path}: the file is cut short: expected {start + length} bytes, found {len(content)}")
+    return Ktx2Texture(width, height, fmt, content[start : start + length])
+
+
+def _texel_bytes(fmt: str) -> int:
+    return 2 * _CHANNELS[fmt] if fmt in _CHANNELS else _BLOCK_BYTES
+
+
+def _size(fmt: str, width: int, height: int) -> int:
+    if fmt in _CHANNELS:
+        return width * height * _texel_bytes(fmt)
+    return -(-width // 4) * -(-height // 4) * _BLOCK_BYTES
+
+
+def _pair(key: str, value: str) -> bytes:
+    """One key and its value, with their length before and zeros to a multiple of 4 bytes behind."""
+    text = f"{key}\0{value}\0".encode()
+    return struct.pack("<I", len(text)) + text + bytes(-len(text) % 4)
+
+
+def _descriptor(fmt: str) -> bytes:
+    """The data format descriptor: its total length and one basic descriptor block."""
+    if fmt in _CHANNELS:
+        model, side = _RGBSDA, 0
+        samples = [(16 * i, 16, channel) for i, channel in enumerate(_CHANNEL_IDS[: _CHANNELS[fmt]])]
+    else:
+        model, side = (_BC6H if fmt.startswith("BC6H") else _ASTC), 3  # sides are stored less one
+        samples = [(0, 8 * _BLOCK_BYTES, 0)]
+    if fmt.endswith("_UNORM"):
+        qualifiers, lowest, highest = 0, struct.pack("<I", 0), struct.pack("<I", 0xFFFF)
+    else:  # of floats the range that stands for -1 or 0 to 1, as floats of 32 bits
+        unsigned = "UFLOAT" in fmt
+        qualifiers = _FLOAT if unsigned else _FLOAT | _SIGNED
+        lowest, highest = struct.pack("<f", 0.0 if unsigned else -1.0), struct.pack("<f", 1.0)
+    size = 24 + 16 * len(samples)
+    # Vendor and type; version and size; model, primaries, transfer and flags; the block's sides; bytes of a plane.
+    head = (0, _VERSION, size, model, _BT709, _LINEAR, 0, side, side, 0, 0, _texel_bytes(fmt))
+    block = struct.pack("<I 2H 4B 4B B7x", *head)
+    for offset, bits, channel in samples:
+        block += struct.pack("<H2B4x", offset, bits - 1, channel | qualifiers) + lowest + highest
+    return struct.pack("<I", 4 + size) + block

@@ -1,0 +1,326 @@
+"""Edge functions of triangles in homogeneous coordinates, and their exact signs; ``raster`` says what they are for."""
+
+import warp as wp
+
+__all__ = [
+    "MOST_PIXELS",
+    "SPACES",
+    "Box",
+    "Corners",
+    "Edges",
+    "Frame",
+    "at",
+    "box_of",
+    "centre",
+    "check_position",
+    "corners_of",
+    "covers",
+    "edges_of",
+    "exact_sign",
+    "finite",
+    "first_pixel",
+    "frame",
+    "functions",
+    "has_corners",
+    "last_pixel",
+    "total_of",
+]
+
+wp.set_module_options({"enable_backward": False, "max_unroll": 4})
+
+SPACES = ("clip", "uv")
+
+# Along one axis. With more, a term of the exact edge function would no longer fit a float64.
+MOST_PIXELS = 16384
+
+_LOW_BITS = wp.constant(wp.int64(2**29 - 1))
+_ZERO = wp.constant(wp.float64(0.0))
+_ONE = wp.constant(wp.float64(1.0))
+_TWO = wp.constant(wp.float64(2.0))
+# Rounding of an edge function, and of the determinant, is below 8 of 2^-53 of its terms' sizes.
+_ROUNDING = wp.constant(wp.float64(2.0**-49))
+# Of a pixel; what a division may lose is far less.
+_SLACK = wp.constant(wp.float64(1.0e-6))
+
+vec12d = wp.types.vector(length=12, dtype=wp.float64)
+
+
+@wp.struct
+class Frame:
+    """Where the pixel centres are: column i, row j is ((x + 2 i) H, (y + y_step j) W, scale W H), all of it integers.
+
+    Attributes:
+        height, width: H, W.
+        x: Of column 0.
+        y, y_step: Of row 0, and from row to row.
+        scale: 1 where coordinates run from -1 to 1, 2 where from 0 to 1.
+    """
+
+    height: int
+    width: int
+    x: int
+    y: int
+    y_step: int
+    scale: int
+
+
+@wp.struct
+class Corners:
+    """A triangle's corners (x, y, w), and z of each."""
+
+    a: wp.vec3d
+    b: wp.vec3d
+    c: wp.vec3d
+    z: wp.vec3d
+
+
+@wp.struct
+class Box:
+    """Pixels [left, right] x [top, bottom]; empty where the ends are the other way round."""
+
+    left: int
+    right: int
+    top: int
+    bottom: int
+
+
+@wp.struct
+class Edges:
+    """The three edge functions, E = x X + y Y + c for X = frame.x + 2 i, Y = frame.y + y_step j, positive inside.
+
+    Attributes:
+        x, y, c: By the corner opposite.
+        limit: What rounding may come to; set by ``edges_of``.
+        sign: Of the determinant of the corners; 0: covers nothing.
+    """
+
+    x: wp.vec3d
+    y: wp.vec3d
+    c: wp.vec3d
+    limit: wp.vec3d
+    sign: wp.float64
+
+
+@wp.func
+def corners_of(position: wp.array2d[float], triangle: wp.array2d[int], t: int) -> Corners:
+    """The corners of a triangle that has three."""
+    out = Corners()
+    i = triangle[t, 0]
+    j = triangle[t, 1]
+    k = triangle[t, 2]
+    if position.shape[1] == 2:
+        out.a = wp.vec3d(wp.float64(position[i, 0]), wp.float64(position[i, 1]), _ONE)
+        out.b = wp.vec3d(wp.float64(position[j, 0]), wp.float64(position[j, 1]), _ONE)
+        out.c = wp.vec3d(wp.float64(position[k, 0]), wp.float64(position[k, 1]), _ONE)
+    else:
+        out.a = wp.vec3d(wp.float64(position[i, 0]), wp.float64(position[i, 1]), wp.float64(position[i, 3]))
+        out.b = wp.vec3d(wp.float64(position[j, 0]), wp.float64(position[j, 1]), wp.float64(position[j, 3]))
+        out.c = wp.vec3d(wp.float64(position[k, 0]), wp.float64(position[k, 1]), wp.float64(position[k, 3]))
+        out.z = wp.vec3d(wp.float64(position[i, 2]), wp.float64(position[j, 2]), wp.float64(position[k, 2]))
+    return out
+
+
+@wp.func
+def has_corners(triangle: wp.array2d[int], t: int, count: int) -> bool:
+    """Whether the numbers of a triangle's corners are below a count."""
+    i = triangle[t, 0]
+    j = triangle[t, 1]
+    k = triangle[t, 2]
+    return wp.min(i, wp.min(j, k)) >= 0 and wp.max(i, wp.max(j, k)) < count
+
+
+@wp.func
+def finite(k: Corners) -> bool:
+    return wp.isfinite(k.a) and wp.isfinite(k.b) and wp.isfinite(k.c) and wp.isfinite(k.z)
+
+
+@wp.func
+def exact_sign(p: wp.vec3d, v: wp.vec3d, w: wp.vec3d) -> wp.float64:
+    """Sign of det[p, v, w], for p of integers up to 2^29 or of float32s, and v, w of float32s.
+
+    A product v_a w_b fits 48 bits, each half of it times p_c fits 53: twelve exact terms. They are added as an
+    expansion, a sum of float64s that don't overlap, whose last one that isn't zero has the sign.
+    """
+    sums = vec12d()
+    count = int(0)
+    for term in range(6):
+        axis = term // 2
+        one = (axis + 1 + term % 2) % 3
+        other = 3 - axis - one
+        whole = v[one] * w[other]
+        high = wp.cast(wp.cast(whole, wp.int64) & ~_LOW_BITS, wp.float64)
+        factor = wp.where(term % 2 == 0, p[axis], -p[axis])
+        for half in range(2):
+            carry = factor * wp.where(half == 0, high, whole - high)
+            for i in range(count):
+                old = sums[i]
+                total = carry + old
+                rest = total - carry
+                sums[i] = (carry - (total - rest)) + (old - rest)
+                carry = total
+            sums[count] = carry
+            count += 1
+    for i in range(12):
+        last = sums[11 - i]
+        if last != _ZERO:
+            return wp.sign(last)
+    return _ZERO
+
+
+@wp.func
+def centre(frame: Frame, row: int, column: int) -> wp.vec3d:
+    """P, of integers."""
+    return wp.vec3d(
+        wp.float64((frame.x + 2 * column) * frame.height),
+        wp.float64((frame.y + frame.y_step * row) * frame.width),
+        wp.float64(frame.scale * frame.width * frame.height),
+    )
+
+
+@wp.func
+def functions(k: Corners, frame: Frame, sign: wp.float64) -> Edges:
+    """Each product of two float32s is exact, so a coefficient's sign is right, and its size to one rounding."""
+    out = Edges()
+    n0 = sign * wp.cross(k.b, k.c)
+    n1 = sign * wp.cross(k.c, k.a)
+    n2 = sign * wp.cross(k.a, k.b)
+    h = wp.float64(frame.height)
+    w = wp.float64(frame.width)
+    out.x = h * wp.vec3d(n0[0], n1[0], n2[0])
+    out.y = w * wp.vec3d(n0[1], n1[1], n2[1])
+    out.c = wp.float64(frame.scale) * w * h * wp.vec3d(n0[2], n1[2], n2[2])
+    out.sign = sign
+    return out
+
+
+@wp.func
+def edges_of(k: Corners, frame: Frame, cull: int) -> Edges:
+    n = wp.cross(k.b, k.c)
+    d = wp.dot(k.a, n)
+    size = wp.abs(k.a[0] * n[0]) + wp.abs(k.a[1] * n[1]) + wp.abs(k.a[2] * n[2])
+    sign = wp.sign(d)
+    if not wp.abs(d) > _ROUNDING * size:
+        sign = exact_sign(k.a, k.b, k.c)
+    if cull != 0 and sign < _ZERO:
+        sign = _ZERO
+    out = functions(k, frame, sign)
+    for i in range(3):
+        across = wp.float64(2 * frame.width) * wp.abs(out.x[i])
+        down = wp.float64(2 * frame.height) * wp.abs(out.y[i])
+        out.limit[i] = _ROUNDING * (across + down + wp.abs(out.c[i]))
+    return out
+
+
+@wp.func
+def covers(e: Edges, k: Corners, frame: Frame, row: int, column: int) -> bool:
+    """Whether P, moved by the infinitely small step, lies inside; exact."""
+    p = centre(frame, row, column)
+    v = k.b
+    w = k.c
+    for i in range(3):
+        s = e.sign * exact_sign(p, v, w)
+        if s == _ZERO:
+            s = e.x[i]
+        if s == _ZERO:
+            s = e.y[i] * wp.float64(frame.y_step)
+        if not s > _ZERO:
+            return False
+        # Opposite the next corner: (b, c), (c, a), (a, b).
+        v = w
+        w = wp.where(i == 0, k.a, k.b)
+    return True
+
+
+@wp.func
+def _seen(k: Corners, axis: int):
+    """Least and greatest x / w, or y / w, of the part in front of the viewer; the first is the greater if none is.
+
+    An edge that leaves the front goes off to one infinity, the same along all of it.
+    """
+    low = wp.float64(wp.inf)
+    high = wp.float64(-wp.inf)
+    for i in range(3):
+        near = wp.where(i == 0, k.a, wp.where(i == 1, k.b, k.c))
+        if near[2] > _ZERO:
+            at = near[axis] / near[2]
+            low = wp.min(low, at)
+            high = wp.max(high, at)
+            for j in range(3):
+                far = wp.where(j == 0, k.a, wp.where(j == 1, k.b, k.c))
+                if not far[2] > _ZERO:
+                    way = far[axis] * near[2] - near[axis] * far[2]
+                    if way > _ZERO:
+                        high = wp.float64(wp.inf)
+                    if way < _ZERO:
+                        low = wp.float64(-wp.inf)
+    return low, high
+
+
+@wp.func
+def first_pixel(at: wp.float64, count: int) -> int:
+    """The first pixel at or after a place in pixels, 0 to count."""
+    return int(wp.clamp(wp.ceil(at - _SLACK), _ZERO, wp.float64(count)))
+
+
+@wp.func
+def last_pixel(at: wp.float64, count: int) -> int:
+    """The last pixel at or before a place in pixels, -1 to count - 1."""
+    return int(wp.clamp(wp.floor(at + _SLACK), -_ONE, wp.float64(count - 1)))
+
+
+@wp.func
+def box_of(k: Corners, frame: Frame) -> Box:
+    out = Box()
+    x_low, x_high = _seen(k, 0)
+    y_low, y_high = _seen(k, 1)
+    x = wp.float64(frame.x)
+    y = wp.float64(frame.y)
+    size_x = wp.float64(frame.scale * frame.width)
+    size_y = wp.float64(frame.scale * frame.height)
+    out.left = first_pixel((size_x * x_low - x) / _TWO, frame.width)
+    out.right = last_pixel((size_x * x_high - x) / _TWO, frame.width)
+    if frame.y_step > 0:
+        out.top = first_pixel((size_y * y_low - y) / _TWO, frame.height)
+        out.bottom = last_pixel((size_y * y_high - y) / _TWO, frame.height)
+    else:
+        out.top = first_pixel((y - size_y * y_high) / _TWO, frame.height)
+        out.bottom = last_pixel((y - size_y * y_low) / _TWO, frame.height)
+    return out
+
+
+@wp.func
+def at(k: Corners, frame: Frame, row: int, column: int):
+    """The edge functions where a pixel is covered, made positive, and their slopes by X and by Y."""
+    e = functions(k, frame, _ONE)
+    x = wp.float64(frame.x + 2 * column)
+    y = wp.float64(frame.y + frame.y_step * row)
+    f = x * e.x + (y * e.y + e.c)
+    # That the pixel is covered is known, and so that all have one sign.
+    sign = wp.where(f[0] + f[1] + f[2] < _ZERO, -_ONE, _ONE)
+    f = wp.vec3d(wp.max(sign * f[0], _ZERO), wp.max(sign * f[1], _ZERO), wp.max(sign * f[2], _ZERO))
+    return f, sign * e.x, sign * e.y
+
+
+@wp.func
+def total_of(v: wp.vec3d) -> wp.float64:
+    return v[0] + v[1] + v[2]
+
+
+def frame(height: int, width: int, space: str) -> Frame:
+    """Where the pixel centres of an image are."""
+    for name, size in (("height", height), ("width", width)):
+        if not 1 <= size <= MOST_PIXELS:
+            raise ValueError(f"{name}: expected 1 to {MOST_PIXELS}, got {size}")
+    out = Frame()
+    out.height, out.width = height, width
+    if space == "uv":
+        out.x, out.y, out.y_step, out.scale = 1, 1, 2, 2
+    else:
+        out.x, out.y, out.y_step, out.scale = 1 - width, height - 1, -2, 1
+    return out
+
+
+def check_position(position, space: str) -> None:
+    columns = 2 if space == "uv" else 4
+    if position.ndim != 2 or position.shape[1] != columns:
+        raise ValueError(f"position: expected [V, {columns}] in {space} space, got {tuple(position.shape)}")

@@ -1,0 +1,262 @@
+"""Reading a texture between its texels, and the ways back (lightmap-uv-clustering-cascade, section 3.3.2).
+
+u points right and v down, row 0 is v = 0; texel i of n has its centre at (i + 1/2) / n. What lies outside [0, 1] is
+
+    clamp   the nearest texel of the border;
+    wrap    the texture again, as it is;
+    mirror  the texture again, every other time turned round: the triangle wave of period 2, F(x) = |x - 2 floor(x/2 +
+            1/2)|. Eq. 8 of the paper has a floor where the bars must be, which makes it -2 or 0 everywhere.
+
+Coordinates are float32, but weights are made in float64: at 4,096 texels float32 would leave them 12 bits. A coordinate
+that is NaN, or infinite and not clamped, reads NaN; it has no gradient and gives the texels none.
+
+``axis_at``, ``read``, ``read_slope`` and ``add`` are for other kernels that read textures; an ``Axis`` of each of u and
+v serves all channels, forward and back.
+"""
+
+import warp as wp
+
+__all__ = [
+    "BOUNDARIES",
+    "FILTERS",
+    "Axis",
+    "add",
+    "axis_at",
+    "codes",
+    "read",
+    "read_slope",
+    "sample",
+    "sample_backward",
+    "triangle_wave",
+    "triangle_wave_slope",
+]
+
+wp.set_module_options({"enable_backward": False})
+
+BOUNDARIES = ("clamp", "wrap", "mirror")
+FILTERS = ("linear", "nearest")
+
+_WRAP, _MIRROR = (wp.constant(BOUNDARIES.index(name)) for name in ("wrap", "mirror"))
+_NEAREST = wp.constant(FILTERS.index("nearest"))
+
+
+@wp.struct
+class Axis:
+    """Where a coordinate lies among the texels of one axis.
+
+    Attributes:
+        low, high: Texels on its two sides, the same one where there is no other; always in the texture.
+        weight: Of ``high``, in [0, 1]; ``low`` has the rest. NaN: the coordinate names no place.
+        slope: What ``weight`` changes by per unit of the coordinate; 0: nothing changes.
+    """
+
+    low: int
+    high: int
+    weight: float
+    slope: float
+
+
+@wp.func
+def triangle_wave(x: float) -> float:
+    """Eq. 8: |x| for x in [-1, 1], of period 2; exact. NaN of what isn't finite."""
+    t = wp.float64(x)
+    half = wp.float64(0.5)
+    return float(wp.abs(t - wp.float64(2.0) * wp.floor(half * t + half)))
+
+
+@wp.func
+def triangle_wave_slope(x: float) -> float:
+    """1 where the wave rises and in its valleys, -1 where it falls and on its peaks; 0 of what isn't finite."""
+    if not wp.isfinite(x):
+        return 0.0
+    t = wp.float64(x)
+    half = wp.float64(0.5)
+    return wp.where(t - wp.float64(2.0) * wp.floor(half * t + half) < wp.float64(0.0), -1.0, 1.0)
+
+
+@wp.func
+def axis_at(x: float, size: int, filter: int, boundary: int) -> Axis:
+    """Places a coordinate.
+
+    Args:
+        x: u or v.
+        size: Texels along the axis, at least 1.
+        filter, boundary: As ``codes`` gives them.
+    """
+    out = Axis()
+    n = wp.float64(size)
+    t = wp.float64(x)
+    slope = float(size)
+    if boundary == _WRAP:
+        t = t - wp.floor(t)
+    elif boundary == _MIRROR:
+        t = wp.float64(triangle_wave(x))
+        slope = slope * triangle_wave_slope(x)
+    if wp.isnan(t):
+        out.weight = wp.nan
+        return out
+    t = wp.clamp(t, wp.float64(0.0), wp.float64(1.0))
+    if filter == _NEAREST:
+        out.low = wp.min(int(t * n), size - 1)
+        out.high = out.low
+        return out
+    place = t * n - wp.float64(0.5)
+    lower = wp.floor(place)
+    out.low = int(lower)
+    out.high = out.low + 1
+    out.weight = float(place - lower)
+    out.slope = slope
+    if boundary == _WRAP:
+        out.low = wp.where(out.low < 0, size - 1, out.low)
+        out.high = wp.where(out.high == size, 0, out.high)
+    elif out.low < 0 or out.high == size:
+        # The texel beyond the border is the one on it, clamped or mirrored.
+        out.low = wp.clamp(out.low, 0, size - 1)
+        out.high = out.low
+        out.weight = 0.0
+        out.slope = 0.0
+    return out
+
+
+@wp.func
+def read(texture: wp.array3d[float], x: Axis, y: Axis, c: int) -> float:
+    """Channel c at a place."""
+    top = texture[y.low, x.low, c]
+    # A neighbour without weight isn't looked at: it may be infinite.
+    if x.weight != 0.0:
+        top = (1.0 - x.weight) * top + x.weight * texture[y.low, x.high, c]
+    if y.weight == 0.0:
+        return top
+    bottom = texture[y.high, x.low, c]
+    if x.weight != 0.0:
+        bottom = (1.0 - x.weight) * bottom + x.weight * texture[y.high, x.high, c]
+    return (1.0 - y.weight) * top + y.weight * bottom
+
+
+@wp.func
+def read_slope(texture: wp.array3d[float], x: Axis, y: Axis, c: int) -> wp.vec2:
+    """What channel c changes by per unit of u and of v."""
+    if wp.isnan(x.weight) or wp.isnan(y.weight):
+        return wp.vec2()
+    top_left = texture[y.low, x.low, c]
+    top_right = texture[y.low, x.high, c]
+    bottom_left = texture[y.high, x.low, c]
+    bottom_right = texture[y.high, x.high, c]
+    across = (1.0 - y.weight) * (top_right - top_left) + y.weight * (bottom_right - bottom_left)
+    down = (1.0 - x.weight) * (bottom_left - top_left) + x.weight * (bottom_right - top_right)
+    return wp.vec2(x.slope * across, y.slope * down)
+
+
+@wp.func
+def add(grad: wp.array3d[float], x: Axis, y: Axis, c: int, g: float):
+    """Adds the gradient of what ``read`` gave to that of the texels that it came from."""
+    if wp.isnan(x.weight) or wp.isnan(y.weight):
+        return
+    top = (1.0 - y.weight) * g
+    wp.atomic_add(grad, y.low, x.low, c, (1.0 - x.weight) * top)
+    if x.weight != 0.0:
+        wp.atomic_add(grad, y.low, x.high, c, x.weight * top)
+    if y.weight != 0.0:
+        bottom = y.weight * g
+        wp.atomic_add(grad, y.high, x.low, c, (1.0 - x.weight) * bottom)
+        if x.weight != 0.0:
+            wp.atomic_add(grad, y.high, x.high, c, x.weight * bottom)
+
+
+@wp.kernel
+def _sample(
+    # in:
+    texture: wp.array3d[float],
+    uv: wp.array1d[wp.vec2],
+    filter: int,
+    boundary: int,
+    # out:
+    out: wp.array2d[float],
+):
+    i = wp.tid()
+    x = axis_at(uv[i][0], texture.shape[1], filter, boundary)
+    y = axis_at(uv[i][1], texture.shape[0], filter, boundary)
+    for c in range(texture.shape[2]):
+        out[i, c] = read(texture, x, y, c)
+
+
+@wp.kernel
+def _sample_backward(
+    # in:
+    texture: wp.array3d[float],
+    uv: wp.array1d[wp.vec2],
+    filter: int,
+    boundary: int,
+    grad_out: wp.array2d[float],
+    # out:
+    grad_texture: wp.array3d[float],
+    grad_uv: wp.array1d[wp.vec2],
+):
+    i = wp.tid()
+    x = axis_at(uv[i][0], texture.shape[1], filter, boundary)
+    y = axis_at(uv[i][1], texture.shape[0], filter, boundary)
+    if grad_texture.shape[0] > 0:
+        for c in range(texture.shape[2]):
+            add(grad_texture, x, y, c, grad_out[i, c])
+    if grad_uv.shape[0] > 0:
+        on_u = float(0.0)
+        on_v = float(0.0)
+        if filter != _NEAREST:
+            for c in range(texture.shape[2]):
+                slope = read_slope(texture, x, y, c)
+                on_u += grad_out[i, c] * slope[0]
+                on_v += grad_out[i, c] * slope[1]
+        grad_uv[i] = wp.vec2(on_u, on_v)
+
+
+def codes(filter: str, boundary: str) -> tuple[int, int]:
+    """What kernels call a filter and a boundary.
+
+    Args:
+        filter: "linear", between the four nearest texels, or "nearest".
+        boundary: "clamp", "wrap" or "mirror", see the module.
+
+    Raises:
+        ValueError: There is no such one.
+    """
+    for name, value, known in (("filter", filter, FILTERS), ("boundary", boundary, BOUNDARIES)):
+        if value not in known:
+            raise ValueError(f"{name}: expected one of {', '.join(known)}, got {value!r}")
+    return FILTERS.index(filter), BOUNDARIES.index(boundary)
+
+
+def _check(texture) -> None:
+    if texture.ndim != 3 or 0 in texture.shape:
+        raise ValueError(f"texture: expected [H, W, C], none of them 0, got {tuple(texture.shape)}")
+
+
+def sample(texture, uv, out, *, filter: str = "linear", boundary: str = "clamp") -> None:
+    """Reads a texture at any places.
+
+    Args:
+        texture: float [H, W, C].
+        uv: vec2 [N].
+        out: float [N, C], written.
+        filter, boundary: As for ``codes``.
+    """
+    _check(texture)
+    inputs = [texture, uv, *codes(filter, boundary)]
+    wp.launch(_sample, uv.shape, inputs=inputs, outputs=[out], device=texture.device)
+
+
+def sample_backward(
+    texture, uv, grad_out, grad_texture, grad_uv, *, filter: str = "linear", boundary: str = "clamp"
+) -> None:
+    """The gradients of ``sample``; that by uv is the one of the texels it lies between, 0 where the border is clamped.
+
+    On CUDA samples are added to ``grad_texture`` in any order, so that the last bits change from run to run.
+
+    Args:
+        texture, uv, filter, boundary: As for ``sample``.
+        grad_out: float [N, C].
+        grad_texture: float [H, W, C], added to; of shape [0, 0, 0]: not wanted.
+        grad_uv: vec2 [N], written; of shape [0]: not wanted.
+    """
+    _check(texture)
+    inputs = [texture, uv, *codes(filter, boundary), grad_out]
+    wp.launch(_sample_backward, uv.shape, inputs=inputs, outputs=[grad_texture, grad_uv], device=texture.device)
