@@ -8,6 +8,7 @@ STAMP := .venv/.installed
 
 demo: $(STAMP)
 	$(BIN)/python demos/lightmap.py
+	$(BIN)/python demos/atlas.py
 	$(BIN)/python demos/probe.py
 
 test: lint
@@ -20,6 +21,7 @@ bench: $(STAMP)
 	mkdir -p out
 	$(BIN)/wlm bench lightmap --quick --json out/bench.json --plot out/bench.png
 	$(BIN)/wlm bench probe --quick --json out/bench.json --plot out/bench-probe.png
+	$(BIN)/wlm bench atlas --quick --json out/bench.json --plot out/bench-atlas.png
 
 lint: $(STAMP)
 	$(BIN)/ruff check

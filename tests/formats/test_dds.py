@@ -80,7 +80,7 @@ def test_two_bytes_a_texel(tmp_path):
 @pytest.mark.parametrize("depth", [1, 3])
 def test_what_was_written_is_read(tmp_path, fmt, depth):
     path = tmp_path / "a.dds"
-    texel = {"R16G16B16A16_FLOAT": 8, "R16G16_FLOAT": 4, "R16G16_UNORM": 4, "R8G8_UNORM": 2}.get(fmt)
+    texel = {"R16G16B16A16_FLOAT": 8, "R16G16_FLOAT": 4, "R16G16_UNORM": 4, "R16G16_UINT": 4, "R8G8_UNORM": 2}.get(fmt)
     blocks = _blocks(10 * depth)[: (5 * 4 * texel if texel else 2 * 16) * depth]
     write_dds(path, blocks, width=5, height=4, depth=depth, fmt=fmt)
     assert read_dds(path) == DdsTexture(5, 4, depth, fmt, depth > 1, blocks)

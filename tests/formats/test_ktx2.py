@@ -14,7 +14,13 @@ from wlm.formats.ktx2 import VK_FORMATS, Ktx2Texture, read_ktx2, write_ktx2
 # Byte offsets, from the KTX specification's section on the file's structure.
 FORMAT, TYPE_SIZE, WIDTH, HEIGHT, DEPTH, LAYERS, FACES, LEVELS, SCHEME = range(12, 48, 4)
 DESCRIPTOR, DESCRIPTOR_BYTES, PAIRS, PAIRS_BYTES, LEVEL, LEVEL_BYTES = 48, 52, 56, 60, 80, 88
-TEXEL = {"R16G16_UNORM": 4, "R16G16_SFLOAT": 4, "R16G16B16_SFLOAT": 6, "R16G16B16A16_SFLOAT": 8}
+TEXEL = {
+    "R16G16_UNORM": 4,
+    "R16G16_UINT": 4,
+    "R16G16_SFLOAT": 4,
+    "R16G16B16_SFLOAT": 6,
+    "R16G16B16A16_SFLOAT": 8,
+}
 ONE, MINUS_ONE = 0x3F800000, 0xBF800000
 
 
@@ -52,6 +58,7 @@ def test_the_header_and_the_way_back(tmp_path, fmt):
     ("fmt", "model", "sides", "plane", "samples"),
     [
         ("R16G16_UNORM", 1, 0, 4, [(0, 15, 0, 0, 0xFFFF), (16, 15, 1, 0, 0xFFFF)]),
+        ("R16G16_UINT", 1, 0, 4, [(0, 15, 0, 0, 1), (16, 15, 1, 0, 1)]),
         ("R16G16_SFLOAT", 1, 0, 4, [(0, 15, 0xC0, MINUS_ONE, ONE), (16, 15, 0xC1, MINUS_ONE, ONE)]),
         ("R16G16B16_SFLOAT", 1, 0, 6, [(16 * i, 15, 0xC0 + i, MINUS_ONE, ONE) for i in range(3)]),
         ("R16G16B16A16_SFLOAT", 1, 0, 8, [(16 * i, 15, 0xC0 + (i, 15)[i == 3], MINUS_ONE, ONE) for i in range(4)]),
@@ -75,7 +82,7 @@ def test_the_data_format_descriptor(tmp_path, fmt, model, sides, plane, samples)
 @pytest.mark.parametrize(
     ("at", "value", "words"),
     [
-        (FORMAT, 43, "vkFormat: expected one of [77, 83, 90, 97, 143, 1000066000], found 43"),
+        (FORMAT, 43, "vkFormat: expected one of [77, 81, 83, 90, 97, 143, 1000066000], found 43"),
         (FORMAT, 83, "the data format descriptor: expected that of R16G16_SFLOAT, found another"),
         (WIDTH, 0, "pixelWidth: expected 1 to 16384, found 0"),
         (WIDTH, 6, "byteLength of level 0: expected 72, found 60"),

@@ -21,16 +21,20 @@ from wlm_kernels import (
 ARCHITECTURE = 90
 MODULES = (
     "blocks",
+    "cascade",
     "gaussian_cubes",
     "gaussian_sum",
     "grids",
     "mlp",
+    "patch_graph",
+    "patches",
     "probe_step",
     "raster",
     "raster_gradient",
     "temporal_decode",
     "temporal_gather",
     "texture",
+    "tile_decode",
     "volume",
 )
 WIDTHS = (8, 17, 32, 64)

@@ -2,23 +2,23 @@
 
 Each encoder takes one lightmap and returns what it weighs, how long it took and what comes back out of it.
 Gaps between charts are filled from the nearest valid texel first, as every engine does: zeros there cost 10
-dB at chart edges. Times are wall-clock on the CPU with one thread, for the codec alone: neither the filling
-nor the packing counts.
+dB at chart edges. Times are wall-clock on the CPU with one thread, for the codec alone: the filling does not
+count.
 """
 
 from __future__ import annotations
 
 import functools
-import importlib
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from types import ModuleType
 from typing import TypeVar
 
 import numpy as np
 
 from wlm.errors import WlmError
+from wlm.formats import hdr_blocks
+from wlm.formats.hdr_blocks import ASTC_MEDIUM, need
 from wlm.imageops import fill_gaps
 
 __all__ = [
@@ -40,8 +40,8 @@ GAMMA = 2.2
 _BC_BLOCK = 4
 # An 8-bit lightmap is stored relative to its brightest texel, which must be kept with it as one float32.
 _SCALE_BYTES = 4
-# astcenc's "medium" preset, the paper's setting.
-ASTC_MEDIUM = 60.0
+# The extra with the codecs' packages.
+_EXTRA = "baselines"
 
 
 @dataclass(frozen=True)
@@ -82,16 +82,13 @@ def encode_bc6h(frame: np.ndarray, mask: np.ndarray, profile: str = "slow") -> B
         WlmError: Shapes do not fit, a valid texel is NaN or infinite, the profile is unknown, or a package is
             missing.
     """
-    texcomp, codecs = _need("ispc_texcomp"), _need("imagecodecs")
-    _check_profile("bc6h", profile, ("veryfast", "fast", "basic", "slow", "veryslow"))
+    for package in ("ispc_texcomp", "imagecodecs"):  # the time to import them isn't the codec's
+        need(package, _EXTRA)
+    _check_profile("bc6h", profile, hdr_blocks.BC6H_PROFILES)
     image = _prepare(frame, mask)
     padded = _pad(image).astype(np.float16)
-    rgba = _with_alpha(padded, np.float16(1))
-    height, width = padded.shape[:2]
-    surface = texcomp.RGBASurface(rgba.tobytes(), width, height, rgba.strides[0])
-    settings = texcomp.BC6HEncSettings.from_profile(profile)
-    data, encode_seconds = _timed(lambda: texcomp.compress_blocks_bc6h(surface, settings))
-    decoded, decode_seconds = _timed(lambda: codecs.bcn_decode(data, 6, shape=(height, width, 3)))
+    data, encode_seconds = _timed(lambda: hdr_blocks.encode_bc6h(padded, profile, _EXTRA))
+    decoded, decode_seconds = _timed(lambda: hdr_blocks.decode_bc6h(data, *padded.shape[:2], _EXTRA))
     return _result("bc6h", image, len(data), encode_seconds, decode_seconds, decoded)
 
 
@@ -110,7 +107,7 @@ def encode_bc7(frame: np.ndarray, mask: np.ndarray, profile: str = "basic") -> B
         WlmError: Shapes do not fit, a valid texel is NaN or infinite, the profile is unknown, or a package is
             missing.
     """
-    texcomp, codecs = _need("ispc_texcomp"), _need("imagecodecs")
+    texcomp, codecs = need("ispc_texcomp", _EXTRA), need("imagecodecs", _EXTRA)
     _check_profile("bc7", profile, ("ultrafast", "veryfast", "fast", "basic", "slow"))
     image = _prepare(frame, mask)
     levels, scale = _to_levels(image)
@@ -143,21 +140,14 @@ def encode_astc(frame: np.ndarray, mask: np.ndarray, block: int = 12, quality: f
         WlmError: Shapes do not fit, a valid texel is NaN or infinite, an argument is out of range, or the
             package is missing.
     """
-    codec = _need("astc_encoder")
     if block not in (4, 5, 6, 8, 10, 12):
         raise WlmError(f"astc: expected a block side of 4, 5, 6, 8, 10 or 12, got {block}")
     if not 0.0 <= quality <= 100.0:
         raise WlmError(f"astc: expected a quality from 0 to 100, got {quality}")
     image = _prepare(frame, mask)
-    height, width = image.shape[:2]
-    rgba = _with_alpha(image.astype(np.float16), np.float16(1))
-    context = _astc_context(block, float(quality))
-    source = codec.ASTCImage(codec.ASTCType.F16, width, height, 1, rgba.tobytes())
-    swizzle = codec.ASTCSwizzle.from_str
-    data, encode_seconds = _timed(lambda: context.compress(source, swizzle("RGB1")))
-    target = codec.ASTCImage(codec.ASTCType.F16, width, height, 1)
-    _, decode_seconds = _timed(lambda: context.decompress(data, target, swizzle("RGBA")))
-    decoded = np.frombuffer(target.data, np.float16).reshape(height, width, 4)[..., :3]
+    texels, codec = image.astype(np.float16), hdr_blocks.astc((block, block), quality, _EXTRA)
+    data, encode_seconds = _timed(lambda: codec.encode(texels))
+    decoded, decode_seconds = _timed(lambda: codec.decode(data, *texels.shape[:2]))
     return _result(f"astc{block}", image, len(data), encode_seconds, decode_seconds, decoded)
 
 
@@ -215,25 +205,9 @@ def run_baselines(
     return [[BASELINES[name](frame, mask) for name in names] for frame in frames]
 
 
-def _need(package: str) -> ModuleType:
-    try:
-        return importlib.import_module(package)
-    except ImportError as error:
-        message = f"baselines: {package} is missing; needs the extra: pip install 'wlm[baselines]'"
-        raise WlmError(message) from error
-
-
 def _check_profile(codec: str, profile: str, known: Sequence[str]) -> None:
     if profile not in known:
         raise WlmError(f"{codec}: unknown profile {profile!r}, expected one of {', '.join(known)}")
-
-
-@functools.lru_cache(maxsize=4)
-def _astc_context(block: int, quality: float) -> object:
-    """Building a context's tables takes 15 ms, and they depend on these two alone."""
-    codec = _need("astc_encoder")
-    config = codec.ASTCConfig(codec.ASTCProfile.HDR_RGB_LDR_A, block, block, 1, quality)
-    return codec.ASTCContext(config, 1)
 
 
 def _prepare(frame: np.ndarray, mask: np.ndarray) -> np.ndarray:

@@ -97,6 +97,57 @@ def probe(
 
 
 @app.command()
+def atlas(
+    quick: Annotated[bool, typer.Option("--quick", help="Fewer steps and rows, for a check in minutes.")] = False,
+    device: Annotated[str, typer.Option(help='Where it computes: "cpu", "cuda" or "cuda:N".')] = "cpu",
+    meshes_path: Annotated[
+        Path | None,
+        typer.Option(
+            "--meshes",
+            metavar="DIR",
+            help="A folder of folders, each with a .glb, its lightmaps .exr and maybe mask.png; default the demo's.",
+        ),
+    ] = None,
+    mesh_path: Annotated[
+        Path | None, typer.Option("--mesh", metavar="FILE", help="Instead, one mesh: .glb, .gltf or .obj.")
+    ] = None,
+    lightmap_paths: Annotated[
+        list[Path] | None,
+        typer.Option("--lightmap", metavar="FILE.exr", help="A lightmap of it; may be given several times."),
+    ] = None,
+    mask_path: Annotated[Path | None, typer.Option("--mask", metavar="FILE.png", help="Their mask.")] = None,
+    json_path: Annotated[
+        Path | None, typer.Option("--json", metavar="FILE.json", help="Write the rows and the environment.")
+    ] = None,
+    plot_path: Annotated[
+        Path | None, typer.Option("--plot", metavar="FILE.png", help="Draw PSNR against size, error against time.")
+    ] = None,
+) -> None:
+    """Lightmaps of meshes: PSNR, SSIM, size and decode time of the profiles, smaller lightmaps and block codecs."""
+    _check_outputs(json_path, plot_path)
+    quiet_warp()
+    from wlm.bench.atlas import PANELS, plotted, run
+    from wlm.interop import check_device
+
+    device = check_device(device)
+    rows = run(
+        quick=quick,
+        device=device,
+        meshes_path=meshes_path,
+        mesh_path=mesh_path,
+        lightmap_paths=lightmap_paths or (),
+        mask_path=mask_path,
+        progress=note,
+    )
+    command = f"wlm bench atlas{' --quick' if quick else ''} --device {device}"
+    for option, path in (("meshes", meshes_path), ("mesh", mesh_path)):
+        command += "" if path is None else f" --{option} {path.name}"
+    command += "".join(f" --lightmap {path.name}" for path in lightmap_paths or ())
+    command += "" if mask_path is None else f" --mask {mask_path.name}"
+    _finish(rows, device, command, json_path, plot_path, PANELS, shown=plotted(rows))
+
+
+@app.command()
 def report(
     files: Annotated[list[Path], typer.Argument(metavar="FILE.json...", help="What `wlm bench ... --json` wrote.")],
     output: Annotated[Path | None, typer.Option("--output", "-o", metavar="PAGE.md", help="Default: print it.")] = None,
@@ -127,13 +178,23 @@ def _check_outputs(json_path: Path | None, plot_path: Path | None) -> None:
 
 
 def _finish(
-    rows: list, device: str, command: str, json_path: Path | None, plot_path: Path | None, panels, beside=()
+    rows: list,
+    device: str,
+    command: str,
+    json_path: Path | None,
+    plot_path: Path | None,
+    panels,
+    beside=(),
+    shown: list | None = None,
 ) -> None:
-    """Writes what was asked for, and prints the table."""
+    """Writes what was asked for, and prints the table.
+
+    A plot has the rows that are ``shown``, all unless told, and those ``beside`` them.
+    """
     from wlm.bench import describe_environment, plot, table, write_json
 
     if json_path is not None:
         write_json(json_path, rows, describe_environment(device, command))
     if plot_path is not None:
-        plot([*beside, *rows], plot_path, panels)
+        plot([*beside, *(rows if shown is None else shown)], plot_path, panels)
     sys.stdout.write(table(rows))

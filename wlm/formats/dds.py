@@ -18,6 +18,7 @@ DXGI_FORMATS = {
     "R16G16B16A16_FLOAT": 10,
     "R16G16_FLOAT": 34,
     "R16G16_UNORM": 35,
+    "R16G16_UINT": 36,
     "R8G8_UNORM": 49,
     "BC6H_UF16": 95,
     "BC6H_SF16": 96,
@@ -29,7 +30,13 @@ others with a texel's channels one after another, little-endian."""
 
 _BLOCK_BYTES = 16
 # Of the formats without blocks.
-_TEXEL_BYTES = {"R16G16B16A16_FLOAT": 8, "R16G16_FLOAT": 4, "R16G16_UNORM": 4, "R8G8_UNORM": 2}
+_TEXEL_BYTES = {
+    "R16G16B16A16_FLOAT": 8,
+    "R16G16_FLOAT": 4,
+    "R16G16_UNORM": 4,
+    "R16G16_UINT": 4,
+    "R8G8_UNORM": 2,
+}
 _MAX_SIDE = 16384  # texels; the limit of a 2D texture in Direct3D 11 and 12
 _MAX_DEPTH = 2048
 

@@ -19,6 +19,7 @@ __all__ = ["VK_FORMATS", "Ktx2Texture", "read_ktx2", "write_ktx2"]
 
 VK_FORMATS = {
     "R16G16_UNORM": 77,
+    "R16G16_UINT": 81,
     "R16G16_SFLOAT": 83,
     "R16G16B16_SFLOAT": 90,
     "R16G16B16A16_SFLOAT": 97,
@@ -35,7 +36,13 @@ _HEADER = struct.Struct("<12s 9I 4I 2Q 3Q")
 _BLOCK_BYTES = 16
 _MAX_SIDE = 16384  # texels; the limit of desktop GPUs
 
-_CHANNELS = {"R16G16_UNORM": 2, "R16G16_SFLOAT": 2, "R16G16B16_SFLOAT": 3, "R16G16B16A16_SFLOAT": 4}
+_CHANNELS = {
+    "R16G16_UNORM": 2,
+    "R16G16_UINT": 2,
+    "R16G16_SFLOAT": 2,
+    "R16G16B16_SFLOAT": 3,
+    "R16G16B16A16_SFLOAT": 4,
+}
 _RGBSDA, _BC6H, _ASTC = 1, 133, 162  # colour models
 _CHANNEL_IDS = (0, 1, 2, 15)  # red, green, blue, alpha
 _VERSION, _BT709, _LINEAR = 2, 1, 1
@@ -179,8 +186,9 @@ def _descriptor(fmt: str) -> bytes:
     else:
         model, side = (_BC6H if fmt.startswith("BC6H") else _ASTC), 3  # sides are stored less one
         samples = [(0, 8 * _BLOCK_BYTES, 0)]
-    if fmt.endswith("_UNORM"):
-        qualifiers, lowest, highest = 0, struct.pack("<I", 0), struct.pack("<I", 0xFFFF)
+    if fmt.endswith(("_UNORM", "_UINT")):  # what stands for 0 and for 1; an integer stands for itself
+        one = 0xFFFF if fmt.endswith("_UNORM") else 1
+        qualifiers, lowest, highest = 0, struct.pack("<I", 0), struct.pack("<I", one)
     else:  # of floats the range that stands for -1 or 0 to 1, as floats of 32 bits
         unsigned = "UFLOAT" in fmt
         qualifiers = _FLOAT if unsigned else _FLOAT | _SIGNED

@@ -1,0 +1,261 @@
+"""Scoring a decoded lightmap: known errors, the metrics that others compute, seams, and every stated behaviour."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+from lit_cube import DIRECTIONS, HEIGHT, WIDTH, lit_cube, waves
+
+from wlm import metrics, render
+from wlm.atlas.data import from_arrays
+from wlm.atlas.evaluate import charts, evaluate
+from wlm.atlas.views import View, sphere_views, visible_uv
+from wlm.errors import WlmError
+from wlm.imageops import fill_gaps
+
+FACES = [View.of(direction) for direction in DIRECTIONS]
+SQUARE = np.array([[-1, -1, 0], [1, -1, 0], [-1, 1, 0], [1, 1, 0]], np.float64)
+TWO = np.array([[0, 1, 2], [2, 1, 3]])
+SQUARE_UV = np.array([[0, 0], [1, 0], [0, 1], [1, 1]], np.float64)
+
+
+def _reader(mesh, change=lambda colour, uv, triangle: colour):
+    """Decodes what the reference holds, with a change."""
+    image = torch.tensor(fill_gaps(mesh.lightmap, mesh.mask))
+
+    def sample(uv, triangle, barycentric):
+        return change(render.texture(image.to(uv.device), uv), uv, triangle)
+
+    return sample
+
+
+def _offset(amount):
+    return lambda colour, uv, triangle: colour + amount
+
+
+def _one(mesh, decoder, **options):
+    return evaluate(mesh, {"it": decoder}, **({"views": FACES, "resolution": 64} | options))["it"]
+
+
+def test_the_reference_is_exact(device):
+    report = _one(lit_cube(), _reader(lit_cube()), views=12, device=device)
+    assert report.views == 12 and report.pixels > 4000 and report.name == "cube"
+    assert report.psnr == report.psnr_worst == report.texel_psnr == math.inf
+    assert report.one_minus_ssim == report.seam_error == report.rest_error == 0.0 and math.isnan(report.seam_ratio)
+    values = json.loads(json.dumps(report.to_json(), allow_nan=False))
+    assert values["psnr"] is None and values["seam_ratio"] is None and values["one_minus_ssim"] == 0.0
+
+
+def test_an_upside_down_lightmap_is_terrible():
+    mesh = lit_cube()
+    image = torch.tensor(fill_gaps(mesh.lightmap, mesh.mask)).flip(0).contiguous()
+    report = _one(mesh, lambda uv, triangle, barycentric: render.texture(image, uv), views=12)
+    assert report.psnr < 12.0 and report.texel_psnr < 12.0 and report.one_minus_ssim > 0.5
+
+
+def test_a_known_error(device):
+    mesh = lit_cube()
+    report = _one(mesh, _reader(mesh, _offset(0.01)), device=device)
+    colours = []
+    for seen, _, uv in visible_uv(mesh, FACES, 64, "cpu"):
+        colours.append(render.texture(torch.tensor(fill_gaps(mesh.lightmap, mesh.mask)), uv[seen >= 0]))
+    peak = float(torch.cat(colours).max() - torch.cat(colours).min())
+    wanted = 20.0 * math.log10(peak / 0.01)
+    assert report.peak == pytest.approx(peak, rel=1e-6) and 1.5 < peak < 2.1
+    assert [report.psnr, report.psnr_worst, report.texel_psnr] == pytest.approx([wanted] * 3, abs=1e-3)
+    assert report.rest_error == pytest.approx(0.01, rel=1e-4)
+
+
+@pytest.mark.parametrize("resolution", [40, 90])
+def test_against_the_metrics_of_pictures(device, resolution):
+    """A blurred lightmap in views that cut nothing off; each view by ``wlm.metrics`` on its whole pictures."""
+    mesh, views = lit_cube(3), sphere_views(4, seed=3)
+    small = torch.tensor(waves(12, 18))
+
+    def blurred(uv, triangle, barycentric):
+        return render.texture(small.to(uv.device), uv)
+
+    report = _one(mesh, blurred, views=views, resolution=resolution, device=device)
+    psnr, ssim = [], []
+    for seen, _, uv in visible_uv(mesh, views, resolution, "cpu"):
+        images = torch.tensor(fill_gaps(mesh.lightmap, mesh.mask)), small
+        pictures = [render.texture(image, uv).numpy() for image in images]
+        psnr.append(metrics.psnr(*pictures, seen.numpy() >= 0, peak=report.peak))
+        ssim.append(metrics.ssim(*pictures, seen.numpy() >= 0, data_range=report.peak))
+    assert report.psnr == pytest.approx(np.mean(psnr), abs=1e-4)
+    assert report.psnr_worst == pytest.approx(min(psnr), abs=1e-4) and report.worst_view == np.argmin(psnr)
+    assert 0.01 < report.one_minus_ssim == pytest.approx(1.0 - np.mean(ssim), abs=1e-4)
+
+
+def test_pictures_smaller_than_the_window_of_ssim():
+    mesh = lit_cube()
+    assert math.isnan(_one(mesh, _reader(mesh, _offset(0.1)), resolution=8).one_minus_ssim)
+    assert _one(mesh, _reader(mesh, _offset(0.1)), resolution=8).psnr > 20.0
+    assert _one(mesh, _reader(mesh, _offset(0.1)), resolution=12).one_minus_ssim > 0.0
+
+
+def test_decoders_do_not_mix():
+    mesh = lit_cube()
+    decoders = {"bad": _reader(mesh, _offset(0.3)), "exact": _reader(mesh), "good": _reader(mesh, _offset(0.001))}
+    reports = evaluate(mesh, decoders, views=FACES, resolution=64)
+    assert list(reports) == list(decoders)
+    for name, decoder in decoders.items():
+        alone = _one(mesh, decoder)
+        assert json.dumps(alone.to_json()) == json.dumps(reports[name].to_json())
+    assert evaluate(mesh, {}, views=FACES, resolution=16) == {}
+
+
+def test_charts():
+    mesh = lit_cube(2)
+    number = charts(mesh)
+    assert number.shape == (48,) and len(set(number)) == 6
+    assert (number.reshape(6, 8) == number[::8, None]).all()
+    # Vertices of their own at equal places make no border; one place in UV with another in space does, and the reverse.
+    six = np.arange(6).reshape(2, 3)
+    for position, uv, count in (
+        (SQUARE[TWO].reshape(6, 3), SQUARE_UV[TWO].reshape(6, 2), 1),
+        (SQUARE[TWO].reshape(6, 3) + np.repeat([[0], [1.0]], 3, 0), SQUARE_UV[TWO].reshape(6, 2), 2),
+        (SQUARE[TWO].reshape(6, 3), SQUARE_UV[TWO].reshape(6, 2) * np.repeat([[1], [0.5]], 3, 0), 2),
+    ):
+        assert len(set(charts(from_arrays(position, six, uv, waves())))) == count
+    # A shared corner alone doesn't join; a triangle without area is in none.
+    fan = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]], np.float64)
+    mesh = from_arrays(fan, np.array([[0, 1, 2], [1, 2, 2], [0, 3, 4]]), fan[:, :2] * 0.5 + 0.5, waves())
+    assert charts(mesh).tolist() == [0, -1, 1]
+
+
+def test_errors_beside_seams_stand_out():
+    """An error in a frame of each chart. A cube's outline is no seam: its other side isn't on the screen."""
+    mesh = lit_cube()
+
+    def frame(width):
+        def change(colour, uv, triangle):
+            cell = (uv * torch.tensor([3.0, 2.0])) % 1.0  # charts reach from 0.05 to 0.95
+            return torch.where(((cell - 0.5).abs().amax(dim=1) > 0.45 - width)[:, None], colour + 0.5, colour)
+
+        return change
+
+    decoders = {f"{width}": _reader(mesh, frame(width)) for width in (0.006, 0.05)}
+    reports = evaluate(mesh, decoders | {"even": _reader(mesh, _offset(0.1))}, views=8, resolution=128)
+    # A hundredth of a face is less than a pixel, so that it lies within one of the border; a tenth is about three.
+    assert 0.1 < reports["0.006"].seam_error < 0.3 and reports["0.006"].seam_ratio > 10.0
+    assert 0.4 < reports["0.05"].seam_error < 0.5 and 4.0 < reports["0.05"].seam_ratio < 6.0
+    assert reports["even"].seam_ratio == pytest.approx(1.0, rel=1e-4)
+    one_face = _one(mesh, decoders["0.05"])
+    assert math.isnan(one_face.seam_error) and math.isnan(one_face.seam_ratio) and one_face.rest_error > 0.0
+
+
+def test_seams_of_tiles_by_labels(device):
+    """A sheet of one chart in tiles of a quarter: an error beside u = 1/2 is at a seam of the tiles only."""
+    mesh = from_arrays(SQUARE, TWO, SQUARE_UV, waves())
+    decoder = _reader(mesh, lambda colour, uv, t: torch.where((uv[:, :1] - 0.5).abs() < 0.02, colour + 1.0, colour))
+
+    def tiles(uv, triangle, barycentric):
+        return (uv[:, 0] * 4).int()
+
+    options = {"views": [View.of([0, 0, 1])], "resolution": 96, "device": device}
+    plain = evaluate(mesh, {"a": decoder, "b": decoder}, labels={"b": tiles}, **options)
+    assert math.isnan(plain["a"].seam_ratio) and plain["b"].seam_ratio == math.inf
+    # Three borders, four pixels wide and as high as the sheet; all that is wrong is at one of them.
+    pixels = plain["b"].pixels
+    assert plain["b"].rest_error == 0.0 and plain["a"].rest_error > 0.0
+    assert plain["a"].rest_error * pixels == pytest.approx(plain["b"].seam_error * 12 * pixels**0.5)
+
+
+def test_two_sheets_apart_have_no_seam_where_one_ends_before_the_other():
+    position = np.concatenate([SQUARE * [0.5, 0.5, 1] + [0, 0, 0.5], SQUARE - [0, 0, 0.5]])
+    uv = np.concatenate([SQUARE_UV * [0.4, 1], SQUARE_UV * [0.4, 1] + [0.6, 0]])
+    mesh = from_arrays(position, np.concatenate([TWO, TWO + 4]), uv, waves())
+    ((seen, _, _),) = visible_uv(mesh, [View.of([0, 0, 1])], 64, "cpu")
+    assert {0, 1, 2, 3} <= set(seen.unique().tolist())
+    assert math.isnan(_one(mesh, _reader(mesh, _offset(0.1)), views=[View.of([0, 0, 1])]).seam_error)
+
+
+def test_views_that_see_nothing_are_left_out():
+    mesh = from_arrays(SQUARE, TWO, SQUARE_UV, waves())
+    edge, front = View.of([1, 0, 0]), View.of([0, 0, 1])
+    report = _one(mesh, _reader(mesh, _offset(0.1)), views=[edge, front, edge])
+    assert report.views == 1 and report.worst_view == 1
+    assert report.psnr == report.psnr_worst == _one(mesh, _reader(mesh, _offset(0.1)), views=[front]).psnr
+    nothing = _one(mesh, _reader(mesh), views=[edge])
+    assert nothing.views == nothing.pixels == 0 and nothing.worst_view == -1
+    numbers = [nothing.peak, nothing.psnr, nothing.psnr_worst, nothing.one_minus_ssim, nothing.rest_error]
+    assert all(math.isnan(number) for number in numbers)
+    assert json.dumps(nothing.to_json(), allow_nan=False)
+
+
+def test_views_that_are_exact_count_as_the_cap():
+    mesh = lit_cube(2)
+    report = _one(mesh, _reader(mesh, lambda c, uv, t: torch.where((t < 8)[:, None], c + 0.1, c)), views=FACES[:2])
+    assert report.psnr == pytest.approx((report.psnr_worst + metrics.PSNR_CAP_DB) / 2.0)
+    assert report.worst_view == 0 and 20.0 < report.psnr_worst < 40.0
+
+
+def test_a_light_of_one_colour_has_no_scale():
+    mesh = lit_cube(1, np.full((HEIGHT, WIDTH, 3), 0.7, np.float32))
+    report = _one(mesh, _reader(mesh, _offset(0.1)), views=4)
+    assert report.peak == 0.0 and report.worst_view == -1
+    assert all(math.isnan(x) for x in (report.psnr, report.psnr_worst, report.one_minus_ssim, report.texel_psnr))
+    assert report.rest_error == pytest.approx(0.1, rel=1e-5)
+
+
+def test_texels_in_the_mask_count(device):
+    """Of a half masked sheet the wrong half isn't counted; the decoder gets the texels' own centres."""
+    mask = np.zeros((HEIGHT, WIDTH), bool)
+    mask[:, : WIDTH // 2] = True
+    mesh = from_arrays(SQUARE, TWO, SQUARE_UV, waves(), mask=mask)
+    image = torch.tensor(fill_gaps(mesh.lightmap, mesh.mask))
+    asked = []
+
+    def decoder(uv, triangle, barycentric):
+        asked.append((uv.cpu(), triangle.cpu(), barycentric.cpu()))
+        return render.texture(image.to(uv.device), uv) + 0.1 * (uv[:, :1] > 0.5)
+
+    report = _one(mesh, decoder, views=[View.of([0, 0, 1])], device=device)
+    assert report.texel_psnr == math.inf and report.psnr < 40.0
+    uv, triangle, barycentric = asked[-1]
+    row, column = np.nonzero(mask)
+    np.testing.assert_allclose(uv, np.stack([(column + 0.5) / WIDTH, (row + 0.5) / HEIGHT], 1), rtol=1e-6)
+    assert triangle.dtype == torch.int32 and barycentric.shape == (len(uv), 3)
+    weighted = (torch.tensor(mesh.uv)[mesh.triangle[triangle]] * barycentric[..., None]).sum(1)
+    np.testing.assert_allclose(weighted, uv, atol=1e-6)
+
+
+def test_what_is_refused():
+    mesh = lit_cube(1)
+    broken = _reader(mesh, lambda c, uv, t: torch.where((uv[:, :1] < 0.2), torch.nan, c))
+    with pytest.raises(WlmError, match="cube: it decodes to NaN or infinity at"):
+        _one(mesh, broken)
+    with pytest.raises(ValueError, match=r"it: expected colours \[\d+, 3\]"):
+        _one(mesh, _reader(mesh, lambda c, uv, t: c[:, :2]))
+    with pytest.raises(ValueError, match="labels: expected names of decoders, got other"):
+        _one(mesh, _reader(mesh), labels={"other": _reader(mesh)})
+    with pytest.raises(ValueError, match="it: expected labels"):
+        _one(mesh, _reader(mesh), labels={"it": lambda uv, t, b: uv[:, 0]})
+    with pytest.raises(WlmError, match="gpu"):
+        _one(mesh, _reader(mesh), device="gpu")
+
+
+def test_progress():
+    calls = []
+    mesh = lit_cube(1)
+    evaluate(mesh, {"it": _reader(mesh)}, views=3, resolution=16, progress=lambda *call: calls.append(call))
+    assert calls == [(1, 3), (2, 3), (3, 3)]
+
+
+def test_threads_are_given_back():
+    mesh, before, inside = lit_cube(1), torch.get_num_threads(), []
+
+    def decoder(uv, triangle, barycentric):
+        inside.append(torch.get_num_threads())
+        return uv
+
+    try:
+        torch.set_num_threads(2)
+        with pytest.raises(ValueError, match="expected colours"):
+            _one(mesh, decoder)
+        assert inside == [1] and torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)

@@ -1,0 +1,341 @@
+"""What an engine gets: textures that read back exactly, a mesh with both UVs, a shader that gives the same light."""
+
+import json
+import os
+import shutil
+import subprocess
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from atlas_meshes import charts, sheet
+from atlas_models import KINDS, random_model
+
+from wlm.atlas import codec, colour, export
+from wlm.atlas.decode import Decoder
+from wlm.atlas.reference import decode64
+from wlm.atlas.shader import atlas_glsl
+from wlm.errors import WlmError
+from wlm.formats.dds import read_dds
+from wlm.formats.exr import read_exr
+from wlm.formats.gltf import read_gltf
+from wlm.formats.ktx2 import read_ktx2
+
+ALWAYS = {"atlas.wlm", "mesh.glb", "colour.exr", "colour.ktx2", "atlas.glsl", "report.json"}
+LUT = {"lut.exr", "lut.ktx2", "lut.dds"}
+
+
+def written(folder, kind, stored="half", mesh=None, **facts):
+    mesh = sheet() if mesh is None else mesh
+    model = random_model(mesh, kind, stored)
+    return model, mesh, export.export(folder, model, mesh, facts)
+
+
+@pytest.mark.parametrize("stored", ["half", "bc6h", "astc"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_is_written(kind, stored, tmp_path):
+    model, mesh, paths = written(tmp_path / "out", kind, stored, seed=3)
+    expected = ALWAYS | (set() if model.method == "plain" else LUT) | (set() if stored == "astc" else {"colour.dds"})
+    assert {path.name for path in paths} == expected == set(os.listdir(tmp_path / "out"))
+    assert paths[-1].name == "report.json" and os.listdir(tmp_path) == ["out"]
+    report = json.loads(paths[-1].read_text())
+    assert report["bytes"] == {path.name: path.stat().st_size for path in paths[:-1]}
+    assert (report["method"], report["source"], report["size"]) == (model.method, mesh.source, [48, 40])
+    assert report["cr"] == model.compression_ratio and report["seed"] == 3
+    assert report["cr_disk"] == 1 - report["bytes"]["atlas.wlm"] * 8 / (40 * 48 * 48)
+    assert (report["seconds"], report["found"]) == ({"fit": 1.5}, {"tiles": 4})
+    back = codec.read(tmp_path / "out" / "atlas.wlm")
+    np.testing.assert_array_equal(back.texels, model.texels)
+    assert "seconds" not in back.report, "one seed gives one file"
+
+
+@pytest.mark.parametrize("kind", ["tiles", "cascade"])
+def test_the_table_is_exact_in_every_format(kind, tmp_path):
+    model, _, _ = written(tmp_path, kind)
+    height, width = model.lut.shape[:2]
+    ktx2, dds = read_ktx2(tmp_path / "lut.ktx2"), read_dds(tmp_path / "lut.dds")
+    exr, _ = read_exr(tmp_path / "lut.exr")
+    assert (ktx2.fmt, dds.fmt) == (("R16G16_UINT",) * 2 if kind == "tiles" else ("R16G16_UNORM",) * 2)
+    assert (ktx2.width, ktx2.height, dds.width, dds.height) == (width, height) * 2
+    for data in (ktx2.data, dds.blocks):
+        np.testing.assert_array_equal(np.frombuffer(data, "<u2").reshape(model.lut.shape), model.lut)
+    scale = 1 if kind == "tiles" else 65535
+    np.testing.assert_array_equal(np.rint(exr[..., :2].astype(np.float64) * scale), model.lut)
+    assert not exr[..., 2].any()
+
+
+@pytest.mark.parametrize("stored", ["half", "bc6h", "astc"])
+def test_the_colours_are_exact_in_every_format(stored, tmp_path):
+    model, _, _ = written(tmp_path, "plain", stored)
+    np.testing.assert_array_equal(read_exr(tmp_path / "colour.exr")[0], model.texels.astype(np.float32))
+    ktx2 = read_ktx2(tmp_path / "colour.ktx2")
+    dds = None if stored == "astc" else read_dds(tmp_path / "colour.dds")
+    assert (ktx2.width, ktx2.height) == (23, 18)
+    if stored == "half":
+        assert (ktx2.fmt, dds.fmt) == ("R16G16B16_SFLOAT", "R16G16B16A16_FLOAT")
+        np.testing.assert_array_equal(np.frombuffer(ktx2.data, "<f2").reshape(18, 23, 3), model.texels)
+        whole = np.frombuffer(dds.blocks, "<f2").reshape(18, 23, 4)
+        np.testing.assert_array_equal(whole[..., :3], model.texels)
+        assert (whole[..., 3] == 1).all()
+        return
+    assert ktx2.fmt == {"bc6h": "BC6H_UFLOAT_BLOCK", "astc": "ASTC_4x4_SFLOAT_BLOCK"}[stored]
+    blocks = np.frombuffer(ktx2.data, np.uint8).reshape(-1, 16)
+    np.testing.assert_array_equal(colour.decode(blocks, 18, 23, stored), model.texels.astype(np.float32))
+    assert dds is None or (dds.fmt == "BC6H_UF16" and dds.blocks == ktx2.data)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_mesh_keeps_its_uvs_and_gets_new_ones(kind, tmp_path):
+    model, mesh, _ = written(tmp_path, kind)
+    (primitive,) = read_gltf(tmp_path / "mesh.glb")[1]
+    np.testing.assert_array_equal(primitive.position[primitive.triangle], mesh.position[mesh.triangle])
+    np.testing.assert_array_equal(primitive.uv[0][primitive.triangle], mesh.uv[mesh.triangle].astype(np.float32))
+    number = json.loads((tmp_path / "report.json").read_text())["new_uv_set"]
+    if len(model.uv):
+        assert set(primitive.uv) == {0, 1} and number == 1
+        np.testing.assert_array_equal(primitive.uv[1][primitive.triangle], model.uv)
+    else:
+        assert set(primitive.uv) == {0} and number is None
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("mesh", [sheet(), charts()], ids=["sheet", "charts"])
+def test_the_folder_alone_gives_the_lightmap(kind, mesh, tmp_path):
+    model, _, _ = written(tmp_path, kind, mesh=mesh)
+    output = export.read_folder(tmp_path)
+    own = export.geometry(output)
+    np.testing.assert_array_equal(own.position[own.triangle], mesh.position[mesh.triangle])
+    np.testing.assert_array_equal(own.uv[own.triangle], mesh.uv[mesh.triangle])
+    np.testing.assert_array_equal(own.mask, mesh.mask)
+    assert own.source == model.source and output.model_bytes == (tmp_path / "atlas.wlm").stat().st_size
+    found = Decoder(output.model).lightmap(own)
+    np.testing.assert_array_equal(found, Decoder(model).lightmap(mesh))
+    assert found.any()
+
+
+def test_a_new_output_takes_the_place_of_an_old_one(tmp_path):
+    folder = tmp_path / "out"
+    folder.mkdir()
+    written(folder, "tiles")
+    (folder / "mine.txt").write_text("x")
+    model, _, paths = written(folder, "plain", "astc")
+    assert set(os.listdir(folder)) == ALWAYS | {"mine.txt"} == {path.name for path in paths} | {"mine.txt"}
+    assert export.read_folder(folder).model.method == "plain"
+
+
+def test_other_folders_are_left_alone(tmp_path):
+    mesh = sheet()
+    model = random_model(mesh, "tiles")
+    full = tmp_path / "full"
+    full.mkdir()
+    (full / "a.txt").write_text("x")
+    with pytest.raises(WlmError, match="full: expected an empty folder or one of an earlier output, found other files"):
+        export.export(full, model, mesh)
+    for content in ("[]", "{", '{"format": "wlm-probe-export"}'):
+        (full / "report.json").write_text(content)
+        with pytest.raises(WlmError, match="found other files"):
+            export.export(full, model, mesh)
+    with pytest.raises(WlmError, match="a.txt: cannot write there: Not a directory"):
+        export.export(full / "a.txt", model, mesh)
+    with pytest.raises(WlmError, match="none does not exist"):
+        export.export(tmp_path / "none" / "out", model, mesh)
+    with pytest.raises(ValueError, match="expected the mesh that was compressed"):
+        export.export(tmp_path / "new", replace(model, source="0" * 16), mesh)
+    assert sorted(os.listdir(tmp_path)) == ["full"] and sorted(os.listdir(full)) == ["a.txt", "report.json"]
+
+
+def test_nothing_half_written_is_left(tmp_path, monkeypatch):
+    mesh = sheet()
+    written(tmp_path / "old", "tiles")
+    before = {path.name: path.read_bytes() for path in (tmp_path / "old").iterdir()}
+
+    def full(path, *_, **__):
+        raise WlmError(f"{path}: cannot write: No space left on device")
+
+    monkeypatch.setattr(export, "write_dds", full)
+    for name in ("old", "new"):
+        with pytest.raises(WlmError) as caught:
+            export.export(tmp_path / name, random_model(mesh, "cascade"), mesh)
+        assert str(caught.value) == f"{tmp_path / name / 'lut.dds'}: cannot write: No space left on device"
+    monkeypatch.setattr(export, "write_dds", lambda *_, **__: (_ for _ in ()).throw(KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        export.export(tmp_path / "old", random_model(mesh, "cascade"), mesh)
+    assert os.listdir(tmp_path) == ["old"]
+    assert {path.name: path.read_bytes() for path in (tmp_path / "old").iterdir()} == before
+
+
+def test_a_texture_beyond_a_gpu(tmp_path):
+    mesh = sheet()
+    model = replace(random_model(mesh, "plain"), texels=np.zeros((1, 16385, 3), np.float16))
+    with pytest.raises(WlmError, match="sheet: T_p: expected at most 16384 texels along a side, found 16385"):
+        export.export(tmp_path / "out", model, mesh)
+    assert os.listdir(tmp_path) == []
+
+
+def test_a_folder_that_is_none_of_ours(tmp_path):
+    for place, words in ((tmp_path / "none", "expected a folder"), (tmp_path, "found no report.json of it")):
+        with pytest.raises(WlmError, match=words):
+            export.read_folder(place)
+    written(tmp_path, "tiles")
+    report = json.loads((tmp_path / "report.json").read_text())
+    changes = (
+        ({"version": 2}, "version: expected 1, found 2"),
+        ({"source": "0" * 16}, "are not of one run"),
+    )
+    for change, words in changes:
+        (tmp_path / "report.json").write_text(json.dumps(report | change))
+        with pytest.raises(WlmError, match=words):
+            export.read_folder(tmp_path)
+    for change, words in (({"triangles": 7}, "expected 7 triangles"), ({"uv_set": 4}, "TEXCOORD_4, found 0")):
+        (tmp_path / "report.json").write_text(json.dumps(report | change))
+        with pytest.raises(WlmError, match=words):
+            export.geometry(export.read_folder(tmp_path))
+
+
+CALLER = """
+{layout}in vec2 place;
+{layout}out vec4 light;
+void main() {{ light = vec4(wlm_atlas(place), 1.0); }}
+"""
+BOUND = "#define WLM_ATLAS_COLOUR_BINDING 0\n#define WLM_ATLAS_LUT_BINDING 1\n"
+
+
+@pytest.mark.skipif(shutil.which("glslangValidator") is None, reason="glslangValidator is not installed")
+@pytest.mark.parametrize("exact", ["", "#define WLM_ATLAS_EXACT\n"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_shader_compiles(kind, exact, tmp_path):
+    text = atlas_glsl(random_model(sheet(), kind))
+    for version, options, layout, defined in (
+        (330, [], "", ""),
+        (450, ["-V", "-o", "shader.spv"], "layout(location = 0) ", BOUND),
+    ):
+        shader = f"#version {version}\n{defined}{exact}{text}{CALLER.format(layout=layout)}"
+        (tmp_path / "shader.frag").write_text(shader)
+        words = ["glslangValidator", *options, "shader.frag"]
+        done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True)
+        assert done.returncode == 0 and "WARNING" not in done.stdout, done.stdout
+
+
+# GLSL's vectors, samplers and functions for a C++ compiler, in single precision as a GPU has it. A sampler's filter has
+# 8 bits of a place between two texels.
+SHIM = """
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <cstdio>
+#include <vector>
+typedef uint32_t uint;
+struct ivec2 { int x, y; ivec2(int x, int y) : x(x), y(y) {} inline explicit ivec2(struct vec2); };
+struct uvec2 { uint x, y; uvec2(uint x, uint y) : x(x), y(y) {} };
+struct vec2 { float x, y; vec2(float x, float y) : x(x), y(y) {} explicit vec2(ivec2 a) : x(a.x), y(a.y) {}
+    explicit vec2(uvec2 a) : x(a.x), y(a.y) {} };
+ivec2::ivec2(vec2 a) : x(a.x), y(a.y) {}
+struct vec3 { float x, y, z; };
+struct vec4 { float x, y, z, w; vec2 xy() { return vec2(x, y); } vec3 rgb() { return vec3{x, y, z}; } };
+struct uvec4 { uint x, y, z, w; uvec2 xy() { return uvec2(x, y); } };
+ivec2 operator+(ivec2 a, ivec2 b) { return ivec2(a.x + b.x, a.y + b.y); }
+ivec2 operator-(ivec2 a, ivec2 b) { return ivec2(a.x - b.x, a.y - b.y); }
+ivec2 min(ivec2 a, ivec2 b) { return ivec2(std::min(a.x, b.x), std::min(a.y, b.y)); }
+uvec2 operator>>(uvec2 a, uint b) { return uvec2(a.x >> b, a.y >> b); }
+uvec2 operator&(uvec2 a, uvec2 b) { return uvec2(a.x & b.x, a.y & b.y); }
+vec2 operator+(vec2 a, vec2 b) { return vec2(a.x + b.x, a.y + b.y); }
+vec2 operator-(vec2 a, vec2 b) { return vec2(a.x - b.x, a.y - b.y); }
+vec2 operator*(vec2 a, vec2 b) { return vec2(a.x * b.x, a.y * b.y); }
+vec2 operator/(vec2 a, vec2 b) { return vec2(a.x / b.x, a.y / b.y); }
+vec2 operator/(vec2 a, float b) { return vec2(a.x / b, a.y / b); }
+vec2 floor(vec2 a) { return vec2(std::floor(a.x), std::floor(a.y)); }
+float limit(float x, float a, float b) { return std::min(std::max(x, a), b); }
+vec2 clamp(vec2 a, vec2 b, vec2 c) { return vec2(limit(a.x, b.x, c.x), limit(a.y, b.y, c.y)); }
+vec4 mix(vec4 a, vec4 b, float s)
+{ return vec4{a.x + s * (b.x - a.x), a.y + s * (b.y - a.y), a.z + s * (b.z - a.z), a.w + s * (b.w - a.w)}; }
+struct sampler2D { int width, height; std::vector<vec4> texels; };
+struct usampler2D { int width, height; std::vector<uvec4> texels; };
+template <class S> ivec2 textureSize(const S& s, int) { return ivec2(s.width, s.height); }
+vec4 texelFetch(const sampler2D& s, ivec2 at, int) { return s.texels.at(at.y * s.width + at.x); }
+uvec4 texelFetch(const usampler2D& s, ivec2 at, int) { return s.texels.at(at.y * s.width + at.x); }
+vec4 textureLod(const sampler2D& s, vec2 at, float)
+{
+    float x = limit(at.x * s.width - 0.5f, 0, s.width - 1), y = limit(at.y * s.height - 0.5f, 0, s.height - 1);
+    x = std::round(x * 256) / 256, y = std::round(y * 256) / 256;
+    int i = x, j = y, k = std::min(i + 1, s.width - 1), l = std::min(j + 1, s.height - 1);
+    vec4 top = mix(texelFetch(s, ivec2(i, j), 0), texelFetch(s, ivec2(k, j), 0), x - i);
+    return mix(top, mix(texelFetch(s, ivec2(i, l), 0), texelFetch(s, ivec2(k, l), 0), x - i), y - j);
+}
+sampler2D colour;
+#ifdef TILES
+usampler2D lut;
+#else
+sampler2D lut;
+#endif
+#define WLM_ATLAS_COLOUR colour
+#define WLM_ATLAS_LUT lut
+#include "shader.h"
+template <class S> void read(S& s, const char* path)
+{
+    FILE* file = fopen(path, "rb");
+    fread(&s.width, 4, 1, file), fread(&s.height, 4, 1, file);
+    s.texels.resize(s.width * s.height);
+    fread(s.texels.data(), 16, s.texels.size(), file);
+    fclose(file);
+}
+int main()
+{
+    read(colour, "colour.bin"), read(lut, "lut.bin");
+    float at[2];
+    while (fread(at, 4, 2, stdin) == 2) {
+        vec3 light = wlm_atlas(vec2(at[0], at[1]));
+        fwrite(&light, 4, 3, stdout);
+    }
+}
+"""
+
+
+def _texture(path, values, kind):
+    """Width, height, and four numbers a texel."""
+    height, width = values.shape[:2]
+    whole = np.zeros((height, width, 4), kind)
+    whole[..., : values.shape[2]] = values
+    path.write_bytes(np.array([width, height], np.int32).tobytes() + whole.tobytes())
+
+
+@pytest.mark.skipif(shutil.which("g++") is None, reason="no C++ compiler is installed")
+@pytest.mark.parametrize("exact", [True, False])
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_shaders_arithmetic(kind, exact, tmp_path):
+    model = random_model(charts(), kind)
+    tiles = model.method == "tiles"
+    # What C++ has no word for.
+    text = atlas_glsl(model).replace(".rgb", ".rgb()").replace(".xy", ".xy()")
+    (tmp_path / "shader.h").write_text(text)
+    (tmp_path / "run.cpp").write_text(SHIM)
+    options = ["-DTILES"] * tiles + ["-DWLM_ATLAS_EXACT"] * exact
+    words = ["g++", "-O1", "-std=c++14", "-Wno-unused-result", *options, "-o", "run", "run.cpp"]
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    _texture(tmp_path / "colour.bin", model.texels.astype(np.float32), np.float32)
+    lut = model.lut if model.lut.size else np.zeros((1, 1, 2))
+    _texture(tmp_path / "lut.bin", lut if tiles else lut / 65535, np.uint32 if tiles else np.float32)
+    uv = np.random.default_rng(0).uniform(-0.1, 1.1, (4000, 2)).astype(np.float32)
+    uv = np.concatenate([uv, [[0, 0], [1, 1], [0, 1], [0.5, 1]]]).astype(np.float32)
+    if tiles:
+        # A point on a border of tiles may be read from either.
+        place = ((uv * [model.width, model.height] - 0.5) / model.profile.tile)[:4000]
+        uv = np.concatenate([uv[:4000][np.abs(place - np.rint(place)).min(1) > 1e-4], uv[4000:]])
+    out = subprocess.run([tmp_path / "run"], cwd=tmp_path, input=uv.tobytes(), capture_output=True, check=True).stdout
+    found = np.frombuffer(out, np.float32).reshape(-1, 3)
+    # Neighbouring texels differ by up to 3, and a 512th of a step is lost along each axis. Where a table is filtered
+    # too its own 512th is one of 65,535 steps' span, up to all 22 texels of the other texture.
+    step = 3.0 / 512 * 2
+    tolerance = 1e-4 if exact else step * (1 + 22 * (model.method == "cascade"))
+    np.testing.assert_allclose(found, decode64(model, uv), rtol=0, atol=tolerance)
+    with torch.no_grad():
+        decoded = Decoder(model).read(torch.from_numpy(uv)).numpy()
+    np.testing.assert_allclose(found, decoded, rtol=0, atol=tolerance)
+
+
+def test_the_shader_says_which_uvs_it_takes():
+    assert "the new UVs of mesh.glb" in atlas_glsl(random_model(sheet(), "cascade"))
+    assert "the mesh's own lightmap UVs" in atlas_glsl(random_model(sheet(), "tiles"))
+    assert "usampler2D" in atlas_glsl(random_model(sheet(), "tiles"))
+    assert "lut" not in atlas_glsl(random_model(sheet(), "plain")).lower()

@@ -1,0 +1,286 @@
+"""The cascade's fit: what it starts from, a step's gradient against autograd, what it comes to, and what it stores."""
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+from kernels.compare import close, exact
+from reference import cascade as reference
+
+from wlm import interop, render
+from wlm.atlas import cascade
+from wlm.atlas.cascade import Textures, fit, fit_cascade, initial
+from wlm.atlas.cluster import Clusters, Stats
+from wlm.atlas.data import LightmappedMesh, from_arrays
+from wlm.atlas.model import Profile
+from wlm.atlas.pack import pack, regenerate
+from wlm.atlas.views import clip_positions, sphere_views
+from wlm.errors import WlmError
+from wlm.imageops import fill_gaps
+
+pytest.importorskip("uvunwrap")
+
+SIDE = 16  # texels of a face of the box
+
+
+def _profile(**settings) -> Profile:
+    usual = {"steps": 40, "resolution": 48, "colour_rate": 0.01, "lut_rate": 2e-3, "scale": 1.0}
+    return Profile(**{"name": "test", "method": "cascade", **usual, **settings})
+
+
+def _box(gain: float = 1.0, light=None) -> LightmappedMesh:
+    """A box, each face a chart of two triangles with an edge of shadow in it; 2 x 3 faces in a map of 40 x 60."""
+    corner = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+    position, uv, triangle = [], [], []
+    for face in range(6):
+        axis, sign = face // 2, 2 * (face % 2) - 1
+        at = np.full((4, 3), float(sign))
+        at[:, (axis + 1) % 3], at[:, (axis + 2) % 3] = corner[:, 0] * sign, corner[:, 1]
+        triangle += [[4 * face, 4 * face + 1, 4 * face + 2], [4 * face, 4 * face + 2, 4 * face + 3]]
+        position.append(at)
+        uv.append((corner * SIDE / 2 + SIDE / 2 + 2 + 20 * np.array([face % 3, face // 3])) / [60, 40])
+    y, x = np.meshgrid(np.arange(40) + 0.5, np.arange(60) + 0.5, indexing="ij")
+    if light is None:
+        bright = 0.3 + 0.2 * np.sin(x / 9) + 0.5 / (1 + np.exp(-3 * ((x + 0.7 * y) % 17 - 8)))
+        light = np.stack([bright, 0.8 * bright, 0.1 + 0.01 * y], -1)
+    return from_arrays(np.concatenate(position), np.array(triangle), np.concatenate(uv), gain * light)
+
+
+def _error(mesh: LightmappedMesh, uv: np.ndarray, colour: np.ndarray, lut: np.ndarray) -> float:
+    """Mean error over the surface in units of the mean radiance, in float64 by the reference."""
+    random = np.random.default_rng(9)
+    triangle = random.integers(0, len(mesh.triangle), 4000)
+    weights = random.dirichlet([1, 1, 1], 4000)[:, None]
+    old, new = (exact((weights @ each[triangle])[:, 0]) for each in (mesh.uv[mesh.triangle], uv))
+    want = reference.bilinear(exact(fill_gaps(mesh.lightmap, mesh.mask)), old)
+    got = reference.sample(exact(colour), exact(lut) if lut.size else None, new)
+    return float((got - want).abs().mean() / want.mean())
+
+
+def _start(mesh: LightmappedMesh, profile: Profile) -> tuple[np.ndarray, Textures]:
+    packed = pack(mesh, None, profile.scale)
+    return packed.uv, initial(*regenerate(mesh, packed), profile)
+
+
+def test_what_a_fit_starts_from():
+    """Sides rounded, T_p the means of boxes, T_c the centres; gaps are filled before."""
+    random = np.random.default_rng(0)
+    lightmap = random.uniform(size=(12, 18, 3)).astype(np.float32)
+    whole = np.ones((12, 18), bool)
+    found = initial(lightmap, whole, _profile(colour_scale=0.5, lut_scale=0.7))
+    assert found.colour.shape == (6, 9, 3) and found.lut.shape == (8, 13, 2)
+    close(found.colour, lightmap.reshape(6, 2, 9, 2, 3).mean((1, 3)), 1e-6)
+    close(found.lut[3, 5], np.array([5.5 / 13, 3.5 / 8]), 1e-6)
+    uneven = initial(lightmap, whole, _profile(colour_scale=0.4)).colour
+    assert uneven.shape == (5, 7, 3)
+    close(uneven.mean((0, 1)), lightmap.mean((0, 1)), 1e-6)
+    row = np.repeat(np.arange(12), 5).reshape(5, 12).mean(1)  # each texel in five parts, twelve parts a box
+    close(initial(np.tile(np.arange(12.0, dtype=np.float32)[:, None, None], (1, 18, 3)), whole,
+                  _profile(colour_scale=0.4)).colour[:, 0, 0], row, 1e-6)  # fmt: skip
+    half = whole.copy()
+    half[:, 9:] = False
+    lightmap[:, :9] = 0.25
+    assert (initial(lightmap, half, _profile()).colour == 0.25).all()
+
+
+def test_the_least_textures():
+    """One texel each, and no table."""
+    lightmap = np.full((1, 1, 3), 2.0, np.float32)
+    found = initial(lightmap, np.ones((1, 1), bool), _profile())
+    np.testing.assert_array_equal(found.colour, lightmap)
+    np.testing.assert_array_equal(found.lut, [[[0.5, 0.5]]])
+    assert initial(lightmap, np.ones((1, 1), bool), _profile(lut_scale=0.0)).lut.shape == (0, 0, 2)
+
+
+@pytest.mark.parametrize("lut_scale", [0.7, 0.0])
+def test_a_steps_gradient_of_a_view(device: str, lut_scale: float):
+    """Against autograd through the drawing of ``wlm.render``, a float64 reading and the image losses."""
+    mesh, profile = _box(), _profile(lut_scale=lut_scale, gradient=0.6)
+    uv, start = _start(mesh, profile)
+    random = np.random.default_rng(1)
+    # Rough textures, so that no difference is near 0, where float32 could tell its sign otherwise than float64.
+    lut = start.lut + random.uniform(-0.04, 0.04, start.lut.shape).astype(np.float32)
+    start = Textures(random.uniform(size=start.colour.shape).astype(np.float32), lut.clip(0, 1))
+    with interop.stream(device):
+        step = cascade._Step(mesh, uv, start, profile, 5, device)
+        before = step.textures()
+        step()
+        grads = [grad.cpu().numpy() for grad in step._grads]
+        after = step.textures()
+
+    clip = torch.tensor(clip_positions(mesh, sphere_views(profile.steps, 5)[0]))
+    raster = render.rasterize(clip, torch.tensor(mesh.triangle), 48, 48)
+    hit = raster.triangle >= 0
+    weights = torch.cat([raster.barycentric, 1 - raster.barycentric.sum(-1, keepdim=True)], -1)[hit].double()
+    old, new = ((weights[:, None] @ exact(each)[raster.triangle[hit]])[:, 0] for each in (mesh.uv[mesh.triangle], uv))
+    unit = mesh.lightmap[mesh.mask].mean()
+    leaves = [exact(before.colour / unit, grad=True), exact(before.lut, grad=True)]
+    want = reference.bilinear(exact(fill_gaps(mesh.lightmap, mesh.mask) / unit), old)
+    image = torch.zeros(48, 48, 3, dtype=torch.float64)
+    image[hit] = reference.sample(leaves[0], leaves[1] if lut_scale else None, new) - want
+    reference.image_loss(image, profile.gradient).backward()
+    assert hit.sum() > 300
+    close(grads[0], leaves[0].grad, 1e-3, "T_p")
+    if lut_scale:
+        close(grads[1], leaves[1].grad, 1e-3, "T_c")
+    moved = (np.abs(after.colour - before.colour) / unit)[np.abs(grads[0]) > 0]
+    np.testing.assert_allclose(moved, profile.colour_rate, rtol=1e-3)
+
+
+@pytest.mark.parametrize("space", ["views", "uv"])
+@pytest.mark.parametrize("lut_scale", [0.7, 0.0])
+def test_a_fit_gets_better(device: str, space: str, lut_scale: float):
+    """On the whole surface, by the reference's reading, well below where it began; all stays in range."""
+    mesh, profile = _box(), _profile(space=space, lut_scale=lut_scale)
+    uv, start = _start(mesh, profile)
+    found = fit(mesh, uv, start, profile, device=device)
+    first, last = (_error(mesh, uv, each.colour, each.lut) for each in (start, found))
+    assert last < 0.75 * first
+    assert found.colour.min() >= 0 and found.colour.shape == start.colour.shape
+    assert found.lut.shape == start.lut.shape and (not found.lut.size or 0 <= found.lut.min() <= found.lut.max() <= 1)
+    assert (np.abs(found.lut - start.lut) > 1e-3).any() == (lut_scale > 0)
+
+
+@pytest.mark.parametrize("space", ["views", "uv"])
+def test_the_unit_of_radiance_does_not_matter(space: str):
+    """A map 1,024 times as bright gives that many times the textures; a black one stays black."""
+    profile = _profile(space=space, steps=10)
+    mesh, bright = _box(), _box(1024.0)
+    uv, start = _start(mesh, profile)
+    one = fit(mesh, uv, start, profile)
+    other = fit(bright, uv, Textures(1024 * start.colour, start.lut), profile)
+    close(other.colour / 1024, one.colour, 1e-4)
+    close(other.lut, one.lut, 1e-4)
+    black = _box(0.0)
+    assert not fit(black, uv, Textures(0 * start.colour, start.lut), profile).colour.any()
+
+
+@pytest.mark.parametrize("space", ["views", "uv"])
+def test_one_seed_one_result(space: str):
+    mesh, profile = _box(), _profile(space=space, steps=6)
+    uv, start = _start(mesh, profile)
+    one, same, other = (fit(mesh, uv, start, profile, seed=seed) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(one.colour, same.colour)
+    np.testing.assert_array_equal(one.lut, same.lut)
+    assert (one.colour != other.colour).any()
+
+
+def test_rates_that_fall():
+    """The first step is as long as at full rate, the last one as short as it is to be; less noise is left."""
+    mesh, profile = _box(), _profile(space="uv", steps=40, final_rate=0.1)
+    uv, start = _start(mesh, profile)
+    step = cascade._Step(mesh, uv, start, profile, 0, "cpu")
+    unit = mesh.lightmap[mesh.mask].mean()
+    before = step.textures().colour
+    step()
+    assert np.abs(step.textures().colour - before).max() / unit == pytest.approx(profile.colour_rate, rel=1e-3)
+    for _ in range(39):
+        step()
+    np.testing.assert_allclose([float(rate) for rate in step._rate], [1e-3, 2e-4], rtol=1e-5)
+    rough = _profile(space="uv", steps=100, colour_rate=0.03, lut_rate=5e-3)
+    kept, fell = (fit(mesh, uv, start, rough.model_copy(update={"final_rate": share})) for share in (1.0, 0.01))
+    assert _error(mesh, uv, fell.colour, fell.lut) < 0.9 * _error(mesh, uv, kept.colour, kept.lut)
+
+
+def test_no_steps_and_progress():
+    mesh, profile = _box(), _profile(steps=0)
+    uv, start = _start(mesh, profile)
+    found = fit(mesh, uv, start, profile, progress=lambda *_: pytest.fail("nothing is done"))
+    close(found.colour, start.colour, 1e-6)
+    np.testing.assert_array_equal(found.lut, start.lut)
+    seen = []
+    fit(mesh, uv, start, _profile(steps=7), progress=lambda done, steps: seen.append((done, steps)))
+    assert seen[-1] == (7, 7)
+
+
+def test_a_fit_that_diverged():
+    mesh, profile = _box(), _profile(steps=1)
+    uv, start = _start(mesh, profile)
+    start.colour[0, 0] = np.nan
+    with pytest.raises(WlmError, match="array: the fit diverged; expected smaller rates than those of test"):
+        fit(mesh, uv, start, profile)
+
+
+def test_no_such_device():
+    mesh, profile = _box(), _profile()
+    with pytest.raises(WlmError, match="device 'cuda:99': expected one of: cpu"):
+        fit_cascade(mesh, None, profile, device="cuda:99")
+
+
+def test_the_whole(device: str):
+    """Two faces that look alike share; what is stored shows the mesh, in the types and ranges of the model."""
+    y, x = np.meshgrid(np.arange(40), np.arange(60), indexing="ij")
+    light = 0.5 + 0.3 * np.sin((x % 20) / 4) * np.cos((y % 20) / 5)
+    mesh = _box(light=np.stack([light, light, light + 0.1 * (x >= 40)], -1))
+    head = np.array([0, 1, 0, 1, 4, 5, 0, 1, 0, 1, 10, 11])
+    representative, group = np.unique(head, return_inverse=True)
+    clusters = Clusters(
+        group.astype(np.int32),
+        representative.astype(np.int32),
+        np.zeros(12, np.int8),
+        np.zeros(12),
+        np.zeros(12, bool),
+        Stats(0, 0, 0),
+    )
+    model = fit_cascade(mesh, clusters, _profile(scale=1.0, colour_scale=0.8), device=device)
+    assert (model.method, model.colour, model.source, model.height, model.width) == (
+        "cascade", "half", mesh.source, 40, 60
+    )  # fmt: skip
+    assert model.texels.dtype == np.float16 and model.lut.dtype == np.uint16 and model.uv.dtype == np.float32
+    assert model.blocks.shape == (0, 16)
+    height, width = model.report["packed"]
+    assert model.texels.shape == (round(0.8 * height), round(0.8 * width), 3)
+    assert model.lut.shape == (round(0.7 * height), round(0.7 * width), 2)
+    counts = {key: model.report[key] for key in ("triangles", "groups", "shared", "charts", "steps")}
+    assert counts == {"triangles": 12, "groups": 6, "shared": 8, "charts": 3, "steps": 40}
+    assert set(model.report["seconds"]) == {"pack", "regenerate", "fit", "write"}
+    assert height * width < 0.5 * 6 * (SIDE + 2) ** 2 * 2
+    assert _error(mesh, model.uv, model.texels, model.lut / 65535.0) < 0.03
+    assert 0 < model.compression_ratio < 1
+
+
+def test_without_a_table_it_is_plain():
+    mesh = _box()
+    model = fit_cascade(mesh, None, _profile(lut_scale=0.0, colour_scale=1.0))
+    assert model.method == "plain" and model.lut.shape == (0, 0, 2) and model.uv.shape == (12, 3, 2)
+    assert _error(mesh, model.uv, model.texels, model.lut) < 0.02
+
+
+def test_triangles_that_are_not_active():
+    """They hide what is behind them and teach nothing: a fit with one is finite, whatever its UVs say."""
+    box = _box()
+    uv = np.concatenate([box.uv, [[0.5, 0.5]] * 3])
+    position = np.concatenate([box.position, [[-2, -2, 1.5], [2, -2, 1.5], [0, 2, 1.5]]])
+    mesh = from_arrays(position, np.concatenate([box.triangle, [[24, 25, 26]]]), uv, box.lightmap, box.mask)
+    assert mesh.active.sum() == 12
+    for space in ("views", "uv"):
+        model = fit_cascade(mesh, None, _profile(space=space))
+        assert model.report["groups"] == 12 and np.isfinite(model.uv).all()
+        assert _error(box, model.uv[:12], model.texels, model.lut / 65535.0) < 0.1
+
+
+def test_blocks_of_the_colours():
+    """T_p as blocks: as the model says, and what they decode to."""
+    pytest.importorskip("ispc_texcomp")
+    mesh = _box()
+    half = fit_cascade(mesh, None, _profile(colour_scale=1.0))
+    blocks = fit_cascade(mesh, None, _profile(colour_scale=1.0, colour="bc6h"))
+    rows, columns = (-(-n // 4) for n in blocks.texels.shape[:2])
+    assert blocks.colour == "bc6h" and blocks.blocks.shape == (rows * columns, 16)
+    close(blocks.texels.astype(np.float32), half.texels.astype(np.float32), 0.1)
+    assert (blocks.texels != half.texels).any()
+
+
+def test_a_cuda_step_is_captured(device: str):
+    """From the fourth on it is replayed."""
+    if device == "cpu":
+        pytest.skip("the CPU has no graphs")
+    for space in ("views", "uv"):
+        mesh, profile = _box(), _profile(space=space)
+        uv, start = _start(mesh, profile)
+        with interop.stream(device):
+            graph = interop.StepGraph(cascade._Step(mesh, uv, start, profile, 0, device), device)
+            for _ in range(5):
+                graph()
+            wp.synchronize_device(device)
+        assert graph.captured

@@ -1,0 +1,255 @@
+"""Clustering against the naive algorithm with its whole matrix, on meshes made of copies, and in the hard cases."""
+
+import numpy as np
+import pytest
+from reference import patches as reference
+
+from wlm.atlas.cluster import ORDERS, Clusters, cluster
+from wlm_kernels import patches as kernels
+from wlm_kernels.patches import SIZES
+
+SIDE = (48, 64)  # rows, columns
+
+
+def _lightmap(seed: int = 0) -> np.ndarray:
+    """Blobs of light, float32 [H, W, 3], brightest about 1.5."""
+    random = np.random.default_rng(seed)
+    y, x = np.mgrid[: SIDE[0], : SIDE[1]]
+    image = np.full((*SIDE, 3), 0.05)
+    for _ in range(8):
+        at, wide = random.random(2) * SIDE, random.uniform(4, 15)
+        blob = np.exp(-((y - at[0]) ** 2 + (x - at[1]) ** 2) / (2 * wide**2))
+        image += blob[..., None] * random.random(3) * 0.6
+    return image.astype(np.float32)
+
+
+def _mesh(count: int, seed: int = 0, longest: float = 9.0) -> tuple[np.ndarray, np.ndarray]:
+    """Triangles at random, each with vertices of its own: UVs [3 F, 2] and vertices [F, 3]."""
+    random = np.random.default_rng(seed)
+    corners = random.random((count, 1, 2)) + random.normal(size=(count, 3, 2)) * longest / 3 / SIDE[1]
+    return np.clip(corners.reshape(-1, 2), 0, 1), np.arange(3 * count).reshape(-1, 3)
+
+
+def _uv(texels: list | np.ndarray) -> np.ndarray:
+    """Places in texels, from the first one's centre, as UVs [N, 2]."""
+    return (np.reshape(texels, (-1, 2)) + 0.5) / [SIDE[1], SIDE[0]]
+
+
+def _naive(uv, triangle, lightmap, threshold: float, colour_threshold: float, maximum: float, active) -> list:
+    """The groups with their representatives, from eq. 1 on, but for the samples, which have a test of their own."""
+    at = uv * [SIDE[1], SIDE[0]] - 0.5
+    corners = at[triangle]
+    longest = np.linalg.norm(corners - np.roll(corners, 1, 1), axis=-1).max(1)
+    level = np.array([next(k for k, n in enumerate(SIZES) if n >= np.ceil(r)) for r in longest], np.int32)
+    texels = np.zeros((*SIDE, 4), np.uint16)
+    texels[..., :3] = np.rint(np.clip(lightmap.astype(float) / maximum, 0, 1) * 65535)
+    samples, _, _ = kernels.sample(texels, np.rint(corners * 65536).astype(np.int64), level, "cpu")
+    packed = samples.numpy()
+    colours = np.stack([packed & 255, packed >> 8 & 255, packed >> 16], -1)
+    patches = np.split(colours, np.cumsum(kernels.samples_of(np.array(SIZES)[level]))[:-1])
+    patches = [patch[:3] if (patch == patch[0]).all() else patch for patch in patches]
+    edges = np.zeros((len(triangle),) * 2, bool)
+    among = np.flatnonzero(active)
+    edges[np.ix_(among, among)] = reference.adjacency([patches[t] for t in among], threshold, colour_threshold)
+    return patches, edges, reference.greedy(edges)
+
+
+def _sound(found: Clusters, count: int) -> None:
+    """What holds of any result."""
+    groups = len(found.representative)
+    assert found.group.shape == found.order.shape == found.distance.shape == found.excluded.shape == (count,)
+    assert sorted(set(found.group.tolist())) == list(range(groups))
+    np.testing.assert_array_equal(found.group[found.representative], np.arange(groups))
+    np.testing.assert_array_equal(found.order[found.representative], 0)
+    np.testing.assert_array_equal(found.distance[found.representative], 0)
+    sizes = np.bincount(found.group, minlength=groups)
+    assert (sizes[found.group[found.excluded]] == 1).all()
+
+
+@pytest.mark.parametrize(("threshold", "colour_threshold"), [(0.03, 0.09), (0.01, 0.09), (0.05, 2.0), (0.05, 0.0)])
+def test_against_naive(device: str, threshold: float, colour_threshold: float):
+    """The same groups, representatives, edges, orders and distances."""
+    count = 90
+    (uv, triangle), lightmap = _mesh(count), _lightmap()
+    active = np.arange(count) % 7 != 0
+    calls = []
+    found = cluster(
+        uv,
+        triangle,
+        lightmap,
+        threshold=threshold,
+        colour_threshold=colour_threshold,
+        active=active,
+        largest=65,
+        device=device,
+        progress=lambda *done: calls.append(done),
+    )
+    patches, edges, groups = _naive(uv, triangle, lightmap, threshold, colour_threshold, 2.0, active)
+    _sound(found, count)
+    assert found.stats.edges == edges.sum() // 2 > 20
+    assert found.stats.edges <= found.stats.visited
+    assert found.stats.compared <= found.stats.visited
+    assert [(int(r), np.flatnonzero(found.group == g).tolist()) for g, r in enumerate(found.representative)] == groups
+    np.testing.assert_array_equal(found.excluded, ~active)
+    for t in range(count):
+        want = reference.distances(patches[found.representative[found.group[t]]], patches[t])
+        assert found.distance[t] == pytest.approx(want.min(), abs=1e-12)
+        assert found.order[t] == int((want < want.min() + 1e-12).argmax())
+    assert calls[-1][0] == calls[-1][1] == active.sum()
+
+
+def test_permuted_copies(device: str):
+    """Vertex k of a copy goes to vertex p[k] of the representative: where its twin is, whatever the order."""
+    lightmap = np.zeros((*SIDE, 3), np.float32)
+    lightmap[:24, :32] = np.random.default_rng(0).random((24, 32, 3))
+    lightmap[24:, 32:] = lightmap[:24, :32]
+    corners = np.array([[3.0, 4.0], [15.0, 5.0], [6.0, 17.0]])
+    uv = [_uv(corners)]
+    for p in ORDERS:
+        copy = np.empty_like(corners)
+        for k in range(3):
+            copy[k] = corners[p[k]] + [32, 24]
+        uv.append(_uv(copy))
+    found = cluster(np.concatenate(uv), np.arange(21).reshape(-1, 3), lightmap, threshold=0.001, device=device)
+    _sound(found, 7)
+    assert found.representative.tolist() == [0]
+    assert [ORDERS[o] for o in found.order[1:]] == list(ORDERS)
+    np.testing.assert_array_equal(found.distance, 0)
+
+
+def test_sizes_are_those_of_texels():
+    """R_s of a lightmap that isn't square takes texels along both axes; a length of 5 texels is size 5, more is 9."""
+    from wlm.atlas.cluster import _corners, _levels
+
+    lengths = [[5, 0], [0, 5], [5.01, 0], [0, 5.01], [3, 4], [0.2, 0.1], [0, 0], [60, 0]]
+    uv = _uv([[[1, 1], [1 + dx, 1 + dy], [1, 1]] for dx, dy in lengths])
+    level = _levels(_corners(uv, np.arange(24).reshape(-1, 3), (*SIDE, 3)), 33)
+    assert [SIZES[k] for k in level] == [5, 5, 9, 9, 5, 2, 2, 33]
+
+
+def test_no_triangle(device: str):
+    found = cluster(np.zeros((0, 2)), np.zeros((0, 3), int), _lightmap(), device=device)
+    assert found.group.shape == found.representative.shape == (0,)
+    assert (found.stats.visited, found.stats.compared, found.stats.edges) == (0, 0, 0)
+
+
+def test_one_triangle(device: str):
+    found = cluster(*_mesh(1), _lightmap(), device=device)
+    _sound(found, 1)
+    assert found.representative.tolist() == [0] and not found.excluded.any()
+
+
+@pytest.mark.parametrize("colour", [0.0, 0.3, 2.0])
+def test_one_colour(device: str, colour: float):
+    """All are alike: one group, of the first; every pair is an edge, and no sample is looked at."""
+    count = 2000
+    found = cluster(*_mesh(count, longest=20), np.full((*SIDE, 3), colour), device=device)
+    _sound(found, count)
+    pairs = count * (count - 1) // 2
+    assert found.representative.tolist() == [0]
+    assert (found.stats.visited, found.stats.compared, found.stats.edges) == (pairs, 0, pairs)
+
+
+def test_degenerate_triangles(device: str):
+    """A point, a line and less than a texel are patches like any other, where their colour is."""
+    lightmap = np.zeros((*SIDE, 3), np.float32)
+    lightmap[:, 32:] = 1.0
+    shapes = np.array([[[0, 0], [0, 0], [0, 0]], [[0, 0], [4, 4], [8, 8]], [[0, 0], [0.2, 0], [0, 0.3]]])
+    uv = _uv(np.concatenate([shapes + 10.0, shapes + 40.0]))
+    found = cluster(uv, np.arange(18).reshape(-1, 3), lightmap, device=device)
+    _sound(found, 6)
+    assert found.group.tolist() == [0, 0, 0, 1, 1, 1]
+
+
+def test_outside_is_the_border(device: str):
+    """UVs outside [0, 1] read the outermost texels."""
+    lightmap = np.zeros((*SIDE, 3), np.float32)
+    lightmap[:, -1] = 0.5
+    uv = np.array([[1.5, 0.2], [1.6, 0.2], [1.5, 0.4], [-3.0, 0.2], [-2.0, 0.2], [-3.0, 0.4]])
+    uv = np.concatenate([uv, _uv([[63, 3], [63, 9], [63, 5]]), _uv([[2, 3], [3, 9], [4, 5]])])
+    found = cluster(uv, np.arange(12).reshape(-1, 3), lightmap, device=device)
+    assert found.group.tolist() == [0, 1, 0, 1]
+
+
+def test_bright_triangles(device: str):
+    """Radiance of exactly 2 takes part; above it, in any channel that a sample reads, the triangle stays alone."""
+    lightmap = np.full((*SIDE, 3), 2.0, np.float32)
+    lightmap[10, 20, 1] = np.nextafter(np.float32(2), np.float32(3))
+    away, on, beside = ([[x, 10], [x + 2, 10], [x, 12]] for x in (40, 20, 21))
+    found = cluster(_uv([away, on, beside, away]), np.arange(12).reshape(-1, 3), lightmap, device=device)
+    _sound(found, 4)
+    assert found.excluded.tolist() == [False, True, False, False]
+    assert found.group.tolist() == [0, 1, 0, 0]
+    found = cluster(_uv([away, on]), np.arange(6).reshape(-1, 3), lightmap, max_radiance=2.1, device=device)
+    assert not found.excluded.any()
+
+
+def test_negative_radiance_is_black(device: str):
+    lightmap = np.zeros((*SIDE, 3), np.float32)
+    lightmap[:, 32:] = -5.0
+    found = cluster(*_mesh(20), lightmap, device=device)
+    assert found.representative.tolist() == [0] and found.distance.max() == 0
+
+
+def test_none_active(device: str):
+    """All are excluded and alone."""
+    found = cluster(*_mesh(5), _lightmap(), active=np.zeros(5, bool), device=device)
+    _sound(found, 5)
+    assert found.excluded.all() and found.representative.tolist() == list(range(5))
+
+
+def test_ties_go_to_the_lowest_number(device: str):
+    """Two pairs, each of one colour: the pair with the lower triangle is taken first, by its lower triangle."""
+    lightmap = np.zeros((*SIDE, 3), np.float32)
+    lightmap[:, 32:] = 1.0
+    dark, light = ([[x, 10], [x + 4, 10], [x, 14]] for x in (8, 50))
+    found = cluster(_uv([light, dark, light, dark]), np.arange(12).reshape(-1, 3), lightmap, device=device)
+    assert found.representative.tolist() == [0, 1] and found.group.tolist() == [0, 1, 0, 1]
+
+
+def test_largest(device: str):
+    """What lies between the samples of the largest size allowed isn't seen: here all but the corners."""
+    lightmap = np.zeros((*SIDE, 3), np.float32)
+    lightmap[14:17, 14:17] = 1.9
+    spot, plain = ([[x, 10], [x + 14, 10], [x, 24]] for x in (10, 40))
+    given = (_uv([spot, plain]), np.arange(6).reshape(-1, 3), lightmap)
+    assert cluster(*given, device=device).group.tolist() == [0, 1]
+    assert cluster(*given, largest=2, device=device).group.tolist() == [0, 0]
+
+
+@pytest.mark.parametrize(
+    ("change", "field"),
+    [
+        ({"uv": np.zeros((6, 3))}, "uv"),
+        ({"uv": np.full((6, 2), np.nan)}, "uv"),
+        ({"uv": np.full((6, 2), 1e9)}, "uv"),
+        ({"triangle": np.zeros((2, 3))}, "triangle"),
+        ({"triangle": np.full((2, 3), 6)}, "triangle"),
+        ({"triangle": np.full((2, 3), -1)}, "triangle"),
+        ({"lightmap": np.zeros((4, 4))}, "lightmap"),
+        ({"lightmap": np.zeros((0, 4, 3))}, "lightmap"),
+        ({"lightmap": np.full((4, 4, 3), np.inf)}, "lightmap"),
+        ({"threshold": 0.0}, "threshold"),
+        ({"threshold": float("nan")}, "threshold"),
+        ({"colour_threshold": -0.1}, "colour_threshold"),
+        ({"max_radiance": 0.0}, "max_radiance"),
+        ({"active": np.ones(3, bool)}, "active"),
+        ({"largest": 64}, "largest"),
+    ],
+)
+def test_wrong_use(change: dict, field: str):
+    given = {"uv": np.zeros((6, 2)), "triangle": np.arange(6).reshape(2, 3), "lightmap": np.zeros((4, 4, 3))}
+    with pytest.raises(ValueError, match=f"^{field}:"):
+        cluster(**(given | change))
+
+
+@pytest.mark.slow
+def test_many_triangles_of_one_colour():
+    """132,000 triangles, all alike, with patches of 65: within 8 GB."""
+    import resource
+
+    count = 132_000
+    found = cluster(*_mesh(count, longest=64), np.full((*SIDE, 3), 0.25, np.float32), largest=65)
+    assert found.representative.tolist() == [0]
+    assert found.stats.edges == count * (count - 1) // 2
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss < 8e6  # KiB

@@ -1,0 +1,293 @@
+"""Packing: rigid charts, texels of their own, corners in their order, and the lightmap under the new UVs."""
+
+import sys
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from wlm.atlas import pack as packing
+from wlm.atlas.cluster import ORDERS, Clusters, Stats
+from wlm.atlas.data import LightmappedMesh, from_arrays
+from wlm.atlas.pack import Packed, pack, regenerate
+from wlm.errors import WlmError
+
+pytest.importorskip("uvunwrap")
+
+SIZE = (40, 64)  # H, W
+
+
+def _mesh(triangles: list, lightmap: np.ndarray | None = None, position: np.ndarray | None = None) -> LightmappedMesh:
+    """A mesh of triangles given by their corners in texels; corners at one place of one sheet are one."""
+    flat = np.array(triangles, np.float64).reshape(-1, 2)
+    uv, index = np.unique(flat, axis=0, return_inverse=True)
+    place = np.concatenate([uv, np.zeros((len(uv), 1))], 1)
+    triangle = index.reshape(-1, 3)
+    if position is not None:
+        uv, triangle, place = flat, np.arange(len(flat)).reshape(-1, 3), position
+    if lightmap is None:
+        lightmap = np.random.default_rng(0).uniform(0.1, 1.0, (*SIZE, 3)).astype(np.float32)
+    height, width = lightmap.shape[:2]
+    return from_arrays(place, triangle, uv / [width, height], lightmap)
+
+
+def _quad(x: float, y: float, w: float, h: float) -> list:
+    a, b, c, d = [x, y], [x + w, y], [x + w, y + h], [x, y + h]
+    return [[a, b, c], [a, c, d]]
+
+
+def _clusters(representative: list[int], order: list[int]) -> Clusters:
+    """Of the representative of each triangle."""
+    heads, group = np.unique(representative, return_inverse=True)
+    count = len(representative)
+    return Clusters(
+        group.astype(np.int32),
+        heads.astype(np.int32),
+        np.array(order, np.int8),
+        np.zeros(count),
+        np.zeros(count, bool),
+        Stats(0, 0, 0),
+    )
+
+
+def _edges(corner: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(corner - np.roll(corner, 1, 1), axis=-1)
+
+
+def _texels(mesh: LightmappedMesh) -> np.ndarray:
+    return (mesh.uv * mesh.mask.shape[::-1])[mesh.triangle]
+
+
+def _read_by(packed: Packed) -> dict[tuple[int, int], set[int]]:
+    """The charts that read each texel, by bilinear reads at many points of each triangle."""
+    random, out = np.random.default_rng(1), {}
+    weights = random.dirichlet([0.5, 0.5, 0.5], 300)
+    weights = np.concatenate([weights, np.eye(3)])
+    for t in np.flatnonzero(packed.source == np.arange(len(packed.source))):
+        low = np.floor(weights @ packed.corner[t] - 0.5).astype(int)
+        for x, y in np.unique((low[:, None] + [[0, 0], [1, 0], [0, 1], [1, 1]]).reshape(-1, 2), axis=0):
+            out.setdefault((int(x), int(y)), set()).add(int(packed.chart[t]))
+    return out
+
+
+def _many(seed: int) -> list:
+    """Triangles of all sizes with gaps between, some wound the other way, and strips of several."""
+    random, out = np.random.default_rng(seed), []
+    for y in range(0, 40, 10):
+        for x in range(0, 60, 10):
+            corner = np.array([x, y]) + random.uniform(0.0, 9.0, (4, 2)) * random.choice([0.05, 0.5, 1.0])
+            kind = random.integers(3)
+            out.append(corner[[0, 2, 1]] if kind == 0 else corner[:3])
+            if kind == 2:
+                out.append(np.stack([corner[1], corner[0], corner[0] + corner[1] - corner[2]]).clip(0, 63))
+    return out
+
+
+@pytest.mark.parametrize("scale", [0.5, 1.0, 0.3])
+def test_rigid_and_apart(scale: float):
+    """Edges keep their length, no chart is mirrored, no texel is read by two charts, all is in the atlas."""
+    mesh = _mesh(_many(2))
+    packed = pack(mesh, None, scale)
+    shown = mesh.active
+    np.testing.assert_allclose(_edges(packed.corner)[shown], scale * _edges(_texels(mesh))[shown], atol=1e-4)
+    area = packing._signed_area
+    np.testing.assert_allclose(area(packed.corner)[shown], scale**2 * area(_texels(mesh))[shown], atol=1e-3)
+    readers = _read_by(packed)
+    assert max(len(charts) for charts in readers.values()) == 1
+    assert len(np.unique(packed.chart[shown])) > 10
+    x, y = np.array(list(readers)).T
+    assert x.min() >= 0 and x.max() < packed.width and y.min() >= 0 and y.max() < packed.height
+    np.testing.assert_allclose(packed.uv * [packed.width, packed.height], packed.corner, atol=1e-3)
+
+
+def test_charts_stay_whole():
+    """Neighbours keep their shared edge, to the bit; charts that only touch don't."""
+    one, other = _quad(5, 5, 8, 6), _quad(13, 5, 8, 6)
+    triangles = np.array(one + other)
+    position = np.concatenate([triangles, np.repeat([0, 0, 1, 1], 3).reshape(4, 3, 1)], 2).reshape(-1, 3)
+    packed = pack(_mesh(triangles, position=position), None, 1.0)
+    np.testing.assert_array_equal(packed.chart[:2], packed.chart[0])
+    assert packed.chart[0] != packed.chart[2]
+    np.testing.assert_array_equal(packed.corner[0, [0, 2]], packed.corner[1, [0, 1]])
+    assert np.abs(packed.corner[0, 1] - packed.corner[2, 0]).max() > 1.0
+    assert max(len(charts) for charts in _read_by(packed).values()) == 1
+
+
+def test_back_leads_to_the_old_place():
+    mesh = _mesh(_many(3))
+    packed = pack(mesh, None, 0.5)
+    at = np.concatenate([packed.corner, np.ones((*packed.corner.shape[:2], 1))], 2)[mesh.active]
+    np.testing.assert_allclose(np.einsum("fij,fkj->fki", packed.back[packed.chart[mesh.active]], at),
+                               _texels(mesh)[mesh.active], atol=1e-6)  # fmt: skip
+
+
+@pytest.mark.parametrize("order", range(6))
+def test_members_take_their_representatives_corners(order: int):
+    """Vertex k goes to vertex p[k]; the member's own texels are gone, and so is its chart."""
+    triangles = [[[2, 2], [20, 3], [4, 15]], [[30, 2], [50, 3], [32, 15]], [[2, 20], [30, 22], [4, 38]]]
+    mesh = _mesh(triangles)
+    packed = pack(mesh, _clusters([2, 1, 2], [order, 0, 0]), 0.5)
+    np.testing.assert_array_equal(packed.source, [2, 1, 2])
+    assert packed.chart[0] == packed.chart[2] != packed.chart[1] and len(packed.back) == 2
+    for k in range(3):
+        np.testing.assert_array_equal(packed.uv[0, k], packed.uv[2, ORDERS[order][k]])
+    alone = pack(mesh, None, 0.5)
+    assert packed.width * packed.height < alone.width * alone.height
+
+
+def test_neighbours_of_which_one_is_a_member():
+    """A chart of which a triangle went elsewhere keeps the rest; split in the middle it is two."""
+    strip = [_quad(4 + 8 * i, 5, 8, 8) for i in range(3)]
+    mesh = _mesh(sum(strip, []))
+    assert len(pack(mesh, None, 1.0).back) == 1
+    split = pack(mesh, _clusters([0, 1, 0, 1, 4, 5], [0] * 6), 1.0)
+    assert len(split.back) == 2
+    np.testing.assert_array_equal(split.corner[[2, 3]], split.corner[[0, 1]])
+
+
+def test_what_is_not_active():
+    """It has no texels; it reads one place that a neighbour reads, or the first."""
+    triangles = [*_quad(5, 5, 8, 6), [[5, 5], [9, 5], [13, 5]], [[30, 30], [31, 31], [32, 32]]]
+    mesh = _mesh(triangles)
+    np.testing.assert_array_equal(mesh.active, [True, True, False, False])
+    packed = pack(mesh, None, 1.0)
+    np.testing.assert_array_equal(packed.source, [0, 1, -1, -1])
+    assert (packed.uv[2] == packed.uv[2, 0]).all() and (packed.uv[3] == 0).all()
+    assert (packed.uv[2, 0] == packed.uv[:2].reshape(-1, 2)).all(1).any()
+
+
+def test_one_triangle_and_a_smaller_one_than_a_texel():
+    for size in (20.0, 0.3, 1e-3):
+        mesh = _mesh([[[8.2, 8.3], [8.2 + size, 8.3], [8.2, 8.3 + size]]])
+        packed = pack(mesh, None, 0.5)
+        np.testing.assert_allclose(_edges(packed.corner), 0.5 * _edges(_texels(mesh)), atol=1e-5)
+        lightmap, mask = regenerate(mesh, packed)
+        assert lightmap.shape == (packed.height, packed.width, 3) and mask.any()
+        assert packed.width <= np.ceil(0.75 * size) + 3
+
+
+def test_thin_triangles_get_a_place(monkeypatch: pytest.MonkeyPatch):
+    """Thinner than the packer takes: alone, and at a chart's border."""
+    asked, stand_in = [], packing._stand_in
+    monkeypatch.setattr(packing, "_stand_in", lambda *args: asked.append(len(args[0])) or stand_in(*args))
+    thin = [[[2, 2], [60, 2.0005], [30, 2.0002]], [[2, 6], [60, 6], [30, 6.0001]], [[5, 30], [25, 30], [15, 29.99999]]]
+    mesh = _mesh([*thin, *_quad(5, 30, 20, 8)])
+    assert mesh.active.all()
+    packed = pack(mesh, None, 0.5)
+    assert sum(asked) >= 1
+    np.testing.assert_allclose(_edges(packed.corner), 0.5 * _edges(_texels(mesh)), atol=1e-4)
+    assert max(len(charts) for charts in _read_by(packed).values()) == 1
+
+
+def test_many_charts(monkeypatch: pytest.MonkeyPatch):
+    """Packed by their boxes, to the same rules."""
+    mesh = _mesh(_many(2))
+    monkeypatch.setattr(packing, "_FEW", 3)
+    packed = pack(mesh, None, 0.5)
+    shown = mesh.active
+    np.testing.assert_allclose(_edges(packed.corner)[shown], 0.5 * _edges(_texels(mesh))[shown], atol=1e-4)
+    assert max(len(charts) for charts in _read_by(packed).values()) == 1
+
+
+def test_folded_and_doubled():
+    """Triangles over each other under the old UVs have texels of their own under the new ones."""
+    fold = [[[4, 4], [24, 4], [14, 16]], [[4, 4], [24, 4], [14, 10]], [[4, 4], [24, 4], [14, 16]]]
+    packed = pack(_mesh(fold), None, 1.0)
+    assert len(np.unique(packed.chart)) == 3
+    assert max(len(charts) for charts in _read_by(packed).values()) == 1
+
+
+def test_a_mesh_of_one_look_needs_little():
+    """All triangles in one group: the atlas is that of one."""
+    mesh = _mesh(sum((_quad(1 + 12 * (i % 5), 1 + 12 * (i // 5), 9, 9) for i in range(15)), []))
+    packed = pack(mesh, _clusters([0] * 30, [0] * 30), 1.0)
+    assert packed.width * packed.height <= 14 * 14
+    full = pack(mesh, None, 1.0)
+    assert full.width * full.height >= 15 * 9 * 9
+
+
+def test_regenerated_colours():
+    """A lightmap that is linear in x and y is the same under the new UVs, up to the charts' borders and beyond."""
+    y, x = np.meshgrid(np.arange(SIZE[0]) + 0.5, np.arange(SIZE[1]) + 0.5, indexing="ij")
+    lightmap = np.stack([x, y, x + 2 * y], -1).astype(np.float32) / 100
+    mesh = from_arrays(*(lambda m: (m.position, m.triangle, m.uv))(_mesh(_many(4))), lightmap, np.ones(SIZE, bool))
+    packed = pack(mesh, None, 0.7)
+    found, mask = regenerate(mesh, packed)
+    readers = _read_by(packed)
+    assert all(mask[y, x] for x, y in readers), "every texel that a bilinear read meets is filled"
+    assert not found[~mask].any() and not mask.all()
+    for (column, row), charts in list(readers.items())[::7]:
+        at = packed.back[charts.pop()] @ [column + 0.5, row + 0.5, 1.0]
+        px, py = at.clip(0.5, np.array(SIZE[::-1]) - 0.5)
+        np.testing.assert_allclose(found[row, column], np.array([px, py, px + 2 * py]) / 100, atol=1e-5)
+
+
+def test_the_mask_has_no_more_than_is_read():
+    """The outline grown by a texel, against distances."""
+    mesh = _mesh([[[3.3, 4.1], [25.2, 9.7], [11.9, 22.6]]])
+    packed = pack(mesh, None, 1.0)
+    _, mask = regenerate(mesh, packed)
+    weights = np.random.default_rng(5).dirichlet([1, 1, 1], 100000)
+    points = weights @ packed.corner[0]
+    low = np.floor(points - 0.5).astype(int)
+    read = np.zeros_like(mask)
+    for dx, dy in ((0, 0), (1, 0), (0, 1), (1, 1)):
+        read[low[:, 1] + dy, low[:, 0] + dx] = True
+    assert not (read & ~mask).any()
+    assert np.count_nonzero(mask & ~read) <= 0.03 * np.count_nonzero(read)
+
+
+def test_the_packer_is_missing(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(sys.modules, "uvunwrap", None)
+    with pytest.raises(WlmError, match="packing UVs needs uvunwrap: install the extra 'atlas'"):
+        pack(_mesh(_quad(5, 5, 8, 6)), None, 0.5)
+
+
+def test_a_packer_that_stretches(monkeypatch: pytest.MonkeyPatch):
+    """What comes back is checked."""
+    import uvunwrap
+
+    made = uvunwrap.generate
+
+    def stretched(*args, **options):
+        atlas = made(*args, **options)
+        out = atlas.meshes[0]
+        corner = np.array(out.corner_uvs).reshape(-1, 2) * [1.1, 1.0]
+        mesh = SimpleNamespace(corner_uvs=corner.reshape(-1), chart=out.chart, indices=out.indices)
+        return SimpleNamespace(meshes=[mesh], width=atlas.width, height=atlas.height)
+
+    monkeypatch.setattr(uvunwrap, "generate", stretched)
+    with pytest.raises(WlmError, match="array: uvunwrap stretched a chart by .* texels: expected at most 0.01"):
+        pack(_mesh(_quad(5, 5, 20, 6)), None, 1.0)
+
+
+def test_a_packer_that_fails(monkeypatch: pytest.MonkeyPatch):
+    """It says so, or leaves a triangle out twice."""
+    import uvunwrap
+
+    monkeypatch.setattr(packing, "_stand_in", lambda points, height: points)
+    with pytest.raises(WlmError, match="array: uvunwrap left out 1 triangles: expected a place for each"):
+        pack(_mesh([[[2, 2], [60, 2.0005], [30, 2.0002]]]), None, 0.5)
+
+    def fails(*args, **options):
+        raise uvunwrap.UnwrapError("no room")
+
+    monkeypatch.setattr(uvunwrap, "generate", fails)
+    with pytest.raises(WlmError, match="array: uvunwrap: no room"):
+        pack(_mesh(_quad(5, 5, 8, 6)), None, 0.5)
+
+
+def test_too_large():
+    mesh = _mesh(_quad(5, 5, 50, 30))
+    with pytest.raises(WlmError, match="array: the packed lightmap: expected at most 16384 texels along a side"):
+        pack(mesh, None, 400.0)
+
+
+def test_wrong_arguments():
+    mesh = _mesh(_quad(5, 5, 8, 6))
+    with pytest.raises(ValueError, match="scale: expected above 0, got 0"):
+        pack(mesh, None, 0.0)
+    with pytest.raises(ValueError, match="padding: expected at least 1, got 0"):
+        pack(mesh, None, 0.5, padding=0)
+    with pytest.raises(ValueError, match="clusters: expected 2 triangles, got 3"):
+        pack(mesh, _clusters([0, 1, 2], [0, 0, 0]), 0.5)

@@ -1,0 +1,304 @@
+"""Tiles at their own resolutions: cutting, least squares, the choice of sizes and where they are put."""
+
+import itertools
+
+import numpy as np
+import pytest
+import torch
+
+from wlm.atlas import tiles as grid
+from wlm.atlas.decode import Decoder
+from wlm.atlas.model import AtlasModel, Profile, pack_entries, unpack_entries
+
+RANDOM = np.random.default_rng(11)
+
+
+def _image(height: int, width: int) -> np.ndarray:
+    return np.random.default_rng(height + width).random((height, width, 3)).astype(np.float32)
+
+
+def _weight(height: int, width: int) -> np.ndarray:
+    return np.random.default_rng(height * width).random((2 * height, 2 * width))
+
+
+def _bilinear(image: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """At places in texels from the first one's centre, float64 [N, 3], clamped."""
+    columns = np.array([[np.interp(x, np.arange(image.shape[1]), row) for row in image[..., c]] for c in range(3)])
+    rows = np.arange(image.shape[0])
+    return np.array([[np.interp(b, rows, columns[c, :, i]) for c in range(3)] for i, b in enumerate(y)])
+
+
+def _places(tiles: grid.Tiles, rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
+    """x and y of each point of each tile, in texels from the first one's centre, [T, m * m]."""
+    m = grid.SUPERSAMPLING * tiles.size
+    inner = (np.arange(m) + 0.5) / grid.SUPERSAMPLING
+    row, column = np.divmod(tiles.index.numpy(), columns)
+    x = column[:, None, None] * tiles.size + inner[None, None, :] + np.zeros((1, m, 1))
+    y = row[:, None, None] * tiles.size + inner[None, :, None] + np.zeros((1, 1, m))
+    assert row.max() < rows
+    return x.reshape(len(row), -1), y.reshape(len(row), -1)
+
+
+@pytest.mark.parametrize("points", [1, 2, 7, 14])
+@pytest.mark.parametrize("samples", [1, 2, 3, 8, 16])
+def test_linear(samples: int, points: int):
+    """Rows are weights of a mean, and reproduce any straight line."""
+    weight = grid.linear(samples, points).numpy()
+    assert weight.shape == (points, samples) and (weight >= 0).all()
+    np.testing.assert_allclose(weight.sum(1), 1.0, atol=1e-6)
+    assert ((weight > 0).sum(1) <= 2).all()
+    if samples > 1:
+        line = 3.0 * np.linspace(0, 1, samples) - 1.0
+        np.testing.assert_allclose(weight @ line, 3.0 * (np.arange(points) + 0.5) / points - 1.0, atol=2e-6)
+
+
+SIZES = [(29, 36), (30, 40), (7, 7), (3, 4), (1, 20), (20, 1), (1, 1), (8, 2)]
+
+
+@pytest.mark.parametrize(("height", "width"), SIZES)
+def test_cut_reads_the_light_between_texels(height: int, width: int):
+    """Also where the last tiles reach beyond the lightmap, which ends at its outermost centres."""
+    size = 7
+    image, weight = _image(height, width), _weight(height, width)
+    tiles = grid.cut(image, weight, size, "cpu")
+    rows, columns = grid.tile_counts(height, width, size)
+    assert (rows, columns) == (max(1, -(-(height - 1) // size)), max(1, -(-(width - 1) // size)))
+    assert len(tiles.index) == rows * columns and tiles.light.shape == (rows * columns, 3, (2 * size) ** 2)
+    x, y = _places(tiles, rows, columns)
+    chosen = RANDOM.integers(0, x.size, 200)
+    want = _bilinear(image, x.flat[chosen], y.flat[chosen])
+    got = tiles.light.permute(0, 2, 1).reshape(-1, 3).numpy()[chosen]
+    np.testing.assert_allclose(got, want, atol=1e-6)
+
+
+@pytest.mark.parametrize(("height", "width"), SIZES)
+def test_cut_keeps_all_weight(height: int, width: int):
+    """Each quarter of a texel counts at its own centre; those outside of the outermost centres at the nearest point."""
+    weight = _weight(height, width)
+    tiles = grid.cut(_image(height, width), weight, 7, "cpu")
+    assert float(tiles.weight.double().sum()) == pytest.approx(1.0, abs=1e-5)
+    rows, columns = grid.tile_counts(height, width, 7)
+    x, y = _places(tiles, rows, columns)
+    got = np.zeros((max(1, 2 * height - 2), max(1, 2 * width - 2)))
+    row, column = (np.rint(2 * place - 0.5).astype(int).ravel() for place in (y, x))
+    values = tiles.weight.numpy().ravel()
+    inside = (row < got.shape[0]) & (column < got.shape[1])
+    assert not values[~inside].any()
+    np.add.at(got, (row[inside], column[inside]), values[inside])
+    want = np.zeros_like(got)
+    own = [np.clip(np.arange(2 * n) - 1, 0, m - 1) for n, m in ((height, got.shape[0]), (width, got.shape[1]))]
+    np.add.at(want, (own[0][:, None], own[1][None, :]), weight / weight.sum())
+    np.testing.assert_allclose(got, want, atol=1e-7)
+
+
+def test_cut_leaves_out_what_does_not_count():
+    weight = np.zeros((60, 60))
+    weight[31, 45] = 5.0  # 15.25 and 22.25 texels from the first centre
+    tiles = grid.cut(_image(30, 30), weight, 7, "cpu")
+    assert tiles.index.tolist() == [2 * 5 + 3]
+    assert float(tiles.weight.sum()) == 1.0 and int((tiles.weight > 0).sum()) == 1
+
+
+def _tiles(count: int, size: int, weight: np.ndarray | None = None, seed: int = 0) -> grid.Tiles:
+    """Smooth light with an edge in it, and some noise."""
+    random = np.random.default_rng(seed)
+    m = grid.SUPERSAMPLING * size
+    y, x = np.mgrid[:m, :m] / m
+    light = random.random((count, 3, 1, 1)) + x * random.normal(size=(count, 3, 1, 1))
+    light += 0.1 * random.random((count, 3, m, m))
+    light += random.random((count, 3, 1, 1)) * (x + y > random.random((count, 1, 1, 1)) * 2)
+    weight = random.random((count, m * m)) if weight is None else weight
+    return grid.Tiles(
+        torch.arange(count),
+        torch.from_numpy(light.reshape(count, 3, -1).astype(np.float32)),
+        torch.from_numpy((weight / weight.sum()).astype(np.float32)),
+        size,
+    )
+
+
+def _kron(nx: int, ny: int, points: int) -> np.ndarray:
+    hats = [np.array([np.interp((np.arange(points) + 0.5) / points, np.linspace(0, 1, n), e) for e in np.eye(n)]).T
+            if n > 1 else np.ones((points, 1)) for n in (ny, nx)]  # fmt: skip
+    return np.kron(*hats)
+
+
+def _least_squares(tiles: grid.Tiles, nx: int, ny: int, pull: float) -> np.ndarray:
+    """The samples [T, ny, nx, 3] in float64, pulled towards those of equal weights as ``solve`` says."""
+    points = grid.SUPERSAMPLING * tiles.size
+    both = _kron(nx, ny, points)
+    out = []
+    for light, weight in zip(tiles.light.double().numpy(), tiles.weight.double().numpy(), strict=True):
+        start = np.linalg.lstsq(both, light.T, rcond=None)[0]
+        root = np.sqrt(weight / weight.mean())[:, None]
+        ridge = np.sqrt(pull * points**2 / (nx * ny))
+        matrix = np.concatenate([root * both, ridge * np.eye(nx * ny)])
+        right = np.concatenate([root * light.T, ridge * start])
+        out.append(np.linalg.lstsq(matrix, right, rcond=None)[0].reshape(ny, nx, 3))
+    return np.array(out)
+
+
+def _error(tiles: grid.Tiles, samples: np.ndarray) -> np.ndarray:
+    """Weighted squared error of each tile in float64."""
+    count, ny, nx, _ = samples.shape
+    shown = _kron(nx, ny, grid.SUPERSAMPLING * tiles.size) @ samples.reshape(count, ny * nx, 3)
+    each = ((shown - tiles.light.double().numpy().transpose(0, 2, 1)) ** 2).mean(2)
+    return (each * tiles.weight.double().numpy()).sum(1)
+
+
+SHAPES = [(1, 1), (2, 1), (1, 3), (3, 2), (4, 4), (5, 8), (8, 8)]
+
+
+@pytest.mark.parametrize(("nx", "ny"), SHAPES)
+def test_solve_against_dense_least_squares(nx: int, ny: int):
+    tiles = _tiles(12, 7)
+    got, want = grid.solve(tiles, nx, ny).double().numpy(), _least_squares(tiles, nx, ny, grid._RIDGE)
+    np.testing.assert_allclose(got, want, atol=2e-3)
+    # The pull costs next to nothing where all is seen.
+    free = _error(tiles, _least_squares(tiles, nx, ny, 0.0))
+    assert (_error(tiles, got) <= free * 1.002 + 1e-12).all()
+    np.testing.assert_allclose(grid.errors(tiles, torch.from_numpy(got).float()).numpy(), _error(tiles, got), rtol=1e-4)
+
+
+@pytest.mark.parametrize(("nx", "ny"), SHAPES)
+def test_solve_where_little_is_seen(nx: int, ny: int):
+    """Weights of zero but for a corner, a column, a point: what is seen is met, the rest stays near the light."""
+    m = 2 * 7
+    weight = np.zeros((3, m, m))
+    weight[0, :4, :5] = RANDOM.random((4, 5)) + 0.1
+    weight[1, :, -1] = 1.0
+    weight[2, 6, 9] = 1.0
+    tiles = _tiles(3, 7, weight.reshape(3, -1))
+    got = grid.solve(tiles, nx, ny).double().numpy()
+    assert np.isfinite(got).all()
+    best = _error(tiles, _least_squares(tiles, nx, ny, grid._RIDGE))
+    assert (_error(tiles, got) <= best * 1.05 + 1e-7).all()
+    light = tiles.light.numpy()
+    low, high = light.min((1, 2)), light.max((1, 2))
+    room = (high - low) * 1.0
+    assert ((got.min((1, 2, 3)) > low - room) & (got.max((1, 2, 3)) < high + room)).all()
+
+
+@pytest.mark.parametrize("size", [3, 7, 15])
+def test_all_samples_are_the_texels(size: int):
+    height, width = 2 * size + 1, 3 * size + 1
+    image = _image(height, width)
+    tiles = grid.cut(image, _weight(height, width), size, "cpu")
+    samples = grid.solve(tiles, size + 1, size + 1).numpy()
+    for index, values in zip(tiles.index.tolist(), samples, strict=True):
+        row, column = (size * i for i in divmod(index, 3))
+        np.testing.assert_allclose(values, image[row : row + size + 1, column : column + size + 1], atol=2e-3)
+    assert float(grid.errors(tiles, torch.from_numpy(samples)).sum()) < 1e-7
+
+
+def test_errors_are_those_of_the_decoder():
+    """The sum is the weighted mean squared error of what is read at the points from the file's own numbers."""
+    height, width, size = 22, 29, 7
+    image = _image(height, width)
+    tiles = grid.cut(image, _weight(height, width), size, "cpu")
+    rows, columns = grid.tile_counts(height, width, size)
+    nx, ny = 4, 3
+    samples = grid.solve(tiles, nx, ny).clamp(min=0.0).half()
+    texels = np.zeros((rows * ny, columns * nx, 3), np.float16)
+    y, x = np.mgrid[:rows, :columns]
+    first = np.stack([x * nx, y * ny], -1)
+    for index, values in zip(tiles.index.tolist(), samples.numpy(), strict=True):
+        row, column = divmod(index, columns)
+        texels[row * ny : (row + 1) * ny, column * nx : (column + 1) * nx] = values
+    model = AtlasModel(
+        "a", "0", Profile(name="a", tile=size), "tiles", "half", height, width, texels, np.empty((0, 16), np.uint8),
+        pack_entries(first, np.broadcast_to([nx, ny], first.shape)), np.empty((0, 3, 2), np.float32),
+    )  # fmt: skip
+    x, y = _places(tiles, rows, columns)
+    uv = np.stack([(x.ravel() + 0.5) / width, (y.ravel() + 0.5) / height], 1).astype(np.float32)
+    shown = Decoder(model).read(torch.from_numpy(uv)).double().numpy().reshape(len(tiles.index), -1, 3)
+    light = tiles.light.double().numpy().transpose(0, 2, 1)
+    want = (((shown - light) ** 2).mean(2) * tiles.weight.double().numpy()).sum(1)
+    np.testing.assert_allclose(grid.errors(tiles, samples.float()).numpy(), want, rtol=2e-3)
+
+
+def test_curves_and_solved():
+    """A curve is the error at each size; each tile is solved at its own; no sample is negative."""
+    tiles = _tiles(9, 5)
+    tiles.light[:2] = (tiles.light[:2] - 2.0).clamp(min=0.0)  # a black tile with some light in it
+    sizes = [(1, 1), (3, 2), (6, 6)]
+    error = grid.curves(tiles, sizes)
+    assert error.shape == (3, 9) and error.dtype == np.float64
+    chosen = np.array([sizes[i % 3] for i in range(9)])
+    samples = grid.solved(tiles, chosen)
+    for i, values in enumerate(samples):
+        assert values.shape == (chosen[i, 1], chosen[i, 0], 3) and (values >= 0).all()
+        own = grid.Tiles(*(part[i : i + 1] for part in (tiles.index, tiles.light, tiles.weight)), tiles.size)
+        # A curve is made with fewer rounds.
+        exact = float(grid.errors(own, torch.from_numpy(values)[None])[0])
+        assert exact <= error[i % 3, i] * 1.01 + 1e-12 and exact >= error[i % 3, i] * 0.9 - 1e-9
+    dark = grid.curves(tiles, sizes, torch.zeros_like)  # the file holds nothing
+    want = (tiles.light.double() ** 2).mean(1) * tiles.weight
+    np.testing.assert_allclose(dark, np.broadcast_to(want.sum(1).numpy(), (3, 9)), rtol=1e-5)
+
+
+def _brute(error: np.ndarray, cost: np.ndarray, budget: float) -> float:
+    """The least error of all choices within a budget."""
+    number = np.arange(error.shape[1])
+    choices = (np.array(one) for one in itertools.product(range(len(cost)), repeat=error.shape[1]))
+    return min(error[one, number].sum() for one in choices if cost[one].sum() <= budget)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_allocate_is_optimal_for_what_it_spends(seed: int):
+    """No choice of the same cost is better, as a Lagrange multiplier promises, and nothing on the hull is left over."""
+    random = np.random.default_rng(seed)
+    cost = np.array([1.0, 2, 4, 6, 9])
+    error = np.sort(random.random((5, 6)), 0)[::-1] * random.random(6) ** 3
+    spent = []
+    for budget in (6.0, 9.0, 14.0, 25.0, 40.0, 54.0):
+        chosen = grid.allocate(error, cost, budget, 0.0)
+        spent.append(cost[chosen].sum())
+        assert spent[-1] <= budget
+        assert error[chosen, np.arange(6)].sum() == pytest.approx(_brute(error, cost, spent[-1]), rel=1e-12)
+    assert spent == sorted(spent) and spent[0] == 6 and spent[-1] == 54
+    # A hull's longest edge is one tile's step from its cheapest size to its dearest.
+    assert all(budget - cost_of < 9 for budget, cost_of in zip((9.0, 14.0, 25.0, 40.0), spent[1:5], strict=True))
+
+
+def test_allocate_buys_no_sample_below_the_least_gain():
+    cost = np.array([1.0, 2.0, 3.0])
+    error = np.array([[10.0, 10.0, 0.0], [9.0, 5.0, 0.0], [8.5, 4.9, 0.0]])
+    assert grid.allocate(error, cost, 100.0, 0.0).tolist() == [2, 2, 0]
+    assert grid.allocate(error, cost, 100.0, 0.6).tolist() == [1, 1, 0]
+    assert grid.allocate(error, cost, 100.0, 2.0).tolist() == [0, 1, 0]
+    assert grid.allocate(error, cost, 4.0, 0.0).tolist() == [0, 1, 0]
+
+
+def test_allocate_gives_the_cheapest_where_nothing_fits():
+    error = np.array([[3.0, 2.0], [1.0, 1.0]])
+    assert grid.allocate(error, np.array([1.0, 2.0]), 0.5, 0.0).tolist() == [0, 0]
+    flat = np.zeros((2, 4))
+    assert grid.allocate(flat, np.array([1.0, 2.0]), 4.0, 0.0).tolist() == [0] * 4
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_place(seed: int):
+    """Inside, apart, and on shelves that waste little."""
+    random = np.random.default_rng(seed)
+    count = int(random.integers(1, 300))
+    sizes = random.integers(1, 17, (count, 2))
+    width = int(sizes[:, 0].max() + random.integers(0, 100))
+    first, height = grid.place(sizes, width)
+    used = np.zeros((height, width), int)
+    for (x, y), (w, h) in zip(first, sizes, strict=True):
+        assert x >= 0 and y >= 0 and x + w <= width and y + h <= height
+        used[y : y + h, x : x + w] += 1
+    assert used.max() == 1 and used[-1].any()
+    if count > 100 and width > 64:
+        assert used.mean() > 0.75
+
+
+def test_entries():
+    """A table's entry holds its place and size, at the ends of their ranges too."""
+    first, size = np.array([[0, 4095], [17, 1]]), np.array([[1, 16], [16, 3]])
+    entries = pack_entries(first, size)
+    assert entries.dtype == np.uint16
+    np.testing.assert_array_equal(np.stack(unpack_entries(entries)), np.stack([first, size]))
+    for wrong in ((first - 1, size), (first + 1, size), (first, size - 1), (first, size + 1)):
+        with pytest.raises(ValueError, match="an entry beyond a texture of 4096 texels or a tile of 16"):
+            pack_entries(*wrong)

@@ -1,0 +1,235 @@
+"""What a compressed lightmap of a mesh is compared with: sizes, known answers, budgets, and what is refused."""
+
+import math
+import sys
+
+import numpy as np
+import pytest
+import torch
+from lit_cube import HEIGHT, WIDTH, lit_cube, waves
+
+from wlm import render
+from wlm.atlas.data import from_arrays
+from wlm.atlas.evaluate import evaluate
+from wlm.atlas.resize import FILTERS, resize
+from wlm.baselines.atlas import ATLAS_BASELINES, block_codec, downsampling, single_colour
+from wlm.errors import WlmError
+from wlm.formats.hdr_blocks import ASTC_BLOCKS
+from wlm.imageops import fill_gaps
+
+BITS = HEIGHT * WIDTH * 48
+FULL = np.ones((HEIGHT, WIDTH), bool)
+
+
+def _sheet(lightmap, mask=None):
+    """A square that shows the whole lightmap."""
+    position = np.array([[-1, 1, 0], [1, 1, 0], [-1, -1, 0], [1, -1, 0]], np.float64)
+    uv = np.array([[0, 0], [1, 0], [0, 1], [1, 1]], np.float64)
+    return from_arrays(position, np.array([[0, 1, 2], [2, 1, 3]]), uv, lightmap, mask, name="sheet")
+
+
+def _read(baseline, mesh):
+    """What the baseline gives at the lightmap's texels, float64 [H, W, 3]; for meshes whose triangles don't count."""
+    height, width = mesh.mask.shape
+    y, x = np.mgrid[:height, :width] + 0.5
+    uv = torch.tensor(np.stack([x / width, y / height], -1).reshape(-1, 2), dtype=torch.float32)
+    nothing = torch.zeros(len(uv), dtype=torch.int32), torch.zeros(len(uv), 3)
+    return baseline.sample(uv, *nothing).numpy().astype(np.float64).reshape(height, width, 3)
+
+
+@pytest.mark.parametrize("name", ATLAS_BASELINES)
+@pytest.mark.parametrize("share", [0.17, 0.5])
+def test_every_one_within_its_budget(name, share):
+    mesh = lit_cube(2)
+    result = ATLAS_BASELINES[name](mesh, share)
+    assert result.name == name and result.share == result.bits / BITS and result.seconds > 0.0
+    # All it can: at least the budget less one row, column or rank of blocks, or its own size.
+    most = {"bc6h": 8, "astc4x4": 8, "astc6x6": 3.84, "astc8x8": 2}.get(name, 48) / 48
+    assert min(share, most) * 0.85 < result.share <= share
+    report = evaluate(mesh, {"it": result.sample}, views=4, resolution=64)["it"]
+    assert report.psnr > (12.0 if name == "single colour" else 25.0)
+
+
+@pytest.mark.parametrize("filter", FILTERS)
+def test_resizing_keeps_one_colour_and_the_size(filter):
+    one = np.full((HEIGHT, WIDTH, 3), 0.7, np.float32)
+    for height, width in ((HEIGHT, WIDTH), (31, 47), (5, 3), (1, 1)):
+        small = resize(one, FULL, height, width, filter)
+        assert small.dtype == np.float64
+        np.testing.assert_allclose(small, np.full((height, width, 3), np.float32(0.7)), rtol=1e-9)
+    np.testing.assert_array_equal(resize(waves(), FULL, HEIGHT, WIDTH, filter), waves())
+
+
+def test_halves_by_hand():
+    line = np.array([[1.0, 3.0, 4.0, 8.0, 9.0, 5.0]])
+    image = np.repeat(np.repeat(line, 2, 0)[..., None], 3, 2)
+    mask = np.ones((2, 6), bool)
+    for filter in ("box", "bilinear"):
+        np.testing.assert_allclose(resize(image, mask, 1, 3, filter)[0, :, 0], [2.0, 6.0, 7.0])
+    # Centres at 1 and 4 of 6: bilinear reads 3 and 9 alone, box has thirds.
+    np.testing.assert_allclose(resize(image, mask, 1, 2, "bilinear")[0, :, 0], [3.0, 9.0])
+    np.testing.assert_allclose(resize(image, mask, 1, 2, "box")[0, :, 0], [8 / 3, 22 / 3])
+    np.testing.assert_allclose(resize(image, mask, 2, 4, "box")[0, :, 0], [5 / 3, 11 / 3, 25 / 3, 19 / 3])
+
+
+def test_lanczos_keeps_slow_waves_and_drops_fast_ones():
+    x = np.arange(96) + 0.5
+    slow, fast = (np.cos(2.0 * np.pi * x * k / 96.0) for k in (6, 40))
+    image = np.repeat((2.0 + np.stack([slow, fast, slow + fast], -1))[None], 4, 0)
+    small = resize(image, np.ones((4, 96), bool), 4, 48, "lanczos") - 2.0
+    centres = (np.arange(48) + 0.5) * 2.0
+    inner = slice(6, -6)
+    np.testing.assert_allclose(small[0, inner, 0], np.cos(2.0 * np.pi * centres * 6 / 96.0)[inner], atol=0.02)
+    assert np.abs(small[0, inner, 1]).max() < 0.05 and small.min() >= -2.0
+
+
+def test_the_fit_has_the_least_squares():
+    """Against NumPy's least squares on a small texture; and better than every filter where the mask is."""
+    random = np.random.default_rng(4)
+    image = (3.0 + waves(12, 15) + random.uniform(0.0, 0.2, (12, 15, 3))).astype(np.float32)
+    mask = np.zeros((12, 15), bool)
+    mask[1:11, 2:13] = True
+    size = (5, 6)
+    found = resize(image, mask, *size, "fit")
+    columns = []
+    for number in range(30):
+        unit = np.zeros((30, 3), np.float32)
+        unit[number] = 1.0
+        texture = torch.tensor(unit.reshape(*size, 3))
+        y, x = (np.argwhere(mask) + 0.5).T / np.array([[12], [15]])
+        columns.append(render.texture(texture, torch.tensor(np.stack([x, y], 1), dtype=torch.float32)).numpy()[:, 0])
+    matrix = np.stack(columns, 1).astype(np.float64)
+
+    def squares(texels):
+        return ((matrix @ texels.reshape(30, 3) - image[mask]) ** 2).sum()
+
+    best, *_ = np.linalg.lstsq(matrix, image[mask].astype(np.float64), rcond=None)
+    assert squares(best) <= squares(found) < squares(best) * 1.01
+    for filter in ("bilinear", "box", "lanczos"):
+        assert squares(found) < 0.9 * squares(resize(image, mask, *size, filter))
+    # Texels that nothing in the mask reads keep the box filter's value.
+    unread = ~matrix.any(axis=0)
+    box = resize(image, mask, *size, "box")
+    assert not unread.all()
+    np.testing.assert_allclose(found.reshape(30, 3)[unread], box.reshape(30, 3)[unread])
+
+
+@pytest.mark.parametrize("filter", FILTERS)
+def test_what_is_in_the_gaps_counts_for_nothing(filter):
+    mask = FULL.copy()
+    mask[10:40, 20:70] = False
+    other = waves()
+    other[~mask] = 60000.0
+    clean, dirty = (downsampling(_sheet(image, mask), 0.3, filter) for image in (waves(), other))
+    np.testing.assert_array_equal(_read(clean, _sheet(waves())), _read(dirty, _sheet(waves())))
+
+
+def test_downsampling_keeps_the_shape_and_never_enlarges():
+    mesh = _sheet(waves())
+    small = downsampling(mesh, 0.25)
+    assert small.size == (HEIGHT // 2, WIDTH // 2) and small.share == 0.25
+    for share in (1.0, 3.0):
+        whole = downsampling(mesh, share)
+        assert whole.size == (HEIGHT, WIDTH) and whole.share == 1.0
+        np.testing.assert_allclose(_read(whole, mesh), waves().astype(np.float16), rtol=2e-6)
+    thin = _sheet(np.repeat(waves(1, 50), 1, 0))
+    assert downsampling(thin, 0.5).size == (1, 25) and downsampling(thin, 0.02).size == (1, 1)
+    # More texels, less error.
+    errors = [np.abs(_read(downsampling(mesh, share), mesh) - waves()).mean() for share in (0.05, 0.2, 0.6)]
+    assert errors == sorted(errors, reverse=True)
+
+
+@pytest.mark.parametrize("codec", ["bc6h", *(f"astc{w}x{h}" for w, h in ASTC_BLOCKS)])
+def test_blocks(codec):
+    light = waves()[..., :1] * np.array([1.0, 0.8, 0.5], np.float32)
+    mesh = _sheet(light)
+    whole = block_codec(mesh, 1.0, codec)
+    width, height = (4, 4) if codec == "bc6h" else map(int, codec[4:].split("x"))
+    assert whole.size == (HEIGHT, WIDTH) and whole.name == codec
+    assert whole.bits == math.ceil(WIDTH / width) * math.ceil(HEIGHT / height) * 128
+    # 2% of the mean; 3% with the largest blocks. Blocks in any other order are 30% off.
+    assert np.abs(_read(whole, mesh) - light).mean() < 0.03
+    small = block_codec(mesh, 0.01, codec)
+    assert 0.005 < small.share <= 0.01 and small.size[0] < HEIGHT
+    odd = _sheet(light[:13, :10])
+    assert block_codec(odd, 20.0, codec).size == (13, 10)
+    assert np.abs(_read(block_codec(odd, 20.0, codec), odd) - light[:13, :10]).mean() < 0.03
+
+
+def test_faces_of_one_colour_become_a_texel_each():
+    """Six faces in four colours: four texels hold them all, and at a larger threshold two that are near share one."""
+    colours = np.array([[1, 1, 1], [1, 0.5, 0], [1, 1, 1], [0, 0, 2], [0.25, 0, 0.25], [1, 1, 1]], np.float32)
+    light = np.empty((HEIGHT, WIDTH, 3), np.float32)
+    for number, colour in enumerate(colours):
+        light[number // 3 * 32 :, number % 3 * 32 :][:32, :32] = colour
+    mesh = lit_cube(2, light)
+    exact = single_colour(mesh, threshold=0.0)
+    assert exact.bits == 4 * 48 and exact.size is None
+    report = evaluate(mesh, {"it": exact.sample}, views=6, resolution=64)["it"]
+    assert report.psnr > 100.0
+    light[: HEIGHT // 2, : WIDTH // 3] = waves()[: HEIGHT // 2, : WIDTH // 3]
+    mesh = lit_cube(2, light)
+    one_left = single_colour(mesh, threshold=1e-4)
+    kept = np.count_nonzero(mesh.mask[: HEIGHT // 2, : WIDTH // 3])
+    assert one_left.bits == (4 + kept) * 48
+    assert evaluate(mesh, {"it": one_left.sample}, views=6, resolution=64)["it"].psnr > 70.0
+    assert single_colour(mesh, threshold=10.0).bits == 48
+
+
+@pytest.mark.parametrize("threshold", [0.02, 0.1, 0.3])
+def test_the_error_of_shared_colours_is_bounded(threshold):
+    """A colour is within the threshold of its triangle's middle, and so are the triangle's colours."""
+    mesh = lit_cube(6)
+    result = single_colour(mesh, threshold=threshold)
+    limit = 2.0 * threshold * float(np.ptp(mesh.lightmap[mesh.mask]))
+    assert 0.0 < result.share < 1.0
+    weight = np.random.default_rng(0).dirichlet([1.0] * 3, len(mesh.triangle))
+    uv = torch.tensor((mesh.uv[mesh.triangle] * weight[..., None]).sum(1), dtype=torch.float32)
+    wanted = render.texture(torch.tensor(fill_gaps(mesh.lightmap, mesh.mask)), uv)
+    found = result.sample(uv, torch.arange(len(uv), dtype=torch.int32), torch.tensor(weight))
+    # Colours were looked at a texel apart; between these they may go a little further.
+    assert float((found - wanted).abs().max()) < limit * 1.1 + 2e-3
+
+
+def test_single_colours_at_a_budget():
+    mesh = lit_cube(4)
+    shares = (0.1, 0.4, 0.9)
+    results = [single_colour(mesh, share) for share in shares]
+    assert all(result.share <= share for result, share in zip(results, shares, strict=True))
+    reports = evaluate(mesh, {str(s): r.sample for s, r in zip(shares, results, strict=True)}, views=6, resolution=64)
+    psnr = [report.psnr for report in reports.values()]
+    assert psnr == sorted(psnr) and psnr[-1] > 60.0
+    assert single_colour(mesh, 1.0 / (HEIGHT * WIDTH)).bits == 48
+    # Flat already, but in more colours than there is room for.
+    steps = np.repeat(np.repeat(np.random.default_rng(1).random((4, 6, 3)), 16, 0), 16, 1).astype(np.float32)
+    assert single_colour(lit_cube(1, steps), 3 / (HEIGHT * WIDTH)).bits <= 3 * 48
+
+
+def test_what_is_refused(monkeypatch):
+    mesh = _sheet(waves())
+    makers = (downsampling, single_colour, lambda mesh, share: block_codec(mesh, share, "astc12x12"))
+    tiny = 0.5 / (HEIGHT * WIDTH)
+    for share, message in (
+        (0.0, "share"),
+        (-1.0, "share"),
+        (math.nan, "share"),
+        (math.inf, "share"),
+        (tiny, "no room"),
+    ):
+        for make in makers:
+            with pytest.raises(ValueError, match=message):
+                make(mesh, share)
+    with pytest.raises(ValueError, match="'cubic'"):
+        downsampling(mesh, 0.5, "cubic")
+    for codec in ("bc7", "astc7x7", "astc"):
+        with pytest.raises(ValueError, match=f"'{codec}'"):
+            block_codec(mesh, 0.5, codec)
+    with pytest.raises(ValueError, match="threshold"):
+        single_colour(mesh, threshold=-0.1)
+    for size in ((0, 4), (4, 0), (HEIGHT + 1, 4)):
+        with pytest.raises(ValueError, match="size"):
+            resize(waves(), FULL, *size)
+    for codec, package in (("bc6h", "ispc_texcomp"), ("astc5x5", "astc_encoder")):
+        monkeypatch.setitem(sys.modules, package, None)  # makes the import fail
+        with pytest.raises(WlmError, match=rf"{package} is missing.*wlm\[baselines\]"):
+            block_codec(mesh, 0.5, codec)

@@ -1,0 +1,296 @@
+import dataclasses
+import json
+import os
+import re
+
+import numpy as np
+import pytest
+import yaml
+from atlas_meshes import charts, sheet
+from PIL import Image
+from test_cli import call, fails
+
+import wlm.atlas.fit
+from wlm.atlas import codec
+from wlm.atlas.data import load_mesh
+from wlm.atlas.decode import Decoder
+from wlm.atlas.evaluate import evaluate
+from wlm.atlas.fit import compress
+from wlm.atlas.model import load_profile
+from wlm.baselines.atlas import downsampling
+from wlm.formats.exr import read_exr, write_exr
+from wlm.formats.gltf_writer import write_glb
+
+CASCADE = {"name": "short", "method": "cascade", "fallback": False, "steps": 20, "resolution": 64}
+QUICK = ("--views", 2)
+
+
+def _files(folder, mesh):
+    """A mesh and its lightmap as files."""
+    write_glb(folder / "mesh.glb", mesh.document, [], 1)
+    write_exr(folder / "light.exr", mesh.lightmap)
+    return folder / "mesh.glb", folder / "light.exr"
+
+
+@pytest.fixture(scope="session")
+def inputs(tmp_path_factory):
+    return _files(tmp_path_factory.mktemp("inputs"), sheet())
+
+
+@pytest.fixture(scope="session")
+def tiles(inputs, tmp_path_factory):
+    """The output of the profile `standard` with few views."""
+    folder = tmp_path_factory.mktemp("tiles") / "out"
+    call("atlas", "compress", *inputs, "-o", folder, *QUICK)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def cascade(inputs, tmp_path_factory):
+    """The output of the paper's method with few steps."""
+    folder = tmp_path_factory.mktemp("cascade")
+    (folder / "short.yaml").write_text(yaml.safe_dump(CASCADE))
+    call("atlas", "compress", *inputs, "-o", folder / "out", "--profile", folder / "short.yaml")
+    return folder / "out"
+
+
+def test_help_lists_the_commands():
+    assert "atlas" in call().split()
+    assert {"compress", "decode", "evaluate", "info"} <= set(call("atlas", "--help").split())
+
+
+def test_compress_prints_one_table(inputs, tmp_path):
+    out = tmp_path / "out"
+    text = call("atlas", "compress", *inputs, "-o", out, *QUICK)
+    model = codec.read(out / "atlas.wlm")
+    for path in out.iterdir():
+        assert re.search(rf"│ {re.escape(path.name)} +│ +{path.stat().st_size:,} │", text)
+    size = (out / "atlas.wlm").stat().st_size
+    for ratio in (model.compression_ratio, 1 - size * 8 / (40 * 48 * 48)):
+        assert f"{ratio:.2%}" in text
+    assert "compress: weights" in call.stderr and os.listdir(tmp_path) == ["out"]
+    report = json.loads((out / "report.json").read_text())
+    assert report["inputs"] == {"mesh": str(inputs[0]), "lightmap": str(inputs[1]), "mask": None}
+    assert (report["seed"], report["device"]) == (0, "cpu") and report["seconds"]["weights"] > 0
+
+
+def test_one_seed_gives_one_file(inputs, tiles, tmp_path):
+    for seed, same in ((0, True), (5, False)):
+        call("atlas", "compress", *inputs, "-o", tmp_path / "out", *QUICK, "--seed", seed)
+        assert ((tmp_path / "out" / "atlas.wlm").read_bytes() == (tiles / "atlas.wlm").read_bytes()) is same
+
+
+def test_the_options_of_compress_reach_the_fit(inputs, tmp_path):
+    mask = np.zeros((40, 48), np.uint8)
+    mask[:30] = 255
+    Image.fromarray(mask).save(tmp_path / "mask.png")
+    options = ["--budget", 0.4, "--colour", "bc6h", "--views", 0, "--uv-set", 0, "--mask", tmp_path / "mask.png"]
+    call("atlas", "compress", *inputs, "-o", tmp_path / "out", *options)
+    # The sheet reaches beyond the mask.
+    assert re.search(r"^warning: .*outside the mask", call.stderr, re.MULTILINE)
+    model = codec.read(tmp_path / "out" / "atlas.wlm")
+    settings = model.profile
+    assert (settings.name, settings.budget, settings.colour, settings.views) == ("standard", 0.4, "bc6h", 0)
+    assert model.source == load_mesh(*inputs, mask_path=tmp_path / "mask.png").source
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert len(report["warnings"]) == 1 and report["inputs"]["mask"] == str(tmp_path / "mask.png")
+    # evaluate finds the mask again.
+    call("atlas", "evaluate", tmp_path / "out", "--views", 2, "--resolution", 64)
+
+
+def test_wrong_words_are_one_line(inputs, tmp_path):
+    out = ["-o", tmp_path / "out"]
+    words = ["atlas", "compress", *inputs, *out]
+    assert "--budget: expected greater than 0, got 0" in fails(*words, "--budget", 0).replace("should be ", "")
+    assert "--colour: expected 'half', 'bc6h' or 'astc', got png" in fails(*words, "--colour", "png")
+    assert "'none'" in fails(*words, "--profile", "none")
+    assert "TEXCOORD_3" in fails(*words, "--uv-set", 3)
+    assert "device 'tpu'" in fails(*words, "--device", "tpu")
+    assert "no such mask" in fails(*words, "--mask", tmp_path / "a.png")
+    call(*words, "--budget", 0.001, *QUICK, code=2)
+    assert re.search(r"^error: budget: 0.001 of 48x40 texels is less than", call.stderr, re.MULTILINE)
+    assert "gone.glb" in fails("atlas", "compress", tmp_path / "gone.glb", inputs[1], *out)
+    assert "gone.exr" in fails("atlas", "compress", inputs[0], tmp_path / "gone.exr", *out)
+    assert "none does not exist" in fails("atlas", "compress", *inputs, "-o", tmp_path / "none" / "out")
+    assert os.listdir(tmp_path) == []
+
+
+def test_other_files_are_not_replaced(inputs, tmp_path, monkeypatch):
+    (tmp_path / "a.txt").write_text("x")
+    # It says so before it computes.
+    monkeypatch.setattr(wlm.atlas.fit, "compress", None)
+    assert "found other files" in fails("atlas", "compress", *inputs, "-o", tmp_path)
+    assert "Not a directory" in fails("atlas", "compress", *inputs, "-o", tmp_path / "a.txt")
+    assert os.listdir(tmp_path) == ["a.txt"]
+
+
+def test_an_interrupt_leaves_nothing(inputs, tmp_path, monkeypatch):
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(wlm.atlas.fit, "compress", interrupted)
+    call("atlas", "compress", *inputs, "-o", tmp_path / "out", code=130)
+    assert os.listdir(tmp_path) == []
+
+
+def test_a_mesh_of_another_format(inputs, tmp_path):
+    mesh = load_mesh(*inputs)
+    lines = ["v {} {} {}".format(*place) for place in mesh.position]
+    # v of an .obj goes up.
+    lines += [f"vt {u} {1 - v}" for u, v in mesh.uv]
+    lines += ["f " + " ".join(f"{i}/{i}" for i in corner) for corner in mesh.triangle + 1]
+    (tmp_path / "mesh.obj").write_text("\n".join(lines))
+    call("atlas", "compress", tmp_path / "mesh.obj", inputs[1], "-o", tmp_path / "out", *QUICK)
+    call("atlas", "decode", tmp_path / "out", "-o", tmp_path / "a.exr")
+    found, _ = read_exr(tmp_path / "a.exr")
+    own = load_mesh(tmp_path / "out" / "mesh.glb", inputs[1])
+    np.testing.assert_allclose(own.uv[own.triangle], mesh.uv[mesh.triangle], atol=1e-6)
+    assert np.abs(found - mesh.lightmap)[mesh.mask].mean() < 0.1
+    call("atlas", "evaluate", tmp_path / "out", "--views", 1, "--resolution", 32)
+
+
+def test_evaluate(inputs, tiles, tmp_path):
+    options = ["--views", 3, "--resolution", 64, "--json", tmp_path / "a.json"]
+    text = call("atlas", "evaluate", tiles, *options)
+    report = json.loads((tmp_path / "a.json").read_text())
+    mesh, model = load_mesh(*inputs), codec.read(tiles / "atlas.wlm")
+    rival = downsampling(mesh, 1.0 - model.compression_ratio)
+    samplers = {"ours": Decoder(model), "rival": rival.sample}
+    expected = evaluate(mesh, samplers, views=3, resolution=64)
+    for found, name in ((report, "ours"), (report["downsampling"], "rival")):
+        # Seams of tiles are others than those of charts.
+        for key in ("psnr", "psnr_worst", "worst_view", "one_minus_ssim", "texel_psnr", "views", "pixels", "peak"):
+            assert found[key] == pytest.approx(expected[name].to_json()[key], rel=1e-6), key
+    assert f"{report['psnr']:.2f}" in text and f"{report['downsampling']['psnr']:.2f}" in text
+    assert report["cr"] == model.compression_ratio and report["cameras"] == 3
+    size = (tiles / "atlas.wlm").stat().st_size
+    assert report["bytes"] == size and report["cr_disk"] == 1 - size * 8 / (40 * 48 * 48)
+    # It has as many bits, less what is left of a row of texels.
+    assert 0 <= report["downsampling"]["cr"] - report["cr"] < 0.02
+    assert report["seam_ratio"] > 0 and "evaluate: 3 of 3" in call.stderr
+
+
+def test_seams_are_those_of_the_method(tmp_path):
+    """A model with an error at the borders of its tiles alone."""
+    mesh = sheet(lambda place: np.ones((*place.shape[:-1], 3)) * (0.5 + place[..., :1]), height=64, width=64, quads=1)
+    paths = _files(tmp_path, mesh)
+    out = tmp_path / "out"
+    call("atlas", "compress", *paths, "-o", out, *QUICK, "--budget", 0.1)
+    options = ["--views", 2, "--resolution", 512, "--json", tmp_path / "a.json"]
+    call("atlas", "evaluate", out, *options)
+    before = json.loads((tmp_path / "a.json").read_text())
+    model = codec.read(out / "atlas.wlm")
+    assert model.method == "tiles" and model.lut.shape == (9, 9, 2)
+    # The tiles' left columns of samples become brighter.
+    texels = model.texels.copy()
+    for x, y in np.unique(model.lut.reshape(-1, 2) >> 4, axis=0):
+        texels[y, x] *= 1.2
+    codec.write(out / "atlas.wlm", dataclasses.replace(model, texels=texels))
+    call("atlas", "evaluate", out, *options)
+    after = json.loads((tmp_path / "a.json").read_text())
+    assert after["seam_error"] > 5 * before["seam_error"]
+    assert after["seam_ratio"] > 1.1
+    assert after["downsampling"] == before["downsampling"] | {"seconds": after["downsampling"]["seconds"]}
+
+
+def test_evaluate_of_new_uvs(cascade):
+    assert codec.read(cascade / "atlas.wlm").method == "cascade"
+    text = call("atlas", "evaluate", cascade, "--views", 2, "--resolution", 64)
+    assert "downsampling" in text and "CR (eq. 9)" in text
+
+
+def test_evaluate_looks_for_its_inputs(inputs, tmp_path):
+    mesh = charts()
+    (tmp_path / "in").mkdir()
+    paths = _files(tmp_path / "in", mesh)
+    out = tmp_path / "out"
+    call("atlas", "compress", *paths, "-o", out, *QUICK)
+    words = ["atlas", "evaluate", out, "--views", 1, "--resolution", 32]
+    expected = call(*words)
+    os.rename(tmp_path / "in", tmp_path / "moved")
+    assert "no such mesh; if it has moved, give --mesh" in fails(*words)
+    moved = ["--mesh", tmp_path / "moved" / "mesh.glb"]
+    assert "no such lightmap; if it has moved, give --lightmap" in fails(*words, *moved)
+    moved += ["--lightmap", tmp_path / "moved" / "light.exr"]
+    assert call(*words, *moved) == expected
+    # A changed input is refused.
+    changed = mesh.lightmap.copy()
+    changed[tuple(np.argwhere(mesh.mask)[0])] += 1.0
+    write_exr(tmp_path / "moved" / "light.exr", changed)
+    assert re.search("made of other inputs than .*light.exr: expected source [0-9a-f]{16}", fails(*words, *moved))
+    assert "made of other inputs" in fails(*words, "--mesh", inputs[0], "--lightmap", inputs[1])
+    report = json.loads((out / "report.json").read_text())
+    del report["inputs"]
+    (out / "report.json").write_text(json.dumps(report))
+    assert "inputs.mesh: expected a path, found none; give --mesh" in fails(*words)
+    assert "expected a name that ends in .json" in fails(*words, "--json", tmp_path / "a.txt")
+
+
+@pytest.mark.parametrize("kind", ["tiles", "cascade"])
+def test_decode_the_lightmap(kind, inputs, request, tmp_path):
+    folder, mesh = request.getfixturevalue(kind), load_mesh(*inputs)
+    text = call("atlas", "decode", folder, "-o", tmp_path / "a.exr")
+    expected = Decoder(codec.read(folder / "atlas.wlm")).lightmap(mesh)
+    found, _ = read_exr(tmp_path / "a.exr")
+    np.testing.assert_array_equal(found, expected.astype(np.float16))
+    assert "48x40" in text and np.abs(found - mesh.lightmap)[mesh.mask].mean() < 0.1
+
+
+@pytest.mark.parametrize("kind", ["tiles", "cascade"])
+def test_decode_a_view(kind, request, tmp_path):
+    folder = request.getfixturevalue(kind)
+    words = ["atlas", "decode", folder, "--view", 2, "--views", 5, "--resolution", 48]
+    text = call(*words, "-o", tmp_path / "a.exr")
+    assert "48x48" in text
+    call(*words, "-o", tmp_path / "a.png")
+    light, _ = read_exr(tmp_path / "a.exr")
+    with Image.open(tmp_path / "a.png") as image:
+        picture = np.asarray(image)
+    assert picture.shape == (48, 48, 3)
+    hit = light.any(axis=2)
+    assert 0.02 < hit.mean() < 0.9 and (picture[~hit] == 128).all()
+    # Brighter light is a brighter pixel.
+    order = np.argsort(light[hit][:, 0])
+    assert (np.diff(picture[hit][order, 0].astype(int)) >= 0).all()
+
+
+def test_wrong_words_of_decode(tiles, tmp_path):
+    words = ["atlas", "decode", tiles, "-o"]
+    assert "a lightmap is written as .exr" in fails(*words, tmp_path / "a.png")
+    assert "expected a name that ends in .exr or .png" in fails(*words, tmp_path / "a.dds")
+    assert "--view: expected 0 to 4, got 5" in fails(*words, tmp_path / "a.png", "--view", 5, "--views", 5)
+    assert "expected a folder that compress wrote" in fails("atlas", "decode", tmp_path, "-o", tmp_path / "a.exr")
+    assert "device 'tpu'" in fails(*words, tmp_path / "a.exr", "--device", "tpu")
+    assert os.listdir(tmp_path) == []
+
+
+@pytest.mark.parametrize("kind", ["tiles", "cascade"])
+def test_info(kind, request):
+    folder = request.getfixturevalue(kind)
+    model, size = codec.read(folder / "atlas.wlm"), (folder / "atlas.wlm").stat().st_size
+    for path in (folder, folder / "atlas.wlm"):
+        facts = json.loads(call("atlas", "info", path, "--json"))
+        assert (facts["name"], facts["method"], facts["bytes"], facts["size"]) == ("mesh", kind, size, [48, 40])
+        assert sum(facts["parts"].values()) == size and facts["cr"] == model.compression_ratio
+        assert facts["colour_size"] == [model.texels.shape[1], model.texels.shape[0]]
+        assert facts["new_uvs"] == len(model.uv) and facts["profile"]["method"] == kind
+    text = call("atlas", "info", folder)
+    assert f"{size:,}" in text and f"{model.compression_ratio:.2%}" in text and "48x40" in text
+    assert ("the mesh's own" in text) is (kind == "tiles")
+
+
+def test_info_of_a_plain_model(inputs, tmp_path):
+    (tmp_path / "plain.yaml").write_text(yaml.safe_dump(CASCADE | {"lut_scale": 0.0, "threshold": 0.0}))
+    call("atlas", "compress", *inputs, "-o", tmp_path / "out", "--profile", tmp_path / "plain.yaml")
+    assert not list((tmp_path / "out").glob("lut.*"))
+    text = call("atlas", "info", tmp_path / "out")
+    assert re.search(r"│ table +│ +none │", text) and re.search(r"│ method +│ +plain │", text)
+    call("atlas", "evaluate", tmp_path / "out", "--views", 1, "--resolution", 32)
+    assert "gone.wlm" in fails("atlas", "info", tmp_path / "gone.wlm")
+
+
+def test_the_command_is_the_library(inputs, tiles):
+    profile = load_profile("standard").model_copy(update={"views": 2})
+    model, back = compress(load_mesh(*inputs), profile), codec.read(tiles / "atlas.wlm")
+    for name in ("texels", "lut", "uv", "blocks"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(model, name))

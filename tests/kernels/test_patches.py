@@ -1,0 +1,202 @@
+"""Patches: samples, dominant colours, orders, distances and bounds against float64 NumPy."""
+
+import numpy as np
+import pytest
+import warp as wp
+from reference import patches as reference
+
+from wlm_kernels import patch_graph as graphs
+from wlm_kernels import patches as kernels
+from wlm_kernels.patches import ORDERS, SIZES
+
+SIDE = (24, 40)
+
+
+def _image(seed: int = 0, contrast: float = 1.0) -> np.ndarray:
+    """Smooth colours with a step, float [H, W, 3] in [0, 1]."""
+    y, x = np.mgrid[: SIDE[0], : SIDE[1]] / SIDE[1]
+    image = np.stack([0.5 + 0.4 * np.sin(7 * x + seed), x * y * 2, np.where(x > 0.4, 0.8, 0.1)], -1)
+    return np.clip(0.3 + contrast * (image - 0.3), 0.0, 1.0)
+
+
+def _texels(image: np.ndarray) -> np.ndarray:
+    return np.concatenate([np.rint(image * 65535), np.zeros((*SIDE, 1))], -1).astype(np.uint16)
+
+
+def _triangles(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Corners in texels, some outside the image, and levels; the first have no area."""
+    random = np.random.default_rng(seed)
+    centre = random.uniform(-2, 1, (count, 1, 2)) + random.random((count, 1, 2)) * [SIDE[1], SIDE[0]]
+    level = random.integers(0, 4, count).astype(np.int32)
+    corners = centre + random.normal(size=(count, 3, 2)) * (2.0**level)[:, None, None] * 0.6
+    corners[0] = corners[0, :1]
+    corners[1, 2] = corners[1, 1]
+    corners[2] = corners[2, :1] + [[0, 0], [1, 2], [2, 4]]
+    return np.rint(corners * 65536) / 65536, level
+
+
+def _sampled(image: np.ndarray, corners: np.ndarray, level: np.ndarray, device: str):
+    fixed = np.rint(corners * 65536).astype(np.int64)
+    samples, patches, bright = kernels.sample(_texels(image), fixed, level, device)
+    kernels.dominant(samples, patches, level)
+    return samples, patches, bright
+
+
+def _unpacked(samples: wp.array, level: np.ndarray) -> list[np.ndarray]:
+    packed = samples.numpy()
+    colours = np.stack([packed & 255, packed >> 8 & 255, packed >> 16], -1)
+    return np.split(colours, np.cumsum(kernels.samples_of(np.array(SIZES)[level]))[:-1])
+
+
+def test_samples(device: str):
+    """Within rounding of bilinear samples at the lattice's barycentrics; what is known of a patch is right too."""
+    image, (corners, level) = _image(), _triangles(60)
+    samples, patches, _ = _sampled(image, corners, level, device)
+    known = patches.numpy()
+    for t, got in enumerate(_unpacked(samples, level)):
+        want = reference.patch(image, corners[t], SIZES[level[t]]) * 255
+        # Half a level, and 1/512 of a texel on each axis at the steepest step of 0.7.
+        assert np.abs(got - want).max() <= 0.5 + 2 * 255 * 0.7 / 512 + 0.01
+        for name, values in (("low", got.min(0)), ("high", got.max(0)), ("colour", reference.dominant(got))):
+            assert known[name][t] == values[0] + 256 * values[1] + 65536 * values[2], name
+        assert known["level"][t] == (0 if (got == got[0]).all() else level[t])
+    assert 0 < (known["level"] == 0).sum() < len(level)
+
+
+def test_samples_are_exact_at_texels(device: str):
+    """At the centres of texels nothing is interpolated: 8 bits of the texel."""
+    image = _image()
+    corners = np.array([[[3, 4], [7, 4], [3, 8]]], float)
+    samples, _, _ = _sampled(image, corners, np.array([2], np.int32), device)
+    at = np.rint(reference.barycentrics(5) @ corners[0]).astype(int)
+    np.testing.assert_array_equal(_unpacked(samples, np.array([2]))[0], np.rint(image[at[:, 1], at[:, 0]] * 255))
+
+
+def test_orders_are_those_of_permuted_vertices(device: str):
+    """``patch_orders`` of a patch equals, exactly, the patches of the triangle with its vertices permuted."""
+    image, (corners, level) = _image(), _triangles(12)
+    plain = _unpacked(_sampled(image, corners, level, device)[0], level)
+    for o, p in enumerate(ORDERS):
+        permuted = np.empty_like(corners)
+        permuted[:, list(p)] = corners
+        for t, got in enumerate(_unpacked(_sampled(image, permuted, level, device)[0], level)):
+            np.testing.assert_array_equal(got, kernels.patch_orders(plain[t])[o])
+
+
+def test_patch_orders_wants_a_patch():
+    with pytest.raises(ValueError, match="samples"):
+        kernels.patch_orders(np.zeros((4, 3)))
+    assert kernels.patch_orders(np.ones((1, 3))).shape == (6, 1, 3)
+
+
+def test_distances(device: str):
+    """Of patches of all pairs of sizes, the least Dist, exact, and the first order that has it; the same both ways."""
+    image, (corners, level) = _image(), _triangles(24)
+    samples, patches, _ = _sampled(image, corners, level, device)
+    split = _unpacked(samples, level)
+    a, b = (x.ravel() for x in np.meshgrid(np.arange(24), np.arange(24)))
+    order, distance = kernels.compare(samples, patches, _ints(a, device), _ints(b, device))
+    sizes = set()
+    for k in range(len(a)):
+        # One colour everywhere is a patch of any size.
+        want = reference.distances(*(_smallest(split[t]) for t in (b[k], a[k])))
+        assert distance[k] == pytest.approx(want.min(), abs=1e-12)
+        assert order[k] == int((want < want.min() + 1e-12).argmax())
+        sizes.add((level[a[k]], level[b[k]]))
+    assert len(sizes) == 16
+    np.testing.assert_array_equal(distance.reshape(24, 24), distance.reshape(24, 24).T)
+    assert distance.max() > 0.1
+
+
+def _smallest(patch: np.ndarray) -> np.ndarray:
+    return patch[:3] if (patch == patch[0]).all() else patch
+
+
+def _ints(values: np.ndarray, device: str) -> wp.array:
+    return wp.array(np.asarray(values, np.int32), dtype=int, device=device)
+
+
+def _graph(samples, patches, threshold: float, colour_threshold: float, device: str):
+    """The graph, and the number that each of its nodes had."""
+    known = patches.numpy()
+    order = np.argsort(kernels.bin_numbers(known["colour"]), kind="stable")
+    nodes = wp.array(known[order], dtype=kernels.Patch, device=device)
+    fits = graphs.fit(samples, nodes, int(known["level"].max()) + 1)
+    return graphs.graph(samples, nodes, fits, graphs.rule(threshold, colour_threshold, device)), order
+
+
+@pytest.mark.parametrize("contrast", [0.02, 0.2, 1.0])
+@pytest.mark.parametrize("threshold", [0.003, 0.03, 0.1])
+def test_neighbours(device: str, threshold: float, contrast: float):
+    """Degrees, rows and what is left of degrees, of the naive matrix; bounds and samples both have a say."""
+    count = 70
+    image, (corners, level) = _image(contrast=contrast), _triangles(count, seed=3)
+    samples, patches, _ = _sampled(image, corners, level, device)
+    graph, number = _graph(samples, patches, threshold, 0.09, device)
+    split = [_smallest(patch) for patch in _unpacked(samples, level)]
+    want = reference.adjacency([split[t] for t in number], threshold, 0.09)
+
+    degree = wp.zeros(count, dtype=int, device=device)
+    compared = wp.zeros(count, dtype=wp.int64, device=device)
+    for begin in range(0, count, 32):
+        graphs.count_neighbours(graph, begin, min(begin + 32, count), degree, compared)
+    np.testing.assert_array_equal(degree.numpy(), want.sum(1))
+
+    left = np.arange(5, count)
+    marked = wp.empty(len(left), dtype=wp.uint8, device=device)
+    for chosen in (5, 40):
+        graphs.mark_neighbours(graph, _ints(left, device), chosen, marked)
+        np.testing.assert_array_equal(marked.numpy(), want[chosen, left] | (left == chosen))
+    graphs.lose_neighbours(graph, _ints(left, device), _ints(np.arange(5), device), degree)
+    np.testing.assert_array_equal(degree.numpy()[left], want[np.ix_(left, left)].sum(1))
+
+
+def test_bounds_settle_most_pairs(device: str):
+    """On smooth colours samples are asked of few pairs."""
+    count = 200
+    y, x = np.mgrid[: SIDE[0], : SIDE[1]] / SIDE[1]
+    image = np.repeat((0.3 + 0.3 * x + 0.2 * y)[..., None], 3, -1)
+    samples, patches, _ = _sampled(image, *_triangles(count), device)
+    graph, _ = _graph(samples, patches, 0.03, 2.0, device)
+    degree = wp.zeros(count, dtype=int, device=device)
+    compared = wp.zeros(count, dtype=wp.int64, device=device)
+    graphs.count_neighbours(graph, 0, count, degree, compared)
+    edges, pairs = degree.numpy().sum() // 2, count * (count - 1) // 2
+    assert 0.1 * pairs < edges < 0.9 * pairs
+    assert compared.numpy().sum() < 0.2 * pairs
+
+
+@pytest.mark.parametrize(("step", "alike"), [(50, True), (51, False)])
+@pytest.mark.parametrize("size", [2, 9])
+def test_the_threshold_itself_is_not_alike(device: str, step: int, alike: bool, size: int):
+    """At lambda = 0.2 = 51 / 255, which no float holds, patches 51 levels apart are dissimilar, 50 are alike."""
+    level = np.full(2, SIZES.index(size), np.int32)
+    image = np.broadcast_to(np.linspace(0, 0.3, SIDE[1])[None, :, None], (*SIDE, 3))
+    samples, patches, _ = _sampled(image, np.array([[[2, 2], [18, 2], [2, 18]]] * 2, float), level, device)
+    grey = samples.numpy()
+    half = len(grey) // 2
+    grey[half:] = grey[:half] + step * 0x010101
+    known = patches.numpy()
+    for name in ("low", "high"):
+        known[name][1] = known[name][0] + step * 0x010101
+    samples = wp.array(grey, dtype=int, device=device)
+    graph, _ = _graph(samples, wp.array(known, dtype=kernels.Patch, device=device), 0.2, 2.0, device)
+    degree = wp.zeros(2, dtype=int, device=device)
+    graphs.count_neighbours(graph, 0, 2, degree, wp.zeros(2, dtype=wp.int64, device=device))
+    assert degree.numpy().tolist() == [int(alike)] * 2
+
+
+def test_dominant_colours_in_lots(device: str, monkeypatch: pytest.MonkeyPatch):
+    """The same however few patches are sorted at once, also where one alone is more than a lot."""
+    image, (corners, level) = _image(), _triangles(40)
+    _, whole, _ = _sampled(image, corners, level, device)
+    monkeypatch.setattr(kernels, "_LOT", 20)
+    _, lots, _ = _sampled(image, corners, level, device)
+    np.testing.assert_array_equal(whole.numpy()["colour"], lots.numpy()["colour"])
+
+
+def test_too_many_samples():
+    """Refused before anything is allocated."""
+    level = np.full(300000, 7, np.int32)
+    with pytest.raises(ValueError, match="samples"):
+        kernels.sample(np.zeros((1, 1, 4), np.uint16), np.zeros((300000, 3, 2), np.int64), level, "cpu")

@@ -1,0 +1,55 @@
+"""Charts of a mesh: triangles that hang together in UV space."""
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+__all__ = ["charts", "welded"]
+
+
+def welded(position: np.ndarray, uv: np.ndarray, triangle: np.ndarray) -> np.ndarray:
+    """Numbers the corners so that those at one place, with one UV, have one number.
+
+    A file splits vertices where any attribute does, a normal for example; a lightmap has no seam there.
+
+    Args:
+        position: [V, 3].
+        uv: [V, 2].
+        triangle: int [F, 3], vertices.
+
+    Returns:
+        int32 [F, 3], numbers from 0.
+    """
+    # Adding 0 makes -0 into 0, which has other bits.
+    values = np.ascontiguousarray(np.concatenate([position, uv], 1, dtype=np.float64) + 0.0)
+    row = values.view([("", np.float64)] * values.shape[1])[:, 0]
+    return np.unique(row, return_inverse=True)[1].astype(np.int32)[triangle]
+
+
+def charts(corner: np.ndarray, active: np.ndarray | None = None) -> np.ndarray:
+    """Finds the charts: triangles that share an edge are in one chart, those that share a corner alone are not.
+
+    Args:
+        corner: int [F, 3], the corners' numbers, ``welded``.
+        active: bool [F], triangles that take part, None: all.
+
+    Returns:
+        int32 [F], the number of each triangle's chart, in the order of their first triangles; -1 where it isn't
+        active.
+    """
+    corner = np.asarray(corner)
+    count = len(corner)
+    out = np.full(count, -1, np.int32)
+    own = np.arange(count) if active is None else np.flatnonzero(active)
+    if not len(own):
+        return out
+    edge = np.sort(np.stack([corner[own], np.roll(corner[own], -1, 1)], -1).reshape(-1, 2), 1)
+    # A graph of triangles and edges: each triangle is joined to its three edges.
+    name = np.unique(edge, axis=0, return_inverse=True)[1].reshape(-1)
+    place = np.repeat(np.arange(len(own)), 3), len(own) + name
+    nodes = len(own) + int(name.max()) + 1
+    graph = coo_array((np.ones(len(name), bool), place), (nodes, nodes))
+    label = connected_components(graph, directed=False)[1][: len(own)]
+    _, first, number = np.unique(label, return_index=True, return_inverse=True)
+    out[own] = np.argsort(np.argsort(first))[number]
+    return out

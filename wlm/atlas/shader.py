@@ -1,0 +1,135 @@
+"""The GLSL that reads an exported atlas (lightmap-uv-clustering-cascade, eq. 7); ``wlm.atlas.export`` writes it."""
+
+from wlm.atlas.model import SIDE_BITS, AtlasModel
+
+__all__ = ["atlas_glsl"]
+
+_HEAD = """\
+// Light from a compressed lightmap: {what}
+// (Lightmap Compression with Color-Coherent UV Clustering and Cascade Texture Optimization, eq. 7).
+// For GLSL 3.30 and later, with or without Vulkan; include it below #version. Call wlm_atlas with
+// {coordinate}: u to the right, v down, (0, 0) at the first row's first texel.
+//
+{textures}
+// They have one mip level. Where WLM_ATLAS_EXACT is defined four texels are fetched and mixed in floats; else the
+// sampler does that, in one fetch, with the 8 or so bits that a GPU gives to a place between two texels.
+
+#ifndef WLM_ATLAS_COLOUR
+{colour_sampler}
+#define WLM_ATLAS_COLOUR wlm_atlas_colour
+#endif
+"""
+
+_SAMPLER = """\
+#ifndef WLM_ATLAS_{upper}_BINDING
+uniform {kind} wlm_atlas_{lower};
+#else
+layout(binding = WLM_ATLAS_{upper}_BINDING) uniform {kind} wlm_atlas_{lower};
+#endif"""
+
+_LUT = """\
+#ifndef WLM_ATLAS_LUT
+{lut_sampler}
+#define WLM_ATLAS_LUT wlm_atlas_lut
+#endif
+"""
+
+_TEXTURES = {
+    "plain": "// colour: the small texture, sampler2D, filter linear, clamped to its edge.",
+    "tiles": "// lut: the table of tiles, usampler2D, two unsigned integers an entry, filter nearest.",
+    "cascade": "// lut: the table of coordinates, sampler2D, filter linear, clamped to its edge.",
+}
+"""What a method has; all have that of "plain"."""
+
+# Coordinates are in texels, so that the tile's own arithmetic stays exact.
+_READ = """
+// The texture at a place in texels; texel i has its centre at i + 1/2.
+{type} wlm_atlas_{name}_at(vec2 place)
+{{
+    ivec2 last = textureSize({image}, 0) - ivec2(1, 1);
+#ifdef WLM_ATLAS_EXACT
+    vec2 inside = clamp(place - vec2(0.5, 0.5), vec2(0.0, 0.0), vec2(last));
+    ivec2 low = ivec2(floor(inside));
+    ivec2 high = min(low + ivec2(1, 1), last);
+    vec2 share = inside - vec2(low);
+    vec4 top = mix(texelFetch({image}, low, 0), texelFetch({image}, ivec2(high.x, low.y), 0), share.x);
+    vec4 bottom = mix(texelFetch({image}, ivec2(low.x, high.y), 0), texelFetch({image}, high, 0), share.x);
+    return mix(top, bottom, share.y).{channels};
+#else
+    return textureLod({image}, place / vec2(last + ivec2(1, 1)), 0.0).{channels};
+#endif
+}}
+"""
+
+_TILES = """
+const vec2 WLM_ATLAS_SIZE = vec2({width}.0, {height}.0); // of the lightmap, in texels
+const float WLM_ATLAS_TILE = {tile}.0; // texels of the lightmap along a tile
+
+vec3 wlm_atlas(vec2 uv)
+{{
+    // Tiles begin and end on centres of the lightmap's texels.
+    vec2 x = clamp(uv * WLM_ATLAS_SIZE - vec2(0.5, 0.5), vec2(0.0, 0.0), WLM_ATLAS_SIZE - vec2(1.0, 1.0));
+    x = x / WLM_ATLAS_TILE;
+    ivec2 tile = min(ivec2(floor(x)), textureSize(WLM_ATLAS_LUT, 0) - ivec2(1, 1));
+    uvec2 entry = texelFetch(WLM_ATLAS_LUT, tile, 0).xy;
+    // An entry is the first texel of the tile's rectangle, and in the low bits its texels less one.
+    vec2 first = vec2(entry >> {bits}u);
+    vec2 steps = vec2(entry & uvec2({mask}u, {mask}u));
+    return wlm_atlas_colour_at(first + (x - vec2(tile)) * steps + vec2(0.5, 0.5));
+}}
+"""
+
+_CASCADE = """
+vec3 wlm_atlas(vec2 uv)
+{
+    // The triangle wave of eq. 8 is the identity on what 16 bits without a sign hold.
+    vec2 place = wlm_atlas_lut_at(uv * vec2(textureSize(WLM_ATLAS_LUT, 0)));
+    return wlm_atlas_colour_at(place * vec2(textureSize(WLM_ATLAS_COLOUR, 0)));
+}
+"""
+
+_PLAIN = """
+vec3 wlm_atlas(vec2 uv)
+{
+    return wlm_atlas_colour_at(uv * vec2(textureSize(WLM_ATLAS_COLOUR, 0)));
+}
+"""
+
+_WHAT = {
+    "tiles": "each of its tiles is a rectangle of a small texture, found by a table",
+    "cascade": "a table of coordinates leads into a small texture",
+    "plain": "a smaller lightmap",
+}
+
+
+def atlas_glsl(model: AtlasModel) -> str:
+    """The shader text for a model: functions alone, to be included below ``#version``.
+
+    Args:
+        model: Its method chooses the text; of tiles the lightmap's size and the tile's are constants in it.
+
+    Returns:
+        GLSL 3.30, which Vulkan's dialect takes too where the bindings are defined.
+    """
+    tiles, cascade = model.method == "tiles", model.method == "cascade"
+    text = _HEAD.format(
+        what=_WHAT[model.method],
+        coordinate="the new UVs of mesh.glb" if len(model.uv) else "the mesh's own lightmap UVs",
+        textures="\n".join(dict.fromkeys((_TEXTURES["plain"], _TEXTURES[model.method]))),
+        colour_sampler=_SAMPLER.format(upper="COLOUR", lower="colour", kind="sampler2D"),
+    )
+    if tiles or cascade:
+        kind = "usampler2D" if tiles else "sampler2D"
+        text += _LUT.format(lut_sampler=_SAMPLER.format(upper="LUT", lower="lut", kind=kind))
+    text += _READ.format(type="vec3", name="colour", image="WLM_ATLAS_COLOUR", channels="rgb")
+    if tiles:
+        return text + _TILES.format(
+            width=model.width,
+            height=model.height,
+            tile=model.profile.tile,
+            bits=SIDE_BITS,
+            mask=(1 << SIDE_BITS) - 1,
+        )
+    if cascade:
+        return text + _READ.format(type="vec2", name="lut", image="WLM_ATLAS_LUT", channels="xy") + _CASCADE
+    return text + _PLAIN

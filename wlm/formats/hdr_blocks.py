@@ -1,0 +1,116 @@
+"""BC6H and ASTC HDR blocks of 16 bytes, by the packages of an extra: half-float RGB in and out.
+
+Blocks follow each other row by row. All runs on the CPU with one thread. The packages are imported when they are used.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib
+from types import ModuleType
+
+import numpy as np
+
+from wlm.errors import WlmError
+
+__all__ = [
+    "ASTC_BLOCKS",
+    "ASTC_MEDIUM",
+    "BC6H_PROFILES",
+    "Astc",
+    "astc",
+    "decode_bc6h",
+    "encode_bc6h",
+    "need",
+]
+
+BC6H_PROFILES = ("veryfast", "fast", "basic", "slow", "veryslow")
+ASTC_BLOCKS = (
+    (4, 4), (5, 4), (5, 5), (6, 5), (6, 6), (8, 5), (8, 6), (8, 8), (10, 5), (10, 6), (10, 8), (10, 10), (12, 10),
+    (12, 12),
+)  # fmt: skip
+"""Width and height of every block that the format has in two dimensions."""
+# astcenc's "medium" preset.
+ASTC_MEDIUM = 60.0
+
+
+def need(package: str, extra: str) -> ModuleType:
+    """Imports a package of an extra.
+
+    Raises:
+        WlmError: It is missing; the line names the extra.
+    """
+    try:
+        return importlib.import_module(package)
+    except ImportError as error:
+        raise WlmError(f"{extra}: {package} is missing; needs the extra: pip install 'wlm[{extra}]'") from error
+
+
+def encode_bc6h(texels: np.ndarray, profile: str, extra: str) -> bytes:
+    """Encodes unsigned BC6H, with Intel's ISPC texture compressor.
+
+    Args:
+        texels: half [H, W, 3], finite, not negative; H and W multiples of 4.
+        profile: One of ``BC6H_PROFILES``, from the fastest to the best.
+        extra: The extra that a message names.
+
+    Raises:
+        WlmError: The package is missing.
+    """
+    texcomp = need("ispc_texcomp", extra)
+    rgba = _with_alpha(texels)
+    height, width = texels.shape[:2]
+    surface = texcomp.RGBASurface(rgba.tobytes(), width, height, rgba.strides[0])
+    return texcomp.compress_blocks_bc6h(surface, texcomp.BC6HEncSettings.from_profile(profile))
+
+
+def decode_bc6h(blocks: bytes, height: int, width: int, extra: str) -> np.ndarray:
+    """Decodes unsigned BC6H to half [H, W, 3], multiples of 4; reserved modes are black.
+
+    Raises:
+        WlmError: The package is missing.
+    """
+    return need("imagecodecs", extra).bcn_decode(blocks, 6, shape=(height, width, 3))
+
+
+class Astc:
+    """ASTC HDR in blocks of one size, by astcenc; made by ``astc``."""
+
+    def __init__(self, codec: ModuleType, block: tuple[int, int], quality: float) -> None:
+        config = codec.ASTCConfig(codec.ASTCProfile.HDR_RGB_LDR_A, *block, 1, quality)
+        self._codec, self._context = codec, codec.ASTCContext(config, 1)
+
+    def encode(self, texels: np.ndarray) -> bytes:
+        """Encodes half [H, W, 3], finite, not negative; astcenc repeats the border where no block ends."""
+        codec, (height, width) = self._codec, texels.shape[:2]
+        source = codec.ASTCImage(codec.ASTCType.F16, width, height, 1, _with_alpha(texels).tobytes())
+        return self._context.compress(source, codec.ASTCSwizzle.from_str("RGB1"))
+
+    def decode(self, blocks: bytes, height: int, width: int) -> np.ndarray:
+        """Decodes to half [H, W, 3]; blocks that break the format are NaN."""
+        codec = self._codec
+        target = codec.ASTCImage(codec.ASTCType.F16, width, height, 1)
+        self._context.decompress(blocks, target, codec.ASTCSwizzle.from_str("RGBA"))
+        return np.frombuffer(target.data, np.float16).reshape(height, width, 4)[..., :3]
+
+
+def astc(block: tuple[int, int], quality: float, extra: str) -> Astc:
+    """Gives the codec of a setting, the same one every time.
+
+    Args:
+        block: One of ``ASTC_BLOCKS``.
+        quality: astcenc's effort, 0 (fastest) to 100 (exhaustive); decoding is the same for all.
+        extra: The extra that a message names.
+
+    Raises:
+        WlmError: The package is missing.
+    """
+    return _astc(need("astc_encoder", extra), block, float(quality))
+
+
+# Building a context's tables takes 15 ms.
+_astc = functools.lru_cache(maxsize=len(ASTC_BLOCKS))(Astc)
+
+
+def _with_alpha(texels: np.ndarray) -> np.ndarray:
+    return np.concatenate([texels, np.ones((*texels.shape[:2], 1), np.float16)], axis=2, dtype=np.float16)

@@ -1,0 +1,188 @@
+"""Smoke in a scene's light: six-way lightmaps weighed for any lights, glow, and the shadows of obstacles.
+
+All in linear light. A lightmap is what one light of irradiance 4 pi gives, so that a light of irradiance E counts for
+E / (4 pi) of it (eq. 5, with the weights of `axes.weights`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from wlm.render import rasterize
+from wlm.smoke.axes import Camera, weights
+from wlm.smoke.reference import SixWay
+
+__all__ = ["Light", "Ramp", "composite", "obstacle_visibility", "shade"]
+
+
+@dataclass(frozen=True, eq=False)
+class Light:
+    """A directional light.
+
+    Attributes:
+        toward: The direction to the light in the world, of any length but 0.
+        irradiance: R, G, B on a surface that faces it; not negative.
+        visibility: float tensor [H, W], the share of the light that reaches the smoke at a pixel, or None: all of it.
+    """
+
+    toward: tuple[float, float, float]
+    irradiance: tuple[float, float, float] = (4 * math.pi,) * 3
+    visibility: torch.Tensor | None = None
+
+
+@dataclass(frozen=True)
+class Ramp:
+    """The colour of a glow: linear between its stops, the end stops' colour beyond them.
+
+    Attributes:
+        stops: Emission, rising.
+        colours: R, G, B of each stop, not negative.
+    """
+
+    stops: tuple[float, ...]
+    colours: tuple[tuple[float, float, float], ...]
+
+    def __post_init__(self) -> None:
+        if len(self.stops) < 2 or np.shape(self.colours) != (len(self.stops), 3):
+            raise ValueError("ramp: expected at least two stops and as many colours of R, G, B")
+        if not (np.isfinite(self.stops).all() and np.isfinite(self.colours).all() and (np.diff(self.stops) > 0).all()):
+            raise ValueError(f"ramp: expected finite colours and rising stops, got {self.stops}")
+
+    def __call__(self, emission: torch.Tensor) -> torch.Tensor:
+        """Colours [..., 3] of emissions of any shape."""
+        stops = torch.tensor(self.stops, dtype=emission.dtype, device=emission.device)
+        colours = torch.tensor(self.colours, dtype=emission.dtype, device=emission.device)
+        after = torch.searchsorted(stops, emission.contiguous()).clamp(1, len(self.stops) - 1)
+        share = ((emission - stops[after - 1]) / (stops[after] - stops[after - 1])).clamp(0, 1)[..., None]
+        return (1 - share) * colours[after - 1] + share * colours[after]
+
+
+def shade(
+    six: SixWay, camera: Camera, lights: Sequence[Light], *, rule: str = "squared", ramp: Ramp | None = None
+) -> torch.Tensor:
+    """The light that comes from the smoke.
+
+    Args:
+        six: Lightmaps as seen by the camera.
+        camera: From where the billboard is seen; its axes turn the lights' directions.
+        lights: Any number.
+        rule: How a direction weighs the lightmaps, one of `axes.RULES`.
+        ramp: Colour of the emission; None: grey, as it is.
+
+    Returns:
+        float32 [H, W, 3], to be added to what is behind the smoke times its transparency.
+
+    Raises:
+        ValueError: A light has no direction, a negative irradiance or a visibility of another shape.
+    """
+    height, width = six.lightmaps.shape[1:]
+    light = torch.zeros((height, width, 3), dtype=torch.float32, device=six.lightmaps.device)
+    for given in lights:
+        irradiance = np.asarray(given.irradiance, np.float64)
+        if irradiance.shape != (3,) or not ((irradiance >= 0) & np.isfinite(irradiance)).all():
+            raise ValueError(f"irradiance: expected three numbers of at least 0, got {given.irradiance}")
+        share = weights(camera.axes @ np.asarray(given.toward, np.float64), rule)
+        grey = torch.einsum("c,chw->hw", torch.tensor(share).to(six.lightmaps), six.lightmaps)
+        if given.visibility is not None:
+            if given.visibility.shape != grey.shape:
+                raise ValueError(f"visibility: expected {tuple(grey.shape)}, got {tuple(given.visibility.shape)}")
+            grey = grey * given.visibility
+        light += grey[..., None] * torch.tensor(irradiance / (4 * math.pi)).to(light)
+    if six.emission is not None:
+        light += six.emission[..., None] if ramp is None else ramp(six.emission)
+    return light
+
+
+def composite(
+    light: torch.Tensor, transparency: torch.Tensor, background: torch.Tensor | Sequence[float]
+) -> torch.Tensor:
+    """Puts smoke in front of a picture (eq. 4).
+
+    Args:
+        light: float32 [H, W, 3], as `shade` gives it.
+        transparency: float32 [H, W].
+        background: [H, W, 3], or one colour.
+
+    Returns:
+        float32 [H, W, 3].
+    """
+    behind = torch.as_tensor(background, dtype=light.dtype, device=light.device)
+    return light + transparency[..., None] * behind
+
+
+def obstacle_visibility(
+    depth: torch.Tensor,
+    camera: Camera,
+    toward: Sequence[float] | np.ndarray,
+    vertices: torch.Tensor,
+    triangles: torch.Tensor,
+    *,
+    resolution: int = 512,
+    bias: float | None = None,
+) -> torch.Tensor:
+    """What of a light the obstacles leave to the smoke's surface, by a shadow map (section 4.5).
+
+    The map is drawn from the light over the obstacles. Each pixel's smoke is looked up at its surface's depth alone, so
+    that a shadow through the depth of the smoke falls on its surface whole or not at all.
+
+    Args:
+        depth: float32 [H, W], distance along the ray to the smoke's surface, as the guiding map has it; 0: none.
+        camera: That of the depths.
+        toward: [3], the direction to the light in the world, of any length but 0.
+        vertices: float32 [V, 3], the obstacles' corners in the world.
+        triangles: int32 or int64 [F, 3], rows of the vertices.
+        resolution: Texels along an edge of the shadow map.
+        bias: How much nearer to the light, in the world's unit, an obstacle must be to keep it off; None: 1.5 texels.
+
+    Returns:
+        float32 [H, W] in [0, 1], mixed between the four texels around a point; 1 where there is no smoke.
+
+    Raises:
+        ValueError: A shape doesn't fit, or the direction has no length.
+    """
+    size = (camera.height, camera.width)
+    if depth.shape != size:
+        raise ValueError(f"depth: expected {size}, got {tuple(depth.shape)}")
+    direction = np.asarray(toward, np.float64)
+    length = np.linalg.norm(direction)
+    if direction.shape != (3,) or not 1e-12 < length < np.inf:
+        raise ValueError(f"toward: expected a direction of some length, got {direction.tolist()}")
+    lit = torch.ones(size, dtype=torch.float32, device=depth.device)
+    if not len(triangles):
+        return lit
+    # Any turn about the light's direction will do.
+    sight = Camera.look_at(direction / length, np.zeros(3), extent=1.0, height=1, width=1)
+    axes = torch.tensor(sight.axes, dtype=torch.float64, device=depth.device)
+    corners = vertices.double() @ axes.T
+    low, high = corners[triangles.reshape(-1).unique()].aminmax(dim=0)
+    middle = 0.5 * (low + high)
+    # Square, and two texels wider than the obstacles on each side, so that the border is empty.
+    half = float((high - low)[:2].max()) * 0.5 * resolution / max(resolution - 4, 1)
+    half = max(half, 1e-9)
+    texel = 2.0 * half / resolution
+    behind = max(float((high - low)[2]), 1e-9)
+    flat = (corners - middle) / half
+    # z grows away from the light.
+    clip = torch.stack([flat[:, 0], flat[:, 1], (middle[2] - corners[:, 2]) / behind, torch.ones_like(flat[:, 0])], 1)
+    drawn = rasterize(clip.float(), triangles, resolution, resolution)
+    nearest = torch.where(drawn.triangle >= 0, middle[2] - drawn.depth.double() * behind, -math.inf)
+
+    origin, way = (torch.tensor(np.ascontiguousarray(a), device=depth.device) for a in camera.rays())
+    at = (origin + depth.double()[..., None] * way) @ axes.T
+    column = ((at[..., 0] - middle[0]) / half + 1.0) * 0.5 * resolution - 0.5
+    row = (1.0 - (at[..., 1] - middle[1]) / half) * 0.5 * resolution - 0.5
+    offset = 1.5 * texel if bias is None else bias
+    hidden = torch.zeros_like(depth, dtype=torch.float64)
+    for down in (0, 1):
+        for across in (0, 1):
+            r, c = row.floor() + down, column.floor() + across
+            weight = (1.0 - (row - r).abs()) * (1.0 - (column - c).abs())
+            # The border's texels are empty: what lies outside is lit.
+            found = nearest[r.clamp(0, resolution - 1).long(), c.clamp(0, resolution - 1).long()]
+            hidden += torch.where(found > at[..., 2] + offset, weight, 0.0)
+    return torch.where(depth > 0, (1.0 - hidden).clamp(0, 1).float(), lit)

@@ -1,0 +1,297 @@
+"""What comes in: smoke as a grid of densities, from arrays, `.npz` or NanoVDB (`.nvdb`) files, checked.
+
+The stated behaviours. What is repaired is given in `DensityVolume.warnings`, one line a kind.
+
+====================================  ================================================================
+input                                 behaviour
+====================================  ================================================================
+NaN or infinite voxels                0; warning with the count and the first
+negative voxels                       0; warning likewise (solvers and filters leave small ones)
+all voxels zero                       fine: nothing is seen, all is transparent
+one voxel                             fine
+no voxel                              error
+float16                               stays half; float32, float64 and integers become float32
+float64 beyond float32                as infinite: 0, warning
+other types, other than 3 dimensions  error
+temperature of another shape          error
+transform of a `.nvdb` that turns,    error
+shears or stretches
+a `.nvdb` of points, vectors, ints    error
+a file missing or damaged             error that names the file, and the field
+====================================  ================================================================
+
+A grid's density has no unit of its own: extinction per length is `extinction` times it.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+import zipfile
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+import warp as wp
+
+from wlm.errors import WlmError
+from wlm.interop import check_device, to_warp
+
+__all__ = ["DensityVolume", "from_array", "load_volume"]
+
+_DENSITY, _TEMPERATURE = "density", "temperature"
+_BAD_FILE = (OSError, ValueError, EOFError, KeyError, MemoryError, NotImplementedError, zipfile.BadZipFile, zlib.error)
+_LARGEST = 2**31 - 1  # voxels that a kernel counts
+
+
+@dataclass(frozen=True, eq=False)
+class DensityVolume:
+    """Smoke in a box of cubic voxels.
+
+    Made directly, it isn't checked: a solver's own frames may be used as they lie on the device.
+
+    Attributes:
+        density: float32 or float16 tensor [X, Y, Z], finite, not negative.
+        extinction: Per length of the world, of density 1; above 0.
+        voxel: A voxel's edge in the world's unit.
+        origin: float64 [3], the corner of voxel (0, 0, 0) in the world; its centre is half a voxel further.
+        temperature: As the density; where it is 1, `emission` per length of the world is given off. None: cold.
+        emission: Light given off per length of the world at temperature 1.
+        warnings: What was repaired, one line each.
+    """
+
+    density: torch.Tensor
+    extinction: float = 1.0
+    voxel: float = 1.0
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    temperature: torch.Tensor | None = None
+    emission: float = 1.0
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """X, Y, Z in voxels."""
+        return tuple(self.density.shape)
+
+    @property
+    def device(self) -> torch.device:
+        """Where the voxels are."""
+        return self.density.device
+
+    @property
+    def centre(self) -> np.ndarray:
+        """The box's centre in the world, float64 [3]."""
+        return np.asarray(self.origin) + 0.5 * self.voxel * np.asarray(self.shape)
+
+    def arrays(self) -> tuple[wp.array, wp.array | None]:
+        """Density and temperature as Warp arrays that share the tensors' memory."""
+        wp.init()  # wrapping a tensor, unlike all else in Warp, doesn't start it
+        hot = None if self.temperature is None else to_warp(self.temperature)
+        return to_warp(self.density), hot
+
+
+def from_array(
+    density: np.ndarray | torch.Tensor,
+    *,
+    extinction: float = 1.0,
+    voxel: float = 1.0,
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    temperature: np.ndarray | torch.Tensor | None = None,
+    emission: float = 1.0,
+    device: str = "cpu",
+    name: str = "array",
+) -> DensityVolume:
+    """Makes a checked volume of arrays.
+
+    Args:
+        density: [X, Y, Z] of numbers; copied where it has to be changed or moved.
+        extinction: Per length of the world, of density 1.
+        voxel: A voxel's edge in the world's unit.
+        origin: The corner of voxel (0, 0, 0) in the world.
+        temperature: [X, Y, Z], or None.
+        emission: Light given off per length of the world at temperature 1.
+        device: "cpu" or "cuda:N".
+        name: What messages call it.
+
+    Returns:
+        The volume, repaired as the module's table says.
+
+    Raises:
+        WlmError: An error of the module's table, or a length or factor that isn't above 0.
+    """
+    device = check_device(device)
+    if not (0 < voxel < np.inf):
+        raise WlmError(f"{name}: voxel: expected a length above 0, found {voxel}")
+    if not (0 < extinction < np.inf):
+        raise WlmError(f"{name}: extinction: expected a number above 0, found {extinction}")
+    if not (0 <= emission < np.inf):
+        raise WlmError(f"{name}: emission: expected a number of at least 0, found {emission}")
+    if np.shape(origin) != (3,) or not np.isfinite(origin).all():
+        raise WlmError(f"{name}: origin: expected three finite numbers, found {origin}")
+    warnings: list[str] = []
+    made = _check(name, _DENSITY, density, device, warnings)
+    hot = None
+    if temperature is not None:
+        # The kernels take both of one type.
+        hot = _check(name, _TEMPERATURE, temperature, device, warnings).to(made.dtype)
+        if hot.shape != made.shape:
+            raise WlmError(f"{name}: {_TEMPERATURE}: expected {tuple(made.shape)} voxels, found {tuple(hot.shape)}")
+    at = tuple(float(o) for o in origin)
+    return DensityVolume(made, float(extinction), float(voxel), at, hot, float(emission), tuple(warnings))
+
+
+def load_volume(
+    path: str | os.PathLike[str],
+    *,
+    extinction: float = 1.0,
+    emission: float = 1.0,
+    voxel: float | None = None,
+    device: str = "cpu",
+) -> DensityVolume:
+    """Reads smoke from a file.
+
+    - `.npz`: an array `density` (X, Y, Z), and, where there are any, `temperature` of the same shape and the numbers
+      `voxel` and `origin` (3).
+    - `.nvdb`: a float grid named `density`, else the first one, over the box of its active voxels; and a grid named
+      `temperature`, over that same box. Its transform gives the voxel's size and place.
+
+    Args:
+        path: The file; its suffix tells the kind.
+        extinction: Per length of the world, of density 1.
+        emission: Light given off per length of the world at temperature 1.
+        voxel: A voxel's edge in the world's unit; None: the file's, or 1.
+        device: "cpu" or "cuda:N".
+
+    Returns:
+        The volume, repaired as the module's table says.
+
+    Raises:
+        WlmError: One line that names the file and the field, for each error of the module's table.
+    """
+    path = Path(path)
+    reader = {".npz": _read_npz, ".nvdb": _read_nvdb}.get(path.suffix.lower())
+    if reader is None:
+        raise WlmError(f"{path}: expected a name that ends in .npz or .nvdb, found {path.suffix or 'none'}")
+    if not path.is_file():
+        raise WlmError(f"{path}: no such file")
+    found = reader(path)
+    if voxel is not None:
+        scale = voxel / found["voxel"]
+        found |= {"voxel": voxel, "origin": tuple(scale * o for o in found["origin"])}
+    return from_array(**found, extinction=extinction, emission=emission, device=device, name=str(path))
+
+
+def _check(name: str, field: str, values: np.ndarray | torch.Tensor, device: str, warnings: list[str]) -> torch.Tensor:
+    if not isinstance(values, torch.Tensor):
+        values = np.asarray(values)
+        if values.dtype.kind not in "iuf" or values.dtype == np.longdouble:
+            raise WlmError(f"{name}: {field}: expected numbers, found {values.dtype}")
+        kept = np.float16 if values.dtype == np.float16 else np.float32
+        with np.errstate(over="ignore"):  # what is too large becomes infinite, and is found below
+            values = torch.from_numpy(np.array(values, kept, order="C"))
+    elif values.dtype.is_complex or values.dtype == torch.bool:
+        raise WlmError(f"{name}: {field}: expected numbers, found {values.dtype}")
+    if values.ndim != 3 or 0 in values.shape or values.numel() > _LARGEST:
+        raise WlmError(f"{name}: {field}: expected [X, Y, Z] voxels, found {tuple(values.shape)}")
+    values = values.detach().to(device, values.dtype if values.dtype == torch.float16 else torch.float32).contiguous()
+    for bad, kind in ((~torch.isfinite(values), "NaN or infinite"), (values < 0, "negative")):
+        count = int(bad.sum())
+        if count:
+            first = np.unravel_index(int(bad.flatten().to(torch.uint8).argmax()), values.shape)
+            at = tuple(int(i) for i in first)
+            warnings.append(f"{name}: {field}: {count} {kind} voxels count as 0, the first is {at}")
+            values = torch.where(bad, torch.zeros_like(values), values)
+    return values
+
+
+def _read_npz(path: Path) -> dict:
+    try:
+        loaded = np.load(path, allow_pickle=False)
+        if not isinstance(loaded, np.lib.npyio.NpzFile):
+            raise WlmError(f"{path}: expected a .npz file of several arrays, found a single array")
+        with loaded as file:
+            if _DENSITY not in file.files:
+                raise WlmError(f"{path}: {_DENSITY} is missing; found {', '.join(file.files) or 'nothing'}")
+            found = {_DENSITY: file[_DENSITY], "voxel": 1.0, "origin": (0.0, 0.0, 0.0)}
+            if _TEMPERATURE in file.files:
+                found[_TEMPERATURE] = file[_TEMPERATURE]
+            for field, size in (("voxel", 1), ("origin", 3)):
+                if field in file.files:
+                    value = file[field]
+                    if value.dtype.kind not in "iuf" or value.size != size or not np.isfinite(value).all():
+                        raise WlmError(f"{path}: {field}: expected {size} finite numbers, found {value.tolist()}")
+                    found[field] = float(value.item()) if size == 1 else tuple(map(float, value.ravel()))
+            return found
+    except _BAD_FILE as error:
+        raise WlmError(f"{path}: cannot read the arrays: {error or type(error).__name__}") from error
+
+
+@wp.kernel(enable_backward=False)
+def _dense(
+    # in:
+    grid: wp.uint64,
+    low: wp.vec3i,
+    # out:
+    out: wp.array3d[float],
+):
+    i, j, k = wp.tid()
+    out[i, j, k] = wp.volume_lookup_f(grid, low[0] + i, low[1] + j, low[2] + k)
+
+
+def _read_nvdb(path: Path) -> dict:
+    """Reads grids into dense arrays: a march reads eight voxels a sample, each a walk down the tree otherwise."""
+    try:
+        volume = wp.Volume.load_from_nvdb(path.read_bytes(), device="cpu")
+        grids = []
+        while volume is not None:
+            grids.append(volume)
+            volume = volume.load_next_grid()
+    except (RuntimeError, struct.error, *_BAD_FILE) as error:
+        raise WlmError(f"{path}: cannot read the NanoVDB file: {error or type(error).__name__}") from error
+    names = [grid.get_grid_info().name for grid in grids]
+    density = grids[names.index(_DENSITY)] if _DENSITY in names else grids[0]
+    info = density.get_grid_info()
+    matrix = np.array(info.transform_matrix, np.float64).reshape(3, 3)
+    voxel = abs(matrix[0, 0])
+    if not (voxel > 0 and np.allclose(matrix, voxel * np.eye(3), atol=1e-5 * voxel)):
+        raise WlmError(f"{path}: {info.name}: expected a grid of cubic voxels along the axes, found {matrix.tolist()}")
+    low, high = _box(path, density)
+    found = {
+        _DENSITY: _fill(path, density, low, high),
+        "voxel": float(voxel),
+        # NanoVDB's coordinates are those of voxel centres.
+        "origin": tuple(float(t + voxel * (i - 0.5)) for t, i in zip(info.translation, low, strict=True)),
+    }
+    if _TEMPERATURE in names:
+        hot = grids[names.index(_TEMPERATURE)]
+        other = hot.get_grid_info()
+        same = np.allclose(np.array(other.transform_matrix).reshape(3, 3), matrix, atol=1e-5 * voxel)
+        if not (same and np.allclose(other.translation, info.translation, atol=1e-4 * voxel)):
+            raise WlmError(f"{path}: {_TEMPERATURE}: expected the voxels of {info.name}")
+        found[_TEMPERATURE] = _fill(path, hot, low, high)
+    return found
+
+
+def _box(path: Path, volume: wp.Volume) -> tuple[np.ndarray, np.ndarray]:
+    """First and last active voxel, tiles too, from the header of the tree's root: Warp itself doesn't tell."""
+    data = volume.array().numpy().tobytes()
+    grid_header, root_offset = 672, 24
+    root = grid_header + struct.unpack_from("<q", data, grid_header + root_offset)[0]
+    corners = np.array(struct.unpack_from("<6i", data, root)).reshape(2, 3)
+    name = volume.get_grid_info().name
+    if (corners[1] < corners[0]).any():
+        raise WlmError(f"{path}: {name}: expected active voxels, found none")
+    if np.prod((corners[1] - corners[0] + 1).astype(object)) > _LARGEST:
+        raise WlmError(f"{path}: {name}: expected a box of at most {_LARGEST} voxels, found {corners.tolist()}")
+    return corners[0], corners[1]
+
+
+def _fill(path: Path, volume: wp.Volume, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    info = volume.get_grid_info()
+    if volume.dtype is not wp.float32:
+        raise WlmError(f"{path}: {info.name or 'grid 0'}: expected a grid of floats, found {info.type_str}")
+    out = wp.empty(tuple(int(n) for n in high - low + 1), dtype=float, device="cpu")
+    wp.launch(_dense, out.shape, inputs=[volume.id, wp.vec3i(*map(int, low))], outputs=[out], device="cpu")
+    return out.numpy()

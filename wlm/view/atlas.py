@@ -1,0 +1,157 @@
+"""Pictures of a mesh under its lightmap: as it was, as it is decoded, and the error between them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import torch
+from PIL import Image, ImageDraw, ImageFont
+
+from wlm import render
+from wlm.atlas.data import LightmappedMesh
+from wlm.atlas.evaluate import Sampler
+from wlm.atlas.views import View, visible_uv
+from wlm.errors import WlmError
+from wlm.formats.atomic import atomic_path
+from wlm.imageops import fill_gaps
+from wlm.interop import check_device
+
+__all__ = ["comparison", "draw", "encode", "original", "save_png", "white_of"]
+
+_WHITE_PERCENTILE = 99.5  # as in `wlm.view.sheet`
+_BACKGROUND = 128  # neither light nor dark surfaces vanish in it
+_MARGIN, _TITLE, _FONT = 6, 26, 16  # pixels
+
+
+def original(mesh: LightmappedMesh, device: str = "cpu") -> Sampler:
+    """The lightmap itself as a decoder: read bilinearly, its gaps filled."""
+    image = torch.from_numpy(fill_gaps(mesh.lightmap, mesh.mask)).to(check_device(device))
+
+    def sample(uv: torch.Tensor, triangle: torch.Tensor, barycentric: torch.Tensor) -> torch.Tensor:
+        return render.texture(image, uv)
+
+    return sample
+
+
+def draw(
+    mesh: LightmappedMesh, samplers: Mapping[str, Sampler], view: View, resolution: int = 512, device: str = "cpu"
+) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Draws a mesh from one camera, as ``wlm.atlas.evaluate`` does.
+
+    Args:
+        mesh: The mesh.
+        samplers: Decoders by name.
+        view: The camera.
+        resolution: Pixels along a side.
+        device: "cpu" or "cuda:0", the decoders'.
+
+    Returns:
+        Of each decoder float32 [resolution, resolution, 3], linear light, 0 beside the mesh; and bool [resolution,
+        resolution], where the mesh is seen.
+    """
+    seen, barycentric, uv = next(iter(visible_uv(mesh, [view], resolution, device)))
+    hit = seen >= 0
+    weight = torch.cat([barycentric[hit], 1.0 - barycentric[hit].sum(1, keepdim=True)], dim=1)
+    pictures = {}
+    for name, sampler in samplers.items():
+        picture = torch.zeros((*seen.shape, 3), dtype=torch.float32, device=seen.device)
+        picture[hit] = sampler(uv[hit], seen[hit], weight).float()
+        pictures[name] = picture.cpu().numpy()
+    return pictures, hit.cpu().numpy()
+
+
+def white_of(light: np.ndarray) -> float:
+    """The light that is shown as white: its 99.5 percentile; 1 where there is none."""
+    white = float(np.percentile(light, _WHITE_PERCENTILE)) if light.size else 0.0
+    return white if white > 0 else float(light.max(initial=0.0)) or 1.0
+
+
+def encode(light: np.ndarray, hit: np.ndarray, white: float) -> np.ndarray:
+    """Linear light [H, W, 3] to sRGB bytes, grey beside the mesh."""
+    share = np.clip(light / white, 0.0, 1.0)
+    shown = np.where(share <= 0.0031308, 12.92 * share, 1.055 * share ** (1 / 2.4) - 0.055)
+    return np.where(hit[..., None], shown * 255.0 + 0.5, _BACKGROUND).astype(np.uint8)
+
+
+def save_png(path: str | os.PathLike[str], pixels: np.ndarray) -> None:
+    """Writes uint8 [H, W, 3] as a PNG, whole or not at all.
+
+    Raises:
+        WlmError: The file can't be written.
+    """
+    with atomic_path(path) as temporary:
+        Image.fromarray(pixels).save(temporary, format="PNG")
+
+
+def comparison(
+    path: str | os.PathLike[str],
+    mesh: LightmappedMesh,
+    samplers: Mapping[str, Sampler],
+    views: Sequence[View],
+    *,
+    resolution: int = 512,
+    gain: float = 8.0,
+    device: str = "cpu",
+) -> None:
+    """Writes a PNG: a row a view, with the original, each decoder, and each decoder's absolute error times a gain.
+
+    All share one exposure: the original's 99.5 percentile over all views is white, and light is encoded as sRGB. The
+    error is taken before that. What a view doesn't see is cut off.
+
+    Args:
+        path: The PNG to write; its folder must exist.
+        mesh: The mesh with its original lightmap.
+        samplers: Decoders by name, at least one; none is called "original".
+        views: The cameras, at least one.
+        resolution: Pixels along a side of a view before it is cut.
+        gain: What errors are multiplied by.
+        device: "cpu" or "cuda:0", the decoders'.
+
+    Raises:
+        ValueError: No decoder, or no view.
+        WlmError: No view sees the mesh, or the file can't be written.
+    """
+    if not samplers or not views:
+        raise ValueError("expected at least one decoder and one view")
+    drawn = []
+    for view in views:
+        pictures, hit = draw(mesh, {"original": original(mesh, device), **samplers}, view, resolution, device)
+        if hit.any():
+            window = tuple(slice(int(line.argmax()), len(line) - int(line[::-1].argmax())) for line in _lines(hit))
+            drawn.append(({name: picture[window] for name, picture in pictures.items()}, hit[window]))
+    if not drawn:
+        raise WlmError(f"{mesh.name}: cannot draw it: no view sees it")
+    white = white_of(np.concatenate([pictures["original"][hit] for pictures, hit in drawn]))
+    rows = []
+    for pictures, hit in drawn:
+        light = [encode(picture, hit, white) for picture in pictures.values()]
+        wrong = (np.abs(pictures[name] - pictures["original"]) * gain for name in samplers)
+        rows.append(light + [encode(error, hit, white) for error in wrong])
+    errors = [f"error x {gain:g}, {name}" for name in samplers]
+    save_png(path, _sheet(rows, ["original", *samplers, *errors]))
+
+
+def _lines(hit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rows and columns with anything in them."""
+    return hit.any(axis=1), hit.any(axis=0)
+
+
+def _sheet(rows: list[list[np.ndarray]], titles: list[str]) -> np.ndarray:
+    """Pictures in rows, each in the middle of its cell, under titles."""
+    cell = max(row[0].shape[1] for row in rows)
+    heights = [row[0].shape[0] for row in rows]
+    width = len(titles) * (cell + _MARGIN) + _MARGIN
+    sheet = Image.new("RGB", (width, sum(heights) + _TITLE + _MARGIN * (len(rows) + 1)), (_BACKGROUND,) * 3)
+    pen, font = ImageDraw.Draw(sheet), ImageFont.load_default(_FONT)
+    for column, title in enumerate(titles):
+        middle = _MARGIN + column * (cell + _MARGIN) + cell // 2
+        pen.text((middle, _MARGIN), title, fill="white", font=font, anchor="ma")
+    y = _TITLE + _MARGIN
+    for row, height in zip(rows, heights, strict=True):
+        for column, picture in enumerate(row):
+            x = _MARGIN + column * (cell + _MARGIN) + (cell - picture.shape[1]) // 2
+            sheet.paste(Image.fromarray(picture), (x, y))
+        y += height + _MARGIN
+    return np.asarray(sheet)

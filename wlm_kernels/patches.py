@@ -1,0 +1,449 @@
+"""Feature patches of triangles and whether two are alike (lightmap-uv-clustering-cascade, section 3.1, eq. 1 to 4).
+
+A patch of size n holds a triangle's colours on a triangular lattice: sample (i, j, k), i + j + k = n - 1, lies at
+the barycentrics (i, j, k) / (n - 1), and is stored at ``j n - j (j - 1) / 2 + i``. On this lattice another order of the
+vertices is another order of (i, j, k), so one stored patch serves all six. Order o is the permutation p =
+``ORDERS[o]``: vertex k of a triangle goes to vertex p[k] of the other.
+
+Sizes are 2, 3, 5, 9 and so on (``SIZES``), so that every lattice lies in all larger ones. A patch of one colour has
+the smallest size, whatever the triangle's, since interpolating it gives that colour everywhere.
+
+Colours are 8 bits a channel, packed as r + 256 g + 65536 b. All that decides is in whole numbers, so that no result
+depends on the device:
+
+- The lightmap comes in 16 bits, vertices in 1/65536 of a texel; a sample's place is rounded to 1/256 of a texel,
+  as the filters of GPUs do.
+- Dist (eq. 2) is summed exactly. Of patches of two sizes the smaller is interpolated linearly in the triangles of its
+  own lattice, which favours no vertex (in the square's cells the result would change with the order), in multiples
+  of 1 / (n - 1) of a level.
+
+The paper leaves open what |.| of a colour is: here the mean of the three channels', so that Dist is in [0, 1].
+"""
+
+import itertools
+
+import numpy as np
+import warp as wp
+
+__all__ = [
+    "BINS",
+    "ORDERS",
+    "SIZES",
+    "Patch",
+    "bin_numbers",
+    "channel",
+    "compare",
+    "distance_sum",
+    "dominant",
+    "patch_orders",
+    "sample",
+    "samples_of",
+    "size_of",
+    "spread",
+    "turned",
+]
+
+ORDERS = tuple(itertools.permutations(range(3)))
+"""p of each order; 0 is the identity."""
+
+SIZES = (2, 3, 5, 9, 17, 33, 65, 129)
+"""Of patches; sums over a larger one would need more than 32 bits."""
+
+BINS = 32
+"""Of the histogram, a channel (section 3.2.1)."""
+
+_LOT = 1 << 22  # samples whose bins are sorted at once
+
+_LEVELS = wp.constant(255)
+_BIN_SHIFT = wp.constant(3)  # 256 levels in 32 bins
+
+# A texel of 16 bits under weights that add up to 256 * 256, to 8 bits.
+_TO_BYTE = wp.constant(wp.int64(65536 * 257))
+_HALF_BYTE = wp.constant(wp.int64(65536 * 257 // 2))
+
+
+@wp.struct
+class Patch:
+    """What is known of a patch besides its samples.
+
+    Attributes:
+        start: Its first sample in the array of all samples.
+        level: Of its size, n = ``SIZES[level]`` = 2 ** level + 1.
+        low: Lowest level of each channel, packed.
+        high: Highest level of each channel, packed.
+        colour: Bin of the dominant colour, packed as a colour.
+    """
+
+    start: int
+    level: int
+    low: int
+    high: int
+    colour: int
+
+
+def samples_of(size):
+    """Samples of a patch of a size, n (n + 1) / 2."""
+    return size * (size + 1) // 2
+
+
+def patch_orders(samples: np.ndarray) -> np.ndarray:
+    """A patch in all six orders (section 3.1, figure 3).
+
+    Args:
+        samples: [N, ...], the samples of one patch as stored.
+
+    Returns:
+        [6, N, ...]. Number o is the patch of the triangle whose vertex p[k] is this one's vertex k, p = ``ORDERS[o]``.
+
+    Raises:
+        ValueError: N isn't the samples of a patch.
+    """
+    size = int((2 * len(samples)) ** 0.5)
+    if size < 1 or samples_of(size) != len(samples):
+        raise ValueError(f"samples: expected n (n + 1) / 2 of them, got {len(samples)}")
+    j, i = np.array([(j, i) for j in range(size) for i in range(size - j)]).T
+    weights = np.stack([i, j, size - 1 - i - j])
+    turned = [weights[list(order)] for order in ORDERS]
+    return np.stack([samples[j * size - j * (j - 1) // 2 + i] for i, j, _ in turned])
+
+
+@wp.func
+def size_of(level: int) -> int:
+    return (1 << level) + 1
+
+
+@wp.func
+def _index(size: int, i: int, j: int) -> int:
+    return j * size - j * (j - 1) // 2 + i
+
+
+@wp.func
+def channel(colour: int, c: int) -> int:
+    return (colour >> (8 * c)) & _LEVELS
+
+
+@wp.func
+def _place(i: int, j: int, k: int, a: wp.int64, b: wp.int64, c: wp.int64, side: int) -> int:
+    """Along an axis of ``side`` texels, in 1/256 of one, clamped to the centres of the outer ones."""
+    steps = wp.int64(i + j + k)
+    last = wp.int64(side - 1) * wp.int64(65536) * steps
+    at = wp.clamp(wp.int64(i) * a + wp.int64(j) * b + wp.int64(k) * c, wp.int64(0), last)
+    return int((at + wp.int64(128) * steps) // (wp.int64(256) * steps))
+
+
+@wp.kernel(enable_backward=False)
+def _sample(
+    # in:
+    lightmap: wp.array3d[wp.uint16],
+    corner: wp.array3d[wp.int64],
+    start: wp.array1d[int],
+    level: wp.array1d[int],
+    # out:
+    samples: wp.array1d[int],
+    patches: wp.array1d[Patch],
+    bright: wp.array1d[wp.uint8],
+):
+    t = wp.tid()
+    n = size_of(level[t])
+    rows = lightmap.shape[0]
+    columns = lightmap.shape[1]
+    low = wp.vec3i(255, 255, 255)
+    high = wp.vec3i(0, 0, 0)
+    over = int(0)
+    at = start[t]
+    for j in range(n):
+        for i in range(n - j):
+            k = n - 1 - i - j
+            x = _place(i, j, k, corner[t, 0, 0], corner[t, 1, 0], corner[t, 2, 0], columns)
+            y = _place(i, j, k, corner[t, 0, 1], corner[t, 1, 1], corner[t, 2, 1], rows)
+            sums = wp.vec3l()
+            for tap in range(4):
+                u = (x >> 8) + (tap & 1)
+                v = (y >> 8) + (tap >> 1)
+                w = wp.where((tap & 1) == 1, x & 255, 256 - (x & 255))
+                w *= wp.where((tap >> 1) == 1, y & 255, 256 - (y & 255))
+                # Also keeps from reading behind the border, where the weight is 0.
+                if w > 0:
+                    for c in range(3):
+                        sums[c] += wp.int64(w) * wp.int64(lightmap[v, u, c])
+                    over = wp.max(over, int(lightmap[v, u, 3]))
+            colour = int(0)
+            for c in range(3):
+                value = int((sums[c] + _HALF_BYTE) // _TO_BYTE)
+                low[c] = wp.min(low[c], value)
+                high[c] = wp.max(high[c], value)
+                colour += value << (8 * c)
+            samples[at] = colour
+            at += 1
+    p = Patch()
+    p.start = start[t]
+    p.level = level[t]
+    p.low = low[0] + (low[1] << 8) + (low[2] << 16)
+    p.high = high[0] + (high[1] << 8) + (high[2] << 16)
+    if p.low == p.high:
+        p.level = 0
+    patches[t] = p
+    bright[t] = wp.uint8(over)
+
+
+@wp.func
+def _bin(colour: int) -> int:
+    """Rising with the number of the bin: red counts most."""
+    r = channel(colour, 0) >> _BIN_SHIFT
+    g = channel(colour, 1) >> _BIN_SHIFT
+    b = channel(colour, 2) >> _BIN_SHIFT
+    return (r << 10) + (g << 5) + b
+
+
+@wp.kernel(enable_backward=False)
+def _bins(
+    # in:
+    samples: wp.array1d[int],
+    first: int,
+    # out:
+    keys: wp.array1d[int],
+    items: wp.array1d[int],
+):
+    i = wp.tid()
+    keys[i] = _bin(samples[first + i])
+    items[i] = i
+
+
+@wp.kernel(enable_backward=False)
+def _commonest(
+    # in:
+    keys: wp.array1d[int],
+    start: wp.array1d[int],
+    first: int,
+    # out:
+    patches: wp.array1d[Patch],
+):
+    """The bin that fills the longest run of a patch's sorted bins, the lowest of equals."""
+    t = wp.tid()
+    best = int(0)
+    longest = int(0)
+    run = int(0)
+    before = int(-1)
+    for i in range(start[t], start[t + 1]):
+        key = keys[i]
+        run = wp.where(key == before, run + 1, 1)
+        before = key
+        if run > longest:
+            longest = run
+            best = key
+    p = patches[first + t]
+    p.colour = (best >> 10) + (((best >> 5) & 31) << 8) + ((best & 31) << 16)
+    patches[first + t] = p
+
+
+@wp.func
+def _difference(a: int, b: int) -> int:
+    return (
+        wp.abs(channel(a, 0) - channel(b, 0))
+        + wp.abs(channel(a, 1) - channel(b, 1))
+        + wp.abs(channel(a, 2) - channel(b, 2))
+    )
+
+
+@wp.func
+def turned(w: wp.vec3i, order: int) -> wp.vec3i:
+    """(w[p[0]], w[p[1]], w[p[2]])."""
+    if order == 0:
+        return w
+    if order == 1:
+        return wp.vec3i(w[0], w[2], w[1])
+    if order == 2:
+        return wp.vec3i(w[1], w[0], w[2])
+    if order == 3:
+        return wp.vec3i(w[1], w[2], w[0])
+    if order == 4:
+        return wp.vec3i(w[2], w[0], w[1])
+    return wp.vec3i(w[2], w[1], w[0])
+
+
+@wp.func
+def _inverse(order: int) -> int:
+    """Of the six only the two turns aren't their own inverse."""
+    if order == 3:
+        return 4
+    if order == 4:
+        return 3
+    return order
+
+
+@wp.func
+def spread(samples: wp.array1d[int], small: Patch, i: int, j: int, level: int) -> wp.vec3i:
+    """``2 ** level`` times a patch's colour at (i, j) of the lattice of this level, its own or a higher one."""
+    # One step of the small lattice is this many of the other.
+    shift = level - small.level
+    size = size_of(small.level)
+    mask = (1 << shift) - 1
+    k = (1 << level) - i - j
+    rx = i & mask
+    ry = j & mask
+    rz = k & mask
+    x = i >> shift
+    y = j >> shift
+    rest = rx + ry + rz
+    a = samples[small.start + _index(size, x, y)]
+    if rest == 0:
+        return (1 << level) * wp.vec3i(channel(a, 0), channel(a, 1), channel(a, 2))
+    b = samples[small.start + _index(size, x, y + 1)]
+    c = samples[small.start + _index(size, x + 1, y)]
+    # In an upright triangle of the lattice the corners are one step up in z, in y and in x.
+    wa = rz
+    wb = ry
+    wc = rx
+    if rest > mask + 1:
+        # In an inverted one they are one step up in all but z, but x, but y.
+        a = samples[small.start + _index(size, x + 1, y + 1)]
+        wa = mask + 1 - rz
+        wb = mask + 1 - rx
+        wc = mask + 1 - ry
+    return (1 << small.level) * wp.vec3i(
+        wa * channel(a, 0) + wb * channel(b, 0) + wc * channel(c, 0),
+        wa * channel(a, 1) + wb * channel(b, 1) + wc * channel(c, 1),
+        wa * channel(a, 2) + wb * channel(b, 2) + wc * channel(c, 2),
+    )
+
+
+@wp.func
+def distance_sum(samples: wp.array1d[int], large: Patch, small: Patch, order: int, limit: int) -> int:
+    """The sum of differences, vertex k of the small one on vertex p[k] of the large one; cut short past the limit."""
+    steps = 1 << large.level
+    size = steps + 1
+    at = large.start
+    total = int(0)
+    for j in range(size):
+        for i in range(size - j):
+            w = turned(wp.vec3i(i, j, steps - i - j), order)
+            a = samples[at]
+            at += 1
+            if small.level == large.level:
+                total += _difference(a, samples[small.start + _index(size, w[0], w[1])])
+            else:
+                b = spread(samples, small, w[0], w[1], large.level)
+                total += wp.abs(steps * channel(a, 0) - b[0])
+                total += wp.abs(steps * channel(a, 1) - b[1])
+                total += wp.abs(steps * channel(a, 2) - b[2])
+        if total >= limit:
+            return total
+    return total
+
+
+@wp.kernel(enable_backward=False)
+def _compare(
+    # in:
+    samples: wp.array1d[int],
+    patches: wp.array1d[Patch],
+    member: wp.array1d[int],
+    representative: wp.array1d[int],
+    # out:
+    order: wp.array1d[wp.int8],
+    distance: wp.array1d[wp.float64],
+):
+    t = wp.tid()
+    a = patches[representative[t]]
+    b = patches[member[t]]
+    large = a
+    small = b
+    if a.level < b.level:
+        large = b
+        small = a
+    limit = int(0x7FFFFFFF)
+    best = int(0)
+    for o in range(6):
+        turn = o
+        if a.level < b.level:
+            turn = _inverse(o)
+        total = distance_sum(samples, large, small, turn, limit)
+        if total < limit:
+            limit = total
+            best = o
+    order[t] = wp.int8(best)
+    size = size_of(large.level)
+    levels = 765 * (size * (size + 1) // 2)
+    if large.level != small.level:
+        levels *= size - 1
+    distance[t] = wp.float64(limit) / wp.float64(levels)
+
+
+def _starts(level: np.ndarray) -> np.ndarray:
+    """Where the patches' samples begin, and where the last ones end, int64 [F + 1]."""
+    return np.concatenate([[0], np.cumsum(samples_of(np.array(SIZES, np.int64))[level])])
+
+
+def sample(lightmap: np.ndarray, corner: np.ndarray, level: np.ndarray, device) -> tuple:
+    """Samples the patches of triangles (section 3.1).
+
+    Args:
+        lightmap: uint16 [H, W, 4]: red, green, blue, and 1 where the texel is too bright, else 0.
+        corner: int64 [F, 3, 2], (x, y) of the vertices in 1/65536 of a texel from the centre of texel (0, 0).
+        level: int32 [F], of the patches' sizes.
+        device: Where the arrays go.
+
+    Returns:
+        Of all patches the samples, int [sum of ``samples_of(SIZES[level])``]; Patch [F], without their dominant
+        colours; and uint8 [F], whether a patch reads a texel that is too bright.
+    """
+    start = _starts(level)
+    if start[-1] > np.iinfo(np.int32).max:
+        raise ValueError(f"level: {start[-1]} samples, expected at most {np.iinfo(np.int32).max}")
+    samples = wp.empty(int(start[-1]), dtype=int, device=device)
+    patches = wp.empty(len(level), dtype=Patch, device=device)
+    bright = wp.empty(len(level), dtype=wp.uint8, device=device)
+    inputs = [
+        wp.array(lightmap, dtype=wp.uint16, device=device),
+        wp.array(corner, dtype=wp.int64, device=device),
+        wp.array(start[:-1].astype(np.int32), dtype=int, device=device),
+        wp.array(level, dtype=int, device=device),
+    ]
+    wp.launch(_sample, len(level), inputs=inputs, outputs=[samples, patches, bright], device=device)
+    return samples, patches, bright
+
+
+def dominant(samples, patches, level: np.ndarray) -> None:
+    """Finds the dominant colours, the commonest of 32 x 32 x 32 bins and the lowest of equals (section 3.2.1).
+
+    The patches are taken in lots, so that sorting takes no memory to speak of.
+
+    Args:
+        samples, patches: As of ``sample``; the latter's ``colour`` is written.
+        level: int32 [F], as given to ``sample``.
+    """
+    device = samples.device
+    start = _starts(level)
+    begin = 0
+    while begin < len(level):
+        end = max(int(np.searchsorted(start, start[begin] + _LOT, "right")) - 1, begin + 1)
+        count = int(start[end] - start[begin])
+        keys, items = (wp.empty(2 * count, dtype=int, device=device) for _ in range(2))
+        local = wp.array((start[begin : end + 1] - start[begin]).astype(np.int32), dtype=int, device=device)
+        wp.launch(_bins, count, inputs=[samples, int(start[begin])], outputs=[keys, items], device=device)
+        wp.utils.segmented_sort_pairs(keys, items, count, local)
+        wp.launch(_commonest, end - begin, inputs=[keys, local, begin], outputs=[patches], device=device)
+        begin = end
+
+
+def bin_numbers(colour: np.ndarray) -> np.ndarray:
+    """The numbers of packed bins, by which they are ordered: red counts most."""
+    return ((colour & 255) << 10) | ((colour >> 8 & 255) << 5) | (colour >> 16 & 255)
+
+
+def compare(samples, patches, member, representative) -> tuple[np.ndarray, np.ndarray]:
+    """The order that brings patches nearest to others, the first of equals, and their distance (eq. 2 and 3).
+
+    Args:
+        samples, patches: As of ``sample``.
+        member, representative: int [N], numbers of patches.
+
+    Returns:
+        int8 [N], o such that vertex k of the member goes to vertex ``ORDERS[o][k]`` of the representative; and
+        float64 [N], Dist, in [0, 1].
+    """
+    device, count = samples.device, member.shape[0]
+    order = wp.empty(count, dtype=wp.int8, device=device)
+    distance = wp.empty(count, dtype=wp.float64, device=device)
+    inputs = [samples, patches, member, representative]
+    wp.launch(_compare, count, inputs=inputs, outputs=[order, distance], device=device)
+    return order.numpy(), distance.numpy()

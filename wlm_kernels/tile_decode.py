@@ -1,0 +1,81 @@
+"""Reads a lightmap from tiles: one entry of a table, then one bilinear read of a small texture.
+
+Tile (i, j) of size B spans the lightmap's texel centres i B to (i + 1) B along x, and j B to (j + 1) B along y; its
+entry says which rectangle of the texture holds it. The rectangle's outermost samples lie on the tile's borders.
+"""
+
+import warp as wp
+
+__all__ = ["SIDE_BITS", "decode"]
+
+SIDE_BITS = wp.constant(4)
+_SIDE_MASK = wp.constant(15)
+
+
+@wp.struct
+class _Axis:
+    low: int
+    high: int
+    share: float
+
+
+@wp.func
+def _tile_place(u: float, texels: int, size: int, tiles: int) -> wp.vec2:
+    """Number of the tile that holds a coordinate, and the place in it from 0 to 1; of NaN tile 0 and NaN."""
+    if not (u == u):
+        return wp.vec2(0.0, u)
+    x = wp.clamp(u * float(texels) - 0.5, 0.0, float(texels - 1)) / float(size)
+    tile = wp.min(wp.floor(x), float(tiles - 1))
+    return wp.vec2(tile, x - tile)
+
+
+@wp.func
+def _axis(entry: wp.uint16, place: float) -> _Axis:
+    """The two texels that a place in a tile lies between."""
+    first = int(entry) >> SIDE_BITS
+    last = int(entry) & _SIDE_MASK
+    x = place * float(last)
+    axis = _Axis()
+    below = wp.max(wp.min(int(x), last - 1), 0)
+    axis.low = first + below
+    axis.high = first + wp.min(below + 1, last)
+    axis.share = x - float(below)
+    return axis
+
+
+@wp.kernel(enable_backward=False)
+def _decode(
+    # in:
+    uv: wp.array1d[wp.vec2],
+    height: int,
+    width: int,
+    size: int,
+    lut: wp.array3d[wp.uint16],
+    texels: wp.array2d[wp.vec3h],
+    # out:
+    out: wp.array1d[wp.vec3],
+):
+    i = wp.tid()
+    at = uv[i]
+    across = _tile_place(at[0], width, size, lut.shape[1])
+    down = _tile_place(at[1], height, size, lut.shape[0])
+    row, column = int(down[0]), int(across[0])
+    x = _axis(lut[row, column, 0], across[1])
+    y = _axis(lut[row, column, 1], down[1])
+    top = wp.lerp(wp.vec3(texels[y.low, x.low]), wp.vec3(texels[y.low, x.high]), x.share)
+    bottom = wp.lerp(wp.vec3(texels[y.high, x.low]), wp.vec3(texels[y.high, x.high]), x.share)
+    out[i] = wp.lerp(top, bottom, y.share)
+
+
+def decode(uv, height: int, width: int, size: int, lut, texels, out) -> None:
+    """Reads light at points.
+
+    Args:
+        uv: vec2 [N], u right, v down; clamped to [0, 1]. Where one isn't a number the result isn't either.
+        height, width: Texels of the lightmap.
+        size: B, texels along a tile.
+        lut: uint16 [ty, tx, 2], along x and y: first texel of the rectangle << 4 | its texels - 1.
+        texels: vec3h [Hp, Wp].
+        out: vec3 [N], written.
+    """
+    wp.launch(_decode, uv.shape, inputs=[uv, height, width, size, lut, texels], outputs=[out], device=uv.device)
