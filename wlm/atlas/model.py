@@ -86,7 +86,7 @@ class Profile(BaseModel):
     tile: int = Field(7, ge=3, le=15)
     views: int = Field(64, ge=0, le=4096)
     unseen: float = Field(0.05, gt=0.0, le=1.0)
-    border: float = Field(6.0, gt=0.0, le=100.0)
+    border: float = Field(16.0, gt=0.0, le=100.0)
     fallback: bool = True
     threshold: float = Field(0.03, ge=0.0, le=1.0)
     colour_threshold: float = Field(0.09, ge=0.0, le=2.0)

@@ -28,7 +28,7 @@ from wlm.atlas.resize import FILTERS, resize
 from wlm.formats import hdr_blocks
 from wlm.imageops import fill_gaps
 
-__all__ = ["ATLAS_BASELINES", "Baseline", "block_codec", "downsampling", "single_colour"]
+__all__ = ["ATLAS_BASELINES", "Baseline", "best_astc", "block_codec", "downsampling", "single_colour"]
 
 _BLOCK_BITS = 128
 _BC6H = (4, 4)
@@ -104,6 +104,19 @@ def block_codec(mesh: LightmappedMesh, share: float, codec: str) -> Baseline:
         data = coder.encode(half)
         decoded = coder.decode(data, height, width)
     return _texture(codec, mesh, decoded, len(data) * 8, start)
+
+
+def best_astc(mesh: LightmappedMesh, share: float) -> Baseline:
+    """ASTC with the smallest blocks that hold the lightmap at its own size within the budget, else ``astc12x12``.
+
+    Resizing a lightmap by little costs more than larger blocks do.
+    """
+    height, width = mesh.mask.shape
+    budget = share * mesh.mask.size * SOURCE_BITS
+    blocks = lambda w, h: math.ceil(height / h) * math.ceil(width / w)  # noqa: E731
+    fitting = ((w, h) for w, h in hdr_blocks.ASTC_BLOCKS if blocks(w, h) * _BLOCK_BITS <= budget)
+    w, h = next(fitting, hdr_blocks.ASTC_BLOCKS[-1])
+    return block_codec(mesh, share, f"astc{w}x{h}")
 
 
 def single_colour(mesh: LightmappedMesh, share: float | None = None, threshold: float = 0.01) -> Baseline:
@@ -243,5 +256,6 @@ ATLAS_BASELINES: dict[str, Callable[[LightmappedMesh, float], Baseline]] = {
     "downsampling": downsampling,
     **{f"downsampling {name}": functools.partial(downsampling, filter=name) for name in FILTERS if name != "fit"},
     **{name: functools.partial(block_codec, codec=name) for name in ("bc6h", "astc4x4", "astc6x6", "astc8x8")},
+    "astc": best_astc,
     "single colour": single_colour,
 }

@@ -31,35 +31,35 @@ import numpy as np
 import torch
 import warp as wp
 
-import wlm
 from wlm import interop
 from wlm.atlas import codec
-from wlm.atlas.data import LightmappedMesh, from_arrays, load_mesh
+from wlm.atlas.data import LightmappedMesh, from_arrays
 from wlm.atlas.decode import Decoder
 from wlm.atlas.evaluate import Report, Sampler, evaluate
 from wlm.atlas.fit import compress
 from wlm.atlas.model import SOURCE_BITS, AtlasModel, Profile, load_profile
 from wlm.atlas.reference import decode64
 from wlm.baselines.atlas import ATLAS_BASELINES
+from wlm.bench.atlas_inputs import Lightmap
 from wlm.bench.plot import Panel
-from wlm.bench.runner import Row, run_peers
+from wlm.bench.runner import Row, read_json, run_peers
 from wlm.errors import WlmError
 from wlm.imageops import fill_gaps
 
-__all__ = ["PANELS", "PROFILES", "Lightmap", "load", "plotted", "run", "run_rows"]
+__all__ = ["PANELS", "PROFILES", "plotted", "run", "run_rivals", "run_rows"]
 
-PROFILES = ("standard", "bc6h", "astc", "paper", "cascade")
+PROFILES = ("standard", "bc6h", "astc", "compact", "cascade", "paper")
 """Profiles of a run; the first has the bits of the first cascade too."""
 
 _RIVALS = {
     "downsampling": "downsampling",
     "downsampling bilinear": "downsampling bilinear",
     "BC6H": "bc6h",
-    "ASTC 4x4": "astc4x4",
-    "ASTC 6x6": "astc6x6",
-    "ASTC 8x8": "astc8x8",
+    "ASTC": "astc",
     "single colour": "single colour",
 }
+_HELD_TO = ("standard", "astc", "compact")  # profiles whose bits rivals get when they run alone
+_FIRST = "downsampling"  # what everything is held against
 _VIEWS, _RESOLUTION = 50, 512  # section 4.1.4; the paper doesn't say at which resolution it scores
 _QUICK_VIEWS, _QUICK_RESOLUTION = 8, 256
 _QUICK_CASCADE = {"steps": 30, "resolution": 256}
@@ -74,108 +74,74 @@ PANELS = (Panel("bpp", "psnr", ("ours", *_RIVALS)), Panel("decode_ms", "max_erro
 Note = Callable[[str], None]
 
 
-@dataclass(frozen=True, eq=False)
-class Lightmap:
-    """A lightmap of a mesh, and the name that its rows have."""
-
-    scene: str
-    mesh: LightmappedMesh
-
-
 def run(
+    lightmaps: Sequence[Lightmap],
+    names: Sequence[str] = (),
     *,
     quick: bool,
     device: str,
-    meshes_path: str | os.PathLike[str] | None = None,
-    mesh_path: str | os.PathLike[str] | None = None,
-    lightmap_paths: Sequence[str | os.PathLike[str]] = (),
-    mask_path: str | os.PathLike[str] | None = None,
+    rivals: bool = True,
     progress: Note | None = None,
 ) -> list[Row]:
     """Measures the atlas system.
 
     Args:
+        lightmaps: At least one, as ``wlm.bench.atlas_inputs.load`` reads them.
+        names: Profiles; none: ``PROFILES``.
         quick: 8 small views instead of 50, the cascade tuned for a few steps, rivals at one size: under 90 seconds on
             two CPU cores with the demo's mesh. The cascade's error is that of an unfinished fit.
         device: "cpu" or "cuda:0", for compressions, views and decodes; the rivals are compressed on the CPU.
-        meshes_path, mesh_path, lightmap_paths, mask_path: As for ``load``.
+        rivals: With the block codecs and single-colour merging, which take minutes on the CPU: ``run_rivals`` has them
+            alone. Downsampling is always there.
         progress: Called with a line before each part of the work.
 
     Returns:
         The rows, lightmap by lightmap in the order of the module's list.
 
     Raises:
-        WlmError: A file or the device isn't there, or a compression failed.
+        WlmError: A profile or the device isn't there, or a compression failed.
     """
-    device = interop.check_device(device)
-    lightmaps = load(meshes_path, mesh_path, lightmap_paths, mask_path)
-    profiles = [load_profile(name) for name in PROFILES]
+    profiles = [load_profile(name) for name in names or PROFILES]
     if quick:
         profiles = [p.model_copy(update=_QUICK_CASCADE) if p.method == "cascade" else p for p in profiles]
     return run_rows(
         lightmaps,
         profiles,
-        device=device,
+        device=interop.check_device(device),
         views=_QUICK_VIEWS if quick else _VIEWS,
         resolution=_QUICK_RESOLUTION if quick else _RESOLUTION,
         whole=not quick,
+        methods=tuple(_RIVALS) if rivals else (_FIRST,),
         progress=progress,
     )
 
 
-def load(
-    meshes_path: str | os.PathLike[str] | None = None,
-    mesh_path: str | os.PathLike[str] | None = None,
-    lightmap_paths: Sequence[str | os.PathLike[str]] = (),
-    mask_path: str | os.PathLike[str] | None = None,
-) -> list[Lightmap]:
-    """Reads what a run measures.
+def run_rivals(
+    results: str | os.PathLike[str], lightmaps: Sequence[Lightmap], *, progress: Note | None = None
+) -> list[Row]:
+    """Measures the rivals alone, at the bits that our tiles took in a former run.
 
     Args:
-        meshes_path: A folder of a mesh, or of such folders: each has one ``.glb``, its lightmaps, ``.exr``, and maybe
-            their ``mask.png``.
-        mesh_path: Instead, one mesh.
-        lightmap_paths: Its lightmaps.
-        mask_path: Their mask; None derives it.
+        results: What that run wrote.
+        lightmaps: At least one; those of that run.
+        progress: As for ``run``.
 
     Returns:
-        The lightmaps. Without any path those of the checkout's ``demos/data/atlas``.
+        The rows of the rivals, of the CPU, and their means.
 
     Raises:
-        WlmError: A file is missing or damaged, a folder has no mesh with a lightmap, or paths were given that don't go
-            together.
+        WlmError: ``results`` can't be read, or has no row of a lightmap.
     """
-    if mesh_path is not None:
-        if meshes_path is not None or not lightmap_paths:
-            raise WlmError("bench atlas: expected --mesh FILE with --lightmap FILE, or --meshes DIR alone")
-        return _lightmaps(Path(mesh_path), [Path(path) for path in lightmap_paths], mask_path)
-    if lightmap_paths or mask_path is not None:
-        raise WlmError("bench atlas: --lightmap and --mask need --mesh FILE")
-    if meshes_path is None:
-        meshes_path = Path(wlm.__file__).resolve().parents[1] / "demos" / "data" / "atlas"
-        if not meshes_path.is_dir():
-            raise WlmError("bench atlas: the demo's mesh comes with a checkout alone; expected --meshes DIR")
-    folder = Path(meshes_path)
-    if not folder.is_dir():
-        raise WlmError(f"{folder}: no such folder; expected one of meshes with their lightmaps")
-    found = []
-    for each in (folder, *sorted(path for path in folder.iterdir() if path.is_dir())):
-        meshes, lightmaps = sorted(each.glob("*.glb")), sorted(each.glob("*.exr"))
-        if len(meshes) > 1:
-            raise WlmError(f"{each}: expected one .glb a folder, found {len(meshes)}")
-        if meshes and lightmaps:
-            mask = each / "mask.png"
-            found += _lightmaps(meshes[0], lightmaps, mask if mask.is_file() else None)
-    if not found:
-        raise WlmError(f"{folder}: expected a .glb and its .exr in it or in folders of it, found none")
-    return found
-
-
-def _lightmaps(mesh: Path, lightmaps: Sequence[Path], mask: str | os.PathLike[str] | None) -> list[Lightmap]:
-    name = mesh.resolve().parent.name if mesh.stem == "mesh" else mesh.stem
-    scenes = [name if path.stem == name else f"{name} {path.stem}" for path in lightmaps]
-    meshes = (load_mesh(mesh, path, mask_path=mask) for path in lightmaps)
-    return [Lightmap(*one) for one in zip(scenes, meshes, strict=True)]
+    ours = [row for row in read_json(results)[0] if (row.system, row.method) == ("atlas", "ours")]
+    scored: list[_Entry] = []
+    for lightmap in lightmaps:
+        rows = [row for row in ours if row.scene == lightmap.scene and row.bpp and row.option in _HELD_TO]
+        if not rows:
+            raise WlmError(f"{results}: expected a row of method ours of {lightmap.scene}")
+        bench = _Bench(lightmap, "cpu", 1, progress or (lambda line: None))
+        shares = [(row.option, row.bpp / SOURCE_BITS) for row in rows]
+        scored += bench.scored(bench.rivals(shares, tuple(_RIVALS)), _VIEWS, _RESOLUTION)
+    return [one.row for one in scored] + (_means(scored, len(lightmaps)) if len(lightmaps) > 1 else [])
 
 
 def run_rows(
@@ -186,6 +152,7 @@ def run_rows(
     views: int,
     resolution: int,
     whole: bool,
+    methods: Sequence[str] = tuple(_RIVALS),
     points: int = _POINTS,
     repeats: int | None = None,
     progress: Note | None = None,
@@ -199,6 +166,7 @@ def run_rows(
         views: Cameras of the scores.
         resolution: Their pixels along a side.
         whole: With the first profile at the bits of a cascade, and rivals at the bits of all profiles.
+        methods: The rivals.
         points: Read by a timed decode.
         repeats: Samples of each decode time; None: 30 on CUDA, 5 on the CPU.
         progress: As for ``run``.
@@ -234,7 +202,12 @@ def run_rows(
         )
         rows = dict(zip((id(entry) for entry in peers), timed, strict=True))
         entries = [replace(entry, row=rows.get(id(entry), entry.row)) for entry in (*entries, *peers[-1:])]
-        entries += bench.rivals(entries, whole)
+        shares = [
+            (entry.row.option, entry.share)
+            for entry in entries
+            if entry.model is not None and entry.row.option == entry.model.profile.name
+        ]
+        entries += bench.rivals(shares if whole else shares[:1], methods)
         scored += bench.scored(entries, views, resolution)
     return [one.row for one in scored] + (_means(scored, len(lightmaps)) if len(lightmaps) > 1 else [])
 
@@ -340,24 +313,26 @@ class _Bench:
         figures = {"bytes": model.texels.nbytes, "bpp": SOURCE_BITS, "max_error": error}
         return _Entry(self._row("lightmap", "half floats", **figures, notes="as it is"), 1.0, decode=decode)
 
-    def rivals(self, entries: Sequence[_Entry], whole: bool) -> list[_Entry]:
-        """The rivals at the bits of our profiles, of the first alone unless ``whole``.
+    def rivals(self, shares: Sequence[tuple[str, float]], methods: Sequence[str]) -> list[_Entry]:
+        """The rivals at the bits of our profiles.
 
         One that holds the whole lightmap in fewer bits isn't measured twice.
+
+        Args:
+            shares: Names of profiles, and their bits over the lightmap's.
+            methods: The rivals.
         """
-        result, shares, enough = [], [], {}
-        for entry in entries:
-            if entry.model is None or entry.row.option != entry.model.profile.name:
+        result, done, enough = [], [], {}
+        for name, share in shares:
+            if any(abs(share / other - 1.0) < _SAME for other in done):
                 continue
-            if shares and (not whole or min(abs(entry.share / share - 1.0) for share in shares) < _SAME):
-                continue
-            shares.append(entry.share)
-            option = f"bits of {entry.row.option}"
-            for method in _RIVALS:
-                if enough.get(method, math.inf) > entry.share:
-                    self.note(f"{method}, {option}")
-                    result.append(self._rival(method, option, entry.share))
-                    if result[-1].full_size:
+            done.append(share)
+            for method in methods:
+                if enough.get(method, math.inf) > share:
+                    self.note(f"{method}, bits of {name}")
+                    result.append(self._rival(method, f"bits of {name}", share))
+                    # ASTC has other blocks for other budgets.
+                    if result[-1].full_size and method != "ASTC":
                         enough[method] = result[-1].share
         return result
 

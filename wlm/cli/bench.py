@@ -116,6 +116,18 @@ def atlas(
         typer.Option("--lightmap", metavar="FILE.exr", help="A lightmap of it; may be given several times."),
     ] = None,
     mask_path: Annotated[Path | None, typer.Option("--mask", metavar="FILE.png", help="Their mask.")] = None,
+    profiles: Annotated[
+        list[str] | None, typer.Option("--profile", metavar="NAME", help="Profiles; default all. Several times.")
+    ] = None,
+    rivals: Annotated[
+        bool, typer.Option("--rivals/--no-rivals", help="With the block codecs, which take minutes on the CPU.")
+    ] = True,
+    rivals_at: Annotated[
+        Path | None,
+        typer.Option(
+            "--rivals-at", metavar="FILE.json", help="The rivals alone, at the bits that ours have in this result file."
+        ),
+    ] = None,
     json_path: Annotated[
         Path | None, typer.Option("--json", metavar="FILE.json", help="Write the rows and the environment.")
     ] = None,
@@ -126,25 +138,30 @@ def atlas(
     """Lightmaps of meshes: PSNR, SSIM, size and decode time of the profiles, smaller lightmaps and block codecs."""
     _check_outputs(json_path, plot_path)
     quiet_warp()
-    from wlm.bench.atlas import PANELS, plotted, run
+    from wlm.bench import read_json
+    from wlm.bench.atlas import PANELS, plotted, run, run_rivals
+    from wlm.bench.atlas_inputs import load
     from wlm.interop import check_device
 
     device = check_device(device)
-    rows = run(
-        quick=quick,
-        device=device,
-        meshes_path=meshes_path,
-        mesh_path=mesh_path,
-        lightmap_paths=lightmap_paths or (),
-        mask_path=mask_path,
-        progress=note,
-    )
-    command = f"wlm bench atlas{' --quick' if quick else ''} --device {device}"
+    lightmaps = load(meshes_path, mesh_path, lightmap_paths or (), mask_path)
+    beside: list = []  # what the plot shows besides the rows
+    if rivals_at is not None:
+        if quick or not rivals or profiles or device != "cpu":
+            raise WlmError("--rivals-at: expected without --quick, --profile, --no-rivals and --device")
+        rows = run_rivals(rivals_at, lightmaps, progress=note)
+        scenes = {row.scene for row in rows}
+        beside = plotted([row for row in read_json(rivals_at)[0] if row.system == "atlas" and row.scene in scenes])
+        command = f"wlm bench atlas --rivals-at {rivals_at.name}"
+    else:
+        rows = run(lightmaps, profiles or (), quick=quick, device=device, rivals=rivals, progress=note)
+        command = f"wlm bench atlas{' --quick' if quick else ''}{'' if rivals else ' --no-rivals'} --device {device}"
     for option, path in (("meshes", meshes_path), ("mesh", mesh_path)):
         command += "" if path is None else f" --{option} {path.name}"
     command += "".join(f" --lightmap {path.name}" for path in lightmap_paths or ())
     command += "" if mask_path is None else f" --mask {mask_path.name}"
-    _finish(rows, device, command, json_path, plot_path, PANELS, shown=plotted(rows))
+    command += "".join(f" --profile {name}" for name in profiles or ())
+    _finish(rows, device, command, json_path, plot_path, PANELS, beside, plotted(rows))
 
 
 @app.command()

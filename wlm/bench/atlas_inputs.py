@@ -1,0 +1,75 @@
+"""The lightmaps that the atlas benchmark measures."""
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import wlm
+from wlm.atlas.data import LightmappedMesh, load_mesh
+from wlm.errors import WlmError
+
+__all__ = ["Lightmap", "load"]
+
+
+@dataclass(frozen=True, eq=False)
+class Lightmap:
+    """A lightmap of a mesh, and the name that its rows have."""
+
+    scene: str
+    mesh: LightmappedMesh
+
+
+def load(
+    meshes_path: str | os.PathLike[str] | None = None,
+    mesh_path: str | os.PathLike[str] | None = None,
+    lightmap_paths: Sequence[str | os.PathLike[str]] = (),
+    mask_path: str | os.PathLike[str] | None = None,
+) -> list[Lightmap]:
+    """Reads what a run measures.
+
+    Args:
+        meshes_path: A folder of a mesh, or of such folders: each has one ``.glb``, its lightmaps, ``.exr``, and maybe
+            their ``mask.png``.
+        mesh_path: Instead, one mesh.
+        lightmap_paths: Its lightmaps.
+        mask_path: Their mask; None derives it.
+
+    Returns:
+        The lightmaps. Without any path those of the checkout's ``demos/data/atlas``.
+
+    Raises:
+        WlmError: A file is missing or damaged, a folder has no mesh with a lightmap, or paths were given that don't go
+            together.
+    """
+    if mesh_path is not None:
+        if meshes_path is not None or not lightmap_paths:
+            raise WlmError("bench atlas: expected --mesh FILE with --lightmap FILE, or --meshes DIR alone")
+        return _lightmaps(Path(mesh_path), [Path(path) for path in lightmap_paths], mask_path)
+    if lightmap_paths or mask_path is not None:
+        raise WlmError("bench atlas: --lightmap and --mask need --mesh FILE")
+    if meshes_path is None:
+        meshes_path = Path(wlm.__file__).resolve().parents[1] / "demos" / "data" / "atlas"
+        if not meshes_path.is_dir():
+            raise WlmError("bench atlas: the demo's mesh comes with a checkout alone; expected --meshes DIR")
+    folder = Path(meshes_path)
+    if not folder.is_dir():
+        raise WlmError(f"{folder}: no such folder; expected one of meshes with their lightmaps")
+    found = []
+    for each in (folder, *sorted(path for path in folder.iterdir() if path.is_dir())):
+        meshes, lightmaps = sorted(each.glob("*.glb")), sorted(each.glob("*.exr"))
+        if len(meshes) > 1:
+            raise WlmError(f"{each}: expected one .glb a folder, found {len(meshes)}")
+        if meshes and lightmaps:
+            mask = each / "mask.png"
+            found += _lightmaps(meshes[0], lightmaps, mask if mask.is_file() else None)
+    if not found:
+        raise WlmError(f"{folder}: expected a .glb and its .exr in it or in folders of it, found none")
+    return found
+
+
+def _lightmaps(mesh: Path, lightmaps: Sequence[Path], mask: str | os.PathLike[str] | None) -> list[Lightmap]:
+    name = mesh.resolve().parent.name if mesh.stem == "mesh" else mesh.stem
+    scenes = [name if path.stem == name else f"{name} {path.stem}" for path in lightmaps]
+    meshes = (load_mesh(mesh, path, mask_path=mask) for path in lightmaps)
+    return [Lightmap(*one) for one in zip(scenes, meshes, strict=True)]
