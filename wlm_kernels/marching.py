@@ -35,7 +35,7 @@ __all__ = [
     "view",
 ]
 
-wp.set_module_options({"enable_backward": False})
+_OPTIONS = {"enable_backward": False}
 
 BRICK = 8
 """Voxels along an edge of a brick, the unit in which empty space is left out."""
@@ -197,7 +197,7 @@ class _Kernels:
 def guide_kernels(dtype: Any) -> _Kernels:
     """Builds (once) the kernels for densities of a type, ``wp.float32`` or ``wp.float16``."""
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", module_options=_OPTIONS)
     def occupied(
         # in:
         density: wp.array3d[dtype],
@@ -214,7 +214,7 @@ def guide_kernels(dtype: Any) -> _Kernels:
                         found = wp.uint8(1)
         bricks[a, b, c] = found
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", module_options=_OPTIONS)
     def lattice(
         # in:
         density: wp.array3d[dtype],
@@ -235,7 +235,7 @@ def guide_kernels(dtype: Any) -> _Kernels:
             _plain_depth(density, p, up, extinction, h), _plain_depth(density, p, -up, extinction, h)
         )
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", module_options=_OPTIONS)
     def transmittance(
         # in:
         density: wp.array3d[dtype],
@@ -251,7 +251,7 @@ def guide_kernels(dtype: Any) -> _Kernels:
         out[i] = wp.exp(-optical_depth(density, bricks, points[i], toward, extinction, h))
 
     def make_guide(from_lattice: bool):
-        @wp.kernel(module="unique", enable_backward=False)
+        @wp.kernel(module="unique", module_options=_OPTIONS)
         def guide(
             # in:
             density: wp.array3d[dtype],
@@ -265,6 +265,7 @@ def guide_kernels(dtype: Any) -> _Kernels:
             g: float,
             cutoff: float,
             unit: float,
+            lead: float,
             # out:
             out: wp.array3d[float],
         ):
@@ -290,7 +291,7 @@ def guide_kernels(dtype: Any) -> _Kernels:
                     sigma = extinction * density_at(density, p)
                     if sigma > 0.0:
                         if depth == 0.0 and sigma > threshold:
-                            depth = s * unit
+                            depth = (s + lead) * unit
                         tau = wp.vec2()
                         if wp.static(from_lattice):
                             tau = _node_at(nodes, p, size_of(density))
@@ -395,18 +396,20 @@ def transmittance(density, extinction: float, points, toward, step: float, out) 
 
 
 def lattice(density, extinction: float, up, step: float):
-    """Optical depths towards the top and the bottom on a lattice of nodes no farther apart than a step.
+    """Optical depths towards the top and the bottom on a lattice of nodes no farther apart than a step, or a voxel.
 
     Args:
         density: float or half [X, Y, Z].
         extinction: Per voxel, of density 1.
         up: Three numbers, the direction to the top, of length 1.
-        step: In voxels, of the nodes and of the march from each.
+        step: In voxels, of the nodes, which are a voxel apart at least, and of the march from each.
 
     Returns:
         vec2 [A, B, C], to the top and to the bottom; the first and the last nodes lie half a voxel out of the grid.
     """
-    shape = tuple(math.ceil((n + 1) / step) + 1 for n in density.shape)
+    # Nodes closer than voxels would tell nothing new and fill the memory.
+    apart = max(step, 1.0)
+    shape = tuple(math.ceil((n + 1) / apart) + 1 for n in density.shape)
     nodes = wp.empty(shape, dtype=wp.vec2, device=density.device)
     inputs = [density, extinction, wp.vec3(*map(float, up)), step]
     kernel = guide_kernels(density.dtype).lattice
@@ -427,6 +430,7 @@ def guide(
     g: float = 0.0,
     cutoff: float = 1e-4,
     unit: float = 1.0,
+    lead: float = 0.0,
     shared: bool = True,
 ) -> None:
     """A guiding map (algorithm 1): smoke lit from the front, the top and the bottom, its transparency and its depth.
@@ -450,13 +454,14 @@ def guide(
         cutoff: A ray ends where less than this is left of its transparency; the error is less than it in transparency
             and 2.5 times it (for g = 0) in light.
         unit: What a voxel's edge is in the depth's unit.
-        shared: Whether the lights from the top and bottom are marched to from a lattice with a node each step, and
-            interpolated, instead of from each sample.
+        lead: Added to depths that were found, in voxels: how far in front of the true camera this one is.
+        shared: Whether the lights from the top and bottom are marched to from a lattice with a node each step (each
+            voxel, of smaller steps), and interpolated, instead of from each sample.
     """
     kernels = guide_kernels(density.dtype)
     if shared:
         nodes, kernel = lattice(density, extinction, seen.up, step), kernels.guide
     else:
         nodes, kernel = wp.empty((0, 0, 0), dtype=wp.vec2, device=density.device), kernels.guide_marching
-    inputs = [density, nodes, extinction, seen, step, jitter, seed, threshold, g, cutoff, unit]
+    inputs = [density, nodes, extinction, seen, step, jitter, seed, threshold, g, cutoff, unit, lead]
     wp.launch(kernel, out.shape[1:], inputs=inputs, outputs=[out], device=density.device)

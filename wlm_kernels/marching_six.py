@@ -31,7 +31,7 @@ from wlm_kernels.marching import (
 
 __all__ = ["EMISSION", "TRANSPARENCY", "lit", "six_kernels", "six_way"]
 
-wp.set_module_options({"enable_backward": False})
+_OPTIONS = {"enable_backward": False}
 
 TRANSPARENCY = 6
 EMISSION = 7
@@ -54,7 +54,7 @@ class _Kernels:
 def six_kernels(dtype: Any) -> _Kernels:
     """Builds (once) the kernels for densities of a type, ``wp.float32`` or ``wp.float16``."""
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", module_options=_OPTIONS)
     def column(
         # in:
         density: wp.array3d[dtype],
@@ -77,7 +77,7 @@ def six_kernels(dtype: Any) -> _Kernels:
                 total += extinction * skipping_at(density, bricks, r.origin + s * r.direction) * dz
         tau[row, col] = total
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", module_options=_OPTIONS)
     def sweep(
         # in:
         density: wp.array3d[dtype],
@@ -137,7 +137,7 @@ def six_kernels(dtype: Any) -> _Kernels:
             else:
                 tau[plane, count - 1 - k, line] = total
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", module_options=_OPTIONS)
     def gather(
         # in:
         density: wp.array3d[dtype],
@@ -205,7 +205,7 @@ def six_kernels(dtype: Any) -> _Kernels:
         out[TRANSPARENCY, row, col] = wp.exp(-tau)
         out[EMISSION, row, col] = out[EMISSION, row, col] + b[2]
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", module_options=_OPTIONS)
     def lit(
         # in:
         density: wp.array3d[dtype],

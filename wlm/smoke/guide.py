@@ -99,10 +99,9 @@ def guide(
             g=g,
             cutoff=cutoff,
             unit=volume.voxel,
+            lead=moved,
             shared=shared,
         )
-        if moved:
-            maps[2] += torch.where(maps[2] > 0, moved * volume.voxel, 0.0)
     return Guide(maps, camera)
 
 

@@ -24,7 +24,7 @@ from wlm.smoke.reference import SixWay
 __all__ = ["pack", "read_flipbook", "unpack", "write_flipbook"]
 
 _SUFFIXES = (".exr", ".png", ".tga")
-_MODES = {3: "RGB", 4: "RGBA"}
+_MODES = ("RGB", "RGBA")
 _BAD_FILE = (OSError, ValueError, SyntaxError, EOFError, UnidentifiedImageError, Image.DecompressionBombError)
 
 
@@ -151,7 +151,7 @@ def write_flipbook(
             write_exr(path, page)
             continue
         clipped += int((page > 1.0).sum())
-        image = Image.fromarray(np.round(np.clip(page, 0.0, 1.0) * 255.0).astype(np.uint8), _MODES[page.shape[2]])
+        image = Image.fromarray(np.round(np.clip(page, 0.0, 1.0) * 255.0).astype(np.uint8))
         with atomic_path(path) as temporary:
             image.save(temporary, format=_suffix(path)[1:].upper())
     return clipped
@@ -194,7 +194,7 @@ def _read(path: str | os.PathLike[str]) -> np.ndarray:
         return page
     try:
         with Image.open(path, formats=[_suffix(path)[1:].upper()]) as image:
-            if image.mode not in _MODES.values():
+            if image.mode not in _MODES:
                 raise WlmError(f"{path}: expected RGB or RGBA of 8 bits, found {image.mode}")
             return np.asarray(image).astype(np.float32) / np.float32(255.0)
     except _BAD_FILE as error:

@@ -19,6 +19,8 @@ from wlm.smoke.reference import SixWay
 
 __all__ = ["Light", "Ramp", "composite", "obstacle_visibility", "shade"]
 
+_SMALLEST_MAP = 8  # texels along an edge, of which four are the empty border
+
 
 @dataclass(frozen=True, eq=False)
 class Light:
@@ -136,14 +138,14 @@ def obstacle_visibility(
         toward: [3], the direction to the light in the world, of any length but 0.
         vertices: float32 [V, 3], the obstacles' corners in the world.
         triangles: int32 or int64 [F, 3], rows of the vertices.
-        resolution: Texels along an edge of the shadow map.
+        resolution: Texels along an edge of the shadow map, at least 8.
         bias: How much nearer to the light, in the world's unit, an obstacle must be to keep it off; None: 1.5 texels.
 
     Returns:
         float32 [H, W] in [0, 1], mixed between the four texels around a point; 1 where there is no smoke.
 
     Raises:
-        ValueError: A shape doesn't fit, or the direction has no length.
+        ValueError: A shape doesn't fit, the direction has no length, or the map is too small.
     """
     size = (camera.height, camera.width)
     if depth.shape != size:
@@ -153,6 +155,8 @@ def obstacle_visibility(
     if direction.shape != (3,) or not 1e-12 < length < np.inf:
         raise ValueError(f"toward: expected a direction of some length, got {direction.tolist()}")
     lit = torch.ones(size, dtype=torch.float32, device=depth.device)
+    if resolution < _SMALLEST_MAP:
+        raise ValueError(f"resolution: expected at least {_SMALLEST_MAP}, got {resolution}")
     if not len(triangles):
         return lit
     # Any turn about the light's direction will do.
@@ -162,8 +166,7 @@ def obstacle_visibility(
     low, high = corners[triangles.reshape(-1).unique()].aminmax(dim=0)
     middle = 0.5 * (low + high)
     # Square, and two texels wider than the obstacles on each side, so that the border is empty.
-    half = float((high - low)[:2].max()) * 0.5 * resolution / max(resolution - 4, 1)
-    half = max(half, 1e-9)
+    half = max(float((high - low)[:2].max()) * 0.5 * resolution / (resolution - 4), 1e-9)
     texel = 2.0 * half / resolution
     behind = max(float((high - low)[2]), 1e-9)
     flat = (corners - middle) / half

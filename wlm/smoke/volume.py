@@ -29,7 +29,7 @@ import os
 import struct
 import zipfile
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -39,7 +39,7 @@ import warp as wp
 from wlm.errors import WlmError
 from wlm.interop import check_device, to_warp
 
-__all__ = ["DensityVolume", "from_array", "load_volume"]
+__all__ = ["DensityVolume", "from_array", "from_grid", "load_volume"]
 
 _DENSITY, _TEMPERATURE = "density", "temperature"
 _BAD_FILE = (OSError, ValueError, EOFError, KeyError, MemoryError, NotImplementedError, zipfile.BadZipFile, zlib.error)
@@ -171,16 +171,24 @@ def load_volume(
         WlmError: One line that names the file and the field, for each error of the module's table.
     """
     path = Path(path)
-    reader = {".npz": _read_npz, ".nvdb": _read_nvdb}.get(path.suffix.lower())
-    if reader is None:
+    if path.suffix.lower() not in (".npz", ".nvdb"):
         raise WlmError(f"{path}: expected a name that ends in .npz or .nvdb, found {path.suffix or 'none'}")
     if not path.is_file():
         raise WlmError(f"{path}: no such file")
-    found = reader(path)
-    if voxel is not None:
-        scale = voxel / found["voxel"]
-        found |= {"voxel": voxel, "origin": tuple(scale * o for o in found["origin"])}
-    return from_array(**found, extinction=extinction, emission=emission, device=device, name=str(path))
+    factors = {"extinction": extinction, "emission": emission, "name": str(path)}
+    if path.suffix.lower() == ".npz":
+        found = from_array(**_read_npz(path), **factors, device=device)
+    else:
+        # Dense on the CPU: a file's tree lies in host memory anyway.
+        dense = from_grid(*_read_nvdb(path), **factors)
+        device = check_device(device)
+        hot = None if dense.temperature is None else dense.temperature.to(device)
+        found = replace(dense, density=dense.density.to(device), temperature=hot)
+    if voxel is None:
+        return found
+    if not 0 < voxel < np.inf:
+        raise WlmError(f"{path}: voxel: expected a length above 0, found {voxel}")
+    return replace(found, voxel=voxel, origin=tuple(voxel / found.voxel * o for o in found.origin))
 
 
 def _check(name: str, field: str, values: np.ndarray | torch.Tensor, device: str, warnings: list[str]) -> torch.Tensor:
@@ -240,58 +248,91 @@ def _dense(
     out[i, j, k] = wp.volume_lookup_f(grid, low[0] + i, low[1] + j, low[2] + k)
 
 
-def _read_nvdb(path: Path) -> dict:
-    """Reads grids into dense arrays: a march reads eight voxels a sample, each a walk down the tree otherwise."""
+def from_grid(
+    density: wp.Volume,
+    temperature: wp.Volume | None = None,
+    *,
+    extinction: float = 1.0,
+    emission: float = 1.0,
+    name: str = "grid",
+) -> DensityVolume:
+    """Makes a checked volume of a NanoVDB grid on its own device, over the box of its active voxels.
+
+    It becomes dense: a march reads eight voxels a sample, each of which would be a walk down the tree.
+
+    Args:
+        density: A grid of floats.
+        temperature: Another with the same transform, or None.
+        extinction: Per length of the world, of density 1.
+        emission: Light given off per length of the world at temperature 1.
+        name: What messages call it.
+
+    Returns:
+        The volume, repaired as the module's table says.
+
+    Raises:
+        WlmError: An error of the module's table.
+    """
+    info = density.get_grid_info()
+    matrix = np.array(info.transform_matrix, np.float64).reshape(3, 3)
+    voxel = abs(matrix[0, 0])
+    if not (voxel > 0 and np.allclose(matrix, voxel * np.eye(3), atol=1e-5 * voxel)):
+        raise WlmError(f"{name}: {info.name}: expected a grid of cubic voxels along the axes, found {matrix.tolist()}")
+    low, high = _box(name, density)
+    hot = None
+    if temperature is not None:
+        other = temperature.get_grid_info()
+        same = np.allclose(np.array(other.transform_matrix).reshape(3, 3), matrix, atol=1e-5 * voxel)
+        if not (same and np.allclose(other.translation, info.translation, atol=1e-4 * voxel)):
+            raise WlmError(f"{name}: {_TEMPERATURE}: expected the voxels of {info.name}")
+        hot = _fill(name, temperature, low, high)
+    return from_array(
+        _fill(name, density, low, high),
+        extinction=extinction,
+        voxel=float(voxel),
+        # NanoVDB's coordinates are those of voxel centres.
+        origin=tuple(float(t + voxel * (i - 0.5)) for t, i in zip(info.translation, low, strict=True)),
+        temperature=hot,
+        emission=emission,
+        device=str(density.device),
+        name=name,
+    )
+
+
+def _read_nvdb(path: Path) -> tuple[wp.Volume, wp.Volume | None]:
+    """The grids named density, or the first, and temperature, if there is one."""
     try:
         volume = wp.Volume.load_from_nvdb(path.read_bytes(), device="cpu")
         grids = []
         while volume is not None:
             grids.append(volume)
             volume = volume.load_next_grid()
-    except (RuntimeError, struct.error, *_BAD_FILE) as error:
+    except (RuntimeError, TypeError, struct.error, *_BAD_FILE) as error:
         raise WlmError(f"{path}: cannot read the NanoVDB file: {error or type(error).__name__}") from error
     names = [grid.get_grid_info().name for grid in grids]
     density = grids[names.index(_DENSITY)] if _DENSITY in names else grids[0]
-    info = density.get_grid_info()
-    matrix = np.array(info.transform_matrix, np.float64).reshape(3, 3)
-    voxel = abs(matrix[0, 0])
-    if not (voxel > 0 and np.allclose(matrix, voxel * np.eye(3), atol=1e-5 * voxel)):
-        raise WlmError(f"{path}: {info.name}: expected a grid of cubic voxels along the axes, found {matrix.tolist()}")
-    low, high = _box(path, density)
-    found = {
-        _DENSITY: _fill(path, density, low, high),
-        "voxel": float(voxel),
-        # NanoVDB's coordinates are those of voxel centres.
-        "origin": tuple(float(t + voxel * (i - 0.5)) for t, i in zip(info.translation, low, strict=True)),
-    }
-    if _TEMPERATURE in names:
-        hot = grids[names.index(_TEMPERATURE)]
-        other = hot.get_grid_info()
-        same = np.allclose(np.array(other.transform_matrix).reshape(3, 3), matrix, atol=1e-5 * voxel)
-        if not (same and np.allclose(other.translation, info.translation, atol=1e-4 * voxel)):
-            raise WlmError(f"{path}: {_TEMPERATURE}: expected the voxels of {info.name}")
-        found[_TEMPERATURE] = _fill(path, hot, low, high)
-    return found
+    return density, grids[names.index(_TEMPERATURE)] if _TEMPERATURE in names else None
 
 
-def _box(path: Path, volume: wp.Volume) -> tuple[np.ndarray, np.ndarray]:
+def _box(where: str, volume: wp.Volume) -> tuple[np.ndarray, np.ndarray]:
     """First and last active voxel, tiles too, from the header of the tree's root: Warp itself doesn't tell."""
     data = volume.array().numpy().tobytes()
     grid_header, root_offset = 672, 24
     root = grid_header + struct.unpack_from("<q", data, grid_header + root_offset)[0]
     corners = np.array(struct.unpack_from("<6i", data, root)).reshape(2, 3)
-    name = volume.get_grid_info().name
+    name = volume.get_grid_info().name or "grid 0"
     if (corners[1] < corners[0]).any():
-        raise WlmError(f"{path}: {name}: expected active voxels, found none")
+        raise WlmError(f"{where}: {name}: expected active voxels, found none")
     if np.prod((corners[1] - corners[0] + 1).astype(object)) > _LARGEST:
-        raise WlmError(f"{path}: {name}: expected a box of at most {_LARGEST} voxels, found {corners.tolist()}")
+        raise WlmError(f"{where}: {name}: expected a box of at most {_LARGEST} voxels, found {corners.tolist()}")
     return corners[0], corners[1]
 
 
-def _fill(path: Path, volume: wp.Volume, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+def _fill(where: str, volume: wp.Volume, low: np.ndarray, high: np.ndarray) -> torch.Tensor:
     info = volume.get_grid_info()
     if volume.dtype is not wp.float32:
-        raise WlmError(f"{path}: {info.name or 'grid 0'}: expected a grid of floats, found {info.type_str}")
-    out = wp.empty(tuple(int(n) for n in high - low + 1), dtype=float, device="cpu")
-    wp.launch(_dense, out.shape, inputs=[volume.id, wp.vec3i(*map(int, low))], outputs=[out], device="cpu")
-    return out.numpy()
+        raise WlmError(f"{where}: {info.name or 'grid 0'}: expected a grid of floats, found {info.type_str}")
+    out = wp.empty(tuple(int(n) for n in high - low + 1), dtype=float, device=volume.device)
+    inputs = [volume.id, wp.vec3i(*map(int, low))]
+    wp.launch(_dense, out.shape, inputs=inputs, outputs=[out], device=volume.device)
+    return wp.to_torch(out)

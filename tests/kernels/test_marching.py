@@ -1,0 +1,233 @@
+"""Guiding maps, transmittance and six-way lightmaps: against float64 references, closed forms and each other."""
+
+import numpy as np
+import pytest
+import warp as wp
+from reference import marching as reference
+from reference.marching import Scene
+
+from kernels.compare import array, close
+from wlm_kernels import marching, marching_six
+
+TYPES = {"float": wp.float32, "half": wp.float16}
+LOOSE = 2e-5  # of the largest value: what float32 leaves of sums over 100 samples
+
+
+def _scene(turned: bool, perspective: bool = False, inside: bool = False, seed: int = 3) -> Scene:
+    """Blobs of smoke with holes, of three unlike sizes, seen along an axis or askew."""
+    random = np.random.default_rng(seed)
+    density = np.maximum(random.normal(0.2, 0.6, (9, 12, 10)), 0).astype(np.float16).astype(np.float32)
+    density[:3, :5] = 0
+    axes = np.eye(3)
+    if turned:
+        axes = np.linalg.qr(random.normal(size=(3, 3)))[0]
+        axes *= np.sign(np.linalg.det(axes))
+    centre = np.array(density.shape) / 2
+    origin = centre + axes[2] * (0.5 if inside else 20.0)
+    pitch = 0.06 if perspective else 1.1
+    return Scene(density, 0.3, origin, *axes, pitch, 14, 11, perspective)
+
+
+def _view(scene: Scene) -> marching.View:
+    return marching.view(
+        scene.origin, scene.right, scene.up, -scene.toward, scene.pitch, scene.width, scene.height, scene.perspective
+    )
+
+
+def _guide(scene: Scene, device: str, dtype=wp.float32, **options) -> np.ndarray:
+    out = wp.full((3, scene.height, scene.width), np.nan, dtype=float, device=device)
+    marching.guide(array(scene.density, dtype, device), scene.extinction, _view(scene), out, **options)
+    return out.numpy()
+
+
+def _six(scene: Scene, device: str, dtype=wp.float32, temperature=None, **options) -> np.ndarray:
+    out = wp.full((8, scene.height, scene.width), np.nan, dtype=float, device=device)
+    if temperature is not None:
+        options["temperature"] = array(temperature, dtype, device)
+    marching_six.six_way(array(scene.density, dtype, device), scene.extinction, _view(scene), out, **options)
+    return out.numpy()
+
+
+def _lit(scene: Scene, device: str, toward: np.ndarray, **options) -> np.ndarray:
+    out = wp.full((scene.height, scene.width), np.nan, dtype=float, device=device)
+    marching_six.lit(array(scene.density, float, device), scene.extinction, _view(scene), toward, out, **options)
+    return out.numpy()
+
+
+@pytest.mark.parametrize("kind", TYPES)
+@pytest.mark.parametrize("perspective", [False, True])
+@pytest.mark.parametrize("turned", [False, True])
+def test_guide_against_reference(device: str, turned: bool, perspective: bool, kind: str):
+    """Algorithm 1 with a march from each sample, at a step that is no divisor of anything."""
+    scene = _scene(turned, perspective)
+    got = _guide(scene, device, TYPES[kind], step=2.37, jitter=0.0, g=0.3, threshold=0.1, cutoff=0.0, shared=False)
+    want = reference.guide(scene, 2.37, 0.3, 0.1)
+    for plane in range(3):
+        close(got[plane], want[plane], LOOSE, f"plane {plane}")
+
+
+def test_shared_lights(device: str):
+    """The lattice holds what the reference marches; with nodes a voxel apart the map is nearly the marched one."""
+    scene = _scene(True)
+    nodes = marching.lattice(array(scene.density, float, device), scene.extinction, scene.up, 2.5)
+    close(nodes.numpy(), reference.nodes(scene, 2.5), LOOSE, "nodes")
+    marched, coarse, fine = (
+        _guide(scene, device, step=step, jitter=0.0, shared=shared)[0]
+        for step, shared in ((0.1, False), (2.0, True), (0.1, True))
+    )
+    error = [np.sqrt(np.square(got - marched).mean() / np.square(marched).mean()) for got in (coarse, fine)]
+    # Of noise from voxel to voxel, the worst that a lattice can meet.
+    assert error[1] < 0.012 < error[0] < 0.2
+    nodes = marching.lattice(array(scene.density, float, device), scene.extinction, scene.up, 0.01)
+    assert nodes.shape == (11, 14, 12)
+
+
+def test_jitter(device: str):
+    """It moves samples within their steps: another seed, another map, no other mean; the same seed, the same bits."""
+    scene = _scene(True)
+    scene.height = scene.width = 64
+    scene.pitch = 0.15
+    first, again, other = (_guide(scene, device, step=3.0, seed=seed) for seed in (1, 1, 2))
+    still = _guide(scene, device, step=0.2, jitter=0.0)
+    np.testing.assert_array_equal(first, again)
+    assert (first != other).any(0).mean() > 0.3
+    for got in (first, other):
+        np.testing.assert_allclose(got[1].mean(), still[1].mean(), rtol=0.02)
+
+
+def test_cutoff(device: str):
+    """What a ray leaves out when it ends early is within what is said."""
+    scene = _scene(False)
+    scene.extinction = 3.0
+    whole = _guide(scene, device, step=0.5, jitter=0.0, cutoff=0.0)
+    for cutoff in (1e-1, 1e-3):
+        cut = _guide(scene, device, step=0.5, jitter=0.0, cutoff=cutoff)
+        error = np.abs(cut - whole)
+        assert 0 < error[0].max() < 2.5 * cutoff and 0 < error[1].max() < cutoff
+        np.testing.assert_array_equal(cut[2], whole[2])
+
+
+@pytest.mark.parametrize("kind", TYPES)
+@pytest.mark.parametrize("inside", [False, True])
+@pytest.mark.parametrize("turned", [False, True])
+def test_six_way_against_reference(device: str, turned: bool, inside: bool, kind: str, monkeypatch):
+    """With the same samples, in slabs of a few planes; from inside the smoke too, and smoke that glows."""
+    scene = _scene(turned, inside=inside)
+    hot = np.random.default_rng(1).uniform(0, 1, scene.density.shape).astype(np.float16).astype(np.float32)
+    monkeypatch.setattr(marching_six, "_SLAB_BYTES", 16 * scene.height * scene.width * 5)
+    got = _six(scene, device, TYPES[kind], hot, step=0.8, g=0.4, emission=0.2)
+    want = reference.six_way(scene, 0.8, 0.4, hot, 0.2)
+    for plane in range(8):
+        assert want[plane].max() > 0.01
+        close(got[plane], want[plane], LOOSE, f"plane {plane}")
+
+
+def test_image_smaller_than_the_smoke(device: str):
+    """Smoke outside the image still casts its shadow: a window of the map is the map of the window."""
+    scene = _scene(True)
+    scene.height = scene.width = 16
+    whole = _six(scene, device, step=0.8)
+    scene.height, scene.width = 4, 6
+    close(_six(scene, device, step=0.8), whole[:, 6:10, 5:11], LOOSE, "window")
+
+
+def test_six_way_against_single_lights(device: str):
+    """The shared sweeps against a march from each sample, which has no code of theirs, as both steps shrink."""
+    scene = _scene(True)
+    ways = [sign * axis for axis in (scene.right, scene.up, scene.toward) for sign in (1.0, -1.0)]
+    fine = [_lit(scene, device, way, step=0.04, g=0.3) for way in ways]
+    close(_lit(scene, device, ways[0], step=0.7, g=0.3), reference.lit(scene, ways[0], 0.7, 0.3), LOOSE, "one light")
+    errors = []
+    for step in (0.5, 0.125):
+        maps = _six(scene, device, step=step, g=0.3)
+        errors.append([np.sqrt(np.square(maps[c] - fine[c]).mean() / np.square(fine[c]).mean()) for c in range(6)])
+    assert max(errors[1]) < 1.5e-3
+    assert max(errors[1]) < 0.4 * max(errors[0])
+
+
+@pytest.mark.parametrize("extinction", [1e-4, 0.05, 2.0])
+def test_slab_closed_forms(device: str, extinction: float):
+    """A ray through the middle of a block: closed forms for what comes along it, one integral for the sides."""
+    n = 16
+    centre = np.full(3, n / 2)
+    density = np.ones((n, n, n), np.float32)
+    scene = Scene(density, extinction, centre + [0, 0, 30.0], *np.eye(3), 0.25, 1, 1)
+    tau = extinction * n
+    # The light from the sides falls off quickly within the dense block's face.
+    step = 0.05 if extinction < 1 else 0.01
+    got = _six(scene, device, step=step)[:, 0, 0]
+    assert got[6] == pytest.approx(np.exp(-tau), rel=1e-4)
+    assert got[4] == pytest.approx(-np.expm1(-2 * tau) / 2, rel=1e-4)
+    assert got[5] == pytest.approx(tau * np.exp(-tau), rel=1e-4)
+    # The density rises over one voxel at either face, and so does a side's optical depth.
+    z = (np.arange(200_000) + 0.5) * (n + 1) / 200_000 - 0.5
+    rise = np.clip(np.minimum(z + 0.5, n + 0.5 - z), 0, 1)
+    dz = z[1] - z[0]
+    passed = extinction * (np.cumsum(rise) - rise / 2) * dz
+    side = np.sum(extinction * rise * np.exp(-passed - extinction * rise * n / 2)) * dz
+    np.testing.assert_allclose(got[:4], side, rtol=2e-3 if extinction > 1 else 2e-4)
+    guide = _guide(scene, device, step=step, jitter=0.0, shared=False, cutoff=0.0)[:, 0, 0]
+    np.testing.assert_allclose(guide[0], got[4] + 2 * side, rtol=2e-3)
+    assert guide[1] == pytest.approx(got[6], rel=1e-4)
+
+
+def test_transmittance(device: str):
+    """Through the whole of a block, half of it and none; with skipped bricks as without."""
+    density = np.zeros((40, 20, 9), np.float32)
+    density[24:] = 1.0
+    points = np.array([[-5, 10, 4.5], [32, 10, 4.5], [50, 10, 4.5], [32, 100, 4.5], [32, 10, 4.5]])
+    out = wp.full(5, np.nan, dtype=float, device=device)
+    grid, at = array(density, float, device), array(points, wp.vec3, device)
+    marching.transmittance(grid, 0.1, at, (1.0, 0.0, 0.0), 0.25, out)
+    np.testing.assert_allclose(out.numpy(), np.exp([-1.6, -0.8, 0, 0, -0.8]), rtol=1e-5)
+    np.testing.assert_array_equal(marching.occupied(grid).numpy()[:, 0, 0], [0, 0, 1, 1, 1])
+    random = np.random.default_rng(7)
+    sparse = np.where(random.random((40, 20, 9)) < 0.02, 1.0, 0.0).astype(np.float32)
+    scene = Scene(sparse, 0.5, *np.zeros((4, 3)), 1, 1, 1)
+    p, way = random.uniform(0, [40, 20, 9], (50, 3)), np.array([0.6, 0.0, 0.8])
+    out = wp.full(50, np.nan, dtype=float, device=device)
+    grid = array(scene.density, float, device)
+    marching.transmittance(grid, 0.5, array(p, wp.vec3, device), way, 0.4, out)
+    close(out, np.exp(-reference.depth_to(scene, p.astype(np.float32), way, 0.4)), LOOSE, "transmittance")
+
+
+@pytest.mark.parametrize("kind", TYPES)
+@pytest.mark.parametrize("name", ["empty", "opaque", "one voxel", "away", "beside"])
+def test_hard_scenes(device: str, name: str, kind: str):
+    """Nothing there, a wall, a single voxel, a camera that looks away or past the smoke."""
+    density = np.ones((6, 6, 6), np.float32)
+    extinction, target = 1.0, np.array([3.0, 3.0, 3.0])
+    if name == "empty":
+        density[:] = 0
+    elif name == "opaque":
+        extinction = 1e6
+    elif name == "one voxel":
+        density = density[:1, :1, :1]
+        target = np.full(3, 0.5)
+    toward = np.array([0, 0, -30.0 if name == "away" else 30.0])
+    beside = np.array([500.0, 0, 0]) if name == "beside" else 0.0
+    scene = Scene(density, extinction, target + toward + beside, *np.eye(3), 0.25, 9, 9)
+    six = _six(scene, device, TYPES[kind], step=0.25)
+    guide = _guide(scene, device, TYPES[kind], step=2.0, jitter=0.0, threshold=1e-6)
+    assert np.isfinite(six).all() and np.isfinite(guide).all()
+    if name in ("empty", "away", "beside"):
+        assert not six[:6].any() and not guide[[0, 2]].any()
+        assert (six[6] == 1).all() and (guide[1] == 1).all()
+    elif name == "opaque":
+        middle = six[:, 3:6, 3:6]
+        assert (middle[6] == 0).all() and (guide[1, 3:6, 3:6] < 1e-4).all()
+        np.testing.assert_allclose(middle[4], 0.5, rtol=1e-5)
+        # A wall lights up from the front alone.
+        assert middle[[0, 1, 2, 3, 5]].max() < 1e-3
+    else:
+        # Tent functions: the mean of the density along the middle is that of one voxel.
+        assert six[6, 4, 4] == pytest.approx(np.exp(-1.0), rel=0.02)
+        assert six[4, 4, 4] == pytest.approx(-np.expm1(-2.0) / 2, rel=0.02)
+        assert 29 < guide[2, 4, 4] < 31
+
+
+def test_wrong_camera():
+    grid, out = wp.zeros((2, 2, 2), dtype=float, device="cpu"), wp.zeros((8, 2, 2), dtype=float, device="cpu")
+    view = marching.view((0, 0, 5), (1, 0, 0), (0, 1, 0), (0, 0, -1), 0.1, 2, 2, perspective=True)
+    with pytest.raises(ValueError, match="need an orthographic camera"):
+        marching_six.six_way(grid, 1.0, view, out)

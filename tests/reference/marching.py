@@ -1,0 +1,172 @@
+"""Marching through a density grid in float64 NumPy: every sample marches to its light alone, nothing is shared."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass
+class Scene:
+    """A grid [X, Y, Z], its extinction per voxel, and a camera in voxels as ``marching.View`` has it."""
+
+    density: np.ndarray
+    extinction: float
+    origin: np.ndarray
+    right: np.ndarray
+    up: np.ndarray
+    toward: np.ndarray
+    pitch: float
+    height: int
+    width: int
+    perspective: bool = False
+
+    def rays(self) -> tuple[np.ndarray, np.ndarray]:
+        """Origins and directions [H, W, 3]."""
+        u = (np.arange(self.width) + 0.5 - self.width / 2) * self.pitch
+        v = (self.height / 2 - np.arange(self.height) - 0.5) * self.pitch
+        across = u[None, :, None] * self.right + v[:, None, None] * self.up
+        if self.perspective:
+            d = across - self.toward
+            return np.broadcast_to(self.origin, d.shape), d / np.linalg.norm(d, axis=-1, keepdims=True)
+        return self.origin + across, np.broadcast_to(-self.toward, across.shape)
+
+
+def trilinear(grid: np.ndarray, p: np.ndarray) -> np.ndarray:
+    """The grid at points [..., 3], voxel centres at i + 1/2, zero outside."""
+    grid = np.pad(np.asarray(grid, np.float64), 1)
+    q = p + 0.5
+    low = np.floor(q).astype(int)
+    f = q - low
+    out = np.zeros(p.shape[:-1])
+    for corner in np.ndindex(2, 2, 2):
+        i = low + np.array(corner)
+        inside = ((i >= 0) & (i < grid.shape)).all(-1)
+        i = np.clip(i, 0, np.array(grid.shape) - 1)
+        w = np.prod(np.where(np.array(corner) == 1, f, 1 - f), -1)
+        out += np.where(inside, w * grid[i[..., 0], i[..., 1], i[..., 2]], 0.0)
+    return out
+
+
+def span(shape: tuple, o: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """First and last distance within the smoke's support, for rays [..., 3]."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        a, b = (-0.5 - o) / d, (np.array(shape) + 0.5 - o) / d
+    flat = np.abs(d) <= 1e-9
+    inside = (o >= -0.5) & (o <= np.array(shape) + 0.5)
+    near = np.where(flat, np.where(inside, -np.inf, np.inf), np.minimum(a, b))
+    far = np.where(flat, np.where(inside, np.inf, -np.inf), np.maximum(a, b))
+    return near.max(-1), far.min(-1)
+
+
+def depth_to(scene: Scene, p: np.ndarray, toward: np.ndarray, h: float) -> np.ndarray:
+    """Optical depth from points [..., 3] towards a light, in equal steps no longer than h."""
+    near, far = span(scene.density.shape, p, np.broadcast_to(toward, p.shape))
+    first = np.maximum(near, 0.0)
+    length = np.maximum(far - first, 0.0)
+    steps = np.ceil(length / h)
+    dt = length / np.maximum(steps, 1)
+    total = np.zeros(p.shape[:-1])
+    for n in range(int(steps.max(initial=0))):
+        s = first + (n + 0.5) * dt
+        q = p + np.where(n < steps, s, 0.0)[..., None] * toward
+        total += np.where(n < steps, trilinear(scene.density, q), 0.0)
+    return total * dt * scene.extinction
+
+
+def phase(g: float, cosine) -> np.ndarray:
+    """Henyey and Greenstein's, times 4 pi."""
+    return (1 - g * g) / (1 + g * g - 2 * g * cosine) ** 1.5
+
+
+def guide(scene: Scene, step: float, g: float, threshold: float) -> np.ndarray:
+    """Algorithm 1 without jitter, marching from each sample: light, transparency, depth, [3, H, W]."""
+    o, d = scene.rays()
+    near, far = span(scene.density.shape, o, d)
+    first = np.maximum(near, 0.0)
+    length = np.maximum(far - first, 0.0)
+    steps = np.ceil(length / step)
+    dt = length / np.maximum(steps, 1)
+    light, t, depth = np.zeros(steps.shape), np.ones(steps.shape), np.zeros(steps.shape)
+    rise = d @ scene.up
+    for n in range(int(steps.max(initial=0))):
+        on = n < steps
+        s = np.where(on, first + (n + 0.5) * dt, 0.0)
+        p = o + s[..., None] * d
+        sigma = np.where(on, scene.extinction * trilinear(scene.density, p), 0.0)
+        depth = np.where((depth == 0) & (sigma > threshold), s, depth)
+        x = sigma * dt
+        sides = phase(g, rise) * np.exp(-depth_to(scene, p, scene.up, step))
+        sides += phase(g, -rise) * np.exp(-depth_to(scene, p, -scene.up, step))
+        light += phase(g, -1.0) * t * t * (1 - np.exp(-2 * x)) / 2 + t * (1 - np.exp(-x)) * sides
+        t = t * np.exp(-x)
+    return np.stack([light, t, depth])
+
+
+def nodes(scene: Scene, step: float) -> np.ndarray:
+    """Optical depths to the top and bottom at the lattice's nodes, [A, B, C, 2]."""
+    axes = [np.linspace(-0.5, n + 0.5, int(np.ceil((n + 1) / step)) + 1) for n in scene.density.shape]
+    p = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
+    return np.stack([depth_to(scene, p, way, step) for way in (scene.up, -scene.up)], -1)
+
+
+def lit(scene: Scene, toward: np.ndarray, step: float, g: float) -> np.ndarray:
+    """Single scattering under one light, [H, W]."""
+    o, d = scene.rays()
+    near, far = span(scene.density.shape, o, d)
+    first = np.maximum(near, 0.0)
+    length = np.maximum(far - first, 0.0)
+    steps = np.ceil(length / step)
+    dt = length / np.maximum(steps, 1)
+    light, tau = np.zeros(steps.shape), np.zeros(steps.shape)
+    for n in range(int(steps.max(initial=0))):
+        s = np.where(n < steps, first + (n + 0.5) * dt, 0.0)
+        p = o + s[..., None] * d
+        x = np.where(n < steps, scene.extinction * trilinear(scene.density, p) * dt, 0.0)
+        light += np.exp(-tau - depth_to(scene, p, toward, step)) * (1 - np.exp(-x))
+        tau += x
+    return light * phase(g, d @ toward)
+
+
+def six_way(
+    scene: Scene, step: float, g: float, temperature: np.ndarray | None = None, emission: float = 0.0
+) -> np.ndarray:
+    """Right, left, top, bottom, front, back, transparency, emission, [8, H, W], with the kernels' own samples.
+
+    The planes' depths are those of the box; the lights to the sides are marched to from each sample in whole parts of a
+    pixel.
+    """
+    corners = np.array(list(np.ndindex(2, 2, 2))) * (np.array(scene.density.shape) + 1.0) - 0.5
+    depths = (corners - scene.origin) @ -scene.toward
+    near, far = depths.min(), depths.max()
+    o, d = scene.rays()
+
+    def samples(first: float, last: float) -> tuple[np.ndarray, float]:
+        count = max(int(np.ceil((last - first) / step)), 0)
+        dz = (last - first) / max(count, 1)
+        return first + (np.arange(count) + 0.5) * dz, dz
+
+    def column(first: float, last: float) -> np.ndarray:
+        at, dz = samples(first, last)
+        return sum((trilinear(scene.density, o + s * d) * dz * scene.extinction for s in at), np.zeros(o.shape[:2]))
+
+    behind, ahead = column(near, min(far, 0.0)), column(max(near, 0.0), far)
+    ds = scene.pitch / max(1, np.ceil(scene.pitch / step))
+    reach = int(np.ceil(np.linalg.norm(scene.density.shape) * 1.5 / ds)) + 1
+    at, dz = samples(max(near, 0.0), far)
+    out = np.zeros((8, *o.shape[:2]))
+    tau = np.zeros(o.shape[:2])
+    for s in at:
+        p = o + s * d
+        x = trilinear(scene.density, p) * dz * scene.extinction
+        share = np.exp(-tau) * (1 - np.exp(-x))
+        for c, way in enumerate((scene.right, -scene.right, scene.up, -scene.up)):
+            side = sum(trilinear(scene.density, p + (n + 0.5) * ds * way) for n in range(reach)) * ds * scene.extinction
+            out[c] += phase(g, 0.0) * share * np.exp(-side)
+        out[4] += phase(g, -1.0) * np.exp(-behind - 2 * tau) * (1 - np.exp(-2 * x)) / 2
+        out[5] += phase(g, 1.0) * np.exp(-ahead) * x
+        if temperature is not None:
+            hot = emission * trilinear(temperature, p) * dz
+            out[7] += hot * np.exp(-tau) * np.where(x > 0, (1 - np.exp(-x)) / np.where(x > 0, x, 1.0), 1.0)
+        tau += x
+    out[6] = np.exp(-tau)
+    return out

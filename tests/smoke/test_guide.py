@@ -1,0 +1,121 @@
+"""Guiding maps and transmittance in the world: units, cameras, hard smoke and the error of a large step."""
+
+import numpy as np
+import pytest
+import torch
+
+from wlm.smoke.axes import Camera
+from wlm.smoke.guide import guide, transmittance
+from wlm.smoke.volume import DensityVolume, from_array
+
+
+def _ball(device: str, n: int = 32, voxel: float = 0.5, extinction: float = 0.4) -> DensityVolume:
+    """A soft ball with a bump, off the origin of the world."""
+    axis = (np.arange(n) + 0.5) / n * 2 - 1
+    x, y, z = np.meshgrid(axis, axis, axis, indexing="ij")
+    density = np.clip(1.6 - 2 * np.sqrt(x**2 + y**2 + z**2), 0, 1) * (1 + 0.5 * np.sin(5 * x) * np.cos(4 * y))
+    return from_array(
+        density.astype(np.float32), extinction=extinction, voxel=voxel, origin=(10.0, -3.0, 5.0), device=device
+    )
+
+
+def _camera(volume: DensityVolume, way: tuple = (0.3, 0.4, 1.0), distance: float = 30.0, **options) -> Camera:
+    target = volume.centre
+    extent = options.pop("extent", 16.0)
+    position = target + distance * np.array(way) / np.linalg.norm(way)
+    return Camera.look_at(position, target, extent=extent, height=24, width=24, **options)
+
+
+@pytest.mark.parametrize("perspective", [False, True])
+def test_depth_is_in_the_world(device: str, perspective: bool):
+    """A pixel's depth along its ray ends on the ball's face; scale and shift change nothing else."""
+    volume = _ball(device)
+    camera = _camera(volume, extent=0.4 if perspective else 16.0, perspective=perspective)
+    got = guide(volume, camera, step=0.5, jitter=0.0, threshold=0.05)
+    origin, way = camera.rays()
+    depth = got.depth.cpu().numpy().astype(np.float64)
+    hit = depth > 0
+    assert 50 < hit.sum() < 24 * 24
+    distance = np.linalg.norm((origin + depth[..., None] * way - volume.centre)[hit], axis=1)
+    # A density of 0.25, the threshold, lies at 0.55 to 0.72 of the half size, 8, as the bumps go.
+    assert 4.2 < distance.min() and distance.max() < 5.8
+    twice = DensityVolume(volume.density, 0.5 * volume.extinction, 2 * volume.voxel, (0.0, 0.0, 0.0))
+    far = _camera(twice, distance=60.0, extent=0.4 if perspective else 32.0, perspective=perspective)
+    other = guide(twice, far, step=0.5, jitter=0.0, threshold=0.05)
+    np.testing.assert_allclose(other.light.cpu(), got.light.cpu(), atol=2e-4)
+    np.testing.assert_allclose(other.depth.cpu(), 2 * got.depth.cpu(), atol=2e-3)
+
+
+def test_distance_of_an_orthographic_camera(device: str):
+    """It changes the depths alone, by as much, even from very far."""
+    volume = _ball(device)
+    near, far = (
+        guide(volume, _camera(volume, distance=distance), jitter=0.0, step=1.0) for distance in (30.0, 30_000.0)
+    )
+    np.testing.assert_allclose(far.maps[:2].cpu(), near.maps[:2].cpu(), atol=1e-3)
+    hit = (near.depth > 0) & (far.depth > 0)
+    np.testing.assert_allclose((far.depth - near.depth)[hit].cpu(), 29_970.0, atol=0.3)
+    assert (far.depth[near.depth == 0] == 0).float().mean() > 0.99
+
+
+def test_camera_inside(device: str):
+    """It sees less smoke than from outside, and no depth beyond what is ahead."""
+    volume = _ball(device)
+    inside, outside = (
+        guide(volume, _camera(volume, distance=distance, extent=4.0), step=0.5, jitter=0.0) for distance in (0.5, 30.0)
+    )
+    assert torch.isfinite(inside.maps).all()
+    assert (inside.transparency > outside.transparency).all()
+    assert 0 < inside.depth.max() < 1
+
+
+def test_steps_against_a_fine_march(device: str):
+    """The error grows with the step, as a table has it; with a step of a voxel it is small."""
+    volume = _ball(device)
+    camera = _camera(volume)
+    fine = guide(volume, camera, step=0.1, jitter=0.0, cutoff=0.0, shared=False).maps
+    errors = []
+    for step in (1.0, 3.0, 10.0, 20.0):
+        maps = guide(volume, camera, step=step).maps
+        errors.append(float((maps[0] - fine[0]).square().mean().sqrt() / fine[0].square().mean().sqrt()))
+    assert errors[0] < 0.02 and errors[2] < 0.5
+    assert errors[0] < errors[1] < errors[2] < errors[3]
+
+
+def test_empty_and_repaired(device: str):
+    """No smoke: black, clear, no depth. Voxels that are NaN were made zero before."""
+    density = np.zeros((4, 4, 4))
+    density[1, 1, 1] = np.nan
+    volume = from_array(density, device=device)
+    maps = guide(volume, _camera(volume)).maps
+    assert not maps[[0, 2]].any() and (maps[1] == 1).all()
+
+
+def test_half(device: str):
+    """Half densities give what their values in float do."""
+    volume = _ball(device)
+    half = DensityVolume(volume.density.half(), volume.extinction, volume.voxel, volume.origin)
+    full = DensityVolume(volume.density.half().float(), volume.extinction, volume.voxel, volume.origin)
+    got, want = (guide(v, _camera(volume), step=2.0).maps.cpu() for v in (half, full))
+    np.testing.assert_array_equal(got, want)
+
+
+def test_transmittance(device: str):
+    """Through a block of 4 m with 0.5 a metre, from its middle, from behind it and from outside."""
+    volume = from_array(
+        np.full((8, 8, 8), 0.25, np.float32), extinction=2.0, voxel=0.5, origin=(1.0, 1.0, 1.0), device=device
+    )
+    points = torch.tensor([[3.0, 3, 3], [3, 3, -7], [3, 3, 20]], device=device)
+    got = transmittance(volume, points, (0.0, 0.0, 7.0))
+    np.testing.assert_allclose(got.cpu(), np.exp([-1.0, -2.0, 0.0]), rtol=1e-5)
+    with pytest.raises(ValueError, match="toward"):
+        transmittance(volume, points, (0.0, 0.0, 0.0))
+    with pytest.raises(ValueError, match=r"points: expected \[N, 3\]"):
+        transmittance(volume, points[0], (0.0, 0.0, 1.0))
+
+
+@pytest.mark.parametrize("options", [{"step": 0.0}, {"jitter": 2.0}, {"g": 1.0}])
+def test_wrong_settings(options: dict):
+    volume = _ball("cpu", 4)
+    with pytest.raises(ValueError, match=next(iter(options))):
+        guide(volume, _camera(volume), **options)

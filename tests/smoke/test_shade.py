@@ -1,0 +1,153 @@
+"""Shading: weights, many lights, glow, and the shadows of obstacles against rays cast."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from wlm.smoke.axes import VECTORS, Camera
+from wlm.smoke.reference import SixWay
+from wlm.smoke.shade import Light, Ramp, composite, obstacle_visibility, shade
+
+FULL = (4 * math.pi,) * 3
+
+
+def _camera(size: int = 8, way: tuple = (0.4, 0.7, 1.0)) -> Camera:
+    return Camera.look_at(10 * np.array(way), (0, 0, 0), extent=4.0, height=size, width=size)
+
+
+def _six(device: str, size: int = 8, emission: bool = False) -> SixWay:
+    random = np.random.default_rng(0)
+    maps = torch.tensor(random.uniform(0, 1, (8, size, size)), dtype=torch.float32, device=device)
+    return SixWay(maps[:6], maps[6], 2 * maps[7] if emission else None)
+
+
+def _box(low: tuple, high: tuple, device: str) -> tuple[torch.Tensor, torch.Tensor]:
+    corners = np.array(list(np.ndindex(2, 2, 2)))
+    vertices = np.where(corners == 1, high, low).astype(np.float32)
+    faces = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    triangles = [(a, b, c) for q in faces for a, b, c in ((q[0], q[1], q[2]), (q[0], q[2], q[3]))]
+    return torch.tensor(vertices, device=device), torch.tensor(triangles, device=device)
+
+
+def test_one_light_along_each_axis(device: str):
+    """Seen askew, a light along an axis of the camera gives that map, in its colour."""
+    six, camera = _six(device), _camera()
+    for index, way in enumerate(VECTORS):
+        toward = tuple(5.0 * camera.axes.T @ way)
+        got = shade(six, camera, [Light(toward, (4 * math.pi, 2 * math.pi, 0.0))])
+        want = six.lightmaps[index][..., None] * torch.tensor([1.0, 0.5, 0.0], device=device)
+        np.testing.assert_allclose(got.cpu(), want.cpu(), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("rule", "share"),
+    [("squared", (9 / 25, 16 / 25)), ("absolute", (3 / 5, 4 / 5)), ("normalised", (3 / 7, 4 / 7))],
+)
+def test_rules(device: str, rule: str, share: tuple):
+    """A light to the left and the back, by each rule; eq. 5 is "absolute"."""
+    six, camera = _six(device), _camera()
+    toward = tuple(camera.axes.T @ np.array([-3.0, 0.0, -4.0]))
+    got = shade(six, camera, [Light(toward, FULL)], rule=rule)[..., 0]
+    np.testing.assert_allclose(got.cpu(), (share[0] * six["left"] + share[1] * six["back"]).cpu(), atol=1e-6)
+
+
+def test_lights_add_up(device: str):
+    """Any number, none too; each with its own share of visible light."""
+    six, camera = _six(device), _camera()
+    lights = [Light((1.0, 2.0, 0.5), (1, 2, 3)), Light((-1.0, 0.1, 0.5), (3, 2, 1)), Light((0.0, 0.0, -1.0))]
+    both = sum(shade(six, camera, [light]) for light in lights)
+    np.testing.assert_allclose(shade(six, camera, lights).cpu(), both.cpu(), rtol=1e-5)
+    assert not shade(six, camera, []).any()
+    half = Light(lights[0].toward, lights[0].irradiance, torch.full((8, 8), 0.5, device=device))
+    want = 0.5 * shade(six, camera, lights[:1])
+    np.testing.assert_allclose(shade(six, camera, [half]).cpu(), want.cpu(), rtol=1e-5)
+
+
+def test_glow(device: str):
+    """Emission is grey without a ramp; with one it has the stops' colours, and those at the ends beyond them."""
+    six, camera = _six(device, emission=True), _camera()
+    np.testing.assert_allclose(shade(six, camera, []).cpu(), six.emission[..., None].expand(8, 8, 3).cpu())
+    ramp = Ramp((0.5, 1.0, 1.5), ((0, 0, 0), (1, 0.5, 0), (4, 4, 2)))
+    got = shade(six, camera, [], ramp=ramp).cpu().numpy()
+    for c in range(3):
+        want = np.interp(six.emission.cpu(), ramp.stops, [colour[c] for colour in ramp.colours])
+        np.testing.assert_allclose(got[..., c], want, atol=1e-5)
+    for wrong in (((1.0,), ((1, 1, 1),)), ((1.0, 1.0), ((0, 0, 0),) * 2), ((0.0, 1.0), ((0, 0, 0), (0, math.nan, 0)))):
+        with pytest.raises(ValueError, match="ramp"):
+            Ramp(*wrong)
+
+
+def test_composite(device: str):
+    """What is behind shows through by the transparency: eq. 4."""
+    six = _six(device)
+    light = torch.full((8, 8, 3), 0.25, device=device)
+    got = composite(light, six.transparency, (1.0, 2.0, 3.0))
+    want = 0.25 + six.transparency[..., None] * torch.tensor([1.0, 2.0, 3.0], device=device)
+    np.testing.assert_allclose(got.cpu(), want.cpu(), rtol=1e-6)
+    np.testing.assert_array_equal(composite(light, six.transparency, torch.zeros(8, 8, 3)).cpu(), light.cpu())
+
+
+@pytest.mark.parametrize("perspective", [False, True])
+@pytest.mark.parametrize("toward", [(0.0, 1.0, 0.0), (0.5, 1.0, -0.3), (0.0, 0.0, 1.0), (-1.0, 0.2, 0.4)])
+def test_shadow_of_a_box(device: str, toward: tuple, perspective: bool):
+    """Against rays cast to the light from a plane of smoke below and behind a box, but for a rim of some texels."""
+    way = (0.1, 1.0, 1.0)
+    extent = 0.6 if perspective else 6.0
+    camera = Camera.look_at(
+        10 * np.array(way) / np.linalg.norm(way), (0, 0, 0), extent=extent, height=40, width=40, perspective=perspective
+    )
+    low, high = (-0.8, 0.2, -0.5), (0.6, 1.0, 0.7)
+    origin, ray = camera.rays()
+    # Smoke's surface: the plane x + 2 y + 2 z = 0.3, which cuts the box.
+    normal = np.array([1.0, 2.0, 2.0])
+    depth = (0.3 - origin @ normal) / (ray @ normal)
+    depth[:, :3] = 0.0
+    depths = torch.tensor(depth, dtype=torch.float32, device=device)
+    got = obstacle_visibility(depths, camera, toward, *_box(low, high, device), resolution=512)
+    at = origin + depth[..., None] * ray
+    light = np.array(toward) / np.linalg.norm(toward)
+
+    def hidden(shrink: float) -> np.ndarray:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            a, b = ((np.array(c) - at) / light for c in (np.array(low) + shrink, np.array(high) - shrink))
+        near, far = np.minimum(a, b).max(-1), np.maximum(a, b).min(-1)
+        return (near < far) & (far > shrink)
+
+    rim = 0.03
+    got = got.cpu().numpy()
+    sure = depth > 0
+    assert (hidden(rim) & sure).sum() > 20
+    assert (got[sure & hidden(rim)] < 1e-6).all()
+    assert (got[sure & ~hidden(-rim)] == 1).all()
+    assert (got[~sure] == 1).all()
+
+
+def test_shadow_falls_behind_only(device: str):
+    """Smoke between the light and the obstacle is lit; a greater bias spares what is close behind."""
+    camera = Camera.look_at((0, 0, 10), (0, 0, 0), extent=4.0, height=9, width=9)
+    box = _box((-1, -1, -0.1), (1, 1, 0.1), device)
+    for depth, bias, want in ((8.0, None, 1.0), (12.0, None, 0.0), (12.0, 3.0, 1.0)):
+        depths = torch.full((9, 9), depth, device=device)
+        got = obstacle_visibility(depths, camera, (0, 0, 1), *box, bias=bias)
+        assert float(got[4, 4]) == want and float(got[0, 0]) == 1.0
+    none = torch.zeros((0, 3), dtype=torch.int64, device=device)
+    assert (obstacle_visibility(depths, camera, (0, 0, 1), box[0], none) == 1).all()
+
+
+def test_wrong_settings():
+    six, camera = _six("cpu"), _camera()
+    with pytest.raises(ValueError, match="irradiance"):
+        shade(six, camera, [Light((0, 0, 1), (-1, 0, 0))])
+    with pytest.raises(ValueError, match="directions"):
+        shade(six, camera, [Light((0, 0, 0))])
+    with pytest.raises(ValueError, match="visibility"):
+        shade(six, camera, [Light((0, 0, 1), FULL, torch.ones(2, 2))])
+    box = _box((0, 0, 0), (1, 1, 1), "cpu")
+    with pytest.raises(ValueError, match="depth"):
+        obstacle_visibility(torch.ones(2, 2), camera, (0, 0, 1), *box)
+    with pytest.raises(ValueError, match="toward"):
+        obstacle_visibility(torch.ones(8, 8), camera, (0, 0, 0), *box)
+    with pytest.raises(ValueError, match="resolution: expected at least 8"):
+        obstacle_visibility(torch.ones(8, 8), camera, (0, 0, 1), *box, resolution=4)
