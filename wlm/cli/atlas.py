@@ -305,24 +305,12 @@ def _inputs(output: "Output", mesh: Path | None, lightmap: Path | None, mask: Pa
 
 
 def _labels(model: "AtlasModel", mesh: "LightmappedMesh", device: str) -> "dict[str, Sampler]":
-    """Numbers of the tiles, or of the new UVs' charts, whose borders are seams of our own; none of a plain model."""
+    """Numbers of the new UVs' charts, whose borders are seams of our own; none where the mesh keeps its UVs."""
     import numpy as np
     import torch
 
     from wlm.atlas.charts import charts, welded
 
-    if model.method == "tiles":
-        rows, columns = model.lut.shape[:2]
-        side = model.profile.tile
-
-        def tile(uv: torch.Tensor, triangle: torch.Tensor, barycentric: torch.Tensor) -> torch.Tensor:
-            column, row = (
-                ((uv[:, i] * texels - 0.5) / side).floor().clamp(0, count - 1).long()
-                for i, texels, count in ((0, model.width, columns), (1, model.height, rows))
-            )
-            return row * columns + column
-
-        return {"ours": tile}
     if not len(model.uv):
         return {}
     corner = np.arange(3 * len(model.uv)).reshape(-1, 3)
