@@ -1,10 +1,12 @@
 """The figures in the documents are those of the committed benchmarks."""
 
+import re
 from pathlib import Path
 
 import pytest
 
 from wlm.bench import Row, read_json
+from wlm.bench.atlas import PANELS as ATLAS_PANELS
 from wlm.bench.probe import PANELS
 from wlm.bench.report import report
 
@@ -107,6 +109,34 @@ def test_readme_speed_of_the_probes_fit():
     ours, plain = (rows["livingroom 12.00", method, "standard 12,000 steps"] for method in ("fit", "dense torch"))
     ratio = plain.encode_seconds / ours.encode_seconds
     assert f"{ours.encode_seconds:.1f} s against {plain.encode_seconds:.0f} s, {ratio:.0f} times" in README
+
+
+def atlas_rows() -> dict[tuple[str, str, str], Row]:
+    return {(row.scene, row.method, row.option): row for row in read_json(FILES[1])[0] if row.system == "atlas"}
+
+
+@pytest.mark.parametrize("name", ["standard", "astc", "compact"])
+def test_readme_atlas(name):
+    rows = atlas_rows()
+    for title, method, option in [
+        (name, "ours", name),
+        *((f"{rival}, as `{name}`", rival, f"bits of {name}") for rival in ATLAS_PANELS[0].methods[1:]),
+    ]:
+        row = rows["mean over 18 lightmaps", method, option]
+        ratio, different, seams = (
+            float(re.search(pattern, row.notes)[1])
+            for pattern in (r"CR ([\d.]+)%", r"1-SSIM [^;]*mean ([\d.e-]+)", r"seam ratio [^;]*mean ([\d.]+)")
+        )
+        assert f"| {title} | {ratio:.1f}% | {row.psnr:.2f} | {different:.4f} | {seams:.2f} |" in README
+
+
+@pytest.mark.parametrize("mesh", sorted({scene.rsplit(" ", 1)[0] for scene, *_ in atlas_rows() if scene[0].isupper()}))
+def test_readme_meshes(mesh):
+    rows, cells = atlas_rows(), []
+    for time in ("day", "night"):
+        both = rows[f"{mesh} {time}", "ours", "standard"], rows[f"{mesh} {time}", "downsampling", "bits of standard"]
+        cells += [*(f"{row.psnr:.2f}" for row in both), *(f"{1 - row.ssim:.4f}" for row in both)]
+    assert f"| {mesh} | {' | '.join(cells)} |" in README
 
 
 def test_images_are_there():
