@@ -116,8 +116,9 @@ def test_no_room_for_a_rival_or_a_table():
     """Eight texels of a lightmap: what doesn't fit is named, and the others are measured."""
     cascade = PROFILES[2].model_copy(update={"scale": 0.2, "colour_scale": 0.2, "lut_scale": 0.2})
     lightmap = Lightmap("small", sheet(height=24, width=24))
+    alone = PROFILES[0].model_copy(update={"fallback": False})
     found = run_rows(
-        [lightmap], [PROFILES[0], cascade], device="cpu", views=1, resolution=32, whole=True, points=100, repeats=1
+        [lightmap], [alone, cascade], device="cpu", views=1, resolution=32, whole=True, points=100, repeats=1
     )
     missing = [row for row in found if "not measured" in row.notes]
     assert ("ours", "standard, bits of paper") in [(row.method, row.option) for row in missing]

@@ -63,6 +63,8 @@ def read(path: str | os.PathLike[str]) -> AtlasModel:
     artifact = read_artifact(path, SYSTEM)
     try:
         return _model(artifact)
+    except WlmError as error:  # of the blocks, which don't know their file
+        raise WlmError(f"{path}: {error}") from error
     except ValidationError as error:
         first = error.errors()[0]
         field = ".".join(str(part) for part in first["loc"])

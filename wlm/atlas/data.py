@@ -197,7 +197,7 @@ def write_mesh(
         path: The `.glb` to write; its folder must exist.
         mesh: The mesh.
         corner_uv: [F, 3, 2], the new UV of each triangle's corners; u right, v down; stored as float32.
-        uv_set: n of the new `TEXCOORD_n`; None takes the first that no primitive of the mesh has.
+        uv_set: n of the new `TEXCOORD_n`; None takes the one after the last that a primitive of the mesh has.
 
     Returns:
         n of the new set.

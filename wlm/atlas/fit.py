@@ -30,7 +30,7 @@ from wlm.atlas.model import (
     pack_entries,
 )
 from wlm.atlas.resize import fitting_size, resize
-from wlm.atlas.views import sphere_views, visibility, visible_uv
+from wlm.atlas.views import sphere_views, visibility
 from wlm.errors import WlmError
 from wlm.formats.exr import HALF_MAX
 from wlm.imageops import fill_gaps
@@ -39,12 +39,12 @@ from wlm.render import rasterize_uv, texture
 __all__ = ["Progress", "compress", "weights"]
 
 Progress = Callable[[str], None]
-"""Called with the name of each stage as it begins."""
+"""Called with the name of each stage as it begins, and in long ones with how far it is."""
 
 _BLOCK = 4
 _RIM = 2  # quarters of a texel along an axis: one texel
-_VIEW = 768  # pixels along a side, where visibility is counted and models are compared
-_COMPARED = 12  # views
+_VIEW = 768  # pixels along a side, where visibility is counted
+_NO_ROOM = "budget: {:g} of {}x{} texels is less than the smallest tiles and their table take: expected more"
 _POINTS = 4  # random points of the surface for each cell, where there are no views
 _POINTS_AT_ONCE = 1 << 20
 # A sample must save this share of the squared range, of one texel of the lightmap: half float's rounding there.
@@ -71,15 +71,15 @@ def compress(
         WlmError: No such device, a missing package, or a budget that the smallest model exceeds.
     """
     device = interop.check_device(device)
-    note = progress or (lambda stage: None)
-    clock = _Clock(note, device)
-    if profile.method == "tiles":
-        model = _tiles(mesh, profile, seed, device, clock)
-    else:
+    clock = _Clock(progress or (lambda stage: None), device)
+    model = _tiles(mesh, profile, seed, device, clock) if profile.method == "tiles" else None
+    if profile.method == "cascade":
         model = _cascade(mesh, profile, seed, device, clock)
     if profile.fallback:
         with clock("compare"):
-            model = _better(mesh, model, seed, device)
+            model = _better(mesh, model, profile, seed, device)
+    elif model is None:
+        raise WlmError(_NO_ROOM.format(profile.budget, *mesh.mask.shape[::-1]))
     # The cascade's own stages stand in for the one that they make up.
     seconds = {stage: time for stage, time in clock.seconds.items() if stage != "cascade"}
     return replace(model, report=model.report | {"seconds": seconds | model.report.get("seconds", {})})
@@ -90,7 +90,7 @@ def _cascade(mesh: LightmappedMesh, profile: Profile, seed: int, device: str, cl
     if profile.threshold > 0:
         # Any number will do for a black lightmap, whose triangles are all alike.
         brightest = float(mesh.lightmap[mesh.mask].max()) or 1.0
-        with clock("cluster"):
+        with clock("cluster") as said:
             clusters = cluster(
                 mesh.uv,
                 mesh.triangle,
@@ -100,38 +100,70 @@ def _cascade(mesh: LightmappedMesh, profile: Profile, seed: int, device: str, cl
                 max_radiance=brightest if profile.max_radiance is None else profile.max_radiance,
                 active=mesh.active,
                 device=device,
+                progress=said,
             )
-    with clock("cascade"):
-        return fit_cascade(mesh, clusters, profile, seed=seed, device=device)
+    with clock("cascade") as said:
+        return fit_cascade(mesh, clusters, profile, seed=seed, device=device, progress=said)
 
 
-def _better(mesh: LightmappedMesh, model: AtlasModel, seed: int, device: str) -> AtlasModel:
-    """The model, or a smaller lightmap of at most as many bits whose error in random views is no larger."""
+def _better(mesh: LightmappedMesh, model: AtlasModel | None, profile: Profile, seed: int, device: str) -> AtlasModel:
+    """The model, or a smaller lightmap of at most as many bits whose weighted error is no larger.
+
+    Without a model the smaller lightmap has the budget's bits, and a texel, or a block, at least.
+    """
     height, width = mesh.mask.shape
-    share = 1.0 - model.compression_ratio
-    whole = 1 if model.colour == "half" else _BLOCK
-    size = fitting_size(height, width, share * height * width * SOURCE_BITS, (whole, whole), COLOUR_BITS[model.colour])
+    share = profile.budget if model is None else 1.0 - model.compression_ratio
+    whole = 1 if profile.colour == "half" else _BLOCK
+    bits = COLOUR_BITS[profile.colour]
+    size = fitting_size(height, width, share * height * width * SOURCE_BITS, (whole, whole), bits)
     if size is None:
-        return model
-    blocks, texels = _stored(resize(mesh.lightmap, mesh.mask, *size), model.colour)
-    plain = replace(
-        model,
-        method="plain",
-        texels=texels,
-        blocks=blocks,
-        lut=np.empty((0, 0, 2), np.uint16),
-        uv=np.empty((0, 3, 2), np.float32),
+        if model is not None:
+            return model
+        size = 1, 1
+    blocks, texels = _stored(resize(mesh.lightmap, mesh.mask, *size), profile.colour)
+    no_lut, no_uv = np.empty((0, 0, 2), np.uint16), np.empty((0, 3, 2), np.float32)
+    plain = AtlasModel(
+        mesh.name, mesh.source, profile, "plain", profile.colour, height, width, texels, blocks, no_lut, no_uv
     )
-    image = torch.from_numpy(fill_gaps(mesh.lightmap, mesh.mask)).to(device)
-    decoders, total = (Decoder(model, device), Decoder(plain, device)), torch.zeros(2, dtype=torch.float64)
-    for seen, barycentric, uv in visible_uv(mesh, sphere_views(_COMPARED, seed + 1), _VIEW, device):
-        hit = seen >= 0
-        points = uv[hit], seen[hit], torch.cat([barycentric[hit], 1.0 - barycentric[hit].sum(1, keepdim=True)], 1)
-        wanted = texture(image, points[0])
-        total += torch.stack([(decoder(*points) - wanted).double().square().sum() for decoder in decoders]).cpu()
-    own, other = total.tolist()
-    report = model.report | {"error against a plain lightmap of as many bits": own / other if other else None}
-    return replace(plain if other <= own else model, report=report)
+    if model is None:
+        return replace(plain, report={"why plain": "tiles do not fit the budget"})
+    points, weight = _scored_points(mesh, weights(mesh, profile, seed + 1, device), device)
+    wanted = texture(torch.from_numpy(fill_gaps(mesh.lightmap, mesh.mask)).to(device), points[0])
+    own, other = (
+        float(((Decoder(each, device)(*points) - wanted).double().square().sum(1) * weight).sum())
+        for each in (model, plain)
+    )
+    ratio = {"error against a plain lightmap of as many bits": own / other if other else None}
+    if own < other:
+        return replace(model, report=model.report | ratio)
+    seconds = {key: value for key, value in model.report.items() if key == "seconds"}
+    return replace(plain, report=seconds | ratio | {"why plain": f"its error is no larger than that of {model.method}"})
+
+
+def _scored_points(
+    mesh: LightmappedMesh, weight: np.ndarray, device: str
+) -> tuple[tuple[torch.Tensor, torch.Tensor, torch.Tensor], torch.Tensor]:
+    """Centres of quarters of texels that are in a triangle, as a decoder takes them, and what each counts.
+
+    Where no triangle holds a centre, being too small, the quarters that count stand for their triangles.
+    """
+    height, width = weight.shape
+    active = np.flatnonzero(mesh.active)
+    raster = rasterize_uv(
+        torch.from_numpy(mesh.uv.astype(np.float32)).to(device),
+        torch.from_numpy(mesh.triangle[active]).to(device),
+        height,
+        width,
+    )
+    hit = raster.triangle >= 0
+    counts = torch.from_numpy(weight).to(device)
+    if not bool(hit.any()):
+        hit = counts > 0
+    row, column = torch.nonzero(hit, as_tuple=True)
+    uv = torch.stack([(column + 0.5) / width, (row + 0.5) / height], 1).float()
+    share = raster.barycentric[hit]
+    triangle = torch.from_numpy(active).to(device)[raster.triangle[hit].clamp(min=0).long()]
+    return (uv, triangle, torch.cat([share, 1.0 - share.sum(1, keepdim=True)], 1)), counts[hit]
 
 
 def _stored(texels: np.ndarray, kind: str) -> tuple[np.ndarray, np.ndarray]:
@@ -200,7 +232,8 @@ def _areas(mesh: LightmappedMesh, height: int, width: int, seed: int) -> np.ndar
     return count.reshape(height, width)
 
 
-def _tiles(mesh: LightmappedMesh, profile: Profile, seed: int, device: str, clock: "_Clock") -> AtlasModel:
+def _tiles(mesh: LightmappedMesh, profile: Profile, seed: int, device: str, clock: "_Clock") -> AtlasModel | None:
+    """The model; None where not even the smallest tiles and their table fit the budget."""
     with clock("weights"):
         image = fill_gaps(mesh.lightmap, mesh.mask)
         tiles = grid.cut(image, weights(mesh, profile, seed, device), profile.tile, device)
@@ -210,17 +243,17 @@ def _tiles(mesh: LightmappedMesh, profile: Profile, seed: int, device: str, cloc
     room = (bits - rows * columns * LUT_BITS) / COLOUR_BITS[profile.colour]
     sizes = _sizes(profile)
     if room < len(tiles.index) * min(nx * ny for nx, ny in sizes):
-        raise WlmError(
-            f"budget: {profile.budget:g} of {width}x{height} texels is less than {len(tiles.index)} tiles of {sizes[0]}"
-            " texels and their table take: expected more, or larger tiles"
-        )
+        return None
     with clock("curves"):
         stored = None if profile.colour == "half" else _through(profile.colour)
         error = grid.curves(tiles, sizes, stored)
     with clock("allocate"):
         peak = float(np.ptp(image[mesh.mask]))
         least = peak**2 * _LEAST_GAIN / (height * width)
-        chosen, first, shape = _fitted(error, np.array(sizes), room, least, profile.colour != "half")
+        found = _fitted(error, np.array(sizes), room, least, profile.colour != "half")
+        if found is None:
+            return None
+        chosen, first, shape = found
     with clock("solve"):
         samples = grid.solved(tiles, chosen)
     with clock("write"):
@@ -246,10 +279,11 @@ class _Clock:
         self._note, self._device = note, device
 
     @contextmanager
-    def __call__(self, stage: str) -> Iterator[None]:
+    def __call__(self, stage: str) -> Iterator[Callable[[int, int], None]]:
+        """Gives what a stage calls with how much of it is done."""
         self._note(stage)
         start = time.perf_counter()
-        yield
+        yield lambda done, total: self._note(f"{stage}: {done:,} of {total:,}")
         if self._device != "cpu":
             torch.cuda.synchronize(self._device)
         self.seconds[stage] = time.perf_counter() - start
@@ -261,7 +295,7 @@ def _sizes(profile: Profile) -> list[tuple[int, int]]:
         sides = range(1, profile.tile + 2)
     else:
         sides = range(_BLOCK, profile.tile + 1 + _BLOCK, _BLOCK)
-        sides = [side for side in sides if side < profile.tile + 1 + _BLOCK and side <= 1 << SIDE_BITS]
+        sides = [side for side in sides if side <= 1 << SIDE_BITS]
     return [(nx, ny) for ny in sides for nx in sides]
 
 
@@ -279,8 +313,8 @@ def _through(name: str) -> Callable[[torch.Tensor], torch.Tensor]:
 
 def _fitted(
     error: np.ndarray, sizes: np.ndarray, room: float, least: float, blocks: bool
-) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
-    """Sizes for which T_p, a rectangle, has room: sizes int [T, 2], first texels [T, 2], rows and columns."""
+) -> tuple[np.ndarray, np.ndarray, tuple[int, int]] | None:
+    """Sizes for which T_p, a rectangle, has room: sizes int [T, 2], first texels [T, 2], rows and columns; or None."""
     cost, budget = sizes.prod(1).astype(np.float64), room
     step, fewest = _BLOCK if blocks else 1, error.shape[1] * cost.min()
     while True:
@@ -300,9 +334,7 @@ def _fitted(
         if area <= room:
             return chosen, first, shape
         if total <= fewest:
-            raise WlmError(
-                f"budget: the smallest tiles pack into {area} texels, and it has room for {room:.0f}: expected more"
-            )
+            return None
         # What is wasted between the shelves is about as much next time.
         budget = min(budget, total) * min(0.999 * room / area, 0.99)
 

@@ -16,7 +16,7 @@ _ROUNDS = 20
 _PULL = 1e-4
 
 
-def fitting_size(height: int, width: int, budget: float, block: tuple[int, int], bits: int) -> tuple[int, int] | None:
+def fitting_size(height: int, width: int, budget: float, block: tuple[int, int], bits: float) -> tuple[int, int] | None:
     """The largest size of a shape whose blocks are within a budget.
 
     Args:
@@ -28,8 +28,9 @@ def fitting_size(height: int, width: int, budget: float, block: tuple[int, int],
     Returns:
         Rows and columns; None if not even one block fits.
     """
-    for rows in range(height, 0, -1):
-        columns = max(1, round(rows * width / height))
+    longest = max(height, width)
+    for side in range(longest, 0, -1):
+        rows, columns = (max(1, round(side * size / longest)) for size in (height, width))
         if -(-rows // block[0]) * -(-columns // block[1]) * block[0] * block[1] * bits <= budget:
             return rows, columns
     return None

@@ -24,7 +24,7 @@ from wlm.atlas.coverage import touched_texels
 from wlm.atlas.data import LightmappedMesh
 from wlm.atlas.evaluate import Sampler
 from wlm.atlas.model import SOURCE_BITS
-from wlm.atlas.resize import FILTERS, resize
+from wlm.atlas.resize import FILTERS, fitting_size, resize
 from wlm.formats import hdr_blocks
 from wlm.imageops import fill_gaps
 
@@ -185,14 +185,10 @@ def _budget(mesh: LightmappedMesh, share: float) -> int:
 
 def _fitting_size(mesh: LightmappedMesh, share: float, block: tuple[int, int], bits: int) -> tuple[int, int]:
     """The largest size of the lightmap's shape, up to its own, whose blocks (width, height) are within the budget."""
-    budget = _budget(mesh, share)
-    height, width = mesh.mask.shape
-    longest = max(height, width)
-    for side in range(longest, 0, -1):
-        rows, columns = (max(1, round(side * size / longest)) for size in (height, width))
-        if math.ceil(rows / block[1]) * math.ceil(columns / block[0]) * bits <= budget:
-            return rows, columns
-    raise ValueError(f"share: {share} of {height} x {width} texels has no room for {bits} bits")
+    size = fitting_size(*mesh.mask.shape, _budget(mesh, share), (block[1], block[0]), bits / (block[0] * block[1]))
+    if size is None:
+        raise ValueError(f"share: {share} of {mesh.mask.shape} texels has no room for {bits} bits")
+    return size
 
 
 def _within(merged: Callable, spread: float, texels: int) -> tuple[np.ndarray, np.ndarray, int]:

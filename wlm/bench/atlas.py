@@ -283,9 +283,11 @@ class _Bench:
         own = next((entry for entry in entries if entry.model and "fit" in entry.model.report["seconds"]), None)
         if own is None:
             return []
-        other = "uv" if own.model.profile.space == "views" else "views"
-        changed = self.fit(own.model.profile.model_copy(update={"space": other}), f"{own.row.option}, space {other}")
-        return [self._tuned(entry) for entry in (own, changed)]
+        # A cascade that doesn't pay is scored as the cascade that it is, here.
+        alone = own.model.profile.model_copy(update={"fallback": False})
+        spaces = (alone.space, "uv" if alone.space == "views" else "views")
+        fits = [self.fit(alone.model_copy(update={"space": space}), f"{own.row.option}, {space}") for space in spaces]
+        return [self._tuned(entry) for entry in fits]
 
     def _tuned(self, entry: _Entry) -> _Entry:
         p, seconds = entry.model.profile, entry.model.report["seconds"]["fit"]

@@ -45,7 +45,9 @@ def compress(
     uv_set: Annotated[
         int | None, typer.Option("--uv-set", min=0, help="n of TEXCOORD_n, the lightmap's UVs; default 1, else 0.")
     ] = None,
-    profile: Annotated[str, typer.Option(help="standard, bc6h, astc, cascade, paper, or a YAML file.")] = "standard",
+    profile: Annotated[
+        str, typer.Option(help="standard, bc6h, astc, compact, cascade, paper, or a YAML file.")
+    ] = "standard",
     budget: Annotated[
         float | None, typer.Option(help="Bits of both textures as a share of the lightmap's at 48 a texel.")
     ] = None,
@@ -53,11 +55,13 @@ def compress(
     views: Annotated[
         int | None, typer.Option(help="Random views that say how much each texel is seen; 0: by area.")
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="One seed gives one result on one device.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Of the random views.")] = 0,
     device: _Device = "cpu",
 ) -> None:
     """Compress the lightmap of a mesh into a folder: the model, the mesh, textures for engines, a shader, a report."""
     settings = _settings(profile, budget=budget, colour=colour, views=views)
+    if settings.method == "cascade" and budget is not None:
+        raise WlmError("--budget: profiles of the cascade have sizes of their own; expected one of tiles, or none")
     quiet_warp()
     from wlm.atlas.data import load_mesh
     from wlm.atlas.export import MODEL_FILE, check_folder, disk_ratio, export
