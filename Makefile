@@ -10,6 +10,7 @@ demo: $(STAMP)
 	$(BIN)/python demos/lightmap.py
 	$(BIN)/python demos/atlas.py
 	$(BIN)/python demos/probe.py
+	$(BIN)/python demos/smoke.py
 
 test: lint
 	$(BIN)/pytest -n 2

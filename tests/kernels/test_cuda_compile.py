@@ -8,7 +8,15 @@ import pytest
 import warp as wp
 
 from wlm_kernels import (
+    advection,
+    advection_sources,
     gaussian_sum,
+    lattice,
+    lattice_bricks,
+    lattice_fields,
+    lattice_links,
+    marching,
+    marching_six,
     mlp,
     probe_decode,
     probe_network,
@@ -20,11 +28,15 @@ from wlm_kernels import (
 
 ARCHITECTURE = 90
 MODULES = (
+    "advection_places",
     "blocks",
     "cascade",
     "gaussian_cubes",
     "gaussian_sum",
     "grids",
+    "lattice_bricks",
+    "lattice_links",
+    "lattice_solids",
     "mlp",
     "patch_graph",
     "patches",
@@ -116,3 +128,50 @@ def test_probe_network(latent: int, hidden: int, outputs: int, tmp_path: Path):
     """The network in training and in decode, whose CUDA forms the CPU never runs."""
     _compile_all(vars(probe_network.network_kernels(latent, hidden, outputs, "cuda")).values(), tmp_path / "network")
     _compile_all(vars(probe_decode.decode_kernels(latent, hidden, outputs, "cuda")).values(), tmp_path / "decode")
+
+
+@pytest.mark.parametrize("dtype", _slow_but(wp.float16, [wp.float32]))
+def test_marching(dtype: type, tmp_path: Path):
+    """Marches through densities of either type."""
+    _compile_all(vars(marching.guide_kernels(dtype)).values(), tmp_path / "guide")
+    _compile_all(vars(marching_six.six_kernels(dtype)).values(), tmp_path / "six")
+
+
+LATTICE_STEPS = (
+    {"lattice": "D3Q19", "solids": True, "walls": (True, True, True)},
+    {"lattice": "D3Q19", "solids": True, "storage": "float16", "bricks": True},
+    {"lattice": "D3Q19", "operator": "bgk", "force": "field"},
+    {"lattice": "D3Q27", "operator": "recursive", "solids": True, "force": "uniform"},
+    {"lattice": "D3Q27", "storage": "float16", "eddies": False},
+    {"lattice": "D2Q9", "operator": "recursive", "bricks": True},
+)
+
+
+@pytest.mark.parametrize("settings", _slow_but(LATTICE_STEPS[1], [LATTICE_STEPS[0], *LATTICE_STEPS[2:]]))
+def test_lattice_step(settings: dict, tmp_path: Path):
+    """Streaming and collision, by everything that changes the code."""
+    _compile_all([lattice.step_kernel(lattice.Spec(**settings))], tmp_path)
+
+
+@pytest.mark.parametrize("balance", _slow_but(True, [False]))
+@pytest.mark.parametrize(
+    ("name", "storage"),
+    [
+        ("D3Q19", "float32"),
+        *(pytest.param(*pair, marks=pytest.mark.slow) for pair in [("D2Q9", "float32"), ("D3Q27", "float16")]),
+    ],
+)
+def test_lattice_boundaries(name: str, storage: str, balance: bool, tmp_path: Path):
+    """Links, whose sums over a block only a GPU has, and what else is of one lattice and storage."""
+    _compile_all(vars(lattice_links.link_kernels(name, storage, balance)).values(), tmp_path / "links")
+    _compile_all(vars(lattice_fields.fluid_kernels(name, storage, (False, True, True))).values(), tmp_path / "fluid")
+    _compile_all([lattice_bricks.rest_kernel(name, storage)], tmp_path / "bricks")
+
+
+@pytest.mark.parametrize("storage", _slow_but("float16", ["float32"]))
+@pytest.mark.parametrize("solids", _slow_but(True, [False]))
+@pytest.mark.parametrize("bricks", _slow_but(True, [False]))
+def test_advection(bricks: bool, solids: bool, storage: str, tmp_path: Path):
+    """Both schemes; and sources, solids and buoyancy, which know no bricks."""
+    _compile_all(vars(advection.field_kernels(storage, bricks, solids)).values(), tmp_path / "fields")
+    _compile_all(vars(advection_sources.source_kernels(storage)).values(), tmp_path / "sources")

@@ -17,7 +17,7 @@ import typer
 from typer.core import TyperGroup
 
 from wlm import __version__
-from wlm.cli import atlas, bench, doctor, lightmap, probe
+from wlm.cli import atlas, bench, doctor, lightmap, probe, smoke
 from wlm.errors import WlmError, one_line
 
 __all__ = ["BAD_INPUT", "INTERRUPTED", "app", "main"]
@@ -64,6 +64,7 @@ app = typer.Typer(
 app.add_typer(lightmap.app, name="lightmap")
 app.add_typer(atlas.app, name="atlas")
 app.add_typer(probe.app, name="probe")
+app.add_typer(smoke.app, name="smoke")
 app.add_typer(bench.app, name="bench")
 app.command()(doctor.doctor)
 

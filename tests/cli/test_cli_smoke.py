@@ -1,0 +1,402 @@
+import json
+import math
+import os
+import re
+import signal
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from PIL import Image
+from smoke_plumes import SCENE, SPHERE, plume, write_frames
+from test_cli import call, fails
+
+import wlm.smoke.simulate
+from wlm.errors import WlmError
+from wlm.formats.exr_planes import read_planes
+from wlm.smoke.axes import axis_faults
+from wlm.smoke.data import CameraSettings, LightSettings, Scene, make_camera
+from wlm.smoke.frames import CHECKPOINT, open_footage, open_frames, read_six_way, save_volume
+from wlm.smoke.guide import guide
+from wlm.smoke.packing import read_flipbook
+from wlm.smoke.reference import six_way
+from wlm.smoke.simulate import simulate
+from wlm.smoke.solver import Solver
+from wlm.smoke.volume import from_array, load_volume
+from wlm.view.smoke import picture, to_bytes
+
+SMALL = ("--resolution", 20, "--step", 1)
+JET = SCENE | {
+    "grid": {"cells": [8, 10, 8], "cell": 0.125, "refine": 2, "origin": [-0.5, 0, -0.5]},
+    "obstacles": [{"radius": 0.17, "path": [[0, -0.25, 0.6, 0], [1, 0.25, 0.6, 0]]}],
+    "frames": 4,
+    "rate": 8.0,
+}
+
+
+@pytest.fixture(scope="session")
+def volume(tmp_path_factory):
+    path = tmp_path_factory.mktemp("volume") / "plume.npz"
+    save_volume(path, plume(hot=True))
+    return path
+
+
+@pytest.fixture(scope="session")
+def frames(tmp_path_factory):
+    """Three frames of a plume that a sphere passes."""
+    return write_frames(tmp_path_factory.mktemp("frames") / "a", obstacles=[SPHERE]).folder
+
+
+@pytest.fixture(scope="session")
+def baked(frames, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("baked") / "six"
+    call("smoke", "bake", frames, "-o", folder, *SMALL)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def jet(tmp_path_factory):
+    """A scene to simulate, and what it leaves."""
+    folder = tmp_path_factory.mktemp("jet")
+    (folder / "jet.yaml").write_text(yaml.safe_dump(JET))
+    call("smoke", "simulate", folder / "jet.yaml", "-o", folder / "a")
+    return folder
+
+
+def camera_of(volume, **settings):
+    size = volume.voxel * np.array(volume.shape)
+    return make_camera(CameraSettings(**{"resolution": 20} | settings), volume.origin, size)
+
+
+def png(path):
+    with Image.open(path) as image:
+        return np.asarray(image)
+
+
+def test_help_lists_the_commands():
+    assert "smoke" in call().split()
+    assert {"simulate", "guide", "bake", "shade", "flipbook"} <= set(call("smoke", "--help").split())
+
+
+def test_simulate(jet, tmp_path):
+    scene, out = jet / "jet.yaml", tmp_path / "out"
+    text = call("smoke", "simulate", scene, "-o", out)
+    assert re.search(r"density +│ +16 x 20 x 16 │", text) and "simulate: 4 of 4, smoke" in call.stderr
+    assert sorted(os.listdir(out)) == [*(f"frame_{i:04d}.npz" for i in range(1, 5)), "scene.json"]
+    footage = open_footage(out)
+    assert footage.scene == Scene.model_validate(JET)
+    amounts = [float(footage.load(number).density.sum()) for number in footage.numbers]
+    assert all(b > a > 0 for a, b in zip(amounts, amounts[1:], strict=False))
+    last = footage.load(4)
+    assert (last.voxel, last.extinction, last.temperature) == (0.0625, 8.0, None)
+    # The jet goes up, and none of it is in the sphere.
+    heights = last.density.sum((0, 2)).numpy()
+    assert heights[:4].min() > 1.0 > 0.01 > heights[-2:].max()
+    places = [last.origin[i] + last.voxel * (np.arange(n) + 0.5) for i, n in enumerate(last.shape)]
+    away = np.stack(np.meshgrid(*places, indexing="ij"), -1) - footage.scene.obstacles[0].centre(0.5)
+    assert not last.density[torch.from_numpy(np.linalg.norm(away, axis=-1) < 0.06)].any()
+    # One scene gives one result, however often.
+    for number in footage.numbers:
+        name = f"frame_{number:04d}.npz"
+        assert torch.equal(load_volume(out / name).density, load_volume(jet / "a" / name).density)
+
+
+def test_simulate_as_told(jet, tmp_path):
+    call("smoke", "simulate", jet / "jet.yaml", "-o", tmp_path / "a", "--frames", 1, "--scale", 0.5, "--resume")
+    assert "there was nothing to resume" in call.stderr
+    footage = open_footage(tmp_path / "a")
+    assert footage.numbers == (1,) and footage.scene.grid.cells == (4, 5, 4) and footage.scene.grid.cell == 0.25
+    line = fails("smoke", "simulate", "jet-sphere", "-o", tmp_path / "b", "--scale", 50)
+    assert "--scale: expected less than or equal to 4096" in line and not (tmp_path / "b").exists()
+    big = yaml.safe_dump(JET | {"grid": {"cells": [4096, 4096, 4096], "cell": 0.1, "faces": {}}})
+    (tmp_path / "big.yaml").write_text(big)
+    line = fails("smoke", "simulate", tmp_path / "big.yaml", "-o", tmp_path / "b")
+    assert "4096 x 4096 x 4096 cells" in line
+    (tmp_path / "fast.yaml").write_text(yaml.safe_dump(JET | {"air": {"speed": 0.1}}))
+    line = fails("smoke", "simulate", tmp_path / "fast.yaml", "-o", tmp_path / "b")
+    assert "cells a step: expected at most 0.3" in line
+    narrow = [SCENE["inlets"][0] | {"radius": 0.01}]
+    (tmp_path / "thin.yaml").write_text(yaml.safe_dump(JET | {"inlets": narrow}))
+    line = fails("smoke", "simulate", tmp_path / "thin.yaml", "-o", tmp_path / "b")
+    assert "inlets.0: expected a cell's centre within its radius" in line
+    slow = {"smoke": {"storage": "float16", "dissipation": 1e-3}}
+    (tmp_path / "half.yaml").write_text(yaml.safe_dump(JET | slow))
+    assert "with float16" in fails("smoke", "simulate", tmp_path / "half.yaml", "-o", tmp_path / "b")
+    assert "jet-sphere" in fails("smoke", "simulate", "none", "-o", tmp_path / "b")
+    assert "found other files" in fails("smoke", "simulate", jet / "jet.yaml", "-o", tmp_path)
+
+
+def test_a_simulation_is_stopped_and_resumed(jet, tmp_path, monkeypatch):
+    """Ctrl-C during the second frame keeps it; the rest comes out the same to the last bit."""
+    out, scene = tmp_path / "out", jet / "jet.yaml"
+    step, done = Solver.step, []
+
+    def interrupted(self, steps=1):
+        step(self, steps)
+        done.append(1)
+        if len(done) == 9:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    per_frame = Scene.model_validate(JET).steps // 2
+    assert per_frame < 9 <= 2 * per_frame
+    monkeypatch.setattr(Solver, "step", interrupted)
+    call("smoke", "simulate", scene, "-o", out, code=130)
+    monkeypatch.undo()
+    assert f"stopped at frame 2: the same command with --resume goes on from {out}" in call.stderr
+    assert sorted(os.listdir(out)) == ["frame_0001.npz", "frame_0002.npz", "scene.json", CHECKPOINT]
+    # With another scene it isn't resumed, and nothing is lost by the attempt.
+    (tmp_path / "other.yaml").write_text(yaml.safe_dump(JET | {"air": {"viscosity": 1.0}}))
+    assert "whose air differs" in fails("smoke", "simulate", tmp_path / "other.yaml", "-o", out, "--resume")
+    call("smoke", "simulate", scene, "-o", out, "--resume")
+    assert sorted(os.listdir(out)) == [*(f"frame_{i:04d}.npz" for i in range(1, 5)), "scene.json"]
+    for number in range(1, 5):
+        name = f"frame_{number:04d}.npz"
+        assert torch.equal(load_volume(out / name).density, load_volume(jet / "a" / name).density)
+    # All is there: nothing is done again.
+    before = (out / "frame_0004.npz").stat().st_mtime_ns
+    call("smoke", "simulate", scene, "-o", out, "--resume")
+    assert "nothing to resume" not in call.stderr
+    assert (out / "frame_0004.npz").stat().st_mtime_ns == before
+
+
+def test_a_blow_up_keeps_the_last_good_state(tmp_path, monkeypatch):
+    monkeypatch.setattr(wlm.smoke.simulate, "KEPT_EVERY", 1)
+    scene = Scene.model_validate(JET)
+    out = tmp_path / "out"
+    check, calls = Solver.check, []
+
+    def failing(self):
+        calls.append(self.steps)
+        if len(calls) > 4:
+            raise WlmError("lattice: blew up in step 9 at cell (1, 2, 3): not a number" + self._kept)
+        check(self)
+
+    monkeypatch.setattr(Solver, "check", failing)
+    with pytest.raises(WlmError, match="blew up in step 9"):
+        simulate(open_frames(out, scene))
+    assert (out / CHECKPOINT).exists()
+    monkeypatch.undo()
+    first = simulate(open_frames(out, scene, resume=True), resume=True)
+    assert 1 < first <= 4 and not (out / CHECKPOINT).exists() and open_footage(out).numbers == (1, 2, 3, 4)
+
+
+@pytest.mark.parametrize("case", ["empty", "covered", "one cell", "hot", "bricks of halves"])
+def test_hard_scenes(case, tmp_path):
+    changed = {
+        "empty": {"inlets": []},
+        # The body lies over the inlet: no smoke comes in.
+        "covered": {"obstacles": [{"radius": [0.6, 0.2, 0.6], "shape": "box", "path": [[0, 0, 0, 0]]}]},
+        "one cell": {"grid": {"cells": [1, 1, 1], "cell": 1.0, "refine": 1}, "inlets": [], "obstacles": []},
+        "bricks of halves": {"smoke": {"bricks": True, "storage": "float16", "scheme": "semi-lagrangian"}},
+        "hot": {
+            "inlets": [],
+            "obstacles": [{"radius": [0.1, 0.1, 0.1], "shape": "cylinder", "path": [[0, 0, 1.0, 0]]}],
+            "smoke": {"buoyancy": 20.0, "weight": 1.0, "emission": 4.0, "cooling": 0.5, "dissipation": 0.1},
+            "sources": [{"centre": [0, 0.4, 0], "radius": 0.25, "temperature": 1.0, "stop": 0.2}],
+        },
+    }[case]
+    scene = Scene.model_validate(JET | {"obstacles": []} | changed | {"frames": 2})
+    amounts = []
+    simulate(open_frames(tmp_path / "a", scene), progress=lambda frame, figures: amounts.append(figures["smoke"]))
+    last = open_footage(tmp_path / "a").load(2)
+    assert len(amounts) == 2 and last.warnings == ()
+    assert (amounts[-1] > 0) == (case in ("hot", "bricks of halves"))
+    assert (last.temperature is not None) == (case == "hot")
+    assert (last.density.dtype == torch.float16) == (case == "bricks of halves")
+    if case == "hot":
+        rows = last.density.sum((0, 2)) * torch.arange(last.shape[1])
+        assert float(rows.sum() / last.density.sum()) > 0.4 / last.voxel, "it rises"
+
+
+def test_guide(volume, tmp_path):
+    out = tmp_path / "g.exr"
+    text = call("smoke", "guide", volume, "-o", out, "--resolution", 20, "--step", 3, "--jitter", 0, "--extinction", 8)
+    loaded = load_volume(volume, extinction=8.0)
+    expected = guide(loaded, camera_of(loaded), step=3.0, jitter=0.0)
+    planes, note = read_planes(out)
+    assert sorted(planes) == ["depth", "light", "transparency"] and note["camera"]["height"] == 20
+    for name in planes:
+        np.testing.assert_array_equal(planes[name], getattr(expected, name).numpy())
+    depth = expected.depth[expected.depth > 0]
+    assert f"{float(depth.min()):.4g}" in text and "g.exr" in text
+    # From elsewhere, and from within.
+    words = ["--toward", "1,0,0", "--turn", 90, "--distance", 0.1, "--extent", 0.5, "--perspective", "--resolution", 8]
+    call("smoke", "guide", volume, "-o", out, *words)
+    camera = read_planes(out)[1]["camera"]
+    assert camera["perspective"] and (camera["height"], camera["extent"]) == (8, 0.5)
+    np.testing.assert_allclose(camera["toward"], [0, 0, -1], atol=1e-9)
+    np.testing.assert_allclose(camera["position"], [0, 0.6, -0.1], atol=1e-9)
+
+
+def test_guide_of_frames(frames, tmp_path):
+    text = call("smoke", "guide", frames, "-o", tmp_path / "g", "--resolution", 16)
+    names = [f"guide_{i:04d}.exr" for i in (1, 2, 3)]
+    assert sorted(os.listdir(tmp_path / "g")) == names and all(name in text for name in names)
+    clear = [read_planes(tmp_path / "g" / name)[0]["transparency"].mean() for name in names]
+    assert clear[0] > clear[1] > clear[2]
+    # Again, over the earlier ones; not over others' files, nor into the frames.
+    call("smoke", "guide", frames, "-o", tmp_path / "g", "--resolution", 8)
+    assert "found guide_0001.exr" in fails("smoke", "bake", frames, "-o", tmp_path / "g")
+    assert "another folder than that of the frames" in fails("smoke", "guide", frames, "-o", frames)
+
+
+def test_bake(volume, tmp_path):
+    out = tmp_path / "b.exr"
+    text = call("smoke", "bake", volume, "-o", out, *SMALL, "--supersample", 2, "--g", 0.3, "--emission", 2)
+    loaded = load_volume(volume, emission=2.0)
+    camera = camera_of(loaded)
+    expected = six_way(loaded, camera, step=1.0, supersample=2, g=0.3)
+    found, seen = read_six_way(out)
+    assert seen == camera
+    for name in ("lightmaps", "transparency", "emission"):
+        torch.testing.assert_close(getattr(found, name), getattr(expected, name).half().float(), rtol=0, atol=0)
+    assert f"{expected.error.largest:.2g}" in text and f"{expected.error.rms:.2g}" in text
+
+
+def test_bake_of_frames(baked):
+    assert sorted(os.listdir(baked)) == [f"six_{i:04d}.exr" for i in (1, 2, 3)]
+    six, _ = read_six_way(baked / "six_0003.exr")
+    assert axis_faults(six.lightmaps.numpy()) == () and six.emission is None
+
+
+def test_lightmaps_that_are_alike_are_noted(tmp_path):
+    # A small piece of an even, thin cloud is as bright everywhere.
+    save_volume(tmp_path / "a.npz", from_array(np.full((8, 8, 8), 0.1), voxel=0.1))
+    call("smoke", "bake", tmp_path / "a.npz", "-o", tmp_path / "a.exr", *SMALL, "--extent", 0.01)
+    assert re.search(r"a.exr: note: \w+ isn't brighter", call.stderr)
+
+
+def test_shade(volume, frames, baked, tmp_path):
+    out = tmp_path / "s.png"
+    lights = ["--light", "1,0,0", "--light", "0,2,0:6,3,0", "--light", "0,0,1:1"]
+    call("smoke", "shade", volume, "-o", out, *SMALL, *lights, "--background", "0.1,0.2,0.3", "--white", 2)
+    loaded = load_volume(volume)
+    camera = camera_of(loaded)
+    given = [((1, 0, 0), (4 * math.pi,) * 3), ((0, 2, 0), (6, 3, 0)), ((0, 0, 1), (1, 1, 1))]
+    made = [LightSettings(toward=toward, irradiance=irradiance).light() for toward, irradiance in given]
+    six = six_way(loaded, camera, step=1.0, estimate=False)
+    expected = to_bytes(picture(six, camera, made, background=(0.1, 0.2, 0.3)), 2.0)
+    np.testing.assert_array_equal(png(out), expected)
+    # Baked lightmaps know their camera.
+    call("smoke", "shade", baked / "six_0002.exr", "-o", out, "--light", "1,1,0", "--rule", "absolute")
+    six, camera = read_six_way(baked / "six_0002.exr")
+    light = LightSettings(toward=(1, 1, 0)).light()
+    np.testing.assert_array_equal(png(out), to_bytes(picture(six, camera, [light], rule="absolute")))
+    # Frames have a scene: its obstacle is in the picture, and moves.
+    text = call("smoke", "shade", frames, "-o", tmp_path / "s", *SMALL)
+    names = [f"shade_{i:04d}.png" for i in (1, 2, 3)]
+    assert sorted(os.listdir(tmp_path / "s")) == [*names, "sheet.png"] and all(name in text for name in names)
+    call("smoke", "shade", baked, "-o", tmp_path / "t")
+    differ = [png(tmp_path / "s" / name) != png(tmp_path / "t" / name) for name in names]
+    columns = [np.flatnonzero(each.any((0, 2))).mean() for each in differ]
+    assert columns[0] < columns[1] < columns[2]
+    assert png(tmp_path / "s" / "sheet.png").shape[1] > 3 * 20
+
+
+def test_a_scenes_glow(tmp_path):
+    """The emission's colour is that of the scene's stops, without any light."""
+    smoke = {"extinction": 8.0, "emission": 5.0, "glow": [[0, 0, 0, 0], [0.1, 1, 0.5, 0], [9, 1, 0.5, 0]]}
+    folder = write_frames(tmp_path / "a", smoke=smoke, lights=[], frames=1).folder
+    save_volume(folder / "frame_0001.npz", plume(hot=True))
+    call("smoke", "shade", folder, "-o", tmp_path / "s", *SMALL)
+    found = png(tmp_path / "s" / "shade_0001.png")
+    # sRGB of a half is 188.
+    assert found.reshape(-1, 3).max(0).tolist() == [255, 188, 0]
+
+
+@pytest.mark.parametrize("layout", ["unity", "o3de", "o3de-tlrb", "embergen"])
+def test_flipbook(layout, baked, volume, tmp_path):
+    text = call("smoke", "flipbook", baked, "-o", tmp_path / "f.exr", "--layout", layout)
+    assert sorted(os.listdir(tmp_path)) == ["f_1.exr", "f_2.exr"] and "2 x 2 cells of 20 x 20" in text
+    paths = (tmp_path / "f_1.exr", tmp_path / "f_2.exr")
+    found = read_flipbook(paths, layout, rows=2, columns=2, count=3)
+    for number, frame in enumerate(found, 1):
+        six, _ = read_six_way(baked / f"six_{number:04d}.exr")
+        torch.testing.assert_close(frame.lightmaps, six.lightmaps)
+        torch.testing.assert_close(frame.transparency, six.transparency, rtol=0, atol=1e-3)
+    assert ("emission" in text) == (layout == "o3de-tlrb"), "the last channel is left out where nothing glows"
+
+
+def test_flipbook_of_volumes(volume, frames, tmp_path):
+    text = call("smoke", "flipbook", volume, "-o", tmp_path / "f.png", *SMALL)
+    gain = float(re.search(r"gain +│ +([\d.]+) ", text)[1])
+    loaded = load_volume(volume)
+    six = six_way(loaded, camera_of(loaded), step=1.0, estimate=False)
+    brightest = max(float(six.lightmaps.max()), float(six.emission.max()))
+    assert gain == pytest.approx(1 / brightest, rel=1e-3)
+    gain = 1 / brightest
+    assert " 0 numbers clipped" in text
+    found = read_flipbook((tmp_path / "f_1.png", tmp_path / "f_2.png"), "unity", rows=1, columns=1, gain=gain)[0]
+    torch.testing.assert_close(found.lightmaps, six.lightmaps, rtol=0, atol=0.51 / 255 / gain)
+    torch.testing.assert_close(found.emission, six.emission, rtol=0, atol=0.51 / 255 / gain)
+    words = ["--count", 2, "--columns", 9, "--gain", 9]
+    text = call("smoke", "flipbook", frames, "-o", tmp_path / "g.tga", *SMALL, *words)
+    assert "1 x 2 cells of 20 x 20" in text and " 0 numbers clipped" not in text
+    found = read_flipbook((tmp_path / "g_1.tga", tmp_path / "g_2.tga"), "unity", rows=1, columns=2, gain=9.0)
+    opaque = [1 - float(frame.transparency.mean()) for frame in found]
+    assert opaque[1] > 3 * opaque[0], "the first and the last"
+
+
+def test_hard_volumes(tmp_path):
+    """Empty smoke, NaN, one voxel: each command ends well."""
+    cases = {"empty": np.zeros((4, 5, 6)), "nan": np.full((3, 3, 3), np.nan), "one": np.ones((1, 1, 1))}
+    for name, density in cases.items():
+        path = tmp_path / f"{name}.npz"
+        np.savez(path, density=density)
+        for command, suffix in (("guide", "exr"), ("bake", "exr"), ("shade", "png"), ("flipbook", "png")):
+            # A light and a camera along an axis.
+            light = ["--light", "0,-1,0"] if command == "shade" else []
+            words = [*light, "--toward", "0,1,0", "--resolution", 5]
+            call("smoke", command, path, "-o", tmp_path / f"{name}-{command}.{suffix}", *words)
+            assert ("warning: " in call.stderr and "27 NaN" in call.stderr) == (name == "nan")
+        picture = png(tmp_path / f"{name}-shade.png")
+        assert bool(picture.any()) == (name == "one")
+
+
+def test_wrong_words_are_one_line(volume, frames, baked, tmp_path):
+    out = tmp_path / "a.exr"
+    made = ("smoke", "bake", volume, "-o", out)
+    assert "--toward: expected three numbers" in fails(*made, "--toward", "1,0")
+    assert "--toward: expected a direction of some length" in fails(*made, "--toward", "0,0,0")
+    assert "--toward: expected finite numbers" in fails(*made, "--toward", "0,inf,0")
+    assert "--extent: expected greater than 0" in fails(*made, "--extent", -1)
+    assert "--distance: expected greater than 0" in fails(*made, "--distance", 0)
+    assert "extinction: expected a number above 0" in fails(*made, "--extinction", 0)
+    assert "--step" in fails(*made, "--step", 0)
+    assert "device 'tpu'" in fails(*made, "--device", "tpu")
+    assert "ends in .exr" in fails("smoke", "bake", volume, "-o", tmp_path / "a.png")
+    assert "gone.npz: no such file" in fails("smoke", "bake", tmp_path / "gone.npz", "-o", out)
+    assert "expected a name that ends in .npz or .nvdb" in fails("smoke", "bake", tmp_path / "a.vdb", "-o", out)
+    shaded = ("smoke", "shade", volume, "-o", tmp_path / "a.png")
+    assert "--light: expected three numbers" in fails(*shaded, "--light", "up")
+    assert "--light: expected a direction" in fails(*shaded, "--light", "0,0,0")
+    assert "--light: expected greater than or equal to 0" in fails(*shaded, "--light", "0,0,1:-1")
+    assert "--rule: expected one of squared" in fails(*shaded, "--rule", "cubed")
+    assert "--white: expected a number above 0" in fails(*shaded, "--white", 0)
+    assert "--background: expected three numbers" in fails(*shaded, "--background", "black")
+    one = baked / "six_0001.exr"
+    assert "was baked: --resolution" in fails("smoke", "shade", one, "-o", tmp_path / "a.png", "--resolution", 8)
+    assert "expected a folder that simulate or bake wrote" in fails("smoke", "shade", tmp_path, "-o", tmp_path / "x")
+    packed = ("smoke", "flipbook", baked, "-o", tmp_path / "a.png")
+    assert "--layout: expected one of unity" in fails(*packed, "--layout", "godot")
+    assert "--gain: expected a number above 0" in fails(*packed, "--gain", 0)
+    assert "ends in .exr or .png or .tga" in fails("smoke", "flipbook", baked, "-o", tmp_path / "a.jpg")
+    assert os.listdir(tmp_path) == []
+
+
+def test_a_scenes_camera_in_perspective(tmp_path):
+    folder = write_frames(tmp_path / "a", camera={"resolution": 8, "perspective": True}).folder
+    call("smoke", "guide", folder, "-o", tmp_path / "g")
+    assert read_planes(tmp_path / "g" / "guide_0001.exr")[1]["camera"]["perspective"]
+    assert "perspective: expected false for six-way" in fails("smoke", "bake", folder, "-o", tmp_path / "b")
+
+
+def test_a_damaged_frame_is_named(tmp_path):
+    folder = write_frames(tmp_path / "a").folder
+    (folder / "frame_0002.npz").write_bytes(b"x")
+    call("smoke", "guide", folder, "-o", tmp_path / "g", "--resolution", 4, code=2)
+    assert re.search(r"^error: .*frame_0002.npz: cannot read", call.stderr, re.MULTILINE)
+    content = json.loads((folder / "scene.json").read_text())
+    (folder / "scene.json").write_text(json.dumps(content | {"version": 2}))
+    assert "version: expected 1, found 2" in fails("smoke", "guide", folder, "-o", tmp_path / "g")

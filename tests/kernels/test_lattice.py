@@ -1,0 +1,260 @@
+"""The lattice's step against float64: operators, boundaries, storage; and the kernels beside it."""
+
+import itertools
+
+import numpy as np
+import pytest
+import warp as wp
+from reference import lattice as reference
+
+from wlm.smoke.lattice import Lattice
+from wlm_kernels.lattice import CAUSES, Spec, step_kernel, trouble_of
+from wlm_kernels.lattice_sets import LATTICES, brick_shape
+from wlm_kernels.lattice_solids import voxelise_mesh, voxelise_sphere
+
+STEPS = 4
+SHAPE = (5, 4, 3)
+TOLERANCE = 3e-7  # of a velocity of 0.05 and a density of 1
+HALF_TOLERANCE = 3e-5
+VISCOSITY = 0.02
+
+
+def _shape(lattice: str) -> tuple[int, int, int]:
+    return (5, 6, 1) if lattice == "D2Q9" else SHAPE
+
+
+class Pair:
+    """One flow, on a device and in float64."""
+
+    def __init__(
+        self, lattice: str, device: str, faces=(), solid=None, motion=None, shape=None, force=None, **settings
+    ):
+        settings = {"operator": "regularised", "smagorinsky": 0.17, "viscosity": VISCOSITY, **settings}
+        self.shape = shape or _shape(lattice)
+        found = LATTICES[lattice]
+        self.how = {key: settings[key] for key in ("operator", "viscosity", "smagorinsky")}
+        random = np.random.default_rng(3)
+        self.u = 0.05 * random.uniform(-1, 1, (*self.shape, 3))
+        self.rho = 1.0 + 0.01 * random.uniform(-1, 1, self.shape)
+        if lattice == "D2Q9":
+            self.u[..., 2] = 0.0
+        solid = np.zeros(self.shape, int) if solid is None else solid
+        self.done, self.ramp = 0, settings.get("ramp", 1)
+        self.inlets = {name: np.array(value) for name, (kind, value) in dict(faces).items() if kind == "inlet"}
+        self.box = reference.Box(np.array(found.c), np.array(found.w), solid, dict(faces))
+        self.force = np.zeros((*self.shape, 3)) if force is None else np.broadcast_to(force, (*self.shape, 3))
+        self.device = Lattice(self.shape, lattice=lattice, device=device, **settings)
+        for name, (kind, value) in dict(faces).items():
+            if kind == "inlet":
+                self.device.set_inlet(name, value)
+            elif kind == "outlet":
+                self.device.set_outlet(name, value)
+            else:
+                self.device.set_wall(name, value, slip=kind == "slip")
+        if force is not None:
+            self.device.set_force(force)
+        if solid.any():
+            velocity, spin, centre = motion or np.zeros((3, 3))
+            self.device.set_solid(solid, velocity, spin=spin, centre=centre)
+            self.box.motion = lambda body, x: np.asarray(velocity) + np.cross(spin, x - np.asarray(centre))
+        self.device.set_flow(self.u, self.rho)
+        start = reference.equilibrium(self.box.c, self.box.w, self.rho, self.u)
+        self._inflow()
+        self.f = reference.stream(self.box, start)
+
+    def step(self) -> None:
+        self.device.step()
+        left = reference.collide(self.box, self.f, force=self.force, **self.how)
+        self.done += 1
+        self._inflow()
+        self.f = reference.stream(self.box, left)
+
+    def _inflow(self) -> None:
+        """Inlets rise with the steps done, and are what they should be after the ramp."""
+        gone = min(1.0, (self.done + 1) / self.ramp)
+        for name, velocity in self.inlets.items():
+            self.box.faces[name] = ("inlet", gone**2 * (3 - 2 * gone) * velocity)
+
+    def hold(self, tolerance: float) -> None:
+        rho, u = reference.fields(self.box, self.f + (self.box.solid[..., None] > 0), self.force)
+        fluid = self.box.solid == 0
+        got_u, got_rho = self.device.velocity().numpy(), self.device.density()
+        assert np.abs(got_rho - rho)[fluid].max() <= tolerance, "density"
+        assert np.abs(got_u - u)[fluid].max() <= tolerance, "velocity"
+
+
+def _run(pair: Pair, tolerance: float = TOLERANCE, steps: int = STEPS) -> None:
+    pair.hold(tolerance)
+    for _ in range(steps):
+        pair.step()
+        pair.hold(tolerance)
+
+
+OPERATORS = [
+    ("D2Q9", "bgk", 0.0),
+    ("D2Q9", "regularised", 0.17),
+    ("D2Q9", "recursive", 0.0),
+    ("D3Q19", "bgk", 0.17),
+    ("D3Q19", "regularised", 0.0),
+    ("D3Q19", "regularised", 0.17),
+    ("D3Q27", "bgk", 0.0),
+    ("D3Q27", "regularised", 0.17),
+    ("D3Q27", "recursive", 0.17),
+]
+
+
+@pytest.mark.parametrize("name", LATTICES)
+def test_velocities_are_isotropic_and_in_pairs(name: str):
+    """Moments of the weights up to the fifth order, those on which Navier-Stokes depends."""
+    c, w = np.array(LATTICES[name].c, float), np.array(LATTICES[name].w)
+    axes = LATTICES[name].axes
+    assert w.sum() == pytest.approx(1.0)
+    np.testing.assert_array_equal(c[1::2], -c[2::2])
+    eye = np.diag([1.0] * axes + [0.0] * (3 - axes))
+    np.testing.assert_allclose(np.einsum("q,qa,qb->ab", w, c, c), eye / 3, atol=1e-15)
+    want = sum(np.einsum(order, eye, eye) for order in ("ab,cd->abcd", "ac,bd->abcd", "ad,bc->abcd")) / 9
+    np.testing.assert_allclose(np.einsum("q,qa,qb,qc,qd->abcd", w, c, c, c, c), want, atol=1e-15)
+
+
+@pytest.mark.parametrize(("lattice", "operator", "smagorinsky"), OPERATORS)
+def test_operators(lattice: str, operator: str, smagorinsky: float, device: str):
+    """A periodic box of noise; the eddies raise the relaxation time by a third of what it is over 1/2."""
+    _run(Pair(lattice, device, operator=operator, smagorinsky=smagorinsky))
+
+
+@pytest.mark.parametrize("operator", ["bgk", "regularised", "recursive"])
+@pytest.mark.parametrize("kind", ["uniform", "field"])
+def test_forces(operator: str, kind: str, device: str):
+    lattice = "D3Q27" if operator == "recursive" else "D3Q19"
+    force = np.array([1e-3, -2e-3, 5e-4])
+    if kind == "field":
+        force = 2e-3 * np.random.default_rng(5).uniform(-1, 1, (*_shape(lattice), 3))
+    _run(Pair(lattice, device, operator=operator, force=force))
+
+
+WALLS = {name: ("wall", (0.0, 0.0, 0.0)) for name in reference.FACES}
+TUNNEL = {"-x": ("inlet", (0.05, 0.01, 0.0)), "+x": ("outlet", None)}
+BOXES = {
+    "walls": WALLS,
+    "one pair of walls": {"-y": WALLS["-y"], "+y": ("wall", (0.1, 0.0, 0.02))},
+    "lids": WALLS | {"+y": ("wall", (0.1, 0.0, 0.0)), "-z": ("wall", (0.0, -0.05, 0.0))},
+    "slip": {name: ("slip", (0.0, 0.0, 0.0)) for name in reference.FACES},
+    "slip and walls": {"-x": WALLS["-x"], "+x": WALLS["+x"], "-z": ("slip", (0, 0, 0)), "+z": ("slip", (0, 0, 0))},
+    "tunnel": WALLS | TUNNEL,
+    "open tunnel": TUNNEL | {"-y": ("slip", (0, 0, 0)), "+y": ("outlet", None)},
+    "pressure": WALLS | {"-z": ("inlet", (0.0, 0.0, 0.04)), "+z": ("outlet", 1.002), "+y": ("outlet", 1.0)},
+    "two outlets": {"-x": ("outlet", None), "+x": ("outlet", None)},
+}
+
+
+@pytest.mark.parametrize("name", BOXES)
+def test_faces(name: str, device: str):
+    """Every kind of face, alone and along edges with others."""
+    _run(Pair("D3Q19", device, faces=BOXES[name]))
+
+
+def test_ramp(device: str):
+    """Inlets rise smoothly, walls that move don't wait."""
+    pair = Pair("D3Q19", device, faces=BOXES["tunnel"] | {"+y": ("wall", (0.1, 0.0, 0.0))}, ramp=3)
+    _run(pair)
+
+
+def _obstacles() -> np.ndarray:
+    solid = np.zeros((6, 5, 5), int)
+    solid[2:4, 1:3, 2] = 1
+    # A wall one cell thick, fluid on both sides of it, and a lone cell at a face.
+    solid[4, :3, 1:] = 1
+    solid[0, 0, 0] = 1
+    return solid
+
+
+@pytest.mark.parametrize("faces", ["walls", "tunnel", "slip"])
+def test_solids(faces: str, device: str):
+    """Bodies at faces, over a part of the inlet, thin ones, and one that moves and spins."""
+    solid = _obstacles()
+    motion = ((0.03, 0.0, -0.02), (0.0, 0.01, 0.004), (3.0, 2.0, 2.5))
+    _run(Pair("D3Q19", device, faces=BOXES[faces], solid=solid, motion=motion, shape=solid.shape))
+
+
+def test_solids_alone(device: str):
+    """In a box with no faces there are no other links."""
+    _run(Pair("D3Q19", device, solid=_obstacles(), shape=_obstacles().shape))
+
+
+def test_solids_with_other_lattices(device: str):
+    """The tables of links serve D3Q27 and D2Q9 as well."""
+    solid = _obstacles()
+    _run(Pair("D3Q27", device, faces=BOXES["tunnel"], solid=solid, shape=solid.shape, operator="recursive"))
+    flat = np.zeros((6, 6, 1), int)
+    flat[2:4, 2] = 1
+    faces = {name: WALLS[name] for name in ("-y", "+y")} | TUNNEL
+    _run(Pair("D2Q9", device, faces=faces, solid=flat, shape=flat.shape))
+
+
+@pytest.mark.parametrize("lattice", LATTICES)
+def test_sixteen_bits(lattice: str, device: str):
+    """A shifted population keeps 11 bits of its deviation: some 1e-5 of the velocity's scale after a few steps."""
+    pair = Pair(lattice, device, storage="float16")
+    _run(pair, HALF_TOLERANCE)
+    with pytest.raises(AssertionError):
+        pair.hold(TOLERANCE / 10)
+
+
+def test_thin_domains(device: str):
+    """Axes of one and two cells, where both neighbours are one cell, or the cell itself."""
+    for shape in ((1, 1, 1), (2, 1, 3), (1, 4, 2)):
+        _run(Pair("D3Q19", device, shape=shape))
+        _run(Pair("D3Q19", device, faces=BOXES["lids"], shape=shape))
+
+
+def test_spec_is_checked():
+    for wrong in (
+        {"lattice": "D3Q19", "operator": "trt"},
+        {"lattice": "D3Q19", "operator": "recursive"},
+        {"lattice": "D3Q19", "storage": "bfloat16"},
+        {"lattice": "D3Q19", "force": "some"},
+        {"lattice": "D3Q15", "operator": "recursive"},
+    ):
+        with pytest.raises(ValueError):
+            Spec(**wrong)
+    assert step_kernel(Spec("D2Q9")) is step_kernel(Spec("D2Q9")), "a kernel is built once"
+
+
+def test_trouble_of_gives_back_what_a_key_holds():
+    for step, cell, code in itertools.product((0, 7, 10**8), (0, 12345, 2**31 - 1), range(3)):
+        assert trouble_of((step * 2**31 + cell) * 4 + code) == (step, cell, CAUSES[code])
+
+
+def test_sphere_voxels(device: str):
+    """Volume, and what the body left is free again while another body stays."""
+    solid = wp.zeros((24, 20, 22), dtype=wp.uint8, device=device)
+    voxelise_sphere(solid, 2, (18.0, 10.0, 11.0), 3.0)
+    others = (solid.numpy() == 2).sum()
+    voxelise_sphere(solid, 1, (8.0, 10.0, 11.0), 6.0)
+    assert (solid.numpy() == 1).sum() == pytest.approx(4 / 3 * np.pi * 6**3, rel=0.03)
+    voxelise_sphere(solid, 1, (9.5, 10.0, 11.0), 2.0)
+    places = np.argwhere(solid.numpy() == 1) + 0.5
+    np.testing.assert_allclose(places.mean(0), (9.5, 10.0, 11.0), atol=0.1)
+    assert (solid.numpy() == 2).sum() == others
+
+
+def test_mesh_voxels(device: str):
+    """A box as a mesh, turned by a quarter about z, scaled and moved."""
+    corners = np.array(list(itertools.product((-1.0, 1.0), (-0.5, 0.5), (-0.25, 0.25))), np.float32)
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    faces = np.array([(a, b, c) + (a, c, d) for a, b, c, d in quads], np.int32).ravel()
+    mesh = wp.Mesh(
+        points=wp.array(corners, dtype=wp.vec3, device=device),
+        indices=wp.array(faces, dtype=int, device=device),
+        support_winding_number=True,
+    )
+    solid = wp.zeros((16, 16, 16), dtype=wp.uint8, device=device)
+    turn = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), 0.5 * np.pi)
+    voxelise_mesh(solid, 3, mesh, position=(8.0, 8.0, 8.0), rotation=turn, scale=4.0)
+    want = np.zeros((16, 16, 16), np.uint8)
+    want[6:10, 4:12, 7:9] = 3
+    np.testing.assert_array_equal(solid.numpy(), want)
+
+
+def test_bricks_cover_the_domain():
+    assert np.prod(brick_shape((64, 64, 64))) == np.prod(brick_shape((64, 64, 1))) == 512

@@ -1,0 +1,180 @@
+"""Pictures of smoke: what is drawn where, before and behind the smoke, and in which cell of a sheet."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from smoke_plumes import plume
+
+from wlm.errors import WlmError
+from wlm.smoke.data import CameraSettings, LightSettings, Obstacle, make_camera
+from wlm.smoke.guide import guide
+from wlm.smoke.reference import SixWay, six_way
+from wlm.smoke.shade import Light, Ramp
+from wlm.view.smoke import (
+    contact_sheet,
+    draw_obstacles,
+    guide_pictures,
+    picture,
+    six_pictures,
+    to_bytes,
+    write_sequence,
+)
+
+FRONT = LightSettings(toward=(0, 0, 1), irradiance=(math.pi,) * 3).light()
+
+
+def _camera(size=32, **settings):
+    """Of the unit box round the origin."""
+    return make_camera(CameraSettings(resolution=size, **settings), (-0.5, -0.5, -0.5), (1, 1, 1))
+
+
+def _ball(x=0.0, y=0.0, z=0.0, radius=0.2, **more):
+    return Obstacle(radius=radius, path=((0.0, x, y, z),), colour=(1.0, 0.5, 0.0), **more)
+
+
+def _flat(camera, transparency, light=0.0, device="cpu"):
+    """The same smoke at every pixel."""
+    size = (camera.height, camera.width)
+    return SixWay(torch.full((6, *size), light, device=device), torch.full(size, transparency, device=device))
+
+
+def test_bytes():
+    assert to_bytes(torch.tensor([[0.0, 0.5, 1.0, 9.0]])).tolist() == [[[0] * 3, [188] * 3, [255] * 3, [255] * 3]]
+    assert to_bytes(np.full((1, 1, 3), 2.0), 4.0).tolist() == [[[188] * 3]]
+    with pytest.raises(ValueError, match="white"):
+        to_bytes(torch.zeros(1, 1), 0.0)
+
+
+@pytest.mark.parametrize("perspective", [False, True])
+@pytest.mark.parametrize("toward", [(0, 0, 1), (0, 1, 0), (1, -2, 0.5)])
+def test_an_obstacle_is_drawn_where_it_is(device, toward, perspective):
+    """A ball against the rays that meet it, worked out by hand."""
+    camera = _camera(48, toward=toward, perspective=perspective)
+    ball = _ball(0.1, -0.05, 0.2)
+    _, depth = draw_obstacles([ball], 0.0, camera, [], device)
+    origin, way = camera.rays()
+    middle = ball.centre(0.0) - origin
+    along = (middle * way).sum(-1)
+    gap = 0.2**2 - ((middle**2).sum(-1) - along**2)
+    expected = np.where(gap > 0, along - np.sqrt(np.maximum(gap, 0)), np.inf)
+    found = depth.cpu().numpy()
+    # The mesh is a little smaller than the ball: its edge is left out.
+    assert np.isinf(found[gap < -0.002]).all() and np.isfinite(found[gap > 0.002]).all()
+    inside = gap > 0.01
+    assert inside.sum() > 30
+    np.testing.assert_allclose(found[inside], expected[inside], atol=0.01)
+
+
+def test_an_obstacle_is_lit_from_where_the_light_is(device):
+    camera = _camera(33)
+    light, depth = draw_obstacles([_ball()], 0.0, camera, [FRONT], device)
+    seen = torch.isfinite(depth)
+    # Face on: its colour times (E / pi + the ambient's 0.2).
+    np.testing.assert_allclose(light[16, 16].cpu(), [1.2, 0.6, 0.0], atol=0.02)
+    assert not light[~seen].any()
+    side, _ = draw_obstacles([_ball()], 0.0, camera, [Light((1.0, 0.0, 0.0), (1.0,) * 3)], device)
+    row = side[16, seen[16]][:, 0]
+    assert row[-1] > row[0] and row[0] == pytest.approx(0.2)
+    # The nearer one of two hides the other, whatever their order.
+    for order in (1, -1):
+        both = [_ball(z=0.25, radius=0.1), Obstacle(radius=0.2, path=((0.0, 0, 0, 0),), colour=(0.0, 0.0, 1.0))]
+        shown, _ = draw_obstacles(both[::order], 0.0, camera, [FRONT], device)
+        assert shown[16, 16, 0] > 0.5 and shown[16, 16, 2] == 0 and shown[16, 11, 2] > 0.3
+    # What lies behind the camera isn't seen.
+    _, none = draw_obstacles([_ball()], 0.0, _camera(33, distance=0.3, target=(0, 0, 0.5)), [FRONT], device)
+    assert torch.isfinite(none).any()
+    _, none = draw_obstacles([_ball(z=1.2)], 0.0, _camera(33, distance=0.3), [FRONT], device)
+    assert not torch.isfinite(none).any()
+    assert not torch.isfinite(draw_obstacles([], 0.0, camera, [], device)[1]).any()
+
+
+def test_an_obstacle_before_and_behind_smoke(device):
+    camera = _camera(33)
+    six = _flat(camera, 0.25, 0.5, device)
+    ball, depth = draw_obstacles([_ball()], 0.0, camera, [FRONT], device)
+    seen = torch.isfinite(depth)
+    background = (0.1, 0.2, 0.3)
+    shown = {"background": background, "obstacles": [_ball()]}
+    # The light is from behind the camera, whose way to the smoke's surface is free where that is before the ball.
+    near, far = torch.full_like(six.transparency, 0.01), torch.full_like(six.transparency, 99.0)
+    before = picture(six, camera, [FRONT], depth=far, **shown)
+    torch.testing.assert_close(before[seen], ball[seen])
+    behind = picture(six, camera, [FRONT], depth=near, **shown)
+    lit = 0.5 * math.pi / (4 * math.pi)
+    torch.testing.assert_close(behind[seen], lit + 0.25 * ball[seen])
+    empty = lit + 0.25 * torch.tensor(background, device=device)
+    torch.testing.assert_close(behind[~seen], empty.expand(int((~seen).sum()), 3))
+    # It stands in the light of the smoke behind it, but for the pixels where it is seen anyway.
+    side = Light((1.0, 0.0, 0.0), (4 * math.pi,) * 3)
+    surface = float(np.dot(np.subtract(camera.position, 0), camera.toward))
+    level = torch.full_like(six.transparency, surface)
+    shadow = picture(six, camera, [side], depth=level, background=(0, 0, 0), obstacles=[_ball(0.3, 0, 0, 0.1)])
+    assert shadow[16, 5, 0] < 0.05 and shadow[5, 5, 0] == pytest.approx(0.5)
+
+
+def test_without_obstacles_it_is_smoke_over_a_colour(device):
+    camera = _camera(8)
+    six = _flat(camera, 0.5, 0.25, device)
+    six = SixWay(six.lightmaps, six.transparency, torch.full_like(six.transparency, 1.0))
+    ramp = Ramp((0.0, 2.0), ((0, 0, 0), (2.0, 1.0, 0.0)))
+    light = Light((0.0, 0.0, 3.0), (4 * math.pi, 0.0, 0.0))
+    found = picture(six, camera, [light], background=(0.2, 0.4, 0.6), ramp=ramp)
+    torch.testing.assert_close(found[3, 4].cpu(), torch.tensor([0.25 + 1.0 + 0.1, 0.5 + 0.2, 0.3]))
+    with pytest.raises(ValueError, match="transparency"):
+        picture(SixWay(six.lightmaps, None), camera, [light])
+    with pytest.raises(ValueError, match="depth"):
+        picture(six, camera, [light], obstacles=[_ball()])
+
+
+def test_pictures_of_the_maps(device):
+    volume = plume(hot=True, device=device)
+    camera = make_camera(CameraSettings(resolution=24), volume.origin, (1, 1.2, 1))
+    six = six_way(volume, camera, step=1.0, estimate=False)
+    shown = six_pictures(six)
+    assert [*shown] == ["right", "left", "top", "bottom", "front", "back", "alpha", "emission"]
+    assert (shown["right"][:, 12:].mean() > shown["left"][:, 12:].mean()) and shown["alpha"].max() > 200
+    np.testing.assert_array_equal(shown["top"], to_bytes(six["top"]))
+    assert "emission" not in six_pictures(SixWay(six.lightmaps, None))
+    found = guide(volume, camera, step=2.0, jitter=0.0)
+    planes = guide_pictures(found)
+    smoke = found.depth.cpu().numpy() > 0
+    assert (planes["depth"][~smoke] == 0).all() and planes["depth"][smoke].min() >= 51
+    nearest = np.unravel_index(np.where(smoke, found.depth.cpu().numpy(), np.inf).argmin(), smoke.shape)
+    assert (planes["depth"][nearest] == 255).all() and (planes["transparency"][0, 0] == 255).all()
+    nothing = guide(plume(0, device=device), camera)
+    assert not guide_pictures(nothing)["depth"].any()
+
+
+def test_a_sequence(tmp_path):
+    frames = [np.full((2, 3, 3), value, np.uint8) for value in (1, 2)]
+    paths = write_sequence(tmp_path / "a", frames, "lit")
+    assert [path.name for path in paths] == ["lit_0001.png", "lit_0002.png"]
+    for path, frame in zip(paths, frames, strict=True):
+        with Image.open(path) as image:
+            np.testing.assert_array_equal(np.asarray(image), frame)
+    with pytest.raises(WlmError, match="cannot write there"):
+        write_sequence(tmp_path / "none" / "a", frames)
+
+
+def test_a_contact_sheet(tmp_path):
+    """Each chosen picture is in its row, in order; long rows are thinned evenly."""
+    rows = {"one": [np.full((10, 12, 3), i, np.uint8) for i in range(20)]}
+    rows["another"] = [200 + cell for cell in rows["one"]]
+    chosen = contact_sheet(tmp_path / "a.png", rows, [str(i) for i in range(20)], columns=4)
+    assert chosen == (0, 6, 13, 19)
+    with Image.open(tmp_path / "a.png") as image:
+        sheet = np.asarray(image)
+    for row, label in enumerate(rows):
+        for column, i in enumerate(chosen):
+            x, y = sheet.shape[1] - (4 - column) * 16, 28 + row * 14
+            np.testing.assert_array_equal(sheet[y : y + 10, x : x + 12], rows[label][i])
+    assert contact_sheet(tmp_path / "b.png", {"": rows["one"][:1]}) == (0,)
+    for wrong in ({"a": rows["one"], "b": rows["one"][:3]}, {}, {"a": []}, {"a": [sheet, rows["one"][0]]}):
+        with pytest.raises(ValueError, match="expected rows"):
+            contact_sheet(tmp_path / "c.png", wrong)
+    with pytest.raises(ValueError, match="titles"):
+        contact_sheet(tmp_path / "c.png", rows, ["a"])
+    assert not (tmp_path / "c.png").exists()

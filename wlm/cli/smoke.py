@@ -1,0 +1,487 @@
+"""`wlm smoke`: simulate smoke, look at it roughly, bake its six-way lightmaps, light them, pack them for an engine."""
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from wlm.cli.console import (
+    check_output,
+    deferred_interrupt,
+    escape,
+    note,
+    number,
+    progress_bar,
+    quiet_warp,
+    show,
+    table,
+)
+from wlm.errors import WlmError
+
+if TYPE_CHECKING:
+    from wlm.smoke.axes import Camera
+    from wlm.smoke.data import Scene
+    from wlm.smoke.frames import Footage
+    from wlm.smoke.reference import SixWay
+    from wlm.smoke.shade import Light
+    from wlm.smoke.volume import DensityVolume
+
+__all__ = ["app"]
+
+app = typer.Typer(help="Smoke: simulated, and seen through six-way lightmaps.")
+
+_Input = Annotated[Path, typer.Argument(metavar="SMOKE", help="A .npz or .nvdb volume, or a folder of simulate.")]
+_Baked = Annotated[
+    Path, typer.Argument(metavar="SMOKE", help="A .npz or .nvdb volume, a folder of simulate; or what bake wrote.")
+]
+_Device = Annotated[str, typer.Option(help='Where it computes: "cpu", "cuda" or "cuda:N".')]
+_Resolution = Annotated[
+    int | None, typer.Option(min=1, max=16384, help="Pixels along the image's height; default the scene's, or 512.")
+]
+_Toward = Annotated[
+    str | None, typer.Option(metavar="X,Y,Z", help="From the smoke to the camera; default the scene's, or 0,0,1.")
+]
+_Turn = Annotated[float, typer.Option(help="Degrees by which the camera is turned about what is up.")]
+_Extent = Annotated[float | None, typer.Option(help="Height of the image in the world; default what holds the box.")]
+_Distance = Annotated[
+    float | None, typer.Option(help="Of the camera from its target; what is behind it isn't seen. Default outside.")
+]
+_Extinction = Annotated[float | None, typer.Option(help="Per length, of density 1; default the scene's, or 1.")]
+_Emission = Annotated[float | None, typer.Option(help="Per length, of temperature 1; default the scene's, or 1.")]
+_Step = Annotated[float, typer.Option(min=0.01, max=1000.0, help="The longest step in voxels.")]
+_Supersample = Annotated[int, typer.Option(min=1, max=16, help="Rays along a pixel's edge.")]
+_G = Annotated[float, typer.Option(min=-0.99, max=0.99, help="Henyey and Greenstein's mean cosine.")]
+
+_SHEET = "sheet.png"
+
+
+@app.command()
+def simulate(
+    scene_name: Annotated[str, typer.Argument(metavar="SCENE", help="jet-sphere, jet-moving, explosion, or a YAML.")],
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="The folder of frames to write.")],
+    frames: Annotated[int | None, typer.Option(min=1, max=9999, help="How many; default the scene's.")] = None,
+    scale: Annotated[
+        float, typer.Option(min=0.001, max=100.0, help="Cells along each axis, as a multiple of the scene's.")
+    ] = 1.0,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with an interrupted simulation in DIR.")] = False,
+    device: _Device = "cpu",
+) -> None:
+    """Simulate a scene into a folder of volumes, one a frame.
+
+    Ctrl-C keeps the state in DIR; the same command with --resume goes on exactly.
+    """
+    quiet_warp()
+    from wlm.interop import check_device
+    from wlm.smoke.data import load_scene
+    from wlm.smoke.frames import open_frames
+    from wlm.smoke.simulate import simulate
+
+    device = check_device(device)
+    scene = load_scene(scene_name)
+    if scale != 1.0:
+        scene = _scaled(scene, scale)
+    if frames is not None:
+        scene = scene.model_copy(update={"frames": frames})
+    folder = open_frames(output, scene, resume=resume)
+    done: dict[str, float] = {}
+    try:
+        with deferred_interrupt() as check_interrupt, progress_bar("simulate") as bar:
+
+            def report(frame: int, figures: dict[str, float]) -> None:
+                done.update(figures, frame=frame)
+                bar(frame, scene.frames, f"smoke {figures['smoke']:.4g}")
+                check_interrupt()
+
+            first = simulate(folder, device=device, resume=resume, progress=report)
+    except KeyboardInterrupt:
+        note(f"stopped at frame {done['frame']:g}: the same command with --resume goes on from {output}")
+        raise
+    if resume and first == 1:
+        note(f"{output}: there was nothing to resume; started at frame 1")
+    rows = table(f"{output}: {scene.name}", ["", "value"])
+    rows.add_row("frames", f"{scene.frames:,}")
+    rows.add_row("velocity", " x ".join(map(str, scene.grid.cells)))
+    rows.add_row("density", " x ".join(map(str, scene.grid.shape)))
+    rows.add_row("steps a frame", f"{scene.steps:,}")
+    if done:
+        rows.add_row("smoke in the last frame", f"{done['smoke']:.4g}")
+        rows.add_row("seconds a frame", f"{done['seconds']:.3g}")
+    show(rows)
+
+
+@app.command()
+def guide(
+    smoke: _Input,
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="OUT", help="A .exr, or of frames a folder.")],
+    resolution: _Resolution = None,
+    step: Annotated[float, typer.Option(min=0.01, max=1000.0, help="In voxels.")] = 10.0,
+    jitter: Annotated[
+        float, typer.Option(min=0.0, max=1.0, help="Share of a step by which samples are shifted at random.")
+    ] = 1.0,
+    seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Of the jitter.")] = 0,
+    threshold: Annotated[
+        float, typer.Option(min=0.0, help="Optical depth of a voxel from which on smoke has a surface.")
+    ] = 0.01,
+    g: _G = 0.0,
+    toward: _Toward = None,
+    turn: _Turn = 0.0,
+    extent: _Extent = None,
+    distance: _Distance = None,
+    perspective: Annotated[bool, typer.Option("--perspective", help="Rays meet in the eye.")] = False,
+    extinction: _Extinction = None,
+    emission: _Emission = None,
+    device: _Device = "cpu",
+) -> None:
+    """Make guiding maps: light, transparency and depth, by a march in large steps (algorithm 1)."""
+    quiet_warp()
+    from wlm.smoke.frames import write_guide
+    from wlm.smoke.guide import guide
+
+    footage = _open(smoke, extinction, emission, device)
+    view = {"resolution": resolution, "toward": toward, "turn": turn, "extent": extent, "distance": distance}
+    if perspective:
+        view["perspective"] = True
+    rows = table(str(smoke), ["file", "covered", "mean light", "nearest", "farthest"])
+    for path, _, volume in _frames(footage, output, "guide", ".exr"):
+        camera = _camera(footage, volume, view)
+        found = guide(volume, camera, step=step, jitter=jitter, seed=seed, threshold=threshold, g=g)
+        write_guide(path, found)
+        depth = found.depth[found.depth > 0]
+        covered = found.transparency < 0.99
+        rows.add_row(
+            escape(path.name),
+            f"{float(covered.float().mean()):.1%}",
+            number(float(found.light[covered].mean()) if covered.any() else None, ".4g"),
+            number(float(depth.min()) if len(depth) else None, ".4g"),
+            number(float(depth.max()) if len(depth) else None, ".4g"),
+        )
+    show(rows)
+
+
+@app.command()
+def bake(
+    smoke: _Input,
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="OUT", help="A .exr, or of frames a folder.")],
+    resolution: _Resolution = None,
+    step: _Step = 0.5,
+    supersample: _Supersample = 1,
+    g: _G = 0.0,
+    toward: _Toward = None,
+    turn: _Turn = 0.0,
+    extent: _Extent = None,
+    distance: _Distance = None,
+    extinction: _Extinction = None,
+    emission: _Emission = None,
+    device: _Device = "cpu",
+) -> None:
+    """Make six-way lightmaps by a fine march, and say how far a step twice as long is from them.
+
+    An EXR has the channels right, left, top, bottom, front, back, transparency and, of hot smoke, emission.
+    """
+    quiet_warp()
+    from wlm.smoke.axes import axis_faults
+    from wlm.smoke.frames import write_six_way
+    from wlm.smoke.reference import six_way
+
+    footage = _open(smoke, extinction, emission, device)
+    view = {"resolution": resolution, "toward": toward, "turn": turn, "extent": extent, "distance": distance}
+    rows = table(str(smoke), ["file", "covered", "mean light", "largest error", "RMS error"])
+    for path, _, volume in _frames(footage, output, "six", ".exr"):
+        camera = _camera(footage, volume, view, flat=True)
+        six = six_way(volume, camera, step=step, g=g, supersample=supersample)
+        write_six_way(path, six, camera)
+        covered = six.transparency < 0.99
+        for fault in axis_faults(six.lightmaps.cpu().numpy()) if covered.any() else ():
+            note(f"{path}: note: {fault}")
+        rows.add_row(
+            escape(path.name),
+            f"{float(covered.float().mean()):.1%}",
+            number(float(six.lightmaps[:, covered].mean()) if covered.any() else None, ".4g"),
+            f"{six.error.largest:.2g}",
+            f"{six.error.rms:.2g}",
+        )
+    show(rows)
+
+
+@app.command()
+def shade(
+    smoke: _Baked,
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="OUT", help="A .png, or of frames a folder.")],
+    light: Annotated[
+        list[str] | None,
+        typer.Option(metavar="X,Y,Z[:R,G,B]", help="Direction to a light and its irradiance; repeat for more."),
+    ] = None,
+    background: Annotated[str | None, typer.Option(metavar="R,G,B", help="Linear colour behind the smoke.")] = None,
+    white: Annotated[float, typer.Option(help="The light that is shown as white.")] = 1.0,
+    rule: Annotated[str, typer.Option(help="Weights of the lightmaps: squared, absolute or normalised.")] = "squared",
+    resolution: _Resolution = None,
+    step: _Step = 1.0,
+    supersample: _Supersample = 1,
+    toward: _Toward = None,
+    turn: _Turn = 0.0,
+    extent: _Extent = None,
+    distance: _Distance = None,
+    extinction: _Extinction = None,
+    emission: _Emission = None,
+    device: _Device = "cpu",
+) -> None:
+    """Light the smoke into PNGs, of frames with the scene's obstacles and a contact sheet.
+
+    The lights are those given, else the scene's, else one from 1,1,1; an irradiance of 4 pi, the default, shows a
+    lightmap as it is.
+    """
+    from wlm.smoke.axes import RULES
+
+    if rule not in RULES:
+        raise WlmError(f"--rule: expected one of {', '.join(RULES)}, got {rule!r}")
+    if not 0 < white < float("inf"):
+        raise WlmError(f"--white: expected a number above 0, got {white}")
+    lights = [_light(text) for text in light or ()]
+    behind = None if background is None else _vector("--background", background)
+    quiet_warp()
+    from wlm.view.atlas import save_png
+    from wlm.view.smoke import contact_sheet, picture, to_bytes
+
+    view = {"resolution": resolution, "toward": toward, "turn": turn, "extent": extent, "distance": distance}
+    marching = {"step": step, "supersample": supersample}
+    shots, scene = _shots(smoke, output, "shade", view, marching, extinction, emission, device)
+    if not lights:
+        lights = [given.light() for given in scene.lights] if scene is not None else [_light("1,1,1")]
+    if behind is None:
+        behind = (0.0, 0.0, 0.0) if scene is None else scene.background
+    rows = table(str(smoke), ["file", "covered", "mean", "largest", "clipped"])
+    drawn = []
+    for path, six, camera, extra in shots:
+        shaded = picture(six, camera, lights, background=behind, rule=rule, **extra)
+        pixels = to_bytes(shaded, white)
+        save_png(path, pixels)
+        drawn.append(pixels)
+        covered = float((six.transparency < 0.99).float().mean())
+        clipped = float((shaded > white).any(-1).float().mean())
+        rows.add_row(
+            escape(path.name), f"{covered:.1%}", f"{shaded.mean():.4g}", f"{shaded.max():.4g}", f"{clipped:.1%}"
+        )
+    if output.is_dir():
+        contact_sheet(output / _SHEET, {"": drawn})
+    show(rows)
+
+
+@app.command()
+def flipbook(
+    smoke: _Baked,
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="OUT", help="A .exr, .png or .tga: becomes OUT_1 and OUT_2.")
+    ],
+    layout: Annotated[str, typer.Option(help="unity, o3de, o3de-tlrb or embergen.")] = "unity",
+    columns: Annotated[int | None, typer.Option(min=1, max=64, help="Of cells; default as square as can be.")] = None,
+    count: Annotated[int | None, typer.Option(min=1, max=4096, help="Frames, evenly spread; default all.")] = None,
+    gain: Annotated[
+        float | None, typer.Option(help="Factor on the light; default 1 in an EXR, else what just doesn't clip.")
+    ] = None,
+    resolution: _Resolution = None,
+    step: _Step = 0.5,
+    supersample: _Supersample = 1,
+    toward: _Toward = None,
+    turn: _Turn = 0.0,
+    extent: _Extent = None,
+    distance: _Distance = None,
+    extinction: _Extinction = None,
+    emission: _Emission = None,
+    device: _Device = "cpu",
+) -> None:
+    """Pack six-way lightmaps into the two textures that an engine reads."""
+    check_output(output, ".exr", ".png", ".tga")
+    from wlm.smoke.axes import EMISSION, LAYOUTS
+
+    if layout not in LAYOUTS:
+        raise WlmError(f"--layout: expected one of {', '.join(LAYOUTS)}, got {layout!r}")
+    if gain is not None and not 0 < gain < float("inf"):
+        raise WlmError(f"--gain: expected a number above 0, got {gain}")
+    quiet_warp()
+    from wlm.smoke.packing import write_flipbook
+
+    view = {"resolution": resolution, "toward": toward, "turn": turn, "extent": extent, "distance": distance}
+    marching = {"step": step, "supersample": supersample}
+    shots, _ = _shots(smoke, None, "six", view, marching, extinction, emission, device, count=count)
+    frames = [six for _, six, _, _ in shots]
+    if any(frame.lightmaps.shape != frames[0].lightmaps.shape for frame in frames):
+        raise WlmError(f"{smoke}: expected lightmaps of one size")
+    columns = min(columns or math.ceil(len(frames) ** 0.5), len(frames))
+    rows_of_cells = -(-len(frames) // columns)
+    if gain is None:
+        planes = [plane for six in frames for plane in (six.lightmaps, six.emission) if plane is not None]
+        brightest = max(float(plane.max()) for plane in planes)
+        gain = 1.0 / brightest if output.suffix.lower() != ".exr" and brightest > 0 else 1.0
+    paths = tuple(output.with_name(f"{output.stem}_{i}{output.suffix}") for i in (1, 2))
+    clipped = write_flipbook(paths, frames, layout, rows=rows_of_cells, columns=columns, gain=gain)
+    height, width = frames[0].lightmaps.shape[1:]
+    rows = table(str(smoke), ["file", "bytes", "channels"], text=["channels"])
+    hot = any(six.emission is not None for six in frames)
+    for path, names in zip(paths, LAYOUTS[layout], strict=True):
+        names = names if hot or names[-1] != EMISSION else names[:-1]
+        rows.add_row(escape(str(path)), f"{path.stat().st_size:,}", " ".join(names))
+    rows.add_section()
+    rows.add_row("frames", f"{len(frames):,}", f"{rows_of_cells} x {columns} cells of {width} x {height}")
+    rows.add_row("gain", f"{gain:.4g}", f"{clipped:,} numbers clipped")
+    show(rows)
+
+
+def _vector(option: str, text: str) -> tuple[float, float, float]:
+    try:
+        x, y, z = map(float, text.split(","))
+    except ValueError:
+        raise WlmError(f"{option}: expected three numbers such as 0,0.5,1, got {text!r}") from None
+    if not all(abs(value) < float("inf") for value in (x, y, z)):
+        raise WlmError(f"{option}: expected finite numbers, got {text!r}")
+    return x, y, z
+
+
+def _scaled(scene: "Scene", scale: float) -> "Scene":
+    from pydantic import ValidationError
+
+    try:
+        return scene.scaled(scale)
+    except ValidationError as error:
+        problem = error.errors(include_url=False)[0]
+        expected = problem["msg"].replace("Input should be", "expected", 1)
+        raise WlmError(f"--scale: {expected} cells along an axis, got {problem['input']}") from error
+
+
+def _light(text: str) -> "Light":
+    toward, colon, irradiance = text.partition(":")
+    from wlm.smoke.data import LightSettings
+
+    given: dict[str, Any] = {"toward": _vector("--light", toward)}
+    if colon:
+        # One number is a white light.
+        given["irradiance"] = _vector("--light", irradiance if "," in irradiance else ",".join([irradiance] * 3))
+    return _made(LightSettings, given, {"toward": "--light", "irradiance": "--light"}).light()
+
+
+def _made(cls: Any, values: dict[str, Any], options: dict[str, str]) -> Any:
+    """Checks settings that options gave, and names the option that is wrong."""
+    from pydantic import ValidationError
+
+    try:
+        return cls(**values)
+    except ValidationError as error:
+        problem = error.errors(include_url=False)[0]
+        field = str(problem["loc"][0]) if problem["loc"] else "settings"
+        expected = problem["msg"].replace("Input should be", "expected", 1)
+        raise WlmError(f"{options.get(field, '--' + field)}: {expected}, got {problem['input']}") from error
+
+
+def _open(smoke: Path, extinction: float | None, emission: float | None, device: str) -> "Footage":
+    from wlm.interop import check_device
+    from wlm.smoke.frames import open_footage
+
+    return open_footage(smoke, extinction=extinction, emission=emission, device=check_device(device))
+
+
+def _paths(smoke: Path, numbers: "tuple[int, ...]", single: bool, output: Path, stem: str, suffix: str) -> list[Path]:
+    """Where each frame goes: into a file, or numbered into a folder."""
+    from wlm.smoke.frames import check_folder
+
+    if single:
+        check_output(output, suffix)
+        return [output]
+    if output.resolve() == smoke.resolve():
+        raise WlmError(f"{output}: expected another folder than that of the frames")
+    folder = check_folder(output, stem, suffix, _SHEET)
+    return [folder / f"{stem}_{number:04d}{suffix}" for number in numbers]
+
+
+def _frames(footage: "Footage", output: Path, stem: str, suffix: str) -> "Iterator[tuple[Path, int, DensityVolume]]":
+    """Volumes with where their result goes; says what was repaired, and how far it is."""
+    paths = _paths(footage.path, footage.numbers, footage.scene is None, output, stem, suffix)
+    with progress_bar(stem) as bar:
+        for done, (path, frame) in enumerate(zip(paths, footage.numbers, strict=True), 1):
+            yield path, frame, _load(footage, frame)
+            bar(done, len(paths), "")
+
+
+def _load(footage: "Footage", frame: int) -> "DensityVolume":
+    volume = footage.load(frame)
+    for warning in volume.warnings:
+        note(f"warning: {warning}")
+    return volume
+
+
+def _camera(footage: "Footage", volume: "DensityVolume", view: dict[str, Any], *, flat: bool = False) -> "Camera":
+    """The scene's camera, or one before the volume, as far as the options don't say otherwise."""
+    import numpy as np
+
+    from wlm.smoke.data import CameraSettings, make_camera
+
+    base = CameraSettings() if footage.scene is None else footage.scene.camera
+    given = {name: value for name, value in view.items() if value is not None and name != "turn"}
+    if "toward" in given:
+        given["toward"] = _vector("--toward", given["toward"])
+    settings = _made(CameraSettings, base.model_dump() | given, {}).turned(view["turn"])
+    if flat and settings.perspective:
+        raise WlmError(f"{footage.path}: camera.perspective: expected false for six-way lightmaps, found true")
+    return make_camera(settings, volume.origin, volume.voxel * np.asarray(volume.shape))
+
+
+def _shots(
+    smoke: Path,
+    output: Path | None,
+    stem: str,
+    view: dict[str, Any],
+    marching: dict[str, Any],
+    extinction: float | None,
+    emission: float | None,
+    device: str,
+    count: int | None = None,
+) -> "tuple[Iterator[tuple[Path, SixWay, Camera, dict[str, Any]]], Scene | None]":
+    """Lightmaps that were baked, or are now, with their cameras and, of frames, what else is in the picture."""
+    from wlm.interop import check_device
+    from wlm.smoke.frames import SCENE_FILE, numbered, read_six_way
+
+    folder = smoke.is_dir()
+    if smoke.suffix.lower() == ".exr" or (folder and not (smoke / SCENE_FILE).exists()):
+        given = [name for name, value in (view | {"extinction": extinction, "emission": emission}).items() if value]
+        if given:
+            raise WlmError(f"{smoke}: was baked: --{given[0]} has to be given to bake")
+        device = check_device(device)
+        files = numbered(smoke, "six", ".exr") if folder else {1: smoke}
+        if not files:
+            raise WlmError(f"{smoke}: expected a folder that simulate or bake wrote")
+        chosen = _spread(tuple(files), count)
+        paths = [smoke] * len(chosen) if output is None else _paths(smoke, chosen, not folder, output, stem, ".png")
+
+        def baked() -> "Iterator[tuple[Path, SixWay, Camera, dict[str, Any]]]":
+            for path, frame in zip(paths, chosen, strict=True):
+                yield path, *read_six_way(files[frame], device), {}
+
+        return baked(), None
+    footage = _open(smoke, extinction, emission, device)
+    chosen, scene = _spread(footage.numbers, count), footage.scene
+    paths = [smoke] * len(chosen) if output is None else _paths(smoke, chosen, scene is None, output, stem, ".png")
+
+    def made() -> "Iterator[tuple[Path, SixWay, Camera, dict[str, Any]]]":
+        from wlm.smoke.guide import guide
+        from wlm.smoke.reference import six_way
+
+        with progress_bar(stem) as bar:
+            for done, (path, frame) in enumerate(zip(paths, chosen, strict=True), 1):
+                volume = _load(footage, frame)
+                camera = _camera(footage, volume, view, flat=True)
+                extra: dict[str, Any] = {}
+                if scene is not None:
+                    extra = {"ramp": scene.smoke.ramp, "obstacles": scene.obstacles, "time": footage.time(frame)}
+                    extra["depth"] = guide(volume, camera, step=1.0, jitter=0.0).depth if scene.obstacles else None
+                yield path, six_way(volume, camera, estimate=False, **marching), camera, extra
+                bar(done, len(paths), "")
+
+    return made(), scene
+
+
+def _spread(numbers: tuple[int, ...], count: int | None) -> tuple[int, ...]:
+    """As many of the frames as asked for, the first and the last among them."""
+    if count is None or count >= len(numbers):
+        return numbers
+    last = len(numbers) - 1
+    return tuple(numbers[round(i * last / max(count - 1, 1))] for i in range(count))

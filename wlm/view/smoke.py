@@ -1,0 +1,263 @@
+"""Pictures of smoke: shaded frames with the scene's obstacles, guiding maps, sequences and contact sheets."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image, ImageDraw, ImageFont
+
+from wlm.errors import WlmError
+from wlm.render import rasterize
+from wlm.smoke.axes import DIRECTIONS, Camera
+from wlm.smoke.data import Obstacle, obstacle_mesh
+from wlm.smoke.guide import Guide
+from wlm.smoke.reference import SixWay
+from wlm.smoke.shade import Light, Ramp, composite, obstacle_visibility, shade
+from wlm.view.atlas import encode, save_png
+
+__all__ = [
+    "MOST_COLUMNS",
+    "contact_sheet",
+    "draw_obstacles",
+    "guide_pictures",
+    "picture",
+    "six_pictures",
+    "to_bytes",
+    "write_sequence",
+]
+
+MOST_COLUMNS = 8
+"""Pictures in a row of a contact sheet."""
+
+_GREY = 96  # of a sheet: neither smoke nor shadow
+_MARGIN, _FONT = 4, 14  # pixels
+_AMBIENT = 0.2  # of an obstacle's colour, so that its dark side can be told from a black background
+
+
+def to_bytes(light: torch.Tensor | np.ndarray, white: float = 1.0) -> np.ndarray:
+    """Linear light to sRGB bytes.
+
+    Args:
+        light: [H, W, 3], or [H, W]: grey.
+        white: The light that is shown as white; what is brighter clips.
+
+    Returns:
+        uint8 [H, W, 3].
+
+    Raises:
+        ValueError: White isn't above 0.
+    """
+    if not 0 < white < math.inf:
+        raise ValueError(f"white: expected a number above 0, got {white}")
+    pixels = np.asarray(light.cpu() if isinstance(light, torch.Tensor) else light, np.float32)
+    if pixels.ndim == 2:
+        pixels = np.repeat(pixels[..., None], 3, axis=2)
+    return encode(pixels, np.ones(pixels.shape[:2], bool), white)
+
+
+def draw_obstacles(
+    obstacles: Sequence[Obstacle], time: float, camera: Camera, lights: Sequence[Light], device: str = "cpu"
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Draws obstacles, matt, under directional lights. They cast no shadows on each other, nor does the smoke on them.
+
+    Args:
+        obstacles: Any number.
+        time: When, in seconds.
+        camera: From where.
+        lights: Any number.
+        device: "cpu" or "cuda:N".
+
+    Returns:
+        Light float32 [H, W, 3], and the distance along the ray float32 [H, W], infinite where there is no obstacle.
+    """
+    points, triangles, owner = (torch.from_numpy(a).to(device) for a in obstacle_mesh(obstacles, time))
+    light = torch.zeros((camera.height, camera.width, 3), dtype=torch.float32, device=device)
+    depth = torch.full(light.shape[:2], math.inf, device=device)
+    axes = torch.tensor(camera.axes, dtype=torch.float32, device=device)
+    seen = (points - torch.tensor(camera.position, dtype=torch.float32, device=device)) @ axes.T
+    away = -seen[:, 2]
+    # Where rays are parallel nothing tells what is behind the camera but its sign.
+    ahead = (away[triangles.long()] > 0).all(1) if not camera.perspective else torch.ones_like(owner, dtype=torch.bool)
+    triangles, owner = triangles[ahead].contiguous(), owner[ahead]
+    if not len(triangles):
+        return light, depth
+    half = 0.5 * camera.extent
+    flat = [seen[:, 0] / (half * camera.width / camera.height), seen[:, 1] / half]
+    far = float(away.abs().max())
+    ends = [away - 1.0, away] if camera.perspective else [away / far, torch.ones_like(away)]
+    found = rasterize(torch.stack(flat + ends, 1), triangles, camera.height, camera.width)
+    hit = found.triangle >= 0
+    number = found.triangle[hit].long()
+    corners = points[triangles[number].long()]
+    weight = torch.cat([found.barycentric[hit], 1.0 - found.barycentric[hit].sum(1, keepdim=True)], 1)
+    at = (corners * weight[..., None]).sum(1)
+    origin, way = (torch.tensor(np.ascontiguousarray(a), dtype=torch.float32, device=device) for a in camera.rays())
+    depth[hit] = ((at - origin[hit]) * way[hit]).sum(1)
+    normal = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal = torch.nn.functional.normalize(normal, dim=1)
+    normal = torch.where((normal * way[hit]).sum(1, keepdim=True) > 0, -normal, normal)
+    colour = torch.tensor([o.colour for o in obstacles], dtype=torch.float32, device=device)[owner[number].long()]
+    total = torch.full_like(colour, _AMBIENT)
+    for given in lights:
+        toward = torch.tensor(given.toward, dtype=torch.float32, device=device)
+        facing = (normal @ (toward / toward.norm())).clamp(min=0)[:, None]
+        total = total + facing * torch.tensor(given.irradiance, dtype=torch.float32, device=device) / math.pi
+    light[hit] = colour * total
+    return light, depth
+
+
+def picture(
+    six: SixWay,
+    camera: Camera,
+    lights: Sequence[Light],
+    *,
+    background: Sequence[float] = (0.0, 0.0, 0.0),
+    ramp: Ramp | None = None,
+    obstacles: Sequence[Obstacle] = (),
+    time: float = 0.0,
+    depth: torch.Tensor | None = None,
+    rule: str = "squared",
+) -> torch.Tensor:
+    """Puts shaded smoke and a scene's obstacles into one picture.
+
+    A billboard is flat: at a pixel an obstacle is before all of the smoke or behind all of it, by the depth of the
+    smoke's surface.
+
+    Args:
+        six: Lightmaps as seen by the camera, with their transparency.
+        camera: From where.
+        lights: Any number.
+        background: A linear colour.
+        ramp: Colour of the emission.
+        obstacles: They are drawn, and keep the lights off the smoke's surface.
+        time: Of the obstacles.
+        depth: float32 [H, W], of the smoke's surface, 0 where there is none, as a guiding map has it; needed with
+            obstacles.
+        rule: How a light's direction weighs the lightmaps.
+
+    Returns:
+        float32 [H, W, 3], linear.
+
+    Raises:
+        ValueError: The lightmaps have no transparency, or there are obstacles and no depth.
+    """
+    if six.transparency is None:
+        raise ValueError("six: expected lightmaps with their transparency")
+    plain = torch.tensor(background, dtype=torch.float32, device=six.lightmaps.device)
+    if not len(obstacles):
+        return composite(shade(six, camera, lights, rule=rule, ramp=ramp), six.transparency, plain)
+    if depth is None:
+        raise ValueError("depth: expected that of the smoke's surface, for the obstacles")
+    device = str(six.lightmaps.device)
+    points, triangles, _ = (torch.from_numpy(a).to(device) for a in obstacle_mesh(obstacles, time))
+    shadowed = [
+        replace(light, visibility=obstacle_visibility(depth, camera, light.toward, points, triangles))
+        for light in lights
+    ]
+    drawn, away = draw_obstacles(obstacles, time, camera, lights, device)
+    behind = torch.where(torch.isfinite(away)[..., None], drawn, plain)
+    smoky = composite(shade(six, camera, shadowed, rule=rule, ramp=ramp), six.transparency, behind)
+    return torch.where((away < depth)[..., None], drawn, smoky)
+
+
+def six_pictures(six: SixWay, white: float = 1.0) -> dict[str, np.ndarray]:
+    """The lightmaps, the opacity and, of hot smoke, the emission, uint8 [H, W, 3] each, by name."""
+    planes = {name: six[name] for name in DIRECTIONS}
+    if six.transparency is not None:
+        planes["alpha"] = 1.0 - six.transparency
+    if six.emission is not None:
+        planes["emission"] = six.emission
+    return {name: to_bytes(plane, 1.0 if name == "alpha" else white) for name, plane in planes.items()}
+
+
+def guide_pictures(found: Guide, white: float = 2.0) -> dict[str, np.ndarray]:
+    """Light, transparency and depth, uint8 [H, W, 3] each, by name; what is nearest is white, no smoke is black."""
+    depth = found.depth.cpu()
+    smoke = depth > 0
+    near, far = (float(depth[smoke].min()), float(depth[smoke].max())) if smoke.any() else (0.0, 0.0)
+    shown = torch.where(smoke, 1.0 - 0.8 * (depth - near) / max(far - near, 1e-12), 0.0)
+    return {
+        "light": to_bytes(found.light, white),
+        "transparency": to_bytes(found.transparency),
+        "depth": np.repeat((shown.numpy() * 255.0 + 0.5).astype(np.uint8)[..., None], 3, axis=2),
+    }
+
+
+def write_sequence(folder: str | os.PathLike[str], pictures: Iterable[np.ndarray], stem: str = "frame") -> list[Path]:
+    """Writes pictures as `STEM_0001.png` and so on, each whole or not at all.
+
+    Args:
+        folder: It is made if its parent is there.
+        pictures: uint8 [H, W, 3].
+        stem: What the names begin with.
+
+    Returns:
+        The files.
+
+    Raises:
+        WlmError: A file can't be written.
+    """
+    folder = Path(folder)
+    try:
+        folder.mkdir(exist_ok=True)
+    except OSError as error:
+        raise WlmError(f"{folder}: cannot write there: {error.strerror or error}") from error
+    paths = []
+    for number, pixels in enumerate(pictures, 1):
+        paths.append(folder / f"{stem}_{number:04d}.png")
+        save_png(paths[-1], pixels)
+    return paths
+
+
+def contact_sheet(
+    path: str | os.PathLike[str],
+    rows: Mapping[str, Sequence[np.ndarray]],
+    titles: Sequence[str] = (),
+    *,
+    columns: int = MOST_COLUMNS,
+) -> tuple[int, ...]:
+    """Writes a PNG of pictures in rows, a label before each; of more than fit in a row those evenly spread are shown.
+
+    Args:
+        path: The PNG to write; its folder must exist.
+        rows: uint8 [H, W, 3] pictures by label, all of one size, as many in each row.
+        titles: Of the columns, as many as there are pictures in a row, or none.
+        columns: Pictures in a row at most.
+
+    Returns:
+        The numbers, from 0, of the pictures shown.
+
+    Raises:
+        ValueError: No picture, or they differ in size or number.
+        WlmError: The file can't be written.
+    """
+    counts = {len(row) for row in rows.values()}
+    shapes = {np.shape(cell) for row in rows.values() for cell in row}
+    if len(counts) != 1 or len(shapes) != 1 or columns < 1:
+        raise ValueError(f"expected rows of as many pictures of one size, got {sorted(counts)} of {sorted(shapes)}")
+    (count,), (height, width, _) = counts, next(iter(shapes))
+    if titles and len(titles) != count:
+        raise ValueError(f"titles: expected {count}, got {len(titles)}")
+    chosen = [int(i) for i in np.unique(np.linspace(0, count - 1, min(columns, count)).round())]
+    font = ImageFont.load_default(_FONT)
+    label = max(math.ceil(font.getlength(text)) for text in rows) + 2 * _MARGIN
+    head = 2 * _FONT if titles else _MARGIN
+    size = (label + len(chosen) * (width + _MARGIN), head + len(rows) * (height + _MARGIN))
+    sheet = Image.new("RGB", size, (_GREY,) * 3)
+    pen = ImageDraw.Draw(sheet)
+    for column, i in enumerate(chosen):
+        x = label + column * (width + _MARGIN)
+        if titles:
+            pen.text((x + width // 2, _FONT), titles[i], "white", font, anchor="mm")
+        for row, cells in enumerate(rows.values()):
+            sheet.paste(Image.fromarray(cells[i]), (x, head + row * (height + _MARGIN)))
+    for row, text in enumerate(rows):
+        pen.text((_MARGIN, head + row * (height + _MARGIN) + height // 2), text, "white", font, anchor="lm")
+    save_png(path, np.asarray(sheet))
+    return tuple(chosen)
