@@ -6,8 +6,9 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt
 
 from wlm.errors import WlmError
+from wlm.formats.exr import HALF_MAX
 
-__all__ = ["fill_gaps"]
+__all__ = ["fill_gaps", "repair"]
 
 
 def fill_gaps(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
@@ -38,3 +39,45 @@ def fill_gaps(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
         return image.copy()
     rows, columns = distance_transform_edt(~valid, return_distances=False, return_indices=True)
     return image[..., rows, columns, :]
+
+
+def repair(frame: np.ndarray, mask: np.ndarray, where: str) -> list[str]:
+    """Makes a lightmap finite and in [0, 65504], half float's range, in place.
+
+    Args:
+        frame: [H, W, 3], linear.
+        mask: bool [H, W], the texels inside; what is done to others isn't told.
+        where: Names the lightmap in the error.
+
+    Returns:
+        What changed inside, a line a kind with its count.
+
+    Raises:
+        WlmError: No texel inside is finite.
+    """
+    notes = []
+    finite = np.isfinite(frame).all(axis=2)
+    all_finite = bool(finite.all())
+    good = mask if all_finite else mask & finite
+    if not good.any():
+        raise WlmError(f"{where}: no texel inside the mask is finite")
+    if not all_finite:
+        broken = np.count_nonzero(mask & ~finite)
+        if broken:
+            notes.append(f"{_texels(broken)} NaN or infinite: replaced by the nearest finite one in the mask")
+            frame[mask & ~finite] = fill_gaps(frame, good)[mask & ~finite]
+        frame[~mask & ~finite] = 0.0
+    if frame.min() < 0:
+        negative = np.count_nonzero((frame < 0).any(axis=2) & good)
+        if negative:
+            notes.append(f"{_texels(negative)} negative: clamped to 0")
+    if frame.max() > HALF_MAX:
+        bright = np.count_nonzero((frame > HALF_MAX).any(axis=2) & good)
+        if bright:
+            notes.append(f"{_texels(bright)} above {HALF_MAX:,.0f}: clamped to it")
+    np.clip(frame, 0.0, HALF_MAX, out=frame)
+    return notes
+
+
+def _texels(count: int) -> str:
+    return f"{count} {'texel' if count == 1 else 'texels'}"

@@ -4,6 +4,7 @@ import gc
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -11,7 +12,7 @@ import warp as wp
 
 from wlm.errors import WlmError
 
-__all__ = ["StepGraph", "available_devices", "check_device", "stream", "to_warp"]
+__all__ = ["StepGraph", "available_devices", "check_device", "free_memory", "stream", "to_warp"]
 
 
 def available_devices() -> list[str]:
@@ -40,6 +41,20 @@ def check_device(name: str) -> str:
             hint = "; Warp sees a GPU that this build of torch does not"
         raise WlmError(f"device '{name}': expected one of: {', '.join(devices)}{hint}")
     return wanted
+
+
+def free_memory(device: wp.Device) -> int:
+    """Bytes that can be allocated on a device.
+
+    Raises:
+        WlmError: The machine doesn't tell.
+    """
+    if device.is_cuda:
+        return device.free_memory
+    for line in Path("/proc/meminfo").read_text().splitlines():
+        if line.startswith("MemAvailable:"):
+            return int(line.split()[1]) * 1024
+    raise WlmError("/proc/meminfo: MemAvailable: expected it, found none")
 
 
 def to_warp(tensor: torch.Tensor, dtype: Any = None) -> wp.array:

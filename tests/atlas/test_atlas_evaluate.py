@@ -9,8 +9,9 @@ import torch
 from lit_cube import DIRECTIONS, HEIGHT, WIDTH, lit_cube, waves
 
 from wlm import metrics, render
+from wlm.atlas.charts import mesh_charts
 from wlm.atlas.data import from_arrays
-from wlm.atlas.evaluate import charts, evaluate
+from wlm.atlas.evaluate import evaluate
 from wlm.atlas.views import View, sphere_views, visible_uv
 from wlm.errors import WlmError
 from wlm.imageops import fill_gaps
@@ -109,7 +110,7 @@ def test_decoders_do_not_mix():
 
 def test_charts():
     mesh = lit_cube(2)
-    number = charts(mesh)
+    number = mesh_charts(mesh)
     assert number.shape == (48,) and len(set(number)) == 6
     assert (number.reshape(6, 8) == number[::8, None]).all()
     # Vertices of their own at equal places make no border; one place in UV with another in space does, and the reverse.
@@ -119,11 +120,11 @@ def test_charts():
         (SQUARE[TWO].reshape(6, 3) + np.repeat([[0], [1.0]], 3, 0), SQUARE_UV[TWO].reshape(6, 2), 2),
         (SQUARE[TWO].reshape(6, 3), SQUARE_UV[TWO].reshape(6, 2) * np.repeat([[1], [0.5]], 3, 0), 2),
     ):
-        assert len(set(charts(from_arrays(position, six, uv, waves())))) == count
+        assert len(set(mesh_charts(from_arrays(position, six, uv, waves())))) == count
     # A shared corner alone doesn't join; a triangle without area is in none.
     fan = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]], np.float64)
     mesh = from_arrays(fan, np.array([[0, 1, 2], [1, 2, 2], [0, 3, 4]]), fan[:, :2] * 0.5 + 0.5, waves())
-    assert charts(mesh).tolist() == [0, -1, 1]
+    assert mesh_charts(mesh).tolist() == [0, -1, 1]
 
 
 def test_errors_beside_seams_stand_out():

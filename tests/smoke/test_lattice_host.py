@@ -137,7 +137,7 @@ def test_too_fast(device: str):
 
 def test_too_large_for_the_memory(device: str, monkeypatch: pytest.MonkeyPatch):
     """What it needs and what there is, before anything is allocated."""
-    monkeypatch.setattr(module, "_free_memory", lambda _device: 3 * 2**29)
+    monkeypatch.setattr(module, "free_memory", lambda _device: 3 * 2**29)
     with pytest.raises(WlmError, match=r"256 x 256 x 256 cells need 2\.4 GiB on .*: expected at most the 1\.5 GiB"):
         Lattice((256, 256, 256), viscosity=0.02, device=device)
     with pytest.raises(WlmError, match="fewer than 2"):
@@ -145,7 +145,7 @@ def test_too_large_for_the_memory(device: str, monkeypatch: pytest.MonkeyPatch):
 
 
 def test_free_memory_is_known(device: str):
-    assert 2**20 < module._free_memory(wp.get_device(device)) < 2**50
+    assert 2**20 < module.free_memory(wp.get_device(device)) < 2**50
 
 
 @pytest.mark.parametrize(

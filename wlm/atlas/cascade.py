@@ -37,6 +37,7 @@ from wlm.atlas.cluster import Clusters
 from wlm.atlas.data import LightmappedMesh
 from wlm.atlas.model import AtlasModel, Profile
 from wlm.atlas.pack import pack, regenerate
+from wlm.atlas.resize import resize
 from wlm.atlas.views import DISTANCE, normalised, sphere_views
 from wlm.errors import WlmError
 from wlm.formats.exr import HALF_MAX
@@ -80,9 +81,7 @@ def initial(lightmap: np.ndarray, mask: np.ndarray, profile: Profile) -> Texture
         T_p, each texel the mean of what it covers, and T_c; none if ``lut_scale`` is 0.
     """
     height, width = mask.shape
-    filled = torch.tensor(fill_gaps(lightmap, mask)).movedim(-1, 0)[None]
-    # Of an area that isn't whole texels too: with antialias a bilinear filter would be twice as wide as the box.
-    colour = _shrunk(filled, _sides(height, width, profile.colour_scale))
+    colour = resize(lightmap, mask, *_sides(height, width, profile.colour_scale), "box").astype(np.float32)
     if profile.lut_scale == 0.0:
         return Textures(colour, np.zeros((0, 0, 2), np.float32))
     rows, columns = _sides(height, width, profile.lut_scale)
@@ -211,20 +210,6 @@ def fit_cascade(
 
 def _sides(height: int, width: int, scale: float) -> tuple[int, int]:
     return max(1, round(scale * height)), max(1, round(scale * width))
-
-
-def _shrunk(image: torch.Tensor, size: tuple[int, int]) -> np.ndarray:
-    """The means over boxes of [1, 3, H, W], whole texels or not: [h, w, 3]."""
-    rows, columns = (_boxes(n, m) for n, m in zip(image.shape[2:], size, strict=True))
-    return (rows @ image[0].double() @ columns.T).movedim(0, -1).float().contiguous().numpy()
-
-
-def _boxes(texels: int, boxes: int) -> torch.Tensor:
-    """The share of each texel in each box, float64 [boxes, texels]."""
-    edge = torch.arange(boxes + 1, dtype=torch.float64) * (texels / boxes)
-    at = torch.arange(texels, dtype=torch.float64)
-    overlap = torch.minimum(edge[1:, None], at + 1.0) - torch.maximum(edge[:-1, None], at)
-    return overlap.clamp(min=0.0) * (boxes / texels)
 
 
 class _Step:

@@ -4,7 +4,9 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-__all__ = ["charts", "welded"]
+from wlm.atlas.data import LightmappedMesh
+
+__all__ = ["charts", "mesh_charts", "welded"]
 
 
 def welded(position: np.ndarray, uv: np.ndarray, triangle: np.ndarray) -> np.ndarray:
@@ -53,3 +55,16 @@ def charts(corner: np.ndarray, active: np.ndarray | None = None) -> np.ndarray:
     _, first, number = np.unique(label, return_index=True, return_inverse=True)
     out[own] = np.argsort(np.argsort(first))[number]
     return out
+
+
+def mesh_charts(mesh: LightmappedMesh) -> np.ndarray:
+    """Numbers the charts of the lightmap's UVs.
+
+    Args:
+        mesh: The mesh.
+
+    Returns:
+        int32 [F]: active triangles that share an edge, with its ends at the same places in space and in UV space, are
+        in one chart, and so on from one to the next; -1 where a triangle isn't active.
+    """
+    return charts(welded(mesh.position, mesh.uv, mesh.triangle), mesh.active)

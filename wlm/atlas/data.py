@@ -39,15 +39,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 
 from wlm.atlas.coverage import covered_texels, touched_texels
 from wlm.errors import WlmError
-from wlm.formats.exr import HALF_MAX, read_exr
+from wlm.formats.exr import read_exr
 from wlm.formats.gltf import GltfDocument, GltfPrimitive, document_from_arrays, read_gltf
 from wlm.formats.gltf_writer import Replacement, write_glb
+from wlm.formats.mask import read_mask
 from wlm.formats.obj import read_obj
-from wlm.imageops import fill_gaps
+from wlm.imageops import repair
 
 __all__ = ["LightmappedMesh", "Part", "from_arrays", "load_mesh", "write_mesh"]
 
@@ -143,7 +143,7 @@ def load_mesh(
         document, primitives = read_gltf(path)
     lightmap, _ = read_exr(lightmap_path)
     lightmap = np.array(lightmap[..., :3], np.float32, order="C")
-    mask = None if mask_path is None else _read_mask(Path(mask_path), lightmap_path, lightmap.shape[:2])
+    mask = None if mask_path is None else read_mask(Path(mask_path), lightmap_path, lightmap.shape[:2])
     return _check(
         str(path), path.stem, document, primitives, uv_set, lightmap, mask, str(lightmap_path), str(mask_path)
     )
@@ -245,24 +245,6 @@ def _document(
         return document_from_arrays(position[used], corner.reshape(-1, 3), uv[used], name)
 
 
-def _read_mask(path: Path, lightmap_path: str | os.PathLike[str], size: tuple[int, int]) -> np.ndarray:
-    """Reads a PNG as [H, W] bool: valid where any colour channel is above 0."""
-    if not path.is_file():
-        raise WlmError(f"{path}: no such mask; expected a PNG of {size[1]}x{size[0]}")
-    try:
-        with Image.open(path) as image:
-            # The header's size first: a wrong one need not be decoded.
-            if (image.height, image.width) != size:
-                raise WlmError(
-                    f"{path}: the mask is {image.width}x{image.height}, but {lightmap_path} is {size[1]}x{size[0]}"
-                )
-            # A palette's index says nothing; an alpha channel is not coverage here.
-            colour = np.asarray(image.convert("RGB") if image.mode in ("P", "PA", "RGBA", "LA") else image)
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise WlmError(f"{path}: cannot read the mask: {error}") from error
-    return colour > 0 if colour.ndim == 2 else (colour > 0).any(axis=2)
-
-
 def _check(
     where: str,
     name: str,
@@ -321,7 +303,7 @@ def _check(
                 f"{name}: {_count(missed, 'texel')} of {covered} that triangles cover are outside the mask: "
                 f"is it of another UV set than TEXCOORD_{uv_set}, or upside down?"
             )
-    warnings += [f"{lightmap_name}: {text}" for text in _repair(lightmap, mask, lightmap_name)]
+    warnings += [f"{lightmap_name}: {text}" for text in repair(lightmap, mask, lightmap_name)]
     source = _hash(position, triangle, uv, lightmap, mask)
     return LightmappedMesh(
         name, position, triangle, uv, active, lightmap, mask, uv_set, source, tuple(warnings), document, tuple(parts)
@@ -377,31 +359,6 @@ def _has_area(point: np.ndarray, triangle: np.ndarray) -> np.ndarray:
     else:
         twice = np.linalg.norm(np.cross(one, two), axis=1)
     return twice > 2 * _FLAT
-
-
-def _repair(lightmap: np.ndarray, mask: np.ndarray, where: str) -> list[str]:
-    """Makes the lightmap [H, W, 3] finite and in [0, HALF_MAX], in place; returns what changed inside."""
-    notes = []
-    finite = np.isfinite(lightmap).all(axis=2)
-    good = mask & finite
-    if not good.any():
-        raise WlmError(f"{where}: no texel inside the mask is finite")
-    broken = mask & ~finite
-    if broken.any():
-        lightmap[broken] = fill_gaps(lightmap, good)[broken]
-        notes.append(
-            f"{_count(np.count_nonzero(broken), 'texel')} NaN or infinite: replaced by the nearest finite one in the "
-            "mask"
-        )
-    lightmap[~mask & ~finite] = 0.0
-    negative = np.count_nonzero((lightmap < 0).any(axis=2) & good)
-    if negative:
-        notes.append(f"{_count(negative, 'texel')} negative: clamped to 0")
-    bright = np.count_nonzero((lightmap > HALF_MAX).any(axis=2) & good)
-    if bright:
-        notes.append(f"{_count(bright, 'texel')} above {HALF_MAX:,.0f}: clamped to it")
-    np.clip(lightmap, 0.0, HALF_MAX, out=lightmap)
-    return notes
 
 
 def _count(number: int, one: str, many: str | None = None) -> str:

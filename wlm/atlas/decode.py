@@ -4,9 +4,10 @@ import numpy as np
 import torch
 import warp as wp
 
-from wlm import interop, render
+from wlm import interop
 from wlm.atlas.data import LightmappedMesh
 from wlm.atlas.model import AtlasModel
+from wlm.atlas.views import texel_triangles
 from wlm.errors import WlmError
 from wlm.imageops import fill_gaps
 from wlm_kernels import cascade, tile_decode
@@ -117,16 +118,10 @@ class Decoder:
             uv = np.stack([(column + 0.5) / width, (row + 0.5) / height], 1).astype(np.float32)
             result[mesh.mask] = self.read(torch.from_numpy(uv).to(self.device)).cpu().numpy()
             return result
-        active = torch.from_numpy(np.flatnonzero(mesh.active)).to(self.device)
-        raster = render.rasterize_uv(
-            torch.from_numpy(mesh.uv.astype(np.float32)).to(self.device),
-            torch.from_numpy(mesh.triangle).to(self.device)[active],
-            height,
-            width,
-        )
-        hit = raster.triangle >= 0
-        weight = raster.barycentric[hit]
+        triangle, barycentric = texel_triangles(mesh, height, width, self.device)
+        hit = triangle >= 0
+        weight = barycentric[hit]
         weight = torch.cat([weight, 1.0 - weight.sum(1, keepdim=True)], 1)
         found = hit.cpu().numpy()
-        result[found] = self(weight[:, :2], active[raster.triangle[hit].long()], weight).cpu().numpy()
+        result[found] = self(weight[:, :2], triangle[hit], weight).cpu().numpy()
         return fill_gaps(result, found) * mesh.mask[..., None] if found.any() else result

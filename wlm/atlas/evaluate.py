@@ -37,16 +37,15 @@ import torch
 from scipy.ndimage import distance_transform_edt
 
 from wlm import render
-from wlm.atlas.charts import charts as find_charts
-from wlm.atlas.charts import welded
+from wlm.atlas.charts import mesh_charts, welded
 from wlm.atlas.data import LightmappedMesh
-from wlm.atlas.views import View, sphere_views, visible_uv
+from wlm.atlas.views import View, sphere_views, texel_triangles, visible_uv
 from wlm.errors import WlmError
 from wlm.imageops import fill_gaps
 from wlm.interop import check_device
 from wlm.metrics import PSNR_CAP_DB, SSIM_WINDOW
 
-__all__ = ["Report", "Sampler", "charts", "evaluate"]
+__all__ = ["Report", "Sampler", "evaluate"]
 
 Sampler = Callable[[torch.Tensor, torch.Tensor, torch.Tensor], torch.Tensor]
 """A decoder: the mesh's own UVs float32 [N, 2], triangles int32 [N] and barycentrics float32 [N, 3] of points, to
@@ -123,8 +122,8 @@ def evaluate(
         resolution: Pixels along a side of a view, 1 to 16,384.
         device: "cpu" or "cuda:N", where the decoders are called.
         labels: For some of the decoders, what numbers their own charts or tiles: their seams are where it changes.
-            Those of the others are the borders of the lightmap's charts, ``charts``. Either way a border is between
-            neighbouring pixels that see one triangle or two that share a corner in space, so that an outline in
+            Those of the others are the borders of the lightmap's charts, ``mesh_charts``. Either way a border is
+            between neighbouring pixels that see one triangle or two that share a corner in space, so that an outline in
             front of something else is none.
         progress: Called with the views done and their number.
 
@@ -143,7 +142,7 @@ def evaluate(
         raise ValueError(f"labels: expected names of decoders, got {', '.join(unknown)}")
     cameras = sphere_views(views) if isinstance(views, int) else list(views)
     image = torch.tensor(fill_gaps(mesh.lightmap, mesh.mask), device=device)
-    chart = torch.tensor(charts(mesh), device=device)
+    chart = torch.tensor(mesh_charts(mesh), device=device)
     # Corners at one place in space have one number.
     place = torch.tensor(welded(mesh.position, np.zeros_like(mesh.uv), mesh.triangle), device=device)
     with torch.no_grad(), _one_thread(device):
@@ -168,19 +167,6 @@ def evaluate(
                 progress(number + 1, len(cameras))
         texels = _texel_errors(mesh, image, decoders)
     return {name: tally.report(mesh.name, peak, texels[name]) for name, tally in tallies.items()}
-
-
-def charts(mesh: LightmappedMesh) -> np.ndarray:
-    """Numbers the charts of the lightmap's UVs.
-
-    Args:
-        mesh: The mesh.
-
-    Returns:
-        int32 [F]: active triangles that share an edge, with its ends at the same places in space and in UV space, are
-        in one chart, and so on from one to the next; -1 where a triangle isn't active.
-    """
-    return find_charts(welded(mesh.position, mesh.uv, mesh.triangle), mesh.active)
 
 
 @contextmanager
@@ -301,19 +287,12 @@ def _texel_errors(mesh: LightmappedMesh, image: torch.Tensor, decoders: Mapping[
     """Mean squared errors over the texels in the mask with their centre in an active triangle; NaN if there is none."""
     height, width = mesh.mask.shape
     device = image.device
-    active = np.flatnonzero(mesh.active)
-    raster = render.rasterize_uv(
-        torch.tensor(mesh.uv, dtype=torch.float32, device=device),
-        torch.tensor(mesh.triangle[active], device=device),
-        height,
-        width,
-    )
-    hit = (raster.triangle >= 0) & torch.tensor(mesh.mask, device=device)
+    found, barycentric = texel_triangles(mesh, height, width, str(device))
+    hit = (found >= 0) & torch.tensor(mesh.mask, device=device)
     row, column = torch.nonzero(hit, as_tuple=True)
     # At the centre itself, where the reference is the texel, not at the interpolated UV.
     uv = torch.stack([(column + 0.5) / width, (row + 0.5) / height], dim=1).float()
-    triangle = torch.tensor(active, dtype=torch.int32, device=device)[raster.triangle[hit].long()]
-    points = _Points.of(uv, triangle, raster.barycentric[hit])
+    points = _Points.of(uv, found[hit].int(), barycentric[hit])
     if not len(uv):
         return dict.fromkeys(decoders, math.nan)
     wanted = render.texture(image, uv).double()

@@ -14,11 +14,11 @@ from wlm import interop
 from wlm.atlas import colour as codec
 from wlm.atlas import tiles as grid
 from wlm.atlas.cascade import fit_cascade
+from wlm.atlas.charts import mesh_charts
 from wlm.atlas.cluster import cluster
 from wlm.atlas.coverage import covered_texels
 from wlm.atlas.data import LightmappedMesh
 from wlm.atlas.decode import Decoder
-from wlm.atlas.evaluate import charts
 from wlm.atlas.model import (
     COLOUR_BITS,
     LUT_BITS,
@@ -30,11 +30,11 @@ from wlm.atlas.model import (
     pack_entries,
 )
 from wlm.atlas.resize import fitting_size, resize
-from wlm.atlas.views import sphere_views, visibility
+from wlm.atlas.views import sphere_views, surface_points, texel_triangles, visibility
 from wlm.errors import WlmError
 from wlm.formats.exr import HALF_MAX
 from wlm.imageops import fill_gaps
-from wlm.render import rasterize_uv, texture
+from wlm.render import texture
 
 __all__ = ["Progress", "compress", "weights"]
 
@@ -148,21 +148,15 @@ def _scored_points(
     Where no triangle holds a centre, being too small, the quarters that count stand for their triangles.
     """
     height, width = weight.shape
-    active = np.flatnonzero(mesh.active)
-    raster = rasterize_uv(
-        torch.from_numpy(mesh.uv.astype(np.float32)).to(device),
-        torch.from_numpy(mesh.triangle[active]).to(device),
-        height,
-        width,
-    )
-    hit = raster.triangle >= 0
+    found, barycentric = texel_triangles(mesh, height, width, device)
+    hit = found >= 0
     counts = torch.from_numpy(weight).to(device)
     if not bool(hit.any()):
         hit = counts > 0
     row, column = torch.nonzero(hit, as_tuple=True)
     uv = torch.stack([(column + 0.5) / width, (row + 0.5) / height], 1).float()
-    share = raster.barycentric[hit]
-    triangle = torch.from_numpy(active).to(device)[raster.triangle[hit].clamp(min=0).long()]
+    share, triangle = barycentric[hit], found[hit]
+    triangle = torch.where(triangle < 0, int(np.flatnonzero(mesh.active)[0]), triangle)
     return (uv, triangle, torch.cat([share, 1.0 - share.sum(1, keepdim=True)], 1)), counts[hit]
 
 
@@ -197,18 +191,8 @@ def weights(mesh: LightmappedMesh, profile: Profile, seed: int, device: str) -> 
 
 def _borders(mesh: LightmappedMesh, height: int, width: int, device: str) -> np.ndarray:
     """Which cells of UV space are within ``_RIM`` of a border between charts or of a chart and nothing."""
-    active = np.flatnonzero(mesh.active)
-    found = (
-        rasterize_uv(
-            torch.from_numpy(mesh.uv.astype(np.float32)).to(device),
-            torch.from_numpy(mesh.triangle[active]).to(device),
-            height,
-            width,
-        )
-        .triangle.cpu()
-        .numpy()
-    )
-    label = np.where(found < 0, -1, charts(mesh)[active][found])
+    found = texel_triangles(mesh, height, width, device)[0].cpu().numpy()
+    label = np.where(found < 0, -1, mesh_charts(mesh)[found])
     window = 2 * _RIM + 1
     return maximum_filter(label, window) != minimum_filter(label, window)
 
@@ -216,16 +200,11 @@ def _borders(mesh: LightmappedMesh, height: int, width: int, device: str) -> np.
 def _areas(mesh: LightmappedMesh, height: int, width: int, seed: int) -> np.ndarray:
     """How many of random points of the mesh's surface lie in each cell of UV space, int64 [height, width]."""
     random = np.random.default_rng(seed)
-    corner = mesh.position[mesh.triangle]
-    area = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1) * mesh.active
-    ends = np.cumsum(area)
     count = np.zeros(height * width, np.int64)
     total = _POINTS * height * width
     for first in range(0, total, _POINTS_AT_ONCE):
         points = min(_POINTS_AT_ONCE, total - first)
-        triangle = np.searchsorted(ends, random.random(points) * ends[-1], side="right").clip(max=len(ends) - 1)
-        root, share = np.sqrt(random.random(points)), random.random(points)
-        weight = np.stack([1 - root, root * (1 - share), root * share], 1)
+        triangle, weight = surface_points(mesh, points, random)
         uv = np.einsum("nk,nkc->nc", weight, mesh.uv[mesh.triangle[triangle]])
         column, row = ((uv[:, i] * n).astype(np.int64).clip(0, n - 1) for i, n in enumerate((width, height)))
         count += np.bincount(row * width + column, minlength=height * width)

@@ -20,7 +20,16 @@ from wlm import render
 from wlm.atlas.data import LightmappedMesh
 from wlm.interop import check_device
 
-__all__ = ["View", "clip_positions", "normalised", "sphere_views", "visibility", "visible_uv"]
+__all__ = [
+    "View",
+    "clip_positions",
+    "normalised",
+    "sphere_views",
+    "surface_points",
+    "texel_triangles",
+    "visibility",
+    "visible_uv",
+]
 
 DISTANCE = 3.0
 _SPHERE = math.sqrt(3.0)
@@ -190,3 +199,44 @@ def visibility(
         row = (at[:, 1] * height).long().clamp(0, height - 1)
         count += torch.bincount(row * width + column, minlength=height * width)
     return count.reshape(height, width).double().cpu().numpy()
+
+
+def texel_triangles(mesh: LightmappedMesh, height: int, width: int, device: str) -> tuple[torch.Tensor, torch.Tensor]:
+    """Which active triangle holds the centre of each cell of a grid over UV space.
+
+    Args:
+        mesh: The mesh.
+        height, width: Of the grid, row 0 at v = 0.
+        device: "cpu" or "cuda:N".
+
+    Returns:
+        On the device: int64 [height, width], the triangle, the first of several, -1 for none; float32 [height, width,
+        2], the weights of its corners 0 and 1.
+    """
+    active = torch.tensor(np.flatnonzero(mesh.active), device=device)
+    raster = render.rasterize_uv(
+        torch.tensor(mesh.uv, dtype=torch.float32, device=device),
+        torch.tensor(mesh.triangle, device=device)[active],
+        height,
+        width,
+    )
+    return torch.where(raster.triangle >= 0, active[raster.triangle.clamp(min=0).long()], -1), raster.barycentric
+
+
+def surface_points(mesh: LightmappedMesh, count: int, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Random points of the active triangles, each place of the surface as likely.
+
+    Args:
+        mesh: The mesh.
+        count: How many, N.
+        random: Where they come from.
+
+    Returns:
+        int64 [N], their triangles; float64 [N, 3], the weights of the corners.
+    """
+    corner = mesh.position[mesh.triangle]
+    area = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1) * mesh.active
+    ends = np.cumsum(area)
+    triangle = np.searchsorted(ends, random.random(count) * ends[-1], side="right").clip(max=len(ends) - 1)
+    root, share = np.sqrt(random.random(count)), random.random(count)
+    return triangle, np.stack([1.0 - root, root * (1.0 - share), root * share], 1)

@@ -33,12 +33,13 @@ import warp as wp
 
 from wlm import interop
 from wlm.atlas import codec
-from wlm.atlas.data import LightmappedMesh, from_arrays
+from wlm.atlas.data import from_arrays
 from wlm.atlas.decode import Decoder
 from wlm.atlas.evaluate import Report, Sampler, evaluate
 from wlm.atlas.fit import compress
 from wlm.atlas.model import SOURCE_BITS, AtlasModel, Profile, load_profile
 from wlm.atlas.reference import decode64
+from wlm.atlas.views import surface_points
 from wlm.baselines.atlas import ATLAS_BASELINES
 from wlm.bench.atlas_inputs import Lightmap
 from wlm.bench.plot import Panel
@@ -246,7 +247,7 @@ class _Bench:
     def __init__(self, lightmap: Lightmap, device: str, points: int, note: Note):
         self.mesh, self.scene, self.device = lightmap.mesh, lightmap.scene, device
         self.note: Note = lambda line: note(f"{self.scene}: {line}")
-        self.triangle, self.weight = _surface_points(self.mesh, points)
+        self.triangle, self.weight = surface_points(self.mesh, points, np.random.default_rng(0))
 
     def ours(self, profiles: Sequence[Profile], whole: bool) -> list[_Entry]:
         """Our profiles, and the first of them at the bits of the first cascade."""
@@ -429,17 +430,6 @@ def _means(scored: Sequence[_Entry], lightmaps: int) -> list[Row]:
             )
         )
     return rows
-
-
-def _surface_points(mesh: LightmappedMesh, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Random points, each place of the surface as likely: triangles int64 [N] and weights float64 [N, 3]."""
-    random = np.random.default_rng(0)
-    corner = mesh.position[mesh.triangle]
-    area = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1) * mesh.active
-    ends = np.cumsum(area)
-    triangle = np.searchsorted(ends, random.random(count) * ends[-1], side="right").clip(max=len(ends) - 1)
-    root, share = np.sqrt(random.random(count)), random.random(count)
-    return triangle, np.stack([1.0 - root, root * (1.0 - share), root * share], 1)
 
 
 def _warm_up(profile: Profile, device: str) -> None:

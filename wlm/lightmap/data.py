@@ -39,11 +39,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 
 from wlm.errors import WlmError
-from wlm.formats.exr import HALF_MAX, read_exr
-from wlm.imageops import fill_gaps
+from wlm.formats.exr import read_exr
+from wlm.formats.mask import read_mask
+from wlm.imageops import repair
 from wlm.lightmap.listing import SET_FILE, Listing, list_folder, parse_set
 
 __all__ = ["LightmapSet", "from_arrays", "load_set", "parse_times"]
@@ -126,7 +126,7 @@ def load_set(
     elif which == "all":
         valid = np.ones((height, width), bool)
     else:
-        valid = _read_mask(Path(which), listing.files[0], (height, width))
+        valid = read_mask(Path(which), listing.files[0], (height, width), ', "alpha" or "all"')
     return _check(
         listing.name,
         [file.name for file in listing.files],
@@ -258,24 +258,6 @@ def _size(shape: Sequence[int]) -> str:
     return f"{shape[1]}x{shape[0]}"
 
 
-def _read_mask(path: Path, beside: Path, size: tuple[int, int]) -> np.ndarray:
-    """Reads a PNG as [H, W] bool: valid where any colour channel is above 0."""
-    if not path.is_file():
-        raise WlmError(f'{path}: no such mask; expected a PNG of {_size(size)}, "alpha" or "all"')
-    try:
-        with Image.open(path) as image:
-            # The header's size first: a wrong one need not be decoded.
-            if (image.height, image.width) != size:
-                raise WlmError(
-                    f"{path}: the mask is {_size((image.height, image.width))}, but {beside} is {_size(size)}"
-                )
-            # A palette's index says nothing; an alpha channel is not coverage here.
-            colour = np.asarray(image.convert("RGB") if image.mode in ("P", "PA", "RGBA", "LA") else image)
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise WlmError(f"{path}: cannot read the mask: {error}") from error
-    return colour > 0 if colour.ndim == 2 else (colour > 0).any(axis=2)
-
-
 def _check(
     name: str,
     labels: Sequence[str],
@@ -308,7 +290,7 @@ def _check(
         if times[i] == times[i + 1]:
             raise WlmError(f"{where}: {labels[i]} and {labels[i + 1]} have the same time, {times[i]:g}")
     for label, frame in zip(labels, frames, strict=True):
-        warnings += [f"{label}: {text}" for text in _repair(frame, mask, f"{where}: {label}")]
+        warnings += [f"{label}: {text}" for text in repair(frame, mask, f"{where}: {label}")]
     return LightmapSet(
         name=name,
         times=times,
@@ -318,36 +300,6 @@ def _check(
         source=_hash(frames, times, mask),
         warnings=tuple(warnings),
     )
-
-
-def _repair(frame: np.ndarray, mask: np.ndarray, where: str) -> list[str]:
-    """Makes one frame [H, W, 3] finite and in [0, HALF_MAX], in place; returns what changed inside."""
-    notes = []
-    finite = np.isfinite(frame).all(axis=2)
-    all_finite = bool(finite.all())
-    good = mask if all_finite else mask & finite
-    if not good.any():
-        raise WlmError(f"{where}: no texel inside the mask is finite")
-    if not all_finite:
-        broken = np.count_nonzero(mask & ~finite)
-        if broken:
-            notes.append(f"{_texels(broken)} NaN or infinite: replaced by the nearest finite one in the mask")
-            frame[mask & ~finite] = fill_gaps(frame, good)[mask & ~finite]
-        frame[~mask & ~finite] = 0.0
-    if frame.min() < 0:
-        negative = np.count_nonzero((frame < 0).any(axis=2) & good)
-        if negative:
-            notes.append(f"{_texels(negative)} negative: clamped to 0")
-    if frame.max() > HALF_MAX:
-        bright = np.count_nonzero((frame > HALF_MAX).any(axis=2) & good)
-        if bright:
-            notes.append(f"{_texels(bright)} above {HALF_MAX:,.0f}: clamped to it")
-    np.clip(frame, 0.0, HALF_MAX, out=frame)
-    return notes
-
-
-def _texels(count: int) -> str:
-    return f"{count} {'texel' if count == 1 else 'texels'}"
 
 
 def _hash(frames: np.ndarray, times: np.ndarray, mask: np.ndarray) -> str:

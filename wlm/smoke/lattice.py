@@ -18,12 +18,12 @@ a cell freed with no fluid about it  at rest at density 1
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import warp as wp
 
 from wlm.errors import WlmError
+from wlm.interop import free_memory
 from wlm.smoke import lattice_faces
 from wlm.smoke.lattice_engine import BODIES, Engine
 from wlm_kernels.lattice import QUIET, Spec, eddy_factor, trouble_of
@@ -423,18 +423,8 @@ def _check_speed(speed: float, what: str) -> None:
         )
 
 
-def _free_memory(device: wp.Device) -> int:
-    """Bytes that can be allocated on a device."""
-    if device.is_cuda:
-        return device.free_memory
-    for line in Path("/proc/meminfo").read_text().splitlines():
-        if line.startswith("MemAvailable:"):
-            return int(line.split()[1]) * 1024
-    raise WlmError("/proc/meminfo: MemAvailable: expected it, found none")
-
-
 def _require_memory(needed: int, shape: tuple[int, int, int], device: wp.Device) -> None:
-    free = _free_memory(device)
+    free = free_memory(device)
     if needed > free:
         x, y, z = shape
         raise WlmError(

@@ -2,12 +2,12 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 import numpy as np
 import warp as wp
 
 from wlm.errors import WlmError
+from wlm.interop import free_memory
 from wlm.smoke.lattice import Lattice
 from wlm.smoke.lattice_faces import FACES
 from wlm_kernels.advection_places import CLOSED, OPEN, PERIODIC
@@ -41,11 +41,7 @@ def require_memory(shape: tuple[int, int, int], cell_bytes: int, device: wp.Devi
     if x * y * z >= 2**31:
         raise WlmError(f"smoke: {x} x {y} x {z} cells: expected fewer than 2^31: use a lower refinement")
     needed = cell_bytes * x * y * z
-    if device.is_cuda:
-        free = device.free_memory
-    else:
-        lines = Path("/proc/meminfo").read_text().splitlines()
-        free = next(int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:"))
+    free = free_memory(device)
     if needed > free:
         raise WlmError(
             f"smoke: {x} x {y} x {z} cells need {needed / 2**30:.1f} GiB on {device}: expected at most the"

@@ -1,0 +1,37 @@
+"""Masks of lightmaps: PNGs that say which texels belong to a chart."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from wlm.errors import WlmError
+
+__all__ = ["read_mask"]
+
+
+def read_mask(path: Path, beside: str | os.PathLike[str], size: tuple[int, int], others: str = "") -> np.ndarray:
+    """Reads a PNG as [H, W] bool: valid where any colour channel is above 0.
+
+    Args:
+        path: The PNG.
+        beside: The lightmap whose size it must have; for the message.
+        size: Its rows and columns.
+        others: What else than a PNG is expected, for the message of one that isn't there.
+
+    Raises:
+        WlmError: It is missing, damaged or of another size.
+    """
+    if not path.is_file():
+        raise WlmError(f"{path}: no such mask; expected a PNG of {size[1]}x{size[0]}{others}")
+    try:
+        with Image.open(path) as image:
+            # The header's size first: a wrong one need not be decoded.
+            if (image.height, image.width) != size:
+                raise WlmError(f"{path}: the mask is {image.width}x{image.height}, but {beside} is {size[1]}x{size[0]}")
+            # A palette's index says nothing; an alpha channel is not coverage here.
+            colour = np.asarray(image.convert("RGB") if image.mode in ("P", "PA", "RGBA", "LA") else image)
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise WlmError(f"{path}: cannot read the mask: {error}") from error
+    return colour > 0 if colour.ndim == 2 else (colour > 0).any(axis=2)
