@@ -182,5 +182,7 @@ def _side_stream(device: str) -> tuple[torch.cuda.Stream, wp.Stream]:
 
     One for all uses: torch's allocator keeps a pool of memory for every stream.
     """
+    # Warp looks a stream's device up in a table that it makes when it starts, and this may be its first call.
+    wp.init()
     side = torch.cuda.Stream(device)
     return side, wp.stream_from_torch(side)

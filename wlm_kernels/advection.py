@@ -15,8 +15,8 @@ a trace that leaves the domain   at an open face: clean air comes in, 0; at a cl
 a trace that ends in a solid     cut where it first meets it, by bisection: to within 1/64 of its length
 a read beside a solid            solid cells don't count, the other weights are scaled up
 a cell in a solid                0
-MacCormack beside a solid, or    semi-Lagrangian there
-from beyond an open face
+MacCormack with an end beside a  semi-Lagrangian there
+solid or beyond an open face
 a velocity that isn't a number   reads some cell of the grid, never beyond it
 more than half floats hold       65504
 ===============================  =====================================================================
@@ -32,15 +32,17 @@ import warp as wp
 
 from wlm_kernels.advection_places import (
     BRICK,
+    FREE,
     RUN,
+    SOLID,
     Box,
     Bricks,
+    Corner,
     Patch,
-    beside,
+    corner,
     cut,
     evaluate,
     fetch,
-    holds,
     inside,
     leaves,
     place,
@@ -48,6 +50,8 @@ from wlm_kernels.advection_places import (
     stencil_index,
     stencil_weight,
     step_back,
+    wall_at,
+    within,
 )
 from wlm_kernels.lattice_sets import cell_of, index_of
 
@@ -56,8 +60,9 @@ __all__ = ["STORAGES", "Fields", "advect", "correct", "field_kernels", "storage_
 # Loops over eight cells are for places beside solids: unrolled they would take the registers of all others.
 _OPTIONS = {"enable_backward": False, "max_unroll": 4}
 
-# Threads of a block and blocks that share a multiprocessor: what else takes 170 registers then spills a few bytes.
-_BOUNDS = (256, 2)
+# Threads of a block, and blocks that share a multiprocessor: what else takes 110 registers then makes room for more
+# threads and spills where it rarely goes. Measured at 400^3: 2, 3, 4 blocks take 1.02, 0.80, 0.73 ms without solids.
+_BOUNDS = {False: (256, 4), True: (256, 3)}
 
 STORAGES = {"float32": wp.float32, "float16": wp.float16}
 
@@ -87,8 +92,9 @@ class FieldKernels:
 
 
 @functools.cache
-def field_kernels(storage: str, in_bricks: bool, solids: bool) -> FieldKernels:
-    """Builds (once) the kernels that carry fields; those that know no solids are half the code."""
+def field_kernels(storage: str, in_bricks: bool, solids: bool, hot: bool) -> FieldKernels:
+    """Builds (once) the kernels that carry fields; those that know no solids are half the code, and use fewer registers
+    where there is no temperature."""
     stored = STORAGES[storage]
 
     @wp.func
@@ -97,70 +103,94 @@ def field_kernels(storage: str, in_bricks: bool, solids: bool) -> FieldKernels:
             return stored(wp.min(value, _LARGEST_HALF))
         return stored(value)
 
-    @wp.func
-    def is_fluid(box: Box, walls: wp.array1d[wp.uint8], cell: wp.vec3i) -> bool:
-        if wp.static(solids):
-            return not inside(box, walls, cell)
-        return True
+    # By Warp's strides, 64 bits wide each, the addresses would be a third of the work.
+    @wp.func_native("return field.data[i];")
+    def peek(field: wp.array1d[stored], i: int) -> stored: ...
+
+    @wp.func_native("field.data[i] = value;")
+    def poke(field: wp.array1d[stored], i: int, value: stored): ...
 
     @wp.func
-    def trace(
-        box: Box, u: wp.array1d[wp.vec3], walls: wp.array1d[wp.uint8], patch: Patch, x: wp.vec3, v: wp.vec3, dt: float
-    ) -> wp.vec3:
-        end = step_back(box, u, patch, x, v, dt)
-        if wp.static(solids):
-            return cut(box, walls, x, end)
-        return end
+    def value_at(field: wp.array1d[stored], i: int) -> float:
+        return float(peek(field, i))
 
     @wp.func
-    def read(field: wp.array1d[stored], walls: wp.array1d[wp.uint8], box: Box, p: wp.vec3) -> float:
-        """A field at a place within the domain."""
-        at = stencil(box.n, box.periodic, p)
-        if wp.static(solids):
-            if beside(box, walls, p):
-                total = float(0.0)
-                weight = float(0.0)
-                for k in range(8):
-                    cell = stencil_index(at, k)
-                    if not inside(box, walls, cell):
-                        w = stencil_weight(at, k)
-                        total += w * float(field[index_of(box.n, cell)])
-                        weight += w
-                # Nothing but solid cells: there is no smoke to be had.
-                return total / wp.max(weight, 1.0e-6)
-        row00 = (at.low[0] * box.n[1] + at.low[1]) * box.n[2]
-        row01 = (at.low[0] * box.n[1] + at.high[1]) * box.n[2]
-        row10 = (at.high[0] * box.n[1] + at.low[1]) * box.n[2]
-        row11 = (at.high[0] * box.n[1] + at.high[1]) * box.n[2]
-        a = wp.lerp(float(field[row00 + at.low[2]]), float(field[row00 + at.high[2]]), at.f[2])
-        b = wp.lerp(float(field[row01 + at.low[2]]), float(field[row01 + at.high[2]]), at.f[2])
-        c = wp.lerp(float(field[row10 + at.low[2]]), float(field[row10 + at.high[2]]), at.f[2])
-        d = wp.lerp(float(field[row11 + at.low[2]]), float(field[row11 + at.high[2]]), at.f[2])
+    def mixed(field: wp.array1d[stored], at: Corner) -> float:
+        """A field at a place."""
+        i00 = at.base
+        i01 = at.base + at.step[1]
+        i10 = at.base + at.step[0]
+        i11 = i10 + at.step[1]
+        a = wp.lerp(value_at(field, i00), value_at(field, i00 + at.step[2]), at.f[2])
+        b = wp.lerp(value_at(field, i01), value_at(field, i01 + at.step[2]), at.f[2])
+        c = wp.lerp(value_at(field, i10), value_at(field, i10 + at.step[2]), at.f[2])
+        d = wp.lerp(value_at(field, i11), value_at(field, i11 + at.step[2]), at.f[2])
         return wp.lerp(wp.lerp(a, b, at.f[1]), wp.lerp(c, d, at.f[1]), at.f[0])
 
     @wp.func
-    def limited(field: wp.array1d[stored], box: Box, p: wp.vec3, value: float) -> float:
-        """A value held between the least and the largest of those that ``read`` mixes at p."""
+    def mixed_beside(field: wp.array1d[stored], walls: wp.array1d[wp.uint8], box: Box, p: wp.vec3) -> float:
+        """The same at a place beside a solid, of which nothing is taken."""
         at = stencil(box.n, box.periodic, p)
-        row00 = (at.low[0] * box.n[1] + at.low[1]) * box.n[2]
-        row01 = (at.low[0] * box.n[1] + at.high[1]) * box.n[2]
-        row10 = (at.high[0] * box.n[1] + at.low[1]) * box.n[2]
-        row11 = (at.high[0] * box.n[1] + at.high[1]) * box.n[2]
-        low = wp.vec4(
-            float(field[row00 + at.low[2]]),
-            float(field[row01 + at.low[2]]),
-            float(field[row10 + at.low[2]]),
-            float(field[row11 + at.low[2]]),
-        )
-        high = wp.vec4(
-            float(field[row00 + at.high[2]]),
-            float(field[row01 + at.high[2]]),
-            float(field[row10 + at.high[2]]),
-            float(field[row11 + at.high[2]]),
-        )
-        least = wp.min(wp.min(low, high))
-        most = wp.max(wp.max(low, high))
-        return wp.clamp(value, least, most)
+        total = float(0.0)
+        weight = float(0.0)
+        for k in range(8):
+            cell = stencil_index(at, k)
+            if not inside(box, walls, cell):
+                w = stencil_weight(at, k)
+                total += w * value_at(field, index_of(box.n, cell))
+                weight += w
+        # Nothing but solid cells: there is no smoke to be had.
+        return total / wp.max(weight, 1.0e-6)
+
+    @wp.func
+    def limited(field: wp.array1d[stored], at: Corner, value: float) -> float:
+        """A value held between the least and the largest of those that ``mixed`` mixes."""
+        i00 = at.base
+        i01 = at.base + at.step[1]
+        i10 = at.base + at.step[0]
+        i11 = i10 + at.step[1]
+        a = wp.vec4(value_at(field, i00), value_at(field, i01), value_at(field, i10), value_at(field, i11))
+        i00 += at.step[2]
+        i01 += at.step[2]
+        i10 += at.step[2]
+        i11 += at.step[2]
+        b = wp.vec4(value_at(field, i00), value_at(field, i01), value_at(field, i10), value_at(field, i11))
+        return wp.clamp(value, wp.min(wp.min(a, b)), wp.max(wp.max(a, b)))
+
+    @wp.func
+    def end_of(
+        box: Box,
+        u: wp.array1d[wp.vec3],
+        walls: wp.array1d[wp.uint8],
+        patch: Patch,
+        f: wp.vec3,
+        x: wp.vec3,
+        v: wp.vec3,
+        dt: float,
+        own: wp.uint8,
+    ):
+        """Where a trace from x ends in the domain, whether it left it, and whether what lies there has to do with a
+        solid; ``own`` is what ``walls`` has where it starts."""
+        end = step_back(box, u, patch, f, x, v, dt)
+        p = wp.vec3(end)
+        left = bool(False)
+        near = bool(False)
+        if not within(box, end):
+            p = place(box, end)
+            left = leaves(box, end)
+        if wp.static(solids):
+            # Half a coarse cell away from one with no solid about it there is none, and none within a read of there.
+            reach = 0.5 * float(box.ratio)
+            away = end - x
+            short = wp.abs(away[0]) <= reach and wp.abs(away[1]) <= reach and wp.abs(away[2]) <= reach
+            if own != FREE or not short:
+                wall = wall_at(box, walls, p)
+                near = wall != FREE
+                if wall == SOLID:
+                    end = cut(box, walls, x, end)
+                    p = place(box, end)
+                    left = leaves(box, end)
+        return p, left, near
 
     @wp.func
     def first_of_run(box: Box, listed: wp.array1d[int], i: int, k: int) -> wp.vec3i:
@@ -189,27 +219,43 @@ def field_kernels(storage: str, in_bricks: bool, solids: bool) -> FieldKernels:
         """Does a run of cells; gives the largest value among them."""
         most = float(0.0)
         patch = Patch()
-        patch.low = wp.vec3i(-1, -1, -1)
+        patch_x = float(-2.0)
+        own = wp.uint8(0)
+        own_x = float(-1.0)
         for x_cell in range(first[0], wp.min(first[0] + RUN, box.n[0])):
             cell = wp.vec3i(x_cell, first[1], first[2])
             i = index_of(box.n, cell)
             amount = float(0.0)
             warmth = float(0.0)
-            if is_fluid(box, walls, cell):
-                x = wp.vec3(float(cell[0]) + 0.5, float(cell[1]) + 0.5, float(cell[2]) + 0.5)
-                at = stencil(box.coarse, box.periodic, box.share * x)
-                if not holds(patch, at):
-                    patch = fetch(u, box.coarse, at)
-                origin = trace(box, u, walls, patch, x, evaluate(patch, at.f), dt)
-                if not leaves(box, origin):
-                    p = place(box, origin)
-                    amount = share[0] * read(density, walls, box, p)
-                    if heat.shape[0] > 0:
-                        warmth = share[1] * read(heat, walls, box, p)
-            new_density[i] = keep_in_range(amount)
+            x = wp.vec3(float(cell[0]) + 0.5, float(cell[1]) + 0.5, float(cell[2]) + 0.5)
+            if wp.static(solids):
+                coarse_x = wp.floor(box.share * x[0])
+                if coarse_x != own_x:
+                    own = wall_at(box, walls, x)
+                    own_x = coarse_x
+            if own != SOLID:
+                f = box.share * x - wp.vec3(0.5, 0.5, 0.5)
+                least = wp.vec3(wp.floor(f[0]), wp.floor(f[1]), wp.floor(f[2]))
+                if least[0] != patch_x:
+                    patch = fetch(u, box.coarse, stencil(box.coarse, box.periodic, box.share * x))
+                    patch_x = least[0]
+                f -= least
+                p, left, near = end_of(box, u, walls, patch, f, x, evaluate(patch, f), dt, own)
+                if not left:
+                    if wp.static(solids):
+                        if near:
+                            amount = share[0] * mixed_beside(density, walls, box, p)
+                            if wp.static(hot):
+                                warmth = share[1] * mixed_beside(heat, walls, box, p)
+                    if not near:
+                        at = corner(box, p)
+                        amount = share[0] * mixed(density, at)
+                        if wp.static(hot):
+                            warmth = share[1] * mixed(heat, at)
+            poke(new_density, i, keep_in_range(amount))
             most = wp.max(most, amount)
-            if heat.shape[0] > 0:
-                new_heat[i] = keep_in_range(warmth)
+            if wp.static(hot):
+                poke(new_heat, i, keep_in_range(warmth))
                 most = wp.max(most, warmth)
         return most
 
@@ -230,43 +276,50 @@ def field_kernels(storage: str, in_bricks: bool, solids: bool) -> FieldKernels:
     ) -> float:
         most = float(0.0)
         patch = Patch()
-        patch.low = wp.vec3i(-1, -1, -1)
+        patch_x = float(-2.0)
+        own = wp.uint8(0)
+        own_x = float(-1.0)
         for x_cell in range(first[0], wp.min(first[0] + RUN, box.n[0])):
             cell = wp.vec3i(x_cell, first[1], first[2])
             i = index_of(box.n, cell)
-            amount = float(density_hat[i])
+            amount = value_at(density_hat, i)
             warmth = float(0.0)
-            if heat.shape[0] > 0:
-                warmth = float(heat_hat[i])
-            if is_fluid(box, walls, cell):
-                x = wp.vec3(float(cell[0]) + 0.5, float(cell[1]) + 0.5, float(cell[2]) + 0.5)
-                at = stencil(box.coarse, box.periodic, box.share * x)
-                if not holds(patch, at):
-                    patch = fetch(u, box.coarse, at)
-                v = evaluate(patch, at.f)
-                origin = trace(box, u, walls, patch, x, v, dt)
-                target = trace(box, u, walls, patch, x, v, -dt)
-                p = place(box, origin)
-                q = place(box, target)
-                rough = leaves(box, origin) or leaves(box, target)
-                if wp.static(solids):
-                    rough = rough or beside(box, walls, p) or beside(box, walls, q)
-                if not rough:
-                    back = read(density_hat, walls, box, q)
-                    amount = limited(density, box, p, amount + 0.5 * (float(density[i]) - back))
-                    if heat.shape[0] > 0:
-                        cold = read(heat_hat, walls, box, q)
-                        warmth = limited(heat, box, p, warmth + 0.5 * (float(heat[i]) - cold))
+            if wp.static(hot):
+                warmth = value_at(heat_hat, i)
+            x = wp.vec3(float(cell[0]) + 0.5, float(cell[1]) + 0.5, float(cell[2]) + 0.5)
+            if wp.static(solids):
+                coarse_x = wp.floor(box.share * x[0])
+                if coarse_x != own_x:
+                    own = wall_at(box, walls, x)
+                    own_x = coarse_x
+            if own != SOLID:
+                f = box.share * x - wp.vec3(0.5, 0.5, 0.5)
+                least = wp.vec3(wp.floor(f[0]), wp.floor(f[1]), wp.floor(f[2]))
+                if least[0] != patch_x:
+                    patch = fetch(u, box.coarse, stencil(box.coarse, box.periodic, box.share * x))
+                    patch_x = least[0]
+                f -= least
+                v = evaluate(patch, f)
+                p, left_p, near_p = end_of(box, u, walls, patch, f, x, v, dt, own)
+                q, left_q, near_q = end_of(box, u, walls, patch, f, x, v, -dt, own)
+                if not (left_p or left_q or near_p or near_q):
+                    origin = corner(box, p)
+                    target = corner(box, q)
+                    back = mixed(density_hat, target)
+                    amount = limited(density, origin, amount + 0.5 * (value_at(density, i) - back))
+                    if wp.static(hot):
+                        cold = mixed(heat_hat, target)
+                        warmth = limited(heat, origin, warmth + 0.5 * (value_at(heat, i) - cold))
             amount *= share[0]
             warmth *= share[1]
-            new_density[i] = keep_in_range(amount)
+            poke(new_density, i, keep_in_range(amount))
             most = wp.max(most, amount)
-            if heat.shape[0] > 0:
-                new_heat[i] = keep_in_range(warmth)
+            if wp.static(hot):
+                poke(new_heat, i, keep_in_range(warmth))
                 most = wp.max(most, warmth)
         return most
 
-    @wp.kernel(module="unique", module_options=_OPTIONS, launch_bounds=_BOUNDS)
+    @wp.kernel(module="unique", module_options=_OPTIONS, launch_bounds=_BOUNDS[solids])
     def advect(
         # in:
         box: Box,
@@ -297,7 +350,7 @@ def field_kernels(storage: str, in_bricks: bool, solids: bool) -> FieldKernels:
             first = first_of_run(box, listed, i, 0)
             advect_run(box, first, u, walls, density, heat, dt, share, new_density, new_heat)
 
-    @wp.kernel(module="unique", module_options=_OPTIONS, launch_bounds=_BOUNDS)
+    @wp.kernel(module="unique", module_options=_OPTIONS, launch_bounds=_BOUNDS[solids])
     def correct(
         # in:
         box: Box,
@@ -342,7 +395,8 @@ def storage_of(fields: Fields) -> str:
 
 def _launch(name: str, box: Box, first: Sequence, fields: Fields, dt, share, bricks, threshold, out: Fields) -> None:
     solids = first[2].shape[0] > 0
-    kernel = getattr(field_kernels(storage_of(fields), bricks is not None, solids), name)
+    hot = fields.heat.shape[0] > 0
+    kernel = getattr(field_kernels(storage_of(fields), bricks is not None, solids, hot), name)
     device = fields.density.device
     if bricks is None:
         threads = -(-box.n[0] // RUN) * box.n[1] * box.n[2]

@@ -19,11 +19,15 @@ from wlm_kernels.lattice_sets import cell_of, index_of
 __all__ = [
     "BRICK",
     "CLOSED",
+    "FREE",
     "OPEN",
     "PERIODIC",
+    "REACH",
     "RUN",
+    "SOLID",
     "Box",
     "Bricks",
+    "Corner",
     "Patch",
     "make_box",
     "make_bricks",
@@ -40,12 +44,17 @@ PERIODIC, OPEN, CLOSED = 0, 1, 2
 BRICK = 8
 """Cells along an edge of a brick."""
 
-RUN = 4
+RUN = 8
 """Cells along x that one thread does, so that those that share their eight velocities read them once."""
 
-_FREE, _BESIDE, _SOLID = wp.constant(wp.uint8(0)), wp.constant(wp.uint8(1)), wp.constant(wp.uint8(2))
+REACH = 0.25
+"""Coarse cells by which a trace's midpoint may lie outside of the eight velocities about its start, and is still read
+from them: the next eight are mostly the same, and would double the time."""
+
+FREE, _BESIDE, SOLID = wp.constant(wp.uint8(0)), wp.constant(wp.uint8(1)), wp.constant(wp.uint8(2))
 _OPEN = wp.constant(OPEN)
 _HALVINGS = wp.constant(6)
+_REACH = wp.constant(REACH)
 # Groups of threads that share the list of bricks: enough to fill any GPU.
 _WORKERS = 8192
 
@@ -84,11 +93,19 @@ class Stencil:
 
 
 @wp.struct
+class Corner:
+    """The eight cells about a place: where the lowest lies in memory, how far from it the next along each axis do, and
+    how far the place is from one to the other."""
+
+    base: int
+    step: wp.vec3i
+    f: wp.vec3
+
+
+@wp.struct
 class Patch:
     """The velocities of a stencil's cells as the polynomial that they make."""
 
-    low: wp.vec3i
-    high: wp.vec3i
     c: wp.vec3
     x: wp.vec3
     y: wp.vec3
@@ -147,22 +164,51 @@ def stencil_weight(at: Stencil, k: int) -> float:
 
 
 @wp.func
+def _edge(i: int, n: int, periodic: int):
+    """Of the cells i and i + 1 along an axis the lower, and the step from it to the upper."""
+    low = i
+    step = int(1)
+    # Mostly neither, and then nothing else is to be done.
+    if i < 0 or i >= n - 1:
+        low = _neighbour(i, n, periodic)
+        step = _neighbour(i + 1, n, periodic) - low
+    return low, step
+
+
+@wp.func
+def corner(box: Box, p: wp.vec3) -> Corner:
+    """The eight fine cells about a place of the domain."""
+    at = p - wp.vec3(0.5, 0.5, 0.5)
+    least = wp.vec3(wp.floor(at[0]), wp.floor(at[1]), wp.floor(at[2]))
+    x, along_x = _edge(int(least[0]), box.n[0], box.periodic[0])
+    y, along_y = _edge(int(least[1]), box.n[1], box.periodic[1])
+    z, along_z = _edge(int(least[2]), box.n[2], box.periodic[2])
+    out = Corner()
+    out.base = (x * box.n[1] + y) * box.n[2] + z
+    out.step = wp.vec3i(along_x * box.n[1] * box.n[2], along_y * box.n[2], along_z)
+    out.f = at - least
+    return out
+
+
+@wp.func_native("return u.data[i];")
+def _velocity(u: wp.array1d[wp.vec3], i: int) -> wp.vec3: ...
+
+
+@wp.func
 def fetch(u: wp.array1d[wp.vec3], n: wp.vec3i, at: Stencil) -> Patch:
     row00 = (at.low[0] * n[1] + at.low[1]) * n[2]
     row01 = (at.low[0] * n[1] + at.high[1]) * n[2]
     row10 = (at.high[0] * n[1] + at.low[1]) * n[2]
     row11 = (at.high[0] * n[1] + at.high[1]) * n[2]
-    a = u[row00 + at.low[2]]
-    b = u[row00 + at.high[2]] - a
-    c = u[row01 + at.low[2]]
-    d = u[row01 + at.high[2]] - c
-    e = u[row10 + at.low[2]]
-    f = u[row10 + at.high[2]] - e
-    g = u[row11 + at.low[2]]
-    h = u[row11 + at.high[2]] - g
+    a = _velocity(u, row00 + at.low[2])
+    b = _velocity(u, row00 + at.high[2]) - a
+    c = _velocity(u, row01 + at.low[2])
+    d = _velocity(u, row01 + at.high[2]) - c
+    e = _velocity(u, row10 + at.low[2])
+    f = _velocity(u, row10 + at.high[2]) - e
+    g = _velocity(u, row11 + at.low[2])
+    h = _velocity(u, row11 + at.high[2]) - g
     patch = Patch()
-    patch.low = at.low
-    patch.high = at.high
     patch.c = a
     patch.z = b
     patch.y = c - a
@@ -172,11 +218,6 @@ def fetch(u: wp.array1d[wp.vec3], n: wp.vec3i, at: Stencil) -> Patch:
     patch.xy = (g - e) - (c - a)
     patch.xyz = (h - f) - (d - b)
     return patch
-
-
-@wp.func
-def holds(patch: Patch, at: Stencil) -> bool:
-    return at.low == patch.low and at.high == patch.high
 
 
 @wp.func
@@ -204,6 +245,14 @@ def place(box: Box, x: wp.vec3) -> wp.vec3:
 
 
 @wp.func
+def within(box: Box, x: wp.vec3) -> bool:
+    """Whether a place lies in the domain."""
+    low = x[0] >= 0.0 and x[1] >= 0.0 and x[2] >= 0.0
+    # Not so where it isn't a number.
+    return low and x[0] <= float(box.n[0]) and x[1] <= float(box.n[1]) and x[2] <= float(box.n[2])
+
+
+@wp.func
 def leaves(box: Box, x: wp.vec3) -> bool:
     """Whether a place lies beyond an open face."""
     low = bool(False)
@@ -215,18 +264,12 @@ def leaves(box: Box, x: wp.vec3) -> bool:
 
 
 @wp.func
-def _wall_at(box: Box, walls: wp.array1d[wp.uint8], p: wp.vec3) -> wp.uint8:
+def wall_at(box: Box, walls: wp.array1d[wp.uint8], p: wp.vec3) -> wp.uint8:
     """Of the coarse cell that holds a place of the domain."""
     x = wp.clamp(int(p[0] * box.share), 0, box.coarse[0] - 1)
     y = wp.clamp(int(p[1] * box.share), 0, box.coarse[1] - 1)
     z = wp.clamp(int(p[2] * box.share), 0, box.coarse[2] - 1)
     return walls[(x * box.coarse[1] + y) * box.coarse[2] + z]
-
-
-@wp.func
-def beside(box: Box, walls: wp.array1d[wp.uint8], p: wp.vec3) -> bool:
-    """Whether a place of the domain lies in a solid or in a cell that touches one; ``walls`` isn't empty."""
-    return _wall_at(box, walls, p) != _FREE
 
 
 @wp.func
@@ -237,33 +280,33 @@ def inside(box: Box, walls: wp.array1d[wp.uint8], cell: wp.vec3i) -> bool:
     x = cell[0] // box.ratio
     y = cell[1] // box.ratio
     z = cell[2] // box.ratio
-    return walls[(x * box.coarse[1] + y) * box.coarse[2] + z] == _SOLID
+    return walls[(x * box.coarse[1] + y) * box.coarse[2] + z] == SOLID
 
 
 @wp.func
-def step_back(box: Box, u: wp.array1d[wp.vec3], patch: Patch, x: wp.vec3, v: wp.vec3, dt: float) -> wp.vec3:
-    """Where what is at x was ``dt`` steps ago, by the midpoint; ``v`` is the velocity there, read from ``patch``."""
+def step_back(box: Box, u: wp.array1d[wp.vec3], patch: Patch, f: wp.vec3, x: wp.vec3, v: wp.vec3, dt: float) -> wp.vec3:
+    """Where what is at x was ``dt`` steps ago, by the midpoint; ``v`` is the velocity there, at ``f`` of ``patch``."""
     fine = dt * float(box.ratio)
-    at = stencil(box.coarse, box.periodic, box.share * place(box, x - 0.5 * fine * v))
+    half = f - 0.5 * dt * v
+    least = wp.min(half[0], wp.min(half[1], half[2]))
+    most = wp.max(half[0], wp.max(half[1], half[2]))
     w = wp.vec3()
-    # Mostly half a step stays among the same velocities.
-    if holds(patch, at):
-        w = evaluate(patch, at.f)
+    if least >= -_REACH and most <= 1.0 + _REACH:
+        w = evaluate(patch, half)
     else:
+        at = stencil(box.coarse, box.periodic, box.share * place(box, x - 0.5 * fine * v))
         w = evaluate(fetch(u, box.coarse, at), at.f)
     return x - fine * w
 
 
 @wp.func
 def cut(box: Box, walls: wp.array1d[wp.uint8], x: wp.vec3, end: wp.vec3) -> wp.vec3:
-    """A trace's end, or a place before it where the way from x, in the fluid, meets a solid."""
-    if _wall_at(box, walls, place(box, end)) != _SOLID:
-        return end
+    """Of a trace from x, in the fluid, to a solid: a place before its end, where it meets the solid."""
     free = wp.vec3(x)
     solid = wp.vec3(end)
     for _k in range(_HALVINGS):
         middle = 0.5 * (free + solid)
-        if _wall_at(box, walls, place(box, middle)) == _SOLID:
+        if wall_at(box, walls, place(box, middle)) == SOLID:
             solid = middle
         else:
             free = middle
@@ -306,7 +349,7 @@ def _mark(
 ):
     i = wp.tid()
     if solid[i] != wp.uint8(0):
-        walls[i] = _SOLID
+        walls[i] = SOLID
         return
     cell = cell_of(box.coarse, i)
     found = wp.uint8(0)

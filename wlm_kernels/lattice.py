@@ -44,6 +44,9 @@ CAUSES = ("the density is not positive", "the speed exceeds that of sound", "not
 QUIET = (1 << 62) - 1
 """What the trouble's key holds as long as there is none."""
 
+# Of an approximate quotient or root depends what friction does, at 1e-7 of it; density and momentum go round both.
+_OPTIONS = {"enable_backward": False, "max_unroll": 32, "fast_math": True}
+
 # A key is (step * 2^31 + cell) * 4 + cause, so that the least one is the first step's first cell.
 _CELLS = wp.constant(wp.int64(1 << 31))
 _CODES = wp.constant(wp.int64(4))
@@ -75,6 +78,7 @@ class Spec:
         force: One of ``FORCES``.
         bricks: Whether only listed bricks are worked on.
         walls: The axes of which both faces are walls at rest.
+        wide: Whether places are counted in 64 bits, see ``lattice_sets.memory_functions``.
     """
 
     lattice: str
@@ -85,6 +89,7 @@ class Spec:
     force: str = "none"
     bricks: bool = False
     walls: tuple[bool, bool, bool] = (False, False, False)
+    wide: bool = False
 
     def __post_init__(self) -> None:
         for name, value, allowed in (
@@ -100,10 +105,12 @@ class Spec:
 
 @functools.cache
 def _relax(spec: Spec) -> Any:
-    """Builds (once) the collision of a cell: what arrived and its moments -> what leaves."""
+    """Builds (once) the collision of a cell: what arrived, as stored, and its moments -> what leaves, as stored."""
     found = lattice(spec.lattice)
     c, w, flat = found.c, found.w, found.axes == 2
-    vec = memory_functions(spec.lattice, spec.storage, spec.walls).vec
+    vec = memory_functions(spec.lattice, spec.storage, spec.walls, spec.wide).vec
+    # What is stored is linear in the moments: to scale these, or the weights, is less than to scale all populations.
+    scale = STORAGES[spec.storage][1]
     pairs, size = len(c) // 2, 3**found.axes
     vec_hermite = wp.types.vector(size, float)
     # Orders along x, y and z of each Hermite coefficient, and where a velocity's population ends up among them.
@@ -117,7 +124,7 @@ def _relax(spec: Spec) -> Any:
         """The populations of given moments: density, momentum and stress, the latter as Hermite coefficients."""
         out = vec()
         rest = drho - 1.5 * (diagonal[0] + diagonal[1] + diagonal[2])
-        out[0] = wp.static(w[0]) * rest
+        out[0] = wp.static(w[0] * scale) * rest
         for h in range(wp.static(pairs)):
             even = float(rest)
             odd = float(0.0)
@@ -131,14 +138,17 @@ def _relax(spec: Spec) -> Any:
                 even += wp.static(9.0 * c[2 * h + 1][0] * c[2 * h + 1][2]) * off[1]
             if wp.static(c[2 * h + 1][1] * c[2 * h + 1][2] != 0):
                 even += wp.static(9.0 * c[2 * h + 1][1] * c[2 * h + 1][2]) * off[2]
-            out[2 * h + 1] = wp.static(w[2 * h + 1]) * (even + odd)
-            out[2 * h + 2] = wp.static(w[2 * h + 1]) * (even - odd)
+            out[2 * h + 1] = wp.static(w[2 * h + 1] * scale) * (even + odd)
+            out[2 * h + 2] = wp.static(w[2 * h + 1] * scale) * (even - odd)
         return out
 
     @wp.func
     def product(drho: float, u: wp.vec3, after: wp.vec3, diagonal: wp.vec3, off: wp.vec3) -> vec:
         """Equilibrium of all orders at ``after``, and a stress with what follows from it at ``u``."""
-        rho = 1.0 + drho
+        unit = wp.static(scale)
+        mass = unit * (1.0 + drho)
+        trace = unit * diagonal
+        skew = unit * off
         ux = wp.vec3(1.0, u[0], u[0] * u[0])
         uy = wp.vec3(1.0, u[1], u[1] * u[1])
         uz = wp.vec3(1.0, u[2], u[2] * u[2])
@@ -146,24 +156,24 @@ def _relax(spec: Spec) -> Any:
         vy = wp.vec3(1.0, after[1], after[1] * after[1])
         vz = wp.vec3(1.0, after[2], after[2] * after[2])
         a = vec_hermite()
-        a[0] = drho
+        a[0] = unit * drho
         for k in range(1, wp.static(size)):
-            t = rho * vx[wp.static(order[k][0])] * vy[wp.static(order[k][1])] * vz[wp.static(order[k][2])]
+            t = mass * vx[wp.static(order[k][0])] * vy[wp.static(order[k][1])] * vz[wp.static(order[k][2])]
             # Each pair of indices takes its stress, the others their velocity.
             if wp.static(order[k][0] == 2):
-                t += diagonal[0] * uy[wp.static(order[k][1])] * uz[wp.static(order[k][2])]
+                t += trace[0] * uy[wp.static(order[k][1])] * uz[wp.static(order[k][2])]
             if wp.static(order[k][1] == 2):
-                t += diagonal[1] * ux[wp.static(order[k][0])] * uz[wp.static(order[k][2])]
+                t += trace[1] * ux[wp.static(order[k][0])] * uz[wp.static(order[k][2])]
             if wp.static(order[k][2] == 2):
-                t += diagonal[2] * ux[wp.static(order[k][0])] * uy[wp.static(order[k][1])]
+                t += trace[2] * ux[wp.static(order[k][0])] * uy[wp.static(order[k][1])]
             if wp.static(order[k][0] * order[k][1] > 0):
-                s = off[0] * ux[wp.static(order[k][0] - 1)] * uy[wp.static(order[k][1] - 1)]
+                s = skew[0] * ux[wp.static(order[k][0] - 1)] * uy[wp.static(order[k][1] - 1)]
                 t += wp.static(float(order[k][0] * order[k][1])) * s * uz[wp.static(order[k][2])]
             if wp.static(order[k][0] * order[k][2] > 0):
-                s = off[1] * ux[wp.static(order[k][0] - 1)] * uz[wp.static(order[k][2] - 1)]
+                s = skew[1] * ux[wp.static(order[k][0] - 1)] * uz[wp.static(order[k][2] - 1)]
                 t += wp.static(float(order[k][0] * order[k][2])) * s * uy[wp.static(order[k][1])]
             if wp.static(order[k][1] * order[k][2] > 0):
-                s = off[2] * uy[wp.static(order[k][1] - 1)] * uz[wp.static(order[k][2] - 1)]
+                s = skew[2] * uy[wp.static(order[k][1] - 1)] * uz[wp.static(order[k][2] - 1)]
                 t += wp.static(float(order[k][1] * order[k][2])) * s * ux[wp.static(order[k][0])]
             a[k] = t
         # Coefficients to populations, an axis at a time: of 1, c and c^2 - 1/3 with weights 1/6, 2/3, 1/6.
@@ -252,8 +262,8 @@ def step_kernel(spec: Spec) -> wp.Kernel:
         sums: float64 [2], set to 0 for ``lattice_links``.
         out: [Q, N], what leaves every cell now.
     """
-    memory, relax = memory_functions(spec.lattice, spec.storage, spec.walls), _relax(spec)
-    gather, moments, store = memory.gather, memory.moments, memory.store
+    memory, relax = memory_functions(spec.lattice, spec.storage, spec.walls, spec.wide), _relax(spec)
+    gather, moments, put = memory.gather, memory.moments, memory.put
     stored, count_q = STORAGES[spec.storage][0], len(lattice(spec.lattice).c)
 
     @wp.func
@@ -295,10 +305,10 @@ def step_kernel(spec: Spec) -> wp.Kernel:
             force = pushes[i]
         g = relax(g, drho, j, diagonal, off, force, tau, eddy)
         for q in range(wp.static(count_q)):
-            store(out, q, i, g[q])
+            put(out, q, i, g[q])
         return j2 + drho * drho
 
-    @wp.kernel(module="unique", module_options={"enable_backward": False, "max_unroll": 32})
+    @wp.kernel(module="unique", module_options=_OPTIONS)
     def step(
         # in:
         n: wp.vec3i,

@@ -18,6 +18,7 @@ __all__ = [
     "BRICK_CELLS",
     "HALF_SCALE",
     "LATTICES",
+    "NARROW",
     "STORAGES",
     "VelocitySet",
     "Tables",
@@ -126,9 +127,9 @@ def opposite(q: int) -> int:
 @wp.func
 def cell_of(n: wp.vec3i, i: int) -> wp.vec3i:
     """Where cell i lies."""
-    # Two divisions, not four: a remainder would be a division of its own.
-    row = i // n[2]
-    x = row // n[1]
+    # Two divisions, not four: a remainder would be a division of its own. Those of signed numbers take twice as long.
+    row = int(wp.uint32(i) // wp.uint32(n[2]))
+    x = int(wp.uint32(row) // wp.uint32(n[1]))
     return wp.vec3i(x, row - x * n[1], i - row * n[2])
 
 
@@ -185,51 +186,79 @@ def equilibrium(w: float, c: wp.vec3i, drho: float, u: wp.vec3) -> float:
     return w * (drho + (1.0 + drho) * (3.0 * cu + 4.5 * cu * cu - 1.5 * wp.dot(u, u)))
 
 
+NARROW = 2**31 - 1
+"""The largest number of populations, of all cells and directions together, that 32 bits count."""
+
+
 @dataclass(frozen=True)
 class MemoryFunctions:
     """``wp.func``s on populations in memory, of one lattice and storage.
 
     Attributes:
         vec: vec of Q floats.
-        gather: (f, n, p) -> vec, what arrives at cell p: each direction from the cell that it comes from, or out of
-            the cell itself from a wall at rest that closes a whole axis.
-        moments: vec -> drho, momentum, the diagonal and the off-diagonal (xy, xz, yz) of sum c c (f - w).
-        load: (f, q, i) -> float, one stored number.
+        gather: (f, n, p) -> vec, what arrives at cell p, as stored: each direction from the cell that it comes from, or
+            out of the cell itself from a wall at rest that closes a whole axis.
+        moments: vec as stored -> drho, momentum, the diagonal and the off-diagonal (xy, xz, yz) of sum c c (f - w).
+        put: (f, q, i, value), writes one number as stored.
+        load: (f, q, i) -> float, one number.
         store: (f, q, i, value), the same way back.
     """
 
     vec: Any
     gather: Any
     moments: Any
+    put: Any
     load: Any
     store: Any
 
 
 @functools.cache
-def memory_functions(lattice_name: str, storage: str, walls: tuple[bool, bool, bool]) -> MemoryFunctions:
-    """Builds (once) the functions of a lattice and a storage; ``walls``: the axes that walls at rest close."""
+def memory_functions(
+    lattice_name: str, storage: str, walls: tuple[bool, bool, bool], wide: bool = True
+) -> MemoryFunctions:
+    """Builds (once) the functions of a lattice and a storage.
+
+    Args:
+        lattice_name: One of ``LATTICES``.
+        storage: One of ``STORAGES``; "as stored" is times its scale.
+        walls: The axes that walls at rest close.
+        wide: Whether places are counted in 64 bits, which costs a sixth of a step's instructions; without, there may
+            be ``NARROW`` populations.
+
+    Raises:
+        ValueError: There is no such lattice or storage.
+    """
     found = lattice(lattice_name)
     if storage not in STORAGES:
         raise ValueError(f"storage: expected one of {', '.join(STORAGES)}, got {storage!r}")
     c, count = found.c, len(found.c)
     stored, scale = STORAGES[storage]
     vec = wp.types.vector(count, float)
+    place_type = wp.int64 if wide else wp.int32
 
     # Through the pointer: by Warp's strides, 64 bits wide each, the addresses would be half the work of a step.
 
-    @wp.func_native("return f.data[(long long)q * f.shape[1] + i];")
-    def peek(f: wp.array2d[stored], q: int, i: int) -> stored: ...
+    @wp.func_native("return f.data[k];")
+    def peek(f: wp.array2d[stored], k: place_type) -> stored: ...
 
-    @wp.func_native("f.data[(long long)q * f.shape[1] + i] = value;")
-    def poke(f: wp.array2d[stored], q: int, i: int, value: stored): ...
+    @wp.func_native("f.data[k] = value;")
+    def poke(f: wp.array2d[stored], k: place_type, value: stored): ...
+
+    @wp.func
+    def place_of(f: wp.array2d[stored], q: int, i: int) -> place_type:
+        return place_type(q) * place_type(f.shape[1]) + place_type(i)
 
     @wp.func
     def load(f: wp.array2d[stored], q: int, i: int) -> float:
-        return float(peek(f, q, i)) * wp.static(1.0 / scale)
+        return float(peek(f, place_of(f, q, i))) * wp.static(1.0 / scale)
+
+    @wp.func
+    def put(f: wp.array2d[stored], q: int, i: int, value: float):
+        poke(f, place_of(f, q, i), f.dtype(value))
 
     @wp.func
     def store(f: wp.array2d[stored], q: int, i: int, value: float):
-        poke(f, q, i, f.dtype(value * wp.static(scale)))
+        put(f, q, i, value * wp.static(scale))
 
     @wp.func
     def gather(f: wp.array2d[stored], n: wp.vec3i, p: wp.vec3i) -> vec:
@@ -250,7 +279,7 @@ def memory_functions(lattice_name: str, storage: str, walls: tuple[bool, bool, b
         g = vec()
         for q in range(wp.static(count)):
             row = x[wp.static(1 - c[q][0])] * n[1] + y[wp.static(1 - c[q][1])]
-            k = row * n[2] + z[wp.static(1 - c[q][2])]
+            k = place_of(f, q, row * n[2] + z[wp.static(1 - c[q][2])])
             if wp.static(any(walls[a] and c[q][a] != 0 for a in range(3))):
                 # Half-way bounce-back costs no branch: only another place to read from.
                 back = bool(False)
@@ -259,9 +288,8 @@ def memory_functions(lattice_name: str, storage: str, walls: tuple[bool, bool, b
                         back = back or low[a] != 0
                     if wp.static(walls[a] and c[q][a] < 0):
                         back = back or high[a] != 0
-                g[q] = load(f, wp.where(back, wp.static(((q - 1) ^ 1) + 1), q), wp.where(back, i, k))
-            else:
-                g[q] = load(f, q, k)
+                k = wp.where(back, place_of(f, wp.static(((q - 1) ^ 1) + 1), i), k)
+            g[q] = float(peek(f, k))
         return g
 
     @wp.func
@@ -293,6 +321,7 @@ def memory_functions(lattice_name: str, storage: str, walls: tuple[bool, bool, b
                 xz += wp.static(float(c[q][0] * c[q][2])) * g[q]
             if wp.static(c[q][1] * c[q][2] != 0):
                 yz += wp.static(float(c[q][1] * c[q][2])) * g[q]
-        return drho, wp.vec3(jx, jy, jz), wp.vec3(xx, yy, zz), wp.vec3(xy, xz, yz)
+        unit = wp.static(1.0 / scale)
+        return unit * drho, unit * wp.vec3(jx, jy, jz), unit * wp.vec3(xx, yy, zz), unit * wp.vec3(xy, xz, yz)
 
-    return MemoryFunctions(vec, gather, moments, load, store)
+    return MemoryFunctions(vec, gather, moments, put, load, store)

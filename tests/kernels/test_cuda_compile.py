@@ -173,5 +173,5 @@ def test_lattice_boundaries(name: str, storage: str, balance: bool, tmp_path: Pa
 @pytest.mark.parametrize("bricks", _slow_but(True, [False]))
 def test_advection(bricks: bool, solids: bool, storage: str, tmp_path: Path):
     """Both schemes; and sources, solids and buoyancy, which know no bricks."""
-    _compile_all(vars(advection.field_kernels(storage, bricks, solids)).values(), tmp_path / "fields")
+    _compile_all(vars(advection.field_kernels(storage, bricks, solids, not solids)).values(), tmp_path / "fields")
     _compile_all(vars(advection_sources.source_kernels(storage)).values(), tmp_path / "sources")

@@ -7,6 +7,7 @@ import pytest
 import warp as wp
 from reference import lattice as reference
 
+from wlm.smoke import lattice_engine
 from wlm.smoke.lattice import Lattice
 from wlm_kernels.lattice import CAUSES, Spec, step_kernel, trouble_of
 from wlm_kernels.lattice_sets import LATTICES, brick_shape
@@ -198,6 +199,18 @@ def test_sixteen_bits(lattice: str, device: str):
     _run(pair, HALF_TOLERANCE)
     with pytest.raises(AssertionError):
         pair.hold(TOLERANCE / 10)
+
+
+def test_places_of_64_bits(device: str, monkeypatch: pytest.MonkeyPatch):
+    """What a domain of more populations than 32 bits count runs; and the flag is what decides it."""
+    closed = {face: ("wall", np.zeros(3)) for face in ("-y", "+y")}
+    short = Pair("D3Q19", device, closed)
+    assert not short.device._engine.spec.wide
+    monkeypatch.setattr(lattice_engine, "NARROW", 0)
+    for storage, tolerance in (("float32", TOLERANCE), ("float16", HALF_TOLERANCE)):
+        pair = Pair("D3Q19", device, closed, storage=storage)
+        assert pair.device._engine.spec.wide
+        _run(pair, tolerance)
 
 
 def test_thin_domains(device: str):

@@ -29,9 +29,9 @@ class Domain:
             out = out.repeat(self.ratio, axis)
         return out
 
-    def corners(self, p: np.ndarray, shape: np.ndarray):
-        """The eight cells about a place among cells of size 1, with their weights."""
-        base = np.floor(p - 0.5)
+    def corners(self, p: np.ndarray, shape: np.ndarray, about: np.ndarray | None = None):
+        """The eight cells about a place, or about another one, among cells of size 1, with their weights for it."""
+        base = np.floor((p if about is None else about) - 0.5)
         f = p - 0.5 - base
         for corner in itertools.product((0, 1), repeat=3):
             cell = (base + corner).astype(int)
@@ -68,7 +68,14 @@ class Domain:
         return False
 
     def trace(self, x: np.ndarray, dt: float) -> np.ndarray:
-        end = x - dt * self.velocity(x - 0.5 * dt * self.velocity(x))
+        middle = x - 0.5 * dt * self.velocity(x)
+        away = middle / self.ratio - 0.5 - np.floor(x / self.ratio - 0.5)
+        v = self.velocity(middle)
+        if (np.abs(away - 0.5) <= 0.75).all():
+            # Read from the velocities about the start.
+            around = self.corners(middle / self.ratio, np.array(self.solid.shape), x / self.ratio)
+            v = self.ratio * sum(w * self.u[c] for c, w in around)
+        end = x - dt * v
         if self.is_solid(end):
             free = x
             for _ in range(6):
@@ -79,6 +86,11 @@ class Domain:
                     free = middle
             return free
         return end
+
+    def is_near(self, x: np.ndarray, p: np.ndarray) -> bool:
+        """Whether what lies at the end of a trace from x counts as beside a solid."""
+        short = (np.abs(p - x) <= 0.5 * self.ratio).all() and not self.is_solid(x, 1)
+        return self.is_solid(p, 1) and not short
 
     def read(self, field: np.ndarray, p: np.ndarray) -> float:
         found = [(field[c], w) for c, w in self.corners(self.held(p), self.shape) if not self.fine_solid[c]]
@@ -100,7 +112,7 @@ class Domain:
             if self.fine_solid[cell]:
                 continue
             p, q = self.trace(x, dt), self.trace(x, -dt)
-            if self.outside(p) or self.outside(q) or self.is_solid(p, 1) or self.is_solid(q, 1):
+            if self.outside(p) or self.outside(q) or self.is_near(x, p) or self.is_near(x, q):
                 continue
             value = predicted[cell] + 0.5 * (field[cell] - self.read(predicted, q))
             values = [field[c] for c, _ in self.corners(self.held(p), self.shape)]

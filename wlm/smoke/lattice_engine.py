@@ -11,7 +11,7 @@ from wlm.smoke.lattice_faces import Face, bounded_axes, face_links, walled_axes
 from wlm_kernels import lattice_bricks, lattice_links, lattice_solids
 from wlm_kernels.lattice import QUIET, Spec, step_kernel
 from wlm_kernels.lattice_fields import fluid_kernels
-from wlm_kernels.lattice_sets import BRICK_CELLS, STORAGES, brick_shape, tables
+from wlm_kernels.lattice_sets import BRICK_CELLS, NARROW, STORAGES, brick_shape, tables
 from wlm_kernels.lattice_sets import lattice as velocity_set
 
 __all__ = ["BODIES", "Engine"]
@@ -52,12 +52,13 @@ class Engine:
     def __init__(
         self, shape: tuple[int, int, int], spec: Spec, tau: float, eddy: float, quiet: float, rise: float, device
     ) -> None:
-        self.spec, self.device, self._shape, self._n = spec, device, shape, wp.vec3i(*shape)
+        self.device, self._shape, self._n = device, shape, wp.vec3i(*shape)
         self._set = velocity_set(spec.lattice)
         self._tables = tables(spec.lattice, str(device))
         self.cells = math.prod(shape)
         stored = STORAGES[spec.storage][0]
         size = (len(self._set.c), self.cells)
+        self.spec = replace(spec, wide=math.prod(size) > NARROW)
         self._f = [wp.zeros(size, dtype=stored, device=device) for _ in range(2)]
         self._tau, self._eddy, self._quiet, self._rise = tau, eddy, quiet, rise
         self.clock = self.zeros(2, int)
