@@ -6,14 +6,17 @@ from pathlib import Path
 import pytest
 
 from wlm.bench import Row, read_json
-from wlm.bench.atlas import PANELS as ATLAS_PANELS
+from wlm.bench.atlas import PROFILES as ATLAS_PROFILES
 from wlm.bench.probe import PANELS
-from wlm.bench.report import report
+from wlm.bench.report import figures, report
 
 ROOT = Path(__file__).resolve().parents[1]
 GPU = ROOT / "benchmarks" / "nvidia-h200.json"
 FILES = [GPU, ROOT / "benchmarks" / "cpu.json"]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
+ATLAS = (ROOT / "docs" / "atlas.md").read_text(encoding="utf-8")
+ATLAS_RIVALS = ("downsampling", "downsampling bilinear", "BC6H", "ASTC", "single colour")
+ATLAS_MEAN = "mean over 18 lightmaps"
 
 
 def rows_of(path: Path) -> dict[tuple[str, str], Row]:
@@ -111,8 +114,18 @@ def test_readme_speed_of_the_probes_fit():
     assert f"{ours.encode_seconds:.1f} s against {plain.encode_seconds:.0f} s, {ratio:.0f} times" in README
 
 
-def atlas_rows() -> dict[tuple[str, str, str], Row]:
-    return {(row.scene, row.method, row.option): row for row in read_json(FILES[1])[0] if row.system == "atlas"}
+def atlas_rows(path: Path = FILES[1]) -> dict[tuple[str, str, str], Row]:
+    return {(row.scene, row.method, row.option): row for row in read_json(path)[0] if row.system == "atlas"}
+
+
+def noted(row: Row, pattern: str) -> float:
+    """A figure that a row has in its notes alone."""
+    return float(re.search(pattern, row.notes)[1])
+
+
+def atlas_line(title: str, row: Row) -> str:
+    ratio, seams = noted(row, r"CR ([\d.]+)%"), noted(row, r"seam ratio [^;]*mean ([\d.]+)")
+    return f"| {title} | {ratio:.1f}% | {row.psnr:.2f} | {1 - row.ssim:.4f} | {seams:.2f} |"
 
 
 @pytest.mark.parametrize("name", ["standard", "astc", "compact"])
@@ -120,14 +133,68 @@ def test_readme_atlas(name):
     rows = atlas_rows()
     for title, method, option in [
         (name, "ours", name),
-        *((f"{rival}, as `{name}`", rival, f"bits of {name}") for rival in ATLAS_PANELS[0].methods[1:]),
+        *((f"{rival}, as `{name}`", rival, f"bits of {name}") for rival in ATLAS_RIVALS),
     ]:
-        row = rows["mean over 18 lightmaps", method, option]
-        ratio, different, seams = (
-            float(re.search(pattern, row.notes)[1])
-            for pattern in (r"CR ([\d.]+)%", r"1-SSIM [^;]*mean ([\d.e-]+)", r"seam ratio [^;]*mean ([\d.]+)")
-        )
-        assert f"| {title} | {ratio:.1f}% | {row.psnr:.2f} | {different:.4f} | {seams:.2f} |" in README
+        assert atlas_line(title, rows[ATLAS_MEAN, method, option]) in README
+
+
+def test_readme_cascade():
+    rows = atlas_rows(GPU)
+    cascade, tiles, compact = (
+        rows[ATLAS_MEAN, "ours", name] for name in ("cascade", "standard, bits of cascade", "compact")
+    )
+    assert atlas_line("cascade", cascade) in README
+    assert atlas_line("half-float tiles, as `cascade`", tiles) in README
+    # What the text says of them.
+    assert tiles.psnr < cascade.psnr < compact.psnr and compact.bpp < cascade.bpp == pytest.approx(tiles.bpp, rel=0.01)
+    found = " ".join(README.split())
+    assert f"`cascade` takes {cascade.bytes / 1000:.0f} kB a lightmap, `compact` {compact.bytes / 1000:.0f}." in found
+
+
+def test_readme_seams():
+    found, rows, highest = " ".join(README.split()), atlas_rows(GPU), 0.0
+    for name, words in (
+        ("standard", "Seams of `standard` are {} times"),
+        ("astc", "`astc` {}, "),
+        ("compact", "`compact` {}; "),
+    ):
+        notes = rows[ATLAS_MEAN, "ours", name].notes
+        low, high = map(float, re.search(r"seam ratio ([\d.]+) to ([\d.]+)", notes).groups())
+        assert words.format(f"{low:.2f} to {high:.2f}") in found
+        assert (high <= 1.5) is (name == "standard")
+        highest = max(highest, high)
+    assert f"up to {highest:.1f} times; `standard` stays below" in ATLAS
+
+
+@pytest.mark.parametrize("name", ["standard", "astc", "compact", "cascade"])
+def test_readme_atlas_times(name):
+    row, slow = (atlas_rows(path).get((ATLAS_MEAN, "ours", name)) for path in FILES)
+    alone = "" if slow is None else f"{slow.encode_seconds:.1f}"
+    cells = [f"{row.encode_seconds:.1f}", alone, f"{row.decode_ms:.3f}", f"{row.max_error:.0e}"]
+    assert f"| {name} | {' | '.join(cells)} |".replace("|  |", "| |") in README
+
+
+def test_readme_reading_the_lightmap_itself():
+    row = atlas_rows(GPU)[ATLAS_MEAN, "lightmap", "half floats"]
+    assert f"| the lightmap itself | | | {row.decode_ms:.3f} | {row.max_error:.0e} |" in README
+
+
+def test_readme_tuning_of_the_cascade():
+    rows = atlas_rows(GPU)
+    views, uv = (rows["AntiqueCamera day", "fit", f"cascade, space {space}"] for space in ("views", "uv"))
+    found = " ".join(README.split())
+    assert f"{views.encode_seconds:.2f} s in views, as the paper tunes, for {views.psnr:.2f} dB" in found
+    words = "s at points of the surface, as the profile does, for"
+    assert f"{uv.encode_seconds:.2f} {words} {uv.psnr:.2f} dB" in found
+
+
+@pytest.mark.parametrize("name", ATLAS_PROFILES)
+def test_atlas_profiles(name):
+    row = atlas_rows(GPU)["AntiqueCamera day", "ours", name]
+    ratio, seams = noted(row, r"CR ([\d.]+)%"), noted(row, r"seam ratio ([\d.]+)")
+    cells = [f"{ratio:.1f}%", f"{row.psnr:.2f}", f"{seams:.2f}", f"{row.bytes / 1000:.0f}"]
+    cells += [f"{row.encode_seconds:.1f}", f"{row.decode_ms:.3f}"]
+    assert f"| {name} | {' | '.join(cells)} |" in ATLAS
 
 
 @pytest.mark.parametrize("mesh", sorted({scene.rsplit(" ", 1)[0] for scene, *_ in atlas_rows() if scene[0].isupper()}))
@@ -137,6 +204,51 @@ def test_readme_meshes(mesh):
         both = rows[f"{mesh} {time}", "ours", "standard"], rows[f"{mesh} {time}", "downsampling", "bits of standard"]
         cells += [*(f"{row.psnr:.2f}" for row in both), *(f"{1 - row.ssim:.4f}" for row in both)]
     assert f"| {mesh} | {' | '.join(cells)} |" in README
+
+
+# Where the README's figures of smoke are from, and the columns of its tables.
+SMOKE = FILES[1]
+SMOKE_TABLES = {
+    "lattice": ("cells", "ms", "MLUPS", "of the copy"),
+    "lattice storage": ("cells", "RMS", "largest", "mass drift"),
+    "lattice bricks": ("cells", "worked on", "speedup", "largest error"),
+    "advection": ("voxels", "ms", "of the copy", "RMS", "smoke gained"),
+    "advection bricks": ("voxels", "worked on", "ms", "speedup"),
+    "guide": ("voxels", "pixels", "ms", "light RMS", "transparency RMS"),
+    "six ways": ("voxels", "pixels", "ms", "RMS by halving", "largest error"),
+    "weights": ("bias", "least", "most", "RMS", "worst light's RMS"),
+    "frame": ("of", "ms"),
+}
+
+
+def smoke_rows(method: str) -> list[Row]:
+    return [row for row in read_json(SMOKE)[0] if (row.system, row.method) == ("smoke", method)]
+
+
+def smoke_line(row: Row) -> str:
+    known = figures(row)
+    if row.decode_ms is not None:
+        known["ms"] = f"{row.decode_ms:.3g}"
+    if row.max_error is not None:
+        known["largest error"] = f"{row.max_error:.1g}"
+    cells = [row.option, *(known.get(title, "") for title in SMOKE_TABLES[row.method])]
+    return f"| {' | '.join(cells)} |"
+
+
+@pytest.mark.parametrize("method", SMOKE_TABLES)
+def test_readme_smoke(method):
+    lines = [smoke_line(row) for row in smoke_rows(method) if row.option not in ("a copy", "dense")]
+    assert lines
+    assert [line for line in lines if line not in README] == []
+
+
+def test_readme_and_docs_smoke_text():
+    (copy,) = (row for row in smoke_rows("lattice") if row.option == "a copy")
+    assert f"{figures(copy)['GB/s']} GB/s" in README
+    rules = {row.option: figures(row) for row in smoke_rows("weights")}
+    page = " ".join((ROOT / "docs" / "smoke.md").read_text(encoding="utf-8").split())
+    assert f"off by {rules['squared']['RMS']} RMS and {rules['squared']['bias']} in brightness" in page
+    assert f"eq. 5 by {rules['absolute']['RMS']} and {rules['absolute']['bias']}." in page
 
 
 def test_images_are_there():

@@ -7,7 +7,7 @@ import pytest
 from atlas_meshes import charts, sheet, triangle
 from atlas_models import KINDS, random_model
 
-from wlm.atlas import codec
+from wlm.atlas import codec, colour
 from wlm.atlas.model import MOST_SIZE, AtlasModel, pack_entries
 from wlm.errors import WlmError
 from wlm.formats.artifact import read_artifact, write_artifact
@@ -33,6 +33,20 @@ def test_what_is_written_comes_back(kind, colour, tmp_path):
     assert_same(back, model)
     codec.write(tmp_path / "b.wlm", back)
     assert (tmp_path / "a.wlm").read_bytes() == (tmp_path / "b.wlm").read_bytes()
+
+
+@pytest.mark.parametrize("stored", ["half", "bc6h", "astc"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_a_file_holds_takes_no_decoding(kind, stored, tmp_path, monkeypatch):
+    model = random_model(sheet(), kind, stored)
+    size = codec.write(tmp_path / "a.wlm", model)
+    monkeypatch.setattr(colour, "decode", None)
+    found = codec.inspect(tmp_path / "a.wlm")
+    for name in ("name", "source", "profile", "method", "colour", "height", "width", "report", "compression_ratio"):
+        assert getattr(found, name) == getattr(model, name), name
+    assert (found.texels, found.lut) == (model.texels.shape[:2], model.lut.shape[:2])
+    assert found.triangles == len(model.uv) and found.file_bytes == size
+    assert found.header_bytes + sum(found.parts.values()) == size
 
 
 @pytest.mark.parametrize("mesh", [charts(), triangle(), sheet(height=1, width=1), sheet(height=2, width=90)])
@@ -124,9 +138,10 @@ def test_parts_that_do_not_fit_are_refused(kind, part, change, words, tmp_path):
     else:
         tensors[part] = np.ascontiguousarray(change(tensors[part]))
     write_artifact(tmp_path / "b.wlm", "atlas", artifact.settings, tensors, artifact.source)
-    with pytest.raises(WlmError, match=words) as error:
-        codec.read(tmp_path / "b.wlm")
-    assert str(error.value).startswith(f"{tmp_path / 'b.wlm'}: ") and "\n" not in str(error.value)
+    for read in (codec.read, codec.inspect):
+        with pytest.raises(WlmError, match=words) as error:
+            read(tmp_path / "b.wlm")
+        assert str(error.value).startswith(f"{tmp_path / 'b.wlm'}: ") and "\n" not in str(error.value)
 
 
 def test_a_table_with_a_plain_model_is_refused(tmp_path):
@@ -162,9 +177,10 @@ def test_settings_that_do_not_fit_are_refused(change, words, tmp_path):
     codec.write(tmp_path / "a.wlm", random_model(sheet(), "tiles"))
     artifact = read_artifact(tmp_path / "a.wlm")
     write_artifact(tmp_path / "b.wlm", "atlas", artifact.settings | change, artifact.tensors, artifact.source)
-    with pytest.raises(WlmError, match=words) as error:
-        codec.read(tmp_path / "b.wlm")
-    assert str(error.value).startswith(f"{tmp_path / 'b.wlm'}: ") and "\n" not in str(error.value)
+    for read in (codec.read, codec.inspect):
+        with pytest.raises(WlmError, match=words) as error:
+            read(tmp_path / "b.wlm")
+        assert str(error.value).startswith(f"{tmp_path / 'b.wlm'}: ") and "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize("key", ["name", "method", "colour", "size", "texels", "profile", "report"])

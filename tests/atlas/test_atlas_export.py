@@ -13,6 +13,7 @@ from atlas_meshes import charts, sheet
 from atlas_models import KINDS, random_model
 
 from wlm.atlas import codec, colour, export
+from wlm.atlas.data import from_arrays
 from wlm.atlas.decode import Decoder
 from wlm.atlas.reference import decode64
 from wlm.atlas.shader import atlas_glsl
@@ -122,6 +123,66 @@ def test_a_new_output_takes_the_place_of_an_old_one(tmp_path):
     model, _, paths = written(folder, "plain", "astc")
     assert set(os.listdir(folder)) == ALWAYS | {"mine.txt"} == {path.name for path in paths} | {"mine.txt"}
     assert export.read_folder(folder).model.method == "plain"
+
+
+@pytest.mark.parametrize("old", ["empty", "tiles"])
+def test_a_stop_while_files_are_moved_loses_nothing(old, tmp_path, monkeypatch):
+    """Wherever it stops, the folder isn't read as whole, and the same export makes it whole; other files stay."""
+    mesh, folder = charts(), tmp_path / "out"
+    model = random_model(mesh, "plain", "astc")
+    move = os.replace
+    for steps in range(20):
+        shutil.rmtree(folder, ignore_errors=True)
+        if old != "empty":
+            written(folder, old, mesh=mesh)
+            (folder / "mine.txt").write_text("x")
+        left = steps
+
+        def stopped(source, target):
+            nonlocal left
+            if os.path.dirname(target) == str(folder):
+                if not left:
+                    raise KeyboardInterrupt
+                left -= 1
+            move(source, target)
+
+        monkeypatch.setattr(os, "replace", stopped)
+        try:
+            export.export(folder, model, mesh)
+            break
+        except KeyboardInterrupt:
+            pass
+        finally:
+            monkeypatch.setattr(os, "replace", move)
+        assert os.listdir(tmp_path) == ["out"]
+        if steps:
+            with pytest.raises(WlmError, match="out: expected all files of a run; writing them was stopped half-way"):
+                export.read_folder(folder)
+        elif old != "empty":
+            assert export.read_folder(folder).model.method == "tiles", "nothing was moved yet"
+        export.export(folder, model, mesh)
+        assert export.read_folder(folder).model.method == "plain"
+    # The marker, and each file.
+    assert steps == 1 + len(ALWAYS)
+    assert set(os.listdir(folder)) == ALWAYS | ({"mine.txt"} if old != "empty" else set())
+
+
+def test_the_mask_goes_along_where_triangles_do_not_tell_it(tmp_path):
+    """Decoded without the inputs, the lightmap has the texels that were asked for and no others."""
+    whole = charts()
+    mask = whole.mask & (np.arange(64) < 40)
+    mesh = from_arrays(whole.position, whole.triangle, whole.uv, whole.lightmap, mask)
+    model, _, paths = written(tmp_path, "tiles", mesh=mesh)
+    assert "mask.png" in {path.name for path in paths}
+    own = export.geometry(export.read_folder(tmp_path))
+    np.testing.assert_array_equal(own.mask, mask)
+    np.testing.assert_array_equal(Decoder(model).lightmap(own), Decoder(model).lightmap(mesh))
+    (tmp_path / "mask.png").unlink()
+    with pytest.raises(WlmError, match="mask.png: no such mask"):
+        export.geometry(export.read_folder(tmp_path))
+    # An output that needs none takes an old one away.
+    written(tmp_path, "tiles", mesh=whole)
+    assert not (tmp_path / "mask.png").exists()
 
 
 def test_other_folders_are_left_alone(tmp_path):

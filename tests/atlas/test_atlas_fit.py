@@ -5,13 +5,13 @@ import pytest
 import torch
 from atlas_meshes import charts, constant, sheet, soft, triangle
 
-from wlm.atlas import codec
+from wlm.atlas import codec, fit
 from wlm.atlas import tiles as grid
 from wlm.atlas.coverage import covered_texels
 from wlm.atlas.decode import Decoder
 from wlm.atlas.evaluate import evaluate
-from wlm.atlas.fit import _fitted, compress, weights
-from wlm.atlas.model import compression_ratio, load_profile, unpack_entries
+from wlm.atlas.fit import Cells, _fitted, compress, weights
+from wlm.atlas.model import load_profile, unpack_entries
 from wlm.errors import WlmError
 
 FEW = {"views": 2, "fallback": False}
@@ -39,9 +39,9 @@ def downsampled(mesh, share: float) -> float:
 
 def checked(model, mesh) -> np.ndarray:
     """What holds of any model; returns the lightmap that it decodes to."""
-    share = 1.0 - compression_ratio(
-        model.texels.shape[:2], model.lut.shape[:2], mesh.mask.shape, {"half": 48}.get(model.colour, 8)
-    )
+    rows, columns = model.texels.shape[:2]
+    bits = rows * columns * 48 if model.colour == "half" else -(-rows // 4) * -(-columns // 4) * 128
+    share = (bits + model.lut.size * 16) / (mesh.mask.size * 48)
     assert share == pytest.approx(1.0 - model.compression_ratio) and share <= model.profile.budget
     assert model.texels.dtype == np.float16 and np.isfinite(model.texels).all() and (model.texels >= 0).all()
     if model.method == "tiles":
@@ -172,7 +172,7 @@ def test_what_is_not_seen_stays_sane(views: int):
     """One view sees three sides at most, and none the chart within the cube."""
     mesh = charts(height=96, width=128)
     profile = STANDARD.model_copy(update={"views": views})
-    weight = weights(mesh, profile, 0, "cpu")
+    weight = weights(Cells(mesh, "cpu"), profile, 0)
     decoded = checked(compress(mesh, profile), mesh)
     low, high = mesh.lightmap[mesh.mask].min(), mesh.lightmap[mesh.mask].max()
     assert decoded[mesh.mask].min() >= low - 0.3 * (high - low) and decoded.max() <= high + 0.3 * (high - low)
@@ -194,7 +194,8 @@ def test_what_is_not_seen_stays_sane(views: int):
 def test_weights_follow_the_views_and_the_borders():
     """A border of a chart counts more, what has no triangle not at all."""
     mesh = charts(height=48, width=64)
-    plain, bordered = (weights(mesh, STANDARD.model_copy(update={"border": border}), 0, "cpu") for border in (1.0, 5.0))
+    cells = Cells(mesh, "cpu")
+    plain, bordered = (weights(cells, STANDARD.model_copy(update={"border": border}), 0) for border in (1.0, 5.0))
     assert plain.shape == (96, 128) and (plain >= 0).all()
     ratio = bordered[plain > 0] / plain[plain > 0]
     assert set(np.unique(np.round(ratio, 6))) == {1.0, 5.0}
@@ -202,6 +203,29 @@ def test_weights_follow_the_views_and_the_borders():
     # The middle of the first side, three texels and more from its border.
     middle = np.s_[20:28, 12:20]
     np.testing.assert_array_equal(plain[middle], bordered[middle])
+
+
+@pytest.mark.parametrize("profile", ["standard", "cascade"])
+def test_what_the_triangles_cover_is_found_once(profile, monkeypatch):
+    """The comparison with a plain lightmap takes what the fit has found."""
+    mesh, calls = charts(), []
+
+    def counted(name):
+        own = getattr(fit, name)
+
+        def call(*given):
+            calls.append(name)
+            return own(*given)
+
+        return call
+
+    names = ("covered_texels", "mesh_charts", "texel_triangles")
+    for name in names:
+        monkeypatch.setattr(fit, name, counted(name))
+    small = {"views": 2, "steps": 2, "resolution": 64}
+    model = compress(mesh, load_profile(profile).model_copy(update=small))
+    assert "error against a plain lightmap of as many bits" in model.report
+    assert sorted(calls) == sorted(names)
 
 
 def test_a_budget_without_room_for_tiles():

@@ -220,7 +220,7 @@ def test_the_whole(device: str):
         np.zeros(12, np.int8),
         np.zeros(12),
         np.zeros(12, bool),
-        Stats(0, 0, 0),
+        Stats(0, 0),
     )
     model = fit_cascade(mesh, clusters, _profile(scale=1.0, colour_scale=0.8), device=device)
     assert (model.method, model.colour, model.source, model.height, model.width) == (

@@ -46,7 +46,7 @@ def _clusters(representative: list[int], order: list[int]) -> Clusters:
         np.array(order, np.int8),
         np.zeros(count),
         np.zeros(count, bool),
-        Stats(0, 0, 0),
+        Stats(0, 0),
     )
 
 

@@ -10,6 +10,7 @@ from atlas_meshes import charts, sheet
 from PIL import Image
 from test_cli import call, fails
 
+import wlm.atlas.colour
 import wlm.atlas.fit
 from wlm.atlas import codec
 from wlm.atlas.data import load_mesh
@@ -94,8 +95,12 @@ def test_the_options_of_compress_reach_the_fit(inputs, tmp_path):
     assert model.source == load_mesh(*inputs, mask_path=tmp_path / "mask.png").source
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert len(report["warnings"]) == 1 and report["inputs"]["mask"] == str(tmp_path / "mask.png")
-    # evaluate finds the mask again.
+    # evaluate finds the mask again, and decode needs no inputs.
     call("atlas", "evaluate", tmp_path / "out", "--views", 2, "--resolution", 64)
+    (tmp_path / "mask.png").unlink()
+    call("atlas", "decode", tmp_path / "out", "-o", tmp_path / "a.exr")
+    found, _ = read_exr(tmp_path / "a.exr")
+    np.testing.assert_array_equal(found.any(axis=2), mask > 0)
 
 
 def test_wrong_words_are_one_line(inputs, tmp_path):
@@ -254,6 +259,11 @@ def test_wrong_words_of_decode(tiles, tmp_path):
     words = ["atlas", "decode", tiles, "-o"]
     assert "a lightmap is written as .exr" in fails(*words, tmp_path / "a.png")
     assert "expected a name that ends in .exr or .png" in fails(*words, tmp_path / "a.dds")
+    for option, value in (("--views", 50), ("--resolution", 512)):
+        # Also where it is what a view has anyway.
+        text = fails(*words, tmp_path / "a.exr", option, value)
+        assert f"{option}: expected with --view alone" in text
+    assert "--view: expected 0 to 49, got 50" in fails(*words, tmp_path / "a.exr", "--view", 50)
     assert "--view: expected 0 to 4, got 5" in fails(*words, tmp_path / "a.png", "--view", 5, "--views", 5)
     assert "expected a folder that compress wrote" in fails("atlas", "decode", tmp_path, "-o", tmp_path / "a.exr")
     assert "device 'tpu'" in fails(*words, tmp_path / "a.exr", "--device", "tpu")
@@ -273,6 +283,21 @@ def test_info(kind, request):
     text = call("atlas", "info", folder)
     assert f"{size:,}" in text and f"{model.compression_ratio:.2%}" in text and "48x40" in text
     assert ("the mesh's own" in text) is (kind == "tiles")
+
+
+def test_info_decodes_nothing(inputs, tmp_path, monkeypatch):
+    """No package of an extra is needed; what is wrong with a folder is said all the same."""
+    out = tmp_path / "out"
+    call("atlas", "compress", *inputs, "-o", out, *QUICK, "--colour", "astc", "--budget", 0.3)
+    expected = codec.read(out / "atlas.wlm")
+    monkeypatch.setattr(wlm.atlas.colour, "decode", None)
+    facts = json.loads(call("atlas", "info", out, "--json"))
+    assert facts["colour"] == "astc" and facts["cr"] == expected.compression_ratio
+    report = json.loads((out / "report.json").read_text())
+    (out / "report.json").write_text(json.dumps(report | {"source": "0" * 16}))
+    assert "are not of one run" in fails("atlas", "info", out)
+    (out / "report.json").unlink()
+    assert "found no report.json of it" in fails("atlas", "info", out)
 
 
 def test_info_of_a_plain_model(inputs, tmp_path):

@@ -9,7 +9,9 @@ import pytest
 
 from wlm.errors import WlmError
 from wlm.formats.exr import HALF_MAX, read_exr, write_exr
+from wlm.formats.exr_planes import read_planes, write_planes
 
+PLANES = {"depth": np.ones((3, 4)), "top": np.zeros((3, 4))}
 SCANLINES = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
 
 
@@ -91,32 +93,52 @@ def test_misnamed_channels_are_listed(tmp_path, names):
     assert str(caught.value) == f"{path}: expected channels R,G,B or R,G,B,A, found {found}"
 
 
-def test_integers_and_several_parts_are_refused(tmp_path):
+READERS = pytest.mark.parametrize("read", [read_exr, read_planes])
+
+
+@READERS
+def test_integers_and_several_parts_are_refused(tmp_path, read):
     path = tmp_path / "a.exr"
     planes = _planes("RGB")
     OpenEXR.File(SCANLINES, {**planes, "G": np.ones((37, 21), np.uint32)}).write(str(path))
     with pytest.raises(WlmError, match="channel G: expected half or float, found uint32"):
-        read_exr(path)
+        read(path)
     parts = [OpenEXR.Part({}, planes, name=name) for name in ("one", "two")]
     OpenEXR.File(parts).write(str(path))
     with pytest.raises(WlmError, match="expected an EXR file of one part, found 2"):
-        read_exr(path)
+        read(path)
 
 
-def test_a_missing_file_or_other_content_is_refused(tmp_path, capfd):
+@READERS
+def test_a_missing_file_or_other_content_is_refused(tmp_path, capfd, read):
     path = tmp_path / "a.exr"
     with pytest.raises(WlmError, match="cannot read the EXR file: No such file"):
-        read_exr(path)
+        read(path)
     with pytest.raises(WlmError, match="found a folder"):
-        read_exr(tmp_path)
+        read(tmp_path)
     for content in (b"", b"\x76\x2f", b"\x89PNG" + b"x" * 500):
         path.write_bytes(content)
         with pytest.raises(WlmError, match="a.exr: expected an EXR file, found other content$"):
-            read_exr(path)
+            read(path)
     path.write_bytes(b"\x76\x2f\x31\x01" + b"x" * 500)
     with pytest.raises(WlmError, match="cut short or damaged"):
-        read_exr(path)
+        read(path)
     assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("write", [lambda path: write_exr(path, _pixels(3)), lambda path: write_planes(path, PLANES)])
+def test_what_cannot_be_written_leaves_what_was_there(tmp_path, monkeypatch, write):
+    path = tmp_path / "a.exr"
+    path.write_bytes(b"what was there")
+
+    def full(self, name):
+        raise RuntimeError(f"{name}: no room\nat all")
+
+    monkeypatch.setattr(OpenEXR.File, "write", full)
+    with pytest.raises(WlmError) as caught:
+        write(path)
+    assert str(caught.value) == f"{path}: cannot write: {path}: no room at all"
+    assert path.read_bytes() == b"what was there" and os.listdir(tmp_path) == ["a.exr"]
 
 
 @pytest.mark.parametrize("kind", [OpenEXR.scanlineimage, OpenEXR.tiledimage])

@@ -53,13 +53,11 @@ class Stats:
     """What the graph came to.
 
     Attributes:
-        visited: Pairs within lambda_h by dominant colour.
-        compared: Those of them of which samples had to be compared, the others were told by bounds; where rounding
-            decides this may differ from device to device.
+        compared: Pairs of which samples had to be compared, the others were told by bounds; where rounding decides this
+            may differ from device to device.
         edges: Pairs that are alike.
     """
 
-    visited: int
     compared: int
     edges: int
 
@@ -217,20 +215,7 @@ def _degrees(graph: graphs.Graph, progress) -> tuple[wp.array, Stats]:
             wp.synchronize_device(device)
             progress(end, count)
     edges = int(degree.numpy().sum(dtype=np.int64)) // 2
-    return degree, Stats(_visited(graph), int(compared.numpy().sum()), edges)
-
-
-def _visited(graph: graphs.Graph) -> int:
-    """Pairs of nodes whose dominant colours are near each other."""
-    first = graph.first.numpy().astype(np.int64)
-    size = np.diff(first)
-    colour = graph.patches.numpy()["colour"][first[:-1]]
-    bins = np.stack([colour >> shift & 255 for shift in (0, 8, 16)], -1)
-    twice = 0
-    for i in range(len(size)):
-        near = ((bins - bins[i]) ** 2).sum(-1) <= graph.rule.colour
-        twice += int(size[i]) * (int(size[near].sum()) - 1)
-    return twice // 2
+    return degree, Stats(int(compared.numpy().sum()), edges)
 
 
 def _greedy(graph: graphs.Graph, number: np.ndarray, degree: wp.array, progress):

@@ -10,6 +10,7 @@ import math
 
 import numpy as np
 
+from wlm.atlas.model import BLOCK_SIDE
 from wlm.errors import WlmError
 from wlm.formats import hdr_blocks
 from wlm.formats.exr import HALF_MAX
@@ -18,14 +19,13 @@ __all__ = ["BLOCK_CODECS", "block_grid", "decode", "encode"]
 
 BLOCK_CODECS = ("bc6h", "astc")
 _EXTRA = "atlas"
-_SIDE = 4
 # A third of the time of "slow" for 0.2 dB, and every size of every tile is encoded once to know its error.
 _BC6H = "basic"
 
 
 def block_grid(height: int, width: int) -> tuple[int, int]:
     """Rows and columns of blocks that hold a texture."""
-    return math.ceil(height / _SIDE), math.ceil(width / _SIDE)
+    return math.ceil(height / BLOCK_SIDE), math.ceil(width / BLOCK_SIDE)
 
 
 def encode(texels: np.ndarray, codec: str) -> tuple[np.ndarray, np.ndarray]:
@@ -51,7 +51,7 @@ def encode(texels: np.ndarray, codec: str) -> tuple[np.ndarray, np.ndarray]:
     if np.isnan(texels).any():
         raise ValueError(f"texels: {np.count_nonzero(np.isnan(texels).any(axis=2))} are NaN")
     height, width = texels.shape[:2]
-    padded = np.pad(texels, ((0, -height % _SIDE), (0, -width % _SIDE), (0, 0)), mode="edge")
+    padded = np.pad(texels, ((0, -height % BLOCK_SIDE), (0, -width % BLOCK_SIDE), (0, 0)), mode="edge")
     half = np.clip(padded, 0.0, HALF_MAX).astype(np.float16)
     if codec == "bc6h":
         data = hdr_blocks.encode_bc6h(half, _BC6H, _EXTRA)
@@ -82,7 +82,7 @@ def decode(blocks: np.ndarray, height: int, width: int, codec: str) -> np.ndarra
     rows, columns = block_grid(height, width)
     if blocks.dtype != np.uint8 or blocks.shape != (rows * columns, 16) or not blocks.size:
         raise ValueError(f"blocks: expected uint8 [{rows * columns}, 16], got {blocks.dtype} {blocks.shape}")
-    size = (rows * _SIDE, columns * _SIDE)
+    size = (rows * BLOCK_SIDE, columns * BLOCK_SIDE)
     if codec == "bc6h":
         texels = hdr_blocks.decode_bc6h(blocks.tobytes(), *size, _EXTRA)
     else:
@@ -90,10 +90,10 @@ def decode(blocks: np.ndarray, height: int, width: int, codec: str) -> np.ndarra
     texels = texels[:height, :width].astype(np.float32)
     broken = ~np.isfinite(texels).all(axis=2)
     if broken.any():
-        row, column = np.argwhere(broken)[0] // _SIDE
+        row, column = np.argwhere(broken)[0] // BLOCK_SIDE
         raise WlmError(f"{codec}: expected blocks of the format, found none in row {row}, column {column}")
     return texels
 
 
 def _astc() -> hdr_blocks.Astc:
-    return hdr_blocks.astc((_SIDE, _SIDE), hdr_blocks.ASTC_MEDIUM, _EXTRA)
+    return hdr_blocks.astc((BLOCK_SIDE, BLOCK_SIDE), hdr_blocks.ASTC_MEDIUM, _EXTRA)

@@ -1,7 +1,8 @@
 """What a compression leaves in its folder: the model, a mesh, textures for engines and viewers, a shader, a report.
 
-    atlas.wlm                       the model in one file, see ``codec``; all that ``decode`` and ``evaluate`` read
+    atlas.wlm                       the model in one file, see ``codec``
     mesh.glb                        the mesh, with its new UVs as one more set if it has any
+    mask.png                        the texels that belong to charts, unless those are all that triangles touch
     lut.exr, .ktx2, .dds            T_c, unless the model is "plain"
     colour.exr, .ktx2, .dds         T_p; blocks of ASTC have no DDS
     atlas.glsl                      a function that reads them
@@ -24,6 +25,7 @@ from typing import Any
 import numpy as np
 
 from wlm.atlas import codec
+from wlm.atlas.coverage import touched_texels
 from wlm.atlas.data import LightmappedMesh, from_arrays, write_mesh
 from wlm.atlas.model import SOURCE_BITS, AtlasModel
 from wlm.atlas.shader import atlas_glsl
@@ -34,29 +36,42 @@ from wlm.formats.exr import write_exr
 from wlm.formats.gltf import read_gltf
 from wlm.formats.gltf_writer import write_glb
 from wlm.formats.ktx2 import write_ktx2
+from wlm.formats.mask import read_mask, write_mask
 
 __all__ = [
     "FORMAT",
+    "MASK_FILE",
     "MESH_FILE",
     "MODEL_FILE",
     "REPORT_FILE",
     "Output",
     "check_folder",
+    "check_run",
     "disk_ratio",
     "export",
     "geometry",
     "read_folder",
+    "read_report",
 ]
 
 FORMAT = "wlm-atlas"
 _VERSION = 1
 MODEL_FILE = "atlas.wlm"
 MESH_FILE = "mesh.glb"
+MASK_FILE = "mask.png"
 SHADER_FILE = "atlas.glsl"
 REPORT_FILE = "report.json"
 _TEXTURES = ("lut", "colour")
 _SUFFIXES = (".exr", ".ktx2", ".dds")
-_FILES = (MODEL_FILE, MESH_FILE, *(name + end for name in _TEXTURES for end in _SUFFIXES), SHADER_FILE, REPORT_FILE)
+_FILES = (
+    MODEL_FILE,
+    MESH_FILE,
+    MASK_FILE,
+    *(name + end for name in _TEXTURES for end in _SUFFIXES),
+    SHADER_FILE,
+    REPORT_FILE,
+)
+_MARKER = "unfinished"  # stands in the report while files are being moved
 _MOST_SIDE = 16384  # texels of a texture on GPUs
 _LUT_FORMATS = {"tiles": "R16G16_UINT", "cascade": "R16G16_UNORM"}
 _STEPS = 65535.0  # of a coordinate in T_c
@@ -79,7 +94,7 @@ class Output:
     model_bytes: int
 
 
-def disk_ratio(model_bytes: int, model: AtlasModel) -> float:
+def disk_ratio(model_bytes: int, model: AtlasModel | codec.Contents) -> float:
     """CR of bytes on disk: 1 less those of atlas.wlm over the lightmap's at 48 bits a texel."""
     return 1.0 - model_bytes * 8 / (model.height * model.width * SOURCE_BITS)
 
@@ -93,7 +108,8 @@ def export(
     """Writes a model and all that an engine needs.
 
     All files are made beside the folder and moved into it at the end, ``report.json`` last. Into a folder of an earlier
-    output the new one is written over the old; other files there stay.
+    output the new one is written over the old; other files there stay. Where the moving is stopped half-way the folder
+    can't be read, but can be written again.
 
     Args:
         directory: The folder; made if it isn't there.
@@ -129,6 +145,8 @@ def export(
         else:
             # The number is of a set to be added, and there is none.
             write_glb(temporary / MESH_FILE, mesh.document, [], 1)
+        if not np.array_equal(mesh.mask, _touched(mesh)):
+            write_mask(temporary / MASK_FILE, mesh.mask)
         if model.method != "plain":
             _write_lut(temporary, model)
         _write_colour(temporary, model)
@@ -149,7 +167,7 @@ def check_folder(directory: str | os.PathLike[str]) -> None:
     """
     folder = Path(directory)
     try:
-        if folder.exists() and any(folder.iterdir()) and not _is_output(folder):
+        if folder.exists() and any(folder.iterdir()) and _json_of(folder).get("format") != FORMAT:
             raise WlmError(f"{folder}: expected an empty folder or one of an earlier output, found other files")
     except OSError as error:
         raise WlmError(f"{folder}: cannot write there: {error.strerror or error}") from error
@@ -165,20 +183,41 @@ def read_folder(directory: str | os.PathLike[str]) -> Output:
     """Reads what ``export`` wrote: the model and the report.
 
     Raises:
-        WlmError: There is no such folder, it isn't of a compression, a file is damaged, or files are of different runs.
+        WlmError: As ``read_report``; or the model is damaged or of another run than the report.
+    """
+    folder, report = Path(directory), read_report(directory)
+    model = codec.read(folder / MODEL_FILE)
+    check_run(folder, report, model.source)
+    return Output(folder, model, report, (folder / MODEL_FILE).stat().st_size)
+
+
+def read_report(directory: str | os.PathLike[str]) -> dict[str, Any]:
+    """Reads the report that ``export`` wrote.
+
+    Raises:
+        WlmError: There is no such folder, it isn't of a compression, or its files were never all there.
     """
     folder = Path(directory)
     if not folder.is_dir():
         raise WlmError(f"{folder}: expected a folder that compress wrote")
-    if not _is_output(folder):
+    report = _json_of(folder)
+    if report.get("format") != FORMAT:
         raise WlmError(f"{folder}: expected a folder that compress wrote, found no {REPORT_FILE} of it")
-    report = _read_report(folder)
     if report.get("version") != _VERSION:
         raise WlmError(f"{folder / REPORT_FILE}: version: expected {_VERSION}, found {report.get('version')}")
-    model = codec.read(folder / MODEL_FILE)
-    if report.get("source") != model.source:
+    if _MARKER in report:
+        raise WlmError(f"{folder}: expected all files of a run; writing them was stopped half-way, so compress again")
+    return report
+
+
+def check_run(folder: Path, report: Mapping[str, Any], source: str) -> None:
+    """Checks that a model's ``source`` is its report's.
+
+    Raises:
+        WlmError: It is not.
+    """
+    if report.get("source") != source:
         raise WlmError(f"{folder}: {MODEL_FILE} and {REPORT_FILE} are not of one run")
-    return Output(folder, model, report, (folder / MODEL_FILE).stat().st_size)
 
 
 def geometry(output: Output) -> LightmappedMesh:
@@ -188,11 +227,11 @@ def geometry(output: Output) -> LightmappedMesh:
         output: The folder.
 
     Returns:
-        The mesh, its triangles in the model's order. Its lightmap is all ones, and its mask has the texels that its
-        triangles touch. ``source`` is the model's.
+        The mesh, its triangles in the model's order, with the mask that it was compressed with. Its lightmap is all
+        ones. ``source`` is the model's.
 
     Raises:
-        WlmError: mesh.glb is missing, damaged, or not of this model.
+        WlmError: mesh.glb, or a mask that the report names, is missing, damaged, or not of this model.
     """
     path, number = output.folder / MESH_FILE, output.report.get("uv_set")
     _, primitives = read_gltf(path)
@@ -201,27 +240,32 @@ def geometry(output: Output) -> LightmappedMesh:
     if triangles != expected:
         raise WlmError(f"{path}: expected {expected} triangles with TEXCOORD_{number}, found {triangles}")
     first = np.cumsum([0, *(len(each.position) for each in parts)])
-    model = output.model
+    model, mask, files = output.model, None, output.report.get("bytes")
+    if isinstance(files, dict) and MASK_FILE in files:
+        size = model.height, model.width
+        mask = read_mask(output.folder / MASK_FILE, output.folder / MODEL_FILE, size)
     mesh = from_arrays(
         np.concatenate([each.position for each in parts]),
         np.concatenate([each.triangle + start for each, start in zip(parts, first[:-1], strict=True)]),
         np.concatenate([each.uv[number] for each in parts]),
         np.ones((model.height, model.width, 3), np.float32),
+        mask,
         name=str(path),
     )
     return dataclasses.replace(mesh, source=model.source)
 
 
-def _read_report(folder: Path) -> dict[str, Any]:
+def _touched(mesh: LightmappedMesh) -> np.ndarray:
+    """The mask that ``geometry`` derives."""
+    return touched_texels(mesh.uv, mesh.triangle[mesh.active], *mesh.mask.shape)
+
+
+def _json_of(folder: Path) -> dict[str, Any]:
     try:
         found = json.loads((folder / REPORT_FILE).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         found = None
     return found if isinstance(found, dict) else {}
-
-
-def _is_output(folder: Path) -> bool:
-    return _read_report(folder).get("format") == FORMAT
 
 
 @contextmanager
@@ -231,11 +275,15 @@ def _staged(folder: Path) -> Iterator[Path]:
     try:
         temporary.mkdir()
         yield temporary
-        folder.mkdir(exist_ok=True)
         fresh = {path.name for path in temporary.iterdir()}
-        # An old report must not vouch for new files.
-        for name in (REPORT_FILE, *(name for name in _FILES if name not in fresh)):
-            (folder / name).unlink(missing_ok=True)
+        marker = temporary / _MARKER
+        marker.write_text(json.dumps({"format": FORMAT, "version": _VERSION, _MARKER: True}))
+        folder.mkdir(exist_ok=True)
+        # An old report must not vouch for new files, nor may the folder become one that can't be written again.
+        os.replace(marker, folder / REPORT_FILE)
+        for name in _FILES:
+            if name not in fresh:
+                (folder / name).unlink(missing_ok=True)
         for name in sorted(fresh, key=lambda name: name == REPORT_FILE):
             os.replace(temporary / name, folder / name)
     except OSError as error:

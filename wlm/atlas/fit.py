@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -20,6 +21,7 @@ from wlm.atlas.coverage import covered_texels
 from wlm.atlas.data import LightmappedMesh
 from wlm.atlas.decode import Decoder
 from wlm.atlas.model import (
+    BLOCK_SIDE,
     COLOUR_BITS,
     LUT_BITS,
     MOST_SIZE,
@@ -36,12 +38,11 @@ from wlm.formats.exr import HALF_MAX
 from wlm.imageops import fill_gaps
 from wlm.render import texture
 
-__all__ = ["Progress", "compress", "weights"]
+__all__ = ["Cells", "Progress", "compress", "weights"]
 
 Progress = Callable[[str], None]
 """Called with the name of each stage as it begins, and in long ones with how far it is."""
 
-_BLOCK = 4
 _RIM = 2  # quarters of a texel along an axis: one texel
 _VIEW = 768  # pixels along a side, where visibility is counted
 _NO_ROOM = "budget: {:g} of {}x{} texels is less than the smallest tiles and their table take: expected more"
@@ -71,13 +72,14 @@ def compress(
         WlmError: No such device, a missing package, or a budget that the smallest model exceeds.
     """
     device = interop.check_device(device)
-    clock = _Clock(progress or (lambda stage: None), device)
-    model = _tiles(mesh, profile, seed, device, clock) if profile.method == "tiles" else None
+    clock, cells = _Clock(progress or (lambda stage: None), device), Cells(mesh, device)
     if profile.method == "cascade":
         model = _cascade(mesh, profile, seed, device, clock)
+    else:
+        model = _tiles(cells, profile, seed, clock)
     if profile.fallback:
         with clock("compare"):
-            model = _better(mesh, model, profile, seed, device)
+            model = _better(cells, model, profile, seed)
     elif model is None:
         raise WlmError(_NO_ROOM.format(profile.budget, *mesh.mask.shape[::-1]))
     # The cascade's own stages stand in for the one that they make up.
@@ -106,14 +108,46 @@ def _cascade(mesh: LightmappedMesh, profile: Profile, seed: int, device: str, cl
         return fit_cascade(mesh, clusters, profile, seed=seed, device=device, progress=said)
 
 
-def _better(mesh: LightmappedMesh, model: AtlasModel | None, profile: Profile, seed: int, device: str) -> AtlasModel:
+class Cells:
+    """Quarters of the lightmap's texels, [2 H, 2 W]: what is found of them once and counts for all that is compared.
+
+    Attributes:
+        mesh, device: As given.
+    """
+
+    def __init__(self, mesh: LightmappedMesh, device: str):
+        self.mesh, self.device = mesh, device
+        self.height, self.width = (2 * count for count in mesh.mask.shape)
+
+    @cached_property
+    def triangle(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """As ``texel_triangles`` gives them: the triangle that holds a centre, and the weights of its corners."""
+        return texel_triangles(self.mesh, self.height, self.width, self.device)
+
+    @cached_property
+    def covered(self) -> np.ndarray:
+        """bool, whether a triangle holds the centre, exactly."""
+        mesh = self.mesh
+        return covered_texels(mesh.uv, mesh.triangle[mesh.active], self.height, self.width) > 0
+
+    @cached_property
+    def border(self) -> np.ndarray:
+        """bool, within ``_RIM`` of a border between charts or of a chart and nothing."""
+        found = self.triangle[0].cpu().numpy()
+        label = np.where(found < 0, -1, mesh_charts(self.mesh)[found])
+        window = 2 * _RIM + 1
+        return maximum_filter(label, window) != minimum_filter(label, window)
+
+
+def _better(cells: Cells, model: AtlasModel | None, profile: Profile, seed: int) -> AtlasModel:
     """The model, or a smaller lightmap of at most as many bits whose weighted error is no larger.
 
     Without a model the smaller lightmap has the budget's bits, and a texel, or a block, at least.
     """
+    mesh, device = cells.mesh, cells.device
     height, width = mesh.mask.shape
     share = profile.budget if model is None else 1.0 - model.compression_ratio
-    whole = 1 if profile.colour == "half" else _BLOCK
+    whole = 1 if profile.colour == "half" else BLOCK_SIDE
     bits = COLOUR_BITS[profile.colour]
     size = fitting_size(height, width, share * height * width * SOURCE_BITS, (whole, whole), bits)
     if size is None:
@@ -127,7 +161,8 @@ def _better(mesh: LightmappedMesh, model: AtlasModel | None, profile: Profile, s
     )
     if model is None:
         return replace(plain, report={"why plain": "tiles do not fit the budget"})
-    points, weight = _scored_points(mesh, weights(mesh, profile, seed + 1, device), device)
+    # Other views than those of the fit, which would flatter it.
+    points, weight = _scored_points(cells, weights(cells, profile, seed + 1))
     wanted = texture(torch.from_numpy(fill_gaps(mesh.lightmap, mesh.mask)).to(device), points[0])
     own, other = (
         float(((Decoder(each, device)(*points) - wanted).double().square().sum(1) * weight).sum())
@@ -141,22 +176,21 @@ def _better(mesh: LightmappedMesh, model: AtlasModel | None, profile: Profile, s
 
 
 def _scored_points(
-    mesh: LightmappedMesh, weight: np.ndarray, device: str
+    cells: Cells, weight: np.ndarray
 ) -> tuple[tuple[torch.Tensor, torch.Tensor, torch.Tensor], torch.Tensor]:
     """Centres of quarters of texels that are in a triangle, as a decoder takes them, and what each counts.
 
     Where no triangle holds a centre, being too small, the quarters that count stand for their triangles.
     """
-    height, width = weight.shape
-    found, barycentric = texel_triangles(mesh, height, width, device)
+    found, barycentric = cells.triangle
     hit = found >= 0
-    counts = torch.from_numpy(weight).to(device)
+    counts = torch.from_numpy(weight).to(cells.device)
     if not bool(hit.any()):
         hit = counts > 0
     row, column = torch.nonzero(hit, as_tuple=True)
-    uv = torch.stack([(column + 0.5) / width, (row + 0.5) / height], 1).float()
+    uv = torch.stack([(column + 0.5) / cells.width, (row + 0.5) / cells.height], 1).float()
     share, triangle = barycentric[hit], found[hit]
-    triangle = torch.where(triangle < 0, int(np.flatnonzero(mesh.active)[0]), triangle)
+    triangle = torch.where(triangle < 0, int(np.flatnonzero(cells.mesh.active)[0]), triangle)
     return (uv, triangle, torch.cat([share, 1.0 - share.sum(1, keepdim=True)], 1)), counts[hit]
 
 
@@ -168,33 +202,23 @@ def _stored(texels: np.ndarray, kind: str) -> tuple[np.ndarray, np.ndarray]:
     return blocks, texels.astype(np.float16)
 
 
-def weights(mesh: LightmappedMesh, profile: Profile, seed: int, device: str) -> np.ndarray:
+def weights(cells: Cells, profile: Profile, seed: int) -> np.ndarray:
     """How much each quarter of a texel counts: the pixels that show it in random views, and a little for the rest.
 
     Returns:
         float64 [2 H, 2 W], 0 where there is no triangle; at least one is above 0.
     """
-    height, width = (2 * n for n in mesh.mask.shape)
-    triangle = mesh.triangle[mesh.active]
-    covered = covered_texels(mesh.uv, triangle, height, width) > 0
+    mesh, height, width = cells.mesh, cells.height, cells.width
     if not profile.views:
         seen = _areas(mesh, height, width, seed)
     else:
-        seen = visibility(mesh, sphere_views(profile.views, seed), _VIEW, height, width, device)
-    used = covered | (seen > 0)
+        seen = visibility(mesh, sphere_views(profile.views, seed), _VIEW, height, width, cells.device)
+    used = cells.covered | (seen > 0)
     if not used.any():  # smaller than a quarter of a texel, and seen by nobody
         used = np.repeat(np.repeat(mesh.mask, 2, 0), 2, 1)
     usual = seen[used].mean() or 1.0
     result = np.where(used, seen + profile.unseen * usual, 0.0)
-    return np.where(_borders(mesh, height, width, device), profile.border * result, result)
-
-
-def _borders(mesh: LightmappedMesh, height: int, width: int, device: str) -> np.ndarray:
-    """Which cells of UV space are within ``_RIM`` of a border between charts or of a chart and nothing."""
-    found = texel_triangles(mesh, height, width, device)[0].cpu().numpy()
-    label = np.where(found < 0, -1, mesh_charts(mesh)[found])
-    window = 2 * _RIM + 1
-    return maximum_filter(label, window) != minimum_filter(label, window)
+    return np.where(cells.border, profile.border * result, result)
 
 
 def _areas(mesh: LightmappedMesh, height: int, width: int, seed: int) -> np.ndarray:
@@ -211,11 +235,12 @@ def _areas(mesh: LightmappedMesh, height: int, width: int, seed: int) -> np.ndar
     return count.reshape(height, width)
 
 
-def _tiles(mesh: LightmappedMesh, profile: Profile, seed: int, device: str, clock: "_Clock") -> AtlasModel | None:
+def _tiles(cells: Cells, profile: Profile, seed: int, clock: "_Clock") -> AtlasModel | None:
     """The model; None where not even the smallest tiles and their table fit the budget."""
+    mesh = cells.mesh
     with clock("weights"):
         image = fill_gaps(mesh.lightmap, mesh.mask)
-        tiles = grid.cut(image, weights(mesh, profile, seed, device), profile.tile, device)
+        tiles = grid.cut(image, weights(cells, profile, seed), profile.tile, cells.device)
     height, width = mesh.mask.shape
     rows, columns = grid.tile_counts(height, width, profile.tile)
     bits = profile.budget * height * width * SOURCE_BITS
@@ -273,7 +298,7 @@ def _sizes(profile: Profile) -> list[tuple[int, int]]:
     if profile.colour == "half":
         sides = range(1, profile.tile + 2)
     else:
-        sides = range(_BLOCK, profile.tile + 1 + _BLOCK, _BLOCK)
+        sides = range(BLOCK_SIDE, profile.tile + 1 + BLOCK_SIDE, BLOCK_SIDE)
         sides = [side for side in sides if side <= 1 << SIDE_BITS]
     return [(nx, ny) for ny in sides for nx in sides]
 
@@ -295,7 +320,7 @@ def _fitted(
 ) -> tuple[np.ndarray, np.ndarray, tuple[int, int]] | None:
     """Sizes for which T_p, a rectangle, has room: sizes int [T, 2], first texels [T, 2], rows and columns; or None."""
     cost, budget = sizes.prod(1).astype(np.float64), room
-    step, fewest = _BLOCK if blocks else 1, error.shape[1] * cost.min()
+    step, fewest = BLOCK_SIDE if blocks else 1, error.shape[1] * cost.min()
     while True:
         chosen = sizes[grid.allocate(error, cost, budget, least)]
         total = chosen.prod(1).sum()

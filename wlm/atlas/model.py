@@ -19,6 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from wlm.config import load_settings, profile_path
 
 __all__ = [
+    "BLOCK_SIDE",
     "COLOUR_BITS",
     "LUT_BITS",
     "MOST_SIZE",
@@ -37,6 +38,9 @@ SOURCE_BITS = 48
 
 COLOUR_BITS = {"half": 48, "bc6h": 8, "astc": 8}
 """Of a texel of T_p, by how it is stored: half floats, BC6H or ASTC 4x4."""
+
+BLOCK_SIDE = 4
+"""Texels along a block of BC6H or ASTC."""
 
 LUT_BITS = 32
 """Of an entry of T_c: two numbers of 16 bits."""
@@ -147,27 +151,22 @@ class AtlasModel:
 
     @property
     def compression_ratio(self) -> float:
-        """CR of eq. 9; of T_p whole blocks count, where it is made of them."""
-        rows, columns = self.texels.shape[:2]
-        if self.colour != "half":
-            rows, columns = -(-rows // 4) * 4, -(-columns // 4) * 4
-        return compression_ratio(
-            (rows, columns), self.lut.shape[:2], (self.height, self.width), COLOUR_BITS[self.colour]
-        )
+        """CR of eq. 9."""
+        return compression_ratio(self.texels.shape[:2], self.lut.shape[:2], (self.height, self.width), self.colour)
 
 
-def compression_ratio(
-    texels: tuple[int, int], lut: tuple[int, int], size: tuple[int, int], colour_bits: int = SOURCE_BITS
-) -> float:
+def compression_ratio(texels: tuple[int, int], lut: tuple[int, int], size: tuple[int, int], colour: str) -> float:
     """CR of eq. 9: 1 less the bits of both textures over the lightmap's.
 
     Args:
-        texels: Rows and columns of T_p.
+        texels: Rows and columns of T_p. Whole blocks count, where it is made of them.
         lut: Of T_c, (0, 0) for none.
         size: Of the lightmap.
-        colour_bits: Of a texel of T_p.
+        colour: How T_p is stored, as in ``Profile``.
     """
-    bits = texels[0] * texels[1] * colour_bits + lut[0] * lut[1] * LUT_BITS
+    side = 1 if colour == "half" else BLOCK_SIDE
+    rows, columns = (-(-count // side) * side for count in texels)
+    bits = rows * columns * COLOUR_BITS[colour] + lut[0] * lut[1] * LUT_BITS
     return 1.0 - bits / (size[0] * size[1] * SOURCE_BITS)
 
 

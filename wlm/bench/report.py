@@ -2,11 +2,21 @@
 
 import os
 from collections.abc import Sequence
+from itertools import groupby
 from pathlib import Path
 
-from wlm.bench.runner import Run, read_runs, table
+from wlm.bench.runner import Row, Run, read_runs, table
 
-__all__ = ["report"]
+__all__ = ["figures", "report", "tables"]
+
+_SMOKE = "smoke"
+# Field, heading and format of what smoke's tables have besides the figures of their own.
+_SMOKE_COLUMNS = (
+    ("decode_ms", "ms", ".3g"),
+    ("decode_ms_spread", "p90−p10 ms", ".2g"),
+    ("psnr", "PSNR dB", ".2f"),
+    ("max_error", "largest error", ".2g"),
+)
 
 
 def report(paths: Sequence[str | os.PathLike[str]]) -> str:
@@ -36,8 +46,50 @@ def report(paths: Sequence[str | os.PathLike[str]]) -> str:
                 f"`{environment['command']}`, {environment['date'][:10]}; {environment['threads']} threads, Python "
                 f"{environment['python']}, Warp {environment['warp']}, torch {environment['torch']}{cuda}.\n"
             )
-            parts.append(table(run.rows))
+            parts.append(tables(run.rows))
     return "\n".join(parts)
+
+
+def figures(row: Row) -> dict[str, str]:
+    """What a row's notes have as "title: figure", by title; the parts of notes are parted by semicolons."""
+    return dict(part.split(": ", 1) for part in row.notes.split("; ") if ": " in part)
+
+
+def tables(rows: Sequence[Row]) -> str:
+    """Rows as Markdown: one table, but of the smoke system, whose methods have columns of their own, one a method.
+
+    Args:
+        rows: The results, in the order to print.
+
+    Returns:
+        Lines with a final newline; empty for no rows.
+    """
+    others = [row for row in rows if row.system != _SMOKE]
+    parts = [table(others)] if others else []
+    smoke = [row for row in rows if row.system == _SMOKE]
+    for (method, scene), group in groupby(smoke, key=lambda row: (row.method, row.scene)):
+        parts.append(f"#### {method}: {scene}\n")
+        parts.append(_smoke_table(list(group)))
+    return "\n".join(parts)
+
+
+def _smoke_table(rows: list[Row]) -> str:
+    lines = []
+    for row in rows:
+        cells = {"": row.option} | figures(row)
+        for field, heading, form in _SMOKE_COLUMNS:
+            if (value := getattr(row, field)) is not None:
+                cells[heading] = format(value, form)
+        if notes := "; ".join(part for part in row.notes.split("; ") if ": " not in part):
+            cells["notes"] = notes
+        lines.append(cells)
+    titles = list(dict.fromkeys(title for cells in lines for title in cells if title != "notes"))
+    if any("notes" in cells for cells in lines):
+        titles.append("notes")
+    made = ["| " + " | ".join(titles) + " |"]
+    made.append("|" + "|".join("---" if title in ("", "notes") else "---:" for title in titles) + "|")
+    made += ["| " + " | ".join(cells.get(title, "") for title in titles) + " |" for cells in lines]
+    return "\n".join(made) + "\n"
 
 
 def _scenes(run: Run) -> list[str]:

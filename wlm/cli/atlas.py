@@ -31,7 +31,7 @@ app = typer.Typer(help="The lightmap of a mesh: a small colour texture, read thr
 
 _Folder = Annotated[Path, typer.Argument(metavar="DIR", help="A folder that compress wrote.")]
 _Device = Annotated[str, typer.Option(help='Where it computes: "cpu", "cuda" or "cuda:N".')]
-_Resolution = Annotated[int, typer.Option(min=16, max=16384, help="Pixels along a side of a view.")]
+_VIEWS, _RESOLUTION = 50, 512  # section 4.1.4 has as many views
 
 
 @app.command()
@@ -97,8 +97,8 @@ def compress(
 @app.command()
 def evaluate(
     folder: _Folder,
-    views: Annotated[int, typer.Option(min=1, max=4096, help="Cameras, spread evenly on a sphere.")] = 50,
-    resolution: _Resolution = 512,
+    views: Annotated[int, typer.Option(min=1, max=4096, help="Cameras, spread evenly on a sphere.")] = _VIEWS,
+    resolution: Annotated[int, typer.Option(min=16, max=16384, help="Pixels along a side of a view.")] = _RESOLUTION,
     json_path: Annotated[Path | None, typer.Option("--json", metavar="REPORT.json", help="Write a report.")] = None,
     mesh: Annotated[Path | None, typer.Option(help="The mesh; default where it was.")] = None,
     lightmap: Annotated[Path | None, typer.Option(help="The lightmap; default where it was.")] = None,
@@ -171,14 +171,24 @@ def decode(
     view: Annotated[
         int | None, typer.Option(min=0, help="Draw the mesh from this camera of evaluate, instead of the lightmap.")
     ] = None,
-    views: Annotated[int, typer.Option(min=1, max=4096, help="Cameras that evaluate has.")] = 50,
-    resolution: _Resolution = 512,
+    views: Annotated[
+        int | None, typer.Option(min=1, max=4096, help="Of a --view: cameras that evaluate has; default 50.")
+    ] = None,
+    resolution: Annotated[
+        int | None, typer.Option(min=16, max=16384, help="Of a --view: pixels along a side; default 512.")
+    ] = None,
     device: _Device = "cpu",
 ) -> None:
     """Rebuild the lightmap in its original layout, or draw a view of the mesh. The inputs aren't needed."""
     check_output(output, ".exr", ".png")
-    if view is None and output.suffix.lower() == ".png":
-        raise WlmError(f"{output}: a lightmap is written as .exr; a .png is of a --view")
+    if view is None:
+        if output.suffix.lower() == ".png":
+            raise WlmError(f"{output}: a lightmap is written as .exr; a .png is of a --view")
+        for option, given in (("views", views), ("resolution", resolution)):
+            if given is not None:
+                raise WlmError(f"--{option}: expected with --view alone: a lightmap has its own size")
+    views = _VIEWS if views is None else views
+    resolution = _RESOLUTION if resolution is None else resolution
     if view is not None and view >= views:
         raise WlmError(f"--view: expected 0 to {views - 1}, got {view}")
     quiet_warp()
@@ -223,46 +233,44 @@ def info(
     """Say what a compressed lightmap holds, without decoding it."""
     quiet_warp()
     from wlm.atlas import codec
-    from wlm.atlas.export import MODEL_FILE, disk_ratio, read_folder
-    from wlm.formats.artifact import read_artifact
+    from wlm.atlas.export import MODEL_FILE, check_run, disk_ratio, read_report
 
-    file = path
     if path.is_dir():
-        model, file = read_folder(path).model, path / MODEL_FILE
+        report, found = read_report(path), codec.inspect(path / MODEL_FILE)
+        check_run(path, report, found.source)
     else:
-        model = codec.read(path)
-    artifact = read_artifact(file)
+        found = codec.inspect(path)
     facts: dict[str, Any] = {
-        "name": model.name,
-        "method": model.method,
-        "colour": model.colour,
-        "bytes": artifact.file_bytes,
-        "size": [model.width, model.height],
-        "colour_size": [model.texels.shape[1], model.texels.shape[0]],
-        "lut_size": [model.lut.shape[1], model.lut.shape[0]],
-        "new_uvs": len(model.uv),
-        "cr": model.compression_ratio,
-        "cr_disk": disk_ratio(artifact.file_bytes, model),
-        "source": model.source,
-        "parts": {"header": artifact.header_bytes} | artifact.parts,
-        "found": model.report,
-        "profile": model.profile.model_dump(mode="json"),
+        "name": found.name,
+        "method": found.method,
+        "colour": found.colour,
+        "bytes": found.file_bytes,
+        "size": [found.width, found.height],
+        "colour_size": list(found.texels[::-1]),
+        "lut_size": list(found.lut[::-1]),
+        "new_uvs": found.triangles,
+        "cr": found.compression_ratio,
+        "cr_disk": disk_ratio(found.file_bytes, found),
+        "source": found.source,
+        "parts": {"header": found.header_bytes} | found.parts,
+        "found": found.report,
+        "profile": found.profile.model_dump(mode="json"),
     }
     if as_json:
         show_json(facts)
         return
     rows = table(str(path), ["", "value"])
-    rows.add_row("name", escape(model.name))
-    rows.add_row("method", model.method)
-    rows.add_row("bytes", f"{artifact.file_bytes:,}")
+    rows.add_row("name", escape(found.name))
+    rows.add_row("method", found.method)
+    rows.add_row("bytes", f"{found.file_bytes:,}")
     for label, key in (("lightmap", "size"), ("colour texture", "colour_size"), ("table", "lut_size")):
         rows.add_row(label, "x".join(map(str, facts[key])) if facts[key][0] else "none")
-    rows.add_row("colour stored as", model.colour)
-    rows.add_row("UVs", f"new, of {len(model.uv):,} triangles" if len(model.uv) else "the mesh's own")
+    rows.add_row("colour stored as", found.colour)
+    rows.add_row("UVs", f"new, of {found.triangles:,} triangles" if found.triangles else "the mesh's own")
     rows.add_row("CR of both textures", f"{facts['cr']:.2%}")
     rows.add_row("CR on disk", f"{facts['cr_disk']:.2%}")
-    rows.add_row("source", escape(model.source))
-    rows.add_row("profile", escape(model.profile.name))
+    rows.add_row("source", escape(found.source))
+    rows.add_row("profile", escape(found.profile.name))
     rows.add_section()
     for part, count in facts["parts"].items():
         rows.add_row(f"bytes of {part}", f"{count:,}")

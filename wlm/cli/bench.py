@@ -165,6 +165,31 @@ def atlas(
 
 
 @app.command()
+def smoke(
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Small grids, for a minute on a CPU; else the paper's, for a GPU.")
+    ] = False,
+    device: Annotated[str, typer.Option(help='Where it computes: "cpu", "cuda" or "cuda:N".')] = "cpu",
+    json_path: Annotated[
+        Path | None, typer.Option("--json", metavar="FILE.json", help="Write the rows and the environment.")
+    ] = None,
+    plot_path: Annotated[
+        Path | None, typer.Option("--plot", metavar="FILE.png", help="Draw the error of marches against their time.")
+    ] = None,
+) -> None:
+    """Smoke: the lattice beside a copy, advection, guiding maps, six-way lightmaps and a frame, with their errors."""
+    _check_outputs(json_path, plot_path)
+    quiet_warp()
+    from wlm.bench.smoke import PANELS, plotted, run
+    from wlm.interop import check_device
+
+    device = check_device(device)
+    rows = run(quick=quick, device=device, progress=note)
+    command = f"wlm bench smoke{' --quick' if quick else ''} --device {device}"
+    _finish(rows, device, command, json_path, plot_path, PANELS, shown=plotted(rows))
+
+
+@app.command()
 def report(
     files: Annotated[list[Path], typer.Argument(metavar="FILE.json...", help="What `wlm bench ... --json` wrote.")],
     output: Annotated[Path | None, typer.Option("--output", "-o", metavar="PAGE.md", help="Default: print it.")] = None,
@@ -204,14 +229,15 @@ def _finish(
     beside=(),
     shown: list | None = None,
 ) -> None:
-    """Writes what was asked for, and prints the table.
+    """Writes what was asked for, and prints the tables.
 
     A plot has the rows that are ``shown``, all unless told, and those ``beside`` them.
     """
-    from wlm.bench import describe_environment, plot, table, write_json
+    from wlm.bench import describe_environment, plot, write_json
+    from wlm.bench.report import tables
 
     if json_path is not None:
         write_json(json_path, rows, describe_environment(device, command))
     if plot_path is not None:
         plot([*beside, *(rows if shown is None else shown)], plot_path, panels)
-    sys.stdout.write(table(rows))
+    sys.stdout.write(tables(rows))

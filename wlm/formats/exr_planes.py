@@ -6,11 +6,10 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-import OpenEXR
 
-from wlm.errors import WlmError, one_line
-from wlm.formats.atomic import atomic_path
-from wlm.formats.exr import HALF_MAX, _captured_chatter, _check_magic, _open
+from wlm.errors import WlmError
+from wlm.formats.exr import HALF_MAX
+from wlm.formats.exr_file import read_part, write_part
 
 __all__ = ["read_planes", "write_planes"]
 
@@ -39,29 +38,14 @@ def write_planes(
     shapes = {np.shape(plane) for plane in planes.values()}
     if len(shapes) != 1 or len(next(iter(shapes))) != 2 or 0 in next(iter(shapes)):
         raise ValueError(f"expected planes [H, W] of one shape, got {sorted(shapes)}")
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    if note is not None:
-        header[_NOTE] = json.dumps(note, allow_nan=False)
+    attributes = {} if note is None else {_NOTE: json.dumps(note, allow_nan=False)}
     channels = {}
     for name, plane in planes.items():
         plane = np.asarray(plane)
         if name not in whole:
             plane = np.clip(plane, -HALF_MAX, HALF_MAX)
         channels[name] = np.ascontiguousarray(plane, np.float32 if name in whole else np.float16)
-    with atomic_path(path) as temporary:
-        with _captured_chatter() as chatter:
-            try:
-                OpenEXR.File(header, channels).write(str(temporary))
-            except (RuntimeError, ValueError) as error:
-                raise WlmError(f"{path}: cannot write: {one_line(error).replace(str(temporary), str(path))}") from error
-        if chatter.text:
-            raise WlmError(f"{path}: cannot write: {chatter.text}")
-        # The library says nothing where a full disk swallows what it still held when it closed the file.
-        try:
-            read_planes(temporary)
-        except WlmError as error:
-            reason = str(error).replace(str(temporary), "the file as written")
-            raise WlmError(f"{path}: cannot write: {reason}; is the disk full?") from error
+    write_part(path, channels, read_planes, attributes)
 
 
 def read_planes(path: str | os.PathLike[str]) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
@@ -77,24 +61,18 @@ def read_planes(path: str | os.PathLike[str]) -> tuple[dict[str, np.ndarray], di
     Raises:
         WlmError: The file is missing, not an EXR, damaged, of several parts or deep, or a channel isn't half or float.
     """
-    _check_magic(path)
-    file, complaints = _open(path)
-    parts = file.parts if file is not None else []
-    if len(parts) != 1:
-        found = complaints or f"{len(parts)} parts"
-        raise WlmError(f"{path}: expected an EXR file of one part, found: {found}")
-    if parts[0].type() in (OpenEXR.deepscanline, OpenEXR.deeptile):
-        raise WlmError(f"{path}: expected a flat EXR picture, found deep data")
+    part = read_part(path)
     planes = {}
-    for name, channel in parts[0].channels.items():
+    for name, channel in part.channels.items():
         pixels = channel.pixels
         if pixels is None or pixels.dtype not in (np.float16, np.float32):
-            raise WlmError(f"{path}: channel {name}: expected half or float")
+            found = "no pixels" if pixels is None else pixels.dtype
+            raise WlmError(f"{path}: channel {name}: expected half or float, found {found}")
         if planes and pixels.shape != next(iter(planes.values())).shape:
             raise WlmError(f"{path}: channel {name}: expected as many pixels as the others, found {pixels.shape}")
         planes[name] = pixels.astype(np.float32)
     try:
-        note = json.loads(parts[0].header.get(_NOTE, "{}"))
+        note = json.loads(part.header.get(_NOTE, "{}"))
     except (ValueError, TypeError, RecursionError):
         note = None
     if not isinstance(note, dict):

@@ -7,8 +7,9 @@ import numpy as np
 from PIL import Image
 
 from wlm.errors import WlmError
+from wlm.formats.atomic import atomic_path
 
-__all__ = ["read_mask"]
+__all__ = ["read_mask", "write_mask"]
 
 
 def read_mask(path: Path, beside: str | os.PathLike[str], size: tuple[int, int], others: str = "") -> np.ndarray:
@@ -35,3 +36,13 @@ def read_mask(path: Path, beside: str | os.PathLike[str], size: tuple[int, int],
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise WlmError(f"{path}: cannot read the mask: {error}") from error
     return colour > 0 if colour.ndim == 2 else (colour > 0).any(axis=2)
+
+
+def write_mask(path: str | os.PathLike[str], mask: np.ndarray) -> None:
+    """Writes a mask, bool [H, W], as a PNG of one bit a texel, whole or not at all.
+
+    Raises:
+        WlmError: The file can't be written.
+    """
+    with atomic_path(path) as temporary:
+        Image.fromarray(np.asarray(mask, bool)).save(temporary, format="PNG")

@@ -1,0 +1,96 @@
+"""The smoke system against copies, exact solutions and finer marches: speed and error, in one run.
+
+The methods, each a table of its own:
+
+- "lattice": a copy of an array, and steps of the lattice Boltzmann solver of each storage, operator and kind of
+  boundary; their share of the copy's bandwidth is that of the bytes which a step has to move. "moving sphere" also
+  marks the sphere's cells and finds its links anew at each step.
+- "lattice storage": velocities of 16 bits against 32 in a jet, over the inlet's speed, and the share by which the mass
+  drifts.
+- "lattice bricks": bricks against the dense lattice. In the jet's beginning, with an inlet of 0.1 cells a step, by the
+  tolerance: times are medians over equal parts of it, "worked on" is the mean. Where a slab slides at 0.05 cells a step
+  along itself, with a tolerance of 1e-4, by the share of the box that moves.
+- "advection": a step of smoke in eddies, dense, with and without a sphere; and what is wrong with a smooth ball after
+  a whole turn: over its own RMS, the largest difference (its peak is 1), and the smoke that was gained.
+- "advection bricks": the same step where only a cube in a corner has smoke.
+- "guide": guiding maps against a march in steps of half a voxel with no jitter and no cutoff. PSNR is of the light, its
+  greatest value the peak.
+- "six ways": the fine march, with what it says of its own error by halving its step.
+- "weights": six lightmaps weighed for twelve lights against a march to each.
+- "frame": the stages of a frame of the scene `jet-sphere`. The network that shall turn the guide into lightmaps isn't
+  there yet; the march that it stands for is beside it.
+
+A largest error has the unit of what is compared: cells a step, light, or density. Times are of the calls that a user
+makes; on CUDA the lattice replays graphs by itself where it does many steps, and steps of advection are replayed as
+graphs, so that gaps between launches do not count.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from wlm.bench.plot import Panel
+from wlm.bench.runner import Row
+from wlm.bench.smoke_air import advection_rows, lattice_brick_rows, lattice_rows, smoke_brick_rows, storage_rows
+from wlm.bench.smoke_light import frame_rows, guide_rows, six_rows, weight_rows
+from wlm.bench.smoke_setup import FULL, QUICK, Bench, Sizes
+from wlm.interop import check_device
+
+__all__ = ["PANELS", "plotted", "run", "run_rows"]
+
+PANELS = (Panel("decode_ms", "psnr", ("guide",)), Panel("decode_ms", "max_error", ("guide", "six ways")))
+"""What a plot shows: the time of guiding maps and of the fine march against what is wrong with them."""
+
+# The lattice's comes first: it measures the copy that others are held against.
+_PARTS: tuple[Callable[[Bench], list[Row]], ...] = (
+    lattice_rows,
+    storage_rows,
+    lattice_brick_rows,
+    advection_rows,
+    smoke_brick_rows,
+    guide_rows,
+    six_rows,
+    weight_rows,
+    frame_rows,
+)
+
+
+def run(*, quick: bool, device: str, progress: Callable[[str], None] | None = None) -> list[Row]:
+    """Measures the smoke system.
+
+    Args:
+        quick: Small grids, for a minute on a CPU. Otherwise the paper's, for a GPU with 40 GB: hours on a CPU.
+        device: "cpu" or "cuda:0".
+        progress: Called with a line before each part of the work.
+
+    Returns:
+        The rows, method by method.
+
+    Raises:
+        WlmError: The device isn't there, or hasn't the memory.
+    """
+    return run_rows(QUICK if quick else FULL, device=device, progress=progress)
+
+
+def run_rows(sizes: Sizes, *, device: str, progress: Callable[[str], None] | None = None) -> list[Row]:
+    """Measures it on given grids.
+
+    Args:
+        sizes: Of the grids.
+        device: "cpu" or "cuda:0".
+        progress: As for ``run``.
+
+    Returns:
+        The rows.
+
+    Raises:
+        WlmError: As ``run``.
+    """
+    bench = Bench(check_device(device), sizes, progress)
+    return [row for part in _PARTS for row in part(bench)]
+
+
+def plotted(rows: Sequence[Row]) -> list[Row]:
+    """The rows that a plot shows."""
+    methods = {method for panel in PANELS for method in panel.methods}
+    return [row for row in rows if row.method in methods]
