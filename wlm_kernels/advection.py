@@ -32,6 +32,7 @@ import warp as wp
 
 from wlm_kernels.advection_places import (
     BRICK,
+    BRICK_RUN,
     FREE,
     RUN,
     SOLID,
@@ -61,13 +62,13 @@ __all__ = ["STORAGES", "Fields", "advect", "correct", "field_kernels", "storage_
 _OPTIONS = {"enable_backward": False, "max_unroll": 4}
 
 # Threads of a block, and blocks that share a multiprocessor: what else takes 110 registers then makes room for more
-# threads and spills where it rarely goes. Measured at 400^3: 2, 3, 4 blocks take 1.02, 0.80, 0.73 ms without solids.
-_BOUNDS = {False: (256, 4), True: (256, 3)}
+# threads and spills where it rarely goes. At 400^3 on an H200, 2, 3, 4 blocks take 1.02, 0.80, 0.73 ms, runs of 8.
+_BOUNDS = (256, 4)
 
 STORAGES = {"float32": wp.float32, "float16": wp.float16}
 
 _LARGEST_HALF = wp.constant(65504.0)
-_BRICK_RUNS = wp.constant(BRICK * BRICK * BRICK // RUN)
+_BRICK_RUNS = wp.constant(BRICK * BRICK * BRICK // BRICK_RUN)
 
 
 @dataclass(frozen=True)
@@ -96,6 +97,7 @@ def field_kernels(storage: str, in_bricks: bool, solids: bool, hot: bool) -> Fie
     """Builds (once) the kernels that carry fields; those that know no solids are half the code, and use fewer registers
     where there is no temperature."""
     stored = STORAGES[storage]
+    run = BRICK_RUN if in_bricks else RUN
 
     @wp.func
     def keep_in_range(value: float) -> stored:
@@ -198,8 +200,8 @@ def field_kernels(storage: str, in_bricks: bool, solids: bool, hot: bool) -> Fie
         if wp.static(in_bricks):
             r = i % _BRICK_RUNS
             b = cell_of(box.bricks, listed[k])
-            within = cell_of(wp.vec3i(BRICK // RUN, BRICK, BRICK), r)
-            return wp.vec3i(b[0] * BRICK + within[0] * RUN, b[1] * BRICK + within[1], b[2] * BRICK + within[2])
+            within = cell_of(wp.vec3i(BRICK // BRICK_RUN, BRICK, BRICK), r)
+            return wp.vec3i(b[0] * BRICK + within[0] * BRICK_RUN, b[1] * BRICK + within[1], b[2] * BRICK + within[2])
         p = cell_of(box.n, i)
         return wp.vec3i(p[0] * RUN, p[1], p[2])
 
@@ -222,7 +224,7 @@ def field_kernels(storage: str, in_bricks: bool, solids: bool, hot: bool) -> Fie
         patch_x = float(-2.0)
         own = wp.uint8(0)
         own_x = float(-1.0)
-        for x_cell in range(first[0], wp.min(first[0] + RUN, box.n[0])):
+        for x_cell in range(first[0], wp.min(first[0] + wp.static(run), box.n[0])):
             cell = wp.vec3i(x_cell, first[1], first[2])
             i = index_of(box.n, cell)
             amount = float(0.0)
@@ -279,7 +281,7 @@ def field_kernels(storage: str, in_bricks: bool, solids: bool, hot: bool) -> Fie
         patch_x = float(-2.0)
         own = wp.uint8(0)
         own_x = float(-1.0)
-        for x_cell in range(first[0], wp.min(first[0] + RUN, box.n[0])):
+        for x_cell in range(first[0], wp.min(first[0] + wp.static(run), box.n[0])):
             cell = wp.vec3i(x_cell, first[1], first[2])
             i = index_of(box.n, cell)
             amount = value_at(density_hat, i)
@@ -319,7 +321,7 @@ def field_kernels(storage: str, in_bricks: bool, solids: bool, hot: bool) -> Fie
                 most = wp.max(most, warmth)
         return most
 
-    @wp.kernel(module="unique", module_options=_OPTIONS, launch_bounds=_BOUNDS[solids])
+    @wp.kernel(module="unique", module_options=_OPTIONS, launch_bounds=_BOUNDS)
     def advect(
         # in:
         box: Box,
@@ -350,7 +352,7 @@ def field_kernels(storage: str, in_bricks: bool, solids: bool, hot: bool) -> Fie
             first = first_of_run(box, listed, i, 0)
             advect_run(box, first, u, walls, density, heat, dt, share, new_density, new_heat)
 
-    @wp.kernel(module="unique", module_options=_OPTIONS, launch_bounds=_BOUNDS[solids])
+    @wp.kernel(module="unique", module_options=_OPTIONS, launch_bounds=_BOUNDS)
     def correct(
         # in:
         box: Box,

@@ -18,6 +18,7 @@ from wlm_kernels.lattice_sets import cell_of, index_of
 
 __all__ = [
     "BRICK",
+    "BRICK_RUN",
     "CLOSED",
     "FREE",
     "OPEN",
@@ -44,8 +45,9 @@ PERIODIC, OPEN, CLOSED = 0, 1, 2
 BRICK = 8
 """Cells along an edge of a brick."""
 
-RUN = 8
-"""Cells along x that one thread does, so that those that share their eight velocities read them once."""
+RUN, BRICK_RUN = 16, BRICK
+"""Cells along x that one thread does, so that those that share their eight velocities read them once; in bricks fewer,
+as these end."""
 
 REACH = 0.25
 """Coarse cells by which a trace's midpoint may lie outside of the eight velocities about its start, and is still read

@@ -12,9 +12,11 @@ A light is a direction towards it, of irradiance 4 pi, so that an isotropic phas
 
 import functools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import torch
 import warp as wp
 
 __all__ = [
@@ -30,6 +32,7 @@ __all__ = [
     "optical_depth",
     "phase",
     "ray",
+    "scratch",
     "skipping_at",
     "transmittance",
     "view",
@@ -363,6 +366,14 @@ def view(origin, right, up, forward, pitch: float, width: int, height: int, pers
     return made
 
 
+def scratch(shape: Sequence[int], dtype, device: wp.Device) -> wp.array:
+    """Memory for a call's own use, not set. It is torch's, which a graph may capture; Warp's own it may not."""
+    where = wp.device_to_torch(device)
+    if dtype is wp.vec2:
+        return wp.from_torch(torch.empty((*shape, 2), dtype=torch.float32, device=where), dtype=dtype)
+    return wp.from_torch(torch.empty(tuple(shape), dtype=wp.dtype_to_torch(dtype), device=where))
+
+
 def occupied(density):
     """Which bricks have smoke within reach of a sample in them.
 
@@ -373,7 +384,7 @@ def occupied(density):
         uint8 [X / 8, Y / 8, Z / 8], rounded up, 1 where there is any.
     """
     shape = tuple(-(-n // BRICK) for n in density.shape)
-    bricks = wp.empty(shape, dtype=wp.uint8, device=density.device)
+    bricks = scratch(shape, wp.uint8, density.device)
     kernel = guide_kernels(density.dtype).occupied
     wp.launch(kernel, shape, inputs=[density], outputs=[bricks], device=density.device)
     return bricks
@@ -410,7 +421,7 @@ def lattice(density, extinction: float, up, step: float):
     # Nodes closer than voxels would tell nothing new and fill the memory.
     apart = max(step, 1.0)
     shape = tuple(math.ceil((n + 1) / apart) + 1 for n in density.shape)
-    nodes = wp.empty(shape, dtype=wp.vec2, device=density.device)
+    nodes = scratch(shape, wp.vec2, density.device)
     inputs = [density, extinction, wp.vec3(*map(float, up)), step]
     kernel = guide_kernels(density.dtype).lattice
     wp.launch(kernel, shape, inputs=inputs, outputs=[nodes], device=density.device)
@@ -462,6 +473,6 @@ def guide(
     if shared:
         nodes, kernel = lattice(density, extinction, seen.up, step), kernels.guide
     else:
-        nodes, kernel = wp.empty((0, 0, 0), dtype=wp.vec2, device=density.device), kernels.guide_marching
+        nodes, kernel = scratch((0, 0, 0), wp.vec2, density.device), kernels.guide_marching
     inputs = [density, nodes, extinction, seen, step, jitter, seed, threshold, g, cutoff, unit, lead]
     wp.launch(kernel, out.shape[1:], inputs=inputs, outputs=[out], device=density.device)

@@ -25,6 +25,7 @@ from wlm_kernels.marching import (
     optical_depth,
     phase,
     ray,
+    scratch,
     size_of,
     skipping_at,
 )
@@ -278,7 +279,9 @@ def six_way(
     out.zero_()
     near, far = _extent(density.shape, seen.origin, seen.forward)
     start = max(near, 0.0)
-    behind, ahead, passed = (wp.zeros((height, width), device=device) for _ in range(3))
+    behind, ahead, passed = (scratch((height, width), wp.float32, device) for _ in range(3))
+    for plane in (behind, ahead, passed):
+        plane.zero_()
     common = [density, bricks, extinction, seen]
 
     def columns(first: float, last: float, tau) -> tuple[float, int]:
@@ -292,7 +295,7 @@ def six_way(
     dz, planes = columns(start, far, ahead)
     parts = max(1, math.ceil(seen.pitch / step))
     slab = max(1, min(planes, _SLAB_BYTES // (16 * height * width)))
-    sides = [wp.empty((slab, height, width), dtype=float, device=device) for _ in range(4)]
+    sides = [scratch((slab, height, width), wp.float32, device) for _ in range(4)]
     hot = density if temperature is None else temperature
     given = 0.0 if temperature is None else emission
     # Once even without a plane, for the transparency.

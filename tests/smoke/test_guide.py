@@ -32,7 +32,7 @@ def test_depth_is_in_the_world(device: str, perspective: bool):
     volume = _ball(device)
     camera = _camera(volume, extent=0.4 if perspective else 16.0, perspective=perspective)
     got = guide(volume, camera, step=0.5, jitter=0.0, threshold=0.05)
-    origin, way = camera.rays()
+    origin, way = (part.numpy() for part in camera.rays())
     depth = got.depth.cpu().numpy().astype(np.float64)
     hit = depth > 0
     assert 50 < hit.sum() < 24 * 24
@@ -97,7 +97,8 @@ def test_half(device: str):
     half = DensityVolume(volume.density.half(), volume.extinction, volume.voxel, volume.origin)
     full = DensityVolume(volume.density.half().float(), volume.extinction, volume.voxel, volume.origin)
     got, want = (guide(v, _camera(volume), step=2.0).maps.cpu() for v in (half, full))
-    np.testing.assert_array_equal(got, want)
+    # A GPU may contract products and sums of the two in different ways.
+    np.testing.assert_allclose(got, want, rtol=1e-6, atol=1e-6)
 
 
 def test_transmittance(device: str):

@@ -99,7 +99,7 @@ def test_shadow_of_a_box(device: str, toward: tuple, perspective: bool):
         10 * np.array(way) / np.linalg.norm(way), (0, 0, 0), extent=extent, height=40, width=40, perspective=perspective
     )
     low, high = (-0.8, 0.2, -0.5), (0.6, 1.0, 0.7)
-    origin, ray = camera.rays()
+    origin, ray = (part.numpy() for part in camera.rays())
     # Smoke's surface: the plane x + 2 y + 2 z = 0.3, which cuts the box.
     normal = np.array([1.0, 2.0, 2.0])
     depth = (0.3 - origin @ normal) / (ray @ normal)

@@ -55,7 +55,7 @@ def test_an_obstacle_is_drawn_where_it_is(device, toward, perspective):
     camera = _camera(48, toward=toward, perspective=perspective)
     ball = _ball(0.1, -0.05, 0.2)
     _, depth = draw_obstacles([ball], 0.0, camera, [], device)
-    origin, way = camera.rays()
+    origin, way = (part.numpy() for part in camera.rays())
     middle = ball.centre(0.0) - origin
     along = (middle * way).sum(-1)
     gap = 0.2**2 - ((middle**2).sum(-1) - along**2)

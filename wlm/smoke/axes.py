@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 
 from wlm_kernels import marching
 
@@ -188,17 +189,18 @@ class Camera:
         size = (self.height * factor, self.width * factor)
         return Camera(self.position, self.right, self.up, self.toward, self.extent, *size, self.perspective)
 
-    def rays(self) -> tuple[np.ndarray, np.ndarray]:
+    def rays(self, device: torch.device | str = "cpu") -> tuple[torch.Tensor, torch.Tensor]:
         """Origins and directions of length 1 of the pixels' rays in the world, both float64 [H, W, 3]."""
-        u = (np.arange(self.width) + 0.5 - 0.5 * self.width) * self.pitch
-        v = (0.5 * self.height - np.arange(self.height) - 0.5) * self.pitch
-        right, up, toward = self.axes
+        right, up, toward, position = (
+            torch.tensor(np.asarray(vector, np.float64), device=device) for vector in (*self.axes, self.position)
+        )
+        columns, rows = (torch.arange(n, dtype=torch.float64, device=device) for n in (self.width, self.height))
+        u = (columns + 0.5 - 0.5 * self.width) * self.pitch
+        v = (0.5 * self.height - rows - 0.5) * self.pitch
         across = u[None, :, None] * right + v[:, None, None] * up
         if self.perspective:
-            direction = across - toward
-            origin = np.broadcast_to(np.asarray(self.position, np.float64), direction.shape)
-            return origin, direction / np.linalg.norm(direction, axis=-1, keepdims=True)
-        return across + np.asarray(self.position, np.float64), np.broadcast_to(-toward, across.shape)
+            return position.expand_as(across), torch.nn.functional.normalize(across - toward, dim=-1)
+        return across + position, (-toward).expand_as(across)
 
     def view(self, origin: np.ndarray, voxel: float, shape: tuple[int, int, int]) -> tuple[marching.View, float]:
         """The camera in the voxels of a grid.

@@ -163,7 +163,7 @@ def obstacle_visibility(
     sight = Camera.look_at(direction / length, np.zeros(3), extent=1.0, height=1, width=1)
     axes = torch.tensor(sight.axes, dtype=torch.float64, device=depth.device)
     corners = vertices.double() @ axes.T
-    low, high = corners[triangles.reshape(-1).unique()].aminmax(dim=0)
+    low, high = corners[triangles.reshape(-1)].aminmax(dim=0)
     middle = 0.5 * (low + high)
     # Square, and two texels wider than the obstacles on each side, so that the border is empty.
     half = max(float((high - low)[:2].max()) * 0.5 * resolution / (resolution - 4), 1e-9)
@@ -175,7 +175,7 @@ def obstacle_visibility(
     drawn = rasterize(clip.float(), triangles, resolution, resolution)
     nearest = torch.where(drawn.triangle >= 0, middle[2] - drawn.depth.double() * behind, -math.inf)
 
-    origin, way = (torch.tensor(np.ascontiguousarray(a), device=depth.device) for a in camera.rays())
+    origin, way = camera.rays(depth.device)
     at = (origin + depth.double()[..., None] * way) @ axes.T
     column = ((at[..., 0] - middle[0]) / half + 1.0) * 0.5 * resolution - 0.5
     row = (1.0 - (at[..., 1] - middle[1]) / half) * 0.5 * resolution - 0.5

@@ -97,7 +97,7 @@ def draw_obstacles(
     corners = points[triangles[number].long()]
     weight = torch.cat([found.barycentric[hit], 1.0 - found.barycentric[hit].sum(1, keepdim=True)], 1)
     at = (corners * weight[..., None]).sum(1)
-    origin, way = (torch.tensor(np.ascontiguousarray(a), dtype=torch.float32, device=device) for a in camera.rays())
+    origin, way = (part.float() for part in camera.rays(device))
     depth[hit] = ((at - origin[hit]) * way[hit]).sum(1)
     normal = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normal = torch.nn.functional.normalize(normal, dim=1)
