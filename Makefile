@@ -1,4 +1,4 @@
-.PHONY: .venv demo test test-all bench lint clean
+.PHONY: .venv demo demo-network test test-all bench lint clean
 
 PYTHON ?= python3
 BIN := .venv/bin
@@ -12,6 +12,9 @@ demo: $(STAMP)
 	$(BIN)/python demos/probe.py
 	$(BIN)/python demos/smoke.py
 
+demo-network: $(STAMP)
+	$(BIN)/python demos/smoke_network.py --train
+
 test: lint
 	$(BIN)/pytest -n 2
 
@@ -23,6 +26,8 @@ bench: $(STAMP)
 	$(BIN)/wlm bench lightmap --quick --json out/bench.json --plot out/bench.png
 	$(BIN)/wlm bench probe --quick --json out/bench.json --plot out/bench-probe.png
 	$(BIN)/wlm bench atlas --quick --json out/bench.json --plot out/bench-atlas.png
+	$(BIN)/wlm bench smoke --quick --json out/bench.json --plot out/bench-smoke.png
+	$(BIN)/wlm bench smoke-network --quick --profile 16 --json out/bench.json --plot out/bench-smoke-network.png
 
 lint: $(STAMP)
 	$(BIN)/ruff check

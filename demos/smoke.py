@@ -31,14 +31,14 @@ from wlm.smoke.packing import read_flipbook, write_flipbook
 from wlm.smoke.reference import SixWay, lit, six_way
 from wlm.smoke.shade import shade
 from wlm.smoke.simulate import simulate
-from wlm.smoke.volume import DensityVolume, from_array, load_volume
+from wlm.smoke.synthetic import make_plume
+from wlm.smoke.volume import DensityVolume, load_volume
 from wlm.view.smoke import contact_sheet, guide_pictures, picture, six_pictures, to_bytes, write_sequence
 
 HERE = Path(__file__).resolve().parent
 SCALE, REFINE, SUBSTEPS = 0.24, 2, 4
 FRAMES, RATE = 8, 2.0  # four seconds, in which the jet crosses the box
 RESOLUTION = 96
-PLUME = 48  # voxels along its box
 
 # Measured on the CPU; see `_check` for what each is.
 MOST_STEP_ERROR = 0.03
@@ -144,24 +144,6 @@ def plume(out: Path, device: str) -> dict[str, float]:
         "its brightness": brightness,
         "seconds": time.perf_counter() - clock,
     }
-
-
-def make_plume(seed: int = 1) -> DensityVolume:
-    """A leaning column of billows that widens as it rises, hot at its foot, in a box of 1 m."""
-    random = np.random.default_rng(seed)
-    n = PLUME
-    axis = (np.arange(n) + 0.5) / n
-    x, y, z = np.meshgrid(axis, axis, axis, indexing="ij")
-    density = np.zeros((n, n, n))
-    for _ in range(160):
-        height = random.uniform(0.06, 0.82)
-        wide = 0.04 + 0.16 * height
-        at = np.array([0.44 + 0.14 * height, height, 0.5]) + wide * random.normal(0, 0.6, 3) * [1, 0.3, 1]
-        radius = wide * random.uniform(0.25, 0.6)
-        density += np.clip(1.5 - np.sqrt((x - at[0]) ** 2 + (y - at[1]) ** 2 + (z - at[2]) ** 2) / radius, 0, 1)
-    density = np.minimum(density, 1.5).astype(np.float32)
-    temperature = density * np.clip(1.0 - y / 0.3, 0, 1).astype(np.float32)
-    return from_array(density, voxel=1.0 / n, temperature=temperature)
 
 
 def _check_lightmaps(name: str, six: SixWay) -> None:

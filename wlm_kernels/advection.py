@@ -2,7 +2,8 @@
 section 5: 100^3 velocities, 400^3 densities).
 
 Two schemes. Semi-Lagrangian: each cell takes what lies where its smoke was a step ago, found by a midpoint
-(second-order Runge-Kutta) trace and read trilinearly; unconditionally stable, no new extrema, first order.
+(second-order Runge-Kutta) trace and read trilinearly; unconditionally stable, no new extrema, first order. A midpoint
+within ``REACH`` of the eight velocities about the start is read from these, extrapolated.
 MacCormack (Selle et al. 2008): the same, then half of what a way there and back loses is given back, and the result is
 held between the least and the largest of the eight values that the first trace read; second order where smooth.
 Neither conserves mass.

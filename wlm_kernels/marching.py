@@ -28,9 +28,11 @@ __all__ = [
     "guide",
     "guide_kernels",
     "lattice",
+    "nodes_along",
     "occupied",
     "optical_depth",
     "phase",
+    "plain_depth",
     "ray",
     "scratch",
     "skipping_at",
@@ -235,7 +237,7 @@ def guide_kernels(dtype: Any) -> _Kernels:
             float(c) * (size[2] + 1.0) / float(nodes.shape[2] - 1) - 0.5,
         )
         nodes[a, b, c] = wp.vec2(
-            _plain_depth(density, p, up, extinction, h), _plain_depth(density, p, -up, extinction, h)
+            plain_depth(density, p, up, extinction, h), plain_depth(density, p, -up, extinction, h)
         )
 
     @wp.kernel(module="unique", module_options=_OPTIONS)
@@ -300,8 +302,8 @@ def guide_kernels(dtype: Any) -> _Kernels:
                             tau = _node_at(nodes, p, size_of(density))
                         else:
                             tau = wp.vec2(
-                                _plain_depth(density, p, view.up, extinction, h),
-                                _plain_depth(density, p, -view.up, extinction, h),
+                                plain_depth(density, p, view.up, extinction, h),
+                                plain_depth(density, p, -view.up, extinction, h),
                             )
                         x = sigma * dt
                         # The light from the front comes along the ray, through what the ray has come through.
@@ -320,7 +322,7 @@ def guide_kernels(dtype: Any) -> _Kernels:
 
 
 @wp.func
-def _plain_depth(density: wp.array3d[Any], p: wp.vec3, toward: wp.vec3, extinction: float, h: float) -> float:
+def plain_depth(density: wp.array3d[Any], p: wp.vec3, toward: wp.vec3, extinction: float, h: float) -> float:
     """``optical_depth`` without bricks: too few samples to be worth the making of them."""
     span = clip(size_of(density), p, toward)
     first = wp.max(span[0], 0.0)
@@ -369,8 +371,9 @@ def view(origin, right, up, forward, pitch: float, width: int, height: int, pers
 def scratch(shape: Sequence[int], dtype, device: wp.Device) -> wp.array:
     """Memory for a call's own use, not set. It is torch's, which a graph may capture; Warp's own it may not."""
     where = wp.device_to_torch(device)
-    if dtype is wp.vec2:
-        return wp.from_torch(torch.empty((*shape, 2), dtype=torch.float32, device=where), dtype=dtype)
+    if dtype in (wp.vec2, wp.vec4):
+        made = torch.empty((*shape, wp.types.type_size(dtype)), dtype=torch.float32, device=where)
+        return wp.from_torch(made, dtype=dtype)
     return wp.from_torch(torch.empty(tuple(shape), dtype=wp.dtype_to_torch(dtype), device=where))
 
 
@@ -406,6 +409,12 @@ def transmittance(density, extinction: float, points, toward, step: float, out) 
     wp.launch(kernel, points.shape, inputs=inputs, outputs=[out], device=density.device)
 
 
+def nodes_along(shape: Sequence[int], step: float) -> tuple[int, ...]:
+    """Nodes of a lattice no farther apart than a step, or a voxel, from half a voxel out of the grid to half beyond."""
+    # Nodes closer than voxels would tell nothing new and fill the memory.
+    return tuple(math.ceil((n + 1) / max(step, 1.0)) + 1 for n in shape)
+
+
 def lattice(density, extinction: float, up, step: float):
     """Optical depths towards the top and the bottom on a lattice of nodes no farther apart than a step, or a voxel.
 
@@ -418,13 +427,10 @@ def lattice(density, extinction: float, up, step: float):
     Returns:
         vec2 [A, B, C], to the top and to the bottom; the first and the last nodes lie half a voxel out of the grid.
     """
-    # Nodes closer than voxels would tell nothing new and fill the memory.
-    apart = max(step, 1.0)
-    shape = tuple(math.ceil((n + 1) / apart) + 1 for n in density.shape)
-    nodes = scratch(shape, wp.vec2, density.device)
+    nodes = scratch(nodes_along(density.shape, step), wp.vec2, density.device)
     inputs = [density, extinction, wp.vec3(*map(float, up)), step]
     kernel = guide_kernels(density.dtype).lattice
-    wp.launch(kernel, shape, inputs=inputs, outputs=[nodes], device=density.device)
+    wp.launch(kernel, nodes.shape, inputs=inputs, outputs=[nodes], device=density.device)
     return nodes
 
 

@@ -1,8 +1,6 @@
 """The smoke benchmark on tiny grids: every row has its figures, and they agree with what they are of."""
 
-import importlib.util
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,13 +12,14 @@ from wlm.bench import Row, plot, read_json, table, write_json
 from wlm.bench.report import figures, report, tables
 from wlm.bench.smoke import PANELS, plotted, run, run_rows
 from wlm.bench.smoke_air import storage_rows
-from wlm.bench.smoke_light import make_cloud, make_plume, six_rows
+from wlm.bench.smoke_light import make_cloud, six_rows
 from wlm.bench.smoke_setup import QUICK, Bench, number, percent
 from wlm.bench.smoke_setup import row as make_row
 from wlm.bench.timing import Timing
 from wlm.errors import WlmError
 from wlm.smoke.axes import Camera
 from wlm.smoke.reference import six_way
+from wlm.smoke.synthetic import make_plume
 from wlm.smoke.volume import DensityVolume
 
 TINY = replace(
@@ -54,7 +53,6 @@ METHODS = [
     ("plume", "weights"),
     ("jet-sphere", "frame"),
 ]
-ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture(scope="module")
@@ -190,14 +188,16 @@ def test_the_cloud():
     assert torch.equal(cloud, make_cloud(24, "cpu")) and not torch.equal(cloud, make_cloud(24, "cpu", seed=1))
 
 
-def test_the_plume_is_the_demos():
-    path = ROOT / "demos" / "smoke.py"
-    spec = importlib.util.spec_from_file_location("smoke_demo", path)
-    demo = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(demo)
-    ours, theirs = make_plume(), demo.make_plume()
-    torch.testing.assert_close(ours.density, theirs.density, atol=1e-6, rtol=0.0)
-    assert ours.voxel == theirs.voxel
+def test_the_plume():
+    plume, cold = make_plume(16), make_plume(16, hot=False, extinction=3.0)
+    assert torch.equal(plume.density, cold.density) and (plume.voxel, cold.extinction) == (1 / 16, 3.0)
+    assert cold.temperature is None and 0.0 < float(plume.density.max()) <= 1.5
+    assert float(plume.temperature[:, :4].max()) > 0.5 and float(plume.temperature[:, 5:].max()) == 0.0
+    # It rises, and widens as it does.
+    wide = (plume.density > 0).sum((0, 2))
+    assert 0 < int(wide[1]) < int(wide[6]) < int(wide[11])
+    assert torch.equal(plume.density, make_plume(16).density)
+    assert not torch.equal(plume.density, make_plume(16, seed=2).density)
 
 
 def test_notes_of_rows():
@@ -272,3 +272,13 @@ def test_the_command(rows, tmp_path, monkeypatch):
 def test_what_is_refused():
     with pytest.raises(WlmError, match="device 'tpu'"):
         run(quick=True, device="tpu")
+
+
+@pytest.mark.parametrize(("system", "label"), [("smoke", "time (ms)"), ("probe", "decode time (ms)")])
+def test_what_a_time_is_called(system: str, label: str, tmp_path, monkeypatch):
+    """Only what decodes has a decode time."""
+    import matplotlib
+
+    monkeypatch.setitem(matplotlib.rcParams, "svg.fonttype", "none")
+    plot([Row(system, "s", "m", decode_ms=1.0, psnr=30.0)], tmp_path / "p.svg", "decode_ms")
+    assert f">{label}<" in (tmp_path / "p.svg").read_text(encoding="utf-8")

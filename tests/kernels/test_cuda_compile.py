@@ -16,6 +16,8 @@ from wlm_kernels import (
     lattice_fields,
     lattice_links,
     marching,
+    marching_coarse,
+    marching_motion,
     marching_six,
     mlp,
     probe_decode,
@@ -135,6 +137,14 @@ def test_marching(dtype: type, tmp_path: Path):
     """Marches through densities of either type."""
     _compile_all(vars(marching.guide_kernels(dtype)).values(), tmp_path / "guide")
     _compile_all(vars(marching_six.six_kernels(dtype)).values(), tmp_path / "six")
+    _compile_all([marching_motion.motion_kernel(dtype)], tmp_path / "motion")
+
+
+@pytest.mark.parametrize("hot", _slow_but(True, [False]))
+@pytest.mark.parametrize("dtype", _slow_but(wp.float16, [wp.float32]))
+def test_coarse_marching(dtype: type, hot: bool, tmp_path: Path):
+    """The march of all six lights in large steps, with emission and without."""
+    _compile_all(marching_coarse.coarse_kernels(dtype, hot), tmp_path)
 
 
 LATTICE_STEPS = (

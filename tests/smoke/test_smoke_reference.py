@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from wlm.bench.path_tracer import PathTracer
 from wlm.smoke.axes import DIRECTIONS, RULES, VECTORS, Camera, axis_faults, weights
 from wlm.smoke.reference import SixWay, lit, six_way
 from wlm.smoke.volume import DensityVolume, from_array
@@ -206,13 +207,13 @@ def test_wrong_settings():
 @pytest.mark.parametrize("name", ["cube", "plume"])
 def test_against_a_path_tracer(name: str):
     """Mitsuba's volumetric path tracer of one bounce: within 1% above its own noise, in every direction."""
-    mitsuba = pytest.importorskip("mitsuba")
-    mitsuba.set_variant("scalar_rgb")
+    pytest.importorskip("mitsuba")
     volume = from_array(np.ones((12, 12, 12)), extinction=0.15) if name == "cube" else _plume()
     camera = _front(volume, 16)
+    trace = PathTracer(volume, camera, variant="scalar_rgb")
     ours = six_way(volume, camera, step=0.25, supersample=4, estimate=False)
     for index, way in enumerate(VECTORS):
-        runs = np.stack([_traced(mitsuba, volume, camera, way, 2048, seed) for seed in range(4)])
+        runs = np.stack([trace.traced(way, 2048, seed) for seed in range(4)])
         want = ours.lightmaps[index].double().numpy()
         light = runs[..., 0].astype(np.float64)
         energy, noise = np.square(want).mean(), light.var(0, ddof=1).mean() / len(light)
@@ -223,41 +224,21 @@ def test_against_a_path_tracer(name: str):
     assert np.abs(1 - runs[..., 3].mean(0) - ours.transparency.numpy()).max() < 0.05
 
 
-def _traced(mitsuba, volume: DensityVolume, camera: Camera, way: np.ndarray, samples: int, seed: int) -> np.ndarray:
-    """RGBA [H, W, 4]; a border of empty voxels makes Mitsuba's clamped grid end as ours does."""
-    turn = mitsuba.ScalarTransform4f
-    size = np.array(volume.shape, np.float64)
-    grid = np.pad(volume.density.numpy(), 1).transpose(2, 1, 0)[..., None]
-    centre = [float(c) for c in size / 2]
-    half = 0.5 * camera.extent
-    sight = turn().look_at(origin=list(camera.position), target=centre, up=list(camera.up)).scale([half, half, 1.0])
-    film = {"type": "hdrfilm", "width": camera.width, "height": camera.height, "rfilter": {"type": "box"}}
-    film |= {"pixel_format": "rgba", "component_format": "float32"}
-    sampler = {"type": "independent", "sample_count": samples}
-    box = turn().translate([-1.0] * 3).scale([float(s + 2) for s in size])
-    medium = {
-        "type": "heterogeneous",
-        "albedo": 1.0,
-        "scale": volume.extinction,
-        "sigma_t": {"type": "gridvolume", "grid": mitsuba.VolumeGrid(np.ascontiguousarray(grid)), "to_world": box},
-        "phase": {"type": "isotropic"},
-    }
-    scene = mitsuba.load_dict(
-        {
-            "type": "scene",
-            "integrator": {"type": "volpath", "max_depth": 2, "rr_depth": 100, "hide_emitters": True},
-            "sensor": {"type": "orthographic", "to_world": sight, "film": film, "sampler": sampler},
-            "light": {
-                "type": "directional",
-                "direction": [float(-w) for w in camera.axes.T @ way],
-                "irradiance": {"type": "rgb", "value": 4 * math.pi},
-            },
-            "smoke": {
-                "type": "cube",
-                "to_world": turn().translate(centre).scale([float(0.5 * s + 0.999) for s in size]),
-                "bsdf": {"type": "null"},
-                "interior": medium,
-            },
-        }
-    )
-    return np.array(mitsuba.render(scene, seed=seed))
+@pytest.mark.slow
+@pytest.mark.parametrize("way", [(1.0, 0.7, 0.8), (-0.3, -0.9, 0.5), (0.6, 0.2, -1.0)])
+def test_oblique_lights_against_a_path_tracer(way: tuple):
+    """What six-way shading is measured by: the march to a light from anywhere, within 1% above the tracer's noise."""
+    pytest.importorskip("mitsuba")
+    volume = _plume()
+    camera = _front(volume, 16)
+    trace = PathTracer(volume, camera, variant="scalar_rgb")
+    unit = np.array(way) / np.linalg.norm(way)
+    rays = 16
+    fine = lit(volume, camera.finer(rays), camera.axes.T @ unit, step=0.25)
+    want = torch.nn.functional.avg_pool2d(fine[None], rays)[0].double().numpy()
+    runs = np.stack([trace.traced(unit, 2048, seed)[..., 0] for seed in range(4)])
+    runs = runs.astype(np.float64)
+    energy, noise = np.square(want).mean(), runs.var(0, ddof=1).mean() / len(runs)
+    above = np.square(runs.mean(0) - want).mean() - noise
+    assert above < 1e-4 * energy + 4.0 * noise * math.sqrt(2.0 / want.size)
+    assert abs(runs.mean() - want.mean()) < 0.002 * want.mean() + 4.0 * math.sqrt(noise / want.size)

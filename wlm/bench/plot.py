@@ -28,7 +28,9 @@ _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#
 # A second sign for the method, so that a plot survives grey printing; their number shares no factor with the
 # colours'.
 _MARKERS = ("o", "s", "^", "D", "v", "P")
-_AXES = {"decode_ms": "decode time (ms)", "bpp": "size (bpp)"}
+_AXES = {"decode_ms": "time (ms)", "bpp": "size (bpp)"}
+_DECODERS = ("lightmap", "atlas", "probe")
+"""Systems whose time is that of a decode."""
 _UPRIGHT = {"psnr": "PSNR (dB)", "max_error": "largest error"}
 # Above this ratio of largest to smallest, a linear axis squeezes the small ones together.
 _LOG_RATIO = 8.0
@@ -152,7 +154,8 @@ def _draw_panel(axes: Axes, rows: Sequence[Row], panel: Panel, methods: Sequence
     from matplotlib.ticker import LogLocator, NullFormatter
 
     points = [panel.position(row) for row in rows]
-    axes.set_xlabel(_AXES[panel.x])
+    decoded = panel.x == "decode_ms" and any(row.system in _DECODERS for row in rows)
+    axes.set_xlabel(f"decode {_AXES[panel.x]}" if decoded else _AXES[panel.x])
     axes.set_ylabel(_UPRIGHT[panel.y])
     axes.grid(True, color="#e4e4e4", linewidth=0.7)
     axes.set_axisbelow(True)

@@ -9,7 +9,7 @@ from wlm.bench.runner import Row, Run, read_runs, table
 
 __all__ = ["figures", "report", "tables"]
 
-_SMOKE = "smoke"
+_SMOKE = ("smoke", "smoke-network")
 # Field, heading and format of what smoke's tables have besides the figures of their own.
 _SMOKE_COLUMNS = (
     ("decode_ms", "ms", ".3g"),
@@ -56,7 +56,7 @@ def figures(row: Row) -> dict[str, str]:
 
 
 def tables(rows: Sequence[Row]) -> str:
-    """Rows as Markdown: one table, but of the smoke system, whose methods have columns of their own, one a method.
+    """Rows as Markdown: one table, but of the smoke systems, whose methods have columns of their own, one a method.
 
     Args:
         rows: The results, in the order to print.
@@ -64,9 +64,9 @@ def tables(rows: Sequence[Row]) -> str:
     Returns:
         Lines with a final newline; empty for no rows.
     """
-    others = [row for row in rows if row.system != _SMOKE]
+    others = [row for row in rows if row.system not in _SMOKE]
     parts = [table(others)] if others else []
-    smoke = [row for row in rows if row.system == _SMOKE]
+    smoke = [row for row in rows if row.system in _SMOKE]
     for (method, scene), group in groupby(smoke, key=lambda row: (row.method, row.scene)):
         parts.append(f"#### {method}: {scene}\n")
         parts.append(_smoke_table(list(group)))

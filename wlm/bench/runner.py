@@ -35,7 +35,7 @@ class Row:
     """One method with one option on one scene; None where something was not measured or has no meaning.
 
     Attributes:
-        system: `lightmap`, `atlas`, `probe` or `smoke`.
+        system: `lightmap`, `atlas`, `probe`, `smoke` or `smoke-network`.
         scene: Name of the data.
         method: What was run, ours or a baseline.
         option: Profile or setting that tells rows of one method apart; may be empty.

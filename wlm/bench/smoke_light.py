@@ -17,9 +17,10 @@ from wlm.smoke.guide import Guide, guide
 from wlm.smoke.reference import SixWay, lit, six_way
 from wlm.smoke.shade import Light, composite, obstacle_visibility, shade
 from wlm.smoke.simulate import make_solver, volume_of
-from wlm.smoke.volume import DensityVolume, from_array
+from wlm.smoke.synthetic import make_plume
+from wlm.smoke.volume import DensityVolume
 
-__all__ = ["frame_rows", "guide_rows", "make_cloud", "make_plume", "six_rows", "weight_rows"]
+__all__ = ["frame_rows", "guide_rows", "make_cloud", "six_rows", "weight_rows"]
 
 _CLOUD = "cloud"
 _DEPTH = 8.0  # optical, through the cloud's box at density 1
@@ -27,7 +28,7 @@ _OCTAVES = range(2, 7)
 _GAIN = 0.6  # of an octave over the one before
 _HALF_GUIDE = (5, 10, 20)  # steps at which 16 bits are looked at
 _HALF_SIX = 0.5
-_PLUME = 48  # voxels along its box
+_PLUME = 14.0  # the plume's extinction, over its box
 _LIGHTS = 12
 _WEIGHT_STEP = 1.0
 _JITTER = 1.0
@@ -128,7 +129,7 @@ def six_rows(bench: Bench) -> list[Row]:
 def weight_rows(bench: Bench) -> list[Row]:
     """Rules that weigh six lightmaps, against a march to each of some oblique lights, on the demo's plume."""
     bench.note("weights")
-    volume = make_plume(bench.device)
+    volume = make_plume(hot=False, extinction=_PLUME, device=bench.device)
     size = volume.voxel * np.array(volume.shape)
     camera = make_camera(CameraSettings(resolution=bench.sizes.plume), volume.origin, size)
     six = six_way(volume, camera, step=_WEIGHT_STEP, estimate=False)
@@ -219,30 +220,6 @@ def frame_rows(bench: Bench) -> list[Row]:
     total = sum(times[name].median_ms for name in parts)
     figures = {"of": "simulation, guide, shadows, weights", "frames/s": f"{1e3 / total:.3g}"}
     return [*rows, row("jet-sphere", "frame", "all but the network", figures, decode_ms=total)]
-
-
-def make_plume(device: str = "cpu", seed: int = 1) -> DensityVolume:
-    """The plume of the demo, cold: a leaning column of billows that widens as it rises.
-
-    Args:
-        device: "cpu" or "cuda:0".
-        seed: Of the billows.
-
-    Returns:
-        The volume in a box of edge 1.
-    """
-    random = np.random.default_rng(seed)
-    at = (np.arange(_PLUME) + 0.5) / _PLUME
-    cells = np.stack(np.meshgrid(at, at, at, indexing="ij"), -1)
-    density = np.zeros(cells.shape[:3])
-    for _ in range(160):
-        height = random.uniform(0.06, 0.82)
-        wide = 0.04 + 0.16 * height
-        centre = np.array([0.44 + 0.14 * height, height, 0.5]) + wide * random.normal(0, 0.6, 3) * [1, 0.3, 1]
-        radius = wide * random.uniform(0.25, 0.6)
-        density += np.clip(1.5 - np.linalg.norm(cells - centre, axis=-1) / radius, 0, 1)
-    density = np.minimum(density, 1.5).astype(np.float32)
-    return from_array(density, extinction=14.0, voxel=1.0 / _PLUME, device=device)
 
 
 def _cloud(bench: Bench) -> tuple[dict[str, DensityVolume], Camera]:

@@ -140,9 +140,10 @@ def row(
     *,
     timing: Timing | None = None,
     calls: int = 1,
+    system: str = "smoke",
     **values,
 ) -> Row:
-    """A row of the smoke system.
+    """A row of the smoke system, or of another whose methods have tables of their own.
 
     Args:
         scene: What was simulated or looked at.
@@ -152,10 +153,11 @@ def row(
         note: What else a reader must know.
         timing: Of a call.
         calls: Of what a row is about, such as steps, in what was timed.
+        system: "smoke" or "smoke-network".
         values: Other fields of the row.
     """
     notes = [*(f"{title}: {figure}" for title, figure in (figures or {}).items()), *([note] if note else [])]
-    made = Row("smoke", scene, method, option, notes="; ".join(notes), **values)
+    made = Row(system, scene, method, option, notes="; ".join(notes), **values)
     if timing is None:
         return made
     made = made.with_timing(timing)

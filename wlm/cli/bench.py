@@ -189,6 +189,45 @@ def smoke(
     _finish(rows, device, command, json_path, plot_path, PANELS, shown=plotted(rows))
 
 
+@app.command("smoke-network")
+def smoke_network(
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Small grids, for a minute on a CPU; else the paper's, for a GPU.")
+    ] = False,
+    device: Annotated[str, typer.Option(help='Where it computes: "cpu", "cuda" or "cuda:N".')] = "cpu",
+    networks: Annotated[
+        list[Path] | None,
+        typer.Option("--network", metavar="FILE", help="A trained network; default wlm's own. Several times."),
+    ] = None,
+    profiles: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--profile",
+            metavar="NAME",
+            help="A profile, or a YAML file, whose untrained network is timed. Several times.",
+        ),
+    ] = None,
+    json_path: Annotated[
+        Path | None, typer.Option("--json", metavar="FILE.json", help="Write the rows and the environment.")
+    ] = None,
+    plot_path: Annotated[
+        Path | None, typer.Option("--plot", metavar="FILE.png", help="Draw PSNR against time.")
+    ] = None,
+) -> None:
+    """Neural six-way lightmaps: time and error beside marches, flip books and path tracing, by parts and by profile."""
+    _check_outputs(json_path, plot_path)
+    quiet_warp()
+    from wlm.bench.smoke_network import PANELS, plotted, run
+    from wlm.interop import check_device
+
+    device = check_device(device)
+    rows = run(networks or (), profiles or (), quick=quick, device=device, progress=note)
+    command = f"wlm bench smoke-network{' --quick' if quick else ''} --device {device}"
+    command += "".join(f" --network {path.name}" for path in networks or ())
+    command += "".join(f" --profile {Path(name).name}" for name in profiles or ())
+    _finish(rows, device, command, json_path, plot_path, PANELS, shown=plotted(rows))
+
+
 @app.command()
 def report(
     files: Annotated[list[Path], typer.Argument(metavar="FILE.json...", help="What `wlm bench ... --json` wrote.")],

@@ -18,43 +18,46 @@ from wlm.cli.console import (
     show,
     table,
 )
+from wlm.cli.smoke_network import register
+from wlm.cli.smoke_options import (
+    SHEET,
+    Device,
+    Distance,
+    Emission,
+    Extent,
+    Extinction,
+    Input,
+    Resolution,
+    Toward,
+    Turn,
+    camera_of,
+    load,
+    made_of,
+    open_smoke,
+    places,
+    vector,
+    volumes,
+    write_lightmaps,
+)
 from wlm.errors import WlmError
 
 if TYPE_CHECKING:
     from wlm.smoke.axes import Camera
     from wlm.smoke.data import Scene
-    from wlm.smoke.frames import Footage
     from wlm.smoke.reference import SixWay
     from wlm.smoke.shade import Light
-    from wlm.smoke.volume import DensityVolume
 
 __all__ = ["app"]
 
 app = typer.Typer(help="Smoke: simulated, and seen through six-way lightmaps.")
 
-_Input = Annotated[Path, typer.Argument(metavar="SMOKE", help="A .npz or .nvdb volume, or a folder of simulate.")]
 _Baked = Annotated[
-    Path, typer.Argument(metavar="SMOKE", help="A .npz or .nvdb volume, a folder of simulate; or what bake wrote.")
+    Path,
+    typer.Argument(metavar="SMOKE", help="A .npz or .nvdb volume, a folder of simulate, bake or predict, or an EXR."),
 ]
-_Device = Annotated[str, typer.Option(help='Where it computes: "cpu", "cuda" or "cuda:N".')]
-_Resolution = Annotated[
-    int | None, typer.Option(min=1, max=16384, help="Pixels along the image's height; default the scene's, or 512.")
-]
-_Toward = Annotated[
-    str | None, typer.Option(metavar="X,Y,Z", help="From the smoke to the camera; default the scene's, or 0,0,1.")
-]
-_Turn = Annotated[float, typer.Option(help="Degrees by which the camera is turned about what is up.")]
-_Extent = Annotated[float | None, typer.Option(help="Height of the image in the world; default what holds the box.")]
-_Distance = Annotated[
-    float | None, typer.Option(help="Of the camera from its target; what is behind it isn't seen. Default outside.")
-]
-_Extinction = Annotated[float | None, typer.Option(help="Per length, of density 1; default the scene's, or 1.")]
-_Emission = Annotated[float | None, typer.Option(help="Per length, of temperature 1; default the scene's, or 1.")]
 _Step = Annotated[float, typer.Option(min=0.01, max=1000.0, help="The longest step in voxels.")]
 _Supersample = Annotated[int, typer.Option(min=1, max=16, help="Rays along a pixel's edge.")]
 _G = Annotated[float, typer.Option(min=-0.99, max=0.99, help="Henyey and Greenstein's mean cosine.")]
-
-_SHEET = "sheet.png"
 
 
 @app.command()
@@ -66,7 +69,7 @@ def simulate(
         float, typer.Option(min=0.001, max=100.0, help="Cells along each axis, as a multiple of the scene's.")
     ] = 1.0,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with an interrupted simulation in DIR.")] = False,
-    device: _Device = "cpu",
+    device: Device = "cpu",
 ) -> None:
     """Simulate a scene into a folder of volumes, one a frame.
 
@@ -113,9 +116,9 @@ def simulate(
 
 @app.command()
 def guide(
-    smoke: _Input,
+    smoke: Input,
     output: Annotated[Path, typer.Option("--output", "-o", metavar="OUT", help="A .exr, or of frames a folder.")],
-    resolution: _Resolution = None,
+    resolution: Resolution = None,
     step: Annotated[float, typer.Option(min=0.01, max=1000.0, help="In voxels.")] = 10.0,
     jitter: Annotated[
         float, typer.Option(min=0.0, max=1.0, help="Share of a step by which samples are shifted at random.")
@@ -125,27 +128,27 @@ def guide(
         float, typer.Option(min=0.0, help="Optical depth of a voxel from which on smoke has a surface.")
     ] = 0.01,
     g: _G = 0.0,
-    toward: _Toward = None,
-    turn: _Turn = 0.0,
-    extent: _Extent = None,
-    distance: _Distance = None,
+    toward: Toward = None,
+    turn: Turn = 0.0,
+    extent: Extent = None,
+    distance: Distance = None,
     perspective: Annotated[bool, typer.Option("--perspective", help="Rays meet in the eye.")] = False,
-    extinction: _Extinction = None,
-    emission: _Emission = None,
-    device: _Device = "cpu",
+    extinction: Extinction = None,
+    emission: Emission = None,
+    device: Device = "cpu",
 ) -> None:
     """Make guiding maps: light, transparency and depth, by a march in large steps (algorithm 1)."""
     quiet_warp()
     from wlm.smoke.frames import write_guide
     from wlm.smoke.guide import guide
 
-    footage = _open(smoke, extinction, emission, device)
+    footage = open_smoke(smoke, extinction, emission, device)
     view = {"resolution": resolution, "toward": toward, "turn": turn, "extent": extent, "distance": distance}
     if perspective:
         view["perspective"] = True
     rows = table(str(smoke), ["file", "covered", "mean light", "nearest", "farthest"])
-    for path, _, volume in _frames(footage, output, "guide", ".exr"):
-        camera = _camera(footage, volume, view)
+    for path, _, volume in volumes(footage, output, "guide", ".exr"):
+        camera = camera_of(footage, volume, view)
         found = guide(volume, camera, step=step, jitter=jitter, seed=seed, threshold=threshold, g=g)
         write_guide(path, found)
         depth = found.depth[found.depth > 0]
@@ -162,47 +165,32 @@ def guide(
 
 @app.command()
 def bake(
-    smoke: _Input,
+    smoke: Input,
     output: Annotated[Path, typer.Option("--output", "-o", metavar="OUT", help="A .exr, or of frames a folder.")],
-    resolution: _Resolution = None,
+    resolution: Resolution = None,
     step: _Step = 0.5,
     supersample: _Supersample = 1,
     g: _G = 0.0,
-    toward: _Toward = None,
-    turn: _Turn = 0.0,
-    extent: _Extent = None,
-    distance: _Distance = None,
-    extinction: _Extinction = None,
-    emission: _Emission = None,
-    device: _Device = "cpu",
+    toward: Toward = None,
+    turn: Turn = 0.0,
+    extent: Extent = None,
+    distance: Distance = None,
+    extinction: Extinction = None,
+    emission: Emission = None,
+    device: Device = "cpu",
 ) -> None:
     """Make six-way lightmaps by a fine march, and say how far a step twice as long is from them.
 
     An EXR has the channels right, left, top, bottom, front, back, transparency and, of hot smoke, emission.
     """
     quiet_warp()
-    from wlm.smoke.axes import axis_faults
-    from wlm.smoke.frames import write_six_way
     from wlm.smoke.reference import six_way
 
-    footage = _open(smoke, extinction, emission, device)
+    footage = open_smoke(smoke, extinction, emission, device)
     view = {"resolution": resolution, "toward": toward, "turn": turn, "extent": extent, "distance": distance}
-    rows = table(str(smoke), ["file", "covered", "mean light", "largest error", "RMS error"])
-    for path, _, volume in _frames(footage, output, "six", ".exr"):
-        camera = _camera(footage, volume, view, flat=True)
-        six = six_way(volume, camera, step=step, g=g, supersample=supersample)
-        write_six_way(path, six, camera)
-        covered = six.transparency < 0.99
-        for fault in axis_faults(six.lightmaps.cpu().numpy()) if covered.any() else ():
-            note(f"{path}: note: {fault}")
-        rows.add_row(
-            escape(path.name),
-            f"{float(covered.float().mean()):.1%}",
-            number(float(six.lightmaps[:, covered].mean()) if covered.any() else None, ".4g"),
-            f"{six.error.largest:.2g}",
-            f"{six.error.rms:.2g}",
-        )
-    show(rows)
+    write_lightmaps(
+        footage, output, view, lambda *seen: six_way(*seen, step=step, g=g, supersample=supersample), errors=True
+    )
 
 
 @app.command()
@@ -216,16 +204,16 @@ def shade(
     background: Annotated[str | None, typer.Option(metavar="R,G,B", help="Linear colour behind the smoke.")] = None,
     white: Annotated[float, typer.Option(help="The light that is shown as white.")] = 1.0,
     rule: Annotated[str, typer.Option(help="Weights of the lightmaps: squared, absolute or normalised.")] = "squared",
-    resolution: _Resolution = None,
+    resolution: Resolution = None,
     step: _Step = 1.0,
     supersample: _Supersample = 1,
-    toward: _Toward = None,
-    turn: _Turn = 0.0,
-    extent: _Extent = None,
-    distance: _Distance = None,
-    extinction: _Extinction = None,
-    emission: _Emission = None,
-    device: _Device = "cpu",
+    toward: Toward = None,
+    turn: Turn = 0.0,
+    extent: Extent = None,
+    distance: Distance = None,
+    extinction: Extinction = None,
+    emission: Emission = None,
+    device: Device = "cpu",
 ) -> None:
     """Light the smoke into PNGs, of frames with the scene's obstacles and a contact sheet.
 
@@ -239,7 +227,7 @@ def shade(
     if not 0 < white < float("inf"):
         raise WlmError(f"--white: expected a number above 0, got {white}")
     lights = [_light(text) for text in light or ()]
-    behind = None if background is None else _vector("--background", background)
+    behind = None if background is None else vector("--background", background)
     quiet_warp()
     from wlm.view.atlas import save_png
     from wlm.view.smoke import contact_sheet, picture, to_bytes
@@ -264,7 +252,7 @@ def shade(
             escape(path.name), f"{covered:.1%}", f"{shaded.mean():.4g}", f"{shaded.max():.4g}", f"{clipped:.1%}"
         )
     if output.is_dir():
-        contact_sheet(output / _SHEET, {"": drawn})
+        contact_sheet(output / SHEET, {"": drawn})
     show(rows)
 
 
@@ -280,16 +268,16 @@ def flipbook(
     gain: Annotated[
         float | None, typer.Option(help="Factor on the light; default 1 in an EXR, else what just doesn't clip.")
     ] = None,
-    resolution: _Resolution = None,
+    resolution: Resolution = None,
     step: _Step = 0.5,
     supersample: _Supersample = 1,
-    toward: _Toward = None,
-    turn: _Turn = 0.0,
-    extent: _Extent = None,
-    distance: _Distance = None,
-    extinction: _Extinction = None,
-    emission: _Emission = None,
-    device: _Device = "cpu",
+    toward: Toward = None,
+    turn: Turn = 0.0,
+    extent: Extent = None,
+    distance: Distance = None,
+    extinction: Extinction = None,
+    emission: Emission = None,
+    device: Device = "cpu",
 ) -> None:
     """Pack six-way lightmaps into the two textures that an engine reads."""
     check_output(output, ".exr", ".png", ".tga")
@@ -328,16 +316,6 @@ def flipbook(
     show(rows)
 
 
-def _vector(option: str, text: str) -> tuple[float, float, float]:
-    try:
-        x, y, z = map(float, text.split(","))
-    except ValueError:
-        raise WlmError(f"{option}: expected three numbers such as 0,0.5,1, got {text!r}") from None
-    if not all(abs(value) < float("inf") for value in (x, y, z)):
-        raise WlmError(f"{option}: expected finite numbers, got {text!r}")
-    return x, y, z
-
-
 def _scaled(scene: "Scene", scale: float) -> "Scene":
     from pydantic import ValidationError
 
@@ -353,76 +331,11 @@ def _light(text: str) -> "Light":
     toward, colon, irradiance = text.partition(":")
     from wlm.smoke.data import LightSettings
 
-    given: dict[str, Any] = {"toward": _vector("--light", toward)}
+    given: dict[str, Any] = {"toward": vector("--light", toward)}
     if colon:
         # One number is a white light.
-        given["irradiance"] = _vector("--light", irradiance if "," in irradiance else ",".join([irradiance] * 3))
-    return _made(LightSettings, given, {"toward": "--light", "irradiance": "--light"}).light()
-
-
-def _made(cls: Any, values: dict[str, Any], options: dict[str, str]) -> Any:
-    """Checks settings that options gave, and names the option that is wrong."""
-    from pydantic import ValidationError
-
-    try:
-        return cls(**values)
-    except ValidationError as error:
-        problem = error.errors(include_url=False)[0]
-        field = str(problem["loc"][0]) if problem["loc"] else "settings"
-        expected = problem["msg"].replace("Input should be", "expected", 1)
-        raise WlmError(f"{options.get(field, '--' + field)}: {expected}, got {problem['input']}") from error
-
-
-def _open(smoke: Path, extinction: float | None, emission: float | None, device: str) -> "Footage":
-    from wlm.interop import check_device
-    from wlm.smoke.frames import open_footage
-
-    return open_footage(smoke, extinction=extinction, emission=emission, device=check_device(device))
-
-
-def _paths(smoke: Path, numbers: "tuple[int, ...]", single: bool, output: Path, stem: str, suffix: str) -> list[Path]:
-    """Where each frame goes: into a file, or numbered into a folder."""
-    from wlm.smoke.frames import check_folder
-
-    if single:
-        check_output(output, suffix)
-        return [output]
-    if output.resolve() == smoke.resolve():
-        raise WlmError(f"{output}: expected another folder than that of the frames")
-    folder = check_folder(output, stem, suffix, _SHEET)
-    return [folder / f"{stem}_{number:04d}{suffix}" for number in numbers]
-
-
-def _frames(footage: "Footage", output: Path, stem: str, suffix: str) -> "Iterator[tuple[Path, int, DensityVolume]]":
-    """Volumes with where their result goes; says what was repaired, and how far it is."""
-    paths = _paths(footage.path, footage.numbers, footage.scene is None, output, stem, suffix)
-    with progress_bar(stem) as bar:
-        for done, (path, frame) in enumerate(zip(paths, footage.numbers, strict=True), 1):
-            yield path, frame, _load(footage, frame)
-            bar(done, len(paths), "")
-
-
-def _load(footage: "Footage", frame: int) -> "DensityVolume":
-    volume = footage.load(frame)
-    for warning in volume.warnings:
-        note(f"warning: {warning}")
-    return volume
-
-
-def _camera(footage: "Footage", volume: "DensityVolume", view: dict[str, Any], *, flat: bool = False) -> "Camera":
-    """The scene's camera, or one before the volume, as far as the options don't say otherwise."""
-    import numpy as np
-
-    from wlm.smoke.data import CameraSettings, make_camera
-
-    base = CameraSettings() if footage.scene is None else footage.scene.camera
-    given = {name: value for name, value in view.items() if value is not None and name != "turn"}
-    if "toward" in given:
-        given["toward"] = _vector("--toward", given["toward"])
-    settings = _made(CameraSettings, base.model_dump() | given, {}).turned(view["turn"])
-    if flat and settings.perspective:
-        raise WlmError(f"{footage.path}: camera.perspective: expected false for six-way lightmaps, found true")
-    return make_camera(settings, volume.origin, volume.voxel * np.asarray(volume.shape))
+        given["irradiance"] = vector("--light", irradiance if "," in irradiance else ",".join([irradiance] * 3))
+    return made_of(LightSettings, given, {"toward": "--light", "irradiance": "--light"}).light()
 
 
 def _shots(
@@ -450,16 +363,16 @@ def _shots(
         if not files:
             raise WlmError(f"{smoke}: expected a folder that simulate or bake wrote")
         chosen = _spread(tuple(files), count)
-        paths = [smoke] * len(chosen) if output is None else _paths(smoke, chosen, not folder, output, stem, ".png")
+        paths = [smoke] * len(chosen) if output is None else places(smoke, chosen, not folder, output, stem, ".png")
 
         def baked() -> "Iterator[tuple[Path, SixWay, Camera, dict[str, Any]]]":
             for path, frame in zip(paths, chosen, strict=True):
                 yield path, *read_six_way(files[frame], device), {}
 
         return baked(), None
-    footage = _open(smoke, extinction, emission, device)
+    footage = open_smoke(smoke, extinction, emission, device)
     chosen, scene = _spread(footage.numbers, count), footage.scene
-    paths = [smoke] * len(chosen) if output is None else _paths(smoke, chosen, scene is None, output, stem, ".png")
+    paths = [smoke] * len(chosen) if output is None else places(smoke, chosen, scene is None, output, stem, ".png")
 
     def made() -> "Iterator[tuple[Path, SixWay, Camera, dict[str, Any]]]":
         from wlm.smoke.guide import guide
@@ -467,8 +380,8 @@ def _shots(
 
         with progress_bar(stem) as bar:
             for done, (path, frame) in enumerate(zip(paths, chosen, strict=True), 1):
-                volume = _load(footage, frame)
-                camera = _camera(footage, volume, view, flat=True)
+                volume = load(footage, frame)
+                camera = camera_of(footage, volume, view, flat=True)
                 extra: dict[str, Any] = {}
                 if scene is not None:
                     extra = {"ramp": scene.smoke.ramp, "obstacles": scene.obstacles, "time": footage.time(frame)}
@@ -485,3 +398,6 @@ def _spread(numbers: tuple[int, ...], count: int | None) -> tuple[int, ...]:
         return numbers
     last = len(numbers) - 1
     return tuple(numbers[round(i * last / max(count - 1, 1))] for i in range(count))
+
+
+register(app)

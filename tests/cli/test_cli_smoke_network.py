@@ -1,0 +1,210 @@
+"""The network from the command line: trained, stopped and resumed, used, measured, exported."""
+
+import json
+import os
+import re
+import signal
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from smoke_plumes import plume, write_frames
+from test_cli import call, fails
+
+from wlm.smoke import network_file
+from wlm.smoke.coarse import coarse_six_way
+from wlm.smoke.dataset import DatasetSettings
+from wlm.smoke.frames import open_footage, read_six_way, save_volume
+from wlm.smoke.infer import Predictor, predict
+from wlm.smoke.network_file import load_network, save_network, settings_of
+from wlm.smoke.samples import GUIDES
+from wlm.smoke.trainer import Trainer
+
+PROFILE = {
+    "name": "tiny",
+    "network": {"guide": "six", "width": 8, "blocks": [1, 1], "decoder": [1], "stem": 2},
+    "training": {"rounds": 2, "steps": 4, "batch": 2, "warmup": 1, "average": 0.5},
+    "dataset": {
+        "guide": "six",
+        "guide_step": 0.1,
+        "cells": 16,
+        "refine": 2,
+        "resolution": 16,
+        "sequences": 1,
+        "frames": 1,
+        "views": 2,
+        "views_a_frame": 1,
+        "warmup": 0.6,
+        "validation_sequences": 1,
+        "moving": 0.0,
+    },
+}
+
+
+@pytest.fixture(scope="session")
+def trained(tmp_path_factory):
+    """A profile and what its training leaves, with what it said."""
+    folder = tmp_path_factory.mktemp("trained")
+    (folder / "tiny.yaml").write_text(yaml.safe_dump(PROFILE))
+    text = call("smoke", "train", folder / "tiny.yaml", "-o", folder / "a.safetensors", "--seed", 3)
+    return folder, text, call.stderr
+
+
+@pytest.fixture
+def network(trained):
+    return trained[0] / "a.safetensors"
+
+
+@pytest.fixture
+def volume(tmp_path):
+    save_volume(tmp_path / "plume.npz", plume(hot=True))
+    return tmp_path / "plume.npz"
+
+
+def test_train(trained):
+    folder, text, stderr = trained
+    assert sorted(os.listdir(folder)) == ["a.safetensors", "a.safetensors.csv", "tiny.yaml"]
+    assert "8 of 8" in text and "best validation, dB" in text
+    assert re.search(r"train: 8 of 8, PSNR \d+\.\d+ dB, loss \d", stderr)
+    loaded, summary = load_network(folder / "a.safetensors")
+    assert loaded.settings.guide == "six" and summary["seed"] == 3
+    # What looking at smoke as in training takes.
+    assert settings_of("", summary) == DatasetSettings(**PROFILE["dataset"])
+    assert (folder / "a.safetensors.csv").read_text().count("\n") == 3
+
+
+def test_a_training_is_stopped_and_resumed(trained, tmp_path, monkeypatch):
+    """By Ctrl-C, then by the clock; it ends with the same bytes."""
+    folder, _, _ = trained
+    words = ("smoke", "train", folder / "tiny.yaml", "-o", tmp_path / "a.safetensors", "--seed", 3)
+    run, done = Trainer.run, []
+
+    def interrupted(self, *args):
+        run(self, *args)
+        done.append(1)
+        if len(done) == 1:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr("wlm.smoke.train._CHUNK", 2)
+    monkeypatch.setattr(Trainer, "run", interrupted)
+    call(*words, code=130)
+    monkeypatch.setattr(Trainer, "run", run)
+    assert f"stopped at step 2: the same command with --resume goes on from {tmp_path}" in call.stderr
+    assert sorted(os.listdir(tmp_path)) == ["a.safetensors", "a.safetensors.partial"]
+    text = call(*words, "--resume", "--minutes", 0)
+    assert "out of time at step 4" in call.stderr and "4 of 8" in text
+    assert "it was made with seed 3, not 4" in fails(*words[:-1], 4, "--resume")
+    partial = tmp_path / "a.safetensors.partial"
+    kept = partial.read_bytes()
+    partial.write_bytes(kept[:-9] + b"?" + kept[-8:])
+    assert "a.safetensors.partial: the artifact is damaged" in fails(*words, "--resume")
+    partial.write_bytes(kept)
+    call(*words, "--resume")
+    assert not partial.exists()
+    assert (tmp_path / "a.safetensors").read_bytes() == (folder / "a.safetensors").read_bytes()
+
+
+def test_nothing_to_resume_is_told(trained, tmp_path):
+    words = ("smoke", "train", trained[0] / "tiny.yaml", "-o", tmp_path / "a.safetensors")
+    call(*words, "--resume", "--minutes", 0)
+    assert "a.safetensors.partial: there is nothing to resume; starting at step 0" in call.stderr
+
+
+def test_predict_looks_as_training_did(network, volume, tmp_path):
+    out = tmp_path / "a.exr"
+    text = call("smoke", "predict", volume, "-o", out, "--network", network, "--resolution", 20, "--seed", 4)
+    assert "mean light" in text and "error" not in text
+    found, camera = read_six_way(out)
+    smoke = open_footage(volume).load(1)
+    loaded, _ = load_network(network)
+    # A tenth of the 24 voxels of the longest edge.
+    look = {"step": 2.4, "jitter": 1.0, "threshold": 4.0 / 24, "seed": 4}
+    wanted = predict(smoke, camera, Predictor(loaded, 20, camera.width), **look)
+    for name in ("lightmaps", "transparency", "emission"):
+        torch.testing.assert_close(getattr(found, name), getattr(wanted, name), rtol=1e-3, atol=1e-4)
+    call("smoke", "predict", volume, "-o", out, "--network", network, "--resolution", 20, "--seed", 5)
+    assert not torch.equal(read_six_way(out)[0].lightmaps, found.lightmaps)
+    # As what bake wrote.
+    call("smoke", "shade", out, "-o", tmp_path / "a.png")
+
+
+def test_predict_by_the_coarse_march_alone(volume, tmp_path):
+    call("smoke", "predict", volume, "-o", tmp_path / "a.exr", "--coarse", "--resolution", 20)
+    found, camera = read_six_way(tmp_path / "a.exr")
+    look = {"step": 24 / 40, "jitter": 1.0, "threshold": 4.0 / 24, "seed": 0}
+    wanted = coarse_six_way(open_footage(volume).load(1), camera, **look).six
+    torch.testing.assert_close(found.lightmaps, wanted.lightmaps, rtol=1e-3, atol=1e-4)
+
+
+def test_predict_frames(network, tmp_path):
+    folder = write_frames(tmp_path / "frames").folder
+    call("smoke", "predict", folder, "-o", tmp_path / "six", "--network", network, "--resolution", 17)
+    assert sorted(os.listdir(tmp_path / "six")) == [f"six_{i:04d}.exr" for i in (1, 2, 3)]
+    assert read_six_way(tmp_path / "six" / "six_0002.exr")[0].lightmaps.shape == (6, 17, 17)
+
+
+def test_the_network_that_comes_along_is_the_default(network, volume, tmp_path, monkeypatch):
+    monkeypatch.setattr(network_file, "_SHIPPED", "none.safetensors")
+    words = ("smoke", "predict", volume, "-o", tmp_path / "a.exr", "--resolution", 12)
+    assert "none.safetensors: expected the network that comes with wlm" in fails(*words)
+    monkeypatch.setattr(network_file, "shipped", lambda: network)
+    call(*words)
+    call("smoke", "predict", volume, "-o", tmp_path / "b.exr", "--resolution", 12, "--network", network)
+    assert (tmp_path / "a.exr").read_bytes() == (tmp_path / "b.exr").read_bytes()
+
+
+def test_evaluate(network, volume, tmp_path):
+    report = tmp_path / "a.json"
+    text = call("smoke", "evaluate", network, "--smoke", volume, "--resolution", 20, "--json", report)
+    found = json.loads(report.read_text())
+    names = ["density x 0.5", "density x 1", "density x 2", str(volume)]
+    assert [one["name"] for one in found["sets"]] == names and found["resolution"] == 20 and found["cells"] == 16
+    for one in found["sets"]:
+        assert list(one["methods"]) == ["network", "coarse march", "flip book"] and one["half_loss"] is None
+        for method in one["methods"].values():
+            assert method["lowest"] <= method["psnr"] <= method["highest"] and len(method["planes"]) == 8
+            assert f"{method['psnr']:.2f}" in text and f"{method['planes']['top']:.2f}" in text
+    # It stands still.
+    assert found["sets"][3]["methods"]["network"]["flicker_ratio"] is None
+    assert found["network"]["width"] == 8
+
+
+def test_export(network, tmp_path):
+    """ONNX computes what the network does, of a size that its levels' squares don't divide."""
+    for needed in ("onnx", "onnxscript"):
+        pytest.importorskip(needed)
+    runtime = pytest.importorskip("onnxruntime")
+    out = tmp_path / "a.onnx"
+    text = call("smoke", "export", network, "-o", out, "--resolution", 18)
+    assert f"{out.stat().st_size:,} bytes, 18 x 18 pixels" in text and "torchvision" not in call.stderr
+    guide = torch.rand(1, len(GUIDES["six"]), 18, 18)
+    (found,) = runtime.InferenceSession(out).run(["lightmaps"], {"guide": guide.numpy()})
+    with torch.no_grad():
+        assert np.allclose(found, load_network(network)[0](guide), atol=1e-5)
+
+
+def test_wrong_words_are_one_line(trained, network, volume, tmp_path):
+    out = tmp_path / "a.exr"
+    made = ("smoke", "predict", volume, "-o", out)
+    assert "--coarse: expected no --network" in fails(*made, "--coarse", "--network", network)
+    assert "gone.safetensors: cannot read" in fails(*made, "--network", tmp_path / "gone.safetensors")
+    assert "expected an artifact" in fails(*made, "--network", volume)
+    assert "device 'tpu'" in fails(*made, "--network", network, "--device", "tpu")
+    assert "ends in .exr" in fails("smoke", "predict", volume, "-o", tmp_path / "a.png", "--network", network)
+    train = ("smoke", "train", trained[0] / "tiny.yaml", "-o")
+    assert "ends in .safetensors" in fails(*train, tmp_path / "a.wlm")
+    assert "does not exist" in fails(*train, tmp_path / "no" / "a.safetensors")
+    assert "device 'tpu'" in fails(*train, tmp_path / "a.safetensors", "--device", "tpu")
+    assert "network-7" in fails("smoke", "train", "7", "-o", tmp_path / "a.safetensors")
+    evaluate = ("smoke", "evaluate", network)
+    assert "ends in .json" in fails(*evaluate, "--json", tmp_path / "a.txt")
+    assert "ends in .onnx" in fails("smoke", "export", network, "-o", tmp_path / "a.txt")
+    bare = tmp_path / "bare.safetensors"
+    save_network(bare, load_network(network)[0], {})
+    assert "bare.safetensors: summary.dataset: expected" in fails(*made, "--network", bare)
+    other = tmp_path / "other.yaml"
+    other.write_text(yaml.safe_dump(PROFILE | {"dataset": {}}))
+    told = fails("smoke", "train", other, "-o", tmp_path / "a.safetensors")
+    assert "dataset.guide: expected six" in told
+    assert sorted(os.listdir(tmp_path)) == ["bare.safetensors", "other.yaml", "plume.npz"]

@@ -1,0 +1,73 @@
+"""What a NAFBlock does besides products, against float64 of torch."""
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+
+from wlm_kernels.naf_block import STRIP, kernels, lanes
+
+
+def _run(kernel, dim, inputs, shape, half, device) -> np.ndarray:
+    wp.init()
+    made = wp.zeros(shape, dtype=wp.float16 if half else float, device=device)
+    wp.launch(kernel, dim, inputs=inputs, outputs=[made], device=device)
+    return made.numpy().astype(np.float64)
+
+
+def _array(values: torch.Tensor, half: bool, device: str) -> wp.array:
+    return wp.array(values.numpy(), dtype=wp.float16 if half else float, device=device)
+
+
+def _random(half: bool, *shape: int) -> torch.Tensor:
+    values = torch.randn(*shape, generator=torch.Generator().manual_seed(sum(shape)))
+    return values.half().float() if half else values
+
+
+@pytest.mark.parametrize("half, error", [(False, 1e-5), (True, 2e-3)])
+@pytest.mark.parametrize("channels", [1, 8, 17, 128])
+def test_norm(device, half, error, channels):
+    x, shift = 3 * _random(half, 10, channels), _random(False, 2, channels)
+    x[4] = 0
+    inputs = [_array(x, half, device), _array(shift, False, device), 5]
+    cuda = device != "cpu"
+    dim = 10 * lanes(channels, cuda)
+    found = _run(kernels(channels, half, cuda).norm, dim, inputs, (10, channels), half, device)
+    shifted = x.double() + shift.double().repeat_interleave(5, 0)
+    wanted = torch.nn.functional.layer_norm(shifted, (channels,), eps=1e-6).numpy()
+    assert np.abs(found - wanted).max() < error * max(np.abs(wanted).max(), 1)
+
+
+@pytest.mark.parametrize("half, error", [(False, 1e-5), (True, 2e-3)])
+@pytest.mark.parametrize("size", [(1, 1), (1, 6), (5, 4), (7, 9)])
+def test_gate(device, half, error, size):
+    channels = 3
+    x, weight, bias = _random(half, *size, 6), _random(False, 9, 6), _random(False, 6)
+    inputs = [_array(x, half, device), _array(weight, False, device), _array(bias, False, device)]
+    dim = (-(-size[0] // STRIP), size[1], channels)
+    found = _run(kernels(channels, half, device != "cpu").gate, dim, inputs, (*size, channels), half, device)
+    image = x.double().permute(2, 0, 1)[None]
+    kernel = weight.double().t().reshape(6, 1, 3, 3)
+    made = torch.nn.functional.conv2d(image, kernel, bias.double(), padding=1, groups=6)[0].permute(1, 2, 0)
+    wanted = (made[..., :3] * made[..., 3:]).numpy()
+    assert np.abs(found - wanted).max() < error * np.abs(wanted).max()
+
+
+@pytest.mark.parametrize("half, error", [(False, 1e-5), (True, 2e-3)])
+@pytest.mark.parametrize("channels", [5, 48])
+def test_attend(device, half, error, channels):
+    cuda = device != "cpu"
+    n = channels
+    mean, weight, bias, product = (_random(False, *shape) for shape in ((2 * n,), (2, n, n), (2, n), (2, n, n)))
+    inputs = [_array(values, False, device) for values in (mean, weight, bias, product)]
+    found = _run(kernels(n, half, cuda).attend, 2 * n * lanes(n, cuda), inputs, (2, n, n), half, device)
+    factor = torch.einsum("gic,gc->gi", weight.double(), mean.double().view(2, n)) + bias.double()
+    wanted = (factor[:, :, None] * product.double()).numpy()
+    assert np.abs(found - wanted).max() < error * np.abs(wanted).max()
+
+
+@pytest.mark.parametrize("half", [False, True])
+def test_compiles_for_a_gpu(tmp_path, half):
+    for name, kernel in vars(kernels(24, half, True)).items():
+        made = wp.compile_aot_module(kernel.module, arch=[90], module_dir=tmp_path / name)
+        assert any(path.suffix in (".ptx", ".cubin") and path.stat().st_size for path in made)

@@ -1,0 +1,384 @@
+"""Samples to learn from: scenes drawn, simulated and seen; the same bits again, nothing shared, nothing broken."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+import typer
+from PIL import Image
+from pydantic import ValidationError
+from typer.testing import CliRunner
+
+import wlm.smoke.dataset as dataset
+from wlm.cli.smoke_network import register
+from wlm.errors import WlmError
+from wlm.smoke.axes import axis_faults
+from wlm.smoke.data import Air
+from wlm.smoke.dataset import (
+    ATTEMPTS,
+    STAGES,
+    DatasetSettings,
+    draw_scene,
+    load_pool,
+    load_probe_volume,
+    make_pool,
+    make_validation,
+    save_pool,
+)
+from wlm.smoke.reference import six_way
+from wlm.smoke.samples import EMISSION_PLANE, OPACITY_PLANE, Pool, from_srgb
+from wlm.smoke.scenes import Tilted
+from wlm.smoke.simulate import make_solver, volume_of
+from wlm.view.smoke_pool import pool_sheet
+
+SMALL = DatasetSettings(
+    cells=20, refine=2, resolution=40, frames=2, views_a_frame=2, sequences=3, warmup=0.7, hot=0.4, moving=0.0
+)
+FEW = SMALL.model_copy(
+    update={"sequences": 1, "frames": 1, "resolution": 24, "validation_sequences": 1, "views": 4, "warmup": 0.6}
+)
+NAMES = tuple(field.name for field in dataclasses.fields(Pool))
+
+
+@pytest.fixture(scope="module")
+def few():
+    """The smallest round."""
+    return make_pool(FEW, seed=5)
+
+
+@pytest.fixture(scope="module")
+def validation():
+    return make_validation(FEW)
+
+
+@pytest.fixture(scope="module")
+def pool():
+    """A round on the CPU, and what was told of it."""
+    told = []
+    made = make_pool(SMALL, seed=5, progress=lambda done, figures: told.append((done, figures)))
+    return made, told
+
+
+def _same(one: Pool, other: Pool) -> bool:
+    return all(torch.equal(getattr(one, name), getattr(other, name)) for name in NAMES)
+
+
+# Scenes.
+
+
+def test_scenes_are_drawn_again():
+    """The same arguments, the same scene; any other one, another; the validation's are its own."""
+    first = draw_scene(SMALL, 3, 7)
+    assert draw_scene(SMALL, 3, 7) == first
+    others = [draw_scene(SMALL, 4, 7), draw_scene(SMALL, 3, 8), draw_scene(SMALL, 3, 7, validation=True)]
+    drawn = [scene.model_copy(update={"name": ""}) for scene in (first, *others)]
+    assert all(one != other for i, one in enumerate(drawn) for other in drawn[:i])
+
+
+def test_scenes_vary():
+    """All kinds, shapes and shares that the settings ask for, on grids of theirs."""
+    settings = SMALL.model_copy(update={"moving": 0.5})
+    scenes = [draw_scene(settings, 0, index) for index in range(300)]
+    kinds = [scene.name.split()[0] for scene in scenes]
+    assert set(kinds) == {"jet", "plume", "flame", "burst"}
+    assert 0.3 < np.mean([scene.smoke.emission > 0 for scene in scenes]) < 0.5
+    bodies = [body for scene in scenes for body in scene.obstacles]
+    shapes = [body.shape for body in bodies]
+    assert all(shapes.count(shape) > 0.08 * len(shapes) for shape in ("sphere", "box"))
+    assert shapes.count("cylinder") > 0.5 * len(shapes)
+    assert all(1 <= len(s.obstacles) <= 3 for s, kind in zip(scenes, kinds, strict=True) if kind == "jet")
+    assert 0.3 < np.mean([any(len(b.path) > 1 for b in s.obstacles) for s in scenes if s.obstacles]) < 0.7
+    for scene in scenes:
+        assert scene.steps == settings.steps and scene.steps % (2 * scene.smoke.substeps) == 0
+        assert scene.grid.shape == (40, 40, 40) and scene.fastest == 1.0
+        assert all(b.fastest < 2.0 for b in scene.obstacles)
+    jets = [inlet for s, kind in zip(scenes, kinds, strict=True) if kind == "jet" for inlet in s.inlets]
+    tilts = [np.hypot(i.velocity[0], i.velocity[2]) / i.velocity[1] for i in jets if i.face == "-y"]
+    assert min(tilts) < 0.05 and max(tilts) > 0.4
+
+
+@pytest.mark.parametrize("axis", [(0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, -2.0, 0.0), (0.3, -0.5, 0.8)])
+def test_tilted_bodies(axis: tuple):
+    """A cylinder about any axis is the upright one turned, not mirrored."""
+    path = ((0.0, 0.5, 0.5, 0.5),)
+    body = Tilted(shape="cylinder", radius=(0.1, 0.4, 0.1), path=path, axis=axis)
+    points, triangles = body.mesh()
+    along = points @ (np.array(axis) / np.linalg.norm(axis))
+    across = np.sqrt((points**2).sum(1) - along**2)
+    np.testing.assert_allclose([np.abs(along).max(), across.max()], [0.4, 0.1], atol=1e-12)
+    a, b, c = (points[triangles[:, k]] for k in range(3))
+    assert np.einsum("ij,ij->", a, np.cross(b, c)) / 6 == pytest.approx(np.pi * 0.1**2 * 0.8, rel=0.01)
+
+
+# Pools.
+
+
+def test_other_pools(pool, few):
+    """The next round and another seed give others; what is told of one."""
+    made, told = pool
+    assert not torch.equal(few.targets, make_pool(FEW, seed=5, round=1).targets)
+    assert not torch.equal(few.targets, make_pool(FEW, seed=6).targets)
+    assert [done for done, _ in told] == [1, 2, 3]
+    assert told[-1][1]["samples"] == len(made) and all(told[-1][1][stage] > 0 for stage in STAGES)
+
+
+def test_guides_of_six_lights(few):
+    """Another kind of guide changes nothing else, to the last bit, and knows more of each light than one of one."""
+    six = make_pool(FEW.model_copy(update={"guide": "six"}), seed=5)
+    assert six.guides.shape == (len(few), 2, 9, 24, 24) and six.guides.dtype == torch.float16
+    assert all(torch.equal(getattr(six, name), getattr(few, name)) for name in NAMES[1:])
+    torch.testing.assert_close(six.guides[:, :, -2:], few.guides[:, :, 1:], rtol=0, atol=1e-3)
+    off = (six.guides[:, :, :6].float() - six.targets[:, :, :6].float()).square().mean((0, 1, 3, 4))
+    worse = (few.guides[:, :, :1].float() - six.targets[:, :, :6].float()).square().mean((0, 1, 3, 4))
+    assert (off < 0.2 * worse).all()
+
+
+def test_same_bits(device: str):
+    """A pool is a function of its arguments; also where graphs replay the steps."""
+    assert _same(make_pool(FEW, seed=5, device=device), make_pool(FEW, seed=5, device=device))
+
+
+def test_a_gpu_sees_the_same(device: str, pool):
+    """What is drawn doesn't depend on the device; what is seen does by rounding alone, which air makes more of."""
+    if device == "cpu":
+        pytest.skip("the CPU's is what it is compared with")
+    made = make_pool(SMALL, seed=5, device=device)
+    assert str(made.device).startswith(device.split(":")[0])
+    assert torch.equal(made.sequence.cpu(), pool[0].sequence)
+    assert float((made.targets.cpu().float() - pool[0].targets.float()).square().mean()) < 1e-3
+
+
+def test_what_a_pool_holds(pool):
+    """Half floats in their ranges, smoke that fills its part of the image, and names that fit what is bright where."""
+    made, _ = pool
+    assert len(made) == 12 and all(getattr(made, name).dtype == torch.float16 for name in NAMES[:3])
+    for name in NAMES[:3]:
+        assert torch.isfinite(getattr(made, name)).all()
+    light, opacity, depth = made.guides.float().unbind(2)
+    assert light.min() >= 0 and 0.5 < light.max() <= 1.6
+    assert opacity.min() >= 0 and 0.8 < opacity.max() <= 1
+    assert depth.min() >= 0 and depth.max() <= 1 and ((depth > 0) <= (opacity > 0)).all()
+    targets = made.targets.float()
+    assert targets.min() >= 0 and targets.max() <= 1
+    covered = (targets[:, 1, OPACITY_PLANE] > 0.05).float().mean((1, 2))
+    assert 0.02 < covered.min() and 0.08 < covered.mean() < 0.8
+    # The guide is a rough picture of the same smoke.
+    off = (opacity - targets[:, :, OPACITY_PLANE]).square().mean() / targets[:, :, OPACITY_PLANE].square().mean()
+    assert off < 0.15
+    assert axis_faults(from_srgb(targets[:, 1, :6]).numpy()) == ()
+    hot = [draw_scene(SMALL, 5, int(number)).smoke.emission > 0 for number in made.sequence]
+    glow = made.targets[:, 1, EMISSION_PLANE].float().amax((1, 2)) > 0
+    assert glow.tolist() == hot and 0 < sum(hot) < len(hot)
+
+
+def test_motion_finds_the_earlier_frame():
+    """The earlier frame, read where the motion says, is nearer to the later one; read elsewhere it isn't."""
+    # Without bursts, whose smoke comes from nowhere.
+    made = make_pool(SMALL.model_copy(update={"hot": 0.0, "warmup": 0.9}), seed=5)
+    height, width = made.guides.shape[-2:]
+    y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    smoke = (made.targets[:, 1, OPACITY_PLANE] > 0.05)[:, None]
+
+    def errors(right: float, down: float) -> torch.Tensor:
+        """Of each sample and plane."""
+        moved = made.motion.float() * torch.tensor([right, down])[:, None, None]
+        grid = torch.stack([(x - moved[:, 0]) / width * 2 - 1, (y - moved[:, 1]) / height * 2 - 1], -1)
+        # What came in over the image's edge is taken to look like the edge.
+        options = {"align_corners": False, "padding_mode": "border"}
+        read = torch.nn.functional.grid_sample(made.targets[:, 0].float(), grid, **options)
+        # What the smoke has left has no motion, and still differs.
+        return ((read - made.targets[:, 1].float()) * smoke).square().mean((2, 3))[:, :EMISSION_PLANE]
+
+    assert len(made) == 12 and made.motion.abs().max() > 1.0
+    still, moved = errors(0.0, 0.0), errors(1.0, 1.0)
+    # Under a light from below an inlet's foot is lit the same whatever goes through it.
+    assert (moved.sum(0) < torch.tensor([0.5, 0.5, 0.5, 0.9, 0.5, 0.5, 0.5]) * still.sum(0)).all()
+    assert (moved.sum(1) < 0.7 * still.sum(1)).all()
+    for right, down in ((-1.0, 1.0), (1.0, -1.0), (-1.0, -1.0), (0.0, 1.0), (1.0, 0.0), (0.4, 0.4), (1.8, 1.8)):
+        assert moved.sum() < 0.75 * errors(right, down).sum()
+
+
+def test_no_scene_is_shared(few, validation):
+    """Rounds, seeds of replacements and the validation have sequences of their own."""
+    found = [set(made.sequence.tolist()) for made in (few, *(make_pool(FEW, seed=5, round=k) for k in (1, 2)))]
+    found.append(set(validation.sequence.tolist()))
+    assert all(part for part in found)
+    assert sum(map(len, found)) == len(set.union(*found))
+    assert max(found[3]) < 0 <= min(set.union(*found[:3]))
+
+
+def test_validation(validation):
+    """Every pair from every fixed view; another density is of the same smoke."""
+    made, thin = validation, make_validation(FEW, scale=0.4)
+    assert len(made) == FEW.views * FEW.frames * FEW.validation_sequences
+    clear, less = (1 - some.targets[:, :, OPACITY_PLANE].float() for some in (made, thin))
+    # As exact as halves are near 1.
+    torch.testing.assert_close(clear**0.4, less, rtol=0, atol=0.05)
+    assert torch.equal(made.sequence, thin.sequence)
+    assert thin.targets[:, :, OPACITY_PLANE].mean() < 0.95 * made.targets[:, :, OPACITY_PLANE].mean()
+    assert all((a != b).any() for a, b in zip(made.targets, made.targets[1:], strict=False))
+
+
+def test_a_moving_obstacle():
+    """It takes eager steps, and gives samples all the same."""
+    settings = FEW.model_copy(update={"moving": 1.0, "hot": 0.0})
+    index = next(i for i in range(99) if any(len(b.path) > 1 for b in draw_scene(settings, 5, i * ATTEMPTS).obstacles))
+    made = make_pool(settings, seed=5, round=index)
+    assert len(made) == 2 and made.motion.abs().max() > 0
+
+
+# Hard cases.
+
+
+def _wild(settings: DatasetSettings, seed: int, index: int, *, validation: bool = False):
+    """The first scene of each place blows up: no eddies, no viscosity, too fast."""
+    scene = draw_scene(settings, seed, index, validation=validation)
+    if index % ATTEMPTS:
+        return scene
+    air = Air(operator="bgk", smagorinsky=0.0, viscosity=1e-9, speed=0.4, lattice_speed=0.1)
+    inlets = tuple(inlet.model_copy(update={"temperature": 0.0}) for inlet in scene.inlets)
+    return scene.model_copy(update={"air": air, "inlets": inlets, "rate": scene.rate * 0.4})
+
+
+def test_a_scene_that_blows_up(monkeypatch: pytest.MonkeyPatch):
+    """It is skipped and counted, and the next takes its place."""
+    settings = FEW.model_copy(update={"hot": 0.0, "warmup": 1.5})
+    monkeypatch.setattr(dataset, "draw_scene", _wild)
+    told = []
+    # A round whose first scene is a jet, whose speed is fixed.
+    number = next(k for k in range(99) if draw_scene(settings, 2, k * ATTEMPTS).name.startswith("jet"))
+    made = make_pool(settings, seed=2, round=number, progress=lambda _, figures: told.append(figures))
+    assert told[-1]["skipped"] == 1 and torch.isfinite(made.targets).all()
+    assert set(made.sequence.tolist()) == {number * ATTEMPTS + 1}
+
+
+def test_nan_never_enters(monkeypatch: pytest.MonkeyPatch):
+    """A picture with NaN counts as a scene that blew up; after many of them the pool is given up in one line."""
+    calls = []
+
+    def broken(*args, **kwargs):
+        found = six_way(*args, **kwargs)
+        calls.append(1)
+        if len(calls) == 1:
+            found.lightmaps[2, 3, 4] = float("nan")
+        return found
+
+    monkeypatch.setattr(dataset, "six_way", broken)
+    told = []
+    made = make_pool(FEW, seed=5, progress=lambda _, figures: told.append(figures))
+    assert told[-1]["skipped"] == 1 and torch.isfinite(made.targets).all()
+    monkeypatch.setattr(dataset, "ATTEMPTS", 2)
+    monkeypatch.setattr(dataset, "six_way", lambda *a, **k: dataclasses.replace(six_way(*a, **k), transparency=_NAN))
+    with pytest.raises(WlmError, match=r"2 scenes .* NaN"):
+        make_pool(FEW, seed=5)
+
+
+_NAN = torch.full((24, 24), float("nan"))
+
+
+def test_frames_without_smoke():
+    """Almost empty frames are left out but for the share that is asked for, and an empty pool is one."""
+    nothing = FEW.model_copy(update={"least_coverage": 1.0, "kept_empty": 0.0})
+    told = []
+    made = make_pool(nothing, seed=5, progress=lambda _, figures: told.append(figures))
+    assert len(made) == 0 and told[-1]["dropped"] == 2 and made.guides.shape[1:] == (2, 3, 24, 24)
+    assert len(make_pool(nothing.model_copy(update={"kept_empty": 1.0}), seed=5)) == 2
+    start = FEW.model_copy(update={"warmup": 0.0, "hot": 0.0, "kept_empty": 1.0})
+    assert torch.isfinite(make_pool(start, seed=5).targets).all()
+
+
+def test_step_of_the_reference(device: str):
+    """The default step's own error, on simulated smoke, is far below what a network can learn."""
+    scene = draw_scene(SMALL, 5, 1)
+    solver = make_solver(scene, device=device)
+    solver.step(60)
+    camera = dataset._fixed_cameras(SMALL, scene.grid.origin, scene.grid.size)[3]
+    volume = volume_of(scene, solver)
+    found = six_way(volume, camera, step=SMALL.reference_step)
+    fine = six_way(volume, camera, step=0.125, estimate=False).lightmaps
+    off = ((found.lightmaps - fine).square().mean() / fine.square().mean()).sqrt()
+    assert off < 0.01 and off < found.error.rms < 0.1
+
+
+def test_look():
+    """The paper's numbers on the paper's grid, and the same shares of the box on others."""
+    assert SMALL.look((400, 400, 400)) == {"step": 10.0, "jitter": 1.0, "threshold": 0.01}
+    look = SMALL.look((100, 200, 60))
+    assert look["step"] == 5.0 and look["threshold"] == 0.02
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"cells": 8}, {"substeps": 3}, {"zoom": (1.2, 0.8)}, {"density_scales": (0.0, 1.0)}, {"hot": 1.5}, {"unknown": 1}],
+)
+def test_wrong_settings(wrong: dict):
+    """Each is named."""
+    with pytest.raises(ValidationError, match=next(iter(wrong))):
+        DatasetSettings(**wrong)
+
+
+# From elsewhere, files and the command.
+
+
+def test_probe_volume(tmp_path, device: str):
+    """Any volume from the fixed views: nothing moves, and its thickness is that of a scene unless it is given."""
+    axis = (np.arange(24) + 0.5) / 12 - 1
+    x, y, z = np.meshgrid(axis, axis[:18], axis, indexing="ij")
+    np.savez(tmp_path / "a.npz", density=7.0 * np.clip(4 - 6 * np.hypot(np.hypot(x, y), z - 0.3), 0, 1), voxel=0.5)
+    made = load_probe_volume(tmp_path / "a.npz", FEW, device=device)
+    assert len(made) == FEW.views and str(made.device) == str(torch.zeros(0, device=device).device)
+    assert torch.equal(made.guides[:, 0], made.guides[:, 1]) and torch.equal(made.targets[:, 0], made.targets[:, 1])
+    assert not made.motion.any() and made.targets[:, 0, OPACITY_PLANE].amax((1, 2)).min() > 0.95
+    thin = load_probe_volume(tmp_path / "a.npz", FEW, device=device, extinction=1e-3)
+    assert thin.targets[:, 0, OPACITY_PLANE].max() < 0.3
+    np.savez(tmp_path / "none.npz", density=np.zeros((4, 4, 4)))
+    with pytest.raises(WlmError, match=r"none.npz: density: expected smoke"):
+        load_probe_volume(tmp_path / "none.npz", FEW, device=device)
+    with pytest.raises(WlmError, match="no such file"):
+        load_probe_volume(tmp_path / "missing.npz", FEW, device=device)
+
+
+def test_files(tmp_path, pool):
+    """A pool comes back as it was, and other files are refused."""
+    made, _ = pool
+    size = save_pool(tmp_path / "pool", made, SMALL, "round-0")
+    assert size == (tmp_path / "pool").stat().st_size and _same(load_pool(tmp_path / "pool"), made)
+    data = bytearray((tmp_path / "pool").read_bytes())
+    data[-1] ^= 1
+    (tmp_path / "pool").write_bytes(data)
+    with pytest.raises(WlmError, match="damaged"):
+        load_pool(tmp_path / "pool")
+
+
+def test_sheet(tmp_path, pool):
+    """Twelve rows of planes for the samples asked for; an empty pool has none."""
+    made, _ = pool
+    assert pool_sheet(tmp_path / "a.png", made, columns=3) == (0, 6, 11) or len(made) != 12
+    with Image.open(tmp_path / "a.png") as image:
+        assert image.height > 12 * 40 and image.width > 3 * 40 and np.asarray(image).std() > 20
+    empty = Pool(*(getattr(made, name)[:0] for name in NAMES))
+    with pytest.raises(ValueError, match="at least one"):
+        pool_sheet(tmp_path / "b.png", empty)
+
+
+def test_command(tmp_path):
+    """A file and a picture of the samples, of a round and of the validation; wrong settings are one line."""
+    app = typer.Typer()
+    app.callback()(lambda: None)
+    register(app)
+    text = "cells: 16\nrefine: 2\nresolution: 16\nsequences: 1\nframes: 1\nviews: 2\nviews_a_frame: 1\nwarmup: 0.6\n"
+    (tmp_path / "a.yaml").write_text(text + "validation_sequences: 1\n")
+
+    def call(*words: object) -> object:
+        return CliRunner().invoke(app, ["dataset", *map(str, words)])
+
+    for more, count in (((), 1), (("--validation",), 2)):
+        result = call(tmp_path / "a.yaml", "-o", tmp_path / "out", *more)
+        assert result.exit_code == 0, result.output
+        assert len(load_pool(tmp_path / "out" / "pool.safetensors")) == count
+        assert (tmp_path / "out" / "sheet.png").stat().st_size > 500
+        assert "seconds: reference" in result.output
+    (tmp_path / "b.yaml").write_text("cells: 2\n")
+    assert isinstance(call(tmp_path / "b.yaml", "-o", tmp_path / "out").exception, WlmError)
+    assert isinstance(call(tmp_path / "a.yaml", "-o", tmp_path / "no" / "out").exception, WlmError)

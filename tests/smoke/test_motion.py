@@ -1,0 +1,197 @@
+"""Motion across the image: against closed forms, a loop of NumPy, and what it is for, finding smoke where it was."""
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+from reference.marching import span as clip
+from reference.marching import trilinear
+
+from wlm.smoke.axes import Camera
+from wlm.smoke.motion import motion
+from wlm.smoke.reference import six_way
+from wlm.smoke.volume import DensityVolume, from_array
+from wlm_kernels.marching_motion import motion_kernel
+
+SIZE = 24
+
+
+def _camera(volume: DensityVolume, way: tuple = (0.0, 0.0, 1.0), size: int = 20, **settings) -> Camera:
+    extent = 1.1 * max(volume.shape) * volume.voxel
+    position = volume.centre + 3 * extent * np.array(way) / np.linalg.norm(way)
+    return Camera.look_at(position, volume.centre, extent=extent, height=size, width=size, **settings)
+
+
+def _velocity(values: np.ndarray, device: str) -> wp.array:
+    return wp.array(np.asarray(values, np.float32), dtype=wp.vec3, device=device)
+
+
+def _ball(at: tuple = (12.0, 12.0, 12.0), radius: float = 6.0, n: int = SIZE) -> np.ndarray:
+    grid = np.stack(np.meshgrid(*[np.arange(n) + 0.5] * 3, indexing="ij"), -1)
+    return np.clip(radius - np.linalg.norm(grid - np.array(at), axis=-1), 0, 1)
+
+
+def _warped(earlier: torch.Tensor, moved: torch.Tensor) -> torch.Tensor:
+    """An earlier picture [H, W], read where each pixel's smoke was."""
+    height, width = earlier.shape
+    y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    grid = torch.stack([(x - moved[0].cpu()) / width * 2 - 1, (y - moved[1].cpu()) / height * 2 - 1], -1)
+    return torch.nn.functional.grid_sample(earlier.cpu()[None, None], grid[None], align_corners=False)[0, 0]
+
+
+@pytest.mark.parametrize("way", [(0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.6, 0.4, -1.0), (0.0, 1.0, 0.0)])
+def test_uniform_motion(device: str, way: tuple):
+    """A ball that moves as a whole: its velocity's part in the image, and the earlier picture becomes the later one."""
+    shift = np.array([2.0, -3.0, 1.0])
+    before, after = (from_array(_ball(12 + k * shift), voxel=0.5, device=device) for k in (-0.5, 0.5))
+    camera = _camera(after, way, size=48)
+    # 0.25 of the world's lengths a step, 2 steps: the shift, in voxels of half a length.
+    velocity = _velocity(np.broadcast_to(shift, (6, 6, 6, 3)), device)
+    moved = motion(after, velocity, camera, reach=0.5, step=0.5)
+    opacity = 1.0 - six_way(after, camera, estimate=False).transparency
+    right, up, _ = camera.axes @ (0.5 * shift) / camera.pitch
+    smoke = opacity > 0.01
+    for plane, want in zip(moved, (right, -up), strict=True):
+        np.testing.assert_allclose(plane[smoke].cpu(), want, atol=1e-4)
+        assert (plane[opacity == 0] == 0).all() and smoke.any() and not smoke.all()
+    # What the smoke has left behind has no motion: it shows none any more.
+    earlier = 1.0 - six_way(before, camera, estimate=False).transparency
+    error, still = (
+        float((picture - opacity.cpu())[smoke.cpu()].square().mean())
+        for picture in (_warped(earlier, moved), earlier.cpu())
+    )
+    assert error < 0.02 * still
+
+
+def test_rotation(device: str):
+    """About the view's axis every depth turns alike; the trace is that of an arc, to the third order of its angle."""
+    n, angle = 8, 0.2
+    volume = from_array(_ball(radius=10.0), voxel=2.0, origin=(-24.0, -24.0, -24.0), device=device)
+    grid = np.stack(np.meshgrid(*[6.0 * (np.arange(n) + 0.5) - 24.0] * 3, indexing="ij"), -1)
+    velocity = np.cross([0.0, 0.0, angle], grid)
+    camera = _camera(volume, size=40)
+    moved = motion(volume, _velocity(velocity, device), camera, reach=1.0, step=0.5).cpu().numpy()
+    origin, _ = (part.numpy() for part in camera.rays())
+    x, y = origin[..., 0], origin[..., 1]
+    cos, sin = np.cos(angle), np.sin(angle)
+    want = np.stack([x - (cos * x + sin * y), -(y - (cos * y - sin * x))]) / camera.pitch
+    smoke = np.hypot(x, y) < 17
+    np.testing.assert_allclose(moved[:, smoke], want[:, smoke], atol=angle**3 / 4 * 18 / camera.pitch)
+    assert np.abs(want[:, smoke]).max() > 2
+
+
+@pytest.mark.parametrize("thickness", [0.02, 0.3, 20.0])
+def test_hidden_smoke(device: str, thickness: float):
+    """A slab before another that goes the other way: each counts for what is seen of it."""
+    density = np.zeros((16, 16, 16))
+    density[:, :, 2:6] = density[:, :, 10:14] = 1.0
+    volume = from_array(density, extinction=thickness, device=device)
+    velocity = np.zeros((16, 16, 16, 3))
+    velocity[..., :8, 0], velocity[..., 8:, 0] = 1.0, -1.0
+    moved = motion(volume, _velocity(velocity, device), _camera(volume, size=12), reach=1.5, step=0.125)
+    before = 1 - np.exp(-4 * thickness)
+    behind = (1 - before) * before
+    want = 1.5 * (behind - before) / (behind + before) / (1.1 * 16 / 12)
+    np.testing.assert_allclose(moved[0, 4:8, 4:8].cpu(), want, rtol=0.01)
+    assert not moved[1].any()
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float16])
+def test_against_a_loop(device: str, dtype: type):
+    """Askew, over air of other cells than the smoke, at a step that is no divisor of anything."""
+    random = np.random.default_rng(5)
+    density = np.maximum(random.normal(0.1, 0.5, (9, 14, 11)), 0).astype(dtype)
+    density[:, :5, :4] = 0
+    air = random.normal(size=(3, 5, 4, 3)).astype(np.float32)
+    volume = from_array(density, extinction=0.4, voxel=0.5, origin=(1.0, -2.0, 3.0), device=device)
+    assert volume.density.dtype == (torch.float16 if dtype is np.float16 else torch.float32)
+    camera = _camera(volume, (0.7, 0.3, 1.0), size=9)
+    moved = motion(volume, _velocity(air, device), camera, reach=0.6, step=1.37).cpu().numpy()
+    want, opacity = _loop(density.astype(np.float64), 0.2, air, 1.2, camera, volume, 1.37)
+    np.testing.assert_allclose(moved, want, atol=2e-4)
+    assert (opacity > 0.01).sum() > 30 and np.abs(want).max() > 0.5
+
+
+def _loop(density, extinction, air, reach, camera, volume, h):
+    """What the kernel does, in float64 and pixel by pixel; and each pixel's opacity."""
+    size = np.array(density.shape)
+    share = np.array(air.shape[:3]) / size
+
+    def blown(p):
+        q = np.clip(p * share - 0.5, 0, np.array(air.shape[:3]) - 1)
+        padded = np.stack([trilinear(np.pad(air[..., c], 1, mode="edge"), q + 1.5) for c in range(3)])
+        return reach * padded
+
+    out, opacity = np.zeros((2, camera.height, camera.width)), np.zeros((camera.height, camera.width))
+    origins, ways = (part.numpy() for part in camera.rays())
+    for row, column in np.ndindex(camera.height, camera.width):
+        o, d = (origins[row, column] - volume.origin) / volume.voxel, ways[row, column]
+        near, far = clip(density.shape, o, d)
+        moved, seen, t = np.zeros(3), 0.0, 1.0
+        steps = int(np.ceil(max(far - near, 0) / h))
+        for n in range(steps):
+            dt = (far - near) / steps
+            p = o + (near + (n + 0.5) * dt) * d
+            x = extinction * float(trilinear(density, p)) * dt
+            begin = p - blown(p - 0.5 * blown(p))
+            begin = np.minimum(np.maximum(begin, np.minimum(p, 1)), np.maximum(p, size - 1))
+            moved += t * (1 - np.exp(-x)) * (p - begin)
+            seen += t * (1 - np.exp(-x))
+            t *= np.exp(-x)
+        opacity[row, column] = seen
+        if seen > 1e-3:
+            across, up, _ = camera.axes @ (moved / seen) * volume.voxel / camera.pitch
+            out[:, row, column] = across, -up
+    return out, opacity
+
+
+def test_what_came_in(device: str):
+    """Smoke that an inlet let in since was never outside: no pixel reads from beyond the box's foot."""
+    density = np.zeros((16, 16, 16))
+    density[5:11, :12, 5:11] = 1.0
+    volume = from_array(density, device=device)
+    camera = _camera(volume, size=44)
+    velocity = np.zeros((4, 4, 4, 3))
+    velocity[..., 1] = 1.0
+    moved = motion(volume, _velocity(velocity, device), camera, reach=4.0)[1].cpu()
+    rows = (22 - torch.arange(44) - 0.5) * camera.pitch + 8  # heights in the box
+    inside = (rows > 1) & (rows < 12)
+    column = moved[:, 22][inside]
+    expected = -torch.minimum(rows[inside] - 1, torch.tensor(4.0)) / camera.pitch
+    np.testing.assert_allclose(column, expected, atol=1e-3)
+
+
+def test_hard_cases(device: str):
+    """No smoke, smoke too thin to be seen, one voxel, and the same bits again."""
+    wind = _velocity(np.ones((2, 2, 2, 3)), device)
+    for density in (np.zeros((6, 6, 6)), np.full((6, 6, 6), 1e-6)):
+        volume = from_array(density, device=device)
+        assert not motion(volume, wind, _camera(volume), reach=1.0).any()
+    one = from_array(np.ones((1, 1, 1)), extinction=3.0, device=device)
+    moved = motion(one, _velocity(np.ones((1, 1, 1, 3)), device), _camera(one), reach=0.1)
+    assert torch.isfinite(moved).all() and moved.any()
+    ball = from_array(_ball(), device=device)
+    camera = _camera(ball, (1.0, 0.2, 0.4))
+    first, second = (motion(ball, wind, camera, reach=1.0) for _ in range(2))
+    assert torch.equal(first, second)
+
+
+def test_wrong_use(device: str):
+    """Each wrong argument is named."""
+    ball = from_array(_ball(), device=device)
+    wind = _velocity(np.ones((2, 2, 2, 3)), device)
+    with pytest.raises(ValueError, match="orthographic"):
+        motion(ball, wind, _camera(ball, perspective=True), reach=1.0)
+    for options, name in (({"reach": float("nan")}, "reach"), ({"reach": 1.0, "step": 0.0}, "step")):
+        with pytest.raises(ValueError, match=name):
+            motion(ball, wind, _camera(ball), **options)
+    with pytest.raises(ValueError, match="velocity"):
+        motion(ball, wp.zeros((2, 2, 2), dtype=float, device=device), _camera(ball), reach=1.0)
+
+
+@pytest.mark.parametrize("dtype", [wp.float32, wp.float16])
+def test_compiles_for_cuda(dtype: type, tmp_path):
+    """For a GPU that isn't there."""
+    made = wp.compile_aot_module(motion_kernel(dtype).module, arch=[90], module_dir=tmp_path)
+    binaries = [path for path in made if path.suffix in (".ptx", ".cubin")]
+    assert binaries and all(path.stat().st_size > 0 for path in binaries)

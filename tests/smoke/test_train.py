@@ -1,0 +1,262 @@
+"""Training: it learns, goes on exactly where it stopped, keeps the best network, and refuses what can't be learned."""
+
+import csv
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from smoke_samples import small_pool
+
+from wlm.config import profile_names
+from wlm.errors import WlmError
+from wlm.smoke.evaluate import evaluate
+from wlm.smoke.losses import LossSettings
+from wlm.smoke.network import NetworkSettings, SixWayNetwork
+from wlm.smoke.network_file import load_network
+from wlm.smoke.samples import GUIDES, PLANES, Pool
+from wlm.smoke.train import NetworkProfile, load_profile, train
+from wlm.smoke.trainer import Trainer, TrainSettings, plan_round
+
+TINY = NetworkSettings(width=8, blocks=(1, 1), decoder=(1,))
+
+
+def _profile(network: NetworkSettings = TINY, **training) -> NetworkProfile:
+    settings = {"rounds": 2, "steps": 6, "batch": 4, "warmup": 2, "average": 0.5} | training
+    return NetworkProfile(name="tiny", network=network, training=TrainSettings(**settings))
+
+
+def _pool(settings, *, seed, round, device) -> Pool:
+    return small_pool(4, 10 * (seed + 1) + 4 * round).to(device)
+
+
+def _validation(settings, device) -> Pool:
+    return small_pool(2).to(device)
+
+
+def _train(path, profile, **options):
+    return train(path, profile, **{"make_pool": _pool, "make_validation": _validation} | options)
+
+
+def _curves(path) -> list[dict[str, float]]:
+    with open(f"{path}.csv") as file:
+        return [{name: float(value) for name, value in row.items()} for row in csv.DictReader(file)]
+
+
+def test_it_learns_a_small_pool_by_heart(tmp_path, device):
+    pool = small_pool(2).to(device)
+    network = NetworkSettings(width=8, blocks=(1, 1, 1), decoder=(1, 1))
+    before = evaluate(SixWayNetwork(network).to(device), pool)
+    profile = _profile(network, rounds=1, steps=80, average=0.9, mirror="none", rate=1e-2)
+    result = _train(
+        tmp_path / "a", profile, device=device, make_pool=lambda *a, **k: pool, make_validation=lambda *a: pool
+    )
+    # 37.6 dB after 80 steps, on the CPU.
+    assert result.finished and result.best > max(32.0, before.psnr + 6)
+    assert result.score.lowest <= result.score.psnr <= result.score.highest
+    assert result.steps == 80 and result.skipped == 0
+    found, summary = load_network(tmp_path / "a", device=device)
+    assert evaluate(found, pool).psnr == pytest.approx(result.best, abs=0.05)
+    assert summary["psnr"] == result.best and set(summary["planes"]) == set(PLANES)
+
+
+@pytest.mark.parametrize("losses", [LossSettings(), LossSettings(temporal=0.1)])
+def test_a_stopped_training_ends_as_if_it_had_not_been(tmp_path, monkeypatch, losses):
+    monkeypatch.setattr("wlm.smoke.train._CHUNK", 2)
+    profile = _profile(losses=losses)
+    whole = _train(tmp_path / "whole", profile, seed=1)
+
+    def stop(progress) -> None:
+        if progress.step == 4:
+            raise KeyboardInterrupt
+
+    path = tmp_path / "parts"
+    with pytest.raises(KeyboardInterrupt):
+        _train(path, profile, seed=1, progress=stop)
+    steps = []
+    while not (result := _train(path, profile, seed=1, resume=True, minutes=0.0)).finished:
+        steps.append(result.steps)
+    assert steps == [6, 8, 10]
+    assert path.read_bytes() == (tmp_path / "whole").read_bytes()
+    assert replace(result, seconds=0) == replace(whole, seconds=0)
+    assert not (tmp_path / "parts.partial").exists()
+    for one, other in zip(_curves(path), _curves(tmp_path / "whole"), strict=True):
+        assert {**one, "seconds": 0} == {**other, "seconds": 0}
+
+
+def test_curves_and_progress_tell_how_it_goes(tmp_path, monkeypatch):
+    monkeypatch.setattr("wlm.smoke.train._CHUNK", 3)
+    seen = []
+    result = _train(tmp_path / "a", _profile(rounds=3, validate_every=2), progress=seen.append)
+    assert [(at.round, at.step, at.steps) for at in seen] == [(i // 2, 3 * (i + 1), 18) for i in range(6)]
+    assert all(at.loss > 0 and at.seconds > 0 for at in seen)
+    rows = _curves(tmp_path / "a")
+    assert [row["step"] for row in rows] == [6, 12, 18]
+    assert [math.isnan(row["psnr"]) for row in rows] == [True, False, False]
+    assert rows[-1]["psnr"] == pytest.approx(result.score.psnr, abs=1e-5)
+    assert rows[0]["loss"] == rows[0]["mse"] and rows[-1]["loss"] < rows[0]["loss"]
+
+
+def test_the_best_network_is_kept(tmp_path):
+    scores = []
+
+    def worse(settings, *, seed, round, device) -> Pool:
+        pool = small_pool(4, 10)
+        return pool if round == 0 else replace(pool, targets=1 - pool.targets)
+
+    def train(rate: float):
+        profile = _profile(steps=20, average=0.0, rate=rate)
+        return _train(tmp_path / "a", profile, make_pool=worse, progress=lambda at: scores.append(at.psnr))
+
+    # Far below where it began it ends, and what was best stays.
+    with pytest.raises(WlmError, match=r"diverged: .* dB after 40 steps, .* before the first; .* rate than 0.01"):
+        train(1e-2)
+    assert load_network(tmp_path / "a")[1]["psnr"] == max(scores)
+    scores.clear()
+    result = train(1e-3)
+    assert result.best == max(scores) > result.score.psnr
+    assert load_network(tmp_path / "a")[1]["psnr"] == result.best
+
+
+def test_an_untrained_network_is_kept_until_there_is_a_better_one(tmp_path, monkeypatch):
+    monkeypatch.setattr("wlm.smoke.train._CHUNK", 2)
+    result = _train(tmp_path / "a", _profile(), minutes=0.0)
+    summary = load_network(tmp_path / "a")[1]
+    assert not result.finished and result.steps > 0
+    assert summary["steps"] == 0 and summary["psnr"] == result.best
+
+
+def test_a_checkpoint_of_another_training_is_refused(tmp_path):
+    path = tmp_path / "a"
+    _train(path, _profile(), minutes=0.0)
+    for profile in (_profile(rate=2e-3), _profile(NetworkSettings(width=16, blocks=(1, 1), decoder=(1,)))):
+        with pytest.raises(WlmError, match="another fit"):
+            _train(path, profile, resume=True)
+    partial = tmp_path / "a.partial"
+    content = bytearray(partial.read_bytes())
+    content[-9] ^= 1
+    partial.write_bytes(content)
+    with pytest.raises(WlmError, match="damaged"):
+        _train(path, _profile(), resume=True)
+    # Without resume it is ignored.
+    assert _train(path, _profile()).finished
+
+
+@pytest.mark.parametrize("name", ["guides", "targets", "motion"])
+def test_nan_in_a_pool_is_told(tmp_path, name):
+    def broken(settings, *, seed, round, device) -> Pool:
+        pool = small_pool(4, 10)
+        values = getattr(pool, name).clone()
+        values[2, 0, 0, 1] = math.nan
+        return replace(pool, **{name: values}) if round == 1 else pool
+
+    with pytest.raises(WlmError, match=f"round 1: {name}: sample 2: expected finite"):
+        _train(tmp_path / "a", _profile(), make_pool=broken)
+    with pytest.raises(WlmError, match="validation: expected samples, found none"):
+        empty = Pool(*(tensor[:0] for tensor in vars(small_pool()).values()))
+        _train(tmp_path / "a", _profile(), make_validation=lambda settings, device: empty)
+
+
+def test_a_step_of_nan_is_left_out(device):
+    settings = TrainSettings(rounds=1, steps=6, batch=4, graph=False)
+    trainer = Trainer(TINY, settings, seed=0, device=device)
+    pool = small_pool(4).to(device)
+    plan = plan_round(settings, 4, seed=0, round=0)
+    trainer.run(pool, tuple(part[:2] for part in plan))
+    before = trainer.state()
+    broken = replace(pool, targets=torch.full_like(pool.targets, math.nan))
+    trainer.run(broken, tuple(part[2:4] for part in plan))
+    after = trainer.state()
+    assert trainer.skipped == 2 and trainer.step == 4
+    assert all(math.isfinite(value) for value in trainer.take_losses())
+    for name, value in before.items():
+        if name.startswith(("network.", "adam.")):
+            assert (value == after[name]).all(), name
+    trainer.run(pool, tuple(part[4:] for part in plan))
+    assert trainer.skipped == 2
+    assert any((value != after[name]).any() for name, value in trainer.state().items() if name.startswith("network."))
+
+
+def test_a_training_that_diverges_ends(tmp_path, monkeypatch):
+    monkeypatch.setattr("wlm.smoke.train._CHUNK", 4)
+    real = Trainer._gather
+
+    def endless(self, *args):
+        guides, targets, motion = real(self, *args)
+        return guides, torch.full_like(targets, math.inf), motion
+
+    monkeypatch.setattr(Trainer, "_gather", endless)
+    with pytest.raises(WlmError, match=r"diverged: 12 steps of round 0.*smaller rate than 0.001"):
+        _train(tmp_path / "a", _profile(steps=40))
+
+
+def test_a_plan_takes_each_sample_once_before_any_twice():
+    settings = TrainSettings(rounds=1, steps=5, batch=4, mirror="sides")
+    samples, frames, turns = plan_round(settings, 10, seed=3, round=1)
+    assert samples.shape == (5, 4) and sorted(samples.flatten().tolist()) == sorted([*range(10)] * 2)
+    assert set(frames.flatten().tolist()) == {0, 1} and turns[..., 0].any() and not turns[..., 1].any()
+    again, other = (plan_round(settings, 10, seed=3, round=number)[0] for number in (1, 2))
+    assert torch.equal(samples, again) and not torch.equal(samples, other)
+    still = plan_round(settings.model_copy(update={"mirror": "none"}), 10, seed=3, round=1)
+    assert not still[2].any()
+    pairs = plan_round(settings.model_copy(update={"losses": LossSettings(temporal=1.0)}), 10, seed=3, round=1)
+    assert pairs[0].shape == (5, 2)
+
+
+@pytest.mark.parametrize("kind", ["paper", "six"])
+@pytest.mark.parametrize("way, swapped", [(0, ("right", "left")), (1, ("top", "bottom"))])
+def test_a_sample_that_is_turned_over_is_what_its_mirror_would_be(way, swapped, kind):
+    settings = TrainSettings(batch=2, losses=LossSettings(temporal=1.0))
+    trainer = Trainer(TINY.model_copy(update={"guide": kind}), settings, seed=0, device="cpu")
+    pool = small_pool(2, kind=kind)
+    turns = torch.zeros(2, 2, dtype=torch.bool)
+    turns[0, way] = True
+    samples = torch.tensor([1, 0])
+    guides, targets, motion = trainer._gather(pool, samples, samples, turns)
+    axis = -1 - way
+    one, other = (PLANES.index(name) for name in swapped)
+    names = dict(zip(swapped, reversed(swapped), strict=True))
+    for plane, name in enumerate(GUIDES[kind]):
+        source = GUIDES[kind].index(names.get(name, name))
+        assert torch.equal(guides[0, :, plane], pool.guides[1, :, source].float().flip(axis)), name
+    assert torch.equal(targets[0, :, one], pool.targets[1, :, other].float().flip(axis))
+    assert torch.equal(targets[0, :, 5:], pool.targets[1, :, 5:].float().flip(axis))
+    assert torch.equal(motion[0, way], -pool.motion[1, way].float().flip(axis))
+    assert torch.equal(motion[0, 1 - way], pool.motion[1, 1 - way].float().flip(axis))
+    assert torch.equal(guides[1], pool.guides[0].float()) and torch.equal(targets[1], pool.targets[0].float())
+
+
+def test_profiles_load():
+    names = [name for name in profile_names("smoke") if name.startswith("network-")]
+    assert names == ["network-16", "network-24", "network-32", "network-paper"]
+    for name in names:
+        profile = load_profile(name.removeprefix("network-"))
+        kind = "paper" if name == "network-paper" else "six"
+        assert profile.name == name and profile.network.guide == profile.dataset.guide == kind
+        assert profile.network.width == (16 if kind == "paper" else int(name[-2:]))
+    with pytest.raises(WlmError, match="network-7"):
+        load_profile("7")
+
+
+@pytest.mark.parametrize(
+    "network, dataset, told",
+    [
+        ("{guide: six}", "{}", "dataset.guide: expected six, which network.guide is, found paper"),
+        ("{}", "{guide: six}", "dataset.guide: expected paper, which network.guide is, found six"),
+        ("{guide: back}", "{}", "network.guide: expected 'paper', 'front', 'sides' or 'six'"),
+        ("{decoder: [1]}", "{}", "network: decoder: expected 3 levels"),
+    ],
+)
+def test_a_profile_whose_parts_disagree_is_one_line(tmp_path, network, dataset, told):
+    path = tmp_path / "a.yaml"
+    path.write_text(f"name: a\nnetwork: {network}\ndataset: {dataset}\n")
+    with pytest.raises(WlmError) as error:
+        load_profile(str(path))
+    assert str(error.value).startswith(f"{path}: ") and told in str(error.value) and "\n" not in str(error.value)
+
+
+def test_the_rate_rises_and_falls():
+    settings = TrainSettings(rounds=2, steps=50, warmup=9, rate=1e-2, floor=0.1)
+    rates = [settings.rate_at(step) for step in range(100)]
+    assert rates[0] == pytest.approx(1e-3) and max(rates) == pytest.approx(1e-2, rel=0.03)
+    assert rates[-1] == pytest.approx(1e-3, rel=0.02) and rates[20:] == sorted(rates[20:], reverse=True)

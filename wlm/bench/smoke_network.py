@@ -1,0 +1,208 @@
+"""The neural six-way lightmaps against marches, flip books and path tracing: time and error, in one run.
+
+All look at frames of a jet, a plume, a flame and a burst that no network has learned from, nor was chosen by, from one
+camera, and are held against the six-way march in steps of half a voxel. PSNR is of the six lightmaps in sRGB with a
+peak of 1, an image at a time: its mean, least and most. The methods, each a table of its own:
+
+- "time against error": the fine march ("six ways") and the coarse one by their steps in voxels, and networks with the
+  guiding map that each reads and with its planes decoded to light. The emission is that of frames that glow. Times are
+  of a frame, the mean over all; on a GPU as replayed graphs, and as the calls that a user makes beside it.
+- "frame": where the time of a frame goes, and the simulation beside it. "shade" weighs for two lights.
+- "flip book": lightmaps baked from one side, on a billboard that turns with the camera; what the coarse march and the
+  first network make of the turned view is beside it.
+- "path tracing": all six lightmaps by Mitsuba at one bounce, on the CPU whatever the device, with and without a
+  denoiser; only with the extra `bake`.
+- "profiles": the networks' own time by profile, with random weights.
+- "density": the same frames and those a moment before them, with another density. The flicker is the mean change of
+  the lightmaps along the motion, in levels of 255, also over that of the reference, in which nothing flickers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from wlm.bench.plot import Panel
+from wlm.bench.runner import Row
+from wlm.bench.smoke_network_parts import density_rows, frame_rows, profile_rows
+from wlm.bench.smoke_network_rivals import flipbook_rows, traced_rows
+from wlm.bench.smoke_network_setup import (
+    EXACT,
+    FULL,
+    QUICK,
+    Frame,
+    NetworkBench,
+    NetworkSizes,
+    Subject,
+    Whole,
+    open_subjects,
+    row,
+    score,
+)
+from wlm.interop import check_device
+from wlm.metrics.error import psnr_from_mse
+from wlm.smoke.coarse import coarse_six_way
+from wlm.smoke.infer import predict
+from wlm.smoke.network_file import shipped
+from wlm.smoke.reference import SixWay, six_way
+from wlm.smoke.samples import EMISSION_PLANE, OPACITY_PLANE, encode_lightmaps
+
+__all__ = ["PANELS", "plotted", "run", "run_rows"]
+
+PANELS = (Panel("decode_ms", "psnr"),)
+"""What a plot shows."""
+
+_TABLE = "time against error"
+_DEAR = 5.0  # voxels, the longest step of a six-way march that takes long
+
+
+def run(
+    networks: Sequence[str | Path] = (),
+    profiles: Sequence[str] = (),
+    *,
+    quick: bool,
+    device: str,
+    progress: Callable[[str], None] | None = None,
+) -> list[Row]:
+    """Measures networks and what they are compared with.
+
+    Args:
+        networks: Files of trained ones.
+        profiles: Names of profiles whose untrained networks are timed. With neither, the network that comes with wlm.
+        quick: Small grids, for a minute on a CPU. Otherwise the paper's, for a GPU.
+        device: "cpu" or "cuda:0".
+        progress: Called with a line before each part of the work.
+
+    Returns:
+        The rows, method by method.
+
+    Raises:
+        WlmError: A network or a profile can't be read, or the device isn't there or hasn't the memory.
+    """
+    subjects = open_subjects(networks if networks or profiles else [shipped()], profiles)
+    return run_rows(QUICK if quick else FULL, subjects, device=device, progress=progress)
+
+
+def run_rows(
+    sizes: NetworkSizes, subjects: Sequence[Subject], *, device: str, progress: Callable[[str], None] | None = None
+) -> list[Row]:
+    """Measures them on given grids.
+
+    Args:
+        sizes: Of the grids.
+        subjects: The networks.
+        device: "cpu" or "cuda:0".
+        progress: As for ``run``.
+
+    Raises:
+        WlmError: As ``run``.
+    """
+    bench = NetworkBench(check_device(device), sizes, subjects, progress)
+    parts = (error_rows, frame_rows, flipbook_rows, traced_rows, profile_rows, density_rows)
+    return [one for part in parts for one in part(bench)]
+
+
+def error_rows(bench: NetworkBench) -> list[Row]:
+    """Time and error of marches by their steps, and of networks."""
+    bench.note(_TABLE)
+    makers: dict[str, Callable[..., torch.Tensor] | None] = {}  # None: nothing to score
+    notes = {f"six ways, step {EXACT:g}": "what all is held against"}
+    calls: dict[str, Callable[[], object]] = {}
+    chains: dict[str, Callable[[], object]] = {}  # of graphs that each network has already
+    for step in bench.sizes.six:
+        name = f"six ways, step {step:g}"
+        makers[name] = None if name in notes else _six_maker(step)
+        calls[name] = _on_all(bench, _six_call(bench, step))
+    for jitter in (1.0, 0.0):
+        for step in bench.sizes.coarse:
+            name = f"coarse, h {step:g}" + ("" if jitter else ", no jitter")
+            makers[name] = _coarse_maker(step, jitter)
+            calls[name] = _on_all(bench, _coarse_call(bench, step, jitter))
+    for subject in bench.subjects:
+        for half in (True, False) if bench.device != "cpu" else (False,):
+            name = f"{subject.name}, {'fp16' if half else 'fp32'}"
+            whole = Whole(bench, subject, half=half)
+            makers[name] = whole.planes if subject.trained else None
+            if not subject.trained:
+                notes[name] = "not trained"
+            calls[name] = _on_all(bench, _predict_call(bench, whole))
+            parts = [part for frame in bench.frames for part in whole.parts(frame).values()]
+            chains[name] = _in_turn(parts)
+    dear = {name for name in calls if name.startswith("six ways") and float(name.split()[-1]) <= _DEAR}
+    cheap = {name: call for name, call in calls.items() if name not in dear}
+    marched = {name: call for name, call in cheap.items() if name not in chains}
+    long = {name: calls[name] for name in calls if name in dear}
+    eager = bench.time(cheap) | bench.time(long, few=True)
+    graphs = bench.replayed(marched) | bench.replayed(long, few=True)
+    if bench.device != "cpu":
+        graphs |= bench.time(chains)
+    glowing = [i for i, frame in enumerate(bench.frames) if frame.later.temperature is not None]
+    rows = []
+    for name, maker in makers.items():
+        figures, scores = {}, None
+        if maker is not None:
+            made = [maker(frame.later, bench.camera, frame.seed + 1) for frame in bench.frames]
+            scores = score(made, bench.references)
+            figures = scores.figures | {"opacity dB": f"{_plane(OPACITY_PLANE, made, bench.references):.2f}"}
+            if glowing:
+                parts = ([planes[i] for i in glowing] for planes in (made, bench.references))
+                figures["emission dB"] = f"{_plane(EMISSION_PLANE, *parts):.2f}"
+        if name in graphs:
+            figures["as calls, ms"] = f"{eager[name].median_ms / len(bench.frames):.3g}"
+        timing = graphs.get(name, eager[name])
+        psnr = None if scores is None else scores.mean
+        rows.append(row(_TABLE, name, figures, notes.get(name, ""), timing=timing, calls=len(bench.frames), psnr=psnr))
+    return rows
+
+
+def plotted(rows: Sequence[Row]) -> list[Row]:
+    """The rows that a plot shows, with the first part of what they are for their method."""
+    shown = []
+    for one in rows:
+        if one.method == _TABLE:
+            method, _, option = one.option.partition(", ")
+            shown.append(replace(one, method=method, option=option))
+    return shown
+
+
+def _plane(plane: int, made: Sequence[torch.Tensor], references: Sequence[torch.Tensor]) -> float:
+    """PSNR of one of the planes, over all frames."""
+    off = [float((a[plane] - b[plane]).square().mean()) for a, b in zip(made, references, strict=True)]
+    return psnr_from_mse(sum(off) / len(off), 1.0)
+
+
+def _on_all(bench: NetworkBench, call: Callable[[Frame], object]) -> Callable[[], object]:
+    return lambda: [call(frame) for frame in bench.frames]
+
+
+def _in_turn(parts: Sequence[Callable[[], object]]) -> Callable[[], object]:
+    return lambda: [part() for part in parts]
+
+
+def _six_call(bench: NetworkBench, step: float) -> Callable[[Frame], SixWay]:
+    return lambda frame: six_way(frame.later, bench.camera, step=step, estimate=False)
+
+
+def _coarse_call(bench: NetworkBench, step: float, jitter: float) -> Callable[[Frame], object]:
+    return lambda frame: coarse_six_way(frame.later, bench.camera, step=step, jitter=jitter, seed=frame.seed + 1)
+
+
+def _six_maker(step: float) -> Callable[..., torch.Tensor]:
+    return lambda volume, camera, seed: encode_lightmaps(six_way(volume, camera, step=step, estimate=False))
+
+
+def _coarse_maker(step: float, jitter: float) -> Callable[..., torch.Tensor]:
+    return lambda volume, camera, seed: encode_lightmaps(
+        coarse_six_way(volume, camera, step=step, jitter=jitter, seed=seed).six
+    )
+
+
+def _predict_call(bench: NetworkBench, whole: Whole) -> Callable[[Frame], SixWay]:
+    def call(frame: Frame) -> SixWay:
+        look = whole.subject.settings.look(frame.later.shape) | {"seed": frame.seed + 1}
+        return predict(frame.later, bench.camera, whole.predictor, **look)
+
+    return call

@@ -1,0 +1,94 @@
+"""What a frame's lightmaps could be made by instead of a network: a flip book seen from aside, a path tracer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import torch
+
+from wlm.bench.path_tracer import PathTracer, denoise, has_denoiser, has_tracer
+from wlm.bench.runner import Row
+from wlm.bench.smoke_network_setup import EXACT, NetworkBench, Scores, Whole, row, score
+from wlm.bench.timing import time_together
+from wlm.smoke.baselines import billboard
+from wlm.smoke.coarse import coarse_six_way
+from wlm.smoke.reference import SixWay, six_way
+from wlm.smoke.samples import encode_lightmaps, to_srgb
+
+__all__ = ["flipbook_rows", "traced_rows"]
+
+_DENOISED = "denoised"
+
+
+def flipbook_rows(bench: NetworkBench) -> list[Row]:
+    """A flip book baked from the first camera, under cameras that turn away from it."""
+    bench.note("flip book")
+    frames = bench.frames[:: bench.sizes.frames]  # one of each scene
+    baked = [six_way(frame.later, bench.camera, step=EXACT, estimate=False) for frame in frames]
+    pivots = [frame.later.centre for frame in frames]
+    ours = Whole(bench, bench.trained[0], half=True) if bench.trained else None
+    step = bench.settings.look(frames[0].later.shape)["step"]
+    rows = []
+    for degrees in bench.sizes.turns:
+        camera = bench.turned(degrees)
+        references = [bench.reference(frame.later, camera) for frame in frames]
+
+        def turned(camera=camera) -> list[SixWay]:
+            return [billboard(six, bench.camera, camera, at) for six, at in zip(baked, pivots, strict=True)]
+
+        marched = [coarse_six_way(frame.later, camera, step=step, seed=frame.seed + 1).six for frame in frames]
+        found = score([encode_lightmaps(six) for six in turned()], references)
+        beside = score([encode_lightmaps(six) for six in marched], references)
+        figures = found.figures | {f"coarse march, h {step:g}, dB": f"{beside.mean:.2f}"}
+        if ours is not None:
+            made = [ours.planes(frame.later, camera, frame.seed + 1) for frame in frames]
+            figures[f"{ours.subject.name}, dB"] = f"{score(made, references).mean:.2f}"
+        timing = bench.time({"": turned}, few=True)[""]
+        rows.append(
+            row("flip book", f"turned {degrees:g}°", figures, timing=timing, calls=len(frames), psnr=found.mean)
+        )
+    return rows
+
+
+def traced_rows(bench: NetworkBench) -> list[Row]:
+    """All six lightmaps by a path tracer on the CPU, with and without a denoiser, where they are installed."""
+    if not has_tracer():
+        bench.note("path tracing: left out, mitsuba isn't installed: wlm[bake]")
+        return []
+    bench.note("path tracing")
+    numbers = range(0, len(bench.frames), bench.sizes.frames)  # one frame of each scene
+    tracers = [PathTracer(bench.frames[i].later, bench.camera) for i in numbers]
+    references = [bench.references[i].cpu() for i in numbers]
+    made = {count: [tracer(count)[0] for tracer in tracers] for count in bench.sizes.samples}
+    calls: dict[str, Callable[[], object]] = {_name(count): _traced(tracers[0], count) for count in made}
+    if has_denoiser():
+        calls[_DENOISED] = _cleaned(made[bench.sizes.samples[0]][0])
+    times = {name: found.median_ms for name, found in time_together(calls, "cpu", 1, bench.sizes.few).items()}
+    on = {"pixels": f"{bench.sizes.resolution}²", "on": f"CPU, {tracers[0].variant}"}
+    rows = []
+    for count, images in made.items():
+        name = _name(count)
+        found = _score(images, references)
+        rows.append(row("path tracing", name, found.figures | on, decode_ms=times[name], psnr=found.mean))
+        if _DENOISED in times:
+            found, total = _score([denoise(image) for image in images], references), times[name] + times[_DENOISED]
+            option = f"{name}, {_DENOISED}"
+            rows.append(row("path tracing", option, found.figures | on, decode_ms=total, psnr=found.mean))
+    return rows
+
+
+def _name(count: int) -> str:
+    return "1 sample" if count == 1 else f"{count} samples"
+
+
+def _traced(tracer: PathTracer, samples: int) -> Callable[[], object]:
+    return lambda: tracer(samples)
+
+
+def _cleaned(image: np.ndarray) -> Callable[[], object]:
+    return lambda: denoise(image)
+
+
+def _score(images: Sequence[np.ndarray], references: Sequence[torch.Tensor]) -> Scores:
+    return score([to_srgb(torch.from_numpy(image)) for image in images], references)

@@ -1,0 +1,56 @@
+"""How smoke moves across the image between two frames, from the solver's own velocities: the optical flow that the
+paper's temporal loss estimates from pictures (neural-six-way-lightmaps, eq. 9) is known here."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+import warp as wp
+
+from wlm.interop import stream, to_warp
+from wlm.smoke.axes import Camera
+from wlm.smoke.volume import DensityVolume
+from wlm_kernels import marching_motion
+
+__all__ = ["motion"]
+
+
+def motion(
+    volume: DensityVolume, velocity: wp.array, camera: Camera, *, reach: float, step: float = 2.0
+) -> torch.Tensor:
+    """Projects the air's motion into the image, weighted by what the camera sees of the smoke that it carries.
+
+    A pixel shows smoke at many depths, of which each moves otherwise: this is their mean, and hidden smoke hardly
+    counts. Light that moves while smoke doesn't, a shadow's edge, isn't in it.
+
+    Args:
+        volume: The later frame's smoke.
+        velocity: vec3 [A, B, C] on the smoke's device, of the air over the volume's box in cells of any size, as
+            `Solver.velocity` has it.
+        camera: Orthographic, the same for both frames.
+        reach: Lengths of the world that a velocity of 1 goes between the frames: of a solver, a cell's edge times the
+            steps of its lattice.
+        step: The longest step, in voxels.
+
+    Returns:
+        float32 [2, H, W]: pixels to the right and down by which what a pixel shows has moved since the earlier frame; 0
+        where there is no smoke. So the earlier frame, read at the pixel less this, shows the same smoke.
+
+    Raises:
+        ValueError: The camera is in perspective, the velocity isn't vec3 [A, B, C], or a number is out of its range.
+    """
+    if not 0 < step < math.inf:
+        raise ValueError(f"step: expected voxels, above 0, got {step}")
+    if not math.isfinite(reach):
+        raise ValueError(f"reach: expected a finite length, got {reach}")
+    if velocity.dtype is not wp.vec3 or velocity.ndim != 3 or 0 in velocity.shape:
+        raise ValueError(f"velocity: expected vec3 [A, B, C], got {velocity.dtype.__name__} {velocity.shape}")
+    view, _ = camera.view(volume.origin, volume.voxel, volume.shape)
+    device = "cpu" if volume.device.type == "cpu" else f"cuda:{volume.device.index or 0}"
+    with stream(device):
+        out = torch.empty((2, camera.height, camera.width), dtype=torch.float32, device=volume.device)
+        density, _ = volume.arrays()
+        extinction, reached = volume.extinction * volume.voxel, reach / volume.voxel
+        marching_motion.motion(density, extinction, velocity, reached, view, to_warp(out), step=step)
+    return out
