@@ -32,6 +32,22 @@ def test_parts_are_made_only_where_they_weigh():
     assert float(Losses(LossSettings())(predicted, targets, None)["mse"]) == pytest.approx(0.01, rel=1e-4)
 
 
+def test_light_is_compared_in_srgb_or_as_it_is():
+    """An error of one size in the dark counts for less as light, opacity's for the same; below 0 there is a slope."""
+    target = torch.zeros(1, 1, 8, 4, 4)
+    target[:, :, :3] = 0.1
+    target[:, :, 3:6] = 0.8
+    linear = Losses(LossSettings(srgb=False))
+    for plane, share in ((0, 0.05), (3, 2.5), (6, 1.0)):
+        off = target.clone()
+        off[:, :, plane] += 0.01
+        ratio = float(linear(off, target, None)["mse"] / Losses(LossSettings())(off, target, None)["mse"])
+        assert ratio == pytest.approx(share, rel=0.5 if plane < 6 else 1e-4)
+    below = (target - 0.2).requires_grad_()
+    linear(below, target, None)["loss"].backward()
+    assert (below.grad != 0).all()
+
+
 def test_emission_that_is_not_made_is_not_learned():
     targets = small_pool().targets.float()
     predicted = targets.clone()

