@@ -1,10 +1,12 @@
+import gc
+
 import pytest
 import torch
 import warp as wp
 
 from wlm import interop
 from wlm.errors import WlmError
-from wlm.interop import StepGraph, available_devices, check_device, stream, to_warp
+from wlm.interop import StepGraph, available_devices, check_device, device_name, no_collection, stream, to_warp
 
 
 @wp.kernel(enable_backward=False, module="unique")
@@ -43,6 +45,23 @@ def test_a_gpu_that_only_warp_sees_is_refused_with_the_reason(monkeypatch):
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
     with pytest.raises(WlmError, match="this build of torch does not"):
         check_device("cuda")
+
+
+def test_a_device_of_torch_has_the_name_that_is_checked(device):
+    assert device_name(torch.empty(1, device=device).device) == device
+    assert device_name(torch.device("cuda")) == "cuda:0" and device_name(torch.device("cuda:3")) == "cuda:3"
+
+
+@pytest.mark.parametrize("on", [True, False])
+def test_nothing_is_collected_inside_and_all_is_as_before_after(monkeypatch, on):
+    seen = []
+    monkeypatch.setattr(gc, "isenabled", lambda: on)
+    for name in ("enable", "disable"):
+        monkeypatch.setattr(gc, name, lambda name=name: seen.append(name))
+    with pytest.raises(KeyError), no_collection():
+        assert seen == ["disable"]
+        raise KeyError
+    assert seen == ["disable"] + ["enable"] * on
 
 
 def test_a_wrapped_tensor_shares_memory_and_has_no_gradient(device):

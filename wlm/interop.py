@@ -12,7 +12,16 @@ import warp as wp
 
 from wlm.errors import WlmError
 
-__all__ = ["StepGraph", "available_devices", "check_device", "free_memory", "stream", "to_warp"]
+__all__ = [
+    "StepGraph",
+    "available_devices",
+    "check_device",
+    "device_name",
+    "free_memory",
+    "no_collection",
+    "stream",
+    "to_warp",
+]
 
 
 def available_devices() -> list[str]:
@@ -41,6 +50,11 @@ def check_device(name: str) -> str:
             hint = "; Warp sees a GPU that this build of torch does not"
         raise WlmError(f"device '{name}': expected one of: {', '.join(devices)}{hint}")
     return wanted
+
+
+def device_name(device: torch.device) -> str:
+    """The name of a tensor's device as `check_device` returns it and `stream` takes it."""
+    return "cpu" if device.type == "cpu" else f"cuda:{device.index or 0}"
 
 
 def free_memory(device: wp.Device) -> int:
@@ -109,6 +123,18 @@ def stream(device: str) -> Iterator[torch.cuda.Stream | None]:
     outer.wait_stream(side)
 
 
+@contextmanager
+def no_collection() -> Iterator[None]:
+    """Keeps the garbage collector off inside the block: in a capture it could free an older graph, which breaks it."""
+    collecting = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if collecting:
+            gc.enable()
+
+
 class StepGraph:
     """A step that runs many times: captured once as a graph and replayed on CUDA, just called on the CPU.
 
@@ -161,18 +187,12 @@ class StepGraph:
         warp_side = _side_stream(self._device)[1]
         # torch opens the capture; Warp is told of it, so that it frees nothing in the middle of it. Both use
         # the thread-local mode, which lets other threads (a loader, say) allocate meanwhile.
-        # A collection in the middle could free an older graph, which breaks the capture.
-        collecting = gc.isenabled()
-        gc.disable()
-        try:
-            with (
-                torch.cuda.graph(graph, stream=side, capture_error_mode="thread_local"),
-                wp.ScopedCapture(stream=warp_side, external=True),
-            ):
-                self._step()
-        finally:
-            if collecting:
-                gc.enable()
+        with (
+            no_collection(),
+            torch.cuda.graph(graph, stream=side, capture_error_mode="thread_local"),
+            wp.ScopedCapture(stream=warp_side, external=True),
+        ):
+            self._step()
         return graph
 
 

@@ -28,6 +28,8 @@ __all__ = [
     "guide",
     "guide_kernels",
     "lattice",
+    "node_at",
+    "node_position",
     "nodes_along",
     "occupied",
     "optical_depth",
@@ -230,12 +232,7 @@ def guide_kernels(dtype: Any) -> _Kernels:
         nodes: wp.array3d[wp.vec2],
     ):
         a, b, c = wp.tid()
-        size = size_of(density)
-        p = wp.vec3(
-            float(a) * (size[0] + 1.0) / float(nodes.shape[0] - 1) - 0.5,
-            float(b) * (size[1] + 1.0) / float(nodes.shape[1] - 1) - 0.5,
-            float(c) * (size[2] + 1.0) / float(nodes.shape[2] - 1) - 0.5,
-        )
+        p = node_position(nodes, size_of(density), a, b, c)
         nodes[a, b, c] = wp.vec2(
             plain_depth(density, p, up, extinction, h), plain_depth(density, p, -up, extinction, h)
         )
@@ -299,7 +296,7 @@ def guide_kernels(dtype: Any) -> _Kernels:
                             depth = (s + lead) * unit
                         tau = wp.vec2()
                         if wp.static(from_lattice):
-                            tau = _node_at(nodes, p, size_of(density))
+                            tau = node_at(nodes, p, size_of(density))
                         else:
                             tau = wp.vec2(
                                 plain_depth(density, p, view.up, extinction, h),
@@ -337,15 +334,25 @@ def plain_depth(density: wp.array3d[Any], p: wp.vec3, toward: wp.vec3, extinctio
 
 
 @wp.func
-def _face_at(nodes: wp.array3d[wp.vec2], i: int, j: int, k: int, fy: float, fz: float) -> wp.vec2:
+def node_position(nodes: wp.array3d[Any], size: wp.vec3, i: int, j: int, k: int) -> wp.vec3:
+    """Where a lattice's node lies: the first and the last along an axis on the borders of the smoke."""
+    return wp.vec3(
+        float(i) * (size[0] + 1.0) / float(nodes.shape[0] - 1) - 0.5,
+        float(j) * (size[1] + 1.0) / float(nodes.shape[1] - 1) - 0.5,
+        float(k) * (size[2] + 1.0) / float(nodes.shape[2] - 1) - 0.5,
+    )
+
+
+@wp.func
+def _face_at(nodes: wp.array3d[Any], i: int, j: int, k: int, fy: float, fz: float):
     a = wp.lerp(nodes[i, j, k], nodes[i, j, k + 1], fz)
     b = wp.lerp(nodes[i, j + 1, k], nodes[i, j + 1, k + 1], fz)
     return wp.lerp(a, b, fy)
 
 
 @wp.func
-def _node_at(nodes: wp.array3d[wp.vec2], p: wp.vec3, size: wp.vec3) -> wp.vec2:
-    """Trilinear between the nodes, which reach from border to border of the smoke."""
+def node_at(nodes: wp.array3d[Any], p: wp.vec3, size: wp.vec3):
+    """Trilinear between a lattice's nodes."""
     x = (p[0] + 0.5) * float(nodes.shape[0] - 1) / (size[0] + 1.0)
     y = (p[1] + 0.5) * float(nodes.shape[1] - 1) / (size[1] + 1.0)
     z = (p[2] + 0.5) * float(nodes.shape[2] - 1) / (size[2] + 1.0)

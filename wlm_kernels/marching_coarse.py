@@ -16,6 +16,8 @@ from wlm_kernels.marching import (
     absorbed,
     clip,
     density_at,
+    node_at,
+    node_position,
     nodes_along,
     phase,
     plain_depth,
@@ -49,38 +51,13 @@ def coarse_kernels(dtype: Any, hot: bool):
         nodes: wp.array3d[wp.vec4],
     ):
         a, b, c = wp.tid()
-        size = size_of(density)
-        p = wp.vec3(
-            float(a) * (size[0] + 1.0) / float(nodes.shape[0] - 1) - 0.5,
-            float(b) * (size[1] + 1.0) / float(nodes.shape[1] - 1) - 0.5,
-            float(c) * (size[2] + 1.0) / float(nodes.shape[2] - 1) - 0.5,
-        )
+        p = node_position(nodes, size_of(density), a, b, c)
         nodes[a, b, c] = wp.vec4(
             plain_depth(density, p, view.right, extinction, h),
             plain_depth(density, p, -view.right, extinction, h),
             plain_depth(density, p, view.up, extinction, h),
             plain_depth(density, p, -view.up, extinction, h),
         )
-
-    @wp.func
-    def node_at(nodes: wp.array3d[wp.vec4], p: wp.vec3, size: wp.vec3) -> wp.vec4:
-        x = (p[0] + 0.5) * float(nodes.shape[0] - 1) / (size[0] + 1.0)
-        y = (p[1] + 0.5) * float(nodes.shape[1] - 1) / (size[1] + 1.0)
-        z = (p[2] + 0.5) * float(nodes.shape[2] - 1) / (size[2] + 1.0)
-        i = wp.clamp(int(x), 0, nodes.shape[0] - 2)
-        j = wp.clamp(int(y), 0, nodes.shape[1] - 2)
-        k = wp.clamp(int(z), 0, nodes.shape[2] - 2)
-        fx = wp.clamp(x - float(i), 0.0, 1.0)
-        fy = wp.clamp(y - float(j), 0.0, 1.0)
-        fz = wp.clamp(z - float(k), 0.0, 1.0)
-        a = wp.lerp(
-            wp.lerp(nodes[i, j, k], nodes[i, j, k + 1], fz), wp.lerp(nodes[i, j + 1, k], nodes[i, j + 1, k + 1], fz), fy
-        )
-        i += 1
-        b = wp.lerp(
-            wp.lerp(nodes[i, j, k], nodes[i, j, k + 1], fz), wp.lerp(nodes[i, j + 1, k], nodes[i, j + 1, k + 1], fz), fy
-        )
-        return wp.lerp(a, b, fx)
 
     @wp.kernel(module="unique", module_options=_OPTIONS)
     def gather(

@@ -22,8 +22,11 @@ _PER_LANE = 4
 
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
+    // Not the active threads: after a branch these needn't be the whole group yet.
+    const unsigned first = (threadIdx.x % 32) / count * count;
+    const unsigned group = (0xffffffffu >> (32 - count)) << first;
     for (int step = count / 2; step > 0; step /= 2)
-        value += __shfl_xor_sync(__activemask(), value, step, count);
+        value += __shfl_xor_sync(group, value, step, count);
 #endif
     return value;
 """)

@@ -192,17 +192,14 @@ def test_the_command(rows, network, tmp_path, monkeypatch):
     assert "#### profiles: unseen smoke" in result.output and (tmp_path / "a.png").stat().st_size > 1000
 
 
-def test_what_is_measured_if_nothing_is_named(network, monkeypatch):
-    """wlm's own network; of profiles alone, no trained one."""
+def test_networks_or_profiles_are_needed(monkeypatch):
     seen = []
-    monkeypatch.setattr(bench, "shipped", lambda: network)
     monkeypatch.setattr(bench, "run_rows", lambda sizes, subjects, **options: seen.append((sizes, subjects)))
-    run(quick=True, device="cpu")
-    run([], ["16"], quick=False, device="cpu")
-    assert [(sizes == QUICK, [one.name for one in subjects]) for sizes, subjects in seen] == [
-        (True, ["young"]),
-        (False, ["network-16 untrained"]),
-    ]
+    with pytest.raises(WlmError, match="^bench: expected --network FILE or --profile NAME, found neither$"):
+        run(quick=True, device="cpu")
+    run([], ["16"], quick=True, device="cpu")
+    ((sizes, (subject,)),) = seen
+    assert sizes == QUICK and subject.name == "network-16 untrained"
 
 
 def test_without_the_extra(monkeypatch):

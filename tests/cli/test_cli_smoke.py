@@ -178,7 +178,71 @@ def test_a_blow_up_keeps_the_last_good_state(tmp_path, monkeypatch):
     assert (out / CHECKPOINT).exists()
     monkeypatch.undo()
     first = simulate(open_frames(out, scene, resume=True), resume=True)
-    assert 1 < first <= 4 and not (out / CHECKPOINT).exists() and open_footage(out).numbers == (1, 2, 3, 4)
+    assert first == 3 and not (out / CHECKPOINT).exists() and open_footage(out).numbers == (1, 2, 3, 4)
+
+
+def test_a_frame_that_cannot_be_written_is_not_resumed_past(tmp_path, monkeypatch):
+    """A state is kept after its frame: where the frame isn't there, it is simulated again."""
+    monkeypatch.setattr(wlm.smoke.simulate, "KEPT_EVERY", 1)
+    scene, out, save = Scene.model_validate(JET), tmp_path / "out", save_volume
+
+    def full(path, volume):
+        if path.name == "frame_0003.npz":
+            raise WlmError(f"{path}: cannot write: no space left")
+        save(path, volume)
+
+    monkeypatch.setattr(wlm.smoke.simulate, "save_volume", full)
+    with pytest.raises(WlmError, match="no space left"):
+        simulate(open_frames(out, scene))
+    monkeypatch.setattr(wlm.smoke.simulate, "save_volume", save)
+    kept = (out / CHECKPOINT).read_bytes()
+    # A frame that was lost otherwise can't be made of the state that is kept.
+    (out / "frame_0001.npz").rename(tmp_path / "one.npz")
+    with pytest.raises(WlmError, match="expected frame_0001.npz, since the state that is kept is of frame 2"):
+        simulate(open_frames(out, scene, resume=True), resume=True)
+    (tmp_path / "one.npz").rename(out / "frame_0001.npz")
+    assert (out / CHECKPOINT).read_bytes() == kept
+    assert simulate(open_frames(out, scene, resume=True), resume=True) == 3
+    assert open_footage(out).numbers == (1, 2, 3, 4) and not (out / CHECKPOINT).exists()
+
+
+def test_fewer_frames_leave_the_state_that_is_past_them(tmp_path):
+    scene, out = Scene.model_validate(JET), tmp_path / "out"
+
+    def stopped(frame, figures):
+        if frame == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        simulate(open_frames(out, scene), progress=stopped)
+    kept = (out / CHECKPOINT).read_bytes()
+    fewer = scene.model_copy(update={"frames": 2})
+    assert simulate(open_frames(out, fewer, resume=True), resume=True) == 3
+    assert (out / CHECKPOINT).read_bytes() == kept
+    assert simulate(open_frames(out, scene, resume=True), resume=True) == 4
+    assert open_footage(out).numbers == (1, 2, 3, 4) and not (out / CHECKPOINT).exists()
+
+
+def test_earlier_results_outlast_a_command_that_cannot_be(jet, tmp_path, monkeypatch):
+    """Frames, and lightmaps, guides and pictures made of them, when the next run ends before its first result."""
+    frames = write_frames(tmp_path / "frames", frames=2).folder
+    made = {"bake": "bake", "guide": "guide", "shade": "shade"}
+    for command, folder in made.items():
+        call("smoke", command, frames, "-o", tmp_path / folder, "--resolution", 8)
+    call("smoke", "shade", tmp_path / "bake", "-o", tmp_path / "baked")
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    for command, folder in made.items():
+        line = fails("smoke", command, frames, "-o", tmp_path / folder, "--toward", "0,0,0")
+        assert "--toward: expected a direction" in line
+    for path in (frames / "frame_0001.npz", tmp_path / "bake" / "six_0001.exr"):
+        path.write_bytes(b"x")
+    fails("smoke", "guide", frames, "-o", tmp_path / "guide")
+    fails("smoke", "shade", tmp_path / "bake", "-o", tmp_path / "baked")
+    monkeypatch.setattr(wlm.smoke.simulate, "free_memory", lambda device: 3 * 2**10)
+    line = fails("smoke", "simulate", jet / "jet.yaml", "-o", frames)
+    assert re.search(r"8 x 10 x 8 cells of air and 16 x 20 x 16 of smoke need .* the 0.0 GiB that are free", line)
+    changed = {path for path, content in before.items() if not path.exists() or path.read_bytes() != content}
+    assert changed == {frames / "frame_0001.npz", tmp_path / "bake" / "six_0001.exr"}
 
 
 @pytest.mark.parametrize("case", ["empty", "covered", "one cell", "hot", "bricks of halves"])
@@ -376,7 +440,10 @@ def test_wrong_words_are_one_line(volume, frames, baked, tmp_path):
     assert "--white: expected a number above 0" in fails(*shaded, "--white", 0)
     assert "--background: expected three numbers" in fails(*shaded, "--background", "black")
     one = baked / "six_0001.exr"
-    assert "was baked: --resolution" in fails("smoke", "shade", one, "-o", tmp_path / "a.png", "--resolution", 8)
+    for option, value in (("resolution", 8), ("emission", 0), ("step", 1), ("supersample", 1), ("turn", 5)):
+        for command in ("shade", "flipbook"):
+            line = fails("smoke", command, one, "-o", tmp_path / "a.png", f"--{option}", value)
+            assert f"was baked: --{option} has to be given to bake" in line
     assert "expected a folder that simulate or bake wrote" in fails("smoke", "shade", tmp_path, "-o", tmp_path / "x")
     packed = ("smoke", "flipbook", baked, "-o", tmp_path / "a.png")
     assert "--layout: expected one of unity" in fails(*packed, "--layout", "godot")

@@ -12,7 +12,7 @@ import yaml
 from smoke_plumes import plume, write_frames
 from test_cli import call, fails
 
-from wlm.smoke import network_file
+from wlm.smoke import dataset
 from wlm.smoke.coarse import coarse_six_way
 from wlm.smoke.dataset import DatasetSettings
 from wlm.smoke.frames import open_footage, read_six_way, save_volume
@@ -111,6 +111,25 @@ def test_nothing_to_resume_is_told(trained, tmp_path):
     assert "a.safetensors.partial: there is nothing to resume; starting at step 0" in call.stderr
 
 
+def test_a_training_is_stopped_before_its_first_step(trained, tmp_path, monkeypatch):
+    folder, _, _ = trained
+    words = ("smoke", "train", folder / "tiny.yaml", "-o", tmp_path / "a.safetensors", "--seed", 3)
+
+    def interrupted(*_, progress, **__):
+        os.kill(os.getpid(), signal.SIGINT)
+        progress(1, {})
+
+    with monkeypatch.context() as patch:
+        patch.setattr(dataset, "make_pool", interrupted)
+        call(*words, code=130)
+    assert "stopped before another step: the same command with --resume goes on" in call.stderr
+    call(*words, "--resume")
+    held = (tmp_path / "a.safetensors").read_bytes()
+    assert held == (folder / "a.safetensors").read_bytes()
+    assert "a.safetensors: is finished; without --resume it is trained anew" in fails(*words, "--resume")
+    assert (tmp_path / "a.safetensors").read_bytes() == held
+
+
 def test_predict_looks_as_training_did(network, volume, tmp_path):
     out = tmp_path / "a.exr"
     text = call("smoke", "predict", volume, "-o", out, "--network", network, "--resolution", 20, "--seed", 4)
@@ -142,16 +161,6 @@ def test_predict_frames(network, tmp_path):
     call("smoke", "predict", folder, "-o", tmp_path / "six", "--network", network, "--resolution", 17)
     assert sorted(os.listdir(tmp_path / "six")) == [f"six_{i:04d}.exr" for i in (1, 2, 3)]
     assert read_six_way(tmp_path / "six" / "six_0002.exr")[0].lightmaps.shape == (6, 17, 17)
-
-
-def test_the_network_that_comes_along_is_the_default(network, volume, tmp_path, monkeypatch):
-    monkeypatch.setattr(network_file, "_SHIPPED", "none.safetensors")
-    words = ("smoke", "predict", volume, "-o", tmp_path / "a.exr", "--resolution", 12)
-    assert "none.safetensors: expected the network that comes with wlm" in fails(*words)
-    monkeypatch.setattr(network_file, "shipped", lambda: network)
-    call(*words)
-    call("smoke", "predict", volume, "-o", tmp_path / "b.exr", "--resolution", 12, "--network", network)
-    assert (tmp_path / "a.exr").read_bytes() == (tmp_path / "b.exr").read_bytes()
 
 
 def test_evaluate(network, volume, tmp_path):
@@ -188,6 +197,9 @@ def test_wrong_words_are_one_line(trained, network, volume, tmp_path):
     out = tmp_path / "a.exr"
     made = ("smoke", "predict", volume, "-o", out)
     assert "--coarse: expected no --network" in fails(*made, "--coarse", "--network", network)
+    assert "--network: expected a file that train wrote, or --coarse; found neither" in fails(*made)
+    assert "Missing argument 'NETWORK'" in fails("smoke", "evaluate")
+    assert "Missing argument 'NETWORK'" in fails("smoke", "export", "-o", tmp_path / "a.onnx")
     assert "gone.safetensors: cannot read" in fails(*made, "--network", tmp_path / "gone.safetensors")
     assert "expected an artifact" in fails(*made, "--network", volume)
     assert "device 'tpu'" in fails(*made, "--network", network, "--device", "tpu")

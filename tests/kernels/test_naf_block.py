@@ -25,7 +25,7 @@ def _random(half: bool, *shape: int) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("half, error", [(False, 1e-5), (True, 2e-3)])
-@pytest.mark.parametrize("channels", [1, 8, 17, 128])
+@pytest.mark.parametrize("channels", [1, 8, 17, 40, 56, 128])
 def test_norm(device, half, error, channels):
     x, shift = 3 * _random(half, 10, channels), _random(False, 2, channels)
     x[4] = 0
@@ -54,7 +54,7 @@ def test_gate(device, half, error, size):
 
 
 @pytest.mark.parametrize("half, error", [(False, 1e-5), (True, 2e-3)])
-@pytest.mark.parametrize("channels", [5, 48])
+@pytest.mark.parametrize("channels", [5, 40, 48])
 def test_attend(device, half, error, channels):
     cuda = device != "cpu"
     n = channels
@@ -66,8 +66,8 @@ def test_attend(device, half, error, channels):
     assert np.abs(found - wanted).max() < error * np.abs(wanted).max()
 
 
-@pytest.mark.parametrize("half", [False, True])
-def test_compiles_for_a_gpu(tmp_path, half):
-    for name, kernel in vars(kernels(24, half, True)).items():
+@pytest.mark.parametrize("channels, half", [(24, False), (24, True), (128, True)])
+def test_compiles_for_a_gpu(tmp_path, channels, half):
+    for name, kernel in vars(kernels(channels, half, True)).items():
         made = wp.compile_aot_module(kernel.module, arch=[90], module_dir=tmp_path / name)
         assert any(path.suffix in (".ptx", ".cubin") and path.stat().st_size for path in made)

@@ -30,6 +30,7 @@ from wlm.smoke.reference import six_way
 from wlm.smoke.samples import EMISSION_PLANE, OPACITY_PLANE, Pool, from_srgb
 from wlm.smoke.scenes import Tilted
 from wlm.smoke.simulate import make_solver, volume_of
+from wlm.smoke.solver import LEAST_HALF_LOSS
 from wlm.view.smoke_pool import pool_sheet
 
 SMALL = DatasetSettings(
@@ -96,6 +97,21 @@ def test_scenes_vary():
     jets = [inlet for s, kind in zip(scenes, kinds, strict=True) if kind == "jet" for inlet in s.inlets]
     tilts = [np.hypot(i.velocity[0], i.velocity[2]) / i.velocity[1] for i in jets if i.face == "-y"]
     assert min(tilts) < 0.05 and max(tilts) > 0.4
+
+
+def test_storage_of_fine_grids():
+    """Half floats but where they would round the cooling of so short a step away."""
+    fine = DatasetSettings(cells=256)
+    smokes = [(scene.smoke, scene.step) for scene in (draw_scene(fine, 0, index) for index in range(60))]
+    assert {(smoke.hot, smoke.storage) for smoke, _ in smokes} == {
+        (False, "float16"),
+        (True, "float16"),
+        (True, "float32"),
+    }
+    for smoke, step in smokes:
+        lost = 1.0 - np.exp(-smoke.cooling * step * smoke.substeps)
+        assert smoke.storage == ("float32" if 0.0 < lost < LEAST_HALF_LOSS else "float16")
+    assert all(draw_scene(DatasetSettings(), 0, index).smoke.storage == "float16" for index in range(60))
 
 
 @pytest.mark.parametrize("axis", [(0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, -2.0, 0.0), (0.3, -0.5, 0.8)])

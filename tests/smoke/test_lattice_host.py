@@ -224,6 +224,23 @@ def test_a_state_goes_on_to_the_last_bit(storage: str, device: str):
     np.testing.assert_array_equal(first.force_on_solid(), second.force_on_solid())
 
 
+@pytest.mark.parametrize("bricks", [False, True])
+def test_a_state_without_a_body_after_one(bricks: bool, device: str):
+    """Nothing is left of the body that was there."""
+    free, other = (_box(device, bricks=bricks) for _ in range(2))
+    free.step(3)
+    mask = np.zeros(SHAPE, bool)
+    mask[4:6, 3:5, 3:6] = True
+    other.set_solid(mask)
+    other.step(2)
+    state = free.state()
+    for box in (free, other):
+        box.load(state)
+        box.step(6)
+    assert np.abs(free.velocity().numpy()).max() > 0.01
+    np.testing.assert_array_equal(other.velocity().numpy(), free.velocity().numpy())
+
+
 def test_states_are_checked(device: str):
     box = _box(device)
     state = box.state()

@@ -8,7 +8,6 @@ from smoke_samples import small_pool
 
 from wlm.errors import WlmError
 from wlm.formats.artifact import read_artifact, write_artifact
-from wlm.smoke import network_file
 from wlm.smoke.dataset import DatasetSettings
 from wlm.smoke.network import ADAPTERS, NafBlock, NetworkSettings, SixWayNetwork, parameter_count, support
 from wlm.smoke.network_file import SYSTEM, export_onnx, load_network, save_network, settings_of
@@ -177,16 +176,6 @@ def test_a_file_says_how_its_network_looks_at_smoke(tmp_path):
         with pytest.raises(WlmError, match=told) as error:
             settings_of(path, summary)
         assert str(error.value).startswith(f"{path}: ")
-
-
-def test_the_shipped_network_is_found_or_told_missing(tmp_path, monkeypatch):
-    monkeypatch.setattr(network_file, "__file__", str(tmp_path / "wlm" / "smoke" / "network_file.py"))
-    with pytest.raises(WlmError, match=r"smoke-six-16.safetensors: expected the network that comes with wlm"):
-        network_file.shipped()
-    path = tmp_path / "wlm" / "data" / "smoke-six-16.safetensors"
-    path.parent.mkdir(parents=True)
-    save_network(path, _network(guide="six"), {})
-    assert network_file.shipped() == path and load_network(path)[0].settings.guide == "six"
 
 
 def _rewritten(path, change) -> None:

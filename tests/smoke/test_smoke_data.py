@@ -29,6 +29,7 @@ from wlm.smoke.data import (
 from wlm.smoke.frames import (
     CHECKPOINT,
     check_folder,
+    clear_folder,
     open_footage,
     open_frames,
     read_frames,
@@ -257,6 +258,15 @@ def test_folders_that_are_none(tmp_path):
             open_footage(folder)
     with pytest.raises(WlmError, match="expected an empty folder or one of an earlier run, found notes.txt"):
         check_folder(tmp_path / "a", "six", ".exr")
+    assert check_folder(tmp_path / "c", "six", ".exr") == tmp_path / "c"
+    for name in ("six_0001.exr", "six_0002.exr", "sheet.png"):
+        (tmp_path / "c" / name).write_text("x")
+    check_folder(tmp_path / "c", "six", ".exr", "sheet.png")
+    assert len(list((tmp_path / "c").iterdir())) == 3, "to look isn't to remove"
+    clear_folder(tmp_path / "c", "six", ".exr", "sheet.png")
+    assert list((tmp_path / "c").iterdir()) == []
+    with pytest.raises(WlmError, match="cannot write there"):
+        clear_folder(tmp_path / "none", "six", ".exr")
     with pytest.raises(WlmError, match="ends in .npz"):
         save_volume(tmp_path / "a.vdb", plume())
 

@@ -84,6 +84,57 @@ def test_a_stopped_training_ends_as_if_it_had_not_been(tmp_path, monkeypatch, lo
         assert {**one, "seconds": 0} == {**other, "seconds": 0}
 
 
+def test_a_finished_training_is_not_resumed(tmp_path):
+    path = tmp_path / "a"
+    _train(path, _profile())
+    held = path.read_bytes()
+    with pytest.raises(WlmError, match=r"a: is finished; without --resume it is trained anew$"):
+        _train(path, _profile(), resume=True)
+    assert path.read_bytes() == held and not (tmp_path / "a.partial").exists()
+
+
+def _stopped(settings, **options) -> Pool:
+    raise KeyboardInterrupt
+
+
+def _worse(settings, *, seed, round, device) -> Pool:
+    """After the first round what is learned is wrong."""
+    pool = small_pool(4, 10)
+    return pool if round == 0 else replace(pool, targets=1 - pool.targets)
+
+
+def test_a_training_stopped_in_its_first_pool_is_resumed(tmp_path):
+    profile = _profile()
+    _train(tmp_path / "whole", profile)
+    path, partial = tmp_path / "a", tmp_path / "a.partial"
+    assert not _train(path, profile, minutes=0.0).finished  # an older one, of round 1
+    with pytest.raises(KeyboardInterrupt):
+        _train(path, profile, make_pool=_stopped)
+    assert partial.exists() and load_network(path)[1]["steps"] == 0
+    assert _train(path, profile, resume=True).finished
+    assert path.read_bytes() == (tmp_path / "whole").read_bytes()
+
+
+@pytest.mark.parametrize("how", ["untrained", "damaged", "gone"])
+def test_the_best_is_trusted_only_with_its_network(tmp_path, how):
+    profile = _profile(steps=20, average=0.0)
+    path, partial = tmp_path / "a", tmp_path / "a.partial"
+    before = _train(path, profile, make_pool=_worse, minutes=0.0)
+    held = partial.read_bytes()
+    if how == "untrained":
+        with pytest.raises(KeyboardInterrupt):
+            _train(path, profile, make_pool=_stopped)
+        partial.write_bytes(held)
+    elif how == "damaged":
+        path.write_bytes(path.read_bytes()[:-1])
+    else:
+        path.unlink()
+    result = _train(path, profile, make_pool=_worse, resume=True)
+    assert result.finished and result.best == result.score.psnr < before.best
+    summary = load_network(path)[1]
+    assert (summary["steps"], summary["psnr"]) == (40, result.best)
+
+
 def test_curves_and_progress_tell_how_it_goes(tmp_path, monkeypatch):
     monkeypatch.setattr("wlm.smoke.train._CHUNK", 3)
     seen = []
@@ -100,13 +151,9 @@ def test_curves_and_progress_tell_how_it_goes(tmp_path, monkeypatch):
 def test_the_best_network_is_kept(tmp_path):
     scores = []
 
-    def worse(settings, *, seed, round, device) -> Pool:
-        pool = small_pool(4, 10)
-        return pool if round == 0 else replace(pool, targets=1 - pool.targets)
-
     def train(rate: float):
         profile = _profile(steps=20, average=0.0, rate=rate)
-        return _train(tmp_path / "a", profile, make_pool=worse, progress=lambda at: scores.append(at.psnr))
+        return _train(tmp_path / "a", profile, make_pool=_worse, progress=lambda at: scores.append(at.psnr))
 
     # Far below where it began it ends, and what was best stays.
     with pytest.raises(WlmError, match=r"diverged: .* dB after 40 steps, .* before the first; .* rate than 0.01"):
@@ -188,6 +235,12 @@ def test_a_training_that_diverges_ends(tmp_path, monkeypatch):
     monkeypatch.setattr(Trainer, "_gather", endless)
     with pytest.raises(WlmError, match=r"diverged: 12 steps of round 0.*smaller rate than 0.001"):
         _train(tmp_path / "a", _profile(steps=40))
+    # The count goes on over stops.
+    path = tmp_path / "b"
+    for steps in (4, 8):
+        assert _train(path, _profile(steps=40), minutes=0.0, resume=True).skipped == steps
+    with pytest.raises(WlmError, match=r"diverged: 12 steps of round 0"):
+        _train(path, _profile(steps=40), minutes=0.0, resume=True)
 
 
 def test_a_plan_takes_each_sample_once_before_any_twice():

@@ -17,8 +17,8 @@ The methods, each a table of its own:
   greatest value the peak.
 - "six ways": the fine march, with what it says of its own error by halving its step.
 - "weights": six lightmaps weighed for twelve lights against a march to each.
-- "frame": the stages of a frame of the scene `jet-sphere`. The network that shall turn the guide into lightmaps isn't
-  there yet; the march that it stands for is beside it.
+- "frame": the stages of a frame of the scene `jet-sphere`, but for the network that turns the guide into lightmaps,
+  which `smoke_network` measures; the march that it stands for is beside it.
 
 A largest error has the unit of what is compared: cells a step, light, or density. Times are of the calls that a user
 makes; on CUDA the lattice replays graphs by itself where it does many steps, and steps of advection are replayed as

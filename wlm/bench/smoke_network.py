@@ -42,11 +42,11 @@ from wlm.bench.smoke_network_setup import (
     row,
     score,
 )
+from wlm.errors import WlmError
 from wlm.interop import check_device
 from wlm.metrics.error import psnr_from_mse
 from wlm.smoke.coarse import coarse_six_way
 from wlm.smoke.infer import predict
-from wlm.smoke.network_file import shipped
 from wlm.smoke.reference import SixWay, six_way
 from wlm.smoke.samples import EMISSION_PLANE, OPACITY_PLANE, encode_lightmaps
 
@@ -71,7 +71,7 @@ def run(
 
     Args:
         networks: Files of trained ones.
-        profiles: Names of profiles whose untrained networks are timed. With neither, the network that comes with wlm.
+        profiles: Names of profiles whose untrained networks are timed.
         quick: Small grids, for a minute on a CPU. Otherwise the paper's, for a GPU.
         device: "cpu" or "cuda:0".
         progress: Called with a line before each part of the work.
@@ -80,9 +80,11 @@ def run(
         The rows, method by method.
 
     Raises:
-        WlmError: A network or a profile can't be read, or the device isn't there or hasn't the memory.
+        WlmError: Neither is given or one can't be read, or the device isn't there or hasn't the memory.
     """
-    subjects = open_subjects(networks if networks or profiles else [shipped()], profiles)
+    if not networks and not profiles:
+        raise WlmError("bench: expected --network FILE or --profile NAME, found neither")
+    subjects = open_subjects(networks, profiles)
     return run_rows(QUICK if quick else FULL, subjects, device=device, progress=progress)
 
 

@@ -238,7 +238,7 @@ class NetworkBench(Bench):
             try:
                 found[kind] = self._run(scene)
             except WlmError as error:
-                trouble = error  # of which another is drawn
+                trouble = str(error)  # of which another is drawn
             if len(found) == len(kinds):
                 break
         if len(found) < len(kinds):

@@ -197,7 +197,9 @@ def smoke_network(
     device: Annotated[str, typer.Option(help='Where it computes: "cpu", "cuda" or "cuda:N".')] = "cpu",
     networks: Annotated[
         list[Path] | None,
-        typer.Option("--network", metavar="FILE", help="A trained network; default wlm's own. Several times."),
+        typer.Option(
+            "--network", metavar="FILE", help="A trained network; this or --profile is needed. Several times."
+        ),
     ] = None,
     profiles: Annotated[
         list[str] | None,

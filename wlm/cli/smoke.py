@@ -31,6 +31,7 @@ from wlm.cli.smoke_options import (
     Toward,
     Turn,
     camera_of,
+    cleared,
     load,
     made_of,
     open_smoke,
@@ -57,6 +58,12 @@ _Baked = Annotated[
 ]
 _Step = Annotated[float, typer.Option(min=0.01, max=1000.0, help="The longest step in voxels.")]
 _Supersample = Annotated[int, typer.Option(min=1, max=16, help="Rays along a pixel's edge.")]
+# Smoke that was baked has them already.
+_BakeStep = Annotated[
+    float | None,
+    typer.Option(min=0.01, max=1000.0, help="The longest step in voxels; default 1 to shade, 0.5 for a flipbook."),
+]
+_BakeSupersample = Annotated[int | None, typer.Option(min=1, max=16, help="Rays along a pixel's edge; default 1.")]
 _G = Annotated[float, typer.Option(min=-0.99, max=0.99, help="Henyey and Greenstein's mean cosine.")]
 
 
@@ -73,13 +80,13 @@ def simulate(
 ) -> None:
     """Simulate a scene into a folder of volumes, one a frame.
 
-    Ctrl-C keeps the state in DIR; the same command with --resume goes on exactly.
+    Ctrl-C keeps the state in DIR; the same command with --resume goes on to the same frames.
     """
     quiet_warp()
     from wlm.interop import check_device
     from wlm.smoke.data import load_scene
     from wlm.smoke.frames import open_frames
-    from wlm.smoke.simulate import simulate
+    from wlm.smoke.simulate import make_solver, simulate
 
     device = check_device(device)
     scene = load_scene(scene_name)
@@ -87,6 +94,8 @@ def simulate(
         scene = _scaled(scene, scale)
     if frames is not None:
         scene = scene.model_copy(update={"frames": frames})
+    # First: earlier frames aren't removed for a simulation that can't be.
+    solver = make_solver(scene, device=device)
     folder = open_frames(output, scene, resume=resume)
     done: dict[str, float] = {}
     try:
@@ -97,7 +106,7 @@ def simulate(
                 bar(frame, scene.frames, f"smoke {figures['smoke']:.4g}")
                 check_interrupt()
 
-            first = simulate(folder, device=device, resume=resume, progress=report)
+            first = simulate(folder, solver=solver, resume=resume, progress=report)
     except KeyboardInterrupt:
         note(f"stopped at frame {done['frame']:g}: the same command with --resume goes on from {output}")
         raise
@@ -147,8 +156,7 @@ def guide(
     if perspective:
         view["perspective"] = True
     rows = table(str(smoke), ["file", "covered", "mean light", "nearest", "farthest"])
-    for path, _, volume in volumes(footage, output, "guide", ".exr"):
-        camera = camera_of(footage, volume, view)
+    for path, volume, camera in volumes(footage, output, "guide", ".exr", view):
         found = guide(volume, camera, step=step, jitter=jitter, seed=seed, threshold=threshold, g=g)
         write_guide(path, found)
         depth = found.depth[found.depth > 0]
@@ -205,8 +213,8 @@ def shade(
     white: Annotated[float, typer.Option(help="The light that is shown as white.")] = 1.0,
     rule: Annotated[str, typer.Option(help="Weights of the lightmaps: squared, absolute or normalised.")] = "squared",
     resolution: Resolution = None,
-    step: _Step = 1.0,
-    supersample: _Supersample = 1,
+    step: _BakeStep = None,
+    supersample: _BakeSupersample = None,
     toward: Toward = None,
     turn: Turn = 0.0,
     extent: Extent = None,
@@ -234,7 +242,7 @@ def shade(
 
     view = {"resolution": resolution, "toward": toward, "turn": turn, "extent": extent, "distance": distance}
     marching = {"step": step, "supersample": supersample}
-    shots, scene = _shots(smoke, output, "shade", view, marching, extinction, emission, device)
+    shots, scene = _shots(smoke, output, "shade", view, marching, 1.0, extinction, emission, device)
     if not lights:
         lights = [given.light() for given in scene.lights] if scene is not None else [_light("1,1,1")]
     if behind is None:
@@ -269,8 +277,8 @@ def flipbook(
         float | None, typer.Option(help="Factor on the light; default 1 in an EXR, else what just doesn't clip.")
     ] = None,
     resolution: Resolution = None,
-    step: _Step = 0.5,
-    supersample: _Supersample = 1,
+    step: _BakeStep = None,
+    supersample: _BakeSupersample = None,
     toward: Toward = None,
     turn: Turn = 0.0,
     extent: Extent = None,
@@ -292,7 +300,7 @@ def flipbook(
 
     view = {"resolution": resolution, "toward": toward, "turn": turn, "extent": extent, "distance": distance}
     marching = {"step": step, "supersample": supersample}
-    shots, _ = _shots(smoke, None, "six", view, marching, extinction, emission, device, count=count)
+    shots, _ = _shots(smoke, None, "six", view, marching, 0.5, extinction, emission, device, count=count)
     frames = [six for _, six, _, _ in shots]
     if any(frame.lightmaps.shape != frames[0].lightmaps.shape for frame in frames):
         raise WlmError(f"{smoke}: expected lightmaps of one size")
@@ -344,6 +352,7 @@ def _shots(
     stem: str,
     view: dict[str, Any],
     marching: dict[str, Any],
+    usual_step: float,
     extinction: float | None,
     emission: float | None,
     device: str,
@@ -355,41 +364,48 @@ def _shots(
 
     folder = smoke.is_dir()
     if smoke.suffix.lower() == ".exr" or (folder and not (smoke / SCENE_FILE).exists()):
-        given = [name for name, value in (view | {"extinction": extinction, "emission": emission}).items() if value]
-        if given:
-            raise WlmError(f"{smoke}: was baked: --{given[0]} has to be given to bake")
+        options = view | marching | {"extinction": extinction, "emission": emission}
+        # A camera that isn't turned is turned by 0.
+        options["turn"] = options["turn"] or None
+        if given := next((name for name, value in options.items() if value is not None), None):
+            raise WlmError(f"{smoke}: was baked: --{given} has to be given to bake")
         device = check_device(device)
         files = numbered(smoke, "six", ".exr") if folder else {1: smoke}
         if not files:
             raise WlmError(f"{smoke}: expected a folder that simulate or bake wrote")
-        chosen = _spread(tuple(files), count)
-        paths = [smoke] * len(chosen) if output is None else places(smoke, chosen, not folder, output, stem, ".png")
+        chosen, single, scene = _spread(tuple(files), count), not folder, None
 
         def baked() -> "Iterator[tuple[Path, SixWay, Camera, dict[str, Any]]]":
             for path, frame in zip(paths, chosen, strict=True):
                 yield path, *read_six_way(files[frame], device), {}
 
-        return baked(), None
-    footage = open_smoke(smoke, extinction, emission, device)
-    chosen, scene = _spread(footage.numbers, count), footage.scene
-    paths = [smoke] * len(chosen) if output is None else places(smoke, chosen, scene is None, output, stem, ".png")
+        shots = baked()
+    else:
+        footage = open_smoke(smoke, extinction, emission, device)
+        chosen, single, scene = _spread(footage.numbers, count), footage.scene is None, footage.scene
+        fine = {"step": usual_step, "supersample": 1} | {k: v for k, v in marching.items() if v is not None}
 
-    def made() -> "Iterator[tuple[Path, SixWay, Camera, dict[str, Any]]]":
-        from wlm.smoke.guide import guide
-        from wlm.smoke.reference import six_way
+        def made() -> "Iterator[tuple[Path, SixWay, Camera, dict[str, Any]]]":
+            from wlm.smoke.guide import guide
+            from wlm.smoke.reference import six_way
 
-        with progress_bar(stem) as bar:
-            for done, (path, frame) in enumerate(zip(paths, chosen, strict=True), 1):
-                volume = load(footage, frame)
-                camera = camera_of(footage, volume, view, flat=True)
-                extra: dict[str, Any] = {}
-                if scene is not None:
-                    extra = {"ramp": scene.smoke.ramp, "obstacles": scene.obstacles, "time": footage.time(frame)}
-                    extra["depth"] = guide(volume, camera, step=1.0, jitter=0.0).depth if scene.obstacles else None
-                yield path, six_way(volume, camera, estimate=False, **marching), camera, extra
-                bar(done, len(paths), "")
+            with progress_bar(stem) as bar:
+                for done, (path, frame) in enumerate(zip(paths, chosen, strict=True), 1):
+                    volume = load(footage, frame)
+                    camera = camera_of(footage, volume, view, flat=True)
+                    extra: dict[str, Any] = {}
+                    if scene is not None:
+                        extra = {"ramp": scene.smoke.ramp, "obstacles": scene.obstacles, "time": footage.time(frame)}
+                        extra["depth"] = guide(volume, camera, step=1.0, jitter=0.0).depth if scene.obstacles else None
+                    yield path, six_way(volume, camera, estimate=False, **fine), camera, extra
+                    bar(done, len(paths), "")
 
-    return made(), scene
+        shots = made()
+    if output is None:
+        paths = [smoke] * len(chosen)
+        return shots, scene
+    paths = places(smoke, chosen, single, output, stem, ".png")
+    return cleared(shots, single, output, stem, ".png"), scene
 
 
 def _spread(numbers: tuple[int, ...], count: int | None) -> tuple[int, ...]:

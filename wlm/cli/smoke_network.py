@@ -45,10 +45,7 @@ __all__ = ["register"]
 _POOL, _SHEET = "pool.safetensors", "sheet.png"
 _SUFFIX = ".safetensors"
 
-_Network = Annotated[
-    Path | None,
-    typer.Option(metavar="FILE", help="A network that train wrote; default the one that comes with wlm."),
-]
+_Network = Annotated[Path, typer.Argument(metavar="NETWORK", help="A file that train wrote.")]
 
 
 def register(app: typer.Typer) -> None:
@@ -81,14 +78,19 @@ def train(
 
     settings = load_profile(profile)
     kept = Path(f"{output}{SUFFIX}")
-    if resume and not kept.exists():
+    if resume and not kept.exists() and not output.exists():
         note(f"{kept}: there is nothing to resume; starting at step 0")
-    at = 0
+    at, begun = 0, False
     try:
         with deferred_interrupt() as check_interrupt, progress_bar("train") as bar:
 
+            def validated(*_: object) -> None:
+                check_interrupt()
+
             def made(*_: object) -> None:
                 # Between two sequences of a pool nothing is lost: what came before the pool is kept already.
+                nonlocal begun
+                begun = True
                 check_interrupt()
 
             def report(now: Progress) -> None:
@@ -101,7 +103,7 @@ def train(
                 output,
                 settings,
                 make_pool=partial(make_pool, progress=made),
-                make_validation=partial(make_validation, progress=made),
+                make_validation=partial(make_validation, progress=validated),
                 seed=seed,
                 device=device,
                 minutes=minutes,
@@ -109,7 +111,7 @@ def train(
                 progress=report,
             )
     except KeyboardInterrupt:
-        if at or (resume and kept.exists()):
+        if begun or (resume and kept.exists()):
             told = f"at step {at}" if at else "before another step"
             note(f"stopped {told}: the same command with --resume goes on from {kept}")
         raise
@@ -131,7 +133,9 @@ def train(
 def predict(
     smoke: Input,
     output: Annotated[Path, typer.Option("--output", "-o", metavar="OUT", help="A .exr, or of frames a folder.")],
-    network: _Network = None,
+    network: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="A network that train wrote; needed without --coarse.")
+    ] = None,
     coarse: Annotated[
         bool, typer.Option("--coarse", help="By a march in large steps alone, which needs no network.")
     ] = False,
@@ -151,18 +155,17 @@ def predict(
     """
     if coarse and network is not None:
         raise WlmError("--coarse: expected no --network beside it")
+    if network is None and not coarse:
+        raise WlmError("--network: expected a file that train wrote, or --coarse; found neither")
     quiet_warp()
     footage = open_smoke(smoke, extinction, emission, device)
-    make = _coarse(seed) if coarse else _predicted(network, seed, footage.device)
+    make = _coarse(seed) if network is None else _predicted(network, seed, footage.device)
     view = {"resolution": resolution, "toward": toward, "turn": turn, "extent": extent, "distance": distance}
     write_lightmaps(footage, output, view, make)
 
 
 def evaluate(
-    network: Annotated[
-        Path | None,
-        typer.Argument(metavar="NETWORK", help="A file that train wrote; default the one that comes with wlm."),
-    ] = None,
+    network: _Network,
     smoke: Annotated[
         list[Path] | None, typer.Option(metavar="FILE", help="A .npz or .nvdb volume to look at too; repeat for more.")
     ] = None,
@@ -183,39 +186,34 @@ def evaluate(
     quiet_warp()
     from wlm.interop import check_device
     from wlm.smoke.evaluate import evaluate_all
-    from wlm.smoke.network_file import load_network, settings_of, shipped
+    from wlm.smoke.network_file import load_network, settings_of
 
     device = check_device(device)
-    path = shipped() if network is None else network
-    loaded, summary = load_network(path, device=device)
-    settings = settings_of(path, summary)
+    loaded, summary = load_network(network, device=device)
+    settings = settings_of(network, summary)
     changed = {"resolution": resolution, "cells": settings.cells if cells is None else cells}
     with progress_bar("evaluate") as bar:
         found = evaluate_all(loaded, settings.model_copy(update=changed), smoke or (), device=device, progress=bar)
     if json_path is not None:
         facts = {"network": loaded.settings.model_dump(mode="json"), "device": device, **changed}
         write_json(json_path, facts | {"sets": [one.to_json() for one in found]})
-    _show_evaluation(path, found)
+    _show_evaluation(network, found)
 
 
 def export(
+    network: _Network,
     output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE.onnx", help="The file to write.")],
-    network: Annotated[
-        Path | None,
-        typer.Argument(metavar="NETWORK", help="A file that train wrote; default the one that comes with wlm."),
-    ] = None,
     resolution: Annotated[int, typer.Option(min=1, max=16384, help="Pixels along the image's edges.")] = 512,
 ) -> None:
     """Write a network as ONNX: encoded guiding maps to encoded lightmaps, of one size, in float32."""
     check_output(output, ".onnx")
     quiet_warp()
-    from wlm.smoke.network_file import export_onnx, load_network, shipped
+    from wlm.smoke.network_file import export_onnx, load_network
     from wlm.smoke.samples import GUIDES, PLANES
 
-    path = shipped() if network is None else network
-    loaded, _ = load_network(path)
+    loaded, _ = load_network(network)
     size = export_onnx(loaded, output, resolution, resolution)
-    rows = table(str(path), ["", "planes"], text=["planes"])
+    rows = table(str(network), ["", "planes"], text=["planes"])
     rows.add_row("guide", " ".join(GUIDES[loaded.settings.guide]))
     rows.add_row("lightmaps", " ".join(PLANES))
     rows.add_row(escape(str(output)), f"{size:,} bytes, {resolution} x {resolution} pixels")
@@ -289,13 +287,12 @@ def _coarse(seed: int) -> "Callable[[DensityVolume, Camera], SixWay]":
     return lambda volume, camera: coarse_six_way(volume, camera, seed=seed, **settings.look(volume.shape)).six
 
 
-def _predicted(network: Path | None, seed: int, device: str) -> "Callable[[DensityVolume, Camera], SixWay]":
+def _predicted(path: Path, seed: int, device: str) -> "Callable[[DensityVolume, Camera], SixWay]":
     """Makes lightmaps by a network, which looks as it was trained to."""
     from wlm.smoke.infer import Predictor
     from wlm.smoke.infer import predict as run
-    from wlm.smoke.network_file import load_network, settings_of, shipped
+    from wlm.smoke.network_file import load_network, settings_of
 
-    path = shipped() if network is None else network
     loaded, summary = load_network(path)
     settings = settings_of(path, summary)
     predictors: dict[tuple[int, int], Any] = {}

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
@@ -27,6 +27,7 @@ __all__ = [
     "Toward",
     "Turn",
     "camera_of",
+    "cleared",
     "load",
     "made_of",
     "open_smoke",
@@ -53,6 +54,8 @@ Extinction = Annotated[float | None, typer.Option(help="Per length, of density 1
 Emission = Annotated[float | None, typer.Option(help="Per length, of temperature 1; default the scene's, or 1.")]
 
 SHEET = "sheet.png"
+
+_T = TypeVar("_T")
 
 
 def vector(option: str, text: str) -> tuple[float, float, float]:
@@ -88,7 +91,7 @@ def open_smoke(smoke: Path, extinction: float | None, emission: float | None, de
 
 
 def places(smoke: Path, numbers: "tuple[int, ...]", single: bool, output: Path, stem: str, suffix: str) -> list[Path]:
-    """Where each frame goes: into a file, or numbered into a folder."""
+    """Where each frame goes: into a file, or numbered into a folder, which is looked at and not changed yet."""
     from wlm.smoke.frames import check_folder
 
     if single:
@@ -100,13 +103,31 @@ def places(smoke: Path, numbers: "tuple[int, ...]", single: bool, output: Path, 
     return [folder / f"{stem}_{number:04d}{suffix}" for number in numbers]
 
 
-def volumes(footage: "Footage", output: Path, stem: str, suffix: str) -> "Iterator[tuple[Path, int, DensityVolume]]":
-    """Volumes with where their result goes; says what was repaired, and how far it is."""
-    paths = places(footage.path, footage.numbers, footage.scene is None, output, stem, suffix)
-    with progress_bar(stem) as bar:
-        for done, (path, frame) in enumerate(zip(paths, footage.numbers, strict=True), 1):
-            yield path, frame, load(footage, frame)
-            bar(done, len(paths), "")
+def cleared(results: Iterator[_T], single: bool, output: Path, stem: str, suffix: str) -> Iterator[_T]:
+    """The same results; what an earlier run left in the folder goes when the first is there, and not before."""
+    from wlm.smoke.frames import clear_folder
+
+    for done, result in enumerate(results):
+        if done == 0 and not single:
+            clear_folder(output, stem, suffix, SHEET)
+        yield result
+
+
+def volumes(
+    footage: "Footage", output: Path, stem: str, suffix: str, view: dict[str, Any], *, flat: bool = False
+) -> "Iterator[tuple[Path, DensityVolume, Camera]]":
+    """Volumes with where their result goes and their camera; says what was repaired, and how far it is."""
+    single = footage.scene is None
+    paths = places(footage.path, footage.numbers, single, output, stem, suffix)
+
+    def seen() -> "Iterator[tuple[Path, DensityVolume, Camera]]":
+        with progress_bar(stem) as bar:
+            for done, (path, frame) in enumerate(zip(paths, footage.numbers, strict=True), 1):
+                volume = load(footage, frame)
+                yield path, volume, camera_of(footage, volume, view, flat=flat)
+                bar(done, len(paths), "")
+
+    return cleared(seen(), single, output, stem, suffix)
 
 
 def load(footage: "Footage", frame: int) -> "DensityVolume":
@@ -154,8 +175,7 @@ def write_lightmaps(
     from wlm.smoke.frames import write_six_way
 
     rows = table(str(footage.path), ["file", "covered", "mean light", *(["largest error", "RMS error"] * errors)])
-    for path, _, volume in volumes(footage, output, "six", ".exr"):
-        camera = camera_of(footage, volume, view, flat=True)
+    for path, volume, camera in volumes(footage, output, "six", ".exr", view, flat=True):
         six = make(volume, camera)
         write_six_way(path, six, camera)
         covered = six.transparency < 0.99

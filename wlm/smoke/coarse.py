@@ -12,8 +12,9 @@ from dataclasses import dataclass
 
 import torch
 
-from wlm.interop import stream, to_warp
+from wlm.interop import device_name, stream, to_warp
 from wlm.smoke.axes import DIRECTIONS, Camera
+from wlm.smoke.guide import check_march
 from wlm.smoke.reference import SixWay
 from wlm.smoke.volume import DensityVolume
 from wlm_kernels import marching_coarse
@@ -78,15 +79,9 @@ def coarse_six_way(
     Raises:
         ValueError: A setting is out of its range, or the camera is in perspective.
     """
-    if not 0 < step < float("inf"):
-        raise ValueError(f"step: expected voxels, above 0, got {step}")
-    if not 0 <= jitter <= 1:
-        raise ValueError(f"jitter: expected 0 to 1, got {jitter}")
-    if not -1 < g < 1:
-        raise ValueError(f"g: expected a number within -1 and 1, got {g}")
-    device = "cpu" if volume.device.type == "cpu" else f"cuda:{volume.device.index or 0}"
+    check_march(step, g, jitter)
     view, moved = camera.view(volume.origin, volume.voxel, volume.shape)
-    with stream(device):
+    with stream(device_name(volume.device)):
         size = (len(marching_coarse.PLANES), camera.height, camera.width)
         planes = torch.empty(size, dtype=torch.float32, device=volume.device)
         density, temperature = volume.arrays()

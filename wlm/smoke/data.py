@@ -93,7 +93,8 @@ class Grid(_Part):
         refine: Voxels of density along a cell's edge; the paper's 400 over 100.
         origin: The box's corner.
         faces: What each face is: a "wall", a wall without friction ("slip"), "open", or "periodic" like the one
-            opposite, which has to be too. A face with an inlet is a wall around it. Faces that aren't named are open.
+            opposite, which has to be too. A face with an inlet is a wall around it to the air, and lets smoke out as a
+            whole. Faces that aren't named are open.
     """
 
     cells: tuple[_Count, _Count, _Count]
@@ -154,7 +155,7 @@ class Smoke(_Part):
     Attributes:
         extinction: Per metre, of density 1.
         emission: Light given off per metre at temperature 1.
-        dissipation, cooling: Share of the density and of the temperature that is lost a second.
+        dissipation, cooling: Rates at which density and temperature decay, a second: exp(-rate t) is left.
         buoyancy: Metres a second squared, upwards, at temperature 1.
         weight: Metres a second squared, downwards, at density 1.
         up: The direction that is up.

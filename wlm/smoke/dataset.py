@@ -36,7 +36,7 @@ from pydantic_core import PydanticCustomError
 
 from wlm.errors import WlmError
 from wlm.formats.artifact import read_artifact, write_artifact
-from wlm.interop import check_device, stream
+from wlm.interop import check_device, no_collection, stream
 from wlm.smoke.axes import Camera
 from wlm.smoke.data import CameraSettings, Scene, make_camera
 from wlm.smoke.motion import motion
@@ -95,7 +95,7 @@ class DatasetSettings(BaseModel):
         guide_step: h of the guiding map; the paper's 10 of 400 voxels.
         jitter: Share of such a step by which a pixel's samples are shifted.
         surface: Optical depth, over the box's edge, from which on smoke has a surface.
-        reference_step: Of the lightmaps, in voxels; at 1 they are within 0.4% RMS of a march in eighths.
+        reference_step: Of the lightmaps, in voxels.
         extinction: Of density 1, over the box's edge.
         density_scales: What that is multiplied by at random, least and most.
         sequences: In a round.
@@ -263,10 +263,10 @@ class _Maker:
                 solver.check()
             except WlmError as error:
                 # The memory was had before; what the air does is all that can go wrong by now.
-                trouble = error
+                trouble = str(error)  # its traceback would hold the solver
                 continue
             if not all(bool(torch.isfinite(part).all()) for part in (guides, targets, moved)):
-                trouble = WlmError("NaN or infinity in its pictures")
+                trouble = "NaN or infinity in its pictures"
                 continue
             share = covered(targets).cpu().numpy()
             lucky = random.random(len(share)) < self._settings.kept_empty
@@ -366,7 +366,7 @@ class _Air:
             self._solver.step(_PERIOD)
             return
         if self._graph is None:
-            with wp.ScopedCapture(self._solver.device) as capture:
+            with no_collection(), wp.ScopedCapture(self._solver.device) as capture:
                 self._solver.step(_PERIOD)
             self._graph = capture.graph
         wp.capture_launch(self._graph)

@@ -33,6 +33,7 @@ __all__ = [
     "Footage",
     "Frames",
     "check_folder",
+    "clear_folder",
     "frame_file",
     "numbered",
     "open_footage",
@@ -192,7 +193,7 @@ def open_footage(
 
 
 def check_folder(folder: str | os.PathLike[str], stem: str, suffix: str, *others: str) -> Path:
-    """Makes a folder for numbered files, and removes those of an earlier run.
+    """Makes a folder for numbered files, or looks that it holds none but those of an earlier run.
 
     Args:
         folder: Where; it is made if its parent is there.
@@ -205,14 +206,26 @@ def check_folder(folder: str | os.PathLike[str], stem: str, suffix: str, *others
     folder = Path(folder)
     try:
         folder.mkdir(exist_ok=True)
-        mine = [*numbered(folder, stem, suffix).values(), *(folder / name for name in others)]
+        mine = _earlier(folder, stem, suffix, others)
         if other := next((path for path in sorted(folder.iterdir()) if path not in mine), None):
             raise WlmError(f"{folder}: expected an empty folder or one of an earlier run, found {other.name}")
-        for path in mine:
-            path.unlink(missing_ok=True)
     except OSError as error:
         raise WlmError(f"{folder}: cannot write there: {error.strerror or error}") from error
     return folder
+
+
+def clear_folder(folder: str | os.PathLike[str], stem: str, suffix: str, *others: str) -> None:
+    """Removes the files of an earlier run, once the first of the new ones is sure; arguments as for `check_folder`.
+
+    Raises:
+        WlmError: They can't be removed.
+    """
+    folder = Path(folder)
+    try:
+        for path in _earlier(folder, stem, suffix, others):
+            path.unlink(missing_ok=True)
+    except OSError as error:
+        raise WlmError(f"{folder}: cannot write there: {error.strerror or error}") from error
 
 
 def save_volume(path: str | os.PathLike[str], volume: DensityVolume) -> None:
@@ -282,6 +295,10 @@ def read_six_way(path: str | os.PathLike[str], device: str = "cpu") -> tuple[Six
     tensors = {name: torch.from_numpy(plane).to(device) for name, plane in planes.items()}
     six = SixWay(torch.stack([tensors[name] for name in DIRECTIONS]), tensors[_TRANSPARENCY], tensors.get(EMISSION))
     return six, camera
+
+
+def _earlier(folder: Path, stem: str, suffix: str, others: tuple[str, ...]) -> list[Path]:
+    return [*numbered(folder, stem, suffix).values(), *(folder / name for name in others)]
 
 
 def _read_scene(folder: Path) -> Scene:

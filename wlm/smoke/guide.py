@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import torch
 import warp as wp
 
-from wlm.interop import stream, to_warp
+from wlm.interop import device_name, stream, to_warp
 from wlm.smoke.axes import Camera
 from wlm.smoke.volume import DensityVolume
 from wlm_kernels import marching
 
-__all__ = ["Guide", "guide", "transmittance"]
+__all__ = ["Guide", "check_march", "guide", "transmittance"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +41,25 @@ class Guide:
     def depth(self) -> torch.Tensor:
         """[H, W], distance along the ray to the smoke in the world's unit, 0 where there is none."""
         return self.maps[2]
+
+
+def check_march(step: float, g: float = 0.0, jitter: float = 0.0) -> None:
+    """Checks what marches through smoke have in common.
+
+    Args:
+        step: In voxels.
+        g: Henyey and Greenstein's mean cosine.
+        jitter: Share of a step.
+
+    Raises:
+        ValueError: One is out of its range.
+    """
+    if not 0 < step < float("inf"):
+        raise ValueError(f"step: expected voxels, above 0, got {step}")
+    if not -1 < g < 1:
+        raise ValueError(f"g: expected a number within -1 and 1, got {g}")
+    if not 0 <= jitter <= 1:
+        raise ValueError(f"jitter: expected 0 to 1, got {jitter}")
 
 
 def guide(
@@ -76,15 +95,9 @@ def guide(
     Raises:
         ValueError: A setting is out of its range.
     """
-    if not 0 < step < float("inf"):
-        raise ValueError(f"step: expected voxels, above 0, got {step}")
-    if not 0 <= jitter <= 1:
-        raise ValueError(f"jitter: expected 0 to 1, got {jitter}")
-    if not -1 < g < 1:
-        raise ValueError(f"g: expected a number within -1 and 1, got {g}")
-    device = _name(volume.device)
+    check_march(step, g, jitter)
     view, moved = camera.view(volume.origin, volume.voxel, volume.shape)
-    with stream(device):
+    with stream(device_name(volume.device)):
         maps = torch.empty((3, camera.height, camera.width), dtype=torch.float32, device=volume.device)
         density, _ = volume.arrays()
         marching.guide(
@@ -128,7 +141,7 @@ def transmittance(
     length = float(direction.norm())
     if not 1e-12 < length < float("inf"):
         raise ValueError(f"toward: expected a direction of some length, got {tuple(toward)}")
-    with stream(_name(volume.device)):
+    with stream(device_name(volume.device)):
         origin = torch.tensor(volume.origin, dtype=torch.float32, device=points.device)
         at = ((points - origin) / volume.voxel).contiguous()
         out = torch.empty(len(points), dtype=torch.float32, device=points.device)
@@ -142,8 +155,3 @@ def transmittance(
             to_warp(out),
         )
     return out
-
-
-def _name(device: torch.device) -> str:
-    """As `stream` takes it."""
-    return "cpu" if device.type == "cpu" else f"cuda:{device.index or 0}"

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import warp as wp
 
+from wlm.interop import no_collection
 from wlm.smoke.lattice_faces import Face, bounded_axes, face_links, walled_axes
 from wlm_kernels import lattice_bricks, lattice_links, lattice_solids
 from wlm_kernels.lattice import QUIET, Spec, step_kernel
@@ -81,10 +82,10 @@ class Engine:
         self._workers = min(total, _WORKERS) if device.is_cuda else total
 
     @staticmethod
-    def bytes_needed(cells: int, spec: Spec) -> int:
+    def bytes_needed(cells: int, lattice: str, storage: str) -> int:
         """Of the populations, by far the most of all."""
-        size = wp.types.type_size_in_bytes(STORAGES[spec.storage][0])
-        return 2 * len(velocity_set(spec.lattice).c) * cells * size
+        size = wp.types.type_size_in_bytes(STORAGES[storage][0])
+        return 2 * len(velocity_set(lattice).c) * cells * size
 
     @property
     def buffers(self) -> tuple[wp.array, wp.array]:
@@ -190,6 +191,9 @@ class Engine:
                 self._graph = None
                 self._search()
             self._links.last.fill_(self._links.faces + count)
+        else:
+            # A state without solids may follow one that had some.
+            self._links.last.fill_(self._links.faces)
         if self.bricks:
             self.bricks.pinned.zero_()
             lattice_links.pin(self._n, self.bricks.shape, self._links, self.bricks.pinned)
@@ -238,7 +242,7 @@ class Engine:
                 self.run(eager)
                 steps -= eager
                 if self._graph is None and self.done % self.period == 0:
-                    with wp.ScopedCapture(self.device) as capture:
+                    with no_collection(), wp.ScopedCapture(self.device) as capture:
                         self.run(self.period)
                     self._graph, self.done = capture.graph, self.done - self.period
             else:

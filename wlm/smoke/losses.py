@@ -17,7 +17,8 @@ from pathlib import Path
 
 import torch
 import torch.nn.functional as F
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic_core import PydanticCustomError
 from torch import nn
 
 from wlm.errors import WlmError
@@ -37,7 +38,7 @@ _VISIBLE = 0.01  # opacity from which on change is seen
 
 
 class LossSettings(BaseModel):
-    """Weights of eq. 10. The paper doesn't give its own; a part of weight 0 isn't computed.
+    """Weights of eq. 10. The paper doesn't give its own; a part of weight 0 isn't computed; one has to be above it.
 
     Attributes:
         mse: Of the reconstruction.
@@ -52,6 +53,12 @@ class LossSettings(BaseModel):
     srgb: bool = True
     perceptual: float = Field(0.0, ge=0.0)
     temporal: float = Field(0.0, ge=0.0)
+
+    @model_validator(mode="after")
+    def _weighs(self) -> LossSettings:
+        if not self.parts:
+            raise PydanticCustomError("weights", "expected mse, perceptual or temporal above 0, found 0 for all three")
+        return self
 
     @property
     def pairs(self) -> bool:

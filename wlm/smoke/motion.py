@@ -8,8 +8,9 @@ import math
 import torch
 import warp as wp
 
-from wlm.interop import stream, to_warp
+from wlm.interop import device_name, stream, to_warp
 from wlm.smoke.axes import Camera
+from wlm.smoke.guide import check_march
 from wlm.smoke.volume import DensityVolume
 from wlm_kernels import marching_motion
 
@@ -40,15 +41,13 @@ def motion(
     Raises:
         ValueError: The camera is in perspective, the velocity isn't vec3 [A, B, C], or a number is out of its range.
     """
-    if not 0 < step < math.inf:
-        raise ValueError(f"step: expected voxels, above 0, got {step}")
+    check_march(step)
     if not math.isfinite(reach):
         raise ValueError(f"reach: expected a finite length, got {reach}")
     if velocity.dtype is not wp.vec3 or velocity.ndim != 3 or 0 in velocity.shape:
         raise ValueError(f"velocity: expected vec3 [A, B, C], got {velocity.dtype.__name__} {velocity.shape}")
     view, _ = camera.view(volume.origin, volume.voxel, volume.shape)
-    device = "cpu" if volume.device.type == "cpu" else f"cuda:{volume.device.index or 0}"
-    with stream(device):
+    with stream(device_name(volume.device)):
         out = torch.empty((2, camera.height, camera.width), dtype=torch.float32, device=volume.device)
         density, _ = volume.arrays()
         extinction, reached = volume.extinction * volume.voxel, reach / volume.voxel

@@ -98,8 +98,7 @@ class NetworkSettings(BaseModel):
 class ChannelNorm(nn.Module):
     """Layer norm over the channels of a pixel, [N, C, H, W].
 
-    torch's own wants the channels together in memory, and gives a GPU a block of threads a pixel, for 16 numbers: five
-    times as slow.
+    torch's own wants the channels together in memory, and gives a GPU a block of threads a pixel, for 16 numbers.
     """
 
     def __init__(self, channels: int) -> None:

@@ -8,7 +8,6 @@ import os
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,25 +21,12 @@ from wlm.smoke.dataset import DatasetSettings
 from wlm.smoke.network import NetworkSettings, SixWayNetwork
 from wlm.smoke.samples import GUIDES
 
-__all__ = ["SYSTEM", "export_onnx", "load_network", "save_network", "settings_of", "shipped"]
+__all__ = ["SYSTEM", "export_onnx", "load_network", "save_network", "settings_of"]
 
 SYSTEM = "smoke-network"
 
-_SHIPPED = "smoke-six-16.safetensors"
 _OPSET = 20
 _HALF_MAX = 65504.0
-
-
-def shipped() -> Path:
-    """The network that comes with the package.
-
-    Raises:
-        WlmError: It isn't there.
-    """
-    path = Path(__file__).resolve().parents[1] / "data" / _SHIPPED
-    if not path.is_file():
-        raise WlmError(f"{path}: expected the network that comes with wlm, found none: name one that train wrote")
-    return path
 
 
 def save_network(path: str | os.PathLike[str], network: SixWayNetwork, summary: Mapping[str, Any]) -> int:

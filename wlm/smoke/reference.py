@@ -14,8 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from wlm.interop import stream, to_warp
+from wlm.interop import device_name, stream, to_warp
 from wlm.smoke.axes import DIRECTIONS, Camera
+from wlm.smoke.guide import check_march
 from wlm.smoke.volume import DensityVolume
 from wlm_kernels import marching_six
 
@@ -93,13 +94,10 @@ def six_way(
     Raises:
         ValueError: A setting is out of its range, or the camera is in perspective.
     """
-    if not 0 < step < float("inf"):
-        raise ValueError(f"step: expected voxels, above 0, got {step}")
-    if not -1 < g < 1:
-        raise ValueError(f"g: expected a number within -1 and 1, got {g}")
+    check_march(step, g)
     if supersample < 1:
         raise ValueError(f"supersample: expected at least 1, got {supersample}")
-    with stream(_name(volume.device)):
+    with stream(device_name(volume.device)):
         fine = _march(volume, camera, step, g, supersample)
         error = None
         if estimate:
@@ -145,7 +143,7 @@ def lit(
     if direction.shape != (3,) or not 1e-12 < length < np.inf:
         raise ValueError(f"toward: expected a direction of some length, got {direction.tolist()}")
     view, _ = camera.view(volume.origin, volume.voxel, volume.shape)
-    with stream(_name(volume.device)):
+    with stream(device_name(volume.device)):
         out = torch.empty((camera.height, camera.width), dtype=torch.float32, device=volume.device)
         density, _ = volume.arrays()
         extinction = volume.extinction * volume.voxel
@@ -171,8 +169,3 @@ def _march(volume: DensityVolume, camera: Camera, step: float, g: float, supersa
     if supersample == 1:
         return out
     return torch.nn.functional.avg_pool2d(out[None], supersample)[0]
-
-
-def _name(device: torch.device) -> str:
-    """As `stream` takes it."""
-    return "cpu" if device.type == "cpu" else f"cuda:{device.index or 0}"

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from wlm.smoke.data import Air, Grid, Inlet, Obstacle, Scene, Smoke, Source
+from wlm.smoke.solver import LEAST_HALF_LOSS
 
 if TYPE_CHECKING:
     from wlm.smoke.dataset import DatasetSettings
@@ -82,13 +83,15 @@ def draw_scene(settings: DatasetSettings, seed: int, index: int, *, validation: 
     if obstacles and random.random() < settings.moving:
         obstacles[0] = _moving(random, obstacles[0], settings.warmup)
     cell = EDGE / settings.cells
+    rate = 1.0 / (settings.steps * LATTICE_SPEED * cell / SPEED)
+    lost = -np.expm1(-parts["smoke"].get("cooling", 0.0) * settings.substeps / (rate * settings.steps))
     return Scene(
         name=f"{kind} {'validation ' * validation}{seed}/{index}",
         grid=Grid(cells=(settings.cells,) * 3, cell=cell, refine=settings.refine, faces=parts["faces"]),
         air=Air(speed=SPEED, lattice_speed=LATTICE_SPEED, viscosity=_log(random, *_VISCOSITY)),
         smoke=Smoke(
             extinction=settings.extinction / EDGE,
-            storage="float16",
+            storage="float32" if 0.0 < lost < LEAST_HALF_LOSS else "float16",
             bricks=True,
             substeps=settings.substeps,
             **parts["smoke"],
@@ -98,7 +101,7 @@ def draw_scene(settings: DatasetSettings, seed: int, index: int, *, validation: 
         sources=parts["sources"],
         obstacles=tuple(obstacles),
         frames=settings.frames,
-        rate=1.0 / (settings.steps * LATTICE_SPEED * cell / SPEED),
+        rate=rate,
     )
 
 

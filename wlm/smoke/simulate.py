@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-import os
+import math
 import time
 from collections.abc import Callable
 
 import numpy as np
+import warp as wp
 
 from wlm.errors import WlmError
+from wlm.interop import free_memory
 from wlm.smoke import obstacles as bodies
 from wlm.smoke import solver as smoke
+from wlm.smoke import solver_lattice
 from wlm.smoke.data import Inlet, Scene
 from wlm.smoke.frames import CHECKPOINT, Frames, frame_file, save_volume
 from wlm.smoke.lattice import Domain, Lattice
@@ -28,18 +31,19 @@ _INLET_DEPTH = 1.0
 _RAMP = 4
 
 
-def make_solver(scene: Scene, *, device: str = "cpu", checkpoint: str | os.PathLike[str] | None = None) -> smoke.Solver:
+def make_solver(scene: Scene, *, device: str = "cpu") -> smoke.Solver:
     """Builds what simulates a scene.
 
     Args:
         scene: The scene.
         device: As `wlm.interop.check_device` returns it.
-        checkpoint: The file in which the solver keeps its state every `KEPT_EVERY` frames; None: it doesn't.
 
     Raises:
-        WlmError: The memory isn't enough, or an inlet or an obstacle is too fast for the time step.
+        WlmError: The memory isn't enough for air and smoke, before any is allocated, or an inlet is too fast for the
+            time step.
     """
     look = scene.smoke
+    _require_memory(scene, device)
     try:
         lattice = _make_lattice(scene, device)
         return smoke.Solver(
@@ -55,8 +59,6 @@ def make_solver(scene: Scene, *, device: str = "cpu", checkpoint: str | os.PathL
             buoyancy=_buoyancy(scene),
             substeps=look.substeps,
             bricks=look.bricks,
-            checkpoint=checkpoint,
-            checkpoint_every=KEPT_EVERY * scene.steps // look.substeps,
         )
     except ValueError as error:
         # Settings that are right each alone, and too small or too large together.
@@ -72,19 +74,24 @@ def volume_of(scene: Scene, solver: smoke.Solver) -> DensityVolume:
 def simulate(
     frames: Frames,
     *,
+    solver: smoke.Solver | None = None,
     device: str = "cpu",
     resume: bool = False,
     progress: Callable[[int, dict[str, float]], None] | None = None,
 ) -> int:
     """Runs a scene and writes its frames.
 
-    The state is kept in the folder every `KEPT_EVERY` frames, and when `progress` raises KeyboardInterrupt. Going on
-    from it gives the same frames, to the last bit on one device.
+    The state is kept in the folder every `KEPT_EVERY` frames, after the frame itself, and when `progress` raises
+    KeyboardInterrupt. Going on from it gives the same frames: on the CPU to the last bit, on a GPU as far as its
+    atomic sums come out alike, and with smoke in bricks to their threshold.
 
     Args:
         frames: The folder, as `frames.open_frames` gives it.
+        solver: What `make_solver` made of the scene, as it was made; None: it is made here, on `device`. Whoever makes
+            it before the folder is opened knows by then that it can be, and loses no earlier frames if not.
         device: As `wlm.interop.check_device` returns it.
-        resume: Whether to go on from the state that is kept there, if there is one.
+        resume: Whether to go on from the state that is kept there, if there is one. One past the last frame asked for
+            stays there.
         progress: Called after each frame with its number and `smoke`, the density's integral over the box, and
             `seconds` that it took.
 
@@ -92,20 +99,28 @@ def simulate(
         The number of the first frame that was simulated; one more than there are if all were there.
 
     Raises:
-        WlmError: As `make_solver`; the air blew up; a file is damaged or can't be written.
+        WlmError: As `make_solver`; an obstacle is too fast; the air blew up; a file is damaged or can't be written; a
+            frame before the state that is kept is missing.
     """
     scene, checkpoint = frames.scene, frames.folder / CHECKPOINT
-    wanted = range(1, scene.frames + 1)
-    if resume and not checkpoint.exists() and set(wanted) <= set(frames.numbers):
+    missing = sorted(set(range(1, scene.frames + 1)) - set(frames.numbers))
+    kept = resume and checkpoint.exists()
+    if resume and not kept and not missing:
         return scene.frames + 1
-    solver = make_solver(scene, device=device, checkpoint=checkpoint)
+    if solver is None:
+        solver = make_solver(scene, device=device)
     per_frame = scene.steps // scene.smoke.substeps
-    first = 1
-    if resume and checkpoint.exists():
+    done = 0
+    if kept:
         solver.load(checkpoint)
-        first += solver.steps // per_frame
+        done = solver.steps // per_frame
+        if missing and missing[0] <= done:
+            raise WlmError(
+                f"{frames.folder}: expected {frame_file(missing[0])}, since the state that is kept is of frame {done},"
+                " found none; start anew without --resume"
+            )
     timed = _sources(scene)
-    for frame in range(first, scene.frames + 1):
+    for frame in range(done + 1, scene.frames + 1):
         begin = time.perf_counter()
         for step in range(per_frame):
             now = (frame - 1 + step / per_frame) / scene.rate
@@ -114,6 +129,9 @@ def simulate(
         solver.check()
         volume = volume_of(scene, solver)
         save_volume(frames.folder / frame_file(frame), volume)
+        # Only now: a state whose frame isn't there would be resumed past it.
+        if frame % KEPT_EVERY == 0:
+            solver.save(checkpoint)
         if progress is None:
             continue
         figures = {"smoke": float(volume.density.double().sum()) * volume.voxel**3}
@@ -122,8 +140,26 @@ def simulate(
         except KeyboardInterrupt:
             solver.save(checkpoint)
             raise
-    checkpoint.unlink(missing_ok=True)
-    return first
+    if done <= scene.frames:
+        checkpoint.unlink(missing_ok=True)
+    return min(done, scene.frames) + 1
+
+
+def _require_memory(scene: Scene, device: str) -> None:
+    """Looks, before either is allocated, whether air and smoke fit into the memory together."""
+    grid, look = scene.grid, scene.smoke
+    voxel = smoke.voxel_bytes(look.scheme, look.storage, look.hot)
+    needed = Lattice.bytes_needed(grid.cells, scene.air.storage) + voxel * math.prod(grid.shape)
+    warp_device = wp.get_device(device)
+    free = free_memory(warp_device)
+    if needed > free:
+        air, dense = (" x ".join(map(str, shape)) for shape in (grid.cells, grid.shape))
+        raise WlmError(
+            f"{scene.name}: {air} cells of air and {dense} of smoke need {needed / 2**30:.1f} GiB on {device}: expected"
+            f" at most the {free / 2**30:.1f} GiB that are free: use fewer cells, a lower refine or storage: float16"
+        )
+    # More than can be numbered.
+    solver_lattice.require_memory(grid.shape, voxel, warp_device)
 
 
 def _make_lattice(scene: Scene, device: str) -> Lattice:

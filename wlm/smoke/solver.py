@@ -12,9 +12,11 @@ air that blows up                      error of the lattice, within ``wlm.smoke.
                                        steps: step, cell and cause, and the last good checkpoint, which stays
 smoke in an obstacle                   none; what a moving one covers is lost, what it frees takes after the
                                        cells beside it
-smoke at faces                         leaves through inlets and outlets, and clean air comes in; held at walls
+smoke at faces                         leaves through inlets and outlets, and clean air comes in; held at walls. A
+                                       face with an inlet is open as a whole, beside the inlet too
 a grid of one voxel                    fine
-grids too large for the memory         error before anything is allocated: what they need and what there is
+grids too large for the memory         error before any of smoke's is allocated: what they need and what there is;
+                                       ``wlm.smoke.simulate.make_solver`` looks at those of air and smoke together
 =====================================  ===================================================================
 """
 
@@ -37,15 +39,15 @@ from wlm.smoke.obstacles import Obstacle
 from wlm.smoke.volume import DensityVolume
 from wlm_kernels import advection, advection_places, advection_sources
 
-__all__ = ["SCHEMES", "Buoyancy", "Solver", "Source"]
+__all__ = ["LEAST_HALF_LOSS", "SCHEMES", "Buoyancy", "Solver", "Source", "voxel_bytes"]
 
 SCHEMES = ("maccormack", "semi-lagrangian")
 
 _SYSTEM = "smoke-checkpoint"
 # Air as fast as sound is air that blows up, cells a step: smoke moves no further between two looks.
 _SOUND = math.sqrt(1.0 / 3.0)
-# The least part that half floats, of 11 bits, surely lose: less would be rounded away at every step.
-_LEAST_HALF_LOSS = 2.0**-10
+LEAST_HALF_LOSS = 2.0**-10
+"""The least part that half floats, of 11 bits, surely lose in a step: less would be rounded away each time."""
 
 
 @dataclass(frozen=True)
@@ -100,6 +102,12 @@ class Buoyancy:
             raise ValueError("buoyancy: expected finite numbers")
         if len(self.up) != 3 or abs(math.hypot(*self.up) - 1.0) > 1e-4:
             raise ValueError(f"up: expected a vector of length 1, got {self.up}")
+
+
+def voxel_bytes(scheme: str, storage: str, temperature: bool) -> int:
+    """What a cell of smoke takes up in the memory, bytes; arguments as for ``Solver``."""
+    fields = _buffers(scheme) * (2 if temperature else 1)
+    return fields * wp.types.type_size_in_bytes(advection.STORAGES[storage])
 
 
 class Solver:
@@ -159,8 +167,8 @@ class Solver:
             if not (math.isfinite(rate) and rate >= 0.0):
                 raise ValueError(f"{name}: expected a number of at least 0, got {rate}")
         self._share = (math.exp(-dissipation * substeps), math.exp(-cooling * substeps))
-        if storage == "float16" and any(0.0 < 1.0 - s < _LEAST_HALF_LOSS for s in self._share):
-            raise ValueError(f"dissipation, cooling: expected 0 or {_LEAST_HALF_LOSS:.2g} a step and more with float16")
+        if storage == "float16" and any(0.0 < 1.0 - s < LEAST_HALF_LOSS for s in self._share):
+            raise ValueError(f"dissipation, cooling: expected 0 or {LEAST_HALF_LOSS:.2g} a step and more with float16")
         if len(obstacles) > 255:
             raise ValueError(f"obstacles: expected at most 255, got {len(obstacles)}")
         if buoyancy is not None and solver_lattice.has_bricks(lattice):
@@ -171,14 +179,12 @@ class Solver:
         self.sources, self.obstacles, self.buoyancy = tuple(sources), tuple(obstacles), buoyancy
         self.shape = tuple(refinement * size for size in lattice.shape)
         stored = advection.STORAGES[storage]
-        buffers = 3 if scheme == "maccormack" else 2
-        cell_bytes = buffers * (2 if temperature else 1) * wp.types.type_size_in_bytes(stored)
-        solver_lattice.require_memory(self.shape, cell_bytes, self.device)
+        solver_lattice.require_memory(self.shape, voxel_bytes(scheme, storage, temperature), self.device)
         self._box = advection_places.make_box(lattice.shape, refinement, solver_lattice.ends(lattice))
         self._threshold, self._checkpoint, self._every, self._kept = threshold, checkpoint, checkpoint_every, ""
         self._fields = [
             advection.Fields(self._zeros(self.shape, stored), self._zeros(self.shape if temperature else (0,), stored))
-            for _ in range(buffers)
+            for _ in range(_buffers(scheme))
         ]
         coarse = lattice.shape
         self._velocity = self._zeros(coarse, wp.vec3)
@@ -239,16 +245,13 @@ class Solver:
             self._step()
             self._done += 1
             if self._checkpoint is not None and not capturing and self._done % self._every == 0:
-                self.check()
                 self.save(self._checkpoint)
-                # In the lattice's steps, as its own line is.
-                self._kept = f"; the state of step {self._done * self.substeps} is kept in {self._checkpoint}"
 
     def check(self) -> None:
         """Looks whether the air is still air; syncs with the device.
 
         Raises:
-            WlmError: It blew up; the line names step, cell, cause and the last good checkpoint.
+            WlmError: It blew up; the line names step, cell, cause and the checkpoint saved or loaded last.
         """
         with solver_lattice.adding(lambda: self._kept):
             self.lattice.check()
@@ -324,9 +327,11 @@ class Solver:
         """Writes all of the state, whole or not at all.
 
         Raises:
-            WlmError: It can't be written; what was there before stays.
+            WlmError: The air blew up, or the file can't be written; what was there before stays.
         """
-        tensors = {f"lattice.{name}": value for name, value in self.lattice.state().items()}
+        self.check()
+        air = self.lattice.state()
+        tensors = {f"lattice.{name}": value for name, value in air.items()}
         # On a CPU .numpy() is the array itself; it is written before the next step changes it.
         tensors |= {"density": self.density.numpy(), "placed": self._placed}
         if self.temperature is not None:
@@ -334,11 +339,13 @@ class Solver:
         text = json.dumps(self._settings, sort_keys=True).encode()
         source = hashlib.blake2b(text, digest_size=16).hexdigest()
         write_artifact(path, _SYSTEM, self._settings, tensors, source)
+        self._keep(path, air["steps"])
 
     def load(self, path: str | os.PathLike[str]) -> None:
-        """Goes on from a checkpoint of a solver and a lattice of the same settings, to the same last bit.
+        """Goes on from a checkpoint of a solver and a lattice of the same settings.
 
-        A lattice of bricks goes on the same to its tolerance, smoke in bricks to its threshold.
+        On a CPU to the same last bit; on a GPU as far as the atomic sums of its outlets come out alike. A lattice of
+        bricks goes on the same to its tolerance, smoke in bricks to its threshold.
 
         Raises:
             WlmError: The file is damaged, or of another simulation; the line names what differs.
@@ -367,12 +374,21 @@ class Solver:
         self._placed = np.array(state["placed"])
         self._done = self.steps
         if self.obstacles:
-            self._solid.assign(np.array(parts["solid"]).reshape(self._solid.shape))
+            # The lattice of a state before the first step has no solid yet.
+            if parts["solid"].size:
+                self._solid.assign(np.array(parts["solid"]).reshape(self._solid.shape))
+            else:
+                self._solid.zero_()
             advection_places.mark_walls(self._box, self._solid.flatten(), self._walls[0])
         if self._bricks is not None:
             self._bricks.busy.fill_(1)
+        self._keep(path, parts["steps"])
 
     # Within a step.
+
+    def _keep(self, path: str | os.PathLike[str], steps: np.ndarray) -> None:
+        """Notes for the line of an error where a state is kept; in the lattice's steps, as that line is."""
+        self._kept = f"; the state of step {int(steps)} is kept in {path}"
 
     def _place_obstacles(self) -> None:
         """Puts obstacles where they will be in the middle of the step; nothing if they are there and at rest."""
@@ -431,6 +447,10 @@ class Solver:
 
     def _zeros(self, shape: tuple[int, ...], dtype) -> wp.array:
         return wp.zeros(shape, dtype=dtype, device=self.device)
+
+
+def _buffers(scheme: str) -> int:
+    return 3 if scheme == "maccormack" else 2
 
 
 def _named(array: np.ndarray | None) -> str:

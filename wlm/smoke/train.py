@@ -10,6 +10,10 @@ a step whose gradient isn't finite     left out and counted; error when a tenth 
 worse than untrained by 3 dB           error at the end of the round; the best network so far is kept
 an empty pool, or one of another size  error
 out of time, or stopped                a checkpoint is written first
+stopped before the first step          the checkpoint is of step 0, and no older one's
+resumed, with a network that isn't     as without one: the next validation's is kept
+the checkpoint's
+resumed, and already finished          error
 =====================================  ===============================================================
 """
 
@@ -40,7 +44,7 @@ from wlm.interop import check_device
 from wlm.smoke.dataset import DatasetSettings
 from wlm.smoke.evaluate import Evaluation, evaluate
 from wlm.smoke.network import NetworkSettings
-from wlm.smoke.network_file import SYSTEM, save_network
+from wlm.smoke.network_file import SYSTEM, load_network, save_network
 from wlm.smoke.samples import PLANES, Pool
 from wlm.smoke.trainer import Trainer, TrainSettings, plan_round
 
@@ -157,8 +161,8 @@ def train(
         progress: Called about every 50 steps; it may raise KeyboardInterrupt to stop.
 
     Raises:
-        WlmError: No such device, a checkpoint that is damaged or of another training, a pool that isn't fit to be
-            learned from, a training that diverged, or a file that can't be written.
+        WlmError: No such device, a checkpoint that is damaged or of another training, a finished network to resume, a
+            pool that isn't fit to be learned from, a training that diverged, or a file that can't be written.
         KeyboardInterrupt: Raised by ``progress``, after the checkpoint has been written.
     """
     device = check_device(device)
@@ -171,6 +175,8 @@ def train(
     }
     source = hashlib.blake2b(json.dumps(fit, sort_keys=True).encode(), digest_size=16).hexdigest()
     checkpoint = Checkpoint(output, SYSTEM, fit, source, resume=resume)
+    if resume and not checkpoint.resumed and Path(output).exists():
+        raise WlmError(f"{output}: is finished; without --resume it is trained anew")
     run = _Run(Path(output), profile, seed, device, checkpoint, progress, minutes)
     validation = make_validation(profile.dataset, device)
     _check_pool("validation", validation)
@@ -197,6 +203,7 @@ class _Run:
         self.start = time.perf_counter()
         self.limit = math.inf if minutes is None else 60.0 * minutes
         self.before, self.best, self.first, self.score = 0.0, math.nan, math.nan, None
+        self.kept = self.first_skipped = 0  # steps of the best; steps left out before the round
         self.columns = ["step", "seconds", "rate", "loss", *self.settings.losses.parts, "skipped"]
         self.columns += [*_SCORES, *PLANES]
         self.curve = np.zeros((0, len(self.columns)))
@@ -204,12 +211,13 @@ class _Run:
             try:
                 self.trainer.load(state)
                 self.before, self.best, self.first = (float(value) for value in state["clock"])
+                self.kept, self.first_skipped = (int(value) for value in state["counts"])
                 self.curve = state["curve"].reshape(-1, len(self.columns))
             except (KeyError, ValueError) as error:
                 raise WlmError(f"{checkpoint.path}: expected the state of a training: {error}") from error
-            if not output.is_file():
-                self.best = math.nan  # the network that it is of is gone
-        self.first_skipped, self._loss = self.trainer.skipped, math.nan
+            if not self._holds_best():
+                self.best = math.nan
+        self._loss = math.nan
 
     @property
     def late(self) -> bool:
@@ -228,7 +236,8 @@ class _Run:
         """Does what is left of a round; False: out of time."""
         number, begin = self.round, self.round * self.settings.steps
         plan = plan_round(self.settings, len(pool), seed=self.seed, round=number)
-        self.first_skipped = self.trainer.skipped
+        if self.trainer.step == begin:
+            self.first_skipped = self.trainer.skipped
         while (done := self.trainer.step - begin) < self.settings.steps:
             self.trainer.run(pool, tuple(part[done : done + _CHUNK] for part in plan))
             self._check_steps(number)
@@ -250,6 +259,8 @@ class _Run:
         if self.trainer.step == 0:
             self.score = evaluate(self.trainer.average, validation)
             self.first = self.best = self.score.psnr
+            # In this order: with no network, or an older one, its best counts for nothing.
+            self.save()
             save_network(self.output, self.trainer.average, self._summary())
 
     def end_round(self, validation: Pool) -> None:
@@ -264,7 +275,7 @@ class _Run:
                 )
             # True where the best is NaN too.
             if not self.score.psnr <= self.best:
-                self.best = self.score.psnr
+                self.best, self.kept = self.score.psnr, self.trainer.step
                 save_network(self.output, self.trainer.average, self._summary())
         self._add_line(validated)
         self.save()
@@ -281,10 +292,20 @@ class _Run:
     def save(self) -> None:
         """Writes the checkpoint."""
         clock = np.array([self.seconds, self.best, self.first])
-        self.checkpoint.save_running(0, {**self.trainer.state(), "clock": clock, "curve": self.curve})
+        counts = np.array([self.kept, self.first_skipped])
+        state = {"clock": clock, "counts": counts, "curve": self.curve}
+        self.checkpoint.save_running(0, {**self.trainer.state(), **state})
 
     def result(self, finished: bool) -> Result:
         return Result(finished, self.best, self.score, self.trainer.step, self.trainer.skipped, self.seconds)
+
+    def _holds_best(self) -> bool:
+        """Whether the output is the network that the checkpoint calls the best."""
+        try:
+            summary = load_network(self.output)[1]
+        except WlmError:
+            return False  # gone or damaged: no loss, since there will be another
+        return (summary.get("steps"), summary.get("psnr")) == (self.kept, self.best)
 
     def _losses(self) -> list[float]:
         """Means since the last line of the curves."""

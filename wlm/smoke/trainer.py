@@ -36,7 +36,7 @@ class TrainSettings(BaseModel):
             exchanged, both are exact.
         half: Whether CUDA computes in bfloat16 where that is safe; the CPU always uses float32.
         graph: Whether CUDA replays a step from a graph.
-        compiled: Whether CUDA runs the network through torch.compile: a minute at the start, then 1.8 times as quick.
+        compiled: Whether CUDA runs the network through torch.compile: slow to start, then quicker.
         validate_every: Rounds from one validation to the next; the last is always validated.
         losses: Weights of the loss's parts.
     """
