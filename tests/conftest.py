@@ -8,6 +8,9 @@ import pytest
 # One folder a worker: two that compile the same module at once would race for its files. Set before anything
 # imports Warp, which reads it when it starts.
 _WORKER = os.environ.get("PYTEST_XDIST_WORKER", "main")
+# A worker a core: with a thread for each core in each of them, they wait for each other more than they compute.
+if _WORKER != "main":
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ["WARP_CACHE_PATH"] = str(Path(__file__).resolve().parents[1] / ".cache" / f"warp-{_WORKER}")
 
 
