@@ -21,7 +21,19 @@ __all__ = [
     "no_collection",
     "stream",
     "to_warp",
+    "torch_memory",
 ]
+
+
+_TENSORS = {
+    int: (torch.int32, ()),
+    wp.uint8: (torch.uint8, ()),
+    float: (torch.float32, ()),
+    wp.int64: (torch.int64, ()),
+    wp.vec2: (torch.float32, (2,)),
+    wp.vec4: (torch.float32, (4,)),
+}
+"""Warp's types as torch holds them: its own, and the length of its last axis."""
 
 
 def available_devices() -> list[str]:
@@ -133,6 +145,21 @@ def no_collection() -> Iterator[None]:
     finally:
         if collecting:
             gc.enable()
+
+
+def torch_memory(device: torch.device) -> Callable[[tuple[int, ...], Any], wp.array]:
+    """Makes the buffers of kernels, `empty(shape, dtype)`, in torch's memory.
+
+    That may be freed while torch's stream still uses it, and a graph may capture it; Warp's own it may not.
+    """
+
+    def empty(shape: tuple[int, ...], dtype: Any) -> wp.array:
+        kind, tail = _TENSORS[dtype]
+        if 0 in shape:
+            return wp.empty(shape, dtype=dtype, device=wp.device_from_torch(device))
+        return to_warp(torch.empty((*shape, *tail), dtype=kind, device=device), dtype if tail else None)
+
+    return empty
 
 
 class StepGraph:

@@ -14,20 +14,12 @@ import torch
 import warp as wp
 from torch.autograd.function import once_differentiable
 
-from wlm.interop import to_warp
+from wlm.interop import to_warp, torch_memory
 from wlm_kernels import raster as kernels
 from wlm_kernels import raster_gradient
 from wlm_kernels import texture as texture_kernels
 
 __all__ = ["Raster", "interpolate", "rasterize", "rasterize_uv", "texture"]
-
-_TENSORS = {
-    int: (torch.int32, ()),
-    float: (torch.float32, ()),
-    wp.int64: (torch.int64, ()),
-    wp.vec2: (torch.float32, (2,)),
-    wp.vec4: (torch.float32, (4,)),
-}
 
 
 @dataclass(frozen=True)
@@ -168,7 +160,9 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(ctx, position, triangle, height, width, options):
         with _queue(position.device):
-            drawing = kernels.Rasterizer(to_warp(triangle), height, width, empty=_maker(position.device), **options)
+            drawing = kernels.Rasterizer(
+                to_warp(triangle), height, width, empty=torch_memory(position.device), **options
+            )
             found = vars(drawing.run(to_warp(position)))
             tensors = {name: None if array is None else wp.to_torch(array) for name, array in found.items()}
         ctx.save_for_backward(position, triangle, tensors["triangle"])
@@ -263,18 +257,6 @@ def _queue(device: torch.device):
     if device.type == "cpu":
         return nullcontext()
     return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device)), sync_enter=False)
-
-
-def _maker(device: torch.device):
-    """Makes the buffers of ``Rasterizer`` in torch's memory, which may be freed while torch's stream still uses it."""
-
-    def empty(shape: tuple[int, ...], dtype: Any) -> wp.array:
-        kind, tail = _TENSORS[dtype]
-        if 0 in shape:
-            return _nothing(shape, dtype, device)
-        return to_warp(torch.empty((*shape, *tail), dtype=kind, device=device), dtype if tail else None)
-
-    return empty
 
 
 def _nothing(shape: tuple[int, ...], dtype: Any, device: torch.device) -> wp.array:

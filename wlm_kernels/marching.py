@@ -12,11 +12,10 @@ A light is a direction towards it, of irradiance 4 pi, so that an isotropic phas
 
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import torch
 import warp as wp
 
 __all__ = [
@@ -36,11 +35,14 @@ __all__ = [
     "phase",
     "plain_depth",
     "ray",
-    "scratch",
     "skipping_at",
     "transmittance",
     "view",
+    "warp_memory",
 ]
+
+Empty = Callable[[tuple[int, ...], Any], wp.array]
+"""Makes a buffer, not set, of a shape and a type."""
 
 _OPTIONS = {"enable_backward": False}
 
@@ -320,7 +322,10 @@ def guide_kernels(dtype: Any) -> _Kernels:
 
 @wp.func
 def plain_depth(density: wp.array3d[Any], p: wp.vec3, toward: wp.vec3, extinction: float, h: float) -> float:
-    """``optical_depth`` without bricks: too few samples to be worth the making of them."""
+    """``optical_depth`` without bricks: too few samples to be worth the making of them.
+    empty: As for ``occupied``.
+    empty: As for ``occupied``.
+    """
     span = clip(size_of(density), p, toward)
     first = wp.max(span[0], 0.0)
     tau = float(0.0)
@@ -375,32 +380,29 @@ def view(origin, right, up, forward, pitch: float, width: int, height: int, pers
     return made
 
 
-def scratch(shape: Sequence[int], dtype, device: wp.Device) -> wp.array:
-    """Memory for a call's own use, not set. It is torch's, which a graph may capture; Warp's own it may not."""
-    where = wp.device_to_torch(device)
-    if dtype in (wp.vec2, wp.vec4):
-        made = torch.empty((*shape, wp.types.type_size(dtype)), dtype=torch.float32, device=where)
-        return wp.from_torch(made, dtype=dtype)
-    return wp.from_torch(torch.empty(tuple(shape), dtype=wp.dtype_to_torch(dtype), device=where))
+def warp_memory(device: wp.Device) -> Empty:
+    """Makes buffers in Warp's own memory: what calls use that are given no other."""
+    return lambda shape, dtype: wp.empty(shape, dtype=dtype, device=device)
 
 
-def occupied(density):
+def occupied(density, empty: Empty | None = None):
     """Which bricks have smoke within reach of a sample in them.
 
     Args:
         density: float or half [X, Y, Z].
+        empty: Makes a buffer, ``empty(shape, dtype)`` on the density's device; default Warp's.
 
     Returns:
         uint8 [X / 8, Y / 8, Z / 8], rounded up, 1 where there is any.
     """
     shape = tuple(-(-n // BRICK) for n in density.shape)
-    bricks = scratch(shape, wp.uint8, density.device)
+    bricks = (empty or warp_memory(density.device))(shape, wp.uint8)
     kernel = guide_kernels(density.dtype).occupied
     wp.launch(kernel, shape, inputs=[density], outputs=[bricks], device=density.device)
     return bricks
 
 
-def transmittance(density, extinction: float, points, toward, step: float, out) -> None:
+def transmittance(density, extinction: float, points, toward, step: float, out, empty: Empty | None = None) -> None:
     """What is left of light that comes to points from a direction (eq. 3).
 
     Args:
@@ -410,8 +412,9 @@ def transmittance(density, extinction: float, points, toward, step: float, out) 
         toward: Three numbers, the direction to the light, of length 1.
         step: The longest step, in voxels; the error falls with its square where the density is smooth.
         out: float [N], written.
+        empty: As for ``occupied``.
     """
-    inputs = [density, occupied(density), extinction, points, wp.vec3(*map(float, toward)), step]
+    inputs = [density, occupied(density, empty), extinction, points, wp.vec3(*map(float, toward)), step]
     kernel = guide_kernels(density.dtype).transmittance
     wp.launch(kernel, points.shape, inputs=inputs, outputs=[out], device=density.device)
 
@@ -422,7 +425,7 @@ def nodes_along(shape: Sequence[int], step: float) -> tuple[int, ...]:
     return tuple(math.ceil((n + 1) / max(step, 1.0)) + 1 for n in shape)
 
 
-def lattice(density, extinction: float, up, step: float):
+def lattice(density, extinction: float, up, step: float, empty: Empty | None = None):
     """Optical depths towards the top and the bottom on a lattice of nodes no farther apart than a step, or a voxel.
 
     Args:
@@ -434,7 +437,7 @@ def lattice(density, extinction: float, up, step: float):
     Returns:
         vec2 [A, B, C], to the top and to the bottom; the first and the last nodes lie half a voxel out of the grid.
     """
-    nodes = scratch(nodes_along(density.shape, step), wp.vec2, density.device)
+    nodes = (empty or warp_memory(density.device))(nodes_along(density.shape, step), wp.vec2)
     inputs = [density, extinction, wp.vec3(*map(float, up)), step]
     kernel = guide_kernels(density.dtype).lattice
     wp.launch(kernel, nodes.shape, inputs=inputs, outputs=[nodes], device=density.device)
@@ -456,6 +459,7 @@ def guide(
     unit: float = 1.0,
     lead: float = 0.0,
     shared: bool = True,
+    empty: Empty | None = None,
 ) -> None:
     """A guiding map (algorithm 1): smoke lit from the front, the top and the bottom, its transparency and its depth.
 
@@ -484,8 +488,8 @@ def guide(
     """
     kernels = guide_kernels(density.dtype)
     if shared:
-        nodes, kernel = lattice(density, extinction, seen.up, step), kernels.guide
+        nodes, kernel = lattice(density, extinction, seen.up, step, empty), kernels.guide
     else:
-        nodes, kernel = scratch((0, 0, 0), wp.vec2, density.device), kernels.guide_marching
+        nodes, kernel = warp_memory(density.device)((0, 0, 0), wp.vec2), kernels.guide_marching
     inputs = [density, nodes, extinction, seen, step, jitter, seed, threshold, g, cutoff, unit, lead]
     wp.launch(kernel, out.shape[1:], inputs=inputs, outputs=[out], device=density.device)

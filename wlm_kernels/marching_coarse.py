@@ -12,6 +12,7 @@ from typing import Any
 import warp as wp
 
 from wlm_kernels.marching import (
+    Empty,
     View,
     absorbed,
     clip,
@@ -22,8 +23,8 @@ from wlm_kernels.marching import (
     phase,
     plain_depth,
     ray,
-    scratch,
     size_of,
+    warp_memory,
 )
 
 __all__ = ["DEPTH", "PLANES", "coarse_kernels", "coarse_six_way"]
@@ -144,6 +145,7 @@ def coarse_six_way(
     cutoff: float = 1e-4,
     unit: float = 1.0,
     lead: float = 0.0,
+    empty: Empty | None = None,
 ) -> None:
     """Six-way lightmaps, transparency, emission and depth by one march in large steps.
 
@@ -158,6 +160,7 @@ def coarse_six_way(
         g: Henyey and Greenstein's mean cosine, within -1 and 1.
         temperature: As the density, of its shape; None: nothing emits.
         emission: Light given off per voxel of way where the temperature is 1.
+        empty: As for ``marching.occupied``.
 
     Raises:
         ValueError: The camera is in perspective.
@@ -165,7 +168,7 @@ def coarse_six_way(
     if seen.perspective:
         raise ValueError("six-way lightmaps need an orthographic camera: their lights follow its axes")
     lattice, gather = coarse_kernels(density.dtype, temperature is not None)
-    nodes = scratch(nodes_along(density.shape, step), wp.vec4, density.device)
+    nodes = (empty or warp_memory(density.device))(nodes_along(density.shape, step), wp.vec4)
     inputs = [density, extinction, seen, step]
     wp.launch(lattice, nodes.shape, inputs=inputs, outputs=[nodes], device=density.device)
     hot = density if temperature is None else temperature

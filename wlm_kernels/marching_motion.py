@@ -12,7 +12,7 @@ from typing import Any
 
 import warp as wp
 
-from wlm_kernels.marching import View, absorbed, clip, occupied, ray, size_of, skipping_at
+from wlm_kernels.marching import Empty, View, absorbed, clip, occupied, ray, size_of, skipping_at
 
 __all__ = ["motion", "motion_kernel"]
 
@@ -115,6 +115,7 @@ def motion(
     step: float = 2.0,
     cutoff: float = 1e-3,
     least: float = 1e-3,
+    empty: Empty | None = None,
 ) -> None:
     """By how many pixels what each pixel shows has moved since the frame before.
 
@@ -128,11 +129,12 @@ def motion(
         step: The longest step, in voxels.
         cutoff: A ray ends where less than this is left of its transparency.
         least: The opacity up to which a pixel counts as one without smoke.
+        empty: As for ``marching.occupied``.
 
     Raises:
         ValueError: The camera is in perspective.
     """
     if seen.perspective:
         raise ValueError("motion needs an orthographic camera, as the lightmaps do")
-    inputs = [density, occupied(density), extinction, velocity, reach, seen, step, cutoff, least]
+    inputs = [density, occupied(density, empty), extinction, velocity, reach, seen, step, cutoff, least]
     wp.launch(motion_kernel(density.dtype), out.shape[1:], inputs=inputs, outputs=[out], device=density.device)

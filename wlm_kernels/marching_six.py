@@ -17,6 +17,7 @@ from typing import Any
 import warp as wp
 
 from wlm_kernels.marching import (
+    Empty,
     View,
     absorbed,
     clip,
@@ -25,9 +26,9 @@ from wlm_kernels.marching import (
     optical_depth,
     phase,
     ray,
-    scratch,
     size_of,
     skipping_at,
+    warp_memory,
 )
 
 __all__ = ["EMISSION", "TRANSPARENCY", "lit", "six_kernels", "six_way"]
@@ -248,7 +249,16 @@ def _extent(shape, origin, direction) -> tuple[float, float]:
 
 
 def six_way(
-    density, extinction: float, seen: View, out, *, step: float = 0.5, g: float = 0.0, temperature=None, emission=0.0
+    density,
+    extinction: float,
+    seen: View,
+    out,
+    *,
+    step: float = 0.5,
+    g: float = 0.0,
+    temperature=None,
+    emission: float = 0.0,
+    empty: Empty | None = None,
 ) -> None:
     """The six lightmaps, the transparency and the emission of smoke of albedo 1 (eq. 4).
 
@@ -266,6 +276,7 @@ def six_way(
         g: Henyey and Greenstein's mean cosine, within -1 and 1.
         temperature: As the density, of its shape; None: nothing emits.
         emission: Light given off per voxel of way where the temperature is 1.
+        empty: As for ``marching.occupied``.
 
     Raises:
         ValueError: The camera is in perspective.
@@ -275,11 +286,12 @@ def six_way(
     device = density.device
     height, width = seen.height, seen.width
     kernels = six_kernels(density.dtype)
-    bricks = occupied(density)
+    empty = empty or warp_memory(device)
+    bricks = occupied(density, empty)
     out.zero_()
     near, far = _extent(density.shape, seen.origin, seen.forward)
     start = max(near, 0.0)
-    behind, ahead, passed = (scratch((height, width), wp.float32, device) for _ in range(3))
+    behind, ahead, passed = (empty((height, width), float) for _ in range(3))
     for plane in (behind, ahead, passed):
         plane.zero_()
     common = [density, bricks, extinction, seen]
@@ -295,7 +307,7 @@ def six_way(
     dz, planes = columns(start, far, ahead)
     parts = max(1, math.ceil(seen.pitch / step))
     slab = max(1, min(planes, _SLAB_BYTES // (16 * height * width)))
-    sides = [scratch((slab, height, width), wp.float32, device) for _ in range(4)]
+    sides = [empty((slab, height, width), float) for _ in range(4)]
     hot = density if temperature is None else temperature
     given = 0.0 if temperature is None else emission
     # Once even without a plane, for the transparency.
@@ -310,7 +322,17 @@ def six_way(
         wp.launch(kernels.gather, (height, width), inputs=inputs, outputs=[passed, out], device=device)
 
 
-def lit(density, extinction: float, seen: View, toward, out, *, step: float = 0.5, g: float = 0.0) -> None:
+def lit(
+    density,
+    extinction: float,
+    seen: View,
+    toward,
+    out,
+    *,
+    step: float = 0.5,
+    g: float = 0.0,
+    empty: Empty | None = None,
+) -> None:
     """Smoke under one light from any direction: every sample of a ray marches to it, with nothing shared.
 
     What the six lightmaps approximate for a light between their axes (eq. 5), and a check of them along these.
@@ -323,6 +345,7 @@ def lit(density, extinction: float, seen: View, toward, out, *, step: float = 0.
         out: float [H, W], written.
         step: The longest step, in voxels, along rays and to the light.
         g: Henyey and Greenstein's mean cosine, within -1 and 1.
+        empty: As for ``marching.occupied``.
     """
-    inputs = [density, occupied(density), extinction, seen, wp.vec3(*map(float, toward)), step, g]
+    inputs = [density, occupied(density, empty), extinction, seen, wp.vec3(*map(float, toward)), step, g]
     wp.launch(six_kernels(density.dtype).lit, out.shape, inputs=inputs, outputs=[out], device=density.device)

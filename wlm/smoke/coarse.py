@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import torch
 
-from wlm.interop import device_name, stream, to_warp
+from wlm.interop import device_name, stream, to_warp, torch_memory
 from wlm.smoke.axes import DIRECTIONS, Camera
 from wlm.smoke.guide import check_march
 from wlm.smoke.reference import SixWay
@@ -100,5 +100,6 @@ def coarse_six_way(
             cutoff=cutoff,
             unit=volume.voxel,
             lead=moved,
+            empty=torch_memory(volume.device),
         )
     return CoarseSixWay(planes, camera, volume.temperature is not None)

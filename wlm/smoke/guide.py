@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 import warp as wp
 
-from wlm.interop import device_name, stream, to_warp
+from wlm.interop import device_name, stream, to_warp, torch_memory
 from wlm.smoke.axes import Camera
 from wlm.smoke.volume import DensityVolume
 from wlm_kernels import marching
@@ -114,6 +114,7 @@ def guide(
             unit=volume.voxel,
             lead=moved,
             shared=shared,
+            empty=torch_memory(volume.device),
         )
     return Guide(maps, camera)
 
@@ -153,5 +154,6 @@ def transmittance(
             (direction / length).tolist(),
             step,
             to_warp(out),
+            torch_memory(volume.device),
         )
     return out

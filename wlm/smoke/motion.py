@@ -8,7 +8,7 @@ import math
 import torch
 import warp as wp
 
-from wlm.interop import device_name, stream, to_warp
+from wlm.interop import device_name, stream, to_warp, torch_memory
 from wlm.smoke.axes import Camera
 from wlm.smoke.guide import check_march
 from wlm.smoke.volume import DensityVolume
@@ -51,5 +51,7 @@ def motion(
         out = torch.empty((2, camera.height, camera.width), dtype=torch.float32, device=volume.device)
         density, _ = volume.arrays()
         extinction, reached = volume.extinction * volume.voxel, reach / volume.voxel
-        marching_motion.motion(density, extinction, velocity, reached, view, to_warp(out), step=step)
+        marching_motion.motion(
+            density, extinction, velocity, reached, view, to_warp(out), step=step, empty=torch_memory(volume.device)
+        )
     return out

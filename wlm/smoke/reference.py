@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from wlm.interop import device_name, stream, to_warp
+from wlm.interop import device_name, stream, to_warp, torch_memory
 from wlm.smoke.axes import DIRECTIONS, Camera
 from wlm.smoke.guide import check_march
 from wlm.smoke.volume import DensityVolume
@@ -147,7 +147,16 @@ def lit(
         out = torch.empty((camera.height, camera.width), dtype=torch.float32, device=volume.device)
         density, _ = volume.arrays()
         extinction = volume.extinction * volume.voxel
-        marching_six.lit(density, extinction, view, direction / length, to_warp(out), step=step, g=g)
+        marching_six.lit(
+            density,
+            extinction,
+            view,
+            direction / length,
+            to_warp(out),
+            step=step,
+            g=g,
+            empty=torch_memory(volume.device),
+        )
     return out
 
 
@@ -165,6 +174,7 @@ def _march(volume: DensityVolume, camera: Camera, step: float, g: float, supersa
         g=g,
         temperature=temperature,
         emission=volume.emission * volume.voxel,
+        empty=torch_memory(volume.device),
     )
     if supersample == 1:
         return out
