@@ -11,6 +11,7 @@ demo: $(STAMP)
 	$(BIN)/python demos/atlas.py
 	$(BIN)/python demos/probe.py
 	$(BIN)/python demos/smoke.py
+	$(BIN)/python demos/smoke_network.py
 
 demo-network: $(STAMP)
 	$(BIN)/python demos/smoke_network.py --train

@@ -1,5 +1,7 @@
 """The figures in the documents are those of the committed benchmarks."""
 
+import csv
+import json
 import re
 from pathlib import Path
 
@@ -208,6 +210,7 @@ def test_readme_meshes(mesh):
 
 # Where the README's figures of smoke are from, and the columns of its tables.
 SMOKE = FILES[0]
+EVALUATION = ROOT / "benchmarks" / "smoke-network.json"
 SMOKE_TABLES = {
     "lattice": ("cells", "ms", "MLUPS", "of the copy"),
     "lattice storage": ("cells", "RMS", "largest", "mass drift"),
@@ -245,6 +248,67 @@ def test_readme_and_docs_smoke_text():
     page = " ".join((ROOT / "docs" / "smoke.md").read_text(encoding="utf-8").split())
     assert f"off by {rules['squared']['RMS']} RMS and {rules['squared']['bias']} in brightness" in page
     assert f"eq. 5 by {rules['absolute']['RMS']} and {rules['absolute']['bias']}." in page
+
+
+NETWORK_TABLES = {
+    "time against error": ("ms", "as calls, ms", "PSNR dB", "least dB", "most dB", "opacity dB"),
+    "frame": ("of", "ms"),
+}
+
+
+def network_rows(method: str) -> dict[str, Row]:
+    found = (row for row in read_json(SMOKE)[0] if (row.system, row.method) == ("smoke-network", method))
+    return {row.option: row for row in found}
+
+
+def network_line(row: Row) -> str:
+    known = figures(row) | {"ms": f"{row.decode_ms:.3g}", "PSNR dB": "" if row.psnr is None else f"{row.psnr:.2f}"}
+    return f"| {' | '.join([row.option, *(known.get(title, '') for title in NETWORK_TABLES[row.method])])} |"
+
+
+@pytest.mark.parametrize("method", NETWORK_TABLES)
+def test_readme_network(method):
+    lines = [network_line(row) for row in network_rows(method).values()]
+    assert lines
+    assert [line for line in lines if line not in README] == []
+
+
+def test_readme_network_evaluation():
+    """And that the network that comes with wlm holds what it has to."""
+    sets = {one["name"]: one for one in json.loads(EVALUATION.read_text(encoding="utf-8"))["sets"]}
+    assert list(sets) == ["density x 0.5", "density x 1", "density x 2", "smoke.npz"]
+    for name, one in sets.items():
+        for method, found in one["methods"].items():
+            ratio = "" if found["flicker_ratio"] is None else f"{found['flicker_ratio']:.3f}"
+            cells = [name, method, *(f"{found[key]:.2f}" for key in ("psnr", "lowest", "highest")), ratio]
+            assert f"| {' | '.join(cells)} |" in README
+        assert abs(one["half_loss"]) < 0.1 and (one["methods"]["network"]["flicker_ratio"] or 0) < 1.3
+    assert sets["density x 1"]["methods"]["network"]["psnr"] > 36
+
+
+def test_readme_network_text():
+    rows, text = network_rows("time against error"), " ".join(README.split())
+    ours, paper = rows["smoke-six-24, fp16"], rows["smoke-paper-16, fp16"]
+    near, nearer, far = (rows[name] for name in ("coarse, h 3", "coarse, h 2, nodes 3", "six ways, step 7"))
+    told = f"{near.psnr:.1f} dB in {near.decode_ms:.2f} ms and {nearer.psnr:.1f} in {nearer.decode_ms:.2f}, where the"
+    assert f"{told} network has {ours.psnr:.1f} in {ours.decode_ms:.2f}." in text
+    assert f"The network adds {ours.psnr - rows['coarse, h 5'].psnr:.1f} dB to its own guiding map" in text
+    assert f'"six ways" has {far.psnr:.1f} dB in {far.decode_ms:.2f} ms' in text and f"at {paper.psnr:.0f} dB" in text
+    assert far.decode_ms > ours.decode_ms and far.psnr < ours.psnr and nearer.decode_ms < ours.decode_ms
+
+
+def test_docs_training():
+    page = " ".join((ROOT / "docs" / "smoke.md").read_text(encoding="utf-8").split())
+    for name, told in (
+        ("smoke-six-24", ("{psnr:.2f} dB after {step:,} steps and {seconds:.0f} s", True)),
+        ("smoke-six-24", ("after {step:,} steps and {seconds:.0f} s it had {psnr:.2f} dB", False)),
+        ("smoke-paper-16", ("{psnr:.2f} dB after {step:,} steps and {seconds:.0f} s", True)),
+    ):
+        with open(ROOT / "benchmarks" / f"{name}.csv", encoding="utf-8") as file:
+            lines = [{key: float(value) for key, value in line.items()} for line in csv.DictReader(file)]
+        validated = [line | {"step": int(line["step"])} for line in lines if line["psnr"] == line["psnr"]]
+        best = max(validated, key=lambda line: line["psnr"])
+        assert told[0].format(**(best if told[1] else validated[0])) in page
 
 
 def test_images_are_there():

@@ -20,7 +20,7 @@ from wlm.errors import WlmError
 from wlm.smoke.data import CameraSettings, make_camera
 from wlm.smoke.dataset import DatasetSettings
 from wlm.smoke.network import NetworkSettings, SixWayNetwork
-from wlm.smoke.network_file import save_network
+from wlm.smoke.network_file import save_network, shipped
 from wlm.smoke.reference import six_way
 from wlm.smoke.synthetic import make_plume
 
@@ -32,6 +32,7 @@ TINY = replace(
     frames=2,
     six=(4.0, 1.0, 0.5),
     coarse=(4.0, 0.8),
+    swept=((4.0, 1.0), (0.8, 4.0)),
     turns=(0.0, 60.0),
     scales=(1.0, 2.0),
     profile=16,
@@ -39,7 +40,7 @@ TINY = replace(
     repeats=1,
 )
 STEP = 0.8  # of a guiding map of 32 voxels
-NETWORK = NetworkSettings(guide="six", width=8, blocks=(1, 1), decoder=(1,), stem=2)
+NETWORK = NetworkSettings(guide="six", width=8, levels=2, stem=2)
 SETTINGS = DatasetSettings(guide="six")
 
 
@@ -83,7 +84,8 @@ def test_time_against_error(rows):
     assert found["six ways, step 0.5"].psnr is None and "held against" in found["six ways, step 0.5"].notes
     assert found["six ways, step 1"].psnr > found["six ways, step 4"].psnr + 6.0
     assert found["coarse, h 0.8"].psnr > found["coarse, h 4"].psnr + 6.0
-    assert len({found[f"coarse, h 4{jitter}"].psnr for jitter in ("", ", no jitter")}) == 2
+    least, one, other, most = (found[f"coarse, h {h}"].psnr for h in ("4", "4, nodes 1", "0.8, nodes 4", "0.8"))
+    assert least < min(one, other) and max(one, other) < most
     # A network that hasn't learned yet gives back its guide, which is the coarse march.
     assert found["young, fp32"].psnr == pytest.approx(found["coarse, h 0.8"].psnr, abs=0.01)
     assert found["raw, fp32"].psnr is None and found["raw, fp32"].notes == "not trained"
@@ -117,7 +119,8 @@ def test_profiles(rows):
 
 def test_density_and_flicker(rows):
     found = of(rows, "density")
-    assert list(found) == [f"{name}, x{scale}" for scale in (1, 2) for name in ("young", "coarse, h 0.8")]
+    marches = [f"coarse, h {h}" for h in ("0.8", "0.4", "0.24")]
+    assert list(found) == [f"{name}, x{scale}" for scale in (1, 2) for name in ("young", *marches)]
     for scale in (1, 2):
         ours, march = found[f"young, x{scale}"], found[f"coarse, h 0.8, x{scale}"]
         assert ours.psnr == pytest.approx(march.psnr, abs=0.05)
@@ -165,7 +168,7 @@ def test_rows_make_a_file_a_page_and_a_plot(rows, tmp_path):
         assert page.count(f"#### {method}: unseen smoke\n") == 1
     shown = plotted(rows)
     assert [row.method for row in shown] == ["six ways"] * 3 + ["coarse"] * 4 + ["young", "raw"]
-    assert shown[0].option == "step 4" and shown[-3].option == "h 0.8, no jitter"
+    assert shown[0].option == "step 4" and shown[-3].option == "h 0.8, nodes 4"
     plot(shown, tmp_path / "rows.png", PANELS)
     assert (tmp_path / "rows.png").stat().st_size > 10_000
 
@@ -190,6 +193,10 @@ def test_the_command(rows, network, tmp_path, monkeypatch):
     told = "wlm bench smoke-network --quick --device cpu --network young.safetensors --profile 16"
     assert found == rows and environment["command"] == told
     assert "#### profiles: unseen smoke" in result.output and (tmp_path / "a.png").stat().st_size > 1000
+    # Without any, the network that ships; a profile alone stays alone.
+    for words, given in (([], ([shipped()], ())), (["--profile", "16"], ([], ["16"]))):
+        result = CliRunner().invoke(app, ["smoke-network", "--quick", *words])
+        assert result.exit_code == 0 and seen["given"] == given, result.output
 
 
 def test_networks_or_profiles_are_needed(monkeypatch):

@@ -12,19 +12,20 @@ import yaml
 from smoke_plumes import plume, write_frames
 from test_cli import call, fails
 
-from wlm.smoke import dataset
+from wlm.formats.artifact import read_artifact
+from wlm.smoke import dataset, network_file
 from wlm.smoke.coarse import coarse_six_way
 from wlm.smoke.dataset import DatasetSettings
 from wlm.smoke.frames import open_footage, read_six_way, save_volume
 from wlm.smoke.infer import Predictor, predict
-from wlm.smoke.network_file import load_network, save_network, settings_of
+from wlm.smoke.network_file import load_network, save_network, settings_of, shipped
 from wlm.smoke.samples import GUIDES
 from wlm.smoke.trainer import Trainer
 
 PROFILE = {
     "name": "tiny",
-    "network": {"guide": "six", "width": 8, "blocks": [1, 1], "decoder": [1], "stem": 2},
-    "training": {"rounds": 2, "steps": 4, "batch": 2, "warmup": 1, "average": 0.5},
+    "network": {"guide": "six", "width": 8, "levels": 2, "stem": 2},
+    "training": {"rounds": 2, "steps": 4, "batch": 2, "rate": 2e-4, "warmup": 1, "average": 0.5},
     "dataset": {
         "guide": "six",
         "guide_step": 0.1,
@@ -62,6 +63,13 @@ def volume(tmp_path):
     return tmp_path / "plume.npz"
 
 
+def kept(path):
+    """All that a network's file holds, but for the time that its training took."""
+    held = read_artifact(path)
+    settings = {**held.settings, "summary": {**held.settings["summary"], "seconds": 0}}
+    return settings, {name: array.tobytes() for name, array in held.tensors.items()}
+
+
 def test_train(trained):
     folder, text, stderr = trained
     assert sorted(os.listdir(folder)) == ["a.safetensors", "a.safetensors.csv", "tiny.yaml"]
@@ -75,7 +83,7 @@ def test_train(trained):
 
 
 def test_a_training_is_stopped_and_resumed(trained, tmp_path, monkeypatch):
-    """By Ctrl-C, then by the clock; it ends with the same bytes."""
+    """By Ctrl-C, then by the clock; it ends with the same weights."""
     folder, _, _ = trained
     words = ("smoke", "train", folder / "tiny.yaml", "-o", tmp_path / "a.safetensors", "--seed", 3)
     run, done = Trainer.run, []
@@ -96,13 +104,13 @@ def test_a_training_is_stopped_and_resumed(trained, tmp_path, monkeypatch):
     assert "out of time at step 4" in call.stderr and "4 of 8" in text
     assert "it was made with seed 3, not 4" in fails(*words[:-1], 4, "--resume")
     partial = tmp_path / "a.safetensors.partial"
-    kept = partial.read_bytes()
-    partial.write_bytes(kept[:-9] + b"?" + kept[-8:])
+    before = partial.read_bytes()
+    partial.write_bytes(before[:-9] + b"?" + before[-8:])
     assert "a.safetensors.partial: the artifact is damaged" in fails(*words, "--resume")
-    partial.write_bytes(kept)
+    partial.write_bytes(before)
     call(*words, "--resume")
     assert not partial.exists()
-    assert (tmp_path / "a.safetensors").read_bytes() == (folder / "a.safetensors").read_bytes()
+    assert kept(tmp_path / "a.safetensors") == kept(folder / "a.safetensors")
 
 
 def test_nothing_to_resume_is_told(trained, tmp_path):
@@ -124,8 +132,8 @@ def test_a_training_is_stopped_before_its_first_step(trained, tmp_path, monkeypa
         call(*words, code=130)
     assert "stopped before another step: the same command with --resume goes on" in call.stderr
     call(*words, "--resume")
+    assert kept(tmp_path / "a.safetensors") == kept(folder / "a.safetensors")
     held = (tmp_path / "a.safetensors").read_bytes()
-    assert held == (folder / "a.safetensors").read_bytes()
     assert "a.safetensors: is finished; without --resume it is trained anew" in fails(*words, "--resume")
     assert (tmp_path / "a.safetensors").read_bytes() == held
 
@@ -148,12 +156,26 @@ def test_predict_looks_as_training_did(network, volume, tmp_path):
     call("smoke", "shade", out, "-o", tmp_path / "a.png")
 
 
-def test_predict_by_the_coarse_march_alone(volume, tmp_path):
-    call("smoke", "predict", volume, "-o", tmp_path / "a.exr", "--coarse", "--resolution", 20)
+@pytest.mark.parametrize("words, step", [((), 24 / 130), (("--step", 4), 4.0)])
+def test_predict_by_the_coarse_march_alone(volume, tmp_path, words, step):
+    call("smoke", "predict", volume, "-o", tmp_path / "a.exr", "--coarse", *words, "--resolution", 20, "--seed", 2)
     found, camera = read_six_way(tmp_path / "a.exr")
-    look = {"step": 24 / 40, "jitter": 1.0, "threshold": 4.0 / 24, "seed": 0}
-    wanted = coarse_six_way(open_footage(volume).load(1), camera, **look).six
-    torch.testing.assert_close(found.lightmaps, wanted.lightmaps, rtol=1e-3, atol=1e-4)
+    wanted = coarse_six_way(open_footage(volume).load(1), camera, step=step, spacing=step, seed=2).six
+    for name in ("lightmaps", "transparency", "emission"):
+        torch.testing.assert_close(getattr(found, name), getattr(wanted, name), rtol=1e-3, atol=1e-4)
+
+
+def test_without_a_network_the_one_that_ships_is_used(network, volume, tmp_path, monkeypatch):
+    for name, words in (("a", ()), ("b", ("--network", shipped())), ("c", ("--network", network))):
+        call("smoke", "predict", volume, "-o", tmp_path / f"{name}.exr", "--resolution", 20, *words)
+    ours, same, other = (read_six_way(tmp_path / f"{name}.exr")[0].lightmaps for name in "abc")
+    assert torch.equal(ours, same) and not torch.equal(ours, other)
+    # On the shipped one's own smoke the others would take minutes.
+    monkeypatch.setattr(network_file, "shipped", lambda: network)
+    text = call("smoke", "evaluate", "--resolution", 16, "--json", tmp_path / "a.json")
+    assert str(network) in text.replace("\n", "") and json.loads((tmp_path / "a.json").read_text())["cells"] == 16
+    monkeypatch.setattr(network_file, "export_onnx", lambda made, *size: made.settings.width)
+    assert "8 bytes, 512 x 512 pixels" in call("smoke", "export", "-o", tmp_path / "a.onnx")
 
 
 def test_predict_frames(network, tmp_path):
@@ -176,7 +198,21 @@ def test_evaluate(network, volume, tmp_path):
             assert f"{method['psnr']:.2f}" in text and f"{method['planes']['top']:.2f}" in text
     # It stands still.
     assert found["sets"][3]["methods"]["network"]["flicker_ratio"] is None
-    assert found["network"]["width"] == 8
+    told = found["network"]
+    loaded, summary = load_network(network)
+    assert told.items() >= loaded.settings.model_dump(mode="json").items()
+    assert (told["name"], told["profile"], told["seed"], told["device"]) == ("a", "tiny", 3, "cpu")
+    assert told["parameters"] == sum(weight.numel() for weight in loaded.parameters())
+    assert (told["steps"], told["seconds"]) == (summary["steps"], summary["seconds"])
+
+
+def test_a_report_says_of_a_network_what_its_file_does(network, tmp_path):
+    old = tmp_path / "old.safetensors"
+    loaded, summary = load_network(network)
+    save_network(old, loaded, {"dataset": summary["dataset"], "seed": 5})
+    call("smoke", "evaluate", old, "--resolution", 8, "--json", tmp_path / "a.json")
+    told = json.loads((tmp_path / "a.json").read_text())["network"]
+    assert told["seed"] == 5 and not {"profile", "steps", "seconds", "device"} & told.keys()
 
 
 def test_export(network, tmp_path):
@@ -197,9 +233,8 @@ def test_wrong_words_are_one_line(trained, network, volume, tmp_path):
     out = tmp_path / "a.exr"
     made = ("smoke", "predict", volume, "-o", out)
     assert "--coarse: expected no --network" in fails(*made, "--coarse", "--network", network)
-    assert "--network: expected a file that train wrote, or --coarse; found neither" in fails(*made)
-    assert "Missing argument 'NETWORK'" in fails("smoke", "evaluate")
-    assert "Missing argument 'NETWORK'" in fails("smoke", "export", "-o", tmp_path / "a.onnx")
+    assert "--step: expected --coarse beside it" in fails(*made, "--step", 3)
+    assert "--step" in fails(*made, "--coarse", "--step", 0)
     assert "gone.safetensors: cannot read" in fails(*made, "--network", tmp_path / "gone.safetensors")
     assert "expected an artifact" in fails(*made, "--network", volume)
     assert "device 'tpu'" in fails(*made, "--network", network, "--device", "tpu")

@@ -7,44 +7,177 @@ import pytest
 import torch
 from smoke_plumes import plume
 
-from wlm.smoke.axes import Camera
+from wlm.smoke.axes import DIRECTIONS, Camera
 from wlm.smoke.coarse import coarse_six_way
 from wlm.smoke.guide import guide
-from wlm.smoke.reference import six_way
+from wlm.smoke.reference import SixWay, six_way
 from wlm.smoke.volume import DensityVolume, from_array
+from wlm_kernels import marching_coarse
+
+TURNED = (0.5, 0.3, 1.0)
+VIEWS = {"turned": TURNED, "diagonal": (1.0, 1.0, 1.0), "above": (0.0, 1.0, 0.0), "axis": (0.0, 0.0, 1.0)}
 
 
-def _camera(volume: DensityVolume, size: int = 24) -> Camera:
-    toward = np.array([0.5, 0.3, 1.0])
+def _camera(volume: DensityVolume, size: int = 24, toward: tuple[float, float, float] = TURNED) -> Camera:
     reach = 3.0 * max(volume.shape) * volume.voxel
-    return Camera.look_at(volume.centre + reach * toward, volume.centre, extent=0.4 * reach, height=size, width=size)
+    position = volume.centre + reach * np.array(toward)
+    up = (0.3, 1.0, 0.2) if toward == TURNED else (0.0, 1.0, 0.0)
+    return Camera.look_at(position, volume.centre, world_up=up, extent=0.4 * reach, height=size, width=size)
 
 
-def test_small_steps_give_the_fine_march(device: str):
-    """All planes, of hot smoke with a phase function that isn't even."""
+def _errors(found: SixWay, exact: SixWay) -> tuple[float, float]:
+    """Greatest and mean error of any plane, over the plane's greatest value."""
+    pairs = [*zip(found.lightmaps, exact.lightmaps, strict=True), (found.transparency, exact.transparency)]
+    if exact.emission is not None:
+        pairs += [(found.emission, exact.emission)]
+    errors = [(a - b).abs() / b.abs().max() for a, b in pairs]
+    return max(float(e.max()) for e in errors), max(float(e.mean()) for e in errors)
+
+
+def _blob(shape: tuple[int, int, int], device: str) -> DensityVolume:
+    """Smooth, and thin at the box's border."""
+    axes = [np.linspace(-1, 1, n + 2)[1:-1] for n in shape]
+    x, y, z = np.meshgrid(*axes, indexing="ij")
+    density = np.exp(-4 * (x * x + y * y + z * z + x * y)) * (1 + 0.4 * np.sin(4 * x + 3 * z))
+    return from_array(density.astype(np.float32), extinction=0.5, device=device)
+
+
+@pytest.mark.parametrize("view", VIEWS)
+def test_small_steps_give_the_fine_march(device: str, view: str):
+    """All planes, of hot smoke with a phase function that isn't even, from any side."""
     volume = plume(hot=True, device=device)
-    camera = _camera(volume)
+    camera = _camera(volume, toward=VIEWS[view])
     exact = six_way(volume, camera, step=0.25, g=0.4, estimate=False)
     errors = []
-    for step in (1.0, 0.5):
-        found = coarse_six_way(volume, camera, step=step, jitter=0.0, g=0.4).six
-        pairs = [(found.lightmaps, exact.lightmaps), (found.transparency, exact.transparency)]
-        pairs += [(found.emission, exact.emission)]
-        errors.append(max(float((a - b).abs().max() / b.abs().max()) for a, b in pairs))
-    assert errors[1] < 0.02
-    assert errors[1] < 0.7 * errors[0]
+    for step, spacing in ((4.0, 4.0), (2.0, 2.0), (0.5, 1.0)):
+        found = coarse_six_way(volume, camera, step=step, spacing=spacing, jitter=0.0, g=0.4).six
+        errors.append(_errors(found, exact))
+    # Where the box cuts smoke off, the shadow ends within a gap between nodes.
+    assert errors[2][0] < 0.06 and errors[2][1] < 0.004
+    assert errors[2][1] < 0.5 * errors[1][1] < 0.3 * errors[0][1]
+
+
+@pytest.mark.parametrize("view", VIEWS)
+@pytest.mark.parametrize("shape", [(20, 20, 20), (5, 30, 12), (1, 16, 16), (16, 1, 16), (1, 1, 24)])
+def test_boxes(device: str, shape: tuple[int, int, int], view: str):
+    """Of any form, thin ones too, with smoke up to the border."""
+    rng = np.random.default_rng(5)
+    volume = from_array(rng.uniform(0.5, 1.0, shape).astype(np.float32), extinction=0.1, device=device)
+    camera = _camera(volume, 32, VIEWS[view])
+    exact = six_way(volume, camera, step=0.25, estimate=False)
+    found = coarse_six_way(volume, camera, step=0.5, spacing=1.0, jitter=0.0).six
+    most, mean = _errors(found, exact)
+    # Light that grazes a sheet changes within it by more than nodes a voxel apart can follow.
+    limits = (0.03, 0.004) if min(shape) > 1 else (0.12, 0.02)
+    assert most < limits[0] and mean < limits[1]
+
+
+def test_finer_nodes_and_finer_ways_are_better(device: str):
+    """Each of the three steps has an error of its own."""
+    volume = _blob((24, 30, 20), device)
+    camera = _camera(volume, 32)
+    exact = six_way(volume, camera, step=0.25, estimate=False)
+    steps = [{"step": 8.0}, {"step": 1.0, "spacing": 8.0}, {"step": 1.0, "spacing": 8.0, "light_step": 1.0}]
+    steps += [{"step": 1.0, "spacing": 2.0}, {"step": 1.0, "spacing": 1.0, "light_step": 0.5}]
+    errors = [_errors(coarse_six_way(volume, camera, jitter=0.0, **one).six, exact)[1] for one in steps]
+    assert errors == sorted(errors, reverse=True) and errors[-1] < 1e-3
+
+
+def test_a_pixel_by_float64(device: str):
+    """The definition, added up in float64 without anything shared."""
+    volume = _blob((12, 14, 10), device)
+    middle = np.array([6.2, 7.5, 5.1])
+    camera = Camera.look_at((30.0, 22.0, 41.0), middle, world_up=(0.3, 1.0, 0.1), extent=1.0, height=1, width=1)
+    padded = np.pad(volume.density.cpu().numpy().astype(np.float64), 1)
+
+    def density(p: np.ndarray) -> np.ndarray:
+        at = np.clip(p + 0.5, 0.0, np.array(padded.shape) - 1.000001)
+        low = at.astype(int)
+        f = at - low
+        total = np.zeros(p.shape[:-1])
+        for corner in np.ndindex(2, 2, 2):
+            weight = np.prod(np.where(corner, f, 1.0 - f), axis=-1)
+            total += weight * padded[tuple(np.moveaxis(low + np.array(corner), -1, 0))]
+        return total
+
+    h = 0.1
+    way = h * (np.arange(300) + 0.5)
+    right, up, toward = camera.axes
+    # The camera is farther off, and 15 voxels on either side of the middle there is nothing.
+    ray = middle + np.outer(15.0 - way, toward)
+    x = volume.extinction * h * density(ray)
+    passed = np.cumsum(x) - x
+    share = np.exp(-passed) * -np.expm1(-x)
+    found = coarse_six_way(volume, camera, step=0.1, spacing=1.0, light_step=0.1, jitter=0.0, cutoff=0.0).six
+    for name, light in (("right", right), ("left", -right), ("top", up), ("bottom", -up)):
+        tau = volume.extinction * h * density(ray[:, None] + way[:, None] * light).sum(1)
+        assert float(found[name]) == pytest.approx(float((share * np.exp(-tau)).sum()), rel=0.01)
+    t = np.exp(-x.sum())
+    assert float(found.transparency) == pytest.approx(t, rel=1e-3)
+    assert float(found["front"]) == pytest.approx(0.5 * (1 - t * t), rel=1e-3)
+    assert float(found["back"]) == pytest.approx(-t * np.log(t), rel=1e-3)
+
+
+def test_shadows_to_all_sides(device: str):
+    """A wall darkens the light that it stands before, and no other."""
+    density = np.zeros((24, 24, 24), np.float32)
+    density[11:13, 11:13, 8:16] = 0.05
+    open_smoke = from_array(density, device=device)
+    camera = _camera(open_smoke, 16, VIEWS["axis"])
+    settings = {"step": 1.0, "spacing": 2.0, "jitter": 0.0}
+    plain = coarse_six_way(open_smoke, camera, **settings).planes
+    walls = {"right": np.s_[20:22], "left": np.s_[2:4], "top": np.s_[:, 20:22], "bottom": np.s_[:, 2:4]}
+    centre = np.s_[7:9, 7:9]
+    for name, place in walls.items():
+        walled = density.copy()
+        walled[place] = 5.0
+        planes = coarse_six_way(replace(open_smoke, density=torch.from_numpy(walled).to(device)), camera, **settings)
+        ratio = planes.planes[:6][(slice(None), *centre)].mean((1, 2)) / plain[:6][(slice(None), *centre)].mean((1, 2))
+        for other, value in zip(DIRECTIONS, ratio.tolist(), strict=True):
+            assert value == pytest.approx(0.0 if other == name else 1.0, abs=0.01), (name, other)
 
 
 def test_sums_are_the_guiding_map(device: str):
-    """Front, top and bottom together are the guide's light, sample by sample, and the depth is its depth."""
+    """Front, top and bottom together are the guide's light, and without jitter depth and transparency are its own."""
     volume = plume(device=device)
     camera = _camera(volume)
-    settings = {"step": 2.5, "jitter": 1.0, "seed": 7, "threshold": 0.05, "g": -0.2}
-    found, known = coarse_six_way(volume, camera, **settings), guide(volume, camera, **settings)
-    light = found.six["front"] + found.six["top"] + found.six["bottom"]
-    torch.testing.assert_close(light, known.light, rtol=0, atol=3e-4)
+    settings = {"jitter": 0.0, "threshold": 0.05, "g": -0.2}
+    found, known = coarse_six_way(volume, camera, step=2.5, **settings), guide(volume, camera, step=2.5, **settings)
     torch.testing.assert_close(found.six.transparency, known.transparency, rtol=0, atol=1e-6)
     torch.testing.assert_close(found.depth, known.depth, rtol=0, atol=1e-5)
+    found, known = (f(volume, camera, step=1.0, **settings) for f in (coarse_six_way, guide))
+    light = found.six["front"] + found.six["top"] + found.six["bottom"]
+    assert float((light - known.light).abs().mean()) < 0.005 * float(known.light.max())
+
+
+def test_emission_knows_no_nodes(device: str):
+    """What smoke gives off itself passes the ray alone; nothing does without a temperature."""
+    volume = plume(hot=True, device=device)
+    camera = _camera(volume)
+    rough, fine = (coarse_six_way(volume, camera, step=2.0, spacing=spacing, seed=2) for spacing in (12.0, 1.0))
+    assert torch.equal(rough.planes[4:], fine.planes[4:]) and float(rough.six.emission.max()) > 0.05
+    assert not torch.equal(rough.planes[:4], fine.planes[:4])
+    cold = coarse_six_way(replace(volume, temperature=None), camera, step=2.0, seed=2)
+    assert cold.six.emission is None and torch.equal(cold.planes[4:7], fine.planes[4:7])
+    clear = replace(volume, density=torch.zeros_like(volume.density))
+    assert float(coarse_six_way(clear, camera, step=2.0).six.emission.max()) > float(fine.six.emission.max())
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float16])
+def test_empty_bricks_change_nothing(device: str, dtype: torch.dtype, monkeypatch):
+    volume = plume(1, hot=True, device=device)
+    volume = replace(volume, density=volume.density.to(dtype), temperature=volume.temperature.to(dtype))
+    camera = _camera(volume)
+    skipped = coarse_six_way(volume, camera, step=1.5).planes
+    made = []
+    occupied = marching_coarse.occupied
+    monkeypatch.setattr(marching_coarse, "occupied", lambda *args: made.append(occupied(*args)) or made[-1])
+    coarse_six_way(volume, camera, step=7.9)
+    (bricks,) = made
+    assert 0 < bricks.numpy().sum() < bricks.size
+    monkeypatch.setattr(marching_coarse, "BRICK", 0)
+    torch.testing.assert_close(coarse_six_way(volume, camera, step=1.5).planes, skipped, rtol=0, atol=1e-6)
+    assert len(made) == 1
 
 
 def test_front_and_back_follow_from_the_transparency(device: str):
@@ -82,12 +215,73 @@ def test_one_voxel(device: str):
     assert float(planes[6]) == pytest.approx(np.exp(-1.0), rel=0.02)
 
 
+def test_no_voxel_of_smoke(device: str):
+    volume = from_array(np.zeros((9, 4, 17), np.float32), device=device)
+    for step in (0.7, 20.0):
+        planes = coarse_six_way(volume, _camera(volume), step=step).planes
+        assert bool((planes[6] == 1.0).all()) and float(planes[:6].abs().max()) == float(planes[7:].abs().max()) == 0.0
+
+
+def _shifts(seed: int, device: str, size: int = 64, jitter: float = 1.0) -> torch.Tensor:
+    """The jitter of a single step through the box, by the depth of its sample."""
+    volume = from_array(np.ones((8, 8, 8), np.float32), device=device)
+    camera = Camera.look_at((4.0, 4.0, 18.5), (4.0, 4.0, 4.0), extent=6.0, height=size, width=size)
+    found = coarse_six_way(volume, camera, step=9.0, jitter=jitter, seed=seed, threshold=0.0)
+    return (found.depth.cpu().double() - 10.0) / 9.0
+
+
+@pytest.mark.parametrize("seed", [1, 63, 64 * 10**12 + 9, -3])
+def test_jitter(device: str, seed: int):
+    """Jimenez's noise, of which 64 patterns differ; half of it is half as wide."""
+    found = _shifts(seed, device)
+    assert float(found.min()) > -1e-6 and float(found.max()) < 1.0
+    y, x = np.mgrid[:64, :64] + 5.588238 * (seed % 64)
+    wanted = np.mod(52.9829189 * np.mod(0.06711056 * x + 0.00583715 * y, 1.0), 1.0)
+    off = np.abs(found.numpy() - wanted)
+    assert np.minimum(off, 1.0 - off).max() < 2e-3
+    assert torch.equal(found, _shifts(seed, device)) and torch.equal(found, _shifts(seed % 64 + 128, device))
+    assert float((found - _shifts(seed + 1, device)).abs().mean()) > 0.1
+    half = _shifts(seed, device, jitter=0.5)
+    torch.testing.assert_close(half, 0.5 + 0.5 * (found - 0.5), rtol=0, atol=1e-6)
+
+
+def test_jitter_over_a_few_pixels(device: str):
+    """Their mean varies far less than that of independent numbers, and all numbers are as frequent."""
+    found = _shifts(11, device)
+    means = torch.nn.functional.avg_pool2d(found[None], 5)[0]
+    assert float(means.std()) < 0.5 * (1 / 12) ** 0.5 / 5
+    counts = torch.histc(found.float(), 8, 0.0, 1.0)
+    assert float(counts.min()) > 0.85 * found.numel() / 8
+
+
+def test_nodes_are_bounded(device: str):
+    """However close they are asked for, and however thin the box."""
+    volume = _blob((12, 9, 10), device)
+    camera = _camera(volume)
+    wanted = coarse_six_way(volume, camera, step=1.0, spacing=1.0, light_step=0.5).planes
+    for spacing in (0.3, 1e-30):
+        assert torch.equal(coarse_six_way(volume, camera, step=1.0, spacing=spacing, light_step=0.5).planes, wanted)
+    for shape, spacing in (((400, 400, 400), 1.0), ((10**6, 1, 1), 5.0), ((2, 30000, 30000), 1e-3)):
+        view, _ = _camera(volume, toward=VIEWS["diagonal"]).view(np.zeros(3), 1.0, shape)
+        lattice, counts = marching_coarse._lattice(shape, view, spacing)
+        assert min(counts) >= 2 and np.prod(counts, dtype=float) < 1.01 * 2**28
+        # They cover the eight corners.
+        corners = np.array(list(np.ndindex(2, 2, 2))) * (np.array(shape) + 1.0) - 0.5 - np.array(view.origin)
+        for axis, along in enumerate((view.right, view.up, view.forward)):
+            ends = lattice.low[axis], lattice.low[axis] + (counts[axis] - 1) * lattice.gap[axis]
+            reach = corners @ np.array(along)
+            assert ends == pytest.approx((reach.min(), reach.max()), rel=1e-5, abs=1e-2)
+    far = coarse_six_way(volume, camera, step=1.0, spacing=1e30).planes
+    assert torch.isfinite(far).all()
+
+
 def test_wrong_settings(device: str):
     volume = from_array(np.ones((4, 4, 4), np.float32), device=device)
     camera = _camera(volume, 4)
-    for settings in ({"step": 0.0}, {"step": float("nan")}, {"jitter": 1.5}, {"g": 1.0}):
-        with pytest.raises(ValueError, match=next(iter(settings))):
-            coarse_six_way(volume, camera, **settings)
+    wrong = [(name, value) for name in ("step", "spacing", "light_step") for value in (0.0, -1.0, np.nan, np.inf)]
+    for name, value in [*wrong, ("jitter", 1.5), ("g", 1.0)]:
+        with pytest.raises(ValueError, match=f"^{name}: expected [^\n]*, got {value}$"):
+            coarse_six_way(volume, camera, **{name: value})
     eye = Camera.look_at((2.0, 2.0, 30.0), (2.0, 2.0, 2.0), extent=0.4, height=4, width=4, perspective=True)
     with pytest.raises(ValueError, match="orthographic"):
         coarse_six_way(volume, eye)

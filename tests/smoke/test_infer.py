@@ -13,7 +13,7 @@ from wlm.smoke.network import NetworkSettings, SixWayNetwork
 from wlm.smoke.samples import GUIDES
 from wlm.smoke.volume import from_array
 
-TINY = {"width": 8, "blocks": (1, 2, 1), "decoder": (1, 1)}
+TINY = {"width": 8, "levels": 3}
 
 
 def _network(spread: float = 0.2, **changed) -> SixWayNetwork:

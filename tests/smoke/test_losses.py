@@ -74,6 +74,25 @@ def test_warping_moves_an_image_by_its_motion():
     assert torch.allclose(warp(earlier, motion)[0][..., 1:], between, atol=1e-5)
 
 
+@pytest.mark.parametrize("size", [(7, 9), (1, 5), (1, 1)])
+def test_warping_and_its_gradient_are_those_of_torch(size):
+    """Against `grid_sample`, which clamps likewise."""
+    height, width = size
+    image = torch.randn(2, 3, height, width, dtype=torch.float64, requires_grad=True)
+    motion = 4 * torch.randn(2, 2, height, width, dtype=torch.float64)
+    column = torch.arange(width) - motion[:, 0]
+    row = torch.arange(height)[:, None] - motion[:, 1]
+    places = torch.stack([(2 * column + 1) / width - 1, (2 * row + 1) / height - 1], -1)
+    theirs = torch.nn.functional.grid_sample(image, places, padding_mode="border", align_corners=False)
+    ours, inside = warp(image, motion)
+    assert torch.allclose(ours, theirs, atol=1e-12)
+    within = (column >= 0) & (column <= width - 1) & (row >= 0) & (row <= height - 1)
+    assert torch.equal(inside[:, 0] > 0, within)
+    gradients = [torch.autograd.grad((found**3).sum(), image)[0] for found in (ours, theirs)]
+    assert torch.allclose(*gradients, rtol=1e-9, atol=1e-9)
+    assert torch.autograd.gradcheck(lambda x: warp(x, motion)[0], image, atol=1e-6)
+
+
 def test_temporal_loss_sees_flicker_and_not_a_steady_error():
     target = torch.zeros(1, 2, 8, 12, 16)
     target[:, :, 6, 2:10, 2:12] = 1.0

@@ -8,8 +8,11 @@ from reference.marching import span as clip
 from reference.marching import trilinear
 
 from wlm.smoke.axes import Camera
+from wlm.smoke.dataset import DatasetSettings, make_validation
+from wlm.smoke.losses import warp
 from wlm.smoke.motion import motion
 from wlm.smoke.reference import six_way
+from wlm.smoke.samples import OPACITY_PLANE
 from wlm.smoke.volume import DensityVolume, from_array
 from wlm_kernels.marching_motion import motion_kernel
 
@@ -195,3 +198,31 @@ def test_compiles_for_cuda(dtype: type, tmp_path):
     made = wp.compile_aot_module(motion_kernel(dtype).module, arch=[90], module_dir=tmp_path)
     binaries = [path for path in made if path.suffix in (".ptx", ".cubin")]
     assert binaries and all(path.stat().st_size > 0 for path in binaries)
+
+
+@pytest.mark.slow
+def test_optical_flow_sees_the_same_motion():
+    """OpenCV's DIS, which knows two pictures of opacity alone, across their edges: along these it can't see any."""
+    cv2 = pytest.importorskip("cv2")
+    settings = DatasetSettings(cells=32, refine=4, resolution=128, frames=3, validation_sequences=2, views=2)
+    pool = make_validation(settings)
+    flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    flow.setFinestScale(0)
+    alike = []
+    for opacity, moved in zip(pool.targets[:, :, OPACITY_PLANE].float(), pool.motion.float(), strict=True):
+        earlier, later = ((255 * picture).byte().numpy() for picture in opacity)
+        # From the later frame back to the earlier one, which is what a pixel's motion is told by.
+        found = -flow.calc(later, earlier, None).transpose(2, 0, 1)
+        slope = np.stack(np.gradient(opacity[1].numpy())[::-1])
+        steep = np.linalg.norm(slope, axis=0)
+        edges = (opacity[1].numpy() > 0.1) & (steep > 0.01)
+        across = (slope / np.maximum(steep, 1e-6))[:, edges]
+        theirs, ours = ((part[:, edges] * across).sum(0) for part in (found, moved.numpy()))
+        alike.append(np.corrcoef(theirs, ours)[0, 1])
+        still, followed = (
+            float((picture - opacity[1])[torch.from_numpy(edges)].abs().mean())
+            for picture in (opacity[0], warp(opacity[:1][None], moved[None])[0][0, 0])
+        )
+        assert followed < 0.85 * still
+    # .77 to .90 of twelve pairs.
+    assert len(alike) == 12 and min(alike) > 0.7

@@ -1,19 +1,32 @@
-"""The network: its size, what its switches change, what it makes of hard images, and its file."""
+"""The network: its size, what its switches change, what it makes of hard images, its file, and the one that ships."""
+
+import runpy
+from importlib import resources
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from pydantic import ValidationError
+from smoke_plumes import plume
 from smoke_samples import small_pool
 
+import wlm.smoke.network as network_module
+import wlm.smoke.network_file as file_module
 from wlm.errors import WlmError
 from wlm.formats.artifact import read_artifact, write_artifact
+from wlm.metrics.error import psnr_from_mse
+from wlm.smoke.coarse import coarse_six_way
+from wlm.smoke.data import CameraSettings, make_camera
 from wlm.smoke.dataset import DatasetSettings
+from wlm.smoke.infer import Predictor, predict
 from wlm.smoke.network import ADAPTERS, NafBlock, NetworkSettings, SixWayNetwork, parameter_count, support
-from wlm.smoke.network_file import SYSTEM, export_onnx, load_network, save_network, settings_of
-from wlm.smoke.samples import GUIDES, PLANES
+from wlm.smoke.network_file import SYSTEM, export_onnx, load_network, save_network, settings_of, shipped
+from wlm.smoke.reference import six_way
+from wlm.smoke.samples import GUIDES, OPACITY_PLANE, PLANES, encode_lightmaps
+from wlm.smoke.volume import from_array
 
-TINY = {"width": 8, "blocks": (1, 1, 1), "decoder": (1, 1)}
+TINY = {"width": 8, "levels": 3}
 
 
 def _network(seed: int = 0, spread: float = 0.2, **changed) -> SixWayNetwork:
@@ -25,9 +38,13 @@ def _network(seed: int = 0, spread: float = 0.2, **changed) -> SixWayNetwork:
     return network
 
 
-@pytest.mark.parametrize("width, millions", [(16, 1.95), (24, 4.4), (32, 7.8)])
-def test_parameters_are_as_many_as_published(width, millions):
-    assert parameter_count(SixWayNetwork(NetworkSettings(width=width))) == pytest.approx(1e6 * millions, rel=0.04)
+def test_the_u_net_has_its_published_size():
+    """Ronneberger's of 64 channels with 1 channel in and 2 out is known for its 31.03 million."""
+    network = SixWayNetwork(NetworkSettings(width=64))
+    count = sum(parameter_count(part) for part in (network.encoder, network.decoder))
+    # Ours reads 3 planes; its up-convolutions, of 2 x 2 pixels, are the rest but for the last layer's 130.
+    ups = sum(4 * 2 * c * c + c for c in (64, 128, 256, 512))
+    assert count - 2 * 9 * 64 + ups + 130 == 31_030_658
 
 
 def test_a_block_has_its_published_size_and_begins_as_nothing():
@@ -53,6 +70,16 @@ def test_norm_and_its_gradient_are_those_of_torch():
         assert torch.allclose(block.norm1(x), theirs, atol=1e-12)
 
 
+def test_maxima_and_their_gradient_are_those_of_torch():
+    x = torch.randn(2, 3, 6, 8).relu().contiguous(memory_format=torch.channels_last).requires_grad_()
+    ours, theirs = network_module._halved(x), torch.nn.functional.max_pool2d(x, 2)
+    assert torch.equal(ours, theirs)
+    for one, other in zip(*(torch.autograd.grad((f**3).sum(), x) for f in (ours, theirs)), strict=True):
+        assert torch.equal(one, other)
+    with torch.no_grad():
+        assert torch.equal(network_module._halved(x), theirs)
+
+
 def test_it_begins_as_a_mix_of_the_guide():
     guides = small_pool().guides[:, 0].float()
     made = SixWayNetwork(NetworkSettings(**TINY))(guides)
@@ -68,7 +95,7 @@ def test_of_six_lights_it_begins_as_these(stem):
     made = network(guides)
     for name, plane in zip(PLANES, made.unbind(1), strict=True):
         assert torch.allclose(plane, guides[:, GUIDES["six"].index(name)], atol=1e-6), name
-    assert network.stem.in_channels == 9 * stem**2
+    assert network.encoder[0][0].in_channels == 9 * stem**2
 
 
 def test_switches_change_what_they_should():
@@ -82,7 +109,7 @@ def test_switches_change_what_they_should():
     for residual in (False, True):
         blind = _network(depth=False, residual=residual)
         assert torch.equal(blind(guides), blind(depthless))
-    assert parameter_count(_network(residual=False)) == parameter_count(full) - 3 * len(PLANES)
+    assert parameter_count(_network(residual=False)) == parameter_count(full) - 3 * 25 * len(PLANES)
 
     shared = _network(adapters=False)
     assert len(shared.adapters) == len(shared.heads) == 1
@@ -151,7 +178,7 @@ def test_any_resolution(stem, size):
 
 
 def test_settings_that_do_not_fit_are_refused():
-    for wrong in ({"decoder": (1,)}, {"width": 12}, {"stem": 3}, {"blocks": (1, 99, 1)}, {"unknown": 1}):
+    for wrong in ({"levels": 1}, {"levels": 7}, {"width": 12}, {"stem": 3}, {"unknown": 1}):
         with pytest.raises(ValidationError):
             NetworkSettings(**TINY | wrong)
 
@@ -188,13 +215,13 @@ def _rewritten(path, change) -> None:
 @pytest.mark.parametrize(
     "change, told",
     [
-        (lambda settings, tensors: tensors.pop("stem.weight"), "lacks stem.weight"),
+        (lambda settings, tensors: tensors.pop("up.0.weight"), "lacks up.0.weight"),
         (lambda settings, tensors: tensors.update(more=np.zeros(3, np.float16)), "has more"),
         (lambda settings, tensors: settings["network"].update(width=16), "expected .*16.*found .*8"),
         (lambda settings, tensors: settings["network"].update(width=7), "network.width"),
         (lambda settings, tensors: settings.update(summary=3), "summary"),
-        (lambda settings, tensors: tensors["mix"].fill(np.nan), "mix: expected finite"),
-        (lambda settings, tensors: tensors.update(mix=np.zeros((8, 3), np.float32)), "float32"),
+        (lambda settings, tensors: tensors["mix.weight"].fill(np.nan), "mix.weight: expected finite"),
+        (lambda settings, tensors: tensors.update({"mix.weight": np.zeros((8, 3, 5, 5), np.float32)}), "float32"),
     ],
 )
 def test_a_file_that_is_wrong_is_refused_in_one_line(tmp_path, change, told):
@@ -218,9 +245,46 @@ def test_a_damaged_file_another_width_and_unfit_weights_are_refused(tmp_path):
     with pytest.raises(WlmError, match="damaged"):
         load_network(path)
     with torch.no_grad():
-        network.mix[0, 0] = 1e5
-    with pytest.raises(WlmError, match="weight mix"):
+        network.mix.weight[0, 0] = 1e5
+    with pytest.raises(WlmError, match="weight mix.weight"):
         save_network(path, network, {})
+
+
+def test_a_network_comes_with_the_package(monkeypatch, tmp_path):
+    path = shipped()
+    assert path.stat().st_size <= 10_000_000
+    network, summary = load_network(path)
+    assert network.settings.width <= 24 and network.settings.guide == settings_of(path, summary).guide == "six"
+    assert {"profile", "seed", "steps", "seconds", "device"} <= summary.keys()
+    # What a wheel takes along: the file must be among it, by what setup.py says.
+    package = resources.files("wlm")
+    assert package.joinpath("data", path.name).is_file()
+    given = {}
+    monkeypatch.setattr("setuptools.setup", given.update)
+    runpy.run_path(str(Path(file_module.__file__).parents[2] / "setup.py"))
+    assert path in {found for pattern in given["package_data"]["wlm"] for found in Path(str(package)).glob(pattern)}
+    monkeypatch.setattr(file_module, "_SHIPPED", tmp_path / "gone.safetensors")
+    with pytest.raises(WlmError, match="gone.safetensors: expected the network that comes with wlm, found none"):
+        shipped()
+
+
+def test_the_network_that_ships_is_better_than_the_march_that_it_reads():
+    """On dense smoke with an edge, which steps of a voxel miss, at as many pixels a length as it was trained with."""
+    density = (plume().density.numpy() > 0.4).astype(np.float32).repeat(4, 0).repeat(4, 1).repeat(4, 2)
+    volume = from_array(density, extinction=25.0, voxel=0.0125, origin=(-0.5, 0.0, -0.5))
+    settings = CameraSettings(resolution=256, extent=0.6).turned(30.0)
+    camera = make_camera(settings, volume.origin, (1.0, 1.2, 1.0))
+    network, summary = load_network(shipped())
+    look = settings_of("", summary).look(volume.shape)
+    wanted = encode_lightmaps(six_way(volume, camera, step=0.5, estimate=False))[:OPACITY_PLANE]
+    ours = predict(volume, camera, Predictor(network, camera.height, camera.width), **look)
+    march = coarse_six_way(volume, camera, **look).six
+    better, worse = (
+        psnr_from_mse(float((encode_lightmaps(found)[:OPACITY_PLANE] - wanted).square().mean()), 1.0)
+        for found in (ours, march)
+    )
+    # 39.3 dB against 36.8, on the CPU.
+    assert better > worse + 1.5 > 35.0
 
 
 def test_onnx_of_no_pixels_is_refused(tmp_path):
@@ -235,7 +299,7 @@ def test_onnx_computes_the_same(tmp_path, kind, stem):
     for needed in ("onnx", "onnxscript"):
         pytest.importorskip(needed)
     runtime = pytest.importorskip("onnxruntime")
-    network = _network(guide=kind, stem=stem, blocks=(1, 1), decoder=(1,))
+    network = _network(guide=kind, stem=stem, levels=2)
     path = tmp_path / "a.onnx"
     assert export_onnx(network, path, 18, 22) == path.stat().st_size
     guide = torch.rand(1, len(GUIDES[kind]), 18, 22)

@@ -67,6 +67,7 @@ def test_a_guide_is_zero_where_there_is_no_smoke_and_nearest_is_one(device):
 
 
 LOOK = {"step": 2.5, "jitter": 1.0, "threshold": 0.05, "seed": 7}
+STILL = LOOK | {"jitter": 0.0}  # the paper's march and ours shift their samples in their own ways
 
 
 @pytest.mark.parametrize("kind", list(GUIDES))
@@ -74,13 +75,13 @@ def test_a_guide_of_each_kind(device, kind):
     """Its planes are as many as named, 0 where there is no smoke, and those that all share are the same."""
     volume = plume(hot=True, device=device)
     camera = seen(volume)
-    planes = look_at(volume, camera, kind, **LOOK)
+    planes = look_at(volume, camera, kind, **STILL)
     assert planes.shape == (len(GUIDES[kind]), 32, 32) and torch.isfinite(planes).all()
     opacity, depth = planes[-2:]
     empty = opacity == 0
     assert 0.2 < empty.float().mean() < 0.95 and (planes[:, empty] == 0).all()
     assert planes.min() >= 0 and opacity.max() <= 1 and 0.5 < depth.max() <= 1
-    shared = look_at(volume, camera, **LOOK)[1:]
+    shared = look_at(volume, camera, **STILL)[1:]
     assert torch.allclose(planes[-2:], shared, atol=1e-5)
     assert all((planes[i] > 0).any() for i in range(len(planes)))
 
@@ -88,7 +89,8 @@ def test_a_guide_of_each_kind(device, kind):
 def test_the_light_of_a_kind_is_the_sum_of_its_lights(device):
     volume = plume(device=device)
     camera = seen(volume)
-    found = {kind: look_at(volume, camera, kind, **LOOK) for kind in GUIDES}
+    look = STILL | {"step": 0.5}
+    found = {kind: look_at(volume, camera, kind, **look) for kind in GUIDES}
     six = dict(zip(GUIDES["six"], from_srgb(found["six"]), strict=True))
     for kind, names in {
         "paper": ("front", "top", "bottom"),
@@ -96,8 +98,8 @@ def test_the_light_of_a_kind_is_the_sum_of_its_lights(device):
         "sides": ("front", "right", "left"),
     }.items():
         light = from_srgb(found[kind][0])
-        # The guiding map has a march of its own, whose lattice rounds otherwise.
-        assert torch.allclose(light, sum(six[name] for name in names), atol=3e-4), kind
+        # The guiding map has a march of its own, whose nodes lie elsewhere.
+        assert torch.allclose(light, sum(six[name] for name in names), atol=5e-3), kind
     assert not six["emission"].any()
 
 
@@ -115,6 +117,8 @@ def test_other_kinds_are_refused():
     volume = plume()
     with pytest.raises(ValueError, match="kind: expected one of paper, front, sides, six, got 'back'"):
         look_at(volume, seen(volume), "back", **LOOK)
+    with pytest.raises(ValueError, match="spacing: expected none"):
+        look_at(volume, seen(volume), "paper", spacing=2.0, **LOOK)
 
 
 @pytest.mark.parametrize("hot", [False, True])

@@ -32,7 +32,7 @@ from wlm.smoke.network import NetworkSettings, SixWayNetwork
 from wlm.smoke.reference import six_way
 from wlm.smoke.samples import GUIDES, OPACITY_PLANE, PLANES, Pool, encode_lightmaps
 
-TINY = {"width": 8, "blocks": (1, 1), "decoder": (1,)}
+TINY = {"width": 8, "levels": 2}
 FEW = DatasetSettings(
     cells=16, refine=2, resolution=24, frames=1, views=3, warmup=0.8, hot=0.0, validation_sequences=1, moving=0.0
 )

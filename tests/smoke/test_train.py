@@ -10,15 +10,16 @@ from smoke_samples import small_pool
 
 from wlm.config import profile_names
 from wlm.errors import WlmError
+from wlm.formats.artifact import read_artifact
 from wlm.smoke.evaluate import evaluate
 from wlm.smoke.losses import LossSettings
 from wlm.smoke.network import NetworkSettings, SixWayNetwork
 from wlm.smoke.network_file import load_network
-from wlm.smoke.samples import GUIDES, PLANES, Pool
+from wlm.smoke.samples import GUIDES, OPACITY_PLANE, PLANES, Pool
 from wlm.smoke.train import NetworkProfile, load_profile, train
-from wlm.smoke.trainer import Trainer, TrainSettings, plan_round
+from wlm.smoke.trainer import Plan, Trainer, TrainSettings, plan_round
 
-TINY = NetworkSettings(width=8, blocks=(1, 1), decoder=(1,))
+TINY = NetworkSettings(width=8, levels=2)
 
 
 def _profile(network: NetworkSettings = TINY, **training) -> NetworkProfile:
@@ -43,11 +44,18 @@ def _curves(path) -> list[dict[str, float]]:
         return [{name: float(value) for name, value in row.items()} for row in csv.DictReader(file)]
 
 
+def _kept(path) -> tuple[dict, dict[str, bytes]]:
+    """All that a network's file holds, but for the time that its training took."""
+    held = read_artifact(path)
+    settings = {**held.settings, "summary": {**held.settings["summary"], "seconds": 0}}
+    return settings, {name: array.tobytes() for name, array in held.tensors.items()}
+
+
 def test_it_learns_a_small_pool_by_heart(tmp_path, device):
     pool = small_pool(2).to(device)
-    network = NetworkSettings(width=8, blocks=(1, 1, 1), decoder=(1, 1))
+    network = NetworkSettings(width=8, levels=3)
     before = evaluate(SixWayNetwork(network).to(device), pool)
-    profile = _profile(network, rounds=1, steps=80, average=0.9, mirror="none", rate=1e-2)
+    profile = _profile(network, rounds=1, steps=80, average=0.9, mirror="none", rate=3e-3)
     result = _train(
         tmp_path / "a", profile, device=device, make_pool=lambda *a, **k: pool, make_validation=lambda *a: pool
     )
@@ -58,6 +66,8 @@ def test_it_learns_a_small_pool_by_heart(tmp_path, device):
     found, summary = load_network(tmp_path / "a", device=device)
     assert evaluate(found, pool).psnr == pytest.approx(result.best, abs=0.05)
     assert summary["psnr"] == result.best and set(summary["planes"]) == set(PLANES)
+    assert 0.0 < summary["seconds"] <= round(result.seconds, 1)
+    assert summary["device"] == ("cpu" if device == "cpu" else torch.cuda.get_device_name(device))
 
 
 @pytest.mark.parametrize("losses", [LossSettings(), LossSettings(temporal=0.1)])
@@ -77,7 +87,7 @@ def test_a_stopped_training_ends_as_if_it_had_not_been(tmp_path, monkeypatch, lo
     while not (result := _train(path, profile, seed=1, resume=True, minutes=0.0)).finished:
         steps.append(result.steps)
     assert steps == [6, 8, 10]
-    assert path.read_bytes() == (tmp_path / "whole").read_bytes()
+    assert _kept(path) == _kept(tmp_path / "whole")
     assert replace(result, seconds=0) == replace(whole, seconds=0)
     assert not (tmp_path / "parts.partial").exists()
     for one, other in zip(_curves(path), _curves(tmp_path / "whole"), strict=True):
@@ -112,7 +122,7 @@ def test_a_training_stopped_in_its_first_pool_is_resumed(tmp_path):
         _train(path, profile, make_pool=_stopped)
     assert partial.exists() and load_network(path)[1]["steps"] == 0
     assert _train(path, profile, resume=True).finished
-    assert path.read_bytes() == (tmp_path / "whole").read_bytes()
+    assert _kept(path) == _kept(tmp_path / "whole")
 
 
 @pytest.mark.parametrize("how", ["untrained", "damaged", "gone"])
@@ -176,7 +186,7 @@ def test_an_untrained_network_is_kept_until_there_is_a_better_one(tmp_path, monk
 def test_a_checkpoint_of_another_training_is_refused(tmp_path):
     path = tmp_path / "a"
     _train(path, _profile(), minutes=0.0)
-    for profile in (_profile(rate=2e-3), _profile(NetworkSettings(width=16, blocks=(1, 1), decoder=(1,)))):
+    for profile in (_profile(rate=2e-3), _profile(NetworkSettings(width=16, levels=2))):
         with pytest.raises(WlmError, match="another fit"):
             _train(path, profile, resume=True)
     partial = tmp_path / "a.partial"
@@ -208,18 +218,18 @@ def test_a_step_of_nan_is_left_out(device):
     settings = TrainSettings(rounds=1, steps=6, batch=4, graph=False)
     trainer = Trainer(TINY, settings, seed=0, device=device)
     pool = small_pool(4).to(device)
-    plan = plan_round(settings, 4, seed=0, round=0)
-    trainer.run(pool, tuple(part[:2] for part in plan))
+    plan = plan_round(settings, pool, seed=0, round=0)
+    trainer.run(pool, plan.part(0, 2))
     before = trainer.state()
     broken = replace(pool, targets=torch.full_like(pool.targets, math.nan))
-    trainer.run(broken, tuple(part[2:4] for part in plan))
+    trainer.run(broken, plan.part(2, 4))
     after = trainer.state()
     assert trainer.skipped == 2 and trainer.step == 4
     assert all(math.isfinite(value) for value in trainer.take_losses())
     for name, value in before.items():
         if name.startswith(("network.", "adam.")):
             assert (value == after[name]).all(), name
-    trainer.run(pool, tuple(part[4:] for part in plan))
+    trainer.run(pool, plan.part(4, 6))
     assert trainer.skipped == 2
     assert any((value != after[name]).any() for name, value in trainer.state().items() if name.startswith("network."))
 
@@ -245,15 +255,42 @@ def test_a_training_that_diverges_ends(tmp_path, monkeypatch):
 
 def test_a_plan_takes_each_sample_once_before_any_twice():
     settings = TrainSettings(rounds=1, steps=5, batch=4, mirror="sides")
-    samples, frames, turns = plan_round(settings, 10, seed=3, round=1)
+    pool = small_pool(10)
+    plan = plan_round(settings, pool, seed=3, round=1)
+    samples, frames, turns = plan.samples, plan.frames, plan.turns
+    assert plan.corners is None
     assert samples.shape == (5, 4) and sorted(samples.flatten().tolist()) == sorted([*range(10)] * 2)
     assert set(frames.flatten().tolist()) == {0, 1} and turns[..., 0].any() and not turns[..., 1].any()
-    again, other = (plan_round(settings, 10, seed=3, round=number)[0] for number in (1, 2))
+    again, other = (plan_round(settings, pool, seed=3, round=number).samples for number in (1, 2))
     assert torch.equal(samples, again) and not torch.equal(samples, other)
-    still = plan_round(settings.model_copy(update={"mirror": "none"}), 10, seed=3, round=1)
-    assert not still[2].any()
-    pairs = plan_round(settings.model_copy(update={"losses": LossSettings(temporal=1.0)}), 10, seed=3, round=1)
-    assert pairs[0].shape == (5, 2)
+    still = plan_round(settings.model_copy(update={"mirror": "none"}), pool, seed=3, round=1)
+    assert not still.turns.any()
+    pairs = plan_round(settings.model_copy(update={"losses": LossSettings(temporal=1.0)}), pool, seed=3, round=1)
+    assert pairs.samples.shape == (5, 2)
+
+
+def test_parts_of_samples_have_their_smoke():
+    pool = small_pool(2)
+    targets = torch.zeros_like(pool.targets)
+    targets[0, 1, OPACITY_PLANE, 20:23, 17:31] = 1.0  # smaller than a part
+    targets[1, :, OPACITY_PLANE] = 1.0
+    pool = replace(pool, targets=targets)
+    settings = TrainSettings(rounds=1, steps=50, batch=2, crop=16, losses=LossSettings(temporal=1.0))
+    plan = plan_round(settings, pool, seed=0, round=0)
+    corners = {n: set(map(tuple, plan.corners[plan.samples == n].tolist())) for n in range(2)}
+    assert corners[0] == {(16, 16)}
+    assert corners[1] == {(y, x) for y in (0, 16) for x in (0, 16)}
+    trainer = Trainer(TINY, settings, seed=0, device="cpu")
+    for step in range(3):
+        (n,), (y, x) = plan.samples[step].tolist(), plan.corners[step, 0].tolist()
+        guides, found, motion = trainer._gather(pool, replace(plan, turns=torch.zeros_like(plan.turns)), step)
+        assert torch.equal(found[0], pool.targets[n, :, :, y : y + 16, x : x + 16].float())
+        assert torch.equal(guides[0], pool.guides[n, :, :, y : y + 16, x : x + 16].float())
+        assert torch.equal(motion[0], pool.motion[n, :, y : y + 16, x : x + 16].float())
+    trainer.run(pool, plan)
+    assert trainer.step == 50 and trainer.skipped == 0
+    with pytest.raises(ValueError, match="at most 32 pixels"):
+        plan_round(settings.model_copy(update={"crop": 48}), pool, seed=0, round=0)
 
 
 @pytest.mark.parametrize("kind", ["paper", "six"])
@@ -262,10 +299,10 @@ def test_a_sample_that_is_turned_over_is_what_its_mirror_would_be(way, swapped, 
     settings = TrainSettings(batch=2, losses=LossSettings(temporal=1.0))
     trainer = Trainer(TINY.model_copy(update={"guide": kind}), settings, seed=0, device="cpu")
     pool = small_pool(2, kind=kind)
-    turns = torch.zeros(2, 2, dtype=torch.bool)
-    turns[0, way] = True
-    samples = torch.tensor([1, 0])
-    guides, targets, motion = trainer._gather(pool, samples, samples, turns)
+    turns = torch.zeros(1, 2, 2, dtype=torch.bool)
+    turns[0, 0, way] = True
+    samples = torch.tensor([[1, 0]])
+    guides, targets, motion = trainer._gather(pool, Plan(samples, samples, turns, None), 0)
     axis = -1 - way
     one, other = (PLANES.index(name) for name in swapped)
     names = dict(zip(swapped, reversed(swapped), strict=True))
@@ -297,7 +334,7 @@ def test_profiles_load():
         ("{guide: six}", "{}", "dataset.guide: expected six, which network.guide is, found paper"),
         ("{}", "{guide: six}", "dataset.guide: expected paper, which network.guide is, found six"),
         ("{guide: back}", "{}", "network.guide: expected 'paper', 'front', 'sides' or 'six'"),
-        ("{decoder: [1]}", "{}", "network: decoder: expected 3 levels"),
+        ("{levels: 1}", "{}", "network.levels: "),
     ],
 )
 def test_a_profile_whose_parts_disagree_is_one_line(tmp_path, network, dataset, told):

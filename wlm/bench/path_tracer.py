@@ -1,26 +1,37 @@
 """Six-way lightmaps by Mitsuba's volumetric path tracer at one bounce, and Open Image Denoise: the extra `bake`.
 
 Another's way to the same integral: it checks the march where there are many samples, and shows at few of them what a
-path tracer makes of a frame's time. It works on the CPU.
+path tracer makes of a frame's time. Mitsuba traces on the CPU, or on a GPU where the driver comes with OptiX, which
+many that only compute lack; the denoiser is the CPU's.
 """
 
 from __future__ import annotations
 
 import importlib.util
 import math
+import subprocess
+import sys
 from typing import Any
 
 import numpy as np
 
-from wlm.errors import WlmError
+from wlm.errors import WlmError, one_line
 from wlm.smoke.axes import VECTORS, Camera
+from wlm.smoke.data import CameraSettings, make_camera
+from wlm.smoke.synthetic import make_plume
 from wlm.smoke.volume import DensityVolume
 
-__all__ = ["PathTracer", "denoise", "has_denoiser", "has_tracer"]
+__all__ = ["GPU", "PathTracer", "choose_variant", "denoise", "has_denoiser", "has_tracer", "try_variant"]
+
+GPU = "cuda_ad_rgb"
+"""Mitsuba's variant for a GPU."""
 
 _FILTER = "RTLightmap"  # of one image without normals or albedo, in linear light
 _NEVER = 100  # bounces after which paths are ended at random
 _LLVM = 19  # older ones can't translate what Mitsuba asks for, and end the process
+_TRIAL = f"from wlm.bench.path_tracer import try_variant; try_variant({GPU!r})"
+_PATIENCE = 180.0  # seconds of a trial, most of which are for the first kernels
+_TOLD = 160  # characters of why it failed
 
 
 def has_tracer() -> bool:
@@ -33,11 +44,69 @@ def has_denoiser() -> bool:
     return importlib.util.find_spec("pyoidn") is not None
 
 
+def choose_variant(device: str = "cpu") -> tuple[str, str]:
+    """Finds Mitsuba's quickest variant for a device.
+
+    Args:
+        device: "cpu" or "cuda:0".
+
+    Returns:
+        The variant, and why it is the CPU's although a GPU was asked for; empty otherwise.
+
+    Raises:
+        WlmError: Mitsuba isn't installed.
+    """
+    if not has_tracer():
+        raise WlmError("path tracing needs mitsuba: install wlm[bake]")
+    import drjit
+
+    reason = ""
+    if device != "cpu":
+        reason = _no_gpu(device, drjit.has_backend(drjit.JitBackend.CUDA))
+        if not reason:
+            return GPU, ""
+    fast = drjit.has_backend(drjit.JitBackend.LLVM) and drjit.detail.llvm_version()[0] >= _LLVM
+    return "llvm_ad_rgb" if fast else "scalar_rgb", reason
+
+
+def _no_gpu(device: str, found: bool) -> str:
+    """Why Mitsuba can't trace on a GPU; empty if it can."""
+    if device != "cuda:0":
+        return "Mitsuba takes the first GPU alone"
+    if not found:
+        return "Dr.Jit finds no CUDA"
+    # By itself: without OptiX, or with one that is too old, it may end the process.
+    try:
+        trial = subprocess.run([sys.executable, "-c", _TRIAL], capture_output=True, text=True, timeout=_PATIENCE)
+    except subprocess.TimeoutExpired:
+        return f"a first image took more than {_PATIENCE:g} s"
+    except OSError as error:
+        return f"a second process can't be started, {error.strerror}"
+    if trial.returncode == 0:
+        return ""
+    said = trial.stderr.strip().splitlines()
+    return one_line(said[-1] if said else f"a first image ended with {trial.returncode}", _TOLD)
+
+
+def try_variant(variant: str) -> None:
+    """Traces a small plume.
+
+    Raises:
+        WlmError: Mitsuba isn't installed, or the image is black or not finite.
+        Exception: Whatever Mitsuba raises where the variant doesn't work.
+    """
+    volume = make_plume(8, hot=False, extinction=14.0)
+    camera = make_camera(CameraSettings(resolution=8), volume.origin, (1.0, 1.0, 1.0))
+    lightmaps, _ = PathTracer(volume, camera, variant=variant)(4)
+    if not (np.isfinite(lightmaps).all() and lightmaps.any()):
+        raise WlmError(f"path tracing: {variant}: expected light, found none, or numbers that aren't finite")
+
+
 class PathTracer:
     """Smoke as seen by a camera, lit from one of the six directions at a time.
 
     Attributes:
-        variant: Mitsuba's: vectorised by LLVM where one that is new enough is there, else plain.
+        variant: Mitsuba's.
     """
 
     def __init__(self, volume: DensityVolume, camera: Camera, *, variant: str | None = None) -> None:
@@ -46,7 +115,7 @@ class PathTracer:
         Args:
             volume: The smoke; on a GPU it is copied from there.
             camera: Orthographic.
-            variant: Mitsuba's; None: the quickest that there is on a CPU.
+            variant: Mitsuba's, as `choose_variant` gives it; None: the quickest that there is on a CPU.
 
         Raises:
             ValueError: The camera is in perspective.
@@ -56,11 +125,9 @@ class PathTracer:
             raise ValueError("six-way lightmaps need an orthographic camera")
         if not has_tracer():
             raise WlmError("path tracing needs mitsuba: install wlm[bake]")
-        import drjit
         import mitsuba
 
-        fast = drjit.has_backend(drjit.JitBackend.LLVM) and drjit.detail.llvm_version()[0] >= _LLVM
-        self.variant = variant or ("llvm_ad_rgb" if fast else "scalar_rgb")
+        self.variant = variant or choose_variant()[0]
         mitsuba.set_variant(self.variant)
         self._mitsuba, self._camera = mitsuba, camera
         self._smoke = self._load(volume)
@@ -76,6 +143,7 @@ class PathTracer:
         Returns:
             Lightmaps float32 [6, H, W] as those of `SixWay`, and the transparency [H, W], which is noisy too.
         """
+        # Each is a copy on the CPU, which waits for the device.
         images = np.stack([self.traced(way, samples, seed) for way in VECTORS])
         return images[..., 0], 1.0 - images[..., 3].mean(0)
 

@@ -4,8 +4,9 @@ All look at frames of a jet, a plume, a flame and a burst that no network has le
 camera, and are held against the six-way march in steps of half a voxel. PSNR is of the six lightmaps in sRGB with a
 peak of 1, an image at a time: its mean, least and most. The methods, each a table of its own:
 
-- "time against error": the fine march ("six ways") and the coarse one by their steps in voxels, and networks with the
-  guiding map that each reads and with its planes decoded to light. The emission is that of frames that glow. Times are
+- "time against error": the fine march ("six ways") and the coarse one by their steps in voxels, the latter also with
+  nodes of its lattice that are nearer or farther apart than a step, and networks with the guiding map that each reads
+  and with its planes decoded to light. The emission is that of frames that glow. Times are
   of a frame, the mean over all; on a GPU as replayed graphs, and as the calls that a user makes beside it.
 - "frame": where the time of a frame goes, and the simulation beside it. "shade" weighs for two lights.
 - "flip book": lightmaps baked from one side, on a billboard that turns with the camera; what the coarse march and the
@@ -118,11 +119,11 @@ def error_rows(bench: NetworkBench) -> list[Row]:
         name = f"six ways, step {step:g}"
         makers[name] = None if name in notes else _six_maker(step)
         calls[name] = _on_all(bench, _six_call(bench, step))
-    for jitter in (1.0, 0.0):
-        for step in bench.sizes.coarse:
-            name = f"coarse, h {step:g}" + ("" if jitter else ", no jitter")
-            makers[name] = _coarse_maker(step, jitter)
-            calls[name] = _on_all(bench, _coarse_call(bench, step, jitter))
+    coarse = {f"coarse, h {step:g}": (step, step) for step in bench.sizes.coarse}
+    coarse |= {f"coarse, h {step:g}, nodes {spacing:g}": (step, spacing) for step, spacing in bench.sizes.swept}
+    for name, (step, spacing) in coarse.items():
+        makers[name] = _coarse_maker(step, spacing)
+        calls[name] = _on_all(bench, _coarse_call(bench, step, spacing))
     for subject in bench.subjects:
         for half in (True, False) if bench.device != "cpu" else (False,):
             name = f"{subject.name}, {'fp16' if half else 'fp32'}"
@@ -188,17 +189,17 @@ def _six_call(bench: NetworkBench, step: float) -> Callable[[Frame], SixWay]:
     return lambda frame: six_way(frame.later, bench.camera, step=step, estimate=False)
 
 
-def _coarse_call(bench: NetworkBench, step: float, jitter: float) -> Callable[[Frame], object]:
-    return lambda frame: coarse_six_way(frame.later, bench.camera, step=step, jitter=jitter, seed=frame.seed + 1)
+def _coarse_call(bench: NetworkBench, step: float, spacing: float) -> Callable[[Frame], object]:
+    return lambda frame: coarse_six_way(frame.later, bench.camera, step=step, spacing=spacing, seed=frame.seed + 1)
 
 
 def _six_maker(step: float) -> Callable[..., torch.Tensor]:
     return lambda volume, camera, seed: encode_lightmaps(six_way(volume, camera, step=step, estimate=False))
 
 
-def _coarse_maker(step: float, jitter: float) -> Callable[..., torch.Tensor]:
+def _coarse_maker(step: float, spacing: float) -> Callable[..., torch.Tensor]:
     return lambda volume, camera, seed: encode_lightmaps(
-        coarse_six_way(volume, camera, step=step, jitter=jitter, seed=seed).six
+        coarse_six_way(volume, camera, step=step, spacing=spacing, seed=seed).six
     )
 
 

@@ -29,6 +29,7 @@ _LIGHTS = (
 )
 _BACKGROUND = (0.03, 0.04, 0.055)
 _LEVELS = 255.0
+_MARCHES = (1.0, 0.5, 0.3)  # of the guiding map's step, those of the coarse march beside the networks
 
 
 def frame_rows(bench: NetworkBench) -> list[Row]:
@@ -111,8 +112,10 @@ def density_rows(bench: NetworkBench) -> list[Row]:
             predictor = Predictor(subject.network, size, size, device=bench.device)
             pool = _pool(bench, frames, targets, subject.settings)
             found |= compare({subject.name: of_predictor(predictor)}, pool)
-        pool = _pool(bench, frames, targets, bench.settings.model_copy(update={"guide": "six"}))
-        found |= compare({f"coarse, h {step:g}": coarse}, pool)
+        for share in _MARCHES:
+            changed = {"guide": "six", "guide_step": share * bench.settings.guide_step}
+            pool = _pool(bench, frames, targets, bench.settings.model_copy(update=changed))
+            found |= compare({f"coarse, h {share * step:g}": coarse}, pool)
         for name, one in found.items():
             figures = {
                 "least dB": f"{one.lowest:.2f}",

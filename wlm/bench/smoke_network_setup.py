@@ -64,7 +64,8 @@ class NetworkSizes:
         resolution: Pixels along an image's edge.
         kinds: Of scenes, one of each.
         frames: Of each scene.
-        six, coarse: Steps in voxels of the fine march and of the coarse one.
+        six, coarse: Steps in voxels of the fine march and of the coarse one, whose nodes are as far apart.
+        swept: Steps of the coarse march and distances of its nodes, in voxels.
         turns: Degrees by which the camera turns away from what a flip book was baked from.
         scales: Of the density.
         profile: Pixels along the edge of the images that profiles are timed with.
@@ -80,6 +81,7 @@ class NetworkSizes:
     frames: int
     six: tuple[float, ...]
     coarse: tuple[float, ...]
+    swept: tuple[tuple[float, float], ...]
     turns: tuple[float, ...]
     scales: tuple[float, ...]
     profile: int
@@ -97,6 +99,7 @@ FULL = NetworkSizes(
     frames=2,
     six=(20.0, 15.0, 10.0, 7.0, 5.0, 3.0, 2.0, 1.0, EXACT),
     coarse=(20.0, 15.0, 10.0, 7.0, 5.0, 3.0),
+    swept=((10.0, 5.0), (5.0, 10.0), (5.0, 5.0), (3.0, 5.0), (2.0, 5.0), (2.0, 3.0), (1.0, 2.0)),
     turns=(10.0, 30.0, 60.0, 90.0),
     scales=(0.5, 1.0, 2.0),
     profile=512,
@@ -115,6 +118,7 @@ QUICK = NetworkSizes(
     frames=1,
     six=(3.2, 1.6, 1.0, EXACT),
     coarse=(3.2, 2.4, 1.6),
+    swept=((1.6, 3.2), (0.8, 1.6)),
     turns=(30.0, 90.0),
     scales=(0.5, 1.0, 2.0),
     profile=64,

@@ -1,5 +1,6 @@
 """`wlm bench`: speed against error, ours and the baselines."""
 
+import shlex
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -198,7 +199,9 @@ def smoke_network(
     networks: Annotated[
         list[Path] | None,
         typer.Option(
-            "--network", metavar="FILE", help="A trained network; this or --profile is needed. Several times."
+            "--network",
+            metavar="FILE",
+            help="A trained network; default, without --profile, the one that comes with wlm. Several times.",
         ),
     ] = None,
     profiles: Annotated[
@@ -221,13 +224,55 @@ def smoke_network(
     quiet_warp()
     from wlm.bench.smoke_network import PANELS, plotted, run
     from wlm.interop import check_device
+    from wlm.smoke.network_file import shipped
 
     device = check_device(device)
-    rows = run(networks or (), profiles or (), quick=quick, device=device, progress=note)
+    measured = networks or ([] if profiles else [shipped()])
+    rows = run(measured, profiles or (), quick=quick, device=device, progress=note)
     command = f"wlm bench smoke-network{' --quick' if quick else ''} --device {device}"
     command += "".join(f" --network {path.name}" for path in networks or ())
     command += "".join(f" --profile {Path(name).name}" for name in profiles or ())
     _finish(rows, device, command, json_path, plot_path, PANELS, shown=plotted(rows))
+
+
+@app.command("smoke-ablation")
+def smoke_ablation(
+    profile: Annotated[
+        str, typer.Option(metavar="NAME", help="A profile, or a YAML file, of which one thing at a time is changed.")
+    ] = "24",
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Small images and few steps, for seconds on a CPU; else for a GPU.")
+    ] = False,
+    device: Annotated[str, typer.Option(help='Where it computes: "cpu", "cuda" or "cuda:N".')] = "cpu",
+    rounds: Annotated[int | None, typer.Option(min=1, help="Of each training, with samples of its own.")] = None,
+    steps: Annotated[int | None, typer.Option(min=1, help="Of each round.")] = None,
+    only: Annotated[
+        list[str] | None, typer.Option("--only", metavar="ROW", help="A row by its name; default all. Several times.")
+    ] = None,
+    json_path: Annotated[
+        Path | None, typer.Option("--json", metavar="FILE.json", help="Write the rows and the environment.")
+    ] = None,
+) -> None:
+    """Neural six-way lightmaps: short trainings of a profile with one thing changed at a time, beside each other."""
+    _check_outputs(json_path, None)
+    quiet_warp()
+    from wlm.bench import describe_environment, write_json
+    from wlm.bench.smoke_ablation import run
+    from wlm.interop import check_device
+
+    device = check_device(device)
+    command = f"wlm bench smoke-ablation{' --quick' if quick else ''} --profile {Path(profile).name} --device {device}"
+    command += "".join(f" --{name} {value}" for name, value in (("rounds", rounds), ("steps", steps)) if value)
+    command += "".join(f" --only {shlex.quote(name)}" for name in only or ())
+
+    def keep(rows: list) -> None:
+        # What took minutes outlives a stop.
+        if json_path is not None:
+            write_json(json_path, rows, describe_environment(device, command))
+
+    options = {"quick": quick, "device": device, "rounds": rounds, "steps": steps}
+    rows = run(profile, only or (), **options, progress=note, done=keep)
+    _finish(rows, device, command, json_path, None, ())
 
 
 @app.command()

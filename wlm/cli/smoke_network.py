@@ -37,6 +37,7 @@ from wlm.errors import WlmError
 if TYPE_CHECKING:
     from wlm.smoke.axes import Camera
     from wlm.smoke.evaluate import Comparison
+    from wlm.smoke.network import SixWayNetwork
     from wlm.smoke.reference import SixWay
     from wlm.smoke.volume import DensityVolume
 
@@ -45,7 +46,12 @@ __all__ = ["register"]
 _POOL, _SHEET = "pool.safetensors", "sheet.png"
 _SUFFIX = ".safetensors"
 
-_Network = Annotated[Path, typer.Argument(metavar="NETWORK", help="A file that train wrote.")]
+_MARCH = 130  # steps of `predict --coarse` along the longest edge
+
+_Network = Annotated[
+    Path | None,
+    typer.Argument(metavar="NETWORK", help="A file that train wrote; default the one that comes with wlm."),
+]
 
 
 def register(app: typer.Typer) -> None:
@@ -134,13 +140,20 @@ def predict(
     smoke: Input,
     output: Annotated[Path, typer.Option("--output", "-o", metavar="OUT", help="A .exr, or of frames a folder.")],
     network: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="A network that train wrote; needed without --coarse.")
+        Path | None, typer.Option(metavar="FILE", help="A network that train wrote; default the one that wlm has.")
     ] = None,
-    coarse: Annotated[
-        bool, typer.Option("--coarse", help="By a march in large steps alone, which needs no network.")
-    ] = False,
+    coarse: Annotated[bool, typer.Option("--coarse", help="By a march alone, without a network.")] = False,
+    step: Annotated[
+        float | None,
+        typer.Option(
+            min=0.01,
+            max=1000.0,
+            metavar="H",
+            help=f"Voxels, of the march of --coarse; default 1/{_MARCH} of the longest edge.",
+        ),
+    ] = None,
     resolution: Resolution = None,
-    seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Of the guiding map's jitter.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Of the march's jitter.")] = 0,
     toward: Toward = None,
     turn: Turn = 0.0,
     extent: Extent = None,
@@ -155,17 +168,19 @@ def predict(
     """
     if coarse and network is not None:
         raise WlmError("--coarse: expected no --network beside it")
-    if network is None and not coarse:
-        raise WlmError("--network: expected a file that train wrote, or --coarse; found neither")
+    if step is not None and not coarse:
+        raise WlmError("--step: expected --coarse beside it: a network looks as it was trained to")
     quiet_warp()
+    from wlm.smoke.network_file import shipped
+
     footage = open_smoke(smoke, extinction, emission, device)
-    make = _coarse(seed) if network is None else _predicted(network, seed, footage.device)
+    make = _coarse(step, seed) if coarse else _predicted(network or shipped(), seed, footage.device)
     view = {"resolution": resolution, "toward": toward, "turn": turn, "extent": extent, "distance": distance}
     write_lightmaps(footage, output, view, make)
 
 
 def evaluate(
-    network: _Network,
+    network: _Network = None,
     smoke: Annotated[
         list[Path] | None, typer.Option(metavar="FILE", help="A .npz or .nvdb volume to look at too; repeat for more.")
     ] = None,
@@ -186,31 +201,32 @@ def evaluate(
     quiet_warp()
     from wlm.interop import check_device
     from wlm.smoke.evaluate import evaluate_all
-    from wlm.smoke.network_file import load_network, settings_of
+    from wlm.smoke.network_file import load_network, settings_of, shipped
 
-    device = check_device(device)
+    device, network = check_device(device), network or shipped()
     loaded, summary = load_network(network, device=device)
     settings = settings_of(network, summary)
     changed = {"resolution": resolution, "cells": settings.cells if cells is None else cells}
     with progress_bar("evaluate") as bar:
         found = evaluate_all(loaded, settings.model_copy(update=changed), smoke or (), device=device, progress=bar)
     if json_path is not None:
-        facts = {"network": loaded.settings.model_dump(mode="json"), "device": device, **changed}
+        facts = {"network": _described(network, loaded, summary), "device": device, **changed}
         write_json(json_path, facts | {"sets": [one.to_json() for one in found]})
     _show_evaluation(network, found)
 
 
 def export(
-    network: _Network,
     output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE.onnx", help="The file to write.")],
+    network: _Network = None,
     resolution: Annotated[int, typer.Option(min=1, max=16384, help="Pixels along the image's edges.")] = 512,
 ) -> None:
     """Write a network as ONNX: encoded guiding maps to encoded lightmaps, of one size, in float32."""
     check_output(output, ".onnx")
     quiet_warp()
-    from wlm.smoke.network_file import export_onnx, load_network
+    from wlm.smoke.network_file import export_onnx, load_network, shipped
     from wlm.smoke.samples import GUIDES, PLANES
 
+    network = network or shipped()
     loaded, _ = load_network(network)
     size = export_onnx(loaded, output, resolution, resolution)
     rows = table(str(network), ["", "planes"], text=["planes"])
@@ -278,13 +294,15 @@ def dataset(
     note(f"{output / _SHEET}: samples {', '.join(map(str, shown))}")
 
 
-def _coarse(seed: int) -> "Callable[[DensityVolume, Camera], SixWay]":
-    """Makes lightmaps by the march in large steps, those that a network would look with."""
+def _coarse(step: float | None, seed: int) -> "Callable[[DensityVolume, Camera], SixWay]":
+    """Makes lightmaps by a march whose nodes are as far apart as its steps."""
     from wlm.smoke.coarse import coarse_six_way
-    from wlm.smoke.dataset import DatasetSettings
 
-    settings = DatasetSettings()
-    return lambda volume, camera: coarse_six_way(volume, camera, seed=seed, **settings.look(volume.shape)).six
+    def make(volume: "DensityVolume", camera: "Camera") -> "SixWay":
+        voxels = max(volume.shape) / _MARCH if step is None else step
+        return coarse_six_way(volume, camera, step=voxels, seed=seed).six
+
+    return make
 
 
 def _predicted(path: Path, seed: int, device: str) -> "Callable[[DensityVolume, Camera], SixWay]":
@@ -304,6 +322,15 @@ def _predicted(path: Path, seed: int, device: str) -> "Callable[[DensityVolume, 
         return run(volume, camera, predictors[size], seed=seed, **settings.look(volume.shape))
 
     return make
+
+
+def _described(path: Path, network: "SixWayNetwork", summary: dict[str, Any]) -> dict[str, Any]:
+    """Which network it is, and how it was trained as far as its file says."""
+    from wlm.smoke.network import parameter_count
+
+    known = {name: summary[name] for name in ("profile", "seed", "steps", "seconds", "device") if name in summary}
+    settings = network.settings.model_dump(mode="json")
+    return {"name": path.stem, **settings, "parameters": parameter_count(network), **known}
 
 
 def _show_evaluation(path: Path, found: "list[Comparison]") -> None:

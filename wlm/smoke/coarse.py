@@ -1,9 +1,10 @@
 """Six-way lightmaps at the cost of a guiding map: one march in large steps that shares the ways to the lights.
 
 The paper marches in steps of 10 voxels for the sum of three lights, and leaves it to a network to find six lightmaps in
-it (section 4.2). The same march can keep the lights apart: those from the sides take a lattice of nodes, as for the
-guiding map, those from the front and the back follow from the transparency alone, exactly. What it lacks is the error
-of its step.
+it (section 4.2). The same march can keep the lights apart: those from the sides are marched to along the lines of a
+lattice, once for all pixels; those from the front and the back follow from the ray's transparency T alone, exactly, as
+(1 - T^2) / 2 and -T ln T. What it lacks is the error of its steps: of those along the rays, in T too, of the distance
+of the lattice's nodes, between which light is interpolated, and of the steps to the lights. Each is a setting.
 """
 
 from __future__ import annotations
@@ -55,6 +56,8 @@ def coarse_six_way(
     camera: Camera,
     *,
     step: float = 10.0,
+    spacing: float | None = None,
+    light_step: float | None = None,
     jitter: float = 1.0,
     seed: int = 0,
     threshold: float = 0.01,
@@ -66,9 +69,13 @@ def coarse_six_way(
     Args:
         volume: The smoke.
         camera: Orthographic.
-        step: h, in voxels.
-        jitter: Share of a step by which a pixel's samples are shifted at random, 0 to 1.
-        seed: Of the jitter.
+        step: h, in voxels, the longest along the rays. Below 8 empty space is left out, which changes no result.
+        spacing: The largest distance of the lattice's nodes, in voxels; None: as `step`. They are a voxel apart at
+            least, and more where there would be more than 2^28 of them. Each takes 24 bytes while this runs.
+        light_step: The longest along the ways to the lights, in voxels; None: as `spacing`.
+        jitter: Share of a step by which a pixel's samples are shifted, 0 to 1. The shifts are a pattern that varies
+            little over a few pixels.
+        seed: Of the jitter, any whole number; 64 of them differ.
         threshold: tau, the optical depth of one voxel from which on smoke has a surface.
         g: Henyey and Greenstein's mean cosine, within -1 and 1.
         cutoff: A ray ends where less than this is left of its transparency.
@@ -80,6 +87,9 @@ def coarse_six_way(
         ValueError: A setting is out of its range, or the camera is in perspective.
     """
     check_march(step, g, jitter)
+    for name, value in (("spacing", spacing), ("light_step", light_step)):
+        if value is not None and not 0 < value < float("inf"):
+            raise ValueError(f"{name}: expected voxels, above 0, got {value}")
     view, moved = camera.view(volume.origin, volume.voxel, volume.shape)
     with stream(device_name(volume.device)):
         size = (len(marching_coarse.PLANES), camera.height, camera.width)
@@ -91,6 +101,8 @@ def coarse_six_way(
             view,
             to_warp(planes),
             step=step,
+            spacing=spacing,
+            light_step=light_step,
             jitter=jitter,
             seed=seed,
             threshold=threshold,

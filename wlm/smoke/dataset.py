@@ -93,6 +93,8 @@ class DatasetSettings(BaseModel):
         zoom: The image's edge, least and most.
         guide: Of which kind guiding maps are, one of `samples.GUIDES`.
         guide_step: h of the guiding map; the paper's 10 of 400 voxels.
+        guide_spacing: Between the nodes at which its way to the lights is known, where these are kept apart; None: as
+            the step.
         jitter: Share of such a step by which a pixel's samples are shifted.
         surface: Optical depth, over the box's edge, from which on smoke has a surface.
         reference_step: Of the lightmaps, in voxels.
@@ -123,6 +125,7 @@ class DatasetSettings(BaseModel):
     zoom: _Range = (0.65, 1.2)
     guide: Literal["paper", "front", "sides", "six"] = "paper"
     guide_step: _Positive = 1.0 / 40.0
+    guide_spacing: _Positive | None = None
     jitter: _Share = 1.0
     surface: float = Field(4.0, ge=0.0)
     reference_step: _Positive = 1.0
@@ -145,6 +148,8 @@ class DatasetSettings(BaseModel):
             low, high = getattr(self, name)
             if low > high:
                 raise PydanticCustomError("range", "{name}: expected the least before the most", {"name": name})
+        if self.guide == "paper" and self.guide_spacing is not None:
+            raise PydanticCustomError("spacing", "guide_spacing: expected none with the paper's guide, found one")
         return self
 
     @property
@@ -158,9 +163,10 @@ class DatasetSettings(BaseModel):
         return round(crossings * self.cells / (LATTICE_SPEED * whole)) * whole
 
     def look(self, shape: Sequence[int]) -> dict[str, float]:
-        """How `guide` has to look at a volume of so many voxels: its step, jitter and threshold."""
+        """How `look_at` has to look at so many voxels: its step, jitter and threshold, maybe its spacing."""
         longest = max(shape)
-        return {"step": self.guide_step * longest, "jitter": self.jitter, "threshold": self.surface / longest}
+        look = {"step": self.guide_step * longest, "jitter": self.jitter, "threshold": self.surface / longest}
+        return look if self.guide_spacing is None else look | {"spacing": self.guide_spacing * longest}
 
 
 @dataclass(frozen=True)

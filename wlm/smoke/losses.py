@@ -34,6 +34,7 @@ _MEAN = (104.00699, 116.66877, 122.67892)
 _RANGE = 255.0
 # Lightmaps as pictures of three channels: no map lies with its opposite, which it would hide.
 _PICTURES = (("right", "top", "front"), ("left", "bottom", "back"))
+_DIGITS = 40  # binary ones of the largest number of a sum; there are 22 more for the sum itself
 _VISIBLE = 0.01  # opacity from which on change is seen
 
 
@@ -91,7 +92,8 @@ class Perceptual(nn.Module):
             Three tensors [2 N, C, H', W'], relative to the range of a byte; fewer where the image gets too small.
         """
         # The file's channels are blue, green, red.
-        pictures = [planes[:, [PLANES.index(name) for name in reversed(names)]] for names in _PICTURES]
+        # One plane at a time: a list of them would be a tensor of the host's, which no graph takes.
+        pictures = [torch.stack([planes[:, PLANES.index(name)] for name in reversed(names)], 1) for names in _PICTURES]
         x = torch.cat(pictures) * _RANGE - self.mean
         found, i = [], 0
         for block, convolutions in enumerate(_BLOCKS):
@@ -127,10 +129,53 @@ def warp(earlier: torch.Tensor, motion: torch.Tensor) -> tuple[torch.Tensor, tor
     motion = motion.to(earlier.dtype)
     column = torch.arange(width, device=earlier.device, dtype=earlier.dtype) - motion[:, 0]
     row = torch.arange(height, device=earlier.device, dtype=earlier.dtype)[:, None] - motion[:, 1]
-    grid = torch.stack([(2 * column + 1) / width - 1, (2 * row + 1) / height - 1], -1)
     inside = (column >= 0) & (column <= width - 1) & (row >= 0) & (row <= height - 1)
-    moved = F.grid_sample(earlier, grid, mode="bilinear", padding_mode="border", align_corners=False)
+    moved = _Bilinear.apply(earlier, row.clamp(0, height - 1), column.clamp(0, width - 1))
     return moved, inside[:, None].to(earlier.dtype)
+
+
+class _Bilinear(torch.autograd.Function):
+    """Reads images [N, C, H, W] at rows and columns [N, H', W'], within the image, to [N, C, H', W'].
+
+    Many pixels can read one: on a GPU, torch's own gradient adds these up in any order, and no training repeats itself
+    to the bit. Here they are added as whole numbers. There is no gradient of the places.
+    """
+
+    @staticmethod
+    def forward(ctx, image, row, column):
+        height, width = image.shape[-2:]
+        top, left = (at.floor().clamp(0, max(size - 2, 0)) for at, size in ((row, height), (column, width)))
+        across, down = (column - left)[:, None], (row - top)[:, None]
+        first = (top.long() * width + left.long())[:, None]
+        # Of one row or column, what would lie beyond has a weight of 0.
+        below, beside = width if height > 1 else 0, 1 if width > 1 else 0
+        corners = [first, first + beside, first + below, first + below + beside]
+        weights = [(1 - down) * (1 - across), (1 - down) * across, down * (1 - across), down * across]
+        ctx.save_for_backward(*corners, *weights)
+        ctx.shape = image.shape
+        flat = image.flatten(2)
+        parts = (
+            flat.gather(2, _spread(corner, flat)).view(*flat.shape[:2], *row.shape[1:]) * weight
+            for corner, weight in zip(corners, weights, strict=True)
+        )
+        return sum(parts)
+
+    @staticmethod
+    def backward(ctx, gradient):
+        saved = ctx.saved_tensors
+        total = torch.zeros(*ctx.shape[:2], ctx.shape[2] * ctx.shape[3], dtype=torch.int64, device=gradient.device)
+        # A power of 2 leaves all of float32's digits to all but the least.
+        largest = gradient.abs().amax().clamp(min=1e-30, max=1e30).double()
+        unit = torch.exp2(largest.log2().ceil() - _DIGITS)
+        for corner, weight in zip(saved[:4], saved[4:], strict=True):
+            part = ((gradient * weight).double() / unit).round().long()
+            total.scatter_add_(2, _spread(corner, total), part.flatten(2))
+        return (total.double() * unit).to(gradient.dtype).view(ctx.shape), None, None
+
+
+def _spread(index: torch.Tensor, like: torch.Tensor) -> torch.Tensor:
+    """[N, 1, H, W] as [N, C, H W]."""
+    return index.flatten(2).expand(-1, like.shape[1], -1)
 
 
 def residual(frames: torch.Tensor, motion: torch.Tensor, opacity: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

@@ -1,14 +1,15 @@
-"""The network that turns a guiding map into six-way lightmaps (section 4.3): a U-Net of NAFBlocks with adapters.
+"""The network that turns a guiding map into six-way lightmaps (section 4.3): a U-Net with four adapters.
 
-A NAFBlock (Chen et al. 2022) has no activation but the product of one half of its channels with the other. Its
-channel attention multiplies by a linear map of the channels' means over the whole image, so that what the network makes
-of a crop isn't what it makes of the image: it is trained on whole images and run on whole images, and means of one
-view at two resolutions are alike.
+The U-Net is Ronneberger's (2015): two 3 x 3 convolutions a level, maxima on the way down. What its last level finds is
+shared by the adapters, each a NAFBlock (Chen et al. 2022) for two opposite planes. A NAFBlock has no activation but the
+product of one half of its channels with the other; its channel attention multiplies by a linear map of the channels'
+means over the whole image.
 
 Two things are known without learning and are built in:
 
-- opacity differs little from the guide's, and light from the guide's light: the outputs are a learned mix of the
-  guide's planes, which begins as what least squares found, plus what the U-Net finds, which begins as 0;
+- opacity differs little from the guide's, and light from the guide's light, but for the noise of its jitter: the
+  outputs are a learned filter of the guide's planes, which begins as what least squares found of a pixel's own, plus
+  what the U-Net finds, which begins as 0;
 - where no smoke is near, all planes are 0: outputs are multiplied by a mask of where the guide, whose large steps can
   miss a wisp in one pixel and find it in the next, saw some within 8 to 16 pixels.
 """
@@ -19,8 +20,7 @@ from typing import Literal
 
 import torch
 import torch.nn.functional as F
-from pydantic import BaseModel, ConfigDict, Field, model_validator
-from pydantic_core import PydanticCustomError
+from pydantic import BaseModel, ConfigDict, Field
 from torch import nn
 
 from wlm.smoke.samples import GUIDES, PLANES
@@ -32,6 +32,8 @@ ADAPTERS = (("front", "back"), ("right", "left"), ("top", "bottom"), ("opacity",
 
 REACH = 8
 """Pixels within which smoke in the guide lets lightmaps differ from 0, at least."""
+
+_FILTER = 5  # pixels along the edge of what the filter of the guide sees
 
 # What a plane begins as that the guide lacks: shares of its light, opacity and depth. Least squares over plumes of
 # optical depths of 1 to 30 and the paper's guide, rounded, and alike for opposite sides.
@@ -52,37 +54,26 @@ class NetworkSettings(BaseModel):
 
     Attributes:
         width: Channels at the first level; each level has twice those of the one before, at half the resolution.
-        blocks: NAFBlocks at each level on the way down; the last level is the bottom.
-        decoder: NAFBlocks at each level but the bottom on the way up, the finest first.
+        levels: Of the U-Net, the bottom too.
         adapters: Whether each of the four groups of planes has a NAFBlock of its own; otherwise all share one.
         emission: Whether the last plane is made; otherwise it is 0.
         guide: What it reads, one of `samples.GUIDES`.
         depth: Whether the guide's depth, its last plane, is read.
         stem: Pixels along the edge of the squares that the first convolution takes as one: 1 is the paper's, 2 runs the
             whole network at half the resolution, a quarter of the work.
-        residual: Whether the outputs begin as a mix of the guide's planes.
+        residual: Whether a filter of the guide's planes is added to the outputs.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     width: int = Field(16, ge=8, le=64, multiple_of=8)
-    blocks: tuple[int, ...] = Field((2, 2, 2, 14), min_length=2, max_length=6)
-    decoder: tuple[int, ...] = Field((2, 2, 2), min_length=1, max_length=5)
+    levels: int = Field(5, ge=2, le=6)
     adapters: bool = True
     emission: bool = True
     guide: Literal["paper", "front", "sides", "six"] = "paper"
     depth: bool = True
     stem: Literal[1, 2] = 1
     residual: bool = True
-
-    @model_validator(mode="after")
-    def _fits(self) -> NetworkSettings:
-        if len(self.decoder) != len(self.blocks) - 1:
-            told = "decoder: expected {levels} levels, one less than blocks has"
-            raise PydanticCustomError("levels", told, {"levels": len(self.blocks) - 1})
-        if min(self.blocks + self.decoder) < 0 or max(self.blocks + self.decoder) > 64:
-            raise PydanticCustomError("blocks", "blocks, decoder: expected 0 to 64 a level")
-        return self
 
     @property
     def channels(self) -> int:
@@ -92,7 +83,7 @@ class NetworkSettings(BaseModel):
     @property
     def multiple(self) -> int:
         """Pixels of which an image's height and width are made multiples by zeros at its end."""
-        return self.stem * 2 ** (len(self.blocks) - 1)
+        return self.stem * 2 ** (self.levels - 1)
 
 
 class ChannelNorm(nn.Module):
@@ -192,19 +183,22 @@ class SixWayNetwork(nn.Module):
     def __init__(self, settings: NetworkSettings) -> None:
         super().__init__()
         self.settings = settings
-        widths = [settings.width * 2**level for level in range(len(settings.blocks))]
+        widths = [settings.width * 2**level for level in range(settings.levels)]
         first, area = widths[0], settings.stem**2
-        self.stem = nn.Conv2d(settings.channels * area, first, 3, padding=1)
-        self.encoder = nn.ModuleList(_blocks(n, c) for n, c in zip(settings.blocks, widths, strict=True))
-        self.down = nn.ModuleList(nn.Conv2d(c, 2 * c, 2, stride=2) for c in widths[:-1])
-        self.up = nn.ModuleList(nn.Conv2d(2 * c, 4 * c, 1, bias=False) for c in widths[:-1])
-        self.decoder = nn.ModuleList(_blocks(n, c) for n, c in zip(settings.decoder, widths, strict=False))
+        inputs = [settings.channels * area, *widths[:-1]]
+        self.encoder = nn.ModuleList(_twice(before, c) for before, c in zip(inputs, widths, strict=True))
+        # A 1 x 1 convolution and pixels repeated come to what is called an up-convolution, with fewer weights.
+        self.up = nn.ModuleList(nn.Conv2d(2 * c, c, 1) for c in widths[:-1])
+        self.decoder = nn.ModuleList(_twice(2 * c, c) for c in widths[:-1])
         self.groups = _groups(settings)
         self.adapters = nn.ModuleList(NafBlock(first) for _ in self.groups)
         self.heads = nn.ModuleList(nn.Conv2d(first, len(group) * area, 3, padding=1) for group in self.groups)
         if settings.residual:
-            shares = [_start(name, GUIDES[settings.guide]) for group in self.groups for name in group]
-            self.mix = nn.Parameter(torch.tensor(shares)[:, : settings.channels].clone())
+            shares = torch.tensor([_start(name, GUIDES[settings.guide]) for group in self.groups for name in group])
+            self.mix = nn.Conv2d(settings.channels, len(shares), _FILTER, padding=_FILTER // 2, bias=False)
+            with torch.no_grad():
+                self.mix.weight.zero_()
+                self.mix.weight[:, :, _FILTER // 2, _FILTER // 2] = shares[:, : settings.channels]
             for head in self.heads:
                 nn.init.zeros_(head.weight)
                 nn.init.zeros_(head.bias)
@@ -214,15 +208,14 @@ class SixWayNetwork(nn.Module):
         x = guide[:, : self.settings.channels]
         if self.settings.stem > 1:
             x = F.pixel_unshuffle(x, self.settings.stem)
-        x = self.stem(x)
+        x = x.contiguous(memory_format=torch.channels_last)
         skips = []
-        for blocks, down in zip(self.encoder, self.down, strict=False):
-            x = blocks(x)
+        for level, convolutions in enumerate(self.encoder):
+            x = convolutions(_halved(x) if level else x)
             skips.append(x)
-            x = down(x)
-        x = self.encoder[-1](x)
         for level in reversed(range(len(self.up))):
-            x = self.decoder[level](F.pixel_shuffle(self.up[level](x), 2) + skips[level])
+            above = F.interpolate(self.up[level](x), scale_factor=2.0, mode="nearest")
+            x = self.decoder[level](torch.cat([above, skips[level]], 1))
         return x
 
     def forward(self, guide: torch.Tensor) -> torch.Tensor:
@@ -242,8 +235,7 @@ class SixWayNetwork(nn.Module):
         if self.settings.stem > 1:
             made = F.pixel_shuffle(made, self.settings.stem)
         if self.settings.residual:
-            read = padded[:, : self.settings.channels]
-            made = made + F.conv2d(read, self.mix[:, :, None, None].to(padded.dtype))
+            made = made + self.mix(padded[:, : self.settings.channels])
         made = made[:, :, :height, :width] * support(guide[:, -2:-1])
         return self.order(made.to(guide.dtype))
 
@@ -265,8 +257,43 @@ def _start(name: str, planes: tuple[str, ...]) -> tuple[float, ...]:
     return tuple(float(plane == name) for plane in planes) if name in planes else _START[name]
 
 
-def _blocks(count: int, channels: int) -> nn.Sequential:
-    return nn.Sequential(*(NafBlock(channels) for _ in range(count)))
+def _halved(x: torch.Tensor) -> torch.Tensor:
+    """The largest of each 2 x 2 pixels."""
+    return _Largest.apply(x) if torch.is_grad_enabled() else F.max_pool2d(x, 2)
+
+
+class _Largest(torch.autograd.Function):
+    """max_pool2d with a gradient that repeats itself: torch's own adds up in any order on a GPU."""
+
+    @staticmethod
+    def forward(ctx, x):
+        y = F.max_pool2d(x, 2)
+        ctx.save_for_backward(x, y)
+        return y
+
+    @staticmethod
+    def backward(ctx, gradient):
+        x, y = ctx.saved_tensors
+        of_x = torch.empty_like(x)
+        taken = torch.zeros_like(y, dtype=torch.bool)
+        for row in range(2):
+            for column in range(2):
+                # Of equals the first has all.
+                found = (x[:, :, row::2, column::2] == y) & ~taken
+                torch.mul(gradient, found, out=of_x[:, :, row::2, column::2])
+                taken |= found
+        return of_x
+
+
+def _twice(before: int, after: int) -> nn.Sequential:
+    """Two convolutions, which keep the size of what goes through them."""
+    layers = []
+    for inputs in (before, after):
+        convolution = nn.Conv2d(inputs, after, 3, padding=1)
+        nn.init.kaiming_normal_(convolution.weight, nonlinearity="relu")
+        nn.init.zeros_(convolution.bias)
+        layers += [convolution, nn.ReLU(inplace=True)]
+    return nn.Sequential(*layers)
 
 
 def _groups(settings: NetworkSettings) -> tuple[tuple[str, ...], ...]:

@@ -8,6 +8,7 @@ import os
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,10 +22,11 @@ from wlm.smoke.dataset import DatasetSettings
 from wlm.smoke.network import NetworkSettings, SixWayNetwork
 from wlm.smoke.samples import GUIDES
 
-__all__ = ["SYSTEM", "export_onnx", "load_network", "save_network", "settings_of"]
+__all__ = ["SYSTEM", "export_onnx", "load_network", "save_network", "settings_of", "shipped"]
 
 SYSTEM = "smoke-network"
 
+_SHIPPED = Path(__file__).resolve().parents[1] / "data" / "smoke-six-24.safetensors"
 _OPSET = 20
 _HALF_MAX = 65504.0
 
@@ -35,7 +37,7 @@ def save_network(path: str | os.PathLike[str], network: SixWayNetwork, summary: 
     Args:
         path: The file.
         network: On any device.
-        summary: Of its training, such as the dataset's settings and the PSNR reached: JSON values.
+        summary: Of its training, such as the dataset's settings, the seconds and the PSNR reached: JSON values.
 
     Returns:
         The size of the file, bytes.
@@ -98,6 +100,17 @@ def load_network(
             raise WlmError(f"{path}: weight {name}: expected finite numbers, found NaN or infinity")
         wanted[name].copy_(torch.from_numpy(array.astype(np.float32)))
     return network.to(device).eval(), summary
+
+
+def shipped() -> Path:
+    """The trained network that comes with wlm.
+
+    Raises:
+        WlmError: It isn't there.
+    """
+    if not _SHIPPED.is_file():
+        raise WlmError(f"{_SHIPPED}: expected the network that comes with wlm, found none: install wlm anew")
+    return _SHIPPED
 
 
 def settings_of(path: str | os.PathLike[str], summary: Mapping[str, Any]) -> DatasetSettings:

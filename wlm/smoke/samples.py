@@ -111,6 +111,7 @@ def look_at(
     jitter: float,
     threshold: float,
     seed: int,
+    spacing: float | None = None,
 ) -> torch.Tensor:
     """A guiding map of a kind, encoded.
 
@@ -119,6 +120,7 @@ def look_at(
         camera: Orthographic.
         kind: One of ``GUIDES``.
         step, jitter, threshold, seed: As for `guide`.
+        spacing: As for `coarse_six_way`; not of the kind "paper".
 
     Returns:
         float32 [C, H, W], the planes of ``GUIDES``, all 0 where there is no smoke, but for an emission without any.
@@ -129,10 +131,12 @@ def look_at(
     settings = {"step": step, "jitter": jitter, "threshold": threshold, "seed": seed}
     near, far = span(volume, camera)
     if kind == "paper":
+        if spacing is not None:
+            raise ValueError(f"spacing: expected none for the paper's guiding map, got {spacing}")
         return encode_guide(guide(volume, camera, **settings).maps, near, far)
     if kind not in GUIDES:
         raise ValueError(f"kind: expected one of {', '.join(GUIDES)}, got {kind!r}")
-    found = coarse_six_way(volume, camera, **settings)
+    found = coarse_six_way(volume, camera, spacing=spacing, **settings)
     six = found.six
     if kind == "six":
         depth = encode_guide(torch.stack([six["front"], six.transparency, found.depth]), near, far)[2:]

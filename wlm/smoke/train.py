@@ -1,8 +1,9 @@
 """Training a network on pools of samples that are made as they are needed (section 4.4).
 
 Training goes in rounds, each with a pool of its own, of sequences that no other round has. What a step does follows
-from the seed, the round and the step alone, so that a run that was stopped goes on as if it hadn't been: to the bit on
-the CPU; on a GPU as far as its kernels repeat themselves. The stated behaviours:
+from the seed, the round and the step alone, so that a run that was stopped goes on as if it hadn't been: on the CPU its
+weights and its curves are the same to the bit, but for the seconds that the file and the curves tell; on a GPU as far
+as its kernels repeat themselves. The stated behaviours:
 
 =====================================  ===============================================================
 NaN or infinity in a pool              error that names the round, the tensor and the first sample
@@ -198,6 +199,7 @@ class _Run:
 
     def __init__(self, output, profile, seed, device, checkpoint, progress, minutes) -> None:
         self.output, self.profile, self.settings, self.seed = output, profile, profile.training, seed
+        self.device = device
         self.checkpoint, self.progress = checkpoint, progress
         self.trainer = Trainer(profile.network, profile.training, seed=seed, device=device)
         self.start = time.perf_counter()
@@ -235,11 +237,11 @@ class _Run:
     def do_round(self, pool: Pool) -> bool:
         """Does what is left of a round; False: out of time."""
         number, begin = self.round, self.round * self.settings.steps
-        plan = plan_round(self.settings, len(pool), seed=self.seed, round=number)
+        plan = plan_round(self.settings, pool, seed=self.seed, round=number)
         if self.trainer.step == begin:
             self.first_skipped = self.trainer.skipped
         while (done := self.trainer.step - begin) < self.settings.steps:
-            self.trainer.run(pool, tuple(part[done : done + _CHUNK] for part in plan))
+            self.trainer.run(pool, plan.part(done, done + _CHUNK))
             self._check_steps(number)
             self._loss = self._losses()[0]
             if self.trainer.step == begin + self.settings.steps:
@@ -342,6 +344,8 @@ class _Run:
             "profile": self.profile.name,
             "seed": self.seed,
             "steps": self.trainer.step,
+            "seconds": round(self.seconds, 1),
+            "device": "cpu" if self.device == "cpu" else torch.cuda.get_device_name(self.device),
             **self.score.to_json(),
             "training": self.settings.model_dump(mode="json"),
             "dataset": self.profile.dataset.model_dump(mode="json"),

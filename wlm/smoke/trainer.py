@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -13,9 +14,12 @@ from pydantic import BaseModel, ConfigDict, Field
 from wlm.interop import StepGraph
 from wlm.smoke.losses import Losses, LossSettings
 from wlm.smoke.network import NetworkSettings, SixWayNetwork
-from wlm.smoke.samples import GUIDES, PLANES, Pool
+from wlm.smoke.samples import GUIDES, OPACITY_PLANE, PLANES, Pool
 
-__all__ = ["TrainSettings", "Trainer", "plan_round"]
+__all__ = ["Plan", "TrainSettings", "Trainer", "plan_round"]
+
+_GRID = 16  # pixels: twice what the network's mask of where smoke may be is made of
+_VISIBLE = 0.05  # opacity from which on a pixel counts as smoke
 
 # Planes after a mirror across the vertical, then across the horizontal axis.
 _MIRRORED = ({"right": "left", "left": "right"}, {"top": "bottom", "bottom": "top"})
@@ -37,6 +41,8 @@ class TrainSettings(BaseModel):
         half: Whether CUDA computes in bfloat16 where that is safe; the CPU always uses float32.
         graph: Whether CUDA replays a step from a graph.
         compiled: Whether CUDA runs the network through torch.compile: slow to start, then quicker.
+        crop: Pixels along the edges of the part of a sample that a step learns from, which is drawn from where it has
+            smoke; None: all of it. In steps of 16, as the network's mask of where smoke may be has its own grid.
         validate_every: Rounds from one validation to the next; the last is always validated.
         losses: Weights of the loss's parts.
     """
@@ -54,6 +60,7 @@ class TrainSettings(BaseModel):
     half: bool = True
     graph: bool = True
     compiled: bool = False
+    crop: int | None = Field(None, ge=16, multiple_of=16)
     validate_every: int = Field(1, ge=1)
     losses: LossSettings = LossSettings()
 
@@ -89,7 +96,7 @@ class Trainer:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             made = SixWayNetwork(network)
-        self.network = made.to(device)
+        self.network = made.to(device, memory_format=torch.channels_last if self._cuda else torch.contiguous_format)
         self.average = copy.deepcopy(self.network).requires_grad_(False).eval()
         if self._cuda and settings.compiled:
             self.network.compile(dynamic=False)
@@ -125,35 +132,43 @@ class Trainer:
         """Begins new sums."""
         self._sums.zero_()
 
-    def run(self, pool: Pool, plan: tuple[torch.Tensor, torch.Tensor, torch.Tensor]) -> None:
+    def run(self, pool: Pool, plan: Plan) -> None:
         """Does steps.
 
         Args:
             pool: Where the samples are from, on any device.
             plan: Rows of `plan_round`, one a step.
         """
-        for samples, frames, turns in zip(*plan, strict=True):
-            batch = self._gather(pool, samples, frames, turns)
-            if self._batch is None:
-                self._batch = tuple(part.clone() for part in batch)
-            for held, part in zip(self._batch, batch, strict=True):
-                held.copy_(part)
-            self._rate.fill_(self.settings.rate_at(self.step))
-            # A mean over few steps at first: it shall forget the start.
-            decay = min(self.settings.average, (1 + self.step) / (10 + self.step))
-            self._blend.fill_(1 - decay)
-            self._run()
-            self.step += 1
+        # Where kernels could add in any order, those that don't: a seed gives one curve.
+        flags = {"enabled": True, "benchmark": False, "deterministic": True, "allow_tf32": self.settings.half}
+        with torch.backends.cudnn.flags(**flags):
+            for i in range(len(plan.samples)):
+                batch = self._gather(pool, plan, i)
+                if self._batch is None:
+                    self._batch = tuple(part.clone() for part in batch)
+                for held, part in zip(self._batch, batch, strict=True):
+                    held.copy_(part)
+                self._rate.fill_(self.settings.rate_at(self.step))
+                # A mean over few steps at first: it shall forget the start.
+                decay = min(self.settings.average, (1 + self.step) / (10 + self.step))
+                self._blend.fill_(1 - decay)
+                self._run()
+                self.step += 1
 
-    def _gather(self, pool: Pool, samples: torch.Tensor, frames: torch.Tensor, turns: torch.Tensor):
-        samples, turns = samples.to(pool.device), turns.to(self.device)
-        if self.settings.losses.pairs:
-            guides, targets = pool.guides[samples], pool.targets[samples]
-        else:
-            frames = frames.to(pool.device)
-            guides, targets = pool.guides[samples, frames][:, None], pool.targets[samples, frames][:, None]
-        motion = pool.motion[samples]
-        guides, targets, motion = (part.to(self.device).float() for part in (guides, targets, motion))
+    def _gather(self, pool: Pool, plan: Plan, i: int) -> tuple[torch.Tensor, ...]:
+        """The batch of a step: guides [N, K, C, H, W], targets [N, K, 8, H, W] and motion [N, 2, H, W], float32."""
+        samples, turns = plan.samples[i], plan.turns[i].to(self.device)
+        frames = [slice(None)] * len(samples)
+        if not self.settings.losses.pairs:
+            frames = [slice(frame, frame + 1) for frame in plan.frames[i].tolist()]
+        windows = [(slice(None), slice(None))] * len(samples)
+        if plan.corners is not None:
+            windows = [tuple(slice(at, at + self.settings.crop) for at in at) for at in plan.corners[i].tolist()]
+        parts = [
+            (pool.guides[n, k, :, y, x], pool.targets[n, k, :, y, x], pool.motion[n, :, y, x])
+            for n, k, (y, x) in zip(samples.tolist(), frames, windows, strict=True)
+        ]
+        guides, targets, motion = (torch.stack(part).to(self.device).float() for part in zip(*parts, strict=True))
         # Left to right is the last axis, and turns a motion's x; up to down the one before it, and its y.
         ways = zip(turns.unbind(1), (-1, -2), self._swaps, self._guide_swaps, self._signs, strict=True)
         for turned, axis, swap, guide_swap, sign in ways:
@@ -225,25 +240,72 @@ def _mirrored(planes: tuple[str, ...], device: str) -> list[torch.Tensor]:
     return [torch.tensor([planes.index(way.get(n, n)) for n in planes], device=device) for way in _MIRRORED]
 
 
-def plan_round(
-    settings: TrainSettings, count: int, *, seed: int, round: int
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+@dataclass(frozen=True)
+class Plan:
+    """What steps learn from, a row each.
+
+    Attributes:
+        samples: int [steps, B], of the pool.
+        frames: int [steps, B], which of their two, where a step learns from single frames.
+        turns: bool [steps, B, 2], which ways they are turned over.
+        corners: int [steps, B, 2], row and column at which the part that is learned from begins; None: all is.
+    """
+
+    samples: torch.Tensor
+    frames: torch.Tensor
+    turns: torch.Tensor
+    corners: torch.Tensor | None
+
+    def part(self, begin: int, end: int) -> Plan:
+        """Some of the steps."""
+        corners = None if self.corners is None else self.corners[begin:end]
+        return Plan(self.samples[begin:end], self.frames[begin:end], self.turns[begin:end], corners)
+
+
+def plan_round(settings: TrainSettings, pool: Pool, *, seed: int, round: int) -> Plan:
     """Which samples the steps of a round take: all once before any twice, in an order of its own.
 
     Args:
         settings: Of the training.
-        count: Samples in the pool.
+        pool: The samples.
         seed, round: What the order follows from.
 
-    Returns:
-        Samples int [steps, B], which of their two frames [steps, B], and which ways they are turned over, bool
-        [steps, B, 2].
+    Raises:
+        ValueError: The samples are smaller than the parts that are to be taken from them.
     """
-    size = settings.batch // 2 if settings.losses.pairs else settings.batch
+    count, size = len(pool), settings.batch // 2 if settings.losses.pairs else settings.batch
     random = np.random.default_rng([seed, round])
     wanted = settings.steps * size
     order = np.concatenate([random.permutation(count) for _ in range(-(-wanted // count))])[:wanted]
+    order = order.reshape(settings.steps, size)
     frames = random.integers(0, 2, (settings.steps, size))
     turns = random.random((settings.steps, size, 2)) < 0.5
     turns &= np.array([settings.mirror != "none", settings.mirror == "both"])
-    return torch.from_numpy(order.reshape(settings.steps, size)), torch.from_numpy(frames), torch.from_numpy(turns)
+    corners = None
+    if settings.crop is not None:
+        low, high = _corners(pool, settings.crop)
+        share = random.random((settings.steps, size, 2))
+        corners = low[order] + np.floor(share * (high - low + 1)[order]).astype(np.int64)
+        corners = torch.from_numpy(_GRID * corners)
+    return Plan(torch.from_numpy(order), torch.from_numpy(frames), torch.from_numpy(turns), corners)
+
+
+def _corners(pool: Pool, crop: int) -> tuple[np.ndarray, np.ndarray]:
+    """Least and most corner [N, 2] of a sample's parts, in units of `_GRID`: as far as each has some of the smoke.
+
+    Where the smoke is smaller than a part, all of it is in each, up to the rounding to that unit.
+    """
+    size = np.array(pool.targets.shape[-2:])
+    if (size < crop).any():
+        raise ValueError(f"crop: expected at most {min(size)} pixels, which the samples have, got {crop}")
+    bounds = np.empty((2, len(pool), 2), np.int64)
+    for n, targets in enumerate(pool.targets):
+        seen = (targets[:, OPACITY_PLANE] > _VISIBLE).any(0)
+        for axis in range(2):
+            where = seen.any(1 - axis).nonzero()[:, 0]
+            bounds[:, n, axis] = (int(where[0]), int(where[-1]) + 1) if len(where) else (0, size[axis])
+    first, last = bounds
+    # Of smoke that is larger than a part, all of it is seen as often.
+    low, high = np.minimum(first, last - crop), np.maximum(first, last - crop)
+    high = np.clip(high, 0, size - crop) // _GRID
+    return np.minimum(-(-np.clip(low, 0, None) // _GRID), high), high
