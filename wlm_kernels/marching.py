@@ -421,7 +421,7 @@ def transmittance(density, extinction: float, points, toward, step: float, out, 
 
 def nodes_along(shape: Sequence[int], step: float) -> tuple[int, ...]:
     """Nodes of a lattice no farther apart than a step, or a voxel, from half a voxel out of the grid to half beyond."""
-    # Nodes closer than voxels would tell nothing new and fill the memory.
+    # Each marches to its lights by itself: of closer ones the time would grow with the fourth power.
     return tuple(math.ceil((n + 1) / max(step, 1.0)) + 1 for n in shape)
 
 

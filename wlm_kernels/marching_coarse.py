@@ -45,7 +45,7 @@ PLANES = ("right", "left", "top", "bottom", "front", "back", "transparency", "em
 
 DEPTH = PLANES.index("depth")
 
-_LEAST = 1.0  # voxels between nodes: closer ones would tell hardly more
+_LEAST = 0.25  # voxels between nodes
 _MOST = 2**28  # nodes; a long thin box seen along a diagonal has far more than it has voxels
 _PATTERNS = 64  # of the noise
 _ROUNDING = 1e-6  # by which parts may be longer than asked, rather than one more
@@ -290,8 +290,8 @@ def coarse_six_way(
         seen: The camera, [H, W] pixels, orthographic.
         out: float [9, H, W], written: ``PLANES``, each light of irradiance 4 pi, an albedo of 1.
         step: The longest step along rays, in voxels.
-        spacing: The largest distance of neighbouring nodes, in voxels; None: as ``step``. Below a voxel it is one, and
-            it is as much more as makes the nodes about 2^28 at most. A node takes 24 bytes.
+        spacing: The largest distance of neighbouring nodes, in voxels; None: as ``step``. It is a quarter of one at
+            least, and as much more as makes the nodes about 2^28 at most. A node takes 24 bytes.
         light_step: The longest step between nodes, in voxels; None: as ``spacing``.
         jitter: How much of a step the samples of a pixel are shifted, 0 (each in its step's middle) to 1.
         seed: Of the jitter, any whole number; 64 of them differ.

@@ -72,7 +72,7 @@ def test_variants_are_what_they_say():
         "no adapters": {"network.adapters": False},
         "no sRGB": {"training.losses.srgb": False},
         "no temporal loss": {"training.losses.temporal": 0.0},
-        "with perceptual loss": {"training.losses.perceptual": 0.1},
+        "with perceptual loss": {"training.losses.perceptual": 0.3},
         "no depth": {"network.depth": False},
         "one level less": {"network.levels": 2},
         "stem 1": {"network.stem": 1},

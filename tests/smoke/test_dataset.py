@@ -20,12 +20,11 @@ from wlm.smoke.dataset import (
     STAGES,
     DatasetSettings,
     draw_scene,
-    load_pool,
     load_probe_volume,
     make_pool,
     make_validation,
-    save_pool,
 )
+from wlm.smoke.pool_file import load_pool, save_pool
 from wlm.smoke.reference import six_way
 from wlm.smoke.samples import EMISSION_PLANE, OPACITY_PLANE, Pool, from_srgb
 from wlm.smoke.scenes import Tilted
@@ -137,6 +136,24 @@ def test_other_pools(pool, few):
     assert not torch.equal(few.targets, make_pool(FEW, seed=6).targets)
     assert [done for done, _ in told] == [1, 2, 3]
     assert told[-1][1]["samples"] == len(made) and all(told[-1][1][stage] > 0 for stage in STAGES)
+
+
+def test_sequences_of_their_own_cells(monkeypatch):
+    """Between the least and the most; the validation has the most, and each looks at the same shares of the box."""
+    seen = []
+    known = dataset.look_at
+    monkeypatch.setattr(
+        dataset, "look_at", lambda smoke, *rest, **look: seen.append((smoke.shape, look)) or known(smoke, *rest, **look)
+    )
+    settings = FEW.model_copy(update={"cells": 24, "least_cells": 16, "sequences": 4, "frames": 1, "views_a_frame": 1})
+    made = make_pool(settings, seed=5)
+    shapes = {shape[0] for shape, _ in seen}
+    assert len(made) and len(shapes) > 1 and shapes <= {settings.refine * cells for cells in range(16, 25)}
+    assert all(look["step"] == pytest.approx(shape[0] * settings.guide_step) for shape, look in seen)
+    assert torch.equal(made.targets, make_pool(settings, seed=5).targets)
+    seen.clear()
+    make_validation(settings.model_copy(update={"validation_sequences": 1}))
+    assert {shape[0] for shape, _ in seen} == {24 * settings.refine}
 
 
 def test_guides_of_six_lights(few):
@@ -330,7 +347,7 @@ def test_look():
 @pytest.mark.parametrize(
     "wrong",
     [{"cells": 8}, {"substeps": 3}, {"zoom": (1.2, 0.8)}, {"density_scales": (0.0, 1.0)}, {"hot": 1.5}, {"unknown": 1}]
-    + [{"guide_spacing": 0.1}, {"guide_spacing": -0.1, "guide": "six"}],
+    + [{"least_cells": 60}, {"guide_spacing": 0.1}, {"guide_spacing": -0.1, "guide": "six"}],
 )
 def test_wrong_settings(wrong: dict):
     """Each is named."""

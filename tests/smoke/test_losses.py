@@ -2,6 +2,7 @@
 
 import builtins
 import importlib.util
+import math
 
 import pytest
 import torch
@@ -72,6 +73,17 @@ def test_warping_moves_an_image_by_its_motion():
     motion[:, 0], motion[:, 1] = 0.5, 0
     between = 0.5 * (earlier[..., 1:] + earlier[..., :-1])
     assert torch.allclose(warp(earlier, motion)[0][..., 1:], between, atol=1e-5)
+
+
+def test_warping_by_what_is_no_number_is_outside():
+    image = torch.rand(1, 2, 4, 5, requires_grad=True)
+    motion = torch.zeros(1, 2, 4, 5)
+    motion[0, 0, 1, 2], motion[0, 1, 2, 3], motion[0, :, 3, 4] = math.nan, math.inf, -math.inf
+    moved, inside = warp(image, motion)
+    assert torch.isfinite(moved).all() and inside.sum() == 17
+    for value in (math.inf, math.nan, 1e38):
+        (gradient,) = torch.autograd.grad((moved * torch.tensor([value])).sum(), image, retain_graph=True)
+        assert torch.isfinite(gradient).all() == (value == 1e38) and not (gradient < 0).any()
 
 
 @pytest.mark.parametrize("size", [(7, 9), (1, 5), (1, 1)])

@@ -11,7 +11,6 @@ from pydantic import ValidationError
 from smoke_plumes import plume
 from smoke_samples import small_pool
 
-import wlm.smoke.network as network_module
 import wlm.smoke.network_file as file_module
 from wlm.errors import WlmError
 from wlm.formats.artifact import read_artifact, write_artifact
@@ -68,16 +67,6 @@ def test_norm_and_its_gradient_are_those_of_torch():
         assert torch.allclose(one, other, rtol=1e-5, atol=1e-5)
     with torch.no_grad():
         assert torch.allclose(block.norm1(x), theirs, atol=1e-12)
-
-
-def test_maxima_and_their_gradient_are_those_of_torch():
-    x = torch.randn(2, 3, 6, 8).relu().contiguous(memory_format=torch.channels_last).requires_grad_()
-    ours, theirs = network_module._halved(x), torch.nn.functional.max_pool2d(x, 2)
-    assert torch.equal(ours, theirs)
-    for one, other in zip(*(torch.autograd.grad((f**3).sum(), x) for f in (ours, theirs)), strict=True):
-        assert torch.equal(one, other)
-    with torch.no_grad():
-        assert torch.equal(network_module._halved(x), theirs)
 
 
 def test_it_begins_as_a_mix_of_the_guide():

@@ -269,17 +269,47 @@ def test_a_plan_takes_each_sample_once_before_any_twice():
     assert pairs.samples.shape == (5, 2)
 
 
-def test_parts_of_samples_have_their_smoke():
-    pool = small_pool(2)
-    targets = torch.zeros_like(pool.targets)
-    targets[0, 1, OPACITY_PLANE, 20:23, 17:31] = 1.0  # smaller than a part
-    targets[1, :, OPACITY_PLANE] = 1.0
-    pool = replace(pool, targets=targets)
-    settings = TrainSettings(rounds=1, steps=50, batch=2, crop=16, losses=LossSettings(temporal=1.0))
+def _only(pool: Pool, *squares: tuple[int, int, int, int]) -> Pool:
+    """A pool whose first sample has smoke in these alone: first and last row, first and last column."""
+    targets = pool.targets.clone()
+    targets[0, :, OPACITY_PLANE] = 0
+    for top, bottom, left, right in squares:
+        targets[0, 1, OPACITY_PLANE, top : bottom + 1, left : right + 1] = 1.0
+    return replace(pool, targets=targets)
+
+
+@pytest.mark.parametrize("squares", [[(20, 22, 17, 30)], [(0, 0, 31, 31)], [(1, 2, 1, 2), (30, 31, 30, 31)], []])
+def test_parts_of_samples_have_smoke(squares):
+    """All that there is in some part or other; of a sample without any, all."""
+    pool = _only(small_pool(1), *squares)
+    settings = TrainSettings(rounds=1, steps=200, batch=2, crop=16, losses=LossSettings(temporal=1.0))
     plan = plan_round(settings, pool, seed=0, round=0)
-    corners = {n: set(map(tuple, plan.corners[plan.samples == n].tolist())) for n in range(2)}
-    assert corners[0] == {(16, 16)}
-    assert corners[1] == {(y, x) for y in (0, 16) for x in (0, 16)}
+    smoke = pool.targets[0, :, OPACITY_PLANE].amax(0) > 0.05
+    seen = torch.zeros(32, 32, dtype=torch.bool)
+    for y, x in plan.corners[:, 0].tolist():
+        assert 0 <= y <= 16 and 0 <= x <= 16
+        assert smoke[y : y + 16, x : x + 16].any() or not squares
+        seen[y : y + 16, x : x + 16] = True
+    assert seen[smoke].all() and (squares or seen.all())
+
+
+def test_parts_reach_the_end_of_samples_that_squares_do_not_divide():
+    """Of 100 pixels, of which the last four are a square of their own."""
+    pool = Pool(
+        *(torch.zeros(1, 2, *rest, 100, 100) for rest in ((3,), (8,))), torch.zeros(1, 2, 100, 100), torch.zeros(1)
+    )
+    pool = _only(pool, (97, 99, 98, 99), (0, 1, 0, 99))
+    settings = TrainSettings(rounds=1, steps=300, batch=2, crop=48, losses=LossSettings(temporal=1.0))
+    corners = plan_round(settings, pool, seed=0, round=0).corners[:, 0]
+    assert corners.max(0).values.tolist() == [52, 52] and corners.min(0).values.tolist() == [0, 0]
+    # Each square as likely as another: 7 of 8 are in the first row.
+    assert 0.05 < (corners[:, 0] == 52).float().mean() < 0.25
+
+
+def test_a_step_learns_from_parts():
+    pool = small_pool(2)
+    settings = TrainSettings(rounds=1, steps=6, batch=2, crop=16, losses=LossSettings(temporal=1.0))
+    plan = plan_round(settings, pool, seed=0, round=0)
     trainer = Trainer(TINY, settings, seed=0, device="cpu")
     for step in range(3):
         (n,), (y, x) = plan.samples[step].tolist(), plan.corners[step, 0].tolist()
@@ -288,9 +318,28 @@ def test_parts_of_samples_have_their_smoke():
         assert torch.equal(guides[0], pool.guides[n, :, :, y : y + 16, x : x + 16].float())
         assert torch.equal(motion[0], pool.motion[n, :, y : y + 16, x : x + 16].float())
     trainer.run(pool, plan)
-    assert trainer.step == 50 and trainer.skipped == 0
+    assert trainer.step == 6 and trainer.skipped == 0
     with pytest.raises(ValueError, match="at most 32 pixels"):
         plan_round(settings.model_copy(update={"crop": 48}), pool, seed=0, round=0)
+
+
+@pytest.mark.parametrize("losses", [LossSettings(), LossSettings(temporal=0.1)])
+def test_one_seed_gives_one_training_on_one_device(device, losses):
+    """To the bit; images are large enough for a GPU to spread its sums over."""
+    pool = small_pool(4, kind="six").to(device)
+    pool = Pool(
+        *(part.repeat(*(1,) * (part.ndim - 2), 4, 4) for part in (pool.guides, pool.targets, pool.motion)),
+        pool.sequence,
+    )
+    settings = TrainSettings(rounds=1, steps=12, batch=4, losses=losses)
+    network = NetworkSettings(width=16, levels=4, guide="six", stem=2)
+    states = []
+    for _ in range(2):
+        trainer = Trainer(network, settings, seed=3, device=device)
+        trainer.run(pool, plan_round(settings, pool, seed=3, round=0))
+        states.append(trainer.state())
+    one, other = states
+    assert one.keys() == other.keys() and all((one[name] == other[name]).all() for name in one)
 
 
 @pytest.mark.parametrize("kind", ["paper", "six"])
@@ -335,11 +384,12 @@ def test_profiles_load():
         ("{}", "{guide: six}", "dataset.guide: expected paper, which network.guide is, found six"),
         ("{guide: back}", "{}", "network.guide: expected 'paper', 'front', 'sides' or 'six'"),
         ("{levels: 1}", "{}", "network.levels: "),
+        ("{}", "{resolution: 32}, training: {crop: 64}", "training.crop: expected at most 32, which dataset.res"),
     ],
 )
 def test_a_profile_whose_parts_disagree_is_one_line(tmp_path, network, dataset, told):
     path = tmp_path / "a.yaml"
-    path.write_text(f"name: a\nnetwork: {network}\ndataset: {dataset}\n")
+    path.write_text(f"name: a\nnetwork: {network}\ndataset: {dataset}\n".replace("}, training", "}\ntraining"))
     with pytest.raises(WlmError) as error:
         load_profile(str(path))
     assert str(error.value).startswith(f"{path}: ") and told in str(error.value) and "\n" not in str(error.value)

@@ -29,7 +29,8 @@ def flipbook_rows(bench: NetworkBench) -> list[Row]:
     baked = [six_way(frame.later, bench.camera, step=EXACT, estimate=False) for frame in frames]
     pivots = [frame.later.centre for frame in frames]
     ours = Whole(bench, bench.trained[0], half=True) if bench.trained else None
-    step = bench.settings.look(frames[0].later.shape)["step"]
+    settings = bench.settings if ours is None else ours.subject.settings
+    step = settings.look(frames[0].later.shape)["step"]
     rows = []
     for degrees in bench.sizes.turns:
         camera = bench.turned(degrees)
@@ -66,13 +67,13 @@ def traced_rows(bench: NetworkBench) -> list[Row]:
     if variant == GPU:
         try:
             return _rows_of(bench, variant, "")
-        except Exception as error:  # of kinds that Mitsuba doesn't name
+        except (RuntimeError, ImportError, OSError) as error:  # what Mitsuba and Dr.Jit raise
             variant, trouble = choose_variant()[0], one_line(error)
     if trouble:
         bench.note(f"path tracing: on the CPU: {trouble}")
     try:
         return _rows_of(bench, variant, trouble)
-    except Exception as error:
+    except (RuntimeError, ImportError, OSError) as error:
         bench.note(f"path tracing: left out: {one_line(error)}")
         return []
 

@@ -256,7 +256,8 @@ def dataset(
     quiet_warp()
     from wlm.config import load_settings
     from wlm.interop import check_device
-    from wlm.smoke.dataset import STAGES, DatasetSettings, make_pool, make_validation, save_pool
+    from wlm.smoke.dataset import STAGES, DatasetSettings, make_pool, make_validation
+    from wlm.smoke.pool_file import save_pool
     from wlm.view.smoke_pool import pool_sheet
 
     settings, device = load_settings(DatasetSettings, settings_file), check_device(device)

@@ -15,7 +15,7 @@ import torch
 
 from wlm.interop import device_name, stream, to_warp, torch_memory
 from wlm.smoke.axes import DIRECTIONS, Camera
-from wlm.smoke.guide import check_march
+from wlm.smoke.guide import LEAST_STEP, check_march
 from wlm.smoke.reference import SixWay
 from wlm.smoke.volume import DensityVolume
 from wlm_kernels import marching_coarse
@@ -70,8 +70,8 @@ def coarse_six_way(
         volume: The smoke.
         camera: Orthographic.
         step: h, in voxels, the longest along the rays. Below 8 empty space is left out, which changes no result.
-        spacing: The largest distance of the lattice's nodes, in voxels; None: as `step`. They are a voxel apart at
-            least, and more where there would be more than 2^28 of them. Each takes 24 bytes while this runs.
+        spacing: The largest distance of the lattice's nodes, in voxels; None: as `step`. They are a quarter of a voxel
+            apart at least, and more where there would be more than 2^28 of them. Each takes 24 bytes while this runs.
         light_step: The longest along the ways to the lights, in voxels; None: as `spacing`.
         jitter: Share of a step by which a pixel's samples are shifted, 0 to 1. The shifts are a pattern that varies
             little over a few pixels.
@@ -88,8 +88,8 @@ def coarse_six_way(
     """
     check_march(step, g, jitter)
     for name, value in (("spacing", spacing), ("light_step", light_step)):
-        if value is not None and not 0 < value < float("inf"):
-            raise ValueError(f"{name}: expected voxels, above 0, got {value}")
+        if value is not None and not LEAST_STEP <= value < float("inf"):
+            raise ValueError(f"{name}: expected at least {LEAST_STEP} voxels, got {value}")
     view, moved = camera.view(volume.origin, volume.voxel, volume.shape)
     with stream(device_name(volume.device)):
         size = (len(marching_coarse.PLANES), camera.height, camera.width)

@@ -130,7 +130,9 @@ def warp(earlier: torch.Tensor, motion: torch.Tensor) -> tuple[torch.Tensor, tor
     column = torch.arange(width, device=earlier.device, dtype=earlier.dtype) - motion[:, 0]
     row = torch.arange(height, device=earlier.device, dtype=earlier.dtype)[:, None] - motion[:, 1]
     inside = (column >= 0) & (column <= width - 1) & (row >= 0) & (row <= height - 1)
-    moved = _Bilinear.apply(earlier, row.clamp(0, height - 1), column.clamp(0, width - 1))
+    # NaN is outside, and mustn't be an index.
+    places = ((row, height), (column, width))
+    moved = _Bilinear.apply(earlier, *(at.nan_to_num(0.0).clamp(0, size - 1) for at, size in places))
     return moved, inside[:, None].to(earlier.dtype)
 
 
@@ -165,8 +167,9 @@ class _Bilinear(torch.autograd.Function):
         saved = ctx.saved_tensors
         total = torch.zeros(*ctx.shape[:2], ctx.shape[2] * ctx.shape[3], dtype=torch.int64, device=gradient.device)
         # A power of 2 leaves all of float32's digits to all but the least.
-        largest = gradient.abs().amax().clamp(min=1e-30, max=1e30).double()
-        unit = torch.exp2(largest.log2().ceil() - _DIGITS)
+        largest = gradient.abs().amax().clamp(min=1e-30).double()
+        # NaN where it isn't finite, which no sum of whole numbers could say.
+        unit = torch.exp2(largest.log2().ceil() - _DIGITS) + 0.0 * largest
         for corner, weight in zip(saved[:4], saved[4:], strict=True):
             part = ((gradient * weight).double() / unit).round().long()
             total.scatter_add_(2, _spread(corner, total), part.flatten(2))

@@ -187,7 +187,7 @@ class SixWayNetwork(nn.Module):
         first, area = widths[0], settings.stem**2
         inputs = [settings.channels * area, *widths[:-1]]
         self.encoder = nn.ModuleList(_twice(before, c) for before, c in zip(inputs, widths, strict=True))
-        # A 1 x 1 convolution and pixels repeated come to what is called an up-convolution, with fewer weights.
+        # With pixels repeated, in place of up-convolutions of 2 x 2 pixels: a quarter of their weights.
         self.up = nn.ModuleList(nn.Conv2d(2 * c, c, 1) for c in widths[:-1])
         self.decoder = nn.ModuleList(_twice(2 * c, c) for c in widths[:-1])
         self.groups = _groups(settings)
@@ -211,7 +211,7 @@ class SixWayNetwork(nn.Module):
         x = x.contiguous(memory_format=torch.channels_last)
         skips = []
         for level, convolutions in enumerate(self.encoder):
-            x = convolutions(_halved(x) if level else x)
+            x = convolutions(F.max_pool2d(x, 2) if level else x)
             skips.append(x)
         for level in reversed(range(len(self.up))):
             above = F.interpolate(self.up[level](x), scale_factor=2.0, mode="nearest")
@@ -255,34 +255,6 @@ def parameter_count(network: nn.Module) -> int:
 def _start(name: str, planes: tuple[str, ...]) -> tuple[float, ...]:
     """Of a guide's planes those that an output begins as."""
     return tuple(float(plane == name) for plane in planes) if name in planes else _START[name]
-
-
-def _halved(x: torch.Tensor) -> torch.Tensor:
-    """The largest of each 2 x 2 pixels."""
-    return _Largest.apply(x) if torch.is_grad_enabled() else F.max_pool2d(x, 2)
-
-
-class _Largest(torch.autograd.Function):
-    """max_pool2d with a gradient that repeats itself: torch's own adds up in any order on a GPU."""
-
-    @staticmethod
-    def forward(ctx, x):
-        y = F.max_pool2d(x, 2)
-        ctx.save_for_backward(x, y)
-        return y
-
-    @staticmethod
-    def backward(ctx, gradient):
-        x, y = ctx.saved_tensors
-        of_x = torch.empty_like(x)
-        taken = torch.zeros_like(y, dtype=torch.bool)
-        for row in range(2):
-            for column in range(2):
-                # Of equals the first has all.
-                found = (x[:, :, row::2, column::2] == y) & ~taken
-                torch.mul(gradient, found, out=of_x[:, :, row::2, column::2])
-                taken |= found
-        return of_x
 
 
 def _twice(before: int, after: int) -> nn.Sequential:

@@ -1,9 +1,9 @@
 """Training a network on pools of samples that are made as they are needed (section 4.4).
 
 Training goes in rounds, each with a pool of its own, of sequences that no other round has. What a step does follows
-from the seed, the round and the step alone, so that a run that was stopped goes on as if it hadn't been: on the CPU its
-weights and its curves are the same to the bit, but for the seconds that the file and the curves tell; on a GPU as far
-as its kernels repeat themselves. The stated behaviours:
+from the seed, the round and the step alone, so that a run that was stopped goes on as if it hadn't been: on one device
+its weights and its curves are the same to the bit, but for the seconds that the file and the curves tell. The stated
+behaviours:
 
 =====================================  ===============================================================
 NaN or infinity in a pool              error that names the round, the tensor and the first sample
@@ -79,6 +79,10 @@ class NetworkProfile(BaseModel):
             kinds = {"wanted": self.network.guide, "made": self.dataset.guide}
             told = "dataset.guide: expected {wanted}, which network.guide is, found {made}"
             raise PydanticCustomError("guide", told, kinds)
+        if (self.training.crop or 0) > self.dataset.resolution:
+            sizes = {"most": self.dataset.resolution, "found": self.training.crop}
+            told = "training.crop: expected at most {most}, which dataset.resolution is, found {found}"
+            raise PydanticCustomError("crop", told, sizes)
         return self
 
 

@@ -9,6 +9,7 @@ from typing import Literal
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from pydantic import BaseModel, ConfigDict, Field
 
 from wlm.interop import StepGraph
@@ -18,7 +19,7 @@ from wlm.smoke.samples import GUIDES, OPACITY_PLANE, PLANES, Pool
 
 __all__ = ["Plan", "TrainSettings", "Trainer", "plan_round"]
 
-_GRID = 16  # pixels: twice what the network's mask of where smoke may be is made of
+_GRID = 16  # pixels along the edge of the squares of which each has smoke or none
 _VISIBLE = 0.05  # opacity from which on a pixel counts as smoke
 
 # Planes after a mirror across the vertical, then across the horizontal axis.
@@ -40,9 +41,8 @@ class TrainSettings(BaseModel):
             exchanged, both are exact.
         half: Whether CUDA computes in bfloat16 where that is safe; the CPU always uses float32.
         graph: Whether CUDA replays a step from a graph.
-        compiled: Whether CUDA runs the network through torch.compile: slow to start, then quicker.
-        crop: Pixels along the edges of the part of a sample that a step learns from, which is drawn from where it has
-            smoke; None: all of it. In steps of 16, as the network's mask of where smoke may be has its own grid.
+        crop: Pixels along the edges of the part of a sample that a step learns from, which has some of its smoke; None:
+            all of it.
         validate_every: Rounds from one validation to the next; the last is always validated.
         losses: Weights of the loss's parts.
     """
@@ -59,7 +59,6 @@ class TrainSettings(BaseModel):
     mirror: Literal["none", "sides", "both"] = "sides"
     half: bool = True
     graph: bool = True
-    compiled: bool = False
     crop: int | None = Field(None, ge=16, multiple_of=16)
     validate_every: int = Field(1, ge=1)
     losses: LossSettings = LossSettings()
@@ -98,8 +97,6 @@ class Trainer:
             made = SixWayNetwork(network)
         self.network = made.to(device, memory_format=torch.channels_last if self._cuda else torch.contiguous_format)
         self.average = copy.deepcopy(self.network).requires_grad_(False).eval()
-        if self._cuda and settings.compiled:
-            self.network.compile(dynamic=False)
         self.losses = Losses(settings.losses, emission=network.emission).to(device)
         self._weights = list(self.network.parameters())
         self._means = list(self.average.parameters())
@@ -163,7 +160,8 @@ class Trainer:
             frames = [slice(frame, frame + 1) for frame in plan.frames[i].tolist()]
         windows = [(slice(None), slice(None))] * len(samples)
         if plan.corners is not None:
-            windows = [tuple(slice(at, at + self.settings.crop) for at in at) for at in plan.corners[i].tolist()]
+            size = self.settings.crop
+            windows = [tuple(slice(at, at + size) for at in corner) for corner in plan.corners[i].tolist()]
         parts = [
             (pool.guides[n, k, :, y, x], pool.targets[n, k, :, y, x], pool.motion[n, :, y, x])
             for n, k, (y, x) in zip(samples.tolist(), frames, windows, strict=True)
@@ -283,29 +281,43 @@ def plan_round(settings: TrainSettings, pool: Pool, *, seed: int, round: int) ->
     turns &= np.array([settings.mirror != "none", settings.mirror == "both"])
     corners = None
     if settings.crop is not None:
-        low, high = _corners(pool, settings.crop)
-        share = random.random((settings.steps, size, 2))
-        corners = low[order] + np.floor(share * (high - low + 1)[order]).astype(np.int64)
-        corners = torch.from_numpy(_GRID * corners)
+        whole = np.array(pool.targets.shape[-2:])
+        if (whole < settings.crop).any():
+            raise ValueError(f"crop: expected at most {min(whole)} pixels, which the samples have, got {settings.crop}")
+        share = random.random((settings.steps, size, 3))
+        corners = torch.from_numpy(_Smoke(pool).corners(order, share, whole, settings.crop))
     return Plan(torch.from_numpy(order), torch.from_numpy(frames), torch.from_numpy(turns), corners)
 
 
-def _corners(pool: Pool, crop: int) -> tuple[np.ndarray, np.ndarray]:
-    """Least and most corner [N, 2] of a sample's parts, in units of `_GRID`: as far as each has some of the smoke.
+class _Smoke:
+    """Squares of `_GRID` pixels that have smoke, of each of a pool's samples.
 
-    Where the smoke is smaller than a part, all of it is in each, up to the rounding to that unit.
+    Attributes:
+        first: int [N + 1], where each sample's begin in `places`.
+        places: int [M, 2], their rows and columns, in squares.
     """
-    size = np.array(pool.targets.shape[-2:])
-    if (size < crop).any():
-        raise ValueError(f"crop: expected at most {min(size)} pixels, which the samples have, got {crop}")
-    bounds = np.empty((2, len(pool), 2), np.int64)
-    for n, targets in enumerate(pool.targets):
-        seen = (targets[:, OPACITY_PLANE] > _VISIBLE).any(0)
-        for axis in range(2):
-            where = seen.any(1 - axis).nonzero()[:, 0]
-            bounds[:, n, axis] = (int(where[0]), int(where[-1]) + 1) if len(where) else (0, size[axis])
-    first, last = bounds
-    # Of smoke that is larger than a part, all of it is seen as often.
-    low, high = np.minimum(first, last - crop), np.maximum(first, last - crop)
-    high = np.clip(high, 0, size - crop) // _GRID
-    return np.minimum(-(-np.clip(low, 0, None) // _GRID), high), high
+
+    def __init__(self, pool: Pool) -> None:
+        found = []
+        for targets in pool.targets:
+            seen = targets[:, OPACITY_PLANE].amax(0, keepdim=True).float()
+            there = F.max_pool2d(seen[None], _GRID, ceil_mode=True)[0, 0] > _VISIBLE
+            # Where there is none, all are alike.
+            found.append((there if there.any() else ~there).nonzero().cpu().numpy())
+        self.first = np.cumsum([0, *map(len, found)])
+        self.places = np.concatenate(found)
+
+    def corners(self, samples: np.ndarray, share: np.ndarray, size: np.ndarray, crop: int) -> np.ndarray:
+        """Corners int [..., 2] of parts with one of the squares each, every square as likely as another.
+
+        Args:
+            samples: int [...].
+            share: [..., 3], random numbers within 0 and 1: which square, and where in the part it is.
+            size: [2], of the samples.
+            crop: Of the parts.
+        """
+        begin, end = self.first[samples], self.first[samples + 1]
+        square = self.places[begin + np.floor(share[..., 0] * (end - begin)).astype(np.int64)]
+        within = np.floor(share[..., 1:] * (crop // _GRID)).astype(np.int64)
+        # Within the sample, up to its very end.
+        return np.clip(_GRID * (square - within), 0, size - crop)
