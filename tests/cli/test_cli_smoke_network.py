@@ -178,8 +178,17 @@ def test_without_a_network_the_one_that_ships_is_used(network, volume, tmp_path,
     assert "8 bytes, 512 x 512 pixels" in call("smoke", "export", "-o", tmp_path / "a.onnx")
 
 
+@pytest.mark.parametrize("resolution, told", [(20, False), (8, True), (150, True)])
+def test_predict_says_where_it_has_not_learned(network, volume, tmp_path, resolution, told):
+    """A network of images of so many pixels along the box's edge."""
+    call("smoke", "predict", volume, "-o", tmp_path / "a.exr", "--network", network, "--resolution", resolution)
+    assert ("has learned from" in " ".join(call.stderr.split())) == told
+
+
 def test_predict_frames(network, tmp_path):
     folder = write_frames(tmp_path / "frames").folder
+    call("smoke", "predict", folder, "-o", tmp_path / "six", "--network", network, "--resolution", 170)
+    assert " ".join(call.stderr.split()).count("has learned from") == 1
     call("smoke", "predict", folder, "-o", tmp_path / "six", "--network", network, "--resolution", 17)
     assert sorted(os.listdir(tmp_path / "six")) == [f"six_{i:04d}.exr" for i in (1, 2, 3)]
     assert read_six_way(tmp_path / "six" / "six_0002.exr")[0].lightmaps.shape == (6, 17, 17)

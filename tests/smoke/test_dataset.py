@@ -340,6 +340,7 @@ def test_look():
     assert SMALL.look((400, 400, 400)) == {"step": 10.0, "jitter": 1.0, "threshold": 0.01}
     look = SMALL.look((100, 200, 60))
     assert look["step"] == 5.0 and look["threshold"] == 0.02
+    assert DatasetSettings(resolution=240, zoom=(0.5, 1.2)).pixels == (200.0, 480.0)
     apart = DatasetSettings(guide="six", guide_spacing=1 / 80)
     assert apart.look((400, 400, 400)) == {"step": 10.0, "jitter": 1.0, "threshold": 0.01, "spacing": 5.0}
 

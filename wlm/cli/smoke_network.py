@@ -45,6 +45,7 @@ __all__ = ["register"]
 
 _POOL, _SHEET = "pool.safetensors", "sheet.png"
 _SUFFIX = ".safetensors"
+_NEAR = 1.25  # times as many pixels as a network has learned from, or as few, that still count as that
 
 _MARCH = 130  # steps of `predict --coarse` along the longest edge
 
@@ -315,9 +316,14 @@ def _predicted(path: Path, seed: int, device: str) -> "Callable[[DensityVolume, 
     loaded, summary = load_network(path)
     settings = settings_of(path, summary)
     predictors: dict[tuple[int, int], Any] = {}
+    fewest, most = settings.pixels
 
     def make(volume: "DensityVolume", camera: "Camera") -> "SixWay":
         size = (camera.height, camera.width)
+        pixels = camera.height * volume.voxel * max(volume.shape) / camera.extent
+        if not predictors and not fewest / _NEAR <= pixels <= most * _NEAR:
+            learned = f"{path.stem} has learned from {fewest:.0f} to {most:.0f}"
+            note(f"{pixels:.0f} pixels show the smoke's longest edge, {learned}: --coarse may be nearer")
         if size not in predictors:
             predictors[size] = Predictor(loaded, *size, device=device)
         return run(volume, camera, predictors[size], seed=seed, **settings.look(volume.shape))

@@ -157,6 +157,12 @@ class DatasetSettings(BaseModel):
         """Steps of the air between the two frames of a pair: a multiple of what a graph holds."""
         return max(self.lattice_steps(self.interval), _PERIOD * self.substeps)
 
+    @property
+    def pixels(self) -> tuple[float, float]:
+        """Along the box's edge, in the images to learn from: fewest and most."""
+        low, high = self.zoom
+        return self.resolution / high, self.resolution / low
+
     def lattice_steps(self, crossings: float) -> int:
         """A time in steps of the air, rounded to a multiple of what a graph holds."""
         whole = _PERIOD * self.substeps
