@@ -16,10 +16,8 @@ import time
 from pathlib import Path
 
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 
-from wlm.cli.console import quiet_warp
+from wlm.cli.console import quiet_warp, show, table
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_write
 from wlm.interop import check_device
@@ -190,13 +188,11 @@ def main() -> None:
         atomic_write(args.out / "report.json", (json.dumps(figures, indent=1) + "\n").encode())
     except (WlmError, OSError) as error:
         sys.exit(f"error: {error}")
-    table = Table(title=str(args.out), title_justify="left")
-    for column in ("", "", "value"):
-        table.add_column(column, justify="right" if column == "value" else "left")
-    for name, rows in figures.items():
-        for label, value in rows.items():
-            table.add_row(name, label, f"{value:.4g}")
-    Console().print(table)
+    rows = table(str(args.out), ["", "", "value"], text=[""])
+    for name, found in figures.items():
+        for label, value in found.items():
+            rows.add_row(name, label, f"{value:.4g}")
+    show(rows)
 
 
 if __name__ == "__main__":

@@ -121,8 +121,10 @@ def test_an_unknown_row(made):
 
 
 def test_rows(made, no_package, device, tmp_path):
-    rows = run_rows(SIZES, BASE, device=device)
+    known = []
+    rows = run_rows(SIZES, BASE, device=device, done=lambda now: known.append(len(now)))
     assert [row.option for row in rows] == [*TRAINED, *GUIDES, "coarse march"]
+    assert known == [*range(1, len(rows) + 1)]
     for row in rows:
         assert (row.system, row.scene, row.method) == ("smoke-network", "validation, tiny", "ablation")
         found = {title: float(value.replace(",", "")) for title, value in figures(row).items()}
@@ -246,7 +248,13 @@ def test_the_command(monkeypatch, tmp_path):
 
     seen = []
     rows = [bench._row("validation, tiny", "base", _evaluation(), {"ms a step": "3"}, "", encode_seconds=2.0)]
-    monkeypatch.setattr(bench, "run", lambda *given, **options: seen.append((given, options)) or rows)
+
+    def run(*given, **options):
+        seen.append((given, options))
+        options["done"](rows)  # by which rows get into the file
+        return rows
+
+    monkeypatch.setattr(bench, "run", run)
     arguments = ["--quick", "--profile", "16", "--rounds", "2", "--steps", "9", "--only", "base", "--only", "no depth"]
     path = tmp_path / "a.json"
     result = CliRunner().invoke(app, ["smoke-ablation", *arguments, "--json", str(path)])

@@ -160,23 +160,26 @@ def run_rows(
             validation = samples.validation(_changed(base.dataset, {"guide": "six"}))
             found = compare({COARSE: coarse}, validation)[COARSE]
             rows.append(_row(scene, name, found, {}, "no network"))
-            if done is not None:
-                done(rows)
-            continue
-        validation, pools = samples.validation(profile.dataset), samples.pools(profile.dataset, sizes.rounds)
-        note(f"trains {name}")
-        network, skipped, seconds, ms = _train(profile, pools, device)
-        figures = {
-            "training s": number(seconds),
-            "ms a step": f"{ms:.3g}",
-            "parameters": number(parameter_count(network)),
-        }
-        lost = f"{skipped} steps gave NaN or infinity" if skipped else ""
-        found = evaluate(network, validation)
-        rows.append(_row(scene, name, found, figures, lost, encode_seconds=seconds))
+        else:
+            rows.append(_trained_row(scene, name, profile, samples, note, device))
         if done is not None:
             done(rows)
     return rows
+
+
+def _trained_row(
+    scene: str, name: str, profile: NetworkProfile, samples: _Samples, note: Callable[[str], None], device: str
+) -> Row:
+    validation, pools = samples.validation(profile.dataset), samples.pools(profile.dataset, profile.training.rounds)
+    note(f"trains {name}")
+    network, skipped, seconds, ms = _train(profile, pools, device)
+    figures = {
+        "training s": number(seconds),
+        "ms a step": f"{ms:.3g}",
+        "parameters": number(parameter_count(network)),
+    }
+    lost = f"{skipped} steps gave NaN or infinity" if skipped else ""
+    return _row(scene, name, evaluate(network, validation), figures, lost, encode_seconds=seconds)
 
 
 def variants(base: NetworkProfile) -> dict[str, NetworkProfile | None]:

@@ -272,7 +272,7 @@ def smoke_ablation(
 
     options = {"quick": quick, "device": device, "rounds": rounds, "steps": steps}
     rows = run(profile, only or (), **options, progress=note, done=keep)
-    _finish(rows, device, command, json_path, None, ())
+    _finish(rows, device, command, None, None, ())
 
 
 @app.command()

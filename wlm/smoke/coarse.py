@@ -15,7 +15,7 @@ import torch
 
 from wlm.interop import device_name, stream, to_warp, torch_memory
 from wlm.smoke.axes import DIRECTIONS, Camera
-from wlm.smoke.guide import LEAST_STEP, check_march
+from wlm.smoke.guide import check_march, check_step
 from wlm.smoke.reference import SixWay
 from wlm.smoke.volume import DensityVolume
 from wlm_kernels import marching_coarse
@@ -88,8 +88,8 @@ def coarse_six_way(
     """
     check_march(step, g, jitter)
     for name, value in (("spacing", spacing), ("light_step", light_step)):
-        if value is not None and not LEAST_STEP <= value < float("inf"):
-            raise ValueError(f"{name}: expected at least {LEAST_STEP} voxels, got {value}")
+        if value is not None:
+            check_step(name, value)
     view, moved = camera.view(volume.origin, volume.voxel, volume.shape)
     with stream(device_name(volume.device)):
         size = (len(marching_coarse.PLANES), camera.height, camera.width)

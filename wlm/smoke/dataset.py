@@ -39,7 +39,7 @@ from wlm.smoke.axes import Camera
 from wlm.smoke.data import CameraSettings, Scene, make_camera
 from wlm.smoke.motion import motion
 from wlm.smoke.reference import six_way
-from wlm.smoke.samples import GUIDES, OPACITY_PLANE, PLANES, Pool, encode_lightmaps, look_at
+from wlm.smoke.samples import GUIDES, OPACITY_PLANE, PLANES, VISIBLE, Pool, encode_lightmaps, look_at
 from wlm.smoke.scenes import EDGE, LATTICE_SPEED, draw_scene, generator
 from wlm.smoke.simulate import make_solver, volume_of
 from wlm.smoke.solver import Solver
@@ -63,7 +63,6 @@ STAGES = ("simulate", "guide", "reference", "motion")
 """What the time of a pool goes to."""
 
 _EXTENT = 1.1  # of the image over the box's edge, in views that are fixed
-_VISIBLE = 0.05  # opacity from which on a pixel counts as smoke
 # Steps of the solver after which its buffers are where they were: what a graph holds.
 _PERIOD = 2
 _BRIGHT = 0.99  # quantile of a volume's voxels that hold smoke, which stands for its density
@@ -427,7 +426,7 @@ class _Clock:
 
 def covered(targets: torch.Tensor) -> torch.Tensor:
     """Share of the image with smoke in it, of the emptier of two frames: [N] of a pool's targets."""
-    return (targets[:, :, OPACITY_PLANE] > _VISIBLE).float().mean((-2, -1)).amin(1)
+    return (targets[:, :, OPACITY_PLANE] > VISIBLE).float().mean((-2, -1)).amin(1)
 
 
 def load_probe_volume(

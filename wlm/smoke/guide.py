@@ -12,7 +12,7 @@ from wlm.smoke.axes import Camera
 from wlm.smoke.volume import DensityVolume
 from wlm_kernels import marching
 
-__all__ = ["LEAST_STEP", "Guide", "check_march", "guide", "transmittance"]
+__all__ = ["Guide", "check_march", "check_step", "guide", "transmittance"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,8 +43,17 @@ class Guide:
         return self.maps[2]
 
 
-LEAST_STEP = 0.01
-"""Voxels: a march in shorter steps would hardly end."""
+_LEAST_STEP = 0.01  # voxels: a march in shorter steps would hardly end
+
+
+def check_step(name: str, step: float) -> None:
+    """Checks a step, in voxels.
+
+    Raises:
+        ValueError: It is out of its range.
+    """
+    if not _LEAST_STEP <= step < float("inf"):
+        raise ValueError(f"{name}: expected at least {_LEAST_STEP} voxels, got {step}")
 
 
 def check_march(step: float, g: float = 0.0, jitter: float = 0.0) -> None:
@@ -58,8 +67,7 @@ def check_march(step: float, g: float = 0.0, jitter: float = 0.0) -> None:
     Raises:
         ValueError: One is out of its range.
     """
-    if not LEAST_STEP <= step < float("inf"):
-        raise ValueError(f"step: expected at least {LEAST_STEP} voxels, got {step}")
+    check_step("step", step)
     if not -1 < g < 1:
         raise ValueError(f"g: expected a number within -1 and 1, got {g}")
     if not 0 <= jitter <= 1:

@@ -17,6 +17,7 @@ __all__ = [
     "GUIDES",
     "OPACITY_PLANE",
     "PLANES",
+    "VISIBLE",
     "Pool",
     "decode_lightmaps",
     "encode_guide",
@@ -43,6 +44,9 @@ the same march with its lights kept apart."""
 _LIT = {"front": ("front",), "sides": ("front", "right", "left")}
 
 OPACITY_PLANE, EMISSION_PLANE = PLANES.index("opacity"), PLANES.index("emission")
+
+VISIBLE = 0.05
+"""Opacity from which on a pixel counts as smoke."""
 
 # Where sRGB's straight foot ends (IEC 61966-2-1), in linear light and encoded.
 _FOOT, _FOOT_CODE = 0.0031308, 0.04045

@@ -15,12 +15,11 @@ from pydantic import BaseModel, ConfigDict, Field
 from wlm.interop import StepGraph
 from wlm.smoke.losses import Losses, LossSettings
 from wlm.smoke.network import NetworkSettings, SixWayNetwork
-from wlm.smoke.samples import GUIDES, OPACITY_PLANE, PLANES, Pool
+from wlm.smoke.samples import GUIDES, OPACITY_PLANE, PLANES, VISIBLE, Pool
 
 __all__ = ["Plan", "TrainSettings", "Trainer", "plan_round"]
 
 _GRID = 16  # pixels along the edge of the squares of which each has smoke or none
-_VISIBLE = 0.05  # opacity from which on a pixel counts as smoke
 
 # Planes after a mirror across the vertical, then across the horizontal axis.
 _MIRRORED = ({"right": "left", "left": "right"}, {"top": "bottom", "bottom": "top"})
@@ -301,7 +300,7 @@ class _Smoke:
         found = []
         for targets in pool.targets:
             seen = targets[:, OPACITY_PLANE].amax(0, keepdim=True).float()
-            there = F.max_pool2d(seen[None], _GRID, ceil_mode=True)[0, 0] > _VISIBLE
+            there = F.max_pool2d(seen[None], _GRID, ceil_mode=True)[0, 0] > VISIBLE
             # Where there is none, all are alike.
             found.append((there if there.any() else ~there).nonzero().cpu().numpy())
         self.first = np.cumsum([0, *map(len, found)])
