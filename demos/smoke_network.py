@@ -5,7 +5,8 @@ a sequence of PNGs, the three side by side, and a contact sheet. The network is 
 `--network`; `--train` trains a small one first, for half a minute.
 
 The coarse march is the network's guide as it is. On grids as small as these its steps are shorter than a voxel, so that
-it is nearer to the fine march than the network is, which was trained on 400 voxels and 512 pixels along an edge.
+it is nearer to the fine march than the network is, which has learned from 128 to 400 voxels and 205 to 1,024 pixels
+along an edge.
 
     python demos/smoke_network.py
 """
@@ -50,7 +51,7 @@ TURNED, TURN = "jet-sphere", 90.0  # degrees by which its camera turns; its ligh
 
 # What has to be reached on each scene, dB in sRGB: by the network that comes with wlm, by the one that is trained here,
 # and by another; some decibels below what the first two reach on the worst of the scenes.
-LEAST_SHIPPED, LEAST_TRAINED, LEAST_OTHER = 40.0, 42.0, 20.0
+LEAST_SHIPPED, LEAST_TRAINED, LEAST_OTHER = 43.0, 42.0, 20.0
 # Of which light a network may leave where the fine march sees no smoke, the mean.
 MOST_STRAY = 1e-3
 

@@ -288,21 +288,34 @@ def test_readme_network_evaluation():
 
 def test_readme_network_text():
     rows, text = network_rows("time against error"), " ".join(README.split())
-    ours, paper = rows["smoke-six-24, fp16"], rows["smoke-paper-16, fp16"]
-    near, nearer, far = (rows[name] for name in ("coarse, h 3", "coarse, h 2, nodes 3", "six ways, step 7"))
-    told = f"{near.psnr:.1f} dB in {near.decode_ms:.2f} ms and {nearer.psnr:.1f} in {nearer.decode_ms:.2f}, where the"
-    assert f"{told} network has {ours.psnr:.1f} in {ours.decode_ms:.2f}." in text
-    assert f"The network adds {ours.psnr - rows['coarse, h 5'].psnr:.1f} dB to its own guiding map" in text
-    assert f'"six ways" has {far.psnr:.1f} dB in {far.decode_ms:.2f} ms' in text
-    assert f"than {paper.psnr:.0f} dB in" in text
-    assert far.decode_ms > ours.decode_ms and far.psnr < ours.psnr and nearer.decode_ms < ours.decode_ms
+
+    def told(name: str, first: bool = False) -> str:
+        row = rows[name]
+        return f"{row.psnr:.1f}{' dB' * first} in {row.decode_ms:.2f}{' ms' * first}"
+
+    ours, like, far = rows["smoke-six-fast, fp16"], rows["coarse, h 2, nodes 3"], rows["smoke-six-24, fp16"]
+    first, sooner, later = told("coarse, h 5, nodes 3", True), told("coarse, h 3"), told("coarse, h 2, nodes 3")
+    assert f"{first} and {sooner}; `smoke-six-fast` has {told('smoke-six-fast, fp16')}," in text
+    assert f"as near, {later}; and {told('coarse, h 3, nodes 2')} and {told('coarse, h 1, nodes 2')} are beyond" in text
+    assert ours.decode_ms < like.decode_ms and ours.psnr > like.psnr and rows["coarse, h 3"].psnr < ours.psnr
+    assert f"from {rows['coarse, h 3, nodes 2'].decode_ms:.1f} ms on the march again" in text
+    assert rows["coarse, h 3, nodes 2"].psnr > ours.psnr
+    assert far.decode_ms > ours.decode_ms and far.psnr < ours.psnr
+    assert f"The network adds {ours.psnr - rows['coarse, h 5, nodes 3'].psnr:.1f} dB to its own guiding map" in text
+    assert f'"six ways" has {told("six ways, step 7", True)} and {told("six ways, step 5")}.' in text
+    assert f"than {rows['smoke-paper-16, fp16'].psnr:.0f} dB in" in text
+    traced = network_rows("path tracing").values()
+    found = [f"{row.psnr:.1f}{unit} in {row.decode_ms:.0f}" for row, unit in zip(traced, (" dB", ""), strict=True)]
+    assert f"has {found[0]} ms, and {found[1]} with OIDN" in text
+    assert f"30° aside, {network_rows('flip book')['turned 30°'].psnr:.1f}." in text
 
 
 def test_docs_training():
     page = " ".join((ROOT / "docs" / "smoke.md").read_text(encoding="utf-8").split())
     for name, told in (
+        ("smoke-six-fast", ("{psnr:.2f} dB after {step:,} steps and {seconds:.0f} s", True)),
+        ("smoke-six-fast", ("after {step:,} steps and {seconds:.0f} s it had {psnr:.2f} dB", False)),
         ("smoke-six-24", ("{psnr:.2f} dB after {step:,} steps and {seconds:.0f} s", True)),
-        ("smoke-six-24", ("after {step:,} steps and {seconds:.0f} s it had {psnr:.2f} dB", False)),
         ("smoke-paper-16", ("{psnr:.2f} dB after {step:,} steps and {seconds:.0f} s", True)),
     ):
         with open(ROOT / "benchmarks" / f"{name}.csv", encoding="utf-8") as file:
@@ -310,6 +323,37 @@ def test_docs_training():
         validated = [line | {"step": int(line["step"])} for line in lines if line["psnr"] == line["psnr"]]
         best = max(validated, key=lambda line: line["psnr"])
         assert told[0].format(**(best if told[1] else validated[0])) in page
+
+
+def test_docs_limits_of_the_network():
+    page = " ".join((ROOT / "docs" / "smoke.md").read_text(encoding="utf-8").split())
+    found = {}
+    for name in ("256", "smooth"):
+        sets = json.loads((ROOT / "benchmarks" / f"smoke-network-{name}.json").read_text(encoding="utf-8"))["sets"]
+        for one in sets:
+            march, network = (one["methods"][method]["psnr"] for method in ("coarse march", "network"))
+            found[name, one["name"]] = march, network - march
+    worse = found["256", "smoke.npz"][1]
+    found = {name: found[name, "density x 1"] for name in ("256", "smooth")}
+    assert f"of 256 pixels {found['256'][1]:.1f}, and it leaves `smoke.npz` {-worse:.1f} dB worse" in page
+    assert f"whose guide has {found['smooth'][0]:.1f} dB, it adds {found['smooth'][1]:.1f} ([report]" in page
+    assert f"it adds {found['256'][1]:.1f} dB, and takes {-worse:.1f} from `smoke.npz`" in " ".join(README.split())
+
+
+def test_docs_ablation():
+    page = (ROOT / "docs" / "smoke.md").read_text(encoding="utf-8")
+    rows, columns = network_rows("ablation"), ("least dB", "most dB", "flicker over the reference's", "parameters")
+    for row in rows.values():
+        known = figures(row)
+        cells = [row.option, f"{row.psnr:.2f}", *(known.get(title, "") for title in (*columns, "ms a step"))]
+        assert f"| {' | '.join(cells)} |" in page
+    lights = rows["base"].psnr - max(rows[f"guide of {name}"].psnr for name in ("the paper", "the front"))
+    assert f"are worth {lights:.0f} dB" in page
+    assert abs(rows["base"].psnr - min(rows["no adapters"].psnr, rows["one level less"].psnr)) < 0.1
+    assert rows["no temporal loss"].psnr < rows["base"].psnr - 1
+    slower = float(figures(rows["stem 1"])["ms a step"]) / float(figures(rows["base"])["ms a step"])
+    told = f"worth {rows['stem 1'].psnr - rows['base'].psnr:.1f} dB, for {slower:.1f} times the time of a step"
+    assert told in " ".join(page.split())
 
 
 def test_no_line_of_commands_is_there_twice():

@@ -33,9 +33,9 @@ __all__ = [
     "occupied",
     "optical_depth",
     "phase",
-    "plain_depth",
     "ray",
     "skipping_at",
+    "steps_along",
     "transmittance",
     "view",
     "warp_memory",
@@ -113,6 +113,27 @@ def size_of(density: wp.array3d[Any]) -> wp.vec3:
     return wp.vec3(float(density.shape[0]), float(density.shape[1]), float(density.shape[2]))
 
 
+@wp.struct
+class _Steps:
+    """Equal steps along a ray, of which the first begins ``first`` from its origin."""
+
+    first: float
+    length: float
+    count: int
+
+
+@wp.func
+def steps_along(size: wp.vec3, origin: wp.vec3, direction: wp.vec3, h: float) -> _Steps:
+    """Steps no longer than h through all of the smoke before the origin; none where it is missed."""
+    span = clip(size, origin, direction)
+    steps = _Steps()
+    steps.first = wp.max(span[0], 0.0)
+    if span[1] > steps.first:
+        steps.count = int(wp.ceil((span[1] - steps.first) / h))
+        steps.length = (span[1] - steps.first) / float(steps.count)
+    return steps
+
+
 @wp.func
 def density_at(density: wp.array3d[Any], p: wp.vec3) -> float:
     """Trilinear, zero outside; ``p`` is no farther out than half a voxel and rounding."""
@@ -179,16 +200,11 @@ def optical_depth(
     density: wp.array3d[Any], bricks: wp.array3d[wp.uint8], p: wp.vec3, toward: wp.vec3, extinction: float, h: float
 ) -> float:
     """From p out of the smoke, in equal steps no longer than h, each sampled at its middle."""
-    last = clip(size_of(density), p, toward)
-    first = wp.max(last[0], 0.0)
+    steps = steps_along(size_of(density), p, toward, h)
     tau = float(0.0)
-    if last[1] > first:
-        steps = int(wp.ceil((last[1] - first) / h))
-        dt = (last[1] - first) / float(steps)
-        for n in range(steps):
-            tau += skipping_at(density, bricks, p + (first + (float(n) + 0.5) * dt) * toward)
-        tau *= dt * extinction
-    return tau
+    for n in range(steps.count):
+        tau += skipping_at(density, bricks, p + (steps.first + (float(n) + 0.5) * steps.length) * toward)
+    return tau * steps.length * extinction
 
 
 @dataclass(frozen=True)
@@ -235,9 +251,7 @@ def guide_kernels(dtype: Any) -> _Kernels:
     ):
         a, b, c = wp.tid()
         p = node_position(nodes, size_of(density), a, b, c)
-        nodes[a, b, c] = wp.vec2(
-            plain_depth(density, p, up, extinction, h), plain_depth(density, p, -up, extinction, h)
-        )
+        nodes[a, b, c] = _both_depths(density, p, up, extinction, h)
 
     @wp.kernel(module="unique", module_options=_OPTIONS)
     def transmittance(
@@ -275,22 +289,19 @@ def guide_kernels(dtype: Any) -> _Kernels:
         ):
             row, column = wp.tid()
             r = ray(view, row, column)
-            span = clip(size_of(density), r.origin, r.direction)
-            first = wp.max(span[0], 0.0)
+            steps = steps_along(size_of(density), r.origin, r.direction, h)
             light = float(0.0)
             t = float(1.0)
             depth = float(0.0)
-            if span[1] > first:
-                steps = int(wp.ceil((span[1] - first) / h))
-                dt = (span[1] - first) / float(steps)
+            if steps.count > 0:
                 random = wp.rand_init(seed, row * view.width + column)
                 offset = 0.5 + jitter * (wp.randf(random) - 0.5)
                 rise = wp.dot(view.up, r.direction)
                 front = phase(g, -1.0)
                 above = phase(g, rise)
                 below = phase(g, -rise)
-                for n in range(steps):
-                    s = first + (float(n) + offset) * dt
+                for n in range(steps.count):
+                    s = steps.first + (float(n) + offset) * steps.length
                     p = r.origin + s * r.direction
                     sigma = extinction * density_at(density, p)
                     if sigma > 0.0:
@@ -300,11 +311,8 @@ def guide_kernels(dtype: Any) -> _Kernels:
                         if wp.static(from_lattice):
                             tau = node_at(nodes, p, size_of(density))
                         else:
-                            tau = wp.vec2(
-                                plain_depth(density, p, view.up, extinction, h),
-                                plain_depth(density, p, -view.up, extinction, h),
-                            )
-                        x = sigma * dt
+                            tau = _both_depths(density, p, view.up, extinction, h)
+                        x = sigma * steps.length
                         # The light from the front comes along the ray, through what the ray has come through.
                         light += 0.5 * front * t * t * absorbed(2.0 * x)
                         light += t * absorbed(x) * (above * wp.exp(-tau[0]) + below * wp.exp(-tau[1]))
@@ -321,21 +329,18 @@ def guide_kernels(dtype: Any) -> _Kernels:
 
 
 @wp.func
-def plain_depth(density: wp.array3d[Any], p: wp.vec3, toward: wp.vec3, extinction: float, h: float) -> float:
-    """``optical_depth`` without bricks: too few samples to be worth the making of them.
-    empty: As for ``occupied``.
-    empty: As for ``occupied``.
-    """
-    span = clip(size_of(density), p, toward)
-    first = wp.max(span[0], 0.0)
+def _plain_depth(density: wp.array3d[Any], p: wp.vec3, toward: wp.vec3, extinction: float, h: float) -> float:
+    """``optical_depth`` without bricks: too few samples to be worth the making of them."""
+    steps = steps_along(size_of(density), p, toward, h)
     tau = float(0.0)
-    if span[1] > first:
-        steps = int(wp.ceil((span[1] - first) / h))
-        dt = (span[1] - first) / float(steps)
-        for n in range(steps):
-            tau += density_at(density, p + (first + (float(n) + 0.5) * dt) * toward)
-        tau *= dt * extinction
-    return tau
+    for n in range(steps.count):
+        tau += density_at(density, p + (steps.first + (float(n) + 0.5) * steps.length) * toward)
+    return tau * steps.length * extinction
+
+
+@wp.func
+def _both_depths(density: wp.array3d[Any], p: wp.vec3, up: wp.vec3, extinction: float, h: float) -> wp.vec2:
+    return wp.vec2(_plain_depth(density, p, up, extinction, h), _plain_depth(density, p, -up, extinction, h))
 
 
 @wp.func
@@ -397,8 +402,7 @@ def occupied(density, empty: Empty | None = None):
     """
     shape = tuple(-(-n // BRICK) for n in density.shape)
     bricks = (empty or warp_memory(density.device))(shape, wp.uint8)
-    kernel = guide_kernels(density.dtype).occupied
-    wp.launch(kernel, shape, inputs=[density], outputs=[bricks], device=density.device)
+    wp.launch(guide_kernels(density.dtype).occupied, shape, [density], [bricks], device=density.device)
     return bricks
 
 
@@ -433,14 +437,14 @@ def lattice(density, extinction: float, up, step: float, empty: Empty | None = N
         extinction: Per voxel, of density 1.
         up: Three numbers, the direction to the top, of length 1.
         step: In voxels, of the nodes, which are a voxel apart at least, and of the march from each.
+        empty: As for ``occupied``.
 
     Returns:
         vec2 [A, B, C], to the top and to the bottom; the first and the last nodes lie half a voxel out of the grid.
     """
     nodes = (empty or warp_memory(density.device))(nodes_along(density.shape, step), wp.vec2)
     inputs = [density, extinction, wp.vec3(*map(float, up)), step]
-    kernel = guide_kernels(density.dtype).lattice
-    wp.launch(kernel, nodes.shape, inputs=inputs, outputs=[nodes], device=density.device)
+    wp.launch(guide_kernels(density.dtype).lattice, nodes.shape, inputs, [nodes], device=density.device)
     return nodes
 
 
@@ -485,6 +489,7 @@ def guide(
         lead: Added to depths that were found, in voxels: how far in front of the true camera this one is.
         shared: Whether the lights from the top and bottom are marched to from a lattice with a node each step (each
             voxel, of smaller steps), and interpolated, instead of from each sample.
+        empty: As for ``occupied``.
     """
     kernels = guide_kernels(density.dtype)
     if shared:

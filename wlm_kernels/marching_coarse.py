@@ -26,13 +26,13 @@ from wlm_kernels.marching import (
     Empty,
     View,
     absorbed,
-    clip,
     density_at,
     occupied,
     phase,
     ray,
     size_of,
     skipping_at,
+    steps_along,
     warp_memory,
 )
 
@@ -179,16 +179,14 @@ def coarse_kernels(dtype: Any, hot: bool):
     ):
         row, column = wp.tid()
         r = ray(view, row, column)
-        span = clip(size_of(density), r.origin, r.direction)
-        first = wp.max(span[0], 0.0)
+        steps = steps_along(size_of(density), r.origin, r.direction, h)
         sides = wp.vec4()
         glow = float(0.0)
         through = float(0.0)
         t = float(1.0)
         depth = float(0.0)
-        if span[1] > first:
-            steps = int(wp.ceil((span[1] - first) / h))
-            dt = (span[1] - first) / float(steps)
+        if steps.count > 0:
+            dt = steps.length
             offset = 0.5 + jitter * (_noise(row, column, seed) - 0.5)
             # The ray's place in the lattice, which all of its samples share.
             x = (wp.dot(r.origin - view.origin, view.right) - lattice.low[0]) / lattice.gap[0]
@@ -200,8 +198,8 @@ def coarse_kernels(dtype: Any, hot: bool):
             held = int(-1)
             near = wp.vec4()
             far = wp.vec4()
-            for n in range(steps):
-                s = first + (float(n) + offset) * dt
+            for n in range(steps.count):
+                s = steps.first + (float(n) + offset) * dt
                 p = r.origin + s * r.direction
                 sigma = extinction * _sample(density, bricks, p)
                 if wp.static(hot):

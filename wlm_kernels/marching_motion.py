@@ -12,7 +12,7 @@ from typing import Any
 
 import warp as wp
 
-from wlm_kernels.marching import Empty, View, absorbed, clip, occupied, ray, size_of, skipping_at
+from wlm_kernels.marching import Empty, View, absorbed, occupied, ray, size_of, skipping_at, steps_along
 
 __all__ = ["motion", "motion_kernel"]
 
@@ -71,27 +71,23 @@ def motion_kernel(dtype: Any) -> wp.Kernel:
         cells = wp.vec3(float(velocity.shape[0]), float(velocity.shape[1]), float(velocity.shape[2]))
         share = wp.cw_div(cells, size)
         border = wp.vec3(_BORDER, _BORDER, _BORDER)
-        span = clip(size, r.origin, r.direction)
-        first = wp.max(span[0], 0.0)
+        steps = steps_along(size, r.origin, r.direction, h)
         moved = wp.vec3()
         seen = float(0.0)
         t = float(1.0)
-        if span[1] > first:
-            steps = int(wp.ceil((span[1] - first) / h))
-            dt = (span[1] - first) / float(steps)
-            for n in range(steps):
-                p = r.origin + (first + (float(n) + 0.5) * dt) * r.direction
-                x = extinction * skipping_at(density, bricks, p) * dt
-                if x > 0.0:
-                    middle = p - 0.5 * reach * _velocity_at(velocity, wp.cw_mul(share, p))
-                    weight = t * absorbed(x)
-                    begin = p - reach * _velocity_at(velocity, wp.cw_mul(share, middle))
-                    begin = wp.min(wp.max(begin, wp.min(p, border)), wp.max(p, size - border))
-                    moved += weight * (p - begin)
-                    seen += weight
-                    t *= wp.exp(-x)
-                    if t < cutoff:
-                        break
+        for n in range(steps.count):
+            p = r.origin + (steps.first + (float(n) + 0.5) * steps.length) * r.direction
+            x = extinction * skipping_at(density, bricks, p) * steps.length
+            if x > 0.0:
+                middle = p - 0.5 * reach * _velocity_at(velocity, wp.cw_mul(share, p))
+                weight = t * absorbed(x)
+                begin = p - reach * _velocity_at(velocity, wp.cw_mul(share, middle))
+                begin = wp.min(wp.max(begin, wp.min(p, border)), wp.max(p, size - border))
+                moved += weight * (p - begin)
+                seen += weight
+                t *= wp.exp(-x)
+                if t < cutoff:
+                    break
         across = float(0.0)
         down = float(0.0)
         if seen > least:

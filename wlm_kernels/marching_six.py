@@ -28,6 +28,7 @@ from wlm_kernels.marching import (
     ray,
     size_of,
     skipping_at,
+    steps_along,
     warp_memory,
 )
 
@@ -222,20 +223,16 @@ def six_kernels(dtype: Any) -> _Kernels:
     ):
         row, col = wp.tid()
         r = ray(view, row, col)
-        span = clip(size_of(density), r.origin, r.direction)
-        first = wp.max(span[0], 0.0)
+        steps = steps_along(size_of(density), r.origin, r.direction, h)
         light = float(0.0)
         tau = float(0.0)
-        if span[1] > first:
-            steps = int(wp.ceil((span[1] - first) / h))
-            dt = (span[1] - first) / float(steps)
-            for n in range(steps):
-                p = r.origin + (first + (float(n) + 0.5) * dt) * r.direction
-                x = extinction * skipping_at(density, bricks, p) * dt
-                if x > 0.0:
-                    other = optical_depth(density, bricks, p, toward, extinction, h)
-                    light += wp.exp(-tau - other) * absorbed(x)
-                    tau += x
+        for n in range(steps.count):
+            p = r.origin + (steps.first + (float(n) + 0.5) * steps.length) * r.direction
+            x = extinction * skipping_at(density, bricks, p) * steps.length
+            if x > 0.0:
+                other = optical_depth(density, bricks, p, toward, extinction, h)
+                light += wp.exp(-tau - other) * absorbed(x)
+                tau += x
         out[row, col] = light * phase(g, wp.dot(toward, r.direction))
 
     return _Kernels(column, sweep, gather, lit)

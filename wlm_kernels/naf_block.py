@@ -10,7 +10,7 @@ from typing import Any
 
 import warp as wp
 
-__all__ = ["STRIP", "NafKernels", "kernels", "lanes"]
+__all__ = ["STRIP", "NafKernels", "kernels", "lane_sum", "lanes"]
 
 STRIP = 4
 """Pixels below each other that a thread of ``gate`` makes."""
@@ -30,7 +30,9 @@ _PER_LANE = 4
 #endif
     return value;
 """)
-def lane_sum(value: float, count: int) -> float: ...
+def lane_sum(value: float, count: int) -> float:
+    """The sum of a value over the ``count`` threads of a group, a power of 2 up to a warp; on a CPU the value."""
+    ...
 
 
 def lanes(channels: int, cuda: bool) -> int:

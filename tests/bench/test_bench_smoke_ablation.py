@@ -232,12 +232,12 @@ def test_full_sizes_are_what_samples_and_trainings_get(made, monkeypatch):
 
     monkeypatch.setattr(bench, "_train", train)
     monkeypatch.setattr(bench, "evaluate", lambda network, pool: evaluate(network, small_pool(2, 12, 32, "six")))
-    for name in ("16", "24", "32", "paper"):
+    for name in ("16", "24", "32", "fast", "paper"):
         trained.clear()
         assert len(run(name, quick=False, device="cpu")) == len(trained) + 1 >= 10
         for profile, rounds in trained:
             training = profile.training
-            assert (training.rounds, training.steps, training.crop, rounds) == (3, 2000, None, 3)
+            assert (training.rounds, training.steps, training.crop, rounds) == (2, 1200, None, 2)
             sizes = ("cells", "resolution", "sequences", "frames", "validation_sequences")
             assert [getattr(profile.dataset, size) for size in sizes] == [50, 256, 14, 8, 4]
     assert {settings.frames for settings, _, round in made if round is None} == {4}

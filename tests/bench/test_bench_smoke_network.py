@@ -111,7 +111,7 @@ def test_flip_book(rows):
 def test_profiles(rows):
     found = of(rows, "profiles")
     names = [name.removeprefix("network-") for name in profile_names("smoke") if name.startswith("network-")]
-    assert list(found) == [f"{name}, fp32" for name in names] and {"16", "24", "32"} <= set(names)
+    assert list(found) == [f"{name}, fp32" for name in names] and {"16", "24", "32", "fast"} <= set(names)
     for row in found.values():
         count = int(figures(row)["parameters"].replace(",", ""))
         assert float(figures(row)["MB"]) == pytest.approx(2e-6 * count, abs=0.006)

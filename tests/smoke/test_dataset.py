@@ -245,6 +245,9 @@ def test_no_scene_is_shared(few, validation):
 def test_validation(validation):
     """Every pair from every fixed view; another density is of the same smoke."""
     made, thin = validation, make_validation(FEW, scale=0.4)
+    other = make_validation(FEW, test=True)
+    assert _same(other, make_validation(FEW.model_copy(update={"validation_seed": 2027, "test_seed": 0})))
+    assert len(other) != len(made) or not torch.equal(other.targets, made.targets)
     assert len(made) == FEW.views * FEW.frames * FEW.validation_sequences
     clear, less = (1 - some.targets[:, :, OPACITY_PLANE].float() for some in (made, thin))
     # As exact as halves are near 1.
@@ -348,7 +351,8 @@ def test_look():
 @pytest.mark.parametrize(
     "wrong",
     [{"cells": 8}, {"substeps": 3}, {"zoom": (1.2, 0.8)}, {"density_scales": (0.0, 1.0)}, {"hot": 1.5}, {"unknown": 1}]
-    + [{"least_cells": 60}, {"guide_spacing": 0.1}, {"guide_spacing": -0.1, "guide": "six"}],
+    + [{"least_cells": 60}, {"guide_spacing": 0.1}, {"guide_spacing": -0.1, "guide": "six"}]
+    + [{"test_seed": 5, "validation_seed": 5}],
 )
 def test_wrong_settings(wrong: dict):
     """Each is named."""

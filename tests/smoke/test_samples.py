@@ -14,6 +14,7 @@ from wlm.smoke.guide import guide
 from wlm.smoke.reference import SixWay, six_way
 from wlm.smoke.samples import (
     GUIDES,
+    OPACITY_PLANE,
     PLANES,
     Pool,
     decode_lightmaps,
@@ -108,8 +109,14 @@ def test_six_are_the_coarse_march_as_lightmaps_are_encoded(device):
     planes = look_at(volume, camera, "six", **LOOK)
     wanted = encode_lightmaps(coarse_six_way(volume, camera, **LOOK).six)
     for name, plane in zip(PLANES, wanted, strict=True):
-        assert torch.equal(planes[GUIDES["six"].index(name)], plane), name
+        torch.testing.assert_close(planes[GUIDES["six"].index(name)], plane, rtol=1e-6, atol=1e-6, msg=name)
     assert planes[GUIDES["six"].index("emission")].max() > 0.5
+    # As the other kinds' is, by torch.
+    maps = torch.stack([wanted[0], wanted[OPACITY_PLANE], coarse_six_way(volume, camera, **LOOK).depth])
+    depth = encode_guide(maps, *span(volume, camera))[2]
+    torch.testing.assert_close(planes[GUIDES["six"].index("depth")], depth, rtol=1e-6, atol=1e-6)
+    cold = look_at(replace(volume, temperature=None), camera, "six", **LOOK)
+    assert not cold[GUIDES["six"].index("emission")].any()
 
 
 def test_other_kinds_are_refused():
@@ -118,6 +125,15 @@ def test_other_kinds_are_refused():
         look_at(volume, seen(volume), "back", **LOOK)
     with pytest.raises(ValueError, match="spacing: expected none"):
         look_at(volume, seen(volume), "paper", spacing=2.0, **LOOK)
+
+
+@pytest.mark.parametrize("kind", list(GUIDES))
+def test_a_camera_so_far_away_that_all_depths_are_one_is_refused(kind):
+    volume = plume()
+    camera = seen(volume)
+    camera = replace(camera, position=tuple(1e20 * np.asarray(camera.position)))
+    with pytest.raises(ValueError, match="expected near < far"):
+        look_at(volume, camera, kind, **LOOK)
 
 
 @pytest.mark.parametrize("hot", [False, True])

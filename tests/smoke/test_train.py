@@ -367,12 +367,13 @@ def test_a_sample_that_is_turned_over_is_what_its_mirror_would_be(way, swapped, 
 
 def test_profiles_load():
     names = [name for name in profile_names("smoke") if name.startswith("network-")]
-    assert names == ["network-16", "network-24", "network-32", "network-paper"]
+    assert names == [f"network-{name}" for name in ("16", "24", "32", "fast", "paper")]
     for name in names:
         profile = load_profile(name.removeprefix("network-"))
         kind = "paper" if name == "network-paper" else "six"
         assert profile.name == name and profile.network.guide == profile.dataset.guide == kind
-        assert profile.network.width == (16 if kind == "paper" else int(name[-2:]))
+        widths = {"network-paper": 16, "network-fast": 24}
+        assert profile.network.width == (widths[name] if name in widths else int(name[-2:]))
     with pytest.raises(WlmError, match="network-7"):
         load_profile("7")
 

@@ -11,8 +11,8 @@ peak of 1, an image at a time: its mean, least and most. The methods, each a tab
 - "frame": where the time of a frame goes, and the simulation beside it. "shade" weighs for two lights.
 - "flip book": lightmaps baked from one side, on a billboard that turns with the camera; what the coarse march and the
   first network make of the turned view is beside it.
-- "path tracing": all six lightmaps by Mitsuba at one bounce, on the CPU whatever the device, with and without a
-  denoiser; only with the extra `bake`.
+- "path tracing": all six lightmaps by Mitsuba at one bounce, on the GPU where its driver can, else on the CPU, with and
+  without a denoiser, which is the CPU's; only with the extra `bake`.
 - "profiles": the networks' own time by profile, with random weights.
 - "density": the same frames and those a moment before them, with another density. The flicker is the mean change of
   the lightmaps along the motion, in levels of 255, also over that of the reference, in which nothing flickers.

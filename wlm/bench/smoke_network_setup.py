@@ -99,7 +99,7 @@ FULL = NetworkSizes(
     frames=2,
     six=(20.0, 15.0, 10.0, 7.0, 5.0, 3.0, 2.0, 1.0, EXACT),
     coarse=(20.0, 15.0, 10.0, 7.0, 5.0, 3.0),
-    swept=((10.0, 5.0), (5.0, 10.0), (5.0, 5.0), (3.0, 5.0), (2.0, 5.0), (2.0, 3.0), (1.0, 2.0)),
+    swept=((10.0, 5.0), (7.0, 3.0), (5.0, 10.0), (5.0, 3.0), (3.0, 5.0), (3.0, 2.0), (2.0, 3.0), (1.0, 2.0)),
     turns=(10.0, 30.0, 60.0, 90.0),
     scales=(0.5, 1.0, 2.0),
     profile=512,
@@ -231,10 +231,10 @@ class NetworkBench(Bench):
         return self.time({key: StepGraph(call, self.device, warmup=1) for key, call in calls.items()}, few=few)
 
     def _simulate(self) -> None:
-        """Takes frames of the first scene of each kind among validations of another seed than training looks at."""
+        """Takes frames of the first scene of each kind among those of the seed by which no network is chosen."""
         kinds, found, trouble = self.sizes.kinds, {}, None
         for index in range(_DRAWN):
-            scene = draw_scene(self.settings, self.settings.validation_seed + 1, index, validation=True)
+            scene = draw_scene(self.settings, self.settings.test_seed, index, validation=True)
             kind = scene.name.split()[0]
             if kind in found or kind not in kinds:
                 continue

@@ -62,7 +62,7 @@ def register(app: typer.Typer) -> None:
 
 
 def train(
-    profile: Annotated[str, typer.Argument(metavar="PROFILE", help="16, 24, 32, paper, or a YAML file.")],
+    profile: Annotated[str, typer.Argument(metavar="PROFILE", help="fast, 16, 24, 32, paper, or a YAML file.")],
     output: Annotated[Path, typer.Option("--output", "-o", metavar="NETWORK", help="The .safetensors to write.")],
     minutes: Annotated[
         float | None, typer.Option(min=0.0, help="After which it stops and can be resumed; default at its end.")
@@ -194,8 +194,9 @@ def evaluate(
 ) -> None:
     """Measure a network on smoke that it hasn't learned from, beside a coarse march and a flip book.
 
-    The smoke is the validation's at half, once and twice its density, and the volumes given. PSNR is of the lightmaps
-    in sRGB; flicker is what changes from frame to frame beside the motion, over the same of the reference.
+    The smoke is of sequences by which no network was chosen either, at half, once and twice its density, and the
+    volumes given. PSNR is of the lightmaps in sRGB; flicker is what changes from frame to frame beside the motion, over
+    the same of the reference.
     """
     if json_path is not None:
         check_output(json_path, ".json")

@@ -104,7 +104,8 @@ class DatasetSettings(BaseModel):
         apart: Time between two pairs.
         least_coverage: Share of the image up to which a frame counts as almost empty.
         kept_empty: Share of such frames that are kept.
-        validation_sequences, validation_seed: Of the validation.
+        validation_sequences, validation_seed: Of the validation, by which the best of a training's networks is chosen.
+        test_seed: Another than that, of as many sequences by which none is.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -138,6 +139,7 @@ class DatasetSettings(BaseModel):
     kept_empty: _Share = 0.05
     validation_sequences: int = Field(4, ge=1, le=1000)
     validation_seed: int = Field(2026, ge=0)
+    test_seed: int = Field(2027, ge=0)
 
     @model_validator(mode="after")
     def _order(self) -> DatasetSettings:
@@ -147,6 +149,8 @@ class DatasetSettings(BaseModel):
             low, high = getattr(self, name)
             if low > high:
                 raise PydanticCustomError("range", "{name}: expected the least before the most", {"name": name})
+        if self.test_seed == self.validation_seed:
+            raise PydanticCustomError("seed", "test_seed: expected another than validation_seed")
         if self.guide == "paper" and self.guide_spacing is not None:
             raise PydanticCustomError("spacing", "guide_spacing: expected none with the paper's guide, found one")
         return self
@@ -215,6 +219,7 @@ def make_validation(
     settings: DatasetSettings,
     device: str = "cpu",
     *,
+    test: bool = False,
     scale: float = 1.0,
     progress: Callable[[int, dict[str, float]], None] | None = None,
 ) -> Pool:
@@ -223,13 +228,15 @@ def make_validation(
     Args:
         settings: As for `make_pool`.
         device: Likewise.
+        test: Whether of the seed by which no network is chosen.
         scale: Factor on the extinction, as in the paper's ablation of 0.5 and 2; its smoke is the same.
         progress: As for `make_pool`.
 
     Raises:
         WlmError: As `make_pool`.
     """
-    maker = _Maker(settings, settings.validation_seed, True, device, progress, scale)
+    seed = settings.test_seed if test else settings.validation_seed
+    maker = _Maker(settings, seed, True, device, progress, scale)
     return maker.pool(0, settings.validation_sequences)
 
 

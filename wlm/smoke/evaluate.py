@@ -244,13 +244,13 @@ def evaluate_all(
     device: str = "cpu",
     progress: Callable[[int, int, str], None] | None = None,
 ) -> list[Comparison]:
-    """Evaluates a network on sequences that it hasn't learned from, and beside it what needs no network.
+    """Evaluates a network on sequences that it hasn't learned from nor was chosen by, and what needs no network.
 
     Args:
         network: On the device.
         settings: Those that it was trained with, but for sizes.
         volumes: Files for `load_probe_volume`, each seen from all fixed views.
-        densities: Factors on the density of the validation's smoke.
+        densities: Factors on the density of the sequences' smoke.
         device: As `check_device` returns it.
         progress: Called after each set with how many are done, how many there are, and which this was.
 
@@ -258,18 +258,18 @@ def evaluate_all(
         A comparison for each density, then for each volume.
 
     Raises:
-        WlmError: The memory isn't enough, a volume can't be read, or there is no smoke in the validation.
+        WlmError: The memory isn't enough, a volume can't be read, or there is no smoke in the sequences.
     """
     own, six = (settings.model_copy(update={"guide": kind}) for kind in (network.settings.guide, "six"))
 
-    def validation(scale: float) -> Callable[[DatasetSettings], Pool]:
+    def sequences(scale: float) -> Callable[[DatasetSettings], Pool]:
         # Of all frames, so that each has its first view; those almost empty are left out below.
-        return lambda made: make_validation(made.model_copy(update={"kept_empty": 1.0}), device, scale=scale)
+        return lambda made: make_validation(made.model_copy(update={"kept_empty": 1.0}), device, test=True, scale=scale)
 
     def volume(path: Path) -> Callable[[DatasetSettings], Pool]:
         return lambda made: load_probe_volume(path, made, device=device)
 
-    sets = {f"density x {scale:g}": validation(scale) for scale in densities}
+    sets = {f"density x {scale:g}": sequences(scale) for scale in densities}
     sets |= {str(path): volume(path) for path in volumes}
     found = []
     for done, (name, make) in enumerate(sets.items(), 1):

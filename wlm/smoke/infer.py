@@ -4,7 +4,7 @@ The weights of the adapters are folded, which changes nothing but the rounding: 
 1 x 1 convolution behind it, beta and gamma into the one before; the channel attention multiplies the weights of the
 convolution behind it, which are few, instead of the image. The adapters run side by side, and their heads as one
 convolution. Pixels lie as rows of channels, so that 1 x 1 convolutions are plain matrix products; what is between these
-is done by `wlm_kernels.naf_block`.
+is done by `wlm_kernels.naf_block`, and what comes behind the heads by `wlm_kernels.six_planes`.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ import warp as wp
 from torch import nn
 
 from wlm.interop import StepGraph, check_device, to_warp
-from wlm.smoke.axes import DIRECTIONS, Camera
-from wlm.smoke.network import NafBlock, SixWayNetwork, support
+from wlm.smoke.axes import Camera
+from wlm.smoke.network import REACH, NafBlock, SixWayNetwork
 from wlm.smoke.reference import SixWay
 from wlm.smoke.samples import GUIDES, PLANES, decode_lightmaps, look_at
 from wlm.smoke.volume import DensityVolume
-from wlm_kernels import naf_block
+from wlm_kernels import naf_block, six_planes
 
 __all__ = ["Predictor", "predict"]
 
@@ -66,6 +66,7 @@ class Predictor:
             still = SixWayNetwork(network.settings)
             still.load_state_dict(network.state_dict())
             self._folded = _Folded(still, height, width, self.device, kind)
+            self._tail = _Tail(still, height, width, self.device, kind)
         self._guide = torch.zeros(1, len(GUIDES[network.settings.guide]), height, width, device=self.device, dtype=kind)
         self._planes = torch.zeros(len(PLANES), height, width, device=self.device)
         self._run = StepGraph(self._work, self.device, warmup=_WARMUP)
@@ -94,9 +95,8 @@ class Predictor:
     def _work(self) -> None:
         # The quickest of cuDNN's ways, tried out before the graph; where float32 is asked for, it shall be that.
         with torch.backends.cudnn.flags(enabled=True, benchmark=True, deterministic=False, allow_tf32=self.half):
-            self._planes.copy_(self._folded(self._guide))
-        self._planes.clamp_(min=0.0)
-        self._planes[len(DIRECTIONS) :].clamp_(max=1.0)
+            heads = self._folded(self._guide)
+        self._tail(heads, self._guide[0], self._planes)
 
 
 def predict(
@@ -209,7 +209,7 @@ class _Adapters:
 
 
 class _Folded:
-    """A network for images of one size, [1, C, H, W] to [8, H, W]."""
+    """A network's U-Net, adapters and heads for images of one size."""
 
     def __init__(self, network: SixWayNetwork, height: int, width: int, device: str, kind: torch.dtype) -> None:
         self.settings = settings = network.settings
@@ -228,17 +228,10 @@ class _Folded:
         self.shift = self.adapters.shift[:, None].to(*options)
         heads = network.heads
         self.heads = torch.cat([h.weight for h in heads]).to(*options), torch.cat([h.bias for h in heads]).to(*options)
-        names = [name for group in network.groups for name in group]
-        owner = [i for i, group in enumerate(network.groups) for _ in group]
-        made = [name for name in PLANES if name in names]
-        order = torch.tensor([names.index(name) for name in made])
-        self.order, self.owner = order.to(device), torch.tensor(owner)[order].to(device)
-        self.mix = network.mix.weight[order].to(*options) if settings.residual else None
 
     def __call__(self, guide: torch.Tensor) -> torch.Tensor:
-        """Planes in order and not clamped; a last one that isn't made is 0."""
+        """Of [1, C, H, W] what all heads make of each adapter, [G, N, H / stem, W / stem] of the padded image."""
         settings, stem = self.settings, self.settings.stem
-        height, width = guide.shape[-2:]
         padded = F.pad(guide, self.padding)[:, : settings.channels]
         x = F.pixel_unshuffle(padded, stem) if stem > 1 else padded
         x = x.contiguous(memory_format=torch.channels_last)
@@ -252,13 +245,7 @@ class _Folded:
         # Each adapter through all heads: of those only its own count, but one convolution is quicker than four.
         y = self.adapters(x) + self.shift
         y = y.view(-1, *self.size, settings.width).permute(0, 3, 1, 2)
-        y = F.conv2d(y, *self.heads, padding=1)
-        y = y.unflatten(1, (-1, stem**2))[self.owner, self.order]
-        y = F.pixel_shuffle(y, stem)[:, 0] if stem > 1 else y[:, 0]
-        if self.mix is not None:
-            y = y + F.conv2d(padded, self.mix, padding=self.mix.shape[-1] // 2)[0]
-        y = y[:, :height, :width] * support(guide[:, -2:-1])[0]
-        return y if settings.emission else F.pad(y, (0, 0, 0, 0, 0, 1))
+        return F.conv2d(y, *self.heads, padding=1)
 
     def _twice(self, x: torch.Tensor, convolutions: list[tuple[torch.Tensor, torch.Tensor]]) -> torch.Tensor:
         for weight, bias in convolutions:
@@ -267,6 +254,42 @@ class _Folded:
             else:
                 x = F.relu(F.conv2d(x, weight, bias, padding=1))
         return x
+
+
+class _Tail:
+    """Makes planes of what the heads make: their pixels in place, the filter of the guide, no smoke where none is near.
+
+    The filter runs in float32.
+    """
+
+    def __init__(self, network: SixWayNetwork, height: int, width: int, device: str, kind: torch.dtype) -> None:
+        settings = network.settings
+        self.device, self.stem, area = device, settings.stem, settings.stem**2
+        order = [PLANES.index(name) for group in network.groups for name in group]
+        places = torch.tensor([[-1, 0]] * len(PLANES), dtype=torch.int32)
+        owner = [i for i, group in enumerate(network.groups) for _ in group]
+        places[order] = torch.tensor([[i, n * area] for n, i in enumerate(owner)], dtype=torch.int32)
+        filters = network.filter.weight if settings.residual else torch.zeros(len(order), 0, 1, 1)
+        edge = filters.shape[-1]
+        # Down a column first, as a thread goes.
+        weights = torch.zeros(filters.shape[1], edge, edge, len(PLANES))
+        weights[..., order] = filters.permute(1, 3, 2, 0)
+        self._places = to_warp(places.to(device))
+        self._weights = to_warp(weights.view(-1, len(PLANES)).to(device), six_planes.Taps)
+        self._kernels = six_planes.kernels(edge, REACH, kind == torch.float16, device != "cpu")
+        blocks = (-(-height // REACH), -(-width // REACH))
+        self._smoke = to_warp(torch.empty(blocks, dtype=torch.int32, device=device))
+
+    def __call__(self, heads: torch.Tensor, guide: torch.Tensor, planes: torch.Tensor) -> None:
+        """Writes planes [8, H, W], of `_Folded`'s outputs and its guide [C, H, W]."""
+        made, seen = self._kernels, to_warp(guide)
+        self._launch(made.near, made.lanes * self._smoke.size, [seen], self._smoke)
+        pixels = to_warp(heads.permute(0, 2, 3, 1))
+        inputs = [pixels, seen, self._weights, self._places, self.stem, self._smoke]
+        self._launch(made.compose, (-(-guide.shape[1] // six_planes.STRIP), guide.shape[2]), inputs, to_warp(planes))
+
+    def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: list, output: wp.array) -> None:
+        wp.launch(kernel, dim, inputs=inputs, outputs=[output], device=self.device)
 
 
 def _weights(layer: nn.Conv2d, device: str, kind: torch.dtype) -> tuple[torch.Tensor, torch.Tensor]:

@@ -1,9 +1,9 @@
-"""The network that turns a guiding map into six-way lightmaps (section 4.3): a U-Net with four adapters.
+"""The network that turns a guiding map into six-way lightmaps (section 4.3): a U-Net and adapters, four or one.
 
 The U-Net is Ronneberger's (2015): two 3 x 3 convolutions a level, maxima on the way down. What its last level finds is
-shared by the adapters, each a NAFBlock (Chen et al. 2022) for two opposite planes. A NAFBlock has no activation but the
-product of one half of its channels with the other; its channel attention multiplies by a linear map of the channels'
-means over the whole image.
+shared by the adapters, each a NAFBlock (Chen et al. 2022) for two opposite planes, or goes through one for all. A
+NAFBlock has no activation but the product of one half of its channels with the other; its channel attention multiplies
+by a linear map of the channels' means over the whole image.
 
 Two things are known without learning and are built in:
 
@@ -25,7 +25,16 @@ from torch import nn
 
 from wlm.smoke.samples import GUIDES, PLANES
 
-__all__ = ["ADAPTERS", "EPSILON", "NafBlock", "NetworkSettings", "SixWayNetwork", "parameter_count", "support"]
+__all__ = [
+    "ADAPTERS",
+    "EPSILON",
+    "REACH",
+    "NafBlock",
+    "NetworkSettings",
+    "SixWayNetwork",
+    "parameter_count",
+    "support",
+]
 
 ADAPTERS = (("front", "back"), ("right", "left"), ("top", "bottom"), ("opacity", "emission"))
 """The planes that each adapter makes."""
@@ -195,10 +204,10 @@ class SixWayNetwork(nn.Module):
         self.heads = nn.ModuleList(nn.Conv2d(first, len(group) * area, 3, padding=1) for group in self.groups)
         if settings.residual:
             shares = torch.tensor([_start(name, GUIDES[settings.guide]) for group in self.groups for name in group])
-            self.mix = nn.Conv2d(settings.channels, len(shares), _FILTER, padding=_FILTER // 2, bias=False)
+            self.filter = nn.Conv2d(settings.channels, len(shares), _FILTER, padding=_FILTER // 2, bias=False)
             with torch.no_grad():
-                self.mix.weight.zero_()
-                self.mix.weight[:, :, _FILTER // 2, _FILTER // 2] = shares[:, : settings.channels]
+                self.filter.weight.zero_()
+                self.filter.weight[:, :, _FILTER // 2, _FILTER // 2] = shares[:, : settings.channels]
             for head in self.heads:
                 nn.init.zeros_(head.weight)
                 nn.init.zeros_(head.bias)
@@ -235,7 +244,7 @@ class SixWayNetwork(nn.Module):
         if self.settings.stem > 1:
             made = F.pixel_shuffle(made, self.settings.stem)
         if self.settings.residual:
-            made = made + self.mix(padded[:, : self.settings.channels])
+            made = made + self.filter(padded[:, : self.settings.channels])
         made = made[:, :, :height, :width] * support(guide[:, -2:-1])
         return self.order(made.to(guide.dtype))
 

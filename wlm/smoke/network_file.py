@@ -26,7 +26,7 @@ __all__ = ["SYSTEM", "export_onnx", "load_network", "save_network", "settings_of
 
 SYSTEM = "smoke-network"
 
-_SHIPPED = Path(__file__).resolve().parents[1] / "data" / "smoke-six-24.safetensors"
+_SHIPPED = Path(__file__).resolve().parents[1] / "data" / "smoke-six-fast.safetensors"
 _OPSET = 20
 _HALF_MAX = 65504.0
 

@@ -6,11 +6,13 @@ from dataclasses import dataclass, fields
 
 import torch
 
+from wlm.interop import device_name, stream, to_warp
 from wlm.smoke.axes import DIRECTIONS, Camera
 from wlm.smoke.coarse import coarse_six_way
 from wlm.smoke.guide import guide
 from wlm.smoke.reference import SixWay
 from wlm.smoke.volume import DensityVolume
+from wlm_kernels import six_planes
 
 __all__ = [
     "EMISSION_PLANE",
@@ -50,7 +52,6 @@ VISIBLE = 0.05
 
 # Where sRGB's straight foot ends (IEC 61966-2-1), in linear light and encoded.
 _FOOT, _FOOT_CODE = 0.0031308, 0.04045
-_HALF_MAX = 65504.0
 
 
 def to_srgb(linear: torch.Tensor) -> torch.Tensor:
@@ -99,11 +100,15 @@ def encode_guide(maps: torch.Tensor, near: float, far: float) -> torch.Tensor:
     """
     if maps.ndim < 3 or maps.shape[-3] != 3:
         raise ValueError(f"maps: expected [..., 3, H, W], got {tuple(maps.shape)}")
-    if not near < far:
-        raise ValueError(f"near, far: expected near < far, got {near} and {far}")
+    _check_span(near, far)
     light, transparency, depth = maps.unbind(-3)
     share = ((far - depth) / (far - near)).clamp(0.0, 1.0)
     return torch.stack([to_srgb(light), 1.0 - transparency, share * (depth > 0)], -3)
+
+
+def _check_span(near: float, far: float) -> None:
+    if not near < far:
+        raise ValueError(f"near, far: expected near < far, got {near} and {far}")
 
 
 def look_at(
@@ -141,11 +146,13 @@ def look_at(
     if kind not in GUIDES:
         raise ValueError(f"kind: expected one of {', '.join(GUIDES)}, got {kind!r}")
     found = coarse_six_way(volume, camera, spacing=spacing, **settings)
-    six = found.six
     if kind == "six":
-        depth = encode_guide(torch.stack([six["front"], six.transparency, found.depth]), near, far)[2:]
-        planes = encode_lightmaps(six)
-        return torch.cat([planes[:OPACITY_PLANE], planes[EMISSION_PLANE:], planes[OPACITY_PLANE:EMISSION_PLANE], depth])
+        _check_span(near, far)
+        with stream(device_name(volume.device)):
+            encoded = torch.empty_like(found.planes)
+            six_planes.encode_six(to_warp(found.planes), near, far, found.hot, to_warp(encoded))
+        return encoded
+    six = found.six
     light = sum(six[name] for name in _LIT[kind])
     return encode_guide(torch.stack([light, six.transparency, found.depth]), near, far)
 
@@ -168,7 +175,7 @@ def encode_lightmaps(six_way: SixWay) -> torch.Tensor:
 
 
 def decode_lightmaps(planes: torch.Tensor, *, hot: bool = True) -> SixWay:
-    """The inverse of `encode_lightmaps`, in float32; what a network leaves outside a plane's range is clamped to it.
+    """The inverse of `encode_lightmaps`, in float32 and without a gradient; what a plane can't be is clamped.
 
     Args:
         planes: [8, H, W].
@@ -179,12 +186,11 @@ def decode_lightmaps(planes: torch.Tensor, *, hot: bool = True) -> SixWay:
     """
     if planes.ndim != 3 or planes.shape[0] != len(PLANES):
         raise ValueError(f"planes: expected [{len(PLANES)}, H, W], got {tuple(planes.shape)}")
-    planes = planes.float()
-    glow = None
-    if hot:
-        share = from_srgb(planes[EMISSION_PLANE]).clamp(max=1.0)
-        glow = (share / (1.0 - share)).clamp(max=_HALF_MAX)
-    return SixWay(from_srgb(planes[:6]), 1.0 - planes[OPACITY_PLANE].clamp(0.0, 1.0), glow)
+    with stream(device_name(planes.device)):
+        planes = planes.detach().float().contiguous()
+        light = torch.empty_like(planes)
+        six_planes.decode(to_warp(planes), to_warp(light))
+    return SixWay(light[: len(DIRECTIONS)], light[OPACITY_PLANE], light[EMISSION_PLANE] if hot else None)
 
 
 @dataclass(frozen=True, eq=False)
