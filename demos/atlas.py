@@ -15,8 +15,6 @@ import time
 from pathlib import Path
 
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 
 from wlm.atlas import codec
 from wlm.atlas.data import LightmappedMesh, load_mesh
@@ -27,7 +25,7 @@ from wlm.atlas.fit import compress
 from wlm.atlas.model import AtlasModel, Profile, load_profile
 from wlm.atlas.views import View
 from wlm.baselines.atlas import downsampling
-from wlm.cli.console import quiet_warp
+from wlm.cli.console import quiet_warp, show_figures
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_write
 from wlm.interop import check_device
@@ -120,13 +118,8 @@ def main() -> None:
         figures = run(args.out, check_device(args.device))
     except (WlmError, OSError) as error:
         sys.exit(f"error: {error}")
-    table = Table(title=f"{args.out.name}/room-*/{MODEL_FILE}", title_justify="left")
-    for column in ("", *figures):
-        table.add_column(column, justify="right" if column else "left")
-    for label in figures["standard"]:
-        values = [each[label] for each in figures.values()]
-        table.add_row(label, *(f"{value:,}" if isinstance(value, int) else f"{value:.4g}" for value in values))
-    Console().print(table)
+    rows = [(label, *(each[label] for each in figures.values())) for label in figures["standard"]]
+    show_figures(f"{args.out.name}/room-*/{MODEL_FILE}", ["", *figures], rows)
 
 
 if __name__ == "__main__":

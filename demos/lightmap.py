@@ -15,10 +15,8 @@ import time
 from pathlib import Path
 
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 
-from wlm.cli.console import quiet_warp
+from wlm.cli.console import quiet_warp, show_figures
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_write
 from wlm.formats.exr import read_exr, write_exr
@@ -120,12 +118,7 @@ def main() -> None:
         figures = run(args.out, check_device(args.device))
     except (WlmError, OSError) as error:
         sys.exit(f"error: {error}")
-    table = Table(title=f"{args.out.name}/city.wlm", title_justify="left")
-    table.add_column("")
-    table.add_column("value", justify="right")
-    for name, value in figures.items():
-        table.add_row(name, f"{value:,}" if isinstance(value, int) else f"{value:.4g}")
-    Console().print(table)
+    show_figures(f"{args.out.name}/city.wlm", ["", "value"], figures.items())
 
 
 if __name__ == "__main__":

@@ -14,10 +14,7 @@ import sys
 import time
 from pathlib import Path
 
-from rich.console import Console
-from rich.table import Table
-
-from wlm.cli.console import quiet_warp
+from wlm.cli.console import quiet_warp, show_figures
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_write
 from wlm.interop import check_device
@@ -126,12 +123,7 @@ def main() -> None:
         figures = run(args.out, check_device(args.device))
     except (WlmError, OSError) as error:
         sys.exit(f"error: {error}")
-    table = Table(title=f"{args.out.name}/street.wlm", title_justify="left")
-    table.add_column("")
-    table.add_column("value", justify="right")
-    for name, value in figures.items():
-        table.add_row(name, f"{value:,}" if isinstance(value, int) else f"{value:.4g}")
-    Console().print(table)
+    show_figures(f"{args.out.name}/street.wlm", ["", "value"], figures.items())
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from wlm.cli.console import quiet_warp, show, table
+from wlm.cli.console import quiet_warp, show_figures
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_write
 from wlm.interop import check_device
@@ -188,11 +188,8 @@ def main() -> None:
         atomic_write(args.out / "report.json", (json.dumps(figures, indent=1) + "\n").encode())
     except (WlmError, OSError) as error:
         sys.exit(f"error: {error}")
-    rows = table(str(args.out), ["", "", "value"], text=[""])
-    for name, found in figures.items():
-        for label, value in found.items():
-            rows.add_row(name, label, f"{value:.4g}")
-    show(rows)
+    rows = [(name, *figure) for name, found in figures.items() for figure in found.items()]
+    show_figures(str(args.out), ["", "", "value"], rows, text=[""])
 
 
 if __name__ == "__main__":

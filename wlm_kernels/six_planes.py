@@ -15,7 +15,18 @@ import warp as wp
 from wlm_kernels import marching_coarse
 from wlm_kernels.naf_block import lane_sum
 
-__all__ = ["LIGHTS", "PLANES", "STRIP", "PlaneKernels", "Taps", "decode", "encode_six", "kernels"]
+__all__ = [
+    "FOOT",
+    "FOOT_CODE",
+    "LIGHTS",
+    "PLANES",
+    "STRIP",
+    "PlaneKernels",
+    "Taps",
+    "decode",
+    "encode_six",
+    "kernels",
+]
 
 LIGHTS = 6
 """Planes of light, which come first; they may be above 1, the others may not."""
@@ -29,9 +40,11 @@ STRIP = 4
 Taps = wp.types.vector(PLANES, wp.float32)
 """What one pixel of one of the guide's planes adds to each plane."""
 
+FOOT, FOOT_CODE = 0.0031308, 0.04045
+"""Where sRGB's straight foot ends (IEC 61966-2-1), in linear light and encoded."""
+
 _OPTIONS = {"enable_backward": False}
 _BOUNDS = (256, 2)  # threads of a block and blocks at a time: without, registers for half as many
-_FOOT, _FOOT_CODE = 0.0031308, 0.04045  # sRGB's straight foot ends here (IEC 61966-2-1), in linear light and encoded
 _HALF_MAX = 65504.0
 _TRANSPARENCY, _EMISSION = (marching_coarse.PLANES.index(name) for name in ("transparency", "emission"))
 
@@ -57,7 +70,7 @@ def _load(weights: wp.array1d[Taps], i: int) -> Taps:
 @wp.func
 def _srgb(linear: float) -> float:
     """Linear light to sRGB's curve, which goes on above 1; what is below 0 counts as 0."""
-    if linear <= _FOOT:
+    if linear <= FOOT:
         return 12.92 * wp.max(linear, 0.0)
     return 1.055 * wp.pow(linear, 1.0 / 2.4) - 0.055
 
@@ -65,7 +78,7 @@ def _srgb(linear: float) -> float:
 @wp.func
 def _linear(code: float) -> float:
     """The inverse; what is below 0 counts as 0."""
-    if code <= _FOOT_CODE:
+    if code <= FOOT_CODE:
         return wp.max(code, 0.0) / 12.92
     return wp.pow((code + 0.055) / 1.055, 2.4)
 

@@ -8,7 +8,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -29,6 +29,7 @@ __all__ = [
     "progress_bar",
     "quiet_warp",
     "show",
+    "show_figures",
     "show_json",
     "table",
     "write_json",
@@ -57,6 +58,27 @@ def table(title: str, columns: Sequence[str], text: Sequence[str] = ()) -> Table
 def show(content: Table) -> None:
     """Prints a table to stdout."""
     _console().print(content)
+
+
+def show_figures(
+    title: str, columns: Sequence[str], rows: Iterable[Sequence[str | float]], text: Sequence[str] = ()
+) -> None:
+    """Prints a table of words and figures, which are whole numbers in full, others to four digits.
+
+    Args:
+        title, columns, text: As for `table`.
+        rows: A cell for each column.
+    """
+    made = table(title, columns, text)
+    for row in rows:
+        made.add_row(*(_figure(value) for value in row))
+    show(made)
+
+
+def _figure(value: str | float) -> str:
+    if isinstance(value, str):
+        return value
+    return f"{value:,}" if isinstance(value, int) else f"{value:.4g}"
 
 
 def note(text: str) -> None:

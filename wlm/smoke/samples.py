@@ -13,6 +13,7 @@ from wlm.smoke.guide import guide
 from wlm.smoke.reference import SixWay
 from wlm.smoke.volume import DensityVolume
 from wlm_kernels import six_planes
+from wlm_kernels.six_planes import FOOT, FOOT_CODE
 
 __all__ = [
     "EMISSION_PLANE",
@@ -50,21 +51,18 @@ OPACITY_PLANE, EMISSION_PLANE = PLANES.index("opacity"), PLANES.index("emission"
 VISIBLE = 0.05
 """Opacity from which on a pixel counts as smoke."""
 
-# Where sRGB's straight foot ends (IEC 61966-2-1), in linear light and encoded.
-_FOOT, _FOOT_CODE = 0.0031308, 0.04045
-
 
 def to_srgb(linear: torch.Tensor) -> torch.Tensor:
     """Linear light to sRGB's curve, which goes on above 1; what is below 0 counts as 0."""
     # Kept off 0, where the power's slope is infinite and would turn a gradient into NaN.
-    curve = 1.055 * linear.clamp(min=_FOOT) ** (1 / 2.4) - 0.055
-    return torch.where(linear <= _FOOT, 12.92 * linear.clamp(min=0.0), curve)
+    curve = 1.055 * linear.clamp(min=FOOT) ** (1 / 2.4) - 0.055
+    return torch.where(linear <= FOOT, 12.92 * linear.clamp(min=0.0), curve)
 
 
 def from_srgb(code: torch.Tensor) -> torch.Tensor:
     """The inverse of `to_srgb`; what is below 0 counts as 0."""
-    curve = ((code.clamp(min=_FOOT_CODE) + 0.055) / 1.055) ** 2.4
-    return torch.where(code <= _FOOT_CODE, code.clamp(min=0.0) / 12.92, curve)
+    curve = ((code.clamp(min=FOOT_CODE) + 0.055) / 1.055) ** 2.4
+    return torch.where(code <= FOOT_CODE, code.clamp(min=0.0) / 12.92, curve)
 
 
 def span(volume: DensityVolume, camera: Camera) -> tuple[float, float]:
