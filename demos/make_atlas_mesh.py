@@ -21,7 +21,7 @@ from wlm.errors import WlmError
 from wlm.formats.exr import write_exr
 from wlm.formats.gltf import document_from_arrays
 from wlm.formats.gltf_writer import write_glb
-from wlm.imageops import fill_gaps
+from wlm.texels import fill_gaps
 
 NAME = "room"
 SIDE = 256  # texels

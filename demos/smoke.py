@@ -19,18 +19,18 @@ import numpy as np
 
 from wlm.cli.console import quiet_warp, show_figures
 from wlm.errors import WlmError
+from wlm.fluid.volume import DensityVolume, load_volume
 from wlm.formats.atomic import atomic_write
 from wlm.interop import check_device
-from wlm.smoke.axes import DIRECTIONS, axis_faults
-from wlm.smoke.data import CameraSettings, Grid, LightSettings, Scene, load_scene, make_camera
-from wlm.smoke.frames import open_footage, open_frames, save_volume
+from wlm.smoke.bake import SixWay, lit, six_way
+from wlm.smoke.camera import DIRECTIONS, axis_faults
+from wlm.smoke.data import open_footage, open_frames, save_volume
+from wlm.smoke.export import read_flipbook, write_flipbook
 from wlm.smoke.guide import guide
-from wlm.smoke.packing import read_flipbook, write_flipbook
-from wlm.smoke.reference import SixWay, lit, six_way
+from wlm.smoke.learn.synthetic import make_plume
+from wlm.smoke.scene import CameraSettings, Grid, LightSettings, Scene, load_scene, make_camera
 from wlm.smoke.shade import shade
 from wlm.smoke.simulate import simulate
-from wlm.smoke.synthetic import make_plume
-from wlm.smoke.volume import DensityVolume, load_volume
 from wlm.view.smoke import contact_sheet, guide_pictures, picture, six_pictures, to_bytes, write_sequence
 
 HERE = Path(__file__).resolve().parent

@@ -24,22 +24,22 @@ import numpy as np
 
 from wlm.cli.console import quiet_warp, show_figures
 from wlm.errors import WlmError
+from wlm.fluid.volume import DensityVolume
 from wlm.formats.atomic import atomic_write
 from wlm.interop import check_device
 from wlm.metrics.error import psnr_from_mse
-from wlm.smoke.axes import DIRECTIONS, Camera
+from wlm.smoke.bake import SixWay, six_way
+from wlm.smoke.camera import DIRECTIONS, Camera
 from wlm.smoke.coarse import coarse_six_way
-from wlm.smoke.data import Grid, LightSettings, Scene, load_scene, make_camera
-from wlm.smoke.dataset import DatasetSettings, make_pool, make_validation
-from wlm.smoke.frames import open_footage, open_frames
+from wlm.smoke.codec import load_network, settings_of, shipped
+from wlm.smoke.data import open_footage, open_frames
+from wlm.smoke.decode import Predictor, predict
+from wlm.smoke.fit import NetworkProfile, train
 from wlm.smoke.guide import guide
-from wlm.smoke.infer import Predictor, predict
-from wlm.smoke.network_file import load_network, settings_of, shipped
-from wlm.smoke.reference import SixWay, six_way
-from wlm.smoke.samples import EMISSION_PLANE, encode_lightmaps
+from wlm.smoke.learn.dataset import DatasetSettings, make_pool, make_validation
+from wlm.smoke.planes import EMISSION_PLANE, encode_lightmaps
+from wlm.smoke.scene import Grid, LightSettings, Scene, load_scene, make_camera
 from wlm.smoke.simulate import simulate
-from wlm.smoke.train import NetworkProfile, train
-from wlm.smoke.volume import DensityVolume
 from wlm.view.smoke import contact_sheet, picture, to_bytes, write_sequence
 
 HERE = Path(__file__).resolve().parent

@@ -4,8 +4,8 @@ import dataclasses
 
 import numpy as np
 import pytest
-from atlas_meshes import charts, sheet, triangle
-from atlas_models import KINDS, random_model
+from builders.atlas_meshes import charts, sheet, triangle
+from builders.atlas_models import KINDS, random_model
 
 from wlm.atlas import codec, colour
 from wlm.atlas.model import MOST_SIZE, AtlasModel, pack_entries

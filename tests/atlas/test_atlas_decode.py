@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 import torch
-from atlas_meshes import charts, sheet
+from builders.atlas_meshes import charts, sheet
 
 from wlm.atlas.decode import Decoder
+from wlm.atlas.exact import decode64
 from wlm.atlas.fit import compress
 from wlm.atlas.model import AtlasModel, Profile, load_profile
-from wlm.atlas.reference import decode64
 from wlm.errors import WlmError
 
 STANDARD = load_profile("standard").model_copy(update={"views": 2, "fallback": False})

@@ -6,15 +6,16 @@ import math
 import numpy as np
 import pytest
 import torch
-from lit_cube import DIRECTIONS, HEIGHT, WIDTH, lit_cube, waves
+from builders.lit_cube import DIRECTIONS, HEIGHT, WIDTH, lit_cube, waves
 
-from wlm import metrics, render
+from wlm import metrics
 from wlm.atlas.charts import mesh_charts
 from wlm.atlas.data import from_arrays
 from wlm.atlas.evaluate import evaluate
 from wlm.atlas.views import View, sphere_views, visible_uv
 from wlm.errors import WlmError
-from wlm.imageops import fill_gaps
+from wlm.ops import raster
+from wlm.texels import fill_gaps
 
 FACES = [View.of(direction) for direction in DIRECTIONS]
 SQUARE = np.array([[-1, -1, 0], [1, -1, 0], [-1, 1, 0], [1, 1, 0]], np.float64)
@@ -27,7 +28,7 @@ def _reader(mesh, change=lambda colour, uv, triangle: colour):
     image = torch.tensor(fill_gaps(mesh.lightmap, mesh.mask))
 
     def sample(uv, triangle, barycentric):
-        return change(render.texture(image.to(uv.device), uv), uv, triangle)
+        return change(raster.texture(image.to(uv.device), uv), uv, triangle)
 
     return sample
 
@@ -52,7 +53,7 @@ def test_the_reference_is_exact(device):
 def test_an_upside_down_lightmap_is_terrible():
     mesh = lit_cube()
     image = torch.tensor(fill_gaps(mesh.lightmap, mesh.mask)).flip(0).contiguous()
-    report = _one(mesh, lambda uv, triangle, barycentric: render.texture(image, uv), views=12)
+    report = _one(mesh, lambda uv, triangle, barycentric: raster.texture(image, uv), views=12)
     assert report.psnr < 12.0 and report.texel_psnr < 12.0 and report.one_minus_ssim > 0.5
 
 
@@ -61,7 +62,7 @@ def test_a_known_error(device):
     report = _one(mesh, _reader(mesh, _offset(0.01)), device=device)
     colours = []
     for seen, _, uv in visible_uv(mesh, FACES, 64, "cpu"):
-        colours.append(render.texture(torch.tensor(fill_gaps(mesh.lightmap, mesh.mask)), uv[seen >= 0]))
+        colours.append(raster.texture(torch.tensor(fill_gaps(mesh.lightmap, mesh.mask)), uv[seen >= 0]))
     peak = float(torch.cat(colours).max() - torch.cat(colours).min())
     wanted = 20.0 * math.log10(peak / 0.01)
     assert report.peak == pytest.approx(peak, rel=1e-6) and 1.5 < peak < 2.1
@@ -76,13 +77,13 @@ def test_against_the_metrics_of_pictures(device, resolution):
     small = torch.tensor(waves(12, 18))
 
     def blurred(uv, triangle, barycentric):
-        return render.texture(small.to(uv.device), uv)
+        return raster.texture(small.to(uv.device), uv)
 
     report = _one(mesh, blurred, views=views, resolution=resolution, device=device)
     psnr, ssim = [], []
     for seen, _, uv in visible_uv(mesh, views, resolution, "cpu"):
         images = torch.tensor(fill_gaps(mesh.lightmap, mesh.mask)), small
-        pictures = [render.texture(image, uv).numpy() for image in images]
+        pictures = [raster.texture(image, uv).numpy() for image in images]
         psnr.append(metrics.psnr(*pictures, seen.numpy() >= 0, peak=report.peak))
         ssim.append(metrics.ssim(*pictures, seen.numpy() >= 0, data_range=report.peak))
     assert report.psnr == pytest.approx(np.mean(psnr), abs=1e-4)
@@ -212,7 +213,7 @@ def test_texels_in_the_mask_count(device):
 
     def decoder(uv, triangle, barycentric):
         asked.append((uv.cpu(), triangle.cpu(), barycentric.cpu()))
-        return render.texture(image.to(uv.device), uv) + 0.1 * (uv[:, :1] > 0.5)
+        return raster.texture(image.to(uv.device), uv) + 0.1 * (uv[:, :1] > 0.5)
 
     report = _one(mesh, decoder, views=[View.of([0, 0, 1])], device=device)
     assert report.texel_psnr == math.inf and report.psnr < 40.0

@@ -9,13 +9,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from atlas_meshes import charts, sheet
-from atlas_models import KINDS, random_model
+from builders.atlas_meshes import charts, sheet
+from builders.atlas_models import KINDS, random_model
 
 from wlm.atlas import codec, colour, export
 from wlm.atlas.data import from_arrays
 from wlm.atlas.decode import Decoder
-from wlm.atlas.reference import decode64
+from wlm.atlas.exact import decode64
 from wlm.atlas.shader import atlas_glsl
 from wlm.errors import WlmError
 from wlm.formats.dds import read_dds

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from atlas_meshes import charts, constant, sheet, soft, triangle
+from builders.atlas_meshes import charts, constant, sheet, soft, triangle
 
 from wlm.atlas import codec, fit
 from wlm.atlas import tiles as grid

@@ -7,7 +7,7 @@ import warp as wp
 from kernels.compare import close, exact
 from reference import cascade as reference
 
-from wlm import interop, render
+from wlm import interop
 from wlm.atlas import cascade
 from wlm.atlas.cascade import Textures, fit, fit_cascade, initial
 from wlm.atlas.cluster import Clusters, Stats
@@ -16,7 +16,8 @@ from wlm.atlas.model import Profile
 from wlm.atlas.pack import pack, regenerate
 from wlm.atlas.views import clip_positions, sphere_views
 from wlm.errors import WlmError
-from wlm.imageops import fill_gaps
+from wlm.ops import raster as ops_raster
+from wlm.texels import fill_gaps
 
 pytest.importorskip("uvunwrap")
 
@@ -94,7 +95,7 @@ def test_the_least_textures():
 
 @pytest.mark.parametrize("lut_scale", [0.7, 0.0])
 def test_a_steps_gradient_of_a_view(device: str, lut_scale: float):
-    """Against autograd through the drawing of ``wlm.render``, a float64 reading and the image losses."""
+    """Against autograd through the drawing of ``wlm.ops.raster``, a float64 reading and the image losses."""
     mesh, profile = _box(), _profile(lut_scale=lut_scale, gradient=0.6)
     uv, start = _start(mesh, profile)
     random = np.random.default_rng(1)
@@ -109,7 +110,7 @@ def test_a_steps_gradient_of_a_view(device: str, lut_scale: float):
         after = step.textures()
 
     clip = torch.tensor(clip_positions(mesh, sphere_views(profile.steps, 5)[0]))
-    raster = render.rasterize(clip, torch.tensor(mesh.triangle), 48, 48)
+    raster = ops_raster.rasterize(clip, torch.tensor(mesh.triangle), 48, 48)
     hit = raster.triangle >= 0
     weights = torch.cat([raster.barycentric, 1 - raster.barycentric.sum(-1, keepdim=True)], -1)[hit].double()
     old, new = ((weights[:, None] @ exact(each)[raster.triangle[hit]])[:, 0] for each in (mesh.uv[mesh.triangle], uv))

@@ -5,8 +5,8 @@ import pytest
 from reference import patches as reference
 
 from wlm.atlas.cluster import ORDERS, Clusters, cluster
-from wlm_kernels import patches as kernels
-from wlm_kernels.patches import SIZES
+from wlm_kernels.atlas import patches as kernels
+from wlm_kernels.atlas.patches import SIZES
 
 SIDE = (48, 64)  # rows, columns
 

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
-from lit_cube import DIRECTIONS, HEIGHT, WIDTH, corners, lit_cube, waves
+from builders.lit_cube import DIRECTIONS, HEIGHT, WIDTH, corners, lit_cube, waves
 
 from wlm.atlas.data import from_arrays
 from wlm.atlas.views import DISTANCE, View, clip_positions, normalised, sphere_views, visibility, visible_uv

@@ -6,16 +6,16 @@ import sys
 import numpy as np
 import pytest
 import torch
-from lit_cube import HEIGHT, WIDTH, lit_cube, waves
+from builders.lit_cube import HEIGHT, WIDTH, lit_cube, waves
 
-from wlm import render
 from wlm.atlas.data import from_arrays
 from wlm.atlas.evaluate import evaluate
 from wlm.atlas.resize import FILTERS, resize
 from wlm.baselines.atlas import ATLAS_BASELINES, best_astc, block_codec, downsampling, single_colour
 from wlm.errors import WlmError
 from wlm.formats.hdr_blocks import ASTC_BLOCKS
-from wlm.imageops import fill_gaps
+from wlm.ops import raster
+from wlm.texels import fill_gaps
 
 BITS = HEIGHT * WIDTH * 48
 FULL = np.ones((HEIGHT, WIDTH), bool)
@@ -98,7 +98,7 @@ def test_the_fit_has_the_least_squares():
         unit[number] = 1.0
         texture = torch.tensor(unit.reshape(*size, 3))
         y, x = (np.argwhere(mask) + 0.5).T / np.array([[12], [15]])
-        columns.append(render.texture(texture, torch.tensor(np.stack([x, y], 1), dtype=torch.float32)).numpy()[:, 0])
+        columns.append(raster.texture(texture, torch.tensor(np.stack([x, y], 1), dtype=torch.float32)).numpy()[:, 0])
     matrix = np.stack(columns, 1).astype(np.float64)
 
     def squares(texels):
@@ -186,7 +186,7 @@ def test_the_error_of_shared_colours_is_bounded(threshold):
     assert 0.0 < result.share < 1.0
     weight = np.random.default_rng(0).dirichlet([1.0] * 3, len(mesh.triangle))
     uv = torch.tensor((mesh.uv[mesh.triangle] * weight[..., None]).sum(1), dtype=torch.float32)
-    wanted = render.texture(torch.tensor(fill_gaps(mesh.lightmap, mesh.mask)), uv)
+    wanted = raster.texture(torch.tensor(fill_gaps(mesh.lightmap, mesh.mask)), uv)
     found = result.sample(uv, torch.arange(len(uv), dtype=torch.int32), torch.tensor(weight))
     # Colours were looked at a texel apart; between these they may go a little further.
     assert float((found - wanted).abs().max()) < limit * 1.1 + 2e-3

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from atlas_meshes import charts, constant, image, sheet, soft
+from builders.atlas_meshes import charts, constant, image, sheet, soft
 from typer.testing import CliRunner
 
 import wlm.bench.atlas as bench

@@ -17,10 +17,10 @@ from wlm.bench.smoke_setup import QUICK, Bench, number, percent
 from wlm.bench.smoke_setup import row as make_row
 from wlm.bench.timing import Timing
 from wlm.errors import WlmError
-from wlm.smoke.axes import Camera
-from wlm.smoke.reference import six_way
-from wlm.smoke.synthetic import make_plume
-from wlm.smoke.volume import DensityVolume
+from wlm.fluid.volume import DensityVolume
+from wlm.smoke.bake import six_way
+from wlm.smoke.camera import Camera
+from wlm.smoke.learn.synthetic import make_plume
 
 TINY = replace(
     QUICK,

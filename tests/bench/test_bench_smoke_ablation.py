@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from smoke_samples import small_pool
+from builders.smoke_samples import small_pool
 from typer.testing import CliRunner
 
 import wlm.bench.smoke_ablation as bench
@@ -13,10 +13,10 @@ from wlm.bench import Row, read_json, write_json
 from wlm.bench.report import figures, report, tables
 from wlm.bench.smoke_ablation import FULL, QUICK, AblationSizes, run, run_rows, variants
 from wlm.errors import WlmError
-from wlm.smoke.dataset import make_validation
 from wlm.smoke.evaluate import coarse, compare, evaluate
-from wlm.smoke.train import NetworkProfile
-from wlm.smoke.trainer import Trainer, plan_round
+from wlm.smoke.fit import NetworkProfile
+from wlm.smoke.learn.dataset import make_validation
+from wlm.smoke.learn.trainer import Trainer, plan_round
 
 SIZES = AblationSizes(dataset={"resolution": 32}, validation={"frames": 2}, rounds=2, steps=5)
 BASE = NetworkProfile(

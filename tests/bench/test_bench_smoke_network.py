@@ -17,12 +17,12 @@ from wlm.bench.smoke_network import PANELS, plotted, run, run_rows
 from wlm.bench.smoke_network_setup import QUICK, NetworkBench, Subject, open_subjects, score
 from wlm.config import profile_names
 from wlm.errors import WlmError
-from wlm.smoke.data import CameraSettings, make_camera
-from wlm.smoke.dataset import DatasetSettings
-from wlm.smoke.network import NetworkSettings, SixWayNetwork
-from wlm.smoke.network_file import save_network, shipped
-from wlm.smoke.reference import six_way
-from wlm.smoke.synthetic import make_plume
+from wlm.smoke.bake import six_way
+from wlm.smoke.codec import save_network, shipped
+from wlm.smoke.learn.dataset import DatasetSettings
+from wlm.smoke.learn.synthetic import make_plume
+from wlm.smoke.model import NetworkSettings, SixWayNetwork
+from wlm.smoke.scene import CameraSettings, make_camera
 
 TINY = replace(
     QUICK,

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from builders.small_sets import HOURS, moving_light, tiny_profile
 from PIL import Image
-from small_sets import HOURS, moving_light, tiny_profile
 from typer.testing import CliRunner
 
 import wlm

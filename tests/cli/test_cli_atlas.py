@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 import yaml
-from atlas_meshes import charts, sheet
+from builders.atlas_meshes import charts, sheet
 from PIL import Image
 from test_cli import call, fails
 

@@ -8,11 +8,11 @@ from functools import partial
 import numpy as np
 import pytest
 import yaml
-from probe_sets import synthetic
+from builders.probe_sets import synthetic
 from test_cli import call, fails
 
 import wlm.cli.probe
-from wlm.baselines import probes as baselines
+from wlm.baselines import probe as baselines
 from wlm.probe import codec, data, fit
 from wlm.probe.data import load_probes, save_probes
 from wlm.probe.decode import Decoder

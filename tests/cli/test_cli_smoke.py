@@ -8,22 +8,22 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from builders.smoke_plumes import SCENE, SPHERE, plume, write_frames
 from PIL import Image
-from smoke_plumes import SCENE, SPHERE, plume, write_frames
 from test_cli import call, fails
 
 import wlm.smoke.simulate
 from wlm.errors import WlmError
+from wlm.fluid.solver import Solver
+from wlm.fluid.volume import from_array, load_volume
 from wlm.formats.exr_planes import read_planes
-from wlm.smoke.axes import axis_faults
-from wlm.smoke.data import CameraSettings, LightSettings, Scene, make_camera
-from wlm.smoke.frames import CHECKPOINT, open_footage, open_frames, read_six_way, save_volume
+from wlm.smoke.bake import six_way
+from wlm.smoke.camera import axis_faults
+from wlm.smoke.data import CHECKPOINT, open_footage, open_frames, read_six_way, save_volume
+from wlm.smoke.export import read_flipbook
 from wlm.smoke.guide import guide
-from wlm.smoke.packing import read_flipbook
-from wlm.smoke.reference import six_way
+from wlm.smoke.scene import CameraSettings, LightSettings, Scene, make_camera
 from wlm.smoke.simulate import simulate
-from wlm.smoke.solver import Solver
-from wlm.smoke.volume import from_array, load_volume
 from wlm.view.smoke import picture, to_bytes
 
 SMALL = ("--resolution", 20, "--step", 1)

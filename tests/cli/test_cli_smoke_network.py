@@ -9,18 +9,19 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from smoke_plumes import plume, write_frames
+from builders.smoke_plumes import plume, write_frames
 from test_cli import call, fails
 
 from wlm.formats.artifact import read_artifact
-from wlm.smoke import dataset, network_file
+from wlm.smoke import codec
 from wlm.smoke.coarse import coarse_six_way
-from wlm.smoke.dataset import DatasetSettings
-from wlm.smoke.frames import open_footage, read_six_way, save_volume
-from wlm.smoke.infer import Predictor, predict
-from wlm.smoke.network_file import load_network, save_network, settings_of, shipped
-from wlm.smoke.samples import GUIDES
-from wlm.smoke.trainer import Trainer
+from wlm.smoke.codec import load_network, save_network, settings_of, shipped
+from wlm.smoke.data import open_footage, read_six_way, save_volume
+from wlm.smoke.decode import Predictor, predict
+from wlm.smoke.learn import dataset
+from wlm.smoke.learn.dataset import DatasetSettings
+from wlm.smoke.learn.trainer import Trainer
+from wlm.smoke.planes import GUIDES
 
 PROFILE = {
     "name": "tiny",
@@ -94,7 +95,7 @@ def test_a_training_is_stopped_and_resumed(trained, tmp_path, monkeypatch):
         if len(done) == 1:
             os.kill(os.getpid(), signal.SIGINT)
 
-    monkeypatch.setattr("wlm.smoke.train._CHUNK", 2)
+    monkeypatch.setattr("wlm.smoke.fit._CHUNK", 2)
     monkeypatch.setattr(Trainer, "run", interrupted)
     call(*words, code=130)
     monkeypatch.setattr(Trainer, "run", run)
@@ -171,10 +172,10 @@ def test_without_a_network_the_one_that_ships_is_used(network, volume, tmp_path,
     ours, same, other = (read_six_way(tmp_path / f"{name}.exr")[0].lightmaps for name in "abc")
     assert torch.equal(ours, same) and not torch.equal(ours, other)
     # On the shipped one's own smoke the others would take minutes.
-    monkeypatch.setattr(network_file, "shipped", lambda: network)
+    monkeypatch.setattr(codec, "shipped", lambda: network)
     text = call("smoke", "evaluate", "--resolution", 16, "--json", tmp_path / "a.json")
     assert str(network) in text.replace("\n", "") and json.loads((tmp_path / "a.json").read_text())["cells"] == 16
-    monkeypatch.setattr(network_file, "export_onnx", lambda made, *size: made.settings.width)
+    monkeypatch.setattr(codec, "export_onnx", lambda made, *size: made.settings.width)
     assert "8 bytes, 512 x 512 pixels" in call("smoke", "export", "-o", tmp_path / "a.onnx")
 
 

@@ -24,7 +24,7 @@ class Case:
         hidden, gelu, samples: As in ``Profile``.
         shape: Resolution and slices of F_uvt, columns and rows of the planes.
         periodic: A periodic axis of evenly spaced frames, or a clamped one from 0 to 1 in uneven steps.
-        emphasis: See ``wlm_kernels.temporal.Batch``; the weights are random where it isn't 0.
+        emphasis: See ``wlm_kernels.lightmap.features.Batch``; the weights are random where it isn't 0.
         numbers: Of the tiles in their grid.
         texels: How many texels of each tile are valid.
         settings: Other fields of ``Profile``.

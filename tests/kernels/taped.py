@@ -5,7 +5,8 @@ import torch
 import warp as wp
 
 from kernels.stepping import TILE, Problem, Step
-from wlm_kernels import blocks, grids, mlp
+from wlm_kernels import interpolate, mlp
+from wlm_kernels.lightmap import blocks
 
 
 @wp.kernel
@@ -124,9 +125,9 @@ def taped_step(problem: Problem, device: str) -> Step:
             maps["uv_endpoints"], maps["uv_weights"], tile, points["uv"], uv, quantised=problem.quantised
         )
         blocks.reconstruct(maps["uvt_endpoints"], maps["uvt_weights"], as_vec4, quantised=problem.quantised)
-        grids.sample_volume(as_floats, uvt_shape[0] // n, tile, points["uvt"], uvt, problem.periodic)
-        grids.sample_plane(maps["ut"], tile, points["ut"], ut, problem.periodic)
-        grids.sample_plane(maps["vt"], tile, points["vt"], vt, problem.periodic)
+        interpolate.sample_volume(as_floats, uvt_shape[0] // n, tile, points["uvt"], uvt, problem.periodic)
+        interpolate.sample_plane(maps["ut"], tile, points["ut"], ut, problem.periodic)
+        interpolate.sample_plane(maps["vt"], tile, points["vt"], vt, problem.periodic)
         wp.launch(_join, f.shape, inputs=[uv, uvt, ut, vt, encoding, noise], outputs=[f], device=device)
         h1 = gelu(layer(w, 0, inputs, f, width))
         h2 = gelu(layer(w, inputs + 1, inputs + 1 + width, h1, width))

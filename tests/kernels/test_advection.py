@@ -5,9 +5,18 @@ import pytest
 import warp as wp
 from reference.advection import Domain
 
-from wlm_kernels import advection_sources
-from wlm_kernels.advection import Fields, advect, correct
-from wlm_kernels.advection_places import CLOSED, OPEN, PERIODIC, make_box, make_bricks, mark_walls, relist, rings_for
+from wlm_kernels.fluid import advection_sources
+from wlm_kernels.fluid.advection import Fields, advect, correct
+from wlm_kernels.fluid.advection_places import (
+    CLOSED,
+    OPEN,
+    PERIODIC,
+    make_box,
+    make_bricks,
+    mark_walls,
+    relist,
+    rings_for,
+)
 
 WRAPPED = ((PERIODIC, PERIODIC),) * 3
 SHUT = ((CLOSED, CLOSED),) * 3

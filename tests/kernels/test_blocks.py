@@ -8,7 +8,7 @@ from reference import blocks as reference
 
 from kernels.compare import array, close, exact
 from wlm.formats.bc7 import decode_mode6, pack_mode6
-from wlm_kernels import blocks
+from wlm_kernels.lightmap import blocks
 
 SLICES, HEIGHT, WIDTH = 3, 8, 12
 

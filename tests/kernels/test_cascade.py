@@ -7,7 +7,7 @@ import warp as wp
 from reference import cascade as reference
 
 from kernels.compare import array, close, exact
-from wlm_kernels import cascade
+from wlm_kernels.atlas import cascade
 
 # Sides of T_p and of T_c, None: there is no T_c.
 SHAPES = [((7, 5), (6, 9)), ((4, 8), None), ((1, 6), (3, 1)), ((6, 1), (1, 4)), ((1, 1), (1, 1)), ((12, 12), (2, 2))]

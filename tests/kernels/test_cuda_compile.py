@@ -7,49 +7,39 @@ from pathlib import Path
 import pytest
 import warp as wp
 
-from wlm_kernels import (
-    advection,
-    advection_sources,
-    gaussian_sum,
-    lattice,
-    lattice_bricks,
-    lattice_fields,
-    lattice_links,
-    marching,
-    marching_coarse,
-    marching_motion,
-    marching_six,
-    mlp,
-    probe_decode,
-    probe_network,
-    probe_optimiser,
-    probe_step,
-    temporal_decode,
-    temporal_step,
-)
+from wlm_kernels import mlp
+from wlm_kernels.fluid import advection, advection_sources, lattice, lattice_bricks, lattice_fields, lattice_links
+from wlm_kernels.lightmap import decode as lightmap_decode
+from wlm_kernels.lightmap import step as lightmap_step
+from wlm_kernels.probe import decode as probe_decode
+from wlm_kernels.probe import gaussian_sum, optimiser
+from wlm_kernels.probe import network as probe_network
+from wlm_kernels.probe import step as probe_step
+from wlm_kernels.smoke import march as smoke_march
+from wlm_kernels.smoke import march_coarse, march_motion, march_six
 
 ARCHITECTURE = 90
 MODULES = (
-    "advection_places",
-    "blocks",
-    "cascade",
-    "gaussian_cubes",
-    "gaussian_sum",
-    "grids",
-    "lattice_bricks",
-    "lattice_links",
-    "lattice_solids",
+    "atlas.cascade",
+    "atlas.decode",
+    "atlas.patch_graph",
+    "atlas.patches",
+    "fluid.advection_places",
+    "fluid.lattice_bricks",
+    "fluid.lattice_links",
+    "fluid.lattice_solids",
+    "interpolate",
+    "lightmap.blocks",
+    "lightmap.decode",
+    "lightmap.gather",
     "mlp",
-    "patch_graph",
-    "patches",
-    "probe_step",
-    "raster",
-    "raster_gradient",
-    "temporal_decode",
-    "temporal_gather",
-    "texture",
-    "tile_decode",
-    "volume",
+    "probe.cubes",
+    "probe.gaussian_sum",
+    "probe.step",
+    "probe.volume",
+    "raster.gradient",
+    "raster.rasterize",
+    "raster.texture",
 )
 WIDTHS = (8, 17, 32, 64)
 
@@ -95,20 +85,20 @@ def test_mlp(hidden: int, gelu: str, tmp_path: Path):
 @pytest.mark.parametrize("dynamic", _slow_but(True, [False]))
 def test_step(dynamic: bool, hidden: int, gelu: str, tmp_path: Path):
     """The fused training step, whose CUDA form the CPU never runs."""
-    _compile_all(vars(temporal_step.step_kernels(dynamic, hidden, gelu, "cuda")).values(), tmp_path)
+    _compile_all(vars(lightmap_step.step_kernels(dynamic, hidden, gelu, "cuda")).values(), tmp_path)
 
 
 @pytest.mark.parametrize("hidden", _slow_but(16, WIDTHS))
 @pytest.mark.parametrize("dynamic", _slow_but(True, [False]))
 def test_exact_decode(dynamic: bool, hidden: int, tmp_path: Path):
     """Decoding a texel a thread."""
-    _compile_all(temporal_decode.exact_kernels(dynamic, hidden, "tanh"), tmp_path)
+    _compile_all(lightmap_decode.exact_kernels(dynamic, hidden, "tanh"), tmp_path)
 
 
 @pytest.mark.parametrize("hidden", _slow_but(16, WIDTHS))
 def test_strip_decode(hidden: int, tmp_path: Path):
     """Decoding four texels a thread."""
-    _compile_all(vars(temporal_decode.strip_kernels(hidden, "fast")).values(), tmp_path)
+    _compile_all(vars(lightmap_decode.strip_kernels(hidden, "fast")).values(), tmp_path)
 
 
 @pytest.mark.parametrize("latent", _slow_but(9, [1, 12, 32]))
@@ -116,7 +106,7 @@ def test_gaussians(latent: int, tmp_path: Path):
     """The sum of Gaussians at any point, a training step's, and the update."""
     _compile_all(vars(gaussian_sum.sum_kernels(latent)).values(), tmp_path / "sum")
     _compile_all(vars(probe_step.step_kernels(latent, "cuda")).values(), tmp_path / "step")
-    _compile_all([probe_optimiser.update_kernel(latent)], tmp_path / "update")
+    _compile_all([optimiser.update_kernel(latent)], tmp_path / "update")
 
 
 @pytest.mark.parametrize(
@@ -135,16 +125,16 @@ def test_probe_network(latent: int, hidden: int, outputs: int, tmp_path: Path):
 @pytest.mark.parametrize("dtype", _slow_but(wp.float16, [wp.float32]))
 def test_marching(dtype: type, tmp_path: Path):
     """Marches through densities of either type."""
-    _compile_all(vars(marching.guide_kernels(dtype)).values(), tmp_path / "guide")
-    _compile_all(vars(marching_six.six_kernels(dtype)).values(), tmp_path / "six")
-    _compile_all([marching_motion.motion_kernel(dtype)], tmp_path / "motion")
+    _compile_all(vars(smoke_march.guide_kernels(dtype)).values(), tmp_path / "guide")
+    _compile_all(vars(march_six.six_kernels(dtype)).values(), tmp_path / "six")
+    _compile_all([march_motion.motion_kernel(dtype)], tmp_path / "motion")
 
 
 @pytest.mark.parametrize("hot", _slow_but(True, [False]))
 @pytest.mark.parametrize("dtype", _slow_but(wp.float16, [wp.float32]))
 def test_coarse_marching(dtype: type, hot: bool, tmp_path: Path):
     """The march of all six lights in large steps, with emission and without."""
-    _compile_all(marching_coarse.coarse_kernels(dtype, hot), tmp_path)
+    _compile_all(march_coarse.coarse_kernels(dtype, hot), tmp_path)
 
 
 LATTICE_STEPS = (

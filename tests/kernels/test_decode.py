@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
+from builders.synthetic import random_model
 from reference import temporal as reference
-from synthetic import random_model
 
 from kernels.compare import array, close, exact
 from kernels.stepping import TILE, Case, draw, trainer

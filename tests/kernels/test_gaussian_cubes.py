@@ -9,8 +9,9 @@ import warp as wp
 from reference import gaussians as reference
 
 from kernels.compare import array
-from wlm_kernels import gaussian_cubes, gaussian_sum
-from wlm_kernels.gaussian_cubes import TESTS, Cubes, cube_of
+from wlm_kernels.probe import cubes as probe_cubes
+from wlm_kernels.probe import gaussian_sum
+from wlm_kernels.probe.cubes import TESTS, Cubes, cube_of
 
 CUT = 3.0
 LOW, HIGH = [-0.2, 0.0, 0.1], [1.0, 0.7, 0.9]
@@ -81,7 +82,7 @@ def _distances(rows: np.ndarray, cubes: Cubes, test: str, support: str) -> np.nd
 def test_lists_hold_what_meets_the_cube(device: str, test: str, support: str):
     """Against float64; "exact" against a solver of bounded least squares."""
     rows = _gaussians(30, 20.0)
-    cubes = gaussian_cubes.build(_shapes(rows, device, support), LOW, HIGH, 0.3, test=test)
+    cubes = probe_cubes.build(_shapes(rows, device, support), LOW, HIGH, 0.3, test=test)
     assert [*cubes.counts] == [4, 3, 3]
     far = _distances(rows, cubes, test, support)
     listed = _table(cubes, len(rows))
@@ -95,7 +96,7 @@ def test_exact_lists_of_needles_and_sheets(device: str, anisotropy: float, longe
     """The nearest point of a cube, where the ellipsoid's axes differ by more than float32 can tell."""
     rows = _gaussians(16, anisotropy, longest)
     rows[::2, 4] = rows[::2, 3]
-    cubes = gaussian_cubes.build(_shapes(rows, device), LOW, HIGH, 0.25, test="exact")
+    cubes = probe_cubes.build(_shapes(rows, device), LOW, HIGH, 0.25, test="exact")
     far = _distances(rows, cubes, "exact", "ellipsoid")
     listed = _table(cubes, len(rows))
     assert listed[far <= 1.0].all()
@@ -131,20 +132,20 @@ def test_no_list_lacks_a_gaussian_that_reaches(device: str, anisotropy: float, o
         gaussian_sum.sum(used, shapes, None, x, want, CUT)
         for test, size in itertools.product(TESTS, (0.03, 0.31)):
             f = wp.zeros_like(want)
-            gaussian_sum.sum(used, shapes, gaussian_cubes.build(shapes, low, high, size, test=test), x, f, CUT)
+            gaussian_sum.sum(used, shapes, probe_cubes.build(shapes, low, high, size, test=test), x, f, CUT)
             np.testing.assert_array_equal(f.numpy(), want.numpy())
 
 
 def test_exact_lists_are_the_shortest(device: str):
     shapes = _shapes(_gaussians(200, 20.0), device)
-    box, sphere, exact = (_table(gaussian_cubes.build(shapes, LOW, HIGH, 0.1, test=t), 200) for t in TESTS)
+    box, sphere, exact = (_table(probe_cubes.build(shapes, LOW, HIGH, 0.1, test=t), 200) for t in TESTS)
     assert not (exact & ~box).any() and not (exact & ~sphere).any()
     assert exact.sum() < 0.6 * box.sum() and box.sum() < 0.6 * sphere.sum()
 
 
 def test_cube_of_points(device: str):
     """The cube of a point, the nearest one outside of the grid, and some cube for a NaN."""
-    cubes = gaussian_cubes.build(_shapes(_gaussians(3, 2.0), device), LOW, HIGH, 0.3)
+    cubes = probe_cubes.build(_shapes(_gaussians(3, 2.0), device), LOW, HIGH, 0.3)
     random = np.random.default_rng(2)
     x = np.concatenate([random.random((200, 3)) * 4 - 2, [LOW, HIGH, [np.inf, -np.inf, 1e30], [np.nan] * 3]])
     x = x.astype(np.float32)
@@ -165,7 +166,7 @@ def test_hard_gaussians(device: str, test: str):
     rows[2, :3], rows[2, 3:6] = [9.0, 0.35, 0.35], np.log(1e-2)
     rows[3, 0] = np.nan
     rows[4, 4] = np.nan
-    cubes = gaussian_cubes.build(_shapes(rows, device), [0, 0, 0], [1, 1, 1], 0.1, test=test)
+    cubes = probe_cubes.build(_shapes(rows, device), [0, 0, 0], [1, 1, 1], 0.1, test=test)
     listed = _table(cubes, 5).reshape(10, 10, 10, 5)
     assert np.argwhere(listed[..., 0]).tolist() == [[3, 3, 3]]
     assert listed[..., [1, 3, 4]].all()
@@ -176,7 +177,7 @@ def test_hard_gaussians(device: str, test: str):
 def test_no_gaussians(device: str, test: str):
     """Empty lists; one cube where its size is left to us."""
     for size, count in ((0.5, 12), (None, 1)):
-        cubes = gaussian_cubes.build(_shapes(np.zeros((0, 11), np.float32), device), LOW, HIGH, size, test=test)
+        cubes = probe_cubes.build(_shapes(np.zeros((0, 11), np.float32), device), LOW, HIGH, size, test=test)
         assert cubes.start.numpy().tolist() == [0] * (count + 1) and cubes.item.shape == (0,)
 
 
@@ -188,7 +189,7 @@ def test_flat_boxes(device: str, test: str):
         high = np.array(HIGH)
         high[:axes] = LOW[:axes]
         for size in (0.05, None):
-            cubes = gaussian_cubes.build(_shapes(rows, device), LOW, high, size, test=test)
+            cubes = probe_cubes.build(_shapes(rows, device), LOW, high, size, test=test)
             counts = [*cubes.counts]
             assert counts[:axes] == [1] * axes and all(count > 1 for count in counts[axes:])
             assert _table(cubes, 40).any(0).all()
@@ -197,24 +198,24 @@ def test_flat_boxes(device: str, test: str):
 def test_chosen_size(device: str):
     """A quarter of the median reach, or coarser by powers of two where that makes too much."""
     rows = _gaussians(100, 1.0, longest=0.1)
-    cubes = gaussian_cubes.build(_shapes(rows, device), LOW, HIGH)
+    cubes = probe_cubes.build(_shapes(rows, device), LOW, HIGH)
     assert cubes.size == pytest.approx(0.25 * CUT * 0.1)
     rows[:, 3:6] = np.log(1e-3)
-    cubes = gaussian_cubes.build(_shapes(rows, device), LOW, HIGH)
+    cubes = probe_cubes.build(_shapes(rows, device), LOW, HIGH)
     most = 4096 + 8 * 100
     assert most / 8 < np.prod([*cubes.counts]) <= most
     doubled = np.log2(cubes.size / (0.25 * CUT * 1e-3))
     assert doubled == pytest.approx(round(doubled), abs=1e-3)
     # A few small ones don't make the lists of many large ones long.
     rows[:45, 3:6] = np.log(0.5)
-    cubes = gaussian_cubes.build(_shapes(rows, device), LOW, HIGH)
+    cubes = probe_cubes.build(_shapes(rows, device), LOW, HIGH)
     assert len(cubes.item) <= 4096 + 256 * 100
 
 
 def test_everything_is_one_list(device: str):
-    cubes = gaussian_cubes.everything(5, device)
+    cubes = probe_cubes.everything(5, device)
     assert [items.tolist() for items in _lists(cubes)] == [[0, 1, 2, 3, 4]]
-    assert gaussian_cubes.everything(0, device).start.numpy().tolist() == [0, 0]
+    assert probe_cubes.everything(0, device).start.numpy().tolist() == [0, 0]
 
 
 @pytest.mark.parametrize(
@@ -235,4 +236,4 @@ def test_everything_is_one_list(device: str):
 def test_wrong_arguments(arguments: tuple, options: dict, message: str):
     rows = np.tile(np.array([0.5, 0.5, 0.5, 1, 1, 1, 1, 0, 0, 0, 1], np.float32), (3, 1))
     with pytest.raises(ValueError, match=message):
-        gaussian_cubes.build(_shapes(rows, "cpu"), *arguments, **options)
+        probe_cubes.build(_shapes(rows, "cpu"), *arguments, **options)

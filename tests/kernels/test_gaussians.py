@@ -9,9 +9,10 @@ import warp as wp
 from reference import gaussians as reference
 
 from kernels.compare import array, close
-from wlm_kernels import gaussian_cubes, gaussian_sum
-from wlm_kernels.gaussian_cubes import TESTS
-from wlm_kernels.gaussian_sum import SUPPORTS
+from wlm_kernels.probe import cubes as probe_cubes
+from wlm_kernels.probe import gaussian_sum
+from wlm_kernels.probe.cubes import TESTS
+from wlm_kernels.probe.gaussian_sum import SUPPORTS
 
 TOLERANCE = 2e-5  # of a group's largest gradient; float32 gives 6e-6 where a needle is 30 times as long as wide
 CUT = 3.0
@@ -55,7 +56,7 @@ class Sums:
         self.x = array(problem.x, wp.vec3, device)
         self.grad_f = array(problem.grad_f, float, device)
         self.shapes = gaussian_sum.shapes(self.rows, cut, support)
-        self.cubes = test and gaussian_cubes.build(self.shapes, *CORNERS, test=test)
+        self.cubes = test and probe_cubes.build(self.shapes, *CORNERS, test=test)
 
     def forward(self) -> np.ndarray:
         f = wp.full(self.grad_f.shape, np.nan, dtype=float, device=self.rows.device)

@@ -7,7 +7,7 @@ import warp as wp
 from reference import grids as reference
 
 from kernels.compare import array, close, exact
-from wlm_kernels import grids
+from wlm_kernels import interpolate
 
 # Each axis is one cell long in one of them.
 PLANES = [(2, 5, 7, 3), (1, 1, 6, 2), (3, 4, 1, 1), (1, 1, 1, 5)]  # S, T, W, C
@@ -35,9 +35,9 @@ def _run(values: wp.array, times: int, slices: wp.array, points: wp.array, perio
     """Samples a plane (points of 2) or a volume (of 3, its first two axes joined)."""
     out = wp.zeros((len(points), values.shape[-1]), dtype=float, device=values.device, requires_grad=True)
     if points.dtype == wp.vec2:
-        grids.sample_plane(values, slices, points, out, periodic)
+        interpolate.sample_plane(values, slices, points, out, periodic)
     else:
-        grids.sample_volume(values, times, slices, points, out, periodic)
+        interpolate.sample_volume(values, times, slices, points, out, periodic)
     return out
 
 

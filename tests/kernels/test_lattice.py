@@ -7,11 +7,11 @@ import pytest
 import warp as wp
 from reference import lattice as reference
 
-from wlm.smoke import lattice_engine
-from wlm.smoke.lattice import Lattice
-from wlm_kernels.lattice import CAUSES, Spec, step_kernel, trouble_of
-from wlm_kernels.lattice_sets import LATTICES, brick_shape
-from wlm_kernels.lattice_solids import voxelise_mesh, voxelise_sphere
+from wlm.fluid import engine
+from wlm.fluid.lattice import Lattice
+from wlm_kernels.fluid.lattice import CAUSES, Spec, step_kernel, trouble_of
+from wlm_kernels.fluid.lattice_sets import LATTICES, brick_shape
+from wlm_kernels.fluid.lattice_solids import voxelise_mesh, voxelise_sphere
 
 STEPS = 4
 SHAPE = (5, 4, 3)
@@ -206,7 +206,7 @@ def test_places_of_64_bits(device: str, monkeypatch: pytest.MonkeyPatch):
     closed = {face: ("wall", np.zeros(3)) for face in ("-y", "+y")}
     short = Pair("D3Q19", device, closed)
     assert not short.device._engine.spec.wide
-    monkeypatch.setattr(lattice_engine, "NARROW", 0)
+    monkeypatch.setattr(engine, "NARROW", 0)
     for storage, tolerance in (("float32", TOLERANCE), ("float16", HALF_TOLERANCE)):
         pair = Pair("D3Q19", device, closed, storage=storage)
         assert pair.device._engine.spec.wide

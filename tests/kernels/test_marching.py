@@ -7,7 +7,8 @@ from reference import marching as reference
 from reference.marching import Scene
 
 from kernels.compare import array, close
-from wlm_kernels import marching, marching_six
+from wlm_kernels.smoke import march as smoke_march
+from wlm_kernels.smoke import march_six
 
 TYPES = {"float": wp.float32, "half": wp.float16}
 LOOSE = 2e-5  # of the largest value: what float32 leaves of sums over 100 samples
@@ -28,15 +29,15 @@ def _scene(turned: bool, perspective: bool = False, inside: bool = False, seed: 
     return Scene(density, 0.3, origin, *axes, pitch, 14, 11, perspective)
 
 
-def _view(scene: Scene) -> marching.View:
-    return marching.view(
+def _view(scene: Scene) -> smoke_march.View:
+    return smoke_march.view(
         scene.origin, scene.right, scene.up, -scene.toward, scene.pitch, scene.width, scene.height, scene.perspective
     )
 
 
 def _guide(scene: Scene, device: str, dtype=wp.float32, **options) -> np.ndarray:
     out = wp.full((3, scene.height, scene.width), np.nan, dtype=float, device=device)
-    marching.guide(array(scene.density, dtype, device), scene.extinction, _view(scene), out, **options)
+    smoke_march.guide(array(scene.density, dtype, device), scene.extinction, _view(scene), out, **options)
     return out.numpy()
 
 
@@ -44,13 +45,13 @@ def _six(scene: Scene, device: str, dtype=wp.float32, temperature=None, **option
     out = wp.full((8, scene.height, scene.width), np.nan, dtype=float, device=device)
     if temperature is not None:
         options["temperature"] = array(temperature, dtype, device)
-    marching_six.six_way(array(scene.density, dtype, device), scene.extinction, _view(scene), out, **options)
+    march_six.six_way(array(scene.density, dtype, device), scene.extinction, _view(scene), out, **options)
     return out.numpy()
 
 
 def _lit(scene: Scene, device: str, toward: np.ndarray, **options) -> np.ndarray:
     out = wp.full((scene.height, scene.width), np.nan, dtype=float, device=device)
-    marching_six.lit(array(scene.density, float, device), scene.extinction, _view(scene), toward, out, **options)
+    march_six.lit(array(scene.density, float, device), scene.extinction, _view(scene), toward, out, **options)
     return out.numpy()
 
 
@@ -69,7 +70,7 @@ def test_guide_against_reference(device: str, turned: bool, perspective: bool, k
 def test_shared_lights(device: str):
     """The lattice holds what the reference marches; with nodes a voxel apart the map is nearly the marched one."""
     scene = _scene(True)
-    nodes = marching.lattice(array(scene.density, float, device), scene.extinction, scene.up, 2.5)
+    nodes = smoke_march.lattice(array(scene.density, float, device), scene.extinction, scene.up, 2.5)
     close(nodes.numpy(), reference.nodes(scene, 2.5), LOOSE, "nodes")
     marched, coarse, fine = (
         _guide(scene, device, step=step, jitter=0.0, shared=shared)[0]
@@ -78,7 +79,7 @@ def test_shared_lights(device: str):
     error = [np.sqrt(np.square(got - marched).mean() / np.square(marched).mean()) for got in (coarse, fine)]
     # Of noise from voxel to voxel, the worst that a lattice can meet.
     assert error[1] < 0.012 < error[0] < 0.2
-    nodes = marching.lattice(array(scene.density, float, device), scene.extinction, scene.up, 0.01)
+    nodes = smoke_march.lattice(array(scene.density, float, device), scene.extinction, scene.up, 0.01)
     assert nodes.shape == (11, 14, 12)
 
 
@@ -114,7 +115,7 @@ def test_six_way_against_reference(device: str, turned: bool, inside: bool, kind
     """With the same samples, in slabs of a few planes; from inside the smoke too, and smoke that glows."""
     scene = _scene(turned, inside=inside)
     hot = np.random.default_rng(1).uniform(0, 1, scene.density.shape).astype(np.float16).astype(np.float32)
-    monkeypatch.setattr(marching_six, "_SLAB_BYTES", 16 * scene.height * scene.width * 5)
+    monkeypatch.setattr(march_six, "_SLAB_BYTES", 16 * scene.height * scene.width * 5)
     got = _six(scene, device, TYPES[kind], hot, step=0.8, g=0.4, emission=0.2)
     want = reference.six_way(scene, 0.8, 0.4, hot, 0.2)
     for plane in range(8):
@@ -178,16 +179,16 @@ def test_transmittance(device: str):
     points = np.array([[-5, 10, 4.5], [32, 10, 4.5], [50, 10, 4.5], [32, 100, 4.5], [32, 10, 4.5]])
     out = wp.full(5, np.nan, dtype=float, device=device)
     grid, at = array(density, float, device), array(points, wp.vec3, device)
-    marching.transmittance(grid, 0.1, at, (1.0, 0.0, 0.0), 0.25, out)
+    smoke_march.transmittance(grid, 0.1, at, (1.0, 0.0, 0.0), 0.25, out)
     np.testing.assert_allclose(out.numpy(), np.exp([-1.6, -0.8, 0, 0, -0.8]), rtol=1e-5)
-    np.testing.assert_array_equal(marching.occupied(grid).numpy()[:, 0, 0], [0, 0, 1, 1, 1])
+    np.testing.assert_array_equal(smoke_march.occupied(grid).numpy()[:, 0, 0], [0, 0, 1, 1, 1])
     random = np.random.default_rng(7)
     sparse = np.where(random.random((40, 20, 9)) < 0.02, 1.0, 0.0).astype(np.float32)
     scene = Scene(sparse, 0.5, *np.zeros((4, 3)), 1, 1, 1)
     p, way = random.uniform(0, [40, 20, 9], (50, 3)), np.array([0.6, 0.0, 0.8])
     out = wp.full(50, np.nan, dtype=float, device=device)
     grid = array(scene.density, float, device)
-    marching.transmittance(grid, 0.5, array(p, wp.vec3, device), way, 0.4, out)
+    smoke_march.transmittance(grid, 0.5, array(p, wp.vec3, device), way, 0.4, out)
     close(out, np.exp(-reference.depth_to(scene, p.astype(np.float32), way, 0.4)), LOOSE, "transmittance")
 
 
@@ -228,6 +229,6 @@ def test_hard_scenes(device: str, name: str, kind: str):
 
 def test_wrong_camera():
     grid, out = wp.zeros((2, 2, 2), dtype=float, device="cpu"), wp.zeros((8, 2, 2), dtype=float, device="cpu")
-    view = marching.view((0, 0, 5), (1, 0, 0), (0, 1, 0), (0, 0, -1), 0.1, 2, 2, perspective=True)
+    view = smoke_march.view((0, 0, 5), (1, 0, 0), (0, 1, 0), (0, 0, -1), 0.1, 2, 2, perspective=True)
     with pytest.raises(ValueError, match="need an orthographic camera"):
-        marching_six.six_way(grid, 1.0, view, out)
+        march_six.six_way(grid, 1.0, view, out)

@@ -5,7 +5,7 @@ import pytest
 import torch
 import warp as wp
 
-from wlm_kernels.naf_block import STRIP, kernels, lanes
+from wlm_kernels.smoke.naf_block import STRIP, kernels, lanes
 
 
 def _run(kernel, dim, inputs, shape, half, device) -> np.ndarray:

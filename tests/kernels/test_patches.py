@@ -5,9 +5,9 @@ import pytest
 import warp as wp
 from reference import patches as reference
 
-from wlm_kernels import patch_graph as graphs
-from wlm_kernels import patches as kernels
-from wlm_kernels.patches import ORDERS, SIZES
+from wlm_kernels.atlas import patch_graph as graphs
+from wlm_kernels.atlas import patches as kernels
+from wlm_kernels.atlas.patches import ORDERS, SIZES
 
 SIDE = (24, 40)
 

@@ -7,8 +7,9 @@ import warp as wp
 from reference import probe_network as reference
 
 from kernels.compare import array, close, exact
-from wlm_kernels import probe_network, probe_step
-from wlm_kernels.probe_step import GROUP
+from wlm_kernels.probe import network as probe_network
+from wlm_kernels.probe import step as probe_step
+from wlm_kernels.probe.step import GROUP
 
 TOLERANCE = 1e-4  # of an array's largest gradient; float32 gives 3e-6 on the CPU, the GPU's own exp a little more
 # Latent, units, outputs: the standard profile, the least of each, and what no multiple of 4 or 8 fits; for the long

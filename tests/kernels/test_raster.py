@@ -7,9 +7,9 @@ import warp as wp
 from reference import raster as reference
 
 from kernels.compare import array, close, exact
-from wlm_kernels import raster_gradient
-from wlm_kernels.raster import Raster, Rasterizer
-from wlm_kernels.raster_edges import exact_sign
+from wlm_kernels.raster import gradient as raster_gradient
+from wlm_kernels.raster.edges import exact_sign
+from wlm_kernels.raster.rasterize import Raster, Rasterizer
 
 # None: as the device does; 1: every triangle is cut into tiles.
 SPLITS = [None, 1]

@@ -6,8 +6,9 @@ import torch
 import torch.nn.functional as F
 import warp as wp
 
-from wlm_kernels import marching_coarse, six_planes
-from wlm_kernels.six_planes import LIGHTS, PLANES, STRIP, Taps, decode, encode_six, kernels
+from wlm_kernels.smoke import march_coarse
+from wlm_kernels.smoke import planes as smoke_planes
+from wlm_kernels.smoke.planes import LIGHTS, PLANES, STRIP, Taps, decode, encode_six, kernels
 
 _EVERY = [(plane % 2, 5 * plane) for plane in range(PLANES)]  # a group and a first output for each plane
 
@@ -141,7 +142,7 @@ def test_the_guide_of_six_lights(device, size, hot):
     out = wp.full(planes.shape, -1.0, dtype=float, device=device)
     encode_six(_array(planes, False, device), near, far, hot, out)
     found = torch.from_numpy(out.numpy()).double()
-    of = dict(zip(marching_coarse.PLANES, planes.double(), strict=True))
+    of = dict(zip(march_coarse.PLANES, planes.double(), strict=True))
     glow = of["emission"].clamp(min=0) if hot else torch.zeros(size, dtype=torch.float64)
     depth = ((far - of["depth"]) / (far - near)).clamp(0, 1) * (of["depth"] > 0)
     lights = [_srgb(of[name]) for name in ("right", "left", "top", "bottom", "front", "back")]
@@ -180,7 +181,7 @@ def test_wrong_edges_and_reaches_are_refused():
 @pytest.mark.parametrize("half", [False, True])
 def test_compiles_for_a_gpu(tmp_path, half):
     made = kernels(5, 8, half, True)
-    alone = {"encode": six_planes._encode_six, "decode": six_planes._decode}
+    alone = {"encode": smoke_planes._encode_six, "decode": smoke_planes._decode}
     for name, kernel in {"near": made.near, "compose": made.compose, **alone}.items():
         files = wp.compile_aot_module(kernel.module, arch=[90], module_dir=tmp_path / name)
         assert any(path.suffix in (".ptx", ".cubin") and path.stat().st_size for path in files)

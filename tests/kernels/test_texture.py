@@ -7,8 +7,8 @@ import warp as wp
 from reference import texture as reference
 
 from kernels.compare import array, close, exact
-from wlm_kernels import texture
-from wlm_kernels.texture import BOUNDARIES, FILTERS
+from wlm_kernels.raster import texture
+from wlm_kernels.raster.texture import BOUNDARIES, FILTERS
 
 SHAPES = [(7, 5, 3), (4, 8, 1), (1, 6, 2), (6, 1, 2), (1, 1, 4), (3, 3, 17)]  # H, W, C
 

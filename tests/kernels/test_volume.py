@@ -8,7 +8,7 @@ import warp as wp
 from reference import volume as reference
 
 from kernels.compare import array, close
-from wlm_kernels import volume
+from wlm_kernels.probe import volume
 
 SIDE = 4
 SIZES = (0.5, 1.0, 4.0)

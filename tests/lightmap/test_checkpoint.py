@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from small_sets import moving_light, static_light, tiny_profile
+from builders.small_sets import moving_light, static_light, tiny_profile
 
 from wlm.errors import WlmError
 from wlm.formats.artifact import read_artifact, write_artifact

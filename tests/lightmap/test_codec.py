@@ -3,7 +3,7 @@ import resource
 
 import numpy as np
 import pytest
-from synthetic import random_model
+from builders.synthetic import random_model
 
 from wlm.errors import WlmError
 from wlm.formats.artifact import read_artifact, write_artifact

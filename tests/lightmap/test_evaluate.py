@@ -3,7 +3,7 @@ import math
 
 import numpy as np
 import pytest
-from small_sets import moving_light, static_light, tiny_profile
+from builders.small_sets import moving_light, static_light, tiny_profile
 
 from wlm.errors import WlmError
 from wlm.lightmap import codec

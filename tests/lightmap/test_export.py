@@ -9,15 +9,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import texture2ddecoder
+from builders.synthetic import random_model
 from PIL import Image
 from scipy.special import erf
-from synthetic import random_model
 
 from wlm.errors import WlmError
 from wlm.formats.bc7 import decode_image
 from wlm.lightmap.decode import Decoder
+from wlm.lightmap.exact import colour_tile64, decode_tile64
 from wlm.lightmap.export import export
-from wlm.lightmap.reference import colour_tile64, decode_tile64
 from wlm.lightmap.shader import decode_glsl
 
 TIMES = (7.5, 3.3, 21.7)  # stored, between, and across midnight (or past the end)

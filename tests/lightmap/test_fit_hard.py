@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from small_sets import HOURS, moving_light, static_light, tiny_profile
+from builders.small_sets import HOURS, moving_light, static_light, tiny_profile
 
 from wlm.errors import WlmError
 from wlm.lightmap import codec

@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from synthetic import random_model
+from builders.synthetic import random_model
 
 from wlm import interop
 from wlm.errors import WlmError
 from wlm.lightmap.decode import Decoder
-from wlm.lightmap.reference import colour_tile64
+from wlm.lightmap.exact import colour_tile64
 from wlm.lightmap.runtime import ExactDecoder, StripDecoder
 from wlm.lightmap.tiles import TileKind
 

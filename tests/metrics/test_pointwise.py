@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from wlm.errors import WlmError
-from wlm.imageops import fill_gaps
 from wlm.metrics import PSNR_CAP_DB, dynamic_range, half_ulp, max_abs_error, mse, psnr
+from wlm.texels import fill_gaps
 
 
 def test_psnr_of_four_numbers_by_hand():

@@ -5,7 +5,7 @@ import zlib
 
 import numpy as np
 import pytest
-from probe_models import random_model
+from builders.probe_models import random_model
 
 from wlm.errors import WlmError
 from wlm.formats.artifact import read_artifact, write_artifact

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from probe_sets import synthetic
+from builders.probe_sets import synthetic
 
 from wlm.errors import WlmError
 from wlm.probe import data

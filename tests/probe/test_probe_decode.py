@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from probe_models import EXTENT, ORIGIN, SIZE, random_model
+from builders.probe_models import EXTENT, ORIGIN, SIZE, random_model
 
 from wlm.errors import WlmError
 from wlm.probe.decode import CULLINGS, Decoder
-from wlm.probe.reference import decode64
+from wlm.probe.exact import decode64
 
 RANDOM = np.random.default_rng(11)
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from probe_models import EXTENT, ORIGIN, SIZE, random_model
+from builders.probe_models import EXTENT, ORIGIN, SIZE, random_model
 
 from wlm.errors import WlmError
 from wlm.probe.data import load_probes

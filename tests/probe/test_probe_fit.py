@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from probe_sets import synthetic
+from builders.probe_sets import synthetic
 
 from wlm.errors import WlmError
 from wlm.probe.data import from_arrays

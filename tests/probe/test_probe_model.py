@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from probe_models import EXTENT, ORIGIN, SIZE, random_model
+from builders.probe_models import EXTENT, ORIGIN, SIZE, random_model
 from pydantic import ValidationError
 
 from wlm.config import profile_names

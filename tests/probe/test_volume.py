@@ -8,7 +8,7 @@ import pytest
 from reference import volume as reference
 
 from wlm.errors import WlmError
-from wlm.probe.probe_index import ProbeIndex
+from wlm.probe.index import ProbeIndex
 from wlm.probe.volume import SIDE, SIZES, FrameStats, Volume
 
 # A multiple of every block's side, so that all of a scene can move by it.

@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from smoke_plumes import plume
+from builders.smoke_plumes import plume
 
-from wlm.smoke.axes import DIRECTIONS, Camera
+from wlm.fluid.volume import DensityVolume, from_array
+from wlm.smoke.bake import SixWay, six_way
+from wlm.smoke.camera import DIRECTIONS, Camera
 from wlm.smoke.coarse import coarse_six_way
 from wlm.smoke.guide import guide
-from wlm.smoke.reference import SixWay, six_way
-from wlm.smoke.volume import DensityVolume, from_array
-from wlm_kernels import marching_coarse
+from wlm_kernels.smoke import march_coarse
 
 TURNED = (0.5, 0.3, 1.0)
 VIEWS = {"turned": TURNED, "diagonal": (1.0, 1.0, 1.0), "above": (0.0, 1.0, 0.0), "axis": (0.0, 0.0, 1.0)}
@@ -170,12 +170,12 @@ def test_empty_bricks_change_nothing(device: str, dtype: torch.dtype, monkeypatc
     camera = _camera(volume)
     skipped = coarse_six_way(volume, camera, step=1.5).planes
     made = []
-    occupied = marching_coarse.occupied
-    monkeypatch.setattr(marching_coarse, "occupied", lambda *args: made.append(occupied(*args)) or made[-1])
+    occupied = march_coarse.occupied
+    monkeypatch.setattr(march_coarse, "occupied", lambda *args: made.append(occupied(*args)) or made[-1])
     coarse_six_way(volume, camera, step=7.9)
     (bricks,) = made
     assert 0 < bricks.numpy().sum() < bricks.size
-    monkeypatch.setattr(marching_coarse, "BRICK", 0)
+    monkeypatch.setattr(march_coarse, "BRICK", 0)
     torch.testing.assert_close(coarse_six_way(volume, camera, step=1.5).planes, skipped, rtol=0, atol=1e-6)
     assert len(made) == 1
 
@@ -262,7 +262,7 @@ def test_nodes_are_bounded(device: str):
     assert torch.equal(coarse_six_way(volume, camera, step=1.0, spacing=0.01, light_step=0.25).planes, wanted)
     for shape, spacing in (((400, 400, 400), 1.0), ((10**6, 1, 1), 5.0), ((2, 30000, 30000), 1e-3)):
         view, _ = _camera(volume, toward=VIEWS["diagonal"]).view(np.zeros(3), 1.0, shape)
-        lattice, counts = marching_coarse._lattice(shape, view, spacing)
+        lattice, counts = march_coarse._lattice(shape, view, spacing)
         assert min(counts) >= 2 and np.prod(counts, dtype=float) < 1.01 * 2**28
         # They cover the eight corners.
         corners = np.array(list(np.ndindex(2, 2, 2))) * (np.array(shape) + 1.0) - 0.5 - np.array(view.origin)

@@ -10,12 +10,13 @@ from PIL import Image
 from pydantic import ValidationError
 from typer.testing import CliRunner
 
-import wlm.smoke.dataset as dataset
+import wlm.smoke.learn.dataset as dataset
 from wlm.cli.smoke_network import register
 from wlm.errors import WlmError
-from wlm.smoke.axes import axis_faults
-from wlm.smoke.data import Air
-from wlm.smoke.dataset import (
+from wlm.fluid.solver import LEAST_HALF_LOSS
+from wlm.smoke.bake import six_way
+from wlm.smoke.camera import axis_faults
+from wlm.smoke.learn.dataset import (
     ATTEMPTS,
     STAGES,
     DatasetSettings,
@@ -24,12 +25,11 @@ from wlm.smoke.dataset import (
     make_pool,
     make_validation,
 )
-from wlm.smoke.pool_file import load_pool, save_pool
-from wlm.smoke.reference import six_way
-from wlm.smoke.samples import EMISSION_PLANE, OPACITY_PLANE, Pool, from_srgb
-from wlm.smoke.scenes import Tilted
+from wlm.smoke.learn.pool_file import load_pool, save_pool
+from wlm.smoke.learn.scenes import Tilted
+from wlm.smoke.planes import EMISSION_PLANE, OPACITY_PLANE, Pool, from_srgb
+from wlm.smoke.scene import Air
 from wlm.smoke.simulate import make_solver, volume_of
-from wlm.smoke.solver import LEAST_HALF_LOSS
 from wlm.view.smoke_pool import pool_sheet
 
 SMALL = DatasetSettings(

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from wlm.smoke.axes import Camera
+from wlm.fluid.volume import DensityVolume, from_array
+from wlm.smoke.camera import Camera
 from wlm.smoke.guide import guide, transmittance
-from wlm.smoke.volume import DensityVolume, from_array
 
 
 def _ball(device: str, n: int = 32, voxel: float = 0.5, extinction: float = 0.4) -> DensityVolume:

@@ -7,11 +7,11 @@ import math
 import pytest
 import torch
 import torch.nn.functional as F
+from builders.smoke_samples import small_pool
 from pydantic import ValidationError
-from smoke_samples import small_pool
 
 from wlm.errors import WlmError
-from wlm.smoke.losses import Losses, LossSettings, Perceptual, temporal, warp
+from wlm.smoke.learn.losses import Losses, LossSettings, Perceptual, temporal, warp
 
 
 def _have_trunk() -> None:

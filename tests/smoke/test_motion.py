@@ -7,14 +7,14 @@ import warp as wp
 from reference.marching import span as clip
 from reference.marching import trilinear
 
-from wlm.smoke.axes import Camera
-from wlm.smoke.dataset import DatasetSettings, make_validation
-from wlm.smoke.losses import warp
+from wlm.fluid.volume import DensityVolume, from_array
+from wlm.smoke.bake import six_way
+from wlm.smoke.camera import Camera
+from wlm.smoke.learn.dataset import DatasetSettings, make_validation
+from wlm.smoke.learn.losses import warp
 from wlm.smoke.motion import motion
-from wlm.smoke.reference import six_way
-from wlm.smoke.samples import OPACITY_PLANE
-from wlm.smoke.volume import DensityVolume, from_array
-from wlm_kernels.marching_motion import motion_kernel
+from wlm.smoke.planes import OPACITY_PLANE
+from wlm_kernels.smoke.march_motion import motion_kernel
 
 SIZE = 24
 

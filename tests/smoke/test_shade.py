@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from wlm.smoke.axes import VECTORS, Camera
-from wlm.smoke.reference import SixWay
+from wlm.smoke.bake import SixWay
+from wlm.smoke.camera import VECTORS, Camera
 from wlm.smoke.shade import Light, Ramp, composite, obstacle_visibility, shade
 
 FULL = (4 * math.pi,) * 3

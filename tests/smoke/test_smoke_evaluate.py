@@ -7,13 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from smoke_plumes import plume
-from smoke_samples import small_pool
+from builders.smoke_plumes import plume
+from builders.smoke_samples import small_pool
 
+from wlm.baselines.smoke import billboard
 from wlm.errors import WlmError
 from wlm.metrics.error import psnr_from_mse
-from wlm.smoke.baselines import billboard
-from wlm.smoke.dataset import DatasetSettings, _fixed_cameras, load_probe_volume, make_validation
+from wlm.smoke.bake import six_way
+from wlm.smoke.data import save_volume
+from wlm.smoke.decode import Predictor
 from wlm.smoke.evaluate import (
     COARSE,
     FLIP_BOOK,
@@ -26,11 +28,9 @@ from wlm.smoke.evaluate import (
     flip_book,
     of_predictor,
 )
-from wlm.smoke.frames import save_volume
-from wlm.smoke.infer import Predictor
-from wlm.smoke.network import NetworkSettings, SixWayNetwork
-from wlm.smoke.reference import six_way
-from wlm.smoke.samples import GUIDES, OPACITY_PLANE, PLANES, Pool, encode_lightmaps
+from wlm.smoke.learn.dataset import DatasetSettings, _fixed_cameras, load_probe_volume, make_validation
+from wlm.smoke.model import NetworkSettings, SixWayNetwork
+from wlm.smoke.planes import GUIDES, OPACITY_PLANE, PLANES, Pool, encode_lightmaps
 
 TINY = {"width": 8, "levels": 2}
 FEW = DatasetSettings(

@@ -6,18 +6,18 @@ from dataclasses import replace
 
 import pytest
 import torch
-from smoke_samples import small_pool
+from builders.smoke_samples import small_pool
 
 from wlm.config import profile_names
 from wlm.errors import WlmError
 from wlm.formats.artifact import read_artifact
+from wlm.smoke.codec import load_network
 from wlm.smoke.evaluate import evaluate
-from wlm.smoke.losses import LossSettings
-from wlm.smoke.network import NetworkSettings, SixWayNetwork
-from wlm.smoke.network_file import load_network
-from wlm.smoke.samples import GUIDES, OPACITY_PLANE, PLANES, Pool
-from wlm.smoke.train import NetworkProfile, load_profile, train
-from wlm.smoke.trainer import Plan, Trainer, TrainSettings, plan_round
+from wlm.smoke.fit import NetworkProfile, load_profile, train
+from wlm.smoke.learn.losses import LossSettings
+from wlm.smoke.learn.trainer import Plan, Trainer, TrainSettings, plan_round
+from wlm.smoke.model import NetworkSettings, SixWayNetwork
+from wlm.smoke.planes import GUIDES, OPACITY_PLANE, PLANES, Pool
 
 TINY = NetworkSettings(width=8, levels=2)
 
@@ -72,7 +72,7 @@ def test_it_learns_a_small_pool_by_heart(tmp_path, device):
 
 @pytest.mark.parametrize("losses", [LossSettings(), LossSettings(temporal=0.1)])
 def test_a_stopped_training_ends_as_if_it_had_not_been(tmp_path, monkeypatch, losses):
-    monkeypatch.setattr("wlm.smoke.train._CHUNK", 2)
+    monkeypatch.setattr("wlm.smoke.fit._CHUNK", 2)
     profile = _profile(losses=losses)
     whole = _train(tmp_path / "whole", profile, seed=1)
 
@@ -146,7 +146,7 @@ def test_the_best_is_trusted_only_with_its_network(tmp_path, how):
 
 
 def test_curves_and_progress_tell_how_it_goes(tmp_path, monkeypatch):
-    monkeypatch.setattr("wlm.smoke.train._CHUNK", 3)
+    monkeypatch.setattr("wlm.smoke.fit._CHUNK", 3)
     seen = []
     result = _train(tmp_path / "a", _profile(rounds=3, validate_every=2), progress=seen.append)
     assert [(at.round, at.step, at.steps) for at in seen] == [(i // 2, 3 * (i + 1), 18) for i in range(6)]
@@ -176,7 +176,7 @@ def test_the_best_network_is_kept(tmp_path):
 
 
 def test_an_untrained_network_is_kept_until_there_is_a_better_one(tmp_path, monkeypatch):
-    monkeypatch.setattr("wlm.smoke.train._CHUNK", 2)
+    monkeypatch.setattr("wlm.smoke.fit._CHUNK", 2)
     result = _train(tmp_path / "a", _profile(), minutes=0.0)
     summary = load_network(tmp_path / "a")[1]
     assert not result.finished and result.steps > 0
@@ -235,7 +235,7 @@ def test_a_step_of_nan_is_left_out(device):
 
 
 def test_a_training_that_diverges_ends(tmp_path, monkeypatch):
-    monkeypatch.setattr("wlm.smoke.train._CHUNK", 4)
+    monkeypatch.setattr("wlm.smoke.fit._CHUNK", 4)
     real = Trainer._gather
 
     def endless(self, *args):

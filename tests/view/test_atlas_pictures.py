@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from atlas_meshes import charts, constant, sheet, triangle
+from builders.atlas_meshes import charts, constant, sheet, triangle
 from PIL import Image
 
 from wlm.atlas.views import View

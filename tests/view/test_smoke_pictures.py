@@ -5,13 +5,13 @@ import math
 import numpy as np
 import pytest
 import torch
+from builders.smoke_plumes import plume
 from PIL import Image
-from smoke_plumes import plume
 
 from wlm.errors import WlmError
-from wlm.smoke.data import CameraSettings, LightSettings, Obstacle, make_camera
+from wlm.smoke.bake import SixWay, six_way
 from wlm.smoke.guide import guide
-from wlm.smoke.reference import SixWay, six_way
+from wlm.smoke.scene import CameraSettings, LightSettings, Obstacle, make_camera
 from wlm.smoke.shade import Light, Ramp
 from wlm.view.smoke import (
     contact_sheet,

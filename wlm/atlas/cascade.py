@@ -2,7 +2,7 @@
 (lightmap-uv-clustering-cascade, section 3.3).
 
 T_p begins as the regenerated lightmap made smaller by epsilon_p, T_c as the coordinates of its own texels' centres;
-``wlm_kernels.cascade`` says how they are read. Adam then tunes both:
+``wlm_kernels.atlas.cascade`` says how they are read. Adam then tunes both:
 
     space "views"   A step draws the mesh from one random camera of ``views``, with the old UVs and the lightmap, its
                     gaps filled, and with the new UVs and the cascade. The loss is the L1 of the colours, and
@@ -41,10 +41,10 @@ from wlm.atlas.resize import resize
 from wlm.atlas.views import DISTANCE, normalised, sphere_views
 from wlm.errors import WlmError
 from wlm.formats.exr import HALF_MAX
-from wlm.imageops import fill_gaps
-from wlm_kernels import cascade as kernels
-from wlm_kernels import texture as texture_kernels
-from wlm_kernels.raster import Rasterizer
+from wlm.texels import fill_gaps
+from wlm_kernels.atlas import cascade as kernels
+from wlm_kernels.raster import texture as texture_kernels
+from wlm_kernels.raster.rasterize import Rasterizer
 
 __all__ = ["Textures", "fit", "fit_cascade", "initial"]
 

@@ -1,8 +1,8 @@
 """Groups of triangles whose lighting looks alike (lightmap-uv-clustering-cascade, sections 3.1 and 3.2).
 
-Patches of the triangles (``wlm_kernels.patches``) are the nodes of a graph, with an edge where Dist is below lambda in
-one of the six orders of the vertices. The node with most edges, the lowest number of equals, represents a group: itself
-and its neighbours. The group is taken out and the rest counted anew, until no edge is left (eq. 6).
+Patches of the triangles (``wlm_kernels.atlas.patches``) are the nodes of a graph, with an edge where Dist is below
+lambda in one of the six orders of the vertices. The node with most edges, the lowest number of equals, represents a
+group: itself and its neighbours. The group is taken out and the rest counted anew, until no edge is left (eq. 6).
 
 Edges are never stored but told again from the patches, so that memory grows with the triangles and the texels that
 they cover alone: at most ``samples_of(largest)`` words a triangle.
@@ -35,9 +35,9 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from wlm_kernels import patch_graph as graphs
-from wlm_kernels import patches as kernels
-from wlm_kernels.patches import ORDERS, SIZES
+from wlm_kernels.atlas import patch_graph as graphs
+from wlm_kernels.atlas import patches as kernels
+from wlm_kernels.atlas.patches import ORDERS, SIZES
 
 __all__ = ["ORDERS", "Clusters", "Stats", "cluster"]
 
@@ -109,7 +109,7 @@ def cluster(
         colour_threshold: lambda_h, the largest distance of two dominant colours (section 3.2.1); at least 0.
         max_radiance: Triangles that are brighter stay alone (section 4.1.1); it also maps to 255 of 8 bits; above 0.
         active: bool [F], which triangles take part; None for all.
-        largest: The largest size of a patch, one of ``wlm_kernels.patches.SIZES``.
+        largest: The largest size of a patch, one of ``wlm_kernels.atlas.patches.SIZES``.
         device: "cpu" or "cuda:N"; the result is the same on all.
         progress: Called with the triangles done and their number, at first while edges are counted, then while groups
             are taken.

@@ -47,7 +47,7 @@ from wlm.formats.gltf import GltfDocument, GltfPrimitive, document_from_arrays, 
 from wlm.formats.gltf_writer import Replacement, write_glb
 from wlm.formats.mask import read_mask
 from wlm.formats.obj import read_obj
-from wlm.imageops import repair
+from wlm.texels import repair
 
 __all__ = ["LightmappedMesh", "Part", "from_arrays", "load_mesh", "write_mesh"]
 

@@ -9,8 +9,8 @@ from wlm.atlas.data import LightmappedMesh
 from wlm.atlas.model import AtlasModel
 from wlm.atlas.views import texel_triangles
 from wlm.errors import WlmError
-from wlm.imageops import fill_gaps
-from wlm_kernels import cascade, tile_decode
+from wlm.texels import fill_gaps
+from wlm_kernels.atlas import cascade, decode
 
 __all__ = ["Decoder"]
 
@@ -69,7 +69,7 @@ class Decoder:
         """
         model = self.model
         if model.method == "tiles":
-            tile_decode.decode(
+            decode.decode(
                 uv,
                 model.height,
                 model.width,

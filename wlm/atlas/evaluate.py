@@ -36,14 +36,14 @@ import numpy as np
 import torch
 from scipy.ndimage import distance_transform_edt
 
-from wlm import render
 from wlm.atlas.charts import mesh_charts, welded
 from wlm.atlas.data import LightmappedMesh
 from wlm.atlas.views import View, sphere_views, texel_triangles, visible_uv
 from wlm.errors import WlmError
-from wlm.imageops import fill_gaps
 from wlm.interop import check_device
 from wlm.metrics import PSNR_CAP_DB, SSIM_WINDOW
+from wlm.ops import raster
+from wlm.texels import fill_gaps
 
 __all__ = ["Report", "Sampler", "evaluate"]
 
@@ -152,7 +152,7 @@ def evaluate(
             hit = seen >= 0
             points = _Points.of(uv[hit], seen[hit], barycentric[hit])
             if len(points.uv):
-                wanted = render.texture(image, points.uv).double()
+                wanted = raster.texture(image, points.uv).double()
                 similar = _Similarity(hit, wanted, peak)
                 border = _near_border(seen, chart[seen.clamp(min=0).long()], place)[hit]
                 for name, decoder in decoders.items():
@@ -186,7 +186,7 @@ def _peak(mesh: LightmappedMesh, image: torch.Tensor, cameras: Sequence[View], r
     """Largest less smallest of the reference in all views. Drawing twice is cheaper than keeping what all views see."""
     low, high = math.inf, -math.inf
     for seen, _, uv in visible_uv(mesh, cameras, resolution, str(image.device)):
-        colour = render.texture(image, uv[seen >= 0])
+        colour = raster.texture(image, uv[seen >= 0])
         if len(colour):
             low, high = min(low, float(colour.min())), max(high, float(colour.max()))
     if high < low:
@@ -295,7 +295,7 @@ def _texel_errors(mesh: LightmappedMesh, image: torch.Tensor, decoders: Mapping[
     points = _Points.of(uv, found[hit].int(), barycentric[hit])
     if not len(uv):
         return dict.fromkeys(decoders, math.nan)
-    wanted = render.texture(image, uv).double()
+    wanted = raster.texture(image, uv).double()
     return {
         name: float((points.decode(decoder, mesh, name) - wanted).square().mean()) for name, decoder in decoders.items()
     }

@@ -35,8 +35,8 @@ from wlm.atlas.resize import fitting_size, resize
 from wlm.atlas.views import sphere_views, surface_points, texel_triangles, visibility
 from wlm.errors import WlmError
 from wlm.formats.exr import HALF_MAX
-from wlm.imageops import fill_gaps
-from wlm.render import texture
+from wlm.ops.raster import texture
+from wlm.texels import fill_gaps
 
 __all__ = ["Cells", "Progress", "compress", "weights"]
 

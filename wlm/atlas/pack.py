@@ -33,8 +33,8 @@ from wlm.atlas.charts import charts, welded
 from wlm.atlas.cluster import ORDERS, Clusters
 from wlm.atlas.data import LightmappedMesh
 from wlm.errors import WlmError
-from wlm.imageops import fill_gaps
-from wlm.render import rasterize_uv, texture
+from wlm.ops.raster import rasterize_uv, texture
+from wlm.texels import fill_gaps
 
 __all__ = ["Packed", "pack", "regenerate"]
 

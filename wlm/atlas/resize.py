@@ -4,7 +4,7 @@ import numpy as np
 import scipy.sparse as sparse
 
 from wlm.formats.exr import HALF_MAX
-from wlm.imageops import fill_gaps
+from wlm.texels import fill_gaps
 
 __all__ = ["FILTERS", "fitting_size", "resize"]
 

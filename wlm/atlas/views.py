@@ -16,9 +16,9 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from wlm import render
 from wlm.atlas.data import LightmappedMesh
 from wlm.interop import check_device
+from wlm.ops import raster as ops_raster
 
 __all__ = [
     "View",
@@ -111,7 +111,7 @@ def normalised(mesh: LightmappedMesh) -> np.ndarray:
 
 
 def clip_positions(mesh: LightmappedMesh, view: View) -> np.ndarray:
-    """The vertices as a camera sees them, for ``wlm.render.rasterize``.
+    """The vertices as a camera sees them, for ``wlm.ops.raster.rasterize``.
 
     Args:
         mesh: The mesh.
@@ -159,11 +159,11 @@ def visible_uv(
     active = torch.tensor(mesh.active, device=device)
     for view in views:
         with torch.no_grad():
-            raster = render.rasterize(
+            raster = ops_raster.rasterize(
                 torch.tensor(_project(position, view), device=device), triangle, resolution, resolution
             )
             seen, barycentric = raster.triangle, raster.barycentric
-            at = render.interpolate(uv, triangle, raster)
+            at = ops_raster.interpolate(uv, triangle, raster)
             if not mesh.active.all():
                 shown = (seen >= 0) & active[seen.clamp(min=0).long()]
                 seen = torch.where(shown, seen, -1)
@@ -214,7 +214,7 @@ def texel_triangles(mesh: LightmappedMesh, height: int, width: int, device: str)
         2], the weights of its corners 0 and 1.
     """
     active = torch.tensor(np.flatnonzero(mesh.active), device=device)
-    raster = render.rasterize_uv(
+    raster = ops_raster.rasterize_uv(
         torch.tensor(mesh.uv, dtype=torch.float32, device=device),
         torch.tensor(mesh.triangle, device=device)[active],
         height,

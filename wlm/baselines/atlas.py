@@ -19,14 +19,14 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from wlm import render
 from wlm.atlas.coverage import touched_texels
 from wlm.atlas.data import LightmappedMesh
 from wlm.atlas.evaluate import Sampler
 from wlm.atlas.model import SOURCE_BITS
 from wlm.atlas.resize import FILTERS, fitting_size, resize
 from wlm.formats import hdr_blocks
-from wlm.imageops import fill_gaps
+from wlm.ops import raster
+from wlm.texels import fill_gaps
 
 __all__ = ["ATLAS_BASELINES", "Baseline", "best_astc", "block_codec", "downsampling", "single_colour"]
 
@@ -170,7 +170,7 @@ def single_colour(mesh: LightmappedMesh, share: float | None = None, threshold: 
     def sample(uv: torch.Tensor, triangle: torch.Tensor, barycentric: torch.Tensor) -> torch.Tensor:
         device = uv.device
         own = torch.tensor(number, device=device)[triangle.long()]
-        read = render.texture(torch.tensor(image, device=device), uv)
+        read = raster.texture(torch.tensor(image, device=device), uv)
         return torch.where(own[:, None] >= 0, torch.tensor(palette, device=device)[own], read)
 
     return _baseline("single colour", None, mesh, texels * SOURCE_BITS, start, sample)
@@ -225,7 +225,7 @@ def _colour_range(mesh: LightmappedMesh, image: torch.Tensor) -> tuple[np.ndarra
         members = np.flatnonzero(parts == count)
         for piece in np.array_split(members, math.ceil(len(members) * len(weight) / _SAMPLES_AT_ONCE)):
             uv = torch.tensor(np.einsum("sk,fkc->fsc", weight, corner[piece]), dtype=torch.float32)
-            colour = render.texture(image, uv).numpy()
+            colour = raster.texture(image, uv).numpy()
             low[piece], high[piece] = colour.min(axis=1), colour.max(axis=1)
     return low, high
 
@@ -235,7 +235,7 @@ def _texture(name: str, mesh: LightmappedMesh, texels: np.ndarray, bits: int, st
     image = np.ascontiguousarray(texels, np.float32)
 
     def sample(uv: torch.Tensor, triangle: torch.Tensor, barycentric: torch.Tensor) -> torch.Tensor:
-        return render.texture(torch.tensor(image, device=uv.device), uv)
+        return raster.texture(torch.tensor(image, device=uv.device), uv)
 
     return _baseline(name, texels.shape[:2], mesh, bits, start, sample)
 

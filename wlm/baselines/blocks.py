@@ -19,7 +19,7 @@ import numpy as np
 from wlm.errors import WlmError
 from wlm.formats import hdr_blocks
 from wlm.formats.hdr_blocks import ASTC_MEDIUM, need
-from wlm.imageops import fill_gaps
+from wlm.texels import fill_gaps
 
 __all__ = [
     "BASELINES",

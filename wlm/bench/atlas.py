@@ -36,16 +36,16 @@ from wlm.atlas import codec
 from wlm.atlas.data import from_arrays
 from wlm.atlas.decode import Decoder
 from wlm.atlas.evaluate import Report, Sampler, evaluate
+from wlm.atlas.exact import decode64
 from wlm.atlas.fit import compress
 from wlm.atlas.model import SOURCE_BITS, AtlasModel, Profile, load_profile
-from wlm.atlas.reference import decode64
 from wlm.atlas.views import surface_points
 from wlm.baselines.atlas import ATLAS_BASELINES
 from wlm.bench.atlas_inputs import Lightmap
 from wlm.bench.plot import Panel
 from wlm.bench.runner import Row, read_json, run_peers
 from wlm.errors import WlmError
-from wlm.imageops import fill_gaps
+from wlm.texels import fill_gaps
 
 __all__ = ["PANELS", "PROFILES", "plotted", "run", "run_rivals", "run_rows"]
 

@@ -26,16 +26,16 @@ import numpy as np
 import wlm
 from wlm import interop
 from wlm.baselines import BASELINES
-from wlm.baselines.plain_torch import PlainFit
+from wlm.baselines.lightmap_torch import PlainFit
 from wlm.bench.runner import Row, run_peers
 from wlm.errors import WlmError
 from wlm.lightmap import codec
 from wlm.lightmap.data import LightmapSet, load_set
 from wlm.lightmap.decode import Decoder
 from wlm.lightmap.evaluate import bits_per_texel
+from wlm.lightmap.exact import bound64, colour_tile64, decode_tile64
 from wlm.lightmap.fit import compress, dynamic_targets
 from wlm.lightmap.model import TILE, LightmapModel, Profile, TimeAxis, encode_time, load_profile
-from wlm.lightmap.reference import bound64, colour_tile64, decode_tile64
 from wlm.lightmap.runtime import ExactDecoder, StripDecoder
 from wlm.lightmap.tiles import TileGrid, TileKind, assemble
 from wlm.metrics import METRICS, Summary, evaluate_frame, summarise

@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 
 from wlm.errors import WlmError, one_line
-from wlm.smoke.axes import VECTORS, Camera
-from wlm.smoke.data import CameraSettings, make_camera
-from wlm.smoke.synthetic import make_plume
-from wlm.smoke.volume import DensityVolume
+from wlm.fluid.volume import DensityVolume
+from wlm.smoke.camera import VECTORS, Camera
+from wlm.smoke.learn.synthetic import make_plume
+from wlm.smoke.scene import CameraSettings, make_camera
 
 __all__ = ["GPU", "PathTracer", "choose_variant", "denoise", "has_denoiser", "has_tracer", "try_variant"]
 

@@ -10,7 +10,7 @@ For each set these kinds of rows, but where another is named:
   the ellipsoids of the first fit by their spheres. The cuts below the profile's are those of the decode alone.
 - method "fit", the first profile on the first set alone: the speed of the fit, and method "dense torch": as many steps
   in plain torch, all of them on CUDA, else a few.
-- the rivals of ``wlm.baselines.probes`` at the bytes of the first profile's file and at three times as many, and
+- the rivals of ``wlm.baselines.probe`` at the bytes of the first profile's file and at three times as many, and
   Unreal's packing, which has one size. A bit a probe for the dead ones is counted for them too.
 - method "volume": a walk with the cascaded volume over the decoder, and a teleport into an empty one.
 
@@ -32,8 +32,8 @@ import warp as wp
 
 import wlm
 from wlm import interop
-from wlm.baselines.dense_gaussians import DenseFit
-from wlm.baselines.probes import WEIGHT_BITS, Result, at_bytes, unreal_packing
+from wlm.baselines.probe import WEIGHT_BITS, Result, at_bytes, unreal_packing
+from wlm.baselines.probe_torch import DenseFit
 from wlm.bench.plot import Panel
 from wlm.bench.runner import Row, read_json, run_peers
 from wlm.errors import WlmError
@@ -41,9 +41,9 @@ from wlm.probe import codec
 from wlm.probe.data import ProbeSet, load_probes
 from wlm.probe.decode import Decoder, Points
 from wlm.probe.evaluate import Report, evaluate
+from wlm.probe.exact import decode64
 from wlm.probe.fit import compress
 from wlm.probe.model import ProbeModel, Profile, load_profile
-from wlm.probe.reference import decode64
 from wlm.probe.volume import SIZES, Volume
 from wlm.probe.walk import EYE_HEIGHT, camera_path, summary, walk
 

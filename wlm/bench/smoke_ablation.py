@@ -33,13 +33,13 @@ from wlm.bench.smoke_setup import number
 from wlm.bench.smoke_setup import row as smoke_row
 from wlm.errors import WlmError
 from wlm.interop import check_device
-from wlm.smoke.dataset import DatasetSettings, make_pool, make_validation
 from wlm.smoke.evaluate import COARSE, Evaluation, coarse, compare, evaluate
-from wlm.smoke.losses import Losses
-from wlm.smoke.network import SixWayNetwork, parameter_count
-from wlm.smoke.samples import PLANES, Pool
-from wlm.smoke.train import NetworkProfile, load_profile
-from wlm.smoke.trainer import Trainer, plan_round
+from wlm.smoke.fit import NetworkProfile, load_profile
+from wlm.smoke.learn.dataset import DatasetSettings, make_pool, make_validation
+from wlm.smoke.learn.losses import Losses
+from wlm.smoke.learn.trainer import Trainer, plan_round
+from wlm.smoke.model import SixWayNetwork, parameter_count
+from wlm.smoke.planes import PLANES, Pool
 
 __all__ = ["FULL", "METHOD", "QUICK", "AblationSizes", "run", "run_rows", "variants"]
 

@@ -11,11 +11,11 @@ import warp as wp
 
 from wlm.bench.runner import Row
 from wlm.bench.smoke_setup import Bench, number, percent, row
+from wlm.fluid.lattice import Lattice
 from wlm.interop import StepGraph, stream, to_warp
-from wlm.smoke.lattice import Lattice
-from wlm_kernels import advection, advection_places, advection_sources
-from wlm_kernels.lattice_sets import lattice as velocity_set
-from wlm_kernels.lattice_solids import voxelise_sphere
+from wlm_kernels.fluid import advection, advection_places, advection_sources
+from wlm_kernels.fluid.lattice_sets import lattice as velocity_set
+from wlm_kernels.fluid.lattice_solids import voxelise_sphere
 
 __all__ = ["advection_rows", "lattice_brick_rows", "lattice_rows", "smoke_brick_rows", "storage_rows"]
 

@@ -7,15 +7,15 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import torch
 
+from wlm.baselines.smoke import billboard
 from wlm.bench.path_tracer import GPU, PathTracer, choose_variant, denoise, has_denoiser, has_tracer
 from wlm.bench.runner import Row
 from wlm.bench.smoke_network_setup import EXACT, NetworkBench, Scores, Whole, row, score
 from wlm.bench.timing import time_together
 from wlm.errors import one_line
-from wlm.smoke.baselines import billboard
+from wlm.smoke.bake import SixWay, six_way
 from wlm.smoke.coarse import coarse_six_way
-from wlm.smoke.reference import SixWay, six_way
-from wlm.smoke.samples import encode_lightmaps, to_srgb
+from wlm.smoke.planes import encode_lightmaps, to_srgb
 
 __all__ = ["flipbook_rows", "traced_rows"]
 

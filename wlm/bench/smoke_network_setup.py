@@ -13,21 +13,21 @@ from wlm.bench.smoke_setup import Bench
 from wlm.bench.smoke_setup import row as smoke_row
 from wlm.bench.timing import Timing
 from wlm.errors import WlmError
+from wlm.fluid.solver import Solver
+from wlm.fluid.volume import DensityVolume
 from wlm.interop import StepGraph, stream
 from wlm.metrics.error import psnr_from_mse
-from wlm.smoke.axes import DIRECTIONS, Camera
-from wlm.smoke.data import CameraSettings, Scene, make_camera
-from wlm.smoke.dataset import DatasetSettings, draw_scene
-from wlm.smoke.infer import Predictor
+from wlm.smoke.bake import SixWay, six_way
+from wlm.smoke.camera import DIRECTIONS, Camera
+from wlm.smoke.codec import load_network, settings_of
+from wlm.smoke.decode import Predictor
+from wlm.smoke.fit import load_profile
+from wlm.smoke.learn.dataset import DatasetSettings, draw_scene
+from wlm.smoke.model import SixWayNetwork
 from wlm.smoke.motion import motion
-from wlm.smoke.network import SixWayNetwork
-from wlm.smoke.network_file import load_network, settings_of
-from wlm.smoke.reference import SixWay, six_way
-from wlm.smoke.samples import decode_lightmaps, encode_lightmaps, look_at
+from wlm.smoke.planes import decode_lightmaps, encode_lightmaps, look_at
+from wlm.smoke.scene import CameraSettings, Scene, make_camera
 from wlm.smoke.simulate import make_solver, volume_of
-from wlm.smoke.solver import Solver
-from wlm.smoke.train import load_profile
-from wlm.smoke.volume import DensityVolume
 
 __all__ = [
     "EXACT",

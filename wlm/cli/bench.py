@@ -224,7 +224,7 @@ def smoke_network(
     quiet_warp()
     from wlm.bench.smoke_network import PANELS, plotted, run
     from wlm.interop import check_device
-    from wlm.smoke.network_file import shipped
+    from wlm.smoke.codec import shipped
 
     device = check_device(device)
     measured = networks or ([] if profiles else [shipped()])

@@ -412,7 +412,7 @@ def _read_positions(path: Path) -> "np.ndarray":
 
 def _baselines(probes: "ProbeSet", size: int) -> "list[tuple[dict[str, Any], Report]]":
     """Scores what the rivals make of as many bytes; those for which they are too few are named."""
-    from wlm.baselines.probes import PROBE_BASELINES, at_bytes
+    from wlm.baselines.probe import PROBE_BASELINES, at_bytes
     from wlm.probe.evaluate import evaluate
 
     rows = []

@@ -43,9 +43,9 @@ from wlm.cli.smoke_options import (
 from wlm.errors import WlmError
 
 if TYPE_CHECKING:
-    from wlm.smoke.axes import Camera
-    from wlm.smoke.data import Scene
-    from wlm.smoke.reference import SixWay
+    from wlm.smoke.bake import SixWay
+    from wlm.smoke.camera import Camera
+    from wlm.smoke.scene import Scene
     from wlm.smoke.shade import Light
 
 __all__ = ["app"]
@@ -84,8 +84,8 @@ def simulate(
     """
     quiet_warp()
     from wlm.interop import check_device
-    from wlm.smoke.data import load_scene
-    from wlm.smoke.frames import open_frames
+    from wlm.smoke.data import open_frames
+    from wlm.smoke.scene import load_scene
     from wlm.smoke.simulate import make_solver, simulate
 
     device = check_device(device)
@@ -148,7 +148,7 @@ def guide(
 ) -> None:
     """Make guiding maps: light, transparency and depth, by a march in large steps (algorithm 1)."""
     quiet_warp()
-    from wlm.smoke.frames import write_guide
+    from wlm.smoke.data import write_guide
     from wlm.smoke.guide import guide
 
     footage = open_smoke(smoke, extinction, emission, device)
@@ -192,7 +192,7 @@ def bake(
     An EXR has the channels right, left, top, bottom, front, back, transparency and, of hot smoke, emission.
     """
     quiet_warp()
-    from wlm.smoke.reference import six_way
+    from wlm.smoke.bake import six_way
 
     footage = open_smoke(smoke, extinction, emission, device)
     view = {"resolution": resolution, "toward": toward, "turn": turn, "extent": extent, "distance": distance}
@@ -228,7 +228,7 @@ def shade(
     The lights are those given, else the scene's, else one from 1,1,1; an irradiance of 4 pi, the default, shows a
     lightmap as it is.
     """
-    from wlm.smoke.axes import RULES
+    from wlm.smoke.camera import RULES
 
     if rule not in RULES:
         raise WlmError(f"--rule: expected one of {', '.join(RULES)}, got {rule!r}")
@@ -289,14 +289,14 @@ def flipbook(
 ) -> None:
     """Pack six-way lightmaps into the two textures that an engine reads."""
     check_output(output, ".exr", ".png", ".tga")
-    from wlm.smoke.axes import EMISSION, LAYOUTS
+    from wlm.smoke.camera import EMISSION, LAYOUTS
 
     if layout not in LAYOUTS:
         raise WlmError(f"--layout: expected one of {', '.join(LAYOUTS)}, got {layout!r}")
     if gain is not None and not 0 < gain < float("inf"):
         raise WlmError(f"--gain: expected a number above 0, got {gain}")
     quiet_warp()
-    from wlm.smoke.packing import write_flipbook
+    from wlm.smoke.export import write_flipbook
 
     view = {"resolution": resolution, "toward": toward, "turn": turn, "extent": extent, "distance": distance}
     marching = {"step": step, "supersample": supersample}
@@ -337,7 +337,7 @@ def _scaled(scene: "Scene", scale: float) -> "Scene":
 
 def _light(text: str) -> "Light":
     toward, colon, irradiance = text.partition(":")
-    from wlm.smoke.data import LightSettings
+    from wlm.smoke.scene import LightSettings
 
     given: dict[str, Any] = {"toward": vector("--light", toward)}
     if colon:
@@ -360,7 +360,7 @@ def _shots(
 ) -> "tuple[Iterator[tuple[Path, SixWay, Camera, dict[str, Any]]], Scene | None]":
     """Lightmaps that were baked, or are now, with their cameras and, of frames, what else is in the picture."""
     from wlm.interop import check_device
-    from wlm.smoke.frames import SCENE_FILE, numbered, read_six_way
+    from wlm.smoke.data import SCENE_FILE, numbered, read_six_way
 
     folder = smoke.is_dir()
     if smoke.suffix.lower() == ".exr" or (folder and not (smoke / SCENE_FILE).exists()):
@@ -386,8 +386,8 @@ def _shots(
         fine = {"step": usual_step, "supersample": 1} | {k: v for k, v in marching.items() if v is not None}
 
         def made() -> "Iterator[tuple[Path, SixWay, Camera, dict[str, Any]]]":
+            from wlm.smoke.bake import six_way
             from wlm.smoke.guide import guide
-            from wlm.smoke.reference import six_way
 
             with progress_bar(stem) as bar:
                 for done, (path, frame) in enumerate(zip(paths, chosen, strict=True), 1):

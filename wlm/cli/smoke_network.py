@@ -35,11 +35,11 @@ from wlm.cli.smoke_options import (
 from wlm.errors import WlmError
 
 if TYPE_CHECKING:
-    from wlm.smoke.axes import Camera
+    from wlm.fluid.volume import DensityVolume
+    from wlm.smoke.bake import SixWay
+    from wlm.smoke.camera import Camera
     from wlm.smoke.evaluate import Comparison
-    from wlm.smoke.network import SixWayNetwork
-    from wlm.smoke.reference import SixWay
-    from wlm.smoke.volume import DensityVolume
+    from wlm.smoke.model import SixWayNetwork
 
 __all__ = ["register"]
 
@@ -79,9 +79,9 @@ def train(
     check_output(output, _SUFFIX)
     quiet_warp()
     from wlm.formats.checkpoint import SUFFIX
-    from wlm.smoke.dataset import make_pool, make_validation
-    from wlm.smoke.train import Progress, load_profile
-    from wlm.smoke.train import train as fit
+    from wlm.smoke.fit import Progress, load_profile
+    from wlm.smoke.fit import train as fit
+    from wlm.smoke.learn.dataset import make_pool, make_validation
 
     settings = load_profile(profile)
     kept = Path(f"{output}{SUFFIX}")
@@ -172,7 +172,7 @@ def predict(
     if step is not None and not coarse:
         raise WlmError("--step: expected --coarse beside it: a network looks as it was trained to")
     quiet_warp()
-    from wlm.smoke.network_file import shipped
+    from wlm.smoke.codec import shipped
 
     footage = open_smoke(smoke, extinction, emission, device)
     make = _coarse(step, seed) if coarse else _predicted(network or shipped(), seed, footage.device)
@@ -202,8 +202,8 @@ def evaluate(
         check_output(json_path, ".json")
     quiet_warp()
     from wlm.interop import check_device
+    from wlm.smoke.codec import load_network, settings_of, shipped
     from wlm.smoke.evaluate import evaluate_all
-    from wlm.smoke.network_file import load_network, settings_of, shipped
 
     device, network = check_device(device), network or shipped()
     loaded, summary = load_network(network, device=device)
@@ -225,8 +225,8 @@ def export(
     """Write a network as ONNX: encoded guiding maps to encoded lightmaps, of one size, in float32."""
     check_output(output, ".onnx")
     quiet_warp()
-    from wlm.smoke.network_file import export_onnx, load_network, shipped
-    from wlm.smoke.samples import GUIDES, PLANES
+    from wlm.smoke.codec import export_onnx, load_network, shipped
+    from wlm.smoke.planes import GUIDES, PLANES
 
     network = network or shipped()
     loaded, _ = load_network(network)
@@ -258,8 +258,8 @@ def dataset(
     quiet_warp()
     from wlm.config import load_settings
     from wlm.interop import check_device
-    from wlm.smoke.dataset import STAGES, DatasetSettings, make_pool, make_validation
-    from wlm.smoke.pool_file import save_pool
+    from wlm.smoke.learn.dataset import STAGES, DatasetSettings, make_pool, make_validation
+    from wlm.smoke.learn.pool_file import save_pool
     from wlm.view.smoke_pool import pool_sheet
 
     settings, device = load_settings(DatasetSettings, settings_file), check_device(device)
@@ -310,9 +310,9 @@ def _coarse(step: float | None, seed: int) -> "Callable[[DensityVolume, Camera],
 
 def _predicted(path: Path, seed: int, device: str) -> "Callable[[DensityVolume, Camera], SixWay]":
     """Makes lightmaps by a network, which looks as it was trained to."""
-    from wlm.smoke.infer import Predictor
-    from wlm.smoke.infer import predict as run
-    from wlm.smoke.network_file import load_network, settings_of
+    from wlm.smoke.codec import load_network, settings_of
+    from wlm.smoke.decode import Predictor
+    from wlm.smoke.decode import predict as run
 
     loaded, summary = load_network(path)
     settings = settings_of(path, summary)
@@ -334,7 +334,7 @@ def _predicted(path: Path, seed: int, device: str) -> "Callable[[DensityVolume, 
 
 def _described(path: Path, network: "SixWayNetwork", summary: dict[str, Any]) -> dict[str, Any]:
     """Which network it is, and how it was trained as far as its file says."""
-    from wlm.smoke.network import parameter_count
+    from wlm.smoke.model import parameter_count
 
     known = {name: summary[name] for name in ("profile", "seed", "steps", "seconds", "device") if name in summary}
     settings = network.settings.model_dump(mode="json")
@@ -342,7 +342,7 @@ def _described(path: Path, network: "SixWayNetwork", summary: dict[str, Any]) ->
 
 
 def _show_evaluation(path: Path, found: "list[Comparison]") -> None:
-    from wlm.smoke.samples import PLANES
+    from wlm.smoke.planes import PLANES
 
     scores = table(str(path), ["smoke", "method", "PSNR", "lowest", "highest", "flicker"], text=["method"])
     planes = table(f"{path}: PSNR of each plane", ["smoke", "method", *PLANES], text=["method"])

@@ -10,10 +10,10 @@ from wlm.cli.console import check_output, escape, note, number, progress_bar, sh
 from wlm.errors import WlmError
 
 if TYPE_CHECKING:
-    from wlm.smoke.axes import Camera
-    from wlm.smoke.frames import Footage
-    from wlm.smoke.reference import SixWay
-    from wlm.smoke.volume import DensityVolume
+    from wlm.fluid.volume import DensityVolume
+    from wlm.smoke.bake import SixWay
+    from wlm.smoke.camera import Camera
+    from wlm.smoke.data import Footage
 
 __all__ = [
     "SHEET",
@@ -85,14 +85,14 @@ def made_of(cls: Any, values: dict[str, Any], options: dict[str, str]) -> Any:
 def open_smoke(smoke: Path, extinction: float | None, emission: float | None, device: str) -> "Footage":
     """A volume or a folder of frames, on a device that there is."""
     from wlm.interop import check_device
-    from wlm.smoke.frames import open_footage
+    from wlm.smoke.data import open_footage
 
     return open_footage(smoke, extinction=extinction, emission=emission, device=check_device(device))
 
 
 def places(smoke: Path, numbers: "tuple[int, ...]", single: bool, output: Path, stem: str, suffix: str) -> list[Path]:
     """Where each frame goes: into a file, or numbered into a folder, which is looked at and not changed yet."""
-    from wlm.smoke.frames import check_folder
+    from wlm.smoke.data import check_folder
 
     if single:
         check_output(output, suffix)
@@ -105,7 +105,7 @@ def places(smoke: Path, numbers: "tuple[int, ...]", single: bool, output: Path, 
 
 def cleared(results: Iterator[_T], single: bool, output: Path, stem: str, suffix: str) -> Iterator[_T]:
     """The same results; what an earlier run left in the folder goes when the first is there, and not before."""
-    from wlm.smoke.frames import clear_folder
+    from wlm.smoke.data import clear_folder
 
     for done, result in enumerate(results):
         if done == 0 and not single:
@@ -142,7 +142,7 @@ def camera_of(footage: "Footage", volume: "DensityVolume", view: dict[str, Any],
     """The scene's camera, or one before the volume, as far as the options don't say otherwise."""
     import numpy as np
 
-    from wlm.smoke.data import CameraSettings, make_camera
+    from wlm.smoke.scene import CameraSettings, make_camera
 
     base = CameraSettings() if footage.scene is None else footage.scene.camera
     given = {name: value for name, value in view.items() if value is not None and name != "turn"}
@@ -171,8 +171,8 @@ def write_lightmaps(
         make: What makes them.
         errors: Whether they come with the error of their step.
     """
-    from wlm.smoke.axes import axis_faults
-    from wlm.smoke.frames import write_six_way
+    from wlm.smoke.camera import axis_faults
+    from wlm.smoke.data import write_six_way
 
     rows = table(str(footage.path), ["file", "covered", "mean light", *(["largest error", "RMS error"] * errors)])
     for path, volume, camera in volumes(footage, output, "six", ".exr", view, flat=True):

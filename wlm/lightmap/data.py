@@ -43,8 +43,8 @@ import numpy as np
 from wlm.errors import WlmError
 from wlm.formats.exr import read_exr
 from wlm.formats.mask import read_mask
-from wlm.imageops import repair
 from wlm.lightmap.listing import SET_FILE, Listing, list_folder, parse_set
+from wlm.texels import repair
 
 __all__ = ["LightmapSet", "from_arrays", "load_set", "parse_times"]
 

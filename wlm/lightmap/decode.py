@@ -9,7 +9,7 @@ from wlm import interop
 from wlm.errors import WlmError
 from wlm.lightmap.model import TILE, LightmapModel, decode_scale
 from wlm.lightmap.tiles import TileGrid, TileKind, assemble
-from wlm_kernels import temporal_decode
+from wlm_kernels.lightmap import decode as lightmap_decode
 from wlm_kernels.mlp import GELUS
 
 __all__ = ["Decoder"]
@@ -134,14 +134,14 @@ class Decoder:
         before, after, share = self._neighbours(time)
         return self._peak[:, before] if share == 0 else np.maximum(self._peak[:, before], self._peak[:, after])
 
-    def look(self, time: float) -> temporal_decode.Look:
+    def look(self, time: float) -> lightmap_decode.Look:
         """The kernel's view of a time; its arrays cover the mapped tiles in order of their numbers."""
         before, after, share = self._neighbours(time)
         bounds = self._bounds(time)
         inverse = np.divide(1.0, bounds, out=np.zeros_like(bounds), where=bounds > 0)
         scale = (1.0 - share) * self._scale[:, before] + share * self._scale[:, after]
         affine = self.model.affine.astype(np.float32)
-        look = temporal_decode.Look()
+        look = lightmap_decode.Look()
         look.tau = self._axis.place(time)
         look.encoding = wp.vec4(*self._axis.encode(time))
         look.gamma = self.model.profile.gamma
@@ -172,9 +172,9 @@ class _Group:
         dynamic = kind == TileKind.DYNAMIC
         maps = ("uv", "uvt", "ut", "vt") if dynamic else ("uv",)
         self.arrays = [*(getattr(self.stored, name) for name in maps), self.hidden, self.output]
-        self._kernels = temporal_decode.exact_kernels(dynamic, model.profile.hidden, gelu)
+        self._kernels = lightmap_decode.exact_kernels(dynamic, model.profile.hidden, gelu)
 
-    def decode(self, places: list[int], look: temporal_decode.Look, as_bytes: bool) -> np.ndarray:
+    def decode(self, places: list[int], look: lightmap_decode.Look, as_bytes: bool) -> np.ndarray:
         tiles = wp.array(np.array(places, np.int32), dtype=int, device=self.device)
         rows = wp.array(self.rows.astype(np.int32), dtype=int, device=self.device)
         out = wp.empty((len(places), TILE, TILE), dtype=wp.vec4ub if as_bytes else wp.vec3, device=self.device)
@@ -202,7 +202,7 @@ def upload(model: LightmapModel, kind: TileKind, rows: np.ndarray, device: str):
     """
     profile = model.profile
     dynamic = kind == TileKind.DYNAMIC
-    stored = temporal_decode.Stored()
+    stored = lightmap_decode.Stored()
     stored.slices, stored.periodic = profile.uvt_slices, int(model.axis.periodic)
 
     def blocks(values: np.ndarray) -> wp.array:

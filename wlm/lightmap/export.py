@@ -11,8 +11,8 @@ import numpy as np
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_write
 from wlm.formats.dds import write_dds
+from wlm.lightmap.exact import SQRT_12
 from wlm.lightmap.model import TILE, LightmapModel, decode_scale, encode_time
-from wlm.lightmap.reference import SQRT_12
 from wlm.lightmap.shader import decode_glsl
 from wlm.lightmap.tiles import TileKind
 

@@ -21,7 +21,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from wlm.config import load_settings, profile_path
 from wlm.lightmap.tiles import TILE, TileKind
 from wlm_kernels import mlp
-from wlm_kernels.temporal import STATIC_INPUTS, TEMPORAL_INPUTS
+from wlm_kernels.lightmap.features import STATIC_INPUTS, TEMPORAL_INPUTS
 
 __all__ = [
     "LightmapModel",

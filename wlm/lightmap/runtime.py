@@ -13,7 +13,7 @@ from wlm.errors import WlmError
 from wlm.lightmap.decode import Decoder, upload
 from wlm.lightmap.model import TILE, LightmapModel
 from wlm.lightmap.tiles import TileKind
-from wlm_kernels import temporal_decode
+from wlm_kernels.lightmap import decode as lightmap_decode
 
 __all__ = ["ExactDecoder", "StripDecoder"]
 
@@ -35,7 +35,7 @@ class _TileDecoder:
         self._stored, self._hidden, self._output = upload(model, kind, rows, self.device)
         self._places = wp.array(rows.astype(np.int32), dtype=int, device=self.device)
         self._tiles = wp.array(np.arange(len(rows), dtype=np.int32), dtype=int, device=self.device)
-        self._look = temporal_decode.Look()
+        self._look = lightmap_decode.Look()
         self._look.gamma = model.profile.gamma
         for field, dtype in _LOOK_ARRAYS.items():
             setattr(self._look, field, wp.empty(len(mapped), dtype=dtype, device=self.device))
@@ -91,7 +91,7 @@ class StripDecoder(_TileDecoder):
         """
         super().__init__(model, device, gelu, TileKind.DYNAMIC)
         n, resolution = len(self.numbers), model.profile.uvt_resolution
-        self._kernels = temporal_decode.strip_kernels(model.profile.hidden, self.gelu)
+        self._kernels = lightmap_decode.strip_kernels(model.profile.hidden, self.gelu)
         self._volume = wp.empty((n, resolution, resolution), dtype=wp.vec4, device=self.device)
         self._columns = wp.empty((n, model.profile.hidden, TILE), dtype=float, device=self.device)
         self._lines = wp.empty((n, TILE), dtype=wp.vec2, device=self.device)
@@ -141,7 +141,7 @@ class ExactDecoder(_TileDecoder):
         """
         super().__init__(model, device, gelu, kind)
         dynamic = kind == TileKind.DYNAMIC
-        self._kernel = temporal_decode.exact_kernels(dynamic, model.profile.hidden, self.gelu)[1]
+        self._kernel = lightmap_decode.exact_kernels(dynamic, model.profile.hidden, self.gelu)[1]
         self.out = wp.zeros((len(self.numbers), TILE, TILE), dtype=wp.vec4ub, device=self.device)
 
     def decode(self) -> None:

@@ -1,7 +1,7 @@
 """The GLSL that decodes an exported lightmap; ``wlm.lightmap.export`` writes it beside the textures."""
 
 from wlm.lightmap.model import LightmapModel
-from wlm_kernels.temporal import STATIC_INPUTS, TEMPORAL_INPUTS
+from wlm_kernels.lightmap.features import STATIC_INPUTS, TEMPORAL_INPUTS
 
 __all__ = ["decode_glsl"]
 

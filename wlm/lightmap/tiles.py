@@ -14,8 +14,8 @@ from enum import IntEnum
 import numpy as np
 
 from wlm.errors import WlmError
-from wlm.imageops import fill_gaps
 from wlm.lightmap.data import LightmapSet
+from wlm.texels import fill_gaps
 
 __all__ = [
     "TILE",

@@ -9,8 +9,10 @@ import warp as wp
 
 from wlm import interop
 from wlm.lightmap.model import TILE, Profile, TimeAxis, encode_time
-from wlm_kernels import blocks, mlp, temporal, temporal_gather, temporal_step
-from wlm_kernels.temporal_gather import gather_maps, gather_net
+from wlm_kernels import mlp
+from wlm_kernels.lightmap import blocks, features, gather
+from wlm_kernels.lightmap import step as lightmap_step
+from wlm_kernels.lightmap.gather import gather_maps, gather_net
 
 __all__ = ["Targets", "Trainer"]
 
@@ -24,7 +26,7 @@ class Targets:
         number: int [N], numbers of the tiles in their grid.
         colour: float32 [N, T, 128 * 128, 3], (colour / scale - shift) / spread.
         texels: int32 [N, K], valid texels, padded; ``count`` int32 [N] are in use.
-        weight: float32 [N, T, 3]; ``emphasis``: see ``wlm_kernels.temporal.Batch``.
+        weight: float32 [N, T, 3]; ``emphasis``: see ``wlm_kernels.lightmap.features.Batch``.
         shift, spread: float32 [N, 3]; scale: float32 [N, T, 3].
         range: float32 [N, T], of radiance.
     """
@@ -100,14 +102,14 @@ class Trainer:
         self.tiles = len(targets.number)
         self.inputs = profile.inputs(temporal_maps)
         self._cuda = device != "cpu"
-        self._kernels = temporal_step.step_kernels(
+        self._kernels = lightmap_step.step_kernels(
             temporal_maps, profile.hidden, profile.gelu, "cuda" if self._cuda else "cpu"
         )
         self._pool = None if self._cuda else ThreadPoolExecutor(CPU_LANES)
         if not self._cuda:
             # Before two threads ask for them at once, which would compile them twice into one place.
             self._kernels.load(device)
-            wp.load_module(temporal_gather, device)
+            wp.load_module(gather, device)
         with interop.stream(device):
             self._allocate()
             self._upload(targets, seed)
@@ -145,19 +147,19 @@ class Trainer:
         for parameter in (self.hidden, self.output):
             parameter.grad = torch.zeros_like(parameter)
         self.views, at = {}, 0
-        self._offsets = temporal.Offsets()
+        self._offsets = features.Offsets()
         for key, shape in shapes.items():
             self.views[key] = self.maps[at : at + lengths[key]].view(shape)
             setattr(self._offsets, key, at)
             at += lengths[key]
-        maps = temporal.Maps()
+        maps = features.Maps()
         types = {"uv_endpoints": wp.vec4, "uvt_endpoints": wp.vec4, "ut": wp.vec2, "vt": wp.vec2}
         for key, view in self.views.items():
             setattr(maps, key, interop.to_warp(view, types.get(key, wp.float32)))
         self._maps = maps
 
         lanes = 1 if self._cuda else CPU_LANES
-        parts = self.profile.samples // temporal_step.BLOCK if self._cuda else CPU_LANES
+        parts = self.profile.samples // lightmap_step.BLOCK if self._cuda else CPU_LANES
         self._acc = zeros(lanes, total, dtype=torch.int64 if self._cuda else torch.float32)
         self._partial = zeros(parts, *self.hidden.shape)
         self._partial_out = zeros(parts, *self.output.shape)
@@ -225,7 +227,7 @@ class Trainer:
         def put(values, dtype):
             return wp.array(np.ascontiguousarray(values), dtype=dtype, device=self.device)
 
-        batch = temporal.Batch()
+        batch = features.Batch()
         batch.targets = put(targets.colour, wp.vec3)
         batch.texels = put(targets.texels, wp.int32)
         batch.texel_count = put(targets.count, wp.int32)

@@ -13,8 +13,8 @@ import math
 import numpy as np
 
 from wlm.errors import WlmError
-from wlm.imageops import fill_gaps
 from wlm.metrics.error import check_pair
+from wlm.texels import fill_gaps
 
 __all__ = ["flip_exposures", "flip_map"]
 

@@ -7,8 +7,8 @@ import math
 import numpy as np
 
 from wlm.errors import WlmError
-from wlm.imageops import fill_gaps
 from wlm.metrics.error import check_pair
+from wlm.texels import fill_gaps
 
 __all__ = ["SSIM_WINDOW", "ssim", "ssim_map"]
 

@@ -20,10 +20,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from wlm.errors import WlmError
-from wlm.imageops import fill_gaps
 from wlm.metrics.error import check_pair, half_ulp, psnr_from_mse
 from wlm.metrics.flip import flip_exposures, flip_filled
 from wlm.metrics.structural import ssim_filled
+from wlm.texels import fill_gaps
 
 __all__ = [
     "FORMAT_LIMITED_ULPS",

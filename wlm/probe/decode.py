@@ -9,8 +9,10 @@ from wlm import interop
 from wlm.errors import WlmError
 from wlm.probe.model import ProbeModel
 from wlm.probe.start import morton_order
-from wlm_kernels import gaussian_cubes, gaussian_sum, probe_network
-from wlm_kernels.probe_decode import decode_kernels
+from wlm_kernels.probe import cubes as probe_cubes
+from wlm_kernels.probe import gaussian_sum
+from wlm_kernels.probe import network as probe_network
+from wlm_kernels.probe.decode import decode_kernels
 
 __all__ = ["CULLINGS", "Decoder", "Points"]
 
@@ -88,9 +90,9 @@ class Decoder:
         self._shapes = gaussian_sum.shapes(self._rows, self._cut, "sphere" if sphere else "ellipsoid")
         low, high = np.zeros(3, np.float32), model.size.astype(np.float32)
         if culling == "none":
-            self._cubes = gaussian_cubes.everything(count, self.device)
+            self._cubes = probe_cubes.everything(count, self.device)
         else:
-            self._cubes = gaussian_cubes.build(self._shapes, low, high, cube, test=culling)
+            self._cubes = probe_cubes.build(self._shapes, low, high, cube, test=culling)
         self.pairs = self._cubes.item.shape[0]
         self._net = wp.array(self._padded_net(), dtype=float, device=self.device)
         self._kernels = decode_kernels(p.latent, p.hidden, model.outputs, kind)

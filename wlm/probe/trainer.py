@@ -10,11 +10,12 @@ import warp as wp
 from wlm import interop
 from wlm.probe.model import CENTRE, CENTRE_BITS, LATENT, ROTATION, SCALE, Profile
 from wlm.probe.start import first_gaussians, morton_order
-from wlm_kernels import probe_network, probe_step
-from wlm_kernels.gaussians import SHAPE_NUMBERS, Shape
-from wlm_kernels.probe_network import CPU_LANES
-from wlm_kernels.probe_optimiser import Optimiser
-from wlm_kernels.probe_step import GROUP
+from wlm_kernels.probe import network as probe_network
+from wlm_kernels.probe import step as probe_step
+from wlm_kernels.probe.gaussians import SHAPE_NUMBERS, Shape
+from wlm_kernels.probe.network import CPU_LANES
+from wlm_kernels.probe.optimiser import Optimiser
+from wlm_kernels.probe.step import GROUP
 
 __all__ = ["Trainer"]
 

@@ -17,7 +17,8 @@ Follows gaussian-probe-compression, section 3.4, with the settings of section 5.
   together: after a teleport the first frame already covers what is near, if coarsely, where the finest level first
   would leave the rest of the scene black until that level was done.
 - Which level answers a point follows from the windows and from the blocks that are there: the finest that has it, as
-  ``wlm_kernels.volume.read`` says. With every block there that is the paper's choice by the distance to the viewer.
+  ``wlm_kernels.probe.volume.read`` says. With every block there that is the paper's choice by the distance to the
+  viewer.
 """
 
 import time
@@ -30,8 +31,8 @@ import warp as wp
 
 from wlm import interop
 from wlm.errors import WlmError
-from wlm.probe.probe_index import ProbeIndex
-from wlm_kernels import volume as kernels
+from wlm.probe.index import ProbeIndex
+from wlm_kernels.probe import volume as kernels
 
 __all__ = ["BUDGET", "CACHE", "PROBES", "SIDE", "SIZES", "FrameStats", "Reading", "Volume"]
 
@@ -249,7 +250,7 @@ class Volume:
         )
 
     def read(self, points: np.ndarray) -> Reading:
-        """Reads the light at points, as ``wlm_kernels.volume.read`` says; at float32's precision near the viewer.
+        """Reads the light at points, as ``wlm_kernels.probe.volume.read`` says; at float32's precision near the viewer.
 
         Args:
             points: [M, 3], in the unit of the positions. One that is NaN or infinite is covered by nothing.

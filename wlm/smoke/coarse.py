@@ -13,16 +13,16 @@ from dataclasses import dataclass
 
 import torch
 
+from wlm.fluid.volume import DensityVolume
 from wlm.interop import device_name, stream, to_warp, torch_memory
-from wlm.smoke.axes import DIRECTIONS, Camera
+from wlm.smoke.bake import SixWay
+from wlm.smoke.camera import DIRECTIONS, Camera
 from wlm.smoke.guide import check_march, check_step
-from wlm.smoke.reference import SixWay
-from wlm.smoke.volume import DensityVolume
-from wlm_kernels import marching_coarse
+from wlm_kernels.smoke import march_coarse
 
 __all__ = ["CoarseSixWay", "coarse_six_way"]
 
-_TRANSPARENCY, _EMISSION = (marching_coarse.PLANES.index(name) for name in ("transparency", "emission"))
+_TRANSPARENCY, _EMISSION = (march_coarse.PLANES.index(name) for name in ("transparency", "emission"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +30,7 @@ class CoarseSixWay:
     """What such a march finds; H x W pixels.
 
     Attributes:
-        planes: float32 tensor [9, H, W] on the smoke's device, `wlm_kernels.marching_coarse.PLANES`.
+        planes: float32 tensor [9, H, W] on the smoke's device, `wlm_kernels.smoke.march_coarse.PLANES`.
         camera: From where it was looked at.
         hot: Whether the smoke has a temperature; otherwise the emission is 0.
     """
@@ -48,7 +48,7 @@ class CoarseSixWay:
     @property
     def depth(self) -> torch.Tensor:
         """[H, W], distance along the ray to the smoke in the world's unit, 0 where there is none."""
-        return self.planes[marching_coarse.DEPTH]
+        return self.planes[march_coarse.DEPTH]
 
 
 def coarse_six_way(
@@ -92,10 +92,10 @@ def coarse_six_way(
             check_step(name, value)
     view, moved = camera.view(volume.origin, volume.voxel, volume.shape)
     with stream(device_name(volume.device)):
-        size = (len(marching_coarse.PLANES), camera.height, camera.width)
+        size = (len(march_coarse.PLANES), camera.height, camera.width)
         planes = torch.empty(size, dtype=torch.float32, device=volume.device)
         density, temperature = volume.arrays()
-        marching_coarse.coarse_six_way(
+        march_coarse.coarse_six_way(
             density,
             volume.extinction * volume.voxel,
             view,

@@ -1,469 +1,332 @@
-"""A scene to simulate and to look at, as its YAML file says it: the box, its air and smoke, what moves, camera, lights.
+"""What the commands read and leave: folders of frames with the scene they are of, and pictures of named channels.
 
-Lengths are metres, times seconds, directions the world's, +y up unless the scene says otherwise. What smoke comes in
-as, without a scene, is `volume`; what a simulation leaves is `frames`. The stated behaviours:
-
-=======================================  =============================================================
-a number NaN or infinite                 error that names the field
-an unknown or a repeated key             error
-a path whose times don't rise            error
-an inlet's or a source's end before      error
-its start
-no inlet, no source                      fine: the box stays empty
-an obstacle over an inlet                fine: nothing comes in where it lies
-a camera or a light along an axis        fine, along the vertical too
-a light of no direction                  error
-a box of one cell                        fine
-a time step that would be too long for   error when it is simulated: it names the obstacle or the inlet
-a fast obstacle
-=======================================  =============================================================
+A folder of frames holds `scene.json` and `frame_0001.npz`, `frame_0002.npz` and so on, each a volume as
+`wlm.fluid.volume.load_volume` reads it. `simulate` writes it, and can be stopped and resumed.
 """
 
 from __future__ import annotations
 
-import math
+import json
 import os
-from collections.abc import Sequence
-from typing import Annotated, Literal
+import re
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
-from pydantic_core import PydanticCustomError
+import torch
+from pydantic import ValidationError
 
-from wlm.config import load_settings, profile_path
-from wlm.smoke.axes import Camera
-from wlm.smoke.lattice_faces import FACES
-from wlm.smoke.shade import Light, Ramp
-from wlm.smoke.shapes import ball, cube, drum
+from wlm.errors import WlmError
+from wlm.fluid.volume import DensityVolume, load_volume
+from wlm.formats.atomic import atomic_path, atomic_write
+from wlm.formats.exr_planes import read_planes, write_planes
+from wlm.smoke.bake import SixWay
+from wlm.smoke.camera import DIRECTIONS, EMISSION, Camera
+from wlm.smoke.guide import Guide
+from wlm.smoke.scene import Scene
 
 __all__ = [
-    "Air",
-    "CameraSettings",
-    "Smoke",
-    "Grid",
-    "Inlet",
-    "LightSettings",
-    "Obstacle",
-    "Scene",
-    "Source",
-    "load_scene",
-    "make_camera",
-    "obstacle_mesh",
+    "CHECKPOINT",
+    "SCENE_FILE",
+    "Footage",
+    "Frames",
+    "check_folder",
+    "clear_folder",
+    "frame_file",
+    "numbered",
+    "open_footage",
+    "open_frames",
+    "read_frames",
+    "read_six_way",
+    "save_volume",
+    "write_guide",
+    "write_six_way",
 ]
 
-_SHORTEST = 1e-12
-_MARGIN = 1.05  # of an image's height over the box's, so that no smoke touches the edge
+SCENE_FILE = "scene.json"
+CHECKPOINT = "simulation.partial"
+"""In the folder of frames, as long as the simulation isn't done."""
+
+_FORMAT, _VERSION = "wlm-smoke-frames", 1
+_FRAME = "frame"
+_TRANSPARENCY = "transparency"
+_GUIDE = ("light", _TRANSPARENCY, "depth")
 
 
-def _directed(vector: tuple[float, float, float]) -> tuple[float, float, float]:
-    if not math.hypot(*vector) > _SHORTEST:
-        raise PydanticCustomError("direction", "expected a direction of some length")
-    return vector
-
-
-def _rising(path: tuple[tuple[float, float, float, float], ...]) -> tuple[tuple[float, float, float, float], ...]:
-    if any(later[0] <= earlier[0] for earlier, later in zip(path, path[1:], strict=False)):
-        raise PydanticCustomError("path", "expected times that rise")
-    return path
-
-
-_Vector = tuple[float, float, float]
-_Direction = Annotated[_Vector, AfterValidator(_directed)]
-_Colour = tuple[
-    Annotated[float, Field(ge=0.0)],
-    Annotated[float, Field(ge=0.0)],
-    Annotated[float, Field(ge=0.0)],
-]
-_Positive = Annotated[float, Field(gt=0.0)]
-_NotNegative = Annotated[float, Field(ge=0.0)]
-_Count = Annotated[int, Field(ge=1, le=4096)]
-_Face = Literal["-x", "+x", "-y", "+y", "-z", "+z"]
-
-
-class _Part(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
-class Grid(_Part):
-    """The box and what closes it.
+@dataclass(frozen=True)
+class Frames:
+    """A folder of frames.
 
     Attributes:
-        cells: X, Y, Z of the velocity's grid.
-        cell: Metres along a cell's edge.
-        refine: Voxels of density along a cell's edge; the paper's 400 over 100.
-        origin: The box's corner.
-        faces: What each face is: a "wall", a wall without friction ("slip"), "open", or "periodic" like the one
-            opposite, which has to be too. A face with an inlet is a wall around it to the air, and lets smoke out as a
-            whole. Faces that aren't named are open.
+        folder: Where.
+        scene: What it is of.
+        numbers: Of the frames that are there, rising from 1.
     """
 
-    cells: tuple[_Count, _Count, _Count]
-    cell: _Positive
-    refine: int = Field(4, ge=1, le=16)
-    origin: _Vector = (0.0, 0.0, 0.0)
-    faces: dict[_Face, Literal["wall", "slip", "open", "periodic"]] = {}
-
-    @model_validator(mode="after")
-    def _pairs(self) -> Grid:
-        for axis in "xyz":
-            ends = [self.face(f"{sign}{axis}") for sign in "-+"]
-            if ends.count("periodic") == 1:
-                raise PydanticCustomError("faces", "expected both faces of an axis to be periodic, or none")
-        return self
-
-    def face(self, name: str) -> str:
-        """What a face is."""
-        return self.faces.get(name, "open")
-
-    @property
-    def shape(self) -> tuple[int, int, int]:
-        """Voxels of density along x, y, z."""
-        return tuple(self.refine * n for n in self.cells)
-
-    @property
-    def voxel(self) -> float:
-        """Metres along an edge of a voxel of density."""
-        return self.cell / self.refine
-
-    @property
-    def size(self) -> np.ndarray:
-        """Of the box, float64 [3]."""
-        return self.cell * np.asarray(self.cells, np.float64)
+    folder: Path
+    scene: Scene
+    numbers: tuple[int, ...]
 
 
-class Air(_Part):
-    """How the air moves.
-
-    Attributes:
-        viscosity: Kinematic, square metres a second; air's is 1.5e-5.
-        speed: Metres a second that are `lattice_speed` cells a step; null: the fastest inlet or obstacle.
-        lattice_speed: Cells a step. Errors grow with its square, the number of steps with its inverse.
-        operator, smagorinsky, storage: As for `wlm.smoke.lattice.Lattice`.
-    """
-
-    viscosity: _Positive = 1.5e-5
-    speed: _Positive | None = None
-    lattice_speed: float = Field(0.1, gt=0.0, le=0.3)
-    operator: Literal["bgk", "regularised", "recursive"] = "regularised"
-    smagorinsky: _NotNegative = 0.17
-    storage: Literal["float32", "float16"] = "float32"
+def frame_file(number: int) -> str:
+    """The name of a frame's file."""
+    return f"{_FRAME}_{number:04d}.npz"
 
 
-class Smoke(_Part):
-    """What the smoke itself does and how it looks.
-
-    Attributes:
-        extinction: Per metre, of density 1.
-        emission: Light given off per metre at temperature 1.
-        dissipation, cooling: Rates at which density and temperature decay, a second: exp(-rate t) is left.
-        buoyancy: Metres a second squared, upwards, at temperature 1.
-        weight: Metres a second squared, downwards, at density 1.
-        up: The direction that is up.
-        scheme, storage, bricks, substeps: How smoke is carried, as for `wlm.smoke.solver.Solver`.
-        glow: Colours of the emission: stops of emission, R, G, B; none: grey, as it is.
-    """
-
-    extinction: _Positive = 10.0
-    emission: _NotNegative = 0.0
-    dissipation: _NotNegative = 0.0
-    cooling: _NotNegative = 0.0
-    buoyancy: _NotNegative = 0.0
-    weight: _NotNegative = 0.0
-    up: _Direction = (0.0, 1.0, 0.0)
-    scheme: Literal["maccormack", "semi-lagrangian"] = "maccormack"
-    storage: Literal["float32", "float16"] = "float32"
-    bricks: bool = False
-    substeps: int = Field(2, ge=1, le=16)
-    glow: tuple[tuple[float, _NotNegative, _NotNegative, _NotNegative], ...] = ()
-
-    @model_validator(mode="after")
-    def _stops(self) -> Smoke:
-        if len(self.glow) == 1 or any(b[0] <= a[0] for a, b in zip(self.glow, self.glow[1:], strict=False)):
-            raise PydanticCustomError("glow", "expected no stops of glow, or at least two that rise")
-        return self
-
-    @property
-    def hot(self) -> bool:
-        """Whether temperature shows or moves anything."""
-        return self.emission > 0.0 or self.buoyancy > 0.0
-
-    @property
-    def ramp(self) -> Ramp | None:
-        """The glow's colours as shading takes them."""
-        if not self.glow:
-            return None
-        return Ramp(tuple(stop[0] for stop in self.glow), tuple(stop[1:] for stop in self.glow))
+def numbered(folder: Path, stem: str, suffix: str) -> dict[int, Path]:
+    """Files such as `six_0001.exr`, by their rising number."""
+    pattern = re.compile(rf"{re.escape(stem)}_(\d+){re.escape(suffix)}")
+    found = {int(match[1]): path for path in folder.iterdir() if (match := pattern.fullmatch(path.name))}
+    return dict(sorted(found.items()))
 
 
-class _Timed(_Part):
-    start: float = 0.0
-    stop: float | None = None
-
-    @model_validator(mode="after")
-    def _order(self) -> _Timed:
-        if self.stop is not None and self.stop <= self.start:
-            raise PydanticCustomError("stop", "expected to stop after it starts")
-        return self
-
-    def active(self, time: float) -> bool:
-        """Whether it works at a time."""
-        return self.start <= time and (self.stop is None or time < self.stop)
-
-
-class Inlet(_Part):
-    """Where air and smoke come in through a face, all the time.
-
-    Attributes:
-        face: Of the box.
-        centre, radius: The round part of the face that lets air in; radius null: the whole face.
-        velocity: Metres a second, into the box.
-        density, temperature: Of what comes in.
-    """
-
-    face: _Face
-    velocity: _Vector
-    centre: _Vector = (0.0, 0.0, 0.0)
-    radius: _Positive | None = None
-    density: _NotNegative = 1.0
-    temperature: _NotNegative = 0.0
-
-    @model_validator(mode="after")
-    def _inwards(self) -> Inlet:
-        axis, high = divmod(FACES.index(self.face), 2)
-        if not (self.velocity[axis] < 0.0 if high else self.velocity[axis] > 0.0):
-            raise PydanticCustomError("velocity", "expected a velocity into the box")
-        return self
-
-
-class Source(_Timed):
-    """Where smoke arises within the box.
-
-    Attributes:
-        centre, radius: A ball.
-        density, temperature: What the ball is held at, while the source works.
-        start, stop: Seconds; stop null: to the end.
-    """
-
-    centre: _Vector
-    radius: _Positive
-    density: _NotNegative = 1.0
-    temperature: _NotNegative = 0.0
-
-
-class Obstacle(_Part):
-    """A solid body.
-
-    Attributes:
-        shape: "sphere", "box" or "cylinder", which stands along y.
-        radius: Of a sphere; of the others half their extents along x, y and z.
-        path: Where its centre is: time, x, y, z. In between it moves evenly, before and after it rests.
-        colour: What it reflects, in pictures.
-    """
-
-    shape: Literal["sphere", "box", "cylinder"] = "sphere"
-    radius: _Positive | tuple[_Positive, _Positive, _Positive]
-    path: Annotated[tuple[tuple[float, float, float, float], ...], Field(min_length=1), AfterValidator(_rising)]
-    colour: _Colour = (0.12, 0.12, 0.13)
-
-    @model_validator(mode="after")
-    def _sizes(self) -> Obstacle:
-        if (self.shape == "sphere") == isinstance(self.radius, tuple):
-            raise PydanticCustomError("radius", "expected one radius of a sphere, three half extents of another body")
-        return self
-
-    def centre(self, time: float) -> np.ndarray:
-        """Where it is, float64 [3]."""
-        keys = np.array(self.path)
-        return np.array([np.interp(time, keys[:, 0], keys[:, axis]) for axis in (1, 2, 3)])
-
-    @property
-    def fastest(self) -> float:
-        """Metres a second."""
-        keys = np.array(self.path)
-        distance = np.linalg.norm(np.diff(keys[:, 1:], axis=0), axis=1)
-        return float((distance / np.diff(keys[:, 0])).max(initial=0.0))
-
-    def mesh(self) -> tuple[np.ndarray, np.ndarray]:
-        """Its surface about its centre: corners float64 [V, 3], triangles int64 [F, 3], anticlockwise from outside."""
-        points, triangles = {"sphere": ball, "box": cube, "cylinder": drum}[self.shape]()
-        return points * np.asarray(self.radius), triangles
-
-
-class CameraSettings(_Part):
-    """From where smoke is seen.
-
-    Attributes:
-        toward: From the smoke to the camera.
-        target: What is in the image's middle; null: the box's centre.
-        extent: Height of the image in metres, in perspective at distance 1; null: as much as holds the box.
-        distance: Of the camera from its target; null: outside the box. What is behind the camera isn't seen.
-        up: What is up in the image, as far as it can be.
-        resolution: Pixels along the height.
-        aspect: Width over height.
-        perspective: For guiding maps; six-way lightmaps are orthographic.
-    """
-
-    toward: _Direction = (0.0, 0.0, 1.0)
-    target: _Vector | None = None
-    extent: _Positive | None = None
-    distance: _Positive | None = None
-    up: _Direction = (0.0, 1.0, 0.0)
-    resolution: int = Field(512, ge=1, le=16384)
-    aspect: float = Field(1.0, gt=0.0, le=16.0)
-    perspective: bool = False
-
-    def turned(self, degrees: float) -> CameraSettings:
-        """The same camera, turned about what is up: the paper's references are seen from 9 sides, 10 degrees apart."""
-        axis = np.array(self.up) / np.linalg.norm(self.up)
-        toward, angle = np.array(self.toward), math.radians(degrees)
-        along = axis * (axis @ toward)
-        across = toward - along
-        turned = along + math.cos(angle) * across + math.sin(angle) * np.cross(axis, across)
-        return self.model_copy(update={"toward": tuple(map(float, turned))})
-
-
-class LightSettings(_Part):
-    """A directional light.
-
-    Attributes:
-        toward: From the smoke to the light.
-        irradiance: R, G, B on a surface that faces it; 4 pi (12.57) shows a lightmap as it is.
-    """
-
-    toward: _Direction
-    irradiance: _Colour = (4 * math.pi,) * 3
-
-    def light(self) -> Light:
-        """As shading takes it."""
-        return Light(self.toward, self.irradiance)
-
-
-class Scene(_Part):
-    """All of it.
-
-    Attributes:
-        name: Shown in reports.
-        grid, air, smoke: The box and what fills it.
-        inlets, sources, obstacles: What acts on it.
-        camera, lights, background: How it is seen; the background is a linear colour.
-        frames: How many.
-        rate: Frames a second; the first is one interval after the start.
-    """
-
-    name: str
-    grid: Grid
-    air: Air = Air()
-    smoke: Smoke = Smoke()
-    inlets: tuple[Inlet, ...] = ()
-    sources: tuple[Source, ...] = ()
-    obstacles: tuple[Obstacle, ...] = Field((), max_length=255)
-    camera: CameraSettings = CameraSettings()
-    lights: tuple[LightSettings, ...] = (LightSettings(toward=(1.0, 1.0, 1.0)),)
-    background: _Colour = (0.0, 0.0, 0.0)
-    frames: int = Field(100, ge=1, le=9999)
-    rate: _Positive = 25.0
-
-    @model_validator(mode="after")
-    def _flow(self) -> Scene:
-        taken = {inlet.face for inlet in self.inlets}
-        if any(self.grid.face(face) == "periodic" for face in taken):
-            raise PydanticCustomError("inlets", "expected inlets on faces that aren't periodic")
-        if taken and all(face in taken or self.grid.face(face) != "open" for face in FACES):
-            raise PydanticCustomError("inlets", "expected an open face for what the inlets let in")
-        return self
-
-    def time(self, frame: int) -> float:
-        """When a frame is, which count from 1."""
-        return frame / self.rate
-
-    def scaled(self, factor: float) -> Scene:
-        """The same scene on a grid of a multiple of its cells along each axis, rounded; no axis gets fewer than one.
-
-        The longest axis keeps its length, the others keep theirs to half a cell.
-        """
-        if not 0 < factor < math.inf:
-            raise ValueError(f"factor: expected a number above 0, got {factor}")
-        cells = tuple(max(round(n * factor), 1) for n in self.grid.cells)
-        longest = int(np.argmax(self.grid.cells))
-        cell = self.grid.cell * self.grid.cells[longest] / cells[longest]
-        grid = self.grid.model_dump() | {"cells": cells, "cell": cell}
-        return self.model_copy(update={"grid": Grid(**grid)})
-
-    @property
-    def fastest(self) -> float:
-        """Metres a second that make `air.lattice_speed`; 1 where nothing says."""
-        if self.air.speed is not None:
-            return self.air.speed
-        speeds = [float(np.linalg.norm(inlet.velocity)) for inlet in self.inlets]
-        return max([*speeds, *(obstacle.fastest for obstacle in self.obstacles)], default=0.0) or 1.0
-
-    @property
-    def steps(self) -> int:
-        """Steps of the air in a frame, as many as keep `fastest` at or below `air.lattice_speed`, in whole substeps."""
-        least = self.fastest / (self.rate * self.air.lattice_speed * self.grid.cell)
-        return max(math.ceil(least / self.smoke.substeps - 1e-9), 1) * self.smoke.substeps
-
-    @property
-    def step(self) -> float:
-        """Seconds of a step."""
-        return 1.0 / (self.rate * self.steps)
-
-
-def load_scene(name: str | os.PathLike[str]) -> Scene:
-    """Loads ``configs/smoke-NAME.yaml``, or a YAML file of one's own.
-
-    Raises:
-        WlmError: Unknown scene, unreadable file, or a wrong setting.
-    """
-    name = os.fspath(name)
-    return load_settings(Scene, name if name.endswith((".yaml", ".yml")) else profile_path("smoke", name))
-
-
-def make_camera(
-    settings: CameraSettings, origin: Sequence[float] | np.ndarray, size: Sequence[float] | np.ndarray
-) -> Camera:
-    """Places a camera before a box.
+def open_frames(folder: str | os.PathLike[str], scene: Scene, *, resume: bool = False) -> Frames:
+    """Gets a folder ready for a simulation's frames.
 
     Args:
-        settings: The camera.
-        origin, size: The box's corner and edges in the world, [3].
+        folder: Where; it is made if its parent is there.
+        scene: What is simulated.
+        resume: Whether to go on with a simulation of the same scene. Otherwise an earlier one's frames are removed.
+
+    Raises:
+        WlmError: It holds other files, it is of another scene and is to be resumed, or it can't be written.
     """
-    origin, size = np.asarray(origin, np.float64), np.asarray(size, np.float64)
-    target = origin + 0.5 * size if settings.target is None else np.array(settings.target)
-    toward = np.array(settings.toward) / np.linalg.norm(settings.toward)
-    corners = origin + size * np.array([[i >> 2 & 1, i >> 1 & 1, i & 1] for i in range(8)]) - target
-    distance = settings.distance
-    if distance is None:
-        # In perspective as far off as the box is large, so that it isn't seen through a keyhole.
-        distance = float((corners @ toward).max()) + float(np.linalg.norm(size))
-    height = settings.resolution
-    width = max(round(height * settings.aspect), 1)
-    shape = {"height": height, "width": width, "world_up": settings.up, "perspective": settings.perspective}
-    camera = Camera.look_at(target + distance * toward, target, extent=1.0, **shape)
-    extent = settings.extent
-    if extent is None:
-        right, up, _ = np.abs(corners @ camera.axes.T).max(axis=0)
-        extent = 2.0 * _MARGIN * max(float(up), float(right) * height / width)
-        if settings.perspective:
-            # Of the box's nearest side, or of the sphere round it where the camera is inside.
-            nearest = distance - float((corners @ toward).max())
-            extent /= nearest if nearest > 0.0 else distance
-    return Camera.look_at(target + distance * toward, target, extent=extent, **shape)
+    folder = Path(folder)
+    ours = (folder / SCENE_FILE).is_file()
+    try:
+        if folder.exists() and not ours and any(folder.iterdir()):
+            raise WlmError(f"{folder}: expected an empty folder or one of an earlier simulation, found other files")
+        if ours and resume:
+            earlier = read_frames(folder, needed=False)
+            # More frames of the same scene are no other scene.
+            if (field := _difference(_settings(earlier.scene), _settings(scene))) is not None:
+                raise WlmError(f"{folder}: frames of another scene, whose {field} differs; start anew without --resume")
+        elif ours:
+            _read_scene(folder)
+            for path in (*numbered(folder, _FRAME, ".npz").values(), folder / CHECKPOINT):
+                path.unlink(missing_ok=True)
+        folder.mkdir(exist_ok=True)
+    except OSError as error:
+        raise WlmError(f"{folder}: cannot write there: {error.strerror or error}") from error
+    content = {"format": _FORMAT, "version": _VERSION, "scene": scene.model_dump(mode="json")}
+    atomic_write(folder / SCENE_FILE, (json.dumps(content, indent=1, allow_nan=False) + "\n").encode())
+    return Frames(folder, scene, tuple(numbered(folder, _FRAME, ".npz")))
 
 
-def obstacle_mesh(obstacles: Sequence[Obstacle], time: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The surfaces of obstacles as triangles, for their pictures and shadows.
+def read_frames(folder: str | os.PathLike[str], *, needed: bool = True) -> Frames:
+    """Reads what a simulation left, but for the frames themselves.
 
-    Returns:
-        Corners float32 [V, 3] in the world, triangles int32 [F, 3], and which obstacle each is of, int32 [F].
+    Args:
+        folder: Where.
+        needed: Whether a folder without frames is an error.
+
+    Raises:
+        WlmError: It isn't such a folder, `scene.json` is damaged, or there is no frame.
     """
-    corners, triangles, owner = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], [np.zeros(0, np.int64)]
-    first = 0
-    for number, obstacle in enumerate(obstacles):
-        points, faces = obstacle.mesh()
-        corners.append(points + obstacle.centre(time))
-        triangles.append(faces + first)
-        owner.append(np.full(len(faces), number))
-        first += len(points)
-    joined = np.concatenate(corners), np.concatenate(triangles), np.concatenate(owner)
-    return joined[0].astype(np.float32), joined[1].astype(np.int32), joined[2].astype(np.int32)
+    folder = Path(folder)
+    if not (folder / SCENE_FILE).is_file():
+        raise WlmError(f"{folder}: expected a folder that simulate wrote, found no {SCENE_FILE}")
+    scene = _read_scene(folder)
+    numbers = tuple(numbered(folder, _FRAME, ".npz"))
+    if needed and not numbers:
+        raise WlmError(f"{folder}: expected frames such as {frame_file(1)}, found none")
+    return Frames(folder, scene, numbers)
+
+
+@dataclass(frozen=True)
+class Footage:
+    """One volume or many frames, read one at a time.
+
+    Attributes:
+        path: The volume's file, or the folder.
+        scene: Of frames; None: a single volume.
+        numbers: Of the frames, (1,) of a single volume.
+        device: Where volumes go.
+        extinction, emission: In place of the scene's, or of 1; None: those.
+    """
+
+    path: Path
+    scene: Scene | None
+    numbers: tuple[int, ...]
+    device: str = "cpu"
+    extinction: float | None = None
+    emission: float | None = None
+
+    def load(self, number: int) -> DensityVolume:
+        """Reads a frame.
+
+        Raises:
+            WlmError: It is missing or damaged.
+        """
+        path = self.path if self.scene is None else self.path / frame_file(number)
+        smoke = self.scene.smoke if self.scene is not None else None
+        factors = {}
+        for name in ("extinction", "emission"):
+            given = getattr(self, name)
+            factors[name] = given if given is not None else getattr(smoke, name, 1.0)
+        return load_volume(path, **factors, device=self.device)
+
+    def time(self, number: int) -> float:
+        """When a frame is, in seconds; 0 of a single volume."""
+        return 0.0 if self.scene is None else self.scene.time(number)
+
+
+def open_footage(
+    path: str | os.PathLike[str],
+    *,
+    extinction: float | None = None,
+    emission: float | None = None,
+    device: str = "cpu",
+) -> Footage:
+    """Opens a volume, `.npz` or `.nvdb`, or a folder that `simulate` wrote.
+
+    Raises:
+        WlmError: There is no such thing.
+    """
+    path = Path(path)
+    if path.is_dir():
+        frames = read_frames(path)
+        return Footage(path, frames.scene, frames.numbers, device, extinction, emission)
+    return Footage(path, None, (1,), device, extinction, emission)
+
+
+def check_folder(folder: str | os.PathLike[str], stem: str, suffix: str, *others: str) -> Path:
+    """Makes a folder for numbered files, or looks that it holds none but those of an earlier run.
+
+    Args:
+        folder: Where; it is made if its parent is there.
+        stem, suffix: Of the files, as for `numbered`.
+        others: Names that such a run leaves beside them.
+
+    Raises:
+        WlmError: It holds other files, or can't be written.
+    """
+    folder = Path(folder)
+    try:
+        folder.mkdir(exist_ok=True)
+        mine = _earlier(folder, stem, suffix, others)
+        if other := next((path for path in sorted(folder.iterdir()) if path not in mine), None):
+            raise WlmError(f"{folder}: expected an empty folder or one of an earlier run, found {other.name}")
+    except OSError as error:
+        raise WlmError(f"{folder}: cannot write there: {error.strerror or error}") from error
+    return folder
+
+
+def clear_folder(folder: str | os.PathLike[str], stem: str, suffix: str, *others: str) -> None:
+    """Removes the files of an earlier run, once the first of the new ones is sure; arguments as for `check_folder`.
+
+    Raises:
+        WlmError: They can't be removed.
+    """
+    folder = Path(folder)
+    try:
+        for path in _earlier(folder, stem, suffix, others):
+            path.unlink(missing_ok=True)
+    except OSError as error:
+        raise WlmError(f"{folder}: cannot write there: {error.strerror or error}") from error
+
+
+def save_volume(path: str | os.PathLike[str], volume: DensityVolume) -> None:
+    """Writes a volume as `.npz`, whole or not at all, such that `load_volume` reads it back.
+
+    Raises:
+        WlmError: Another suffix, or the file can't be written.
+    """
+    if Path(path).suffix.lower() != ".npz":
+        raise WlmError(f"{path}: expected a name that ends in .npz")
+    arrays = {
+        "density": volume.density.cpu().numpy(),
+        "voxel": np.float64(volume.voxel),
+        "origin": np.asarray(volume.origin, np.float64),
+    }
+    if volume.temperature is not None:
+        arrays["temperature"] = volume.temperature.cpu().numpy()
+    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+        np.savez_compressed(file, **arrays)
+
+
+def write_guide(path: str | os.PathLike[str], found: Guide) -> None:
+    """Writes a guiding map as an EXR of the channels light, transparency and depth, all float32.
+
+    Raises:
+        WlmError: The file can't be written.
+    """
+    planes = dict(zip(_GUIDE, found.maps.cpu().numpy(), strict=True))
+    write_planes(path, planes, {"camera": asdict(found.camera)}, whole=_GUIDE)
+
+
+def write_six_way(path: str | os.PathLike[str], six: SixWay, camera: Camera) -> None:
+    """Writes lightmaps as an EXR of half floats: a channel a direction, `transparency` and, of hot smoke, `emission`.
+
+    Raises:
+        WlmError: The file can't be written.
+    """
+    planes = dict(zip(DIRECTIONS, six.lightmaps.cpu().numpy(), strict=True))
+    for name, plane in ((_TRANSPARENCY, six.transparency), (EMISSION, six.emission)):
+        if plane is not None:
+            planes[name] = plane.cpu().numpy()
+    write_planes(path, planes, {"camera": asdict(camera)})
+
+
+def read_six_way(path: str | os.PathLike[str], device: str = "cpu") -> tuple[SixWay, Camera]:
+    """Reads what `write_six_way` wrote.
+
+    Raises:
+        WlmError: The file is missing or damaged, lacks a channel or its camera, or holds a number that isn't finite.
+    """
+    planes, note = read_planes(path)
+    for name in (*DIRECTIONS, _TRANSPARENCY):
+        if name not in planes:
+            raise WlmError(f"{path}: channel {name}: expected it beside {', '.join(planes)}; is it of bake?")
+    for name, plane in planes.items():
+        if not np.isfinite(plane).all():
+            raise WlmError(f"{path}: channel {name}: expected finite numbers, found NaN or infinity")
+    try:
+        # JSON has lists for tuples.
+        given = {key: tuple(value) if isinstance(value, list) else value for key, value in note["camera"].items()}
+        camera = Camera(**given)
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise WlmError(f"{path}: header attribute wlm: camera: expected that of bake: {error}") from error
+    size = next(iter(planes.values())).shape
+    if size != (camera.height, camera.width):
+        raise WlmError(f"{path}: expected the camera's {camera.height} x {camera.width} pixels, found {size}")
+    tensors = {name: torch.from_numpy(plane).to(device) for name, plane in planes.items()}
+    six = SixWay(torch.stack([tensors[name] for name in DIRECTIONS]), tensors[_TRANSPARENCY], tensors.get(EMISSION))
+    return six, camera
+
+
+def _earlier(folder: Path, stem: str, suffix: str, others: tuple[str, ...]) -> list[Path]:
+    return [*numbered(folder, stem, suffix).values(), *(folder / name for name in others)]
+
+
+def _read_scene(folder: Path) -> Scene:
+    path = folder / SCENE_FILE
+    try:
+        content = json.loads(path.read_bytes())
+    except OSError as error:
+        raise WlmError(f"{path}: cannot read: {error.strerror or error}") from error
+    except (ValueError, RecursionError) as error:
+        raise WlmError(f"{path}: not valid JSON: {error}") from error
+    if not isinstance(content, dict) or content.get("format") != _FORMAT:
+        raise WlmError(f"{path}: expected a scene of a simulation's frames, found other content")
+    if content.get("version") != _VERSION:
+        raise WlmError(f"{path}: version: expected {_VERSION}, found {content.get('version')}")
+    try:
+        return Scene.model_validate(content.get("scene"))
+    except ValidationError as error:
+        problem = error.errors(include_url=False)[0]
+        field = ".".join(map(str, ("scene", *problem["loc"])))
+        raise WlmError(f"{path}: {field}: {problem['msg']}") from error
+
+
+def _settings(scene: Scene) -> dict[str, Any]:
+    """What a simulation's frames depend on: neither how many there are nor how they are looked at."""
+    looks = {"smoke": {"extinction", "glow"}, "obstacles": {"__all__": {"colour"}}}
+    others = dict.fromkeys(("name", "frames", "camera", "lights", "background"), True)
+    return json.loads(scene.model_dump_json(exclude=others | looks))
+
+
+def _difference(one: Mapping[str, Any], other: Mapping[str, Any]) -> str | None:
+    return next((key for key in other if one.get(key) != other[key]), None)

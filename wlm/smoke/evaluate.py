@@ -16,12 +16,12 @@ import torch
 
 from wlm.errors import WlmError
 from wlm.metrics.error import psnr_from_mse
-from wlm.smoke.axes import DIRECTIONS
-from wlm.smoke.dataset import DatasetSettings, covered, load_probe_volume, make_validation
-from wlm.smoke.infer import Predictor
-from wlm.smoke.losses import residual
-from wlm.smoke.network import SixWayNetwork
-from wlm.smoke.samples import GUIDES, OPACITY_PLANE, PLANES, Pool
+from wlm.smoke.camera import DIRECTIONS
+from wlm.smoke.decode import Predictor
+from wlm.smoke.learn.dataset import DatasetSettings, covered, load_probe_volume, make_validation
+from wlm.smoke.learn.losses import residual
+from wlm.smoke.model import SixWayNetwork
+from wlm.smoke.planes import GUIDES, OPACITY_PLANE, PLANES, Pool
 
 __all__ = [
     "COARSE",

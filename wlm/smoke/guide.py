@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import torch
 import warp as wp
 
+from wlm.fluid.volume import DensityVolume
 from wlm.interop import device_name, stream, to_warp, torch_memory
-from wlm.smoke.axes import Camera
-from wlm.smoke.volume import DensityVolume
-from wlm_kernels import marching
+from wlm.smoke.camera import Camera
+from wlm_kernels.smoke import march as smoke_march
 
 __all__ = ["Guide", "check_march", "check_step", "guide", "transmittance"]
 
@@ -112,7 +112,7 @@ def guide(
     with stream(device_name(volume.device)):
         maps = torch.empty((3, camera.height, camera.width), dtype=torch.float32, device=volume.device)
         density, _ = volume.arrays()
-        marching.guide(
+        smoke_march.guide(
             density,
             volume.extinction * volume.voxel,
             view,
@@ -159,7 +159,7 @@ def transmittance(
         at = ((points - origin) / volume.voxel).contiguous()
         out = torch.empty(len(points), dtype=torch.float32, device=points.device)
         density, _ = volume.arrays()
-        marching.transmittance(
+        smoke_march.transmittance(
             density,
             volume.extinction * volume.voxel,
             to_warp(at, wp.vec3),

@@ -8,11 +8,11 @@ import math
 import torch
 import warp as wp
 
+from wlm.fluid.volume import DensityVolume
 from wlm.interop import device_name, stream, to_warp, torch_memory
-from wlm.smoke.axes import Camera
+from wlm.smoke.camera import Camera
 from wlm.smoke.guide import check_march
-from wlm.smoke.volume import DensityVolume
-from wlm_kernels import marching_motion
+from wlm_kernels.smoke import march_motion
 
 __all__ = ["motion"]
 
@@ -51,7 +51,7 @@ def motion(
         out = torch.empty((2, camera.height, camera.width), dtype=torch.float32, device=volume.device)
         density, _ = volume.arrays()
         extinction, reached = volume.extinction * volume.voxel, reach / volume.voxel
-        marching_motion.motion(
+        march_motion.motion(
             density, extinction, velocity, reached, view, to_warp(out), step=step, empty=torch_memory(volume.device)
         )
     return out

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from wlm.render import rasterize
-from wlm.smoke.axes import Camera, weights
-from wlm.smoke.reference import SixWay
+from wlm.ops.raster import rasterize
+from wlm.smoke.bake import SixWay
+from wlm.smoke.camera import Camera, weights
 
 __all__ = ["Light", "Ramp", "composite", "obstacle_visibility", "shade"]
 

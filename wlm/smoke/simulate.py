@@ -10,15 +10,15 @@ import numpy as np
 import warp as wp
 
 from wlm.errors import WlmError
+from wlm.fluid import obstacles as bodies
+from wlm.fluid import solver as smoke
+from wlm.fluid import solver_lattice
+from wlm.fluid.faces import FACES
+from wlm.fluid.lattice import Domain, Lattice
+from wlm.fluid.volume import DensityVolume
 from wlm.interop import free_memory
-from wlm.smoke import obstacles as bodies
-from wlm.smoke import solver as smoke
-from wlm.smoke import solver_lattice
-from wlm.smoke.data import Inlet, Scene
-from wlm.smoke.frames import CHECKPOINT, Frames, frame_file, save_volume
-from wlm.smoke.lattice import Domain, Lattice
-from wlm.smoke.lattice_faces import FACES
-from wlm.smoke.volume import DensityVolume
+from wlm.smoke.data import CHECKPOINT, Frames, frame_file, save_volume
+from wlm.smoke.scene import Inlet, Scene
 
 __all__ = ["KEPT_EVERY", "make_solver", "simulate", "volume_of"]
 

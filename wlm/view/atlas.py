@@ -9,14 +9,14 @@ import numpy as np
 import torch
 from PIL import Image, ImageDraw, ImageFont
 
-from wlm import render
 from wlm.atlas.data import LightmappedMesh
 from wlm.atlas.evaluate import Sampler
 from wlm.atlas.views import View, visible_uv
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_path
-from wlm.imageops import fill_gaps
 from wlm.interop import check_device
+from wlm.ops import raster
+from wlm.texels import fill_gaps
 
 __all__ = ["comparison", "draw", "encode", "original", "save_png", "white_of"]
 
@@ -30,7 +30,7 @@ def original(mesh: LightmappedMesh, device: str = "cpu") -> Sampler:
     image = torch.from_numpy(fill_gaps(mesh.lightmap, mesh.mask)).to(check_device(device))
 
     def sample(uv: torch.Tensor, triangle: torch.Tensor, barycentric: torch.Tensor) -> torch.Tensor:
-        return render.texture(image, uv)
+        return raster.texture(image, uv)
 
     return sample
 

@@ -7,7 +7,7 @@ import os
 import numpy as np
 import torch
 
-from wlm.smoke.samples import GUIDES, PLANES, Pool
+from wlm.smoke.planes import GUIDES, PLANES, Pool
 from wlm.view.smoke import MOST_COLUMNS, contact_sheet
 
 __all__ = ["pool_sheet"]

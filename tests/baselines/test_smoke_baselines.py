@@ -1,0 +1,89 @@
+"""What the network is compared with: a coarse march, and a billboard that is looked at from elsewhere."""
+
+import numpy as np
+import pytest
+import torch
+from builders.smoke_plumes import plume
+
+from wlm.baselines.smoke import billboard, direct
+from wlm.fluid.volume import DensityVolume
+from wlm.smoke.bake import SixWay, six_way
+from wlm.smoke.camera import Camera
+from wlm.smoke.scene import CameraSettings, make_camera
+
+
+def _camera(volume: DensityVolume, degrees: float = 0.0, **settings: object) -> Camera:
+    given = CameraSettings(**{"extent": 1.6, "resolution": 32} | settings).turned(degrees)
+    return make_camera(given, volume.origin, volume.voxel * np.asarray(volume.shape))
+
+
+def _error(one: SixWay, other: SixWay) -> float:
+    return float((one.lightmaps - other.lightmaps).square().mean().sqrt())
+
+
+def test_direct(device: str):
+    """The reference's integral: the same at its step, and worse the longer the step."""
+    volume = plume(hot=True, device=device)
+    camera = _camera(volume, 20.0)
+    want = six_way(volume, camera, step=0.25, estimate=False)
+    errors = [_error(direct(volume, camera, step), want) for step in (0.25, 1.0, 4.0, 10.0)]
+    assert errors[0] == 0.0 and all(a < b for a, b in zip(errors, errors[1:], strict=False))
+    found = direct(volume, camera, 10.0)
+    assert found.error is None and found.emission.max() > 0
+    with pytest.raises(ValueError, match="orthographic"):
+        direct(volume, _camera(volume, perspective=True), 4.0)
+
+
+def test_billboard_from_the_same_side(device: str):
+    """Nothing changes where the camera doesn't, with heat and without."""
+    volume = plume(hot=True, device=device)
+    camera = _camera(volume)
+    baked = six_way(volume, camera, estimate=False)
+    shown = billboard(baked, camera, camera, volume.centre)
+    for name in ("lightmaps", "transparency", "emission"):
+        torch.testing.assert_close(getattr(shown, name), getattr(baked, name), atol=2e-6, rtol=0)
+    cold = SixWay(baked.lightmaps, baked.transparency)
+    assert billboard(cold, camera, camera, volume.centre).emission is None
+
+
+def test_billboard_from_elsewhere(device: str):
+    """A turn about the pivot shows the side that was baked, off by ever more; that is the error it is to have."""
+    volume = plume(device=device)
+    first = _camera(volume)
+    baked = six_way(volume, first, estimate=False)
+    errors = []
+    for degrees in (0.0, 30.0, 90.0):
+        camera = _camera(volume, degrees)
+        shown = billboard(baked, first, camera, volume.centre)
+        torch.testing.assert_close(shown.lightmaps, baked.lightmaps, atol=1e-4, rtol=0)
+        errors.append(_error(shown, six_way(volume, camera, estimate=False)))
+    assert errors[0] < 1e-4 < errors[1] < errors[2] and errors[2] > 0.03
+
+
+def test_billboard_moves_with_the_image(device: str):
+    """A camera that is shifted, nearer or finer sees the billboard there, as it sees the smoke itself."""
+    volume = plume(device=device)
+    first = _camera(volume, resolution=96)
+    baked = six_way(volume, first, estimate=False)
+    target = tuple(volume.centre + np.array([0.3, -0.2, 0.0]))
+    for settings in ({"target": target}, {"extent": 1.1}, {"resolution": 48}, {"aspect": 0.5}):
+        camera = _camera(volume, **{"resolution": 96} | settings)
+        want = six_way(volume, camera, estimate=False)
+        black = SixWay(torch.zeros_like(want.lightmaps), None)
+        assert _error(billboard(baked, first, camera, volume.centre), want) < 0.05 * _error(black, want)
+    away = _camera(volume, target=(9.0, 9.0, 9.0))
+    shown = billboard(baked, first, away, volume.centre)
+    assert not shown.lightmaps.any() and (shown.transparency == 1).all()
+
+
+def test_billboard_wrong_use(device: str):
+    """Each wrong argument is named."""
+    volume = plume(device=device)
+    camera = _camera(volume)
+    baked = six_way(volume, camera, estimate=False)
+    with pytest.raises(ValueError, match="orthographic"):
+        billboard(baked, camera, _camera(volume, perspective=True), volume.centre)
+    with pytest.raises(ValueError, match="32 x 32"):
+        billboard(SixWay(baked.lightmaps[:, 1:], None), camera, camera, volume.centre)
+    with pytest.raises(ValueError, match="transparency"):
+        billboard(SixWay(baked.lightmaps, None), camera, camera, volume.centre)

@@ -1,0 +1,185 @@
+"""Reading smoke: arrays, .npz and NanoVDB files, what is repaired and what is refused."""
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+
+from wlm.errors import WlmError
+from wlm.fluid.volume import from_array, from_grid, load_volume
+
+_GRID_INDEX, _GRID_NAME, _HEADER, _METADATA = 24, 40, 16, 176
+
+
+def _nvdb(path: Path, density: np.ndarray, voxel: float = 0.5, at: tuple = (1.0, 2.0, 3.0)) -> None:
+    empty = 0.0 if density.ndim == 3 else (0.0,) * 3
+    volume = wp.Volume.load_from_numpy(density, min_world=at, voxel_size=voxel, bg_value=empty, device="cpu")
+    volume.save_to_nvdb(path)
+
+
+def _joined(path: Path, parts: dict[str, Path]) -> None:
+    """One file of several named grids, of files of one grid without a name."""
+    heads, grids = [], []
+    for i, (name, part) in enumerate(parts.items()):
+        data = part.read_bytes()
+        head, grid = data[_HEADER : _HEADER + _METADATA], bytearray(data[_HEADER + _METADATA + 1 :])
+        text = name.encode() + b"\0"
+        heads.append(head[:136] + struct.pack("<I", len(text)) + head[140:] + text)
+        grid[_GRID_INDEX : _GRID_INDEX + 8] = struct.pack("<II", i, len(parts))
+        grid[_GRID_NAME : _GRID_NAME + len(text)] = text
+        grids.append(bytes(grid))
+    first = next(iter(parts.values())).read_bytes()[:_HEADER]
+    path.write_bytes(first[:12] + struct.pack("<HH", len(parts), 0) + b"".join(heads) + b"".join(grids))
+
+
+def test_npz(tmp_path: Path, device: str):
+    path = tmp_path / "a.npz"
+    density = np.arange(24, dtype=np.float32).reshape(2, 3, 4)
+    np.savez(path, density=density, temperature=density / 24, voxel=0.25, origin=[1.0, 2.0, 3.0])
+    volume = load_volume(path, extinction=2.0, device=device)
+    assert volume.shape == (2, 3, 4) and volume.voxel == 0.25 and volume.origin == (1.0, 2.0, 3.0)
+    np.testing.assert_array_equal(volume.density.cpu(), density)
+    np.testing.assert_array_equal(volume.temperature.cpu(), density / 24)
+    np.testing.assert_allclose(volume.centre, [1.25, 2.375, 3.5])
+    assert volume.warnings == () and volume.device.type == device[:4].rstrip(":")
+    other = load_volume(path, voxel=1.0)
+    assert other.voxel == 1.0 and other.origin == (4.0, 8.0, 12.0)
+
+
+def test_types():
+    """Half stays half, all else is float; temperature follows the density."""
+    values = np.ones((2, 2, 2))
+    for dtype, want in ((np.float16, torch.float16), (np.float64, torch.float32), (np.uint8, torch.float32)):
+        volume = from_array(values.astype(dtype), temperature=values)
+        assert volume.density.dtype == volume.temperature.dtype == want
+    source = np.ones((2, 2, 2), np.float32)
+    volume = from_array(source)
+    source[:] = 5
+    assert (volume.density == 1).all()
+
+
+def test_repairs(device: str):
+    """NaN, infinite and negative voxels become zero, with a line that counts them and names the first."""
+    density = np.ones((3, 3, 3))
+    density[0, 1, 2] = np.nan
+    density[2, 0, 0] = np.inf
+    density[1, 1, 1] = -0.5
+    density[2, 2, 2] = 1e300
+    volume = from_array(density, device=device, name="smoke")
+    assert volume.warnings == (
+        "smoke: density: 3 NaN or infinite voxels count as 0, the first is (0, 1, 2)",
+        "smoke: density: 1 negative voxels count as 0, the first is (1, 1, 1)",
+    )
+    assert float(volume.density.sum()) == 23.0
+    hot = from_array(np.ones((1, 1, 1)), temperature=np.full((1, 1, 1), np.nan))
+    assert float(hot.temperature) == 0 and len(hot.warnings) == 1
+
+
+def test_nvdb(tmp_path: Path, device: str):
+    """Voxels lie where NanoVDB has them: its coordinates are centres."""
+    density = np.random.default_rng(0).uniform(0.1, 1, (9, 5, 3)).astype(np.float32)
+    path = tmp_path / "a.nvdb"
+    _nvdb(path, density)
+    volume = load_volume(path, device=device)
+    assert volume.voxel == 0.5 and volume.origin == (0.75, 1.75, 2.75)
+    got = volume.density.cpu().numpy()
+    np.testing.assert_array_equal(got[:9, :5, :3], density)
+    # Warp's writer fills whole leaves.
+    assert got.shape == (16, 8, 8) and got.sum() == pytest.approx(density.sum(), rel=1e-5)
+
+
+def test_grid_on_its_device(device: str):
+    """A `wp.Volume` becomes dense where it lies."""
+    density = np.random.default_rng(2).uniform(0.1, 1, (8, 8, 8)).astype(np.float32)
+    grid = wp.Volume.load_from_numpy(density, min_world=(0.0, 0.0, 0.0), voxel_size=2.0, device=device)
+    volume = from_grid(grid, grid, extinction=3.0)
+    np.testing.assert_array_equal(volume.density.cpu(), density)
+    np.testing.assert_array_equal(volume.temperature.cpu(), density)
+    assert volume.origin == (-1.0, -1.0, -1.0) and volume.voxel == 2.0 and volume.extinction == 3.0
+    assert str(volume.device) == device
+
+
+def test_nvdb_of_two_grids(tmp_path: Path):
+    """The grid named density is found where it isn't the first; temperature comes along."""
+    random = np.random.default_rng(1)
+    density, hot = (random.uniform(0.1, 1, (8, 8, 8)).astype(np.float32) for _ in range(2))
+    for name, values in (("d", density), ("t", hot)):
+        _nvdb(tmp_path / f"{name}.nvdb", values)
+    _joined(tmp_path / "both.nvdb", {"temperature": tmp_path / "t.nvdb", "density": tmp_path / "d.nvdb"})
+    volume = load_volume(tmp_path / "both.nvdb")
+    np.testing.assert_array_equal(volume.density, density)
+    np.testing.assert_array_equal(volume.temperature, hot)
+    _nvdb(tmp_path / "t.nvdb", hot, voxel=0.25)
+    _joined(tmp_path / "both.nvdb", {"temperature": tmp_path / "t.nvdb", "density": tmp_path / "d.nvdb"})
+    with pytest.raises(WlmError, match="both.nvdb: temperature: expected the voxels of density"):
+        load_volume(tmp_path / "both.nvdb")
+
+
+def test_damaged_nvdb(tmp_path: Path):
+    """Cut short anywhere, or not the file at all: one line."""
+    path = tmp_path / "a.nvdb"
+    _nvdb(path, np.ones((8, 8, 8), np.float32))
+    whole = path.read_bytes()
+    for size in (0, 10, 16, 100, 192, 193, 500, 900, len(whole) // 2, len(whole) - 1):
+        path.write_bytes(whole[:size])
+        with pytest.raises(WlmError, match=r"a\.nvdb: cannot read the NanoVDB file"):
+            load_volume(path)
+    path.write_bytes(b"no volume at all" * 100)
+    with pytest.raises(WlmError, match="cannot read the NanoVDB file"):
+        load_volume(path)
+
+
+def test_nvdb_of_others(tmp_path: Path):
+    """Vectors and stretched voxels aren't smoke."""
+    path = tmp_path / "a.nvdb"
+    _nvdb(path, np.ones((8, 8, 8, 3), np.float32))
+    with pytest.raises(WlmError, match="expected a grid of floats"):
+        load_volume(path)
+    _nvdb(path, np.ones((8, 8, 8), np.float32), voxel=(1.0, 2.0, 1.0))
+    with pytest.raises(WlmError, match="expected a grid of cubic voxels"):
+        load_volume(path)
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"smoke": np.ones((2, 2, 2))}, "density is missing; found smoke"),
+        ({"density": np.ones((2, 2))}, r"density: expected \[X, Y, Z\] voxels, found \(2, 2\)"),
+        ({"density": np.ones((0, 2, 2))}, r"density: expected \[X, Y, Z\] voxels"),
+        ({"density": np.full((1, 1, 1), "x")}, "density: expected numbers"),
+        ({"density": np.ones((1, 1, 1), complex)}, "density: expected numbers"),
+        ({"density": np.ones((2, 2, 2)), "temperature": np.ones((2, 2, 1))}, "temperature: expected"),
+        ({"density": np.ones((1, 1, 1)), "voxel": 0.0}, "voxel: expected a length above 0"),
+        ({"density": np.ones((1, 1, 1)), "voxel": "big"}, "voxel: expected 1 finite numbers"),
+        ({"density": np.ones((1, 1, 1)), "origin": [0.0, np.nan, 0.0]}, "origin: expected 3 finite numbers"),
+    ],
+)
+def test_wrong_npz(tmp_path: Path, arrays: dict, message: str):
+    np.savez(tmp_path / "a.npz", **arrays)
+    with pytest.raises(WlmError, match=rf"a\.npz: {message}"):
+        load_volume(tmp_path / "a.npz")
+
+
+def test_wrong_files(tmp_path: Path):
+    (tmp_path / "b.npz").write_bytes(b"PK\x03\x04 cut")
+    np.save(tmp_path / "c.npy", np.ones(3))
+    (tmp_path / "c.npy").rename(tmp_path / "c.npz")
+    for name, message in (
+        ("a.vdb", "expected a name that ends in .npz or .nvdb, found .vdb"),
+        ("a.npz", "no such file"),
+        ("b.npz", "cannot read the arrays"),
+        ("c.npz", "expected a .npz file of several arrays"),
+    ):
+        with pytest.raises(WlmError, match=message):
+            load_volume(tmp_path / name)
+    for options, message in (
+        ({"extinction": 0.0}, "extinction: expected a number above 0"),
+        ({"emission": -1.0}, "emission: expected"),
+        ({"device": "cuda:99"}, "cuda:99"),
+        ({"voxel": -1.0}, "voxel: expected a length above 0"),
+    ):
+        with pytest.raises(WlmError, match=message):
+            from_array(np.ones((1, 1, 1)), **options)

@@ -1,0 +1,390 @@
+"""A whole simulation: smoke in moving air, obstacles, checkpoints, and the hard cases."""
+
+from pathlib import Path as FilePath
+
+import numpy as np
+import pytest
+import warp as wp
+
+from wlm.errors import WlmError
+from wlm.fluid import solver_lattice
+from wlm.fluid.faces import FACES
+from wlm.fluid.lattice import CHECK_EVERY, Lattice
+from wlm.fluid.obstacles import Mesh, Path, Sphere, box_mesh
+from wlm.fluid.solver import SCHEMES, Buoyancy, Solver, Source
+from wlm.formats.artifact import read_artifact, write_artifact
+from wlm_kernels.fluid.advection_places import CLOSED, OPEN, PERIODIC
+
+SHAPE = (20, 10, 10)
+NOZZLE = Source("box", (2, 5, 5), (1.5, 2.5, 2.5), 1.0, 0.5, fixed=True)
+MOVING = Sphere(Path.of([[9, 5, 5], [12, 5, 5]], [0, 60]), 2.0)
+
+
+def _tunnel(device: str, shape=SHAPE, speed: float = 0.1, **settings) -> Lattice:
+    lattice = Lattice(shape, device=device, **({"viscosity": 1e-4, "ramp": 10} | settings))
+    lattice.set_inlet("-x", (speed, 0.0, 0.0))
+    lattice.set_outlet("+x")
+    for face in FACES[2:]:
+        lattice.set_wall(face, slip=True)
+    return lattice
+
+
+def _room(device: str, shape=(10, 12, 10), viscosity: float = 0.02) -> Lattice:
+    lattice = Lattice(shape, viscosity=viscosity, device=device)
+    for face in FACES:
+        lattice.set_wall(face)
+    return lattice
+
+
+def _jet(device: str, obstacles=(MOVING,), **settings) -> Solver:
+    settings = {"refinement": 2, "temperature": True, "sources": [NOZZLE], "dissipation": 1e-3} | settings
+    return Solver(_tunnel(device), obstacles=obstacles, buoyancy=Buoyancy(1e-4), **settings)
+
+
+def _numbers(solver: Solver) -> np.ndarray:
+    return solver.density.numpy().astype(np.float64)
+
+
+# Smoke in air.
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_a_jet_carries_smoke_past_a_sphere(scheme: str, device: str):
+    """It comes as far as the air does, none lies in the sphere, and there is none too much."""
+    jet = _jet(device, scheme=scheme)
+    jet.step(50)
+    density = _numbers(jet)
+    assert density.shape == (40, 20, 20)
+    assert density.min() >= 0.0 and density.max() == 1.0
+    solid = jet.solid.numpy() == 1
+    assert np.count_nonzero(solid) > 20
+    np.testing.assert_array_equal(density[solid.repeat(2, 0).repeat(2, 1).repeat(2, 2)], 0.0)
+    front = np.flatnonzero(density.sum((1, 2)) > 0.5).max() / 2
+    assert 8 < front < 18
+    assert jet.steps == 50 and jet.lattice.steps == 100
+
+
+def test_bricks_give_the_dense_result(device: str):
+    dense, bricks = (_jet(device, bricks=b) for b in (False, True))
+    for solver in (dense, bricks):
+        solver.step(30)
+    np.testing.assert_allclose(_numbers(bricks), _numbers(dense), rtol=0, atol=1e-5)
+    assert dense.active_cells == 16000
+
+
+def test_still_smoke_costs_its_bricks(device: str):
+    """A puff in a long, still room: bricks about it are worked on, and no others."""
+    source = Source("sphere", (4, 4, 4), (1, 1, 1), 1.0, fixed=True)
+    solver = Solver(_room(device, (64, 8, 8)), refinement=2, sources=[source], bricks=True)
+    # At first all bricks count as busy.
+    solver.step(3)
+    # The brick of the puff and those within a ring of it, of 16 x 2 x 2.
+    assert solver.active_cells == 3 * 2 * 2 * 512
+
+
+def test_half_floats_are_near_whole_ones(device: str):
+    whole, half = (_jet(device, storage=s, dissipation=0.0) for s in ("float32", "float16"))
+    for solver in (whole, half):
+        solver.step(20)
+    assert half.density.dtype is wp.float16
+    difference = _numbers(half) - _numbers(whole)
+    assert np.abs(difference).max() <= 2e-2 and np.sqrt(np.mean(difference**2)) <= 1e-3
+
+
+def test_smoke_decays(device: str):
+    """Still smoke decays by exp(-rate t), its temperature by its own rate."""
+    source = Source("box", (4, 4, 4), (9, 9, 9), 1.0, 2.0)
+    lattice = _room(device, (8, 8, 8))
+    rates = {"dissipation": 0.01, "cooling": 0.03, "substeps": 1}
+    solver = Solver(lattice, refinement=1, temperature=True, sources=[source], **rates)
+    solver.step(1)
+    solver.sources = ()
+    solver.step(20)
+    np.testing.assert_allclose(solver.density.numpy(), np.exp(-0.2), rtol=1e-5)
+    np.testing.assert_allclose(solver.temperature.numpy(), 2.0 * np.exp(-0.6), rtol=1e-5)
+
+
+@pytest.mark.parametrize("bricks", [False, True])
+def test_hot_smoke_rises_and_heavy_smoke_falls(bricks: bool, device: str):
+    heights = []
+    for buoyancy in (Buoyancy(2e-3), Buoyancy(0.0, 2e-3)):
+        source = Source("sphere", (5, 6, 5), (2, 2, 2), 0.05, 0.05)
+        solver = Solver(
+            _room(device), refinement=2, temperature=True, sources=[source], buoyancy=buoyancy, bricks=bricks
+        )
+        solver.step(40)
+        density = _numbers(solver)
+        heights.append((density.sum((0, 2)) * (np.arange(24) + 0.5)).sum() / density.sum() / 2)
+    assert heights[0] > 6.3 and heights[1] < 5.7
+
+
+# Obstacles.
+
+
+def test_an_obstacle_over_the_inlet(device: str):
+    """With all of it covered nothing comes in, neither air nor smoke."""
+    plug = box_mesh(Path.of((2, 5, 5)), (4.4, 12, 12))
+    solver = _jet(device, obstacles=[plug])
+    solver.step(20)
+    np.testing.assert_array_equal(_numbers(solver), 0.0)
+    assert np.abs(solver.velocity.numpy()).max() <= 1e-6
+
+
+def test_an_obstacle_too_fast(device: str):
+    fast = Sphere(Path.of([[9, 5, 5], [19, 5, 5]], [10, 20]), 2.0)
+    solver = _jet(device, obstacles=[fast])
+    solver.step(5)
+    with pytest.raises(WlmError, match="moves at 1 cells a step: expected at most 0.3"):
+        solver.step(1)
+
+
+def test_obstacles_cover_what_they_should(device: str):
+    """A sphere and a box, each with a number of its own; and when both are over a cell, one of them has it."""
+    box = box_mesh(Path.of((14, 5, 5)), (4, 6, 2))
+    solver = _jet(device, obstacles=[MOVING, box])
+    solver.step(1)
+    solid = solver.solid.numpy()
+    x = np.stack(np.meshgrid(*[np.arange(n) + 0.5 for n in SHAPE], indexing="ij"), -1)
+    np.testing.assert_array_equal(solid == 2, (np.abs(x - (14, 5, 5)) < (2, 3, 1)).all(-1))
+    # A sphere that goes on from 9 by 3 cells in 60 steps is put where it is in the middle of the first two.
+    np.testing.assert_array_equal(solid == 1, np.linalg.norm(x - (9.05, 5, 5), axis=-1) < 2)
+
+
+def test_paths():
+    path = Path.of([[0, 0, 0], [2, 0, 0], [2, 4, 0]], [10, 20, 30])
+    for time, at in ((0, (0, 0, 0)), (15, (1, 0, 0)), (25, (2, 2, 0)), (99, (2, 4, 0))):
+        np.testing.assert_allclose(path.at(time), at)
+    for wrong in (
+        lambda: Path.of([[0, 0, 0], [1, 0, 0]], [1, 1]),
+        lambda: Path.of([0, 0, np.nan]),
+        lambda: Path.of([0, 0, 0], [0, 1]),
+        lambda: Sphere(path, 0.0),
+        lambda: box_mesh(path, (1, 1, 0)),
+        lambda: Mesh(path, np.zeros((3, 3)), np.array([[0, 1, 3]])),
+        lambda: Mesh(path, np.zeros((3, 2)), np.array([[0, 1, 2]])),
+        lambda: Mesh(path, np.zeros((3, 3)), np.array([[0, 1, 2]]), scale=0.0),
+    ):
+        with pytest.raises(ValueError, match="expected"):
+            wrong()
+
+
+# Checkpoints.
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_a_checkpoint_goes_on_to_the_last_bit(scheme: str, device: str, tmp_path: FilePath):
+    """Past the time when the obstacle comes to rest; with a step of an odd number."""
+    first, second = (_jet(device, scheme=scheme) for _ in range(2))
+    first.step(17)
+    first.save(tmp_path / "state")
+    first.step(20)
+    second.load(tmp_path / "state")
+    assert second.steps == 17
+    second.step(20)
+    for name in ("density", "temperature", "velocity", "solid"):
+        np.testing.assert_array_equal(getattr(first, name).numpy(), getattr(second, name).numpy())
+
+
+def test_bricks_go_on_from_a_checkpoint(device: str, tmp_path: FilePath):
+    """With a threshold of 0 to the last bit."""
+    first, second = (_jet(device, bricks=True, threshold=0.0, storage="float16") for _ in range(2))
+    first.step(11)
+    first.save(tmp_path / "state")
+    second.step(4)
+    second.load(tmp_path / "state")
+    for solver in (first, second):
+        solver.step(8)
+    np.testing.assert_array_equal(_numbers(first), _numbers(second))
+
+
+@pytest.mark.parametrize("before", [0, 5])
+def test_a_checkpoint_of_before_the_first_step(before: int, device: str, tmp_path: FilePath):
+    """Of a solver whose obstacles aren't placed yet, into one whose obstacle has moved already too."""
+    first, second = _jet(device), _jet(device)
+    first.save(tmp_path / "state")
+    second.step(before)
+    second.load(tmp_path / "state")
+    assert second.steps == 0 and not second.solid.numpy().any()
+    for solver in (first, second):
+        solver.step(6)
+    assert first.solid.numpy().any()
+    for name in ("density", "temperature", "velocity", "solid"):
+        np.testing.assert_array_equal(getattr(first, name).numpy(), getattr(second, name).numpy())
+
+
+def test_checkpoints_are_checked(device: str, tmp_path: FilePath):
+    solver, path = _jet(device), tmp_path / "state"
+    solver.step(2)
+    solver.save(path)
+    for other, match in (
+        (_jet(device, dissipation=2e-3), "dissipation: expected 0.002, found 0.001"),
+        (_jet(device, obstacles=()), "obstacles: expected"),
+    ):
+        with pytest.raises(WlmError, match=match):
+            other.load(path)
+    stored = read_artifact(path)
+    for name, value, match in (
+        ("density", np.zeros((2, 2, 2), np.float32), r"density: expected float32 \(40, 20, 20\), found float32"),
+        ("lattice.populations", None, "populations: missing"),
+        ("placed", None, "placed: expected float64 .*, found none"),
+    ):
+        tensors = {key: np.array(v) for key, v in stored.tensors.items() if key != name}
+        if value is not None:
+            tensors[name] = value
+        write_artifact(tmp_path / "wrong", stored.system, stored.settings, tensors, stored.source)
+        with pytest.raises(WlmError, match=match) as caught:
+            solver.load(tmp_path / "wrong")
+        assert "wrong" in str(caught.value)
+    path.write_bytes(path.read_bytes()[:-7])
+    with pytest.raises(WlmError, match="cut short"):
+        solver.load(path)
+    with pytest.raises(WlmError, match="cannot read"):
+        solver.load(tmp_path / "nothing")
+
+
+def test_a_blow_up_stops_with_the_last_good_state(device: str, tmp_path: FilePath):
+    """Ever hotter smoke drives the air beyond the speed of sound: named, soon, and the file is of before."""
+    path = tmp_path / "good"
+    source = Source("sphere", (5, 6, 5), (3, 3, 3), 0.1, 0.1)
+
+    def make() -> Solver:
+        settings = {"temperature": True, "sources": [source], "buoyancy": Buoyancy(0.02), "refinement": 1}
+        return Solver(_room(device), checkpoint=path, checkpoint_every=4, **settings)
+
+    solver = make()
+    with pytest.raises(WlmError, match=r"blew up in step \d+ at cell .*; the state of step \d+ is kept in") as caught:
+        solver.step(500)
+    words = str(caught.value).split()
+    blown, kept = int(words[words.index("step") + 1]), int(words[words.index("kept") - 2])
+    assert solver.lattice.steps <= blown + CHECK_EVERY + 2
+    assert 8 <= kept <= blown
+    again = make()
+    again.load(path)
+    assert again.lattice.steps == kept
+    # Where nothing newer is kept, the file that was loaded is named; what blew up isn't saved over it.
+    content = path.read_bytes()
+    with pytest.raises(WlmError, match="blew up in step"):
+        solver.save(path)
+    assert path.read_bytes() == content
+    resumed = Solver(_room(device), temperature=True, sources=[source], buoyancy=Buoyancy(0.02), refinement=1)
+    resumed.load(path)
+    with pytest.raises(WlmError, match=f"; the state of step {kept} is kept in {path}"):
+        resumed.step(500)
+    assert np.isfinite(_numbers(again)).all() and np.isfinite(again.lattice.velocity().numpy()).all()
+    again.step(1)
+    with pytest.raises(WlmError, match="blew up"):
+        solver.step(1)
+
+
+@pytest.mark.slow
+def test_five_thousand_steps_past_a_sphere(device: str):
+    """At a viscosity of 1e-6 with the default operator: stable, and the air's mass stays within 0.1%."""
+    ball = Sphere(Path.of((10, 8, 8)), 3.0)
+    lattice = _tunnel(device, (32, 16, 16), viscosity=1e-6, ramp=128)
+    source = Source("box", (2, 8, 8), (1.5, 4, 4), 1.0, fixed=True)
+    solver = Solver(lattice, refinement=1, sources=[source], obstacles=[ball])
+    solver.step(1)
+    mass = lattice.mass()
+    solver.step(2499)
+    assert lattice.steps == 5000
+    assert abs(lattice.mass() / mass - 1.0) <= 1e-3
+    density = _numbers(solver)
+    assert 0.0 <= density.min() and density.max() <= 1.0 and density.sum() > 100
+
+
+# Hard cases.
+
+
+def test_no_smoke(device: str):
+    solver = Solver(_tunnel(device), refinement=2, bricks=True)
+    solver.step(4)
+    assert solver.active_cells == 0
+    np.testing.assert_array_equal(_numbers(solver), 0.0)
+    assert solver.velocity.numpy()[..., 0].max() > 0.01
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_one_voxel(scheme: str, device: str):
+    source = Source("box", (0.5, 0.5, 0.5), (1, 1, 1), 0.25)
+    for bricks in (False, True):
+        lattice = Lattice((1, 1, 1), viscosity=0.1, device=device)
+        solver = Solver(lattice, refinement=1, scheme=scheme, sources=[source], bricks=bricks, substeps=1)
+        solver.step(4)
+        assert _numbers(solver).tolist() == [[[1.0]]]
+
+
+def test_too_large(device: str):
+    with pytest.raises(WlmError, match="1600 x 1600 x 1600 cells: expected fewer than 2\\^31"):
+        Solver(Lattice((8, 8, 8), viscosity=0.1, device=device), refinement=200)
+    with pytest.raises(WlmError, match=r"100 x 100 x 100 cells need .* GiB on .*: expected at most"):
+        solver_lattice.require_memory((100, 100, 100), 10**9, wp.get_device(device))
+
+
+def test_faces_as_smoke_sees_them(device: str):
+    assert solver_lattice.ends(_tunnel(device)) == ((OPEN, OPEN), (CLOSED, CLOSED), (CLOSED, CLOSED))
+    assert solver_lattice.ends(Lattice((2, 2, 2), viscosity=0.1)) == ((PERIODIC, PERIODIC),) * 3
+
+
+def test_wrong_arguments(device: str):
+    lattice = _room(device, (4, 4, 4))
+    hot = Source("box", (1, 1, 1), (1, 1, 1), 1.0, 1.0)
+    for settings, match in (
+        ({"scheme": "upwind"}, "scheme"),
+        ({"storage": "int8"}, "storage"),
+        ({"refinement": 0}, "refinement"),
+        ({"substeps": 0}, "substeps"),
+        ({"dissipation": -1.0}, "dissipation"),
+        ({"storage": "float16", "dissipation": 1e-5}, "with float16"),
+        ({"sources": [hot]}, "temperature: expected True"),
+        ({"obstacles": [MOVING] * 256}, "at most 255"),
+        ({"checkpoint_every": 0}, "checkpoint_every"),
+    ):
+        with pytest.raises(ValueError, match=match):
+            Solver(lattice, **settings)
+    with pytest.raises(ValueError, match="without bricks"):
+        Solver(Lattice((8, 8, 8), viscosity=0.1, bricks=True, device=device), buoyancy=Buoyancy(0.0, 1e-3))
+    for wrong in (
+        lambda: Source("cone", (1, 1, 1), (1, 1, 1), 1.0),
+        lambda: Source("box", (1, 1, np.inf), (1, 1, 1), 1.0),
+        lambda: Source("box", (1, 1, 1), (1, 0, 1), 1.0),
+        lambda: Source("box", (1, 1, 1), (1, 1, 1), -1.0),
+        lambda: Buoyancy(np.nan),
+        lambda: Buoyancy(1.0, up=(0.0, 2.0, 0.0)),
+        lambda: Solver(lattice).step(-1),
+    ):
+        with pytest.raises(ValueError, match="expected"):
+            wrong()
+
+
+def test_a_frame_is_the_smoke_as_it_is(device: str):
+    solver = _jet(device)
+    solver.step(4)
+    frame = solver.frame(extinction=3.0, emission=2.0, cell=0.5, origin=(1.0, 2.0, 3.0))
+    assert frame.voxel == 0.25 and frame.origin == (1.0, 2.0, 3.0)
+    assert (frame.extinction, frame.emission) == (3.0, 2.0)
+    np.testing.assert_array_equal(frame.density.cpu().numpy(), solver.density.numpy())
+    np.testing.assert_array_equal(frame.temperature.cpu().numpy(), solver.temperature.numpy())
+    assert frame.density.data_ptr() == solver.density.ptr
+    cold = Solver(_room(device, (4, 4, 4)))
+    assert cold.frame().temperature is None and cold.temperature is None
+
+
+def test_steps_can_be_captured(device: str):
+    """In a graph of the user's: the same smoke as by eager steps, counted too."""
+    at_rest = [Sphere(Path.of((9, 5, 5)), 2.0)]
+    if device == "cpu":
+        solver = _jet(device)
+        solver.step(2 * solver.period)
+        assert solver.steps == 4
+        return
+    for bricks in (False, True):
+        eager, graphed = (_jet(device, obstacles=at_rest, bricks=bricks) for _ in range(2))
+        graphed.step(2)
+        with wp.ScopedCapture(device) as capture:
+            graphed.step(2)
+        for _ in range(5):
+            wp.capture_launch(capture.graph)
+        graphed.check()
+        eager.step(12)
+        np.testing.assert_array_equal(_numbers(eager), _numbers(graphed))
+        assert graphed.steps == eager.steps == 12

@@ -1,0 +1,382 @@
+"""Scenes from YAML, cameras before boxes, obstacles on paths, folders of frames, lightmaps in files."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+import pytest
+import torch
+import yaml
+from builders.smoke_plumes import SCENE, SPHERE, plume, write_frames
+from pydantic import ValidationError
+
+from wlm.config import profile_names
+from wlm.errors import WlmError
+from wlm.fluid.faces import FACES
+from wlm.fluid.volume import from_array, load_volume
+from wlm.formats.exr_planes import read_planes, write_planes
+from wlm.smoke.bake import six_way
+from wlm.smoke.data import (
+    CHECKPOINT,
+    check_folder,
+    clear_folder,
+    open_footage,
+    open_frames,
+    read_frames,
+    read_six_way,
+    save_volume,
+    write_guide,
+    write_six_way,
+)
+from wlm.smoke.guide import guide
+from wlm.smoke.scene import (
+    CameraSettings,
+    LightSettings,
+    Obstacle,
+    Scene,
+    Smoke,
+    Source,
+    load_scene,
+    make_camera,
+    obstacle_mesh,
+)
+
+
+def _scene(tmp_path, **changed):
+    path = tmp_path / "scene.yaml"
+    path.write_text(yaml.safe_dump(SCENE | changed))
+    return load_scene(path)
+
+
+def test_a_scene_from_a_file(tmp_path):
+    scene = _scene(tmp_path, obstacles=[SPHERE])
+    assert (scene.grid.shape, scene.grid.voxel) == ((20, 24, 20), 0.05)
+    np.testing.assert_allclose(scene.grid.size, [1.0, 1.2, 1.0])
+    assert (scene.grid.face("+x"), scene.time(3)) == ("open", pytest.approx(0.3))
+    # 1 m/s is 5 cells a second, at most 0.1 cells a step; the sphere moves 0.8 m in 0.4 s, twice as fast.
+    assert (scene.fastest, scene.steps) == (pytest.approx(2.0), 10)
+    assert scene.step == pytest.approx(0.01) and scene.fastest * scene.step / scene.grid.cell <= 0.1 + 1e-9
+    assert _scene(tmp_path, inlets=[]).fastest == 1.0
+
+
+@pytest.mark.parametrize("name", ["jet-sphere", "jet-moving", "explosion"])
+def test_the_scenes_that_there_are(name):
+    scene = load_scene(name)
+    assert name in profile_names("smoke")
+    # Nothing begins inside of an obstacle or out of the box, and the paper's grids are meant.
+    assert scene.grid.cells == (100, 100, 100) and scene.grid.shape == (400, 400, 400)
+    box = scene.grid.origin + scene.grid.size
+    for time in np.linspace(0, scene.time(scene.frames), 9):
+        for obstacle in scene.obstacles:
+            assert (np.abs(obstacle.centre(time) - 0.5 * box) + obstacle.radius < 0.5 * box).all()
+    assert scene.inlets or scene.sources
+    small = scene.scaled(0.16)
+    assert small.grid.cells == (16, 16, 16)
+    np.testing.assert_allclose(small.grid.size, scene.grid.size)
+    assert small.steps * 5 < scene.steps * 2
+
+
+def test_scaling_keeps_one_cell(tmp_path):
+    scene = _scene(tmp_path, grid={"cells": [8, 1, 2], "cell": 1.0})
+    small = scene.scaled(0.25)
+    assert small.grid.cells == (2, 1, 1) and small.grid.cell == 4.0
+    assert _scene(tmp_path, grid={"cells": [1, 1, 1], "cell": 1.0}).scaled(0.01).grid.cells == (1, 1, 1)
+    with pytest.raises(ValueError, match="factor"):
+        scene.scaled(0)
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"grid": {"cells": [4, 4], "cell": 0.1}}, "grid.cells"),
+        ({"grid": {"cells": [4, 4, 0], "cell": 0.1}}, "grid.cells.2: expected greater than or equal to 1, got 0"),
+        ({"grid": {"cells": [4, 4, 4], "cell": -1}}, "grid.cell: expected greater than 0, got -1"),
+        ({"grid": {"cells": [4, 4, 4], "cell": 1, "faces": {"up": "wall"}}}, "grid.faces.up"),
+        ({"grid": {"cells": [4, 4, 4], "cell": 1, "faces": {"-x": "periodic"}}}, "both faces of an axis"),
+        ({"smoke": {"extinction": 0}}, "smoke.extinction: expected greater than 0"),
+        ({"smoke": {"glow": [[0, 1, 1, 1]]}}, "smoke: expected no stops of glow, or at least two that rise"),
+        ({"air": {"viscosity": math.nan}}, "air.viscosity: expected a finite number, got nan"),
+        ({"sources": [{"centre": [0, 0, 0], "radius": 1, "start": 2, "stop": 1}]}, "expected to stop after it starts"),
+        ({"obstacles": [SPHERE | {"path": []}]}, "obstacles.0.path"),
+        ({"obstacles": [SPHERE | {"path": [[0, 0, 0, 0], [0, 1, 1, 1]]}]}, "0.path: expected times that rise"),
+        ({"obstacles": [SPHERE | {"shape": "box"}]}, "obstacles.0: expected one radius of a sphere, three half"),
+        ({"inlets": [{"face": "up", "velocity": [0, 1, 0]}]}, "inlets.0.face"),
+        ({"inlets": [{"face": "+y", "velocity": [0, 1, 0]}]}, "inlets.0: expected a velocity into the box"),
+        ({"inlets": [{"face": "-x", "velocity": [0, 1, 0]}]}, "inlets.0: expected a velocity into the box"),
+        ({"grid": {"cells": [4, 4, 4], "cell": 1, "faces": dict.fromkeys(FACES, "wall")}}, "expected an open face"),
+        (
+            {"grid": {"cells": [4, 4, 4], "cell": 1, "faces": {"-y": "periodic", "+y": "periodic"}}},
+            "expected inlets on faces that aren't periodic",
+        ),
+        ({"lights": [{"toward": [0, 0, 0]}]}, "lights.0.toward: expected a direction of some length"),
+        ({"lights": [{"toward": [0, 1, 0], "irradiance": [1, -1, 1]}]}, "lights.0.irradiance.1"),
+        ({"camera": {"resolution": 0}}, "camera.resolution"),
+        ({"frames": 0}, "frames: expected greater than or equal to 1"),
+        ({"camara": {}}, "unknown key 'camara'; did you mean 'camera'?"),
+    ],
+)
+def test_what_a_scene_may_not_be(tmp_path, changed, said):
+    with pytest.raises(WlmError, match="scene.yaml") as caught:
+        _scene(tmp_path, **changed)
+    assert said in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_scenes_that_are_not_there(tmp_path):
+    with pytest.raises(WlmError, match="expected one of the known profiles: .*jet-sphere"):
+        load_scene("jet")
+    with pytest.raises(WlmError, match="cannot read"):
+        load_scene(tmp_path / "none.yaml")
+
+
+def test_an_obstacle_on_its_path():
+    there = Obstacle(radius=1.0, path=((1.0, 0, 0, 0), (3.0, 4, 0, 0), (4.0, 4, 2, 0)))
+    for time, centre in ((0.0, (0, 0, 0)), (2.0, (2, 0, 0)), (3.5, (4, 1, 0)), (9.0, (4, 2, 0))):
+        np.testing.assert_allclose(there.centre(time), centre)
+    assert there.fastest == 2.0 and Obstacle(radius=1.0, path=((0.0, 1, 2, 3),)).fastest == 0.0
+    with pytest.raises(ValidationError):
+        Obstacle(radius=(1.0, 1.0, 1.0), path=((0.0, 0, 0, 0),))
+
+
+def test_the_surfaces_of_obstacles():
+    ball = Obstacle(radius=0.5, path=((0.0, 1, 2, 3),))
+    box = Obstacle(shape="box", radius=(1.0, 2.0, 3.0), path=((0.0, 0, 0, 0),))
+    drum = Obstacle(shape="cylinder", radius=(0.5, 2.0, 1.0), path=((0.0, 1, 2, 3),))
+    for body, volume in ((ball, 4 / 3 * math.pi * 0.125), (box, 48.0), (drum, 2 * math.pi)):
+        points, triangles, owner = obstacle_mesh([body], 0.0)
+        assert points.dtype == np.float32 and triangles.dtype == np.int32 and not owner.any()
+        a, b, c = (points[triangles[:, i]].astype(np.float64) - body.centre(0.0) for i in range(3))
+        # Each triangle and the centre make a tetrahedron; those of a closed surface fill the body once, and where the
+        # corners run anticlockwise from outside each counts as positive.
+        parts = np.einsum("ij,ij->i", a, np.cross(b, c)) / 6
+        assert (parts > 0).all() and parts.sum() == pytest.approx(volume, rel=0.02)
+    distance = np.linalg.norm(obstacle_mesh([ball], 0.0)[0] - [1, 2, 3], axis=1)
+    np.testing.assert_allclose(distance, 0.5, rtol=1e-5)
+    points, triangles, owner = obstacle_mesh([box, ball], 0.0)
+    assert triangles.max() == len(points) - 1 and (owner[:12] == 0).all() and (owner[12:] == 1).all()
+    assert [len(part) for part in obstacle_mesh([], 0.0)] == [0, 0, 0]
+
+
+def test_a_source_works_for_its_time():
+    source = Source(centre=(0, 0, 0), radius=1, start=1, stop=2)
+    assert [source.active(time) for time in (0.9, 1.0, 1.9, 2.0)] == [False, True, True, False]
+    assert Source(centre=(0, 0, 0), radius=1).active(1e9)
+
+
+@pytest.mark.parametrize("toward", [(0, 0, 1), (0, 1, 0), (-1, 0, 0), (1, 2, -3)])
+def test_a_camera_holds_the_box(toward):
+    """Every corner is in the image, the fullest side nearly fills it, and the whole box is before the camera."""
+    origin, size = np.array([3.0, -1.0, 2.0]), np.array([1.0, 4.0, 2.0])
+    corners = origin + size * np.array([[i >> 2, i >> 1 & 1, i & 1] for i in range(8)])
+    for aspect in (1.0, 0.5, 3.0):
+        camera = make_camera(CameraSettings(toward=toward, aspect=aspect, resolution=40), origin, size)
+        assert (camera.height, camera.width) == (40, round(40 * aspect))
+        seen = (corners - camera.position) @ camera.axes.T
+        half = 0.5 * camera.extent * np.array([aspect, 1.0])
+        share = (np.abs(seen[:, :2]) / half).max()
+        assert share == pytest.approx(1 / 1.05) and (seen[:, 2] < 0).all()
+        eye = make_camera(CameraSettings(toward=toward, aspect=aspect, resolution=40, perspective=True), origin, size)
+        seen = (corners - eye.position) @ eye.axes.T
+        assert (np.abs(seen[:, :2] / seen[:, 2:]) < 0.5 * eye.extent * np.array([aspect, 1.0])).all()
+
+
+def test_a_camera_as_it_is_told():
+    settings = CameraSettings(toward=(0, 0, 2), target=(1, 2, 3), extent=5, distance=7)
+    camera = make_camera(settings, (0, 0, 0), (1, 1, 1))
+    np.testing.assert_allclose(camera.position, (1, 2, 10))
+    assert camera.extent == 5
+    turned = settings.turned(90)
+    np.testing.assert_allclose(turned.toward, (2, 0, 0), atol=1e-12)
+    np.testing.assert_allclose(settings.turned(360).toward, settings.toward, atol=1e-12)
+    assert CameraSettings(toward=(0, 1, 0)).turned(30).toward == pytest.approx((0, 1, 0))
+    # From within, in perspective: the extent is that of a view, not infinite.
+    inside = make_camera(CameraSettings(distance=0.1, perspective=True), (0, 0, 0), (1, 1, 1))
+    assert np.isfinite(inside.extent) and inside.position[2] == pytest.approx(0.6)
+
+
+def test_lights_and_glow():
+    light = LightSettings(toward=(0, 3, 0)).light()
+    assert light.toward == (0, 3, 0) and light.irradiance == pytest.approx((4 * math.pi,) * 3)
+    assert Smoke().ramp is None and not Smoke().hot and Smoke(emission=1.0).hot
+    ramp = Smoke(glow=((0, 0, 0, 0), (2, 4, 2, 0))).ramp
+    np.testing.assert_allclose(ramp(torch.tensor([1.0])), [[2, 1, 0]])
+
+
+def test_a_folder_of_frames(tmp_path):
+    frames = write_frames(tmp_path / "a", obstacles=[SPHERE])
+    assert frames.numbers == (1, 2, 3) and frames.scene.obstacles[0].radius == 0.15
+    footage = open_footage(tmp_path / "a")
+    assert (footage.numbers, footage.time(2)) == ((1, 2, 3), pytest.approx(0.2))
+    for number in footage.numbers:
+        volume, expected = footage.load(number), plume(number)
+        assert torch.equal(volume.density, expected.density) and volume.warnings == ()
+        assert (volume.voxel, volume.origin, volume.extinction) == (0.05, (-0.5, 0.0, -0.5), 8.0)
+    assert open_footage(tmp_path / "a", extinction=3.0).load(1).extinction == 3.0
+    single = open_footage(tmp_path / "a" / "frame_0002.npz")
+    assert (single.scene, single.numbers, single.load(1).extinction, single.time(1)) == (None, (1,), 1.0, 0.0)
+
+
+def test_a_folder_is_begun_anew_or_resumed(tmp_path):
+    folder = tmp_path / "a"
+    scene = write_frames(folder).scene
+    (folder / CHECKPOINT).write_bytes(b"x")
+    assert open_frames(folder, scene, resume=True).numbers == (1, 2, 3)
+    # How it is looked at, and for how long, is no other simulation; how the air moves is.
+    looks = scene.model_copy(update={"frames": 9, "camera": CameraSettings(resolution=7), "name": "b"})
+    assert open_frames(folder, looks, resume=True).numbers == (1, 2, 3)
+    assert read_frames(folder).scene.frames == 9
+    other = Scene.model_validate(SCENE | {"air": {"viscosity": 1.0}})
+    with pytest.raises(WlmError, match="frames of another scene, whose air differs"):
+        open_frames(folder, other, resume=True)
+    assert open_frames(folder, other).numbers == () and sorted(p.name for p in folder.iterdir()) == ["scene.json"]
+    with pytest.raises(WlmError, match="expected frames such as frame_0001.npz, found none"):
+        open_footage(folder)
+    assert open_frames(tmp_path / "new", scene, resume=True).numbers == ()
+
+
+def test_folders_that_are_none(tmp_path):
+    scene = Scene.model_validate(SCENE)
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "notes.txt").write_text("x")
+    with pytest.raises(WlmError, match="found other files"):
+        open_frames(tmp_path / "a", scene)
+    with pytest.raises(WlmError, match="cannot write there"):
+        open_frames(tmp_path / "none" / "b", scene)
+    with pytest.raises(WlmError, match=r"expected a folder that simulate wrote, found no scene.json"):
+        open_footage(tmp_path / "a")
+    for content, said in (
+        ("{", "not valid JSON"),
+        ("[]", "found other content"),
+        (json.dumps({"format": "wlm-smoke-frames", "version": 9}), "version: expected 1, found 9"),
+        (json.dumps({"format": "wlm-smoke-frames", "version": 1, "scene": {}}), "scene.name: Field required"),
+    ):
+        folder = tmp_path / "b"
+        folder.mkdir(exist_ok=True)
+        (folder / "scene.json").write_text(content)
+        with pytest.raises(WlmError, match=said):
+            open_footage(folder)
+    with pytest.raises(WlmError, match="expected an empty folder or one of an earlier run, found notes.txt"):
+        check_folder(tmp_path / "a", "six", ".exr")
+    assert check_folder(tmp_path / "c", "six", ".exr") == tmp_path / "c"
+    for name in ("six_0001.exr", "six_0002.exr", "sheet.png"):
+        (tmp_path / "c" / name).write_text("x")
+    check_folder(tmp_path / "c", "six", ".exr", "sheet.png")
+    assert len(list((tmp_path / "c").iterdir())) == 3, "to look isn't to remove"
+    clear_folder(tmp_path / "c", "six", ".exr", "sheet.png")
+    assert list((tmp_path / "c").iterdir()) == []
+    with pytest.raises(WlmError, match="cannot write there"):
+        clear_folder(tmp_path / "none", "six", ".exr")
+    with pytest.raises(WlmError, match="ends in .npz"):
+        save_volume(tmp_path / "a.vdb", plume())
+
+
+@pytest.mark.parametrize("hot", [False, True])
+def test_a_volume_comes_back(tmp_path, hot, device):
+    volume = plume(hot=hot, device=device)
+    save_volume(tmp_path / "a.npz", volume)
+    found = load_volume(tmp_path / "a.npz", device=device)
+    assert torch.equal(found.density, volume.density)
+    assert (found.temperature is not None) == hot
+    assert not hot or torch.equal(found.temperature, volume.temperature)
+
+
+@pytest.mark.parametrize("hot", [False, True])
+def test_lightmaps_in_a_file(tmp_path, hot, device):
+    volume = plume(hot=hot, device=device)
+    camera = make_camera(CameraSettings(resolution=16, aspect=0.75), volume.origin, (1, 1.2, 1))
+    six = six_way(volume, camera, step=1.0, estimate=False)
+    write_six_way(tmp_path / "a.exr", six, camera)
+    planes, _ = read_planes(tmp_path / "a.exr")
+    names = ["right", "left", "top", "bottom", "front", "back", "transparency", *(["emission"] if hot else [])]
+    assert sorted(planes) == sorted(names)
+    found, seen = read_six_way(tmp_path / "a.exr", device)
+    assert seen == camera and (found.emission is not None) == hot
+    torch.testing.assert_close(found.lightmaps, six.lightmaps.half().float(), rtol=0, atol=0)
+    torch.testing.assert_close(found.transparency, six.transparency.half().float(), rtol=0, atol=0)
+
+
+def test_a_guiding_map_in_a_file(tmp_path):
+    volume = plume()
+    camera = make_camera(CameraSettings(resolution=16, distance=9e4), volume.origin, (1, 1.2, 1))
+    found = guide(volume, camera)
+    write_guide(tmp_path / "a.exr", found)
+    planes, note = read_planes(tmp_path / "a.exr")
+    assert note["camera"]["extent"] == camera.extent
+    # Not half floats: depths are far beyond them.
+    np.testing.assert_array_equal(planes["depth"], found.depth.numpy())
+    np.testing.assert_array_equal(planes["light"], found.light.numpy())
+    np.testing.assert_array_equal(planes["transparency"], found.transparency.numpy())
+    assert planes["depth"].max() > 65504
+
+
+def test_files_that_are_no_lightmaps(tmp_path):
+    volume = plume()
+    camera = make_camera(CameraSettings(resolution=8), volume.origin, (1, 1.2, 1))
+    six = six_way(volume, camera, step=2.0, estimate=False)
+    path = tmp_path / "a.exr"
+    write_six_way(path, six, camera)
+    planes, note = read_planes(path)
+
+    def refused(planes, note, said):
+        write_planes(path, planes, note)
+        with pytest.raises(WlmError, match=said):
+            read_six_way(path)
+
+    refused({k: v for k, v in planes.items() if k != "top"}, note, "channel top: expected it")
+    refused(planes | {"top": planes["top"] * np.nan}, note, "channel top: expected finite numbers")
+    refused(planes, None, "camera: expected that of bake")
+    refused(planes, {"camera": {"extent": 1}}, "camera: expected that of bake")
+    refused({k: v[:4] for k, v in planes.items()}, note, "expected the camera's 8 x 8 pixels")
+    damaged = path.read_bytes()
+    path.write_bytes(damaged[: len(damaged) // 2])
+    with pytest.raises(WlmError, match="a.exr"):
+        read_six_way(path)
+    path.write_bytes(b"none")
+    with pytest.raises(WlmError, match="expected an EXR file"):
+        read_planes(path)
+    with pytest.raises(WlmError, match="none.exr"):
+        read_planes(tmp_path / "none.exr")
+    channels = {"a": np.ones((2, 2), np.uint32)}
+    OpenEXR.File({"type": OpenEXR.scanlineimage}, channels).write(str(path))
+    with pytest.raises(WlmError, match="channel a: expected half or float"):
+        read_planes(path)
+    OpenEXR.File({"type": OpenEXR.scanlineimage, "wlm": "{"}, {"a": np.ones((2, 2), np.float32)}).write(str(path))
+    with pytest.raises(WlmError, match="header attribute wlm: expected a JSON object"):
+        read_planes(path)
+
+
+def test_planes_that_cannot_be_written(tmp_path):
+    with pytest.raises(ValueError, match="one shape"):
+        write_planes(tmp_path / "a.exr", {"a": np.ones((2, 2)), "b": np.ones((2, 3))})
+    with pytest.raises(ValueError, match="one shape"):
+        write_planes(tmp_path / "a.exr", {})
+    with pytest.raises(WlmError, match="cannot write"):
+        write_planes(tmp_path / "none" / "a.exr", {"a": np.ones((2, 2))})
+    write_planes(tmp_path / "a.exr", {"a": np.full((1, 1), 1e9), "b": np.full((1, 1), 1e9)}, whole=("b",))
+    planes, note = read_planes(tmp_path / "a.exr")
+    assert planes["a"] == 65504 and planes["b"] == np.float32(1e9) and note == {}
+    assert [path.name for path in tmp_path.iterdir()] == ["a.exr"]
+
+
+def test_empty_smoke_and_one_voxel(tmp_path):
+    for density in (np.zeros((4, 4, 4)), np.ones((1, 1, 1))):
+        volume = from_array(density)
+        camera = make_camera(CameraSettings(resolution=6), volume.origin, density.shape)
+        six = six_way(volume, camera, estimate=False)
+        write_six_way(tmp_path / "a.exr", six, camera)
+        found, _ = read_six_way(tmp_path / "a.exr")
+        assert bool((found.transparency < 1).any()) == bool(density.any())
+
+
+def test_the_scene_in_the_document(tmp_path):
+    """The page's scene "in full" is one, and names every setting that there is."""
+    page = (Path(__file__).resolve().parents[2] / "docs" / "smoke.md").read_text(encoding="utf-8")
+    block = page[page.index("    name: jet\n") : page.index("A row of a path")]
+    path = tmp_path / "scene.yaml"
+    path.write_text("\n".join(line[4:] for line in block.splitlines()))
+    scene = load_scene(path)
+    given = yaml.safe_load(path.read_text())
+    for name, part in (("grid", scene.grid), ("air", scene.air), ("smoke", scene.smoke), ("camera", scene.camera)):
+        assert set(type(part).model_fields) - {"perspective"} == set(given[name])
+    assert set(Scene.model_fields) == set(given) and set(Source.model_fields) == set(given["sources"][0])

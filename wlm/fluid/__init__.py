@@ -1,0 +1,1 @@
+"""Fluids: a lattice Boltzmann solver of air, smoke carried by it, density volumes and obstacles."""

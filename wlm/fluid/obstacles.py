@@ -1,0 +1,157 @@
+"""What stands in the air of a simulation, or moves through it: spheres and closed meshes, and their paths.
+
+Lengths are cells of the velocity grid, times are its steps, as in ``wlm.fluid.lattice``.
+"""
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import warp as wp
+
+from wlm_kernels.fluid.lattice_solids import voxelise_mesh, voxelise_sphere
+
+__all__ = ["Mesh", "Obstacle", "Path", "Sphere", "box_mesh"]
+
+
+@dataclass(frozen=True, eq=False)
+class Path:
+    """Key positions over time, straight lines between them; at rest before the first and after the last.
+
+    Attributes:
+        positions: float64 [K, 3], cells.
+        times: float64 [K], steps, each greater than the last.
+    """
+
+    positions: np.ndarray
+    times: np.ndarray
+
+    @classmethod
+    def of(cls, positions: Sequence, times: Sequence[float] = (0.0,)) -> "Path":
+        """Makes a path.
+
+        Args:
+            positions: [K, 3], or one place (3,) to stay at.
+            times: [K].
+
+        Raises:
+            ValueError: Wrong shapes, numbers that aren't finite, or times that don't increase.
+        """
+        p, t = np.atleast_2d(np.asarray(positions, np.float64)), np.asarray(times, np.float64)
+        if t.ndim != 1 or len(t) == 0 or p.shape != (len(t), 3):
+            raise ValueError(f"path: expected positions [K, 3] and times [K], got {p.shape} and {t.shape}")
+        if not (np.isfinite(p).all() and np.isfinite(t).all()):
+            raise ValueError("path: expected finite numbers")
+        if (np.diff(t) <= 0).any():
+            raise ValueError("path: expected times that increase")
+        return cls(p, t)
+
+    @property
+    def moves(self) -> bool:
+        """Whether it isn't at one place all the time."""
+        return bool((self.positions != self.positions[0]).any())
+
+    def at(self, time: float) -> np.ndarray:
+        """The position at a time, float64 (3,)."""
+        return np.array([np.interp(time, self.times, self.positions[:, axis]) for axis in range(3)])
+
+    def describe(self) -> dict:
+        """What it is, as JSON values."""
+        return {"positions": self.positions.tolist(), "times": self.times.tolist()}
+
+
+@dataclass(frozen=True, eq=False)
+class Sphere:
+    """A ball.
+
+    Attributes:
+        path: Of its centre.
+        radius: Cells, above 0.
+    """
+
+    path: Path
+    radius: float
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.radius < np.inf:
+            raise ValueError(f"radius: expected a length above 0, got {self.radius}")
+
+    def cover(self, solid: wp.array, body: int, position: np.ndarray) -> None:
+        """Marks the cells whose centres it holds at a position, and frees those that it held before.
+
+        Args:
+            solid: uint8 [X, Y, Z], changed.
+            body: Its number, 1 to 255.
+            position: (3,), cells.
+        """
+        voxelise_sphere(solid, body, position.tolist(), self.radius)
+
+    def describe(self) -> dict:
+        """What it is, as JSON values, for a checkpoint to name."""
+        return self.path.describe() | {"radius": self.radius}
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """A closed mesh, which moves without turning. A cell's centre that lies on its very surface falls either way.
+
+    Attributes:
+        path: Of its origin.
+        vertices: float32 [V, 3], in units of ``scale`` cells about its origin.
+        triangles: int32 [T, 3], anticlockwise from outside.
+        scale: Cells a unit.
+    """
+
+    path: Path
+    vertices: np.ndarray
+    triangles: np.ndarray
+    scale: float = 1.0
+    _meshes: dict[str, wp.Mesh] = field(default_factory=dict, init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        v, t = np.asarray(self.vertices), np.asarray(self.triangles)
+        if v.ndim != 2 or v.shape[1] != 3 or not np.isfinite(v).all():
+            raise ValueError(f"vertices: expected finite numbers [V, 3], got {v.shape}")
+        if t.ndim != 2 or t.shape[1] != 3 or len(t) == 0 or t.min() < 0 or t.max() >= len(v):
+            raise ValueError(f"triangles: expected vertices' numbers [T, 3], at least one, got {t.shape}")
+        if not 0.0 < self.scale < np.inf:
+            raise ValueError(f"scale: expected a number above 0, got {self.scale}")
+
+    def cover(self, solid: wp.array, body: int, position: np.ndarray) -> None:
+        """As ``Sphere.cover``."""
+        device = str(solid.device)
+        if device not in self._meshes:
+            points = wp.array(np.asarray(self.vertices, np.float32), dtype=wp.vec3, device=device)
+            indices = wp.array(np.asarray(self.triangles, np.int32).ravel(), dtype=int, device=device)
+            self._meshes[device] = wp.Mesh(points, indices, support_winding_number=True)
+        voxelise_mesh(solid, body, self._meshes[device], position.tolist(), scale=self.scale)
+
+    def describe(self) -> dict:
+        """As ``Sphere.describe``; a hash stands for its arrays."""
+        digest = hashlib.blake2b(np.asarray(self.vertices, np.float32).tobytes(), digest_size=16)
+        digest.update(np.asarray(self.triangles, np.int32).tobytes())
+        return self.path.describe() | {"mesh": digest.hexdigest(), "scale": self.scale}
+
+
+Obstacle = Sphere | Mesh
+
+
+def box_mesh(path: Path, size: Sequence[float]) -> Mesh:
+    """A box about its path, edges along the axes.
+
+    Args:
+        path: Of its centre.
+        size: (3,), cells, above 0.
+
+    Raises:
+        ValueError: A size that isn't above 0.
+    """
+    edges = np.asarray(size, np.float64)
+    if edges.shape != (3,) or not ((edges > 0.0) & np.isfinite(edges)).all():
+        raise ValueError(f"size: expected three lengths above 0, got {size}")
+    corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+    # Of each face the corners, anticlockwise from outside.
+    faces = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    triangles = [t for a, b, c, d in faces for t in ((a, b, c), (a, c, d))]
+    return Mesh(path, (corners * edges).astype(np.float32), np.array(triangles, np.int32))

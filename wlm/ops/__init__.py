@@ -1,0 +1,1 @@
+"""Differentiable operations for torch on Warp kernels."""

@@ -1,0 +1,296 @@
+"""Differentiable drawing for torch: triangles to pixels, attributes and textures at what each pixel sees.
+
+Four functions with gradients by autograd, on the device of their tensors; on CUDA they queue work on torch's current
+stream. All floats are float32. Row 0 of an image is its top row. ``wlm_kernels.raster.rasterize`` says where pixel
+centres are and what covers them, ``wlm_kernels.raster.texture`` how a texture is read. On CUDA gradients that many
+pixels give to one number are added in any order, so that its last bits change from run to run. There is no second
+derivative.
+"""
+
+from contextlib import nullcontext
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+import warp as wp
+from torch.autograd.function import once_differentiable
+
+from wlm.interop import to_warp, torch_memory
+from wlm_kernels.raster import gradient as raster_gradient
+from wlm_kernels.raster import rasterize as kernels
+from wlm_kernels.raster import texture as texture_kernels
+
+__all__ = ["Raster", "interpolate", "rasterize", "rasterize_uv", "texture"]
+
+
+@dataclass(frozen=True)
+class Raster:
+    """What each pixel sees.
+
+    Attributes:
+        triangle: int32 [H, W], the number of the triangle, -1: none.
+        barycentric: float [H, W, 2], the weights, in [0, 1], of the triangle's corners 0 and 1 at the point seen;
+            corner 2 has the rest. Where there is no triangle it is 0, as is all below. It has a gradient.
+        depth: float [H, W], z / w; 0 everywhere in UV space. It has no gradient.
+        derivative: float [H, W, 4], what the weights change by from pixel to pixel: du/dx, du/dy, dv/dx, dv/dy, x to
+            the right and y down; None: not asked for. It has no gradient.
+        coverage: int32 [H, W], how many triangles cover the pixel's centre, hidden ones too; None: not asked for.
+    """
+
+    triangle: torch.Tensor
+    barycentric: torch.Tensor
+    depth: torch.Tensor
+    derivative: torch.Tensor | None
+    coverage: torch.Tensor | None
+
+
+def rasterize(
+    clip: torch.Tensor,
+    triangle: torch.Tensor,
+    height: int,
+    width: int,
+    *,
+    cull: bool = False,
+    derivative: bool = False,
+    coverage: bool = False,
+) -> Raster:
+    """Draws triangles given in clip space; each pixel sees the one of least z / w in front of the viewer (w > 0).
+
+    There is no near and no far plane, and a triangle may reach behind the viewer. Of triangles as deep as each other
+    the first is seen. One with a corner that isn't finite, or of no area, isn't drawn.
+
+    Args:
+        clip: float [V, 4], x, y, z, w; the image shows x/w and y/w in [-1, 1], y up. The barycentrics' gradient reaches
+            x, y and w, for the triangle that is seen; that another may come to be seen has none.
+        triangle: int32 or int64 [F, 3], rows of ``clip``, with either winding.
+        height, width: H and W in pixels, 1 to 16,384.
+        cull: Whether to leave out triangles whose corners run clockwise on the screen.
+        derivative, coverage: Whether to fill these of ``Raster``.
+
+    Raises:
+        ValueError: A tensor's shape, type, device or size doesn't fit, or a triangle has a corner that isn't in
+            ``clip``. Finding that out waits for the GPU; while a CUDA graph is captured it isn't looked for, and such
+            triangles aren't drawn.
+    """
+    return _rasterize(clip, triangle, height, width, "clip", cull, derivative, coverage)
+
+
+def rasterize_uv(
+    uv: torch.Tensor,
+    triangle: torch.Tensor,
+    height: int,
+    width: int,
+    *,
+    cull: bool = False,
+    derivative: bool = False,
+    coverage: bool = False,
+) -> Raster:
+    """Draws triangles into the texels of a texture; where some overlap the first one is seen.
+
+    Args:
+        uv: float [V, 2], u right, v down (glTF): the texture is [0, 1] x [0, 1], row 0 is v = 0, and texel i of n has
+            its centre at (i + 1/2) / n. What lies outside isn't drawn. The barycentrics' gradient reaches it.
+        triangle: int32 or int64 [F, 3], rows of ``uv``.
+        height, width: H and W in texels, 1 to 16,384.
+        cull: Whether to leave out triangles whose corners run clockwise where u points right and v up.
+        derivative, coverage: Whether to fill these of ``Raster``.
+
+    Raises:
+        ValueError: As for ``rasterize``.
+    """
+    return _rasterize(uv, triangle, height, width, "uv", cull, derivative, coverage)
+
+
+def interpolate(attribute: torch.Tensor, triangle: torch.Tensor, raster: Raster) -> torch.Tensor:
+    """The corners' attributes at the point that each pixel sees, 0 where it sees none.
+
+    Args:
+        attribute: float [V, C], with a gradient.
+        triangle: int32 or int64 [F, 3], rows of ``attribute``: as many triangles as were drawn, but a corner may have
+            other numbers here than there.
+        raster: What was drawn; its barycentrics have a gradient.
+
+    Returns:
+        float [H, W, C].
+
+    Raises:
+        ValueError: As for ``rasterize``.
+    """
+    _check("attribute", attribute, (None, None))
+    triangle = _checked_triangles(triangle, attribute)
+    _check("raster.barycentric", raster.barycentric, (None, None, 2), attribute.device)
+    return _Interpolate.apply(attribute, triangle, raster.triangle, raster.barycentric)
+
+
+def texture(image: torch.Tensor, uv: torch.Tensor, *, filter: str = "linear", boundary: str = "clamp") -> torch.Tensor:
+    """Reads a texture.
+
+    A coordinate that is NaN, or infinite and not clamped, reads NaN; it has no gradient and gives the texels none.
+
+    Args:
+        image: float [H, W, C], none of them 0, with a gradient.
+        uv: float [..., 2], u right, v down, texel i of n at (i + 1/2) / n; any number. With a gradient, for the filter
+            "linear": the slope between the texels that it lies between.
+        filter: "linear" or "nearest".
+        boundary: What lies outside [0, 1]: "clamp", the border's texels; "wrap", the texture again; "mirror", the
+            texture turned round and again, a triangle wave (lightmap-uv-clustering-cascade, eq. 8).
+
+    Returns:
+        float [..., C].
+
+    Raises:
+        ValueError: No such filter or boundary, or a tensor's shape, type or device doesn't fit.
+    """
+    texture_kernels.codes(filter, boundary)
+    _check("image", image, (None, None, None))
+    if 0 in image.shape:
+        raise ValueError(f"image: expected texels and channels, got {tuple(image.shape)}")
+    _check("uv", uv, (*uv.shape[:-1], 2), image.device)
+    found = _Texture.apply(image, uv.reshape(-1, 2), filter, boundary)
+    return found.reshape(*uv.shape[:-1], image.shape[2])
+
+
+def _rasterize(position, triangle, height, width, space, cull, derivative, coverage) -> Raster:
+    _check("uv" if space == "uv" else "clip", position, (None, 2 if space == "uv" else 4))
+    triangle = _checked_triangles(triangle, position)
+    options = {"space": space, "cull": cull, "derivative": derivative, "coverage": coverage}
+    return Raster(*_Rasterize.apply(position, triangle, height, width, options))
+
+
+class _Rasterize(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, position, triangle, height, width, options):
+        with _queue(position.device):
+            drawing = kernels.Rasterizer(
+                to_warp(triangle), height, width, empty=torch_memory(position.device), **options
+            )
+            found = vars(drawing.run(to_warp(position)))
+            tensors = {name: None if array is None else wp.to_torch(array) for name, array in found.items()}
+        ctx.save_for_backward(position, triangle, tensors["triangle"])
+        ctx.space = options["space"]
+        ctx.mark_non_differentiable(
+            *(tensor for name, tensor in tensors.items() if name != "barycentric" and tensor is not None)
+        )
+        return tuple(tensors.values())
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, _triangle, grad_barycentric, *_others):
+        position, triangle, found = ctx.saved_tensors
+        grad = torch.zeros_like(position, memory_format=torch.contiguous_format)
+        with _queue(position.device):
+            raster_gradient.rasterize_backward(
+                to_warp(position),
+                to_warp(triangle),
+                to_warp(found),
+                to_warp(grad_barycentric.contiguous(), wp.vec2),
+                to_warp(grad),
+                ctx.space,
+            )
+        return grad, None, None, None, None
+
+
+class _Interpolate(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, attribute, triangle, found, barycentric):
+        barycentric = barycentric.contiguous()
+        out = attribute.new_empty(*found.shape, attribute.shape[1])
+        with _queue(attribute.device):
+            seen = to_warp(found), to_warp(barycentric, wp.vec2)
+            raster_gradient.interpolate(to_warp(attribute), to_warp(triangle), *seen, to_warp(out))
+        ctx.save_for_backward(attribute, triangle, found, barycentric)
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, grad_out):
+        attribute, triangle, found, barycentric = ctx.saved_tensors
+        wanted = ctx.needs_input_grad
+        on_attribute = torch.zeros_like(attribute, memory_format=torch.contiguous_format) if wanted[0] else None
+        on_barycentric = torch.empty_like(barycentric) if wanted[3] else None
+        with _queue(attribute.device):
+            raster_gradient.interpolate_backward(
+                to_warp(attribute),
+                to_warp(triangle),
+                to_warp(found),
+                to_warp(barycentric, wp.vec2),
+                to_warp(grad_out.contiguous()),
+                _wanted(on_attribute, (0, 0), wp.float32, attribute.device),
+                _wanted(on_barycentric, (0, 0), wp.vec2, attribute.device),
+            )
+        return on_attribute, None, None, on_barycentric
+
+
+class _Texture(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, image, uv, filter, boundary):
+        uv = uv.contiguous()
+        out = image.new_empty(len(uv), image.shape[2])
+        with _queue(image.device):
+            arrays = to_warp(image), to_warp(uv, wp.vec2), to_warp(out)
+            texture_kernels.sample(*arrays, filter=filter, boundary=boundary)
+        ctx.save_for_backward(image, uv)
+        ctx.mode = {"filter": filter, "boundary": boundary}
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, grad_out):
+        image, uv = ctx.saved_tensors
+        on_image = torch.zeros_like(image, memory_format=torch.contiguous_format) if ctx.needs_input_grad[0] else None
+        on_uv = torch.empty_like(uv) if ctx.needs_input_grad[1] else None
+        with _queue(image.device):
+            texture_kernels.sample_backward(
+                to_warp(image),
+                to_warp(uv, wp.vec2),
+                to_warp(grad_out.contiguous()),
+                _wanted(on_image, (0, 0, 0), wp.float32, image.device),
+                _wanted(on_uv, (0,), wp.vec2, image.device),
+                **ctx.mode,
+            )
+        return on_image, on_uv, None, None
+
+
+def _queue(device: torch.device):
+    """Puts Warp's work on torch's current stream."""
+    # Wrapping a tensor, unlike all else in Warp, doesn't start it.
+    wp.init()
+    if device.type == "cpu":
+        return nullcontext()
+    return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device)), sync_enter=False)
+
+
+def _nothing(shape: tuple[int, ...], dtype: Any, device: torch.device) -> wp.array:
+    return wp.empty(shape, dtype=dtype, device=wp.device_from_torch(device))
+
+
+def _wanted(tensor: torch.Tensor | None, shape: tuple[int, ...], dtype: Any, device: torch.device) -> wp.array:
+    """A gradient's buffer, or the empty array that says that none is wanted."""
+    return _nothing(shape, dtype, device) if tensor is None else to_warp(tensor, dtype)
+
+
+def _check(name: str, tensor: torch.Tensor, shape: tuple[int | None, ...], device: torch.device | None = None) -> None:
+    """Checks a float tensor; a size of None may be any."""
+    fits = len(tensor.shape) == len(shape) and all(
+        want is None or got == want for got, want in zip(tensor.shape, shape, strict=True)
+    )
+    if not fits or tensor.dtype != torch.float32:
+        wanted = ", ".join("any" if size is None else str(size) for size in shape)
+        raise ValueError(f"{name}: expected float32 [{wanted}], got {tensor.dtype} {tuple(tensor.shape)}")
+    if device is not None and tensor.device != device:
+        raise ValueError(f"{name}: expected a tensor on {device}, got one on {tensor.device}")
+
+
+def _checked_triangles(triangle: torch.Tensor, corners: torch.Tensor) -> torch.Tensor:
+    """The triangles as int32, their numbers among those of the corners."""
+    if triangle.ndim != 2 or triangle.shape[1] != 3 or triangle.dtype not in (torch.int32, torch.int64):
+        raise ValueError(f"triangle: expected int32 or int64 [F, 3], got {triangle.dtype} {tuple(triangle.shape)}")
+    if triangle.device != corners.device:
+        raise ValueError(f"triangle: expected a tensor on {corners.device}, got one on {triangle.device}")
+    capturing = triangle.is_cuda and torch.cuda.is_current_stream_capturing()
+    if len(triangle) and not capturing:
+        low, high = torch.stack(triangle.aminmax()).tolist()
+        if low < 0 or high >= len(corners):
+            found = low if low < 0 else high
+            raise ValueError(f"triangle: expected numbers from 0 to {len(corners) - 1}, found {found}")
+    return triangle.to(torch.int32)

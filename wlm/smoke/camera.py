@@ -1,0 +1,229 @@
+"""Which way is which: the six directions, the camera, the weights of a light, the channels of engines.
+
+Directions are the camera's: x to the right, y up, z from the smoke towards the camera. A lightmap is named for where
+its light comes from, so that "right" is brighter on the image's right side, "front" is lit from the camera's side and
+"back" from behind the smoke. A light's direction points from the smoke to the light. Images have row 0 at the top.
+
+Unity's local z is minus the billboard's normal: a light behind is +z there, and -z here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from wlm_kernels.smoke import march
+
+__all__ = ["ALPHA", "DIRECTIONS", "EMISSION", "LAYOUTS", "RULES", "VECTORS", "Camera", "axis_faults", "weights"]
+
+DIRECTIONS = ("right", "left", "top", "bottom", "front", "back")
+"""The order of the lightmaps in all arrays."""
+
+VECTORS = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], np.float64)
+"""Towards the light of each lightmap, in the camera's axes."""
+
+ALPHA, EMISSION = "alpha", "emission"
+"""What a channel of a file may hold besides a lightmap; alpha is opacity, 1 - transparency."""
+
+LAYOUTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "unity": (("right", "top", "back", ALPHA), ("left", "bottom", "front", EMISSION)),
+    "o3de": (("right", "left", "top", ALPHA), ("bottom", "back", "front", EMISSION)),
+    "o3de-tlrb": (("top", "left", "right", "bottom"), ("front", "back", EMISSION, ALPHA)),
+    "embergen": (("top", "left", "right", ALPHA), ("bottom", "back", "front", EMISSION)),
+}
+"""Channels R, G, B, A of an engine's two textures. O3DE takes opacity from a third, which this alpha may be."""
+
+RULES = ("squared", "absolute", "normalised")
+"""How a light's direction w weighs the lightmaps: w_p^2; |w_p|, the paper's eq. 5; |w_p| / (|w_x| + |w_y| + |w_z|)."""
+
+_SHORTEST = 1e-12
+# A map's centre of brightness must lie this share of the image farther out than its opposite's.
+_MARGIN = 1e-3
+
+
+def weights(toward: Sequence[float] | np.ndarray, rule: str = "squared") -> np.ndarray:
+    """What each lightmap counts for under a light, in the order of ``DIRECTIONS``.
+
+    Eq. 5 of the paper weighs by |w|, whose sum for oblique lights is up to 1.73 times that along an axis: too bright by
+    half on average, as path tracing shows. The squares' sum is 1, and engines use them.
+
+    Args:
+        toward: [..., 3], the directions to the lights in the camera's axes, of any length but 0.
+        rule: One of ``RULES``.
+
+    Returns:
+        float64 [..., 6], not negative.
+
+    Raises:
+        ValueError: No such rule, or a direction of no length or that isn't finite.
+    """
+    if rule not in RULES:
+        raise ValueError(f"rule: expected one of {', '.join(RULES)}, got {rule!r}")
+    toward = np.asarray(toward, np.float64)
+    length = np.linalg.norm(toward, axis=-1, keepdims=True)
+    if toward.shape[-1:] != (3,) or not (np.isfinite(length) & (length > _SHORTEST)).all():
+        raise ValueError(f"expected directions [..., 3] of some length, got {toward.tolist()}")
+    along = np.maximum((toward / length) @ VECTORS.T, 0.0)
+    if rule == "squared":
+        return along**2
+    return along / along.sum(-1, keepdims=True) if rule == "normalised" else along
+
+
+def axis_faults(lightmaps: np.ndarray) -> tuple[str, ...]:
+    """Checks that lightmaps are what their names say, by where each is bright.
+
+    Only smoke that stops some light can tell: in thin smoke the maps are alike, and that counts as a fault.
+
+    Args:
+        lightmaps: [..., 6, H, W], one frame or many, in the order of ``DIRECTIONS``.
+
+    Returns:
+        One line a fault: "right" must be brighter on the right than "left", "top" above "bottom", "front" brighter
+        than "back". Two opposites that changed places are always found; "right" for "top" need not be.
+
+    Raises:
+        ValueError: The shape isn't that of lightmaps.
+    """
+    lightmaps = np.asarray(lightmaps, np.float64)
+    if lightmaps.ndim < 3 or lightmaps.shape[-3] != 6:
+        raise ValueError(f"expected lightmaps [..., 6, H, W], got {lightmaps.shape}")
+    height, width = lightmaps.shape[-2:]
+    sums = lightmaps.reshape(-1, 6, height, width).sum(0)
+    total = sums.sum((1, 2))
+    if not (np.isfinite(total) & (total > 0)).all():
+        dark = [name for name, value in zip(DIRECTIONS, total, strict=True) if not value > 0]
+        return (f"no light in {', '.join(dark) or 'some lightmap'}",)
+    x = (sums.sum(1) @ (np.arange(width) + 0.5)) / total / width
+    y = 1.0 - (sums.sum(2) @ (np.arange(height) + 0.5)) / total / height
+    faults = []
+    if not x[0] > x[1] + _MARGIN:
+        faults.append(f"right isn't brighter on the right than left: centres at {x[0]:.3f} and {x[1]:.3f} of the width")
+    if not y[2] > y[3] + _MARGIN:
+        faults.append(f"top isn't brighter above than bottom: centres at {y[2]:.3f} and {y[3]:.3f} of the height")
+    if not total[4] > total[5]:
+        faults.append(f"front isn't brighter than back: {total[4]:.4g} and {total[5]:.4g} in all")
+    return tuple(faults)
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Where smoke is seen from.
+
+    Attributes:
+        position: The image's centre in the camera's plane, or the eye, in the world's unit. Nothing behind it is seen.
+        right, up, toward: The image's axes in the world, orthogonal and of length 1; right x up = toward, which
+            points from what is seen to the camera.
+        extent: The image's height in the world's unit; in perspective that at distance 1.
+        height, width: H and W in pixels, which are square.
+        perspective: Whether rays meet in the eye; the six-way lightmaps themselves are orthographic.
+    """
+
+    position: tuple[float, float, float]
+    right: tuple[float, float, float]
+    up: tuple[float, float, float]
+    toward: tuple[float, float, float]
+    extent: float
+    height: int
+    width: int
+    perspective: bool = False
+
+    def __post_init__(self) -> None:
+        axes = self.axes
+        if axes.shape != (3, 3) or not np.allclose(axes @ axes.T, np.eye(3), atol=1e-5):
+            raise ValueError(f"right, up, toward: expected orthogonal directions of length 1, got {axes.tolist()}")
+        if np.linalg.det(axes) < 0:
+            raise ValueError("right, up, toward: expected right x up = toward, got a mirrored frame")
+        if np.shape(self.position) != (3,) or not np.isfinite(self.position).all():
+            raise ValueError(f"position: expected three finite numbers, got {self.position}")
+        if not 0 < self.extent < np.inf:
+            raise ValueError(f"extent: expected a length above 0, got {self.extent}")
+        if self.height < 1 or self.width < 1:
+            raise ValueError(f"expected at least one pixel, got {self.height} x {self.width}")
+
+    @staticmethod
+    def look_at(
+        position: Sequence[float],
+        target: Sequence[float],
+        *,
+        extent: float,
+        height: int,
+        width: int,
+        world_up: Sequence[float] = (0.0, 1.0, 0.0),
+        perspective: bool = False,
+    ) -> Camera:
+        """Makes a camera that looks from a position to a target.
+
+        Where it looks straight up or down, "up" is chosen among the axes of the world, the same at every call.
+
+        Raises:
+            ValueError: The position is the target, or a size is wrong.
+        """
+        toward = np.asarray(position, np.float64) - np.asarray(target, np.float64)
+        length = np.linalg.norm(toward)
+        if not _SHORTEST < length < np.inf:
+            raise ValueError(f"expected a position apart from its target, got {tuple(position)} and {tuple(target)}")
+        toward = toward / length
+        right = np.cross(world_up, toward)
+        if np.linalg.norm(right) < 1e-6 * max(np.linalg.norm(world_up), 1e-300):
+            right = np.cross(np.eye(3)[np.argmin(np.abs(toward))], toward)
+        right = right / np.linalg.norm(right)
+        up = np.cross(toward, right)
+        axes = (tuple(map(float, axis)) for axis in (position, right, up, toward))
+        return Camera(*axes, float(extent), height, width, perspective)
+
+    @property
+    def axes(self) -> np.ndarray:
+        """Right, up, toward: float64 [3, 3], which takes a direction in the world to one in the camera's axes."""
+        return np.array([self.right, self.up, self.toward], np.float64)
+
+    @property
+    def pitch(self) -> float:
+        """A pixel's edge in the world's unit, in perspective at distance 1."""
+        return self.extent / self.height
+
+    def finer(self, factor: int) -> Camera:
+        """The same view with each pixel cut in factor x factor."""
+        size = (self.height * factor, self.width * factor)
+        return Camera(self.position, self.right, self.up, self.toward, self.extent, *size, self.perspective)
+
+    def rays(self, device: torch.device | str = "cpu") -> tuple[torch.Tensor, torch.Tensor]:
+        """Origins and directions of length 1 of the pixels' rays in the world, both float64 [H, W, 3]."""
+        right, up, toward, position = (
+            torch.tensor(np.asarray(vector, np.float64), device=device) for vector in (*self.axes, self.position)
+        )
+        columns, rows = (torch.arange(n, dtype=torch.float64, device=device) for n in (self.width, self.height))
+        u = (columns + 0.5 - 0.5 * self.width) * self.pitch
+        v = (0.5 * self.height - rows - 0.5) * self.pitch
+        across = u[None, :, None] * right + v[:, None, None] * up
+        if self.perspective:
+            return position.expand_as(across), torch.nn.functional.normalize(across - toward, dim=-1)
+        return across + position, (-toward).expand_as(across)
+
+    def view(self, origin: np.ndarray, voxel: float, shape: tuple[int, int, int]) -> tuple[march.View, float]:
+        """The camera in the voxels of a grid.
+
+        An orthographic camera far from the grid is moved along its axis to just before it, which changes nothing but
+        the rounding.
+
+        Args:
+            origin: [3], the grid's corner in the world.
+            voxel: A voxel's edge in the world's unit.
+            shape: Of the grid.
+
+        Returns:
+            The view, and how far it was moved, in voxels: what depths lack.
+        """
+        position = (np.asarray(self.position, np.float64) - np.asarray(origin, np.float64)) / voxel
+        right, up, toward = self.axes
+        moved = 0.0
+        if not self.perspective:
+            ends = (-0.5 - position, np.asarray(shape) + 0.5 - position)
+            moved = max(float(sum(min(-a * t, -b * t) for a, b, t in zip(*ends, toward, strict=True))) - 1.0, 0.0)
+            position = position - moved * toward
+            pitch = self.pitch / voxel
+        else:
+            pitch = self.pitch
+        return march.view(position, right, up, -toward, pitch, self.width, self.height, self.perspective), moved

@@ -1,0 +1,226 @@
+"""Flip books of six-way lightmaps, as engines read them: two textures with the frames in rows, from the top left.
+
+EXR holds half floats as they are. PNG and TGA hold 8 bits a channel, linear, so that 1 is the brightest: a texture is
+to be imported without sRGB decoding. Light is premultiplied: it is added to what is behind, times 1 - alpha.
+`axes.LAYOUTS` says which channel is what.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image, UnidentifiedImageError
+
+from wlm.errors import WlmError
+from wlm.formats.atomic import atomic_path
+from wlm.formats.exr import read_exr, write_exr
+from wlm.smoke.bake import SixWay
+from wlm.smoke.camera import ALPHA, DIRECTIONS, EMISSION, LAYOUTS
+
+__all__ = ["pack", "read_flipbook", "unpack", "write_flipbook"]
+
+_SUFFIXES = (".exr", ".png", ".tga")
+_MODES = ("RGB", "RGBA")
+_BAD_FILE = (OSError, ValueError, SyntaxError, EOFError, UnidentifiedImageError, Image.DecompressionBombError)
+
+
+def pack(
+    frames: Sequence[SixWay], layout: str = "unity", *, rows: int, columns: int, gain: float = 1.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Lays frames out in two textures.
+
+    A channel that is last and that no frame fills is left out: the second texture of cold smoke has three.
+
+    Args:
+        frames: At least one, at most rows x columns, all of one size. Cells without a frame are empty: black, alpha 0.
+        layout: One of `axes.LAYOUTS`.
+        rows, columns: Of cells.
+        gain: Factor on the lightmaps and the emission, to use the range of 8 bits.
+
+    Returns:
+        Two arrays float32 [rows * H, columns * W, 3 or 4].
+
+    Raises:
+        ValueError: The frames don't fit, no such layout, or a gain that isn't above 0.
+    """
+    _check_cells(layout, rows, columns, gain)
+    if not 1 <= len(frames) <= rows * columns:
+        raise ValueError(f"expected 1 to {rows * columns} frames, got {len(frames)}")
+    height, width = frames[0].lightmaps.shape[1:]
+    filled = set(DIRECTIONS)
+    for name, wanted in ((ALPHA, "transparency"), (EMISSION, "emission")):
+        if any(getattr(frame, wanted) is not None for frame in frames):
+            filled.add(name)
+    pages = []
+    for names in LAYOUTS[layout]:
+        names = names if names[-1] in filled else names[:-1]
+        page = np.zeros((rows, height, columns, width, len(names)), np.float32)
+        for i, frame in enumerate(frames):
+            if tuple(frame.lightmaps.shape[1:]) != (height, width):
+                raise ValueError(f"frame {i}: expected {height} x {width}, got {tuple(frame.lightmaps.shape[1:])}")
+            for c, name in enumerate(names):
+                page[i // columns, :, i % columns, :, c] = _plane(frame, name, gain)
+        pages.append(page.reshape(rows * height, columns * width, len(names)))
+    return pages[0], pages[1]
+
+
+def unpack(
+    first: np.ndarray,
+    second: np.ndarray,
+    layout: str = "unity",
+    *,
+    rows: int,
+    columns: int,
+    count: int | None = None,
+    gain: float = 1.0,
+) -> list[SixWay]:
+    """Cuts two textures into frames, the reverse of `pack`.
+
+    Args:
+        first, second: [rows * H, columns * W, 3 or 4]; a channel that isn't there isn't known.
+        layout: One of `axes.LAYOUTS`.
+        rows, columns: Of cells.
+        count: Frames; None: all cells.
+        gain: What the light was multiplied by.
+
+    Returns:
+        The frames, float32 on the CPU.
+
+    Raises:
+        ValueError: The shapes don't fit each other, the cells or the layout.
+    """
+    _check_cells(layout, rows, columns, gain)
+    count = rows * columns if count is None else count
+    if not 1 <= count <= rows * columns:
+        raise ValueError(f"count: expected 1 to {rows * columns} frames, got {count}")
+    if first.shape[:2] != second.shape[:2]:
+        raise ValueError(f"expected two textures of one size, got {first.shape[:2]} and {second.shape[:2]}")
+    if first.shape[0] % rows or first.shape[1] % columns or 0 in first.shape:
+        raise ValueError(f"expected {rows} x {columns} cells of whole pixels, got {first.shape[0]} x {first.shape[1]}")
+    planes: dict[str, np.ndarray] = {}
+    for page, names in zip((first, second), LAYOUTS[layout], strict=True):
+        height, width = page.shape[0] // rows, page.shape[1] // columns
+        cells = page.reshape(rows, height, columns, width, -1).transpose(0, 2, 4, 1, 3)
+        cells = cells.reshape(rows * columns, -1, height, width)[:count].astype(np.float32)
+        planes |= {name: cells[:, c] for c, name in enumerate(names[: page.shape[2]])}
+    missing = [name for name in DIRECTIONS if name not in planes]
+    if missing:
+        raise ValueError(f"layout {layout}: expected channels for {', '.join(missing)}")
+    maps = torch.from_numpy(np.stack([planes[name] for name in DIRECTIONS], 1) / np.float32(gain))
+    clear = torch.from_numpy(1.0 - planes[ALPHA]) if ALPHA in planes else None
+    glow = torch.from_numpy(planes[EMISSION] / np.float32(gain)) if EMISSION in planes else None
+    return [
+        SixWay(maps[i], None if clear is None else clear[i], None if glow is None else glow[i]) for i in range(count)
+    ]
+
+
+def write_flipbook(
+    paths: tuple[str | os.PathLike[str], str | os.PathLike[str]],
+    frames: Sequence[SixWay],
+    layout: str = "unity",
+    *,
+    rows: int,
+    columns: int,
+    gain: float = 1.0,
+) -> int:
+    """Writes frames as two textures, each whole or not at all.
+
+    Args:
+        paths: The two files, .exr, .png or .tga; their folders must exist.
+        frames, layout, rows, columns, gain: As for `pack`.
+
+    Returns:
+        How many numbers were too bright for their file and became its brightest.
+
+    Raises:
+        ValueError: As for `pack`.
+        WlmError: Another suffix, a number that isn't finite, or a file that can't be written.
+    """
+    for path in paths:
+        _suffix(path)
+    clipped = 0
+    for path, page in zip(paths, pack(frames, layout, rows=rows, columns=columns, gain=gain), strict=True):
+        if not np.isfinite(page).all():
+            raise WlmError(f"{path}: cannot write: expected finite light, found NaN or infinity")
+        if _suffix(path) == ".exr":
+            clipped += int((page > 65504.0).sum())
+            write_exr(path, page)
+            continue
+        clipped += int((page > 1.0).sum())
+        image = Image.fromarray(np.round(np.clip(page, 0.0, 1.0) * 255.0).astype(np.uint8))
+        with atomic_path(path) as temporary:
+            image.save(temporary, format=_suffix(path)[1:].upper())
+    return clipped
+
+
+def read_flipbook(
+    paths: tuple[str | os.PathLike[str], str | os.PathLike[str]],
+    layout: str = "unity",
+    *,
+    rows: int,
+    columns: int,
+    count: int | None = None,
+    gain: float = 1.0,
+) -> list[SixWay]:
+    """Reads frames from two textures.
+
+    Args:
+        paths: The two files, .exr, .png or .tga (8 bits a channel, linear).
+        layout, rows, columns, count, gain: As for `unpack`.
+
+    Returns:
+        The frames, on the CPU. What a file has no channel for, transparency or emission, is None.
+
+    Raises:
+        WlmError: A file is missing, damaged, of another kind or size, holds numbers that aren't finite, or lacks a
+            channel of the layout.
+    """
+    pages = [_read(path) for path in paths]
+    try:
+        return unpack(pages[0], pages[1], layout, rows=rows, columns=columns, count=count, gain=gain)
+    except ValueError as error:
+        raise WlmError(f"{paths[0]}, {paths[1]}: {error}") from error
+
+
+def _read(path: str | os.PathLike[str]) -> np.ndarray:
+    if _suffix(path) == ".exr":
+        page = read_exr(path)[0]
+        if not np.isfinite(page).all():
+            raise WlmError(f"{path}: expected finite light, found NaN or infinity")
+        return page
+    try:
+        with Image.open(path, formats=[_suffix(path)[1:].upper()]) as image:
+            if image.mode not in _MODES:
+                raise WlmError(f"{path}: expected RGB or RGBA of 8 bits, found {image.mode}")
+            return np.asarray(image).astype(np.float32) / np.float32(255.0)
+    except _BAD_FILE as error:
+        raise WlmError(f"{path}: cannot read the picture: {error}") from error
+
+
+def _plane(frame: SixWay, name: str, gain: float) -> np.ndarray | float:
+    if name == ALPHA:
+        # A frame without transparency among others that have it: where nothing is known, nothing is hidden.
+        return 0.0 if frame.transparency is None else 1.0 - frame.transparency.cpu().numpy()
+    if name == EMISSION:
+        return 0.0 if frame.emission is None else gain * frame.emission.cpu().numpy()
+    return gain * frame[name].cpu().numpy()
+
+
+def _suffix(path: str | os.PathLike[str]) -> str:
+    suffix = Path(path).suffix.lower()
+    if suffix not in _SUFFIXES:
+        raise WlmError(f"{path}: expected a name that ends in {', '.join(_SUFFIXES)}, found {suffix or 'none'}")
+    return suffix
+
+
+def _check_cells(layout: str, rows: int, columns: int, gain: float) -> None:
+    if layout not in LAYOUTS:
+        raise ValueError(f"layout: expected one of {', '.join(LAYOUTS)}, got {layout!r}")
+    if rows < 1 or columns < 1:
+        raise ValueError(f"expected at least one row and column, got {rows} x {columns}")
+    if not 0 < gain < np.inf:
+        raise ValueError(f"gain: expected a number above 0, got {gain}")

@@ -1,0 +1,1 @@
+"""Training of the six-way network: data, losses and optimiser."""

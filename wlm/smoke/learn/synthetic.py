@@ -1,0 +1,43 @@
+"""Smoke made of noise, where none from a simulation or a file is at hand: for demos and measurements."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from wlm.fluid.volume import DensityVolume, from_array
+
+__all__ = ["make_plume"]
+
+_BILLOWS = 160
+_MOST = 1.5  # density
+_HOT = 0.3  # height up to which it is
+
+
+def make_plume(
+    n: int = 48, *, seed: int = 1, hot: bool = True, extinction: float = 1.0, device: str = "cpu"
+) -> DensityVolume:
+    """A leaning column of billows that widens as it rises, in a box of edge 1.
+
+    Args:
+        n: Voxels along an edge of the box, at least 1.
+        seed: Of the billows.
+        hot: Whether it has a temperature, which is highest at its foot.
+        extinction: Over the box's edge, of density 1.
+        device: "cpu" or "cuda:N".
+
+    Raises:
+        WlmError: No such device.
+    """
+    random = np.random.default_rng(seed)
+    axis = (np.arange(n) + 0.5) / n
+    x, y, z = np.meshgrid(axis, axis, axis, indexing="ij")
+    density = np.zeros((n, n, n))
+    for _ in range(_BILLOWS):
+        height = random.uniform(0.06, 0.82)
+        wide = 0.04 + 0.16 * height
+        at = np.array([0.44 + 0.14 * height, height, 0.5]) + wide * random.normal(0, 0.6, 3) * [1, 0.3, 1]
+        radius = wide * random.uniform(0.25, 0.6)
+        density += np.clip(1.5 - np.sqrt((x - at[0]) ** 2 + (y - at[1]) ** 2 + (z - at[2]) ** 2) / radius, 0, 1)
+    density = np.minimum(density, _MOST).astype(np.float32)
+    temperature = density * np.clip(1.0 - y / _HOT, 0, 1).astype(np.float32) if hot else None
+    return from_array(density, extinction=extinction, voxel=1.0 / n, temperature=temperature, device=device)

@@ -1,0 +1,175 @@
+"""The adjoints of sampling a temporal lightmap's maps, by hand: where each gradient is added.
+
+On CUDA gradients are added as 64-bit integers, since integer addition has no order and one seed must give one result;
+on the CPU each lane (a range of samples, run by one thread) has float buffers of its own.
+"""
+
+import functools
+
+import warp as wp
+
+from wlm_kernels.interpolate import axis_index, cell, fraction
+from wlm_kernels.lightmap.blocks import ste_endpoint, ste_weight
+from wlm_kernels.lightmap.features import Maps, Offsets
+
+__all__ = ["scatters"]
+
+
+@wp.func
+def corner_share(base: int, at: int, other: int, f: float, block: int) -> wp.vec2:
+    """The linear weights of an axis's two cells (at, other), kept where the cell lies in ``block``."""
+    a = wp.where(at // 4 == block, 1.0 - f, 0.0)
+    b = wp.where(other // 4 == block, f, 0.0)
+    return wp.vec2(a, b)
+
+
+@functools.cache
+def _adders(device_kind: str):
+    """How a gradient is added: as an integer on CUDA, as a float into a lane's own buffer on the CPU."""
+    if device_kind == "cuda":
+        # Fixed point with steps of 2^-40, about 1e-12; a sum beyond 8e6 would overflow.
+
+        @wp.func
+        def add(acc: wp.array2d[wp.int64], lane: int, i: int, value: float):
+            wp.atomic_add(acc, lane, i, wp.int64(value * 1099511627776.0))
+
+        return add, wp.int64
+
+    @wp.func
+    def add(acc: wp.array2d[float], lane: int, i: int, value: float):
+        acc[lane, i] += value
+
+    return add, float
+
+
+@functools.cache
+def scatters(device_kind: str):
+    """Builds (once) the adjoints of texel, volume and plane sampling.
+
+    Args:
+        device_kind: "cpu" or "cuda".
+
+    Returns:
+        Three ``wp.func``s and the scalar type of the sums that they add to.
+    """
+    add, scalar = _adders(device_kind)
+
+    @wp.func
+    def add_endpoints(acc: wp.array2d[scalar], lane: int, at: int, a: float, b: float, g: wp.vec4):
+        for c in range(4):
+            add(acc, lane, at + c, a * g[c])
+            add(acc, lane, at + 4 + c, b * g[c])
+
+    @wp.func
+    def scatter_texel(
+        acc: wp.array2d[scalar],
+        lane: int,
+        offsets: Offsets,
+        maps: Maps,
+        n: int,
+        y: int,
+        x: int,
+        quantised: int,
+        g: wp.vec4,
+    ):
+        width = maps.uv_weights.shape[2]
+        height = maps.uv_weights.shape[1]
+        e0 = ste_endpoint(maps.uv_endpoints[n, y // 4, x // 4, 0], quantised)
+        e1 = ste_endpoint(maps.uv_endpoints[n, y // 4, x // 4, 1], quantised)
+        w = ste_weight(maps.uv_weights[n, y, x], quantised)
+        add(acc, lane, offsets.uv_weights + (n * height + y) * width + x, wp.dot(e1 - e0, g))
+        block = (n * (height // 4) + y // 4) * (width // 4) + x // 4
+        add_endpoints(acc, lane, offsets.uv_endpoints + block * 8, 1.0 - w, w, g)
+
+    @wp.func
+    def scatter_volume(
+        acc: wp.array2d[scalar],
+        lane: int,
+        offsets: Offsets,
+        maps: Maps,
+        n: int,
+        slices: int,
+        u: float,
+        v: float,
+        tau: float,
+        periodic: int,
+        quantised: int,
+        g: wp.vec4,
+    ):
+        height = maps.uvt_weights.shape[1]
+        width = maps.uvt_weights.shape[2]
+        x = cell(u, width)
+        y = cell(v, height)
+        t = cell(tau, slices)
+        fx = fraction(u, width)
+        fy = fraction(v, height)
+        ft = fraction(tau, slices)
+        xa = axis_index(x, width, 0)
+        xb = axis_index(x + 1, width, 0)
+        ya = axis_index(y, height, 0)
+        yb = axis_index(y + 1, height, 0)
+        two = int(2)  # rolled, as in volume_at
+        four = int(4)
+        for k in range(two):
+            s = n * slices + axis_index(t + k, slices, periodic)
+            ct = wp.where(k == 0, 1.0 - ft, ft)
+            # The eight corners lie in one to four blocks a slice: a block's endpoints get one sum, not one a corner.
+            for j in range(two):
+                by = wp.where(j == 0, ya // 4, yb // 4)
+                if j == 0 or by != ya // 4:
+                    cy = corner_share(y, ya, yb, fy, by) * ct
+                    for i in range(two):
+                        bx = wp.where(i == 0, xa // 4, xb // 4)
+                        if i == 0 or bx != xa // 4:
+                            cx = corner_share(x, xa, xb, fx, bx)
+                            e0 = ste_endpoint(maps.uvt_endpoints[s, by, bx, 0], quantised)
+                            e1 = ste_endpoint(maps.uvt_endpoints[s, by, bx, 1], quantised)
+                            along = wp.dot(e1 - e0, g)
+                            first = float(0.0)
+                            second = float(0.0)
+                            for q in range(four):
+                                c = cy[q // 2] * cx[q % 2]
+                                if c != 0.0:
+                                    yy = wp.where(q // 2 == 0, ya, yb)
+                                    xx = wp.where(q % 2 == 0, xa, xb)
+                                    w = ste_weight(maps.uvt_weights[s, yy, xx], quantised)
+                                    first += c * (1.0 - w)
+                                    second += c * w
+                                    add(
+                                        acc,
+                                        lane,
+                                        offsets.uvt_weights + (s * height + yy) * width + xx,
+                                        c * along,
+                                    )
+                            block = (s * (height // 4) + by) * (width // 4) + bx
+                            add_endpoints(acc, lane, offsets.uvt_endpoints + block * 8, first, second, g)
+
+    @wp.func
+    def scatter_plane(
+        acc: wp.array2d[scalar],
+        lane: int,
+        offset: int,
+        rows: int,
+        columns: int,
+        n: int,
+        p: float,
+        tau: float,
+        periodic: int,
+        g: wp.vec2,
+    ):
+        x = cell(p, columns)
+        t = cell(tau, rows)
+        fx = fraction(p, columns)
+        ft = fraction(tau, rows)
+        two = int(2)
+        for k in range(two):
+            tt = axis_index(t + k, rows, periodic)
+            ct = wp.where(k == 0, 1.0 - ft, ft)
+            for i in range(two):
+                xx = axis_index(x + i, columns, 0)
+                c = ct * wp.where(i == 0, 1.0 - fx, fx)
+                at = offset + ((n * rows + tt) * columns + xx) * 2
+                add(acc, lane, at, c * g[0])
+                add(acc, lane, at + 1, c * g[1])
+
+    return scatter_texel, scatter_volume, scatter_plane, scalar

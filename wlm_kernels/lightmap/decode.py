@@ -1,0 +1,433 @@
+"""Reading temporal lightmap tiles from their stored bytes: BC7 blocks, 8-bit planes and a small MLP.
+
+``exact_kernels`` evaluates a texel a thread, in the same order of operations as training. ``StripKernels`` is the
+runtime path: what depends on the time alone is done once a frame (the two slices of F_uvt are mixed, the planes and
+the encoded time pass the first layer for each column), and a thread decodes four texels, so that each weight is loaded
+once for four.
+"""
+
+import functools
+from dataclasses import dataclass
+from typing import Any
+
+import warp as wp
+
+from wlm_kernels import mlp
+from wlm_kernels.interpolate import axis_index, cell, fraction
+from wlm_kernels.lightmap.blocks import bits7, byte_mix, index_level, stored_texel
+from wlm_kernels.lightmap.features import CENTRE, STATIC_INPUTS, TEMPORAL_INPUTS
+
+__all__ = ["Look", "Stored", "StripKernels", "exact_kernels", "strip_kernels"]
+
+
+@wp.struct
+class Stored:
+    """N tiles as stored, S slices of F_uvt. Static tiles leave all but the first empty."""
+
+    uv: wp.array4d[wp.uint64]  # [N, 32, 32, 2]
+    uvt: wp.array4d[wp.uint64]  # [N * S, R/4, R/4, 2]
+    ut: wp.array3d[wp.vec2ub]  # [N, rows of time, columns]
+    vt: wp.array3d[wp.vec2ub]  # [N, rows of time, columns]
+    slices: int
+    periodic: int
+
+
+@wp.struct
+class Look:
+    """One time, and what turns a network's answer into colour: (shift + spread y) scale."""
+
+    tau: float
+    encoding: wp.vec4
+    gamma: float
+    scale: wp.array1d[wp.vec3]  # [N] mean of each channel at this time
+    inverse_peak: wp.array1d[float]  # [N] 1 / the bound of the tile at this time; 0 for a black one
+    shift: wp.array1d[wp.vec3]  # [N]
+    spread: wp.array1d[wp.vec3]  # [N]
+
+
+@wp.func
+def stored_plane(plane: wp.array3d[wp.vec2ub], n: int, t: int, x: int) -> wp.vec2:
+    v = plane[n, t, x]
+    return wp.vec2(float(v[0]) / 255.0, float(v[1]) / 255.0)
+
+
+@wp.func
+def stored_plane_at(plane: wp.array3d[wp.vec2ub], n: int, p: float, tau: float, periodic: int) -> wp.vec2:
+    rows = plane.shape[1]
+    columns = plane.shape[2]
+    x = cell(p, columns)
+    t = cell(tau, rows)
+    fx = fraction(p, columns)
+    ft = fraction(tau, rows)
+    xa = axis_index(x, columns, 0)
+    xb = axis_index(x + 1, columns, 0)
+    ta = axis_index(t, rows, periodic)
+    tb = axis_index(t + 1, rows, periodic)
+    early = (1.0 - fx) * stored_plane(plane, n, ta, xa) + fx * stored_plane(plane, n, ta, xb)
+    late = (1.0 - fx) * stored_plane(plane, n, tb, xa) + fx * stored_plane(plane, n, tb, xb)
+    return (1.0 - ft) * early + ft * late
+
+
+@wp.func
+def stored_volume_at(stored: Stored, n: int, u: float, v: float, tau: float) -> wp.vec4:
+    height = stored.uvt.shape[1] * 4
+    width = stored.uvt.shape[2] * 4
+    x = cell(u, width)
+    y = cell(v, height)
+    t = cell(tau, stored.slices)
+    fx = fraction(u, width)
+    fy = fraction(v, height)
+    ft = fraction(tau, stored.slices)
+    f = wp.vec4()
+    for k in range(2):
+        s = n * stored.slices + axis_index(t + k, stored.slices, stored.periodic)
+        ct = wp.where(k == 0, 1.0 - ft, ft)
+        for j in range(2):
+            yy = axis_index(y + j, height, 0)
+            cy = ct * wp.where(j == 0, 1.0 - fy, fy)
+            for i in range(2):
+                xx = axis_index(x + i, width, 0)
+                c = cy * wp.where(i == 0, 1.0 - fx, fx)
+                f += c * stored_texel(stored.uvt, s, yy, xx)
+    return f
+
+
+@wp.func
+def finish_colour(look: Look, n: int, y: wp.vec3) -> wp.vec3:
+    """The colour in gamma space, >= 0."""
+    c = wp.cw_mul(look.shift[n] + wp.cw_mul(look.spread[n], y), look.scale[n])
+    return wp.vec3(wp.max(c[0], 0.0), wp.max(c[1], 0.0), wp.max(c[2], 0.0))
+
+
+@wp.func
+def finish_byte(c: float, inverse_peak: float) -> wp.uint8:
+    return wp.uint8(int(wp.clamp(c * inverse_peak, 0.0, 1.0) * 255.0 + 0.5))
+
+
+@wp.func
+def finish_bytes(look: Look, n: int, y: wp.vec3) -> wp.vec4ub:
+    """The 8-bit output: gamma-space colour over the tile's bound at this time; alpha is 255."""
+    c = finish_colour(look, n, y)
+    p = look.inverse_peak[n]
+    return wp.vec4ub(finish_byte(c[0], p), finish_byte(c[1], p), finish_byte(c[2], p), wp.uint8(255))
+
+
+@functools.cache
+def exact_kernels(temporal: bool, hidden: int, gelu: str) -> tuple[Any, Any]:
+    """Builds (once) the kernels that decode whole tiles, one texel a thread.
+
+    Args:
+        temporal: Whether the tiles have temporal maps.
+        hidden: H, width of the hidden layers.
+        gelu: One of ``mlp.GELUS``.
+
+    Returns:
+        Two kernels over (tiles, 128, 128). Their inputs are ``Stored``, hidden vecH [N, I + H + 2], output vec3
+        [N, H + 1], ``Look``, rows int [N] (each tile's place in ``Look``) and tiles int [n]. Their one output is
+        [n, 128, 128]: linear radiance as vec3, or 8-bit colour as vec4ub.
+    """
+    inputs = TEMPORAL_INPUTS if temporal else STATIC_INPUTS
+    centred = 12 if temporal else 4
+    net = mlp.kernels(inputs, hidden, gelu)
+    vec_in, vec_hidden = net.vec_in, net.vec_hidden
+    first, second, third, act = net.first, net.second, net.third, net.act
+
+    @wp.func
+    def answer(
+        stored: Stored, w: wp.array2d[vec_hidden], o: wp.array2d[wp.vec3], look: Look, n: int, y: int, x: int
+    ) -> wp.vec3:
+        f = vec_in()
+        uv = stored_texel(stored.uv, n, y, x)
+        for c in range(4):
+            f[c] = uv[c]
+        if wp.static(temporal):
+            u = (float(x) + 0.5) / 128.0
+            v = (float(y) + 0.5) / 128.0
+            uvt = stored_volume_at(stored, n, u, v, look.tau)
+            ut = stored_plane_at(stored.ut, n, u, look.tau, stored.periodic)
+            vt = stored_plane_at(stored.vt, n, v, look.tau, stored.periodic)
+            for c in range(4):
+                f[4 + c] = uvt[c]
+                f[12 + c] = look.encoding[c]
+            for c in range(2):
+                f[8 + c] = ut[c]
+                f[10 + c] = vt[c]
+        for c in range(wp.static(centred)):
+            f[c] = (f[c] + 0.0 - 0.5) * CENTRE
+        return third(o, n, act(second(w, n, act(first(w, n, f)))))
+
+    options = {"enable_backward": False}
+
+    @wp.kernel(module="unique", module_options=options)
+    def radiance(
+        # in:
+        stored: Stored,
+        w: wp.array2d[vec_hidden],
+        o: wp.array2d[wp.vec3],
+        look: Look,
+        rows: wp.array1d[int],
+        tiles: wp.array1d[int],
+        # out:
+        out: wp.array3d[wp.vec3],
+    ):
+        i, y, x = wp.tid()
+        n = tiles[i]
+        c = finish_colour(look, rows[n], answer(stored, w, o, look, n, y, x))
+        out[i, y, x] = wp.vec3(wp.pow(c[0], look.gamma), wp.pow(c[1], look.gamma), wp.pow(c[2], look.gamma))
+
+    @wp.kernel(module="unique", module_options=options)
+    def bytes_(
+        # in:
+        stored: Stored,
+        w: wp.array2d[vec_hidden],
+        o: wp.array2d[wp.vec3],
+        look: Look,
+        rows: wp.array1d[int],
+        tiles: wp.array1d[int],
+        # out:
+        out: wp.array3d[wp.vec4ub],
+    ):
+        i, y, x = wp.tid()
+        n = tiles[i]
+        out[i, y, x] = finish_bytes(look, rows[n], answer(stored, w, o, look, n, y, x))
+
+    return radiance, bytes_
+
+
+@wp.kernel(enable_backward=False)
+def _frame_volume(
+    # in:
+    stored: Stored,
+    tau: float,
+    # out:
+    volume: wp.array3d[wp.vec4],
+):
+    """F_uvt at one time, centred: [N, R, R]."""
+    n, y, x = wp.tid()
+    t = cell(tau, stored.slices)
+    ft = fraction(tau, stored.slices)
+    sa = n * stored.slices + axis_index(t, stored.slices, stored.periodic)
+    sb = n * stored.slices + axis_index(t + 1, stored.slices, stored.periodic)
+    f = (1.0 - ft) * stored_texel(stored.uvt, sa, y, x) + ft * stored_texel(stored.uvt, sb, y, x)
+    volume[n, y, x] = (f - wp.vec4(0.5)) * CENTRE
+
+
+@dataclass(frozen=True)
+class StripKernels:
+    """The runtime path of one network shape; see ``decode``."""
+
+    hidden: int
+    vec_hidden: Any
+    _frame_lines: Any
+    _decode: Any
+
+    def decode(self, stored, hidden, output, look, volume, columns, rows, places, tiles, out) -> None:
+        """Decodes tiles to 8-bit colour at one time.
+
+        Args:
+            stored: ``Stored``, dynamic tiles.
+            hidden: vecH [N, I + H + 2].
+            output: vec3 [N, H + 1].
+            look: ``Look``.
+            volume: vec4 [N, R, R], scratch.
+            columns: float [N, H, 128], scratch.
+            rows: vec2 [N, 128], scratch.
+            places: int [N], each tile's place in ``look``.
+            tiles: int [n], the tiles wanted. The scratch of all N is filled.
+            out: uint32 [n, 128, 128], RGBA from the lowest byte.
+        """
+        device = out.device
+        wp.launch(_frame_volume, volume.shape, inputs=[stored, look.tau], outputs=[volume], device=device)
+        wp.launch(
+            self._frame_lines,
+            rows.shape,
+            inputs=[stored, hidden, look],
+            outputs=[columns, rows],
+            device=device,
+        )
+        wp.launch(
+            self._decode,
+            (out.shape[0], 32, 128),
+            inputs=[stored, hidden, output, look, volume, columns, rows, places, tiles],
+            outputs=[out],
+            device=device,
+            block_dim=128,
+        )
+
+
+@wp.func
+def pack(v: wp.vec4ub) -> wp.uint32:
+    return (
+        wp.uint32(v[0])
+        | wp.lshift(wp.uint32(v[1]), wp.uint32(8))
+        | wp.lshift(wp.uint32(v[2]), wp.uint32(16))
+        | wp.lshift(wp.uint32(v[3]), wp.uint32(24))
+    )
+
+
+@wp.func
+def centred_texel(a: wp.vec4, b: wp.vec4, high: wp.uint64, i: int) -> wp.vec4:
+    """Texel i of a block with endpoint bytes a and b, as it enters the network."""
+    index = int(wp.rshift(high, wp.uint64(4 * i)) & wp.uint64(15))
+    if i == 0:
+        index = int(wp.rshift(high, wp.uint64(1)) & wp.uint64(7))
+    k = float(index_level(index))
+    f = wp.vec4(byte_mix(a[0], b[0], k), byte_mix(a[1], b[1], k), byte_mix(a[2], b[2], k), byte_mix(a[3], b[3], k))
+    return f * 0.013584712361323677 - wp.vec4(1.7320508075688772)  # (f / 255 - 1/2) sqrt(12)
+
+
+@wp.func
+def frame_volume_at(volume: wp.array3d[wp.vec4], n: int, y: int, x: int) -> wp.vec4:
+    size = volume.shape[1]
+    u = (float(x) + 0.5) / 128.0
+    v = (float(y) + 0.5) / 128.0
+    x0 = cell(u, size)
+    y0 = cell(v, size)
+    fx = fraction(u, size)
+    fy = fraction(v, size)
+    xa = wp.max(x0, 0)
+    xb = wp.min(x0 + 1, size - 1)
+    ya = wp.max(y0, 0)
+    yb = wp.min(y0 + 1, size - 1)
+    top = (1.0 - fx) * volume[n, ya, xa] + fx * volume[n, ya, xb]
+    bottom = (1.0 - fx) * volume[n, yb, xa] + fx * volume[n, yb, xb]
+    return (1.0 - fy) * top + fy * bottom
+
+
+STRIP_BOUNDS = (128, 3)  # threads of a block, blocks of a multiprocessor: 168 registers a thread, no spills
+
+
+@functools.cache
+def strip_kernels(hidden: int, gelu: str) -> StripKernels:
+    """Builds (once) the runtime path for dynamic tiles of a hidden width.
+
+    Args:
+        hidden: H, width of the hidden layers.
+        gelu: One of ``mlp.GELUS``.
+    """
+    net = mlp.kernels(TEMPORAL_INPUTS, hidden, gelu)
+    vec_hidden = net.vec_hidden
+    act = net.act
+    options = {"enable_backward": False}
+
+    @wp.kernel(module="unique", module_options=options)
+    def frame_lines(
+        # in:
+        stored: Stored,
+        w: wp.array2d[vec_hidden],
+        look: Look,
+        # out:
+        columns: wp.array3d[float],
+        rows: wp.array2d[wp.vec2],
+    ):
+        """What F_ut and the time add to the first layer of each column, and F_vt of each row, centred."""
+        n, i = wp.tid()
+        p = (float(i) + 0.5) / 128.0
+        ut = stored_plane_at(stored.ut, n, p, look.tau, stored.periodic)
+        vt = stored_plane_at(stored.vt, n, p, look.tau, stored.periodic)
+        h = w[n, 16]
+        for c in range(4):
+            h += w[n, 12 + c] * look.encoding[c]
+        for c in range(2):
+            h += w[n, 8 + c] * ((ut[c] - 0.5) * CENTRE)
+        for j in range(wp.static(hidden)):
+            columns[n, j, i] = h[j]
+        rows[n, i] = (vt - wp.vec2(0.5)) * CENTRE
+
+    @wp.kernel(module="unique", module_options=options, launch_bounds=STRIP_BOUNDS)
+    def decode(
+        # in:
+        stored: Stored,
+        w: wp.array2d[vec_hidden],
+        o: wp.array2d[wp.vec3],
+        look: Look,
+        volume: wp.array3d[wp.vec4],
+        columns: wp.array3d[float],
+        rows: wp.array2d[wp.vec2],
+        places: wp.array1d[int],
+        tiles: wp.array1d[int],
+        # out:
+        out: wp.array3d[wp.uint32],
+    ):
+        """A thread decodes the four texels of one column of a block; a warp's threads are neighbours in x."""
+        i, block, x = wp.tid()
+        n = tiles[i]
+        place = places[n]
+        y = block * 4
+        low = stored.uv[n, block, x // 4, 0]
+        high = stored.uv[n, block, x // 4, 1]
+        p0 = float(int(wp.rshift(low, wp.uint64(63))))
+        p1 = float(int(high & wp.uint64(1)))
+        a = wp.vec4(bits7(low, 7), bits7(low, 21), bits7(low, 35), bits7(low, 49)) * 2.0 + wp.vec4(p0)
+        b = wp.vec4(bits7(low, 14), bits7(low, 28), bits7(low, 42), bits7(low, 56)) * 2.0 + wp.vec4(p1)
+        at = x % 4
+        f0 = centred_texel(a, b, high, at)
+        f1 = centred_texel(a, b, high, at + 4)
+        f2 = centred_texel(a, b, high, at + 8)
+        f3 = centred_texel(a, b, high, at + 12)
+        h0 = vec_hidden()
+        for j in range(wp.static(hidden)):
+            h0[j] = columns[n, j, x]
+        h1 = h0
+        h2 = h0
+        h3 = h0
+        for c in range(4):
+            column = w[n, c]
+            h0 += column * f0[c]
+            h1 += column * f1[c]
+            h2 += column * f2[c]
+            h3 += column * f3[c]
+        f0 = frame_volume_at(volume, n, y, x)
+        f1 = frame_volume_at(volume, n, y + 1, x)
+        f2 = frame_volume_at(volume, n, y + 2, x)
+        f3 = frame_volume_at(volume, n, y + 3, x)
+        for c in range(4):
+            column = w[n, 4 + c]
+            h0 += column * f0[c]
+            h1 += column * f1[c]
+            h2 += column * f2[c]
+            h3 += column * f3[c]
+        r0 = rows[n, y]
+        r1 = rows[n, y + 1]
+        r2 = rows[n, y + 2]
+        r3 = rows[n, y + 3]
+        for c in range(2):
+            column = w[n, 10 + c]
+            h0 += column * r0[c]
+            h1 += column * r1[c]
+            h2 += column * r2[c]
+            h3 += column * r3[c]
+        h0 = act(h0)
+        h1 = act(h1)
+        h2 = act(h2)
+        h3 = act(h3)
+        k0 = w[n, wp.static(17 + hidden)]
+        k1 = k0
+        k2 = k0
+        k3 = k0
+        for c in range(wp.static(hidden)):
+            column = w[n, 17 + c]
+            k0 += column * h0[c]
+            k1 += column * h1[c]
+            k2 += column * h2[c]
+            k3 += column * h3[c]
+        k0 = act(k0)
+        k1 = act(k1)
+        k2 = act(k2)
+        k3 = act(k3)
+        y0 = o[n, wp.static(hidden)]
+        y1 = y0
+        y2 = y0
+        y3 = y0
+        for c in range(wp.static(hidden)):
+            colour = o[n, c]
+            y0 += colour * k0[c]
+            y1 += colour * k1[c]
+            y2 += colour * k2[c]
+            y3 += colour * k3[c]
+        out[i, y, x] = pack(finish_bytes(look, place, y0))
+        out[i, y + 1, x] = pack(finish_bytes(look, place, y1))
+        out[i, y + 2, x] = pack(finish_bytes(look, place, y2))
+        out[i, y + 3, x] = pack(finish_bytes(look, place, y3))
+
+    return StripKernels(hidden, vec_hidden, frame_lines, decode)

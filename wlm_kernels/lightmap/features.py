@@ -1,0 +1,256 @@
+"""The temporal lightmap model in training: its maps, its time axis and its targets, as functions for kernels.
+
+A tile is F_uv, F_uvt, F_ut, F_vt and an MLP (neural-dynamic-gi, eq. 5 and table 1). Its network's inputs are, in
+order: F_uv 4, F_uvt 4, F_ut 2, F_vt 2, the encoded time 4; tiles without temporal maps use F_uv alone. Features v in
+[0, 1] enter as (v - 1/2) sqrt(12): mean 0 and variance 1 where v is uniform.
+
+``temporal_step`` trains with these, ``temporal_gather`` turns its sums into gradients, ``temporal_adjoint`` holds the
+adjoints of sampling by hand, ``temporal_decode`` reads tiles from their stored bytes.
+"""
+
+import warp as wp
+
+from wlm_kernels.interpolate import axis_index, cell, fraction
+from wlm_kernels.lightmap.blocks import texel
+
+__all__ = ["CENTRE", "STATIC_INPUTS", "TEMPORAL_INPUTS", "Batch", "Maps", "Moment", "Offsets", "Sample"]
+
+TEMPORAL_INPUTS = 16
+STATIC_INPUTS = 4
+CENTRE = wp.constant(3.4641016151377544)  # sqrt(12)
+
+
+@wp.struct
+class Maps:
+    """The feature maps of N tiles with S time slices in F_uvt. Static tiles leave all but the first two empty."""
+
+    uv_endpoints: wp.array4d[wp.vec4]  # [N, 32, 32, 2]
+    uv_weights: wp.array3d[float]  # [N, 128, 128]
+    uvt_endpoints: wp.array4d[wp.vec4]  # [N * S, R/4, R/4, 2]
+    uvt_weights: wp.array3d[float]  # [N * S, R, R]
+    ut: wp.array3d[wp.vec2]  # [N, rows of time, columns]
+    vt: wp.array3d[wp.vec2]  # [N, rows of time, columns]
+
+
+@wp.struct
+class Offsets:
+    """Where the gradients of each map begin in the flat gradient array, in scalars."""
+
+    uv_endpoints: int
+    uv_weights: int
+    uvt_endpoints: int
+    uvt_weights: int
+    ut: int
+    vt: int
+
+
+@wp.func
+def ste_byte(v: float, quantised: int) -> float:
+    """A plane's value as used: clamped, or on its 8-bit level; straight-through in ``scatter_plane``."""
+    c = wp.clamp(v, 0.0, 1.0)
+    if quantised == 0:
+        return c
+    return wp.floor(c * 255.0 + 0.5) / 255.0
+
+
+@wp.func
+def ste_byte2(v: wp.vec2, quantised: int) -> wp.vec2:
+    return wp.vec2(ste_byte(v[0], quantised), ste_byte(v[1], quantised))
+
+
+@wp.func
+def plane_at(plane: wp.array3d[wp.vec2], n: int, p: float, tau: float, periodic: int, quantised: int) -> wp.vec2:
+    rows = plane.shape[1]
+    columns = plane.shape[2]
+    x = cell(p, columns)
+    t = cell(tau, rows)
+    fx = fraction(p, columns)
+    ft = fraction(tau, rows)
+    xa = axis_index(x, columns, 0)
+    xb = axis_index(x + 1, columns, 0)
+    ta = axis_index(t, rows, periodic)
+    tb = axis_index(t + 1, rows, periodic)
+    early = (1.0 - fx) * ste_byte2(plane[n, ta, xa], quantised) + fx * ste_byte2(plane[n, ta, xb], quantised)
+    late = (1.0 - fx) * ste_byte2(plane[n, tb, xa], quantised) + fx * ste_byte2(plane[n, tb, xb], quantised)
+    return (1.0 - ft) * early + ft * late
+
+
+@wp.func
+def volume_at(
+    maps: Maps, n: int, slices: int, u: float, v: float, tau: float, periodic: int, quantised: int
+) -> wp.vec4:
+    height = maps.uvt_weights.shape[1]
+    width = maps.uvt_weights.shape[2]
+    x = cell(u, width)
+    y = cell(v, height)
+    t = cell(tau, slices)
+    fx = fraction(u, width)
+    fy = fraction(v, height)
+    ft = fraction(tau, slices)
+    f = wp.vec4()
+    two = int(2)  # a variable keeps the loops rolled: unrolled, the code outgrows the GPU's instruction cache
+    for k in range(two):
+        s = n * slices + axis_index(t + k, slices, periodic)
+        ct = wp.where(k == 0, 1.0 - ft, ft)
+        for j in range(two):
+            yy = axis_index(y + j, height, 0)
+            cy = ct * wp.where(j == 0, 1.0 - fy, fy)
+            for i in range(two):
+                xx = axis_index(x + i, width, 0)
+                c = cy * wp.where(i == 0, 1.0 - fx, fx)
+                f += c * texel(maps.uvt_endpoints, maps.uvt_weights, s, yy, xx, quantised)
+    return f
+
+
+@wp.struct
+class Batch:
+    """What a step is trained on. T stored times, K the longest list of valid texels."""
+
+    targets: wp.array3d[wp.vec3]  # [N, T, 128 * 128] normalised gamma-space colour
+    texels: wp.array2d[int]  # [N, K] flat indices of valid texels, padded
+    texel_count: wp.array1d[int]  # [N]
+    tau: wp.array1d[float]  # [T] place of each time on the features' time axis, in [0, 1]
+    encoding: wp.array1d[wp.vec4]  # [T] gamma(t) of eq. 4
+    weight: wp.array2d[wp.vec3]  # [N, T] weight of the squared error of each channel
+    number: wp.array1d[int]  # [N] number of the tile in its lightmap
+    scale: wp.array2d[wp.vec3]  # [N, T] what colours at each time were divided by
+    control: wp.array1d[int]  # [0] step
+    slices: int  # S of F_uvt
+    turn: float  # gamma(t) is sine and cosine of turn tau and of 2 turn tau
+    between: float  # share of the samples at times between two stored ones
+    gamma: float
+    inverse_range: wp.array2d[float]  # [N, T] 1 / the squared range of radiance; 0 where there is none
+    tracked: wp.array4d[float]  # [lanes, N, T, 2] sum and count of squared errors of radiance, or empty: not wanted
+    seed: int
+    shift: wp.array1d[wp.vec3]  # [N] colour over scale = shift + spread * target
+    spread: wp.array1d[wp.vec3]  # [N]
+    emphasis: float  # exponent of the colour over scale in the weight of a texel; 0: none
+    periodic: int
+    quantised: int
+
+
+@wp.func
+def draw_state(batch: Batch, n: int, b: int, samples: int) -> wp.uint32:
+    return wp.rand_init(batch.seed + batch.number[n] * 9973, batch.control[0] * samples + b)
+
+
+@wp.struct
+class Moment:
+    """The time of a sample: a stored one, or a share of the way to the next."""
+
+    k: int
+    next: int
+    share: float
+    tau: float
+    encoding: wp.vec4
+
+
+@wp.func
+def stored_moment(batch: Batch, k: int) -> Moment:
+    m = Moment()
+    m.k = k
+    m.next = k
+    m.share = 0.0
+    m.tau = batch.tau[k]
+    m.encoding = batch.encoding[k]
+    return m
+
+
+@wp.func
+def moment_between(batch: Batch, k: int, share: float) -> Moment:
+    """Where the features are read on the way from time k to the next one; from the last it leads to the first."""
+    m = stored_moment(batch, k)
+    last = batch.tau.shape[0] - 1
+    if k < last or batch.periodic != 0:
+        m.next = wp.where(k < last, k + 1, 0)
+        m.share = share
+        gap = batch.tau[m.next] - m.tau
+        if gap < 0.0:
+            gap += 1.0
+        m.tau += share * gap
+        if m.tau >= 1.0 and batch.periodic != 0:
+            m.tau -= 1.0
+        a = batch.turn * m.tau
+        m.encoding = wp.vec4(wp.sin(a), wp.cos(a), wp.sin(2.0 * a), wp.cos(2.0 * a))
+    return m
+
+
+@wp.struct
+class Sample:
+    """A random sample of a tile."""
+
+    flat: int  # index of its texel
+    moment: Moment
+    state: wp.uint32  # of the generator, for what is drawn next
+
+
+@wp.func
+def draw_sample(batch: Batch, n: int, b: int, samples: int) -> Sample:
+    """Sample b of tile n at this step: a valid texel and a time."""
+    state = draw_state(batch, n, b, samples)
+    s = Sample()
+    s.flat = batch.texels[n, wp.randi(state, 0, batch.texel_count[n])]
+    k = wp.randi(state, 0, batch.tau.shape[0])
+    s.moment = stored_moment(batch, k)
+    if batch.between > 0.0:  # not drawn for nothing: profiles without it keep their samples
+        share = wp.randf(state)
+        if wp.randf(state) < batch.between:
+            s.moment = moment_between(batch, k, share)
+    s.state = state
+    return s
+
+
+@wp.func
+def target_at(batch: Batch, n: int, m: Moment, flat: int) -> wp.vec3:
+    """What the network should answer: at a time between two, their colours are interpolated (eq. 2)."""
+    a = batch.targets[n, m.k, flat]
+    if m.share == 0.0:
+        return a
+    b = batch.targets[n, m.next, flat]
+    early = (1.0 - m.share) * batch.scale[n, m.k]
+    late = m.share * batch.scale[n, m.next]
+    colour = wp.cw_mul(batch.shift[n] + wp.cw_mul(batch.spread[n], a), early) + wp.cw_mul(
+        batch.shift[n] + wp.cw_mul(batch.spread[n], b), late
+    )
+    scale = early + late
+    y = wp.vec3()
+    for c in range(3):
+        if scale[c] > 0.0:
+            y[c] = (colour[c] / scale[c] - batch.shift[n][c]) / batch.spread[n][c]
+    return y
+
+
+@wp.func
+def texel_weight(batch: Batch, n: int, m: Moment, target: wp.vec3) -> wp.vec3:
+    weight = (1.0 - m.share) * batch.weight[n, m.k] + m.share * batch.weight[n, m.next]
+    if batch.emphasis == 0.0:
+        return weight
+    colour = batch.shift[n] + wp.cw_mul(batch.spread[n], target)
+    least = 0.02  # keeps black texels in the fit
+    return wp.cw_mul(
+        weight,
+        wp.vec3(
+            wp.pow(wp.max(colour[0], least), batch.emphasis),
+            wp.pow(wp.max(colour[1], least), batch.emphasis),
+            wp.pow(wp.max(colour[2], least), batch.emphasis),
+        ),
+    )
+
+
+@wp.func
+def radiance_of(batch: Batch, n: int, k: int, y: wp.vec3) -> wp.vec3:
+    c = wp.cw_mul(batch.shift[n] + wp.cw_mul(batch.spread[n], y), batch.scale[n, k])
+    return wp.vec3(
+        wp.pow(wp.max(c[0], 0.0), batch.gamma),
+        wp.pow(wp.max(c[1], 0.0), batch.gamma),
+        wp.pow(wp.max(c[2], 0.0), batch.gamma),
+    )
+
+
+@wp.func
+def track_error(batch: Batch, lane: int, n: int, m: Moment, target: wp.vec3, error: wp.vec3):
+    """Adds a sample's error as PSNR measures it, for progress reports; the sums take no part in the fit."""
+    if batch.tracked.shape[0] > 0 and m.share == 0.0:
+        e = radiance_of(batch, n, m.k, target + error) - radiance_of(batch, n, m.k, target)
+        wp.atomic_add(batch.tracked, lane, n, m.k, 0, wp.dot(e, e) / 3.0 * batch.inverse_range[n, m.k])
+        wp.atomic_add(batch.tracked, lane, n, m.k, 1, 1.0)

@@ -1,0 +1,315 @@
+"""One launch that trains temporal lightmap tiles: sample the maps, run the MLP, take the loss and every gradient.
+
+It handles B random samples of each of N tiles (neural-dynamic-gi, section 3.3, 3.4 and 4): draws a valid texel and a
+time, samples F_uv, F_uvt, F_ut and F_vt, adds the uniform noise of eq. 6, centres the features, runs the network,
+takes the weighted squared error and adds up the gradients. ``temporal_gather`` then makes gradient arrays of them.
+
+The same sums give the same result on one device. A tile's samples depend on the seed, the step and its number alone,
+so that a tile fits to the same result in any batch.
+"""
+
+import functools
+from dataclasses import dataclass
+from typing import Any
+
+import warp as wp
+
+from wlm_kernels import mlp
+from wlm_kernels.lightmap.adjoint import scatters
+from wlm_kernels.lightmap.blocks import texel
+from wlm_kernels.lightmap.features import (
+    CENTRE,
+    STATIC_INPUTS,
+    TEMPORAL_INPUTS,
+    Batch,
+    Maps,
+    Moment,
+    Offsets,
+    Sample,
+    draw_sample,
+    plane_at,
+    target_at,
+    texel_weight,
+    track_error,
+    volume_at,
+)
+from wlm_kernels.lightmap.reduce import BLOCK, block_reduction, reload
+
+__all__ = ["BLOCK", "StepKernels", "step_kernels"]
+
+LAUNCH_BOUNDS = (BLOCK, 2)  # two blocks a multiprocessor leave 255 registers a thread: no spills at width 16
+NOISE = wp.constant(1.0 / 256.0)  # alpha of eq. 6: one step of 8 bits
+
+
+@dataclass(frozen=True)
+class StepKernels:
+    """The training step of one network shape on one kind of device; see ``launch``."""
+
+    inputs: int
+    hidden: int
+    device_kind: str
+    net: mlp.MlpKernels
+    scalar: Any
+    draw: Any
+    _step: Any
+
+    def load(self, device) -> None:
+        """Compiles the step for a device now rather than at its first launch."""
+        self._step.module.load(wp.get_device(device))
+
+    def launch(
+        self,
+        maps,
+        offsets,
+        hidden,
+        output,
+        batch,
+        samples,
+        acc,
+        partial,
+        partial_out,
+        loss,
+        base=0,
+        count=None,
+    ):
+        """Adds the gradients of B samples a tile.
+
+        Args:
+            maps: ``Maps``, the parameters.
+            offsets: ``Offsets`` into ``acc``.
+            hidden: vecH [N, I + H + 2], see ``wlm_kernels.mlp``.
+            output: vec3 [N, H + 1].
+            batch: ``Batch``.
+            samples: B; on CUDA a multiple of ``BLOCK``.
+            acc: [lanes, M], gradient sums of the maps: int64 on CUDA (one lane), float on the CPU.
+            partial: float [P, N, I + H + 2, H]: written on CUDA, one P a block; added to on the CPU, one P a lane.
+            partial_out: float [P, N, H + 1, 3], likewise.
+            loss: float [P, N], likewise: the sum of weighted squared errors over samples and channels / (3 B).
+            base, count: The CPU's lane: samples base to base + count - 1 of each tile.
+        """
+        tiles = hidden.shape[0]
+        span = samples if count is None else count
+        wp.launch(
+            self._step,
+            (tiles, span),
+            inputs=[maps, offsets, hidden, output, batch, samples, base],
+            outputs=[acc, partial, partial_out, loss],
+            device=hidden.device,
+            block_dim=BLOCK,
+        )
+
+
+@functools.cache
+def step_kernels(temporal: bool, hidden: int, gelu: str, device_kind: str) -> StepKernels:
+    """Builds (once) the training step for tiles with or without temporal maps.
+
+    Args:
+        temporal: Whether the tiles have F_uvt, F_ut, F_vt and the encoded time.
+        hidden: H, width of the hidden layers.
+        gelu: "exact" or "tanh".
+        device_kind: "cpu" or "cuda".
+    """
+    inputs = TEMPORAL_INPUTS if temporal else STATIC_INPUTS
+    noisy = 12 if temporal else 4
+    net = mlp.kernels(inputs, hidden, gelu)
+    vec_in, vec_hidden = net.vec_in, net.vec_hidden
+    first, second, third = net.first, net.second, net.third
+    gate, slope = net.gate, net.slope
+    back_hidden, back_output, back_input = net.back_hidden, net.back_output, net.back_input
+    scatter_texel, scatter_volume, scatter_plane, scalar = scatters(device_kind)
+    columns_2 = inputs + 1
+
+    @wp.func
+    def features(maps: Maps, batch: Batch, n: int, y: int, x: int, m: Moment, state: wp.uint32) -> vec_in:
+        f = vec_in()
+        uv = texel(maps.uv_endpoints, maps.uv_weights, n, y, x, batch.quantised)
+        for c in range(4):
+            f[c] = uv[c]
+        if wp.static(temporal):
+            u = (float(x) + 0.5) / 128.0
+            v = (float(y) + 0.5) / 128.0
+            tau = m.tau
+            uvt = volume_at(maps, n, batch.slices, u, v, tau, batch.periodic, batch.quantised)
+            ut = plane_at(maps.ut, n, u, tau, batch.periodic, batch.quantised)
+            vt = plane_at(maps.vt, n, v, tau, batch.periodic, batch.quantised)
+            e = m.encoding
+            for c in range(4):
+                f[4 + c] = uvt[c]
+                f[12 + c] = e[c]
+            for c in range(2):
+                f[8 + c] = ut[c]
+                f[10 + c] = vt[c]
+        for c in range(wp.static(noisy)):
+            # Quantised maps are on their levels already; eq. 6 stands in for the rounding before that.
+            noise = wp.where(batch.quantised == 0, (wp.randf(state) - 0.5) * NOISE, 0.0)
+            f[c] = (f[c] + noise - 0.5) * CENTRE
+        return f
+
+    @wp.func
+    def scatter(
+        acc: wp.array2d[scalar],
+        lane: int,
+        offsets: Offsets,
+        maps: Maps,
+        batch: Batch,
+        n: int,
+        sample: Sample,
+        g: vec_in,
+    ):
+        c = CENTRE
+        y = sample.flat // 128
+        x = sample.flat % 128
+        scatter_texel(acc, lane, offsets, maps, n, y, x, batch.quantised, c * wp.vec4(g[0], g[1], g[2], g[3]))
+        if wp.static(temporal):
+            u = (float(x) + 0.5) / 128.0
+            v = (float(y) + 0.5) / 128.0
+            tau = sample.moment.tau
+            scatter_volume(
+                acc,
+                lane,
+                offsets,
+                maps,
+                n,
+                batch.slices,
+                u,
+                v,
+                tau,
+                batch.periodic,
+                batch.quantised,
+                c * wp.vec4(g[4], g[5], g[6], g[7]),
+            )
+            rows = maps.ut.shape[1]
+            columns = maps.ut.shape[2]
+            scatter_plane(acc, lane, offsets.ut, rows, columns, n, u, tau, batch.periodic, c * wp.vec2(g[8], g[9]))
+            scatter_plane(acc, lane, offsets.vt, rows, columns, n, v, tau, batch.periodic, c * wp.vec2(g[10], g[11]))
+
+    @wp.struct
+    class Pass:
+        """What the gradients are made of: each layer's input and the delta behind it, and the sample's loss."""
+
+        f: vec_in
+        h1: vec_hidden
+        h2: vec_hidden
+        d1: vec_hidden
+        d2: vec_hidden
+        d3: wp.vec3
+        loss: float
+
+    @wp.func
+    def forward_backward(
+        maps: Maps,
+        w: wp.array2d[vec_hidden],
+        o: wp.array2d[wp.vec3],
+        batch: Batch,
+        lane: int,
+        n: int,
+        sample: Sample,
+        samples: int,
+    ) -> Pass:
+        m = sample.moment
+        f = features(maps, batch, n, sample.flat // 128, sample.flat % 128, m, sample.state)
+        a1 = first(w, n, f)
+        g1 = gate(a1)
+        h1 = wp.cw_mul(a1, g1)
+        a2 = second(w, n, h1)
+        g2 = gate(a2)
+        h2 = wp.cw_mul(a2, g2)
+        target = target_at(batch, n, m, sample.flat)
+        error = third(o, n, h2) - target
+        track_error(batch, lane, n, m, target, error)
+        half = wp.cw_mul(texel_weight(batch, n, m, target), error) / (3.0 * float(samples))
+        d3 = 2.0 * half
+        reload()
+        d2 = wp.cw_mul(back_output(o, n, d3), slope(a2, g2))
+        reload()
+        d1 = wp.cw_mul(back_hidden(w, n, d2), slope(a1, g1))
+        p = Pass()
+        p.f = f
+        p.h1 = h1
+        p.h2 = h2
+        p.d1 = d1
+        p.d2 = d2
+        p.d3 = d3
+        p.loss = wp.dot(half, error)
+        return p
+
+    options = {"enable_backward": False}
+
+    @wp.kernel(module="unique", module_options=options)
+    def draw(
+        # in:
+        maps: Maps,
+        batch: Batch,
+        samples: int,
+        # out:
+        place: wp.array2d[wp.vec3i],
+        f: wp.array2d[vec_in],
+    ):
+        n, b = wp.tid()
+        sample = draw_sample(batch, n, b, samples)
+        y = sample.flat // 128
+        x = sample.flat % 128
+        place[n, b] = wp.vec3i(y, x, sample.moment.k)
+        f[n, b] = features(maps, batch, n, y, x, sample.moment, sample.state)
+
+    if device_kind == "cpu":
+
+        @wp.kernel(module="unique", module_options=options)
+        def step(
+            # in:
+            maps: Maps,
+            offsets: Offsets,
+            w: wp.array2d[vec_hidden],
+            o: wp.array2d[wp.vec3],
+            batch: Batch,
+            samples: int,
+            base: int,
+            # out:
+            acc: wp.array2d[scalar],
+            partial: wp.array3d[vec_hidden],
+            partial_out: wp.array3d[wp.vec3],
+            loss: wp.array2d[float],
+        ):
+            n, i = wp.tid()
+            b = base + i
+            lane = wp.where(base == 0, 0, 1)
+            sample = draw_sample(batch, n, b, samples)
+            p = forward_backward(maps, w, o, batch, lane, n, sample, samples)
+            loss[lane, n] += p.loss
+            for c in range(wp.static(inputs)):
+                partial[lane, n, c] += p.d1 * p.f[c]
+            partial[lane, n, wp.static(inputs)] += p.d1
+            for c in range(wp.static(hidden)):
+                partial[lane, n, wp.static(columns_2) + c] += p.d2 * p.h1[c]
+                partial_out[lane, n, c] += p.d3 * p.h2[c]
+            partial[lane, n, wp.static(columns_2 + hidden)] += p.d2
+            partial_out[lane, n, wp.static(hidden)] += p.d3
+            scatter(acc, lane, offsets, maps, batch, n, sample, back_input(w, n, p.d1))
+
+    else:
+        reduce = block_reduction(net)
+
+        @wp.kernel(module="unique", module_options=options, launch_bounds=LAUNCH_BOUNDS)
+        def step(
+            # in:
+            maps: Maps,
+            offsets: Offsets,
+            w: wp.array2d[vec_hidden],
+            o: wp.array2d[wp.vec3],
+            batch: Batch,
+            samples: int,
+            base: int,
+            # out:
+            acc: wp.array2d[scalar],
+            partial: wp.array2d[float],
+            partial_out: wp.array2d[float],
+            loss: wp.array1d[float],
+        ):
+            n, b = wp.tid()
+            sample = draw_sample(batch, n, b, samples)
+            p = forward_backward(maps, w, o, batch, 0, n, sample, samples)
+            row = (b // wp.static(BLOCK)) * w.shape[0] + n
+            reduce(p.f, p.h1, p.h2, p.d1, p.d2, p.d3, p.loss, row, partial, partial_out, loss)
+            scatter(acc, 0, offsets, maps, batch, n, sample, back_input(w, n, p.d1))
+
+    return StepKernels(inputs, hidden, device_kind, net, scalar, draw, step)

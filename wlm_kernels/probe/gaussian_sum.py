@@ -1,0 +1,277 @@
+"""The Gaussians' sum at any points and its gradients (gaussian-probe-compression, eq. 2 to 6, 11 and 12).
+
+``gaussian_cubes`` says which Gaussians a point looks at; without it each looks at all, which is the reference for it.
+Two ways back: ``backward`` is by hand, a thread a Gaussian over the points of the cubes in its reach, nothing added by
+atomics; ``sum_taped`` is recorded by ``wp.Tape``, in float64 and with no code in common, for other losses and as a
+check. What a Gaussian reaches is a constant to both.
+
+A training step over probes that stand still is quicker by ``probe_step``.
+"""
+
+import functools
+from dataclasses import dataclass
+from typing import Any
+
+import warp as wp
+
+from wlm_kernels.probe.cubes import REACH_MARGIN, Cubes, cube_of, everything, sort_by_cube, span
+from wlm_kernels.probe.gaussians import LATENT, SHAPE_NUMBERS, Shape, functions, shape_of, touches
+
+__all__ = ["SUPPORTS", "backward", "shapes", "sum", "sum_kernels", "sum_taped"]
+
+SUPPORTS = ("ellipsoid", "sphere")
+
+# As in ``gaussians``: a shorter quaternion stands for no rotation.
+_SHORTEST = wp.constant(wp.float64(1.0e-12))
+
+
+@wp.func
+def _log_scale(rows: wp.array2d[float], k: int) -> wp.vec3:
+    return wp.vec3(rows[k, 3], rows[k, 4], rows[k, 5])
+
+
+@wp.func
+def _quaternion(rows: wp.array2d[float], k: int) -> wp.vec4:
+    return wp.vec4(rows[k, 6], rows[k, 7], rows[k, 8], rows[k, 9])
+
+
+@wp.kernel(enable_backward=False)
+def _shapes(
+    # in:
+    rows: wp.array2d[float],
+    cut: float,
+    sphere: int,
+    # out:
+    out: wp.array1d[Shape],
+):
+    k = wp.tid()
+    centre = wp.vec3(rows[k, 0], rows[k, 1], rows[k, 2])
+    out[k] = shape_of(centre, _log_scale(rows, k), _quaternion(rows, k), cut, sphere)
+
+
+@wp.kernel(enable_backward=False)
+def _cubes_of(
+    # in:
+    cubes: Cubes,
+    x: wp.array1d[wp.vec3],
+    # out:
+    keys: wp.array1d[int],
+    items: wp.array1d[int],
+):
+    i = wp.tid()
+    keys[i] = cube_of(cubes, x[i])
+    items[i] = i
+
+
+@wp.kernel
+def _frames(
+    # in:
+    rows: wp.array2d[float],
+    # out:
+    frames: wp.array1d[wp.mat33d],
+):
+    """W = S^-1 R^T."""
+    k = wp.tid()
+    q = wp.vec4d(wp.float64(rows[k, 6]), wp.float64(rows[k, 7]), wp.float64(rows[k, 8]), wp.float64(rows[k, 9]))
+    turn = wp.identity(n=3, dtype=wp.float64)
+    n = wp.length(q)
+    if n >= _SHORTEST:
+        h = q / n
+        turn = wp.quat_to_matrix(wp.quatd(h[1], h[2], h[3], h[0]))
+    s = wp.vec3d(wp.exp(-wp.float64(rows[k, 3])), wp.exp(-wp.float64(rows[k, 4])), wp.exp(-wp.float64(rows[k, 5])))
+    frames[k] = wp.diag(s) * wp.transpose(turn)
+
+
+@wp.kernel
+def _sum_taped(
+    # in:
+    rows: wp.array2d[float],
+    frames: wp.array1d[wp.mat33d],
+    cubes: Cubes,
+    x: wp.array1d[wp.vec3],
+    cut: float,
+    sphere: int,
+    # out:
+    f: wp.array2d[float],
+):
+    i = wp.tid()
+    cube = cube_of(cubes, x[i])
+    for j in range(cubes.start[cube], cubes.start[cube + 1]):
+        k = cubes.item[j]
+        d = wp.vec3d(x[i]) - wp.vec3d(wp.float64(rows[k, 0]), wp.float64(rows[k, 1]), wp.float64(rows[k, 2]))
+        u = frames[k] * d
+        d2 = wp.dot(u, u)
+        # Squared: the root's slope at a point on a centre would make NaN of a gradient of 0.
+        far = d2
+        if sphere != 0:
+            longest = wp.exp(wp.float64(wp.max(rows[k, 3], wp.max(rows[k, 4], rows[k, 5]))))
+            far = wp.length_sq(d) / (longest * longest)
+        if far < wp.float64(cut) * wp.float64(cut):
+            w = float(wp.exp(wp.float64(-0.5) * d2))
+            # To memory: a variable's past would be lost on the way back through a loop that isn't unrolled.
+            for c in range(f.shape[0]):
+                f[c, i] += w * rows[k, LATENT + c]
+
+
+@dataclass(frozen=True)
+class _Kernels:
+    """Of one latent length."""
+
+    forward: Any
+    backward: Any
+
+
+@functools.cache
+def sum_kernels(latent: int) -> _Kernels:
+    """Builds (once) the kernels of ``sum`` and ``backward`` for latents of length L."""
+    fn = functions(latent)
+    vec_latent, vec_sums = fn.vec_latent, fn.vec_sums
+    add, accumulate, chain = fn.add, fn.accumulate, fn.chain
+    options = {"enable_backward": False, "max_unroll": 32}
+
+    @wp.kernel(module="unique", module_options=options)
+    def forward(
+        # in:
+        rows: wp.array2d[float],
+        shapes: wp.array1d[Shape],
+        cubes: Cubes,
+        x: wp.array1d[wp.vec3],
+        cut: float,
+        # out:
+        f: wp.array2d[float],
+    ):
+        i = wp.tid()
+        cube = cube_of(cubes, x[i])
+        s = vec_latent()
+        for j in range(cubes.start[cube], cubes.start[cube + 1]):
+            k = cubes.item[j]
+            s = add(s, shapes[k], rows, k, x[i], cut)
+        for c in range(wp.static(latent)):
+            f[c, i] = s[c]
+
+    @wp.kernel(module="unique", module_options=options)
+    def backward(
+        # in:
+        rows: wp.array2d[float],
+        shapes: wp.array1d[Shape],
+        cubes: Cubes,
+        order: wp.array1d[int],
+        start: wp.array1d[int],
+        x: wp.array1d[wp.vec3],
+        cut: float,
+        grad_f: wp.array2d[float],
+        # out:
+        grad: wp.array2d[float],
+    ):
+        k = wp.tid()
+        shape = shapes[k]
+        first, last = span(cubes, shape.centre, shape.reach)
+        sums = vec_sums()
+        for a in range(first[0], last[0] + 1):
+            for b in range(first[1], last[1] + 1):
+                # Cubes in a row along the last axis are neighbours in memory, and so are their points.
+                row = (a * cubes.counts[1] + b) * cubes.counts[2]
+                for j in range(start[row + first[2]], start[row + last[2] + 1]):
+                    i = order[j]
+                    # Most points aren't reached: look, generously, before loading their gradients.
+                    if touches(shape, x[i], REACH_MARGIN * shape.reach):
+                        g = vec_latent()
+                        for c in range(wp.static(latent)):
+                            g[c] = grad_f[c, i]
+                        sums = accumulate(sums, shape, rows, k, x[i], g, cut)
+        head = chain(sums, shape, _log_scale(rows, k), _quaternion(rows, k))
+        for c in range(wp.static(LATENT)):
+            grad[k, c] = head[c]
+        for c in range(wp.static(latent)):
+            grad[k, LATENT + c] = sums[SHAPE_NUMBERS + c]
+
+    return _Kernels(forward, backward)
+
+
+def _latent(rows) -> int:
+    latent = rows.shape[1] - LATENT
+    if latent < 1:
+        raise ValueError(f"rows: expected more than {LATENT} columns, got {rows.shape[1]}")
+    return latent
+
+
+def _sphere(support: str) -> int:
+    if support not in SUPPORTS:
+        raise ValueError(f"support: expected one of {', '.join(SUPPORTS)}, got {support!r}")
+    return SUPPORTS.index(support)
+
+
+def shapes(rows, cut: float, support: str = "ellipsoid"):
+    """What the rows of Gaussians come to.
+
+    Args:
+        rows: float [K, 10 + L], see ``gaussians``.
+        cut: How far a Gaussian reaches, in standard deviations.
+        support: "ellipsoid": as far along each axis as it is long; "sphere": everywhere as far as along the longest
+            (eq. 6).
+
+    Returns:
+        Shape [K].
+    """
+    out = wp.empty(rows.shape[0], dtype=Shape, device=rows.device)
+    wp.launch(_shapes, out.shape, inputs=[rows, cut, _sphere(support)], outputs=[out], device=rows.device)
+    return out
+
+
+def sum(rows, shapes, cubes, x, f, cut: float) -> None:
+    """F(x) = sum of F_k w_k(x) over the Gaussians that reach x (eq. 5).
+
+    Whatever the lists, as long as they lack none that reaches a point, the result is the same to the last bit.
+
+    Args:
+        rows: float [K, 10 + L].
+        shapes: Shape [K], made of the rows with this cut.
+        cubes: ``gaussian_cubes.Cubes`` of the shapes; None: every point looks at all Gaussians.
+        x: vec3 [N]; one that is NaN is reached by none.
+        f: float [L, N], written.
+        cut: How far a Gaussian reaches, in standard deviations.
+    """
+    cubes = cubes or everything(rows.shape[0], rows.device)
+    kernel = sum_kernels(_latent(rows)).forward
+    wp.launch(kernel, x.shape, inputs=[rows, shapes, cubes, x, cut], outputs=[f], device=rows.device)
+
+
+def backward(rows, shapes, cubes, x, grad_f, grad, cut: float) -> None:
+    """The gradient of ``sum`` by its rows.
+
+    Args:
+        rows, shapes, cubes, x, cut: As for ``sum``.
+        grad_f: float [L, N], the gradient of f.
+        grad: float [K, 10 + L], written.
+    """
+    device, count = rows.device, x.shape[0]
+    cubes = cubes or everything(rows.shape[0], device)
+    kernel = sum_kernels(_latent(rows)).backward
+    total = cubes.start.shape[0] - 1
+    keys, order = (wp.empty(2 * count, dtype=int, device=device) for _ in range(2))
+    start = wp.empty(total + 1, dtype=int, device=device)
+    wp.launch(_cubes_of, count, inputs=[cubes, x], outputs=[keys, order], device=device)
+    sort_by_cube(keys, order, count, total, start)
+    inputs = [rows, shapes, cubes, order, start, x, cut, grad_f]
+    wp.launch(kernel, rows.shape[0], inputs=inputs, outputs=[grad], device=device)
+
+
+def sum_taped(rows, cubes, x, f, cut: float, support: str = "ellipsoid") -> None:
+    """``sum``, recorded by an open ``wp.Tape`` with gradients for the rows.
+
+    On CUDA gradients of Gaussians are added in any order, so that the last bits change from run to run.
+
+    Args:
+        rows: float [K, 10 + L], requires a gradient.
+        cubes, x, cut: As for ``sum``.
+        f: float [L, N], written.
+        support: As for ``shapes``.
+    """
+    device, count = rows.device, rows.shape[0]
+    cubes = cubes or everything(count, device)
+    sphere = _sphere(support)
+    _latent(rows)
+    f.zero_()
+    frames = wp.empty(count, dtype=wp.mat33d, device=device, requires_grad=True)
+    wp.launch(_frames, count, inputs=[rows], outputs=[frames], device=device)
+    wp.launch(_sum_taped, x.shape, inputs=[rows, frames, cubes, x, cut, sphere], outputs=[f], device=device)

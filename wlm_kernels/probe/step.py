@@ -1,0 +1,465 @@
+"""A training step of Gaussians and their network (gaussian-probe-compression, section 3.2 and 3.3), but the network.
+
+Probes are sorted along a space-filling curve and taken in groups of 64 neighbours, each with a box. A step is five
+launches: which Gaussians meet which groups, as bit masks (``touch``); the Gaussians' sum at each probe (``features``);
+the network there and back (``probe_network``); the sums that the gradients of each Gaussian are made of (``collect``);
+and the optimisers (``update``). A launch runs over probes, or over Gaussians, and nothing is added up by atomics: one
+seed gives one result, on either device.
+
+The masks take the place of the paper's sorted lists of cubes in training, where the probes stand still: there is
+nothing to count, scan and sort (``gaussian_cubes`` does, for points at any place).
+"""
+
+import functools
+from dataclasses import dataclass
+from typing import Any
+
+import warp as wp
+
+from wlm_kernels.probe.gaussians import LATENT, SHAPE_NUMBERS, Shape, functions, shape_of, touches
+from wlm_kernels.probe.optimiser import update_kernel
+
+__all__ = [
+    "GROUP",
+    "SPLITS",
+    "Groups",
+    "StepKernels",
+    "count_step",
+    "next_bit",
+    "step_kernels",
+    "touch",
+]
+
+GROUP = 64  # probes
+SPLITS = 4  # threads that share a probe's sum on CUDA, where 15,000 probes alone leave most of a GPU idle
+_COLLECTORS = 256  # threads that share a Gaussian's gradient on CUDA: the widest one sets the pace
+
+@wp.struct
+class Groups:
+    """Probes in groups; N is a multiple of ``GROUP``, G = N / GROUP.
+
+    Attributes:
+        x: [N], positions in the normalised frame; those behind ``count`` only fill the last group.
+        middle, half: [G], the groups' boxes.
+        count: Probes.
+    """
+
+    x: wp.array1d[wp.vec3]
+    middle: wp.array1d[wp.vec3]
+    half: wp.array1d[wp.vec3]
+    count: int
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return __ffs(bits) - 1;
+#else
+    return __builtin_ctz(bits);
+#endif
+""")
+def next_bit(bits: wp.uint32) -> int:
+    """Place of the lowest bit that is set; ``bits`` must not be 0."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return __ballot_sync(0xffffffffu, bit != 0);
+#else
+    return 0u;
+#endif
+""")
+def _ballot(bit: int) -> wp.uint32:
+    """A word of the bits of the 32 threads of a warp."""
+    ...
+
+
+@wp.kernel(enable_backward=False)
+def _count_step(control: wp.array1d[int]):
+    control[0] = control[0] + 1
+
+
+@wp.func
+def _meet(groups: Groups, shapes: wp.array1d[Shape], g: int, k: int) -> int:
+    if g < groups.middle.shape[0] and k < shapes.shape[0]:
+        if touches(shapes[k], groups.middle[g], groups.half[g]):
+            return 1
+    return 0
+
+
+@wp.kernel(enable_backward=False)
+def _touch_cpu(
+    # in:
+    groups: Groups,
+    shapes: wp.array1d[Shape],
+    transposed: int,
+    # out:
+    bits: wp.array2d[wp.uint32],
+):
+    row, word = wp.tid()
+    found = wp.uint32(0)
+    for b in range(32):
+        other = word * 32 + b
+        met = int(0)
+        if transposed == 0:
+            met = _meet(groups, shapes, row, other)
+        else:
+            met = _meet(groups, shapes, other, row)
+        found = found | (wp.uint32(met) << wp.uint32(b))
+    bits[row, word] = found
+
+
+@wp.kernel(enable_backward=False)
+def _touch_cuda(
+    # in:
+    groups: Groups,
+    shapes: wp.array1d[Shape],
+    transposed: int,
+    # out:
+    bits: wp.array2d[wp.uint32],
+):
+    row, word, b = wp.tid()
+    other = word * 32 + b
+    met = int(0)
+    if transposed == 0:
+        met = _meet(groups, shapes, row, other)
+    else:
+        met = _meet(groups, shapes, other, row)
+    # Threads 0 to 31 of the last dimension are one warp, whole in every launch.
+    found = _ballot(met)
+    if b == 0:
+        bits[row, word] = found
+
+
+def count_step(control) -> None:
+    """Adds one to ``control``, int [1], the number of the step."""
+    wp.launch(_count_step, 1, outputs=[control], device=control.device)
+
+
+def touch(groups, shapes, by_group, by_gaussian) -> None:
+    """Finds which Gaussians may reach which groups.
+
+    Args:
+        groups: ``Groups``.
+        shapes: Shape [K].
+        by_group: uint32 [G, ceil(K / 32)], written: bit b of word w is Gaussian 32 w + b.
+        by_gaussian: uint32 [K, ceil(G / 32)], written.
+    """
+    device = shapes.device
+    for transposed, bits in enumerate((by_group, by_gaussian)):
+        inputs = [groups, shapes, transposed]
+        if device.is_cuda:
+            wp.launch(_touch_cuda, (*bits.shape, 32), inputs=inputs, outputs=[bits], device=device)
+        else:
+            wp.launch(_touch_cpu, bits.shape, inputs=inputs, outputs=[bits], device=device)
+
+
+@dataclass(frozen=True)
+class StepKernels:
+    """The launches of one latent length on one kind of device."""
+
+    latent: int
+    device_kind: str
+    _shapes: Any
+    _features: Any
+    _collect: Any
+    _update: Any
+
+    def load(self, device) -> None:
+        """Compiles them for a device now."""
+        for kernel in (self._shapes, self._features, self._collect, self._update, _count_step):
+            kernel.module.load(wp.get_device(device))
+
+    def shapes(self, rows, bounds, quantised, levels, cut, sphere, used, shapes) -> None:
+        """Makes what a step uses of the parameters.
+
+        Args:
+            rows: float [K, 10 + L], the parameters.
+            bounds: float [2, 10 + L], lowest and highest value of each channel.
+            quantised: 1 to round to the levels of the file (eq. 13 and 14), 0 to use the rows as they are.
+            levels: float [10 + L], each channel's highest code.
+            cut, sphere: As for ``gaussians.shape_of``.
+            used: float [K, 10 + L], written.
+            shapes: Shape [K], written.
+        """
+        wp.launch(
+            self._shapes,
+            rows.shape[0],
+            inputs=[rows, bounds, quantised, levels, cut, sphere],
+            outputs=[used, shapes],
+            device=rows.device,
+        )
+
+    def features(self, groups, shapes, used, by_group, cut, f, base=0, count=None) -> None:
+        """The Gaussians' sum at each probe.
+
+        Args:
+            groups, shapes, used, by_group, cut: As above.
+            f: float [S, L, N], written: S parts of the sum, S = ``SPLITS`` on CUDA and 1 on the CPU.
+            base, count: On the CPU, the probes from ``base`` on.
+        """
+        probes = groups.x.shape[0]
+        dims = (probes // GROUP, SPLITS, GROUP) if self.device_kind == "cuda" else count or probes
+        wp.launch(
+            self._features,
+            dims,
+            inputs=[groups, shapes, used, by_group, cut, base],
+            outputs=[f],
+            device=f.device,
+            block_dim=GROUP,
+        )
+
+    def collect(self, groups, shapes, used, by_gaussian, grad_f, cut, sums, base=0, count=None) -> None:
+        """Sums over the probes what the gradients of each Gaussian are made of.
+
+        Args:
+            groups, shapes, used, by_gaussian, cut: As above.
+            grad_f: float [L, N], the gradient of the sum; 0 behind ``groups.count``.
+            sums: float [K, 9 + L], written.
+            base, count: On the CPU, the Gaussians from ``base`` on.
+        """
+        gaussians = used.shape[0]
+        dims = (gaussians, _COLLECTORS) if self.device_kind == "cuda" else count or gaussians
+        wp.launch(
+            self._collect,
+            dims,
+            inputs=[groups, shapes, used, by_gaussian, grad_f, cut, base],
+            outputs=[sums],
+            device=sums.device,
+            block_dim=_COLLECTORS,
+        )
+
+    def update(self, optimiser, rows, used, shapes, sums, moments, net, net_moments, partial) -> None:
+        """One step of Adan for the Gaussians and of Adam for the network.
+
+        Args:
+            optimiser: ``probe_optimiser.Optimiser``.
+            rows: float [K, 10 + L], updated.
+            used: float [K, 10 + L], what the gradients were taken at.
+            shapes: Shape [K].
+            sums: float [K, 9 + L], of ``collect``.
+            moments: float [4, K, 10 + L], updated.
+            net: float [P], updated.
+            net_moments: float [2, P], updated.
+            partial: float [B, P], parts of the network's gradient.
+        """
+        wp.launch(
+            self._update,
+            net.shape[0] + (rows.size if optimiser.move else 0),
+            inputs=[optimiser, used, shapes, sums, partial],
+            outputs=[rows, moments, net, net_moments],
+            device=net.device,
+        )
+
+
+@functools.cache
+def step_kernels(latent: int, device_kind: str) -> StepKernels:
+    """Builds (once) the launches.
+
+    Args:
+        latent: L.
+        device_kind: "cpu" or "cuda".
+    """
+    fn = functions(latent)
+    vec_latent, vec_sums = fn.vec_latent, fn.vec_sums
+    add, accumulate = fn.add, fn.accumulate
+    channels = LATENT + latent
+    options = {"enable_backward": False, "max_unroll": 32}
+
+    @wp.kernel(module="unique", module_options=options)
+    def shapes_kernel(
+        # in:
+        rows: wp.array2d[float],
+        bounds: wp.array2d[float],
+        quantised: int,
+        levels: wp.array1d[float],
+        cut: float,
+        sphere: int,
+        # out:
+        used: wp.array2d[float],
+        shapes: wp.array1d[Shape],
+    ):
+        k = wp.tid()
+        for c in range(wp.static(channels)):
+            value = rows[k, c]
+            if quantised != 0:
+                low = bounds[0, c]
+                high = bounds[1, c]
+                if high > low:
+                    step = (high - low) / levels[c]
+                    value = low + step * wp.clamp(wp.floor((value - low) / step + 0.5), 0.0, levels[c])
+                else:
+                    value = low
+            used[k, c] = value
+        shapes[k] = shape_of(
+            wp.vec3(used[k, 0], used[k, 1], used[k, 2]),
+            wp.vec3(used[k, 3], used[k, 4], used[k, 5]),
+            wp.vec4(used[k, 6], used[k, 7], used[k, 8], used[k, 9]),
+            cut,
+            sphere,
+        )
+
+    @wp.func
+    def sum_at(
+        groups: Groups,
+        shapes: wp.array1d[Shape],
+        used: wp.array2d[float],
+        by_group: wp.array2d[wp.uint32],
+        cut: float,
+        i: int,
+        first: int,
+        stride: int,
+    ) -> vec_latent:
+        g = i // GROUP
+        x = groups.x[i]
+        f = vec_latent()
+        for w in range(first, by_group.shape[1], stride):
+            bits = by_group[g, w]
+            while bits != wp.uint32(0):
+                k = w * 32 + next_bit(bits)
+                bits = bits & (bits - wp.uint32(1))
+                f = add(f, shapes[k], used, k, x, cut)
+        return f
+
+    @wp.func
+    def sums_of(
+        groups: Groups,
+        shapes: wp.array1d[Shape],
+        used: wp.array2d[float],
+        by_gaussian: wp.array2d[wp.uint32],
+        grad_f: wp.array2d[float],
+        cut: float,
+        k: int,
+        first: int,
+        stride: int,
+        lane: int,
+        lanes: int,
+    ) -> vec_sums:
+        s = vec_sums()
+        shape = shapes[k]
+        turn = int(0)
+        for w in range(by_gaussian.shape[1]):
+            bits = by_gaussian[k, w]
+            while bits != wp.uint32(0):
+                g = w * 32 + next_bit(bits)
+                bits = bits & (bits - wp.uint32(1))
+                # The groups go round among those who share the Gaussian.
+                turn += 1
+                if turn % stride != first:
+                    continue
+                for j in range(lane, GROUP, lanes):
+                    i = g * GROUP + j
+                    # Most of a group that is met at a corner isn't reached: look before loading gradients.
+                    if not touches(shape, groups.x[i], wp.vec3()):
+                        continue
+                    gradient = vec_latent()
+                    for c in range(wp.static(latent)):
+                        gradient[c] = grad_f[c, i]
+                    s = accumulate(s, shape, used, k, groups.x[i], gradient, cut)
+        return s
+
+    if device_kind == "cpu":
+
+        @wp.kernel(module="unique", module_options=options)
+        def features(
+            # in:
+            groups: Groups,
+            shapes: wp.array1d[Shape],
+            used: wp.array2d[float],
+            by_group: wp.array2d[wp.uint32],
+            cut: float,
+            base: int,
+            # out:
+            f: wp.array3d[float],
+        ):
+            i = base + wp.tid()
+            s = sum_at(groups, shapes, used, by_group, cut, i, 0, 1)
+            for c in range(wp.static(latent)):
+                f[0, c, i] = s[c]
+
+        @wp.kernel(module="unique", module_options=options)
+        def collect(
+            # in:
+            groups: Groups,
+            shapes: wp.array1d[Shape],
+            used: wp.array2d[float],
+            by_gaussian: wp.array2d[wp.uint32],
+            grad_f: wp.array2d[float],
+            cut: float,
+            base: int,
+            # out:
+            sums: wp.array2d[float],
+        ):
+            k = base + wp.tid()
+            s = sums_of(groups, shapes, used, by_gaussian, grad_f, cut, k, 0, 1, 0, 1)
+            for c in range(wp.static(SHAPE_NUMBERS + latent)):
+                sums[k, c] = s[c]
+
+    else:
+        block_sum = _block_sum(vec_sums, SHAPE_NUMBERS + latent)
+
+        @wp.kernel(module="unique", module_options=options)
+        def features(
+            # in:
+            groups: Groups,
+            shapes: wp.array1d[Shape],
+            used: wp.array2d[float],
+            by_group: wp.array2d[wp.uint32],
+            cut: float,
+            base: int,
+            # out:
+            f: wp.array3d[float],
+        ):
+            g, split, lane = wp.tid()
+            i = g * GROUP + lane
+            s = sum_at(groups, shapes, used, by_group, cut, i, split, SPLITS)
+            for c in range(wp.static(latent)):
+                f[split, c, i] = s[c]
+
+        @wp.kernel(module="unique", module_options=options)
+        def collect(
+            # in:
+            groups: Groups,
+            shapes: wp.array1d[Shape],
+            used: wp.array2d[float],
+            by_gaussian: wp.array2d[wp.uint32],
+            grad_f: wp.array2d[float],
+            cut: float,
+            base: int,
+            # out:
+            sums: wp.array2d[float],
+        ):
+            k, t = wp.tid()
+            s = sums_of(
+                groups, shapes, used, by_gaussian, grad_f, cut, k, t // GROUP, _COLLECTORS // GROUP, t % GROUP, GROUP
+            )
+            block_sum(s, k, sums)
+
+    return StepKernels(latent, device_kind, shapes_kernel, features, collect, update_kernel(latent))
+
+
+def _block_sum(vec_sums, numbers: int):
+    """The sum of a vector over a CUDA block, in a fixed order, into row k of an array."""
+    snippet = f"""
+    constexpr int N = {numbers}, WARPS = {_COLLECTORS // 32};
+    __shared__ float parts[WARPS][N];
+    const int t = threadIdx.x;
+    #pragma unroll
+    for (int c = 0; c < N; ++c) {{
+        float x = v.c[c];
+        #pragma unroll
+        for (int step = 16; step > 0; step /= 2) x += __shfl_down_sync(0xffffffffu, x, step);
+        if (t % 32 == 0) parts[t / 32][c] = x;
+    }}
+    __syncthreads();
+    if (t < N) {{
+        float x = 0.0f;
+        for (int w = 0; w < WARPS; ++w) x += parts[w][t];
+        out.data[size_t(k) * N + t] = x;
+    }}
+    """
+
+    @wp.func_native(snippet)
+    def block_sum(v: vec_sums, k: int, out: wp.array2d[float]): ...
+
+    return block_sum

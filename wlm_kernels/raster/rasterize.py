@@ -1,0 +1,385 @@
+"""Triangles to pixels, in clip space or in UV space: which triangle each pixel centre sees, where in it, how deep.
+
+A pixel centre P and a corner v are homogeneous, (x, y, w). The edge function of corner i, E_i = det[P, v_j, v_k], is
+linear in the pixel; P lies in the part of the triangle that is in front of the viewer (w > 0) where all three have the
+sign of det[v_0, v_1, v_2], and E_i / (E_0 + E_1 + E_2) are the barycentrics of the point seen there. Nothing is divided
+by w, so a triangle that reaches behind the viewer needs no clipping; there is no near and no far plane.
+
+Whether a pixel is covered is decided without any rounding. Where float64 can't tell the sign of an edge function it is
+computed exactly, and where it is exactly zero the pixel counts as moved by an infinitely small step to the right, and
+by an infinitely smaller one down: the top-left rule, for both windings. So a pixel on an edge or a corner that
+triangles share is covered by exactly one of those that surround it, also where they have corners of their own with
+equal numbers.
+
+Which triangle wins a pixel is a minimum over 64-bit keys, depth first and then number: the same on every run.
+
+Row 0 is the top row of the image. In clip space y points up, pixel (row j, column i) of H x W has its centre at
+x/w = (2 i + 1) / W - 1, y/w = 1 - (2 j + 1) / H, and of the triangles over a pixel the one of least z/w wins. In UV
+space, glTF's, v points down, the centre is u = (i + 1/2) / W, v = (j + 1/2) / H, and the least number wins.
+
+A triangle with a corner that isn't finite, or whose index names no corner, and one of no area, cover nothing.
+
+The edge functions are in ``raster_edges``; ``raster_gradient`` reads attributes where the pixels look, and goes back.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import warp as wp
+
+from wlm_kernels.raster.edges import (
+    MOST_PIXELS,
+    SPACES,
+    Box,
+    Corners,
+    Frame,
+    at,
+    box_of,
+    check_position,
+    corners_of,
+    covers,
+    edges_of,
+    finite,
+    first_pixel,
+    frame,
+    has_corners,
+    last_pixel,
+    total_of,
+)
+
+__all__ = ["MOST_PIXELS", "SPACES", "Raster", "Rasterizer"]
+
+wp.set_module_options({"enable_backward": False, "max_unroll": 4})
+
+# Large triangles are cut into tiles of this side, a thread each: 64 pixels one after the other.
+_TILE = wp.constant(8)
+# A box of no more pixels is drawn at once. On the CPU, where a launch is a loop, every triangle is.
+_SMALL = 64
+# Threads that share the tiles, about what an H100 holds of them at a time.
+_SHARERS = 65536
+
+_EMPTY = wp.constant(wp.int64(2**63 - 1))  # a key behind all depths
+_ZERO = wp.constant(wp.float64(0.0))
+_ONE = wp.constant(wp.float64(1.0))
+_TWO = wp.constant(wp.float64(2.0))
+
+
+@wp.func
+def _draw(
+    k: Corners,
+    t: int,
+    box: Box,
+    frame: Frame,
+    cull: int,
+    names: wp.int64,
+    keys: wp.array2d[wp.int64],
+    coverage: wp.array2d[int],
+):
+    """Offers a triangle to the pixels of a box."""
+    e = edges_of(k, frame, cull)
+    if e.sign == _ZERO:
+        return
+    # z / w is linear on the screen: the sum of E_i z_i over det scale W H.
+    det = wp.abs(wp.dot(k.a, wp.cross(k.b, k.c))) * wp.float64(frame.scale) * wp.float64(frame.width)
+    det = det * wp.float64(frame.height)
+    z_x = wp.dot(e.x, k.z) / det
+    z_y = wp.dot(e.y, k.z) / det
+    z_c = wp.dot(e.c, k.z) / det
+    # A sliver may lose all digits of that; its depth is still between its corners'.
+    z_low = wp.float64(-wp.inf)
+    z_high = wp.float64(wp.inf)
+    if k.a[2] > _ZERO and k.b[2] > _ZERO and k.c[2] > _ZERO:
+        z = wp.vec3d(k.z[0] / k.a[2], k.z[1] / k.b[2], k.z[2] / k.c[2])
+        z_low = wp.min(z)
+        z_high = wp.max(z)
+    for row in range(box.top, box.bottom + 1):
+        y = wp.float64(frame.y + frame.y_step * row)
+        rest = y * e.y + e.c
+        low = wp.float64(frame.x + 2 * box.left)
+        high = wp.float64(frame.x + 2 * box.right)
+        for i in range(3):
+            if e.x[i] > _ZERO:
+                low = wp.max(low, (-e.limit[i] - rest[i]) / e.x[i])
+            elif e.x[i] < _ZERO:
+                high = wp.min(high, (-e.limit[i] - rest[i]) / e.x[i])
+            elif rest[i] < -e.limit[i]:
+                high = wp.float64(-wp.inf)
+        first = first_pixel((low - wp.float64(frame.x)) / _TWO, frame.width)
+        last = last_pixel((high - wp.float64(frame.x)) / _TWO, frame.width)
+        for column in range(first, last + 1):
+            x = wp.float64(frame.x + 2 * column)
+            f = x * e.x + rest
+            inside = f[0] > e.limit[0] and f[1] > e.limit[1] and f[2] > e.limit[2]
+            if not inside:
+                if f[0] >= -e.limit[0] and f[1] >= -e.limit[1] and f[2] >= -e.limit[2]:
+                    inside = covers(e, k, frame, row, column)
+            if inside:
+                depth = x * z_x + (y * z_y + z_c)
+                if not depth > z_low:
+                    depth = z_low
+                if depth > z_high:
+                    depth = z_high
+                # As an integer of the same order; -0 is made 0 first.
+                bits = wp.cast(depth + _ZERO, wp.int64)
+                if bits < wp.int64(0):
+                    bits = bits ^ _EMPTY
+                key = (bits & ~names) | wp.int64(t)
+                if key < keys[row, column]:
+                    wp.atomic_min(keys, row, column, key)
+                if coverage.shape[0] > 0:
+                    wp.atomic_add(coverage, row, column, 1)
+
+
+@wp.kernel
+def _draw_small(
+    # in:
+    position: wp.array2d[float],
+    triangle: wp.array2d[int],
+    frame: Frame,
+    cull: int,
+    names: wp.int64,
+    small: int,
+    unit: wp.int64,
+    # out:
+    keys: wp.array2d[wp.int64],
+    coverage: wp.array2d[int],
+    queued: wp.array1d[wp.int64],
+    queue: wp.array1d[int],
+    starts: wp.array1d[wp.int64],
+):
+    """Draws what is small and queues the rest.
+
+    ``queued`` counts triangles in units and tiles below them, in one addition, so that the queue's starts rise.
+    """
+    t = wp.tid()
+    if not has_corners(triangle, t, position.shape[0]):
+        return
+    k = corners_of(position, triangle, t)
+    if finite(k):
+        box = box_of(k, frame)
+        across = box.right - box.left + 1
+        down = box.bottom - box.top + 1
+        if across > 0 and down > 0:
+            if across * down <= small:
+                _draw(k, t, box, frame, cull, names, keys, coverage)
+            else:
+                tiles = wp.int64((across + _TILE - 1) // _TILE) * wp.int64((down + _TILE - 1) // _TILE)
+                before = wp.atomic_add(queued, 0, unit + tiles)
+                place = int(before / unit)
+                queue[place] = t
+                starts[place] = before % unit
+
+
+@wp.kernel
+def _draw_tiles(
+    # in:
+    position: wp.array2d[float],
+    triangle: wp.array2d[int],
+    frame: Frame,
+    cull: int,
+    names: wp.int64,
+    unit: wp.int64,
+    sharers: int,
+    queued: wp.array1d[wp.int64],
+    queue: wp.array1d[int],
+    starts: wp.array1d[wp.int64],
+    # out:
+    keys: wp.array2d[wp.int64],
+    coverage: wp.array2d[int],
+):
+    item = wp.int64(wp.tid())
+    count = int(queued[0] / unit)
+    items = queued[0] % unit
+    while item < items:
+        low = int(0)
+        high = int(count)
+        while high - low > 1:
+            middle = (low + high) // 2
+            if starts[middle] <= item:
+                low = middle
+            else:
+                high = middle
+        t = queue[low]
+        k = corners_of(position, triangle, t)
+        box = box_of(k, frame)
+        tile = int(item - starts[low])
+        across = (box.right - box.left + _TILE) // _TILE
+        box.left = box.left + (tile % across) * _TILE
+        box.top = box.top + (tile // across) * _TILE
+        box.right = wp.min(box.right, box.left + _TILE - 1)
+        box.bottom = wp.min(box.bottom, box.top + _TILE - 1)
+        _draw(k, t, box, frame, cull, names, keys, coverage)
+        item += wp.int64(sharers)
+
+
+@wp.kernel
+def _resolve(
+    # in:
+    position: wp.array2d[float],
+    triangle: wp.array2d[int],
+    frame: Frame,
+    names: wp.int64,
+    keys: wp.array2d[wp.int64],
+    # out:
+    found: wp.array2d[int],
+    barycentric: wp.array2d[wp.vec2],
+    depth: wp.array2d[float],
+    derivative: wp.array2d[wp.vec4],
+):
+    row, column = wp.tid()
+    key = keys[row, column]
+    if key == _EMPTY:
+        found[row, column] = -1
+        barycentric[row, column] = wp.vec2()
+        depth[row, column] = 0.0
+        if derivative.shape[0] > 0:
+            derivative[row, column] = wp.vec4()
+        return
+    t = int(key & names)
+    k = corners_of(position, triangle, t)
+    f, f_x, f_y = at(k, frame, row, column)
+    total = total_of(f)
+    # Too small for float64 all over: any point of the triangle is as right.
+    u = _ONE / wp.float64(3.0)
+    v = u
+    scale = _ZERO
+    if total > _ZERO:
+        scale = _ONE / total
+        u = f[0] * scale
+        v = f[1] * scale
+    share = wp.vec3d(u, v, _ONE - u - v)
+    found[row, column] = t
+    barycentric[row, column] = wp.vec2(float(u), float(v))
+    depth[row, column] = float(wp.dot(share, k.z) / wp.dot(share, wp.vec3d(k.a[2], k.b[2], k.c[2])))
+    if derivative.shape[0] > 0:
+        step_x = _TWO * scale
+        step_y = wp.float64(frame.y_step) * scale
+        derivative[row, column] = wp.vec4(
+            float(step_x * (f_x[0] - u * total_of(f_x))),
+            float(step_y * (f_y[0] - u * total_of(f_y))),
+            float(step_x * (f_x[1] - v * total_of(f_x))),
+            float(step_y * (f_y[1] - v * total_of(f_y))),
+        )
+
+
+@dataclass(frozen=True)
+class Raster:
+    """What each pixel sees.
+
+    Attributes:
+        triangle: int [H, W], its number, -1: none.
+        barycentric: vec2 [H, W], the weights of the triangle's corners 0 and 1 at the point seen, in [0, 1], true in
+            space and not only on the screen; corner 2 has the rest. 0 where there is no triangle, as all below.
+        depth: float [H, W], z / w.
+        derivative: vec4 [H, W], how the weights change from pixel to pixel: du/dx, du/dy, dv/dx, dv/dy, for x to the
+            right and y down; None: not asked for.
+        coverage: int [H, W], how many triangles cover the pixel's centre, hidden ones too; None: not asked for.
+    """
+
+    triangle: Any
+    barycentric: Any
+    depth: Any
+    derivative: Any | None
+    coverage: Any | None
+
+
+class Rasterizer:
+    """Draws the same triangles many times. All buffers are made here: ``run`` may be captured in a CUDA graph.
+
+    Beside the result it holds 8 bytes a pixel and 12 a triangle: what a triangle is cut into is counted, not stored.
+
+    Args:
+        triangle: int [F, 3], numbers of corners.
+        height, width: Of the image, 1 to ``MOST_PIXELS``.
+        space: "clip" or "uv", see the module.
+        cull: Whether to leave out triangles that run clockwise: as seen on the screen in clip space, in a frame with v
+            up in UV space.
+        derivative, coverage: Whether to fill these of ``Raster``.
+        split: The most pixels in the box of a triangle that one thread draws; None: 64 on CUDA, no limit on the CPU.
+        empty: Makes a buffer, ``empty(shape, dtype=...)`` on the triangles' device; default Warp's.
+
+    Attributes:
+        raster: ``Raster``, what ``run`` fills.
+
+    Raises:
+        ValueError: A wrong argument, or so many triangles and pixels that their tiles can't be counted.
+    """
+
+    def __init__(
+        self,
+        triangle,
+        height: int,
+        width: int,
+        *,
+        space: str = "clip",
+        cull: bool = False,
+        derivative: bool = False,
+        coverage: bool = False,
+        split: int | None = None,
+        empty: Callable[..., Any] | None = None,
+    ) -> None:
+        if space not in SPACES:
+            raise ValueError(f"space: expected one of {', '.join(SPACES)}, got {space!r}")
+        if triangle.ndim != 2 or triangle.shape[1] != 3:
+            raise ValueError(f"triangle: expected [F, 3], got {tuple(triangle.shape)}")
+        device, count = triangle.device, triangle.shape[0]
+        empty = empty or (lambda shape, dtype: wp.empty(shape, dtype=dtype, device=device))
+        self._triangle = triangle
+        self._space = space
+        self._frame = frame(height, width, space)
+        self._cull = int(cull)
+        self._split = split if split is not None else MOST_PIXELS**2 if device.is_cpu else _SMALL
+        self._sharers = 1 if device.is_cpu else _SHARERS
+        bits = max(1, (count - 1).bit_length())
+        self._names = (1 << bits) - 1
+        self._unit = 1 << (62 - bits)
+        if max(1, count) * math.ceil(height / _TILE) * math.ceil(width / _TILE) >= self._unit:
+            raise ValueError(f"triangle: {count} are too many for {height} x {width} pixels")
+        size = (height, width)
+        none = empty((0, 0), dtype=int)
+        self._keys = empty(size, dtype=wp.int64)
+        self._queued = empty((1,), dtype=wp.int64)
+        self._queue = empty((count,), dtype=int)
+        self._starts = empty((count,), dtype=wp.int64)
+        self._slopes = empty(size if derivative else (0, 0), dtype=wp.vec4)
+        self._coverage = empty(size, dtype=int) if coverage else none
+        self.raster = Raster(
+            empty(size, dtype=int),
+            empty(size, dtype=wp.vec2),
+            empty(size, dtype=float),
+            self._slopes if derivative else None,
+            self._coverage if coverage else None,
+        )
+
+    def run(self, position) -> Raster:
+        """Draws.
+
+        Args:
+            position: float [V, 4], clip coordinates x, y, z, w; or in UV space float [V, 2], u and v.
+
+        Returns:
+            ``raster``, overwritten by the next run.
+
+        Raises:
+            ValueError: ``position`` isn't of the space's shape.
+        """
+        check_position(position, self._space)
+        device, count = self._triangle.device, self._triangle.shape[0]
+        self._keys.fill_(_EMPTY)
+        self._queued.zero_()
+        if self.raster.coverage is not None:
+            self._coverage.zero_()
+        shared = [position, self._triangle, self._frame]
+        rule = [self._cull, self._names]
+        work = [self._queued, self._queue, self._starts]
+        pixels = [self._keys, self._coverage]
+        inputs = [*shared, *rule, self._split, self._unit]
+        wp.launch(_draw_small, count, inputs=inputs, outputs=[*pixels, *work], device=device)
+        inputs = [*shared, *rule, self._unit, self._sharers, *work]
+        wp.launch(_draw_tiles, self._sharers, inputs=inputs, outputs=pixels, device=device)
+        r = self.raster
+        outputs = [r.triangle, r.barycentric, r.depth, self._slopes]
+        wp.launch(_resolve, self._keys.shape, inputs=[*shared, self._names, self._keys], outputs=outputs, device=device)
+        return r

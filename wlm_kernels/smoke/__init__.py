@@ -1,0 +1,1 @@
+"""Kernels of six-way images of smoke."""

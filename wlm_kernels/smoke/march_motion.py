@@ -1,0 +1,136 @@
+"""How smoke moves across the image: what is seen along a ray, and how far the air carried it between two frames.
+
+Units, sampling and cameras are those of ``marching``. What a ray sees of a step is what the step keeps of the light,
+T (1 - exp(-sigma h)): hidden smoke counts as little as it is seen. The air's velocities lie on a grid of their own over
+the same box, as ``advection`` has them: trilinear between cell centres, constant beyond the outermost. Smoke is traced
+back by the midpoint, as the solver carries it; the velocities are taken to be those of the later frame all the while.
+What came into the box since counts as having been where smoke at its border looks the same.
+"""
+
+import functools
+from typing import Any
+
+import warp as wp
+
+from wlm_kernels.smoke.march import Empty, View, absorbed, occupied, ray, size_of, skipping_at, steps_along
+
+__all__ = ["motion", "motion_kernel"]
+
+_OPTIONS = {"enable_backward": False}
+
+# Voxels from the box's faces: nearer to them a picture of the smoke fades.
+_BORDER = wp.constant(1.0)
+
+
+@wp.func
+def _velocity_at(velocity: wp.array3d[wp.vec3], p: wp.vec3) -> wp.vec3:
+    x = wp.clamp(p[0] - 0.5, 0.0, float(velocity.shape[0] - 1))
+    y = wp.clamp(p[1] - 0.5, 0.0, float(velocity.shape[1] - 1))
+    z = wp.clamp(p[2] - 0.5, 0.0, float(velocity.shape[2] - 1))
+    i = int(x)
+    j = int(y)
+    k = int(z)
+    # At the last cell its like has no weight.
+    i1 = wp.min(i + 1, velocity.shape[0] - 1)
+    j1 = wp.min(j + 1, velocity.shape[1] - 1)
+    k1 = wp.min(k + 1, velocity.shape[2] - 1)
+    fx = x - float(i)
+    fy = y - float(j)
+    fz = z - float(k)
+    near = wp.lerp(
+        wp.lerp(velocity[i, j, k], velocity[i, j, k1], fz), wp.lerp(velocity[i, j1, k], velocity[i, j1, k1], fz), fy
+    )
+    far = wp.lerp(
+        wp.lerp(velocity[i1, j, k], velocity[i1, j, k1], fz), wp.lerp(velocity[i1, j1, k], velocity[i1, j1, k1], fz), fy
+    )
+    return wp.lerp(near, far, fx)
+
+
+@functools.cache
+def motion_kernel(dtype: Any) -> wp.Kernel:
+    """Builds (once) the kernel for densities of a type, ``wp.float32`` or ``wp.float16``."""
+
+    @wp.kernel(module="unique", module_options=_OPTIONS)
+    def motion(
+        # in:
+        density: wp.array3d[dtype],
+        bricks: wp.array3d[wp.uint8],
+        extinction: float,
+        velocity: wp.array3d[wp.vec3],
+        reach: float,
+        view: View,
+        h: float,
+        cutoff: float,
+        least: float,
+        # out:
+        out: wp.array3d[float],
+    ):
+        row, column = wp.tid()
+        r = ray(view, row, column)
+        size = size_of(density)
+        cells = wp.vec3(float(velocity.shape[0]), float(velocity.shape[1]), float(velocity.shape[2]))
+        share = wp.cw_div(cells, size)
+        border = wp.vec3(_BORDER, _BORDER, _BORDER)
+        steps = steps_along(size, r.origin, r.direction, h)
+        moved = wp.vec3()
+        seen = float(0.0)
+        t = float(1.0)
+        for n in range(steps.count):
+            p = r.origin + (steps.first + (float(n) + 0.5) * steps.length) * r.direction
+            x = extinction * skipping_at(density, bricks, p) * steps.length
+            if x > 0.0:
+                middle = p - 0.5 * reach * _velocity_at(velocity, wp.cw_mul(share, p))
+                weight = t * absorbed(x)
+                begin = p - reach * _velocity_at(velocity, wp.cw_mul(share, middle))
+                begin = wp.min(wp.max(begin, wp.min(p, border)), wp.max(p, size - border))
+                moved += weight * (p - begin)
+                seen += weight
+                t *= wp.exp(-x)
+                if t < cutoff:
+                    break
+        across = float(0.0)
+        down = float(0.0)
+        if seen > least:
+            scale = 1.0 / (seen * view.pitch)
+            across = scale * wp.dot(moved, view.right)
+            down = -scale * wp.dot(moved, view.up)
+        out[0, row, column] = across
+        out[1, row, column] = down
+
+    return motion
+
+
+def motion(
+    density,
+    extinction: float,
+    velocity,
+    reach: float,
+    seen: View,
+    out,
+    *,
+    step: float = 2.0,
+    cutoff: float = 1e-3,
+    least: float = 1e-3,
+    empty: Empty | None = None,
+) -> None:
+    """By how many pixels what each pixel shows has moved since the frame before.
+
+    Args:
+        density: float or half [X, Y, Z], of the later frame.
+        extinction: Per voxel, of density 1.
+        velocity: vec3 [A, B, C], of the air over the same box, of any number of cells.
+        reach: Voxels that a velocity of 1 goes between the frames.
+        seen: An orthographic camera, [H, W] pixels, the same for both frames.
+        out: float [2, H, W], written: pixels to the right and down; 0 where there is no smoke.
+        step: The longest step, in voxels.
+        cutoff: A ray ends where less than this is left of its transparency.
+        least: The opacity up to which a pixel counts as one without smoke.
+        empty: As for ``marching.occupied``.
+
+    Raises:
+        ValueError: The camera is in perspective.
+    """
+    if seen.perspective:
+        raise ValueError("motion needs an orthographic camera, as the lightmaps do")
+    inputs = [density, occupied(density, empty), extinction, velocity, reach, seen, step, cutoff, least]
+    wp.launch(motion_kernel(density.dtype), out.shape[1:], inputs=inputs, outputs=[out], device=density.device)

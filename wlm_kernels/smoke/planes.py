@@ -1,0 +1,283 @@
+"""Planes of six lights before the network and behind it: the guide that it reads, and the lightmaps that it makes.
+
+Each is a pass over the image in place of some tens of small ones. ``encode_six`` makes the guide of what the coarse
+march finds, ``decode`` light of the planes that the network makes. ``kernels`` builds and caches, for a number type,
+what makes these planes of the outputs of the network's heads and of a filter of the guide, where smoke is near; sums
+are float32 whatever the type is. Nothing has a gradient: training is torch's.
+"""
+
+import functools
+from dataclasses import dataclass
+from typing import Any
+
+import warp as wp
+
+from wlm_kernels.smoke import march_coarse
+from wlm_kernels.smoke.naf_block import lane_sum
+
+__all__ = [
+    "FOOT",
+    "FOOT_CODE",
+    "LIGHTS",
+    "PLANES",
+    "STRIP",
+    "PlaneKernels",
+    "Taps",
+    "decode",
+    "encode_six",
+    "kernels",
+]
+
+LIGHTS = 6
+"""Planes of light, which come first; they may be above 1, the others may not."""
+
+PLANES = LIGHTS + 2
+"""That are made: the lights, opacity and emission."""
+
+STRIP = 4
+"""Pixels below each other that a thread of ``compose`` makes."""
+
+Taps = wp.types.vector(PLANES, wp.float32)
+"""What one pixel of one of the guide's planes adds to each plane."""
+
+FOOT, FOOT_CODE = 0.0031308, 0.04045
+"""Where sRGB's straight foot ends (IEC 61966-2-1), in linear light and encoded."""
+
+_OPTIONS = {"enable_backward": False}
+_BOUNDS = (256, 2)  # threads of a block and blocks at a time: without, registers for half as many
+_HALF_MAX = 65504.0
+_TRANSPARENCY, _EMISSION = (march_coarse.PLANES.index(name) for name in ("transparency", "emission"))
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    // Two wide loads: alone, the compiler can't know that they are aligned.
+    const float4* wide = reinterpret_cast<const float4*>(weights.data + i);
+    const float4 a = __ldg(wide), b = __ldg(wide + 1);
+    wp::vec_t<8, float> taps;
+    taps.c[0] = a.x; taps.c[1] = a.y; taps.c[2] = a.z; taps.c[3] = a.w;
+    taps.c[4] = b.x; taps.c[5] = b.y; taps.c[6] = b.z; taps.c[7] = b.w;
+    return taps;
+#else
+    return weights.data[i];
+#endif
+""")
+def _load(weights: wp.array1d[Taps], i: int) -> Taps:
+    """The weights at a place; they begin at a multiple of 16 bytes."""
+    ...
+
+
+@wp.func
+def _srgb(linear: float) -> float:
+    """Linear light to sRGB's curve, which goes on above 1; what is below 0 counts as 0."""
+    if linear <= FOOT:
+        return 12.92 * wp.max(linear, 0.0)
+    return 1.055 * wp.pow(linear, 1.0 / 2.4) - 0.055
+
+
+@wp.func
+def _linear(code: float) -> float:
+    """The inverse; what is below 0 counts as 0."""
+    if code <= FOOT_CODE:
+        return wp.max(code, 0.0) / 12.92
+    return wp.pow((code + 0.055) / 1.055, 2.4)
+
+
+@wp.func
+def _at_most_one(value: float) -> float:
+    """Not ``wp.min``, which would make a NaN 1."""
+    return wp.where(value > 1.0, 1.0, value)
+
+
+@wp.func
+def _at_least_zero(value: float) -> float:
+    """Not ``wp.max``, which would make a NaN 0."""
+    return wp.where(value < 0.0, 0.0, value)
+
+
+@wp.kernel(module="unique", module_options=_OPTIONS)
+def _encode_six(
+    # in:
+    planes: wp.array3d[float],
+    far: float,
+    length: float,
+    hot: bool,
+    # out:
+    out: wp.array3d[float],
+):
+    row, column = wp.tid()
+    for k in range(wp.static(LIGHTS)):
+        out[k, row, column] = _srgb(planes[k, row, column])
+    glow = float(0.0)
+    if hot:
+        glow = _at_least_zero(planes[wp.static(_EMISSION), row, column])
+    out[wp.static(LIGHTS), row, column] = _srgb(glow / (1.0 + glow))
+    out[wp.static(LIGHTS + 1), row, column] = 1.0 - planes[wp.static(_TRANSPARENCY), row, column]
+    depth = planes[wp.static(march_coarse.DEPTH), row, column]
+    share = _at_most_one(_at_least_zero((far - depth) / length))
+    out[wp.static(LIGHTS + 2), row, column] = share * float(depth > 0.0)
+
+
+def encode_six(planes: wp.array, near: float, far: float, hot: bool, out: wp.array) -> None:
+    """What the coarse march finds as the network reads it.
+
+    Args:
+        planes: float [9, H, W], of `marching_coarse.PLANES`.
+        near, far: Distances at which the smoke begins and ends, near < far.
+        hot: Whether the emission counts; otherwise it is 0.
+        out: float [9, H, W], is written: six lights in sRGB; emission e as e / (1 + e) in sRGB; opacity; depth as a
+            share of the span, 1 at its near end, 0 where none was found. A NaN stays one.
+    """
+    inputs = [planes, far, far - near, hot]
+    wp.launch(_encode_six, planes.shape[1:], inputs=inputs, outputs=[out], device=planes.device)
+
+
+@wp.kernel(module="unique", module_options=_OPTIONS)
+def _decode(
+    # in:
+    planes: wp.array3d[float],
+    # out:
+    out: wp.array3d[float],
+):
+    row, column = wp.tid()
+    for k in range(wp.static(LIGHTS)):
+        out[k, row, column] = _linear(planes[k, row, column])
+    opacity = planes[wp.static(LIGHTS), row, column]
+    out[wp.static(LIGHTS), row, column] = 1.0 - _at_most_one(_at_least_zero(opacity))
+    share = _linear(planes[wp.static(LIGHTS + 1), row, column])
+    most = wp.static(_HALF_MAX / (1.0 + _HALF_MAX))
+    out[wp.static(LIGHTS + 1), row, column] = wp.where(share > most, _HALF_MAX, share / (1.0 - share))
+
+
+def decode(planes: wp.array, out: wp.array) -> None:
+    """Light of planes.
+
+    Args:
+        planes: float [PLANES, H, W]: the lights and the emission e as e / (1 + e) in sRGB, the opacity before it.
+        out: float [PLANES, H, W], is written: six lights, transparency, emission up to the largest half float. What is
+            outside a plane's range is clamped to it; a NaN stays one.
+    """
+    wp.launch(_decode, planes.shape[1:], inputs=[planes], outputs=[out], device=planes.device)
+
+
+@dataclass(frozen=True)
+class PlaneKernels:
+    """The kernels of a number type T; the guide is T [C, H, W], its last planes opacity and depth.
+
+    Attributes:
+        lanes: L, threads of ``near`` that share a block.
+        near: [blocks L], of reach x reach pixels: whether there is smoke in them. In: the guide. Out: int
+            [ceil(H / reach), ceil(W / reach)], 0 or 1. A NaN is no smoke.
+        compose: [ceil(H / STRIP), W]: the planes, clamped to what each can be, and 0 where neither a block nor one of
+            its eight neighbours has smoke; elsewhere a NaN stays one. In: T [G, ceil(H / stem), ceil(W / stem), N] or
+            larger, N outputs of heads from each of G groups; the guide; weights Taps [c edge edge] of a filter of its
+            first c planes, from column to row within each, aligned to 16 bytes, with zeros outside the image; of
+            each plane the group and the first of its stem x stem outputs, int [PLANES, 2], or a group below 0 where
+            it isn't made and is 0; stem; ``near``. Out: float [PLANES, H, W].
+    """
+
+    lanes: int
+    near: wp.Kernel
+    compose: wp.Kernel
+
+
+@functools.cache
+def kernels(edge: int, reach: int, half: bool, cuda: bool) -> PlaneKernels:
+    """The kernels for half floats or float32, on a GPU or a CPU.
+
+    Args:
+        edge: Pixels along the edge of the filter, odd, at most 15.
+        reach: Pixels along the edge of a block, a power of 2 from STRIP to a warp's threads.
+        half: Whether T is half floats.
+        cuda: Whether for a GPU.
+
+    Raises:
+        ValueError: An edge or a reach that isn't one of those.
+    """
+    if edge not in range(1, 16, 2):
+        raise ValueError(f"edge: expected an odd number, at most 15, got {edge}")
+    if reach not in (4, 8, 16, 32):
+        raise ValueError(f"reach: expected 4, 8, 16 or 32, got {reach}")
+    number: Any = wp.float16 if half else wp.float32
+    # Neighbouring threads read neighbouring pixels. One thread a block would read its rows with a block's width between
+    # it and its neighbour; maxima by atomics would need another launch that sets them to 0.
+    count = reach if cuda else 1
+    column_type = wp.types.vector(STRIP + edge - 1, wp.float32)
+    sums = wp.types.matrix((STRIP, PLANES), wp.float32)
+    middle = edge // 2
+
+    @wp.kernel(module="unique", module_options=_OPTIONS)
+    def near(
+        # in:
+        guide: wp.array3d[number],
+        # out:
+        smoke: wp.array2d[int],
+    ):
+        t = wp.tid()
+        lane = t % wp.static(count)
+        i = t // wp.static(count) // smoke.shape[1]
+        j = t // wp.static(count) % smoke.shape[1]
+        opacity = guide.shape[0] - 2
+        found = float(0.0)
+        for y in range(wp.static(reach)):
+            # Past the image's end its last pixels again, which are of the same block.
+            row = wp.min(i * wp.static(reach) + y, guide.shape[1] - 1)
+            for x in range(wp.static(reach // count)):
+                column = wp.min(j * wp.static(reach) + x * wp.static(count) + lane, guide.shape[2] - 1)
+                found += float(float(guide[opacity, row, column]) > 0.0)
+        found = lane_sum(found, wp.static(count))
+        if lane == 0:
+            smoke[i, j] = int(found > 0.0)
+
+    @wp.kernel(module="unique", module_options=_OPTIONS, launch_bounds=_BOUNDS)
+    def compose(
+        # in:
+        heads: wp.array4d[number],
+        guide: wp.array3d[number],
+        weights: wp.array1d[Taps],
+        places: wp.array2d[int],
+        stem: int,
+        smoke: wp.array2d[int],
+        # out:
+        out: wp.array3d[float],
+    ):
+        strip, column = wp.tid()
+        row = strip * wp.static(STRIP)
+        # A block's rows are whole strips.
+        i = row // wp.static(reach)
+        j = column // wp.static(reach)
+        found = int(0)
+        for y in range(3):
+            for x in range(3):
+                found += smoke[wp.clamp(i + y - 1, 0, smoke.shape[0] - 1), wp.clamp(j + x - 1, 0, smoke.shape[1] - 1)]
+        total = sums()
+        if found > 0:
+            for c in range(weights.shape[0] // wp.static(edge * edge)):
+                for x in range(wp.static(edge)):
+                    q = column + x - wp.static(middle)
+                    across = q >= 0 and q < guide.shape[2]
+                    q = wp.clamp(q, 0, guide.shape[2] - 1)
+                    values = column_type()
+                    for y in range(wp.static(STRIP + edge - 1)):
+                        r = row + y - wp.static(middle)
+                        inside = across and r >= 0 and r < guide.shape[1]
+                        # Loaded in any case, not in a branch: all loads are under way at once.
+                        value = float(guide[c, wp.clamp(r, 0, guide.shape[1] - 1), q])
+                        values[y] = wp.where(inside, value, 0.0)
+                    for y in range(wp.static(edge)):
+                        here = wp.vec4(values[y], values[y + 1], values[y + 2], values[y + 3])
+                        # Each weight serves a strip: loading one takes as long as using it.
+                        total += wp.outer(here, _load(weights, (c * wp.static(edge) + x) * wp.static(edge) + y))
+        for k in range(wp.static(PLANES)):
+            group = places[k, 0]
+            for y in range(wp.static(STRIP)):
+                r = row + y
+                if r < out.shape[1]:
+                    made = float(0.0)
+                    if found > 0 and group >= 0:
+                        place = places[k, 1] + (r % stem) * stem + column % stem
+                        made = _at_least_zero(total[y, k] + float(heads[group, r // stem, column // stem, place]))
+                        made = wp.where(k < wp.static(LIGHTS), made, _at_most_one(made))
+                    out[k, r, column] = made
+
+    return PlaneKernels(count, near, compose)
