@@ -13,12 +13,12 @@ import warp as wp
 from wlm.fluid import shapes
 from wlm_kernels.fluid.lattice_solids import voxelise_mesh, voxelise_sphere
 
-__all__ = ["Mesh", "Obstacle", "Path", "Sphere", "box_mesh"]
+__all__ = ["Mesh", "Obstacle", "Sphere", "Trajectory", "box_mesh"]
 
 
 @dataclass(frozen=True, eq=False)
-class Path:
-    """Key positions over time, straight lines between them; at rest before the first and after the last.
+class Trajectory:
+    """Positions over time, linear between keys; at rest before the first key and after the last.
 
     Attributes:
         positions: float64 [K, 3], cells.
@@ -29,8 +29,8 @@ class Path:
     times: np.ndarray
 
     @classmethod
-    def of(cls, positions: Sequence, times: Sequence[float] = (0.0,)) -> "Path":
-        """Makes a path.
+    def of(cls, positions: Sequence, times: Sequence[float] = (0.0,)) -> "Trajectory":
+        """Makes a trajectory.
 
         Args:
             positions: [K, 3], or one position (3,) to stay at, cells.
@@ -71,7 +71,7 @@ class Sphere:
         radius: Cells, above 0.
     """
 
-    path: Path
+    path: Trajectory
     radius: float
 
     def __post_init__(self) -> None:
@@ -106,7 +106,7 @@ class Mesh:
         scale: Cells per unit.
     """
 
-    path: Path
+    path: Trajectory
     vertices: np.ndarray
     triangles: np.ndarray
     scale: float = 1.0
@@ -141,7 +141,7 @@ Obstacle = Sphere | Mesh
 """In cells and steps of the lattice."""
 
 
-def box_mesh(path: Path, size: Sequence[float]) -> Mesh:
+def box_mesh(path: Trajectory, size: Sequence[float]) -> Mesh:
     """A box with its edges along the axes.
 
     Args:

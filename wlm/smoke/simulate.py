@@ -256,7 +256,7 @@ def _obstacles(scene: Scene) -> list[bodies.Obstacle]:
     made: list[bodies.Obstacle] = []
     for obstacle in scene.obstacles:
         keys = np.array(obstacle.path)
-        path = bodies.Path.of((keys[:, 1:] - grid.origin) / grid.cell, keys[:, 0] / scene.step)
+        path = bodies.Trajectory.of((keys[:, 1:] - grid.origin) / grid.cell, keys[:, 0] / scene.step)
         if obstacle.shape == "sphere":
             made.append(bodies.Sphere(path, obstacle.radius / grid.cell))
         else:
