@@ -52,9 +52,9 @@ def test_npz(tmp_path: Path, device: str):
 def test_types():
     """Half stays half, all else is float; temperature follows the density."""
     values = np.ones((2, 2, 2))
-    for dtype, want in ((np.float16, torch.float16), (np.float64, torch.float32), (np.uint8, torch.float32)):
+    for dtype, expected in ((np.float16, torch.float16), (np.float64, torch.float32), (np.uint8, torch.float32)):
         volume = from_array(values.astype(dtype), temperature=values)
-        assert volume.density.dtype == volume.temperature.dtype == want
+        assert volume.density.dtype == volume.temperature.dtype == expected
     source = np.ones((2, 2, 2), np.float32)
     volume = from_array(source)
     source[:] = 5

@@ -1,23 +1,22 @@
 """A whole simulation: smoke in moving air, obstacles, checkpoints, and the hard cases."""
 
-from pathlib import Path as FilePath
+from pathlib import Path
 
 import numpy as np
 import pytest
 import warp as wp
 
 from wlm.errors import WlmError
-from wlm.fluid import solver_lattice
-from wlm.fluid.faces import FACES
+from wlm.fluid.faces import FACES, axis_ends
 from wlm.fluid.lattice import CHECK_EVERY, Lattice
-from wlm.fluid.obstacles import Mesh, Path, Sphere, box_mesh
-from wlm.fluid.solver import SCHEMES, Buoyancy, Solver, Source
+from wlm.fluid.obstacles import Mesh, Sphere, Trajectory, box_mesh
+from wlm.fluid.solver import SCHEMES, Buoyancy, Solver, Source, require_memory
 from wlm.formats.artifact import read_artifact, write_artifact
 from wlm_kernels.fluid.advection_places import CLOSED, OPEN, PERIODIC
 
 SHAPE = (20, 10, 10)
 NOZZLE = Source("box", (2, 5, 5), (1.5, 2.5, 2.5), 1.0, 0.5, fixed=True)
-MOVING = Sphere(Path.of([[9, 5, 5], [12, 5, 5]], [0, 60]), 2.0)
+MOVING = Sphere(Trajectory.of([[9, 5, 5], [12, 5, 5]], [0, 60]), 2.0)
 
 
 def _tunnel(device: str, shape=SHAPE, speed: float = 0.1, **settings) -> Lattice:
@@ -123,7 +122,7 @@ def test_hot_smoke_rises_and_heavy_smoke_falls(bricks: bool, device: str):
 
 def test_an_obstacle_over_the_inlet(device: str):
     """With all of it covered nothing comes in, neither air nor smoke."""
-    plug = box_mesh(Path.of((2, 5, 5)), (4.4, 12, 12))
+    plug = box_mesh(Trajectory.of((2, 5, 5)), (4.4, 12, 12))
     solver = _jet(device, obstacles=[plug])
     solver.step(20)
     np.testing.assert_array_equal(_numbers(solver), 0.0)
@@ -131,7 +130,7 @@ def test_an_obstacle_over_the_inlet(device: str):
 
 
 def test_an_obstacle_too_fast(device: str):
-    fast = Sphere(Path.of([[9, 5, 5], [19, 5, 5]], [10, 20]), 2.0)
+    fast = Sphere(Trajectory.of([[9, 5, 5], [19, 5, 5]], [10, 20]), 2.0)
     solver = _jet(device, obstacles=[fast])
     solver.step(5)
     with pytest.raises(WlmError, match="moves at 1 cells a step: expected at most 0.3"):
@@ -140,7 +139,7 @@ def test_an_obstacle_too_fast(device: str):
 
 def test_obstacles_cover_what_they_should(device: str):
     """A sphere and a box, each with a number of its own; and when both are over a cell, one of them has it."""
-    box = box_mesh(Path.of((14, 5, 5)), (4, 6, 2))
+    box = box_mesh(Trajectory.of((14, 5, 5)), (4, 6, 2))
     solver = _jet(device, obstacles=[MOVING, box])
     solver.step(1)
     solid = solver.solid.numpy()
@@ -151,13 +150,13 @@ def test_obstacles_cover_what_they_should(device: str):
 
 
 def test_paths():
-    path = Path.of([[0, 0, 0], [2, 0, 0], [2, 4, 0]], [10, 20, 30])
+    path = Trajectory.of([[0, 0, 0], [2, 0, 0], [2, 4, 0]], [10, 20, 30])
     for time, at in ((0, (0, 0, 0)), (15, (1, 0, 0)), (25, (2, 2, 0)), (99, (2, 4, 0))):
         np.testing.assert_allclose(path.at(time), at)
     for wrong in (
-        lambda: Path.of([[0, 0, 0], [1, 0, 0]], [1, 1]),
-        lambda: Path.of([0, 0, np.nan]),
-        lambda: Path.of([0, 0, 0], [0, 1]),
+        lambda: Trajectory.of([[0, 0, 0], [1, 0, 0]], [1, 1]),
+        lambda: Trajectory.of([0, 0, np.nan]),
+        lambda: Trajectory.of([0, 0, 0], [0, 1]),
         lambda: Sphere(path, 0.0),
         lambda: box_mesh(path, (1, 1, 0)),
         lambda: Mesh(path, np.zeros((3, 3)), np.array([[0, 1, 3]])),
@@ -172,7 +171,7 @@ def test_paths():
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)
-def test_a_checkpoint_goes_on_to_the_last_bit(scheme: str, device: str, tmp_path: FilePath):
+def test_a_checkpoint_goes_on_to_the_last_bit(scheme: str, device: str, tmp_path: Path):
     """Past the time when the obstacle comes to rest; with a step of an odd number."""
     first, second = (_jet(device, scheme=scheme) for _ in range(2))
     first.step(17)
@@ -185,7 +184,7 @@ def test_a_checkpoint_goes_on_to_the_last_bit(scheme: str, device: str, tmp_path
         np.testing.assert_array_equal(getattr(first, name).numpy(), getattr(second, name).numpy())
 
 
-def test_bricks_go_on_from_a_checkpoint(device: str, tmp_path: FilePath):
+def test_bricks_go_on_from_a_checkpoint(device: str, tmp_path: Path):
     """With a threshold of 0 to the last bit."""
     first, second = (_jet(device, bricks=True, threshold=0.0, storage="float16") for _ in range(2))
     first.step(11)
@@ -198,7 +197,7 @@ def test_bricks_go_on_from_a_checkpoint(device: str, tmp_path: FilePath):
 
 
 @pytest.mark.parametrize("before", [0, 5])
-def test_a_checkpoint_of_before_the_first_step(before: int, device: str, tmp_path: FilePath):
+def test_a_checkpoint_of_before_the_first_step(before: int, device: str, tmp_path: Path):
     """Of a solver whose obstacles aren't placed yet, into one whose obstacle has moved already too."""
     first, second = _jet(device), _jet(device)
     first.save(tmp_path / "state")
@@ -212,7 +211,7 @@ def test_a_checkpoint_of_before_the_first_step(before: int, device: str, tmp_pat
         np.testing.assert_array_equal(getattr(first, name).numpy(), getattr(second, name).numpy())
 
 
-def test_checkpoints_are_checked(device: str, tmp_path: FilePath):
+def test_checkpoints_are_checked(device: str, tmp_path: Path):
     solver, path = _jet(device), tmp_path / "state"
     solver.step(2)
     solver.save(path)
@@ -242,7 +241,7 @@ def test_checkpoints_are_checked(device: str, tmp_path: FilePath):
         solver.load(tmp_path / "nothing")
 
 
-def test_a_blow_up_stops_with_the_last_good_state(device: str, tmp_path: FilePath):
+def test_a_blow_up_stops_with_the_last_good_state(device: str, tmp_path: Path):
     """Ever hotter smoke drives the air beyond the speed of sound: named, soon, and the file is of before."""
     path = tmp_path / "good"
     source = Source("sphere", (5, 6, 5), (3, 3, 3), 0.1, 0.1)
@@ -279,7 +278,7 @@ def test_a_blow_up_stops_with_the_last_good_state(device: str, tmp_path: FilePat
 @pytest.mark.slow
 def test_five_thousand_steps_past_a_sphere(device: str):
     """At a viscosity of 1e-6 with the default operator: stable, and the air's mass stays within 0.1%."""
-    ball = Sphere(Path.of((10, 8, 8)), 3.0)
+    ball = Sphere(Trajectory.of((10, 8, 8)), 3.0)
     lattice = _tunnel(device, (32, 16, 16), viscosity=1e-6, ramp=128)
     source = Source("box", (2, 8, 8), (1.5, 4, 4), 1.0, fixed=True)
     solver = Solver(lattice, refinement=1, sources=[source], obstacles=[ball])
@@ -317,12 +316,12 @@ def test_too_large(device: str):
     with pytest.raises(WlmError, match="1600 x 1600 x 1600 cells: expected fewer than 2\\^31"):
         Solver(Lattice((8, 8, 8), viscosity=0.1, device=device), refinement=200)
     with pytest.raises(WlmError, match=r"100 x 100 x 100 cells need .* GiB on .*: expected at most"):
-        solver_lattice.require_memory((100, 100, 100), 10**9, wp.get_device(device))
+        require_memory((100, 100, 100), 10**9, wp.get_device(device))
 
 
 def test_faces_as_smoke_sees_them(device: str):
-    assert solver_lattice.ends(_tunnel(device)) == ((OPEN, OPEN), (CLOSED, CLOSED), (CLOSED, CLOSED))
-    assert solver_lattice.ends(Lattice((2, 2, 2), viscosity=0.1)) == ((PERIODIC, PERIODIC),) * 3
+    assert axis_ends(_tunnel(device).faces) == ((OPEN, OPEN), (CLOSED, CLOSED), (CLOSED, CLOSED))
+    assert axis_ends({}) == ((PERIODIC, PERIODIC),) * 3
 
 
 def test_wrong_arguments(device: str):
@@ -341,8 +340,6 @@ def test_wrong_arguments(device: str):
     ):
         with pytest.raises(ValueError, match=match):
             Solver(lattice, **settings)
-    with pytest.raises(ValueError, match="without bricks"):
-        Solver(Lattice((8, 8, 8), viscosity=0.1, bricks=True, device=device), buoyancy=Buoyancy(0.0, 1e-3))
     for wrong in (
         lambda: Source("cone", (1, 1, 1), (1, 1, 1), 1.0),
         lambda: Source("box", (1, 1, np.inf), (1, 1, 1), 1.0),
@@ -371,12 +368,9 @@ def test_a_frame_is_the_smoke_as_it_is(device: str):
 
 def test_steps_can_be_captured(device: str):
     """In a graph of the user's: the same smoke as by eager steps, counted too."""
-    at_rest = [Sphere(Path.of((9, 5, 5)), 2.0)]
     if device == "cpu":
-        solver = _jet(device)
-        solver.step(2 * solver.period)
-        assert solver.steps == 4
-        return
+        pytest.skip("graphs are CUDA's")
+    at_rest = [Sphere(Trajectory.of((9, 5, 5)), 2.0)]
     for bricks in (False, True):
         eager, graphed = (_jet(device, obstacles=at_rest, bricks=bricks) for _ in range(2))
         graphed.step(2)
