@@ -31,7 +31,7 @@ def _box(device: str, shape=SHAPE, inlet: bool = True, **settings) -> Lattice:
 
 
 @pytest.mark.parametrize("where", [(3, 2, 5), (11, 7, 7)])
-def test_not_a_number_is_found_and_named(where: tuple[int, int, int], device: str):
+def test_not_a_number_is_reported(where: tuple[int, int, int], device: str):
     box = _box(device)
     box.step(5)
     state = box.state()
@@ -46,7 +46,7 @@ def test_not_a_number_is_found_and_named(where: tuple[int, int, int], device: st
         box.check()
 
 
-def test_speed_and_density_are_found_and_named(device: str):
+def test_speed_and_density_are_reported(device: str):
     box = Lattice(SHAPE, viscosity=0.02, device=device)
     u = np.zeros((*SHAPE, 3))
     u[4, 3, 2] = (0.0, 0.7, 0.0)
@@ -62,7 +62,7 @@ def test_speed_and_density_are_found_and_named(device: str):
 
 
 def test_blow_up_stops_the_run_soon(device: str):
-    """BGK without eddies at next to no viscosity: the run ends within the steps between two looks."""
+    """BGK without eddies at a viscosity near 0: the run ends within the steps between two checks."""
     box = _box(device, viscosity=1e-6, operator="bgk", smagorinsky=0.0)
     rough = 0.1 * np.random.default_rng(1).uniform(-1, 1, (*SHAPE, 3))
     box.set_flow(rough)
@@ -77,7 +77,7 @@ def test_blow_up_stops_the_run_soon(device: str):
 
 
 def test_body_over_the_inlet(device: str):
-    """Air comes in where the inlet is open; with all of it covered nothing moves."""
+    """Air comes in where the inlet isn't covered; with all of it covered nothing moves."""
     covered = _box(device)
     mask = np.zeros(SHAPE, bool)
     mask[0] = True
@@ -127,7 +127,7 @@ def test_too_fast(device: str):
 
 
 def test_too_large_for_the_memory(device: str, monkeypatch: pytest.MonkeyPatch):
-    """What it needs and what there is, before anything is allocated."""
+    """The error names the memory needed and that available, before anything is allocated."""
     monkeypatch.setattr(module, "free_memory", lambda _device: 3 * 2**29)
     with pytest.raises(WlmError, match=r"256 x 256 x 256 cells need 2\.4 GiB on .*: expected at most the 1\.5 GiB"):
         Lattice((256, 256, 256), viscosity=0.02, device=device)
@@ -249,7 +249,7 @@ def test_states_are_checked(device: str):
 
 
 def test_a_body_that_moves_pushes_air(device: str):
-    """A sphere that is voxelised anew at every step: no holes, no pile of air, and a drag against its motion."""
+    """A sphere voxelised again at every step: no voids, no excess of air, and a drag against its motion."""
     shape = (40, 20, 20)
     box = _box(device, shape, inlet=False, viscosity=0.05)
     solid = wp.zeros(shape, dtype=wp.uint8, device=device)
@@ -270,12 +270,12 @@ def test_a_body_that_moves_pushes_air(device: str):
 
 
 def test_a_body_may_come_before_or_after_the_flow(device: str):
-    """What the air sent towards cells that become solid comes back from them at once."""
+    """Populations sent towards cells that become solid come back from them at once."""
     mask = np.zeros(SHAPE, np.uint8)
     mask[4:7, 3:6, 2:5], mask[9, 7, 7] = 1, 2
     motion = [(0.05, 0.0, 0.02), (0.0, 0.0, 0.0)]
     flow = 0.05 * np.random.default_rng(4).uniform(-1, 1, (*SHAPE, 3))
-    found = []
+    velocities = []
     for first in ("body", "flow"):
         box = Lattice(SHAPE, viscosity=0.02, device=device)
         if first == "body":
@@ -283,15 +283,14 @@ def test_a_body_may_come_before_or_after_the_flow(device: str):
         box.set_flow(flow)
         if first == "flow":
             box.set_solid(mask, motion)
-        found.append(box.velocity().numpy().copy())
+        velocities.append(box.velocity().numpy().copy())
         box.step(3)
-        found.append(box.velocity().numpy().copy())
-    np.testing.assert_array_equal(found[0], found[2])
-    np.testing.assert_array_equal(found[1], found[3])
+        velocities.append(box.velocity().numpy().copy())
+    np.testing.assert_array_equal(velocities[:2], velocities[2:])
 
 
-def test_freed_cells_take_after_their_neighbours(device: str):
-    """In a uniform wind a body that vanishes leaves just the wind; a cell with no fluid about it is at rest."""
+def test_freed_cells_get_the_mean_of_their_neighbours(device: str):
+    """In a uniform wind a body that vanishes leaves just the wind; a cell with no fluid around it is at rest."""
     wind = (0.04, -0.02, 0.01)
     box = Lattice(SHAPE, viscosity=0.02, device=device)
     box.set_flow(wind, 1.01)
@@ -301,7 +300,7 @@ def test_freed_cells_take_after_their_neighbours(device: str):
     box.set_solid(np.zeros_like(mask))
     np.testing.assert_allclose(box.velocity().numpy(), np.broadcast_to(wind, (*SHAPE, 3)), atol=1e-5)
     np.testing.assert_allclose(box.density(), 1.01, atol=1e-5)
-    # At a face what comes in from beyond it counts too, and isn't what the far side has.
+    # At a face the mean takes no cell of the far side.
     box = Lattice(SHAPE, viscosity=0.02, device=device)
     for face in FACES[:2]:
         box.set_wall(face, slip=True)
@@ -335,7 +334,7 @@ def test_a_rotor_turns_the_air(device: str):
     np.testing.assert_allclose(box.force_on_solid(), 0.0, atol=1e-4)
 
 
-# The rest.
+# Conversions, outputs, graphs.
 
 
 def test_domain_converts():

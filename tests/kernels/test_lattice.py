@@ -32,7 +32,7 @@ class Pair:
     ):
         settings = {"operator": "regularised", "smagorinsky": 0.17, "viscosity": VISCOSITY, **settings}
         self.shape = shape or _shape(lattice)
-        found = LATTICES[lattice]
+        velocities = LATTICES[lattice]
         self.how = {key: settings[key] for key in ("operator", "viscosity", "smagorinsky")}
         random = np.random.default_rng(3)
         self.u = 0.05 * random.uniform(-1, 1, (*self.shape, 3))
@@ -42,7 +42,7 @@ class Pair:
         solid = np.zeros(self.shape, int) if solid is None else solid
         self.done, self.ramp = 0, settings.get("ramp", 1)
         self.inlets = {name: np.array(value) for name, (kind, value) in dict(faces).items() if kind == "inlet"}
-        self.box = reference.Box(np.array(found.c), np.array(found.w), solid, dict(faces))
+        self.box = reference.Box(np.array(velocities.c), np.array(velocities.w), solid, dict(faces))
         self.force = np.zeros((*self.shape, 3)) if force is None else np.broadcast_to(force, (*self.shape, 3))
         self.device = Lattice(self.shape, lattice=lattice, device=device, **settings)
         for name, (kind, value) in dict(faces).items():
@@ -71,10 +71,10 @@ class Pair:
         self.f = reference.stream(self.box, left)
 
     def _inflow(self) -> None:
-        """Inlets rise with the steps done, and are what they should be after the ramp."""
-        gone = min(1.0, (self.done + 1) / self.ramp)
+        """Inlets rise smoothly with the steps done, to their velocity after the ramp."""
+        risen = min(1.0, (self.done + 1) / self.ramp)
         for name, velocity in self.inlets.items():
-            self.box.faces[name] = ("inlet", gone**2 * (3 - 2 * gone) * velocity)
+            self.box.faces[name] = ("inlet", risen**2 * (3 - 2 * risen) * velocity)
 
     def hold(self, tolerance: float) -> None:
         rho, u = reference.fields(self.box, self.f + (self.box.solid[..., None] > 0), self.force)
@@ -194,15 +194,15 @@ def test_solids_with_other_lattices(device: str):
 
 @pytest.mark.parametrize("lattice", LATTICES)
 def test_sixteen_bits(lattice: str, device: str):
-    """A shifted population keeps 11 bits of its deviation: some 1e-5 of the velocity's scale after a few steps."""
+    """A population keeps 11 bits of its deviation from rest: some 1e-5 of the velocity's scale after a few steps."""
     pair = Pair(lattice, device, storage="float16")
     _run(pair, HALF_TOLERANCE)
     with pytest.raises(AssertionError):
         pair.hold(TOLERANCE / 10)
 
 
-def test_places_of_64_bits(device: str, monkeypatch: pytest.MonkeyPatch):
-    """What a domain of more populations than 32 bits count runs; and the flag is what decides it."""
+def test_indices_of_64_bits(device: str, monkeypatch: pytest.MonkeyPatch):
+    """The indices of a domain of more populations than 32 bits count, in a small one."""
     closed = {face: ("wall", np.zeros(3)) for face in ("-y", "+y")}
     short = Pair("D3Q19", device, closed)
     assert not short.device._engine.spec.wide
@@ -233,22 +233,22 @@ def test_spec_is_checked():
     assert step_kernel(Spec("D2Q9")) is step_kernel(Spec("D2Q9")), "a kernel is built once"
 
 
-def test_trouble_of_gives_back_what_a_key_holds():
+def test_trouble_of_decodes_a_key():
     for step, cell, code in itertools.product((0, 7, 10**8), (0, 12345, 2**31 - 1), range(3)):
         assert trouble_of((step * 2**31 + cell) * 4 + code) == (step, cell, CAUSES[code])
 
 
 def test_sphere_voxels(device: str):
-    """Volume, and what the body left is free again while another body stays."""
+    """Its volume; cells that it leaves are free again, and those of another body stay."""
     solid = wp.zeros((24, 20, 22), dtype=wp.uint8, device=device)
     voxelise_sphere(solid, 2, (18.0, 10.0, 11.0), 3.0)
-    others = (solid.numpy() == 2).sum()
+    cells = (solid.numpy() == 2).sum()
     voxelise_sphere(solid, 1, (8.0, 10.0, 11.0), 6.0)
     assert (solid.numpy() == 1).sum() == pytest.approx(4 / 3 * np.pi * 6**3, rel=0.03)
     voxelise_sphere(solid, 1, (9.5, 10.0, 11.0), 2.0)
     places = np.argwhere(solid.numpy() == 1) + 0.5
     np.testing.assert_allclose(places.mean(0), (9.5, 10.0, 11.0), atol=0.1)
-    assert (solid.numpy() == 2).sum() == others
+    assert (solid.numpy() == 2).sum() == cells
 
 
 def test_mesh_voxels(device: str):
