@@ -11,13 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from builders.running import call, fails
 from builders.small_sets import HOURS, moving_light, tiny_profile
 from PIL import Image
-from typer.testing import CliRunner
 
 import wlm
 import wlm.cli.lightmap
-from wlm.cli import app
 from wlm.formats.exr import read_exr, write_exr
 from wlm.lightmap import codec, fit
 from wlm.lightmap.data import load_set
@@ -25,25 +24,6 @@ from wlm.lightmap.decode import Decoder
 from wlm.lightmap.evaluation import evaluate
 
 ROOT = Path(__file__).resolve().parents[2]
-
-
-def call(*words, code=0):
-    """Runs the command in this process; what it printed to stdout."""
-    result = CliRunner().invoke(app, [str(word) for word in words])
-    if result.exception is not None and not isinstance(result.exception, SystemExit):
-        raise result.exception
-    assert result.exit_code == code, result.output
-    assert "\x1b" not in result.output, "no control codes where there is no terminal"
-    call.stderr = result.stderr
-    return result.stdout
-
-
-def fails(*words):
-    """Runs a command that must end with one line and exit code 2; the line."""
-    assert call(*words, code=2) == ""
-    lines = call.stderr.splitlines()
-    assert len(lines) == 1 and lines[0].startswith("error: "), call.stderr
-    return lines[0]
 
 
 def spawn(*words, code="from wlm.cli import main\nmain()", **options):
