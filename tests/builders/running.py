@@ -1,8 +1,14 @@
 """Running the command line in this process."""
 
+import os
+import signal
+from contextlib import contextmanager
+
 from typer.testing import CliRunner
 
+import wlm.cli.console
 from wlm.cli import app
+from wlm.system import Meter
 
 
 def call(*words, code=0):
@@ -22,3 +28,19 @@ def fails(*words):
     lines = call.stderr.splitlines()
     assert len(lines) == 1 and lines[0].startswith("error: "), call.stderr
     return lines[0]
+
+
+def report_always(monkeypatch):
+    """Makes long work report whenever it could, not twice a second."""
+    monkeypatch.setattr(Meter, "due", lambda self, done: True)
+
+
+def press_ctrl_c(monkeypatch):
+    """Makes every report of progress of a command come with a Ctrl-C."""
+
+    @contextmanager
+    def bar(what):
+        yield lambda done, total, text: os.kill(os.getpid(), signal.SIGINT)
+
+    report_always(monkeypatch)
+    monkeypatch.setattr(wlm.cli.console, "progress_bar", bar)
