@@ -65,9 +65,8 @@ def test_set_json_and_its_folder_are_read_alike(tmp_path):
         assert (lightmaps.name, lightmaps.period, lightmaps.warnings) == ("tiny", 24.0, ())
         np.testing.assert_array_equal(lightmaps.frames, frames)
         np.testing.assert_array_equal(lightmaps.times, TIMES)
-        assert (
-            lightmaps.frames.dtype == np.float32 and lightmaps.times.dtype == np.float64 and lightmaps.mask.dtype == bool
-        )
+        types = lightmaps.frames.dtype, lightmaps.times.dtype, lightmaps.mask.dtype
+        assert types == (np.float32, np.float64, bool)
         assert lightmaps.mask.all() and lightmaps.mask.shape == (HEIGHT, WIDTH)
 
 
