@@ -11,7 +11,7 @@ from reference import temporal as reference
 
 from kernels.compare import array, close, exact
 from kernels.stepping import TILE, Case, draw, trainer
-from wlm.formats.bc7 import decode_image, pack_mode6
+from wlm.formats.bc7 import decode_image
 from wlm.lightmap.decode import Decoder, TimeTable
 from wlm.lightmap.model import LightmapModel
 from wlm.lightmap.runtime import StripDecoder
@@ -126,30 +126,21 @@ def test_strip_against_exact(device: str, hidden: int, gelu: str):
     _hold_strip(_model(hidden, gelu), device, STORED + BETWEEN)
 
 
-def _in_blocks(index: np.ndarray) -> np.ndarray:
-    """Texels [S, H, W] as [S, H/4, W/4, 16]."""
-    s, h, w = index.shape
-    return index.reshape(s, h // 4, 4, w // 4, 4).transpose(0, 1, 3, 2, 4).reshape(s, h // 4, w // 4, 16)
-
-
 def _stored(fit, case: Case) -> LightmapModel:
-    """A trainer's tiles as the file holds them, with scales of their own."""
+    """A trainer's tiles as the file holds them, with random scales."""
     parts, n = fit.quantised(), fit.tiles
     kind = TileKind.DYNAMIC if case.temporal else TileKind.STATIC
     base = random_model([int(kind)] * n, columns=n, times=tuple(fit.axis.times), hidden=case.hidden)
     random = np.random.default_rng(1)
-    fields = {"uv": pack_mode6(parts["uv_endpoints"], _in_blocks(parts["uv_index"]))}
-    fields["net" if case.temporal else "net_static"] = parts["net"]
-    if case.temporal:
-        uvt = pack_mode6(parts["uvt_endpoints"], _in_blocks(parts["uvt_index"]))
-        fields |= {"uvt": uvt.reshape(n, -1, *uvt.shape[1:]), "ut": parts["ut"], "vt": parts["vt"]}
+    if not case.temporal:
+        parts["net_static"] = parts.pop("net")
     return dataclasses.replace(
         base,
         profile=fit.profile,
         period=fit.axis.period,
         scale=random.integers(143, 148, base.scale.shape, np.uint8),
         peak=random.integers(149, 153, base.peak.shape, np.uint8),
-        **fields,
+        **parts,
     )
 
 

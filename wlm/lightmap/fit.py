@@ -9,7 +9,6 @@ import numpy as np
 
 from wlm import interop
 from wlm.errors import WlmError
-from wlm.formats.bc7 import pack_mode6
 from wlm.formats.checkpoint import Checkpoint
 from wlm.lightmap.data import LightmapSet
 from wlm.lightmap.model import LightmapModel, Profile, encode_scale, part_table
@@ -66,7 +65,7 @@ def compress(
             del targets
             try:
                 _run(trainer, number, meter, checkpoint)
-                parts = _stored(trainer)
+                parts = trainer.quantised()
             finally:
                 trainer.close()
             if checkpoint is not None:
@@ -251,22 +250,3 @@ def _run(trainer: Trainer, number: int, meter: Meter, checkpoint: Checkpoint | N
             f"tile {trainer.numbers[diverged][0]}: the fit diverged; expected a smaller map_rate or net_rate than "
             f"{trainer.profile.name}'s"
         )
-
-
-def _stored(trainer: Trainer) -> dict[str, np.ndarray]:
-    """The parts of a batch as the file holds them, ``net`` also of static tiles."""
-    parts = trainer.quantised()
-
-    def blocks(name: str) -> np.ndarray:
-        index = parts[f"{name}_index"]
-        s, h, w = index.shape
-        # Texels [S, H, W] -> blocks [S, H/4, W/4, 16], row-major in the block.
-        index = index.reshape(s, h // 4, 4, w // 4, 4).swapaxes(2, 3).reshape(s, h // 4, w // 4, 16)
-        return pack_mode6(parts[f"{name}_endpoints"], index)
-
-    result = {"uv": blocks("uv"), "net": parts["net"]}
-    if trainer.temporal:
-        uvt = blocks("uvt")
-        uvt = uvt.reshape(-1, trainer.profile.uvt_slices, *uvt.shape[1:])
-        result |= {"uvt": uvt, "ut": parts["ut"], "vt": parts["vt"]}
-    return result

@@ -9,8 +9,8 @@ import torch
 import warp as wp
 
 from wlm import interop
+from wlm.formats.bc7 import pack_mode6
 from wlm.lightmap.model import TILE, Profile, TimeAxis, encode_time
-from wlm_kernels import mlp
 from wlm_kernels.lightmap import blocks, features, gather
 from wlm_kernels.lightmap import step as lightmap_step
 from wlm_kernels.lightmap.gather import gather_maps, gather_net
@@ -377,28 +377,33 @@ class Trainer:
         return float((-10.0 * torch.log10(mean.clamp_min(1e-12))).mean())
 
     def quantised(self) -> dict[str, np.ndarray]:
-        """The maps and networks as stored.
+        """The maps and networks as the file holds them.
 
         Returns:
-            ``uv_endpoints`` uint8 [N, 32, 32, 2, 4] and ``uv_index`` uint8 [N, 128, 128], the same for ``uvt`` with
-            [N * S, ...]; ``ut``, ``vt`` uint8; ``net`` float16 [N, P].
+            ``net`` and ``uv``, of dynamic tiles also ``uvt``, ``ut`` and ``vt``, as ``LightmapModel`` has them; ``net``
+            is ``net_static`` of static tiles.
         """
-        result = {}
-        with interop.stream(self.device):
-            for key in ("uv", "uvt") if self.temporal else ("uv",):
-                endpoints, weights = (getattr(self._maps, f"{key}_{name}") for name in ("endpoints", "weights"))
-                bytes_out = wp.empty(endpoints.shape, dtype=wp.vec4ub, device=self.device)
-                index_out = wp.empty(weights.shape, dtype=wp.uint8, device=self.device)
-                blocks.quantise(endpoints, weights, bytes_out, index_out)
-                result[f"{key}_endpoints"], result[f"{key}_index"] = bytes_out, index_out
-        result = {key: value.numpy() for key, value in result.items()}
-        for key in ("ut", "vt") if self.temporal else ():
-            plane = np.clip(self.views[key].cpu().numpy(), 0.0, 1.0)
-            result[key] = np.floor(plane * np.float32(255.0) + np.float32(0.5)).astype(np.uint8)
         net = torch.cat([self.hidden.detach().flatten(1), self.output.detach().flatten(1)], 1)
-        result["net"] = net.cpu().numpy().astype(np.float16)
-        assert result["net"].shape[1] == mlp.parameter_count(self.inputs, self.profile.hidden)
+        result = {"net": net.cpu().numpy().astype(np.float16), "uv": self._blocks("uv")}
+        if self.temporal:
+            uvt = self._blocks("uvt")
+            result["uvt"] = uvt.reshape(self.tiles, -1, *uvt.shape[1:])
+            for key in ("ut", "vt"):
+                plane = np.clip(self.views[key].cpu().numpy(), 0.0, 1.0)
+                result[key] = np.floor(plane * np.float32(255.0) + np.float32(0.5)).astype(np.uint8)
         return result
+
+    def _blocks(self, name: str) -> np.ndarray:
+        """A map as BC7 blocks, uint8 [S, H/4, W/4, 16]."""
+        endpoints, weights = (getattr(self._maps, f"{name}_{part}") for part in ("endpoints", "weights"))
+        with interop.stream(self.device):
+            levels = wp.empty(endpoints.shape, dtype=wp.vec4ub, device=self.device)
+            index = wp.empty(weights.shape, dtype=wp.uint8, device=self.device)
+            blocks.quantise(endpoints, weights, levels, index)
+        s, h, w = index.shape
+        # Texels [S, H, W] -> blocks [S, H/4, W/4, 16], row-major in the block.
+        index = index.numpy().reshape(s, h // 4, 4, w // 4, 4).swapaxes(2, 3).reshape(s, h // 4, w // 4, 16)
+        return pack_mode6(levels.numpy(), index)
 
     def _adams(self) -> tuple[tuple[str, torch.optim.Adam], ...]:
         return ("adam_maps", self._adam_maps), ("adam_net", self._adam_net)

@@ -102,6 +102,12 @@ def finish_colour(time: TimeState, n: int, y: wp.vec3) -> wp.vec3:
 
 
 @wp.func
+def finish_radiance(time: TimeState, n: int, y: wp.vec3) -> wp.vec3:
+    c = finish_colour(time, n, y)
+    return wp.vec3(wp.pow(c[0], time.gamma), wp.pow(c[1], time.gamma), wp.pow(c[2], time.gamma))
+
+
+@wp.func
 def finish_byte(c: float, inverse_peak: float) -> wp.uint8:
     return wp.uint8(int(wp.clamp(c * inverse_peak, 0.0, 1.0) * 255.0 + 0.5))
 
@@ -164,42 +170,26 @@ def exact_kernels(temporal: bool, hidden: int, gelu: str) -> tuple[Any, Any]:
             f[c] = (f[c] + 0.0 - 0.5) * CENTRE
         return third(output, n, act(second(hidden, n, act(first(hidden, n, f)))))
 
-    options = {"enable_backward": False}
+    def decode_kernel(dtype: Any, finish: Any) -> wp.Kernel:
+        @wp.kernel(module="unique", module_options={"enable_backward": False})
+        def decode(
+            # in:
+            stored: Stored,
+            hidden: wp.array2d[vec_hidden],
+            output: wp.array2d[wp.vec3],
+            time: TimeState,
+            places: wp.array1d[int],
+            tiles: wp.array1d[int],
+            # out:
+            out: wp.array3d[dtype],
+        ):
+            i, y, x = wp.tid()
+            n = tiles[i]
+            out[i, y, x] = finish(time, places[n], network_output(stored, hidden, output, time, n, y, x))
 
-    @wp.kernel(module="unique", module_options=options)
-    def radiance(
-        # in:
-        stored: Stored,
-        hidden: wp.array2d[vec_hidden],
-        output: wp.array2d[wp.vec3],
-        time: TimeState,
-        places: wp.array1d[int],
-        tiles: wp.array1d[int],
-        # out:
-        out: wp.array3d[wp.vec3],
-    ):
-        i, y, x = wp.tid()
-        n = tiles[i]
-        c = finish_colour(time, places[n], network_output(stored, hidden, output, time, n, y, x))
-        out[i, y, x] = wp.vec3(wp.pow(c[0], time.gamma), wp.pow(c[1], time.gamma), wp.pow(c[2], time.gamma))
+        return decode
 
-    @wp.kernel(module="unique", module_options=options)
-    def bytes_(
-        # in:
-        stored: Stored,
-        hidden: wp.array2d[vec_hidden],
-        output: wp.array2d[wp.vec3],
-        time: TimeState,
-        places: wp.array1d[int],
-        tiles: wp.array1d[int],
-        # out:
-        out: wp.array3d[wp.vec4ub],
-    ):
-        i, y, x = wp.tid()
-        n = tiles[i]
-        out[i, y, x] = finish_bytes(time, places[n], network_output(stored, hidden, output, time, n, y, x))
-
-    return radiance, bytes_
+    return decode_kernel(wp.vec3, finish_radiance), decode_kernel(wp.vec4ub, finish_bytes)
 
 
 @wp.kernel(enable_backward=False)

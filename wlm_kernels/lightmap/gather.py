@@ -8,6 +8,17 @@ import warp as wp
 __all__ = ["gather_maps", "gather_net"]
 
 
+@wp.func
+def drain(partial: wp.array2d[float], i: int, clear: int) -> float:
+    """The sum of column i, which is cleared if ``clear`` isn't 0."""
+    s = float(0.0)
+    for p in range(partial.shape[0]):
+        s += partial[p, i]
+        if clear != 0:
+            partial[p, i] = 0.0
+    return s
+
+
 @wp.kernel(enable_backward=False)
 def _gather_maps_cpu(
     # in and out:
@@ -18,11 +29,7 @@ def _gather_maps_cpu(
     grad: wp.array1d[float],
 ):
     i = base + wp.tid()
-    s = float(0.0)
-    for lane in range(acc.shape[0]):
-        s += acc[lane, i]
-        acc[lane, i] = 0.0
-    grad[i] = s
+    grad[i] = drain(acc, i, 1)
     parameters[i] = wp.clamp(parameters[i], 0.0, 1.0)
 
 
@@ -57,27 +64,12 @@ def _gather_net(
     rates: wp.array1d[float],
 ):
     i = wp.tid()
-    parts = partial.shape[0]
     if i < grad.shape[0]:
-        s = float(0.0)
-        for p in range(parts):
-            s += partial[p, i]
-            if clear != 0:
-                partial[p, i] = 0.0
-        grad[i] = s
+        grad[i] = drain(partial, i, clear)
     if i < grad_out.shape[0]:
-        s = float(0.0)
-        for p in range(parts):
-            s += partial_out[p, i]
-            if clear != 0:
-                partial_out[p, i] = 0.0
-        grad_out[i] = s
+        grad_out[i] = drain(partial_out, i, clear)
     if i < mean_loss.shape[0]:
-        s = float(0.0)
-        for p in range(parts):
-            s += loss[p, i]
-            if clear != 0:
-                loss[p, i] = 0.0
+        s = drain(loss, i, clear)
         mean_loss[i] = mean_loss[i] + (s - mean_loss[i]) * 0.02  # a running mean over about 50 steps
     if i == 0:
         share = schedule[wp.min(control[0], schedule.shape[0] - 1)]
