@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from builders.running import call, fails
 from builders.smoke_plumes import SCENE, SPHERE, plume, write_frames
 from PIL import Image
-from test_cli import call, fails
 
 import wlm.smoke.simulate
 from wlm.errors import WlmError

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from builders.running import call, fails
 from builders.smoke_plumes import plume, write_frames
-from test_cli import call, fails
 
 from wlm.fluid.volume import save_volume
 from wlm.formats.artifact import read_artifact
