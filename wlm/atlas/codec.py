@@ -99,7 +99,7 @@ def _checked(artifact: Artifact) -> tuple[dict[str, Any], tuple[int, int], dict[
         The fields of ``AtlasModel`` but for its arrays; rows and columns of T_p; and the parts.
     """
     settings = artifact.settings
-    profile = check_settings(Profile, settings["profile"], "profile.")
+    profile = check_settings(Profile, settings["profile"], "profile: ")
     method, stored = settings["method"], settings["colour"]
     if method not in _METHODS or stored not in COLOUR_BITS:
         raise ValueError(f"method {method!r} with colour {stored!r}")

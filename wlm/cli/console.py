@@ -172,14 +172,14 @@ def progress_bar(what: str) -> Iterator[Callable[[int, int, str], None]]:
     console = _console(stderr=True)
     start = time.perf_counter()
     if not console.is_terminal:
-        shown = 0
+        reported = 0
 
         def line(done: int, total: int, text: str) -> None:
-            nonlocal shown
+            nonlocal reported
             if not done and not total:
                 note(what)
-            if (part := done * _PLAIN_REPORTS // max(total, 1)) > shown:
-                shown = part
+            if (part := done * _PLAIN_REPORTS // max(total, 1)) > reported:
+                reported = part
                 note(f"{what}: {done} of {total}{text and ', '}{text}, {_left(start, done, total)}")
 
         yield line
