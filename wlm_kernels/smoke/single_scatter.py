@@ -28,9 +28,9 @@ wp.set_module_options({"enable_backward": False})
 # A length that is a whole number of steps mustn't be cut into one more by rounding.
 _SLACK = 1.0001
 
-# exp(-100) is 0 in float32. Depths end there: the adjoint subtracts what was added, and a sum of thousands, of which
+# exp(-104) is 0 in float32. Depths end there: the adjoint subtracts what was added, and a sum of thousands, of which
 # nothing is seen, would leave it no digits of what is.
-_OPAQUE = wp.constant(100.0)
+_OPAQUE = wp.constant(104.0)
 
 
 @wp.struct
