@@ -19,8 +19,8 @@ import numpy as np
 from wlm.atlas import codec
 from wlm.atlas.data import LightmappedMesh, load_mesh
 from wlm.atlas.decode import Decoder
-from wlm.atlas.evaluate import Report, evaluate
-from wlm.atlas.export import MODEL_FILE, disk_ratio, export
+from wlm.atlas.evaluation import Report, evaluate
+from wlm.atlas.exporter import MODEL_FILE, disk_ratio, export
 from wlm.atlas.fit import compress
 from wlm.atlas.model import AtlasModel, Profile, load_profile
 from wlm.atlas.views import View

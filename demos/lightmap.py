@@ -24,7 +24,7 @@ from wlm.interop import check_device
 from wlm.lightmap import codec
 from wlm.lightmap.data import LightmapSet, load_set
 from wlm.lightmap.decode import Decoder
-from wlm.lightmap.evaluate import Report, evaluate
+from wlm.lightmap.evaluation import Report, evaluate
 from wlm.lightmap.fit import compress
 from wlm.lightmap.model import Profile, load_profile
 from wlm.view.sheet import before_after_error

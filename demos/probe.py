@@ -21,7 +21,7 @@ from wlm.interop import check_device
 from wlm.probe import codec
 from wlm.probe.data import load_probes, save_probes
 from wlm.probe.decode import Decoder
-from wlm.probe.evaluate import evaluate
+from wlm.probe.evaluation import evaluate
 from wlm.probe.fit import compress
 from wlm.probe.model import Profile, load_profile
 from wlm.probe.volume import Volume

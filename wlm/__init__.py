@@ -1,5 +1,24 @@
-"""Compressed precomputed lighting on NVIDIA Warp kernels."""
+"""Compressed precomputed lighting on NVIDIA Warp kernels.
 
-__all__ = ["__version__"]
+    import wlm
+
+    day = wlm.lightmap.load("demos/data/city")
+    model = wlm.lightmap.compress(day, "M")
+    model.save("city.wlm")
+    frame = wlm.load("city.wlm").decoder("cpu").frame(18.5)
+
+``wlm.lightmap``, ``wlm.atlas``, ``wlm.probe`` and ``wlm.smoke`` have the same verbs; ``wlm.fluid`` simulates what smoke
+is seen of; ``wlm.ops`` has the kernels as differentiable torch operations. ``load`` reads any file of theirs.
+"""
+
+from wlm._facade import facade
+
+__all__ = ["WlmError", "__version__", "atlas", "fluid", "lightmap", "load", "ops", "probe", "smoke"]
 
 __version__ = "0.1.0"
+
+_PACKAGES = ("atlas", "fluid", "lightmap", "ops", "probe", "smoke")
+
+__getattr__, __dir__ = facade(
+    __name__, {name: f"wlm.{name}" for name in _PACKAGES} | {"WlmError": "wlm.errors", "load": "wlm.system"}
+)

@@ -13,7 +13,7 @@ from pydantic import BaseModel, ValidationError
 
 from wlm.errors import WlmError, one_line
 
-__all__ = ["load_settings", "profile_names", "profile_path"]
+__all__ = ["check_settings", "load_settings", "profile_names", "profile_path"]
 
 _Settings = TypeVar("_Settings", bound=BaseModel)
 
@@ -47,17 +47,34 @@ def load_settings(cls: type[_Settings], path: str | os.PathLike[str]) -> _Settin
         raise WlmError(f"{path}: expected a mapping of settings, found an empty file")
     if not isinstance(values, dict):
         raise WlmError(f"{path}: expected a mapping of settings, found {_shown(values)}")
+    return check_settings(cls, values, f"{path}: ")
+
+
+def check_settings(cls: type[_Settings], values: Any, prefix: str = "") -> _Settings:
+    """Checks a mapping of settings. Unknown keys are errors, whatever the model's own policy.
+
+    Args:
+        cls: The pydantic model.
+        values: A mapping of its fields, plain values.
+        prefix: Text before the field's name in an error: ``"scene.yaml: "``, ``"--"`` or ``"file: profile."``.
+
+    Returns:
+        The checked settings.
+
+    Raises:
+        WlmError: One line with the field, what was expected and what was found; the first of several problems.
+    """
     try:
         return cls.model_validate(values, extra="forbid")
     except ValidationError as error:
-        raise WlmError(f"{path}: {_first_problem(cls, error)}") from error
+        raise WlmError(f"{prefix}{_first_problem(cls, error)}") from error
 
 
 def profile_path(system: str, name: str) -> Path:
     """Finds a profile, `configs/<system>-<name>.yaml`, in a checkout or in the installed package.
 
     Args:
-        system: `lightmap`, `atlas`, `probe` or `smoke`.
+        system: ``lightmap``, ``atlas``, ``probe`` or ``smoke-network``.
         name: The profile's name, `M` for example.
 
     Returns:
@@ -66,21 +83,21 @@ def profile_path(system: str, name: str) -> Path:
     Raises:
         WlmError: There is no such profile; the line lists those that there are.
     """
-    wanted = f"{system}-{name}.yaml"
+    file_name = f"{system}-{name}.yaml"
     for folder in _profile_folders():
         # Compared with the listing, not joined: a name such as `../x` can't leave the folder.
         for candidate in folder.glob("*.yaml"):
-            if candidate.name == wanted:
+            if candidate.name == file_name:
                 return candidate
-    known = ", ".join(profile_names(system)) or "none"
-    raise WlmError(f"profile '{name}' of {system}: expected one of the known profiles: {known}")
+    names = ", ".join(profile_names(system)) or "none"
+    raise WlmError(f"profile '{name}' of {system}: expected one of the known profiles: {names}")
 
 
 def profile_names(system: str) -> list[str]:
     """Lists the profiles of a system, sorted.
 
     Args:
-        system: `lightmap`, `atlas`, `probe` or `smoke`.
+        system: ``lightmap``, ``atlas``, ``probe`` or ``smoke-network``.
     """
     prefix = f"{system}-"
     files = {file.stem for folder in _profile_folders() for file in folder.glob(f"{prefix}*.yaml")}
@@ -103,14 +120,14 @@ class _Loader(yaml.SafeLoader):
     """A safe loader that refuses a key given twice, of which YAML would silently keep the last."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        seen = set()
+        keys = set()
         for key_node, _ in node.value:
             if isinstance(key_node, yaml.ScalarNode):
-                if key_node.value in seen:
+                if key_node.value in keys:
                     raise yaml.constructor.ConstructorError(
                         None, None, f"the key '{key_node.value}' is given twice", key_node.start_mark
                     )
-                seen.add(key_node.value)
+                keys.add(key_node.value)
         return super().construct_mapping(node, deep)
 
 
@@ -145,9 +162,9 @@ def _suggestion(cls: type[BaseModel], location: tuple[int | str, ...]) -> str:
         # A union, a list or a dict of models: its keys would need a guess.
         if not (isinstance(model, type) and issubclass(model, BaseModel)):
             return ""
-    known = [field.alias or name for name, field in model.model_fields.items()]
-    close = difflib.get_close_matches(str(location[-1]), known, n=1)
-    return f"; did you mean '{close[0]}'?" if close else f"; expected one of: {', '.join(known)}"
+    fields = [field.alias or name for name, field in model.model_fields.items()]
+    close = difflib.get_close_matches(str(location[-1]), fields, n=1)
+    return f"; did you mean '{close[0]}'?" if close else f"; expected one of: {', '.join(fields)}"
 
 
 def _shown(value: object) -> str:

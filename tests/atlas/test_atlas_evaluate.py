@@ -11,7 +11,7 @@ from builders.lit_cube import DIRECTIONS, HEIGHT, WIDTH, lit_cube, waves
 from wlm import metrics
 from wlm.atlas.charts import mesh_charts
 from wlm.atlas.data import from_arrays
-from wlm.atlas.evaluate import evaluate
+from wlm.atlas.evaluation import evaluate
 from wlm.atlas.views import View, sphere_views, visible_uv
 from wlm.errors import WlmError
 from wlm.ops import raster

@@ -12,7 +12,7 @@ import torch
 from builders.atlas_meshes import charts, sheet
 from builders.atlas_models import KINDS, random_model
 
-from wlm.atlas import codec, colour, export
+from wlm.atlas import codec, colour, exporter
 from wlm.atlas.data import from_arrays
 from wlm.atlas.decode import Decoder
 from wlm.atlas.exact import decode64
@@ -30,7 +30,7 @@ LUT = {"lut.exr", "lut.ktx2", "lut.dds"}
 def written(folder, kind, stored="half", mesh=None, **facts):
     mesh = sheet() if mesh is None else mesh
     model = random_model(mesh, kind, stored)
-    return model, mesh, export.export(folder, model, mesh, facts)
+    return model, mesh, exporter.export(folder, model, mesh, facts)
 
 
 @pytest.mark.parametrize("stored", ["half", "bc6h", "astc"])
@@ -104,8 +104,8 @@ def test_the_mesh_keeps_its_uvs_and_gets_new_ones(kind, tmp_path):
 @pytest.mark.parametrize("mesh", [sheet(), charts()], ids=["sheet", "charts"])
 def test_the_folder_alone_gives_the_lightmap(kind, mesh, tmp_path):
     model, _, _ = written(tmp_path, kind, mesh=mesh)
-    output = export.read_folder(tmp_path)
-    own = export.geometry(output)
+    output = exporter.read_folder(tmp_path)
+    own = exporter.geometry(output)
     np.testing.assert_array_equal(own.position[own.triangle], mesh.position[mesh.triangle])
     np.testing.assert_array_equal(own.uv[own.triangle], mesh.uv[mesh.triangle])
     np.testing.assert_array_equal(own.mask, mesh.mask)
@@ -122,7 +122,7 @@ def test_a_new_output_takes_the_place_of_an_old_one(tmp_path):
     (folder / "mine.txt").write_text("x")
     model, _, paths = written(folder, "plain", "astc")
     assert set(os.listdir(folder)) == ALWAYS | {"mine.txt"} == {path.name for path in paths} | {"mine.txt"}
-    assert export.read_folder(folder).model.method == "plain"
+    assert exporter.read_folder(folder).model.method == "plain"
 
 
 @pytest.mark.parametrize("old", ["empty", "tiles"])
@@ -148,7 +148,7 @@ def test_a_stop_while_files_are_moved_loses_nothing(old, tmp_path, monkeypatch):
 
         monkeypatch.setattr(os, "replace", stopped)
         try:
-            export.export(folder, model, mesh)
+            exporter.export(folder, model, mesh)
             break
         except KeyboardInterrupt:
             pass
@@ -157,11 +157,11 @@ def test_a_stop_while_files_are_moved_loses_nothing(old, tmp_path, monkeypatch):
         assert os.listdir(tmp_path) == ["out"]
         if steps:
             with pytest.raises(WlmError, match="out: expected all files of a run; writing them was stopped half-way"):
-                export.read_folder(folder)
+                exporter.read_folder(folder)
         elif old != "empty":
-            assert export.read_folder(folder).model.method == "tiles", "nothing was moved yet"
-        export.export(folder, model, mesh)
-        assert export.read_folder(folder).model.method == "plain"
+            assert exporter.read_folder(folder).model.method == "tiles", "nothing was moved yet"
+        exporter.export(folder, model, mesh)
+        assert exporter.read_folder(folder).model.method == "plain"
     # The marker, and each file.
     assert steps == 1 + len(ALWAYS)
     assert set(os.listdir(folder)) == ALWAYS | ({"mine.txt"} if old != "empty" else set())
@@ -174,12 +174,12 @@ def test_the_mask_goes_along_where_triangles_do_not_tell_it(tmp_path):
     mesh = from_arrays(whole.position, whole.triangle, whole.uv, whole.lightmap, mask)
     model, _, paths = written(tmp_path, "tiles", mesh=mesh)
     assert "mask.png" in {path.name for path in paths}
-    own = export.geometry(export.read_folder(tmp_path))
+    own = exporter.geometry(exporter.read_folder(tmp_path))
     np.testing.assert_array_equal(own.mask, mask)
     np.testing.assert_array_equal(Decoder(model).lightmap(own), Decoder(model).lightmap(mesh))
     (tmp_path / "mask.png").unlink()
     with pytest.raises(WlmError, match="mask.png: no such mask"):
-        export.geometry(export.read_folder(tmp_path))
+        exporter.geometry(exporter.read_folder(tmp_path))
     # An output that needs none takes an old one away.
     written(tmp_path, "tiles", mesh=whole)
     assert not (tmp_path / "mask.png").exists()
@@ -192,17 +192,17 @@ def test_other_folders_are_left_alone(tmp_path):
     full.mkdir()
     (full / "a.txt").write_text("x")
     with pytest.raises(WlmError, match="full: expected an empty folder or one of an earlier output, found other files"):
-        export.export(full, model, mesh)
+        exporter.export(full, model, mesh)
     for content in ("[]", "{", '{"format": "wlm-probe-export"}'):
         (full / "report.json").write_text(content)
         with pytest.raises(WlmError, match="found other files"):
-            export.export(full, model, mesh)
+            exporter.export(full, model, mesh)
     with pytest.raises(WlmError, match="a.txt: cannot write there: Not a directory"):
-        export.export(full / "a.txt", model, mesh)
+        exporter.export(full / "a.txt", model, mesh)
     with pytest.raises(WlmError, match="none does not exist"):
-        export.export(tmp_path / "none" / "out", model, mesh)
+        exporter.export(tmp_path / "none" / "out", model, mesh)
     with pytest.raises(ValueError, match="expected the mesh that was compressed"):
-        export.export(tmp_path / "new", replace(model, source="0" * 16), mesh)
+        exporter.export(tmp_path / "new", replace(model, source="0" * 16), mesh)
     assert sorted(os.listdir(tmp_path)) == ["full"] and sorted(os.listdir(full)) == ["a.txt", "report.json"]
 
 
@@ -214,14 +214,14 @@ def test_nothing_half_written_is_left(tmp_path, monkeypatch):
     def full(path, *_, **__):
         raise WlmError(f"{path}: cannot write: No space left on device")
 
-    monkeypatch.setattr(export, "write_dds", full)
+    monkeypatch.setattr(exporter, "write_dds", full)
     for name in ("old", "new"):
         with pytest.raises(WlmError) as caught:
-            export.export(tmp_path / name, random_model(mesh, "cascade"), mesh)
+            exporter.export(tmp_path / name, random_model(mesh, "cascade"), mesh)
         assert str(caught.value) == f"{tmp_path / name / 'lut.dds'}: cannot write: No space left on device"
-    monkeypatch.setattr(export, "write_dds", lambda *_, **__: (_ for _ in ()).throw(KeyboardInterrupt))
+    monkeypatch.setattr(exporter, "write_dds", lambda *_, **__: (_ for _ in ()).throw(KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
-        export.export(tmp_path / "old", random_model(mesh, "cascade"), mesh)
+        exporter.export(tmp_path / "old", random_model(mesh, "cascade"), mesh)
     assert os.listdir(tmp_path) == ["old"]
     assert {path.name: path.read_bytes() for path in (tmp_path / "old").iterdir()} == before
 
@@ -230,14 +230,14 @@ def test_a_texture_beyond_a_gpu(tmp_path):
     mesh = sheet()
     model = replace(random_model(mesh, "plain"), texels=np.zeros((1, 16385, 3), np.float16))
     with pytest.raises(WlmError, match="sheet: T_p: expected at most 16384 texels along a side, found 16385"):
-        export.export(tmp_path / "out", model, mesh)
+        exporter.export(tmp_path / "out", model, mesh)
     assert os.listdir(tmp_path) == []
 
 
 def test_a_folder_that_is_none_of_ours(tmp_path):
     for place, words in ((tmp_path / "none", "expected a folder"), (tmp_path, "found no report.json of it")):
         with pytest.raises(WlmError, match=words):
-            export.read_folder(place)
+            exporter.read_folder(place)
     written(tmp_path, "tiles")
     report = json.loads((tmp_path / "report.json").read_text())
     changes = (
@@ -247,11 +247,11 @@ def test_a_folder_that_is_none_of_ours(tmp_path):
     for change, words in changes:
         (tmp_path / "report.json").write_text(json.dumps(report | change))
         with pytest.raises(WlmError, match=words):
-            export.read_folder(tmp_path)
+            exporter.read_folder(tmp_path)
     for change, words in (({"triangles": 7}, "expected 7 triangles"), ({"uv_set": 4}, "TEXCOORD_4, found 0")):
         (tmp_path / "report.json").write_text(json.dumps(report | change))
         with pytest.raises(WlmError, match=words):
-            export.geometry(export.read_folder(tmp_path))
+            exporter.geometry(exporter.read_folder(tmp_path))
 
 
 CALLER = """

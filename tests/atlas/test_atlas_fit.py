@@ -9,7 +9,7 @@ from wlm.atlas import codec, fit
 from wlm.atlas import tiles as grid
 from wlm.atlas.coverage import covered_texels
 from wlm.atlas.decode import Decoder
-from wlm.atlas.evaluate import evaluate
+from wlm.atlas.evaluation import evaluate
 from wlm.atlas.fit import Cells, _fitted, compress, weights
 from wlm.atlas.model import load_profile, unpack_entries
 from wlm.errors import WlmError

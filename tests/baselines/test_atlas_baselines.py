@@ -9,7 +9,7 @@ import torch
 from builders.lit_cube import HEIGHT, WIDTH, lit_cube, waves
 
 from wlm.atlas.data import from_arrays
-from wlm.atlas.evaluate import evaluate
+from wlm.atlas.evaluation import evaluate
 from wlm.atlas.resize import FILTERS, resize
 from wlm.baselines.atlas import ATLAS_BASELINES, best_astc, block_codec, downsampling, single_colour
 from wlm.errors import WlmError

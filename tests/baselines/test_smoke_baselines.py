@@ -7,7 +7,7 @@ from builders.smoke_plumes import plume
 
 from wlm.baselines.smoke import billboard, direct
 from wlm.fluid.volume import DensityVolume
-from wlm.smoke.bake import SixWay, six_way
+from wlm.smoke.baking import SixWay, six_way
 from wlm.smoke.camera import Camera
 from wlm.smoke.scene import CameraSettings, make_camera
 

@@ -7,7 +7,7 @@ from typer.testing import CliRunner
 
 import wlm.bench.atlas as bench
 from wlm.atlas.data import LightmappedMesh, write_mesh
-from wlm.atlas.evaluate import evaluate
+from wlm.atlas.evaluation import evaluate
 from wlm.atlas.fit import compress
 from wlm.atlas.model import Profile
 from wlm.bench import plot, read_json, table, write_json

@@ -18,7 +18,7 @@ from wlm.bench.smoke_setup import row as make_row
 from wlm.bench.timing import Timing
 from wlm.errors import WlmError
 from wlm.fluid.volume import DensityVolume
-from wlm.smoke.bake import six_way
+from wlm.smoke.baking import six_way
 from wlm.smoke.camera import Camera
 from wlm.smoke.learn.synthetic import make_plume
 

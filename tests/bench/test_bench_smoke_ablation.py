@@ -13,7 +13,7 @@ from wlm.bench import Row, read_json, write_json
 from wlm.bench.report import figures, report, tables
 from wlm.bench.smoke_ablation import FULL, QUICK, AblationSizes, run, run_rows, variants
 from wlm.errors import WlmError
-from wlm.smoke.evaluate import coarse, compare, evaluate
+from wlm.smoke.evaluation import coarse, compare, evaluate
 from wlm.smoke.fit import NetworkProfile
 from wlm.smoke.learn.dataset import make_validation
 from wlm.smoke.learn.trainer import Trainer, plan_round
@@ -273,6 +273,6 @@ def test_the_command(monkeypatch, tmp_path):
 
 
 def _evaluation():
-    from wlm.smoke.evaluate import Evaluation
+    from wlm.smoke.evaluation import Evaluation
 
     return Evaluation(31.0, 30.0, 32.0, (31.0,) * 8, 0.1, 0.1)

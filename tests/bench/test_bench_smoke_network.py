@@ -17,7 +17,7 @@ from wlm.bench.smoke_network import PANELS, plotted, run, run_rows
 from wlm.bench.smoke_network_setup import QUICK, NetworkBench, Subject, open_subjects, score
 from wlm.config import profile_names
 from wlm.errors import WlmError
-from wlm.smoke.bake import six_way
+from wlm.smoke.baking import six_way
 from wlm.smoke.codec import save_network, shipped
 from wlm.smoke.learn.dataset import DatasetSettings
 from wlm.smoke.learn.synthetic import make_plume

@@ -10,7 +10,7 @@ import torch
 from builders.smoke_plumes import plume
 
 from wlm.fluid.volume import DensityVolume
-from wlm.smoke.bake import six_way
+from wlm.smoke.baking import six_way
 from wlm.smoke.camera import Camera
 from wlm.smoke.planes import Pool, encode_lightmaps, look_at
 from wlm.smoke.scene import CameraSettings, make_camera

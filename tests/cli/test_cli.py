@@ -22,7 +22,7 @@ from wlm.formats.exr import read_exr, write_exr
 from wlm.lightmap import codec, fit
 from wlm.lightmap.data import load_set
 from wlm.lightmap.decode import Decoder
-from wlm.lightmap.evaluate import evaluate
+from wlm.lightmap.evaluation import evaluate
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -202,7 +202,7 @@ def test_info_says_what_is_in_the_file(fitted):
 
 
 def test_export_lists_what_it_wrote(fitted, tmp_path):
-    pytest.importorskip("wlm.lightmap.export")
+    pytest.importorskip("wlm.lightmap.exporter")
     text = call("lightmap", "export", fitted, "-o", tmp_path / "out")
     files = list((tmp_path / "out").iterdir())
     assert files and all(file.name in text for file in files)

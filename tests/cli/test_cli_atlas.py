@@ -15,7 +15,7 @@ import wlm.atlas.fit
 from wlm.atlas import codec
 from wlm.atlas.data import load_mesh
 from wlm.atlas.decode import Decoder
-from wlm.atlas.evaluate import evaluate
+from wlm.atlas.evaluation import evaluate
 from wlm.atlas.fit import compress
 from wlm.atlas.model import load_profile
 from wlm.baselines.atlas import downsampling

@@ -16,7 +16,7 @@ from wlm.baselines import probe as baselines
 from wlm.probe import codec, data, fit
 from wlm.probe.data import load_probes, save_probes
 from wlm.probe.decode import Decoder
-from wlm.probe.evaluate import evaluate
+from wlm.probe.evaluation import evaluate
 
 PROBES, DEAD = 160, 5
 

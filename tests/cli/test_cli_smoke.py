@@ -17,10 +17,10 @@ from wlm.errors import WlmError
 from wlm.fluid.solver import Solver
 from wlm.fluid.volume import from_array, load_volume
 from wlm.formats.exr_planes import read_planes
-from wlm.smoke.bake import six_way
+from wlm.smoke.baking import six_way
 from wlm.smoke.camera import axis_faults
 from wlm.smoke.data import CHECKPOINT, open_footage, open_frames, read_six_way, save_volume
-from wlm.smoke.export import read_flipbook
+from wlm.smoke.exporter import read_flipbook
 from wlm.smoke.guide import guide
 from wlm.smoke.scene import CameraSettings, LightSettings, Scene, make_camera
 from wlm.smoke.simulate import simulate

@@ -9,7 +9,7 @@ from wlm.errors import WlmError
 from wlm.lightmap import codec
 from wlm.lightmap.data import from_arrays
 from wlm.lightmap.decode import Decoder
-from wlm.lightmap.evaluate import bits_per_texel, evaluate, evaluate_baselines, part_bytes
+from wlm.lightmap.evaluation import bits_per_texel, evaluate, evaluate_baselines, part_bytes
 from wlm.lightmap.fit import compress
 from wlm.metrics import evaluate_frame, summarise
 

@@ -17,7 +17,7 @@ from wlm.errors import WlmError
 from wlm.formats.bc7 import decode_image
 from wlm.lightmap.decode import Decoder
 from wlm.lightmap.exact import colour_tile64, decode_tile64
-from wlm.lightmap.export import export
+from wlm.lightmap.exporter import export
 from wlm.lightmap.shader import decode_glsl
 
 TIMES = (7.5, 3.3, 21.7)  # stored, between, and across midnight (or past the end)

@@ -8,7 +8,7 @@ from wlm.errors import WlmError
 from wlm.lightmap import codec
 from wlm.lightmap.data import from_arrays
 from wlm.lightmap.decode import Decoder
-from wlm.lightmap.evaluate import count_kinds, evaluate
+from wlm.lightmap.evaluation import count_kinds, evaluate
 from wlm.lightmap.fit import compress
 from wlm.lightmap.model import TimeAxis
 

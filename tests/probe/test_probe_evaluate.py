@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from wlm.errors import WlmError
-from wlm.probe import evaluate as module
+from wlm.probe import evaluation as module
 from wlm.probe.data import ProbeSet
-from wlm.probe.evaluate import NORMALS, evaluate
+from wlm.probe.evaluation import NORMALS, evaluate
 from wlm.probe.sphere import fibonacci_sphere, irradiance
 
 

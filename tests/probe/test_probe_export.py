@@ -12,7 +12,7 @@ from builders.probe_models import EXTENT, ORIGIN, SIZE, random_model
 from wlm.errors import WlmError
 from wlm.probe.data import load_probes
 from wlm.probe.decode import Decoder
-from wlm.probe.export import export
+from wlm.probe.exporter import export
 from wlm.probe.shader import probe_glsl
 
 SHAPES = [

@@ -8,7 +8,7 @@ import torch
 
 from wlm.bench.path_tracer import PathTracer
 from wlm.fluid.volume import DensityVolume, from_array
-from wlm.smoke.bake import SixWay, lit, six_way
+from wlm.smoke.baking import SixWay, lit, six_way
 from wlm.smoke.camera import DIRECTIONS, RULES, VECTORS, Camera, axis_faults, weights
 
 

@@ -8,7 +8,7 @@ import torch
 from builders.smoke_plumes import plume
 
 from wlm.fluid.volume import DensityVolume, from_array
-from wlm.smoke.bake import SixWay, six_way
+from wlm.smoke.baking import SixWay, six_way
 from wlm.smoke.camera import DIRECTIONS, Camera
 from wlm.smoke.coarse import coarse_six_way
 from wlm.smoke.guide import guide

@@ -14,7 +14,7 @@ import wlm.smoke.learn.dataset as dataset
 from wlm.cli.smoke_network import register
 from wlm.errors import WlmError
 from wlm.fluid.solver import LEAST_HALF_LOSS
-from wlm.smoke.bake import six_way
+from wlm.smoke.baking import six_way
 from wlm.smoke.camera import axis_faults
 from wlm.smoke.learn.dataset import (
     ATTEMPTS,

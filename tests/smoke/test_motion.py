@@ -8,7 +8,7 @@ from reference.marching import span as clip
 from reference.marching import trilinear
 
 from wlm.fluid.volume import DensityVolume, from_array
-from wlm.smoke.bake import six_way
+from wlm.smoke.baking import six_way
 from wlm.smoke.camera import Camera
 from wlm.smoke.learn.dataset import DatasetSettings, make_validation
 from wlm.smoke.learn.losses import warp

@@ -8,7 +8,7 @@ import torch
 from builders.smoke_plumes import plume
 from builders.smoke_samples import seen, small_pool
 
-from wlm.smoke.bake import SixWay, six_way
+from wlm.smoke.baking import SixWay, six_way
 from wlm.smoke.camera import Camera
 from wlm.smoke.coarse import coarse_six_way
 from wlm.smoke.guide import guide

@@ -17,7 +17,7 @@ from wlm.errors import WlmError
 from wlm.fluid.faces import FACES
 from wlm.fluid.volume import from_array, load_volume
 from wlm.formats.exr_planes import read_planes, write_planes
-from wlm.smoke.bake import six_way
+from wlm.smoke.baking import six_way
 from wlm.smoke.data import (
     CHECKPOINT,
     check_folder,

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from wlm.smoke.bake import SixWay
+from wlm.smoke.baking import SixWay
 from wlm.smoke.camera import VECTORS, Camera
-from wlm.smoke.shade import Light, Ramp, composite, obstacle_visibility, shade
+from wlm.smoke.shading import Light, Ramp, composite, obstacle_visibility, shade
 
 FULL = (4 * math.pi,) * 3
 

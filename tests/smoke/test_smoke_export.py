@@ -10,9 +10,9 @@ from PIL import Image
 from wlm.errors import WlmError
 from wlm.fluid.volume import from_array
 from wlm.formats.exr import read_exr, write_exr
-from wlm.smoke.bake import SixWay, six_way
+from wlm.smoke.baking import SixWay, six_way
 from wlm.smoke.camera import DIRECTIONS, LAYOUTS, Camera, axis_faults
-from wlm.smoke.export import pack, read_flipbook, unpack, write_flipbook
+from wlm.smoke.exporter import pack, read_flipbook, unpack, write_flipbook
 
 KINDS = {".exr": 6e-4, ".png": 0.51 / 255, ".tga": 0.51 / 255}
 

@@ -16,7 +16,7 @@ from wlm.errors import WlmError
 from wlm.fluid.volume import from_array
 from wlm.formats.artifact import read_artifact, write_artifact
 from wlm.metrics.error import psnr_from_mse
-from wlm.smoke.bake import six_way
+from wlm.smoke.baking import six_way
 from wlm.smoke.coarse import coarse_six_way
 from wlm.smoke.codec import SYSTEM, export_onnx, load_network, save_network, settings_of, shipped
 from wlm.smoke.decode import Predictor, predict

@@ -12,7 +12,7 @@ from wlm.config import profile_names
 from wlm.errors import WlmError
 from wlm.formats.artifact import read_artifact
 from wlm.smoke.codec import load_network
-from wlm.smoke.evaluate import evaluate
+from wlm.smoke.evaluation import evaluate
 from wlm.smoke.fit import NetworkProfile, load_profile, train
 from wlm.smoke.learn.losses import LossSettings
 from wlm.smoke.learn.trainer import Plan, Trainer, TrainSettings, plan_round

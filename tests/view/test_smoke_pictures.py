@@ -9,10 +9,10 @@ from builders.smoke_plumes import plume
 from PIL import Image
 
 from wlm.errors import WlmError
-from wlm.smoke.bake import SixWay, six_way
+from wlm.smoke.baking import SixWay, six_way
 from wlm.smoke.guide import guide
 from wlm.smoke.scene import CameraSettings, LightSettings, Obstacle, make_camera
-from wlm.smoke.shade import Light, Ramp
+from wlm.smoke.shading import Light, Ramp
 from wlm.view.smoke import (
     contact_sheet,
     draw_obstacles,

@@ -18,7 +18,7 @@ __all__ = ["Decoder"]
 class Decoder:
     """A model on a device.
 
-    It is a ``wlm.atlas.evaluate.Sampler``.
+    It is a ``wlm.atlas.evaluation.Sampler``.
 
     Attributes:
         model, device: As given.

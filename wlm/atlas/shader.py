@@ -1,4 +1,4 @@
-"""The GLSL that reads an exported atlas (lightmap-uv-clustering-cascade, eq. 7); ``wlm.atlas.export`` writes it."""
+"""The GLSL that reads an exported atlas (lightmap-uv-clustering-cascade, eq. 7); ``wlm.atlas.exporter`` writes it."""
 
 from wlm.atlas.model import SIDE_BITS, AtlasModel
 

@@ -21,7 +21,7 @@ import torch
 
 from wlm.atlas.coverage import touched_texels
 from wlm.atlas.data import LightmappedMesh
-from wlm.atlas.evaluate import Sampler
+from wlm.atlas.evaluation import Sampler
 from wlm.atlas.model import SOURCE_BITS
 from wlm.atlas.resize import FILTERS, fitting_size, resize
 from wlm.formats import hdr_blocks
@@ -48,7 +48,7 @@ class Baseline:
         bits: Of all that a decoder needs; UVs cost nothing, as in eq. 9.
         share: ``bits`` over the lightmap's at 48 a texel.
         seconds: Wall-clock time of the compression, on the CPU.
-        sample: The decoder, for ``wlm.atlas.evaluate``.
+        sample: The decoder, for ``wlm.atlas.evaluation``.
     """
 
     name: str

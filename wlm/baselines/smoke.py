@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from wlm.fluid.volume import DensityVolume
-from wlm.smoke.bake import SixWay, six_way
+from wlm.smoke.baking import SixWay, six_way
 from wlm.smoke.camera import Camera
 
 __all__ = ["billboard", "direct"]

@@ -15,7 +15,7 @@ For each lightmap of each mesh these kinds of rows:
 Where there are several lightmaps the last rows are the means over them; their largest error is the largest of all.
 
 A largest error is that against the float64 decode of the same model. A decode on CUDA is timed as the replay of a
-graph, so that gaps between launches do not count. The peaks of PSNR are those of ``wlm.atlas.evaluate``.
+graph, so that gaps between launches do not count. The peaks of PSNR are those of ``wlm.atlas.evaluation``.
 """
 
 import math
@@ -35,7 +35,7 @@ from wlm import interop
 from wlm.atlas import codec
 from wlm.atlas.data import from_arrays
 from wlm.atlas.decode import Decoder
-from wlm.atlas.evaluate import Report, Sampler, evaluate
+from wlm.atlas.evaluation import Report, Sampler, evaluate
 from wlm.atlas.exact import decode64
 from wlm.atlas.fit import compress
 from wlm.atlas.model import SOURCE_BITS, AtlasModel, Profile, load_profile

@@ -32,7 +32,7 @@ from wlm.errors import WlmError
 from wlm.lightmap import codec
 from wlm.lightmap.data import LightmapSet, load_set
 from wlm.lightmap.decode import Decoder
-from wlm.lightmap.evaluate import bits_per_texel
+from wlm.lightmap.evaluation import bits_per_texel
 from wlm.lightmap.exact import bound64, colour_tile64, decode_tile64
 from wlm.lightmap.fit import compress, dynamic_targets
 from wlm.lightmap.model import TILE, LightmapModel, Profile, TimeAxis, encode_time, load_profile

@@ -40,7 +40,7 @@ from wlm.errors import WlmError
 from wlm.probe import codec
 from wlm.probe.data import ProbeSet, load_probes
 from wlm.probe.decode import Decoder, Points
-from wlm.probe.evaluate import Report, evaluate
+from wlm.probe.evaluation import Report, evaluate
 from wlm.probe.exact import decode64
 from wlm.probe.fit import compress
 from wlm.probe.model import ProbeModel, Profile, load_profile

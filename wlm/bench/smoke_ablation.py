@@ -33,7 +33,7 @@ from wlm.bench.smoke_setup import number
 from wlm.bench.smoke_setup import row as smoke_row
 from wlm.errors import WlmError
 from wlm.interop import check_device
-from wlm.smoke.evaluate import COARSE, Evaluation, coarse, compare, evaluate
+from wlm.smoke.evaluation import COARSE, Evaluation, coarse, compare, evaluate
 from wlm.smoke.fit import NetworkProfile, load_profile
 from wlm.smoke.learn.dataset import DatasetSettings, make_pool, make_validation
 from wlm.smoke.learn.losses import Losses

@@ -12,12 +12,12 @@ from wlm.bench.runner import Row
 from wlm.bench.smoke_setup import Bench, percent, row
 from wlm.fluid.volume import DensityVolume
 from wlm.interop import StepGraph
-from wlm.smoke.bake import SixWay, lit, six_way
+from wlm.smoke.baking import SixWay, lit, six_way
 from wlm.smoke.camera import RULES, Camera
 from wlm.smoke.guide import Guide, guide
 from wlm.smoke.learn.synthetic import make_plume
 from wlm.smoke.scene import CameraSettings, load_scene, make_camera, obstacle_mesh
-from wlm.smoke.shade import Light, composite, obstacle_visibility, shade
+from wlm.smoke.shading import Light, composite, obstacle_visibility, shade
 from wlm.smoke.simulate import make_solver, volume_of
 
 __all__ = ["frame_rows", "guide_rows", "make_cloud", "six_rows", "weight_rows"]

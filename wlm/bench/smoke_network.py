@@ -46,7 +46,7 @@ from wlm.bench.smoke_network_setup import (
 from wlm.errors import WlmError
 from wlm.interop import check_device
 from wlm.metrics.error import psnr_from_mse
-from wlm.smoke.bake import SixWay, six_way
+from wlm.smoke.baking import SixWay, six_way
 from wlm.smoke.coarse import coarse_six_way
 from wlm.smoke.decode import predict
 from wlm.smoke.planes import EMISSION_PLANE, OPACITY_PLANE, encode_lightmaps

@@ -10,15 +10,15 @@ from wlm.bench.runner import Row
 from wlm.bench.smoke_network_setup import Frame, NetworkBench, Whole, row
 from wlm.bench.smoke_setup import number
 from wlm.config import profile_names
-from wlm.smoke.bake import SixWay
+from wlm.smoke.baking import SixWay
 from wlm.smoke.decode import Predictor
-from wlm.smoke.evaluate import coarse, compare, of_predictor
+from wlm.smoke.evaluation import coarse, compare, of_predictor
 from wlm.smoke.fit import load_profile
 from wlm.smoke.learn.dataset import DatasetSettings
 from wlm.smoke.model import SixWayNetwork, parameter_count
 from wlm.smoke.planes import GUIDES, Pool, decode_lightmaps, look_at
 from wlm.smoke.scene import LightSettings
-from wlm.smoke.shade import composite, shade
+from wlm.smoke.shading import composite, shade
 
 __all__ = ["density_rows", "frame_rows", "profile_rows"]
 

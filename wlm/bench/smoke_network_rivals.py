@@ -13,7 +13,7 @@ from wlm.bench.runner import Row
 from wlm.bench.smoke_network_setup import EXACT, NetworkBench, Scores, Whole, row, score
 from wlm.bench.timing import time_together
 from wlm.errors import one_line
-from wlm.smoke.bake import SixWay, six_way
+from wlm.smoke.baking import SixWay, six_way
 from wlm.smoke.coarse import coarse_six_way
 from wlm.smoke.planes import encode_lightmaps, to_srgb
 

@@ -17,7 +17,7 @@ from wlm.fluid.solver import Solver
 from wlm.fluid.volume import DensityVolume
 from wlm.interop import StepGraph, stream
 from wlm.metrics.error import psnr_from_mse
-from wlm.smoke.bake import SixWay, six_way
+from wlm.smoke.baking import SixWay, six_way
 from wlm.smoke.camera import DIRECTIONS, Camera
 from wlm.smoke.codec import load_network, settings_of
 from wlm.smoke.decode import Predictor

@@ -21,8 +21,8 @@ from wlm.errors import WlmError
 
 if TYPE_CHECKING:
     from wlm.atlas.data import LightmappedMesh
-    from wlm.atlas.evaluate import Sampler
-    from wlm.atlas.export import Output
+    from wlm.atlas.evaluation import Sampler
+    from wlm.atlas.exporter import Output
     from wlm.atlas.model import AtlasModel, Profile
 
 __all__ = ["app"]
@@ -64,7 +64,7 @@ def compress(
         raise WlmError("--budget: profiles of the cascade have sizes of their own; expected one of tiles, or none")
     quiet_warp()
     from wlm.atlas.data import load_mesh
-    from wlm.atlas.export import MODEL_FILE, check_folder, disk_ratio, export
+    from wlm.atlas.exporter import MODEL_FILE, check_folder, disk_ratio, export
     from wlm.atlas.fit import compress
     from wlm.interop import check_device
 
@@ -110,8 +110,8 @@ def evaluate(
         check_output(json_path, ".json")
     quiet_warp()
     from wlm.atlas.decode import Decoder
-    from wlm.atlas.evaluate import evaluate
-    from wlm.atlas.export import disk_ratio, read_folder
+    from wlm.atlas.evaluation import evaluate
+    from wlm.atlas.exporter import disk_ratio, read_folder
     from wlm.atlas.model import SOURCE_BITS
     from wlm.baselines.atlas import downsampling
 
@@ -193,7 +193,7 @@ def decode(
         raise WlmError(f"--view: expected 0 to {views - 1}, got {view}")
     quiet_warp()
     from wlm.atlas.decode import Decoder
-    from wlm.atlas.export import geometry, read_folder
+    from wlm.atlas.exporter import geometry, read_folder
     from wlm.formats.exr import write_exr
 
     found = read_folder(folder)
@@ -233,7 +233,7 @@ def info(
     """Say what a compressed lightmap holds, without decoding it."""
     quiet_warp()
     from wlm.atlas import codec
-    from wlm.atlas.export import MODEL_FILE, check_run, disk_ratio, read_report
+    from wlm.atlas.exporter import MODEL_FILE, check_run, disk_ratio, read_report
 
     if path.is_dir():
         report, found = read_report(path), codec.inspect(path / MODEL_FILE)
@@ -295,7 +295,7 @@ def _settings(profile: str, **given: Any) -> "Profile":
 def _inputs(output: "Output", mesh: Path | None, lightmap: Path | None, mask: Path | None) -> "LightmappedMesh":
     """The mesh and lightmap that were compressed, from where they were or where the options say."""
     from wlm.atlas.data import load_mesh
-    from wlm.atlas.export import REPORT_FILE
+    from wlm.atlas.exporter import REPORT_FILE
 
     stored = output.report.get("inputs")
     stored = stored if isinstance(stored, dict) else {}

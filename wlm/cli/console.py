@@ -9,16 +9,20 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
+from rich.progress import BarColumn, TaskProgressColumn, TextColumn
+from rich.progress import Progress as Bar
 from rich.table import Table
 
 from wlm.errors import WlmError
+
+if TYPE_CHECKING:
+    from wlm.system import OnProgress, Progress
 
 __all__ = [
     "check_output",
@@ -28,6 +32,7 @@ __all__ = [
     "number",
     "progress_bar",
     "quiet_warp",
+    "running",
     "show",
     "show_figures",
     "show_json",
@@ -165,12 +170,12 @@ def progress_bar(what: str) -> Iterator[Callable[[int, int, str], None]]:
     console = _console(stderr=True)
     start = time.perf_counter()
     if not console.is_terminal:
-        shown = 0
+        reported = 0
 
         def line(done: int, total: int, text: str) -> None:
-            nonlocal shown
-            if (part := done * _PLAIN_REPORTS // max(total, 1)) > shown:
-                shown = part
+            nonlocal reported
+            if (part := done * _PLAIN_REPORTS // max(total, 1)) > reported:
+                reported = part
                 note(f"{what}: {done} of {total}{text and ', '}{text}, {_left(start, done, total)}")
 
         yield line
@@ -181,7 +186,7 @@ def progress_bar(what: str) -> Iterator[Callable[[int, int, str], None]]:
         TaskProgressColumn(),
         TextColumn("{task.fields[note]}"),
     )
-    with Progress(*columns, console=console, transient=True) as bar:
+    with Bar(*columns, console=console, transient=True) as bar:
         task = bar.add_task(what, total=None, note="")
 
         def update(done: int, total: int, text: str) -> None:
@@ -223,6 +228,43 @@ def deferred_interrupt() -> Iterator[Callable[[], None]]:
         yield check
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+@contextmanager
+def running(what: str, checkpoint: Path | None = None) -> "Iterator[OnProgress]":
+    """Shows the progress of long work and, where it has a checkpoint, lets Ctrl-C stop it between two steps.
+
+    Args:
+        what: The work, in a word or two.
+        checkpoint: The file that keeps an interrupted run; None: Ctrl-C ends the work at once.
+
+    Yields:
+        A callback for the work. Once it has been called and Ctrl-C stopped the work, a line says how to go on.
+    """
+    last: Any = None
+    with deferred_interrupt() if checkpoint is not None else nullcontext(lambda: None) as check_interrupt:
+        try:
+            with progress_bar(what) as bar:
+
+                def report(progress: "Progress") -> None:
+                    nonlocal last
+                    last = progress
+                    figures = ", ".join(_named_figure(*item) for item in progress.figures.items())
+                    bar(progress.done, progress.total, figures)
+                    check_interrupt()
+
+                yield report
+        except KeyboardInterrupt:
+            if checkpoint is not None and checkpoint.exists():
+                step = f" at step {last.done}" if last is not None else ""
+                note(f"stopped{step}: the same command with --resume goes on from {checkpoint}")
+            raise
+
+
+def _named_figure(name: str, value: float) -> str:
+    """``PSNR dB`` of 41.2 is written "PSNR 41.2 dB"."""
+    label, _, unit = name.partition(" ")
+    return " ".join(filter(None, (label, number(value, ".4g"), unit)))
 
 
 def _left(start: float, done: int, total: int) -> str:

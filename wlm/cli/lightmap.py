@@ -22,7 +22,7 @@ from wlm.errors import WlmError
 
 if TYPE_CHECKING:
     from wlm.lightmap.data import LightmapSet
-    from wlm.lightmap.evaluate import BaselineReport, Report
+    from wlm.lightmap.evaluation import BaselineReport, Report
     from wlm.lightmap.model import LightmapModel, Profile
 
 __all__ = ["app"]
@@ -161,7 +161,7 @@ def evaluate(
     quiet_warp()
     from wlm.interop import check_device
     from wlm.lightmap import codec
-    from wlm.lightmap.evaluate import evaluate, evaluate_baselines
+    from wlm.lightmap.evaluation import evaluate, evaluate_baselines
 
     device = check_device(device)
     model = codec.read(file)
@@ -196,7 +196,7 @@ def info(
     quiet_warp()
     from wlm.lightmap import codec
     from wlm.lightmap.decode import Decoder
-    from wlm.lightmap.evaluate import count_kinds, part_bytes
+    from wlm.lightmap.evaluation import count_kinds, part_bytes
 
     model = codec.read(file)
     decoder = Decoder(model, device)
@@ -251,7 +251,7 @@ def export(
     from wlm.formats.exr import write_exr
     from wlm.lightmap import codec
     from wlm.lightmap.decode import Decoder
-    from wlm.lightmap.export import export
+    from wlm.lightmap.exporter import export
 
     model = codec.read(file)
     decoder = Decoder(model, device)
@@ -305,7 +305,7 @@ def _write_png(path: Path, pixels: Any, bounds: Any, gamma: float) -> None:
 
 
 def _show_compressed(path: Path, model: "LightmapModel", lightmaps: "LightmapSet", size: int, seconds: float) -> None:
-    from wlm.lightmap.evaluate import bits_per_texel, count_kinds
+    from wlm.lightmap.evaluation import bits_per_texel, count_kinds
 
     kinds = ", ".join(f"{count} {kind}" for kind, count in count_kinds(model).items() if count)
     rows = table(model.name, ["file", "bytes", "bpp", "tiles", "seconds"], text=["tiles"])

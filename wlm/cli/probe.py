@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from wlm.probe.data import ProbeSet
-    from wlm.probe.evaluate import Report
+    from wlm.probe.evaluation import Report
     from wlm.probe.model import ProbeModel, Profile
 
 __all__ = ["app"]
@@ -179,7 +179,7 @@ def evaluate(
     quiet_warp()
     from wlm.probe import codec
     from wlm.probe.decode import Decoder
-    from wlm.probe.evaluate import evaluate
+    from wlm.probe.evaluation import evaluate
 
     model = codec.read(file)
     decoder = Decoder(model, device)
@@ -263,7 +263,7 @@ def export(
     """
     quiet_warp()
     from wlm.probe import codec
-    from wlm.probe.export import export
+    from wlm.probe.exporter import export
 
     rows = table(str(output), ["file", "bytes"])
     for path in export(codec.read(file), output, device=device):
@@ -413,7 +413,7 @@ def _read_positions(path: Path) -> "np.ndarray":
 def _baselines(probes: "ProbeSet", size: int) -> "list[tuple[dict[str, Any], Report]]":
     """Scores what the rivals make of as many bytes; those for which they are too few are named."""
     from wlm.baselines.probe import PROBE_BASELINES, at_bytes
-    from wlm.probe.evaluate import evaluate
+    from wlm.probe.evaluation import evaluate
 
     rows = []
     with progress_bar("baselines") as bar:

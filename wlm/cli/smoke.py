@@ -43,10 +43,10 @@ from wlm.cli.smoke_options import (
 from wlm.errors import WlmError
 
 if TYPE_CHECKING:
-    from wlm.smoke.bake import SixWay
+    from wlm.smoke.baking import SixWay
     from wlm.smoke.camera import Camera
     from wlm.smoke.scene import Scene
-    from wlm.smoke.shade import Light
+    from wlm.smoke.shading import Light
 
 __all__ = ["app"]
 
@@ -192,7 +192,7 @@ def bake(
     An EXR has the channels right, left, top, bottom, front, back, transparency and, of hot smoke, emission.
     """
     quiet_warp()
-    from wlm.smoke.bake import six_way
+    from wlm.smoke.baking import six_way
 
     footage = open_smoke(smoke, extinction, emission, device)
     view = {"resolution": resolution, "toward": toward, "turn": turn, "extent": extent, "distance": distance}
@@ -296,7 +296,7 @@ def flipbook(
     if gain is not None and not 0 < gain < float("inf"):
         raise WlmError(f"--gain: expected a number above 0, got {gain}")
     quiet_warp()
-    from wlm.smoke.export import write_flipbook
+    from wlm.smoke.exporter import write_flipbook
 
     view = {"resolution": resolution, "toward": toward, "turn": turn, "extent": extent, "distance": distance}
     marching = {"step": step, "supersample": supersample}
@@ -386,7 +386,7 @@ def _shots(
         fine = {"step": usual_step, "supersample": 1} | {k: v for k, v in marching.items() if v is not None}
 
         def made() -> "Iterator[tuple[Path, SixWay, Camera, dict[str, Any]]]":
-            from wlm.smoke.bake import six_way
+            from wlm.smoke.baking import six_way
             from wlm.smoke.guide import guide
 
             with progress_bar(stem) as bar:

@@ -36,9 +36,9 @@ from wlm.errors import WlmError
 
 if TYPE_CHECKING:
     from wlm.fluid.volume import DensityVolume
-    from wlm.smoke.bake import SixWay
+    from wlm.smoke.baking import SixWay
     from wlm.smoke.camera import Camera
-    from wlm.smoke.evaluate import Comparison
+    from wlm.smoke.evaluation import Comparison
     from wlm.smoke.model import SixWayNetwork
 
 __all__ = ["register"]
@@ -203,7 +203,7 @@ def evaluate(
     quiet_warp()
     from wlm.interop import check_device
     from wlm.smoke.codec import load_network, settings_of, shipped
-    from wlm.smoke.evaluate import evaluate_all
+    from wlm.smoke.evaluation import evaluate_all
 
     device, network = check_device(device), network or shipped()
     loaded, summary = load_network(network, device=device)

@@ -11,7 +11,7 @@ from wlm.errors import WlmError
 
 if TYPE_CHECKING:
     from wlm.fluid.volume import DensityVolume
-    from wlm.smoke.bake import SixWay
+    from wlm.smoke.baking import SixWay
     from wlm.smoke.camera import Camera
     from wlm.smoke.data import Footage
 

@@ -26,7 +26,7 @@ import numpy as np
 from wlm.errors import WlmError, one_line
 from wlm.formats.atomic import atomic_write
 
-__all__ = ["FORMAT_VERSION", "Artifact", "read_artifact", "write_artifact"]
+__all__ = ["FORMAT_VERSION", "Artifact", "encode_artifact", "read_artifact", "write_artifact"]
 
 FORMAT_VERSION = 1
 
@@ -89,10 +89,7 @@ def write_artifact(
 
     Args:
         path: The file to write; its folder must exist.
-        system: The system's name, without spaces.
-        settings: Plain JSON values; NaN and Inf are none.
-        tensors: The parts by name: any shape; a bool, an integer of 8 to 64 bits or a float of 16 to 64.
-        source: A hash of the input, without spaces, not empty.
+        system, settings, tensors, source: As for ``encode_artifact``.
 
     Returns:
         The size of the file, bytes.
@@ -100,6 +97,26 @@ def write_artifact(
     Raises:
         ValueError: A name, a setting or a type that the format can't hold.
         WlmError: The file can't be written; what was there before stays.
+    """
+    return atomic_write(path, encode_artifact(system, settings, tensors, source))
+
+
+def encode_artifact(
+    system: str, settings: Mapping[str, Any], tensors: Mapping[str, np.ndarray], source: str
+) -> list[bytes | np.ndarray]:
+    """Lays out an artifact in memory; the tensors are not copied where they are contiguous.
+
+    Args:
+        system: The system's name, without spaces.
+        settings: Plain JSON values; NaN and Inf are none.
+        tensors: The parts by name: any shape; a bool, an integer of 8 to 64 bits or a float of 16 to 64.
+        source: A hash of the input, without spaces, not empty.
+
+    Returns:
+        The file's content as consecutive buffers: the header, then the tensors.
+
+    Raises:
+        ValueError: A name, a setting or a type that the format can't hold.
     """
     for what, word in (("system", system), ("source", source)):
         if not word or not word.isascii() or not word.isprintable() or " " in word:
@@ -134,7 +151,7 @@ def write_artifact(
         digest.update(array)
     # With its quote, the first match is the placeholder: a source of zeros is followed by a space.
     head = head.replace(f' {_NO_DIGEST}"'.encode(), f' {digest.hexdigest()}"'.encode(), 1)
-    return atomic_write(path, [head, *arrays.values()])
+    return [head, *arrays.values()]
 
 
 def read_artifact(path: str | os.PathLike[str], system: str | None = None) -> Artifact:

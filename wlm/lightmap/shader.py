@@ -1,4 +1,4 @@
-"""The GLSL that decodes an exported lightmap; ``wlm.lightmap.export`` writes it beside the textures."""
+"""The GLSL that decodes an exported lightmap; ``wlm.lightmap.exporter`` writes it beside the textures."""
 
 from wlm.lightmap.model import LightmapModel
 from wlm_kernels.lightmap.features import STATIC_INPUTS, TEMPORAL_INPUTS

@@ -1,4 +1,4 @@
-"""The GLSL that decodes an exported probe model; ``wlm.probe.export`` writes it beside the numbers."""
+"""The GLSL that decodes an exported probe model; ``wlm.probe.exporter`` writes it beside the numbers."""
 
 from wlm.probe.model import LATENT, ProbeModel
 from wlm.probe.sphere import sh_count

@@ -15,7 +15,7 @@ import torch
 
 from wlm.fluid.volume import DensityVolume
 from wlm.interop import device_name, stream, to_warp, torch_memory
-from wlm.smoke.bake import SixWay
+from wlm.smoke.baking import SixWay
 from wlm.smoke.camera import DIRECTIONS, Camera
 from wlm.smoke.guide import check_march, check_step
 from wlm_kernels.smoke import march_coarse

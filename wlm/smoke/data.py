@@ -22,7 +22,7 @@ from wlm.errors import WlmError
 from wlm.fluid.volume import DensityVolume, load_volume
 from wlm.formats.atomic import atomic_path, atomic_write
 from wlm.formats.exr_planes import read_planes, write_planes
-from wlm.smoke.bake import SixWay
+from wlm.smoke.baking import SixWay
 from wlm.smoke.camera import DIRECTIONS, EMISSION, Camera
 from wlm.smoke.guide import Guide
 from wlm.smoke.scene import Scene

@@ -18,7 +18,7 @@ from torch import nn
 
 from wlm.fluid.volume import DensityVolume
 from wlm.interop import StepGraph, check_device, to_warp
-from wlm.smoke.bake import SixWay
+from wlm.smoke.baking import SixWay
 from wlm.smoke.camera import Camera
 from wlm.smoke.model import REACH, NafBlock, SixWayNetwork
 from wlm.smoke.planes import GUIDES, PLANES, decode_lightmaps, look_at

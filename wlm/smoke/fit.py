@@ -43,7 +43,7 @@ from wlm.formats.atomic import atomic_write
 from wlm.formats.checkpoint import Checkpoint
 from wlm.interop import check_device
 from wlm.smoke.codec import SYSTEM, load_network, save_network
-from wlm.smoke.evaluate import Evaluation, evaluate
+from wlm.smoke.evaluation import Evaluation, evaluate
 from wlm.smoke.learn.dataset import DatasetSettings
 from wlm.smoke.learn.trainer import Trainer, TrainSettings, plan_round
 from wlm.smoke.model import NetworkSettings

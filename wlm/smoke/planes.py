@@ -8,7 +8,7 @@ import torch
 
 from wlm.fluid.volume import DensityVolume
 from wlm.interop import device_name, stream, to_warp
-from wlm.smoke.bake import SixWay
+from wlm.smoke.baking import SixWay
 from wlm.smoke.camera import DIRECTIONS, Camera
 from wlm.smoke.coarse import coarse_six_way
 from wlm.smoke.guide import guide

@@ -34,7 +34,7 @@ from wlm.config import load_settings, profile_path
 from wlm.fluid.faces import FACES
 from wlm.fluid.shapes import ball, cube, drum
 from wlm.smoke.camera import Camera
-from wlm.smoke.shade import Light, Ramp
+from wlm.smoke.shading import Light, Ramp
 
 __all__ = [
     "Air",

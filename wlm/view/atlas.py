@@ -10,7 +10,7 @@ import torch
 from PIL import Image, ImageDraw, ImageFont
 
 from wlm.atlas.data import LightmappedMesh
-from wlm.atlas.evaluate import Sampler
+from wlm.atlas.evaluation import Sampler
 from wlm.atlas.views import View, visible_uv
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_path
@@ -38,7 +38,7 @@ def original(mesh: LightmappedMesh, device: str = "cpu") -> Sampler:
 def draw(
     mesh: LightmappedMesh, samplers: Mapping[str, Sampler], view: View, resolution: int = 512, device: str = "cpu"
 ) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Draws a mesh from one camera, as ``wlm.atlas.evaluate`` does.
+    """Draws a mesh from one camera, as ``wlm.atlas.evaluation`` does.
 
     Args:
         mesh: The mesh.

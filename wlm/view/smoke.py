@@ -14,11 +14,11 @@ from PIL import Image, ImageDraw, ImageFont
 
 from wlm.errors import WlmError
 from wlm.ops.raster import rasterize
-from wlm.smoke.bake import SixWay
+from wlm.smoke.baking import SixWay
 from wlm.smoke.camera import DIRECTIONS, Camera
 from wlm.smoke.guide import Guide
 from wlm.smoke.scene import Obstacle, obstacle_mesh
-from wlm.smoke.shade import Light, Ramp, composite, obstacle_visibility, shade
+from wlm.smoke.shading import Light, Ramp, composite, obstacle_visibility, shade
 from wlm.view.atlas import encode, save_png
 
 __all__ = [

@@ -37,7 +37,7 @@ from wlm.errors import WlmError
 from wlm.fluid.solver import Solver
 from wlm.fluid.volume import load_volume
 from wlm.interop import check_device, no_collection, stream
-from wlm.smoke.bake import six_way
+from wlm.smoke.baking import six_way
 from wlm.smoke.camera import Camera
 from wlm.smoke.learn.scenes import EDGE, LATTICE_SPEED, draw_scene, generator
 from wlm.smoke.motion import motion

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from wlm.ops.raster import rasterize
-from wlm.smoke.bake import SixWay
+from wlm.smoke.baking import SixWay
 from wlm.smoke.camera import Camera, weights
 
 __all__ = ["Light", "Ramp", "composite", "obstacle_visibility", "shade"]

@@ -18,7 +18,7 @@ from PIL import Image, UnidentifiedImageError
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_path
 from wlm.formats.exr import read_exr, write_exr
-from wlm.smoke.bake import SixWay
+from wlm.smoke.baking import SixWay
 from wlm.smoke.camera import ALPHA, DIRECTIONS, EMISSION, LAYOUTS
 
 __all__ = ["pack", "read_flipbook", "unpack", "write_flipbook"]

@@ -1,0 +1,20 @@
+"""Options that several commands have, each spelled out once."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+__all__ = ["AsJson", "Device", "ModelFile", "ReportFile", "Resume", "Seed", "output_option"]
+
+Device = Annotated[str, typer.Option(help='Where it computes: "cpu", "cuda" or "cuda:N".')]
+Seed = Annotated[int, typer.Option(min=0, max=2**31 - 1, help="One seed gives one result on one device.")]
+Resume = Annotated[bool, typer.Option("--resume", help="Go on with an interrupted run of the same output.")]
+ReportFile = Annotated[Path | None, typer.Option("--json", metavar="REPORT.json", help="Write a report.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")]
+ModelFile = Annotated[Path, typer.Argument(metavar="FILE.wlm", help="A file that compress wrote.")]
+
+
+def output_option(metavar: str, help_text: str) -> Any:
+    """``--output`` or ``-o``, for ``Annotated[Path, output_option(...)]``."""
+    return typer.Option("--output", "-o", metavar=metavar, help=help_text)
