@@ -31,7 +31,6 @@ MODULES = (
     "lightmap.blocks",
     "lightmap.decode",
     "lightmap.gather",
-    "mlp",
     "probe.cubes",
     "probe.gaussian_sum",
     "probe.step",
@@ -39,6 +38,7 @@ MODULES = (
     "raster.gradient",
     "raster.rasterize",
     "raster.texture",
+    "smoke.single_scatter",
 )
 WIDTHS = (8, 17, 32, 64)
 
@@ -75,8 +75,9 @@ def test_modules(name: str, tmp_path: Path):
 @pytest.mark.parametrize("gelu", _slow_but("fast", ["exact", "tanh"]))
 @pytest.mark.parametrize("hidden", _slow_but(16, WIDTHS))
 def test_mlp(hidden: int, gelu: str, tmp_path: Path):
-    """ "fast" has an instruction that only a GPU has."""
-    _compile_all(vars(mlp.kernels(16, hidden, gelu)).values(), tmp_path)
+    """ "fast" has an instruction that only a GPU has; three outputs, and another number."""
+    _compile_all(vars(mlp.kernels(16, hidden, gelu)).values(), tmp_path / "three")
+    _compile_all(vars(mlp.kernels(16, hidden, gelu, 5)).values(), tmp_path / "five")
 
 
 @pytest.mark.parametrize("gelu", _slow_but("tanh", ["exact"]))
