@@ -170,12 +170,12 @@ def progress_bar(what: str) -> Iterator[Callable[[int, int, str], None]]:
     console = _console(stderr=True)
     start = time.perf_counter()
     if not console.is_terminal:
-        shown = 0
+        reported = 0
 
         def line(done: int, total: int, text: str) -> None:
-            nonlocal shown
-            if (part := done * _PLAIN_REPORTS // max(total, 1)) > shown:
-                shown = part
+            nonlocal reported
+            if (part := done * _PLAIN_REPORTS // max(total, 1)) > reported:
+                reported = part
                 note(f"{what}: {done} of {total}{text and ', '}{text}, {_left(start, done, total)}")
 
         yield line
