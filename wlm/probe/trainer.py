@@ -8,7 +8,7 @@ import torch
 import warp as wp
 
 from wlm import interop
-from wlm.probe.model import CENTRE, CENTRE_BITS, LATENT, ROTATION, SCALE, Profile
+from wlm.probe.model import CENTRE, LATENT, ROTATION, SCALE, Profile, layer_shapes
 from wlm.probe.start import first_gaussians, morton_order
 from wlm_kernels.probe import network as probe_network
 from wlm_kernels.probe import step as probe_step
@@ -139,9 +139,7 @@ class Trainer:
         self._shapes = wp.zeros(count, dtype=Shape, device=self.device)
         self._by_group = wp.zeros((groups, -(-count // 32)), dtype=wp.uint32, device=self.device)
         self._by_gaussian = wp.zeros((count, -(-groups // 32)), dtype=wp.uint32, device=self.device)
-        levels = np.full(channels, 2**self.profile.bits - 1)
-        levels[CENTRE] = 2**CENTRE_BITS - 1
-        self._levels = self._put(levels, float)
+        self._levels = self._put(2 ** self.profile.code_bits() - 1, float)
 
     def _settings(self) -> Optimiser:
         p = self.profile
@@ -297,15 +295,14 @@ class Trainer:
     def _decoded(self) -> torch.Tensor:
         """What the network makes of the features, normalised, float32 [N, D]."""
         p, d = self.profile, self._outputs
-        inputs, hidden, wide = p.latent + 3, p.hidden, probe_network.padded(d)
-        sizes = [(inputs + 1, hidden), (hidden + 1, hidden), (hidden + 1, wide)]
-        parts = self._tensors["net"].split([rows * columns for rows, columns in sizes])
-        first, second, third = (part.view(size) for part, size in zip(parts, sizes, strict=True))
+        shapes = layer_shapes(p.latent, p.hidden, probe_network.padded(d))
+        parts = self._tensors["net"].split([rows * columns for rows, columns in shapes])
+        first, second, third = (part.view(shape) for part, shape in zip(parts, shapes, strict=True))
         x = wp.to_torch(self._groups.x)[: self._probes]
         h = torch.cat([self._tensors["f"].sum(0).T[: self._probes], x], 1)
-        h = torch.sigmoid(h @ first[:inputs] + first[inputs])
-        h = torch.sigmoid(h @ second[:hidden] + second[hidden])
-        return (h @ third[:hidden] + third[hidden])[:, :d]
+        h = torch.sigmoid(h @ first[:-1] + first[-1])
+        h = torch.sigmoid(h @ second[:-1] + second[-1])
+        return (h @ third[:-1] + third[-1])[:, :d]
 
     def mse(self) -> float:
         """Mean squared error of the live probes' numbers at the last step; NaN before the first."""
@@ -322,10 +319,10 @@ class Trainer:
         span = np.where(high > low, high - low, 1.0)
         code = np.rint((t["used"][self.kept] - low) / span * self._levels.numpy())
         code = np.where(high > low, code, 0).astype(np.uint16)
-        inputs, hidden, wide = p.latent + 3, p.hidden, probe_network.padded(d)
-        before = (inputs + 1) * hidden + (hidden + 1) * hidden
-        third = t["net"][before:].reshape(hidden + 1, wide)[:, :d] * self.spread
-        third[hidden] += self.mean
+        *others, last = layer_shapes(p.latent, p.hidden, probe_network.padded(d))
+        before = sum(rows * columns for rows, columns in others)
+        third = t["net"][before:].reshape(last)[:, :d] * self.spread
+        third[-1] += self.mean
         gain = float(np.abs(third).max()) or 1.0
         net = np.concatenate([t["net"][:before], (third / gain).ravel()])
         return {

@@ -5,9 +5,9 @@ S = diag(scale), R the rotation and W = S^-1 R^T,
 
     F(x) = sum_k F_k w_k(x),   w_k(x) = exp(-|u|^2 / 2),   u = W_k (x - centre_k),   over the k that reach x.
 
-``Shape`` is a row prepared for use. The backward pass sums, over the points, the symmetric a w u u^T and the vector a w u
-with a = dL/dF . F_k, and ``chain`` makes gradients of the row of them. No difference of large numbers is left in it.
-Where a Gaussian is a needle or a sheet, u itself is one: it is then computed in float64, for these Gaussians alone.
+``Shape`` is a row prepared for use. The backward pass sums, over the points, the symmetric a w u u^T and the vector
+a w u with a = dL/dF . F_k, and ``chain`` makes gradients of the row of them. No difference of large numbers is left in
+it. Where a Gaussian is a needle or a sheet, u itself is one: it is then computed in float64, for these Gaussians alone.
 
 The twin to read first: ``tests/reference/gaussians.py``.
 """

@@ -5,8 +5,8 @@ input, then the biases; a row of the last layer is padded to a multiple of four 
 
 On CUDA a block of threads takes up to 64 probes through all layers in shared memory, each thread a piece of 4 probes by
 8 units at a time: fourteen small matrix products, for which one probe per thread would spill its registers. That is
-CUDA C++, in ``native/layers.cuh`` and ``native/network.cuh``. On the CPU a thread takes one probe. Parts of the weights'
-gradients are written by block, to be added in a fixed order.
+CUDA C++, in ``native/layers.cuh`` and ``native/network.cuh``. On the CPU a thread takes one probe. Parts of the
+gradient of the weights are written by block, to be added in a fixed order.
 
 The twin to read first: ``tests/reference/probe_network.py``.
 """

@@ -1,7 +1,9 @@
 """The optimisers of Gaussians and network, one number per thread: Adan or Adam (gaussian-probe-compression, section 5).
 
-They are ours because a whole step has to be in one CUDA graph, which libraries that count steps in Python can't be. The
-twins to read first are torch's Adam and pytorch-optimizer's Adan: ``tests/kernels/test_probe_step.py`` holds them to both.
+They are ours because a whole step has to be in one CUDA graph, which libraries that count steps in Python can't be.
+
+The twins to read first: torch's Adam and pytorch-optimizer's Adan, to which ``tests/kernels/test_probe_step.py`` holds
+these.
 """
 
 import functools

@@ -1,10 +1,10 @@
-"""A training step of Gaussians and their network, all but the network (gaussian-probe-compression, section 3.2 and 3.3).
+"""A training step of the Gaussians (gaussian-probe-compression, section 3.2 and 3.3); ``network`` has the rest of it.
 
 Probes are sorted along a space-filling curve and taken in groups of 64 neighbours, each with a box. A step is five
 launches: which Gaussians meet which groups, as bit masks (``touch``); the Gaussians' sum at each probe (``features``);
 the network, forward and backward (``network``); the sums that the gradients of each Gaussian are made of
-(``collect``); and the optimisers (``update``). A launch runs over probes, or over Gaussians, and nothing is added up by atomics: one
-seed gives one result, on either device.
+(``collect``); and the optimisers (``update``). A launch runs over probes, or over Gaussians, and nothing is added up by
+atomics: one seed gives one result, on either device.
 
 The masks take the place of the paper's sorted lists of cubes in training, where the probes stand still: there is
 nothing to count, scan and sort (``cubes`` does, for points at any place).
