@@ -19,7 +19,7 @@ PSNR_CAP_DB = 120.0
 def check_pair(
     ref: np.ndarray, test: np.ndarray, mask: np.ndarray | None, where: str
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Check a reference, a test image and a mask; return them as float64, float64 and bool.
+    """Checks a reference, a test image and a mask, and returns them as float64, float64 and bool.
 
     Args:
         ref: `[H, W, C]`, linear.
