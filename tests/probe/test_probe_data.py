@@ -65,19 +65,15 @@ def test_npz(tmp_path):
         np.testing.assert_array_equal(loaded.position, _position())
         np.testing.assert_array_equal(loaded.values.reshape(N, 9, 3), _values(N, 9, 3))
         assert loaded.live.all()
-        dtypes = (loaded.position.dtype, loaded.values.dtype, loaded.live.dtype)
-        assert dtypes == (np.float64, np.float32, bool)
-
-
-def test_flat_and_shaped_values_are_one_set(tmp_path):
-    _same(load(_write(tmp_path / "a.npz")), from_arrays(_position(), _values(N, 27), name="a"))
+        assert [a.dtype for a in (loaded.position, loaded.values, loaded.live)] == [np.float64, np.float32, bool]
 
 
 @pytest.mark.parametrize("shape", [(N, 1), (N, 5), (N, 7, 3), (N, 1, 3), (N, 4, 3), (N, 16, 3), (1, 27), (1, 1)])
 def test_any_count_of_probes_and_numbers(shape):
-    loaded = from_arrays(_position(shape[0]), _values(*shape))
-    assert (loaded.probes, loaded.outputs) == (shape[0], np.prod(shape[1:]))
-    np.testing.assert_array_equal(loaded.values, _values(*shape).reshape(shape[0], -1))
+    probes = from_arrays(_position(shape[0]), _values(*shape))
+    assert (probes.probes, probes.outputs) == (shape[0], np.prod(shape[1:]))
+    _same(probes, from_arrays(_position(shape[0]), _values(*shape).reshape(shape[0], -1)))
+    np.testing.assert_array_equal(probes.values, _values(*shape).reshape(shape[0], -1))
 
 
 def test_several_arrays_need_a_key(tmp_path):
@@ -200,9 +196,8 @@ def test_dead_probes():
     values[5, 0, 0] = -np.inf
     loaded = from_arrays(_position(), values, name="yard")
     assert loaded.live.tolist() == [True, False, False, False, True, False]
-    assert loaded.warnings == (
-        "yard: 2 probes with a NaN or infinite number in sh, first probe 2: set to zero and left out",
-    )
+    (warning,) = loaded.warnings
+    assert warning == "yard: 2 probes with a NaN or infinite number in sh, first probe 2: set to zero and left out"
     np.testing.assert_array_equal(loaded.values[[1, 2, 3, 5]], 0.0)
     np.testing.assert_array_equal(loaded.values[[0, 4]], values[[0, 4]].reshape(2, 27))
     assert np.isnan(values[2, 4, 1])  # the caller's array is left alone
@@ -222,9 +217,8 @@ def test_no_live_probe_and_no_probe(tmp_path):
 def test_a_position_that_is_not_finite(bad):
     position = _position()
     position[4, 2] = bad
-    assert "position[4]: expected finite numbers, got (0.5, 0.625," in _message(
-        from_arrays, position, _values(N, 27)
-    )
+    text = _message(from_arrays, position, _values(N, 27))
+    assert "position[4]: expected finite numbers, got (0.5, 0.625," in text
 
 
 def test_positions_far_away_are_kept():
@@ -253,11 +247,12 @@ def test_coincident_positions():
     assert from_arrays(position, _values(N, 27)).warnings == ()
 
 
-def test_the_largest_number_and_beyond():
+def test_numbers_as_large_and_as_small_as_float32_allows():
     values = _values(N, 27)
-    values[3, 8], values[4, 0] = LARGEST, -LARGEST
+    values[3, 8], values[4, 0], values[5] = LARGEST, -LARGEST, -1e-44
     loaded = from_arrays(_position(), values)
-    assert loaded.values[3, 8] == np.float32(LARGEST) and loaded.live.all()
+    np.testing.assert_array_equal(loaded.values, values)
+    assert loaded.live.all() and loaded.warnings == ()
     with np.errstate(over="raise"):
         assert np.isfinite(np.square(loaded.values)).all()
     for bad in (LARGEST * 1.001, -1e30, 1e300, 1.7e308):
@@ -266,14 +261,6 @@ def test_the_largest_number_and_beyond():
         for convention in ("threejs", "godot"):
             message = _message(from_arrays, _position(), wide, convention=convention)
             assert "sh[3]: expected numbers within 1.8e+19, got " in message
-
-
-def test_negative_and_tiny_numbers_are_kept():
-    values = -np.abs(_values(N, 27))
-    values[0] = 1e-44
-    loaded = from_arrays(_position(), values)
-    np.testing.assert_array_equal(loaded.values, values)
-    assert loaded.live.all() and loaded.warnings == ()
 
 
 @pytest.mark.parametrize("dtype", [np.float16, np.float64, np.int16, np.uint8, ">f4", np.longdouble])
@@ -357,6 +344,7 @@ def test_an_array_that_claims_to_be_huge(tmp_path):
         ("[1]", "expected a JSON object, got [1]"),
         ('"sh"', 'expected a JSON object, got "sh"'),
         ("", "not valid JSON"),
+        ("\xff\xfe\x00", "not valid JSON"),
         ('{"position": [[0, 0, 0]], "sh": [[1]]', "not valid JSON"),
         ("[" * 100_000, "not valid JSON"),
         ("{}", "position is missing; found nothing"),
@@ -364,10 +352,7 @@ def test_an_array_that_claims_to_be_huge(tmp_path):
         ('{"position": [[0, 0, 0]], "sh": {"a": 1}}', "sh: expected a list, got an object"),
         ('{"position": [[0, 0, 0], [1, 1]], "sh": [[1], [2]]}', "position[1]: expected numbers, as many as"),
         ('{"position": [[0, 0, 0], [1, 1, 1]], "sh": [[1], [2, 3]]}', "sh[1]: expected numbers, as many as"),
-        (
-            '{"position": [[0, 0, 0]], "sh": [["1"]]}',
-            'sh[0]: expected numbers, as many as sh[0] has, got ["1"]',
-        ),
+        ('{"position": [[0, 0, 0]], "sh": [["1"]]}', 'numbers, as many as sh[0] has, got ["1"]'),
         ('{"position": [[0, 0, 0], [1, 1, 1]], "sh": [[1], [null]]}', "sh[1]: expected numbers"),
         ('{"position": [[0, 0, 0]], "sh": [[true]]}', "sh[0]: expected numbers"),
         ('{"position": [[0, 0, 0]], "sh": [[1%s, 0.5]]}' % ("0" * 400), "sh[0]: expected numbers"),
@@ -378,26 +363,20 @@ def test_an_array_that_claims_to_be_huge(tmp_path):
         ('{"probes": [3]}', "probes[0]: expected an object (position, sh), got 3"),
         ('{"probes": [{"position": [0, 0, 0], "sh": [1]}, {"sh": [1]}]}', "probes[1].position is missing"),
         ('{"probes": [{"position": [0, 0, 0], "sh": [1]}, {"position": [1, 1, 1]}]}', "probes[1].sh is missing"),
-        (
-            '{"probes": [{"position": [0, 0, 0], "sh": [1]}, {"position": 1, "sh": [1]}]}',
-            "position[1]: expected",
-        ),
+        ('{"probes": [{"position": [0, 0, 0], "sh": [1]}, {"position": 1, "sh": [1]}]}', "position[1]: expected"),
         ('{"probes": [{"position": [0, 0, 0]}]}', "begins with sh"),
     ],
 )
 def test_malformed_json_names_the_field(tmp_path, content, expected):
     path = tmp_path / "a.json"
-    path.write_text(content)
+    path.write_bytes(content.encode("latin-1"))
     message = _message(load, path)
     assert message.startswith(f"{path}: ") and expected in message
 
 
-def test_json_that_is_no_text_and_json_with_nan(tmp_path):
-    path = tmp_path / "a.json"
-    path.write_bytes(b"\xff\xfe\x00")
-    assert "a.json: not valid JSON" in _message(load, path)
-    path.write_text('{"position": [[0, 0, 0], [1, 1, 1]], "sh": [[1, 2], [NaN, 3]]}')
-    loaded = load(path)
+def test_json_with_nan(tmp_path):
+    content = {"position": [[0, 0, 0], [1, 1, 1]], "sh": [[1, 2], [float("nan"), 3]]}
+    loaded = load(_write_json(tmp_path / "a.json", content))
     assert loaded.live.tolist() == [True, False] and len(loaded.warnings) == 1
 
 
@@ -417,32 +396,20 @@ def test_positions_of_any_file(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("content", "expected"),
     [
-        ("", "not valid JSON"),
         ("[[0, 1", "not valid JSON"),
-        ("[" * 100_000, "not valid JSON"),
         ("\xff\xfe", "not valid JSON"),
         ("3", "expected a JSON object, got 3"),
         ("{}", "position: expected a list, got null"),
-        ('{"position": null}', "position: expected a list, got null"),
-        ('{"probes": 3}', "probes: expected a list, got 3"),
         ('{"probes": [{"sh": 3}]}', "probes[0].position is missing"),
-        ('{"probes": []}', "position: expected at least one, found none"),
         ("[]", "position: expected at least one, found none"),
         ("[[1, 2]]", "position: expected (N, 3), got (1, 2)"),
-        ("[[1, 2, 3], [1, 2]]", "position[1]: expected numbers, as many as position[0] has, got [1, 2]"),
-        ('[[0, 0, 0], [0, 1, "2"]]', "position[1]: expected numbers"),
-        ("[[true, true, false]]", "position[0]: expected numbers"),
-        ("[[0, 1, NaN]]", "position[0]: expected finite numbers"),
-        ("[[0, 1, 1e999]]", "position[0]: expected finite numbers"),
+        ('[[0, 0, 0], [0, 1, "2"]]', "position[1]: expected numbers, as many as position[0] has, got [0, 1, "),
         ("[[0, 1, 1" + "0" * 400 + "]]", "position[0]: expected numbers"),
-        ({}, "position is not a file"),
+        ("[[0, 1, 1e999]]", "position[0]: expected finite numbers"),
         ({"path": np.zeros((2, 3))}, "position is not a file"),
-        ({"position": np.zeros(3)}, "position: expected (N, 3), got (3,)"),
         ({"position": np.zeros((0, 3))}, "position: expected at least one, found none"),
         ({"position": np.zeros((2, 3), bool)}, "position: expected numbers, got bool"),
-        ({"position": np.array([["a", "b", "c"]])}, "position: expected numbers, got <U1"),
         ({"position": np.array([[None, 0, 0]])}, "cannot read the arrays"),
-        ({"position": np.array([[0.0, 0.0, 0.0], [np.inf, 0.0, 0.0]])}, "position[1]: expected finite numbers"),
     ],
 )
 def test_what_holds_no_positions(tmp_path, content, expected):
@@ -521,10 +488,8 @@ def test_writing_is_refused_without_touching_the_file(tmp_path):
 def test_arrays_are_copied():
     position, values = _position(), _values(N, 27)
     loaded = from_arrays(position, values)
-    position[:] = 0.0
-    values[:] = 0.0
-    np.testing.assert_array_equal(loaded.position, _position())
-    np.testing.assert_array_equal(loaded.values, _values(N, 27))
+    position[:], values[:] = 0.0, 0.0
+    _same(loaded, from_arrays(_position(), _values(N, 27)))
 
 
 @pytest.mark.parametrize("key", ["12.00", "21.00"])
@@ -533,11 +498,3 @@ def test_the_demo_set(key):
     assert loaded.warnings == () and loaded.outputs == 27 and 1500 < loaded.probes < 2500
     assert 0.5 * loaded.probes < loaded.live.sum() < loaded.probes
     assert DEMO.stat().st_size < 300_000
-
-
-def test_the_made_up_room():
-    room = synthetic(500, seed=3, coefficients=4, dead=7)
-    assert (room.probes, room.outputs, room.live.sum(), room.warnings) == (500, 12, 493, ())
-    _same(room, synthetic(500, seed=3, coefficients=4, dead=7))
-    assert room.source != synthetic(500, seed=4, coefficients=4, dead=7).source
-    assert synthetic(1, coefficients=16).outputs == 48

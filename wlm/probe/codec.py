@@ -62,7 +62,7 @@ def decode(artifact: Artifact) -> ProbeModel:
     profile = check_settings(Profile, settings["profile"], "profile: ")
     sizes = [settings[key] for key in ("probes", "outputs", "gaussians", "dropped")]
     if not all(type(size) is int for size in sizes) or min(sizes[:3]) < 1 or sizes[3] < 0:
-        raise ValueError(f"probes, outputs, gaussians, dropped: expected whole numbers, the first three above 0, got {sizes}")
+        raise ValueError(f"probes, outputs, gaussians, dropped: expected whole numbers, got {sizes}")
     probes, outputs, count, dropped = sizes
     parts = check_parts(artifact.tensors, _parts(profile, outputs))
     frame, positions = parts["frame"], parts["positions"]

@@ -113,7 +113,7 @@ def compress(
         size=size,
         dead=np.zeros(0, bool) if probes.live.all() else ~probes.live,
         positions=stored,
-        dropped=int((~trainer.kept).sum()),
+        dropped=int((~trainer.needed).sum()),
         **parts,
     )
 

@@ -74,7 +74,11 @@ def decode_kernels(latent: int, hidden: int, outputs: int, device_kind: str) -> 
     fn = functions(latent)
     add, vec_latent = fn.add, fn.vec_latent
     points = probes_at_once(latent, hidden, outputs)
-    options = {"enable_backward": False, "max_unroll": 32 if device_kind == "cuda" else 1}
+    cuda = device_kind == "cuda"
+    options = {"enable_backward": False, "max_unroll": 32 if cuda else 1}
+    network = cpu_network(latent, hidden, outputs)
+    forward, vec_in = network.forward, network.vec_in
+    finish = _finish(latent, hidden, outputs, points, vec_latent)
 
     @wp.func
     def sum_at(
@@ -103,23 +107,26 @@ def decode_kernels(latent: int, hidden: int, outputs: int, device_kind: str) -> 
                 shape = next_shape
         return f
 
-    if device_kind == "cpu":
-        network = cpu_network(latent, hidden, outputs)
-        forward, vec_in = network.forward, network.vec_in
-
-        @wp.kernel(module="unique", module_options=options)
-        def kernel(
-            # in:
-            rows: wp.array2d[float],
-            shapes: wp.array1d[Shape],
-            cubes: Cubes,
-            cut: float,
-            net: wp.array1d[float],
-            gain: float,
-            x: wp.array1d[wp.vec3],
-            # out:
-            out: wp.array2d[float],
-        ):
+    @wp.kernel(module="unique", module_options=options)
+    def kernel(
+        # in:
+        rows: wp.array2d[float],
+        shapes: wp.array1d[Shape],
+        cubes: Cubes,
+        cut: float,
+        net: wp.array1d[float],
+        gain: float,
+        x: wp.array1d[wp.vec3],
+        # out:
+        out: wp.array2d[float],
+    ):
+        if wp.static(cuda):
+            block, t = wp.tid()
+            # Threads past the end repeat the last point, so that all of a block meet.
+            i = wp.min(block * wp.static(points) + t % wp.static(points), x.shape[0] - 1)
+            f = sum_at(rows, shapes, cubes, cut, x[i], t // wp.static(points), wp.static(THREADS // points))
+            finish(f, x[i], net, gain, block, x.shape[0], out)
+        else:
             i = wp.tid()
             f = sum_at(rows, shapes, cubes, cut, x[i], 0, 1)
             v = vec_in()
@@ -130,29 +137,6 @@ def decode_kernels(latent: int, hidden: int, outputs: int, device_kind: str) -> 
             _h1, _h2, y = forward(net, v)
             for c in range(wp.static(outputs)):
                 out[i, c] = gain * y[c]
-
-    else:
-        share = THREADS // points
-        finish = _finish(latent, hidden, outputs, points, vec_latent)
-
-        @wp.kernel(module="unique", module_options=options)
-        def kernel(
-            # in:
-            rows: wp.array2d[float],
-            shapes: wp.array1d[Shape],
-            cubes: Cubes,
-            cut: float,
-            net: wp.array1d[float],
-            gain: float,
-            x: wp.array1d[wp.vec3],
-            # out:
-            out: wp.array2d[float],
-        ):
-            block, t = wp.tid()
-            # Threads past the end repeat the last point, so that all of a block meet.
-            i = wp.min(block * wp.static(points) + t % wp.static(points), x.shape[0] - 1)
-            f = sum_at(rows, shapes, cubes, cut, x[i], t // wp.static(points), wp.static(share))
-            finish(f, x[i], net, gain, block, x.shape[0], out)
 
     return DecodeKernels(latent, hidden, outputs, device_kind, points, kernel)
 

@@ -269,6 +269,8 @@ def step_kernels(latent: int, device_kind: str) -> StepKernels:
     add, accumulate = fn.add, fn.accumulate
     channels = LATENT + latent
     options = {"enable_backward": False, "max_unroll": 32}
+    cuda = device_kind == "cuda"
+    block_sum = _block_sum(vec_sums, SHAPE_NUMBERS + latent)
 
     @wp.kernel(module="unique", module_options=options)
     def shapes_kernel(
@@ -362,82 +364,54 @@ def step_kernels(latent: int, device_kind: str) -> StepKernels:
                     s = accumulate(s, shape, used, k, groups.x[i], gradient, cut)
         return s
 
-    if device_kind == "cpu":
-
-        @wp.kernel(module="unique", module_options=options)
-        def features(
-            # in:
-            groups: Groups,
-            shapes: wp.array1d[Shape],
-            used: wp.array2d[float],
-            by_group: wp.array2d[wp.uint32],
-            cut: float,
-            base: int,
-            # out:
-            f: wp.array3d[float],
-        ):
-            i = base + wp.tid()
-            s = sum_at(groups, shapes, used, by_group, cut, i, 0, 1)
-            for c in range(wp.static(latent)):
-                f[0, c, i] = s[c]
-
-        @wp.kernel(module="unique", module_options=options)
-        def collect(
-            # in:
-            groups: Groups,
-            shapes: wp.array1d[Shape],
-            used: wp.array2d[float],
-            by_gaussian: wp.array2d[wp.uint32],
-            grad_f: wp.array2d[float],
-            cut: float,
-            base: int,
-            # out:
-            sums: wp.array2d[float],
-        ):
-            k = base + wp.tid()
-            s = sums_of(groups, shapes, used, by_gaussian, grad_f, cut, k, 0, 1, 0, 1)
-            for c in range(wp.static(SHAPE_NUMBERS + latent)):
-                sums[k, c] = s[c]
-
-    else:
-        block_sum = _block_sum(vec_sums, SHAPE_NUMBERS + latent)
-
-        @wp.kernel(module="unique", module_options=options)
-        def features(
-            # in:
-            groups: Groups,
-            shapes: wp.array1d[Shape],
-            used: wp.array2d[float],
-            by_group: wp.array2d[wp.uint32],
-            cut: float,
-            base: int,
-            # out:
-            f: wp.array3d[float],
-        ):
+    @wp.kernel(module="unique", module_options=options)
+    def features(
+        # in:
+        groups: Groups,
+        shapes: wp.array1d[Shape],
+        used: wp.array2d[float],
+        by_group: wp.array2d[wp.uint32],
+        cut: float,
+        base: int,
+        # out:
+        f: wp.array3d[float],
+    ):
+        if wp.static(cuda):
             g, split, lane = wp.tid()
             i = g * GROUP + lane
             s = sum_at(groups, shapes, used, by_group, cut, i, split, SPLITS)
             for c in range(wp.static(latent)):
                 f[split, c, i] = s[c]
+        else:
+            i = base + wp.tid()
+            s = sum_at(groups, shapes, used, by_group, cut, i, 0, 1)
+            for c in range(wp.static(latent)):
+                f[0, c, i] = s[c]
 
-        @wp.kernel(module="unique", module_options=options)
-        def collect(
-            # in:
-            groups: Groups,
-            shapes: wp.array1d[Shape],
-            used: wp.array2d[float],
-            by_gaussian: wp.array2d[wp.uint32],
-            grad_f: wp.array2d[float],
-            cut: float,
-            base: int,
-            # out:
-            sums: wp.array2d[float],
-        ):
+    @wp.kernel(module="unique", module_options=options)
+    def collect(
+        # in:
+        groups: Groups,
+        shapes: wp.array1d[Shape],
+        used: wp.array2d[float],
+        by_gaussian: wp.array2d[wp.uint32],
+        grad_f: wp.array2d[float],
+        cut: float,
+        base: int,
+        # out:
+        sums: wp.array2d[float],
+    ):
+        if wp.static(cuda):
             k, t = wp.tid()
             s = sums_of(
                 groups, shapes, used, by_gaussian, grad_f, cut, k, t // GROUP, _COLLECTORS // GROUP, t % GROUP, GROUP
             )
             block_sum(s, k, sums)
+        else:
+            k = base + wp.tid()
+            s = sums_of(groups, shapes, used, by_gaussian, grad_f, cut, k, 0, 1, 0, 1)
+            for c in range(wp.static(SHAPE_NUMBERS + latent)):
+                sums[k, c] = s[c]
 
     return StepKernels(latent, device_kind, shapes_kernel, features, collect, update_kernel(latent))
 
