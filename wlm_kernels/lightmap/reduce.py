@@ -1,6 +1,6 @@
 """Sums over a CUDA block of samples, in native code: see ``native/block_sums.cuh``, and why there.
 
-Read first: ``tests/reference/network.py``, whose gradients by autograd these sums are.
+Read first: ``tests/reference/temporal.py``, ``losses``, whose gradients by autograd these sums are.
 """
 
 from pathlib import Path
