@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import yaml
 from builders.probe_sets import synthetic
-from test_cli import call, fails
+from builders.running import call, fails
 
 import wlm.cli.console
 from wlm.baselines import probe as baselines

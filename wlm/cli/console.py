@@ -9,7 +9,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -164,6 +164,8 @@ def quiet_warp() -> None:
 def progress_bar(what: str) -> Iterator[Callable[[int, int, str], None]]:
     """Shows progress on stderr: a bar on a terminal, else a plain line about every tenth of the work.
 
+    Of work without a known number of steps there is one line, at its beginning.
+
     Args:
         what: The work, in a word or two.
 
@@ -177,6 +179,8 @@ def progress_bar(what: str) -> Iterator[Callable[[int, int, str], None]]:
 
         def line(done: int, total: int, text: str) -> None:
             nonlocal reported
+            if not done and not total:
+                note(what)
             if (part := done * _PLAIN_REPORTS // max(total, 1)) > reported:
                 reported = part
                 note(f"{what}: {done} of {total}{text and ', '}{text}, {_left(start, done, total)}")
@@ -237,6 +241,8 @@ def deferred_interrupt() -> Iterator[Callable[[], None]]:
 def running(what: str, checkpoint: Path | None = None) -> "Iterator[OnProgress]":
     """Shows the progress of long work and, where it has a checkpoint, lets Ctrl-C stop it between two steps.
 
+    Each stage that isn't ``what`` has a bar of its own, named ``what: stage``.
+
     Args:
         what: The work, in a word or two.
         checkpoint: The file that keeps an interrupted run; None: Ctrl-C ends the work at once.
@@ -247,10 +253,16 @@ def running(what: str, checkpoint: Path | None = None) -> "Iterator[OnProgress]"
     last: Any = None
     with deferred_interrupt() if checkpoint is not None else nullcontext(lambda: None) as check_interrupt:
         try:
-            with progress_bar(what) as bar:
+            with ExitStack() as bars:
+                bar = bars.enter_context(progress_bar(what))
 
                 def report(progress: "Progress") -> None:
-                    nonlocal last
+                    nonlocal bar, last
+                    if progress.stage != (what if last is None else last.stage):
+                        bars.close()
+                        bar = bars.enter_context(
+                            progress_bar(what if progress.stage == what else f"{what}: {progress.stage}")
+                        )
                     last = progress
                     figures = ", ".join(_named_figure(*item) for item in progress.figures.items())
                     bar(progress.done, progress.total, figures)
