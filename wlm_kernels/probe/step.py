@@ -417,7 +417,7 @@ def step_kernels(latent: int, device_kind: str) -> StepKernels:
 
 def _block_sum(vec_sums, numbers: int):
     """The sum of a vector over a CUDA block, in a fixed order, into row k of an array."""
-    @wp.func_native(native_source(__package__, "block_sum", numbers=numbers, warps=_COLLECTORS // 32))
+    @wp.func_native(native_source(__package__, "block_sum", N=numbers, WARPS=_COLLECTORS // 32))
     def block_sum(v: vec_sums, k: int, out: wp.array2d[float]): ...
 
     return block_sum
