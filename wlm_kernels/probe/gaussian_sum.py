@@ -175,7 +175,7 @@ def _sphere(support: str) -> int:
 
 
 def shapes(rows, cut: float, support: str = "ellipsoid"):
-    """What the rows of Gaussians come to.
+    """Builds the ``Shape`` of each row.
 
     Args:
         rows: float [K, 10 + L], see ``gaussians``.
