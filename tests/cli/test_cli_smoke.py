@@ -7,12 +7,14 @@ import signal
 import numpy as np
 import pytest
 import torch
+import wlm.smoke.simulate
 import yaml
 from builders.smoke_plumes import SCENE, SPHERE, plume, write_frames
 from PIL import Image
 from test_cli import call, fails
+from wlm.smoke.guide import guide
+from wlm.smoke.simulate import simulate
 
-import wlm.smoke.simulate
 from wlm.errors import WlmError
 from wlm.fluid.solver import Solver
 from wlm.fluid.volume import from_array, load_volume
@@ -21,9 +23,7 @@ from wlm.smoke.baking import six_way
 from wlm.smoke.camera import axis_faults
 from wlm.smoke.data import CHECKPOINT, open_footage, open_frames, read_six_way, save_volume
 from wlm.smoke.exporter import read_flipbook
-from wlm.smoke.guide import guide
 from wlm.smoke.scene import CameraSettings, LightSettings, Scene, make_camera
-from wlm.smoke.simulate import simulate
 from wlm.view.smoke import picture, to_bytes
 
 SMALL = ("--resolution", 20, "--step", 1)

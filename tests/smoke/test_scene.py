@@ -11,6 +11,7 @@ import torch
 import yaml
 from builders.smoke_plumes import SCENE, SPHERE, plume, write_frames
 from pydantic import ValidationError
+from wlm.smoke.guide import guide
 
 from wlm.config import profile_names
 from wlm.errors import WlmError
@@ -30,7 +31,6 @@ from wlm.smoke.data import (
     write_guide,
     write_six_way,
 )
-from wlm.smoke.guide import guide
 from wlm.smoke.scene import (
     CameraSettings,
     LightSettings,

@@ -7,10 +7,10 @@ import pytest
 import torch
 from builders.smoke_plumes import plume
 from PIL import Image
+from wlm.smoke.guide import guide
 
 from wlm.errors import WlmError
 from wlm.smoke.baking import SixWay, six_way
-from wlm.smoke.guide import guide
 from wlm.smoke.scene import CameraSettings, LightSettings, Obstacle, make_camera
 from wlm.smoke.shading import Light, Ramp
 from wlm.view.smoke import (
