@@ -189,7 +189,7 @@ def test_predict_says_where_it_has_not_learned(network, volume, tmp_path, resolu
 
 
 def test_predict_frames(network, tmp_path):
-    folder = write_frames(tmp_path / "frames").folder
+    folder = write_frames(tmp_path / "frames").path
     call("smoke", "predict", folder, "-o", tmp_path / "six", "--network", network, "--resolution", 170)
     assert " ".join(call.stderr.split()).count("has learned from") == 1
     call("smoke", "predict", folder, "-o", tmp_path / "six", "--network", network, "--resolution", 17)
