@@ -20,7 +20,8 @@ import torch
 
 from wlm.config import check_settings
 from wlm.errors import WlmError
-from wlm.fluid.volume import DensityVolume, load_volume
+from wlm.fluid.volume import DensityVolume
+from wlm.fluid.volume import load_volume as load
 from wlm.formats.atomic import atomic_path, atomic_write
 from wlm.formats.exr_planes import read_planes, write_planes
 from wlm.formats.folder import claim, read_index
@@ -97,7 +98,7 @@ class Frames:
         for name in ("extinction", "emission"):
             override = getattr(self, name)
             factors[name] = override if override is not None else getattr(smoke, name, 1.0)
-        return load_volume(self.file(number), **factors, device=self.device)
+        return load(self.file(number), **factors, device=self.device)
 
     def volumes(
         self, numbers: Sequence[int] | None = None, progress: OnProgress | None = None
