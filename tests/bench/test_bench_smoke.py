@@ -28,7 +28,6 @@ TINY = replace(
     small=12,
     compared=(20, 40),
     drift=60,
-    tolerances=(1e-6, 10.0),
     fills=(0.0, 1.0),
     coarse=6,
     cloud=24,
@@ -44,8 +43,6 @@ TINY = replace(
 METHODS = [
     ("jet", "lattice"),
     ("jet", "lattice storage"),
-    ("jet", "lattice bricks"),
-    ("shear", "lattice bricks"),
     ("ball", "advection"),
     ("cube", "advection bricks"),
     ("cloud", "guide"),
@@ -106,17 +103,6 @@ def test_sixteen_bits_lose_little(rows):
     assert share(figures(storage["float16, 40 steps"])["largest"]) > share(figures(storage["float16, 40 steps"])["RMS"])
     drift = {name: abs(float(figures(storage[f"{name}, 60 steps"])["mass drift"])) for name in ("float32", "float16")}
     assert drift["float32"] < drift["float16"] < 1e-4
-
-
-def test_bricks_are_held_to_the_dense_lattice(rows):
-    lattice = of(rows, "lattice bricks")
-    assert lattice["tolerance 1e-06"].max_error < 1e-6
-    # Beyond any speed, all is at rest but what the inlet touches.
-    rough = lattice["tolerance 10"]
-    assert rough.max_error > 1e-4 and share(figures(rough)["worked on"]) < 1.0
-    assert share(figures(lattice["flow in 0%"])["worked on"]) == 0.0
-    assert share(figures(lattice["flow in 100%"])["worked on"]) == 1.0
-    assert lattice["flow in 100%"].max_error < 1e-6
 
 
 def test_schemes_and_a_solution(rows):

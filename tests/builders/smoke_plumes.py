@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from wlm.fluid.volume import DensityVolume, from_array
+from wlm.fluid.volume import DensityVolume, from_array, save_volume
 from wlm.smoke.camera import Camera
-from wlm.smoke.data import Frames, load_frames, open_frames, save_volume
+from wlm.smoke.data import Frames, load_frames, open_frames
 from wlm.smoke.scene import Scene
 
 SCENE = {

@@ -6,7 +6,7 @@ import torch
 from builders.smoke_plumes import plume
 
 import wlm
-from wlm.smoke.data import save_volume
+from wlm.fluid.volume import save_volume
 
 
 @pytest.fixture

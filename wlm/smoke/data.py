@@ -20,9 +20,8 @@ import torch
 
 from wlm.config import check_settings
 from wlm.errors import WlmError
-from wlm.fluid.volume import DensityVolume
-from wlm.fluid.volume import load_volume as load
-from wlm.formats.atomic import atomic_path, atomic_write
+from wlm.fluid.volume import DensityVolume, load_volume
+from wlm.formats.atomic import atomic_write
 from wlm.formats.exr_planes import read_planes, write_planes
 from wlm.formats.folder import claim, read_index
 from wlm.smoke.camera import DIRECTIONS, EMISSION, Camera
@@ -36,11 +35,11 @@ __all__ = [
     "SCENE_FILE",
     "Frames",
     "NumberedFiles",
+    "load",
     "load_frames",
     "numbered",
     "open_frames",
     "read_six_way",
-    "save_volume",
     "spread",
     "write_guide",
     "write_six_way",
@@ -49,6 +48,9 @@ __all__ = [
 SCENE_FILE = "scene.json"
 CHECKPOINT = "simulation.partial"
 """In the folder of frames, as long as the simulation isn't done."""
+
+# The name of every system's reader.
+load = load_volume
 
 _FORMAT, _VERSION = "wlm-smoke-frames", 1
 _TRANSPARENCY = "transparency"
@@ -98,7 +100,7 @@ class Frames:
         for name in ("extinction", "emission"):
             override = getattr(self, name)
             factors[name] = override if override is not None else getattr(smoke, name, 1.0)
-        return load(self.file(number), **factors, device=self.device)
+        return load_volume(self.file(number), **factors, device=self.device)
 
     def volumes(
         self, numbers: Sequence[int] | None = None, progress: OnProgress | None = None
@@ -226,25 +228,6 @@ class NumberedFiles:
     def _earlier(self) -> list[Path]:
         files = numbered(self.folder, self._stem, self._suffix).values()
         return [*files, *(self.folder / name for name in self._others)]
-
-
-def save_volume(path: str | os.PathLike[str], volume: DensityVolume) -> None:
-    """Writes a volume as ``.npz``, whole or not at all, such that ``wlm.smoke.load`` reads it back.
-
-    Raises:
-        WlmError: Another suffix, or the file can't be written.
-    """
-    if Path(path).suffix.lower() != ".npz":
-        raise WlmError(f"{path}: expected a name that ends in .npz")
-    arrays = {
-        "density": volume.density.cpu().numpy(),
-        "voxel": np.float64(volume.voxel),
-        "origin": np.asarray(volume.origin, np.float64),
-    }
-    if volume.temperature is not None:
-        arrays["temperature"] = volume.temperature.cpu().numpy()
-    with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        np.savez_compressed(file, **arrays)
 
 
 def write_guide(path: str | os.PathLike[str], guide: Guide) -> None:

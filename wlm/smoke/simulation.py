@@ -11,13 +11,12 @@ import warp as wp
 
 from wlm.errors import WlmError
 from wlm.fluid import solver as fluid
-from wlm.fluid import solver_lattice
 from wlm.fluid.faces import FACES
 from wlm.fluid.lattice import Domain, Lattice
-from wlm.fluid.obstacles import Mesh, Obstacle, Path, Sphere
-from wlm.fluid.volume import DensityVolume
+from wlm.fluid.obstacles import Mesh, Obstacle, Sphere, Trajectory
+from wlm.fluid.volume import DensityVolume, save_volume
 from wlm.interop import free_memory
-from wlm.smoke.data import CHECKPOINT, Frames, save_volume
+from wlm.smoke.data import CHECKPOINT, Frames
 from wlm.smoke.scene import Inlet, Scene, SourceSettings
 from wlm.system import Meter, OnProgress
 
@@ -160,7 +159,7 @@ def _require_memory(scene: Scene, device: str) -> None:
             f" at most the {free / 2**30:.1f} GiB that are free: use fewer cells, a lower refine or storage: float16"
         )
     # A grid may also have more voxels than can be numbered.
-    solver_lattice.require_memory(grid.shape, voxel, warp_device)
+    fluid.require_memory(grid.shape, voxel, warp_device)
 
 
 def _make_lattice(scene: Scene, device: str) -> Lattice:
@@ -258,7 +257,7 @@ def _obstacles(scene: Scene) -> list[Obstacle]:
     obstacles: list[Obstacle] = []
     for settings in scene.obstacles:
         keys = np.array(settings.path)
-        path = Path.of((keys[:, 1:] - grid.origin) / grid.cell, keys[:, 0] / scene.step)
+        path = Trajectory.of((keys[:, 1:] - grid.origin) / grid.cell, keys[:, 0] / scene.step)
         if settings.shape == "sphere":
             obstacles.append(Sphere(path, settings.radius / grid.cell))
         else:
