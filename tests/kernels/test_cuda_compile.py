@@ -16,7 +16,7 @@ from wlm_kernels.probe import gaussian_sum, optimiser
 from wlm_kernels.probe import network as probe_network
 from wlm_kernels.probe import step as probe_step
 from wlm_kernels.smoke import march as smoke_march
-from wlm_kernels.smoke import march_coarse, march_motion, march_six
+from wlm_kernels.smoke import march_coarse, march_guide, march_motion, march_six
 
 ARCHITECTURE = 90
 MODULES = (
@@ -31,7 +31,6 @@ MODULES = (
     "lightmap.blocks",
     "lightmap.decode",
     "lightmap.gather",
-    "mlp",
     "probe.cubes",
     "probe.gaussian_sum",
     "probe.step",
@@ -39,6 +38,7 @@ MODULES = (
     "raster.gradient",
     "raster.rasterize",
     "raster.texture",
+    "smoke.single_scatter",
 )
 WIDTHS = (8, 17, 32, 64)
 
@@ -75,8 +75,9 @@ def test_modules(name: str, tmp_path: Path):
 @pytest.mark.parametrize("gelu", _slow_but("fast", ["exact", "tanh"]))
 @pytest.mark.parametrize("hidden", _slow_but(16, WIDTHS))
 def test_mlp(hidden: int, gelu: str, tmp_path: Path):
-    """ "fast" has an instruction that only a GPU has."""
-    _compile_all(vars(mlp.kernels(16, hidden, gelu)).values(), tmp_path)
+    """ "fast" has an instruction that only a GPU has; three outputs, and another number."""
+    _compile_all(vars(mlp.kernels(16, hidden, gelu)).values(), tmp_path / "three")
+    _compile_all(vars(mlp.kernels(16, hidden, gelu, 5)).values(), tmp_path / "five")
 
 
 @pytest.mark.parametrize("gelu", _slow_but("tanh", ["exact"]))
@@ -124,7 +125,8 @@ def test_probe_network(latent: int, hidden: int, outputs: int, tmp_path: Path):
 @pytest.mark.parametrize("dtype", _slow_but(wp.float16, [wp.float32]))
 def test_marching(dtype: type, tmp_path: Path):
     """Marches through densities of either type."""
-    _compile_all(vars(smoke_march.guide_kernels(dtype)).values(), tmp_path / "guide")
+    _compile_all([smoke_march.occupied_kernel(dtype)], tmp_path / "bricks")
+    _compile_all(vars(march_guide.guide_kernels(dtype)).values(), tmp_path / "guide")
     _compile_all(vars(march_six.six_kernels(dtype)).values(), tmp_path / "six")
     _compile_all([march_motion.motion_kernel(dtype)], tmp_path / "motion")
 

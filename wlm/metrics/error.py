@@ -128,8 +128,8 @@ def psnr(ref: np.ndarray, test: np.ndarray, mask: np.ndarray | None = None, peak
 
 
 def psnr_from_mse(error: float, peak: float) -> float:
-    """`psnr` for a mean squared error that is known already, with the same cap and the same NaN."""
-    if peak == 0.0:
+    """`psnr` of a mean squared error, with the same cap; NaN where the error is NaN or the peak isn't above 0."""
+    if math.isnan(error) or not peak > 0.0:
         return math.nan
     if error == 0.0:
         return PSNR_CAP_DB
