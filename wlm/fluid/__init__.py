@@ -24,33 +24,25 @@ Lengths are in cells of the lattice, times in its steps; ``Domain`` converts fro
 
 from wlm._facade import facade
 
-__all__ = [
-    "FACES",
-    "Buoyancy",
-    "DensityVolume",
-    "Domain",
-    "Lattice",
-    "Mesh",
-    "Obstacle",
-    "Solver",
-    "Source",
-    "Sphere",
-    "Trajectory",
-    "box_mesh",
-    "from_array",
-    "from_grid",
-    "load_volume",
-    "save_volume",
-]
-
-_MODULES = {
-    "faces": ("FACES",),
-    "lattice": ("Domain", "Lattice"),
-    "obstacles": ("Mesh", "Obstacle", "Sphere", "Trajectory", "box_mesh"),
-    "solver": ("Buoyancy", "Solver", "Source"),
-    "volume": ("DensityVolume", "from_array", "from_grid", "load_volume", "save_volume"),
+_PLACES = {
+    "Buoyancy": "wlm.fluid.solver",
+    "DensityVolume": "wlm.fluid.volume",
+    "Domain": "wlm.fluid.lattice",
+    "FACES": "wlm.fluid.faces",
+    "Lattice": "wlm.fluid.lattice",
+    "Mesh": "wlm.fluid.obstacles",
+    "Obstacle": "wlm.fluid.obstacles",
+    "Solver": "wlm.fluid.solver",
+    "Source": "wlm.fluid.solver",
+    "Sphere": "wlm.fluid.obstacles",
+    "Trajectory": "wlm.fluid.obstacles",
+    "box_mesh": "wlm.fluid.obstacles",
+    "from_array": "wlm.fluid.volume",
+    "from_grid": "wlm.fluid.volume",
+    "load_volume": "wlm.fluid.volume",
+    "save_volume": "wlm.fluid.volume",
 }
 
-__getattr__, __dir__ = facade(
-    __name__, {name: f"{__name__}.{module}" for module, names in _MODULES.items() for name in names}
-)
+__all__ = sorted(_PLACES)
+
+__getattr__, __dir__ = facade(__name__, _PLACES)
