@@ -110,30 +110,25 @@ def evaluate(
         check_output(json_path, ".json")
     quiet_warp()
     from wlm.atlas.decode import Decoder
-    from wlm.atlas.evaluation import evaluate
     from wlm.atlas.exporter import disk_ratio, read_folder
-    from wlm.atlas.model import SOURCE_BITS
-    from wlm.baselines.atlas import downsampling
+    from wlm.baselines.atlas import evaluate_rivals, share_of
 
     output = read_folder(folder)
     model = output.model
     original = _inputs(output, mesh, lightmap, mask)
     decoder = Decoder(model, device)
-    texels = model.height * model.width
-    bits = round((1.0 - model.compression_ratio) * texels * SOURCE_BITS)
-    # Half a bit more, so that rounding takes none away.
-    rival = downsampling(original, (bits + 0.5) / (texels * SOURCE_BITS))
     with progress_bar("evaluate") as bar:
-        reports = evaluate(
+        ours, ((rival, other),) = evaluate_rivals(
+            model,
+            decoder,
             original,
-            {"ours": decoder, rival.name: rival.sample},
             views=views,
             resolution=resolution,
             device=decoder.device,
             labels=_labels(model, original, decoder.device),
             progress=lambda done, total: bar(done, total, ""),
         )
-    ours, other = reports["ours"], reports[rival.name]
+    rival_cr = 1.0 - share_of(rival, original)
     facts = {
         "method": model.method,
         "profile": model.profile.name,
@@ -142,11 +137,11 @@ def evaluate(
         "cr_disk": disk_ratio(output.model_bytes, model),
     }
     if json_path is not None:
-        rest = {"size": list(rival.size), "cr": 1.0 - rival.share, "seconds": rival.seconds}
+        rest = {"size": list(rival.size), "cr": rival_cr, "seconds": rival.encode_seconds}
         settings = {"cameras": views, "resolution": resolution, "device": decoder.device}
         write_json(json_path, ours.to_json() | facts | settings | {rival.name: other.to_json() | rest})
     rows = table(f"{folder}: {ours.views} views", ["", "ours", rival.name])
-    rows.add_row("CR (eq. 9)", f"{facts['cr']:.2%}", f"{1.0 - rival.share:.2%}")
+    rows.add_row("CR (eq. 9)", f"{facts['cr']:.2%}", f"{rival_cr:.2%}")
     rows.add_row("CR on disk", f"{facts['cr_disk']:.2%}", "–")
     for label, name, form in _ROWS:
         rows.add_row(label, *(number(getattr(each, name), form) for each in (ours, other)))

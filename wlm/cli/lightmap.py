@@ -21,8 +21,10 @@ from wlm.cli.console import (
 from wlm.errors import WlmError
 
 if TYPE_CHECKING:
+    from wlm.baselines.lightmap import Score
+    from wlm.baselines.rival import Rival
     from wlm.lightmap.data import LightmapSet
-    from wlm.lightmap.evaluation import BaselineReport, Report
+    from wlm.lightmap.evaluation import Report
     from wlm.lightmap.model import LightmapModel, Profile
 
 __all__ = ["app"]
@@ -161,7 +163,7 @@ def evaluate(
     quiet_warp()
     from wlm.interop import check_device
     from wlm.lightmap import codec
-    from wlm.lightmap.evaluation import evaluate, evaluate_baselines
+    from wlm.lightmap.evaluation import evaluate
 
     device = check_device(device)
     model = codec.read(file)
@@ -174,16 +176,18 @@ def evaluate(
             device=device,
             progress=lambda done, total: bar(done, total, ""),
         )
-    others: list[BaselineReport] = []
+    rivals: list[tuple[Rival, Score]] = []
     if baselines:
+        from wlm.baselines.lightmap import evaluate_rivals
+
         with progress_bar("baselines") as bar:
-            others = evaluate_baselines(
+            rivals = evaluate_rivals(
                 model, lightmaps, tuple(_NAMES), progress=lambda done, total: bar(done, total, "")
             )
     if json_path is not None:
-        extra = {"baselines": [other.to_json() for other in others]} if baselines else {}
+        extra = {"baselines": [rival.to_json() | score.to_json() for rival, score in rivals]} if baselines else {}
         write_json(json_path, report.to_json() | extra)
-    _show_report(file, report, others)
+    _show_report(file, report, rivals)
 
 
 @app.command()
@@ -315,7 +319,7 @@ def _show_compressed(path: Path, model: "LightmapModel", lightmaps: "LightmapSet
     show(rows)
 
 
-def _show_report(file: Path, report: "Report", others: "list[BaselineReport]") -> None:
+def _show_report(file: Path, report: "Report", rivals: "list[tuple[Rival, Score]]") -> None:
     rows = table(str(file), ["", "PSNR dB", "SSIM", "FLIP", "bytes", "bpp"])
 
     def add(name: str, psnr: float, ssim: float, flip: float, size: str = "", bpp: str = "") -> None:
@@ -329,8 +333,8 @@ def _show_report(file: Path, report: "Report", others: "list[BaselineReport]") -
         f"{report.bytes:,}",
         f"{report.bpp:.3f}",
     )
-    for other in others:
-        add(_NAMES[other.name], other.psnr, other.ssim, other.flip, f"{other.bytes:,}", f"{other.bpp:.3f}")
+    for rival, score in rivals:
+        add(_NAMES[rival.name], score.psnr, score.ssim, score.flip, f"{score.bytes:,}", f"{score.bpp:.3f}")
     rows.add_section()
     scores = (report.psnr_by_time, report.ssim_by_time, report.flip_by_time)
     for stamp, *values in zip(report.time_values, *scores, strict=True):

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from wlm import interop
-from wlm.baselines import BASELINES
 from wlm.errors import WlmError
 from wlm.lightmap.data import LightmapSet
 from wlm.lightmap.decode import Decoder
@@ -19,13 +18,12 @@ from wlm.lightmap.tiles import TileGrid, TileKind
 from wlm.metrics import METRICS, FrameMetrics, Summary, evaluate_frame, summarise
 
 __all__ = [
-    "BaselineReport",
     "Report",
     "bits_per_texel",
     "count_kinds",
     "evaluate",
-    "evaluate_baselines",
     "part_bytes",
+    "scored_mask",
 ]
 
 # Stored times are float32 where that keeps them apart; see ``wlm.lightmap.codec``.
@@ -99,31 +97,6 @@ class Report:
         return _plain({field.name: getattr(self, field.name) for field in dataclasses.fields(self)})
 
 
-@dataclass(frozen=True)
-class BaselineReport:
-    """A block codec on the same lightmaps, scored over the same texels.
-
-    Attributes:
-        name: As in ``wlm.baselines.BASELINES``.
-        psnr, ssim, flip: As in ``Report``.
-        bpp: Bits a texel and time. These codecs have a fixed rate, so this holds for any part of the map.
-        bytes: Of all times of the whole map, also where only some tiles are scored.
-        encode_seconds: Wall-clock time of the encoder over all times, one thread.
-    """
-
-    name: str
-    psnr: float
-    ssim: float
-    flip: float
-    bpp: float
-    bytes: int
-    encode_seconds: float
-
-    def to_json(self) -> dict[str, Any]:
-        """The report as JSON's own types; NaN is None."""
-        return _plain(dataclasses.asdict(self))
-
-
 def evaluate(
     model: LightmapModel,
     lightmaps: LightmapSet,
@@ -155,7 +128,7 @@ def evaluate(
     """
     start = time.perf_counter()
     device = interop.check_device(device)
-    mask = _scored_mask(model, lightmaps)
+    mask = scored_mask(model, lightmaps)
     decoder = Decoder(model, device)
     frames = []
     for i, stamp in enumerate(model.times):
@@ -164,49 +137,6 @@ def evaluate(
         if progress is not None:
             progress(i + 1, len(model.times))
     return _report(model, lightmaps, file_bytes, device, frames, time.perf_counter() - start)
-
-
-def evaluate_baselines(
-    model: LightmapModel,
-    lightmaps: LightmapSet,
-    names: Sequence[str] = ("bc6h", "bc7", "astc12", "astc10", "8bit"),
-    *,
-    metrics: Sequence[str] = METRICS,
-    progress: Callable[[int, int], None] | None = None,
-) -> list[BaselineReport]:
-    """Puts every time through block codecs, one time at once, and scores the texels that ``evaluate`` scores.
-
-    Args:
-        model: The model to compare with: it says which tiles are scored.
-        lightmaps: The input.
-        names: Keys of ``wlm.baselines.BASELINES``.
-        metrics: As for ``evaluate``.
-        progress: Called after each codec and time with the number done and the number in all.
-
-    Returns:
-        One report a name, in their order.
-
-    Raises:
-        WlmError: As ``evaluate``, an unknown name, or the extra `baselines` is missing.
-    """
-    for name in names:
-        if name not in BASELINES:
-            raise WlmError(f"baselines: unknown codec {name!r}, expected one of {', '.join(BASELINES)}")
-    mask = _scored_mask(model, lightmaps)
-    reports = []
-    texels = lightmaps.mask.size * len(lightmaps.frames)
-    for k, name in enumerate(names):
-        frames, size, seconds = [], 0, 0.0
-        for i, frame in enumerate(lightmaps.frames):
-            # The whole map's mask: an engine would encode all of it, whatever we score.
-            result = BASELINES[name](frame, lightmaps.mask)
-            size, seconds = size + result.bytes, seconds + result.encode_seconds
-            frames.append(evaluate_frame(frame, result.decoded, mask, TILE, metrics, name=name))
-            if progress is not None:
-                progress(k * len(lightmaps.frames) + i + 1, len(names) * len(lightmaps.frames))
-        summary = summarise(frames)
-        reports.append(BaselineReport(name, summary.psnr, summary.ssim, summary.flip, size * 8 / texels, size, seconds))
-    return reports
 
 
 def bits_per_texel(model: LightmapModel, mask: np.ndarray, file_bytes: int) -> float:
@@ -255,8 +185,15 @@ def _held(model: LightmapModel) -> np.ndarray:
     return tiles.repeat(TILE, axis=0).repeat(TILE, axis=1)[: grid.height, : grid.width]
 
 
-def _scored_mask(model: LightmapModel, lightmaps: LightmapSet) -> np.ndarray:
-    """Checks that a set fits a model; bool [H, W] of the valid texels that the model holds."""
+def scored_mask(model: LightmapModel, lightmaps: LightmapSet) -> np.ndarray:
+    """Checks that a set fits a model.
+
+    Returns:
+        bool [H, W], the valid texels that the model holds: those that are scored.
+
+    Raises:
+        WlmError: As ``evaluate``.
+    """
     count, height, width = lightmaps.frames.shape[:3]
     if (height, width) != (model.height, model.width):
         raise WlmError(
