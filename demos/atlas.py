@@ -65,12 +65,12 @@ def run(out: Path, device: str) -> dict[str, dict[str, float]]:
         decoder = Decoder(model, device)
         rival = downsampling(mesh, 1.0 - model.compression_ratio)
         reports = evaluate(
-            mesh, {"ours": decoder, "rival": rival.sample}, views=VIEWS, resolution=RESOLUTION, device=device
+            mesh, {"ours": decoder, "rival": rival.decoded}, views=VIEWS, resolution=RESOLUTION, device=device
         )
         size = (folder / MODEL_FILE).stat().st_size
         figures[name] = _figures(model, size, reports["ours"], reports["rival"]) | {"seconds to compress": seconds}
         if name == "standard":
-            drawn = {"decoded": decoder, "downsampled": rival.sample}
+            drawn = {"decoded": decoder, "downsampled": rival.decoded}
             _check_rebuilt(decoder.lightmap(mesh), mesh)
     atomic_write(out / "room_report.json", (json.dumps(figures, indent=1) + "\n").encode())
     comparison(out / "room.png", mesh, drawn, DRAWN, resolution=640, device=device)
