@@ -12,6 +12,7 @@ demo: $(STAMP)
 	$(BIN)/python demos/probe.py
 	$(BIN)/python demos/smoke.py
 	$(BIN)/python demos/smoke_network.py
+	$(BIN)/python demos/gallery.py
 
 demo-network: $(STAMP)
 	$(BIN)/python demos/smoke_network.py --train

@@ -19,12 +19,12 @@ import numpy as np
 
 from wlm.cli.console import quiet_warp, show_figures
 from wlm.errors import WlmError
-from wlm.fluid.volume import DensityVolume, load_volume
+from wlm.fluid.volume import DensityVolume, load_volume, save_volume
 from wlm.formats.atomic import atomic_write
 from wlm.interop import check_device
 from wlm.smoke.baking import SixWay, lit, six_way
 from wlm.smoke.camera import DIRECTIONS, axis_faults
-from wlm.smoke.data import open_footage, open_frames, save_volume
+from wlm.smoke.data import open_footage, open_frames
 from wlm.smoke.exporter import read_flipbook, write_flipbook
 from wlm.smoke.guide import guide
 from wlm.smoke.learn.synthetic import make_plume

@@ -120,14 +120,14 @@ class _Loader(yaml.SafeLoader):
     """A safe loader that refuses a key given twice, of which YAML would silently keep the last."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        seen = set()
+        keys = set()
         for key_node, _ in node.value:
             if isinstance(key_node, yaml.ScalarNode):
-                if key_node.value in seen:
+                if key_node.value in keys:
                     raise yaml.constructor.ConstructorError(
                         None, None, f"the key '{key_node.value}' is given twice", key_node.start_mark
                     )
-                seen.add(key_node.value)
+                keys.add(key_node.value)
         return super().construct_mapping(node, deep)
 
 
@@ -162,9 +162,9 @@ def _suggestion(cls: type[BaseModel], location: tuple[int | str, ...]) -> str:
         # A union, a list or a dict of models: its keys would need a guess.
         if not (isinstance(model, type) and issubclass(model, BaseModel)):
             return ""
-    known = [field.alias or name for name, field in model.model_fields.items()]
-    close = difflib.get_close_matches(str(location[-1]), known, n=1)
-    return f"; did you mean '{close[0]}'?" if close else f"; expected one of: {', '.join(known)}"
+    fields = [field.alias or name for name, field in model.model_fields.items()]
+    close = difflib.get_close_matches(str(location[-1]), fields, n=1)
+    return f"; did you mean '{close[0]}'?" if close else f"; expected one of: {', '.join(fields)}"
 
 
 def _shown(value: object) -> str:

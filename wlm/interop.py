@@ -54,14 +54,14 @@ def check_device(name: str) -> str:
     Raises:
         WlmError: No such device; the line lists those that there are.
     """
-    wanted = "cuda:0" if name == "cuda" else name
+    full_name = "cuda:0" if name == "cuda" else name
     devices = available_devices()
-    if wanted not in devices:
+    if full_name not in devices:
         hint = ""
-        if wanted.startswith("cuda") and wp.get_cuda_device_count() > torch.cuda.device_count():
+        if full_name.startswith("cuda") and wp.get_cuda_device_count() > torch.cuda.device_count():
             hint = "; Warp sees a GPU that this build of torch does not"
         raise WlmError(f"device '{name}': expected one of: {', '.join(devices)}{hint}")
-    return wanted
+    return full_name
 
 
 def device_name(device: torch.device) -> str:

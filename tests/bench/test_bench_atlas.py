@@ -7,7 +7,7 @@ from builders.bench_rows import check_command, check_outputs, keys
 
 import wlm.bench.atlas as bench
 from wlm.atlas.data import LightmappedMesh, write_mesh
-from wlm.atlas.evaluation import evaluate
+from wlm.atlas.evaluation import compare
 from wlm.atlas.fit import compress
 from wlm.atlas.model import Profile
 from wlm.bench import write_json
@@ -68,7 +68,7 @@ def test_rows_are_of_what_they_name(lightmaps, rows):
     row = rows[0]
     assert row["bpp"] == pytest.approx(48 * (1 - model.compression_ratio))
     assert row["compression_ratio"] == model.compression_ratio
-    report = evaluate(mesh, {"a": bench.Decoder(model)}, views=3, resolution=64)["a"]
+    report = compare(mesh, {"a": bench.Decoder(model)}, views=3, resolution=64)["a"]
     for name in ("psnr", "psnr_worst", "texel_psnr", "one_minus_ssim"):
         assert row[name] == pytest.approx(getattr(report, name)), name
     assert "seam_ratio" not in row.figures  # a sheet has no seam

@@ -24,7 +24,6 @@ TINY = replace(
     small=12,
     compared=(20, 40),
     drift=60,
-    tolerances=(1e-6, 10.0),
     fills=(0.0, 1.0),
     coarse=6,
     cloud=24,
@@ -40,8 +39,6 @@ TINY = replace(
 METHODS = [
     ("jet", "lattice"),
     ("jet", "lattice storage"),
-    ("jet", "lattice bricks"),
-    ("shear", "lattice bricks"),
     ("ball", "advection"),
     ("cube", "advection bricks"),
     ("cloud", "guide"),
@@ -93,16 +90,6 @@ def test_sixteen_bits_lose_little(rows):
     assert storage["float16, 40 steps"]["largest"] > storage["float16, 40 steps"]["rms"]
     drift = {name: abs(storage[f"{name}, 60 steps"]["mass_drift"]) for name in ("float32", "float16")}
     assert drift["float32"] < drift["float16"] < 1e-4
-
-
-def test_bricks_are_compared_with_the_dense_lattice(rows):
-    lattice = by_option(rows, "lattice bricks")
-    assert lattice["tolerance 1e-06"]["max_error"] < 1e-6
-    # Beyond any speed, all is at rest but what the inlet touches.
-    rough = lattice["tolerance 10"]
-    assert rough["max_error"] > 1e-4 and rough["worked_on"] < 1.0
-    assert lattice["flow in 0%"]["worked_on"] == 0.0 and lattice["flow in 100%"]["worked_on"] == 1.0
-    assert lattice["flow in 100%"]["max_error"] < 1e-6
 
 
 def test_schemes_and_a_solution(rows):

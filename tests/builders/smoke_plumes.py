@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from wlm.fluid.volume import DensityVolume, from_array
-from wlm.smoke.data import Frames, frame_file, open_frames, read_frames, save_volume
+from wlm.fluid.volume import DensityVolume, from_array, save_volume
+from wlm.smoke.data import Frames, frame_file, open_frames, read_frames
 from wlm.smoke.scene import Scene
 
 SCENE = {

@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from builders.running import call, fails
 from builders.smoke_plumes import SCENE, SPHERE, plume, write_frames
 from PIL import Image
-from test_cli import call, fails
 
 import wlm.smoke.simulate
 from wlm.errors import WlmError
 from wlm.fluid.solver import Solver
-from wlm.fluid.volume import from_array, load_volume
+from wlm.fluid.volume import from_array, load_volume, save_volume
 from wlm.formats.exr_planes import read_planes
 from wlm.smoke.baking import six_way
 from wlm.smoke.camera import axis_faults
-from wlm.smoke.data import CHECKPOINT, open_footage, open_frames, read_six_way, save_volume
+from wlm.smoke.data import CHECKPOINT, open_footage, open_frames, read_six_way
 from wlm.smoke.exporter import read_flipbook
 from wlm.smoke.guide import guide
 from wlm.smoke.scene import CameraSettings, LightSettings, Scene, make_camera

@@ -9,14 +9,15 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from builders.running import call, fails
 from builders.smoke_plumes import plume, write_frames
-from test_cli import call, fails
 
+from wlm.fluid.volume import save_volume
 from wlm.formats.artifact import read_artifact
 from wlm.smoke import codec
 from wlm.smoke.coarse import coarse_six_way
 from wlm.smoke.codec import load_network, save_network, settings_of, shipped
-from wlm.smoke.data import open_footage, read_six_way, save_volume
+from wlm.smoke.data import open_footage, read_six_way
 from wlm.smoke.decode import Predictor, predict
 from wlm.smoke.learn import dataset
 from wlm.smoke.learn.dataset import DatasetSettings

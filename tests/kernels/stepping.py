@@ -6,11 +6,11 @@ import numpy as np
 import torch
 import warp as wp
 from reference import temporal as reference
-from reference.network import mlp
 
 from wlm import interop
 from wlm.lightmap.model import Profile, TimeAxis, encode_time
 from wlm.lightmap.trainer import Targets, Trainer
+from wlm.ops import plain
 
 TILE = 128
 
@@ -211,7 +211,7 @@ class Problem:
 
     def losses(self) -> torch.Tensor:
         """Each tile's loss."""
-        answer = mlp(self.hidden, self.output, self.features(), self.gelu)
+        answer = plain.mlp(self.features(), self.hidden, self.output, gelu=self.gelu)
         return reference.losses(answer, self.target, self.weight)
 
     def step(self) -> Step:

@@ -9,6 +9,7 @@ import warp as wp
 from reference import gaussians as reference
 
 from kernels.compare import array, close
+from wlm.ops import plain
 from wlm_kernels.probe import gaussian_sum, optimiser
 from wlm_kernels.probe import step as probe_step
 from wlm_kernels.probe.gaussians import SHAPE_NUMBERS, Shape
@@ -268,7 +269,7 @@ class Training:
         network = torch.optim.Adam([net], lr=NET_RATE)
         x, grad_f = (torch.tensor(v, dtype=torch.float64) for v in (self.step.x, self.grad_f))
         for factor, partial in zip(SCHEDULE, self.net_grads, strict=True):
-            f = reference.gaussian_sum(torch.cat(groups, 1), x, self.step.cut)
+            f = plain.gaussian_sum(torch.cat(groups, 1), x, cut=self.step.cut).T
             gaussians.zero_grad()
             (f * grad_f).sum().backward()
             net.grad = torch.tensor(partial.astype(np.float64).sum(0))

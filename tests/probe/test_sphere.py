@@ -31,13 +31,13 @@ def quadrature(order):
     return np.stack([ring * np.cos(phi), ring * np.sin(phi), z], 1), np.repeat(weight * np.pi / order, 2 * order)
 
 
-def test_the_order_and_the_signs_are_the_house_s():
+def test_the_order_and_the_signs_are_canonical():
     x, y, z = d = unit(20).T
-    found = basis(d.T, 9)
+    values = basis(d.T, 9)
     named = [np.ones(20), y, z, x, x * y, y * z, 3 * z * z - 1, x * z, x * x - y * y]
     published = [0.282095, 0.488603, 0.488603, 0.488603, 1.092548, 1.092548, 0.315392, 1.092548, 0.546274]
     for column, (shape, factor) in enumerate(zip(named, published, strict=True)):
-        np.testing.assert_allclose(found[:, column], factor * shape, atol=2e-6)
+        np.testing.assert_allclose(values[:, column], factor * shape, atol=2e-6)
 
 
 def test_the_basis_is_orthonormal():
@@ -46,7 +46,7 @@ def test_the_basis_is_orthonormal():
     np.testing.assert_allclose((values * weights[:, None]).T @ values, np.eye(121), atol=1e-12)
 
 
-def test_the_basis_is_scipy_s():
+def test_the_basis_equals_that_of_scipy():
     directions = unit(40)
     found = basis(directions, 25)
     theta, phi = np.arccos(directions[:, 2]), np.arctan2(directions[:, 1], directions[:, 0])

@@ -15,7 +15,7 @@ from pydantic import ValidationError
 from wlm.config import profile_names
 from wlm.errors import WlmError
 from wlm.fluid.faces import FACES
-from wlm.fluid.volume import from_array, load_volume
+from wlm.fluid.volume import from_array, load_volume, save_volume
 from wlm.formats.exr_planes import read_planes, write_planes
 from wlm.smoke.baking import six_way
 from wlm.smoke.data import (
@@ -26,7 +26,6 @@ from wlm.smoke.data import (
     open_frames,
     read_frames,
     read_six_way,
-    save_volume,
     write_guide,
     write_six_way,
 )

@@ -12,9 +12,9 @@ from builders.smoke_samples import small_pool
 
 from wlm.baselines.smoke import billboard
 from wlm.errors import WlmError
+from wlm.fluid.volume import save_volume
 from wlm.metrics.error import psnr_from_mse
 from wlm.smoke.baking import six_way
-from wlm.smoke.data import save_volume
 from wlm.smoke.decode import Predictor
 from wlm.smoke.evaluation import (
     COARSE,

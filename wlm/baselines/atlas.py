@@ -14,7 +14,7 @@ from __future__ import annotations
 import functools
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -22,7 +22,7 @@ import torch
 
 from wlm.atlas.coverage import touched_texels
 from wlm.atlas.data import LightmappedMesh
-from wlm.atlas.evaluation import Report, Sampler, evaluate
+from wlm.atlas.evaluation import Score, compare
 from wlm.atlas.model import SOURCE_BITS, AtlasModel
 from wlm.atlas.resize import FILTERS, fitting_size, resize
 from wlm.baselines.rival import Rival
@@ -46,36 +46,24 @@ def share_of(rival: Rival, mesh: LightmappedMesh) -> float:
 
 
 def evaluate_rivals(
-    model: AtlasModel,
-    decoder: Sampler,
-    mesh: LightmappedMesh,
-    names: Sequence[str] = ("downsampling",),
-    *,
-    labels: Mapping[str, Sampler] | None = None,
-    **options: Any,
-) -> tuple[Report, list[tuple[Rival, Report]]]:
-    """Scores a model beside rivals of as many bits, on the same views.
+    model: AtlasModel, mesh: LightmappedMesh, names: Sequence[str] = ("downsampling",), **options: Any
+) -> list[tuple[Rival, Score]]:
+    """Scores rivals of as many bits as a model.
 
     Args:
         model: It says how many bits.
-        decoder: Of the model.
         mesh: The mesh with its original lightmap.
         names: Keys of ``RIVALS``.
-        labels: Numbers of the model's own charts, as for ``wlm.atlas.evaluate``.
-        options: Views, resolution, device and progress, as for it.
-
-    Returns:
-        The model's report, and the rivals with theirs.
+        options: As for ``wlm.atlas.evaluation.compare``.
 
     Raises:
-        WlmError, ValueError: As ``wlm.atlas.evaluate`` or the rival.
+        WlmError, ValueError: As ``compare`` or the rival.
     """
     bits = round((1.0 - model.compression_ratio) * mesh.mask.size * SOURCE_BITS)
     # Half a bit more, so that rounding takes none away.
     rivals = [RIVALS[name](mesh, (bits + 0.5) / (mesh.mask.size * SOURCE_BITS)) for name in names]
-    decoders = {"ours": decoder, **{rival.name: rival.decoded for rival in rivals}}
-    reports = evaluate(mesh, decoders, labels=labels, **options)
-    return reports["ours"], [(rival, reports[rival.name]) for rival in rivals]
+    scores = compare(mesh, {rival.name: rival.decoded for rival in rivals}, **options)
+    return [(rival, scores[rival.name]) for rival in rivals]
 
 
 def downsampling(mesh: LightmappedMesh, share: float, filter: str = "fit") -> Rival:

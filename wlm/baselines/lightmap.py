@@ -26,7 +26,7 @@ from wlm.lightmap.data import LightmapSet
 from wlm.lightmap.evaluation import scored_mask
 from wlm.lightmap.model import TILE, LightmapModel
 from wlm.metrics import METRICS, evaluate_frame, summarise
-from wlm.system import Report
+from wlm.system import Meter, OnProgress, Report
 from wlm.texels import fill_gaps
 
 __all__ = ["RIVALS", "Score", "encode_8bit", "encode_astc", "encode_bc6h", "encode_bc7", "evaluate_rivals"]
@@ -152,7 +152,7 @@ def evaluate_rivals(
     names: Sequence[str] = ("bc6h", "bc7", "astc12", "astc10", "8bit"),
     *,
     metrics: Sequence[str] = METRICS,
-    progress: Callable[[int, int], None] | None = None,
+    progress: OnProgress | None = None,
 ) -> list[tuple[Rival, Score]]:
     """Puts every time through block codecs, one time after the other, and scores the texels that ``evaluate`` scores.
 
@@ -161,7 +161,7 @@ def evaluate_rivals(
         lightmaps: The input.
         names: Keys of ``RIVALS``.
         metrics: As for ``wlm.lightmap.evaluate``.
-        progress: Called after each codec and time with the number done and the number in all.
+        progress: Called about twice a second.
 
     Returns:
         For each name the rival, with bytes and seconds of all times and without what was decoded, and its score.
@@ -173,6 +173,7 @@ def evaluate_rivals(
         if name not in RIVALS:
             raise WlmError(f"baselines: unknown codec {name!r}, expected one of {', '.join(RIVALS)}")
     mask, count = scored_mask(model, lightmaps), len(lightmaps.frames)
+    meter = Meter(progress, "baselines", len(names) * count)
     results = []
     for k, name in enumerate(names):
         rivals, frames = [], []
@@ -181,8 +182,8 @@ def evaluate_rivals(
             rival = RIVALS[name](frame, lightmaps.mask)
             frames.append(evaluate_frame(frame, rival.decoded, mask, TILE, metrics, name=name))
             rivals.append(replace(rival, decoded=None))  # a set of them is too much memory
-            if progress is not None:
-                progress(k * count + i + 1, len(names) * count)
+            if meter.due(k * count + i + 1):
+                meter.report(k * count + i + 1)
         summed = {key: sum(getattr(rival, key) for rival in rivals) for key in _SUMMED}
         rival, summary = replace(rivals[0], **summed), summarise(frames)
         bpp = rival.bytes * 8 / (lightmaps.mask.size * count)

@@ -18,7 +18,8 @@ from wlm.baselines import probe_mbd, probe_pca
 from wlm.baselines.rival import Rival, measure
 from wlm.errors import WlmError
 from wlm.probe.data import ProbeSet
-from wlm.probe.evaluation import Report, evaluate
+from wlm.probe.evaluation import Report, score
+from wlm.system import Meter, OnProgress
 
 __all__ = [
     "RIVALS",
@@ -301,7 +302,7 @@ def evaluate_rivals(
     budget_bytes: int,
     names: Sequence[str] = (),
     *,
-    progress: Callable[[int, int, str], None] | None = None,
+    progress: OnProgress | None = None,
     skipped: Callable[[WlmError], None] | None = None,
 ) -> list[tuple[Rival, Report]]:
     """Scores the rivals at one size.
@@ -310,13 +311,14 @@ def evaluate_rivals(
         probes: The input.
         budget_bytes: The largest size, that of our file.
         names: Keys of ``RIVALS``; none: all.
-        progress: Called after each rival with the number done, the number in all, and its name.
+        progress: Called after each rival.
         skipped: Called for a rival that can't be that small, or that can't hold such probes, with the reason.
 
     Returns:
         The others, with their reports.
     """
     names = names or tuple(RIVALS)
+    meter = Meter(progress, "baselines", len(names))
     results = []
     for done, name in enumerate(names, 1):
         try:
@@ -325,9 +327,8 @@ def evaluate_rivals(
             if skipped is not None:
                 skipped(error)
         else:
-            results.append((rival, evaluate(rival.decoded, probes, rival.bytes)))
-        if progress is not None:
-            progress(done, len(names), name)
+            results.append((rival, score(rival.decoded, probes, rival.bytes)))
+        meter.report(done)
     return results
 
 

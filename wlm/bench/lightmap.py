@@ -28,13 +28,12 @@ from wlm.bench.plot import Panel
 from wlm.bench.rows import Row
 from wlm.bench.runner import Bench, Fit, Note, demo_data
 from wlm.errors import WlmError
-from wlm.lightmap import codec
-from wlm.lightmap.data import LightmapSet, load_set
+from wlm.lightmap.data import LightmapSet, load
 from wlm.lightmap.decode import Decoder
 from wlm.lightmap.evaluation import bits_per_texel, count_kinds
 from wlm.lightmap.exact import bound64, colour_tile64, decode_tile64
 from wlm.lightmap.fit import compress, dynamic_targets
-from wlm.lightmap.model import TILE, LightmapModel, Profile, TimeAxis, encode_time, load_profile
+from wlm.lightmap.model import TILE, LightmapModel, Profile, TimeAxis, encode_time
 from wlm.lightmap.runtime import ExactDecoder, StripDecoder
 from wlm.lightmap.tiles import TileGrid, TileKind, assemble
 from wlm.metrics import METRICS, Summary, evaluate_frame, summarise
@@ -107,8 +106,8 @@ def run(
     Raises:
         WlmError: The set or the device isn't there, or a fit diverged.
     """
-    lightmaps = load_set(demo_data("city", "--set PATH") if set_path is None else set_path)
-    profiles = [load_profile(name) for name in (QUICK_PROFILES if quick else PROFILES)]
+    lightmaps = load(demo_data("city", "--set PATH") if set_path is None else set_path)
+    profiles = [Profile.load(name) for name in (QUICK_PROFILES if quick else PROFILES)]
     chosen = np.arange(len(lightmaps.times))
     if quick:
         steps = max(200, _QUICK_TILE_STEPS // TileGrid.of(*lightmaps.mask.shape).count)
@@ -201,7 +200,7 @@ class _LightmapBench(Bench):
         """Fits and writes a profile; compiling its kernels is no part of either time."""
         self.note(f"{profile.name}: fitting {self.grid.count} tiles, {profile.steps:,} steps")
         compress(self.lightmaps, profile.model_copy(update={"steps": 10}), device=self.device)
-        return self.fit(profile.name, lambda: compress(self.lightmaps, profile, device=self.device), codec)
+        return self.fit(profile.name, lambda: compress(self.lightmaps, profile, device=self.device))
 
     def profile_row(self, fit: Fit) -> tuple[Row, Callable[[], object]]:
         """What a profile costs and yields; and its decode, to be timed."""

@@ -21,7 +21,6 @@ CUDA is timed as the replay of a graph, so that gaps between launches do not cou
 """
 
 import os
-import zlib
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
@@ -36,13 +35,13 @@ from wlm.bench.plot import Panel
 from wlm.bench.rows import Row, read_json
 from wlm.bench.runner import Bench, Fit, Note, demo_data, exact_errors
 from wlm.errors import WlmError
-from wlm.probe import codec
-from wlm.probe.data import ProbeSet, load_probes
+from wlm.probe.codec import pack_dead
+from wlm.probe.data import ProbeSet, load
 from wlm.probe.decode import Decoder, Points
-from wlm.probe.evaluation import Report, evaluate
+from wlm.probe.evaluation import Report, score
 from wlm.probe.exact import decode64
 from wlm.probe.fit import compress
-from wlm.probe.model import ProbeModel, Profile, load_profile
+from wlm.probe.model import ProbeModel, Profile
 from wlm.probe.volume import SIZES, Volume
 from wlm.probe.walk import EYE_HEIGHT, camera_path, summary, walk
 
@@ -94,7 +93,7 @@ def run(
         quick: Short fits, no other ratios than the profiles', rivals of one size, a short walk, and of the demo noon
             alone: under two minutes on two CPU cores. Its errors are those of unfinished fits.
         device: "cpu" or "cuda:0", for fits, decodes and the volume.
-        probes_path: A file as ``wlm.probe.data.load_probes`` reads it; None: the checkout's
+        probes_path: A file as ``wlm.probe.load`` reads it; None: the checkout's
             ``demos/data/probes/street.npz``.
         keys: Which of the file's arrays, one set of rows each; none: the only one, or noon and night of the demo's.
         rivals: With the PCA family and Unreal's packing, which take minutes on the CPU and no GPU: ``run_rivals``
@@ -108,7 +107,7 @@ def run(
         WlmError: The file, a key or the device isn't there, or a fit diverged.
     """
     sets = _load(probes_path, keys or (_DEMO_KEYS[: 1 if quick else None] if probes_path is None else ()))
-    profiles = [load_profile(name) for name in PROFILES]
+    profiles = [Profile.load(name) for name in PROFILES]
     if quick:
         steps = max(200, _QUICK_PROBE_STEPS // max(int(probes.live.sum()) for probes in sets))
         profiles = [profile.model_copy(update={"steps": min(steps, profile.steps)}) for profile in profiles]
@@ -157,7 +156,7 @@ def run_rivals(
 def _load(path: str | os.PathLike[str] | None, keys: Sequence[str]) -> list[ProbeSet]:
     if path is None:
         path = demo_data("probes/street.npz", "--probes FILE")
-    return [load_probes(path, key=key) for key in keys or (None,)]
+    return [load(path, key=key) for key in keys or (None,)]
 
 
 def run_rows(
@@ -223,7 +222,7 @@ class _ProbeBench(Bench):
         """Fits and writes a profile; compiling its kernels is no part of either time."""
         self.note(f"{option}: fitting {len(self.position):,} probes, {profile.steps:,} steps")
         compress(self.probes, profile.model_copy(update={"steps": 10}), device=self.device)
-        return self.fit(option, lambda: compress(self.probes, profile, device=self.device), codec)
+        return self.fit(option, lambda: compress(self.probes, profile, device=self.device))
 
     def profile_row(self, fit: Fit) -> tuple[Row, Callable[[], object]]:
         """What a fit costs and yields; and its decode, to be timed."""
@@ -316,7 +315,7 @@ class _ProbeBench(Bench):
             encode_seconds=seconds * p.steps,
             step_ms=1e3 * seconds,
             times_ours=1e3 * seconds / step_ms,
-            psnr=evaluate(self._all(peer.decoded()), self.probes, fit.bytes).psnr if whole else None,
+            psnr=score(self._all(peer.decoded()), self.probes, fit.bytes).psnr if whole else None,
             **counts,
         )
         return [ours, dense]
@@ -336,7 +335,7 @@ class _ProbeBench(Bench):
             rival = encode(position=self.position, values=self.values)
         except WlmError as error:  # nothing fits, or no L0, L1 or L2 in RGB
             return self.missing_row(method, option, error)
-        report = evaluate(self._all(rival.decoded), self.probes, rival.bytes + self._dead_bytes())
+        report = score(self._all(rival.decoded), self.probes, rival.bytes + self._dead_bytes())
         return self.row(
             method,
             option,
@@ -403,7 +402,7 @@ class _ProbeBench(Bench):
         """The score, and the errors against float64."""
         decoder.run(points)
         values = points.values()
-        return evaluate(self._all(values), self.probes, size), exact_errors(values, exact)
+        return score(self._all(values), self.probes, size), exact_errors(values, exact)
 
     def _all(self, live: np.ndarray) -> np.ndarray:
         """Values of all probes, the dead ones zero."""
@@ -413,8 +412,7 @@ class _ProbeBench(Bench):
 
     def _dead_bytes(self) -> int:
         """What the list of dead probes takes, as in our file."""
-        dead = ~self.probes.live
-        return len(zlib.compress(np.packbits(dead).tobytes(), 9)) if dead.any() else 0
+        return len(pack_dead(~self.probes.live))
 
 
 def _size_and_psnr(report: Report) -> dict[str, float]:

@@ -16,6 +16,7 @@ from wlm.bench.rows import Row
 from wlm.bench.timing import Timing, time_together
 from wlm.errors import WlmError
 from wlm.interop import StepGraph, check_device
+from wlm.system import Model, load
 
 __all__ = ["Bench", "Fit", "Note", "demo_data", "exact_errors"]
 
@@ -29,13 +30,15 @@ class Fit:
 
     Attributes:
         option: What its row is called.
-        model: As read from the file.
+        model: As loaded from the file.
+        fitted: As it was before.
         bytes: Size of the file.
         fit_seconds, write_seconds: Wall-clock times.
     """
 
     option: str
     model: Any
+    fitted: Any
     bytes: int
     fit_seconds: float
     write_seconds: float
@@ -121,13 +124,12 @@ class Bench:
         """Makes the row of what can't be measured: a package isn't installed, or nothing fits the size."""
         return self.row(method, option, f"not measured: {error}")
 
-    def fit(self, option: str, compress: Callable[[], Any], codec: Any) -> Fit:
-        """Fits a model, writes it and reads it back.
+    def fit(self, option: str, compress: Callable[[], Model]) -> Fit:
+        """Fits a model, saves it and loads it again.
 
         Args:
             option: What its row is called.
             compress: Fits it; everything that it needs has been compiled.
-            codec: The system's, with ``write`` and ``read``.
         """
         start = time.perf_counter()
         model = compress()
@@ -135,9 +137,9 @@ class Bench:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "model.wlm"
             writing = time.perf_counter()
-            size = codec.write(path, model)
+            size = model.save(path)
             written = time.perf_counter()
-            return Fit(option, codec.read(path), size, fitted - start, written - writing)
+            return Fit(option, load(path, self.system), model, size, fitted - start, written - writing)
 
     def replay(self, call: Callable[[], object]) -> StepGraph:
         """Captures a call in a graph on CUDA, so that gaps between launches do not count."""

@@ -1,4 +1,4 @@
-"""Air and smoke in motion: the lattice beside a copy, its bricks, 16 bits, and the schemes that carry smoke."""
+"""Air and smoke in motion: the lattice beside a copy, 16 bits, and the schemes that carry smoke."""
 
 from __future__ import annotations
 
@@ -17,12 +17,9 @@ from wlm_kernels.fluid import advection, advection_places, advection_sources
 from wlm_kernels.fluid.lattice_sets import lattice as velocity_set
 from wlm_kernels.fluid.lattice_solids import voxelise_sphere
 
-__all__ = ["advection_rows", "lattice_brick_rows", "lattice_rows", "smoke_brick_rows", "storage_rows"]
+__all__ = ["advection_rows", "lattice_rows", "smoke_brick_rows", "storage_rows"]
 
 _SPEED = 0.1  # of the inlet, cells a step
-# Speed of the slab that moves along itself, the cells over which it rises, and the tolerance for rest: the lattice's
-# response to the rise far away is a hundredth of that.
-_SHEAR, _RISE, _REST = 0.05, 8, 1e-4
 _VISCOSITY = 1e-6
 _COPIED = {"cpu": 1 << 24, "cuda": 1 << 28}  # floats: far more than caches hold
 _RATIO = 4
@@ -100,60 +97,6 @@ def storage_rows(bench: SmokeBench) -> list[Row]:
     return rows
 
 
-def lattice_brick_rows(bench: SmokeBench) -> list[Row]:
-    """Bricks against the dense lattice: by tolerance in a jet's beginning, and by the share of air in motion."""
-    bench.note("lattice: bricks")
-    return _jet_brick_rows(bench) + _shear_brick_rows(bench)
-
-
-def _jet_brick_rows(bench: SmokeBench) -> list[Row]:
-    size = bench.sizes.lattice
-    jets = {f"tolerance {t:g}": _jet(bench, size, bricks=True, tolerance=t) for t in bench.sizes.tolerances}
-    dense = _jet(bench, size)
-    return _brick_rows(bench, "jet", {"dense": dense, **jets}, lambda name: dense)
-
-
-def _shear_brick_rows(bench: SmokeBench) -> list[Row]:
-    fills = {f"flow in {100 * fill:g}%": fill for fill in bench.sizes.fills}
-    shears = {name: _shear(bench, fill, bricks=True, tolerance=_REST) for name, fill in fills.items()}
-    for lattice in shears.values():
-        lattice.step(2 * lattice.period)  # at first all bricks are worked on
-    shears = {"dense": _shear(bench, 0.5), **shears}
-    return _brick_rows(bench, "shear", shears, lambda name: _shear(bench, fills[name]))
-
-
-def _brick_rows(
-    bench: SmokeBench, scene: str, lattices: dict[str, Lattice], exact: Callable[[str], Lattice]
-) -> list[Row]:
-    """Times lattices side by side, then holds each to an exact one after as many steps."""
-    chunk, size = bench.sizes.chunk, bench.sizes.lattice
-    active: dict[str, list[float]] = {name: [] for name in lattices}
-
-    def step(name: str) -> Callable[[], None]:
-        def go() -> None:
-            lattices[name].step(chunk)
-            # Bricks reach beyond a grid that isn't a multiple of them.
-            active[name].append(min(lattices[name].active_cells / size**3, 1.0))
-
-        return go
-
-    times = bench.time({name: step(name) for name in lattices})
-    done = max(lattice.steps for lattice in lattices.values())
-    rows = []
-    for name, lattice in lattices.items():
-        timed = active[name][-bench.sizes.repeats :]
-        figures = {"cells": size, "steps": done, "worked_on": float(np.mean(timed))}
-        if name != "dense":
-            figures["speedup"] = times["dense"].median_ms / times[name].median_ms
-            reference = exact(name)
-            for both in (lattice, reference):
-                both.step(done - both.steps)
-            error = wp.to_torch(lattice.velocity()) - wp.to_torch(reference.velocity())
-            figures["max_error"] = float(error.abs().max())
-        rows.append(bench.row("lattice bricks", name, scene=scene, timing=times[name], calls=chunk, **figures))
-    return rows
-
-
 def advection_rows(bench: SmokeBench) -> list[Row]:
     """Schemes and storages: the time of a step with and without solids, and the error after a ball's whole turn."""
     rows = []
@@ -170,7 +113,7 @@ def advection_rows(bench: SmokeBench) -> list[Row]:
             walls = _walls(box, bench.device, radius)
             for scheme in _SCHEMES:
                 option = f"{scheme}, {storage}{solid}"
-                calls[option] = _carry(bench, scheme, box, velocity, walls, fields, _SUBSTEPS)
+                calls[option] = _carry(bench, scheme, box, velocity, walls, fields)
         times = bench.time(calls)
         for option, timing in times.items():
             scheme = option.split(",")[0]
@@ -194,7 +137,7 @@ def smoke_brick_rows(bench: SmokeBench) -> list[Row]:
     box, velocity = _box(n), _swirl(n, bench.device)
     walls = _walls(box, bench.device, 0.0)
     for scheme in _SCHEMES:
-        dense = _carry(bench, scheme, box, velocity, walls, _cubes(bench, 1.0, scheme), _SUBSTEPS)
+        dense = _carry(bench, scheme, box, velocity, walls, _cubes(bench, 1.0, scheme))
         calls, lists = {"dense": dense}, {}
         for fill in bench.sizes.fills:
             name = f"smoke in {100 * fill:g}%"
@@ -249,19 +192,6 @@ def _moving(bench: SmokeBench, size: int) -> tuple[Callable[[], None], int]:
     return go, steps
 
 
-def _shear(bench: SmokeBench, fill: float, **settings) -> Lattice:
-    """A slab of the periodic box moves along itself: nothing but friction ever changes where there is flow."""
-    size = bench.sizes.lattice
-    lattice = Lattice((size,) * 3, viscosity=_VISCOSITY, device=bench.device, **settings)
-    velocity = np.zeros((size, 1, 1, 3), np.float32)
-    at = np.arange(size) + 0.5
-    inside = np.minimum(at, fill * size - at) if fill < 1.0 else np.full(size, np.inf)
-    rise = np.clip(inside / min(_RISE, max(0.5 * fill * size, 1.0)), 0.0, 1.0)
-    velocity[:, 0, 0, 2] = _SHEAR * rise**3 * (rise * (6.0 * rise - 15.0) + 10.0)  # smooth up to its second slope
-    lattice.set_flow(velocity)
-    return lattice
-
-
 def _stepper(lattice: Lattice, steps: int) -> Callable[[], None]:
     return lambda: lattice.step(steps)
 
@@ -304,13 +234,13 @@ def _swirl(n: int, device: str) -> wp.array:
     return wp.array(u.reshape(-1, 3).astype(np.float32), dtype=wp.vec3, device=device)
 
 
-def _carry(bench, scheme: str, box, velocity, walls, fields, dt: float, **where) -> Callable[[], None]:
+def _carry(bench: SmokeBench, scheme: str, box, velocity, walls, fields) -> Callable[[], None]:
     """A step that writes to a second field: replayed, it does the same again."""
 
     def step() -> None:
-        advection.advect(box, velocity, walls, fields[0], fields[1], dt, **where)
+        advection.advect(box, velocity, walls, fields[0], fields[1], _SUBSTEPS)
         if scheme == "maccormack":
-            advection.correct(box, velocity, walls, *fields, dt, **where)
+            advection.correct(box, velocity, walls, *fields, _SUBSTEPS)
 
     return bench.replay(step)
 
@@ -328,7 +258,7 @@ def _carry_bricks(bench, scheme: str, fill: float, box, velocity, walls):
     """A step in bricks, their lists and the emptying of others; and the bricks."""
     fields = _cubes(bench, fill, scheme)
     rings = advection_places.rings_for(math.sqrt(1.0 / 3.0) * _SUBSTEPS * _RATIO)
-    bricks = advection_places.make_bricks(box, rings, bench.device)
+    bricks = advection_places.make_bricks(box, rings, _THRESHOLD, bench.device)
     edge = box.n[0]
     at = torch.arange(edge**3, device=bench.device)
     brick = torch.zeros(bricks.busy.shape[0], dtype=torch.int32, device=bench.device)
@@ -337,16 +267,15 @@ def _carry_bricks(bench, scheme: str, fill: float, box, velocity, walls):
     index = (x // size * box.bricks[1] + y // size) * box.bricks[2] + z // size
     brick[index[wp.to_torch(fields[0].density) > 0]] = 1
     busy = to_warp(brick)
-    where = {"bricks": bricks, "threshold": _THRESHOLD}
 
     def step() -> None:
         wp.copy(bricks.busy, busy)
         advection_places.relist(box, bricks)
         for field in fields:
-            advection_sources.rest(box, bricks, field.density)
-        advection.advect(box, velocity, walls, fields[0], fields[1], _SUBSTEPS, **where)
+            advection_sources.empty_retired(box, bricks, field)
+        advection.advect(box, velocity, walls, fields[0], fields[1], _SUBSTEPS, bricks=bricks)
         if scheme == "maccormack":
-            advection.correct(box, velocity, walls, *fields, _SUBSTEPS, **where)
+            advection.correct(box, velocity, walls, *fields, _SUBSTEPS, bricks=bricks)
 
     return bench.replay(step), bricks
 

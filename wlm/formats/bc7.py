@@ -78,9 +78,9 @@ def unpack_mode6(blocks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         raise ValueError(f"expected blocks uint8 [..., 16], got {blocks.dtype} {blocks.shape}")
     words = np.ascontiguousarray(blocks).view("<u8").astype(np.uint64)
     low, high = words[..., 0], words[..., 1]
-    other = (low & np.uint64((1 << _MODE_BITS) - 1)) != _MODE_6
-    if np.any(other):
-        place = int(np.flatnonzero(other)[0])
+    foreign = (low & np.uint64((1 << _MODE_BITS) - 1)) != _MODE_6
+    if np.any(foreign):
+        place = int(np.flatnonzero(foreign)[0])
         raise WlmError(f"BC7 block {place}: expected mode 6, found {_mode_name(int(low.flat[place]))}")
     parity = np.stack([low >> np.uint64(63), high & np.uint64(1)], axis=-1)
     upper = (low[..., None, None] >> _ENDPOINT_SHIFTS) & np.uint64(0x7F)

@@ -143,14 +143,14 @@ class Checkpoint:
                 self._running[1][key] = np.array(value)
 
 
-def _difference(stored: Mapping[str, Any], wanted: Mapping[str, Any]) -> str:
+def _difference(stored: Mapping[str, Any], expected: Mapping[str, Any]) -> str:
     """Names the first thing in which two fits differ; empty if they are one."""
-    for key, value in wanted.items():
-        other = stored.get(key)
-        if isinstance(value, dict) and isinstance(other, dict):
-            for name in sorted({*value, *other}):
-                if value.get(name) != other.get(name):
-                    return f"it was made with {key} {name}={other.get(name)}, not {value.get(name)}"
-        elif value != other:
-            return f"it was made with {key} {other}, not {value}"
+    for key, value in expected.items():
+        before = stored.get(key)
+        if isinstance(value, dict) and isinstance(before, dict):
+            for name in sorted({*value, *before}):
+                if value.get(name) != before.get(name):
+                    return f"it was made with {key} {name}={before.get(name)}, not {value.get(name)}"
+        elif value != before:
+            return f"it was made with {key} {before}, not {value}"
     return ""

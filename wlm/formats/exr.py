@@ -39,8 +39,8 @@ def read_exr(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]]
     planes = [channels[name].pixels for name in names]
     for name, plane in zip(names, planes, strict=True):
         if plane is None or plane.dtype not in (np.float16, np.float32):
-            found = "no pixels" if plane is None else plane.dtype
-            raise WlmError(f"{path}: channel {name}: expected half or float, found {found}")
+            content = "no pixels" if plane is None else plane.dtype
+            raise WlmError(f"{path}: channel {name}: expected half or float, found {content}")
         if plane.shape != planes[0].shape:
             raise WlmError(f"{path}: channel {name}: expected {planes[0].shape} pixels, found {plane.shape}")
     return np.stack(planes, axis=-1).astype(np.float32, copy=False), names

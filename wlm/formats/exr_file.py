@@ -134,5 +134,5 @@ def _captured_chatter() -> Iterator[_Chatter]:
             os.close(saved)
             # The reason follows the code; what precedes it is the file's name, which our own line has.
             reasons = [line.decode(errors="replace").partition(") ")[2] for line in ours]
-            said = "; ".join(dict.fromkeys(map(str.strip, reasons))) or printed.getvalue()
-            chatter.text = one_line(said, 200)
+            messages = "; ".join(dict.fromkeys(map(str.strip, reasons))) or printed.getvalue()
+            chatter.text = one_line(messages, 200)

@@ -66,8 +66,8 @@ def read_planes(path: str | os.PathLike[str]) -> tuple[dict[str, np.ndarray], di
     for name, channel in part.channels.items():
         pixels = channel.pixels
         if pixels is None or pixels.dtype not in (np.float16, np.float32):
-            found = "no pixels" if pixels is None else pixels.dtype
-            raise WlmError(f"{path}: channel {name}: expected half or float, found {found}")
+            content = "no pixels" if pixels is None else pixels.dtype
+            raise WlmError(f"{path}: channel {name}: expected half or float, found {content}")
         if planes and pixels.shape != next(iter(planes.values())).shape:
             raise WlmError(f"{path}: channel {name}: expected as many pixels as the others, found {pixels.shape}")
         planes[name] = pixels.astype(np.float32)

@@ -114,7 +114,7 @@ class GltfPrimitive:
 
 
 def read_gltf(path: str | os.PathLike[str]) -> tuple[GltfDocument, list[GltfPrimitive]]:
-    """Read a `.glb` or `.gltf` file; its first bytes tell which it is.
+    """Reads a `.glb` or `.gltf` file; its first bytes tell which it is.
 
     Args:
         path: The file.
@@ -151,7 +151,7 @@ def read_gltf(path: str | os.PathLike[str]) -> tuple[GltfDocument, list[GltfPrim
 def document_from_arrays(
     position: np.ndarray, triangle: np.ndarray, uv: np.ndarray, name: str
 ) -> tuple[GltfDocument, GltfPrimitive]:
-    """Make a document of one mesh, for geometry that came from elsewhere.
+    """Makes a document of one mesh, for geometry that came from elsewhere.
 
     Args:
         position: [V, 3], in any unit; stored as float32.
@@ -353,7 +353,7 @@ def _rows(document: GltfDocument, where: str, place: dict, count: int, size: int
 
 
 def _read_primitives(document: GltfDocument) -> list[GltfPrimitive]:
-    found = []
+    primitives = []
     cache: dict[tuple[int, str], np.ndarray] = {}  # primitives often share their accessors
 
     def floats(number: int, kind: str) -> np.ndarray:
@@ -383,7 +383,7 @@ def _read_primitives(document: GltfDocument) -> list[GltfPrimitive]:
                 if len(values) != len(local):
                     raise WlmError(f"{where}: {name}: expected {len(local)} vertices as POSITION, found {len(values)}")
                 uv[number] = values[row]
-            found.append(
+            primitives.append(
                 GltfPrimitive(
                     node=node,
                     mesh=mesh_number,
@@ -395,7 +395,7 @@ def _read_primitives(document: GltfDocument) -> list[GltfPrimitive]:
                     row=row,
                 )
             )
-    return found
+    return primitives
 
 
 def _floats(document: GltfDocument, number: int, kind: str) -> np.ndarray:
@@ -441,14 +441,14 @@ def _walk(document: GltfDocument) -> Iterator[tuple[int, np.ndarray]]:
     else:
         children = {child for node in nodes for child in node.get("children", [])}
         roots = [number for number in range(len(nodes)) if number not in children]
-    seen = set()
+    visited = set()
     stack = [(root, np.eye(4)) for root in reversed(roots)]
     while stack:
         number, above = stack.pop()
         node = document.item("nodes", number)
-        if number in seen:
+        if number in visited:
             raise WlmError(f"{document.path}: nodes[{number}]: expected one parent, found it twice in the scene")
-        seen.add(number)
+        visited.add(number)
         transform = above @ _transform(node)
         yield number, transform
         stack += [(child, transform) for child in reversed(node.get("children", []))]

@@ -67,7 +67,7 @@ class Replacement:
 def write_glb(
     path: str | os.PathLike[str], document: GltfDocument, replacements: Sequence[Replacement], uv_set: int
 ) -> int:
-    """Write a document as `.glb` with some primitives replaced and all else as it was, whole or not at all.
+    """Writes a document as `.glb` with some primitives replaced and all else as it was, whole or not at all.
 
     Attributes and morph targets keep their encoding. Where a primitive lacks sets below `uv_set`, which glTF wants in
     a row, they are given the new UVs too. Data that nothing uses any more is left out, unless the file has an
@@ -171,18 +171,18 @@ class _Tree:
         used = self.content.get("extensionsUsed", [])
         if all(name.startswith(_HARMLESS) for name in used):
             self._keep("accessors", _accessor_slots)
-            kept = self._keep("bufferViews", _view_slots)
-            self.payloads = [self.payloads[number] for number in kept]
+            numbers = self._keep("bufferViews", _view_slots)
+            self.payloads = [self.payloads[number] for number in numbers]
 
     def _keep(self, kind: str, slots: Callable[[dict], Iterable[tuple[dict, str]]]) -> list[int]:
         """Keeps those entries of a list that the slots refer to, and numbers them anew; returns the old numbers."""
         places = list(slots(self.content))
-        kept = sorted({holder[key] for holder, key in places})
-        new = {old: number for number, old in enumerate(kept)}
+        numbers = sorted({holder[key] for holder, key in places})
+        new = {old: number for number, old in enumerate(numbers)}
         for holder, key in places:
             holder[key] = new[holder[key]]
-        self.content[kind] = [self.content[kind][number] for number in kept]
-        return kept
+        self.content[kind] = [self.content[kind][number] for number in numbers]
+        return numbers
 
     def _gathered(self, number: int, rows: np.ndarray, bounds: bool) -> int:
         """Adds an accessor with some rows of another one in the same encoding."""

@@ -234,9 +234,9 @@ class _Reader:
         return None
 
     def expect(self, field: str, kind: int, text: str) -> None:
-        found = self.u32()
-        if found != kind:
-            raise WlmError(f"{self.path}: {field}: expected {text} (type {kind}), found type {found}")
+        marker = self.u32()
+        if marker != kind:
+            raise WlmError(f"{self.path}: {field}: expected {text} (type {kind}), found type {marker}")
 
     def vectors(self) -> np.ndarray:
         """A packed array of Vector3, float64 [N, 3]."""

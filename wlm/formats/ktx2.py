@@ -187,8 +187,8 @@ def _descriptor(fmt: str) -> bytes:
         model, side = (_BC6H if fmt.startswith("BC6H") else _ASTC), 3  # sides are stored less one
         samples = [(0, 8 * _BLOCK_BYTES, 0)]
     if fmt.endswith(("_UNORM", "_UINT")):  # what stands for 0 and for 1; an integer stands for itself
-        one = 0xFFFF if fmt.endswith("_UNORM") else 1
-        qualifiers, lowest, highest = 0, struct.pack("<I", 0), struct.pack("<I", one)
+        unity = 0xFFFF if fmt.endswith("_UNORM") else 1
+        qualifiers, lowest, highest = 0, struct.pack("<I", 0), struct.pack("<I", unity)
     else:  # of floats the range that stands for -1 or 0 to 1, as floats of 32 bits
         unsigned = "UFLOAT" in fmt
         qualifiers = _FLOAT if unsigned else _FLOAT | _SIGNED

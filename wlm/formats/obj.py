@@ -35,7 +35,7 @@ class ObjMesh:
 
 
 def read_obj(path: str | os.PathLike[str]) -> ObjMesh:
-    """Read an OBJ file.
+    """Reads an OBJ file.
 
     Args:
         path: The file, UTF-8 or any other text whose numbers are ASCII.
@@ -108,7 +108,7 @@ def _corner(word: str, points: int, places: int) -> tuple[int, int]:
 
 def _index(text: str, count: int) -> int:
     number = int(text)
-    found = number - 1 if number > 0 else count + number
-    if number == 0 or not 0 <= found < count:
+    index = number - 1 if number > 0 else count + number
+    if number == 0 or not 0 <= index < count:
         raise ValueError
-    return found
+    return index

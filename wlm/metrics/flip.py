@@ -104,9 +104,9 @@ def flip_filled(ref: np.ndarray, test: np.ndarray, span: tuple[float, float] | N
         if not test.any():
             return np.zeros(ref.shape[:2])
         black = np.zeros(ref.shape, np.float32)
-        shown = np.clip(test, 0.0, 1.0).astype(np.float32)
+        clipped = np.clip(test, 0.0, 1.0).astype(np.float32)
         error, _, _ = flip_evaluator.evaluate(
-            black, shown, "LDR", inputsRGB=False, applyMagma=False, computeMeanError=False
+            black, clipped, "LDR", inputsRGB=False, applyMagma=False, computeMeanError=False
         )
         return error[..., 0].astype(np.float64)
     start, stop = span

@@ -134,7 +134,7 @@ def evaluate_frame(
     flip_exposure_count: int = 2,
     name: str = "lightmap",
 ) -> FrameMetrics:
-    """Score one lightmap tile by tile (neural-dynamic-gi, section 10.2, as this module settles it).
+    """Scores one lightmap tile by tile (neural-dynamic-gi, section 10.2, as this module settles it).
 
     Args:
         ref: `[H, W, 3]`, linear RGB, any float dtype. Texels outside the mask are ignored.
@@ -253,12 +253,12 @@ def summarise(frames: Sequence[FrameMetrics]) -> Summary:
 
 def _nanmean(values: np.ndarray, axis: int | tuple[int, ...] | None = None) -> np.ndarray:
     """`np.nanmean` without its warning: a mean over nothing is NaN and is expected here."""
-    known = ~np.isnan(values)
-    count = known.sum(axis=axis)
-    total = np.where(known, values, 0.0).sum(axis=axis)
+    valid = ~np.isnan(values)
+    count = valid.sum(axis=axis)
+    total = np.where(valid, values, 0.0).sum(axis=axis)
     return np.where(count > 0, total / np.maximum(count, 1), math.nan)
 
 
 def _nanmax(values: np.ndarray) -> float:
-    known = values[~np.isnan(values)]
-    return float(known.max()) if known.size else math.nan
+    valid = values[~np.isnan(values)]
+    return float(valid.max()) if valid.size else math.nan

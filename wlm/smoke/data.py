@@ -20,7 +20,7 @@ from pydantic import ValidationError
 
 from wlm.errors import WlmError
 from wlm.fluid.volume import DensityVolume, load_volume
-from wlm.formats.atomic import atomic_path, atomic_write
+from wlm.formats.atomic import atomic_write
 from wlm.formats.exr_planes import read_planes, write_planes
 from wlm.smoke.baking import SixWay
 from wlm.smoke.camera import DIRECTIONS, EMISSION, Camera
@@ -40,7 +40,6 @@ __all__ = [
     "open_frames",
     "read_frames",
     "read_six_way",
-    "save_volume",
     "write_guide",
     "write_six_way",
 ]
@@ -226,25 +225,6 @@ def clear_folder(folder: str | os.PathLike[str], stem: str, suffix: str, *others
             path.unlink(missing_ok=True)
     except OSError as error:
         raise WlmError(f"{folder}: cannot write there: {error.strerror or error}") from error
-
-
-def save_volume(path: str | os.PathLike[str], volume: DensityVolume) -> None:
-    """Writes a volume as `.npz`, whole or not at all, such that `load_volume` reads it back.
-
-    Raises:
-        WlmError: Another suffix, or the file can't be written.
-    """
-    if Path(path).suffix.lower() != ".npz":
-        raise WlmError(f"{path}: expected a name that ends in .npz")
-    arrays = {
-        "density": volume.density.cpu().numpy(),
-        "voxel": np.float64(volume.voxel),
-        "origin": np.asarray(volume.origin, np.float64),
-    }
-    if volume.temperature is not None:
-        arrays["temperature"] = volume.temperature.cpu().numpy()
-    with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        np.savez_compressed(file, **arrays)
 
 
 def write_guide(path: str | os.PathLike[str], found: Guide) -> None:

@@ -32,7 +32,7 @@ from pydantic_core import PydanticCustomError
 
 from wlm.config import load_settings, profile_path
 from wlm.fluid.faces import FACES
-from wlm.fluid.shapes import ball, cube, drum
+from wlm.fluid.shapes import box, cylinder, sphere
 from wlm.smoke.camera import Camera
 from wlm.smoke.shading import Light, Ramp
 
@@ -285,7 +285,7 @@ class Obstacle(_Part):
 
     def mesh(self) -> tuple[np.ndarray, np.ndarray]:
         """Its surface about its centre: corners float64 [V, 3], triangles int64 [F, 3], anticlockwise from outside."""
-        points, triangles = {"sphere": ball, "box": cube, "cylinder": drum}[self.shape]()
+        points, triangles = {"sphere": sphere, "box": box, "cylinder": cylinder}[self.shape]()
         return points * np.asarray(self.radius), triangles
 
 

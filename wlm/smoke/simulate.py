@@ -12,12 +12,11 @@ import warp as wp
 from wlm.errors import WlmError
 from wlm.fluid import obstacles as bodies
 from wlm.fluid import solver as smoke
-from wlm.fluid import solver_lattice
 from wlm.fluid.faces import FACES
 from wlm.fluid.lattice import Domain, Lattice
-from wlm.fluid.volume import DensityVolume
+from wlm.fluid.volume import DensityVolume, save_volume
 from wlm.interop import free_memory
-from wlm.smoke.data import CHECKPOINT, Frames, frame_file, save_volume
+from wlm.smoke.data import CHECKPOINT, Frames, frame_file
 from wlm.smoke.scene import Inlet, Scene
 
 __all__ = ["KEPT_EVERY", "make_solver", "simulate", "volume_of"]
@@ -159,7 +158,7 @@ def _require_memory(scene: Scene, device: str) -> None:
             f" at most the {free / 2**30:.1f} GiB that are free: use fewer cells, a lower refine or storage: float16"
         )
     # More than can be numbered.
-    solver_lattice.require_memory(grid.shape, voxel, warp_device)
+    smoke.require_memory(grid.shape, voxel, warp_device)
 
 
 def _make_lattice(scene: Scene, device: str) -> Lattice:
@@ -257,7 +256,7 @@ def _obstacles(scene: Scene) -> list[bodies.Obstacle]:
     made: list[bodies.Obstacle] = []
     for obstacle in scene.obstacles:
         keys = np.array(obstacle.path)
-        path = bodies.Path.of((keys[:, 1:] - grid.origin) / grid.cell, keys[:, 0] / scene.step)
+        path = bodies.Trajectory.of((keys[:, 1:] - grid.origin) / grid.cell, keys[:, 0] / scene.step)
         if obstacle.shape == "sphere":
             made.append(bodies.Sphere(path, obstacle.radius / grid.cell))
         else:

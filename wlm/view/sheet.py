@@ -40,7 +40,7 @@ def before_after_error(
     times: Sequence[float] | np.ndarray,
     columns: int = MAX_COLUMNS,
 ) -> tuple[int, ...]:
-    """Write a PNG of reference, decoded and absolute error, one column a time.
+    """Writes a PNG of reference, decoded and absolute error, one column a time.
 
     Reference and decoded share one exposure a column: the white that its title states is the reference's 99.5
     percentile, and light is shown as `(irradiance / white) ** (1 / 2.2)`. The error is the mean of its
@@ -79,15 +79,15 @@ def before_after_error(
         raise WlmError(f"sheet: expected 1 to {MAX_COLUMNS} columns, got {columns}")
 
     scores = np.array([psnr(ref, dec, mask) for ref, dec in zip(reference, decoded, strict=True)])
-    shown = _choose(scores, columns)
-    whites = [_white(reference[i][mask]) for i in shown]
-    absolute = [np.abs(decoded[i] - reference[i]).mean(axis=2) for i in shown]
+    chosen = _choose(scores, columns)
+    whites = [_white(reference[i][mask]) for i in chosen]
+    absolute = [np.abs(decoded[i] - reference[i]).mean(axis=2) for i in chosen]
     errors = [error / white for error, white in zip(absolute, whites, strict=True)]
     gain = _gain(np.concatenate([error[mask] for error in errors]))
 
-    figure, axes, bar = _layout(len(shown), *mask.shape)
+    figure, axes, bar = _layout(len(chosen), *mask.shape)
     colours = ScalarMappable(Normalize(0.0, 1.0 / gain), _COLOURS)
-    for column, (i, white, error) in enumerate(zip(shown, whites, errors, strict=True)):
+    for column, (i, white, error) in enumerate(zip(chosen, whites, errors, strict=True)):
         pictures = (_expose(reference[i], white), _expose(decoded[i], white), colours.to_rgba(error)[..., :3])
         for axis, picture in zip(axes[:, column], pictures, strict=True):
             axis.imshow(np.where(mask[..., None], picture, _GREY), interpolation="nearest", aspect="auto")
@@ -101,7 +101,7 @@ def before_after_error(
     scale.outline.set_visible(False)
     with atomic_path(path) as temporary:
         figure.savefig(temporary, format="png", dpi=_DPI)
-    return tuple(shown)
+    return tuple(chosen)
 
 
 def _choose(scores: np.ndarray, columns: int) -> list[int]:
