@@ -23,8 +23,8 @@ def pages(paths: Sequence[str | os.PathLike[str]], index: str | os.PathLike[str]
         index: The index; the pages are in a folder beside it that has its name without the suffix.
 
     Returns:
-        The pages by their paths from the index's folder. Each says where and with what each run was measured, the
-        command that measures it again, and its rows.
+        The pages by their paths from the index's folder. Each has the plots ``images/bench-SYSTEM*.png`` beside the
+        index and of each run where and with what it was measured, the command that measures it again, and its rows.
 
     Raises:
         WlmError: A file is missing or is no result file.
@@ -43,10 +43,16 @@ def pages(paths: Sequence[str | os.PathLike[str]], index: str | os.PathLike[str]
                 parts.append(f"## {machines[-1]}: `{file}`\n")
                 parts += map(_section, sorted(measured, key=_order))
         if parts:
+            pictures = sorted((index.parent / "images").glob(f"bench-{system}*.png"))
+            plots = [f"![{picture.stem}](../images/{picture.name})\n" for picture in pictures]
             page = f"{index.stem}/{system}.md"
-            contents[page] = "\n".join([f"# Results: {system}\n", f"{head}\n", *parts])
+            contents[page] = "\n".join([f"# Results: {system}\n", f"{head}\n", *plots, *parts])
             links.append(f"- [{system}]({page}): {', '.join(machines)}")
-    return {index.name: "\n".join(["# Results\n", f"{head}\n", *links, ""]), **contents}
+    foot = (
+        "Each page has the command of each run: with `--json FILE.json` it replaces the rows of its scenes in that file,\n"
+        "with `--plot images/bench-SYSTEM.png` it draws a plot.\n"
+    )
+    return {index.name: "\n".join(["# Results\n", f"{head}\n", *links, "", foot]), **contents}
 
 
 def tables(rows: Sequence[Row]) -> str:
