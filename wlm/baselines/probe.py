@@ -1,9 +1,15 @@
 """What a compressed probe set is compared with: the PCA family, a moving basis, and an engine's 8-bit packing.
 
-Each function takes N probes and returns a ``Rival`` whose ``decoded`` is float32 [N, D], read from the byte string
-that ``bytes`` counts (gaussian-probe-compression, sections 2.2 and 5.1). The positions are an engine's own and cost
-nothing here, as in the paper. The paper gives its rivals no bits to choose; weights of 4 or 5 bits leave room for more
-components and gain several decibels at the same size, so ``at_bytes`` tries them too.
+Each function takes N probes, their positions [N, 3] and values [N, D] in any unit, and returns a ``Rival`` whose
+``decoded`` is float32 [N, D], read from the byte string that ``bytes`` counts (gaussian-probe-compression, sections 2.2
+and 5.1). The positions are an engine's own and cost nothing here, as in the paper. The paper gives its rivals no bits
+to choose; weights of 4 or 5 bits leave room for more components and gain several decibels at the same size, so
+``at_bytes`` tries them too.
+
+The settings that the functions share are the number of ``components``, basis vectors of a part, 1 to D, and the
+``bits`` of a weight, 1 to 16, over the range of each part and component; None for half floats. Means and bases are half
+floats always. All raise a ``WlmError`` where there are no probes, or NaN or infinite numbers, and a ``ValueError`` for
+wrong shapes or a setting out of range.
 """
 
 from __future__ import annotations
@@ -57,19 +63,7 @@ _SHIFT = np.array([0, 11, 22], np.uint32)
 
 
 def global_pca(position: np.ndarray, values: np.ndarray, components: int, *, bits: int | None = None) -> Rival:
-    """Principal components of all probes (GPCA).
-
-    Args:
-        position: [N, 3].
-        values: [N, D], any unit.
-        components: Basis vectors, 1 to D.
-        bits: Of a weight, 1 to 16, over the range of each component; None for half floats. Means and bases are half
-            floats always.
-
-    Raises:
-        WlmError: No probes, or NaN or infinite numbers.
-        ValueError: Wrong shapes, or a setting out of range.
-    """
+    """Principal components of all probes, which are one part (GPCA)."""
     position, values = _checked(position, values, components, bits)
     return _pca("global_pca", "part", position, values, components, bits, lambda: (probe_pca.whole(position), ()))
 
@@ -80,14 +74,8 @@ def block_pca(
     """Principal components of each cube of a regular grid (BPCA, Nishino et al. 2005).
 
     Args:
-        position: [N, 3].
-        values: [N, D].
-        components: Basis vectors of a block, 1 to D.
+        position, values, components, bits: See the module.
         blocks: The most cubes that hold a probe, at least 1. They have one size, so a few fewer come out.
-        bits: As ``global_pca``, over the range of each block and component.
-
-    Raises:
-        WlmError, ValueError: As ``global_pca``.
     """
     position, values = _checked(position, values, components, bits)
     _in_range("blocks", blocks, 1)
@@ -110,18 +98,12 @@ def window_pca(
     """Block PCA with the basis of a block and its surroundings (WBPCA, Nishino et al. 2005).
 
     Neighbouring blocks then have similar bases and smaller seams, at the cost of a larger error; each probe is coded
-    once, in its own block's basis.
+    once, in the basis of the block that it lies in.
 
     Args:
-        position: [N, 3].
-        values: [N, D].
-        components: Basis vectors of a block, 1 to D.
+        position, values, components, bits: See the module.
         blocks: As ``block_pca``.
         overlap: How far the window reaches over its block on all sides, in sides of a block, at least 0.
-        bits: As ``block_pca``.
-
-    Raises:
-        WlmError, ValueError: As ``global_pca``.
     """
     position, values = _checked(position, values, components, bits)
     _in_range("blocks", blocks, 1)
@@ -147,18 +129,12 @@ def clustered_pca(
     """Principal components of each cluster (CPCA).
 
     Args:
-        position: [N, 3].
-        values: [N, D].
-        components: Basis vectors of a cluster, 1 to D.
+        position, values, components, bits: See the module.
         clusters: At least 1. Fewer come out where there are fewer distinct probes, or where a cluster ends empty.
         seed: Of the first centres.
         signal: False clusters the positions with k-means, as gaussian-probe-compression, section 5.1, has it: the
             centres are stored, and a probe needs no index. True puts each probe where it is reconstructed best, as
             Sloan et al. 2003 do: an index of ceil(log2 clusters) bits a probe is stored and counted.
-        bits: As ``block_pca``.
-
-    Raises:
-        WlmError, ValueError: As ``global_pca``.
     """
     position, values = _checked(position, values, components, bits)
     _in_range("clusters", clusters, 1)
@@ -181,15 +157,9 @@ def moving_basis(
     """Moving basis decomposition (MBD, Silvennoinen and Sloan 2021) at free positions.
 
     Args:
-        position: [N, 3].
-        values: [N, D].
-        components: Basis vectors at a corner of the grid, 1 to D.
+        position, values, components, bits: See the module; a part is a cell, the basis vectors are at its corners.
         grid: Cells along the longest side of the probes' box, 1 to 2**20.
         iterations: Rounds of alternating least squares from the PCA of all probes, at least 0.
-        bits: As ``block_pca``, over the range of each cell and component.
-
-    Raises:
-        WlmError, ValueError: As ``global_pca``.
     """
     position, values = _checked(position, values, components, bits)
     _in_range("grid", grid, 1, probe_pca.MAX_CELLS)
@@ -212,13 +182,9 @@ def unreal_packing(position: np.ndarray, values: np.ndarray, bands: int | None =
     as it is decoded, which costs nothing and is closer than the engine's own ratio.
 
     Args:
-        position: [N, 3]; only their number counts.
-        values: [N, D], D = 3, 12 or 27: SH coefficients from L00, for each its red, green and blue.
+        position: Only their number counts.
+        values: D = 3, 12 or 27 (else a ``WlmError``): SH coefficients from L00, for each its red, green and blue.
         bands: 1 to 3, SH bands that are kept, 4, 13 or 28 bytes a probe; the rest decode to zero. None for all.
-
-    Raises:
-        WlmError: As ``global_pca``, or D is none of these.
-        ValueError: Wrong shapes, or more bands than there are.
     """
     position, values = _checked(position, values)
     most = _unreal_bands(values.shape[1])
@@ -273,18 +239,16 @@ def at_bytes(
 
     Args:
         name: A key of ``RIVALS``.
-        position: [N, 3].
-        values: [N, D].
+        position, values: See the module.
         budget_bytes: The largest size.
         bits: Bits of a weight to try; ``(None,)`` keeps to half floats as gaussian-probe-compression's table has them.
-            The engine's packing has its own.
+            The engine's packing has none to choose.
 
     Returns:
         The best result; its times are those of its settings alone, without the search.
 
     Raises:
-        WlmError: Unknown name, a budget that nothing fits, or as ``global_pca``.
-        ValueError: Wrong shapes, or bits out of range.
+        WlmError: An unknown name, or a budget that nothing fits.
     """
     if name not in RIVALS:
         raise WlmError(f"probes: unknown baseline {name!r}, expected one of {', '.join(RIVALS)}")

@@ -159,26 +159,16 @@ def run_rows(
     repeats: int | None = None,
     progress: Note | None = None,
 ) -> list[Row]:
-    """Measures the given profiles on given lightmaps.
+    """Measures the given profiles; the rest as for ``run``.
 
     Args:
         lightmaps: At least one.
         profiles: At least one; the rivals have the bits of the first.
-        device: "cpu" or "cuda:0".
-        views: Cameras of the scores.
-        resolution: Their pixels along a side.
+        views, resolution: Cameras of the scores, and their pixels along a side.
         whole: With the first profile at the bits of a cascade, and rivals at the bits of all profiles.
         methods: The rivals.
         points: Read by a timed decode.
-        repeats: Samples of each decode time; None: 30 on CUDA, 5 on the CPU.
-        progress: As for ``run``.
-
-    Returns:
-        The rows.
-
-    Raises:
-        WlmError: As ``run``.
-        ValueError: No lightmap or no profile.
+        repeats: As for ``Bench``.
     """
     if not lightmaps or not profiles:
         raise ValueError("expected at least one lightmap and one profile")

@@ -68,20 +68,6 @@ _CODECS = {
     "astc10": ("ASTC", "10x10"),
     "8bit": ("8 bits", ""),
 }
-_MODEL_PARTS = (
-    "kind",
-    "uv",
-    "uvt",
-    "ut",
-    "vt",
-    "net",
-    "net_static",
-    "scale",
-    "scale_static",
-    "peak",
-    "affine",
-    "constant",
-)
 
 
 def run(
@@ -128,22 +114,13 @@ def run_rows(
     repeats: int | None = None,
     progress: Note | None = None,
 ) -> list[Row]:
-    """Measures the given profiles on a given set.
+    """Measures the given profiles on a given set; the rest as for ``run``.
 
     Args:
         lightmaps: The set.
         profiles: At least one. The rows of decode options are of the one named "M", else of the first.
-        device: "cpu" or "cuda:0".
-        chosen: Indices of the times that are scored, int [K].
-        repeats: Samples of each decode time; None: 30 on CUDA, 5 on the CPU, where a sample is a whole map.
-        progress: As for ``run``.
-
-    Returns:
-        The rows.
-
-    Raises:
-        WlmError: As ``run``.
-        ValueError: No profile, or no time.
+        chosen: Indices of the times that are scored, int [K], at least one.
+        repeats: As for ``Bench``.
     """
     if not profiles or len(chosen) == 0:
         raise ValueError("expected at least one profile and one time")
@@ -175,7 +152,7 @@ def _hours(times: Sequence[float]) -> str:
 
 def _repeated(model: LightmapModel, count: int) -> LightmapModel:
     """The model of a map that holds the tiles of this one several times over."""
-    arrays = {part: np.concatenate([getattr(model, part)] * count) for part in _MODEL_PARTS}
+    arrays = {name: np.concatenate([array] * count) for name, array in model.parts.items()}
     return replace(model, width=TILE * len(model.kind), height=TILE * count, **arrays)
 
 

@@ -170,24 +170,15 @@ def run_rows(
     repeats: int | None = None,
     progress: Note | None = None,
 ) -> list[Row]:
-    """Measures the given profiles on given sets.
+    """Measures the given profiles on given sets; the rest as for ``run``.
 
     Args:
         sets: At least one.
         profiles: At least one; all but the rows "ours" are about the first.
-        device: "cpu" or "cuda:0".
-        ratios: Further ratios of the first profile; its own is left out.
+        ratios: Further ratios of the first profile; the profile's ratio is left out.
         sizes: Of the rivals, in bytes of the first profile's file: 1, 3; none: no rivals.
-        frames: Of the walk.
-        repeats: Samples of each decode time; None: 30 on CUDA, 5 on the CPU, where a sample is a whole set.
-        progress: As for ``run``.
-
-    Returns:
-        The rows.
-
-    Raises:
-        WlmError: As ``run``, or no frame.
-        ValueError: No set or no profile.
+        frames: Frames of the walk, at least one.
+        repeats: As for ``Bench``.
     """
     if not sets or not profiles:
         raise ValueError("expected at least one set and one profile")

@@ -49,8 +49,8 @@ def pages(paths: Sequence[str | os.PathLike[str]], index: str | os.PathLike[str]
             contents[page] = "\n".join([f"# Results: {system}\n", f"{head}\n", *plots, *parts])
             links.append(f"- [{system}]({page}): {', '.join(machines)}")
     foot = (
-        "Each page has the command of each run: with `--json FILE.json` it replaces the rows of its scenes in that file,\n"
-        "with `--plot images/bench-SYSTEM.png` it draws a plot.\n"
+        "Each page has the command of each run. With `--json FILE.json` it replaces the rows of its scenes in a file,\n"
+        "with `--plot docs/images/bench-SYSTEM.png` it draws a plot.\n"
     )
     return {index.name: "\n".join(["# Results\n", f"{head}\n", *links, "", foot]), **contents}
 

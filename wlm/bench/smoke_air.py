@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import torch
@@ -57,7 +58,7 @@ def lattice_rows(bench: SmokeBench) -> list[Row]:
     calls["copy"] = lambda: target.copy_(source)
     calls["kernel"] = lambda: torch.neg(source, out=target)
     for name, (size, settings) in cases.items():
-        calls[name] = _stepper(_jet(bench, size, **settings), chunk)
+        calls[name] = partial(_jet(bench, size, **settings).step, chunk)
     sphere = f"float32, moving sphere, {small}³"
     calls[sphere], moved = _moving(bench, small)
     times = bench.time(calls)
@@ -190,10 +191,6 @@ def _moving(bench: SmokeBench, size: int) -> tuple[Callable[[], None], int]:
             lattice.step(1)
 
     return go, steps
-
-
-def _stepper(lattice: Lattice, steps: int) -> Callable[[], None]:
-    return lambda: lattice.step(steps)
 
 
 def _bytes(lattice: str = "D3Q19", storage: str = "float32", faces: str = "all", **_) -> int:

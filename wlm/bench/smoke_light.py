@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import torch
@@ -67,7 +67,8 @@ def guide_rows(bench: SmokeBench) -> list[Row]:
     cases |= {("alone", step, "float32"): volumes["float32"] for step in sizes.guide_alone}
     cases |= {("shared", step, "float16"): volumes["float16"] for step in _HALF_GUIDE}
     calls = {
-        key: _guide_call(volume, camera, step=float(key[1]), shared=key[0] == "shared") for key, volume in cases.items()
+        (way, step, storage): partial(guide, volume, camera, jitter=_JITTER, step=float(step), shared=way == "shared")
+        for (way, step, storage), volume in cases.items()
     }
     # Calls of seconds get fewer samples than those of milliseconds.
     long = {key: call for key, call in calls.items() if key[0] == "alone" and key[1] < 5}
@@ -109,7 +110,9 @@ def six_rows(bench: SmokeBench) -> list[Row]:
     volumes, camera = _cloud(bench)
     cases = {f"step {step:g}": (volumes["float32"], step) for step in sizes.six}
     cases[f"step {_HALF_SIX:g}, float16"] = (volumes["float16"], _HALF_SIX)
-    calls = {name: _six_call(*case, camera) for name, case in cases.items()}
+    calls = {
+        name: partial(six_way, volume, camera, step=step, estimate=False) for name, (volume, step) in cases.items()
+    }
     times = bench.time(calls, few=True)
     finest = six_way(volumes["float32"], camera, step=sizes.six[-1], estimate=False).lightmaps
     rows = []
@@ -212,7 +215,8 @@ def frame_rows(bench: SmokeBench) -> list[Row]:
         "weights and background": shading,
     }
     times = bench.time(calls, few=device == "cpu")
-    times |= bench.time({"six ways by march": _six_call(volume, _HALF_SIX, camera)}, few=True)
+    march = partial(six_way, volume, camera, step=_HALF_SIX, estimate=False)
+    times |= bench.time({"six ways by march": march}, few=True)
     air_cells, voxels = ("x".join(map(str, shape)) for shape in (scene.grid.cells, scene.grid.shape))
     pixels = f"{camera.width}x{camera.height}"
     of = {
@@ -243,14 +247,6 @@ def _cloud(bench: SmokeBench) -> tuple[dict[str, DensityVolume], Camera]:
     centre = volumes["float32"].centre
     eye = centre + n * np.array([1.6, 0.9, 2.2])
     return volumes, Camera.look_at(eye, centre, extent=1.15 * n, height=pixels, width=pixels)
-
-
-def _guide_call(volume: DensityVolume, camera: Camera, **settings) -> Callable[[], Guide]:
-    return lambda: guide(volume, camera, jitter=_JITTER, **settings)
-
-
-def _six_call(volume: DensityVolume, step: float, camera: Camera) -> Callable[[], SixWay]:
-    return lambda: six_way(volume, camera, step=step, estimate=False)
 
 
 def _sphere(count: int) -> np.ndarray:

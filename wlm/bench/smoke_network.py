@@ -35,7 +35,6 @@ from wlm.bench.smoke_network_setup import (
     EXACT,
     FULL,
     QUICK,
-    Frame,
     NetworkBench,
     NetworkSizes,
     Pipeline,
@@ -44,8 +43,10 @@ from wlm.bench.smoke_network_setup import (
     score,
 )
 from wlm.errors import WlmError
+from wlm.fluid.volume import DensityVolume
 from wlm.metrics.error import psnr_from_mse
 from wlm.smoke.baking import SixWay, six_way
+from wlm.smoke.camera import Camera
 from wlm.smoke.coarse import coarse_six_way
 from wlm.smoke.decode import predict
 from wlm.smoke.planes import EMISSION_PLANE, OPACITY_PLANE, encode_lightmaps
@@ -100,44 +101,41 @@ def run_rows(
 def error_rows(bench: NetworkBench) -> list[Row]:
     """Time and error of marches by their steps, and of networks."""
     bench.note(_TABLE)
-    makers: dict[str, Callable[..., torch.Tensor] | None] = {}  # None: nothing to score
-    notes = {f"six ways, step {EXACT:g}": "the reference"}
-    calls: dict[str, Callable[[], object]] = {}
-    chains: dict[str, Callable[[], object]] = {}  # of the graphs that each network has already
-    for step in bench.sizes.six:
-        name = f"six ways, step {step:g}"
-        makers[name] = None if name in notes else _six_maker(step)
-        calls[name] = _on_all(bench, _six_call(bench, step))
+    marches = {f"six ways, step {step:g}": _six(step) for step in bench.sizes.six}
     coarse = {f"coarse, h {step:g}": (step, step) for step in bench.sizes.coarse}
     coarse |= {f"coarse, h {step:g}, nodes {spacing:g}": (step, spacing) for step, spacing in bench.sizes.swept}
-    for name, (step, spacing) in coarse.items():
-        makers[name] = _coarse_maker(step, spacing)
-        calls[name] = _on_all(bench, _coarse_call(bench, step, spacing))
+    marches |= {name: _coarse(*steps) for name, steps in coarse.items()}
+    predicted = {name: _encoded(march) for name, march in marches.items()}
+    reference = f"six ways, step {EXACT:g}"
+    notes = {reference: "the reference"}
+    calls = {name: _on_all(bench, march) for name, march in marches.items()}
+    chains: dict[str, Callable[[], object]] = {}  # of the graphs that each network has already
     for subject in bench.subjects:
         for half in (True, False) if bench.device != "cpu" else (False,):
             name = f"{subject.name}, {'fp16' if half else 'fp32'}"
             pipeline = Pipeline(bench, subject, half=half)
-            makers[name] = pipeline.planes if subject.trained else None
-            if not subject.trained:
+            if subject.trained:
+                predicted[name] = pipeline.planes
+            else:
                 notes[name] = "not trained"
-            calls[name] = _on_all(bench, _predict_call(bench, pipeline))
+            calls[name] = _on_all(bench, _network(pipeline))
             parts = [part for frame in bench.frames for part in pipeline.parts(frame).values()]
             chains[name] = _in_turn(parts)
     long = {name for name in calls if name.startswith("six ways") and float(name.split()[-1]) <= _LONG}
     short_calls = {name: call for name, call in calls.items() if name not in long}
     long_calls = {name: call for name, call in calls.items() if name in long}
     eager = bench.time(short_calls) | bench.time(long_calls, few=True)
-    marches = {name: call for name, call in short_calls.items() if name not in chains}
-    graphs = bench.replayed(marches) | bench.replayed(long_calls, few=True)
+    graphs = bench.replayed({name: call for name, call in short_calls.items() if name not in chains})
+    graphs |= bench.replayed(long_calls, few=True)
     if bench.device != "cpu":
         graphs |= bench.time(chains)
     count = len(bench.frames)
     glowing = [i for i, frame in enumerate(bench.frames) if frame.later.temperature is not None]
     rows = []
-    for name, maker in makers.items():
+    for name in calls:
         figures = {}
-        if maker is not None:
-            planes = [maker(frame.later, bench.camera, frame.seed + 1) for frame in bench.frames]
+        if name in predicted and name != reference:
+            planes = [predicted[name](frame.later, bench.camera, frame.seed + 1) for frame in bench.frames]
             figures = score(planes, bench.references)
             figures["opacity_psnr"] = _plane_psnr(OPACITY_PLANE, planes, bench.references)
             if glowing:
@@ -166,35 +164,33 @@ def _plane_psnr(plane: int, predicted: Sequence[torch.Tensor], references: Seque
     return psnr_from_mse(sum(squares) / len(squares), 1.0)
 
 
-def _on_all(bench: NetworkBench, call: Callable[[Frame], object]) -> Callable[[], object]:
-    return lambda: [call(frame) for frame in bench.frames]
+_March = Callable[[DensityVolume, Camera, int], SixWay]
+"""Smoke, a camera and a seed to lightmaps."""
+
+
+def _six(step: float) -> _March:
+    return lambda volume, camera, seed: six_way(volume, camera, step=step, estimate=False)
+
+
+def _coarse(step: float, spacing: float) -> _March:
+    return lambda volume, camera, seed: coarse_six_way(volume, camera, step=step, spacing=spacing, seed=seed).six
+
+
+def _network(pipeline: Pipeline) -> _March:
+    def march(volume: DensityVolume, camera: Camera, seed: int) -> SixWay:
+        look = pipeline.subject.settings.look(volume.shape) | {"seed": seed}
+        return predict(volume, camera, pipeline.predictor, **look)
+
+    return march
+
+
+def _encoded(march: _March) -> Callable[[DensityVolume, Camera, int], torch.Tensor]:
+    return lambda volume, camera, seed: encode_lightmaps(march(volume, camera, seed))
+
+
+def _on_all(bench: NetworkBench, march: _March) -> Callable[[], object]:
+    return lambda: [march(frame.later, bench.camera, frame.seed + 1) for frame in bench.frames]
 
 
 def _in_turn(parts: Sequence[Callable[[], object]]) -> Callable[[], object]:
     return lambda: [part() for part in parts]
-
-
-def _six_call(bench: NetworkBench, step: float) -> Callable[[Frame], SixWay]:
-    return lambda frame: six_way(frame.later, bench.camera, step=step, estimate=False)
-
-
-def _coarse_call(bench: NetworkBench, step: float, spacing: float) -> Callable[[Frame], object]:
-    return lambda frame: coarse_six_way(frame.later, bench.camera, step=step, spacing=spacing, seed=frame.seed + 1)
-
-
-def _six_maker(step: float) -> Callable[..., torch.Tensor]:
-    return lambda volume, camera, seed: encode_lightmaps(six_way(volume, camera, step=step, estimate=False))
-
-
-def _coarse_maker(step: float, spacing: float) -> Callable[..., torch.Tensor]:
-    return lambda volume, camera, seed: encode_lightmaps(
-        coarse_six_way(volume, camera, step=step, spacing=spacing, seed=seed).six
-    )
-
-
-def _predict_call(bench: NetworkBench, pipeline: Pipeline) -> Callable[[Frame], SixWay]:
-    def call(frame: Frame) -> SixWay:
-        look = pipeline.subject.settings.look(frame.later.shape) | {"seed": frame.seed + 1}
-        return predict(frame.later, bench.camera, pipeline.predictor, **look)
-
-    return call

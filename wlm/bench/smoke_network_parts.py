@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import torch
 
@@ -84,7 +85,7 @@ def profile_rows(bench: NetworkBench) -> list[Row]:
         for half in (True, False) if cuda else (False,):
             predictor = Predictor(network, size, size, device=bench.device, half=half)
             encoded = torch.rand(len(GUIDES[setting.guide]), size, size, device=bench.device)
-            calls[name, "fp16" if half else "fp32"] = _predictor_call(predictor, encoded)
+            calls[name, "fp16" if half else "fp32"] = partial(predictor, encoded)
     times = bench.time(calls, few=not cuda)
     rows = []
     for (name, kind), timing in times.items():
@@ -149,7 +150,3 @@ def _shading(bench: NetworkBench) -> Callable[[], object]:
 
 def _all_of(parts: Sequence[dict[str, Callable[[], object]]], name: str) -> Callable[[], object]:
     return lambda: [part[name]() for part in parts]
-
-
-def _predictor_call(predictor: Predictor, encoded: torch.Tensor) -> Callable[[], object]:
-    return lambda: predictor(encoded)

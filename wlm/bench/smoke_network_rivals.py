@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 import torch
@@ -83,9 +84,9 @@ def _rows_of(bench: NetworkBench, variant: str, trouble: str) -> list[Row]:
     tracers = [PathTracer(bench.frames[i].later, bench.camera, variant=variant) for i in numbers]
     references = [bench.references[i].cpu() for i in numbers]
     traced = {count: [tracer(count)[0] for tracer in tracers] for count in bench.sizes.samples}
-    calls: dict[str, Callable[[], object]] = {_name(count): _traced(tracers[0], count) for count in traced}
+    calls: dict[str, Callable[[], object]] = {_name(count): partial(tracers[0], count) for count in traced}
     if has_denoiser():
-        calls[_DENOISED] = _cleaned(traced[bench.sizes.samples[0]][0])
+        calls[_DENOISED] = partial(denoise, traced[bench.sizes.samples[0]][0])
     # By the CPU's clock on both: an image is a copy there.
     times = {name: timing.median_ms for name, timing in time_together(calls, "cpu", 1, bench.sizes.few).items()}
     notes = f"on the {'GPU' if variant == GPU else 'CPU'}, {variant}" + (f": not on the GPU, {trouble}" * bool(trouble))
@@ -105,14 +106,6 @@ def _rows_of(bench: NetworkBench, variant: str, trouble: str) -> list[Row]:
 
 def _name(count: int) -> str:
     return "1 sample" if count == 1 else f"{count} samples"
-
-
-def _traced(tracer: PathTracer, samples: int) -> Callable[[], object]:
-    return lambda: tracer(samples)
-
-
-def _cleaned(image: np.ndarray) -> Callable[[], object]:
-    return lambda: denoise(image)
 
 
 def _score(images: Sequence[np.ndarray], references: Sequence[torch.Tensor]) -> dict[str, float]:
