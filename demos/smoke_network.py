@@ -17,7 +17,7 @@ import argparse
 import json
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -28,19 +28,21 @@ from wlm.fluid.volume import DensityVolume
 from wlm.formats.atomic import atomic_write
 from wlm.interop import check_device
 from wlm.metrics.error import psnr_from_mse
-from wlm.smoke.baking import SixWay, six_way
+from wlm.smoke.baking import bake
 from wlm.smoke.camera import DIRECTIONS, Camera
-from wlm.smoke.coarse import coarse_six_way
+from wlm.smoke.coarse import march
 from wlm.smoke.codec import load_network, settings_of, shipped
-from wlm.smoke.data import open_footage, open_frames
+from wlm.smoke.data import load_frames, open_frames
 from wlm.smoke.decode import Predictor, predict
 from wlm.smoke.fit import NetworkProfile, train
-from wlm.smoke.guide import guide
+from wlm.smoke.guiding import guide
 from wlm.smoke.learn.dataset import DatasetSettings, make_pool, make_validation
+from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.planes import EMISSION_PLANE, encode_lightmaps
 from wlm.smoke.scene import Grid, LightSettings, Scene, load_scene, make_camera
-from wlm.smoke.simulate import simulate
+from wlm.smoke.simulation import simulate
 from wlm.view.smoke import contact_sheet, picture, to_bytes, write_sequence
+from wlm_kernels.smoke.settings import March
 
 HERE = Path(__file__).resolve().parent
 SCALE, REFINE, SUBSTEPS = 0.24, 2, 4
@@ -84,11 +86,11 @@ class Ways:
 
     def of(self, volume: DensityVolume, camera: Camera, frame: int) -> dict[str, SixWay]:
         """Lightmaps by the fine march, the network and the coarse march."""
-        look = self.settings.look(volume.shape) | {"seed": frame}
+        look = self.settings.look(volume.shape, frame)
         return {
-            "reference": six_way(volume, camera, step=STEP, estimate=False),
-            "network": predict(volume, camera, self.predictor, **look),
-            "coarse march": coarse_six_way(volume, camera, **look).six,
+            "reference": bake(volume, camera, step=STEP, estimate=False),
+            "network": predict(volume, camera, self.predictor, look),
+            "coarse march": march(volume, camera, look),
         }
 
 
@@ -102,7 +104,7 @@ def trained(out: Path, device: str) -> Path:
 def light(out: Path, name: str, scene: Scene, ways: Ways, least: float, turn: float, device: str) -> dict[str, float]:
     """Simulates a scene, lights its frames in each way, and says how far they are from the fine march."""
     simulate(open_frames(out / name, scene), device=device)
-    footage = open_footage(out / name, device=device)
+    footage = load_frames(out / name, device=device)
     rows: dict[str, list[np.ndarray]] = {}
     scores: dict[str, list[float]] = {}
     for number in footage.numbers:
@@ -110,11 +112,11 @@ def light(out: Path, name: str, scene: Scene, ways: Ways, least: float, turn: fl
         camera = make_camera(scene.camera.turned(turn * share), scene.grid.origin, scene.grid.size)
         lights = [turned(given, -2.0 * turn * share).light() for given in scene.lights]
         shown = {"background": scene.background, "obstacles": scene.obstacles, "time": scene.time(number)}
-        if scene.obstacles:
-            shown["depth"] = guide(volume, camera, step=1.0, jitter=0.0).depth
+        depth = guide(volume, camera, March(1.0, jitter=0.0)).depth if scene.obstacles else None
         made = ways.of(volume, camera, number)
         for way, six in made.items():
-            rows.setdefault(way, []).append(to_bytes(picture(six, camera, lights, ramp=scene.smoke.ramp, **shown)))
+            drawn = picture(replace(six, depth=depth), lights, ramp=scene.smoke.ramp, **shown)
+            rows.setdefault(way, []).append(to_bytes(drawn))
             if way != "reference":
                 for what, value in psnr(six, made["reference"]).items():
                     scores.setdefault(f"{way}, {what}dB", []).append(value)

@@ -7,8 +7,9 @@ from builders.smoke_plumes import plume
 
 from wlm.baselines.smoke import billboard
 from wlm.fluid.volume import DensityVolume
-from wlm.smoke.baking import SixWay, six_way
+from wlm.smoke.baking import bake
 from wlm.smoke.camera import Camera
+from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.scene import CameraSettings, make_camera
 
 
@@ -25,7 +26,7 @@ def test_billboard_from_the_same_side(device: str):
     """Nothing changes where the camera doesn't, with heat and without."""
     volume = plume(hot=True, device=device)
     camera = _camera(volume)
-    baked = six_way(volume, camera, estimate=False)
+    baked = bake(volume, camera, estimate=False)
     shown = billboard(baked, camera, camera, volume.centre)
     for name in ("lightmaps", "transparency", "emission"):
         torch.testing.assert_close(getattr(shown, name), getattr(baked, name), atol=2e-6, rtol=0)
@@ -37,13 +38,13 @@ def test_billboard_from_elsewhere(device: str):
     """A turn about the pivot shows the side that was baked, off by ever more; that is the error it is to have."""
     volume = plume(device=device)
     first = _camera(volume)
-    baked = six_way(volume, first, estimate=False)
+    baked = bake(volume, first, estimate=False)
     errors = []
     for degrees in (0.0, 30.0, 90.0):
         camera = _camera(volume, degrees)
         shown = billboard(baked, first, camera, volume.centre)
         torch.testing.assert_close(shown.lightmaps, baked.lightmaps, atol=1e-4, rtol=0)
-        errors.append(_error(shown, six_way(volume, camera, estimate=False)))
+        errors.append(_error(shown, bake(volume, camera, estimate=False)))
     assert errors[0] < 1e-4 < errors[1] < errors[2] and errors[2] > 0.03
 
 
@@ -51,11 +52,11 @@ def test_billboard_moves_with_the_image(device: str):
     """A camera that is shifted, nearer or finer sees the billboard there, as it sees the smoke itself."""
     volume = plume(device=device)
     first = _camera(volume, resolution=96)
-    baked = six_way(volume, first, estimate=False)
+    baked = bake(volume, first, estimate=False)
     target = tuple(volume.centre + np.array([0.3, -0.2, 0.0]))
     for settings in ({"target": target}, {"extent": 1.1}, {"resolution": 48}, {"aspect": 0.5}):
         camera = _camera(volume, **{"resolution": 96} | settings)
-        want = six_way(volume, camera, estimate=False)
+        want = bake(volume, camera, estimate=False)
         black = SixWay(torch.zeros_like(want.lightmaps), None)
         assert _error(billboard(baked, first, camera, volume.centre), want) < 0.05 * _error(black, want)
     away = _camera(volume, target=(9.0, 9.0, 9.0))
@@ -67,7 +68,7 @@ def test_billboard_wrong_use(device: str):
     """Each wrong argument is named."""
     volume = plume(device=device)
     camera = _camera(volume)
-    baked = six_way(volume, camera, estimate=False)
+    baked = bake(volume, camera, estimate=False)
     with pytest.raises(ValueError, match="orthographic"):
         billboard(baked, camera, _camera(volume, perspective=True), volume.centre)
     with pytest.raises(ValueError, match="32 x 32"):

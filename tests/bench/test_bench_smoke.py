@@ -14,7 +14,7 @@ from wlm.bench.smoke_light import make_cloud, six_rows
 from wlm.bench.smoke_setup import QUICK, SmokeBench
 from wlm.errors import WlmError
 from wlm.fluid.volume import DensityVolume
-from wlm.smoke.baking import six_way
+from wlm.smoke.baking import bake
 from wlm.smoke.camera import Camera
 from wlm.smoke.learn.synthetic import make_plume
 
@@ -123,7 +123,7 @@ def test_six_ways_are_those_of_the_system(rows):
     volume = DensityVolume(make_cloud(24, "cpu"), extinction=8.0 / 24)
     eye = volume.centre + 24 * np.array([1.6, 0.9, 2.2])
     camera = Camera.look_at(eye, volume.centre, extent=1.15 * 24, height=16, width=16)
-    assert by_option(rows, "six ways")["step 1"]["max_error"] == six_way(volume, camera, step=1.0).error.largest
+    assert by_option(rows, "six ways")["step 1"]["max_error"] == bake(volume, camera, step=1.0).error.largest
 
 
 def test_weights(rows):

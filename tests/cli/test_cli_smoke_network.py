@@ -15,14 +15,15 @@ from builders.smoke_plumes import plume, write_frames
 from wlm.fluid.volume import save_volume
 from wlm.formats.artifact import read_artifact
 from wlm.smoke import codec
-from wlm.smoke.coarse import coarse_six_way
+from wlm.smoke.coarse import march
 from wlm.smoke.codec import load_network, save_network, settings_of, shipped
-from wlm.smoke.data import open_footage, read_six_way
+from wlm.smoke.data import load_frames, read_six_way
 from wlm.smoke.decode import Predictor, predict
 from wlm.smoke.learn import dataset
 from wlm.smoke.learn.dataset import DatasetSettings
 from wlm.smoke.learn.trainer import Trainer
 from wlm.smoke.planes import GUIDES
+from wlm_kernels.smoke.settings import March
 
 PROFILE = {
     "name": "tiny",
@@ -144,16 +145,17 @@ def test_predict_looks_as_training_did(network, volume, tmp_path):
     out = tmp_path / "a.exr"
     text = call("smoke", "predict", volume, "-o", out, "--network", network, "--resolution", 20, "--seed", 4)
     assert "mean light" in text and "error" not in text
-    found, camera = read_six_way(out)
-    smoke = open_footage(volume).load(1)
+    found = read_six_way(out)
+    camera = found.camera
+    smoke = load_frames(volume).load(1)
     loaded, _ = load_network(network)
     # A tenth of the 24 voxels of the longest edge.
-    look = {"step": 2.4, "jitter": 1.0, "threshold": 4.0 / 24, "seed": 4}
-    wanted = predict(smoke, camera, Predictor(loaded, 20, camera.width), **look)
+    look = March(2.4, seed=4, threshold=4.0 / 24)
+    wanted = predict(smoke, camera, Predictor(loaded, 20, camera.width), look)
     for name in ("lightmaps", "transparency", "emission"):
         torch.testing.assert_close(getattr(found, name), getattr(wanted, name), rtol=1e-3, atol=1e-4)
     call("smoke", "predict", volume, "-o", out, "--network", network, "--resolution", 20, "--seed", 5)
-    assert not torch.equal(read_six_way(out)[0].lightmaps, found.lightmaps)
+    assert not torch.equal(read_six_way(out).lightmaps, found.lightmaps)
     # As what bake wrote.
     call("smoke", "shade", out, "-o", tmp_path / "a.png")
 
@@ -161,8 +163,8 @@ def test_predict_looks_as_training_did(network, volume, tmp_path):
 @pytest.mark.parametrize("words, step", [((), 24 / 130), (("--step", 4), 4.0)])
 def test_predict_by_the_coarse_march_alone(volume, tmp_path, words, step):
     call("smoke", "predict", volume, "-o", tmp_path / "a.exr", "--coarse", *words, "--resolution", 20, "--seed", 2)
-    found, camera = read_six_way(tmp_path / "a.exr")
-    wanted = coarse_six_way(open_footage(volume).load(1), camera, step=step, spacing=step, seed=2).six
+    found = read_six_way(tmp_path / "a.exr")
+    wanted = march(load_frames(volume).load(1), found.camera, March(step, step, seed=2))
     for name in ("lightmaps", "transparency", "emission"):
         torch.testing.assert_close(getattr(found, name), getattr(wanted, name), rtol=1e-3, atol=1e-4)
 
@@ -170,7 +172,7 @@ def test_predict_by_the_coarse_march_alone(volume, tmp_path, words, step):
 def test_without_a_network_the_one_that_ships_is_used(network, volume, tmp_path, monkeypatch):
     for name, words in (("a", ()), ("b", ("--network", shipped())), ("c", ("--network", network))):
         call("smoke", "predict", volume, "-o", tmp_path / f"{name}.exr", "--resolution", 20, *words)
-    ours, same, other = (read_six_way(tmp_path / f"{name}.exr")[0].lightmaps for name in "abc")
+    ours, same, other = (read_six_way(tmp_path / f"{name}.exr").lightmaps for name in "abc")
     assert torch.equal(ours, same) and not torch.equal(ours, other)
     # On the shipped one's own smoke the others would take minutes.
     monkeypatch.setattr(codec, "shipped", lambda: network)
@@ -188,12 +190,12 @@ def test_predict_says_where_it_has_not_learned(network, volume, tmp_path, resolu
 
 
 def test_predict_frames(network, tmp_path):
-    folder = write_frames(tmp_path / "frames").folder
+    folder = write_frames(tmp_path / "frames").path
     call("smoke", "predict", folder, "-o", tmp_path / "six", "--network", network, "--resolution", 170)
     assert " ".join(call.stderr.split()).count("has learned from") == 1
     call("smoke", "predict", folder, "-o", tmp_path / "six", "--network", network, "--resolution", 17)
     assert sorted(os.listdir(tmp_path / "six")) == [f"six_{i:04d}.exr" for i in (1, 2, 3)]
-    assert read_six_way(tmp_path / "six" / "six_0002.exr")[0].lightmaps.shape == (6, 17, 17)
+    assert read_six_way(tmp_path / "six" / "six_0002.exr").lightmaps.shape == (6, 17, 17)
 
 
 def test_evaluate(network, volume, tmp_path):

@@ -14,7 +14,7 @@ import wlm.smoke.learn.dataset as dataset
 from wlm.cli.smoke_network import register
 from wlm.errors import WlmError
 from wlm.fluid.solver import LEAST_HALF_LOSS
-from wlm.smoke.baking import six_way
+from wlm.smoke.baking import bake
 from wlm.smoke.camera import axis_faults
 from wlm.smoke.learn.dataset import (
     ATTEMPTS,
@@ -29,8 +29,9 @@ from wlm.smoke.learn.pool_file import load_pool, save_pool
 from wlm.smoke.learn.scenes import Tilted
 from wlm.smoke.planes import EMISSION_PLANE, OPACITY_PLANE, Pool, from_srgb
 from wlm.smoke.scene import Air
-from wlm.smoke.simulate import make_solver, volume_of
+from wlm.smoke.simulation import make_solver, volume_of
 from wlm.view.smoke_pool import pool_sheet
+from wlm_kernels.smoke.settings import March
 
 SMALL = DatasetSettings(
     cells=20, refine=2, resolution=40, frames=2, views_a_frame=2, sequences=3, warmup=0.7, hot=0.4, moving=0.0
@@ -141,15 +142,18 @@ def test_other_pools(pool, few):
 def test_sequences_of_their_own_cells(monkeypatch):
     """Between the least and the most; the validation has the most, and each looks at the same shares of the box."""
     seen = []
-    known = dataset.look_at
-    monkeypatch.setattr(
-        dataset, "look_at", lambda smoke, *rest, **look: seen.append((smoke.shape, look)) or known(smoke, *rest, **look)
-    )
+    render = dataset.render_guide
+
+    def spied(smoke, camera, kind, march):
+        seen.append((smoke.shape, march))
+        return render(smoke, camera, kind, march)
+
+    monkeypatch.setattr(dataset, "render_guide", spied)
     settings = FEW.model_copy(update={"cells": 24, "least_cells": 16, "sequences": 4, "frames": 1, "views_a_frame": 1})
     made = make_pool(settings, seed=5)
     shapes = {shape[0] for shape, _ in seen}
     assert len(made) and len(shapes) > 1 and shapes <= {settings.refine * cells for cells in range(16, 25)}
-    assert all(look["step"] == pytest.approx(shape[0] * settings.guide_step) for shape, look in seen)
+    assert all(march.step == pytest.approx(shape[0] * settings.guide_step) for shape, march in seen)
     assert torch.equal(made.targets, make_pool(settings, seed=5).targets)
     seen.clear()
     make_validation(settings.model_copy(update={"validation_sequences": 1}))
@@ -295,18 +299,18 @@ def test_nan_never_enters(monkeypatch: pytest.MonkeyPatch):
     calls = []
 
     def broken(*args, **kwargs):
-        found = six_way(*args, **kwargs)
+        found = bake(*args, **kwargs)
         calls.append(1)
         if len(calls) == 1:
             found.lightmaps[2, 3, 4] = float("nan")
         return found
 
-    monkeypatch.setattr(dataset, "six_way", broken)
+    monkeypatch.setattr(dataset, "bake", broken)
     told = []
     made = make_pool(FEW, seed=5, progress=lambda _, figures: told.append(figures))
     assert told[-1]["skipped"] == 1 and torch.isfinite(made.targets).all()
     monkeypatch.setattr(dataset, "ATTEMPTS", 2)
-    monkeypatch.setattr(dataset, "six_way", lambda *a, **k: dataclasses.replace(six_way(*a, **k), transparency=_NAN))
+    monkeypatch.setattr(dataset, "bake", lambda *a, **k: dataclasses.replace(bake(*a, **k), transparency=_NAN))
     with pytest.raises(WlmError, match=r"2 scenes .* NaN"):
         make_pool(FEW, seed=5)
 
@@ -332,20 +336,19 @@ def test_step_of_the_reference(device: str):
     solver.step(60)
     camera = dataset._fixed_cameras(SMALL, scene.grid.origin, scene.grid.size)[3]
     volume = volume_of(scene, solver)
-    found = six_way(volume, camera, step=SMALL.reference_step)
-    fine = six_way(volume, camera, step=0.125, estimate=False).lightmaps
+    found = bake(volume, camera, step=SMALL.reference_step)
+    fine = bake(volume, camera, step=0.125, estimate=False).lightmaps
     off = ((found.lightmaps - fine).square().mean() / fine.square().mean()).sqrt()
     assert off < 0.01 and off < found.error.rms < 0.1
 
 
 def test_look():
     """The paper's numbers on the paper's grid, and the same shares of the box on others."""
-    assert SMALL.look((400, 400, 400)) == {"step": 10.0, "jitter": 1.0, "threshold": 0.01}
-    look = SMALL.look((100, 200, 60))
-    assert look["step"] == 5.0 and look["threshold"] == 0.02
+    assert SMALL.look((400, 400, 400)) == March(10.0, jitter=1.0, threshold=0.01)
+    assert SMALL.look((100, 200, 60), seed=3) == March(5.0, seed=3, threshold=0.02)
     assert DatasetSettings(resolution=240, zoom=(0.5, 1.2)).pixels == (200.0, 480.0)
     apart = DatasetSettings(guide="six", guide_spacing=1 / 80)
-    assert apart.look((400, 400, 400)) == {"step": 10.0, "jitter": 1.0, "threshold": 0.01, "spacing": 5.0}
+    assert apart.look((400, 400, 400)) == March(10.0, 5.0, jitter=1.0, threshold=0.01)
 
 
 @pytest.mark.parametrize(

@@ -8,10 +8,11 @@ from builders.smoke_plumes import plume
 from builders.smoke_samples import STEP, sample, seen
 
 from wlm.fluid.volume import from_array
-from wlm.smoke.coarse import coarse_six_way
+from wlm.smoke.coarse import march
 from wlm.smoke.decode import Predictor, predict
 from wlm.smoke.model import NetworkSettings, SixWayNetwork
 from wlm.smoke.planes import GUIDES
+from wlm_kernels.smoke.settings import March
 
 TINY = {"width": 8, "levels": 3}
 
@@ -100,7 +101,7 @@ def test_hard_smoke(device, stem):
     }
     for name, volume in volumes.items():
         camera = replace(seen(volume), height=50, width=70)
-        six = predict(volume, camera, predictor, step=STEP)
+        six = predict(volume, camera, predictor, March(STEP))
         assert six.lightmaps.shape == (6, 50, 70) and six.emission is None
         for plane in (six.lightmaps, six.transparency):
             assert torch.isfinite(plane).all() and plane.min() >= 0, name
@@ -112,8 +113,8 @@ def test_hard_smoke(device, stem):
 
 def test_emission_is_given_where_there_is_some():
     hot, camera = plume(hot=True), seen(plume())
-    assert predict(hot, camera, Predictor(_network(), 32, 32), step=STEP).emission.shape == (32, 32)
-    assert predict(hot, camera, Predictor(_network(emission=False), 32, 32), step=STEP).emission is None
+    assert predict(hot, camera, Predictor(_network(), 32, 32), March(STEP)).emission.shape == (32, 32)
+    assert predict(hot, camera, Predictor(_network(emission=False), 32, 32), March(STEP)).emission is None
 
 
 def test_of_six_lights_an_untrained_network_is_the_coarse_march(device):
@@ -123,8 +124,8 @@ def test_of_six_lights_an_untrained_network_is_the_coarse_march(device):
     network = SixWayNetwork(NetworkSettings(**TINY, guide="six")).to(device)
     predictor = Predictor(network, 32, 32, device=device, half=False)
     assert predictor.guide == "six"
-    found = predict(volume, camera, predictor, step=STEP, seed=5)
-    known = coarse_six_way(volume, camera, step=STEP, seed=5).six
+    found = predict(volume, camera, predictor, March(STEP, seed=5))
+    known = march(volume, camera, March(STEP, seed=5))
     for name in ("lightmaps", "transparency", "emission"):
         torch.testing.assert_close(getattr(found, name), getattr(known, name), rtol=1e-4, atol=1e-5)
     with pytest.raises(ValueError, match=r"expected \[9, 32, 32\]"):
@@ -136,9 +137,9 @@ def test_predictions_repeat_and_the_network_is_left_alone():
     before = {name: value.clone() for name, value in network.state_dict().items()}
     predictor = Predictor(network, 32, 32)
     volume, camera = plume(), seen(plume())
-    one, other = (predict(volume, camera, predictor, step=STEP, seed=3) for _ in range(2))
+    one, other = (predict(volume, camera, predictor, March(STEP, seed=3)) for _ in range(2))
     assert torch.equal(one.lightmaps, other.lightmaps)
-    assert not torch.equal(one.lightmaps, predict(volume, camera, predictor, step=STEP, seed=4).lightmaps)
+    assert not torch.equal(one.lightmaps, predict(volume, camera, predictor, March(STEP, seed=4)).lightmaps)
     assert all(torch.equal(value, before[name]) for name, value in network.state_dict().items())
 
 

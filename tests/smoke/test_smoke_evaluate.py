@@ -14,7 +14,7 @@ from wlm.baselines.smoke import billboard
 from wlm.errors import WlmError
 from wlm.fluid.volume import save_volume
 from wlm.metrics.error import psnr_from_mse
-from wlm.smoke.baking import six_way
+from wlm.smoke.baking import bake
 from wlm.smoke.decode import Predictor
 from wlm.smoke.evaluation import (
     COARSE,
@@ -142,7 +142,7 @@ def test_a_flip_book_is_the_billboard(tmp_path, device):
     assert len(pool) == 3 and len(others) == 2 and torch.equal(others.targets, pool.targets[1:])
     volume = plume(device=device)
     first, *rest = _fixed_cameras(FEW, volume.origin, volume.voxel * np.array(volume.shape))
-    baked = six_way(volume, first, step=FEW.reference_step, estimate=False)
+    baked = bake(volume, first, step=FEW.reference_step, estimate=False)
     for planes, camera in zip(shown(others, slice(0, 2)), rest, strict=True):
         wanted = encode_lightmaps(billboard(baked, first, camera, volume.centre))
         assert (planes - wanted).abs().max() < 4e-3

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from wlm.smoke.baking import SixWay
 from wlm.smoke.camera import Camera
+from wlm.smoke.lightmaps import SixWay
 
 __all__ = ["billboard"]
 
@@ -47,7 +47,7 @@ def billboard(baked: SixWay, source: Camera, camera: Camera, pivot: np.ndarray) 
     v = torch.tensor(rows / (0.5 * source.height * source.pitch), dtype=torch.float32)
     grid = torch.stack(torch.broadcast_tensors(u[None, :], v[:, None]), -1)[None].to(baked.lightmaps.device)
     read = torch.nn.functional.grid_sample(torch.cat(planes)[None], grid, align_corners=False)[0]
-    return SixWay(read[:6], 1.0 - read[6], read[7] if baked.emission is not None else None)
+    return SixWay(read[:6], 1.0 - read[6], read[7] if baked.emission is not None else None, camera)
 
 
 def _offset(camera: Camera, pivot: np.ndarray) -> tuple[float, float]:

@@ -12,13 +12,15 @@ from wlm.bench.rows import Row
 from wlm.bench.smoke_setup import SmokeBench
 from wlm.fluid.volume import DensityVolume
 from wlm.metrics.error import psnr_from_mse
-from wlm.smoke.baking import SixWay, lit, six_way
+from wlm.smoke.baking import bake, lit
 from wlm.smoke.camera import RULES, Camera
-from wlm.smoke.guide import Guide, guide
+from wlm.smoke.guiding import Guide, guide
 from wlm.smoke.learn.synthetic import make_plume
+from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.scene import CameraSettings, load_scene, make_camera, obstacle_mesh
-from wlm.smoke.shading import Light, composite, obstacle_visibility, shade
-from wlm.smoke.simulate import make_solver, volume_of
+from wlm.smoke.shading import Light, obstacle_visibility
+from wlm.smoke.simulation import make_solver, volume_of
+from wlm_kernels.smoke.settings import March
 
 __all__ = ["frame_rows", "guide_rows", "make_cloud", "six_rows", "weight_rows"]
 
@@ -62,12 +64,12 @@ def guide_rows(bench: SmokeBench) -> list[Row]:
     bench.note("guide")
     sizes = bench.sizes
     volumes, camera = _cloud(bench)
-    fine = guide(volumes["float32"], camera, step=sizes.exact, jitter=0.0, cutoff=0.0, shared=False)
+    fine = guide(volumes["float32"], camera, March(sizes.exact, jitter=0.0, cutoff=0.0), shared=False)
     cases = {("shared", step, "float32"): volumes["float32"] for step in sizes.guide_shared}
     cases |= {("alone", step, "float32"): volumes["float32"] for step in sizes.guide_alone}
     cases |= {("shared", step, "float16"): volumes["float16"] for step in _HALF_GUIDE}
     calls = {
-        (way, step, storage): partial(guide, volume, camera, jitter=_JITTER, step=float(step), shared=way == "shared")
+        (way, step, storage): partial(guide, volume, camera, March(float(step), jitter=_JITTER), shared=way == "shared")
         for (way, step, storage), volume in cases.items()
     }
     # Calls of seconds get fewer samples than those of milliseconds.
@@ -80,9 +82,9 @@ def guide_rows(bench: SmokeBench) -> list[Row]:
     rows = []
     for key, volume in cases.items():
         way, step, storage = key
-        settings = {"step": float(step), "shared": way == "shared"}
-        jittered = guide(volume, camera, jitter=_JITTER, **settings)
-        still = guide(volume, camera, jitter=0.0, **settings)
+        shared = way == "shared"
+        jittered = guide(volume, camera, March(float(step), jitter=_JITTER), shared=shared)
+        still = guide(volume, camera, March(float(step), jitter=0.0), shared=shared)
         option = f"h {step:g}" + (", each pixel alone" if way == "alone" else "")
         option += ", float16" if storage == "float16" else ""
         row = bench.row(
@@ -110,14 +112,12 @@ def six_rows(bench: SmokeBench) -> list[Row]:
     volumes, camera = _cloud(bench)
     cases = {f"step {step:g}": (volumes["float32"], step) for step in sizes.six}
     cases[f"step {_HALF_SIX:g}, float16"] = (volumes["float16"], _HALF_SIX)
-    calls = {
-        name: partial(six_way, volume, camera, step=step, estimate=False) for name, (volume, step) in cases.items()
-    }
+    calls = {name: partial(bake, volume, camera, step=step, estimate=False) for name, (volume, step) in cases.items()}
     times = bench.time(calls, few=True)
-    finest = six_way(volumes["float32"], camera, step=sizes.six[-1], estimate=False).lightmaps
+    finest = bake(volumes["float32"], camera, step=sizes.six[-1], estimate=False).lightmaps
     rows = []
     for name, (volume, step) in cases.items():
-        six = six_way(volume, camera, step=step)
+        six = bake(volume, camera, step=step)
         is_finest = step == sizes.six[-1]
         row = bench.row(
             "six ways",
@@ -141,13 +141,13 @@ def weight_rows(bench: SmokeBench) -> list[Row]:
     volume = make_plume(hot=False, extinction=_PLUME, device=bench.device)
     size = volume.voxel * np.array(volume.shape)
     camera = make_camera(CameraSettings(resolution=bench.sizes.plume), volume.origin, size)
-    six = six_way(volume, camera, step=_WEIGHT_STEP, estimate=False)
-    six = SixWay(six.lightmaps, None)
+    six = bake(volume, camera, step=_WEIGHT_STEP, estimate=False)
+    six = SixWay(six.lightmaps, None, camera=camera)
     lights = [tuple(map(float, toward)) for toward in _sphere(_LIGHTS)]
     exact = [lit(volume, camera, toward, step=_WEIGHT_STEP) for toward in lights]
     rows = []
     for rule in RULES:
-        weighted = [shade(six, camera, [Light(toward)], rule=rule)[..., 0] for toward in lights]
+        weighted = [six.shade([Light(toward)], rule=rule)[..., 0] for toward in lights]
         pairs = list(zip(weighted, exact, strict=True))
         bias = [float(w.double().mean() / e.double().mean()) - 1.0 for w, e in pairs]
         row = bench.row(
@@ -186,7 +186,7 @@ def frame_rows(bench: SmokeBench) -> list[Row]:
     volume = DensityVolume(volume.density.clone(), volume.extinction, volume.voxel, volume.origin)
     bench.note("frame: its stages")
     surface = guide(volume, camera)
-    six = six_way(volume, camera, estimate=False)
+    six = bake(volume, camera, estimate=False)
     lights = [settings.light() for settings in scene.lights]
     corners, triangles, _ = obstacle_mesh(scene.obstacles, scene.time(sizes.frames))
     corners, triangles = (torch.from_numpy(part).to(device) for part in (corners, triangles))
@@ -204,7 +204,7 @@ def frame_rows(bench: SmokeBench) -> list[Row]:
     shadowed = shadows()
 
     def shading() -> torch.Tensor:
-        return composite(shade(six, camera, shadowed), six.transparency, scene.background)
+        return six.shade(shadowed, background=scene.background)
 
     calls = {
         "air alone": lambda: [air.lattice.step(scene.smoke.substeps) for _ in range(steps)],
@@ -215,7 +215,7 @@ def frame_rows(bench: SmokeBench) -> list[Row]:
         "weights and background": shading,
     }
     times = bench.time(calls, few=device == "cpu")
-    march = partial(six_way, volume, camera, step=_HALF_SIX, estimate=False)
+    march = partial(bake, volume, camera, step=_HALF_SIX, estimate=False)
     times |= bench.time({"six ways by march": march}, few=True)
     air_cells, voxels = ("x".join(map(str, shape)) for shape in (scene.grid.cells, scene.grid.shape))
     pixels = f"{camera.width}x{camera.height}"

@@ -45,11 +45,13 @@ from wlm.bench.smoke_network_setup import (
 from wlm.errors import WlmError
 from wlm.fluid.volume import DensityVolume
 from wlm.metrics.error import psnr_from_mse
-from wlm.smoke.baking import SixWay, six_way
+from wlm.smoke.baking import bake
 from wlm.smoke.camera import Camera
-from wlm.smoke.coarse import coarse_six_way
+from wlm.smoke.coarse import march
 from wlm.smoke.decode import predict
+from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.planes import EMISSION_PLANE, OPACITY_PLANE, encode_lightmaps
+from wlm_kernels.smoke.settings import March
 
 __all__ = ["PANELS", "plotted", "run", "run_rows"]
 
@@ -105,10 +107,10 @@ def error_rows(bench: NetworkBench) -> list[Row]:
     coarse = {f"coarse, h {step:g}": (step, step) for step in bench.sizes.coarse}
     coarse |= {f"coarse, h {step:g}, nodes {spacing:g}": (step, spacing) for step, spacing in bench.sizes.swept}
     marches |= {name: _coarse(*steps) for name, steps in coarse.items()}
-    predicted = {name: _encoded(march) for name, march in marches.items()}
+    predicted = {name: _encoded(method) for name, method in marches.items()}
     reference = f"six ways, step {EXACT:g}"
     notes = {reference: "the reference"}
-    calls = {name: _on_all(bench, march) for name, march in marches.items()}
+    calls = {name: _on_all(bench, method) for name, method in marches.items()}
     chains: dict[str, Callable[[], object]] = {}  # of the graphs that each network has already
     for subject in bench.subjects:
         for half in (True, False) if bench.device != "cpu" else (False,):
@@ -164,32 +166,29 @@ def _plane_psnr(plane: int, predicted: Sequence[torch.Tensor], references: Seque
     return psnr_from_mse(sum(squares) / len(squares), 1.0)
 
 
-_March = Callable[[DensityVolume, Camera, int], SixWay]
+_Method = Callable[[DensityVolume, Camera, int], SixWay]
 """Smoke, a camera and a seed to lightmaps."""
 
 
-def _six(step: float) -> _March:
-    return lambda volume, camera, seed: six_way(volume, camera, step=step, estimate=False)
+def _six(step: float) -> _Method:
+    return lambda volume, camera, seed: bake(volume, camera, step=step, estimate=False)
 
 
-def _coarse(step: float, spacing: float) -> _March:
-    return lambda volume, camera, seed: coarse_six_way(volume, camera, step=step, spacing=spacing, seed=seed).six
+def _coarse(step: float, spacing: float) -> _Method:
+    return lambda volume, camera, seed: march(volume, camera, March(step, spacing, seed=seed))
 
 
-def _network(pipeline: Pipeline) -> _March:
-    def march(volume: DensityVolume, camera: Camera, seed: int) -> SixWay:
-        look = pipeline.subject.settings.look(volume.shape) | {"seed": seed}
-        return predict(volume, camera, pipeline.predictor, **look)
-
-    return march
+def _network(pipeline: Pipeline) -> _Method:
+    look = pipeline.subject.settings.look
+    return lambda volume, camera, seed: predict(volume, camera, pipeline.predictor, look(volume.shape, seed))
 
 
-def _encoded(march: _March) -> Callable[[DensityVolume, Camera, int], torch.Tensor]:
-    return lambda volume, camera, seed: encode_lightmaps(march(volume, camera, seed))
+def _encoded(method: _Method) -> Callable[[DensityVolume, Camera, int], torch.Tensor]:
+    return lambda volume, camera, seed: encode_lightmaps(method(volume, camera, seed))
 
 
-def _on_all(bench: NetworkBench, march: _March) -> Callable[[], object]:
-    return lambda: [march(frame.later, bench.camera, frame.seed + 1) for frame in bench.frames]
+def _on_all(bench: NetworkBench, method: _Method) -> Callable[[], object]:
+    return lambda: [method(frame.later, bench.camera, frame.seed + 1) for frame in bench.frames]
 
 
 def _in_turn(parts: Sequence[Callable[[], object]]) -> Callable[[], object]:

@@ -10,15 +10,13 @@ import torch
 from wlm.bench.rows import Row
 from wlm.bench.smoke_network_setup import Frame, NetworkBench, Pipeline
 from wlm.config import profile_names
-from wlm.smoke.baking import SixWay
 from wlm.smoke.decode import Predictor
 from wlm.smoke.evaluation import coarse, compare, of_predictor
 from wlm.smoke.fit import load_profile
 from wlm.smoke.learn.dataset import DatasetSettings
 from wlm.smoke.model import SixWayNetwork, parameter_count
-from wlm.smoke.planes import GUIDES, Pool, decode_lightmaps, look_at
+from wlm.smoke.planes import GUIDES, Pool, decode_lightmaps, render_guide
 from wlm.smoke.scene import LightSettings
-from wlm.smoke.shading import composite, shade
 
 __all__ = ["density_rows", "frame_rows", "profile_rows"]
 
@@ -42,7 +40,7 @@ def frame_rows(bench: NetworkBench) -> list[Row]:
     for subject in bench.subjects:
         pipeline = Pipeline(bench, subject, half=half)
         parts = [pipeline.parts(frame) for frame in bench.frames]
-        step = subject.settings.look(bench.frames[0].later.shape)["step"]
+        step = subject.settings.look(bench.frames[0].later.shape).step
         stages = {
             "guide": f"{subject.settings.guide}, {size}², h {step:.3g}",
             "network": f"{size}², {'fp16' if half else 'fp32'}",
@@ -98,7 +96,7 @@ def profile_rows(bench: NetworkBench) -> list[Row]:
 def density_rows(bench: NetworkBench) -> list[Row]:
     """The networks and the coarse march on thinner and denser smoke, and how much they flicker."""
     bench.note("density")
-    size, step = bench.sizes.resolution, bench.settings.look(bench.frames[0].later.shape)["step"]
+    size, step = bench.sizes.resolution, bench.settings.look(bench.frames[0].later.shape).step
     rows = []
     for scale in bench.sizes.scales:
         frames = [frame.scaled(scale) for frame in bench.frames]
@@ -130,9 +128,9 @@ def _pool(bench: NetworkBench, frames: Sequence[Frame], targets: torch.Tensor, s
     """The frames as samples with guiding maps of some settings."""
     guides = []
     for frame in frames:
-        look = settings.look(frame.later.shape)
+        shape = frame.later.shape
         pair = [
-            look_at(smoke, bench.camera, settings.guide, seed=seed, **look)
+            render_guide(smoke, bench.camera, settings.guide, settings.look(shape, seed))
             for seed, smoke in enumerate(frame.smoke, frame.seed)
         ]
         guides.append(torch.stack(pair))
@@ -144,8 +142,11 @@ def _pool(bench: NetworkBench, frames: Sequence[Frame], targets: torch.Tensor, s
 def _shading(bench: NetworkBench) -> Callable[[], object]:
     lights = [settings.light() for settings in _LIGHTS]
     pairs = zip(bench.frames, bench.references, strict=True)
-    six: list[SixWay] = [decode_lightmaps(planes, hot=frame.later.temperature is not None) for frame, planes in pairs]
-    return lambda: [composite(shade(maps, bench.camera, lights), maps.transparency, _BACKGROUND) for maps in six]
+    six = [
+        decode_lightmaps(planes, hot=frame.later.temperature is not None, camera=bench.camera)
+        for frame, planes in pairs
+    ]
+    return lambda: [lightmaps.shade(lights, background=_BACKGROUND) for lightmaps in six]
 
 
 def _all_of(parts: Sequence[dict[str, Callable[[], object]]], name: str) -> Callable[[], object]:

@@ -15,17 +15,18 @@ from wlm.fluid.solver import Solver
 from wlm.fluid.volume import DensityVolume
 from wlm.interop import stream
 from wlm.metrics.error import psnr_from_mse
-from wlm.smoke.baking import SixWay, six_way
+from wlm.smoke.baking import bake
 from wlm.smoke.camera import DIRECTIONS, Camera
 from wlm.smoke.codec import load_network, settings_of
 from wlm.smoke.decode import Predictor
 from wlm.smoke.fit import load_profile
 from wlm.smoke.learn.dataset import DatasetSettings, draw_scene
+from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.model import SixWayNetwork
 from wlm.smoke.motion import motion
-from wlm.smoke.planes import decode_lightmaps, encode_lightmaps, look_at
+from wlm.smoke.planes import decode_lightmaps, encode_lightmaps, render_guide
 from wlm.smoke.scene import CameraSettings, Scene, make_camera
-from wlm.smoke.simulate import make_solver, volume_of
+from wlm.smoke.simulation import make_solver, volume_of
 
 __all__ = [
     "EXACT",
@@ -199,7 +200,7 @@ class NetworkBench(Bench):
 
     def reference(self, volume: DensityVolume, camera: Camera | None = None) -> torch.Tensor:
         """Planes [8, H, W] by the finest march."""
-        return encode_lightmaps(six_way(volume, camera or self.camera, step=EXACT, estimate=False))
+        return encode_lightmaps(bake(volume, camera or self.camera, step=EXACT, estimate=False))
 
     def replayed(self, calls: Mapping[str, Callable[[], object]], *, few: bool = False) -> dict[str, Timing]:
         """Times calls as graphs; on a CPU there is nothing to replay."""
@@ -277,19 +278,19 @@ class Pipeline:
 
     def planes(self, volume: DensityVolume, camera: Camera, seed: int) -> torch.Tensor:
         """The planes that the network predicts, [8, H, W]; a copy."""
-        look = self.subject.settings.look(volume.shape) | {"seed": seed}
+        look = self.subject.settings.look(volume.shape, seed)
         with stream(self._bench.device):
-            return self.predictor(look_at(volume, camera, self.predictor.guide, **look)).clone()
+            return self.predictor(render_guide(volume, camera, self.predictor.guide, look)).clone()
 
     def parts(self, frame: Frame) -> dict[str, Callable[[], object]]:
         """Calls that make a frame's guiding map, planes and lightmaps, each from the result of the one before."""
-        look = self.subject.settings.look(frame.later.shape) | {"seed": frame.seed + 1}
+        look = self.subject.settings.look(frame.later.shape, frame.seed + 1)
         kind, hot = self.predictor.guide, frame.later.temperature is not None
-        encoded = look_at(frame.later, self.camera, kind, **look)
+        encoded = render_guide(frame.later, self.camera, kind, look)
         planes = self.predictor(encoded)
 
         def guided() -> None:
-            encoded.copy_(look_at(frame.later, self.camera, kind, **look))
+            encoded.copy_(render_guide(frame.later, self.camera, kind, look))
 
         def decoded() -> SixWay:
             return decode_lightmaps(planes, hot=hot and self.predictor.emission)

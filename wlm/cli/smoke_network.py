@@ -19,33 +19,21 @@ from wlm.cli.console import (
     table,
     write_json,
 )
-from wlm.cli.smoke_options import (
-    Device,
-    Distance,
-    Emission,
-    Extent,
-    Extinction,
-    Input,
-    Resolution,
-    Toward,
-    Turn,
-    open_smoke,
-    write_lightmaps,
-)
+from wlm.cli.options import Device
+from wlm.cli.smoke_options import Input, SmokeOptions, with_smoke, write_lightmaps
 from wlm.errors import WlmError
 
 if TYPE_CHECKING:
     from wlm.fluid.volume import DensityVolume
-    from wlm.smoke.baking import SixWay
     from wlm.smoke.camera import Camera
     from wlm.smoke.evaluation import Comparison
+    from wlm.smoke.lightmaps import SixWay
     from wlm.smoke.model import SixWayNetwork
 
 __all__ = ["register"]
 
 _POOL, _SHEET = "pool.safetensors", "sheet.png"
 _SUFFIX = ".safetensors"
-_NEAR = 1.25  # times as many pixels as a network has learned from, or as few, that still count as that
 
 _MARCH = 130  # steps of `predict --coarse` along the longest edge
 
@@ -137,9 +125,11 @@ def train(
     show(rows)
 
 
+@with_smoke
 def predict(
     smoke: Input,
     output: Annotated[Path, typer.Option("--output", "-o", metavar="OUT", help="A .exr, or of frames a folder.")],
+    options: SmokeOptions,
     network: Annotated[
         Path | None, typer.Option(metavar="FILE", help="A network that train wrote; default the one that wlm has.")
     ] = None,
@@ -153,15 +143,7 @@ def predict(
             help=f"Voxels, of the march of --coarse; default 1/{_MARCH} of the longest edge.",
         ),
     ] = None,
-    resolution: Resolution = None,
     seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Of the march's jitter.")] = 0,
-    toward: Toward = None,
-    turn: Turn = 0.0,
-    extent: Extent = None,
-    distance: Distance = None,
-    extinction: Extinction = None,
-    emission: Emission = None,
-    device: Device = "cpu",
 ) -> None:
     """Make six-way lightmaps by the network, from a guiding map as it was trained with: what bake makes, sooner.
 
@@ -172,12 +154,9 @@ def predict(
     if step is not None and not coarse:
         raise WlmError("--step: expected --coarse beside it: a network looks as it was trained to")
     quiet_warp()
-    from wlm.smoke.codec import shipped
-
-    footage = open_smoke(smoke, extinction, emission, device)
-    make = _coarse(step, seed) if coarse else _predicted(network or shipped(), seed, footage.device)
-    view = {"resolution": resolution, "toward": toward, "turn": turn, "extent": extent, "distance": distance}
-    write_lightmaps(footage, output, view, make)
+    frames = options.open(smoke)
+    make = _coarse(step, seed) if coarse else _predicted(network, seed, frames.device)
+    write_lightmaps(frames, options.camera(frames), output, make)
 
 
 def evaluate(
@@ -299,35 +278,28 @@ def dataset(
 
 def _coarse(step: float | None, seed: int) -> "Callable[[DensityVolume, Camera], SixWay]":
     """Makes lightmaps by a march whose nodes are as far apart as its steps."""
-    from wlm.smoke.coarse import coarse_six_way
+    from wlm.smoke.coarse import march
+    from wlm_kernels.smoke.settings import March
 
     def make(volume: "DensityVolume", camera: "Camera") -> "SixWay":
         voxels = max(volume.shape) / _MARCH if step is None else step
-        return coarse_six_way(volume, camera, step=voxels, seed=seed).six
+        return march(volume, camera, March(voxels, seed=seed))
 
     return make
 
 
-def _predicted(path: Path, seed: int, device: str) -> "Callable[[DensityVolume, Camera], SixWay]":
-    """Makes lightmaps by a network, which looks as it was trained to."""
-    from wlm.smoke.codec import load_network, settings_of
-    from wlm.smoke.decode import Predictor
-    from wlm.smoke.decode import predict as run
+def _predicted(path: Path | None, seed: int, device: str) -> "Callable[[DensityVolume, Camera], SixWay]":
+    """Makes lightmaps by a network; notes once where it wasn't trained for the image's size."""
+    from wlm.smoke.prediction import SmokePredictor
 
-    loaded, summary = load_network(path)
-    settings = settings_of(path, summary)
-    predictors: dict[tuple[int, int], Any] = {}
-    fewest, most = settings.pixels
+    predictor, first = SmokePredictor(path, device), True
 
     def make(volume: "DensityVolume", camera: "Camera") -> "SixWay":
-        size = (camera.height, camera.width)
-        pixels = camera.height * volume.voxel * max(volume.shape) / camera.extent
-        if not predictors and not fewest / _NEAR <= pixels <= most * _NEAR:
-            learned = f"{path.stem} has learned from {fewest:.0f} to {most:.0f}"
-            note(f"{pixels:.0f} pixels show the smoke's longest edge, {learned}: --coarse may be nearer")
-        if size not in predictors:
-            predictors[size] = Predictor(loaded, *size, device=device)
-        return run(volume, camera, predictors[size], seed=seed, **settings.look(volume.shape))
+        nonlocal first
+        if first and (warning := predictor.warning(volume, camera)):
+            note(warning)
+        first = False
+        return predictor(volume, camera, seed)
 
     return make
 

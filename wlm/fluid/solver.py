@@ -17,7 +17,7 @@ smoke at faces                         leaves through inlets and outlets, and cl
                                        face with an inlet is open as a whole, beside the inlet too
 a grid of one voxel                    fine
 grids too large for the memory         error before any smoke is allocated: what it needs and what there is;
-                                       ``wlm.smoke.simulate.make_solver`` checks air and smoke together
+                                       ``wlm.smoke.simulation.make_solver`` checks air and smoke together
 =====================================  ===================================================================
 """
 

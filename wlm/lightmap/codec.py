@@ -41,17 +41,17 @@ def decode(artifact: Artifact) -> LightmapModel:
     settings, tensors = artifact.settings, artifact.tensors
     profile = check_settings(Profile, settings["profile"], "profile.")
     width, height = (int(size) for size in settings["size"])
-    kind = check_parts(tensors, {"kind": Part(np.uint8, (TileGrid.of(height, width).count,))})["kind"]
+    tiles = Part(np.uint8, (TileGrid.of(height, width).count,))
+    kind, times = check_parts(tensors, {"kind": tiles, "times": Part((np.float32, np.float64), (None,))}).values()
     if kind.max() > max(TileKind):
         raise ValueError(f"part kind: expected 0 to {max(TileKind)}, found {kind.max()}")
-    times = tensors["times"].astype(np.float64)
-    if len(times) < 1 or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
-        raise ValueError("part times: expected finite times that increase")
+    if len(times) < 1 or (np.diff(times) <= 0).any():
+        raise ValueError("part times: expected times that increase")
     return LightmapModel(
         name=str(settings["name"]),
         width=width,
         height=height,
-        times=times,
+        times=times.astype(np.float64),
         period=None if settings["period"] is None else float(settings["period"]),
         source=artifact.source,
         profile=profile,

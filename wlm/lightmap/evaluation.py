@@ -45,7 +45,7 @@ class Report(BaseReport):
         psnr_by_tile, ssim_by_tile, flip_by_tile: float64 [rows, columns] of the grid, means over the times.
         psnr_by_time, ssim_by_time, flip_by_time: float64 [T], means over the tiles.
         time_values: float64 [T], the stored times.
-        worst_psnr: Lowest PSNR of a tile at a time.
+        worst_psnr: Lowest PSNR of any tile at any time.
         worst_tile: Where that is: ``time``, ``tile`` (its number), ``row``, ``column``; None without a score.
         max_abs_error: Largest absolute error of a valid texel, scored or not, in the input's units.
         max_abs_error_unscored: The same over what has no score.

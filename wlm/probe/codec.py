@@ -102,10 +102,11 @@ def _unpack_dead(packed: np.ndarray, probes: int) -> np.ndarray:
     if not packed.size:
         return np.zeros(0, bool)
     size = -(-probes // 8)
+    inflater = zlib.decompressobj()
     try:
-        bits = zlib.decompressobj().decompress(packed.tobytes(), size + 1)
+        bits = inflater.decompress(packed.tobytes(), size + 1)
     except zlib.error as error:
         raise ValueError(f"part dead: {error}") from error
-    if len(bits) != size:
+    if len(bits) != size or not inflater.eof or inflater.unused_data:
         raise ValueError(f"part dead: expected a bit for each of {probes} probes")
     return np.unpackbits(np.frombuffer(bits, np.uint8), count=probes).astype(bool)

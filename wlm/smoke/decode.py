@@ -18,12 +18,13 @@ from torch import nn
 
 from wlm.fluid.volume import DensityVolume
 from wlm.interop import StepGraph, check_device, to_warp
-from wlm.smoke.baking import SixWay
 from wlm.smoke.camera import Camera
+from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.model import REACH, NafBlock, SixWayNetwork
-from wlm.smoke.planes import GUIDES, PLANES, decode_lightmaps, look_at
+from wlm.smoke.planes import GUIDES, PLANES, decode_lightmaps, render_guide
 from wlm_kernels.smoke import naf_block
 from wlm_kernels.smoke import planes as smoke_planes
+from wlm_kernels.smoke.settings import March
 
 __all__ = ["Predictor", "predict"]
 
@@ -76,7 +77,7 @@ class Predictor:
         """Makes the planes of one image; on CUDA it is queued, not awaited.
 
         Args:
-            encoded: [C, H, W], of `samples.look_at` and the network's kind, on the device.
+            encoded: [C, H, W], of `planes.render_guide` and the network's kind, on the device.
 
         Returns:
             float32 [8, H, W] in the order of `samples.PLANES`, clamped to what each can be. It is overwritten by the
@@ -100,35 +101,23 @@ class Predictor:
         self._tail(heads, self._guide[0], self._planes)
 
 
-def predict(
-    volume: DensityVolume,
-    camera: Camera,
-    predictor: Predictor,
-    *,
-    step: float = 10.0,
-    jitter: float = 1.0,
-    seed: int = 0,
-    threshold: float = 0.01,
-    spacing: float | None = None,
-) -> SixWay:
+def predict(volume: DensityVolume, camera: Camera, predictor: Predictor, march: March = March()) -> SixWay:
     """Makes six-way lightmaps of smoke: its guiding map, the network, and its planes decoded.
 
     Args:
         volume: On the predictor's device.
         camera: Orthographic; of the predictor's height and width.
         predictor: The network.
-        step, jitter, seed, threshold, spacing: Of the guiding map, as for `look_at`: what the network was trained
-            with, which `DatasetSettings.look` gives.
+        march: Of the guiding map: what the network was trained with, which `DatasetSettings.look` gives.
 
     Returns:
         The lightmaps, with emission if the smoke has a temperature and the network makes it.
 
     Raises:
-        ValueError: Another size or device, or a setting out of its range.
+        ValueError: Another size or device.
     """
-    look = {"step": step, "jitter": jitter, "seed": seed, "threshold": threshold, "spacing": spacing}
-    planes = predictor(look_at(volume, camera, predictor.guide, **look))
-    return decode_lightmaps(planes, hot=predictor.emission and volume.temperature is not None)
+    planes = predictor(render_guide(volume, camera, predictor.guide, march))
+    return decode_lightmaps(planes, hot=predictor.emission and volume.temperature is not None, camera=camera)
 
 
 class _Adapters:

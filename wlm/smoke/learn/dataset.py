@@ -37,13 +37,14 @@ from wlm.errors import WlmError
 from wlm.fluid.solver import Solver
 from wlm.fluid.volume import load_volume
 from wlm.interop import check_device, no_collection, stream
-from wlm.smoke.baking import six_way
+from wlm.smoke.baking import bake
 from wlm.smoke.camera import Camera
 from wlm.smoke.learn.scenes import EDGE, LATTICE_SPEED, draw_scene, generator
 from wlm.smoke.motion import motion
-from wlm.smoke.planes import GUIDES, OPACITY_PLANE, PLANES, VISIBLE, Pool, encode_lightmaps, look_at
+from wlm.smoke.planes import GUIDES, OPACITY_PLANE, PLANES, VISIBLE, Pool, encode_lightmaps, render_guide
 from wlm.smoke.scene import CameraSettings, Scene, make_camera
-from wlm.smoke.simulate import make_solver, volume_of
+from wlm.smoke.simulation import make_solver, volume_of
+from wlm_kernels.smoke.settings import March
 
 __all__ = [
     "ATTEMPTS",
@@ -171,11 +172,12 @@ class DatasetSettings(BaseModel):
         whole = _PERIOD * self.substeps
         return round(crossings * self.cells / (LATTICE_SPEED * whole)) * whole
 
-    def look(self, shape: Sequence[int]) -> dict[str, float]:
-        """How `look_at` has to look at so many voxels: its step, jitter and threshold, maybe its spacing."""
+    def look(self, shape: Sequence[int], seed: int = 0) -> March:
+        """The march of a guiding map through so many voxels."""
         longest = max(shape)
-        look = {"step": self.guide_step * longest, "jitter": self.jitter, "threshold": self.surface / longest}
-        return look if self.guide_spacing is None else look | {"spacing": self.guide_spacing * longest}
+        spacing = None if self.guide_spacing is None else self.guide_spacing * longest
+        threshold = self.surface / longest
+        return March(self.guide_step * longest, spacing, jitter=self.jitter, seed=seed, threshold=threshold)
 
 
 @dataclass(frozen=True)
@@ -333,10 +335,10 @@ class _Maker:
                 for number, shot in enumerate(shots, pair * views):
                     seen = replace(smoke, extinction=smoke.extinction * shot.scale)
                     with clock("guide"):
-                        look = settings.look(smoke.shape) | {"seed": shot.seed + frame}
-                        guides[number, frame] = look_at(seen, shot.camera, settings.guide, **look)
+                        look = settings.look(smoke.shape, shot.seed + frame)
+                        guides[number, frame] = render_guide(seen, shot.camera, settings.guide, look)
                     with clock("reference"):
-                        found = six_way(seen, shot.camera, step=settings.reference_step, estimate=False)
+                        found = bake(seen, shot.camera, step=settings.reference_step, estimate=False)
                         targets[number, frame] = encode_lightmaps(found)
                     if frame:
                         with clock("motion"):
@@ -470,8 +472,8 @@ def load_probe_volume(
     cameras = _fixed_cameras(settings, volume.origin, volume.voxel * np.asarray(volume.shape))
     guides, targets = [], []
     for number, camera in enumerate(cameras):
-        guides.append(look_at(volume, camera, settings.guide, seed=number, **settings.look(volume.shape)).half())
-        targets.append(encode_lightmaps(six_way(volume, camera, step=settings.reference_step, estimate=False)).half())
+        guides.append(render_guide(volume, camera, settings.guide, settings.look(volume.shape, number)).half())
+        targets.append(encode_lightmaps(bake(volume, camera, step=settings.reference_step, estimate=False)).half())
     pairs = [torch.stack([torch.stack(parts)] * 2, 1) for parts in (guides, targets)]
     still = torch.zeros((len(cameras), *pairs[0].shape[1:2], *pairs[0].shape[-2:]), dtype=torch.float16)
     return Pool(*pairs, still.to(device), torch.zeros(len(cameras), dtype=torch.int64, device=device))

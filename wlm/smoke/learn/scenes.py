@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from wlm.fluid.solver import LEAST_HALF_LOSS
-from wlm.smoke.scene import Air, Grid, Inlet, Obstacle, Scene, Smoke, Source
+from wlm.smoke.scene import Air, Grid, Inlet, ObstacleSettings, Scene, Smoke, SourceSettings
 
 if TYPE_CHECKING:
     from wlm.smoke.learn.dataset import DatasetSettings
@@ -38,7 +38,7 @@ _CYLINDERS, _BALLS = 0.65, 0.85  # shares of obstacles, running; the rest are bo
 _CROSSING = (0.9, 1.6)  # seconds in which a moving obstacle crosses the box
 
 
-class Tilted(Obstacle):
+class Tilted(ObstacleSettings):
     """A body that is turned such that its y axis points along another.
 
     Attributes:
@@ -150,7 +150,7 @@ def _flame(random: np.random.Generator) -> dict[str, Any]:
 
 def _plume(random: np.random.Generator) -> dict[str, Any]:
     """A ball that is held at a density and a temperature; smoke rises from it and rolls up."""
-    ball = Source(
+    ball = SourceSettings(
         centre=_place(random, (0.35, 0.1, 0.35), (0.65, 0.16, 0.65)),
         radius=EDGE * _log(random, *_RADIUS),
         density=random.uniform(0.6, 1.0),
@@ -163,7 +163,7 @@ def _plume(random: np.random.Generator) -> dict[str, Any]:
 def _burst(random: np.random.Generator) -> dict[str, Any]:
     """Balls that are hot for a moment, beside each other."""
     balls = [
-        Source(
+        SourceSettings(
             centre=_place(random, (0.32, 0.12, 0.32), (0.68, 0.3, 0.68)),
             radius=EDGE * random.uniform(0.08, 0.17),
             density=random.uniform(0.7, 1.0),
