@@ -158,7 +158,7 @@ def test_evaluate(inputs, tiles, tmp_path):
     report = json.loads((tmp_path / "a.json").read_text())
     mesh, model = load_mesh(*inputs), codec.read(tiles / "atlas.wlm")
     rival = downsampling(mesh, 1.0 - model.compression_ratio)
-    samplers = {"ours": Decoder(model), "rival": rival.sample}
+    samplers = {"ours": Decoder(model), "rival": rival.decoded}
     expected = evaluate(mesh, samplers, views=3, resolution=64)
     for found, name in ((report, "ours"), (report["downsampling"], "rival")):
         # Seams of tiles are others than those of charts.
