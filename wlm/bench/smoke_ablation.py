@@ -28,18 +28,20 @@ from typing import TypeVar
 import torch
 from pydantic import BaseModel
 
+from wlm.baselines.smoke import COARSE, coarse
 from wlm.bench.runner import Row
 from wlm.bench.smoke_setup import number
 from wlm.bench.smoke_setup import row as smoke_row
 from wlm.errors import WlmError
 from wlm.interop import check_device
-from wlm.smoke.evaluation import COARSE, Evaluation, coarse, compare, evaluate
-from wlm.smoke.fit import NetworkProfile, load_profile
-from wlm.smoke.learn.dataset import DatasetSettings, make_pool, make_validation
+from wlm.smoke.evaluation import Score, of_network, score
+from wlm.smoke.learn.dataset import make_pool, make_validation
 from wlm.smoke.learn.losses import Losses
+from wlm.smoke.learn.pool import Pool
+from wlm.smoke.learn.settings import DatasetSettings
 from wlm.smoke.learn.trainer import Trainer, plan_round
-from wlm.smoke.model import SixWayNetwork, parameter_count
-from wlm.smoke.planes import PLANES, Pool
+from wlm.smoke.model import Profile, SixWayNetwork, parameter_count
+from wlm.smoke.planes import PLANES
 
 __all__ = ["FULL", "METHOD", "QUICK", "AblationSizes", "run", "run_rows", "variants"]
 
@@ -127,12 +129,12 @@ def run(
     """
     sizes = QUICK if quick else FULL
     given = {name: value for name, value in {"rounds": rounds, "steps": steps}.items() if value is not None}
-    return run_rows(replace(sizes, **given), load_profile(profile), only, device=device, progress=progress, done=done)
+    return run_rows(replace(sizes, **given), Profile.load(profile), only, device=device, progress=progress, done=done)
 
 
 def run_rows(
     sizes: AblationSizes,
-    base: NetworkProfile,
+    base: Profile,
     only: Sequence[str] = (),
     *,
     device: str,
@@ -158,7 +160,7 @@ def run_rows(
     for name, profile in chosen.items():
         if profile is None:
             validation = samples.validation(_changed(base.dataset, {"guide": "six"}))
-            found = compare({COARSE: coarse}, validation)[COARSE]
+            found = score(coarse, validation)
             rows.append(_row(scene, name, found, {}, "no network"))
         else:
             rows.append(_trained_row(scene, name, profile, samples, note, device))
@@ -168,7 +170,7 @@ def run_rows(
 
 
 def _trained_row(
-    scene: str, name: str, profile: NetworkProfile, samples: _Samples, note: Callable[[str], None], device: str
+    scene: str, name: str, profile: Profile, samples: _Samples, note: Callable[[str], None], device: str
 ) -> Row:
     validation, pools = samples.validation(profile.dataset), samples.pools(profile.dataset, profile.training.rounds)
     note(f"trains {name}")
@@ -179,10 +181,10 @@ def _trained_row(
         "parameters": number(parameter_count(network)),
     }
     lost = f"{skipped} steps gave NaN or infinity" if skipped else ""
-    return _row(scene, name, evaluate(network, validation), figures, lost, encode_seconds=seconds)
+    return _row(scene, name, score(of_network(network), validation), figures, lost, encode_seconds=seconds)
 
 
-def variants(base: NetworkProfile) -> dict[str, NetworkProfile | None]:
+def variants(base: Profile) -> dict[str, Profile | None]:
     """The profiles that are compared.
 
     Args:
@@ -214,7 +216,7 @@ def _seen_by(kind: str) -> dict[str, object]:
     return {"guide": kind} | ({"guide_spacing": None} if kind == "paper" else {})
 
 
-def _chosen(base: NetworkProfile, only: Sequence[str], note: Callable[[str], None]) -> dict[str, NetworkProfile | None]:
+def _chosen(base: Profile, only: Sequence[str], note: Callable[[str], None]) -> dict[str, Profile | None]:
     """Those variants that are wanted and can be trained."""
     known = variants(base)
     for name in only:
@@ -234,7 +236,7 @@ def _chosen(base: NetworkProfile, only: Sequence[str], note: Callable[[str], Non
     return chosen
 
 
-def _left_out(profile: NetworkProfile, base: NetworkProfile) -> str:
+def _left_out(profile: Profile, base: Profile) -> str:
     """Why a variant isn't trained; empty if it is."""
     if profile == base:
         return f"{base.name} is so already"
@@ -283,7 +285,7 @@ def _with_smoke(where: str, pool: Pool) -> Pool:
     return pool
 
 
-def _train(profile: NetworkProfile, pools: Sequence[Pool], device: str) -> tuple[SixWayNetwork, int, float, float]:
+def _train(profile: Profile, pools: Sequence[Pool], device: str) -> tuple[SixWayNetwork, int, float, float]:
     """Trains a network; returns also the steps left out, the seconds in all and a step's milliseconds, the median."""
     gc.collect()  # a trainer and its graph hold each other, and much memory
     settings = profile.training
@@ -309,7 +311,7 @@ def _wait(device: str) -> None:
         torch.cuda.synchronize(device)
 
 
-def _row(scene: str, name: str, found: Evaluation, figures: dict[str, str], note: str, **values) -> Row:
+def _row(scene: str, name: str, found: Score, figures: dict[str, str], note: str, **values) -> Row:
     decibels = {"least": found.lowest, "most": found.highest}
     decibels |= {plane: found.planes[PLANES.index(plane)] for plane in _PLANES}
     quality = {f"{title} dB": f"{value:.2f}" for title, value in decibels.items()}

@@ -48,8 +48,7 @@ from wlm.interop import check_device
 from wlm.metrics.error import psnr_from_mse
 from wlm.smoke.baking import SixWay, six_way
 from wlm.smoke.coarse import coarse_six_way
-from wlm.smoke.decode import predict
-from wlm.smoke.planes import EMISSION_PLANE, OPACITY_PLANE, encode_lightmaps
+from wlm.smoke.planes import EMISSION_PLANE, OPACITY_PLANE, decode_lightmaps, encode_lightmaps, look_at
 
 __all__ = ["PANELS", "plotted", "run", "run_rows"]
 
@@ -206,6 +205,7 @@ def _coarse_maker(step: float, spacing: float) -> Callable[..., torch.Tensor]:
 def _predict_call(bench: NetworkBench, whole: Whole) -> Callable[[Frame], SixWay]:
     def call(frame: Frame) -> SixWay:
         look = whole.subject.settings.look(frame.later.shape) | {"seed": frame.seed + 1}
-        return predict(frame.later, bench.camera, whole.predictor, **look)
+        planes = whole.decoder(look_at(frame.later, bench.camera, whole.decoder.guide, **look))
+        return decode_lightmaps(planes, hot=whole.decoder.emission and frame.later.temperature is not None)
 
     return call

@@ -6,23 +6,23 @@ from collections.abc import Callable, Sequence
 
 import torch
 
+from wlm.baselines.smoke import coarse
 from wlm.bench.runner import Row
 from wlm.bench.smoke_network_setup import Frame, NetworkBench, Whole, row
 from wlm.bench.smoke_setup import number
 from wlm.config import profile_names
 from wlm.smoke.baking import SixWay
-from wlm.smoke.decode import Predictor
-from wlm.smoke.evaluation import coarse, compare, of_predictor
-from wlm.smoke.fit import load_profile
-from wlm.smoke.learn.dataset import DatasetSettings
-from wlm.smoke.model import SixWayNetwork, parameter_count
-from wlm.smoke.planes import GUIDES, Pool, decode_lightmaps, look_at
+from wlm.smoke.decode import Decoder
+from wlm.smoke.evaluation import of_decoder, score
+from wlm.smoke.learn.pool import Pool
+from wlm.smoke.learn.settings import DatasetSettings
+from wlm.smoke.model import Profile, SixWayNetwork, SmokeModel, parameter_count
+from wlm.smoke.planes import GUIDES, decode_lightmaps, look_at
 from wlm.smoke.scene import LightSettings
 from wlm.smoke.shading import composite, shade
 
 __all__ = ["density_rows", "frame_rows", "profile_rows"]
 
-_PREFIX = "network-"
 _LIGHTS = (
     LightSettings(toward=(1.0, 0.8, 0.6), irradiance=(11.0, 10.3, 9.4)),
     LightSettings(toward=(-1.0, 0.3, 0.5), irradiance=(1.6, 2.2, 3.2)),
@@ -75,17 +75,16 @@ def profile_rows(bench: NetworkBench) -> list[Row]:
     """The time of each profile's network alone."""
     bench.note("profiles")
     size, cuda = bench.sizes.profile, bench.device != "cpu"
-    names = [name.removeprefix(_PREFIX) for name in profile_names("smoke") if name.startswith(_PREFIX)]
-    settings = {name: load_profile(name).network for name in names}
+    settings = {name: Profile.load(name).network for name in profile_names(Profile.FILES)}
     calls, counts = {}, {}
     for name, one in settings.items():
         torch.manual_seed(0)
-        network = SixWayNetwork(one)
-        counts[name] = parameter_count(network)
+        model = SmokeModel(SixWayNetwork(one), {})
+        counts[name] = parameter_count(model.network)
         for half in (True, False) if cuda else (False,):
-            predictor = Predictor(network, size, size, device=bench.device, half=half)
+            decoder = model.decoder(bench.device, height=size, width=size, half=half)
             encoded = torch.rand(len(GUIDES[one.guide]), size, size, device=bench.device)
-            calls[name, "fp16" if half else "fp32"] = _predictor_call(predictor, encoded)
+            calls[name, "fp16" if half else "fp32"] = _decoder_call(decoder, encoded)
     times = bench.time(calls, few=not cuda)
     rows = []
     for (name, kind), timing in times.items():
@@ -109,13 +108,13 @@ def density_rows(bench: NetworkBench) -> list[Row]:
         targets = torch.stack([torch.stack([bench.reference(one) for one in frame.smoke]) for frame in frames])
         found = {}
         for subject in bench.trained:
-            predictor = Predictor(subject.network, size, size, device=bench.device)
+            decoder = subject.model.decoder(bench.device, height=size, width=size)
             pool = _pool(bench, frames, targets, subject.settings)
-            found |= compare({subject.name: of_predictor(predictor)}, pool)
+            found[subject.name] = score(of_decoder(decoder), pool)
         for share in _MARCHES:
             changed = {"guide": "six", "guide_step": share * bench.settings.guide_step}
             pool = _pool(bench, frames, targets, bench.settings.model_copy(update=changed))
-            found |= compare({f"coarse, h {share * step:g}": coarse}, pool)
+            found[f"coarse, h {share * step:g}"] = score(coarse, pool)
         for name, one in found.items():
             figures = {
                 "least dB": f"{one.lowest:.2f}",
@@ -152,5 +151,5 @@ def _all_of(parts: Sequence[dict[str, Callable[[], object]]], name: str) -> Call
     return lambda: [part[name]() for part in parts]
 
 
-def _predictor_call(predictor: Predictor, encoded: torch.Tensor) -> Callable[[], object]:
-    return lambda: predictor(encoded)
+def _decoder_call(decoder: Decoder, encoded: torch.Tensor) -> Callable[[], object]:
+    return lambda: decoder(encoded)

@@ -19,11 +19,10 @@ from wlm.interop import StepGraph, stream
 from wlm.metrics.error import psnr_from_mse
 from wlm.smoke.baking import SixWay, six_way
 from wlm.smoke.camera import DIRECTIONS, Camera
-from wlm.smoke.codec import load_network, settings_of
-from wlm.smoke.decode import Predictor
-from wlm.smoke.fit import load_profile
-from wlm.smoke.learn.dataset import DatasetSettings, draw_scene
-from wlm.smoke.model import SixWayNetwork
+from wlm.smoke.codec import open_network
+from wlm.smoke.learn.scenes import draw_scene
+from wlm.smoke.learn.settings import DatasetSettings
+from wlm.smoke.model import Profile, SixWayNetwork, SmokeModel
 from wlm.smoke.motion import motion
 from wlm.smoke.planes import decode_lightmaps, encode_lightmaps, look_at
 from wlm.smoke.scene import CameraSettings, Scene, make_camera
@@ -164,13 +163,13 @@ class Subject:
 
     Attributes:
         name: In tables.
-        network: On the CPU.
+        model: On the CPU.
         settings: Of the samples that it learned from, or would.
         trained: Otherwise its weights are random, and its time alone says something.
     """
 
     name: str
-    network: SixWayNetwork
+    model: SmokeModel
     settings: DatasetSettings
     trained: bool
 
@@ -289,39 +288,39 @@ class Whole:
 
     Attributes:
         subject: The network.
-        predictor: It at work.
+        decoder: It at work.
         guided: The guiding map, written in place.
     """
 
     def __init__(self, bench: NetworkBench, subject: Subject, *, half: bool) -> None:
         size = bench.sizes.resolution
         self.subject, self.camera = subject, bench.camera
-        self.predictor = Predictor(subject.network, size, size, device=bench.device, half=half)
+        self.decoder = subject.model.decoder(bench.device, height=size, width=size, half=half)
         self._device = bench.device
 
     def planes(self, volume: DensityVolume, camera: Camera, seed: int) -> torch.Tensor:
         """What the network makes of smoke, [8, H, W]; a copy."""
         look = self.subject.settings.look(volume.shape) | {"seed": seed}
         with stream(self._device):
-            return self.predictor(look_at(volume, camera, self.predictor.guide, **look)).clone()
+            return self.decoder(look_at(volume, camera, self.decoder.guide, **look)).clone()
 
     def parts(self, frame: Frame) -> dict[str, Callable[[], object]]:
         """Calls that make a frame's guiding map, planes and lightmaps, each from what the one before left."""
         look = self.subject.settings.look(frame.later.shape) | {"seed": frame.seed + 1}
-        kind, hot = self.predictor.guide, frame.later.temperature is not None
+        kind, hot = self.decoder.guide, frame.later.temperature is not None
         encoded = look_at(frame.later, self.camera, kind, **look)
-        made = self.predictor(encoded)
+        made = self.decoder(encoded)
 
         def guided() -> None:
             encoded.copy_(look_at(frame.later, self.camera, kind, **look))
 
         def decoded() -> SixWay:
-            return decode_lightmaps(made, hot=hot and self.predictor.emission)
+            return decode_lightmaps(made, hot=hot and self.decoder.emission)
 
         return {
             "guide": StepGraph(guided, self._device, warmup=1),
             # A graph by itself.
-            "network": lambda: self.predictor(encoded),
+            "network": lambda: self.decoder(encoded),
             "decode": StepGraph(decoded, self._device, warmup=1),
         }
 
@@ -344,13 +343,13 @@ def open_subjects(networks: Sequence[str | Path], profiles: Sequence[str]) -> li
     """
     subjects = []
     for path in map(Path, networks):
-        network, summary = load_network(path)
-        subjects.append(Subject(path.stem, network, settings_of(path, summary), True))
+        model = open_network(path)
+        subjects.append(Subject(path.stem, model, model.dataset, True))
     for name in profiles:
-        profile = load_profile(name)
+        profile = Profile.load(name)
         torch.manual_seed(0)
-        network = SixWayNetwork(profile.network)
-        subjects.append(Subject(f"{profile.name} untrained", network, profile.dataset, False))
+        model = SmokeModel(SixWayNetwork(profile.network), {})
+        subjects.append(Subject(f"{profile.name} untrained", model, profile.dataset, False))
     names = [subject.name for subject in subjects]
     for name in names:
         if names.count(name) > 1:
