@@ -30,6 +30,4 @@ def random_model(mesh: LightmappedMesh, kind: str, colour: str = "half", seed: i
         blocks, texels = blocks_of.encode(texels, colour)
     texels = texels.astype(np.float16)
     report = {"seconds": {"fit": 1.5}, "tiles": 4}
-    return AtlasModel(
-        mesh.name, mesh.source, profile, method, colour, height, width, texels, blocks, lut, uv, report
-    )
+    return AtlasModel(mesh.name, mesh.source, profile, method, colour, height, width, texels, blocks, lut, uv, report)

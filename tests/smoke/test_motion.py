@@ -10,8 +10,9 @@ from reference.marching import trilinear
 from wlm.fluid.volume import DensityVolume, from_array
 from wlm.smoke.baking import six_way
 from wlm.smoke.camera import Camera
-from wlm.smoke.learn.dataset import DatasetSettings, make_validation
+from wlm.smoke.learn.dataset import make_validation
 from wlm.smoke.learn.losses import warp
+from wlm.smoke.learn.settings import DatasetSettings
 from wlm.smoke.motion import motion
 from wlm.smoke.planes import OPACITY_PLANE
 from wlm_kernels.smoke.march_motion import motion_kernel

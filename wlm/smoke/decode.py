@@ -38,9 +38,7 @@ class Decoder:
         half: Whether it computes in half floats.
     """
 
-    def __init__(
-        self, model: SmokeModel, device: str = "cpu", *, height: int, width: int, half: bool = True
-    ) -> None:
+    def __init__(self, model: SmokeModel, device: str = "cpu", *, height: int, width: int, half: bool = True) -> None:
         """Folds the weights, as they are now, and allocates buffers.
 
         Args:
@@ -195,7 +193,7 @@ class _Body:
         self.heads = torch.cat([h.weight for h in heads]).to(*options), torch.cat([h.bias for h in heads]).to(*options)
 
     def __call__(self, guide: torch.Tensor) -> torch.Tensor:
-        """Of a guide [1, C, H, W], all heads' outputs for each adapter: [G, N, H / stem, W / stem] of the padded image."""
+        """All heads' outputs for each adapter, [G, N, H / stem, W / stem], of a guide [1, C, H, W] that is padded."""
         settings, stem = self.settings, self.settings.stem
         padded = F.pad(guide, self.padding)[:, : settings.channels]
         x = F.pixel_unshuffle(padded, stem) if stem > 1 else padded

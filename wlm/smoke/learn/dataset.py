@@ -163,9 +163,7 @@ class _Shot(NamedTuple):
 class _Maker:
     """Makes the pools of one set: training, validation or test."""
 
-    def __init__(
-        self, settings: DatasetSettings, seed: int, validation: bool, device: str, scale: float = 1.0
-    ) -> None:
+    def __init__(self, settings: DatasetSettings, seed: int, validation: bool, device: str, scale: float = 1.0) -> None:
         self._settings, self._seed, self._validation, self._scale = settings, seed, validation, scale
         self._device = check_device(device)
         self._clock = _Clock(self._device)
