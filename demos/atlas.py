@@ -16,14 +16,9 @@ from pathlib import Path
 
 import numpy as np
 
-from wlm.atlas import codec
-from wlm.atlas.data import LightmappedMesh, load_mesh
-from wlm.atlas.decode import Decoder
-from wlm.atlas.evaluation import Report, evaluate
-from wlm.atlas.exporter import MODEL_FILE, disk_ratio, export
-from wlm.atlas.fit import compress
-from wlm.atlas.model import AtlasModel, Profile, load_profile
-from wlm.atlas.views import View
+import wlm
+from wlm.atlas.evaluation import Report, Score
+from wlm.atlas.exporter import MODEL_FILE
 from wlm.baselines.atlas import downsampling
 from wlm.cli.console import quiet_warp, show_figures
 from wlm.errors import WlmError
@@ -34,41 +29,36 @@ from wlm.view.atlas import comparison
 HERE = Path(__file__).resolve().parent
 VIEWS, RESOLUTION = 12, 256
 STEPS = 600
-DRAWN = [View.of((1.0, 0.7, 1.0)), View.of((0.4, 1.2, 1.0))]  # into the room
+DRAWN = [wlm.atlas.View.of((1.0, 0.7, 1.0)), wlm.atlas.View.of((0.4, 1.2, 1.0))]  # into the room
 
-# By profile: least PSNR, CR of eq. 9, CR of bytes on disk, and dB above downsampling at as many bits. Seeds 0 to 3 gave
-# 52.1 to 52.4 dB and 15.7 to 16.0 dB above, and 35.8 to 36.0 dB and 3.9 to 4.1 dB above, on the CPU.
+# By profile: lower bounds of PSNR, CR of eq. 9, CR of bytes on disk, and dB above downsampling at as many bits. Seeds 0
+# to 3 gave 52.1 to 52.4 dB and 15.7 to 16.0 dB above, and 35.8 to 36.0 dB and 3.9 to 4.1 dB above, on the CPU.
 LEAST = {
     "standard": (51.5, 0.83, 0.828, 15.0),
     "paper": (35.0, 0.92, 0.68, 3.0),
 }
-MOST_TEXEL_ERROR = 0.004  # of the rebuilt lightmap, as a share of the light's range
+MOST_TEXEL_ERROR = 0.004  # of the rebuilt lightmap, as a fraction of the light's range
 
 
 def run(out: Path, device: str) -> dict[str, dict[str, float]]:
     """Runs the demo and returns its figures by profile."""
     data = HERE / "data" / "atlas"
-    mesh = load_mesh(data / "room.glb", data / "room.exr")
-    short = {"steps": STEPS, "resolution": RESOLUTION}
-    profiles = {
-        "standard": load_profile("standard"),
-        "paper": Profile(**load_profile("paper").model_dump() | short),
-    }
+    mesh = wlm.atlas.load(data / "room.glb", data / "room.exr")
+    overrides = {"standard": {}, "paper": {"steps": STEPS, "resolution": RESOLUTION}}
+    options = {"views": VIEWS, "resolution": RESOLUTION, "device": device}
     figures, drawn = {}, {}
-    for name, profile in profiles.items():
+    for name, settings in overrides.items():
         start = time.perf_counter()
         folder = out / f"room-{name}"
-        export(folder, compress(mesh, profile, seed=0, device=device), mesh)
+        wlm.atlas.export(wlm.atlas.compress(mesh, name, device=device, **settings), folder, mesh)
         seconds = time.perf_counter() - start
-        # From here on the folder is all there is.
-        model = codec.read(folder / MODEL_FILE)
-        decoder = Decoder(model, device)
+        # From here on only the folder is used.
+        model = wlm.load(folder / MODEL_FILE)
+        decoder = model.decoder(device)
         rival = downsampling(mesh, 1.0 - model.compression_ratio)
-        reports = evaluate(
-            mesh, {"ours": decoder, "rival": rival.sample}, views=VIEWS, resolution=RESOLUTION, device=device
-        )
-        size = (folder / MODEL_FILE).stat().st_size
-        figures[name] = _figures(model, size, reports["ours"], reports["rival"]) | {"seconds to compress": seconds}
+        report = wlm.atlas.evaluate(model, mesh, **options)
+        score = wlm.atlas.compare(mesh, {"rival": rival.sample}, **options)["rival"]
+        figures[name] = _figures(report, score) | {"seconds to compress": seconds}
         if name == "standard":
             drawn = {"decoded": decoder, "downsampled": rival.sample}
             _check_rebuilt(decoder.lightmap(mesh), mesh)
@@ -79,28 +69,28 @@ def run(out: Path, device: str) -> dict[str, dict[str, float]]:
     return figures
 
 
-def _figures(model: AtlasModel, size: int, ours: Report, rival: Report) -> dict[str, float]:
+def _figures(ours: Report, rival: Score) -> dict[str, float]:
     return {
         "PSNR dB": ours.psnr,
-        "CR of eq. 9": model.compression_ratio,
-        "CR on disk": disk_ratio(size, model),
+        "CR of eq. 9": ours.cr,
+        "CR on disk": ours.cr_disk,
         "dB above downsampling": ours.psnr - rival.psnr,
         "PSNR dB, worst view": ours.psnr_worst,
         "1 - SSIM": ours.one_minus_ssim,
         "1 - SSIM, downsampling": rival.one_minus_ssim,
-        "bytes": size,
+        "bytes": ours.bytes,
     }
 
 
-def _check_rebuilt(lightmap: np.ndarray, mesh: LightmappedMesh) -> None:
-    """The lightmap in its own layout is close to the original and empty where that is."""
+def _check_rebuilt(lightmap: np.ndarray, mesh: wlm.atlas.LightmappedMesh) -> None:
+    """Checks that the lightmap in its own layout is close to the original, and empty where that is."""
     error = np.abs(lightmap - mesh.lightmap)[mesh.mask].mean() / np.ptp(mesh.lightmap[mesh.mask])
     if lightmap[~mesh.mask].any() or not error <= MOST_TEXEL_ERROR:
         raise WlmError(f"demo: error of the rebuilt lightmap: expected at most {MOST_TEXEL_ERROR}, got {error:.4g}")
 
 
 def _check(name: str, figures: dict[str, float], least: tuple[float, ...]) -> None:
-    """Holds the first figures to their bounds; what it raises names the figure."""
+    """Holds the first figures to their bounds; an error names the figure."""
     for (label, value), bound in zip(figures.items(), least, strict=False):
         if not value >= bound:
             raise WlmError(f"demo: {name}: {label}: expected at least {bound}, got {value:.4g}")

@@ -17,7 +17,7 @@ import argparse
 import json
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -28,20 +28,21 @@ from wlm.fluid.volume import DensityVolume
 from wlm.formats.atomic import atomic_write
 from wlm.interop import check_device
 from wlm.metrics.error import psnr_from_mse
-from wlm.smoke.baking import SixWay, six_way
+from wlm.smoke.baking import bake
 from wlm.smoke.camera import DIRECTIONS, Camera
-from wlm.smoke.coarse import coarse_six_way
+from wlm.smoke.coarse import march
 from wlm.smoke.codec import open_network
-from wlm.smoke.data import open_footage, open_frames
-from wlm.smoke.decode import Decoder
+from wlm.smoke.data import load_frames, open_frames
 from wlm.smoke.fit import train
-from wlm.smoke.guide import guide
-from wlm.smoke.learn.settings import DatasetSettings
-from wlm.smoke.model import Profile
-from wlm.smoke.planes import EMISSION_PLANE, decode_lightmaps, encode_lightmaps, look_at
+from wlm.smoke.guiding import guide
+from wlm.smoke.lightmaps import SixWay
+from wlm.smoke.model import Profile, SmokeModel
+from wlm.smoke.planes import EMISSION_PLANE, encode_lightmaps
+from wlm.smoke.prediction import SmokePredictor
 from wlm.smoke.scene import Grid, LightSettings, Scene, load_scene, make_camera
-from wlm.smoke.simulate import simulate
+from wlm.smoke.simulation import simulate
 from wlm.view.smoke import contact_sheet, picture, to_bytes, write_sequence
+from wlm_kernels.smoke.settings import March
 
 HERE = Path(__file__).resolve().parent
 SCALE, REFINE, SUBSTEPS = 0.24, 2, 4
@@ -76,35 +77,24 @@ SMALL = Profile.model_validate(
 )
 
 
-@dataclass(frozen=True)
-class Methods:
-    """What renders lightmaps of smoke, by name.
-
-    Attributes:
-        decoder: The network.
-        settings: How its guiding maps are made.
-    """
-
-    decoder: Decoder
-    settings: DatasetSettings
-
-    def render(self, volume: DensityVolume, camera: Camera, frame: int) -> dict[str, SixWay]:
-        """Lightmaps by the fine march, the network and the coarse march."""
-        look = self.settings.look(volume.shape) | {"seed": frame}
-        planes = self.decoder(look_at(volume, camera, self.decoder.guide, **look))
-        return {
-            "reference": six_way(volume, camera, step=STEP, estimate=False),
-            "network": decode_lightmaps(planes, hot=self.decoder.emission and volume.temperature is not None),
-            "coarse march": coarse_six_way(volume, camera, **look).six,
-        }
+def render(
+    volume: DensityVolume, camera: Camera, model: SmokeModel, predictor: SmokePredictor, seed: int
+) -> dict[str, SixWay]:
+    """Lightmaps by the fine march, the network and the coarse march that is its guide."""
+    return {
+        "reference": bake(volume, camera, step=STEP, estimate=False),
+        "network": predictor(volume, camera, seed),
+        "coarse march": march(volume, camera, model.dataset.look(volume.shape, seed)),
+    }
 
 
 def light(
-    out: Path, name: str, scene: Scene, methods: Methods, least: float, turn: float, device: str
+    out: Path, name: str, scene: Scene, model: SmokeModel, least: float, turn: float, device: str
 ) -> dict[str, float]:
-    """Simulates a scene, lights its frames by each method, and scores them against the fine march."""
+    """Simulates a scene, lights its frames by each method, and scores these against the fine march."""
+    predictor = SmokePredictor(model, device)
     simulate(open_frames(out / name, scene), device=device)
-    footage = open_footage(out / name, device=device)
+    footage = load_frames(out / name, device=device)
     rows: dict[str, list[np.ndarray]] = {}
     scores: dict[str, list[float]] = {}
     for number in footage.numbers:
@@ -112,11 +102,10 @@ def light(
         camera = make_camera(scene.camera.turned(turn * share), scene.grid.origin, scene.grid.size)
         lights = [turned(settings, -2.0 * turn * share).light() for settings in scene.lights]
         options = {"background": scene.background, "obstacles": scene.obstacles, "time": scene.time(number)}
-        if scene.obstacles:
-            options["depth"] = guide(volume, camera, step=1.0, jitter=0.0).depth
-        lightmaps = methods.render(volume, camera, number)
+        depth = guide(volume, camera, March(1.0, jitter=0.0)).depth if scene.obstacles else None
+        lightmaps = render(volume, camera, model, predictor, number)
         for method, six in lightmaps.items():
-            image = picture(six, camera, lights, ramp=scene.smoke.ramp, **options)
+            image = picture(replace(six, depth=depth), lights, ramp=scene.smoke.ramp, **options)
             rows.setdefault(method, []).append(to_bytes(image))
             if method != "reference":
                 for what, value in psnr(six, lightmaps["reference"]).items():
@@ -189,18 +178,14 @@ def main() -> None:
         args.out.mkdir(parents=True, exist_ok=True)
         device = check_device(args.device)
         if args.train:
-            path, least = args.out / "network.safetensors", LEAST_TRAINED
-            train(SMALL, path, device=device)
+            model, least = train(SMALL, args.out / "network.safetensors", device=device).model, LEAST_TRAINED
         else:
-            path, least = args.network, LEAST_OTHER if args.network else LEAST_SHIPPED
-        model = open_network(path)
-        decoder = model.decoder(device, height=args.resolution, width=args.resolution)
-        methods = Methods(decoder, model.dataset)
+            model, least = open_network(args.network), LEAST_OTHER if args.network else LEAST_SHIPPED
         figures = {}
         for name in RATES:
             scene = few_frames(name, args.scale, args.refine, args.resolution)
             turn = TURN if name == TURNED else 0.0
-            figures[name] = light(args.out, name, scene, methods, least, turn, device)
+            figures[name] = light(args.out, name, scene, model, least, turn, device)
         figures["all"] = {"seconds": time.perf_counter() - clock}
         atomic_write(args.out / "report.json", (json.dumps(figures, indent=1) + "\n").encode())
     except (WlmError, OSError) as error:

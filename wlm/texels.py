@@ -12,7 +12,7 @@ __all__ = ["fill_gaps", "repair"]
 
 
 def fill_gaps(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Give every texel outside the mask the value of the nearest texel inside it (Euclidean distance).
+    """Gives every texel outside the mask the value of the nearest texel inside it (Euclidean distance).
 
     A lightmap's gaps between charts are never seen but share codec blocks and filter windows with texels that
     are; zeros there cost a block codec 10 dB and more at chart edges.

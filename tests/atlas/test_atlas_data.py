@@ -1,6 +1,4 @@
-"""What comes in: every stated behaviour of `wlm.atlas.data`, the coverage of texels, and a mesh with new UVs."""
-
-from __future__ import annotations
+"""Input: every stated behaviour of ``wlm.atlas.data``, the coverage of texels, and a mesh with new UVs."""
 
 import json
 from pathlib import Path
@@ -10,7 +8,7 @@ import pytest
 from PIL import Image
 
 from wlm.atlas.coverage import covered_texels, touched_texels
-from wlm.atlas.data import from_arrays, load_mesh, write_mesh
+from wlm.atlas.data import from_arrays, load, write_mesh
 from wlm.errors import WlmError
 from wlm.formats.exr import HALF_MAX, write_exr
 from wlm.formats.gltf import document_from_arrays, read_gltf
@@ -66,7 +64,7 @@ def test_a_mesh_from_files_and_arrays(tmp_path, kind):
     if kind == "arrays":
         mesh = from_arrays(POSITION, TRIANGLE, UV, _lightmap(), name="square")
     else:
-        mesh = load_mesh(glb.with_suffix(f".{kind}"), light)
+        mesh = load(glb.with_suffix(f".{kind}"), light)
     assert (mesh.name, mesh.uv_set, mesh.warnings) == ("square", 0, ())
     np.testing.assert_array_equal(mesh.position, POSITION)
     np.testing.assert_array_equal(mesh.triangle, TRIANGLE)
@@ -91,15 +89,15 @@ def test_source_names_all_that_counts():
 
 def test_the_second_set_is_the_lightmaps_unless_told(tmp_path):
     files = _files(tmp_path, UV + 0.125)
-    mesh = load_mesh(*files)
+    mesh = load(*files)
     assert mesh.uv_set == 1
     np.testing.assert_array_equal(mesh.uv, UV + 0.125)
-    mesh = load_mesh(*files, uv_set=0)
+    mesh = load(*files, uv_set=0)
     assert mesh.uv_set == 0
     np.testing.assert_array_equal(mesh.uv, UV)
-    assert "expected the UV set TEXCOORD_2, found TEXCOORD_0, TEXCOORD_1" in _message(load_mesh, *files, uv_set=2)
+    assert "expected the UV set TEXCOORD_2, found TEXCOORD_0, TEXCOORD_1" in _message(load, *files, uv_set=2)
     write_mesh(files[0], mesh, mesh.uv[mesh.triangle] * 0.5)
-    assert sorted(load_mesh(*files).parts[0].primitive.uv) == [0, 1, 2] and load_mesh(*files).uv_set == 1
+    assert sorted(load(*files).parts[0].primitive.uv) == [0, 1, 2] and load(*files).uv_set == 1
 
 
 def test_several_primitives_nodes_and_one_without_the_set(tmp_path):
@@ -111,7 +109,7 @@ def test_several_primitives_nodes_and_one_without_the_set(tmp_path):
     document.content["nodes"].append({"mesh": 0, "translation": [5, 0, 0]})
     document.content["scenes"][0]["nodes"] = [0, 1]
     write_glb(glb, document, [], 1)
-    mesh = load_mesh(glb, light)
+    mesh = load(glb, light)
     np.testing.assert_array_equal(mesh.position, np.concatenate([POSITION, POSITION + [5, 0, 0]]))
     np.testing.assert_array_equal(mesh.triangle, np.concatenate([TRIANGLE, TRIANGLE + 4]))
     assert [(part.vertex, part.triangle, part.primitive.node) for part in mesh.parts] == [(0, 0, 0), (4, 2, 1)]
@@ -121,7 +119,7 @@ def test_several_primitives_nodes_and_one_without_the_set(tmp_path):
     assert overlap == "square: 12 texels in several triangles: their UVs overlap"
     corner_uv = np.random.default_rng(2).integers(0, 64, (4, 3, 2)) / 64
     assert write_mesh(tmp_path / "out.glb", mesh, corner_uv) == 2
-    again = load_mesh(tmp_path / "out.glb", light, uv_set=2)
+    again = load(tmp_path / "out.glb", light, uv_set=2)
     np.testing.assert_array_equal(again.uv[again.triangle], corner_uv)
     np.testing.assert_array_equal(again.position[again.triangle], mesh.position[mesh.triangle])
     unchanged = read_gltf(tmp_path / "out.glb")[1][0]
@@ -133,14 +131,14 @@ def test_no_uvs_no_triangles_and_other_names(tmp_path):
     document, _ = read_gltf(glb)
     del document.content["meshes"][0]["primitives"][0]["attributes"]["TEXCOORD_0"]
     write_glb(glb, document, [], 1)
-    assert "the mesh has no UVs: expected TEXCOORD_0 or TEXCOORD_1" in _message(load_mesh, glb, light)
+    assert "the mesh has no UVs: expected TEXCOORD_0 or TEXCOORD_1" in _message(load, glb, light)
     (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3")
-    assert "the mesh has no UVs: expected vt" in _message(load_mesh, tmp_path / "a.obj", light)
+    assert "the mesh has no UVs: expected vt" in _message(load, tmp_path / "a.obj", light)
     (tmp_path / "a.gltf").write_text(json.dumps({"asset": {"version": "2.0"}}))
-    assert "a.gltf: has no triangles" in _message(load_mesh, tmp_path / "a.gltf", light)
+    assert "a.gltf: has no triangles" in _message(load, tmp_path / "a.gltf", light)
     (tmp_path / "a.obj").write_text("v 0 0 0\nvt 0 0\n")
-    assert "a.obj: has no triangles" in _message(load_mesh, tmp_path / "a.obj", light)
-    assert "expected a name that ends in .glb" in _message(load_mesh, tmp_path / "a.fbx", light)
+    assert "a.obj: has no triangles" in _message(load, tmp_path / "a.obj", light)
+    assert "expected a name that ends in .glb" in _message(load, tmp_path / "a.fbx", light)
     assert "has no triangles" in _message(from_arrays, POSITION, TRIANGLE[:0], UV, _lightmap())
 
 
@@ -149,7 +147,7 @@ def test_no_uvs_no_triangles_and_other_names(tmp_path):
     [
         ({"position": POSITION[:, :2]}, "position: expected numbers [N, 3], got float64 (4, 2)"),
         ({"uv": POSITION}, "uv: expected numbers [N, 2]"),
-        ({"uv": UV[:3]}, "uv: expected 4 rows, one a position, got 3"),
+        ({"uv": UV[:3]}, "uv: expected 4 rows, one per position, got 3"),
         ({"triangle": TRIANGLE * 1.0}, "triangle: expected numbers [N, 3], got float64"),
         ({"triangle": TRIANGLE + 1}, "triangle: expected vertices 0 to 3, found 1 to 4"),
         ({"triangle": TRIANGLE - 1}, "triangle: expected vertices 0 to 3, found -1 to 2"),
@@ -233,11 +231,11 @@ def test_a_mask_that_is_given(tmp_path):
     mask = _with(_chart(), (5, 5), True)
     path = tmp_path / "mask.png"
     Image.fromarray(mask.astype(np.uint8)).save(path)
-    mesh = load_mesh(*files, mask_path=path)
+    mesh = load(*files, mask_path=path)
     np.testing.assert_array_equal(mesh.mask, mask)
     assert mesh.warnings == ()
     Image.fromarray(mask[::-1].astype(np.uint8)).save(path)
-    (warning,) = load_mesh(*files, mask_path=path).warnings
+    (warning,) = load(*files, mask_path=path).warnings
     assert "square: 11 texels of 12 that triangles cover are outside the mask: is it of another UV set" in warning
 
 
@@ -259,31 +257,31 @@ def test_a_mask_that_is_derived_leaves_out_what_was_never_baked():
 def test_masks_that_do_not_fit(tmp_path):
     files = _files(tmp_path)
     path = tmp_path / "mask.png"
-    assert "no such mask; expected a PNG of 8x6" in _message(load_mesh, *files, mask_path=path)
+    assert "no such mask; expected a PNG of 8x6" in _message(load, *files, mask_path=path)
     Image.fromarray(np.ones((WIDTH, HEIGHT), np.uint8)).save(path)
-    assert _message(load_mesh, *files, mask_path=path) == f"{path}: the mask is 6x8, but {files[1]} is 8x6"
+    assert _message(load, *files, mask_path=path) == f"{path}: the mask is 6x8, but {files[1]} is 8x6"
     Image.fromarray(np.zeros((HEIGHT, WIDTH), np.uint8)).save(path)
-    assert _message(load_mesh, *files, mask_path=path).startswith(f"{path}: the mask is empty")
+    assert _message(load, *files, mask_path=path).startswith(f"{path}: the mask is empty")
     path.write_bytes(b"no picture")
-    assert "cannot read the mask" in _message(load_mesh, *files, mask_path=path)
+    assert "cannot read the mask" in _message(load, *files, mask_path=path)
 
 
 def test_a_mesh_is_written_with_new_uvs(tmp_path):
     files = _files(tmp_path)
-    mesh = load_mesh(*files)
+    mesh = load(*files)
     corner_uv = np.zeros((2, 3, 2))
     corner_uv[0] = [[0, 0], [1, 0], [0, 1]]
     corner_uv[1] = [[-0.0, 1], [1, 0], [0.5, 0.5]]  # shares both of its old vertices with the first
     assert write_mesh(tmp_path / "out.glb", mesh, corner_uv) == 1
-    again = load_mesh(tmp_path / "out.glb", files[1])
+    again = load(tmp_path / "out.glb", files[1])
     assert again.uv_set == 1 and len(again.position) == 4
     np.testing.assert_array_equal(again.uv[again.triangle], corner_uv + 0.0)
     np.testing.assert_array_equal(again.position[again.triangle], POSITION[TRIANGLE])
-    kept = load_mesh(tmp_path / "out.glb", files[1], uv_set=0)
+    kept = load(tmp_path / "out.glb", files[1], uv_set=0)
     np.testing.assert_array_equal(kept.uv[kept.triangle], UV[TRIANGLE])
     corner_uv[1, 0] = 0.25
     assert write_mesh(tmp_path / "out.glb", again, corner_uv) == 2
-    assert len(load_mesh(tmp_path / "out.glb", files[1], uv_set=2).position) == 5
+    assert len(load(tmp_path / "out.glb", files[1], uv_set=2).position) == 5
     with pytest.raises(ValueError, match="has not yet, got 0"):
         write_mesh(tmp_path / "out.glb", mesh, corner_uv, uv_set=0)
     for wrong in (corner_uv[:1], _with(corner_uv, (0, 0, 0), np.nan)):
@@ -294,9 +292,9 @@ def test_a_mesh_is_written_with_new_uvs(tmp_path):
 def test_what_came_from_an_obj_is_written_as_glb(tmp_path):
     (tmp_path / "a.obj").write_text(OBJ)
     write_exr(tmp_path / "light.exr", _lightmap())
-    mesh = load_mesh(tmp_path / "a.obj", tmp_path / "light.exr")
+    mesh = load(tmp_path / "a.obj", tmp_path / "light.exr")
     write_mesh(tmp_path / "out.glb", mesh, mesh.uv[mesh.triangle] * 0.5)
-    again = load_mesh(tmp_path / "out.glb", tmp_path / "light.exr")
+    again = load(tmp_path / "out.glb", tmp_path / "light.exr")
     np.testing.assert_array_equal(again.uv, UV * 0.5)
     trimesh = pytest.importorskip("trimesh")
     (other,) = trimesh.load(tmp_path / "out.glb").geometry.values()

@@ -6,16 +6,17 @@ import math
 import numpy as np
 import pytest
 import torch
+from builders.atlas_meshes import sheet
+from builders.atlas_models import random_model
 from builders.lit_cube import DIRECTIONS, HEIGHT, WIDTH, lit_cube, waves
 
 from wlm import metrics
 from wlm.atlas.charts import mesh_charts
 from wlm.atlas.data import from_arrays
-from wlm.atlas.evaluation import evaluate
+from wlm.atlas.evaluation import compare, evaluate
 from wlm.atlas.views import View, sphere_views, visible_uv
 from wlm.errors import WlmError
 from wlm.ops import raster
-from wlm.texels import fill_gaps
 
 FACES = [View.of(direction) for direction in DIRECTIONS]
 SQUARE = np.array([[-1, -1, 0], [1, -1, 0], [-1, 1, 0], [1, 1, 0]], np.float64)
@@ -25,7 +26,7 @@ SQUARE_UV = np.array([[0, 0], [1, 0], [0, 1], [1, 1]], np.float64)
 
 def _reader(mesh, change=lambda colour, uv, triangle: colour):
     """Decodes what the reference holds, with a change."""
-    image = torch.tensor(fill_gaps(mesh.lightmap, mesh.mask))
+    image = torch.tensor(mesh.filled)
 
     def sample(uv, triangle, barycentric):
         return change(raster.texture(image.to(uv.device), uv), uv, triangle)
@@ -38,21 +39,21 @@ def _offset(amount):
 
 
 def _one(mesh, decoder, **options):
-    return evaluate(mesh, {"it": decoder}, **({"views": FACES, "resolution": 64} | options))["it"]
+    return compare(mesh, {"it": decoder}, **({"views": FACES, "resolution": 64} | options))["it"]
 
 
 def test_the_reference_is_exact(device):
     report = _one(lit_cube(), _reader(lit_cube()), views=12, device=device)
     assert report.views == 12 and report.pixels > 4000 and report.name == "cube"
-    assert report.psnr == report.psnr_worst == report.texel_psnr == math.inf
+    assert report.psnr == report.psnr_worst == report.texel_psnr == metrics.PSNR_CAP_DB
     assert report.one_minus_ssim == report.seam_error == report.rest_error == 0.0 and math.isnan(report.seam_ratio)
     values = json.loads(json.dumps(report.to_json(), allow_nan=False))
-    assert values["psnr"] is None and values["seam_ratio"] is None and values["one_minus_ssim"] == 0.0
+    assert values["psnr"] == 120.0 and values["seam_ratio"] is None and values["one_minus_ssim"] == 0.0
 
 
 def test_an_upside_down_lightmap_is_terrible():
     mesh = lit_cube()
-    image = torch.tensor(fill_gaps(mesh.lightmap, mesh.mask)).flip(0).contiguous()
+    image = torch.tensor(mesh.filled).flip(0).contiguous()
     report = _one(mesh, lambda uv, triangle, barycentric: raster.texture(image, uv), views=12)
     assert report.psnr < 12.0 and report.texel_psnr < 12.0 and report.one_minus_ssim > 0.5
 
@@ -62,11 +63,11 @@ def test_a_known_error(device):
     report = _one(mesh, _reader(mesh, _offset(0.01)), device=device)
     colours = []
     for seen, _, uv in visible_uv(mesh, FACES, 64, "cpu"):
-        colours.append(raster.texture(torch.tensor(fill_gaps(mesh.lightmap, mesh.mask)), uv[seen >= 0]))
+        colours.append(raster.texture(torch.tensor(mesh.filled), uv[seen >= 0]))
     peak = float(torch.cat(colours).max() - torch.cat(colours).min())
-    wanted = 20.0 * math.log10(peak / 0.01)
+    expected = 20.0 * math.log10(peak / 0.01)
     assert report.peak == pytest.approx(peak, rel=1e-6) and 1.5 < peak < 2.1
-    assert [report.psnr, report.psnr_worst, report.texel_psnr] == pytest.approx([wanted] * 3, abs=1e-3)
+    assert [report.psnr, report.psnr_worst, report.texel_psnr] == pytest.approx([expected] * 3, abs=1e-3)
     assert report.rest_error == pytest.approx(0.01, rel=1e-4)
 
 
@@ -82,7 +83,7 @@ def test_against_the_metrics_of_pictures(device, resolution):
     report = _one(mesh, blurred, views=views, resolution=resolution, device=device)
     psnr, ssim = [], []
     for seen, _, uv in visible_uv(mesh, views, resolution, "cpu"):
-        images = torch.tensor(fill_gaps(mesh.lightmap, mesh.mask)), small
+        images = torch.tensor(mesh.filled), small
         pictures = [raster.texture(image, uv).numpy() for image in images]
         psnr.append(metrics.psnr(*pictures, seen.numpy() >= 0, peak=report.peak))
         ssim.append(metrics.ssim(*pictures, seen.numpy() >= 0, data_range=report.peak))
@@ -101,12 +102,12 @@ def test_pictures_smaller_than_the_window_of_ssim():
 def test_decoders_do_not_mix():
     mesh = lit_cube()
     decoders = {"bad": _reader(mesh, _offset(0.3)), "exact": _reader(mesh), "good": _reader(mesh, _offset(0.001))}
-    reports = evaluate(mesh, decoders, views=FACES, resolution=64)
+    reports = compare(mesh, decoders, views=FACES, resolution=64)
     assert list(reports) == list(decoders)
     for name, decoder in decoders.items():
         alone = _one(mesh, decoder)
         assert json.dumps(alone.to_json()) == json.dumps(reports[name].to_json())
-    assert evaluate(mesh, {}, views=FACES, resolution=16) == {}
+    assert compare(mesh, {}, views=FACES, resolution=16) == {}
 
 
 def test_charts():
@@ -140,7 +141,7 @@ def test_errors_beside_seams_stand_out():
         return change
 
     decoders = {f"{width}": _reader(mesh, frame(width)) for width in (0.006, 0.05)}
-    reports = evaluate(mesh, decoders | {"even": _reader(mesh, _offset(0.1))}, views=8, resolution=128)
+    reports = compare(mesh, decoders | {"even": _reader(mesh, _offset(0.1))}, views=8, resolution=128)
     # A hundredth of a face is less than a pixel, so that it lies within one of the border; a tenth is about three.
     assert 0.1 < reports["0.006"].seam_error < 0.3 and reports["0.006"].seam_ratio > 10.0
     assert 0.4 < reports["0.05"].seam_error < 0.5 and 4.0 < reports["0.05"].seam_ratio < 6.0
@@ -158,7 +159,7 @@ def test_seams_of_tiles_by_labels(device):
         return (uv[:, 0] * 4).int()
 
     options = {"views": [View.of([0, 0, 1])], "resolution": 96, "device": device}
-    plain = evaluate(mesh, {"a": decoder, "b": decoder}, labels={"b": tiles}, **options)
+    plain = compare(mesh, {"a": decoder, "b": decoder}, labels={"b": tiles}, **options)
     assert math.isnan(plain["a"].seam_ratio) and plain["b"].seam_ratio == math.inf
     # Three borders, four pixels wide and as high as the sheet; all that is wrong is at one of them.
     pixels = plain["b"].pixels
@@ -203,21 +204,36 @@ def test_a_light_of_one_colour_has_no_scale():
     assert report.rest_error == pytest.approx(0.1, rel=1e-5)
 
 
+@pytest.mark.parametrize("kind", ["tiles", "plain with uv"])
+def test_a_models_report_is_its_score_and_its_size(device, kind):
+    """Seams are the borders of the new UVs' charts where there are any; one chart without them has none."""
+    mesh = sheet()
+    model, options = random_model(mesh, kind), {"views": 3, "resolution": 64, "device": device}
+    report = evaluate(model, mesh, **options)
+    labels = {} if kind == "tiles" else {"it": lambda uv, triangle, barycentric: triangle}  # a chart per triangle
+    score = compare(mesh, {"it": model.decoder(device)}, labels=labels, **options)["it"]
+    assert {name: report.to_json()[name] for name in score.to_json()} == score.to_json()
+    assert math.isnan(report.seam_ratio) == (kind == "tiles")
+    assert (report.method, report.profile, report.bytes) == (model.method, "random", model.file_bytes())
+    assert (report.cr, report.cr_disk) == (model.compression_ratio, 1 - report.bytes * 8 / (40 * 48 * 48))
+    assert evaluate(model, mesh, **options, file_bytes=11520).cr_disk == 0.0
+
+
 def test_texels_in_the_mask_count(device):
     """Of a half masked sheet the wrong half isn't counted; the decoder gets the texels' own centres."""
     mask = np.zeros((HEIGHT, WIDTH), bool)
     mask[:, : WIDTH // 2] = True
     mesh = from_arrays(SQUARE, TWO, SQUARE_UV, waves(), mask=mask)
-    image = torch.tensor(fill_gaps(mesh.lightmap, mesh.mask))
-    asked = []
+    image = torch.tensor(mesh.filled)
+    calls = []
 
     def decoder(uv, triangle, barycentric):
-        asked.append((uv.cpu(), triangle.cpu(), barycentric.cpu()))
+        calls.append((uv.cpu(), triangle.cpu(), barycentric.cpu()))
         return raster.texture(image.to(uv.device), uv) + 0.1 * (uv[:, :1] > 0.5)
 
     report = _one(mesh, decoder, views=[View.of([0, 0, 1])], device=device)
-    assert report.texel_psnr == math.inf and report.psnr < 40.0
-    uv, triangle, barycentric = asked[-1]
+    assert report.texel_psnr == metrics.PSNR_CAP_DB and report.psnr < 40.0
+    uv, triangle, barycentric = calls[-1]
     row, column = np.nonzero(mask)
     np.testing.assert_allclose(uv, np.stack([(column + 0.5) / WIDTH, (row + 0.5) / HEIGHT], 1), rtol=1e-6)
     assert triangle.dtype == torch.int32 and barycentric.shape == (len(uv), 3)
@@ -241,10 +257,9 @@ def test_what_is_refused():
 
 
 def test_progress():
-    calls = []
-    mesh = lit_cube(1)
-    evaluate(mesh, {"it": _reader(mesh)}, views=3, resolution=16, progress=lambda *call: calls.append(call))
-    assert calls == [(1, 3), (2, 3), (3, 3)]
+    reports, mesh = [], lit_cube(1)
+    compare(mesh, {"it": _reader(mesh)}, views=3, resolution=16, progress=reports.append)
+    assert (reports[-1].stage, reports[-1].done, reports[-1].total) == ("evaluate", 3, 3)
 
 
 def test_threads_are_given_back():

@@ -1,4 +1,4 @@
-"""What an engine gets: textures that read back exactly, a mesh with both UVs, a shader that gives the same light."""
+"""Output for engines: textures that read back exactly, a mesh with both UVs, a shader that gives the same light."""
 
 import json
 import os
@@ -12,7 +12,8 @@ import torch
 from builders.atlas_meshes import charts, sheet
 from builders.atlas_models import KINDS, random_model
 
-from wlm.atlas import codec, colour, exporter
+import wlm
+from wlm.atlas import colour, exporter
 from wlm.atlas.data import from_arrays
 from wlm.atlas.decode import Decoder
 from wlm.atlas.exact import decode64
@@ -30,7 +31,7 @@ LUT = {"lut.exr", "lut.ktx2", "lut.dds"}
 def written(folder, kind, stored="half", mesh=None, **facts):
     mesh = sheet() if mesh is None else mesh
     model = random_model(mesh, kind, stored)
-    return model, mesh, exporter.export(folder, model, mesh, facts)
+    return model, mesh, exporter.export(model, folder, mesh, facts)
 
 
 @pytest.mark.parametrize("stored", ["half", "bc6h", "astc"])
@@ -46,9 +47,7 @@ def test_what_is_written(kind, stored, tmp_path):
     assert report["cr"] == model.compression_ratio and report["seed"] == 3
     assert report["cr_disk"] == 1 - report["bytes"]["atlas.wlm"] * 8 / (40 * 48 * 48)
     assert (report["seconds"], report["found"]) == ({"fit": 1.5}, {"tiles": 4})
-    back = codec.read(tmp_path / "out" / "atlas.wlm")
-    np.testing.assert_array_equal(back.texels, model.texels)
-    assert "seconds" not in back.report, "one seed gives one file"
+    np.testing.assert_array_equal(wlm.load(tmp_path / "out" / "atlas.wlm").texels, model.texels)
 
 
 @pytest.mark.parametrize("kind", ["tiles", "cascade"])
@@ -105,14 +104,14 @@ def test_the_mesh_keeps_its_uvs_and_gets_new_ones(kind, tmp_path):
 def test_the_folder_alone_gives_the_lightmap(kind, mesh, tmp_path):
     model, _, _ = written(tmp_path, kind, mesh=mesh)
     output = exporter.read_folder(tmp_path)
-    own = exporter.geometry(output)
-    np.testing.assert_array_equal(own.position[own.triangle], mesh.position[mesh.triangle])
-    np.testing.assert_array_equal(own.uv[own.triangle], mesh.uv[mesh.triangle])
-    np.testing.assert_array_equal(own.mask, mesh.mask)
-    assert own.source == model.source and output.model_bytes == (tmp_path / "atlas.wlm").stat().st_size
-    found = Decoder(output.model).lightmap(own)
-    np.testing.assert_array_equal(found, Decoder(model).lightmap(mesh))
-    assert found.any()
+    geometry = exporter.geometry(output)
+    np.testing.assert_array_equal(geometry.position[geometry.triangle], mesh.position[mesh.triangle])
+    np.testing.assert_array_equal(geometry.uv[geometry.triangle], mesh.uv[mesh.triangle])
+    np.testing.assert_array_equal(geometry.mask, mesh.mask)
+    assert geometry.source == model.source and output.model_bytes == (tmp_path / "atlas.wlm").stat().st_size
+    decoded = Decoder(output.model).lightmap(geometry)
+    np.testing.assert_array_equal(decoded, Decoder(model).lightmap(mesh))
+    assert decoded.any()
 
 
 def test_a_new_output_takes_the_place_of_an_old_one(tmp_path):
@@ -148,7 +147,7 @@ def test_a_stop_while_files_are_moved_loses_nothing(old, tmp_path, monkeypatch):
 
         monkeypatch.setattr(os, "replace", stopped)
         try:
-            exporter.export(folder, model, mesh)
+            exporter.export(model, folder, mesh)
             break
         except KeyboardInterrupt:
             pass
@@ -160,23 +159,23 @@ def test_a_stop_while_files_are_moved_loses_nothing(old, tmp_path, monkeypatch):
                 exporter.read_folder(folder)
         elif old != "empty":
             assert exporter.read_folder(folder).model.method == "tiles", "nothing was moved yet"
-        exporter.export(folder, model, mesh)
+        exporter.export(model, folder, mesh)
         assert exporter.read_folder(folder).model.method == "plain"
     # The marker, and each file.
     assert steps == 1 + len(ALWAYS)
     assert set(os.listdir(folder)) == ALWAYS | ({"mine.txt"} if old != "empty" else set())
 
 
-def test_the_mask_goes_along_where_triangles_do_not_tell_it(tmp_path):
-    """Decoded without the inputs, the lightmap has the texels that were asked for and no others."""
+def test_a_mask_that_triangles_do_not_imply_is_written(tmp_path):
+    """Decoded without the inputs, the lightmap has the texels of the mask and no others."""
     whole = charts()
     mask = whole.mask & (np.arange(64) < 40)
     mesh = from_arrays(whole.position, whole.triangle, whole.uv, whole.lightmap, mask)
     model, _, paths = written(tmp_path, "tiles", mesh=mesh)
     assert "mask.png" in {path.name for path in paths}
-    own = exporter.geometry(exporter.read_folder(tmp_path))
-    np.testing.assert_array_equal(own.mask, mask)
-    np.testing.assert_array_equal(Decoder(model).lightmap(own), Decoder(model).lightmap(mesh))
+    geometry = exporter.geometry(exporter.read_folder(tmp_path))
+    np.testing.assert_array_equal(geometry.mask, mask)
+    np.testing.assert_array_equal(Decoder(model).lightmap(geometry), Decoder(model).lightmap(mesh))
     (tmp_path / "mask.png").unlink()
     with pytest.raises(WlmError, match="mask.png: no such mask"):
         exporter.geometry(exporter.read_folder(tmp_path))
@@ -192,17 +191,17 @@ def test_other_folders_are_left_alone(tmp_path):
     full.mkdir()
     (full / "a.txt").write_text("x")
     with pytest.raises(WlmError, match="full: expected an empty folder or one of an earlier output, found other files"):
-        exporter.export(full, model, mesh)
+        exporter.export(model, full, mesh)
     for content in ("[]", "{", '{"format": "wlm-probe-export"}'):
         (full / "report.json").write_text(content)
         with pytest.raises(WlmError, match="found other files"):
-            exporter.export(full, model, mesh)
+            exporter.export(model, full, mesh)
     with pytest.raises(WlmError, match="a.txt: cannot write there: Not a directory"):
-        exporter.export(full / "a.txt", model, mesh)
+        exporter.export(model, full / "a.txt", mesh)
     with pytest.raises(WlmError, match="none does not exist"):
-        exporter.export(tmp_path / "none" / "out", model, mesh)
+        exporter.export(model, tmp_path / "none" / "out", mesh)
     with pytest.raises(ValueError, match="expected the mesh that was compressed"):
-        exporter.export(tmp_path / "new", replace(model, source="0" * 16), mesh)
+        exporter.export(replace(model, source="0" * 16), tmp_path / "new", mesh)
     assert sorted(os.listdir(tmp_path)) == ["full"] and sorted(os.listdir(full)) == ["a.txt", "report.json"]
 
 
@@ -217,11 +216,11 @@ def test_nothing_half_written_is_left(tmp_path, monkeypatch):
     monkeypatch.setattr(exporter, "write_dds", full)
     for name in ("old", "new"):
         with pytest.raises(WlmError) as caught:
-            exporter.export(tmp_path / name, random_model(mesh, "cascade"), mesh)
+            exporter.export(random_model(mesh, "cascade"), tmp_path / name, mesh)
         assert str(caught.value) == f"{tmp_path / name / 'lut.dds'}: cannot write: No space left on device"
     monkeypatch.setattr(exporter, "write_dds", lambda *_, **__: (_ for _ in ()).throw(KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
-        exporter.export(tmp_path / "old", random_model(mesh, "cascade"), mesh)
+        exporter.export(random_model(mesh, "cascade"), tmp_path / "old", mesh)
     assert os.listdir(tmp_path) == ["old"]
     assert {path.name: path.read_bytes() for path in (tmp_path / "old").iterdir()} == before
 
@@ -230,11 +229,11 @@ def test_a_texture_beyond_a_gpu(tmp_path):
     mesh = sheet()
     model = replace(random_model(mesh, "plain"), texels=np.zeros((1, 16385, 3), np.float16))
     with pytest.raises(WlmError, match="sheet: T_p: expected at most 16384 texels along a side, found 16385"):
-        exporter.export(tmp_path / "out", model, mesh)
+        exporter.export(model, tmp_path / "out", mesh)
     assert os.listdir(tmp_path) == []
 
 
-def test_a_folder_that_is_none_of_ours(tmp_path):
+def test_a_folder_of_something_else(tmp_path):
     for place, words in ((tmp_path / "none", "expected a folder"), (tmp_path, "found no report.json of it")):
         with pytest.raises(WlmError, match=words):
             exporter.read_folder(place)
@@ -366,7 +365,7 @@ def _texture(path, values, kind):
 def test_the_shaders_arithmetic(kind, exact, tmp_path):
     model = random_model(charts(), kind)
     tiles = model.method == "tiles"
-    # What C++ has no word for.
+    # C++ has no swizzles.
     text = atlas_glsl(model).replace(".rgb", ".rgb()").replace(".xy", ".xy()")
     (tmp_path / "shader.h").write_text(text)
     (tmp_path / "run.cpp").write_text(SHIM)
@@ -384,18 +383,18 @@ def test_the_shaders_arithmetic(kind, exact, tmp_path):
         place = ((uv * [model.width, model.height] - 0.5) / model.profile.tile)[:4000]
         uv = np.concatenate([uv[:4000][np.abs(place - np.rint(place)).min(1) > 1e-4], uv[4000:]])
     out = subprocess.run([tmp_path / "run"], cwd=tmp_path, input=uv.tobytes(), capture_output=True, check=True).stdout
-    found = np.frombuffer(out, np.float32).reshape(-1, 3)
+    light = np.frombuffer(out, np.float32).reshape(-1, 3)
     # Neighbouring texels differ by up to 3, and a 512th of a step is lost along each axis. Where a table is filtered
     # too its own 512th is one of 65,535 steps' span, up to all 22 texels of the other texture.
     step = 3.0 / 512 * 2
     tolerance = 1e-4 if exact else step * (1 + 22 * (model.method == "cascade"))
-    np.testing.assert_allclose(found, decode64(model, uv), rtol=0, atol=tolerance)
+    np.testing.assert_allclose(light, decode64(model, uv), rtol=0, atol=tolerance)
     with torch.no_grad():
         decoded = Decoder(model).read(torch.from_numpy(uv)).numpy()
-    np.testing.assert_allclose(found, decoded, rtol=0, atol=tolerance)
+    np.testing.assert_allclose(light, decoded, rtol=0, atol=tolerance)
 
 
-def test_the_shader_says_which_uvs_it_takes():
+def test_the_shader_names_the_uvs_that_it_takes():
     assert "the new UVs of mesh.glb" in atlas_glsl(random_model(sheet(), "cascade"))
     assert "the mesh's own lightmap UVs" in atlas_glsl(random_model(sheet(), "tiles"))
     assert "usampler2D" in atlas_glsl(random_model(sheet(), "tiles"))

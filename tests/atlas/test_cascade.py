@@ -4,20 +4,20 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
+from builders.atlas_models import grouped
 from kernels.compare import close, exact
 from reference import cascade as reference
 
 from wlm import interop
 from wlm.atlas import cascade
-from wlm.atlas.cascade import Textures, fit, fit_cascade, initial
-from wlm.atlas.cluster import Clusters, Stats
+from wlm.atlas.cascade import Textures, fit_cascade, initial, tune
 from wlm.atlas.data import LightmappedMesh, from_arrays
 from wlm.atlas.model import Profile
 from wlm.atlas.pack import pack, regenerate
+from wlm.atlas.stages import Stages
 from wlm.atlas.views import clip_positions, sphere_views
 from wlm.errors import WlmError
 from wlm.ops import raster as ops_raster
-from wlm.texels import fill_gaps
 
 pytest.importorskip("uvunwrap")
 
@@ -53,7 +53,7 @@ def _error(mesh: LightmappedMesh, uv: np.ndarray, colour: np.ndarray, lut: np.nd
     triangle = random.integers(0, len(mesh.triangle), 4000)
     weights = random.dirichlet([1, 1, 1], 4000)[:, None]
     old, new = (exact((weights @ each[triangle])[:, 0]) for each in (mesh.uv[mesh.triangle], uv))
-    want = reference.bilinear(exact(fill_gaps(mesh.lightmap, mesh.mask)), old)
+    want = reference.bilinear(exact(mesh.filled), old)
     got = reference.sample(exact(colour), exact(lut) if lut.size else None, new)
     return float((got - want).abs().mean() / want.mean())
 
@@ -116,7 +116,7 @@ def test_a_steps_gradient_of_a_view(device: str, lut_scale: float):
     old, new = ((weights[:, None] @ exact(each)[raster.triangle[hit]])[:, 0] for each in (mesh.uv[mesh.triangle], uv))
     unit = mesh.lightmap[mesh.mask].mean()
     leaves = [exact(before.colour / unit, grad=True), exact(before.lut, grad=True)]
-    want = reference.bilinear(exact(fill_gaps(mesh.lightmap, mesh.mask) / unit), old)
+    want = reference.bilinear(exact(mesh.filled / unit), old)
     image = torch.zeros(48, 48, 3, dtype=torch.float64)
     image[hit] = reference.sample(leaves[0], leaves[1] if lut_scale else None, new) - want
     reference.image_loss(image, profile.gradient).backward()
@@ -134,7 +134,7 @@ def test_a_fit_gets_better(device: str, space: str, lut_scale: float):
     """On the whole surface, by the reference's reading, well below where it began; all stays in range."""
     mesh, profile = _box(), _profile(space=space, lut_scale=lut_scale)
     uv, start = _start(mesh, profile)
-    found = fit(mesh, uv, start, profile, device=device)
+    found = tune(mesh, uv, start, profile, device=device)
     first, last = (_error(mesh, uv, each.colour, each.lut) for each in (start, found))
     assert last < 0.75 * first
     assert found.colour.min() >= 0 and found.colour.shape == start.colour.shape
@@ -148,19 +148,19 @@ def test_the_unit_of_radiance_does_not_matter(space: str):
     profile = _profile(space=space, steps=10)
     mesh, bright = _box(), _box(1024.0)
     uv, start = _start(mesh, profile)
-    one = fit(mesh, uv, start, profile)
-    other = fit(bright, uv, Textures(1024 * start.colour, start.lut), profile)
+    one = tune(mesh, uv, start, profile)
+    other = tune(bright, uv, Textures(1024 * start.colour, start.lut), profile)
     close(other.colour / 1024, one.colour, 1e-4)
     close(other.lut, one.lut, 1e-4)
     black = _box(0.0)
-    assert not fit(black, uv, Textures(0 * start.colour, start.lut), profile).colour.any()
+    assert not tune(black, uv, Textures(0 * start.colour, start.lut), profile).colour.any()
 
 
 @pytest.mark.parametrize("space", ["views", "uv"])
 def test_one_seed_one_result(space: str):
     mesh, profile = _box(), _profile(space=space, steps=6)
     uv, start = _start(mesh, profile)
-    one, same, other = (fit(mesh, uv, start, profile, seed=seed) for seed in (1, 1, 2))
+    one, same, other = (tune(mesh, uv, start, profile, seed=seed) for seed in (1, 1, 2))
     np.testing.assert_array_equal(one.colour, same.colour)
     np.testing.assert_array_equal(one.lut, same.lut)
     assert (one.colour != other.colour).any()
@@ -179,19 +179,19 @@ def test_rates_that_fall():
         step()
     np.testing.assert_allclose([float(rate) for rate in step._rate], [1e-3, 2e-4], rtol=1e-5)
     rough = _profile(space="uv", steps=100, colour_rate=0.03, lut_rate=5e-3)
-    kept, fell = (fit(mesh, uv, start, rough.model_copy(update={"final_rate": share})) for share in (1.0, 0.01))
+    kept, fell = (tune(mesh, uv, start, rough.model_copy(update={"final_rate": share})) for share in (1.0, 0.01))
     assert _error(mesh, uv, fell.colour, fell.lut) < 0.9 * _error(mesh, uv, kept.colour, kept.lut)
 
 
 def test_no_steps_and_progress():
     mesh, profile = _box(), _profile(steps=0)
     uv, start = _start(mesh, profile)
-    found = fit(mesh, uv, start, profile, progress=lambda *_: pytest.fail("nothing is done"))
+    found = tune(mesh, uv, start, profile, progress=lambda *_: pytest.fail("nothing is done"))
     close(found.colour, start.colour, 1e-6)
     np.testing.assert_array_equal(found.lut, start.lut)
-    seen = []
-    fit(mesh, uv, start, _profile(steps=7), progress=lambda done, steps: seen.append((done, steps)))
-    assert seen[-1] == (7, 7)
+    reports = []
+    tune(mesh, uv, start, _profile(steps=7), progress=reports.append)
+    assert (reports[-1].stage, reports[-1].done, reports[-1].total) == ("fit", 7, 7)
 
 
 def test_a_fit_that_diverged():
@@ -199,13 +199,7 @@ def test_a_fit_that_diverged():
     uv, start = _start(mesh, profile)
     start.colour[0, 0] = np.nan
     with pytest.raises(WlmError, match="array: the fit diverged; expected smaller rates than those of test"):
-        fit(mesh, uv, start, profile)
-
-
-def test_no_such_device():
-    mesh, profile = _box(), _profile()
-    with pytest.raises(WlmError, match="device 'cuda:99': expected one of: cpu"):
-        fit_cascade(mesh, None, profile, device="cuda:99")
+        tune(mesh, uv, start, profile)
 
 
 def test_the_whole(device: str):
@@ -213,17 +207,9 @@ def test_the_whole(device: str):
     y, x = np.meshgrid(np.arange(40), np.arange(60), indexing="ij")
     light = 0.5 + 0.3 * np.sin((x % 20) / 4) * np.cos((y % 20) / 5)
     mesh = _box(light=np.stack([light, light, light + 0.1 * (x >= 40)], -1))
-    head = np.array([0, 1, 0, 1, 4, 5, 0, 1, 0, 1, 10, 11])
-    representative, group = np.unique(head, return_inverse=True)
-    clusters = Clusters(
-        group.astype(np.int32),
-        representative.astype(np.int32),
-        np.zeros(12, np.int8),
-        np.zeros(12),
-        np.zeros(12, bool),
-        Stats(0, 0),
-    )
-    model = fit_cascade(mesh, clusters, _profile(scale=1.0, colour_scale=0.8), device=device)
+    clusters = grouped([0, 1, 0, 1, 4, 5, 0, 1, 0, 1, 10, 11])
+    stages = Stages(device)
+    model = fit_cascade(mesh, clusters, _profile(scale=1.0, colour_scale=0.8), 0, stages)
     assert (model.method, model.colour, model.source, model.height, model.width) == (
         "cascade", "half", mesh.source, 40, 60
     )  # fmt: skip
@@ -234,7 +220,7 @@ def test_the_whole(device: str):
     assert model.lut.shape == (round(0.7 * height), round(0.7 * width), 2)
     counts = {key: model.report[key] for key in ("triangles", "groups", "shared", "charts", "steps")}
     assert counts == {"triangles": 12, "groups": 6, "shared": 8, "charts": 3, "steps": 40}
-    assert set(model.report["seconds"]) == {"pack", "regenerate", "fit", "write"}
+    assert set(stages.seconds) == {"pack", "regenerate", "fit", "write"}
     assert height * width < 0.5 * 6 * (SIDE + 2) ** 2 * 2
     assert _error(mesh, model.uv, model.texels, model.lut / 65535.0) < 0.03
     assert 0 < model.compression_ratio < 1
@@ -242,7 +228,7 @@ def test_the_whole(device: str):
 
 def test_without_a_table_it_is_plain():
     mesh = _box()
-    model = fit_cascade(mesh, None, _profile(lut_scale=0.0, colour_scale=1.0))
+    model = fit_cascade(mesh, None, _profile(lut_scale=0.0, colour_scale=1.0), 0, Stages("cpu"))
     assert model.method == "plain" and model.lut.shape == (0, 0, 2) and model.uv.shape == (12, 3, 2)
     assert _error(mesh, model.uv, model.texels, model.lut) < 0.02
 
@@ -255,7 +241,7 @@ def test_triangles_that_are_not_active():
     mesh = from_arrays(position, np.concatenate([box.triangle, [[24, 25, 26]]]), uv, box.lightmap, box.mask)
     assert mesh.active.sum() == 12
     for space in ("views", "uv"):
-        model = fit_cascade(mesh, None, _profile(space=space))
+        model = fit_cascade(mesh, None, _profile(space=space), 0, Stages("cpu"))
         assert model.report["groups"] == 12 and np.isfinite(model.uv).all()
         assert _error(box, model.uv[:12], model.texels, model.lut / 65535.0) < 0.1
 
@@ -264,8 +250,10 @@ def test_blocks_of_the_colours():
     """T_p as blocks: as the model says, and what they decode to."""
     pytest.importorskip("ispc_texcomp")
     mesh = _box()
-    half = fit_cascade(mesh, None, _profile(colour_scale=1.0))
-    blocks = fit_cascade(mesh, None, _profile(colour_scale=1.0, colour="bc6h"))
+    half, blocks = (
+        fit_cascade(mesh, None, _profile(colour_scale=1.0, colour=colour), 0, Stages("cpu"))
+        for colour in ("half", "bc6h")
+    )
     rows, columns = (-(-n // 4) for n in blocks.texels.shape[:2])
     assert blocks.colour == "bc6h" and blocks.blocks.shape == (rows * columns, 16)
     close(blocks.texels.astype(np.float32), half.texels.astype(np.float32), 0.1)

@@ -72,7 +72,7 @@ def test_against_naive(device: str, threshold: float, colour_threshold: float):
     count = 90
     (uv, triangle), lightmap = _mesh(count), _lightmap()
     active = np.arange(count) % 7 != 0
-    calls = []
+    reports = []
     found = cluster(
         uv,
         triangle,
@@ -82,7 +82,7 @@ def test_against_naive(device: str, threshold: float, colour_threshold: float):
         active=active,
         largest=65,
         device=device,
-        progress=lambda *done: calls.append(done),
+        progress=reports.append,
     )
     patches, edges, groups = _naive(uv, triangle, lightmap, threshold, colour_threshold, 2.0, active)
     _sound(found, count)
@@ -93,7 +93,8 @@ def test_against_naive(device: str, threshold: float, colour_threshold: float):
         want = reference.distances(patches[found.representative[found.group[t]]], patches[t])
         assert found.distance[t] == pytest.approx(want.min(), abs=1e-12)
         assert found.order[t] == int((want < want.min() + 1e-12).argmax())
-    assert calls[-1][0] == calls[-1][1] == active.sum()
+    assert [report.stage for report in reports] == ["compare patches", "cluster"]
+    assert all(report.done == report.total == active.sum() for report in reports)
 
 
 def test_permuted_copies(device: str):

@@ -5,9 +5,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from builders.atlas_models import grouped
 
 from wlm.atlas import pack as packing
-from wlm.atlas.cluster import ORDERS, Clusters, Stats
+from wlm.atlas.cluster import ORDERS
 from wlm.atlas.data import LightmappedMesh, from_arrays
 from wlm.atlas.pack import Packed, pack, regenerate
 from wlm.errors import WlmError
@@ -34,20 +35,6 @@ def _mesh(triangles: list, lightmap: np.ndarray | None = None, position: np.ndar
 def _quad(x: float, y: float, w: float, h: float) -> list:
     a, b, c, d = [x, y], [x + w, y], [x + w, y + h], [x, y + h]
     return [[a, b, c], [a, c, d]]
-
-
-def _clusters(representative: list[int], order: list[int]) -> Clusters:
-    """Of the representative of each triangle."""
-    heads, group = np.unique(representative, return_inverse=True)
-    count = len(representative)
-    return Clusters(
-        group.astype(np.int32),
-        heads.astype(np.int32),
-        np.array(order, np.int8),
-        np.zeros(count),
-        np.zeros(count, bool),
-        Stats(0, 0),
-    )
 
 
 def _edges(corner: np.ndarray) -> np.ndarray:
@@ -113,11 +100,11 @@ def test_charts_stay_whole():
     assert max(len(charts) for charts in _read_by(packed).values()) == 1
 
 
-def test_back_leads_to_the_old_place():
+def test_to_lightmap_leads_to_the_old_place():
     mesh = _mesh(_many(3))
     packed = pack(mesh, None, 0.5)
     at = np.concatenate([packed.corner, np.ones((*packed.corner.shape[:2], 1))], 2)[mesh.active]
-    np.testing.assert_allclose(np.einsum("fij,fkj->fki", packed.back[packed.chart[mesh.active]], at),
+    np.testing.assert_allclose(np.einsum("fij,fkj->fki", packed.to_lightmap[packed.chart[mesh.active]], at),
                                _texels(mesh)[mesh.active], atol=1e-6)  # fmt: skip
 
 
@@ -126,9 +113,9 @@ def test_members_take_their_representatives_corners(order: int):
     """Vertex k goes to vertex p[k]; the member's own texels are gone, and so is its chart."""
     triangles = [[[2, 2], [20, 3], [4, 15]], [[30, 2], [50, 3], [32, 15]], [[2, 20], [30, 22], [4, 38]]]
     mesh = _mesh(triangles)
-    packed = pack(mesh, _clusters([2, 1, 2], [order, 0, 0]), 0.5)
+    packed = pack(mesh, grouped([2, 1, 2], [order, 0, 0]), 0.5)
     np.testing.assert_array_equal(packed.source, [2, 1, 2])
-    assert packed.chart[0] == packed.chart[2] != packed.chart[1] and len(packed.back) == 2
+    assert packed.chart[0] == packed.chart[2] != packed.chart[1] and len(packed.to_lightmap) == 2
     for k in range(3):
         np.testing.assert_array_equal(packed.uv[0, k], packed.uv[2, ORDERS[order][k]])
     alone = pack(mesh, None, 0.5)
@@ -139,9 +126,9 @@ def test_neighbours_of_which_one_is_a_member():
     """A chart of which a triangle went elsewhere keeps the rest; split in the middle it is two."""
     strip = [_quad(4 + 8 * i, 5, 8, 8) for i in range(3)]
     mesh = _mesh(sum(strip, []))
-    assert len(pack(mesh, None, 1.0).back) == 1
-    split = pack(mesh, _clusters([0, 1, 0, 1, 4, 5], [0] * 6), 1.0)
-    assert len(split.back) == 2
+    assert len(pack(mesh, None, 1.0).to_lightmap) == 1
+    split = pack(mesh, grouped([0, 1, 0, 1, 4, 5]), 1.0)
+    assert len(split.to_lightmap) == 2
     np.testing.assert_array_equal(split.corner[[2, 3]], split.corner[[0, 1]])
 
 
@@ -168,8 +155,8 @@ def test_one_triangle_and_a_smaller_one_than_a_texel():
 
 def test_thin_triangles_get_a_place(monkeypatch: pytest.MonkeyPatch):
     """Thinner than the packer takes: alone, and at a chart's border."""
-    asked, stand_in = [], packing._stand_in
-    monkeypatch.setattr(packing, "_stand_in", lambda *args: asked.append(len(args[0])) or stand_in(*args))
+    asked, thickened = [], packing._thickened
+    monkeypatch.setattr(packing, "_thickened", lambda *args: asked.append(len(args[0])) or thickened(*args))
     thin = [[[2, 2], [60, 2.0005], [30, 2.0002]], [[2, 6], [60, 6], [30, 6.0001]], [[5, 30], [25, 30], [15, 29.99999]]]
     mesh = _mesh([*thin, *_quad(5, 30, 20, 8)])
     assert mesh.active.all()
@@ -200,7 +187,7 @@ def test_folded_and_doubled():
 def test_a_mesh_of_one_look_needs_little():
     """All triangles in one group: the atlas is that of one."""
     mesh = _mesh(sum((_quad(1 + 12 * (i % 5), 1 + 12 * (i // 5), 9, 9) for i in range(15)), []))
-    packed = pack(mesh, _clusters([0] * 30, [0] * 30), 1.0)
+    packed = pack(mesh, grouped([0] * 30), 1.0)
     assert packed.width * packed.height <= 14 * 14
     full = pack(mesh, None, 1.0)
     assert full.width * full.height >= 15 * 9 * 9
@@ -217,7 +204,7 @@ def test_regenerated_colours():
     assert all(mask[y, x] for x, y in readers), "every texel that a bilinear read meets is filled"
     assert not found[~mask].any() and not mask.all()
     for (column, row), charts in list(readers.items())[::7]:
-        at = packed.back[charts.pop()] @ [column + 0.5, row + 0.5, 1.0]
+        at = packed.to_lightmap[charts.pop()] @ [column + 0.5, row + 0.5, 1.0]
         px, py = at.clip(0.5, np.array(SIZE[::-1]) - 0.5)
         np.testing.assert_allclose(found[row, column], np.array([px, py, px + 2 * py]) / 100, atol=1e-5)
 
@@ -265,7 +252,7 @@ def test_a_packer_that_fails(monkeypatch: pytest.MonkeyPatch):
     """It says so, or leaves a triangle out twice."""
     import uvunwrap
 
-    monkeypatch.setattr(packing, "_stand_in", lambda points, height: points)
+    monkeypatch.setattr(packing, "_thickened", lambda points, height: points)
     with pytest.raises(WlmError, match="array: uvunwrap left out 1 triangles: expected a place for each"):
         pack(_mesh([[[2, 2], [60, 2.0005], [30, 2.0002]]]), None, 0.5)
 
@@ -290,4 +277,4 @@ def test_wrong_arguments():
     with pytest.raises(ValueError, match="padding: expected at least 1, got 0"):
         pack(mesh, None, 0.5, padding=0)
     with pytest.raises(ValueError, match="clusters: expected 2 triangles, got 3"):
-        pack(mesh, _clusters([0, 1, 2], [0, 0, 0]), 0.5)
+        pack(mesh, grouped([0, 1, 2]), 0.5)

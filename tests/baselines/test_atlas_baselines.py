@@ -9,7 +9,7 @@ import torch
 from builders.lit_cube import HEIGHT, WIDTH, lit_cube, waves
 
 from wlm.atlas.data import from_arrays
-from wlm.atlas.evaluation import evaluate
+from wlm.atlas.evaluation import compare
 from wlm.atlas.resize import FILTERS, resize
 from wlm.baselines.atlas import ATLAS_BASELINES, best_astc, block_codec, downsampling, single_colour
 from wlm.errors import WlmError
@@ -47,7 +47,7 @@ def test_every_one_within_its_budget(name, share):
     # All it can: at least the budget less one row, column or rank of blocks, or its own size.
     most = {"bc6h": 8, "astc": 8, "astc4x4": 8, "astc6x6": 3.84, "astc8x8": 2}.get(name, 48) / 48
     assert min(share, most) * 0.85 < result.share <= share
-    report = evaluate(mesh, {"it": result.sample}, views=4, resolution=64)["it"]
+    report = compare(mesh, {"it": result.sample}, views=4, resolution=64)["it"]
     assert report.psnr > (12.0 if name == "single colour" else 25.0)
 
 
@@ -166,14 +166,14 @@ def test_faces_of_one_colour_become_a_texel_each():
     mesh = lit_cube(2, light)
     exact = single_colour(mesh, threshold=0.0)
     assert exact.bits == 4 * 48 and exact.size is None
-    report = evaluate(mesh, {"it": exact.sample}, views=6, resolution=64)["it"]
+    report = compare(mesh, {"it": exact.sample}, views=6, resolution=64)["it"]
     assert report.psnr > 100.0
     light[: HEIGHT // 2, : WIDTH // 3] = waves()[: HEIGHT // 2, : WIDTH // 3]
     mesh = lit_cube(2, light)
     one_left = single_colour(mesh, threshold=1e-4)
     kept = np.count_nonzero(mesh.mask[: HEIGHT // 2, : WIDTH // 3])
     assert one_left.bits == (4 + kept) * 48
-    assert evaluate(mesh, {"it": one_left.sample}, views=6, resolution=64)["it"].psnr > 70.0
+    assert compare(mesh, {"it": one_left.sample}, views=6, resolution=64)["it"].psnr > 70.0
     assert single_colour(mesh, threshold=10.0).bits == 48
 
 
@@ -197,7 +197,7 @@ def test_single_colours_at_a_budget():
     shares = (0.1, 0.4, 0.9)
     results = [single_colour(mesh, share) for share in shares]
     assert all(result.share <= share for result, share in zip(results, shares, strict=True))
-    reports = evaluate(mesh, {str(s): r.sample for s, r in zip(shares, results, strict=True)}, views=6, resolution=64)
+    reports = compare(mesh, {str(s): r.sample for s, r in zip(shares, results, strict=True)}, views=6, resolution=64)
     psnr = [report.psnr for report in reports.values()]
     assert psnr == sorted(psnr) and psnr[-1] > 60.0
     assert single_colour(mesh, 1.0 / (HEIGHT * WIDTH)).bits == 48

@@ -148,18 +148,6 @@ def test_bytes_and_positions_are_all_that_decoding_needs(bits):
             probe_mbd.decode(wrong, position)
 
 
-@pytest.mark.parametrize("bits", range(17))
-def test_bits_are_packed_and_read(bits):
-    numbers = np.random.default_rng(bits).integers(0, 2**bits, 77)
-    data = probe_pca.pack_bits(numbers, bits)
-    assert len(data) == -(-77 * bits // 8)
-    np.testing.assert_array_equal(probe_pca.unpack_bits(data, 77, bits), numbers)
-
-
-def test_bits_by_hand():
-    assert probe_pca.pack_bits(np.array([5, 2, 7]), 3) == bytes([0b11_010_101, 0b1])
-
-
 def test_weights_keep_the_ends_of_each_range():
     weight = np.array([[0.0, 5.0], [1.0, 5.0], [-4.0, 0.25], [4.0, 0.5], [0.1, 0.375]])
     part = np.array([0, 0, 1, 1, 1])

@@ -7,13 +7,13 @@ from builders.smoke_plumes import plume
 from builders.smoke_samples import small_pool
 
 from wlm.baselines.smoke import billboard, coarse, direct, flip_book
-from wlm.fluid.volume import DensityVolume
-from wlm.smoke.baking import SixWay, six_way
+from wlm.fluid.volume import DensityVolume, save_volume
+from wlm.smoke.baking import bake
 from wlm.smoke.camera import Camera
-from wlm.smoke.data import save_volume
 from wlm.smoke.evaluation import HeldOut, score
 from wlm.smoke.learn.dataset import fixed_cameras, pool_of_volume
 from wlm.smoke.learn.settings import DatasetSettings
+from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.planes import GUIDES, PLANES, encode_lightmaps
 from wlm.smoke.scene import CameraSettings, make_camera
 
@@ -31,7 +31,7 @@ def test_direct(device: str):
     """The reference's integral: the same at its step, and worse the longer the step."""
     volume = plume(hot=True, device=device)
     camera = _camera(volume, 20.0)
-    want = six_way(volume, camera, step=0.25, estimate=False)
+    want = bake(volume, camera, step=0.25, estimate=False)
     errors = [_error(direct(volume, camera, step), want) for step in (0.25, 1.0, 4.0, 10.0)]
     assert errors[0] == 0.0 and all(a < b for a, b in zip(errors, errors[1:], strict=False))
     found = direct(volume, camera, 10.0)
@@ -44,7 +44,7 @@ def test_billboard_from_the_same_side(device: str):
     """Nothing changes where the camera doesn't, with heat and without."""
     volume = plume(hot=True, device=device)
     camera = _camera(volume)
-    baked = six_way(volume, camera, estimate=False)
+    baked = bake(volume, camera, estimate=False)
     shown = billboard(baked, camera, camera, volume.centre)
     for name in ("lightmaps", "transparency", "emission"):
         torch.testing.assert_close(getattr(shown, name), getattr(baked, name), atol=2e-6, rtol=0)
@@ -56,13 +56,13 @@ def test_billboard_from_elsewhere(device: str):
     """A turn about the pivot shows the side that was baked, off by ever more; that is the error it is to have."""
     volume = plume(device=device)
     first = _camera(volume)
-    baked = six_way(volume, first, estimate=False)
+    baked = bake(volume, first, estimate=False)
     errors = []
     for degrees in (0.0, 30.0, 90.0):
         camera = _camera(volume, degrees)
         shown = billboard(baked, first, camera, volume.centre)
         torch.testing.assert_close(shown.lightmaps, baked.lightmaps, atol=1e-4, rtol=0)
-        errors.append(_error(shown, six_way(volume, camera, estimate=False)))
+        errors.append(_error(shown, bake(volume, camera, estimate=False)))
     assert errors[0] < 1e-4 < errors[1] < errors[2] and errors[2] > 0.03
 
 
@@ -70,11 +70,11 @@ def test_billboard_moves_with_the_image(device: str):
     """A camera that is shifted, nearer or finer sees the billboard there, as it sees the smoke itself."""
     volume = plume(device=device)
     first = _camera(volume, resolution=96)
-    baked = six_way(volume, first, estimate=False)
+    baked = bake(volume, first, estimate=False)
     target = tuple(volume.centre + np.array([0.3, -0.2, 0.0]))
     for settings in ({"target": target}, {"extent": 1.1}, {"resolution": 48}, {"aspect": 0.5}):
         camera = _camera(volume, **{"resolution": 96} | settings)
-        want = six_way(volume, camera, estimate=False)
+        want = bake(volume, camera, estimate=False)
         black = SixWay(torch.zeros_like(want.lightmaps), None)
         assert _error(billboard(baked, first, camera, volume.centre), want) < 0.05 * _error(black, want)
     away = _camera(volume, target=(9.0, 9.0, 9.0))
@@ -86,7 +86,7 @@ def test_billboard_wrong_use(device: str):
     """Each wrong argument is named."""
     volume = plume(device=device)
     camera = _camera(volume)
-    baked = six_way(volume, camera, estimate=False)
+    baked = bake(volume, camera, estimate=False)
     with pytest.raises(ValueError, match="orthographic"):
         billboard(baked, camera, _camera(volume, perspective=True), volume.centre)
     with pytest.raises(ValueError, match="32 x 32"):
@@ -118,7 +118,7 @@ def test_a_flip_book_is_the_billboard(tmp_path, device):
     assert len(pool) == 3 and len(others) == 2 and torch.equal(others.targets, pool.targets[1:])
     volume = plume(device=device)
     first, *rest = fixed_cameras(settings, volume.origin, volume.voxel * np.array(volume.shape))
-    baked = six_way(volume, first, step=settings.reference_step, estimate=False)
+    baked = bake(volume, first, step=settings.reference_step, estimate=False)
     for planes, camera in zip(method(others, slice(0, 2)), rest, strict=True):
         expected = encode_lightmaps(billboard(baked, first, camera, volume.centre))
         assert (planes - expected).abs().max() < 4e-3

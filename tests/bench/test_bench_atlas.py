@@ -7,7 +7,7 @@ from typer.testing import CliRunner
 
 import wlm.bench.atlas as bench
 from wlm.atlas.data import LightmappedMesh, write_mesh
-from wlm.atlas.evaluation import evaluate
+from wlm.atlas.evaluation import compare
 from wlm.atlas.fit import compress
 from wlm.atlas.model import Profile
 from wlm.bench import plot, read_json, table, write_json
@@ -66,7 +66,7 @@ def test_rows_are_of_what_they_name(lightmaps, rows):
     model = compress(mesh, PROFILES[0])
     row = rows[0]
     assert row.bpp == pytest.approx(48 * (1 - model.compression_ratio))
-    report = evaluate(mesh, {"a": bench.Decoder(model)}, views=3, resolution=64)["a"]
+    report = compare(mesh, {"a": bench.Decoder(model)}, views=3, resolution=64)["a"]
     assert row.psnr == pytest.approx(report.psnr) and row.ssim == pytest.approx(1 - report.one_minus_ssim)
     for figure in (f"CR {100 * model.compression_ratio:.1f}%", f"worst view {report.psnr_worst:.2f} dB"):
         assert figure in row.notes

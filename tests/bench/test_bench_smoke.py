@@ -18,7 +18,7 @@ from wlm.bench.smoke_setup import row as make_row
 from wlm.bench.timing import Timing
 from wlm.errors import WlmError
 from wlm.fluid.volume import DensityVolume
-from wlm.smoke.baking import six_way
+from wlm.smoke.baking import bake
 from wlm.smoke.camera import Camera
 from wlm.smoke.learn.synthetic import make_plume
 
@@ -28,7 +28,6 @@ TINY = replace(
     small=12,
     compared=(20, 40),
     drift=60,
-    tolerances=(1e-6, 10.0),
     fills=(0.0, 1.0),
     coarse=6,
     cloud=24,
@@ -44,8 +43,6 @@ TINY = replace(
 METHODS = [
     ("jet", "lattice"),
     ("jet", "lattice storage"),
-    ("jet", "lattice bricks"),
-    ("shear", "lattice bricks"),
     ("ball", "advection"),
     ("cube", "advection bricks"),
     ("cloud", "guide"),
@@ -108,17 +105,6 @@ def test_sixteen_bits_lose_little(rows):
     assert drift["float32"] < drift["float16"] < 1e-4
 
 
-def test_bricks_are_held_to_the_dense_lattice(rows):
-    lattice = of(rows, "lattice bricks")
-    assert lattice["tolerance 1e-06"].max_error < 1e-6
-    # Beyond any speed, all is at rest but what the inlet touches.
-    rough = lattice["tolerance 10"]
-    assert rough.max_error > 1e-4 and share(figures(rough)["worked on"]) < 1.0
-    assert share(figures(lattice["flow in 0%"])["worked on"]) == 0.0
-    assert share(figures(lattice["flow in 100%"])["worked on"]) == 1.0
-    assert lattice["flow in 100%"].max_error < 1e-6
-
-
 def test_schemes_and_a_solution(rows):
     """The ball comes round; the scheme of second order is the better one, and 16 bits change little."""
     found = of(rows, "advection")
@@ -150,7 +136,7 @@ def test_six_ways_are_those_of_the_system(rows):
     volume = DensityVolume(make_cloud(24, "cpu"), extinction=8.0 / 24)
     eye = volume.centre + 24 * np.array([1.6, 0.9, 2.2])
     camera = Camera.look_at(eye, volume.centre, extent=1.15 * 24, height=16, width=16)
-    assert of(rows, "six ways")["step 1"].max_error == six_way(volume, camera, step=1.0).error.largest
+    assert of(rows, "six ways")["step 1"].max_error == bake(volume, camera, step=1.0).error.largest
 
 
 def test_weights(rows):

@@ -17,7 +17,7 @@ from wlm.bench.smoke_network import PANELS, plotted, run, run_rows
 from wlm.bench.smoke_network_setup import QUICK, NetworkBench, Subject, open_subjects, score
 from wlm.config import profile_names
 from wlm.errors import WlmError
-from wlm.smoke.baking import six_way
+from wlm.smoke.baking import bake
 from wlm.smoke.codec import shipped
 from wlm.smoke.learn.settings import DatasetSettings
 from wlm.smoke.learn.synthetic import make_plume
@@ -226,7 +226,7 @@ def test_a_path_tracer_finds_the_same_light():
     pytest.importorskip("mitsuba")
     volume, camera = _plume()
     # A tracer's pixels are means over their area.
-    wanted = six_way(volume, camera, step=0.5, supersample=4, estimate=False)
+    wanted = bake(volume, camera, step=0.5, supersample=4, estimate=False)
     trace = PathTracer(volume, camera)
     lightmaps, transparency = trace(256)
     exact = wanted.lightmaps.numpy()

@@ -1,11 +1,13 @@
-"""Atlas models of random numbers: as good as fitted ones for whoever only writes or reads them."""
+"""Atlas models of random numbers, for tests of what only writes or reads them; and groups of triangles."""
+
+from collections.abc import Sequence
 
 import numpy as np
 
-from wlm.atlas import colour as blocks_of
+from wlm.atlas.cluster import Clusters, Stats
+from wlm.atlas.colour import quantise
 from wlm.atlas.data import LightmappedMesh
-from wlm.atlas.model import AtlasModel, Profile, pack_entries
-from wlm.atlas.tiles import tile_counts
+from wlm.atlas.model import AtlasModel, Profile, pack_entries, tile_counts
 
 KINDS = ("tiles", "cascade", "plain", "plain with uv")
 
@@ -23,11 +25,22 @@ def random_model(mesh: LightmappedMesh, kind: str, colour: str = "half", seed: i
         lut = pack_entries(random.integers(0, np.array([23, 18]) - size + 1), size)
     elif method == "cascade":
         lut = random.integers(0, 65536, (9, 13, 2)).astype(np.uint16)
-    own = method == "cascade" or kind.endswith("uv")
-    uv = random.random((len(mesh.triangle), 3, 2)).astype(np.float32) if own else np.empty((0, 3, 2), np.float32)
-    blocks = np.empty((0, 16), np.uint8)
-    if colour != "half":
-        blocks, texels = blocks_of.encode(texels, colour)
-    texels = texels.astype(np.float16)
+    triangles = len(mesh.triangle) if method == "cascade" or kind.endswith("uv") else 0
+    uv = random.random((triangles, 3, 2)).astype(np.float32)
+    settings = (mesh.name, mesh.source, profile, method, colour, height, width)
     report = {"seconds": {"fit": 1.5}, "tiles": 4}
-    return AtlasModel(mesh.name, mesh.source, profile, method, colour, height, width, texels, blocks, lut, uv, report)
+    return AtlasModel(*settings, **quantise(texels, colour), lut=lut, uv=uv, report=report)
+
+
+def grouped(representative: Sequence[int], order: Sequence[int] | None = None) -> Clusters:
+    """Groups by each triangle's representative and, if not all 0, its order."""
+    heads, group = np.unique(representative, return_inverse=True)
+    count = len(representative)
+    return Clusters(
+        group.astype(np.int32),
+        heads.astype(np.int32),
+        np.zeros(count, np.int8) if order is None else np.array(order, np.int8),
+        np.zeros(count),
+        np.zeros(count, bool),
+        Stats(0, 0),
+    )

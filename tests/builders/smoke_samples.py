@@ -13,12 +13,13 @@ from builders.smoke_plumes import plume
 
 from wlm.fluid.volume import DensityVolume
 from wlm.formats.artifact import read_artifact
-from wlm.smoke.baking import six_way
+from wlm.smoke.baking import bake
 from wlm.smoke.camera import Camera
 from wlm.smoke.learn.pool import Pool
 from wlm.smoke.model import NetworkSettings, SixWayNetwork, SmokeModel
-from wlm.smoke.planes import encode_lightmaps, look_at
+from wlm.smoke.planes import encode_lightmaps, render_guide
 from wlm.smoke.scene import CameraSettings, make_camera
+from wlm_kernels.smoke.settings import March
 
 STEP = 3.0
 """Of the guiding maps, in voxels."""
@@ -34,8 +35,8 @@ def sample(
     volume: DensityVolume, camera: Camera, seed: int = 0, kind: str = "paper"
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """A guide [C, H, W] of a kind and its lightmaps [8, H, W], encoded."""
-    guide = look_at(volume, camera, kind, step=STEP, jitter=1.0, threshold=0.01, seed=seed)
-    return guide, encode_lightmaps(six_way(volume, camera, step=1.0, estimate=False))
+    guide = render_guide(volume, camera, kind, March(STEP, seed=seed))
+    return guide, encode_lightmaps(bake(volume, camera, step=1.0, estimate=False))
 
 
 @functools.cache

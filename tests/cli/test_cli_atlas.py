@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import yaml
 from builders.atlas_meshes import charts, sheet
+from builders.running import call, fails
 from PIL import Image
-from test_cli import call, fails
 
 import wlm.atlas.colour
 import wlm.atlas.fit

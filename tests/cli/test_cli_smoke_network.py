@@ -9,21 +9,23 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from builders.running import call, fails
 from builders.smoke_plumes import plume, write_frames
 from builders.smoke_samples import file_content
-from test_cli import call, fails
 
 import wlm
+from wlm.fluid.volume import save_volume
 from wlm.smoke import codec, onnx_file
-from wlm.smoke.coarse import coarse_six_way
+from wlm.smoke.coarse import march
 from wlm.smoke.codec import open_network, shipped
-from wlm.smoke.data import open_footage, read_six_way, save_volume
+from wlm.smoke.data import load_frames, read_six_way
 from wlm.smoke.learn import dataset
 from wlm.smoke.learn.pool import load_pool
 from wlm.smoke.learn.settings import DatasetSettings
 from wlm.smoke.learn.trainer import Trainer
 from wlm.smoke.model import SmokeModel
-from wlm.smoke.planes import GUIDES, decode_lightmaps, look_at
+from wlm.smoke.planes import GUIDES, decode_lightmaps, render_guide
+from wlm_kernels.smoke.settings import March
 
 PROFILE = {
     "name": "tiny",
@@ -137,15 +139,15 @@ def test_predict_marches_as_in_training(network, volume, tmp_path):
     out = tmp_path / "a.exr"
     text = call("smoke", "predict", volume, "-o", out, "--network", network, "--resolution", 20, "--seed", 4)
     assert "mean light" in text and "error" not in text
-    six, camera = read_six_way(out)
-    smoke = open_footage(volume).load(1)
+    six = read_six_way(out)
     # A tenth of the 24 voxels of the longest edge.
-    guide = look_at(smoke, camera, "six", step=2.4, jitter=1.0, threshold=4.0 / 24, seed=4)
-    expected = decode_lightmaps(wlm.load(network).decoder(height=20, width=camera.width)(guide))
+    march = March(2.4, seed=4, threshold=4.0 / 24)
+    guide = render_guide(load_frames(volume).load(1), six.camera, "six", march)
+    expected = decode_lightmaps(wlm.load(network).decoder(height=20, width=six.camera.width)(guide))
     for name in ("lightmaps", "transparency", "emission"):
         torch.testing.assert_close(getattr(six, name), getattr(expected, name), rtol=1e-3, atol=1e-4)
     call("smoke", "predict", volume, "-o", out, "--network", network, "--resolution", 20, "--seed", 5)
-    assert not torch.equal(read_six_way(out)[0].lightmaps, six.lightmaps)
+    assert not torch.equal(read_six_way(out).lightmaps, six.lightmaps)
     # As what bake wrote.
     call("smoke", "shade", out, "-o", tmp_path / "a.png")
 
@@ -153,8 +155,8 @@ def test_predict_marches_as_in_training(network, volume, tmp_path):
 @pytest.mark.parametrize("words, step", [((), 24 / 130), (("--step", 4), 4.0)])
 def test_predict_by_the_coarse_march_alone(volume, tmp_path, words, step):
     call("smoke", "predict", volume, "-o", tmp_path / "a.exr", "--coarse", *words, "--resolution", 20, "--seed", 2)
-    six, camera = read_six_way(tmp_path / "a.exr")
-    expected = coarse_six_way(open_footage(volume).load(1), camera, step=step, spacing=step, seed=2).six
+    six = read_six_way(tmp_path / "a.exr")
+    expected = march(load_frames(volume).load(1), six.camera, March(step, step, seed=2))
     for name in ("lightmaps", "transparency", "emission"):
         torch.testing.assert_close(getattr(six, name), getattr(expected, name), rtol=1e-3, atol=1e-4)
 
@@ -162,7 +164,7 @@ def test_predict_by_the_coarse_march_alone(volume, tmp_path, words, step):
 def test_without_a_network_the_one_that_ships_is_used(network, volume, tmp_path, monkeypatch):
     for name, words in (("a", ()), ("b", ("--network", shipped())), ("c", ("--network", network))):
         call("smoke", "predict", volume, "-o", tmp_path / f"{name}.exr", "--resolution", 20, *words)
-    default, same, other = (read_six_way(tmp_path / f"{name}.exr")[0].lightmaps for name in "abc")
+    default, same, other = (read_six_way(tmp_path / f"{name}.exr").lightmaps for name in "abc")
     assert torch.equal(default, same) and not torch.equal(default, other)
     # On the shipped one's own smoke the others would take minutes.
     monkeypatch.setattr(codec, "shipped", lambda: network)
@@ -180,12 +182,12 @@ def test_predict_notes_images_unlike_those_of_training(network, volume, tmp_path
 
 
 def test_predict_frames(network, tmp_path):
-    folder = write_frames(tmp_path / "frames").folder
+    folder = write_frames(tmp_path / "frames").path
     call("smoke", "predict", folder, "-o", tmp_path / "six", "--network", network, "--resolution", 170)
     assert " ".join(call.stderr.split()).count("was trained with") == 1
     call("smoke", "predict", folder, "-o", tmp_path / "six", "--network", network, "--resolution", 17)
     assert sorted(os.listdir(tmp_path / "six")) == [f"six_{i:04d}.exr" for i in (1, 2, 3)]
-    assert read_six_way(tmp_path / "six" / "six_0002.exr")[0].lightmaps.shape == (6, 17, 17)
+    assert read_six_way(tmp_path / "six" / "six_0002.exr").lightmaps.shape == (6, 17, 17)
 
 
 def test_evaluate(network, volume, tmp_path):

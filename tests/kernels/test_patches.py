@@ -121,7 +121,7 @@ def _graph(samples, patches, threshold: float, colour_threshold: float, device: 
     known = patches.numpy()
     order = np.argsort(kernels.bin_numbers(known["colour"]), kind="stable")
     nodes = wp.array(known[order], dtype=kernels.Patch, device=device)
-    fits = graphs.fit(samples, nodes, int(known["level"].max()) + 1)
+    fits = graphs.bounds(samples, nodes, int(known["level"].max()) + 1)
     return graphs.graph(samples, nodes, fits, graphs.rule(threshold, colour_threshold, device)), order
 
 
@@ -147,7 +147,7 @@ def test_neighbours(device: str, threshold: float, contrast: float):
     for chosen in (5, 40):
         graphs.mark_neighbours(graph, _ints(left, device), chosen, marked)
         np.testing.assert_array_equal(marked.numpy(), want[chosen, left] | (left == chosen))
-    graphs.lose_neighbours(graph, _ints(left, device), _ints(np.arange(5), device), degree)
+    graphs.remove_neighbours(graph, _ints(left, device), _ints(np.arange(5), device), degree)
     np.testing.assert_array_equal(degree.numpy()[left], want[np.ix_(left, left)].sum(1))
 
 
@@ -190,7 +190,7 @@ def test_dominant_colours_in_lots(device: str, monkeypatch: pytest.MonkeyPatch):
     """The same however few patches are sorted at once, also where one alone is more than a lot."""
     image, (corners, level) = _image(), _triangles(40)
     _, whole, _ = _sampled(image, corners, level, device)
-    monkeypatch.setattr(kernels, "_LOT", 20)
+    monkeypatch.setattr(kernels, "_AT_ONCE", 20)
     _, lots, _ = _sampled(image, corners, level, device)
     np.testing.assert_array_equal(whole.numpy()["colour"], lots.numpy()["colour"])
 

@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from wlm.errors import WlmError
 from wlm.fluid.solver import LEAST_HALF_LOSS
-from wlm.smoke.baking import six_way
+from wlm.smoke.baking import bake
 from wlm.smoke.camera import axis_faults
 from wlm.smoke.learn import dataset
 from wlm.smoke.learn.dataset import (
@@ -27,8 +27,9 @@ from wlm.smoke.learn.scenes import Tilted, draw_scene
 from wlm.smoke.learn.settings import DatasetSettings
 from wlm.smoke.planes import EMISSION_PLANE, GUIDES, OPACITY_PLANE, from_srgb
 from wlm.smoke.scene import Air
-from wlm.smoke.simulate import make_solver, volume_of
+from wlm.smoke.simulation import make_solver, volume_of
 from wlm.view.smoke_pool import pool_sheet
+from wlm_kernels.smoke.settings import March
 
 SMALL = DatasetSettings(
     cells=20, refine=2, resolution=40, frames=2, views_a_frame=2, sequences=3, warmup=0.7, hot=0.4, moving=0.0
@@ -149,18 +150,19 @@ def test_reports_of_a_pool(pool):
 def test_sequences_with_their_own_cells(monkeypatch):
     """Between the least and the most; the validation has the most. All are marched in the same shares of the box."""
     marches = []
-    look_at = dataset.look_at
-    monkeypatch.setattr(
-        dataset,
-        "look_at",
-        lambda smoke, *rest, **look: marches.append((smoke.shape, look)) or look_at(smoke, *rest, **look),
-    )
+    render_guide = dataset.render_guide
+
+    def record(volume, camera, kind, march):
+        marches.append((volume.shape, march))
+        return render_guide(volume, camera, kind, march)
+
+    monkeypatch.setattr(dataset, "render_guide", record)
     changes = {"cells": 20, "least_cells": 16, "sequences": 3, "views_a_frame": 1, "warmup": 0.4}
     settings = FEW.model_copy(update=changes)
     samples = make_pool(settings, seed=5)
     shapes = {shape[0] for shape, _ in marches}
     assert len(samples) and len(shapes) > 1 and shapes <= {settings.refine * cells for cells in range(16, 21)}
-    assert all(look["step"] == pytest.approx(shape[0] * settings.guide_step) for shape, look in marches)
+    assert all(march.step == pytest.approx(shape[0] * settings.guide_step) for shape, march in marches)
     marches.clear()
     make_validation(settings.model_copy(update={"views": 1}))
     assert {shape[0] for shape, _ in marches} == {20 * settings.refine}
@@ -299,19 +301,19 @@ def test_nan_never_enters(monkeypatch: pytest.MonkeyPatch):
     calls = []
 
     def broken(*args, **kwargs):
-        six = six_way(*args, **kwargs)
+        six = bake(*args, **kwargs)
         calls.append(1)
         if len(calls) == 1:
             six.lightmaps[2, 3, 4] = float("nan")
         return six
 
-    monkeypatch.setattr(dataset, "six_way", broken)
+    monkeypatch.setattr(dataset, "bake", broken)
     reports = []
     samples = make_pool(FEW, seed=5, progress=reports.append)
     assert _counts(reports)["skipped"] == 1 and torch.isfinite(samples.targets).all()
     monkeypatch.setattr(dataset, "ATTEMPTS", 2)
     nan = torch.full((24, 24), float("nan"))
-    monkeypatch.setattr(dataset, "six_way", lambda *a, **k: dataclasses.replace(six_way(*a, **k), transparency=nan))
+    monkeypatch.setattr(dataset, "bake", lambda *a, **k: dataclasses.replace(bake(*a, **k), transparency=nan))
     with pytest.raises(WlmError, match=r"2 scenes .* NaN"):
         make_pool(FEW, seed=5)
 
@@ -334,20 +336,19 @@ def test_step_of_the_reference(device: str):
     solver.step(60)
     camera = fixed_cameras(SMALL, scene.grid.origin, scene.grid.size)[3]
     volume = volume_of(scene, solver)
-    six = six_way(volume, camera, step=SMALL.reference_step)
-    fine = six_way(volume, camera, step=0.125, estimate=False).lightmaps
+    six = bake(volume, camera, step=SMALL.reference_step)
+    fine = bake(volume, camera, step=0.125, estimate=False).lightmaps
     off = ((six.lightmaps - fine).square().mean() / fine.square().mean()).sqrt()
     assert off < 0.01 and off < six.error.rms < 0.1
 
 
 def test_look():
     """The paper's numbers on the paper's grid, and the same shares of the box on others."""
-    assert SMALL.look((400, 400, 400)) == {"step": 10.0, "jitter": 1.0, "threshold": 0.01}
-    look = SMALL.look((100, 200, 60))
-    assert look["step"] == 5.0 and look["threshold"] == 0.02
+    assert SMALL.look((400, 400, 400)) == March(10.0, jitter=1.0, threshold=0.01)
+    assert SMALL.look((100, 200, 60), seed=3) == March(5.0, seed=3, threshold=0.02)
     assert DatasetSettings(resolution=240, zoom=(0.5, 1.2)).pixels == (200.0, 480.0)
     apart = DatasetSettings(guide="six", guide_spacing=1 / 80)
-    assert apart.look((400, 400, 400)) == {"step": 10.0, "jitter": 1.0, "threshold": 0.01, "spacing": 5.0}
+    assert apart.look((400, 400, 400)) == March(10.0, 5.0, jitter=1.0, threshold=0.01)
 
 
 @pytest.mark.parametrize(

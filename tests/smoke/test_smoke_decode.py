@@ -8,11 +8,10 @@ from builders.smoke_plumes import plume
 from builders.smoke_samples import STEP, random_model, sample, view_of
 
 from wlm.fluid.volume import from_array
-from wlm.smoke.coarse import coarse_six_way
+from wlm.smoke.coarse import march
 from wlm.smoke.model import NetworkSettings, SixWayNetwork, SmokeModel
-from wlm.smoke.planes import GUIDES, decode_lightmaps, look_at
-
-LOOK = {"step": STEP, "jitter": 1.0, "threshold": 0.01}
+from wlm.smoke.planes import GUIDES, decode_lightmaps, render_guide
+from wlm_kernels.smoke.settings import March
 
 
 def _expected(model: SmokeModel, guide: torch.Tensor) -> torch.Tensor:
@@ -88,7 +87,7 @@ def test_hard_smoke(device, stem):
     }
     for name, volume in volumes.items():
         camera = replace(view_of(volume), height=50, width=70)
-        six = decode_lightmaps(decoder(look_at(volume, camera, "six", seed=0, **LOOK)))
+        six = decode_lightmaps(decoder(render_guide(volume, camera, "six", March(STEP))))
         for plane in (six.lightmaps, six.transparency):
             assert torch.isfinite(plane).all() and plane.min() >= 0, name
         assert six.transparency.max() <= 1
@@ -103,10 +102,10 @@ def test_with_six_lights_an_untrained_network_is_the_coarse_march(device):
     camera = view_of(volume)
     model = SmokeModel(SixWayNetwork(NetworkSettings(width=8, levels=3, guide="six")), {})
     decoder = model.decoder(device, height=32, width=32, half=False)
-    six = decode_lightmaps(decoder(look_at(volume, camera, decoder.guide, seed=5, **LOOK)))
-    march = coarse_six_way(volume, camera, seed=5, **LOOK).six
+    six = decode_lightmaps(decoder(render_guide(volume, camera, decoder.guide, March(STEP, seed=5))))
+    coarse = march(volume, camera, March(STEP, seed=5))
     for name in ("lightmaps", "transparency", "emission"):
-        torch.testing.assert_close(getattr(six, name), getattr(march, name), rtol=1e-4, atol=1e-5)
+        torch.testing.assert_close(getattr(six, name), getattr(coarse, name), rtol=1e-4, atol=1e-5)
     with pytest.raises(ValueError, match=r"expected \[9, 32, 32\]"):
         decoder(torch.zeros(3, 32, 32, device=device))
 

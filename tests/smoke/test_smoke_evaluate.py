@@ -13,8 +13,8 @@ from builders.smoke_samples import random_model, small_pool
 import wlm
 from wlm.baselines.smoke import COARSE, FLIP_BOOK, RIVALS
 from wlm.errors import WlmError
+from wlm.fluid.volume import save_volume
 from wlm.metrics.error import psnr_from_mse
-from wlm.smoke.data import save_volume
 from wlm.smoke.evaluation import HALF, NETWORK, compare, evaluate, of_decoder, of_network, score
 from wlm.smoke.learn.dataset import make_validation
 from wlm.smoke.learn.pool import Pool

@@ -1,1 +1,38 @@
-"""A mesh's lightmap as new UVs, a UV look-up table and a small colour texture (lightmap-uv-clustering-cascade)."""
+"""A mesh's lightmap as a small colour texture, read through a look-up table (lightmap-uv-clustering-cascade)."""
+
+from wlm._facade import facade
+
+__all__ = [
+    "AtlasModel",
+    "Decoder",
+    "LightmappedMesh",
+    "Profile",
+    "Report",
+    "View",
+    "compare",
+    "compress",
+    "evaluate",
+    "export",
+    "from_arrays",
+    "load",
+    "read_folder",
+]
+
+__getattr__, __dir__ = facade(
+    __name__,
+    {
+        "AtlasModel": "wlm.atlas.model",
+        "Decoder": "wlm.atlas.decode",
+        "LightmappedMesh": "wlm.atlas.data",
+        "Profile": "wlm.atlas.model",
+        "Report": "wlm.atlas.evaluation",
+        "View": "wlm.atlas.views",
+        "compare": "wlm.atlas.evaluation",
+        "compress": "wlm.atlas.fit",
+        "evaluate": "wlm.atlas.evaluation",
+        "export": "wlm.atlas.exporter",
+        "from_arrays": "wlm.atlas.data",
+        "load": "wlm.atlas.data",
+        "read_folder": "wlm.atlas.exporter",
+    },
+)

@@ -1,4 +1,4 @@
-"""Charts of a mesh: triangles that hang together in UV space."""
+"""Charts of a mesh: triangles that are connected in UV space."""
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -10,9 +10,9 @@ __all__ = ["charts", "mesh_charts", "welded"]
 
 
 def welded(position: np.ndarray, uv: np.ndarray, triangle: np.ndarray) -> np.ndarray:
-    """Numbers the corners so that those at one place, with one UV, have one number.
+    """Numbers the corners so that those with equal position and UV have one number.
 
-    A file splits vertices where any attribute does, a normal for example; a lightmap has no seam there.
+    A file splits vertices where any attribute differs, a normal for example; a lightmap has no seam there.
 
     Args:
         position: [V, 3].
@@ -29,11 +29,11 @@ def welded(position: np.ndarray, uv: np.ndarray, triangle: np.ndarray) -> np.nda
 
 
 def charts(corner: np.ndarray, active: np.ndarray | None = None) -> np.ndarray:
-    """Finds the charts: triangles that share an edge are in one chart, those that share a corner alone are not.
+    """Numbers the charts: triangles that share an edge are in one chart, those that share a corner alone are not.
 
     Args:
         corner: int [F, 3], the corners' numbers, ``welded``.
-        active: bool [F], triangles that take part, None: all.
+        active: bool [F], triangles that take part; None: all.
 
     Returns:
         int32 [F], the number of each triangle's chart, in the order of their first triangles; -1 where it isn't
@@ -42,18 +42,18 @@ def charts(corner: np.ndarray, active: np.ndarray | None = None) -> np.ndarray:
     corner = np.asarray(corner)
     count = len(corner)
     out = np.full(count, -1, np.int32)
-    own = np.arange(count) if active is None else np.flatnonzero(active)
-    if not len(own):
+    triangle = np.arange(count) if active is None else np.flatnonzero(active)
+    if not len(triangle):
         return out
-    edge = np.sort(np.stack([corner[own], np.roll(corner[own], -1, 1)], -1).reshape(-1, 2), 1)
-    # A graph of triangles and edges: each triangle is joined to its three edges.
-    name = np.unique(edge, axis=0, return_inverse=True)[1].reshape(-1)
-    place = np.repeat(np.arange(len(own)), 3), len(own) + name
-    nodes = len(own) + int(name.max()) + 1
-    graph = coo_array((np.ones(len(name), bool), place), (nodes, nodes))
-    label = connected_components(graph, directed=False)[1][: len(own)]
+    edge = np.sort(np.stack([corner[triangle], np.roll(corner[triangle], -1, 1)], -1).reshape(-1, 2), 1)
+    # A bipartite graph: each triangle is joined to its three edges.
+    edge = np.unique(edge, axis=0, return_inverse=True)[1].reshape(-1)
+    links = np.repeat(np.arange(len(triangle)), 3), len(triangle) + edge
+    nodes = len(triangle) + int(edge.max()) + 1
+    graph = coo_array((np.ones(len(edge), bool), links), (nodes, nodes))
+    label = connected_components(graph, directed=False)[1][: len(triangle)]
     _, first, number = np.unique(label, return_index=True, return_inverse=True)
-    out[own] = np.argsort(np.argsort(first))[number]
+    out[triangle] = np.argsort(np.argsort(first))[number]
     return out
 
 
@@ -64,7 +64,7 @@ def mesh_charts(mesh: LightmappedMesh) -> np.ndarray:
         mesh: The mesh.
 
     Returns:
-        int32 [F]: active triangles that share an edge, with its ends at the same places in space and in UV space, are
-        in one chart, and so on from one to the next; -1 where a triangle isn't active.
+        int32 [F]: active triangles connected by edges whose ends coincide in space and in UV space are one chart; -1
+        where a triangle isn't active.
     """
     return charts(welded(mesh.position, mesh.uv, mesh.triangle), mesh.active)

@@ -1,19 +1,20 @@
-"""Groups of triangles whose lighting looks alike (lightmap-uv-clustering-cascade, sections 3.1 and 3.2).
+"""Groups of triangles whose lighting is alike (lightmap-uv-clustering-cascade, sections 3.1 and 3.2).
 
 Patches of the triangles (``wlm_kernels.atlas.patches``) are the nodes of a graph, with an edge where Dist is below
-lambda in one of the six orders of the vertices. The node with most edges, the lowest number of equals, represents a
-group: itself and its neighbours. The group is taken out and the rest counted anew, until no edge is left (eq. 6).
+lambda in one of the six orders of the vertices. The node with most edges (the lowest number of equals) represents a
+group: itself and its neighbours. The group is removed and the edges of the rest are counted again, until no edge is
+left (eq. 6).
 
-Edges are never stored but told again from the patches, so that memory grows with the triangles and the texels that
-they cover alone: at most ``samples_of(largest)`` words a triangle.
+Edges are never stored but recomputed from the patches, so that memory grows with the triangles and the texels that
+they cover alone: at most ``samples_of(largest)`` words per triangle.
 
 Where the paper is silent or we differ:
 
 - The sizes of patches are 2 ** k + 1, the next that is at least R_s (eq. 1), and at most ``largest``.
-- R_s takes lengths in texels, so that it is right where the lightmap isn't square.
+- R_s takes lengths in texels, which is right where the lightmap isn't square too.
 - A triangle is excluded if its patch reads a texel above ``max_radiance`` in any channel; one at exactly that isn't.
-  The samples of a triangle beyond ``largest`` lie more than a texel apart, and what is between them isn't seen.
-- Colours are in shares of ``max_radiance``, and so are lambda and lambda_h: a dark map wants a lower maximum.
+  The samples of a triangle larger than ``largest`` lie more than a texel apart, and texels between them are not read.
+- Colours are fractions of ``max_radiance``, and so are lambda and lambda_h: a dark map needs a lower maximum.
 
 The stated behaviours:
 
@@ -29,12 +30,13 @@ NaN, Inf, UVs beyond +-65536               ValueError: the loader lets none pass
 =========================================  ===========================================================
 """
 
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
 
+from wlm.system import Meter, OnProgress
 from wlm_kernels.atlas import patch_graph as graphs
 from wlm_kernels.atlas import patches as kernels
 from wlm_kernels.atlas.patches import ORDERS, SIZES
@@ -42,19 +44,19 @@ from wlm_kernels.atlas.patches import ORDERS, SIZES
 __all__ = ["ORDERS", "Clusters", "Stats", "cluster"]
 
 # Against 65, measured on six meshes with lightmaps of 512 x 512, lambda = 0.03, 0.01 and 0.003: mostly 2 to 6 times as
-# quick; within 1% as many edges; as many groups within a seventh, or within one where there are ten or fewer.
+# fast; edges within 1%; groups within a seventh, or within one group where there are ten or fewer.
 LARGEST = 17
 _FARTHEST = 65536.0
-_PIECE = 1 << 26  # pairs between two calls of ``progress``
+_PAIRS_AT_ONCE = 1 << 26  # between two looks at the clock
 
 
 @dataclass(frozen=True)
 class Stats:
-    """What the graph came to.
+    """Figures of the graph.
 
     Attributes:
-        compared: Pairs of which samples had to be compared, the others were told by bounds; where rounding decides this
-            may differ from device to device.
+        compared: Pairs whose samples had to be compared, bounds having settled the others; rounding may make it differ
+            from device to device.
         edges: Pairs that are alike.
     """
 
@@ -68,13 +70,13 @@ class Clusters:
 
     Attributes:
         group: int32 [F], number of each triangle's group. Groups of several come first, in the order in which they
-            were taken, then single ones, by triangle.
+            were formed, then single triangles, by number.
         representative: int32 [G], a triangle of each group.
         order: int8 [F]: vertex k of the triangle goes to vertex p[k] of its representative, p = ``ORDERS[order]``. Of
             orders that fit equally well the first; 0 for representatives.
         distance: float64 [F], Dist to the representative in this order (eq. 2), below lambda.
         excluded: bool [F], too bright or not active: each is a group of its own.
-        stats: What the graph came to.
+        stats: Figures of the graph.
     """
 
     group: np.ndarray
@@ -96,7 +98,7 @@ def cluster(
     active: np.ndarray | None = None,
     largest: int = LARGEST,
     device: str = "cpu",
-    progress: Callable[[int, int], None] | None = None,
+    progress: OnProgress | None = None,
 ) -> Clusters:
     """Groups triangles whose patches are alike.
 
@@ -104,15 +106,15 @@ def cluster(
         uv: [V, 2], of the lightmap; v = 0 is the top of row 0.
         triangle: int [F, 3], vertices.
         lightmap: [H, W, 3], linear RGB.
-        threshold: lambda of eq. 4, in shares of ``max_radiance``: the largest mean difference of two patches' samples
+        threshold: lambda of eq. 4, a fraction of ``max_radiance``: the largest mean difference of two patches' samples
             and channels; above 0.
         colour_threshold: lambda_h, the largest distance of two dominant colours (section 3.2.1); at least 0.
         max_radiance: Triangles that are brighter stay alone (section 4.1.1); it also maps to 255 of 8 bits; above 0.
         active: bool [F], which triangles take part; None for all.
         largest: The largest size of a patch, one of ``wlm_kernels.atlas.patches.SIZES``.
         device: "cpu" or "cuda:N"; the result is the same on all.
-        progress: Called with the triangles done and their number, at first while edges are counted, then while groups
-            are taken.
+        progress: Called with the triangles done, in stage "compare patches" while edges are counted, then in stage
+            "cluster" while groups are formed.
 
     Returns:
         The groups.
@@ -133,29 +135,29 @@ def cluster(
     kernels.dominant(samples, patches, level)
     excluded |= bright.numpy() != 0
 
-    every = patches.numpy()
-    taking_part = np.flatnonzero(~excluded)
-    bins = kernels.bin_numbers(every["colour"][taking_part])
-    number = taking_part[np.argsort(bins, kind="stable")]  # the triangle of each node
-    nodes = wp.array(every[number], dtype=kernels.Patch, device=device)
-    fits = graphs.fit(samples, nodes, int(level.max(initial=0)) + 1)
-    graph = graphs.graph(samples, nodes, fits, graphs.rule(threshold, colour_threshold, device))
+    included = np.flatnonzero(~excluded)
+    patch = patches.numpy()
+    bins = kernels.bin_numbers(patch["colour"][included])
+    number = included[np.argsort(bins, kind="stable")]  # the triangle of each node
+    nodes = wp.array(patch[number], dtype=kernels.Patch, device=device)
+    bounds = graphs.bounds(samples, nodes, int(level.max(initial=0)) + 1)
+    graph = graphs.graph(samples, nodes, bounds, graphs.rule(threshold, colour_threshold, device))
 
     degree, stats = _degrees(graph, progress)
     head = np.arange(count, dtype=np.int32)  # the representative of each triangle
-    taken: list[int] = []
-    for chosen, members in _greedy(graph, number, degree, progress):
-        head[number[members]] = number[chosen]
-        taken.append(number[chosen])
-    alone = head == np.arange(count)
-    alone[taken] = False
-    representative = np.concatenate([np.array(taken, np.int64), np.flatnonzero(alone)]).astype(np.int32)
-    place = np.empty(count, np.int32)
-    place[representative] = np.arange(len(representative), dtype=np.int32)
+    heads: list[int] = []
+    for node, members in _greedy(graph, number, degree, progress):
+        head[number[members]] = number[node]
+        heads.append(number[node])
+    single = head == np.arange(count)
+    single[heads] = False
+    representative = np.concatenate([np.array(heads, np.int64), np.flatnonzero(single)]).astype(np.int32)
+    group = np.empty(count, np.int32)
+    group[representative] = np.arange(len(representative), dtype=np.int32)
 
     pairs = [wp.array(values, dtype=int, device=device) for values in (np.arange(count, dtype=np.int32), head)]
     order, distance = kernels.compare(samples, patches, *pairs)
-    return Clusters(place[head], representative, order, distance, excluded, stats)
+    return Clusters(group[head], representative, order, distance, excluded, stats)
 
 
 def _check(uv, triangle, lightmap, threshold, colour_threshold, max_radiance, largest) -> None:
@@ -182,72 +184,76 @@ def _check(uv, triangle, lightmap, threshold, colour_threshold, max_radiance, la
 
 
 def _texels(lightmap: np.ndarray, max_radiance: float) -> np.ndarray:
-    """The lightmap as the kernels take it: 16 bits a channel, and whether it is too bright."""
+    """The lightmap as the kernels take it: 16 bits per channel, and 1 in the fourth where it is too bright."""
     texels = np.empty((*lightmap.shape[:2], 4), np.uint16)
-    share = lightmap.astype(np.float64) / max_radiance
-    texels[..., :3] = np.rint(np.clip(share, 0.0, 1.0) * 65535.0)
+    fraction = lightmap.astype(np.float64) / max_radiance
+    texels[..., :3] = np.rint(np.clip(fraction, 0.0, 1.0) * 65535.0)
     texels[..., 3] = (lightmap > max_radiance).any(-1)
     return texels
 
 
 def _corners(uv: np.ndarray, triangle: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """The vertices in 1/65536 of a texel from the first texel's centre, int64 [F, 3, 2]."""
-    at = (uv * [shape[1], shape[0]] - 0.5) * 65536.0
-    return np.rint(at).astype(np.int64)[triangle.astype(np.int64)]
+    place = (uv * [shape[1], shape[0]] - 0.5) * 65536.0
+    return np.rint(place).astype(np.int64)[triangle.astype(np.int64)]
 
 
 def _levels(corner: np.ndarray, largest: int) -> np.ndarray:
-    """The size that a patch is due, int32 [F]: R_s (eq. 1), or the next larger of ``SIZES``, or the largest."""
+    """Each patch's size as a level, int32 [F]: R_s (eq. 1), or the next larger of ``SIZES``, at most ``largest``."""
     edge = (corner - np.roll(corner, 1, 1)) / 65536.0
     longest = np.hypot(edge[..., 0], edge[..., 1]).max(1, initial=0.0)
     return np.searchsorted(SIZES, np.minimum(np.ceil(longest), largest)).astype(np.int32)
 
 
-def _degrees(graph: graphs.Graph, progress) -> tuple[wp.array, Stats]:
+def _degrees(graph: graphs.Graph, progress: OnProgress | None) -> tuple[wp.array, Stats]:
+    """The number of neighbours of each node, int [M]."""
     count, device = graph.patches.shape[0], graph.patches.device
     degree = wp.zeros(count, dtype=int, device=device)
     compared = wp.zeros(count, dtype=wp.int64, device=device)
-    piece = max(_PIECE // max(count, 1), 1)
+    meter, piece = Meter(progress, "compare patches", count), max(_PAIRS_AT_ONCE // max(count, 1), 1)
     for begin in range(0, count, piece):
         end = min(begin + piece, count)
         graphs.count_neighbours(graph, begin, end, degree, compared)
         if progress is not None:
             wp.synchronize_device(device)
-            progress(end, count)
+            if meter.due(end):
+                meter.report(end)
     edges = int(degree.numpy().sum(dtype=np.int64)) // 2
     return degree, Stats(int(compared.numpy().sum()), edges)
 
 
-def _greedy(graph: graphs.Graph, number: np.ndarray, degree: wp.array, progress):
-    """Takes groups out of the graph (section 3.2.2).
+def _greedy(
+    graph: graphs.Graph, number: np.ndarray, degree: wp.array, progress: OnProgress | None
+) -> Iterator[tuple[int, np.ndarray]]:
+    """Forms groups and removes them from the graph (section 3.2.2).
 
     Args:
         graph: The graph, of M nodes.
         number: int [M], the triangle of each node, which settles ties.
-        degree: int [M], used up.
-        progress: As for `cluster`.
+        degree: int [M], reduced to those among the nodes that remain.
+        progress: As for ``cluster``.
 
     Yields:
-        The node that represents a group, and the nodes of the group; groups of one aren't given.
+        The node that represents a group, and the nodes of the group; groups of one are left out.
     """
-    device = degree.device
-    left = np.flatnonzero(degree.numpy() > 0).astype(np.int32)
-    while len(left):
-        if progress is not None:
-            progress(len(number) - len(left), len(number))
-        degrees = degree.numpy()[left]
-        top = left[degrees == degrees.max()]
-        chosen = int(top[number[top].argmin()])
-        on_device = wp.array(left, dtype=int, device=device)
-        marked = wp.empty(len(left), dtype=wp.uint8, device=device)
-        graphs.mark_neighbours(graph, on_device, chosen, marked)
+    meter = Meter(progress, "cluster", len(number))
+
+    def on_device(nodes: np.ndarray) -> wp.array:
+        return wp.array(nodes, dtype=int, device=degree.device)
+
+    remaining = np.flatnonzero(degree.numpy() > 0).astype(np.int32)
+    while len(remaining):
+        if meter.due(len(number) - len(remaining)):
+            meter.report(len(number) - len(remaining))
+        degrees = degree.numpy()[remaining]
+        top = remaining[degrees == degrees.max()]
+        node = int(top[number[top].argmin()])
+        marked = wp.empty(len(remaining), dtype=wp.uint8, device=degree.device)
+        graphs.mark_neighbours(graph, on_device(remaining), node, marked)
         members = marked.numpy() != 0
-        gone, left = left[members], left[~members]
-        yield chosen, gone
-        if len(left):
-            graphs.lose_neighbours(
-                graph, wp.array(left, dtype=int, device=device), wp.array(gone, dtype=int, device=device), degree
-            )
-            left = left[degree.numpy()[left] > 0]
-    if progress is not None:
-        progress(len(number), len(number))
+        group, remaining = remaining[members], remaining[~members]
+        yield node, group
+        if len(remaining):
+            graphs.remove_neighbours(graph, on_device(remaining), on_device(group), degree)
+            remaining = remaining[degree.numpy()[remaining] > 0]
+    meter.report(len(number))

@@ -1,10 +1,8 @@
-"""The colour texture as blocks that GPUs read: BC6H, or ASTC HDR in blocks of 4x4.
+"""The colour texture as stored: half floats, or blocks that GPUs decode, BC6H or ASTC HDR 4x4.
 
-Both take 16 bytes for 4x4 texels, 8 bits a texel. lightmap-uv-clustering-cascade, section 4.4, counts 6 for ASTC 4x4,
-which the format doesn't have; we count 8. Both need the extra `atlas`.
+Both block formats take 16 bytes for 4x4 texels, 8 bits per texel. lightmap-uv-clustering-cascade, section 4.4, counts 6
+for ASTC 4x4, which the format doesn't have; we count 8. Both need the extra ``atlas``.
 """
-
-from __future__ import annotations
 
 import math
 
@@ -15,17 +13,36 @@ from wlm.errors import WlmError
 from wlm.formats import hdr_blocks
 from wlm.formats.exr import HALF_MAX
 
-__all__ = ["BLOCK_CODECS", "block_grid", "decode", "encode"]
+__all__ = ["BLOCK_CODECS", "block_grid", "decode", "encode", "quantise"]
 
 BLOCK_CODECS = ("bc6h", "astc")
 _EXTRA = "atlas"
-# A third of the time of "slow" for 0.2 dB, and every size of every tile is encoded once to know its error.
+# A third of the time of "slow" for 0.2 dB less, and every size of every tile is encoded once to measure its error.
 _BC6H = "basic"
 
 
 def block_grid(height: int, width: int) -> tuple[int, int]:
     """Rows and columns of blocks that hold a texture."""
     return math.ceil(height / BLOCK_SIDE), math.ceil(width / BLOCK_SIDE)
+
+
+def quantise(texels: np.ndarray, colour: str) -> dict[str, np.ndarray]:
+    """Encodes T_p as it is stored.
+
+    Args:
+        texels: numbers [H, W, 3], linear.
+        colour: "half", "bc6h" or "astc".
+
+    Returns:
+        ``texels`` and, of a block format, ``blocks`` of ``AtlasModel``.
+
+    Raises:
+        WlmError: A package is missing; the line names the extra.
+    """
+    if colour == "half":
+        return {"texels": texels.clip(0.0, HALF_MAX).astype(np.float16)}
+    blocks, decoded = encode(texels, colour)
+    return {"texels": decoded.astype(np.float16), "blocks": blocks}
 
 
 def encode(texels: np.ndarray, codec: str) -> tuple[np.ndarray, np.ndarray]:
@@ -37,10 +54,10 @@ def encode(texels: np.ndarray, codec: str) -> tuple[np.ndarray, np.ndarray]:
         codec: "bc6h" or "astc".
 
     Returns:
-        Blocks, uint8 [B, 16], row by row; and what they decode to, float32 [H, W, 3].
+        Blocks, uint8 [B, 16], row by row; and their decoded texels, float32 [H, W, 3].
 
     Raises:
-        ValueError: No such codec, the shape is wrong, or a texel is NaN.
+        ValueError: No such codec, a wrong shape, or a NaN texel.
         WlmError: A package is missing; the line names the extra.
     """
     texels = np.asarray(texels)
@@ -73,7 +90,7 @@ def decode(blocks: np.ndarray, height: int, width: int, codec: str) -> np.ndarra
         float32 [height, width, 3], finite, in [0, 65504].
 
     Raises:
-        ValueError: No such codec, or the blocks aren't as many as the size needs.
+        ValueError: No such codec, or another number of blocks than the size needs.
         WlmError: A block isn't one of the format; or a package is missing, and the line names the extra.
     """
     blocks = np.asarray(blocks)

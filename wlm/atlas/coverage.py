@@ -1,10 +1,8 @@
-"""Which texels of a lightmap a mesh's UV triangles touch or cover, exactly and in bounded memory.
+"""Texels of a lightmap that a mesh's UV triangles touch or cover, exactly and in bounded memory.
 
 Texel (row, column) is the square [column, column + 1] x [row, row + 1] of UVs times (W, H), its centre in the
 middle. Each triangle is cut into the rows of texels that it meets; a row of it is a span of texels.
 """
-
-from __future__ import annotations
 
 from collections.abc import Iterator
 
@@ -16,13 +14,12 @@ _SPANS_AT_ONCE = 1 << 20  # about 200 bytes each while they are worked on
 
 
 def touched_texels(uv: np.ndarray, triangle: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Find the texels whose square some triangle's inside meets, however small the part.
+    """Finds the texels whose square intersects some triangle's inside, however little.
 
     Args:
         uv: float64 [V, 2] in [0, 1]; u right, v down from the top row.
         triangle: int [F, 3], with area in UV.
-        height: Texels.
-        width: Texels.
+        height, width: Texels.
 
     Returns:
         bool [height, width]. A triangle that ends exactly at a texel's side doesn't touch the texel.
@@ -39,7 +36,7 @@ def touched_texels(uv: np.ndarray, triangle: np.ndarray, height: int, width: int
                 x = _crossing(start, end, y)
                 np.minimum(low, x, out=low, where=meets)
                 np.maximum(high, x, out=high, where=meets)
-        # In rounding a part of no width may become one of none; it lies in the texel of its left end.
+        # Rounding may leave a span without width; it lies in the texel of its left end.
         first = np.clip(np.floor(low).astype(np.int64), 0, width - 1)
         stop = np.clip(np.ceil(high).astype(np.int64), first + 1, width)
         _add_spans(change, row, first, stop)
@@ -47,15 +44,14 @@ def touched_texels(uv: np.ndarray, triangle: np.ndarray, height: int, width: int
 
 
 def covered_texels(uv: np.ndarray, triangle: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Count for every texel the triangles that hold its centre.
+    """Counts for every texel the triangles that hold its centre.
 
     A centre on an edge that two triangles share is in exactly one of them.
 
     Args:
         uv: float64 [V, 2] in [0, 1]; u right, v down from the top row.
         triangle: int [F, 3].
-        height: Texels.
-        width: Texels.
+        height, width: Texels.
 
     Returns:
         int32 [height, width].
@@ -70,9 +66,9 @@ def covered_texels(uv: np.ndarray, triangle: np.ndarray, height: int, width: int
             x = _crossing(start, end, y)
             np.minimum(low, x, out=low, where=meets)
             np.maximum(high, x, out=high, where=meets)
-        there = low <= high
-        first, stop = (np.ceil(x[there] - 0.5).astype(np.int64).clip(0, width) for x in (low, high))
-        _add_spans(change, row[there], first, stop)
+        hit = low <= high
+        first, stop = (np.ceil(x[hit] - 0.5).astype(np.int64).clip(0, width) for x in (low, high))
+        _add_spans(change, row[hit], first, stop)
     return np.cumsum(change, axis=1, dtype=np.int32)[:, :width]
 
 
@@ -85,7 +81,7 @@ def _rows(
     if centres:
         first, stop = np.ceil(v.min(axis=1) - 0.5), np.floor(v.max(axis=1) - 0.5) + 1
     else:
-        # In rounding a triangle's height may become none.
+        # Rounding may leave a triangle without height.
         first, stop = np.floor(v.min(axis=1)).clip(0, height - 1), np.ceil(v.max(axis=1))
         stop = np.maximum(stop, first + 1)
     first = first.astype(np.int64).clip(0, height)
@@ -99,7 +95,7 @@ def _rows(
 
 
 def _directed(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Puts each edge's upper end first (of a level one the left), so that both its triangles compute alike."""
+    """Puts each edge's upper end first (of a level edge the left one), so that both its triangles compute alike."""
     swap = (a[:, 1] > b[:, 1]) | ((a[:, 1] == b[:, 1]) & (a[:, 0] > b[:, 0]))
     return np.where(swap[:, None], b, a), np.where(swap[:, None], a, b)
 
@@ -113,6 +109,6 @@ def _crossing(start: np.ndarray, end: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 def _add_spans(change: np.ndarray, row: np.ndarray, first: np.ndarray, stop: np.ndarray) -> None:
     """Adds 1 to the texels first <= column < stop of each row, as differences along the row."""
-    flat, step = change.reshape(-1), change.shape[1]
-    flat += np.bincount(row * step + first, minlength=flat.size).astype(np.int32)
-    flat -= np.bincount(row * step + stop, minlength=flat.size).astype(np.int32)
+    flat, stride = change.reshape(-1), change.shape[1]
+    flat += np.bincount(row * stride + first, minlength=flat.size).astype(np.int32)
+    flat -= np.bincount(row * stride + stop, minlength=flat.size).astype(np.int32)

@@ -1,7 +1,7 @@
-"""What comes in: a mesh with lightmap UVs and its lightmap, read from files or arrays and checked; a mesh with new UVs.
+"""Input: a mesh with lightmap UVs and its lightmap, read from files or arrays and checked; writing it with new UVs.
 
-The stated behaviours. "Inside" is inside the mask. What is repaired or odd is given in `LightmappedMesh.warnings`, one
-line a kind, with its count.
+The stated behaviours. "Inside" means inside the mask. Each kind of repair or oddity is one line of
+``LightmappedMesh.warnings``, with its count.
 
 ====================================  ================================================================
 input                                 behaviour
@@ -11,7 +11,7 @@ a primitive without the UV set        left out, and unchanged in what is written
 a position or UV NaN or infinite,     error that names the primitive and the vertex
 a position beyond float32
 a UV outside [0, 1]                   clamped to it, as a lightmap is read clamped; warning
-triangles without area, in space or   kept, but not `active`: they take no part; warning
+triangles without area, in space or   kept, but not ``active``: they take no part; warning
 in UV
 no triangle with area                 error
 overlapping UVs, a mesh drawn twice   fine: what shares texels is lit alike; warning
@@ -25,17 +25,16 @@ an empty mask                         error
 a mask that misses over 1% of the     warning: it may be of another UV set
 texels whose centres are in triangles
 no mask                               derived: texels whose centre is in a triangle, and those that a
-                                      triangle touches at all if they aren't 0, as what was never baked is
+                                      triangle touches at all unless they are 0, as texels never baked are
 ====================================  ================================================================
 
-Inputs of the method: lightmap-uv-clustering-cascade, section 3 (there mesh, UVs and an HDR lightmap).
+The method's inputs: lightmap-uv-clustering-cascade, section 3 (mesh, UVs and an HDR lightmap).
 """
-
-from __future__ import annotations
 
 import hashlib
 import os
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -47,17 +46,17 @@ from wlm.formats.gltf import GltfDocument, GltfPrimitive, document_from_arrays, 
 from wlm.formats.gltf_writer import Replacement, write_glb
 from wlm.formats.mask import read_mask
 from wlm.formats.obj import read_obj
-from wlm.texels import repair
+from wlm.texels import fill_gaps, repair
 
-__all__ = ["LightmappedMesh", "Part", "from_arrays", "load_mesh", "write_mesh"]
+__all__ = ["LightmappedMesh", "Part", "from_arrays", "load", "write_mesh"]
 
-_FLAT = 1e-12  # of a triangle's area to its longest side squared: below, float64 can't tell it from none
-_MISSED = 0.01
+_FLAT = 1e-12  # ratio of area to longest side squared below which float64 can't tell a triangle from one without area
+_MISSED = 0.01  # fraction of covered texels that a mask may miss without a warning
 
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """Where one primitive's vertices and triangles begin in the mesh; they follow each other in its order.
+    """Where one primitive's vertices and triangles begin in the mesh; they keep their order.
 
     Attributes:
         primitive: The primitive.
@@ -82,11 +81,11 @@ class LightmappedMesh:
         active: bool [F], false where a triangle has no area; at least one is true.
         lightmap: float32 [H, W, 3], linear, finite, in [0, 65504].
         mask: bool [H, W], true where a texel belongs to a chart; at least one is.
-        uv_set: n of the `TEXCOORD_n` that was read; 0 for what is no glTF.
+        uv_set: n of the ``TEXCOORD_n`` that was read; 0 where the input is no glTF.
         source: 16 hexadecimal digits of BLAKE2b over the mesh, the lightmap and the mask.
-        warnings: What was repaired or is odd, one line each.
+        warnings: Repairs and oddities, one line each.
         document: The file that the mesh came from, or one made for it.
-        parts: Which primitives the mesh is made of, in order.
+        parts: The primitives that make up the mesh, in order.
     """
 
     name: str
@@ -102,23 +101,28 @@ class LightmappedMesh:
     document: GltfDocument
     parts: tuple[Part, ...]
 
+    @cached_property
+    def filled(self) -> np.ndarray:
+        """The lightmap with charts dilated into the gaps between them, float32 [H, W, 3]; not to be written to."""
+        return fill_gaps(self.lightmap, self.mask)
 
-def load_mesh(
+
+def load(
     mesh_path: str | os.PathLike[str],
     lightmap_path: str | os.PathLike[str],
     *,
     mask_path: str | os.PathLike[str] | None = None,
     uv_set: int | None = None,
 ) -> LightmappedMesh:
-    """Read a mesh (`.glb`, `.gltf`, `.obj`) and its lightmap (EXR).
+    """Reads a mesh (``.glb``, ``.gltf``, ``.obj``) and its lightmap (EXR).
 
     Args:
         mesh_path: The mesh. All primitives that its scene draws and that have the UV set make one mesh.
-        lightmap_path: Linear RGB; row 0 is v = 0 of glTF, v = 1 of an `.obj`.
+        lightmap_path: Linear RGB; row 0 is v = 0 of glTF, v = 1 of an ``.obj``.
         mask_path: A PNG of the lightmap's size; a texel belongs to a chart where any colour channel is above 0. None
             derives it from the triangles.
-        uv_set: n of `TEXCOORD_n`, the lightmap's UVs. None takes 1, where engines and viewers look for them, if any
-            primitive has it, else 0. An `.obj` has only 0.
+        uv_set: n of ``TEXCOORD_n``, the lightmap's UVs. None takes 1, where engines and viewers look for them, if any
+            primitive has it, else 0. An ``.obj`` has only 0.
 
     Returns:
         The mesh, repaired as the module's table says.
@@ -157,7 +161,7 @@ def from_arrays(
     mask: np.ndarray | None = None,
     name: str = "array",
 ) -> LightmappedMesh:
-    """Make a checked mesh of arrays, under the same rules as `load_mesh`.
+    """Makes a checked mesh of arrays, under the same rules as ``load``.
 
     Args:
         position: [V, 3] of numbers, in any unit; rounded to float32, as files hold it.
@@ -188,16 +192,16 @@ def from_arrays(
 def write_mesh(
     path: str | os.PathLike[str], mesh: LightmappedMesh, corner_uv: np.ndarray, uv_set: int | None = None
 ) -> int:
-    """Write the mesh's file again, with one more UV set and all else as it was, whole or not at all.
+    """Writes the mesh's file again, with one more UV set and all else as it was, whole or not at all.
 
     Corners of one vertex that have the same new UV stay one vertex; the others become vertices of their own with the
     same attributes.
 
     Args:
-        path: The `.glb` to write; its folder must exist.
+        path: The ``.glb`` to write; its folder must exist.
         mesh: The mesh.
         corner_uv: [F, 3, 2], the new UV of each triangle's corners; u right, v down; stored as float32.
-        uv_set: n of the new `TEXCOORD_n`; None takes the one after the last that a primitive of the mesh has.
+        uv_set: n of the new ``TEXCOORD_n``; None takes the one after the last that a primitive of the mesh has.
 
     Returns:
         n of the new set.
@@ -227,13 +231,13 @@ def write_mesh(
 def _document(
     where: str, name: str, position: np.ndarray, triangle: np.ndarray, uv: np.ndarray
 ) -> tuple[GltfDocument, GltfPrimitive]:
-    """Checks arrays' shapes and ranges, and makes a document of what the triangles use."""
+    """Checks arrays' shapes and ranges, and makes a document of the vertices that triangles use."""
     for field, array, kinds in (("position", position, "iuf"), ("triangle", triangle, "iu"), ("uv", uv, "iuf")):
         width = 2 if field == "uv" else 3
         if array.ndim != 2 or array.shape[1] != width or array.dtype.kind not in kinds:
             raise WlmError(f"{where}: {field}: expected numbers [N, {width}], got {array.dtype} {array.shape}")
     if len(uv) != len(position):
-        raise WlmError(f"{where}: uv: expected {len(position)} rows, one a position, got {len(uv)}")
+        raise WlmError(f"{where}: uv: expected {len(position)} rows, one per position, got {len(uv)}")
     if not len(triangle):
         raise WlmError(f"{where}: has no triangles")
     if triangle.min() < 0 or triangle.max() >= len(position):
@@ -241,7 +245,7 @@ def _document(
             f"{where}: triangle: expected vertices 0 to {len(position) - 1}, found {triangle.min()} to {triangle.max()}"
         )
     used, corner = np.unique(triangle, return_inverse=True)
-    with np.errstate(over="ignore"):  # named below as infinite
+    with np.errstate(over="ignore"):  # ``_check_finite`` reports it as infinite
         return document_from_arrays(position[used], corner.reshape(-1, 3), uv[used], name)
 
 
@@ -256,14 +260,14 @@ def _check(
     lightmap_name: str,
     mask_name: str,
 ) -> LightmappedMesh:
-    """Applies the module's table to what was read."""
+    """Applies the module's table to the content of the files."""
     warnings: list[str] = []
-    chosen, uv_set = _choose(where, primitives, uv_set, warnings)
+    primitives, uv_set = _select(where, primitives, uv_set, warnings)
     parts, vertices, triangles = [], 0, 0
-    for each in chosen:
-        _check_finite(where, each, uv_set)
-        parts.append(Part(each, vertices, triangles))
-        vertices, triangles = vertices + len(each.position), triangles + len(each.triangle)
+    for primitive in primitives:
+        _check_finite(where, primitive, uv_set)
+        parts.append(Part(primitive, vertices, triangles))
+        vertices, triangles = vertices + len(primitive.position), triangles + len(primitive.triangle)
     position = np.concatenate([part.primitive.position for part in parts])
     triangle = np.concatenate([part.primitive.triangle + part.vertex for part in parts], dtype=np.int32)
     uv = np.concatenate([part.primitive.uv[uv_set] for part in parts]).astype(np.float64)
@@ -284,20 +288,20 @@ def _check(
         warnings.append(f"{name}: {_count(flat, 'triangle')} without area in space or in UV: left out")
 
     height, width = lightmap.shape[:2]
-    times = covered_texels(uv, triangle[active], height, width)
-    overlaps = np.count_nonzero(times > 1)
+    coverage = covered_texels(uv, triangle[active], height, width)
+    overlaps = np.count_nonzero(coverage > 1)
     if overlaps:
         warnings.append(f"{name}: {_count(overlaps, 'texel')} in several triangles: their UVs overlap")
     if mask is None:
         touched = touched_texels(uv, triangle[active], height, width)
-        # A baker that asks for centres leaves the fringe of a chart at 0: such a texel is a gap to fill, not darkness.
-        mask = touched & ((times > 0) | (lightmap != 0).any(axis=2))
+        # A baker that samples texel centres leaves the fringe of a chart at 0: a gap to fill, not darkness.
+        mask = touched & ((coverage > 0) | (lightmap != 0).any(axis=2))
         if not mask.any():
             mask = touched
     else:
         if not mask.any():
             raise WlmError(f"{mask_name}: the mask is empty: no texel belongs to a chart")
-        missed, covered = np.count_nonzero((times > 0) & ~mask), np.count_nonzero(times)
+        missed, covered = np.count_nonzero((coverage > 0) & ~mask), np.count_nonzero(coverage)
         if missed > _MISSED * covered:
             warnings.append(
                 f"{name}: {_count(missed, 'texel')} of {covered} that triangles cover are outside the mask: "
@@ -310,10 +314,10 @@ def _check(
     )
 
 
-def _choose(
+def _select(
     where: str, primitives: list[GltfPrimitive], uv_set: int | None, warnings: list[str]
 ) -> tuple[list[GltfPrimitive], int]:
-    """Picks the UV set and the primitives that have it."""
+    """Selects the UV set and the primitives that have it."""
     if not primitives:
         raise WlmError(f"{where}: has no triangles")
     sets = sorted({number for each in primitives for number in each.uv})
@@ -321,17 +325,17 @@ def _choose(
         raise WlmError(f"{where}: the mesh has no UVs: expected TEXCOORD_0 or TEXCOORD_1")
     if uv_set is None:
         uv_set = 1 if 1 in sets else 0
-    chosen = [each for each in primitives if uv_set in each.uv]
-    if not chosen:
-        found = ", ".join(f"TEXCOORD_{number}" for number in sets)
-        raise WlmError(f"{where}: expected the UV set TEXCOORD_{uv_set}, found {found}")
-    others = [each for each in primitives if uv_set not in each.uv]
-    if others:
+    selected = [each for each in primitives if uv_set in each.uv]
+    if not selected:
+        names = ", ".join(f"TEXCOORD_{number}" for number in sets)
+        raise WlmError(f"{where}: expected the UV set TEXCOORD_{uv_set}, found {names}")
+    skipped = [each for each in primitives if uv_set not in each.uv]
+    if skipped:
         warnings.append(
-            f"{where}: {_count(len(others), 'primitive')} of {len(primitives)} without TEXCOORD_{uv_set}, first "
-            f"{others[0].name}: left out"
+            f"{where}: {_count(len(skipped), 'primitive')} of {len(primitives)} without TEXCOORD_{uv_set}, first "
+            f"{skipped[0].name}: left out"
         )
-    return chosen, uv_set
+    return selected, uv_set
 
 
 def _check_finite(where: str, primitive: GltfPrimitive, uv_set: int) -> None:
@@ -347,26 +351,26 @@ def _check_finite(where: str, primitive: GltfPrimitive, uv_set: int) -> None:
 
 
 def _has_area(point: np.ndarray, triangle: np.ndarray) -> np.ndarray:
-    """Says of each triangle of points [V, 2 or 3] whether it has an area, whatever its size."""
+    """Whether each triangle of points [V, 2 or 3] has an area, whatever its size: bool [F]."""
     a, b, c = (point[triangle[:, k]] for k in range(3))
-    one, two = b - a, c - a
-    longest = np.sqrt(np.maximum.reduce([(edge * edge).sum(axis=1) for edge in (one, two, c - b)]))
+    ab, ac = b - a, c - a
+    longest = np.sqrt(np.maximum.reduce([(edge * edge).sum(axis=1) for edge in (ab, ac, c - b)]))
     # Scaled to a longest side of 1, so that neither tiny nor huge triangles leave float64's range.
     scale = np.divide(1.0, longest, out=np.zeros_like(longest), where=longest > 0)[:, None]
-    one, two = one * scale, two * scale
+    ab, ac = ab * scale, ac * scale
     if point.shape[1] == 2:
-        twice = np.abs(one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0])
+        twice_area = np.abs(ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0])
     else:
-        twice = np.linalg.norm(np.cross(one, two), axis=1)
-    return twice > 2 * _FLAT
+        twice_area = np.linalg.norm(np.cross(ab, ac), axis=1)
+    return twice_area > 2 * _FLAT
 
 
-def _count(number: int, one: str, many: str | None = None) -> str:
-    return f"{number} {one if number == 1 else many or one + 's'}"
+def _count(number: int, singular: str, plural: str | None = None) -> str:
+    return f"{number} {singular if number == 1 else plural or singular + 's'}"
 
 
 def _hash(*arrays: np.ndarray) -> str:
-    """Names the input by 16 hexadecimal digits, the same on every machine."""
+    """Hashes the input to 16 hexadecimal digits, the same on every machine."""
     digest = hashlib.blake2b(digest_size=8)
     for array in arrays:
         digest.update(np.asarray(array.shape, "<i8").tobytes())

@@ -6,8 +6,8 @@ import warp as wp
 
 from wlm import interop
 from wlm.atlas.data import LightmappedMesh
-from wlm.atlas.model import AtlasModel
-from wlm.atlas.views import texel_triangles
+from wlm.atlas.model import LUT_STEPS, AtlasModel
+from wlm.atlas.views import corner_weights, texel_triangles
 from wlm.errors import WlmError
 from wlm.texels import fill_gaps
 from wlm_kernels.atlas import cascade, decode
@@ -16,20 +16,19 @@ __all__ = ["Decoder"]
 
 
 class Decoder:
-    """A model on a device.
-
-    It is a ``wlm.atlas.evaluation.Sampler``.
+    """A model on a device. It is a ``wlm.atlas.evaluation.Sampler``.
 
     Attributes:
-        model, device: As given.
+        model: The model.
+        device: "cpu" or "cuda:N".
     """
 
-    def __init__(self, model: AtlasModel, device: str = "cpu"):
+    def __init__(self, model: AtlasModel, device: str = "cpu") -> None:
         """Loads a model.
 
         Args:
             model: The model.
-            device: "cpu" or "cuda:0".
+            device: "cpu", "cuda" or "cuda:N".
 
         Raises:
             WlmError: No such device.
@@ -37,19 +36,19 @@ class Decoder:
         self.model, self.device = model, interop.check_device(device)
         lut = model.lut
         if model.method == "tiles":
-            # As stored: two bytes a number.
+            # As stored: two bytes per number.
             self._texels = wp.array(np.ascontiguousarray(model.texels), dtype=wp.vec3h, device=self.device)
             self._lut = wp.array(np.ascontiguousarray(lut), dtype=wp.uint16, device=self.device)
         else:
             self._texels = wp.array(model.texels.astype(np.float32), dtype=float, device=self.device)
-            self._lut = wp.array((lut / np.float32(65535)).astype(np.float32), dtype=float, device=self.device)
+            self._lut = wp.array((lut / np.float32(LUT_STEPS)).astype(np.float32), dtype=float, device=self.device)
         self._corner = torch.tensor(model.uv, device=self.device)
 
     def read(self, uv: torch.Tensor) -> torch.Tensor:
-        """Light at coordinates, as a shader reads it.
+        """Reads light at coordinates, as a shader does.
 
         Args:
-            uv: float32 [N, 2] on the decoder's device: the model's own UVs where it has any, else the lightmap's.
+            uv: float32 [N, 2] on the decoder's device: the model's new UVs where it has any, else the lightmap's.
 
         Returns:
             float32 [N, 3].
@@ -61,7 +60,7 @@ class Decoder:
         return out
 
     def run(self, uv: wp.array, out: torch.Tensor) -> None:
-        """Reads light into an array that is there; on CUDA it is queued, not awaited.
+        """Reads light into an existing array; on CUDA the work is queued, not awaited.
 
         Args:
             uv: vec2 [N], N at least 1.
@@ -82,12 +81,12 @@ class Decoder:
             cascade.sample(self._texels, self._lut, uv, interop.to_warp(out))
 
     def __call__(self, uv: torch.Tensor, triangle: torch.Tensor, barycentric: torch.Tensor) -> torch.Tensor:
-        """Light at points of the mesh.
+        """Reads light at points of the mesh.
 
         Args:
             uv: float32 [N, 2], the mesh's own UVs there.
-            triangle: int [N], which triangle each is in.
-            barycentric: float32 [N, 3].
+            triangle: int [N], the triangle of each point.
+            barycentric: float32 [N, 3], weights of its corners.
 
         Returns:
             float32 [N, 3].
@@ -97,14 +96,14 @@ class Decoder:
         return self.read(uv)
 
     def lightmap(self, mesh: LightmappedMesh) -> np.ndarray:
-        """The lightmap in its original layout.
+        """Decodes the lightmap in its original layout.
 
         Args:
             mesh: The mesh that was compressed.
 
         Returns:
-            float32 [H, W, 3], zero outside of the mask. A texel of the mask whose centre is in no triangle has the
-            value of the nearest that is, where the mesh has new UVs.
+            float32 [H, W, 3], zero outside of the mask. Where the mesh has new UVs, a texel of the mask whose centre is
+            in no triangle has the value of the nearest texel whose centre is.
 
         Raises:
             WlmError: The model is of another mesh.
@@ -120,8 +119,7 @@ class Decoder:
             return result
         triangle, barycentric = texel_triangles(mesh, height, width, self.device)
         hit = triangle >= 0
-        weight = barycentric[hit]
-        weight = torch.cat([weight, 1.0 - weight.sum(1, keepdim=True)], 1)
-        found = hit.cpu().numpy()
-        result[found] = self(weight[:, :2], triangle[hit], weight).cpu().numpy()
-        return fill_gaps(result, found) * mesh.mask[..., None] if found.any() else result
+        covered = hit.cpu().numpy()
+        # A model with new UVs ignores the first argument.
+        result[covered] = self(barycentric[hit], triangle[hit], corner_weights(barycentric[hit])).cpu().numpy()
+        return fill_gaps(result, covered) * mesh.mask[..., None] if covered.any() else result

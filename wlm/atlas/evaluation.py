@@ -1,21 +1,21 @@
-"""How far a decoded lightmap is from the original (lightmap-uv-clustering-cascade, section 4.1.4).
+"""Error of a decoded lightmap in views of the mesh (lightmap-uv-clustering-cascade, section 4.1.4).
 
-The mesh is drawn from cameras around it, ``wlm.atlas.views``. A pixel is the lightmap's linear RGB at the point that it
-sees, without any shading. The reference is the original lightmap read bilinearly, clamped, its gaps filled from the
-nearest texel of a chart. Only covered pixels count; a view of none is left out.
+The mesh is drawn from cameras around it, ``wlm.atlas.views``. A pixel is the lightmap's linear RGB at its surface
+point, without any shading. The reference is the original lightmap read bilinearly, clamped, its gaps filled from the
+nearest texel of a chart. Only covered pixels count; a view without any is left out.
 
-The peak of every PSNR and the range of SSIM are one number: largest less smallest of the reference's covered pixels of
-all views. (The paper doesn't say which it takes; a peak for each view would change with the cameras.)
+The peak of every PSNR and the range of SSIM are one number: maximum less minimum of the reference's covered pixels of
+all views. (The paper doesn't name its peak; one per view would change with the cameras.)
 
 The stated behaviours:
 
 ====================================  ================================================================
 input                                 behaviour
 ====================================  ================================================================
-decoded exactly                       PSNR is infinite, null in JSON; 1 - SSIM is 0; the seam ratio is NaN
-some views exact                      each counts as ``PSNR_CAP_DB``, 120 dB, in the mean
-the reference is one grey, to within  the peak is 0, PSNR and SSIM are NaN, null in JSON: there is no scale
-a millionth
+decoded exactly                       PSNR is ``PSNR_CAP_DB``, 120 dB, in a view as in the mean;
+                                      1 - SSIM is 0; the seam ratio is NaN
+the reference is one grey, to within  the peak is 0, PSNR and SSIM are NaN, null in JSON: there is no
+a millionth                           range to measure against
 nothing covered in any view           the same, and the errors are NaN too
 no seam on any screen                 ``seam_error`` and ``seam_ratio`` are NaN
 an error at seams alone               ``seam_ratio`` is infinite, null in JSON
@@ -23,58 +23,61 @@ NaN or Inf in what was decoded        error that names the decoder
 ====================================  ================================================================
 """
 
-from __future__ import annotations
-
-import dataclasses
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 import torch
 from scipy.ndimage import distance_transform_edt
 
-from wlm.atlas.charts import mesh_charts, welded
+from wlm import system
+from wlm.atlas.charts import charts, mesh_charts, welded
 from wlm.atlas.data import LightmappedMesh
-from wlm.atlas.views import View, sphere_views, texel_triangles, visible_uv
+from wlm.atlas.decode import Decoder
+from wlm.atlas.model import AtlasModel, disk_ratio
+from wlm.atlas.views import View, corner_weights, sphere_views, texel_triangles, visible_uv
 from wlm.errors import WlmError
 from wlm.interop import check_device
-from wlm.metrics import PSNR_CAP_DB, SSIM_WINDOW
+from wlm.metrics import SSIM_WINDOW
+from wlm.metrics.error import psnr_from_mse
 from wlm.ops import raster
-from wlm.texels import fill_gaps
+from wlm.system import Meter, OnProgress
 
-__all__ = ["Report", "Sampler", "evaluate"]
+__all__ = ["RESOLUTION", "VIEWS", "Report", "Sampler", "Score", "compare", "evaluate"]
 
 Sampler = Callable[[torch.Tensor, torch.Tensor, torch.Tensor], torch.Tensor]
 """A decoder: the mesh's own UVs float32 [N, 2], triangles int32 [N] and barycentrics float32 [N, 3] of points, to
-linear RGB float [N, 3] or, of labels, to int [N]; all on one device."""
+linear RGB float [N, 3] or, for labels, to int [N]; all on one device."""
 
-# Wang et al. 2004, as wlm.metrics has it.
+VIEWS, RESOLUTION = 50, 512
+"""Cameras of a score, as many as in section 4.1.4, and pixels along a side of a view, which the paper doesn't state."""
+
+# Wang et al. 2004, as in ``wlm.metrics.structural``.
 _SIGMA, _C1, _C2 = 1.5, 0.01, 0.03
 _HALF = SSIM_WINDOW // 2
-# Reading one colour bilinearly in float32 gives it to within this share.
+# Relative rounding error of reading a constant colour bilinearly in float32.
 _ROUNDING = 1e-6
 
 
 @dataclass(frozen=True)
-class Report:
-    """How wrong a decoder is.
+class Score(system.Report):
+    """The error of a decoder.
 
     Attributes:
         name: The mesh's name.
-        views: How many saw anything.
-        pixels: Covered in all of them.
+        views: Number of views that show the mesh.
+        pixels: Covered pixels in all of them.
         peak: Range of the reference there, of the PSNRs and SSIM.
         psnr: dB, the mean over views of each view's.
         psnr_worst: dB, of the worst view.
         worst_view: Its number among the cameras; -1: no view, or no peak.
         one_minus_ssim: 1 less the mean SSIM of each view's covered pixels, averaged over the views: a Gaussian window
-            of 11 pixels, sigma 1.5; pixels nearer than 5 to the picture's edge are left out. Beside the mesh both
-            pictures have the reference's nearest covered pixel.
+            of 11 pixels, sigma 1.5; pixels nearer than 5 to the picture's edge are left out. Uncovered pixels of both
+            pictures have the reference's nearest covered value.
         seam_error: Mean absolute error of the covered pixels within 2 pixels of a chart's border, over all views.
-        rest_error: Of all others.
+        rest_error: Mean absolute error of all others.
         seam_ratio: ``seam_error`` over ``rest_error``: 1 where seams don't stand out.
         texel_psnr: dB, over the lightmap's texels that are in the mask and have their centre in a triangle.
     """
@@ -92,48 +95,97 @@ class Report:
     seam_ratio: float
     texel_psnr: float
 
-    def to_json(self) -> dict[str, Any]:
-        """The report as JSON's own types, under the attributes' names; NaN and infinity are None."""
-        values = dataclasses.asdict(self)
-        return {
-            key: None if isinstance(value, float) and not math.isfinite(value) else value
-            for key, value in values.items()
-        }
+
+@dataclass(frozen=True)
+class Report(Score):
+    """The error and the size of a model.
+
+    Attributes:
+        method: The model's.
+        profile: Name of its settings.
+        bytes: Size of its file.
+        cr: Compression ratio of both textures (eq. 9).
+        cr_disk: Compression ratio of the file.
+    """
+
+    method: str
+    profile: str
+    bytes: int
+    cr: float
+    cr_disk: float
 
 
 def evaluate(
+    model: AtlasModel,
+    mesh: LightmappedMesh,
+    *,
+    views: int | Sequence[View] = VIEWS,
+    resolution: int = RESOLUTION,
+    device: str = "cpu",
+    progress: OnProgress | None = None,
+    file_bytes: int | None = None,
+) -> Report:
+    """Compares a model with the original lightmap.
+
+    Seams are the borders of the new UVs' charts, or of the lightmap's where the mesh keeps its UVs.
+
+    Args:
+        model: The model.
+        mesh: The mesh that was compressed, with its original lightmap.
+        views, resolution, device, progress: As for ``compare``.
+        file_bytes: Size of the model's file; None: ``model.file_bytes()``.
+
+    Raises:
+        WlmError: There is no such device.
+    """
+    decoder = Decoder(model, device)
+    labels = {"model": _chart_labels(model, mesh, decoder.device)} if len(model.uv) else {}
+    options = {"views": views, "resolution": resolution, "device": device, "progress": progress}
+    score = compare(mesh, {"model": decoder}, labels=labels, **options)["model"]
+    size = model.file_bytes() if file_bytes is None else file_bytes
+    return Report(
+        **vars(score),
+        method=model.method,
+        profile=model.profile.name,
+        bytes=size,
+        cr=model.compression_ratio,
+        cr_disk=disk_ratio(size, (model.height, model.width)),
+    )
+
+
+def compare(
     mesh: LightmappedMesh,
     decoders: Mapping[str, Sampler],
     *,
-    views: int | Sequence[View] = 50,
-    resolution: int = 512,
+    views: int | Sequence[View] = VIEWS,
+    resolution: int = RESOLUTION,
     device: str = "cpu",
     labels: Mapping[str, Sampler] | None = None,
-    progress: Callable[[int, int], None] | None = None,
-) -> dict[str, Report]:
-    """Compares decoders with the original lightmap. Each view is drawn for all of them at once.
+    progress: OnProgress | None = None,
+) -> dict[str, Score]:
+    """Compares any decoders with the original lightmap. Each view is drawn once for all of them.
 
     On the CPU torch has one thread until it returns: 50 views of 512² take 2 to 5 s.
 
     Args:
         mesh: The mesh with its original lightmap.
         decoders: By name; see ``Sampler``.
-        views: How many cameras, spread evenly on the sphere; or the cameras.
+        views: Number of cameras, spread evenly on the sphere; or the cameras.
         resolution: Pixels along a side of a view, 1 to 16,384.
         device: "cpu" or "cuda:N", where the decoders are called.
-        labels: For some of the decoders, what numbers their own charts or tiles: their seams are where it changes.
-            Those of the others are the borders of the lightmap's charts, ``mesh_charts``. Either way a border is
-            between neighbouring pixels that see one triangle or two that share a corner in space, so that an outline in
-            front of something else is none.
-        progress: Called with the views done and their number.
+        labels: For some of the decoders, numbers of their own charts or tiles: their seams are where these change.
+            Those of the others are the borders of the lightmap's charts, ``mesh_charts``. Either way a border lies
+            between neighbouring pixels that show one triangle or two that share a corner in space, so that an outline
+            in front of something else is none.
+        progress: Called with the views done.
 
     Returns:
-        The reports by name.
+        The scores by name.
 
     Raises:
         WlmError: There is no such device, or a decoder gives NaN or infinity.
-        ValueError: The resolution is out of range, a decoder's colours or labels have the wrong shape, or labels are
-            given for no decoder.
+        ValueError: The resolution is out of range, a decoder's colours or labels have the wrong shape, or labels name
+            no decoder.
     """
     device = check_device(device)
     labels = dict(labels or {})
@@ -141,38 +193,47 @@ def evaluate(
     if unknown:
         raise ValueError(f"labels: expected names of decoders, got {', '.join(unknown)}")
     cameras = sphere_views(views) if isinstance(views, int) else list(views)
-    image = torch.tensor(fill_gaps(mesh.lightmap, mesh.mask), device=device)
+    image = torch.tensor(mesh.filled, device=device)
     chart = torch.tensor(mesh_charts(mesh), device=device)
     # Corners at one place in space have one number.
     place = torch.tensor(welded(mesh.position, np.zeros_like(mesh.uv), mesh.triangle), device=device)
+    meter = Meter(progress, "evaluate", len(cameras))
     with torch.no_grad(), _one_thread(device):
         peak = _peak(mesh, image, cameras, resolution)
         tallies = {name: _Tally() for name in decoders}
-        for number, (seen, barycentric, uv) in enumerate(visible_uv(mesh, cameras, resolution, device)):
-            hit = seen >= 0
-            points = _Points.of(uv[hit], seen[hit], barycentric[hit])
-            if len(points.uv):
-                wanted = raster.texture(image, points.uv).double()
-                similar = _Similarity(hit, wanted, peak)
-                border = _near_border(seen, chart[seen.clamp(min=0).long()], place)[hit]
+        for number, (visible, barycentric, uv) in enumerate(visible_uv(mesh, cameras, resolution, device)):
+            hit = visible >= 0
+            points = uv[hit], visible[hit], corner_weights(barycentric[hit])
+            if len(points[0]):
+                target = raster.texture(image, points[0]).double()
+                similarity = _Similarity(hit, target, peak)
+                chart_border = _near_border(visible, chart[visible.clamp(min=0).long()], place)[hit]
                 for name, decoder in decoders.items():
-                    error = points.decode(decoder, mesh, name) - wanted
-                    own = border
+                    error = _colours(decoder, points, mesh, name) - target
+                    border = chart_border
                     if name in labels:
-                        label = torch.zeros(seen.shape, dtype=torch.int64, device=device)
-                        label[hit] = points.labels(labels[name], name)
-                        own = _near_border(seen, label, place)[hit]
-                    tallies[name].add(number, error, own, similar.mean(wanted + error))
-            if progress is not None:
-                progress(number + 1, len(cameras))
-        texels = _texel_errors(mesh, image, decoders)
-    return {name: tally.report(mesh.name, peak, texels[name]) for name, tally in tallies.items()}
+                        label = torch.zeros(visible.shape, dtype=torch.int64, device=device)
+                        label[hit] = _labels(labels[name], points, name)
+                        border = _near_border(visible, label, place)[hit]
+                    tallies[name].add(number, error, border, similarity.mean(target + error))
+            if meter.due(number + 1):
+                meter.report(number + 1)
+        texel_errors = _texel_errors(mesh, image, decoders)
+    return {name: tally.score(mesh.name, peak, texel_errors[name]) for name, tally in tallies.items()}
+
+
+def _chart_labels(model: AtlasModel, mesh: LightmappedMesh, device: str) -> Sampler:
+    """Numbers of the charts of a model's new UVs."""
+    corner = np.arange(3 * len(model.uv)).reshape(-1, 3)
+    corner = welded(mesh.position[mesh.triangle].reshape(-1, 3), model.uv.reshape(-1, 2), corner)
+    number = torch.from_numpy(charts(corner)).to(device)
+    return lambda uv, triangle, barycentric: number[triangle.long()]
 
 
 @contextmanager
 def _one_thread(device: str) -> Iterator[None]:
-    """Keeps torch to one thread on the CPU: its calls are short, and where others want the cores its second thread
-    makes an evaluation ten times slower, while on a free machine it gains little."""
+    """Keeps torch to one thread on the CPU: its calls are short, and on a busy machine a second thread makes an
+    evaluation ten times slower, while on a free machine it gains little."""
     threads = torch.get_num_threads()
     try:
         if device == "cpu":
@@ -183,10 +244,10 @@ def _one_thread(device: str) -> Iterator[None]:
 
 
 def _peak(mesh: LightmappedMesh, image: torch.Tensor, cameras: Sequence[View], resolution: int) -> float:
-    """Largest less smallest of the reference in all views. Drawing twice is cheaper than keeping what all views see."""
+    """Maximum less minimum of the reference in all views. Drawing twice is cheaper than storing all views."""
     low, high = math.inf, -math.inf
-    for seen, _, uv in visible_uv(mesh, cameras, resolution, str(image.device)):
-        colour = raster.texture(image, uv[seen >= 0])
+    for visible, _, uv in visible_uv(mesh, cameras, resolution, str(image.device)):
+        colour = raster.texture(image, uv[visible >= 0])
         if len(colour):
             low, high = min(low, float(colour.min())), max(high, float(colour.max()))
     if high < low:
@@ -194,42 +255,32 @@ def _peak(mesh: LightmappedMesh, image: torch.Tensor, cameras: Sequence[View], r
     return high - low if high - low > _ROUNDING * high else 0.0
 
 
-@dataclass(frozen=True, eq=False)
-class _Points:
-    """What N pixels or texels see."""
+_Points = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
+"""What a ``Sampler`` takes."""
 
-    uv: torch.Tensor
-    triangle: torch.Tensor
-    barycentric: torch.Tensor
 
-    @staticmethod
-    def of(uv: torch.Tensor, triangle: torch.Tensor, barycentric: torch.Tensor) -> _Points:
-        """Adds the third weight to [N, 2]."""
-        return _Points(uv, triangle, torch.cat([barycentric, 1.0 - barycentric.sum(1, keepdim=True)], dim=1))
+def _colours(decoder: Sampler, points: _Points, mesh: LightmappedMesh, name: str) -> torch.Tensor:
+    """The decoded colours, float64 [N, 3], checked."""
+    colour, count = decoder(*points), len(points[0])
+    if colour.shape != (count, 3):
+        raise ValueError(f"{name}: expected colours [{count}, 3], got {tuple(colour.shape)}")
+    broken = int((~torch.isfinite(colour).all(dim=1)).sum())
+    if broken:
+        raise WlmError(f"{mesh.name}: {name} decodes to NaN or infinity at {broken} of {count} points")
+    return colour.double()
 
-    def decode(self, decoder: Sampler, mesh: LightmappedMesh, name: str) -> torch.Tensor:
-        """The colours, float64 [N, 3], checked."""
-        colour = decoder(self.uv, self.triangle, self.barycentric)
-        if colour.shape != (len(self.uv), 3):
-            raise ValueError(f"{name}: expected colours [{len(self.uv)}, 3], got {tuple(colour.shape)}")
-        broken = int((~torch.isfinite(colour).all(dim=1)).sum())
-        if broken:
-            raise WlmError(f"{mesh.name}: {name} decodes to NaN or infinity at {broken} of {len(colour)} points")
-        return colour.double()
 
-    def labels(self, label: Sampler, name: str) -> torch.Tensor:
-        """The numbers, int64 [N], checked."""
-        number = label(self.uv, self.triangle, self.barycentric)
-        if number.shape != (len(self.uv),) or number.is_floating_point():
-            raise ValueError(
-                f"{name}: expected labels, integers [{len(self.uv)}], got {number.dtype} {tuple(number.shape)}"
-            )
-        return number.long()
+def _labels(labels: Sampler, points: _Points, name: str) -> torch.Tensor:
+    """The labels, int64 [N], checked."""
+    label, count = labels(*points), len(points[0])
+    if label.shape != (count,) or label.is_floating_point():
+        raise ValueError(f"{name}: expected labels, integers [{count}], got {label.dtype} {tuple(label.shape)}")
+    return label.long()
 
 
 @dataclass
 class _Tally:
-    """What adds up over the views of a decoder."""
+    """Sums over the views of a decoder."""
 
     mse: list[float] = field(default_factory=list)
     view: list[int] = field(default_factory=list)
@@ -249,26 +300,24 @@ class _Tally:
         self.rest += float(absolute[~border].sum())
         self.seam_pixels += int(border.sum())
 
-    def report(self, name: str, peak: float, texel_mse: float) -> Report:
-        psnr = [_psnr(mse, peak) for mse in self.mse]
-        capped = [min(value, PSNR_CAP_DB) for value in psnr]
-        exact = bool(psnr) and min(psnr) == math.inf
+    def score(self, name: str, peak: float, texel_mse: float) -> Score:
+        psnr = [psnr_from_mse(mse, peak) for mse in self.mse]
         ssim = [value for value in self.ssim if not math.isnan(value)]
         seam, rest = _ratio(self.seam, self.seam_pixels), _ratio(self.rest, self.pixels - self.seam_pixels)
         measured = bool(psnr) and peak > 0.0
-        return Report(
+        return Score(
             name=name,
             views=len(psnr),
             pixels=self.pixels,
             peak=peak,
-            psnr=math.inf if exact else _ratio(sum(capped), len(capped)),
+            psnr=_ratio(sum(psnr), len(psnr)),
             psnr_worst=min(psnr, default=math.nan),
             worst_view=self.view[int(np.argmin(psnr))] if measured else -1,
             one_minus_ssim=1.0 - _ratio(sum(ssim), len(ssim)),
             seam_error=seam,
             rest_error=rest,
             seam_ratio=math.inf if rest == 0.0 and seam > 0.0 else _ratio(seam, rest),
-            texel_psnr=_psnr(texel_mse, peak),
+            texel_psnr=psnr_from_mse(texel_mse, peak),
         )
 
 
@@ -276,46 +325,40 @@ def _ratio(a: float, b: float) -> float:
     return a / b if b else math.nan
 
 
-def _psnr(mse: float, peak: float) -> float:
-    """Decibels: infinite without an error, NaN without a range."""
-    if math.isnan(mse) or not peak > 0.0:
-        return math.nan
-    return 20.0 * math.log10(peak) - 10.0 * math.log10(mse) if mse > 0.0 else math.inf
-
-
 def _texel_errors(mesh: LightmappedMesh, image: torch.Tensor, decoders: Mapping[str, Sampler]) -> dict[str, float]:
-    """Mean squared errors over the texels in the mask with their centre in an active triangle; NaN if there is none."""
+    """Mean squared errors over the texels in the mask with their centre in an active triangle; NaN without any."""
     height, width = mesh.mask.shape
     device = image.device
-    found, barycentric = texel_triangles(mesh, height, width, str(device))
-    hit = (found >= 0) & torch.tensor(mesh.mask, device=device)
+    triangle, barycentric = texel_triangles(mesh, height, width, str(device))
+    hit = (triangle >= 0) & torch.tensor(mesh.mask, device=device)
     row, column = torch.nonzero(hit, as_tuple=True)
     # At the centre itself, where the reference is the texel, not at the interpolated UV.
     uv = torch.stack([(column + 0.5) / width, (row + 0.5) / height], dim=1).float()
-    points = _Points.of(uv, found[hit].int(), barycentric[hit])
+    points = uv, triangle[hit].int(), corner_weights(barycentric[hit])
     if not len(uv):
         return dict.fromkeys(decoders, math.nan)
-    wanted = raster.texture(image, uv).double()
+    target = raster.texture(image, uv).double()
     return {
-        name: float((points.decode(decoder, mesh, name) - wanted).square().mean()) for name, decoder in decoders.items()
+        name: float((_colours(decoder, points, mesh, name) - target).square().mean())
+        for name, decoder in decoders.items()
     }
 
 
-def _near_border(seen: torch.Tensor, label: torch.Tensor, place: torch.Tensor) -> torch.Tensor:
+def _near_border(visible: torch.Tensor, label: torch.Tensor, place: torch.Tensor) -> torch.Tensor:
     """The pixels within 2 pixels of a border.
 
     Args:
-        seen: int [h, w], triangles, -1 for none.
-        label: int [h, w], what differs on both sides of a border.
+        visible: int [h, w], triangles, -1 for none.
+        label: int [h, w], which differs on the two sides of a border.
         place: int [F, 3], numbers of the corners' places in space.
 
     Returns:
         bool [h, w].
     """
-    border = torch.zeros(seen.shape, dtype=torch.bool, device=seen.device)
+    border = torch.zeros(visible.shape, dtype=torch.bool, device=visible.device)
     for axis in (0, 1):
-        count = seen.shape[axis] - 1
-        first, second = (seen.narrow(axis, start, count) for start in (0, 1))
+        count = visible.shape[axis] - 1
+        first, second = (visible.narrow(axis, start, count) for start in (0, 1))
         differ = label.narrow(axis, 0, count) != label.narrow(axis, 1, count)
         pairs = torch.nonzero(differ & (first >= 0) & (second >= 0), as_tuple=True)
         corners = place[first[pairs].long()], place[second[pairs].long()]
@@ -323,43 +366,46 @@ def _near_border(seen: torch.Tensor, label: torch.Tensor, place: torch.Tensor) -
         row, column = (index[touch] for index in pairs)
         border[row, column] = True
         border[row + (axis == 0), column + (axis == 1)] = True
-    # These are the pixels at the border; their neighbours, also diagonal ones, are the second ones from it.
+    # These pixels are the first ones from the border; their neighbours, also diagonal ones, the second ones.
     return torch.nn.functional.max_pool2d(border[None].float(), 3, stride=1, padding=1)[0] > 0
 
 
 class _Similarity:
-    """SSIM of one view against many decoders, with what depends on the reference worked out once.
+    """SSIM of one view's decoders, equal to ``wlm.metrics.ssim`` of the whole pictures.
+
+    That one compares two images on the host; this one computes the reference's part once for all decoders, on their
+    device, and only where the mesh is.
 
     Args:
-        hit: bool [h, w], the covered pixels, some of them true.
-        wanted: float64 [N, 3], the reference there, row by row.
+        hit: bool [h, w], the covered pixels, at least one.
+        target: float64 [N, 3], the reference there, row by row.
         peak: The range.
     """
 
-    def __init__(self, hit: torch.Tensor, wanted: torch.Tensor, peak: float) -> None:
+    def __init__(self, hit: torch.Tensor, target: torch.Tensor, peak: float) -> None:
         self._peak = peak
         height, width = hit.shape
         rows, columns = (torch.nonzero(hit.any(dim=axis)).flatten() for axis in (1, 0))
         top, bottom = max(int(rows[0]) - _HALF, 0), min(int(rows[-1]) + _HALF + 1, height)
         left, right = max(int(columns[0]) - _HALF, 0), min(int(columns[-1]) + _HALF + 1, width)
-        cut = hit[top:bottom, left:right]
-        # The crop's outermost pixels are out of the picture's inside, or uncovered.
-        inside = cut[_HALF:-_HALF, _HALF:-_HALF] if min(cut.shape) >= SSIM_WINDOW else cut[:0]
+        crop = hit[top:bottom, left:right]
+        # The crop's outermost pixels are uncovered, or have no whole window in the picture.
+        inside = crop[_HALF:-_HALF, _HALF:-_HALF] if min(crop.shape) >= SSIM_WINDOW else crop[:0]
         self._inside = inside
         if not (peak > 0.0 and bool(inside.any())):
             self._inside = inside[:0]
             return
-        nearest = distance_transform_edt(~cut.cpu().numpy(), return_distances=False, return_indices=True)
-        rank = torch.zeros(cut.shape, dtype=torch.int64, device=hit.device)
-        rank[cut] = torch.arange(len(wanted), device=hit.device)
+        nearest = distance_transform_edt(~crop.cpu().numpy(), return_distances=False, return_indices=True)
+        index = torch.zeros(crop.shape, dtype=torch.int64, device=hit.device)
+        index[crop] = torch.arange(len(target), device=hit.device)
         row, column = torch.tensor(nearest, device=hit.device).long()
-        self._hit, self._source = cut, rank[row, column]
-        self._reference = wanted[self._source].permute(2, 0, 1)
+        self._hit, self._source = crop, index[row, column]
+        self._reference = target[self._source].permute(2, 0, 1)
         self._mean, square = _blur(torch.stack([self._reference, self._reference.square()]))
         self._variance = square - self._mean.square()
 
     def mean(self, colour: torch.Tensor) -> float:
-        """SSIM's mean over the covered pixels whose window is in the picture; NaN if there is none, or no range.
+        """Mean over the covered pixels whose window is in the picture; NaN without any, or without a range.
 
         Args:
             colour: float64 [N, 3], decoded.
@@ -370,13 +416,13 @@ class _Similarity:
         mean, square, product = _blur(torch.stack([picture, picture.square(), picture * self._reference]))
         variance, covariance = square - mean.square(), product - mean * self._mean
         c1, c2 = (_C1 * self._peak) ** 2, (_C2 * self._peak) ** 2
-        similar = (2.0 * mean * self._mean + c1) * (2.0 * covariance + c2)
-        similar /= (mean.square() + self._mean.square() + c1) * (variance + self._variance + c2)
-        return float(similar.mean(dim=0)[self._inside].mean())
+        similarity = (2.0 * mean * self._mean + c1) * (2.0 * covariance + c2)
+        similarity /= (mean.square() + self._mean.square() + c1) * (variance + self._variance + c2)
+        return float(similarity.mean(dim=0)[self._inside].mean())
 
 
 def _blur(image: torch.Tensor) -> torch.Tensor:
-    """Gaussian means of [..., h, w] where the window is inside: [..., h - 10, w - 10]."""
+    """Gaussian means of [..., h, w] where the whole window is inside: [..., h - 10, w - 10]."""
     offset = torch.arange(-_HALF, _HALF + 1, dtype=image.dtype)
     weight = torch.exp(-0.5 * (offset / _SIGMA) ** 2)
     weight = (weight / weight.sum()).tolist()
@@ -384,7 +430,7 @@ def _blur(image: torch.Tensor) -> torch.Tensor:
         count = image.shape[axis] - 2 * _HALF
         blurred = weight[_HALF] * image.narrow(axis, _HALF, count)
         for k in range(_HALF):
-            both = image.narrow(axis, k, count) + image.narrow(axis, 2 * _HALF - k, count)
-            blurred.add_(both, alpha=weight[k])
+            pair = image.narrow(axis, k, count) + image.narrow(axis, 2 * _HALF - k, count)
+            blurred.add_(pair, alpha=weight[k])
         image = blurred
     return image

@@ -1,22 +1,20 @@
-"""The decode in float64, from a model's stored numbers to light: what the kernels are compared with."""
+"""The decode in float64, from a model's stored numbers to light: the reference of the runtime kernels."""
 
 import numpy as np
 
-from wlm.atlas.model import AtlasModel, unpack_entries
+from wlm.atlas.model import LUT_STEPS, AtlasModel, unpack_entries
 
 __all__ = ["decode64"]
 
-_LUT_STEPS = 65535.0  # of a coordinate
-
 
 def decode64(model: AtlasModel, uv: np.ndarray) -> np.ndarray:
-    """Light at points (lightmap-uv-clustering-cascade, eq. 7).
+    """Reads light at points (lightmap-uv-clustering-cascade, eq. 7).
 
-    Neighbouring tiles meet with a step. A point that float32 puts into the other one differs by that.
+    Light has a step where tiles meet; a point that float32 rounds into the neighbouring tile differs by that step.
 
     Args:
         model: The model.
-        uv: [N, 2], finite: the model's own UVs where it has any, else the lightmap's; clamped to [0, 1].
+        uv: [N, 2], finite: the model's new UVs where it has any, else the lightmap's; clamped to [0, 1].
 
     Returns:
         float64 [N, 3].
@@ -26,7 +24,7 @@ def decode64(model: AtlasModel, uv: np.ndarray) -> np.ndarray:
     if model.method == "tiles":
         return _tiles(model, texels, uv)
     if model.method == "cascade":
-        uv = _bilinear(model.lut / _LUT_STEPS, uv)
+        uv = _bilinear(model.lut / LUT_STEPS, uv)
     return _bilinear(texels, uv)
 
 
@@ -45,7 +43,7 @@ def _bilinear(texels: np.ndarray, uv: np.ndarray) -> np.ndarray:
 
 
 def _between(texels: np.ndarray, first: np.ndarray, last: np.ndarray, place: np.ndarray) -> np.ndarray:
-    """Reads [H, W, C] at places [N, 2], from texel 0's centre, in rectangles from first to last texels."""
+    """Reads [H, W, C] bilinearly at places [N, 2] in texels from texel 0's centre, clamped to first..last texels."""
     low = np.clip(np.floor(place).astype(np.int64), first, last)
     high = np.minimum(low + 1, last)
     share = (place - low)[:, :, None]

@@ -1,4 +1,4 @@
-"""What a compression leaves in its folder: the model, a mesh, textures for engines and viewers, a shader, a report.
+"""The folder of a compression: the model, a mesh, textures for engines and viewers, a shader, a report.
 
     atlas.wlm                       the model in one file, see ``codec``
     mesh.glb                        the mesh, with its new UVs as one more set if it has any
@@ -9,30 +9,27 @@
     report.json                     settings, sizes, times, warnings, and where the inputs were
 """
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import os
-import secrets
-import shutil
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from wlm import system
 from wlm.atlas import codec
 from wlm.atlas.coverage import touched_texels
-from wlm.atlas.data import LightmappedMesh, from_arrays, write_mesh
-from wlm.atlas.model import SOURCE_BITS, AtlasModel
+from wlm.atlas.data import LightmappedMesh, from_arrays, load, write_mesh
+from wlm.atlas.model import LUT_STEPS, AtlasModel, disk_ratio
 from wlm.atlas.shader import atlas_glsl
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_write
 from wlm.formats.dds import write_dds
 from wlm.formats.exr import write_exr
+from wlm.formats.folder import UNFINISHED, read_index, staged
 from wlm.formats.gltf import read_gltf
 from wlm.formats.gltf_writer import write_glb
 from wlm.formats.ktx2 import write_ktx2
@@ -45,13 +42,11 @@ __all__ = [
     "MODEL_FILE",
     "REPORT_FILE",
     "Output",
-    "check_folder",
-    "check_run",
-    "disk_ratio",
+    "describe",
     "export",
     "geometry",
     "read_folder",
-    "read_report",
+    "read_inputs",
 ]
 
 FORMAT = "wlm-atlas"
@@ -61,31 +56,21 @@ MESH_FILE = "mesh.glb"
 MASK_FILE = "mask.png"
 SHADER_FILE = "atlas.glsl"
 REPORT_FILE = "report.json"
-_TEXTURES = ("lut", "colour")
-_SUFFIXES = (".exr", ".ktx2", ".dds")
-_FILES = (
-    MODEL_FILE,
-    MESH_FILE,
-    MASK_FILE,
-    *(name + end for name in _TEXTURES for end in _SUFFIXES),
-    SHADER_FILE,
-    REPORT_FILE,
-)
-_MARKER = "unfinished"  # stands in the report while files are being moved
+_TEXTURES = tuple(name + suffix for name in ("lut", "colour") for suffix in (".exr", ".ktx2", ".dds"))
+_FILES = (MODEL_FILE, MESH_FILE, MASK_FILE, *_TEXTURES, SHADER_FILE, REPORT_FILE)
 _MOST_SIDE = 16384  # texels of a texture on GPUs
 _LUT_FORMATS = {"tiles": "R16G16_UINT", "cascade": "R16G16_UNORM"}
-_STEPS = 65535.0  # of a coordinate in T_c
 
 
 @dataclass(frozen=True)
 class Output:
-    """What is in the folder of a compression.
+    """The content of an exported folder.
 
     Attributes:
         folder: The folder.
         model: The model.
-        report: report.json.
-        model_bytes: Of atlas.wlm.
+        report: Content of report.json.
+        model_bytes: Size of atlas.wlm.
     """
 
     folder: Path
@@ -94,14 +79,9 @@ class Output:
     model_bytes: int
 
 
-def disk_ratio(model_bytes: int, model: AtlasModel | codec.Contents) -> float:
-    """CR of bytes on disk: 1 less those of atlas.wlm over the lightmap's at 48 bits a texel."""
-    return 1.0 - model_bytes * 8 / (model.height * model.width * SOURCE_BITS)
-
-
 def export(
-    directory: str | os.PathLike[str],
     model: AtlasModel,
+    directory: str | os.PathLike[str],
     mesh: LightmappedMesh,
     facts: Mapping[str, Any] | None = None,
 ) -> list[Path]:
@@ -112,10 +92,11 @@ def export(
     can't be read, but can be written again.
 
     Args:
-        directory: The folder; made if it isn't there.
         model: The model.
+        directory: The folder; made if it isn't there.
         mesh: The mesh that was compressed.
-        facts: More for ``report.json``, plain JSON values: "inputs" for example.
+        facts: More entries of ``report.json``, plain JSON values. "inputs", a mapping with the paths "mesh",
+            "lightmap" and "mask" (None: none), is what ``read_inputs`` reads.
 
     Returns:
         The files written, ``report.json`` last.
@@ -127,97 +108,58 @@ def export(
     """
     if model.source != mesh.source:
         raise ValueError(f"model of {model.source}, mesh of {mesh.source}: expected the mesh that was compressed")
-    folder = Path(directory)
-    check_folder(folder)
     for name, texture in (("T_p", model.texels), ("T_c", model.lut)):
         side = max(texture.shape[:2])
         if side > _MOST_SIDE:
             raise WlmError(f"{model.name}: {name}: expected at most {_MOST_SIDE} texels along a side, found {side}")
-    with _staged(folder) as temporary:
-        # Times differ from run to run; without them one seed gives one file.
-        kept = dict(model.report)
-        seconds = kept.pop("seconds", {})
-        model = dataclasses.replace(model, report=kept)
-        model_bytes = codec.write(temporary / MODEL_FILE, model)
+    folder = Path(directory)
+    with staged(folder, REPORT_FILE, FORMAT, _FILES.__contains__) as temporary:
+        model_bytes = model.save(temporary / MODEL_FILE)
         new_set = None
         if len(model.uv):
             new_set = write_mesh(temporary / MESH_FILE, mesh, model.uv)
         else:
             # The number is of a set to be added, and there is none.
             write_glb(temporary / MESH_FILE, mesh.document, [], 1)
-        if not np.array_equal(mesh.mask, _touched(mesh)):
+        # ``geometry`` derives the mask from the triangles where there is no file of it.
+        if not np.array_equal(mesh.mask, touched_texels(mesh.uv, mesh.triangle[mesh.active], *mesh.mask.shape)):
             write_mask(temporary / MASK_FILE, mesh.mask)
         if model.method != "plain":
             _write_lut(temporary, model)
         _write_colour(temporary, model)
         atomic_write(temporary / SHADER_FILE, atlas_glsl(model).encode())
-        written = sorted(path.name for path in temporary.iterdir())
-        report = _report(model, mesh, new_set, model_bytes) | {"seconds": seconds} | dict(facts or {})
-        report["bytes"] = {name: (temporary / name).stat().st_size for name in written}
+        names = sorted(path.name for path in temporary.iterdir())
+        report = _report(model, mesh, new_set, model_bytes) | dict(facts or {})
+        report["bytes"] = {name: (temporary / name).stat().st_size for name in names}
         atomic_write(temporary / REPORT_FILE, (json.dumps(report, indent=1, allow_nan=False) + "\n").encode())
-        names = [*written, REPORT_FILE]
-    return [folder / name for name in names]
-
-
-def check_folder(directory: str | os.PathLike[str]) -> None:
-    """Checks, before long work, that a folder can be written.
-
-    Raises:
-        WlmError: It is a file, holds something other than an earlier output, or it or its parent can't be written.
-    """
-    folder = Path(directory)
-    try:
-        if folder.exists() and any(folder.iterdir()) and _json_of(folder).get("format") != FORMAT:
-            raise WlmError(f"{folder}: expected an empty folder or one of an earlier output, found other files")
-    except OSError as error:
-        raise WlmError(f"{folder}: cannot write there: {error.strerror or error}") from error
-    parent = folder.resolve().parent
-    if not parent.is_dir():
-        raise WlmError(f"{folder}: cannot write: the folder {parent} does not exist")
-    for place in (parent, folder):
-        if place.exists() and not os.access(place, os.W_OK):
-            raise WlmError(f"{folder}: cannot write: the folder {place} is read-only")
+    return [folder / name for name in (*names, REPORT_FILE)]
 
 
 def read_folder(directory: str | os.PathLike[str]) -> Output:
     """Reads what ``export`` wrote: the model and the report.
 
     Raises:
-        WlmError: As ``read_report``; or the model is damaged or of another run than the report.
+        WlmError: There is no such folder, it isn't an exported one, its files were never all there, or the model is
+            damaged or of another run than the report.
     """
-    folder, report = Path(directory), read_report(directory)
-    model = codec.read(folder / MODEL_FILE)
-    check_run(folder, report, model.source)
+    folder, report = Path(directory), _read_report(directory)
+    model = system.load(folder / MODEL_FILE, AtlasModel.SYSTEM)
+    _check_run(folder, report, model.source)
     return Output(folder, model, report, (folder / MODEL_FILE).stat().st_size)
 
 
-def read_report(directory: str | os.PathLike[str]) -> dict[str, Any]:
-    """Reads the report that ``export`` wrote.
+def describe(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Says what an exported folder's model, or a model's file, holds: ``codec.describe``.
 
     Raises:
-        WlmError: There is no such folder, it isn't of a compression, or its files were never all there.
+        WlmError: As ``read_folder`` for a folder, and as ``codec.describe``.
     """
-    folder = Path(directory)
-    if not folder.is_dir():
-        raise WlmError(f"{folder}: expected a folder that compress wrote")
-    report = _json_of(folder)
-    if report.get("format") != FORMAT:
-        raise WlmError(f"{folder}: expected a folder that compress wrote, found no {REPORT_FILE} of it")
-    if report.get("version") != _VERSION:
-        raise WlmError(f"{folder / REPORT_FILE}: version: expected {_VERSION}, found {report.get('version')}")
-    if _MARKER in report:
-        raise WlmError(f"{folder}: expected all files of a run; writing them was stopped half-way, so compress again")
-    return report
-
-
-def check_run(folder: Path, report: Mapping[str, Any], source: str) -> None:
-    """Checks that a model's ``source`` is its report's.
-
-    Raises:
-        WlmError: It is not.
-    """
-    if report.get("source") != source:
-        raise WlmError(f"{folder}: {MODEL_FILE} and {REPORT_FILE} are not of one run")
+    if not os.path.isdir(path):
+        return codec.describe(path)
+    folder, report = Path(path), _read_report(path)
+    facts = codec.describe(folder / MODEL_FILE)
+    _check_run(folder, report, facts["source"])
+    return facts
 
 
 def geometry(output: Output) -> LightmappedMesh:
@@ -255,45 +197,58 @@ def geometry(output: Output) -> LightmappedMesh:
     return dataclasses.replace(mesh, source=model.source)
 
 
-def _touched(mesh: LightmappedMesh) -> np.ndarray:
-    """The mask that ``geometry`` derives."""
-    return touched_texels(mesh.uv, mesh.triangle[mesh.active], *mesh.mask.shape)
+def read_inputs(
+    output: Output,
+    mesh_path: str | os.PathLike[str] | None = None,
+    lightmap_path: str | os.PathLike[str] | None = None,
+    mask_path: str | os.PathLike[str] | None = None,
+) -> LightmappedMesh:
+    """Reads the mesh and lightmap that were compressed.
+
+    Args:
+        output: The folder; its report names them ("inputs").
+        mesh_path, lightmap_path, mask_path: Where they are now; None: where they were.
+
+    Raises:
+        WlmError: A path isn't known, a file is missing or damaged, or it isn't what was compressed. The line names
+            the option of ``wlm atlas evaluate`` that gives the path.
+    """
+    stored = output.report.get("inputs")
+    stored = stored if isinstance(stored, dict) else {}
+    paths = {"mesh": mesh_path, "lightmap": lightmap_path, "mask": mask_path}
+    paths = {name: Path(path or stored[name]) for name, path in paths.items() if path or stored.get(name)}
+    for name in ("mesh", "lightmap"):
+        if name not in paths:
+            raise WlmError(f"{output.folder / REPORT_FILE}: inputs.{name}: expected a path, found none; give --{name}")
+        if not paths[name].is_file():
+            raise WlmError(f"{paths[name]}: no such {name}; if it has moved, give --{name}")
+    mesh = load(paths["mesh"], paths["lightmap"], mask_path=paths.get("mask"), uv_set=output.report.get("uv_set"))
+    if mesh.source != output.model.source:
+        names = ", ".join(map(str, paths.values()))
+        raise WlmError(
+            f"{output.folder}: made of other inputs than {names}: expected source {output.model.source}, found "
+            f"{mesh.source}"
+        )
+    return mesh
 
 
-def _json_of(folder: Path) -> dict[str, Any]:
-    try:
-        found = json.loads((folder / REPORT_FILE).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        found = None
-    return found if isinstance(found, dict) else {}
+def _read_report(directory: str | os.PathLike[str]) -> dict[str, Any]:
+    folder = Path(directory)
+    if not folder.is_dir():
+        raise WlmError(f"{folder}: expected a folder that compress wrote")
+    report = read_index(folder / REPORT_FILE)
+    if report.get("format") != FORMAT:
+        raise WlmError(f"{folder}: expected a folder that compress wrote, found no {REPORT_FILE} of it")
+    if UNFINISHED in report:
+        raise WlmError(f"{folder}: expected all files of a run; writing them was stopped half-way, so compress again")
+    if report.get("version") != _VERSION:
+        raise WlmError(f"{folder / REPORT_FILE}: version: expected {_VERSION}, found {report.get('version')}")
+    return report
 
 
-@contextmanager
-def _staged(folder: Path) -> Iterator[Path]:
-    """Gives a new folder beside the real one, and moves its files there at the end if nothing went wrong."""
-    temporary = folder.resolve().parent / f".wlm-{secrets.token_hex(8)}.tmp"
-    try:
-        temporary.mkdir()
-        yield temporary
-        fresh = {path.name for path in temporary.iterdir()}
-        marker = temporary / _MARKER
-        marker.write_text(json.dumps({"format": FORMAT, "version": _VERSION, _MARKER: True}))
-        folder.mkdir(exist_ok=True)
-        # An old report must not vouch for new files, nor may the folder become one that can't be written again.
-        os.replace(marker, folder / REPORT_FILE)
-        for name in _FILES:
-            if name not in fresh:
-                (folder / name).unlink(missing_ok=True)
-        for name in sorted(fresh, key=lambda name: name == REPORT_FILE):
-            os.replace(temporary / name, folder / name)
-    except OSError as error:
-        raise WlmError(f"{folder}: cannot write there: {error.strerror or error}") from error
-    except WlmError as error:
-        # Messages name the file as the user will know it.
-        raise WlmError(str(error).replace(str(temporary), str(folder))) from error
-    finally:
-        with suppress(OSError):
-            shutil.rmtree(temporary)
+def _check_run(folder: Path, report: Mapping[str, Any], source: str) -> None:
+    if report.get("source") != source:
+        raise WlmError(f"{folder}: {MODEL_FILE} and {REPORT_FILE} are not of one run")
 
 
 def _write_lut(folder: Path, model: AtlasModel) -> None:
@@ -301,7 +256,7 @@ def _write_lut(folder: Path, model: AtlasModel) -> None:
     height, width = model.lut.shape[:2]
     data, fmt = np.ascontiguousarray(model.lut, "<u2").tobytes(), _LUT_FORMATS[model.method]
     picture = np.zeros((height, width, 3), np.float32)
-    picture[..., :2] = model.lut if model.method == "tiles" else model.lut / _STEPS
+    picture[..., :2] = model.lut if model.method == "tiles" else model.lut / LUT_STEPS
     write_exr(folder / "lut.exr", picture, half=False)
     write_ktx2(folder / "lut.ktx2", data, width, height, fmt)
     write_dds(folder / "lut.dds", data, width, height, fmt=fmt)
@@ -342,8 +297,9 @@ def _report(model: AtlasModel, mesh: LightmappedMesh, new_set: int | None, model
         "uv_set": mesh.uv_set,
         "new_uv_set": new_set,
         "cr": model.compression_ratio,
-        "cr_disk": disk_ratio(model_bytes, model),
+        "cr_disk": disk_ratio(model_bytes, mesh.mask.shape),
         "profile": model.profile.model_dump(mode="json"),
         "warnings": list(mesh.warnings),
-        "found": model.report,
+        "found": {name: value for name, value in model.report.items() if name != "seconds"},
+        "seconds": model.report.get("seconds", {}),
     }

@@ -3,85 +3,91 @@
 A lightmap is read through a look-up table (lightmap-uv-clustering-cascade, eq. 7): C(u) = T_p(F(T_c(u))), with T_c the
 small table, T_p the small colour texture and one of these for F:
 
-    tiles    u picks a tile of the lightmap; its entry of T_c, read without a filter, says which rectangle of T_p holds
-             the tile, and u's place in the tile is u's place in the rectangle. Ours.
-    cascade  T_c is read with a bilinear filter and gives a coordinate, which a triangle wave brings into [0, 1]
-             (eq. 8). The paper's; u is a coordinate of the mesh's new, shared UVs.
-    plain    there is no table: the lightmap at a lower resolution, or under new UVs.
+    tiles    u lies in a tile of the lightmap. The tile's entry of T_c, read without a filter, names a rectangle of T_p;
+             relative position in the tile is relative position in the rectangle. Ours.
+    cascade  T_c, read bilinearly at the mesh's new, shared UVs, gives a coordinate, which a triangle wave folds into
+             [0, 1] (eq. 8). The paper's.
+    plain    No table: the lightmap at a lower resolution, or under new UVs.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
-from wlm.config import load_settings, profile_path
+from wlm.errors import WlmError
+from wlm.system import Model, Settings
 
 __all__ = [
     "BLOCK_SIDE",
     "COLOUR_BITS",
     "LUT_BITS",
+    "LUT_STEPS",
     "MOST_SIZE",
-    "SOURCE_BITS",
     "SIDE_BITS",
+    "SOURCE_BITS",
     "AtlasModel",
     "Profile",
     "compression_ratio",
-    "load_profile",
+    "disk_ratio",
     "pack_entries",
+    "tile_counts",
     "unpack_entries",
 ]
 
 SOURCE_BITS = 48
-"""Of a texel of the lightmap: three half floats (eq. 9)."""
+"""Bits per texel of the lightmap: three half floats (eq. 9)."""
 
 COLOUR_BITS = {"half": 48, "bc6h": 8, "astc": 8}
-"""Of a texel of T_p, by how it is stored: half floats, BC6H or ASTC 4x4."""
+"""Bits per texel of T_p, by how it is stored: half floats, BC6H or ASTC 4x4."""
 
 BLOCK_SIDE = 4
 """Texels along a block of BC6H or ASTC."""
 
 LUT_BITS = 32
-"""Of an entry of T_c: two numbers of 16 bits."""
+"""Bits per entry of T_c: two numbers of 16 bits."""
 
-# An entry of a tile is two numbers, one an axis: the rectangle's first texel, and its texels less one.
+LUT_STEPS = 65535.0
+"""Of method "cascade": a coordinate of 1 in T_c."""
+
+# An entry of a tile has one number per axis: the rectangle's first texel, and its number of texels less one.
 SIDE_BITS = 4
 MOST_SIZE = 1 << (16 - SIDE_BITS)
-"""Texels that T_p may have along an axis, where tiles are."""
+"""Most texels of T_p along an axis for method "tiles"."""
 
 
-class Profile(BaseModel):
+class Profile(Settings):
     """Settings of a compression.
 
     Attributes:
         name: Shown in reports.
         method: "tiles" or "cascade", see the module.
         colour: How T_p is stored: "half" floats, "bc6h" or "astc" (4x4).
-        budget: Of "tiles": bits of T_p and T_c as a share of the lightmap's at 48 bits a texel, 1 - CR of eq. 9.
-        tile: Of "tiles": texels of the lightmap along a tile, 3 to 15. A tile has up to one sample more, so that
-            the longest of them keeps every texel.
-        views: Random views of the unit sphere from which it is counted how much each texel is seen; 0: texels count
-            by their area on the mesh.
-        unseen: Weight of what no view sees, as a share of the mean weight.
-        border: Weight of what lies within a texel of a chart's border, as a multiple: an error there is a seam.
-        fallback: Whether a plain smaller lightmap of as many bits takes the place of what has the larger error.
+        budget: For "tiles": bits of T_p and T_c as a fraction of the lightmap's at 48 bits per texel, 1 - CR of eq. 9.
+        tile: For "tiles": texels of the lightmap along a tile, 3 to 15. A tile has up to one sample more per axis, and
+            with these it keeps every texel.
+        views: Random views of the unit sphere; a texel counts by the pixels that show it. 0: by its area on the mesh.
+        unseen: Weight of what no view shows, as a fraction of the mean weight.
+        border: Factor on the weight within a texel of a chart's border: an error there is a seam.
+        fallback: Whether a plain smaller lightmap of as many bits replaces the result if its error is no larger.
         threshold: lambda of eq. 4; 0 shares no triangles.
         colour_threshold: lambda_h of section 3.2.1.
-        max_radiance: Triangles with a brighter texel are not shared, and lambda and lambda_h are shares of it (section
-            4.1.1); null: the brightest texel of the charts, so that a dark lightmap is told apart as a bright one is.
+        max_radiance: Triangles with a brighter texel are not shared, and lambda and lambda_h are fractions of it
+            (section 4.1.1); null: the brightest texel of the charts, which treats dark and bright lightmaps alike.
         scale: epsilon, of the repacked lightmap (section 3.3.1).
-        colour_scale: epsilon_p, of T_p against that.
-        lut_scale: epsilon_c, of T_c against that; 0: no table, method "plain".
+        colour_scale: epsilon_p, sides of T_p over those of the repacked lightmap.
+        lut_scale: epsilon_c, the same for T_c; 0: no table, method "plain".
         space: Where T_p and T_c are tuned: in random "views", or in "uv" at points of the mesh's surface.
-        steps: Of Adam.
-        colour_rate, lut_rate: First learning rates of T_p, whose unit is the lightmap's mean, and of T_c.
-        final_rate: Both rates end here, as a share of the first.
+        steps: Steps of Adam.
+        colour_rate, lut_rate: Initial learning rates of T_p, in units of the lightmap's mean, and of T_c.
+        final_rate: Learning rates of the last step as a fraction of the initial ones.
         resolution: Pixels along a side of a view.
         gradient: Weight of the image gradients' L1 in the loss beside the colours' L1 (section 3.3.3).
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    FILES: ClassVar[str] = "atlas"
 
     name: str
     method: Literal["tiles", "cascade"] = "tiles"
@@ -106,35 +112,40 @@ class Profile(BaseModel):
     resolution: int = Field(2048, ge=16, le=8192)
     gradient: float = Field(1.0, ge=0.0)
 
+    def override(self, values: Mapping[str, Any], prefix: str = "") -> Self:
+        """Replaces some settings, as ``wlm.system.Settings.override``.
 
-def load_profile(name: str) -> Profile:
-    """Loads ``configs/atlas-NAME.yaml``, or a YAML file of one's own.
-
-    Raises:
-        WlmError: Unknown profile, unreadable file, or a wrong setting.
-    """
-    path = name if name.endswith((".yaml", ".yml")) else profile_path("atlas", name)
-    return load_settings(Profile, path)
+        Raises:
+            WlmError: Unknown or out of range; or a budget for the cascade, which has none.
+        """
+        if values.get("budget") is not None and (values.get("method") or self.method) == "cascade":
+            raise WlmError(
+                f"{prefix}budget: profiles of the cascade have sizes of their own; expected one of tiles, or none"
+            )
+        return super().override(values, prefix)
 
 
 @dataclass(frozen=True, eq=False)
-class AtlasModel:
+class AtlasModel(Model):
     """A compressed lightmap.
 
     Attributes:
-        name: Of the mesh.
+        name: The mesh's name.
         source: ``LightmappedMesh.source``.
-        profile: What it was asked to be.
-        method: What it is: "tiles", "cascade" or "plain". It may be "plain" where the method does not pay.
+        profile: The settings that were asked for.
+        method: "tiles", "cascade" or "plain"; "plain" also where the profile's method does not pay.
         colour: How T_p is stored, as in ``Profile``.
         height, width: Texels of the lightmap.
         texels: half [Hp, Wp, 3], T_p, finite, not negative; what ``blocks`` decode to where there are any.
-        blocks: uint8 [B, 16], the blocks of T_p, row by row, or [0, 16].
-        lut: uint16 [Hc, Wc, 2], T_c: of "tiles" ``pack_entries``' [ty, tx, 2]; of "cascade" coordinates in 1 / 65535;
-            [0, 0, 2] of "plain".
+        blocks: uint8 [B, 16], the blocks of T_p, row by row; [0, 16] for half floats.
+        lut: uint16 [Hc, Wc, 2], T_c: for "tiles" ``pack_entries``' [ty, tx, 2]; for "cascade" coordinates in units of
+            1 / ``LUT_STEPS``; [0, 0, 2] for "plain".
         uv: float32 [F, 3, 2] in [0, 1], the corners' new UVs; [0, 3, 2] where the mesh keeps its own.
-        report: What was found on the way, for people: seconds by stage, groups, why it is plain.
+        report: Facts about the compression, for people: "seconds" by stage (not saved, since they differ from run to
+            run), groups, why it is plain.
     """
+
+    SYSTEM: ClassVar[str] = "atlas"
 
     name: str
     source: str
@@ -144,9 +155,9 @@ class AtlasModel:
     height: int
     width: int
     texels: np.ndarray
-    blocks: np.ndarray
-    lut: np.ndarray
-    uv: np.ndarray
+    blocks: np.ndarray = field(default_factory=lambda: np.empty((0, 16), np.uint8))
+    lut: np.ndarray = field(default_factory=lambda: np.empty((0, 0, 2), np.uint16))
+    uv: np.ndarray = field(default_factory=lambda: np.empty((0, 3, 2), np.float32))
     report: dict[str, Any] = field(default_factory=dict)
 
     @property
@@ -159,9 +170,9 @@ def compression_ratio(texels: tuple[int, int], lut: tuple[int, int], size: tuple
     """CR of eq. 9: 1 less the bits of both textures over the lightmap's.
 
     Args:
-        texels: Rows and columns of T_p. Whole blocks count, where it is made of them.
-        lut: Of T_c, (0, 0) for none.
-        size: Of the lightmap.
+        texels: Rows and columns of T_p. Blocks count whole.
+        lut: Rows and columns of T_c, (0, 0) for none.
+        size: Rows and columns of the lightmap.
         colour: How T_p is stored, as in ``Profile``.
     """
     side = 1 if colour == "half" else BLOCK_SIDE
@@ -170,18 +181,36 @@ def compression_ratio(texels: tuple[int, int], lut: tuple[int, int], size: tuple
     return 1.0 - bits / (size[0] * size[1] * SOURCE_BITS)
 
 
+def disk_ratio(file_bytes: int, size: tuple[int, int]) -> float:
+    """CR of a model's file: 1 less its bits over the lightmap's.
+
+    Args:
+        file_bytes: The file's size.
+        size: Rows and columns of the lightmap.
+    """
+    return 1.0 - file_bytes * 8 / (size[0] * size[1] * SOURCE_BITS)
+
+
+def tile_counts(height: int, width: int, tile: int) -> tuple[int, int]:
+    """Rows and columns of the grid of tiles over a lightmap: the shape of T_c for "tiles".
+
+    Tiles span texel centres; the last ones may reach beyond the lightmap.
+    """
+    return max(1, -(-(height - 1) // tile)), max(1, -(-(width - 1) // tile))
+
+
 def pack_entries(first: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """Entries of T_c for tiles.
+    """Encodes entries of T_c for tiles.
 
     Args:
         first: int [..., 2], x and y of the rectangle's first texel, below ``MOST_SIZE``.
-        size: int [..., 2], its texels along x and y, 1 to 16.
+        size: int [..., 2], the rectangle's texels along x and y, 1 to 16.
 
     Returns:
         uint16 [..., 2]: ``first`` shifted left by 4, plus ``size`` - 1.
 
     Raises:
-        ValueError: A number out of range.
+        ValueError: A number is out of range.
     """
     first, size = np.asarray(first), np.asarray(size)
     if (first < 0).any() or (first >= MOST_SIZE).any() or (size < 1).any() or (size > 1 << SIDE_BITS).any():
@@ -190,6 +219,6 @@ def pack_entries(first: np.ndarray, size: np.ndarray) -> np.ndarray:
 
 
 def unpack_entries(lut: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Undoes ``pack_entries``: first texels and sizes, int64 [..., 2] each."""
+    """Decodes ``pack_entries``: first texels and sizes, int64 [..., 2] each."""
     lut = np.asarray(lut).astype(np.int64)
     return lut >> SIDE_BITS, (lut & ((1 << SIDE_BITS) - 1)) + 1

@@ -1,4 +1,4 @@
-"""Smaller lightmaps, to be read bilinearly."""
+"""Lightmaps at a lower resolution, to be read bilinearly."""
 
 import numpy as np
 import scipy.sparse as sparse
@@ -10,20 +10,20 @@ __all__ = ["FILTERS", "fitting_size", "resize"]
 
 FILTERS = ("bilinear", "box", "lanczos", "fit")
 _LOBES = 3
-# Conjugate gradients: 5 rounds are within 0.1 dB of these, and three times as many gain nothing.
+# Of conjugate gradients: 5 are within 0.1 dB of these, and three times as many gain nothing.
 _ROUNDS = 20
-# Pull of the fit towards the box filter's result. It alone decides texels that no chart reads, and hardly any other.
+# Regularisation towards the box filter's result: it decides texels that no chart reads, and hardly changes any other.
 _PULL = 1e-4
 
 
 def fitting_size(height: int, width: int, budget: float, block: tuple[int, int], bits: float) -> tuple[int, int] | None:
-    """The largest size of a shape whose blocks are within a budget.
+    """The largest size of a given aspect ratio whose blocks are within a budget.
 
     Args:
         height, width: The shape, and the largest size.
         budget: Bits.
         block: Rows and columns of texels in a block, 1 and 1 for none.
-        bits: Of a texel, where all blocks are whole.
+        bits: Bits per texel; blocks count whole.
 
     Returns:
         Rows and columns; None if not even one block fits.
@@ -44,7 +44,7 @@ def resize(lightmap: np.ndarray, mask: np.ndarray, height: int, width: int, filt
         mask: bool [H, W], true where a texel counts.
         height, width: 1 to H and 1 to W.
         filter: "bilinear" reads the lightmap at the new texels' centres; "box" averages it over their squares;
-            "lanczos" has 3 lobes; "fit" has the least squares when it is read at the mask's texels.
+            "lanczos" has 3 lobes; "fit" has the least squared error when it is read at the mask's texels.
 
     Returns:
         float64 [height, width, 3] in [0, 65504]; at the lightmap's own size it is the lightmap with its gaps filled.
@@ -60,55 +60,55 @@ def resize(lightmap: np.ndarray, mask: np.ndarray, height: int, width: int, filt
     if (height, width) == mask.shape:
         return filled
     weights = _WEIGHTS["box" if filter == "fit" else filter]
-    # Rows, then columns. The matrices are nearly empty.
+    # Separable: rows, then columns, with sparse matrices.
     rows = (weights(height, mask.shape[0]) @ filled.reshape(mask.shape[0], -1)).reshape(height, mask.shape[1], 3)
-    turned = np.ascontiguousarray(rows.swapaxes(0, 1)).reshape(mask.shape[1], -1)
-    small = (weights(width, mask.shape[1]) @ turned).reshape(width, height, 3).swapaxes(0, 1)
+    columns = np.ascontiguousarray(rows.swapaxes(0, 1)).reshape(mask.shape[1], -1)
+    small = (weights(width, mask.shape[1]) @ columns).reshape(width, height, 3).swapaxes(0, 1)
     if filter == "fit":
         small = _fit(filled, mask, small)
     return np.clip(small, 0.0, HALF_MAX)
 
 
 def _fit(filled: np.ndarray, mask: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """Least squares of what is read at the mask's texels, from a first guess [h, w, 3], by conjugate gradients."""
+    """Minimises the squared error at the mask's texels by conjugate gradients, from an initial [h, w, 3]."""
     inside = mask.reshape(-1)
     read = sparse.kron(*(_bilinear(old, new) for old, new in zip(mask.shape, start.shape[:2], strict=True)), "csr")
     read = read[inside]
     normal = (read.T @ read + _PULL * sparse.identity(read.shape[1])).tocsr()
     change = np.zeros((read.shape[1], 3))
-    rest = read.T @ (filled.reshape(-1, 3)[inside] - read @ start.reshape(-1, 3))
-    step, size = rest.copy(), (rest * rest).sum(axis=0)
+    residual = read.T @ (filled.reshape(-1, 3)[inside] - read @ start.reshape(-1, 3))
+    direction, energy = residual.copy(), (residual * residual).sum(axis=0)
     for _ in range(_ROUNDS):
-        moved = normal @ step
-        along = (step * moved).sum(axis=0)
-        # A channel that is solved already has nothing left to divide by.
-        length = np.divide(size, along, out=np.zeros(3), where=along > 0.0)
-        change += length * step
-        rest -= length * moved
-        before, size = size, (rest * rest).sum(axis=0)
-        step = rest + np.divide(size, before, out=np.zeros(3), where=before > 0.0) * step
+        image = normal @ direction
+        curvature = (direction * image).sum(axis=0)
+        # A channel that is solved already has a curvature of 0.
+        step = np.divide(energy, curvature, out=np.zeros(3), where=curvature > 0.0)
+        change += step * direction
+        residual -= step * image
+        before, energy = energy, (residual * residual).sum(axis=0)
+        direction = residual + np.divide(energy, before, out=np.zeros(3), where=before > 0.0) * direction
     return start + change.reshape(start.shape)
 
 
 def _bilinear(new: int, old: int) -> sparse.csr_matrix:
-    """Reads `old` texels at the centres of `new` ones, clamped."""
-    at = (np.arange(new) + 0.5) * old / new - 0.5
-    first = np.floor(at).astype(np.int64)
+    """[new, old], reads ``old`` texels at the centres of ``new`` ones, clamped."""
+    place = (np.arange(new) + 0.5) * old / new - 0.5
+    first = np.floor(place).astype(np.int64)
     column = np.clip(np.stack([first, first + 1]), 0, old - 1)
-    weight = np.stack([1.0 - (at - first), at - first])
+    weight = np.stack([1.0 - (place - first), place - first])
     row = np.broadcast_to(np.arange(new), (2, new))
     return sparse.csr_matrix((weight.reshape(-1), (row.reshape(-1), column.reshape(-1))), shape=(new, old))
 
 
 def _box(new: int, old: int) -> sparse.csr_matrix:
-    """Means of `old` texels over the squares of `new` ones."""
+    """[new, old], means of ``old`` texels over the squares of ``new`` ones."""
     side, texel = np.arange(new + 1) * (old / new), np.arange(old)
     weight = np.minimum(side[1:, None], texel + 1.0) - np.maximum(side[:-1, None], texel)
     return _normalised(np.maximum(weight, 0.0))
 
 
 def _lanczos(new: int, old: int) -> sparse.csr_matrix:
-    """A windowed sinc that lets through what `new` texels can hold."""
+    """[new, old], a windowed sinc with the bandwidth of ``new`` texels."""
     scale = old / new
     x = (np.arange(old) + 0.5 - (np.arange(new) + 0.5)[:, None] * scale) / scale
     return _normalised(np.where(np.abs(x) < _LOBES, np.sinc(x) * np.sinc(x / _LOBES), 0.0))

@@ -39,9 +39,9 @@ _TEXTURES = {
     "tiles": "// lut: the table of tiles, usampler2D, two unsigned integers an entry, filter nearest.",
     "cascade": "// lut: the table of coordinates, sampler2D, filter linear, clamped to its edge.",
 }
-"""What a method has; all have that of "plain"."""
+"""Textures of each method; all have that of "plain"."""
 
-# Coordinates are in texels, so that the tile's own arithmetic stays exact.
+# Coordinates are in texels, so that arithmetic within a tile stays exact.
 _READ = """
 // The texture at a place in texels; texel i has its centre at i + 1/2.
 {type} wlm_atlas_{name}_at(vec2 place)

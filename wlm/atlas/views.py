@@ -1,17 +1,16 @@
-"""Views of a mesh from all around, and what each of their pixels sees (lightmap-uv-clustering-cascade, section 4.1.4).
+"""Views of a mesh from all around, and the surface point at each pixel (lightmap-uv-clustering-cascade, section 4.1.4).
 
-The mesh is brought into [-1, 1]³: the longest side of its box is 2 long, the box's centre is the origin. Cameras are at
+The mesh is scaled into [-1, 1]³: the longest side of its box is 2 long, the box's centre is the origin. Cameras are at
 a distance of 3 and look at the origin. Their field of view just holds the sphere around that cube, of radius sqrt 3:
 2 asin(sqrt 3 / 3), 70.5 degrees both ways, so that nothing is ever cut off. Pictures are square; row 0 is their top.
 
-A triangle that isn't ``active`` hides what is behind it, but a pixel that sees one counts as one that sees nothing.
+A triangle that isn't ``active`` hides what is behind it, but its pixels count as uncovered.
 """
-
-from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 import torch
@@ -21,8 +20,11 @@ from wlm.interop import check_device
 from wlm.ops import raster as ops_raster
 
 __all__ = [
+    "DISTANCE",
+    "ZOOM",
     "View",
     "clip_positions",
+    "corner_weights",
     "normalised",
     "sphere_views",
     "surface_points",
@@ -32,11 +34,15 @@ __all__ = [
 ]
 
 DISTANCE = 3.0
+"""Of a camera from the origin."""
+
 _SPHERE = math.sqrt(3.0)
-# Clip x is this times the distance from the axis; w is the distance along it.
-_ZOOM = math.sqrt(DISTANCE**2 - _SPHERE**2) / _SPHERE
+
+ZOOM = math.sqrt(DISTANCE**2 - _SPHERE**2) / _SPHERE
+"""Clip x over the distance from the camera's axis; w is the distance along it."""
+
 _NEAR, _FAR = DISTANCE - _SPHERE, DISTANCE + _SPHERE
-# Past this share of y in the direction, 26 degrees from a pole, the picture's up is z instead of y.
+# Where y in the direction is larger, within 26 degrees of a pole, the picture's up is z instead of y.
 _STEEP = 0.9
 _GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
 
@@ -52,9 +58,9 @@ class View:
 
     axes: np.ndarray
 
-    @staticmethod
-    def of(direction: Sequence[float] | np.ndarray) -> View:
-        """Makes the camera that is in a direction from the origin.
+    @classmethod
+    def of(cls, direction: Sequence[float] | np.ndarray) -> Self:
+        """Makes the camera in a direction from the origin.
 
         Args:
             direction: [3], of any length but 0. The picture's up is +y, or +z where the direction is near y's axis.
@@ -69,21 +75,21 @@ class View:
         back = back / np.linalg.norm(back)
         right = np.cross([0.0, 1.0, 0.0] if abs(back[1]) <= _STEEP else [0.0, 0.0, 1.0], back)
         right = right / np.linalg.norm(right)
-        return View(np.stack([right, np.cross(back, right), back]))
+        return cls(np.stack([right, np.cross(back, right), back]))
 
     @property
     def eye(self) -> np.ndarray:
-        """Where the camera is, float64 [3]."""
+        """The camera's position, float64 [3]."""
         return DISTANCE * self.axes[2]
 
 
 def sphere_views(count: int, seed: int | np.random.Generator | None = None) -> list[View]:
-    """Gives cameras on the sphere.
+    """Makes cameras on the sphere.
 
     Args:
-        count: How many, at least 0.
-        seed: None spreads them evenly (a Fibonacci sphere); else they are random and independent, each direction as
-            likely. A generator goes on where it was.
+        count: Number of cameras, at least 0.
+        seed: None spreads them evenly (a Fibonacci sphere); else they are random, independent and uniform. A generator
+            goes on where it was.
 
     Raises:
         ValueError: A negative count.
@@ -93,25 +99,25 @@ def sphere_views(count: int, seed: int | np.random.Generator | None = None) -> l
     if seed is None:
         number = np.arange(count)
         y = 1.0 - (2.0 * number + 1.0) / max(count, 1)
-        turn = number * _GOLDEN_ANGLE
+        azimuth = number * _GOLDEN_ANGLE
     else:
         random = np.random.default_rng(seed)
         y = random.uniform(-1.0, 1.0, count)
-        turn = random.uniform(0.0, 2.0 * math.pi, count)
+        azimuth = random.uniform(0.0, 2.0 * math.pi, count)
     # Bands of equal height have equal areas on a sphere.
     radius = np.sqrt(1.0 - y * y)
-    return [View.of(each) for each in np.stack([radius * np.cos(turn), y, radius * np.sin(turn)], axis=-1)]
+    return [View.of(each) for each in np.stack([radius * np.cos(azimuth), y, radius * np.sin(azimuth)], axis=-1)]
 
 
 def normalised(mesh: LightmappedMesh) -> np.ndarray:
-    """The positions in [-1, 1]³, float64 [V, 3]; the box is that of all triangles."""
+    """The positions scaled into [-1, 1]³, float64 [V, 3]; the box is that of all triangles."""
     used = mesh.position[mesh.triangle.reshape(-1)]
     low, high = used.min(axis=0), used.max(axis=0)
     return (mesh.position - (low + high) / 2.0) * (2.0 / (high - low).max())
 
 
 def clip_positions(mesh: LightmappedMesh, view: View) -> np.ndarray:
-    """The vertices as a camera sees them, for ``wlm.ops.raster.rasterize``.
+    """The vertices in a camera's clip space, for ``wlm.ops.raster.rasterize``.
 
     Args:
         mesh: The mesh.
@@ -119,17 +125,17 @@ def clip_positions(mesh: LightmappedMesh, view: View) -> np.ndarray:
 
     Returns:
         float32 [V, 4]: x, y, z, w; w is the distance along the camera's axis, z / w is -1 and 1 where the sphere
-        around the cube is nearest and farthest. Vertices at one place get equal numbers.
+        around the cube is nearest and farthest. Vertices at one place have equal numbers.
     """
     return _project(normalised(mesh), view)
 
 
 def _project(position: np.ndarray, view: View) -> np.ndarray:
-    # Sums by hand: a matrix product may round rows differently, and shared edges would come apart.
+    # Written out: a matrix product may round rows differently, and shared edges would come apart.
     x, y, back = (position[:, 0] * a + position[:, 1] * b + position[:, 2] * c for a, b, c in view.axes)
     w = DISTANCE - back
     z = ((_FAR + _NEAR) * w - 2.0 * _FAR * _NEAR) / (_FAR - _NEAR)
-    return np.stack([_ZOOM * x, _ZOOM * y, z, w], axis=1).astype(np.float32)
+    return np.stack([ZOOM * x, ZOOM * y, z, w], axis=1).astype(np.float32)
 
 
 def visible_uv(
@@ -144,9 +150,9 @@ def visible_uv(
         device: "cpu" or "cuda:N".
 
     Yields:
-        For each camera, on the device: int32 [h, w], the triangle that is seen, -1 for none; float32 [h, w, 2], the
-        weights of its corners 0 and 1, corner 2 has the rest; float32 [h, w, 2], the mesh's own UVs there. The latter
-        two are 0 where nothing is seen.
+        For each camera, on the device: int32 [h, w], the visible triangle, -1 for none; float32 [h, w, 2], the weights
+        of its corners 0 and 1, corner 2 has the rest; float32 [h, w, 2], the mesh's own UVs there. The latter two are
+        0 in uncovered pixels.
 
     Raises:
         WlmError: There is no such device.
@@ -162,29 +168,34 @@ def visible_uv(
             raster = ops_raster.rasterize(
                 torch.tensor(_project(position, view), device=device), triangle, resolution, resolution
             )
-            seen, barycentric = raster.triangle, raster.barycentric
-            at = ops_raster.interpolate(uv, triangle, raster)
+            visible, barycentric = raster.triangle, raster.barycentric
+            pixel_uv = ops_raster.interpolate(uv, triangle, raster)
             if not mesh.active.all():
-                shown = (seen >= 0) & active[seen.clamp(min=0).long()]
-                seen = torch.where(shown, seen, -1)
-                barycentric, at = barycentric * shown[..., None], at * shown[..., None]
-        yield seen, barycentric, at
+                covered = (visible >= 0) & active[visible.clamp(min=0).long()]
+                visible = torch.where(covered, visible, -1)
+                barycentric, pixel_uv = barycentric * covered[..., None], pixel_uv * covered[..., None]
+        yield visible, barycentric, pixel_uv
+
+
+def corner_weights(barycentric: torch.Tensor) -> torch.Tensor:
+    """The weights of all three corners, float32 [N, 3], from those of corners 0 and 1, [N, 2]."""
+    return torch.cat([barycentric, 1.0 - barycentric.sum(1, keepdim=True)], dim=1)
 
 
 def visibility(
     mesh: LightmappedMesh, views: Sequence[View], resolution: int, height: int, width: int, device: str
 ) -> np.ndarray:
-    """Counts how much each part of UV space is seen.
+    """Counts the pixels that show each part of UV space.
 
     Args:
         mesh: The mesh.
         views: The cameras.
         resolution: Pixels along a side of their pictures.
-        height, width: Of a grid over UV space, row 0 at v = 0. It may be finer than the lightmap.
+        height, width: Size of a grid over UV space, row 0 at v = 0. It may be finer than the lightmap.
         device: "cpu" or "cuda:N".
 
     Returns:
-        float64 [height, width], the pixels of all views whose UVs lie in each cell; a UV of 1 is in the last one.
+        float64 [height, width], pixels of all views whose UVs lie in each cell; a UV of 1 lies in the last one.
 
     Raises:
         WlmError: There is no such device.
@@ -193,20 +204,20 @@ def visibility(
     if height < 1 or width < 1:
         raise ValueError(f"height, width: expected at least 1, got {height} and {width}")
     count = torch.zeros(height * width, dtype=torch.int64, device=check_device(device))
-    for seen, _, uv in visible_uv(mesh, views, resolution, device):
-        at = uv[seen >= 0].double()
-        column = (at[:, 0] * width).long().clamp(0, width - 1)
-        row = (at[:, 1] * height).long().clamp(0, height - 1)
+    for visible, _, uv in visible_uv(mesh, views, resolution, device):
+        u, v = uv[visible >= 0].double().T
+        column = (u * width).long().clamp(0, width - 1)
+        row = (v * height).long().clamp(0, height - 1)
         count += torch.bincount(row * width + column, minlength=height * width)
     return count.reshape(height, width).double().cpu().numpy()
 
 
 def texel_triangles(mesh: LightmappedMesh, height: int, width: int, device: str) -> tuple[torch.Tensor, torch.Tensor]:
-    """Which active triangle holds the centre of each cell of a grid over UV space.
+    """Finds the active triangle that holds the centre of each cell of a grid over UV space.
 
     Args:
         mesh: The mesh.
-        height, width: Of the grid, row 0 at v = 0.
+        height, width: Size of the grid, row 0 at v = 0.
         device: "cpu" or "cuda:N".
 
     Returns:
@@ -224,12 +235,12 @@ def texel_triangles(mesh: LightmappedMesh, height: int, width: int, device: str)
 
 
 def surface_points(mesh: LightmappedMesh, count: int, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Random points of the active triangles, each place of the surface as likely.
+    """Draws random points of the active triangles, uniform over the surface.
 
     Args:
         mesh: The mesh.
-        count: How many, N.
-        random: Where they come from.
+        count: Number of points, N.
+        random: The generator.
 
     Returns:
         int64 [N], their triangles; float64 [N, 3], the weights of the corners.

@@ -29,6 +29,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from wlm.errors import WlmError
+from wlm.formats.bits import pack_bits, unpack_bits
 
 __all__ = [
     "BLOCKS",
@@ -47,13 +48,11 @@ __all__ = [
     "encode",
     "extent_of",
     "fit_subspaces",
-    "pack_bits",
     "part_count",
     "payload_bytes",
     "read_weights",
     "rescale",
     "scale_of",
-    "unpack_bits",
     "weight_bytes",
     "whole",
     "windows",
@@ -199,7 +198,7 @@ def by_signal(values: np.ndarray, clusters: int, components: int, seed: int) -> 
                 break
             error = now
     label, count = compact(label)
-    return Partition(SIGNAL, label, count, pack_bits(label, _index_bits(count)))
+    return Partition(SIGNAL, label, count, pack_bits(label[:, None], [_index_bits(count)]).tobytes())
 
 
 def fit_subspaces(values: np.ndarray, members: Sequence[np.ndarray], components: int) -> tuple[np.ndarray, np.ndarray]:
@@ -344,7 +343,7 @@ def write_weights(weight: np.ndarray, label: np.ndarray, count: int, bits: int |
     # A range of zero has steps of zero, and level 0 is its value.
     level = np.divide(weight - low[label], step[label], out=np.zeros_like(weight), where=step[label] > 0)
     level = np.clip(np.rint(level), 0, 2**bits - 1).astype(np.int64)
-    return bounds.tobytes() + pack_bits(level.ravel(), bits)
+    return bounds.tobytes() + pack_bits(level, [bits] * level.shape[1]).tobytes()
 
 
 def read_weights(data: bytes, label: np.ndarray, count: int, components: int, bits: int | None) -> np.ndarray:
@@ -353,21 +352,14 @@ def read_weights(data: bytes, label: np.ndarray, count: int, components: int, bi
     if bits is None:
         return np.frombuffer(data, "<f2", probes * components).reshape(probes, components).astype(np.float32)
     bounds = np.frombuffer(data, "<f2", count * 2 * components).reshape(count, 2, components)
-    level = unpack_bits(data[bounds.nbytes :], probes * components, bits).reshape(probes, components)
+    level = _read_numbers(data[bounds.nbytes :], probes * components, bits).reshape(probes, components)
     low, step = _levels(bounds, bits)
     return (low[label] + level * step[label]).astype(np.float32)
 
 
-def pack_bits(numbers: np.ndarray, bits: int) -> bytes:
-    """Packs whole numbers below 2 ** bits one behind the other, the lowest bit first; bits may be 0."""
-    spread = (np.asarray(numbers)[:, None] >> np.arange(bits)) & 1
-    return np.packbits(spread.astype(np.uint8).ravel(), bitorder="little").tobytes()
-
-
-def unpack_bits(data: bytes, count: int, bits: int) -> np.ndarray:
-    """Reads ``count`` numbers that ``pack_bits`` wrote, int64."""
-    spread = np.unpackbits(np.frombuffer(data, np.uint8), count=count * bits, bitorder="little")
-    return spread.reshape(count, bits).astype(np.int64) @ (1 << np.arange(bits, dtype=np.int64))
+def _read_numbers(data: bytes, count: int, bits: int) -> np.ndarray:
+    """Reads ``count`` numbers of so many bits each, int64."""
+    return unpack_bits(np.frombuffer(data, np.uint8), [bits], count)[:, 0].astype(np.int64)
 
 
 _PARTITION_BYTES = {
@@ -385,7 +377,7 @@ def _read_partition(kind: int, data: bytes, position: np.ndarray, count: int) ->
         return compact(_cubes(position, struct.unpack("<d", data)[0]))[0]
     if kind == PLACE:
         return _nearest(position, np.frombuffer(data, "<u2").reshape(count, 3))
-    return unpack_bits(data, len(position), _index_bits(count))
+    return _read_numbers(data, len(position), _index_bits(count))
 
 
 def _levels(bounds: np.ndarray, bits: int) -> tuple[np.ndarray, np.ndarray]:

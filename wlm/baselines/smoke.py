@@ -6,10 +6,11 @@ import numpy as np
 import torch
 
 from wlm.fluid.volume import DensityVolume
-from wlm.smoke.baking import SixWay, six_way
+from wlm.smoke.baking import bake
 from wlm.smoke.camera import Camera
 from wlm.smoke.evaluation import Contender, HeldOut, Method
 from wlm.smoke.learn.pool import Pool
+from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.planes import GUIDES, PLANES
 
 __all__ = ["COARSE", "FLIP_BOOK", "RIVALS", "billboard", "coarse", "direct", "flip_book"]
@@ -67,7 +68,7 @@ def direct(volume: DensityVolume, camera: Camera, step: float, *, g: float = 0.0
     Raises:
         ValueError: A setting is out of its range, or the camera is in perspective.
     """
-    return six_way(volume, camera, step=step, g=g, estimate=False)
+    return bake(volume, camera, step=step, g=g, estimate=False)
 
 
 def billboard(baked: SixWay, seen: Camera, camera: Camera, pivot: np.ndarray) -> SixWay:
@@ -106,7 +107,7 @@ def billboard(baked: SixWay, seen: Camera, camera: Camera, pivot: np.ndarray) ->
     v = torch.tensor(rows / (0.5 * seen.height * seen.pitch), dtype=torch.float32)
     grid = torch.stack(torch.broadcast_tensors(u[None, :], v[:, None]), -1)[None].to(baked.lightmaps.device)
     read = torch.nn.functional.grid_sample(torch.cat(planes)[None], grid, align_corners=False)[0]
-    return SixWay(read[:6], 1.0 - read[6], read[7] if baked.emission is not None else None)
+    return SixWay(read[:6], 1.0 - read[6], read[7] if baked.emission is not None else None, camera)
 
 
 def _offset(camera: Camera, pivot: np.ndarray) -> tuple[float, float]:

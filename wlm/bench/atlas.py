@@ -31,14 +31,13 @@ import numpy as np
 import torch
 import warp as wp
 
-from wlm import interop
-from wlm.atlas import codec
+from wlm import interop, system
 from wlm.atlas.data import from_arrays
 from wlm.atlas.decode import Decoder
-from wlm.atlas.evaluation import Report, Sampler, evaluate
+from wlm.atlas.evaluation import Sampler, Score, compare
 from wlm.atlas.exact import decode64
 from wlm.atlas.fit import compress
-from wlm.atlas.model import SOURCE_BITS, AtlasModel, Profile, load_profile
+from wlm.atlas.model import SOURCE_BITS, AtlasModel, Profile
 from wlm.atlas.views import surface_points
 from wlm.baselines.atlas import ATLAS_BASELINES
 from wlm.bench.atlas_inputs import Lightmap
@@ -103,7 +102,7 @@ def run(
     Raises:
         WlmError: A profile or the device isn't there, or a compression failed.
     """
-    profiles = [load_profile(name) for name in names or PROFILES]
+    profiles = [Profile.load(name) for name in names or PROFILES]
     if quick:
         profiles = [p.model_copy(update=_QUICK_CASCADE) if p.method == "cascade" else p for p in profiles]
     return run_rows(
@@ -238,7 +237,7 @@ class _Entry:
     sample: Sampler | None = None
     decode: Callable[[], object] | None = None
     model: AtlasModel | None = None
-    report: Report | None = None
+    report: Score | None = None
     full_size: bool = False
 
 
@@ -269,9 +268,10 @@ class _Bench:
         model = compress(self.mesh, profile, device=self.device)
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "atlas.wlm"
-            size = codec.write(path, model)
+            size = model.save(path)
             seconds = time.perf_counter() - start
-            model = codec.read(path)
+            # The file leaves the stages' times out.
+            model = replace(system.load(path, "atlas"), report=model.report)
         decode, error, usual = self._decode(model)
         share = 1.0 - model.compression_ratio
         stages = ", ".join(f"{name} {value:.2g}" for name, value in model.report["seconds"].items())
@@ -360,7 +360,7 @@ class _Bench:
         """Scores all in one go: each view is drawn once."""
         self.note(f"scoring, {views} views of {resolution}²")
         decoders = {str(i): entry.sample for i, entry in enumerate(entries) if entry.sample is not None}
-        reports = evaluate(self.mesh, decoders, views=views, resolution=resolution, device=self.device)
+        reports = compare(self.mesh, decoders, views=views, resolution=resolution, device=self.device)
         result = []
         for i, entry in enumerate(entries):
             report, row = reports.get(str(i)), entry.row
@@ -450,7 +450,7 @@ def _kind(model: AtlasModel) -> str:
     return f"{model.method}{steps}, T_p {model.texels.shape[1]}x{model.texels.shape[0]}{lut}"
 
 
-def _scores(report: Report) -> str:
+def _scores(report: Score) -> str:
     """What a row has no column for. SSIM's four figures say little where 1 - SSIM is what methods differ by."""
     figures = (
         ("1-SSIM", report.one_minus_ssim, ".2g", ""),

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import wlm
-from wlm.atlas.data import LightmappedMesh, load_mesh
+from wlm.atlas.data import LightmappedMesh
+from wlm.atlas.data import load as load_mesh
 from wlm.errors import WlmError
 
 __all__ = ["Lightmap", "load"]

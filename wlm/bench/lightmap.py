@@ -29,13 +29,12 @@ from wlm.baselines import BASELINES
 from wlm.baselines.lightmap_torch import PlainFit
 from wlm.bench.runner import Row, run_peers
 from wlm.errors import WlmError
-from wlm.lightmap import codec
-from wlm.lightmap.data import LightmapSet, load_set
+from wlm.lightmap.data import LightmapSet, load
 from wlm.lightmap.decode import Decoder
 from wlm.lightmap.evaluation import bits_per_texel
 from wlm.lightmap.exact import bound64, colour_tile64, decode_tile64
 from wlm.lightmap.fit import compress, dynamic_targets
-from wlm.lightmap.model import TILE, LightmapModel, Profile, TimeAxis, encode_time, load_profile
+from wlm.lightmap.model import TILE, LightmapModel, Profile, TimeAxis, encode_time
 from wlm.lightmap.runtime import ExactDecoder, StripDecoder
 from wlm.lightmap.tiles import TileGrid, TileKind, assemble
 from wlm.metrics import METRICS, Summary, evaluate_frame, summarise
@@ -84,7 +83,7 @@ def run(
         quick: Three profiles with short fits, scored at three times (9, 12 and 21 h if the set has them): four
             minutes on two CPU cores for 16 tiles. Its errors are those of unfinished fits.
         device: "cpu" or "cuda:0", for fits and decodes.
-        set_path: A set as ``wlm.lightmap.data.load_set`` reads it; None: the checkout's ``demos/data/city``, two
+        set_path: A set as ``wlm.lightmap.load`` reads it; None: the checkout's ``demos/data/city``, two
             tiles of the city.
         progress: Called with a line before each part of the work.
 
@@ -98,8 +97,8 @@ def run(
         set_path = Path(wlm.__file__).resolve().parents[1] / "demos" / "data" / "city"
         if not set_path.is_dir():
             raise WlmError("bench lightmap: the demo's set comes with a checkout alone; expected --set PATH")
-    lightmaps = load_set(set_path)
-    profiles = [load_profile(name) for name in (QUICK_PROFILES if quick else PROFILES)]
+    lightmaps = load(set_path)
+    profiles = [Profile.load(name) for name in (QUICK_PROFILES if quick else PROFILES)]
     chosen = np.arange(len(lightmaps.times))
     if quick:
         tiles = TileGrid.of(*lightmaps.mask.shape).count
@@ -224,9 +223,9 @@ class _Bench:
         model = compress(self.lightmaps, profile, device=self.device)
         fitted = time.perf_counter()
         path = folder / f"{profile.name}.wlm"
-        size = codec.write(path, model)
+        size = model.save(path)
         written = time.perf_counter()
-        return _Fit(profile, codec.read(path), size, fitted - start, written - fitted)
+        return _Fit(profile, wlm.load(path), size, fitted - start, written - fitted)
 
     def profile_row(self, fit: _Fit) -> tuple[Row, Callable[[], object]]:
         """What a profile costs and gives, but for the time of its decode, which is the function's."""

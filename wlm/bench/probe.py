@@ -22,7 +22,6 @@ import math
 import os
 import tempfile
 import time
-import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -31,19 +30,19 @@ import numpy as np
 import warp as wp
 
 import wlm
-from wlm import interop
+from wlm import interop, system
 from wlm.baselines.probe import WEIGHT_BITS, Result, at_bytes, unreal_packing
 from wlm.baselines.probe_torch import DenseFit
 from wlm.bench.plot import Panel
 from wlm.bench.runner import Row, read_json, run_peers
 from wlm.errors import WlmError
-from wlm.probe import codec
-from wlm.probe.data import ProbeSet, load_probes
+from wlm.probe.codec import pack_dead
+from wlm.probe.data import ProbeSet, load
 from wlm.probe.decode import Decoder, Points
-from wlm.probe.evaluation import Report, evaluate
+from wlm.probe.evaluation import Report, score
 from wlm.probe.exact import decode64
 from wlm.probe.fit import compress
-from wlm.probe.model import ProbeModel, Profile, load_profile
+from wlm.probe.model import ProbeModel, Profile
 from wlm.probe.volume import SIZES, Volume
 from wlm.probe.walk import EYE_HEIGHT, camera_path, summary, walk
 
@@ -97,7 +96,7 @@ def run(
         quick: Short fits, no other ratios than the profiles', rivals of one size, a short walk, and of the demo noon
             alone: under two minutes on two CPU cores. Its errors are those of unfinished fits.
         device: "cpu" or "cuda:0", for fits, decodes and the volume.
-        probes_path: A file as ``wlm.probe.data.load_probes`` reads it; None: the checkout's
+        probes_path: A file as ``wlm.probe.load`` reads it; None: the checkout's
             ``demos/data/probes/street.npz``.
         keys: Which of the file's arrays, one set of rows each; none: the only one, or noon and night of the demo's.
         rivals: With the PCA family and Unreal's packing, which take minutes on the CPU and no GPU: ``run_rivals``
@@ -111,7 +110,7 @@ def run(
         WlmError: The file, a key or the device isn't there, or a fit diverged.
     """
     sets = _load(probes_path, keys or (_DEMO_KEYS[: 1 if quick else None] if probes_path is None else ()))
-    profiles = [load_profile(name) for name in PROFILES]
+    profiles = [Profile.load(name) for name in PROFILES]
     if quick:
         steps = max(200, _QUICK_PROBE_STEPS // max(int(one.live.sum()) for one in sets))
         profiles = [profile.model_copy(update={"steps": min(steps, profile.steps)}) for profile in profiles]
@@ -161,7 +160,7 @@ def _load(path: str | os.PathLike[str] | None, keys: Sequence[str]) -> list[Prob
         path = Path(wlm.__file__).resolve().parents[1] / "demos" / "data" / "probes" / "street.npz"
         if not path.is_file():
             raise WlmError("bench probe: the demo's probes come with a checkout alone; expected --probes FILE")
-    return [load_probes(path, key=key) for key in keys or (None,)]
+    return [load(path, key=key) for key in keys or (None,)]
 
 
 def run_rows(
@@ -248,9 +247,9 @@ class _Bench:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "model.wlm"
             writing = time.perf_counter()
-            size = codec.write(path, model)
+            size = model.save(path)
             written = time.perf_counter()
-            return _Fit(option, codec.read(path), size, fitted - start, written - writing)
+            return _Fit(option, system.load(path, "probe"), size, fitted - start, written - writing)
 
     def profile_row(self, fit: _Fit) -> tuple[Row, Callable[[], object]]:
         """What a fit costs and gives, but for the time of its decode, which is the function's."""
@@ -345,7 +344,7 @@ class _Bench:
             f"times ours{scaled}",
         )
         if whole:
-            row = replace(row, psnr=_finite(evaluate(self._all(peer.decoded()), self.probes, fit.bytes).psnr))
+            row = replace(row, psnr=_finite(score(self._all(peer.decoded()), self.probes, fit.bytes).psnr))
         return [ours, row]
 
     def rival_rows(self, size: int, sizes: Sequence[int]) -> list[Row]:
@@ -415,7 +414,7 @@ class _Bench:
         decoder.run(points)
         values = points.values()
         error = np.abs(values - exact).max(1)
-        report = evaluate(self._all(values), self.probes, size)
+        report = score(self._all(values), self.probes, size)
         return report, float(error.max()), f"99.9% of the probes within {np.percentile(error, 99.9):.2g} of float64"
 
     def _timer(self, decoder: Decoder, points: Points) -> Callable[[], object]:
@@ -435,12 +434,11 @@ class _Bench:
 
     def _dead_bytes(self) -> int:
         """What it takes to say which probes are dead, as in our file."""
-        dead = ~self.probes.live
-        return len(zlib.compress(np.packbits(dead).tobytes(), 9)) if dead.any() else 0
+        return len(pack_dead(~self.probes.live))
 
     def _result_row(self, method: str, option: str, result: Result) -> Row:
         size = result.bytes + self._dead_bytes()
-        report = evaluate(self._all(result.decoded), self.probes, size)
+        report = score(self._all(result.decoded), self.probes, size)
         row = self._row(
             method,
             option,
@@ -464,7 +462,7 @@ def _in_given_order(points: Points) -> None:
 
 
 def _finite(value: float) -> float | None:
-    """JSON has no infinity: a set without a range has no PSNR, and one decoded exactly none either."""
+    """JSON has no NaN: a set without a range has no PSNR."""
     return value if math.isfinite(value) else None
 
 

@@ -7,9 +7,6 @@ The methods, each a table of its own:
   marks the sphere's cells and finds its links anew at each step.
 - "lattice storage": velocities of 16 bits against 32 in a jet, over the inlet's speed, and the share by which the mass
   drifts.
-- "lattice bricks": bricks against the dense lattice. In the jet's beginning, with an inlet of 0.1 cells a step, by the
-  tolerance: times are medians over equal parts of it, "worked on" is the mean. Where a slab slides at 0.05 cells a step
-  along itself, with a tolerance of 1e-4, by the share of the box that moves.
 - "advection": a step of smoke in eddies, dense, with and without a sphere; and what is wrong with a smooth ball after
   a whole turn: over its own RMS, the largest difference (its peak is 1), and the smoke that was gained.
 - "advection bricks": the same step where only a cube in a corner has smoke.
@@ -31,7 +28,7 @@ from collections.abc import Callable, Sequence
 
 from wlm.bench.plot import Panel
 from wlm.bench.runner import Row
-from wlm.bench.smoke_air import advection_rows, lattice_brick_rows, lattice_rows, smoke_brick_rows, storage_rows
+from wlm.bench.smoke_air import advection_rows, lattice_rows, smoke_brick_rows, storage_rows
 from wlm.bench.smoke_light import frame_rows, guide_rows, six_rows, weight_rows
 from wlm.bench.smoke_setup import FULL, QUICK, Bench, Sizes
 from wlm.interop import check_device
@@ -45,7 +42,6 @@ PANELS = (Panel("decode_ms", "psnr", ("guide",)), Panel("decode_ms", "max_error"
 _PARTS: tuple[Callable[[Bench], list[Row]], ...] = (
     lattice_rows,
     storage_rows,
-    lattice_brick_rows,
     advection_rows,
     smoke_brick_rows,
     guide_rows,

@@ -1,4 +1,4 @@
-"""Air and smoke in motion: the lattice beside a copy, its bricks, 16 bits, and the schemes that carry smoke."""
+"""Air and smoke in motion: the lattice beside a copy, 16 bits, and the schemes that carry smoke."""
 
 from __future__ import annotations
 
@@ -17,12 +17,9 @@ from wlm_kernels.fluid import advection, advection_places, advection_sources
 from wlm_kernels.fluid.lattice_sets import lattice as velocity_set
 from wlm_kernels.fluid.lattice_solids import voxelise_sphere
 
-__all__ = ["advection_rows", "lattice_brick_rows", "lattice_rows", "smoke_brick_rows", "storage_rows"]
+__all__ = ["advection_rows", "lattice_rows", "smoke_brick_rows", "storage_rows"]
 
 _SPEED = 0.1  # of the inlet, cells a step
-# Speed of the slab that moves along itself, the cells over which that rises, and what counts as rest beside it: what
-# the lattice makes of the rise far away is a hundredth of that.
-_SHEAR, _RISE, _REST = 0.05, 8, 1e-4
 _VISCOSITY = 1e-6
 _COPIED = {"cpu": 1 << 24, "cuda": 1 << 28}  # floats: far more than caches hold
 _RATIO = 4
@@ -104,60 +101,6 @@ def storage_rows(bench: Bench) -> list[Row]:
         lattice.step(sizes.drift - lattice.steps)
         figures = {"cells": f"{sizes.small}³", "mass drift": f"{lattice.mass() / mass - 1.0:.2g}"}
         rows.append(row("jet", "lattice storage", f"{name}, {sizes.drift:,} steps", figures))
-    return rows
-
-
-def lattice_brick_rows(bench: Bench) -> list[Row]:
-    """Bricks against the dense lattice: by tolerance in a jet's beginning, and by the share of air in motion."""
-    bench.note("lattice: bricks")
-    return _jet_brick_rows(bench) + _shear_brick_rows(bench)
-
-
-def _jet_brick_rows(bench: Bench) -> list[Row]:
-    size = bench.sizes.lattice
-    jets = {f"tolerance {t:g}": _jet(bench, size, bricks=True, tolerance=t) for t in bench.sizes.tolerances}
-    dense = _jet(bench, size)
-    return _brick_rows(bench, "jet", {"dense": dense, **jets}, lambda name: dense)
-
-
-def _shear_brick_rows(bench: Bench) -> list[Row]:
-    fills = {f"flow in {percent(fill)}": fill for fill in bench.sizes.fills}
-    shears = {name: _shear(bench, fill, bricks=True, tolerance=_REST) for name, fill in fills.items()}
-    for lattice in shears.values():
-        lattice.step(2 * lattice.period)  # at first all bricks are worked on
-    shears = {"dense": _shear(bench, 0.5), **shears}
-    return _brick_rows(bench, "shear", shears, lambda name: _shear(bench, fills[name]))
-
-
-def _brick_rows(bench: Bench, scene: str, lattices: dict[str, Lattice], exact: Callable[[str], Lattice]) -> list[Row]:
-    """Times lattices side by side, then holds each to an exact one after as many steps."""
-    chunk, size = bench.sizes.chunk, bench.sizes.lattice
-    seen: dict[str, list[float]] = {name: [] for name in lattices}
-
-    def step(name: str) -> Callable[[], None]:
-        def go() -> None:
-            lattices[name].step(chunk)
-            # Bricks reach beyond a grid that isn't a multiple of them.
-            seen[name].append(min(lattices[name].active_cells / size**3, 1.0))
-
-        return go
-
-    times = bench.time({name: step(name) for name in lattices})
-    done = max(lattice.steps for lattice in lattices.values())
-    rows = []
-    for name, lattice in lattices.items():
-        timed = seen[name][-bench.sizes.repeats :]
-        figures = {"cells": f"{size}³", "steps": f"{done:,}", "worked on": percent(float(np.mean(timed)))}
-        if name == "dense":
-            rows.append(row(scene, "lattice bricks", name, figures, timing=times[name], calls=chunk))
-            continue
-        figures["speedup"] = f"{times['dense'].median_ms / times[name].median_ms:.2f}"
-        other = exact(name)
-        for one in (lattice, other):
-            one.step(done - one.steps)
-        off = float((wp.to_torch(lattice.velocity()) - wp.to_torch(other.velocity())).abs().max())
-        common = {"timing": times[name], "calls": chunk, "max_error": off}
-        rows.append(row(scene, "lattice bricks", name, figures, **common))
     return rows
 
 
@@ -260,19 +203,6 @@ def _moving(bench: Bench, size: int) -> tuple[Callable[[], None], int]:
     return go, steps
 
 
-def _shear(bench: Bench, fill: float, **settings) -> Lattice:
-    """A slab of the periodic box moves along itself: nothing but friction ever changes where there is flow."""
-    size = bench.sizes.lattice
-    made = Lattice((size,) * 3, viscosity=_VISCOSITY, device=bench.device, **settings)
-    velocity = np.zeros((size, 1, 1, 3), np.float32)
-    at = np.arange(size) + 0.5
-    inside = np.minimum(at, fill * size - at) if fill < 1.0 else np.full(size, np.inf)
-    rise = np.clip(inside / min(_RISE, max(0.5 * fill * size, 1.0)), 0.0, 1.0)
-    velocity[:, 0, 0, 2] = _SHEAR * rise**3 * (rise * (6.0 * rise - 15.0) + 10.0)  # smooth up to its second slope
-    made.set_flow(velocity)
-    return made
-
-
 def _stepper(lattice: Lattice, steps: int) -> Callable[[], None]:
     return lambda: lattice.step(steps)
 
@@ -339,7 +269,7 @@ def _carry_bricks(bench, scheme: str, fill: float, box, velocity, walls):
     """A step in bricks, their lists and the emptying of others; and the bricks."""
     fields = _cubes(bench, fill, scheme)
     rings = advection_places.rings_for(math.sqrt(1.0 / 3.0) * _SUBSTEPS * _RATIO)
-    bricks = advection_places.make_bricks(box, rings, bench.device)
+    bricks = advection_places.make_bricks(box, rings, _THRESHOLD, bench.device)
     edge = box.n[0]
     at = torch.arange(edge**3, device=bench.device)
     brick = torch.zeros(bricks.busy.shape[0], dtype=torch.int32, device=bench.device)
@@ -348,16 +278,15 @@ def _carry_bricks(bench, scheme: str, fill: float, box, velocity, walls):
     index = (x // size * box.bricks[1] + y // size) * box.bricks[2] + z // size
     brick[index[wp.to_torch(fields[0].density) > 0]] = 1
     busy = to_warp(brick)
-    where = {"bricks": bricks, "threshold": _THRESHOLD}
 
     def step() -> None:
         wp.copy(bricks.busy, busy)
         advection_places.relist(box, bricks)
         for field in fields:
-            advection_sources.rest(box, bricks, field.density)
-        advection.advect(box, velocity, walls, fields[0], fields[1], _SUBSTEPS, **where)
+            advection_sources.empty_retired(box, bricks, field)
+        advection.advect(box, velocity, walls, fields[0], fields[1], _SUBSTEPS, bricks=bricks)
         if scheme == "maccormack":
-            advection.correct(box, velocity, walls, *fields, _SUBSTEPS, **where)
+            advection.correct(box, velocity, walls, *fields, _SUBSTEPS, bricks=bricks)
 
     return StepGraph(step, bench.device, warmup=1), bricks
 

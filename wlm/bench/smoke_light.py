@@ -12,13 +12,15 @@ from wlm.bench.runner import Row
 from wlm.bench.smoke_setup import Bench, percent, row
 from wlm.fluid.volume import DensityVolume
 from wlm.interop import StepGraph
-from wlm.smoke.baking import SixWay, lit, six_way
+from wlm.smoke.baking import bake, lit
 from wlm.smoke.camera import RULES, Camera
-from wlm.smoke.guide import Guide, guide
+from wlm.smoke.guiding import Guide, guide
 from wlm.smoke.learn.synthetic import make_plume
+from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.scene import CameraSettings, load_scene, make_camera, obstacle_mesh
-from wlm.smoke.shading import Light, composite, obstacle_visibility, shade
-from wlm.smoke.simulate import make_solver, volume_of
+from wlm.smoke.shading import Light, obstacle_visibility
+from wlm.smoke.simulation import make_solver, volume_of
+from wlm_kernels.smoke.settings import March
 
 __all__ = ["frame_rows", "guide_rows", "make_cloud", "six_rows", "weight_rows"]
 
@@ -62,7 +64,7 @@ def guide_rows(bench: Bench) -> list[Row]:
     bench.note("guide")
     sizes = bench.sizes
     volumes, camera = _cloud(bench)
-    fine = guide(volumes["float32"], camera, step=sizes.exact, jitter=0.0, cutoff=0.0, shared=False)
+    fine = guide(volumes["float32"], camera, March(sizes.exact, jitter=0.0, cutoff=0.0), shared=False)
     cases = {("shared", step, "float32"): volumes["float32"] for step in sizes.guide_shared}
     cases |= {("alone", step, "float32"): volumes["float32"] for step in sizes.guide_alone}
     cases |= {("shared", step, "float16"): volumes["float16"] for step in _HALF_GUIDE}
@@ -79,9 +81,9 @@ def guide_rows(bench: Bench) -> list[Row]:
     rows = []
     for key, volume in cases.items():
         way, step, storage = key
-        settings = {"step": float(step), "shared": way == "shared"}
-        found = guide(volume, camera, jitter=_JITTER, **settings)
-        still = guide(volume, camera, jitter=0.0, **settings)
+        shared = way == "shared"
+        found = guide(volume, camera, March(float(step), jitter=_JITTER), shared=shared)
+        still = guide(volume, camera, March(float(step), jitter=0.0), shared=shared)
         off = (found.light - fine.light).double()
         figures = {
             "voxels": f"{sizes.cloud}³",
@@ -108,10 +110,10 @@ def six_rows(bench: Bench) -> list[Row]:
     cases[f"step {_HALF_SIX:g}, float16"] = (volumes["float16"], _HALF_SIX)
     calls = {name: _six_call(*case, camera) for name, case in cases.items()}
     times = bench.time(calls, few=True)
-    finest = six_way(volumes["float32"], camera, step=sizes.six[-1], estimate=False).lightmaps
+    finest = bake(volumes["float32"], camera, step=sizes.six[-1], estimate=False).lightmaps
     rows = []
     for name, (volume, step) in cases.items():
-        made = six_way(volume, camera, step=step)
+        made = bake(volume, camera, step=step)
         figures = {
             "voxels": f"{sizes.cloud}³",
             "pixels": f"{sizes.resolution}²",
@@ -132,13 +134,13 @@ def weight_rows(bench: Bench) -> list[Row]:
     volume = make_plume(hot=False, extinction=_PLUME, device=bench.device)
     size = volume.voxel * np.array(volume.shape)
     camera = make_camera(CameraSettings(resolution=bench.sizes.plume), volume.origin, size)
-    six = six_way(volume, camera, step=_WEIGHT_STEP, estimate=False)
-    six = SixWay(six.lightmaps, None)
+    six = bake(volume, camera, step=_WEIGHT_STEP, estimate=False)
+    six = SixWay(six.lightmaps, None, camera=camera)
     lights = [tuple(map(float, toward)) for toward in _round(_LIGHTS)]
     exact = [lit(volume, camera, toward, step=_WEIGHT_STEP) for toward in lights]
     rows = []
     for rule in RULES:
-        weighed = [shade(six, camera, [Light(toward)], rule=rule)[..., 0] for toward in lights]
+        weighed = [six.shade([Light(toward)], rule=rule)[..., 0] for toward in lights]
         bias = [float(w.double().mean() / e.double().mean()) - 1.0 for w, e in zip(weighed, exact, strict=True)]
         each = [_relative(w, e) for w, e in zip(weighed, exact, strict=True)]
         figures = {
@@ -174,7 +176,7 @@ def frame_rows(bench: Bench) -> list[Row]:
     volume = DensityVolume(volume.density.clone(), volume.extinction, volume.voxel, volume.origin)
     bench.note("frame: its stages")
     surface = guide(volume, camera)
-    six = six_way(volume, camera, estimate=False)
+    six = bake(volume, camera, estimate=False)
     lights = [given.light() for given in scene.lights]
     corners, triangles, _ = obstacle_mesh(scene.obstacles, scene.time(sizes.frames))
     corners, triangles = (torch.from_numpy(part).to(device) for part in (corners, triangles))
@@ -192,7 +194,7 @@ def frame_rows(bench: Bench) -> list[Row]:
     shadowed = shadows()
 
     def shading() -> torch.Tensor:
-        return composite(shade(six, camera, shadowed), six.transparency, scene.background)
+        return six.shade(shadowed, background=scene.background)
 
     calls = {
         "air alone": lambda: [air.lattice.step(scene.smoke.substeps) for _ in range(steps)],
@@ -235,12 +237,12 @@ def _cloud(bench: Bench) -> tuple[dict[str, DensityVolume], Camera]:
     return volumes, Camera.look_at(eye, centre, extent=1.15 * n, height=pixels, width=pixels)
 
 
-def _guide_call(volume: DensityVolume, camera: Camera, **settings) -> Callable[[], Guide]:
-    return lambda: guide(volume, camera, jitter=_JITTER, **settings)
+def _guide_call(volume: DensityVolume, camera: Camera, step: float, shared: bool) -> Callable[[], Guide]:
+    return lambda: guide(volume, camera, March(step, jitter=_JITTER), shared=shared)
 
 
 def _six_call(volume: DensityVolume, step: float, camera: Camera) -> Callable[[], SixWay]:
-    return lambda: six_way(volume, camera, step=step, estimate=False)
+    return lambda: bake(volume, camera, step=step, estimate=False)
 
 
 def _round(count: int) -> np.ndarray:

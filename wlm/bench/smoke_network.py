@@ -46,9 +46,11 @@ from wlm.bench.smoke_network_setup import (
 from wlm.errors import WlmError
 from wlm.interop import check_device
 from wlm.metrics.error import psnr_from_mse
-from wlm.smoke.baking import SixWay, six_way
-from wlm.smoke.coarse import coarse_six_way
-from wlm.smoke.planes import EMISSION_PLANE, OPACITY_PLANE, decode_lightmaps, encode_lightmaps, look_at
+from wlm.smoke.baking import bake
+from wlm.smoke.coarse import march
+from wlm.smoke.lightmaps import SixWay
+from wlm.smoke.planes import EMISSION_PLANE, OPACITY_PLANE, decode_lightmaps, encode_lightmaps, render_guide
+from wlm_kernels.smoke.settings import March
 
 __all__ = ["PANELS", "plotted", "run", "run_rows"]
 
@@ -185,27 +187,25 @@ def _in_turn(parts: Sequence[Callable[[], object]]) -> Callable[[], object]:
 
 
 def _six_call(bench: NetworkBench, step: float) -> Callable[[Frame], SixWay]:
-    return lambda frame: six_way(frame.later, bench.camera, step=step, estimate=False)
+    return lambda frame: bake(frame.later, bench.camera, step=step, estimate=False)
 
 
 def _coarse_call(bench: NetworkBench, step: float, spacing: float) -> Callable[[Frame], object]:
-    return lambda frame: coarse_six_way(frame.later, bench.camera, step=step, spacing=spacing, seed=frame.seed + 1)
+    return lambda frame: march(frame.later, bench.camera, March(step, spacing, seed=frame.seed + 1))
 
 
 def _six_maker(step: float) -> Callable[..., torch.Tensor]:
-    return lambda volume, camera, seed: encode_lightmaps(six_way(volume, camera, step=step, estimate=False))
+    return lambda volume, camera, seed: encode_lightmaps(bake(volume, camera, step=step, estimate=False))
 
 
 def _coarse_maker(step: float, spacing: float) -> Callable[..., torch.Tensor]:
-    return lambda volume, camera, seed: encode_lightmaps(
-        coarse_six_way(volume, camera, step=step, spacing=spacing, seed=seed).six
-    )
+    return lambda volume, camera, seed: encode_lightmaps(march(volume, camera, March(step, spacing, seed=seed)))
 
 
 def _predict_call(bench: NetworkBench, whole: Whole) -> Callable[[Frame], SixWay]:
     def call(frame: Frame) -> SixWay:
-        look = whole.subject.settings.look(frame.later.shape) | {"seed": frame.seed + 1}
-        planes = whole.decoder(look_at(frame.later, bench.camera, whole.decoder.guide, **look))
+        look = whole.subject.settings.look(frame.later.shape, frame.seed + 1)
+        planes = whole.decoder(render_guide(frame.later, bench.camera, whole.decoder.guide, look))
         return decode_lightmaps(planes, hot=whole.decoder.emission and frame.later.temperature is not None)
 
     return call

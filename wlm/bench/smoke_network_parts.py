@@ -11,15 +11,14 @@ from wlm.bench.runner import Row
 from wlm.bench.smoke_network_setup import Frame, NetworkBench, Whole, row
 from wlm.bench.smoke_setup import number
 from wlm.config import profile_names
-from wlm.smoke.baking import SixWay
 from wlm.smoke.decode import Decoder
 from wlm.smoke.evaluation import of_decoder, score
 from wlm.smoke.learn.pool import Pool
 from wlm.smoke.learn.settings import DatasetSettings
+from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.model import Profile, SixWayNetwork, SmokeModel, parameter_count
-from wlm.smoke.planes import GUIDES, decode_lightmaps, look_at
+from wlm.smoke.planes import GUIDES, decode_lightmaps, render_guide
 from wlm.smoke.scene import LightSettings
-from wlm.smoke.shading import composite, shade
 
 __all__ = ["density_rows", "frame_rows", "profile_rows"]
 
@@ -42,7 +41,7 @@ def frame_rows(bench: NetworkBench) -> list[Row]:
     for subject in bench.subjects:
         whole = Whole(bench, subject, half=half)
         parts = [whole.parts(frame) for frame in bench.frames]
-        step = subject.settings.look(bench.frames[0].later.shape)["step"]
+        step = subject.settings.look(bench.frames[0].later.shape).step
         of = {
             "guide": f"{subject.settings.guide}, {size}², h {step:.3g}",
             "network": f"{size}², {'fp16' if half else 'fp32'}",
@@ -101,7 +100,7 @@ def profile_rows(bench: NetworkBench) -> list[Row]:
 def density_rows(bench: NetworkBench) -> list[Row]:
     """The networks and the coarse march on thinner and denser smoke, and how much they flicker."""
     bench.note("density")
-    size, step = bench.sizes.resolution, bench.settings.look(bench.frames[0].later.shape)["step"]
+    size, step = bench.sizes.resolution, bench.settings.look(bench.frames[0].later.shape).step
     rows = []
     for scale in bench.sizes.scales:
         frames = [frame.scaled(scale) for frame in bench.frames]
@@ -130,10 +129,12 @@ def _pool(bench: NetworkBench, frames: Sequence[Frame], targets: torch.Tensor, s
     """The frames as samples with guiding maps of some settings."""
     guides = []
     for frame in frames:
-        look = settings.look(frame.later.shape)
+        shape = frame.later.shape
         pair = enumerate(frame.smoke, frame.seed)
         guides.append(
-            torch.stack([look_at(one, bench.camera, settings.guide, seed=seed, **look) for seed, one in pair])
+            torch.stack(
+                [render_guide(one, bench.camera, settings.guide, settings.look(shape, seed)) for seed, one in pair]
+            )
         )
     moved = torch.stack([frame.motion for frame in frames])
     number = torch.arange(len(frames), device=targets.device)
@@ -143,8 +144,11 @@ def _pool(bench: NetworkBench, frames: Sequence[Frame], targets: torch.Tensor, s
 def _shading(bench: NetworkBench) -> Callable[[], object]:
     lights = [given.light() for given in _LIGHTS]
     pairs = zip(bench.frames, bench.references, strict=True)
-    six: list[SixWay] = [decode_lightmaps(planes, hot=frame.later.temperature is not None) for frame, planes in pairs]
-    return lambda: [composite(shade(one, bench.camera, lights), one.transparency, _BACKGROUND) for one in six]
+    six: list[SixWay] = [
+        decode_lightmaps(planes, hot=frame.later.temperature is not None, camera=bench.camera)
+        for frame, planes in pairs
+    ]
+    return lambda: [one.shade(lights, background=_BACKGROUND) for one in six]
 
 
 def _all_of(parts: Sequence[dict[str, Callable[[], object]]], name: str) -> Callable[[], object]:

@@ -13,9 +13,11 @@ from wlm.bench.runner import Row
 from wlm.bench.smoke_network_setup import EXACT, NetworkBench, Scores, Whole, row, score
 from wlm.bench.timing import time_together
 from wlm.errors import one_line
-from wlm.smoke.baking import SixWay, six_way
-from wlm.smoke.coarse import coarse_six_way
+from wlm.smoke.baking import bake
+from wlm.smoke.coarse import march
+from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.planes import encode_lightmaps, to_srgb
+from wlm_kernels.smoke.settings import March
 
 __all__ = ["flipbook_rows", "traced_rows"]
 
@@ -26,11 +28,11 @@ def flipbook_rows(bench: NetworkBench) -> list[Row]:
     """A flip book baked from the first camera, under cameras that turn away from it."""
     bench.note("flip book")
     frames = bench.frames[:: bench.sizes.frames]  # one of each scene
-    baked = [six_way(frame.later, bench.camera, step=EXACT, estimate=False) for frame in frames]
+    baked = [bake(frame.later, bench.camera, step=EXACT, estimate=False) for frame in frames]
     pivots = [frame.later.centre for frame in frames]
     ours = Whole(bench, bench.trained[0], half=True) if bench.trained else None
     settings = bench.settings if ours is None else ours.subject.settings
-    step = settings.look(frames[0].later.shape)["step"]
+    step = settings.look(frames[0].later.shape).step
     rows = []
     for degrees in bench.sizes.turns:
         camera = bench.turned(degrees)
@@ -39,7 +41,7 @@ def flipbook_rows(bench: NetworkBench) -> list[Row]:
         def turned(camera=camera) -> list[SixWay]:
             return [billboard(six, bench.camera, camera, at) for six, at in zip(baked, pivots, strict=True)]
 
-        marched = [coarse_six_way(frame.later, camera, step=step, seed=frame.seed + 1).six for frame in frames]
+        marched = [march(frame.later, camera, March(step, seed=frame.seed + 1)) for frame in frames]
         found = score([encode_lightmaps(six) for six in turned()], references)
         beside = score([encode_lightmaps(six) for six in marched], references)
         figures = found.figures | {f"coarse march, h {step:g}, dB": f"{beside.mean:.2f}"}

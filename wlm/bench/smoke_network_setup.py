@@ -17,16 +17,17 @@ from wlm.fluid.solver import Solver
 from wlm.fluid.volume import DensityVolume
 from wlm.interop import StepGraph, stream
 from wlm.metrics.error import psnr_from_mse
-from wlm.smoke.baking import SixWay, six_way
+from wlm.smoke.baking import bake
 from wlm.smoke.camera import DIRECTIONS, Camera
 from wlm.smoke.codec import open_network
 from wlm.smoke.learn.scenes import draw_scene
 from wlm.smoke.learn.settings import DatasetSettings
+from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.model import Profile, SixWayNetwork, SmokeModel
 from wlm.smoke.motion import motion
-from wlm.smoke.planes import decode_lightmaps, encode_lightmaps, look_at
+from wlm.smoke.planes import decode_lightmaps, encode_lightmaps, render_guide
 from wlm.smoke.scene import CameraSettings, Scene, make_camera
-from wlm.smoke.simulate import make_solver, volume_of
+from wlm.smoke.simulation import make_solver, volume_of
 
 __all__ = [
     "EXACT",
@@ -221,7 +222,7 @@ class NetworkBench(Bench):
 
     def reference(self, volume: DensityVolume, camera: Camera | None = None) -> torch.Tensor:
         """Planes [8, H, W] by the finest march."""
-        return encode_lightmaps(six_way(volume, camera or self.camera, step=EXACT, estimate=False))
+        return encode_lightmaps(bake(volume, camera or self.camera, step=EXACT, estimate=False))
 
     def replayed(self, calls: Mapping[str, Callable[[], object]], *, few: bool = False) -> dict[str, Timing]:
         """Times calls as graphs; on a CPU there is nothing to replay."""
@@ -300,19 +301,19 @@ class Whole:
 
     def planes(self, volume: DensityVolume, camera: Camera, seed: int) -> torch.Tensor:
         """What the network makes of smoke, [8, H, W]; a copy."""
-        look = self.subject.settings.look(volume.shape) | {"seed": seed}
+        look = self.subject.settings.look(volume.shape, seed)
         with stream(self._device):
-            return self.decoder(look_at(volume, camera, self.decoder.guide, **look)).clone()
+            return self.decoder(render_guide(volume, camera, self.decoder.guide, look)).clone()
 
     def parts(self, frame: Frame) -> dict[str, Callable[[], object]]:
         """Calls that make a frame's guiding map, planes and lightmaps, each from what the one before left."""
-        look = self.subject.settings.look(frame.later.shape) | {"seed": frame.seed + 1}
+        look = self.subject.settings.look(frame.later.shape, frame.seed + 1)
         kind, hot = self.decoder.guide, frame.later.temperature is not None
-        encoded = look_at(frame.later, self.camera, kind, **look)
+        encoded = render_guide(frame.later, self.camera, kind, look)
         made = self.decoder(encoded)
 
         def guided() -> None:
-            encoded.copy_(look_at(frame.later, self.camera, kind, **look))
+            encoded.copy_(render_guide(frame.later, self.camera, kind, look))
 
         def decoded() -> SixWay:
             return decode_lightmaps(made, hot=hot and self.decoder.emission)

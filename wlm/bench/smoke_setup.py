@@ -21,8 +21,7 @@ class Sizes:
         chunk: Steps of a lattice that are timed as one.
         compared: Steps after which 16 bits are compared with 32.
         drift: Steps after which the mass is.
-        tolerances: Of the lattice's bricks.
-        fills: Shares of the domain in which there is flow, or smoke.
+        fills: Shares of the domain in which there is smoke.
         coarse: Cells of velocity along an edge, each of four of smoke.
         cloud: Voxels along an edge of what is marched through.
         resolution: Pixels along an edge of the image.
@@ -42,7 +41,6 @@ class Sizes:
     chunk: int
     compared: tuple[int, ...]
     drift: int
-    tolerances: tuple[float, ...]
     fills: tuple[float, ...]
     coarse: int
     cloud: int
@@ -66,7 +64,6 @@ FULL = Sizes(
     chunk=48,
     compared=(500, 1000),
     drift=5000,
-    tolerances=(1e-6, 1e-5, 1e-4, 1e-3, 1e-2),
     fills=(0.0, 0.05, 0.1, 0.25, 0.5, 0.75, 1.0),
     coarse=100,
     cloud=400,
@@ -91,7 +88,6 @@ QUICK = Sizes(
     chunk=8,
     compared=(100, 200),
     drift=300,
-    tolerances=(1e-6, 1e-4, 1e-2),
     fills=(0.0, 0.25, 1.0),
     coarse=12,
     cloud=48,

@@ -19,33 +19,20 @@ from wlm.cli.console import (
     write_json,
 )
 from wlm.cli.options import Device, ReportFile, Resume, Seed, output_option
-from wlm.cli.smoke_options import (
-    Distance,
-    Emission,
-    Extent,
-    Extinction,
-    Input,
-    Resolution,
-    Toward,
-    Turn,
-    open_smoke,
-    write_lightmaps,
-)
+from wlm.cli.smoke_options import Input, SmokeOptions, with_smoke, write_lightmaps
 from wlm.errors import WlmError
 
 if TYPE_CHECKING:
     from wlm.fluid.volume import DensityVolume
-    from wlm.smoke.baking import SixWay
     from wlm.smoke.camera import Camera
     from wlm.smoke.evaluation import Comparison
+    from wlm.smoke.lightmaps import SixWay
     from wlm.smoke.model import SmokeModel
     from wlm.system import Progress
 
 __all__ = ["register"]
 
 _POOL, _SHEET = "pool.safetensors", "sheet.png"
-_NEAR = 1.25  # factor between an image's pixels and a network's training images from which on a note is printed
-
 _MARCH = 130  # steps of `predict --coarse` along the longest edge
 
 _Network = Annotated[
@@ -103,9 +90,11 @@ def train(
     show(rows)
 
 
+@with_smoke
 def predict(
     smoke: Input,
     output: Annotated[Path, output_option("OUT", "A .exr, or of frames a folder.")],
+    options: SmokeOptions,
     network: Annotated[
         Path | None, typer.Option(metavar="FILE", help="A network that train wrote; default the one that wlm has.")
     ] = None,
@@ -119,15 +108,7 @@ def predict(
             help=f"Voxels, of the march of --coarse; default 1/{_MARCH} of the longest edge.",
         ),
     ] = None,
-    resolution: Resolution = None,
     seed: Seed = 0,
-    toward: Toward = None,
-    turn: Turn = 0.0,
-    extent: Extent = None,
-    distance: Distance = None,
-    extinction: Extinction = None,
-    emission: Emission = None,
-    device: Device = "cpu",
 ) -> None:
     """Make six-way lightmaps by the network, from a guiding map as it was trained with: what bake makes, sooner.
 
@@ -138,10 +119,9 @@ def predict(
     if step is not None and not coarse:
         raise WlmError("--step: expected --coarse beside it: a network looks as it was trained to")
     quiet_warp()
-    footage = open_smoke(smoke, extinction, emission, device)
-    make = _coarse(step, seed) if coarse else _predicted(network, seed, footage.device)
-    view = {"resolution": resolution, "toward": toward, "turn": turn, "extent": extent, "distance": distance}
-    write_lightmaps(footage, output, view, make)
+    frames = options.open(smoke)
+    make = _coarse(step, seed) if coarse else _predicted(network, seed, frames.device)
+    write_lightmaps(frames, options.camera(frames), output, make)
 
 
 def evaluate(
@@ -265,35 +245,28 @@ def dataset(
 
 def _coarse(step: float | None, seed: int) -> "Callable[[DensityVolume, Camera], SixWay]":
     """Makes lightmaps by a march whose nodes are as far apart as its steps."""
-    from wlm.smoke.coarse import coarse_six_way
+    from wlm.smoke.coarse import march
+    from wlm_kernels.smoke.settings import March
 
     def make(volume: "DensityVolume", camera: "Camera") -> "SixWay":
         voxels = max(volume.shape) / _MARCH if step is None else step
-        return coarse_six_way(volume, camera, step=voxels, seed=seed).six
+        return march(volume, camera, March(voxels, seed=seed))
 
     return make
 
 
 def _predicted(path: Path | None, seed: int, device: str) -> "Callable[[DensityVolume, Camera], SixWay]":
-    """Makes lightmaps by a network, with guiding maps as in its training."""
-    from wlm.smoke.codec import open_network
-    from wlm.smoke.planes import decode_lightmaps, look_at
+    """Makes lightmaps by a network; notes once where it wasn't trained for the image's size."""
+    from wlm.smoke.prediction import SmokePredictor
 
-    model = open_network(path)
-    decoders: dict[tuple[int, int], Any] = {}
-    fewest, most = model.dataset.pixels
+    predictor, first = SmokePredictor(path, device), True
 
     def make(volume: "DensityVolume", camera: "Camera") -> "SixWay":
-        size = (camera.height, camera.width)
-        pixels = camera.height * volume.voxel * max(volume.shape) / camera.extent
-        if not decoders and not fewest / _NEAR <= pixels <= most * _NEAR:
-            trained = f"the network was trained with {fewest:.0f} to {most:.0f}"
-            note(f"{pixels:.0f} pixels show the smoke's longest edge, {trained}: --coarse may be nearer")
-        if size not in decoders:
-            decoders[size] = model.decoder(device, height=camera.height, width=camera.width)
-        decoder = decoders[size]
-        planes = decoder(look_at(volume, camera, decoder.guide, seed=seed, **model.dataset.look(volume.shape)))
-        return decode_lightmaps(planes, hot=decoder.emission and volume.temperature is not None)
+        nonlocal first
+        if first and (warning := predictor.warning(volume, camera)):
+            note(warning)
+        first = False
+        return predictor(volume, camera, seed)
 
     return make
 

@@ -114,7 +114,7 @@ class GltfPrimitive:
 
 
 def read_gltf(path: str | os.PathLike[str]) -> tuple[GltfDocument, list[GltfPrimitive]]:
-    """Read a `.glb` or `.gltf` file; its first bytes tell which it is.
+    """Reads a `.glb` or `.gltf` file; its first bytes tell which it is.
 
     Args:
         path: The file.
@@ -151,7 +151,7 @@ def read_gltf(path: str | os.PathLike[str]) -> tuple[GltfDocument, list[GltfPrim
 def document_from_arrays(
     position: np.ndarray, triangle: np.ndarray, uv: np.ndarray, name: str
 ) -> tuple[GltfDocument, GltfPrimitive]:
-    """Make a document of one mesh, for geometry that came from elsewhere.
+    """Makes a document of one mesh, for geometry that came from elsewhere.
 
     Args:
         position: [V, 3], in any unit; stored as float32.

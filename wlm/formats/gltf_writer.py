@@ -67,7 +67,7 @@ class Replacement:
 def write_glb(
     path: str | os.PathLike[str], document: GltfDocument, replacements: Sequence[Replacement], uv_set: int
 ) -> int:
-    """Write a document as `.glb` with some primitives replaced and all else as it was, whole or not at all.
+    """Writes a document as `.glb` with some primitives replaced and all else as it was, whole or not at all.
 
     Attributes and morph targets keep their encoding. Where a primitive lacks sets below `uv_set`, which glTF wants in
     a row, they are given the new UVs too. Data that nothing uses any more is left out, unless the file has an

@@ -35,7 +35,7 @@ class ObjMesh:
 
 
 def read_obj(path: str | os.PathLike[str]) -> ObjMesh:
-    """Read an OBJ file.
+    """Reads an OBJ file.
 
     Args:
         path: The file, UTF-8 or any other text whose numbers are ASCII.

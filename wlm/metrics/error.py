@@ -19,7 +19,7 @@ PSNR_CAP_DB = 120.0
 def check_pair(
     ref: np.ndarray, test: np.ndarray, mask: np.ndarray | None, where: str
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Check a reference, a test image and a mask; return them as float64, float64 and bool.
+    """Checks a reference, a test image and a mask, and returns them as float64, float64 and bool.
 
     Args:
         ref: `[H, W, C]`, linear.
@@ -128,8 +128,8 @@ def psnr(ref: np.ndarray, test: np.ndarray, mask: np.ndarray | None = None, peak
 
 
 def psnr_from_mse(error: float, peak: float) -> float:
-    """`psnr` for a mean squared error that is known already, with the same cap and the same NaN."""
-    if peak == 0.0:
+    """`psnr` of a mean squared error, with the same cap; NaN where the error is NaN or the peak isn't above 0."""
+    if math.isnan(error) or not peak > 0.0:
         return math.nan
     if error == 0.0:
         return PSNR_CAP_DB

@@ -134,7 +134,7 @@ def evaluate_frame(
     flip_exposure_count: int = 2,
     name: str = "lightmap",
 ) -> FrameMetrics:
-    """Score one lightmap tile by tile (neural-dynamic-gi, section 10.2, as this module settles it).
+    """Scores one lightmap tile by tile (neural-dynamic-gi, section 10.2, as this module settles it).
 
     Args:
         ref: `[H, W, 3]`, linear RGB, any float dtype. Texels outside the mask are ignored.

@@ -71,7 +71,7 @@ class Decoder:
         """Predicts the planes of one image; on CUDA the work is queued, not awaited.
 
         Args:
-            encoded: [C, H, W], a guiding map of ``planes.look_at`` of the kind ``guide``, on the device.
+            encoded: [C, H, W], a guiding map of ``planes.render_guide`` of the kind ``guide``, on the device.
 
         Returns:
             float32 [8, H, W] in the order of ``PLANES``, clamped to their ranges. The next call overwrites it.

@@ -1,6 +1,4 @@
-"""Pictures of a mesh under its lightmap: as it was, as it is decoded, and the error between them."""
-
-from __future__ import annotations
+"""Pictures of a mesh under its lightmap: the original, the decoded ones, and their errors."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -11,23 +9,22 @@ from PIL import Image, ImageDraw, ImageFont
 
 from wlm.atlas.data import LightmappedMesh
 from wlm.atlas.evaluation import Sampler
-from wlm.atlas.views import View, visible_uv
+from wlm.atlas.views import View, corner_weights, visible_uv
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_path
 from wlm.interop import check_device
 from wlm.ops import raster
-from wlm.texels import fill_gaps
 
 __all__ = ["comparison", "draw", "encode", "original", "save_png", "white_of"]
 
-_WHITE_PERCENTILE = 99.5  # as in `wlm.view.sheet`
-_BACKGROUND = 128  # neither light nor dark surfaces vanish in it
+_WHITE_PERCENTILE = 99.5  # as in ``wlm.view.sheet``
+_BACKGROUND = 128  # light and dark surfaces stand out from it
 _MARGIN, _TITLE, _FONT = 6, 26, 16  # pixels
 
 
 def original(mesh: LightmappedMesh, device: str = "cpu") -> Sampler:
     """The lightmap itself as a decoder: read bilinearly, its gaps filled."""
-    image = torch.from_numpy(fill_gaps(mesh.lightmap, mesh.mask)).to(check_device(device))
+    image = torch.from_numpy(mesh.filled).to(check_device(device))
 
     def sample(uv: torch.Tensor, triangle: torch.Tensor, barycentric: torch.Tensor) -> torch.Tensor:
         return raster.texture(image, uv)
@@ -45,34 +42,34 @@ def draw(
         samplers: Decoders by name.
         view: The camera.
         resolution: Pixels along a side.
-        device: "cpu" or "cuda:0", the decoders'.
+        device: "cpu" or "cuda:N", the decoders'.
 
     Returns:
-        Of each decoder float32 [resolution, resolution, 3], linear light, 0 beside the mesh; and bool [resolution,
-        resolution], where the mesh is seen.
+        For each decoder float32 [resolution, resolution, 3], linear light, 0 beside the mesh; and bool [resolution,
+        resolution], true where the mesh is visible.
     """
-    seen, barycentric, uv = next(iter(visible_uv(mesh, [view], resolution, device)))
-    hit = seen >= 0
-    weight = torch.cat([barycentric[hit], 1.0 - barycentric[hit].sum(1, keepdim=True)], dim=1)
+    visible, barycentric, uv = next(iter(visible_uv(mesh, [view], resolution, device)))
+    hit = visible >= 0
+    weight = corner_weights(barycentric[hit])
     pictures = {}
     for name, sampler in samplers.items():
-        picture = torch.zeros((*seen.shape, 3), dtype=torch.float32, device=seen.device)
-        picture[hit] = sampler(uv[hit], seen[hit], weight).float()
+        picture = torch.zeros((*visible.shape, 3), dtype=torch.float32, device=visible.device)
+        picture[hit] = sampler(uv[hit], visible[hit], weight).float()
         pictures[name] = picture.cpu().numpy()
     return pictures, hit.cpu().numpy()
 
 
 def white_of(light: np.ndarray) -> float:
-    """The light that is shown as white: its 99.5 percentile; 1 where there is none."""
+    """The radiance that is shown as white: the 99.5th percentile; 1 where there is no light."""
     white = float(np.percentile(light, _WHITE_PERCENTILE)) if light.size else 0.0
     return white if white > 0 else float(light.max(initial=0.0)) or 1.0
 
 
 def encode(light: np.ndarray, hit: np.ndarray, white: float) -> np.ndarray:
-    """Linear light [H, W, 3] to sRGB bytes, grey beside the mesh."""
-    share = np.clip(light / white, 0.0, 1.0)
-    shown = np.where(share <= 0.0031308, 12.92 * share, 1.055 * share ** (1 / 2.4) - 0.055)
-    return np.where(hit[..., None], shown * 255.0 + 0.5, _BACKGROUND).astype(np.uint8)
+    """Encodes linear light [H, W, 3] as sRGB bytes, grey beside the mesh."""
+    linear = np.clip(light / white, 0.0, 1.0)
+    encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    return np.where(hit[..., None], encoded * 255.0 + 0.5, _BACKGROUND).astype(np.uint8)
 
 
 def save_png(path: str | os.PathLike[str], pixels: np.ndarray) -> None:
@@ -95,19 +92,19 @@ def comparison(
     gain: float = 8.0,
     device: str = "cpu",
 ) -> None:
-    """Writes a PNG: a row a view, with the original, each decoder, and each decoder's absolute error times a gain.
+    """Writes a PNG: one row per view, with the original, each decoder, and each decoder's absolute error times a gain.
 
-    All share one exposure: the original's 99.5 percentile over all views is white, and light is encoded as sRGB. The
-    error is taken before that. What a view doesn't see is cut off.
+    All share one exposure: the original's 99.5th percentile over all views is white, and light is encoded as sRGB.
+    Errors are linear. Each view is cropped to the mesh.
 
     Args:
         path: The PNG to write; its folder must exist.
         mesh: The mesh with its original lightmap.
         samplers: Decoders by name, at least one; none is called "original".
         views: The cameras, at least one.
-        resolution: Pixels along a side of a view before it is cut.
-        gain: What errors are multiplied by.
-        device: "cpu" or "cuda:0", the decoders'.
+        resolution: Pixels along a side of a view before it is cropped.
+        gain: Factor on errors.
+        device: "cpu" or "cuda:N", the decoders'.
 
     Raises:
         ValueError: No decoder, or no view.
@@ -119,7 +116,8 @@ def comparison(
     for view in views:
         pictures, hit = draw(mesh, {"original": original(mesh, device), **samplers}, view, resolution, device)
         if hit.any():
-            window = tuple(slice(int(line.argmax()), len(line) - int(line[::-1].argmax())) for line in _lines(hit))
+            lines = hit.any(axis=1), hit.any(axis=0)
+            window = tuple(slice(int(line.argmax()), len(line) - int(line[::-1].argmax())) for line in lines)
             drawn.append(({name: picture[window] for name, picture in pictures.items()}, hit[window]))
     if not drawn:
         raise WlmError(f"{mesh.name}: cannot draw it: no view sees it")
@@ -127,19 +125,14 @@ def comparison(
     rows = []
     for pictures, hit in drawn:
         light = [encode(picture, hit, white) for picture in pictures.values()]
-        wrong = (np.abs(pictures[name] - pictures["original"]) * gain for name in samplers)
-        rows.append(light + [encode(error, hit, white) for error in wrong])
-    errors = [f"error x {gain:g}, {name}" for name in samplers]
-    save_png(path, _sheet(rows, ["original", *samplers, *errors]))
-
-
-def _lines(hit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rows and columns with anything in them."""
-    return hit.any(axis=1), hit.any(axis=0)
+        errors = (np.abs(pictures[name] - pictures["original"]) * gain for name in samplers)
+        rows.append(light + [encode(error, hit, white) for error in errors])
+    titles = [f"error x {gain:g}, {name}" for name in samplers]
+    save_png(path, _sheet(rows, ["original", *samplers, *titles]))
 
 
 def _sheet(rows: list[list[np.ndarray]], titles: list[str]) -> np.ndarray:
-    """Pictures in rows, each in the middle of its cell, under titles."""
+    """Arranges pictures in rows under titles, each in the middle of its cell."""
     cell = max(row[0].shape[1] for row in rows)
     heights = [row[0].shape[0] for row in rows]
     width = len(titles) * (cell + _MARGIN) + _MARGIN

@@ -40,7 +40,7 @@ def before_after_error(
     times: Sequence[float] | np.ndarray,
     columns: int = MAX_COLUMNS,
 ) -> tuple[int, ...]:
-    """Write a PNG of reference, decoded and absolute error, one column a time.
+    """Writes a PNG of reference, decoded and absolute error, one column a time.
 
     Reference and decoded share one exposure a column: the white that its title states is the reference's 99.5
     percentile, and light is shown as `(irradiance / white) ** (1 / 2.2)`. The error is the mean of its

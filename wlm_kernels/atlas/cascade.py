@@ -1,17 +1,19 @@
-"""Reading a cascade of two textures, its ways back, and what else a step of its fit needs
+"""Reading a cascade of two textures, its backward pass, and the points and losses of a tuning step
 (lightmap-uv-clustering-cascade, sections 3.3.2 and 3.3.3).
 
-C(u) = T_p(F(T_c(u))) (eq. 7): T_c gives a coordinate, the triangle wave F brings it into [0, 1], T_p gives the colour.
-Both textures are read between their texels and clamped at their borders, as ``texture`` says. An empty T_c stands for
-none: C(u) = T_p(u).
+C(u) = T_p(F(T_c(u))) (eq. 7): T_c gives a coordinate, the triangle wave F folds it into [0, 1], T_p gives the colour.
+Both textures are read bilinearly and clamped at their borders, see ``wlm_kernels.raster.texture``. An empty T_c stands
+for none: C(u) = T_p(u).
 
-Two things of the paper had to be settled. Eq. 8 has a floor where bars must be and would be -2 or 0 everywhere; here
-F(x) = 2 |x/2 - floor(x/2 + 1/2)|. And F acts on what was read from T_c, as eq. 7 says, two waves a point; acting on its
-texels it would be eight, and the same where they are in [0, 1], which is all that 16 bits without a sign can hold.
-F(x) = x there, so a decoder of a stored T_c has no wave to compute.
+Two points of the paper had to be settled. Eq. 8 has a floor where an absolute value must be, and would be -2 or 0
+everywhere; here F(x) = 2 |x/2 - floor(x/2 + 1/2)|. And F acts on the value read from T_c, as eq. 7 says, two waves per
+point; acting on T_c's texels it would be eight, with the same result where they are in [0, 1], the range of unsigned
+16-bit numbers. F(x) = x there, so a decoder of a stored T_c computes no wave.
 
-A point is a coordinate u; one that is NaN stands for nothing to read: it reads NaN, its loss is 0, it has no gradient.
+A point is a coordinate u. A NaN coordinate is an empty point: it reads NaN, its loss is 0, it has no gradient.
 Gradients of textures are added by atomics: on CUDA in any order, so that the last bits change from run to run.
+
+Read ``tests/reference/cascade.py`` first: eq. 7 and both losses in float64, differentiated by autograd.
 """
 
 import warp as wp
@@ -30,7 +32,7 @@ _CHANNELS = wp.constant(3)
 
 @wp.struct
 class _Place:
-    """Where u leads: among the texels of T_c, if there are any, and of T_p."""
+    """Texels of T_c, if there is one, and of T_p that a coordinate reads."""
 
     lut_x: Axis
     lut_y: Axis
@@ -64,9 +66,9 @@ def _sample(
     out: wp.array2d[float],
 ):
     i = wp.tid()
-    at = _place(colour, lut, uv[i])
+    place = _place(colour, lut, uv[i])
     for c in range(_CHANNELS):
-        out[i, c] = read(colour, at.x, at.y, c)
+        out[i, c] = read(colour, place.x, place.y, c)
 
 
 @wp.kernel
@@ -84,14 +86,14 @@ def _sample_backward(
     g = wp.vec3(grad_out[i, 0], grad_out[i, 1], grad_out[i, 2])
     if g[0] == 0.0 and g[1] == 0.0 and g[2] == 0.0:
         return
-    at = _place(colour, lut, uv[i])
-    on = wp.vec2()
+    place = _place(colour, lut, uv[i])
+    grad_place = wp.vec2()
     for c in range(_CHANNELS):
-        add(grad_colour, at.x, at.y, c, g[c])
-        on += g[c] * read_slope(colour, at.x, at.y, c)
+        add(grad_colour, place.x, place.y, c, g[c])
+        grad_place += g[c] * read_slope(colour, place.x, place.y, c)
     if lut.shape[0] > 0:
-        add(grad_lut, at.lut_x, at.lut_y, 0, on[0])
-        add(grad_lut, at.lut_x, at.lut_y, 1, on[1])
+        add(grad_lut, place.lut_x, place.lut_y, 0, grad_place[0])
+        add(grad_lut, place.lut_x, place.lut_y, 1, grad_place[1])
 
 
 @wp.func
@@ -126,7 +128,7 @@ def _surface_points(
     # in:
     area: wp.array1d[wp.float64],
     corner: wp.array2d[wp.vec2],
-    apart: float,
+    distance: float,
     seed: int,
     step: wp.array1d[int],
     # out:
@@ -137,29 +139,29 @@ def _surface_points(
     count = triangle.shape[0] // 2
     state = wp.rand_init(seed + step[0], i)
     last = area.shape[0] - 1
-    # Above 0 and up to the whole, so that a triangle without area is never met.
+    # In (0, 1], so that a triangle without area is never drawn.
     share = (wp.float64(i + 1) - wp.float64(wp.randf(state))) / wp.float64(count)
     t = wp.min(wp.lower_bound(area, share * area[last]), last)
     b = wp.vec2(wp.randf(state), wp.randf(state))
     if b[0] + b[1] > 1.0:
         b = wp.vec2(1.0 - b[0], 1.0 - b[1])
-    turn = 2.0 * wp.pi * wp.randf(state)
-    step_u = apart * wp.cos(turn)
-    step_v = apart * wp.sin(turn)
-    one = corner[t, 0] - corner[t, 2]
-    two = corner[t, 1] - corner[t, 2]
-    area_uv = one[0] * two[1] - one[1] * two[0]
-    other = b
+    angle = 2.0 * wp.pi * wp.randf(state)
+    step_u = distance * wp.cos(angle)
+    step_v = distance * wp.sin(angle)
+    e0 = corner[t, 0] - corner[t, 2]
+    e1 = corner[t, 1] - corner[t, 2]
+    area_uv = e0[0] * e1[1] - e0[1] * e1[0]
+    partner = b
     if area_uv != 0.0:
-        d = wp.vec2(step_u * two[1] - step_v * two[0], one[0] * step_v - one[1] * step_u) / area_uv
+        d = wp.vec2(step_u * e1[1] - step_v * e1[0], e0[0] * step_v - e0[1] * step_u) / area_uv
         if _inside(b + d):
-            other = b + d
+            partner = b + d
         elif _inside(b - d):
-            other = b - d
+            partner = b - d
     triangle[i] = t
     triangle[count + i] = t
     barycentric[i] = b
-    barycentric[count + i] = other
+    barycentric[count + i] = partner
 
 
 @wp.func
@@ -169,7 +171,7 @@ def _or_zero(x: float) -> float:
 
 @wp.func
 def _sign(x: float) -> float:
-    """Warp's own is 1 at 0, where L1 has no slope."""
+    """The sign, 0 at 0 where L1 has no slope; ``wp.sign`` is 1 there."""
     return wp.where(x > 0.0, 1.0, wp.where(x < 0.0, -1.0, 0.0))
 
 
@@ -208,11 +210,11 @@ def _pair_loss(
 ):
     i, c = wp.tid()
     j = i + difference.shape[0] // 2
-    one = _or_zero(difference[i, c])
-    two = _or_zero(difference[j, c])
-    between = weight * _sign(one - two)
-    grad[i, c] = _sign(one) + between
-    grad[j, c] = _sign(two) - between
+    d_i = _or_zero(difference[i, c])
+    d_j = _or_zero(difference[j, c])
+    between = weight * _sign(d_i - d_j)
+    grad[i, c] = _sign(d_i) + between
+    grad[j, c] = _sign(d_j) - between
 
 
 def _check(colour, lut) -> None:
@@ -223,7 +225,7 @@ def _check(colour, lut) -> None:
 
 
 def sample(colour, lut, uv, out) -> None:
-    """C(u) at any points (eq. 7).
+    """Reads C(u) at any points (eq. 7).
 
     Args:
         colour: float [Hp, Wp, 3], T_p.
@@ -239,7 +241,7 @@ def sample(colour, lut, uv, out) -> None:
 
 
 def sample_backward(colour, lut, uv, grad_out, grad_colour, grad_lut) -> None:
-    """The gradients of ``sample`` by its textures.
+    """Backward pass of ``sample``: the gradients of its textures.
 
     Args:
         colour, lut, uv: As for ``sample``.
@@ -256,10 +258,10 @@ def sample_backward(colour, lut, uv, grad_out, grad_colour, grad_lut) -> None:
 
 
 def corner_points(triangle, barycentric, corner, uv) -> None:
-    """Coordinates of points in triangles.
+    """Interpolates coordinates at points in triangles.
 
     Args:
-        triangle: int [N], of each point, -1: none.
+        triangle: int [N], the triangle of each point, -1: none.
         barycentric: vec2 [N], weights of its corners 0 and 1.
         corner: vec2 [F, 3], coordinates of the corners.
         uv: vec2 [N], written; NaN where there is no triangle.
@@ -269,32 +271,33 @@ def corner_points(triangle, barycentric, corner, uv) -> None:
     )
 
 
-def surface_points(area, corner, apart: float, seed: int, step, triangle, barycentric) -> None:
-    """Draws pairs of random points: the first spread evenly over a surface, the second near it in the same triangle.
+def surface_points(area, corner, distance: float, seed: int, step, triangle, barycentric) -> None:
+    """Draws pairs of random points: the first stratified over a surface, the second near it in the same triangle.
 
     Args:
-        area: float64 [F], the areas of the triangles up to and with each one; the last is above 0.
+        area: float64 [F], cumulative areas of the triangles; the last is above 0.
         corner: vec2 [F, 3], coordinates of the corners, of any area.
-        apart: How far apart the two are, in units of the coordinates. Where the triangle has no room for that in the
-            direction drawn, they are one point.
-        seed: Of the draw, together with the step.
+        distance: Between the two points, in units of the coordinates. Where the triangle has no room for that in the
+            direction drawn, the points are equal.
+        seed: Seed of the draw, together with the step.
         step: int [1], on the device.
         triangle: int [2 N], written: the first points, then the second.
         barycentric: vec2 [2 N], written, weights of the corners 0 and 1.
     """
     count = triangle.shape[0] // 2
-    inputs = [area, corner, apart, seed, step]
+    inputs = [area, corner, distance, seed, step]
     wp.launch(_surface_points, count, inputs=inputs, outputs=[triangle, barycentric], device=area.device)
 
 
 def image_loss(difference, weight: float, grad) -> None:
-    """The gradient of an image's loss: the sum of |d| over all pixels and channels, and ``weight`` times that of the
-    differences of d between neighbours, to the right and below (section 3.3.3: L1 of the colours and of the images'
-    gradients, of which the difference is the gradient of the difference).
+    """Computes the gradient of an image's loss: L1 of the colours and of the images' gradients (section 3.3.3).
+
+    The loss is the sum of |d| over all pixels and channels plus ``weight`` times the sum of |d_p - d_q| over pairs of
+    neighbours p and q, horizontal and vertical.
 
     Args:
-        difference: float [H, W, 3], d, the image less the reference. NaN is where both show nothing: 0.
-        weight: Of the second part.
+        difference: float [H, W, 3], d, the image less the reference; NaN where neither shows the mesh, which is 0.
+        weight: Weight of the second sum.
         grad: float [H, W, 3], written; 0 where d is NaN.
     """
     device = difference.device
@@ -302,11 +305,11 @@ def image_loss(difference, weight: float, grad) -> None:
 
 
 def pair_loss(difference, weight: float, grad) -> None:
-    """The gradient of the loss of pairs of points: the sum of |d|, and ``weight`` times that of |d_i - d_(N + i)|.
+    """Computes the gradient of the loss of pairs of points: the sums of |d| and of ``weight`` |d_i - d_(N + i)|.
 
     Args:
         difference: float [2 N, 3], d; NaN counts as 0.
-        weight: Of the second part.
+        weight: Weight of the second sum.
         grad: float [2 N, 3], written.
     """
     size = (difference.shape[0] // 2, 3)

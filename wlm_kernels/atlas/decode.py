@@ -1,7 +1,9 @@
 """Reads a lightmap from tiles: one entry of a table, then one bilinear read of a small texture.
 
 Tile (i, j) of size B spans the lightmap's texel centres i B to (i + 1) B along x, and j B to (j + 1) B along y; its
-entry says which rectangle of the texture holds it. The rectangle's outermost samples lie on the tile's borders.
+entry names the rectangle of the texture that holds it. The rectangle's outermost samples lie on the tile's borders.
+
+Read ``wlm/atlas/exact.py`` first: the same in float64 NumPy.
 """
 
 import warp as wp
@@ -14,6 +16,8 @@ _SIDE_MASK = wp.constant(15)
 
 @wp.struct
 class _Axis:
+    """Two texels along an axis, and the weight of the second."""
+
     low: int
     high: int
     share: float
@@ -21,7 +25,7 @@ class _Axis:
 
 @wp.func
 def _tile_place(u: float, texels: int, size: int, tiles: int) -> wp.vec2:
-    """Number of the tile that holds a coordinate, and the place in it from 0 to 1; of NaN tile 0 and NaN."""
+    """Number of the tile that holds a coordinate, and the place in it from 0 to 1; for NaN tile 0 and NaN."""
     if not (u == u):
         return wp.vec2(0.0, u)
     x = wp.clamp(u * float(texels) - 0.5, 0.0, float(texels - 1)) / float(size)
@@ -55,10 +59,11 @@ def _decode(
     # out:
     out: wp.array1d[wp.vec3],
 ):
+    """One point per thread."""
     i = wp.tid()
-    at = uv[i]
-    across = _tile_place(at[0], width, size, lut.shape[1])
-    down = _tile_place(at[1], height, size, lut.shape[0])
+    u = uv[i]
+    across = _tile_place(u[0], width, size, lut.shape[1])
+    down = _tile_place(u[1], height, size, lut.shape[0])
     row, column = int(down[0]), int(across[0])
     x = _axis(lut[row, column, 0], across[1])
     y = _axis(lut[row, column, 1], down[1])
@@ -71,10 +76,10 @@ def decode(uv, height: int, width: int, size: int, lut, texels, out) -> None:
     """Reads light at points.
 
     Args:
-        uv: vec2 [N], u right, v down; clamped to [0, 1]. Where one isn't a number the result isn't either.
+        uv: vec2 [N], u right, v down; clamped to [0, 1]. NaN reads NaN.
         height, width: Texels of the lightmap.
         size: B, texels along a tile.
-        lut: uint16 [ty, tx, 2], along x and y: first texel of the rectangle << 4 | its texels - 1.
+        lut: uint16 [ty, tx, 2], for x and y: first texel of the rectangle << 4 | number of its texels - 1.
         texels: vec3h [Hp, Wp].
         out: vec3 [N], written.
     """

@@ -1,7 +1,9 @@
-"""The graph of patches that are alike (lightmap-uv-clustering-cascade, section 3.2), of which no edge is stored.
+"""The graph of patches that are alike (lightmap-uv-clustering-cascade, section 3.2), without storing its edges.
 
-Few pairs need all their samples. Most are settled by bounds from below and from above (``Fit``), which are in float32,
-are made looser by more than that loses, and so never change a result.
+Few pairs need all their samples compared. Bounds of the distance from below and from above (``Bounds``) settle most;
+they are in float32, with a margin larger than its rounding, and so never change a result.
+
+Read ``tests/reference/patches.py`` first (``distances``, ``adjacency``, ``greedy``): the same with the whole matrix.
 """
 
 import math
@@ -23,15 +25,25 @@ from wlm_kernels.atlas.patches import (
     turned,
 )
 
-__all__ = ["Fit", "Graph", "Rule", "count_neighbours", "fit", "graph", "lose_neighbours", "mark_neighbours", "rule"]
+__all__ = [
+    "Bounds",
+    "Graph",
+    "Rule",
+    "bounds",
+    "count_neighbours",
+    "graph",
+    "mark_neighbours",
+    "remove_neighbours",
+    "rule",
+]
 
-# More than float32 loses of a bound, in levels of which there are up to 765: 6e-8 of them a few dozen times.
+# More than the rounding of a bound in float32: 6e-8 of up to 765 levels, a few dozen times.
 _MARGIN = wp.constant(4.0e-3)
 
 
 @wp.struct
-class Fit:
-    """What bounds Dist on one lattice, in levels.
+class Bounds:
+    """Quantities of one patch that bound Dist on one lattice, in levels.
 
     With weights w = (i, j, k) / (n - 1), which add up to 1, and the colours T of one patch and T' of the other:
 
@@ -42,24 +54,23 @@ class Fit:
     Attributes:
         moment: Row v: the mean over the samples of w_v T.
         corner: Row v: C_v of the best L by least squares.
-        rest: Mean over the samples of |T - L|, summed over the channels.
+        residual: Mean over the samples of |T - L|, summed over the channels.
     """
 
     moment: wp.mat33
     corner: wp.mat33
-    rest: float
+    residual: float
 
 
 @wp.struct
 class Rule:
-    """When patches are alike.
+    """Thresholds below which patches are alike.
 
     Attributes:
-        colour: Largest square of the distance between two dominant colours, in bins.
-        level: Mean difference, summed over the channels, in levels, below which two are alike.
+        colour: Largest squared distance of two dominant colours, in bins.
+        level: Mean difference, summed over the channels, in levels.
         whole: The same rounded up: a whole number is below ``level`` where it is below this one.
-        same: [len(SIZES)], for two patches of one size: alike where the sum of the differences of all samples and
-            channels, in levels, is less.
+        same: [len(SIZES)], for two patches of one size: sum of the differences of all samples and channels, in levels.
         mixed: [len(SIZES)], the same where the larger has this size, in 1 / (n - 1) of a level.
     """
 
@@ -71,14 +82,14 @@ class Rule:
 
 
 @wp.kernel(enable_backward=False)
-def _fit(
+def _bounds(
     # in:
     samples: wp.array1d[int],
     patches: wp.array1d[Patch],
     # out:
-    fits: wp.array2d[Fit],
+    bounds: wp.array2d[Bounds],
 ):
-    """On the lattice of a patch and all larger ones; a smaller one is never asked for."""
+    """One patch and lattice per thread. Lattices smaller than the patch's own are never used and stay unset."""
     t, level = wp.tid()
     p = patches[t]
     if level < p.level:
@@ -100,17 +111,17 @@ def _fit(
     corner = wp.matrix_from_rows(moment[0] - mean, moment[1] - mean, moment[2] - mean) / (
         all - wp.float64(3.0) * across
     )
-    rest = wp.float64(0.0)
+    residual = wp.float64(0.0)
     for j in range(steps + 1):
         for i in range(steps + 1 - j):
             w = wp.vec3d(wp.float64(i), wp.float64(j), wp.float64(steps - i - j))
             d = wp.vec3d(spread(samples, p, i, j, level)) / scale - w * corner
-            rest += wp.abs(d[0]) + wp.abs(d[1]) + wp.abs(d[2])
-    f = Fit()
+            residual += wp.abs(d[0]) + wp.abs(d[1]) + wp.abs(d[2])
+    f = Bounds()
     f.moment = wp.mat33(moment / (scale * scale * count))
     f.corner = wp.mat33(corner * scale)
-    f.rest = float(rest / count)
-    fits[t, level] = f
+    f.residual = float(residual / count)
+    bounds[t, level] = f
 
 
 @wp.func
@@ -151,14 +162,14 @@ def _near(rule: Rule, a: int, b: int) -> bool:
 
 @wp.func
 def _alike(
-    samples: wp.array1d[int], patches: wp.array1d[Patch], fits: wp.array2d[Fit], rule: Rule, x: int, y: int
+    samples: wp.array1d[int], patches: wp.array1d[Patch], bounds: wp.array2d[Bounds], rule: Rule, x: int, y: int
 ) -> int:
-    """Whether any order brings Dist below lambda (eq. 3 and 4): odd where one does, above 1 where samples say so."""
+    """Whether Dist is below lambda in any order (eq. 3 and 4): odd if it is, above 1 if samples had to be compared."""
     a = patches[x]
     b = patches[y]
     if not _near(rule, a.colour, b.colour):
         return 0
-    # No interpolation leaves the range of a patch: what two ranges say holds for every sample in every order.
+    # No interpolation leaves the range of a patch: bounds by two ranges hold for every sample in every order.
     most = int(0)
     least = int(0)
     for c in range(3):
@@ -176,31 +187,31 @@ def _alike(
         large = y
         small = x
     level = wp.max(a.level, b.level)
-    f = fits[large, level]
-    g = fits[small, level]
+    f = bounds[large, level]
+    g = bounds[small, level]
     below = _row_differences(f.moment, g.moment)
     above = _row_differences(f.corner, g.corner)
-    hopeful = int(0)
+    undecided = int(0)
     first = int(0)
     closest = float(wp.inf)
     for order in range(6):
-        bound = _along(above, order) / 3.0 + f.rest + g.rest
+        bound = _along(above, order) / 3.0 + f.residual + g.residual
         if bound < rule.level - _MARGIN:
             return 1
         if bound < closest:
             closest = bound
             first = order
         if _along(below, order) < rule.level + _MARGIN:
-            hopeful += 1 << order
-    if hopeful == 0:
+            undecided += 1 << order
+    if undecided == 0:
         return 0
     limit = rule.mixed[level]
     if a.level == b.level:
         limit = rule.same[level]
     for i in range(6):
-        # The likeliest first: one that is alike spares the others.
+        # The likeliest first: if it is alike the others need no comparison.
         order = (first + i) % 6
-        if ((hopeful >> order) & 1) == 1:
+        if ((undecided >> order) & 1) == 1:
             if distance_sum(samples, patches[large], patches[small], order, limit) < limit:
                 return 3
     return 2
@@ -211,7 +222,7 @@ def _count(
     # in:
     samples: wp.array1d[int],
     patches: wp.array1d[Patch],
-    fits: wp.array2d[Fit],
+    bounds: wp.array2d[Bounds],
     rule: Rule,
     cell: wp.array1d[int],
     first: wp.array1d[int],
@@ -220,22 +231,22 @@ def _count(
     degree: wp.array1d[int],
     compared: wp.array1d[wp.int64],
 ):
-    """Each pair once: the thread of the one that comes first counts for both."""
+    """One patch per thread; each pair once, counted for both by the thread of the first."""
     a = offset + wp.tid()
     colour = patches[a].colour
-    mine = int(0)
+    neighbours = int(0)
     count = wp.int64(0)
     for c in range(cell[a], first.shape[0] - 1):
         if not _near(rule, colour, patches[first[c]].colour):
             continue
         for b in range(wp.max(first[c], a + 1), first[c + 1]):
-            said = _alike(samples, patches, fits, rule, a, b)
-            if said > 1:
+            alike = _alike(samples, patches, bounds, rule, a, b)
+            if alike > 1:
                 count += wp.int64(1)
-            if (said & 1) == 1:
-                mine += 1
+            if (alike & 1) == 1:
+                neighbours += 1
                 wp.atomic_add(degree, b, 1)
-    wp.atomic_add(degree, a, mine)
+    wp.atomic_add(degree, a, neighbours)
     compared[a] = count
 
 
@@ -244,82 +255,84 @@ def _mark(
     # in:
     samples: wp.array1d[int],
     patches: wp.array1d[Patch],
-    fits: wp.array2d[Fit],
+    bounds: wp.array2d[Bounds],
     rule: Rule,
-    left: wp.array1d[int],
-    chosen: int,
+    nodes: wp.array1d[int],
+    node: int,
     # out:
     marked: wp.array1d[wp.uint8],
 ):
+    """One node per thread."""
     i = wp.tid()
-    a = left[i]
-    said = int(1)  # its own neighbour
-    if a != chosen:
-        said = _alike(samples, patches, fits, rule, chosen, a)
-    marked[i] = wp.uint8(said & 1)
+    a = nodes[i]
+    alike = int(1)  # the node itself is marked too
+    if a != node:
+        alike = _alike(samples, patches, bounds, rule, node, a)
+    marked[i] = wp.uint8(alike & 1)
 
 
 @wp.kernel(enable_backward=False)
-def _lose(
+def _remove(
     # in:
     samples: wp.array1d[int],
     patches: wp.array1d[Patch],
-    fits: wp.array2d[Fit],
+    bounds: wp.array2d[Bounds],
     rule: Rule,
-    left: wp.array1d[int],
-    gone: wp.array1d[int],
+    nodes: wp.array1d[int],
+    removed: wp.array1d[int],
     # out:
     degree: wp.array1d[int],
 ):
-    a = left[wp.tid()]
-    lost = int(0)
-    for i in range(gone.shape[0]):
-        b = gone[i]
-        if (_alike(samples, patches, fits, rule, a, b) & 1) == 1:
-            lost += 1
-    degree[a] -= lost
+    """One remaining node per thread."""
+    a = nodes[wp.tid()]
+    count = int(0)
+    for i in range(removed.shape[0]):
+        b = removed[i]
+        if (_alike(samples, patches, bounds, rule, a, b) & 1) == 1:
+            count += 1
+    degree[a] -= count
 
 
 def rule(threshold: float, colour_threshold: float, device) -> Rule:
-    """When two patches are alike, exact at the thresholds: these stand for the decimal fractions that they print as.
+    """Makes the thresholds, exact as the decimal fractions that they print as.
 
     Args:
         threshold: lambda (eq. 4); Dist must be less.
-        colour_threshold: lambda_h (section 3.2.1); the distance of two dominant colours may be this, and not more.
+        colour_threshold: lambda_h (section 3.2.1), the largest distance of two dominant colours.
         device: Where the arrays go.
     """
     total = Fraction(str(threshold)) * 765  # of three channels of 255 levels
-    made = Rule()
-    made.colour = math.floor((Fraction(str(colour_threshold)) * BINS) ** 2)
-    made.level = float(total)
-    made.whole = math.ceil(total)
+    out = Rule()
+    out.colour = math.floor((Fraction(str(colour_threshold)) * BINS) ** 2)
+    out.level = float(total)
+    out.whole = math.ceil(total)
     same = [math.ceil(total * samples_of(size)) for size in SIZES]
     mixed = [math.ceil(total * samples_of(size) * (size - 1)) for size in SIZES]
-    made.same = wp.array(same, dtype=int, device=device)
-    made.mixed = wp.array(mixed, dtype=int, device=device)
-    return made
+    out.same = wp.array(same, dtype=int, device=device)
+    out.mixed = wp.array(mixed, dtype=int, device=device)
+    return out
 
 
-def fit(samples, patches, levels: int):
-    """What bounds the distances of patches, Fit [F, levels].
+def bounds(samples, patches, levels: int):
+    """Computes ``Bounds`` [F, levels] of patches.
 
     Args:
         samples, patches: As of ``sample``.
         levels: One more than the highest level of a patch.
     """
-    fits = wp.empty((patches.shape[0], levels), dtype=Fit, device=samples.device)
-    wp.launch(_fit, fits.shape, inputs=[samples, patches], outputs=[fits], device=samples.device)
-    return fits
+    out = wp.empty((patches.shape[0], levels), dtype=Bounds, device=samples.device)
+    wp.launch(_bounds, out.shape, inputs=[samples, patches], outputs=[out], device=samples.device)
+    return out
 
 
 @dataclass(frozen=True)
 class Graph:
-    """The similarity graph (eq. 5), of which no edge is stored: each is told from the patches when it is asked for.
+    """The similarity graph (eq. 5). No edge is stored: each is computed from the patches when it is needed.
 
     Attributes:
-        samples: int, of all patches.
+        samples: int, samples of all patches.
         patches: Patch [M], by rising bin of the dominant colour.
-        fits: Fit [M, levels].
+        bounds: Bounds [M, levels].
         rule: Rule.
         cell: int [M], number of the bin among those that occur.
         first: int [cells + 1], the first patch of each bin.
@@ -327,59 +340,59 @@ class Graph:
 
     samples: wp.array
     patches: wp.array
-    fits: wp.array
+    bounds: wp.array
     rule: Rule
     cell: wp.array
     first: wp.array
 
     def _inputs(self) -> list:
-        return [self.samples, self.patches, self.fits, self.rule]
+        return [self.samples, self.patches, self.bounds, self.rule]
 
 
-def graph(samples, patches, fits, rule: Rule) -> Graph:
+def graph(samples, patches, bounds, rule: Rule) -> Graph:
     """Makes the graph of patches that are sorted by ``bin_numbers``."""
     bins = bin_numbers(patches.numpy()["colour"])
     _, first, cell = np.unique(bins, return_index=True, return_inverse=True)
     first = np.append(first, len(bins))
     device = samples.device
     cells = [wp.array(values.astype(np.int32), dtype=int, device=device) for values in (cell, first)]
-    return Graph(samples, patches, fits, rule, *cells)
+    return Graph(samples, patches, bounds, rule, *cells)
 
 
 def count_neighbours(graph: Graph, begin: int, end: int, degree, compared) -> None:
-    """Adds the edges between a patch from ``begin`` on, before ``end``, and any later one to the degrees of both.
+    """Adds the edges between patches ``begin`` to ``end`` - 1 and any later one to the degrees of both.
 
     Args:
         graph: The graph.
         begin, end: The range.
         degree: int [M], added to.
-        compared: int64 [M], written in the range: edges for which the bounds didn't do.
+        compared: int64 [M], written in the range: pairs that the bounds did not settle.
     """
     inputs = [*graph._inputs(), graph.cell, graph.first, begin]
     wp.launch(_count, end - begin, inputs=inputs, outputs=[degree, compared], device=degree.device)
 
 
-def mark_neighbours(graph: Graph, left, chosen: int, marked) -> None:
-    """Finds the neighbours of a patch among those that are left, and itself.
+def mark_neighbours(graph: Graph, nodes, node: int, marked) -> None:
+    """Marks a patch and its neighbours.
 
     Args:
         graph: The graph.
-        left: int [L], patches.
-        chosen: The patch.
-        marked: uint8 [L], written: 1 for ``chosen`` and its neighbours, else 0.
+        nodes: int [L], the patches to look at.
+        node: The patch.
+        marked: uint8 [L], written: 1 for ``node`` and its neighbours, else 0.
     """
-    inputs = [*graph._inputs(), left, chosen]
-    wp.launch(_mark, left.shape, inputs=inputs, outputs=[marked], device=left.device)
+    inputs = [*graph._inputs(), nodes, node]
+    wp.launch(_mark, nodes.shape, inputs=inputs, outputs=[marked], device=nodes.device)
 
 
-def lose_neighbours(graph: Graph, left, gone, degree) -> None:
-    """Takes the edges to patches that are gone from the degrees of those that are left.
+def remove_neighbours(graph: Graph, nodes, removed, degree) -> None:
+    """Subtracts the edges to removed patches from the degrees of the remaining ones.
 
     Args:
         graph: The graph.
-        left: int [L], patches.
-        gone: int [G], others.
-        degree: int [M].
+        nodes: int [L], the remaining patches.
+        removed: int [G], the removed ones.
+        degree: int [M], subtracted from.
     """
-    inputs = [*graph._inputs(), left, gone]
-    wp.launch(_lose, left.shape, inputs=inputs, outputs=[degree], device=left.device)
+    inputs = [*graph._inputs(), nodes, removed]
+    wp.launch(_remove, nodes.shape, inputs=inputs, outputs=[degree], device=nodes.device)

@@ -8,16 +8,18 @@ vertices is another order of (i, j, k), so one stored patch serves all six. Orde
 Sizes are 2, 3, 5, 9 and so on (``SIZES``), so that every lattice lies in all larger ones. A patch of one colour has
 the smallest size, whatever the triangle's, since interpolating it gives that colour everywhere.
 
-Colours are 8 bits a channel, packed as r + 256 g + 65536 b. All that decides is in whole numbers, so that no result
+Colours have 8 bits per channel, packed as r + 256 g + 65536 b. Every decision is made in integers, so that no result
 depends on the device:
 
-- The lightmap comes in 16 bits, vertices in 1/65536 of a texel; a sample's place is rounded to 1/256 of a texel,
-  as the filters of GPUs do.
-- Dist (eq. 2) is summed exactly. Of patches of two sizes the smaller is interpolated linearly in the triangles of its
-  own lattice, which favours no vertex (in the square's cells the result would change with the order), in multiples
-  of 1 / (n - 1) of a level.
+- The lightmap has 16 bits per channel, vertices are in 1/65536 of a texel, and a sample's place is rounded to 1/256 of
+  a texel, as texture filters of GPUs do.
+- Dist (eq. 2) is summed exactly. Of two patches of different sizes the smaller is interpolated linearly in the
+  triangles of its own lattice, in multiples of 1 / (n - 1) of a level. That favours no vertex; with square cells the
+  result would change with the order.
 
-The paper leaves open what |.| of a colour is: here the mean of the three channels', so that Dist is in [0, 1].
+The paper does not define |.| of a colour: here it is the mean of the three channels', so that Dist is in [0, 1].
+
+Read ``tests/reference/patches.py`` first: the same per triangle in float64 NumPy.
 """
 
 import itertools
@@ -44,31 +46,31 @@ __all__ = [
 ]
 
 ORDERS = tuple(itertools.permutations(range(3)))
-"""p of each order; 0 is the identity."""
+"""Permutation p of each order; order 0 is the identity."""
 
 SIZES = (2, 3, 5, 9, 17, 33, 65, 129)
-"""Of patches; sums over a larger one would need more than 32 bits."""
+"""Sizes of patches; sums over a larger one would need more than 32 bits."""
 
 BINS = 32
-"""Of the histogram, a channel (section 3.2.1)."""
+"""Bins of the histogram per channel (section 3.2.1)."""
 
-_LOT = 1 << 22  # samples whose bins are sorted at once
+_AT_ONCE = 1 << 22  # samples whose bins are sorted in one call
 
 _LEVELS = wp.constant(255)
 _BIN_SHIFT = wp.constant(3)  # 256 levels in 32 bins
 
-# A texel of 16 bits under weights that add up to 256 * 256, to 8 bits.
+# Divisor from 16 bits, under weights that add up to 256 * 256, to 8 bits.
 _TO_BYTE = wp.constant(wp.int64(65536 * 257))
 _HALF_BYTE = wp.constant(wp.int64(65536 * 257 // 2))
 
 
 @wp.struct
 class Patch:
-    """What is known of a patch besides its samples.
+    """A patch without its samples.
 
     Attributes:
         start: Its first sample in the array of all samples.
-        level: Of its size, n = ``SIZES[level]`` = 2 ** level + 1.
+        level: Level of its size, n = ``SIZES[level]`` = 2 ** level + 1.
         low: Lowest level of each channel, packed.
         high: Highest level of each channel, packed.
         colour: Bin of the dominant colour, packed as a colour.
@@ -82,18 +84,18 @@ class Patch:
 
 
 def samples_of(size):
-    """Samples of a patch of a size, n (n + 1) / 2."""
+    """Number of samples of a patch of size n, n (n + 1) / 2."""
     return size * (size + 1) // 2
 
 
 def patch_orders(samples: np.ndarray) -> np.ndarray:
-    """A patch in all six orders (section 3.1, figure 3).
+    """Gives a patch in all six orders (section 3.1, figure 3).
 
     Args:
         samples: [N, ...], the samples of one patch as stored.
 
     Returns:
-        [6, N, ...]. Number o is the patch of the triangle whose vertex p[k] is this one's vertex k, p = ``ORDERS[o]``.
+        [6, N, ...]. Entry o is the patch of the triangle whose vertex p[k] is this one's vertex k, p = ``ORDERS[o]``.
 
     Raises:
         ValueError: N isn't the samples of a patch.
@@ -103,8 +105,8 @@ def patch_orders(samples: np.ndarray) -> np.ndarray:
         raise ValueError(f"samples: expected n (n + 1) / 2 of them, got {len(samples)}")
     j, i = np.array([(j, i) for j in range(size) for i in range(size - j)]).T
     weights = np.stack([i, j, size - 1 - i - j])
-    turned = [weights[list(order)] for order in ORDERS]
-    return np.stack([samples[j * size - j * (j - 1) // 2 + i] for i, j, _ in turned])
+    permuted = [weights[list(order)] for order in ORDERS]
+    return np.stack([samples[j * size - j * (j - 1) // 2 + i] for i, j, _ in permuted])
 
 
 @wp.func
@@ -124,7 +126,7 @@ def channel(colour: int, c: int) -> int:
 
 @wp.func
 def _place(i: int, j: int, k: int, a: wp.int64, b: wp.int64, c: wp.int64, side: int) -> int:
-    """Along an axis of ``side`` texels, in 1/256 of one, clamped to the centres of the outer ones."""
+    """A sample's place along an axis of ``side`` texels, in 1/256 of a texel, clamped to the outermost centres."""
     steps = wp.int64(i + j + k)
     last = wp.int64(side - 1) * wp.int64(65536) * steps
     at = wp.clamp(wp.int64(i) * a + wp.int64(j) * b + wp.int64(k) * c, wp.int64(0), last)
@@ -143,6 +145,7 @@ def _sample(
     patches: wp.array1d[Patch],
     bright: wp.array1d[wp.uint8],
 ):
+    """One triangle per thread."""
     t = wp.tid()
     n = size_of(level[t])
     rows = lightmap.shape[0]
@@ -162,7 +165,7 @@ def _sample(
                 v = (y >> 8) + (tap >> 1)
                 w = wp.where((tap & 1) == 1, x & 255, 256 - (x & 255))
                 w *= wp.where((tap >> 1) == 1, y & 255, 256 - (y & 255))
-                # Also keeps from reading behind the border, where the weight is 0.
+                # Texels beyond the border have weight 0 and must not be read.
                 if w > 0:
                     for c in range(3):
                         sums[c] += wp.int64(w) * wp.int64(lightmap[v, u, c])
@@ -188,7 +191,7 @@ def _sample(
 
 @wp.func
 def _bin(colour: int) -> int:
-    """Rising with the number of the bin: red counts most."""
+    """Number of a colour's bin, red in the highest bits."""
     r = channel(colour, 0) >> _BIN_SHIFT
     g = channel(colour, 1) >> _BIN_SHIFT
     b = channel(colour, 2) >> _BIN_SHIFT
@@ -204,6 +207,7 @@ def _bins(
     keys: wp.array1d[int],
     items: wp.array1d[int],
 ):
+    """One sample per thread."""
     i = wp.tid()
     keys[i] = _bin(samples[first + i])
     items[i] = i
@@ -218,7 +222,7 @@ def _commonest(
     # out:
     patches: wp.array1d[Patch],
 ):
-    """The bin that fills the longest run of a patch's sorted bins, the lowest of equals."""
+    """One patch per thread: the bin of the longest run among its sorted bins, the lowest of equals."""
     t = wp.tid()
     best = int(0)
     longest = int(0)
@@ -247,7 +251,7 @@ def _difference(a: int, b: int) -> int:
 
 @wp.func
 def turned(w: wp.vec3i, order: int) -> wp.vec3i:
-    """(w[p[0]], w[p[1]], w[p[2]])."""
+    """(w[p[0]], w[p[1]], w[p[2]]) for the permutation p of an order."""
     if order == 0:
         return w
     if order == 1:
@@ -263,7 +267,7 @@ def turned(w: wp.vec3i, order: int) -> wp.vec3i:
 
 @wp.func
 def _inverse(order: int) -> int:
-    """Of the six only the two turns aren't their own inverse."""
+    """The inverse permutation; only the two rotations, orders 3 and 4, aren't their own."""
     if order == 3:
         return 4
     if order == 4:
@@ -274,7 +278,7 @@ def _inverse(order: int) -> int:
 @wp.func
 def spread(samples: wp.array1d[int], small: Patch, i: int, j: int, level: int) -> wp.vec3i:
     """``2 ** level`` times a patch's colour at (i, j) of the lattice of this level, its own or a higher one."""
-    # One step of the small lattice is this many of the other.
+    # One step of the small lattice is 2 ** shift steps of the other.
     shift = level - small.level
     size = size_of(small.level)
     mask = (1 << shift) - 1
@@ -290,12 +294,12 @@ def spread(samples: wp.array1d[int], small: Patch, i: int, j: int, level: int) -
         return (1 << level) * wp.vec3i(channel(a, 0), channel(a, 1), channel(a, 2))
     b = samples[small.start + _index(size, x, y + 1)]
     c = samples[small.start + _index(size, x + 1, y)]
-    # In an upright triangle of the lattice the corners are one step up in z, in y and in x.
+    # In an upright triangle of the lattice the corners have z, y or x one step higher.
     wa = rz
     wb = ry
     wc = rx
     if rest > mask + 1:
-        # In an inverted one they are one step up in all but z, but x, but y.
+        # In an inverted one they have all but z, all but x or all but y one step higher.
         a = samples[small.start + _index(size, x + 1, y + 1)]
         wa = mask + 1 - rz
         wb = mask + 1 - rx
@@ -309,7 +313,7 @@ def spread(samples: wp.array1d[int], small: Patch, i: int, j: int, level: int) -
 
 @wp.func
 def distance_sum(samples: wp.array1d[int], large: Patch, small: Patch, order: int, limit: int) -> int:
-    """The sum of differences, vertex k of the small one on vertex p[k] of the large one; cut short past the limit."""
+    """Sum of differences, vertex k of the small patch on vertex p[k] of the large one; stops past the limit."""
     steps = 1 << large.level
     size = steps + 1
     at = large.start
@@ -342,6 +346,7 @@ def _compare(
     order: wp.array1d[wp.int8],
     distance: wp.array1d[wp.float64],
 ):
+    """One pair of patches per thread."""
     t = wp.tid()
     a = patches[representative[t]]
     b = patches[member[t]]
@@ -353,10 +358,10 @@ def _compare(
     limit = int(0x7FFFFFFF)
     best = int(0)
     for o in range(6):
-        turn = o
+        permutation = o
         if a.level < b.level:
-            turn = _inverse(o)
-        total = distance_sum(samples, large, small, turn, limit)
+            permutation = _inverse(o)
+        total = distance_sum(samples, large, small, permutation, limit)
         if total < limit:
             limit = total
             best = o
@@ -369,7 +374,7 @@ def _compare(
 
 
 def _starts(level: np.ndarray) -> np.ndarray:
-    """Where the patches' samples begin, and where the last ones end, int64 [F + 1]."""
+    """First sample of each patch, then the number of all samples, int64 [F + 1]."""
     return np.concatenate([[0], np.cumsum(samples_of(np.array(SIZES, np.int64))[level])])
 
 
@@ -379,12 +384,15 @@ def sample(lightmap: np.ndarray, corner: np.ndarray, level: np.ndarray, device) 
     Args:
         lightmap: uint16 [H, W, 4]: red, green, blue, and 1 where the texel is too bright, else 0.
         corner: int64 [F, 3, 2], (x, y) of the vertices in 1/65536 of a texel from the centre of texel (0, 0).
-        level: int32 [F], of the patches' sizes.
+        level: int32 [F], levels of the patches' sizes.
         device: Where the arrays go.
 
     Returns:
-        Of all patches the samples, int [sum of ``samples_of(SIZES[level])``]; Patch [F], without their dominant
-        colours; and uint8 [F], whether a patch reads a texel that is too bright.
+        The samples of all patches, int [sum of ``samples_of(SIZES[level])``]; Patch [F], without their dominant
+        colours; and uint8 [F], 1 where a patch reads a texel that is too bright.
+
+    Raises:
+        ValueError: More samples than 32 bits count.
     """
     start = _starts(level)
     if start[-1] > np.iinfo(np.int32).max:
@@ -405,17 +413,17 @@ def sample(lightmap: np.ndarray, corner: np.ndarray, level: np.ndarray, device) 
 def dominant(samples, patches, level: np.ndarray) -> None:
     """Finds the dominant colours, the commonest of 32 x 32 x 32 bins and the lowest of equals (section 3.2.1).
 
-    The patches are taken in lots, so that sorting takes no memory to speak of.
+    A limited number of samples is sorted at once, so that sorting takes little memory.
 
     Args:
         samples, patches: As of ``sample``; the latter's ``colour`` is written.
-        level: int32 [F], as given to ``sample``.
+        level: int32 [F], as passed to ``sample``.
     """
     device = samples.device
     start = _starts(level)
     begin = 0
     while begin < len(level):
-        end = max(int(np.searchsorted(start, start[begin] + _LOT, "right")) - 1, begin + 1)
+        end = max(int(np.searchsorted(start, start[begin] + _AT_ONCE, "right")) - 1, begin + 1)
         count = int(start[end] - start[begin])
         keys, items = (wp.empty(2 * count, dtype=int, device=device) for _ in range(2))
         local = wp.array((start[begin : end + 1] - start[begin]).astype(np.int32), dtype=int, device=device)
@@ -426,12 +434,12 @@ def dominant(samples, patches, level: np.ndarray) -> None:
 
 
 def bin_numbers(colour: np.ndarray) -> np.ndarray:
-    """The numbers of packed bins, by which they are ordered: red counts most."""
+    """Numbers of packed bins, the order of the graph's nodes: red in the highest bits."""
     return ((colour & 255) << 10) | ((colour >> 8 & 255) << 5) | (colour >> 16 & 255)
 
 
 def compare(samples, patches, member, representative) -> tuple[np.ndarray, np.ndarray]:
-    """The order that brings patches nearest to others, the first of equals, and their distance (eq. 2 and 3).
+    """Finds the order with the least distance of each pair, the first of equals, and that distance (eq. 2 and 3).
 
     Args:
         samples, patches: As of ``sample``.

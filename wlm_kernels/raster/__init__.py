@@ -1,1 +1,1 @@
-"""Kernels of rasterization and textures."""
+"""Kernels of rasterization, interpolation and textures, with their backward passes."""

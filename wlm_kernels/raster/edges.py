@@ -1,4 +1,7 @@
-"""Edge functions of triangles in homogeneous coordinates, and their exact signs; ``raster`` says what they are for."""
+"""Edge functions of triangles in homogeneous coordinates, and their exact signs.
+
+``wlm_kernels.raster.rasterize`` defines them. Read ``tests/reference/raster.py`` first: coverage in Python's integers.
+"""
 
 import warp as wp
 
@@ -9,12 +12,12 @@ __all__ = [
     "Corners",
     "Edges",
     "Frame",
-    "at",
     "box_of",
     "centre",
     "check_position",
     "corners_of",
     "covers",
+    "edges_at",
     "edges_of",
     "exact_sign",
     "finite",
@@ -30,16 +33,16 @@ wp.set_module_options({"enable_backward": False, "max_unroll": 4})
 
 SPACES = ("clip", "uv")
 
-# Along one axis. With more, a term of the exact edge function would no longer fit a float64.
 MOST_PIXELS = 16384
+"""Along one axis. With more, a term of the exact edge function would no longer fit a float64."""
 
 _LOW_BITS = wp.constant(wp.int64(2**29 - 1))
 _ZERO = wp.constant(wp.float64(0.0))
 _ONE = wp.constant(wp.float64(1.0))
 _TWO = wp.constant(wp.float64(2.0))
-# Rounding of an edge function, and of the determinant, is below 8 of 2^-53 of its terms' sizes.
+# Rounding errors of an edge function, and of the determinant, are below 8 * 2^-53 of the sum of its terms' sizes.
 _ROUNDING = wp.constant(wp.float64(2.0**-49))
-# Of a pixel; what a division may lose is far less.
+# In pixels; far more than the rounding of a division.
 _SLACK = wp.constant(wp.float64(1.0e-6))
 
 vec12d = wp.types.vector(length=12, dtype=wp.float64)
@@ -47,13 +50,13 @@ vec12d = wp.types.vector(length=12, dtype=wp.float64)
 
 @wp.struct
 class Frame:
-    """Where the pixel centres are: column i, row j is ((x + 2 i) H, (y + y_step j) W, scale W H), all of it integers.
+    """Pixel centres: column i, row j has its centre at ((x + 2 i) H, (y + y_step j) W, scale W H), all integers.
 
     Attributes:
         height, width: H, W.
-        x: Of column 0.
-        y, y_step: Of row 0, and from row to row.
-        scale: 1 where coordinates run from -1 to 1, 2 where from 0 to 1.
+        x: x of column 0.
+        y, y_step: y of row 0, and its change from row to row.
+        scale: 1 where coordinates run from -1 to 1, 2 where they run from 0 to 1.
     """
 
     height: int
@@ -76,7 +79,7 @@ class Corners:
 
 @wp.struct
 class Box:
-    """Pixels [left, right] x [top, bottom]; empty where the ends are the other way round."""
+    """Pixels [left, right] x [top, bottom]; empty where left > right or top > bottom."""
 
     left: int
     right: int
@@ -89,9 +92,9 @@ class Edges:
     """The three edge functions, E = x X + y Y + c for X = frame.x + 2 i, Y = frame.y + y_step j, positive inside.
 
     Attributes:
-        x, y, c: By the corner opposite.
-        limit: What rounding may come to; set by ``edges_of``.
-        sign: Of the determinant of the corners; 0: covers nothing.
+        x, y, c: Coefficients; component i belongs to the edge opposite corner i.
+        limit: Bound of the rounding error; set by ``edges_of``.
+        sign: Sign of the determinant of the corners; 0: covers nothing.
     """
 
     x: wp.vec3d
@@ -103,7 +106,7 @@ class Edges:
 
 @wp.func
 def corners_of(position: wp.array2d[float], triangle: wp.array2d[int], t: int) -> Corners:
-    """The corners of a triangle that has three."""
+    """The corners of a triangle; their numbers must be valid."""
     out = Corners()
     i = triangle[t, 0]
     j = triangle[t, 1]
@@ -122,7 +125,7 @@ def corners_of(position: wp.array2d[float], triangle: wp.array2d[int], t: int) -
 
 @wp.func
 def has_corners(triangle: wp.array2d[int], t: int, count: int) -> bool:
-    """Whether the numbers of a triangle's corners are below a count."""
+    """Whether the numbers of a triangle's corners are from 0 to ``count`` - 1."""
     i = triangle[t, 0]
     j = triangle[t, 1]
     k = triangle[t, 2]
@@ -139,20 +142,21 @@ def exact_sign(p: wp.vec3d, v: wp.vec3d, w: wp.vec3d) -> wp.float64:
     """Sign of det[p, v, w], for p of integers up to 2^29 or of float32s, and v, w of float32s.
 
     A product v_a w_b fits 48 bits, each half of it times p_c fits 53: twelve exact terms. They are added as an
-    expansion, a sum of float64s that don't overlap, whose last one that isn't zero has the sign.
+    expansion, a sum of float64s that don't overlap; its last component that isn't zero has the sign.
     """
     sums = vec12d()
     count = int(0)
     for term in range(6):
         axis = term // 2
-        one = (axis + 1 + term % 2) % 3
-        other = 3 - axis - one
-        whole = v[one] * w[other]
+        a = (axis + 1 + term % 2) % 3
+        b = 3 - axis - a
+        whole = v[a] * w[b]
         high = wp.cast(wp.cast(whole, wp.int64) & ~_LOW_BITS, wp.float64)
         factor = wp.where(term % 2 == 0, p[axis], -p[axis])
         for half in range(2):
             carry = factor * wp.where(half == 0, high, whole - high)
             for i in range(count):
+                # Two-sum: total and the rounding error of carry + old, exact together.
                 old = sums[i]
                 total = carry + old
                 rest = total - carry
@@ -169,7 +173,7 @@ def exact_sign(p: wp.vec3d, v: wp.vec3d, w: wp.vec3d) -> wp.float64:
 
 @wp.func
 def centre(frame: Frame, row: int, column: int) -> wp.vec3d:
-    """P, of integers."""
+    """P, integers."""
     return wp.vec3d(
         wp.float64((frame.x + 2 * column) * frame.height),
         wp.float64((frame.y + frame.y_step * row) * frame.width),
@@ -179,7 +183,7 @@ def centre(frame: Frame, row: int, column: int) -> wp.vec3d:
 
 @wp.func
 def functions(k: Corners, frame: Frame, sign: wp.float64) -> Edges:
-    """Each product of two float32s is exact, so a coefficient's sign is right, and its size to one rounding."""
+    """The edge functions. Products of two float32s are exact: a coefficient has the right sign and one rounding."""
     out = Edges()
     n0 = sign * wp.cross(k.b, k.c)
     n1 = sign * wp.cross(k.c, k.a)
@@ -195,6 +199,7 @@ def functions(k: Corners, frame: Frame, sign: wp.float64) -> Edges:
 
 @wp.func
 def edges_of(k: Corners, frame: Frame, cull: int) -> Edges:
+    """The edge functions, positive inside, with their rounding bounds; of sign 0 if the triangle covers nothing."""
     n = wp.cross(k.b, k.c)
     d = wp.dot(k.a, n)
     size = wp.abs(k.a[0] * n[0]) + wp.abs(k.a[1] * n[1]) + wp.abs(k.a[2] * n[2])
@@ -213,7 +218,7 @@ def edges_of(k: Corners, frame: Frame, cull: int) -> Edges:
 
 @wp.func
 def covers(e: Edges, k: Corners, frame: Frame, row: int, column: int) -> bool:
-    """Whether P, moved by the infinitely small step, lies inside; exact."""
+    """Whether P, moved by the infinitesimal step of the top-left rule, lies inside; exact."""
     p = centre(frame, row, column)
     v = k.b
     w = k.c
@@ -232,47 +237,48 @@ def covers(e: Edges, k: Corners, frame: Frame, row: int, column: int) -> bool:
 
 
 @wp.func
-def _seen(k: Corners, axis: int):
-    """Least and greatest x / w, or y / w, of the part in front of the viewer; the first is the greater if none is.
+def _extent(k: Corners, axis: int):
+    """Least and greatest x / w, or y / w, of the part in front of the viewer; least > greatest if there is none.
 
-    An edge that leaves the front goes off to one infinity, the same along all of it.
+    An edge that crosses w = 0 goes to an infinity whose sign is the same along all of it.
     """
     low = wp.float64(wp.inf)
     high = wp.float64(-wp.inf)
     for i in range(3):
         near = wp.where(i == 0, k.a, wp.where(i == 1, k.b, k.c))
         if near[2] > _ZERO:
-            at = near[axis] / near[2]
-            low = wp.min(low, at)
-            high = wp.max(high, at)
+            place = near[axis] / near[2]
+            low = wp.min(low, place)
+            high = wp.max(high, place)
             for j in range(3):
                 far = wp.where(j == 0, k.a, wp.where(j == 1, k.b, k.c))
                 if not far[2] > _ZERO:
-                    way = far[axis] * near[2] - near[axis] * far[2]
-                    if way > _ZERO:
+                    direction = far[axis] * near[2] - near[axis] * far[2]
+                    if direction > _ZERO:
                         high = wp.float64(wp.inf)
-                    if way < _ZERO:
+                    if direction < _ZERO:
                         low = wp.float64(-wp.inf)
     return low, high
 
 
 @wp.func
-def first_pixel(at: wp.float64, count: int) -> int:
+def first_pixel(place: wp.float64, count: int) -> int:
     """The first pixel at or after a place in pixels, 0 to count."""
-    return int(wp.clamp(wp.ceil(at - _SLACK), _ZERO, wp.float64(count)))
+    return int(wp.clamp(wp.ceil(place - _SLACK), _ZERO, wp.float64(count)))
 
 
 @wp.func
-def last_pixel(at: wp.float64, count: int) -> int:
+def last_pixel(place: wp.float64, count: int) -> int:
     """The last pixel at or before a place in pixels, -1 to count - 1."""
-    return int(wp.clamp(wp.floor(at + _SLACK), -_ONE, wp.float64(count - 1)))
+    return int(wp.clamp(wp.floor(place + _SLACK), -_ONE, wp.float64(count - 1)))
 
 
 @wp.func
 def box_of(k: Corners, frame: Frame) -> Box:
+    """Bounding box of the part in front of the viewer."""
     out = Box()
-    x_low, x_high = _seen(k, 0)
-    y_low, y_high = _seen(k, 1)
+    x_low, x_high = _extent(k, 0)
+    y_low, y_high = _extent(k, 1)
     x = wp.float64(frame.x)
     y = wp.float64(frame.y)
     size_x = wp.float64(frame.scale * frame.width)
@@ -289,13 +295,13 @@ def box_of(k: Corners, frame: Frame) -> Box:
 
 
 @wp.func
-def at(k: Corners, frame: Frame, row: int, column: int):
-    """The edge functions where a pixel is covered, made positive, and their slopes by X and by Y."""
+def edges_at(k: Corners, frame: Frame, row: int, column: int):
+    """The edge functions at a covered pixel, made positive, and their slopes by X and by Y."""
     e = functions(k, frame, _ONE)
     x = wp.float64(frame.x + 2 * column)
     y = wp.float64(frame.y + frame.y_step * row)
     f = x * e.x + (y * e.y + e.c)
-    # That the pixel is covered is known, and so that all have one sign.
+    # The pixel is covered, so all have one sign.
     sign = wp.where(f[0] + f[1] + f[2] < _ZERO, -_ONE, _ONE)
     f = wp.vec3d(wp.max(sign * f[0], _ZERO), wp.max(sign * f[1], _ZERO), wp.max(sign * f[2], _ZERO))
     return f, sign * e.x, sign * e.y
@@ -307,7 +313,11 @@ def total_of(v: wp.vec3d) -> wp.float64:
 
 
 def frame(height: int, width: int, space: str) -> Frame:
-    """Where the pixel centres of an image are."""
+    """Makes the frame of an image.
+
+    Raises:
+        ValueError: A size is out of range.
+    """
     for name, size in (("height", height), ("width", width)):
         if not 1 <= size <= MOST_PIXELS:
             raise ValueError(f"{name}: expected 1 to {MOST_PIXELS}, got {size}")

@@ -1,25 +1,25 @@
-"""Triangles to pixels, in clip space or in UV space: which triangle each pixel centre sees, where in it, how deep.
+"""Rasterization in clip space or UV space: the visible triangle at each pixel centre, the barycentrics, the depth.
 
 A pixel centre P and a corner v are homogeneous, (x, y, w). The edge function of corner i, E_i = det[P, v_j, v_k], is
 linear in the pixel; P lies in the part of the triangle that is in front of the viewer (w > 0) where all three have the
 sign of det[v_0, v_1, v_2], and E_i / (E_0 + E_1 + E_2) are the barycentrics of the point seen there. Nothing is divided
 by w, so a triangle that reaches behind the viewer needs no clipping; there is no near and no far plane.
 
-Whether a pixel is covered is decided without any rounding. Where float64 can't tell the sign of an edge function it is
-computed exactly, and where it is exactly zero the pixel counts as moved by an infinitely small step to the right, and
-by an infinitely smaller one down: the top-left rule, for both windings. So a pixel on an edge or a corner that
-triangles share is covered by exactly one of those that surround it, also where they have corners of their own with
-equal numbers.
+Coverage is decided without rounding. Where float64 can't decide the sign of an edge function it is computed exactly,
+and where it is exactly zero the pixel counts as moved by an infinitesimal step to the right, and by an infinitely
+smaller one down: the top-left rule, for both windings. So a pixel on an edge or a corner that triangles share is
+covered by exactly one of those that surround it, also where each has vertices of its own at equal positions.
 
-Which triangle wins a pixel is a minimum over 64-bit keys, depth first and then number: the same on every run.
+The visible triangle is a minimum over 64-bit keys, depth first and then number: the same on every run.
 
 Row 0 is the top row of the image. In clip space y points up, pixel (row j, column i) of H x W has its centre at
 x/w = (2 i + 1) / W - 1, y/w = 1 - (2 j + 1) / H, and of the triangles over a pixel the one of least z/w wins. In UV
 space, glTF's, v points down, the centre is u = (i + 1/2) / W, v = (j + 1/2) / H, and the least number wins.
 
-A triangle with a corner that isn't finite, or whose index names no corner, and one of no area, cover nothing.
+A triangle covers nothing if a corner isn't finite or doesn't exist, or if it has no area.
 
-The edge functions are in ``raster_edges``; ``raster_gradient`` reads attributes where the pixels look, and goes back.
+Edge functions are in ``edges``; interpolation and backward passes in ``gradient``. Read ``tests/reference/raster.py``
+first: the same by solving for the corners' weights at each pixel.
 """
 
 import math
@@ -35,11 +35,11 @@ from wlm_kernels.raster.edges import (
     Box,
     Corners,
     Frame,
-    at,
     box_of,
     check_position,
     corners_of,
     covers,
+    edges_at,
     edges_of,
     finite,
     first_pixel,
@@ -53,11 +53,11 @@ __all__ = ["MOST_PIXELS", "SPACES", "Raster", "Rasterizer"]
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 4})
 
-# Large triangles are cut into tiles of this side, a thread each: 64 pixels one after the other.
+# Large triangles are cut into tiles of this side, one thread per tile of 64 pixels.
 _TILE = wp.constant(8)
-# A box of no more pixels is drawn at once. On the CPU, where a launch is a loop, every triangle is.
+# A triangle with no more pixels in its box is drawn by one thread. On the CPU, where a launch is a loop, all are.
 _SMALL = 64
-# Threads that share the tiles, about what an H100 holds of them at a time.
+# Threads that share the tiles, about as many as an H100 keeps resident.
 _SHARERS = 65536
 
 _EMPTY = wp.constant(wp.int64(2**63 - 1))  # a key behind all depths
@@ -77,7 +77,7 @@ def _draw(
     keys: wp.array2d[wp.int64],
     coverage: wp.array2d[int],
 ):
-    """Offers a triangle to the pixels of a box."""
+    """Draws the part of a triangle in a box: lowers the keys and counts the coverage of its pixels."""
     e = edges_of(k, frame, cull)
     if e.sign == _ZERO:
         return
@@ -87,7 +87,7 @@ def _draw(
     z_x = wp.dot(e.x, k.z) / det
     z_y = wp.dot(e.y, k.z) / det
     z_c = wp.dot(e.c, k.z) / det
-    # A sliver may lose all digits of that; its depth is still between its corners'.
+    # For a sliver that may cancel completely; clamped to the depths of its corners.
     z_low = wp.float64(-wp.inf)
     z_high = wp.float64(wp.inf)
     if k.a[2] > _ZERO and k.b[2] > _ZERO and k.c[2] > _ZERO:
@@ -121,7 +121,7 @@ def _draw(
                     depth = z_low
                 if depth > z_high:
                     depth = z_high
-                # As an integer of the same order; -0 is made 0 first.
+                # As an integer of the same order; adding 0 turns -0 into 0.
                 bits = wp.cast(depth + _ZERO, wp.int64)
                 if bits < wp.int64(0):
                     bits = bits ^ _EMPTY
@@ -149,9 +149,10 @@ def _draw_small(
     queue: wp.array1d[int],
     starts: wp.array1d[wp.int64],
 ):
-    """Draws what is small and queues the rest.
+    """One triangle per thread: draws small ones and queues the others.
 
-    ``queued`` counts triangles in units and tiles below them, in one addition, so that the queue's starts rise.
+    ``queued`` counts triangles in multiples of ``unit`` and tiles below that, in one atomic addition, so that the
+    queue's starts rise.
     """
     t = wp.tid()
     if not has_corners(triangle, t, position.shape[0]):
@@ -189,6 +190,7 @@ def _draw_tiles(
     keys: wp.array2d[wp.int64],
     coverage: wp.array2d[int],
 ):
+    """One tile of a queued triangle per thread and round."""
     item = wp.int64(wp.tid())
     count = int(queued[0] / unit)
     items = queued[0] % unit
@@ -223,15 +225,16 @@ def _resolve(
     names: wp.int64,
     keys: wp.array2d[wp.int64],
     # out:
-    found: wp.array2d[int],
+    visible: wp.array2d[int],
     barycentric: wp.array2d[wp.vec2],
     depth: wp.array2d[float],
     derivative: wp.array2d[wp.vec4],
 ):
+    """One pixel per thread."""
     row, column = wp.tid()
     key = keys[row, column]
     if key == _EMPTY:
-        found[row, column] = -1
+        visible[row, column] = -1
         barycentric[row, column] = wp.vec2()
         depth[row, column] = 0.0
         if derivative.shape[0] > 0:
@@ -239,9 +242,9 @@ def _resolve(
         return
     t = int(key & names)
     k = corners_of(position, triangle, t)
-    f, f_x, f_y = at(k, frame, row, column)
+    f, f_x, f_y = edges_at(k, frame, row, column)
     total = total_of(f)
-    # Too small for float64 all over: any point of the triangle is as right.
+    # Where all edge functions underflow, any point of the triangle is as right.
     u = _ONE / wp.float64(3.0)
     v = u
     scale = _ZERO
@@ -250,7 +253,7 @@ def _resolve(
         u = f[0] * scale
         v = f[1] * scale
     share = wp.vec3d(u, v, _ONE - u - v)
-    found[row, column] = t
+    visible[row, column] = t
     barycentric[row, column] = wp.vec2(float(u), float(v))
     depth[row, column] = float(wp.dot(share, k.z) / wp.dot(share, wp.vec3d(k.a[2], k.b[2], k.c[2])))
     if derivative.shape[0] > 0:
@@ -266,16 +269,16 @@ def _resolve(
 
 @dataclass(frozen=True)
 class Raster:
-    """What each pixel sees.
+    """The visible surface point of each pixel.
 
     Attributes:
-        triangle: int [H, W], its number, -1: none.
-        barycentric: vec2 [H, W], the weights of the triangle's corners 0 and 1 at the point seen, in [0, 1], true in
-            space and not only on the screen; corner 2 has the rest. 0 where there is no triangle, as all below.
+        triangle: int [H, W], number of the visible triangle, -1: none.
+        barycentric: vec2 [H, W], weights of its corners 0 and 1, perspective-correct, in [0, 1]; corner 2 has the rest.
+            0 where there is no triangle, as all below.
         depth: float [H, W], z / w.
-        derivative: vec4 [H, W], how the weights change from pixel to pixel: du/dx, du/dy, dv/dx, dv/dy, for x to the
-            right and y down; None: not asked for.
-        coverage: int [H, W], how many triangles cover the pixel's centre, hidden ones too; None: not asked for.
+        derivative: vec4 [H, W], derivatives of the weights per pixel: du/dx, du/dy, dv/dx, dv/dy, x to the right and y
+            down; None: not computed.
+        coverage: int [H, W], number of triangles that cover the pixel's centre, hidden ones too; None: not computed.
     """
 
     triangle: Any
@@ -286,19 +289,18 @@ class Raster:
 
 
 class Rasterizer:
-    """Draws the same triangles many times. All buffers are made here: ``run`` may be captured in a CUDA graph.
+    """Draws the same triangles many times. Buffers are allocated once: ``run`` may be captured in a CUDA graph.
 
-    Beside the result it holds 8 bytes a pixel and 12 a triangle: what a triangle is cut into is counted, not stored.
+    Beside the result it holds 8 bytes per pixel and 12 per triangle: tiles of triangles are counted, not stored.
 
     Args:
         triangle: int [F, 3], numbers of corners.
-        height, width: Of the image, 1 to ``MOST_PIXELS``.
+        height, width: Size of the image, 1 to ``MOST_PIXELS``.
         space: "clip" or "uv", see the module.
-        cull: Whether to leave out triangles that run clockwise: as seen on the screen in clip space, in a frame with v
-            up in UV space.
-        derivative, coverage: Whether to fill these of ``Raster``.
-        split: The most pixels in the box of a triangle that one thread draws; None: 64 on CUDA, no limit on the CPU.
-        empty: Makes a buffer, ``empty(shape, dtype=...)`` on the triangles' device; default Warp's.
+        cull: Whether to leave out clockwise triangles: on the screen in clip space, in a frame with v up in UV space.
+        derivative, coverage: Whether to compute these of ``Raster``.
+        split: Most pixels in the box of a triangle that one thread draws; None: 64 on CUDA, no limit on the CPU.
+        empty: Allocates a buffer, ``empty(shape, dtype=...)`` on the triangles' device; default Warp's.
 
     Attributes:
         raster: ``Raster``, what ``run`` fills.
@@ -354,7 +356,7 @@ class Rasterizer:
         )
 
     def run(self, position) -> Raster:
-        """Draws.
+        """Draws the triangles.
 
         Args:
             position: float [V, 4], clip coordinates x, y, z, w; or in UV space float [V, 2], u and v.
@@ -363,7 +365,7 @@ class Rasterizer:
             ``raster``, overwritten by the next run.
 
         Raises:
-            ValueError: ``position`` isn't of the space's shape.
+            ValueError: ``position`` has a wrong shape for the space.
         """
         check_position(position, self._space)
         device, count = self._triangle.device, self._triangle.shape[0]

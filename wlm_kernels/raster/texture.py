@@ -1,17 +1,20 @@
-"""Reading a texture between its texels, and the ways back (lightmap-uv-clustering-cascade, section 3.3.2).
+"""Bilinear and nearest texture reads, and their backward pass (lightmap-uv-clustering-cascade, section 3.3.2).
 
-u points right and v down, row 0 is v = 0; texel i of n has its centre at (i + 1/2) / n. What lies outside [0, 1] is
+u points right and v down, row 0 is v = 0; texel i of n has its centre at (i + 1/2) / n. What lies outside [0, 1]
+depends on the boundary:
 
     clamp   the nearest texel of the border;
-    wrap    the texture again, as it is;
-    mirror  the texture again, every other time turned round: the triangle wave of period 2, F(x) = |x - 2 floor(x/2 +
-            1/2)|. Eq. 8 of the paper has a floor where the bars must be, which makes it -2 or 0 everywhere.
+    wrap    the texture repeated;
+    mirror  the texture repeated, every other copy mirrored: the triangle wave of period 2, F(x) = |x - 2 floor(x/2 +
+            1/2)|. Eq. 8 of the paper has a floor in place of the absolute value, which makes it -2 or 0 everywhere.
 
-Coordinates are float32, but weights are made in float64: at 4,096 texels float32 would leave them 12 bits. A coordinate
-that is NaN, or infinite and not clamped, reads NaN; it has no gradient and gives the texels none.
+Coordinates are float32, but weights are computed in float64: at 4,096 texels float32 would leave them 12 bits. A
+coordinate that is NaN, or infinite and not clamped, reads NaN; it has no gradient and gives the texels none.
 
-``axis_at``, ``read``, ``read_slope`` and ``add`` are for other kernels that read textures; an ``Axis`` of each of u and
-v serves all channels, forward and back.
+``axis_at``, ``read``, ``read_slope`` and ``add`` serve other kernels that read textures; one ``Axis`` for u and one for
+v serve all channels, forward and backward.
+
+Read ``tests/reference/texture.py`` first: the same by torch's ``grid_sample`` in float64.
 """
 
 import warp as wp
@@ -42,12 +45,12 @@ _NEAREST = wp.constant(FILTERS.index("nearest"))
 
 @wp.struct
 class Axis:
-    """Where a coordinate lies among the texels of one axis.
+    """A coordinate's two texels along one axis, and their weights.
 
     Attributes:
-        low, high: Texels on its two sides, the same one where there is no other; always in the texture.
-        weight: Of ``high``, in [0, 1]; ``low`` has the rest. NaN: the coordinate names no place.
-        slope: What ``weight`` changes by per unit of the coordinate; 0: nothing changes.
+        low, high: The texels on its two sides, equal at a border; always in the texture.
+        weight: Weight of ``high``, in [0, 1]; ``low`` has the rest. NaN: the coordinate reads NaN.
+        slope: Derivative of ``weight`` by the coordinate.
     """
 
     low: int
@@ -58,7 +61,7 @@ class Axis:
 
 @wp.func
 def triangle_wave(x: float) -> float:
-    """Eq. 8: |x| for x in [-1, 1], of period 2; exact. NaN of what isn't finite."""
+    """Eq. 8: |x| for x in [-1, 1], of period 2; exact. NaN for NaN and infinity."""
     t = wp.float64(x)
     half = wp.float64(0.5)
     return float(wp.abs(t - wp.float64(2.0) * wp.floor(half * t + half)))
@@ -66,7 +69,7 @@ def triangle_wave(x: float) -> float:
 
 @wp.func
 def triangle_wave_slope(x: float) -> float:
-    """1 where the wave rises and in its valleys, -1 where it falls and on its peaks; 0 of what isn't finite."""
+    """1 where the wave rises and in its valleys, -1 where it falls and on its peaks; 0 for NaN and infinity."""
     if not wp.isfinite(x):
         return 0.0
     t = wp.float64(x)
@@ -76,12 +79,12 @@ def triangle_wave_slope(x: float) -> float:
 
 @wp.func
 def axis_at(x: float, size: int, filter: int, boundary: int) -> Axis:
-    """Places a coordinate.
+    """Finds the texels and weights of a coordinate.
 
     Args:
         x: u or v.
         size: Texels along the axis, at least 1.
-        filter, boundary: As ``codes`` gives them.
+        filter, boundary: Numbers by ``codes``.
     """
     out = Axis()
     n = wp.float64(size)
@@ -110,7 +113,7 @@ def axis_at(x: float, size: int, filter: int, boundary: int) -> Axis:
         out.low = wp.where(out.low < 0, size - 1, out.low)
         out.high = wp.where(out.high == size, 0, out.high)
     elif out.low < 0 or out.high == size:
-        # The texel beyond the border is the one on it, clamped or mirrored.
+        # Clamped or mirrored, the texel beyond the border is the border's own.
         out.low = wp.clamp(out.low, 0, size - 1)
         out.high = out.low
         out.weight = 0.0
@@ -122,7 +125,7 @@ def axis_at(x: float, size: int, filter: int, boundary: int) -> Axis:
 def read(texture: wp.array3d[float], x: Axis, y: Axis, c: int) -> float:
     """Channel c at a place."""
     top = texture[y.low, x.low, c]
-    # A neighbour without weight isn't looked at: it may be infinite.
+    # A neighbour with weight 0 isn't read: it may be infinite.
     if x.weight != 0.0:
         top = (1.0 - x.weight) * top + x.weight * texture[y.low, x.high, c]
     if y.weight == 0.0:
@@ -135,7 +138,7 @@ def read(texture: wp.array3d[float], x: Axis, y: Axis, c: int) -> float:
 
 @wp.func
 def read_slope(texture: wp.array3d[float], x: Axis, y: Axis, c: int) -> wp.vec2:
-    """What channel c changes by per unit of u and of v."""
+    """Derivatives of channel c by u and by v."""
     if wp.isnan(x.weight) or wp.isnan(y.weight):
         return wp.vec2()
     top_left = texture[y.low, x.low, c]
@@ -149,7 +152,7 @@ def read_slope(texture: wp.array3d[float], x: Axis, y: Axis, c: int) -> wp.vec2:
 
 @wp.func
 def add(grad: wp.array3d[float], x: Axis, y: Axis, c: int, g: float):
-    """Adds the gradient of what ``read`` gave to that of the texels that it came from."""
+    """Adds the gradient of a value of ``read`` to the gradients of its texels."""
     if wp.isnan(x.weight) or wp.isnan(y.weight):
         return
     top = (1.0 - y.weight) * g
@@ -173,6 +176,7 @@ def _sample(
     # out:
     out: wp.array2d[float],
 ):
+    """One point per thread."""
     i = wp.tid()
     x = axis_at(uv[i][0], texture.shape[1], filter, boundary)
     y = axis_at(uv[i][1], texture.shape[0], filter, boundary)
@@ -192,6 +196,7 @@ def _sample_backward(
     grad_texture: wp.array3d[float],
     grad_uv: wp.array1d[wp.vec2],
 ):
+    """One point per thread."""
     i = wp.tid()
     x = axis_at(uv[i][0], texture.shape[1], filter, boundary)
     y = axis_at(uv[i][1], texture.shape[0], filter, boundary)
@@ -199,29 +204,29 @@ def _sample_backward(
         for c in range(texture.shape[2]):
             add(grad_texture, x, y, c, grad_out[i, c])
     if grad_uv.shape[0] > 0:
-        on_u = float(0.0)
-        on_v = float(0.0)
+        grad_u = float(0.0)
+        grad_v = float(0.0)
         if filter != _NEAREST:
             for c in range(texture.shape[2]):
                 slope = read_slope(texture, x, y, c)
-                on_u += grad_out[i, c] * slope[0]
-                on_v += grad_out[i, c] * slope[1]
-        grad_uv[i] = wp.vec2(on_u, on_v)
+                grad_u += grad_out[i, c] * slope[0]
+                grad_v += grad_out[i, c] * slope[1]
+        grad_uv[i] = wp.vec2(grad_u, grad_v)
 
 
 def codes(filter: str, boundary: str) -> tuple[int, int]:
-    """What kernels call a filter and a boundary.
+    """The numbers of a filter and a boundary in kernels.
 
     Args:
         filter: "linear", between the four nearest texels, or "nearest".
         boundary: "clamp", "wrap" or "mirror", see the module.
 
     Raises:
-        ValueError: There is no such one.
+        ValueError: An unknown name.
     """
-    for name, value, known in (("filter", filter, FILTERS), ("boundary", boundary, BOUNDARIES)):
-        if value not in known:
-            raise ValueError(f"{name}: expected one of {', '.join(known)}, got {value!r}")
+    for name, value, names in (("filter", filter, FILTERS), ("boundary", boundary, BOUNDARIES)):
+        if value not in names:
+            raise ValueError(f"{name}: expected one of {', '.join(names)}, got {value!r}")
     return FILTERS.index(filter), BOUNDARIES.index(boundary)
 
 
@@ -231,7 +236,7 @@ def _check(texture) -> None:
 
 
 def sample(texture, uv, out, *, filter: str = "linear", boundary: str = "clamp") -> None:
-    """Reads a texture at any places.
+    """Reads a texture at any coordinates.
 
     Args:
         texture: float [H, W, C].
@@ -247,15 +252,15 @@ def sample(texture, uv, out, *, filter: str = "linear", boundary: str = "clamp")
 def sample_backward(
     texture, uv, grad_out, grad_texture, grad_uv, *, filter: str = "linear", boundary: str = "clamp"
 ) -> None:
-    """The gradients of ``sample``; that by uv is the one of the texels it lies between, 0 where the border is clamped.
+    """Backward pass of ``sample``. The gradient of uv is the slope between its texels, 0 at a clamped border.
 
     On CUDA samples are added to ``grad_texture`` in any order, so that the last bits change from run to run.
 
     Args:
         texture, uv, filter, boundary: As for ``sample``.
         grad_out: float [N, C].
-        grad_texture: float [H, W, C], added to; of shape [0, 0, 0]: not wanted.
-        grad_uv: vec2 [N], written; of shape [0]: not wanted.
+        grad_texture: float [H, W, C], added to; of shape [0, 0, 0]: not computed.
+        grad_uv: vec2 [N], written; of shape [0]: not computed.
     """
     _check(texture)
     inputs = [texture, uv, *codes(filter, boundary), grad_out]

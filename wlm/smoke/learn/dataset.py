@@ -34,15 +34,15 @@ from wlm.errors import WlmError
 from wlm.fluid.solver import Solver
 from wlm.fluid.volume import load_volume
 from wlm.interop import check_device, no_collection, stream
-from wlm.smoke.baking import six_way
+from wlm.smoke.baking import bake
 from wlm.smoke.camera import Camera
 from wlm.smoke.learn.pool import Pool
 from wlm.smoke.learn.scenes import draw_scene, generator
 from wlm.smoke.learn.settings import EDGE, PERIOD, DatasetSettings
 from wlm.smoke.motion import motion
-from wlm.smoke.planes import GUIDES, PLANES, encode_lightmaps, look_at
+from wlm.smoke.planes import GUIDES, PLANES, encode_lightmaps, render_guide
 from wlm.smoke.scene import CameraSettings, Scene, make_camera
-from wlm.smoke.simulate import make_solver, volume_of
+from wlm.smoke.simulation import make_solver, volume_of
 from wlm.system import Meter, OnProgress
 
 __all__ = ["ATTEMPTS", "STAGES", "fixed_cameras", "make_pool", "make_validation", "pool_of_volume"]
@@ -138,8 +138,8 @@ def pool_of_volume(
     cameras = fixed_cameras(settings, volume.origin, volume.voxel * np.asarray(volume.shape))
     guides, targets = [], []
     for number, camera in enumerate(cameras):
-        guides.append(look_at(volume, camera, settings.guide, seed=number, **settings.look(volume.shape)).half())
-        targets.append(encode_lightmaps(six_way(volume, camera, step=settings.reference_step, estimate=False)).half())
+        guides.append(render_guide(volume, camera, settings.guide, settings.look(volume.shape, number)).half())
+        targets.append(encode_lightmaps(bake(volume, camera, step=settings.reference_step, estimate=False)).half())
     pairs = [torch.stack([torch.stack(parts)] * 2, 1) for parts in (guides, targets)]
     still = torch.zeros((len(cameras), 2, *pairs[0].shape[-2:]), dtype=torch.float16, device=pairs[0].device)
     return Pool(*pairs, still, torch.zeros(len(cameras), dtype=torch.int64, device=pairs[0].device))
@@ -244,10 +244,10 @@ class _Maker:
                 for number, shot in enumerate(shots, pair * views):
                     volume = replace(smoke, extinction=smoke.extinction * shot.scale)
                     with clock("guide"):
-                        look = settings.look(volume.shape) | {"seed": shot.seed + frame}
-                        guides[number, frame] = look_at(volume, shot.camera, settings.guide, **look)
+                        march = settings.look(volume.shape, shot.seed + frame)
+                        guides[number, frame] = render_guide(volume, shot.camera, settings.guide, march)
                     with clock("reference"):
-                        six = six_way(volume, shot.camera, step=settings.reference_step, estimate=False)
+                        six = bake(volume, shot.camera, step=settings.reference_step, estimate=False)
                         targets[number, frame] = encode_lightmaps(six)
                     if frame:
                         with clock("motion"):

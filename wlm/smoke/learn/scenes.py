@@ -21,7 +21,7 @@ import numpy as np
 
 from wlm.fluid.solver import LEAST_HALF_LOSS
 from wlm.smoke.learn.settings import EDGE, LATTICE_SPEED, SPEED, DatasetSettings
-from wlm.smoke.scene import Air, Grid, Inlet, Obstacle, Scene, Smoke, Source
+from wlm.smoke.scene import Air, Grid, Inlet, ObstacleSettings, Scene, Smoke, SourceSettings
 
 __all__ = ["Tilted", "draw_scene", "generator"]
 
@@ -33,7 +33,7 @@ _CYLINDERS, _SPHERES = 0.65, 0.85  # cumulative shares of the obstacles' shapes;
 _CROSSING = (0.9, 1.6)  # seconds in which it crosses the box
 
 
-class Tilted(Obstacle):
+class Tilted(ObstacleSettings):
     """An obstacle whose y axis is turned to another direction.
 
     Attributes:
@@ -43,7 +43,7 @@ class Tilted(Obstacle):
     axis: tuple[float, float, float] = (0.0, 1.0, 0.0)
 
     def mesh(self) -> tuple[np.ndarray, np.ndarray]:
-        """As ``Obstacle.mesh``, turned."""
+        """As ``ObstacleSettings.mesh``, turned."""
         points, triangles = super().mesh()
         up = np.array(self.axis) / np.linalg.norm(self.axis)
         right = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
@@ -145,7 +145,7 @@ def _flame(random: np.random.Generator) -> dict[str, Any]:
 
 def _plume(random: np.random.Generator) -> dict[str, Any]:
     """A sphere held at a density and a temperature; smoke rises from it and rolls up."""
-    sphere = Source(
+    sphere = SourceSettings(
         centre=_place(random, (0.35, 0.1, 0.35), (0.65, 0.16, 0.65)),
         radius=EDGE * _log(random, *_RADIUS),
         density=random.uniform(0.6, 1.0),
@@ -158,7 +158,7 @@ def _plume(random: np.random.Generator) -> dict[str, Any]:
 def _burst(random: np.random.Generator) -> dict[str, Any]:
     """Spheres side by side, hot for a moment."""
     spheres = [
-        Source(
+        SourceSettings(
             centre=_place(random, (0.32, 0.12, 0.32), (0.68, 0.3, 0.68)),
             radius=EDGE * random.uniform(0.08, 0.17),
             density=random.uniform(0.7, 1.0),

@@ -9,6 +9,8 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 from pydantic_core import PydanticCustomError
 
+from wlm_kernels.smoke.settings import March
+
 __all__ = ["EDGE", "LATTICE_SPEED", "PERIOD", "SPEED", "DatasetSettings", "GuideKind", "LossSettings", "TrainSettings"]
 
 EDGE, SPEED, LATTICE_SPEED = 1.0, 1.0, 0.1
@@ -125,18 +127,17 @@ class DatasetSettings(BaseModel):
         graph = PERIOD * self.substeps
         return round(crossings * self.cells / (LATTICE_SPEED * graph)) * graph
 
-    def look(self, shape: Sequence[int]) -> dict[str, float]:
-        """The guiding map's march for a grid of this shape, as keywords of ``planes.look_at``.
+    def look(self, shape: Sequence[int], seed: int = 0) -> March:
+        """The march of a guiding map through a grid.
 
         Args:
             shape: Voxels along x, y, z.
-
-        Returns:
-            ``step``, ``jitter`` and ``threshold``; ``spacing`` where ``guide_spacing`` is set.
+            seed: Of the jitter.
         """
         longest = max(shape)
-        look = {"step": self.guide_step * longest, "jitter": self.jitter, "threshold": self.surface / longest}
-        return look if self.guide_spacing is None else look | {"spacing": self.guide_spacing * longest}
+        spacing = None if self.guide_spacing is None else self.guide_spacing * longest
+        threshold = self.surface / longest
+        return March(self.guide_step * longest, spacing, jitter=self.jitter, seed=seed, threshold=threshold)
 
 
 class LossSettings(BaseModel):

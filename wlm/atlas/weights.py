@@ -1,0 +1,87 @@
+"""Weights of a lightmap's error: how much each part of it counts, by visibility and by nearness to a seam."""
+
+from functools import cached_property
+
+import numpy as np
+import torch
+from scipy.ndimage import maximum_filter, minimum_filter
+
+from wlm.atlas.charts import mesh_charts
+from wlm.atlas.coverage import covered_texels
+from wlm.atlas.data import LightmappedMesh
+from wlm.atlas.model import Profile
+from wlm.atlas.views import sphere_views, surface_points, texel_triangles, visibility
+
+__all__ = ["FineGrid", "weights"]
+
+_BORDER = 2  # cells of the fine grid: one texel
+_RESOLUTION = 768  # pixels along a side of a view that visibility is counted in
+_POINTS = 4  # random points of the surface per cell, where there are no views
+_POINTS_AT_ONCE = 1 << 20
+
+
+class FineGrid:
+    """The lightmap's grid at twice its resolution: each cell is a quarter of a texel. Its maps are computed once.
+
+    Attributes:
+        mesh: The mesh.
+        device: "cpu" or "cuda:N".
+        height, width: Cells, 2 H and 2 W.
+    """
+
+    def __init__(self, mesh: LightmappedMesh, device: str) -> None:
+        self.mesh, self.device = mesh, device
+        self.height, self.width = (2 * count for count in mesh.mask.shape)
+
+    @cached_property
+    def triangle(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """The triangle that holds each cell's centre, and the weights of its corners, as ``texel_triangles``."""
+        return texel_triangles(self.mesh, self.height, self.width, self.device)
+
+    @cached_property
+    def covered(self) -> np.ndarray:
+        """bool [2 H, 2 W], whether a triangle holds the centre, exactly."""
+        mesh = self.mesh
+        return covered_texels(mesh.uv, mesh.triangle[mesh.active], self.height, self.width) > 0
+
+    @cached_property
+    def border(self) -> np.ndarray:
+        """bool [2 H, 2 W], within a texel of a chart's border."""
+        triangle = self.triangle[0].cpu().numpy()
+        chart = np.where(triangle < 0, -1, mesh_charts(self.mesh)[triangle])
+        window = 2 * _BORDER + 1
+        return maximum_filter(chart, window) != minimum_filter(chart, window)
+
+
+def weights(grid: FineGrid, profile: Profile, seed: int) -> np.ndarray:
+    """How much each cell counts: the pixels that show it in random views, and a little for those that none shows.
+
+    Returns:
+        float64 [2 H, 2 W], 0 where there is no triangle; at least one is above 0.
+    """
+    mesh, height, width = grid.mesh, grid.height, grid.width
+    if not profile.views:
+        visible = _areas(mesh, height, width, seed)
+    else:
+        views = sphere_views(profile.views, seed)
+        visible = visibility(mesh, views, _RESOLUTION, height, width, grid.device)
+    used = grid.covered | (visible > 0)
+    if not used.any():  # the mesh is smaller than a cell, and no pixel shows it
+        used = np.repeat(np.repeat(mesh.mask, 2, 0), 2, 1)
+    mean = visible[used].mean() or 1.0
+    result = np.where(used, visible + profile.unseen * mean, 0.0)
+    return np.where(grid.border, profile.border * result, result)
+
+
+def _areas(mesh: LightmappedMesh, height: int, width: int, seed: int) -> np.ndarray:
+    """How many random points of the mesh's surface lie in each cell of UV space, int64 [height, width]."""
+    random = np.random.default_rng(seed)
+    count = np.zeros(height * width, np.int64)
+    total = _POINTS * height * width
+    for first in range(0, total, _POINTS_AT_ONCE):
+        points = min(_POINTS_AT_ONCE, total - first)
+        triangle, weight = surface_points(mesh, points, random)
+        uv = np.einsum("nk,nkc->nc", weight, mesh.uv[mesh.triangle[triangle]])
+        column, row = ((uv[:, i] * n).astype(np.int64).clip(0, n - 1) for i, n in enumerate((width, height)))
+        count += np.bincount(row * width + column, minlength=height * width)
+    return count.reshape(height, width)
