@@ -16,17 +16,13 @@ from pathlib import Path
 
 import numpy as np
 
+import wlm
 from wlm.cli.console import quiet_warp, show_figures
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_write
 from wlm.formats.exr import read_exr, write_exr
 from wlm.interop import check_device
-from wlm.lightmap import codec
-from wlm.lightmap.data import LightmapSet, load_set
-from wlm.lightmap.decode import Decoder
-from wlm.lightmap.evaluation import Report, evaluate
-from wlm.lightmap.fit import compress
-from wlm.lightmap.model import Profile, load_profile
+from wlm.lightmap import LightmapSet, Report
 from wlm.view.sheet import before_after_error
 
 HERE = Path(__file__).resolve().parent
@@ -48,19 +44,17 @@ def run(out: Path, device: str) -> dict[str, float]:
         nonlocal clock
         seconds[name], clock = time.perf_counter() - clock, time.perf_counter()
 
-    lightmaps = load_set(HERE / "data" / "city")
+    lightmaps = wlm.lightmap.load(HERE / "data" / "city")
     lap("load")
-    profile = Profile(**load_profile("M").model_dump() | {"steps": STEPS, "samples": SAMPLES})
-    model = compress(lightmaps, profile, seed=0, device=device)
     path = out / "city.wlm"
-    size = codec.write(path, model)
+    size = wlm.lightmap.compress(lightmaps, "M", device=device, steps=STEPS, samples=SAMPLES).save(path)
     lap("fit")
-    # From here on the file is all there is.
-    model = codec.read(path)
-    decoder = Decoder(model, device)
+    # From here on everything comes from the file.
+    model = wlm.load(path)
+    decoder = model.decoder(device)
     write_exr(out / "city_18_50h.exr", decoder.frame(BETWEEN))
     lap("decode")
-    report = evaluate(model, lightmaps, size, device=device)
+    report = wlm.lightmap.evaluate(model, lightmaps, device=device)
     atomic_write(out / "report.json", (json.dumps(report.to_json(), indent=1) + "\n").encode())
     lap("evaluate")
     decoded = np.stack([decoder.frame(stamp) for stamp in model.times])
@@ -72,7 +66,7 @@ def run(out: Path, device: str) -> dict[str, float]:
         "SSIM": report.ssim,
         "FLIP": report.flip,
         "bytes": size,
-        "bits a texel and hour": report.bpp,
+        "bits per texel and hour": report.bpp,
         "times smaller": _half_bytes(lightmaps) / size,
     } | {f"seconds to {name}": value for name, value in seconds.items()}
 
@@ -83,10 +77,10 @@ def _half_bytes(lightmaps: LightmapSet) -> int:
 
 
 def _check(lightmaps: LightmapSet, report: Report, out: Path) -> None:
-    """Holds the result to the bounds above; what it raises names the figure."""
+    """Checks the result against the bounds above; an error names the figure."""
     ratio = _half_bytes(lightmaps) / report.bytes
     if not report.bpp <= MOST_BPP:
-        raise WlmError(f"demo: expected at most {MOST_BPP} bits a texel, got {report.bpp:.3f}")
+        raise WlmError(f"demo: expected at most {MOST_BPP} bits per texel, got {report.bpp:.3f}")
     if not report.psnr >= LEAST_PSNR:
         raise WlmError(f"demo: expected a PSNR of at least {LEAST_PSNR} dB, got {report.psnr:.2f}")
     if not ratio >= LEAST_RATIO:

@@ -18,7 +18,7 @@ from PIL import Image
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_path, atomic_write
 from wlm.formats.exr import write_exr
-from wlm.lightmap.data import LightmapSet, load_set
+from wlm.lightmap.data import LightmapSet, load
 
 
 def crop(lightmaps: LightmapSet, out: Path, y: int, x: int, height: int, width: int) -> int:
@@ -83,7 +83,7 @@ def main() -> None:
         parser.add_argument(f"--{name}", type=int, required=True, help=f"{name} of the crop in texels")
     args = parser.parse_args()
     try:
-        lightmaps = load_set(args.set)
+        lightmaps = load(args.set)
         size = crop(lightmaps, args.out, args.y, args.x, args.height, args.width)
     except WlmError as error:
         sys.exit(f"error: {error}")

@@ -16,7 +16,7 @@ import numpy as np
 
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_path
-from wlm.probe.data import ProbeSet, load_probes
+from wlm.probe.data import ProbeSet, load
 
 
 def crop(sets: list[ProbeSet], out: Path, low: list[float], high: list[float]) -> tuple[int, list[float]]:
@@ -70,7 +70,7 @@ def main() -> None:
         parser.add_argument(f"--{name}", type=float, nargs=3, required=True, metavar=("X", "Y", "Z"), help=help_text)
     args = parser.parse_args()
     try:
-        sets = [load_probes(args.input, key=key) for key in args.keys]
+        sets = [load(args.input, key=key) for key in args.keys]
         count, scores = crop(sets, args.out, args.low, args.high)
     except WlmError as error:
         sys.exit(f"error: {error}")

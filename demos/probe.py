@@ -14,17 +14,11 @@ import sys
 import time
 from pathlib import Path
 
+import wlm
 from wlm.cli.console import quiet_warp, show_figures
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_write
 from wlm.interop import check_device
-from wlm.probe import codec
-from wlm.probe.data import load_probes, save_probes
-from wlm.probe.decode import Decoder
-from wlm.probe.evaluation import evaluate
-from wlm.probe.fit import compress
-from wlm.probe.model import Profile, load_profile
-from wlm.probe.volume import Volume
 from wlm.probe.walk import EYE_HEIGHT, camera_path, summary, walk
 from wlm.view.spheres import render_probes
 
@@ -52,28 +46,27 @@ def run(out: Path, device: str) -> dict[str, float]:
         nonlocal clock
         seconds[name], clock = time.perf_counter() - clock, time.perf_counter()
 
-    probes = load_probes(HERE / "data" / "probes" / "street.npz", key="12.00")
+    probes = wlm.probe.load(HERE / "data" / "probes" / "street.npz", key="12.00")
     lap("load")
-    profile = Profile(**load_profile("small").model_dump() | {"steps": STEPS})
     path = out / "street.wlm"
-    size = codec.write(path, compress(probes, profile, seed=0, device=device))
+    size = wlm.probe.compress(probes, "small", seed=0, device=device, steps=STEPS).save(path)
     lap("fit")
     # From here on the file is all there is, but for the positions, which an engine has.
-    model = codec.read(path)
-    decoder = Decoder(model, device)
+    model = wlm.load(path)
+    decoder = model.decoder(device)
     decoded = decoder.decode_probes(probes.position)
-    save_probes(out / "street_decoded.npz", probes.position, decoded)
+    wlm.probe.save_probes(out / "street_decoded.npz", probes.position, decoded)
     lap("decode")
-    report = evaluate(decoded, probes, size)
+    report = wlm.probe.score(decoded, probes, size)
     lap("evaluate")
-    volume = Volume(probes.position, decoder.decode, model.outputs, live=probes.live, scale=SCALE, device=device)
+    live = probes.live
+    volume = wlm.probe.Volume(probes.position, decoder.decode, model.outputs, live=live, scale=SCALE, device=device)
     figures = summary(walk(volume, camera_path(volume.position, FRAMES, EYE_HEIGHT * SCALE)))
     lap("walk")
     content = {"report": report.to_json(), "walk": figures}
     atomic_write(out / "street_report.json", (json.dumps(content, indent=1) + "\n").encode())
     try:
-        shown = probes.live
-        render_probes(out / "street.png", probes.position[shown], probes.values[shown], decoded[shown])
+        render_probes(out / "street.png", probes.position[live], probes.values[live], decoded[live])
     except WlmError as error:
         # A picture needs pyvista and an OpenGL library; all else here does not.
         print(error)
@@ -82,20 +75,20 @@ def run(out: Path, device: str) -> dict[str, float]:
         "PSNR dB": report.psnr,
         "PSNR dB of the irradiance": report.irradiance_psnr,
         "bytes": size,
-        "bits a probe": report.bits_per_probe,
+        "bits per probe": report.bits_per_probe,
         "times smaller": 1.0 / report.ratio,
         "Gaussians": model.count,
         "covered by the volume": figures["coverage"]["mean"],
         "error of the volume": figures["rmse"]["mean"] / figures["rms"]["mean"],
         "blocks decoded a frame": figures["updated"]["mean"],
     }
-    _check(result, bool(decoded[~probes.live].any()))
+    _check(result, bool(decoded[~live].any()))
     return result | {f"seconds to {name}": value for name, value in seconds.items()}
 
 
-def _check(result: dict[str, float], haunted: bool) -> None:
-    """Holds the result to the bounds above; what it raises names the figure."""
-    if haunted:
+def _check(result: dict[str, float], dead_probes_lit: bool) -> None:
+    """Holds the result to the bounds above; an error names the figure."""
+    if dead_probes_lit:
         raise WlmError("demo: expected dead probes to decode to zero")
     for name, bound in (("bytes", MOST_BYTES), ("error of the volume", MOST_VOLUME_ERROR)):
         if not result[name] <= bound:

@@ -16,21 +16,21 @@ import time
 from pathlib import Path
 
 import numpy as np
+from wlm.smoke.guide import guide
+from wlm.smoke.simulate import simulate
 
 from wlm.cli.console import quiet_warp, show_figures
 from wlm.errors import WlmError
-from wlm.fluid.volume import DensityVolume, load_volume
+from wlm.fluid.volume import DensityVolume, load_volume, save_volume
 from wlm.formats.atomic import atomic_write
 from wlm.interop import check_device
 from wlm.smoke.baking import SixWay, lit, six_way
 from wlm.smoke.camera import DIRECTIONS, axis_faults
-from wlm.smoke.data import open_footage, open_frames, save_volume
+from wlm.smoke.data import open_footage, open_frames
 from wlm.smoke.exporter import read_flipbook, write_flipbook
-from wlm.smoke.guide import guide
 from wlm.smoke.learn.synthetic import make_plume
 from wlm.smoke.scene import CameraSettings, Grid, LightSettings, Scene, load_scene, make_camera
 from wlm.smoke.shading import shade
-from wlm.smoke.simulate import simulate
 from wlm.view.smoke import contact_sheet, guide_pictures, picture, six_pictures, to_bytes, write_sequence
 
 HERE = Path(__file__).resolve().parent

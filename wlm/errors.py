@@ -2,7 +2,7 @@
 
 __all__ = ["WlmError", "one_line"]
 
-_LIMIT = 500
+_LIMIT = 2000  # characters: room for several long paths
 
 
 def one_line(text: object, limit: int = _LIMIT) -> str:

@@ -189,12 +189,12 @@ class Part:
     """One part of a system's file: a row of its table of parts.
 
     Attributes:
-        dtype: NumPy type.
+        dtype: NumPy type, or the types of which it is one.
         shape: Sizes; None where any size will do. A part with a size of 0 is left out of the file.
         optional: Whether the file may lack it; it is then of size 0 where ``shape`` says None.
     """
 
-    dtype: type
+    dtype: type | tuple[type, ...]
     shape: tuple[int | None, ...]
     optional: bool = False
 
@@ -214,10 +214,11 @@ def check_parts(tensors: Mapping[str, np.ndarray], table: Mapping[str, Part]) ->
     """
     parts = {}
     for name, part in table.items():
+        kinds = part.dtype if isinstance(part.dtype, tuple) else (part.dtype,)
         if name in tensors:
             value = tensors[name]
         elif part.optional or 0 in part.shape:
-            value = np.zeros([size or 0 for size in part.shape], part.dtype)
+            value = np.zeros([size or 0 for size in part.shape], kinds[0])
         else:
             raise ValueError(f"part {name} is missing")
         sizes = value.shape
@@ -226,9 +227,10 @@ def check_parts(tensors: Mapping[str, np.ndarray], table: Mapping[str, Part]) ->
         )
         # An optional part is whole or not there.
         absent = part.optional and value.size == 0
-        if value.dtype != part.dtype or not (fits or absent):
-            expected = f"{np.dtype(part.dtype)} ({', '.join('any' if n is None else str(n) for n in part.shape)})"
-            raise ValueError(f"part {name} is {value.dtype} {sizes}, expected {expected}")
+        if value.dtype not in kinds or not (fits or absent):
+            types = " or ".join(np.dtype(kind).name for kind in kinds)
+            shape = ", ".join("any" if size is None else str(size) for size in part.shape)
+            raise ValueError(f"part {name} is {value.dtype} {sizes}, expected {types} ({shape})")
         if value.dtype.kind == "f" and not np.isfinite(value).all():
             raise ValueError(f"part {name}: expected finite numbers, found NaN or infinity")
         parts[name] = value

@@ -1,13 +1,20 @@
-"""Planes and volumes of features, sampled linearly, with a time axis that is clamped or periodic.
+"""Planes and volumes of features, sampled linearly, with a last axis that is clamped or periodic.
 
-A plane is ``[S, T, W, C]``: row = time, column = u or v. A volume is ``[S, T, H, W, C]``. Space is clamped to the
-border; time is clamped, or wraps round when ``periodic`` (the last slice is the first's neighbour). Coordinates are
-in [0, 1], cell centres at (i + 1/2) / size. Any number of channels C; the adjoint is the tape's.
+A plane is ``[T, W, C]``: row = time (or v), column = u. A volume is ``[T, H, W, C]``. Space is clamped to the border;
+the first axis is clamped, or wraps round when ``periodic`` (its last slice is the first's neighbour). Coordinates are
+in [0, 1], cell centres at (i + 1/2) / size. Any number of channels C. Twins in torch: ``wlm.ops.plain``.
 """
 
 import warp as wp
 
-__all__ = ["sample_plane", "sample_volume"]
+from wlm_kernels.raster.texture import BOUNDARIES, Axis, axis_at
+
+__all__ = ["sample", "sample_backward"]
+
+wp.set_module_options({"enable_backward": False})
+
+_LINEAR = wp.constant(0)
+_CLAMP, _WRAP = (wp.constant(BOUNDARIES.index(name)) for name in ("clamp", "wrap"))
 
 
 @wp.func
@@ -30,110 +37,145 @@ def axis_index(i: int, size: int, periodic: int) -> int:
     return wp.clamp(i, 0, size - 1)
 
 
-@wp.kernel
-def _sample_plane(
-    # in:
-    plane: wp.array4d[float],
-    slices: wp.array1d[int],
-    points: wp.array1d[wp.vec2],
-    periodic: int,
-    # out:
-    out: wp.array2d[float],
-):
-    i, c = wp.tid()
-    s = slices[i]
-    p = points[i]
-    rows = plane.shape[1]
-    columns = plane.shape[2]
-    x = cell(p[0], columns)
-    t = cell(p[1], rows)
-    fx = fraction(p[0], columns)
-    ft = fraction(p[1], rows)
-    xa = axis_index(x, columns, 0)
-    xb = axis_index(x + 1, columns, 0)
-    ta = axis_index(t, rows, periodic)
-    tb = axis_index(t + 1, rows, periodic)
-    out[i, c] = (1.0 - ft) * ((1.0 - fx) * plane[s, ta, xa, c] + fx * plane[s, ta, xb, c]) + ft * (
-        (1.0 - fx) * plane[s, tb, xa, c] + fx * plane[s, tb, xb, c]
-    )
+@wp.struct
+class _Cell:
+    """Where a point lies in its volume: along the width, the height and the first axis, of which ``base`` is row 0.
+
+    A plane is a volume of height 1, in which only the first four of eight corners differ.
+    """
+
+    x: Axis
+    y: Axis
+    t: Axis
+    base: int
+    corners: int
 
 
 @wp.func
-def _bilinear(
-    volume: wp.array4d[float], row: int, y: int, yb: int, x: int, xb: int, fy: float, fx: float, c: int
-) -> float:
-    return (1.0 - fy) * ((1.0 - fx) * volume[row, y, x, c] + fx * volume[row, y, xb, c]) + fy * (
-        (1.0 - fx) * volume[row, yb, x, c] + fx * volume[row, yb, xb, c]
-    )
+def _cell_of(
+    values: wp.array4d[float], times: int, layers: wp.array1d[int], points: wp.array2d[float], periodic: int, i: int
+) -> _Cell:
+    out = _Cell()
+    out.x = axis_at(points[i, 0], values.shape[2], _LINEAR, _CLAMP)
+    out.corners = 4
+    if points.shape[1] == 3:
+        out.corners = 8
+        out.y = axis_at(points[i, 1], values.shape[1], _LINEAR, _CLAMP)
+    out.t = axis_at(points[i, points.shape[1] - 1], times, _LINEAR, wp.where(periodic != 0, _WRAP, _CLAMP))
+    if layers.shape[0] > 0:
+        out.base = layers[i] * times
+    return out
+
+
+@wp.func
+def _weight(axis: Axis, side: int) -> float:
+    return wp.where(side == 0, 1.0 - axis.weight, axis.weight)
+
+
+@wp.func
+def _index(axis: Axis, side: int) -> int:
+    return wp.where(side == 0, axis.low, axis.high)
 
 
 @wp.kernel
-def _sample_volume(
+def _sample(
     # in:
-    volume: wp.array4d[float],
+    values: wp.array4d[float],
     times: int,
-    slices: wp.array1d[int],
-    points: wp.array1d[wp.vec3],
+    layers: wp.array1d[int],
+    points: wp.array2d[float],
     periodic: int,
     # out:
     out: wp.array2d[float],
 ):
-    i, c = wp.tid()
-    base = slices[i] * times
-    p = points[i]
-    height = volume.shape[1]
-    width = volume.shape[2]
-    x = cell(p[0], width)
-    y = cell(p[1], height)
-    t = cell(p[2], times)
-    fx = fraction(p[0], width)
-    fy = fraction(p[1], height)
-    ft = fraction(p[2], times)
-    xa = axis_index(x, width, 0)
-    xb = axis_index(x + 1, width, 0)
-    ya = axis_index(y, height, 0)
-    yb = axis_index(y + 1, height, 0)
-    ta = base + axis_index(t, times, periodic)
-    tb = base + axis_index(t + 1, times, periodic)
-    out[i, c] = (1.0 - ft) * _bilinear(volume, ta, ya, yb, xa, xb, fy, fx, c) + ft * _bilinear(
-        volume, tb, ya, yb, xa, xb, fy, fx, c
-    )
+    i = wp.tid()
+    at = _cell_of(values, times, layers, points, periodic, i)
+    for c in range(out.shape[1]):
+        out[i, c] = 0.0
+    for corner in range(at.corners):
+        a = corner & 1
+        b = corner >> 2
+        d = (corner >> 1) & 1
+        w = _weight(at.x, a) * _weight(at.y, b) * _weight(at.t, d)
+        if w != 0.0:
+            for c in range(out.shape[1]):
+                out[i, c] += w * values[at.base + _index(at.t, d), _index(at.y, b), _index(at.x, a), c]
 
 
-def sample_plane(plane, slices, points, out, periodic: bool = False) -> None:
-    """Samples planes bilinearly; recorded by an open ``wp.Tape``.
+@wp.kernel
+def _sample_backward(
+    # in:
+    values: wp.array4d[float],
+    times: int,
+    layers: wp.array1d[int],
+    points: wp.array2d[float],
+    periodic: int,
+    grad_out: wp.array2d[float],
+    # out:
+    grad_values: wp.array4d[float],
+    grad_points: wp.array2d[float],
+):
+    i = wp.tid()
+    at = _cell_of(values, times, layers, points, periodic, i)
+    on_x = float(0.0)
+    on_y = float(0.0)
+    on_t = float(0.0)
+    for corner in range(at.corners):
+        a = corner & 1
+        b = corner >> 2
+        d = (corner >> 1) & 1
+        wx = _weight(at.x, a)
+        wy = _weight(at.y, b)
+        wt = _weight(at.t, d)
+        row = at.base + _index(at.t, d)
+        y = _index(at.y, b)
+        x = _index(at.x, a)
+        if grad_values.shape[0] > 0 and wx * wy * wt != 0.0:
+            for c in range(grad_out.shape[1]):
+                wp.atomic_add(grad_values, row, y, x, c, wx * wy * wt * grad_out[i, c])
+        if grad_points.shape[0] > 0:
+            along = float(0.0)
+            for c in range(grad_out.shape[1]):
+                along += grad_out[i, c] * values[row, y, x, c]
+            on_x += (2.0 * float(a) - 1.0) * wy * wt * along
+            on_y += (2.0 * float(b) - 1.0) * wx * wt * along
+            on_t += (2.0 * float(d) - 1.0) * wx * wy * along
+    if grad_points.shape[0] > 0:
+        grad_points[i, 0] = at.x.slope * on_x
+        if points.shape[1] == 3:
+            grad_points[i, 1] = at.y.slope * on_y
+        grad_points[i, points.shape[1] - 1] = at.t.slope * on_t
+
+
+def sample(values, times: int, layers, points, out, periodic: bool = False) -> None:
+    """Samples planes bilinearly, or volumes trilinearly; outside [0, 1] the border goes on, or the next period.
 
     Args:
-        plane: float [S, T, W, C].
-        slices: int [N], the plane of each point.
-        points: vec2 [N], (u, t) in [0, 1].
-        out: float [N, C].
-        periodic: Whether the time axis wraps.
+        values: float [L * T, H, W, C], L planes (H = 1) or volumes, one behind the other: Warp arrays end at four
+            dimensions.
+        times: T, slices of each.
+        layers: int [N], the plane or volume of each point, 0 to L - 1; of shape [0]: L is 1.
+        points: float [N, 2] (u, t) or [N, 3] (u, v, t).
+        out: float [N, C], written.
+        periodic: Whether the axis of T wraps.
     """
-    wp.launch(
-        _sample_plane,
-        out.shape,
-        inputs=[plane, slices, points, int(periodic)],
-        outputs=[out],
-        device=plane.device,
-    )
+    inputs = [values, times, layers, points, int(periodic)]
+    wp.launch(_sample, points.shape[0], inputs=inputs, outputs=[out], device=values.device)
 
 
-def sample_volume(volume, times: int, slices, points, out, periodic: bool = False) -> None:
-    """Samples volumes trilinearly; recorded by an open ``wp.Tape``.
+def sample_backward(
+    values, times: int, layers, points, grad_out, grad_values, grad_points, periodic: bool = False
+) -> None:
+    """The adjoint of ``sample``; by a coordinate it is the slope between two cell centres, 0 where it is clamped.
+
+    On CUDA points are added to ``grad_values`` in any order, so that the last bits change from run to run.
 
     Args:
-        volume: float [S * T, H, W, C] (Warp arrays end at four dimensions).
-        times: T, slices of time in each volume.
-        slices: int [N], the volume of each point.
-        points: vec3 [N], (u, v, t) in [0, 1].
-        out: float [N, C].
-        periodic: Whether the time axis wraps.
+        values, times, layers, points, periodic: As for ``sample``.
+        grad_out: float [N, C].
+        grad_values: float [L * T, H, W, C], added to; of shape [0, 0, 0, 0]: not computed.
+        grad_points: float, like ``points``, written; of shape [0, 0]: not computed.
     """
-    wp.launch(
-        _sample_volume,
-        out.shape,
-        inputs=[volume, times, slices, points, int(periodic)],
-        outputs=[out],
-        device=volume.device,
-    )
+    inputs = [values, times, layers, points, int(periodic), grad_out]
+    outputs = [grad_values, grad_points]
+    wp.launch(_sample_backward, points.shape[0], inputs=inputs, outputs=outputs, device=values.device)

@@ -3,14 +3,14 @@
 The weights of N networks lie in two arrays, column by column, so that a layer is ``h += column[c] * x[c]``:
 
     hidden  [N, I + 1 + H + 1] of vecH: I columns of the first layer, its bias, H columns of the second, its bias
-    output  [N, H + 1] of vec3:         H columns of the third layer, its bias
+    output  [N, H + 1] of vecO:         H columns of the third layer, its bias
 
-I inputs, H units (any width; 8 to 64 are tested), 3 outputs. ``kernels`` builds and caches the functions of one
+I inputs, H units (any width; 8 to 64 are tested), O outputs. ``kernels`` builds and caches the functions of one
 shape. GELU is "exact" (erf), "tanh" (the tanh form, within 4.8e-4 of it) or "fast" (the tanh form with the GPU's own
 tanh instruction, 2^-11 relative; on the CPU the same as "tanh").
 
-Two ways back: ``MlpKernels.backward`` is by hand, and ``linear`` with ``activate`` is recorded by ``wp.Tape``: one
-thread an output, so that no accumulator has to be replayed (a dynamic loop's isn't, see the tests).
+``MlpKernels.backward`` is the adjoint of the inputs and of each layer; the gradients of the weights are matrix products
+of what it writes, which ``wlm.ops.mlp`` leaves to torch. ``wlm.ops.plain.mlp`` is the same network in ten lines.
 """
 
 import functools
@@ -19,7 +19,7 @@ from typing import Any
 
 import warp as wp
 
-__all__ = ["GELUS", "MlpKernels", "activate", "kernels", "linear", "parameter_count"]
+__all__ = ["GELUS", "MlpKernels", "kernels", "parameter_count"]
 
 GELUS = ("exact", "tanh", "fast")
 
@@ -85,6 +85,7 @@ class MlpKernels:
         hidden: H, width of both hidden layers.
         vec_in: vec of I floats.
         vec_hidden: vec of H floats.
+        vec_out: vec of O floats.
         first, second, third: ``wp.func`` of each layer before its activation.
         act: ``wp.func`` vecH -> vecH, GELU.
         gate, slope: ``wp.func``s with act(a) = a gate(a), and its derivative slope(a, gate(a)).
@@ -97,6 +98,7 @@ class MlpKernels:
     hidden: int
     vec_in: Any
     vec_hidden: Any
+    vec_out: Any
     first: Any
     second: Any
     third: Any
@@ -107,46 +109,34 @@ class MlpKernels:
     back_output: Any
     back_input: Any
     _forward: Any
-    _deltas: Any
-    _weights: Any
+    _backward: Any
 
     def forward(self, hidden, output, x, y) -> None:
         """Evaluates N networks on B inputs each.
 
         Args:
             hidden: vecH [N, I + H + 2], see the module.
-            output: vec3 [N, H + 1].
+            output: vecO [N, H + 1].
             x: vecI [N, B].
-            y: vec3 [N, B], written.
+            y: vecO [N, B], written.
         """
         wp.launch(self._forward, x.shape, inputs=[hidden, output, x], outputs=[y], device=x.device)
 
-    def backward(self, hidden, output, x, grad_y, grad_x, grad_hidden, grad_output) -> None:
-        """All gradients by hand; sums run in a fixed order, so that they repeat exactly.
+    def backward(self, hidden, output, x, grad_y, grad_x, h1, h2, d1, d2) -> None:
+        """The adjoint of each layer, one input of one network per thread.
+
+        A layer's weights have the gradient h^T d, its bias the sum of d, of its input h and the adjoint d of its result
+        before the activation: x and d1, h1 and d2, h2 and grad_y.
 
         Args:
             hidden, output, x: As for ``forward``.
-            grad_y: vec3 [N, B].
+            grad_y: vecO [N, B].
             grad_x: vecI [N, B], written.
-            grad_hidden: vecH [N, I + H + 2], written.
-            grad_output: vec3 [N, H + 1], written.
+            h1, h2: vecH [N, B], written: the layers' results.
+            d1, d2: vecH [N, B], written: the adjoints of the layers' results before their activation.
         """
-        scratch = [wp.empty(x.shape, dtype=self.vec_hidden, device=x.device) for _ in range(4)]
-        wp.launch(
-            self._deltas,
-            x.shape,
-            inputs=[hidden, output, x, grad_y],
-            outputs=[grad_x, *scratch],
-            device=x.device,
-        )
-        rows = self.inputs + 2 * self.hidden + 3
-        wp.launch(
-            self._weights,
-            (x.shape[0], rows),
-            inputs=[x, grad_y, *scratch],
-            outputs=[grad_hidden, grad_output],
-            device=x.device,
-        )
+        inputs = [hidden, output, x, grad_y]
+        wp.launch(self._backward, x.shape, inputs=inputs, outputs=[grad_x, h1, h2, d1, d2], device=x.device)
 
 
 def parameter_count(inputs: int, hidden: int) -> int:
@@ -155,21 +145,23 @@ def parameter_count(inputs: int, hidden: int) -> int:
 
 
 @functools.cache
-def kernels(inputs: int, hidden: int, gelu: str = "exact") -> MlpKernels:
+def kernels(inputs: int, hidden: int, gelu: str = "exact", outputs: int = 3) -> MlpKernels:
     """Builds (once) the functions of one network shape.
 
     Args:
         inputs: I >= 1.
         hidden: H >= 1.
         gelu: One of ``GELUS``.
+        outputs: O >= 1.
 
     Raises:
         ValueError: On a shape below 1 or an unknown activation.
     """
-    if inputs < 1 or hidden < 1 or gelu not in GELUS:
-        raise ValueError(f"no MLP of {inputs} inputs, {hidden} units and GELU {gelu!r}")
+    if min(inputs, hidden, outputs) < 1 or gelu not in GELUS:
+        raise ValueError(f"no MLP of {inputs} inputs, {hidden} units, {outputs} outputs and GELU {gelu!r}")
     vec_in = wp.types.vector(inputs, float)
     vec_hidden = wp.types.vector(hidden, float)
+    vec_out = wp.vec3 if outputs == 3 else wp.types.vector(outputs, float)
     gate_of, slope_of = _GELU[gelu]
     bias_1 = inputs
     columns_2 = inputs + 1
@@ -190,7 +182,7 @@ def kernels(inputs: int, hidden: int, gelu: str = "exact") -> MlpKernels:
         return h
 
     @wp.func
-    def third(w: wp.array2d[wp.vec3], n: int, x: vec_hidden) -> wp.vec3:
+    def third(w: wp.array2d[vec_out], n: int, x: vec_hidden) -> vec_out:
         y = w[n, wp.static(hidden)]
         for c in range(wp.static(hidden)):
             y += w[n, c] * x[c]
@@ -222,7 +214,7 @@ def kernels(inputs: int, hidden: int, gelu: str = "exact") -> MlpKernels:
         return g
 
     @wp.func
-    def back_output(w: wp.array2d[wp.vec3], n: int, delta: wp.vec3) -> vec_hidden:
+    def back_output(w: wp.array2d[vec_out], n: int, delta: vec_out) -> vec_hidden:
         g = vec_hidden()
         for c in range(wp.static(hidden)):
             g[c] = wp.dot(w[n, c], delta)
@@ -241,10 +233,10 @@ def kernels(inputs: int, hidden: int, gelu: str = "exact") -> MlpKernels:
     def forward(
         # in:
         w: wp.array2d[vec_hidden],
-        o: wp.array2d[wp.vec3],
+        o: wp.array2d[vec_out],
         x: wp.array2d[vec_in],
         # out:
-        y: wp.array2d[wp.vec3],
+        y: wp.array2d[vec_out],
     ):
         n, b = wp.tid()
         h1 = act(first(w, n, x[n, b]))
@@ -252,12 +244,12 @@ def kernels(inputs: int, hidden: int, gelu: str = "exact") -> MlpKernels:
         y[n, b] = third(o, n, h2)
 
     @wp.kernel(module="unique", module_options=options)
-    def deltas(
+    def backward(
         # in:
         w: wp.array2d[vec_hidden],
-        o: wp.array2d[wp.vec3],
+        o: wp.array2d[vec_out],
         x: wp.array2d[vec_in],
-        grad_y: wp.array2d[wp.vec3],
+        grad_y: wp.array2d[vec_out],
         # out:
         grad_x: wp.array2d[vec_in],
         h1_out: wp.array2d[vec_hidden],
@@ -279,51 +271,12 @@ def kernels(inputs: int, hidden: int, gelu: str = "exact") -> MlpKernels:
         d1_out[n, b] = d1
         d2_out[n, b] = d2
 
-    @wp.kernel(module="unique", module_options=options)
-    def weights(
-        # in:
-        x: wp.array2d[vec_in],
-        grad_y: wp.array2d[wp.vec3],
-        h1: wp.array2d[vec_hidden],
-        h2: wp.array2d[vec_hidden],
-        d1: wp.array2d[vec_hidden],
-        d2: wp.array2d[vec_hidden],
-        # out:
-        grad_w: wp.array2d[vec_hidden],
-        grad_o: wp.array2d[wp.vec3],
-    ):
-        n, row = wp.tid()
-        count = x.shape[1]
-        column = vec_hidden()
-        colour = wp.vec3()
-        if row < wp.static(bias_1):
-            for b in range(count):
-                column += d1[n, b] * x[n, b][row]
-        elif row == wp.static(bias_1):
-            for b in range(count):
-                column += d1[n, b]
-        elif row < wp.static(bias_2):
-            for b in range(count):
-                column += d2[n, b] * h1[n, b][row - wp.static(columns_2)]
-        elif row == wp.static(bias_2):
-            for b in range(count):
-                column += d2[n, b]
-        elif row < wp.static(bias_2 + 1 + hidden):
-            for b in range(count):
-                colour += grad_y[n, b] * h2[n, b][row - wp.static(bias_2 + 1)]
-        else:
-            for b in range(count):
-                colour += grad_y[n, b]
-        if row <= wp.static(bias_2):
-            grad_w[n, row] = column
-        else:
-            grad_o[n, row - wp.static(bias_2 + 1)] = colour
-
     return MlpKernels(
         inputs,
         hidden,
         vec_in,
         vec_hidden,
+        vec_out,
         first,
         second,
         third,
@@ -334,57 +287,5 @@ def kernels(inputs: int, hidden: int, gelu: str = "exact") -> MlpKernels:
         back_output,
         back_input,
         forward,
-        deltas,
-        weights,
+        backward,
     )
-
-
-@wp.kernel
-def _linear(
-    # in:
-    w: wp.array2d[float],
-    bias_row: int,
-    first_row: int,
-    x: wp.array2d[float],
-    groups: wp.array1d[int],
-    width: int,
-    # out:
-    y: wp.array2d[float],
-):
-    i, j = wp.tid()
-    n = groups[i]
-    s = w[n, bias_row * width + j]
-    for c in range(x.shape[1]):
-        s += w[n, (first_row + c) * width + j] * x[i, c]
-    y[i, j] = s
-
-
-@wp.kernel
-def _gelu(x: wp.array2d[float], y: wp.array2d[float]):
-    i, j = wp.tid()
-    y[i, j] = x[i, j] * gate_exact(x[i, j])
-
-
-def linear(weights, first_row: int, bias_row: int, x, groups, y) -> None:
-    """One layer of N networks for the tape: y[i] = W[groups[i]] x[i] + b.
-
-    Args:
-        weights: float [N, rows * W], the scalars of ``hidden`` or ``output`` above; W is the layer's width.
-        first_row: Row of the layer's first column.
-        bias_row: Row of its bias.
-        x: float [M, I].
-        groups: int [M], the network of each row.
-        y: float [M, W], written.
-    """
-    wp.launch(
-        _linear,
-        y.shape,
-        inputs=[weights, bias_row, first_row, x, groups, y.shape[1]],
-        outputs=[y],
-        device=x.device,
-    )
-
-
-def activate(x, y) -> None:
-    """Exact GELU of each entry of x into y, both float [M, W]; recorded by an open ``wp.Tape``."""
-    wp.launch(_gelu, x.shape, inputs=[x], outputs=[y], device=x.device)

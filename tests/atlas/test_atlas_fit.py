@@ -35,7 +35,7 @@ def downsampled(mesh, share: float) -> float:
 
     row, column = np.nonzero(mesh.mask)
     uv = torch.tensor(np.stack([column + 0.5, row + 0.5], 1) / mesh.mask.shape[::-1], dtype=torch.float32)
-    decoded = downsampling(mesh, share).sample(uv, torch.zeros(len(uv), dtype=torch.int32), torch.zeros(len(uv), 3))
+    decoded = downsampling(mesh, share).decoded(uv, torch.zeros(len(uv), dtype=torch.int32), torch.zeros(len(uv), 3))
     target = mesh.lightmap[mesh.mask].astype(np.float64)
     return 10 * np.log10(np.ptp(target) ** 2 / np.mean((decoded.numpy() - target) ** 2))
 

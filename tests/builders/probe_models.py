@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from wlm.probe.model import CENTRE_BITS, ProbeModel, Profile, network_size
+from wlm.probe.model import CENTRE_BITS, ProbeModel, Profile, layer_shapes
 
 ORIGIN, EXTENT, SIZE = np.array([-3.0, 1.0, 20.0]), 8.0, np.array([1.0, 0.375, 0.75])
 
@@ -18,9 +18,8 @@ def random_model(
     low = np.concatenate([np.zeros(3), np.full(3, scales[0]), np.full(4, -turn), np.full(latent, -1.0)])
     high = np.concatenate([SIZE, np.full(3, scales[1]), np.full(4, turn), np.full(latent, 2.0)])
     code = rng.integers(0, 2**profile.bits, (count, 7 + latent)).astype(np.uint16)
-    inputs = np.array([latent + 3] * (latent + 4) * hidden + [hidden] * (hidden + 1) * (hidden + outputs))[
-        : network_size(latent, hidden, outputs)
-    ]
+    shapes = layer_shapes(latent, hidden, outputs)
+    inputs = np.repeat([latent + 3, hidden, hidden], [rows * columns for rows, columns in shapes])
     zero = np.zeros(probes if dead else 0, bool)
     zero[np.linspace(0, probes - 1, dead).astype(int)] = dead > 0
     stored = rng.integers(0, 2**16, (probes if positions else 0, 3)).astype(np.uint16)

@@ -5,45 +5,20 @@ import resource
 import signal
 import subprocess
 import sys
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
+from builders.running import call, fails, press_ctrl_c
 from builders.small_sets import HOURS, moving_light, tiny_profile
 from PIL import Image
-from typer.testing import CliRunner
 
 import wlm
-import wlm.cli.lightmap
-from wlm.cli import app
 from wlm.formats.exr import read_exr, write_exr
-from wlm.lightmap import codec, fit
-from wlm.lightmap.data import load_set
-from wlm.lightmap.decode import Decoder
-from wlm.lightmap.evaluation import evaluate
+from wlm.lightmap import codec
 
 ROOT = Path(__file__).resolve().parents[2]
-
-
-def call(*words, code=0):
-    """Runs the command in this process; what it printed to stdout."""
-    result = CliRunner().invoke(app, [str(word) for word in words])
-    if result.exception is not None and not isinstance(result.exception, SystemExit):
-        raise result.exception
-    assert result.exit_code == code, result.output
-    assert "\x1b" not in result.output, "no control codes where there is no terminal"
-    call.stderr = result.stderr
-    return result.stdout
-
-
-def fails(*words):
-    """Runs a command that must end with one line and exit code 2; the line."""
-    assert call(*words, code=2) == ""
-    lines = call.stderr.splitlines()
-    assert len(lines) == 1 and lines[0].startswith("error: "), call.stderr
-    return lines[0]
 
 
 def spawn(*words, code="from wlm.cli import main\nmain()", **options):
@@ -114,7 +89,7 @@ def test_compress_prints_one_table(folder, profile, tmp_path):
     size = out.stat().st_size
     assert f"{size:,}" in text and f"{size * 8 / (40 * 24 * 5):.3f}" in text
     assert re.search(r"fit: 10 of 10, loss [\d.]+, PSNR -?[\d.]+ dB", call.stderr)
-    model = codec.read(out)
+    model = wlm.load(out)
     assert (model.profile.steps, model.profile.samples, model.period) == (10, 128, None)
     assert [path.name for path in tmp_path.iterdir()] == ["a.wlm"], "no checkpoint is left"
 
@@ -127,10 +102,10 @@ def test_the_options_of_compress_reach_the_fit(folder, profile, tmp_path):
     options = ["--times", "0:10:2", "--mask", tmp_path / "mask.png", "--period", 12, "--tiles", "0"]
     options += ["--steps", 12, "--samples", 256]
     call("lightmap", "compress", folder, "-o", out, "--profile", profile, *options)
-    model = codec.read(out)
+    model = wlm.load(out)
     assert model.times.tolist() == [0, 2, 4, 6, 8] and model.period == 12
     assert (model.profile.steps, model.profile.samples) == (12, 256)
-    again = load_set(folder, times=[0, 2, 4, 6, 8], mask=tmp_path / "mask.png", period=12)
+    again = wlm.lightmap.load(folder, times=[0, 2, 4, 6, 8], mask=tmp_path / "mask.png", period=12)
     assert model.source == again.source
     # The seed of the command is the seed of the fit.
     for seed, same in ((0, True), (1, False)):
@@ -147,19 +122,10 @@ def test_warnings_of_the_set_are_shown(folder, profile, tmp_path):
 
 
 def test_decode_writes_the_frame(fitted, tmp_path):
-    text = call(
-        "lightmap",
-        "decode",
-        fitted,
-        "--time",
-        18.5,
-        "-o",
-        tmp_path / "f.exr",
-        "--eight-bit",
-        tmp_path / "f.png",
-    )
+    words = ["-o", tmp_path / "f.exr", "--eight-bit", tmp_path / "f.png"]
+    text = call("lightmap", "decode", fitted, "--time", 18.5, *words)
     assert "18.5" in text and "24x40" in text
-    decoder = Decoder(codec.read(fitted))
+    decoder = wlm.load(fitted).decoder()
     np.testing.assert_allclose(read_exr(tmp_path / "f.exr")[0], decoder.frame(18.5), rtol=1e-3, atol=1e-6)
     with Image.open(tmp_path / "f.png") as image:
         np.testing.assert_array_equal(np.asarray(image), decoder.frame_8bit(18.5)[0])
@@ -171,7 +137,7 @@ def test_decode_writes_the_frame(fitted, tmp_path):
 def test_evaluate_prints_and_writes_the_report(fitted, folder, tmp_path):
     words = ["lightmap", "evaluate", fitted, folder, "--json", tmp_path / "r.json", "--period", 24]
     text = call(*words, "--baselines")
-    report = evaluate(codec.read(fitted), load_set(folder, period=24.0), fitted.stat().st_size)
+    report = wlm.lightmap.evaluate(wlm.load(fitted), wlm.lightmap.load(folder, period=24.0))
     stored = json.loads((tmp_path / "r.json").read_text())
     baselines = stored.pop("baselines")
     assert {**stored, "seconds": 0} == {**report.to_json(), "seconds": 0}
@@ -202,7 +168,6 @@ def test_info_says_what_is_in_the_file(fitted):
 
 
 def test_export_lists_what_it_wrote(fitted, tmp_path):
-    pytest.importorskip("wlm.lightmap.exporter")
     text = call("lightmap", "export", fitted, "-o", tmp_path / "out")
     files = list((tmp_path / "out").iterdir())
     assert files and all(file.name in text for file in files)
@@ -262,10 +227,10 @@ def test_bad_input_is_one_line_and_exit_code_2(words, says, folder, fitted, tmp_
 
 
 def test_an_unknown_exception_is_a_bug_and_shows(fitted, monkeypatch):
-    def broken(path):
+    def broken(artifact):
         raise ZeroDivisionError
 
-    monkeypatch.setattr(codec, "read", broken)
+    monkeypatch.setattr(codec, "decode", broken)
     with pytest.raises(ZeroDivisionError):
         call("lightmap", "info", fitted)
 
@@ -293,14 +258,8 @@ def test_a_ctrl_c_is_kept_and_resumed_to_the_same_bytes(folder, profile, tmp_pat
     words = ["lightmap", "compress", folder, "--profile", profile, "--steps", 40]
     whole, out = tmp_path / "whole.wlm", tmp_path / "a.wlm"
     call(*words, "-o", whole)
-
-    @contextmanager
-    def press_ctrl_c(what):
-        yield lambda done, total, text: os.kill(os.getpid(), signal.SIGINT)
-
     with monkeypatch.context() as patched:
-        patched.setattr(fit, "REPORT_EVERY", 0.0)
-        patched.setattr(wlm.cli.lightmap, "progress_bar", press_ctrl_c)
+        press_ctrl_c(patched)
         assert call(*words, "-o", out, code=130) == ""
     assert call.stderr.splitlines() == [f"stopped at step 5: the same command with --resume goes on from {out}.partial"]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.wlm.partial", "whole.wlm"]
@@ -347,35 +306,22 @@ def test_a_closed_pipe_is_no_traceback(fitted):
     assert process.returncode == 1 and errors == ""
 
 
-def test_bench_writes_what_it_was_given(monkeypatch, tmp_path):
-    module = pytest.importorskip("wlm.bench.lightmap")
-    from wlm.bench import Row, read_json
-
-    asked = []
-
-    def run(*, quick, device, set_path, progress):
-        asked.append((quick, device, set_path))
-        progress("one of one")
-        return [Row("lightmap", "city", "wlm", "M", bytes=10, bpp=0.7, decode_ms=1.0, psnr=40.0)]
-
-    monkeypatch.setattr(module, "run", run)
-    text = call("bench", "lightmap", "--quick", "--json", tmp_path / "r.json", "--plot", tmp_path / "p.png")
-    assert asked == [(True, "cpu", None)] and "one of one" in call.stderr
-    assert "| lightmap | city | wlm |" in text
-    rows, environment = read_json(tmp_path / "r.json")
-    assert rows[0].psnr == 40.0 and environment
-    assert (tmp_path / "p.png").read_bytes().startswith(b"\x89PNG")
-    assert "ends in" in fails("bench", "lightmap", "--plot", tmp_path / "p.txt")
-
-
-def test_bench_report_makes_a_page(tmp_path):
+def test_bench_report_makes_pages(tmp_path):
     from wlm.bench import Row, describe_environment, write_json
 
-    file, page = tmp_path / "here.json", tmp_path / "page.md"
-    write_json(file, [Row("lightmap", "city", "ours", "M", psnr=45.98)], describe_environment("cpu", "wlm bench"))
+    file, index = tmp_path / "here.json", tmp_path / "index.md"
+    row = Row("lightmap", "city", "ours", "M", {"psnr": 45.98})
+    write_json(file, [row], describe_environment("cpu", "wlm bench"))
     text = call("bench", "report", file)
     assert "`here.json`" in text and "| 45.98 |" in text
-    call("bench", "report", file, "-o", page)
-    assert page.read_text(encoding="utf-8") == text
-    assert "ends in" in fails("bench", "report", file, "-o", tmp_path / "page.txt")
+    call("bench", "report", file, "-o", index)
+    assert "index/lightmap.md" in index.read_text(encoding="utf-8")
+    assert "| 45.98 |" in (tmp_path / "index" / "lightmap.md").read_text(encoding="utf-8")
+    assert "ends in" in fails("bench", "report", file, "-o", tmp_path / "index.txt")
     assert "absent.json" in fails("bench", "report", tmp_path / "absent.json")
+
+
+def test_bench_checks_its_outputs_before_the_work(tmp_path):
+    (tmp_path / "mine.json").write_text("{}")
+    assert "ends in" in fails("bench", "lightmap", "--plot", tmp_path / "p.txt")
+    assert "not a result file" in fails("bench", "smoke", "--json", tmp_path / "mine.json")

@@ -1,4 +1,4 @@
-"""The lattice against published and exact flows; what takes minutes on a CPU is marked slow."""
+"""The lattice against published and exact flows; tests of minutes on a CPU are marked slow."""
 
 import numpy as np
 import pytest
@@ -31,9 +31,9 @@ def _cavity_error(reynolds: int, cells: int, steps: int, device: str, **settings
     u = cavity.velocity().numpy()[:, :, 0, 0] / lid
     middle = 0.5 * (u[cells // 2 - 1] + u[cells // 2])
     y = np.concatenate([[0.0], (np.arange(cells) + 0.5) / cells, [1.0]])
-    found = np.interp(GHIA_Y, y, np.concatenate([[0.0], middle, [1.0]]))
+    profile = np.interp(GHIA_Y, y, np.concatenate([[0.0], middle, [1.0]]))
     assert cavity.mass() == pytest.approx(cells**2, rel=1e-6)
-    return float(np.sqrt(np.mean((found - GHIA[reynolds]) ** 2)))
+    return float(np.sqrt(np.mean((profile - GHIA[reynolds]) ** 2)))
 
 
 def test_cavity_at_100(device: str):
@@ -80,7 +80,7 @@ def _vortex_ratio(cells: int, device: str, **settings) -> float:
     [("D2Q9", "bgk"), ("D2Q9", "recursive"), ("D3Q19", "regularised"), ("D3Q19", "bgk"), ("D3Q27", "recursive")],
 )
 def test_vortices_decay(lattice: str, operator: str, device: str):
-    """Within 1%: the viscosity is the one that was asked for."""
+    """Within 1% of the decay at the viscosity that was set."""
     assert _vortex_ratio(32, device, lattice=lattice, operator=operator) == pytest.approx(1.0, abs=0.01)
 
 
@@ -103,11 +103,11 @@ def _channel_error(cells: int, device: str, operator: str, lattice: str) -> floa
     channel.set_wall("-y")
     channel.set_wall("+y")
     channel.set_force((8 * viscosity * peak / cells**2, 0.0, 0.0))
-    # Until what is left of the start, exp(-pi^2 nu t / H^2), is 1e-6.
+    # Until the start has decayed to exp(-pi^2 nu t / H^2) = 1e-6.
     channel.step(int(14 * cells**2 / (np.pi**2 * viscosity)))
     y = (np.arange(cells) + 0.5) / cells
-    found = channel.velocity().numpy()[0, :, 0, 0] / peak
-    return float(np.sqrt(np.mean((found - 4 * y * (1 - y)) ** 2)))
+    profile = channel.velocity().numpy()[0, :, 0, 0] / peak
+    return float(np.sqrt(np.mean((profile - 4 * y * (1 - y)) ** 2)))
 
 
 @pytest.mark.parametrize(("lattice", "operator"), [("D2Q9", "bgk"), ("D3Q19", "regularised"), ("D3Q27", "recursive")])
@@ -156,11 +156,11 @@ def _sphere_drag(diameter: int, ahead: float, behind: float, beside: float, devi
     tunnel.set_solid(solid)
     # The diameter of a sphere of as many cells.
     area = np.pi / 4 * (24 * np.count_nonzero(solid.numpy()) / np.pi) ** (2 / 3)
-    found = []
+    drag = []
     for _ in range(5):
         tunnel.step(round(2 * diameter / speed))
-        found.append(4 * tunnel.force_on_solid()[0] / (0.5 * speed**2 * area))
-    return np.array(found)
+        drag.append(4 * tunnel.force_on_solid()[0] / (0.5 * speed**2 * area))
+    return np.array(drag)
 
 
 @pytest.mark.slow
@@ -205,7 +205,7 @@ def test_cylinder_sheds_vortices(operator: str, device: str):
 
 
 def _jet(shape: tuple[int, int, int], device: str, **settings) -> Lattice:
-    """A jet at u = 0.1 past a sphere in a box, at a viscosity that is next to nothing."""
+    """A jet at u = 0.1 past a sphere in a box, at a viscosity near 0."""
     x, y, z = shape
     settings = {"viscosity": 1e-6, "ramp": 4 * x, **settings}
     box = Lattice(shape, device=device, **settings)
@@ -236,7 +236,7 @@ def _hold_jet(box: Lattice, steps: int, drift: float) -> None:
 
 
 def test_jet_is_stable(device: str):
-    """With the default operator: the mass drifts by rounding, and no step undoes what the last one did."""
+    """With the default operator: the mass drifts by rounding, and there is no flutter of period 2."""
     _hold_jet(_jet((24, 12, 12), device), 5000, 1e-6)
 
 
@@ -251,7 +251,7 @@ def test_larger_jet_is_stable(settings: dict, drift: float, device: str):
 
 
 def test_sixteen_bits_follow_the_jet(device: str):
-    """Before chaos sets in the two differ by what 11 bits hold."""
+    """Before chaos sets in the two differ by the rounding to 11 bits."""
     exact, half = (_jet((24, 12, 12), device, storage=storage) for storage in ("float32", "float16"))
     for box in (exact, half):
         box.step(300)

@@ -1,4 +1,4 @@
-"""Reading smoke: arrays, .npz and NanoVDB files, what is repaired and what is refused."""
+"""Reading volumes: arrays, ``.npz`` and NanoVDB files, repairs and refusals."""
 
 import struct
 from pathlib import Path
@@ -21,7 +21,7 @@ def _nvdb(path: Path, density: np.ndarray, voxel: float = 0.5, at: tuple = (1.0,
 
 
 def _joined(path: Path, parts: dict[str, Path]) -> None:
-    """One file of several named grids, of files of one grid without a name."""
+    """Joins files of one unnamed grid into a file of several named ones."""
     heads, grids = [], []
     for i, (name, part) in enumerate(parts.items()):
         data = part.read_bytes()
@@ -45,16 +45,16 @@ def test_npz(tmp_path: Path, device: str):
     np.testing.assert_array_equal(volume.temperature.cpu(), density / 24)
     np.testing.assert_allclose(volume.centre, [1.25, 2.375, 3.5])
     assert volume.warnings == () and volume.device.type == device[:4].rstrip(":")
-    other = load_volume(path, voxel=1.0)
-    assert other.voxel == 1.0 and other.origin == (4.0, 8.0, 12.0)
+    scaled = load_volume(path, voxel=1.0)
+    assert scaled.voxel == 1.0 and scaled.origin == (4.0, 8.0, 12.0)
 
 
 def test_types():
     """Half stays half, all else is float; temperature follows the density."""
     values = np.ones((2, 2, 2))
-    for dtype, want in ((np.float16, torch.float16), (np.float64, torch.float32), (np.uint8, torch.float32)):
+    for dtype, expected in ((np.float16, torch.float16), (np.float64, torch.float32), (np.uint8, torch.float32)):
         volume = from_array(values.astype(dtype), temperature=values)
-        assert volume.density.dtype == volume.temperature.dtype == want
+        assert volume.density.dtype == volume.temperature.dtype == expected
     source = np.ones((2, 2, 2), np.float32)
     volume = from_array(source)
     source[:] = 5
@@ -103,7 +103,7 @@ def test_grid_on_its_device(device: str):
 
 
 def test_nvdb_of_two_grids(tmp_path: Path):
-    """The grid named density is found where it isn't the first; temperature comes along."""
+    """The grid named density needn't be the first; temperature is read too."""
     random = np.random.default_rng(1)
     density, hot = (random.uniform(0.1, 1, (8, 8, 8)).astype(np.float32) for _ in range(2))
     for name, values in (("d", density), ("t", hot)):
@@ -132,8 +132,8 @@ def test_damaged_nvdb(tmp_path: Path):
         load_volume(path)
 
 
-def test_nvdb_of_others(tmp_path: Path):
-    """Vectors and stretched voxels aren't smoke."""
+def test_unsupported_nvdb(tmp_path: Path):
+    """Grids of vectors and of stretched voxels are refused."""
     path = tmp_path / "a.nvdb"
     _nvdb(path, np.ones((8, 8, 8, 3), np.float32))
     with pytest.raises(WlmError, match="expected a grid of floats"):

@@ -1,23 +1,23 @@
 """A whole simulation: smoke in moving air, obstacles, checkpoints, and the hard cases."""
 
-from pathlib import Path as FilePath
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
 import warp as wp
 
 from wlm.errors import WlmError
-from wlm.fluid import solver_lattice
-from wlm.fluid.faces import FACES
+from wlm.fluid.faces import FACES, axis_ends
 from wlm.fluid.lattice import CHECK_EVERY, Lattice
-from wlm.fluid.obstacles import Mesh, Path, Sphere, box_mesh
-from wlm.fluid.solver import SCHEMES, Buoyancy, Solver, Source
+from wlm.fluid.obstacles import Mesh, Sphere, Trajectory, box_mesh
+from wlm.fluid.solver import SCHEMES, Buoyancy, Solver, Source, require_memory
 from wlm.formats.artifact import read_artifact, write_artifact
 from wlm_kernels.fluid.advection_places import CLOSED, OPEN, PERIODIC
 
 SHAPE = (20, 10, 10)
 NOZZLE = Source("box", (2, 5, 5), (1.5, 2.5, 2.5), 1.0, 0.5, fixed=True)
-MOVING = Sphere(Path.of([[9, 5, 5], [12, 5, 5]], [0, 60]), 2.0)
+MOVING = Sphere(Trajectory.of([[9, 5, 5], [12, 5, 5]], [0, 60]), 2.0)
 
 
 def _tunnel(device: str, shape=SHAPE, speed: float = 0.1, **settings) -> Lattice:
@@ -45,12 +45,17 @@ def _numbers(solver: Solver) -> np.ndarray:
     return solver.density.numpy().astype(np.float64)
 
 
+def _assert_same(first: Solver, second: Solver) -> None:
+    for name in ("density", "temperature", "velocity", "solid"):
+        np.testing.assert_array_equal(getattr(first, name).numpy(), getattr(second, name).numpy())
+
+
 # Smoke in air.
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_a_jet_carries_smoke_past_a_sphere(scheme: str, device: str):
-    """It comes as far as the air does, none lies in the sphere, and there is none too much."""
+    """It comes as far as the air does, none lies in the sphere, and no value exceeds the nozzle's."""
     jet = _jet(device, scheme=scheme)
     jet.step(50)
     density = _numbers(jet)
@@ -58,7 +63,7 @@ def test_a_jet_carries_smoke_past_a_sphere(scheme: str, device: str):
     assert density.min() >= 0.0 and density.max() == 1.0
     solid = jet.solid.numpy() == 1
     assert np.count_nonzero(solid) > 20
-    np.testing.assert_array_equal(density[solid.repeat(2, 0).repeat(2, 1).repeat(2, 2)], 0.0)
+    np.testing.assert_array_equal(density[np.kron(solid, np.ones((2, 2, 2), bool))], 0.0)
     front = np.flatnonzero(density.sum((1, 2)) > 0.5).max() / 2
     assert 8 < front < 18
     assert jet.steps == 50 and jet.lattice.steps == 100
@@ -73,22 +78,28 @@ def test_bricks_give_the_dense_result(device: str):
 
 
 def test_still_smoke_costs_its_bricks(device: str):
-    """A puff in a long, still room: bricks about it are worked on, and no others."""
+    """A puff in a long, still room: the bricks around it are computed, and no others."""
     source = Source("sphere", (4, 4, 4), (1, 1, 1), 1.0, fixed=True)
     solver = Solver(_room(device, (64, 8, 8)), refinement=2, sources=[source], bricks=True)
     # At first all bricks count as busy.
     solver.step(3)
-    # The brick of the puff and those within a ring of it, of 16 x 2 x 2.
+    # The puff's bricks and one ring around them, of 16 x 2 x 2.
     assert solver.active_cells == 3 * 2 * 2 * 512
 
 
-def test_half_floats_are_near_whole_ones(device: str):
-    whole, half = (_jet(device, storage=s, dissipation=0.0) for s in ("float32", "float16"))
-    for solver in (whole, half):
+def test_half_floats_are_near_single_ones(device: str, tmp_path: Path):
+    single, half = (_jet(device, storage=storage, dissipation=0.0) for storage in ("float32", "float16"))
+    for solver in (single, half):
         solver.step(20)
     assert half.density.dtype is wp.float16
-    difference = _numbers(half) - _numbers(whole)
+    difference = _numbers(half) - _numbers(single)
     assert np.abs(difference).max() <= 2e-2 and np.sqrt(np.mean(difference**2)) <= 1e-3
+    half.save(tmp_path / "state")
+    resumed = _jet(device, storage="float16", dissipation=0.0)
+    resumed.load(tmp_path / "state")
+    for solver in (half, resumed):
+        solver.step(2)
+    _assert_same(half, resumed)
 
 
 def test_smoke_decays(device: str):
@@ -109,9 +120,8 @@ def test_hot_smoke_rises_and_heavy_smoke_falls(bricks: bool, device: str):
     heights = []
     for buoyancy in (Buoyancy(2e-3), Buoyancy(0.0, 2e-3)):
         source = Source("sphere", (5, 6, 5), (2, 2, 2), 0.05, 0.05)
-        solver = Solver(
-            _room(device), refinement=2, temperature=True, sources=[source], buoyancy=buoyancy, bricks=bricks
-        )
+        settings = {"bricks": bricks, "scheme": "semi-lagrangian" if bricks else "maccormack"}
+        solver = Solver(_room(device), refinement=2, temperature=True, sources=[source], buoyancy=buoyancy, **settings)
         solver.step(40)
         density = _numbers(solver)
         heights.append((density.sum((0, 2)) * (np.arange(24) + 0.5)).sum() / density.sum() / 2)
@@ -123,7 +133,7 @@ def test_hot_smoke_rises_and_heavy_smoke_falls(bricks: bool, device: str):
 
 def test_an_obstacle_over_the_inlet(device: str):
     """With all of it covered nothing comes in, neither air nor smoke."""
-    plug = box_mesh(Path.of((2, 5, 5)), (4.4, 12, 12))
+    plug = box_mesh(Trajectory.of((2, 5, 5)), (4.4, 12, 12))
     solver = _jet(device, obstacles=[plug])
     solver.step(20)
     np.testing.assert_array_equal(_numbers(solver), 0.0)
@@ -131,7 +141,7 @@ def test_an_obstacle_over_the_inlet(device: str):
 
 
 def test_an_obstacle_too_fast(device: str):
-    fast = Sphere(Path.of([[9, 5, 5], [19, 5, 5]], [10, 20]), 2.0)
+    fast = Sphere(Trajectory.of([[9, 5, 5], [19, 5, 5]], [10, 20]), 2.0)
     solver = _jet(device, obstacles=[fast])
     solver.step(5)
     with pytest.raises(WlmError, match="moves at 1 cells a step: expected at most 0.3"):
@@ -139,25 +149,25 @@ def test_an_obstacle_too_fast(device: str):
 
 
 def test_obstacles_cover_what_they_should(device: str):
-    """A sphere and a box, each with a number of its own; and when both are over a cell, one of them has it."""
-    box = box_mesh(Path.of((14, 5, 5)), (4, 6, 2))
+    """A sphere and a box, numbered in their order."""
+    box = box_mesh(Trajectory.of((14, 5, 5)), (4, 6, 2))
     solver = _jet(device, obstacles=[MOVING, box])
     solver.step(1)
     solid = solver.solid.numpy()
     x = np.stack(np.meshgrid(*[np.arange(n) + 0.5 for n in SHAPE], indexing="ij"), -1)
     np.testing.assert_array_equal(solid == 2, (np.abs(x - (14, 5, 5)) < (2, 3, 1)).all(-1))
-    # A sphere that goes on from 9 by 3 cells in 60 steps is put where it is in the middle of the first two.
+    # The sphere moves 3 cells in 60 steps, and is placed where it is in the middle of the first two.
     np.testing.assert_array_equal(solid == 1, np.linalg.norm(x - (9.05, 5, 5), axis=-1) < 2)
 
 
 def test_paths():
-    path = Path.of([[0, 0, 0], [2, 0, 0], [2, 4, 0]], [10, 20, 30])
+    path = Trajectory.of([[0, 0, 0], [2, 0, 0], [2, 4, 0]], [10, 20, 30])
     for time, at in ((0, (0, 0, 0)), (15, (1, 0, 0)), (25, (2, 2, 0)), (99, (2, 4, 0))):
         np.testing.assert_allclose(path.at(time), at)
     for wrong in (
-        lambda: Path.of([[0, 0, 0], [1, 0, 0]], [1, 1]),
-        lambda: Path.of([0, 0, np.nan]),
-        lambda: Path.of([0, 0, 0], [0, 1]),
+        lambda: Trajectory.of([[0, 0, 0], [1, 0, 0]], [1, 1]),
+        lambda: Trajectory.of([0, 0, np.nan]),
+        lambda: Trajectory.of([0, 0, 0], [0, 1]),
         lambda: Sphere(path, 0.0),
         lambda: box_mesh(path, (1, 1, 0)),
         lambda: Mesh(path, np.zeros((3, 3)), np.array([[0, 1, 3]])),
@@ -172,8 +182,8 @@ def test_paths():
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)
-def test_a_checkpoint_goes_on_to_the_last_bit(scheme: str, device: str, tmp_path: FilePath):
-    """Past the time when the obstacle comes to rest; with a step of an odd number."""
+def test_a_checkpoint_goes_on_to_the_last_bit(scheme: str, device: str, tmp_path: Path):
+    """From an odd step on, past the time when the obstacle comes to rest."""
     first, second = (_jet(device, scheme=scheme) for _ in range(2))
     first.step(17)
     first.save(tmp_path / "state")
@@ -181,25 +191,24 @@ def test_a_checkpoint_goes_on_to_the_last_bit(scheme: str, device: str, tmp_path
     second.load(tmp_path / "state")
     assert second.steps == 17
     second.step(20)
-    for name in ("density", "temperature", "velocity", "solid"):
-        np.testing.assert_array_equal(getattr(first, name).numpy(), getattr(second, name).numpy())
+    _assert_same(first, second)
 
 
-def test_bricks_go_on_from_a_checkpoint(device: str, tmp_path: FilePath):
+def test_bricks_go_on_from_a_checkpoint(device: str, tmp_path: Path):
     """With a threshold of 0 to the last bit."""
-    first, second = (_jet(device, bricks=True, threshold=0.0, storage="float16") for _ in range(2))
+    first, second = (_jet(device, bricks=True, threshold=0.0) for _ in range(2))
     first.step(11)
     first.save(tmp_path / "state")
     second.step(4)
     second.load(tmp_path / "state")
     for solver in (first, second):
         solver.step(8)
-    np.testing.assert_array_equal(_numbers(first), _numbers(second))
+    _assert_same(first, second)
 
 
 @pytest.mark.parametrize("before", [0, 5])
-def test_a_checkpoint_of_before_the_first_step(before: int, device: str, tmp_path: FilePath):
-    """Of a solver whose obstacles aren't placed yet, into one whose obstacle has moved already too."""
+def test_a_checkpoint_of_before_the_first_step(before: int, device: str, tmp_path: Path):
+    """Its obstacles aren't placed yet; those of the solver that loads it are, or have moved."""
     first, second = _jet(device), _jet(device)
     first.save(tmp_path / "state")
     second.step(before)
@@ -208,20 +217,19 @@ def test_a_checkpoint_of_before_the_first_step(before: int, device: str, tmp_pat
     for solver in (first, second):
         solver.step(6)
     assert first.solid.numpy().any()
-    for name in ("density", "temperature", "velocity", "solid"):
-        np.testing.assert_array_equal(getattr(first, name).numpy(), getattr(second, name).numpy())
+    _assert_same(first, second)
 
 
-def test_checkpoints_are_checked(device: str, tmp_path: FilePath):
+def test_checkpoints_are_checked(device: str, tmp_path: Path):
     solver, path = _jet(device), tmp_path / "state"
     solver.step(2)
     solver.save(path)
-    for other, match in (
+    for different, match in (
         (_jet(device, dissipation=2e-3), "dissipation: expected 0.002, found 0.001"),
         (_jet(device, obstacles=()), "obstacles: expected"),
     ):
         with pytest.raises(WlmError, match=match):
-            other.load(path)
+            different.load(path)
     stored = read_artifact(path)
     for name, value, match in (
         ("density", np.zeros((2, 2, 2), np.float32), r"density: expected float32 \(40, 20, 20\), found float32"),
@@ -242,8 +250,8 @@ def test_checkpoints_are_checked(device: str, tmp_path: FilePath):
         solver.load(tmp_path / "nothing")
 
 
-def test_a_blow_up_stops_with_the_last_good_state(device: str, tmp_path: FilePath):
-    """Ever hotter smoke drives the air beyond the speed of sound: named, soon, and the file is of before."""
+def test_a_blow_up_stops_with_the_last_good_state(device: str, tmp_path: Path):
+    """Ever hotter smoke drives the air beyond the speed of sound: it stops soon, and the file is from before."""
     path = tmp_path / "good"
     source = Source("sphere", (5, 6, 5), (3, 3, 3), 0.1, 0.1)
 
@@ -261,14 +269,14 @@ def test_a_blow_up_stops_with_the_last_good_state(device: str, tmp_path: FilePat
     again = make()
     again.load(path)
     assert again.lattice.steps == kept
-    # Where nothing newer is kept, the file that was loaded is named; what blew up isn't saved over it.
+    # An error names the file that was loaded if there is none newer; a state that blew up isn't saved over it.
     content = path.read_bytes()
     with pytest.raises(WlmError, match="blew up in step"):
         solver.save(path)
     assert path.read_bytes() == content
     resumed = Solver(_room(device), temperature=True, sources=[source], buoyancy=Buoyancy(0.02), refinement=1)
     resumed.load(path)
-    with pytest.raises(WlmError, match=f"; the state of step {kept} is kept in {path}"):
+    with pytest.raises(WlmError, match=re.escape(f"; the state of step {kept} is kept in {path}")):
         resumed.step(500)
     assert np.isfinite(_numbers(again)).all() and np.isfinite(again.lattice.velocity().numpy()).all()
     again.step(1)
@@ -279,7 +287,7 @@ def test_a_blow_up_stops_with_the_last_good_state(device: str, tmp_path: FilePat
 @pytest.mark.slow
 def test_five_thousand_steps_past_a_sphere(device: str):
     """At a viscosity of 1e-6 with the default operator: stable, and the air's mass stays within 0.1%."""
-    ball = Sphere(Path.of((10, 8, 8)), 3.0)
+    ball = Sphere(Trajectory.of((10, 8, 8)), 3.0)
     lattice = _tunnel(device, (32, 16, 16), viscosity=1e-6, ramp=128)
     source = Source("box", (2, 8, 8), (1.5, 4, 4), 1.0, fixed=True)
     solver = Solver(lattice, refinement=1, sources=[source], obstacles=[ball])
@@ -317,12 +325,12 @@ def test_too_large(device: str):
     with pytest.raises(WlmError, match="1600 x 1600 x 1600 cells: expected fewer than 2\\^31"):
         Solver(Lattice((8, 8, 8), viscosity=0.1, device=device), refinement=200)
     with pytest.raises(WlmError, match=r"100 x 100 x 100 cells need .* GiB on .*: expected at most"):
-        solver_lattice.require_memory((100, 100, 100), 10**9, wp.get_device(device))
+        require_memory((100, 100, 100), 10**9, wp.get_device(device))
 
 
 def test_faces_as_smoke_sees_them(device: str):
-    assert solver_lattice.ends(_tunnel(device)) == ((OPEN, OPEN), (CLOSED, CLOSED), (CLOSED, CLOSED))
-    assert solver_lattice.ends(Lattice((2, 2, 2), viscosity=0.1)) == ((PERIODIC, PERIODIC),) * 3
+    assert axis_ends(_tunnel(device).faces) == ((OPEN, OPEN), (CLOSED, CLOSED), (CLOSED, CLOSED))
+    assert axis_ends({}) == ((PERIODIC, PERIODIC),) * 3
 
 
 def test_wrong_arguments(device: str):
@@ -341,8 +349,6 @@ def test_wrong_arguments(device: str):
     ):
         with pytest.raises(ValueError, match=match):
             Solver(lattice, **settings)
-    with pytest.raises(ValueError, match="without bricks"):
-        Solver(Lattice((8, 8, 8), viscosity=0.1, bricks=True, device=device), buoyancy=Buoyancy(0.0, 1e-3))
     for wrong in (
         lambda: Source("cone", (1, 1, 1), (1, 1, 1), 1.0),
         lambda: Source("box", (1, 1, np.inf), (1, 1, 1), 1.0),
@@ -371,12 +377,9 @@ def test_a_frame_is_the_smoke_as_it_is(device: str):
 
 def test_steps_can_be_captured(device: str):
     """In a graph of the user's: the same smoke as by eager steps, counted too."""
-    at_rest = [Sphere(Path.of((9, 5, 5)), 2.0)]
     if device == "cpu":
-        solver = _jet(device)
-        solver.step(2 * solver.period)
-        assert solver.steps == 4
-        return
+        pytest.skip("graphs are CUDA's")
+    at_rest = [Sphere(Trajectory.of((9, 5, 5)), 2.0)]
     for bricks in (False, True):
         eager, graphed = (_jet(device, obstacles=at_rest, bricks=bricks) for _ in range(2))
         graphed.step(2)

@@ -8,7 +8,7 @@ import pytest
 import warp as wp
 
 from wlm_kernels import mlp
-from wlm_kernels.fluid import advection, advection_sources, lattice, lattice_bricks, lattice_fields, lattice_links
+from wlm_kernels.fluid import advection, advection_sources, lattice, lattice_fields, lattice_links
 from wlm_kernels.lightmap import decode as lightmap_decode
 from wlm_kernels.lightmap import step as lightmap_step
 from wlm_kernels.probe import decode as probe_decode
@@ -16,7 +16,7 @@ from wlm_kernels.probe import gaussian_sum, optimiser
 from wlm_kernels.probe import network as probe_network
 from wlm_kernels.probe import step as probe_step
 from wlm_kernels.smoke import march as smoke_march
-from wlm_kernels.smoke import march_coarse, march_motion, march_six
+from wlm_kernels.smoke import march_coarse, march_guide, march_motion, march_six
 
 ARCHITECTURE = 90
 MODULES = (
@@ -25,14 +25,12 @@ MODULES = (
     "atlas.patch_graph",
     "atlas.patches",
     "fluid.advection_places",
-    "fluid.lattice_bricks",
     "fluid.lattice_links",
     "fluid.lattice_solids",
     "interpolate",
     "lightmap.blocks",
     "lightmap.decode",
     "lightmap.gather",
-    "mlp",
     "probe.cubes",
     "probe.gaussian_sum",
     "probe.step",
@@ -40,6 +38,7 @@ MODULES = (
     "raster.gradient",
     "raster.rasterize",
     "raster.texture",
+    "smoke.single_scatter",
 )
 WIDTHS = (8, 17, 32, 64)
 
@@ -76,8 +75,9 @@ def test_modules(name: str, tmp_path: Path):
 @pytest.mark.parametrize("gelu", _slow_but("fast", ["exact", "tanh"]))
 @pytest.mark.parametrize("hidden", _slow_but(16, WIDTHS))
 def test_mlp(hidden: int, gelu: str, tmp_path: Path):
-    """ "fast" has an instruction that only a GPU has."""
-    _compile_all(vars(mlp.kernels(16, hidden, gelu)).values(), tmp_path)
+    """ "fast" has an instruction that only a GPU has; three outputs, and another number."""
+    _compile_all(vars(mlp.kernels(16, hidden, gelu)).values(), tmp_path / "three")
+    _compile_all(vars(mlp.kernels(16, hidden, gelu, 5)).values(), tmp_path / "five")
 
 
 @pytest.mark.parametrize("gelu", _slow_but("tanh", ["exact"]))
@@ -125,7 +125,8 @@ def test_probe_network(latent: int, hidden: int, outputs: int, tmp_path: Path):
 @pytest.mark.parametrize("dtype", _slow_but(wp.float16, [wp.float32]))
 def test_marching(dtype: type, tmp_path: Path):
     """Marches through densities of either type."""
-    _compile_all(vars(smoke_march.guide_kernels(dtype)).values(), tmp_path / "guide")
+    _compile_all([smoke_march.occupied_kernel(dtype)], tmp_path / "bricks")
+    _compile_all(vars(march_guide.guide_kernels(dtype)).values(), tmp_path / "guide")
     _compile_all(vars(march_six.six_kernels(dtype)).values(), tmp_path / "six")
     _compile_all([march_motion.motion_kernel(dtype)], tmp_path / "motion")
 
@@ -139,11 +140,11 @@ def test_coarse_marching(dtype: type, hot: bool, tmp_path: Path):
 
 LATTICE_STEPS = (
     {"lattice": "D3Q19", "solids": True, "walls": (True, True, True)},
-    {"lattice": "D3Q19", "solids": True, "storage": "float16", "bricks": True},
+    {"lattice": "D3Q19", "solids": True, "storage": "float16"},
     {"lattice": "D3Q19", "operator": "bgk", "force": "field"},
     {"lattice": "D3Q27", "operator": "recursive", "solids": True, "force": "uniform"},
     {"lattice": "D3Q27", "storage": "float16", "eddies": False},
-    {"lattice": "D2Q9", "operator": "recursive", "bricks": True},
+    {"lattice": "D2Q9", "operator": "recursive"},
 )
 
 
@@ -165,13 +166,13 @@ def test_lattice_boundaries(name: str, storage: str, balance: bool, tmp_path: Pa
     """Links, whose sums over a block only a GPU has, and what else is of one lattice and storage."""
     _compile_all(vars(lattice_links.link_kernels(name, storage, balance)).values(), tmp_path / "links")
     _compile_all(vars(lattice_fields.fluid_kernels(name, storage, (False, True, True))).values(), tmp_path / "fluid")
-    _compile_all([lattice_bricks.rest_kernel(name, storage)], tmp_path / "bricks")
 
 
-@pytest.mark.parametrize("storage", _slow_but("float16", ["float32"]))
+@pytest.mark.parametrize("stored", _slow_but(wp.float16, [wp.float32]))
 @pytest.mark.parametrize("solids", _slow_but(True, [False]))
 @pytest.mark.parametrize("bricks", _slow_but(True, [False]))
-def test_advection(bricks: bool, solids: bool, storage: str, tmp_path: Path):
-    """Both schemes; and sources, solids and buoyancy, which know no bricks."""
-    _compile_all(vars(advection.field_kernels(storage, bricks, solids, not solids)).values(), tmp_path / "fields")
-    _compile_all(vars(advection_sources.source_kernels(storage)).values(), tmp_path / "sources")
+def test_advection(bricks: bool, solids: bool, stored: type, tmp_path: Path):
+    """Both schemes; and sources, solids and buoyancy, which are the same with bricks and without."""
+    carry = [advection.carry_kernel(correcting, stored, bricks, solids, not solids) for correcting in (False, True)]
+    _compile_all(carry, tmp_path / "carry")
+    _compile_all(vars(advection_sources.source_kernels(stored)).values(), tmp_path / "sources")

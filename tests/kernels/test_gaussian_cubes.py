@@ -9,6 +9,7 @@ import warp as wp
 from reference import gaussians as reference
 
 from kernels.compare import array
+from wlm.ops import plain
 from wlm_kernels.probe import cubes as probe_cubes
 from wlm_kernels.probe import gaussian_sum
 from wlm_kernels.probe.cubes import TESTS, Cubes, cube_of
@@ -69,12 +70,12 @@ def _distances(rows: np.ndarray, cubes: Cubes, test: str, support: str) -> np.nd
     if test == "sphere" or support == "sphere":
         return np.linalg.norm(apart, axis=2) / reference.reach(rows, CUT, "sphere").max(1)
     whiten = reference.whitening(torch.tensor(rows, dtype=torch.float64)).numpy()
-    found = [
+    nearest = [
         reference.nearest(w, c, a, b) if (c < a).any() or (c > b).any() else 0.0
         for a, b in zip(low, high, strict=True)
         for w, c in zip(whiten, centre, strict=True)
     ]
-    return np.array(found).reshape(len(low), len(rows)) / CUT
+    return np.array(nearest).reshape(len(low), len(rows)) / CUT
 
 
 @pytest.mark.parametrize("support", ["ellipsoid", "sphere"])
@@ -108,7 +109,7 @@ def test_exact_lists_of_needles_and_sheets(device: str, anisotropy: float, longe
 
 def _reached(row: np.ndarray, random: np.random.Generator, count: int = 60) -> np.ndarray:
     """Points at the border of what a Gaussian reaches, on either side of it by rounding."""
-    turn = reference.rotations(torch.tensor(row[None, 6:10], dtype=torch.float64))[0].numpy()
+    turn = plain.rotations(torch.tensor(row[None, 6:10], dtype=torch.float64))[0].numpy()
     u = random.normal(size=(count, 3))
     u *= CUT * (1.0 + 1e-6 * random.normal(size=(count, 1))) / np.linalg.norm(u, axis=1, keepdims=True)
     return row[:3] + (u * np.exp(row[3:6].astype(np.float64))) @ turn.T

@@ -9,6 +9,7 @@ import warp as wp
 from reference import gaussians as reference
 
 from kernels.compare import array, close
+from wlm.ops import plain
 from wlm_kernels.probe import gaussian_sum, optimiser
 from wlm_kernels.probe import step as probe_step
 from wlm_kernels.probe.gaussians import SHAPE_NUMBERS, Shape
@@ -164,13 +165,13 @@ def test_features_and_collect(device: str, latent: int, sphere: int):
 def test_steps_repeat(device: str):
     """Nothing is added in an order that changes."""
     grad_f = np.random.default_rng(3).normal(size=(9, 500)).astype(np.float32)
-    found = []
+    runs = []
     for _ in range(2):
         step = Step(_x(500), _rows(70), device)
         step.prepare()
-        found.append((step.features(), step.collect(grad_f)))
-    np.testing.assert_array_equal(found[0][0], found[1][0])
-    np.testing.assert_array_equal(found[0][1], found[1][1])
+        runs.append((step.features(), step.collect(grad_f)))
+    np.testing.assert_array_equal(runs[0][0], runs[1][0])
+    np.testing.assert_array_equal(runs[0][1], runs[1][1])
 
 
 def test_two_lanes_equal_one():
@@ -268,7 +269,7 @@ class Training:
         network = torch.optim.Adam([net], lr=NET_RATE)
         x, grad_f = (torch.tensor(v, dtype=torch.float64) for v in (self.step.x, self.grad_f))
         for factor, partial in zip(SCHEDULE, self.net_grads, strict=True):
-            f = reference.gaussian_sum(torch.cat(groups, 1), x, self.step.cut)
+            f = plain.gaussian_sum(torch.cat(groups, 1), x, cut=self.step.cut).T
             gaussians.zero_grad()
             (f * grad_f).sum().backward()
             net.grad = torch.tensor(partial.astype(np.float64).sum(0))

@@ -7,6 +7,7 @@ import warp as wp
 from reference import raster as reference
 
 from kernels.compare import array, close, exact
+from wlm.ops import plain
 from wlm_kernels.raster import gradient as raster_gradient
 from wlm_kernels.raster.edges import exact_sign
 from wlm_kernels.raster.rasterize import Raster, Rasterizer
@@ -87,8 +88,8 @@ def test_derivative(device: str, kind: str):
     got = _run(position, triangle, *size, device)
     visible = got.triangle.numpy()
     hit = visible >= 0
-    pixels = reference.centres(*size)[torch.tensor(hit)].requires_grad_()
-    b = reference.weights(exact(position), torch.tensor(triangle)[visible[hit]], pixels, *size)
+    pixels = plain.pixel_centres(*size)[torch.tensor(hit)].requires_grad_()
+    b = plain.corner_weights(exact(position), torch.tensor(triangle)[visible[hit]], pixels, *size)
     share = b / b.sum(-1, keepdim=True)
     slopes = [torch.autograd.grad(share[:, i].sum(), pixels, retain_graph=True)[0] for i in range(2)]
     np.testing.assert_allclose(got.derivative.numpy()[hit], torch.cat(slopes, 1), rtol=1e-4, atol=1e-6)
@@ -399,8 +400,8 @@ def test_gradient_of_positions(device: str, kind: str):
     hit = visible >= 0
     toward = np.random.default_rng(3).normal(size=(*size, 2)).astype(np.float32)
     position64 = exact(position, grad=True)
-    pixels = reference.centres(*size)[torch.tensor(hit)]
-    b = reference.weights(position64, torch.tensor(triangle)[visible[hit]], pixels, *size)
+    pixels = plain.pixel_centres(*size)[torch.tensor(hit)]
+    b = plain.corner_weights(position64, torch.tensor(triangle)[visible[hit]], pixels, *size)
     ((b / b.sum(-1, keepdim=True))[:, :2] * exact(toward[hit])).sum().backward()
     on_device = [array(position, float, device), array(triangle.astype(np.int32), int, device)]
     grad = wp.zeros_like(on_device[0])

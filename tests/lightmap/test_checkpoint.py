@@ -1,20 +1,22 @@
+"""Interrupted fits: what their checkpoint keeps, and what it refuses."""
+
 import numpy as np
 import pytest
+from builders.running import report_always
 from builders.small_sets import moving_light, static_light, tiny_profile
 
 from wlm.errors import WlmError
 from wlm.formats.artifact import read_artifact, write_artifact
 from wlm.formats.checkpoint import Checkpoint
-from wlm.lightmap import codec, fit
-from wlm.lightmap.checkpoint import open_checkpoint
 from wlm.lightmap.data import from_arrays
+from wlm.lightmap.fit import compress, open_checkpoint
 
 PROFILE = tiny_profile(steps=40)
 
 
 @pytest.fixture(autouse=True)
 def report_every_chunk(monkeypatch):
-    monkeypatch.setattr(fit, "REPORT_EVERY", 0.0)
+    report_always(monkeypatch)
 
 
 def both_kinds():
@@ -24,8 +26,8 @@ def both_kinds():
 
 
 def stop_after(step):
-    def report(now):
-        if now.step >= step:
+    def report(progress):
+        if progress.done >= step:
             raise KeyboardInterrupt
 
     return report
@@ -34,7 +36,7 @@ def stop_after(step):
 def interrupted(path, lightmaps, step, profile=PROFILE, **options):
     checkpoint = open_checkpoint(path, lightmaps, profile, **options)
     with pytest.raises(KeyboardInterrupt):
-        fit.compress(lightmaps, profile, progress=stop_after(step), checkpoint=checkpoint, **options)
+        compress(lightmaps, profile, progress=stop_after(step), checkpoint=checkpoint, **options)
     return checkpoint
 
 
@@ -42,7 +44,7 @@ def interrupted(path, lightmaps, step, profile=PROFILE, **options):
 def whole(tmp_path_factory):
     """The file of a fit that was not interrupted."""
     path = tmp_path_factory.mktemp("whole") / "whole.wlm"
-    codec.write(path, fit.compress(both_kinds(), PROFILE, seed=3))
+    compress(both_kinds(), PROFILE, seed=3).save(path)
     return path.read_bytes()
 
 
@@ -54,8 +56,8 @@ def test_a_resumed_fit_gives_the_bytes_of_one_that_was_not_interrupted(tmp_path,
     interrupted(tmp_path / "resumed.wlm", lightmaps, step, seed=3)
     checkpoint = open_checkpoint(tmp_path / "resumed.wlm", lightmaps, PROFILE, seed=3, resume=True)
     steps = []
-    model = fit.compress(lightmaps, PROFILE, seed=3, progress=lambda now: steps.append(now.step), checkpoint=checkpoint)
-    codec.write(tmp_path / "resumed.wlm", model)
+    model = compress(lightmaps, PROFILE, seed=3, progress=lambda now: steps.append(now.done), checkpoint=checkpoint)
+    model.save(tmp_path / "resumed.wlm")
 
     assert (tmp_path / "resumed.wlm").read_bytes() == whole
     assert steps[0] > step and steps[-1] == 80, "what was done is not done again"
@@ -65,12 +67,12 @@ def test_a_resumed_fit_gives_the_bytes_of_one_that_was_not_interrupted(tmp_path,
 
 def test_a_fit_may_be_interrupted_again_and_again(tmp_path):
     lightmaps = moving_light()
-    whole = fit.compress(lightmaps, PROFILE)
+    whole = compress(lightmaps, PROFILE)
     for step in (5, 10, 30):
         interrupted(tmp_path / "a.wlm", lightmaps, step)
         checkpoint = open_checkpoint(tmp_path / "a.wlm", lightmaps, PROFILE, resume=True)
         assert checkpoint.running(0)["control"] == step
-    resumed = fit.compress(lightmaps, PROFILE, checkpoint=checkpoint)
+    resumed = compress(lightmaps, PROFILE, checkpoint=checkpoint)
     np.testing.assert_array_equal(resumed.uv, whole.uv)
     np.testing.assert_array_equal(resumed.net, whole.net)
 

@@ -1,4 +1,4 @@
-"""What comes in: every stated behaviour of `wlm.lightmap.data`."""
+"""Reading and checking sets: every stated behaviour of ``wlm.lightmap.data``."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from PIL import Image
 
 from wlm.errors import WlmError
 from wlm.formats.exr import write_exr
-from wlm.lightmap.data import from_arrays, load_set, parse_times
+from wlm.lightmap.data import from_arrays, load, parse_times
 
 HEIGHT, WIDTH = 5, 7
 TIMES = (0.0, 6.5, 18.55)
@@ -50,9 +50,9 @@ def _save_mask(path: Path, mask: np.ndarray, mode: str = "L") -> None:
 
 def _message(call, *args: object, **options: object) -> str:
     """Returns the error of a call; it must be one line."""
-    with pytest.raises(WlmError) as caught:
+    with pytest.raises(WlmError) as error:
         call(*args, **options)
-    text = str(caught.value)
+    text = str(error.value)
     assert "\n" not in text
     return text
 
@@ -60,35 +60,34 @@ def _message(call, *args: object, **options: object) -> str:
 def test_set_json_and_its_folder_are_read_alike(tmp_path):
     frames = _frames()
     path = _write_set(tmp_path, frames)
-    for given in (path, str(path), tmp_path):
-        found = load_set(given)
-        assert (found.name, found.period, found.warnings) == ("tiny", 24.0, ())
-        np.testing.assert_array_equal(found.frames, frames)
-        np.testing.assert_array_equal(found.times, TIMES)
-        assert (
-            found.frames.dtype == np.float32 and found.times.dtype == np.float64 and found.mask.dtype == bool
-        )
-        assert found.mask.all() and found.mask.shape == (HEIGHT, WIDTH)
+    for source in (path, str(path), tmp_path):
+        lightmaps = load(source)
+        assert (lightmaps.name, lightmaps.period, lightmaps.warnings) == ("tiny", 24.0, ())
+        np.testing.assert_array_equal(lightmaps.frames, frames)
+        np.testing.assert_array_equal(lightmaps.times, TIMES)
+        types = lightmaps.frames.dtype, lightmaps.times.dtype, lightmaps.mask.dtype
+        assert types == (np.float32, np.float64, bool)
+        assert lightmaps.mask.all() and lightmaps.mask.shape == (HEIGHT, WIDTH)
 
 
 def test_optional_fields_may_be_absent(tmp_path):
-    found = load_set(_write_set(tmp_path, _frames(), name=None, period_hours=None))
-    assert (found.name, found.period) == (tmp_path.name, None)
+    lightmaps = load(_write_set(tmp_path, _frames(), name=None, period_hours=None))
+    assert (lightmaps.name, lightmaps.period) == (tmp_path.name, None)
 
 
 def test_times_and_period_given_replace_those_of_the_set(tmp_path):
     path = _write_set(tmp_path, _frames())
-    found = load_set(path, times=[1, 2, 30], period=40)
-    np.testing.assert_array_equal(found.times, [1, 2, 30])
-    assert found.period == 40.0
-    assert "2 times for 3 lightmaps" in _message(load_set, path, times=[1, 2])
+    lightmaps = load(path, times=[1, 2, 30], period=40)
+    np.testing.assert_array_equal(lightmaps.times, [1, 2, 30])
+    assert lightmaps.period == 40.0
+    assert "2 times for 3 lightmaps" in _message(load, path, times=[1, 2])
 
 
 def test_source_names_pixels_times_and_mask(tmp_path):
     frames, mask = _frames(), np.ones((HEIGHT, WIDTH), bool)
     base = from_arrays(frames, TIMES, mask).source
     assert len(base) == 16 and int(base, 16) >= 0
-    assert load_set(_write_set(tmp_path, frames)).source == base
+    assert load(_write_set(tmp_path, frames)).source == base
     brighter, other = frames.copy(), mask.copy()
     brighter[2, 4, 6, 2] += 1.0
     other[0, 0] = False
@@ -101,16 +100,16 @@ def test_source_names_pixels_times_and_mask(tmp_path):
 def test_mask_png_of_any_mode(tmp_path, mode):
     mask = np.arange(HEIGHT * WIDTH).reshape(HEIGHT, WIDTH) % 3 == 0
     _save_mask(tmp_path / "mask.png", mask, mode)
-    found = load_set(_write_set(tmp_path, _frames(), mask="mask.png"))
-    np.testing.assert_array_equal(found.mask, mask)
+    lightmaps = load(_write_set(tmp_path, _frames(), mask="mask.png"))
+    np.testing.assert_array_equal(lightmaps.mask, mask)
 
 
 def test_mask_png_counts_any_colour_and_any_level(tmp_path):
     picture = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     picture[1, 2, 0] = picture[3, 4, 2] = 1
     Image.fromarray(picture).save(tmp_path / "mask.png")
-    found = load_set(_write_set(tmp_path, _frames(), mask="mask.png"))
-    np.testing.assert_array_equal(found.mask, picture.any(axis=2))
+    lightmaps = load(_write_set(tmp_path, _frames(), mask="mask.png"))
+    np.testing.assert_array_equal(lightmaps.mask, picture.any(axis=2))
 
 
 def test_mask_argument_replaces_that_of_the_set(tmp_path):
@@ -119,9 +118,9 @@ def test_mask_argument_replaces_that_of_the_set(tmp_path):
     other = tmp_path / "elsewhere.png"
     _save_mask(other, mask)
     path = _write_set(tmp_path, _frames(), mask="missing.png")
-    np.testing.assert_array_equal(load_set(path, mask=other).mask, mask)
-    assert load_set(path, mask="all").mask.all()
-    assert "missing.png" in _message(load_set, path)
+    np.testing.assert_array_equal(load(path, mask=other).mask, mask)
+    assert load(path, mask="all").mask.all()
+    assert "missing.png" in _message(load, path)
 
 
 def test_mask_from_alpha_needs_all_frames(tmp_path):
@@ -130,27 +129,27 @@ def test_mask_from_alpha_needs_all_frames(tmp_path):
     frames[0, 0, 0, 3] = 0.0
     frames[2, 3, 4, 3] = -1.0
     frames[1, 2, 2, 3] = 0.25
-    found = load_set(_write_set(tmp_path, frames, mask="alpha"))
+    lightmaps = load(_write_set(tmp_path, frames, mask="alpha"))
     expected = np.ones((HEIGHT, WIDTH), bool)
     expected[0, 0] = expected[3, 4] = False
-    np.testing.assert_array_equal(found.mask, expected)
-    np.testing.assert_array_equal(found.frames, frames[..., :3])
+    np.testing.assert_array_equal(lightmaps.mask, expected)
+    np.testing.assert_array_equal(lightmaps.frames, frames[..., :3])
 
 
 def test_mask_from_alpha_without_alpha_names_the_file(tmp_path):
-    message = _message(load_set, _write_set(tmp_path, _frames(), mask="alpha"))
+    message = _message(load, _write_set(tmp_path, _frames(), mask="alpha"))
     assert "a.exr" in message and "channel A" in message
 
 
 def test_mask_errors(tmp_path):
     path = _write_set(tmp_path, _frames(), mask="mask.png")
     _save_mask(tmp_path / "mask.png", np.ones((HEIGHT, WIDTH + 1), bool))
-    message = _message(load_set, path)
+    message = _message(load, path)
     assert "mask.png" in message and "8x5" in message and "7x5" in message
     _save_mask(tmp_path / "mask.png", np.zeros((HEIGHT, WIDTH), bool))
-    assert "mask is empty" in _message(load_set, path)
+    assert "mask is empty" in _message(load, path)
     (tmp_path / "mask.png").write_bytes(b"no picture")
-    assert "mask.png: cannot read the mask" in _message(load_set, path)
+    assert "mask.png: cannot read the mask" in _message(load, path)
 
 
 def test_nan_and_inf_inside_take_the_nearest_finite_texel(tmp_path):
@@ -163,17 +162,17 @@ def test_nan_and_inf_inside_take_the_nearest_finite_texel(tmp_path):
     frames[2, 4, 6, 1] = -np.inf
     expected = frames.copy()
     _save_mask(tmp_path / "mask.png", mask)
-    found = load_set(_write_set(tmp_path, frames, mask="mask.png"))
+    lightmaps = load(_write_set(tmp_path, frames, mask="mask.png"))
     expected[1, 0, 0] = 0.0
-    assert tuple(found.frames[1, 2, 1]) in {tuple(frames[1, 1, 1]), tuple(frames[1, 3, 1])}
-    assert tuple(found.frames[2, 4, 6]) in {tuple(frames[2, 3, 6]), tuple(frames[2, 4, 5])}
+    assert tuple(lightmaps.frames[1, 2, 1]) in {tuple(frames[1, 1, 1]), tuple(frames[1, 3, 1])}
+    assert tuple(lightmaps.frames[2, 4, 6]) in {tuple(frames[2, 3, 6]), tuple(frames[2, 4, 5])}
     repaired = np.zeros((len(TIMES), HEIGHT, WIDTH), bool)
     repaired[1, 2, 1:4] = repaired[2, 4, 6] = True
-    np.testing.assert_array_equal(found.frames[~repaired], expected[~repaired])
-    assert np.isfinite(found.frames).all()
-    assert len(found.warnings) == 2
-    assert found.warnings[0].startswith("b.exr: 3 texels NaN or infinite")
-    assert found.warnings[1].startswith("c.exr: 1 texel NaN or infinite")
+    np.testing.assert_array_equal(lightmaps.frames[~repaired], expected[~repaired])
+    assert np.isfinite(lightmaps.frames).all()
+    assert len(lightmaps.warnings) == 2
+    assert lightmaps.warnings[0].startswith("b.exr: 3 texels NaN or infinite")
+    assert lightmaps.warnings[1].startswith("c.exr: 1 texel NaN or infinite")
 
 
 def test_frame_without_a_finite_texel_inside_is_an_error(tmp_path):
@@ -182,7 +181,7 @@ def test_frame_without_a_finite_texel_inside_is_an_error(tmp_path):
     mask = np.ones((HEIGHT, WIDTH), bool)
     mask[:, 0] = False
     _save_mask(tmp_path / "mask.png", mask)
-    message = _message(load_set, _write_set(tmp_path, frames, mask="mask.png"))
+    message = _message(load, _write_set(tmp_path, frames, mask="mask.png"))
     assert "b.exr" in message and "finite" in message
 
 
@@ -193,68 +192,68 @@ def test_negative_radiance_is_clamped_and_counted():
     frames[0, 0, 0] = -5.0
     mask = np.ones((HEIGHT, WIDTH), bool)
     mask[0, 0] = False
-    found = from_arrays(frames, TIMES, mask)
-    np.testing.assert_array_equal(found.frames[0, 1, 1], (0.0, 2.0, 0.0))
-    np.testing.assert_array_equal(found.frames, np.maximum(frames, 0.0))
-    assert found.warnings == ("frame 0 (time 0): 2 texels negative: clamped to 0",)
+    lightmaps = from_arrays(frames, TIMES, mask)
+    np.testing.assert_array_equal(lightmaps.frames[0, 1, 1], (0.0, 2.0, 0.0))
+    np.testing.assert_array_equal(lightmaps.frames, np.maximum(frames, 0.0))
+    assert lightmaps.warnings == ("frame 0 (time 0): 2 texels negative: clamped to 0",)
     assert frames[0, 1, 1, 0] == -1.0  # the caller's array is left alone
 
 
 def test_hdr_passes_up_to_the_largest_half():
     frames = _frames()
     frames[0, 0, 0] = (60_000.0, 65_504.0, 0.0)
-    found = from_arrays(frames, TIMES)
-    np.testing.assert_array_equal(found.frames, frames)
-    assert found.warnings == ()
+    lightmaps = from_arrays(frames, TIMES)
+    np.testing.assert_array_equal(lightmaps.frames, frames)
+    assert lightmaps.warnings == ()
     frames[2, 0, 0] = (70_000.0, 1.0, 1e30)
-    found = from_arrays(frames, TIMES)
-    np.testing.assert_array_equal(found.frames[2, 0, 0], (65_504.0, 1.0, 65_504.0))
-    assert found.warnings == ("frame 2 (time 18.55): 1 texel above 65,504: clamped to it",)
+    lightmaps = from_arrays(frames, TIMES)
+    np.testing.assert_array_equal(lightmaps.frames[2, 0, 0], (65_504.0, 1.0, 65_504.0))
+    assert lightmaps.warnings == ("frame 2 (time 18.55): 1 texel above 65,504: clamped to it",)
 
 
 def test_repair_takes_neighbours_as_they_are_after_clamping():
     frames = np.zeros((1, 1, 3, 3))
     frames[0, 0] = [[-4.0, 1e6, 1.0], [np.nan, 0.0, 0.0], [-4.0, 1e6, 1.0]]
-    found = from_arrays(frames, [0.0])
-    np.testing.assert_array_equal(found.frames[0, 0, 1], (0.0, 65_504.0, 1.0))
+    lightmaps = from_arrays(frames, [0.0])
+    np.testing.assert_array_equal(lightmaps.frames[0, 0, 1], (0.0, 65_504.0, 1.0))
 
 
 def test_all_zero_and_one_time_and_one_texel_are_fine():
     assert from_arrays(np.zeros((2, 3, 4, 3)), [0, 1]).warnings == ()
-    found = from_arrays(np.full((1, 1, 1, 3), 2.0), [7.0], period=24)
-    assert found.frames.shape == (1, 1, 1, 3) and found.period == 24.0
+    lightmaps = from_arrays(np.full((1, 1, 1, 3), 2.0), [7.0], period=24)
+    assert lightmaps.frames.shape == (1, 1, 1, 3) and lightmaps.period == 24.0
 
 
 def test_unsorted_times_are_sorted_with_their_frames(tmp_path):
     frames = _frames()
     entries = [{"time_hours": t, "file": f} for t, f in zip((12, 3, 20), FILES, strict=True)]
-    found = load_set(_write_set(tmp_path, frames, lightmaps=entries))
-    np.testing.assert_array_equal(found.times, [3, 12, 20])
-    np.testing.assert_array_equal(found.frames, frames[[1, 0, 2]])
-    assert len(found.warnings) == 1 and "sorted" in found.warnings[0]
+    lightmaps = load(_write_set(tmp_path, frames, lightmaps=entries))
+    np.testing.assert_array_equal(lightmaps.times, [3, 12, 20])
+    np.testing.assert_array_equal(lightmaps.frames, frames[[1, 0, 2]])
+    assert len(lightmaps.warnings) == 1 and "sorted" in lightmaps.warnings[0]
 
 
 def test_warnings_after_sorting_name_the_right_file(tmp_path):
     frames = _frames()
     frames[0, 0, 0, 0] = -1.0
     entries = [{"time_hours": t, "file": f} for t, f in zip((12, 3, 20), FILES, strict=True)]
-    found = load_set(_write_set(tmp_path, frames, lightmaps=entries))
-    assert found.warnings[1].startswith("a.exr: 1 texel negative")
+    lightmaps = load(_write_set(tmp_path, frames, lightmaps=entries))
+    assert lightmaps.warnings[1].startswith("a.exr: 1 texel negative")
 
 
 def test_equal_times_name_both_files(tmp_path):
     entries = [{"time_hours": t, "file": f} for t, f in zip((3, 5, 3), FILES, strict=True)]
-    message = _message(load_set, _write_set(tmp_path, _frames(), lightmaps=entries))
+    message = _message(load, _write_set(tmp_path, _frames(), lightmaps=entries))
     assert "a.exr and c.exr" in message and "3" in message
 
 
 @pytest.mark.parametrize("time", [24.0, -0.5, 25.0])
 def test_time_outside_the_period_is_an_error(tmp_path, time):
     path = _write_set(tmp_path, _frames())
-    message = _message(load_set, path, times=[0, 1, time])
+    message = _message(load, path, times=[0, 1, time])
     assert "c.exr" in message and "24" in message
     _write_set(tmp_path, _frames(), period_hours=None)
-    assert time in load_set(path, times=[0, 1, time]).times
+    assert time in load(path, times=[0, 1, time]).times
 
 
 @pytest.mark.parametrize("time", [float("nan"), float("inf")])
@@ -270,10 +269,10 @@ def test_bad_period_is_an_error(period):
 def test_sizes_that_disagree_name_both_files(tmp_path):
     path = _write_set(tmp_path, _frames())
     write_exr(tmp_path / "b.exr", np.zeros((HEIGHT, WIDTH - 1, 3), np.float32))
-    message = _message(load_set, path)
+    message = _message(load, path)
     assert "b.exr: is 6x5" in message and "a.exr is 7x5" in message
     path = _write_set(tmp_path, _frames(), width=WIDTH + 1)
-    message = _message(load_set, path)
+    message = _message(load, path)
     assert "a.exr: is 7x5" in message and "set.json states 8x5" in message
 
 
@@ -281,12 +280,12 @@ def test_missing_truncated_and_misnamed_exr_name_the_file(tmp_path):
     path = _write_set(tmp_path, _frames())
     whole = (tmp_path / "b.exr").read_bytes()
     (tmp_path / "b.exr").write_bytes(whole[: len(whole) // 2])
-    assert "b.exr" in _message(load_set, path)
+    assert "b.exr" in _message(load, path)
     (tmp_path / "b.exr").unlink()
-    assert "b.exr" in _message(load_set, path)
+    assert "b.exr" in _message(load, path)
     # One letter in the list of channels: R becomes X.
     (tmp_path / "b.exr").write_bytes(whole.replace(b"R\0\x02\0\0\0", b"X\0\x02\0\0\0", 1))
-    message = _message(load_set, path)
+    message = _message(load, path)
     assert "b.exr" in message and "X" in message
 
 
@@ -323,7 +322,7 @@ def test_malformed_set_names_the_field(tmp_path, changes, expected):
         if value is None:
             del content[key]
     path.write_text(json.dumps(content))
-    message = _message(load_set, path)
+    message = _message(load, path)
     assert message.startswith(f"{path}: ") and expected in message
 
 
@@ -331,12 +330,12 @@ def test_malformed_set_names_the_field(tmp_path, changes, expected):
 def test_set_that_is_no_json_object_names_the_file(tmp_path, text):
     path = tmp_path / "set.json"
     path.write_bytes(text.encode("latin-1"))
-    assert str(path) in _message(load_set, path)
+    assert str(path) in _message(load, path)
 
 
 def test_path_that_does_not_exist(tmp_path):
-    assert "nowhere" in _message(load_set, tmp_path / "nowhere")
-    assert "expected a set.json or EXR files" in _message(load_set, tmp_path)
+    assert "nowhere" in _message(load, tmp_path / "nowhere")
+    assert "expected a set.json or EXR files" in _message(load, tmp_path)
 
 
 def test_plain_folder_takes_files_in_natural_order(tmp_path):
@@ -344,18 +343,18 @@ def test_plain_folder_takes_files_in_natural_order(tmp_path):
     for name, frame in zip(("x10.exr", "x2.exr", "x1.EXR"), frames, strict=True):
         write_exr(tmp_path / name, frame)
     (tmp_path / "._x1.exr").write_bytes(b"another program's")
-    found = load_set(tmp_path, times=[1, 2, 3])
-    np.testing.assert_array_equal(found.frames, frames[::-1])
-    assert (found.name, found.period, found.warnings) == (tmp_path.name, None, ())
-    assert "2 times for 3 lightmaps" in _message(load_set, tmp_path, times=[1, 2])
+    lightmaps = load(tmp_path, times=[1, 2, 3])
+    np.testing.assert_array_equal(lightmaps.frames, frames[::-1])
+    assert (lightmaps.name, lightmaps.period, lightmaps.warnings) == (tmp_path.name, None, ())
+    assert "2 times for 3 lightmaps" in _message(load, tmp_path, times=[1, 2])
 
 
 def test_plain_folder_uses_its_mask(tmp_path):
     write_exr(tmp_path / "a.exr", _frames()[0])
     mask = np.arange(HEIGHT * WIDTH).reshape(HEIGHT, WIDTH) % 2 == 0
     _save_mask(tmp_path / "mask.png", mask)
-    np.testing.assert_array_equal(load_set(tmp_path, times=[0]).mask, mask)
-    assert load_set(tmp_path, times=[0], mask="all").mask.all()
+    np.testing.assert_array_equal(load(tmp_path, times=[0]).mask, mask)
+    assert load(tmp_path, times=[0], mask="all").mask.all()
 
 
 def test_plain_folder_reads_hours_from_names(tmp_path):
@@ -363,17 +362,17 @@ def test_plain_folder_reads_hours_from_names(tmp_path):
     names = ("m_5.5h", "m_5.45h", "m_18_55h", "m_07h", "m_20.25")
     for name, frame in zip(names, frames, strict=True):
         write_exr(tmp_path / f"{name}.exr", frame)
-    found = load_set(tmp_path)
-    np.testing.assert_array_equal(found.times, [5.45, 5.5, 7, 18.55, 20.25])
-    np.testing.assert_array_equal(found.frames, frames[[1, 0, 3, 2, 4]])
-    assert found.warnings == ()  # nobody gave an order that could be wrong
+    lightmaps = load(tmp_path)
+    np.testing.assert_array_equal(lightmaps.times, [5.45, 5.5, 7, 18.55, 20.25])
+    np.testing.assert_array_equal(lightmaps.frames, frames[[1, 0, 3, 2, 4]])
+    assert lightmaps.warnings == ()  # nobody gave an order that could be wrong
 
 
 @pytest.mark.parametrize("odd", ["m_12", "noon", "m12h"])
 def test_plain_folder_with_a_name_that_tells_no_hour(tmp_path, odd):
     for name in ("m_05_00h", odd):
         write_exr(tmp_path / f"{name}.exr", _frames()[0])
-    message = _message(load_set, tmp_path)
+    message = _message(load, tmp_path)
     assert "2 EXR files" in message and "--times" in message and odd in message
 
 
@@ -414,14 +413,14 @@ def test_parse_times_refuses(text):
 
 
 def test_demo_set_loads_without_a_repair(tmp_path):
-    found = load_set(DEMO)
-    assert found.frames.shape == (26, 256, 128, 3) and found.period == 24.0 and found.warnings == ()
-    assert 18.45 in found.times and 18.55 in found.times
-    before, after = (found.frames[list(found.times).index(t)][found.mask].mean() for t in (18.45, 18.55))
+    lightmaps = load(DEMO)
+    assert lightmaps.frames.shape == (26, 256, 128, 3) and lightmaps.period == 24.0 and lightmaps.warnings == ()
+    assert 18.45 in lightmaps.times and 18.55 in lightmaps.times
+    before, after = (lightmaps.frames[list(lightmaps.times).index(t)][lightmaps.mask].mean() for t in (18.45, 18.55))
     assert after > 1.5 * before  # the lamps
-    assert not found.frames[:, ~found.mask].any()
-    # Read by the names alone, the same hours are found.
+    assert not lightmaps.frames[:, ~lightmaps.mask].any()
+    # Read by the names alone, the same hours are lightmaps.
     for file in DEMO.glob("*.exr"):
         shutil.copy(file, tmp_path)
     shutil.copy(DEMO / "mask.png", tmp_path)
-    assert load_set(tmp_path).source == found.source
+    assert load(tmp_path).source == lightmaps.source

@@ -1,15 +1,18 @@
+"""Scores: those of the protocol, over what a model holds."""
+
 import json
 import math
 
 import numpy as np
 import pytest
+from builders.running import report_always
 from builders.small_sets import moving_light, static_light, tiny_profile
 
+import wlm
 from wlm.errors import WlmError
-from wlm.lightmap import codec
 from wlm.lightmap.data import from_arrays
 from wlm.lightmap.decode import Decoder
-from wlm.lightmap.evaluation import bits_per_texel, evaluate, evaluate_baselines, part_bytes
+from wlm.lightmap.evaluation import bits_per_texel, evaluate, part_bytes
 from wlm.lightmap.fit import compress
 from wlm.metrics import evaluate_frame, summarise
 
@@ -32,14 +35,14 @@ def four_tiles():
 def fitted(tmp_path_factory):
     lightmaps = four_tiles()
     path = tmp_path_factory.mktemp("fitted") / "a.wlm"
-    size = codec.write(path, compress(lightmaps, tiny_profile(steps=60)))
-    return lightmaps, codec.read(path), size
+    size = compress(lightmaps, tiny_profile(steps=60)).save(path)
+    return lightmaps, wlm.load(path), size
 
 
 @pytest.fixture(scope="module")
 def report(fitted):
-    lightmaps, model, size = fitted
-    return evaluate(model, lightmaps, size)
+    lightmaps, model, _ = fitted
+    return evaluate(model, lightmaps)
 
 
 def test_the_scores_are_those_of_the_protocol(fitted, report):
@@ -89,7 +92,7 @@ def test_the_report_is_json_without_nan(report):
 def test_only_the_held_tiles_are_scored(fitted):
     lightmaps, whole, _ = fitted
     model = compress(lightmaps, tiny_profile(steps=60), tiles=[1, 2])
-    report = evaluate(model, lightmaps, 50_000)
+    report = evaluate(model, lightmaps, file_bytes=50_000)
     assert report.not_scored == {"empty": 5, "not_held": 5, "few_texels": 0, "zero_range": 5}
     assert report.tiles == 2 and "1 tiles with valid texels" in report.warnings[0]
     assert math.isnan(report.psnr_by_tile[0, 0]) and math.isfinite(report.psnr_by_tile[0, 1])
@@ -98,25 +101,26 @@ def test_only_the_held_tiles_are_scored(fitted):
     assert bits_per_texel(whole, lightmaps.mask, 50_000) == 50_000 * 8 / (200 * 228 * 5)
 
 
-def test_metrics_not_asked_for_are_null(fitted):
-    lightmaps, model, size = fitted
+def test_metrics_not_asked_for_are_null(fitted, monkeypatch):
+    lightmaps, model, _ = fitted
     calls = []
-    report = evaluate(model, lightmaps, size, metrics=("psnr",), progress=lambda *now: calls.append(now))
+    report_always(monkeypatch)
+    report = evaluate(model, lightmaps, metrics=("psnr",), progress=lambda now: calls.append((now.done, now.total)))
     document = report.to_json()
     assert document["ssim"] is None and document["flip"] is None and document["psnr"] == report.psnr
     assert calls == [(i, 5) for i in range(1, 6)]
 
 
 def test_another_source_is_scored_with_a_warning(fitted):
-    lightmaps, model, size = fitted
+    lightmaps, model, _ = fitted
     other = from_arrays(lightmaps.frames * 1.5, lightmaps.times, lightmaps.mask, 24.0)
-    report = evaluate(model, other, size, metrics=("psnr",))
+    report = evaluate(model, other, metrics=("psnr",))
     assert model.source in report.warnings[0] and other.source in report.warnings[0]
-    assert report.psnr < evaluate(model, lightmaps, size, metrics=("psnr",)).psnr
+    assert report.psnr < evaluate(model, lightmaps, metrics=("psnr",)).psnr
 
 
 def test_a_set_that_does_not_fit_is_one_line(fitted):
-    lightmaps, model, size = fitted
+    lightmaps, model, _ = fitted
     frames, times, mask = lightmaps.frames, lightmaps.times, lightmaps.mask
     for other, says in (
         (from_arrays(frames[:, :-1], times, mask[:-1]), "is 228x199, but the file four holds 228x200"),
@@ -125,27 +129,10 @@ def test_a_set_that_does_not_fit_is_one_line(fitted):
         (from_arrays(frames, times, ~mask), "no tile of the file four has a valid texel"),
     ):
         with pytest.raises(WlmError, match=says):
-            evaluate(model, other, size)
+            evaluate(model, other)
     with pytest.raises(WlmError, match="unknown metric"):
-        evaluate(model, lightmaps, size, metrics=("lpips",))
+        evaluate(model, lightmaps, metrics=("lpips",))
     with pytest.raises(WlmError, match="device"):
-        evaluate(model, lightmaps, size, device="tpu")
+        evaluate(model, lightmaps, device="tpu")
     with pytest.raises(ValueError, match="file_bytes"):
-        evaluate(model, lightmaps, 100, metrics=("psnr",))
-
-
-def test_baselines_are_scored_over_the_same_texels(fitted):
-    lightmaps, _, _ = fitted
-    model = compress(lightmaps, tiny_profile(steps=10), tiles=[1])
-    (plain, bc6h) = evaluate_baselines(model, lightmaps, ("8bit", "bc6h"), metrics=("psnr",))
-    assert plain.bytes == 5 * (200 * 228 * 3 + 4) and plain.bpp == pytest.approx(24.0, abs=0.01)
-    assert bc6h.bpp == pytest.approx(8.0, abs=0.1) and math.isnan(plain.ssim)
-    assert plain.to_json()["ssim"] is None
-    # Not scored where the model holds nothing: noise there changes nothing.
-    frames = lightmaps.frames.copy()
-    frames[:, :, :128] *= 1.0 / np.random.default_rng(0).uniform(1.0, 9.0, frames[:, :, :128].shape)
-    noisy = from_arrays(frames, lightmaps.times, lightmaps.mask, 24.0)
-    (again,) = evaluate_baselines(model, noisy, ("bc6h",), metrics=("psnr",))
-    assert again.psnr == bc6h.psnr
-    with pytest.raises(WlmError, match="unknown codec"):
-        evaluate_baselines(model, lightmaps, ("jpeg",))
+        evaluate(model, lightmaps, file_bytes=100, metrics=("psnr",))

@@ -15,6 +15,7 @@ from scipy.special import erf
 
 from wlm.errors import WlmError
 from wlm.formats.bc7 import decode_image
+from wlm.formats.exr import read_exr
 from wlm.lightmap.decode import Decoder
 from wlm.lightmap.exact import colour_tile64, decode_tile64
 from wlm.lightmap.exporter import export
@@ -122,6 +123,7 @@ def test_the_files_alone_give_the_decoders_light(settings, tmp_path):
     model = random_model(**settings)
     export(model, tmp_path)
     decoder = Decoder(model)
+    np.testing.assert_array_equal(read_exr(tmp_path / "frame.exr")[0], decoder.frame(model.times[0]))
     for time in TIMES:
         expected = decoder.frame(time)
         # float32 in the decoder, 9 digits in the file: 1e-6 of the brightest texel measured.
@@ -135,7 +137,7 @@ def test_other_decoders_read_the_textures(tmp_path):
     assert sorted(names) == sorted(path.name for path in tmp_path.iterdir())
     parts = ["uv", "uvt", "ut", "vt"]
     stems = [f"tile_0000_{p}" for p in parts] + ["tile_0001_uv"] + [f"tile_0003_{p}" for p in parts]
-    assert names == [f"{stem}.dds" for stem in stems] + ["decode.glsl", "weights.json"]
+    assert names == [f"{stem}.dds" for stem in stems] + ["decode.glsl", "frame.exr", "weights.json"]
     for place, number in enumerate((0, 1, 3)):
         with Image.open(tmp_path / f"tile_{number:04d}_uv.dds") as image:
             assert np.array_equal(np.asarray(image), decode_image(model.uv[place]))
@@ -164,8 +166,9 @@ def test_a_second_export_replaces_the_first_and_nothing_else(tmp_path):
     export(random_model((3, 3)), folder)
     (folder / "readme.txt").write_text("mine")
     export(random_model((2, 0), seed=1), folder)
-    found = sorted(path.name for path in folder.iterdir())
-    assert found == ["decode.glsl", "readme.txt", "tile_0000_uv.dds", "weights.json"]
+    names = sorted(path.name for path in folder.iterdir())
+    assert names == ["decode.glsl", "frame.exr", "readme.txt", "tile_0000_uv.dds", "weights.json"]
+    assert [path.name for path in folder.parent.iterdir()] == ["here"]
 
 
 @pytest.mark.parametrize("content", [None, "{}", "[1]", "not json"])
@@ -174,7 +177,7 @@ def test_a_folder_of_other_files_is_left_alone(content, tmp_path):
     if content is not None:
         (tmp_path / "weights.json").write_text(content)
     before = {path: path.read_bytes() for path in tmp_path.iterdir()}
-    with pytest.raises(WlmError, match="expected an empty folder or one of an earlier export"):
+    with pytest.raises(WlmError, match="expected an empty folder or one of an earlier output"):
         export(random_model((2, 0)), tmp_path)
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
 
@@ -187,8 +190,12 @@ def test_what_cannot_be_exported(tmp_path):
         export(replace(model, net_static=net), tmp_path / "new")
     assert not (tmp_path / "new").exists()
     (tmp_path / "file").write_text("x")
-    with pytest.raises(WlmError, match="cannot export there"):
-        export(model, tmp_path / "file")
+    for folder in (tmp_path / "file", tmp_path / "file" / "below"):
+        with pytest.raises(WlmError, match="cannot write there"):
+            export(model, folder)
+    with pytest.raises(WlmError, match="device 'tpu'"):
+        export(model, tmp_path / "new", device="tpu")
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
 CALLER = """
@@ -298,12 +305,8 @@ def run_shader(program, folder, number, time):
     document = json.loads((folder / "weights.json").read_text())
     before, after, share, tau = place_in_time(document, time)
     tile = next(tile for tile in document["tiles"] if tile["number"] == number)
-    networks = [
-        np.ravel(other[key])
-        for other in document["tiles"]
-        if "W1" in other
-        for key in ("W1", "b1", "W2", "b2", "W3", "b3")
-    ]
+    keys = ("W1", "b1", "W2", "b2", "W3", "b3")
+    networks = [np.ravel(each[key]) for each in document["tiles"] if "W1" in each for key in keys]
     networks = np.concatenate(networks)
     scale = (1.0 - share) * np.array(tile["scale"][before]) + share * np.array(tile["scale"][after])
     dynamic = tile["kind"] == "dynamic"

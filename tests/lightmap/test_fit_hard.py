@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from builders.small_sets import HOURS, moving_light, static_light, tiny_profile
 
+import wlm
 from wlm.errors import WlmError
-from wlm.lightmap import codec
 from wlm.lightmap.data import from_arrays
 from wlm.lightmap.decode import Decoder
 from wlm.lightmap.evaluation import count_kinds, evaluate
@@ -16,9 +16,9 @@ PROFILE = tiny_profile()
 
 
 def through_file(tmp_path, lightmaps, profile=PROFILE, **options):
-    """Compresses, writes and reads; the decoder of the file, which gives finite light that isn't negative."""
-    codec.write(tmp_path / "a.wlm", compress(lightmaps, profile, **options))
-    decoder = Decoder(codec.read(tmp_path / "a.wlm"))
+    """Compresses, saves and loads; the file's decoder, which gives finite light that isn't negative."""
+    compress(lightmaps, profile, **options).save(tmp_path / "a.wlm")
+    decoder = wlm.load(tmp_path / "a.wlm").decoder()
     for stamp in lightmaps.times:
         frame = decoder.frame(stamp)
         assert frame.shape == lightmaps.frames.shape[1:]
@@ -31,7 +31,7 @@ def decoded(decoder):
 
 
 def file_bytes(tmp_path, lightmaps, **options):
-    codec.write(tmp_path / "bytes.wlm", compress(lightmaps, PROFILE, **options))
+    compress(lightmaps, PROFILE, **options).save(tmp_path / "bytes.wlm")
     return (tmp_path / "bytes.wlm").read_bytes()
 
 
@@ -78,7 +78,7 @@ def test_one_valid_texel(tmp_path):
     # A texel alone is a constant at every time, whatever the light does.
     assert only(decoder, "constant")
     np.testing.assert_allclose(decoded(decoder)[:, 77, 3], lightmaps.frames[:, 77, 3], rtol=2**-10)
-    report = evaluate(decoder.model, lightmaps, (tmp_path / "a.wlm").stat().st_size)
+    report = evaluate(decoder.model, lightmaps)
     assert report.scored == 0 and report.to_json()["psnr"] is None
 
 
@@ -107,7 +107,8 @@ def test_maps_that_are_no_multiple_of_a_tile(tmp_path, height, width, tiles):
     assert decoder.tile(0, 3.0, border=4).shape == (136, 136, 3)
     pixels, peak = decoder.frame_8bit(3.0)
     assert pixels.shape == (height, width, 4) and peak.shape == (tiles,)
-    report = evaluate(decoder.model, lightmaps, (tmp_path / "a.wlm").stat().st_size, metrics=("psnr",))
+    report = evaluate(decoder.model, lightmaps, metrics=("psnr",))
+    assert report.bytes == (tmp_path / "a.wlm").stat().st_size
     assert report.bpp == report.bytes * 8 / (height * width * len(HOURS))
 
 
@@ -119,8 +120,8 @@ def test_light_up_to_60000(tmp_path):
     assert out.max() > 10_000
     np.testing.assert_allclose(out.mean((1, 2)), lightmaps.frames.mean((1, 2)), rtol=0.3)
     # The scale is the same path for any brightness: the fit is as good as that of the dim set.
-    dim = evaluate(compress(moving_light(), tiny_profile(steps=60)), moving_light(), 10**6, metrics=("psnr",))
-    bright = evaluate(decoder.model, lightmaps, 10**6, metrics=("psnr",))
+    dim = evaluate(compress(moving_light(), tiny_profile(steps=60)), moving_light(), metrics=("psnr",))
+    bright = evaluate(decoder.model, lightmaps, metrics=("psnr",))
     assert bright.psnr == pytest.approx(dim.psnr, abs=2.0)
 
 

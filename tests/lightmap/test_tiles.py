@@ -50,17 +50,8 @@ def _kind(linear: np.ndarray, mask: np.ndarray | None = None, budget: float = 60
 def test_grid():
     grid = TileGrid.of(HEIGHT, WIDTH)
     assert grid == TileGrid(HEIGHT, WIDTH, 2, 3) and grid.count == 6
-    assert [grid.origin(i) for i in range(6)] == [
-        (0, 0),
-        (0, 128),
-        (0, 256),
-        (128, 0),
-        (128, 128),
-        (128, 256),
-    ]
-    assert (
-        TileGrid.of(1, 1).count == 1 and TileGrid.of(128, 256).count == 2 and TileGrid.of(129, 1).count == 2
-    )
+    assert [grid.origin(i) for i in range(6)] == [(y, x) for y in (0, 128) for x in (0, 128, 256)]
+    assert [TileGrid.of(*size).count for size in ((1, 1), (128, 256), (129, 1))] == [1, 2, 2]
     for index in (-1, 6):
         with pytest.raises(WlmError, match="outside the grid"):
             grid.origin(index)
@@ -125,14 +116,9 @@ def test_one_texel_fills_its_tile():
 
 
 def test_split_refuses(lightmaps):
-    for wanted, text in (
-        ([6], "outside the grid"),
-        ([-1], "outside the grid"),
-        ([1, 1], "twice"),
-        ([], "none"),
-    ):
+    for tiles, text in (([6], "outside the grid"), ([-1], "outside the grid"), ([1, 1], "twice"), ([], "none")):
         with pytest.raises(WlmError, match=text):
-            split(lightmaps, GAMMA, wanted)
+            split(lightmaps, GAMMA, tiles)
     for gamma in (0.0, -1.0, float("nan"), float("inf")):
         with pytest.raises(WlmError, match="gamma"):
             split(lightmaps, gamma)
@@ -142,10 +128,8 @@ def test_assemble_fills_what_is_absent_and_keeps_the_type():
     grid = TileGrid.of(HEIGHT, WIDTH)
     image = assemble(np.full((1, TILE, TILE, 2), 7, np.uint8), np.array([4]), grid, fill=3)
     assert image.shape == (HEIGHT, WIDTH, 2) and image.dtype == np.uint8
-    assert (image[TILE:, TILE : 2 * TILE] == 7).all()
-    assert (image == 7).sum() == (HEIGHT - TILE) * TILE * 2 and (image == 3).sum() == image.size - (
-        image == 7
-    ).sum()
+    assert (image[TILE:, TILE : 2 * TILE] == 7).all() and (image == 7).sum() == (HEIGHT - TILE) * TILE * 2
+    assert ((image == 7) | (image == 3)).all()
     with pytest.raises(WlmError, match="twice"):
         assemble(np.zeros((2, TILE, TILE, 3)), np.array([1, 1]), grid)
     with pytest.raises(WlmError, match="expected tiles"):
@@ -177,9 +161,9 @@ def test_static_pattern_recovers_a_product():
     strength = np.array([[0.5, 1.0, 0.0], [0.0, 3.0, 0.0]])  # blue never, red not at the second time
     colour = (strength[None, :, None, None] * pattern[:, None]).astype(np.float32)
     means = channel_means(colour, np.ones((1, TILE, TILE), bool))
-    found = static_pattern(colour, means)
-    np.testing.assert_allclose(found[..., :2], pattern[..., :2], rtol=1e-5)
-    assert (found[..., 2] == 0).all()
+    recovered = static_pattern(colour, means)
+    np.testing.assert_allclose(recovered[..., :2], pattern[..., :2], rtol=1e-5)
+    assert (recovered[..., 2] == 0).all()
 
 
 def test_empty_tile_ignores_its_colour():
@@ -203,7 +187,6 @@ def test_constant_is_one_half_float_step_and_no_more(value):
     linear[1, 5, 5, 1] = step
     assert _kind(linear) is TileKind.CONSTANT
     linear[1, 5, 5, 1] = two
-    # gap.
     assert _kind(linear) is not TileKind.CONSTANT
 
 
@@ -300,6 +283,6 @@ def test_parse_tiles(text, expected):
     ],
 )
 def test_parse_tiles_refuses(text, expected):
-    with pytest.raises(WlmError) as caught:
+    with pytest.raises(WlmError) as error:
         parse_tiles(text, 8)
-    assert expected in str(caught.value) and "\n" not in str(caught.value)
+    assert expected in str(error.value) and "\n" not in str(error.value)

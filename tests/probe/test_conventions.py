@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from wlm.errors import WlmError
-from wlm.probe.conventions import CONVENTIONS, HOUSE, from_house, to_house
+from wlm.probe.conventions import CANONICAL, CONVENTIONS, from_canonical, to_canonical
 
 LIMITED = ("unreal", "unity")
 
@@ -45,8 +45,8 @@ def light(d):
     return np.stack([red, 2.0 - 0.9 * y + 0.5 * x * z, 0.7 + 0.6 * z * z - 0.4 * x * y], 1)
 
 
-def house_basis(d):
-    """The house's basis, from its polynomials up to factors, made orthonormal numerically."""
+def canonical_basis(d):
+    """The canonical basis, from its polynomials up to factors, made orthonormal numerically."""
 
     def polynomials(d):
         x, y, z = d.T
@@ -56,10 +56,10 @@ def house_basis(d):
     return polynomials(d) / np.sqrt(solid @ polynomials(around) ** 2)
 
 
-def house_coefficients():
-    """The light's projection onto the house's basis, float64 [1, 9, 3] (gaussian-probe-compression, eq. 1)."""
+def canonical_coefficients():
+    """The light's projection onto the canonical basis, float64 [1, 9, 3] (gaussian-probe-compression, eq. 1)."""
     d, solid = sphere()
-    return np.einsum("m,mc,mk->ck", solid, house_basis(d), light(d))[None]
+    return np.einsum("m,mc,mk->ck", solid, canonical_basis(d), light(d))[None]
 
 
 def irradiance_over_pi(normals):
@@ -114,29 +114,29 @@ def unity_shade_sh9(c, n):
     return linear + quadratic + c[8] * (x * x - y * y)
 
 
-def test_threejs_is_the_house_and_yields_radiance():
+def test_threejs_is_canonical_and_yields_radiance():
     d = directions()
-    coefficients = from_house(house_coefficients(), "threejs")[0]
+    coefficients = from_canonical(canonical_coefficients(), "threejs")[0]
     np.testing.assert_allclose(threejs_get_at(coefficients, d), light(d), atol=1e-5)
 
 
 def test_godot_shader_yields_irradiance_over_pi():
     n = directions(20)
-    coefficients = from_house(house_coefficients(), "godot")[0]
+    coefficients = from_canonical(canonical_coefficients(), "godot")[0]
     np.testing.assert_allclose(godot_shader(coefficients, n), irradiance_over_pi(n), atol=1e-5)
 
 
-def test_godot_bake_leads_to_the_house():
+def test_godot_bake_becomes_canonical():
     # The baker's estimate with evenly spread rays: 4 / rays times the sum of light times basis.
     d, solid = sphere()
     share = solid / solid.sum()
-    baked = 4.0 * np.einsum("m,mc,mk->ck", share, house_basis(d), light(d))[None]
-    np.testing.assert_allclose(to_house(baked, "godot"), house_coefficients(), atol=1e-12)
+    baked = 4.0 * np.einsum("m,mc,mk->ck", share, canonical_basis(d), light(d))[None]
+    np.testing.assert_allclose(to_canonical(baked, "godot"), canonical_coefficients(), atol=1e-12)
 
 
 def test_unreal_basis_yields_radiance_and_diffuse_transfer():
     d = directions()
-    coefficients = from_house(house_coefficients(), "unreal")[0]
+    coefficients = from_canonical(canonical_coefficients(), "unreal")[0]
     np.testing.assert_allclose(unreal_basis(d) @ coefficients, light(d), atol=1e-5)
     transfer = np.repeat([np.pi, 2.0 * np.pi / 3.0, np.pi / 4.0], [1, 3, 5])
     np.testing.assert_allclose((unreal_basis(d) * transfer) @ coefficients / np.pi, irradiance_over_pi(d), atol=1e-5)
@@ -144,7 +144,7 @@ def test_unreal_basis_yields_radiance_and_diffuse_transfer():
 
 def test_unity_evaluation_yields_irradiance_over_pi():
     n = directions()
-    coefficients = from_house(house_coefficients(), "unity")[0]
+    coefficients = from_canonical(canonical_coefficients(), "unity")[0]
     np.testing.assert_allclose(unity_shade_sh9(coefficients, n), irradiance_over_pi(n), atol=1e-12)
 
 
@@ -153,14 +153,14 @@ def test_unity_lights():
     ambient = np.zeros((1, 9, 3))
     ambient[0, 0] = 0.2, 0.5, 0.9
     d = directions(20)
-    np.testing.assert_allclose(house_basis(d) @ to_house(ambient, "unity")[0], np.tile(ambient[0, 0], (20, 1)))
+    np.testing.assert_allclose(canonical_basis(d) @ to_canonical(ambient, "unity")[0], np.tile(ambient[0, 0], (20, 1)))
     # AddDirectionalLight: a far light of 16 pi / 17 shows its own colour on a surface that faces it, and its numbers
     # are colour * 16 pi / 17 * basis * (1 / 2 sqrt(pi), sqrt(3) / 3 sqrt(pi), sqrt(15) / 8 sqrt(pi), ...).
     colour, power, root = np.array([1.0, 0.6, 0.3]), 16.0 * math.pi / 17.0, math.sqrt(math.pi)
     towards = directions(5, seed=8)
     for way in towards:
-        shone = (power * house_basis(way[None])[0][:, None] * colour)[None]
-        stored = from_house(shone, "unity")
+        shone = (power * canonical_basis(way[None])[0][:, None] * colour)[None]
+        stored = from_canonical(shone, "unity")
         np.testing.assert_allclose(unity_shade_sh9(stored[0], way[None])[0], colour)
         factor = [0.5, *[math.sqrt(3.0) / 3.0] * 3, *[math.sqrt(15.0) / 8.0] * 2, math.sqrt(5.0) / 16.0]
         factor = np.array([*factor, math.sqrt(15.0) / 8.0, math.sqrt(15.0) / 16.0]) / root
@@ -170,43 +170,43 @@ def test_unity_lights():
 
 @pytest.mark.parametrize("name", CONVENTIONS)
 @pytest.mark.parametrize("coefficients", [1, 4, 9])
-def test_there_and_back(name, coefficients):
+def test_round_trip(name, coefficients):
     values = np.random.default_rng(1).normal(size=(50, coefficients, 3)).astype(np.float32)
-    for first, second in ((to_house, from_house), (from_house, to_house)):
+    for first, second in ((to_canonical, from_canonical), (from_canonical, to_canonical)):
         back = second(first(values, name), name)
         assert back.dtype == np.float64
         np.testing.assert_allclose(back, values, rtol=4e-16)
         np.testing.assert_array_equal(back.astype(np.float32), values)
-    if name != HOUSE:
-        assert not np.array_equal(from_house(values, name), values) or (name, coefficients) == ("unreal", 1)
+    if name != CANONICAL:
+        assert not np.array_equal(from_canonical(values, name), values) or (name, coefficients) == ("unreal", 1)
 
 
 def test_values_are_left_alone_and_nan_stays_nan():
     values = np.ones((2, 4, 3))
     values[1, 2, 0] = np.nan
     for name in CONVENTIONS:
-        found = to_house(values, name)
-        assert np.isnan(found).sum() == 1 and np.isnan(found[1, 2, 0])
-    found[:] = 0.0
+        converted = to_canonical(values, name)
+        assert np.isnan(converted).sum() == 1 and np.isnan(converted[1, 2, 0])
+    converted[:] = 0.0
     assert values[0, 0, 0] == 1.0
 
 
 @pytest.mark.parametrize("name", ["threejs", "godot"])
 def test_higher_bands_where_a_convention_has_a_rule_for_them(name):
     values = np.ones((1, 25, 3))
-    np.testing.assert_allclose(from_house(values, name), 1.0 if name == "threejs" else 1.0 / np.pi)
+    np.testing.assert_allclose(from_canonical(values, name), 1.0 if name == "threejs" else 1.0 / np.pi)
 
 
 def test_errors():
     for name in LIMITED:
         with pytest.raises(WlmError, match=rf"convention {name}: knows L0 to L2, got L3 \(16 coefficients\)"):
-            to_house(np.ones((1, 16, 3)), name)
+            to_canonical(np.ones((1, 16, 3)), name)
     for name in CONVENTIONS:
         for count in (2, 8):
             with pytest.raises(WlmError, match=f"convention {name}: expected 1, 4, 9 ... coefficients .* got {count}"):
-                from_house(np.ones((1, count, 3)), name)
+                from_canonical(np.ones((1, count, 3)), name)
     with pytest.raises(WlmError, match="convention: expected threejs, godot, unreal, unity, got 'frostbite'"):
-        to_house(np.ones((1, 9, 3)), "frostbite")
+        to_canonical(np.ones((1, 9, 3)), "frostbite")
     for shape in ((9, 3), (1, 3, 9), (1, 9, 4)):
         with pytest.raises(ValueError, match=r"\[N, C, 3\]"):
-            to_house(np.ones(shape), HOUSE)
+            to_canonical(np.ones(shape), CANONICAL)

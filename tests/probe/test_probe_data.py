@@ -13,8 +13,8 @@ from builders.probe_sets import synthetic
 
 from wlm.errors import WlmError
 from wlm.probe import data
-from wlm.probe.conventions import CONVENTIONS, from_house
-from wlm.probe.data import LARGEST, ProbeSet, from_arrays, load_probes, save_probes
+from wlm.probe.conventions import CONVENTIONS, from_canonical
+from wlm.probe.data import LARGEST, ProbeSet, from_arrays, load, load_positions, save_probes
 
 DEMO = Path(__file__).resolve().parents[2] / "demos" / "data" / "probes" / "street.npz"
 N = 6
@@ -58,53 +58,49 @@ def _same(a: ProbeSet, b: ProbeSet) -> None:
 
 def test_npz(tmp_path):
     path = _write(tmp_path / "Room.NPZ.npz")
-    for given in (path, str(path)):
-        found = load_probes(given)
-        assert (found.name, found.key, found.warnings) == ("Room.NPZ", "sh", ())
-        assert (found.probes, found.outputs, found.float_bytes) == (N, 27, N * 27 * 4)
-        np.testing.assert_array_equal(found.position, _position())
-        np.testing.assert_array_equal(found.values.reshape(N, 9, 3), _values(N, 9, 3))
-        assert found.live.all()
-        dtypes = (found.position.dtype, found.values.dtype, found.live.dtype)
-        assert dtypes == (np.float64, np.float32, bool)
-
-
-def test_flat_and_shaped_values_are_one_set(tmp_path):
-    _same(load_probes(_write(tmp_path / "a.npz")), from_arrays(_position(), _values(N, 27), name="a"))
+    for argument in (path, str(path)):
+        loaded = load(argument)
+        assert (loaded.name, loaded.key, loaded.warnings) == ("Room.NPZ", "sh", ())
+        assert (loaded.probes, loaded.outputs, loaded.float_bytes) == (N, 27, N * 27 * 4)
+        np.testing.assert_array_equal(loaded.position, _position())
+        np.testing.assert_array_equal(loaded.values.reshape(N, 9, 3), _values(N, 9, 3))
+        assert loaded.live.all()
+        assert [a.dtype for a in (loaded.position, loaded.values, loaded.live)] == [np.float64, np.float32, bool]
 
 
 @pytest.mark.parametrize("shape", [(N, 1), (N, 5), (N, 7, 3), (N, 1, 3), (N, 4, 3), (N, 16, 3), (1, 27), (1, 1)])
 def test_any_count_of_probes_and_numbers(shape):
-    found = from_arrays(_position(shape[0]), _values(*shape))
-    assert (found.probes, found.outputs) == (shape[0], np.prod(shape[1:]))
-    np.testing.assert_array_equal(found.values, _values(*shape).reshape(shape[0], -1))
+    probes = from_arrays(_position(shape[0]), _values(*shape))
+    assert (probes.probes, probes.outputs) == (shape[0], np.prod(shape[1:]))
+    _same(probes, from_arrays(_position(shape[0]), _values(*shape).reshape(shape[0], -1)))
+    np.testing.assert_array_equal(probes.values, _values(*shape).reshape(shape[0], -1))
 
 
 def test_several_arrays_need_a_key(tmp_path):
     path = _write(tmp_path / "a.npz", **{"sh": _values(N, 3), "sh_09.00": _values(N, 12), "sh_12.00": _values(N, 27)})
-    assert "give the key of one: sh, sh_09.00, sh_12.00" in _message(load_probes, path)
+    assert "give the key of one: sh, sh_09.00, sh_12.00" in _message(load, path)
     for key, outputs, name in (("12.00", 27, "sh_12.00"), ("sh_09.00", 12, "sh_09.00"), ("sh", 3, "sh")):
-        found = load_probes(path, key=key)
-        assert (found.outputs, found.key) == (outputs, name)
-    message = _message(load_probes, path, key="21.00")
+        loaded = load(path, key=key)
+        assert (loaded.outputs, loaded.key) == (outputs, name)
+    message = _message(load, path, key="21.00")
     assert str(path) in message and "21.00" in message and "sh, sh_09.00, sh_12.00" in message
-    assert "expected values named position" in _message(load_probes, path, key="position")
+    assert "expected values named position" in _message(load, path, key="position")
 
 
 def test_an_exact_name_goes_before_one_with_sh(tmp_path):
     path = _write(tmp_path / "a.npz", noon=_values(N, 1), sh_noon=_values(N, 2))
-    assert load_probes(path, key="noon").outputs == 1
+    assert load(path, key="noon").outputs == 1
     np.savez(path, position=_position(), noon=_values(N, 1))
-    assert "begins with sh" in _message(load_probes, path) and "noon" in _message(load_probes, path)
-    assert load_probes(path, key="noon").key == "noon"
+    assert "begins with sh" in _message(load, path) and "noon" in _message(load, path)
+    assert load(path, key="noon").key == "noon"
 
 
 def test_missing_arrays(tmp_path):
     path = tmp_path / "a.npz"
     np.savez(path, sh=_values(N, 3))
-    assert "position is missing; found sh" in _message(load_probes, path)
+    assert "position is missing; found sh" in _message(load, path)
     np.savez(path, position=_position())
-    assert "found nothing" in _message(load_probes, path)
+    assert "found nothing" in _message(load, path)
 
 
 def test_both_forms_of_json(tmp_path):
@@ -112,69 +108,69 @@ def test_both_forms_of_json(tmp_path):
     lists = {"position": _position().tolist(), "sh": values.tolist(), "author": "me"}
     probes = [{"position": p, "sh": v, "room": 3} for p, v in zip(lists["position"], lists["sh"], strict=True)]
     for content in (lists, {"probes": probes, "made": "by hand"}):
-        found = load_probes(_write_json(tmp_path / "hall.json", content))
-        assert (found.name, found.key) == ("hall", "sh")
-        _same(found, from_arrays(_position(), values))
+        loaded = load(_write_json(tmp_path / "hall.json", content))
+        assert (loaded.name, loaded.key) == ("hall", "sh")
+        _same(loaded, from_arrays(_position(), values))
     flat = {"position": lists["position"], "sh_9": values.reshape(N, 12).tolist(), "sh_12": [[1]] * N}
-    _same(load_probes(_write_json(tmp_path / "flat.json", flat), key="9"), from_arrays(_position(), values))
+    _same(load(_write_json(tmp_path / "flat.json", flat), key="9"), from_arrays(_position(), values))
 
 
 def test_a_convention_from_the_file_or_the_caller(tmp_path):
-    house = from_arrays(_position(), _values(N, 9, 3))
+    canonical = from_arrays(_position(), _values(N, 9, 3))
     for name in CONVENTIONS:
-        engine = from_house(_values(N, 9, 3), name)
+        engine = from_canonical(_values(N, 9, 3), name)
         rounded = from_arrays(_position(), engine, convention=name)
-        np.testing.assert_allclose(rounded.values, house.values, rtol=2e-7)
+        np.testing.assert_allclose(rounded.values, canonical.values, rtol=2e-7)
         content = {"position": _position().tolist(), "sh": engine.tolist(), "convention": name}
-        _same(load_probes(_write_json(tmp_path / "a.json", content)), rounded)
-        _same(load_probes(_write(tmp_path / "a.npz", sh=engine, convention=np.array(name))), rounded)
-        _same(load_probes(_write(tmp_path / "a.npz", sh=engine.reshape(N, 27)), convention=name), rounded)
+        _same(load(_write_json(tmp_path / "a.json", content)), rounded)
+        _same(load(_write(tmp_path / "a.npz", sh=engine, convention=np.array(name))), rounded)
+        _same(load(_write(tmp_path / "a.npz", sh=engine.reshape(N, 27)), convention=name), rounded)
         # The caller's word goes before the file's.
-        wrong = next(other for other in CONVENTIONS if other != name)
-        _same(load_probes(_write(tmp_path / "a.npz", sh=engine, convention=np.array(wrong)), convention=name), rounded)
+        wrong = CONVENTIONS[CONVENTIONS.index(name) - 1]
+        _same(load(_write(tmp_path / "a.npz", sh=engine, convention=np.array(wrong)), convention=name), rounded)
 
 
 def test_conventions_that_do_not_fit(tmp_path):
     path = _write(tmp_path / "a.npz", sh=_values(N, 16, 3))
-    assert load_probes(path, convention="godot").outputs == 48
-    message = _message(load_probes, path, convention="unity")
+    assert load(path, convention="godot").outputs == 48
+    message = _message(load, path, convention="unity")
     assert str(path) in message and "knows L0 to L2, got L3" in message
     for values in (_values(N, 5), _values(N, 6), _values(N, 5, 3)):
         assert from_arrays(_position(), values).outputs == np.prod(values.shape[1:])
         assert "expected spherical harmonics" in _message(from_arrays, _position(), values, convention="unreal")
     for call in (
-        lambda: load_probes(path, convention="Unity"),
+        lambda: load(path, convention="Unity"),
         lambda: save_probes(path, _position(), _values(N, 5), convention="Unity"),
     ):
         message = _message(call)
         assert str(path) in message and "expected threejs, godot, unreal, unity, got 'Unity'" in message
     for wrong in (np.array(3), np.array(["unity"])):
-        message = _message(load_probes, _write(tmp_path / "b.npz", convention=wrong))
+        message = _message(load, _write(tmp_path / "b.npz", convention=wrong))
         assert "b.npz: convention: expected a name, got" in message
     content = {"position": [[0, 0, 0]], "sh": [[1]], "convention": {}}
-    assert "expected a name, got an object" in _message(load_probes, _write_json(tmp_path / "b.json", content))
+    assert "expected a name, got an object" in _message(load, _write_json(tmp_path / "b.json", content))
 
 
 def test_godot_file(tmp_path, monkeypatch):
     # What its reader returns; the reader has its own tests.
     path = tmp_path / "level.lmbake"
     path.write_bytes(b"RSRC")
-    monkeypatch.setattr(data, "read_lmbake", lambda given: (_position(), _values(N, 9, 3)))
-    found = load_probes(path)
-    assert (found.name, found.key) == ("level", "sh")
-    _same(found, from_arrays(_position(), _values(N, 9, 3), convention="godot"))
-    np.testing.assert_allclose(found.values.ravel(), _values(N * 27) * np.pi, rtol=2e-7)
-    assert load_probes(path, key="sh").outputs == 27
-    assert "expected values named 12.00" in _message(load_probes, path, key="12.00")
-    _same(load_probes(path, convention="threejs"), from_arrays(_position(), _values(N, 9, 3)))
+    monkeypatch.setattr(data, "read_lmbake", lambda path: (_position(), _values(N, 9, 3)))
+    loaded = load(path)
+    assert (loaded.name, loaded.key) == ("level", "sh")
+    _same(loaded, from_arrays(_position(), _values(N, 9, 3), convention="godot"))
+    np.testing.assert_allclose(loaded.values.ravel(), _values(N * 27) * np.pi, rtol=2e-7)
+    assert load(path, key="sh").outputs == 27
+    assert "expected values named 12.00" in _message(load, path, key="12.00")
+    _same(load(path, convention="threejs"), from_arrays(_position(), _values(N, 9, 3)))
 
 
 def test_suffix_and_path(tmp_path):
-    assert "ends in .npz or .json or .lmbake, found .exr" in _message(load_probes, tmp_path / "a.exr")
-    assert "found none" in _message(load_probes, tmp_path / "a")
-    assert "missing.json: no such file" in _message(load_probes, tmp_path / "missing.json")
+    assert "ends in .npz or .json or .lmbake, found .exr" in _message(load, tmp_path / "a.exr")
+    assert "found none" in _message(load, tmp_path / "a")
+    assert "missing.json: no such file" in _message(load, tmp_path / "missing.json")
     (tmp_path / "folder.npz").mkdir()
-    assert "no such file" in _message(load_probes, tmp_path / "folder.npz")
+    assert "no such file" in _message(load, tmp_path / "folder.npz")
 
 
 def test_source_names_positions_values_and_live():
@@ -194,17 +190,16 @@ def test_dead_probes():
     values = _values(N, 9, 3)
     values[1] = 0.0
     values[3] = -0.0
-    found = from_arrays(_position(), values)
-    assert found.warnings == () and found.live.tolist() == [True, False, True, False, True, True]
+    loaded = from_arrays(_position(), values)
+    assert loaded.warnings == () and loaded.live.tolist() == [True, False, True, False, True, True]
     values[2, 4, 1] = np.nan
     values[5, 0, 0] = -np.inf
-    found = from_arrays(_position(), values, name="yard")
-    assert found.live.tolist() == [True, False, False, False, True, False]
-    assert found.warnings == (
-        "yard: 2 probes with a NaN or infinite number in sh, first probe 2: set to zero and left out",
-    )
-    np.testing.assert_array_equal(found.values[[1, 2, 3, 5]], 0.0)
-    np.testing.assert_array_equal(found.values[[0, 4]], values[[0, 4]].reshape(2, 27))
+    loaded = from_arrays(_position(), values, name="yard")
+    assert loaded.live.tolist() == [True, False, False, False, True, False]
+    (warning,) = loaded.warnings
+    assert warning == "yard: 2 probes with a NaN or infinite number in sh, first probe 2: set to zero and left out"
+    np.testing.assert_array_equal(loaded.values[[1, 2, 3, 5]], 0.0)
+    np.testing.assert_array_equal(loaded.values[[0, 4]], values[[0, 4]].reshape(2, 27))
     assert np.isnan(values[2, 4, 1])  # the caller's array is left alone
 
 
@@ -212,25 +207,25 @@ def test_no_live_probe_and_no_probe(tmp_path):
     for values in (np.zeros((N, 27)), np.full((N, 27), np.nan), np.full((N, 27), 1e-60)):
         assert "array: sh: every probe is zero or not finite" in _message(from_arrays, _position(), values)
     path = _write(tmp_path / "a.npz", position=np.zeros((0, 3)), sh=np.zeros((0, 9, 3)))
-    assert "a.npz: position: holds no probes" in _message(load_probes, path)
+    assert "a.npz: position: expected at least one, found none" in _message(load, path)
     for content in ({"probes": []}, {"position": [], "sh": []}):
-        assert "position: holds no probes" in _message(load_probes, _write_json(tmp_path / "a.json", content))
+        path = _write_json(tmp_path / "a.json", content)
+        assert "position: expected at least one, found none" in _message(load, path)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_a_position_that_is_not_finite(bad):
     position = _position()
     position[4, 2] = bad
-    assert "position of probe 4: expected finite numbers, got (0.5, 0.625," in _message(
-        from_arrays, position, _values(N, 27)
-    )
+    text = _message(from_arrays, position, _values(N, 27))
+    assert "position[4]: expected finite numbers, got (0.5, 0.625," in text
 
 
 def test_positions_far_away_are_kept():
     position = _position() + [1e9, -3e12, 0.0]
-    found = from_arrays(position, _values(N, 27))
-    np.testing.assert_array_equal(found.position, position)
-    assert found.warnings == ()
+    loaded = from_arrays(position, _values(N, 27))
+    np.testing.assert_array_equal(loaded.position, position)
+    assert loaded.warnings == ()
     position[0, 0], position[1, 0] = -1.5e308, 1.5e308
     assert "further apart than float64 can tell" in _message(from_arrays, position, _values(N, 27))
 
@@ -240,49 +235,42 @@ def test_coincident_positions():
     position[4] = position[2] = position[1]
     position[5] = 0.0
     position[3] = -0.0
-    found = from_arrays(position, _values(N, 27), name="yard")
-    assert found.warnings == ("yard: 3 probes at the position of another: they decode to the same values",)
-    np.testing.assert_array_equal(found.values, _values(N, 27))
-    assert found.live.all()
-    one = from_arrays(np.zeros((2, 3)), _values(2, 3))
-    assert one.warnings == ("array: 1 probe at the position of another: they decode to the same values",)
+    loaded = from_arrays(position, _values(N, 27), name="yard")
+    assert loaded.warnings == ("yard: 3 probes at the position of another: they decode to the same values",)
+    np.testing.assert_array_equal(loaded.values, _values(N, 27))
+    assert loaded.live.all()
+    pair = from_arrays(np.zeros((2, 3)), _values(2, 3))
+    assert pair.warnings == ("array: 1 probe at the position of another: they decode to the same values",)
     # One coordinate alike is no coincidence.
     position = _position()
     position[:, 1] = 7.0
     assert from_arrays(position, _values(N, 27)).warnings == ()
 
 
-def test_the_largest_number_and_beyond():
+def test_numbers_as_large_and_as_small_as_float32_allows():
     values = _values(N, 27)
-    values[3, 8], values[4, 0] = LARGEST, -LARGEST
-    found = from_arrays(_position(), values)
-    assert found.values[3, 8] == np.float32(LARGEST) and found.live.all()
+    values[3, 8], values[4, 0], values[5] = LARGEST, -LARGEST, -1e-44
+    loaded = from_arrays(_position(), values)
+    np.testing.assert_array_equal(loaded.values, values)
+    assert loaded.live.all() and loaded.warnings == ()
     with np.errstate(over="raise"):
-        assert np.isfinite(np.square(found.values)).all()
+        assert np.isfinite(np.square(loaded.values)).all()
     for bad in (LARGEST * 1.001, -1e30, 1e300, 1.7e308):
         wide = values.astype(np.float64)
         wide[3, 8], wide[5, 1] = bad, np.inf
         for convention in ("threejs", "godot"):
             message = _message(from_arrays, _position(), wide, convention=convention)
-            assert "sh of probe 3: expected numbers within 1.8e+19, got " in message
-
-
-def test_negative_and_tiny_numbers_are_kept():
-    values = -np.abs(_values(N, 27))
-    values[0] = 1e-44
-    found = from_arrays(_position(), values)
-    np.testing.assert_array_equal(found.values, values)
-    assert found.live.all() and found.warnings == ()
+            assert "sh[3]: expected numbers within 1.8e+19, got " in message
 
 
 @pytest.mark.parametrize("dtype", [np.float16, np.float64, np.int16, np.uint8, ">f4", np.longdouble])
 def test_number_types_are_converted(tmp_path, dtype):
     values = np.arange(1, N * 27 + 1).reshape(N, 9, 3).astype(dtype)
     position = np.arange(3 * N).reshape(N, 3).astype(dtype)
-    found = load_probes(_write(tmp_path / "a.npz", position=position, sh=values))
-    assert (found.position.dtype, found.values.dtype) == (np.float64, np.float32)
-    np.testing.assert_array_equal(found.values.reshape(N, 9, 3), values)
-    np.testing.assert_array_equal(found.position, position)
+    loaded = load(_write(tmp_path / "a.npz", position=position, sh=values))
+    assert (loaded.position.dtype, loaded.values.dtype) == (np.float64, np.float32)
+    np.testing.assert_array_equal(loaded.values.reshape(N, 9, 3), values)
+    np.testing.assert_array_equal(loaded.position, position)
 
 
 @pytest.mark.parametrize(
@@ -290,7 +278,7 @@ def test_number_types_are_converted(tmp_path, dtype):
     [
         ({"position": np.zeros((N, 2))}, "position: expected (N, 3), got (6, 2)"),
         ({"position": np.zeros(3)}, "position: expected (N, 3), got (3,)"),
-        ({"position": np.float64(3)}, "position: holds no probes"),
+        ({"position": np.float64(3)}, "position: expected at least one, found none"),
         ({"position": np.full((N, 3), "a")}, "position: expected numbers, got <U1"),
         ({"sh": _values(N - 1, 9, 3)}, "sh: expected (6, C, 3) with RGB last or (6, D), a row for each position, got"),
         ({"sh": _values(N, 3, 9)}, "got (6, 3, 9)"),
@@ -307,7 +295,7 @@ def test_number_types_are_converted(tmp_path, dtype):
 )
 def test_wrong_shapes_and_types(tmp_path, changes, expected):
     path = _write(tmp_path / "a.npz", **changes)
-    message = _message(load_probes, path)
+    message = _message(load, path)
     assert message.startswith(f"{path}: ") and expected in message
 
 
@@ -315,14 +303,14 @@ def test_damaged_npz(tmp_path):
     path = tmp_path / "a.npz"
     for content in (b"", b"PK\3\4", b"no archive", np.random.default_rng(0).bytes(500)):
         path.write_bytes(content)
-        assert "a.npz: cannot read the arrays" in _message(load_probes, path)
+        assert "a.npz: cannot read the arrays" in _message(load, path)
     with open(path, "wb") as file:
         np.save(file, _values(N, 27))
-    assert "found a single array" in _message(load_probes, path)
+    assert "found a single array" in _message(load, path)
     whole = _write(tmp_path / "whole.npz", sh=_values(N, 27)).read_bytes()
     for end in range(0, len(whole), 37):
         path.write_bytes(whole[:end])
-        assert "a.npz: cannot read the arrays" in _message(load_probes, path)
+        assert "a.npz: cannot read the arrays" in _message(load, path)
 
 
 def test_any_damaged_byte_of_an_npz_is_read_or_is_one_line(tmp_path):
@@ -335,7 +323,7 @@ def test_any_damaged_byte_of_an_npz_is_read_or_is_one_line(tmp_path):
         damaged[at] = rng.integers(256)
         path.write_bytes(damaged)
         try:
-            assert load_probes(path).probes == 2
+            assert load(path).probes == 2
         except WlmError as error:
             assert "\n" not in str(error)
 
@@ -347,7 +335,7 @@ def test_an_array_that_claims_to_be_huge(tmp_path):
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("position.npy", header.getvalue())
         archive.writestr("sh.npy", header.getvalue())
-    assert "a.npz: cannot read the arrays" in _message(load_probes, path)
+    assert "a.npz: cannot read the arrays" in _message(load, path)
 
 
 @pytest.mark.parametrize(
@@ -356,48 +344,83 @@ def test_an_array_that_claims_to_be_huge(tmp_path):
         ("[1]", "expected a JSON object, got [1]"),
         ('"sh"', 'expected a JSON object, got "sh"'),
         ("", "not valid JSON"),
+        ("\xff\xfe\x00", "not valid JSON"),
         ('{"position": [[0, 0, 0]], "sh": [[1]]', "not valid JSON"),
         ("[" * 100_000, "not valid JSON"),
         ("{}", "position is missing; found nothing"),
         ('{"position": 3, "sh": [[1]]}', "position: expected a list, got 3"),
         ('{"position": [[0, 0, 0]], "sh": {"a": 1}}', "sh: expected a list, got an object"),
-        ('{"position": [[0, 0, 0], [1, 1]], "sh": [[1], [2]]}', "position of probe 1: expected numbers, as many as"),
-        ('{"position": [[0, 0, 0], [1, 1, 1]], "sh": [[1], [2, 3]]}', "sh of probe 1: expected numbers, as many as"),
-        (
-            '{"position": [[0, 0, 0]], "sh": [["1"]]}',
-            'sh of probe 0: expected numbers, as many as probe 0 has, got ["1"]',
-        ),
-        ('{"position": [[0, 0, 0], [1, 1, 1]], "sh": [[1], [null]]}', "sh of probe 1: expected numbers"),
-        ('{"position": [[0, 0, 0]], "sh": [[true]]}', "sh of probe 0: expected numbers"),
-        ('{"position": [[0, 0, 0]], "sh": [[1%s, 0.5]]}' % ("0" * 400), "sh of probe 0: expected numbers"),
+        ('{"position": [[0, 0, 0], [1, 1]], "sh": [[1], [2]]}', "position[1]: expected numbers, as many as"),
+        ('{"position": [[0, 0, 0], [1, 1, 1]], "sh": [[1], [2, 3]]}', "sh[1]: expected numbers, as many as"),
+        ('{"position": [[0, 0, 0]], "sh": [["1"]]}', 'numbers, as many as sh[0] has, got ["1"]'),
+        ('{"position": [[0, 0, 0], [1, 1, 1]], "sh": [[1], [null]]}', "sh[1]: expected numbers"),
+        ('{"position": [[0, 0, 0]], "sh": [[true]]}', "sh[0]: expected numbers"),
+        ('{"position": [[0, 0, 0]], "sh": [[1%s, 0.5]]}' % ("0" * 400), "sh[0]: expected numbers"),
         ('{"position": [[0, 0, 0]], "sh": [[1%s]]}' % ("0" * 5000), "not valid JSON"),
-        ('{"position": [[0, 0, NaN]], "sh": [[1]]}', "position of probe 0: expected finite numbers"),
-        ('{"position": [[0, 0, 0]], "sh": [' + "[" * 80 + "1" + "]" * 80 + "]}", "sh of probe 0: expected numbers"),
+        ('{"position": [[0, 0, NaN]], "sh": [[1]]}', "position[0]: expected finite numbers"),
+        ('{"position": [[0, 0, 0]], "sh": [' + "[" * 80 + "1" + "]" * 80 + "]}", "sh[0]: expected numbers"),
         ('{"probes": {}}', "probes: expected a list, got an object"),
         ('{"probes": [3]}', "probes[0]: expected an object (position, sh), got 3"),
         ('{"probes": [{"position": [0, 0, 0], "sh": [1]}, {"sh": [1]}]}', "probes[1].position is missing"),
         ('{"probes": [{"position": [0, 0, 0], "sh": [1]}, {"position": [1, 1, 1]}]}', "probes[1].sh is missing"),
-        (
-            '{"probes": [{"position": [0, 0, 0], "sh": [1]}, {"position": 1, "sh": [1]}]}',
-            "position of probe 1: expected",
-        ),
+        ('{"probes": [{"position": [0, 0, 0], "sh": [1]}, {"position": 1, "sh": [1]}]}', "position[1]: expected"),
         ('{"probes": [{"position": [0, 0, 0]}]}', "begins with sh"),
     ],
 )
 def test_malformed_json_names_the_field(tmp_path, content, expected):
     path = tmp_path / "a.json"
-    path.write_text(content)
-    message = _message(load_probes, path)
+    path.write_bytes(content.encode("latin-1"))
+    message = _message(load, path)
     assert message.startswith(f"{path}: ") and expected in message
 
 
-def test_json_that_is_no_text_and_json_with_nan(tmp_path):
-    path = tmp_path / "a.json"
-    path.write_bytes(b"\xff\xfe\x00")
-    assert "a.json: not valid JSON" in _message(load_probes, path)
-    path.write_text('{"position": [[0, 0, 0], [1, 1, 1]], "sh": [[1, 2], [NaN, 3]]}')
-    found = load_probes(path)
-    assert found.live.tolist() == [True, False] and len(found.warnings) == 1
+def test_json_with_nan(tmp_path):
+    content = {"position": [[0, 0, 0], [1, 1, 1]], "sh": [[1, 2], [float("nan"), 3]]}
+    loaded = load(_write_json(tmp_path / "a.json", content))
+    assert loaded.live.tolist() == [True, False] and len(loaded.warnings) == 1
+
+
+def test_positions_of_any_file(tmp_path, monkeypatch):
+    points = _position().tolist()
+    lists = {"a.json": points, "b.json": {"position": points}, "c.txt": {"probes": [{"position": x} for x in points]}}
+    paths = [_write_json(tmp_path / name, content) for name, content in lists.items()]
+    np.savez(tmp_path / "d.npz", position=_position().astype(np.float32), other=1)
+    (tmp_path / "e.lmbake").write_bytes(b"RSRC")
+    monkeypatch.setattr(data, "read_lmbake", lambda path: (_position().astype(np.float32), None))
+    for path in (*paths, tmp_path / "d.npz", tmp_path / "e.lmbake"):
+        position = load_positions(path)
+        assert position.dtype == np.float64
+        np.testing.assert_array_equal(position, _position())
+
+
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [
+        ("[[0, 1", "not valid JSON"),
+        ("\xff\xfe", "not valid JSON"),
+        ("3", "expected a JSON object, got 3"),
+        ("{}", "position: expected a list, got null"),
+        ('{"probes": [{"sh": 3}]}', "probes[0].position is missing"),
+        ("[]", "position: expected at least one, found none"),
+        ("[[1, 2]]", "position: expected (N, 3), got (1, 2)"),
+        ('[[0, 0, 0], [0, 1, "2"]]', "position[1]: expected numbers, as many as position[0] has, got [0, 1, "),
+        ("[[0, 1, 1" + "0" * 400 + "]]", "position[0]: expected numbers"),
+        ("[[0, 1, 1e999]]", "position[0]: expected finite numbers"),
+        ({"path": np.zeros((2, 3))}, "position is not a file"),
+        ({"position": np.zeros((0, 3))}, "position: expected at least one, found none"),
+        ({"position": np.zeros((2, 3), bool)}, "position: expected numbers, got bool"),
+        ({"position": np.array([[None, 0, 0]])}, "cannot read the arrays"),
+    ],
+)
+def test_what_holds_no_positions(tmp_path, content, expected):
+    path = tmp_path / ("a.json" if isinstance(content, str) else "a.npz")
+    if isinstance(content, str):
+        path.write_bytes(content.encode("latin-1"))
+    else:
+        np.savez(path, **content)
+    message = _message(load_positions, path)
+    assert message.startswith(f"{path}: ") and expected in message
+    assert "no such file" in _message(load_positions, tmp_path / "absent.npz")
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".json", ".JSON"])
@@ -407,19 +430,19 @@ def test_what_was_written_is_read(tmp_path, suffix, convention, outputs):
     probes = synthetic(40, coefficients=outputs // 3, dead=2)
     path = tmp_path / f"a{suffix}"
     save_probes(path, probes.position, probes.values, key="sh_9", convention=convention)
-    found = load_probes(path)
-    assert found.key == "sh_9"
-    np.testing.assert_array_equal(found.position, probes.position)
-    np.testing.assert_array_equal(found.live, probes.live)
+    loaded = load(path)
+    assert loaded.key == "sh_9"
+    np.testing.assert_array_equal(loaded.position, probes.position)
+    np.testing.assert_array_equal(loaded.live, probes.live)
     if convention in ("threejs", "unreal"):
-        _same(found, probes)
-    np.testing.assert_allclose(found.values, probes.values, rtol=3e-7)
+        _same(loaded, probes)
+    np.testing.assert_allclose(loaded.values, probes.values, rtol=3e-7)
 
 
 def test_files_hold_the_engines_numbers(tmp_path):
     values = _values(N, 9, 3)
     for name in CONVENTIONS:
-        expected = from_house(values, name).astype(np.float32)
+        expected = from_canonical(values, name).astype(np.float32)
         save_probes(tmp_path / "a.npz", _position().astype(np.float32), values.reshape(N, 27), convention=name)
         with np.load(tmp_path / "a.npz", allow_pickle=False) as file:
             assert sorted(file.files) == ["convention", "position", "sh"] and file["convention"] == name
@@ -435,7 +458,7 @@ def test_files_hold_the_engines_numbers(tmp_path):
 def test_numbers_that_are_no_harmonics_are_written_flat(tmp_path):
     for path in (tmp_path / "a.npz", tmp_path / "a.json"):
         save_probes(path, _position(), _values(N, 6))
-        _same(load_probes(path), from_arrays(_position(), _values(N, 6)))
+        _same(load(path), from_arrays(_position(), _values(N, 6)))
     with np.load(tmp_path / "a.npz") as file:
         assert file["sh"].shape == (N, 6)
 
@@ -464,24 +487,14 @@ def test_writing_is_refused_without_touching_the_file(tmp_path):
 
 def test_arrays_are_copied():
     position, values = _position(), _values(N, 27)
-    found = from_arrays(position, values)
-    position[:] = 0.0
-    values[:] = 0.0
-    np.testing.assert_array_equal(found.position, _position())
-    np.testing.assert_array_equal(found.values, _values(N, 27))
+    loaded = from_arrays(position, values)
+    position[:], values[:] = 0.0, 0.0
+    _same(loaded, from_arrays(_position(), _values(N, 27)))
 
 
 @pytest.mark.parametrize("key", ["12.00", "21.00"])
 def test_the_demo_set(key):
-    found = load_probes(DEMO, key=key)
-    assert found.warnings == () and found.outputs == 27 and 1500 < found.probes < 2500
-    assert 0.5 * found.probes < found.live.sum() < found.probes
+    loaded = load(DEMO, key=key)
+    assert loaded.warnings == () and loaded.outputs == 27 and 1500 < loaded.probes < 2500
+    assert 0.5 * loaded.probes < loaded.live.sum() < loaded.probes
     assert DEMO.stat().st_size < 300_000
-
-
-def test_the_made_up_room():
-    room = synthetic(500, seed=3, coefficients=4, dead=7)
-    assert (room.probes, room.outputs, room.live.sum(), room.warnings) == (500, 12, 493, ())
-    _same(room, synthetic(500, seed=3, coefficients=4, dead=7))
-    assert room.source != synthetic(500, seed=4, coefficients=4, dead=7).source
-    assert synthetic(1, coefficients=16).outputs == 48

@@ -91,7 +91,7 @@ def test_the_models_own_probes(device):
 
 def test_wrong_positions():
     decoder = Decoder(random_model())
-    with pytest.raises(WlmError, match="random: the model has no positions stored"):
+    with pytest.raises(WlmError, match="random: holds no positions"):
         decoder.decode_probes()
     with pytest.raises(WlmError, match="expected the positions of 200 probes, got 7"):
         decoder.decode_probes(np.zeros((7, 3)))

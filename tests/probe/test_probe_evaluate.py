@@ -5,11 +5,13 @@ import math
 
 import numpy as np
 import pytest
+from builders.probe_models import random_model
 
 from wlm.errors import WlmError
+from wlm.metrics import PSNR_CAP_DB
 from wlm.probe import evaluation as module
 from wlm.probe.data import ProbeSet
-from wlm.probe.evaluation import NORMALS, evaluate
+from wlm.probe.evaluation import NORMALS, evaluate, score
 from wlm.probe.sphere import fibonacci_sphere, irradiance
 
 
@@ -39,7 +41,7 @@ def decibels(error, peak):
 
 def test_the_scores_are_those_of_plain_sums(pair):
     decoded, probes = pair
-    report = evaluate(decoded, probes, 1000)
+    report = score(decoded, probes, 1000)
     error = decoded.astype(np.float64) - probes.values
     peak = float(probes.values.max()) - float(probes.values.min())
     assert report.peak == peak
@@ -63,10 +65,10 @@ def test_the_scores_are_those_of_plain_sums(pair):
 def test_irradiance_is_scored_where_light_falls(pair):
     decoded, probes = pair
     normals, live = fibonacci_sphere(NORMALS), probes.live
-    wanted = irradiance(probes.values[live].reshape(-1, 9, 3), normals)
-    got = irradiance(decoded[live].reshape(-1, 9, 3), normals)
-    report = evaluate(decoded, probes, 1000)
-    assert report.irradiance_psnr == pytest.approx(decibels(got - wanted, np.ptp(wanted)))
+    exact = irradiance(probes.values[live].reshape(-1, 9, 3), normals)
+    predicted = irradiance(decoded[live].reshape(-1, 9, 3), normals)
+    report = score(decoded, probes, 1000)
+    assert report.irradiance_psnr == pytest.approx(decibels(predicted - exact, np.ptp(exact)))
 
 
 def test_an_error_that_no_diffuse_surface_sees_costs_no_irradiance():
@@ -74,32 +76,42 @@ def test_an_error_that_no_diffuse_surface_sees_costs_no_irradiance():
     probes = probe_set(rng.normal(size=(8, 48)))
     decoded = probes.values.copy()
     decoded[:, 27:] += 1.0  # the third band
-    report = evaluate(decoded, probes, 100)
-    assert report.psnr < 20 and report.psnr_by_band[:3] == [math.inf] * 3
-    assert report.irradiance_psnr == math.inf
+    report = score(decoded, probes, 100)
+    assert report.psnr < 20 and report.psnr_by_band[:3] == [PSNR_CAP_DB] * 3
+    assert report.irradiance_psnr == PSNR_CAP_DB
 
 
 def test_noise_of_a_known_size_has_a_known_score():
     values = np.zeros((4, 27), np.float32)
     values[0, 0], values[1, 0] = 2.0, -2.0
-    report = evaluate(values + np.float32(0.25), probe_set(values), 54)
+    report = score(values + np.float32(0.25), probe_set(values), 54)
     assert report.psnr == pytest.approx(20 * math.log10(4 / 0.25))
     assert (report.mse, report.mean_abs_error, report.max_abs_error) == (0.0625, 0.25, 0.25)
     assert report.bits_per_probe == 54 * 8 / 4 and report.ratio == 54 / (4 * 27 * 4)
 
 
-def test_an_exact_copy_is_infinite_and_null_in_json(pair):
+def test_an_exact_copy_has_the_capped_score(pair):
     _, probes = pair
-    report = evaluate(probes.values, probes, 1000)
-    assert report.psnr == report.psnr_live == report.irradiance_psnr == math.inf
+    report = score(probes.values, probes, 1000)
+    assert report.psnr == report.psnr_live == report.irradiance_psnr == PSNR_CAP_DB
     assert report.worst_probe is None and report.max_abs_error == 0.0
-    document = report.to_json()
-    assert json.loads(json.dumps(document, allow_nan=False)) == document
-    assert document["psnr"] is None and document["psnr_by_band"] == [None] * 3 and document["mse"] == 0.0
+    assert report.psnr_by_band == [PSNR_CAP_DB] * 3 and report.mse == 0.0
+
+
+def test_a_model_is_scored_as_its_decode_is(device):
+    model = random_model(positions=True, dead=5)
+    decoded = model.decoder(device).decode_probes()
+    noise = np.random.default_rng(0).normal(size=decoded.shape).astype(np.float32)
+    probes = probe_set(decoded + noise, position=model.stored_positions())
+    figures = []
+    report = evaluate(model, probes, device=device, progress=figures.append)
+    assert report.to_json() == score(decoded, probes, model.file_bytes()).to_json()
+    assert figures[-1].figures == {"PSNR dB": report.psnr}
+    assert evaluate(model, probes, device=device, file_bytes=7).bytes == 7
 
 
 def test_the_report_is_json(pair):
-    report = evaluate(*pair, 1000)
+    report = score(*pair, 1000)
     document = report.to_json()
     assert json.loads(json.dumps(document, allow_nan=False)) == document
     assert document["psnr"] == report.psnr and len(document["psnr_by_coefficient"]) == 27
@@ -109,7 +121,7 @@ def test_the_report_is_json(pair):
 @pytest.mark.parametrize("offset", [0.0, 0.5])
 def test_without_a_range_there_is_no_psnr(offset):
     probes = probe_set(np.full((3, 27), 0.25))
-    report = evaluate(probes.values + np.float32(offset), probes, 100)
+    report = score(probes.values + np.float32(offset), probes, 100)
     assert math.isnan(report.psnr) and math.isnan(report.psnr_live) and report.to_json()["psnr"] is None
     assert all(math.isnan(score) for score in report.psnr_by_band)
     assert report.max_abs_error == offset
@@ -118,14 +130,14 @@ def test_without_a_range_there_is_no_psnr(offset):
 def test_light_from_everywhere_has_no_range_of_irradiance():
     values = np.zeros((3, 27), np.float32)
     values[:, :3] = 1.0
-    report = evaluate(values * np.float32(0.5), probe_set(values), 100)
+    report = score(values * np.float32(0.5), probe_set(values), 100)
     assert math.isfinite(report.psnr) and math.isnan(report.irradiance_psnr)
 
 
 @pytest.mark.parametrize("outputs", [1, 2, 6, 28])
 def test_numbers_that_are_no_bands_have_no_irradiance(outputs):
     values = np.arange(5.0 * outputs).reshape(5, outputs)
-    report = evaluate(values.astype(np.float32) + 1, probe_set(values), 10)
+    report = score(values.astype(np.float32) + 1, probe_set(values), 10)
     assert report.psnr_by_band is None and report.irradiance_psnr is None
     assert report.psnr == pytest.approx(20 * math.log10(5 * outputs - 1))
     assert len(report.psnr_by_coefficient) == outputs
@@ -133,32 +145,32 @@ def test_numbers_that_are_no_bands_have_no_irradiance(outputs):
 
 def test_one_probe():
     values = np.arange(27.0)[None]
-    report = evaluate(values.astype(np.float32), probe_set(values), 10)
-    assert report.psnr == math.inf and report.bits_per_probe == 80
-    report = evaluate(np.ones((1, 1), np.float32), probe_set([[3.0]]), 10)
+    report = score(values.astype(np.float32), probe_set(values), 10)
+    assert report.psnr == PSNR_CAP_DB and report.bits_per_probe == 80
+    report = score(np.ones((1, 1), np.float32), probe_set([[3.0]]), 10)
     assert math.isnan(report.psnr) and report.mse == 4.0 and report.worst_probe["probe"] == 0
 
 
 def test_no_live_probe():
     probes = probe_set(np.zeros((2, 27)), live=[False, False])
-    report = evaluate(probes.values, probes, 10)
+    report = score(probes.values, probes, 10)
     assert math.isnan(report.psnr_live) and math.isnan(report.irradiance_psnr) and report.live == 0
 
 
 def test_many_probes_are_scored_in_pieces(pair, monkeypatch):
-    whole = evaluate(*pair, 1000).to_json()
+    whole = score(*pair, 1000).to_json()
     monkeypatch.setattr(module, "_ROWS", 7)
-    pieces = evaluate(*pair, 1000).to_json()
+    pieces = score(*pair, 1000).to_json()
     for name, value in whole.items():
         assert pieces[name] == (value if isinstance(value, str | dict | None) else pytest.approx(value, rel=1e-12))
 
 
 def test_large_and_tiny_values_keep_their_score(pair):
     decoded, probes = pair
-    middle = evaluate(decoded, probes, 1000)
+    middle = score(decoded, probes, 1000)
     for scale in (1e-30, 1e18):
         other = probe_set(probes.values.astype(np.float64) * scale, probes.live)
-        report = evaluate((decoded.astype(np.float64) * scale).astype(np.float32), other, 1000)
+        report = score((decoded.astype(np.float64) * scale).astype(np.float32), other, 1000)
         assert report.psnr == pytest.approx(middle.psnr, abs=1e-4)
         assert report.irradiance_psnr == pytest.approx(middle.irradiance_psnr, abs=1e-4)
 
@@ -169,13 +181,13 @@ def test_what_cannot_be_scored_is_one_line(pair):
         broken = decoded.copy()
         broken[[7, 20], 4] = spoilt
         with pytest.raises(WlmError, match="2 probes decode to NaN or infinity, first probe 7"):
-            evaluate(broken, probes, 1000)
+            score(broken, probes, 1000)
     with pytest.raises(WlmError, match="room: has 50 probes of 27 numbers, but 49 of 27 were decoded"):
-        evaluate(decoded[:-1], probes, 1000)
+        score(decoded[:-1], probes, 1000)
     with pytest.raises(WlmError, match="of 12 were decoded"):
-        evaluate(decoded[:, :12], probes, 1000)
+        score(decoded[:, :12], probes, 1000)
     for size in (0, -1):
         with pytest.raises(ValueError, match="file_bytes"):
-            evaluate(decoded, probes, size)
+            score(decoded, probes, size)
     with pytest.raises(ValueError, match=r"\[N, D\]"):
-        evaluate(decoded.reshape(50, 9, 3), probes, 1000)
+        score(decoded.reshape(50, 9, 3), probes, 1000)

@@ -10,7 +10,7 @@ import pytest
 from builders.probe_models import EXTENT, ORIGIN, SIZE, random_model
 
 from wlm.errors import WlmError
-from wlm.probe.data import load_probes
+from wlm.probe.data import load
 from wlm.probe.decode import Decoder
 from wlm.probe.exporter import export
 from wlm.probe.shader import probe_glsl
@@ -112,10 +112,10 @@ def test_the_files_alone_give_the_decoders_light(settings, tmp_path):
 def test_the_reference_is_the_files_light(settings, tmp_path):
     model = random_model(**settings)
     export(model, tmp_path)
-    reference = load_probes(tmp_path / "reference.json")
+    reference = load(tmp_path / "reference.json")
     assert reference.probes == min(model.count, 64) + 1 and reference.outputs == model.outputs
-    found = Files(tmp_path).values(reference.position)
-    np.testing.assert_allclose(found, reference.values, rtol=0, atol=2e-5 * np.abs(found).max())
+    values = Files(tmp_path).values(reference.position)
+    np.testing.assert_allclose(values, reference.values, rtol=0, atol=2e-5 * np.abs(values).max())
     outside = reference.position[-1]
     assert (outside > ORIGIN + EXTENT * SIZE).all()
 
@@ -163,8 +163,8 @@ def test_a_second_export_replaces_the_first_and_nothing_else(tmp_path):
     export(random_model(positions=True), folder)
     (folder / "readme.txt").write_text("mine")
     export(random_model(seed=1, dead=0), folder)
-    found = sorted(path.name for path in folder.iterdir())
-    assert found == ["gaussians.bin", "network.bin", "probe.glsl", "probe.json", "readme.txt", "reference.json"]
+    names = sorted(path.name for path in folder.iterdir())
+    assert names == ["gaussians.bin", "network.bin", "probe.glsl", "probe.json", "readme.txt", "reference.json"]
     assert json.loads((folder / "probe.json").read_text())["dead"] == []
 
 
@@ -174,7 +174,7 @@ def test_a_folder_of_other_files_is_left_alone(content, tmp_path):
     if content is not None:
         (tmp_path / "probe.json").write_text(content)
     before = {path: path.read_bytes() for path in tmp_path.iterdir()}
-    with pytest.raises(WlmError, match="expected an empty folder or one of an earlier export"):
+    with pytest.raises(WlmError, match="expected an empty folder or one of an earlier output"):
         export(random_model(), tmp_path)
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
 
@@ -192,7 +192,7 @@ def test_what_cannot_be_exported(tmp_path):
         export(model, tmp_path / "new", device="tpu")
     assert not (tmp_path / "new").exists()
     (tmp_path / "file").write_text("x")
-    with pytest.raises(WlmError, match="cannot export there"):
+    with pytest.raises(WlmError, match="cannot write there"):
         export(model, tmp_path / "file")
 
 
@@ -341,14 +341,14 @@ def test_the_shaders_arithmetic(settings, tmp_path):
     )
     assert done.returncode == 0, done.stderr
     files = Files(folder)
-    position = np.concatenate([places(), load_probes(folder / "reference.json").position]).astype(np.float32)
+    position = np.concatenate([places(), load(folder / "reference.json").position]).astype(np.float32)
     words = [program, folder / "gaussians.bin", folder / "network.bin"]
     out = subprocess.run(words, input=position.tobytes(), capture_output=True, check=True).stdout
-    found = np.frombuffer(out, np.float32).reshape(len(position), 3, model.outputs)
+    values = np.frombuffer(out, np.float32).reshape(len(position), 3, model.outputs)
     x, latent = files.place(position.astype(np.float64)), files.latent
     for kind, chosen in enumerate((slice(None), slice(1, None, 2), slice(0, None, 2))):
         files.latent = np.zeros_like(latent)
         files.latent[chosen] = latent[chosen]
         expected = files.values(position.astype(np.float64))
-        np.testing.assert_allclose(found[:, kind], expected, rtol=0, atol=2e-5 * np.abs(expected).max())
+        np.testing.assert_allclose(values[:, kind], expected, rtol=0, atol=2e-5 * np.abs(expected).max())
     assert files.weights(x).any()

@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 from builders.probe_sets import synthetic
 
+import wlm
 from wlm.errors import WlmError
-from wlm.probe.data import from_arrays
-from wlm.probe.fit import Progress, compress, open_checkpoint
+from wlm.probe.data import from_arrays, save_probes
+from wlm.probe.evaluation import evaluate
+from wlm.probe.fit import _frame, compress, open_checkpoint
 from wlm.probe.model import Profile
 from wlm.probe.start import first_gaussians, local_spread, morton_order
 from wlm.probe.trainer import Trainer
@@ -15,28 +17,36 @@ SMALL = Profile(name="small", ratio=0.1, latent=3, hidden=16, steps=60)
 RANDOM = np.random.default_rng(7)
 
 
-def psnr(model, probes):
-    from wlm.probe.decode import Decoder
-
-    decoded = Decoder(model).decode_probes(probes.position).astype(np.float64)
-    assert np.isfinite(decoded).all()
-    peak = float(np.ptp(probes.values))
-    return 10 * np.log10(peak**2 / np.mean((decoded - probes.values) ** 2))
-
-
 def arrays(model):
     return [getattr(model, key) for key in ("centre", "code", "bounds", "net")]
 
 
 def test_it_learns_and_says_how_well():
     probes = synthetic(300)
-    seen: list[Progress] = []
-    model = compress(probes, SMALL.model_copy(update={"steps": 600}), progress=seen.append)
+    reports = []
+    model = compress(probes, SMALL, steps=600, progress=reports.append)
     flat = 10 * np.log10(np.ptp(probes.values) ** 2 / np.mean((probes.values - probes.values.mean(0)) ** 2))
-    assert psnr(model, probes) > flat + 8
-    assert seen[-1].step == seen[-1].steps == 600
+    psnr = evaluate(model, probes).psnr
+    assert psnr > flat + 8
+    assert reports[-1].done == reports[-1].total == 600
     # The last report is of the model before its network is rounded to half floats.
-    assert seen[-1].psnr == pytest.approx(psnr(model, probes), abs=0.1)
+    assert reports[-1].figures["PSNR dB"] == pytest.approx(psnr, abs=0.1)
+
+
+def test_from_file_to_light_by_the_public_names(tmp_path):
+    probes = synthetic(60)
+    save_probes(tmp_path / "street.npz", probes.position, probes.values, key="sh_12.00")
+    probes = wlm.probe.load(tmp_path / "street.npz", key="12.00")
+    model = wlm.probe.compress(probes, "small", steps=20)
+    assert (model.profile.name, model.profile.hidden, model.profile.steps) == ("small", 24, 20)
+    points = RANDOM.random((5, 3))
+    light = model.decoder("cpu").decode(points)  # [M, 3] -> [M, 27]
+    assert light.shape == (5, 27) and np.isfinite(light).all()
+    model.save(tmp_path / "street.wlm")
+    np.testing.assert_array_equal(wlm.load(tmp_path / "street.wlm").decoder("cpu").decode(points), light)
+    with pytest.raises(WlmError, match="unknown key 'step'; did you mean 'steps'"):
+        wlm.probe.compress(probes, "small", step=20)
+    assert all(getattr(wlm.probe, name) is not None for name in wlm.probe.__all__)
 
 
 def test_one_seed_gives_one_result():
@@ -71,90 +81,52 @@ def test_an_interrupt_is_kept(tmp_path):
         compress(probes, SMALL, progress=stop, checkpoint=checkpoint)
     with pytest.raises(WlmError, match="seed"):
         open_checkpoint(tmp_path / "a.wlm", probes, SMALL, seed=1, resume=True)
-    kept = open_checkpoint(tmp_path / "a.wlm", probes, SMALL, resume=True)
-    assert kept.running(0)["control"][0] == 60  # a short fit reports at its end
+    stored = open_checkpoint(tmp_path / "a.wlm", probes, SMALL, resume=True)
+    assert stored.running(0)["control"][0] == 60  # a short fit reports at its end
 
 
 def _input(probes):
-    from wlm.probe.fit import _frame
-
     origin, extent, _ = _frame(probes.position)
     x = ((probes.position - origin) / extent).astype(np.float32)
     return x[probes.live], probes.values[probes.live]
 
 
-def hard(kind):
-    values = RANDOM.normal(size=(40, 27)).astype(np.float32)
-    position = RANDOM.random((40, 3)) * 4
-    if kind == "one probe":
-        return position[:1], values[:1]
-    if kind == "two probes":
-        return position[:2], values[:2]
-    if kind == "coincident":
-        return np.repeat(position[:1], 40, 0), values
-    if kind == "pairs":
-        return np.repeat(position[:20], 2, 0), values
-    if kind == "a plane":
-        return position * [1, 0, 1], values
-    if kind == "a line":
-        return position * [1, 0, 0] + 5, values
-    if kind == "far away":
-        return position + 1e6, values
-    if kind == "very far":
-        return position * 1e9, values
-    if kind == "tiny":
-        return position * 1e-6, values
-    if kind == "constant":
-        return position, np.full((40, 27), 0.25, np.float32)
-    if kind == "one constant channel":
-        values[:, 5] = 3.0
-        return position, values
-    if kind == "huge values":
-        return position, values * np.float32(1e17)
-    if kind == "tiny values":
-        return position, values * np.float32(1e-20)
-    if kind == "one number":
-        return position, values[:, :1]
-    if kind == "most dead":
-        values[3:] = 0
-        return position, values
-    if kind == "NaN":
-        values[7, 3] = np.nan
-        return position, values
-    raise AssertionError(kind)
+PLACES = RANDOM.random((40, 3)) * 4
+VALUES = RANDOM.normal(size=(40, 27)).astype(np.float32)
 
 
-KINDS = [
-    "one probe",
-    "two probes",
-    "coincident",
-    "pairs",
-    "a plane",
-    "a line",
-    "far away",
-    "very far",
-    "tiny",
-    "constant",
-    "one constant channel",
-    "huge values",
-    "tiny values",
-    "one number",
-    "most dead",
-    "NaN",
-]
+def changed(values, index, number):
+    values = values.copy()
+    values[index] = number
+    return values
 
 
-@pytest.mark.parametrize("kind", KINDS)
+HARD = {
+    "one probe": (PLACES[:1], VALUES[:1]),
+    "two probes": (PLACES[:2], VALUES[:2]),
+    "coincident": (np.repeat(PLACES[:1], 40, 0), VALUES),
+    "pairs": (np.repeat(PLACES[:20], 2, 0), VALUES),
+    "a plane": (PLACES * [1, 0, 1], VALUES),
+    "a line": (PLACES * [1, 0, 0] + 5, VALUES),
+    "far away": (PLACES + 1e6, VALUES),
+    "very far": (PLACES * 1e9, VALUES),
+    "tiny": (PLACES * 1e-6, VALUES),
+    "constant": (PLACES, np.full_like(VALUES, 0.25)),
+    "one constant channel": (PLACES, changed(VALUES, (slice(None), 5), 3.0)),
+    "huge values": (PLACES, VALUES * np.float32(1e17)),
+    "tiny values": (PLACES, VALUES * np.float32(1e-20)),
+    "one number": (PLACES, VALUES[:, :1]),
+    "most dead": (PLACES, changed(VALUES, slice(3, None), 0.0)),
+    "NaN": (PLACES, changed(VALUES, (7, 3), np.nan)),
+}
+
+
+@pytest.mark.parametrize("kind", HARD)
 def test_hard_sets(kind, tmp_path):
-    from wlm.probe import codec
-    from wlm.probe.decode import Decoder
-
-    position, values = hard(kind)
-    probes = from_arrays(position, values)
-    profile = SMALL.model_copy(update={"steps": 240, "ratio": 0.5})
-    codec.write(tmp_path / "a.wlm", compress(probes, profile, positions=True))
-    model = codec.read(tmp_path / "a.wlm")
-    decoded = Decoder(model).decode_probes(probes.position)
+    probes = from_arrays(*HARD[kind])
+    compress(probes, SMALL, steps=240, ratio=0.5, positions=True).save(tmp_path / "a.wlm")
+    decoder = wlm.load(tmp_path / "a.wlm").decoder()
+    decoded = decoder.decode_probes(probes.position)
     assert decoded.shape == probes.values.shape and np.isfinite(decoded).all()
     assert (decoded[~probes.live] == 0).all()
     live = probes.values[probes.live].astype(np.float64)
@@ -164,23 +136,23 @@ def test_hard_sets(kind, tmp_path):
     assert error <= mean * 1.05 + 2e-3 * np.abs(live).max()
     if kind == "coincident":
         assert np.ptp(decoded, axis=0).max() == 0
-    np.testing.assert_allclose(Decoder(model).decode_probes(), decoded, rtol=0, atol=0.3 * np.abs(live).max())
+    np.testing.assert_allclose(decoder.decode_probes(), decoded, rtol=0, atol=0.3 * np.abs(live).max())
 
 
 def test_more_gaussians_than_places_are_not_made():
     probes = from_arrays(np.repeat(RANDOM.random((6, 3)), 5, 0), RANDOM.normal(size=(30, 3)).astype(np.float32))
-    model = compress(probes, SMALL.model_copy(update={"ratio": 1.0}))
+    model = compress(probes, SMALL, ratio=1.0)
     assert model.count + model.dropped == 6
 
 
 def test_useless_gaussians_are_dropped_within_the_bound():
     probes = synthetic(200)
-    profile = SMALL.model_copy(update={"steps": 300, "ratio": 0.3, "prune": 0.03})
+    profile = SMALL.override({"steps": 300, "ratio": 0.3, "prune": 0.03})
     x, values = _input(probes)
     trainer = Trainer(x, values, profile, 0, "cpu")
     try:
         trainer.run(profile.steps)
-        dropped = int((~trainer.kept).sum())
+        dropped = int((~trainer.needed).sum())
         # The trainer measured the change itself; here the features are summed by other kernels.
         assert dropped > 0 and 0 < trainer.dropped_change <= 0.03 * np.ptp(values) * 1.2
     finally:
@@ -188,7 +160,7 @@ def test_useless_gaussians_are_dropped_within_the_bound():
     model = compress(probes, profile)
     assert model.dropped == dropped and model.count == 60 - dropped
     # Nothing but what no probe feels goes where nothing may change.
-    assert compress(probes, profile.model_copy(update={"prune": 0.0})).dropped < dropped
+    assert compress(probes, profile, prune=0.0).dropped < dropped
 
 
 def test_a_fit_that_diverges_is_an_error(monkeypatch):

@@ -9,7 +9,7 @@ from pydantic import ValidationError
 
 from wlm.config import profile_names
 from wlm.errors import WlmError
-from wlm.probe.model import CENTRE, LATENT, ROTATION, SCALE, Profile, load_profile, network_size
+from wlm.probe.model import CENTRE, LATENT, Profile, layer_shapes
 
 
 @pytest.mark.parametrize("bits", [4, 10, 16])
@@ -18,32 +18,27 @@ def test_codes_reach_from_the_lowest_to_the_highest_value(bits):
     centre, code = model.centre.copy(), model.code.copy()
     centre[0], centre[1], code[0], code[1] = 0, 65535, 0, 2**bits - 1
     model = replace(model, centre=centre, code=code)
-    found = model.gaussians()
-    low, high = model.bounds
-    parts = ((CENTRE, found.centre), (SCALE, np.log(found.scale)), (ROTATION, found.rotation), (LATENT, found.latent))
-    for channels, values in parts:
-        assert values.dtype == np.float32
-        np.testing.assert_allclose(values[0], low[channels], rtol=1e-6)
-        np.testing.assert_allclose(values[1], high[channels], rtol=1e-6)
+    rows = model.rows()
+    assert rows.dtype == np.float32
+    np.testing.assert_allclose(rows[:2], model.bounds, rtol=1e-6)
 
 
 def test_codes_in_between_are_those_of_the_equation():
     model = random_model()
-    found = model.gaussians()
+    rows = model.rows()
     low, high = model.bounds.astype(np.float64)
     # Eq. 14 in float64: two roundings of float32 at values up to 3 wide.
     expected = low[LATENT] + model.code[:, 7:] * (high - low)[LATENT] / 1023.0
-    np.testing.assert_allclose(found.latent, expected, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(rows[:, LATENT], expected, rtol=0, atol=1e-6)
     expected = low[CENTRE] + model.centre * (high - low)[CENTRE] / 65535.0
-    np.testing.assert_allclose(found.centre, expected, rtol=0, atol=1e-6)
-    assert (found.scale > 0).all() and found.latent.flags.c_contiguous
+    np.testing.assert_allclose(rows[:, CENTRE], expected, rtol=0, atol=1e-6)
 
 
 def test_a_channel_of_one_value_is_that_value():
     model = random_model()
     bounds = model.bounds.copy()
     bounds[:, 12] = 0.1
-    np.testing.assert_array_equal(replace(model, bounds=bounds).gaussians().latent[:, 2], np.float32(0.1))
+    np.testing.assert_array_equal(replace(model, bounds=bounds).rows()[:, 12], np.float32(0.1))
 
 
 def test_positions_are_normalised_and_moved_into_the_box():
@@ -74,39 +69,49 @@ def test_a_box_without_a_width():
 def test_stored_positions_span_the_box():
     model = random_model(probes=3, dead=0, positions=True)
     codes = np.array([[0, 0, 0], [65535, 65535, 65535], [1, 2, 65534]], np.uint16)
-    found = replace(model, positions=codes).stored_positions()
-    assert found.dtype == np.float64
-    np.testing.assert_array_equal(found[0], ORIGIN)
-    np.testing.assert_allclose(found[1], ORIGIN + EXTENT * SIZE, rtol=1e-15)
-    np.testing.assert_allclose(found[2], ORIGIN + EXTENT * SIZE * np.array([1, 2, 65534]) / 65535, rtol=1e-15)
+    position = replace(model, positions=codes).stored_positions()
+    assert position.dtype == np.float64
+    np.testing.assert_array_equal(position[0], ORIGIN)
+    np.testing.assert_allclose(position[1], ORIGIN + EXTENT * SIZE, rtol=1e-15)
+    np.testing.assert_allclose(position[2], ORIGIN + EXTENT * SIZE * np.array([1, 2, 65534]) / 65535, rtol=1e-15)
+
+
+def test_positions_are_recognised_as_the_models_own():
+    model = random_model(probes=3, dead=0)
+    position = ORIGIN + EXTENT * SIZE * np.array([[0, 0, 0], [1, 1, 1], [0.5, 0.5, 0.5]])
+    assert model.has_probes_at(position) and model.has_probes_at(position.astype(np.float32).astype(np.float64))
+    moved = position + [[0, 0, 0], [1e-3, 0, 0], [0, 0, 0]]
+    assert not model.has_probes_at(moved) and not model.has_probes_at(position[:2])
+    with pytest.raises(WlmError, match="random: holds no positions"):
+        model.stored_positions()
 
 
 def test_sizes_are_those_of_the_paper():
     # 9 + 3 inputs, two layers of 64, 27 numbers, a bias each.
-    assert network_size(9, 64, 27) == 12 * 64 + 64 + 64 * 64 + 64 + 64 * 27 + 27
-    assert Profile(name="x").gaussian_bits() == 208
-    assert Profile(name="x", bits=8, latent=12).gaussian_bits() == 3 * 16 + 19 * 8
+    assert layer_shapes(9, 64, 27) == [(13, 64), (65, 64), (65, 27)]
+    assert Profile(name="x").code_bits().sum() == 208
+    assert Profile(name="x", bits=8, latent=12).code_bits().sum() == 3 * 16 + 19 * 8
     # As half floats, table 3: 19 numbers a Gaussian for 5% of 15,000 probes and the network, within 10% of 50.1 KB.
-    assert (2 * 19 * 750 + 2 * network_size(9, 64, 27)) / 1024 == pytest.approx(50.1, rel=0.2)
+    assert (2 * 19 * 750 + 2 * (13 * 64 + 65 * 64 + 65 * 27)) / 1024 == pytest.approx(50.1, rel=0.2)
 
 
 def test_the_profiles_that_are_there():
     assert {"compact", "paper", "standard"} <= set(profile_names("probe"))
     for name in ("compact", "paper", "standard"):
-        assert load_profile(name).name == name
-    paper = load_profile("paper")
+        assert Profile.load(name).name == name
+    paper = Profile.load("paper")
     assert (paper.ratio, paper.bits, paper.latent, paper.hidden, paper.cut) == (0.05, 10, 9, 64, 3.0)
     assert (paper.support, paper.optimiser, paper.steps) == ("sphere", "adan", 12000)
 
 
-def test_a_profile_of_ones_own(tmp_path):
+def test_a_profile_from_a_file(tmp_path):
     (tmp_path / "mine.yaml").write_text("name: mine\nbits: 8\n")
-    assert load_profile(str(tmp_path / "mine.yaml")).bits == 8
+    assert Profile.load(str(tmp_path / "mine.yaml")).bits == 8
     (tmp_path / "mine.yaml").write_text("name: mine\nbitts: 8\n")
     with pytest.raises(WlmError, match="mine.yaml: unknown key 'bitts'; did you mean 'bits'"):
-        load_profile(str(tmp_path / "mine.yaml"))
+        Profile.load(str(tmp_path / "mine.yaml"))
     with pytest.raises(WlmError, match="profile 'tiny' of probe: expected one of"):
-        load_profile("tiny")
+        Profile.load("tiny")
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import pytest
 
 from wlm.errors import WlmError
 from wlm.probe.volume import Volume
-from wlm.probe.walk import camera_path, load_path, summary, walk
+from wlm.probe.walk import camera_path, summary, walk
 
 
 def _hills(count: int = 900) -> np.ndarray:
@@ -49,104 +49,28 @@ def test_camera_path_follows_the_ground():
 
 def test_camera_path_of_little():
     """One probe, coincident probes, one frame, and no room in plan."""
-    one = np.array([[3.0, 4.0, 5.0]])
-    np.testing.assert_allclose(camera_path(one, 3), [[3.0, 5.6, 5.0]] * 3)
-    np.testing.assert_allclose(camera_path(np.repeat(one, 40, 0), 20, 0.0), np.repeat(one, 20, 0))
+    place = np.array([[3.0, 4.0, 5.0]])
+    np.testing.assert_allclose(camera_path(place, 3), [[3.0, 5.6, 5.0]] * 3)
+    np.testing.assert_allclose(camera_path(np.repeat(place, 40, 0), 20, 0.0), np.repeat(place, 20, 0))
     assert camera_path(_hills(), 1).shape == (1, 3)
     tower = np.stack([np.zeros(5), np.arange(5.0), np.zeros(5)], 1)
     np.testing.assert_allclose(camera_path(tower, 2, 1.0), [[0.0, 3.0, 0.0]] * 2)
-    for position, frames in [(np.zeros((0, 3)), 5), (one, 0)]:
+    for position, frames in [(np.zeros((0, 3)), 5), (place, 0)]:
         with pytest.raises(WlmError, match="camera path: expected at least"):
             camera_path(position, frames)
-    for position, up in [(one[0], 1), (one, 3)]:
+    for position, up in [(place[0], 1), (place, 3)]:
         with pytest.raises(ValueError, match="camera path"):
             camera_path(position, 5, up=up)
-
-
-def test_load_path(tmp_path):
-    points = [[0, 1.5, -2], [3, 4, 5e6]]
-    (tmp_path / "a.json").write_text(json.dumps(points))
-    np.savez(tmp_path / "a.npz", position=np.array(points, np.float32), other=1)
-    for name in ("a.json", "a.npz"):
-        found = load_path(tmp_path / name)
-        assert found.dtype == np.float64
-        np.testing.assert_array_equal(found, points)
-
-
-@pytest.mark.parametrize(
-    ("content", "word"),
-    [
-        ("", "JSON"),
-        ("[[0, 1", "JSON"),
-        ("[" * 100_000, "JSON"),
-        ("{}", "list"),
-        ("[]", "list"),
-        ("3", "list"),
-        ("[[0, 1]]", "viewpoint 0"),
-        ('[[0, 0, 0], [0, 1, "2"]]', "viewpoint 1"),
-        ("[[0, 1, true]]", "viewpoint 0"),
-        ("[[0, 1, NaN]]", "viewpoint 0"),
-        ("[[0, 1, Infinity]]", "viewpoint 0"),
-        ("[[0, 1, 1" + "0" * 400 + "]]", "viewpoint 0"),
-        (b"\xff\xfe", "JSON"),
-    ],
-)
-def test_load_path_refuses_json(tmp_path, content: str | bytes, word: str):
-    path = tmp_path / "path.json"
-    path.write_bytes(content if isinstance(content, bytes) else content.encode())
-    _refused(path, word)
-
-
-@pytest.mark.parametrize(
-    ("arrays", "word"),
-    [
-        ({"path": np.zeros((2, 3))}, "'position'"),
-        ({}, "'position'"),
-        ({"position": np.zeros(3)}, "F, 3"),
-        ({"position": np.zeros((0, 3))}, "F, 3"),
-        ({"position": np.zeros((2, 3), bool)}, "F, 3"),
-        ({"position": np.array([["a", "b", "c"]])}, "F, 3"),
-        ({"position": np.array([[None, 0, 0]])}, "npz"),
-        ({"position": np.array([[0.0, 0.0, 0.0], [np.inf, 0.0, 0.0]])}, "viewpoint 1"),
-    ],
-)
-def test_load_path_refuses_npz(tmp_path, arrays: dict, word: str):
-    path = tmp_path / "path.npz"
-    np.savez(path, **arrays)
-    _refused(path, word)
-
-
-def test_load_path_refuses_files(tmp_path):
-    for name in ("none.json", "none.npz"):
-        _refused(tmp_path / name, "cannot read")
-    path = tmp_path / "text.npz"
-    path.write_text("no archive")
-    _refused(path, "npz")
-    np.savez_compressed(tmp_path / "good.npz", position=np.random.default_rng(0).random((500, 3)))
-    whole = (tmp_path / "good.npz").read_bytes()
-    for damaged in (whole[: len(whole) // 2], whole[:300] + bytes(200) + whole[500:]):
-        path.write_bytes(damaged)
-        _refused(path, "npz")
-    with (tmp_path / "one.npz").open("wb") as file:
-        np.save(file, np.zeros((2, 3)))
-    _refused(tmp_path / "one.npz", "npz")
-
-
-def _refused(path, word: str) -> None:
-    with pytest.raises(WlmError) as caught:
-        load_path(path)
-    text = str(caught.value)
-    assert text.startswith(f"{path}: ") and word in text and "\n" not in text
 
 
 def test_figures_of_each_frame(device: str):
     """A slow walk through a whole scene: what the figures say is what the volume and the decoder do."""
     position = _hills()
     volume = Volume(position, _light, 2, budget=40, device=device)
-    seen = []
+    reports = []
     path = _line(12, 1.0)
-    figures = walk(volume, path, samples=100, progress=lambda done, total: seen.append((done, total)))
-    assert seen == [(i + 1, 12) for i in range(12)]
+    figures = walk(volume, path, samples=100, progress=reports.append)
+    assert (reports[-1].done, reports[-1].total, len(figures)) == (12, 12, 12)
     for figure, viewpoint in zip(figures, path, strict=True):
         assert figure.viewpoint == tuple(viewpoint) and figure.samples == 100
         assert figure.coverage == pytest.approx(sum(figure.by_level)) and 0.0 < figure.coverage <= 1.0
@@ -194,26 +118,26 @@ def test_second_lap_costs_no_decode():
     first = walk(volume, path)
     second = walk(volume, path)
     assert sum(f.stats.updated for f in first) > 0 and sum(f.stats.updated for f in second) == 0
-    found = summary(second)
-    assert found["from_cache"] == 1.0 and found["settled"] == 1.0 and found["probes"]["max"] == 0.0
+    figures = summary(second)
+    assert figures["from_cache"] == 1.0 and figures["settled"] == 1.0 and figures["probes"]["max"] == 0.0
     assert second[5].rmse == first[5].rmse  # the same draw, too
 
 
 def test_summary():
     volume = Volume(_hills(), _light, 2, budget=30)
-    figures = walk(volume, _line(20, 2.0))
-    found = summary(figures)
-    assert json.loads(json.dumps(found, allow_nan=False)) == found
-    updated = [f.stats.updated for f in figures]
+    frames = walk(volume, _line(20, 2.0))
+    figures = summary(frames)
+    assert json.loads(json.dumps(figures, allow_nan=False)) == figures
+    updated = [f.stats.updated for f in frames]
     expected = {"mean": np.mean(updated), "p95": np.percentile(updated, 95), "max": max(updated)}
-    assert found["frames"] == 20 and found["updated"] == pytest.approx(expected)
-    stages = found["find_ms"]["mean"] + found["decode_ms"]["mean"] + found["upload_ms"]["mean"]
-    assert found["update_ms"]["mean"] == pytest.approx(stages)
-    slowest = max(f.stats.find_seconds + f.stats.decode_seconds + f.stats.upload_seconds for f in figures)
-    assert found["update_ms"]["max"] == pytest.approx(1e3 * slowest)
-    assert found["coverage"]["min"] == min(f.coverage for f in figures)
-    assert found["settled"] == np.mean([f.stats.left == 0 for f in figures])
-    assert found["by_level"] == pytest.approx(np.mean([f.by_level for f in figures], 0))
+    assert figures["frames"] == 20 and figures["updated"] == pytest.approx(expected)
+    stages = figures["find_ms"]["mean"] + figures["decode_ms"]["mean"] + figures["upload_ms"]["mean"]
+    assert figures["update_ms"]["mean"] == pytest.approx(stages)
+    slowest = max(f.stats.find_seconds + f.stats.decode_seconds + f.stats.upload_seconds for f in frames)
+    assert figures["update_ms"]["max"] == pytest.approx(1e3 * slowest)
+    assert figures["coverage"]["min"] == min(f.coverage for f in frames)
+    assert figures["settled"] == np.mean([f.stats.left == 0 for f in frames])
+    assert figures["by_level"] == pytest.approx(np.mean([f.by_level for f in frames], 0))
     with pytest.raises(ValueError, match="summary"):
         summary([])
 
@@ -223,9 +147,9 @@ def test_a_walk_outside_of_the_scene():
     volume = Volume(_hills(), _light, 2, budget=10**6)
     away = walk(volume, _line(2, 1.0) + 1e6)
     assert all(f.samples == 0 and math.isnan(f.coverage) and math.isnan(f.rmse) for f in away)
-    found = summary(away)
-    assert json.loads(json.dumps(found, allow_nan=False)) == found
-    assert all(found[key] is None for key in ("coverage", "by_level", "rmse", "rms", "from_cache"))
+    figures = summary(away)
+    assert json.loads(json.dumps(figures, allow_nan=False)) == figures
+    assert all(figures[key] is None for key in ("coverage", "by_level", "rmse", "rms", "from_cache"))
     there = walk(volume, _line(1, 0.0))
     assert summary(away + there)["rmse"]["mean"] == there[0].rmse
     assert walk(volume, np.zeros((0, 3))) == []

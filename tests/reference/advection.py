@@ -1,36 +1,42 @@
-"""Advection in float64 on points, cell by cell; nothing is shared with the kernels.
+"""Advection in float64, cell by cell, without any code of the kernels.
 
-Places are in fine cells; ``ends`` gives for each axis its low and high end: 0 periodic, 1 open, 2 closed.
+``Domain.semi_lagrangian`` and ``Domain.maccormack`` are the two steps. Positions are in fine cells; ``ends`` gives for
+each axis its low and high end: 0 periodic, 1 open, 2 closed.
 """
 
 import itertools
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 
 @dataclass
 class Domain:
-    """Velocities [x, y, z, 3], coarse cells a step; solid: bool [x, y, z]; ratio: fine cells a coarse one."""
+    """A domain and its air.
+
+    Attributes:
+        u: Velocities [X, Y, Z, 3], coarse cells a step.
+        solid: bool [X, Y, Z], coarse cells.
+        refinement: Fine cells along an edge of a coarse one.
+        ends: See the module.
+    """
 
     u: np.ndarray
     solid: np.ndarray
-    ratio: int
+    refinement: int
     ends: tuple[tuple[int, int], ...]
 
-    @property
+    @cached_property
     def shape(self) -> np.ndarray:
-        return np.array(self.solid.shape) * self.ratio
+        return np.array(self.solid.shape) * self.refinement
 
-    @property
+    @cached_property
     def fine_solid(self) -> np.ndarray:
-        out = self.solid
-        for axis in range(3):
-            out = out.repeat(self.ratio, axis)
-        return out
+        return np.kron(self.solid, np.ones((self.refinement,) * 3, bool))
 
     def corners(self, p: np.ndarray, shape: np.ndarray, about: np.ndarray | None = None):
-        """The eight cells about a place, or about another one, among cells of size 1, with their weights for it."""
+        """The eight cells around p (or around ``about``), among cells of size 1, with their trilinear weights for p."""
         base = np.floor((p if about is None else about) - 0.5)
         f = p - 0.5 - base
         for corner in itertools.product((0, 1), repeat=3):
@@ -40,8 +46,8 @@ class Domain:
                 cell[axis] = cell[axis] % n if low == 0 else min(max(cell[axis], 0), n - 1)
             yield tuple(cell), np.prod([f[a] if corner[a] else 1 - f[a] for a in range(3)])
 
-    def held(self, p: np.ndarray) -> np.ndarray:
-        """A place as periodic, or held within the domain."""
+    def into_domain(self, p: np.ndarray) -> np.ndarray:
+        """A point wrapped along periodic axes and clamped to the faces of the others."""
         n = self.shape
         return np.array([p[a] % n[a] if self.ends[a][0] == 0 else np.clip(p[a], 0, n[a]) for a in range(3)])
 
@@ -50,37 +56,39 @@ class Domain:
         return any((p[a] < 0 and e[0] == 1) or (p[a] > n[a] and e[1] == 1) for a, e in enumerate(self.ends))
 
     def velocity(self, p: np.ndarray) -> np.ndarray:
-        """At a place, fine cells a step."""
+        """Of the air at a point, fine cells a step."""
         coarse = np.array(self.solid.shape)
-        at = self.held(p) / self.ratio
-        return self.ratio * sum(w * self.u[c] for c, w in self.corners(at, coarse))
+        at = self.into_domain(p) / self.refinement
+        return self.refinement * sum(w * self.u[c] for c, w in self.corners(at, coarse))
 
-    def is_solid(self, p: np.ndarray, reach: int = 0) -> bool:
-        """Whether the coarse cell of a place is solid, or one within ``reach`` of it."""
-        coarse = np.array(self.solid.shape)
-        cell = np.minimum((self.held(p) / self.ratio).astype(int), coarse - 1)
-        for step in itertools.product(range(-reach, reach + 1), repeat=3):
-            beside = cell + step
-            for a, (low, _) in enumerate(self.ends):
-                beside[a] = beside[a] % coarse[a] if low == 0 else np.clip(beside[a], 0, coarse[a] - 1)
-            if self.solid[tuple(beside)]:
-                return True
-        return False
+    @cached_property
+    def beside(self) -> np.ndarray:
+        """bool [X, Y, Z], the coarse cells that are solid or touch one that is."""
+        cells = self.solid
+        for axis, (low, _) in enumerate(self.ends):
+            cells = np.pad(cells, [(int(a == axis),) * 2 for a in range(3)], mode="wrap" if low == 0 else "edge")
+        return np.lib.stride_tricks.sliding_window_view(cells, (3, 3, 3)).any((3, 4, 5))
 
-    def trace(self, x: np.ndarray, dt: float) -> np.ndarray:
+    def at(self, cells: np.ndarray, p: np.ndarray) -> bool:
+        """The value of the coarse cell that holds a point."""
+        cell = (self.into_domain(p) / self.refinement).astype(int)
+        return bool(cells[tuple(np.minimum(cell, np.array(cells.shape) - 1))])
+
+    def departure_point(self, x: np.ndarray, dt: float) -> np.ndarray:
+        """x - dt u(x - dt u(x) / 2), cut where the trace meets a solid."""
         middle = x - 0.5 * dt * self.velocity(x)
-        away = middle / self.ratio - 0.5 - np.floor(x / self.ratio - 0.5)
+        away = middle / self.refinement - 0.5 - np.floor(x / self.refinement - 0.5)
         v = self.velocity(middle)
         if (np.abs(away - 0.5) <= 0.75).all():
-            # Read from the velocities about the start.
-            around = self.corners(middle / self.ratio, np.array(self.solid.shape), x / self.ratio)
-            v = self.ratio * sum(w * self.u[c] for c, w in around)
+            # Extrapolated from the velocities around the start.
+            around = self.corners(middle / self.refinement, np.array(self.solid.shape), x / self.refinement)
+            v = self.refinement * sum(w * self.u[c] for c, w in around)
         end = x - dt * v
-        if self.is_solid(end):
+        if self.at(self.solid, end):
             free = x
             for _ in range(6):
                 middle = 0.5 * (free + end)
-                if self.is_solid(middle):
+                if self.at(self.solid, middle):
                     end = middle
                 else:
                     free = middle
@@ -88,33 +96,36 @@ class Domain:
         return end
 
     def is_near(self, x: np.ndarray, p: np.ndarray) -> bool:
-        """Whether what lies at the end of a trace from x counts as beside a solid."""
-        short = (np.abs(p - x) <= 0.5 * self.ratio).all() and not self.is_solid(x, 1)
-        return self.is_solid(p, 1) and not short
+        """Whether the end p of a trace from x counts as beside a solid."""
+        short = (np.abs(p - x) <= 0.5 * self.refinement).all() and not self.at(self.beside, x)
+        return self.at(self.beside, p) and not short
 
     def read(self, field: np.ndarray, p: np.ndarray) -> float:
-        found = [(field[c], w) for c, w in self.corners(self.held(p), self.shape) if not self.fine_solid[c]]
-        return sum(v * w for v, w in found) / max(sum(w for _, w in found), 1e-6)
+        """A field at a point, of the cells that aren't solid."""
+        cells = [(c, w) for c, w in self.corners(self.into_domain(p), self.shape) if not self.fine_solid[c]]
+        return sum(w * field[c] for c, w in cells) / max(sum(w for _, w in cells), 1e-6)
 
     def semi_lagrangian(self, field: np.ndarray, dt: float) -> np.ndarray:
+        """A step of dt: every cell takes the field at its departure point, or clean air from beyond an open face."""
         out = np.zeros(self.shape)
         for cell in np.ndindex(out.shape):
             if not self.fine_solid[cell]:
-                p = self.trace(np.array(cell) + 0.5, dt)
+                p = self.departure_point(np.array(cell) + 0.5, dt)
                 out[cell] = 0.0 if self.outside(p) else self.read(field, p)
         return out
 
     def maccormack(self, field: np.ndarray, dt: float) -> np.ndarray:
+        """The same, corrected by half of what a step there and back loses, within the values that the trace reads."""
         predicted = self.semi_lagrangian(field, dt)
         out = predicted.copy()
         for cell in np.ndindex(out.shape):
             x = np.array(cell) + 0.5
             if self.fine_solid[cell]:
                 continue
-            p, q = self.trace(x, dt), self.trace(x, -dt)
+            p, q = self.departure_point(x, dt), self.departure_point(x, -dt)
             if self.outside(p) or self.outside(q) or self.is_near(x, p) or self.is_near(x, q):
                 continue
             value = predicted[cell] + 0.5 * (field[cell] - self.read(predicted, q))
-            values = [field[c] for c, _ in self.corners(self.held(p), self.shape)]
+            values = [field[c] for c, _ in self.corners(self.into_domain(p), self.shape)]
             out[cell] = np.clip(value, min(values), max(values))
         return out

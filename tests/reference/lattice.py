@@ -1,7 +1,11 @@
-"""A lattice Boltzmann step in float64, cell by cell and with whole populations (weights and all).
+"""A lattice Boltzmann step in float64, cell by cell and with complete populations f (not f - w).
 
-Nothing is shared with the kernels: streaming asks for each cell and direction where it comes from, and collision
-goes by Hermite polynomials, those of the recursive operator by Malaspinas's recursion taken literally.
+    f = equilibrium(c, w, rho, u)
+    while True:
+        f = stream(box, collide(box, f, operator, viscosity, smagorinsky, force))
+
+It shares nothing with the kernels: streaming asks for each cell and direction where the population comes from, and
+collision uses Hermite polynomials, those of the recursive operator by Malaspinas's recursion taken literally.
 """
 
 import itertools
@@ -15,39 +19,37 @@ RANKS = ("wall", "inlet", "outlet", "slip")
 CS2 = 1.0 / 3.0
 
 
-def _still(_body: int, x: np.ndarray) -> np.ndarray:
-    return np.zeros(3)
-
-
 @dataclass
 class Box:
-    """A domain and what is in it.
+    """A domain and its boundaries.
 
     Attributes:
-        c, w: The lattice, [Q, 3] and [Q].
+        c, w: Velocities [Q, 3] and weights [Q].
         solid: int [X, Y, Z], 0 is fluid.
         faces: For some of ``FACES``: one of ``RANKS``, and the velocity or the density (None: mass is conserved).
-        motion: (body, place in cells) -> velocity of its surface.
+        motion: (body, position in cells) -> velocity of its surface.
     """
 
     c: np.ndarray
     w: np.ndarray
     solid: np.ndarray
     faces: dict[str, tuple[str, object]] = field(default_factory=dict)
-    motion: Callable = _still
+    motion: Callable = lambda body, x: np.zeros(3)
+
+    def crossed(self, source: np.ndarray) -> list[int]:
+        """The faces, by their numbers in ``FACES``, beyond which a cell lies; periodic ones don't count."""
+        beyond = np.stack([source < 0, source >= self.solid.shape], 1).ravel()
+        return [number for number in np.flatnonzero(beyond) if FACES[number] in self.faces]
 
     def face_of(self, source: np.ndarray) -> tuple[str, object] | None:
-        """What decides for something that comes from ``source``, None inside or across a periodic face."""
-        crossed = []
-        for number, name in enumerate(FACES):
-            axis, high = divmod(number, 2)
-            beyond = source[axis] >= self.solid.shape[axis] if high else source[axis] < 0
-            if name in self.faces and beyond:
-                kind, value = self.faces[name]
-                # Where two walls meet one at rest decides.
-                rank = -1 if kind == "wall" and not np.any(value) else RANKS.index(kind)
-                crossed.append((rank, number, (kind, value)))
-        return min(crossed, key=lambda each: each[:2])[2] if crossed else None
+        """The condition of a population that comes from ``source``; None inside or across a periodic face."""
+        ranked = []
+        for number in self.crossed(source):
+            kind, value = self.faces[FACES[number]]
+            # Where two walls meet, a wall at rest decides.
+            rank = -1 if kind == "wall" and not np.any(value) else RANKS.index(kind)
+            ranked.append((rank, number, (kind, value)))
+        return min(ranked, key=lambda entry: entry[:2])[2] if ranked else None
 
 
 def equilibrium(c: np.ndarray, w: np.ndarray, rho: np.ndarray, u: np.ndarray) -> np.ndarray:
@@ -57,7 +59,7 @@ def equilibrium(c: np.ndarray, w: np.ndarray, rho: np.ndarray, u: np.ndarray) ->
 
 
 def fields(box: Box, f: np.ndarray, force: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Density and velocity of what has arrived, f [X, Y, Z, Q]."""
+    """Density and velocity of the populations that have arrived, f [X, Y, Z, Q]."""
     rho = f.sum(-1)
     return rho, (f @ box.c + 0.5 * force) / rho[..., None]
 
@@ -75,9 +77,9 @@ def _recursive(c: np.ndarray, w: np.ndarray, u: np.ndarray, stress: np.ndarray) 
             return stress[index]
         head, last = index[:-1], index[-1]
         total = u[last] * coefficient(head)
-        for at, one in enumerate(head):
+        for at, axis in enumerate(head):
             rest = head[:at] + head[at + 1 :]
-            total += np.prod([u[a] for a in rest]) * stress[one, last]
+            total += np.prod([u[a] for a in rest]) * stress[axis, last]
         return total
 
     out = np.zeros(len(c))
@@ -100,26 +102,25 @@ def _product(c: np.ndarray, w: np.ndarray, rho: float, u: np.ndarray) -> np.ndar
 
 
 def collide(box: Box, f: np.ndarray, operator: str, viscosity: float, smagorinsky: float, force) -> np.ndarray:
-    """What leaves each cell, of what has arrived."""
+    """The populations that leave each cell, from those that have arrived."""
     c, w, out = box.c, box.w, np.empty_like(f)
     traceless = np.einsum("qa,qb->qab", c, c) - CS2 * np.eye(3) * c.any(0)
     for cell in zip(*np.nonzero(box.solid == 0), strict=True):
         rho = f[cell].sum()
         u = f[cell] @ c / rho
         after = u + force[cell] / rho
-        calm = equilibrium(c, w, rho, u)
-        stress = np.einsum("q,qa,qb->ab", f[cell] - calm, c, c)
-        tau0 = 0.5 + 3.0 * viscosity
-        # |S| = 3 |Pi| / (2 rho tau) sqrt(2), and tau = tau0 + 3 (C^2 |S|): fixed point by iteration.
-        tau = tau0
-        for _ in range(200):
+        f_eq = equilibrium(c, w, rho, u)
+        stress = np.einsum("q,qa,qb->ab", f[cell] - f_eq, c, c)
+        # |S| = sqrt(2) 3 |Pi| / (2 rho tau) and tau = tau_0 + 3 C^2 |S|, by iteration to the fixed point.
+        tau, previous = 0.5 + 3.0 * viscosity, 0.0
+        while abs(tau - previous) > 1e-15:
             rate = np.sqrt(2.0) * 1.5 / (rho * tau) * np.linalg.norm(stress)
-            tau = tau0 + 3.0 * smagorinsky**2 * rate
+            previous, tau = tau, 0.5 + 3.0 * viscosity + 3.0 * smagorinsky**2 * rate
         keep = 1.0 - 1.0 / tau
         axes = np.diag(c.any(0).astype(float))
         shear = stress - axes * np.trace(stress) / np.trace(axes)
         if operator == "bgk":
-            out[cell] = f[cell] - (f[cell] - calm) / tau + equilibrium(c, w, rho, after) - calm
+            out[cell] = f[cell] - (f[cell] - f_eq) / tau + equilibrium(c, w, rho, after) - f_eq
         elif operator == "regularised":
             second = w * np.einsum("qab,ab->q", traceless, shear) / (2 * CS2**2)
             out[cell] = equilibrium(c, w, rho, after) + keep * second
@@ -129,9 +130,9 @@ def collide(box: Box, f: np.ndarray, operator: str, viscosity: float, smagorinsk
 
 
 def stream(box: Box, f: np.ndarray) -> np.ndarray:
-    """What arrives, of what left."""
+    """The populations that arrive in each cell, from those that left."""
     c, w, shape = box.c, box.w, np.array(box.solid.shape)
-    opposite = [int(np.flatnonzero((c == -one).all(1))[0]) for one in c]
+    opposite = [int(np.flatnonzero((c == -velocity).all(1))[0]) for velocity in c]
     out = np.zeros_like(f)
     balance, open_weight, balanced = 0.0, 0.0, []
     for cell in np.ndindex(f.shape[:3]):
@@ -160,12 +161,10 @@ def stream(box: Box, f: np.ndarray) -> np.ndarray:
                 rho = f[cell].sum()
                 u = f[cell] @ c / rho
                 hold = 1.0
-                for number, name in enumerate(FACES):
+                for number in box.crossed(source):
                     axis, high = divmod(number, 2)
-                    beyond = source[axis] >= shape[axis] if high else source[axis] < 0
-                    if name in box.faces and beyond:
-                        u[axis] = max(u[axis], 0.0) if high else min(u[axis], 0.0)
-                        hold = min(hold, 0.3 / shape[axis])
+                    u[axis] = max(u[axis], 0.0) if high else min(u[axis], 0.0)
+                    hold = min(hold, 0.3 / shape[axis])
                 if value is not None:
                     rho += hold * (value - rho)
                 out[cell][q] = equilibrium(c, w, np.array(rho), u)[q]
@@ -180,13 +179,10 @@ def stream(box: Box, f: np.ndarray) -> np.ndarray:
 
 def _mirrored(box: Box, f: np.ndarray, cell: tuple, q: int, opposite: list[int]) -> float:
     turned, along = box.c[q].copy(), box.c[q].copy()
-    source = np.array(cell) - box.c[q]
-    for number, name in enumerate(FACES):
-        axis, high = divmod(number, 2)
-        beyond = source[axis] >= box.solid.shape[axis] if high else source[axis] < 0
-        if name in box.faces and beyond:
-            turned[axis], along[axis] = -turned[axis], 0
-    place = tuple((np.array(cell) - along) % np.array(box.solid.shape))
-    if box.solid[place]:
+    for number in box.crossed(np.array(cell) - box.c[q]):
+        axis = number // 2
+        turned[axis], along[axis] = -turned[axis], 0
+    neighbour = tuple((np.array(cell) - along) % np.array(box.solid.shape))
+    if box.solid[neighbour]:
         return f[cell][opposite[q]]
-    return f[place][int(np.flatnonzero((box.c == turned).all(1))[0])]
+    return f[neighbour][int(np.flatnonzero((box.c == turned).all(1))[0])]

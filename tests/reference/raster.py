@@ -1,35 +1,11 @@
-"""Rasterizing by its definition: a pixel centre as a weighted sum of a triangle's corners, by solving for the weights.
-
-With P the pixel centre as (x, y, 1) and the corners (x, y, w) as columns of M, b = M^-1 P has no negative part where a
-pixel is covered from the front, b / sum(b) are the barycentrics, and b . z is z / w.
-"""
+"""Rasterizing by its definition, with how sure it is: ``wlm.ops.plain`` says how a pixel is weighed."""
 
 from fractions import Fraction
 
 import numpy as np
 import torch
 
-
-def centres(height: int, width: int) -> torch.Tensor:
-    """Pixel centres (column, row) in pixels: [H, W, 2], to be moved and passed to ``weights``."""
-    row, column = torch.meshgrid(
-        torch.arange(height, dtype=torch.float64), torch.arange(width, dtype=torch.float64), indexing="ij"
-    )
-    return torch.stack([column, row], -1) + 0.5
-
-
-def weights(
-    position: torch.Tensor, triangle: torch.Tensor, pixels: torch.Tensor, height: int, width: int
-) -> torch.Tensor:
-    """b of triangles at places, broadcast: triangle [..., 3], pixels [..., 2], result [..., 3]."""
-    x, y = pixels[..., 0] / width, pixels[..., 1] / height
-    if position.shape[1] == 4:
-        x, y = 2.0 * x - 1.0, 1.0 - 2.0 * y
-        corners = position[triangle][..., [0, 1, 3]]
-    else:
-        corners = torch.cat([position, torch.ones_like(position[:, :1])], 1)[triangle]
-    p = torch.stack([x, y, torch.ones_like(x)], -1)
-    return torch.linalg.solve(corners.transpose(-1, -2), p.unsqueeze(-1)).squeeze(-1)
+from wlm.ops.plain import corner_weights, pixel_centres
 
 
 def rasterize(
@@ -42,7 +18,7 @@ def rasterize(
     """
     p = torch.tensor(position, dtype=torch.float64)
     t = torch.tensor(triangle, dtype=torch.int64)
-    b = weights(p, t[:, None, None], centres(height, width)[None], height, width)
+    b = corner_weights(p, t[:, None, None], pixel_centres(height, width)[None], height, width)
     z = (b * p[t][:, None, None, :, 2]).sum(-1) if p.shape[1] == 4 else torch.zeros(b.shape[:3], dtype=b.dtype)
     share = b / b.abs().sum(-1, keepdim=True)
     inside = (b >= 0).all(-1)

@@ -4,8 +4,7 @@ import math
 
 import torch
 
-from reference import blocks, grids
-from reference.network import mlp
+from wlm.ops import plain
 
 SIZE = 128
 
@@ -15,7 +14,7 @@ def byte_levels(values: torch.Tensor, quantised: bool) -> torch.Tensor:
     used = values.clamp(0.0, 1.0)
     if quantised:
         used = torch.floor(used * 255.0 + 0.5) / 255.0
-    return blocks.straight_through(values, used)
+    return plain.straight_through(values, used)
 
 
 def features_of(
@@ -48,9 +47,9 @@ def features_of(
     v, u = ((place.double() + 0.5) / SIZE).unbind(1)
     parts = [
         found,
-        grids.volume(uvt, tile, torch.stack([u, v, tau], 1), periodic),
-        grids.plane(ut, tile, torch.stack([u, tau], 1), periodic),
-        grids.plane(vt, tile, torch.stack([v, tau], 1), periodic),
+        plain.volume(uvt, torch.stack([u, v, tau], 1), layer=tile, periodic=periodic),
+        plain.plane(ut, torch.stack([u, tau], 1), layer=tile, periodic=periodic),
+        plain.plane(vt, torch.stack([v, tau], 1), layer=tile, periodic=periodic),
         encoding,
     ]
     return torch.cat(parts, 1)
@@ -71,10 +70,10 @@ def train_features(
     quantised: bool,
 ) -> torch.Tensor:
     """``features_of`` from maps in training; keys and shapes as in ``wlm.lightmap.trainer.Trainer.views``."""
-    uv = blocks.texels(maps["uv_endpoints"], maps["uv_weights"], quantised)
+    uv = plain.bc7_texels(maps["uv_endpoints"], maps["uv_weights"], quantised=quantised)
     temporal = None
     if "uvt_weights" in maps:
-        uvt = blocks.texels(maps["uvt_endpoints"], maps["uvt_weights"], quantised)
+        uvt = plain.bc7_texels(maps["uvt_endpoints"], maps["uvt_weights"], quantised=quantised)
         planes = (byte_levels(maps[key], quantised) for key in ("ut", "vt"))
         temporal = (uvt.reshape(len(uv), -1, *uvt.shape[1:]), *planes)
     return features_of(uv, temporal, tile, place, tau, encoding, periodic)
@@ -114,5 +113,5 @@ def decode(
     Returns:
         [M, 3].
     """
-    y = mlp(hidden[None], output[None], centre(features)[None], kind)[0]
+    y = plain.mlp(centre(features), hidden, output, gelu=kind)
     return ((affine[0] + affine[1] * y) * scale).clamp(min=0.0)

@@ -1,4 +1,4 @@
-"""Affine subspaces for parts of a probe set: how the parts are found, and what is stored.
+"""Affine subspaces for parts of a probe set: how the set is divided, and what is stored.
 
 A probe of part c is its mean and a few of its basis vectors, y ~ m_c + sum_j w_j b_cj. How the set is divided is all
 that differs between the PCA family of gaussian-probe-compression, section 5.1. What is stored, in this order and
@@ -29,6 +29,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from wlm.errors import WlmError
+from wlm.formats.bits import pack_bits, unpack_bits
 
 __all__ = [
     "BLOCKS",
@@ -47,13 +48,11 @@ __all__ = [
     "encode",
     "extent_of",
     "fit_subspaces",
-    "pack_bits",
     "part_count",
     "payload_bytes",
     "read_weights",
     "rescale",
     "scale_of",
-    "unpack_bits",
     "weight_bytes",
     "whole",
     "windows",
@@ -62,7 +61,7 @@ __all__ = [
 
 HEADER = struct.Struct("<BBHHIf")
 HALF_MAX = 65504.0
-# How the parts are found again by a decoder.
+# How a decoder finds the parts.
 WHOLE, BLOCKS, PLACE, SIGNAL = range(4)
 _CENTRE_LEVELS = 65535
 # Cells along the longest side of the box, at most: three such numbers fit into one 64-bit key.
@@ -140,12 +139,12 @@ def windows(position: np.ndarray, partition: Partition, side: float, overlap: fl
         For each part the indices of its window, its own probes among them.
     """
     low = position.min(0)
-    first = [own[0] for own in partition.members]
+    first = [probes[0] for probes in partition.members]
     centre = low + (np.floor((position[first] - low) / side) + 0.5) * side
     # The slack keeps a probe on a cube's face in that cube's window.
     radius = side * (0.5 + overlap) * (1.0 + 1e-9)
-    found = cKDTree(position).query_ball_point(centre, radius, p=np.inf, return_sorted=True)
-    return [np.asarray(near, np.int64) for near in found]
+    windows = cKDTree(position).query_ball_point(centre, radius, p=np.inf, return_sorted=True)
+    return [np.asarray(window, np.int64) for window in windows]
 
 
 def by_place(position: np.ndarray, clusters: int, seed: int) -> Partition:
@@ -199,7 +198,7 @@ def by_signal(values: np.ndarray, clusters: int, components: int, seed: int) -> 
                 break
             error = now
     label, count = compact(label)
-    return Partition(SIGNAL, label, count, pack_bits(label, _index_bits(count)))
+    return Partition(SIGNAL, label, count, pack_bits(label[:, None], [_index_bits(count)]).tobytes())
 
 
 def fit_subspaces(values: np.ndarray, members: Sequence[np.ndarray], components: int) -> tuple[np.ndarray, np.ndarray]:
@@ -217,10 +216,10 @@ def fit_subspaces(values: np.ndarray, members: Sequence[np.ndarray], components:
     width = values.shape[1]
     mean = np.empty((len(members), width))
     basis = np.empty((len(members), components, width))
-    for part, own in enumerate(members):
-        mean[part] = values[own].mean(0)
+    for part, probes in enumerate(members):
+        mean[part] = values[probes].mean(0)
         if components:
-            centred = values[own] - mean[part]
+            centred = values[probes] - mean[part]
             # Ascending eigenvalues, and a whole orthonormal set even of a matrix of zeros.
             basis[part] = np.linalg.eigh(centred.T @ centred)[1].T[::-1][:components]
     return mean, basis
@@ -248,8 +247,8 @@ def encode(
     # Weights for the subspace as it is read back: the rounding of means and bases is no error of its own then.
     inverse = np.linalg.pinv(basis.astype(np.float64))
     weight = np.empty((len(values), components))
-    for part, own in enumerate(partition.members):
-        weight[own] = (values[own] - mean[part].astype(np.float64)) @ inverse[part]
+    for part, probes in enumerate(partition.members):
+        weight[probes] = (values[probes] - mean[part].astype(np.float64)) @ inverse[part]
     weights = write_weights(weight, partition.label, partition.count, bits)
     head = HEADER.pack(partition.kind, bits or 0, values.shape[1], components, partition.count, scale)
     return b"".join((head, partition.stored, mean.tobytes(), basis.tobytes(), weights))
@@ -284,8 +283,8 @@ def decode(payload: bytes, position: np.ndarray) -> np.ndarray:
     start += basis.size * 2
     weight = read_weights(payload[start:], label, count, components, bits or None)
     decoded = mean[label]
-    for part, own in enumerate(_members(label, count)):
-        decoded[own] += weight[own] @ basis[part].astype(np.float32)
+    for part, indices in enumerate(_members(label, count)):
+        decoded[indices] += weight[indices] @ basis[part].astype(np.float32)
     return rescale(decoded, scale)
 
 
@@ -344,7 +343,7 @@ def write_weights(weight: np.ndarray, label: np.ndarray, count: int, bits: int |
     # A range of zero has steps of zero, and level 0 is its value.
     level = np.divide(weight - low[label], step[label], out=np.zeros_like(weight), where=step[label] > 0)
     level = np.clip(np.rint(level), 0, 2**bits - 1).astype(np.int64)
-    return bounds.tobytes() + pack_bits(level.ravel(), bits)
+    return bounds.tobytes() + pack_bits(level, [bits] * level.shape[1]).tobytes()
 
 
 def read_weights(data: bytes, label: np.ndarray, count: int, components: int, bits: int | None) -> np.ndarray:
@@ -353,21 +352,14 @@ def read_weights(data: bytes, label: np.ndarray, count: int, components: int, bi
     if bits is None:
         return np.frombuffer(data, "<f2", probes * components).reshape(probes, components).astype(np.float32)
     bounds = np.frombuffer(data, "<f2", count * 2 * components).reshape(count, 2, components)
-    level = unpack_bits(data[bounds.nbytes :], probes * components, bits).reshape(probes, components)
+    level = _read_numbers(data[bounds.nbytes :], probes * components, bits).reshape(probes, components)
     low, step = _levels(bounds, bits)
     return (low[label] + level * step[label]).astype(np.float32)
 
 
-def pack_bits(numbers: np.ndarray, bits: int) -> bytes:
-    """Packs whole numbers below 2 ** bits one behind the other, the lowest bit first; bits may be 0."""
-    spread = (np.asarray(numbers)[:, None] >> np.arange(bits)) & 1
-    return np.packbits(spread.astype(np.uint8).ravel(), bitorder="little").tobytes()
-
-
-def unpack_bits(data: bytes, count: int, bits: int) -> np.ndarray:
-    """Reads ``count`` numbers that ``pack_bits`` wrote, int64."""
-    spread = np.unpackbits(np.frombuffer(data, np.uint8), count=count * bits, bitorder="little")
-    return spread.reshape(count, bits).astype(np.int64) @ (1 << np.arange(bits, dtype=np.int64))
+def _read_numbers(data: bytes, count: int, bits: int) -> np.ndarray:
+    """Reads ``count`` numbers of so many bits each, int64."""
+    return unpack_bits(np.frombuffer(data, np.uint8), [bits], count)[:, 0].astype(np.int64)
 
 
 _PARTITION_BYTES = {
@@ -385,7 +377,7 @@ def _read_partition(kind: int, data: bytes, position: np.ndarray, count: int) ->
         return compact(_cubes(position, struct.unpack("<d", data)[0]))[0]
     if kind == PLACE:
         return _nearest(position, np.frombuffer(data, "<u2").reshape(count, 3))
-    return unpack_bits(data, len(position), _index_bits(count))
+    return _read_numbers(data, len(position), _index_bits(count))
 
 
 def _levels(bounds: np.ndarray, bits: int) -> tuple[np.ndarray, np.ndarray]:

@@ -40,7 +40,7 @@ __all__ = [
     "write_json",
 ]
 
-_PLAIN_WIDTH = 120  # of a table that goes to a file or a pipe, in characters
+_PLAIN_WIDTH = 10_000  # characters: no cell of a table that goes to a file or a pipe wraps, names of files stay whole
 _PLAIN_REPORTS = 10  # lines of progress that a log gets in all
 _STDERR = 2
 _MISSING_DRIVER = b"Could not find or load the NVIDIA CUDA driver"
@@ -54,14 +54,17 @@ def _console(stderr: bool = False) -> Console:
 
 def table(title: str, columns: Sequence[str], text: Sequence[str] = ()) -> Table:
     """Starts a table: the first column and those named in ``text`` hold text, the others numbers."""
-    made = Table(title=escape(title), title_justify="left", title_style="bold", header_style="bold")
+    rows = Table(title=title, header_style="bold")
     for i, heading in enumerate(columns):
-        made.add_column(heading, justify="right" if i and heading not in text else "left", overflow="fold")
-    return made
+        rows.add_column(heading, justify="right" if i and heading not in text else "left", overflow="fold")
+    return rows
 
 
 def show(content: Table) -> None:
-    """Prints a table to stdout."""
+    """Prints a table to stdout, its title in a line above it, which wraps at no width but the terminal's."""
+    # Rich would wrap it at the width of the columns.
+    title, content.title = content.title, None
+    _console().print(title, style="bold", markup=False, soft_wrap=True)
     _console().print(content)
 
 
@@ -74,10 +77,10 @@ def show_figures(
         title, columns, text: As for `table`.
         rows: A cell for each column.
     """
-    made = table(title, columns, text)
+    content = table(title, columns, text)
     for row in rows:
-        made.add_row(*(_figure(value) for value in row))
-    show(made)
+        content.add_row(*(_figure(value) for value in row))
+    show(content)
 
 
 def _figure(value: str | float) -> str:
@@ -235,7 +238,7 @@ def deferred_interrupt() -> Iterator[Callable[[], None]]:
 
 
 @contextmanager
-def running(what: str, checkpoint: Path | None = None) -> "Iterator[OnProgress]":
+def running(what: str, checkpoint: Path | None = None, unit: str = "step") -> "Iterator[OnProgress]":
     """Shows the progress of long work and, where it has a checkpoint, lets Ctrl-C stop it between two steps.
 
     Each stage that isn't ``what`` has a bar of its own, named ``what: stage``.
@@ -243,6 +246,7 @@ def running(what: str, checkpoint: Path | None = None) -> "Iterator[OnProgress]"
     Args:
         what: The work, in a word or two.
         checkpoint: The file that keeps an interrupted run; None: Ctrl-C ends the work at once.
+        unit: What the work's progress counts.
 
     Yields:
         A callback for the work. Once it has been called and Ctrl-C stopped the work, a line says how to go on.
@@ -268,7 +272,7 @@ def running(what: str, checkpoint: Path | None = None) -> "Iterator[OnProgress]"
                 yield report
         except KeyboardInterrupt:
             if checkpoint is not None and checkpoint.exists():
-                step = f" at step {last.done}" if last is not None else ""
+                step = f" at {unit} {last.done}" if last is not None else ""
                 note(f"stopped{step}: the same command with --resume goes on from {checkpoint}")
             raise
 

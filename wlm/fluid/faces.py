@@ -5,27 +5,28 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from wlm_kernels.fluid.advection_places import CLOSED, OPEN, PERIODIC
 from wlm_kernels.fluid.lattice_links import BOUNCE, INLET, OUTLET, PRESSURE, SLIP
 from wlm_kernels.fluid.lattice_sets import VelocitySet
 
-__all__ = ["FACES", "Face", "bounded_axes", "face_links", "inlet", "outlet", "wall", "walled_axes"]
+__all__ = ["FACES", "Face", "axis_ends", "bounded_axes", "face_links", "inlet", "outlet", "wall", "walled_axes"]
 
 FACES = ("-x", "+x", "-y", "+y", "-z", "+z")
 """The faces, by the axis that they close and the end of it."""
 
-# Where a link crosses two faces, along an edge of the domain, the least of these decides, then the order of FACES.
+# Where a link crosses two faces, along an edge of the domain, the lower rank decides, then the order of FACES.
 _STILL, _MOVING, _INLET, _OUTLET, _SLIP = range(5)
 
 
 @dataclass(frozen=True, eq=False)
 class Face:
-    """One face; its cells in the order of the two axes that are left.
+    """The boundary condition on a face of A x B cells, in the order of the other two axes.
 
     Attributes:
-        rank: uint8 [A, B], what decides along edges.
+        rank: uint8 [A, B], precedence along the domain's edges.
         kind: uint8 [A, B], kinds of ``lattice_links``.
         velocity: float64 [A, B, 3], of a wall or an inlet, cells a step.
-        excess: Density less 1 of an outlet that holds it.
+        excess: Density less 1 of an outlet with a given density.
     """
 
     rank: np.ndarray
@@ -43,21 +44,21 @@ def _size(shape: tuple[int, int, int], face: str) -> tuple[int, int]:
 
 
 def _velocity(size: tuple[int, int], velocity) -> np.ndarray:
-    given = np.asarray(velocity, np.float64)
-    if given.shape not in ((3,), (*size, 3)):
-        raise ValueError(f"velocity: expected shape (3,) or {(*size, 3)}, got {given.shape}")
-    if not np.isfinite(given).all():
+    velocity = np.asarray(velocity, np.float64)
+    if velocity.shape not in ((3,), (*size, 3)):
+        raise ValueError(f"velocity: expected shape (3,) or {(*size, 3)}, got {velocity.shape}")
+    if not np.isfinite(velocity).all():
         raise ValueError("velocity: expected finite numbers")
-    return np.broadcast_to(given, (*size, 3))
+    return np.broadcast_to(velocity, (*size, 3))
 
 
 def wall(shape: tuple[int, int, int], face: str, velocity=(0.0, 0.0, 0.0), slip: bool = False) -> Face:
-    """A wall; one that slips has no velocity."""
+    """A wall without slip, or with it, which has no velocity."""
     size = _size(shape, face)
-    given = _velocity(size, velocity)
+    velocity = _velocity(size, velocity)
     if slip:
-        return Face(np.full(size, _SLIP), np.full(size, SLIP, np.uint8), given)
-    return Face(np.where(given.any(-1), _MOVING, _STILL), np.full(size, BOUNCE, np.uint8), given)
+        return Face(np.full(size, _SLIP), np.full(size, SLIP, np.uint8), velocity)
+    return Face(np.where(velocity.any(-1), _MOVING, _STILL), np.full(size, BOUNCE, np.uint8), velocity)
 
 
 def inlet(shape: tuple[int, int, int], face: str, velocity, where=None) -> Face:
@@ -66,12 +67,12 @@ def inlet(shape: tuple[int, int, int], face: str, velocity, where=None) -> Face:
     opened = np.ones(size, bool) if where is None else np.asarray(where, bool)
     if opened.shape != size:
         raise ValueError(f"where: expected shape {size}, got {opened.shape}")
-    given = np.where(opened[..., None], _velocity(size, velocity), 0.0)
-    return Face(np.where(opened, _INLET, _STILL), np.where(opened, INLET, BOUNCE).astype(np.uint8), given)
+    velocity = np.where(opened[..., None], _velocity(size, velocity), 0.0)
+    return Face(np.where(opened, _INLET, _STILL), np.where(opened, INLET, BOUNCE).astype(np.uint8), velocity)
 
 
 def outlet(shape: tuple[int, int, int], face: str, density: float | None = None) -> Face:
-    """An outlet that conserves mass, or one that holds a density."""
+    """An outlet that conserves mass, or one that relaxes to a density."""
     size = _size(shape, face)
     if density is not None and not (np.isfinite(density) and density > 0.0):
         raise ValueError(f"density: expected a positive number, got {density}")
@@ -95,9 +96,18 @@ def bounded_axes(faces: Mapping[str, Face]) -> tuple[int, int, int]:
 
 
 def walled_axes(faces: Mapping[str, Face]) -> tuple[bool, bool, bool]:
-    """Whether each axis is closed by walls at rest: the kernels see to those, without links."""
+    """Whether each axis is closed by walls at rest, which need no links."""
     still = [name in faces and bool((faces[name].rank == _STILL).all()) for name in FACES]
     return still[0] and still[1], still[2] and still[3], still[4] and still[5]
+
+
+def axis_ends(faces: Mapping[str, Face]) -> tuple[tuple[int, int], ...]:
+    """The kinds of each axis' two ends for smoke, see ``advection_places``; a face that isn't all wall is open."""
+    ends = []
+    for name in FACES:
+        walled = name in faces and np.isin(faces[name].kind, (BOUNCE, SLIP)).all()
+        ends.append(PERIODIC if name not in faces else CLOSED if walled else OPEN)
+    return tuple(zip(ends[::2], ends[1::2], strict=True))
 
 
 def face_links(
@@ -105,10 +115,10 @@ def face_links(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The links of all faces but those of walled axes, direction by direction, each in the order of the cells.
 
-    Solid cells have theirs too: the kernels pass over them.
+    They include those of solid cells, which the kernels skip.
 
     Returns:
-        Cells int32 [L], codes uint8 [L] and terms float32 [L].
+        ``cell`` int32 [L], ``code`` uint8 [L] and ``term`` float32 [L] of ``wlm_kernels.fluid.lattice_links.Links``.
     """
     bounded = bounded_axes(faces)
     closed = np.array(walled_axes(faces))
@@ -118,7 +128,7 @@ def face_links(
             np.moveaxis(beside, axis, 0)[[0, -1]] = True
     cells = np.flatnonzero(beside)
     places = np.stack(np.unravel_index(cells, shape), 1)
-    found = []
+    links = []
     for q in range(1, len(lattice.c)):
         source = places - np.array(lattice.c[q])
         walled = (((source < 0) | (source >= np.array(shape))) & closed).any(1)
@@ -135,9 +145,9 @@ def face_links(
             at = first[wins], second[wins]
             rank[wins], kind[wins], velocity[wins] = face.rank[at], face.kind[at], face.velocity[at]
             excess[wins] = face.excess
-        held = (rank < 255) & ~walled
-        moved = 6.0 * lattice.w[q] * (velocity @ np.array(lattice.c[q], float))
-        term = np.where((kind == BOUNCE) | (kind == INLET), moved, excess)
-        found.append((cells[held], (q + 32 * kind)[held], term[held]))
-    columns = zip(*found, strict=True)
+        linked = (rank < 255) & ~walled
+        momentum = 6.0 * lattice.w[q] * (velocity @ np.array(lattice.c[q], float))
+        term = np.where((kind == BOUNCE) | (kind == INLET), momentum, excess)
+        links.append((cells[linked], (q + 32 * kind)[linked], term[linked]))
+    columns = zip(*links, strict=True)
     return tuple(np.concatenate(c).astype(t) for c, t in zip(columns, (np.int32, np.uint8, np.float32), strict=True))

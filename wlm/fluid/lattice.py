@@ -1,18 +1,17 @@
-"""A lattice Boltzmann solver of smoke's air: the velocity that carries the density (neural-six-way-lightmaps,
-section 5).
+"""A lattice Boltzmann solver of air (neural-six-way-lightmaps, section 5).
 
-Inside, lengths are cells, times are steps, and the density of air at rest is 1; ``Domain`` converts. Arrays are
-[X, Y, Z], cell centres at half integers. Stated behaviours:
+Lengths are in cells, times in steps, and the density of air at rest is 1; ``Domain`` converts. Arrays are [X, Y, Z],
+cell centres at half integers. Stated behaviours:
 
-===================================  =================================================================
-a flow that blows up                 error within ``CHECK_EVERY`` steps: the first step and cell, and why
-a wall, body or inlet too fast       error: the speed and ``MAX_SPEED``
-a body over an inlet                 nothing comes in where it lies; with all covered, nothing at all
-a body over everything               nothing moves
-a grid of one voxel                  fine, as is any axis of one cell
-a domain too large for the memory    error before anything is allocated: what it needs and what there is
-a cell freed with no fluid about it  at rest at density 1
-===================================  =================================================================
+====================================  =================================================================
+a flow that blows up                  error within ``CHECK_EVERY`` steps: the first step and cell, and why
+a wall, body or inlet too fast        error: the speed and ``MAX_SPEED``
+a body over an inlet                  nothing comes in where it lies; with all covered, nothing at all
+a body over everything                nothing moves
+a grid of one voxel                   fine, as is any axis of one cell
+a domain too large for the memory     error before anything is allocated: what it needs and what there is
+a cell freed with no fluid around it  at rest at density 1
+====================================  =================================================================
 """
 
 import math
@@ -24,27 +23,27 @@ import warp as wp
 
 from wlm.errors import WlmError
 from wlm.fluid import faces as fluid_faces
-from wlm.fluid.engine import BODIES, Engine
+from wlm.fluid.engine import BODIES, PERIOD, Engine
 from wlm.interop import free_memory
 from wlm_kernels.fluid.lattice import QUIET, Spec, eddy_factor, trouble_of
-from wlm_kernels.fluid.lattice_sets import BRICK_CELLS
 
 __all__ = ["CHECK_EVERY", "MAX_SPEED", "Domain", "Lattice"]
 
 CHECK_EVERY = 48
-"""Steps between two looks at whether a cell went wrong; a multiple of what a graph holds."""
+"""Steps between two checks for a flow that blew up; a multiple of what a graph holds."""
 
 MAX_SPEED = 0.3
-"""The fastest wall, body or inlet, cells a step: half the speed of sound, where errors of Ma^2 reach a quarter."""
+"""Limit of the speed of walls, bodies and inlets, cells a step: half the speed of sound, where the error of order Ma^2
+reaches a quarter."""
 
 _MOTION = ("velocity", "spin", "centre")
-# A graph is worth its capture for a run of this many steps.
+# From this many steps on a graph repays its capture.
 _GRAPH_FROM = 16
 
 
 @dataclass(frozen=True)
 class Domain:
-    """The size of a cell and of a step, to convert from and to SI units.
+    """The size of a cell and of a step, which converts SI units to those of a lattice.
 
     Attributes:
         cell: Metres.
@@ -62,45 +61,48 @@ class Domain:
 
     @classmethod
     def of_speed(cls, cell: float, speed: float, lattice_speed: float = 0.1) -> "Domain":
-        """The step at which ``speed`` (m/s) is ``lattice_speed`` (cells a step)."""
+        """The domain in which ``speed`` (m/s) is ``lattice_speed`` (cells a step)."""
         return cls(cell, lattice_speed * cell / speed)
 
-    def speed(self, metres_a_second: float) -> float:
-        """Cells a step."""
-        return metres_a_second * self.step / self.cell
+    def speed(self, value: float) -> float:
+        """A speed in m/s as cells a step."""
+        return value * self.step / self.cell
 
-    def viscosity(self, square_metres_a_second: float) -> float:
-        """Square cells a step."""
-        return square_metres_a_second * self.step / self.cell**2
+    def viscosity(self, value: float) -> float:
+        """A kinematic viscosity in m^2/s as square cells a step."""
+        return value * self.step / self.cell**2
 
-    def acceleration(self, metres_a_second2: float) -> float:
-        """Cells a step, a step."""
-        return metres_a_second2 * self.step**2 / self.cell
+    def acceleration(self, value: float) -> float:
+        """An acceleration in m/s^2 as cells a step squared."""
+        return value * self.step**2 / self.cell
 
 
 class Lattice:
-    """A box of air, all of it at rest at first, periodic along every axis until a face is set.
+    """A box of air, at rest at first, periodic along every axis without faces.
 
-    Order: faces, then ``set_flow`` if the air moves at first, then steps; bodies and forces at any time.
+    Set faces first, then ``set_flow`` unless the air begins at rest, then step; bodies and forces at any time.
 
     Args:
         shape: Cells along x, y and z.
         viscosity: Kinematic, square cells a step; above 0.
-        operator: "bgk", "regularised" or "recursive", see ``wlm_kernels.fluid.lattice``.
-        smagorinsky: C of the eddy viscosity; 0 is none. With it the default operator is stable at 1e-6.
+        operator: Of collision: "bgk", "regularised" or "recursive", see ``wlm_kernels.fluid.lattice``.
+        smagorinsky: C of the eddy viscosity; 0 is none. With 0.17 the default operator is stable at viscosity 1e-6.
         storage: "float32" or "float16": half the memory and traffic; a jet's velocity then differs by less than 0.2% of
-            its speed (RMS, until chaos parts the two), and its mass drifts by some 3e-5 in 5,000 steps.
+            its speed (RMS, until chaos separates the two), and its mass drifts by some 3e-5 in 5,000 steps.
         lattice: "D2Q9" (Z = 1), "D3Q19" or "D3Q27".
-        device: As ``wlm.interop.check_device`` returns it.
-        ramp: Steps in which inlets rise to their velocity. A sudden start sends a sound wave through the box, and walls
-            and outlets that conserve mass keep it in: four times the longest axis makes little of it.
-        bricks: Whether only bricks of 512 cells with flow in them, and those beside them, are worked on.
-        tolerance: With bricks: momentum or density, as a deviation from rest, below which air counts as at rest.
+        device: "cpu" or "cuda:N".
+        ramp: Steps in which inlets rise to their velocity. A sudden start sends a sound wave through the box, which
+            walls and outlets that conserve mass reflect: four times the longest axis makes it weak.
+
+    Attributes:
+        period: Steps after which a CUDA graph of them can be replayed, see ``step``.
 
     Raises:
         ValueError: A wrong argument.
         WlmError: The memory isn't enough.
     """
+
+    period = PERIOD
 
     def __init__(
         self,
@@ -113,33 +115,28 @@ class Lattice:
         lattice: str = "D3Q19",
         device: str = "cpu",
         ramp: int = 0,
-        bricks: bool = False,
-        tolerance: float = 1e-6,
     ) -> None:
         self.shape = _checked_shape(shape, lattice)
         for name, value, least in (("viscosity", viscosity, 1e-12), ("smagorinsky", smagorinsky, 0.0)):
             if not (math.isfinite(value) and value >= least):
                 raise ValueError(f"{name}: expected a number of at least {least:g}, got {value}")
-        if not (math.isfinite(tolerance) and tolerance >= 0.0):
-            raise ValueError(f"tolerance: expected a number of at least 0, got {tolerance}")
         if ramp < 0:
             raise ValueError(f"ramp: expected at least 0 steps, got {ramp}")
         self.device = wp.get_device(device)
-        spec = Spec(lattice, operator, storage, eddies=smagorinsky > 0.0, bricks=bricks)
+        spec = Spec(lattice, operator, storage, eddies=smagorinsky > 0.0)
         _require_memory(self.bytes_needed(self.shape, storage, lattice), self.shape, self.device)
         tau, eddy = 0.5 + 3.0 * viscosity, eddy_factor(smagorinsky)
-        # A ramp of one step is none: the first that comes in does so after it.
-        rise = 1.0 / max(ramp, 1)
-        self._engine = Engine(self.shape, spec, tau, eddy, tolerance * tolerance, rise, self.device)
+        # A ramp of one step is none: the first air comes in after it.
+        self._engine = Engine(self.shape, spec, tau, eddy, 1.0 / max(ramp, 1), self.device)
         self._faces: dict[str, fluid_faces.Face] = {}
         self._begun = False
 
     @staticmethod
     def bytes_needed(shape: tuple[int, int, int], storage: str = "float32", lattice: str = "D3Q19") -> int:
-        """What a lattice takes up in the memory but for small parts, bytes; arguments as for the class."""
+        """Memory of a lattice without its small parts, bytes; arguments as for the class."""
         return Engine.bytes_needed(math.prod(shape), lattice, storage)
 
-    # What the domain holds.
+    # Setting up.
 
     def set_wall(self, face: str, velocity=(0.0, 0.0, 0.0), *, slip: bool = False) -> None:
         """Closes a face.
@@ -147,7 +144,7 @@ class Lattice:
         Args:
             face: One of ``wlm.fluid.faces.FACES``, "-x" for example.
             velocity: Of the wall, cells a step, along it; (3,) or [A, B, 3] for the face's cells.
-            slip: Without friction; it has no velocity then.
+            slip: Whether it is without friction, and so without a velocity.
         """
         self._set_face(face, fluid_faces.wall(self.shape, face, velocity, slip))
 
@@ -157,7 +154,7 @@ class Lattice:
         Args:
             face: As for ``set_wall``.
             velocity: Cells a step; (3,) or [A, B, 3] for the face's cells.
-            where: bool [A, B], None: the whole face. The rest is a wall.
+            where: bool [A, B], the part that is open; None: the whole face. The rest is a wall.
         """
         self._set_face(face, fluid_faces.inlet(self.shape, face, velocity, where))
 
@@ -166,23 +163,22 @@ class Lattice:
 
         Args:
             face: As for ``set_wall``.
-            density: None: as much leaves, through all such outlets together, as comes in elsewhere, so that the
-                mass stays what it is. A number: the density is drawn to it, gently enough to let sound out, and the
-                mass finds its own level.
+            density: None: as much leaves, through all such outlets together, as comes in elsewhere, which conserves
+                mass. A number: the density relaxes to it, slowly enough to let sound out, and mass isn't conserved.
         """
         self._set_face(face, fluid_faces.outlet(self.shape, face, density))
 
     def set_solid(self, mask, velocity=(0.0, 0.0, 0.0), *, spin=(0.0, 0.0, 0.0), centre=(0.0, 0.0, 0.0)) -> None:
-        """Says which cells are solid, and how they move; to be called again when they have moved.
+        """Sets which cells are solid and how they move; call it again when they have moved.
 
-        Cells that are no longer solid get the equilibrium of the mean of their neighbours. It takes a sync with the
-        device, and isn't for graphs.
+        Cells that are no longer solid get the equilibrium of the mean of their neighbours. It syncs with the device and
+        can't be captured in a graph.
 
         Args:
-            mask: bool, or integers 0 (fluid) to 255 for many bodies, [X, Y, Z]; an array of NumPy or a Warp array of
-                uint8 on the device, see ``wlm_kernels.fluid.lattice_solids``.
+            mask: bool, or the bodies' numbers 1 to 255 and 0 for fluid, [X, Y, Z]; a NumPy array, or a Warp array of
+                uint8 on the device as ``wlm_kernels.fluid.lattice_solids`` makes it.
             velocity: Of the bodies' centres, cells a step; (3,) for body 1 or [K, 3] for bodies 1 to K.
-            spin: Radians a step, likewise.
+            spin: Angular velocity, radians a step, likewise.
             centre: Cells, likewise; used where a body spins.
 
         Raises:
@@ -190,11 +186,11 @@ class Lattice:
         """
         new, bodies = self._mask(mask), self._engine.bodies
         for field, value in (("velocity", velocity), ("spin", spin), ("centre", centre)):
-            given = np.atleast_2d(np.asarray(value, np.float32))
-            if given.ndim != 2 or given.shape[1] != 3 or len(given) >= BODIES or not np.isfinite(given).all():
+            vectors = np.atleast_2d(np.asarray(value, np.float32))
+            if vectors.ndim != 2 or vectors.shape[1] != 3 or len(vectors) >= BODIES or not np.isfinite(vectors).all():
                 raise ValueError(f"{field}: expected finite numbers of shape (3,) or [K, 3], K < {BODIES}")
             rows = np.zeros((BODIES, 3), np.float32)
-            rows[1 : len(given) + 1] = given
+            rows[1 : len(vectors) + 1] = vectors
             getattr(bodies, field).assign(rows)
         self._prepare()
         _check_speed(self._engine.cover(new), "a solid's surface")
@@ -203,8 +199,8 @@ class Lattice:
         """Sets the force on the air.
 
         Args:
-            force: An acceleration, cells a step a step: (3,) for all cells, or [X, Y, Z, 3]; a Warp array of vec3
-                [X, Y, Z] on the device is used as it is, so that it may change between steps. None: no force.
+            force: An acceleration, cells a step squared: (3,) for all cells, or [X, Y, Z, 3]; a Warp array of vec3
+                [X, Y, Z] on the device isn't copied, so that it may change between steps. None: no force.
         """
         if force is None:
             self._engine.set_force(None, None)
@@ -214,13 +210,13 @@ class Lattice:
                 raise ValueError(f"force: expected vec3 {self.shape} on {self.device}")
             self._engine.set_force(None, force.flatten())
             return
-        given = np.asarray(force, np.float32)
-        if given.shape not in ((3,), (*self.shape, 3)) or not np.isfinite(given).all():
-            raise ValueError(f"force: expected finite numbers of shape (3,) or {(*self.shape, 3)}, got {given.shape}")
-        if given.ndim == 1:
-            self._engine.set_force(wp.vec3(*given.tolist()), None)
+        vectors = np.asarray(force, np.float32)
+        if vectors.shape not in ((3,), (*self.shape, 3)) or not np.isfinite(vectors).all():
+            raise ValueError(f"force: expected finite numbers of shape (3,) or {(*self.shape, 3)}, got {vectors.shape}")
+        if vectors.ndim == 1:
+            self._engine.set_force(wp.vec3(*vectors.tolist()), None)
         else:
-            self._engine.set_force(None, wp.array(given.reshape(-1, 3), dtype=wp.vec3, device=self.device))
+            self._engine.set_force(None, wp.array(vectors.reshape(-1, 3), dtype=wp.vec3, device=self.device))
 
     def set_flow(self, velocity=(0.0, 0.0, 0.0), density=1.0) -> None:
         """Sets all air to the equilibrium of a velocity and a density.
@@ -234,8 +230,8 @@ class Lattice:
         drho = (np.broadcast_to(np.asarray(density, np.float64), self.shape) - 1.0).astype(np.float32).ravel()
         if not (np.isfinite(u).all() and np.isfinite(drho).all()):
             raise ValueError("velocity, density: expected finite numbers")
-        moved = wp.array(np.ascontiguousarray(u), dtype=wp.vec3, device=self.device)
-        self._engine.start(wp.array(drho, device=self.device), moved)
+        u = wp.array(np.ascontiguousarray(u), dtype=wp.vec3, device=self.device)
+        self._engine.start(wp.array(drho, device=self.device), u)
         self._begun = True
 
     @property
@@ -243,17 +239,12 @@ class Lattice:
         """The faces that were set, by their names; an axis without any is periodic."""
         return dict(self._faces)
 
-    @property
-    def bricks(self) -> bool:
-        """Whether only bricks with flow are worked on."""
-        return self._engine.bricks is not None
-
-    # What happens.
+    # Running.
 
     def step(self, steps: int = 1) -> None:
-        """Goes on by some steps, and looks every ``CHECK_EVERY`` whether the flow is still one.
+        """Runs some steps, and ``check`` after every ``CHECK_EVERY`` of them.
 
-        Within the capture of a CUDA graph it doesn't look: call ``check`` between replays; the number of steps must
+        Within the capture of a CUDA graph it doesn't check: call ``check`` between replays. The number of steps must
         be a multiple of ``period`` there, and so must be those done before.
 
         Raises:
@@ -261,10 +252,10 @@ class Lattice:
         """
         if steps < 0:
             raise ValueError(f"steps: expected at least 0, got {steps}")
-        engine, period = self._engine, self.period
+        engine = self._engine
         if self.device.is_cuda and self.device.is_capturing:
-            if not self._begun or steps % period or engine.done % period:
-                raise ValueError(f"steps: expected, in a graph, a multiple of {period} after eager ones, got {steps}")
+            if not self._begun or steps % PERIOD or engine.done % PERIOD:
+                raise ValueError(f"steps: expected, in a graph, a multiple of {PERIOD} after eager ones, got {steps}")
             engine.run(steps)
             return
         self._prepare()
@@ -280,32 +271,27 @@ class Lattice:
             self.check()
 
     @property
-    def period(self) -> int:
-        """Steps after which the buffers, and with bricks the lists, are as they were: what a graph may hold."""
-        return self._engine.period
-
-    @property
     def steps(self) -> int:
         """Steps done, by replays of a graph too; syncs with the device."""
         return int(self._engine.clock.numpy()[self._engine.done % 2])
 
     def check(self) -> None:
-        """Looks whether a cell went wrong so far, which every step notes on the device; syncs with it.
+        """Checks that the flow hasn't blown up, which every step records on the device; syncs with it.
 
         Raises:
-            WlmError: One did; the line names the first step, the cell and the cause.
+            WlmError: It has; the line names the first step, the cell and the cause.
         """
         key = int(self._engine.trouble.numpy()[0])
         if key == QUIET:
             return
         step, cell, cause = trouble_of(key)
-        place = tuple(int(a) for a in np.unravel_index(cell, self.shape))
+        indices = tuple(int(a) for a in np.unravel_index(cell, self.shape))
         raise WlmError(
-            f"lattice: blew up in step {step} at cell {place}: {cause}; expected speeds below {MAX_SPEED} and a"
+            f"lattice: blew up in step {step} at cell {indices}: {cause}; expected speeds below {MAX_SPEED} and a"
             f" viscosity that the operator bears: use a shorter time step, a larger viscosity or smagorinsky=0.17"
         )
 
-    # What comes out.
+    # Results.
 
     def velocity(self, out: wp.array | None = None) -> wp.array:
         """The velocity, vec3 [X, Y, Z], cells a step; in a solid cell the body's."""
@@ -315,7 +301,7 @@ class Lattice:
         return out
 
     def excess_density(self, out: wp.array | None = None) -> wp.array:
-        """The density less 1, float [X, Y, Z], which float32 holds more exactly; 0 in a solid cell."""
+        """The density less 1, float [X, Y, Z], which float32 resolves better; 0 in a solid cell."""
         self._prepare()
         out = wp.empty(self.shape, dtype=float, device=self.device) if out is None else out
         self._engine.fields(out.flatten(), self._engine.zeros(0, wp.vec3))
@@ -326,30 +312,24 @@ class Lattice:
         return 1.0 + self.excess_density().numpy().astype(np.float64)
 
     def mass(self) -> float:
-        """Of all fluid cells, summed in float64."""
+        """The mass of all fluid cells, summed in float64."""
         solid = int(np.count_nonzero(self._engine.solid.numpy()))
         return self._engine.cells - solid + float(self.excess_density().numpy().sum(dtype=np.float64))
 
     def force_on_solid(self, body: int = 1) -> np.ndarray:
         """The force of the air on a body in the last step, by momentum exchange, float64 (3,).
 
-        The push of air at rest at density 1 is left out; on a body that the air surrounds it is zero anyway.
+        The pressure of air at rest at density 1 is left out; on a body that the air surrounds it sums to zero anyway.
         """
         if not 0 < body < BODIES:
             raise ValueError(f"body: expected 1 to {BODIES - 1}, got {body}")
         self._prepare()
-        return self._engine.force()[body]
-
-    @property
-    def active_cells(self) -> int:
-        """Cells worked on in a step, to the brick; all without bricks. Syncs with the device."""
-        bricks = self._engine.bricks
-        return int(bricks.count.numpy()[0]) * BRICK_CELLS if bricks else self._engine.cells
+        return self._engine.force_on_bodies()[body]
 
     def state(self) -> dict[str, np.ndarray]:
-        """What ``load`` takes: populations as stored, solid cells and their motion, steps done."""
+        """The state, for ``load``: scaled populations, solid cells and their motion, steps done."""
         engine = self._engine
-        # On a CPU .numpy() is the array itself, which the next step changes.
+        # On a CPU .numpy() shares the array's memory, which the next step changes.
         return {
             "populations": engine.buffers[0].numpy().copy(),
             "solid": engine.solid.numpy().copy(),
@@ -358,10 +338,9 @@ class Lattice:
         }
 
     def load(self, state: Mapping[str, np.ndarray]) -> None:
-        """Goes on from a state of a lattice of the same settings, faces and force.
+        """Continues from the state of a lattice of the same settings, faces and force.
 
-        On a CPU to the same last bit; on a GPU as far as the atomic sums of its outlets come out alike. With bricks
-        all are taken as busy at first, so that it is the same only to the tolerance.
+        On a CPU the steps that follow are bit for bit the same; on a GPU but for the order of its outlets' atomic sums.
 
         Raises:
             WlmError: The state is of another shape, lattice or storage.
@@ -377,10 +356,10 @@ class Lattice:
         for name, (shapes, dtype) in expected.items():
             if name not in state:
                 raise WlmError(f"lattice state: {name}: missing")
-            got = np.asarray(state[name])
-            if got.shape not in shapes or got.dtype != dtype:
-                wanted = f"{np.dtype(dtype)} {' or '.join(str(shape) for shape in shapes)}"
-                raise WlmError(f"lattice state: {name}: expected {wanted}, found {got.dtype} {got.shape}")
+            part = np.asarray(state[name])
+            if part.shape not in shapes or part.dtype != dtype:
+                allowed = f"{np.dtype(dtype)} {' or '.join(str(shape) for shape in shapes)}"
+                raise WlmError(f"lattice state: {name}: expected {allowed}, found {part.dtype} {part.shape}")
         self._prepare()
         for field, rows in zip(_MOTION, state["bodies"], strict=True):
             getattr(engine.bodies, field).assign(rows)
@@ -403,12 +382,12 @@ class Lattice:
             if mask.shape != self.shape or mask.dtype != wp.uint8 or mask.device != self.device:
                 raise ValueError(f"mask: expected uint8 {self.shape} on {self.device}")
             return mask.flatten()
-        given = np.asarray(mask)
-        if given.shape != self.shape or given.dtype.kind not in "biu":
-            raise ValueError(f"mask: expected bool or integers {self.shape}, got {given.dtype} {given.shape}")
-        if given.min() < 0 or given.max() >= BODIES:
+        mask = np.asarray(mask)
+        if mask.shape != self.shape or mask.dtype.kind not in "biu":
+            raise ValueError(f"mask: expected bool or integers {self.shape}, got {mask.dtype} {mask.shape}")
+        if mask.min() < 0 or mask.max() >= BODIES:
             raise ValueError(f"mask: expected numbers from 0 to {BODIES - 1}")
-        return wp.array(given.astype(np.uint8).ravel(), dtype=wp.uint8, device=self.device)
+        return wp.array(mask.astype(np.uint8).ravel(), dtype=wp.uint8, device=self.device)
 
 
 def _checked_shape(shape, lattice: str) -> tuple[int, int, int]:

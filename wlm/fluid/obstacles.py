@@ -1,6 +1,6 @@
-"""What stands in the air of a simulation, or moves through it: spheres and closed meshes, and their paths.
+"""Solid obstacles in the air of a simulation, at rest or moving: spheres and closed meshes, and their paths.
 
-Lengths are cells of the velocity grid, times are its steps, as in ``wlm.fluid.lattice``.
+Lengths are in cells of the lattice, times in its steps, as in ``wlm.fluid.lattice``.
 """
 
 import hashlib
@@ -10,14 +10,15 @@ from dataclasses import dataclass, field
 import numpy as np
 import warp as wp
 
+from wlm.fluid import shapes
 from wlm_kernels.fluid.lattice_solids import voxelise_mesh, voxelise_sphere
 
-__all__ = ["Mesh", "Obstacle", "Path", "Sphere", "box_mesh"]
+__all__ = ["Mesh", "Obstacle", "Sphere", "Trajectory", "box_mesh"]
 
 
 @dataclass(frozen=True, eq=False)
-class Path:
-    """Key positions over time, straight lines between them; at rest before the first and after the last.
+class Trajectory:
+    """Positions over time, linear between keys; at rest before the first key and after the last.
 
     Attributes:
         positions: float64 [K, 3], cells.
@@ -28,12 +29,12 @@ class Path:
     times: np.ndarray
 
     @classmethod
-    def of(cls, positions: Sequence, times: Sequence[float] = (0.0,)) -> "Path":
-        """Makes a path.
+    def of(cls, positions: Sequence, times: Sequence[float] = (0.0,)) -> "Trajectory":
+        """Makes a trajectory.
 
         Args:
-            positions: [K, 3], or one place (3,) to stay at.
-            times: [K].
+            positions: [K, 3], or one position (3,) to stay at, cells.
+            times: [K], steps.
 
         Raises:
             ValueError: Wrong shapes, numbers that aren't finite, or times that don't increase.
@@ -49,7 +50,7 @@ class Path:
 
     @property
     def moves(self) -> bool:
-        """Whether it isn't at one place all the time."""
+        """Whether its positions differ."""
         return bool((self.positions != self.positions[0]).any())
 
     def at(self, time: float) -> np.ndarray:
@@ -57,20 +58,20 @@ class Path:
         return np.array([np.interp(time, self.times, self.positions[:, axis]) for axis in range(3)])
 
     def describe(self) -> dict:
-        """What it is, as JSON values."""
+        """Its settings as JSON values."""
         return {"positions": self.positions.tolist(), "times": self.times.tolist()}
 
 
 @dataclass(frozen=True, eq=False)
 class Sphere:
-    """A ball.
+    """A spherical obstacle.
 
     Attributes:
         path: Of its centre.
         radius: Cells, above 0.
     """
 
-    path: Path
+    path: Trajectory
     radius: float
 
     def __post_init__(self) -> None:
@@ -78,7 +79,7 @@ class Sphere:
             raise ValueError(f"radius: expected a length above 0, got {self.radius}")
 
     def cover(self, solid: wp.array, body: int, position: np.ndarray) -> None:
-        """Marks the cells whose centres it holds at a position, and frees those that it held before.
+        """Marks the cells whose centres lie in it at a position, and frees those marked before.
 
         Args:
             solid: uint8 [X, Y, Z], changed.
@@ -88,22 +89,24 @@ class Sphere:
         voxelise_sphere(solid, body, position.tolist(), self.radius)
 
     def describe(self) -> dict:
-        """What it is, as JSON values, for a checkpoint to name."""
+        """Its settings as JSON values, by which a checkpoint is recognised."""
         return self.path.describe() | {"radius": self.radius}
 
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """A closed mesh, which moves without turning. A cell's centre that lies on its very surface falls either way.
+    """An obstacle bounded by a closed mesh, which moves without turning.
+
+    A cell whose centre lies exactly on the surface may be in it or not.
 
     Attributes:
         path: Of its origin.
-        vertices: float32 [V, 3], in units of ``scale`` cells about its origin.
+        vertices: float32 [V, 3] around its origin, in units of ``scale`` cells.
         triangles: int32 [T, 3], anticlockwise from outside.
-        scale: Cells a unit.
+        scale: Cells per unit.
     """
 
-    path: Path
+    path: Trajectory
     vertices: np.ndarray
     triangles: np.ndarray
     scale: float = 1.0
@@ -128,21 +131,22 @@ class Mesh:
         voxelise_mesh(solid, body, self._meshes[device], position.tolist(), scale=self.scale)
 
     def describe(self) -> dict:
-        """As ``Sphere.describe``; a hash stands for its arrays."""
+        """As ``Sphere.describe``, with a hash of its arrays."""
         digest = hashlib.blake2b(np.asarray(self.vertices, np.float32).tobytes(), digest_size=16)
         digest.update(np.asarray(self.triangles, np.int32).tobytes())
         return self.path.describe() | {"mesh": digest.hexdigest(), "scale": self.scale}
 
 
 Obstacle = Sphere | Mesh
+"""In cells and steps of the lattice."""
 
 
-def box_mesh(path: Path, size: Sequence[float]) -> Mesh:
-    """A box about its path, edges along the axes.
+def box_mesh(path: Trajectory, size: Sequence[float]) -> Mesh:
+    """A box with its edges along the axes.
 
     Args:
         path: Of its centre.
-        size: (3,), cells, above 0.
+        size: (3,), lengths of the edges, cells, above 0.
 
     Raises:
         ValueError: A size that isn't above 0.
@@ -150,8 +154,5 @@ def box_mesh(path: Path, size: Sequence[float]) -> Mesh:
     edges = np.asarray(size, np.float64)
     if edges.shape != (3,) or not ((edges > 0.0) & np.isfinite(edges)).all():
         raise ValueError(f"size: expected three lengths above 0, got {size}")
-    corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
-    # Of each face the corners, anticlockwise from outside.
-    faces = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-    triangles = [t for a, b, c, d in faces for t in ((a, b, c), (a, c, d))]
-    return Mesh(path, (corners * edges).astype(np.float32), np.array(triangles, np.int32))
+    corners, triangles = shapes.box()
+    return Mesh(path, (0.5 * corners * edges).astype(np.float32), triangles.astype(np.int32))

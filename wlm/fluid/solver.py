@@ -1,8 +1,9 @@
-"""A simulation of smoke: air on a lattice, smoke carried by it on a finer grid, sources and obstacles
+"""A simulation of smoke: air on a lattice, and smoke carried by it on a finer grid, with sources and obstacles
 (neural-six-way-lightmaps, section 5: 100^3 velocities, 400^3 densities).
 
-Lengths are cells of the lattice, times its steps. A step of the solver is ``substeps`` of the lattice, in this order:
-obstacles move, hot smoke lifts the air, the air moves, it carries the smoke, sources give. Stated behaviours:
+Lengths are in cells of the lattice, times in its steps. A step of the solver is ``substeps`` of the lattice, in this
+order: obstacles move, smoke accelerates the air (buoyancy), the air moves, it carries the smoke, sources give. Stated
+behaviours:
 
 =====================================  ===================================================================
 no smoke                               fine: the air moves, every density is 0
@@ -10,13 +11,12 @@ an obstacle that covers an inlet       nothing comes in where it lies
 an obstacle or an inlet too fast       error of the lattice: the speed and its limit
 air that blows up                      error of the lattice, within ``wlm.fluid.lattice.CHECK_EVERY`` of its
                                        steps: step, cell and cause, and the last good checkpoint, which stays
-smoke in an obstacle                   none; what a moving one covers is lost, what it frees takes after the
-                                       cells beside it
+smoke in an obstacle                   none; smoke that a moving one covers is lost, cells that it frees get
+                                       the mean of the cells beside them
 smoke at faces                         leaves through inlets and outlets, and clean air comes in; held at walls. A
                                        face with an inlet is open as a whole, beside the inlet too
 a grid of one voxel                    fine
-grids too large for the memory         error before any of smoke's is allocated: what they need and what there is;
-                                       ``wlm.smoke.simulate.make_solver`` looks at those of air and smoke together
+grids too large for the memory         error before any smoke is allocated: what it needs and what there is
 =====================================  ===================================================================
 """
 
@@ -24,7 +24,8 @@ import hashlib
 import json
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -32,35 +33,38 @@ import numpy as np
 import warp as wp
 
 from wlm.errors import WlmError
-from wlm.fluid import solver_lattice
+from wlm.fluid.faces import axis_ends
 from wlm.fluid.lattice import Lattice
 from wlm.fluid.obstacles import Obstacle
 from wlm.fluid.volume import DensityVolume
 from wlm.formats.artifact import read_artifact, write_artifact
+from wlm.interop import free_memory
 from wlm_kernels.fluid import advection, advection_places, advection_sources
+from wlm_kernels.fluid.advection_places import DENSE
 
-__all__ = ["LEAST_HALF_LOSS", "SCHEMES", "Buoyancy", "Solver", "Source", "voxel_bytes"]
+__all__ = ["LEAST_HALF_LOSS", "SCHEMES", "Buoyancy", "Solver", "Source", "require_memory", "voxel_bytes"]
 
 SCHEMES = ("maccormack", "semi-lagrangian")
 
-_SYSTEM = "smoke-checkpoint"
-# Air as fast as sound is air that blows up, cells a step: smoke moves no further between two looks.
-_SOUND = math.sqrt(1.0 / 3.0)
 LEAST_HALF_LOSS = 2.0**-10
-"""The least part that half floats, of 11 bits, surely lose in a step: less would be rounded away each time."""
+"""The least relative decay in a step that half floats, of 11 bits, can store: less would be rounded away each time."""
+
+_SYSTEM = "smoke-checkpoint"
+# The speed of sound, cells a step: the lattice counts faster air as blown up, so that smoke moves no farther in a step.
+_SOUND = math.sqrt(1.0 / 3.0)
 
 
 @dataclass(frozen=True)
 class Source:
-    """Where smoke comes from.
+    """A region that gives smoke, in cells and steps of the lattice.
 
     Attributes:
         shape: "box" or "sphere".
         centre: Cells.
         size: Half edges, or radii, cells; above 0.
-        density: A step of the lattice, or what it is held at.
+        density: Added in a step of the lattice, or the value that is set.
         temperature: Likewise.
-        fixed: Whether both are held, not added to.
+        fixed: Whether both are set instead of added.
     """
 
     shape: str
@@ -85,11 +89,11 @@ class Source:
 
 @dataclass(frozen=True)
 class Buoyancy:
-    """What smoke does to the air, by the means over a cell of the lattice.
+    """The acceleration of the air by smoke, linear in density and temperature.
 
     Attributes:
-        lift: Acceleration against gravity of temperature 1, cells a step, a step.
-        weight: Acceleration along gravity of density 1, likewise.
+        lift: Upwards at temperature 1, cells of the lattice a step squared.
+        weight: Downwards at density 1, likewise.
         up: Unit vector against gravity.
     """
 
@@ -105,38 +109,62 @@ class Buoyancy:
 
 
 def voxel_bytes(scheme: str, storage: str, temperature: bool) -> int:
-    """What a cell of smoke takes up in the memory, bytes; arguments as for ``Solver``."""
+    """Memory of a cell of smoke, bytes; arguments as for ``Solver``."""
     fields = _buffers(scheme) * (2 if temperature else 1)
     return fields * wp.types.type_size_in_bytes(advection.STORAGES[storage])
+
+
+def require_memory(shape: tuple[int, int, int], cell_bytes: int, device: wp.Device) -> None:
+    """Checks that a grid of smoke can be indexed and allocated.
+
+    Raises:
+        WlmError: It can't.
+    """
+    x, y, z = shape
+    if x * y * z >= 2**31:
+        raise WlmError(f"smoke: {x} x {y} x {z} cells: expected fewer than 2^31: use a lower refinement")
+    needed = cell_bytes * x * y * z
+    free = free_memory(device)
+    if needed > free:
+        raise WlmError(
+            f"smoke: {x} x {y} x {z} cells need {needed / 2**30:.1f} GiB on {device}: expected at most the"
+            f" {free / 2**30:.1f} GiB that are free: use a lower refinement, storage='float16' or the scheme"
+            " 'semi-lagrangian'"
+        )
 
 
 class Solver:
     """Smoke in the air of a lattice.
 
-    Faces are set on the lattice beforehand; its solids and its force are the solver's to set. A moving obstacle takes
-    a sync with the device at each step.
+    Set the lattice's faces beforehand; its solids and its force are set by the solver. A moving obstacle syncs with the
+    device at each step.
 
     Args:
-        lattice: The air. With ``buoyancy`` it must be a dense one: bricks of air at rest would feel no force.
-        refinement: Cells of smoke along an edge of one of air.
-        scheme: One of ``SCHEMES``.
-        storage: "float32" or "float16": half the memory; 11 bits of a value are kept at each step.
+        lattice: The air.
+        refinement: Cells of smoke along an edge of a cell of the lattice.
+        scheme: Of advection, one of ``SCHEMES``.
+        storage: "float32" or "float16": half the memory and as fast, but each step rounds to 11 bits.
         temperature: Whether smoke has one.
-        sources: Where it comes from.
+        sources: Where smoke comes from.
         obstacles: At most 255.
-        dissipation: Rate at which density decays, a step of the lattice: exp(-dissipation t).
-        cooling: Likewise of temperature.
+        dissipation: Decay rate of the density, per step of the lattice: exp(-dissipation t) remains.
+        cooling: Likewise of the temperature.
         buoyancy: None for none.
-        substeps: Steps of the lattice in one of the solver. A speed of 1 / substeps lets smoke jump over walls.
-        bricks: Whether only bricks of 8^3 cells with smoke in them, and those beside them, are worked on.
-        threshold: With bricks: the value up to which a brick counts as empty.
-        checkpoint: The file of the last good state; None keeps none.
-        checkpoint_every: Steps of the solver between two.
+        substeps: Steps of the lattice in one of the solver. At a speed of 1 / substeps smoke can jump over walls.
+        bricks: Whether only bricks of 8^3 cells with smoke in them, and those beside them, are computed.
+        threshold: With bricks: the largest value of a brick that counts as empty.
+        checkpoint: The file of the last good state; None: no file.
+        checkpoint_every: Steps of the solver between two checkpoints.
+
+    Attributes:
+        period: Steps after which a CUDA graph of them can be replayed, see ``step``.
 
     Raises:
         ValueError: A wrong argument.
         WlmError: The memory isn't enough.
     """
+
+    period = 2
 
     def __init__(
         self,
@@ -166,41 +194,38 @@ class Solver:
         for name, rate in (("dissipation", dissipation), ("cooling", cooling), ("threshold", threshold)):
             if not (math.isfinite(rate) and rate >= 0.0):
                 raise ValueError(f"{name}: expected a number of at least 0, got {rate}")
-        self._share = (math.exp(-dissipation * substeps), math.exp(-cooling * substeps))
-        if storage == "float16" and any(0.0 < 1.0 - s < LEAST_HALF_LOSS for s in self._share):
+        self._decay = (math.exp(-dissipation * substeps), math.exp(-cooling * substeps))
+        if storage == "float16" and any(0.0 < 1.0 - factor < LEAST_HALF_LOSS for factor in self._decay):
             raise ValueError(f"dissipation, cooling: expected 0 or {LEAST_HALF_LOSS:.2g} a step and more with float16")
         if len(obstacles) > 255:
             raise ValueError(f"obstacles: expected at most 255, got {len(obstacles)}")
-        if buoyancy is not None and solver_lattice.has_bricks(lattice):
-            raise ValueError("buoyancy: expected a lattice without bricks: those at rest would feel no force")
         if not temperature and (cooling or (buoyancy and buoyancy.lift) or any(s.temperature for s in sources)):
             raise ValueError("temperature: expected True, since something asks for one")
         self.lattice, self.device, self.scheme, self.substeps = lattice, lattice.device, scheme, substeps
         self.sources, self.obstacles, self.buoyancy = tuple(sources), tuple(obstacles), buoyancy
         self.shape = tuple(refinement * size for size in lattice.shape)
-        stored = advection.STORAGES[storage]
-        solver_lattice.require_memory(self.shape, voxel_bytes(scheme, storage, temperature), self.device)
-        self._box = advection_places.make_box(lattice.shape, refinement, solver_lattice.ends(lattice))
-        self._threshold, self._checkpoint, self._every, self._kept = threshold, checkpoint, checkpoint_every, ""
+        stored, cells = advection.STORAGES[storage], math.prod(self.shape)
+        require_memory(self.shape, voxel_bytes(scheme, storage, temperature), self.device)
+        self._box = advection_places.make_box(lattice.shape, refinement, axis_ends(lattice.faces))
+        self._checkpoint, self._checkpoint_every, self._kept = checkpoint, checkpoint_every, ""
         self._fields = [
-            advection.Fields(self._zeros(self.shape, stored), self._zeros(self.shape if temperature else (0,), stored))
+            advection.Fields(self._zeros((cells,), stored), self._zeros((cells if temperature else 0,), stored))
             for _ in range(_buffers(scheme))
         ]
-        coarse = lattice.shape
-        self._velocity = self._zeros(coarse, wp.vec3)
+        self._velocity = self._zeros(lattice.shape, wp.vec3)
         self._force = None
         if buoyancy is not None:
-            self._force = self._zeros(coarse, wp.vec3)
+            self._force = self._zeros(lattice.shape, wp.vec3)
             lattice.set_force(self._force)
-        self._solid = self._zeros(coarse if obstacles else (0,), wp.uint8)
+        self._solid = self._zeros(lattice.shape if obstacles else (0,), wp.uint8)
         self._walls = [self._zeros((self._solid.size,), wp.uint8) for _ in range(2)]
         self._placed = np.full((len(obstacles), 2, 3), np.nan)
-        self._bricks = None
+        self._bricks = DENSE
         if bricks:
             rings = advection_places.rings_for(_SOUND * substeps * refinement)
-            self._bricks = advection_places.make_bricks(self._box, rings, str(self.device))
+            self._bricks = advection_places.make_bricks(self._box, rings, threshold, str(self.device))
         self._settings = {
-            "lattice": list(coarse),
+            "lattice": list(lattice.shape),
             "refinement": refinement,
             "scheme": scheme,
             "storage": storage,
@@ -214,18 +239,18 @@ class Solver:
             "bricks": bricks,
             "threshold": threshold,
         }
-        # As JSON gives it back, which has no tuples.
+        # As JSON gives them back, which has no tuples.
         self._settings: dict[str, Any] = json.loads(json.dumps(self._settings))
         self._done = 0
 
-    # What happens.
+    # Running.
 
     def step(self, steps: int = 1) -> None:
-        """Goes on by some steps, and keeps a checkpoint where one is due.
+        """Runs some steps, and writes checkpoints.
 
-        Within the capture of a CUDA graph nothing is looked at or kept: call ``check`` between replays. Their number,
-        and that of the steps done before, must be a multiple of ``period`` there, ``substeps`` of the lattice's own,
-        and obstacles must rest.
+        Within the capture of a CUDA graph it neither checks nor writes: call ``check`` between replays. The number of
+        steps there, and of those done before, must be a multiple of ``period``, ``substeps`` one of the lattice's
+        ``period``, and obstacles must be at rest.
 
         Raises:
             WlmError: The air blew up, an obstacle is too fast, or the checkpoint can't be written.
@@ -244,39 +269,35 @@ class Solver:
                 self._place_obstacles()
             self._step()
             self._done += 1
-            if self._checkpoint is not None and not capturing and self._done % self._every == 0:
+            if self._checkpoint is not None and not capturing and self._done % self._checkpoint_every == 0:
                 self.save(self._checkpoint)
 
     def check(self) -> None:
-        """Looks whether the air is still air; syncs with the device.
+        """Checks that the air hasn't blown up; syncs with the device.
 
         Raises:
-            WlmError: It blew up; the line names step, cell, cause and the checkpoint saved or loaded last.
+            WlmError: It has; the line names step, cell, cause and the checkpoint saved or loaded last.
         """
-        with solver_lattice.adding(lambda: self._kept):
+        with self._naming_checkpoint():
             self.lattice.check()
-
-    @property
-    def period(self) -> int:
-        """Steps after which all buffers are where they were: what a graph may hold."""
-        return 2
 
     @property
     def steps(self) -> int:
         """Steps done, by replays of a graph too; syncs with the device."""
         return self.lattice.steps // self.substeps
 
-    # What comes out.
+    # Results.
 
     @property
     def density(self) -> wp.array:
-        """float or half [X, Y, Z] on the device; good until the next step."""
-        return self._fields[0].density
+        """float or half [X, Y, Z] on the device; valid until the next step."""
+        return self._fields[0].density.reshape(self.shape)
 
     @property
     def temperature(self) -> wp.array | None:
         """Likewise; None without one."""
-        return self._fields[0].heat if self._fields[0].heat.size else None
+        values = self._fields[0].temperature
+        return values.reshape(self.shape) if values.size else None
 
     @property
     def solid(self) -> wp.array:
@@ -285,13 +306,13 @@ class Solver:
 
     @property
     def velocity(self) -> wp.array:
-        """vec3 [cells of the lattice], cells a step: what carried the smoke in the last step."""
+        """vec3 [cells of the lattice], cells a step: the velocity that carried the smoke in the last step."""
         return self._velocity
 
     @property
     def active_cells(self) -> int:
-        """Cells of smoke worked on in the last step, to the brick; all without bricks. Syncs with the device."""
-        if self._bricks is None:
+        """Cells of smoke computed in the last step, in whole bricks; all without bricks. Syncs with the device."""
+        if self._bricks is DENSE:
             return math.prod(self.shape)
         return int(self._bricks.count.numpy()[0]) * advection_places.BRICK**3
 
@@ -303,7 +324,7 @@ class Solver:
         cell: float = 1.0,
         origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
     ) -> DensityVolume:
-        """The smoke as it is, to render; it shares the solver's memory and is good until the next step.
+        """The smoke as a volume to render; it shares the solver's memory and is valid until the next step.
 
         Args:
             extinction: Per length of the world, of density 1.
@@ -311,87 +332,96 @@ class Solver:
             cell: Edge of a cell of the lattice in the world's unit.
             origin: Corner of the domain in the world.
         """
-        hot = None if self.temperature is None else wp.to_torch(self.temperature)
         return DensityVolume(
             density=wp.to_torch(self.density),
             extinction=extinction,
-            voxel=cell * self._box.share,
+            voxel=cell * self._box.voxel,
             origin=origin,
-            temperature=hot,
+            temperature=None if self.temperature is None else wp.to_torch(self.temperature),
             emission=emission,
         )
 
     # Checkpoints.
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Writes all of the state, whole or not at all.
+        """Writes the complete state, atomically.
 
         Raises:
-            WlmError: The air blew up, or the file can't be written; what was there before stays.
+            WlmError: The air blew up, or the file can't be written; an earlier file stays.
         """
         self.check()
         air = self.lattice.state()
         tensors = {f"lattice.{name}": value for name, value in air.items()}
-        # On a CPU .numpy() is the array itself; it is written before the next step changes it.
+        # On a CPU .numpy() shares the array's memory; it is written before the next step changes it.
         tensors |= {"density": self.density.numpy(), "placed": self._placed}
         if self.temperature is not None:
             tensors["temperature"] = self.temperature.numpy()
         text = json.dumps(self._settings, sort_keys=True).encode()
         source = hashlib.blake2b(text, digest_size=16).hexdigest()
         write_artifact(path, _SYSTEM, self._settings, tensors, source)
-        self._keep(path, air["steps"])
+        self._note_checkpoint(path, air["steps"])
 
     def load(self, path: str | os.PathLike[str]) -> None:
-        """Goes on from a checkpoint of a solver and a lattice of the same settings.
+        """Continues from a checkpoint of a solver and a lattice of the same settings.
 
-        On a CPU to the same last bit; on a GPU as far as the atomic sums of its outlets come out alike. A lattice of
-        bricks goes on the same to its tolerance, smoke in bricks to its threshold.
+        On a CPU the steps that follow are bit for bit the same; on a GPU but for the order of the outlets' atomic sums,
+        and with bricks to their threshold.
 
         Raises:
             WlmError: The file is damaged, or of another simulation; the line names what differs.
         """
         artifact = read_artifact(path, _SYSTEM)
         for name, value in self._settings.items():
-            if (found := artifact.settings.get(name)) != value:
-                raise WlmError(f"{path}: {name}: expected {value}, found {found}: a checkpoint of another simulation")
+            if (stored := artifact.settings.get(name)) != value:
+                raise WlmError(f"{path}: {name}: expected {value}, found {stored}: a checkpoint of another simulation")
         state, now = artifact.tensors, self._fields[0]
-        expected = {"density": now.density.numpy(), "placed": self._placed}
+        expected = {"density": self.density.numpy(), "placed": self._placed}
         if self.temperature is not None:
-            expected["temperature"] = now.heat.numpy()
+            expected["temperature"] = self.temperature.numpy()
         for name, like in expected.items():
-            got = state.get(name)
-            if got is None or got.shape != like.shape or got.dtype != like.dtype:
-                raise WlmError(f"{path}: {name}: expected {like.dtype} {like.shape}, found {_named(got)}")
-        parts = {name.removeprefix("lattice."): v for name, v in state.items() if name.startswith("lattice.")}
-        with solver_lattice.adding(lambda: f" (in {path})"):
-            self.lattice.load(parts)
+            part = state.get(name)
+            if part is None or part.shape != like.shape or part.dtype != like.dtype:
+                raise WlmError(f"{path}: {name}: expected {like.dtype} {like.shape}, found {_described(part)}")
+        air = {name.removeprefix("lattice."): v for name, v in state.items() if name.startswith("lattice.")}
+        try:
+            self.lattice.load(air)
+        except WlmError as error:
+            raise WlmError(f"{error} (in {path})") from error
         for fields in self._fields[1:]:
             fields.density.zero_()
-            fields.heat.zero_()
-        now.density.assign(state["density"])
+            fields.temperature.zero_()
+        now.density.assign(state["density"].ravel())
         if self.temperature is not None:
-            now.heat.assign(state["temperature"])
+            now.temperature.assign(state["temperature"].ravel())
         self._placed = np.array(state["placed"])
         self._done = self.steps
         if self.obstacles:
             # The lattice of a state before the first step has no solid yet.
-            if parts["solid"].size:
-                self._solid.assign(np.array(parts["solid"]).reshape(self._solid.shape))
+            if air["solid"].size:
+                self._solid.assign(np.array(air["solid"]).reshape(self._solid.shape))
             else:
                 self._solid.zero_()
             advection_places.mark_walls(self._box, self._solid.flatten(), self._walls[0])
-        if self._bricks is not None:
+        if self._bricks is not DENSE:
             self._bricks.busy.fill_(1)
-        self._keep(path, parts["steps"])
+        self._note_checkpoint(path, air["steps"])
+
+    def _note_checkpoint(self, path: str | os.PathLike[str], steps: np.ndarray) -> None:
+        """Remembers for errors where a state is kept; its step is the lattice's, as in the lattice's errors."""
+        self._kept = f"; the state of step {int(steps)} is kept in {path}"
+
+    @contextmanager
+    def _naming_checkpoint(self) -> Iterator[None]:
+        """Adds to the line of an error where a state is kept."""
+        try:
+            yield
+        except WlmError as error:
+            raise WlmError(f"{error}{self._kept}") from error
 
     # Within a step.
 
-    def _keep(self, path: str | os.PathLike[str], steps: np.ndarray) -> None:
-        """Notes for the line of an error where a state is kept; in the lattice's steps, as that line is."""
-        self._kept = f"; the state of step {int(steps)} is kept in {path}"
-
     def _place_obstacles(self) -> None:
-        """Puts obstacles where they will be in the middle of the step; nothing if they are there and at rest."""
+        """Moves obstacles to where they will be in the middle of the step, unless they are there and at rest."""
         begin = float(self._done * self.substeps)
         placed = np.empty_like(self._placed)
         for k, obstacle in enumerate(self.obstacles):
@@ -401,49 +431,48 @@ class Solver:
             return
         for k, obstacle in enumerate(self.obstacles):
             obstacle.cover(self._solid, k + 1, placed[k, 0])
-        with solver_lattice.adding(lambda: self._kept):
+        with self._naming_checkpoint():
             self.lattice.set_solid(self._solid, placed[:, 1])
         old, new = self._walls
         advection_places.mark_walls(self._box, self._solid.flatten(), new)
-        where = [self._bricks, self._threshold]
-        advection_sources.change_solids(self._box, old, new, self._flat(0), *where)
+        advection_sources.change_solids(self._box, old, new, self._fields[0], self._bricks)
         self._walls = [new, old]
         self._placed = placed
 
     def _step(self) -> None:
         box, walls, bricks = self._box, self._walls[0], self._bricks
-        if bricks is not None:
+        if bricks is not DENSE:
             advection_places.relist(box, bricks)
             for fields in self._fields:
-                advection_sources.rest(box, bricks, fields.density.flatten())
-                if fields.heat.size:
-                    advection_sources.rest(box, bricks, fields.heat.flatten())
+                advection_sources.empty_retired(box, bricks, fields)
         if self.buoyancy is not None:
-            fall = [-self.buoyancy.weight * a for a in self.buoyancy.up]
-            rise = [self.buoyancy.lift * a for a in self.buoyancy.up]
-            advection_sources.buoyancy(box, walls, self._flat(0), fall, rise, self._force.flatten(), bricks)
-        with solver_lattice.adding(lambda: self._kept):
+            by_density = [-self.buoyancy.weight * a for a in self.buoyancy.up]
+            by_temperature = [self.buoyancy.lift * a for a in self.buoyancy.up]
+            force = self._force.flatten()
+            advection_sources.buoyancy(box, walls, self._fields[0], by_density, by_temperature, force, bricks)
+        with self._naming_checkpoint():
             self.lattice.step(self.substeps)
         self.lattice.velocity(out=self._velocity)
-        how = [box, self._velocity.flatten(), walls, self._flat(0), self._flat(1)]
-        where = {"bricks": bricks, "threshold": self._threshold}
-        if self.scheme == "maccormack":
-            advection.advect(*how, self.substeps, **where)
-            advection.correct(*how, self._flat(2), self.substeps, self._share, **where)
-            self._fields[0], self._fields[2] = self._fields[2], self._fields[0]
-        else:
-            advection.advect(*how, self.substeps, self._share, **where)
-            self._fields[0], self._fields[1] = self._fields[1], self._fields[0]
+        self._carry()
         for source in self.sources:
-            kind = advection_sources.BOX if source.shape == "box" else advection_sources.SPHERE
-            times = 1.0 if source.fixed else float(self.substeps)
-            centre, half = ([box.ratio * v for v in each] for each in (source.centre, source.size))
-            value = (times * source.density, times * source.temperature)
-            fixed = {"fixed": source.fixed, **where}
-            advection_sources.add_source(box, walls, kind, centre, half, value, self._flat(0), **fixed)
+            shape = advection_sources.BOX if source.shape == "box" else advection_sources.SPHERE
+            steps = 1.0 if source.fixed else float(self.substeps)
+            centre, size = ([box.refinement * v for v in lengths] for lengths in (source.centre, source.size))
+            value = (steps * source.density, steps * source.temperature)
+            where = [box, walls, shape, centre, size, value]
+            advection_sources.add_source(*where, self._fields[0], fixed=source.fixed, bricks=bricks)
 
-    def _flat(self, k: int) -> advection.Fields:
-        return advection.Fields(self._fields[k].density.flatten(), self._fields[k].heat.flatten())
+    def _carry(self) -> None:
+        now, *spare = self._fields
+        where = [self._box, self._velocity.flatten(), self._walls[0], now]
+        if self.scheme == "maccormack":
+            predicted, out = spare
+            advection.advect(*where, predicted, self.substeps, bricks=self._bricks)
+            advection.correct(*where, predicted, out, self.substeps, self._decay, self._bricks)
+            self._fields = [out, predicted, now]
+        else:
+            advection.advect(*where, spare[0], self.substeps, self._decay, self._bricks)
+            self._fields = [spare[0], now]
 
     def _zeros(self, shape: tuple[int, ...], dtype) -> wp.array:
         return wp.zeros(shape, dtype=dtype, device=self.device)
@@ -453,5 +482,5 @@ def _buffers(scheme: str) -> int:
     return 3 if scheme == "maccormack" else 2
 
 
-def _named(array: np.ndarray | None) -> str:
+def _described(array: np.ndarray | None) -> str:
     return "none" if array is None else f"{array.dtype} {array.shape}"

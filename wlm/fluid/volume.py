@@ -1,26 +1,26 @@
-"""What comes in: smoke as a grid of densities, from arrays, `.npz` or NanoVDB (`.nvdb`) files, checked.
+"""Density volumes of smoke, checked, from arrays, ``.npz`` or NanoVDB (``.nvdb``) files; and writing ``.npz``.
 
-The stated behaviours. What is repaired is given in `DensityVolume.warnings`, one line a kind.
+Stated behaviours. Repairs are listed in ``DensityVolume.warnings``, one line for each kind.
 
 ====================================  ================================================================
 input                                 behaviour
 ====================================  ================================================================
 NaN or infinite voxels                0; warning with the count and the first
 negative voxels                       0; warning likewise (solvers and filters leave small ones)
-all voxels zero                       fine: nothing is seen, all is transparent
+all voxels zero                       fine: all is transparent
 one voxel                             fine
 no voxel                              error
 float16                               stays half; float32, float64 and integers become float32
 float64 beyond float32                as infinite: 0, warning
 other types, other than 3 dimensions  error
 temperature of another shape          error
-transform of a `.nvdb` that turns,    error
+transform of a ``.nvdb`` that turns,  error
 shears or stretches
-a `.nvdb` of points, vectors, ints    error
+a ``.nvdb`` of points, vectors, ints  error
 a file missing or damaged             error that names the file, and the field
 ====================================  ================================================================
 
-A grid's density has no unit of its own: extinction per length is `extinction` times it.
+A grid's density has no unit of its own: the extinction per length is ``extinction`` times it.
 """
 
 from __future__ import annotations
@@ -37,29 +37,30 @@ import torch
 import warp as wp
 
 from wlm.errors import WlmError
+from wlm.formats.atomic import atomic_path
 from wlm.interop import check_device, to_warp
 
-__all__ = ["DensityVolume", "from_array", "from_grid", "load_volume"]
+__all__ = ["DensityVolume", "from_array", "from_grid", "load_volume", "save_volume"]
 
 _DENSITY, _TEMPERATURE = "density", "temperature"
 _BAD_FILE = (OSError, ValueError, EOFError, KeyError, MemoryError, NotImplementedError, zipfile.BadZipFile, zlib.error)
-_LARGEST = 2**31 - 1  # voxels that a kernel counts
+_LARGEST = 2**31 - 1  # voxels that a kernel can index
 
 
 @dataclass(frozen=True, eq=False)
 class DensityVolume:
     """Smoke in a box of cubic voxels.
 
-    Made directly, it isn't checked: a solver's own frames may be used as they lie on the device.
+    The constructor doesn't check: a solver's frames are used as they lie on the device. ``from_array`` does.
 
     Attributes:
         density: float32 or float16 tensor [X, Y, Z], finite, not negative.
-        extinction: Per length of the world, of density 1; above 0.
-        voxel: A voxel's edge in the world's unit.
+        extinction: Per unit of length at density 1; above 0.
+        voxel: Edge of a voxel, in the world's unit.
         origin: float64 [3], the corner of voxel (0, 0, 0) in the world; its centre is half a voxel further.
-        temperature: As the density; where it is 1, `emission` per length of the world is given off. None: cold.
-        emission: Light given off per length of the world at temperature 1.
-        warnings: What was repaired, one line each.
+        temperature: Like the density; None: no emission.
+        emission: Light given off per unit of length at temperature 1.
+        warnings: The repairs, one line each.
     """
 
     density: torch.Tensor
@@ -77,7 +78,7 @@ class DensityVolume:
 
     @property
     def device(self) -> torch.device:
-        """Where the voxels are."""
+        """The device of the voxels."""
         return self.density.device
 
     @property
@@ -87,7 +88,7 @@ class DensityVolume:
 
     def arrays(self) -> tuple[wp.array, wp.array | None]:
         """Density and temperature as Warp arrays that share the tensors' memory."""
-        wp.init()  # wrapping a tensor, unlike all else in Warp, doesn't start it
+        wp.init()  # unlike the rest of Warp, wrapping a tensor doesn't initialise it
         hot = None if self.temperature is None else to_warp(self.temperature)
         return to_warp(self.density), hot
 
@@ -103,20 +104,20 @@ def from_array(
     device: str = "cpu",
     name: str = "array",
 ) -> DensityVolume:
-    """Makes a checked volume of arrays.
+    """Makes a checked volume from arrays.
 
     Args:
-        density: [X, Y, Z] of numbers; copied where it has to be changed or moved.
-        extinction: Per length of the world, of density 1.
-        voxel: A voxel's edge in the world's unit.
+        density: Numbers [X, Y, Z]; copied where they have to be changed or moved.
+        extinction: Per unit of length at density 1.
+        voxel: Edge of a voxel, in the world's unit.
         origin: The corner of voxel (0, 0, 0) in the world.
         temperature: [X, Y, Z], or None.
-        emission: Light given off per length of the world at temperature 1.
+        emission: Light given off per unit of length at temperature 1.
         device: "cpu" or "cuda:N".
-        name: What messages call it.
+        name: By which messages name it.
 
     Returns:
-        The volume, repaired as the module's table says.
+        The volume, repaired as in the module's table.
 
     Raises:
         WlmError: An error of the module's table, or a length or factor that isn't above 0.
@@ -131,15 +132,15 @@ def from_array(
     if np.shape(origin) != (3,) or not np.isfinite(origin).all():
         raise WlmError(f"{name}: origin: expected three finite numbers, found {origin}")
     warnings: list[str] = []
-    made = _check(name, _DENSITY, density, device, warnings)
-    hot = None
+    smoke = _check(name, _DENSITY, density, device, warnings)
+    heat = None
     if temperature is not None:
-        # The kernels take both of one type.
-        hot = _check(name, _TEMPERATURE, temperature, device, warnings).to(made.dtype)
-        if hot.shape != made.shape:
-            raise WlmError(f"{name}: {_TEMPERATURE}: expected {tuple(made.shape)} voxels, found {tuple(hot.shape)}")
-    at = tuple(float(o) for o in origin)
-    return DensityVolume(made, float(extinction), float(voxel), at, hot, float(emission), tuple(warnings))
+        # Kernels take both in one type.
+        heat = _check(name, _TEMPERATURE, temperature, device, warnings).to(smoke.dtype)
+        if heat.shape != smoke.shape:
+            raise WlmError(f"{name}: {_TEMPERATURE}: expected {tuple(smoke.shape)} voxels, found {tuple(heat.shape)}")
+    corner = tuple(float(o) for o in origin)
+    return DensityVolume(smoke, float(extinction), float(voxel), corner, heat, float(emission), tuple(warnings))
 
 
 def load_volume(
@@ -150,22 +151,22 @@ def load_volume(
     voxel: float | None = None,
     device: str = "cpu",
 ) -> DensityVolume:
-    """Reads smoke from a file.
+    """Reads a volume from a file.
 
-    - `.npz`: an array `density` (X, Y, Z), and, where there are any, `temperature` of the same shape and the numbers
-      `voxel` and `origin` (3).
-    - `.nvdb`: a float grid named `density`, else the first one, over the box of its active voxels; and a grid named
-      `temperature`, over that same box. Its transform gives the voxel's size and place.
+    - ``.npz``: an array ``density`` [X, Y, Z], and optionally ``temperature`` of the same shape and the numbers
+      ``voxel`` and ``origin`` [3].
+    - ``.nvdb``: a float grid named ``density``, else the first one, over the box of its active voxels; and a grid named
+      ``temperature``, over the same box. Its transform gives the size and the position of the voxels.
 
     Args:
-        path: The file; its suffix tells the kind.
-        extinction: Per length of the world, of density 1.
-        emission: Light given off per length of the world at temperature 1.
-        voxel: A voxel's edge in the world's unit; None: the file's, or 1.
+        path: The file; its suffix tells the format.
+        extinction: Per unit of length at density 1.
+        emission: Light given off per unit of length at temperature 1.
+        voxel: Edge of a voxel, in the world's unit; None: the file's, or 1.
         device: "cpu" or "cuda:N".
 
     Returns:
-        The volume, repaired as the module's table says.
+        The volume, repaired as in the module's table.
 
     Raises:
         WlmError: One line that names the file and the field, for each error of the module's table.
@@ -177,18 +178,37 @@ def load_volume(
         raise WlmError(f"{path}: no such file")
     factors = {"extinction": extinction, "emission": emission, "name": str(path)}
     if path.suffix.lower() == ".npz":
-        found = from_array(**_read_npz(path), **factors, device=device)
+        volume = from_array(**_read_npz(path), **factors, device=device)
     else:
-        # Dense on the CPU: a file's tree lies in host memory anyway.
+        # It becomes dense on the CPU: the file's tree is in host memory anyway.
         dense = from_grid(*_read_nvdb(path), **factors)
         device = check_device(device)
-        hot = None if dense.temperature is None else dense.temperature.to(device)
-        found = replace(dense, density=dense.density.to(device), temperature=hot)
+        heat = None if dense.temperature is None else dense.temperature.to(device)
+        volume = replace(dense, density=dense.density.to(device), temperature=heat)
     if voxel is None:
-        return found
+        return volume
     if not 0 < voxel < np.inf:
         raise WlmError(f"{path}: voxel: expected a length above 0, found {voxel}")
-    return replace(found, voxel=voxel, origin=tuple(voxel / found.voxel * o for o in found.origin))
+    return replace(volume, voxel=voxel, origin=tuple(voxel / volume.voxel * o for o in volume.origin))
+
+
+def save_volume(path: str | os.PathLike[str], volume: DensityVolume) -> None:
+    """Writes a volume as ``.npz``, atomically, such that ``load_volume`` reads it back.
+
+    Raises:
+        WlmError: Another suffix, or the file can't be written.
+    """
+    if Path(path).suffix.lower() != ".npz":
+        raise WlmError(f"{path}: expected a name that ends in .npz")
+    arrays = {
+        _DENSITY: volume.density.cpu().numpy(),
+        "voxel": np.float64(volume.voxel),
+        "origin": np.asarray(volume.origin, np.float64),
+    }
+    if volume.temperature is not None:
+        arrays[_TEMPERATURE] = volume.temperature.cpu().numpy()
+    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+        np.savez_compressed(file, **arrays)
 
 
 def _check(name: str, field: str, values: np.ndarray | torch.Tensor, device: str, warnings: list[str]) -> torch.Tensor:
@@ -196,9 +216,9 @@ def _check(name: str, field: str, values: np.ndarray | torch.Tensor, device: str
         values = np.asarray(values)
         if values.dtype.kind not in "iuf" or values.dtype == np.longdouble:
             raise WlmError(f"{name}: {field}: expected numbers, found {values.dtype}")
-        kept = np.float16 if values.dtype == np.float16 else np.float32
-        with np.errstate(over="ignore"):  # what is too large becomes infinite, and is found below
-            values = torch.from_numpy(np.array(values, kept, order="C"))
+        dtype = np.float16 if values.dtype == np.float16 else np.float32
+        with np.errstate(over="ignore"):  # values too large become infinite, which is repaired below
+            values = torch.from_numpy(np.array(values, dtype, order="C"))
     elif values.dtype.is_complex or values.dtype == torch.bool:
         raise WlmError(f"{name}: {field}: expected numbers, found {values.dtype}")
     if values.ndim != 3 or 0 in values.shape or values.numel() > _LARGEST:
@@ -222,16 +242,16 @@ def _read_npz(path: Path) -> dict:
         with loaded as file:
             if _DENSITY not in file.files:
                 raise WlmError(f"{path}: {_DENSITY} is missing; found {', '.join(file.files) or 'nothing'}")
-            found = {_DENSITY: file[_DENSITY], "voxel": 1.0, "origin": (0.0, 0.0, 0.0)}
+            parts = {_DENSITY: file[_DENSITY], "voxel": 1.0, "origin": (0.0, 0.0, 0.0)}
             if _TEMPERATURE in file.files:
-                found[_TEMPERATURE] = file[_TEMPERATURE]
+                parts[_TEMPERATURE] = file[_TEMPERATURE]
             for field, size in (("voxel", 1), ("origin", 3)):
                 if field in file.files:
                     value = file[field]
                     if value.dtype.kind not in "iuf" or value.size != size or not np.isfinite(value).all():
                         raise WlmError(f"{path}: {field}: expected {size} finite numbers, found {value.tolist()}")
-                    found[field] = float(value.item()) if size == 1 else tuple(map(float, value.ravel()))
-            return found
+                    parts[field] = float(value.item()) if size == 1 else tuple(map(float, value.ravel()))
+            return parts
     except _BAD_FILE as error:
         raise WlmError(f"{path}: cannot read the arrays: {error or type(error).__name__}") from error
 
@@ -256,19 +276,19 @@ def from_grid(
     emission: float = 1.0,
     name: str = "grid",
 ) -> DensityVolume:
-    """Makes a checked volume of a NanoVDB grid on its own device, over the box of its active voxels.
+    """Makes a checked volume from a NanoVDB grid, on the grid's device, over the box of its active voxels.
 
-    It becomes dense: a march reads eight voxels a sample, each of which would be a walk down the tree.
+    It becomes dense: a march reads eight voxels for each sample, each of which would be a walk down the tree.
 
     Args:
         density: A grid of floats.
-        temperature: Another with the same transform, or None.
-        extinction: Per length of the world, of density 1.
-        emission: Light given off per length of the world at temperature 1.
-        name: What messages call it.
+        temperature: Another grid with the same transform, or None.
+        extinction: Per unit of length at density 1.
+        emission: Light given off per unit of length at temperature 1.
+        name: By which messages name it.
 
     Returns:
-        The volume, repaired as the module's table says.
+        The volume, repaired as in the module's table.
 
     Raises:
         WlmError: An error of the module's table.
@@ -279,20 +299,20 @@ def from_grid(
     if not (voxel > 0 and np.allclose(matrix, voxel * np.eye(3), atol=1e-5 * voxel)):
         raise WlmError(f"{name}: {info.name}: expected a grid of cubic voxels along the axes, found {matrix.tolist()}")
     low, high = _box(name, density)
-    hot = None
+    heat = None
     if temperature is not None:
-        other = temperature.get_grid_info()
-        same = np.allclose(np.array(other.transform_matrix).reshape(3, 3), matrix, atol=1e-5 * voxel)
-        if not (same and np.allclose(other.translation, info.translation, atol=1e-4 * voxel)):
+        heat_info = temperature.get_grid_info()
+        same = np.allclose(np.array(heat_info.transform_matrix).reshape(3, 3), matrix, atol=1e-5 * voxel)
+        if not (same and np.allclose(heat_info.translation, info.translation, atol=1e-4 * voxel)):
             raise WlmError(f"{name}: {_TEMPERATURE}: expected the voxels of {info.name}")
-        hot = _fill(name, temperature, low, high)
+        heat = _read_dense(name, temperature, low, high)
     return from_array(
-        _fill(name, density, low, high),
+        _read_dense(name, density, low, high),
         extinction=extinction,
         voxel=float(voxel),
         # NanoVDB's coordinates are those of voxel centres.
         origin=tuple(float(t + voxel * (i - 0.5)) for t, i in zip(info.translation, low, strict=True)),
-        temperature=hot,
+        temperature=heat,
         emission=emission,
         device=str(density.device),
         name=name,
@@ -315,7 +335,7 @@ def _read_nvdb(path: Path) -> tuple[wp.Volume, wp.Volume | None]:
 
 
 def _box(where: str, volume: wp.Volume) -> tuple[np.ndarray, np.ndarray]:
-    """First and last active voxel, tiles too, from the header of the tree's root: Warp itself doesn't tell."""
+    """First and last active voxel, tiles too, from the header of the tree's root, which Warp doesn't expose."""
     data = volume.array().numpy().tobytes()
     grid_header, root_offset = 672, 24
     root = grid_header + struct.unpack_from("<q", data, grid_header + root_offset)[0]
@@ -328,7 +348,7 @@ def _box(where: str, volume: wp.Volume) -> tuple[np.ndarray, np.ndarray]:
     return corners[0], corners[1]
 
 
-def _fill(where: str, volume: wp.Volume, low: np.ndarray, high: np.ndarray) -> torch.Tensor:
+def _read_dense(where: str, volume: wp.Volume, low: np.ndarray, high: np.ndarray) -> torch.Tensor:
     info = volume.get_grid_info()
     if volume.dtype is not wp.float32:
         raise WlmError(f"{where}: {info.name or 'grid 0'}: expected a grid of floats, found {info.type_str}")

@@ -1,7 +1,7 @@
 """What comes in: a set of lightmaps over time, read from EXR files or arrays and checked.
 
-The stated behaviours. "Inside" is inside the mask; counts are of texels, in any channel, and are given in
-`LightmapSet.warnings`, one line a file and kind.
+The stated behaviours. "Inside" is inside the mask. Repairs are counted in texels, whichever channels they touch, and
+listed in ``LightmapSet.warnings``, one line per file and kind.
 
 ====================================  ================================================================
 input                                 behaviour
@@ -11,18 +11,18 @@ NaN, Inf inside                       the texel takes the value of the nearest f
 a frame with no finite texel inside   error
 negative inside                       the channel is clamped to 0; warning
 above 65,504 inside (half's maximum)  the channel is clamped to 65,504; warning
-any of these outside                  0, 0 and 65,504, without a warning: nobody sees those texels
+any of these outside                  0, 0 and 65,504, without a warning: those texels are never seen
 all zero                              fine
 an empty mask                         error
 one time                              fine
 times out of order                    sorted, with their frames; warning
 two equal times                       error that names both files
-a time outside [0, period)            error: 24 h is 0 h, and wrapping would hide a slip in the list
+a time outside [0, period)            error: 24 h is 0 h, and wrapping would hide a mistake in the list
 a NaN or infinite time                error
-frames, mask or `set.json` that       error that names both files
+frames, mask or ``set.json`` that     error that names both files
 disagree in size
 a file missing or damaged, a          error that names the file, and the field
-malformed `set.json`
+malformed ``set.json``
 ====================================  ================================================================
 
 Layout of a set and its evaluation: neural-dynamic-gi, section 10.1.
@@ -46,7 +46,7 @@ from wlm.formats.mask import read_mask
 from wlm.lightmap.listing import SET_FILE, Listing, list_folder, parse_set
 from wlm.texels import repair
 
-__all__ = ["LightmapSet", "from_arrays", "load_set", "parse_times"]
+__all__ = ["LightmapSet", "from_arrays", "load", "parse_times"]
 
 _READERS = 2  # decompression releases the GIL; more threads than this only fight over the disk
 _MAX_TIMES = 100_000  # far above any real set; "0:24:1e-9" must not fill the memory
@@ -58,10 +58,10 @@ class LightmapSet:
 
     Attributes:
         name: The set's name.
-        times: `[T]` float64, strictly increasing, in hours or any other unit.
-        frames: `[T, H, W, 3]` float32, linear RGB irradiance, finite, in [0, 65504]. Row 0 is v = 0.
-        mask: `[H, W]` bool, true where a texel belongs to a chart; at least one is.
-        period: Length of the day in the unit of `times`, all of which are then in [0, period); None where the
+        times: ``[T]`` float64, strictly increasing, in hours or any other unit.
+        frames: ``[T, H, W, 3]`` float32, linear RGB irradiance, finite, in [0, 65504]. Row 0 is v = 0.
+        mask: ``[H, W]`` bool, true where a texel belongs to a chart; at least one is.
+        period: Length of the day in the unit of ``times``, all of which are then in [0, period); None where the
             set is not periodic and times outside its ends are clamped.
         source: 16 hexadecimal digits of BLAKE2b over the checked pixels, the times and the mask.
         warnings: What was repaired, one line each.
@@ -76,30 +76,30 @@ class LightmapSet:
     warnings: tuple[str, ...]
 
 
-def load_set(
+def load(
     path: str | os.PathLike[str],
     *,
     times: Sequence[float] | None = None,
     mask: str | os.PathLike[str] | None = None,
     period: float | None = None,
 ) -> LightmapSet:
-    """Read a lightmap set: a `set.json`, a folder that holds one, or a plain folder of EXR files.
+    """Reads a lightmap set: a ``set.json``, a folder that holds one, or a plain folder of EXR files.
 
-    `set.json` is an object with `width`, `height` and `lightmaps` (a list of `{"time_hours", "file"}`), and
-    may have `name`, `period_hours` and `mask` (a PNG's name, or "alpha"; absent means that all texels are
+    ``set.json`` is an object with ``width``, ``height`` and ``lightmaps`` (a list of ``{"time_hours", "file"}``), and
+    may have ``name``, ``period_hours`` and ``mask`` (a PNG's name, or "alpha"; absent means that all texels are
     valid). Other keys are ignored. Names of files are relative to it.
 
-    The files of a plain folder are taken in natural order of their names ("2" before "10"). Without `times`,
-    the hours are read from the names if every one ends like `_18_55h`, `_18.55h`, `_18h` or `_18.55`, the
-    digits after the second separator being decimals, not minutes. A `mask.png` among them is the mask unless
-    `mask` says otherwise.
+    The files of a plain folder are taken in natural order of their names ("2" before "10"). Without ``times``,
+    the hours are read from the names if every one ends like ``_18_55h``, ``_18.55h``, ``_18h`` or ``_18.55``, the
+    digits after the second separator being decimals, not minutes. A ``mask.png`` among them is the mask unless
+    ``mask`` says otherwise.
 
     Args:
-        path: The `set.json` or the folder.
-        times: One time for each lightmap in the order of the list or the names; replaces those of `set.json`.
+        path: The ``set.json`` or the folder.
+        times: One time for each lightmap in the order of the list or the names; replaces those of ``set.json``.
         mask: A PNG (a texel is valid where any colour channel is above 0), "alpha" (valid where the alpha
             channel of every frame is above 0) or "all"; None takes what the set says.
-        period: Length of the day in the unit of the times; None takes the set's `period_hours`, if any.
+        period: Length of the day in the unit of the times; None takes the set's ``period_hours``, if any.
 
     Returns:
         The set, repaired as the module's table says.
@@ -117,16 +117,16 @@ def load_set(
     else:
         raise WlmError(f"{path}: no such file or folder; expected a {SET_FILE} or a folder of EXR files")
 
-    which = str(mask) if mask is not None else listing.mask
-    need_alpha = which == "alpha"
+    mask_source = str(mask) if mask is not None else listing.mask
+    need_alpha = mask_source == "alpha"
     frames, alpha = _read_frames(listing, need_alpha)
     height, width = frames.shape[1:3]
     if need_alpha:
         valid = alpha
-    elif which == "all":
+    elif mask_source == "all":
         valid = np.ones((height, width), bool)
     else:
-        valid = read_mask(Path(which), listing.files[0], (height, width), ', "alpha" or "all"')
+        valid = read_mask(Path(mask_source), listing.files[0], (height, width), ', "alpha" or "all"')
     return _check(
         listing.name,
         [file.name for file in listing.files],
@@ -135,7 +135,7 @@ def load_set(
         valid,
         listing.period if period is None else period,
         where=str(path),
-        mask_from="the alpha channels" if need_alpha else which,
+        mask_from="the alpha channels" if need_alpha else mask_source,
         warn_order=listing.warn_order,
     )
 
@@ -147,12 +147,12 @@ def from_arrays(
     period: float | None = None,
     name: str = "array",
 ) -> LightmapSet:
-    """Make a checked set of arrays, under the same rules as `load_set`.
+    """Makes a checked set from arrays, under the same rules as ``load``.
 
     Args:
-        frames: `[T, H, W, 3]` of numbers, linear RGB irradiance; copied.
-        times: `[T]`, in any order.
-        mask: `[H, W]`, true where a texel is valid; None for all.
+        frames: ``[T, H, W, 3]`` of numbers, linear RGB irradiance; copied.
+        times: ``[T]``, in any order.
+        mask: ``[H, W]``, true where a texel is valid; None for all.
         period: Length of the day in the unit of the times; None for a set that is not periodic.
         name: The set's name, used in messages too.
 
@@ -167,7 +167,7 @@ def from_arrays(
     if frames.ndim != 4 or frames.shape[3] != 3 or 0 in frames.shape:
         raise WlmError(f"{name}: expected frames [T, H, W, 3], none of them 0, got {frames.shape}")
     if stamps.shape != frames.shape[:1]:
-        raise WlmError(f"{name}: expected {len(frames)} times, one a frame, got shape {stamps.shape}")
+        raise WlmError(f"{name}: expected {len(frames)} times, one per frame, got shape {stamps.shape}")
     valid = np.ones(frames.shape[1:3], bool) if mask is None else np.asarray(mask).astype(bool)
     if valid.shape != frames.shape[1:3]:
         raise WlmError(f"{name}: expected a mask of {frames.shape[1:3]}, got {valid.shape}")
@@ -178,9 +178,9 @@ def from_arrays(
 
 
 def parse_times(text: str) -> list[float]:
-    """Read a list of times: numbers and `start:stop:step` ranges, separated by commas.
+    """Reads a list of times: numbers and ``start:stop:step`` ranges, separated by commas.
 
-    A range leaves `stop` out, as Python's do: "0:24:1" is 0, 1, ... 23, one day without its first hour twice.
+    A range leaves ``stop`` out, as Python's do: "0:24:1" is 0, 1, ... 23, one day without its first hour twice.
 
     Args:
         text: Such as "0,1,2.5", "0:24:1" or "0:18:1,18.45,18.55,19:24:1".
@@ -254,7 +254,7 @@ def _read_rgb(path: Path, need_alpha: bool) -> tuple[np.ndarray, np.ndarray | No
 
 
 def _size(shape: Sequence[int]) -> str:
-    """Writes [H, W, ...] as people do: width first."""
+    """Writes [H, W, ...] with the width first."""
     return f"{shape[1]}x{shape[0]}"
 
 
@@ -270,7 +270,7 @@ def _check(
     mask_from: str,
     warn_order: bool = True,
 ) -> LightmapSet:
-    """Applies the module's table to what was read."""
+    """Applies the module's table to frames from files or arrays."""
     if not mask.any():
         raise WlmError(f"{where}: the mask is empty: no texel is valid ({mask_from})")
     if period is not None and not (math.isfinite(period) and period > 0):
@@ -303,7 +303,7 @@ def _check(
 
 
 def _hash(frames: np.ndarray, times: np.ndarray, mask: np.ndarray) -> str:
-    """Names the input by 16 hexadecimal digits, the same on every machine."""
+    """Hashes the input to 16 hexadecimal digits, the same on every machine."""
     digest = hashlib.blake2b(digest_size=8)
     digest.update(np.asarray(frames.shape, "<i8").tobytes())
     digest.update(np.asarray(times, "<f8").tobytes())

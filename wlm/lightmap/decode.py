@@ -1,5 +1,7 @@
 """The runtime path: any tile at any time, or a whole frame, from the stored bytes alone."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 
 import numpy as np
@@ -12,7 +14,7 @@ from wlm.lightmap.tiles import TileGrid, TileKind, assemble
 from wlm_kernels.lightmap import decode as lightmap_decode
 from wlm_kernels.mlp import GELUS
 
-__all__ = ["Decoder"]
+__all__ = ["Decoder", "StoredTiles", "TimeTable", "gelu_of"]
 
 
 class Decoder:
@@ -22,38 +24,32 @@ class Decoder:
     smoothly; times outside the day wrap round, or stop at the first and last where the set isn't periodic.
     """
 
-    def __init__(self, model: LightmapModel, device: str = "cpu", gelu: str | None = None):
+    def __init__(self, model: LightmapModel, device: str = "cpu", gelu: str | None = None) -> None:
         """Uploads a model.
 
         Args:
-            model: From ``codec.read`` or ``fit.compress``.
-            device: "cpu" or "cuda:0".
-            gelu: Another GELU than the one that the model was trained with, for speed; None: its own.
+            model: The model.
+            device: "cpu", "cuda" or "cuda:N".
+            gelu: Another GELU than the one that the model was trained with, for speed; None: the model's.
 
         Raises:
-            WlmError: On a device or a GELU that isn't there.
+            WlmError: No such device or GELU.
         """
-        self.model, self.device = model, interop.check_device(device)
-        self.gelu = gelu or model.profile.gelu
-        if self.gelu not in GELUS:
-            raise WlmError(f"gelu: expected one of {', '.join(GELUS)}, got {self.gelu!r}")
-        self._axis = model.axis
+        self.model, self.device, self.gelu = model, interop.check_device(device), gelu_of(model, gelu)
         self._grid = TileGrid.of(model.height, model.width)
-        self._scale = model.scales
-        self._peak = decode_scale(model.peak, model.profile.gamma)
-        mapped = np.flatnonzero(model.kind >= TileKind.STATIC)
-        kinds = model.kind[mapped]
-        self._groups = {}
+        self._times = TimeTable(model, self.device)
+        self._groups = []
         for kind in (TileKind.DYNAMIC, TileKind.STATIC):
-            rows = np.flatnonzero(kinds == kind)
-            if len(rows):
-                self._groups[kind] = _Group(model, kind, mapped[rows], rows, self.device, self.gelu)
+            if (model.kind == kind).any():
+                tiles = StoredTiles(model, kind, self.device)
+                kernels = lightmap_decode.exact_kernels(kind == TileKind.DYNAMIC, model.profile.hidden, self.gelu)
+                self._groups.append((tiles, kernels))
         self._constants = {int(tile): i for i, tile in enumerate(np.flatnonzero(model.kind == TileKind.CONSTANT))}
 
     @property
     def device_bytes(self) -> int:
         """Memory that the maps and networks take up on the device, in bytes: what a runtime keeps resident."""
-        return sum(array.capacity for group in self._groups.values() for array in group.arrays)
+        return sum(tiles.device_bytes for tiles, _ in self._groups)
 
     def tile(self, number: int, time: float, border: int = 0) -> np.ndarray:
         """Decodes one tile.
@@ -78,11 +74,8 @@ class Decoder:
     def tiles(self, numbers: Sequence[int], time: float) -> np.ndarray:
         """Decodes tiles to linear radiance, float32 [n, 128, 128, 3]; empty ones are 0."""
         out = np.zeros((len(numbers), TILE, TILE, 3), np.float32)
-        before, after, share = self._neighbours(time)
-        for i, number in enumerate(numbers):
-            if number in self._constants:
-                row = self.model.constant[self._constants[number]].astype(np.float32)
-                out[i] = (1.0 - share) * row[before] + share * row[after]
+        for i, radiance in self._constant(numbers, time):
+            out[i] = radiance
         self._decode(numbers, time, out, as_bytes=False)
         return out
 
@@ -95,21 +88,16 @@ class Decoder:
         """
         out = np.zeros((len(numbers), TILE, TILE, 4), np.uint8)
         peak = np.zeros(len(numbers), np.float32)
-        before, after, share = self._neighbours(time)
-        bounds = self._bounds(time)
-        gamma = self.model.profile.gamma
-        for i, number in enumerate(numbers):
-            if number in self._constants:
-                row = self.model.constant[self._constants[number]].astype(np.float32)
-                colour = ((1.0 - share) * row[before] + share * row[after]) ** (1.0 / gamma)
-                peak[i] = colour.max()
-                if peak[i] > 0:
-                    out[i, ..., :3] = np.floor(colour / peak[i] * 255.0 + 0.5)
-                out[i, ..., 3] = 255
-        for group in self._groups.values():
-            for i, number in enumerate(numbers):
-                if number in group.place:
-                    peak[i] = bounds[group.rows[group.place[number]]]
+        for i, radiance in self._constant(numbers, time):
+            colour = radiance ** (1.0 / self.model.profile.gamma)
+            peak[i] = colour.max()
+            if peak[i] > 0:
+                out[i, ..., :3] = np.floor(colour / peak[i] * 255.0 + 0.5)
+            out[i, ..., 3] = 255
+        bounds = self._times.bounds(time)
+        for tiles, _ in self._groups:
+            for i, row in tiles.among(numbers):
+                peak[i] = bounds[tiles.rows[row]]
         self._decode(numbers, time, out, as_bytes=True)
         return out, peak
 
@@ -124,103 +112,141 @@ class Decoder:
         tiles, peak = self.tiles_8bit(numbers.tolist(), time)
         return assemble(tiles, numbers, self._grid), peak
 
-    def _neighbours(self, time: float) -> tuple[int, int, float]:
-        if not np.isfinite(time):
-            raise WlmError(f"time: expected a finite number, got {time}")
-        return self._axis.neighbours(time)
-
-    def _bounds(self, time: float) -> np.ndarray:
-        """Bound of each mapped tile; between two times the larger, since a texel may follow either."""
-        before, after, share = self._neighbours(time)
-        return self._peak[:, before] if share == 0 else np.maximum(self._peak[:, before], self._peak[:, after])
-
-    def look(self, time: float) -> lightmap_decode.Look:
-        """The kernel's view of a time; its arrays cover the mapped tiles in order of their numbers."""
-        before, after, share = self._neighbours(time)
-        bounds = self._bounds(time)
-        inverse = np.divide(1.0, bounds, out=np.zeros_like(bounds), where=bounds > 0)
-        scale = (1.0 - share) * self._scale[:, before] + share * self._scale[:, after]
-        affine = self.model.affine.astype(np.float32)
-        look = lightmap_decode.Look()
-        look.tau = self._axis.place(time)
-        look.encoding = wp.vec4(*self._axis.encode(time))
-        look.gamma = self.model.profile.gamma
-        look.scale = wp.array(scale.astype(np.float32), dtype=wp.vec3, device=self.device)
-        look.inverse_peak = wp.array(inverse, dtype=float, device=self.device)
-        look.shift = wp.array(np.ascontiguousarray(affine[:, 0]), dtype=wp.vec3, device=self.device)
-        look.spread = wp.array(np.ascontiguousarray(affine[:, 1]), dtype=wp.vec3, device=self.device)
-        return look
+    def _constant(self, numbers: Sequence[int], time: float) -> list[tuple[int, np.ndarray]]:
+        """The constant tiles among ``numbers``: their places there and their radiance [3]."""
+        before, after, share = self._times.neighbours(time)
+        rows = self.model.constant.astype(np.float32)
+        return [
+            (i, (1.0 - share) * rows[k, before] + share * rows[k, after])
+            for i, k in enumerate(map(self._constants.get, numbers))
+            if k is not None
+        ]
 
     def _decode(self, numbers: Sequence[int], time: float, out: np.ndarray, as_bytes: bool) -> None:
         if not self._groups:
             return
-        look = self.look(time)
-        for group in self._groups.values():
-            wanted = [i for i, number in enumerate(numbers) if number in group.place]
-            if wanted:
-                out[wanted] = group.decode([group.place[numbers[i]] for i in wanted], look, as_bytes)
+        state = self._times.at(time)
+        for tiles, kernels in self._groups:
+            chosen = tiles.among(numbers)
+            if not chosen:
+                continue
+            places, rows = (np.array(values, np.int32) for values in zip(*chosen, strict=True))
+            decoded = wp.empty((len(rows), TILE, TILE), dtype=wp.vec4ub if as_bytes else wp.vec3, device=self.device)
+            wp.launch(
+                kernels[int(as_bytes)],
+                decoded.shape,
+                inputs=[*tiles.arguments, state, tiles.places, wp.array(rows, device=self.device)],
+                outputs=[decoded],
+                device=self.device,
+            )
+            out[places] = decoded.numpy()
 
 
-class _Group:
-    """The stored tiles of one kind on a device."""
+def gelu_of(model: LightmapModel, gelu: str | None) -> str:
+    """The GELU to decode with: ``gelu``, or the model's for None.
 
-    def __init__(self, model: LightmapModel, kind: TileKind, numbers, rows, device: str, gelu: str):
-        """``numbers``: of the tiles in the grid; ``rows``: their places among the mapped tiles."""
-        self.rows, self.device = rows, device
-        self.place = {int(number): i for i, number in enumerate(numbers)}
-        self.stored, self.hidden, self.output = upload(model, kind, rows, device)
-        dynamic = kind == TileKind.DYNAMIC
-        maps = ("uv", "uvt", "ut", "vt") if dynamic else ("uv",)
-        self.arrays = [*(getattr(self.stored, name) for name in maps), self.hidden, self.output]
-        self._kernels = lightmap_decode.exact_kernels(dynamic, model.profile.hidden, gelu)
-
-    def decode(self, places: list[int], look: lightmap_decode.Look, as_bytes: bool) -> np.ndarray:
-        tiles = wp.array(np.array(places, np.int32), dtype=int, device=self.device)
-        rows = wp.array(self.rows.astype(np.int32), dtype=int, device=self.device)
-        out = wp.empty((len(places), TILE, TILE), dtype=wp.vec4ub if as_bytes else wp.vec3, device=self.device)
-        wp.launch(
-            self._kernels[int(as_bytes)],
-            out.shape,
-            inputs=[self.stored, self.hidden, self.output, look, rows, tiles],
-            outputs=[out],
-            device=self.device,
-        )
-        return out.numpy()
-
-
-def upload(model: LightmapModel, kind: TileKind, rows: np.ndarray, device: str):
-    """Puts the tiles of one kind on a device.
-
-    Args:
-        model: The model.
-        kind: DYNAMIC or STATIC.
-        rows: The tiles' places among the mapped ones, all of that kind.
-        device: The device.
-
-    Returns:
-        ``Stored``, hidden vecH [N, I + H + 2] and output vec3 [N, H + 1].
+    Raises:
+        WlmError: There is no such GELU.
     """
-    profile = model.profile
-    dynamic = kind == TileKind.DYNAMIC
-    stored = lightmap_decode.Stored()
-    stored.slices, stored.periodic = profile.uvt_slices, int(model.axis.periodic)
+    gelu = gelu or model.profile.gelu
+    if gelu not in GELUS:
+        raise WlmError(f"gelu: expected one of {', '.join(GELUS)}, got {gelu!r}")
+    return gelu
 
-    def blocks(values: np.ndarray) -> wp.array:
-        words = np.ascontiguousarray(values).view("<u8")
-        return wp.array(words.reshape(-1, *words.shape[-3:]), dtype=wp.uint64, device=device)
 
-    stored.uv = blocks(model.uv[rows])
-    if dynamic:
-        stored.uvt = blocks(model.uvt)
-        stored.ut = wp.array(np.ascontiguousarray(model.ut), dtype=wp.vec2ub, device=device)
-        stored.vt = wp.array(np.ascontiguousarray(model.vt), dtype=wp.vec2ub, device=device)
-    net = (model.net if dynamic else model.net_static).astype(np.float32)
-    split = (profile.inputs(dynamic) + profile.hidden + 2) * profile.hidden
-    vec_hidden = wp.types.vector(profile.hidden, float)
-    hidden = np.ascontiguousarray(net[:, :split]).reshape(len(net), -1, profile.hidden)
-    output = np.ascontiguousarray(net[:, split:]).reshape(len(net), -1, 3)
-    return (
-        stored,
-        wp.array(hidden, dtype=vec_hidden, device=device),
-        wp.array(output, dtype=wp.vec3, device=device),
-    )
+class TimeTable:
+    """What a decode takes from the time: the scales and bounds of a model's mapped tiles, and gamma(t)."""
+
+    def __init__(self, model: LightmapModel, device: str) -> None:
+        """Uploads shift and spread, which are the same at all times."""
+        self._axis, self._scale, self._gamma = model.axis, model.scales, model.profile.gamma
+        self._peak = decode_scale(model.peak, model.profile.gamma)
+        affine = np.ascontiguousarray(model.affine.astype(np.float32).swapaxes(0, 1))
+        self._shift, self._spread = (wp.array(values, dtype=wp.vec3, device=device) for values in affine)
+
+    def neighbours(self, time: float) -> tuple[int, int, float]:
+        """As ``TimeAxis.neighbours``.
+
+        Raises:
+            WlmError: The time isn't finite.
+        """
+        if not np.isfinite(time):
+            raise WlmError(f"time: expected a finite number, got {time}")
+        return self._axis.neighbours(time)
+
+    def bounds(self, time: float) -> np.ndarray:
+        """Bound of each mapped tile, float32 [N_m]; between two times the larger, since a texel may follow either."""
+        before, after, share = self.neighbours(time)
+        return self._peak[:, before] if share == 0 else np.maximum(self._peak[:, before], self._peak[:, after])
+
+    def at(self, time: float, state: lightmap_decode.TimeState | None = None) -> lightmap_decode.TimeState:
+        """The state of a time, for kernels.
+
+        Args:
+            time: In the unit of the model's times.
+            state: From an earlier call, to be overwritten in place; None: a new one.
+        """
+        before, after, share = self.neighbours(time)
+        bounds = self.bounds(time)
+        if state is None:
+            state = lightmap_decode.TimeState()
+            state.gamma, state.shift, state.spread = self._gamma, self._shift, self._spread
+            state.scale = wp.empty_like(self._shift)
+            state.inverse_peak = wp.empty(len(bounds), dtype=float, device=self._shift.device)
+        scale = (1.0 - share) * self._scale[:, before] + share * self._scale[:, after]
+        state.scale.assign(scale.astype(np.float32))
+        state.inverse_peak.assign(np.divide(1.0, bounds, out=np.zeros_like(bounds), where=bounds > 0))
+        state.tau, state.encoding = self._axis.place(time), wp.vec4(*self._axis.encode(time))
+        return state
+
+
+class StoredTiles:
+    """The stored tiles of one kind on a device.
+
+    Attributes:
+        numbers: int [n], their numbers in the grid.
+        rows: int [n], their places among the model's mapped tiles.
+        places: ``rows`` on the device.
+        arguments: What each decode kernel takes first: ``Stored``, hidden vecH [n, I + H + 2], output vec3 [n, H + 1].
+        device_bytes: Memory that they take up on the device, bytes.
+    """
+
+    def __init__(self, model: LightmapModel, kind: TileKind, device: str) -> None:
+        """Uploads the tiles of a kind, DYNAMIC or STATIC.
+
+        Raises:
+            WlmError: The model has none.
+        """
+        profile, dynamic = model.profile, kind == TileKind.DYNAMIC
+        self.rows = np.flatnonzero(model.kind[model.mapped] == kind)
+        if not len(self.rows):
+            raise WlmError(f"{model.name}: expected at least one {kind.name.lower()} tile, found none")
+        self.numbers = model.mapped[self.rows]
+        self.places = wp.array(self.rows.astype(np.int32), dtype=int, device=device)
+
+        def blocks(values: np.ndarray) -> wp.array:
+            words = np.ascontiguousarray(values).view("<u8")
+            return wp.array(words.reshape(-1, *words.shape[-3:]), dtype=wp.uint64, device=device)
+
+        stored = lightmap_decode.Stored()
+        stored.slices, stored.periodic = profile.uvt_slices, int(model.axis.periodic)
+        maps = {"uv": blocks(model.uv[self.rows])}
+        if dynamic:
+            maps["uvt"] = blocks(model.uvt)
+            for name in ("ut", "vt"):
+                maps[name] = wp.array(np.ascontiguousarray(getattr(model, name)), dtype=wp.vec2ub, device=device)
+        for name, values in maps.items():
+            setattr(stored, name, values)
+        net = (model.net if dynamic else model.net_static).astype(np.float32)
+        split = (profile.inputs(dynamic) + profile.hidden + 2) * profile.hidden
+        hidden = np.ascontiguousarray(net[:, :split]).reshape(len(net), -1, profile.hidden)
+        output = np.ascontiguousarray(net[:, split:]).reshape(len(net), -1, 3)
+        hidden = wp.array(hidden, dtype=wp.types.vector(profile.hidden, float), device=device)
+        output = wp.array(output, dtype=wp.vec3, device=device)
+        self.arguments = (stored, hidden, output)
+        self.device_bytes = sum(array.capacity for array in (*maps.values(), hidden, output))
+        self._row_of = {int(number): i for i, number in enumerate(self.numbers)}
+
+    def among(self, numbers: Sequence[int]) -> list[tuple[int, int]]:
+        """Those of ``numbers`` that are here: their places in ``numbers`` and in ``self.numbers``."""
+        return [(i, self._row_of[number]) for i, number in enumerate(numbers) if number in self._row_of]

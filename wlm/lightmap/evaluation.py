@@ -1,67 +1,63 @@
 """Scoring a compressed lightmap set against its input, by the paper's protocol (neural-dynamic-gi, section 10.2)."""
 
-import dataclasses
-import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from wlm import interop
-from wlm.baselines import BASELINES
 from wlm.errors import WlmError
 from wlm.lightmap.data import LightmapSet
 from wlm.lightmap.decode import Decoder
 from wlm.lightmap.model import TILE, LightmapModel
 from wlm.lightmap.tiles import TileGrid, TileKind
 from wlm.metrics import METRICS, FrameMetrics, Summary, evaluate_frame, summarise
+from wlm.system import Meter, OnProgress
+from wlm.system import Report as BaseReport
 
 __all__ = [
-    "BaselineReport",
     "Report",
     "bits_per_texel",
     "count_kinds",
     "evaluate",
-    "evaluate_baselines",
     "part_bytes",
+    "scored_mask",
 ]
 
 # Stored times are float32 where that keeps them apart; see ``wlm.lightmap.codec``.
 _TIME_TOLERANCE = 1e-6
 
-_PARTS = ("uv", "uvt", "ut", "vt", "net", "net_static", "scale", "scale_static", "peak", "affine", "constant", "kind")
-
 
 @dataclass(frozen=True)
-class Report:
-    """What a compressed set weighs and how wrong it is. A mean over nothing, and a metric not asked for, is NaN.
+class Report(BaseReport):
+    """Size and error of a compressed set. A mean over nothing, and a metric that was not computed, is NaN.
 
     Attributes:
-        psnr, ssim, flip: Means over every scored tile at every time; decibels, in [-1, 1], in [0, 1].
+        psnr, ssim, flip: Means over every scored tile at every time; decibels (120 for an exact tile), in [-1, 1], in
+            [0, 1].
         psnr_unlimited: The mean of PSNR without the tiles of ``format_limited``.
-        bpp: Bits a texel and time, ``bytes * 8 / (area * times)``; the area is as ``bits_per_texel`` states.
+        bpp: Bits per texel and time, see ``bits_per_texel``.
         bytes: Size of the file on disk.
         tiles, times: Tiles that the file holds, and times.
         device: Where it was decoded.
-        seconds: Wall-clock time to decode and score everything; scoring takes most of it.
+        seconds: Wall-clock time to decode and score all times; scoring takes most of it.
         psnr_by_tile, ssim_by_tile, flip_by_tile: float64 [rows, columns] of the grid, means over the times.
         psnr_by_time, ssim_by_time, flip_by_time: float64 [T], means over the tiles.
         time_values: float64 [T], the stored times.
-        worst_psnr: Lowest PSNR of a tile at a time.
+        worst_psnr: Lowest PSNR of any tile at any time.
         worst_tile: Where that is: ``time``, ``tile`` (its number), ``row``, ``column``; None without a score.
         max_abs_error: Largest absolute error of a valid texel, scored or not, in the input's units.
         max_abs_error_unscored: The same over what has no score.
         scored: Tiles times times that count in the means.
         not_scored: The rest, by reason: ``empty`` (no valid texel), ``not_held`` (valid texels, but not in the
             file), ``few_texels``, ``zero_range`` (see ``wlm.metrics``).
-        no_ssim: Scored ones whose SSIM could not be taken.
+        no_ssim: Scored ones without an SSIM.
         format_limited: ``time``, ``tile`` of the scored ones that span only a few steps of half float.
-        parts: Bytes of the file by part; ``header`` is the rest: the header and the list of times.
+        parts: Bytes of the file by part, see ``part_bytes``.
         profile: Name of the settings.
         kinds: Tiles of the grid by kind: ``empty``, ``constant``, ``static``, ``dynamic``.
-        warnings: What the reader of the numbers should know.
+        warnings: Tiles that were not scored, or another input than the file's.
     """
 
     psnr: float
@@ -94,56 +90,27 @@ class Report:
     kinds: dict[str, int]
     warnings: list[str]
 
-    def to_json(self) -> dict[str, Any]:
-        """The report as JSON's own types, under the attributes' names; NaN is None."""
-        return _plain({field.name: getattr(self, field.name) for field in dataclasses.fields(self)})
-
-
-@dataclass(frozen=True)
-class BaselineReport:
-    """A block codec on the same lightmaps, scored over the same texels.
-
-    Attributes:
-        name: As in ``wlm.baselines.BASELINES``.
-        psnr, ssim, flip: As in ``Report``.
-        bpp: Bits a texel and time. These codecs have a fixed rate, so this holds for any part of the map.
-        bytes: Of all times of the whole map, also where only some tiles are scored.
-        encode_seconds: Wall-clock time of the encoder over all times, one thread.
-    """
-
-    name: str
-    psnr: float
-    ssim: float
-    flip: float
-    bpp: float
-    bytes: int
-    encode_seconds: float
-
-    def to_json(self) -> dict[str, Any]:
-        """The report as JSON's own types; NaN is None."""
-        return _plain(dataclasses.asdict(self))
-
 
 def evaluate(
     model: LightmapModel,
     lightmaps: LightmapSet,
-    file_bytes: int,
     *,
     device: str = "cpu",
     metrics: Sequence[str] = METRICS,
-    progress: Callable[[int, int], None] | None = None,
+    progress: OnProgress | None = None,
+    file_bytes: int | None = None,
 ) -> Report:
     """Decodes every stored time from the stored bytes and compares it with the input.
 
-    Only what the file holds is scored: where it was made of some tiles, the texels of the others are masked out.
+    Only what the model holds is scored: where it was made of some tiles, the texels of the others are masked out.
 
     Args:
-        model: From ``codec.read``.
-        lightmaps: The input. Another one of the same size and times is scored too, with a warning.
-        file_bytes: Size of the model's file.
-        device: "cpu" or "cuda:0", where it is decoded.
+        model: The model.
+        lightmaps: The input. Another set of the same size and times is scored too, with a warning.
+        device: Where it is decoded: "cpu", "cuda" or "cuda:N".
         metrics: Any of "psnr", "ssim" and "flip"; FLIP takes most of the time.
-        progress: Called after each time with the number done and the number in all.
+        progress: Called about twice a second.
+        file_bytes: Size of the model's file; None: that of the file that it would be saved to.
 
     Returns:
         The report.
@@ -155,65 +122,24 @@ def evaluate(
     """
     start = time.perf_counter()
     device = interop.check_device(device)
-    mask = _scored_mask(model, lightmaps)
+    mask = scored_mask(model, lightmaps)
     decoder = Decoder(model, device)
+    meter = Meter(progress, "score", len(model.times))
     frames = []
     for i, stamp in enumerate(model.times):
         name = f"{model.name} at {stamp:g}"
         frames.append(evaluate_frame(lightmaps.frames[i], decoder.frame(stamp), mask, TILE, metrics, name=name))
-        if progress is not None:
-            progress(i + 1, len(model.times))
+        if meter.due(i + 1):
+            meter.report(i + 1)
+    file_bytes = model.file_bytes() if file_bytes is None else file_bytes
     return _report(model, lightmaps, file_bytes, device, frames, time.perf_counter() - start)
 
 
-def evaluate_baselines(
-    model: LightmapModel,
-    lightmaps: LightmapSet,
-    names: Sequence[str] = ("bc6h", "bc7", "astc12", "astc10", "8bit"),
-    *,
-    metrics: Sequence[str] = METRICS,
-    progress: Callable[[int, int], None] | None = None,
-) -> list[BaselineReport]:
-    """Puts every time through block codecs, one time at once, and scores the texels that ``evaluate`` scores.
-
-    Args:
-        model: The model to compare with: it says which tiles are scored.
-        lightmaps: The input.
-        names: Keys of ``wlm.baselines.BASELINES``.
-        metrics: As for ``evaluate``.
-        progress: Called after each codec and time with the number done and the number in all.
-
-    Returns:
-        One report a name, in their order.
-
-    Raises:
-        WlmError: As ``evaluate``, an unknown name, or the extra `baselines` is missing.
-    """
-    for name in names:
-        if name not in BASELINES:
-            raise WlmError(f"baselines: unknown codec {name!r}, expected one of {', '.join(BASELINES)}")
-    mask = _scored_mask(model, lightmaps)
-    reports = []
-    texels = lightmaps.mask.size * len(lightmaps.frames)
-    for k, name in enumerate(names):
-        frames, size, seconds = [], 0, 0.0
-        for i, frame in enumerate(lightmaps.frames):
-            # The whole map's mask: an engine would encode all of it, whatever we score.
-            result = BASELINES[name](frame, lightmaps.mask)
-            size, seconds = size + result.bytes, seconds + result.encode_seconds
-            frames.append(evaluate_frame(frame, result.decoded, mask, TILE, metrics, name=name))
-            if progress is not None:
-                progress(k * len(lightmaps.frames) + i + 1, len(names) * len(lightmaps.frames))
-        summary = summarise(frames)
-        reports.append(BaselineReport(name, summary.psnr, summary.ssim, summary.flip, size * 8 / texels, size, seconds))
-    return reports
-
-
 def bits_per_texel(model: LightmapModel, mask: np.ndarray, file_bytes: int) -> float:
-    """Bits a texel and time: ``file_bytes * 8 / (area * times)``.
+    """Bits per texel and time: ``file_bytes * 8 / (area * times)``.
 
-    The area is the whole map, gaps between charts included, as a texture of that size is what it stands for. Where
-    the file holds only some of the tiles with a valid texel, it is the part of the map that the held ones cover.
+    The area is the whole map with the gaps between charts, as the file replaces textures of that size. Where the model
+    holds only some of the tiles with a valid texel, it is the part of the map that these cover.
 
     Args:
         model: The model.
@@ -221,7 +147,7 @@ def bits_per_texel(model: LightmapModel, mask: np.ndarray, file_bytes: int) -> f
         file_bytes: Size of the model's file.
 
     Raises:
-        WlmError: The file holds no tile.
+        WlmError: The model holds no tile.
     """
     held = _held(model)
     area = mask.size if not (mask & ~held).any() else int(held.sum())
@@ -236,12 +162,12 @@ def count_kinds(model: LightmapModel) -> dict[str, int]:
 
 
 def part_bytes(model: LightmapModel, file_bytes: int) -> dict[str, int]:
-    """Bytes of a model's file by part, the largest first; ``header`` is the header and the list of times.
+    """Bytes of a model's file by part, the largest first; ``header`` is the rest: the header and the times.
 
     Raises:
         ValueError: ``file_bytes`` is less than the parts take.
     """
-    parts = {name: int(getattr(model, name).nbytes) for name in _PARTS}
+    parts = {name: value.nbytes for name, value in model.parts.items()}
     parts["header"] = file_bytes - sum(parts.values())
     if parts["header"] < 0:
         raise ValueError(f"file_bytes: expected at least {file_bytes - parts['header']}, got {file_bytes}")
@@ -255,8 +181,15 @@ def _held(model: LightmapModel) -> np.ndarray:
     return tiles.repeat(TILE, axis=0).repeat(TILE, axis=1)[: grid.height, : grid.width]
 
 
-def _scored_mask(model: LightmapModel, lightmaps: LightmapSet) -> np.ndarray:
-    """Checks that a set fits a model; bool [H, W] of the valid texels that the model holds."""
+def scored_mask(model: LightmapModel, lightmaps: LightmapSet) -> np.ndarray:
+    """Checks that a set fits a model.
+
+    Returns:
+        bool [H, W], the valid texels that the model holds: those that are scored.
+
+    Raises:
+        WlmError: As ``evaluate``.
+    """
     count, height, width = lightmaps.frames.shape[:3]
     if (height, width) != (model.height, model.width):
         raise WlmError(
@@ -300,20 +233,11 @@ def _report(
 
     def place(where: tuple[int, int, int]) -> dict[str, float | int]:
         i, row, column = where
-        return {
-            "time": float(model.times[i]),
-            "tile": row * columns + column,
-            "row": row,
-            "column": column,
-        }
+        return {"time": float(model.times[i]), "tile": row * columns + column, "row": row, "column": column}
 
-    scores = {
-        f"{name}{suffix}": getattr(summary, f"{name}{suffix}")
-        for name in METRICS
-        for suffix in ("", "_by_tile", "_by_time")
-    }
+    scores = (f"{name}{suffix}" for name in METRICS for suffix in ("", "_by_tile", "_by_time"))
     return Report(
-        **scores,
+        **{name: getattr(summary, name) for name in scores},
         psnr_unlimited=summary.psnr_unlimited,
         bpp=bits_per_texel(model, lightmaps.mask, file_bytes),
         bytes=file_bytes,
@@ -338,7 +262,7 @@ def _report(
 
 
 def _left_out(model: LightmapModel, lightmaps: LightmapSet, summary: Summary) -> dict[str, int]:
-    """Counts tiles times times without a score by reason; to the metrics a tile masked out is one of few texels."""
+    """Counts tiles times times without a score by reason; the metrics count a tile masked out as of few texels."""
     grid = TileGrid.of(model.height, model.width)
     valid = np.zeros((grid.rows * TILE, grid.cols * TILE), bool)
     valid[: grid.height, : grid.width] = lightmaps.mask
@@ -352,16 +276,3 @@ def _left_out(model: LightmapModel, lightmaps: LightmapSet, summary: Summary) ->
         "few_texels": summary.few_texels - empty - not_held,
         "zero_range": summary.zero_range,
     }
-
-
-def _plain(value: Any) -> Any:
-    """NumPy and NaN to what JSON holds."""
-    if isinstance(value, np.ndarray | np.generic):
-        value = value.tolist()
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value

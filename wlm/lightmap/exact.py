@@ -1,4 +1,4 @@
-"""The float64 path: a stored tile decoded in plain NumPy, to which every other way of decoding is held."""
+"""The float64 path: a stored tile decoded in plain NumPy, the reference of every other decoder."""
 
 import math
 
@@ -33,7 +33,7 @@ def decode_tile64(model: LightmapModel, number: int, time: float) -> np.ndarray:
     """
     _check(model, number, time)
     if model.kind[number] == TileKind.CONSTANT:
-        return _spread_out(_constant(model, number, time))
+        return _filled(_constant(model, number, time))
     return colour_tile64(model, number, time) ** model.profile.gamma
 
 
@@ -44,18 +44,18 @@ def colour_tile64(model: LightmapModel, number: int, time: float) -> np.ndarray:
     if kind == TileKind.EMPTY:
         return np.zeros((TILE, TILE, 3))
     if kind == TileKind.CONSTANT:
-        return _spread_out(_constant(model, number, time) ** (1.0 / model.profile.gamma))
+        return _filled(_constant(model, number, time) ** (1.0 / model.profile.gamma))
     before, after, share = model.axis.neighbours(time)
     place = _place(model, number)
     scale = model.scales[place].astype(np.float64)  # [T, 3]
     shift, spread = model.affine[place].astype(np.float64)
-    answer = _answer(model, number, place, time)
-    colour = (shift + spread * answer) * ((1.0 - share) * scale[before] + share * scale[after])
+    output = _network_output(model, number, place, time)
+    colour = (shift + spread * output) * ((1.0 - share) * scale[before] + share * scale[after])
     return np.maximum(colour, 0.0)
 
 
 def bound64(model: LightmapModel, number: int, time: float) -> float:
-    """What 255 of the 8-bit output stands for in gamma space; 0 for a black or an empty tile.
+    """Gamma-space colour that 255 of the 8-bit output stands for; 0 for a black or an empty tile.
 
     Args:
         model: The model.
@@ -93,12 +93,12 @@ def _constant(model: LightmapModel, number: int, time: float) -> np.ndarray:
     return (1.0 - share) * rows[before] + share * rows[after]
 
 
-def _spread_out(colour: np.ndarray) -> np.ndarray:
+def _filled(colour: np.ndarray) -> np.ndarray:
     return np.broadcast_to(colour, (TILE, TILE, 3)).copy()
 
 
-def _answer(model: LightmapModel, number: int, place: int, time: float) -> np.ndarray:
-    """The network's answer y [128, 128, 3]."""
+def _network_output(model: LightmapModel, number: int, place: int, time: float) -> np.ndarray:
+    """The network's output y [128, 128, 3]."""
     profile = model.profile
     dynamic = model.kind[number] == TileKind.DYNAMIC
     row = int((model.kind[:number] == model.kind[number]).sum())  # among the tiles of its kind

@@ -1,4 +1,4 @@
-"""Lightmaps for engines: DDS textures, weights in JSON and a shader, which together need nothing of this package."""
+"""Lightmaps for engines: DDS textures, weights in JSON and a shader, usable without this package."""
 
 import json
 import os
@@ -7,25 +7,30 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 
 from wlm.errors import WlmError
-from wlm.formats.atomic import atomic_write
+from wlm.formats.atomic import atomic_path
 from wlm.formats.dds import write_dds
+from wlm.formats.exr import write_exr
+from wlm.formats.folder import compact_json, rounded, staged
+from wlm.lightmap.decode import Decoder
 from wlm.lightmap.exact import SQRT_12
 from wlm.lightmap.model import TILE, LightmapModel, decode_scale, encode_time
 from wlm.lightmap.shader import decode_glsl
 from wlm.lightmap.tiles import TileKind
 
-__all__ = ["FORMAT", "SHADER_FILE", "WEIGHTS_FILE", "export"]
+__all__ = ["FORMAT", "FRAME_FILE", "SHADER_FILE", "WEIGHTS_FILE", "export", "write_8bit"]
 
 FORMAT = "wlm-lightmap-export"
 _VERSION = 1
 WEIGHTS_FILE = "weights.json"
 SHADER_FILE = "decode.glsl"
+FRAME_FILE = "frame.exr"
 
 _TEXTURE = re.compile(r"tile_\d{4,}_(uv|uvt|ut|vt)\.dds")
-_LIST_OF_NUMBERS = re.compile(r"\[\n([^\[\]{}\"]*)\]")
-_CENTRED_DYNAMIC, _CENTRED_STATIC = 12, 4  # inputs that come from textures; the encoded time is fed as it is
+_CENTRED_DYNAMIC, _CENTRED_STATIC = 12, 4  # inputs that come from textures; the encoded time is not centred
 
 _ABOUT = {
     "tiles": "Tiles of tile_size texels at (column, row) of the grid. A tile that is not listed is empty: 0.",
@@ -45,64 +50,66 @@ _ABOUT = {
 }
 
 
-def export(model: LightmapModel, directory: str | os.PathLike[str]) -> list[Path]:
-    """Writes a model as textures, weights and a shader.
+def export(model: LightmapModel, directory: str | os.PathLike[str], *, device: str = "cpu") -> list[Path]:
+    """Writes a model as textures, weights and a shader, and a frame to compare with.
 
     For tile N of the grid, with four digits: ``tile_N_uv.dds``, F_uv in BC7, and of a dynamic tile also
     ``tile_N_uvt.dds``, F_uvt as a BC7 volume whose depth is time, and ``tile_N_ut.dds`` and ``tile_N_vt.dds``,
     F_ut and F_vt in R8G8_UNORM with time down the rows (neural-dynamic-gi, Table 1). The blocks are the model's
-    own bytes. ``weights.json`` explains itself under "about"; ``decode.glsl`` is the decoder.
+    own bytes. ``decode.glsl`` is the decoder; ``frame.exr`` is the map at the first stored time, as the shader should
+    show it; ``weights.json`` explains itself under "about".
 
-    Each file is written whole or not at all, ``weights.json`` last. Into a folder of an earlier export the new one is
-    written over the old, and textures of tiles that are no more are removed; other files there stay.
+    The files are written beside the folder and moved in together, ``weights.json`` last. An earlier export is replaced,
+    and textures of tiles that are no longer there are removed; other files stay.
 
     Args:
-        model: From ``codec.read`` or ``fit.compress``.
+        model: The model.
         directory: The folder; made if it isn't there.
+        device: Where the frame is decoded.
 
     Returns:
-        The files written, in the order of writing.
+        The files written.
 
     Raises:
-        WlmError: The folder holds something other than an earlier export, or can't be written; or a number of the
-            model isn't finite.
+        WlmError: The folder holds something other than an earlier export, or can't be written; no such device; or a
+            number of the model isn't finite.
     """
     folder = Path(directory)
+    frame = Decoder(model, device).frame(float(model.times[0]))
     text = _document(model)
-    _claim(folder)
-    mapped = np.flatnonzero(model.kind >= TileKind.STATIC).tolist()
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise WlmError(f"{folder}: cannot write there: {error.strerror or error}") from error
     dynamic = np.flatnonzero(model.kind == TileKind.DYNAMIC).tolist()
-    written = []
-    for place, number in enumerate(mapped):
-        row = dynamic.index(number) if model.kind[number] == TileKind.DYNAMIC else None
-        written += _write_maps(folder, number, model, place, row)
-    written += [folder / SHADER_FILE, folder / WEIGHTS_FILE]
-    atomic_write(written[-2], decode_glsl(model).encode())
-    atomic_write(written[-1], text.encode())
-    try:
-        for path in folder.iterdir():
-            if _TEXTURE.fullmatch(path.name) and path not in written:
-                path.unlink()
-    except OSError as error:
-        raise WlmError(f"{folder}: cannot remove the old export: {error.strerror or error}") from error
-    return written
+    with staged(folder, WEIGHTS_FILE, FORMAT, lambda name: bool(_TEXTURE.fullmatch(name))) as staging:
+        written = []
+        for place, number in enumerate(model.mapped.tolist()):
+            row = dynamic.index(number) if number in dynamic else None
+            written += _write_maps(staging, number, model, place, row)
+        (staging / SHADER_FILE).write_bytes(decode_glsl(model).encode())
+        write_exr(staging / FRAME_FILE, frame, half=False)
+        (staging / WEIGHTS_FILE).write_bytes(text.encode())
+        written += [staging / name for name in (SHADER_FILE, FRAME_FILE, WEIGHTS_FILE)]
+    return [folder / path.name for path in written]
 
 
-def _claim(folder: Path) -> None:
-    """Makes the folder, or checks that it is empty or of an earlier export."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        empty = not any(folder.iterdir())
-    except OSError as error:
-        raise WlmError(f"{folder}: cannot export there: {error.strerror or error}") from error
-    if empty:
-        return
-    try:
-        found = json.loads((folder / WEIGHTS_FILE).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        found = None
-    if not isinstance(found, dict) or found.get("format") != FORMAT:
-        raise WlmError(f"{folder}: expected an empty folder or one of an earlier export, found other files")
+def write_8bit(path: str | os.PathLike[str], decoder: Decoder, time: float) -> None:
+    """Writes a frame as a texture cache holds it: a PNG of 8 bits, with gamma and each tile's bound in its text "wlm".
+
+    Args:
+        path: The PNG.
+        decoder: The decoder.
+        time: In the unit of the set's times.
+
+    Raises:
+        WlmError: The time isn't finite, or the file can't be written.
+    """
+    pixels, bounds = decoder.frame_8bit(time)
+    text = PngInfo()
+    text.add_text("wlm", json.dumps({"gamma": decoder.model.profile.gamma, "bounds": bounds.tolist()}))
+    with atomic_path(path) as temporary:
+        Image.fromarray(pixels).save(temporary, "PNG", pnginfo=text)
 
 
 def _write_maps(folder: Path, number: int, model: LightmapModel, place: int, row: int | None) -> list[Path]:
@@ -123,16 +130,6 @@ def _write_maps(folder: Path, number: int, model: LightmapModel, place: int, row
     return written
 
 
-def _finish(model: LightmapModel, place: int) -> dict[str, Any]:
-    shift, spread = model.affine[place]
-    return {
-        "shift": _numbers(shift),
-        "spread": _numbers(spread),
-        "scale": _numbers(model.scales[place]),
-        "peak": _numbers(decode_scale(model.peak[place], model.profile.gamma)),
-    }
-
-
 def _network(net: np.ndarray, hidden: int, temporal: bool) -> dict[str, Any]:
     """Weights by layer, the centring of the textures' features folded into the first."""
     centred = _CENTRED_DYNAMIC if temporal else _CENTRED_STATIC
@@ -144,33 +141,35 @@ def _network(net: np.ndarray, hidden: int, temporal: bool) -> dict[str, Any]:
     first[:centred] *= SQRT_12
     bias -= 0.5 * first[:centred].sum(0)
     return {
-        "W1": _numbers(first),
-        "b1": _numbers(bias),
-        "W2": _numbers(layers[inputs + 1 : -1]),
-        "b2": _numbers(layers[-1]),
-        "W3": _numbers(output[:-1]),
-        "b3": _numbers(output[-1]),
+        "W1": rounded(first),
+        "b1": rounded(bias),
+        "W2": rounded(layers[inputs + 1 : -1]),
+        "b2": rounded(layers[-1]),
+        "W3": rounded(output[:-1]),
+        "b3": rounded(output[-1]),
     }
 
 
 def _tiles(model: LightmapModel) -> tuple[list[dict[str, Any]], int]:
     """Describes the tiles in the order of their numbers, and counts the floats of their networks."""
-    tiles, offset = [], 0
-    next_of = dict.fromkeys(TileKind, 0)
+    scales, peaks = model.scales, decode_scale(model.peak, model.profile.gamma)
+    tiles, offset, mapped = [], 0, 0
+    rows = dict.fromkeys(TileKind, 0)  # the next tile's place among those of its kind
     for number in np.flatnonzero(model.kind != TileKind.EMPTY).tolist():
         kind = TileKind(int(model.kind[number]))
-        row, next_of[kind] = next_of[kind], next_of[kind] + 1
+        row, rows[kind] = rows[kind], rows[kind] + 1
         place = divmod(number, model.tile_columns)
         tile = {"number": number, "kind": kind.name.lower(), "column": place[1], "row": place[0]}
         if kind == TileKind.CONSTANT:
-            tile["radiance"] = _numbers(model.constant[row])
+            tile["radiance"] = rounded(model.constant[row])
         else:
             temporal = kind == TileKind.DYNAMIC
             net = (model.net if temporal else model.net_static)[row]
-            mapped = int((model.kind[:number] >= TileKind.STATIC).sum())
-            tile |= _finish(model, mapped) | {"network_offset": offset}
+            shift, spread = model.affine[mapped]
+            tile |= {"shift": rounded(shift), "spread": rounded(spread)}
+            tile |= {"scale": rounded(scales[mapped]), "peak": rounded(peaks[mapped]), "network_offset": offset}
             tile |= _network(net, model.profile.hidden, temporal)
-            offset += len(net)
+            mapped, offset = mapped + 1, offset + len(net)
         tiles.append(tile)
     return tiles, offset
 
@@ -195,20 +194,10 @@ def _document(model: LightmapModel) -> str:
         "times": model.times.tolist(),
         "period": model.period,
         "time_axis": {"rule": axis.kind, "repeats": axis.periodic},
-        "tau": _numbers(encode_time(axis)[0]),
+        "tau": rounded(encode_time(axis)[0]),
         "tiles": tiles,
     }
     try:
-        text = json.dumps(document, indent=1, allow_nan=False)
+        return compact_json(document)
     except ValueError as error:
         raise WlmError(f"{model.name}: cannot export: a weight is NaN or infinite") from error
-    # One number a line would be most of the file. Strings hold no raw line break, so that none is touched.
-    return _LIST_OF_NUMBERS.sub(lambda found: "[" + " ".join(found[1].split()) + "]", text) + "\n"
-
-
-def _numbers(values: np.ndarray) -> list[Any]:
-    """As lists, with the 9 digits that tell every float32 from its neighbours."""
-    values = np.asarray(values, np.float64)
-    if values.ndim == 1:
-        return [float(f"{value:.9g}") for value in values]
-    return [_numbers(row) for row in values]

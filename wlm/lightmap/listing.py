@@ -1,6 +1,6 @@
-"""Where the frames of a lightmap set lie and when they belong: a `set.json`, or the names in a folder.
+"""The files of a lightmap set and their times: from a ``set.json``, or from the names in a folder.
 
-No pixel is read here. The layout follows the scene configuration of neural-dynamic-gi, section 10.1.
+No pixels are read here. The layout follows the scene configuration of neural-dynamic-gi, section 10.1.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ __all__ = ["SET_FILE", "Listing", "list_folder", "parse_set"]
 
 SET_FILE = "set.json"
 
-# The hour at the end of a file's name: `_18_55h` and `_18.55h` are 18.55, `_18h` is 18. A bare `_18` may just
-# as well be a frame's number and is not taken for an hour.
+# The hour at the end of a file's name: `_18_55h` and `_18.55h` are 18.55, `_18h` is 18. A bare `_18` may as well be
+# a frame's number and is not taken for an hour.
 _NAME_TIME = re.compile(r"_([0-9]+)(?:[_.]([0-9]+))?h$|_([0-9]+\.[0-9]+)$", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
 class Listing:
-    """What is to be read, and what the set says of itself.
+    """The files to read, and what the set states about itself.
 
     Attributes:
         name: The set's name.
@@ -34,7 +34,7 @@ class Listing:
         period: Length of the day in the unit of the times, or None.
         size: Height and width in texels where the set states them, else None.
         stated_by: The file that states the size, or the folder.
-        warn_order: Whether times out of order are somebody's slip, and worth a warning.
+        warn_order: Whether times that are out of order deserve a warning.
     """
 
     name: str
@@ -48,7 +48,7 @@ class Listing:
 
 
 def list_folder(folder: Path, times: Sequence[float] | None) -> Listing:
-    """Lists a folder of EXR files without a `set.json`, as `load_set` states.
+    """Lists a folder of EXR files without a ``set.json``, as ``wlm.lightmap.load`` states.
 
     Args:
         folder: The folder.
@@ -69,34 +69,33 @@ def list_folder(folder: Path, times: Sequence[float] | None) -> Listing:
     files = sorted((f for f in files if f.name[0] != "."), key=lambda f: (_natural(f.name), f.name))
     if not files:
         raise WlmError(f"{folder}: expected a {SET_FILE} or EXR files, found neither")
-    given = times
+    # Names need not sort by their hours ("_5.5h" before "_5.45h"): only times that the caller gave have an order.
+    warn_order = times is not None
     if times is None:
-        found = [_time_of_name(f.stem) for f in files]
-        if None in found:
+        times = [_time_of_name(f.stem) for f in files]
+        if None in times:
             raise WlmError(
                 f"{folder}: {_count(files, 'EXR file')} and no {SET_FILE}: give {_count(files, 'time')} with "
-                f"--times ({files[found.index(None)].name} does not end in an hour such as _18_55h)"
+                f"--times ({files[times.index(None)].name} does not end in an hour such as _18_55h)"
             )
-        times = found
     _check_count(folder, files, times)
-    own_mask = folder / "mask.png"
-    mask = str(own_mask) if own_mask.is_file() else "all"
-    # Names need not sort by their hours ("_5.5h" before "_5.45h"): only an order that somebody gave is worth
-    # a warning.
-    return Listing(folder.resolve().name, files, times, mask, None, None, folder, given is not None)
+    mask = folder / "mask.png"
+    return Listing(
+        folder.resolve().name, files, times, str(mask) if mask.is_file() else "all", None, None, folder, warn_order
+    )
 
 
 def _natural(name: str) -> list[str | int]:
-    """Splits digits from text, so that names compare as people count."""
+    """Sort key with digits split from text: "2" before "10"."""
     return [int(part) if i % 2 else part.lower() for i, part in enumerate(re.split(r"([0-9]+)", name))]
 
 
 def _time_of_name(stem: str) -> float | None:
     """Returns the hour that a file's name ends in, or None."""
-    found = _NAME_TIME.search(stem)
-    if not found:
+    match = _NAME_TIME.search(stem)
+    if not match:
         return None
-    whole, decimals, bare = found.groups()
+    whole, decimals, bare = match.groups()
     return float(bare or f"{whole}.{decimals or 0}")
 
 
@@ -110,7 +109,7 @@ def _check_count(where: Path, files: Sequence[Path], times: Sequence[float]) -> 
 
 
 def parse_set(path: Path, times: Sequence[float] | None) -> Listing:
-    """Reads and checks a `set.json`, as `load_set` states.
+    """Reads and checks a ``set.json``, as ``wlm.lightmap.load`` states.
 
     Args:
         path: The file.
@@ -193,10 +192,10 @@ def _is_size(value: object) -> bool:
 
 
 def _kind(value: object) -> str:
-    """Names a JSON value shortly: its kind where it is long, else itself."""
+    """Describes a JSON value in a message: itself, or its kind where it is long."""
     if isinstance(value, dict):
         return "an object"
     if isinstance(value, list):
         return f"a list of {len(value)}" if value else "an empty list"
-    shown = json.dumps(value) if not isinstance(value, int) or abs(value) < 1e300 else "a very large number"
-    return shown if len(shown) <= 60 else shown[:57] + "..."
+    text = json.dumps(value) if not isinstance(value, int) or abs(value) < 1e300 else "a very large number"
+    return text if len(text) <= 60 else text[:57] + "..."

@@ -1,25 +1,25 @@
 """The model of a temporal lightmap: its settings, its time axis, its scales and its arrays.
 
 A tile of 128 x 128 texels over T times is F_uv, F_uvt, F_ut, F_vt and a small MLP (neural-dynamic-gi, eq. 5). The
-network's answer y is the colour in gamma space after three undone steps:
+network's output y is normalised colour; decoding undoes the normalisation:
 
     colour(u, v, t) = (shift + spread y) * scale(t),     radiance = max(colour, 0) ** gamma
 
-``scale`` is the mean of each channel at each time (section 4), ``shift`` and ``spread`` the mean and the deviation
-of what is left over all times. The paper stops at the mean; a tile whose lighting hardly varies would then ask the
-network for 1 +- 0.001. All three are stored rounded, and the fit divides by the rounded values, so that rounding
-them costs nothing.
+``colour`` is in gamma space. ``scale`` is the mean of each channel at each time (section 4), ``shift`` and ``spread``
+are the mean and the standard deviation, over all times, of colour / scale. The paper stops at the mean; the network of
+a tile whose lighting hardly varies would then have to output 1 +- 0.001. All three are stored rounded, and the fit
+divides by the rounded values, so that rounding them costs nothing.
 """
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
-from wlm.config import load_settings, profile_path
 from wlm.lightmap.tiles import TILE, TileKind
+from wlm.system import Model, Part, Settings
 from wlm_kernels import mlp
 from wlm_kernels.lightmap.features import STATIC_INPUTS, TEMPORAL_INPUTS
 
@@ -30,14 +30,14 @@ __all__ = [
     "decode_scale",
     "encode_scale",
     "encode_time",
-    "load_profile",
+    "part_table",
 ]
 
 SCALE_SPAN = (-21.0, 16.0)  # log2 of radiance: from half float's small numbers to its largest
 
 
-class Profile(BaseModel):
-    """Settings of a fit. Sizes are the paper's table 3; the rest says how the fit goes.
+class Profile(Settings):
+    """Settings of a fit: the sizes of the paper's table 3, and the training.
 
     Attributes:
         name: Shown in reports.
@@ -45,28 +45,28 @@ class Profile(BaseModel):
         uvt_resolution: Texels of F_uvt along u and along v.
         uvt_slices: Slices of F_uvt along time.
         plane_columns, plane_rows: Size of F_ut and F_vt: along u or v, and along time.
-        gelu: "exact", or its "tanh" form, which the GPU has an instruction for.
+        gelu: "exact", or its "tanh" form, for which GPUs have an instruction.
         gamma: The maps hold radiance ** (1 / gamma).
         time_axis: "paper": the features' time axis is the hour over the period, clamped at its ends. "frames": every
             interval between stored times gets an equal part of it, so that a lamp switched within minutes has as much
             room as an hour of afternoon; it wraps round where the set is periodic.
-        steps, samples: Steps of the fit, and random samples of each tile in one.
-        map_rate, net_rate: Adam's first learning rate of the maps and of the network.
-        final_rate: Both end here, on half a cosine, as a share of the first.
+        steps: Steps of the fit.
+        samples: Random samples of each tile in one step.
+        map_rate, net_rate: Adam's initial learning rate of the maps and of the network.
+        final_rate: Final learning rate of both as a fraction of the initial one; the schedule is half a cosine.
         adam_epsilon: Adam's epsilon; the loss is a mean over a tile's samples and channels.
         metric_weight: 0: the squared error in normalised gamma space, as the paper; 1: each texel, channel and time
             weighted so that the loss is the squared error of linear radiance over the tile's range at that time,
             which is what PSNR measures; between: the geometric mean.
-        between: Share of the samples that are drawn at times between two stored ones, where the fit follows their
-            interpolation (eq. 2); 0 leaves those times to the network.
-        quantise_from: Share of the steps after which the maps are used on the exact levels of the file.
-        freeze_from: Share of the steps after which the maps stand still and the network alone is tuned.
-        static_budget_db, see ``wlm.lightmap.tiles.classify``.
+        between: Fraction of the samples at times between two stored ones, whose target is the interpolated radiance
+            (eq. 2); with 0 those times are whatever the network extrapolates.
+        quantise_from: Fraction of the steps after which the maps are quantised to the exact levels of the file.
+        freeze_from: Fraction of the steps after which the maps are frozen and the network alone is trained.
+        static_budget_db: See ``wlm.lightmap.tiles.classify``.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    FILES: ClassVar[str] = "lightmap"
 
-    name: str
     hidden: int = Field(16, ge=4, le=128)
     uvt_resolution: int = Field(32, ge=4, le=128, multiple_of=4)
     uvt_slices: int = Field(12, ge=1, le=64)
@@ -105,16 +105,6 @@ class Profile(BaseModel):
         return size
 
 
-def load_profile(name: str) -> Profile:
-    """Loads ``configs/lightmap-NAME.yaml``, or a YAML file of one's own.
-
-    Raises:
-        WlmError: Unknown profile, unreadable file, or a wrong setting.
-    """
-    path = name if name.endswith((".yaml", ".yml")) else profile_path("lightmap", name)
-    return load_settings(Profile, path)
-
-
 @dataclass(frozen=True)
 class TimeAxis:
     """Places a time on the features' time axis; see ``Profile.time_axis``.
@@ -136,17 +126,17 @@ class TimeAxis:
 
     @property
     def turn(self) -> float:
-        """gamma(t) is sine and cosine of turn tau and of 2 turn tau: whole turns where the axis wraps."""
+        """Radians that tau is multiplied by in gamma(t) of eq. 4: a full turn where the axis wraps."""
         return (2.0 if self.periodic else 1.0) * math.pi
 
     def wrap(self, t: float) -> float:
-        """The time in the set's own range: modulo the period, or clamped to the first and last stored time."""
+        """Wraps a time by the period, or clamps it to the first and last stored time."""
         if self.period is not None:
             return t % self.period
         return float(np.clip(t, self.times[0], self.times[-1]))
 
     def neighbours(self, t: float) -> tuple[int, int, float]:
-        """The stored times around t, and the share of the second: radiance there is interpolated (eq. 2)."""
+        """Indices of the stored times around t, and the weight of the second in the interpolation of eq. 2."""
         t = self.wrap(t)
         n = len(self.times)
         after = int(np.searchsorted(self.times, t, side="right"))
@@ -167,11 +157,8 @@ class TimeAxis:
             span = self.period if self.period is not None else max(self.times[-1] - self.times[0], 1e-12)
             return float((self.wrap(t) - first) / span)
         before, _, share = self.neighbours(t)
-        return (
-            ((before + share + 0.5) / len(self.times)) % 1.0
-            if self.periodic
-            else (before + share + 0.5) / len(self.times)
-        )
+        tau = (before + share + 0.5) / len(self.times)
+        return tau % 1.0 if self.periodic else tau
 
     def encode(self, t: float) -> np.ndarray:
         """gamma(t) of eq. 4, float32 [4]."""
@@ -205,29 +192,59 @@ def decode_scale(codes: np.ndarray, gamma: float) -> np.ndarray:
     return np.where(codes > 0, value, 0.0).astype(np.float32)
 
 
-@dataclass
-class LightmapModel:
-    """A compressed lightmap set: what the file holds, as arrays.
+def part_table(profile: Profile, kind: np.ndarray, times: int) -> dict[str, Part]:
+    """The arrays of a model, in the order of its file.
 
-    N_m tiles have maps (STATIC and DYNAMIC, in the order of their numbers), N_d of them temporal ones, N_c tiles are
-    constants. S slices of F_uvt of R x R texels.
+    N_m tiles have maps (STATIC and DYNAMIC, by number), N_d of them temporal ones; N_c tiles are constant.
+
+    Args:
+        profile: The settings.
+        kind: uint8 [tiles], as in ``LightmapModel``.
+        times: T.
+    """
+    dynamic, static, constant = (
+        int((kind == value).sum()) for value in (TileKind.DYNAMIC, TileKind.STATIC, TileKind.CONSTANT)
+    )
+    mapped, r = dynamic + static, profile.uvt_resolution // 4
+    plane = Part(np.uint8, (dynamic, profile.plane_rows, profile.plane_columns, 2))
+    parameters, static_parameters = (mlp.parameter_count(profile.inputs(t), profile.hidden) for t in (True, False))
+    return {
+        "uv": Part(np.uint8, (mapped, TILE // 4, TILE // 4, 16)),
+        "uvt": Part(np.uint8, (dynamic, profile.uvt_slices, r, r, 16)),
+        "ut": plane,
+        "vt": plane,
+        "net": Part(np.float16, (dynamic, parameters)),
+        "net_static": Part(np.float16, (static, static_parameters)),
+        "scale": Part(np.uint8, (dynamic, times, 3)),
+        "scale_static": Part(np.float16, (static, times, 3)),
+        "peak": Part(np.uint8, (mapped, times)),
+        "affine": Part(np.float16, (mapped, 2, 3)),
+        "constant": Part(np.float16, (constant, times, 3)),
+    }
+
+
+@dataclass
+class LightmapModel(Model):
+    """A compressed lightmap set: what the file holds, as arrays. Their types and shapes are in ``part_table``.
 
     Attributes:
         name, width, height, times, period, source: Of the input, see ``LightmapSet``.
         profile: The settings of the fit.
         kind: uint8 [tiles], ``TileKind`` of each tile of the grid, row-major; EMPTY also where not compressed.
-        uv: uint8 [N_m, 32, 32, 16], BC7 blocks of F_uv.
-        uvt: uint8 [N_d, S, R/4, R/4, 16], BC7 blocks of F_uvt, slice by slice.
-        ut, vt: uint8 [N_d, rows, columns, 2].
-        net: float16 [N_d, P], the networks of dynamic tiles, ``hidden`` rows and then ``output`` rows.
-        net_static: float16 [N_m - N_d, P'], those of static tiles.
-        scale: uint8 [N_d, T, 3], codes of the mean of each channel at each time, in gamma space.
-        scale_static: float16 [N_m - N_d, T, 3], the means themselves in static tiles: their network doesn't know the
-            time, so that it can't make up for rounding.
-        peak: uint8 [N_m, T], codes of a bound of the tile at each time, in gamma space: 255 of the 8-bit output.
-        affine: float16 [N_m, 2, 3], shift and spread.
-        constant: float16 [N_c, T, 3], the radiance of constant tiles.
+        uv: BC7 blocks of F_uv.
+        uvt: BC7 blocks of F_uvt, slice by slice.
+        ut, vt: F_ut and F_vt, time down the rows.
+        net: Networks of dynamic tiles, ``hidden`` rows and then ``output`` rows, see ``wlm_kernels.mlp``.
+        net_static: Those of static tiles.
+        scale: Codes of the mean of each channel at each time, in gamma space.
+        scale_static: The means themselves in static tiles: their network doesn't know the time, so it can't make up
+            for rounding.
+        peak: Codes of an upper bound of the tile at each time, in gamma space: 255 of the 8-bit output.
+        affine: Shift and spread.
+        constant: Radiance of constant tiles.
     """
+
+    SYSTEM: ClassVar[str] = "lightmap"
 
     name: str
     width: int
@@ -250,14 +267,24 @@ class LightmapModel:
     constant: np.ndarray
 
     @property
+    def parts(self) -> dict[str, np.ndarray]:
+        """The arrays by name, in the order of the file; ``kind`` is the last."""
+        return {name: getattr(self, name) for name in (*part_table(self.profile, self.kind, len(self.times)), "kind")}
+
+    @property
     def axis(self) -> TimeAxis:
         """The time axis of the features."""
         return TimeAxis(self.times, self.period, self.profile.time_axis)
 
     @property
+    def mapped(self) -> np.ndarray:
+        """int [N_m], numbers of the tiles that have maps; ``uv``, ``peak`` and ``affine`` have their rows."""
+        return np.flatnonzero(self.kind >= TileKind.STATIC)
+
+    @property
     def scales(self) -> np.ndarray:
         """The scale of every mapped tile, float32 [N_m, T, 3]."""
-        kinds = self.kind[self.kind >= TileKind.STATIC]
+        kinds = self.kind[self.mapped]
         result = np.empty((len(kinds), len(self.times), 3), np.float32)
         result[kinds == TileKind.DYNAMIC] = decode_scale(self.scale, self.profile.gamma)
         result[kinds == TileKind.STATIC] = self.scale_static

@@ -1,7 +1,7 @@
 """Decoding to 8 bits at runtime: everything stays on the device, and a decode is launches alone.
 
-``wlm.lightmap.decode.Decoder`` answers questions from the host; these two are for a renderer's loop. Each holds the
-tiles of one kind: a whole map is a ``StripDecoder``, an ``ExactDecoder`` of the static tiles if there are any, and
+``wlm.lightmap.Decoder`` returns arrays on the host; these two are for a renderer's loop. Each holds the tiles of one
+kind: a whole map is a ``StripDecoder``, an ``ExactDecoder`` of the static tiles if there are any, and
 ``Decoder.tiles_8bit`` for the constant tiles, one colour each, which need no launch.
 """
 
@@ -9,8 +9,7 @@ import numpy as np
 import warp as wp
 
 from wlm import interop
-from wlm.errors import WlmError
-from wlm.lightmap.decode import Decoder, upload
+from wlm.lightmap.decode import StoredTiles, TimeTable, gelu_of
 from wlm.lightmap.model import TILE, LightmapModel
 from wlm.lightmap.tiles import TileKind
 from wlm_kernels.lightmap import decode as lightmap_decode
@@ -19,26 +18,15 @@ __all__ = ["ExactDecoder", "StripDecoder"]
 
 
 class _TileDecoder:
-    """The tiles of one kind on a device, and the time that they are decoded at."""
+    """The tiles of one kind on a device, and the time at which they are decoded."""
 
-    def __init__(self, model: LightmapModel, device: str, gelu: str | None, kind: TileKind):
-        self.model, self.device = model, interop.check_device(device)
-        # On the host, where it only has to say what a time looks like (and to check the GELU).
-        self._host = Decoder(model, "cpu", gelu)
-        self.gelu = self._host.gelu
-        mapped = np.flatnonzero(model.kind >= TileKind.STATIC)
-        rows = np.flatnonzero(model.kind[mapped] == kind)
-        if not len(rows):
-            raise WlmError(f"{model.name}: expected at least one {kind.name.lower()} tile, found none")
-        self.numbers = mapped[rows]
-        self._rows = rows
-        self._stored, self._hidden, self._output = upload(model, kind, rows, self.device)
-        self._places = wp.array(rows.astype(np.int32), dtype=int, device=self.device)
-        self._tiles = wp.array(np.arange(len(rows), dtype=np.int32), dtype=int, device=self.device)
-        self._look = lightmap_decode.Look()
-        self._look.gamma = model.profile.gamma
-        for field, dtype in _LOOK_ARRAYS.items():
-            setattr(self._look, field, wp.empty(len(mapped), dtype=dtype, device=self.device))
+    def __init__(self, model: LightmapModel, device: str, gelu: str | None, kind: TileKind) -> None:
+        self.model, self.device, self.gelu = model, interop.check_device(device), gelu_of(model, gelu)
+        self._stored = StoredTiles(model, kind, self.device)
+        self.numbers = self._stored.numbers
+        self._tiles = wp.array(np.arange(len(self.numbers), dtype=np.int32), dtype=int, device=self.device)
+        self._times = TimeTable(model, self.device)
+        self._state = None
         self.set_time(float(model.times[0]))
 
     def set_time(self, time: float) -> None:
@@ -53,12 +41,8 @@ class _TileDecoder:
         Raises:
             WlmError: It isn't finite.
         """
-        look = self._host.look(time)
-        for field in _LOOK_ARRAYS:
-            wp.copy(getattr(self._look, field), getattr(look, field))
-        self._look.tau, self._look.encoding = look.tau, look.encoding
-        inverse = look.inverse_peak.numpy()[self._rows]
-        self._bounds = np.divide(1.0, inverse, out=np.zeros_like(inverse), where=inverse > 0)
+        self._state = self._times.at(time, self._state)
+        self._bounds = self._times.bounds(time)[self._stored.rows]
 
     @property
     def bounds(self) -> np.ndarray:
@@ -66,11 +50,8 @@ class _TileDecoder:
         return self._bounds.copy()
 
 
-_LOOK_ARRAYS = {"scale": wp.vec3, "inverse_peak": float, "shift": wp.vec3, "spread": wp.vec3}
-
-
 class StripDecoder(_TileDecoder):
-    """The fast path of dynamic tiles: a thread decodes four texels (section 3.5).
+    """The fast path of dynamic tiles: one thread decodes four texels (section 3.5).
 
     Attributes:
         numbers: int [n], numbers of the dynamic tiles in the grid, in the order of ``out``.
@@ -78,39 +59,31 @@ class StripDecoder(_TileDecoder):
         gelu: The GELU in use.
     """
 
-    def __init__(self, model: LightmapModel, device: str = "cpu", gelu: str | None = None):
-        """Uploads the model's dynamic tiles and allocates everything; the time is the first stored one.
+    def __init__(self, model: LightmapModel, device: str = "cpu", gelu: str | None = None) -> None:
+        """Uploads the model's dynamic tiles and allocates all buffers; the time is the first stored one.
 
         Args:
-            model: From ``codec.read`` or ``fit.compress``.
-            device: "cpu" or "cuda:0".
-            gelu: Another GELU than the model's own, see ``wlm_kernels.mlp``; None: its own.
+            model: The model.
+            device: "cpu", "cuda" or "cuda:N".
+            gelu: Another GELU than the model's, see ``wlm_kernels.mlp``; None: the model's.
 
         Raises:
-            WlmError: On a device or a GELU that isn't there, or a model without dynamic tiles.
+            WlmError: No such device or GELU, or a model without dynamic tiles.
         """
         super().__init__(model, device, gelu, TileKind.DYNAMIC)
         n, resolution = len(self.numbers), model.profile.uvt_resolution
         self._kernels = lightmap_decode.strip_kernels(model.profile.hidden, self.gelu)
-        self._volume = wp.empty((n, resolution, resolution), dtype=wp.vec4, device=self.device)
-        self._columns = wp.empty((n, model.profile.hidden, TILE), dtype=float, device=self.device)
-        self._lines = wp.empty((n, TILE), dtype=wp.vec2, device=self.device)
+        self._scratch = (
+            wp.empty((n, resolution, resolution), dtype=wp.vec4, device=self.device),
+            wp.empty((n, model.profile.hidden, TILE), dtype=float, device=self.device),
+            wp.empty((n, TILE), dtype=wp.vec2, device=self.device),
+        )
         self.out = wp.zeros((n, TILE, TILE), dtype=wp.uint32, device=self.device)
 
     def decode(self) -> None:
-        """Decodes all tiles into ``out``: three launches, no allocation, nothing awaited; can be captured."""
-        self._kernels.decode(
-            self._stored,
-            self._hidden,
-            self._output,
-            self._look,
-            self._volume,
-            self._columns,
-            self._lines,
-            self._places,
-            self._tiles,
-            self.out,
-        )
+        """Decodes all tiles into ``out``: three launches, no allocation, no wait; can be captured."""
+        stored = self._stored
+        self._kernels.decode(*stored.arguments, self._state, *self._scratch, stored.places, self._tiles, self.out)
 
     def numpy(self) -> np.ndarray:
         """The last decode on the host, uint8 [n, 128, 128, 4]."""
@@ -119,7 +92,7 @@ class StripDecoder(_TileDecoder):
 
 
 class ExactDecoder(_TileDecoder):
-    """The plain path of static or dynamic tiles: a thread decodes one texel, in training's order of operations.
+    """The plain path of static or dynamic tiles: one thread decodes one texel, in training's order of operations.
 
     Attributes:
         numbers: int [n], numbers of the tiles of that kind in the grid, in the order of ``out``.
@@ -133,23 +106,23 @@ class ExactDecoder(_TileDecoder):
         device: str = "cpu",
         gelu: str | None = None,
         kind: TileKind = TileKind.DYNAMIC,
-    ):
+    ) -> None:
         """Uploads the model's tiles of one kind; the other arguments and errors are those of ``StripDecoder``.
 
         Args:
             kind: STATIC or DYNAMIC.
         """
         super().__init__(model, device, gelu, kind)
-        dynamic = kind == TileKind.DYNAMIC
-        self._kernel = lightmap_decode.exact_kernels(dynamic, model.profile.hidden, self.gelu)[1]
+        self._kernel = lightmap_decode.exact_kernels(kind == TileKind.DYNAMIC, model.profile.hidden, self.gelu)[1]
         self.out = wp.zeros((len(self.numbers), TILE, TILE), dtype=wp.vec4ub, device=self.device)
 
     def decode(self) -> None:
-        """Decodes all tiles into ``out``: one launch, no allocation, nothing awaited; can be captured."""
+        """Decodes all tiles into ``out``: one launch, no allocation, no wait; can be captured."""
+        stored = self._stored
         wp.launch(
             self._kernel,
             self.out.shape,
-            inputs=[self._stored, self._hidden, self._output, self._look, self._places, self._tiles],
+            inputs=[*stored.arguments, self._state, stored.places, self._tiles],
             outputs=[self.out],
             device=self.device,
         )

@@ -1,12 +1,13 @@
-"""Cutting a lightmap set into tiles, and telling which of them need a model.
+"""Cutting a lightmap set into tiles, and the least model that each needs.
 
-A tile is the unit of streaming and of fitting, one model each (neural-dynamic-gi, sections 3.5 and 9).
+A tile is the unit of streaming and of fitting, with a model of its own (neural-dynamic-gi, sections 3.5 and 9).
 """
 
 from __future__ import annotations
 
 import math
 import re
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
@@ -32,8 +33,8 @@ __all__ = [
 
 TILE = 128  # texels a side: the paper's tile (Table 1)
 
-# A colour that was encoded and decoded again in float32 is a few parts in 10^6 off; a half float's step is at
-# least 488 such parts, so a step and this slack is never taken for two.
+# A colour that was encoded and decoded again in float32 is off by a few parts in 10^6; a half float's step is at
+# least 488 such parts, so one step with this slack is never mistaken for two.
 _STEP_SLACK = 1.01
 _HALF_MIN_EXPONENT = -14  # below 2**-14 half floats are subnormal and their step no longer shrinks
 _HALF_MANTISSA_BITS = 10
@@ -41,8 +42,8 @@ _HALF_MANTISSA_BITS = 10
 
 @dataclass(frozen=True)
 class TileGrid:
-    """How tiles cover a map: row-major, the last row and column reaching past its end where it is no
-    multiple.
+    """How tiles cover a map: row-major; the last row and column reach past its end where its size is no multiple of
+    a tile's.
 
     Attributes:
         height: Height of the map in texels.
@@ -96,11 +97,11 @@ class TileData:
     """A batch of N tiles, ready for fitting.
 
     Attributes:
-        index: `[N]` int64, number of each tile in its grid, row-major.
-        colour: `[N, T, 128, 128, 3]` float32, `irradiance ** (1 / gamma)`. Texels outside the mask hold the
-            nearest valid one of the tile; where the map ends its last row and column go on. All zero in an
-            empty tile.
-        mask: `[N, 128, 128]` bool, true where a texel is valid; false past the map's end.
+        index: ``[N]`` int64, number of each tile in its grid, row-major.
+        colour: ``[N, T, 128, 128, 3]`` float32, ``irradiance ** (1 / gamma)``. Texels outside the mask hold the
+            nearest valid one of the tile; past the map's end its last row and column repeat. All zero in an empty
+            tile.
+        mask: ``[N, 128, 128]`` bool, true where a texel is valid; false past the map's end.
     """
 
     index: np.ndarray
@@ -109,26 +110,25 @@ class TileData:
 
 
 class TileKind(IntEnum):
-    """The least that a tile needs; the numbers are written in files and stay."""
+    """The least model that a tile needs; the numbers are those in files."""
 
     EMPTY = 0
     """No valid texel: nothing is stored."""
     CONSTANT = 1
-    """One colour a time."""
+    """One colour per time."""
     STATIC = 2
-    """One colour a time and one pattern for all times."""
+    """One colour per time and one pattern for all times."""
     DYNAMIC = 3
     """The full model."""
 
 
 def split(lightmaps: LightmapSet, gamma: float, tiles: Sequence[int] | None = None) -> TileData:
-    """Cut a set into tiles of gamma-encoded colour (neural-dynamic-gi, section 4).
+    """Cuts a set into tiles of gamma-encoded colour (neural-dynamic-gi, section 4).
 
     Args:
-        lightmaps: The set, `[T, H, W, 3]`.
-        gamma: Colours are stored as `x ** (1 / gamma)`, which spends precision on the dark; above 0.
-        tiles: Numbers of the tiles wanted, in the order wanted; None for all. `N × T × 192 KiB` is the
-            memory.
+        lightmaps: The set, ``[T, H, W, 3]``.
+        gamma: Colours are stored as ``x ** (1 / gamma)``, which spends precision on the dark; above 0.
+        tiles: Numbers of the tiles, in the order of the result; None for all. They take N * T * 192 KiB of memory.
 
     Returns:
         The N tiles.
@@ -164,11 +164,11 @@ def channel_means(colour: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """Mean of each channel of each tile at each time, over the valid texels (neural-dynamic-gi, section 4).
 
     Args:
-        colour: `[N, T, 128, 128, 3]`, as in `TileData`.
-        mask: `[N, 128, 128]` bool.
+        colour: ``[N, T, 128, 128, 3]``, as in ``TileData``.
+        mask: ``[N, 128, 128]`` bool.
 
     Returns:
-        `[N, T, 3]` float64, summed in float64; 0 for an empty tile.
+        ``[N, T, 3]`` float64, summed in float64; 0 for an empty tile.
     """
     means = np.zeros((*colour.shape[:2], 3))
     for n, valid in enumerate(mask):
@@ -179,20 +179,19 @@ def channel_means(colour: np.ndarray, mask: np.ndarray) -> np.ndarray:
 
 
 def static_pattern(colour: np.ndarray, means: np.ndarray) -> np.ndarray:
-    """Pattern of each tile that, times its means, is the best guess of a tile whose light only changes in
-    strength.
+    """Pattern of each tile whose product with the means approximates a tile whose light only changes in strength.
 
-    It is `sum over t of colour / sum over t of means`: weighted by the means, so that a nearly black time,
-    whose texels are a few steps of half float apart, has next to no say, and no division by a mean of 0 takes
-    place. `means * pattern` is exact where the tile is the product of a colour a time and a pattern, in
-    gamma-encoded and so in linear space.
+    It is the sum over t of colour over the sum over t of means: weighted by the means, so that a nearly black time,
+    whose texels are a few steps of half float apart, hardly counts, and a mean of 0 is never divided by.
+    ``means * pattern`` is exact where the tile is the product of one colour per time and a pattern, in gamma-encoded
+    and so in linear space.
 
     Args:
-        colour: `[N, T, 128, 128, 3]`, as in `TileData`.
-        means: `[N, T, 3]`, from `channel_means`.
+        colour: ``[N, T, 128, 128, 3]``, as in ``TileData``.
+        means: ``[N, T, 3]``, from ``channel_means``.
 
     Returns:
-        `[N, 128, 128, 3]` float64 with a mean of 1 over the valid texels; 0 in a channel that is black at
+        ``[N, 128, 128, 3]`` float64 with a mean of 1 over the valid texels; 0 in a channel that is black at
         every time.
     """
     total = means.sum(axis=1)[:, None, None, :]
@@ -202,27 +201,27 @@ def static_pattern(colour: np.ndarray, means: np.ndarray) -> np.ndarray:
 
 
 def classify(tiles: TileData, gamma: float, static_budget_db: float = 60.0) -> np.ndarray:
-    """Find the least that each tile needs, from a stated error budget.
+    """Finds the least model that each tile needs, from a stated error budget.
 
     In linear space, over the valid texels:
 
-    - `EMPTY`: there is none.
-    - `CONSTANT`: at every time no channel spans more than one step of half float, as wide as it is at the
+    - ``EMPTY``: there is none.
+    - ``CONSTANT``: at every time no channel spans more than one step of half float, as wide as it is at the
       channel's least value. A half-float source holds nothing finer. An all-zero tile is one.
-    - `STATIC`: `means * static_pattern` is good enough at every time: its PSNR, with the range of the tile at
+    - ``STATIC``: ``means * static_pattern`` is good enough at every time: its PSNR, with the range of the tile at
       that time as the peak (neural-dynamic-gi, section 10.2), is at least the budget, or no channel of any
-      texel is more than one step of half float off. The second covers times of a range so small, or none,
-      that the PSNR would measure the half float. One time is such a product exactly.
-    - `DYNAMIC`: the rest.
+      texel is more than one step of half float off. The second covers times whose range is zero or so small
+      that the PSNR would measure the half float. A set of one time is such a product exactly.
+    - ``DYNAMIC``: the rest.
 
     Args:
-        tiles: From `split`.
-        gamma: The one given to `split`.
-        static_budget_db: The least PSNR in decibels at which a static tile will do; infinite admits only what
-            is within a step of half float.
+        tiles: From ``split``.
+        gamma: The one given to ``split``.
+        static_budget_db: The lowest PSNR in decibels that makes a tile static; infinite admits only what is within a
+            step of half float.
 
     Returns:
-        `[N]` int64 of `TileKind`.
+        ``[N]`` int64 of ``TileKind``.
 
     Raises:
         WlmError: Gamma is not above 0, or the budget is NaN.
@@ -246,7 +245,7 @@ def classify(tiles: TileData, gamma: float, static_budget_db: float = 60.0) -> n
 
 
 def parse_tiles(text: str, count: int) -> list[int]:
-    """Read a list of tiles: numbers and closed ranges, separated by commas.
+    """Reads a list of tiles: numbers and closed ranges, separated by commas.
 
     Args:
         text: Such as "0-3,7".
@@ -262,35 +261,33 @@ def parse_tiles(text: str, count: int) -> list[int]:
     for part in text.split(","):
         # At most 9 digits: a longer number is outside any grid, and int() refuses very long ones in its own
         # words.
-        found = re.fullmatch(r"\s*([0-9]{1,9})\s*(?:-\s*([0-9]{1,9})\s*)?", part)
-        if not found:
+        match = re.fullmatch(r"\s*([0-9]{1,9})\s*(?:-\s*([0-9]{1,9})\s*)?", part)
+        if not match:
             raise WlmError(f"tiles: expected a number or first-last, got {part.strip()!r} in {text!r}")
-        first = int(found[1])
-        last = first if found[2] is None else int(found[2])
+        first = int(match[1])
+        last = first if match[2] is None else int(match[2])
         if last < first:
             raise WlmError(f"tiles: the range {part.strip()!r} runs down; expected first-last")
         if last >= count:
             raise WlmError(f"tiles: tile {last} is out of range; expected 0 to {count - 1}")
         tiles.extend(range(first, last + 1))
-    seen: set[int] = set()
-    for tile in tiles:
-        if tile in seen:
+    for tile, count in Counter(tiles).items():
+        if count > 1:
             raise WlmError(f"tiles: tile {tile} is given twice in {text!r}")
-        seen.add(tile)
     return tiles
 
 
 def assemble(tiles: np.ndarray, index: np.ndarray, grid: TileGrid, fill: float = 0.0) -> np.ndarray:
-    """Put tiles back into a map; the inverse of cutting.
+    """Puts tiles back into a map; the inverse of ``split``.
 
     Args:
-        tiles: `[N, 128, 128, C]`, any dtype.
-        index: `[N]`, number of each tile in the grid.
+        tiles: ``[N, 128, 128, C]``, any dtype.
+        index: ``[N]``, number of each tile in the grid.
         grid: The map's.
-        fill: Value of the texels of tiles that are not given.
+        fill: Value of the texels of tiles that ``index`` lacks.
 
     Returns:
-        `[H, W, C]`, of the tiles' dtype. What the tiles hold past the map's end is dropped.
+        ``[H, W, C]``, of the tiles' dtype. What the tiles hold past the map's end is dropped.
 
     Raises:
         WlmError: Shapes do not fit, or a number is outside the grid or given twice.
@@ -316,7 +313,7 @@ def _check_gamma(gamma: float) -> None:
 
 
 def _check_index(index: np.ndarray, grid: TileGrid) -> None:
-    """Refuses no tile at all, a tile outside the grid and one that is given twice."""
+    """Raises where there is no tile, a tile outside the grid or one twice."""
     if not index.size:
         raise WlmError("tiles: expected at least one tile, got none")
     for tile in (index.min(), index.max()):
@@ -337,7 +334,7 @@ def _half_step(value: np.ndarray) -> np.ndarray:
 def _is_constant(colour: np.ndarray, valid: np.ndarray, gamma: float) -> bool:
     """Whether no channel of [T, 128, 128, 3] spans more than a step of half float at any time."""
     encoded = colour[:, valid].astype(np.float64)  # [T, K, 3]
-    # Decoding keeps the order, so the extremes are found before it.
+    # Decoding is monotonic, so the extremes are taken before it.
     low, high = encoded.min(axis=1) ** gamma, encoded.max(axis=1) ** gamma
     return bool((high - low <= _STEP_SLACK * _half_step(low)).all())
 
@@ -349,7 +346,7 @@ def _is_static(
     gamma: float,
     budget_db: float,
 ) -> bool:
-    """Whether a tile is a colour a time times one pattern, within the budget at every time."""
+    """Whether one colour per time, multiplied by one pattern, meets the budget at every time."""
     pattern = static_pattern(colour[None], means[None])[0][valid] ** gamma  # [K, 3]
     for frame, mean in zip(colour, means, strict=True):
         linear = frame[valid].astype(np.float64) ** gamma
@@ -357,7 +354,7 @@ def _is_static(
         if (error <= _STEP_SLACK * _half_step(linear)).all():
             continue
         peak = np.ptp(linear)
-        # A range of zero means one grey over all channels; the error above is then more than a step: no.
+        # A range of zero is one grey in all channels; the error above is then more than a step of half float.
         if peak == 0.0 or 10.0 * math.log10(peak * peak / np.mean(np.square(error))) < budget_db:
             return False
     return True

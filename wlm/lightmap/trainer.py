@@ -1,6 +1,7 @@
-"""One batch of tiles being fitted on a device: its parameters, its optimisers and its steps."""
+"""Training of one batch of tiles on a device: its parameters, its optimisers and its steps."""
 
 import math
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -8,26 +9,32 @@ import torch
 import warp as wp
 
 from wlm import interop
+from wlm.formats.bc7 import pack_mode6
 from wlm.lightmap.model import TILE, Profile, TimeAxis, encode_time
-from wlm_kernels import mlp
 from wlm_kernels.lightmap import blocks, features, gather
 from wlm_kernels.lightmap import step as lightmap_step
 from wlm_kernels.lightmap.gather import gather_maps, gather_net
 
 __all__ = ["Targets", "Trainer"]
 
-CPU_LANES = 2  # ranges of samples with sums of their own; fixed, so that results don't depend on the cores
+# What a checkpoint keeps: attributes of a trainer, and of each of Adam's parameters.
+_STATE = ("maps", "hidden", "output", "loss", "control")
+_ADAM_STATE = ("step", "exp_avg", "exp_avg_sq")
+
+CPU_LANES = 2  # ranges of samples with separate sums; fixed, so that results don't depend on the number of cores
 
 
 class Targets:
-    """What N tiles are fitted to, on the host.
+    """The training data of N tiles, on the host.
 
     Attributes:
         number: int [N], numbers of the tiles in their grid.
         colour: float32 [N, T, 128 * 128, 3], (colour / scale - shift) / spread.
-        texels: int32 [N, K], valid texels, padded; ``count`` int32 [N] are in use.
-        weight: float32 [N, T, 3]; ``emphasis``: see ``wlm_kernels.lightmap.features.Batch``.
-        shift, spread: float32 [N, 3]; scale: float32 [N, T, 3].
+        texels: int32 [N, K], flat indices of valid texels, padded.
+        count: int32 [N], number of valid texels.
+        weight, emphasis: float32 [N, T, 3] and a number, see ``wlm_kernels.lightmap.features.Batch``.
+        shift, spread: float32 [N, 3].
+        scale: float32 [N, T, 3].
         range: float32 [N, T], of radiance.
     """
 
@@ -41,7 +48,16 @@ class Targets:
         gamma: float,
         metric_weight: float,
     ):
-        """Normalises and weights gamma-space colour [N, T, 128, 128, 3] by the rounded scale [N, T, 3] and affine."""
+        """Normalises and weights colour.
+
+        Args:
+            number: int [N].
+            colour: float32 [N, T, 128, 128, 3], in gamma space.
+            mask: bool [N, 128, 128], valid texels.
+            scale: float32 [N, T, 3], as rounded for the file.
+            affine: float32 [N, 2, 3], shift and spread, as rounded for the file.
+            gamma, metric_weight: Of the ``Profile``.
+        """
         n, times = colour.shape[:2]
         self.number = number.astype(np.int32)
         self.scale = scale
@@ -62,18 +78,33 @@ class Targets:
             self.range[i] = span
             if metric_weight > 0:
                 # d radiance / d y = gamma (colour / scale)^(gamma - 1) scale^gamma spread; the middle factor is
-                # the texel's emphasis. A tile without range is not scored: any weight will do.
+                # the texel's emphasis. A tile without range is not scored, so it has no weight.
                 slope = gamma * scale[i] ** gamma * self.spread[i] / np.where(span > 0, span, 1.0)[:, None]
                 self.weight[i] = np.where(span[:, None] > 0, slope, 0.0) ** (2.0 * metric_weight)
-        # A black channel has no scale: whatever the network says, it decodes to 0.
+        # A black channel has scale 0: whatever the network's output, it decodes to 0.
         self.weight *= scale > 0
         self.emphasis = 2.0 * (gamma - 1.0) * metric_weight
 
 
 class Trainer:
-    """Fits N tiles of one kind together; see ``Profile`` for the stages.
+    """Trains N tiles of one kind together; see ``Profile`` for the stages.
 
-    The state (``state`` and ``load``) is all that a later step depends on, so that a resumed fit goes on exactly.
+    ``state`` holds everything that a later step depends on, so that a resumed fit goes on exactly.
+
+    Attributes:
+        profile: The settings.
+        axis: The time axis.
+        device: As ``interop.check_device`` returns it.
+        temporal: Whether the tiles are DYNAMIC rather than STATIC.
+        numbers: int32 [N], numbers of the tiles in their grid.
+        tiles: N.
+        inputs: Inputs of the network.
+        views: The maps by name, as ``wlm_kernels.lightmap.features.Maps`` has them: views of ``maps``.
+        maps, maps_grad: float32 [M], all maps and their gradients.
+        hidden, output: The networks, see ``wlm_kernels.mlp``.
+        loss: float32 [N], running mean of each tile's loss over about 50 steps.
+        control: int32 [1], steps done.
+        batch: The targets as the kernels take them.
     """
 
     def __init__(
@@ -86,20 +117,20 @@ class Trainer:
         device: str,
         track: bool = False,
     ):
-        """Uploads the targets and draws the first parameters.
+        """Uploads the targets and draws the initial parameters.
 
         Args:
             profile: The settings.
             axis: The time axis.
-            targets: What to fit.
+            targets: The training data.
             temporal_maps: Whether the tiles are DYNAMIC rather than STATIC.
-            seed: Of everything random.
+            seed: Of the initial parameters and of all samples.
             device: As ``interop.check_device`` returns it.
-            track: Whether ``psnr`` will be asked for.
+            track: Whether to sum what ``psnr`` needs.
         """
         self._track = track
         self.profile, self.axis, self.device, self.temporal = profile, axis, device, temporal_maps
-        self.tiles = len(targets.number)
+        self.numbers, self.tiles = targets.number, len(targets.number)
         self.inputs = profile.inputs(temporal_maps)
         self._cuda = device != "cpu"
         self._kernels = lightmap_step.step_kernels(
@@ -107,13 +138,13 @@ class Trainer:
         )
         self._pool = None if self._cuda else ThreadPoolExecutor(CPU_LANES)
         if not self._cuda:
-            # Before two threads ask for them at once, which would compile them twice into one place.
+            # Before two lanes launch them at once, which would compile them twice into one file.
             self._kernels.load(device)
             wp.load_module(gather, device)
         with interop.stream(device):
             self._allocate()
             self._upload(targets, seed)
-            self._draw(targets.number, seed)
+            self._draw(seed)
         self._stages = [
             interop.StepGraph(lambda: self._step(False, True), device, warmup=2),
             interop.StepGraph(lambda: self._step(True, True), device, warmup=1),
@@ -138,7 +169,7 @@ class Trainer:
         lengths = {key: math.prod(shape) for key, shape in shapes.items()}
         total = sum(lengths.values())
 
-        def zeros(*shape, dtype=torch.float32):
+        def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> torch.Tensor:
             return torch.zeros(shape, dtype=dtype, device=device)
 
         self.maps, self.maps_grad = zeros(total), zeros(total)
@@ -169,12 +200,7 @@ class Trainer:
         self._tracked = zeros(lanes if self._track else 0, n, len(self.axis.times), 2)
         rates = zeros(2)
         self._rates = rates
-        fused = {
-            "betas": (0.9, 0.999),
-            "eps": self.profile.adam_epsilon,
-            "fused": True,
-            "capturable": self._cuda,
-        }
+        fused = {"eps": self.profile.adam_epsilon, "fused": True, "capturable": self._cuda}
         self._adam_maps = torch.optim.Adam(self._pieces(), lr=rates[0] if self._cuda else 1.0, **fused)
         self._adam_net = torch.optim.Adam([self.hidden, self.output], lr=rates[1] if self._cuda else 1.0, **fused)
 
@@ -206,10 +232,10 @@ class Trainer:
         )
 
     def _pieces(self) -> list[torch.Tensor]:
-        """The maps as views, the optimiser's parameters.
+        """The maps in pieces, as the optimiser's parameters.
 
-        A fused Adam gives a block of threads 65,536 numbers of one tensor: one long tensor would leave most of a
-        GPU idle. 36 is as many tensors as one of its launches takes.
+        A fused Adam gives each block of threads 65,536 numbers of one tensor: a single long tensor would leave most of
+        a GPU idle. 36 is as many tensors as one of its launches takes.
         """
         pieces = 36 if self._cuda else 1
         size = -(-self.maps.numel() // pieces)
@@ -224,7 +250,7 @@ class Trainer:
         tau, encoding = encode_time(self.axis)
         self._schedule = self._rates_over_steps()
 
-        def put(values, dtype):
+        def put(values: np.ndarray, dtype: type) -> wp.array:
             return wp.array(np.ascontiguousarray(values), dtype=dtype, device=self.device)
 
         batch = features.Batch()
@@ -259,13 +285,13 @@ class Trainer:
         values = p.final_rate + (1.0 - p.final_rate) * 0.5 * (1.0 + np.cos(np.pi * share))
         return wp.array(values.astype(np.float32), dtype=float, device=self.device)
 
-    def _draw(self, number: np.ndarray, seed: int) -> None:
-        """First parameters; each tile draws from a generator of its own, so that it is the same in any batch."""
+    def _draw(self, seed: int) -> None:
+        """Draws the initial parameters; each tile has its own generator, so that it is the same in any batch."""
         hidden, inputs = self.profile.hidden, self.inputs
         maps = {key: np.empty(view.shape, np.float32) for key, view in self.views.items()}
         w = np.zeros(tuple(self.hidden.shape), np.float32)
         o = np.zeros(tuple(self.output.shape), np.float32)
-        for i, tile in enumerate(number):
+        for i, tile in enumerate(self.numbers):
             random = np.random.default_rng([seed, int(tile)])
             for values in maps.values():
                 part = values.reshape(self.tiles, -1)
@@ -285,7 +311,7 @@ class Trainer:
         return int(self.control.item())
 
     def stage(self, step: int) -> int:
-        """0: continuous maps with noise, 1: maps on their exact levels, 2: maps frozen."""
+        """Stage of a step: 0, continuous maps with noise; 1, maps on their exact levels; 2, maps frozen."""
         p = self.profile
         return int(step >= round(p.quantise_from * p.steps)) + int(step >= round(p.freeze_from * p.steps))
 
@@ -295,7 +321,7 @@ class Trainer:
         threads = torch.get_num_threads()
         try:
             if not self._cuda:
-                # Between its own calls torch's second thread would spin on the core that a lane needs.
+                # Torch's second thread would spin between torch's calls, on the core that a lane needs.
                 torch.set_num_threads(1)
             with interop.stream(self.device):
                 for step in range(first, first + steps):
@@ -333,7 +359,7 @@ class Trainer:
             self._adam_maps.step()
         self._adam_net.step()
 
-    def _share(self, work) -> None:
+    def _share(self, work: Callable[[int], None]) -> None:
         """Runs ``work(lane)`` for each lane on the CPU's threads; a launch releases the interpreter's lock."""
         list(self._pool.map(work, range(CPU_LANES)))
 
@@ -346,63 +372,53 @@ class Trainer:
         with interop.stream(self.device):
             sums = self._tracked.sum(0).cpu()
             self._tracked.zero_()
-        seen = (sums[..., 1] > 0) & self._scored
-        mean = sums[..., 0][seen] / sums[..., 1][seen]
+        sampled = (sums[..., 1] > 0) & self._scored
+        mean = sums[..., 0][sampled] / sums[..., 1][sampled]
         return float((-10.0 * torch.log10(mean.clamp_min(1e-12))).mean())
 
     def quantised(self) -> dict[str, np.ndarray]:
-        """The maps and networks as stored.
+        """The maps and networks as the file holds them.
 
         Returns:
-            ``uv_endpoints`` uint8 [N, 32, 32, 2, 4] and ``uv_index`` uint8 [N, 128, 128], the same for ``uvt`` with
-            [N * S, ...]; ``ut``, ``vt`` uint8; ``net`` float16 [N, P].
+            ``net`` and ``uv``, of dynamic tiles also ``uvt``, ``ut`` and ``vt``, as ``LightmapModel`` has them; ``net``
+            is ``net_static`` of static tiles.
         """
-        result = {}
-        with interop.stream(self.device):
-            for key in ("uv", "uvt") if self.temporal else ("uv",):
-                endpoints, weights = (
-                    getattr(self._maps, f"{key}_endpoints"),
-                    getattr(self._maps, f"{key}_weights"),
-                )
-                bytes_out = wp.empty(endpoints.shape, dtype=wp.vec4ub, device=self.device)
-                index_out = wp.empty(weights.shape, dtype=wp.uint8, device=self.device)
-                blocks.quantise(endpoints, weights, bytes_out, index_out)
-                result[f"{key}_endpoints"], result[f"{key}_index"] = bytes_out, index_out
-        result = {key: value.numpy() for key, value in result.items()}
-        for key in ("ut", "vt") if self.temporal else ():
-            plane = np.clip(self.views[key].cpu().numpy(), 0.0, 1.0)
-            result[key] = np.floor(plane * np.float32(255.0) + np.float32(0.5)).astype(np.uint8)
         net = torch.cat([self.hidden.detach().flatten(1), self.output.detach().flatten(1)], 1)
-        result["net"] = net.cpu().numpy().astype(np.float16)
-        assert result["net"].shape[1] == mlp.parameter_count(self.inputs, self.profile.hidden)
+        result = {"net": net.cpu().numpy().astype(np.float16), "uv": self._blocks("uv")}
+        if self.temporal:
+            uvt = self._blocks("uvt")
+            result["uvt"] = uvt.reshape(self.tiles, -1, *uvt.shape[1:])
+            for key in ("ut", "vt"):
+                plane = np.clip(self.views[key].cpu().numpy(), 0.0, 1.0)
+                result[key] = np.floor(plane * np.float32(255.0) + np.float32(0.5)).astype(np.uint8)
         return result
+
+    def _blocks(self, name: str) -> np.ndarray:
+        """A map as BC7 blocks, uint8 [S, H/4, W/4, 16]."""
+        endpoints, weights = (getattr(self._maps, f"{name}_{part}") for part in ("endpoints", "weights"))
+        with interop.stream(self.device):
+            levels = wp.empty(endpoints.shape, dtype=wp.vec4ub, device=self.device)
+            index = wp.empty(weights.shape, dtype=wp.uint8, device=self.device)
+            blocks.quantise(endpoints, weights, levels, index)
+        s, h, w = index.shape
+        # Texels [S, H, W] -> blocks [S, H/4, W/4, 16], row-major in the block.
+        index = index.numpy().reshape(s, h // 4, 4, w // 4, 4).swapaxes(2, 3).reshape(s, h // 4, w // 4, 16)
+        return pack_mode6(levels.numpy(), index)
+
+    def _adams(self) -> tuple[tuple[str, torch.optim.Adam], ...]:
+        return ("adam_maps", self._adam_maps), ("adam_net", self._adam_net)
 
     def state(self) -> dict[str, np.ndarray]:
         """Everything that later steps depend on."""
-        named = {
-            "maps": self.maps,
-            "hidden": self.hidden,
-            "output": self.output,
-            "loss": self.loss,
-            "control": self.control,
-        }
-        result = {key: value.detach().cpu().numpy() for key, value in named.items()}
-        for name, adam in (("adam_maps", self._adam_maps), ("adam_net", self._adam_net)):
+        result = {key: getattr(self, key) for key in _STATE}
+        for name, adam in self._adams():
             for i, values in enumerate(adam.state.values()):
-                for key in ("step", "exp_avg", "exp_avg_sq"):
-                    result[f"{name}.{i}.{key}"] = values[key].detach().cpu().numpy()
+                result |= {f"{name}.{i}.{key}": values[key] for key in _ADAM_STATE}
         # Copies, and numbers stay without a dimension.
-        return {key: np.array(value) for key, value in result.items()}
+        return {key: np.array(value.detach().cpu().numpy()) for key, value in result.items()}
 
     def load(self, state: dict[str, np.ndarray]) -> None:
         """Goes back to a ``state``; arrays of other shapes raise ValueError."""
-        named = {
-            "maps": self.maps,
-            "hidden": self.hidden,
-            "output": self.output,
-            "loss": self.loss,
-            "control": self.control,
-        }
 
         def put(target: torch.Tensor, key: str) -> None:
             value = torch.from_numpy(np.array(state[key]))
@@ -411,21 +427,18 @@ class Trainer:
             target.copy_(value)
 
         with interop.stream(self.device), torch.no_grad():
-            for key, value in named.items():
-                put(value, key)
-            for name, adam in (("adam_maps", self._adam_maps), ("adam_net", self._adam_net)):
+            for key in _STATE:
+                put(getattr(self, key), key)
+            for name, adam in self._adams():
                 for i, parameter in enumerate(adam.param_groups[0]["params"]):
                     if f"{name}.{i}.step" in state:
                         slot = adam.state[parameter]
                         slot["step"] = torch.zeros((), device=self.device)
-                        slot["exp_avg"], slot["exp_avg_sq"] = (
-                            torch.zeros_like(parameter),
-                            torch.zeros_like(parameter),
-                        )
-                        for key in ("step", "exp_avg", "exp_avg_sq"):
+                        slot["exp_avg"], slot["exp_avg_sq"] = (torch.zeros_like(parameter) for _ in range(2))
+                        for key in _ADAM_STATE:
                             put(slot[key], f"{name}.{i}.{key}")
 
     def close(self) -> None:
-        """Ends the CPU's threads."""
+        """Ends the CPU lanes' threads."""
         if self._pool is not None:
             self._pool.shutdown()

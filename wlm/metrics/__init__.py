@@ -1,6 +1,6 @@
 """Error of HDR lightmaps: PSNR, SSIM and HDR-FLIP, masked, and in tiles as the paper scores them."""
 
-from wlm.metrics.error import PSNR_CAP_DB, dynamic_range, half_ulp, max_abs_error, mse, psnr
+from wlm.metrics.error import PSNR_CAP_DB, dynamic_range, half_ulp, max_abs_error, mse, psnr, psnr_from_mse
 from wlm.metrics.flip import flip_exposures, flip_map
 from wlm.metrics.structural import SSIM_WINDOW, ssim, ssim_map
 from wlm.metrics.tiled import (
@@ -29,6 +29,7 @@ __all__ = [
     "max_abs_error",
     "mse",
     "psnr",
+    "psnr_from_mse",
     "ssim",
     "ssim_map",
     "summarise",

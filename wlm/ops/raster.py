@@ -1,21 +1,18 @@
-"""Differentiable drawing for torch: triangles to pixels, attributes and textures at what each pixel sees.
+"""Triangles to pixels: rasterization, attributes and textures at the point that each pixel sees.
 
-Four functions with gradients by autograd, on the device of their tensors; on CUDA they queue work on torch's current
-stream. All floats are float32. Row 0 of an image is its top row. ``wlm_kernels.raster.rasterize`` says where pixel
-centres are and what covers them, ``wlm_kernels.raster.texture`` how a texture is read. On CUDA gradients that many
-pixels give to one number are added in any order, so that its last bits change from run to run. There is no second
-derivative.
+Row 0 of an image is its top row. ``wlm_kernels.raster.rasterize`` says where pixel centres are and what covers them,
+``wlm_kernels.raster.texture`` how a texture is read. On CUDA gradients that many pixels give to one number are added in
+any order, so that its last bits change from run to run.
 """
 
-from contextlib import nullcontext
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 import warp as wp
 from torch.autograd.function import once_differentiable
 
 from wlm.interop import to_warp, torch_memory
+from wlm.ops.tensors import check, check_index, dense, on_stream, optional_array, zeros_for
 from wlm_kernels.raster import gradient as raster_gradient
 from wlm_kernels.raster import rasterize as kernels
 from wlm_kernels.raster import texture as texture_kernels
@@ -25,7 +22,7 @@ __all__ = ["Raster", "interpolate", "rasterize", "rasterize_uv", "texture"]
 
 @dataclass(frozen=True)
 class Raster:
-    """What each pixel sees.
+    """The triangle that each pixel sees, and where in it.
 
     Attributes:
         triangle: int32 [H, W], the number of the triangle, -1: none.
@@ -116,9 +113,9 @@ def interpolate(attribute: torch.Tensor, triangle: torch.Tensor, raster: Raster)
     Raises:
         ValueError: As for ``rasterize``.
     """
-    _check("attribute", attribute, (None, None))
+    check("attribute", attribute, (None, None))
     triangle = _checked_triangles(triangle, attribute)
-    _check("raster.barycentric", raster.barycentric, (None, None, 2), attribute.device)
+    check("raster.barycentric", raster.barycentric, (None, None, 2), attribute.device)
     return _Interpolate.apply(attribute, triangle, raster.triangle, raster.barycentric)
 
 
@@ -142,16 +139,16 @@ def texture(image: torch.Tensor, uv: torch.Tensor, *, filter: str = "linear", bo
         ValueError: No such filter or boundary, or a tensor's shape, type or device doesn't fit.
     """
     texture_kernels.codes(filter, boundary)
-    _check("image", image, (None, None, None))
+    check("image", image, (None, None, None))
     if 0 in image.shape:
         raise ValueError(f"image: expected texels and channels, got {tuple(image.shape)}")
-    _check("uv", uv, (*uv.shape[:-1], 2), image.device)
-    found = _Texture.apply(image, uv.reshape(-1, 2), filter, boundary)
-    return found.reshape(*uv.shape[:-1], image.shape[2])
+    check("uv", uv, (*uv.shape[:-1], 2), image.device)
+    texels = _Texture.apply(image, uv.reshape(-1, 2), filter, boundary)
+    return texels.reshape(*uv.shape[:-1], image.shape[2])
 
 
 def _rasterize(position, triangle, height, width, space, cull, derivative, coverage) -> Raster:
-    _check("uv" if space == "uv" else "clip", position, (None, 2 if space == "uv" else 4))
+    check("uv" if space == "uv" else "clip", position, (None, 2 if space == "uv" else 4))
     triangle = _checked_triangles(triangle, position)
     options = {"space": space, "cull": cull, "derivative": derivative, "coverage": coverage}
     return Raster(*_Rasterize.apply(position, triangle, height, width, options))
@@ -160,12 +157,12 @@ def _rasterize(position, triangle, height, width, space, cull, derivative, cover
 class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(ctx, position, triangle, height, width, options):
-        with _queue(position.device):
+        with on_stream(position.device):
             drawing = kernels.Rasterizer(
                 to_warp(triangle), height, width, empty=torch_memory(position.device), **options
             )
-            found = vars(drawing.run(to_warp(position)))
-            tensors = {name: None if array is None else wp.to_torch(array) for name, array in found.items()}
+            arrays = vars(drawing.run(to_warp(position)))
+            tensors = {name: None if array is None else wp.to_torch(array) for name, array in arrays.items()}
         ctx.save_for_backward(position, triangle, tensors["triangle"])
         ctx.space = options["space"]
         ctx.mark_non_differentiable(
@@ -176,14 +173,14 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx, _triangle, grad_barycentric, *_others):
-        position, triangle, found = ctx.saved_tensors
-        grad = torch.zeros_like(position, memory_format=torch.contiguous_format)
-        with _queue(position.device):
+        position, triangle, visible = ctx.saved_tensors
+        grad = zeros_for(position)
+        with on_stream(position.device):
             raster_gradient.rasterize_backward(
                 to_warp(position),
                 to_warp(triangle),
-                to_warp(found),
-                to_warp(grad_barycentric.contiguous(), wp.vec2),
+                to_warp(visible),
+                to_warp(dense(grad_barycentric), wp.vec2),
                 to_warp(grad),
                 ctx.space,
             )
@@ -192,31 +189,30 @@ class _Rasterize(torch.autograd.Function):
 
 class _Interpolate(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, attribute, triangle, found, barycentric):
-        barycentric = barycentric.contiguous()
-        out = attribute.new_empty(*found.shape, attribute.shape[1])
-        with _queue(attribute.device):
-            seen = to_warp(found), to_warp(barycentric, wp.vec2)
-            raster_gradient.interpolate(to_warp(attribute), to_warp(triangle), *seen, to_warp(out))
-        ctx.save_for_backward(attribute, triangle, found, barycentric)
+    def forward(ctx, attribute, triangle, visible, barycentric):
+        barycentric = dense(barycentric)
+        out = attribute.new_empty(*visible.shape, attribute.shape[1])
+        with on_stream(attribute.device):
+            pixels = to_warp(visible), to_warp(barycentric, wp.vec2)
+            raster_gradient.interpolate(to_warp(attribute), to_warp(triangle), *pixels, to_warp(out))
+        ctx.save_for_backward(attribute, triangle, visible, barycentric)
         return out
 
     @staticmethod
     @once_differentiable
     def backward(ctx, grad_out):
-        attribute, triangle, found, barycentric = ctx.saved_tensors
-        wanted = ctx.needs_input_grad
-        on_attribute = torch.zeros_like(attribute, memory_format=torch.contiguous_format) if wanted[0] else None
-        on_barycentric = torch.empty_like(barycentric) if wanted[3] else None
-        with _queue(attribute.device):
+        attribute, triangle, visible, barycentric = ctx.saved_tensors
+        on_attribute = zeros_for(attribute, ctx.needs_input_grad[0])
+        on_barycentric = torch.empty_like(barycentric) if ctx.needs_input_grad[3] else None
+        with on_stream(attribute.device):
             raster_gradient.interpolate_backward(
                 to_warp(attribute),
                 to_warp(triangle),
-                to_warp(found),
+                to_warp(visible),
                 to_warp(barycentric, wp.vec2),
-                to_warp(grad_out.contiguous()),
-                _wanted(on_attribute, (0, 0), wp.float32, attribute.device),
-                _wanted(on_barycentric, (0, 0), wp.vec2, attribute.device),
+                to_warp(dense(grad_out)),
+                optional_array(on_attribute, 2, wp.float32, attribute.device),
+                optional_array(on_barycentric, 2, wp.vec2, attribute.device),
             )
         return on_attribute, None, None, on_barycentric
 
@@ -224,9 +220,9 @@ class _Interpolate(torch.autograd.Function):
 class _Texture(torch.autograd.Function):
     @staticmethod
     def forward(ctx, image, uv, filter, boundary):
-        uv = uv.contiguous()
+        uv = dense(uv)
         out = image.new_empty(len(uv), image.shape[2])
-        with _queue(image.device):
+        with on_stream(image.device):
             arrays = to_warp(image), to_warp(uv, wp.vec2), to_warp(out)
             texture_kernels.sample(*arrays, filter=filter, boundary=boundary)
         ctx.save_for_backward(image, uv)
@@ -237,60 +233,21 @@ class _Texture(torch.autograd.Function):
     @once_differentiable
     def backward(ctx, grad_out):
         image, uv = ctx.saved_tensors
-        on_image = torch.zeros_like(image, memory_format=torch.contiguous_format) if ctx.needs_input_grad[0] else None
+        on_image = zeros_for(image, ctx.needs_input_grad[0])
         on_uv = torch.empty_like(uv) if ctx.needs_input_grad[1] else None
-        with _queue(image.device):
+        with on_stream(image.device):
             texture_kernels.sample_backward(
                 to_warp(image),
                 to_warp(uv, wp.vec2),
-                to_warp(grad_out.contiguous()),
-                _wanted(on_image, (0, 0, 0), wp.float32, image.device),
-                _wanted(on_uv, (0,), wp.vec2, image.device),
+                to_warp(dense(grad_out)),
+                optional_array(on_image, 3, wp.float32, image.device),
+                optional_array(on_uv, 1, wp.vec2, image.device),
                 **ctx.mode,
             )
         return on_image, on_uv, None, None
 
 
-def _queue(device: torch.device):
-    """Puts Warp's work on torch's current stream."""
-    # Wrapping a tensor, unlike all else in Warp, doesn't start it.
-    wp.init()
-    if device.type == "cpu":
-        return nullcontext()
-    return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device)), sync_enter=False)
-
-
-def _nothing(shape: tuple[int, ...], dtype: Any, device: torch.device) -> wp.array:
-    return wp.empty(shape, dtype=dtype, device=wp.device_from_torch(device))
-
-
-def _wanted(tensor: torch.Tensor | None, shape: tuple[int, ...], dtype: Any, device: torch.device) -> wp.array:
-    """A gradient's buffer, or the empty array that says that none is wanted."""
-    return _nothing(shape, dtype, device) if tensor is None else to_warp(tensor, dtype)
-
-
-def _check(name: str, tensor: torch.Tensor, shape: tuple[int | None, ...], device: torch.device | None = None) -> None:
-    """Checks a float tensor; a size of None may be any."""
-    fits = len(tensor.shape) == len(shape) and all(
-        want is None or got == want for got, want in zip(tensor.shape, shape, strict=True)
-    )
-    if not fits or tensor.dtype != torch.float32:
-        wanted = ", ".join("any" if size is None else str(size) for size in shape)
-        raise ValueError(f"{name}: expected float32 [{wanted}], got {tensor.dtype} {tuple(tensor.shape)}")
-    if device is not None and tensor.device != device:
-        raise ValueError(f"{name}: expected a tensor on {device}, got one on {tensor.device}")
-
-
 def _checked_triangles(triangle: torch.Tensor, corners: torch.Tensor) -> torch.Tensor:
     """The triangles as int32, their numbers among those of the corners."""
-    if triangle.ndim != 2 or triangle.shape[1] != 3 or triangle.dtype not in (torch.int32, torch.int64):
-        raise ValueError(f"triangle: expected int32 or int64 [F, 3], got {triangle.dtype} {tuple(triangle.shape)}")
-    if triangle.device != corners.device:
-        raise ValueError(f"triangle: expected a tensor on {corners.device}, got one on {triangle.device}")
-    capturing = triangle.is_cuda and torch.cuda.is_current_stream_capturing()
-    if len(triangle) and not capturing:
-        low, high = torch.stack(triangle.aminmax()).tolist()
-        if low < 0 or high >= len(corners):
-            found = low if low < 0 else high
-            raise ValueError(f"triangle: expected numbers from 0 to {len(corners) - 1}, found {found}")
+    check_index("triangle", triangle, len(corners), (None, 3), corners.device)
     return triangle.to(torch.int32)

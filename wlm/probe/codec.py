@@ -1,143 +1,76 @@
-"""The artifact of a probe model: packed Gaussians and a half-float network in one file, and reading it back.
+"""Probe models in files: packed Gaussians and a half-float network.
 
-Parts: ``gaussians`` (uint8: for every Gaussian three centres of 16 bits and 7 + L codes of b bits, packed without a
-gap, the lowest bit first), ``bounds``, ``net``, ``frame`` (origin, extent, size of the box, gain) and, where there
-are any, ``dead`` (a bit a probe, deflated) and ``positions``.
+``gaussians`` holds for every Gaussian three centres of 16 bits and 7 + L codes of b bits, packed without a gap, the
+lowest bit first; ``frame`` is origin, extent, size of the box and gain; ``dead`` is a bit for each probe, deflated.
 """
 
-import os
 import zlib
+from typing import Any
 
 import numpy as np
-from pydantic import ValidationError
 
-from wlm.errors import WlmError
-from wlm.formats.artifact import Artifact, read_artifact, write_artifact
-from wlm.probe.model import CENTRE_BITS, LATENT, ProbeModel, Profile, network_size
+from wlm.config import check_settings
+from wlm.formats.artifact import Artifact
+from wlm.formats.bits import pack_bits, unpack_bits
+from wlm.probe.model import LATENT, ProbeModel, Profile, layer_shapes
+from wlm.system import Part, check_parts
 
-__all__ = ["SYSTEM", "pack_bits", "read", "unpack_bits", "write"]
-
-SYSTEM = "probe"
-
-
-def pack_bits(values: np.ndarray, widths: np.ndarray) -> np.ndarray:
-    """Packs integers of given widths, row after row.
-
-    Args:
-        values: uint16 [K, C].
-        widths: int [C], bits of each column, 1 to 16.
-
-    Returns:
-        uint8 [ceil(K * sum(widths) / 8)], the lowest bit of each number first.
-
-    Raises:
-        ValueError: A number needs more bits than its column has.
-    """
-    values = np.asarray(values, np.uint16)
-    if values.size and (values.astype(np.int64).max(0) >> widths).any():
-        raise ValueError("a number doesn't fit the width of its column")
-    columns = [(values[:, c, None] >> np.arange(width)) & 1 for c, width in enumerate(widths)]
-    bits = np.concatenate(columns, 1).astype(np.uint8)
-    return np.packbits(bits, bitorder="little")
+__all__ = ["decode", "encode", "pack_dead"]
 
 
-def unpack_bits(packed: np.ndarray, widths: np.ndarray, count: int) -> np.ndarray:
-    """Undoes ``pack_bits`` for ``count`` rows; uint16 [count, C].
-
-    Raises:
-        ValueError: Another number of bytes than so many rows take.
-    """
-    total = int(np.sum(widths))
-    if len(packed) != -(-count * total // 8):
-        raise ValueError(f"{len(packed)} bytes for {count} rows of {total} bits")
-    bits = np.unpackbits(packed, count=count * total, bitorder="little").reshape(count, total).astype(np.uint16)
-    ends = np.cumsum(widths)
-    columns = [
-        (bits[:, end - width : end] << np.arange(width, dtype=np.uint16)).sum(1, dtype=np.uint16)
-        for end, width in zip(ends, widths, strict=True)
-    ]
-    return np.stack(columns, 1)
+def _parts(profile: Profile, outputs: int) -> dict[str, Part]:
+    """The table of parts."""
+    layers = layer_shapes(profile.latent, profile.hidden, outputs)
+    return {
+        "gaussians": Part(np.uint8, (None,)),
+        "bounds": Part(np.float32, (2, LATENT.start + profile.latent)),
+        "net": Part(np.float16, (sum(rows * columns for rows, columns in layers),)),
+        "frame": Part(np.float64, (8,)),
+        "dead": Part(np.uint8, (None,), optional=True),
+        "positions": Part(np.uint16, (None, 3), optional=True),
+    }
 
 
-def _widths(profile: Profile) -> np.ndarray:
-    return np.array([CENTRE_BITS] * 3 + [profile.bits] * (7 + profile.latent))
-
-
-def write(path: str | os.PathLike[str], model: ProbeModel) -> int:
-    """Writes a model to one file, atomically.
-
-    Returns:
-        The file's size in bytes.
-
-    Raises:
-        WlmError: The file can't be written; what was there before is untouched.
-    """
-    profile = model.profile.model_dump()
-    defaults = Profile(name="").model_dump()
+def encode(model: ProbeModel) -> tuple[dict[str, Any], dict[str, np.ndarray], str]:
+    """Settings, parts and source of a model's file."""
     settings = {
         "name": model.name,
         "probes": model.probes,
         "outputs": model.outputs,
         "gaussians": model.count,
         "dropped": model.dropped,
-        "profile": {key: value for key, value in profile.items() if value != defaults[key]},
+        "profile": model.profile.changes(),
     }
-    tensors = {
-        "gaussians": pack_bits(np.concatenate([model.centre, model.code], 1), _widths(model.profile)),
+    parts = {
+        "gaussians": pack_bits(model.codes, model.profile.code_bits()),
         "bounds": model.bounds.astype(np.float32),
         "net": model.net,
         "frame": np.array([*model.origin, model.extent, *model.size, model.gain], np.float64),
+        "dead": pack_dead(model.dead),
+        "positions": model.positions,
     }
-    if model.dead.any():
-        tensors["dead"] = np.frombuffer(zlib.compress(np.packbits(model.dead).tobytes(), 9), np.uint8)
-    if len(model.positions):
-        tensors["positions"] = model.positions
-    return write_artifact(path, SYSTEM, settings, tensors, model.source)
+    return settings, {name: part for name, part in parts.items() if part.size}, model.source
 
 
-def read(path: str | os.PathLike[str]) -> ProbeModel:
-    """Reads a model.
+def decode(artifact: Artifact) -> ProbeModel:
+    """Makes the model of a file; what ``encode`` gave comes back bit for bit.
 
     Raises:
-        WlmError: One line: not such a file, truncated, tampered with, of another system or version, or with parts
-            that don't fit each other.
+        WlmError, ValueError, LookupError: A setting or a part is missing, or they don't fit each other.
     """
-    artifact = read_artifact(path, SYSTEM)
-    try:
-        return _model(artifact)
-    except (LookupError, TypeError, ValueError, ValidationError, zlib.error) as error:
-        raise WlmError(f"{path}: the file's parts do not fit its settings: {error}") from error
-
-
-def _model(artifact: Artifact) -> ProbeModel:
-    settings, tensors = artifact.settings, artifact.tensors
-    profile = Profile(**settings["profile"])
-    probes, outputs, count, dropped = (int(settings[key]) for key in ("probes", "outputs", "gaussians", "dropped"))
-    if min(probes, outputs, count) < 1 or dropped < 0:
-        raise ValueError(f"{count} Gaussians for {probes} probes of {outputs} numbers")
-    channels = LATENT.start + profile.latent
-    expected = {
-        "bounds": (np.float32, (2, channels)),
-        "net": (np.float16, (network_size(profile.latent, profile.hidden, outputs),)),
-        "frame": (np.float64, (8,)),
-    }
-    for key, (kind, shape) in expected.items():
-        value = tensors[key]
-        if value.dtype != kind or value.shape != shape or not np.isfinite(value).all():
-            raise ValueError(f"part {key} is {value.dtype} {value.shape}, expected finite {np.dtype(kind)} {shape}")
-    frame = tensors["frame"]
+    settings = artifact.settings
+    profile = check_settings(Profile, settings["profile"], "profile: ")
+    sizes = [settings[key] for key in ("probes", "outputs", "gaussians", "dropped")]
+    if not all(type(size) is int for size in sizes) or min(sizes[:3]) < 1 or sizes[3] < 0:
+        raise ValueError(f"probes, outputs, gaussians, dropped: expected whole numbers, got {sizes}")
+    probes, outputs, count, dropped = sizes
+    parts = check_parts(artifact.tensors, _parts(profile, outputs))
+    frame, positions = parts["frame"], parts["positions"]
     if not (frame[3] > 0 and (frame[4:7] >= 0).all() and (frame[4:7] <= 1).all()):
         raise ValueError("part frame: expected a positive extent and a size within it")
-    codes = unpack_bits(tensors["gaussians"], _widths(profile), count)
-    dead = np.zeros(0, bool)
-    if "dead" in tensors:
-        inflated = zlib.decompressobj().decompress(tensors["dead"].tobytes(), -(-probes // 8) + 1)
-        if len(inflated) != -(-probes // 8):
-            raise ValueError(f"part dead: expected a bit for each of {probes} probes")
-        dead = np.unpackbits(np.frombuffer(inflated, np.uint8), count=probes).astype(bool)
-    positions = tensors.get("positions", np.zeros((0, 3), np.uint16))
-    if positions.dtype != np.uint16 or positions.shape not in ((0, 3), (probes, 3)):
-        raise ValueError(f"part positions is {positions.dtype} {positions.shape}, expected uint16 {(probes, 3)}")
+    if len(positions) not in (0, probes):
+        raise ValueError(f"part positions holds {len(positions)}, expected {probes}")
+    codes = unpack_bits(parts["gaussians"], profile.code_bits(), count)
     return ProbeModel(
         name=str(settings["name"]),
         source=artifact.source,
@@ -150,9 +83,30 @@ def _model(artifact: Artifact) -> ProbeModel:
         gain=float(frame[7]),
         centre=codes[:, :3],
         code=codes[:, 3:],
-        bounds=tensors["bounds"],
-        net=tensors["net"],
-        dead=dead,
+        bounds=parts["bounds"],
+        net=parts["net"],
+        dead=_unpack_dead(parts["dead"], probes),
         positions=positions,
         dropped=dropped,
     )
+
+
+def pack_dead(dead: np.ndarray) -> np.ndarray:
+    """A bit for each probe, bool [N], deflated; uint8, empty where none is dead."""
+    packed = zlib.compress(np.packbits(dead).tobytes(), 9) if dead.any() else b""
+    return np.frombuffer(packed, np.uint8)
+
+
+def _unpack_dead(packed: np.ndarray, probes: int) -> np.ndarray:
+    """bool [N], or empty where none is dead."""
+    if not packed.size:
+        return np.zeros(0, bool)
+    size = -(-probes // 8)
+    inflater = zlib.decompressobj()
+    try:
+        bits = inflater.decompress(packed.tobytes(), size + 1)
+    except zlib.error as error:
+        raise ValueError(f"part dead: {error}") from error
+    if len(bits) != size or not inflater.eof or inflater.unused_data:
+        raise ValueError(f"part dead: expected a bit for each of {probes} probes")
+    return np.unpackbits(np.frombuffer(bits, np.uint8), count=probes).astype(bool)

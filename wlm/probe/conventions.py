@@ -1,24 +1,25 @@
 """Spherical harmonics as engines store them, and as this package does.
 
-The house's own numbers are the radiance L projected onto the orthonormal real basis, c_lm = integral of L Y_lm
-(gaussian-probe-compression, eq. 1), all signs plus, in the order 1; y, z, x; xy, yz, 3z2-1, xz, x2-y2; and so on, m
-from -l to l in band l. Every engine here has that order, so what differs is one factor for each coefficient:
+The canonical numbers, those of this package, are the radiance L projected onto the orthonormal real basis, c_lm =
+integral of L Y_lm (gaussian-probe-compression, eq. 1), all signs plus, in the order 1; y, z, x; xy, yz, 3z2-1, xz,
+x2-y2; and so on, m from -l to l in band l. Every engine here has that order, so what differs is one factor for each
+coefficient:
 
 =======  ==========================================  ========  ========================================
-name     type in the engine                          bands     the engine's number = the house's times
+name     type in the engine                          bands     engine's number / canonical number
 =======  ==========================================  ========  ========================================
-threejs  SphericalHarmonics3 (LightProbe)            any       1: it is the house's
+threejs  SphericalHarmonics3 (LightProbe)            any       1: it is the canonical one
 godot    LightmapGIData.probe_data["sh"]             any       1 / pi
 unreal   FSHVector2, FSHVector3, FSHVectorRGB3       L0 to L2  (-1)^m, the Condon-Shortley phase
 unity    SphericalHarmonicsL2 (LightProbes)          L0 to L2  K_lm A_l / pi
 =======  ==========================================  ========  ========================================
 
-- three.js: `getAt` is the radiance and `getIrradianceAt` the irradiance.
+- three.js: ``getAt`` is the radiance and ``getIrradianceAt`` the irradiance.
 - Godot: the baker averages 4 L Y over the sphere where the integral is 4 pi times the average, so that its shader,
   which folds in pi, 2 pi / 3 and pi / 4, gets irradiance / pi without a division. Not convolved.
 - Unreal: y, x, yz and xz have a minus sign, z, xy, 3z2-1 and x2-y2 have none. Its tables end with band 2. These are the
   vectors of the engine's own maths, not the packed bricks of a volumetric lightmap.
-- Unity: `Evaluate` and the shader's ShadeSH9 are plain polynomials that yield irradiance / pi. The basis' constants
+- Unity: ``Evaluate`` and the shader's ShadeSH9 are plain polynomials that yield irradiance / pi. The basis' constants
   K_lm (0.2821; 0.4886; 1.0925, 0.3154 for 3z2-1, 0.5463 for x2-y2) and the clamped cosine's A_l / pi = 1, 2/3, 1/4
   (Ramamoorthi and Hanrahan 2001) are therefore in the numbers already, and are taken out here. C# indexes them
   [channel, coefficient]; here, as everywhere in this package, the channel is last.
@@ -37,10 +38,10 @@ import numpy as np
 from wlm.errors import WlmError
 from wlm.probe.sphere import coefficient_bands, cosine_factor, sh_count
 
-__all__ = ["CONVENTIONS", "HOUSE", "from_house", "to_house"]
+__all__ = ["CONVENTIONS", "CANONICAL", "from_canonical", "to_canonical"]
 
-HOUSE = "threejs"
-CONVENTIONS = (HOUSE, "godot", "unreal", "unity")
+CANONICAL = "threejs"
+CONVENTIONS = (CANONICAL, "godot", "unreal", "unity")
 
 _LAST_BAND = {"unreal": 2, "unity": 2}
 
@@ -50,15 +51,15 @@ _BASIS = np.array([math.sqrt(0.25 / math.pi), *[_K1] * 3, _K2, _K2, math.sqrt(5.
 _COSINE = np.array([cosine_factor(band) / math.pi for band in coefficient_bands(9)])
 
 
-def to_house(values: np.ndarray, name: str) -> np.ndarray:
-    """An engine's coefficients as the house's, the module's table read from right to left.
+def to_canonical(values: np.ndarray, name: str) -> np.ndarray:
+    """Converts an engine's coefficients to canonical ones.
 
     Args:
         values: [N, C, 3], C = 1, 4, 9 ... coefficients, RGB last. NaN and Inf stay what they are.
-        name: One of `CONVENTIONS`.
+        name: One of ``CONVENTIONS``.
 
     Returns:
-        float64 [N, C, 3]; `from_house` leads back, without any rounding for "threejs" and "unreal".
+        float64 [N, C, 3]; ``from_canonical`` leads back, without any rounding for "threejs" and "unreal".
 
     Raises:
         WlmError: The name is unknown, C isn't a whole number of bands, or the engine has no such band.
@@ -67,8 +68,8 @@ def to_house(values: np.ndarray, name: str) -> np.ndarray:
     return _checked(values) / _factors(values.shape[1], name)[:, None]
 
 
-def from_house(values: np.ndarray, name: str) -> np.ndarray:
-    """The house's coefficients as an engine's; the inverse of `to_house`, with its arguments and errors."""
+def from_canonical(values: np.ndarray, name: str) -> np.ndarray:
+    """Converts canonical coefficients to an engine's; arguments and errors as for ``to_canonical``."""
     return _checked(values) * _factors(values.shape[1], name)[:, None]
 
 
@@ -79,7 +80,7 @@ def _checked(values: np.ndarray) -> np.ndarray:
 
 
 def _factors(coefficients: int, name: str) -> np.ndarray:
-    """What the house's coefficients are multiplied by, float64 [C]."""
+    """The last column of the module's table, float64 [C]."""
     if name not in CONVENTIONS:
         raise WlmError(f"convention: expected {', '.join(CONVENTIONS)}, got {name!r}")
     if sh_count(3 * coefficients) is None:

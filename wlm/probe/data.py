@@ -1,6 +1,6 @@
-"""What comes in: light probes at free positions, read from `.npz`, `.json` or Godot's `.lmbake` and checked.
+"""What comes in: light probes at free positions, read from ``.npz``, ``.json`` or Godot's ``.lmbake`` and checked.
 
-The stated behaviours. What is repaired is given in `ProbeSet.warnings`, one line a kind; probes count from 0.
+The stated behaviours. ``ProbeSet.warnings`` says what was repaired, in one line for each kind; probes count from 0.
 
 ====================================  ================================================================
 input                                 behaviour
@@ -9,7 +9,7 @@ a position NaN or infinite            error that names the probe
 positions far from the origin         kept in float64
 positions that span more than         error
 float64 holds
-coincident positions                  fine; one warning with the count of those that repeat another's:
+coincident positions                  fine; one warning with the count of those that repeat an earlier one:
                                       they decode to one value, whatever they held
 NaN, Inf in a probe                   the probe is not live and all its numbers become 0; warning with
                                       the count and the first
@@ -21,9 +21,9 @@ a number beyond +-1.8e19              error that names the probe: the loss is a 
                                       where the square of anything larger is infinite
 float16, float64, integers            converted to float32; what is too small for it becomes 0
 other types, text, ragged lists       error that names the field
-one probe, one number a probe         fine
-several arrays named `sh...`          error that lists them, unless `key` names one
-a convention that is not the house's  error where the numbers are not 1, 4 or 9 RGB coefficients (any
+one probe, one number per probe       fine
+several arrays named ``sh...``          error that lists them, unless ``key`` names one
+a convention of an engine             error where the numbers are not 1, 4 or 9 RGB coefficients (any
                                       square for Godot's)
 a file missing or damaged             error that names the file, and the field
 ====================================  ================================================================
@@ -42,22 +42,25 @@ import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_path, atomic_write
+from wlm.formats.folder import rounded
 from wlm.formats.godot import read_lmbake
-from wlm.probe.conventions import CONVENTIONS, HOUSE, from_house, to_house
+from wlm.probe.conventions import CANONICAL, CONVENTIONS, from_canonical, to_canonical
 from wlm.probe.sphere import sh_count
 
-__all__ = ["LARGEST", "ProbeSet", "from_arrays", "load_probes", "save_probes"]
+__all__ = ["LARGEST", "ProbeSet", "from_arrays", "load", "load_positions", "save_probes"]
 
 LARGEST = float(np.sqrt(np.finfo(np.float32).max))
 """The largest number whose square float32 still holds."""
 
-_POSITION, _CONVENTION, _PROBES = "position", "convention", "probes"
-_SH = "sh"
+_T = TypeVar("_T")
+
+_POSITION, _CONVENTION, _PROBES, _SH = "position", "convention", "probes", "sh"
 # What NumPy and the modules below it raise on a file that is none, is cut short, or lies about its sizes.
 _BAD_FILE = (
     OSError,
@@ -83,12 +86,11 @@ class ProbeSet:
         name: The set's name.
         position: float64 [N, 3], in the input's unit and axes.
         values: float32 [N, D], finite; zero where a probe is not live. For spherical harmonics D = 3 C, and
-            `values.reshape(N, C, 3)` are coefficients of radiance in the house's convention
-            (`wlm.probe.conventions`), RGB last.
+            ``values.reshape(N, C, 3)`` are canonical coefficients of radiance (``wlm.probe.conventions``), RGB last.
         key: Name of the array that was read.
         live: bool [N], false where the probe takes no part in the fit and decodes to zero; at least one is true.
         source: 16 hexadecimal digits of BLAKE2b over the positions, the values and which are live.
-        warnings: What was repaired or is odd, one line each.
+        warnings: What was repaired, one line each.
     """
 
     name: str
@@ -111,13 +113,13 @@ class ProbeSet:
 
     @property
     def float_bytes(self) -> int:
-        """Size of the values in float32, what a compressed size is compared with."""
+        """Size of the values in float32, with which a compressed size is compared."""
         return self.probes * self.outputs * 4
 
 
 @dataclass(frozen=True)
 class _Raw:
-    """What a file holds, not yet checked: positions, values, the name of their array, the convention it states."""
+    """The content of a file, not yet checked; ``key`` names the array of values, ``convention`` is what it states."""
 
     position: np.ndarray
     values: np.ndarray
@@ -125,26 +127,21 @@ class _Raw:
     convention: str
 
 
-def load_probes(
-    path: str | os.PathLike[str],
-    *,
-    key: str | None = None,
-    convention: str | None = None,
-) -> ProbeSet:
-    """Read light probes from a file.
+def load(path: str | os.PathLike[str], *, key: str | None = None, convention: str | None = None) -> ProbeSet:
+    """Reads light probes from a file.
 
-    - `.npz`: arrays `position` (N, 3) and `sh...` (N, C, 3) or (N, D), and a string `convention` if it isn't the
-      house's.
-    - `.json`: `{"position": [[x, y, z], ...], "sh": [[[r, g, b], ...], ...]}`, or
-      `{"probes": [{"position": [x, y, z], "sh": [[r, g, b], ...]}, ...]}`, and `"convention"` likewise.
-    - `.lmbake`: a lightmap bake of Godot 4.
+    - ``.npz``: arrays ``position`` (N, 3) and ``sh...`` (N, C, 3) or (N, D), and a string ``convention`` if they aren't
+      canonical.
+    - ``.json``: ``{"position": [[x, y, z], ...], "sh": [[[r, g, b], ...], ...]}``, or
+      ``{"probes": [{"position": [x, y, z], "sh": [[r, g, b], ...]}, ...]}``, and ``"convention"`` likewise.
+    - ``.lmbake``: a lightmap bake of Godot 4.
 
     Args:
         path: The file; its suffix tells the kind.
         key: Name of the array of values, or that name without "sh_" in front of it ("12.00" for "sh_12.00"). None
             takes the only one whose name begins with "sh".
-        convention: One of `wlm.probe.conventions.CONVENTIONS`, in which the file's numbers are. None takes what the
-            file states: "godot" for `.lmbake`, else its `convention`, else the house's.
+        convention: One of ``wlm.probe.conventions.CONVENTIONS``, in which the file's numbers are. None takes what the
+            file states: "godot" for ``.lmbake``, else its ``convention``, else the canonical one.
 
     Returns:
         The set, repaired as the module's table says.
@@ -163,22 +160,52 @@ def load_probes(
     return _check(str(path), path.stem, raw.position, raw.values, raw.key, stated)
 
 
+def load_positions(path: str | os.PathLike[str]) -> np.ndarray:
+    """Reads the positions of a probe file, whatever else is in it, or a list of points.
+
+    Args:
+        path: A file as for ``load``, which needs to hold no values, or JSON, ``[[x, y, z], ...]``. What ends neither in
+            .npz nor in .lmbake is taken for JSON.
+
+    Returns:
+        float64 [M, 3], finite, M at least 1.
+
+    Raises:
+        WlmError: The file is missing, damaged, or holds something else.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise WlmError(f"{path}: no such file")
+    kind = path.suffix.lower()
+    if kind == ".npz":
+        position = _read_arrays(path, lambda file: file[_POSITION])
+    elif kind == ".lmbake":
+        position = read_lmbake(path)[0]
+    else:
+        content = _json(path)
+        if isinstance(content, list):
+            position = _numbers(path, _POSITION, content)
+        else:
+            position = _fields(path, content)[1](_POSITION)
+    return _check_positions(str(path), position)
+
+
 def from_arrays(
     position: np.ndarray,
     values: np.ndarray,
     *,
     name: str = "array",
     key: str = _SH,
-    convention: str = HOUSE,
+    convention: str = CANONICAL,
 ) -> ProbeSet:
-    """Make a checked set of arrays, under the same rules as `load_probes`.
+    """Makes a checked set of arrays, under the same rules as ``load``.
 
     Args:
         position: [N, 3] of numbers; copied.
         values: [N, C, 3], RGB last, or [N, D] of numbers; copied.
         name: The set's name, used in messages too.
         key: What the values are called.
-        convention: One of `wlm.probe.conventions.CONVENTIONS`, in which the values are.
+        convention: One of ``wlm.probe.conventions.CONVENTIONS``, in which the values are.
 
     Returns:
         The set, repaired as the module's table says.
@@ -195,9 +222,9 @@ def save_probes(
     values: np.ndarray,
     *,
     key: str = _SH,
-    convention: str = HOUSE,
+    convention: str = CANONICAL,
 ) -> None:
-    """Write probes as `.npz` or `.json`, whole or not at all, such that `load_probes` reads them back.
+    """Writes probes as ``.npz`` or ``.json``, whole or not at all, such that ``load`` reads them back.
 
     Where D is that of RGB spherical harmonics, they are written as (N, C, 3), else as (N, D). The file states the
     convention.
@@ -205,9 +232,9 @@ def save_probes(
     Args:
         path: The file to write; its suffix tells the kind, its folder must exist.
         position: [N, 3].
-        values: float32 [N, D], finite, in the house's convention.
+        values: float32 [N, D], finite, canonical.
         key: Name of the array of values.
-        convention: One of `wlm.probe.conventions.CONVENTIONS`, to write the values in.
+        convention: One of ``wlm.probe.conventions.CONVENTIONS``, to write the values in.
 
     Raises:
         ValueError: The shapes don't fit, or a number is NaN or infinite.
@@ -223,7 +250,7 @@ def save_probes(
     # The last two are arguments of NumPy's writer.
     if key in (_POSITION, _CONVENTION, _PROBES, "file", "allow_pickle"):
         raise WlmError(f"{path}: expected another name for the values, {key!r} means something else")
-    engine = _convert(str(path), values, convention, from_house)
+    engine = _convert(str(path), values, convention, from_canonical)
     if position.dtype != np.float32:  # half the bytes, where the caller has no more digits
         position = position.astype(np.float64)
     suffix = path.suffix.lower()
@@ -232,50 +259,67 @@ def save_probes(
         with atomic_path(path) as temporary, open(temporary, "wb") as file:
             np.savez_compressed(file, **arrays)
     elif suffix == ".json":
-        content = {_CONVENTION: convention, _POSITION: position.tolist(), key: _shortest(engine)}
+        content = {_CONVENTION: convention, _POSITION: position.tolist(), key: rounded(engine)}
         atomic_write(path, json.dumps(content).encode())
     else:
         raise WlmError(f"{path}: expected a name that ends in .npz or .json, found {path.suffix or 'none'}")
 
 
 def _read_npz(path: Path, key: str | None) -> _Raw:
+    def read(file: np.lib.npyio.NpzFile) -> _Raw:
+        name = _choose(path, file.files, key)
+        stated = file[_CONVENTION].tolist() if _CONVENTION in file.files else CANONICAL
+        return _Raw(file[_POSITION], file[name], name, _text(path, stated))
+
+    return _read_arrays(path, read)
+
+
+def _read_arrays(path: Path, read: Callable[[np.lib.npyio.NpzFile], _T]) -> _T:
+    """What ``read`` takes from a ``.npz`` file."""
     try:
         loaded = np.load(path, allow_pickle=False)
         if not isinstance(loaded, np.lib.npyio.NpzFile):
             raise WlmError(f"{path}: expected a .npz file of several arrays, found a single array")
         with loaded as file:
-            name = _choose(path, file.files, key)
-            stated = file[_CONVENTION].tolist() if _CONVENTION in file.files else HOUSE
-            return _Raw(file[_POSITION], file[name], name, _text(path, stated))
+            return read(file)
     except _BAD_FILE as error:
         raise WlmError(f"{path}: cannot read the arrays: {error or type(error).__name__}") from error
 
 
 def _read_json(path: Path, key: str | None) -> _Raw:
+    content = _json(path)
+    names, read = _fields(path, content)
+    name = _choose(path, names, key)
+    return _Raw(read(_POSITION), read(name), name, _text(path, content.get(_CONVENTION, CANONICAL)))
+
+
+def _json(path: Path) -> Any:
     try:
-        content = json.loads(path.read_bytes())
+        return json.loads(path.read_bytes())
     except OSError as error:
         raise WlmError(f"{path}: cannot read: {error.strerror or error}") from error
     except (ValueError, RecursionError) as error:
         raise WlmError(f"{path}: not valid JSON: {error}") from error
+
+
+def _fields(path: Path, content: Any) -> tuple[list[str], Callable[[str], np.ndarray]]:
+    """Names of the probes' fields in either form of JSON, and a function that reads one as an array."""
     if not isinstance(content, dict):
         raise WlmError(f"{path}: expected a JSON object, got {_kind(content)}")
-    convention = _text(path, content.get(_CONVENTION, HOUSE))
     if _PROBES not in content:
-        name = _choose(path, content, key)
-        rows = [_rows(path, content, field) for field in (_POSITION, name)]
-    else:
-        probes = _rows(path, content, _PROBES)
+        return list(content), lambda field: _numbers(path, field, _rows(path, content, field))
+    probes = _rows(path, content, _PROBES)
+    for i, probe in enumerate(probes):
+        if not isinstance(probe, dict):
+            raise WlmError(f"{path}: {_PROBES}[{i}]: expected an object (position, sh), got {_kind(probe)}")
+
+    def read(field: str) -> np.ndarray:
         for i, probe in enumerate(probes):
-            if not isinstance(probe, dict):
-                raise WlmError(f"{path}: {_PROBES}[{i}]: expected an object (position, sh), got {_kind(probe)}")
-        name = _choose(path, probes[0] if probes else {_POSITION: [], _SH: []}, key)
-        for i, probe in enumerate(probes):
-            for field in (_POSITION, name):
-                if field not in probe:
-                    raise WlmError(f"{path}: {_PROBES}[{i}].{field} is missing")
-        rows = [[probe[field] for probe in probes] for field in (_POSITION, name)]
-    return _Raw(_numbers(path, _POSITION, rows[0]), _numbers(path, name, rows[1]), name, convention)
+            if field not in probe:
+                raise WlmError(f"{path}: {_PROBES}[{i}].{field} is missing")
+        return _numbers(path, field, [probe[field] for probe in probes])
+
+    return list(probes[0]) if probes else [_POSITION, _SH], read
 
 
 def _read_godot(path: Path, key: str | None) -> _Raw:
@@ -283,30 +327,26 @@ def _read_godot(path: Path, key: str | None) -> _Raw:
     return _Raw(position, values, _choose(path, (_POSITION, _SH), key), "godot")
 
 
-_READERS: dict[str, Callable[[Path, str | None], _Raw]] = {
-    ".npz": _read_npz,
-    ".json": _read_json,
-    ".lmbake": _read_godot,
-}
+_READERS = {".npz": _read_npz, ".json": _read_json, ".lmbake": _read_godot}
 
 
 def _choose(path: Path, names: Sequence[str], key: str | None) -> str:
     """Picks the array of values by its name, with or without "sh_", or the only one that begins with "sh"."""
     if _POSITION not in names:
         raise WlmError(f"{path}: {_POSITION} is missing; found {', '.join(names) or 'nothing'}")
-    others = [name for name in names if name not in (_POSITION, _CONVENTION)]
-    listed = ", ".join(others) or "nothing"
+    fields = [name for name in names if name not in (_POSITION, _CONVENTION)]
+    listed = ", ".join(fields) or "nothing"
     if key is not None:
         for name in (key, f"{_SH}_{key}"):
-            if name in others:
+            if name in fields:
                 return name
         raise WlmError(f"{path}: expected values named {key} or {_SH}_{key}; found {listed}")
-    found = [name for name in others if name.startswith(_SH)]
-    if not found:
+    candidates = [name for name in fields if name.startswith(_SH)]
+    if not candidates:
         raise WlmError(f"{path}: expected values whose name begins with {_SH}, or the key of others; found {listed}")
-    if len(found) > 1:
-        raise WlmError(f"{path}: several sets of values; give the key of one: {', '.join(found)}")
-    return found[0]
+    if len(candidates) > 1:
+        raise WlmError(f"{path}: several sets of values; give the key of one: {', '.join(candidates)}")
+    return candidates[0]
 
 
 def _text(path: Path, value: object) -> str:
@@ -316,8 +356,8 @@ def _text(path: Path, value: object) -> str:
 
 
 def _rows(path: Path, holder: dict, field: str) -> list:
-    if not isinstance(holder[field], list):
-        raise WlmError(f"{path}: {field}: expected a list, got {_kind(holder[field])}")
+    if not isinstance(holder.get(field), list):
+        raise WlmError(f"{path}: {field}: expected a list, got {_kind(holder.get(field))}")
     return holder[field]
 
 
@@ -328,7 +368,7 @@ def _numbers(path: Path, field: str, rows: list) -> np.ndarray:
         return array
     shapes = [None if row is None else row.shape for row in map(_array, rows)]
     odd = next((i for i, shape in enumerate(shapes) if shape is None or shape != shapes[0]), 0)
-    raise WlmError(f"{path}: {field} of probe {odd}: expected numbers, as many as probe 0 has, got {_kind(rows[odd])}")
+    raise WlmError(f"{path}: {field}[{odd}]: expected numbers, as many as {field}[0] has, got {_kind(rows[odd])}")
 
 
 def _array(value: object) -> np.ndarray | None:
@@ -341,32 +381,26 @@ def _array(value: object) -> np.ndarray | None:
 
 
 def _kind(value: object) -> str:
-    """Names a JSON value shortly."""
+    """A short name of a JSON value."""
     if isinstance(value, dict):
         return "an object"
     text = json.dumps(value)
     return text if len(text) <= 60 else text[:57] + "..."
 
 
-def _shortest(values: np.ndarray) -> list:
-    """Nested lists of float32 numbers, each with the nine digits that lead back to it and not float64's seventeen."""
-    flat = [float(f"{value:.9g}") for value in values.ravel().tolist()]
-    return np.array(flat).reshape(values.shape).tolist()
-
-
 def _convert(where: str, values: np.ndarray, name: str, change: Callable[[np.ndarray, str], np.ndarray]) -> np.ndarray:
-    """Brings [N, C, 3] or [N, D] from or to a convention; [N, C, 3] where that is what D makes, else [N, D]."""
+    """Brings [N, C, 3] or [N, D] from or to a convention; the result is [N, C, 3] where D = 3 C, else [N, D]."""
     if name not in CONVENTIONS:
         raise WlmError(f"{where}: {_CONVENTION}: expected {', '.join(CONVENTIONS)}, got {name!r}")
     coefficients = sh_count(int(np.prod(values.shape[1:])))
     if coefficients is not None:
         values = values.reshape(len(values), coefficients, 3)
-    if name == HOUSE:
+    if name == CANONICAL:
         return values
     if coefficients is None:
         raise WlmError(
             f"{where}: convention {name}: expected spherical harmonics of 1, 4, 9 ... RGB coefficients, "
-            f"got {values.shape[1:]} numbers a probe"
+            f"got {values.shape[1:]} numbers per probe"
         )
     try:
         with np.errstate(over="ignore"):
@@ -384,30 +418,24 @@ def _check(
     convention: str,
 ) -> ProbeSet:
     """Applies the module's table to what was read."""
-    for field, array in ((_POSITION, position), (key, values)):
-        if array.dtype.kind not in "iuf":
-            raise WlmError(f"{where}: {field}: expected numbers, got {array.dtype}")
-    count = len(position) if position.ndim else 0
-    if count == 0:
-        raise WlmError(f"{where}: {_POSITION}: holds no probes")
-    if position.shape != (count, 3):
-        raise WlmError(f"{where}: {_POSITION}: expected (N, 3), got {position.shape}")
+    position = _check_positions(where, position)
+    count = len(position)
+    if values.dtype.kind not in "iuf":
+        raise WlmError(f"{where}: {key}: expected numbers, got {values.dtype}")
     if values.ndim not in (2, 3) or len(values) != count or values.size == 0 or values.shape[2:] not in ((), (3,)):
         raise WlmError(
             f"{where}: {key}: expected ({count}, C, 3) with RGB last or ({count}, D), a row for each position, "
             f"got {values.shape}"
         )
-    position = position.astype(np.float64)
-    _check_positions(where, position)
 
     # float64, so that what doesn't fit float32 is told from Inf; integers have no NaN to look for.
     wide = values.astype(np.float64)
     finite = np.isfinite(wide).all(axis=tuple(range(1, wide.ndim)))
-    wide = _convert(where, wide, convention, to_house).reshape(count, -1)
+    wide = _convert(where, wide, convention, to_canonical).reshape(count, -1)
     beyond = np.flatnonzero(finite & (np.abs(wide).max(axis=1) > LARGEST))
     if len(beyond):
         worst = np.abs(wide[beyond[0]]).max()
-        raise WlmError(f"{where}: {key} of probe {beyond[0]}: expected numbers within {LARGEST:.2g}, got {worst:.3g}")
+        raise WlmError(f"{where}: {key}[{beyond[0]}]: expected numbers within {LARGEST:.2g}, got {worst:.3g}")
     wide[~finite] = 0.0
     checked = wide.astype(np.float32)
     live = (checked != 0.0).any(axis=1)
@@ -427,15 +455,25 @@ def _check(
     return ProbeSet(name, position, checked, key, live, _hash(position, checked, live), tuple(warnings))
 
 
-def _check_positions(where: str, position: np.ndarray) -> None:
+def _check_positions(where: str, position: np.ndarray) -> np.ndarray:
+    """float64 [N, 3]."""
+    if position.dtype.kind not in "iuf":
+        raise WlmError(f"{where}: {_POSITION}: expected numbers, got {position.dtype}")
+    count = len(position) if position.ndim else 0
+    if count == 0:
+        raise WlmError(f"{where}: {_POSITION}: expected at least one, found none")
+    if position.shape != (count, 3):
+        raise WlmError(f"{where}: {_POSITION}: expected (N, 3), got {position.shape}")
+    position = position.astype(np.float64)
     bad = np.flatnonzero(~np.isfinite(position).all(axis=1))
     if len(bad):
         text = ", ".join(f"{x:g}" for x in position[bad[0]])
-        raise WlmError(f"{where}: {_POSITION} of probe {bad[0]}: expected finite numbers, got ({text})")
+        raise WlmError(f"{where}: {_POSITION}[{bad[0]}]: expected finite numbers, got ({text})")
     with np.errstate(over="ignore"):
         extent = np.ptp(position, axis=0).max()
     if not np.isfinite(extent):
-        raise WlmError(f"{where}: {_POSITION}: the probes lie further apart than float64 can tell")
+        raise WlmError(f"{where}: {_POSITION}: the positions lie further apart than float64 can tell")
+    return position
 
 
 def _repeated(position: np.ndarray) -> int:

@@ -18,7 +18,7 @@ __all__ = ["CULLINGS", "Decoder", "Points"]
 
 Culling = Literal["box", "sphere", "exact", "none"]
 CULLINGS = ("exact", "box", "sphere", "none")
-"""How the Gaussians of a cube are found; see ``Decoder``."""
+"""How a cube's list of Gaussians is made; see ``Decoder``."""
 
 
 class Points:
@@ -26,7 +26,7 @@ class Points:
 
     Attributes:
         x: vec3 [M], normalised, along a Z-curve.
-        order: int [M], the place that each had.
+        order: int [M], the place that each had in the input.
         out: float [M, D], filled by ``Decoder.run``.
     """
 
@@ -37,7 +37,7 @@ class Points:
         self.out = wp.zeros((len(x), model.outputs), dtype=float, device=device)
 
     def values(self) -> np.ndarray:
-        """What was decoded, float32 [M, D], in the points' own order."""
+        """The decoded light, float32 [M, D], in the order of the input."""
         result = np.empty(self.out.shape, np.float32)
         result[self.order] = self.out.numpy()
         return result
@@ -50,7 +50,7 @@ class Decoder:
     for what a Gaussian reaches is tested again at each point; they differ in how many Gaussians a list has in vain.
 
     Attributes:
-        model, device: As given.
+        model, device: The arguments.
         pairs: Entries in all lists.
     """
 
@@ -94,16 +94,11 @@ class Decoder:
         else:
             self._cubes = probe_cubes.build(self._shapes, low, high, cube, test=culling)
         self.pairs = self._cubes.item.shape[0]
-        self._net = wp.array(self._padded_net(), dtype=float, device=self.device)
+        first, second, third = (layer.astype(np.float32) for layer in model.layers())
+        third = np.pad(third, ((0, 0), (0, probe_network.padded(model.outputs) - model.outputs)))
+        net = np.concatenate([first.ravel(), second.ravel(), third.ravel()])
+        self._net = wp.array(net, dtype=float, device=self.device)
         self._kernels = decode_kernels(p.latent, p.hidden, model.outputs, kind)
-
-    def _padded_net(self) -> np.ndarray:
-        """The network as the kernels take it: float32, rows of the last layer padded."""
-        p, d = self.model.profile, self.model.outputs
-        before = (p.latent + 4) * p.hidden + (p.hidden + 1) * p.hidden
-        third = np.zeros((p.hidden + 1, probe_network.padded(d)), np.float32)
-        third[:, :d] = self.model.net[before:].reshape(p.hidden + 1, d)
-        return np.concatenate([self.model.net[:before].astype(np.float32), third.ravel()])
 
     @property
     def device_bytes(self) -> int:
@@ -164,8 +159,6 @@ class Decoder:
         """
         model = self.model
         if position is None:
-            if not len(model.positions):
-                raise WlmError(f"{model.name}: the model has no positions stored; expected them to be given")
             position = model.stored_positions()
         if len(position) != model.probes:
             raise WlmError(f"{model.name}: expected the positions of {model.probes} probes, got {len(position)}")

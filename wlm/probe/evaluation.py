@@ -8,7 +8,7 @@ The stated behaviours:
 ====================================  ================================================================
 input                                 behaviour
 ====================================  ================================================================
-decoded exactly                       PSNR is infinite; null in JSON, with an error of 0 beside it
+decoded exactly                       PSNR is 120 dB, the cap of ``wlm.metrics``; its error is 0
 all coefficients equal (range 0)      PSNR is NaN, null in JSON: there is no scale to measure against
 irradiance the same everywhere        the same for its PSNR
 D is not 3 (l + 1)²                   no bands and no irradiance: None
@@ -19,7 +19,6 @@ another number of probes or outputs   error
 ====================================  ================================================================
 """
 
-import dataclasses
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -27,10 +26,15 @@ from typing import Any
 import numpy as np
 
 from wlm.errors import WlmError
+from wlm.metrics import psnr_from_mse
 from wlm.probe.data import ProbeSet
+from wlm.probe.decode import Decoder
+from wlm.probe.model import ProbeModel
 from wlm.probe.sphere import coefficient_bands, fibonacci_sphere, irradiance, sh_count
+from wlm.system import Meter, OnProgress
+from wlm.system import Report as BaseReport
 
-__all__ = ["NORMALS", "Report", "evaluate"]
+__all__ = ["NORMALS", "Report", "evaluate", "score"]
 
 # The mean square of any L2 irradiance over these is within 6% of that over the sphere: a score within 0.3 dB.
 NORMALS = 32
@@ -38,8 +42,8 @@ _ROWS = 32768  # of probes in one piece, so that float64 copies stay at some ten
 
 
 @dataclass(frozen=True)
-class Report:
-    """What compressed probes weigh and how wrong they are.
+class Report(BaseReport):
+    """Size and errors of compressed probes.
 
     Every PSNR is ``10 log10(peak² / mse)``. For coefficients the peak is one number, largest less smallest of all
     coefficients of all probes of the input, so that the bands and the coefficients can be compared.
@@ -80,13 +84,40 @@ class Report:
     psnr_by_coefficient: np.ndarray
     irradiance_psnr: float | None
 
-    def to_json(self) -> dict[str, Any]:
-        """The report as JSON's own types, under the attributes' names; NaN and infinity are None."""
-        return _plain({field.name: getattr(self, field.name) for field in dataclasses.fields(self)})
+
+def evaluate(
+    model: ProbeModel,
+    probes: ProbeSet,
+    *,
+    device: str = "cpu",
+    progress: OnProgress | None = None,
+    file_bytes: int | None = None,
+) -> Report:
+    """Decodes a model at its probes and compares them with the input.
+
+    Args:
+        model: The model.
+        probes: The input, in the order of the fit.
+        device: Where it is decoded.
+        progress: Called after the decode and at the end.
+        file_bytes: Size of the model's file; None: of the one that ``model.save`` writes.
+
+    Returns:
+        The report.
+
+    Raises:
+        WlmError: No such device, or as ``score``.
+    """
+    meter = Meter(progress, "evaluate", 2)
+    decoded = Decoder(model, device).decode_probes(probes.position)
+    meter.report(1)
+    report = score(decoded, probes, model.file_bytes() if file_bytes is None else file_bytes)
+    meter.report(2, PSNR_dB=report.psnr)
+    return report
 
 
-def evaluate(decoded: np.ndarray, probes: ProbeSet, file_bytes: int) -> Report:
-    """Compares decoded probes with their input.
+def score(decoded: np.ndarray, probes: ProbeSet, file_bytes: int) -> Report:
+    """Compares probes that any decoder gave with their input.
 
     Args:
         decoded: float32 [N, D], in the input's order.
@@ -136,7 +167,7 @@ def evaluate(decoded: np.ndarray, probes: ProbeSet, file_bytes: int) -> Report:
     by_band = None
     if coefficients is not None:
         band = np.repeat(coefficient_bands(coefficients), 3)
-        by_band = [_psnr(by_coefficient[band == i].mean(), peak) for i in range(band[-1] + 1)]
+        by_band = [psnr_from_mse(by_coefficient[band == i].mean(), peak) for i in range(band[-1] + 1)]
     return Report(
         name=probes.name,
         probes=count,
@@ -146,31 +177,23 @@ def evaluate(decoded: np.ndarray, probes: ProbeSet, file_bytes: int) -> Report:
         bits_per_probe=file_bytes * 8 / count,
         ratio=file_bytes / (count * outputs * 4),
         peak=peak,
-        psnr=_psnr(mse, peak),
-        psnr_live=_psnr(by_probe[live].mean(), peak) if live.any() else math.nan,
+        psnr=psnr_from_mse(mse, peak),
+        psnr_live=psnr_from_mse(by_probe[live].mean(), peak) if live.any() else math.nan,
         mse=mse,
         mean_abs_error=absolute / (count * outputs),
         max_abs_error=largest,
         worst_probe=_worst(by_probe, probes.position, peak),
         psnr_by_band=by_band,
-        psnr_by_coefficient=np.array([_psnr(error, peak) for error in by_coefficient]),
+        psnr_by_coefficient=np.array([psnr_from_mse(error, peak) for error in by_coefficient]),
         irradiance_psnr=None if coefficients is None else _irradiance_psnr(decoded[live], values[live], coefficients),
     )
-
-
-def _psnr(mse: float, peak: float) -> float:
-    """Decibels: infinite without an error, NaN without a range."""
-    if peak == 0.0:
-        return math.nan
-    # Two logarithms and no square: a range of 1e-200 squared would underflow to zero.
-    return 20.0 * math.log10(peak) - 10.0 * math.log10(mse) if mse > 0.0 else math.inf
 
 
 def _worst(by_probe: np.ndarray, position: np.ndarray, peak: float) -> dict[str, Any] | None:
     worst = int(np.argmax(by_probe))
     if by_probe[worst] == 0.0:
         return None
-    return {"probe": worst, "psnr": _psnr(by_probe[worst], peak), "position": position[worst].tolist()}
+    return {"probe": worst, "psnr": psnr_from_mse(by_probe[worst], peak), "position": position[worst].tolist()}
 
 
 def _irradiance_psnr(decoded: np.ndarray, values: np.ndarray, coefficients: int) -> float:
@@ -182,20 +205,7 @@ def _irradiance_psnr(decoded: np.ndarray, values: np.ndarray, coefficients: int)
     rows = max(1, _ROWS // NORMALS)
     for start in range(0, len(values), rows):
         pair = np.stack([values[start : start + rows], decoded[start : start + rows]])
-        wanted, got = irradiance(pair.reshape(2, -1, coefficients, 3), normals)
-        low, high = min(low, float(wanted.min())), max(high, float(wanted.max()))
-        total += float(np.square(got - wanted).sum())
-    return _psnr(total / (len(values) * NORMALS * 3), high - low)
-
-
-def _plain(value: Any) -> Any:
-    """NumPy, NaN and infinity to what JSON holds."""
-    if isinstance(value, np.ndarray | np.generic):
-        value = value.tolist()
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_plain(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
+        exact, predicted = irradiance(pair.reshape(2, -1, coefficients, 3), normals)
+        low, high = min(low, float(exact.min())), max(high, float(exact.max()))
+        total += float(np.square(predicted - exact).sum())
+    return psnr_from_mse(total / (len(values) * NORMALS * 3), high - low)

@@ -4,7 +4,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.special import expit
 
-from wlm.probe.model import CENTRE, CENTRE_BITS, LATENT, ROTATION, SCALE, ProbeModel
+from wlm.probe.model import CENTRE, LATENT, ROTATION, SCALE, ProbeModel
 
 __all__ = ["decode64"]
 
@@ -32,7 +32,7 @@ def decode64(model: ProbeModel, position: np.ndarray) -> np.ndarray:
     scale = np.exp(rows[:, SCALE])
     q = np.where(np.linalg.norm(rows[:, ROTATION], axis=1, keepdims=True) < _SHORTEST, [1, 0, 0, 0], rows[:, ROTATION])
     whiten = Rotation.from_quat(q[:, [1, 2, 3, 0]]).as_matrix().transpose(0, 2, 1) / scale[:, :, None]  # S^-1 R^T
-    net = _layers(model)
+    net = [(layer[:-1], layer[-1]) for layer in (layer.astype(np.float64) for layer in model.layers())]
     out = np.empty((len(x), model.outputs))
     piece = max(1, _PAIRS // model.count)
     for start in range(0, len(x), piece):
@@ -40,10 +40,10 @@ def decode64(model: ProbeModel, position: np.ndarray) -> np.ndarray:
         away = part[:, None] - rows[:, CENTRE]
         d2 = (np.einsum("kij,nkj->nki", whiten, away) ** 2).sum(2)
         if p.support == "sphere":
-            reached = (away**2).sum(2) < (p.cut * scale.max(1)) ** 2
+            within = (away**2).sum(2) < (p.cut * scale.max(1)) ** 2
         else:
-            reached = d2 < p.cut**2
-        h = np.concatenate([np.where(reached, np.exp(-0.5 * d2), 0.0) @ rows[:, LATENT], part], 1)
+            within = d2 < p.cut**2
+        h = np.concatenate([np.where(within, np.exp(-0.5 * d2), 0.0) @ rows[:, LATENT], part], 1)
         for weight, bias in net[:2]:
             h = expit(h @ weight + bias)
         out[start : start + piece] = h @ net[2][0] + net[2][1]
@@ -53,16 +53,4 @@ def decode64(model: ProbeModel, position: np.ndarray) -> np.ndarray:
 def _rows(model: ProbeModel) -> np.ndarray:
     """Eq. 14, float64 [K, 10 + L]."""
     low, high = model.bounds.astype(np.float64)
-    levels = np.full(len(low), 2.0**model.profile.bits - 1.0)
-    levels[CENTRE] = 2.0**CENTRE_BITS - 1.0
-    return low + np.concatenate([model.centre, model.code], 1) * ((high - low) / levels)
-
-
-def _layers(model: ProbeModel) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Weights [inputs, outputs] and biases [outputs] of the three layers, float64."""
-    hidden = model.profile.hidden
-    sizes = [(model.profile.latent + 4, hidden), (hidden + 1, hidden), (hidden + 1, model.outputs)]
-    ends = np.cumsum([rows * columns for rows, columns in sizes])
-    parts = np.split(model.net.astype(np.float64), ends[:-1])
-    layers = [part.reshape(size) for part, size in zip(parts, sizes, strict=True)]
-    return [(layer[:-1], layer[-1]) for layer in layers]
+    return low + model.codes * ((high - low) / (2.0 ** model.profile.code_bits() - 1.0))

@@ -5,20 +5,18 @@ paper's numbers are half floats. Here those of the Gaussians are the file's own 
 exactly what was trained, where a half float may move a centre by a 4096th of the box.
 """
 
-import json
 import os
-import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from wlm.errors import WlmError
-from wlm.formats.atomic import atomic_write
-from wlm.probe.conventions import HOUSE
+from wlm.formats.folder import compact_json, rounded, staged
+from wlm.probe.conventions import CANONICAL
 from wlm.probe.data import save_probes
 from wlm.probe.decode import Decoder
-from wlm.probe.model import CENTRE, CENTRE_BITS, ProbeModel
+from wlm.probe.model import CENTRE, SCALE, ProbeModel
 from wlm.probe.shader import HEAD_WORDS, gaussian_words, probe_glsl
 from wlm.probe.sphere import sh_count
 
@@ -42,9 +40,9 @@ POSITIONS_FILE = "positions.bin"
 SHADER_FILE = "probe.glsl"
 REFERENCE_FILE = "reference.json"
 
+_FILES = {INFO_FILE, GAUSSIANS_FILE, NETWORK_FILE, POSITIONS_FILE, SHADER_FILE, REFERENCE_FILE}
 _REFERENCES = 64  # positions in reference.json, and one outside the box
 _FOUR = 4
-_LIST_OF_NUMBERS = re.compile(r"\[\n([^\[\]{}\"]*)\]")
 
 _ABOUT = {
     "place": "x = (position - origin) / extent, then each coordinate of x clamped to 0 ... size. The Gaussians and the "
@@ -78,16 +76,16 @@ def export(model: ProbeModel, directory: str | os.PathLike[str], *, device: str 
     if the model has positions, ``reference.json`` has the light at some places to compare with, and ``probe.json``
     explains itself under "about".
 
-    Each file is written whole or not at all, ``probe.json`` last. Into a folder of an earlier export the new one is
-    written over the old; other files there stay.
+    All files are made beside the folder and moved in together, ``probe.json`` last. A new export replaces an earlier
+    one in its folder; other files there stay.
 
     Args:
-        model: From ``codec.read`` or ``fit.compress``.
+        model: The model.
         directory: The folder; made if it isn't there.
         device: Where the reference is decoded.
 
     Returns:
-        The files written, in the order of writing.
+        The files written, ``probe.json`` last.
 
     Raises:
         WlmError: The folder holds something other than an earlier export, or can't be written; no such device; or a
@@ -108,67 +106,37 @@ def export(model: ProbeModel, directory: str | os.PathLike[str], *, device: str 
     }
     if len(model.positions):
         files[POSITIONS_FILE] = np.ascontiguousarray(model.positions, "<u2").tobytes()
-    text = _document(model, {name: len(content) for name, content in files.items()})
-    _claim(folder)
-    for name, content in files.items():
-        atomic_write(folder / name, content)
-    save_probes(folder / REFERENCE_FILE, position, values)
-    atomic_write(folder / INFO_FILE, text.encode())
-    if POSITIONS_FILE not in files:
-        try:
-            (folder / POSITIONS_FILE).unlink(missing_ok=True)
-        except OSError as error:
-            raise WlmError(f"{folder}: cannot remove the old export: {error.strerror or error}") from error
-    return [folder / name for name in (*files, REFERENCE_FILE, INFO_FILE)]
-
-
-def _claim(folder: Path) -> None:
-    """Makes the folder, or checks that it is empty or of an earlier export."""
+    document = _document(model, {name: len(content) for name, content in files.items()})
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        empty = not any(folder.iterdir())
+        folder.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise WlmError(f"{folder}: cannot export there: {error.strerror or error}") from error
-    if empty:
-        return
-    try:
-        found = json.loads((folder / INFO_FILE).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        found = None
-    if not isinstance(found, dict) or found.get("format") != FORMAT:
-        raise WlmError(f"{folder}: expected an empty folder or one of an earlier export, found other files")
-
-
-def _steps(model: ProbeModel) -> np.ndarray:
-    """What a code counts, of each number; float32 [10 + L], as ``ProbeModel.gaussians`` has it."""
-    low, high = model.bounds
-    levels = np.full(len(low), 2**model.profile.bits - 1, np.float32)
-    levels[CENTRE] = 2**CENTRE_BITS - 1
-    return (high - low) / levels
+        raise WlmError(f"{folder}: cannot write there: {error.strerror or error}") from error
+    with staged(folder, INFO_FILE, FORMAT, _FILES.__contains__) as temporary:
+        for name, content in files.items():
+            (temporary / name).write_bytes(content)
+        save_probes(temporary / REFERENCE_FILE, position, values)
+        (temporary / INFO_FILE).write_text(compact_json(document), encoding="utf-8")
+    return [folder / name for name in (*files, REFERENCE_FILE, INFO_FILE)]
 
 
 def _gaussian_bytes(model: ProbeModel) -> bytes:
     words = gaussian_words(model.profile.latent)
     codes = np.zeros((model.count, 2 * words), "<u2")
-    whole = np.concatenate([model.centre, model.code], 1)
-    codes[:, : whole.shape[1]] = whole
+    codes[:, : model.codes.shape[1]] = model.codes
     with np.errstate(over="ignore"):
         head = np.array([*model.origin, model.extent, *model.size, model.gain, model.profile.cut], "<f4")
     if not (np.isfinite(head).all() and head[3] > 0):
         raise WlmError(f"{model.name}: cannot export: the probes' box is too large or too small for floats")
     count = np.array([model.count], "<u4")
-    numbers = np.concatenate([model.bounds[0], _steps(model)]).astype("<f4")
+    numbers = np.concatenate([model.bounds[0], model.steps]).astype("<f4")
     return head.tobytes() + count.tobytes() + numbers.tobytes() + codes.tobytes()
 
 
 def _network_bytes(model: ProbeModel) -> bytes:
     """The network in 4 x 4 blocks, as the shader reads it."""
-    profile = model.profile
-    sizes = [profile.latent + 3, profile.hidden, profile.hidden, model.outputs]
-    pieces, at = [], 0
-    for inputs, outputs in zip(sizes, sizes[1:], strict=False):
-        layer = model.net[at : at + (inputs + 1) * outputs].reshape(inputs + 1, outputs)
-        at += layer.size
+    pieces = []
+    for layer in model.layers():
+        inputs, outputs = len(layer) - 1, layer.shape[1]
         # The biases first, then a row for each input.
         padded = np.zeros((1 + _up(inputs), _up(outputs)), "<f2")
         padded[0, :outputs], padded[1 : inputs + 1, :outputs] = layer[-1], layer[:-1]
@@ -184,14 +152,14 @@ def _up(count: int) -> int:
 def _reference_positions(model: ProbeModel) -> np.ndarray:
     """Centres of Gaussians, spread evenly over their numbers, and a place outside the box; float64 [M, 3]."""
     chosen = np.unique(np.linspace(0, model.count - 1, min(model.count, _REFERENCES)).astype(int))
-    inside = model.gaussians().centre[chosen].astype(np.float64)
+    inside = model.rows()[chosen, CENTRE].astype(np.float64)
     return model.origin + model.extent * np.concatenate([inside, model.size[None] + 0.25])
 
 
-def _document(model: ProbeModel, sizes: dict[str, int]) -> str:
+def _document(model: ProbeModel, sizes: dict[str, int]) -> dict[str, Any]:
     profile = model.profile
-    scale = model.gaussians().scale.astype(np.float64)
-    document: dict[str, Any] = {
+    scale = np.exp(model.rows()[:, SCALE]).astype(np.float64)
+    return {
         "format": FORMAT,
         "version": _VERSION,
         "about": _ABOUT,
@@ -201,7 +169,7 @@ def _document(model: ProbeModel, sizes: dict[str, int]) -> str:
         "probes": model.probes,
         "outputs": model.outputs,
         "coefficients": sh_count(model.outputs),
-        "convention": HOUSE,
+        "convention": CANONICAL,
         "gaussians": model.count,
         "latent": profile.latent,
         "hidden": profile.hidden,
@@ -211,18 +179,10 @@ def _document(model: ProbeModel, sizes: dict[str, int]) -> str:
         "extent": model.extent,
         "size": model.size.tolist(),
         "gain": model.gain,
-        "low": _numbers(model.bounds[0]),
-        "step": _numbers(_steps(model)),
+        "low": rounded(model.bounds[0]),
+        "step": rounded(model.steps),
         "first_gaussian_word": HEAD_WORDS + 2 * model.bounds.shape[1],
         "words_per_gaussian": gaussian_words(profile.latent),
         "slenderness": float(f"{(scale.max(1) / scale.min(1)).max():.3g}"),
         "dead": np.flatnonzero(model.dead).tolist(),
     }
-    text = json.dumps(document, indent=1, allow_nan=False)
-    # One number a line would be most of the file. Strings hold no raw line break, so that none is touched.
-    return _LIST_OF_NUMBERS.sub(lambda found: "[" + " ".join(found[1].split()) + "]", text) + "\n"
-
-
-def _numbers(values: np.ndarray) -> list[float]:
-    """With the 9 digits that tell every float32 from its neighbours."""
-    return [float(f"{value:.9g}") for value in values.tolist()]

@@ -1,48 +1,39 @@
 """Fitting a probe set: from checked input to a compressed model (gaussian-probe-compression, section 3.2 and 3.3)."""
 
 import math
-import time
-from collections.abc import Callable
-from dataclasses import dataclass
+import os
+from typing import Any
 
 import numpy as np
 
 from wlm import interop
 from wlm.errors import WlmError
 from wlm.formats.checkpoint import Checkpoint
-from wlm.probe.codec import SYSTEM
+from wlm.metrics import psnr_from_mse
 from wlm.probe.data import ProbeSet
 from wlm.probe.model import ProbeModel, Profile
 from wlm.probe.trainer import Trainer
+from wlm.system import Meter, OnProgress
 
-__all__ = ["Progress", "compress", "open_checkpoint"]
+__all__ = ["compress", "open_checkpoint"]
 
-REPORT_EVERY = 0.5  # seconds between two reports
 _CHUNK = {"cpu": 5, "cuda": 500}  # steps between two looks at the clock
 
 
-@dataclass(frozen=True)
-class Progress:
-    """Where a fit is.
-
-    Attributes:
-        step, steps: Done and in all.
-        psnr: dB, over all numbers of all probes, their range as the peak; NaN where the range is zero.
-        seconds: So far.
-    """
-
-    step: int
-    steps: int
-    psnr: float
-    seconds: float
-
-
-def open_checkpoint(output, probes: ProbeSet, profile: Profile, *, seed=0, device="cpu", resume=False) -> Checkpoint:
-    """Opens the checkpoint of a fit, the file ``OUTPUT.partial``; the arguments are those of ``compress``.
+def open_checkpoint(
+    output: str | os.PathLike[str],
+    probes: ProbeSet,
+    profile: str | os.PathLike[str] | Profile = "standard",
+    *,
+    seed: int = 0,
+    device: str = "cpu",
+    resume: bool = False,
+) -> Checkpoint:
+    """Opens the checkpoint of a fit, the file ``OUTPUT.partial``.
 
     Args:
         output: The file that the fit is for.
-        probes, profile, seed: What the fit depends on.
+        probes, profile, seed: As for ``compress``: what the fit depends on.
         device: Only its kind matters: a fit may go on on another GPU.
         resume: Whether to go on from the file, if there is one.
 
@@ -51,22 +42,23 @@ def open_checkpoint(output, probes: ProbeSet, profile: Profile, *, seed=0, devic
     """
     fit = {
         "input": probes.source,
-        "profile": profile.model_dump(mode="json"),
+        "profile": Profile.load(profile).model_dump(mode="json"),
         "seed": int(seed),
         "device": "cpu" if device == "cpu" else "cuda",
     }
-    return Checkpoint(output, SYSTEM, fit, probes.source, resume=resume)
+    return Checkpoint(output, ProbeModel.SYSTEM, fit, probes.source, resume=resume)
 
 
 def compress(
     probes: ProbeSet,
-    profile: Profile,
+    profile: str | os.PathLike[str] | Profile = "standard",
     *,
     seed: int = 0,
     device: str = "cpu",
-    progress: Callable[[Progress], None] | None = None,
+    progress: OnProgress | None = None,
     checkpoint: Checkpoint | None = None,
     positions: bool = False,
+    **overrides: Any,
 ) -> ProbeModel:
     """Compresses a probe set.
 
@@ -74,20 +66,23 @@ def compress(
 
     Args:
         probes: The set.
-        profile: The settings.
+        profile: The settings: a name, a YAML file, or a ``Profile``.
         seed: One seed gives one result on one device.
         device: "cpu" or "cuda:0".
-        progress: Called about twice a second.
-        checkpoint: From ``open_checkpoint``, or None: where an interrupted fit is kept and resumed.
+        progress: Called about twice a second, with the PSNR of all numbers of all probes.
+        checkpoint: From ``open_checkpoint`` for the same settings, or None: where an interrupted fit is kept and
+            resumed.
         positions: Whether the model carries the probes' positions, 16 bits an axis; an engine has them anyway.
+        overrides: Settings that replace the profile's: ``steps=500``.
 
     Returns:
-        The model, ready for ``wlm.probe.codec.write``.
+        The model.
 
     Raises:
-        WlmError: On a device that isn't there, or a fit that diverged.
+        WlmError: A profile, a setting or a device that isn't there, or a fit that diverged.
         KeyboardInterrupt: Raised by ``progress``, after the checkpoint, if there is one, has been written.
     """
+    profile = Profile.load(profile).override(overrides)
     device = interop.check_device(device)
     origin, extent, size = _frame(probes.position)
     x = ((probes.position - origin) / extent).astype(np.float32)
@@ -118,7 +113,7 @@ def compress(
         size=size,
         dead=np.zeros(0, bool) if probes.live.all() else ~probes.live,
         positions=stored,
-        dropped=int((~trainer.kept).sum()),
+        dropped=int((~trainer.needed).sum()),
         **parts,
     )
 
@@ -133,24 +128,27 @@ def _frame(position: np.ndarray) -> tuple[np.ndarray, float, np.ndarray]:
     return low, extent, np.minimum((high - low) / extent, 1.0)
 
 
-def _run(trainer: Trainer, probes: ProbeSet, profile: Profile, device: str, progress, checkpoint) -> None:
-    start = last = time.perf_counter()
+def _run(
+    trainer: Trainer,
+    probes: ProbeSet,
+    profile: Profile,
+    device: str,
+    progress: OnProgress | None,
+    checkpoint: Checkpoint | None,
+) -> None:
+    meter = Meter(progress, "fit", profile.steps)
     peak = float(probes.values.max()) - float(probes.values.min())
     # Dead probes decode exactly, and count.
-    share = probes.live.mean()
+    live = probes.live.mean()
     step = trainer.step
     while step < profile.steps:
         count = min(_CHUNK["cpu" if device == "cpu" else "cuda"], profile.steps - step)
         trainer.run(count)
         step += count
-        now = time.perf_counter()
-        if progress is None or (now - last < REPORT_EVERY and step < profile.steps):
+        if not meter.due(step):
             continue
-        last = now
-        mse = trainer.mse() * share
-        psnr = 10 * math.log10(peak * peak / mse) if peak > 0 and mse > 0 else math.nan
         try:
-            progress(Progress(step, profile.steps, psnr, now - start))
+            meter.report(step, PSNR_dB=psnr_from_mse(trainer.mse() * live, peak))
         except KeyboardInterrupt:
             if checkpoint is not None:
                 checkpoint.save_running(0, trainer.state())

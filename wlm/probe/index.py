@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-__all__ = ["ProbeIndex"]
+__all__ = ["ProbeIndex", "morton_keys"]
 
 _BITS = 21  # of a Morton key for each axis: three of them fill 63 bits
 # The grid starts at a multiple of so many cells: boxes of 2, 4 ... 1024 cells that are aligned to the origin of the
@@ -68,7 +68,7 @@ class ProbeIndex:
             self._cell = math.ldexp(self._cell, math.ceil(math.log2(least) - math.log2(self._cell)))
         start = self.low if self.count else np.zeros(3)
         self._start = np.floor(start / self._cell / _ALIGNED) * _ALIGNED
-        key = _morton(self._cells(position))
+        key = morton_keys(self._cells(position))
         self._order = np.argsort(key, kind="stable")
         self._key = key[self._order]
         self._position = position[self._order]
@@ -118,13 +118,13 @@ class ProbeIndex:
         depth = np.frexp((last - first).max(1, initial=0).astype(np.float64))[1].astype(np.int64)[:, None]
         near, far = first >> depth, last >> depth
         # A corner that lies in the same cell as another one is left out.
-        wanted = (~_CORNERS | (far > near)[:, None]).all(2)
-        corner = np.where(_CORNERS, far[:, None], near[:, None])[wanted]
-        shift = (3 * np.broadcast_to(depth, wanted.shape)[wanted]).astype(np.uint64)
-        code = _morton(corner)
+        distinct = (~_CORNERS | (far > near)[:, None]).all(2)
+        corner = np.where(_CORNERS, far[:, None], near[:, None])[distinct]
+        shift = (3 * np.broadcast_to(depth, distinct.shape)[distinct]).astype(np.uint64)
+        code = morton_keys(corner)
         begin = np.searchsorted(self._key, code << shift)
         end = np.searchsorted(self._key, (code + np.uint64(1)) << shift)
-        return np.broadcast_to(boxes[:, None], wanted.shape)[wanted], begin, end
+        return np.broadcast_to(boxes[:, None], distinct.shape)[distinct], begin, end
 
     def _cells(self, position: np.ndarray) -> np.ndarray:
         """int64 [M, 3], the cell of each position, or the nearest cell of the grid.
@@ -137,7 +137,7 @@ class ProbeIndex:
         return np.clip(cell, 0, 2**_BITS - 1).astype(np.int64)
 
 
-def _morton(cell: np.ndarray) -> np.ndarray:
+def morton_keys(cell: np.ndarray) -> np.ndarray:
     """uint64 [M], bits of x, y and z in turn, for cells int64 [M, 3] below 2 ** 21."""
     bits = cell.astype(np.uint64)
     for shift, mask in _SPREAD:

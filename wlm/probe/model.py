@@ -9,12 +9,13 @@ eq. 2 to 7):
 """
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
-from wlm.config import load_settings, profile_path
+from wlm.errors import WlmError
+from wlm.system import Model, Settings
 
 __all__ = [
     "CENTRE",
@@ -22,11 +23,9 @@ __all__ = [
     "LATENT",
     "ROTATION",
     "SCALE",
-    "Gaussians",
     "ProbeModel",
     "Profile",
-    "load_profile",
-    "network_size",
+    "layer_shapes",
 ]
 
 # Channels of a Gaussian, in the order of ``ProbeModel.bounds``; the last three groups share ``Profile.bits``.
@@ -37,7 +36,7 @@ LATENT = slice(10, None)
 CENTRE_BITS = 16
 
 
-class Profile(BaseModel):
+class Profile(Settings):
     """Settings of a fit.
 
     Attributes:
@@ -64,9 +63,8 @@ class Profile(BaseModel):
         prune: Bound on what dropping useless Gaussians may change, as a share of the range of the probes' numbers.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    FILES: ClassVar[str] = "probe"
 
-    name: str
     ratio: float = Field(0.05, gt=0.0, le=1.0)
     bits: int = Field(10, ge=4, le=16)
     latent: int = Field(9, ge=1, le=32)
@@ -95,45 +93,18 @@ class Profile(BaseModel):
             raise ValueError("quantise_from must not be later than freeze_from")
         return self
 
-    def gaussian_bits(self) -> int:
-        """Bits of one Gaussian in the file."""
-        return 3 * CENTRE_BITS + (7 + self.latent) * self.bits
+    def code_bits(self) -> np.ndarray:
+        """Bits of each number of a Gaussian in the file, int [10 + L]."""
+        return np.array([CENTRE_BITS] * 3 + [self.bits] * (7 + self.latent))
 
 
-def load_profile(name: str) -> Profile:
-    """Loads ``configs/probe-NAME.yaml``, or a YAML file of one's own.
-
-    Raises:
-        WlmError: Unknown profile, unreadable file, or a wrong setting.
-    """
-    path = name if name.endswith((".yaml", ".yml")) else profile_path("probe", name)
-    return load_settings(Profile, path)
-
-
-def network_size(latent: int, hidden: int, outputs: int) -> int:
-    """Scalars in the network: latent + 3 inputs, two hidden layers, ``outputs`` outputs."""
-    return (latent + 3 + 1) * hidden + (hidden + 1) * hidden + (hidden + 1) * outputs
+def layer_shapes(latent: int, hidden: int, outputs: int) -> list[tuple[int, int]]:
+    """Shapes of the network's layers: a row of weights for each input, then one of biases; a column for each output."""
+    return [(latent + 4, hidden), (hidden + 1, hidden), (hidden + 1, outputs)]
 
 
 @dataclass(frozen=True, eq=False)
-class Gaussians:
-    """Gaussians in the normalised frame, as the kernels take them.
-
-    Attributes:
-        centre: float32 [K, 3].
-        scale: float32 [K, 3], standard deviations along the Gaussian's own axes, positive.
-        rotation: float32 [K, 4], quaternions w, x, y, z of any length; one of length zero stands for no rotation.
-        latent: float32 [K, L].
-    """
-
-    centre: np.ndarray
-    scale: np.ndarray
-    rotation: np.ndarray
-    latent: np.ndarray
-
-
-@dataclass(frozen=True, eq=False)
-class ProbeModel:
+class ProbeModel(Model):
     """A compressed probe set; N probes of D numbers, K Gaussians with latents of L.
 
     Attributes:
@@ -150,10 +121,13 @@ class ProbeModel:
         code: uint16 [K, 7 + L], below 2 ** bits: log of the scale, rotation, latent.
         bounds: float32 [2, 10 + L], lowest and highest value of each channel.
         net: float16 [P], the network: for each layer a row of weights for every input, then the biases.
-        dead: bool [N], probes that decode to zero: all their numbers are, or they were none. Empty if there are none.
+        dead: bool [N], probes that decode to zero: all their numbers were zero, or one was not finite. Empty if there
+            are none.
         positions: uint16 [N, 3] over the box, where they are stored with the model; else empty.
         dropped: Gaussians that no probe felt and that are not stored.
     """
+
+    SYSTEM: ClassVar[str] = "probe"
 
     name: str
     source: str
@@ -177,6 +151,30 @@ class ProbeModel:
         """K, Gaussians that are stored."""
         return len(self.centre)
 
+    @property
+    def codes(self) -> np.ndarray:
+        """All codes of each Gaussian, uint16 [K, 10 + L], in the order of ``bounds``."""
+        return np.concatenate([self.centre, self.code], 1)
+
+    @property
+    def steps(self) -> np.ndarray:
+        """What one unit of each code is worth, float32 [10 + L]."""
+        low, high = self.bounds
+        return (high - low) / (2 ** self.profile.code_bits() - 1).astype(np.float32)
+
+    def rows(self) -> np.ndarray:
+        """The Gaussians' numbers restored from their codes (eq. 14), float32 [K, 10 + L].
+
+        Scales are logarithms; quaternions w, x, y, z have any length, and one of length zero stands for no rotation.
+        """
+        return self.bounds[0] + self.codes.astype(np.float32) * self.steps
+
+    def layers(self) -> list[np.ndarray]:
+        """The three layers of ``net``, float16, as ``layer_shapes`` has them."""
+        shapes = layer_shapes(self.profile.latent, self.profile.hidden, self.outputs)
+        parts = np.split(self.net, np.cumsum([rows * columns for rows, columns in shapes])[:-1])
+        return [part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)]
+
     def normalise(self, position: np.ndarray) -> np.ndarray:
         """Positions in the normalised frame, moved to the nearest point of the probes' box.
 
@@ -190,18 +188,20 @@ class ProbeModel:
         return np.clip(x, 0.0, self.size).astype(np.float32)
 
     def stored_positions(self) -> np.ndarray:
-        """The positions stored with the model, float64 [N, 3], to 1/65535 of the box."""
+        """The positions stored with the model, float64 [N, 3], to 1/65535 of the box.
+
+        Raises:
+            WlmError: None are stored.
+        """
+        if not len(self.positions):
+            raise WlmError(f"{self.name}: holds no positions; expected those of its probes, or a fit that stores them")
         return self.origin + self.extent * self.size * (self.positions / 65535.0)
 
-    def rows(self) -> np.ndarray:
-        """The Gaussians' numbers restored from their codes (eq. 14), float32 [K, 10 + L]; scales as logarithms."""
-        low, high = self.bounds
-        levels = np.full(len(low), 2**self.profile.bits - 1, np.float32)
-        levels[CENTRE] = 2**CENTRE_BITS - 1
-        whole = np.concatenate([self.centre, self.code], 1).astype(np.float32)
-        return low + whole * ((high - low) / levels)
-
-    def gaussians(self) -> Gaussians:
-        """The Gaussians as decoding uses them."""
-        rows = self.rows()
-        return Gaussians(rows[:, CENTRE], np.exp(rows[:, SCALE]), rows[:, ROTATION], rows[:, LATENT].copy())
+    def has_probes_at(self, position: np.ndarray) -> bool:
+        """Whether positions, float64 [M, 3], are taken for the model's own probes: as many, and in the same box."""
+        if len(position) != self.probes:
+            return False
+        box = np.stack([self.origin, self.origin + self.extent * self.size])
+        # An engine may have rounded them to float32.
+        slack = 1e-6 * self.extent + np.finfo(np.float32).eps * np.abs(box).max()
+        return bool((np.abs(np.stack([position.min(0), position.max(0)]) - box) <= slack).all())

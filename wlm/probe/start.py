@@ -3,24 +3,23 @@
 import numpy as np
 from scipy.spatial import cKDTree
 
+from wlm.probe.index import morton_keys
+
 __all__ = ["first_gaussians", "local_spread", "morton_order"]
 
-_BITS = 10  # of each coordinate in a Morton code
+_MORTON_CELLS = 1023  # along an axis of the unit cube
 _NEIGHBOURS = 9  # that a probe's surroundings are judged by, itself among them
-_ROUNDS = 4  # of k-means; more undo what the draw gave to detail
-_PLAIN_ROUNDS = 20  # without it
+_PIECE = 4096  # probes at once
+_ROUNDS = 4  # of k-means where the draw follows detail, which more rounds would undo
+_PLAIN_ROUNDS = 20  # where it does not
 _FLOOR = 0.05  # of the mean spread, below which no surroundings fall
 _SMALLEST = 1e-4  # of the box: first scales are no smaller
 
 
 def morton_order(x: np.ndarray) -> np.ndarray:
     """Order of points [N, 3] of the unit cube along a Z-curve, int [N]; ties keep their order."""
-    cell = np.clip(x * (2**_BITS - 1), 0, 2**_BITS - 1).astype(np.uint64)
-    code = np.zeros(len(x), np.uint64)
-    for bit in range(_BITS):
-        for axis in range(3):
-            code |= (cell[:, axis] >> np.uint64(bit) & np.uint64(1)) << np.uint64(3 * bit + axis)
-    return np.argsort(code, kind="stable")
+    cell = np.clip(x * _MORTON_CELLS, 0, _MORTON_CELLS).astype(np.int64)
+    return np.argsort(morton_keys(cell), kind="stable")
 
 
 def local_spread(x: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -35,13 +34,10 @@ def local_spread(x: np.ndarray, values: np.ndarray) -> np.ndarray:
     """
     near = cKDTree(x).query(x, k=min(_NEIGHBOURS, len(x)))[1].reshape(len(x), -1)
     # In pieces: all neighbours' numbers at once would be nine times the set.
-    spread = np.concatenate([np.sqrt(values[part].astype(np.float64).var(1).sum(1)) for part in _pieces(near)])
+    pieces = (near[start : start + _PIECE] for start in range(0, len(near), _PIECE))
+    spread = np.concatenate([np.sqrt(values[piece].astype(np.float64).var(1).sum(1)) for piece in pieces])
     floor = _FLOOR * spread.mean()
     return spread + (floor if floor > 0 else 1.0)
-
-
-def _pieces(array: np.ndarray, size: int = 4096):
-    return [array[at : at + size] for at in range(0, len(array), size)]
 
 
 def first_gaussians(
@@ -52,7 +48,7 @@ def first_gaussians(
     Args:
         x: float32 [N, 3], normalised positions.
         values: float32 [N, D].
-        count: Gaussians that are wanted; no more than there are distinct positions are made.
+        count: Number of Gaussians, at most that of the distinct positions.
         detail, first_scale: See ``wlm.probe.model.Profile``.
         random: Where the draw comes from.
 
@@ -78,6 +74,6 @@ def _kmeans(x: np.ndarray, centre: np.ndarray, rounds: int) -> np.ndarray:
         label = cKDTree(centre).query(x)[1]
         size = np.bincount(label, minlength=len(centre))
         total = np.stack([np.bincount(label, x[:, axis], len(centre)) for axis in range(3)], 1)
-        # One that no probe is nearest to stays where it is.
+        # A centre that is nearest to no probe stays where it is.
         centre = np.where(size[:, None] > 0, total / np.maximum(size, 1)[:, None], centre)
     return centre

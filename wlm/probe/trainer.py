@@ -1,4 +1,4 @@
-"""The training of Gaussians and network on a device (gaussian-probe-compression, section 3.2 and 3.3)."""
+"""Training of Gaussians and network on a device (gaussian-probe-compression, section 3.2 and 3.3)."""
 
 import math
 from concurrent.futures import ThreadPoolExecutor
@@ -8,7 +8,7 @@ import torch
 import warp as wp
 
 from wlm import interop
-from wlm.probe.model import CENTRE, CENTRE_BITS, LATENT, ROTATION, SCALE, Profile
+from wlm.probe.model import CENTRE, LATENT, ROTATION, SCALE, Profile, layer_shapes
 from wlm.probe.start import first_gaussians, morton_order
 from wlm_kernels.probe import network as probe_network
 from wlm_kernels.probe import step as probe_step
@@ -31,7 +31,7 @@ class Trainer:
 
     Attributes:
         count: K, Gaussians.
-        kept: bool [K], false where a Gaussian is useless, known from the last stage on.
+        needed: bool [K], false where a Gaussian is dropped; all true before the last stage.
         dropped_change: Largest change of a probe's number by leaving those out.
     """
 
@@ -57,7 +57,7 @@ class Trainer:
         self._upload(x, values)
         self._allocate(*self._first(x, values, random))
         self._optimiser = self._settings()
-        self.kept = np.ones(self.count, bool)
+        self.needed = np.ones(self.count, bool)
         self.dropped_change = 0.0
         self._pool = None if self._cuda else ThreadPoolExecutor(CPU_LANES)
         self._stages = [interop.StepGraph(lambda stage=s: self._step(stage), device, warmup=1) for s in range(3)]
@@ -81,7 +81,7 @@ class Trainer:
         self.mean, self.spread = exact.mean(0), exact.std(0)
         spread = self.spread
         target = np.zeros((d, padded), np.float32)
-        # A channel that never changes is its mean: nothing to learn, and nothing is made of what the network says.
+        # A channel that never changes is its mean: nothing to learn, and the network's output for it has no effect.
         target[:, :n] = np.divide(exact - self.mean, spread, out=np.zeros_like(exact), where=spread > 0).T
         self._target = self._put(target, float)
         # The squared error of the numbers themselves, in units of the most varied channel's variance.
@@ -91,8 +91,8 @@ class Trainer:
     def _first(self, x: np.ndarray, values: np.ndarray, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """The first Gaussians and network."""
         p = self.profile
-        wanted = max(1, round(p.ratio * len(x)))
-        centre, scale = first_gaussians(x, values, wanted, p.detail, p.first_scale, random)
+        count = max(1, round(p.ratio * len(x)))
+        centre, scale = first_gaussians(x, values, count, p.detail, p.first_scale, random)
         rows = np.zeros((len(centre), LATENT.start + p.latent), np.float32)
         rows[:, CENTRE] = centre
         rows[:, SCALE] = np.log(scale)[:, None]
@@ -139,9 +139,7 @@ class Trainer:
         self._shapes = wp.zeros(count, dtype=Shape, device=self.device)
         self._by_group = wp.zeros((groups, -(-count // 32)), dtype=wp.uint32, device=self.device)
         self._by_gaussian = wp.zeros((count, -(-groups // 32)), dtype=wp.uint32, device=self.device)
-        levels = np.full(channels, 2**self.profile.bits - 1)
-        levels[CENTRE] = 2**CENTRE_BITS - 1
-        self._levels = self._put(levels, float)
+        self._levels = self._put(2 ** self.profile.code_bits() - 1, float)
 
     def _settings(self) -> Optimiser:
         p = self.profile
@@ -256,10 +254,10 @@ class Trainer:
         list(self._pool.map(lambda lane: work(*lane), lanes))
 
     def _prune(self) -> None:
-        """Finds the Gaussians whose absence changes no decoded number by more than the profile allows.
+        """Drops the Gaussians whose absence changes no decoded number by more than the profile allows.
 
-        They are taken in the order of what the probes feel of them, at most; the longest run of them that together
-        stays within the bound is dropped. One always stays.
+        They are taken in the order of an upper bound of their influence on the probes; the longest run of them that
+        together stays within the limit is dropped. One always stays.
         """
         t, latent = self._tensors, self._tensors["used"][:, LATENT]
         # With a gradient of one in one channel, the first of the latent's sums is the sum of the Gaussian's weights.
@@ -268,8 +266,8 @@ class Trainer:
         a = self._arrays
         collect = (self._groups, self._shapes, a["used"], self._by_gaussian, a["grad_f"], self.profile.cut, a["sums"])
         self._share(self.count, lambda *lane: self._step_kernels.collect(*collect, *lane))
-        felt = t["sums"][:, SHAPE_NUMBERS] * latent.norm(dim=1)
-        order = felt.argsort(stable=True)
+        influence = t["sums"][:, SHAPE_NUMBERS] * latent.norm(dim=1)
+        order = influence.argsort(stable=True)
         stored = latent.clone()
         self._features()
         whole = self._decoded()
@@ -291,21 +289,20 @@ class Trainer:
             else:
                 high = middle - 1
         self.dropped_change = change(low)
-        self.kept = np.ones(self.count, bool)
-        self.kept[order[:low].cpu().numpy()] = False
+        self.needed = np.ones(self.count, bool)
+        self.needed[order[:low].cpu().numpy()] = False
 
     def _decoded(self) -> torch.Tensor:
-        """What the network makes of the features, normalised, float32 [N, D]."""
+        """The network's output for the features, normalised, float32 [N, D]."""
         p, d = self.profile, self._outputs
-        inputs, hidden, wide = p.latent + 3, p.hidden, probe_network.padded(d)
-        sizes = [(inputs + 1, hidden), (hidden + 1, hidden), (hidden + 1, wide)]
-        parts = self._tensors["net"].split([rows * columns for rows, columns in sizes])
-        first, second, third = (part.view(size) for part, size in zip(parts, sizes, strict=True))
+        shapes = layer_shapes(p.latent, p.hidden, probe_network.padded(d))
+        parts = self._tensors["net"].split([rows * columns for rows, columns in shapes])
+        first, second, third = (part.view(shape) for part, shape in zip(parts, shapes, strict=True))
         x = wp.to_torch(self._groups.x)[: self._probes]
         h = torch.cat([self._tensors["f"].sum(0).T[: self._probes], x], 1)
-        h = torch.sigmoid(h @ first[:inputs] + first[inputs])
-        h = torch.sigmoid(h @ second[:hidden] + second[hidden])
-        return (h @ third[:hidden] + third[hidden])[:, :d]
+        h = torch.sigmoid(h @ first[:-1] + first[-1])
+        h = torch.sigmoid(h @ second[:-1] + second[-1])
+        return (h @ third[:-1] + third[-1])[:, :d]
 
     def mse(self) -> float:
         """Mean squared error of the live probes' numbers at the last step; NaN before the first."""
@@ -320,12 +317,12 @@ class Trainer:
         t = {key: self._tensors[key].cpu().numpy().astype(np.float64) for key in ("used", "bounds", "net")}
         low, high = t["bounds"]
         span = np.where(high > low, high - low, 1.0)
-        code = np.rint((t["used"][self.kept] - low) / span * self._levels.numpy())
+        code = np.rint((t["used"][self.needed] - low) / span * self._levels.numpy())
         code = np.where(high > low, code, 0).astype(np.uint16)
-        inputs, hidden, wide = p.latent + 3, p.hidden, probe_network.padded(d)
-        before = (inputs + 1) * hidden + (hidden + 1) * hidden
-        third = t["net"][before:].reshape(hidden + 1, wide)[:, :d] * self.spread
-        third[hidden] += self.mean
+        *others, last = layer_shapes(p.latent, p.hidden, probe_network.padded(d))
+        before = sum(rows * columns for rows, columns in others)
+        third = t["net"][before:].reshape(last)[:, :d] * self.spread
+        third[-1] += self.mean
         gain = float(np.abs(third).max()) or 1.0
         net = np.concatenate([t["net"][:before], (third / gain).ravel()])
         return {
@@ -339,7 +336,7 @@ class Trainer:
     def state(self) -> dict[str, np.ndarray]:
         """Everything that later steps depend on."""
         result = {key: self._tensors[key].cpu().numpy().copy() for key in _STATE}
-        return result | {"kept": self.kept.copy(), "entered": np.array(self._entered)}
+        return result | {"kept": self.needed.copy(), "entered": np.array(self._entered)}
 
     def load(self, state: dict[str, np.ndarray]) -> None:
         """Goes back to a ``state``; arrays of other shapes raise ValueError."""
@@ -348,11 +345,11 @@ class Trainer:
             if value.shape != target.shape:
                 raise ValueError(f"{key}: expected shape {tuple(target.shape)}, got {tuple(value.shape)}")
             target.copy_(value)
-        self.kept, self._entered = np.array(state["kept"]), int(state["entered"])
+        self.needed, self._entered = np.array(state["kept"]), int(state["entered"])
         if self._entered == 2:
             with interop.stream(self.device):
                 self._make_shapes(quantised=True)
-                self._tensors["used"][torch.from_numpy(~self.kept).to(self.device), LATENT] = 0.0
+                self._tensors["used"][torch.from_numpy(~self.needed).to(self.device), LATENT] = 0.0
                 self._features()
 
     def close(self) -> None:

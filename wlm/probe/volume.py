@@ -50,7 +50,7 @@ _FARTHEST = 2**30  # coordinate of a block: int32 on the device, with room for a
 
 @dataclass(frozen=True)
 class FrameStats:
-    """What one frame did.
+    """The work of one frame.
 
     Attributes:
         entered: Blocks that came into a window, empty ones included.
@@ -84,7 +84,7 @@ class Reading:
     Attributes:
         values: float32 [M, D]; 0 where nothing covers the point.
         level: int32 [M], the level with the largest share in it, -1 where nothing covers the point.
-        weight: float32 [M], how much of it was found at any level: 1 where all blocks round the point are there.
+        weight: float32 [M], the share of the trilinear weights that blocks of any level cover; 1 where none is missing.
     """
 
     values: np.ndarray
@@ -190,9 +190,9 @@ class Volume:
 
     @property
     def host_bytes(self) -> int:
-        """Memory of the index, the cache and the books on the host, in bytes."""
-        books = (self._level, self._place, self._block, self._held, self._waiting)
-        return sum(array.nbytes for array in books) + self.index.memory_bytes + self._cache.memory_bytes
+        """Host memory of the index, the cache and the slot tables, in bytes."""
+        tables = (self._level, self._place, self._block, self._held, self._waiting)
+        return sum(array.nbytes for array in tables) + self.index.memory_bytes + self._cache.memory_bytes
 
     def update(self, viewpoint: np.ndarray) -> FrameStats:
         """Moves the windows to a viewpoint and fills up to ``budget`` of the blocks that are missing.
@@ -324,7 +324,7 @@ class Volume:
         return self._base.copy()
 
     def _move(self, viewpoint: np.ndarray) -> tuple[np.ndarray, int]:
-        """Moves the windows: the slots that have to hold another block now, and how many dropped one that waited."""
+        """Moves the windows; returns the slots whose block changed, and how many of them dropped one that waited."""
         base = np.floor(viewpoint / self._size[:, None] + 0.5).astype(np.int64) - self.side // 2
         moved = np.flatnonzero((base != self._base).any(1) | (self._viewpoint is None))
         self._viewpoint = viewpoint
@@ -399,14 +399,14 @@ class Volume:
 
 
 def _thin(probes: np.ndarray, offsets: np.ndarray, most: int | None) -> tuple[np.ndarray, np.ndarray]:
-    """Leaves each block of ``ProbeIndex.query`` at most so many probes, evenly spaced in their order."""
+    """Keeps at most so many probes of each block of ``ProbeIndex.query``, evenly spaced in their order."""
     count = np.diff(offsets)
     if most is None or (count <= most).all():
         return probes, offsets
     owner = np.repeat(np.arange(len(count)), count)
     number, total = np.arange(len(probes)) - offsets[owner], count[owner]
-    kept = (total <= most) | (number * most // total != (number - 1) * most // total)
-    return probes[kept], np.concatenate([[0], np.cumsum(np.minimum(count, most))])
+    chosen = (total <= most) | (number * most // total != (number - 1) * most // total)
+    return probes[chosen], np.concatenate([[0], np.cumsum(np.minimum(count, most))])
 
 
 class _BlockCache:
@@ -418,7 +418,7 @@ class _BlockCache:
 
     @property
     def memory_bytes(self) -> int:
-        """Bytes of the values that are kept."""
+        """Bytes of the cached values."""
         return len(self._row) * self._values.itemsize * self._values.shape[1]
 
     def touch(self, keys: list[tuple[int, ...]]) -> None:

@@ -1,28 +1,23 @@
-"""A walk through a scene with a cascaded lighting volume: what each frame costs, covers and gets wrong."""
+"""A walk through a scene with a cascaded lighting volume: cost, coverage and error of each frame."""
 
-import json
 import math
-import os
 import time
-import zipfile
-import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from wlm.errors import WlmError
 from wlm.probe.volume import FrameStats, Volume
+from wlm.system import Meter, OnProgress
 
-__all__ = ["EYE_HEIGHT", "FrameFigures", "camera_path", "load_path", "summary", "walk"]
+__all__ = ["EYE_HEIGHT", "FrameFigures", "camera_path", "summary", "walk"]
 
 EYE_HEIGHT = 1.6  # metres
 
 _LOOP = 0.35  # half axes of the loop over the box's sides: it stays inside, and passes near the rim
 _GROUND = 16  # probes that tell the height of the ground
-_ARRAY = "position"  # in a path's .npz, as in a probe set's
 
 
 @dataclass(frozen=True)
@@ -31,7 +26,7 @@ class FrameFigures:
 
     Attributes:
         viewpoint: x, y, z.
-        stats: What the update did, and its seconds by stage.
+        stats: Of the update, with its seconds by stage.
         read_seconds: Reading the samples, with the copies to the device and back.
         samples: Live probes near the viewer at which the volume was read.
         coverage: Share of them that some level answers; NaN where there are none, as the next three.
@@ -57,7 +52,7 @@ def walk(
     samples: int = 256,
     radius: float | None = None,
     seed: int = 0,
-    progress: Callable[[int, int], None] | None = None,
+    progress: OnProgress | None = None,
 ) -> list[FrameFigures]:
     """Moves a volume along a path, one update a frame, and reads it at probes near the viewer.
 
@@ -71,7 +66,7 @@ def walk(
         radius: Half the side of the cube round the viewer that they are drawn from; None: that of the second finest
             window (32 m with the paper's settings), or of the only one.
         seed: Of the draw, which is the same in every frame at one place.
-        progress: Called after each frame with the number done and the number in all.
+        progress: Called about twice a second, with the frames done.
 
     Returns:
         One entry a frame.
@@ -88,14 +83,15 @@ def walk(
     if samples < 1 or not radius > 0.0:
         raise ValueError(f"samples, radius: expected at least 1 and above 0, got {samples} and {radius}")
     figures = []
+    meter = Meter(progress, "walk", len(path))
     for frame, viewpoint in enumerate(path):
         stats = volume.update(viewpoint)
         near, _ = volume.index.query(viewpoint[None] - radius, viewpoint[None] + radius)
         if len(near) > samples:
             near = np.random.default_rng(seed).choice(near, samples, replace=False)
         figures.append(_measure(volume, viewpoint, stats, volume.position[near]))
-        if progress is not None:
-            progress(frame + 1, len(path))
+        if meter.due(frame + 1):
+            meter.report(frame + 1)
     return figures
 
 
@@ -121,7 +117,7 @@ def _measure(volume: Volume, viewpoint: np.ndarray, stats: FrameStats, points: n
 
 
 def summary(figures: Sequence[FrameFigures]) -> dict[str, object]:
-    """Sums a walk up, in numbers, lists and None alone.
+    """Statistics of a walk, in numbers, lists and None alone.
 
     Args:
         figures: From ``walk``, at least one frame.
@@ -146,32 +142,28 @@ def summary(figures: Sequence[FrameFigures]) -> dict[str, object]:
     cached, updated = sum(s.cached for s in stats), sum(s.updated for s in stats)
     result["from_cache"] = cached / (cached + updated) if cached + updated else None
     for name in counts:
-        result[name] = _high([getattr(s, name) for s in stats])
+        result[name] = _statistics([getattr(s, name) for s in stats])
     stages = {name: [1e3 * getattr(s, f"{name}_seconds") for s in stats] for name in ("find", "decode", "upload")}
-    result["update_ms"] = _high(np.sum(list(stages.values()), 0))
+    result["update_ms"] = _statistics(np.sum(list(stages.values()), 0))
     for name, values in stages.items():
-        result[f"{name}_ms"] = _high(values)
-    result["read_ms"] = _high([1e3 * figure.read_seconds for figure in figures])
+        result[f"{name}_ms"] = _statistics(values)
+    result["read_ms"] = _statistics([1e3 * figure.read_seconds for figure in figures])
     sampled = [figure for figure in figures if figure.samples]
-    result["coverage"] = _low([figure.coverage for figure in sampled])
+    result["coverage"] = _statistics([figure.coverage for figure in sampled], more_is_worse=False)
     result["by_level"] = np.mean([figure.by_level for figure in sampled], 0).tolist() if sampled else None
-    result["rmse"] = _high([figure.rmse for figure in sampled])
-    result["rms"] = _high([figure.rms for figure in sampled])
+    result["rmse"] = _statistics([figure.rmse for figure in sampled])
+    result["rms"] = _statistics([figure.rms for figure in sampled])
     return result
 
 
-def _high(values: Sequence[float] | np.ndarray) -> dict[str, float] | None:
-    """Where more is worse."""
+def _statistics(values: Sequence[float] | np.ndarray, more_is_worse: bool = True) -> dict[str, float] | None:
+    """Mean, the percentile that only 5% of the values exceed in the bad direction, and the worst value."""
     if len(values) == 0:
         return None
-    return {"mean": float(np.mean(values)), "p95": float(np.percentile(values, 95)), "max": float(np.max(values))}
-
-
-def _low(values: Sequence[float]) -> dict[str, float] | None:
-    """Where less is worse."""
-    if len(values) == 0:
-        return None
-    return {"mean": float(np.mean(values)), "p5": float(np.percentile(values, 5)), "min": float(np.min(values))}
+    mean = {"mean": float(np.mean(values))}
+    if more_is_worse:
+        return mean | {"p95": float(np.percentile(values, 95)), "max": float(np.max(values))}
+    return mean | {"p5": float(np.percentile(values, 5)), "min": float(np.min(values))}
 
 
 def camera_path(position: np.ndarray, frames: int, eye_height: float = EYE_HEIGHT, up: int = 1) -> np.ndarray:
@@ -214,60 +206,3 @@ def camera_path(position: np.ndarray, frames: int, eye_height: float = EYE_HEIGH
     path[:, plan] = around
     path[:, up] = smooth + eye_height
     return path
-
-
-def load_path(path: str | os.PathLike[str]) -> np.ndarray:
-    """Reads a camera path: JSON, ``[[x, y, z], ...]``, or an ``.npz`` with ``position`` [F, 3].
-
-    Args:
-        path: The file; what doesn't end in .npz is JSON.
-
-    Returns:
-        float64 [F, 3], finite, F at least 1.
-
-    Raises:
-        WlmError: The file is missing, damaged, or holds something else.
-    """
-    path = Path(path)
-    points = _load_npz(path) if path.suffix.lower() == ".npz" else _load_json(path)
-    bad = np.flatnonzero(~np.isfinite(points).all(1))
-    if len(bad):
-        raise WlmError(f"{path}: viewpoint {bad[0]}: expected finite numbers, got {points[bad[0]].tolist()}")
-    return points
-
-
-def _load_npz(path: Path) -> np.ndarray:
-    try:
-        with np.load(path, allow_pickle=False) as arrays:
-            if _ARRAY not in arrays.files:
-                found = ", ".join(arrays.files) or "none"
-                raise WlmError(f"{path}: expected an array '{_ARRAY}' [F, 3], found {found}")
-            points = arrays[_ARRAY]
-    except OSError as error:
-        raise WlmError(f"{path}: cannot read the path: {error.strerror or error}") from error
-    except (ValueError, TypeError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
-        raise WlmError(f"{path}: expected an .npz of arrays: {error}") from error
-    if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0 or points.dtype.kind not in "fiu":
-        found = f"{points.dtype} {list(points.shape)}"
-        raise WlmError(f"{path}: {_ARRAY}: expected numbers [F, 3], at least one viewpoint, got {found}")
-    return points.astype(np.float64)
-
-
-def _load_json(path: Path) -> np.ndarray:
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise WlmError(f"{path}: cannot read the path: {error.strerror or error}") from error
-    except (ValueError, RecursionError) as error:
-        raise WlmError(f"{path}: expected JSON: {error}") from error
-    if not isinstance(content, list) or not content:
-        raise WlmError(f"{path}: expected a list of viewpoints [x, y, z], got {json.dumps(content)[:60]}")
-    for i, point in enumerate(content):
-        if not isinstance(point, list) or len(point) != 3 or not all(_is_number(x) for x in point):
-            raise WlmError(f"{path}: viewpoint {i}: expected three numbers [x, y, z], got {json.dumps(point)[:60]}")
-    return np.array(content, np.float64)
-
-
-def _is_number(value: object) -> bool:
-    # True is an int to Python, NaN and Infinity are JSON to it, and its integers have any length.
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= 1e300

@@ -1,4 +1,6 @@
-"""What changes smoke but the air: sources, solids that come and go; and what smoke does to air, buoyancy.
+"""Smoke apart from its transport: sources, solids that come and go, and buoyancy, by which smoke moves the air.
+
+Read ``test_sources`` and ``test_buoyancy_is_of_means`` in ``tests/kernels/test_advection.py`` first: the same in NumPy.
 
 Fields and domains are those of ``advection`` and ``advection_places``. Stated behaviour:
 
@@ -18,11 +20,11 @@ from dataclasses import dataclass
 
 import warp as wp
 
-from wlm_kernels.fluid.advection import STORAGES, Fields, storage_of
-from wlm_kernels.fluid.advection_places import BRICK, Box, Bricks, inside
+from wlm_kernels.fluid.advection import Fields, fields_struct
+from wlm_kernels.fluid.advection_places import BRICK, DENSE, SOLID, Box, Bricks, is_solid
 from wlm_kernels.fluid.lattice_sets import cell_of, index_of
 
-__all__ = ["BOX", "SPHERE", "add_source", "buoyancy", "change_solids", "rest", "source_kernels"]
+__all__ = ["BOX", "SPHERE", "add_source", "buoyancy", "change_solids", "empty_retired", "source_kernels"]
 
 _OPTIONS = {"enable_backward": False}
 
@@ -33,82 +35,76 @@ _SPHERE = wp.constant(SPHERE)
 _LARGEST_HALF = wp.constant(65504.0)
 _BRICK = wp.constant(BRICK)
 _BRICK_CELLS = wp.constant(BRICK**3)
-_SOLID = wp.constant(wp.uint8(2))
 
 
 @dataclass(frozen=True)
 class SourceKernels:
-    """Of one storage.
+    """The kernels of one storage.
 
     Attributes:
-        source: Over the cells of a box about a source.
-        cover: Empties what becomes solid and fills what ceases to be, over coarse cells.
+        source: Over the cells of a box around a source.
+        cover: Empties cells that become solid and fills those that cease to be, over coarse cells.
         lift: Over coarse cells.
-        rest: Empties retired bricks, over workers times a brick's cells.
+        empty: Empties retired bricks, over workers times a brick's cells.
     """
 
     source: wp.Kernel
     cover: wp.Kernel
     lift: wp.Kernel
-    rest: wp.Kernel
+    empty: wp.Kernel
 
 
 @wp.func
-def _brick_of(box: Box, p: wp.vec3i) -> int:
-    return index_of(box.bricks, wp.vec3i(p[0] // _BRICK, p[1] // _BRICK, p[2] // _BRICK))
-
-
-@wp.func
-def _mark_busy(box: Box, p: wp.vec3i, value: float, threshold: float, busy: wp.array1d[int]):
-    if busy.shape[0] > 0 and value > threshold:
-        busy[_brick_of(box, p)] = 1
+def _mark_busy(box: Box, p: wp.vec3i, value: float, bricks: Bricks):
+    if bricks.workers > 0 and value > bricks.threshold:
+        bricks.busy[index_of(box.bricks, wp.vec3i(p[0] // _BRICK, p[1] // _BRICK, p[2] // _BRICK))] = 1
 
 
 @functools.cache
-def source_kernels(storage: str) -> SourceKernels:
-    """Builds (once) the kernels of a storage."""
-    stored = STORAGES[storage]
+def source_kernels(stored: type) -> SourceKernels:
+    """Builds (once) the kernels for fields of ``wp.float32`` or ``wp.float16``."""
+    fields_type = fields_struct(stored)
+
+    @wp.func
+    def in_range(value: float) -> float:
+        if wp.static(stored is wp.float16):
+            return wp.min(value, _LARGEST_HALF)
+        return value
 
     @wp.kernel(module="unique", module_options=_OPTIONS)
     def source(
         # in:
         box: Box,
         walls: wp.array1d[wp.uint8],
-        kind: int,
+        shape: int,
         centre: wp.vec3,
-        half: wp.vec3,
+        size: wp.vec3,
         value: wp.vec2,
-        grow: float,
+        kept: float,
         low: wp.vec3i,
-        size: wp.vec3i,
-        threshold: float,
+        cells: wp.vec3i,
+        bricks: Bricks,
         # in, out:
-        density: wp.array1d[stored],
-        heat: wp.array1d[stored],
-        busy: wp.array1d[int],
+        fields: fields_type,
     ):
-        p = low + cell_of(size, wp.tid())
-        if inside(box, walls, p):
+        p = low + cell_of(cells, wp.tid())
+        if is_solid(box, walls, p):
             return
         x = wp.vec3(float(p[0]) + 0.5, float(p[1]) + 0.5, float(p[2]) + 0.5)
-        away = wp.abs(wp.cw_div(x - centre, half))
+        away = wp.abs(wp.cw_div(x - centre, size))
         within = away[0] <= 1.0 and away[1] <= 1.0 and away[2] <= 1.0
-        if kind == _SPHERE:
+        if shape == _SPHERE:
             within = wp.dot(away, away) <= 1.0
         if not within:
             return
         i = index_of(box.n, p)
-        amount = wp.max(grow * float(density[i]) + value[0], 0.0)
-        if wp.static(storage == "float16"):
-            amount = wp.min(amount, _LARGEST_HALF)
-        density[i] = stored(amount)
-        _mark_busy(box, p, amount, threshold, busy)
-        if heat.shape[0] > 0:
-            warmth = wp.max(grow * float(heat[i]) + value[1], 0.0)
-            if wp.static(storage == "float16"):
-                warmth = wp.min(warmth, _LARGEST_HALF)
-            heat[i] = stored(warmth)
-            _mark_busy(box, p, warmth, threshold, busy)
+        smoke = in_range(wp.max(kept * float(fields.density[i]) + value[0], 0.0))
+        fields.density[i] = stored(smoke)
+        _mark_busy(box, p, smoke, bricks)
+        if fields.temperature.shape[0] > 0:
+            heat = in_range(wp.max(kept * float(fields.temperature[i]) + value[1], 0.0))
+            fields.temperature[i] = stored(heat)
+            _mark_busy(box, p, heat, bricks)
 
     @wp.kernel(module="unique", module_options=_OPTIONS)
     def cover(
@@ -116,29 +112,27 @@ def source_kernels(storage: str) -> SourceKernels:
         box: Box,
         before: wp.array1d[wp.uint8],
         after: wp.array1d[wp.uint8],
-        threshold: float,
+        bricks: Bricks,
         # in, out:
-        density: wp.array1d[stored],
-        heat: wp.array1d[stored],
-        busy: wp.array1d[int],
+        fields: fields_type,
     ):
         i = wp.tid()
-        was = before[i] == _SOLID
-        if was == (after[i] == _SOLID):
+        was_solid = before[i] == SOLID
+        if was_solid == (after[i] == SOLID):
             return
         coarse = cell_of(box.coarse, i)
-        r = box.ratio
+        r = box.refinement
         for k in range(r * r * r):
             within = cell_of(wp.vec3i(r, r, r), k)
             p = wp.vec3i(coarse[0] * r + within[0], coarse[1] * r + within[1], coarse[2] * r + within[2])
-            amount = float(0.0)
-            warmth = float(0.0)
-            found = float(0.0)
-            if was:
+            smoke = float(0.0)
+            heat = float(0.0)
+            count = float(0.0)
+            if was_solid:
                 for j in range(27):
                     step = wp.vec3i(j // 9 - 1, j // 3 % 3 - 1, j % 3 - 1)
                     beside = coarse + step
-                    # The cell of the neighbour that lies nearest.
+                    # The fine cell of this neighbour that lies nearest.
                     q = wp.vec3i()
                     valid = bool(True)
                     for a in range(3):
@@ -149,169 +143,154 @@ def source_kernels(storage: str) -> SourceKernels:
                         valid = valid and beside[a] >= 0 and beside[a] < box.coarse[a]
                     if valid:
                         c = index_of(box.coarse, beside)
-                        if before[c] != _SOLID and after[c] != _SOLID:
+                        if before[c] != SOLID and after[c] != SOLID:
                             at = index_of(box.n, q)
-                            amount += float(density[at])
-                            if heat.shape[0] > 0:
-                                warmth += float(heat[at])
-                            found += 1.0
-            share = 1.0 / wp.max(found, 1.0)
+                            smoke += float(fields.density[at])
+                            if fields.temperature.shape[0] > 0:
+                                heat += float(fields.temperature[at])
+                            count += 1.0
+            weight = 1.0 / wp.max(count, 1.0)
             at = index_of(box.n, p)
-            density[at] = stored(share * amount)
-            _mark_busy(box, p, share * amount, threshold, busy)
-            if heat.shape[0] > 0:
-                heat[at] = stored(share * warmth)
-                _mark_busy(box, p, share * warmth, threshold, busy)
+            fields.density[at] = stored(weight * smoke)
+            _mark_busy(box, p, weight * smoke, bricks)
+            if fields.temperature.shape[0] > 0:
+                fields.temperature[at] = stored(weight * heat)
+                _mark_busy(box, p, weight * heat, bricks)
 
     @wp.kernel(module="unique", module_options=_OPTIONS)
     def lift(
         # in:
         box: Box,
         walls: wp.array1d[wp.uint8],
-        density: wp.array1d[stored],
-        heat: wp.array1d[stored],
-        fall: wp.vec3,
-        rise: wp.vec3,
-        active: wp.array1d[int],
+        fields: fields_type,
+        by_density: wp.vec3,
+        by_temperature: wp.vec3,
+        bricks: Bricks,
         # out:
         force: wp.array1d[wp.vec3],
     ):
         i = wp.tid()
         coarse = cell_of(box.coarse, i)
-        r = box.ratio
+        r = box.refinement
         first = r * coarse
         needed = int(1)
-        if active.shape[0] > 0:
+        if bricks.workers > 0:
             last = wp.vec3i(first[0] + r - 1, first[1] + r - 1, first[2] + r - 1)
             needed = int(0)
             for x in range(first[0] // _BRICK, last[0] // _BRICK + 1):
                 for y in range(first[1] // _BRICK, last[1] // _BRICK + 1):
                     for z in range(first[2] // _BRICK, last[2] // _BRICK + 1):
-                        needed = wp.max(needed, active[index_of(box.bricks, wp.vec3i(x, y, z))])
-        amount = float(0.0)
-        warmth = float(0.0)
-        if needed != 0 and not inside(box, walls, first):
+                        needed = wp.max(needed, bricks.active[index_of(box.bricks, wp.vec3i(x, y, z))])
+        smoke = float(0.0)
+        heat = float(0.0)
+        if needed != 0 and not is_solid(box, walls, first):
             for x in range(r):
                 for y in range(r):
                     row = ((first[0] + x) * box.n[1] + first[1] + y) * box.n[2] + first[2]
                     for z in range(r):
-                        amount += float(density[row + z])
-                        if heat.shape[0] > 0:
-                            warmth += float(heat[row + z])
-        share = box.share * box.share * box.share
-        force[i] = (share * amount) * fall + (share * warmth) * rise
+                        smoke += float(fields.density[row + z])
+                        if fields.temperature.shape[0] > 0:
+                            heat += float(fields.temperature[row + z])
+        volume = box.voxel * box.voxel * box.voxel
+        force[i] = (volume * smoke) * by_density + (volume * heat) * by_temperature
 
     @wp.kernel(module="unique", module_options=_OPTIONS)
-    def rest(
+    def empty(
         # in:
         box: Box,
-        retired: wp.array1d[int],
-        left: wp.array1d[int],
-        workers: int,
+        bricks: Bricks,
         # out:
-        field: wp.array1d[stored],
+        fields: fields_type,
     ):
         i = wp.tid()
-        for k in range(i // _BRICK_CELLS, left[0], workers):
-            b = cell_of(box.bricks, retired[k])
+        for k in range(i // _BRICK_CELLS, bricks.retired_count[0], bricks.workers):
+            b = cell_of(box.bricks, bricks.retired[k])
             within = cell_of(wp.vec3i(_BRICK, _BRICK, _BRICK), i % _BRICK_CELLS)
             p = _BRICK * b + within
             if p[0] < box.n[0] and p[1] < box.n[1] and p[2] < box.n[2]:
-                field[index_of(box.n, p)] = stored(0.0)
+                at = index_of(box.n, p)
+                fields.density[at] = stored(0.0)
+                if fields.temperature.shape[0] > 0:
+                    fields.temperature[at] = stored(0.0)
 
-    return SourceKernels(source, cover, lift, rest)
+    return SourceKernels(source, cover, lift, empty)
 
 
-def _busy_of(fields: Fields, bricks: Bricks | None) -> wp.array:
-    return wp.empty(0, dtype=int, device=fields.density.device) if bricks is None else bricks.busy
+def _launch(name: str, size: int, inputs: list, output, fields: Fields) -> None:
+    kernel = getattr(source_kernels(fields.density.dtype), name)
+    wp.launch(kernel, size, inputs=inputs, outputs=[output], device=fields.density.device)
 
 
 def add_source(
     box: Box,
     walls: wp.array,
-    kind: int,
+    shape: int,
     centre: Sequence[float],
-    half: Sequence[float],
+    size: Sequence[float],
     value: tuple[float, float],
     fields: Fields,
     *,
     fixed: bool,
-    bricks: Bricks | None = None,
-    threshold: float = 0.0,
+    bricks: Bricks = DENSE,
 ) -> None:
-    """Adds to the cells whose centres lie in a box or an ellipsoid, or sets them; below 0 they don't get.
+    """Adds smoke to the cells whose centres lie in a box or an ellipsoid, or sets it there; the result is at least 0.
 
     Args:
         box: The domain.
         walls: As for ``advection.advect``.
-        kind: ``SPHERE`` or ``BOX``.
+        shape: ``SPHERE`` or ``BOX``.
         centre: In fine cells.
-        half: Radii or half edges, fine cells, above 0.
+        size: Radii or half edges, fine cells, above 0.
         value: Density and temperature to add or to set.
         fields: Changed.
         fixed: Whether they are set.
-        bricks: Where smoke comes in, its bricks are marked as busy.
-        threshold: The value above which they are.
+        bricks: Those where smoke comes in are marked as busy.
     """
-    low = [max(0, int(c - h)) for c, h in zip(centre, half, strict=True)]
-    high = [min(n, int(max(c + h + 1.0, 0.0))) for c, h, n in zip(centre, half, box.n, strict=True)]
-    size = [max(0, b - a) for a, b in zip(low, high, strict=True)]
-    cells = size[0] * size[1] * size[2]
-    if cells == 0:
-        return
-    what = [kind, wp.vec3(*centre), wp.vec3(*half), wp.vec2(*value), 0.0 if fixed else 1.0]
-    inputs = [box, walls, *what, wp.vec3i(*low), wp.vec3i(*size), float(threshold)]
-    outputs = [fields.density, fields.heat, _busy_of(fields, bricks)]
-    kernel = source_kernels(storage_of(fields)).source
-    wp.launch(kernel, cells, inputs=inputs, outputs=outputs, device=fields.density.device)
+    low = [max(0, int(c - h)) for c, h in zip(centre, size, strict=True)]
+    high = [min(n, int(max(c + h + 1.0, 0.0))) for c, h, n in zip(centre, size, box.n, strict=True)]
+    cells = [max(0, b - a) for a, b in zip(low, high, strict=True)]
+    total = cells[0] * cells[1] * cells[2]
+    if total > 0:
+        region = [wp.vec3(*centre), wp.vec3(*size), wp.vec2(*value), 0.0 if fixed else 1.0]
+        inputs = [box, walls, shape, *region, wp.vec3i(*low), wp.vec3i(*cells), bricks]
+        _launch("source", total, inputs, fields.arrays, fields)
 
 
-def change_solids(
-    box: Box, before: wp.array, after: wp.array, fields: Fields, bricks: Bricks | None = None, threshold: float = 0.0
-) -> None:
+def change_solids(box: Box, before: wp.array, after: wp.array, fields: Fields, bricks: Bricks = DENSE) -> None:
     """Empties the cells that become solid and fills those that no longer are.
 
     Args:
         box: The domain.
         before, after: uint8 [coarse cells], from ``advection_places.mark_walls``.
         fields: Changed.
-        bricks, threshold: As for ``add_source``.
+        bricks: As for ``add_source``.
     """
-    outputs = [fields.density, fields.heat, _busy_of(fields, bricks)]
-    kernel = source_kernels(storage_of(fields)).cover
-    inputs = [box, before, after, float(threshold)]
-    wp.launch(kernel, before.shape[0], inputs=inputs, outputs=outputs, device=before.device)
+    _launch("cover", before.shape[0], [box, before, after, bricks], fields.arrays, fields)
 
 
 def buoyancy(
     box: Box,
     walls: wp.array,
     fields: Fields,
-    fall: Sequence[float],
-    rise: Sequence[float],
+    by_density: Sequence[float],
+    by_temperature: Sequence[float],
     force: wp.array,
-    bricks: Bricks | None = None,
+    bricks: Bricks = DENSE,
 ) -> None:
-    """The acceleration of each coarse cell's air, of the means of its fine cells: density fall + temperature rise.
+    """The acceleration of the air by smoke, linear in the means of a coarse cell's density and temperature.
 
     Args:
         box: The domain.
         walls: As for ``advection.advect``.
         fields: The smoke.
-        fall, rise: (3,), of density 1 and of temperature 1, coarse cells a step, a step.
+        by_density, by_temperature: (3,), at density 1 and at temperature 1, coarse cells a step squared.
         force: vec3 [coarse cells], set; 0 in solids.
-        bricks: Those last listed, and busy since; None: all.
+        bricks: Where none is active the means are 0.
     """
-    active = wp.empty(0, dtype=int, device=force.device) if bricks is None else bricks.active
-    inputs = [box, walls, fields.density, fields.heat, wp.vec3(*fall), wp.vec3(*rise), active]
-    kernel = source_kernels(storage_of(fields)).lift
-    wp.launch(kernel, force.shape[0], inputs=inputs, outputs=[force], device=force.device)
+    inputs = [box, walls, fields.arrays, wp.vec3(*by_density), wp.vec3(*by_temperature), bricks]
+    _launch("lift", force.shape[0], inputs, force, fields)
 
 
-def rest(box: Box, bricks: Bricks, field: wp.array) -> None:
-    """Empties the bricks that ``advection_places.relist`` retired; to be done in every buffer."""
-    storage = "float16" if field.dtype is wp.float16 else "float32"
-    inputs = [box, bricks.retired, bricks.left, bricks.workers]
-    threads = bricks.workers * int(_BRICK_CELLS)
-    kernel = source_kernels(storage).rest
-    wp.launch(kernel, threads, inputs=inputs, outputs=[field], device=field.device)
+def empty_retired(box: Box, bricks: Bricks, fields: Fields) -> None:
+    """Empties the bricks that ``advection_places.relist`` retired; needed in every buffer."""
+    _launch("empty", bricks.workers * int(_BRICK_CELLS), [box, bricks], fields.arrays, fields)

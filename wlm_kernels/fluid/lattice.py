@@ -1,25 +1,27 @@
-"""The lattice Boltzmann step: streaming and collision in one pass over two buffers, and the fields that it carries.
+"""The lattice Boltzmann step: streaming and collision in one pass over two buffers.
 
-A cell pulls what arrives, f_q(x, t + 1) = f*_q(x - c_q, t), and writes what leaves, f*. From a wall at rest that
-closes an axis it pulls what it sent there. It knows no other boundary: the place that it would pull from beyond a face
-or out of a solid is one that nobody else reads, and ``lattice_links`` puts there what comes back. So the kernel has no
-branch but the one that skips solid cells.
+Read ``tests/reference/lattice.py`` first: the same step in float64 NumPy, cell by cell.
 
-Collision operators, all by way of f* = f_eq(rho, u + F / rho) + R(f - f_eq(rho, u)), which is Kupershtokh's exact
-difference for the force F; the velocity of the fluid is u + F / (2 rho):
+A cell pulls the populations that arrive, f_q(x, t + 1) = f*_q(x - c_q, t), and writes those that leave, f*. From a wall
+at rest that closes an axis it pulls what it sent there (half-way bounce-back). It knows no other boundary: nothing else
+reads the element that it would pull from beyond a face or out of a solid, and ``lattice_links`` writes there what comes
+back. So the kernel has no branch but the one that skips solid cells.
 
-- "bgk": R = 1 - 1 / tau of every population.
-- "regularised": R keeps of them but the stress, the second-order Hermite part (Latt and Chopard 2006).
-- "recursive": all Hermite orders that the lattice carries, those above the second from the stress by recursion
-  (Malaspinas 2015; D2Q9 and D3Q27, whose sets are products of one axis).
+Collision, with Kupershtokh's exact difference for a force F; the velocity of the fluid is u + F / (2 rho):
 
-But for "bgk" the trace of the stress, which is friction to sound alone, is relaxed at once: a bulk viscosity of 1/9
-(1/6 in two dimensions). Kept like the rest, at viscosities near 0 it flips its sign at every step and is not forgotten:
-in a jet past a sphere a flutter of period 2 grew to a third of the velocity in 10,000 steps, at 1e-6 and at 1e-4; now
-there is none to speak of.
+    f* = f_eq(rho, u + F / rho) + R(f - f_eq(rho, u))
 
-With Smagorinsky's C the relaxation time is raised by the eddies that the grid can't hold, nu_t = C^2 |S|, and |S|
-comes from the stress at hand: tau = (tau_0 + sqrt(tau_0^2 + 18 sqrt(2) C^2 |Pi| / rho)) / 2.
+- "bgk": R multiplies every population by 1 - 1 / tau, where tau = 1/2 + 3 nu.
+- "regularised": R also projects onto the second-order Hermite part, the stress (Latt and Chopard 2006).
+- "recursive": the same with all Hermite orders that the lattice carries, those above the second from the stress by
+  recursion (Malaspinas 2015; D2Q9 and D3Q27, which are products of one axis).
+
+Except for "bgk" the trace of the stress, which only damps sound, is relaxed in one step: a bulk viscosity of 1/9 (1/6
+in two dimensions). Relaxed like the rest, at viscosities near 0 it changes its sign at every step and doesn't decay: in
+a jet past a sphere a flutter of period 2 grew to a third of the velocity in 10,000 steps, at 1e-6 and at 1e-4.
+
+Smagorinsky's eddy viscosity nu_t = C^2 |S| adds what the grid can't resolve; with |S| from the non-equilibrium stress
+Pi it becomes tau = (tau_0 + sqrt(tau_0^2 + 18 sqrt(2) C^2 |Pi| / rho)) / 2.
 
 The paper names no operator or lattice (section 5 cites Li et al. 2023); plain BGK blows up at its viscosities.
 """
@@ -31,15 +33,7 @@ from typing import Any
 
 import warp as wp
 
-from wlm_kernels.fluid.lattice_sets import (
-    BRICK_CELLS,
-    STORAGES,
-    cell_in_brick,
-    cell_of,
-    index_of,
-    lattice,
-    memory_functions,
-)
+from wlm_kernels.fluid.lattice_sets import STORAGES, cell_of, lattice, memory_functions
 
 __all__ = ["CAUSES", "FORCES", "OPERATORS", "QUIET", "Spec", "eddy_factor", "step_kernel", "trouble_of"]
 
@@ -50,12 +44,12 @@ CAUSES = ("the density is not positive", "the speed exceeds that of sound", "not
 """Why a run stops, in the order of their codes."""
 
 QUIET = (1 << 62) - 1
-"""What the trouble's key holds as long as there is none."""
+"""The trouble's key as long as there is none."""
 
-# Of an approximate quotient or root depends what friction does, at 1e-7 of it; density and momentum go round both.
+# fast_math's approximate quotients and roots enter the stress alone, at 1e-7 of it; density and momentum take none.
 _OPTIONS = {"enable_backward": False, "max_unroll": 32, "fast_math": True}
 
-# A key is (step * 2^31 + cell) * 4 + cause, so that the least one is the first step's first cell.
+# A key is (step * 2^31 + cell) * 4 + cause, so that the least is that of the first step's first cell.
 _CELLS = wp.constant(wp.int64(1 << 31))
 _CODES = wp.constant(wp.int64(4))
 _SOUND2 = wp.constant(1.0 / 3.0)
@@ -84,9 +78,8 @@ class Spec:
         eddies: Whether Smagorinsky's C is above 0.
         solids: Whether any cell may be solid.
         force: One of ``FORCES``.
-        bricks: Whether only listed bricks are worked on.
         walls: The axes of which both faces are walls at rest.
-        wide: Whether places are counted in 64 bits, see ``lattice_sets.memory_functions``.
+        wide: Whether elements are indexed in 64 bits, see ``lattice_sets.memory_functions``.
     """
 
     lattice: str
@@ -95,7 +88,6 @@ class Spec:
     eddies: bool = True
     solids: bool = False
     force: str = "none"
-    bricks: bool = False
     walls: tuple[bool, bool, bool] = (False, False, False)
     wide: bool = False
 
@@ -113,23 +105,23 @@ class Spec:
 
 @functools.cache
 def _relax(spec: Spec) -> Any:
-    """Builds (once) the collision of a cell: what arrived, as stored, and its moments -> what leaves, as stored."""
-    found = lattice(spec.lattice)
-    c, w, flat = found.c, found.w, found.axes == 2
+    """Builds (once) the collision of a cell: scaled populations that arrived, and their moments -> those that leave."""
+    velocities = lattice(spec.lattice)
+    c, w, axes, flat = velocities.c, velocities.w, velocities.axes, velocities.axes == 2
     vec = memory_functions(spec.lattice, spec.storage, spec.walls, spec.wide).vec
-    # What is stored is linear in the moments: to scale these, or the weights, is less than to scale all populations.
+    # Populations are linear in the moments: to scale these, or the weights, is less work than to scale all populations.
     scale = STORAGES[spec.storage][1]
-    pairs, size = len(c) // 2, 3**found.axes
+    pairs, size = len(c) // 2, 3**axes
     vec_hermite = wp.types.vector(size, float)
-    # Orders along x, y and z of each Hermite coefficient, and where a velocity's population ends up among them.
-    order = [(k // 9, k // 3 % 3, k % 3) if found.axes == 3 else (k // 3, k % 3, 0) for k in range(size)]
+    # Orders along x, y and z of each Hermite coefficient, and the place of each velocity's population among them.
+    order = [(k // 9, k // 3 % 3, k % 3) if axes == 3 else (k // 3, k % 3, 0) for k in range(size)]
     slot = [order.index((x + 1, y + 1, 0 if flat else z + 1)) for x, y, z in c]
-    steps = (9, 3, 1) if found.axes == 3 else (3, 1)
-    first = [[k for k in range(size) if order[k][a] == 0] for a in range(found.axes)]
+    steps = (9, 3, 1) if axes == 3 else (3, 1)
+    first = [[k for k in range(size) if order[k][a] == 0] for a in range(axes)]
 
     @wp.func
     def hermite(drho: float, j: wp.vec3, diagonal: wp.vec3, off: wp.vec3) -> vec:
-        """The populations of given moments: density, momentum and stress, the latter as Hermite coefficients."""
+        """Populations of the moments density, momentum and stress, the last as Hermite coefficients."""
         out = vec()
         rest = drho - 1.5 * (diagonal[0] + diagonal[1] + diagonal[2])
         out[0] = wp.static(w[0] * scale) * rest
@@ -152,7 +144,7 @@ def _relax(spec: Spec) -> Any:
 
     @wp.func
     def product(drho: float, u: wp.vec3, after: wp.vec3, diagonal: wp.vec3, off: wp.vec3) -> vec:
-        """Equilibrium of all orders at ``after``, and a stress with what follows from it at ``u``."""
+        """Equilibrium of all orders at ``after``, plus a stress and the orders that follow from it at ``u``."""
         unit = wp.static(scale)
         mass = unit * (1.0 + drho)
         trace = unit * diagonal
@@ -185,7 +177,7 @@ def _relax(spec: Spec) -> Any:
                 t += wp.static(float(order[k][1] * order[k][2])) * s * ux[wp.static(order[k][0])]
             a[k] = t
         # Coefficients to populations, an axis at a time: of 1, c and c^2 - 1/3 with weights 1/6, 2/3, 1/6.
-        for axis in range(wp.static(found.axes)):
+        for axis in range(wp.static(axes)):
             for k in range(wp.static(size // 3)):
                 low = a[wp.static(first[axis][k])]
                 mid = a[wp.static(first[axis][k] + steps[axis])]
@@ -201,100 +193,95 @@ def _relax(spec: Spec) -> Any:
 
     @wp.func
     def relax(
-        g: vec,
-        drho: float,
-        j: wp.vec3,
-        diagonal: wp.vec3,
-        off: wp.vec3,
-        push: wp.vec3,
-        tau: float,
-        eddy: float,
+        g: vec, drho: float, j: wp.vec3, diagonal: wp.vec3, off: wp.vec3, force: wp.vec3, tau: float, eddy: float
     ) -> vec:
         rho = 1.0 + drho
-        # One division for all of a step's.
-        share = 1.0 / rho
-        u = share * j
-        after = share * (j + push)
+        # One division by the density serves all of the step.
+        inverse = 1.0 / rho
+        u = inverse * j
+        after = inverse * (j + force)
         third = wp.static(1.0 / 3.0) * drho
-        # The equilibrium's stress, and the rest, which is what friction makes of the flow.
-        calm = wp.cw_mul(j, u)
-        skew = wp.vec3(j[0] * u[1], j[0] * u[2], j[1] * u[2])
-        strain = diagonal - calm - wp.vec3(third, third, third)
+        # The stress of the equilibrium, and the non-equilibrium stress, which is that of the flow's strain.
+        eq_diagonal = wp.cw_mul(j, u)
+        eq_off = wp.vec3(j[0] * u[1], j[0] * u[2], j[1] * u[2])
+        neq_diagonal = diagonal - eq_diagonal - wp.vec3(third, third, third)
         if wp.static(flat):
-            strain = wp.vec3(strain[0], strain[1], 0.0)
-        shear = off - skew
-        longer = float(tau)
+            neq_diagonal = wp.vec3(neq_diagonal[0], neq_diagonal[1], 0.0)
+        neq_off = off - eq_off
+        tau_eddy = float(tau)
         if wp.static(spec.eddies):
-            size2 = wp.dot(strain, strain) + 2.0 * wp.dot(shear, shear)
-            longer = 0.5 * (tau + wp.sqrt(tau * tau + eddy * share * wp.sqrt(size2)))
-        keep = 1.0 - 1.0 / longer
+            norm2 = wp.dot(neq_diagonal, neq_diagonal) + 2.0 * wp.dot(neq_off, neq_off)
+            tau_eddy = 0.5 * (tau + wp.sqrt(tau * tau + eddy * inverse * wp.sqrt(norm2)))
+        keep = 1.0 - 1.0 / tau_eddy
         if wp.static(spec.operator != "bgk"):
-            mean = wp.static(1.0 / found.axes) * (strain[0] + strain[1] + strain[2])
-            strain -= wp.vec3(mean, mean, wp.static(0.0 if flat else 1.0) * mean)
+            mean = wp.static(1.0 / axes) * (neq_diagonal[0] + neq_diagonal[1] + neq_diagonal[2])
+            neq_diagonal -= wp.vec3(mean, mean, wp.static(0.0 if flat else 1.0) * mean)
         if wp.static(spec.operator == "bgk"):
-            before = hermite(drho, j, calm, skew)
+            equilibrium = hermite(drho, j, eq_diagonal, eq_off)
             if wp.static(spec.force == "none"):
-                return before + keep * (g - before)
-            moved = wp.vec3(after[0] * after[1], after[0] * after[2], after[1] * after[2])
-            return hermite(drho, rho * after, rho * wp.cw_mul(after, after), rho * moved) + keep * (g - before)
+                return equilibrium + keep * (g - equilibrium)
+            cross = wp.vec3(after[0] * after[1], after[0] * after[2], after[1] * after[2])
+            forced = hermite(drho, rho * after, rho * wp.cw_mul(after, after), rho * cross)
+            return forced + keep * (g - equilibrium)
         if wp.static(spec.operator == "recursive"):
-            return product(drho, u, after, keep * strain, keep * shear)
+            return product(drho, u, after, keep * neq_diagonal, keep * neq_off)
         if wp.static(spec.force == "none"):
-            return hermite(drho, j, calm + keep * strain, skew + keep * shear)
-        moved = wp.vec3(after[0] * after[1], after[0] * after[2], after[1] * after[2])
-        return hermite(drho, rho * after, rho * wp.cw_mul(after, after) + keep * strain, rho * moved + keep * shear)
+            return hermite(drho, j, eq_diagonal + keep * neq_diagonal, eq_off + keep * neq_off)
+        cross = wp.vec3(after[0] * after[1], after[0] * after[2], after[1] * after[2])
+        stress = rho * wp.cw_mul(after, after) + keep * neq_diagonal
+        return hermite(drho, rho * after, stress, rho * cross + keep * neq_off)
 
     return relax
 
 
 @functools.cache
 def step_kernel(spec: Spec) -> wp.Kernel:
-    """Builds (once) the step of a spec.
-
-    Launched over all cells; with bricks over ``BRICK_CELLS`` times any number of workers, which share out the list.
+    """Builds (once) the step of a spec, over all cells.
 
     Args of the kernel:
         n: Cells along x, y and z.
-        f: [Q, N], what left every cell in the last step.
+        f: [Q, N], the populations that left every cell in the last step.
         solid: uint8 [N], above 0 where a cell is solid; used if ``spec.solids``.
-        tau: 1/2 + 3 nu.
+        tau: Relaxation time, 1/2 + 3 nu.
         eddy: ``eddy_factor``, used if ``spec.eddies``.
-        push: Force on a cell's fluid, used if ``spec.force`` is "uniform".
-        pushes: vec3 [N], used if it is "field".
-        brick, listed, count, workers, quiet: A brick's cells; the bricks to work on and their number, on the device;
-            how many workers share them; the square of the deviation from rest above which a brick counts as busy.
-        parity: Which of the two numbers of ``clock`` is this step's.
+        force: Force on a cell's fluid, used if ``spec.force`` is "uniform".
+        forces: vec3 [N], used if it is "field".
+        parity: Which of the two elements of ``clock`` is this step's.
         clock: int [2], counts steps.
         trouble: int64 [1], lowered to the key of the first cell that went wrong.
-        busy: int [bricks], set to 1 where a brick isn't at rest.
         sums: float64 [2], set to 0 for ``lattice_links``.
-        out: [Q, N], what leaves every cell now.
+        out: [Q, N], the populations that leave every cell now.
     """
     memory, relax = memory_functions(spec.lattice, spec.storage, spec.walls, spec.wide), _relax(spec)
     gather, moments, put = memory.gather, memory.moments, memory.put
     stored, count_q = STORAGES[spec.storage][0], len(lattice(spec.lattice).c)
 
-    @wp.func
-    def advance(
+    @wp.kernel(module="unique", module_options=_OPTIONS)
+    def step(
+        # in:
         n: wp.vec3i,
         f: wp.array2d[stored],
-        p: wp.vec3i,
-        i: int,
         solid: wp.array1d[wp.uint8],
         tau: float,
         eddy: float,
-        push: wp.vec3,
-        pushes: wp.array1d[wp.vec3],
+        force: wp.vec3,
+        forces: wp.array1d[wp.vec3],
         parity: int,
+        # out:
         clock: wp.array1d[int],
         trouble: wp.array1d[wp.int64],
+        sums: wp.array1d[wp.float64],
         out: wp.array2d[stored],
-    ) -> float:
-        """Does one cell; gives the square of its deviation from rest."""
+    ):
+        i = wp.tid()
+        if i == 0:
+            clock[1 - parity] = clock[parity] + 1
+            sums[0] = wp.float64(0.0)
+            sums[1] = wp.float64(0.0)
         if wp.static(spec.solids):
             if solid[i] != wp.uint8(0):
-                return 0.0
-        g = gather(f, n, p)
+                return
+        g = gather(f, n, cell_of(n, i))
         drho, j, diagonal, off = moments(g)
         rho = 1.0 + drho
         j2 = wp.dot(j, j)
@@ -306,54 +293,13 @@ def step_kernel(spec: Spec) -> wp.Kernel:
                 code = 0
             key = wp.int64(clock[parity]) * _CELLS + wp.int64(i)
             wp.atomic_min(trouble, 0, key * _CODES + wp.int64(code))
-        force = wp.vec3()
+        push = wp.vec3()
         if wp.static(spec.force == "uniform"):
-            force = push
+            push = force
         if wp.static(spec.force == "field"):
-            force = pushes[i]
-        g = relax(g, drho, j, diagonal, off, force, tau, eddy)
+            push = forces[i]
+        g = relax(g, drho, j, diagonal, off, push, tau, eddy)
         for q in range(wp.static(count_q)):
             put(out, q, i, g[q])
-        return j2 + drho * drho
-
-    @wp.kernel(module="unique", module_options=_OPTIONS)
-    def step(
-        # in:
-        n: wp.vec3i,
-        f: wp.array2d[stored],
-        solid: wp.array1d[wp.uint8],
-        tau: float,
-        eddy: float,
-        push: wp.vec3,
-        pushes: wp.array1d[wp.vec3],
-        brick: wp.vec3i,
-        listed: wp.array1d[int],
-        count: wp.array1d[int],
-        workers: int,
-        quiet: float,
-        parity: int,
-        # out:
-        clock: wp.array1d[int],
-        trouble: wp.array1d[wp.int64],
-        busy: wp.array1d[int],
-        sums: wp.array1d[wp.float64],
-        out: wp.array2d[stored],
-    ):
-        i = wp.tid()
-        if i == 0:
-            clock[1 - parity] = clock[parity] + 1
-            sums[0] = wp.float64(0.0)
-            sums[1] = wp.float64(0.0)
-        if wp.static(spec.bricks):
-            for k in range(i // BRICK_CELLS, count[0], workers):
-                b = listed[k]
-                p = cell_in_brick(n, brick, b, i % BRICK_CELLS)
-                if p[0] < n[0] and p[1] < n[1] and p[2] < n[2]:
-                    away = advance(n, f, p, index_of(n, p), solid, tau, eddy, push, pushes, parity, clock, trouble, out)
-                    if away > quiet:
-                        busy[b] = 1
-        else:
-            p = cell_of(n, i)
-            advance(n, f, p, i, solid, tau, eddy, push, pushes, parity, clock, trouble, out)
 
     return step

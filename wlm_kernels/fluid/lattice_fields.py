@@ -1,4 +1,7 @@
-"""The air on a lattice as fields: its velocity and density, how it starts, and what fills cells that were solid."""
+"""Velocity and density of the air on a lattice, its start, and the refill of cells that are no longer solid.
+
+Read ``tests/reference/lattice.py`` first: ``fields`` and ``equilibrium`` there are the same moments in float64 NumPy.
+"""
 
 import functools
 from dataclasses import dataclass
@@ -23,13 +26,13 @@ __all__ = ["FluidKernels", "fluid_kernels"]
 
 @dataclass(frozen=True)
 class FluidKernels:
-    """Of one lattice and storage.
+    """The kernels of one lattice and storage, each over all cells.
 
     Attributes:
-        fields: What the fluid does, over all cells.
-        start: Lets an equilibrium leave all cells, over all cells.
-        neighbours: The mean of the fluid around each cell that stops being solid, over all cells.
-        uncover: Sets those cells to it, over all cells.
+        fields: Density less 1 and velocity of every cell.
+        start: Sets every cell to an equilibrium.
+        neighbours: The mean of the fluid around each cell that stops being solid.
+        uncover: Sets those cells to the equilibrium of that mean.
     """
 
     fields: wp.Kernel
@@ -40,7 +43,7 @@ class FluidKernels:
 
 @functools.cache
 def fluid_kernels(lattice_name: str, storage: str, walls: tuple[bool, bool, bool]) -> FluidKernels:
-    """Builds (once) the kernels that are not run at every step; the arguments are those of ``memory_functions``."""
+    """Builds (once) the kernels that don't run at every step; arguments as for ``memory_functions``."""
     memory = memory_functions(lattice_name, storage, walls)
     gather, moments, load, store = memory.gather, memory.moments, memory.load, memory.store
     stored = STORAGES[storage][0]
@@ -53,8 +56,8 @@ def fluid_kernels(lattice_name: str, storage: str, walls: tuple[bool, bool, bool
         f: wp.array2d[stored],
         solid: wp.array1d[wp.uint8],
         bodies: Bodies,
-        push: wp.vec3,
-        pushes: wp.array1d[wp.vec3],
+        force: wp.vec3,
+        forces: wp.array1d[wp.vec3],
         # out:
         drho: wp.array1d[float],
         u: wp.array1d[wp.vec3],
@@ -63,16 +66,16 @@ def fluid_kernels(lattice_name: str, storage: str, walls: tuple[bool, bool, bool
         p = cell_of(n, i)
         excess = float(0.0)
         v = wp.vec3()
-        inside = int(0)
+        body = int(0)
         if solid.shape[0] > 0:
-            inside = int(solid[i])
-        if inside > 0:
-            v = body_velocity(bodies, inside, p)
+            body = int(solid[i])
+        if body > 0:
+            v = body_velocity(bodies, body, p)
         else:
             excess, j, _diagonal, _off = moments(gather(f, n, p))
-            half = 0.5 * push
-            if pushes.shape[0] > 0:
-                half += 0.5 * pushes[i]
+            half = 0.5 * force
+            if forces.shape[0] > 0:
+                half += 0.5 * forces[i]
             v = (j + half) / (1.0 + excess)
         if drho.shape[0] > 0:
             drho[i] = excess
@@ -113,10 +116,10 @@ def fluid_kernels(lattice_name: str, storage: str, walls: tuple[bool, bool, bool
         for q in range(1, t.w.shape[0]):
             beside = p + t.c[q]
             if not crosses(n, bounded, beside):
-                other = wrapped(n, beside)
-                k = index_of(n, other)
+                neighbour = wrapped(n, beside)
+                k = index_of(n, neighbour)
                 if covered[k] == wp.uint8(0) and solid[k] == wp.uint8(0):
-                    excess, j, _diagonal, _off = moments(gather(f, n, other))
+                    excess, j, _diagonal, _off = moments(gather(f, n, neighbour))
                     rho = 1.0 + excess
                     total += t.w[q] * wp.vec4(excess, j[0] / rho, j[1] / rho, j[2] / rho)
                     weight += t.w[q]
@@ -146,7 +149,7 @@ def fluid_kernels(lattice_name: str, storage: str, walls: tuple[bool, bool, bool
         p = cell_of(n, i)
         for q in range(t.w.shape[0]):
             value = equilibrium(t.w[q], t.c[q], drho, u)
-            # A link's place holds what comes in next: of this cell's, that is the equilibrium too.
+            # A link's element holds what comes in next: for this cell that is the equilibrium too.
             if owned(n, bounded, walled, p + t.c[q]):
                 store(f, q, i, value)
             if not owned(n, bounded, walled, p - t.c[q]):

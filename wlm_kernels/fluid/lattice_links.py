@@ -1,24 +1,21 @@
-"""What comes back from walls, and in through inlets and outlets, on a lattice.
+"""Boundary conditions of the lattice: what comes back from walls, and in through inlets and outlets.
 
-A link is a fluid cell a and a direction q in which something comes to it from beyond a face of the domain or out of a
-solid. (Axes that walls at rest close have none: ``lattice`` sees to those.) The place that a pulls it from, population
-q of the cell at a - c_q seen as periodic, is read by a alone. So after every step the links' values are computed from
-what has just left the cells, and then put into those places: two passes, since the place of one link may hold what
-another reads.
+Read ``tests/reference/lattice.py`` first: ``stream`` there has the same conditions in float64 NumPy, link by link.
 
-- bounce: f_q = f*_opposite + term, half-way bounce-back; the term 6 w (c . u) carries a wall's velocity at density 1.
-- inlet: the same, so that it lets in just u of mass a cell; its term may rise from 0 in the first steps.
+A link is a fluid cell a and a direction q in which a population comes to it from beyond a face of the domain or out of
+a solid. (Axes closed by walls at rest have none: the step of ``lattice`` does those.) The element that cell a pulls it
+from, population q of the periodic image of the cell a - c_q, is read by a alone. So after every step the links' values
+are computed from the populations f* that have just left the cells, and then written into those elements: two passes,
+since the element of one link may hold what another reads.
+
+- bounce: f_q = f*_opposite + term, half-way bounce-back; the term 6 w_q c_q . u carries a wall's velocity at density 1.
+- inlet: the same, which lets in a mass of u for each cell of the face; its term may rise from 0 in the first steps.
 - slip: the mirror image of what leaves the neighbour, a wall without friction.
-- outlet: the equilibrium of the cell's own density and velocity, no gradient; what it takes is then shifted, alike at
-  all outlets, so that as much leaves through them as comes in elsewhere: mass is conserved to rounding.
-- pressure: the same, with the density drawn towards a given one, whose deviation from 1 is the term.
+- outlet: the equilibrium at the cell's own density and velocity (zero gradient). It is then shifted, by w_q times the
+  same factor at all outlets, so that as much leaves through them as comes in elsewhere: mass is conserved to rounding.
+- pressure: the same without the shift, its density relaxed towards a given one, whose excess over 1 is the term.
 
-Flow that would come in through an outlet is stopped at it: it would feed on itself.
-
-    cell  int [L]        a
-    code  uint8 [L]      q + 32 kind
-    term  float [L]      see above
-    value float [L]      between the passes
+Velocities into the domain are set to 0 at an outlet: backflow would feed on itself.
 """
 
 import functools
@@ -29,7 +26,6 @@ import warp as wp
 from wlm_kernels.fluid.lattice_sets import (
     STORAGES,
     Tables,
-    brick_of,
     cell_of,
     crosses,
     equilibrium,
@@ -38,8 +34,21 @@ from wlm_kernels.fluid.lattice_sets import (
     opposite,
     wrapped,
 )
+from wlm_kernels.fluid.lattice_solids import Bodies, velocity_at
 
-__all__ = ["BLOCK", "BOUNCE", "INLET", "OUTLET", "PRESSURE", "SLIP", "LinkKernels", "apply", "link_kernels", "pin"]
+__all__ = [
+    "BLOCK",
+    "BOUNCE",
+    "INLET",
+    "OUTLET",
+    "PRESSURE",
+    "SLIP",
+    "LinkKernels",
+    "Links",
+    "apply",
+    "find_links",
+    "link_kernels",
+]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -48,23 +57,44 @@ _BOUNCE, _SLIP, _OUTLET, _INLET = (wp.constant(kind) for kind in (BOUNCE, SLIP, 
 
 BLOCK = 256
 
-# A density that is held at once throws all sound back. Drawn to its value at this rate over the crossing of the
-# domain (0.25 to 0.6 in the literature, Poinsot and Lele 1992), it lets most of it out and still keeps its mean.
+# An outlet of fixed density reflects all sound. Relaxed to its value at this rate over the crossing of the domain (0.25
+# to 0.6 in the literature, Poinsot and Lele 1992), it lets most of it out and still keeps its mean.
 _HOLD = wp.constant(0.3)
+
+
+@wp.struct
+class Links:
+    """Links on a device, those of faces first.
+
+    Attributes:
+        cell: int [L], the fluid cell a.
+        code: uint8 [L], the direction q + 32 times the kind.
+        term: float [L], see the module.
+        value: float [L], between the two passes.
+        used: int [1], the number of elements in use.
+        faces: The number of links of faces.
+    """
+
+    cell: wp.array1d[int]
+    code: wp.array1d[wp.uint8]
+    term: wp.array1d[float]
+    value: wp.array1d[float]
+    used: wp.array1d[int]
+    faces: int
 
 
 @dataclass(frozen=True)
 class LinkKernels:
-    """Of one lattice and storage.
+    """The kernels of one lattice and storage.
 
     Attributes:
         values: First pass, over the links, rounded up to ``BLOCK``.
-        places: Second pass, over the links.
-        force: What the fluid does to each body, over the links.
+        write: Second pass, over the links.
+        force: The force of the fluid on each body, over the links.
     """
 
     values: wp.Kernel
-    places: wp.Kernel
+    write: wp.Kernel
     force: wp.Kernel
 
 
@@ -83,7 +113,7 @@ def link_kernels(lattice_name: str, storage: str, balance: bool) -> LinkKernels:
 
     @wp.func
     def mirrored(t: Tables, n: wp.vec3i, bounded: wp.vec3i, i: int, q: int):
-        """Whose image sends to cell i in direction q, where a wall slips, and in which direction it does itself."""
+        """The cell whose mirror image in a slip wall sends population q to cell i, and that cell's own direction."""
         p = cell_of(n, i)
         c = t.c[q]
         x = _beyond(p[0] - c[0], n[0], bounded[0])
@@ -94,10 +124,10 @@ def link_kernels(lattice_name: str, storage: str, balance: bool) -> LinkKernels:
         return index_of(n, wrapped(n, p - along)), turned
 
     @wp.func
-    def let_out(
+    def outflow(
         t: Tables, n: wp.vec3i, bounded: wp.vec3i, f: wp.array2d[stored], i: int, q: int, kind: int, term: float
     ) -> float:
-        """What an outlet sends to cell i in direction q."""
+        """The population that an outlet sends to cell i in direction q."""
         drho = float(0.0)
         j = wp.vec3()
         for k in range(t.w.shape[0]):
@@ -126,52 +156,49 @@ def link_kernels(lattice_name: str, storage: str, balance: bool) -> LinkKernels:
         n: wp.vec3i,
         bounded: wp.vec3i,
         first: int,
-        last: wp.array1d[int],
         solid: wp.array1d[wp.uint8],
-        cell: wp.array1d[int],
-        code: wp.array1d[wp.uint8],
-        term: wp.array1d[float],
         clock: wp.array1d[int],
         rise: float,
         f: wp.array2d[stored],
+        # in, out:
+        links: Links,
         # out:
-        value: wp.array1d[float],
         sums: wp.array1d[wp.float64],
     ):
         at = first + wp.tid()
         net = wp.float64(0.0)
         weight = wp.float64(0.0)
-        live = at < last[0]
+        live = at < links.used[0]
         if live:
-            i = cell[at]
-            q = int(code[at]) & 31
-            kind = int(code[at]) >> 5
+            i = links.cell[at]
+            q = int(links.code[at]) & 31
+            kind = int(links.code[at]) >> 5
             if solid.shape[0] > 0:
                 live = solid[i] == wp.uint8(0)
             if live:
                 out = load(f, opposite(q), i)
                 v = float(0.0)
                 if kind == _BOUNCE:
-                    v = out + term[at]
+                    v = out + links.term[at]
                 elif kind == _INLET:
-                    # Of the two numbers the larger counts the steps done; this is for the next.
-                    gone = wp.min(1.0, float(wp.max(clock[0], clock[1]) + 1) * rise)
-                    v = out + gone * gone * (3.0 - 2.0 * gone) * term[at]
+                    # The larger of the two counts the steps done; this is for the next.
+                    risen = wp.min(1.0, float(wp.max(clock[0], clock[1]) + 1) * rise)
+                    v = out + risen * risen * (3.0 - 2.0 * risen) * links.term[at]
                 elif kind == _SLIP:
                     k, c = mirrored(t, n, bounded, i, q)
-                    # The image of a solid bounces back.
+                    # At the image of a solid it bounces back.
                     v = load(f, t.index[9 * (c[0] + 1) + 3 * (c[1] + 1) + c[2] + 1], k)
                     if solid.shape[0] > 0:
                         if solid[k] != wp.uint8(0):
                             v = out
                 else:
-                    v = let_out(t, n, bounded, f, i, q, kind, term[at])
-                value[at] = v
+                    v = outflow(t, n, bounded, f, i, q, kind, links.term[at])
+                links.value[at] = v
                 net = wp.float64(v - out)
                 if kind == _OUTLET:
                     weight = wp.float64(t.w[q])
         if wp.static(balance):
-            # Every thread of the block takes part in the sums, and of most blocks they are 0.
+            # Every thread of a block takes part in its sums, most of which are 0.
             block_net = wp.tile_extract(wp.tile_sum(wp.tile(net)), 0)
             block_weight = wp.tile_extract(wp.tile_sum(wp.tile(weight)), 0)
             if wp.tid() % wp.block_dim() == 0:
@@ -181,27 +208,24 @@ def link_kernels(lattice_name: str, storage: str, balance: bool) -> LinkKernels:
                     wp.atomic_add(sums, 1, block_weight)
 
     @wp.kernel(module="unique", module_options=options)
-    def places(
+    def write(
         # in:
         t: Tables,
         n: wp.vec3i,
         first: int,
-        last: wp.array1d[int],
-        cell: wp.array1d[int],
-        code: wp.array1d[wp.uint8],
-        value: wp.array1d[float],
+        links: Links,
         sums: wp.array1d[wp.float64],
         # out:
         f: wp.array2d[stored],
     ):
         at = first + wp.tid()
-        if at >= last[0]:
+        if at >= links.used[0]:
             return
-        i = cell[at]
-        q = int(code[at]) & 31
-        v = value[at]
+        i = links.cell[at]
+        q = int(links.code[at]) & 31
+        v = links.value[at]
         if wp.static(balance):
-            if int(code[at]) >> 5 == _OUTLET and sums[1] > wp.float64(0.0):
+            if int(links.code[at]) >> 5 == _OUTLET and sums[1] > wp.float64(0.0):
                 v -= t.w[q] * float(sums[0] / sums[1])
         store(f, q, index_of(n, wrapped(n, cell_of(n, i) - t.c[q])), v)
 
@@ -211,104 +235,124 @@ def link_kernels(lattice_name: str, storage: str, balance: bool) -> LinkKernels:
         t: Tables,
         n: wp.vec3i,
         bounded: wp.vec3i,
-        last: wp.array1d[int],
+        links: Links,
         solid: wp.array1d[wp.uint8],
-        cell: wp.array1d[int],
-        code: wp.array1d[wp.uint8],
-        term: wp.array1d[float],
         f: wp.array2d[stored],
         # out:
         total: wp.array1d[wp.vec3d],
     ):
         at = wp.tid()
-        if at >= last[0]:
+        if at >= links.used[0]:
             return
-        i = cell[at]
-        q = int(code[at]) & 31
+        i = links.cell[at]
+        q = int(links.code[at]) & 31
         c = t.c[q]
-        place = index_of(n, wrapped(n, cell_of(n, i) - c))
-        k = int(place)
-        if int(code[at]) >> 5 == _SLIP:
-            # Where such a wall cuts a body, the image of this link is one of the body's.
+        element = index_of(n, wrapped(n, cell_of(n, i) - c))
+        k = int(element)
+        if int(links.code[at]) >> 5 == _SLIP:
+            # Where a slip wall cuts a body, the mirror image of this link is one of the body's.
             k, c = mirrored(t, n, bounded, i, q)
         elif crosses(n, bounded, cell_of(n, i) - c):
             return
         if solid[k] == wp.uint8(0) or solid[i] != wp.uint8(0):
             return
-        # The place holds what came back; what went in is that less the term, and both push the same way.
-        exchanged = wp.float64(term[at] - 2.0 * load(f, q, place))
+        # The element holds what came back; what went in is that less the term, and both push the same way.
+        exchanged = wp.float64(links.term[at] - 2.0 * load(f, q, element))
         along = wp.vec3d(wp.float64(c[0]), wp.float64(c[1]), wp.float64(c[2]))
         wp.atomic_add(total, int(solid[k]), exchanged * along)
 
-    return LinkKernels(values, places, force)
+    return LinkKernels(values, write, force)
 
 
 @wp.kernel
-def _pin(
+def _find(
     # in:
+    t: Tables,
     n: wp.vec3i,
-    brick: wp.vec3i,
-    last: wp.array1d[int],
-    cell: wp.array1d[int],
-    code: wp.array1d[wp.uint8],
-    term: wp.array1d[float],
+    bounded: wp.vec3i,
+    solid: wp.array1d[wp.uint8],
+    bodies: Bodies,
+    # in, out:
+    links: Links,
     # out:
-    pinned: wp.array1d[int],
+    count: wp.array1d[int],
+    fastest: wp.array1d[float],
 ):
-    at = wp.tid()
-    if at < last[0]:
-        if term[at] != 0.0 or int(code[at]) >> 5 == _OUTLET:
-            pinned[brick_of(n, brick, cell_of(n, cell[at]))] = 1
+    i = wp.tid()
+    if solid[i] != wp.uint8(0):
+        return
+    p = cell_of(n, i)
+    for q in range(1, t.w.shape[0]):
+        source = p - t.c[q]
+        if not crosses(n, bounded, source):
+            k = int(solid[index_of(n, wrapped(n, source))])
+            if k > 0:
+                # The wall lies halfway between the two cells' centres.
+                c = wp.vec3(float(t.c[q][0]), float(t.c[q][1]), float(t.c[q][2]))
+                x = wp.vec3(float(p[0]) + 0.5, float(p[1]) + 0.5, float(p[2]) + 0.5) - 0.5 * c
+                u = velocity_at(bodies, k, x)
+                if wp.dot(u, u) > 0.0:
+                    wp.atomic_max(fastest, 0, wp.length(u))
+                at = links.faces + wp.atomic_add(count, 0, 1)
+                if at < links.cell.shape[0]:
+                    links.cell[at] = i
+                    links.code[at] = wp.uint8(q)
+                    links.term[at] = 6.0 * t.w[q] * wp.dot(c, u)
+
+
+def find_links(tables: Tables, n: wp.vec3i, bounded: wp.vec3i, solid: wp.array, bodies: Bodies, links: Links):
+    """Lists the links of solid cells, in any order, after those of faces; ``used`` stays as it is.
+
+    Args:
+        tables: The velocity set.
+        n: Cells along x, y and z.
+        bounded: 1 for each axis that isn't periodic.
+        solid: uint8 [N].
+        bodies: Their motion.
+        links: Changed.
+
+    Returns:
+        The number of these links, whether or not they fit, int [1], and the speed of the fastest surface, float [1].
+    """
+    count, fastest = (wp.zeros(1, dtype=dtype, device=solid.device) for dtype in (int, float))
+    inputs = [tables, n, bounded, solid, bodies, links]
+    wp.launch(_find, solid.shape[0], inputs=inputs, outputs=[count, fastest], device=solid.device)
+    return count, fastest
 
 
 def apply(
     kernels: LinkKernels,
-    tables,
-    n,
-    bounded,
+    tables: Tables,
+    n: wp.vec3i,
+    bounded: wp.vec3i,
     first: int,
-    links,
-    solid,
-    clock,
+    links: Links,
+    solid: wp.array,
+    clock: wp.array,
     rise: float,
-    f,
-    sums,
+    f: wp.array,
+    sums: wp.array,
 ) -> None:
-    """Both passes over the links from place ``first`` on.
+    """Runs both passes over the links from element ``first`` on.
 
     Args:
         kernels: Of the lattice and storage of ``f``.
-        tables: ``lattice_sets.Tables``.
+        tables: The velocity set.
         n: Cells along x, y and z.
-        bounded: vec3i, 1 for each axis that isn't periodic.
+        bounded: 1 for each axis that isn't periodic.
         first: 0, or the first link of a solid.
-        links: Has ``cell``, ``code``, ``term`` and ``value`` [L] and ``last`` int [1], how many are in use.
+        links: The links; ``value`` is changed.
         solid: uint8 [N], or [0] if no cell is solid.
         clock: int [2], see ``lattice.step_kernel``.
         rise: Inlets are at their full velocity after 1 / rise steps.
-        f: [Q, N], what has just left the cells.
-        sums: float64 [2], what all links take in without the shift and the weight of the outlets; 0 before.
+        f: [Q, N], the populations that have just left the cells, changed.
+        sums: float64 [2], 0 before: the mass that all links let in without the shift, and the weight of the outlets.
     """
     size, device = links.cell.shape[0] - first, f.device
     if size <= 0:
         return
-    inputs = [tables, n, bounded, first, links.last, solid, links.cell, links.code, links.term]
-    inputs += [clock, rise, f]
     threads = -(-size // BLOCK) * BLOCK
-    outputs = [links.value, sums]
-    wp.launch(kernels.values, threads, inputs=inputs, outputs=outputs, block_dim=BLOCK, device=device)
-    inputs = [tables, n, first, links.last, links.cell, links.code, links.value, sums]
-    wp.launch(kernels.places, size, inputs=inputs, outputs=[f], device=device)
-
-
-def pin(n, brick, links, pinned) -> None:
-    """Marks the bricks in which a link moves fluid that is at rest.
-
-    Args:
-        n, brick: Cells of the domain and of a brick.
-        links: As for ``apply``.
-        pinned: int [bricks], set to 1 where that is so.
-    """
-    inputs = [n, brick, links.last, links.cell, links.code, links.term]
-    if links.cell.shape[0] > 0:
-        wp.launch(_pin, links.cell.shape[0], inputs=inputs, outputs=[pinned], device=pinned.device)
+    inputs = [tables, n, bounded, first, solid, clock, rise, f, links]
+    wp.launch(kernels.values, threads, inputs=inputs, outputs=[sums], block_dim=BLOCK, device=device)
+    inputs = [tables, n, first, links, sums]
+    wp.launch(kernels.write, size, inputs=inputs, outputs=[f], device=device)

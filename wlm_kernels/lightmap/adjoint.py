@@ -1,10 +1,13 @@
-"""The adjoints of sampling a temporal lightmap's maps, by hand: where each gradient is added.
+"""Hand-written adjoints of sampling a temporal lightmap's maps: each scatters a gradient to the cells it was read from.
 
-On CUDA gradients are added as 64-bit integers, since integer addition has no order and one seed must give one result;
-on the CPU each lane (a range of samples, run by one thread) has float buffers of its own.
+On CUDA gradients are added as 64-bit integers, since the result of integer addition does not depend on the order and
+one seed must give one result; on the CPU each lane (a range of samples, run by one thread) has its own float buffers.
+
+Read first: ``tests/reference/temporal.py``, ``train_features``, whose gradients by autograd these are.
 """
 
 import functools
+from typing import Any
 
 import warp as wp
 
@@ -16,16 +19,16 @@ __all__ = ["scatters"]
 
 
 @wp.func
-def corner_share(base: int, at: int, other: int, f: float, block: int) -> wp.vec2:
-    """The linear weights of an axis's two cells (at, other), kept where the cell lies in ``block``."""
-    a = wp.where(at // 4 == block, 1.0 - f, 0.0)
-    b = wp.where(other // 4 == block, f, 0.0)
+def corner_weights(first: int, second: int, f: float, block: int) -> wp.vec2:
+    """The linear weights of an axis's two cells; 0 for a cell outside ``block``."""
+    a = wp.where(first // 4 == block, 1.0 - f, 0.0)
+    b = wp.where(second // 4 == block, f, 0.0)
     return wp.vec2(a, b)
 
 
 @functools.cache
-def _adders(device_kind: str):
-    """How a gradient is added: as an integer on CUDA, as a float into a lane's own buffer on the CPU."""
+def _adders(device_kind: str) -> tuple[Any, Any]:
+    """The function that adds a number to a sum, and the sum's type."""
     if device_kind == "cuda":
         # Fixed point with steps of 2^-40, about 1e-12; a sum beyond 8e6 would overflow.
 
@@ -43,7 +46,7 @@ def _adders(device_kind: str):
 
 
 @functools.cache
-def scatters(device_kind: str):
+def scatters(device_kind: str) -> tuple[Any, Any, Any, Any]:
     """Builds (once) the adjoints of texel, volume and plane sampling.
 
     Args:
@@ -113,15 +116,15 @@ def scatters(device_kind: str):
         for k in range(two):
             s = n * slices + axis_index(t + k, slices, periodic)
             ct = wp.where(k == 0, 1.0 - ft, ft)
-            # The eight corners lie in one to four blocks a slice: a block's endpoints get one sum, not one a corner.
+            # The four corners of a slice lie in one to four blocks: endpoints get one sum per block, not per corner.
             for j in range(two):
                 by = wp.where(j == 0, ya // 4, yb // 4)
                 if j == 0 or by != ya // 4:
-                    cy = corner_share(y, ya, yb, fy, by) * ct
+                    cy = corner_weights(ya, yb, fy, by) * ct
                     for i in range(two):
                         bx = wp.where(i == 0, xa // 4, xb // 4)
                         if i == 0 or bx != xa // 4:
-                            cx = corner_share(x, xa, xb, fx, bx)
+                            cx = corner_weights(xa, xb, fx, bx)
                             e0 = ste_endpoint(maps.uvt_endpoints[s, by, bx, 0], quantised)
                             e1 = ste_endpoint(maps.uvt_endpoints[s, by, bx, 1], quantised)
                             along = wp.dot(e1 - e0, g)

@@ -1,4 +1,4 @@
-"""Feature maps stored as BC7 mode 6 blocks: endpoints and weights, their exact levels, and sampling.
+"""Feature maps stored as BC7 mode 6 blocks: endpoints and weights, their exact levels, and their texels.
 
 A map of 4 channels is cut into blocks of 4x4 texels. A block holds two endpoints ``e0, e1`` in [0, 1]^4 and one
 weight in [0, 1] a texel; a texel is ``(1 - w) e0 + w e1`` (neural-dynamic-gi, eq. 7 and 8). BC7 mode 6 stores the
@@ -6,7 +6,7 @@ endpoints with 7 bits a channel plus one lowest bit shared by the four channels,
 
 ``quantised=1`` evaluates the map on exactly those levels, so that what is trained is what the file decodes to; the
 adjoint is straight-through: each rounding has derivative 1, and values outside [0, 1] keep their gradient, so that
-Adam can bring them back.
+Adam can bring them back. ``wlm.ops.plain.bc7_texels`` is the same in a few lines of torch.
 
 Arrays: endpoints ``[S, H/4, W/4, 2]`` of vec4, weights ``[S, H, W]``, where S counts slices (tiles, or tiles x
 times). Blocks of the file are ``[S, H/4, W/4, 2]`` of uint64, the low and the high half of 16 little-endian bytes.
@@ -14,7 +14,9 @@ times). Blocks of the file are ``[S, H/4, W/4, 2]`` of uint64, the low and the h
 
 import warp as wp
 
-__all__ = ["quantise", "reconstruct", "sample"]
+__all__ = ["quantise", "reconstruct", "reconstruct_backward"]
+
+wp.set_module_options({"enable_backward": False})
 
 
 @wp.func
@@ -30,15 +32,10 @@ def index_level(index: int) -> int:
 
 @wp.func
 def ste_weight(w: float, quantised: int) -> float:
-    """The weight as used: clamped, or on its exact level of 64ths. Straight-through."""
+    """The weight as used: clamped, or on its exact level of 64ths. Its derivative is taken as 1."""
     if quantised == 0:
         return wp.clamp(w, 0.0, 1.0)
     return float(index_level(weight_index(w))) / 64.0
-
-
-@wp.func_grad(ste_weight)
-def _adj_ste_weight(w: float, quantised: int, adj_ret: float):
-    wp.adjoint[w] += adj_ret
 
 
 @wp.func
@@ -67,7 +64,7 @@ def endpoint_byte(e: wp.vec4) -> wp.vec4:
 
 @wp.func
 def ste_endpoint(e: wp.vec4, quantised: int) -> wp.vec4:
-    """The endpoint as used, in [0, 1]: clamped, or on its exact bytes over 255. Straight-through."""
+    """The endpoint as used, in [0, 1]: clamped, or on its exact bytes over 255. Its derivative is taken as 1."""
     if quantised == 0:
         return wp.vec4(
             wp.clamp(e[0], 0.0, 1.0),
@@ -76,11 +73,6 @@ def ste_endpoint(e: wp.vec4, quantised: int) -> wp.vec4:
             wp.clamp(e[3], 0.0, 1.0),
         )
     return endpoint_byte(e) / 255.0
-
-
-@wp.func_grad(ste_endpoint)
-def _adj_ste_endpoint(e: wp.vec4, quantised: int, adj_ret: wp.vec4):
-    wp.adjoint[e] += adj_ret
 
 
 @wp.func
@@ -107,13 +99,6 @@ def ste_mix(e0: wp.vec4, e1: wp.vec4, w: float, quantised: int) -> wp.vec4:
         )
         / 255.0
     )
-
-
-@wp.func_grad(ste_mix)
-def _adj_ste_mix(e0: wp.vec4, e1: wp.vec4, w: float, quantised: int, adj_ret: wp.vec4):
-    wp.adjoint[e0] += (1.0 - w) * adj_ret
-    wp.adjoint[e1] += w * adj_ret
-    wp.adjoint[w] += wp.dot(e1 - e0, adj_ret)
 
 
 @wp.func
@@ -168,41 +153,35 @@ def _reconstruct(
 
 
 @wp.kernel
-def _sample(
+def _reconstruct_backward(
     # in:
     endpoints: wp.array4d[wp.vec4],
     weights: wp.array3d[float],
-    slices: wp.array1d[int],
-    points: wp.array1d[wp.vec2],
     quantised: int,
+    grad_out: wp.array3d[wp.vec4],
     # out:
-    out: wp.array1d[wp.vec4],
+    grad_endpoints: wp.array4d[wp.vec4],
+    grad_weights: wp.array3d[float],
 ):
-    i = wp.tid()
-    s = slices[i]
-    height = weights.shape[1]
-    width = weights.shape[2]
-    p = points[i]
-    x = p[0] * float(width) - 0.5
-    y = p[1] * float(height) - 0.5
-    x0 = int(wp.floor(x))
-    y0 = int(wp.floor(y))
-    fx = x - float(x0)
-    fy = y - float(y0)
-    xa = wp.clamp(x0, 0, width - 1)
-    xb = wp.clamp(x0 + 1, 0, width - 1)
-    ya = wp.clamp(y0, 0, height - 1)
-    yb = wp.clamp(y0 + 1, 0, height - 1)
-    top = (1.0 - fx) * texel(endpoints, weights, s, ya, xa, quantised) + fx * texel(
-        endpoints, weights, s, ya, xb, quantised
-    )
-    bottom = (1.0 - fx) * texel(endpoints, weights, s, yb, xa, quantised) + fx * texel(
-        endpoints, weights, s, yb, xb, quantised
-    )
-    out[i] = (1.0 - fy) * top + fy * bottom
+    # One block per thread: its sums have a fixed order, and no two threads write to one number.
+    s, row, column = wp.tid()
+    e0 = ste_endpoint(endpoints[s, row, column, 0], quantised)
+    e1 = ste_endpoint(endpoints[s, row, column, 1], quantised)
+    on_e0 = wp.vec4()
+    on_e1 = wp.vec4()
+    for i in range(16):
+        y = 4 * row + i // 4
+        x = 4 * column + i % 4
+        w = ste_weight(weights[s, y, x], quantised)
+        g = grad_out[s, y, x]
+        on_e0 += (1.0 - w) * g
+        on_e1 += w * g
+        grad_weights[s, y, x] = wp.dot(e1 - e0, g)
+    grad_endpoints[s, row, column, 0] = on_e0
+    grad_endpoints[s, row, column, 1] = on_e1
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel
 def _quantise(
     # in:
     endpoints: wp.array4d[wp.vec4],
@@ -219,41 +198,32 @@ def _quantise(
 
 
 def reconstruct(endpoints, weights, out, quantised: bool = False) -> None:
-    """Writes a whole map from its endpoints and weights (eq. 8); recorded by an open ``wp.Tape``.
+    """Writes a whole map from its endpoints and weights (eq. 8).
 
     Args:
         endpoints: vec4 [S, H/4, W/4, 2], in [0, 1].
         weights: float [S, H, W], in [0, 1].
         out: vec4 [S, H, W].
-        quantised: Evaluate on the exact levels of BC7 mode 6; the adjoint is straight-through.
+        quantised: Evaluate on the exact levels of BC7 mode 6.
     """
-    wp.launch(
-        _reconstruct,
-        weights.shape,
-        inputs=[endpoints, weights, int(quantised)],
-        outputs=[out],
-        device=weights.device,
-    )
+    inputs = [endpoints, weights, int(quantised)]
+    wp.launch(_reconstruct, weights.shape, inputs=inputs, outputs=[out], device=weights.device)
 
 
-def sample(endpoints, weights, slices, points, out, quantised: bool = False) -> None:
-    """Samples a map bilinearly, clamped at its border; recorded by an open ``wp.Tape``.
+def reconstruct_backward(
+    endpoints, weights, grad_out, grad_endpoints, grad_weights, quantised: bool = False
+) -> None:
+    """The adjoint of ``reconstruct``, straight through clamps and roundings; the same bits at each run.
 
     Args:
-        endpoints: vec4 [S, H/4, W/4, 2], in [0, 1].
-        weights: float [S, H, W], in [0, 1].
-        slices: int [N], the slice of each point.
-        points: vec2 [N], (u, v) in [0, 1]; the centre of texel (y, x) is ((x + 1/2) / W, (y + 1/2) / H).
-        out: vec4 [N].
-        quantised: Evaluate on the exact levels of BC7 mode 6; the adjoint is straight-through.
+        endpoints, weights, quantised: As for ``reconstruct``.
+        grad_out: vec4 [S, H, W].
+        grad_endpoints: vec4 [S, H/4, W/4, 2], written.
+        grad_weights: float [S, H, W], written.
     """
-    wp.launch(
-        _sample,
-        len(points),
-        inputs=[endpoints, weights, slices, points, int(quantised)],
-        outputs=[out],
-        device=weights.device,
-    )
+    inputs = [endpoints, weights, int(quantised), grad_out]
+    outputs = [grad_endpoints, grad_weights]
+    wp.launch(_reconstruct_backward, endpoints.shape[:3], inputs=inputs, outputs=outputs, device=weights.device)
 
 
 def quantise(endpoints, weights, bytes_out, index_out) -> None:

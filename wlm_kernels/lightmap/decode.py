@@ -1,9 +1,11 @@
 """Reading temporal lightmap tiles from their stored bytes: BC7 blocks, 8-bit planes and a small MLP.
 
-``exact_kernels`` evaluates a texel a thread, in the same order of operations as training. ``StripKernels`` is the
-runtime path: what depends on the time alone is done once a frame (the two slices of F_uvt are mixed, the planes and
-the encoded time pass the first layer for each column), and a thread decodes four texels, so that each weight is loaded
-once for four.
+``exact_kernels`` evaluates one texel per thread, in the same order of operations as training. ``StripKernels`` is the
+runtime path: what depends on the time alone is computed once per frame (the two slices of F_uvt are mixed; F_ut and the
+encoded time pass the first layer for each column), and a thread decodes four texels, so that each weight is loaded once
+for four.
+
+Read first: ``wlm/lightmap/exact.py``, the same decode in NumPy.
 """
 
 import functools
@@ -17,7 +19,7 @@ from wlm_kernels.interpolate import axis_index, cell, fraction
 from wlm_kernels.lightmap.blocks import bits7, byte_mix, index_level, stored_texel
 from wlm_kernels.lightmap.features import CENTRE, STATIC_INPUTS, TEMPORAL_INPUTS
 
-__all__ = ["Look", "Stored", "StripKernels", "exact_kernels", "strip_kernels"]
+__all__ = ["Stored", "StripKernels", "TimeState", "exact_kernels", "strip_kernels"]
 
 
 @wp.struct
@@ -33,8 +35,8 @@ class Stored:
 
 
 @wp.struct
-class Look:
-    """One time, and what turns a network's answer into colour: (shift + spread y) scale."""
+class TimeState:
+    """One time, and what turns a network's output y into colour: (shift + spread y) scale."""
 
     tau: float
     encoding: wp.vec4
@@ -93,10 +95,16 @@ def stored_volume_at(stored: Stored, n: int, u: float, v: float, tau: float) -> 
 
 
 @wp.func
-def finish_colour(look: Look, n: int, y: wp.vec3) -> wp.vec3:
+def finish_colour(time: TimeState, n: int, y: wp.vec3) -> wp.vec3:
     """The colour in gamma space, >= 0."""
-    c = wp.cw_mul(look.shift[n] + wp.cw_mul(look.spread[n], y), look.scale[n])
+    c = wp.cw_mul(time.shift[n] + wp.cw_mul(time.spread[n], y), time.scale[n])
     return wp.vec3(wp.max(c[0], 0.0), wp.max(c[1], 0.0), wp.max(c[2], 0.0))
+
+
+@wp.func
+def finish_radiance(time: TimeState, n: int, y: wp.vec3) -> wp.vec3:
+    c = finish_colour(time, n, y)
+    return wp.vec3(wp.pow(c[0], time.gamma), wp.pow(c[1], time.gamma), wp.pow(c[2], time.gamma))
 
 
 @wp.func
@@ -105,16 +113,16 @@ def finish_byte(c: float, inverse_peak: float) -> wp.uint8:
 
 
 @wp.func
-def finish_bytes(look: Look, n: int, y: wp.vec3) -> wp.vec4ub:
+def finish_bytes(time: TimeState, n: int, y: wp.vec3) -> wp.vec4ub:
     """The 8-bit output: gamma-space colour over the tile's bound at this time; alpha is 255."""
-    c = finish_colour(look, n, y)
-    p = look.inverse_peak[n]
+    c = finish_colour(time, n, y)
+    p = time.inverse_peak[n]
     return wp.vec4ub(finish_byte(c[0], p), finish_byte(c[1], p), finish_byte(c[2], p), wp.uint8(255))
 
 
 @functools.cache
 def exact_kernels(temporal: bool, hidden: int, gelu: str) -> tuple[Any, Any]:
-    """Builds (once) the kernels that decode whole tiles, one texel a thread.
+    """Builds (once) the kernels that decode whole tiles, one texel per thread.
 
     Args:
         temporal: Whether the tiles have temporal maps.
@@ -123,7 +131,7 @@ def exact_kernels(temporal: bool, hidden: int, gelu: str) -> tuple[Any, Any]:
 
     Returns:
         Two kernels over (tiles, 128, 128). Their inputs are ``Stored``, hidden vecH [N, I + H + 2], output vec3
-        [N, H + 1], ``Look``, rows int [N] (each tile's place in ``Look``) and tiles int [n]. Their one output is
+        [N, H + 1], ``TimeState``, places int [N] (of each tile in ``TimeState``) and tiles int [n]. Their output is
         [n, 128, 128]: linear radiance as vec3, or 8-bit colour as vec4ub.
     """
     inputs = TEMPORAL_INPUTS if temporal else STATIC_INPUTS
@@ -133,8 +141,14 @@ def exact_kernels(temporal: bool, hidden: int, gelu: str) -> tuple[Any, Any]:
     first, second, third, act = net.first, net.second, net.third, net.act
 
     @wp.func
-    def answer(
-        stored: Stored, w: wp.array2d[vec_hidden], o: wp.array2d[wp.vec3], look: Look, n: int, y: int, x: int
+    def network_output(
+        stored: Stored,
+        hidden: wp.array2d[vec_hidden],
+        output: wp.array2d[wp.vec3],
+        time: TimeState,
+        n: int,
+        y: int,
+        x: int,
     ) -> wp.vec3:
         f = vec_in()
         uv = stored_texel(stored.uv, n, y, x)
@@ -143,55 +157,39 @@ def exact_kernels(temporal: bool, hidden: int, gelu: str) -> tuple[Any, Any]:
         if wp.static(temporal):
             u = (float(x) + 0.5) / 128.0
             v = (float(y) + 0.5) / 128.0
-            uvt = stored_volume_at(stored, n, u, v, look.tau)
-            ut = stored_plane_at(stored.ut, n, u, look.tau, stored.periodic)
-            vt = stored_plane_at(stored.vt, n, v, look.tau, stored.periodic)
+            uvt = stored_volume_at(stored, n, u, v, time.tau)
+            ut = stored_plane_at(stored.ut, n, u, time.tau, stored.periodic)
+            vt = stored_plane_at(stored.vt, n, v, time.tau, stored.periodic)
             for c in range(4):
                 f[4 + c] = uvt[c]
-                f[12 + c] = look.encoding[c]
+                f[12 + c] = time.encoding[c]
             for c in range(2):
                 f[8 + c] = ut[c]
                 f[10 + c] = vt[c]
         for c in range(wp.static(centred)):
             f[c] = (f[c] + 0.0 - 0.5) * CENTRE
-        return third(o, n, act(second(w, n, act(first(w, n, f)))))
+        return third(output, n, act(second(hidden, n, act(first(hidden, n, f)))))
 
-    options = {"enable_backward": False}
+    def decode_kernel(dtype: Any, finish: Any) -> wp.Kernel:
+        @wp.kernel(module="unique", module_options={"enable_backward": False})
+        def decode(
+            # in:
+            stored: Stored,
+            hidden: wp.array2d[vec_hidden],
+            output: wp.array2d[wp.vec3],
+            time: TimeState,
+            places: wp.array1d[int],
+            tiles: wp.array1d[int],
+            # out:
+            out: wp.array3d[dtype],
+        ):
+            i, y, x = wp.tid()
+            n = tiles[i]
+            out[i, y, x] = finish(time, places[n], network_output(stored, hidden, output, time, n, y, x))
 
-    @wp.kernel(module="unique", module_options=options)
-    def radiance(
-        # in:
-        stored: Stored,
-        w: wp.array2d[vec_hidden],
-        o: wp.array2d[wp.vec3],
-        look: Look,
-        rows: wp.array1d[int],
-        tiles: wp.array1d[int],
-        # out:
-        out: wp.array3d[wp.vec3],
-    ):
-        i, y, x = wp.tid()
-        n = tiles[i]
-        c = finish_colour(look, rows[n], answer(stored, w, o, look, n, y, x))
-        out[i, y, x] = wp.vec3(wp.pow(c[0], look.gamma), wp.pow(c[1], look.gamma), wp.pow(c[2], look.gamma))
+        return decode
 
-    @wp.kernel(module="unique", module_options=options)
-    def bytes_(
-        # in:
-        stored: Stored,
-        w: wp.array2d[vec_hidden],
-        o: wp.array2d[wp.vec3],
-        look: Look,
-        rows: wp.array1d[int],
-        tiles: wp.array1d[int],
-        # out:
-        out: wp.array3d[wp.vec4ub],
-    ):
-        i, y, x = wp.tid()
-        n = tiles[i]
-        out[i, y, x] = finish_bytes(look, rows[n], answer(stored, w, o, look, n, y, x))
-
-    return radiance, bytes_
+    return decode_kernel(wp.vec3, finish_radiance), decode_kernel(wp.vec4ub, finish_bytes)
 
 
 @wp.kernel(enable_backward=False)
@@ -214,41 +212,58 @@ def _frame_volume(
 
 @dataclass(frozen=True)
 class StripKernels:
-    """The runtime path of one network shape; see ``decode``."""
+    """The runtime path of one network shape; see ``decode``.
+
+    Attributes:
+        hidden: H, width of the hidden layers.
+        vec_hidden: vec of H floats.
+    """
 
     hidden: int
     vec_hidden: Any
     _frame_lines: Any
     _decode: Any
 
-    def decode(self, stored, hidden, output, look, volume, columns, rows, places, tiles, out) -> None:
+    def decode(
+        self,
+        stored: Stored,
+        hidden: wp.array,
+        output: wp.array,
+        time: TimeState,
+        volume: wp.array,
+        columns: wp.array,
+        rows: wp.array,
+        places: wp.array,
+        tiles: wp.array,
+        out: wp.array,
+    ) -> None:
         """Decodes tiles to 8-bit colour at one time.
 
         Args:
-            stored: ``Stored``, dynamic tiles.
+            stored: Dynamic tiles.
             hidden: vecH [N, I + H + 2].
             output: vec3 [N, H + 1].
-            look: ``Look``.
+            time: The time.
             volume: vec4 [N, R, R], scratch.
             columns: float [N, H, 128], scratch.
             rows: vec2 [N, 128], scratch.
-            places: int [N], each tile's place in ``look``.
-            tiles: int [n], the tiles wanted. The scratch of all N is filled.
+            places: int [N], each tile's place in ``time``.
+            tiles: int [n], the tiles to decode. The scratch of all N is filled.
             out: uint32 [n, 128, 128], RGBA from the lowest byte.
         """
         device = out.device
-        wp.launch(_frame_volume, volume.shape, inputs=[stored, look.tau], outputs=[volume], device=device)
+        wp.launch(_frame_volume, volume.shape, inputs=[stored, time.tau], outputs=[volume], device=device)
         wp.launch(
             self._frame_lines,
             rows.shape,
-            inputs=[stored, hidden, look],
+            inputs=[stored, hidden, time],
             outputs=[columns, rows],
             device=device,
         )
         wp.launch(
             self._decode,
             (out.shape[0], 32, 128),
-            inputs=[stored, hidden, output, look, volume, columns, rows, places, tiles],
+            inputs=[stored, hidden, output, time, volume, columns, rows, places, tiles],
             outputs=[out],
             device=device,
             block_dim=128,
@@ -294,7 +309,7 @@ def frame_volume_at(volume: wp.array3d[wp.vec4], n: int, y: int, x: int) -> wp.v
     return (1.0 - fy) * top + fy * bottom
 
 
-STRIP_BOUNDS = (128, 3)  # threads of a block, blocks of a multiprocessor: 168 registers a thread, no spills
+STRIP_BOUNDS = (128, 3)  # threads of a block, blocks of a multiprocessor: 168 registers per thread, no spills
 
 
 @functools.cache
@@ -306,31 +321,30 @@ def strip_kernels(hidden: int, gelu: str) -> StripKernels:
         gelu: One of ``mlp.GELUS``.
     """
     net = mlp.kernels(TEMPORAL_INPUTS, hidden, gelu)
-    vec_hidden = net.vec_hidden
-    act = net.act
+    units, vec_hidden, act = net.hidden, net.vec_hidden, net.act
     options = {"enable_backward": False}
 
     @wp.kernel(module="unique", module_options=options)
     def frame_lines(
         # in:
         stored: Stored,
-        w: wp.array2d[vec_hidden],
-        look: Look,
+        hidden: wp.array2d[vec_hidden],
+        time: TimeState,
         # out:
         columns: wp.array3d[float],
         rows: wp.array2d[wp.vec2],
     ):
-        """What F_ut and the time add to the first layer of each column, and F_vt of each row, centred."""
+        """Contribution of F_ut and the time to the first layer of each column, and F_vt of each row, centred."""
         n, i = wp.tid()
         p = (float(i) + 0.5) / 128.0
-        ut = stored_plane_at(stored.ut, n, p, look.tau, stored.periodic)
-        vt = stored_plane_at(stored.vt, n, p, look.tau, stored.periodic)
-        h = w[n, 16]
+        ut = stored_plane_at(stored.ut, n, p, time.tau, stored.periodic)
+        vt = stored_plane_at(stored.vt, n, p, time.tau, stored.periodic)
+        h = hidden[n, 16]
         for c in range(4):
-            h += w[n, 12 + c] * look.encoding[c]
+            h += hidden[n, 12 + c] * time.encoding[c]
         for c in range(2):
-            h += w[n, 8 + c] * ((ut[c] - 0.5) * CENTRE)
-        for j in range(wp.static(hidden)):
+            h += hidden[n, 8 + c] * ((ut[c] - 0.5) * CENTRE)
+        for j in range(wp.static(units)):
             columns[n, j, i] = h[j]
         rows[n, i] = (vt - wp.vec2(0.5)) * CENTRE
 
@@ -338,9 +352,9 @@ def strip_kernels(hidden: int, gelu: str) -> StripKernels:
     def decode(
         # in:
         stored: Stored,
-        w: wp.array2d[vec_hidden],
-        o: wp.array2d[wp.vec3],
-        look: Look,
+        hidden: wp.array2d[vec_hidden],
+        output: wp.array2d[wp.vec3],
+        time: TimeState,
         volume: wp.array3d[wp.vec4],
         columns: wp.array3d[float],
         rows: wp.array2d[wp.vec2],
@@ -349,7 +363,7 @@ def strip_kernels(hidden: int, gelu: str) -> StripKernels:
         # out:
         out: wp.array3d[wp.uint32],
     ):
-        """A thread decodes the four texels of one column of a block; a warp's threads are neighbours in x."""
+        """One thread decodes the four texels of one column of a block; a warp's threads are neighbours in x."""
         i, block, x = wp.tid()
         n = tiles[i]
         place = places[n]
@@ -366,13 +380,13 @@ def strip_kernels(hidden: int, gelu: str) -> StripKernels:
         f2 = centred_texel(a, b, high, at + 8)
         f3 = centred_texel(a, b, high, at + 12)
         h0 = vec_hidden()
-        for j in range(wp.static(hidden)):
+        for j in range(wp.static(units)):
             h0[j] = columns[n, j, x]
         h1 = h0
         h2 = h0
         h3 = h0
         for c in range(4):
-            column = w[n, c]
+            column = hidden[n, c]
             h0 += column * f0[c]
             h1 += column * f1[c]
             h2 += column * f2[c]
@@ -382,7 +396,7 @@ def strip_kernels(hidden: int, gelu: str) -> StripKernels:
         f2 = frame_volume_at(volume, n, y + 2, x)
         f3 = frame_volume_at(volume, n, y + 3, x)
         for c in range(4):
-            column = w[n, 4 + c]
+            column = hidden[n, 4 + c]
             h0 += column * f0[c]
             h1 += column * f1[c]
             h2 += column * f2[c]
@@ -392,7 +406,7 @@ def strip_kernels(hidden: int, gelu: str) -> StripKernels:
         r2 = rows[n, y + 2]
         r3 = rows[n, y + 3]
         for c in range(2):
-            column = w[n, 10 + c]
+            column = hidden[n, 10 + c]
             h0 += column * r0[c]
             h1 += column * r1[c]
             h2 += column * r2[c]
@@ -401,12 +415,12 @@ def strip_kernels(hidden: int, gelu: str) -> StripKernels:
         h1 = act(h1)
         h2 = act(h2)
         h3 = act(h3)
-        k0 = w[n, wp.static(17 + hidden)]
+        k0 = hidden[n, wp.static(17 + units)]
         k1 = k0
         k2 = k0
         k3 = k0
-        for c in range(wp.static(hidden)):
-            column = w[n, 17 + c]
+        for c in range(wp.static(units)):
+            column = hidden[n, 17 + c]
             k0 += column * h0[c]
             k1 += column * h1[c]
             k2 += column * h2[c]
@@ -415,19 +429,19 @@ def strip_kernels(hidden: int, gelu: str) -> StripKernels:
         k1 = act(k1)
         k2 = act(k2)
         k3 = act(k3)
-        y0 = o[n, wp.static(hidden)]
+        y0 = output[n, wp.static(units)]
         y1 = y0
         y2 = y0
         y3 = y0
-        for c in range(wp.static(hidden)):
-            colour = o[n, c]
+        for c in range(wp.static(units)):
+            colour = output[n, c]
             y0 += colour * k0[c]
             y1 += colour * k1[c]
             y2 += colour * k2[c]
             y3 += colour * k3[c]
-        out[i, y, x] = pack(finish_bytes(look, place, y0))
-        out[i, y + 1, x] = pack(finish_bytes(look, place, y1))
-        out[i, y + 2, x] = pack(finish_bytes(look, place, y2))
-        out[i, y + 3, x] = pack(finish_bytes(look, place, y3))
+        out[i, y, x] = pack(finish_bytes(time, place, y0))
+        out[i, y + 1, x] = pack(finish_bytes(time, place, y1))
+        out[i, y + 2, x] = pack(finish_bytes(time, place, y2))
+        out[i, y + 3, x] = pack(finish_bytes(time, place, y3))
 
     return StripKernels(hidden, vec_hidden, frame_lines, decode)

@@ -4,8 +4,10 @@ A tile is F_uv, F_uvt, F_ut, F_vt and an MLP (neural-dynamic-gi, eq. 5 and table
 order: F_uv 4, F_uvt 4, F_ut 2, F_vt 2, the encoded time 4; tiles without temporal maps use F_uv alone. Features v in
 [0, 1] enter as (v - 1/2) sqrt(12): mean 0 and variance 1 where v is uniform.
 
-``temporal_step`` trains with these, ``temporal_gather`` turns its sums into gradients, ``temporal_adjoint`` holds the
-adjoints of sampling by hand, ``temporal_decode`` reads tiles from their stored bytes.
+``step`` trains with these, ``gather`` turns its sums into gradients, ``adjoint`` has the hand-written adjoints of
+sampling, ``decode`` reads tiles from their stored bytes.
+
+Read first: ``tests/reference/temporal.py``, ``train_features``.
 """
 
 import warp as wp
@@ -22,7 +24,7 @@ CENTRE = wp.constant(3.4641016151377544)  # sqrt(12)
 
 @wp.struct
 class Maps:
-    """The feature maps of N tiles with S time slices in F_uvt. Static tiles leave all but the first two empty."""
+    """The feature maps of N tiles with S time slices in F_uvt. In static tiles all but the first two are empty."""
 
     uv_endpoints: wp.array4d[wp.vec4]  # [N, 32, 32, 2]
     uv_weights: wp.array3d[float]  # [N, 128, 128]
@@ -46,7 +48,7 @@ class Offsets:
 
 @wp.func
 def ste_byte(v: float, quantised: int) -> float:
-    """A plane's value as used: clamped, or on its 8-bit level; straight-through in ``scatter_plane``."""
+    """A plane's value, clamped or on its 8-bit level; its adjoint is straight-through, in ``scatter_plane``."""
     c = wp.clamp(v, 0.0, 1.0)
     if quantised == 0:
         return c
@@ -104,7 +106,7 @@ def volume_at(
 
 @wp.struct
 class Batch:
-    """What a step is trained on. T stored times, K the longest list of valid texels."""
+    """Training data of N tiles at T stored times; K is the length of the longest list of valid texels."""
 
     targets: wp.array3d[wp.vec3]  # [N, T, 128 * 128] normalised gamma-space colour
     texels: wp.array2d[int]  # [N, K] flat indices of valid texels, padded
@@ -113,14 +115,14 @@ class Batch:
     encoding: wp.array1d[wp.vec4]  # [T] gamma(t) of eq. 4
     weight: wp.array2d[wp.vec3]  # [N, T] weight of the squared error of each channel
     number: wp.array1d[int]  # [N] number of the tile in its lightmap
-    scale: wp.array2d[wp.vec3]  # [N, T] what colours at each time were divided by
+    scale: wp.array2d[wp.vec3]  # [N, T] divisor of the colours at each time
     control: wp.array1d[int]  # [0] step
     slices: int  # S of F_uvt
     turn: float  # gamma(t) is sine and cosine of turn tau and of 2 turn tau
-    between: float  # share of the samples at times between two stored ones
+    between: float  # fraction of the samples at times between two stored ones
     gamma: float
     inverse_range: wp.array2d[float]  # [N, T] 1 / the squared range of radiance; 0 where there is none
-    tracked: wp.array4d[float]  # [lanes, N, T, 2] sum and count of squared errors of radiance, or empty: not wanted
+    tracked: wp.array4d[float]  # [lanes, N, T, 2] sum and count of squared errors of radiance; empty: not tracked
     seed: int
     shift: wp.array1d[wp.vec3]  # [N] colour over scale = shift + spread * target
     spread: wp.array1d[wp.vec3]  # [N]
@@ -136,7 +138,7 @@ def draw_state(batch: Batch, n: int, b: int, samples: int) -> wp.uint32:
 
 @wp.struct
 class Moment:
-    """The time of a sample: a stored one, or a share of the way to the next."""
+    """The time of a sample: stored time k, or ``share`` of the way from it to the next."""
 
     k: int
     next: int
@@ -158,7 +160,7 @@ def stored_moment(batch: Batch, k: int) -> Moment:
 
 @wp.func
 def moment_between(batch: Batch, k: int, share: float) -> Moment:
-    """Where the features are read on the way from time k to the next one; from the last it leads to the first."""
+    """A time between k and the next one; after the last comes the first where the axis is periodic."""
     m = stored_moment(batch, k)
     last = batch.tau.shape[0] - 1
     if k < last or batch.periodic != 0:
@@ -192,7 +194,7 @@ def draw_sample(batch: Batch, n: int, b: int, samples: int) -> Sample:
     s.flat = batch.texels[n, wp.randi(state, 0, batch.texel_count[n])]
     k = wp.randi(state, 0, batch.tau.shape[0])
     s.moment = stored_moment(batch, k)
-    if batch.between > 0.0:  # not drawn for nothing: profiles without it keep their samples
+    if batch.between > 0.0:  # without it nothing is drawn, so that the samples of such profiles stay the same
         share = wp.randf(state)
         if wp.randf(state) < batch.between:
             s.moment = moment_between(batch, k, share)
@@ -202,7 +204,7 @@ def draw_sample(batch: Batch, n: int, b: int, samples: int) -> Sample:
 
 @wp.func
 def target_at(batch: Batch, n: int, m: Moment, flat: int) -> wp.vec3:
-    """What the network should answer: at a time between two, their colours are interpolated (eq. 2)."""
+    """The target of the network: at a time between two, their interpolated colours (eq. 2)."""
     a = batch.targets[n, m.k, flat]
     if m.share == 0.0:
         return a
@@ -249,7 +251,7 @@ def radiance_of(batch: Batch, n: int, k: int, y: wp.vec3) -> wp.vec3:
 
 @wp.func
 def track_error(batch: Batch, lane: int, n: int, m: Moment, target: wp.vec3, error: wp.vec3):
-    """Adds a sample's error as PSNR measures it, for progress reports; the sums take no part in the fit."""
+    """Adds a sample's error as PSNR measures it, for progress reports alone."""
     if batch.tracked.shape[0] > 0 and m.share == 0.0:
         e = radiance_of(batch, n, m.k, target + error) - radiance_of(batch, n, m.k, target)
         wp.atomic_add(batch.tracked, lane, n, m.k, 0, wp.dot(e, e) / 3.0 * batch.inverse_range[n, m.k])

@@ -1,11 +1,13 @@
-"""One launch that trains temporal lightmap tiles: sample the maps, run the MLP, take the loss and every gradient.
+"""One launch that trains temporal lightmap tiles: sample the maps, run the MLP, compute the loss and every gradient.
 
 It handles B random samples of each of N tiles (neural-dynamic-gi, section 3.3, 3.4 and 4): draws a valid texel and a
 time, samples F_uv, F_uvt, F_ut and F_vt, adds the uniform noise of eq. 6, centres the features, runs the network,
-takes the weighted squared error and adds up the gradients. ``temporal_gather`` then makes gradient arrays of them.
+computes the weighted squared error and sums the gradients. ``gather`` turns the sums into gradient arrays.
 
-The same sums give the same result on one device. A tile's samples depend on the seed, the step and its number alone,
-so that a tile fits to the same result in any batch.
+The sums are in a fixed order or of integers, so that one seed gives one result on one device. A tile's samples depend
+on the seed, the step and its number alone, so that a tile fits to the same result in any batch.
+
+Read first: ``tests/reference/temporal.py``, ``train_features`` and ``losses``: the same loss in torch.
 """
 
 import functools
@@ -37,13 +39,21 @@ from wlm_kernels.lightmap.reduce import BLOCK, block_reduction, reload
 
 __all__ = ["BLOCK", "StepKernels", "step_kernels"]
 
-LAUNCH_BOUNDS = (BLOCK, 2)  # two blocks a multiprocessor leave 255 registers a thread: no spills at width 16
+LAUNCH_BOUNDS = (BLOCK, 2)  # two blocks per multiprocessor leave 255 registers per thread: no spills at width 16
 NOISE = wp.constant(1.0 / 256.0)  # alpha of eq. 6: one step of 8 bits
 
 
 @dataclass(frozen=True)
 class StepKernels:
-    """The training step of one network shape on one kind of device; see ``launch``."""
+    """The training step of one network shape on one kind of device; see ``launch``.
+
+    Attributes:
+        inputs, hidden: I and H of the network.
+        device_kind: "cpu" or "cuda".
+        net: The network's functions.
+        scalar: Type of the sums of the maps' gradients: int64 on CUDA, float on the CPU.
+        draw: Kernel that writes the samples of the coming step, for tests.
+    """
 
     inputs: int
     hidden: int
@@ -53,39 +63,39 @@ class StepKernels:
     draw: Any
     _step: Any
 
-    def load(self, device) -> None:
-        """Compiles the step for a device now rather than at its first launch."""
+    def load(self, device: str) -> None:
+        """Compiles the step for a device before its first launch."""
         self._step.module.load(wp.get_device(device))
 
     def launch(
         self,
-        maps,
-        offsets,
-        hidden,
-        output,
-        batch,
-        samples,
-        acc,
-        partial,
-        partial_out,
-        loss,
-        base=0,
-        count=None,
-    ):
-        """Adds the gradients of B samples a tile.
+        maps: Maps,
+        offsets: Offsets,
+        hidden: wp.array,
+        output: wp.array,
+        batch: Batch,
+        samples: int,
+        acc: wp.array,
+        partial: wp.array,
+        partial_out: wp.array,
+        loss: wp.array,
+        base: int = 0,
+        count: int | None = None,
+    ) -> None:
+        """Adds the gradients of B samples of each tile.
 
         Args:
-            maps: ``Maps``, the parameters.
-            offsets: ``Offsets`` into ``acc``.
+            maps: The parameters.
+            offsets: Of their gradients in ``acc``.
             hidden: vecH [N, I + H + 2], see ``wlm_kernels.mlp``.
             output: vec3 [N, H + 1].
-            batch: ``Batch``.
+            batch: The training data.
             samples: B; on CUDA a multiple of ``BLOCK``.
             acc: [lanes, M], gradient sums of the maps: int64 on CUDA (one lane), float on the CPU.
-            partial: float [P, N, I + H + 2, H]: written on CUDA, one P a block; added to on the CPU, one P a lane.
+            partial: float [P, N, I + H + 2, H]: written on CUDA, one P per block; added to on the CPU, one P per lane.
             partial_out: float [P, N, H + 1, 3], likewise.
             loss: float [P, N], likewise: the sum of weighted squared errors over samples and channels / (3 B).
-            base, count: The CPU's lane: samples base to base + count - 1 of each tile.
+            base, count: A lane of the CPU: samples base to base + count - 1 of each tile; default all.
         """
         tiles = hidden.shape[0]
         span = samples if count is None else count
@@ -117,7 +127,7 @@ def step_kernels(temporal: bool, hidden: int, gelu: str, device_kind: str) -> St
     gate, slope = net.gate, net.slope
     back_hidden, back_output, back_input = net.back_hidden, net.back_output, net.back_input
     scatter_texel, scatter_volume, scatter_plane, scalar = scatters(device_kind)
-    columns_2 = inputs + 1
+    units, columns_2 = net.hidden, inputs + 1
 
     @wp.func
     def features(maps: Maps, batch: Batch, n: int, y: int, x: int, m: Moment, state: wp.uint32) -> vec_in:
@@ -140,7 +150,7 @@ def step_kernels(temporal: bool, hidden: int, gelu: str, device_kind: str) -> St
                 f[8 + c] = ut[c]
                 f[10 + c] = vt[c]
         for c in range(wp.static(noisy)):
-            # Quantised maps are on their levels already; eq. 6 stands in for the rounding before that.
+            # Eq. 6: noise in place of the rounding, until the maps are quantised.
             noise = wp.where(batch.quantised == 0, (wp.randf(state) - 0.5) * NOISE, 0.0)
             f[c] = (f[c] + noise - 0.5) * CENTRE
         return f
@@ -185,7 +195,7 @@ def step_kernels(temporal: bool, hidden: int, gelu: str, device_kind: str) -> St
 
     @wp.struct
     class Pass:
-        """What the gradients are made of: each layer's input and the delta behind it, and the sample's loss."""
+        """The factors of the gradients: each layer's input and the delta behind it, and the sample's loss."""
 
         f: vec_in
         h1: vec_hidden
@@ -198,8 +208,8 @@ def step_kernels(temporal: bool, hidden: int, gelu: str, device_kind: str) -> St
     @wp.func
     def forward_backward(
         maps: Maps,
-        w: wp.array2d[vec_hidden],
-        o: wp.array2d[wp.vec3],
+        hidden: wp.array2d[vec_hidden],
+        output: wp.array2d[wp.vec3],
         batch: Batch,
         lane: int,
         n: int,
@@ -208,21 +218,21 @@ def step_kernels(temporal: bool, hidden: int, gelu: str, device_kind: str) -> St
     ) -> Pass:
         m = sample.moment
         f = features(maps, batch, n, sample.flat // 128, sample.flat % 128, m, sample.state)
-        a1 = first(w, n, f)
+        a1 = first(hidden, n, f)
         g1 = gate(a1)
         h1 = wp.cw_mul(a1, g1)
-        a2 = second(w, n, h1)
+        a2 = second(hidden, n, h1)
         g2 = gate(a2)
         h2 = wp.cw_mul(a2, g2)
         target = target_at(batch, n, m, sample.flat)
-        error = third(o, n, h2) - target
+        error = third(output, n, h2) - target
         track_error(batch, lane, n, m, target, error)
         half = wp.cw_mul(texel_weight(batch, n, m, target), error) / (3.0 * float(samples))
         d3 = 2.0 * half
         reload()
-        d2 = wp.cw_mul(back_output(o, n, d3), slope(a2, g2))
+        d2 = wp.cw_mul(back_output(output, n, d3), slope(a2, g2))
         reload()
-        d1 = wp.cw_mul(back_hidden(w, n, d2), slope(a1, g1))
+        d1 = wp.cw_mul(back_hidden(hidden, n, d2), slope(a1, g1))
         p = Pass()
         p.f = f
         p.h1 = h1
@@ -259,8 +269,8 @@ def step_kernels(temporal: bool, hidden: int, gelu: str, device_kind: str) -> St
             # in:
             maps: Maps,
             offsets: Offsets,
-            w: wp.array2d[vec_hidden],
-            o: wp.array2d[wp.vec3],
+            hidden: wp.array2d[vec_hidden],
+            output: wp.array2d[wp.vec3],
             batch: Batch,
             samples: int,
             base: int,
@@ -274,17 +284,17 @@ def step_kernels(temporal: bool, hidden: int, gelu: str, device_kind: str) -> St
             b = base + i
             lane = wp.where(base == 0, 0, 1)
             sample = draw_sample(batch, n, b, samples)
-            p = forward_backward(maps, w, o, batch, lane, n, sample, samples)
+            p = forward_backward(maps, hidden, output, batch, lane, n, sample, samples)
             loss[lane, n] += p.loss
             for c in range(wp.static(inputs)):
                 partial[lane, n, c] += p.d1 * p.f[c]
             partial[lane, n, wp.static(inputs)] += p.d1
-            for c in range(wp.static(hidden)):
+            for c in range(wp.static(units)):
                 partial[lane, n, wp.static(columns_2) + c] += p.d2 * p.h1[c]
                 partial_out[lane, n, c] += p.d3 * p.h2[c]
-            partial[lane, n, wp.static(columns_2 + hidden)] += p.d2
-            partial_out[lane, n, wp.static(hidden)] += p.d3
-            scatter(acc, lane, offsets, maps, batch, n, sample, back_input(w, n, p.d1))
+            partial[lane, n, wp.static(columns_2 + units)] += p.d2
+            partial_out[lane, n, wp.static(units)] += p.d3
+            scatter(acc, lane, offsets, maps, batch, n, sample, back_input(hidden, n, p.d1))
 
     else:
         reduce = block_reduction(net)
@@ -294,8 +304,8 @@ def step_kernels(temporal: bool, hidden: int, gelu: str, device_kind: str) -> St
             # in:
             maps: Maps,
             offsets: Offsets,
-            w: wp.array2d[vec_hidden],
-            o: wp.array2d[wp.vec3],
+            hidden: wp.array2d[vec_hidden],
+            output: wp.array2d[wp.vec3],
             batch: Batch,
             samples: int,
             base: int,
@@ -307,9 +317,9 @@ def step_kernels(temporal: bool, hidden: int, gelu: str, device_kind: str) -> St
         ):
             n, b = wp.tid()
             sample = draw_sample(batch, n, b, samples)
-            p = forward_backward(maps, w, o, batch, 0, n, sample, samples)
-            row = (b // wp.static(BLOCK)) * w.shape[0] + n
+            p = forward_backward(maps, hidden, output, batch, 0, n, sample, samples)
+            row = (b // wp.static(BLOCK)) * hidden.shape[0] + n
             reduce(p.f, p.h1, p.h2, p.d1, p.d2, p.d3, p.loss, row, partial, partial_out, loss)
-            scatter(acc, 0, offsets, maps, batch, n, sample, back_input(w, n, p.d1))
+            scatter(acc, 0, offsets, maps, batch, n, sample, back_input(hidden, n, p.d1))
 
     return StepKernels(inputs, hidden, device_kind, net, scalar, draw, step)

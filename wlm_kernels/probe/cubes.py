@@ -13,6 +13,8 @@ Whether a cube lists a Gaussian is one of three tests:
 All are made looser by more than what float32 loses, so no list lacks a Gaussian that reaches a point of its cube.
 Cubes at the border of the grid have no outer faces but go on for ever: a point outside takes the nearest cube's list,
 and that list is right for it too.
+
+The twin to read first: ``reach`` and ``nearest`` in ``tests/reference/gaussians.py``.
 """
 
 import math
@@ -166,11 +168,11 @@ def _nearest(whiten: wp.mat33d, low: wp.vec3d, high: wp.vec3d) -> wp.float64:
     for a in range(3):
         b = (a + 1) % 3
         c = (a + 2) % 3
-        seen = wp.max(low[a], zero) + wp.min(high[a], zero)
-        if seen != zero:
+        offset = wp.max(low[a], zero) + wp.min(high[a], zero)
+        if offset != zero:
             outside = 1
             face = _on_face(
-                seen * wp.vec3d(whiten[0, a], whiten[1, a], whiten[2, a]),
+                offset * wp.vec3d(whiten[0, a], whiten[1, a], whiten[2, a]),
                 wp.vec3d(whiten[0, b], whiten[1, b], whiten[2, b]),
                 wp.vec3d(whiten[0, c], whiten[1, c], whiten[2, c]),
                 low[b],
@@ -406,7 +408,7 @@ def _chosen_grid(shapes, corners: np.ndarray, kind: int) -> Cubes:
     reach = shapes.numpy()["reach"].max(1, initial=0.0)
     reach = reach[np.isfinite(reach) & (reach > 0)]
     extent = float((corners[1] - corners[0]).max())
-    # With nothing to go by, or no box to divide, one cube.
+    # Without a Gaussian that reaches, or a box to divide: one cube.
     size = _FIRST_SIZE * float(np.median(reach)) if len(reach) and extent > 0 else max(extent, 1.0)
     count = shapes.shape[0]
     cubes = _grid(corners, size)

@@ -1,8 +1,10 @@
 """Decoding points: the Gaussians' sum and the network in one launch (gaussian-probe-compression, eq. 5 to 7).
 
 On CUDA a block of 128 threads takes up to 64 points: the threads share out the Gaussians that each point's cube lists,
-the sums meet in shared memory, and the network runs on all points together (``probe_network.layer_code``). On the CPU a
-thread takes a point.
+the sums meet in shared memory, and the network runs on all points together (``native/layers.cuh``, then
+``native/decode.cuh``). On the CPU a thread takes one point.
+
+The twin to read first: ``wlm/probe/exact.py``.
 """
 
 import functools
@@ -11,6 +13,7 @@ from typing import Any
 
 import warp as wp
 
+from wlm_kernels.native import native_source
 from wlm_kernels.probe.cubes import Cubes, cube_of
 from wlm_kernels.probe.gaussians import Shape, functions
 from wlm_kernels.probe.network import THREADS, cpu_network, layer_code, probes_at_once
@@ -20,18 +23,16 @@ __all__ = ["DecodeKernels", "decode_kernels"]
 
 @dataclass(frozen=True)
 class DecodeKernels:
-    """The decode of one network shape on one kind of device."""
+    """The decode of one network shape on one kind of device.
 
-    latent: int
-    hidden: int
-    outputs: int
+    Attributes:
+        device_kind: "cpu" or "cuda".
+        points: Points that a block of threads takes on CUDA.
+    """
+
     device_kind: str
     points: int
     _kernel: Any
-
-    def load(self, device) -> None:
-        """Compiles it for a device now."""
-        self._kernel.module.load(wp.get_device(device))
 
     def launch(self, rows, shapes, cubes, cut, net, gain, x, out) -> None:
         """Decodes points.
@@ -39,9 +40,9 @@ class DecodeKernels:
         Args:
             rows: float [K, 10 + L].
             shapes: Shape [K], made of the rows with this cut.
-            cubes: ``gaussian_cubes.Cubes`` of the shapes; points outside take the nearest cube's list.
+            cubes: ``cubes.Cubes`` of the shapes; points outside take the nearest cube's list.
             cut: How far a Gaussian reaches, in standard deviations.
-            net: float [P], see ``probe_network``.
+            net: float [P], see ``network``.
             gain: Factor of the network's outputs.
             x: vec3 [M], in the normalised frame.
             out: float [M, D], written.
@@ -71,7 +72,11 @@ def decode_kernels(latent: int, hidden: int, outputs: int, device_kind: str) -> 
     fn = functions(latent)
     add, vec_latent = fn.add, fn.vec_latent
     points = probes_at_once(latent, hidden, outputs)
-    options = {"enable_backward": False, "max_unroll": 32 if device_kind == "cuda" else 1}
+    cuda = device_kind == "cuda"
+    options = {"enable_backward": False, "max_unroll": 32 if cuda else 1}
+    network = cpu_network(latent, hidden, outputs)
+    forward, vec_in = network.forward, network.vec_in
+    finish = _finish(latent, hidden, outputs, points, vec_latent)
 
     @wp.func
     def sum_at(
@@ -100,23 +105,26 @@ def decode_kernels(latent: int, hidden: int, outputs: int, device_kind: str) -> 
                 shape = next_shape
         return f
 
-    if device_kind == "cpu":
-        network = cpu_network(latent, hidden, outputs)
-        forward, vec_in = network.forward, network.vec_in
-
-        @wp.kernel(module="unique", module_options=options)
-        def kernel(
-            # in:
-            rows: wp.array2d[float],
-            shapes: wp.array1d[Shape],
-            cubes: Cubes,
-            cut: float,
-            net: wp.array1d[float],
-            gain: float,
-            x: wp.array1d[wp.vec3],
-            # out:
-            out: wp.array2d[float],
-        ):
+    @wp.kernel(module="unique", module_options=options)
+    def kernel(
+        # in:
+        rows: wp.array2d[float],
+        shapes: wp.array1d[Shape],
+        cubes: Cubes,
+        cut: float,
+        net: wp.array1d[float],
+        gain: float,
+        x: wp.array1d[wp.vec3],
+        # out:
+        out: wp.array2d[float],
+    ):
+        if wp.static(cuda):
+            block, t = wp.tid()
+            # Threads past the end repeat the last point, so that all of a block meet.
+            i = wp.min(block * wp.static(points) + t % wp.static(points), x.shape[0] - 1)
+            f = sum_at(rows, shapes, cubes, cut, x[i], t // wp.static(points), wp.static(THREADS // points))
+            finish(f, x[i], net, gain, block, x.shape[0], out)
+        else:
             i = wp.tid()
             f = sum_at(rows, shapes, cubes, cut, x[i], 0, 1)
             v = vec_in()
@@ -128,60 +136,12 @@ def decode_kernels(latent: int, hidden: int, outputs: int, device_kind: str) -> 
             for c in range(wp.static(outputs)):
                 out[i, c] = gain * y[c]
 
-    else:
-        share = THREADS // points
-        finish = _finish(latent, hidden, outputs, points, vec_latent)
-
-        @wp.kernel(module="unique", module_options=options)
-        def kernel(
-            # in:
-            rows: wp.array2d[float],
-            shapes: wp.array1d[Shape],
-            cubes: Cubes,
-            cut: float,
-            net: wp.array1d[float],
-            gain: float,
-            x: wp.array1d[wp.vec3],
-            # out:
-            out: wp.array2d[float],
-        ):
-            block, t = wp.tid()
-            # Threads past the end repeat the last point, so that all of a block meet.
-            i = wp.min(block * wp.static(points) + t % wp.static(points), x.shape[0] - 1)
-            f = sum_at(rows, shapes, cubes, cut, x[i], t // wp.static(points), wp.static(share))
-            finish(f, x[i], net, gain, block, x.shape[0], out)
-
-    return DecodeKernels(latent, hidden, outputs, device_kind, points, kernel)
+    return DecodeKernels(device_kind, points, kernel)
 
 
 def _finish(latent: int, hidden: int, outputs: int, points: int, vec_latent):
     """The network of a block of points, from the parts of their sums."""
-    snippet = f"""
-    {layer_code(latent, hidden, outputs, points)}
-    const int t = threadIdx.x, first = block * P, part = t / P, point = t % P;
-    const float* w1 = net.data, *w2 = w1 + SECOND, *w3 = w1 + THIRD;
-    if (part == 0) {{
-        for (int c = 0; c < 3; ++c) X[(L + c) * LD + point] = x[c];
-    }}
-    for (int turn = 0; turn < T / P; ++turn) {{
-        if (part == turn) {{
-            #pragma unroll
-            for (int c = 0; c < L; ++c) {{
-                float& sum = X[c * LD + point];
-                sum = turn == 0 ? f.c[c] : sum + f.c[c];
-            }}
-        }}
-        __syncthreads();
-    }}
-    forward(X, I, w1, A);
-    forward(A, H, w2, B);
-    last(B, w3, [&](int c, int p, float y) {{ E[c * LD + p] = gain * y; }});
-    __syncthreads();
-    for (int m = t; m < P * D; m += T) {{
-        const int p = m / D;
-        if (first + p < count) out.data[size_t(first) * D + m] = E[m % D * LD + p];
-    }}
-    """
+    snippet = layer_code(latent, hidden, outputs, points) + native_source(__package__, "decode")
 
     @wp.func_native(snippet)
     def finish(

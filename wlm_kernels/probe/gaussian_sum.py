@@ -1,11 +1,11 @@
 """The Gaussians' sum at any points and its gradients (gaussian-probe-compression, eq. 2 to 6, 11 and 12).
 
-``gaussian_cubes`` says which Gaussians a point looks at; without it each looks at all, which is the reference for it.
-Two ways back: ``backward`` is by hand, a thread a Gaussian over the points of the cubes in its reach, nothing added by
-atomics; ``sum_taped`` is recorded by ``wp.Tape``, in float64 and with no code in common, for other losses and as a
-check. What a Gaussian reaches is a constant to both.
+``cubes`` says which Gaussians a point looks at; without it each looks at all, with the same result. ``backward`` gives
+the gradient of the rows, one Gaussian per thread over the points of the cubes in its reach, ``backward_points`` that of
+the points, one point per thread: nothing is added by atomics. What a Gaussian reaches is a constant to both. The twin
+in torch is ``wlm.ops.plain.gaussian_sum``.
 
-A training step over probes that stand still is quicker by ``probe_step``.
+A training step over probes that stand still is quicker by ``step``.
 """
 
 import functools
@@ -17,12 +17,11 @@ import warp as wp
 from wlm_kernels.probe.cubes import REACH_MARGIN, Cubes, cube_of, everything, sort_by_cube, span
 from wlm_kernels.probe.gaussians import LATENT, SHAPE_NUMBERS, Shape, functions, shape_of, touches
 
-__all__ = ["SUPPORTS", "backward", "shapes", "sum", "sum_kernels", "sum_taped"]
+__all__ = ["SUPPORTS", "backward", "backward_points", "shapes", "sum", "sum_kernels"]
+
+wp.set_module_options({"enable_backward": False})
 
 SUPPORTS = ("ellipsoid", "sphere")
-
-# As in ``gaussians``: a shorter quaternion stands for no rotation.
-_SHORTEST = wp.constant(wp.float64(1.0e-12))
 
 
 @wp.func
@@ -35,7 +34,7 @@ def _quaternion(rows: wp.array2d[float], k: int) -> wp.vec4:
     return wp.vec4(rows[k, 6], rows[k, 7], rows[k, 8], rows[k, 9])
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel
 def _shapes(
     # in:
     rows: wp.array2d[float],
@@ -49,7 +48,7 @@ def _shapes(
     out[k] = shape_of(centre, _log_scale(rows, k), _quaternion(rows, k), cut, sphere)
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel
 def _cubes_of(
     # in:
     cubes: Cubes,
@@ -63,70 +62,21 @@ def _cubes_of(
     items[i] = i
 
 
-@wp.kernel
-def _frames(
-    # in:
-    rows: wp.array2d[float],
-    # out:
-    frames: wp.array1d[wp.mat33d],
-):
-    """W = S^-1 R^T."""
-    k = wp.tid()
-    q = wp.vec4d(wp.float64(rows[k, 6]), wp.float64(rows[k, 7]), wp.float64(rows[k, 8]), wp.float64(rows[k, 9]))
-    turn = wp.identity(n=3, dtype=wp.float64)
-    n = wp.length(q)
-    if n >= _SHORTEST:
-        h = q / n
-        turn = wp.quat_to_matrix(wp.quatd(h[1], h[2], h[3], h[0]))
-    s = wp.vec3d(wp.exp(-wp.float64(rows[k, 3])), wp.exp(-wp.float64(rows[k, 4])), wp.exp(-wp.float64(rows[k, 5])))
-    frames[k] = wp.diag(s) * wp.transpose(turn)
-
-
-@wp.kernel
-def _sum_taped(
-    # in:
-    rows: wp.array2d[float],
-    frames: wp.array1d[wp.mat33d],
-    cubes: Cubes,
-    x: wp.array1d[wp.vec3],
-    cut: float,
-    sphere: int,
-    # out:
-    f: wp.array2d[float],
-):
-    i = wp.tid()
-    cube = cube_of(cubes, x[i])
-    for j in range(cubes.start[cube], cubes.start[cube + 1]):
-        k = cubes.item[j]
-        d = wp.vec3d(x[i]) - wp.vec3d(wp.float64(rows[k, 0]), wp.float64(rows[k, 1]), wp.float64(rows[k, 2]))
-        u = frames[k] * d
-        d2 = wp.dot(u, u)
-        # Squared: the root's slope at a point on a centre would make NaN of a gradient of 0.
-        far = d2
-        if sphere != 0:
-            longest = wp.exp(wp.float64(wp.max(rows[k, 3], wp.max(rows[k, 4], rows[k, 5]))))
-            far = wp.length_sq(d) / (longest * longest)
-        if far < wp.float64(cut) * wp.float64(cut):
-            w = float(wp.exp(wp.float64(-0.5) * d2))
-            # To memory: a variable's past would be lost on the way back through a loop that isn't unrolled.
-            for c in range(f.shape[0]):
-                f[c, i] += w * rows[k, LATENT + c]
-
-
 @dataclass(frozen=True)
 class _Kernels:
     """Of one latent length."""
 
     forward: Any
     backward: Any
+    backward_points: Any
 
 
 @functools.cache
 def sum_kernels(latent: int) -> _Kernels:
-    """Builds (once) the kernels of ``sum`` and ``backward`` for latents of length L."""
+    """Builds (once) the kernels of ``sum`` and its adjoints for latents of length L."""
     fn = functions(latent)
     vec_latent, vec_sums = fn.vec_latent, fn.vec_sums
-    add, accumulate, chain = fn.add, fn.accumulate, fn.chain
+    add, accumulate, chain, slope = fn.add, fn.accumulate, fn.chain, fn.slope
     options = {"enable_backward": False, "max_unroll": 32}
 
     @wp.kernel(module="unique", module_options=options)
@@ -185,7 +135,30 @@ def sum_kernels(latent: int) -> _Kernels:
         for c in range(wp.static(latent)):
             grad[k, LATENT + c] = sums[SHAPE_NUMBERS + c]
 
-    return _Kernels(forward, backward)
+    @wp.kernel(module="unique", module_options=options)
+    def backward_points(
+        # in:
+        rows: wp.array2d[float],
+        shapes: wp.array1d[Shape],
+        cubes: Cubes,
+        x: wp.array1d[wp.vec3],
+        cut: float,
+        grad_f: wp.array2d[float],
+        # out:
+        grad: wp.array1d[wp.vec3],
+    ):
+        i = wp.tid()
+        cube = cube_of(cubes, x[i])
+        g = vec_latent()
+        for c in range(wp.static(latent)):
+            g[c] = grad_f[c, i]
+        total = wp.vec3()
+        for j in range(cubes.start[cube], cubes.start[cube + 1]):
+            k = cubes.item[j]
+            total += slope(shapes[k], rows, k, x[i], g, cut)
+        grad[i] = total
+
+    return _Kernels(forward, backward, backward_points)
 
 
 def _latent(rows) -> int:
@@ -202,7 +175,7 @@ def _sphere(support: str) -> int:
 
 
 def shapes(rows, cut: float, support: str = "ellipsoid"):
-    """What the rows of Gaussians come to.
+    """Builds the ``Shape`` of each row.
 
     Args:
         rows: float [K, 10 + L], see ``gaussians``.
@@ -256,22 +229,13 @@ def backward(rows, shapes, cubes, x, grad_f, grad, cut: float) -> None:
     wp.launch(kernel, rows.shape[0], inputs=inputs, outputs=[grad], device=device)
 
 
-def sum_taped(rows, cubes, x, f, cut: float, support: str = "ellipsoid") -> None:
-    """``sum``, recorded by an open ``wp.Tape`` with gradients for the rows.
-
-    On CUDA gradients of Gaussians are added in any order, so that the last bits change from run to run.
+def backward_points(rows, shapes, cubes, x, grad_f, grad, cut: float) -> None:
+    """The gradient of ``sum`` by its points.
 
     Args:
-        rows: float [K, 10 + L], requires a gradient.
-        cubes, x, cut: As for ``sum``.
-        f: float [L, N], written.
-        support: As for ``shapes``.
+        rows, shapes, cubes, x, grad_f, cut: As for ``backward``.
+        grad: vec3 [N], written.
     """
-    device, count = rows.device, rows.shape[0]
-    cubes = cubes or everything(count, device)
-    sphere = _sphere(support)
-    _latent(rows)
-    f.zero_()
-    frames = wp.empty(count, dtype=wp.mat33d, device=device, requires_grad=True)
-    wp.launch(_frames, count, inputs=[rows], outputs=[frames], device=device)
-    wp.launch(_sum_taped, x.shape, inputs=[rows, frames, cubes, x, cut, sphere], outputs=[f], device=device)
+    cubes = cubes or everything(rows.shape[0], rows.device)
+    kernel = sum_kernels(_latent(rows)).backward_points
+    wp.launch(kernel, x.shape, inputs=[rows, shapes, cubes, x, cut, grad_f], outputs=[grad], device=rows.device)

@@ -5,9 +5,11 @@ S = diag(scale), R the rotation and W = S^-1 R^T,
 
     F(x) = sum_k F_k w_k(x),   w_k(x) = exp(-|u|^2 / 2),   u = W_k (x - centre_k),   over the k that reach x.
 
-``Shape`` is what a row comes to. The backward pass sums, over the points, the symmetric a w u u^T and the vector a w u
-with a = dL/dF . F_k, and ``chain`` makes gradients of the row of them. No difference of large numbers is left in it.
-Where a Gaussian is a needle or a sheet, u itself is one: it is then computed in float64, for these Gaussians alone.
+``Shape`` is a row prepared for use. The backward pass sums, over the points, the symmetric a w u u^T and the vector
+a w u with a = dL/dF . F_k, and ``chain`` makes gradients of the row of them. No difference of large numbers is left in
+it. Where a Gaussian is a needle or a sheet, u itself is one: it is then computed in float64, for these Gaussians alone.
+
+The twin to read first: ``tests/reference/gaussians.py``.
 """
 
 import functools
@@ -69,7 +71,7 @@ def _rotation(q: wp.vec4d) -> wp.mat33d:
 
 @wp.func
 def shape_of(centre: wp.vec3, log_scale: wp.vec3, q: wp.vec4, cut: float, sphere: int) -> Shape:
-    """What a row comes to.
+    """Builds the ``Shape`` of one row.
 
     Args:
         centre, log_scale, q: The row's first ten numbers.
@@ -142,6 +144,7 @@ class GaussianFunctions:
         vec_sums: vec of 9 + L floats, what ``accumulate`` adds up over points.
         add: (f, shape, rows, k, x, cut) -> f with Gaussian k at x added.
         accumulate: (sums, shape, rows, k, x, grad_f, cut) -> sums with the point x added.
+        slope: (shape, rows, k, x, grad_f, cut) -> what Gaussian k gives to the gradient of x.
         chain: (sums, shape, log_scale, q) -> gradient of the first ten numbers of a row; that of the latent is the
             sums' rest.
     """
@@ -151,6 +154,7 @@ class GaussianFunctions:
     vec_sums: Any
     add: Any
     accumulate: Any
+    slope: Any
     chain: Any
 
 
@@ -195,6 +199,17 @@ def functions(latent: int) -> GaussianFunctions:
         return sums
 
     @wp.func
+    def slope(shape: Shape, rows: wp.array2d[float], k: int, x: wp.vec3, g: vec_latent, cut: float) -> wp.vec3:
+        u = _whitened(shape, x)
+        d2 = wp.dot(u, u)
+        if not _reaches(shape, x, d2, cut):
+            return wp.vec3()
+        a = float(0.0)
+        for c in range(wp.static(latent)):
+            a += g[c] * rows[k, LATENT + c]
+        return -a * wp.exp(-0.5 * d2) * (wp.transpose(shape.whiten) * u)
+
+    @wp.func
     def chain(sums: vec_sums, shape: Shape, log_scale: wp.vec3, q: wp.vec4) -> _vec10:
         centre = wp.transpose(shape.whiten) * wp.vec3(sums[0], sums[1], sums[2])
         # A turn by omega in the Gaussian's own axes moves u by -S^-1 [omega] S u.
@@ -218,4 +233,4 @@ def functions(latent: int) -> GaussianFunctions:
             g[6 + c] = dq[c]
         return g
 
-    return GaussianFunctions(latent, vec_latent, vec_sums, add, accumulate, chain)
+    return GaussianFunctions(latent, vec_latent, vec_sums, add, accumulate, slope, chain)

@@ -1,11 +1,14 @@
-"""The probes' network there and back (gaussian-probe-compression, eq. 7 and 8): loss, and every gradient.
+"""The probes' network, forward and backward (gaussian-probe-compression, eq. 7 and 8): loss, and every gradient.
 
 L + 3 inputs, two hidden layers of H units, D outputs. Its weights are one array: for each layer a row for every
 input, then the biases; a row of the last layer is padded to a multiple of four numbers.
 
 On CUDA a block of threads takes up to 64 probes through all layers in shared memory, each thread a piece of 4 probes by
-8 units at a time: fourteen small matrix products, for which one thread a probe would spill its registers. On the CPU a
-thread takes a probe. Parts of the weights' gradients are written by block, to be added in a fixed order.
+8 units at a time: fourteen small matrix products, for which one probe per thread would spill its registers. That is
+CUDA C++, in ``native/layers.cuh`` and ``native/network.cuh``. On the CPU a thread takes one probe. Parts of the
+gradient of the weights are written by block, to be added in a fixed order.
+
+The twin to read first: ``tests/reference/probe_network.py``.
 """
 
 import functools
@@ -13,6 +16,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import warp as wp
+
+from wlm_kernels.native import native_source
 
 __all__ = [
     "CPU_LANES",
@@ -42,68 +47,9 @@ def probes_at_once(latent: int, hidden: int, outputs: int) -> int:
 
 
 def layer_code(latent: int, hidden: int, outputs: int, probes: int) -> str:
-    """CUDA code for the forward pass of a block of ``THREADS`` threads, for the beginning of a native function.
-
-    It declares the sizes, the rows X (inputs), A and B (hidden layers) and E (outputs) of P probes in shared memory,
-    and ``forward(in, rows, weights, out)``, a hidden layer, and ``last(in, weights, put)``, which hands every output
-    c of probe p to ``put(c, p, value)``. The caller fills X and synchronises.
-    """
-    inputs, wide = latent + 3, padded(outputs)
-    return f"""
-    constexpr int L = {latent}, I = {inputs}, H = {hidden}, D = {outputs}, DP = {wide}, T = {THREADS};
-    constexpr int SECOND = (I + 1) * H, THIRD = SECOND + (H + 1) * H, SIZE = THIRD + (H + 1) * DP;
-    constexpr int P = {probes}, LD = P + 4;  // rows of P probes, a bank apart
-    constexpr int Q = P / 4;                 // pieces along the probes
-    __shared__ __align__(16) float X[I * LD], A[H * LD], B[H * LD], E[DP * LD];
-    auto four = [](const float* p) {{ return *reinterpret_cast<const float4*>(p); }};
-    auto forward = [&](const float* in, int rows, const float* w, float* out) {{
-        for (int tile = threadIdx.x; tile < Q * (H / 8); tile += T) {{
-            const int p = tile % Q * 4, j = tile / Q * 8;
-            float sum[8][4];
-            #pragma unroll
-            for (int v = 0; v < 8; ++v)
-                #pragma unroll
-                for (int u = 0; u < 4; ++u) sum[v][u] = w[rows * H + j + v];
-            #pragma unroll 4
-            for (int i = 0; i < rows; ++i) {{
-                const float4 a = four(in + i * LD + p), b = four(w + i * H + j), c = four(w + i * H + j + 4);
-                const float left[4] = {{a.x, a.y, a.z, a.w}}, right[8] = {{b.x, b.y, b.z, b.w, c.x, c.y, c.z, c.w}};
-                #pragma unroll
-                for (int v = 0; v < 8; ++v)
-                    #pragma unroll
-                    for (int u = 0; u < 4; ++u) sum[v][u] += left[u] * right[v];
-            }}
-            #pragma unroll
-            for (int v = 0; v < 8; ++v)
-                #pragma unroll
-                for (int u = 0; u < 4; ++u) out[(j + v) * LD + p + u] = 1.0f / (1.0f + __expf(-sum[v][u]));
-        }}
-        __syncthreads();
-    }};
-    auto last = [&](const float* in, const float* w, auto put) {{
-        for (int tile = threadIdx.x; tile < Q * (DP / 4); tile += T) {{
-            const int p = tile % Q * 4, j = tile / Q * 4;
-            float sum[4][4];
-            #pragma unroll
-            for (int v = 0; v < 4; ++v)
-                #pragma unroll
-                for (int u = 0; u < 4; ++u) sum[v][u] = w[H * DP + j + v];
-            #pragma unroll 4
-            for (int i = 0; i < H; ++i) {{
-                const float4 a = four(in + i * LD + p), b = four(w + i * DP + j);
-                const float left[4] = {{a.x, a.y, a.z, a.w}}, right[4] = {{b.x, b.y, b.z, b.w}};
-                #pragma unroll
-                for (int v = 0; v < 4; ++v)
-                    #pragma unroll
-                    for (int u = 0; u < 4; ++u) sum[v][u] += left[u] * right[v];
-            }}
-            #pragma unroll
-            for (int v = 0; v < 4; ++v)
-                #pragma unroll
-                for (int u = 0; u < 4; ++u) put(j + v, p + u, sum[v][u]);
-        }}
-    }};
-    """
+    """CUDA code for the forward pass of a block of ``THREADS`` threads: the beginning of a body, see its file."""
+    sizes = {"L": latent, "H": hidden, "D": outputs, "DP": padded(outputs)}
+    return native_source(__package__, "layers", **sizes, P=probes, T=THREADS)
 
 
 @dataclass(frozen=True)
@@ -142,7 +88,7 @@ class NetworkKernels:
         """The loss, sum over live probes and numbers of weight * error^2, and its gradients.
 
         Args:
-            groups: ``probe_step.Groups``.
+            groups: ``step.Groups``.
             f: float [S, L, N], the Gaussians' sums in S parts.
             target: float [D, N].
             weight: float [D].
@@ -179,129 +125,7 @@ def network_kernels(latent: int, hidden: int, outputs: int, device_kind: str) ->
     """
     options = {"enable_backward": False}
     probes = probes_at_once(latent, hidden, outputs)
-    snippet = f"""
-    {layer_code(latent, hidden, outputs, probes)}
-    const int t = threadIdx.x;
-    const int first = block * P, n = x.shape[0];
-    const float* w1 = net.data, *w2 = w1 + SECOND, *w3 = w1 + THIRD;
-    float* part = partial.data + size_t(block) * SIZE;
-
-    for (int m = t; m < I * P; m += T) {{
-        const int c = m / P, p = m % P;
-        float v = 0.0f;
-        if (c < L) for (int s = 0; s < f.shape[0]; ++s) v += f.data[(size_t(s) * L + c) * n + first + p];
-        else v = x.data[first + p][c - L];
-        X[c * LD + p] = v;
-    }}
-    __syncthreads();
-    // The delta before a layer from the one behind it, in place of the layer's input.
-    auto back = [&](const float* d, int count, const float* w, float* out) {{
-        for (int tile = t; tile < Q * (H / 8); tile += T) {{
-            const int p = tile % Q * 4, i = tile / Q * 8;
-            float sum[8][4] = {{}};
-            for (int j = 0; j < count; j += 4) {{
-                float right[4][4];
-                #pragma unroll
-                for (int s = 0; s < 4; ++s) {{
-                    const float4 a = four(d + (j + s) * LD + p);
-                    right[s][0] = a.x; right[s][1] = a.y; right[s][2] = a.z; right[s][3] = a.w;
-                }}
-                #pragma unroll
-                for (int v = 0; v < 8; ++v) {{
-                    const float4 b = four(w + (i + v) * count + j);
-                    #pragma unroll
-                    for (int u = 0; u < 4; ++u)
-                        sum[v][u] += b.x * right[0][u] + b.y * right[1][u] + b.z * right[2][u] + b.w * right[3][u];
-                }}
-            }}
-            #pragma unroll
-            for (int v = 0; v < 8; ++v)
-                #pragma unroll
-                for (int u = 0; u < 4; ++u) {{
-                    float& h = out[(i + v) * LD + p + u];
-                    h = sum[v][u] * h * (1.0f - h);
-                }}
-        }}
-        __syncthreads();
-    }};
-    // The gradient of a layer's weights, rows of inputs times units, and of its biases.
-    auto outer = [&](const float* in, int rows, auto tall, const float* d, int count, float* out) {{
-        constexpr int R = sizeof(*tall);
-        const int down = rows / R, across = count / 4;
-        for (int tile = t; tile < down * across; tile += T) {{
-            // Rows a thread apart lie in different banks.
-            const int i = tile % down, j = tile / down;
-            float sum[R][4] = {{}};
-            #pragma unroll 2
-            for (int p = 0; p < P; p += 4) {{
-                float4 right[4];
-                #pragma unroll
-                for (int v = 0; v < 4; ++v) right[v] = four(d + (j + v * across) * LD + p);
-                #pragma unroll
-                for (int u = 0; u < R; ++u) {{
-                    const float4 a = four(in + (i + u * down) * LD + p);
-                    #pragma unroll
-                    for (int v = 0; v < 4; ++v)
-                        sum[u][v] += a.x * right[v].x + a.y * right[v].y + a.z * right[v].z + a.w * right[v].w;
-                }}
-            }}
-            #pragma unroll
-            for (int u = 0; u < R; ++u)
-                #pragma unroll
-                for (int v = 0; v < 4; ++v) out[(i + u * down) * count + j + v * across] = sum[u][v];
-        }}
-        for (int j = t; j < count; j += T) {{
-            float sum = 0.0f;
-            for (int p = 0; p < P; p += 4) {{
-                const float4 a = four(d + j * LD + p);
-                sum += (a.x + a.y) + (a.z + a.w);
-            }}
-            out[rows * count + j] = sum;
-        }}
-        __syncthreads();
-    }};
-    // Rows that a thread takes, as the size of an array, for a lambda's argument can carry no number.
-    const char (*one)[1] = nullptr, (*eight)[8] = nullptr;
-
-    forward(X, I, w1, A);
-    forward(A, H, w2, B);
-    float error = 0.0f;
-    last(B, w3, [&](int c, int p, float y) {{
-        float d = 0.0f;
-        if (c < D && first + p < count) {{
-            const float e = y - target.data[size_t(c) * n + first + p];
-            d = weight.data[c] * e;
-            error += d * e;
-        }}
-        E[c * LD + p] = 2.0f * d;
-    }});
-    __syncthreads();
-    outer(B, H, eight, E, DP, part + THIRD);
-    back(E, DP, w3, B);
-    outer(A, H, eight, B, H, part + SECOND);
-    back(B, H, w2, A);
-    outer(X, I, one, A, H, part);
-    for (int m = t; m < L * Q; m += T) {{
-        const int p = m % Q * 4, i = m / Q;
-        float4 sum = {{0.0f, 0.0f, 0.0f, 0.0f}};
-        #pragma unroll 4
-        for (int j = 0; j < H; ++j) {{
-            const float4 a = four(A + j * LD + p);
-            const float b = w1[i * H + j];
-            sum.x += a.x * b; sum.y += a.y * b; sum.z += a.z * b; sum.w += a.w * b;
-        }}
-        *reinterpret_cast<float4*>(grad_f.data + size_t(i) * n + first + p) = sum;
-    }}
-    #pragma unroll
-    for (int step = 16; step > 0; step /= 2) error += __shfl_down_sync(0xffffffffu, error, step);
-    if (t % 32 == 0) X[t / 32] = error;
-    __syncthreads();
-    if (t == 0) {{
-        float sum = 0.0f;
-        for (int s = 0; s < T / 32; ++s) sum += X[s];
-        loss.data[block] = sum;
-    }}
-    """
+    snippet = layer_code(latent, hidden, outputs, probes) + native_source(__package__, "network")
     if device_kind == "cuda":
 
         @wp.func_native(snippet)

@@ -1,7 +1,9 @@
-"""The optimisers of Gaussians and network, one thread a number: Adan or Adam (gaussian-probe-compression, section 5).
+"""The optimisers of Gaussians and network, one number per thread: Adan or Adam (gaussian-probe-compression, section 5).
 
-They are ours because a whole step has to be in one CUDA graph, which libraries that count steps in Python can't be; the
-tests hold them to pytorch-optimizer's Adan and torch's Adam.
+They are ours because a whole step has to be in one CUDA graph, which libraries that count steps in Python can't be.
+
+The twins to read first: torch's Adam and pytorch-optimizer's Adan, to which ``tests/kernels/test_probe_step.py`` holds
+these.
 """
 
 import functools
@@ -48,7 +50,7 @@ class Optimiser:
 
 @functools.cache
 def update_kernel(latent: int):
-    """Builds (once) the kernel of ``probe_step.StepKernels.update`` for latents of length L."""
+    """Builds (once) the kernel of ``step.StepKernels.update`` for latents of length L."""
     fn = functions(latent)
     vec_sums, chain = fn.vec_sums, fn.chain
     channels = LATENT + latent

@@ -1,13 +1,15 @@
-"""A training step of Gaussians and their network (gaussian-probe-compression, section 3.2 and 3.3), but the network.
+"""A training step of the Gaussians (gaussian-probe-compression, section 3.2 and 3.3); ``network`` has the rest of it.
 
 Probes are sorted along a space-filling curve and taken in groups of 64 neighbours, each with a box. A step is five
 launches: which Gaussians meet which groups, as bit masks (``touch``); the Gaussians' sum at each probe (``features``);
-the network there and back (``probe_network``); the sums that the gradients of each Gaussian are made of (``collect``);
-and the optimisers (``update``). A launch runs over probes, or over Gaussians, and nothing is added up by atomics: one
-seed gives one result, on either device.
+the network, forward and backward (``network``); the sums that the gradients of each Gaussian are made of
+(``collect``); and the optimisers (``update``). A launch runs over probes, or over Gaussians, and nothing is added up by
+atomics: one seed gives one result, on either device.
 
 The masks take the place of the paper's sorted lists of cubes in training, where the probes stand still: there is
-nothing to count, scan and sort (``gaussian_cubes`` does, for points at any place).
+nothing to count, scan and sort (``cubes`` does, for points at any place).
+
+The twin to read first: ``tests/reference/gaussians.py``.
 """
 
 import functools
@@ -16,6 +18,7 @@ from typing import Any
 
 import warp as wp
 
+from wlm_kernels.native import native_source
 from wlm_kernels.probe.gaussians import LATENT, SHAPE_NUMBERS, Shape, functions, shape_of, touches
 from wlm_kernels.probe.optimiser import update_kernel
 
@@ -33,6 +36,7 @@ __all__ = [
 GROUP = 64  # probes
 SPLITS = 4  # threads that share a probe's sum on CUDA, where 15,000 probes alone leave most of a GPU idle
 _COLLECTORS = 256  # threads that share a Gaussian's gradient on CUDA: the widest one sets the pace
+
 
 @wp.struct
 class Groups:
@@ -97,16 +101,16 @@ def _touch_cpu(
     bits: wp.array2d[wp.uint32],
 ):
     row, word = wp.tid()
-    found = wp.uint32(0)
+    word_bits = wp.uint32(0)
     for b in range(32):
-        other = word * 32 + b
+        column = word * 32 + b
         met = int(0)
         if transposed == 0:
-            met = _meet(groups, shapes, row, other)
+            met = _meet(groups, shapes, row, column)
         else:
-            met = _meet(groups, shapes, other, row)
-        found = found | (wp.uint32(met) << wp.uint32(b))
-    bits[row, word] = found
+            met = _meet(groups, shapes, column, row)
+        word_bits = word_bits | (wp.uint32(met) << wp.uint32(b))
+    bits[row, word] = word_bits
 
 
 @wp.kernel(enable_backward=False)
@@ -119,16 +123,16 @@ def _touch_cuda(
     bits: wp.array2d[wp.uint32],
 ):
     row, word, b = wp.tid()
-    other = word * 32 + b
+    column = word * 32 + b
     met = int(0)
     if transposed == 0:
-        met = _meet(groups, shapes, row, other)
+        met = _meet(groups, shapes, row, column)
     else:
-        met = _meet(groups, shapes, other, row)
+        met = _meet(groups, shapes, column, row)
     # Threads 0 to 31 of the last dimension are one warp, whole in every launch.
-    found = _ballot(met)
+    word_bits = _ballot(met)
     if b == 0:
-        bits[row, word] = found
+        bits[row, word] = word_bits
 
 
 def count_step(control) -> None:
@@ -158,7 +162,6 @@ def touch(groups, shapes, by_group, by_gaussian) -> None:
 class StepKernels:
     """The launches of one latent length on one kind of device."""
 
-    latent: int
     device_kind: str
     _shapes: Any
     _features: Any
@@ -171,7 +174,7 @@ class StepKernels:
             kernel.module.load(wp.get_device(device))
 
     def shapes(self, rows, bounds, quantised, levels, cut, sphere, used, shapes) -> None:
-        """Makes what a step uses of the parameters.
+        """Prepares the parameters for a step: rounded to the file's levels if asked for, and as shapes.
 
         Args:
             rows: float [K, 10 + L], the parameters.
@@ -210,7 +213,7 @@ class StepKernels:
         )
 
     def collect(self, groups, shapes, used, by_gaussian, grad_f, cut, sums, base=0, count=None) -> None:
-        """Sums over the probes what the gradients of each Gaussian are made of.
+        """Sums over the probes the terms of each Gaussian's gradient.
 
         Args:
             groups, shapes, used, by_gaussian, cut: As above.
@@ -233,7 +236,7 @@ class StepKernels:
         """One step of Adan for the Gaussians and of Adam for the network.
 
         Args:
-            optimiser: ``probe_optimiser.Optimiser``.
+            optimiser: ``optimiser.Optimiser``.
             rows: float [K, 10 + L], updated.
             used: float [K, 10 + L], what the gradients were taken at.
             shapes: Shape [K].
@@ -265,6 +268,8 @@ def step_kernels(latent: int, device_kind: str) -> StepKernels:
     add, accumulate = fn.add, fn.accumulate
     channels = LATENT + latent
     options = {"enable_backward": False, "max_unroll": 32}
+    cuda = device_kind == "cuda"
+    block_sum = _block_sum(vec_sums, SHAPE_NUMBERS + latent)
 
     @wp.kernel(module="unique", module_options=options)
     def shapes_kernel(
@@ -349,7 +354,7 @@ def step_kernels(latent: int, device_kind: str) -> StepKernels:
                     continue
                 for j in range(lane, GROUP, lanes):
                     i = g * GROUP + j
-                    # Most of a group that is met at a corner isn't reached: look before loading gradients.
+                    # A group that is met at a corner is hardly reached: test before loading gradients.
                     if not touches(shape, groups.x[i], wp.vec3()):
                         continue
                     gradient = vec_latent()
@@ -358,108 +363,61 @@ def step_kernels(latent: int, device_kind: str) -> StepKernels:
                     s = accumulate(s, shape, used, k, groups.x[i], gradient, cut)
         return s
 
-    if device_kind == "cpu":
-
-        @wp.kernel(module="unique", module_options=options)
-        def features(
-            # in:
-            groups: Groups,
-            shapes: wp.array1d[Shape],
-            used: wp.array2d[float],
-            by_group: wp.array2d[wp.uint32],
-            cut: float,
-            base: int,
-            # out:
-            f: wp.array3d[float],
-        ):
-            i = base + wp.tid()
-            s = sum_at(groups, shapes, used, by_group, cut, i, 0, 1)
-            for c in range(wp.static(latent)):
-                f[0, c, i] = s[c]
-
-        @wp.kernel(module="unique", module_options=options)
-        def collect(
-            # in:
-            groups: Groups,
-            shapes: wp.array1d[Shape],
-            used: wp.array2d[float],
-            by_gaussian: wp.array2d[wp.uint32],
-            grad_f: wp.array2d[float],
-            cut: float,
-            base: int,
-            # out:
-            sums: wp.array2d[float],
-        ):
-            k = base + wp.tid()
-            s = sums_of(groups, shapes, used, by_gaussian, grad_f, cut, k, 0, 1, 0, 1)
-            for c in range(wp.static(SHAPE_NUMBERS + latent)):
-                sums[k, c] = s[c]
-
-    else:
-        block_sum = _block_sum(vec_sums, SHAPE_NUMBERS + latent)
-
-        @wp.kernel(module="unique", module_options=options)
-        def features(
-            # in:
-            groups: Groups,
-            shapes: wp.array1d[Shape],
-            used: wp.array2d[float],
-            by_group: wp.array2d[wp.uint32],
-            cut: float,
-            base: int,
-            # out:
-            f: wp.array3d[float],
-        ):
+    @wp.kernel(module="unique", module_options=options)
+    def features(
+        # in:
+        groups: Groups,
+        shapes: wp.array1d[Shape],
+        used: wp.array2d[float],
+        by_group: wp.array2d[wp.uint32],
+        cut: float,
+        base: int,
+        # out:
+        f: wp.array3d[float],
+    ):
+        if wp.static(cuda):
             g, split, lane = wp.tid()
             i = g * GROUP + lane
             s = sum_at(groups, shapes, used, by_group, cut, i, split, SPLITS)
             for c in range(wp.static(latent)):
                 f[split, c, i] = s[c]
+        else:
+            i = base + wp.tid()
+            s = sum_at(groups, shapes, used, by_group, cut, i, 0, 1)
+            for c in range(wp.static(latent)):
+                f[0, c, i] = s[c]
 
-        @wp.kernel(module="unique", module_options=options)
-        def collect(
-            # in:
-            groups: Groups,
-            shapes: wp.array1d[Shape],
-            used: wp.array2d[float],
-            by_gaussian: wp.array2d[wp.uint32],
-            grad_f: wp.array2d[float],
-            cut: float,
-            base: int,
-            # out:
-            sums: wp.array2d[float],
-        ):
+    @wp.kernel(module="unique", module_options=options)
+    def collect(
+        # in:
+        groups: Groups,
+        shapes: wp.array1d[Shape],
+        used: wp.array2d[float],
+        by_gaussian: wp.array2d[wp.uint32],
+        grad_f: wp.array2d[float],
+        cut: float,
+        base: int,
+        # out:
+        sums: wp.array2d[float],
+    ):
+        if wp.static(cuda):
             k, t = wp.tid()
             s = sums_of(
                 groups, shapes, used, by_gaussian, grad_f, cut, k, t // GROUP, _COLLECTORS // GROUP, t % GROUP, GROUP
             )
             block_sum(s, k, sums)
+        else:
+            k = base + wp.tid()
+            s = sums_of(groups, shapes, used, by_gaussian, grad_f, cut, k, 0, 1, 0, 1)
+            for c in range(wp.static(SHAPE_NUMBERS + latent)):
+                sums[k, c] = s[c]
 
-    return StepKernels(latent, device_kind, shapes_kernel, features, collect, update_kernel(latent))
+    return StepKernels(device_kind, shapes_kernel, features, collect, update_kernel(latent))
 
 
 def _block_sum(vec_sums, numbers: int):
     """The sum of a vector over a CUDA block, in a fixed order, into row k of an array."""
-    snippet = f"""
-    constexpr int N = {numbers}, WARPS = {_COLLECTORS // 32};
-    __shared__ float parts[WARPS][N];
-    const int t = threadIdx.x;
-    #pragma unroll
-    for (int c = 0; c < N; ++c) {{
-        float x = v.c[c];
-        #pragma unroll
-        for (int step = 16; step > 0; step /= 2) x += __shfl_down_sync(0xffffffffu, x, step);
-        if (t % 32 == 0) parts[t / 32][c] = x;
-    }}
-    __syncthreads();
-    if (t < N) {{
-        float x = 0.0f;
-        for (int w = 0; w < WARPS; ++w) x += parts[w][t];
-        out.data[size_t(k) * N + t] = x;
-    }}
-    """
-
-    @wp.func_native(snippet)
+    @wp.func_native(native_source(__package__, "block_sum", N=numbers, WARPS=_COLLECTORS // 32))
     def block_sum(v: vec_sums, k: int, out: wp.array2d[float]): ...
 
     return block_sum

@@ -8,6 +8,8 @@ its level's window and its slot holds it.
 
 Arrays: values float [L * side^3, D] and held vec3i [L * side^3], by slot; bases vec3i [L]; views vec4 [L], where the
 points' origin lies in the grid, ``origin / s - (base + side / 2 + 1/2)``, and 1 / s. None has a gradient.
+
+The twin to read first: ``tests/reference/volume.py``.
 """
 
 import warp as wp
@@ -35,8 +37,8 @@ def slot_of(level: int, block: wp.vec3i, side: int) -> int:
 
 @wp.func
 def holds(held: wp.array1d[wp.vec3i], slot: int, block: wp.vec3i) -> bool:
-    found = held[slot]
-    return found[0] == block[0] and found[1] == block[1] and found[2] == block[2]
+    held_block = held[slot]
+    return held_block[0] == block[0] and held_block[1] == block[1] and held_block[2] == block[2]
 
 
 @wp.kernel(enable_backward=False)

@@ -1,0 +1,114 @@
+"""The four systems as the contract's tests take them: a file each, what it decodes to, and a fit of a moment."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from builders import atlas_meshes, probe_sets, small_sets
+
+import wlm
+
+FILES = Path(__file__).resolve().parents[1] / "files"
+
+
+@dataclass(frozen=True)
+class Subject:
+    """One system.
+
+    Attributes:
+        name: Of its package.
+        file: Written before the systems had a contract.
+        decode: Turns a loaded model into arrays, by the names of ``stored``.
+        stored: What the file decoded to when it was written; None: nothing is kept of it.
+        data: Makes a small input.
+        compress: Fits it within seconds; takes the keywords of ``compress``.
+        evaluate: Scores a model of that data within a second.
+        export: Exports a model into a folder.
+        open_checkpoint: Opens a checkpoint of that fit: (output, resume); None: the fit keeps none.
+    """
+
+    name: str
+    file: Path
+    decode: Callable[[Any], dict[str, np.ndarray]]
+    stored: Path | None
+    data: Callable[[], Any]
+    compress: Callable[..., Any]
+    evaluate: Callable[[Any, Any], Any]
+    export: Callable[[Any, Any, Path], list[Path]]
+    open_checkpoint: Callable[[Any, Path, bool], Any] | None
+
+
+def _lightmap() -> Subject:
+    profile = small_sets.tiny_profile(steps=40)
+
+    def checkpoint(data: Any, output: Path, resume: bool) -> Any:
+        from wlm.lightmap.fit import open_checkpoint
+
+        return open_checkpoint(output, data, profile, resume=resume)
+
+    return Subject(
+        "lightmap",
+        FILES / "lightmap.wlm",
+        lambda model: {"frame": model.decoder().frame(18.5)[::8, ::8]},
+        FILES / "lightmap.npz",
+        small_sets.moving_light,
+        lambda data, **options: wlm.lightmap.compress(data, profile, **options),
+        lambda model, data: wlm.lightmap.evaluate(model, data, metrics=("psnr",)),
+        lambda model, data, folder: wlm.lightmap.export(model, folder),
+        checkpoint,
+    )
+
+
+def _probe() -> Subject:
+    profile = wlm.probe.Profile(name="tiny", ratio=0.1, steps=60, hidden=16, latent=3)
+
+    def checkpoint(data: Any, output: Path, resume: bool) -> Any:
+        from wlm.probe.fit import open_checkpoint
+
+        return open_checkpoint(output, data, profile, resume=resume)
+
+    return Subject(
+        "probe",
+        FILES / "probe.wlm",
+        lambda model: {"values": model.decoder().decode_probes()},
+        FILES / "probe.npz",
+        lambda: probe_sets.synthetic(300, dead=5),
+        lambda data, **options: wlm.probe.compress(data, profile, **options),
+        lambda model, data: wlm.probe.evaluate(model, data),
+        lambda model, data, folder: wlm.probe.export(model, folder),
+        checkpoint,
+    )
+
+
+def _atlas(kind: str) -> Subject:
+    profile = wlm.atlas.Profile(name="tiny", views=0)
+
+    def decode(model: Any) -> dict[str, np.ndarray]:
+        with np.load(FILES / f"atlas-{kind}.npz") as stored:
+            uv = stored["uv"]
+        return {"uv": uv, "light": model.decoder().read(torch.from_numpy(uv)).numpy()}
+
+    return Subject(
+        "atlas",
+        FILES / f"atlas-{kind}.wlm",
+        decode,
+        FILES / f"atlas-{kind}.npz",
+        atlas_meshes.sheet,
+        lambda data, **options: wlm.atlas.compress(data, profile, **options),
+        lambda model, data: wlm.atlas.evaluate(model, data, views=2, resolution=32),
+        lambda model, data, folder: wlm.atlas.export(model, folder, data),
+        None,
+    )
+
+
+SUBJECTS: dict[str, Callable[[], Subject]] = {
+    "lightmap": _lightmap,
+    "probe": _probe,
+    **{f"atlas-{kind}": lambda kind=kind: _atlas(kind) for kind in ("tiles", "cascade", "bc6h", "plain")},
+}
+"""By name; made when asked for, since importing a system takes time."""

@@ -1,0 +1,46 @@
+"""Running the command line in this process."""
+
+import os
+import signal
+from contextlib import contextmanager
+
+from typer.testing import CliRunner
+
+import wlm.cli.console
+from wlm.cli import app
+from wlm.system import Meter
+
+
+def call(*words, code=0):
+    """Runs the command in this process and returns what it printed to stdout; ``call.stderr`` has the rest."""
+    result = CliRunner().invoke(app, [str(word) for word in words])
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    assert result.exit_code == code, result.output
+    assert "\x1b" not in result.output, "no control codes where there is no terminal"
+    call.stderr = result.stderr
+    return result.stdout
+
+
+def fails(*words):
+    """Runs a command that must end with exit code 2 and one line, which is returned."""
+    assert call(*words, code=2) == ""
+    lines = call.stderr.splitlines()
+    assert len(lines) == 1 and lines[0].startswith("error: "), call.stderr
+    return lines[0]
+
+
+def report_always(monkeypatch):
+    """Makes long work report whenever it could, not twice a second."""
+    monkeypatch.setattr(Meter, "due", lambda self, done: True)
+
+
+def press_ctrl_c(monkeypatch):
+    """Makes every report of progress of a command come with a Ctrl-C."""
+
+    @contextmanager
+    def bar(what):
+        yield lambda done, total, text: os.kill(os.getpid(), signal.SIGINT)
+
+    report_always(monkeypatch)
+    monkeypatch.setattr(wlm.cli.console, "progress_bar", bar)

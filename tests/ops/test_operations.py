@@ -1,0 +1,389 @@
+"""Every operation against its twin in float64 and against finite differences, and what all of them refuse."""
+
+import inspect
+import subprocess
+import sys
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from kernels.compare import close
+
+from wlm import ops
+from wlm.ops import plain
+
+VALUE, GRADIENT = 1e-5, 1e-4  # of the largest number of a tensor
+SLOPE = 1e-3  # of the derivative along a direction
+
+
+@dataclass
+class Case:
+    """Arguments of an operation.
+
+    Attributes:
+        op: Its name in ``wlm.ops`` and in ``plain``.
+        leaves: Tensors with a gradient, by argument.
+        constants: Other tensors, by argument.
+        options: Other arguments.
+        sizes: Of the step for differences, by leaf, where 1e-2 isn't right; 0: the gradient isn't the slope.
+    """
+
+    op: str
+    leaves: dict[str, np.ndarray]
+    constants: dict[str, np.ndarray] = field(default_factory=dict)
+    options: dict[str, Any] = field(default_factory=dict)
+    sizes: dict[str, float] = field(default_factory=dict)
+
+    def tensors(self, device: str, dtype: torch.dtype = torch.float32) -> dict[str, torch.Tensor]:
+        """All tensors, of one float type; the leaves require a gradient."""
+        tensors = {name: torch.tensor(values, device=device) for name, values in (self.leaves | self.constants).items()}
+        tensors = {name: t.to(dtype) if t.is_floating_point() else t for name, t in tensors.items()}
+        return {name: t.requires_grad_(name in self.leaves) for name, t in tensors.items()}
+
+    def call(self, module: Any, tensors: dict[str, torch.Tensor]) -> tuple[torch.Tensor, ...]:
+        """The results."""
+        results = getattr(module, self.op)(**tensors, **self.options)
+        return results if isinstance(results, tuple) else (results,)
+
+
+def _points(count: int, *cells: int, seed: int = 1, outside: float = 0.0) -> np.ndarray:
+    """Points between cell centres, none within a tenth of a cell of one: there a slope changes."""
+    random = np.random.default_rng(seed)
+    size = np.array(cells)
+    low, high = (-outside * size).astype(int) - 1, ((1.0 + outside) * size).astype(int)
+    cell = random.integers(low, high, (count, len(cells)))
+    return ((cell + 0.5 + random.uniform(0.1, 0.9, cell.shape)) / size).astype(np.float32)
+
+
+def _normal(*shape: int, seed: int = 2) -> np.ndarray:
+    return np.random.default_rng(seed).normal(size=shape).astype(np.float32)
+
+
+def _uniform(low: float, high: float, *shape: int, seed: int = 3) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(low, high, shape).astype(np.float32)
+
+
+def _layers(count: int, layers: int) -> np.ndarray:
+    return np.random.default_rng(4).integers(0, layers, count)
+
+
+def _units(*shape: int, seed: int = 5) -> np.ndarray:
+    d = _normal(*shape, 3, seed=seed)
+    return d / np.linalg.norm(d, axis=-1, keepdims=True)
+
+
+def _network(inputs: int, width: int, outputs: int, *networks: int) -> dict[str, np.ndarray]:
+    return {
+        "x": _normal(*networks, 37, inputs),
+        "hidden": _normal(*networks, inputs + width + 2, width, seed=6) / width**0.5,
+        "output": _normal(*networks, width + 1, outputs, seed=7) / width**0.5,
+    }
+
+
+def _gaussians(count: int, latent: int) -> np.ndarray:
+    rows = _normal(count, 10 + latent)
+    rows[:, :3] = _uniform(0.0, 1.0, count, 3)
+    rows[:, 3:6] = -2.0 + 0.5 * rows[:, 3:6]
+    return rows
+
+
+def _rays(count: int, middle: tuple[float, ...], radius: float, distance: float) -> dict[str, np.ndarray]:
+    """Rays that begin ``distance`` before random points round the middle."""
+    direction = _units(count)
+    origin = np.array(middle, np.float32) + radius * _normal(count, 3) - distance * direction
+    return {"origin": origin, "direction": direction}
+
+
+def _smoke(density: np.ndarray, lights: int = 2, emitting: bool = True, distance: float = 12.0, **options) -> Case:
+    """A march through a grid."""
+    middle = tuple(n / 2 for n in density.shape)
+    leaves, constants = {"density": density}, _rays(40, middle, 2.0, distance)
+    if lights:
+        leaves["colour"], constants["toward"] = _uniform(0.2, 1.0, lights, 3), _units(lights, seed=8)
+    if emitting:
+        leaves["emission"] = _uniform(0.0, 1.0, *density.shape, 3)
+    # Opaque smoke hardly answers to a small step.
+    return Case("march", leaves, constants, options, {"density": 0.5} if density.max() > 10.0 else {})
+
+
+_BLOCKS = {"endpoints": _uniform(0.1, 0.9, 2, 3, 2, 4), "weights": _uniform(0.1, 0.9, 8, 12)}
+_BEYOND = {"endpoints": _uniform(-0.3, 1.3, 2, 3, 2, 4), "weights": _uniform(-0.3, 1.3, 8, 12)}
+_STRAIGHT = {"endpoints": 0.0, "weights": 0.0, "uv": 1e-3}
+_THIN = _uniform(0.05, 0.3, 6, 7, 8)
+_THIRDS = {"xy": _normal(4, 5, 3), "xz": _normal(6, 5, 3, seed=9), "yz": _normal(6, 4, 3, seed=10)}
+_IN_CELLS = {"points": 5e-3}
+_SPACE = {"points": _points(60, 60, 60, 60)}
+
+CASES = {
+    "bc7_map": Case("bc7_map", {**_BLOCKS, "uv": _points(50, 12, 8)}, sizes={"uv": 5e-3}),
+    "bc7_map-beyond": Case("bc7_map", {**_BEYOND, "uv": _points(50, 12, 8, outside=0.5)}, sizes=_STRAIGHT),
+    "bc7_map-quantised": Case(
+        "bc7_map", {**_BEYOND, "uv": _points(50, 12, 8)}, options={"quantised": True}, sizes=_STRAIGHT
+    ),
+    "bc7_map-layers": Case(
+        "bc7_map",
+        {
+            "endpoints": _uniform(0.1, 0.9, 3, 1, 2, 2, 4),
+            "weights": _uniform(0.1, 0.9, 3, 4, 8),
+            "uv": _points(50, 8, 4),
+        },
+        {"layer": _layers(50, 3)},
+        sizes={"uv": 5e-3},
+    ),
+    "bc7_texels": Case("bc7_texels", _BLOCKS),
+    "plane": Case("plane", {"values": _normal(5, 7, 3), "points": _points(60, 7, 5, outside=0.5)}, sizes=_IN_CELLS),
+    "plane-periodic-layers": Case(
+        "plane",
+        {"values": _normal(3, 5, 7, 2), "points": _points(60, 7, 5, outside=1.5)},
+        {"layer": _layers(60, 3).astype(np.int32)},
+        {"periodic": True},
+        _IN_CELLS,
+    ),
+    "plane-one-cell": Case("plane", {"values": _normal(1, 1, 17), "points": _points(9, 1, 1)}, sizes=_IN_CELLS),
+    "volume": Case(
+        "volume", {"values": _normal(4, 5, 7, 3), "points": _points(60, 7, 5, 4, outside=0.5)}, sizes=_IN_CELLS
+    ),
+    "volume-periodic-layers": Case(
+        "volume",
+        {"values": _normal(3, 4, 1, 6, 2), "points": _points(60, 6, 1, 4, outside=1.5)},
+        {"layer": _layers(60, 3)},
+        {"periodic": True},
+        _IN_CELLS,
+    ),
+    "triplane": Case("triplane", _THIRDS | _SPACE, sizes={"points": 1e-4}),
+    "triplane-product": Case("triplane", _THIRDS | _SPACE, {}, {"reduce": "product"}, {"points": 1e-4}),
+    "triplane-concatenate": Case("triplane", _THIRDS | _SPACE, {}, {"reduce": "concatenate"}, {"points": 1e-4}),
+    **{f"mlp-{width}": Case("mlp", _network(16, width, 3, 3)) for width in (8, 16, 17, 32, 64)},
+    "mlp-tanh": Case("mlp", _network(5, 16, 4, 2), options={"gelu": "tanh"}),
+    "mlp-fast": Case("mlp", _network(5, 17, 1), options={"gelu": "fast"}),
+    "gaussian_sum": Case(
+        "gaussian_sum", {"rows": _gaussians(24, 5), "points": _uniform(0.0, 1.0, 80, 3)}, options={"cut": 6.0}
+    ),
+    "gaussian_sum-sphere": Case(
+        "gaussian_sum",
+        {"rows": _gaussians(9, 17), "points": _uniform(0.0, 1.0, 80, 3)},
+        options={"support": "sphere"},
+        sizes={"rows": 0.0, "points": 0.0},  # what is reached changes at a step
+    ),
+    "gaussian_sum-lists": Case(
+        "gaussian_sum",
+        {"rows": _gaussians(300, 1), "points": _uniform(0.0, 1.0, 500, 3)},
+        sizes={"rows": 0.0, "points": 0.0},
+    ),
+    "march": _smoke(_THIN, step=0.8, g=0.4),
+    "march-inside": _smoke(_THIN, distance=1.0, step=2.5, g=-0.6),
+    "march-transmittance": _smoke(_THIN, lights=0, emitting=False),
+    "march-emission": _smoke(_THIN, lights=0),
+    "march-light": _smoke(_THIN, lights=1, emitting=False),
+    "march-opaque": _smoke(300.0 * _THIN, step=0.8),
+    "march-no-smoke": _smoke(0.0 * _THIN),
+    "march-one-voxel": _smoke(_uniform(0.5, 1.0, 1, 1, 1), step=0.3),
+}
+FIRST = {case.op: name for name, case in reversed(CASES.items())}  # one of each operation
+# The GPU's tanh instruction is within 2^-11 relative; x (1 - tanh) and x (1 - tanh^2) carry that to the gradients.
+FAST = {"value": 2e-3, "gradient": 5e-3}
+
+
+def _results(case: Case, module: Any, tensors: dict[str, torch.Tensor]) -> tuple[list, dict]:
+    """The values and, for random adjoints of them, the gradients by leaf."""
+    values = case.call(module, tensors)
+    adjoints = [torch.from_numpy(_normal(*value.shape, seed=20 + i)).to(value) for i, value in enumerate(values)]
+    pairs = [pair for pair in zip(values, adjoints, strict=True) if pair[0].requires_grad]
+    torch.autograd.backward(*zip(*pairs, strict=True))
+    return [value.detach() for value in values], {name: tensors[name].grad for name in case.leaves}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_against_float64(device: str, name: str):
+    """Values and every gradient, against autograd through the twin in float64."""
+    case = CASES[name]
+    values, grads = _results(case, ops, case.tensors(device))
+    values64, grads64 = _results(case, plain, case.tensors("cpu", torch.float64))
+    coarse = name == "mlp-fast" and device != "cpu"
+    for i, (value, value64) in enumerate(zip(values, values64, strict=True)):
+        close(value, value64, FAST["value"] if coarse else VALUE, f"result {i}")
+    for leaf, grad64 in grads64.items():
+        close(grads[leaf], grad64, FAST["gradient"] if coarse else GRADIENT, f"gradient of {leaf}")
+    # A gradient that is 0 everywhere would hold anything: it is only where one cell or no smoke leaves nothing to move.
+    assert all(grad.any() for grad in grads64.values()) or name in ("plane-one-cell", "march-no-smoke")
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_against_differences(device: str, name: str):
+    """The derivative along a random direction of each leaf, by central differences of the operation itself."""
+    case = CASES[name]
+    _, grads = _results(case, ops, case.tensors(device))
+    for leaf in case.leaves:
+        size = case.sizes.get(leaf, 1e-2)
+        if size == 0.0:
+            continue
+        along = torch.from_numpy(np.sign(_normal(*case.leaves[leaf].shape, seed=30))).to(device)
+        # A density mustn't be below 0.
+        forward = name == "march-no-smoke" and leaf == "density"
+        if forward:
+            along, size = along.abs(), 2e-4
+
+        def objective(step: float, leaf=leaf, along=along) -> float:
+            tensors = case.tensors(device)
+            with torch.no_grad():
+                tensors[leaf] = tensors[leaf] + step * along
+                values = case.call(ops, tensors)
+            adjoints = [torch.from_numpy(_normal(*value.shape, seed=20 + i)) for i, value in enumerate(values)]
+            return sum(float((v.cpu().double() * a).sum()) for v, a in zip(values, adjoints, strict=True))
+
+        if forward:
+            slope = (4.0 * objective(size) - 3.0 * objective(0.0) - objective(2.0 * size)) / (2.0 * size)
+        else:
+            # Two lengths of the step together leave an error of the fifth order.
+            slope = 8.0 * (objective(size / 2) - objective(-size / 2)) - (objective(size) - objective(-size))
+            slope /= 6.0 * size
+        derivative = float((grads[leaf].double() * along).sum())
+        scale = max(abs(derivative), 0.1 * float(grads[leaf].double().norm()))
+        assert abs(slope - derivative) <= SLOPE * scale, f"{leaf}: {slope:.6g} by differences, {derivative:.6g}"
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_any_strides(name: str):
+    """Tensors that aren't contiguous give the same bits, and gradients of any strides are taken."""
+    case = CASES[name]
+    values, grads = _results(case, ops, case.tensors("cpu"))
+    tensors = case.tensors("cpu")
+    spread = {leaf: torch.stack([t.detach(), t.detach()], -1)[..., 0] for leaf, t in tensors.items()}
+    assert all(t.numel() == 1 or not t.is_contiguous() for t in spread.values())
+    spread = {leaf: t.requires_grad_(leaf in case.leaves) for leaf, t in spread.items()}
+    results = case.call(ops, spread)
+    adjoints = [torch.from_numpy(_normal(*value.shape, seed=20 + i)) for i, value in enumerate(results)]
+    torch.autograd.backward(results, [torch.stack([a, a], -1)[..., 0] for a in adjoints])
+    for value, other in zip(values, results, strict=True):
+        assert torch.equal(value, other)
+    for leaf, grad in grads.items():
+        assert torch.equal(grad, spread[leaf].grad), leaf
+
+
+# Which arguments are cut to nothing together.
+EMPTY = {
+    "bc7_map": (["uv"],),
+    "plane": (["points"],),
+    "volume-periodic-layers": (["points", "layer"],),
+    "triplane": (["points"],),
+    "mlp-fast": (["x"],),
+    "mlp-8": (["x", "hidden", "output"],),
+    "gaussian_sum": (["points"], ["rows"]),
+    "march": (["origin", "direction"], ["toward", "colour"]),
+}
+
+
+@pytest.mark.parametrize("name", EMPTY)
+def test_nothing_in(device: str, name: str):
+    """No points, no networks, no Gaussians, no rays: results of the twin's shape, and gradients of 0."""
+    case = CASES[name]
+    for cut in EMPTY[name]:
+        tensors, tensors64 = case.tensors(device), case.tensors("cpu", torch.float64)
+        for set_ in (tensors, tensors64):
+            for leaf in cut:
+                set_[leaf] = set_[leaf].detach()[:0].requires_grad_(leaf in case.leaves)
+        values, want = case.call(ops, tensors), case.call(plain, tensors64)
+        assert [v.shape for v in values] == [v.shape for v in want]
+        for value, value64 in zip(values, want, strict=True):
+            close(value, value64, VALUE)
+        sum(v.sum() for v in values).backward()
+        if cut != ["rows"] and cut != ["toward", "colour"]:
+            assert not any(tensors[leaf].grad.any() for leaf in case.leaves)
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")], ids=str)
+@pytest.mark.parametrize("name", FIRST.values())
+def test_not_a_number(device: str, name: str, bad: float):
+    """One such number in any tensor is an error of one line that names the tensor."""
+    case = CASES[name]
+    for leaf in (*case.leaves, *case.constants):
+        tensors = {key: value.detach() for key, value in case.tensors(device).items()}
+        if not tensors[leaf].is_floating_point():
+            continue
+        tensors[leaf].view(-1)[-1] = bad
+        with pytest.raises(ValueError, match=rf"^(length of )?{leaf}: expected finite numbers, found ") as error:
+            case.call(ops, tensors)
+        assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("name", FIRST.values())
+def test_wrong_tensors(device: str, name: str):
+    """A wrong type, number of axes or device of any tensor is an error that names it."""
+    case = CASES[name]
+    for leaf in (*case.leaves, *case.constants):
+        if leaf == "layer":
+            continue
+        for change, message in (
+            (lambda t: t.double(), f"{leaf}: expected float32 .*float64"),
+            (lambda t: t.flatten()[:1], f"{leaf}: expected float32 "),
+            (lambda t: t.to("meta"), "expected a tensor on .* meta"),
+        ):
+            tensors = {key: value.detach() for key, value in case.tensors(device).items()}
+            tensors[leaf] = change(tensors[leaf])
+            with pytest.raises(ValueError, match=message) as error:
+                case.call(ops, tensors)
+            assert "\n" not in str(error.value)
+
+
+REFUSED = [
+    ("bc7_map", {"weights": torch.zeros(8, 10)}, "weights: expected sizes in whole blocks of 4 x 4, got (8, 10)"),
+    ("bc7_map", {"endpoints": torch.zeros(2, 2, 2, 4)}, "endpoints: expected float32 [2, 3, 2, 4], got"),
+    ("bc7_map", {"weights": torch.zeros(1, 8, 12)}, "weights: expected float32 [any, any], got"),
+    ("bc7_map", {"uv": torch.zeros(5, 3)}, "uv: expected"),
+    ("bc7_map-layers", {"layer": torch.full((50,), 3)}, "layer: expected numbers from 0 to 2, found 3"),
+    ("bc7_map-layers", {"layer": torch.zeros(50)}, "layer: expected int32 or int64 [50], got torch.float32"),
+    ("plane", {"values": torch.zeros(0, 7, 3)}, "values: expected cells and channels, got (0, 7, 3)"),
+    ("plane-periodic-layers", {"layer": torch.full((60,), -1)}, "layer: expected numbers from 0 to 2, found -1"),
+    ("plane-periodic-layers", {"layer": torch.zeros(59).int()}, "layer: expected int32 or int64 [60], got"),
+    ("volume", {"points": torch.zeros(5, 2)}, "points: expected float32 [5, 3], got torch.float32 (5, 2)"),
+    ("triplane", {"yz": torch.zeros(6, 4, 2)}, "yz: expected float32 [any, any, 3], got"),
+    ("triplane", {"reduce": "mean"}, "reduce: expected one of sum, product, concatenate, got 'mean'"),
+    ("mlp-8", {"gelu": "relu"}, "gelu: expected one of exact, tanh, fast, got 'relu'"),
+    ("mlp-8", {"hidden": torch.zeros(3, 27, 8)}, "hidden: expected float32 [3, 26, 8], got"),
+    ("mlp-8", {"output": torch.zeros(2, 9, 3)}, "output: expected float32 [3, 9, 3], got"),
+    ("mlp-8", {"hidden": torch.zeros(3, 83, 65), "output": torch.zeros(3, 66, 3)}, "hidden: expected 1 to 64 units"),
+    ("gaussian_sum", {"rows": torch.zeros(3, 10)}, "rows: expected more than 10 columns, got 10"),
+    ("gaussian_sum", {"cut": 0.0}, "cut: expected a number above 0, got 0.0"),
+    ("gaussian_sum", {"support": "cube"}, "support: expected one of ellipsoid, sphere, got 'cube'"),
+    ("march", {"density": -torch.ones(6, 7, 8)}, "density: expected numbers from 0 to inf, found -1"),
+    ("march", {"density": torch.zeros(6, 0, 8)}, "density: expected voxels, got (6, 0, 8)"),
+    ("march", {"direction": torch.ones(40, 3)}, "length of direction: expected numbers from 0.999 to 1.001"),
+    ("march", {"direction": torch.ones(39, 3)}, "direction: expected float32 [40, 3], got"),
+    ("march", {"toward": torch.zeros(2, 3)}, "length of toward: expected numbers from 0.999 to 1.001, found 0"),
+    ("march", {"toward": None}, "toward, colour: expected both or neither"),
+    ("march", {"origin": torch.zeros(40, 3).requires_grad_()}, "origin: expected a tensor that requires no gradient"),
+    ("march", {"emission": torch.zeros(6, 7, 8)}, "emission: expected float32 [6, 7, 8, 3], got"),
+    ("march", {"step": 0.0}, "step: expected a number above 0, got 0.0"),
+    ("march", {"g": 1.0}, "g: expected a number within -1 and 1, got 1.0"),
+]
+
+
+@pytest.mark.parametrize(("name", "changes", "message"), REFUSED, ids=[f"{r[0]}-{[*r[1]][0]}" for r in REFUSED])
+def test_refused(name: str, changes: dict, message: str):
+    case = CASES[name]
+    with pytest.raises(ValueError) as error:
+        getattr(ops, case.op)(**{**case.tensors("cpu"), **case.options, **changes})
+    assert str(error.value).startswith(message)
+
+
+@pytest.mark.parametrize("name", [n for n in ops.__all__ if n not in ("plain", "Raster", "bc7_blocks")])
+def test_twins_take_the_same_arguments(name: str):
+    """A reader can put one in the place of the other; culling and what else is drawn are the kernels' alone."""
+    own = inspect.signature(getattr(ops, name)).parameters
+    twin = inspect.signature(getattr(plain, name)).parameters
+    extra = {"cull", "derivative", "coverage"} if name.startswith("rasterize") else set()
+    assert [p for p in own if p not in extra] == [*twin]
+    assert all(own[p].default == twin[p].default for p in twin)
+
+
+def test_names_load_when_they_are_used():
+    """The package itself imports neither torch nor Warp, lists its names, and says which it lacks."""
+    code = "import sys; from wlm import ops; assert not {'torch', 'warp'} & {*sys.modules}; print(*dir(ops))"
+    listed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+    assert {*ops.__all__} <= {*listed}
+    for name in ops.__all__:
+        assert getattr(ops, name).__doc__
+    with pytest.raises(AttributeError, match="no attribute 'perlin'"):
+        _ = ops.perlin

@@ -1,0 +1,44 @@
+"""Integers of a few bits each, packed without a gap."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+__all__ = ["pack_bits", "unpack_bits"]
+
+
+def pack_bits(values: np.ndarray, widths: np.ndarray | Sequence[int]) -> np.ndarray:
+    """Packs integers of given widths, row after row.
+
+    Args:
+        values: [K, C], below 2**16.
+        widths: int [C], bits of each column, 0 to 16.
+
+    Returns:
+        uint8 [ceil(K * sum(widths) / 8)], the lowest bit of each number first.
+
+    Raises:
+        ValueError: A number needs more bits than its column has.
+    """
+    values = np.asarray(values)
+    if values.size and (values.max(0) >> np.asarray(widths)).any():
+        raise ValueError("a number doesn't fit the width of its column")
+    columns = [(values[:, c, None] >> np.arange(width)) & 1 for c, width in enumerate(widths)]
+    return np.packbits(np.concatenate(columns, 1).astype(np.uint8), bitorder="little")
+
+
+def unpack_bits(packed: np.ndarray, widths: np.ndarray | Sequence[int], count: int) -> np.ndarray:
+    """Undoes ``pack_bits`` for ``count`` rows; uint16 [count, C].
+
+    Raises:
+        ValueError: Another number of bytes than so many rows take.
+    """
+    total = int(np.sum(widths))
+    if len(packed) != -(-count * total // 8):
+        raise ValueError(f"{len(packed)} bytes for {count} rows of {total} bits")
+    bits = np.unpackbits(packed, count=count * total, bitorder="little").reshape(count, total).astype(np.uint16)
+    columns = [
+        (bits[:, end - width : end] << np.arange(width, dtype=np.uint16)).sum(1, dtype=np.uint16)
+        for end, width in zip(np.cumsum(widths), widths, strict=True)
+    ]
+    return np.stack(columns, 1)

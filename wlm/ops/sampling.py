@@ -1,0 +1,159 @@
+"""Feature grids sampled linearly: planes, triplanes and volumes, with gradients to their values and to the points.
+
+A coordinate is in [0, 1], the centre of cell i of n at (i + 1/2) / n. Beyond the outermost centres, and so outside
+[0, 1] too, the border goes on, without a slope; a periodic axis goes on with its next period instead.
+
+On CUDA the points of a cell are added to its gradient in any order, so that the last bits change from run to run.
+"""
+
+import torch
+import warp as wp
+from torch.autograd.function import once_differentiable
+
+from wlm.interop import to_warp
+from wlm.ops.tensors import check, check_finite, check_index, on_stream, optional_array, zeros_for
+from wlm_kernels import interpolate
+
+__all__ = ["plane", "triplane", "volume"]
+
+REDUCTIONS = ("sum", "product", "concatenate")
+
+
+def plane(
+    values: torch.Tensor, points: torch.Tensor, *, layer: torch.Tensor | None = None, periodic: bool = False
+) -> torch.Tensor:
+    """Samples a plane of features bilinearly; ``plain.plane`` is the twin.
+
+    Args:
+        values: float [H, W, C], or [L, H, W, C] with ``layer``; with a gradient.
+        points: float [..., 2], u along the width, v along the height (the time, in a lightmap's planes;
+            neural-dynamic-gi, eq. 5). With a gradient: the slope between the cells that a point lies between.
+        layer: int32 or int64 [...], 0 to L - 1: the plane of each point.
+        periodic: Whether v wraps round: row 0 is the neighbour of row H - 1.
+
+    Returns:
+        float [..., C].
+
+    Raises:
+        ValueError: A tensor's shape, type or device doesn't fit, or a number isn't finite or in range. Finding that
+            out waits for the GPU; while a CUDA graph is captured it isn't looked for.
+    """
+    return sample(values, points, layer, periodic, axes=2)
+
+
+def volume(
+    values: torch.Tensor, points: torch.Tensor, *, layer: torch.Tensor | None = None, periodic: bool = False
+) -> torch.Tensor:
+    """Samples a volume of features trilinearly; ``plain.volume`` is the twin.
+
+    Args:
+        values: float [D, H, W, C], or [L, D, H, W, C] with ``layer``; with a gradient.
+        points: float [..., 3], u along the width, v along the height, w along the depth; with a gradient.
+        layer: int32 or int64 [...], 0 to L - 1: the volume of each point.
+        periodic: Whether w wraps round.
+
+    Returns:
+        float [..., C].
+
+    Raises:
+        ValueError: As for ``plane``.
+    """
+    return sample(values, points, layer, periodic, axes=3)
+
+
+def triplane(
+    xy: torch.Tensor, xz: torch.Tensor, yz: torch.Tensor, points: torch.Tensor, *, reduce: str = "sum"
+) -> torch.Tensor:
+    """Samples three planes at the projections of points in space; ``plain.triplane`` is the twin.
+
+    Args:
+        xy: float [H, W, C], u is x and v is y (Chan et al., "Efficient Geometry-aware 3D Generative Adversarial
+            Networks", section 3.2); with a gradient, as all of these.
+        xz: float [H', W', C], u is x and v is z.
+        yz: float [H'', W'', C], u is y and v is z.
+        points: float [..., 3], x, y, z in [0, 1].
+        reduce: How the three are joined: "sum"; "product" (Fridovich-Keil et al., "K-Planes", eq. 1); or
+            "concatenate", in the order of the arguments, where each plane may have a C of its own.
+
+    Returns:
+        float [..., C], or [..., the sum of the three C].
+
+    Raises:
+        ValueError: As for ``plane``, or there is no such reduction.
+    """
+    if reduce not in REDUCTIONS:
+        raise ValueError(f"reduce: expected one of {', '.join(REDUCTIONS)}, got {reduce!r}")
+    check("xy", xy, (None, None, None))
+    channels = None if reduce == "concatenate" else xy.shape[2]
+    check("xz", xz, (None, None, channels), xy.device)
+    check("yz", yz, (None, None, channels), xy.device)
+    check("points", points, (*points.shape[:-1], 3), xy.device)
+    x, y, z = points.unbind(-1)
+    # The adjoint of a stack of columns is cheaper than that of a choice by index.
+    projections = {"xy": (xy, x, y), "xz": (xz, x, z), "yz": (yz, y, z)}
+    parts = [
+        sample(values, torch.stack(at, -1), axes=2, names=(name, "points"))
+        for name, (values, *at) in projections.items()
+    ]
+    if reduce == "concatenate":
+        return torch.cat(parts, -1)
+    return parts[0] * parts[1] * parts[2] if reduce == "product" else parts[0] + parts[1] + parts[2]
+
+
+def sample(
+    values: torch.Tensor,
+    points: torch.Tensor,
+    layer: torch.Tensor | None = None,
+    periodic: bool = False,
+    *,
+    axes: int,
+    names: tuple[str, str] = ("values", "points"),
+) -> torch.Tensor:
+    """``plane`` for 2 axes, ``volume`` for 3; ``names`` are what messages call the values and the points."""
+    check(names[0], values, (None,) * (axes + 1 if layer is None else axes + 2))
+    if 0 in values.shape:
+        raise ValueError(f"{names[0]}: expected cells and channels, got {tuple(values.shape)}")
+    check(names[1], points, (*points.shape[:-1], axes), values.device)
+    check_finite(**dict(zip(names, (values, points), strict=True)))
+    shape = points.shape[:-1]
+    if layer is None:
+        layer = torch.empty(0, dtype=torch.int32, device=values.device)
+    else:
+        check_index("layer", layer, len(values), tuple(shape), values.device)
+    times, width, channels = values.shape[-axes - 1], values.shape[-2], values.shape[-1]
+    height = values.shape[-3] if axes == 3 else 1
+    # Warp arrays have at most four dimensions: layers stand one behind the other.
+    joined = values.reshape(-1, height, width, channels)
+    sampled = _Sample.apply(joined, times, layer.reshape(-1).to(torch.int32), points.reshape(-1, axes), periodic)
+    return sampled.reshape(*shape, channels)
+
+
+class _Sample(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, values, times, layer, points, periodic):
+        out = values.new_empty(len(points), values.shape[3])
+        with on_stream(values.device):
+            arrays = to_warp(values), times, to_warp(layer), to_warp(points)
+            interpolate.sample(*arrays, to_warp(out), periodic)
+        ctx.save_for_backward(values, layer, points)
+        ctx.times, ctx.periodic = times, periodic
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, grad_out):
+        values, layer, points = ctx.saved_tensors
+        on_values = zeros_for(values, ctx.needs_input_grad[0])
+        on_points = zeros_for(points, ctx.needs_input_grad[3])
+        with on_stream(values.device):
+            interpolate.sample_backward(
+                to_warp(values),
+                ctx.times,
+                to_warp(layer),
+                to_warp(points),
+                to_warp(grad_out),
+                optional_array(on_values, 4, wp.float32, values.device),
+                optional_array(on_points, 2, wp.float32, values.device),
+                ctx.periodic,
+            )
+        return on_values, None, None, on_points, None

@@ -1,0 +1,20 @@
+"""Bodies of native functions: CUDA C++ in files of its own, in the folder ``native`` beside the kernels that use it."""
+
+from importlib import resources
+
+__all__ = ["native_source"]
+
+
+def native_source(package: str, name: str, **constants: int) -> str:
+    """Reads the body of a native function for ``wp.func_native``, or a part of one.
+
+    Args:
+        package: The package whose folder ``native`` has the file ``NAME.cuh``: ``__package__`` of the kernels.
+        name: See ``package``.
+        constants: Integers that the code uses, by name.
+
+    Returns:
+        The constants' declarations and the file.
+    """
+    declarations = (f"constexpr int {key} = {value};\n" for key, value in constants.items())
+    return "".join(declarations) + (resources.files(package) / "native" / f"{name}.cuh").read_text(encoding="utf-8")

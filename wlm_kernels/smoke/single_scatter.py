@@ -1,0 +1,336 @@
+"""Single scattering, emission and optical depth along any rays through a density grid, and their adjoints.
+
+Units, sampling and steps are those of ``march``; the density is the extinction per voxel. Along a ray of steps h, with
+x_n = sigma(p_n) h and T_n = exp(-x_0 - ... - x_(n-1)) (neural-six-way-lightmaps, eq. 1 to 3),
+
+    scattered of light l    sum_n T_n (1 - exp(-x_n)) exp(-tau_l(p_n))        without phase function and colour
+    emitted                 sum_n T_n (1 - exp(-x_n)) / x_n h e(p_n)
+    depth                   sum_n x_n
+
+where tau_l, the optical depth from a point to a light, is marched to from the nodes of a lattice that all rays share,
+and is linear between them. All is exact in its derivatives: steps depend on the geometry alone, and a ray ends early
+only where float32 has nothing left of it. ``wlm.ops.plain.march`` is the same in torch.
+
+Adjoints run from a ray's end to its start, so that what a sample hides is a running sum. They add to the density, the
+emission and the nodes by atomics: on CUDA in any order, so that the last bits change from run to run.
+"""
+
+from typing import Any
+
+import warp as wp
+
+from wlm_kernels.smoke.march import absorbed, node_position, size_of, steps_along
+
+__all__ = ["depths", "depths_backward", "march", "march_backward"]
+
+wp.set_module_options({"enable_backward": False})
+
+# A length that is a whole number of steps mustn't be cut into one more by rounding.
+_SLACK = 1.0001
+
+# exp(-104) is 0 in float32. Depths end there: the adjoint subtracts what was added, and a sum of thousands, of which
+# nothing is seen, would leave it no digits of what is.
+_OPAQUE = wp.constant(104.0)
+
+
+@wp.struct
+class _Cell:
+    """The eight values that a point lies between; the weights of those outside the grid are 0."""
+
+    low: wp.vec3i
+    high: wp.vec3i
+    low_weight: wp.vec3
+    high_weight: wp.vec3
+
+
+@wp.func
+def _cell(q: wp.vec3, counts: wp.vec3i) -> _Cell:
+    """Where ``q`` lies, in units of the grid, whose value i is at i."""
+    cell = _Cell()
+    for axis in range(3):
+        i = int(wp.floor(q[axis]))
+        f = q[axis] - float(i)
+        n = counts[axis]
+        cell.low[axis] = wp.clamp(i, 0, n - 1)
+        cell.high[axis] = wp.clamp(i + 1, 0, n - 1)
+        cell.low_weight[axis] = wp.where(i >= 0 and i < n, 1.0 - f, 0.0)
+        cell.high_weight[axis] = wp.where(i >= -1 and i < n - 1, f, 0.0)
+    return cell
+
+
+@wp.func
+def _counts(grid: wp.array3d[Any]) -> wp.vec3i:
+    return wp.vec3i(grid.shape[0], grid.shape[1], grid.shape[2])
+
+
+@wp.func
+def _voxel(density: wp.array3d[Any], p: wp.vec3) -> _Cell:
+    return _cell(p - wp.vec3(0.5, 0.5, 0.5), _counts(density))
+
+
+@wp.func
+def _node(nodes: wp.array3d[float], size: wp.vec3, p: wp.vec3) -> _Cell:
+    n = _counts(nodes)
+    first = p + wp.vec3(0.5, 0.5, 0.5)
+    q = wp.vec3(
+        first[0] * float(n[0] - 1) / (size[0] + 1.0),
+        first[1] * float(n[1] - 1) / (size[1] + 1.0),
+        first[2] * float(n[2] - 1) / (size[2] + 1.0),
+    )
+    return _cell(q, n)
+
+
+@wp.func
+def _corner(cell: _Cell, corner: int) -> wp.vec3i:
+    return wp.vec3i(
+        wp.where((corner & 4) == 0, cell.low[0], cell.high[0]),
+        wp.where((corner & 2) == 0, cell.low[1], cell.high[1]),
+        wp.where((corner & 1) == 0, cell.low[2], cell.high[2]),
+    )
+
+
+@wp.func
+def _weight(cell: _Cell, corner: int) -> float:
+    x = wp.where((corner & 4) == 0, cell.low_weight[0], cell.high_weight[0])
+    y = wp.where((corner & 2) == 0, cell.low_weight[1], cell.high_weight[1])
+    z = wp.where((corner & 1) == 0, cell.low_weight[2], cell.high_weight[2])
+    return x * y * z
+
+
+@wp.func
+def _read(grid: wp.array3d[Any], cell: _Cell):
+    value = _weight(cell, 0) * grid[cell.low[0], cell.low[1], cell.low[2]]
+    for corner in range(1, 8):
+        i = _corner(cell, corner)
+        value += _weight(cell, corner) * grid[i[0], i[1], i[2]]
+    return value
+
+
+@wp.func
+def _add(grad: wp.array3d[Any], cell: _Cell, g: Any):
+    for corner in range(8):
+        w = _weight(cell, corner)
+        if w != 0.0:
+            i = _corner(cell, corner)
+            wp.atomic_add(grad, i[0], i[1], i[2], w * g)
+
+
+@wp.func
+def _share(x: float) -> float:
+    """(1 - exp(-x)) / x."""
+    return wp.where(x > 0.0, absorbed(x) / x, 1.0)
+
+
+@wp.func
+def _share_slope(x: float) -> float:
+    """The derivative of ``_share``, without cancellation where x is small."""
+    if x < 0.05:
+        return -0.5 + x * (1.0 / 3.0 - x * (0.125 - x * (1.0 / 30.0 - x / 144.0)))
+    return (wp.exp(-x) - absorbed(x) / x) / x
+
+
+@wp.kernel
+def _depths(
+    # in:
+    density: wp.array3d[float],
+    toward: wp.array1d[wp.vec3],
+    step: float,
+    # out:
+    nodes: wp.array4d[float],
+):
+    light, a, b, c = wp.tid()
+    size = size_of(density)
+    p = node_position(nodes[light], size, a, b, c)
+    steps = steps_along(size, p, toward[light], step)
+    tau = float(0.0)
+    for n in range(steps.count):
+        s = steps.first + (float(n) + 0.5) * steps.length
+        tau += _read(density, _voxel(density, p + s * toward[light]))
+    nodes[light, a, b, c] = tau * steps.length
+
+
+@wp.kernel
+def _depths_backward(
+    # in:
+    toward: wp.array1d[wp.vec3],
+    step: float,
+    grad_nodes: wp.array4d[float],
+    # out:
+    grad_density: wp.array3d[float],
+):
+    light, a, b, c = wp.tid()
+    g = grad_nodes[light, a, b, c]
+    if g != 0.0:
+        size = size_of(grad_density)
+        p = node_position(grad_nodes[light], size, a, b, c)
+        steps = steps_along(size, p, toward[light], step)
+        for n in range(steps.count):
+            s = steps.first + (float(n) + 0.5) * steps.length
+            _add(grad_density, _voxel(grad_density, p + s * toward[light]), g * steps.length)
+
+
+@wp.kernel
+def _march(
+    # in:
+    density: wp.array3d[float],
+    emission: wp.array3d[wp.vec3],
+    nodes: wp.array4d[float],
+    origin: wp.array1d[wp.vec3],
+    direction: wp.array1d[wp.vec3],
+    step: float,
+    # out:
+    scattered: wp.array2d[float],
+    emitted: wp.array1d[wp.vec3],
+    depth: wp.array1d[float],
+    count: wp.array1d[int],
+):
+    r = wp.tid()
+    size = size_of(density)
+    steps = steps_along(size, origin[r], direction[r], step)
+    for light in range(nodes.shape[0]):
+        scattered[r, light] = 0.0
+    glow = wp.vec3()
+    tau = float(0.0)
+    n = int(0)
+    while n < steps.count and tau < _OPAQUE:
+        p = origin[r] + (steps.first + (float(n) + 0.5) * steps.length) * direction[r]
+        voxel = _voxel(density, p)
+        x = _read(density, voxel) * steps.length
+        t = wp.exp(-tau)
+        if emission.shape[0] > 0:
+            glow += t * _share(x) * steps.length * _read(emission, voxel)
+        if nodes.shape[0] > 0 and x > 0.0:
+            node = _node(nodes[0], size, p)
+            for light in range(nodes.shape[0]):
+                scattered[r, light] += t * absorbed(x) * wp.exp(-_read(nodes[light], node))
+        tau += wp.min(x, _OPAQUE)
+        n += 1
+    emitted[r] = glow
+    depth[r] = tau
+    count[r] = n
+
+
+@wp.kernel
+def _march_backward(
+    # in:
+    density: wp.array3d[float],
+    emission: wp.array3d[wp.vec3],
+    nodes: wp.array4d[float],
+    origin: wp.array1d[wp.vec3],
+    direction: wp.array1d[wp.vec3],
+    step: float,
+    depth: wp.array1d[float],
+    count: wp.array1d[int],
+    grad_scattered: wp.array2d[float],
+    grad_emitted: wp.array1d[wp.vec3],
+    grad_depth: wp.array1d[float],
+    # out:
+    grad_density: wp.array3d[float],
+    grad_emission: wp.array3d[wp.vec3],
+    grad_nodes: wp.array4d[float],
+):
+    r = wp.tid()
+    size = size_of(density)
+    steps = steps_along(size, origin[r], direction[r], step)
+    tau = depth[r]
+    hidden = float(0.0)  # the objective's share that comes from behind the sample
+    for back in range(count[r]):
+        n = count[r] - 1 - back
+        p = origin[r] + (steps.first + (float(n) + 0.5) * steps.length) * direction[r]
+        voxel = _voxel(density, p)
+        x = _read(density, voxel) * steps.length
+        tau -= wp.min(x, _OPAQUE)
+        t = wp.exp(-tau)
+        lit = float(0.0)
+        if nodes.shape[0] > 0:
+            node = _node(nodes[0], size, p)
+            for light in range(nodes.shape[0]):
+                share = grad_scattered[r, light] * wp.exp(-_read(nodes[light], node))
+                lit += share
+                if x > 0.0:
+                    _add(grad_nodes[light], node, -t * absorbed(x) * share)
+        glow = float(0.0)
+        if emission.shape[0] > 0:
+            glow = steps.length * wp.dot(_read(emission, voxel), grad_emitted[r])
+            if grad_emission.shape[0] > 0:
+                _add(grad_emission, voxel, t * _share(x) * steps.length * grad_emitted[r])
+        on_x = t * (wp.exp(-x) * lit + _share_slope(x) * glow) - hidden + grad_depth[r]
+        _add(grad_density, voxel, on_x * steps.length)
+        hidden += t * (absorbed(x) * lit + _share(x) * glow)
+
+
+def depths(density, toward, step: float, nodes) -> None:
+    """Optical depths towards lights on a lattice.
+
+    Args:
+        density: float [X, Y, Z], extinction per voxel, at least 0.
+        toward: vec3 [L], the directions to the lights, of length 1.
+        step: The longest step, in voxels.
+        nodes: float [L, A, B, C], written; ``march.nodes_along`` has the number of nodes, ``march.node_position`` their
+            places.
+    """
+    inputs = [density, toward, step * _SLACK]
+    wp.launch(_depths, nodes.shape, inputs=inputs, outputs=[nodes], device=density.device)
+
+
+def depths_backward(toward, step: float, grad_nodes, grad_density) -> None:
+    """The adjoint of ``depths``.
+
+    Args:
+        toward, step: As for ``depths``.
+        grad_nodes: float [L, A, B, C].
+        grad_density: float [X, Y, Z], added to.
+    """
+    inputs = [toward, step * _SLACK, grad_nodes]
+    wp.launch(_depths_backward, grad_nodes.shape, inputs=inputs, outputs=[grad_density], device=grad_density.device)
+
+
+def march(density, emission, nodes, origin, direction, step: float, scattered, emitted, depth, count) -> None:
+    """What comes along rays from lights of colour 1, with a phase function of 1.
+
+    Args:
+        density: float [X, Y, Z], extinction per voxel, at least 0.
+        emission: vec3 [X, Y, Z], light given off per voxel of way; of shape [0, 0, 0]: nothing emits.
+        nodes: float [L, A, B, C] from ``depths``; L may be 0.
+        origin, direction: vec3 [R], in voxels; directions of length 1.
+        step: The longest step, in voxels.
+        scattered: float [R, L], written.
+        emitted: vec3 [R], written.
+        depth: float [R], written: the optical depth along each ray, as far as light gets through.
+        count: int [R], written: the samples of each ray, as far as light gets through.
+    """
+    inputs = [density, emission, nodes, origin, direction, step * _SLACK]
+    wp.launch(_march, origin.shape, inputs=inputs, outputs=[scattered, emitted, depth, count], device=density.device)
+
+
+def march_backward(
+    density,
+    emission,
+    nodes,
+    origin,
+    direction,
+    step: float,
+    depth,
+    count,
+    grad_scattered,
+    grad_emitted,
+    grad_depth,
+    grad_density,
+    grad_emission,
+    grad_nodes,
+) -> None:
+    """The adjoint of ``march``; the density's share by way of the nodes is that of ``depths_backward``.
+
+    Args:
+        density, emission, nodes, origin, direction, step, depth, count: As for ``march``, and as it wrote them.
+        grad_scattered: float [R, L].
+        grad_emitted: vec3 [R].
+        grad_depth: float [R].
+        grad_density: float [X, Y, Z], added to.
+        grad_emission: vec3 [X, Y, Z], added to; of shape [0, 0, 0]: not computed.
+        grad_nodes: float [L, A, B, C], added to.
+    """
+    inputs = [density, emission, nodes, origin, direction, step * _SLACK, depth, count]
+    inputs += [grad_scattered, grad_emitted, grad_depth]
+    outputs = [grad_density, grad_emission, grad_nodes]
+    wp.launch(_march_backward, origin.shape, inputs=inputs, outputs=outputs, device=density.device)
