@@ -1,21 +1,9 @@
-"""What the systems are compared with. Block codecs need the extra `baselines`."""
+"""What the systems are compared with, one module a system. Block codecs need the extra `baselines`.
 
-from wlm.baselines.blocks import (
-    BASELINES,
-    BlockResult,
-    encode_8bit,
-    encode_astc,
-    encode_bc6h,
-    encode_bc7,
-    run_baselines,
-)
+Each module has the same verbs: ``RIVALS``, the methods by name, each of which makes a ``Rival``; and
+``evaluate_rivals``, which scores rivals by the system's own evaluation. No system knows of them.
+"""
 
-__all__ = [
-    "BASELINES",
-    "BlockResult",
-    "encode_8bit",
-    "encode_astc",
-    "encode_bc6h",
-    "encode_bc7",
-    "run_baselines",
-]
+from wlm.baselines.rival import Rival
+
+__all__ = ["Rival"]

@@ -1,70 +1,50 @@
-"""What the network's lightmaps are compared with: a coarse march of all six, and a flip book baked from one side."""
+"""What the network's lightmaps are compared with: a flip book that was baked from one side."""
 
 from __future__ import annotations
 
 import numpy as np
 import torch
 
-from wlm.fluid.volume import DensityVolume
-from wlm.smoke.baking import bake
 from wlm.smoke.camera import Camera
 from wlm.smoke.lightmaps import SixWay
 
-__all__ = ["billboard", "direct"]
+__all__ = ["billboard"]
 
 
-def direct(volume: DensityVolume, camera: Camera, step: float, *, g: float = 0.0) -> SixWay:
-    """The lightmaps themselves in large steps: what else the time that a network takes could be spent on.
-
-    The reference's own integral, without its error. Along rays the time falls with the step; to the sides no step is
-    longer than a pixel, which is marched through anyway.
-
-    Args:
-        volume: The smoke.
-        camera: Orthographic.
-        step: The longest step, in voxels; the guiding map's is 10.
-        g: Henyey and Greenstein's mean cosine, within -1 and 1.
-
-    Raises:
-        ValueError: A setting is out of its range, or the camera is in perspective.
-    """
-    return bake(volume, camera, step=step, g=g, estimate=False)
-
-
-def billboard(baked: SixWay, seen: Camera, camera: Camera, pivot: np.ndarray) -> SixWay:
-    """Lightmaps baked from one side, on a billboard that turns to the camera: a flip book seen from elsewhere.
+def billboard(baked: SixWay, source: Camera, camera: Camera, pivot: np.ndarray) -> SixWay:
+    """Shows lightmaps that were baked from one side on a billboard that turns to the camera, as a flip book does.
 
     The billboard stands at the pivot and always faces the camera, so that a turn about the pivot changes nothing but
-    which way its axes point: the smoke keeps the look of the side that was baked. Lights are weighed in the axes of the
-    new camera, as engines do.
+    the directions of its axes: the smoke keeps the look of the side that was baked. Lights are weighted in the axes of
+    the new camera, as engines do.
 
     Args:
-        baked: From `seen`.
-        seen: Orthographic.
-        camera: Orthographic, from where it is looked at.
+        baked: From ``source``.
+        source: Orthographic.
+        camera: Orthographic, from where the billboard is seen.
         pivot: [3], the point of the world about which the billboard turns: the smoke's centre.
 
     Returns:
-        Lightmaps for `camera`; transparent beyond what was baked.
+        Lightmaps for ``camera``; transparent beyond what was baked.
 
     Raises:
-        ValueError: A camera is in perspective, or the lightmaps aren't those of `seen`.
+        ValueError: A camera is in perspective, or the lightmaps aren't those of ``source``.
     """
-    if seen.perspective or camera.perspective:
+    if source.perspective or camera.perspective:
         raise ValueError("a billboard needs orthographic cameras, as the lightmaps do")
-    if tuple(baked.lightmaps.shape[1:]) != (seen.height, seen.width):
-        raise ValueError(f"baked: expected {seen.height} x {seen.width}, got {tuple(baked.lightmaps.shape[1:])}")
+    if tuple(baked.lightmaps.shape[1:]) != (source.height, source.width):
+        raise ValueError(f"baked: expected {source.height} x {source.width}, got {tuple(baked.lightmaps.shape[1:])}")
     if baked.transparency is None:
         raise ValueError("baked: expected lightmaps with their transparency")
     planes = [baked.lightmaps, 1.0 - baked.transparency[None]]
     if baked.emission is not None:
         planes.append(baked.emission[None])
     # Where the new image's pixels lie about the pivot, and what pixel of the baked one lies there.
-    (x, y), (x0, y0) = _offset(camera, pivot), _offset(seen, pivot)
+    (x, y), (x0, y0) = _offset(camera, pivot), _offset(source, pivot)
     columns = (np.arange(camera.width) + 0.5 - 0.5 * camera.width) * camera.pitch - x + x0
     rows = (np.arange(camera.height) + 0.5 - 0.5 * camera.height) * camera.pitch + y - y0
-    u = torch.tensor(columns / (0.5 * seen.width * seen.pitch), dtype=torch.float32)
-    v = torch.tensor(rows / (0.5 * seen.height * seen.pitch), dtype=torch.float32)
+    u = torch.tensor(columns / (0.5 * source.width * source.pitch), dtype=torch.float32)
+    v = torch.tensor(rows / (0.5 * source.height * source.pitch), dtype=torch.float32)
     grid = torch.stack(torch.broadcast_tensors(u[None, :], v[:, None]), -1)[None].to(baked.lightmaps.device)
     read = torch.nn.functional.grid_sample(torch.cat(planes)[None], grid, align_corners=False)[0]
     return SixWay(read[:6], 1.0 - read[6], read[7] if baked.emission is not None else None, camera)

@@ -13,6 +13,7 @@ __all__ = [
     "export",
     "from_arrays",
     "load",
+    "open_checkpoint",
 ]
 
 __getattr__, __dir__ = facade(
@@ -28,5 +29,6 @@ __getattr__, __dir__ = facade(
         "export": "wlm.lightmap.exporter",
         "from_arrays": "wlm.lightmap.data",
         "load": "wlm.lightmap.data",
+        "open_checkpoint": "wlm.lightmap.fit",
     },
 )
