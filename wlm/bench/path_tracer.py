@@ -144,10 +144,10 @@ class PathTracer:
             Lightmaps float32 [6, H, W] as those of `SixWay`, and the transparency [H, W], which is noisy too.
         """
         # Each is a copy on the CPU, which waits for the device.
-        images = np.stack([self._trace(direction, samples, seed) for direction in VECTORS])
+        images = np.stack([self.trace(direction, samples, seed) for direction in VECTORS])
         return images[..., 0], 1.0 - images[..., 3].mean(0)
 
-    def _trace(self, direction: np.ndarray, samples: int, seed: int) -> np.ndarray:
+    def trace(self, direction: np.ndarray, samples: int, seed: int = 0) -> np.ndarray:
         """RGBA float32 [H, W, 4] under one light of irradiance 4 pi; its direction [3] is in the camera's axes."""
         light = {
             "type": "directional",
