@@ -10,17 +10,18 @@ from builders.smoke_samples import small_pool
 from typer.testing import CliRunner
 
 import wlm.bench.smoke_ablation as bench
+from wlm.baselines.smoke import coarse
 from wlm.bench import Row, read_json, tables, write_json
 from wlm.bench.runner import Bench
 from wlm.bench.smoke_ablation import FULL, QUICK, AblationSizes, run, run_rows, variants
 from wlm.errors import WlmError
-from wlm.smoke.evaluation import coarse, compare, evaluate
-from wlm.smoke.fit import NetworkProfile
+from wlm.smoke.evaluation import Score, of_network, score
 from wlm.smoke.learn.dataset import make_validation
 from wlm.smoke.learn.trainer import Trainer, plan_round
+from wlm.smoke.model import Profile
 
 SIZES = AblationSizes(dataset={"resolution": 32}, validation={"frames": 2}, rounds=2, steps=5)
-BASE = NetworkProfile(
+BASE = Profile(
     name="tiny",
     network={"guide": "six", "width": 8, "levels": 3, "stem": 2},
     training={"batch": 4, "warmup": 0, "crop": 64, "losses": {"temporal": 0.02}},
@@ -84,7 +85,7 @@ def test_variants_are_what_they_say():
 
 
 def test_what_a_profile_is_already_is_left_out(requests, no_package):
-    least = NetworkProfile(
+    least = Profile(
         name="least",
         network={"guide": "paper", "width": 8, "levels": 2, "adapters": False, "depth": False},
         training={"batch": 2, "losses": {"mse": 0.0, "temporal": 1.0, "srgb": False}},
@@ -167,11 +168,11 @@ def test_a_row_is_of_a_network_that_has_learned(requests, device):
     settings = BASE.training.model_copy(update={"rounds": 2, "steps": 5, "crop": None})
     trainer = Trainer(BASE.network, settings, seed=0, device=device)
     validation = small_pool(2, 12, 32, "six").to(device)
-    before = evaluate(trainer.average, validation)
+    before = score(of_network(trainer.average), validation)
     for i in range(2):
         pool = small_pool(4, 4 * i, 32, "six").to(device)
         trainer.run(pool, plan_round(settings, pool, seed=0, round=i))
-    after = evaluate(trainer.average, validation)
+    after = score(of_network(trainer.average), validation)
     assert base["psnr"] == pytest.approx(after.psnr, abs=1e-6 if device == "cpu" else 1e-3)
     assert abs(after.psnr - before.psnr) > 0.01
     sides = [base[f"{side}_psnr"] for side in ("right", "left")]
@@ -201,7 +202,7 @@ def test_simulated_smoke():
     settings = BASE.dataset.model_copy(update=dict(QUICK.dataset) | dict(QUICK.validation))
     pool = make_validation(settings)
     assert len(pool) >= 2
-    assert row["psnr"] == pytest.approx(compare({"": coarse}, pool)[""].psnr)
+    assert row["psnr"] == pytest.approx(score(coarse, pool).psnr)
     assert tables([row]).count("| coarse march |") == 1
 
 
@@ -227,7 +228,7 @@ def test_full_sizes_are_what_samples_and_trainings_get(requests, monkeypatch):
         return Trainer(BASE.network, BASE.training, seed=0, device=device).average, 0, 1.0, 1.0
 
     monkeypatch.setattr(bench, "_train", train)
-    monkeypatch.setattr(bench, "evaluate", lambda network, pool: evaluate(network, small_pool(2, 12, 32, "six")))
+    monkeypatch.setattr(bench, "score", lambda method, pool: score(method, small_pool(2, 12, 32, "six")))
     for name in ("16", "24", "32", "fast", "paper"):
         trained.clear()
         assert len(run(name, quick=False, device="cpu")) == len(trained) + 1 >= 10
@@ -258,6 +259,4 @@ def test_the_command(monkeypatch, tmp_path):
 
 
 def _evaluation():
-    from wlm.smoke.evaluation import Evaluation
-
-    return Evaluation(31.0, 30.0, 32.0, (31.0,) * 8, 0.1, 0.1)
+    return Score(31.0, 30.0, 32.0, (31.0,) * 8, 0.1, 0.1)

@@ -16,10 +16,10 @@ from wlm.bench.smoke_network_setup import QUICK, NetworkBench, Subject, open_sub
 from wlm.config import profile_names
 from wlm.errors import WlmError
 from wlm.smoke.baking import bake
-from wlm.smoke.codec import save_network, shipped
-from wlm.smoke.learn.dataset import DatasetSettings
+from wlm.smoke.codec import shipped
+from wlm.smoke.learn.settings import DatasetSettings
 from wlm.smoke.learn.synthetic import make_plume
-from wlm.smoke.model import NetworkSettings, SixWayNetwork
+from wlm.smoke.model import NetworkSettings, SixWayNetwork, SmokeModel
 from wlm.smoke.scene import CameraSettings, make_camera
 
 TINY = replace(
@@ -47,7 +47,7 @@ def network(tmp_path_factory):
     """A file with a network that is as it begins: its outputs are the guide's own planes."""
     path = tmp_path_factory.mktemp("networks") / "young.safetensors"
     torch.manual_seed(1)
-    save_network(path, SixWayNetwork(NETWORK), {"dataset": SETTINGS.model_dump(mode="json")})
+    SmokeModel(SixWayNetwork(NETWORK), {"dataset": SETTINGS.model_dump(mode="json")}).save(path)
     return path
 
 
@@ -56,7 +56,7 @@ def rows(network):
     """Without a path tracer, whether there is one or not."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(rivals, "has_tracer", lambda: False)
-        untrained = Subject("raw", SixWayNetwork(NETWORK), SETTINGS, False)
+        untrained = Subject("raw", SmokeModel(SixWayNetwork(NETWORK), {}), SETTINGS, False)
         return run_rows(TINY, [*open_subjects([network], []), untrained], device="cpu")
 
 
@@ -137,13 +137,13 @@ def test_networks_are_named_and_read(network, tmp_path):
     (subject,) = open_subjects([network], [])
     assert subject.name == "young" and subject.trained and subject.settings == SETTINGS
     (raw,) = open_subjects([], ["16"])
-    assert raw.name == "network-16 untrained" and not raw.trained and raw.network.settings.width == 16
+    assert raw.name == "network-16 untrained" and not raw.trained and raw.model.settings.width == 16
     with pytest.raises(WlmError, match="got young 2 times"):
         open_subjects([network, network], [])
     with pytest.raises(WlmError, match="nosuch"):
         open_subjects([], ["nosuch"])
     path = tmp_path / "bare.safetensors"
-    save_network(path, SixWayNetwork(NETWORK), {})
+    SmokeModel(SixWayNetwork(NETWORK), {}).save(path)
     with pytest.raises(WlmError, match="summary.dataset"):
         open_subjects([path], [])
 

@@ -10,8 +10,9 @@ from reference.marching import trilinear
 
 from wlm.fluid.volume import from_array
 from wlm.smoke.baking import bake
-from wlm.smoke.learn.dataset import DatasetSettings, make_validation
+from wlm.smoke.learn.dataset import make_validation
 from wlm.smoke.learn.losses import warp
+from wlm.smoke.learn.settings import DatasetSettings
 from wlm.smoke.motion import motion
 from wlm.smoke.planes import OPACITY_PLANE
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from builders.smoke_plumes import plume
-from builders.smoke_samples import seen, small_pool
+from builders.smoke_samples import view_of
 
 from wlm.smoke.baking import bake
 from wlm.smoke.camera import Camera
@@ -17,7 +17,6 @@ from wlm.smoke.planes import (
     GUIDES,
     OPACITY_PLANE,
     PLANES,
-    Pool,
     decode_lightmaps,
     encode_guide,
     encode_lightmaps,
@@ -56,7 +55,7 @@ def test_span_is_of_the_ball_around_the_box_for_all_turns():
 
 def test_a_guide_is_zero_where_there_is_no_smoke_and_nearest_is_one(device):
     volume = plume(device=device)
-    camera = seen(volume)
+    camera = view_of(volume)
     near, far = span(volume, camera)
     encoded = encode_guide(guide(volume, camera, March(2.0)).maps, near, far)
     empty = encoded[1] == 0
@@ -77,7 +76,7 @@ STILL = replace(MARCH, jitter=0.0)  # the paper's march and ours shift their sam
 def test_a_guide_of_each_kind(device, kind):
     """Its planes are as many as named, 0 where there is no smoke, and those that all share are the same."""
     volume = plume(hot=True, device=device)
-    camera = seen(volume)
+    camera = view_of(volume)
     planes = render_guide(volume, camera, kind, STILL)
     assert planes.shape == (len(GUIDES[kind]), 32, 32) and torch.isfinite(planes).all()
     opacity, depth = planes[-2:]
@@ -91,7 +90,7 @@ def test_a_guide_of_each_kind(device, kind):
 
 def test_the_light_of_a_kind_is_the_sum_of_its_lights(device):
     volume = plume(device=device)
-    camera = seen(volume)
+    camera = view_of(volume)
     found = {kind: render_guide(volume, camera, kind, replace(STILL, step=1.0)) for kind in GUIDES}
     six = dict(zip(GUIDES["six"], from_srgb(found["six"]), strict=True))
     for kind, names in {
@@ -106,7 +105,7 @@ def test_the_light_of_a_kind_is_the_sum_of_its_lights(device):
 
 def test_six_are_the_coarse_march_as_lightmaps_are_encoded(device):
     volume = replace(plume(hot=True, device=device), emission=30.0)
-    camera = seen(volume)
+    camera = view_of(volume)
     planes = render_guide(volume, camera, "six", MARCH)
     wanted = encode_lightmaps(march(volume, camera, MARCH))
     for name, plane in zip(PLANES, wanted, strict=True):
@@ -123,15 +122,15 @@ def test_six_are_the_coarse_march_as_lightmaps_are_encoded(device):
 def test_other_kinds_are_refused():
     volume = plume()
     with pytest.raises(ValueError, match="kind: expected one of paper, front, sides, six, got 'back'"):
-        render_guide(volume, seen(volume), "back", MARCH)
+        render_guide(volume, view_of(volume), "back", MARCH)
     with pytest.raises(ValueError, match="spacing: expected none"):
-        render_guide(volume, seen(volume), "paper", replace(MARCH, spacing=2.0))
+        render_guide(volume, view_of(volume), "paper", replace(MARCH, spacing=2.0))
 
 
 @pytest.mark.parametrize("kind", list(GUIDES))
 def test_a_camera_so_far_away_that_all_depths_are_one_is_refused(kind):
     volume = plume()
-    camera = seen(volume)
+    camera = view_of(volume)
     camera = replace(camera, position=tuple(1e20 * np.asarray(camera.position)))
     with pytest.raises(ValueError, match="expected near < far"):
         render_guide(volume, camera, kind, MARCH)
@@ -140,7 +139,7 @@ def test_a_camera_so_far_away_that_all_depths_are_one_is_refused(kind):
 @pytest.mark.parametrize("hot", [False, True])
 def test_lightmaps_come_back(device, hot):
     volume = replace(plume(hot=hot, device=device), emission=30.0)
-    six = bake(volume, seen(volume), step=1.0, estimate=False)
+    six = bake(volume, view_of(volume), step=1.0, estimate=False)
     six = SixWay(3.0 * six.lightmaps, six.transparency, six.emission)  # above 1 too
     assert six.lightmaps.max() > 1
     planes = encode_lightmaps(six)
@@ -171,19 +170,3 @@ def test_wrong_shapes_are_refused():
         decode_lightmaps(torch.zeros(7, 4, 4))
     with pytest.raises(ValueError, match="transparency"):
         encode_lightmaps(SixWay(torch.zeros(6, 4, 4), None))
-    pool = small_pool()
-    with pytest.raises(ValueError, match="motion"):
-        Pool(pool.guides, pool.targets, pool.motion[:, :1], pool.sequence)
-    for planes in (0, 2, 4, 10):
-        with pytest.raises(ValueError, match="guides: .* of one of GUIDES"):
-            Pool(pool.guides[:, :, :1].repeat(1, 1, planes, 1, 1), pool.targets, pool.motion, pool.sequence)
-    six = Pool(pool.guides.repeat(1, 1, 3, 1, 1), pool.targets, pool.motion, pool.sequence)
-    assert six.guides.shape[2] == len(GUIDES["six"])
-    assert len(pool.to("cpu")) == len(pool) == 6
-
-
-def test_some_of_a_pool():
-    pool = small_pool()
-    odd = pool.take(torch.arange(len(pool)) % 2 == 1)
-    assert odd.sequence.tolist() == [1, 3, 5] and torch.equal(odd.guides, pool.guides[1::2])
-    assert pool.take(torch.tensor([4, 0])).sequence.tolist() == [4, 0]

@@ -393,7 +393,7 @@ def test_empty_smoke_and_one_voxel(tmp_path):
 
 def test_the_scene_in_the_document(tmp_path):
     """The page's scene "in full" is one, and names every setting that there is."""
-    page = (Path(__file__).resolve().parents[2] / "docs" / "smoke.md").read_text(encoding="utf-8")
+    page = (Path(__file__).resolve().parents[2] / "docs" / "fluid.md").read_text(encoding="utf-8")
     block = page[page.index("    name: jet\n") : page.index("A row of a path")]
     path = tmp_path / "scene.yaml"
     path.write_text("\n".join(line[4:] for line in block.splitlines()))

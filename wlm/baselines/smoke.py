@@ -6,9 +6,49 @@ import numpy as np
 import torch
 
 from wlm.smoke.camera import Camera
+from wlm.smoke.evaluation import Contender, HeldOut, Method
+from wlm.smoke.learn.pool import Pool
 from wlm.smoke.lightmaps import SixWay
+from wlm.smoke.planes import GUIDES, PLANES
 
-__all__ = ["billboard"]
+__all__ = ["COARSE", "FLIP_BOOK", "RIVALS", "billboard", "coarse", "flip_book"]
+
+COARSE, FLIP_BOOK = "coarse march", "flip book"
+
+_SIX = GUIDES["six"]
+
+
+def coarse(pool: Pool, part: slice) -> torch.Tensor:
+    """The coarse march of six lights, which is a pool's guide of kind "six": what a network has to be better than.
+
+    Raises:
+        ValueError: The pool's guides are of another kind.
+    """
+    if pool.guides.shape[2] != len(_SIX):
+        raise ValueError(f"pool: expected guides of kind six, [N, 2, {len(_SIX)}, H, W]")
+    return pool.guides[part][:, :, [_SIX.index(name) for name in PLANES]].float()
+
+
+def flip_book(held_out: HeldOut) -> tuple[Pool, Method]:
+    """What a flip book baked from the first view shows in the others: that view's own planes, as ``billboard`` does.
+
+    Returns:
+        The samples of the other views, none where there is one view, and the method for them.
+
+    Raises:
+        ValueError: The samples aren't whole sets of views.
+    """
+    pool, views = held_out.whole, held_out.settings.views
+    if len(pool) % views:
+        raise ValueError(f"pool: expected whole sets of {views} views, got {len(pool)} samples")
+    number = torch.arange(len(pool), device=pool.device)
+    others = number[(number % views > 0) & held_out.keep]
+    baked = pool.targets[others - others % views]
+    return pool.take(others), lambda _, part: baked[part].float()
+
+
+RIVALS: dict[str, Contender] = {COARSE: lambda held_out: (held_out.pool("six"), coarse), FLIP_BOOK: flip_book}
+"""What ``wlm smoke evaluate`` compares a network with."""
 
 
 def billboard(baked: SixWay, source: Camera, camera: Camera, pivot: np.ndarray) -> SixWay:

@@ -28,16 +28,18 @@ from typing import TypeVar
 import torch
 from pydantic import BaseModel
 
+from wlm.baselines.smoke import COARSE, coarse
 from wlm.bench.rows import Row
 from wlm.bench.runner import Bench, Note
 from wlm.errors import WlmError
-from wlm.smoke.evaluation import COARSE, Evaluation, coarse, compare, evaluate
-from wlm.smoke.fit import NetworkProfile, load_profile
-from wlm.smoke.learn.dataset import DatasetSettings, make_pool, make_validation
+from wlm.smoke.evaluation import Score, of_network, score
+from wlm.smoke.learn.dataset import make_pool, make_validation
 from wlm.smoke.learn.losses import Losses
+from wlm.smoke.learn.pool import Pool
+from wlm.smoke.learn.settings import DatasetSettings
 from wlm.smoke.learn.trainer import Trainer, plan_round
-from wlm.smoke.model import SixWayNetwork, parameter_count
-from wlm.smoke.planes import PLANES, Pool
+from wlm.smoke.model import Profile, SixWayNetwork, parameter_count
+from wlm.smoke.planes import PLANES
 
 __all__ = ["FULL", "METHOD", "QUICK", "AblationSizes", "run", "run_rows", "variants"]
 
@@ -125,12 +127,12 @@ def run(
     """
     sizes = QUICK if quick else FULL
     changes = {name: value for name, value in {"rounds": rounds, "steps": steps}.items() if value is not None}
-    return run_rows(replace(sizes, **changes), load_profile(profile), only, device=device, progress=progress, done=done)
+    return run_rows(replace(sizes, **changes), Profile.load(profile), only, device=device, progress=progress, done=done)
 
 
 def run_rows(
     sizes: AblationSizes,
-    base: NetworkProfile,
+    base: Profile,
     only: Sequence[str] = (),
     *,
     device: str,
@@ -147,7 +149,7 @@ def run_rows(
     for name, profile in chosen.items():
         if profile is None:
             validation = samples.validation(_changed(base.dataset, {"guide": "six"}))
-            rows.append(_row(bench, name, compare({COARSE: coarse}, validation)[COARSE], "no network"))
+            rows.append(_row(bench, name, score(coarse, validation), "no network"))
         else:
             rows.append(_trained_row(bench, name, profile, samples))
         if done is not None:
@@ -155,16 +157,16 @@ def run_rows(
     return rows
 
 
-def _trained_row(bench: Bench, name: str, profile: NetworkProfile, samples: _Samples) -> Row:
+def _trained_row(bench: Bench, name: str, profile: Profile, samples: _Samples) -> Row:
     validation, pools = samples.validation(profile.dataset), samples.pools(profile.dataset, profile.training.rounds)
     bench.note(f"trains {name}")
     network, skipped, seconds, step_ms = _train(profile, pools, bench.device)
     figures = {"encode_seconds": seconds, "step_ms": step_ms, "parameters": parameter_count(network)}
     note = f"{skipped} steps gave NaN or infinity" if skipped else ""
-    return _row(bench, name, evaluate(network, validation), note, **figures)
+    return _row(bench, name, score(of_network(network), validation), note, **figures)
 
 
-def variants(base: NetworkProfile) -> dict[str, NetworkProfile | None]:
+def variants(base: Profile) -> dict[str, Profile | None]:
     """The profiles that are compared.
 
     Args:
@@ -192,7 +194,7 @@ def variants(base: NetworkProfile) -> dict[str, NetworkProfile | None]:
     return {"base": base, **{name: _changed(base, change) for name, change in changes.items()}, COARSE: None}
 
 
-def _chosen(base: NetworkProfile, only: Sequence[str], note: Note) -> dict[str, NetworkProfile | None]:
+def _chosen(base: Profile, only: Sequence[str], note: Note) -> dict[str, Profile | None]:
     """The variants that were asked for and can be trained."""
     profiles = variants(base)
     for name in only:
@@ -212,7 +214,7 @@ def _chosen(base: NetworkProfile, only: Sequence[str], note: Note) -> dict[str, 
     return chosen
 
 
-def _left_out(profile: NetworkProfile, base: NetworkProfile) -> str:
+def _left_out(profile: Profile, base: Profile) -> str:
     """Why a variant isn't trained; empty if it is."""
     if profile == base:
         return f"{base.name} is so already"
@@ -261,7 +263,7 @@ def _with_smoke(where: str, pool: Pool) -> Pool:
     return pool
 
 
-def _train(profile: NetworkProfile, pools: Sequence[Pool], device: str) -> tuple[SixWayNetwork, int, float, float]:
+def _train(profile: Profile, pools: Sequence[Pool], device: str) -> tuple[SixWayNetwork, int, float, float]:
     """Trains a network; returns also the skipped steps, the seconds in all and the median milliseconds of a step."""
     gc.collect()  # a trainer and its graph hold each other, and much memory
     settings = profile.training
@@ -287,7 +289,7 @@ def _wait(device: str) -> None:
         torch.cuda.synchronize(device)
 
 
-def _row(bench: Bench, name: str, evaluation: Evaluation, note: str = "", **figures: float) -> Row:
+def _row(bench: Bench, name: str, evaluation: Score, note: str = "", **figures: float) -> Row:
     return bench.row(
         METHOD,
         name,

@@ -48,9 +48,8 @@ from wlm.metrics.error import psnr_from_mse
 from wlm.smoke.baking import bake
 from wlm.smoke.camera import Camera
 from wlm.smoke.coarse import march
-from wlm.smoke.decode import predict
 from wlm.smoke.lightmaps import SixWay
-from wlm.smoke.planes import EMISSION_PLANE, OPACITY_PLANE, encode_lightmaps
+from wlm.smoke.planes import EMISSION_PLANE, OPACITY_PLANE, decode_lightmaps, encode_lightmaps, render_guide
 from wlm_kernels.smoke.settings import March
 
 __all__ = ["PANELS", "plotted", "run", "run_rows"]
@@ -179,8 +178,14 @@ def _coarse(step: float, spacing: float) -> _Method:
 
 
 def _network(pipeline: Pipeline) -> _Method:
-    look = pipeline.subject.settings.look
-    return lambda volume, camera, seed: predict(volume, camera, pipeline.predictor, look(volume.shape, seed))
+    decoder = pipeline.decoder
+
+    def lightmaps(volume: DensityVolume, camera: Camera, seed: int) -> SixWay:
+        look = pipeline.subject.settings.look(volume.shape, seed)
+        planes = decoder(render_guide(volume, camera, decoder.guide, look))
+        return decode_lightmaps(planes, hot=decoder.emission and volume.temperature is not None)
+
+    return lightmaps
 
 
 def _encoded(method: _Method) -> Callable[[DensityVolume, Camera, int], torch.Tensor]:

@@ -7,20 +7,19 @@ from functools import partial
 
 import torch
 
+from wlm.baselines.smoke import coarse
 from wlm.bench.rows import Row
 from wlm.bench.smoke_network_setup import Frame, NetworkBench, Pipeline
 from wlm.config import profile_names
-from wlm.smoke.decode import Predictor
-from wlm.smoke.evaluation import coarse, compare, of_predictor
-from wlm.smoke.fit import load_profile
-from wlm.smoke.learn.dataset import DatasetSettings
-from wlm.smoke.model import SixWayNetwork, parameter_count
-from wlm.smoke.planes import GUIDES, Pool, decode_lightmaps, render_guide
+from wlm.smoke.evaluation import of_decoder, score
+from wlm.smoke.learn.pool import Pool
+from wlm.smoke.learn.settings import DatasetSettings
+from wlm.smoke.model import Profile, SixWayNetwork, SmokeModel, parameter_count
+from wlm.smoke.planes import GUIDES, decode_lightmaps, render_guide
 from wlm.smoke.scene import LightSettings
 
 __all__ = ["density_rows", "frame_rows", "profile_rows"]
 
-_PREFIX = "network-"
 _LIGHTS = (
     LightSettings(toward=(1.0, 0.8, 0.6), irradiance=(11.0, 10.3, 9.4)),
     LightSettings(toward=(-1.0, 0.3, 0.5), irradiance=(1.6, 2.2, 3.2)),
@@ -73,17 +72,16 @@ def profile_rows(bench: NetworkBench) -> list[Row]:
     """The time of each profile's network alone."""
     bench.note("profiles")
     size, cuda = bench.sizes.profile, bench.device != "cpu"
-    names = [name.removeprefix(_PREFIX) for name in profile_names("smoke") if name.startswith(_PREFIX)]
-    settings = {name: load_profile(name).network for name in names}
+    settings = {name: Profile.load(name).network for name in profile_names(Profile.FILES)}
     calls, counts = {}, {}
     for name, setting in settings.items():
         torch.manual_seed(0)
-        network = SixWayNetwork(setting)
-        counts[name] = parameter_count(network)
+        model = SmokeModel(SixWayNetwork(setting), {})
+        counts[name] = parameter_count(model.network)
         for half in (True, False) if cuda else (False,):
-            predictor = Predictor(network, size, size, device=bench.device, half=half)
+            decoder = model.decoder(bench.device, height=size, width=size, half=half)
             encoded = torch.rand(len(GUIDES[setting.guide]), size, size, device=bench.device)
-            calls[name, "fp16" if half else "fp32"] = partial(predictor, encoded)
+            calls[name, "fp16" if half else "fp32"] = partial(decoder, encoded)
     times = bench.time(calls, few=not cuda)
     rows = []
     for (name, kind), timing in times.items():
@@ -103,13 +101,13 @@ def density_rows(bench: NetworkBench) -> list[Row]:
         targets = torch.stack([torch.stack([bench.reference(smoke) for smoke in frame.smoke]) for frame in frames])
         evaluations = {}
         for subject in bench.trained:
-            predictor = Predictor(subject.network, size, size, device=bench.device)
+            decoder = subject.model.decoder(bench.device, height=size, width=size)
             pool = _pool(bench, frames, targets, subject.settings)
-            evaluations |= compare({subject.name: of_predictor(predictor)}, pool)
+            evaluations[subject.name] = score(of_decoder(decoder), pool)
         for share in _MARCHES:
             changed = {"guide": "six", "guide_step": share * bench.settings.guide_step}
             pool = _pool(bench, frames, targets, bench.settings.model_copy(update=changed))
-            evaluations |= compare({f"coarse, h {share * step:g}": coarse}, pool)
+            evaluations[f"coarse, h {share * step:g}"] = score(coarse, pool)
         for name, evaluation in evaluations.items():
             row = bench.row(
                 "density",

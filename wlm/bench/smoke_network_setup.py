@@ -17,12 +17,11 @@ from wlm.interop import stream
 from wlm.metrics.error import psnr_from_mse
 from wlm.smoke.baking import bake
 from wlm.smoke.camera import DIRECTIONS, Camera
-from wlm.smoke.codec import load_network, settings_of
-from wlm.smoke.decode import Predictor
-from wlm.smoke.fit import load_profile
-from wlm.smoke.learn.dataset import DatasetSettings, draw_scene
+from wlm.smoke.codec import open_network
+from wlm.smoke.learn.scenes import draw_scene
+from wlm.smoke.learn.settings import DatasetSettings
 from wlm.smoke.lightmaps import SixWay
-from wlm.smoke.model import SixWayNetwork
+from wlm.smoke.model import Profile, SixWayNetwork, SmokeModel
 from wlm.smoke.motion import motion
 from wlm.smoke.planes import decode_lightmaps, encode_lightmaps, render_guide
 from wlm.smoke.scene import CameraSettings, Scene, make_camera
@@ -144,13 +143,13 @@ class Subject:
 
     Attributes:
         name: In tables.
-        network: On the CPU.
+        model: On the CPU.
         settings: Of the samples of its training.
         trained: False where its weights are random and only its time is measured.
     """
 
     name: str
-    network: SixWayNetwork
+    model: SmokeModel
     settings: DatasetSettings
     trained: bool
 
@@ -252,38 +251,38 @@ class Pipeline:
 
     Attributes:
         subject: The network.
-        predictor: The network as it is used.
+        decoder: The network as it is used.
     """
 
     def __init__(self, bench: NetworkBench, subject: Subject, *, half: bool) -> None:
         size = bench.sizes.resolution
         self.subject, self.camera = subject, bench.camera
-        self.predictor = Predictor(subject.network, size, size, device=bench.device, half=half)
+        self.decoder = subject.model.decoder(bench.device, height=size, width=size, half=half)
         self._bench = bench
 
     def planes(self, volume: DensityVolume, camera: Camera, seed: int) -> torch.Tensor:
         """The planes that the network predicts, [8, H, W]; a copy."""
         look = self.subject.settings.look(volume.shape, seed)
         with stream(self._bench.device):
-            return self.predictor(render_guide(volume, camera, self.predictor.guide, look)).clone()
+            return self.decoder(render_guide(volume, camera, self.decoder.guide, look)).clone()
 
     def parts(self, frame: Frame) -> dict[str, Callable[[], object]]:
         """Calls that make a frame's guiding map, planes and lightmaps, each from the result of the one before."""
         look = self.subject.settings.look(frame.later.shape, frame.seed + 1)
-        kind, hot = self.predictor.guide, frame.later.temperature is not None
+        kind, hot = self.decoder.guide, frame.later.temperature is not None
         encoded = render_guide(frame.later, self.camera, kind, look)
-        planes = self.predictor(encoded)
+        planes = self.decoder(encoded)
 
         def guided() -> None:
             encoded.copy_(render_guide(frame.later, self.camera, kind, look))
 
         def decoded() -> SixWay:
-            return decode_lightmaps(planes, hot=hot and self.predictor.emission)
+            return decode_lightmaps(planes, hot=hot and self.decoder.emission)
 
         return {
             "guide": self._bench.replay(guided),
             # A graph by itself.
-            "network": lambda: self.predictor(encoded),
+            "network": lambda: self.decoder(encoded),
             "decode": self._bench.replay(decoded),
         }
 
@@ -306,13 +305,13 @@ def open_subjects(networks: Sequence[str | Path], profiles: Sequence[str]) -> li
     """
     subjects = []
     for path in map(Path, networks):
-        network, summary = load_network(path)
-        subjects.append(Subject(path.stem, network, settings_of(path, summary), True))
+        model = open_network(path)
+        subjects.append(Subject(path.stem, model, model.dataset, True))
     for name in profiles:
-        profile = load_profile(name)
+        profile = Profile.load(name)
         torch.manual_seed(0)
-        network = SixWayNetwork(profile.network)
-        subjects.append(Subject(f"{profile.name} untrained", network, profile.dataset, False))
+        model = SmokeModel(SixWayNetwork(profile.network), {})
+        subjects.append(Subject(f"{profile.name} untrained", model, profile.dataset, False))
     names = [subject.name for subject in subjects]
     for name in names:
         if names.count(name) > 1:

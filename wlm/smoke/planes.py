@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-
 import torch
 
 from wlm.fluid.volume import DensityVolume
@@ -23,7 +21,6 @@ __all__ = [
     "OPACITY_PLANE",
     "PLANES",
     "VISIBLE",
-    "Pool",
     "decode_lightmaps",
     "encode_guide",
     "encode_lightmaps",
@@ -179,52 +176,3 @@ def decode_lightmaps(planes: torch.Tensor, *, hot: bool = True, camera: Camera |
         smoke_planes.decode(to_warp(planes), to_warp(light))
     glow = light[EMISSION_PLANE] if hot else None
     return SixWay(light[: len(DIRECTIONS)], light[OPACITY_PLANE], glow, camera)
-
-
-@dataclass(frozen=True, eq=False)
-class Pool:
-    """Pairs of frames to learn from; all tensors on one device, the floats half.
-
-    Attributes:
-        guides: [N, 2, C, H, W], encoded, of one of ``GUIDES``; two frames that follow each other, the earlier first.
-        targets: [N, 2, 8, H, W], encoded.
-        motion: [N, 2, H, W], pixels, x to the right and y down, by which what the later frame shows has moved since
-            the earlier one.
-        sequence: int [N], the sequence that a sample is of; sets are split by these, never by frames.
-    """
-
-    guides: torch.Tensor
-    targets: torch.Tensor
-    motion: torch.Tensor
-    sequence: torch.Tensor
-
-    def __post_init__(self) -> None:
-        count, size = len(self.guides), tuple(self.guides.shape[-2:])
-        channels = self.guides.shape[2] if self.guides.ndim == 5 else 0
-        if channels not in map(len, GUIDES.values()):
-            raise ValueError(f"guides: expected [N, 2, C, H, W] of one of GUIDES, got {list(self.guides.shape)}")
-        wanted = {
-            "guides": (count, 2, channels, *size),
-            "targets": (count, 2, len(PLANES), *size),
-            "motion": (count, 2, *size),
-            "sequence": (count,),
-        }
-        for name, shape in wanted.items():
-            if tuple(getattr(self, name).shape) != shape:
-                raise ValueError(f"{name}: expected {list(shape)}, got {list(getattr(self, name).shape)}")
-
-    def __len__(self) -> int:
-        return len(self.guides)
-
-    @property
-    def device(self) -> torch.device:
-        """Where the samples are."""
-        return self.guides.device
-
-    def take(self, which: torch.Tensor) -> Pool:
-        """Some of the samples, by an index or a mask."""
-        return Pool(*(getattr(self, field.name)[which] for field in fields(self)))
-
-    def to(self, device: str | torch.device) -> Pool:
-        """The same samples on another device."""
-        return Pool(*(getattr(self, field.name).to(device) for field in fields(self)))

@@ -8,10 +8,11 @@ from dataclasses import replace
 
 from wlm.fluid.volume import DensityVolume
 from wlm.interop import check_device, device_name
-from wlm.smoke import codec
 from wlm.smoke.camera import Camera
-from wlm.smoke.decode import Predictor
+from wlm.smoke.codec import open_network
+from wlm.smoke.decode import Decoder
 from wlm.smoke.lightmaps import SixWay
+from wlm.smoke.model import SmokeModel
 from wlm.smoke.planes import decode_lightmaps, render_guide
 
 __all__ = ["SmokePredictor", "predict"]
@@ -29,21 +30,20 @@ class SmokePredictor:
         device: Where it runs.
     """
 
-    def __init__(self, model: str | os.PathLike[str] | None = None, device: str = "cpu") -> None:
+    def __init__(self, model: SmokeModel | str | os.PathLike[str] | None = None, device: str = "cpu") -> None:
         """Loads the network.
 
         Args:
-            model: A network's file; None: the network that comes with wlm.
+            model: A network or its file; None: the network that comes with wlm.
             device: "cpu", "cuda" or "cuda:N".
 
         Raises:
             WlmError: No such device; the file is missing or damaged, or lacks the settings of its guiding maps.
         """
         self.device = check_device(device)
-        path = codec.shipped() if model is None else model
-        self._network, summary = codec.load_network(path)
-        self._settings = codec.settings_of(path, summary)
-        self._decoders: dict[tuple[int, int], Predictor] = {}
+        self._model = model if isinstance(model, SmokeModel) else open_network(model)
+        self._settings = self._model.dataset
+        self._decoders: dict[tuple[int, int], Decoder] = {}
 
     def __call__(self, smoke: DensityVolume, camera: Camera, seed: int = 0) -> SixWay:
         """Makes lightmaps.
@@ -67,7 +67,7 @@ class SmokePredictor:
         if size not in self._decoders:
             if len(self._decoders) == _SIZES:
                 del self._decoders[next(iter(self._decoders))]
-            self._decoders[size] = Predictor(self._network, *size, device=self.device)
+            self._decoders[size] = Decoder(self._model, self.device, height=size[0], width=size[1])
         decoder = self._decoders[size]
         march = self._settings.look(smoke.shape, seed)
         planes = decoder(render_guide(smoke, camera, decoder.guide, march))
@@ -79,14 +79,14 @@ class SmokePredictor:
         fewest, most = self._settings.pixels
         if fewest / _SLACK <= pixels <= most * _SLACK:
             return None
-        learned = f"the network has learned from {fewest:.0f} to {most:.0f}"
-        return f"{pixels:.0f} pixels show the smoke's longest edge, {learned}: the coarse march may be nearer"
+        trained = f"the network was trained with {fewest:.0f} to {most:.0f}"
+        return f"{pixels:.0f} pixels show the smoke's longest edge, {trained}: the coarse march may be nearer"
 
 
 def predict(
     smoke: DensityVolume,
     camera: Camera,
-    model: SmokePredictor | str | os.PathLike[str] | None = None,
+    model: SmokePredictor | SmokeModel | str | os.PathLike[str] | None = None,
     device: str | None = None,
     seed: int = 0,
 ) -> SixWay:
@@ -95,8 +95,8 @@ def predict(
     Args:
         smoke: On any device.
         camera: Orthographic.
-        model: A network's file, or a ``SmokePredictor`` for many frames; None: the network that comes with wlm, which
-            is loaded once for each device.
+        model: A network, its file, or a ``SmokePredictor`` for many frames; None: the network that comes with wlm,
+            which is loaded once for each device.
         device: Where a network that isn't loaded runs; None: where the smoke is.
         seed: Of the guiding map's jitter.
 
