@@ -3,12 +3,12 @@
 Read first: ``tests/reference/temporal.py``, ``losses``, whose gradients by autograd these sums are.
 """
 
-from pathlib import Path
 from typing import Any
 
 import warp as wp
 
 from wlm_kernels import mlp
+from wlm_kernels.native import native_source
 
 __all__ = ["BLOCK", "block_reduction", "reload"]
 
@@ -44,24 +44,12 @@ def block_reduction(net: mlp.MlpKernels) -> Any:
     sizes = [round4(inputs + 1), round4(hidden), round4(hidden + 1), round4(hidden), round4(hidden + 1), 4]
     # An odd multiple of 4, so that threads hit different banks.
     stride = sum(sizes) + (4 if sum(sizes) % 8 == 0 else 0)
-    across = sizes[1] // 4
-    constants = {
-        "I": inputs,
-        "H": hidden,
-        "THREADS": BLOCK,
-        "STAGED": next(s for s in (128, 64, 32, 16) if s * stride * 4 <= _SHARED),
-        "STRIDE": stride,
-        **{name: sum(sizes[:i]) for i, name in enumerate(("F", "D1", "H1", "D2", "H2", "D3"))},
-        "B1": sizes[0] // 4 * across,
-        "B2": sizes[2] // 4 * across,
-        "B3": sizes[4] // 4,
-        "ACROSS": across,
-    }
-    text = (Path(__file__).parent / "native" / "block_sums.cuh").read_text(encoding="utf-8")
-    snippet = "".join(f"constexpr int {name} = {value};\n" for name, value in constants.items()) + text
+    staged = next(count for count in (128, 64, 32, 16) if count * stride * 4 <= _SHARED)
+    starts = {f"at_{name}": sum(sizes[:i]) for i, name in enumerate(("f", "d1", "h1", "d2", "h2", "d3"))}
+    numbers = {"inputs": inputs, "hidden": hidden, "threads": BLOCK, "staged": staged, "stride": stride} | starts
     vec_in, vec_hidden = net.vec_in, net.vec_hidden
 
-    @wp.func_native(snippet)
+    @wp.func_native(native_source(__package__, "block_sums", **numbers))
     def reduce(
         f: vec_in,
         h1: vec_hidden,
