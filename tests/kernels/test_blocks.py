@@ -7,7 +7,7 @@ from reference import blocks as reference
 
 from kernels.compare import array
 from wlm import ops
-from wlm.formats.bc7 import decode_mode6, pack_mode6
+from wlm.formats.bc7 import decode_image
 from wlm.ops import plain
 from wlm_kernels.lightmap import blocks
 
@@ -42,15 +42,13 @@ def _quantise(endpoints: np.ndarray, weights: np.ndarray, device: str) -> tuple[
 
 
 def test_quantised_texels_are_the_decoded_file(device: str):
-    """What is trained on is what the file decodes to, bit for bit."""
-    endpoints, weights = _blocks_in_a_row(12)
-    stored, index = _quantise(endpoints, weights, device)
-    count = endpoints.shape[2]
-    in_blocks = index.reshape(4, count, 4).swapaxes(0, 1).reshape(count, 16)
-    decoded = decode_mode6(pack_mode6(stored[0, 0], in_blocks)).reshape(count, 4, 4, 4)
-    used = ops.bc7_texels(torch.tensor(endpoints[0]).to(device), torch.tensor(weights[0]).to(device), quantised=True)
-    used = used.cpu().numpy().reshape(4, count, 4, 4).swapaxes(0, 1)
-    np.testing.assert_array_equal(used, decoded.astype(np.float32) / np.float32(255.0))
+    """What is trained on is what the file decodes to, bit for bit; alone and in layers."""
+    leaves = [torch.tensor(values).to(device) for values in _blocks_in_a_row(12)]
+    for maps in (leaves, [values[0] for values in leaves]):
+        packed = ops.bc7_blocks(*maps)
+        decoded = decode_image(packed[0] if packed.ndim == 4 else packed).astype(np.float32) / np.float32(255.0)
+        texels = ops.bc7_texels(*maps, quantised=True).cpu().numpy()
+        np.testing.assert_array_equal(texels.reshape(decoded.shape), decoded)
 
 
 def test_quantised_endpoints_are_the_nearest(device: str):
@@ -77,11 +75,13 @@ def test_quantised_endpoints_are_the_nearest(device: str):
 
 
 def test_twin_decodes_the_file_too():
-    """The twin's float64 texels are the bytes' own, where no endpoint is as near to two of them."""
+    """The twin's float64 texels are the file's, where no endpoint is as near to two of its bytes."""
     random = np.random.default_rng(14)
-    endpoints = random.uniform(0.0, 1.0, (1, 50, 2, 4)).astype(np.float32)
-    weights = random.uniform(0.0, 1.0, (4, 200)).astype(np.float32)
-    stored, index = _quantise(endpoints[None], weights[None], "cpu")
-    decoded = decode_mode6(pack_mode6(stored[0, 0], index.reshape(4, 50, 4).swapaxes(0, 1).reshape(50, 16)))
-    texels = plain.bc7_texels(torch.tensor(endpoints).double(), torch.tensor(weights).double(), quantised=True)
-    np.testing.assert_allclose(texels.numpy().reshape(4, 50, 4, 4).swapaxes(0, 1).reshape(50, 16, 4) * 255, decoded)
+    endpoints, weights = (torch.tensor(random.uniform(size=shape)).float() for shape in ((3, 50, 2, 4), (12, 200)))
+    texels = plain.bc7_texels(endpoints.double(), weights.double(), quantised=True)
+    np.testing.assert_allclose(texels.numpy() * 255.0, decode_image(ops.bc7_blocks(endpoints, weights)))
+
+
+def test_no_blocks():
+    assert ops.bc7_blocks(torch.zeros(0, 2, 2, 4), torch.zeros(0, 8)).shape == (0, 2, 16)
+    assert ops.bc7_blocks(torch.zeros(0, 1, 2, 2, 4), torch.zeros(0, 4, 8)).shape == (0, 1, 2, 16)

@@ -4,7 +4,7 @@ Functions with gradients by autograd, on the device of their tensors; on CUDA th
 All floats are float32, and there is no second derivative. ``plain`` has each of them again in a few lines of torch, of
 any float type: the definition that the kernels are held to. The page is docs/ops.md.
 
-    bc7_map, bc7_texels     a feature map in BC7 mode 6 blocks, sampled or whole
+    bc7_map, bc7_texels, bc7_blocks     a feature map in BC7 mode 6 blocks: sampled, whole, and as a file's bytes
     plane, triplane, volume     feature grids, sampled linearly
     mlp                     small networks of two hidden layers
     gaussian_sum            a sum of 3D Gaussians at any points
@@ -12,35 +12,43 @@ any float type: the definition that the kernels are held to. The page is docs/op
     march                   transmittance and single-scattered light through a density grid
 """
 
-from importlib import import_module
-from typing import Any
+from wlm._facade import facade
 
-_MODULES = {
-    "bc7_map": "blocks",
-    "bc7_texels": "blocks",
-    "gaussian_sum": "gaussians",
-    "interpolate": "raster",
-    "march": "marching",
-    "mlp": "networks",
-    "plane": "sampling",
-    "Raster": "raster",
-    "rasterize": "raster",
-    "rasterize_uv": "raster",
-    "texture": "raster",
-    "triplane": "sampling",
-    "volume": "sampling",
-}
+__all__ = [
+    "Raster",
+    "bc7_blocks",
+    "bc7_map",
+    "bc7_texels",
+    "gaussian_sum",
+    "interpolate",
+    "march",
+    "mlp",
+    "plain",
+    "plane",
+    "rasterize",
+    "rasterize_uv",
+    "texture",
+    "triplane",
+    "volume",
+]
 
-__all__ = ["plain", *_MODULES]
-
-
-def __getattr__(name: str) -> Any:
-    if name == "plain":
-        return import_module("wlm.ops.plain")
-    if name not in _MODULES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"wlm.ops.{_MODULES[name]}"), name)
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+__getattr__, __dir__ = facade(
+    __name__,
+    {
+        "Raster": "wlm.ops.raster",
+        "bc7_blocks": "wlm.ops.blocks",
+        "bc7_map": "wlm.ops.blocks",
+        "bc7_texels": "wlm.ops.blocks",
+        "gaussian_sum": "wlm.ops.gaussians",
+        "interpolate": "wlm.ops.raster",
+        "march": "wlm.ops.marching",
+        "mlp": "wlm.ops.networks",
+        "plain": "wlm.ops.plain",
+        "plane": "wlm.ops.sampling",
+        "rasterize": "wlm.ops.raster",
+        "rasterize_uv": "wlm.ops.raster",
+        "texture": "wlm.ops.raster",
+        "triplane": "wlm.ops.sampling",
+        "volume": "wlm.ops.sampling",
+    },
+)

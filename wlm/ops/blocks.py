@@ -3,21 +3,21 @@
 A map of 4 channels is cut into blocks of 4 x 4 texels. A block has two endpoints, e0 and e1, and a weight w for each
 texel, which is (1 - w) e0 + w e1 (neural-dynamic-gi, eq. 7 and 8). ``quantised`` evaluates that on exactly the levels
 that a file of 16 bytes a block holds, and rounds as its decoder does; roundings and clamps are straight-through, with
-derivative 1. Train without it first, and with it at the end.
-
-``wlm.formats.bc7.pack_mode6`` writes the blocks; ``wlm_kernels.lightmap.blocks.quantise`` gives it their integers.
+derivative 1. Train without it first, and with it at the end; ``bc7_blocks`` then gives the file's bytes.
 """
 
+import numpy as np
 import torch
 import warp as wp
 from torch.autograd.function import once_differentiable
 
+from wlm.formats.bc7 import pack_mode6
 from wlm.interop import to_warp
 from wlm.ops.sampling import sample
 from wlm.ops.tensors import check, check_finite, dense, on_stream
 from wlm_kernels.lightmap import blocks
 
-__all__ = ["bc7_map", "bc7_texels"]
+__all__ = ["bc7_blocks", "bc7_map", "bc7_texels"]
 
 
 def bc7_map(
@@ -67,15 +67,48 @@ def bc7_texels(endpoints: torch.Tensor, weights: torch.Tensor, *, quantised: boo
     Raises:
         ValueError: As for ``bc7_map``.
     """
+    _check(endpoints, weights)
+    shape = (-1 if weights.numel() else 0, *weights.shape[-2:])
+    texels = _Texels.apply(endpoints.reshape(-1, *endpoints.shape[-4:]), weights.reshape(shape), quantised)
+    return texels.reshape(*weights.shape, 4)
+
+
+def bc7_blocks(endpoints: torch.Tensor, weights: torch.Tensor) -> np.ndarray:
+    """Packs maps into the bytes of a file, which decode to ``bc7_texels`` with ``quantised``; without a gradient.
+
+    Args:
+        endpoints: float [H/4, W/4, 2, 4] or [L, H/4, W/4, 2, 4], see ``bc7_map``.
+        weights: float [H, W] or [L, H, W].
+
+    Returns:
+        uint8 [H/4, W/4, 16] or [L, H/4, W/4, 16], BC7 blocks of mode 6.
+
+    Raises:
+        ValueError: As for ``bc7_map``.
+    """
+    _check(endpoints, weights)
+    *layers, height, width = weights.shape
+    stored = torch.empty(endpoints.shape, dtype=torch.uint8, device=weights.device)
+    index = torch.empty(weights.shape, dtype=torch.uint8, device=weights.device)
+    if weights.numel():
+        with on_stream(weights.device):
+            blocks.quantise(
+                to_warp(dense(endpoints).reshape(-1, *endpoints.shape[-4:]), wp.vec4),
+                to_warp(weights.reshape(-1, height, width)),
+                to_warp(stored.reshape(-1, *stored.shape[-4:]), wp.vec4ub),
+                to_warp(index.reshape(-1, height, width)),
+            )
+    in_blocks = index.reshape(*layers, height // 4, 4, width // 4, 4).transpose(-3, -2)
+    return pack_mode6(stored.cpu().numpy(), in_blocks.reshape(*stored.shape[:-2], 16).cpu().numpy())
+
+
+def _check(endpoints: torch.Tensor, weights: torch.Tensor) -> None:
     check("weights", weights, (None,) * (3 if weights.ndim == 3 else 2))
     *layers, height, width = weights.shape
     if height % 4 or width % 4:
         raise ValueError(f"weights: expected sizes in whole blocks of 4 x 4, got {tuple(weights.shape)}")
     check("endpoints", endpoints, (*layers, height // 4, width // 4, 2, 4), weights.device)
     check_finite(endpoints=endpoints, weights=weights)
-    shape = (-1 if weights.numel() else 0, height, width)
-    texels = _Texels.apply(endpoints.reshape(-1, *endpoints.shape[-4:]), weights.reshape(shape), quantised)
-    return texels.reshape(*weights.shape, 4)
 
 
 class _Texels(torch.autograd.Function):

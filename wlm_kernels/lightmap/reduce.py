@@ -44,12 +44,22 @@ def block_reduction(net: mlp.MlpKernels) -> Any:
     sizes = [round4(inputs + 1), round4(hidden), round4(hidden + 1), round4(hidden), round4(hidden + 1), 4]
     # An odd multiple of 4, so that threads hit different banks.
     stride = sum(sizes) + (4 if sum(sizes) % 8 == 0 else 0)
-    staged = next(count for count in (128, 64, 32, 16) if count * stride * 4 <= _SHARED)
-    starts = {f"at_{name}": sum(sizes[:i]) for i, name in enumerate(("f", "d1", "h1", "d2", "h2", "d3"))}
-    numbers = {"inputs": inputs, "hidden": hidden, "threads": BLOCK, "staged": staged, "stride": stride} | starts
+    across = sizes[1] // 4
+    constants = {
+        "I": inputs,
+        "H": hidden,
+        "THREADS": BLOCK,
+        "STAGED": next(s for s in (128, 64, 32, 16) if s * stride * 4 <= _SHARED),
+        "STRIDE": stride,
+        **{name: sum(sizes[:i]) for i, name in enumerate(("F", "D1", "H1", "D2", "H2", "D3"))},
+        "B1": sizes[0] // 4 * across,
+        "B2": sizes[2] // 4 * across,
+        "B3": sizes[4] // 4,
+        "ACROSS": across,
+    }
     vec_in, vec_hidden = net.vec_in, net.vec_hidden
 
-    @wp.func_native(native_source(__package__, "block_sums", **numbers))
+    @wp.func_native(native_source(__package__, "block_sums", **constants))
     def reduce(
         f: vec_in,
         h1: vec_hidden,
