@@ -1,7 +1,7 @@
-"""The documents: the pages of results are those that the command makes, and figures are those of the benchmarks.
+"""The documents: their figures are those of the benchmarks, and the pages of results those that the command makes.
 
 A document states figures of ``benchmarks/`` in a comment right above a paragraph, a list or a table, a source on each
-line and its figures in the order in which the text has them::
+line and its figures in the order of the text::
 
     <!-- figures
     nvidia-h200/lightmap/city/ours/M: psnr | bpp .1f
@@ -9,11 +9,10 @@ line and its figures in the order in which the text has them::
     -->
     Profile M has 45.98 dB at 0.7 bits a texel, 2 dB more than L.
 
-A source is a file, then of its rows the system, scene, method and option; of a report of ``wlm smoke evaluate --json``
-``FILE/SET/METHOD``, of a training's curve ``FILE.csv/STEP``. `` - `` between two sources is their difference, `` / ``
-their ratio. A figure's name is one of ``wlm.bench.figures``, which has its format too, unless another follows the name.
-
-Above a table of all rows of a method one line is enough, with the figures of the columns after the first, the option::
+A source is a file, then system, scene, method and option of a row; ``FILE/SET/METHOD`` of a report of ``wlm smoke
+evaluate --json``; ``FILE.csv/STEP`` of a training's curve. `` - `` between two sources is their difference, `` / ``
+their ratio. A figure has the format of ``wlm.bench.figures`` unless another follows its name. Above a table of all rows
+of a method one line is enough, with the figures of the columns after the first, which is the option::
 
     <!-- table nvidia-h200/atlas/AntiqueCamera day/ours: psnr bytes -->
 """
@@ -40,11 +39,10 @@ def sources(file: str) -> dict[str, Mapping[str, float]]:
     """The figures in a file of ``benchmarks/``, by the rest of their source."""
     path = ROOT / "benchmarks" / file
     if path.suffix == ".csv":
-        with open(path, encoding="utf-8") as lines:
-            return {row["step"]: {name: float(cell) for name, cell in row.items()} for row in csv.DictReader(lines)}
+        lines = csv.DictReader(path.read_text(encoding="utf-8").splitlines())
+        return {line["step"]: {name: float(cell) for name, cell in line.items()} for line in lines}
     path = path.with_suffix(".json")
-    sets = json.loads(path.read_text(encoding="utf-8")).get("sets")
-    if sets is not None:
+    if sets := json.loads(path.read_text(encoding="utf-8")).get("sets"):
         return {f"{images['name']}/{name}": images["methods"][name] for images in sets for name in images["methods"]}
     return {f"{row.system}/{row.scene}/{row.method}/{row.option}": row.figures for row in read_json(path)[0]}
 

@@ -181,7 +181,7 @@ def test_against_a_path_tracer(name: str):
     trace = PathTracer(volume, camera, variant="scalar_rgb")
     ours = bake(volume, camera, step=0.25, supersample=4, estimate=False)
     for index, way in enumerate(VECTORS):
-        runs = np.stack([trace.traced(way, 2048, seed) for seed in range(4)])
+        runs = np.stack([trace.trace(way, 2048, seed) for seed in range(4)])
         want = ours.lightmaps[index].double().numpy()
         light = runs[..., 0].astype(np.float64)
         energy, noise = np.square(want).mean(), light.var(0, ddof=1).mean() / len(light)
@@ -204,7 +204,7 @@ def test_oblique_lights_against_a_path_tracer(way: tuple):
     rays = 16
     fine = lit(volume, camera.finer(rays), camera.axes.T @ unit, step=0.25)
     want = torch.nn.functional.avg_pool2d(fine[None], rays)[0].double().numpy()
-    runs = np.stack([trace.traced(unit, 2048, seed)[..., 0] for seed in range(4)])
+    runs = np.stack([trace.trace(unit, 2048, seed)[..., 0] for seed in range(4)])
     runs = runs.astype(np.float64)
     energy, noise = np.square(want).mean(), runs.var(0, ddof=1).mean() / len(runs)
     above = np.square(runs.mean(0) - want).mean() - noise

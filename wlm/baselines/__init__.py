@@ -1,7 +1,8 @@
 """What the systems are compared with, one module a system. Block codecs need the extra `baselines`.
 
-Each module has the same verbs: ``RIVALS``, the methods by name, each of which makes a ``Rival``; and
-``evaluate_rivals``, which scores rivals by the system's own evaluation. No system knows of them.
+Each module has ``RIVALS``, the methods by name, and they are scored by the system's evaluation: a method makes a
+``Rival`` of an input, and ``evaluate_rivals`` scores it. The rivals of smoke make no file: each is what
+``wlm.smoke.evaluation.compare`` takes beside a network. No system imports a baseline.
 """
 
 from wlm.baselines.rival import Rival

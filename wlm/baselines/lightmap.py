@@ -191,9 +191,9 @@ def evaluate_rivals(
     return results
 
 
-def _check_profile(codec: str, profile: str, known: Sequence[str]) -> None:
-    if profile not in known:
-        raise WlmError(f"{codec}: unknown profile {profile!r}, expected one of {', '.join(known)}")
+def _check_profile(codec: str, profile: str, names: Sequence[str]) -> None:
+    if profile not in names:
+        raise WlmError(f"{codec}: unknown profile {profile!r}, expected one of {', '.join(names)}")
 
 
 def _prepare(frame: np.ndarray, mask: np.ndarray) -> np.ndarray:

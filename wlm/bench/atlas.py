@@ -135,7 +135,7 @@ def run_rivals(
     rows: list[Row] = []
     for lightmap in lightmaps:
         shares = {
-            row.option: row["bpp"] / SOURCE_BITS
+            row.option: _share(row)
             for row in ours
             if row.scene == lightmap.scene and row.option in _HELD_TO and row.get("bpp")
         }
@@ -179,7 +179,7 @@ def run_rows(
     for lightmap in lightmaps:
         bench = _AtlasBench(lightmap, device, progress, points, repeats)
         entries = bench.ours(profiles, whole)
-        shares = {entry.row.option: entry.share for entry in entries[: len(profiles)]}
+        shares = {entry.row.option: _share(entry.row) for entry in entries[: len(profiles)]}
         if lightmap is lightmaps[0]:
             entries += bench.tuned(entries)
         entries.append(bench.original(entries[0].model))
@@ -194,25 +194,26 @@ def plotted(rows: Sequence[Row]) -> list[Row]:
     return [row for row in rows if row.scene.startswith(MEAN)] or list(rows)
 
 
+def _share(row: Row) -> float:
+    """Bits of eq. 9 over the lightmap's."""
+    return row["bpp"] / SOURCE_BITS
+
+
 @dataclass(frozen=True, eq=False)
 class _Entry:
     """What a lightmap is measured with.
 
     Attributes:
         row: Without score, and before the timing without a decode time.
-        share: Bits of eq. 9 over the lightmap's.
         sample: The decoder to score; None: none.
         decode: The decoder to time; None: none.
         model: Ours.
-        full_size: Whether a rival has as many texels as the lightmap.
     """
 
     row: Row
-    share: float
     sample: Sampler | None = None
     decode: Callable[[], object] | None = None
     model: AtlasModel | None = None
-    full_size: bool = False
 
 
 class _AtlasBench(Bench):
@@ -232,9 +233,9 @@ class _AtlasBench(Bench):
         if whole and cascade is not None and profiles[0].method == "tiles":
             option = f"{profiles[0].name}, bits of {cascade.row.option}"
             try:
-                entries.append(self.entry(profiles[0].model_copy(update={"budget": cascade.share}), option))
+                entries.append(self.entry(profiles[0].model_copy(update={"budget": _share(cascade.row)}), option))
             except WlmError as error:  # no room for a table
-                entries.append(_Entry(self.missing_row("ours", option, error), cascade.share))
+                entries.append(_Entry(self.missing_row("ours", option, error)))
         return entries
 
     def entry(self, profile: Profile, option: str) -> _Entry:
@@ -243,14 +244,13 @@ class _AtlasBench(Bench):
         fit = self.fit(option, lambda: compress(self.mesh, profile, device=self.device))
         model = replace(fit.model, report=fit.fitted.report)  # the file leaves the stages' times out
         decode, errors = self._decode(model)
-        share = 1.0 - model.compression_ratio
         figures = {f"{stage}_seconds": seconds for stage, seconds in model.report["seconds"].items()}
         row = self.row(
             "ours",
             option,
             model.method,
             bytes=fit.bytes,
-            bpp=SOURCE_BITS * share,
+            bpp=SOURCE_BITS * (1.0 - model.compression_ratio),
             compression_ratio=model.compression_ratio,
             encode_seconds=fit.seconds,
             steps=profile.steps if profile.method == "cascade" else None,
@@ -261,7 +261,7 @@ class _AtlasBench(Bench):
             **errors,
             **figures,
         )
-        return _Entry(row, share, Decoder(model, self.device), decode, model)
+        return _Entry(row, Decoder(model, self.device), decode, model)
 
     def tuned(self, entries: Sequence[_Entry]) -> list[_Entry]:
         """A cascade tuned in either space."""
@@ -283,7 +283,7 @@ class _AtlasBench(Bench):
                 steps=alone.steps,
                 resolution=alone.resolution,
             )
-            tuned.append(_Entry(row, fit.share, fit.sample))
+            tuned.append(_Entry(row, fit.sample))
         return tuned
 
     def original(self, model: AtlasModel) -> _Entry:
@@ -299,7 +299,7 @@ class _AtlasBench(Bench):
         )
         decode, errors = self._decode(model)
         figures = {"bytes": model.texels.nbytes, "bpp": SOURCE_BITS, "compression_ratio": 0.0}
-        return _Entry(self.row("lightmap", "half floats", "as it is", **figures, **errors), 1.0, decode=decode)
+        return _Entry(self.row("lightmap", "half floats", "as it is", **figures, **errors), decode=decode)
 
     def timed(self, entries: Sequence[_Entry]) -> list[_Entry]:
         """Times the decoders of those that have one, in turns."""
@@ -326,16 +326,17 @@ class _AtlasBench(Bench):
                 if enough.get(method, math.inf) > share:
                     self.note(f"{method}, bits of {profile}")
                     entries.append(self._rival(method, f"bits of {profile}", share))
+                    row = entries[-1].row
                     # ASTC has other blocks for other budgets.
-                    if entries[-1].full_size and method != "ASTC":
-                        enough[method] = entries[-1].share
+                    if (row.get("colour_height"), row.get("colour_width")) == self.mesh.mask.shape and method != "ASTC":
+                        enough[method] = _share(row)
         return entries
 
     def _rival(self, method: str, option: str, share: float) -> _Entry:
         try:
             rival = RIVALS[_RIVALS[method]](self.mesh, share)
         except (WlmError, ValueError) as error:  # a package is missing, or nothing fits
-            return _Entry(self.missing_row(method, option, error), share)
+            return _Entry(self.missing_row(method, option, error))
         share = share_of(rival, self.mesh)
         height, width = rival.size or (None, None)
         row = self.row(
@@ -349,7 +350,7 @@ class _AtlasBench(Bench):
             colour_width=width,
             colour_height=height,
         )
-        return _Entry(row, share, rival.decoded, full_size=rival.size == self.mesh.mask.shape)
+        return _Entry(row, rival.decoded)
 
     def scored(self, entries: Sequence[_Entry], views: int, resolution: int) -> list[Row]:
         """Scores all in one go: each view is drawn once."""

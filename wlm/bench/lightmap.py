@@ -192,7 +192,7 @@ class _LightmapBench(Bench):
         row = self.row(
             "ours",
             fit.option,
-            f"{self.scored_at}errors of the float decode; time of the whole map to 8 bits, {self.replayed}",
+            f"{self.scored_at}errors of the float decode; time of the whole map to 8 bits, {self.mode}",
             bytes=fit.bytes,
             bpp=bits_per_texel(model, self.lightmaps.mask, fit.bytes),
             encode_seconds=fit.seconds,
@@ -221,7 +221,7 @@ class _LightmapBench(Bench):
             path,
             _GELUS[gelu],
             f"profile {fit.option}, GELU by {_GELUS[gelu]}{trained}; {self.scored_at}errors of the 8-bit output, the "
-            f"largest as a share of 255 at {_hours(self.error_times)}; time {self.replayed}",
+            f"largest as a share of 255 at {_hours(self.error_times)}; time {self.mode}",
             max_error=error,
             tiles_timed=len(timed.kind),
             # What an option costs shows in PSNR and in its largest error; FLIP would take most of the run.

@@ -105,8 +105,8 @@ def plot(rows: Sequence[Row], path: str | Path, x: str | Panel | Sequence[str | 
     from matplotlib.figure import Figure
 
     path = Path(path)
-    given = (x,) if isinstance(x, str | Panel) else x
-    panels = [Panel(panel) if isinstance(panel, str) else panel for panel in given]
+    quantities = (x,) if isinstance(x, str | Panel) else x
+    panels = [Panel(quantity) if isinstance(quantity, str) else quantity for quantity in quantities]
     if path.suffix.lower() not in (".png", ".svg", ".pdf"):
         raise WlmError(f"{path}: expected a picture's name that ends in .png, .svg or .pdf")
     scenes = list(dict.fromkeys(row.scene for row in rows))

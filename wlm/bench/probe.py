@@ -223,7 +223,7 @@ class _ProbeBench(Bench):
         row = self.row(
             "ours",
             fit.option,
-            f"time of all live probes, {self.replayed}",
+            f"time of all live probes, {self.mode}",
             encode_seconds=fit.seconds,
             steps=model.profile.steps,
             probes=report.live,
@@ -262,7 +262,7 @@ class _ProbeBench(Bench):
         row = self.row(
             "decode",
             option,
-            f"profile {fit.option}{spheres}; time of all live probes, {self.replayed}",
+            f"profile {fit.option}{spheres}; time of all live probes, {self.mode}",
             psnr=report.psnr,
             gaussians=decoder.model.count,
             list_entries=decoder.pairs,

@@ -76,22 +76,22 @@ def _group(rows: list[Row]) -> str:
     """One table if it fits the width; else several with fewer columns, and notes below them."""
     labels = [[row.method, row.option] if len({row.method for row in rows}) > 1 else [row.option] for row in rows]
     figures = {name: figure for table in TABLES.values() for name, figure in table.items()}
-    whole = _table(rows, labels, figures, "notes", [row.notes for row in rows])
+    whole = _table(figures, "notes", rows, labels, [row.notes for row in rows])
     if max(map(len, whole)) <= _WIDTH:
         return "\n".join([*whole, ""])
     notes = list(dict.fromkeys(row.notes for row in rows if row.notes))
     numbers = [str(notes.index(row.notes) + 1) if row.notes else "" for row in rows]
     parts = []
     for title, table in TABLES.items():
-        shown = [i for i, row in enumerate(rows) if not table.keys().isdisjoint(row.figures)]
-        if shown:
-            picked = [rows[i] for i in shown], [labels[i] for i in shown], table
-            parts += [f"{title}:\n", *_table(*picked, "note", [numbers[i] for i in shown]), ""]
+        measured = [i for i, row in enumerate(rows) if not table.keys().isdisjoint(row.figures)]
+        if measured:
+            columns = ([values[i] for i in measured] for values in (rows, labels, numbers))
+            parts += [f"{title}:\n", *_table(table, "note", *columns), ""]
     return "\n".join([*parts, *(f"{number}. {note}" for number, note in enumerate(notes, 1)), ""])
 
 
 def _table(
-    rows: Sequence[Row], labels: Sequence[list[str]], figures: Mapping[str, Figure], last: str, notes: Sequence[str]
+    figures: Mapping[str, Figure], last: str, rows: Sequence[Row], labels: Sequence[list[str]], notes: Sequence[str]
 ) -> list[str]:
     """The lines of a table, without the columns that no row fills."""
     figures = {name: figure for name, figure in figures.items() if any(name in row.figures for row in rows)}

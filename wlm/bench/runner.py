@@ -55,7 +55,7 @@ class Bench:
     Attributes:
         system, scene: Of the rows.
         device: "cpu" or "cuda:0".
-        replayed: How a replayed call ran, for the notes of a row.
+        mode: How a replayed call runs on this device, for the notes of a row.
     """
 
     def __init__(
@@ -91,7 +91,7 @@ class Bench:
         self._warmup = warmup if warmup is not None else 1 if slow else 5
         self._repeats = repeats if repeats is not None else 5 if slow else 30
         self._few = few
-        self.replayed = "one thread" if slow else "replayed as a graph"
+        self.mode = "one thread" if slow else "replayed as a graph"
 
     def note(self, line: str) -> None:
         """Reports what is done next."""

@@ -53,38 +53,23 @@ _EARLY = 0.35  # of the time before the first frame, where the smoke's source so
 
 @dataclass(frozen=True)
 class NetworkSizes:
-    """Grids, steps and repeats.
+    """Grids, steps and repeats."""
 
-    Attributes:
-        cells, refine: Cells of the air along the box's edge, and voxels along a cell's.
-        resolution: Pixels along an image's edge.
-        kinds: Kinds of scenes, one scene of each.
-        frames: Frames of each scene.
-        six, coarse: Steps in voxels of the fine march and of the coarse one, whose nodes are as far apart.
-        swept: Steps of the coarse march and distances of its nodes, in voxels.
-        turns: Angles between the camera and the one that a flip book was baked from, in degrees.
-        scales: Factors on the density.
-        profile: Pixels along the edge of the images that profiles are timed with.
-        samples: Samples per pixel of the path tracer.
-        warmup, repeats: Calls before the first that is timed, and samples.
-        few: Samples of calls that take long.
-    """
-
-    cells: int
-    refine: int
-    resolution: int
-    kinds: tuple[str, ...]
-    frames: int
-    six: tuple[float, ...]
-    coarse: tuple[float, ...]
-    swept: tuple[tuple[float, float], ...]
-    turns: tuple[float, ...]
-    scales: tuple[float, ...]
-    profile: int
-    samples: tuple[int, ...]
-    warmup: int
-    repeats: int
-    few: int
+    cells: int  # of the air along the box's edge
+    refine: int  # voxels along a cell's edge
+    resolution: int  # pixels along an image's edge
+    kinds: tuple[str, ...]  # of scenes, one scene of each
+    frames: int  # of each scene
+    six: tuple[float, ...]  # steps in voxels of the fine march
+    coarse: tuple[float, ...]  # and of the coarse one, whose nodes are as far apart
+    swept: tuple[tuple[float, float], ...]  # steps of the coarse march and distances of its nodes
+    turns: tuple[float, ...]  # degrees between the camera and the one that a flip book was baked from
+    scales: tuple[float, ...]  # factors on the density
+    profile: int  # pixels along the edge of the images that profiles are timed with
+    samples: tuple[int, ...]  # per pixel, of the path tracer
+    warmup: int  # calls before the first that is timed
+    repeats: int  # samples of a time
+    few: int  # samples of a time that is long
 
 
 FULL = NetworkSizes(

@@ -12,49 +12,28 @@ __all__ = ["FULL", "QUICK", "Sizes", "SmokeBench"]
 
 @dataclass(frozen=True)
 class Sizes:
-    """Grids, steps and repeats.
+    """Grids, steps and repeats."""
 
-    Attributes:
-        lattice, small: Cells along an edge of the large and the small lattice.
-        chunk: Steps of a lattice that are timed as one.
-        compared: Steps after which velocities of 16 and 32 bits are compared.
-        drift: Steps after which the drift of the mass is measured.
-        fills: Shares of the domain in which there is smoke.
-        coarse: Cells of velocity along an edge, each four voxels of smoke along its edge.
-        cloud: Voxels along an edge of what is marched through.
-        resolution: Pixels along an edge of the image.
-        exact: The step in voxels of the march that guiding maps are compared with.
-        guide_shared, guide_alone: Steps of the guiding map, with marches to the lights that pixels share, or with one
-            for each pixel.
-        six: Steps of the six-way march; the shortest is last.
-        plume: Pixels along an edge of the image of the plume.
-        scale: Cells of the scene, as a multiple of its own.
-        frames: Frames of the scene before the one that is timed.
-        warmup, repeats: Calls before the first that is timed, and samples.
-        few: Samples of calls that take long.
-        every: Include slow-to-compile cases of minor interest.
-    """
-
-    lattice: int
-    small: int
-    chunk: int
-    compared: tuple[int, ...]
-    drift: int
-    fills: tuple[float, ...]
-    coarse: int
-    cloud: int
-    resolution: int
-    exact: float
-    guide_shared: tuple[float, ...]
-    guide_alone: tuple[float, ...]
-    six: tuple[float, ...]
-    plume: int
-    scale: float
-    frames: int
-    warmup: int
-    repeats: int
-    few: int
-    every: bool
+    lattice: int  # cells along an edge of the large lattice
+    small: int  # and of the small one
+    chunk: int  # steps of a lattice that are timed as one
+    compared: tuple[int, ...]  # steps after which velocities of 16 and 32 bits are compared
+    drift: int  # steps after which the drift of the mass is measured
+    fills: tuple[float, ...]  # shares of the domain in which there is smoke
+    coarse: int  # cells of velocity along an edge, each four voxels of smoke along its edge
+    cloud: int  # voxels along an edge of the cloud
+    resolution: int  # pixels along an edge of its image
+    exact: float  # step in voxels of the march that guiding maps are compared with
+    guide_shared: tuple[float, ...]  # steps of guiding maps whose pixels share marches to the lights
+    guide_alone: tuple[float, ...]  # and of those with one for each pixel
+    six: tuple[float, ...]  # steps of the six-way march; the shortest is last
+    plume: int  # pixels along an edge of the image of the plume
+    scale: float  # of the scene's cells
+    frames: int  # of the scene before the one that is timed
+    warmup: int  # calls before the first that is timed
+    repeats: int  # samples of a time
+    few: int  # samples of a time that is long
+    every: bool  # include slow-to-compile cases of minor interest
 
 
 FULL = Sizes(

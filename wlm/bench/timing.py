@@ -1,7 +1,7 @@
 """How long a call takes, on the CPU or on a CUDA device.
 
-A number here is the time of one call among many made back to back, after a warm-up that compiles kernels and
-fills caches. On CUDA that includes the launch wherever launching takes longer than the kernels; capture the
+A number here is the time of one call among many, back to back, after a warm-up that compiles kernels and fills
+caches. On CUDA that includes the launch wherever launching takes longer than the kernels; capture the
 call in a graph to leave it out.
 """
 
