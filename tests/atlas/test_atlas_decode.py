@@ -141,9 +141,9 @@ def test_the_front_door(tmp_path, monkeypatch):
 def test_another_mesh_is_refused():
     model = models(sheet)["tiles"]
     line = "sheet: expected the mesh and lightmap that the model was made of"
-    for other in (sheet(height=41), sheet(lambda place: place[..., :1] * np.ones(3)), sheet(quads=5)):
+    for mesh in (sheet(height=41), sheet(lambda place: place[..., :1] * np.ones(3)), sheet(quads=5)):
         with pytest.raises(WlmError, match=line):
-            Decoder(model).lightmap(other)
+            Decoder(model).lightmap(mesh)
     with pytest.raises(WlmError, match="device 'tpu'"):
         Decoder(model, "tpu")
 

@@ -139,8 +139,8 @@ def _least_squares(tiles: grid.Tiles, nx: int, ny: int, pull: float) -> np.ndarr
 def _error(tiles: grid.Tiles, samples: np.ndarray) -> np.ndarray:
     """Weighted squared error of each tile in float64."""
     count, ny, nx, _ = samples.shape
-    shown = _kron(nx, ny, grid.SUPERSAMPLING * tiles.size) @ samples.reshape(count, ny * nx, 3)
-    each = ((shown - tiles.light.double().numpy().transpose(0, 2, 1)) ** 2).mean(2)
+    interpolated = _kron(nx, ny, grid.SUPERSAMPLING * tiles.size) @ samples.reshape(count, ny * nx, 3)
+    each = ((interpolated - tiles.light.double().numpy().transpose(0, 2, 1)) ** 2).mean(2)
     return (each * tiles.weight.double().numpy()).sum(1)
 
 
@@ -208,9 +208,9 @@ def test_errors_are_those_of_the_decoder():
     model = AtlasModel(*settings, texels, lut=lut)
     x, y = _places(tiles, rows, columns)
     uv = np.stack([(x.ravel() + 0.5) / width, (y.ravel() + 0.5) / height], 1).astype(np.float32)
-    shown = Decoder(model).read(torch.from_numpy(uv)).double().numpy().reshape(len(tiles.index), -1, 3)
+    decoded = Decoder(model).read(torch.from_numpy(uv)).double().numpy().reshape(len(tiles.index), -1, 3)
     light = tiles.light.double().numpy().transpose(0, 2, 1)
-    expected = (((shown - light) ** 2).mean(2) * tiles.weight.double().numpy()).sum(1)
+    expected = (((decoded - light) ** 2).mean(2) * tiles.weight.double().numpy()).sum(1)
     np.testing.assert_allclose(grid.errors(tiles, samples.float()).numpy(), expected, rtol=2e-3)
 
 
@@ -237,8 +237,8 @@ def test_curves_and_solved():
 def _brute(error: np.ndarray, cost: np.ndarray, budget: float) -> float:
     """The least error of all choices within a budget."""
     number = np.arange(error.shape[1])
-    choices = (np.array(one) for one in itertools.product(range(len(cost)), repeat=error.shape[1]))
-    return min(error[one, number].sum() for one in choices if cost[one].sum() <= budget)
+    choices = (np.array(choice) for choice in itertools.product(range(len(cost)), repeat=error.shape[1]))
+    return min(error[choice, number].sum() for choice in choices if cost[choice].sum() <= budget)
 
 
 @pytest.mark.parametrize("seed", range(6))
