@@ -57,10 +57,10 @@ def run(out: Path, device: str) -> dict[str, dict[str, float]]:
         decoder = model.decoder(device)
         rival = downsampling(mesh, 1.0 - model.compression_ratio)
         report = wlm.atlas.evaluate(model, mesh, **options)
-        score = wlm.atlas.compare(mesh, {"rival": rival.sample}, **options)["rival"]
+        score = wlm.atlas.compare(mesh, {"rival": rival.decoded}, **options)["rival"]
         figures[name] = _figures(report, score) | {"seconds to compress": seconds}
         if name == "standard":
-            drawn = {"decoded": decoder, "downsampled": rival.sample}
+            drawn = {"decoded": decoder, "downsampled": rival.decoded}
             _check_rebuilt(decoder.lightmap(mesh), mesh)
     atomic_write(out / "room_report.json", (json.dumps(figures, indent=1) + "\n").encode())
     comparison(out / "room.png", mesh, drawn, DRAWN, resolution=640, device=device)

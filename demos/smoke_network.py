@@ -17,7 +17,7 @@ import argparse
 import json
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -28,19 +28,21 @@ from wlm.fluid.volume import DensityVolume
 from wlm.formats.atomic import atomic_write
 from wlm.interop import check_device
 from wlm.metrics.error import psnr_from_mse
-from wlm.smoke.baking import SixWay, six_way
+from wlm.smoke.baking import bake
 from wlm.smoke.camera import DIRECTIONS, Camera
-from wlm.smoke.coarse import coarse_six_way
-from wlm.smoke.codec import load_network, settings_of, shipped
-from wlm.smoke.data import open_footage, open_frames
-from wlm.smoke.decode import Predictor, predict
-from wlm.smoke.fit import NetworkProfile, train
-from wlm.smoke.guide import guide
-from wlm.smoke.learn.dataset import DatasetSettings, make_pool, make_validation
+from wlm.smoke.coarse import march
+from wlm.smoke.codec import open_network
+from wlm.smoke.data import load_frames, open_frames
+from wlm.smoke.fit import train
+from wlm.smoke.guiding import guide
+from wlm.smoke.lightmaps import SixWay
+from wlm.smoke.model import Profile, SmokeModel
 from wlm.smoke.planes import EMISSION_PLANE, encode_lightmaps
+from wlm.smoke.prediction import SmokePredictor
 from wlm.smoke.scene import Grid, LightSettings, Scene, load_scene, make_camera
-from wlm.smoke.simulate import simulate
+from wlm.smoke.simulation import simulate
 from wlm.view.smoke import contact_sheet, picture, to_bytes, write_sequence
+from wlm_kernels.smoke.settings import March
 
 HERE = Path(__file__).resolve().parent
 SCALE, REFINE, SUBSTEPS = 0.24, 2, 4
@@ -49,13 +51,13 @@ RESOLUTION, FRAMES = 128, 6
 RATES = {"jet-sphere": 1.5, "jet-moving": 1.5, "explosion": 6.0}  # frames a second
 TURNED, TURN = "jet-sphere", 90.0  # degrees by which its camera turns; its lights turn the other way
 
-# What has to be reached on each scene, dB in sRGB: by the network that comes with wlm, by the one that is trained here,
-# and by another; some decibels below what the first two reach on the worst of the scenes.
+# Least PSNR on each scene, dB in sRGB: of the network that comes with wlm, of the one trained here, and of any other;
+# some decibels below what the first two reach on the worst of the scenes.
 LEAST_SHIPPED, LEAST_TRAINED, LEAST_OTHER = 43.0, 42.0, 20.0
-# Of which light a network may leave where the fine march sees no smoke, the mean.
+# Largest mean light of a network's lightmaps where the fine march sees no smoke.
 MOST_STRAY = 1e-3
 
-SMALL = NetworkProfile.model_validate(
+SMALL = Profile.model_validate(
     {
         "name": "demo",
         "network": {"guide": "six", "width": 8, "levels": 3, "stem": 2},
@@ -75,53 +77,43 @@ SMALL = NetworkProfile.model_validate(
 )
 
 
-@dataclass(frozen=True)
-class Ways:
-    """What makes lightmaps of smoke, by name, of one network."""
-
-    predictor: Predictor
-    settings: DatasetSettings
-
-    def of(self, volume: DensityVolume, camera: Camera, frame: int) -> dict[str, SixWay]:
-        """Lightmaps by the fine march, the network and the coarse march."""
-        look = self.settings.look(volume.shape) | {"seed": frame}
-        return {
-            "reference": six_way(volume, camera, step=STEP, estimate=False),
-            "network": predict(volume, camera, self.predictor, **look),
-            "coarse march": coarse_six_way(volume, camera, **look).six,
-        }
+def render(
+    volume: DensityVolume, camera: Camera, model: SmokeModel, predictor: SmokePredictor, seed: int
+) -> dict[str, SixWay]:
+    """Lightmaps by the fine march, the network and the coarse march that is its guide."""
+    return {
+        "reference": bake(volume, camera, step=STEP, estimate=False),
+        "network": predictor(volume, camera, seed),
+        "coarse march": march(volume, camera, model.dataset.look(volume.shape, seed)),
+    }
 
 
-def trained(out: Path, device: str) -> Path:
-    """Trains a small network."""
-    path = out / "network.safetensors"
-    train(path, SMALL, make_pool=make_pool, make_validation=make_validation, device=device)
-    return path
-
-
-def light(out: Path, name: str, scene: Scene, ways: Ways, least: float, turn: float, device: str) -> dict[str, float]:
-    """Simulates a scene, lights its frames in each way, and says how far they are from the fine march."""
+def light(
+    out: Path, name: str, scene: Scene, model: SmokeModel, least: float, turn: float, device: str
+) -> dict[str, float]:
+    """Simulates a scene, lights its frames by each method, and scores these against the fine march."""
+    predictor = SmokePredictor(model, device)
     simulate(open_frames(out / name, scene), device=device)
-    footage = open_footage(out / name, device=device)
+    footage = load_frames(out / name, device=device)
     rows: dict[str, list[np.ndarray]] = {}
     scores: dict[str, list[float]] = {}
     for number in footage.numbers:
         volume, share = footage.load(number), (number - 1) / (FRAMES - 1)
         camera = make_camera(scene.camera.turned(turn * share), scene.grid.origin, scene.grid.size)
-        lights = [turned(given, -2.0 * turn * share).light() for given in scene.lights]
-        shown = {"background": scene.background, "obstacles": scene.obstacles, "time": scene.time(number)}
-        if scene.obstacles:
-            shown["depth"] = guide(volume, camera, step=1.0, jitter=0.0).depth
-        made = ways.of(volume, camera, number)
-        for way, six in made.items():
-            rows.setdefault(way, []).append(to_bytes(picture(six, camera, lights, ramp=scene.smoke.ramp, **shown)))
-            if way != "reference":
-                for what, value in psnr(six, made["reference"]).items():
-                    scores.setdefault(f"{way}, {what}dB", []).append(value)
-        check_clear(f"{name}, frame {number}", made["network"], made["reference"])
-    write_sequence(out / f"{name}_frames", [np.concatenate(beside, 1) for beside in zip(*rows.values(), strict=True)])
+        lights = [turned(settings, -2.0 * turn * share).light() for settings in scene.lights]
+        options = {"background": scene.background, "obstacles": scene.obstacles, "time": scene.time(number)}
+        depth = guide(volume, camera, March(1.0, jitter=0.0)).depth if scene.obstacles else None
+        lightmaps = render(volume, camera, model, predictor, number)
+        for method, six in lightmaps.items():
+            image = picture(replace(six, depth=depth), lights, ramp=scene.smoke.ramp, **options)
+            rows.setdefault(method, []).append(to_bytes(image))
+            if method != "reference":
+                for what, value in psnr(six, lightmaps["reference"]).items():
+                    scores.setdefault(f"{method}, {what}dB", []).append(value)
+        check_clear(f"{name}, frame {number}", lightmaps["network"], lightmaps["reference"])
+    write_sequence(out / f"{name}_frames", [np.concatenate(images, 1) for images in zip(*rows.values(), strict=True)])
     contact_sheet(out / f"{name}.png", rows, [f"{scene.time(number):.2g} s" for number in footage.numbers])
-    mean = {way: sum(values) / len(values) for way, values in scores.items()}
+    mean = {method: sum(values) / len(values) for method, values in scores.items()}
     if not mean["network, dB"] >= least:
         raise WlmError(f"demo: {name}: expected the network to reach {least} dB, got {mean['network, dB']:.2f}")
     return mean | {"network's worst frame, dB": min(scores["network, dB"])}
@@ -149,20 +141,20 @@ def turned(light: LightSettings, degrees: float) -> LightSettings:
     return light.model_copy(update={"toward": tuple(map(float, around))})
 
 
-def psnr(made: SixWay, wanted: SixWay) -> dict[str, float]:
-    """Of the six lightmaps in sRGB, and of the emission if there is any, by what they are of."""
-    off = (encode_lightmaps(made) - encode_lightmaps(wanted)).square()
-    found = {"": psnr_from_mse(float(off[: len(DIRECTIONS)].mean()), 1.0)}
-    if wanted.emission is not None:
-        found["emission, "] = psnr_from_mse(float(off[EMISSION_PLANE].mean()), 1.0)
-    return found
+def psnr(predicted: SixWay, target: SixWay) -> dict[str, float]:
+    """Of the six lightmaps in sRGB, and of the emission if there is any."""
+    off = (encode_lightmaps(predicted) - encode_lightmaps(target)).square()
+    values = {"": psnr_from_mse(float(off[: len(DIRECTIONS)].mean()), 1.0)}
+    if target.emission is not None:
+        values["emission, "] = psnr_from_mse(float(off[EMISSION_PLANE].mean()), 1.0)
+    return values
 
 
-def check_clear(name: str, made: SixWay, wanted: SixWay) -> None:
-    """A network has to leave black what has no smoke."""
-    clear = wanted.transparency > 0.999
+def check_clear(name: str, predicted: SixWay, target: SixWay) -> None:
+    """Checks that a network leaves black what has no smoke."""
+    clear = target.transparency > 0.999
     if clear.any():
-        stray = made.lightmaps[:, clear].mean(1)
+        stray = predicted.lightmaps[:, clear].mean(1)
         for direction, light in zip(DIRECTIONS, stray.tolist(), strict=True):
             if not light <= MOST_STRAY:
                 raise WlmError(f"demo: {name}: {direction}: expected no light beside the smoke, got {light:.3g}")
@@ -186,22 +178,19 @@ def main() -> None:
         args.out.mkdir(parents=True, exist_ok=True)
         device = check_device(args.device)
         if args.train:
-            path, least = trained(args.out, device), LEAST_TRAINED
+            model, least = train(SMALL, args.out / "network.safetensors", device=device).model, LEAST_TRAINED
         else:
-            path, least = (args.network, LEAST_OTHER) if args.network else (shipped(), LEAST_SHIPPED)
-        network, summary = load_network(path)
-        size = (args.resolution, args.resolution)
-        ways = Ways(Predictor(network, *size, device=device), settings_of(path, summary))
+            model, least = open_network(args.network), LEAST_OTHER if args.network else LEAST_SHIPPED
         figures = {}
         for name in RATES:
             scene = few_frames(name, args.scale, args.refine, args.resolution)
             turn = TURN if name == TURNED else 0.0
-            figures[name] = light(args.out, name, scene, ways, least, turn, device)
+            figures[name] = light(args.out, name, scene, model, least, turn, device)
         figures["all"] = {"seconds": time.perf_counter() - clock}
         atomic_write(args.out / "report.json", (json.dumps(figures, indent=1) + "\n").encode())
     except (WlmError, OSError) as error:
         sys.exit(f"error: {error}")
-    rows = [(name, *figure) for name, found in figures.items() for figure in found.items()]
+    rows = [(name, *figure) for name, values in figures.items() for figure in values.items()]
     show_figures(str(args.out), ["", "", "value"], rows, text=[""])
 
 

@@ -228,8 +228,9 @@ def check_parts(tensors: Mapping[str, np.ndarray], table: Mapping[str, Part]) ->
         # An optional part is whole or not there.
         absent = part.optional and value.size == 0
         if value.dtype not in kinds or not (fits or absent):
-            expected = f"{' or '.join(np.dtype(kind).name for kind in kinds)} ({', '.join('any' if n is None else str(n) for n in part.shape)})"
-            raise ValueError(f"part {name} is {value.dtype} {sizes}, expected {expected}")
+            types = " or ".join(np.dtype(kind).name for kind in kinds)
+            shape = ", ".join("any" if size is None else str(size) for size in part.shape)
+            raise ValueError(f"part {name} is {value.dtype} {sizes}, expected {types} ({shape})")
         if value.dtype.kind == "f" and not np.isfinite(value).all():
             raise ValueError(f"part {name}: expected finite numbers, found NaN or infinity")
         parts[name] = value

@@ -1,25 +1,20 @@
 """Bodies of native functions: CUDA C++ in files of its own, in the folder ``native`` beside the kernels that use it."""
 
 from importlib import resources
-from string import Template
 
 __all__ = ["native_source"]
 
 
-def native_source(package: str, name: str, **numbers: int) -> str:
-    """Reads the body of a native function for ``wp.func_native``.
+def native_source(package: str, name: str, **constants: int) -> str:
+    """Reads the body of a native function for ``wp.func_native``, or a part of one.
 
     Args:
-        package: The package whose folder ``native`` has the file: ``__package__`` of the kernels.
-        name: The file is ``NAME.cuh``: comments, an empty line, then code, indented as a function's body is.
-        numbers: By name, what the ``$name``s in the code stand for.
+        package: The package whose folder ``native`` has the file ``NAME.cuh``: ``__package__`` of the kernels.
+        name: See ``package``.
+        constants: Integers that the code uses, by name.
 
     Returns:
-        The code. What stands above the file's first empty line explains it and is left out.
-
-    Raises:
-        KeyError: The code has a name that ``numbers`` lacks.
+        The constants' declarations and the file.
     """
-    text = (resources.files(package) / "native" / f"{name}.cuh").read_text(encoding="utf-8")
-    _, code = text.split("\n\n", 1)
-    return f"\n{Template(code).substitute(numbers)}    "
+    declarations = (f"constexpr int {key} = {value};\n" for key, value in constants.items())
+    return "".join(declarations) + (resources.files(package) / "native" / f"{name}.cuh").read_text(encoding="utf-8")

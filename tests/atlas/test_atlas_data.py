@@ -277,8 +277,8 @@ def test_a_mesh_is_written_with_new_uvs(tmp_path):
     assert again.uv_set == 1 and len(again.position) == 4
     np.testing.assert_array_equal(again.uv[again.triangle], corner_uv + 0.0)
     np.testing.assert_array_equal(again.position[again.triangle], POSITION[TRIANGLE])
-    kept = load(tmp_path / "out.glb", files[1], uv_set=0)
-    np.testing.assert_array_equal(kept.uv[kept.triangle], UV[TRIANGLE])
+    original = load(tmp_path / "out.glb", files[1], uv_set=0)
+    np.testing.assert_array_equal(original.uv[original.triangle], UV[TRIANGLE])
     corner_uv[1, 0] = 0.25
     assert write_mesh(tmp_path / "out.glb", again, corner_uv) == 2
     assert len(load(tmp_path / "out.glb", files[1], uv_set=2).position) == 5
@@ -297,8 +297,8 @@ def test_what_came_from_an_obj_is_written_as_glb(tmp_path):
     again = load(tmp_path / "out.glb", tmp_path / "light.exr")
     np.testing.assert_array_equal(again.uv, UV * 0.5)
     trimesh = pytest.importorskip("trimesh")
-    (other,) = trimesh.load(tmp_path / "out.glb").geometry.values()
-    np.testing.assert_array_equal(other.vertices[other.faces], POSITION[TRIANGLE])
+    (loaded,) = trimesh.load(tmp_path / "out.glb").geometry.values()
+    np.testing.assert_array_equal(loaded.vertices[loaded.faces], POSITION[TRIANGLE])
 
 
 def test_texels_touched_and_covered_as_by_cutting_polygons():
@@ -360,14 +360,14 @@ def _area_within(corner: np.ndarray, x: int, y: int) -> float:
     """Area of a triangle within the unit square at (x, y), by cutting it along the square's four sides."""
     polygon = list(corner)
     for axis, sign, limit in ((0, 1, x), (0, -1, -x - 1), (1, 1, y), (1, -1, -y - 1)):
-        kept = []
+        clipped = []
         for a, b in zip(polygon, polygon[1:] + polygon[:1], strict=True):
             inside_a, inside_b = sign * a[axis] - limit, sign * b[axis] - limit
             if inside_a >= 0:
-                kept.append(a)
+                clipped.append(a)
             if inside_a * inside_b < 0:
-                kept.append(a + (b - a) * inside_a / (inside_a - inside_b))
-        polygon = kept
+                clipped.append(a + (b - a) * inside_a / (inside_a - inside_b))
+        polygon = clipped
         if not polygon:
             return 0.0
     px, py = np.array(polygon).T

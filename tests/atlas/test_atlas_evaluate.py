@@ -1,4 +1,4 @@
-"""Scoring a decoded lightmap: known errors, the metrics that others compute, seams, and every stated behaviour."""
+"""Scoring a decoded lightmap: known errors, agreement with ``wlm.metrics``, seams, and every stated behaviour."""
 
 import json
 import math
@@ -62,8 +62,8 @@ def test_a_known_error(device):
     mesh = lit_cube()
     report = _one(mesh, _reader(mesh, _offset(0.01)), device=device)
     colours = []
-    for seen, _, uv in visible_uv(mesh, FACES, 64, "cpu"):
-        colours.append(raster.texture(torch.tensor(mesh.filled), uv[seen >= 0]))
+    for visible, _, uv in visible_uv(mesh, FACES, 64, "cpu"):
+        colours.append(raster.texture(torch.tensor(mesh.filled), uv[visible >= 0]))
     peak = float(torch.cat(colours).max() - torch.cat(colours).min())
     expected = 20.0 * math.log10(peak / 0.01)
     assert report.peak == pytest.approx(peak, rel=1e-6) and 1.5 < peak < 2.1
@@ -82,11 +82,11 @@ def test_against_the_metrics_of_pictures(device, resolution):
 
     report = _one(mesh, blurred, views=views, resolution=resolution, device=device)
     psnr, ssim = [], []
-    for seen, _, uv in visible_uv(mesh, views, resolution, "cpu"):
+    for visible, _, uv in visible_uv(mesh, views, resolution, "cpu"):
         images = torch.tensor(mesh.filled), small
         pictures = [raster.texture(image, uv).numpy() for image in images]
-        psnr.append(metrics.psnr(*pictures, seen.numpy() >= 0, peak=report.peak))
-        ssim.append(metrics.ssim(*pictures, seen.numpy() >= 0, data_range=report.peak))
+        psnr.append(metrics.psnr(*pictures, visible.numpy() >= 0, peak=report.peak))
+        ssim.append(metrics.ssim(*pictures, visible.numpy() >= 0, data_range=report.peak))
     assert report.psnr == pytest.approx(np.mean(psnr), abs=1e-4)
     assert report.psnr_worst == pytest.approx(min(psnr), abs=1e-4) and report.worst_view == np.argmin(psnr)
     assert 0.01 < report.one_minus_ssim == pytest.approx(1.0 - np.mean(ssim), abs=1e-4)
@@ -171,8 +171,8 @@ def test_two_sheets_apart_have_no_seam_where_one_ends_before_the_other():
     position = np.concatenate([SQUARE * [0.5, 0.5, 1] + [0, 0, 0.5], SQUARE - [0, 0, 0.5]])
     uv = np.concatenate([SQUARE_UV * [0.4, 1], SQUARE_UV * [0.4, 1] + [0.6, 0]])
     mesh = from_arrays(position, np.concatenate([TWO, TWO + 4]), uv, waves())
-    ((seen, _, _),) = visible_uv(mesh, [View.of([0, 0, 1])], 64, "cpu")
-    assert {0, 1, 2, 3} <= set(seen.unique().tolist())
+    ((visible, _, _),) = visible_uv(mesh, [View.of([0, 0, 1])], 64, "cpu")
+    assert {0, 1, 2, 3} <= set(visible.unique().tolist())
     assert math.isnan(_one(mesh, _reader(mesh, _offset(0.1)), views=[View.of([0, 0, 1])]).seam_error)
 
 

@@ -1,4 +1,4 @@
-"""Tiles at their own resolutions: cutting, least squares, the choice of sizes and where they are put."""
+"""Tiles at their own resolutions: cutting, least squares, allocation of sizes and packing."""
 
 import itertools
 
@@ -8,7 +8,7 @@ import torch
 
 from wlm.atlas import tiles as grid
 from wlm.atlas.decode import Decoder
-from wlm.atlas.model import AtlasModel, Profile, pack_entries, unpack_entries
+from wlm.atlas.model import AtlasModel, Profile, pack_entries, tile_counts, unpack_entries
 
 RANDOM = np.random.default_rng(11)
 
@@ -61,14 +61,13 @@ def test_cut_reads_the_light_between_texels(height: int, width: int):
     size = 7
     image, weight = _image(height, width), _weight(height, width)
     tiles = grid.cut(image, weight, size, "cpu")
-    rows, columns = grid.tile_counts(height, width, size)
+    rows, columns = tile_counts(height, width, size)
     assert (rows, columns) == (max(1, -(-(height - 1) // size)), max(1, -(-(width - 1) // size)))
     assert len(tiles.index) == rows * columns and tiles.light.shape == (rows * columns, 3, (2 * size) ** 2)
     x, y = _places(tiles, rows, columns)
     chosen = RANDOM.integers(0, x.size, 200)
-    want = _bilinear(image, x.flat[chosen], y.flat[chosen])
-    got = tiles.light.permute(0, 2, 1).reshape(-1, 3).numpy()[chosen]
-    np.testing.assert_allclose(got, want, atol=1e-6)
+    light = tiles.light.permute(0, 2, 1).reshape(-1, 3).numpy()[chosen]
+    np.testing.assert_allclose(light, _bilinear(image, x.flat[chosen], y.flat[chosen]), atol=1e-6)
 
 
 @pytest.mark.parametrize(("height", "width"), SIZES)
@@ -77,21 +76,21 @@ def test_cut_keeps_all_weight(height: int, width: int):
     weight = _weight(height, width)
     tiles = grid.cut(_image(height, width), weight, 7, "cpu")
     assert float(tiles.weight.double().sum()) == pytest.approx(1.0, abs=1e-5)
-    rows, columns = grid.tile_counts(height, width, 7)
+    rows, columns = tile_counts(height, width, 7)
     x, y = _places(tiles, rows, columns)
-    got = np.zeros((max(1, 2 * height - 2), max(1, 2 * width - 2)))
+    total = np.zeros((max(1, 2 * height - 2), max(1, 2 * width - 2)))
     row, column = (np.rint(2 * place - 0.5).astype(int).ravel() for place in (y, x))
     values = tiles.weight.numpy().ravel()
-    inside = (row < got.shape[0]) & (column < got.shape[1])
+    inside = (row < total.shape[0]) & (column < total.shape[1])
     assert not values[~inside].any()
-    np.add.at(got, (row[inside], column[inside]), values[inside])
-    want = np.zeros_like(got)
-    own = [np.clip(np.arange(2 * n) - 1, 0, m - 1) for n, m in ((height, got.shape[0]), (width, got.shape[1]))]
-    np.add.at(want, (own[0][:, None], own[1][None, :]), weight / weight.sum())
-    np.testing.assert_allclose(got, want, atol=1e-7)
+    np.add.at(total, (row[inside], column[inside]), values[inside])
+    expected = np.zeros_like(total)
+    rows, columns = (np.clip(np.arange(2 * n) - 1, 0, m - 1) for n, m in zip((height, width), total.shape, strict=True))
+    np.add.at(expected, (rows[:, None], columns[None, :]), weight / weight.sum())
+    np.testing.assert_allclose(total, expected, atol=1e-7)
 
 
-def test_cut_leaves_out_what_does_not_count():
+def test_cut_leaves_out_tiles_without_weight():
     weight = np.zeros((60, 60))
     weight[31, 45] = 5.0  # 15.25 and 22.25 texels from the first centre
     tiles = grid.cut(_image(30, 30), weight, 7, "cpu")
@@ -140,8 +139,8 @@ def _least_squares(tiles: grid.Tiles, nx: int, ny: int, pull: float) -> np.ndarr
 def _error(tiles: grid.Tiles, samples: np.ndarray) -> np.ndarray:
     """Weighted squared error of each tile in float64."""
     count, ny, nx, _ = samples.shape
-    shown = _kron(nx, ny, grid.SUPERSAMPLING * tiles.size) @ samples.reshape(count, ny * nx, 3)
-    each = ((shown - tiles.light.double().numpy().transpose(0, 2, 1)) ** 2).mean(2)
+    interpolated = _kron(nx, ny, grid.SUPERSAMPLING * tiles.size) @ samples.reshape(count, ny * nx, 3)
+    each = ((interpolated - tiles.light.double().numpy().transpose(0, 2, 1)) ** 2).mean(2)
     return (each * tiles.weight.double().numpy()).sum(1)
 
 
@@ -151,31 +150,31 @@ SHAPES = [(1, 1), (2, 1), (1, 3), (3, 2), (4, 4), (5, 8), (8, 8)]
 @pytest.mark.parametrize(("nx", "ny"), SHAPES)
 def test_solve_against_dense_least_squares(nx: int, ny: int):
     tiles = _tiles(12, 7)
-    got, want = grid.solve(tiles, nx, ny).double().numpy(), _least_squares(tiles, nx, ny, grid._RIDGE)
-    np.testing.assert_allclose(got, want, atol=2e-3)
-    # The pull costs next to nothing where all is seen.
-    free = _error(tiles, _least_squares(tiles, nx, ny, 0.0))
-    assert (_error(tiles, got) <= free * 1.002 + 1e-12).all()
-    np.testing.assert_allclose(grid.errors(tiles, torch.from_numpy(got).float()).numpy(), _error(tiles, got), rtol=1e-4)
+    samples = grid.solve(tiles, nx, ny).double().numpy()
+    np.testing.assert_allclose(samples, _least_squares(tiles, nx, ny, grid._RIDGE), atol=2e-3)
+    # The ridge costs next to nothing where every point has a weight.
+    error, least = _error(tiles, samples), _error(tiles, _least_squares(tiles, nx, ny, 0.0))
+    assert (error <= least * 1.002 + 1e-12).all()
+    np.testing.assert_allclose(grid.errors(tiles, torch.from_numpy(samples).float()).numpy(), error, rtol=1e-4)
 
 
 @pytest.mark.parametrize(("nx", "ny"), SHAPES)
-def test_solve_where_little_is_seen(nx: int, ny: int):
-    """Weights of zero but for a corner, a column, a point: what is seen is met, the rest stays near the light."""
+def test_solve_with_few_weights(nx: int, ny: int):
+    """Weights of zero but for a corner, a column, a point: these are fitted, the rest stays near the light."""
     m = 2 * 7
     weight = np.zeros((3, m, m))
     weight[0, :4, :5] = RANDOM.random((4, 5)) + 0.1
     weight[1, :, -1] = 1.0
     weight[2, 6, 9] = 1.0
     tiles = _tiles(3, 7, weight.reshape(3, -1))
-    got = grid.solve(tiles, nx, ny).double().numpy()
-    assert np.isfinite(got).all()
+    samples = grid.solve(tiles, nx, ny).double().numpy()
+    assert np.isfinite(samples).all()
     best = _error(tiles, _least_squares(tiles, nx, ny, grid._RIDGE))
-    assert (_error(tiles, got) <= best * 1.05 + 1e-7).all()
+    assert (_error(tiles, samples) <= best * 1.05 + 1e-7).all()
     light = tiles.light.numpy()
     low, high = light.min((1, 2)), light.max((1, 2))
-    room = (high - low) * 1.0
-    assert ((got.min((1, 2, 3)) > low - room) & (got.max((1, 2, 3)) < high + room)).all()
+    margin = high - low
+    assert ((samples.min((1, 2, 3)) > low - margin) & (samples.max((1, 2, 3)) < high + margin)).all()
 
 
 @pytest.mark.parametrize("size", [3, 7, 15])
@@ -195,7 +194,7 @@ def test_errors_are_those_of_the_decoder():
     height, width, size = 22, 29, 7
     image = _image(height, width)
     tiles = grid.cut(image, _weight(height, width), size, "cpu")
-    rows, columns = grid.tile_counts(height, width, size)
+    rows, columns = tile_counts(height, width, size)
     nx, ny = 4, 3
     samples = grid.solve(tiles, nx, ny).clamp(min=0.0).half()
     texels = np.zeros((rows * ny, columns * nx, 3), np.float16)
@@ -204,16 +203,15 @@ def test_errors_are_those_of_the_decoder():
     for index, values in zip(tiles.index.tolist(), samples.numpy(), strict=True):
         row, column = divmod(index, columns)
         texels[row * ny : (row + 1) * ny, column * nx : (column + 1) * nx] = values
-    model = AtlasModel(
-        "a", "0", Profile(name="a", tile=size), "tiles", "half", height, width, texels, np.empty((0, 16), np.uint8),
-        pack_entries(first, np.broadcast_to([nx, ny], first.shape)), np.empty((0, 3, 2), np.float32),
-    )  # fmt: skip
+    lut = pack_entries(first, np.broadcast_to([nx, ny], first.shape))
+    settings = ("a", "0", Profile(name="a", tile=size), "tiles", "half", height, width)
+    model = AtlasModel(*settings, texels, lut=lut)
     x, y = _places(tiles, rows, columns)
     uv = np.stack([(x.ravel() + 0.5) / width, (y.ravel() + 0.5) / height], 1).astype(np.float32)
-    shown = Decoder(model).read(torch.from_numpy(uv)).double().numpy().reshape(len(tiles.index), -1, 3)
+    decoded = Decoder(model).read(torch.from_numpy(uv)).double().numpy().reshape(len(tiles.index), -1, 3)
     light = tiles.light.double().numpy().transpose(0, 2, 1)
-    want = (((shown - light) ** 2).mean(2) * tiles.weight.double().numpy()).sum(1)
-    np.testing.assert_allclose(grid.errors(tiles, samples.float()).numpy(), want, rtol=2e-3)
+    expected = (((decoded - light) ** 2).mean(2) * tiles.weight.double().numpy()).sum(1)
+    np.testing.assert_allclose(grid.errors(tiles, samples.float()).numpy(), expected, rtol=2e-3)
 
 
 def test_curves_and_solved():
@@ -227,20 +225,20 @@ def test_curves_and_solved():
     samples = grid.solved(tiles, chosen)
     for i, values in enumerate(samples):
         assert values.shape == (chosen[i, 1], chosen[i, 0], 3) and (values >= 0).all()
-        own = grid.Tiles(*(part[i : i + 1] for part in (tiles.index, tiles.light, tiles.weight)), tiles.size)
-        # A curve is made with fewer rounds.
-        exact = float(grid.errors(own, torch.from_numpy(values)[None])[0])
+        tile = grid.Tiles(*(part[i : i + 1] for part in (tiles.index, tiles.light, tiles.weight)), tiles.size)
+        # A curve takes fewer rounds.
+        exact = float(grid.errors(tile, torch.from_numpy(values)[None])[0])
         assert exact <= error[i % 3, i] * 1.01 + 1e-12 and exact >= error[i % 3, i] * 0.9 - 1e-9
     dark = grid.curves(tiles, sizes, torch.zeros_like)  # the file holds nothing
-    want = (tiles.light.double() ** 2).mean(1) * tiles.weight
-    np.testing.assert_allclose(dark, np.broadcast_to(want.sum(1).numpy(), (3, 9)), rtol=1e-5)
+    expected = (tiles.light.double() ** 2).mean(1) * tiles.weight
+    np.testing.assert_allclose(dark, np.broadcast_to(expected.sum(1).numpy(), (3, 9)), rtol=1e-5)
 
 
 def _brute(error: np.ndarray, cost: np.ndarray, budget: float) -> float:
     """The least error of all choices within a budget."""
     number = np.arange(error.shape[1])
-    choices = (np.array(one) for one in itertools.product(range(len(cost)), repeat=error.shape[1]))
-    return min(error[one, number].sum() for one in choices if cost[one].sum() <= budget)
+    choices = (np.array(choice) for choice in itertools.product(range(len(cost)), repeat=error.shape[1]))
+    return min(error[choice, number].sum() for choice in choices if cost[choice].sum() <= budget)
 
 
 @pytest.mark.parametrize("seed", range(6))

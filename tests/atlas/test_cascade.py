@@ -1,4 +1,4 @@
-"""The cascade's fit: what it starts from, a step's gradient against autograd, what it comes to, and what it stores."""
+"""The cascade: initial textures, a step's gradient against autograd, the tuned textures, and the stored ones."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ from wlm.atlas.data import LightmappedMesh, from_arrays
 from wlm.atlas.model import Profile
 from wlm.atlas.pack import pack, regenerate
 from wlm.atlas.stages import Stages
-from wlm.atlas.views import clip_positions, sphere_views
+from wlm.atlas.views import clip_positions, normalised, sphere_views
 from wlm.errors import WlmError
 from wlm.ops import raster as ops_raster
 
@@ -25,8 +25,8 @@ SIDE = 16  # texels of a face of the box
 
 
 def _profile(**settings) -> Profile:
-    usual = {"steps": 40, "resolution": 48, "colour_rate": 0.01, "lut_rate": 2e-3, "scale": 1.0}
-    return Profile(**{"name": "test", "method": "cascade", **usual, **settings})
+    defaults = {"steps": 40, "resolution": 48, "colour_rate": 0.01, "lut_rate": 2e-3, "scale": 1.0}
+    return Profile(**{"name": "test", "method": "cascade", **defaults, **settings})
 
 
 def _box(gain: float = 1.0, light=None) -> LightmappedMesh:
@@ -68,10 +68,10 @@ def test_what_a_fit_starts_from():
     random = np.random.default_rng(0)
     lightmap = random.uniform(size=(12, 18, 3)).astype(np.float32)
     whole = np.ones((12, 18), bool)
-    found = initial(lightmap, whole, _profile(colour_scale=0.5, lut_scale=0.7))
-    assert found.colour.shape == (6, 9, 3) and found.lut.shape == (8, 13, 2)
-    close(found.colour, lightmap.reshape(6, 2, 9, 2, 3).mean((1, 3)), 1e-6)
-    close(found.lut[3, 5], np.array([5.5 / 13, 3.5 / 8]), 1e-6)
+    start = initial(lightmap, whole, _profile(colour_scale=0.5, lut_scale=0.7))
+    assert start.colour.shape == (6, 9, 3) and start.lut.shape == (8, 13, 2)
+    close(start.colour, lightmap.reshape(6, 2, 9, 2, 3).mean((1, 3)), 1e-6)
+    close(start.lut[3, 5], np.array([5.5 / 13, 3.5 / 8]), 1e-6)
     uneven = initial(lightmap, whole, _profile(colour_scale=0.4)).colour
     assert uneven.shape == (5, 7, 3)
     close(uneven.mean((0, 1)), lightmap.mean((0, 1)), 1e-6)
@@ -87,9 +87,9 @@ def test_what_a_fit_starts_from():
 def test_the_least_textures():
     """One texel each, and no table."""
     lightmap = np.full((1, 1, 3), 2.0, np.float32)
-    found = initial(lightmap, np.ones((1, 1), bool), _profile())
-    np.testing.assert_array_equal(found.colour, lightmap)
-    np.testing.assert_array_equal(found.lut, [[[0.5, 0.5]]])
+    start = initial(lightmap, np.ones((1, 1), bool), _profile())
+    np.testing.assert_array_equal(start.colour, lightmap)
+    np.testing.assert_array_equal(start.lut, [[[0.5, 0.5]]])
     assert initial(lightmap, np.ones((1, 1), bool), _profile(lut_scale=0.0)).lut.shape == (0, 0, 2)
 
 
@@ -109,7 +109,7 @@ def test_a_steps_gradient_of_a_view(device: str, lut_scale: float):
         grads = [grad.cpu().numpy() for grad in step._grads]
         after = step.textures()
 
-    clip = torch.tensor(clip_positions(mesh, sphere_views(profile.steps, 5)[0]))
+    clip = torch.tensor(clip_positions(normalised(mesh), sphere_views(profile.steps, 5)[0]))
     raster = ops_raster.rasterize(clip, torch.tensor(mesh.triangle), 48, 48)
     hit = raster.triangle >= 0
     weights = torch.cat([raster.barycentric, 1 - raster.barycentric.sum(-1, keepdim=True)], -1)[hit].double()
@@ -134,12 +134,12 @@ def test_a_fit_gets_better(device: str, space: str, lut_scale: float):
     """On the whole surface, by the reference's reading, well below where it began; all stays in range."""
     mesh, profile = _box(), _profile(space=space, lut_scale=lut_scale)
     uv, start = _start(mesh, profile)
-    found = tune(mesh, uv, start, profile, device=device)
-    first, last = (_error(mesh, uv, each.colour, each.lut) for each in (start, found))
+    tuned = tune(mesh, uv, start, profile, device=device)
+    first, last = (_error(mesh, uv, each.colour, each.lut) for each in (start, tuned))
     assert last < 0.75 * first
-    assert found.colour.min() >= 0 and found.colour.shape == start.colour.shape
-    assert found.lut.shape == start.lut.shape and (not found.lut.size or 0 <= found.lut.min() <= found.lut.max() <= 1)
-    assert (np.abs(found.lut - start.lut) > 1e-3).any() == (lut_scale > 0)
+    assert tuned.colour.min() >= 0 and tuned.colour.shape == start.colour.shape
+    assert tuned.lut.shape == start.lut.shape and (not tuned.lut.size or 0 <= tuned.lut.min() <= tuned.lut.max() <= 1)
+    assert (np.abs(tuned.lut - start.lut) > 1e-3).any() == (lut_scale > 0)
 
 
 @pytest.mark.parametrize("space", ["views", "uv"])
@@ -148,10 +148,10 @@ def test_the_unit_of_radiance_does_not_matter(space: str):
     profile = _profile(space=space, steps=10)
     mesh, bright = _box(), _box(1024.0)
     uv, start = _start(mesh, profile)
-    one = tune(mesh, uv, start, profile)
-    other = tune(bright, uv, Textures(1024 * start.colour, start.lut), profile)
-    close(other.colour / 1024, one.colour, 1e-4)
-    close(other.lut, one.lut, 1e-4)
+    textures = tune(mesh, uv, start, profile)
+    brighter = tune(bright, uv, Textures(1024 * start.colour, start.lut), profile)
+    close(brighter.colour / 1024, textures.colour, 1e-4)
+    close(brighter.lut, textures.lut, 1e-4)
     black = _box(0.0)
     assert not tune(black, uv, Textures(0 * start.colour, start.lut), profile).colour.any()
 
@@ -160,10 +160,10 @@ def test_the_unit_of_radiance_does_not_matter(space: str):
 def test_one_seed_one_result(space: str):
     mesh, profile = _box(), _profile(space=space, steps=6)
     uv, start = _start(mesh, profile)
-    one, same, other = (tune(mesh, uv, start, profile, seed=seed) for seed in (1, 1, 2))
-    np.testing.assert_array_equal(one.colour, same.colour)
-    np.testing.assert_array_equal(one.lut, same.lut)
-    assert (one.colour != other.colour).any()
+    first, again, second = (tune(mesh, uv, start, profile, seed=seed) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(first.colour, again.colour)
+    np.testing.assert_array_equal(first.lut, again.lut)
+    assert (first.colour != second.colour).any()
 
 
 def test_rates_that_fall():
@@ -179,16 +179,16 @@ def test_rates_that_fall():
         step()
     np.testing.assert_allclose([float(rate) for rate in step._rate], [1e-3, 2e-4], rtol=1e-5)
     rough = _profile(space="uv", steps=100, colour_rate=0.03, lut_rate=5e-3)
-    kept, fell = (tune(mesh, uv, start, rough.model_copy(update={"final_rate": share})) for share in (1.0, 0.01))
-    assert _error(mesh, uv, fell.colour, fell.lut) < 0.9 * _error(mesh, uv, kept.colour, kept.lut)
+    constant, decayed = (tune(mesh, uv, start, rough.model_copy(update={"final_rate": share})) for share in (1.0, 0.01))
+    assert _error(mesh, uv, decayed.colour, decayed.lut) < 0.9 * _error(mesh, uv, constant.colour, constant.lut)
 
 
 def test_no_steps_and_progress():
     mesh, profile = _box(), _profile(steps=0)
     uv, start = _start(mesh, profile)
-    found = tune(mesh, uv, start, profile, progress=lambda *_: pytest.fail("nothing is done"))
-    close(found.colour, start.colour, 1e-6)
-    np.testing.assert_array_equal(found.lut, start.lut)
+    tuned = tune(mesh, uv, start, profile, progress=lambda *_: pytest.fail("nothing is done"))
+    close(tuned.colour, start.colour, 1e-6)
+    np.testing.assert_array_equal(tuned.lut, start.lut)
     reports = []
     tune(mesh, uv, start, _profile(steps=7), progress=reports.append)
     assert (reports[-1].stage, reports[-1].done, reports[-1].total) == ("fit", 7, 7)

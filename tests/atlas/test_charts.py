@@ -1,4 +1,4 @@
-"""Charts: what hangs together, what doesn't."""
+"""Charts: connected triangles, and those that only touch."""
 
 import numpy as np
 
@@ -43,9 +43,9 @@ def test_many():
     first = (length + 2) * np.arange(strips)[:, None] + np.arange(length)
     corner = np.stack([first, first + 1, first + 2], -1).reshape(-1, 3)
     random = np.random.default_rng(0).permutation(len(corner))
-    found = charts(corner[random])
-    assert found.max() + 1 == strips
+    chart = charts(corner[random])
+    assert chart.max() + 1 == strips
     strip = random // length
-    assert len(np.unique(np.stack([found, strip]), axis=1).T) == strips
-    first = np.unique(found, return_index=True)[1]
+    assert len(np.unique(np.stack([chart, strip]), axis=1).T) == strips
+    first = np.unique(chart, return_index=True)[1]
     assert (np.diff(first) > 0).all(), "numbered in the order of their first triangles"

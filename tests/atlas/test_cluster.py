@@ -1,4 +1,4 @@
-"""Clustering against the naive algorithm with its whole matrix, on meshes made of copies, and in the hard cases."""
+"""Clustering: against the naive algorithm with its whole matrix, on meshes made of copies, and in hard cases."""
 
 import numpy as np
 import pytest
@@ -54,16 +54,17 @@ def _naive(uv, triangle, lightmap, threshold: float, colour_threshold: float, ma
     return patches, edges, reference.greedy(edges)
 
 
-def _sound(found: Clusters, count: int) -> None:
-    """What holds of any result."""
-    groups = len(found.representative)
-    assert found.group.shape == found.order.shape == found.distance.shape == found.excluded.shape == (count,)
-    assert sorted(set(found.group.tolist())) == list(range(groups))
-    np.testing.assert_array_equal(found.group[found.representative], np.arange(groups))
-    np.testing.assert_array_equal(found.order[found.representative], 0)
-    np.testing.assert_array_equal(found.distance[found.representative], 0)
-    sizes = np.bincount(found.group, minlength=groups)
-    assert (sizes[found.group[found.excluded]] == 1).all()
+def _sound(clusters: Clusters, count: int) -> None:
+    """Checks invariants of any result."""
+    groups = len(clusters.representative)
+    for values in (clusters.group, clusters.order, clusters.distance, clusters.excluded):
+        assert values.shape == (count,)
+    assert sorted(set(clusters.group.tolist())) == list(range(groups))
+    np.testing.assert_array_equal(clusters.group[clusters.representative], np.arange(groups))
+    np.testing.assert_array_equal(clusters.order[clusters.representative], 0)
+    np.testing.assert_array_equal(clusters.distance[clusters.representative], 0)
+    sizes = np.bincount(clusters.group, minlength=groups)
+    assert (sizes[clusters.group[clusters.excluded]] == 1).all()
 
 
 @pytest.mark.parametrize(("threshold", "colour_threshold"), [(0.03, 0.09), (0.01, 0.09), (0.05, 2.0), (0.05, 0.0)])
@@ -73,7 +74,7 @@ def test_against_naive(device: str, threshold: float, colour_threshold: float):
     (uv, triangle), lightmap = _mesh(count), _lightmap()
     active = np.arange(count) % 7 != 0
     reports = []
-    found = cluster(
+    clusters = cluster(
         uv,
         triangle,
         lightmap,
@@ -85,14 +86,15 @@ def test_against_naive(device: str, threshold: float, colour_threshold: float):
         progress=reports.append,
     )
     patches, edges, groups = _naive(uv, triangle, lightmap, threshold, colour_threshold, 2.0, active)
-    _sound(found, count)
-    assert found.stats.edges == edges.sum() // 2 > 20
-    assert [(int(r), np.flatnonzero(found.group == g).tolist()) for g, r in enumerate(found.representative)] == groups
-    np.testing.assert_array_equal(found.excluded, ~active)
+    _sound(clusters, count)
+    assert clusters.stats.edges == edges.sum() // 2 > 20
+    members = [np.flatnonzero(clusters.group == group).tolist() for group in range(len(clusters.representative))]
+    assert list(zip(clusters.representative.tolist(), members, strict=True)) == groups
+    np.testing.assert_array_equal(clusters.excluded, ~active)
     for t in range(count):
-        want = reference.distances(patches[found.representative[found.group[t]]], patches[t])
-        assert found.distance[t] == pytest.approx(want.min(), abs=1e-12)
-        assert found.order[t] == int((want < want.min() + 1e-12).argmax())
+        expected = reference.distances(patches[clusters.representative[clusters.group[t]]], patches[t])
+        assert clusters.distance[t] == pytest.approx(expected.min(), abs=1e-12)
+        assert clusters.order[t] == int((expected < expected.min() + 1e-12).argmax())
     assert [report.stage for report in reports] == ["compare patches", "cluster"]
     assert all(report.done == report.total == active.sum() for report in reports)
 
@@ -109,11 +111,11 @@ def test_permuted_copies(device: str):
         for k in range(3):
             copy[k] = corners[p[k]] + [32, 24]
         uv.append(_uv(copy))
-    found = cluster(np.concatenate(uv), np.arange(21).reshape(-1, 3), lightmap, threshold=0.001, device=device)
-    _sound(found, 7)
-    assert found.representative.tolist() == [0]
-    assert [ORDERS[o] for o in found.order[1:]] == list(ORDERS)
-    np.testing.assert_array_equal(found.distance, 0)
+    clusters = cluster(np.concatenate(uv), np.arange(21).reshape(-1, 3), lightmap, threshold=0.001, device=device)
+    _sound(clusters, 7)
+    assert clusters.representative.tolist() == [0]
+    assert [ORDERS[o] for o in clusters.order[1:]] == list(ORDERS)
+    np.testing.assert_array_equal(clusters.distance, 0)
 
 
 def test_sizes_are_those_of_texels():
@@ -127,26 +129,26 @@ def test_sizes_are_those_of_texels():
 
 
 def test_no_triangle(device: str):
-    found = cluster(np.zeros((0, 2)), np.zeros((0, 3), int), _lightmap(), device=device)
-    assert found.group.shape == found.representative.shape == (0,)
-    assert (found.stats.compared, found.stats.edges) == (0, 0)
+    clusters = cluster(np.zeros((0, 2)), np.zeros((0, 3), int), _lightmap(), device=device)
+    assert clusters.group.shape == clusters.representative.shape == (0,)
+    assert (clusters.stats.compared, clusters.stats.edges) == (0, 0)
 
 
 def test_one_triangle(device: str):
-    found = cluster(*_mesh(1), _lightmap(), device=device)
-    _sound(found, 1)
-    assert found.representative.tolist() == [0] and not found.excluded.any()
+    clusters = cluster(*_mesh(1), _lightmap(), device=device)
+    _sound(clusters, 1)
+    assert clusters.representative.tolist() == [0] and not clusters.excluded.any()
 
 
 @pytest.mark.parametrize("colour", [0.0, 0.3, 2.0])
 def test_one_colour(device: str, colour: float):
     """All are alike: one group, of the first; every pair is an edge, and no sample is looked at."""
     count = 2000
-    found = cluster(*_mesh(count, longest=20), np.full((*SIDE, 3), colour), device=device)
-    _sound(found, count)
+    clusters = cluster(*_mesh(count, longest=20), np.full((*SIDE, 3), colour), device=device)
+    _sound(clusters, count)
     pairs = count * (count - 1) // 2
-    assert found.representative.tolist() == [0]
-    assert (found.stats.compared, found.stats.edges) == (0, pairs)
+    assert clusters.representative.tolist() == [0]
+    assert (clusters.stats.compared, clusters.stats.edges) == (0, pairs)
 
 
 def test_degenerate_triangles(device: str):
@@ -155,9 +157,9 @@ def test_degenerate_triangles(device: str):
     lightmap[:, 32:] = 1.0
     shapes = np.array([[[0, 0], [0, 0], [0, 0]], [[0, 0], [4, 4], [8, 8]], [[0, 0], [0.2, 0], [0, 0.3]]])
     uv = _uv(np.concatenate([shapes + 10.0, shapes + 40.0]))
-    found = cluster(uv, np.arange(18).reshape(-1, 3), lightmap, device=device)
-    _sound(found, 6)
-    assert found.group.tolist() == [0, 0, 0, 1, 1, 1]
+    clusters = cluster(uv, np.arange(18).reshape(-1, 3), lightmap, device=device)
+    _sound(clusters, 6)
+    assert clusters.group.tolist() == [0, 0, 0, 1, 1, 1]
 
 
 def test_outside_is_the_border(device: str):
@@ -166,8 +168,8 @@ def test_outside_is_the_border(device: str):
     lightmap[:, -1] = 0.5
     uv = np.array([[1.5, 0.2], [1.6, 0.2], [1.5, 0.4], [-3.0, 0.2], [-2.0, 0.2], [-3.0, 0.4]])
     uv = np.concatenate([uv, _uv([[63, 3], [63, 9], [63, 5]]), _uv([[2, 3], [3, 9], [4, 5]])])
-    found = cluster(uv, np.arange(12).reshape(-1, 3), lightmap, device=device)
-    assert found.group.tolist() == [0, 1, 0, 1]
+    clusters = cluster(uv, np.arange(12).reshape(-1, 3), lightmap, device=device)
+    assert clusters.group.tolist() == [0, 1, 0, 1]
 
 
 def test_bright_triangles(device: str):
@@ -175,26 +177,26 @@ def test_bright_triangles(device: str):
     lightmap = np.full((*SIDE, 3), 2.0, np.float32)
     lightmap[10, 20, 1] = np.nextafter(np.float32(2), np.float32(3))
     away, on, beside = ([[x, 10], [x + 2, 10], [x, 12]] for x in (40, 20, 21))
-    found = cluster(_uv([away, on, beside, away]), np.arange(12).reshape(-1, 3), lightmap, device=device)
-    _sound(found, 4)
-    assert found.excluded.tolist() == [False, True, False, False]
-    assert found.group.tolist() == [0, 1, 0, 0]
-    found = cluster(_uv([away, on]), np.arange(6).reshape(-1, 3), lightmap, max_radiance=2.1, device=device)
-    assert not found.excluded.any()
+    clusters = cluster(_uv([away, on, beside, away]), np.arange(12).reshape(-1, 3), lightmap, device=device)
+    _sound(clusters, 4)
+    assert clusters.excluded.tolist() == [False, True, False, False]
+    assert clusters.group.tolist() == [0, 1, 0, 0]
+    clusters = cluster(_uv([away, on]), np.arange(6).reshape(-1, 3), lightmap, max_radiance=2.1, device=device)
+    assert not clusters.excluded.any()
 
 
 def test_negative_radiance_is_black(device: str):
     lightmap = np.zeros((*SIDE, 3), np.float32)
     lightmap[:, 32:] = -5.0
-    found = cluster(*_mesh(20), lightmap, device=device)
-    assert found.representative.tolist() == [0] and found.distance.max() == 0
+    clusters = cluster(*_mesh(20), lightmap, device=device)
+    assert clusters.representative.tolist() == [0] and clusters.distance.max() == 0
 
 
 def test_none_active(device: str):
     """All are excluded and alone."""
-    found = cluster(*_mesh(5), _lightmap(), active=np.zeros(5, bool), device=device)
-    _sound(found, 5)
-    assert found.excluded.all() and found.representative.tolist() == list(range(5))
+    clusters = cluster(*_mesh(5), _lightmap(), active=np.zeros(5, bool), device=device)
+    _sound(clusters, 5)
+    assert clusters.excluded.all() and clusters.representative.tolist() == list(range(5))
 
 
 def test_ties_go_to_the_lowest_number(device: str):
@@ -202,18 +204,18 @@ def test_ties_go_to_the_lowest_number(device: str):
     lightmap = np.zeros((*SIDE, 3), np.float32)
     lightmap[:, 32:] = 1.0
     dark, light = ([[x, 10], [x + 4, 10], [x, 14]] for x in (8, 50))
-    found = cluster(_uv([light, dark, light, dark]), np.arange(12).reshape(-1, 3), lightmap, device=device)
-    assert found.representative.tolist() == [0, 1] and found.group.tolist() == [0, 1, 0, 1]
+    clusters = cluster(_uv([light, dark, light, dark]), np.arange(12).reshape(-1, 3), lightmap, device=device)
+    assert clusters.representative.tolist() == [0, 1] and clusters.group.tolist() == [0, 1, 0, 1]
 
 
 def test_largest(device: str):
-    """What lies between the samples of the largest size allowed isn't seen: here all but the corners."""
+    """Texels between the samples of the largest size allowed aren't read: here all but the corners."""
     lightmap = np.zeros((*SIDE, 3), np.float32)
     lightmap[14:17, 14:17] = 1.9
     spot, plain = ([[x, 10], [x + 14, 10], [x, 24]] for x in (10, 40))
-    given = (_uv([spot, plain]), np.arange(6).reshape(-1, 3), lightmap)
-    assert cluster(*given, device=device).group.tolist() == [0, 1]
-    assert cluster(*given, largest=2, device=device).group.tolist() == [0, 0]
+    inputs = (_uv([spot, plain]), np.arange(6).reshape(-1, 3), lightmap)
+    assert cluster(*inputs, device=device).group.tolist() == [0, 1]
+    assert cluster(*inputs, largest=2, device=device).group.tolist() == [0, 0]
 
 
 @pytest.mark.parametrize(
@@ -237,9 +239,9 @@ def test_largest(device: str):
     ],
 )
 def test_wrong_use(change: dict, field: str):
-    given = {"uv": np.zeros((6, 2)), "triangle": np.arange(6).reshape(2, 3), "lightmap": np.zeros((4, 4, 3))}
+    inputs = {"uv": np.zeros((6, 2)), "triangle": np.arange(6).reshape(2, 3), "lightmap": np.zeros((4, 4, 3))}
     with pytest.raises(ValueError, match=f"^{field}:"):
-        cluster(**(given | change))
+        cluster(**(inputs | change))
 
 
 @pytest.mark.slow
@@ -248,7 +250,7 @@ def test_many_triangles_of_one_colour():
     import resource
 
     count = 132_000
-    found = cluster(*_mesh(count, longest=64), np.full((*SIDE, 3), 0.25, np.float32), largest=65)
-    assert found.representative.tolist() == [0]
-    assert found.stats.edges == count * (count - 1) // 2
+    clusters = cluster(*_mesh(count, longest=64), np.full((*SIDE, 3), 0.25, np.float32), largest=65)
+    assert clusters.representative.tolist() == [0]
+    assert clusters.stats.edges == count * (count - 1) // 2
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss < 8e6  # KiB

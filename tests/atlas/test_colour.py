@@ -1,4 +1,4 @@
-"""The colour texture as blocks: what comes back, the ends of its range, and what is refused."""
+"""The colour texture as blocks: round trips, the ends of its range, and errors."""
 
 import sys
 
@@ -57,8 +57,8 @@ def test_bc6h_is_what_another_decoder_reads():
     raw = imagecodecs.bcn_decode(blocks.tobytes(), 6, shape=(8, 8, 3))
     np.testing.assert_array_equal(raw.astype(np.float32), decoded)
     bgra = np.frombuffer(texture2ddecoder.decode_bc6(blocks.tobytes(), 8, 8), np.uint8).reshape(8, 8, 4)
-    seen = bgra[..., 2::-1].astype(np.float64)
-    assert np.corrcoef(seen.ravel(), np.clip(decoded, 0.0, 1.0).ravel())[0, 1] > 0.99
+    rgb = bgra[..., 2::-1].astype(np.float64)
+    assert np.corrcoef(rgb.ravel(), np.clip(decoded, 0.0, 1.0).ravel())[0, 1] > 0.99
 
 
 def test_what_is_refused():

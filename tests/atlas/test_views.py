@@ -1,4 +1,4 @@
-"""Views: cameras on the sphere, what they hold, what each pixel sees, and how often UV space is seen."""
+"""Views: cameras on the sphere, their field of view, the surface point at each pixel, and visibility in UV space."""
 
 import dataclasses
 
@@ -8,18 +8,18 @@ import torch
 from builders.lit_cube import DIRECTIONS, HEIGHT, WIDTH, corners, lit_cube, waves
 
 from wlm.atlas.data import from_arrays
-from wlm.atlas.views import DISTANCE, View, clip_positions, normalised, sphere_views, visibility, visible_uv
+from wlm.atlas.views import View, clip_positions, normalised, sphere_views, visibility, visible_uv
 from wlm.errors import WlmError
 
 
-def _sees(mesh, direction, resolution=48, device="cpu"):
-    (found,) = visible_uv(mesh, [View.of(direction)], resolution, device)
-    return [tensor.cpu().numpy() for tensor in found]
+def _drawn(mesh, direction, resolution=48, device="cpu"):
+    (drawn,) = visible_uv(mesh, [View.of(direction)], resolution, device)
+    return [tensor.cpu().numpy() for tensor in drawn]
 
 
 def test_even_views_are_spread_all_around():
     views = sphere_views(50)
-    eyes = np.stack([view.eye for view in views]) / DISTANCE
+    eyes = np.stack([view.axes[2] for view in views])
     np.testing.assert_allclose(np.linalg.norm(eyes, axis=1), 1.0, rtol=1e-12)
     assert np.abs(eyes.mean(axis=0)).max() < 0.02
     cosine = eyes @ eyes.T - 2.0 * np.eye(50)
@@ -31,9 +31,9 @@ def test_even_views_are_spread_all_around():
 
 
 def test_random_views_by_their_seed():
-    first, again, other = (np.stack([v.axes for v in sphere_views(2000, seed)]) for seed in (7, 7, 8))
+    first, again, second = (np.stack([v.axes for v in sphere_views(2000, seed)]) for seed in (7, 7, 8))
     np.testing.assert_array_equal(first, again)
-    assert (first != other).any(axis=(1, 2)).all()
+    assert (first != second).any(axis=(1, 2)).all()
     eyes = first[:, 2]
     # Uniform: mean 0, each coordinate squared 1/3; four deviations of 2000 samples.
     assert np.abs(eyes.mean(axis=0)).max() < 4.0 * (1 / 3 / 2000) ** 0.5
@@ -62,16 +62,17 @@ def test_what_is_no_direction(direction):
 def test_the_picture_just_holds_the_sphere():
     """A tangent from the camera touches the sphere of radius sqrt 3 where p . d = 1: at corners of the cube."""
     mesh = lit_cube(1)
-    clip = clip_positions(mesh, View.of([1, 0, 0]))
+    position = normalised(mesh)
+    clip = clip_positions(position, View.of([1, 0, 0]))
     assert clip.shape == (24, 4) and clip.dtype == np.float32
     touching = mesh.position[:, 0] == 1.0
     radius = np.hypot(clip[:, 0], clip[:, 1]) / clip[:, 3]
     np.testing.assert_allclose(radius[touching], 1.0, rtol=1e-6)
     assert (radius[~touching] < 0.9).all()
     for view in sphere_views(40):
-        x, y, z, w = clip_positions(mesh, view).T
+        x, y, z, w = clip_positions(position, view).T
         assert (np.hypot(x, y) <= w * (1 + 1e-6)).all() and (np.abs(z) <= w * (1 + 1e-6)).all()
-    z, w = clip_positions(mesh, View.of([1, 1, 1]))[:, 2:].T
+    z, w = clip_positions(position, View.of([1, 1, 1]))[:, 2:].T
     assert (z / w).min() == pytest.approx(-1.0, abs=1e-6) and (z / w).max() == pytest.approx(1.0, abs=1e-6)
 
 
@@ -85,12 +86,12 @@ def test_normalised_whatever_the_place_and_size():
 def test_each_face_from_its_own_side(device):
     mesh = lit_cube(2)
     for number, direction in enumerate(DIRECTIONS):
-        seen, barycentric, uv = _sees(mesh, direction, 48, device)
-        hit = seen >= 0
-        assert seen.dtype == np.int32 and barycentric.shape == (48, 48, 2) and uv.shape == (48, 48, 2)
-        assert set(np.unique(seen[hit])) == set(range(8 * number, 8 * number + 8))
+        visible, barycentric, uv = _drawn(mesh, direction, 48, device)
+        hit = visible >= 0
+        assert visible.dtype == np.int32 and barycentric.shape == (48, 48, 2) and uv.shape == (48, 48, 2)
+        assert set(np.unique(visible[hit])) == set(range(8 * number, 8 * number + 8))
         weight = np.concatenate([barycentric, 1.0 - barycentric.sum(-1, keepdims=True)], -1)[hit][..., None]
-        corner = mesh.triangle[seen[hit]]
+        corner = mesh.triangle[visible[hit]]
         np.testing.assert_allclose(uv[hit], (mesh.uv[corner] * weight).sum(1), atol=1e-6)
         place = (mesh.position[corner] * weight).sum(1)
         np.testing.assert_allclose(place @ direction, 1.0, atol=1e-5)
@@ -111,17 +112,17 @@ def test_inactive_triangles_hide_and_are_not_seen():
     uv = np.array([[0, 0], [1, 0], [0, 1], [0.5, 0.5], [0, 0], [1, 0], [0, 1], [1, 1]], np.float64)
     mesh = from_arrays(position, triangle, uv, waves())
     assert mesh.active.tolist() == [True, False, True, True]
-    seen, barycentric, at = _sees(mesh, [0, 0, 1])
-    assert set(np.unique(seen)) == {-1, 0}
-    assert not barycentric[seen < 0].any() and not at[seen < 0].any()
+    visible, barycentric, at = _drawn(mesh, [0, 0, 1])
+    assert set(np.unique(visible)) == {-1, 0}
+    assert not barycentric[visible < 0].any() and not at[visible < 0].any()
     flat = dataclasses.replace(mesh, active=np.array([True, True, True, True]))
-    assert set(np.unique(_sees(flat, [0, 0, 1])[0])) == {-1, 0, 1}
-    assert set(np.unique(_sees(mesh, [0, 0, -1])[0])) == {-1, 2, 3}
+    assert set(np.unique(_drawn(flat, [0, 0, 1])[0])) == {-1, 0, 1}
+    assert set(np.unique(_drawn(mesh, [0, 0, -1])[0])) == {-1, 2, 3}
 
 
 def test_visibility_counts_every_covered_pixel_once(device):
     mesh, views = lit_cube(2), sphere_views(9, seed=1)
-    pixels = sum(int((seen >= 0).sum()) for seen, _, _ in visible_uv(mesh, views, 64, device))
+    pixels = sum(int((visible >= 0).sum()) for visible, _, _ in visible_uv(mesh, views, 64, device))
     count = visibility(mesh, views, 64, HEIGHT, WIDTH, device)
     assert count.dtype == np.float64 and count.shape == (HEIGHT, WIDTH) and count.sum() == pixels > 5000
     np.testing.assert_array_equal(count, visibility(mesh, views, 64, HEIGHT, WIDTH, device))

@@ -7,10 +7,10 @@ import functools
 import numpy as np
 import pytest
 
-from wlm.baselines import probe as baselines_probe
+from wlm.baselines import probe as baselines
 from wlm.baselines import probe_mbd, probe_pca
 from wlm.baselines.probe import (
-    PROBE_BASELINES,
+    RIVALS,
     at_bytes,
     block_pca,
     clustered_pca,
@@ -163,21 +163,21 @@ def test_blocks_are_cubes_of_one_size():
     for most in (1, 2, 7, 40, 300):
         partition, side = probe_pca.by_blocks(position, most)
         assert 0.6 * most <= partition.count <= most
-        for own in partition.members:
-            assert (np.ptp(position[own], axis=0) <= side).all()
+        for probes in partition.members:
+            assert (np.ptp(position[probes], axis=0) <= side).all()
     assert probe_pca.by_blocks(position, 3000)[0].count > 2000
 
 
 def test_windows_hold_the_cube_and_what_lies_around():
     position, values = _probes()
     partition, side = probe_pca.by_blocks(position, 20)
-    found = probe_pca.windows(position, partition, side, 0.25)
+    windows = probe_pca.windows(position, partition, side, 0.25)
     corner = position.min(0) + np.floor((position - position.min(0)) / side) * side
-    for own, near in zip(partition.members, found, strict=True):
-        low = corner[own[0]] - 0.25 * side
+    for probes, near in zip(partition.members, windows, strict=True):
+        low = corner[probes[0]] - 0.25 * side
         inside = ((position >= low) & (position <= low + 1.5 * side)).all(1)
         np.testing.assert_array_equal(near, np.flatnonzero(inside))
-        assert set(own) <= set(near)
+        assert set(probes) <= set(near)
     errors = [_error(values, window_pca(position, values, 2, 20, overlap=o).decoded) for o in (0, 0.25, 1, 100)]
     np.testing.assert_array_equal(
         window_pca(position, values, 2, 20, overlap=0).decoded, block_pca(position, values, 2, 20).decoded
@@ -417,7 +417,7 @@ def test_unreal_refuses():
         unreal_packing(position, values * np.inf)
 
 
-@pytest.mark.parametrize("name", PROBE_BASELINES)
+@pytest.mark.parametrize("name", RIVALS)
 def test_at_bytes_keeps_the_size_and_uses_it(name):
     position, values = _probes(count=300)
     budgets = [int(share * values.nbytes) for share in (0.09, 0.28, 0.5)]
@@ -450,8 +450,8 @@ def test_at_bytes_finds_the_best_of_all_settings():
 def test_at_bytes_stops_where_fewer_components_gain_nothing(monkeypatch):
     position, values = _probes(count=50)
     runs = []
-    run = baselines_probe._run
-    monkeypatch.setattr(baselines_probe, "_run", lambda *given: runs.append(given) or run(*given))
+    measure = baselines.measure
+    monkeypatch.setattr(baselines, "measure", lambda *args, **more: runs.append(args) or measure(*args, **more))
     found = at_bytes("global_pca", position, values, 10**6, (None,))
     assert found.option == "K=12, 1 part, half floats" and len(runs) == 3
 

@@ -10,7 +10,7 @@ import torch
 import wlm.bench.path_tracer as path_tracer
 import wlm.bench.smoke_network_rivals as rivals
 from wlm.bench.path_tracer import GPU, choose_variant, try_variant
-from wlm.bench.report import figures, tables
+from wlm.bench.runner import Bench
 from wlm.errors import WlmError
 
 BACKENDS = SimpleNamespace(CUDA="cuda", LLVM="llvm")
@@ -18,12 +18,12 @@ BACKENDS = SimpleNamespace(CUDA="cuda", LLVM="llvm")
 
 @pytest.fixture
 def drjit(monkeypatch):
-    """Installs Mitsuba's compiler for looks: with some backends, an LLVM of some version, a trial of some program."""
+    """Installs a stand-in for Mitsuba's compiler, with these backends, this version of LLVM and this trial program."""
 
     def install(backends=("cuda", "llvm"), llvm=19, trial="print()"):
         detail = SimpleNamespace(llvm_version=lambda: (llvm, 1, 0))
-        made = SimpleNamespace(JitBackend=BACKENDS, has_backend=lambda one: one in backends, detail=detail)
-        monkeypatch.setitem(sys.modules, "drjit", made)
+        module = SimpleNamespace(JitBackend=BACKENDS, has_backend=lambda name: name in backends, detail=detail)
+        monkeypatch.setitem(sys.modules, "drjit", module)
         monkeypatch.setattr(path_tracer, "has_tracer", lambda: True)
         monkeypatch.setattr(path_tracer, "_TRIAL", trial)
 
@@ -82,10 +82,10 @@ def test_without_mitsuba(monkeypatch):
 def test_a_trial_wants_light(monkeypatch, value):
     """The program of a trial is a call of this."""
     assert path_tracer._TRIAL.endswith(f"try_variant('{GPU}')")
-    seen = []
+    variants = []
 
     def tracer(volume, camera, *, variant):
-        seen.append(variant)
+        variants.append(variant)
         return lambda samples: (np.full((6, camera.height, camera.width), value), np.ones((8, 8)))
 
     monkeypatch.setattr(path_tracer, "PathTracer", tracer)
@@ -94,7 +94,7 @@ def test_a_trial_wants_light(monkeypatch, value):
     else:
         with pytest.raises(WlmError, match=f"^path tracing: {GPU}: expected light, found none, or numbers"):
             try_variant(GPU)
-    assert seen == [GPU]
+    assert variants == [GPU]
 
 
 def test_the_real_trial():
@@ -104,8 +104,8 @@ def test_the_real_trial():
 
 @pytest.fixture
 def bench(monkeypatch):
-    """Two scenes of grey smoke, and a tracer that gives them back, on those variants alone that it is told to."""
-    works, said = set(), []
+    """Two scenes of grey smoke, and a tracer that works on the variants in ``works`` alone."""
+    works, lines = set(), []
     references = [torch.full((8, 16, 16), 0.5) for _ in range(4)]
 
     class Tracer:
@@ -120,16 +120,16 @@ def bench(monkeypatch):
     monkeypatch.setattr(rivals, "has_tracer", lambda: True)
     monkeypatch.setattr(rivals, "has_denoiser", lambda: True)
     monkeypatch.setattr(rivals, "denoise", lambda images: images)
-    sizes = SimpleNamespace(frames=2, samples=(1, 4), few=1, resolution=16)
-    frames = [SimpleNamespace(later=None) for _ in range(4)]
-    made = SimpleNamespace(device="cuda:0", sizes=sizes, frames=frames, references=references, camera=None)
-    made.note, made.said, made.works = said.append, said, works
-    return made
+    bench = Bench("smoke-network", "cpu", lines.append, clock="time_ms")
+    bench.device, bench.camera, bench.lines, bench.works = "cuda:0", None, lines, works
+    bench.sizes = SimpleNamespace(frames=2, samples=(1, 4), few=1, resolution=16)
+    bench.frames, bench.references = [SimpleNamespace(later=None) for _ in range(4)], references
+    return bench
 
 
-def choose(monkeypatch, found: str, reason: str = ""):
+def choose(monkeypatch, variant: str, reason: str = ""):
     monkeypatch.setattr(
-        rivals, "choose_variant", lambda device="cpu": (found, reason) if device != "cpu" else ("scalar_rgb", "")
+        rivals, "choose_variant", lambda device="cpu": (variant, reason) if device != "cpu" else ("scalar_rgb", "")
     )
 
 
@@ -139,29 +139,29 @@ def test_rows_on_the_gpu(bench, monkeypatch):
     rows = rivals.traced_rows(bench)
     options = ["1 sample", "1 sample, denoised on the CPU", "4 samples", "4 samples, denoised on the CPU"]
     assert [row.option for row in rows] == options
-    assert all(figures(row)["on"] == "GPU, cuda_ad_rgb" and row.decode_ms > 0.0 for row in rows)
+    assert all(row.notes == "on the GPU, cuda_ad_rgb" and row["time_ms"] > 0.0 for row in rows)
     # 0.2 is 0.4845 in sRGB.
-    assert rows[0].psnr == pytest.approx(-20.0 * np.log10(0.5 - 0.48453), abs=0.01)
-    assert bench.said == ["path tracing"] and "| notes |" not in tables(rows)
+    assert rows[0]["psnr"] == pytest.approx(-20.0 * np.log10(0.5 - 0.48453), abs=0.01)
+    assert bench.lines == ["path tracing"]
 
 
 @pytest.mark.parametrize(
-    ("chosen", "reason", "told"),
+    ("chosen", "reason", "note"),
     [
-        ("scalar_rgb", "no OptiX: none; at all", "no OptiX, none, at all"),
-        (GPU, "", "cuda_ad_rgb, doesn't work, it never did"),
+        ("scalar_rgb", "no OptiX: none; at all", "no OptiX: none; at all"),
+        (GPU, "", "cuda_ad_rgb: doesn't work; it never did"),
     ],
 )
-def test_rows_of_a_gpu_that_does_not_work_are_the_cpus(bench, monkeypatch, chosen, reason, told):
-    """Whether it shows in the trial or after it; the reason is a note, and no figure of it."""
+def test_rows_of_a_gpu_that_does_not_work_are_the_cpus(bench, monkeypatch, chosen, reason, note):
+    """Whether it shows in the trial or after it; the reason is in the notes."""
     choose(monkeypatch, chosen, reason)
     bench.works.add("scalar_rgb")
     rows = rivals.traced_rows(bench)
     assert [row.option for row in rows] == ["1 sample", "1 sample, denoised", "4 samples", "4 samples, denoised"]
     for row in rows:
-        assert figures(row)["on"] == "CPU, scalar_rgb" and set(figures(row)) == {"least dB", "most dB", "pixels", "on"}
-    assert tables(rows).count(f"| not on the GPU ({told}) |") == 4
-    assert bench.said[1].startswith("path tracing: on the CPU: ") and len(bench.said) == 2
+        assert row.notes == f"on the CPU, scalar_rgb: not on the GPU, {note}"
+        assert set(row.figures) == {"psnr", "psnr_min", "psnr_max", "pixels", "time_ms"}
+    assert bench.lines[1].startswith("path tracing: on the CPU: ") and len(bench.lines) == 2
 
 
 @pytest.mark.parametrize("where", ["cpu", "cuda:0"])
@@ -169,4 +169,4 @@ def test_a_tracer_that_works_nowhere_costs_its_own_rows_alone(bench, monkeypatch
     bench.device = where
     choose(monkeypatch, GPU)
     assert rivals.traced_rows(bench) == []
-    assert bench.said[-1] == "path tracing: left out: scalar_rgb: doesn't work; it never did"
+    assert bench.lines[-1] == "path tracing: left out: scalar_rgb: doesn't work; it never did"

@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+from builders.bench_rows import check_command, check_outputs, keys
 
 import wlm.bench.probe as bench
-from wlm.bench import plot, read_json, table, write_json
+from wlm.bench import write_json
 from wlm.bench.probe import PANELS, run, run_rivals, run_rows
 from wlm.errors import WlmError
 from wlm.probe.data import from_arrays
@@ -45,23 +46,31 @@ def test_every_row_has_its_figures(rows):
     rivals = [(name, size) for size in ("same bytes", "3x bytes") for name in RIVALS] + [("Unreal packing", "")]
     volume = [("volume", "walk of 4 frames"), ("volume", "teleport")]
     for scene, speed in (("room", fits), ("hall", [])):
-        names = [(row.method, row.option) for row in rows if row.scene == scene]
-        assert names == [*ours, *(("decode", way) for way in ways), *speed, *rivals, *volume]
+        assert keys(row for row in rows if row.scene == scene) == [
+            *ours,
+            *(("decode", way) for way in ways),
+            *speed,
+            *rivals,
+            *volume,
+        ]
     for row in rows:
         assert row.system == "probe" and row.notes
         if row.method in ("ours", "decode"):
-            assert row.psnr > 10.0 and row.decode_ms > 0.0 and row.max_error < (1.0 if "cut" in row.option else 1e-4)
+            assert row["psnr"] > 10.0 and row["decode_ms"] > 0.0
+            assert row["error_999"] <= row["max_error"] < (1.0 if "cut" in row.option else 1e-4)
         if row.method == "ours":
-            assert row.bpp == pytest.approx(row.bytes * 8 / 300) and row.encode_seconds > 0.0
-            assert "for 270 live probes" in row.notes
+            assert row["bpp"] == pytest.approx(row["bytes"] * 8 / 300) and row["encode_seconds"] > 0.0
+            assert row["probes"] == 270 and row["share_of_float32"] == pytest.approx(row["bpp"] / (27 * 32))
+        if row.method == "volume":
+            assert 0.0 <= row["coverage"] <= 1.0 and row["frames"] >= 1
 
 
 def test_rivals_keep_to_the_bytes(rows):
     ours = {row.scene: row for row in rows if (row.method, row.option) == ("ours", "standard")}
     for row in rows:
-        if row.method in RIVALS and row.bytes is not None:
+        if row.method in RIVALS and row.figures:
             times = 3 if row.option == "3x bytes" else 1
-            assert row.bytes <= times * ours[row.scene].bytes and row.psnr > 5.0
+            assert row["bytes"] <= times * ours[row.scene]["bytes"] and row["psnr"] > 5.0
 
 
 def test_rivals_alone_are_the_same(sets, rows, tmp_path, monkeypatch):
@@ -69,20 +78,23 @@ def test_rivals_alone_are_the_same(sets, rows, tmp_path, monkeypatch):
     monkeypatch.setattr(bench, "_load", lambda path, keys: sets[:1])
     alone = run_rivals(tmp_path / "rows.json", probes_path="room.npz")
     beside = [row for row in rows if row.scene == "room" and row.method in [*RIVALS, "Unreal packing"]]
-    assert [(row.method, row.option, row.bytes, row.psnr) for row in alone] == [
-        (row.method, row.option, row.bytes, row.psnr) for row in beside
-    ]
+    assert keys(alone) == keys(beside)
+    for name in ("bytes", "psnr"):
+        assert [row.get(name) for row in alone] == [row.get(name) for row in beside]
     write_json(tmp_path / "hall.json", [row for row in rows if row.scene == "hall"], {})
     with pytest.raises(WlmError, match="expected a row of profile standard of room"):
         run_rivals(tmp_path / "hall.json", probes_path="room.npz")
 
 
-def test_rows_make_a_file_a_table_and_a_plot(rows, tmp_path):
-    write_json(tmp_path / "rows.json", rows, {})
-    assert read_json(tmp_path / "rows.json")[0] == rows
-    assert len(table(rows).splitlines()) == 2 + len(rows)
-    plot(rows, tmp_path / "rows.png", PANELS)
-    assert (tmp_path / "rows.png").stat().st_size > 10_000
+def test_rows_make_a_file_tables_and_a_plot(rows, tmp_path):
+    check_outputs(rows, tmp_path, PANELS)
+
+
+def test_the_command(rows, tmp_path, monkeypatch):
+    words = ["probe", "--no-rivals", "--probes", tmp_path / "room.npz", "--key", "sh", "--key", "sh_noon"]
+    command, _, options = check_command(monkeypatch, bench, rows, words, tmp_path)
+    assert command == "wlm bench probe --no-rivals --device cpu --probes room.npz --key sh --key sh_noon"
+    assert options["keys"] == ["sh", "sh_noon"] and not options["rivals"] and not options["quick"]
 
 
 def test_what_is_refused(sets, tmp_path):

@@ -5,20 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from typer.testing import CliRunner
+from builders.bench_rows import by_option, check_command, check_outputs
 
 import wlm.bench.smoke as bench
-from wlm.bench import Row, plot, read_json, table, write_json
-from wlm.bench.report import figures, report, tables
 from wlm.bench.smoke import PANELS, plotted, run, run_rows
 from wlm.bench.smoke_air import storage_rows
 from wlm.bench.smoke_light import make_cloud, six_rows
-from wlm.bench.smoke_setup import QUICK, Bench, number, percent
-from wlm.bench.smoke_setup import row as make_row
-from wlm.bench.timing import Timing
+from wlm.bench.smoke_setup import QUICK, SmokeBench
 from wlm.errors import WlmError
 from wlm.fluid.volume import DensityVolume
-from wlm.smoke.baking import six_way
+from wlm.smoke.baking import bake
 from wlm.smoke.camera import Camera
 from wlm.smoke.learn.synthetic import make_plume
 
@@ -57,29 +53,20 @@ def rows():
     return run_rows(TINY, device="cpu")
 
 
-def of(rows, method: str) -> dict[str, Row]:
-    return {row.option: row for row in rows if row.method == method}
-
-
-def share(text: str) -> float:
-    assert text.endswith("%")
-    return float(text[:-1]) / 100.0
-
-
 def test_every_row_has_its_figures(rows):
     assert list(dict.fromkeys((row.scene, row.method) for row in rows)) == METHODS
-    keys = [(row.scene, row.method, row.option) for row in rows]
-    assert len(set(keys)) == len(keys)
+    labels = [(row.scene, row.method, row.option) for row in rows]
+    assert len(set(labels)) == len(labels)
     for row in rows:
-        assert row.system == "smoke" and figures(row)
-        assert (row.decode_ms is None) == (row.method in ("lattice storage", "weights"))
-        assert row.decode_ms is None or row.decode_ms > 0.0
+        assert row.system == "smoke" and row.figures
+        assert ("time_ms" in row.figures) == (row.method not in ("lattice storage", "weights"))
+        assert row.get("time_ms") is None or row["time_ms"] > 0.0
 
 
 def test_shares_of_the_copy(rows):
     """The bytes that a step must move, over its time and the copy's bandwidth."""
-    lattice = of(rows, "lattice")
-    copied = 1e9 * float(figures(lattice["a copy"])["GB/s"])
+    lattice = by_option(rows, "lattice")
+    bandwidth = 1e9 * lattice["a copy"]["bandwidth"]
     for option, size, cell in (
         ("float32, periodic", 32, 152),
         ("float32, all boundaries", 32, 153),
@@ -88,83 +75,82 @@ def test_shares_of_the_copy(rows):
         ("float16, all boundaries, 12³", 12, 77),
     ):
         row = lattice[option]
-        seconds = 1e-3 * row.decode_ms
-        assert share(figures(row)["of the copy"]) == pytest.approx(size**3 * cell / seconds / copied, rel=0.01)
-        assert float(figures(row)["MLUPS"]) == pytest.approx(1e-6 * size**3 / seconds, rel=0.01)
+        seconds = 1e-3 * row["time_ms"]
+        assert row["cells"] == size
+        assert row["of_copy"] == pytest.approx(size**3 * cell / seconds / bandwidth)
+        assert row["mlups"] == pytest.approx(1e-6 * size**3 / seconds)
     for option, moved in (("semi-lagrangian, float32", 8), ("maccormack, float32", 20), ("maccormack, float16", 10)):
-        row = of(rows, "advection")[option]
-        found = 24**3 * moved / (1e-3 * row.decode_ms) / copied
-        assert share(figures(row)["of the copy"]) == pytest.approx(found, rel=0.01)
+        row = by_option(rows, "advection")[option]
+        assert row["of_copy"] == pytest.approx(24**3 * moved / (1e-3 * row["time_ms"]) / bandwidth)
 
 
 def test_sixteen_bits_lose_little(rows):
-    storage = of(rows, "lattice storage")
-    assert 0.0 < share(figures(storage["float16, 40 steps"])["RMS"]) < 0.01
-    assert share(figures(storage["float16, 40 steps"])["largest"]) > share(figures(storage["float16, 40 steps"])["RMS"])
-    drift = {name: abs(float(figures(storage[f"{name}, 60 steps"])["mass drift"])) for name in ("float32", "float16")}
+    storage = by_option(rows, "lattice storage")
+    assert 0.0 < storage["float16, 40 steps"]["rms"] < 0.01
+    assert storage["float16, 40 steps"]["largest"] > storage["float16, 40 steps"]["rms"]
+    drift = {name: abs(storage[f"{name}, 60 steps"]["mass_drift"]) for name in ("float32", "float16")}
     assert drift["float32"] < drift["float16"] < 1e-4
 
 
 def test_schemes_and_a_solution(rows):
     """The ball comes round; the scheme of second order is the better one, and 16 bits change little."""
-    found = of(rows, "advection")
-    error = {option: share(figures(row)["RMS"]) for option, row in found.items() if "RMS" in figures(row)}
+    advection = by_option(rows, "advection")
+    error = {option: row["rms"] for option, row in advection.items() if "rms" in row.figures}
     assert len(error) == 4
     assert error["maccormack, float32"] < 0.8 * error["semi-lagrangian, float32"] < 0.8
     for scheme in ("maccormack", "semi-lagrangian"):
         assert error[f"{scheme}, float16"] == pytest.approx(error[f"{scheme}, float32"], rel=0.05)
-        assert found[f"{scheme}, float32"].max_error < 1.0
-    bricks = of(rows, "advection bricks")
-    assert share(figures(bricks["maccormack, smoke in 0%"])["worked on"]) == 0.0
-    assert share(figures(bricks["maccormack, smoke in 100%"])["worked on"]) == 1.0
+        assert advection[f"{scheme}, float32"]["max_error"] < 1.0
+    bricks = by_option(rows, "advection bricks")
+    assert bricks["maccormack, smoke in 0%"]["worked_on"] == 0.0
+    assert bricks["maccormack, smoke in 100%"]["worked_on"] == 1.0
 
 
 def test_smaller_steps_have_smaller_errors(rows):
-    guides, six = of(rows, "guide"), of(rows, "six ways")
-    light = {option: share(figures(row)["light RMS"]) for option, row in guides.items()}
+    guides, six = by_option(rows, "guide"), by_option(rows, "six ways")
+    light = {option: row["light_rms"] for option, row in guides.items()}
     assert light["h 2"] < light["h 10"] and light["h 1, each pixel alone"] < light["h 10, each pixel alone"]
     assert light["h 10, float16"] == pytest.approx(light["h 10"], rel=0.01)
-    assert guides["h 2"].psnr > guides["h 10"].psnr and guides["h 2"].max_error < guides["h 10"].max_error
-    assert six["step 0.5"].max_error < six["step 1"].max_error
-    assert share(figures(six["step 0.5"])["RMS by halving"]) < share(figures(six["step 1"])["RMS by halving"])
-    # What the coarser one lacks of the finer is what the finer one says by halving.
-    assert figures(six["step 1"])["RMS from the finest"] == figures(six["step 0.5"])["RMS by halving"]
+    assert guides["h 2"]["psnr"] > guides["h 10"]["psnr"] and guides["h 2"]["max_error"] < guides["h 10"]["max_error"]
+    for name in ("max_error", "halving_rms"):
+        assert six["step 0.5"][name] < six["step 1"][name]
+    # The coarser one's difference from the finer is the finer one's own estimate by halving.
+    assert six["step 1"]["finest_rms"] == pytest.approx(six["step 0.5"]["halving_rms"], rel=1e-4)
 
 
 def test_six_ways_are_those_of_the_system(rows):
-    """A row's error is what the march itself says."""
+    """A row's error is the march's own estimate."""
     volume = DensityVolume(make_cloud(24, "cpu"), extinction=8.0 / 24)
     eye = volume.centre + 24 * np.array([1.6, 0.9, 2.2])
     camera = Camera.look_at(eye, volume.centre, extent=1.15 * 24, height=16, width=16)
-    assert of(rows, "six ways")["step 1"].max_error == six_way(volume, camera, step=1.0).error.largest
+    assert by_option(rows, "six ways")["step 1"]["max_error"] == bake(volume, camera, step=1.0).error.largest
 
 
 def test_weights(rows):
     """Eq. 5 is too bright by half on average; the sums of the other rules are 1."""
-    bias = {rule: share(figures(row)["bias"]) for rule, row in of(rows, "weights").items()}
-    assert set(bias) == {"squared", "absolute", "normalised"}
-    assert bias["absolute"] > 0.3 and abs(bias["squared"]) < 0.15 and abs(bias["normalised"]) < 0.15
-    for row in of(rows, "weights").values():
-        given = figures(row)
-        assert share(given["least"]) < share(given["bias"]) < share(given["most"])
-        assert 0.0 < share(given["RMS"]) < share(given["worst light's RMS"])
+    weights = by_option(rows, "weights")
+    assert set(weights) == {"squared", "absolute", "normalised"}
+    assert weights["absolute"]["bias"] > 0.3
+    assert abs(weights["squared"]["bias"]) < 0.15 and abs(weights["normalised"]["bias"]) < 0.15
+    for row in weights.values():
+        assert row["bias_min"] < row["bias"] < row["bias_max"] and 0.0 < row["rms"] < row["worst_rms"]
 
 
 def test_a_frame_is_the_sum_of_its_stages(rows):
-    frame = of(rows, "frame")
+    frame = by_option(rows, "frame")
     parts = ("simulation", "guide", "obstacles' shadows", "weights and background")
     total = frame["all but the network"]
-    assert total.decode_ms == pytest.approx(sum(frame[part].decode_ms for part in parts))
-    assert float(figures(total)["frames/s"]) == pytest.approx(1e3 / total.decode_ms, rel=0.01)
-    assert frame["air alone"].decode_ms < frame["simulation"].decode_ms
+    assert total["time_ms"] == pytest.approx(sum(frame[part]["time_ms"] for part in parts))
+    assert total["frame_rate"] == pytest.approx(1e3 / total["time_ms"])
+    assert frame["air alone"]["time_ms"] < frame["simulation"]["time_ms"]
 
 
 def test_one_measurement_twice():
-    """Errors don't hang on what ran before."""
-    setup = Bench("cpu", TINY)
+    """Errors don't depend on what ran before."""
+    setup = SmokeBench("cpu", TINY)
     assert storage_rows(setup) == storage_rows(setup)
     first, second = six_rows(setup), six_rows(setup)
-    assert [row.max_error for row in first] == [row.max_error for row in second]
+    assert [row["max_error"] for row in first] == [row["max_error"] for row in second]
 
 
 def test_the_cloud():
@@ -186,85 +172,16 @@ def test_the_plume():
     assert not torch.equal(plume.density, make_plume(16, seed=2).density)
 
 
-def test_notes_of_rows():
-    timing = Timing(8.0, 7.0, 9.0, 3)
-    made = make_row("s", "m", "o", {"a b": "1%", "c": "2"}, "more, of it", timing=timing, calls=4, max_error=0.5)
-    assert made.notes == "a b: 1%; c: 2; more, of it"
-    assert figures(made) == {"a b": "1%", "c": "2"}
-    assert (made.decode_ms, made.decode_ms_spread, made.max_error) == (2.0, 0.5, 0.5)
-    assert make_row("s", "m", "o").notes == "" and figures(make_row("s", "m", "o", note="just words")) == {}
-    assert (number(23825.4), number(6.036), number(0.0)) == ("23,825", "6.04", "0")
-    assert (percent(0.90961), percent(1.0), percent(6.3e-5)) == ("91%", "100%", "0.0063%")
-
-
-def test_tables():
-    """A table a method with columns of its own; other systems' rows keep the table that they have."""
-    first = make_row("jet", "lattice", "a", {"cells": "16³"}, timing=Timing(1.0, 0.5, 2.0, 3))
-    second = make_row("jet", "lattice", "b", {"cells": "16³", "MLUPS": "7"}, "slow")
-    third = make_row("plume", "weights", "c", {"bias": "+1.0%"}, max_error=0.25)
-    made = tables([first, second, third])
-    assert made == (
-        "#### lattice: jet\n\n"
-        "|  | cells | ms | p90−p10 ms | MLUPS | notes |\n"
-        "|---|---:|---:|---:|---:|---|\n"
-        "| a | 16³ | 1 | 1.5 |  |  |\n"
-        "| b | 16³ |  |  | 7 | slow |\n"
-        "\n#### weights: plume\n\n"
-        "|  | bias | largest error |\n"
-        "|---|---:|---:|\n"
-        "| c | +1.0% | 0.25 |\n"
-    )
-    other = Row("probe", "room", "ours", "a", notes="4 Gaussians; title: no column")
-    assert tables([other]) == table([other])
-    assert tables([first, other]) == table([other]) + "\n" + tables([first])
-    assert tables([]) == ""
-
-
-def test_rows_make_a_file_a_page_and_a_plot(rows, tmp_path):
-    path = tmp_path / "rows.json"
-    environment = {"device": "cpu", "device_name": "a CPU", "command": "wlm bench smoke", "date": "2026-01-02T03:04:05"}
-    environment |= {"threads": 1, "python": "3", "warp": "1", "torch": "2"}
-    write_json(path, rows, environment)
-    assert read_json(path)[0] == rows
-    page = report([path])
-    for scene, method in METHODS:
-        assert page.count(f"#### {method}: {scene}\n") == 1
-    assert page.count("\n| ") == len(rows) + len(METHODS)
+def test_rows_make_a_file_tables_and_a_plot(rows, tmp_path):
+    check_outputs(rows, tmp_path, PANELS, plotted(rows))
     assert {row.method for row in plotted(rows)} == {"guide", "six ways"}
-    plot(plotted(rows), tmp_path / "rows.png", PANELS)
-    assert (tmp_path / "rows.png").stat().st_size > 10_000
 
 
 def test_the_command(rows, tmp_path, monkeypatch):
-    """What it writes, and the command line that it keeps."""
-    from wlm.cli.bench import app
-
-    seen = {}
-
-    def measured(**options):
-        seen.update(options)
-        return rows
-
-    monkeypatch.setattr(bench, "run", measured)
-    json, png = str(tmp_path / "a.json"), str(tmp_path / "a.png")
-    result = CliRunner().invoke(app, ["smoke", "--quick", "--json", json, "--plot", png])
-    assert result.exit_code == 0, result.output
-    assert seen["quick"] and seen["device"] == "cpu"
-    found, environment = read_json(json)
-    assert found == rows and environment["command"] == "wlm bench smoke --quick --device cpu"
-    assert "#### frame: jet-sphere" in result.output and (tmp_path / "a.png").stat().st_size > 1000
+    command, _, options = check_command(monkeypatch, bench, rows, ["smoke", "--quick"], tmp_path)
+    assert command == "wlm bench smoke --quick --device cpu" and options["quick"]
 
 
 def test_what_is_refused():
     with pytest.raises(WlmError, match="device 'tpu'"):
         run(quick=True, device="tpu")
-
-
-@pytest.mark.parametrize(("system", "label"), [("smoke", "time (ms)"), ("probe", "decode time (ms)")])
-def test_what_a_time_is_called(system: str, label: str, tmp_path, monkeypatch):
-    """Only what decodes has a decode time."""
-    import matplotlib
-
-    monkeypatch.setitem(matplotlib.rcParams, "svg.fonttype", "none")
-    plot([Row(system, "s", "m", decode_ms=1.0, psnr=30.0)], tmp_path / "p.svg", "decode_ms")
-    assert f">{label}<" in (tmp_path / "p.svg").read_text(encoding="utf-8")

@@ -6,7 +6,7 @@ import math
 import pytest
 import torch
 
-from wlm.bench import Timing, cpu_threads, time_call, time_together, timing
+from wlm.bench import Timing, time_together, timing
 from wlm.errors import WlmError
 
 
@@ -35,7 +35,7 @@ def test_distribution_is_of_one_call(monkeypatch):
 
     monkeypatch.setattr(timing.time, "perf_counter", lambda: now[0])
     # Two calls to warm up and one to see how long a call is are not in the distribution.
-    result = time_call(call, warmup=2, repeats=11)
+    result = time_together({"": call}, warmup=2, repeats=11)[""]
     assert result.n == 11
     assert (result.median_ms, result.p10_ms, result.p90_ms) == pytest.approx((12.0, 4.0, 20.0))
 
@@ -68,13 +68,13 @@ def test_no_peers():
 @pytest.mark.parametrize(("warmup", "repeats"), [(0, 5), (5, 0)])
 def test_counts_are_checked(warmup, repeats):
     with pytest.raises(WlmError, match="at least 1"):
-        time_call(lambda: None, warmup=warmup, repeats=repeats)
+        time_together({"": lambda: None}, warmup=warmup, repeats=repeats)
 
 
 @pytest.mark.parametrize("name", ["gpu", "cuda:77", "cuda:x", ""])
 def test_unknown_devices_are_refused(name):
     with pytest.raises(WlmError):
-        time_call(lambda: None, name)
+        time_together({"": lambda: None}, name)
 
 
 def test_an_error_in_a_call_is_not_hidden():
@@ -82,17 +82,7 @@ def test_an_error_in_a_call_is_not_hidden():
         raise ZeroDivisionError
 
     with pytest.raises(ZeroDivisionError):
-        time_call(broken)
-
-
-def test_cpu_threads_are_set_and_put_back():
-    before = torch.get_num_threads()
-    with pytest.raises(ZeroDivisionError), cpu_threads(before + 1):
-        assert torch.get_num_threads() == before + 1
-        raise ZeroDivisionError
-    assert torch.get_num_threads() == before
-    with pytest.raises(WlmError, match="thread"), cpu_threads(0):
-        pass
+        time_together({"": broken})
 
 
 def test_every_device_gives_a_finite_time_and_does_the_work(device):

@@ -1,10 +1,13 @@
 """Small meshes with lightmaps, for tests of the atlas."""
 
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 
 from wlm.atlas.data import LightmappedMesh, from_arrays
+from wlm.formats.exr import write_exr
+from wlm.formats.gltf_writer import write_glb
 
 Light = Callable[[np.ndarray], np.ndarray]
 """Radiance [..., 3] at places [..., 2] in [0, 1] of the lightmap."""
@@ -61,6 +64,13 @@ def triangle(light: Light = soft, height: int = 16, width: int = 16, name: str =
     corner = np.array([[0.1, 0.1], [0.7, 0.15], [0.2, 0.6]])
     position = np.insert(corner, 2, 0.0, axis=1)
     return from_arrays(position, np.array([[0, 1, 2]]), corner, image(light, height, width), name=name)
+
+
+def write_files(folder: Path, mesh: LightmappedMesh) -> tuple[Path, Path]:
+    """Writes a mesh and its lightmap as ``mesh.glb`` and ``light.exr``."""
+    write_glb(folder / "mesh.glb", mesh.document, [], 1)
+    write_exr(folder / "light.exr", mesh.lightmap)
+    return folder / "mesh.glb", folder / "light.exr"
 
 
 def _quads(rows: int, columns: int) -> np.ndarray:

@@ -54,21 +54,21 @@ def synthetic(count: int, seed: int = 0, coefficients: int = 9, dead: int = 0) -
     window, far = lobe(WINDOW, 0.75)
     lamp, near = lobe(LAMP, 0.95)
     values = window[..., None] * [1.0, 1.2, 1.6] * (6.0 / (1.0 + far))[:, None, None]
-    values += lamp[..., None] * [8.0, 5.5, 2.5] * (_seen(position, LAMP) / (1.0 + near))[:, None, None]
+    values += lamp[..., None] * [8.0, 5.5, 2.5] * (_visible(position, LAMP) / (1.0 + near))[:, None, None]
     values[:, 0] += 0.3 * (1.0 + np.sin(position[:, :1] * [0.5, 0.8, 1.1])) * [0.9, 0.7, 0.5]
     if dead:
         values[np.linspace(0, count - 1, dead).astype(int)] = 0.0
     return from_arrays(position, values.astype(np.float32), name="room")
 
 
-def _seen(position: np.ndarray, light: np.ndarray) -> np.ndarray:
+def _visible(position: np.ndarray, light: np.ndarray) -> np.ndarray:
     """1 where no block lies between a point and the light, else 0."""
     way = light - position
     way[way == 0.0] = 1e-12
-    seen = np.ones(len(position))
+    visible = np.ones(len(position))
     for low, high in BLOCKS:
         first, second = (low - position) / way, (high - position) / way
         enters = np.minimum(first, second).max(axis=1)
         leaves = np.maximum(first, second).min(axis=1)
-        seen[(enters < leaves) & (leaves > 0.0) & (enters < 1.0)] = 0.0
-    return seen
+        visible[(enters < leaves) & (leaves > 0.0) & (enters < 1.0)] = 0.0
+    return visible

@@ -1,4 +1,4 @@
-"""Lightmap sets of one to four tiles and settings so small that a fit takes a moment."""
+"""Lightmap sets of one to four tiles, and settings with which a fit takes a moment."""
 
 import numpy as np
 
@@ -9,13 +9,13 @@ HOURS = (0.0, 5.0, 11.0, 13.5, 20.0)
 
 
 def tiny_profile(**settings) -> Profile:
-    """The sizes that all these tests share, so that each kernel is compiled once."""
+    """Sizes that all these tests share, so that each kernel is compiled once."""
     sizes = {"hidden": 16, "uvt_resolution": 8, "uvt_slices": 4, "plane_columns": 16, "plane_rows": 8}
     return Profile(name="tiny", **sizes | {"steps": 20, "samples": 128} | settings)
 
 
 def moving_light(height=128, width=128, hours=HOURS, period=24.0, mask=None, seed=0, gain=1.0) -> LightmapSet:
-    """A spot that wanders with the hour over a rough wall, so that no tile is static."""
+    """A spot that moves with the hour over a rough wall, so that no tile is static."""
     v, u = np.mgrid[:height, :width] / 128.0
     wall = np.random.default_rng(seed).uniform(0.6, 1.0, (height, width, 3))
     frames = []

@@ -1,4 +1,4 @@
-"""Small smoke for tests: a leaning plume, alone and as the frames of a scene."""
+"""Small smoke for tests: a leaning plume, alone and as the frames of a scene; cameras before it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from wlm.fluid.volume import DensityVolume, from_array, save_volume
-from wlm.smoke.data import Frames, frame_file, open_frames, read_frames
+from wlm.smoke.camera import Camera
+from wlm.smoke.data import Frames, load_frames, open_frames
 from wlm.smoke.scene import Scene
 
 SCENE = {
@@ -36,9 +37,22 @@ def plume(frame: int = 3, *, hot: bool = False, device: str = "cpu") -> DensityV
     return from_array(density, extinction=8.0, temperature=temperature, device=device, **place)
 
 
+def unit_grid(n: int) -> list[np.ndarray]:
+    """x, y and z of n^3 voxel centres of the box from -1 to 1."""
+    axis = (np.arange(n) + 0.5) / n * 2 - 1
+    return np.meshgrid(axis, axis, axis, indexing="ij")
+
+
+def facing(volume: DensityVolume, way: tuple = (0.0, 0.0, 1.0), size: int = 24, **options) -> Camera:
+    """A square image of a volume from some side, of 1.1 times its longest edge unless told."""
+    edge = max(volume.shape) * volume.voxel
+    position = volume.centre + 3.3 * edge * np.array(way) / np.linalg.norm(way)
+    return Camera.look_at(position, volume.centre, **({"extent": 1.1 * edge, "height": size, "width": size} | options))
+
+
 def write_frames(folder: Path, **changed: object) -> Frames:
     """A folder as a simulation leaves it."""
     frames = open_frames(folder, Scene.model_validate(SCENE | changed))
     for number in range(1, frames.scene.frames + 1):
-        save_volume(folder / frame_file(number), plume(number))
-    return read_frames(folder)
+        save_volume(frames.file(number), plume(number))
+    return load_frames(folder)

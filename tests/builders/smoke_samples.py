@@ -1,26 +1,32 @@
-"""A small pool of samples for tests: a plume of several densities, rising, seen from some sides."""
+"""Small pools and networks for tests: a rising plume at several densities, from several sides; random weights."""
 
 from __future__ import annotations
 
 import functools
+import os
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
 from builders.smoke_plumes import plume
 
 from wlm.fluid.volume import DensityVolume
-from wlm.smoke.baking import six_way
+from wlm.formats.artifact import read_artifact
+from wlm.smoke.baking import bake
 from wlm.smoke.camera import Camera
-from wlm.smoke.planes import Pool, encode_lightmaps, look_at
+from wlm.smoke.learn.pool import Pool
+from wlm.smoke.model import NetworkSettings, SixWayNetwork, SmokeModel
+from wlm.smoke.planes import encode_lightmaps, render_guide
 from wlm.smoke.scene import CameraSettings, make_camera
+from wlm_kernels.smoke.settings import March
 
 STEP = 3.0
 """Of the guiding maps, in voxels."""
 
 
-def seen(volume: DensityVolume, degrees: float = 0.0, resolution: int = 32) -> Camera:
-    """A camera round a volume."""
+def view_of(volume: DensityVolume, degrees: float = 0.0, resolution: int = 32) -> Camera:
+    """A camera that holds a volume, turned about it."""
     settings = CameraSettings(resolution=resolution).turned(degrees)
     return make_camera(settings, volume.origin, volume.voxel * np.array(volume.shape))
 
@@ -29,23 +35,39 @@ def sample(
     volume: DensityVolume, camera: Camera, seed: int = 0, kind: str = "paper"
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """A guide [C, H, W] of a kind and its lightmaps [8, H, W], encoded."""
-    guided = look_at(volume, camera, kind, step=STEP, jitter=1.0, threshold=0.01, seed=seed)
-    return guided, encode_lightmaps(six_way(volume, camera, step=1.0, estimate=False))
+    guide = render_guide(volume, camera, kind, March(STEP, seed=seed))
+    return guide, encode_lightmaps(bake(volume, camera, step=1.0, estimate=False))
 
 
 @functools.cache
 def small_pool(count: int = 6, first: int = 0, resolution: int = 32, kind: str = "paper") -> Pool:
-    """Samples on the CPU, the odd ones hot; whole numbers of ``first`` give others."""
+    """Samples on the CPU, those of odd numbers hot; numbers begin at ``first``."""
     guides, targets = [], []
     for i in range(first, first + count):
         pair = []
         for frame in (2.0, 2.1):
             volume = replace(plume(frame + 0.15 * (i % 5), hot=i % 2 == 1), extinction=4.0 + 5.0 * (i % 3))
-            pair.append(sample(volume, seen(volume, 37.0 * i, resolution), 2 * i, kind))
-        guides.append(torch.stack([guided for guided, _ in pair]))
-        targets.append(torch.stack([wanted for _, wanted in pair]))
+            pair.append(sample(volume, view_of(volume, 37.0 * i, resolution), 2 * i, kind))
+        guides.append(torch.stack([guide for guide, _ in pair]))
+        targets.append(torch.stack([target for _, target in pair]))
     motion = torch.zeros(count, 2, resolution, resolution)
     motion[:, 1] = -1.0
     return Pool(
         torch.stack(guides).half(), torch.stack(targets).half(), motion.half(), torch.arange(first, first + count)
     )
+
+
+def random_model(spread: float = 0.2, seed: int = 0, **settings: Any) -> SmokeModel:
+    """A tiny network all of whose weights matter."""
+    torch.manual_seed(seed)
+    network = SixWayNetwork(NetworkSettings(**{"width": 8, "levels": 3} | settings))
+    for parameter in network.parameters():
+        torch.nn.init.normal_(parameter, std=spread)
+    return SmokeModel(network, {})
+
+
+def file_content(path: str | os.PathLike[str]) -> tuple[dict[str, Any], dict[str, bytes]]:
+    """What a network's file holds, but for the seconds that its training took."""
+    artifact = read_artifact(path)
+    settings = {**artifact.settings, "summary": {**artifact.settings["summary"], "seconds": 0}}
+    return settings, {name: array.tobytes() for name, array in artifact.tensors.items()}

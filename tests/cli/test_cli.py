@@ -306,35 +306,22 @@ def test_a_closed_pipe_is_no_traceback(fitted):
     assert process.returncode == 1 and errors == ""
 
 
-def test_bench_writes_what_it_was_given(monkeypatch, tmp_path):
-    module = pytest.importorskip("wlm.bench.lightmap")
-    from wlm.bench import Row, read_json
-
-    asked = []
-
-    def run(*, quick, device, set_path, progress):
-        asked.append((quick, device, set_path))
-        progress("one of one")
-        return [Row("lightmap", "city", "wlm", "M", bytes=10, bpp=0.7, decode_ms=1.0, psnr=40.0)]
-
-    monkeypatch.setattr(module, "run", run)
-    text = call("bench", "lightmap", "--quick", "--json", tmp_path / "r.json", "--plot", tmp_path / "p.png")
-    assert asked == [(True, "cpu", None)] and "one of one" in call.stderr
-    assert "| lightmap | city | wlm |" in text
-    rows, environment = read_json(tmp_path / "r.json")
-    assert rows[0].psnr == 40.0 and environment
-    assert (tmp_path / "p.png").read_bytes().startswith(b"\x89PNG")
-    assert "ends in" in fails("bench", "lightmap", "--plot", tmp_path / "p.txt")
-
-
-def test_bench_report_makes_a_page(tmp_path):
+def test_bench_report_makes_pages(tmp_path):
     from wlm.bench import Row, describe_environment, write_json
 
-    file, page = tmp_path / "here.json", tmp_path / "page.md"
-    write_json(file, [Row("lightmap", "city", "ours", "M", psnr=45.98)], describe_environment("cpu", "wlm bench"))
+    file, index = tmp_path / "here.json", tmp_path / "index.md"
+    row = Row("lightmap", "city", "ours", "M", {"psnr": 45.98})
+    write_json(file, [row], describe_environment("cpu", "wlm bench"))
     text = call("bench", "report", file)
     assert "`here.json`" in text and "| 45.98 |" in text
-    call("bench", "report", file, "-o", page)
-    assert page.read_text(encoding="utf-8") == text
-    assert "ends in" in fails("bench", "report", file, "-o", tmp_path / "page.txt")
+    call("bench", "report", file, "-o", index)
+    assert "index/lightmap.md" in index.read_text(encoding="utf-8")
+    assert "| 45.98 |" in (tmp_path / "index" / "lightmap.md").read_text(encoding="utf-8")
+    assert "ends in" in fails("bench", "report", file, "-o", tmp_path / "index.txt")
     assert "absent.json" in fails("bench", "report", tmp_path / "absent.json")
+
+
+def test_bench_checks_its_outputs_before_the_work(tmp_path):
+    (tmp_path / "mine.json").write_text("{}")
+    assert "ends in" in fails("bench", "lightmap", "--plot", tmp_path / "p.txt")
+    assert "not a result file" in fails("bench", "smoke", "--json", tmp_path / "mine.json")

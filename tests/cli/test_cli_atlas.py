@@ -6,36 +6,25 @@ import re
 import numpy as np
 import pytest
 import yaml
-from builders.atlas_meshes import charts, sheet
+from builders.atlas_meshes import charts, sheet, write_files
 from builders.running import call, fails
 from PIL import Image
 
 import wlm.atlas.colour
 import wlm.atlas.fit
-from wlm.atlas import codec
-from wlm.atlas.data import load_mesh
-from wlm.atlas.decode import Decoder
-from wlm.atlas.evaluation import evaluate
+from wlm.atlas.data import load
+from wlm.atlas.evaluation import compare, evaluate
 from wlm.atlas.fit import compress
-from wlm.atlas.model import load_profile
 from wlm.baselines.atlas import downsampling
 from wlm.formats.exr import read_exr, write_exr
-from wlm.formats.gltf_writer import write_glb
 
 CASCADE = {"name": "short", "method": "cascade", "fallback": False, "steps": 20, "resolution": 64}
 QUICK = ("--views", 2)
 
 
-def _files(folder, mesh):
-    """A mesh and its lightmap as files."""
-    write_glb(folder / "mesh.glb", mesh.document, [], 1)
-    write_exr(folder / "light.exr", mesh.lightmap)
-    return folder / "mesh.glb", folder / "light.exr"
-
-
 @pytest.fixture(scope="session")
 def inputs(tmp_path_factory):
-    return _files(tmp_path_factory.mktemp("inputs"), sheet())
+    return write_files(tmp_path_factory.mktemp("inputs"), sheet())
 
 
 @pytest.fixture(scope="session")
@@ -63,7 +52,7 @@ def test_help_lists_the_commands():
 def test_compress_prints_one_table(inputs, tmp_path):
     out = tmp_path / "out"
     text = call("atlas", "compress", *inputs, "-o", out, *QUICK)
-    model = codec.read(out / "atlas.wlm")
+    model = wlm.load(out / "atlas.wlm")
     for path in out.iterdir():
         assert re.search(rf"│ {re.escape(path.name)} +│ +{path.stat().st_size:,} │", text)
     size = (out / "atlas.wlm").stat().st_size
@@ -75,39 +64,40 @@ def test_compress_prints_one_table(inputs, tmp_path):
     assert (report["seed"], report["device"]) == (0, "cpu") and report["seconds"]["weights"] > 0
 
 
-def test_one_seed_gives_one_file(inputs, tiles, tmp_path):
-    for seed, same in ((0, True), (5, False)):
-        call("atlas", "compress", *inputs, "-o", tmp_path / "out", *QUICK, "--seed", seed)
-        assert ((tmp_path / "out" / "atlas.wlm").read_bytes() == (tiles / "atlas.wlm").read_bytes()) is same
+def test_the_command_is_the_library(inputs, tiles, tmp_path):
+    """Also byte for byte: one seed gives one file."""
+    mesh = load(*inputs)
+    assert compress(mesh, views=2).save(tmp_path / "a.wlm")
+    assert (tmp_path / "a.wlm").read_bytes() == (tiles / "atlas.wlm").read_bytes()
 
 
 def test_the_options_of_compress_reach_the_fit(inputs, tmp_path):
     mask = np.zeros((40, 48), np.uint8)
     mask[:30] = 255
     Image.fromarray(mask).save(tmp_path / "mask.png")
-    options = ["--budget", 0.4, "--colour", "bc6h", "--views", 0, "--uv-set", 0, "--mask", tmp_path / "mask.png"]
-    call("atlas", "compress", *inputs, "-o", tmp_path / "out", *options)
+    options = ["--budget", 0.4, "--colour", "bc6h", "--views", 1, "--uv-set", 0, "--mask", tmp_path / "mask.png"]
+    call("atlas", "compress", *inputs, "-o", tmp_path / "out", *options, "--seed", 5)
     # The sheet reaches beyond the mask.
     assert re.search(r"^warning: .*outside the mask", call.stderr, re.MULTILINE)
-    model = codec.read(tmp_path / "out" / "atlas.wlm")
-    settings = model.profile
-    assert (settings.name, settings.budget, settings.colour, settings.views) == ("standard", 0.4, "bc6h", 0)
-    assert model.source == load_mesh(*inputs, mask_path=tmp_path / "mask.png").source
+    mesh = load(*inputs, mask_path=tmp_path / "mask.png")
+    compress(mesh, seed=5, budget=0.4, colour="bc6h", views=1).save(tmp_path / "a.wlm")
+    assert (tmp_path / "a.wlm").read_bytes() == (tmp_path / "out" / "atlas.wlm").read_bytes()
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert len(report["warnings"]) == 1 and report["inputs"]["mask"] == str(tmp_path / "mask.png")
-    # evaluate finds the mask again, and decode needs no inputs.
+    # evaluate reads the mask again, and decode needs no inputs.
     call("atlas", "evaluate", tmp_path / "out", "--views", 2, "--resolution", 64)
     (tmp_path / "mask.png").unlink()
     call("atlas", "decode", tmp_path / "out", "-o", tmp_path / "a.exr")
-    found, _ = read_exr(tmp_path / "a.exr")
-    np.testing.assert_array_equal(found.any(axis=2), mask > 0)
+    decoded, _ = read_exr(tmp_path / "a.exr")
+    np.testing.assert_array_equal(decoded.any(axis=2), mask > 0)
 
 
 def test_wrong_words_are_one_line(inputs, tmp_path):
     out = ["-o", tmp_path / "out"]
     words = ["atlas", "compress", *inputs, *out]
     assert "--budget: expected greater than 0, got 0" in fails(*words, "--budget", 0).replace("should be ", "")
-    assert "--colour: expected 'half', 'bc6h' or 'astc', got png" in fails(*words, "--colour", "png")
+    assert "--colour: expected 'half', 'bc6h' or 'astc', got 'png'" in fails(*words, "--colour", "png")
+    assert "--budget: profiles of the cascade" in fails(*words, "--profile", "paper", "--budget", 0.1)
     assert "'none'" in fails(*words, "--profile", "none")
     assert "TEXCOORD_3" in fails(*words, "--uv-set", 3)
     assert "device 'tpu'" in fails(*words, "--device", "tpu")
@@ -137,7 +127,7 @@ def test_an_interrupt_leaves_nothing(inputs, tmp_path, monkeypatch):
 
 
 def test_a_mesh_of_another_format(inputs, tmp_path):
-    mesh = load_mesh(*inputs)
+    mesh = load(*inputs)
     lines = ["v {} {} {}".format(*place) for place in mesh.position]
     # v of an .obj goes up.
     lines += [f"vt {u} {1 - v}" for u, v in mesh.uv]
@@ -145,65 +135,55 @@ def test_a_mesh_of_another_format(inputs, tmp_path):
     (tmp_path / "mesh.obj").write_text("\n".join(lines))
     call("atlas", "compress", tmp_path / "mesh.obj", inputs[1], "-o", tmp_path / "out", *QUICK)
     call("atlas", "decode", tmp_path / "out", "-o", tmp_path / "a.exr")
-    found, _ = read_exr(tmp_path / "a.exr")
-    own = load_mesh(tmp_path / "out" / "mesh.glb", inputs[1])
-    np.testing.assert_allclose(own.uv[own.triangle], mesh.uv[mesh.triangle], atol=1e-6)
-    assert np.abs(found - mesh.lightmap)[mesh.mask].mean() < 0.1
+    decoded, _ = read_exr(tmp_path / "a.exr")
+    written = load(tmp_path / "out" / "mesh.glb", inputs[1])
+    np.testing.assert_allclose(written.uv[written.triangle], mesh.uv[mesh.triangle], atol=1e-6)
+    assert np.abs(decoded - mesh.lightmap)[mesh.mask].mean() < 0.1
     call("atlas", "evaluate", tmp_path / "out", "--views", 1, "--resolution", 32)
 
 
-def test_evaluate(inputs, tiles, tmp_path):
-    options = ["--views", 3, "--resolution", 64, "--json", tmp_path / "a.json"]
-    text = call("atlas", "evaluate", tiles, *options)
+@pytest.mark.parametrize("kind", ["tiles", "cascade"])
+def test_evaluate(kind, inputs, request, tmp_path):
+    """The report of the library, with those of the rival."""
+    folder, options = request.getfixturevalue(kind), {"views": 3, "resolution": 64}
+    words = ["--views", 3, "--resolution", 64, "--json", tmp_path / "a.json"]
+    text = call("atlas", "evaluate", folder, *words)
     report = json.loads((tmp_path / "a.json").read_text())
-    mesh, model = load_mesh(*inputs), codec.read(tiles / "atlas.wlm")
+    mesh, model = load(*inputs), wlm.load(folder / "atlas.wlm")
+    expected = evaluate(model, mesh, **options).to_json()
     rival = downsampling(mesh, 1.0 - model.compression_ratio)
-    samplers = {"ours": Decoder(model), "rival": rival.sample}
-    expected = evaluate(mesh, samplers, views=3, resolution=64)
-    for found, name in ((report, "ours"), (report["downsampling"], "rival")):
-        # Seams of tiles are others than those of charts.
-        for key in ("psnr", "psnr_worst", "worst_view", "one_minus_ssim", "texel_psnr", "views", "pixels", "peak"):
-            assert found[key] == pytest.approx(expected[name].to_json()[key], rel=1e-6), key
+    score = compare(mesh, {"rival": rival.decoded}, **options)["rival"].to_json()
+    assert report.items() >= expected.items() and report["downsampling"].items() >= score.items()
     assert f"{report['psnr']:.2f}" in text and f"{report['downsampling']['psnr']:.2f}" in text
-    assert report["cr"] == model.compression_ratio and report["cameras"] == 3
-    size = (tiles / "atlas.wlm").stat().st_size
-    assert report["bytes"] == size and report["cr_disk"] == 1 - size * 8 / (40 * 48 * 48)
+    assert report["cameras"] == 3 and "evaluate: 3 of 3" in call.stderr
     # It has as many bits, less what is left of a row of texels.
-    assert 0 <= report["downsampling"]["cr"] - report["cr"] < 0.02
+    assert 0 <= report["downsampling"]["cr"] - report["cr"] < 0.04
     # One chart has no seam.
-    assert report["seam_ratio"] is None and "evaluate: 3 of 3" in call.stderr
+    assert (report["seam_ratio"] is None) == (kind == "tiles")
 
 
 def test_seams_are_the_borders_of_charts(tmp_path):
     """A model with an error at the borders of the lightmap's charts alone."""
-    mesh = charts(height=64, width=64)
-    paths = _files(tmp_path, mesh)
     out = tmp_path / "out"
-    call("atlas", "compress", *paths, "-o", out, *QUICK)
+    call("atlas", "compress", *write_files(tmp_path, charts(height=64, width=64)), "-o", out, *QUICK)
     options = ["--views", 3, "--resolution", 256, "--json", tmp_path / "a.json"]
     call("atlas", "evaluate", out, *options)
     before = json.loads((tmp_path / "a.json").read_text())
     assert before["seam_error"] / before["rest_error"] == pytest.approx(before["seam_ratio"])
-    model = codec.read(out / "atlas.wlm")
+    model = wlm.load(out / "atlas.wlm")
     assert model.method == "tiles"
     # All becomes brighter by one amount: seams no longer stand out.
-    codec.write(out / "atlas.wlm", dataclasses.replace(model, texels=(model.texels + np.float16(0.5))))
+    dataclasses.replace(model, texels=model.texels + np.float16(0.5)).save(out / "atlas.wlm")
     call("atlas", "evaluate", out, *options)
     after = json.loads((tmp_path / "a.json").read_text())
     assert after["seam_ratio"] == pytest.approx(1.0, abs=0.05) and after["psnr"] < before["psnr"]
     assert after["downsampling"] == before["downsampling"] | {"seconds": after["downsampling"]["seconds"]}
 
 
-def test_evaluate_of_new_uvs(cascade):
-    assert codec.read(cascade / "atlas.wlm").method == "cascade"
-    text = call("atlas", "evaluate", cascade, "--views", 2, "--resolution", 64)
-    assert "downsampling" in text and "CR (eq. 9)" in text
-
-
 def test_evaluate_looks_for_its_inputs(inputs, tmp_path):
     mesh = charts()
     (tmp_path / "in").mkdir()
-    paths = _files(tmp_path / "in", mesh)
+    paths = write_files(tmp_path / "in", mesh)
     out = tmp_path / "out"
     call("atlas", "compress", *paths, "-o", out, *QUICK)
     words = ["atlas", "evaluate", out, "--views", 1, "--resolution", 32]
@@ -229,12 +209,12 @@ def test_evaluate_looks_for_its_inputs(inputs, tmp_path):
 
 @pytest.mark.parametrize("kind", ["tiles", "cascade"])
 def test_decode_the_lightmap(kind, inputs, request, tmp_path):
-    folder, mesh = request.getfixturevalue(kind), load_mesh(*inputs)
+    folder, mesh = request.getfixturevalue(kind), load(*inputs)
     text = call("atlas", "decode", folder, "-o", tmp_path / "a.exr")
-    expected = Decoder(codec.read(folder / "atlas.wlm")).lightmap(mesh)
-    found, _ = read_exr(tmp_path / "a.exr")
-    np.testing.assert_array_equal(found, expected.astype(np.float16))
-    assert "48x40" in text and np.abs(found - mesh.lightmap)[mesh.mask].mean() < 0.1
+    expected = wlm.load(folder / "atlas.wlm").decoder().lightmap(mesh)
+    decoded, _ = read_exr(tmp_path / "a.exr")
+    np.testing.assert_array_equal(decoded, expected.astype(np.float16))
+    assert "48x40" in text and np.abs(decoded - mesh.lightmap)[mesh.mask].mean() < 0.1
 
 
 @pytest.mark.parametrize("kind", ["tiles", "cascade"])
@@ -260,7 +240,7 @@ def test_wrong_words_of_decode(tiles, tmp_path):
     assert "a lightmap is written as .exr" in fails(*words, tmp_path / "a.png")
     assert "expected a name that ends in .exr or .png" in fails(*words, tmp_path / "a.dds")
     for option, value in (("--views", 50), ("--resolution", 512)):
-        # Also where it is what a view has anyway.
+        # Also where it is the default of a view.
         text = fails(*words, tmp_path / "a.exr", option, value)
         assert f"{option}: expected with --view alone" in text
     assert "--view: expected 0 to 49, got 50" in fails(*words, tmp_path / "a.exr", "--view", 50)
@@ -273,12 +253,10 @@ def test_wrong_words_of_decode(tiles, tmp_path):
 @pytest.mark.parametrize("kind", ["tiles", "cascade"])
 def test_info(kind, request):
     folder = request.getfixturevalue(kind)
-    model, size = codec.read(folder / "atlas.wlm"), (folder / "atlas.wlm").stat().st_size
+    model, size = wlm.load(folder / "atlas.wlm"), (folder / "atlas.wlm").stat().st_size
     for path in (folder, folder / "atlas.wlm"):
         facts = json.loads(call("atlas", "info", path, "--json"))
         assert (facts["name"], facts["method"], facts["bytes"], facts["size"]) == ("mesh", kind, size, [48, 40])
-        assert sum(facts["parts"].values()) == size and facts["cr"] == model.compression_ratio
-        assert facts["colour_size"] == [model.texels.shape[1], model.texels.shape[0]]
         assert facts["new_uvs"] == len(model.uv) and facts["profile"]["method"] == kind
     text = call("atlas", "info", folder)
     assert f"{size:,}" in text and f"{model.compression_ratio:.2%}" in text and "48x40" in text
@@ -286,13 +264,11 @@ def test_info(kind, request):
 
 
 def test_info_decodes_nothing(inputs, tmp_path, monkeypatch):
-    """No package of an extra is needed; what is wrong with a folder is said all the same."""
+    """No package of an extra is needed; a damaged folder is refused all the same."""
     out = tmp_path / "out"
     call("atlas", "compress", *inputs, "-o", out, *QUICK, "--colour", "astc", "--budget", 0.3)
-    expected = codec.read(out / "atlas.wlm")
     monkeypatch.setattr(wlm.atlas.colour, "decode", None)
-    facts = json.loads(call("atlas", "info", out, "--json"))
-    assert facts["colour"] == "astc" and facts["cr"] == expected.compression_ratio
+    assert json.loads(call("atlas", "info", out, "--json"))["colour"] == "astc"
     report = json.loads((out / "report.json").read_text())
     (out / "report.json").write_text(json.dumps(report | {"source": "0" * 16}))
     assert "are not of one run" in fails("atlas", "info", out)
@@ -308,10 +284,3 @@ def test_info_of_a_plain_model(inputs, tmp_path):
     assert re.search(r"│ table +│ +none │", text) and re.search(r"│ method +│ +plain │", text)
     call("atlas", "evaluate", tmp_path / "out", "--views", 1, "--resolution", 32)
     assert "gone.wlm" in fails("atlas", "info", tmp_path / "gone.wlm")
-
-
-def test_the_command_is_the_library(inputs, tiles):
-    profile = load_profile("standard").model_copy(update={"views": 2})
-    model, back = compress(load_mesh(*inputs), profile), codec.read(tiles / "atlas.wlm")
-    for name in ("texels", "lut", "uv", "blocks"):
-        np.testing.assert_array_equal(getattr(back, name), getattr(model, name))

@@ -145,8 +145,8 @@ def test_decode_in_an_engines_convention(fitted, room, tmp_path):
 
 def test_evaluate_prints_and_writes_the_report(fitted, room, tmp_path, monkeypatch):
     # Two of the rivals, for time; one of them has no room.
-    few = {name: baselines.PROBE_BASELINES[name] for name in ("global_pca", "unreal")}
-    monkeypatch.setattr(baselines, "PROBE_BASELINES", few)
+    few = {name: baselines.RIVALS[name] for name in ("global_pca", "unreal")}
+    monkeypatch.setattr(baselines, "RIVALS", few)
     monkeypatch.setattr(baselines, "at_bytes", partial(baselines.at_bytes, bits=(8,)))
     words = ["probe", "evaluate", fitted, room, "--json", tmp_path / "r.json"]
     text = call(*words, "--baselines")
@@ -169,7 +169,7 @@ def test_evaluate_prints_and_writes_the_report(fitted, room, tmp_path, monkeypat
 
 
 def test_rivals_without_room_are_named(fitted, room, monkeypatch):
-    monkeypatch.setattr(baselines, "PROBE_BASELINES", {"unreal": lambda position, values, size, bits: None})
+    monkeypatch.setattr(baselines, "RIVALS", {"unreal": lambda position, values, size, bits: None})
     text = call("probe", "evaluate", fitted, room, "--baselines")
     assert "nothing fits into" in call.stderr and "Unreal" not in text
 

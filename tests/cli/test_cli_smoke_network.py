@@ -1,4 +1,4 @@
-"""The network from the command line: trained, stopped and resumed, used, measured, exported."""
+"""The network from the command line: trained, stopped and resumed, used, measured, exported; its samples."""
 
 import json
 import os
@@ -11,18 +11,21 @@ import torch
 import yaml
 from builders.running import call, fails
 from builders.smoke_plumes import plume, write_frames
+from builders.smoke_samples import file_content
 
+import wlm
 from wlm.fluid.volume import save_volume
-from wlm.formats.artifact import read_artifact
-from wlm.smoke import codec
-from wlm.smoke.coarse import coarse_six_way
-from wlm.smoke.codec import load_network, save_network, settings_of, shipped
-from wlm.smoke.data import open_footage, read_six_way
-from wlm.smoke.decode import Predictor, predict
+from wlm.smoke import codec, onnx_file
+from wlm.smoke.coarse import march
+from wlm.smoke.codec import open_network, shipped
+from wlm.smoke.data import load_frames, read_six_way
 from wlm.smoke.learn import dataset
-from wlm.smoke.learn.dataset import DatasetSettings
+from wlm.smoke.learn.pool import load_pool
+from wlm.smoke.learn.settings import DatasetSettings
 from wlm.smoke.learn.trainer import Trainer
-from wlm.smoke.planes import GUIDES
+from wlm.smoke.model import SmokeModel
+from wlm.smoke.planes import GUIDES, decode_lightmaps, render_guide
+from wlm_kernels.smoke.settings import March
 
 PROFILE = {
     "name": "tiny",
@@ -47,7 +50,7 @@ PROFILE = {
 
 @pytest.fixture(scope="session")
 def trained(tmp_path_factory):
-    """A profile and what its training leaves, with what it said."""
+    """A profile and what its training leaves, with its output."""
     folder = tmp_path_factory.mktemp("trained")
     (folder / "tiny.yaml").write_text(yaml.safe_dump(PROFILE))
     text = call("smoke", "train", folder / "tiny.yaml", "-o", folder / "a.safetensors", "--seed", 3)
@@ -65,35 +68,32 @@ def volume(tmp_path):
     return tmp_path / "plume.npz"
 
 
-def kept(path):
-    """All that a network's file holds, but for the time that its training took."""
-    held = read_artifact(path)
-    settings = {**held.settings, "summary": {**held.settings["summary"], "seconds": 0}}
-    return settings, {name: array.tobytes() for name, array in held.tensors.items()}
-
-
 def test_train(trained):
     folder, text, stderr = trained
     assert sorted(os.listdir(folder)) == ["a.safetensors", "a.safetensors.csv", "tiny.yaml"]
     assert "8 of 8" in text and "best validation, dB" in text
     assert re.search(r"train: 8 of 8, PSNR \d+\.\d+ dB, loss \d", stderr)
-    loaded, summary = load_network(folder / "a.safetensors")
-    assert loaded.settings.guide == "six" and summary["seed"] == 3
-    # What looking at smoke as in training takes.
-    assert settings_of("", summary) == DatasetSettings(**PROFILE["dataset"])
+    model = wlm.load(folder / "a.safetensors")
+    assert model.settings.guide == "six" and model.summary["seed"] == 3
+    assert model.dataset == DatasetSettings(**PROFILE["dataset"])
     assert (folder / "a.safetensors.csv").read_text().count("\n") == 3
+    # The same from Python.
+    again = wlm.smoke.train(folder / "tiny.yaml", folder / "b.safetensors", seed=3)
+    assert again.finished and file_content(folder / "b.safetensors") == file_content(folder / "a.safetensors")
+    for name in ("b.safetensors", "b.safetensors.csv"):
+        (folder / name).unlink()
 
 
 def test_a_training_is_stopped_and_resumed(trained, tmp_path, monkeypatch):
     """By Ctrl-C, then by the clock; it ends with the same weights."""
     folder, _, _ = trained
     words = ("smoke", "train", folder / "tiny.yaml", "-o", tmp_path / "a.safetensors", "--seed", 3)
-    run, done = Trainer.run, []
+    run, calls = Trainer.run, []
 
     def interrupted(self, *args):
         run(self, *args)
-        done.append(1)
-        if len(done) == 1:
+        calls.append(1)
+        if len(calls) == 1:
             os.kill(os.getpid(), signal.SIGINT)
 
     monkeypatch.setattr("wlm.smoke.fit._CHUNK", 2)
@@ -106,19 +106,13 @@ def test_a_training_is_stopped_and_resumed(trained, tmp_path, monkeypatch):
     assert "out of time at step 4" in call.stderr and "4 of 8" in text
     assert "it was made with seed 3, not 4" in fails(*words[:-1], 4, "--resume")
     partial = tmp_path / "a.safetensors.partial"
-    before = partial.read_bytes()
-    partial.write_bytes(before[:-9] + b"?" + before[-8:])
+    checkpoint = partial.read_bytes()
+    partial.write_bytes(checkpoint[:-9] + b"?" + checkpoint[-8:])
     assert "a.safetensors.partial: the artifact is damaged" in fails(*words, "--resume")
-    partial.write_bytes(before)
+    partial.write_bytes(checkpoint)
     call(*words, "--resume")
     assert not partial.exists()
-    assert kept(tmp_path / "a.safetensors") == kept(folder / "a.safetensors")
-
-
-def test_nothing_to_resume_is_told(trained, tmp_path):
-    words = ("smoke", "train", trained[0] / "tiny.yaml", "-o", tmp_path / "a.safetensors")
-    call(*words, "--resume", "--minutes", 0)
-    assert "a.safetensors.partial: there is nothing to resume; starting at step 0" in call.stderr
+    assert file_content(tmp_path / "a.safetensors") == file_content(folder / "a.safetensors")
 
 
 def test_a_training_is_stopped_before_its_first_step(trained, tmp_path, monkeypatch):
@@ -127,33 +121,33 @@ def test_a_training_is_stopped_before_its_first_step(trained, tmp_path, monkeypa
 
     def interrupted(*_, progress, **__):
         os.kill(os.getpid(), signal.SIGINT)
-        progress(1, {})
+        progress(None)
 
     with monkeypatch.context() as patch:
         patch.setattr(dataset, "make_pool", interrupted)
-        call(*words, code=130)
-    assert "stopped before another step: the same command with --resume goes on" in call.stderr
+        call(*words, "--resume", code=130)
+    assert "a.safetensors.partial: there is nothing to resume; starting at step 0" in call.stderr
+    assert "stopped at step 0: the same command with --resume goes on" in call.stderr
     call(*words, "--resume")
-    assert kept(tmp_path / "a.safetensors") == kept(folder / "a.safetensors")
-    held = (tmp_path / "a.safetensors").read_bytes()
+    assert file_content(tmp_path / "a.safetensors") == file_content(folder / "a.safetensors")
+    content = (tmp_path / "a.safetensors").read_bytes()
     assert "a.safetensors: is finished; without --resume it is trained anew" in fails(*words, "--resume")
-    assert (tmp_path / "a.safetensors").read_bytes() == held
+    assert (tmp_path / "a.safetensors").read_bytes() == content
 
 
-def test_predict_looks_as_training_did(network, volume, tmp_path):
+def test_predict_marches_as_in_training(network, volume, tmp_path):
     out = tmp_path / "a.exr"
     text = call("smoke", "predict", volume, "-o", out, "--network", network, "--resolution", 20, "--seed", 4)
     assert "mean light" in text and "error" not in text
-    found, camera = read_six_way(out)
-    smoke = open_footage(volume).load(1)
-    loaded, _ = load_network(network)
+    six = read_six_way(out)
     # A tenth of the 24 voxels of the longest edge.
-    look = {"step": 2.4, "jitter": 1.0, "threshold": 4.0 / 24, "seed": 4}
-    wanted = predict(smoke, camera, Predictor(loaded, 20, camera.width), **look)
+    march = March(2.4, seed=4, threshold=4.0 / 24)
+    guide = render_guide(load_frames(volume).load(1), six.camera, "six", march)
+    expected = decode_lightmaps(wlm.load(network).decoder(height=20, width=six.camera.width)(guide))
     for name in ("lightmaps", "transparency", "emission"):
-        torch.testing.assert_close(getattr(found, name), getattr(wanted, name), rtol=1e-3, atol=1e-4)
+        torch.testing.assert_close(getattr(six, name), getattr(expected, name), rtol=1e-3, atol=1e-4)
     call("smoke", "predict", volume, "-o", out, "--network", network, "--resolution", 20, "--seed", 5)
-    assert not torch.equal(read_six_way(out)[0].lightmaps, found.lightmaps)
+    assert not torch.equal(read_six_way(out).lightmaps, six.lightmaps)
     # As what bake wrote.
     call("smoke", "shade", out, "-o", tmp_path / "a.png")
 
@@ -161,108 +155,119 @@ def test_predict_looks_as_training_did(network, volume, tmp_path):
 @pytest.mark.parametrize("words, step", [((), 24 / 130), (("--step", 4), 4.0)])
 def test_predict_by_the_coarse_march_alone(volume, tmp_path, words, step):
     call("smoke", "predict", volume, "-o", tmp_path / "a.exr", "--coarse", *words, "--resolution", 20, "--seed", 2)
-    found, camera = read_six_way(tmp_path / "a.exr")
-    wanted = coarse_six_way(open_footage(volume).load(1), camera, step=step, spacing=step, seed=2).six
+    six = read_six_way(tmp_path / "a.exr")
+    expected = march(load_frames(volume).load(1), six.camera, March(step, step, seed=2))
     for name in ("lightmaps", "transparency", "emission"):
-        torch.testing.assert_close(getattr(found, name), getattr(wanted, name), rtol=1e-3, atol=1e-4)
+        torch.testing.assert_close(getattr(six, name), getattr(expected, name), rtol=1e-3, atol=1e-4)
 
 
 def test_without_a_network_the_one_that_ships_is_used(network, volume, tmp_path, monkeypatch):
     for name, words in (("a", ()), ("b", ("--network", shipped())), ("c", ("--network", network))):
         call("smoke", "predict", volume, "-o", tmp_path / f"{name}.exr", "--resolution", 20, *words)
-    ours, same, other = (read_six_way(tmp_path / f"{name}.exr")[0].lightmaps for name in "abc")
-    assert torch.equal(ours, same) and not torch.equal(ours, other)
+    default, same, other = (read_six_way(tmp_path / f"{name}.exr").lightmaps for name in "abc")
+    assert torch.equal(default, same) and not torch.equal(default, other)
     # On the shipped one's own smoke the others would take minutes.
     monkeypatch.setattr(codec, "shipped", lambda: network)
     text = call("smoke", "evaluate", "--resolution", 16, "--json", tmp_path / "a.json")
     assert str(network) in text.replace("\n", "") and json.loads((tmp_path / "a.json").read_text())["cells"] == 16
-    monkeypatch.setattr(codec, "export_onnx", lambda made, *size: made.settings.width)
+    monkeypatch.setattr(onnx_file, "export", lambda model, path, **size: model.settings.width)
     assert "8 bytes, 512 x 512 pixels" in call("smoke", "export", "-o", tmp_path / "a.onnx")
 
 
-@pytest.mark.parametrize("resolution, told", [(20, False), (8, True), (150, True)])
-def test_predict_says_where_it_has_not_learned(network, volume, tmp_path, resolution, told):
+@pytest.mark.parametrize("resolution, noted", [(20, False), (8, True), (150, True)])
+def test_predict_notes_images_unlike_those_of_training(network, volume, tmp_path, resolution, noted):
     """A network of images of so many pixels along the box's edge."""
     call("smoke", "predict", volume, "-o", tmp_path / "a.exr", "--network", network, "--resolution", resolution)
-    assert ("has learned from" in " ".join(call.stderr.split())) == told
+    assert ("was trained with" in " ".join(call.stderr.split())) == noted
 
 
 def test_predict_frames(network, tmp_path):
-    folder = write_frames(tmp_path / "frames").folder
+    folder = write_frames(tmp_path / "frames").path
     call("smoke", "predict", folder, "-o", tmp_path / "six", "--network", network, "--resolution", 170)
-    assert " ".join(call.stderr.split()).count("has learned from") == 1
+    assert " ".join(call.stderr.split()).count("was trained with") == 1
     call("smoke", "predict", folder, "-o", tmp_path / "six", "--network", network, "--resolution", 17)
     assert sorted(os.listdir(tmp_path / "six")) == [f"six_{i:04d}.exr" for i in (1, 2, 3)]
-    assert read_six_way(tmp_path / "six" / "six_0002.exr")[0].lightmaps.shape == (6, 17, 17)
+    assert read_six_way(tmp_path / "six" / "six_0002.exr").lightmaps.shape == (6, 17, 17)
 
 
 def test_evaluate(network, volume, tmp_path):
-    report = tmp_path / "a.json"
-    text = call("smoke", "evaluate", network, "--smoke", volume, "--resolution", 20, "--json", report)
-    found = json.loads(report.read_text())
+    path = tmp_path / "a.json"
+    text = call("smoke", "evaluate", network, "--smoke", volume, "--resolution", 20, "--json", path)
+    report = json.loads(path.read_text())
     names = ["density x 0.5", "density x 1", "density x 2", str(volume)]
-    assert [one["name"] for one in found["sets"]] == names and found["resolution"] == 20 and found["cells"] == 16
-    for one in found["sets"]:
-        assert list(one["methods"]) == ["network", "coarse march", "flip book"] and one["half_loss"] is None
-        for method in one["methods"].values():
+    assert [part["name"] for part in report["sets"]] == names and report["resolution"] == 20 and report["cells"] == 16
+    for part in report["sets"]:
+        assert list(part["methods"]) == ["network", "coarse march", "flip book"] and part["half_loss"] is None
+        for method in part["methods"].values():
             assert method["lowest"] <= method["psnr"] <= method["highest"] and len(method["planes"]) == 8
             assert f"{method['psnr']:.2f}" in text and f"{method['planes']['top']:.2f}" in text
     # It stands still.
-    assert found["sets"][3]["methods"]["network"]["flicker_ratio"] is None
-    told = found["network"]
-    loaded, summary = load_network(network)
-    assert told.items() >= loaded.settings.model_dump(mode="json").items()
-    assert (told["name"], told["profile"], told["seed"], told["device"]) == ("a", "tiny", 3, "cpu")
-    assert told["parameters"] == sum(weight.numel() for weight in loaded.parameters())
-    assert (told["steps"], told["seconds"]) == (summary["steps"], summary["seconds"])
+    assert report["sets"][3]["methods"]["network"]["flicker_ratio"] is None
+    facts, model = report["network"], wlm.load(network)
+    assert facts.items() >= model.settings.model_dump(mode="json").items()
+    assert (facts["name"], facts["profile"], facts["seed"], facts["device"]) == ("a", "tiny", 3, "cpu")
+    assert facts["parameters"] == sum(weight.numel() for weight in model.network.parameters())
+    assert (facts["steps"], facts["seconds"]) == (model.summary["steps"], model.summary["seconds"])
 
 
 def test_a_report_says_of_a_network_what_its_file_does(network, tmp_path):
-    old = tmp_path / "old.safetensors"
-    loaded, summary = load_network(network)
-    save_network(old, loaded, {"dataset": summary["dataset"], "seed": 5})
+    old, model = tmp_path / "old.safetensors", wlm.load(network)
+    SmokeModel(model.network, {"dataset": model.summary["dataset"], "seed": 5}).save(old)
     call("smoke", "evaluate", old, "--resolution", 8, "--json", tmp_path / "a.json")
-    told = json.loads((tmp_path / "a.json").read_text())["network"]
-    assert told["seed"] == 5 and not {"profile", "steps", "seconds", "device"} & told.keys()
+    facts = json.loads((tmp_path / "a.json").read_text())["network"]
+    assert facts["seed"] == 5 and not {"profile", "steps", "seconds", "device"} & facts.keys()
 
 
 def test_export(network, tmp_path):
     """ONNX computes what the network does, of a size that its levels' squares don't divide."""
-    for needed in ("onnx", "onnxscript"):
-        pytest.importorskip(needed)
+    for package in ("onnx", "onnxscript"):
+        pytest.importorskip(package)
     runtime = pytest.importorskip("onnxruntime")
     out = tmp_path / "a.onnx"
     text = call("smoke", "export", network, "-o", out, "--resolution", 18)
     assert f"{out.stat().st_size:,} bytes, 18 x 18 pixels" in text and "torchvision" not in call.stderr
     guide = torch.rand(1, len(GUIDES["six"]), 18, 18)
-    (found,) = runtime.InferenceSession(out).run(["lightmaps"], {"guide": guide.numpy()})
+    (planes,) = runtime.InferenceSession(out).run(["lightmaps"], {"guide": guide.numpy()})
     with torch.no_grad():
-        assert np.allclose(found, load_network(network)[0](guide), atol=1e-5)
+        assert np.allclose(planes, wlm.load(network).network(guide), atol=1e-5)
+
+
+def test_dataset(tmp_path):
+    """A file and a picture of the samples, of a round and of the validation."""
+    names = ("cells", "refine", "resolution", "sequences", "frames", "views", "views_a_frame", "warmup")
+    settings = {name: PROFILE["dataset"][name] for name in (*names, "validation_sequences")}
+    (tmp_path / "a.yaml").write_text(yaml.safe_dump(settings))
+    words = ("smoke", "dataset", tmp_path / "a.yaml", "-o")
+    for more, count in (((), 1), (("--validation",), 2)):
+        assert "seconds: reference" in call(*words, tmp_path / "out", *more)
+        assert len(load_pool(tmp_path / "out" / "pool.safetensors")) == count
+        assert (tmp_path / "out" / "sheet.png").stat().st_size > 500
+    (tmp_path / "b.yaml").write_text("cells: 2\n")
+    assert "b.yaml: cells: " in fails("smoke", "dataset", tmp_path / "b.yaml", "-o", tmp_path / "out")
+    assert "cannot write there" in fails(*words, tmp_path / "no" / "out")
 
 
 def test_wrong_words_are_one_line(trained, network, volume, tmp_path):
     out = tmp_path / "a.exr"
-    made = ("smoke", "predict", volume, "-o", out)
-    assert "--coarse: expected no --network" in fails(*made, "--coarse", "--network", network)
-    assert "--step: expected --coarse beside it" in fails(*made, "--step", 3)
-    assert "--step" in fails(*made, "--coarse", "--step", 0)
-    assert "gone.safetensors: cannot read" in fails(*made, "--network", tmp_path / "gone.safetensors")
-    assert "expected an artifact" in fails(*made, "--network", volume)
-    assert "device 'tpu'" in fails(*made, "--network", network, "--device", "tpu")
+    predict = ("smoke", "predict", volume, "-o", out)
+    assert "--coarse: expected no --network" in fails(*predict, "--coarse", "--network", network)
+    assert "--step: expected --coarse beside it" in fails(*predict, "--step", 3)
+    assert "--step" in fails(*predict, "--coarse", "--step", 0)
+    assert "gone.safetensors: cannot read" in fails(*predict, "--network", tmp_path / "gone.safetensors")
+    assert "expected an artifact" in fails(*predict, "--network", volume)
+    assert "device 'tpu'" in fails(*predict, "--network", network, "--device", "tpu")
     assert "ends in .exr" in fails("smoke", "predict", volume, "-o", tmp_path / "a.png", "--network", network)
     train = ("smoke", "train", trained[0] / "tiny.yaml", "-o")
     assert "ends in .safetensors" in fails(*train, tmp_path / "a.wlm")
     assert "does not exist" in fails(*train, tmp_path / "no" / "a.safetensors")
     assert "device 'tpu'" in fails(*train, tmp_path / "a.safetensors", "--device", "tpu")
-    assert "network-7" in fails("smoke", "train", "7", "-o", tmp_path / "a.safetensors")
-    evaluate = ("smoke", "evaluate", network)
-    assert "ends in .json" in fails(*evaluate, "--json", tmp_path / "a.txt")
+    assert "profile '7' of smoke-network" in fails("smoke", "train", "7", "-o", tmp_path / "a.safetensors")
+    assert "ends in .json" in fails("smoke", "evaluate", network, "--json", tmp_path / "a.txt")
     assert "ends in .onnx" in fails("smoke", "export", network, "-o", tmp_path / "a.txt")
     bare = tmp_path / "bare.safetensors"
-    save_network(bare, load_network(network)[0], {})
-    assert "bare.safetensors: summary.dataset: expected" in fails(*made, "--network", bare)
+    SmokeModel(open_network(network).network, {}).save(bare)
+    assert "bare.safetensors: summary.dataset: expected" in fails(*predict, "--network", bare)
     other = tmp_path / "other.yaml"
     other.write_text(yaml.safe_dump(PROFILE | {"dataset": {}}))
-    told = fails("smoke", "train", other, "-o", tmp_path / "a.safetensors")
-    assert "dataset.guide: expected six" in told
+    assert "dataset.guide: expected six" in fails("smoke", "train", other, "-o", tmp_path / "a.safetensors")
     assert sorted(os.listdir(tmp_path)) == ["bare.safetensors", "other.yaml", "plume.npz"]

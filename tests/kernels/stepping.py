@@ -17,7 +17,7 @@ TILE = 128
 
 @dataclass(frozen=True)
 class Case:
-    """What a trainer is made of.
+    """The settings and targets of a trainer.
 
     Attributes:
         temporal: Whether the tiles have temporal maps.
@@ -42,9 +42,8 @@ class Case:
     settings: dict = field(default_factory=dict)
 
     def profile(self) -> Profile:
-        """The settings, of ten steps where nothing else is said."""
+        """The settings; ten steps and no samples between times unless ``settings`` has others."""
         resolution, slices, columns, rows = self.shape
-        given = {"steps": 10, "between": 0.0} | self.settings
         return Profile(
             name="test",
             hidden=self.hidden,
@@ -55,16 +54,16 @@ class Case:
             plane_columns=columns,
             plane_rows=rows,
             time_axis="frames" if self.periodic else "paper",
-            **given,
+            **{"steps": 10, "between": 0.0} | self.settings,
         )
 
     def axis(self) -> TimeAxis:
-        """Five times; the clamped axis reads its features at exactly 0 and 1, too."""
+        """Five times; the clamped axis also reads its features at exactly 0 and 1."""
         times = np.array([0.0, 3.0, 8.0, 13.0, 20.0])
         return TimeAxis(times, 24.0, "frames") if self.periodic else TimeAxis(times, None, "paper")
 
     def targets(self) -> Targets:
-        """Random colours on random masks; a tile's own depend on its number alone."""
+        """Random colours on random masks; those of a tile depend on its number alone."""
         times = len(self.axis().times)
         colour, mask, scale, affine, weight = [], [], [], [], []
         for number, count in zip(self.numbers, self.texels, strict=True):
@@ -84,7 +83,7 @@ class Case:
 
 
 def trainer(case: Case, device: str, seed: int = 3, spread: bool = True) -> Trainer:
-    """A trainer; ``spread`` maps and networks are random with values out of range, not the first draw."""
+    """A trainer; with ``spread`` its maps and networks are random with values out of range, not the initial ones."""
     result = Trainer(case.profile(), case.axis(), case.targets(), case.temporal, seed, device)
     if spread:
         for key, values in _clear_values(result).items():
@@ -98,7 +97,7 @@ def trainer(case: Case, device: str, seed: int = 3, spread: bool = True) -> Trai
 
 
 def _clear_values(trainer: Trainer) -> dict[str, np.ndarray]:
-    """Random maps, near levels that can be stored: which level is nearest is beyond float32's doubt.
+    """Random maps near levels that can be stored, so that float32 and float64 round to the same level.
 
     A value half-way between two levels may be rounded either way, and one such value would be an error of a whole
     level against the reference. One in thirty weights and plane values lies out of range.
@@ -137,13 +136,13 @@ def draw(trainer: Trainer, quantised: bool) -> tuple[np.ndarray, np.ndarray]:
 
 
 def drawn_noise(trainer: Trainer, quantised: bool) -> np.ndarray:
-    """The noise of the coming step, centred as the features are: what it draws where all maps are 1/2."""
-    kept = trainer.maps.detach().clone()
+    """The noise of the coming step, centred as the features are: the features where all maps are 1/2."""
+    maps = trainer.maps.detach().clone()
     with torch.no_grad():
         trainer.maps.fill_(0.5)
     noise = draw(trainer, False)[1]
     with torch.no_grad():
-        trainer.maps.copy_(kept)
+        trainer.maps.copy_(maps)
     noise[..., 12:] = 0.0  # the encoded time, which has none
     return np.zeros_like(noise) if quantised else noise
 
@@ -157,7 +156,7 @@ class Step:
 
 
 def fused_step(trainer: Trainer, quantised: bool) -> Step:
-    """Does one step; the parameters move only after their gradients are taken."""
+    """Does one step; the parameters move only after their gradients are computed."""
     before = trainer.losses().astype(np.float64)
     with interop.stream(trainer.device):
         trainer._step(quantised, True)
@@ -198,7 +197,7 @@ class Problem:
     def features(self) -> torch.Tensor:
         """The network's inputs, centred and with the noise, [N, B, I]."""
         flat = self.place.reshape(-1, 3)
-        found = reference.train_features(
+        features = reference.train_features(
             self.maps,
             self.tile,
             flat[:, :2],
@@ -207,7 +206,7 @@ class Problem:
             self.periodic,
             self.quantised,
         )
-        return reference.centre(found).reshape(self.noise.shape) + self.noise
+        return reference.centre(features).reshape(self.noise.shape) + self.noise
 
     def losses(self) -> torch.Tensor:
         """Each tile's loss."""
@@ -258,13 +257,8 @@ def problem(trainer: Trainer, case: Case, quantised: bool) -> Problem:
 
     scale, weight = mixed(targets.scale), mixed(targets.weight)
     scales = torch.from_numpy(targets.scale).double()[:, :, None]
-    colour = mixed(
-        (
-            (shift + spread * torch.from_numpy(targets.colour).flatten(1, 2)).reshape(targets.colour.shape)
-            * scales
-        ).numpy(),
-        texel,
-    )
+    colours = (shift + spread * torch.from_numpy(targets.colour).flatten(1, 2)).reshape(targets.colour.shape) * scales
+    colour = mixed(colours.numpy(), texel)
     target = (sum(colour) / sum(scale) - shift) / spread
 
     def leaf(values: torch.Tensor) -> torch.Tensor:

@@ -1,4 +1,4 @@
-"""Reading a cascade: values and gradients against float64, borders, points that are none, and the fit's points."""
+"""Reading a cascade: values and gradients against float64, borders, NaN, and the points and losses of tuning."""
 
 import numpy as np
 import pytest
@@ -68,7 +68,7 @@ def test_against_reference(device: str, shape: tuple, lut_shape: tuple | None, s
         close(grad_lut, leaves[1].grad, 1e-4, "T_c")
 
 
-def test_gradients_are_what_a_step_changes(device: str):
+def test_gradients_against_finite_differences(device: str):
     """Central differences in directions of both textures, within one linear piece of T_p."""
     random = np.random.default_rng(1)
     colour = random.normal(size=(3, 3, 3)).astype(np.float32)
@@ -157,18 +157,18 @@ def test_points_on_a_surface(device: str):
         return triangle.numpy(), barycentric.numpy()
 
     triangle, weights = draw(0)
-    first, other = weights[:count], weights[count:]
+    first, second = weights[:count], weights[count:]
     np.testing.assert_array_equal(triangle[:count], triangle[count:])
     np.testing.assert_allclose(np.bincount(triangle[:count], minlength=6), areas / 8 * count, atol=2)
     assert (weights >= 0).all() and (weights.sum(1) <= 1.0).all()
     np.testing.assert_allclose(first.mean(0), 1 / 3, atol=0.02)
     large = np.isin(triangle[:count], [1, 2])
-    moved = (first - other)[large]
+    moved = (first - second)[large]
     far = np.linalg.norm(moved @ (corner[1, :2] - corner[1, 2]), axis=1)
     near = far < 1e-6
     np.testing.assert_allclose(far[~near], apart, rtol=1e-4)
     assert 0 < near.mean() < 0.3
-    assert (first == other)[~large].all(), "no room in the small one, no direction in the flat one"
+    assert (first == second)[~large].all(), "no room in the small one, no direction in the flat one"
     np.testing.assert_array_equal(draw(0)[1], weights)
     assert (draw(1)[1] != weights).any(1).mean() > 0.99
 

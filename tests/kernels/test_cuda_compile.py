@@ -16,7 +16,7 @@ from wlm_kernels.probe import gaussian_sum, optimiser
 from wlm_kernels.probe import network as probe_network
 from wlm_kernels.probe import step as probe_step
 from wlm_kernels.smoke import march as smoke_march
-from wlm_kernels.smoke import march_coarse, march_motion, march_six
+from wlm_kernels.smoke import march_coarse, march_guide, march_motion, march_six
 
 ARCHITECTURE = 90
 MODULES = (
@@ -125,7 +125,8 @@ def test_probe_network(latent: int, hidden: int, outputs: int, tmp_path: Path):
 @pytest.mark.parametrize("dtype", _slow_but(wp.float16, [wp.float32]))
 def test_marching(dtype: type, tmp_path: Path):
     """Marches through densities of either type."""
-    _compile_all(vars(smoke_march.guide_kernels(dtype)).values(), tmp_path / "guide")
+    _compile_all([smoke_march.occupied_kernel(dtype)], tmp_path / "bricks")
+    _compile_all(vars(march_guide.guide_kernels(dtype)).values(), tmp_path / "guide")
     _compile_all(vars(march_six.six_kernels(dtype)).values(), tmp_path / "six")
     _compile_all([march_motion.motion_kernel(dtype)], tmp_path / "motion")
 

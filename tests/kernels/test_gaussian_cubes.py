@@ -70,12 +70,12 @@ def _distances(rows: np.ndarray, cubes: Cubes, test: str, support: str) -> np.nd
     if test == "sphere" or support == "sphere":
         return np.linalg.norm(apart, axis=2) / reference.reach(rows, CUT, "sphere").max(1)
     whiten = reference.whitening(torch.tensor(rows, dtype=torch.float64)).numpy()
-    found = [
+    nearest = [
         reference.nearest(w, c, a, b) if (c < a).any() or (c > b).any() else 0.0
         for a, b in zip(low, high, strict=True)
         for w, c in zip(whiten, centre, strict=True)
     ]
-    return np.array(found).reshape(len(low), len(rows)) / CUT
+    return np.array(nearest).reshape(len(low), len(rows)) / CUT
 
 
 @pytest.mark.parametrize("support", ["ellipsoid", "sphere"])

@@ -91,16 +91,23 @@ def _run(pair: Pair, tolerance: float = TOLERANCE, steps: int = STEPS) -> None:
         pair.hold(tolerance)
 
 
+def _slow(*values: object) -> object:
+    """What a faster case covers but for the compilation of one more kernel."""
+    return pytest.param(*values, marks=pytest.mark.slow)
+
+
 OPERATORS = [
     ("D2Q9", "bgk", 0.0),
     ("D2Q9", "regularised", 0.17),
     ("D2Q9", "recursive", 0.0),
-    ("D3Q19", "bgk", 0.17),
+    ("D3Q19", "bgk", 0.0),
+    _slow("D3Q19", "bgk", 0.17),
     ("D3Q19", "regularised", 0.0),
     ("D3Q19", "regularised", 0.17),
-    ("D3Q27", "bgk", 0.0),
+    _slow("D3Q27", "bgk", 0.0),
     ("D3Q27", "regularised", 0.17),
-    ("D3Q27", "recursive", 0.17),
+    ("D3Q27", "recursive", 0.0),
+    _slow("D3Q27", "recursive", 0.17),
 ]
 
 
@@ -123,8 +130,17 @@ def test_operators(lattice: str, operator: str, smagorinsky: float, device: str)
     _run(Pair(lattice, device, operator=operator, smagorinsky=smagorinsky))
 
 
-@pytest.mark.parametrize("operator", ["bgk", "regularised", "recursive"])
-@pytest.mark.parametrize("kind", ["uniform", "field"])
+@pytest.mark.parametrize(
+    ("operator", "kind"),
+    [
+        ("bgk", "field"),
+        ("regularised", "uniform"),
+        ("recursive", "field"),
+        _slow("bgk", "uniform"),
+        _slow("regularised", "field"),
+        _slow("recursive", "uniform"),
+    ],
+)
 def test_forces(operator: str, kind: str, device: str):
     lattice = "D3Q27" if operator == "recursive" else "D3Q19"
     force = np.array([1e-3, -2e-3, 5e-4])
@@ -155,9 +171,8 @@ def test_faces(name: str, device: str):
 
 
 def test_ramp(device: str):
-    """Inlets rise smoothly, walls that move don't wait."""
-    pair = Pair("D3Q19", device, faces=BOXES["tunnel"] | {"+y": ("wall", (0.1, 0.0, 0.0))}, ramp=3)
-    _run(pair)
+    """Inlets rise smoothly, moving walls don't."""
+    _run(Pair("D3Q19", device, faces=TUNNEL | {"-y": WALLS["-y"], "+y": ("wall", (0.1, 0.0, 0.0))}, ramp=3))
 
 
 def _obstacles() -> np.ndarray:
@@ -185,32 +200,32 @@ def test_solids_alone(device: str):
 def test_solids_with_other_lattices(device: str):
     """The tables of links serve D3Q27 and D2Q9 as well."""
     solid = _obstacles()
-    _run(Pair("D3Q27", device, faces=BOXES["tunnel"], solid=solid, shape=solid.shape, operator="recursive"))
+    pair = Pair("D3Q27", device, faces=BOXES["tunnel"], solid=solid, shape=solid.shape, operator="recursive")
+    _run(pair, steps=2)
     flat = np.zeros((6, 6, 1), int)
     flat[2:4, 2] = 1
     faces = {name: WALLS[name] for name in ("-y", "+y")} | TUNNEL
     _run(Pair("D2Q9", device, faces=faces, solid=flat, shape=flat.shape))
 
 
-@pytest.mark.parametrize("lattice", LATTICES)
+@pytest.mark.parametrize("lattice", ["D3Q19", _slow("D2Q9"), _slow("D3Q27")])
 def test_sixteen_bits(lattice: str, device: str):
     """A population keeps 11 bits of its deviation from rest: some 1e-5 of the velocity's scale after a few steps."""
-    pair = Pair(lattice, device, storage="float16")
+    pair = Pair(lattice, device, storage="float16", smagorinsky=0.0)
     _run(pair, HALF_TOLERANCE)
     with pytest.raises(AssertionError):
         pair.hold(TOLERANCE / 10)
 
 
-def test_indices_of_64_bits(device: str, monkeypatch: pytest.MonkeyPatch):
+@pytest.mark.parametrize(("storage", "tolerance"), [("float32", TOLERANCE), _slow("float16", HALF_TOLERANCE)])
+def test_indices_of_64_bits(storage: str, tolerance: float, device: str, monkeypatch: pytest.MonkeyPatch):
     """The indices of a domain of more populations than 32 bits count, in a small one."""
     closed = {face: ("wall", np.zeros(3)) for face in ("-y", "+y")}
-    short = Pair("D3Q19", device, closed)
-    assert not short.device._engine.spec.wide
+    assert not Pair("D3Q19", device, closed, storage=storage).device._engine.spec.wide
     monkeypatch.setattr(engine, "NARROW", 0)
-    for storage, tolerance in (("float32", TOLERANCE), ("float16", HALF_TOLERANCE)):
-        pair = Pair("D3Q19", device, closed, storage=storage)
-        assert pair.device._engine.spec.wide
-        _run(pair, tolerance)
+    pair = Pair("D3Q19", device, closed, storage=storage)
+    assert pair.device._engine.spec.wide
+    _run(pair, tolerance)
 
 
 def test_thin_domains(device: str):

@@ -49,18 +49,18 @@ def _unpacked(samples: wp.array, level: np.ndarray) -> list[np.ndarray]:
 
 
 def test_samples(device: str):
-    """Within rounding of bilinear samples at the lattice's barycentrics; what is known of a patch is right too."""
+    """Within rounding of bilinear samples at the lattice's barycentrics; and the patch's range and dominant colour."""
     image, (corners, level) = _image(), _triangles(60)
     samples, patches, _ = _sampled(image, corners, level, device)
-    known = patches.numpy()
+    patch = patches.numpy()
     for t, got in enumerate(_unpacked(samples, level)):
         want = reference.patch(image, corners[t], SIZES[level[t]]) * 255
         # Half a level, and 1/512 of a texel on each axis at the steepest step of 0.7.
         assert np.abs(got - want).max() <= 0.5 + 2 * 255 * 0.7 / 512 + 0.01
         for name, values in (("low", got.min(0)), ("high", got.max(0)), ("colour", reference.dominant(got))):
-            assert known[name][t] == values[0] + 256 * values[1] + 65536 * values[2], name
-        assert known["level"][t] == (0 if (got == got[0]).all() else level[t])
-    assert 0 < (known["level"] == 0).sum() < len(level)
+            assert patch[name][t] == values[0] + 256 * values[1] + 65536 * values[2], name
+        assert patch["level"][t] == (0 if (got == got[0]).all() else level[t])
+    assert 0 < (patch["level"] == 0).sum() < len(level)
 
 
 def test_samples_are_exact_at_texels(device: str):
@@ -73,20 +73,14 @@ def test_samples_are_exact_at_texels(device: str):
 
 
 def test_orders_are_those_of_permuted_vertices(device: str):
-    """``patch_orders`` of a patch equals, exactly, the patches of the triangle with its vertices permuted."""
+    """A patch reordered equals, exactly, the patch of the triangle with its vertices permuted."""
     image, (corners, level) = _image(), _triangles(12)
     plain = _unpacked(_sampled(image, corners, level, device)[0], level)
-    for o, p in enumerate(ORDERS):
+    for p in ORDERS:
         permuted = np.empty_like(corners)
         permuted[:, list(p)] = corners
         for t, got in enumerate(_unpacked(_sampled(image, permuted, level, device)[0], level)):
-            np.testing.assert_array_equal(got, kernels.patch_orders(plain[t])[o])
-
-
-def test_patch_orders_wants_a_patch():
-    with pytest.raises(ValueError, match="samples"):
-        kernels.patch_orders(np.zeros((4, 3)))
-    assert kernels.patch_orders(np.ones((1, 3))).shape == (6, 1, 3)
+            np.testing.assert_array_equal(got, reference.reordered(plain[t], SIZES[level[t]], p))
 
 
 def test_distances(device: str):
@@ -118,17 +112,17 @@ def _ints(values: np.ndarray, device: str) -> wp.array:
 
 def _graph(samples, patches, threshold: float, colour_threshold: float, device: str):
     """The graph, and the number that each of its nodes had."""
-    known = patches.numpy()
-    order = np.argsort(kernels.bin_numbers(known["colour"]), kind="stable")
-    nodes = wp.array(known[order], dtype=kernels.Patch, device=device)
-    fits = graphs.bounds(samples, nodes, int(known["level"].max()) + 1)
-    return graphs.graph(samples, nodes, fits, graphs.rule(threshold, colour_threshold, device)), order
+    patch = patches.numpy()
+    order = np.argsort(kernels.bin_numbers(patch["colour"]), kind="stable")
+    nodes = wp.array(patch[order], dtype=kernels.Patch, device=device)
+    bounds = graphs.bounds(samples, nodes, int(patch["level"].max()) + 1)
+    return graphs.graph(samples, nodes, bounds, graphs.rule(threshold, colour_threshold, device)), order
 
 
 @pytest.mark.parametrize("contrast", [0.02, 0.2, 1.0])
 @pytest.mark.parametrize("threshold", [0.003, 0.03, 0.1])
 def test_neighbours(device: str, threshold: float, contrast: float):
-    """Degrees, rows and what is left of degrees, of the naive matrix; bounds and samples both have a say."""
+    """Degrees, rows and remaining degrees of the naive matrix; some pairs need samples, for others bounds do."""
     count = 70
     image, (corners, level) = _image(contrast=contrast), _triangles(count, seed=3)
     samples, patches, _ = _sampled(image, corners, level, device)
@@ -152,7 +146,7 @@ def test_neighbours(device: str, threshold: float, contrast: float):
 
 
 def test_bounds_settle_most_pairs(device: str):
-    """On smooth colours samples are asked of few pairs."""
+    """On smooth colours few pairs need their samples compared."""
     count = 200
     y, x = np.mgrid[: SIDE[0], : SIDE[1]] / SIDE[1]
     image = np.repeat((0.3 + 0.3 * x + 0.2 * y)[..., None], 3, -1)
@@ -176,23 +170,23 @@ def test_the_threshold_itself_is_not_alike(device: str, step: int, alike: bool, 
     grey = samples.numpy()
     half = len(grey) // 2
     grey[half:] = grey[:half] + step * 0x010101
-    known = patches.numpy()
+    patch = patches.numpy()
     for name in ("low", "high"):
-        known[name][1] = known[name][0] + step * 0x010101
+        patch[name][1] = patch[name][0] + step * 0x010101
     samples = wp.array(grey, dtype=int, device=device)
-    graph, _ = _graph(samples, wp.array(known, dtype=kernels.Patch, device=device), 0.2, 2.0, device)
+    graph, _ = _graph(samples, wp.array(patch, dtype=kernels.Patch, device=device), 0.2, 2.0, device)
     degree = wp.zeros(2, dtype=int, device=device)
     graphs.count_neighbours(graph, 0, 2, degree, wp.zeros(2, dtype=wp.int64, device=device))
     assert degree.numpy().tolist() == [int(alike)] * 2
 
 
-def test_dominant_colours_in_lots(device: str, monkeypatch: pytest.MonkeyPatch):
-    """The same however few patches are sorted at once, also where one alone is more than a lot."""
+def test_dominant_colours_in_parts(device: str, monkeypatch: pytest.MonkeyPatch):
+    """The same however few samples are sorted at once, also where one patch alone has more."""
     image, (corners, level) = _image(), _triangles(40)
     _, whole, _ = _sampled(image, corners, level, device)
     monkeypatch.setattr(kernels, "_AT_ONCE", 20)
-    _, lots, _ = _sampled(image, corners, level, device)
-    np.testing.assert_array_equal(whole.numpy()["colour"], lots.numpy()["colour"])
+    _, parts, _ = _sampled(image, corners, level, device)
+    np.testing.assert_array_equal(whole.numpy()["colour"], parts.numpy()["colour"])
 
 
 def test_too_many_samples():

@@ -1,4 +1,4 @@
-"""The probes' network there and back: loss and every gradient against autograd in float64."""
+"""The probes' network, forward and backward: loss and every gradient against autograd in float64."""
 
 import numpy as np
 import pytest
@@ -58,7 +58,7 @@ class Pass:
     def launch(self, *lane: int) -> None:
         self.launches.launch(self.groups, *self.arrays, self.grad_f, self.partial, self.loss, *lane)
 
-    def found(self) -> tuple[float, np.ndarray, np.ndarray]:
+    def results(self) -> tuple[float, np.ndarray, np.ndarray]:
         """The loss, the gradient of f [L, N] with the padding, and that of the weights."""
         return self.loss.numpy().sum(dtype=np.float64), self.grad_f.numpy(), self.partial.numpy().sum(0, np.float64)
 
@@ -72,7 +72,7 @@ class Pass:
 
 
 def _hold(run: Pass) -> None:
-    (loss, grad_f, grad), (want_loss, want_f, want) = run.found(), run.expected()
+    (loss, grad_f, grad), (want_loss, want_f, want) = run.results(), run.expected()
     assert loss == pytest.approx(want_loss, rel=1e-5)
     close(grad_f[:, : run.count], want_f, TOLERANCE, "gradient of the sums")
     assert not grad_f[:, run.count :].any(), "probes behind the last one give nothing"
@@ -104,7 +104,7 @@ def test_all_probes_are_padding(device: str):
     run = Pass((9, 64, 27), 1, device)
     run.groups.count = 0
     run.launch()
-    loss, grad_f, grad = run.found()
+    loss, grad_f, grad = run.results()
     assert loss == 0.0 and not grad_f.any() and not grad.any()
 
 
@@ -135,10 +135,10 @@ def test_lanes_add():
     """On the CPU a launch adds to what its buffers hold."""
     run = Pass((9, 64, 27), GROUP, "cpu")
     run.launch()
-    loss, _, grad = run.found()
+    loss, _, grad = run.results()
     run.launch()
-    assert run.found()[0] == pytest.approx(2 * loss, rel=1e-6)
-    close(run.found()[2], 2 * grad, 1e-6)
+    assert run.results()[0] == pytest.approx(2 * loss, rel=1e-6)
+    close(run.results()[2], 2 * grad, 1e-6)
 
 
 def test_same_bits_every_time(device: str):
@@ -146,7 +146,7 @@ def test_same_bits_every_time(device: str):
     first, second = (Pass((9, 64, 27), 300, device) for _ in range(2))
     first.launch()
     second.launch()
-    for a, b in zip(first.found(), second.found(), strict=True):
+    for a, b in zip(first.results(), second.results(), strict=True):
         np.testing.assert_array_equal(a, b)
 
 
@@ -154,7 +154,7 @@ def test_by_differences(device: str):
     """The slope of the loss along a random direction of all weights and sums."""
     run = Pass((9, 64, 27), 100, device)
     run.launch()
-    _, grad_f, grad = run.found()
+    _, grad_f, grad = run.results()
     random = np.random.default_rng(4)
     by_f, by_net = (random.normal(size=v.shape).astype(np.float32) for v in (run.f, run.net))
     by_net = np.where(run.net != 0, by_net, 0).astype(np.float32)
@@ -165,7 +165,7 @@ def test_by_differences(device: str):
         moved.arrays[0].assign(run.f + np.float32(step) * by_f)
         moved.arrays[3].assign(run.net + np.float32(step) * by_net)
         moved.launch()
-        return moved.found()[0]
+        return moved.results()[0]
 
     h = 2e-3
     slope = (8.0 * (loss(h) - loss(-h)) - (loss(2 * h) - loss(-2 * h))) / (12.0 * h)

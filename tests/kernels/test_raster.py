@@ -1,4 +1,4 @@
-"""Rasterizing: who covers what, where, how deep, the ways back, and what has no area, no place or no front."""
+"""Rasterizing: coverage, barycentrics, depth, backward passes, and triangles without area, place or front."""
 
 import numpy as np
 import pytest
@@ -50,9 +50,9 @@ def _grid(cells: int, jitter: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     first = (np.arange(cells)[:, None] * (cells + 1) + np.arange(cells)).reshape(-1)
     a, b, c, d = first, first + 1, first + cells + 2, first + cells + 1
     turned = random.integers(0, 2, len(first)).astype(bool)[:, None]
-    one = np.where(turned, np.stack([a, b, c], 1), np.stack([b, d, a], 1))
-    other = np.where(turned, np.stack([a, d, c], 1), np.stack([b, c, d], 1))
-    return xy.astype(np.float32), np.concatenate([one, other])
+    first_half = np.where(turned, np.stack([a, b, c], 1), np.stack([b, d, a], 1))
+    second_half = np.where(turned, np.stack([a, d, c], 1), np.stack([b, c, d], 1))
+    return xy.astype(np.float32), np.concatenate([first_half, second_half])
 
 
 def _clip(xy: np.ndarray, w: np.ndarray | float = 1.0) -> np.ndarray:
@@ -64,32 +64,32 @@ def _clip(xy: np.ndarray, w: np.ndarray | float = 1.0) -> np.ndarray:
 @pytest.mark.parametrize("size", [(33, 50), (1, 1), (7, 1)])
 @pytest.mark.parametrize("kind", ["flat", "perspective", "behind", "uv"])
 def test_against_reference(device: str, kind: str, size: tuple[int, int], split: int | None):
-    """The triangle seen, the point in it and its depth, by solving for the corners' weights at each pixel."""
+    """The visible triangle, the barycentrics and the depth, by solving for the corners' weights at each pixel."""
     position, triangle = _scene(kind)
     got = _run(position, triangle, *size, device, split=split)
-    seen, share, depth, sure = reference.rasterize(position, triangle, *size)
+    visible, share, depth, sure = reference.rasterize(position, triangle, *size)
     sure = sure > 1e-9
     assert sure.mean() > 0.99
-    np.testing.assert_array_equal(got.triangle.numpy()[sure], seen[sure])
-    hit = sure & (seen >= 0)
+    np.testing.assert_array_equal(got.triangle.numpy()[sure], visible[sure])
+    hit = sure & (visible >= 0)
     assert kind == "behind" or size != (33, 50) or 0.3 < hit.mean() < 1.0
     np.testing.assert_allclose(got.barycentric.numpy()[hit], share[hit][:, :2], atol=1e-6)
     np.testing.assert_allclose(got.depth.numpy()[hit], depth[hit], rtol=1e-5, atol=1e-6)
-    missed = sure & (seen < 0)
+    missed = sure & (visible < 0)
     for values in (got.barycentric, got.depth, got.derivative):
         assert not values.numpy()[missed].any()
 
 
 @pytest.mark.parametrize("kind", ["perspective", "behind", "uv"])
 def test_derivative(device: str, kind: str):
-    """What the barycentrics change by per pixel, against the reference's own gradient by the place."""
+    """Derivatives of the barycentrics per pixel, against autograd of the reference."""
     size = (33, 50)
     position, triangle = _scene(kind)
     got = _run(position, triangle, *size, device)
-    seen = got.triangle.numpy()
-    hit = seen >= 0
+    visible = got.triangle.numpy()
+    hit = visible >= 0
     pixels = plain.pixel_centres(*size)[torch.tensor(hit)].requires_grad_()
-    b = plain.corner_weights(exact(position), torch.tensor(triangle)[seen[hit]], pixels, *size)
+    b = plain.corner_weights(exact(position), torch.tensor(triangle)[visible[hit]], pixels, *size)
     share = b / b.sum(-1, keepdim=True)
     slopes = [torch.autograd.grad(share[:, i].sum(), pixels, retain_graph=True)[0] for i in range(2)]
     np.testing.assert_allclose(got.derivative.numpy()[hit], torch.cat(slopes, 1), rtol=1e-4, atol=1e-6)
@@ -101,8 +101,8 @@ def test_derivative(device: str, kind: str):
 def test_no_gap_and_no_double_hit(device: str, cells: int, jitter: float, space: str, split: int | None):
     """Every pixel of a square is covered once, also where triangles that meet have corners of their own."""
     xy, triangle = _grid(cells, jitter)
-    own = xy[triangle].reshape(-1, 2), np.arange(triangle.size).reshape(-1, 3)
-    for points, triangles in ((xy, triangle), own):
+    separate = xy[triangle].reshape(-1, 2), np.arange(triangle.size).reshape(-1, 3)
+    for points, triangles in ((xy, triangle), separate):
         position = _clip(points) if space == "clip" else (points + 1) / 2
         coverage = _run(position, triangles, 64, 64, device, split=split).coverage.numpy()
         np.testing.assert_array_equal(coverage, 1)
@@ -207,22 +207,22 @@ def test_edges_through_centres_exactly(device: str):
     """Where float64 errs: an edge of full mantissas through a centre, shared by two triangles, and slivers along it."""
     random = np.random.default_rng(11)
     height, width = 45, 77
-    made = [_sliver(random, height, width) for _ in range(80)]
-    made = [corners for corners in made if corners is not None]
-    assert len(made) > 10
+    slivers = [_sliver(random, height, width) for _ in range(80)]
+    slivers = [corners for corners in slivers if corners is not None]
+    assert len(slivers) > 10
     covered = 0
-    for trial, corners in enumerate(made):
+    for trial, corners in enumerate(slivers):
         sliver = np.insert(corners, 2, 0.3 * corners[:, 2], 1).astype(np.float32)
         np.testing.assert_array_equal(sliver[:, [0, 1, 3]], corners)
         sliver = sliver[random.permutation(3)] if trial % 2 else sliver
         want = reference.covers(sliver, height, width)
         # In front of a plane just behind it, behind one just in front, however few digits its depth has.
-        for depth, seen in ((0.31, 0), (0.29, 1)):
+        for depth, visible in ((0.31, 0), (0.29, 1)):
             plane = _clip(np.array([[-3, -3], [3, -3], [0, 3]])) * np.float32([1, 1, 0, 1])
             plane[:, 2] = depth
             got = _run(np.concatenate([sliver, plane]), np.arange(6), height, width, device)
             np.testing.assert_array_equal(got.coverage.numpy(), 1 + want)
-            np.testing.assert_array_equal(got.triangle.numpy()[want], seen)
+            np.testing.assert_array_equal(got.triangle.numpy()[want], visible)
         covered += want.sum()
         # Two that share the edge on both sides of it.
         apart = np.concatenate([sliver[:2], _clip(np.array([[-9.0, 8.0], [9.0, -7.0]]))])
@@ -308,10 +308,10 @@ def test_cull(device: str):
     """Clockwise triangles aren't drawn when asked so; a triangle seen from behind turns."""
     position = _clip(np.array([[-3, -3], [3, -3], [0, 3]]))
     uv = (position[:, :2] + 1) / 2  # the same on paper, with v up
-    for order, seen in (([0, 1, 2], 0), ([0, 2, 1], -1)):
+    for order, visible in (([0, 1, 2], 0), ([0, 2, 1], -1)):
         assert (_run(position, order, 4, 4, device).triangle.numpy() == 0).all()
-        assert (_run(position, order, 4, 4, device, cull=True).triangle.numpy() == seen).all()
-        assert (_run(uv, order, 4, 4, device, cull=True).triangle.numpy() == seen).all()
+        assert (_run(position, order, 4, 4, device, cull=True).triangle.numpy() == visible).all()
+        assert (_run(uv, order, 4, 4, device, cull=True).triangle.numpy() == visible).all()
 
 
 def test_what_covers_nothing(device: str):
@@ -373,7 +373,7 @@ def test_splitting_changes_nothing(device: str):
 def test_run_again(device: str):
     """A second run has nothing of the first; on CUDA the same graph draws what its buffer holds when it is launched."""
     position, triangle = _scene("behind")
-    other = position[::-1].copy()
+    reversed_corners = position[::-1].copy()
     on_device = array(position, float, device)
     drawing = Rasterizer(array(triangle.astype(np.int32), int, device), 33, 50, coverage=True)
     drawing.run(on_device)
@@ -382,7 +382,7 @@ def test_run_again(device: str):
         with wp.ScopedCapture(device) as capture:
             drawing.run(on_device)
         launch = lambda: wp.capture_launch(capture.graph)  # noqa: E731
-    for values in (other, position):
+    for values in (reversed_corners, position):
         on_device.assign(values)
         launch()
         want = _run(values, triangle, 33, 50, device)
@@ -396,12 +396,12 @@ def test_gradient_of_positions(device: str, kind: str):
     size = (33, 50)
     position, triangle = _scene(kind, 12)
     got = _run(position, triangle, *size, device)
-    seen = got.triangle.numpy()
-    hit = seen >= 0
+    visible = got.triangle.numpy()
+    hit = visible >= 0
     toward = np.random.default_rng(3).normal(size=(*size, 2)).astype(np.float32)
     position64 = exact(position, grad=True)
     pixels = plain.pixel_centres(*size)[torch.tensor(hit)]
-    b = plain.corner_weights(position64, torch.tensor(triangle)[seen[hit]], pixels, *size)
+    b = plain.corner_weights(position64, torch.tensor(triangle)[visible[hit]], pixels, *size)
     ((b / b.sum(-1, keepdim=True))[:, :2] * exact(toward[hit])).sum().backward()
     on_device = [array(position, float, device), array(triangle.astype(np.int32), int, device)]
     grad = wp.zeros_like(on_device[0])
@@ -415,7 +415,7 @@ def test_interpolate(device: str):
     size = (33, 50)
     position, triangle = _scene("perspective")
     got = _run(position, triangle, *size, device)
-    seen = torch.tensor(got.triangle.numpy())
+    visible = torch.tensor(got.triangle.numpy())
     random = np.random.default_rng(4)
     for channels in (1, 3, 20):
         attribute = random.normal(size=(17, channels)).astype(np.float32)
@@ -423,7 +423,7 @@ def test_interpolate(device: str):
         toward = random.normal(size=(*size, channels)).astype(np.float32)
         attribute64, uv64 = exact(attribute, grad=True), exact(got.barycentric.numpy(), grad=True)
         share = torch.cat([uv64, 1 - uv64.sum(-1, keepdim=True)], -1)
-        want = (attribute64[torch.tensor(corner)[seen]] * share[..., None]).sum(-2) * (seen >= 0)[..., None]
+        want = (attribute64[torch.tensor(corner)[visible]] * share[..., None]).sum(-2) * (visible >= 0)[..., None]
         want.backward(exact(toward))
         here = array(attribute, float, device), array(corner, int, device), got.triangle, got.barycentric
         out = wp.full((*size, channels), 7.0, dtype=float, device=device)
@@ -439,13 +439,13 @@ def test_interpolate_what_is_not_there(device: str):
     """Triangles beyond the list and corners beyond the attributes read 0 and give nothing."""
     triangle = array(np.array([[0, 1, 2], [0, 1, 3], [-1, 1, 2]]), int, device)
     attribute = array(np.ones((3, 2), np.float32), float, device)
-    found = array(np.array([[0, 1, 2, 3, -1]]), int, device)
+    visible = array(np.array([[0, 1, 2, 3, -1]]), int, device)
     uv = array(np.full((1, 5, 2), 0.25, np.float32), wp.vec2, device)
     out = wp.full((1, 5, 2), 7.0, dtype=float, device=device)
-    raster_gradient.interpolate(attribute, triangle, found, uv, out)
+    raster_gradient.interpolate(attribute, triangle, visible, uv, out)
     np.testing.assert_array_equal(out.numpy()[0, :, 0], [1, 0, 0, 0, 0])
     grad, grad_uv = wp.zeros_like(attribute), wp.zeros_like(uv)
-    raster_gradient.interpolate_backward(attribute, triangle, found, uv, out, grad, grad_uv)
+    raster_gradient.interpolate_backward(attribute, triangle, visible, uv, out, grad, grad_uv)
     np.testing.assert_array_equal(grad.numpy()[:, 0], [0.25, 0.25, 0.5])
 
 

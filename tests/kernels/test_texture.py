@@ -1,4 +1,4 @@
-"""Reading textures: values, gradients, borders, and coordinates that are no place."""
+"""Reading textures: values, gradients, borders, and coordinates that are NaN, infinite or huge."""
 
 import numpy as np
 import pytest
@@ -58,7 +58,7 @@ def test_against_reference(device: str, shape: tuple[int, ...], filter: str, bou
 
 
 @pytest.mark.parametrize("boundary", BOUNDARIES)
-def test_slope_is_what_a_step_changes(device: str, boundary: str):
+def test_slope_against_finite_differences(device: str, boundary: str):
     """Central differences between texel centres, exact for the linear piece but for float32."""
     shape = (9, 6, 2)
     image = np.random.default_rng(2).normal(size=shape).astype(np.float32)
@@ -84,14 +84,14 @@ def test_centres_and_borders(device: str):
     }
     for boundary, (at_centres, at_ends) in want.items():
         for filter in FILTERS:
-            found = Reading(image, centres, device, filter=filter, boundary=boundary).forward()[:, 0]
-            np.testing.assert_array_equal(found, at_centres)
-        found = Reading(image, ends, device, boundary=boundary).forward()[:, 0]
-        np.testing.assert_array_equal(found, at_ends)
+            values = Reading(image, centres, device, filter=filter, boundary=boundary).forward()[:, 0]
+            np.testing.assert_array_equal(values, at_centres)
+        values = Reading(image, ends, device, boundary=boundary).forward()[:, 0]
+        np.testing.assert_array_equal(values, at_ends)
 
 
 def test_a_texel_at_a_centre_stands_alone(device: str):
-    """An infinite neighbour without weight isn't seen."""
+    """An infinite neighbour without weight isn't read."""
     image = np.array([[[1.0], [np.inf]], [[np.nan], [3.0]]], np.float32)
     uv = np.array([[0.25, 0.25], [0.75, 0.75]], np.float32)
     for filter in FILTERS:
@@ -100,7 +100,7 @@ def test_a_texel_at_a_centre_stands_alone(device: str):
 
 @pytest.mark.parametrize("boundary", BOUNDARIES)
 @pytest.mark.parametrize("filter", FILTERS)
-def test_no_place(device: str, filter: str, boundary: str):
+def test_coordinates_without_a_texel(device: str, filter: str, boundary: str):
     """NaN reads NaN and gives nothing; infinity likewise, unless it is clamped; huge numbers are even integers."""
     image = np.random.default_rng(3).uniform(1.0, 2.0, (3, 5, 2)).astype(np.float32)
     bad = [[np.nan, 0.5], [0.5, np.nan], [np.nan, np.nan]]
@@ -120,8 +120,8 @@ def test_no_place(device: str, filter: str, boundary: str):
     np.testing.assert_array_equal(Reading(image, huge, device, **args).forward(), want)
     if boundary == "clamp":
         ends = np.array([[1, 0.1], [0.9, 0]], np.float32)
-        found = Reading(image, np.array(infinite, np.float32), device, **args).forward()
-        np.testing.assert_array_equal(found, Reading(image, ends, device, **args).forward())
+        values = Reading(image, np.array(infinite, np.float32), device, **args).forward()
+        np.testing.assert_array_equal(values, Reading(image, ends, device, **args).forward())
 
 
 def test_weights_of_a_wide_texture(device: str):
@@ -136,7 +136,7 @@ def test_weights_of_a_wide_texture(device: str):
     close(Reading(image, uv, device).forward()[:, 0], want, 1e-6)
 
 
-def test_gradients_that_are_not_wanted(device: str):
+def test_gradients_that_are_not_computed(device: str):
     """An empty buffer stays empty, the other is as with both."""
     image, uv = np.random.default_rng(5).normal(size=(4, 4, 2)).astype(np.float32), _points((4, 4, 2))
     reading = Reading(image, uv, device)

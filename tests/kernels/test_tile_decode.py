@@ -1,4 +1,4 @@
-"""Reading tiles: against float64, at every border, and where a coordinate is no place."""
+"""Reading tiles: against float64, at every border, and at coordinates that are NaN or infinite."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What comes in: every stated behaviour of `wlm.lightmap.data`."""
+"""Reading and checking sets: every stated behaviour of ``wlm.lightmap.data``."""
 
 from __future__ import annotations
 
@@ -60,8 +60,8 @@ def _message(call, *args: object, **options: object) -> str:
 def test_set_json_and_its_folder_are_read_alike(tmp_path):
     frames = _frames()
     path = _write_set(tmp_path, frames)
-    for given in (path, str(path), tmp_path):
-        lightmaps = load(given)
+    for source in (path, str(path), tmp_path):
+        lightmaps = load(source)
         assert (lightmaps.name, lightmaps.period, lightmaps.warnings) == ("tiny", 24.0, ())
         np.testing.assert_array_equal(lightmaps.frames, frames)
         np.testing.assert_array_equal(lightmaps.times, TIMES)

@@ -12,7 +12,7 @@ import wlm
 from wlm.errors import WlmError
 from wlm.lightmap.data import from_arrays
 from wlm.lightmap.decode import Decoder
-from wlm.lightmap.evaluation import bits_per_texel, evaluate, evaluate_baselines, part_bytes
+from wlm.lightmap.evaluation import bits_per_texel, evaluate, part_bytes
 from wlm.lightmap.fit import compress
 from wlm.metrics import evaluate_frame, summarise
 
@@ -136,20 +136,3 @@ def test_a_set_that_does_not_fit_is_one_line(fitted):
         evaluate(model, lightmaps, device="tpu")
     with pytest.raises(ValueError, match="file_bytes"):
         evaluate(model, lightmaps, file_bytes=100, metrics=("psnr",))
-
-
-def test_baselines_are_scored_over_the_same_texels(fitted):
-    lightmaps, _, _ = fitted
-    model = compress(lightmaps, tiny_profile(steps=10), tiles=[1])
-    (plain, bc6h) = evaluate_baselines(model, lightmaps, ("8bit", "bc6h"), metrics=("psnr",))
-    assert plain.bytes == 5 * (200 * 228 * 3 + 4) and plain.bpp == pytest.approx(24.0, abs=0.01)
-    assert bc6h.bpp == pytest.approx(8.0, abs=0.1) and math.isnan(plain.ssim)
-    assert plain.to_json()["ssim"] is None
-    # Not scored where the model holds nothing: noise there changes nothing.
-    frames = lightmaps.frames.copy()
-    frames[:, :, :128] *= 1.0 / np.random.default_rng(0).uniform(1.0, 9.0, frames[:, :, :128].shape)
-    noisy = from_arrays(frames, lightmaps.times, lightmaps.mask, 24.0)
-    (again,) = evaluate_baselines(model, noisy, ("bc6h",), metrics=("psnr",))
-    assert again.psnr == bc6h.psnr
-    with pytest.raises(WlmError, match="unknown codec"):
-        evaluate_baselines(model, lightmaps, ("jpeg",))

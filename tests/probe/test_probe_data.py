@@ -58,8 +58,8 @@ def _same(a: ProbeSet, b: ProbeSet) -> None:
 
 def test_npz(tmp_path):
     path = _write(tmp_path / "Room.NPZ.npz")
-    for given in (path, str(path)):
-        loaded = load(given)
+    for argument in (path, str(path)):
+        loaded = load(argument)
         assert (loaded.name, loaded.key, loaded.warnings) == ("Room.NPZ", "sh", ())
         assert (loaded.probes, loaded.outputs, loaded.float_bytes) == (N, 27, N * 27 * 4)
         np.testing.assert_array_equal(loaded.position, _position())
@@ -155,7 +155,7 @@ def test_godot_file(tmp_path, monkeypatch):
     # What its reader returns; the reader has its own tests.
     path = tmp_path / "level.lmbake"
     path.write_bytes(b"RSRC")
-    monkeypatch.setattr(data, "read_lmbake", lambda given: (_position(), _values(N, 9, 3)))
+    monkeypatch.setattr(data, "read_lmbake", lambda path: (_position(), _values(N, 9, 3)))
     loaded = load(path)
     assert (loaded.name, loaded.key) == ("level", "sh")
     _same(loaded, from_arrays(_position(), _values(N, 9, 3), convention="godot"))
@@ -239,8 +239,8 @@ def test_coincident_positions():
     assert loaded.warnings == ("yard: 3 probes at the position of another: they decode to the same values",)
     np.testing.assert_array_equal(loaded.values, _values(N, 27))
     assert loaded.live.all()
-    one = from_arrays(np.zeros((2, 3)), _values(2, 3))
-    assert one.warnings == ("array: 1 probe at the position of another: they decode to the same values",)
+    pair = from_arrays(np.zeros((2, 3)), _values(2, 3))
+    assert pair.warnings == ("array: 1 probe at the position of another: they decode to the same values",)
     # One coordinate alike is no coincidence.
     position = _position()
     position[:, 1] = 7.0

@@ -78,9 +78,10 @@ def test_stored_positions_span_the_box():
 
 def test_positions_are_recognised_as_the_models_own():
     model = random_model(probes=3, dead=0)
-    own = ORIGIN + EXTENT * SIZE * np.array([[0, 0, 0], [1, 1, 1], [0.5, 0.5, 0.5]])
-    assert model.has_probes_at(own) and model.has_probes_at(own.astype(np.float32).astype(np.float64))
-    assert not model.has_probes_at(own[:2]) and not model.has_probes_at(own + [[0, 0, 0], [1e-3, 0, 0], [0, 0, 0]])
+    position = ORIGIN + EXTENT * SIZE * np.array([[0, 0, 0], [1, 1, 1], [0.5, 0.5, 0.5]])
+    assert model.has_probes_at(position) and model.has_probes_at(position.astype(np.float32).astype(np.float64))
+    moved = position + [[0, 0, 0], [1e-3, 0, 0], [0, 0, 0]]
+    assert not model.has_probes_at(moved) and not model.has_probes_at(position[:2])
     with pytest.raises(WlmError, match="random: holds no positions"):
         model.stored_positions()
 

@@ -48,7 +48,7 @@ def test_the_basis_is_orthonormal():
 
 def test_the_basis_equals_that_of_scipy():
     directions = unit(40)
-    found = basis(directions, 25)
+    values = basis(directions, 25)
     theta, phi = np.arccos(directions[:, 2]), np.arctan2(directions[:, 1], directions[:, 0])
     for band in range(5):
         for m in range(-band, band + 1):
@@ -56,7 +56,7 @@ def test_the_basis_equals_that_of_scipy():
             value = sph_harm_y(band, abs(m), theta, phi) * (-1) ** m
             real = value.real if m >= 0 else value.imag
             expected = real * (1 if m == 0 else np.sqrt(2))
-            np.testing.assert_allclose(found[:, band * band + band + m], expected, atol=1e-13)
+            np.testing.assert_allclose(values[:, band * band + band + m], expected, atol=1e-13)
 
 
 def test_the_poles_are_finite():
@@ -75,13 +75,12 @@ def test_radiance_of_projected_light_is_that_light():
     values = (basis(directions, 9) * weights[:, None]).T @ np.stack([light, 2 * light, 0 * light], 1)
     there = unit(15)
     again = 1.0 + there[:, 1] * there[:, 2] - 0.5 * there[:, 0]
-    found = radiance(values, there)
-    np.testing.assert_allclose(found, np.stack([again, 2 * again, 0 * again], 1), atol=1e-12)
+    np.testing.assert_allclose(radiance(values, there), np.stack([again, 2 * again, 0 * again], 1), atol=1e-12)
 
 
 def test_cosine_factors_are_the_published_ones():
-    found = [cosine_factor(band) for band in range(7)]
-    np.testing.assert_allclose(found, np.pi * np.array([1, 2 / 3, 1 / 4, 0, -1 / 24, 0, 1 / 64]), rtol=1e-15)
+    factors = [cosine_factor(band) for band in range(7)]
+    np.testing.assert_allclose(factors, np.pi * np.array([1, 2 / 3, 1 / 4, 0, -1 / 24, 0, 1 / 64]), rtol=1e-15)
 
 
 @pytest.mark.parametrize("band", range(9))
@@ -118,9 +117,9 @@ def test_light_from_above_lights_what_looks_up():
 
 def test_many_probes_at_once():
     values, normals = RNG.normal(size=(4, 5, 9, 3)).astype(np.float32), unit(6)
-    found = irradiance(values, normals)
-    assert found.shape == (4, 5, 6, 3) and found.dtype == np.float64
-    np.testing.assert_allclose(found[2, 3], irradiance(values[2, 3], normals), rtol=1e-12)
+    light = irradiance(values, normals)
+    assert light.shape == (4, 5, 6, 3) and light.dtype == np.float64
+    np.testing.assert_allclose(light[2, 3], irradiance(values[2, 3], normals), rtol=1e-12)
     assert radiance(values[:0], normals).shape == (0, 5, 6, 3)
 
 

@@ -42,13 +42,13 @@ def _surface(count: int = 1500, seed: int = 0) -> np.ndarray:
 
 def _names(position: np.ndarray, volume: Volume) -> set[tuple[int, int, int, int]]:
     """(level, x, y, z) of the blocks of the windows that hold a probe, one probe at a time."""
-    found = set()
+    names = set()
     for level, size in enumerate(volume.sizes):
         base = volume.base[level]
         for block in np.floor(position / size).astype(int):
             if ((block >= base) & (block < base + volume.side)).all():
-                found.add((level, *block.tolist()))
-    return found
+                names.add((level, *block.tolist()))
+    return names
 
 
 def _there(volume: Volume) -> dict[tuple[int, int, int, int], np.ndarray]:
@@ -76,12 +76,12 @@ def _settle(volume: Volume, viewpoint: object) -> list[FrameStats]:
 
 
 def _check_query(position: np.ndarray, low: np.ndarray, high: np.ndarray, cell: float | None) -> int:
-    found, offsets = ProbeIndex(position, cell).query(low, high)
-    assert offsets.shape == (len(low) + 1,) and offsets[0] == 0 and offsets[-1] == len(found)
+    probes, offsets = ProbeIndex(position, cell).query(low, high)
+    assert offsets.shape == (len(low) + 1,) and offsets[0] == 0 and offsets[-1] == len(probes)
     for i in range(len(low)):
         want = np.flatnonzero(((position >= low[i]) & (position < high[i])).all(1))
-        np.testing.assert_array_equal(np.sort(found[offsets[i] : offsets[i + 1]]), want)
-    return len(found)
+        np.testing.assert_array_equal(np.sort(probes[offsets[i] : offsets[i + 1]]), want)
+    return len(probes)
 
 
 @pytest.mark.parametrize(
@@ -122,8 +122,8 @@ def test_index_of_blocks():
         block = np.unique(np.floor(position / size), axis=0)
         around = np.array(list(itertools.product((-1, 0, 1), repeat=3)))
         block = np.unique((block[:, None] + around).reshape(-1, 3), axis=0)
-        found, offsets = ProbeIndex(position, 0.3).query(block * size, (block + 1) * size)
-        np.testing.assert_array_equal(np.sort(found), np.arange(len(position)))
+        probes, offsets = ProbeIndex(position, 0.3).query(block * size, (block + 1) * size)
+        np.testing.assert_array_equal(np.sort(probes), np.arange(len(position)))
         assert (np.diff(offsets) == 0).any()
 
 
@@ -151,18 +151,18 @@ def test_teleport_converges_in_the_frames_of_the_budget(device: str, budget: int
     """ceil(blocks with a probe / budget) frames, each full but the last; empty blocks cost nothing."""
     position = _surface(600)
     volume = Volume(position, Field(), 5, budget=budget, device=device)
-    made = set()
+    decoded = set()
     for viewpoint in ([0.0, 2.0, 0.0], [700.0, 0.0, 0.0], [-40.0, 3.0, 41.0]):
         frames = _settle(volume, viewpoint)
-        wanted = _names(position, volume)
-        blocks = len(wanted - made)
-        made |= wanted
+        names = _names(position, volume)
+        blocks = len(names - decoded)
+        decoded |= names
         assert frames[0].queued == blocks
         assert len(frames) == max(math.ceil(blocks / budget), 1)
         assert [f.updated for f in frames[:-1]] == [budget] * (len(frames) - 1)
         assert sum(f.updated for f in frames) == blocks
         assert [f.left for f in frames] == [max(blocks - budget * (i + 1), 0) for i in range(len(frames))]
-        assert set(_there(volume)) == wanted
+        assert set(_there(volume)) == names
         again = volume.update(viewpoint)
         assert (again.entered, again.updated, again.cached, again.probes, again.left) == (0, 0, 0, 0, 0)
 
@@ -207,8 +207,8 @@ def test_thinned_blocks():
     assert 0.0 < np.abs(got[1, 0, 0, 0] - want[1, 0, 0, 0]).max() < 0.2
     small = [name for name in got if name[0] == 0]
     np.testing.assert_array_equal([got[name] for name in small], [want[name] for name in small])
-    one = Volume(position, field, 5, sizes=(32.0,), probes=64)
-    assert one.update([16.0, 16.0, 16.0]).probes == 64
+    single = Volume(position, field, 5, sizes=(32.0,), probes=64)
+    assert single.update([16.0, 16.0, 16.0]).probes == 64
     spread = field.asked[-1]
     assert np.ptp(spread, axis=0).min() > 24 and np.abs(spread.mean(0) - 16).max() < 4
 
@@ -262,8 +262,8 @@ def test_no_read_of_a_block_that_is_not_there(device: str):
         stats = volume.update(viewpoint)
         dropped += stats.dropped
         there = _there(volume)
-        wanted = _names(position, volume)
-        assert set(there) <= wanted and len(wanted - set(there)) == stats.left > 0
+        names = _names(position, volume)
+        assert set(there) <= names and len(names - set(there)) == stats.left > 0
         for name, value in there.items():
             if name not in truth:
                 truth[name] = _value(name, position, volume, field)

@@ -49,16 +49,16 @@ def test_camera_path_follows_the_ground():
 
 def test_camera_path_of_little():
     """One probe, coincident probes, one frame, and no room in plan."""
-    one = np.array([[3.0, 4.0, 5.0]])
-    np.testing.assert_allclose(camera_path(one, 3), [[3.0, 5.6, 5.0]] * 3)
-    np.testing.assert_allclose(camera_path(np.repeat(one, 40, 0), 20, 0.0), np.repeat(one, 20, 0))
+    place = np.array([[3.0, 4.0, 5.0]])
+    np.testing.assert_allclose(camera_path(place, 3), [[3.0, 5.6, 5.0]] * 3)
+    np.testing.assert_allclose(camera_path(np.repeat(place, 40, 0), 20, 0.0), np.repeat(place, 20, 0))
     assert camera_path(_hills(), 1).shape == (1, 3)
     tower = np.stack([np.zeros(5), np.arange(5.0), np.zeros(5)], 1)
     np.testing.assert_allclose(camera_path(tower, 2, 1.0), [[0.0, 3.0, 0.0]] * 2)
-    for position, frames in [(np.zeros((0, 3)), 5), (one, 0)]:
+    for position, frames in [(np.zeros((0, 3)), 5), (place, 0)]:
         with pytest.raises(WlmError, match="camera path: expected at least"):
             camera_path(position, frames)
-    for position, up in [(one[0], 1), (one, 3)]:
+    for position, up in [(place[0], 1), (place, 3)]:
         with pytest.raises(ValueError, match="camera path"):
             camera_path(position, 5, up=up)
 

@@ -61,17 +61,18 @@ class Domain:
         at = self.into_domain(p) / self.refinement
         return self.refinement * sum(w * self.u[c] for c, w in self.corners(at, coarse))
 
-    def is_solid(self, p: np.ndarray, reach: int = 0) -> bool:
-        """Whether the coarse cell of a point is solid, or one within ``reach`` of it."""
-        coarse = np.array(self.solid.shape)
-        cell = np.minimum((self.into_domain(p) / self.refinement).astype(int), coarse - 1)
-        for step in itertools.product(range(-reach, reach + 1), repeat=3):
-            beside = cell + step
-            for a, (low, _) in enumerate(self.ends):
-                beside[a] = beside[a] % coarse[a] if low == 0 else np.clip(beside[a], 0, coarse[a] - 1)
-            if self.solid[tuple(beside)]:
-                return True
-        return False
+    @cached_property
+    def beside(self) -> np.ndarray:
+        """bool [X, Y, Z], the coarse cells that are solid or touch one that is."""
+        cells = self.solid
+        for axis, (low, _) in enumerate(self.ends):
+            cells = np.pad(cells, [(int(a == axis),) * 2 for a in range(3)], mode="wrap" if low == 0 else "edge")
+        return np.lib.stride_tricks.sliding_window_view(cells, (3, 3, 3)).any((3, 4, 5))
+
+    def at(self, cells: np.ndarray, p: np.ndarray) -> bool:
+        """The value of the coarse cell that holds a point."""
+        cell = (self.into_domain(p) / self.refinement).astype(int)
+        return bool(cells[tuple(np.minimum(cell, np.array(cells.shape) - 1))])
 
     def departure_point(self, x: np.ndarray, dt: float) -> np.ndarray:
         """x - dt u(x - dt u(x) / 2), cut where the trace meets a solid."""
@@ -83,11 +84,11 @@ class Domain:
             around = self.corners(middle / self.refinement, np.array(self.solid.shape), x / self.refinement)
             v = self.refinement * sum(w * self.u[c] for c, w in around)
         end = x - dt * v
-        if self.is_solid(end):
+        if self.at(self.solid, end):
             free = x
             for _ in range(6):
                 middle = 0.5 * (free + end)
-                if self.is_solid(middle):
+                if self.at(self.solid, middle):
                     end = middle
                 else:
                     free = middle
@@ -96,8 +97,8 @@ class Domain:
 
     def is_near(self, x: np.ndarray, p: np.ndarray) -> bool:
         """Whether the end p of a trace from x counts as beside a solid."""
-        short = (np.abs(p - x) <= 0.5 * self.refinement).all() and not self.is_solid(x, 1)
-        return self.is_solid(p, 1) and not short
+        short = (np.abs(p - x) <= 0.5 * self.refinement).all() and not self.at(self.beside, x)
+        return self.at(self.beside, p) and not short
 
     def read(self, field: np.ndarray, p: np.ndarray) -> float:
         """A field at a point, of the cells that aren't solid."""

@@ -1,22 +1,23 @@
-"""Six-way lightmaps of smoke: the axes' names, their own error, a path tracer, hard smoke."""
+"""Six-way lightmaps of smoke: the axes' names, their own error, a path tracer."""
 
 import math
 
 import numpy as np
 import pytest
 import torch
+from builders.smoke_plumes import facing, unit_grid
 
 from wlm.bench.path_tracer import PathTracer
 from wlm.fluid.volume import DensityVolume, from_array
-from wlm.smoke.baking import SixWay, lit, six_way
+from wlm.smoke.baking import bake, lit
 from wlm.smoke.camera import DIRECTIONS, RULES, VECTORS, Camera, axis_faults, weights
+from wlm.smoke.lightmaps import SixWay
 
 
 def _plume(device: str = "cpu", n: int = 28, extinction: float = 0.25, seed: int = 2) -> DensityVolume:
     """A leaning column of billows."""
     random = np.random.default_rng(seed)
-    axis = (np.arange(n) + 0.5) / n * 2 - 1
-    x, y, z = np.meshgrid(axis, axis, axis, indexing="ij")
+    x, y, z = unit_grid(n)
     density = np.zeros((n, n, n))
     for _ in range(14):
         height = random.uniform(-0.7, 0.7)
@@ -26,20 +27,13 @@ def _plume(device: str = "cpu", n: int = 28, extinction: float = 0.25, seed: int
     return from_array(density.astype(np.float32), extinction=extinction, device=device)
 
 
-def _front(volume: DensityVolume, size: int = 24, way: tuple = (0.0, 0.0, 1.0)) -> Camera:
-    extent = 1.1 * max(volume.shape) * volume.voxel
-    position = volume.centre + 3 * extent * np.array(way) / np.linalg.norm(way)
-    return Camera.look_at(position, volume.centre, extent=extent, height=size, width=size)
-
-
 @pytest.mark.parametrize("way", [(0.0, 0.0, 1.0), (1.0, 0.5, -0.3), (0.0, 1.0, 0.0)])
 def test_names_of_the_axes(device: str, way: tuple):
     """A dense ball's bright side is the named one from wherever it is seen, and the check tells a mix-up."""
-    axis = (np.arange(20) + 0.5) / 10 - 1
-    x, y, z = np.meshgrid(axis, axis, axis, indexing="ij")
+    x, y, z = unit_grid(20)
     ball = np.clip(6 - 8 * np.sqrt(x**2 + y**2 + z**2), 0, 1).astype(np.float32)
     volume = from_array(ball, extinction=1.0, device=device)
-    maps = six_way(volume, _front(volume, way=way), step=1.0, estimate=False).lightmaps.cpu().numpy()
+    maps = bake(volume, facing(volume, way), step=1.0, estimate=False).lightmaps.cpu().numpy()
     assert axis_faults(maps) == ()
     for a, b in ((0, 1), (2, 3), (4, 5)):
         swapped = maps.copy()
@@ -61,7 +55,7 @@ def test_a_screen_darkens_one_map(device: str, direction: str):
     place[axis] = slice(21, 23) if way > 0 else slice(1, 3)
     density[tuple(place)] = 50
     screened = from_array(density, extinction=0.2, device=device)
-    before, after = (six_way(v, camera, step=0.5, estimate=False) for v in (alone, screened))
+    before, after = (bake(v, camera, step=0.5, estimate=False) for v in (alone, screened))
     assert after[direction].max() < 1e-2 < 0.2 < before[direction].max()
     for other in DIRECTIONS:
         # The wall behind is seen, and lit, through the smoke.
@@ -72,11 +66,11 @@ def test_a_screen_darkens_one_map(device: str, direction: str):
 def test_halving_the_step(device: str):
     """Each halving at least halves the error, until rounding; and what is stated covers what remains."""
     volume = _plume(device, extinction=0.8)
-    camera = _front(volume, way=(0.4, 0.3, 1.0))
-    fine = six_way(volume, camera, step=1 / 32, estimate=False)
+    camera = facing(volume, (0.4, 0.3, 1.0))
+    fine = bake(volume, camera, step=1 / 32, estimate=False)
     errors, stated = [], []
     for step in (2.0, 1.0, 0.5, 0.25, 0.125):
-        maps = six_way(volume, camera, step=step)
+        maps = bake(volume, camera, step=step)
         off = (maps.lightmaps - fine.lightmaps).double()
         errors.append(float((off.square().mean() / fine.lightmaps.double().square().mean()).sqrt()))
         stated.append(maps.error.rms)
@@ -90,8 +84,8 @@ def test_halving_the_step(device: str):
 def test_shading_approximates_oblique_lights(device: str):
     """Twelve lights: the squares are right on average; eq. 5's weights are too bright by about a half."""
     volume = _plume(device)
-    camera = _front(volume)
-    six = six_way(volume, camera, estimate=False).lightmaps.double().cpu()
+    camera = facing(volume)
+    six = bake(volume, camera, estimate=False).lightmaps.double().cpu()
     # The corners of an icosahedron, turned off the axes.
     golden = (1 + math.sqrt(5)) / 2
     corners = [np.roll((0, a, b * golden), k) for k in range(3) for a in (-1, 1) for b in (-1, 1)]
@@ -111,8 +105,8 @@ def test_shading_approximates_oblique_lights(device: str):
 def test_along_an_axis(device: str):
     """A light along an axis is that axis' map, by every rule, and by the marcher of any light."""
     volume = _plume(device)
-    camera = _front(volume, way=(0.5, 0.2, 1.0))
-    six = six_way(volume, camera, step=0.25, g=0.4, estimate=False).lightmaps
+    camera = facing(volume, (0.5, 0.2, 1.0))
+    six = bake(volume, camera, step=0.25, g=0.4, estimate=False).lightmaps
     for index, way in enumerate(VECTORS):
         for rule in RULES:
             np.testing.assert_array_equal(weights(3.0 * way, rule), np.eye(6)[index])
@@ -123,9 +117,9 @@ def test_along_an_axis(device: str):
 def test_supersampling(device: str):
     """A pixel of n x n rays is the mean of the n x n pixels of a finer image."""
     volume = _plume(device)
-    camera = _front(volume, 12)
-    got = six_way(volume, camera, step=1.0, supersample=3)
-    fine = six_way(volume, camera.finer(3), step=1.0)
+    camera = facing(volume, size=12)
+    got = bake(volume, camera, step=1.0, supersample=3)
+    fine = bake(volume, camera.finer(3), step=1.0)
     want = torch.nn.functional.avg_pool2d(fine.lightmaps[None], 3)[0]
     np.testing.assert_allclose(got.lightmaps.cpu(), want.cpu(), rtol=1e-6)
     assert got.lightmaps.shape == (6, 12, 12) and got.error.rms > 0
@@ -137,51 +131,25 @@ def test_emission(device: str):
     hot[:, :, 2:4] = 0.5
     volume = from_array(np.zeros_like(hot), temperature=hot, emission=3.0, voxel=0.5, device=device)
     camera = Camera.look_at((1.5, 1.5, 9), (1.5, 1.5, 0), extent=0.5, height=2, width=2)
-    six = six_way(volume, camera, step=0.1)
+    six = bake(volume, camera, step=0.1)
     np.testing.assert_allclose(six.emission.cpu(), 3.0 * 0.5 * 2 * 0.5, rtol=1e-4)
     assert (six.transparency == 1).all() and not six.lightmaps.any()
-    assert six_way(_plume(device), camera).emission is None
+    assert bake(_plume(device), camera).emission is None
     # Of a medium that also absorbs, L (1 - exp(-tau)) with L = emission / extinction.
     both = from_array(np.ones_like(hot), temperature=np.ones_like(hot), emission=3.0, extinction=0.7, device=device)
     camera = Camera.look_at((3, 3, 9), (3, 3, 0), extent=0.5, height=1, width=1)
-    assert float(six_way(both, camera, step=0.05).emission) == pytest.approx(3 / 0.7 * -math.expm1(-4.2), rel=1e-3)
-
-
-@pytest.mark.parametrize("name", ["empty", "opaque", "one voxel", "not a number", "inside"])
-def test_hard_smoke(device: str, name: str):
-    density = np.ones((5, 5, 5), np.float32)
-    extinction, distance = 1.0, 20.0
-    if name == "empty":
-        density[:] = 0
-    elif name == "opaque":
-        extinction = 1e5
-    elif name == "one voxel":
-        density = density[:1, :1, :1]
-    elif name == "not a number":
-        density[:] = np.nan
-    else:
-        distance = 0.1
-    volume = from_array(density, extinction=extinction, device=device)
-    camera = Camera.look_at(volume.centre + [0, 0, distance], volume.centre, extent=8.0, height=16, width=16)
-    six = six_way(volume, camera)
-    assert torch.isfinite(six.lightmaps).all() and torch.isfinite(six.transparency).all()
-    assert six.lightmaps.min() >= 0 and six.lightmaps.max() <= 1 and math.isfinite(six.error.rms)
-    if name in ("empty", "not a number"):
-        assert not six.lightmaps.any() and (six.transparency == 1).all() and six.error.rms == 0
-        assert len(volume.warnings) == (name == "not a number")
-    else:
-        assert six.transparency.min() < 0.9 and six["front"].max() > 0.05
+    assert float(bake(both, camera, step=0.05).emission) == pytest.approx(3 / 0.7 * -math.expm1(-4.2), rel=1e-3)
 
 
 def test_wrong_settings():
     volume = _plume(n=4)
-    camera = _front(volume)
+    camera = facing(volume)
     for options in ({"step": -1.0}, {"g": -1.0}, {"supersample": 0}):
         with pytest.raises(ValueError, match=next(iter(options))):
-            six_way(volume, camera, **options)
+            bake(volume, camera, **options)
     with pytest.raises(ValueError, match="orthographic"):
         seen = Camera.look_at((0, 0, 9), (0, 0, 0), extent=1.0, height=2, width=2, perspective=True)
-        six_way(volume, seen)
+        bake(volume, seen)
     with pytest.raises(ValueError, match="toward"):
         lit(volume, camera, (0.0, 0.0, 0.0))
     with pytest.raises(ValueError, match="rule: expected one of"):
@@ -209,11 +177,11 @@ def test_against_a_path_tracer(name: str):
     """Mitsuba's volumetric path tracer of one bounce: within 1% above its own noise, in every direction."""
     pytest.importorskip("mitsuba")
     volume = from_array(np.ones((12, 12, 12)), extinction=0.15) if name == "cube" else _plume()
-    camera = _front(volume, 16)
+    camera = facing(volume, size=16)
     trace = PathTracer(volume, camera, variant="scalar_rgb")
-    ours = six_way(volume, camera, step=0.25, supersample=4, estimate=False)
+    ours = bake(volume, camera, step=0.25, supersample=4, estimate=False)
     for index, way in enumerate(VECTORS):
-        runs = np.stack([trace.traced(way, 2048, seed) for seed in range(4)])
+        runs = np.stack([trace.trace(way, 2048, seed) for seed in range(4)])
         want = ours.lightmaps[index].double().numpy()
         light = runs[..., 0].astype(np.float64)
         energy, noise = np.square(want).mean(), light.var(0, ddof=1).mean() / len(light)
@@ -230,13 +198,13 @@ def test_oblique_lights_against_a_path_tracer(way: tuple):
     """What six-way shading is measured by: the march to a light from anywhere, within 1% above the tracer's noise."""
     pytest.importorskip("mitsuba")
     volume = _plume()
-    camera = _front(volume, 16)
+    camera = facing(volume, size=16)
     trace = PathTracer(volume, camera, variant="scalar_rgb")
     unit = np.array(way) / np.linalg.norm(way)
     rays = 16
     fine = lit(volume, camera.finer(rays), camera.axes.T @ unit, step=0.25)
     want = torch.nn.functional.avg_pool2d(fine[None], rays)[0].double().numpy()
-    runs = np.stack([trace.traced(unit, 2048, seed)[..., 0] for seed in range(4)])
+    runs = np.stack([trace.trace(unit, 2048, seed)[..., 0] for seed in range(4)])
     runs = runs.astype(np.float64)
     energy, noise = np.square(want).mean(), runs.var(0, ddof=1).mean() / len(runs)
     above = np.square(runs.mean(0) - want).mean() - noise

@@ -1,28 +1,37 @@
 """Six-way lightmaps by a coarse march: against the fine march, the guiding map, and what is known exactly."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
-from builders.smoke_plumes import plume
+from builders.smoke_plumes import facing, plume
 
 from wlm.fluid.volume import DensityVolume, from_array
-from wlm.smoke.baking import SixWay, six_way
+from wlm.smoke.baking import bake
 from wlm.smoke.camera import DIRECTIONS, Camera
-from wlm.smoke.coarse import coarse_six_way
-from wlm.smoke.guide import guide
+from wlm.smoke.coarse import march, march_planes
+from wlm.smoke.guiding import guide
+from wlm.smoke.lightmaps import SixWay
 from wlm_kernels.smoke import march_coarse
+from wlm_kernels.smoke.settings import March
 
 TURNED = (0.5, 0.3, 1.0)
 VIEWS = {"turned": TURNED, "diagonal": (1.0, 1.0, 1.0), "above": (0.0, 1.0, 0.0), "axis": (0.0, 0.0, 1.0)}
 
 
 def _camera(volume: DensityVolume, size: int = 24, toward: tuple[float, float, float] = TURNED) -> Camera:
-    reach = 3.0 * max(volume.shape) * volume.voxel
-    position = volume.centre + reach * np.array(toward)
     up = (0.3, 1.0, 0.2) if toward == TURNED else (0.0, 1.0, 0.0)
-    return Camera.look_at(position, volume.centre, world_up=up, extent=0.4 * reach, height=size, width=size)
+    return facing(volume, toward, size, world_up=up, extent=1.2 * max(volume.shape) * volume.voxel)
+
+
+def _march(volume: DensityVolume, camera: Camera, **settings) -> SixWay:
+    return march(volume, camera, March(**settings))
+
+
+def _planes(volume: DensityVolume, camera: Camera, **settings) -> torch.Tensor:
+    return march_planes(volume, camera, March(**settings))
 
 
 def _errors(found: SixWay, exact: SixWay) -> tuple[float, float]:
@@ -47,10 +56,10 @@ def test_small_steps_give_the_fine_march(device: str, view: str):
     """All planes, of hot smoke with a phase function that isn't even, from any side."""
     volume = plume(hot=True, device=device)
     camera = _camera(volume, toward=VIEWS[view])
-    exact = six_way(volume, camera, step=0.25, g=0.4, estimate=False)
+    exact = bake(volume, camera, step=0.25, g=0.4, estimate=False)
     errors = []
     for step, spacing in ((4.0, 4.0), (2.0, 2.0), (0.5, 1.0)):
-        found = coarse_six_way(volume, camera, step=step, spacing=spacing, jitter=0.0, g=0.4).six
+        found = _march(volume, camera, step=step, spacing=spacing, jitter=0.0, g=0.4)
         errors.append(_errors(found, exact))
     # Where the box cuts smoke off, the shadow ends within a gap between nodes.
     assert errors[2][0] < 0.06 and errors[2][1] < 0.004
@@ -64,8 +73,8 @@ def test_boxes(device: str, shape: tuple[int, int, int], view: str):
     rng = np.random.default_rng(5)
     volume = from_array(rng.uniform(0.5, 1.0, shape).astype(np.float32), extinction=0.1, device=device)
     camera = _camera(volume, 32, VIEWS[view])
-    exact = six_way(volume, camera, step=0.25, estimate=False)
-    found = coarse_six_way(volume, camera, step=0.5, spacing=1.0, jitter=0.0).six
+    exact = bake(volume, camera, step=0.25, estimate=False)
+    found = _march(volume, camera, step=0.5, spacing=1.0, jitter=0.0)
     most, mean = _errors(found, exact)
     # Light that grazes a sheet changes within it by more than nodes a voxel apart can follow.
     limits = (0.03, 0.004) if min(shape) > 1 else (0.12, 0.02)
@@ -76,10 +85,10 @@ def test_finer_nodes_and_finer_ways_are_better(device: str):
     """Each of the three steps has an error of its own."""
     volume = _blob((24, 30, 20), device)
     camera = _camera(volume, 32)
-    exact = six_way(volume, camera, step=0.25, estimate=False)
+    exact = bake(volume, camera, step=0.25, estimate=False)
     steps = [{"step": 8.0}, {"step": 1.0, "spacing": 8.0}, {"step": 1.0, "spacing": 8.0, "light_step": 1.0}]
     steps += [{"step": 1.0, "spacing": 2.0}, {"step": 1.0, "spacing": 1.0, "light_step": 0.5}]
-    errors = [_errors(coarse_six_way(volume, camera, jitter=0.0, **one).six, exact)[1] for one in steps]
+    errors = [_errors(_march(volume, camera, jitter=0.0, **one), exact)[1] for one in steps]
     assert errors == sorted(errors, reverse=True) and errors[-1] < 1e-3
 
 
@@ -108,7 +117,7 @@ def test_a_pixel_by_float64(device: str):
     x = volume.extinction * h * density(ray)
     passed = np.cumsum(x) - x
     share = np.exp(-passed) * -np.expm1(-x)
-    found = coarse_six_way(volume, camera, step=0.1, spacing=1.0, light_step=0.1, jitter=0.0, cutoff=0.0).six
+    found = _march(volume, camera, step=0.1, spacing=1.0, light_step=0.1, jitter=0.0, cutoff=0.0)
     for name, light in (("right", right), ("left", -right), ("top", up), ("bottom", -up)):
         tau = volume.extinction * h * density(ray[:, None] + way[:, None] * light).sum(1)
         assert float(found[name]) == pytest.approx(float((share * np.exp(-tau)).sum()), rel=0.01)
@@ -125,14 +134,14 @@ def test_shadows_to_all_sides(device: str):
     open_smoke = from_array(density, device=device)
     camera = _camera(open_smoke, 16, VIEWS["axis"])
     settings = {"step": 1.0, "spacing": 2.0, "jitter": 0.0}
-    plain = coarse_six_way(open_smoke, camera, **settings).planes
+    plain = _planes(open_smoke, camera, **settings)
     walls = {"right": np.s_[20:22], "left": np.s_[2:4], "top": np.s_[:, 20:22], "bottom": np.s_[:, 2:4]}
     centre = np.s_[7:9, 7:9]
     for name, place in walls.items():
         walled = density.copy()
         walled[place] = 5.0
-        planes = coarse_six_way(replace(open_smoke, density=torch.from_numpy(walled).to(device)), camera, **settings)
-        ratio = planes.planes[:6][(slice(None), *centre)].mean((1, 2)) / plain[:6][(slice(None), *centre)].mean((1, 2))
+        planes = _planes(replace(open_smoke, density=torch.from_numpy(walled).to(device)), camera, **settings)
+        ratio = planes[:6][(slice(None), *centre)].mean((1, 2)) / plain[:6][(slice(None), *centre)].mean((1, 2))
         for other, value in zip(DIRECTIONS, ratio.tolist(), strict=True):
             assert value == pytest.approx(0.0 if other == name else 1.0, abs=0.01), (name, other)
 
@@ -142,25 +151,27 @@ def test_sums_are_the_guiding_map(device: str):
     volume = plume(device=device)
     camera = _camera(volume)
     settings = {"jitter": 0.0, "threshold": 0.05, "g": -0.2}
-    found, known = coarse_six_way(volume, camera, step=2.5, **settings), guide(volume, camera, step=2.5, **settings)
-    torch.testing.assert_close(found.six.transparency, known.transparency, rtol=0, atol=1e-6)
-    torch.testing.assert_close(found.depth, known.depth, rtol=0, atol=1e-5)
-    found, known = (f(volume, camera, step=1.0, **settings) for f in (coarse_six_way, guide))
-    light = found.six["front"] + found.six["top"] + found.six["bottom"]
-    assert float((light - known.light).abs().mean()) < 0.005 * float(known.light.max())
+    six, maps = (method(volume, camera, March(2.5, **settings)) for method in (march, guide))
+    torch.testing.assert_close(six.transparency, maps.transparency, rtol=0, atol=1e-6)
+    torch.testing.assert_close(six.depth, maps.depth, rtol=0, atol=1e-5)
+    six, maps = (method(volume, camera, March(1.0, **settings)) for method in (march, guide))
+    light = six["front"] + six["top"] + six["bottom"]
+    assert float((light - maps.light).abs().mean()) < 0.005 * float(maps.light.max())
 
 
 def test_emission_knows_no_nodes(device: str):
     """What smoke gives off itself passes the ray alone; nothing does without a temperature."""
     volume = plume(hot=True, device=device)
     camera = _camera(volume)
-    rough, fine = (coarse_six_way(volume, camera, step=2.0, spacing=spacing, seed=2) for spacing in (12.0, 1.0))
-    assert torch.equal(rough.planes[4:], fine.planes[4:]) and float(rough.six.emission.max()) > 0.05
-    assert not torch.equal(rough.planes[:4], fine.planes[:4])
-    cold = coarse_six_way(replace(volume, temperature=None), camera, step=2.0, seed=2)
-    assert cold.six.emission is None and torch.equal(cold.planes[4:7], fine.planes[4:7])
+    rough, fine = (_planes(volume, camera, step=2.0, spacing=spacing, seed=2) for spacing in (12.0, 1.0))
+    assert torch.equal(rough[4:], fine[4:]) and not torch.equal(rough[:4], fine[:4])
+    emission = march_coarse.PLANES.index("emission")
+    assert float(fine[emission].max()) > 0.05
+    cold = replace(volume, temperature=None)
+    assert _march(cold, camera).emission is None
+    assert torch.equal(_planes(cold, camera, step=2.0, seed=2)[4:emission], fine[4:emission])
     clear = replace(volume, density=torch.zeros_like(volume.density))
-    assert float(coarse_six_way(clear, camera, step=2.0).six.emission.max()) > float(fine.six.emission.max())
+    assert float(_march(clear, camera, step=2.0).emission.max()) > float(fine[emission].max())
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float16])
@@ -168,65 +179,36 @@ def test_empty_bricks_change_nothing(device: str, dtype: torch.dtype, monkeypatc
     volume = plume(1, hot=True, device=device)
     volume = replace(volume, density=volume.density.to(dtype), temperature=volume.temperature.to(dtype))
     camera = _camera(volume)
-    skipped = coarse_six_way(volume, camera, step=1.5).planes
+    skipped = _planes(volume, camera, step=1.5)
     made = []
     occupied = march_coarse.occupied
     monkeypatch.setattr(march_coarse, "occupied", lambda *args: made.append(occupied(*args)) or made[-1])
-    coarse_six_way(volume, camera, step=7.9)
+    _march(volume, camera, step=7.9)
     (bricks,) = made
     assert 0 < bricks.numpy().sum() < bricks.size
     monkeypatch.setattr(march_coarse, "BRICK", 0)
-    torch.testing.assert_close(coarse_six_way(volume, camera, step=1.5).planes, skipped, rtol=0, atol=1e-6)
+    torch.testing.assert_close(_planes(volume, camera, step=1.5), skipped, rtol=0, atol=1e-6)
     assert len(made) == 1
 
 
 def test_front_and_back_follow_from_the_transparency(device: str):
     """(1 - T^2) / 2 and -T ln T, which the fine march finds too."""
     volume = plume(device=device)
-    exact = six_way(volume, _camera(volume), step=0.25, estimate=False)
+    exact = bake(volume, _camera(volume), step=0.25, estimate=False)
     t = exact.transparency.double()
     torch.testing.assert_close(exact["front"].double(), 0.5 * (1 - t * t), rtol=0, atol=2e-4)
     back = torch.where(t > 0, -t * t.clamp(min=1e-30).log(), 0.0)
     torch.testing.assert_close(exact["back"].double(), back, rtol=0, atol=2e-4)
-    found = coarse_six_way(volume, _camera(volume), step=4.0).six
+    found = _march(volume, _camera(volume), step=4.0)
     t = found.transparency.double()
     torch.testing.assert_close(found["front"].double(), 0.5 * (1 - t * t), rtol=0, atol=1e-6)
-
-
-@pytest.mark.parametrize("extinction", [0.0, 1e4])
-def test_none_and_opaque(device: str, extinction: float):
-    """No smoke is black and clear, smoke like stone is finite."""
-    volume = replace(plume(device=device), extinction=extinction)
-    planes = coarse_six_way(volume, _camera(volume), step=3.0).planes
-    assert torch.isfinite(planes).all()
-    if not extinction:
-        assert float(planes[:6].abs().max()) == 0.0 and bool((planes[6] == 1.0).all())
-        assert float(planes[8].max()) == 0.0
-    else:
-        assert float(planes[6].min()) < 1e-4 and float(planes[4].max()) == pytest.approx(0.5, abs=1e-3)
-
-
-def test_one_voxel(device: str):
-    """A grid of one voxel, seen by one pixel."""
-    volume = from_array(np.ones((1, 1, 1), np.float32), extinction=1.0, device=device)
-    camera = Camera.look_at((0.5, 0.5, 5.0), (0.5, 0.5, 0.5), extent=1.0, height=1, width=1)
-    planes = coarse_six_way(volume, camera, step=0.1, jitter=0.0).planes.flatten()
-    # Trilinear falls off to 0 half a voxel beyond: one voxel's worth in all.
-    assert float(planes[6]) == pytest.approx(np.exp(-1.0), rel=0.02)
-
-
-def test_no_voxel_of_smoke(device: str):
-    volume = from_array(np.zeros((9, 4, 17), np.float32), device=device)
-    for step in (0.7, 20.0):
-        planes = coarse_six_way(volume, _camera(volume), step=step).planes
-        assert bool((planes[6] == 1.0).all()) and float(planes[:6].abs().max()) == float(planes[7:].abs().max()) == 0.0
 
 
 def _shifts(seed: int, device: str, size: int = 64, jitter: float = 1.0) -> torch.Tensor:
     """The jitter of a single step through the box, by the depth of its sample."""
     volume = from_array(np.ones((8, 8, 8), np.float32), device=device)
     camera = Camera.look_at((4.0, 4.0, 18.5), (4.0, 4.0, 4.0), extent=6.0, height=size, width=size)
-    found = coarse_six_way(volume, camera, step=9.0, jitter=jitter, seed=seed, threshold=0.0)
+    found = _march(volume, camera, step=9.0, jitter=jitter, seed=seed, threshold=0.0)
     return (found.depth.cpu().double() - 10.0) / 9.0
 
 
@@ -258,10 +240,11 @@ def test_nodes_are_bounded(device: str):
     """However close they are asked for, and however thin the box."""
     volume = _blob((12, 9, 10), device)
     camera = _camera(volume)
-    wanted = coarse_six_way(volume, camera, step=1.0, spacing=0.25).planes
-    assert torch.equal(coarse_six_way(volume, camera, step=1.0, spacing=0.01, light_step=0.25).planes, wanted)
+    wanted = _planes(volume, camera, step=1.0, spacing=0.25)
+    assert torch.equal(_planes(volume, camera, step=1.0, spacing=0.01, light_step=0.25), wanted)
     for shape, spacing in (((400, 400, 400), 1.0), ((10**6, 1, 1), 5.0), ((2, 30000, 30000), 1e-3)):
-        view, _ = _camera(volume, toward=VIEWS["diagonal"]).view(np.zeros(3), 1.0, shape)
+        box = SimpleNamespace(origin=np.zeros(3), voxel=1.0, shape=shape)
+        view = _camera(volume, toward=VIEWS["diagonal"]).view(box)
         lattice, counts = march_coarse._lattice(shape, view, spacing)
         assert min(counts) >= 2 and np.prod(counts, dtype=float) < 1.01 * 2**28
         # They cover the eight corners.
@@ -270,17 +253,24 @@ def test_nodes_are_bounded(device: str):
             ends = lattice.low[axis], lattice.low[axis] + (counts[axis] - 1) * lattice.gap[axis]
             reach = corners @ np.array(along)
             assert ends == pytest.approx((reach.min(), reach.max()), rel=1e-5, abs=1e-2)
-    far = coarse_six_way(volume, camera, step=1.0, spacing=1e30).planes
+    far = _planes(volume, camera, step=1.0, spacing=1e30)
     assert torch.isfinite(far).all()
 
 
-def test_wrong_settings(device: str):
-    volume = from_array(np.ones((4, 4, 4), np.float32), device=device)
-    camera = _camera(volume, 4)
-    wrong = [(name, value) for name in ("step", "spacing", "light_step") for value in (0.0, -1.0, np.nan, np.inf)]
-    for name, value in [*wrong, ("jitter", 1.5), ("g", 1.0)]:
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [(name, (0.0, -1.0, np.nan, np.inf)) for name in ("step", "spacing", "light_step")]
+    + [(name, (-1e-9, np.nan)) for name in ("threshold", "cutoff")]
+    + [("jitter", (-0.5, 1.5, np.nan)), ("g", (-1.0, 1.0, np.nan))],
+)
+def test_settings_out_of_their_range(name: str, values: tuple[float, ...]):
+    for value in values:
         with pytest.raises(ValueError, match=f"^{name}: expected [^\n]*, got {value}$"):
-            coarse_six_way(volume, camera, **{name: value})
+            March(**{name: value})
+
+
+def test_an_eye_is_refused(device: str):
+    volume = from_array(np.ones((4, 4, 4), np.float32), device=device)
     eye = Camera.look_at((2.0, 2.0, 30.0), (2.0, 2.0, 2.0), extent=0.4, height=4, width=4, perspective=True)
     with pytest.raises(ValueError, match="orthographic"):
-        coarse_six_way(volume, eye)
+        _march(volume, eye)

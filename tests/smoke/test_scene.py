@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,26 +18,25 @@ from wlm.errors import WlmError
 from wlm.fluid.faces import FACES
 from wlm.fluid.volume import from_array, load_volume, save_volume
 from wlm.formats.exr_planes import read_planes, write_planes
-from wlm.smoke.baking import six_way
+from wlm.smoke.baking import bake
 from wlm.smoke.data import (
     CHECKPOINT,
-    check_folder,
-    clear_folder,
-    open_footage,
+    NumberedFiles,
+    load_frames,
     open_frames,
-    read_frames,
     read_six_way,
+    spread,
     write_guide,
     write_six_way,
 )
-from wlm.smoke.guide import guide
+from wlm.smoke.guiding import guide
 from wlm.smoke.scene import (
     CameraSettings,
     LightSettings,
-    Obstacle,
+    ObstacleSettings,
     Scene,
     Smoke,
-    Source,
+    SourceSettings,
     load_scene,
     make_camera,
     obstacle_mesh,
@@ -84,6 +84,8 @@ def test_scaling_keeps_one_cell(tmp_path):
     assert _scene(tmp_path, grid={"cells": [1, 1, 1], "cell": 1.0}).scaled(0.01).grid.cells == (1, 1, 1)
     with pytest.raises(ValueError, match="factor"):
         scene.scaled(0)
+    with pytest.raises(WlmError, match="plume: grid.cells.0: expected less than or equal to 4096, got 8000"):
+        scene.scaled(1000)
 
 
 @pytest.mark.parametrize(
@@ -130,18 +132,18 @@ def test_scenes_that_are_not_there(tmp_path):
 
 
 def test_an_obstacle_on_its_path():
-    there = Obstacle(radius=1.0, path=((1.0, 0, 0, 0), (3.0, 4, 0, 0), (4.0, 4, 2, 0)))
+    there = ObstacleSettings(radius=1.0, path=((1.0, 0, 0, 0), (3.0, 4, 0, 0), (4.0, 4, 2, 0)))
     for time, centre in ((0.0, (0, 0, 0)), (2.0, (2, 0, 0)), (3.5, (4, 1, 0)), (9.0, (4, 2, 0))):
         np.testing.assert_allclose(there.centre(time), centre)
-    assert there.fastest == 2.0 and Obstacle(radius=1.0, path=((0.0, 1, 2, 3),)).fastest == 0.0
+    assert there.fastest == 2.0 and ObstacleSettings(radius=1.0, path=((0.0, 1, 2, 3),)).fastest == 0.0
     with pytest.raises(ValidationError):
-        Obstacle(radius=(1.0, 1.0, 1.0), path=((0.0, 0, 0, 0),))
+        ObstacleSettings(radius=(1.0, 1.0, 1.0), path=((0.0, 0, 0, 0),))
 
 
 def test_the_surfaces_of_obstacles():
-    ball = Obstacle(radius=0.5, path=((0.0, 1, 2, 3),))
-    box = Obstacle(shape="box", radius=(1.0, 2.0, 3.0), path=((0.0, 0, 0, 0),))
-    drum = Obstacle(shape="cylinder", radius=(0.5, 2.0, 1.0), path=((0.0, 1, 2, 3),))
+    ball = ObstacleSettings(radius=0.5, path=((0.0, 1, 2, 3),))
+    box = ObstacleSettings(shape="box", radius=(1.0, 2.0, 3.0), path=((0.0, 0, 0, 0),))
+    drum = ObstacleSettings(shape="cylinder", radius=(0.5, 2.0, 1.0), path=((0.0, 1, 2, 3),))
     for body, volume in ((ball, 4 / 3 * math.pi * 0.125), (box, 48.0), (drum, 2 * math.pi)):
         points, triangles, owner = obstacle_mesh([body], 0.0)
         assert points.dtype == np.float32 and triangles.dtype == np.int32 and not owner.any()
@@ -158,9 +160,9 @@ def test_the_surfaces_of_obstacles():
 
 
 def test_a_source_works_for_its_time():
-    source = Source(centre=(0, 0, 0), radius=1, start=1, stop=2)
+    source = SourceSettings(centre=(0, 0, 0), radius=1, start=1, stop=2)
     assert [source.active(time) for time in (0.9, 1.0, 1.9, 2.0)] == [False, True, True, False]
-    assert Source(centre=(0, 0, 0), radius=1).active(1e9)
+    assert SourceSettings(centre=(0, 0, 0), radius=1).active(1e9)
 
 
 @pytest.mark.parametrize("toward", [(0, 0, 1), (0, 1, 0), (-1, 0, 0), (1, 2, -3)])
@@ -205,14 +207,15 @@ def test_lights_and_glow():
 def test_a_folder_of_frames(tmp_path):
     frames = write_frames(tmp_path / "a", obstacles=[SPHERE])
     assert frames.numbers == (1, 2, 3) and frames.scene.obstacles[0].radius == 0.15
-    footage = open_footage(tmp_path / "a")
+    footage = load_frames(tmp_path / "a")
     assert (footage.numbers, footage.time(2)) == ((1, 2, 3), pytest.approx(0.2))
-    for number in footage.numbers:
-        volume, expected = footage.load(number), plume(number)
+    assert footage.camera == frames.scene.camera
+    for number, volume in footage.volumes():
+        expected = plume(number)
         assert torch.equal(volume.density, expected.density) and volume.warnings == ()
         assert (volume.voxel, volume.origin, volume.extinction) == (0.05, (-0.5, 0.0, -0.5), 8.0)
-    assert open_footage(tmp_path / "a", extinction=3.0).load(1).extinction == 3.0
-    single = open_footage(tmp_path / "a" / "frame_0002.npz")
+    assert load_frames(tmp_path / "a", extinction=3.0).load(1).extinction == 3.0
+    single = load_frames(tmp_path / "a" / "frame_0002.npz")
     assert (single.scene, single.numbers, single.load(1).extinction, single.time(1)) == (None, (1,), 1.0, 0.0)
 
 
@@ -224,13 +227,13 @@ def test_a_folder_is_begun_anew_or_resumed(tmp_path):
     # How it is looked at, and for how long, is no other simulation; how the air moves is.
     looks = scene.model_copy(update={"frames": 9, "camera": CameraSettings(resolution=7), "name": "b"})
     assert open_frames(folder, looks, resume=True).numbers == (1, 2, 3)
-    assert read_frames(folder).scene.frames == 9
+    assert load_frames(folder).scene.frames == 9
     other = Scene.model_validate(SCENE | {"air": {"viscosity": 1.0}})
     with pytest.raises(WlmError, match="frames of another scene, whose air differs"):
         open_frames(folder, other, resume=True)
     assert open_frames(folder, other).numbers == () and sorted(p.name for p in folder.iterdir()) == ["scene.json"]
     with pytest.raises(WlmError, match="expected frames such as frame_0001.npz, found none"):
-        open_footage(folder)
+        load_frames(folder)
     assert open_frames(tmp_path / "new", scene, resume=True).numbers == ()
 
 
@@ -240,34 +243,52 @@ def test_folders_that_are_none(tmp_path):
     (tmp_path / "a" / "notes.txt").write_text("x")
     with pytest.raises(WlmError, match="found other files"):
         open_frames(tmp_path / "a", scene)
-    with pytest.raises(WlmError, match="cannot write there"):
+    with pytest.raises(WlmError, match="cannot write: the folder .* does not exist"):
         open_frames(tmp_path / "none" / "b", scene)
     with pytest.raises(WlmError, match=r"expected a folder that simulate wrote, found no scene.json"):
-        open_footage(tmp_path / "a")
+        load_frames(tmp_path / "a")
     for content, said in (
-        ("{", "not valid JSON"),
+        ("{", "found other content"),
         ("[]", "found other content"),
         (json.dumps({"format": "wlm-smoke-frames", "version": 9}), "version: expected 1, found 9"),
-        (json.dumps({"format": "wlm-smoke-frames", "version": 1, "scene": {}}), "scene.name: Field required"),
+        (
+            json.dumps({"format": "wlm-smoke-frames", "version": 1, "scene": {}}),
+            "scene.name: expected a value, found none",
+        ),
     ):
         folder = tmp_path / "b"
         folder.mkdir(exist_ok=True)
         (folder / "scene.json").write_text(content)
         with pytest.raises(WlmError, match=said):
-            open_footage(folder)
-    with pytest.raises(WlmError, match="expected an empty folder or one of an earlier run, found notes.txt"):
-        check_folder(tmp_path / "a", "six", ".exr")
-    assert check_folder(tmp_path / "c", "six", ".exr") == tmp_path / "c"
-    for name in ("six_0001.exr", "six_0002.exr", "sheet.png"):
-        (tmp_path / "c" / name).write_text("x")
-    check_folder(tmp_path / "c", "six", ".exr", "sheet.png")
-    assert len(list((tmp_path / "c").iterdir())) == 3, "to look isn't to remove"
-    clear_folder(tmp_path / "c", "six", ".exr", "sheet.png")
-    assert list((tmp_path / "c").iterdir()) == []
-    with pytest.raises(WlmError, match="cannot write there"):
-        clear_folder(tmp_path / "none", "six", ".exr")
+            load_frames(folder)
     with pytest.raises(WlmError, match="ends in .npz"):
         save_volume(tmp_path / "a.vdb", plume())
+
+
+def test_numbered_files_replace_those_of_an_earlier_run(tmp_path):
+    folder = tmp_path / "a"
+    assert NumberedFiles(folder, "six", ".exr").file(12) == folder / "six_0012.exr"
+    for name in ("six_0001.exr", "six_0002.exr", "sheet.png"):
+        (folder / name).write_text("x")
+    files = NumberedFiles(folder, "six", ".exr", "sheet.png")
+    assert len(list(folder.iterdir())) == 3, "not before the first result"
+    files.file(1).write_text("y")
+    files.file(2)
+    assert [path.read_text() for path in folder.iterdir()] == ["y"]
+    with pytest.raises(WlmError, match="expected an empty folder or one of an earlier run, found six_0001.exr"):
+        NumberedFiles(folder, "guide", ".exr")
+    with pytest.raises(WlmError, match="cannot write there"):
+        NumberedFiles(tmp_path / "none" / "b", "six", ".exr")
+
+
+def test_frames_evenly_spread():
+    assert [spread((2, 3, 5, 8, 13), count) for count in (None, 9, 1, 2, 3)] == [
+        (2, 3, 5, 8, 13),
+        (2, 3, 5, 8, 13),
+        (2,),
+        (2, 13),
+        (2, 5, 13),
+    ]
 
 
 @pytest.mark.parametrize("hot", [False, True])
@@ -284,13 +305,13 @@ def test_a_volume_comes_back(tmp_path, hot, device):
 def test_lightmaps_in_a_file(tmp_path, hot, device):
     volume = plume(hot=hot, device=device)
     camera = make_camera(CameraSettings(resolution=16, aspect=0.75), volume.origin, (1, 1.2, 1))
-    six = six_way(volume, camera, step=1.0, estimate=False)
-    write_six_way(tmp_path / "a.exr", six, camera)
+    six = bake(volume, camera, step=1.0, estimate=False)
+    write_six_way(tmp_path / "a.exr", six)
     planes, _ = read_planes(tmp_path / "a.exr")
     names = ["right", "left", "top", "bottom", "front", "back", "transparency", *(["emission"] if hot else [])]
     assert sorted(planes) == sorted(names)
-    found, seen = read_six_way(tmp_path / "a.exr", device)
-    assert seen == camera and (found.emission is not None) == hot
+    found = read_six_way(tmp_path / "a.exr", device)
+    assert found.camera == camera and (found.emission is not None) == hot
     torch.testing.assert_close(found.lightmaps, six.lightmaps.half().float(), rtol=0, atol=0)
     torch.testing.assert_close(found.transparency, six.transparency.half().float(), rtol=0, atol=0)
 
@@ -312,9 +333,11 @@ def test_a_guiding_map_in_a_file(tmp_path):
 def test_files_that_are_no_lightmaps(tmp_path):
     volume = plume()
     camera = make_camera(CameraSettings(resolution=8), volume.origin, (1, 1.2, 1))
-    six = six_way(volume, camera, step=2.0, estimate=False)
+    six = bake(volume, camera, step=2.0, estimate=False)
+    with pytest.raises(ValueError, match="camera: expected"):
+        write_six_way(tmp_path / "a.exr", replace(six, camera=None))
     path = tmp_path / "a.exr"
-    write_six_way(path, six, camera)
+    write_six_way(path, six)
     planes, note = read_planes(path)
 
     def refused(planes, note, said):
@@ -362,15 +385,15 @@ def test_empty_smoke_and_one_voxel(tmp_path):
     for density in (np.zeros((4, 4, 4)), np.ones((1, 1, 1))):
         volume = from_array(density)
         camera = make_camera(CameraSettings(resolution=6), volume.origin, density.shape)
-        six = six_way(volume, camera, estimate=False)
-        write_six_way(tmp_path / "a.exr", six, camera)
-        found, _ = read_six_way(tmp_path / "a.exr")
+        six = bake(volume, camera, estimate=False)
+        write_six_way(tmp_path / "a.exr", six)
+        found = read_six_way(tmp_path / "a.exr")
         assert bool((found.transparency < 1).any()) == bool(density.any())
 
 
 def test_the_scene_in_the_document(tmp_path):
     """The page's scene "in full" is one, and names every setting that there is."""
-    page = (Path(__file__).resolve().parents[2] / "docs" / "smoke.md").read_text(encoding="utf-8")
+    page = (Path(__file__).resolve().parents[2] / "docs" / "fluid.md").read_text(encoding="utf-8")
     block = page[page.index("    name: jet\n") : page.index("A row of a path")]
     path = tmp_path / "scene.yaml"
     path.write_text("\n".join(line[4:] for line in block.splitlines()))
@@ -378,4 +401,4 @@ def test_the_scene_in_the_document(tmp_path):
     given = yaml.safe_load(path.read_text())
     for name, part in (("grid", scene.grid), ("air", scene.air), ("smoke", scene.smoke), ("camera", scene.camera)):
         assert set(type(part).model_fields) - {"perspective"} == set(given[name])
-    assert set(Scene.model_fields) == set(given) and set(Source.model_fields) == set(given["sources"][0])
+    assert set(Scene.model_fields) == set(given) and set(SourceSettings.model_fields) == set(given["sources"][0])

@@ -1,26 +1,25 @@
 """Shading: weights, many lights, glow, and the shadows of obstacles against rays cast."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
-from wlm.smoke.baking import SixWay
 from wlm.smoke.camera import VECTORS, Camera
-from wlm.smoke.shading import Light, Ramp, composite, obstacle_visibility, shade
+from wlm.smoke.lightmaps import SixWay
+from wlm.smoke.shading import Light, Ramp, obstacle_visibility
 
 FULL = (4 * math.pi,) * 3
 
 
-def _camera(size: int = 8, way: tuple = (0.4, 0.7, 1.0)) -> Camera:
-    return Camera.look_at(10 * np.array(way), (0, 0, 0), extent=4.0, height=size, width=size)
-
-
-def _six(device: str, size: int = 8, emission: bool = False) -> SixWay:
+def _six(device: str, emission: bool = False) -> SixWay:
+    """Seen askew."""
     random = np.random.default_rng(0)
-    maps = torch.tensor(random.uniform(0, 1, (8, size, size)), dtype=torch.float32, device=device)
-    return SixWay(maps[:6], maps[6], 2 * maps[7] if emission else None)
+    maps = torch.tensor(random.uniform(0, 1, (8, 8, 8)), dtype=torch.float32, device=device)
+    camera = Camera.look_at(10 * np.array((0.4, 0.7, 1.0)), (0, 0, 0), extent=4.0, height=8, width=8)
+    return SixWay(maps[:6], maps[6], 2 * maps[7] if emission else None, camera)
 
 
 def _box(low: tuple, high: tuple, device: str) -> tuple[torch.Tensor, torch.Tensor]:
@@ -32,11 +31,11 @@ def _box(low: tuple, high: tuple, device: str) -> tuple[torch.Tensor, torch.Tens
 
 
 def test_one_light_along_each_axis(device: str):
-    """Seen askew, a light along an axis of the camera gives that map, in its colour."""
-    six, camera = _six(device), _camera()
+    """A light along an axis of the camera gives that map, in its colour."""
+    six = _six(device)
     for index, way in enumerate(VECTORS):
-        toward = tuple(5.0 * camera.axes.T @ way)
-        got = shade(six, camera, [Light(toward, (4 * math.pi, 2 * math.pi, 0.0))])
+        toward = tuple(5.0 * six.camera.axes.T @ way)
+        got = six.shade([Light(toward, (4 * math.pi, 2 * math.pi, 0.0))])
         want = six.lightmaps[index][..., None] * torch.tensor([1.0, 0.5, 0.0], device=device)
         np.testing.assert_allclose(got.cpu(), want.cpu(), atol=1e-6)
 
@@ -47,30 +46,30 @@ def test_one_light_along_each_axis(device: str):
 )
 def test_rules(device: str, rule: str, share: tuple):
     """A light to the left and the back, by each rule; eq. 5 is "absolute"."""
-    six, camera = _six(device), _camera()
-    toward = tuple(camera.axes.T @ np.array([-3.0, 0.0, -4.0]))
-    got = shade(six, camera, [Light(toward, FULL)], rule=rule)[..., 0]
+    six = _six(device)
+    toward = tuple(six.camera.axes.T @ np.array([-3.0, 0.0, -4.0]))
+    got = six.shade([Light(toward, FULL)], rule=rule)[..., 0]
     np.testing.assert_allclose(got.cpu(), (share[0] * six["left"] + share[1] * six["back"]).cpu(), atol=1e-6)
 
 
 def test_lights_add_up(device: str):
     """Any number, none too; each with its own share of visible light."""
-    six, camera = _six(device), _camera()
+    six = _six(device)
     lights = [Light((1.0, 2.0, 0.5), (1, 2, 3)), Light((-1.0, 0.1, 0.5), (3, 2, 1)), Light((0.0, 0.0, -1.0))]
-    both = sum(shade(six, camera, [light]) for light in lights)
-    np.testing.assert_allclose(shade(six, camera, lights).cpu(), both.cpu(), rtol=1e-5)
-    assert not shade(six, camera, []).any()
+    both = sum(six.shade([light]) for light in lights)
+    np.testing.assert_allclose(six.shade(lights).cpu(), both.cpu(), rtol=1e-5)
+    assert not six.shade([]).any()
     half = Light(lights[0].toward, lights[0].irradiance, torch.full((8, 8), 0.5, device=device))
-    want = 0.5 * shade(six, camera, lights[:1])
-    np.testing.assert_allclose(shade(six, camera, [half]).cpu(), want.cpu(), rtol=1e-5)
+    want = 0.5 * six.shade(lights[:1])
+    np.testing.assert_allclose(six.shade([half]).cpu(), want.cpu(), rtol=1e-5)
 
 
 def test_glow(device: str):
     """Emission is grey without a ramp; with one it has the stops' colours, and those at the ends beyond them."""
-    six, camera = _six(device, emission=True), _camera()
-    np.testing.assert_allclose(shade(six, camera, []).cpu(), six.emission[..., None].expand(8, 8, 3).cpu())
+    six = _six(device, emission=True)
+    np.testing.assert_allclose(six.shade([]).cpu(), six.emission[..., None].expand(8, 8, 3).cpu())
     ramp = Ramp((0.5, 1.0, 1.5), ((0, 0, 0), (1, 0.5, 0), (4, 4, 2)))
-    got = shade(six, camera, [], ramp=ramp).cpu().numpy()
+    got = six.shade([], ramp=ramp).cpu().numpy()
     for c in range(3):
         want = np.interp(six.emission.cpu(), ramp.stops, [colour[c] for colour in ramp.colours])
         np.testing.assert_allclose(got[..., c], want, atol=1e-5)
@@ -79,14 +78,14 @@ def test_glow(device: str):
             Ramp(*wrong)
 
 
-def test_composite(device: str):
-    """What is behind shows through by the transparency: eq. 4."""
+def test_background(device: str):
+    """It shows through by the transparency (eq. 4): one colour, or a picture."""
     six = _six(device)
-    light = torch.full((8, 8, 3), 0.25, device=device)
-    got = composite(light, six.transparency, (1.0, 2.0, 3.0))
-    want = 0.25 + six.transparency[..., None] * torch.tensor([1.0, 2.0, 3.0], device=device)
-    np.testing.assert_allclose(got.cpu(), want.cpu(), rtol=1e-6)
-    np.testing.assert_array_equal(composite(light, six.transparency, torch.zeros(8, 8, 3)).cpu(), light.cpu())
+    light = six.shade([Light((0.0, 0.0, 1.0))])
+    for background in ((1.0, 2.0, 3.0), torch.rand((8, 8, 3), device=device)):
+        got = six.shade([Light((0.0, 0.0, 1.0))], background=background)
+        want = light + six.transparency[..., None] * torch.as_tensor(background, device=device)
+        np.testing.assert_allclose(got.cpu(), want.cpu(), rtol=1e-6)
 
 
 @pytest.mark.parametrize("perspective", [False, True])
@@ -137,13 +136,22 @@ def test_shadow_falls_behind_only(device: str):
 
 
 def test_wrong_settings():
-    six, camera = _six("cpu"), _camera()
+    six = _six("cpu")
     with pytest.raises(ValueError, match="irradiance"):
-        shade(six, camera, [Light((0, 0, 1), (-1, 0, 0))])
+        six.shade([Light((0, 0, 1), (-1, 0, 0))])
     with pytest.raises(ValueError, match="directions"):
-        shade(six, camera, [Light((0, 0, 0))])
+        six.shade([Light((0, 0, 0))])
     with pytest.raises(ValueError, match="visibility"):
-        shade(six, camera, [Light((0, 0, 1), FULL, torch.ones(2, 2))])
+        six.shade([Light((0, 0, 1), FULL, torch.ones(2, 2))])
+    with pytest.raises(ValueError, match="camera: expected that of the lightmaps"):
+        replace(six, camera=None).shade([Light((0, 0, 1))])
+    with pytest.raises(ValueError, match="transparency: expected"):
+        replace(six, transparency=None).shade([], background=(0, 0, 0))
+    with pytest.raises(ValueError, match="camera: expected .8, 8. pixels"):
+        replace(six, camera=six.camera.finer(2))
+    with pytest.raises(ValueError, match="depth: expected"):
+        replace(six, depth=torch.ones(2, 2))
+    camera = six.camera
     box = _box((0, 0, 0), (1, 1, 1), "cpu")
     with pytest.raises(ValueError, match="depth"):
         obstacle_visibility(torch.ones(2, 2), camera, (0, 0, 1), *box)

@@ -5,14 +5,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from builders.smoke_plumes import unit_grid
 from PIL import Image
 
 from wlm.errors import WlmError
 from wlm.fluid.volume import from_array
 from wlm.formats.exr import read_exr, write_exr
-from wlm.smoke.baking import SixWay, six_way
+from wlm.smoke.baking import bake
 from wlm.smoke.camera import DIRECTIONS, LAYOUTS, Camera, axis_faults
-from wlm.smoke.exporter import pack, read_flipbook, unpack, write_flipbook
+from wlm.smoke.exporter import brightest_gain, cells, channels, pack, read_flipbook, unpack, write_flipbook
+from wlm.smoke.lightmaps import SixWay
 
 KINDS = {".exr": 6e-4, ".png": 0.51 / 255, ".tga": 0.51 / 255}
 
@@ -66,6 +68,23 @@ def test_cold_smoke_has_no_emission(tmp_path: Path):
     assert unpack(first, second, rows=1, columns=2)[1].transparency is None
 
 
+def test_defaults():
+    """Cells as near to a square as can be, and the gain that just doesn't clip."""
+    assert [cells(*words) for words in ((1,), (3,), (5,), (64,), (5, 2), (2, 9))] == [
+        (1, 1),
+        (2, 2),
+        (2, 3),
+        (8, 8),
+        (3, 2),
+        (1, 2),
+    ]
+    frames = _frames(2)
+    largest = max(float(frame.emission.max()) for frame in frames)
+    dim = [SixWay(0.1 * frame.lightmaps, None, frame.emission) for frame in frames]
+    assert brightest_gain(dim) == 1 / largest and brightest_gain([SixWay(torch.zeros(6, 2, 2), None)]) == 1
+    assert channels(dim, "unity") == (("right", "top", "back"), ("left", "bottom", "front", "emission"))
+
+
 def test_gain_and_clipping(tmp_path: Path):
     """8 bits end at 1: what is brighter is counted; a gain is undone by the reader."""
     frames = _frames(1, emission=False)
@@ -84,12 +103,11 @@ def test_gain_and_clipping(tmp_path: Path):
 @pytest.mark.parametrize("suffix", KINDS)
 def test_axes_survive(tmp_path: Path, suffix: str):
     """Lightmaps of ours pass the check of the axes after a trip through files, and fail it under another layout."""
-    axis = (np.arange(24) + 0.5) / 12 - 1
-    x, y, z = np.meshgrid(axis, axis, axis, indexing="ij")
+    x, y, z = unit_grid(24)
     ball = np.clip(5 - 7 * np.sqrt(x**2 + y**2 + (z - 0.05) ** 2), 0, 1).astype(np.float32)
     volume = from_array(ball, extinction=0.6)
     camera = Camera.look_at((12, 12, 60), (12, 12, 0), extent=24.0, height=24, width=24)
-    frames = [six_way(volume, camera, step=1.0, estimate=False)] * 2
+    frames = [bake(volume, camera, step=1.0, estimate=False)] * 2
     paths = _paths(tmp_path, suffix)
     write_flipbook(paths, frames, "unity", rows=1, columns=2)
     for layout in LAYOUTS:

@@ -1,4 +1,4 @@
-"""Pictures of a mesh under its lightmap: what is in which cell, on one exposure."""
+"""Pictures of a mesh under its lightmap: the cells of a sheet, on one exposure."""
 
 import numpy as np
 import pytest
@@ -32,8 +32,8 @@ def test_a_decoder_gets_the_corners_weights():
 
     def place(uv, number, weight):
         corner = torch.from_numpy(mesh.uv[mesh.triangle].astype(np.float32))[number.long()]
-        found = (corner * weight[:, :, None]).sum(1)
-        np.testing.assert_allclose(found.numpy(), uv.numpy(), atol=1e-6)
+        interpolated = (corner * weight[:, :, None]).sum(1)
+        np.testing.assert_allclose(interpolated.numpy(), uv.numpy(), atol=1e-6)
         return torch.ones(len(uv), 3)
 
     pictures, hit = draw(mesh, {"a": place}, FRONT, 48)
@@ -42,9 +42,9 @@ def test_a_decoder_gets_the_corners_weights():
 
 def test_exposure():
     light = np.array([[[0.0, 0.5, 1.0], [2.0, -1.0, 0.001]]])
-    shown = encode(light, np.array([[True, True]]), 1.0)
+    encoded = encode(light, np.array([[True, True]]), 1.0)
     # sRGB of a half is 188, of a thousandth 12.92 / 1000.
-    np.testing.assert_array_equal(shown, [[[0, 188, 255], [255, 0, 3]]])
+    np.testing.assert_array_equal(encoded, [[[0, 188, 255], [255, 0, 3]]])
     assert (encode(light, np.zeros((1, 2), bool), 1.0) == 128).all()
     assert white_of(np.zeros((5, 3))) == 1.0 == white_of(np.zeros((0, 3)))
     dark = np.zeros((10000, 3))

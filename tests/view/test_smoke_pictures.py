@@ -1,6 +1,7 @@
 """Pictures of smoke: what is drawn where, before and behind the smoke, and in which cell of a sheet."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,9 +10,10 @@ from builders.smoke_plumes import plume
 from PIL import Image
 
 from wlm.errors import WlmError
-from wlm.smoke.baking import SixWay, six_way
-from wlm.smoke.guide import guide
-from wlm.smoke.scene import CameraSettings, LightSettings, Obstacle, make_camera
+from wlm.smoke.baking import bake
+from wlm.smoke.guiding import guide
+from wlm.smoke.lightmaps import SixWay
+from wlm.smoke.scene import CameraSettings, LightSettings, ObstacleSettings, make_camera
 from wlm.smoke.shading import Light, Ramp
 from wlm.view.smoke import (
     contact_sheet,
@@ -22,6 +24,7 @@ from wlm.view.smoke import (
     to_bytes,
     write_sequence,
 )
+from wlm_kernels.smoke.settings import March
 
 FRONT = LightSettings(toward=(0, 0, 1), irradiance=(math.pi,) * 3).light()
 
@@ -32,13 +35,14 @@ def _camera(size=32, **settings):
 
 
 def _ball(x=0.0, y=0.0, z=0.0, radius=0.2, **more):
-    return Obstacle(radius=radius, path=((0.0, x, y, z),), colour=(1.0, 0.5, 0.0), **more)
+    return ObstacleSettings(radius=radius, path=((0.0, x, y, z),), colour=(1.0, 0.5, 0.0), **more)
 
 
 def _flat(camera, transparency, light=0.0, device="cpu"):
     """The same smoke at every pixel."""
     size = (camera.height, camera.width)
-    return SixWay(torch.full((6, *size), light, device=device), torch.full(size, transparency, device=device))
+    clear = torch.full(size, transparency, device=device)
+    return SixWay(torch.full((6, *size), light, device=device), clear, camera=camera)
 
 
 def test_bytes():
@@ -80,7 +84,7 @@ def test_an_obstacle_is_lit_from_where_the_light_is(device):
     assert row[-1] > row[0] and row[0] == pytest.approx(0.2)
     # The nearer one of two hides the other, whatever their order.
     for order in (1, -1):
-        both = [_ball(z=0.25, radius=0.1), Obstacle(radius=0.2, path=((0.0, 0, 0, 0),), colour=(0.0, 0.0, 1.0))]
+        both = [_ball(z=0.25, radius=0.1), ObstacleSettings(radius=0.2, path=((0.0, 0, 0, 0),), colour=(0.0, 0.0, 1.0))]
         shown, _ = draw_obstacles(both[::order], 0.0, camera, [FRONT], device)
         assert shown[16, 16, 0] > 0.5 and shown[16, 16, 2] == 0 and shown[16, 11, 2] > 0.3
     # What lies behind the camera isn't seen.
@@ -100,9 +104,9 @@ def test_an_obstacle_before_and_behind_smoke(device):
     shown = {"background": background, "obstacles": [_ball()]}
     # The light is from behind the camera, whose way to the smoke's surface is free where that is before the ball.
     near, far = torch.full_like(six.transparency, 0.01), torch.full_like(six.transparency, 99.0)
-    before = picture(six, camera, [FRONT], depth=far, **shown)
+    before = picture(replace(six, depth=far), [FRONT], **shown)
     torch.testing.assert_close(before[seen], ball[seen])
-    behind = picture(six, camera, [FRONT], depth=near, **shown)
+    behind = picture(replace(six, depth=near), [FRONT], **shown)
     lit = 0.5 * math.pi / (4 * math.pi)
     torch.testing.assert_close(behind[seen], lit + 0.25 * ball[seen])
     empty = lit + 0.25 * torch.tensor(background, device=device)
@@ -111,34 +115,34 @@ def test_an_obstacle_before_and_behind_smoke(device):
     side = Light((1.0, 0.0, 0.0), (4 * math.pi,) * 3)
     surface = float(np.dot(np.subtract(camera.position, 0), camera.toward))
     level = torch.full_like(six.transparency, surface)
-    shadow = picture(six, camera, [side], depth=level, background=(0, 0, 0), obstacles=[_ball(0.3, 0, 0, 0.1)])
+    shadow = picture(replace(six, depth=level), [side], obstacles=[_ball(0.3, 0, 0, 0.1)])
     assert shadow[16, 5, 0] < 0.05 and shadow[5, 5, 0] == pytest.approx(0.5)
 
 
 def test_without_obstacles_it_is_smoke_over_a_colour(device):
     camera = _camera(8)
     six = _flat(camera, 0.5, 0.25, device)
-    six = SixWay(six.lightmaps, six.transparency, torch.full_like(six.transparency, 1.0))
+    six = replace(six, emission=torch.ones_like(six.transparency))
     ramp = Ramp((0.0, 2.0), ((0, 0, 0), (2.0, 1.0, 0.0)))
     light = Light((0.0, 0.0, 3.0), (4 * math.pi, 0.0, 0.0))
-    found = picture(six, camera, [light], background=(0.2, 0.4, 0.6), ramp=ramp)
+    found = picture(six, [light], background=(0.2, 0.4, 0.6), ramp=ramp)
     torch.testing.assert_close(found[3, 4].cpu(), torch.tensor([0.25 + 1.0 + 0.1, 0.5 + 0.2, 0.3]))
     with pytest.raises(ValueError, match="transparency"):
-        picture(SixWay(six.lightmaps, None), camera, [light])
+        picture(replace(six, transparency=None), [light])
     with pytest.raises(ValueError, match="depth"):
-        picture(six, camera, [light], obstacles=[_ball()])
+        picture(six, [light], obstacles=[_ball()])
 
 
 def test_pictures_of_the_maps(device):
     volume = plume(hot=True, device=device)
     camera = make_camera(CameraSettings(resolution=24), volume.origin, (1, 1.2, 1))
-    six = six_way(volume, camera, step=1.0, estimate=False)
+    six = bake(volume, camera, step=1.0, estimate=False)
     shown = six_pictures(six)
     assert [*shown] == ["right", "left", "top", "bottom", "front", "back", "alpha", "emission"]
     assert (shown["right"][:, 12:].mean() > shown["left"][:, 12:].mean()) and shown["alpha"].max() > 200
     np.testing.assert_array_equal(shown["top"], to_bytes(six["top"]))
     assert "emission" not in six_pictures(SixWay(six.lightmaps, None))
-    found = guide(volume, camera, step=2.0, jitter=0.0)
+    found = guide(volume, camera, March(2.0, jitter=0.0))
     planes = guide_pictures(found)
     smoke = found.depth.cpu().numpy() > 0
     assert (planes["depth"][~smoke] == 0).all() and planes["depth"][smoke].min() >= 51

@@ -65,9 +65,9 @@ def halves(picture):
     """Mean brightness of the upper, lower, left and right half of what is seen."""
     where = inside(picture)
     rows, columns = np.nonzero(where.any(1))[0], np.nonzero(where.any(0))[0]
-    seen = picture[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1].mean(2)
-    h, w = seen.shape
-    return seen[: h // 2].mean(), seen[-(h // 2) :].mean(), seen[:, : w // 2].mean(), seen[:, -(w // 2) :].mean()
+    crop = picture[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1].mean(2)
+    h, w = crop.shape
+    return crop[: h // 2].mean(), crop[-(h // 2) :].mean(), crop[:, : w // 2].mean(), crop[:, -(w // 2) :].mean()
 
 
 @pytest.mark.parametrize(("up", "axis", "right", "left"), [("y", Y, X, Z), ("z", Z, Y, -Y)])
@@ -111,19 +111,19 @@ def test_the_pictures_share_one_exposure(opengl, tmp_path):
     render_probes(tmp_path / "a.png", [[0, 0, 0]], original, decoded, error_gain=0.5, width=900)
     middles = [picture[picture.shape[0] // 2, picture.shape[1] // 2] for picture in panels(tmp_path / "a.png")]
     # sRGB of 1, 1/2 and 1/4.
-    for found, expected in zip(middles, (255, 188, 137), strict=True):
-        assert np.abs(found - expected).max() <= 1
+    for middle, expected in zip(middles, (255, 188, 137), strict=True):
+        assert np.abs(middle - expected).max() <= 1
 
 
 def test_an_exact_copy_has_a_black_error_and_a_gain_makes_it_brighter(opengl, tmp_path):
     position, original = np.array([[0.0, 0, 0], [1, 0, 0]]), from_everywhere(1.0, 2.0)
-    seen = []
+    brightness = []
     for decoded, gain in ((original, 8), (original * 0.98, 4), (original * 1.02, 16)):
         render_probes(tmp_path / "a.png", position, original, decoded, error_gain=gain, width=900)
         error = panels(tmp_path / "a.png")[2]
-        seen.append(error[inside(error)].mean())
-    assert seen[0] < 8, "but for the edge"
-    assert seen[0] + 20 < seen[1] < seen[2] - 20
+        brightness.append(error[inside(error)].mean())
+    assert brightness[0] < 8, "but for the edge"
+    assert brightness[0] + 20 < brightness[1] < brightness[2] - 20
 
 
 def test_a_band_that_no_surface_sees_is_seen_as_radiance(opengl, tmp_path):
@@ -158,8 +158,8 @@ def test_of_too_many_a_fixed_choice_is_shown(opengl, tmp_path, monkeypatch):
     for name in ("a.png", "b.png"):
         assert render_probes(tmp_path / name, position, values, values, width=900) == 10
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
-    shown = [inside(panels(tmp_path / name)[2]).sum() for name in ("a.png", "all.png")]
-    assert shown[0] > 0 and shown[1] > 0
+    covered = [inside(panels(tmp_path / name)[2]).sum() for name in ("a.png", "all.png")]
+    assert covered[0] > 0 and covered[1] > 0
     # The number is in the title.
     title, plain = (title_pixels(tmp_path / name) for name in ("a.png", "all.png"))
     assert title > 2 * plain > 0
@@ -207,8 +207,8 @@ def test_dark_and_bright_light(opengl, tmp_path):
         (from_everywhere(1e-30), black, (255, 0, 255)),
     ):
         render_probes(tmp_path / "a.png", position, original, decoded, width=900)
-        found = [picture[picture.shape[0] // 2, picture.shape[1] // 2, 0] for picture in panels(tmp_path / "a.png")]
-        np.testing.assert_allclose(found, expected, atol=1)
+        middles = [picture[picture.shape[0] // 2, picture.shape[1] // 2, 0] for picture in panels(tmp_path / "a.png")]
+        np.testing.assert_allclose(middles, expected, atol=1)
 
 
 def test_a_folder_that_is_not_there_is_one_line(opengl, tmp_path):

@@ -1,21 +1,10 @@
-"""What the systems are compared with. Block codecs need the extra `baselines`."""
+"""What the systems are compared with, one module a system. Block codecs need the extra `baselines`.
 
-from wlm.baselines.blocks import (
-    BASELINES,
-    BlockResult,
-    encode_8bit,
-    encode_astc,
-    encode_bc6h,
-    encode_bc7,
-    run_baselines,
-)
+Each module has ``RIVALS``, the methods by name, and they are scored by the system's evaluation: a method makes a
+``Rival`` of an input, and ``evaluate_rivals`` scores it. The rivals of smoke make no file: each is what
+``wlm.smoke.evaluation.compare`` takes beside a network. No system imports a baseline.
+"""
 
-__all__ = [
-    "BASELINES",
-    "BlockResult",
-    "encode_8bit",
-    "encode_astc",
-    "encode_bc6h",
-    "encode_bc7",
-    "run_baselines",
-]
+from wlm.baselines.rival import Rival
+
+__all__ = ["Rival"]

@@ -1,7 +1,8 @@
 """What a compressed lightmap of a mesh is compared with (lightmap-uv-clustering-cascade, sections 4.3 and 4.4).
 
 A budget is a share of the lightmap's bits at 48 a texel, 1 - CR of eq. 9. Each method gives the best that it has within
-the share, and says what it used. Gaps are filled from the nearest texel of a chart before anything is resized.
+the share; its ``bytes`` are those of all that a decoder needs but the UVs, which cost nothing in eq. 9, and ``decoded``
+is a ``Sampler`` of ``wlm.atlas.evaluation``. Charts are dilated from the nearest texel before anything is resized.
 
 The paper's DownSampling is "bilinear". The smaller texture that has the least squares where it is read at the charts'
 texels takes a few tenths of a second more, and on 18 lightmaps of 512² at a share of 0.17 it is 1.7 dB above bilinear
@@ -13,22 +14,23 @@ from __future__ import annotations
 import functools
 import math
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import torch
 
 from wlm.atlas.coverage import touched_texels
 from wlm.atlas.data import LightmappedMesh
-from wlm.atlas.evaluation import Sampler
-from wlm.atlas.model import SOURCE_BITS
+from wlm.atlas.evaluation import Score, compare
+from wlm.atlas.model import SOURCE_BITS, AtlasModel
 from wlm.atlas.resize import FILTERS, fitting_size, resize
+from wlm.baselines.rival import Rival
 from wlm.formats import hdr_blocks
 from wlm.ops import raster
 from wlm.texels import fill_gaps
 
-__all__ = ["ATLAS_BASELINES", "Baseline", "best_astc", "block_codec", "downsampling", "single_colour"]
+__all__ = ["RIVALS", "best_astc", "block_codec", "downsampling", "evaluate_rivals", "share_of", "single_colour"]
 
 _BLOCK_BITS = 128
 _BC6H = (4, 4)
@@ -38,28 +40,33 @@ _LEAST_LIMIT = 1e-6
 _SAMPLES_AT_ONCE = 1 << 20
 
 
-@dataclass(frozen=True, eq=False)
-class Baseline:
-    """A lightmap through one method.
+def share_of(rival: Rival, mesh: LightmappedMesh) -> float:
+    """The bits of a rival over the lightmap's at 48 a texel."""
+    return rival.bytes * 8 / (mesh.mask.size * SOURCE_BITS)
 
-    Attributes:
-        name: The method.
-        size: Rows and columns of its texture; None where the method has no such thing.
-        bits: Of all that a decoder needs; UVs cost nothing, as in eq. 9.
-        share: ``bits`` over the lightmap's at 48 a texel.
-        seconds: Wall-clock time of the compression, on the CPU.
-        sample: The decoder, for ``wlm.atlas.evaluation``.
+
+def evaluate_rivals(
+    model: AtlasModel, mesh: LightmappedMesh, names: Sequence[str] = ("downsampling",), **options: Any
+) -> list[tuple[Rival, Score]]:
+    """Scores rivals of as many bits as a model.
+
+    Args:
+        model: It says how many bits.
+        mesh: The mesh with its original lightmap.
+        names: Keys of ``RIVALS``.
+        options: As for ``wlm.atlas.evaluation.compare``.
+
+    Raises:
+        WlmError, ValueError: As ``compare`` or the rival.
     """
-
-    name: str
-    size: tuple[int, int] | None
-    bits: int
-    share: float
-    seconds: float
-    sample: Sampler
+    bits = round((1.0 - model.compression_ratio) * mesh.mask.size * SOURCE_BITS)
+    # Half a bit more, so that rounding takes none away.
+    rivals = [RIVALS[name](mesh, (bits + 0.5) / (mesh.mask.size * SOURCE_BITS)) for name in names]
+    scores = compare(mesh, {rival.name: rival.decoded for rival in rivals}, **options)
+    return [(rival, scores[rival.name]) for rival in rivals]
 
 
-def downsampling(mesh: LightmappedMesh, share: float, filter: str = "fit") -> Baseline:
+def downsampling(mesh: LightmappedMesh, share: float, filter: str = "fit") -> Rival:
     """The lightmap at a lower resolution in half floats, read bilinearly.
 
     Args:
@@ -74,10 +81,10 @@ def downsampling(mesh: LightmappedMesh, share: float, filter: str = "fit") -> Ba
     height, width = _fitting_size(mesh, share, (1, 1), SOURCE_BITS)
     texels = resize(mesh.lightmap, mesh.mask, height, width, filter).astype(np.float16)
     name = "downsampling" if filter == "fit" else f"downsampling {filter}"
-    return _texture(name, mesh, texels, height * width * SOURCE_BITS, start)
+    return _texture(name, texels, height * width * SOURCE_BITS // 8, start)
 
 
-def block_codec(mesh: LightmappedMesh, share: float, codec: str) -> Baseline:
+def block_codec(mesh: LightmappedMesh, share: float, codec: str) -> Rival:
     """The lightmap in blocks of 16 bytes, at the highest resolution, up to its own, whose blocks are within the budget.
 
     Args:
@@ -103,10 +110,10 @@ def block_codec(mesh: LightmappedMesh, share: float, codec: str) -> Baseline:
         coder = hdr_blocks.astc(block, hdr_blocks.ASTC_MEDIUM, _EXTRA)
         data = coder.encode(half)
         decoded = coder.decode(data, height, width)
-    return _texture(codec, mesh, decoded, len(data) * 8, start)
+    return _texture(codec, decoded, len(data), start)
 
 
-def best_astc(mesh: LightmappedMesh, share: float) -> Baseline:
+def best_astc(mesh: LightmappedMesh, share: float) -> Rival:
     """ASTC with the smallest blocks that hold the lightmap at its own size within the budget, else ``astc12x12``.
 
     Resizing a lightmap by little costs more than larger blocks do.
@@ -119,11 +126,11 @@ def best_astc(mesh: LightmappedMesh, share: float) -> Baseline:
     return block_codec(mesh, share, f"astc{w}x{h}")
 
 
-def single_colour(mesh: LightmappedMesh, share: float | None = None, threshold: float = 0.01) -> Baseline:
+def single_colour(mesh: LightmappedMesh, share: float | None = None, threshold: float = 0.01) -> Rival:
     """Triangles of nearly one colour become one texel each, the same for all that are nearly alike; others stay.
 
-    After Luo et al. 2023 as section 4.3 tells of it. It is given what a packer can't reach: what stays costs the texels
-    that it touches, with no gaps and no borders, and is read without any loss but rounding to half.
+    After Luo et al. 2023, as section 4.3 describes it, with a packer better than any: a triangle that stays costs the
+    texels that it touches, without gaps or borders, and is read without any loss but rounding to half.
 
     Args:
         mesh: The mesh and its lightmap.
@@ -146,34 +153,33 @@ def single_colour(mesh: LightmappedMesh, share: float | None = None, threshold: 
         flat = np.flatnonzero(mesh.active & (spread <= limit))
         middle = (low[flat] + high[flat]) / 2.0
         cell = np.floor(middle / (2.0 * limit)) if limit > 0.0 else middle
-        _, own = np.unique(cell, axis=0, return_inverse=True)
         number = np.full(len(spread), -1)
-        number[flat] = own.reshape(-1)
+        number[flat] = np.unique(cell, axis=0, return_inverse=True)[1].reshape(-1)
         count = int(number.max()) + 1
         colour_low, colour_high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
         np.minimum.at(colour_low, number[flat], middle)
         np.maximum.at(colour_high, number[flat], middle)
-        kept = touched_texels(mesh.uv, mesh.triangle[mesh.active & (number < 0)], *mesh.mask.shape)
-        return number, (colour_low + colour_high) / 2.0, count + np.count_nonzero(kept)
+        touched = touched_texels(mesh.uv, mesh.triangle[mesh.active & (number < 0)], *mesh.mask.shape)
+        return number, (colour_low + colour_high) / 2.0, count + np.count_nonzero(touched)
 
     if share is None:
-        found = merged(threshold * float(np.ptp(mesh.lightmap[mesh.mask])))
+        merging = merged(threshold * float(np.ptp(mesh.lightmap[mesh.mask])))
     else:
         room = _budget(mesh, share) // SOURCE_BITS
         if room == 0:
             raise ValueError(f"share: {share} of {mesh.mask.size} texels has no room for one")
-        found = _within(merged, float(spread.max()), room)
-    number, colours, texels = found
+        merging = _within(merged, float(spread.max()), room)
+    number, colours, texels = merging
     image = filled.astype(np.float16).astype(np.float32)
     palette = np.concatenate([colours.astype(np.float16), np.zeros((1, 3))]).astype(np.float32)
 
     def sample(uv: torch.Tensor, triangle: torch.Tensor, barycentric: torch.Tensor) -> torch.Tensor:
         device = uv.device
-        own = torch.tensor(number, device=device)[triangle.long()]
+        colour = torch.tensor(number, device=device)[triangle.long()]
         read = raster.texture(torch.tensor(image, device=device), uv)
-        return torch.where(own[:, None] >= 0, torch.tensor(palette, device=device)[own], read)
+        return torch.where(colour[:, None] >= 0, torch.tensor(palette, device=device)[colour], read)
 
-    return _baseline("single colour", None, mesh, texels * SOURCE_BITS, start, sample)
+    return Rival("single colour", texels * SOURCE_BITS // 8, time.perf_counter() - start, None, sample)
 
 
 def _budget(mesh: LightmappedMesh, share: float) -> int:
@@ -192,7 +198,7 @@ def _fitting_size(mesh: LightmappedMesh, share: float, block: tuple[int, int], b
 
 
 def _within(merged: Callable, spread: float, texels: int) -> tuple[np.ndarray, np.ndarray, int]:
-    """What ``merged`` finds at the smallest limit whose texels are few enough; at least one is."""
+    """The merging at the smallest limit whose texels are few enough; at least one is."""
     best = merged(0.0)
     if best[2] <= texels:
         return best
@@ -202,9 +208,9 @@ def _within(merged: Callable, spread: float, texels: int) -> tuple[np.ndarray, n
         low, high = high, 2.0 * high
     for _ in range(_BISECTIONS):
         limit = (low + high) / 2.0
-        found = merged(limit)
-        if found[2] <= texels:
-            best, high = found, limit
+        merging = merged(limit)
+        if merging[2] <= texels:
+            best, high = merging, limit
         else:
             low = limit
     return best
@@ -230,28 +236,21 @@ def _colour_range(mesh: LightmappedMesh, image: torch.Tensor) -> tuple[np.ndarra
     return low, high
 
 
-def _texture(name: str, mesh: LightmappedMesh, texels: np.ndarray, bits: int, start: float) -> Baseline:
-    """A baseline that is a texture in half floats under the lightmap's UVs."""
+def _texture(name: str, texels: np.ndarray, bytes: int, start: float) -> Rival:
+    """A rival that is a texture under the lightmap's UVs."""
     image = np.ascontiguousarray(texels, np.float32)
 
     def sample(uv: torch.Tensor, triangle: torch.Tensor, barycentric: torch.Tensor) -> torch.Tensor:
         return raster.texture(torch.tensor(image, device=uv.device), uv)
 
-    return _baseline(name, texels.shape[:2], mesh, bits, start, sample)
+    return Rival(name, bytes, time.perf_counter() - start, None, sample, size=texels.shape[:2])
 
 
-def _baseline(
-    name: str, size: tuple[int, int] | None, mesh: LightmappedMesh, bits: int, start: float, sample: Sampler
-) -> Baseline:
-    seconds = time.perf_counter() - start
-    return Baseline(name, size, bits, bits / (mesh.mask.size * SOURCE_BITS), seconds, sample)
-
-
-# By name: a mesh and a share to what each gives.
-ATLAS_BASELINES: dict[str, Callable[[LightmappedMesh, float], Baseline]] = {
+RIVALS: dict[str, Callable[[LightmappedMesh, float], Rival]] = {
     "downsampling": downsampling,
     **{f"downsampling {name}": functools.partial(downsampling, filter=name) for name in FILTERS if name != "fit"},
     **{name: functools.partial(block_codec, codec=name) for name in ("bc6h", "astc4x4", "astc6x6", "astc8x8")},
     "astc": best_astc,
     "single colour": single_colour,
 }
+"""By name: a mesh and a share to the rival."""

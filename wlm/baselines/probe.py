@@ -1,31 +1,39 @@
 """What a compressed probe set is compared with: the PCA family, a moving basis, and an engine's 8-bit packing.
 
-Each function takes N probes and returns what they weigh, how long it took and what comes back out of the bytes
-(gaussian-probe-compression, sections 2.2 and 5.1). The positions are an engine's own and cost nothing here, as in
-the paper. The paper gives its rivals no bits to choose; weights of 4 or 5 bits leave room for more components and
-gain several decibels at the same size, so ``at_bytes`` tries them too. Times are wall-clock on the CPU.
+Each function takes N probes, their positions [N, 3] and values [N, D] in any unit, and returns a ``Rival`` whose
+``decoded`` is float32 [N, D], read from the byte string that ``bytes`` counts (gaussian-probe-compression, sections 2.2
+and 5.1). The positions are an engine's own and cost nothing here, as in the paper. The paper gives its rivals no bits
+to choose; weights of 4 or 5 bits leave room for more components and gain several decibels at the same size, so
+``at_bytes`` tries them too.
+
+The settings that the functions share are the number of ``components``, basis vectors of a part, 1 to D, and the
+``bits`` of a weight, 1 to 16, over the range of each part and component; None for half floats. Means and bases are half
+floats always. All raise a ``WlmError`` where there are no probes, or NaN or infinite numbers, and a ``ValueError`` for
+wrong shapes or a setting out of range.
 """
 
 from __future__ import annotations
 
 import bisect
 import functools
-import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from wlm.baselines import probe_mbd, probe_pca
+from wlm.baselines.rival import Rival, measure
 from wlm.errors import WlmError
+from wlm.probe.data import ProbeSet
+from wlm.probe.evaluation import Report, score
+from wlm.system import Meter, OnProgress
 
 __all__ = [
-    "PROBE_BASELINES",
+    "RIVALS",
     "WEIGHT_BITS",
-    "Result",
     "at_bytes",
     "block_pca",
     "clustered_pca",
+    "evaluate_rivals",
     "global_pca",
     "moving_basis",
     "pack_unreal",
@@ -54,59 +62,20 @@ _DROPPED = np.array([4, 4, 5], np.uint32)
 _SHIFT = np.array([0, 11, 22], np.uint32)
 
 
-@dataclass(frozen=True, eq=False)
-class Result:
-    """A probe set through one method.
-
-    Attributes:
-        name: The method, as in ``PROBE_BASELINES``.
-        option: Its settings, for a table.
-        decoded: float32 [N, D].
-        bytes: Length of the byte string that ``decoded`` was read from; positions are not in it.
-        encode_seconds: Wall-clock time from values to bytes.
-        decode_seconds: Wall-clock time from bytes and positions to values.
-    """
-
-    name: str
-    option: str
-    decoded: np.ndarray
-    bytes: int
-    encode_seconds: float
-    decode_seconds: float
-
-
-def global_pca(position: np.ndarray, values: np.ndarray, components: int, *, bits: int | None = None) -> Result:
-    """Principal components of all probes (GPCA).
-
-    Args:
-        position: [N, 3].
-        values: [N, D], any unit.
-        components: Basis vectors, 1 to D.
-        bits: Of a weight, 1 to 16, over the range of each component; None for half floats. Means and bases are half
-            floats always.
-
-    Raises:
-        WlmError: No probes, or NaN or infinite numbers.
-        ValueError: Wrong shapes, or a setting out of range.
-    """
+def global_pca(position: np.ndarray, values: np.ndarray, components: int, *, bits: int | None = None) -> Rival:
+    """Principal components of all probes, which are one part (GPCA)."""
     position, values = _checked(position, values, components, bits)
     return _pca("global_pca", "part", position, values, components, bits, lambda: (probe_pca.whole(position), ()))
 
 
 def block_pca(
     position: np.ndarray, values: np.ndarray, components: int, blocks: int, *, bits: int | None = None
-) -> Result:
+) -> Rival:
     """Principal components of each cube of a regular grid (BPCA, Nishino et al. 2005).
 
     Args:
-        position: [N, 3].
-        values: [N, D].
-        components: Basis vectors of a block, 1 to D.
+        position, values, components, bits: See the module.
         blocks: The most cubes that hold a probe, at least 1. They have one size, so a few fewer come out.
-        bits: As ``global_pca``, over the range of each block and component.
-
-    Raises:
-        WlmError, ValueError: As ``global_pca``.
     """
     position, values = _checked(position, values, components, bits)
     _in_range("blocks", blocks, 1)
@@ -125,22 +94,16 @@ def window_pca(
     *,
     overlap: float = 1.0,
     bits: int | None = None,
-) -> Result:
+) -> Rival:
     """Block PCA with the basis of a block and its surroundings (WBPCA, Nishino et al. 2005).
 
     Neighbouring blocks then have similar bases and smaller seams, at the cost of a larger error; each probe is coded
-    once, in its own block's basis.
+    once, in the basis of the block that it lies in.
 
     Args:
-        position: [N, 3].
-        values: [N, D].
-        components: Basis vectors of a block, 1 to D.
+        position, values, components, bits: See the module.
         blocks: As ``block_pca``.
         overlap: How far the window reaches over its block on all sides, in sides of a block, at least 0.
-        bits: As ``block_pca``.
-
-    Raises:
-        WlmError, ValueError: As ``global_pca``.
     """
     position, values = _checked(position, values, components, bits)
     _in_range("blocks", blocks, 1)
@@ -162,22 +125,16 @@ def clustered_pca(
     *,
     signal: bool = False,
     bits: int | None = None,
-) -> Result:
+) -> Rival:
     """Principal components of each cluster (CPCA).
 
     Args:
-        position: [N, 3].
-        values: [N, D].
-        components: Basis vectors of a cluster, 1 to D.
+        position, values, components, bits: See the module.
         clusters: At least 1. Fewer come out where there are fewer distinct probes, or where a cluster ends empty.
         seed: Of the first centres.
         signal: False clusters the positions with k-means, as gaussian-probe-compression, section 5.1, has it: the
             centres are stored, and a probe needs no index. True puts each probe where it is reconstructed best, as
             Sloan et al. 2003 do: an index of ceil(log2 clusters) bits a probe is stored and counted.
-        bits: As ``block_pca``.
-
-    Raises:
-        WlmError, ValueError: As ``global_pca``.
     """
     position, values = _checked(position, values, components, bits)
     _in_range("clusters", clusters, 1)
@@ -196,32 +153,26 @@ def moving_basis(
     iterations: int = _ROUNDS,
     *,
     bits: int | None = None,
-) -> Result:
+) -> Rival:
     """Moving basis decomposition (MBD, Silvennoinen and Sloan 2021) at free positions.
 
     Args:
-        position: [N, 3].
-        values: [N, D].
-        components: Basis vectors at a corner of the grid, 1 to D.
+        position, values, components, bits: See the module; a part is a cell, the basis vectors are at its corners.
         grid: Cells along the longest side of the probes' box, 1 to 2**20.
         iterations: Rounds of alternating least squares from the PCA of all probes, at least 0.
-        bits: As ``block_pca``, over the range of each cell and component.
-
-    Raises:
-        WlmError, ValueError: As ``global_pca``.
     """
     position, values = _checked(position, values, components, bits)
     _in_range("grid", grid, 1, probe_pca.MAX_CELLS)
     _in_range("iterations", iterations, 0)
-    return _run(
+    return measure(
         "moving_basis",
-        lambda payload: f"K={components}, grid {grid}, {_weights(bits)}",
         lambda: probe_mbd.encode(position, values, components, grid, iterations, bits),
         lambda payload: probe_mbd.decode(payload, position),
+        option=lambda payload: f"K={components}, grid {grid}, {_weights(bits)}",
     )
 
 
-def unreal_packing(position: np.ndarray, values: np.ndarray, bands: int | None = None) -> Result:
+def unreal_packing(position: np.ndarray, values: np.ndarray, bands: int | None = None) -> Rival:
     """SH as the bricks of Unreal's volumetric lightmap store it, without sky occlusion: 28 bytes a probe at L2.
 
     The ambient colour L0 is R11G11B10F; every other coefficient is divided by it and by the range that light can
@@ -231,24 +182,20 @@ def unreal_packing(position: np.ndarray, values: np.ndarray, bands: int | None =
     as it is decoded, which costs nothing and is closer than the engine's own ratio.
 
     Args:
-        position: [N, 3]; only their number counts.
-        values: [N, D], D = 3, 12 or 27: SH coefficients from L00, for each its red, green and blue.
+        position: Only their number counts.
+        values: D = 3, 12 or 27 (else a ``WlmError``): SH coefficients from L00, for each its red, green and blue.
         bands: 1 to 3, SH bands that are kept, 4, 13 or 28 bytes a probe; the rest decode to zero. None for all.
-
-    Raises:
-        WlmError: As ``global_pca``, or D is none of these.
-        ValueError: Wrong shapes, or more bands than there are.
     """
     position, values = _checked(position, values)
     most = _unreal_bands(values.shape[1])
     bands = most if bands is None else bands
     _in_range("bands", bands, 1, most)
     width = values.shape[1]
-    return _run(
+    return measure(
         "unreal",
-        lambda payload: f"L{bands - 1}",
         lambda: pack_unreal(values, bands),
         lambda payload: unpack_unreal(payload, width, bands),
+        option=lambda payload: f"L{bands - 1}",
     )
 
 
@@ -284,74 +231,107 @@ def at_bytes(
     values: np.ndarray,
     budget_bytes: int,
     bits: Sequence[int | None] = WEIGHT_BITS,
-) -> Result:
+) -> Rival:
     """The settings of one method with the least squared error that a size allows, by a small search.
 
     For each number of bits the component counts are tried from the largest downwards until two in a row gain
     nothing, each with as many parts as fit, at most ``MAX_PARTS`` or ``MAX_GRID`` cells.
 
     Args:
-        name: A key of ``PROBE_BASELINES``.
-        position: [N, 3].
-        values: [N, D].
+        name: A key of ``RIVALS``.
+        position, values: See the module.
         budget_bytes: The largest size.
         bits: Bits of a weight to try; ``(None,)`` keeps to half floats as gaussian-probe-compression's table has them.
-            The engine's packing has its own.
+            The engine's packing has none to choose.
 
     Returns:
         The best result; its times are those of its settings alone, without the search.
 
     Raises:
-        WlmError: Unknown name, a budget that nothing fits, or as ``global_pca``.
-        ValueError: Wrong shapes, or bits out of range.
+        WlmError: An unknown name, or a budget that nothing fits.
     """
-    if name not in PROBE_BASELINES:
-        raise WlmError(f"probes: unknown baseline {name!r}, expected one of {', '.join(PROBE_BASELINES)}")
+    if name not in RIVALS:
+        raise WlmError(f"probes: unknown baseline {name!r}, expected one of {', '.join(RIVALS)}")
     for number in bits:
         _check_bits(number)
     position, values = _checked(position, values)
-    best = PROBE_BASELINES[name](position, values, budget_bytes, bits)
+    best = RIVALS[name](position, values, budget_bytes, bits)
     if best is None:
         raise WlmError(f"probes: {name}: nothing fits into {budget_bytes} bytes for {len(values)} probes")
     return best
+
+
+def evaluate_rivals(
+    probes: ProbeSet,
+    budget_bytes: int,
+    names: Sequence[str] = (),
+    *,
+    progress: OnProgress | None = None,
+    skipped: Callable[[WlmError], None] | None = None,
+) -> list[tuple[Rival, Report]]:
+    """Scores the rivals at one size.
+
+    Args:
+        probes: The input.
+        budget_bytes: The largest size, that of our file.
+        names: Keys of ``RIVALS``; none: all.
+        progress: Called after each rival.
+        skipped: Called for a rival that can't be that small, or that can't hold such probes, with the reason.
+
+    Returns:
+        The others, with their reports.
+    """
+    names = names or tuple(RIVALS)
+    meter = Meter(progress, "baselines", len(names))
+    results = []
+    for done, name in enumerate(names, 1):
+        try:
+            rival = at_bytes(name, probes.position, probes.values, budget_bytes)
+        except WlmError as error:
+            if skipped is not None:
+                skipped(error)
+        else:
+            results.append((rival, score(rival.decoded, probes, rival.bytes)))
+        meter.report(done)
+    return results
 
 
 def _search(
     values: np.ndarray,
     bits: Sequence[int | None],
     largest: Callable[[int, int | None], int],
-    make: Callable[[int, int, int | None], Result],
-) -> tuple[Result, tuple[int, int, int | None]] | None:
+    make: Callable[[int, int, int | None], Rival],
+) -> tuple[Rival, tuple[int, int, int | None]] | None:
     """``at_bytes`` for a method with components, parts and bits.
 
     ``largest`` gives the most parts for components and bits, 0 where nothing fits; ``make`` a result for all three.
     Returns the best result with its three settings, or None.
     """
-    tried: list[tuple[float, Result, tuple[int, int, int | None]]] = []
+    tried: list[tuple[float, Rival, tuple[int, int, int | None]]] = []
     for number in bits:
         least, waited = np.inf, 0
         for components in range(values.shape[1], 0, -1):
             parts = largest(components, number)
             if not parts:
                 continue
-            result = make(components, parts, number)
-            error = _error(values, result)
-            tried.append((error, result, (components, parts, number)))
+            rival = make(components, parts, number)
+            error = _error(values, rival)
+            tried.append((error, rival, (components, parts, number)))
             waited = 0 if error < least else waited + 1
             least = min(least, error)
             if waited == _PATIENCE:
                 break
-    return min(tried, key=lambda one: (one[0], one[1].bytes))[1:] if tried else None
+    return min(tried, key=lambda entry: (entry[0], entry[1].bytes))[1:] if tried else None
 
 
 def _pca_at(
     kind: int,
-    make: Callable[..., Result],
+    make: Callable[..., Rival],
     position: np.ndarray,
     values: np.ndarray,
     budget: int,
     bits: Sequence[int | None],
-) -> Result | None:
+) -> Rival | None:
     probes, width = values.shape
     most = 1 if kind == probe_pca.WHOLE else min(probes, MAX_PARTS)
 
@@ -359,15 +339,15 @@ def _pca_at(
         size = functools.partial(probe_pca.payload_bytes, kind, probes, width, components, bits=number)
         return bisect.bisect_right(range(1, most + 1), budget, key=lambda parts: size(count=parts))
 
-    def build(components: int, parts: int, number: int | None) -> Result:
+    def build(components: int, parts: int, number: int | None) -> Rival:
         divided = () if kind == probe_pca.WHOLE else (parts,)
         return make(position, values, components, *divided, bits=number)
 
-    found = _search(values, bits, largest, build)
-    return found[0] if found else None
+    best = _search(values, bits, largest, build)
+    return best[0] if best else None
 
 
-def _moving_at(position: np.ndarray, values: np.ndarray, budget: int, bits: Sequence[int | None]) -> Result | None:
+def _moving_at(position: np.ndarray, values: np.ndarray, budget: int, bits: Sequence[int | None]) -> Rival | None:
     probes, width = values.shape
     grids: list[tuple[int, int]] = []
     while len(grids) < MAX_GRID:
@@ -381,26 +361,25 @@ def _moving_at(position: np.ndarray, values: np.ndarray, budget: int, bits: Sequ
         size = functools.partial(probe_mbd.payload_bytes, probes, width, components, bits=number)
         return max((g for g, parts in enumerate(grids, 1) if size(parts=parts) <= budget), default=0)
 
-    def build(components: int, grid: int, number: int | None) -> Result:
+    def build(components: int, grid: int, number: int | None) -> Rival:
         return moving_basis(position, values, components, grid, _SEARCH_ROUNDS, bits=number)
 
-    found = _search(values, bits, largest, build)
-    if found is None:
+    best = _search(values, bits, largest, build)
+    if best is None:
         return None
-    first, (components, grid, number) = found
+    first, (components, grid, number) = best
     longer = moving_basis(position, values, components, grid, bits=number)
-    return min((first, longer), key=lambda result: _error(values, result))
+    return min((first, longer), key=lambda rival: _error(values, rival))
 
 
-def _unreal_at(position: np.ndarray, values: np.ndarray, budget: int, bits: Sequence[int | None]) -> Result | None:
+def _unreal_at(position: np.ndarray, values: np.ndarray, budget: int, bits: Sequence[int | None]) -> Rival | None:
     for bands in range(_unreal_bands(values.shape[1]), 0, -1):
         if len(values) * (4 + 3 * (bands**2 - 1)) <= budget:
             return unreal_packing(position, values, bands)
     return None
 
 
-# By name, each as `at_bytes` calls it: positions, values, bytes, bits to try.
-PROBE_BASELINES: dict[str, Callable[[np.ndarray, np.ndarray, int, Sequence[int | None]], Result | None]] = {
+RIVALS: dict[str, Callable[[np.ndarray, np.ndarray, int, Sequence[int | None]], Rival | None]] = {
     "global_pca": functools.partial(_pca_at, probe_pca.WHOLE, global_pca),
     "block_pca": functools.partial(_pca_at, probe_pca.BLOCKS, block_pca),
     "window_pca": functools.partial(_pca_at, probe_pca.BLOCKS, window_pca),
@@ -409,6 +388,7 @@ PROBE_BASELINES: dict[str, Callable[[np.ndarray, np.ndarray, int, Sequence[int |
     "moving_basis": _moving_at,
     "unreal": _unreal_at,
 }
+"""By name, each as ``at_bytes`` calls it: positions, values, bytes and the bits to try, to the best ``Rival``."""
 
 
 def _pca(
@@ -419,32 +399,21 @@ def _pca(
     components: int,
     bits: int | None,
     divide: Callable[[], tuple[probe_pca.Partition, Sequence[np.ndarray]]],
-) -> Result:
+) -> Rival:
     def encode() -> bytes:
         partition, members = divide()
         return probe_pca.encode(values, partition, components, bits, members)
 
-    return _run(
+    return measure(
         name,
-        lambda payload: f"K={components}, {probe_pca.part_count(payload)} {parts}, {_weights(bits)}",
         encode,
         lambda payload: probe_pca.decode(payload, position),
+        option=lambda payload: f"K={components}, {probe_pca.part_count(payload)} {parts}, {_weights(bits)}",
     )
 
 
-def _run(
-    name: str, option: Callable[[bytes], str], encode: Callable[[], bytes], decode: Callable[[bytes], np.ndarray]
-) -> Result:
-    start = time.perf_counter()
-    payload = encode()
-    middle = time.perf_counter()
-    decoded = decode(payload)
-    end = time.perf_counter()
-    return Result(name, option(payload), decoded, len(payload), middle - start, end - middle)
-
-
-def _error(values: np.ndarray, result: Result) -> float:
-    return float(np.square(result.decoded - values).sum())
+def _error(values: np.ndarray, rival: Rival) -> float:
+    return float(np.square(rival.decoded - values).sum())
 
 
 def _weights(bits: int | None) -> str:

@@ -1,4 +1,4 @@
-"""Affine subspaces for parts of a probe set: how the parts are found, and what is stored.
+"""Affine subspaces for parts of a probe set: how the set is divided, and what is stored.
 
 A probe of part c is its mean and a few of its basis vectors, y ~ m_c + sum_j w_j b_cj. How the set is divided is all
 that differs between the PCA family of gaussian-probe-compression, section 5.1. What is stored, in this order and
@@ -61,7 +61,7 @@ __all__ = [
 
 HEADER = struct.Struct("<BBHHIf")
 HALF_MAX = 65504.0
-# How the parts are found again by a decoder.
+# How a decoder finds the parts.
 WHOLE, BLOCKS, PLACE, SIGNAL = range(4)
 _CENTRE_LEVELS = 65535
 # Cells along the longest side of the box, at most: three such numbers fit into one 64-bit key.
@@ -139,12 +139,12 @@ def windows(position: np.ndarray, partition: Partition, side: float, overlap: fl
         For each part the indices of its window, its own probes among them.
     """
     low = position.min(0)
-    first = [own[0] for own in partition.members]
+    first = [probes[0] for probes in partition.members]
     centre = low + (np.floor((position[first] - low) / side) + 0.5) * side
     # The slack keeps a probe on a cube's face in that cube's window.
     radius = side * (0.5 + overlap) * (1.0 + 1e-9)
-    found = cKDTree(position).query_ball_point(centre, radius, p=np.inf, return_sorted=True)
-    return [np.asarray(near, np.int64) for near in found]
+    windows = cKDTree(position).query_ball_point(centre, radius, p=np.inf, return_sorted=True)
+    return [np.asarray(window, np.int64) for window in windows]
 
 
 def by_place(position: np.ndarray, clusters: int, seed: int) -> Partition:
@@ -216,10 +216,10 @@ def fit_subspaces(values: np.ndarray, members: Sequence[np.ndarray], components:
     width = values.shape[1]
     mean = np.empty((len(members), width))
     basis = np.empty((len(members), components, width))
-    for part, own in enumerate(members):
-        mean[part] = values[own].mean(0)
+    for part, probes in enumerate(members):
+        mean[part] = values[probes].mean(0)
         if components:
-            centred = values[own] - mean[part]
+            centred = values[probes] - mean[part]
             # Ascending eigenvalues, and a whole orthonormal set even of a matrix of zeros.
             basis[part] = np.linalg.eigh(centred.T @ centred)[1].T[::-1][:components]
     return mean, basis
@@ -247,8 +247,8 @@ def encode(
     # Weights for the subspace as it is read back: the rounding of means and bases is no error of its own then.
     inverse = np.linalg.pinv(basis.astype(np.float64))
     weight = np.empty((len(values), components))
-    for part, own in enumerate(partition.members):
-        weight[own] = (values[own] - mean[part].astype(np.float64)) @ inverse[part]
+    for part, probes in enumerate(partition.members):
+        weight[probes] = (values[probes] - mean[part].astype(np.float64)) @ inverse[part]
     weights = write_weights(weight, partition.label, partition.count, bits)
     head = HEADER.pack(partition.kind, bits or 0, values.shape[1], components, partition.count, scale)
     return b"".join((head, partition.stored, mean.tobytes(), basis.tobytes(), weights))
@@ -283,8 +283,8 @@ def decode(payload: bytes, position: np.ndarray) -> np.ndarray:
     start += basis.size * 2
     weight = read_weights(payload[start:], label, count, components, bits or None)
     decoded = mean[label]
-    for part, own in enumerate(_members(label, count)):
-        decoded[own] += weight[own] @ basis[part].astype(np.float32)
+    for part, indices in enumerate(_members(label, count)):
+        decoded[indices] += weight[indices] @ basis[part].astype(np.float32)
     return rescale(decoded, scale)
 
 

@@ -1,72 +1,93 @@
-"""What the network's lightmaps are compared with: a coarse march of all six, and a flip book baked from one side."""
+"""What the network's lightmaps are compared with: a flip book that was baked from one side."""
 
 from __future__ import annotations
 
 import numpy as np
 import torch
 
-from wlm.fluid.volume import DensityVolume
-from wlm.smoke.baking import SixWay, six_way
 from wlm.smoke.camera import Camera
+from wlm.smoke.evaluation import Contender, HeldOut, Method
+from wlm.smoke.learn.pool import Pool
+from wlm.smoke.lightmaps import SixWay
+from wlm.smoke.planes import GUIDES, PLANES
 
-__all__ = ["billboard", "direct"]
+__all__ = ["COARSE", "FLIP_BOOK", "RIVALS", "billboard", "coarse", "flip_book"]
+
+COARSE, FLIP_BOOK = "coarse march", "flip book"
+
+_SIX = GUIDES["six"]
 
 
-def direct(volume: DensityVolume, camera: Camera, step: float, *, g: float = 0.0) -> SixWay:
-    """The lightmaps themselves in large steps: what else the time that a network takes could be spent on.
-
-    The reference's own integral, without its error. Along rays the time falls with the step; to the sides no step is
-    longer than a pixel, which is marched through anyway.
-
-    Args:
-        volume: The smoke.
-        camera: Orthographic.
-        step: The longest step, in voxels; the guiding map's is 10.
-        g: Henyey and Greenstein's mean cosine, within -1 and 1.
+def coarse(pool: Pool, part: slice) -> torch.Tensor:
+    """The coarse march of six lights, which is a pool's guide of kind "six": what a network has to be better than.
 
     Raises:
-        ValueError: A setting is out of its range, or the camera is in perspective.
+        ValueError: The pool's guides are of another kind.
     """
-    return six_way(volume, camera, step=step, g=g, estimate=False)
+    if pool.guides.shape[2] != len(_SIX):
+        raise ValueError(f"pool: expected guides of kind six, [N, 2, {len(_SIX)}, H, W]")
+    return pool.guides[part][:, :, [_SIX.index(name) for name in PLANES]].float()
 
 
-def billboard(baked: SixWay, seen: Camera, camera: Camera, pivot: np.ndarray) -> SixWay:
-    """Lightmaps baked from one side, on a billboard that turns to the camera: a flip book seen from elsewhere.
+def flip_book(held_out: HeldOut) -> tuple[Pool, Method]:
+    """What a flip book baked from the first view shows in the others: that view's own planes, as ``billboard`` does.
+
+    Returns:
+        The samples of the other views, none where there is one view, and the method for them.
+
+    Raises:
+        ValueError: The samples aren't whole sets of views.
+    """
+    pool, views = held_out.whole, held_out.settings.views
+    if len(pool) % views:
+        raise ValueError(f"pool: expected whole sets of {views} views, got {len(pool)} samples")
+    number = torch.arange(len(pool), device=pool.device)
+    others = number[(number % views > 0) & held_out.keep]
+    baked = pool.targets[others - others % views]
+    return pool.take(others), lambda _, part: baked[part].float()
+
+
+RIVALS: dict[str, Contender] = {COARSE: lambda held_out: (held_out.pool("six"), coarse), FLIP_BOOK: flip_book}
+"""What ``wlm smoke evaluate`` compares a network with."""
+
+
+def billboard(baked: SixWay, source: Camera, camera: Camera, pivot: np.ndarray) -> SixWay:
+    """Shows lightmaps that were baked from one side on a billboard that turns to the camera, as a flip book does.
 
     The billboard stands at the pivot and always faces the camera, so that a turn about the pivot changes nothing but
-    which way its axes point: the smoke keeps the look of the side that was baked. Lights are weighed in the axes of the
-    new camera, as engines do.
+    the directions of its axes: the smoke keeps the look of the side that was baked. Lights are weighted in the axes of
+    the new camera, as engines do.
 
     Args:
-        baked: From `seen`.
-        seen: Orthographic.
-        camera: Orthographic, from where it is looked at.
+        baked: From ``source``.
+        source: Orthographic.
+        camera: Orthographic, from where the billboard is seen.
         pivot: [3], the point of the world about which the billboard turns: the smoke's centre.
 
     Returns:
-        Lightmaps for `camera`; transparent beyond what was baked.
+        Lightmaps for ``camera``; transparent beyond what was baked.
 
     Raises:
-        ValueError: A camera is in perspective, or the lightmaps aren't those of `seen`.
+        ValueError: A camera is in perspective, or the lightmaps aren't those of ``source``.
     """
-    if seen.perspective or camera.perspective:
+    if source.perspective or camera.perspective:
         raise ValueError("a billboard needs orthographic cameras, as the lightmaps do")
-    if tuple(baked.lightmaps.shape[1:]) != (seen.height, seen.width):
-        raise ValueError(f"baked: expected {seen.height} x {seen.width}, got {tuple(baked.lightmaps.shape[1:])}")
+    if tuple(baked.lightmaps.shape[1:]) != (source.height, source.width):
+        raise ValueError(f"baked: expected {source.height} x {source.width}, got {tuple(baked.lightmaps.shape[1:])}")
     if baked.transparency is None:
         raise ValueError("baked: expected lightmaps with their transparency")
     planes = [baked.lightmaps, 1.0 - baked.transparency[None]]
     if baked.emission is not None:
         planes.append(baked.emission[None])
     # Where the new image's pixels lie about the pivot, and what pixel of the baked one lies there.
-    (x, y), (x0, y0) = _offset(camera, pivot), _offset(seen, pivot)
+    (x, y), (x0, y0) = _offset(camera, pivot), _offset(source, pivot)
     columns = (np.arange(camera.width) + 0.5 - 0.5 * camera.width) * camera.pitch - x + x0
     rows = (np.arange(camera.height) + 0.5 - 0.5 * camera.height) * camera.pitch + y - y0
-    u = torch.tensor(columns / (0.5 * seen.width * seen.pitch), dtype=torch.float32)
-    v = torch.tensor(rows / (0.5 * seen.height * seen.pitch), dtype=torch.float32)
+    u = torch.tensor(columns / (0.5 * source.width * source.pitch), dtype=torch.float32)
+    v = torch.tensor(rows / (0.5 * source.height * source.pitch), dtype=torch.float32)
     grid = torch.stack(torch.broadcast_tensors(u[None, :], v[:, None]), -1)[None].to(baked.lightmaps.device)
     read = torch.nn.functional.grid_sample(torch.cat(planes)[None], grid, align_corners=False)[0]
-    return SixWay(read[:6], 1.0 - read[6], read[7] if baked.emission is not None else None)
+    return SixWay(read[:6], 1.0 - read[6], read[7] if baked.emission is not None else None, camera)
 
 
 def _offset(camera: Camera, pivot: np.ndarray) -> tuple[float, float]:

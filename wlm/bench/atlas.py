@@ -2,9 +2,9 @@
 
 For each lightmap of each mesh these kinds of rows:
 
-- method "ours", a profile each: the file, the compression with the writing, the error as the mesh is seen from around,
-  and the time to read a million random points of its surface. In a full run also the first profile at the bits that
-  the paper's method came to.
+- method "ours", one row for each profile: the file, the compression with the writing, the error as the mesh is seen
+  from around, and the time to read a million random points of its surface. In a full run also the first profile at the
+  bits that the paper's method came to.
 - method "lightmap": the time to read the same points from the lightmap itself, in half floats.
 - the rivals of ``wlm.baselines.atlas`` at the bits of the first profile; in a full run also at those of the others.
   Bits are those of eq. 9 of lightmap-uv-clustering-cascade, which leave out UVs and headers; a rival's bytes are these
@@ -12,7 +12,8 @@ For each lightmap of each mesh these kinds of rows:
 - method "fit", of the first lightmap alone: the cascade tuned in views, as the paper does it, and at points of the
   surface; the time is that of the tuning alone.
 
-Where there are several lightmaps the last rows are the means over them; their largest error is the largest of all.
+Where there are several lightmaps the last rows are the means over them, with the least and the most of some figures;
+their largest error is the largest of all.
 
 A largest error is that against the float64 decode of the same model. A decode on CUDA is timed as the replay of a
 graph, so that gaps between launches do not count. The peaks of PSNR are those of ``wlm.atlas.evaluation``.
@@ -20,29 +21,27 @@ graph, so that gaps between launches do not count. The peaks of PSNR are those o
 
 import math
 import os
-import tempfile
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from statistics import fmean
 
 import numpy as np
 import torch
 import warp as wp
 
-from wlm import interop, system
+from wlm import interop
 from wlm.atlas.data import from_arrays
 from wlm.atlas.decode import Decoder
-from wlm.atlas.evaluation import Sampler, Score, compare
+from wlm.atlas.evaluation import Sampler, compare
 from wlm.atlas.exact import decode64
 from wlm.atlas.fit import compress
 from wlm.atlas.model import SOURCE_BITS, AtlasModel, Profile
 from wlm.atlas.views import surface_points
-from wlm.baselines.atlas import ATLAS_BASELINES
+from wlm.baselines.atlas import RIVALS, share_of
 from wlm.bench.atlas_inputs import Lightmap
 from wlm.bench.plot import Panel
-from wlm.bench.runner import Row, read_json, run_peers
+from wlm.bench.rows import MEAN, Row, read_json
+from wlm.bench.runner import Bench, Note, exact_errors
 from wlm.errors import WlmError
 from wlm.texels import fill_gaps
 
@@ -59,20 +58,19 @@ _RIVALS = {
     "single colour": "single colour",
 }
 _HELD_TO = ("standard", "astc", "compact")  # profiles whose bits rivals get when they run alone
-_FIRST = "downsampling"  # what everything is held against
+_FIRST = "downsampling"  # what everything is compared with
 _VIEWS, _RESOLUTION = 50, 512  # section 4.1.4; the paper doesn't say at which resolution it scores
 _QUICK_VIEWS, _QUICK_RESOLUTION = 8, 256
 _QUICK_CASCADE = {"steps": 30, "resolution": 256}
 _POINTS = 1_000_000
 _CHECKED = 1 << 17  # of them, against float64
-_SAME = 0.01  # shares of bits that differ by less are one
-_MEAN = "mean over"
+_SAME = 0.01  # shares of bits that differ by less are equal
+_AVERAGED = ("bytes", "bpp", "compression_ratio", "encode_seconds", "decode_ms", "psnr", "one_minus_ssim", "seam_ratio")
+_RANGED = ("psnr", "one_minus_ssim", "seam_ratio")  # with their least and most
 
 PANELS = (Panel("bpp", "psnr", ("ours", _FIRST, "BC6H", "ASTC")), Panel("decode_ms", "max_error", ("ours", "lightmap")))
 """What a plot of the rows shows: quality against size, of all but the weakest rivals, whose names would hide the rest;
-and what is wrong with a decode against its time."""
-
-Note = Callable[[str], None]
+and a decode's error against its time."""
 
 
 def run(
@@ -134,15 +132,18 @@ def run_rivals(
         WlmError: ``results`` can't be read, or has no row of a lightmap.
     """
     ours = [row for row in read_json(results)[0] if (row.system, row.method) == ("atlas", "ours")]
-    scored: list[_Entry] = []
+    rows: list[Row] = []
     for lightmap in lightmaps:
-        rows = [row for row in ours if row.scene == lightmap.scene and row.bpp and row.option in _HELD_TO]
-        if not rows:
+        shares = {
+            row.option: _share(row)
+            for row in ours
+            if row.scene == lightmap.scene and row.option in _HELD_TO and row.get("bpp")
+        }
+        if not shares:
             raise WlmError(f"{results}: expected a row of method ours of {lightmap.scene}")
-        bench = _Bench(lightmap, "cpu", 1, progress or (lambda line: None))
-        shares = [(row.option, row.bpp / SOURCE_BITS) for row in rows]
-        scored += bench.scored(bench.rivals(shares, tuple(_RIVALS)), _VIEWS, _RESOLUTION)
-    return [one.row for one in scored] + (_means(scored, len(lightmaps)) if len(lightmaps) > 1 else [])
+        bench = _AtlasBench(lightmap, "cpu", progress, 1)
+        rows += bench.scored(bench.rivals(shares, tuple(_RIVALS)), _VIEWS, _RESOLUTION)
+    return rows + _means(rows, len(lightmaps))
 
 
 def run_rows(
@@ -158,64 +159,44 @@ def run_rows(
     repeats: int | None = None,
     progress: Note | None = None,
 ) -> list[Row]:
-    """Measures given profiles on given lightmaps.
+    """Measures the given profiles; the rest as for ``run``.
 
     Args:
         lightmaps: At least one.
         profiles: At least one; the rivals have the bits of the first.
-        device: "cpu" or "cuda:0".
-        views: Cameras of the scores.
-        resolution: Their pixels along a side.
+        views, resolution: Cameras of the scores, and their pixels along a side.
         whole: With the first profile at the bits of a cascade, and rivals at the bits of all profiles.
         methods: The rivals.
         points: Read by a timed decode.
-        repeats: Samples of each decode time; None: 30 on CUDA, 5 on the CPU.
-        progress: As for ``run``.
-
-    Returns:
-        The rows.
-
-    Raises:
-        WlmError: As ``run``.
-        ValueError: No lightmap or no profile.
+        repeats: As for ``Bench``.
     """
     if not lightmaps or not profiles:
         raise ValueError("expected at least one lightmap and one profile")
-    device = interop.check_device(device)
-    note = progress or (lambda line: None)
-    note("compiling")
+    (progress or (lambda line: None))("compiling")
     for profile in profiles:
         _warm_up(profile, device)
-    few = device == "cpu"
-    scored: list[_Entry] = []
+    rows: list[Row] = []
     for lightmap in lightmaps:
-        bench = _Bench(lightmap, device, points, note)
+        bench = _AtlasBench(lightmap, device, progress, points, repeats)
         entries = bench.ours(profiles, whole)
+        shares = {entry.row.option: _share(entry.row) for entry in entries[: len(profiles)]}
         if lightmap is lightmaps[0]:
             entries += bench.tuned(entries)
-        bench.note("timing the decoders, in turns")
-        peers = [entry for entry in (*entries, bench.original(entries[0].model)) if entry.decode is not None]
-        timed = run_peers(
-            [(entry.row, entry.decode) for entry in peers],
-            device,
-            warmup=1 if few else 5,
-            repeats=repeats if repeats is not None else 5 if few else 30,
-        )
-        rows = dict(zip((id(entry) for entry in peers), timed, strict=True))
-        entries = [replace(entry, row=rows.get(id(entry), entry.row)) for entry in (*entries, *peers[-1:])]
-        shares = [
-            (entry.row.option, entry.share)
-            for entry in entries
-            if entry.model is not None and entry.row.option == entry.model.profile.name
-        ]
-        entries += bench.rivals(shares if whole else shares[:1], methods)
-        scored += bench.scored(entries, views, resolution)
-    return [one.row for one in scored] + (_means(scored, len(lightmaps)) if len(lightmaps) > 1 else [])
+        entries.append(bench.original(entries[0].model))
+        entries = bench.timed(entries)
+        entries += bench.rivals(shares if whole else {profiles[0].name: shares[profiles[0].name]}, methods)
+        rows += bench.scored(entries, views, resolution)
+    return rows + _means(rows, len(lightmaps))
 
 
 def plotted(rows: Sequence[Row]) -> list[Row]:
     """The rows that a plot shows: the means, or all where there are none."""
-    return [row for row in rows if row.scene.startswith(_MEAN)] or list(rows)
+    return [row for row in rows if row.scene.startswith(MEAN)] or list(rows)
+
+
+def _share(row: Row) -> float:
+    """Bits of eq. 9 over the lightmap's."""
+    return row["bpp"] / SOURCE_BITS
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,83 +205,86 @@ class _Entry:
 
     Attributes:
         row: Without score, and before the timing without a decode time.
-        share: Bits of eq. 9 over the lightmap's.
         sample: The decoder to score; None: none.
         decode: The decoder to time; None: none.
         model: Ours.
-        report: The score; None: none, or not yet.
-        full_size: Whether a rival has as many texels as the lightmap.
     """
 
     row: Row
-    share: float
     sample: Sampler | None = None
     decode: Callable[[], object] | None = None
     model: AtlasModel | None = None
-    report: Score | None = None
-    full_size: bool = False
 
 
-class _Bench:
-    """A lightmap, and where it is compressed and decoded."""
+class _AtlasBench(Bench):
+    """A lightmap, and points of its surface."""
 
-    def __init__(self, lightmap: Lightmap, device: str, points: int, note: Note):
-        self.mesh, self.scene, self.device = lightmap.mesh, lightmap.scene, device
-        self.note: Note = lambda line: note(f"{self.scene}: {line}")
+    def __init__(
+        self, lightmap: Lightmap, device: str, progress: Note | None, points: int, repeats: int | None = None
+    ) -> None:
+        super().__init__("atlas", device, progress, scene=lightmap.scene, repeats=repeats)
+        self.mesh = lightmap.mesh
         self.triangle, self.weight = surface_points(self.mesh, points, np.random.default_rng(0))
 
     def ours(self, profiles: Sequence[Profile], whole: bool) -> list[_Entry]:
         """Our profiles, and the first of them at the bits of the first cascade."""
-        entries = [self.fit(profile, profile.name) for profile in profiles]
+        entries = [self.entry(profile, profile.name) for profile in profiles]
         cascade = next((entry for entry in entries if entry.model.profile.method == "cascade"), None)
         if whole and cascade is not None and profiles[0].method == "tiles":
             option = f"{profiles[0].name}, bits of {cascade.row.option}"
             try:
-                entries.append(self.fit(profiles[0].model_copy(update={"budget": cascade.share}), option))
+                entries.append(self.entry(profiles[0].model_copy(update={"budget": _share(cascade.row)}), option))
             except WlmError as error:  # no room for a table
-                entries.append(_Entry(self._row("ours", option, notes=f"not measured: {error}"), cascade.share))
+                entries.append(_Entry(self.missing_row("ours", option, error)))
         return entries
 
-    def fit(self, profile: Profile, option: str) -> _Entry:
+    def entry(self, profile: Profile, option: str) -> _Entry:
         """Compresses and writes, and reads the file back."""
         self.note(f"{option}: compressing")
-        start = time.perf_counter()
-        model = compress(self.mesh, profile, device=self.device)
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "atlas.wlm"
-            size = model.save(path)
-            seconds = time.perf_counter() - start
-            # The file leaves the stages' times out.
-            model = replace(system.load(path, "atlas"), report=model.report)
-        decode, error, usual = self._decode(model)
-        share = 1.0 - model.compression_ratio
-        stages = ", ".join(f"{name} {value:.2g}" for name, value in model.report["seconds"].items())
-        notes = f"CR {100 * model.compression_ratio:.1f}%; {_kind(model)}; {usual}; s: {stages}"
-        figures = {"bytes": size, "bpp": SOURCE_BITS * share, "encode_seconds": seconds, "max_error": error}
-        row = self._row("ours", option, **figures, notes=notes)
-        return _Entry(row, share, Decoder(model, self.device), decode, model)
+        fit = self.fit(option, lambda: compress(self.mesh, profile, device=self.device))
+        model = replace(fit.model, report=fit.fitted.report)  # the file leaves the stages' times out
+        decode, errors = self._decode(model)
+        figures = {f"{stage}_seconds": seconds for stage, seconds in model.report["seconds"].items()}
+        row = self.row(
+            "ours",
+            option,
+            model.method,
+            bytes=fit.bytes,
+            bpp=SOURCE_BITS * (1.0 - model.compression_ratio),
+            compression_ratio=model.compression_ratio,
+            encode_seconds=fit.seconds,
+            steps=profile.steps if profile.method == "cascade" else None,
+            colour_width=model.texels.shape[1],
+            colour_height=model.texels.shape[0],
+            lut_width=model.lut.shape[1] or None,
+            lut_height=model.lut.shape[0] or None,
+            **errors,
+            **figures,
+        )
+        return _Entry(row, Decoder(model, self.device), decode, model)
 
     def tuned(self, entries: Sequence[_Entry]) -> list[_Entry]:
         """A cascade tuned in either space."""
-        own = next((entry for entry in entries if entry.model and "fit" in entry.model.report["seconds"]), None)
-        if own is None:
+        cascade = next((entry for entry in entries if entry.model and "fit" in entry.model.report["seconds"]), None)
+        if cascade is None:
             return []
         # A cascade that doesn't pay is scored as the cascade that it is, here.
-        alone = own.model.profile.model_copy(update={"fallback": False})
-        spaces = (alone.space, "uv" if alone.space == "views" else "views")
-        fits = [self.fit(alone.model_copy(update={"space": space}), f"{own.row.option}, {space}") for space in spaces]
-        return [self._tuned(entry) for entry in fits]
-
-    def _tuned(self, entry: _Entry) -> _Entry:
-        p, seconds = entry.model.profile, entry.model.report["seconds"]["fit"]
-        row = self._row(
-            "fit",
-            f"{p.name}, space {p.space}",
-            encode_seconds=seconds,
-            notes=f"{p.steps:,} steps at {p.resolution}²: {1e3 * seconds / max(p.steps, 1):.3g} ms a step; the tuning "
-            "alone",
-        )
-        return _Entry(row, entry.share, entry.sample)
+        alone = cascade.model.profile.model_copy(update={"fallback": False})
+        tuned = []
+        for space in (alone.space, "uv" if alone.space == "views" else "views"):
+            fit = self.entry(alone.model_copy(update={"space": space}), f"{cascade.row.option}, {space}")
+            seconds = fit.model.report["seconds"]["fit"]
+            row = self.row(
+                "fit",
+                f"{alone.name}, space {space}",
+                "the tuning alone",
+                encode_seconds=seconds,
+                step_ms=1e3 * seconds / max(alone.steps, 1),
+                steps=alone.steps,
+                resolution=alone.resolution,
+            )
+            tuned.append(_Entry(row, fit.sample))
+        return tuned
 
     def original(self, model: AtlasModel) -> _Entry:
         """The lightmap itself, in the place of a model of it."""
@@ -313,124 +297,105 @@ class _Bench:
             lut=np.empty((0, 0, 2), np.uint16),
             uv=np.empty((0, 3, 2), np.float32),
         )
-        decode, error, _ = self._decode(model)
-        figures = {"bytes": model.texels.nbytes, "bpp": SOURCE_BITS, "max_error": error}
-        return _Entry(self._row("lightmap", "half floats", **figures, notes="as it is"), 1.0, decode=decode)
+        decode, errors = self._decode(model)
+        figures = {"bytes": model.texels.nbytes, "bpp": SOURCE_BITS, "compression_ratio": 0.0}
+        return _Entry(self.row("lightmap", "half floats", "as it is", **figures, **errors), decode=decode)
 
-    def rivals(self, shares: Sequence[tuple[str, float]], methods: Sequence[str]) -> list[_Entry]:
+    def timed(self, entries: Sequence[_Entry]) -> list[_Entry]:
+        """Times the decoders of those that have one, in turns."""
+        peers = [entry for entry in entries if entry.decode is not None]
+        rows = self.time_rows([(entry.row, entry.decode) for entry in peers])
+        timed = {id(entry): row for entry, row in zip(peers, rows, strict=True)}
+        return [replace(entry, row=timed.get(id(entry), entry.row)) for entry in entries]
+
+    def rivals(self, shares: dict[str, float], methods: Sequence[str]) -> list[_Entry]:
         """The rivals at the bits of our profiles.
 
         One that holds the whole lightmap in fewer bits isn't measured twice.
 
         Args:
-            shares: Names of profiles, and their bits over the lightmap's.
+            shares: By profile, its bits over the lightmap's.
             methods: The rivals.
         """
-        result, done, enough = [], [], {}
-        for name, share in shares:
-            if any(abs(share / other - 1.0) < _SAME for other in done):
+        entries, measured, enough = [], [], {}
+        for profile, share in shares.items():
+            if any(abs(share / other - 1.0) < _SAME for other in measured):
                 continue
-            done.append(share)
+            measured.append(share)
             for method in methods:
                 if enough.get(method, math.inf) > share:
-                    self.note(f"{method}, bits of {name}")
-                    result.append(self._rival(method, f"bits of {name}", share))
+                    self.note(f"{method}, bits of {profile}")
+                    entries.append(self._rival(method, f"bits of {profile}", share))
+                    row = entries[-1].row
                     # ASTC has other blocks for other budgets.
-                    if result[-1].full_size and method != "ASTC":
-                        enough[method] = result[-1].share
-        return result
+                    if (row.get("colour_height"), row.get("colour_width")) == self.mesh.mask.shape and method != "ASTC":
+                        enough[method] = _share(row)
+        return entries
 
     def _rival(self, method: str, option: str, share: float) -> _Entry:
         try:
-            rival = ATLAS_BASELINES[_RIVALS[method]](self.mesh, share)
+            rival = RIVALS[_RIVALS[method]](self.mesh, share)
         except (WlmError, ValueError) as error:  # a package is missing, or nothing fits
-            return _Entry(self._row(method, option, notes=f"not measured: {error}"), share)
-        size = "" if rival.size is None else f"; {rival.size[1]}x{rival.size[0]} texels"
-        row = self._row(
+            return _Entry(self.missing_row(method, option, error))
+        share = share_of(rival, self.mesh)
+        height, width = rival.size or (None, None)
+        row = self.row(
             method,
             option,
-            bytes=math.ceil(int(rival.bits) / 8),
-            bpp=SOURCE_BITS * rival.share,
-            encode_seconds=rival.seconds,
-            notes=f"CR {100 * (1.0 - rival.share):.1f}%{size}; compressed on the CPU, no file",
+            "compressed on the CPU, no file",
+            bytes=rival.bytes,
+            bpp=SOURCE_BITS * share,
+            compression_ratio=1.0 - share,
+            encode_seconds=rival.encode_seconds,
+            colour_width=width,
+            colour_height=height,
         )
-        return _Entry(row, rival.share, rival.sample, full_size=rival.size == self.mesh.mask.shape)
+        return _Entry(row, rival.decoded)
 
-    def scored(self, entries: Sequence[_Entry], views: int, resolution: int) -> list[_Entry]:
+    def scored(self, entries: Sequence[_Entry], views: int, resolution: int) -> list[Row]:
         """Scores all in one go: each view is drawn once."""
         self.note(f"scoring, {views} views of {resolution}²")
         decoders = {str(i): entry.sample for i, entry in enumerate(entries) if entry.sample is not None}
         reports = compare(self.mesh, decoders, views=views, resolution=resolution, device=self.device)
-        result = []
-        for i, entry in enumerate(entries):
-            report, row = reports.get(str(i)), entry.row
-            if report is not None:
-                psnr, ssim = _known(report.psnr), _known(1.0 - report.one_minus_ssim)
-                row = replace(row, psnr=psnr, ssim=ssim, notes=f"{_scores(report)}; {row.notes}")
-            # The decoders are done with, and hold memory of the device.
-            result.append(_Entry(row, entry.share, report=report))
-        return result
+        rows = [entry.row for entry in entries]
+        for i, report in reports.items():
+            names = ("psnr", "psnr_worst", "texel_psnr", "one_minus_ssim", "seam_ratio")
+            rows[int(i)] = rows[int(i)].with_figures(**{name: getattr(report, name) for name in names})
+        return rows
 
-    def _decode(self, model: AtlasModel) -> tuple[Callable[[], object], float, str]:
-        """What is timed, the largest error against float64, and where nearly all errors lie.
-
-        A point that rounding puts into the neighbouring tile has an error far beyond all others.
-        """
+    def _decode(self, model: AtlasModel) -> tuple[Callable[[], object], dict[str, float]]:
+        """The decode to time, and its errors against float64."""
         decoder = Decoder(model, self.device)
         corner = model.uv if len(model.uv) else self.mesh.uv[self.mesh.triangle]
         uv = np.einsum("nk,nkc->nc", self.weight, corner[self.triangle]).astype(np.float32)
-        own = torch.from_numpy(uv).to(self.device)
+        points = interop.to_warp(torch.from_numpy(uv).to(self.device), wp.vec2)
         out = torch.empty((len(uv), 3), dtype=torch.float32, device=self.device)
-        places = interop.to_warp(own, wp.vec2)
-        decoder.run(places, out)
+        decoder.run(points, out)
         wp.synchronize_device(self.device)
-        error = np.abs(out[:_CHECKED].cpu().numpy() - decode64(model, uv[:_CHECKED])).max(1)
-        usual = f"99.9% of points within {np.percentile(error, 99.9):.2g} of float64"
-        return interop.StepGraph(lambda: decoder.run(places, out), self.device, warmup=1), float(error.max()), usual
-
-    def _row(self, method: str, option: str, **values) -> Row:
-        return Row("atlas", self.scene, method, option, **values)
+        errors = exact_errors(out[:_CHECKED].cpu().numpy(), decode64(model, uv[:_CHECKED]))
+        return self.replay(lambda: decoder.run(points, out)), errors
 
 
-def _means(scored: Sequence[_Entry], lightmaps: int) -> list[Row]:
-    """A row for each method and option that was measured more than once."""
-    groups: dict[tuple[str, str], list[_Entry]] = {}
-    for one in scored:
-        if not one.row.notes.startswith("not measured"):
-            groups.setdefault((one.row.method, one.row.option), []).append(one)
-    rows = []
+def _means(rows: Sequence[Row], lightmaps: int) -> list[Row]:
+    """A row for each method and option that was measured on more than one lightmap."""
+    groups: dict[tuple[str, str], list[Row]] = {}
+    for row in rows:
+        if row.figures and row.method != "fit":
+            groups.setdefault((row.method, row.option), []).append(row)
+    means = []
     for (method, option), group in groups.items():
-        if method == "fit" or len(group) < 2:
+        if len(group) < 2:
             continue
-
-        def mean(name: str, group=group) -> float | None:
-            values = [value for one in group if (value := getattr(one.row, name)) is not None]
-            return fmean(values) if values else None
-
-        size, error = mean("bytes"), [one.row.max_error for one in group if one.row.max_error is not None]
-        notes = f"{len(group)} lightmaps; CR {100 * (1.0 - fmean(one.share for one in group)):.1f}%"
-        reports = [one.report for one in group if one.report is not None]
-        for title, values in (
-            ("PSNR", [report.psnr for report in reports]),
-            ("1-SSIM", [report.one_minus_ssim for report in reports]),
-            ("seam ratio", [report.seam_ratio for report in reports]),
-        ):
-            finite = [value for value in values if math.isfinite(value)]
-            if finite:
-                notes += f"; {title} {min(finite):.4g} to {max(finite):.4g}, mean {fmean(finite):.4g}"
-        rows.append(
-            Row(
-                "atlas",
-                f"{_MEAN} {lightmaps} lightmaps",
-                method,
-                option,
-                bytes=None if size is None else round(size),
-                max_error=max(error, default=None),
-                notes=notes,
-                **{name: mean(name) for name in ("bpp", "encode_seconds", "decode_ms", "psnr", "ssim")},
-            )
-        )
-    return rows
+        figures: dict[str, float | None] = {}
+        for name in _AVERAGED:
+            if values := [row[name] for row in group if name in row.figures]:
+                figures[name] = fmean(values)
+                if name in _RANGED:
+                    figures |= {f"{name}_min": min(values), f"{name}_max": max(values)}
+        figures["max_error"] = max((row["max_error"] for row in group if "max_error" in row.figures), default=None)
+        figures["lightmaps"] = len(group)
+        means.append(Row("atlas", f"{MEAN} {lightmaps} lightmaps", method, option, figures))
+    return means
 
 
 def _warm_up(profile: Profile, device: str) -> None:
@@ -442,26 +407,3 @@ def _warm_up(profile: Profile, device: str) -> None:
     small = {"views": 1, "steps": min(profile.steps, 4), "resolution": 64, "budget": 1.0}
     model = compress(mesh, profile.model_copy(update=small), device=device)
     Decoder(model, device).lightmap(mesh)
-
-
-def _kind(model: AtlasModel) -> str:
-    steps = f" of {model.profile.steps:,} steps" if model.profile.method == "cascade" else ""
-    lut = f", T_c {model.lut.shape[1]}x{model.lut.shape[0]}" if model.lut.size else ""
-    return f"{model.method}{steps}, T_p {model.texels.shape[1]}x{model.texels.shape[0]}{lut}"
-
-
-def _scores(report: Score) -> str:
-    """What a row has no column for. SSIM's four figures say little where 1 - SSIM is what methods differ by."""
-    figures = (
-        ("1-SSIM", report.one_minus_ssim, ".2g", ""),
-        ("worst view", report.psnr_worst, ".2f", " dB"),
-        ("seam ratio", report.seam_ratio, ".2f", ""),
-        ("texels", report.texel_psnr, ".2f", " dB"),
-    )
-    known = [f"{name} {value:{form}}{unit}" for name, value, form, unit in figures if math.isfinite(value)]
-    return ", ".join(known) or "no range to measure against"
-
-
-def _known(value: float) -> float | None:
-    """JSON has no infinity: a lightmap without a range has no PSNR, and one decoded exactly none either."""
-    return value if math.isfinite(value) else None

@@ -1,4 +1,4 @@
-"""The lightmaps that the atlas benchmark measures."""
+"""The inputs of the atlas benchmark: lightmaps of meshes."""
 
 import os
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ __all__ = ["Lightmap", "load"]
 
 @dataclass(frozen=True, eq=False)
 class Lightmap:
-    """A lightmap of a mesh, and the name that its rows have."""
+    """A mesh with its lightmap, and the scene of its rows."""
 
     scene: str
     mesh: LightmappedMesh
@@ -27,7 +27,7 @@ def load(
     lightmap_paths: Sequence[str | os.PathLike[str]] = (),
     mask_path: str | os.PathLike[str] | None = None,
 ) -> list[Lightmap]:
-    """Reads what a run measures.
+    """Reads the lightmaps of a run.
 
     Args:
         meshes_path: A folder of a mesh, or of such folders: each has one ``.glb``, its lightmaps, ``.exr``, and maybe
@@ -56,21 +56,21 @@ def load(
     folder = Path(meshes_path)
     if not folder.is_dir():
         raise WlmError(f"{folder}: no such folder; expected one of meshes with their lightmaps")
-    found = []
+    lightmaps = []
     for each in (folder, *sorted(path for path in folder.iterdir() if path.is_dir())):
-        meshes, lightmaps = sorted(each.glob("*.glb")), sorted(each.glob("*.exr"))
+        meshes, images = sorted(each.glob("*.glb")), sorted(each.glob("*.exr"))
         if len(meshes) > 1:
             raise WlmError(f"{each}: expected one .glb a folder, found {len(meshes)}")
-        if meshes and lightmaps:
+        if meshes and images:
             mask = each / "mask.png"
-            found += _lightmaps(meshes[0], lightmaps, mask if mask.is_file() else None)
-    if not found:
+            lightmaps += _lightmaps(meshes[0], images, mask if mask.is_file() else None)
+    if not lightmaps:
         raise WlmError(f"{folder}: expected a .glb and its .exr in it or in folders of it, found none")
-    return found
+    return lightmaps
 
 
 def _lightmaps(mesh: Path, lightmaps: Sequence[Path], mask: str | os.PathLike[str] | None) -> list[Lightmap]:
     name = mesh.resolve().parent.name if mesh.stem == "mesh" else mesh.stem
     scenes = [name if path.stem == name else f"{name} {path.stem}" for path in lightmaps]
     meshes = (load_mesh(mesh, path, mask_path=mask) for path in lightmaps)
-    return [Lightmap(*one) for one in zip(scenes, meshes, strict=True)]
+    return [Lightmap(*pair) for pair in zip(scenes, meshes, strict=True)]

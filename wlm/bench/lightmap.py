@@ -2,36 +2,35 @@
 
 Four kinds of rows:
 
-- method "ours", a profile each: the file, the fit, the errors of the float decode against the input, and the decode
-  time of the whole map to 8 bits on the fast path.
-- methods "exact" (a texel a thread) and "strip" (the fast path), a GELU each, of profile M: the 8-bit output against
-  the input, and its largest error against the float64 path. Half a level of 8 bits, 0.00196, is the rounding itself.
-- the block codecs of ``wlm.baselines``, on the same lightmaps.
-- method "fit", a profile each: the speed of the fit alone; and the same fit in plain torch, all of it on CUDA in a
-  full run, else a few steps.
+- method "ours", one row for each profile: the file, the fit, the errors of the float decode against the input, and the
+  decode time of the whole map to 8 bits on the fast path. The largest error is in radiance, against the float64 path.
+- methods "exact" (one texel per thread) and "strip" (the fast path), one row for each form of the GELU, of profile M:
+  the 8-bit output against the input, and its largest error against the float64 path as a share of 255. Half a level of
+  8 bits, 0.00196, is the rounding itself.
+- the block codecs of ``wlm.baselines.lightmap``, on the same lightmaps.
+- method "fit", one row for each profile: the speed of the fit alone; and the same fit in plain torch, all of it on CUDA
+  in a full run, else a few steps.
 
 A decode on CUDA is timed as the replay of a graph, so that gaps between launches do not count; block codecs decode on
 the CPU alone, and in a texture unit on a GPU, so that they have a decode time on the CPU alone.
 """
 
 import os
-import tempfile
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import replace
 
 import numpy as np
 
-import wlm
-from wlm import interop
-from wlm.baselines import BASELINES
+from wlm.baselines.lightmap import RIVALS
 from wlm.baselines.lightmap_torch import PlainFit
-from wlm.bench.runner import Row, run_peers
+from wlm.bench.plot import Panel
+from wlm.bench.rows import Row
+from wlm.bench.runner import Bench, Fit, Note, demo_data
 from wlm.errors import WlmError
 from wlm.lightmap.data import LightmapSet, load
 from wlm.lightmap.decode import Decoder
-from wlm.lightmap.evaluation import bits_per_texel
+from wlm.lightmap.evaluation import bits_per_texel, count_kinds
 from wlm.lightmap.exact import bound64, colour_tile64, decode_tile64
 from wlm.lightmap.fit import compress, dynamic_targets
 from wlm.lightmap.model import TILE, LightmapModel, Profile, TimeAxis, encode_time
@@ -39,7 +38,7 @@ from wlm.lightmap.runtime import ExactDecoder, StripDecoder
 from wlm.lightmap.tiles import TileGrid, TileKind, assemble
 from wlm.metrics import METRICS, Summary, evaluate_frame, summarise
 
-__all__ = ["PROFILES", "QUICK_PROFILES", "run", "run_rows"]
+__all__ = ["PANELS", "PROFILES", "QUICK_PROFILES", "run", "run_rows"]
 
 PROFILES = ("L", "M", "H", "M64", "M-paper")
 """Profiles of a full run: the paper's table 3, and M as the paper fits it."""
@@ -47,13 +46,16 @@ PROFILES = ("L", "M", "H", "M64", "M-paper")
 QUICK_PROFILES = ("L", "M", "M-paper")
 """Profiles of a quick run."""
 
+PANELS = (Panel("decode_ms"), Panel("bpp"))
+"""What a plot of the rows shows: quality against time and size."""
+
 # A quick fit is worth this many steps of one tile, however many tiles there are: under a minute on two CPU cores.
 _QUICK_TILE_STEPS = 8_000
 _QUICK_SAMPLES = 2048
 _QUICK_HOURS = (9.0, 12.0, 21.0)  # morning, noon and lamps
 _FULL_TILES = 64  # of 1024 x 1024
 _PLAIN_STEPS = 10  # of the fit in plain torch, where it isn't run to its end
-_ERROR_TIMES = 3  # the float64 path takes 30 ms a tile and time
+_ERROR_TIMES = 3  # the float64 path takes 30 ms for one tile at one time
 
 # GELU by its gate, which is shorter to read in a plot.
 _GELUS = {"exact": "erf", "tanh": "tanh", "fast": "fast tanh"}
@@ -67,15 +69,13 @@ _CODECS = {
     "8bit": ("8 bits", ""),
 }
 
-Report = Callable[[str], None]
-
 
 def run(
     *,
     quick: bool,
     device: str,
     set_path: str | os.PathLike[str] | None = None,
-    progress: Report | None = None,
+    progress: Note | None = None,
 ) -> list[Row]:
     """Measures the lightmap system on one set.
 
@@ -83,8 +83,7 @@ def run(
         quick: Three profiles with short fits, scored at three times (9, 12 and 21 h if the set has them): four
             minutes on two CPU cores for 16 tiles. Its errors are those of unfinished fits.
         device: "cpu" or "cuda:0", for fits and decodes.
-        set_path: A set as ``wlm.lightmap.load`` reads it; None: the checkout's ``demos/data/city``, two
-            tiles of the city.
+        set_path: A lightmap set; None: the checkout's ``demos/data/city``, two tiles of the city.
         progress: Called with a line before each part of the work.
 
     Returns:
@@ -93,16 +92,11 @@ def run(
     Raises:
         WlmError: The set or the device isn't there, or a fit diverged.
     """
-    if set_path is None:
-        set_path = Path(wlm.__file__).resolve().parents[1] / "demos" / "data" / "city"
-        if not set_path.is_dir():
-            raise WlmError("bench lightmap: the demo's set comes with a checkout alone; expected --set PATH")
-    lightmaps = load(set_path)
+    lightmaps = load(demo_data("city", "--set PATH") if set_path is None else set_path)
     profiles = [Profile.load(name) for name in (QUICK_PROFILES if quick else PROFILES)]
     chosen = np.arange(len(lightmaps.times))
     if quick:
-        tiles = TileGrid.of(*lightmaps.mask.shape).count
-        steps = max(200, _QUICK_TILE_STEPS // tiles)
+        steps = max(200, _QUICK_TILE_STEPS // TileGrid.of(*lightmaps.mask.shape).count)
         profiles = [
             profile.model_copy(update={"steps": min(steps, profile.steps), "samples": _QUICK_SAMPLES})
             for profile in profiles
@@ -118,52 +112,35 @@ def run_rows(
     device: str,
     chosen: Sequence[int] | np.ndarray,
     repeats: int | None = None,
-    progress: Report | None = None,
+    progress: Note | None = None,
 ) -> list[Row]:
-    """Measures given profiles on a given set.
+    """Measures the given profiles on a given set; the rest as for ``run``.
 
     Args:
         lightmaps: The set.
         profiles: At least one. The rows of decode options are of the one named "M", else of the first.
-        device: "cpu" or "cuda:0".
-        chosen: Places of the times that are scored, int [K].
-        repeats: Samples of each decode time; None: 30 on CUDA, 5 on the CPU, where a sample is a whole map.
-        progress: As for ``run``.
-
-    Returns:
-        The rows.
-
-    Raises:
-        WlmError: As ``run``.
-        ValueError: No profile, or no time.
+        chosen: Indices of the times that are scored, int [K], at least one.
+        repeats: As for ``Bench``.
     """
     if not profiles or len(chosen) == 0:
         raise ValueError("expected at least one profile and one time")
-    device = interop.check_device(device)
-    report = progress or (lambda line: None)
-    bench = _Bench(lightmaps, device, np.asarray(chosen), report)
-    with tempfile.TemporaryDirectory() as folder:
-        fits = [bench.fit(profile, Path(folder)) for profile in profiles]
+    bench = _LightmapBench(lightmaps, np.asarray(chosen), device, progress, repeats)
+    fits = [bench.fit_profile(profile) for profile in profiles]
     peers = [bench.profile_row(fit) for fit in fits]
-    best = next((fit for fit in fits if fit.profile.name == "M"), fits[0])
+    best = next((fit for fit in fits if fit.option == "M"), fits[0])
     if (best.model.kind >= TileKind.STATIC).any():
         # On the CPU "fast" is "tanh".
-        gelus = [gelu for gelu in _GELUS if device != "cpu" or gelu != "fast"]
-        for path in ("exact", "strip"):
-            peers += [bench.option_row(best, path, gelu) for gelu in gelus]
-    report("timing the decoders, in turns")
-    few = device == "cpu"
-    rows = run_peers(
-        peers, device, warmup=1 if few else 5, repeats=repeats if repeats is not None else 5 if few else 30
-    )
+        gelus = [gelu for gelu in _GELUS if bench.device != "cpu" or gelu != "fast"]
+        peers += [bench.option_row(best, path, gelu) for path in ("exact", "strip") for gelu in gelus]
+    rows = bench.time_rows(peers)
     rows += [bench.codec_row(name) for name in _CODECS]
     rows += [bench.fit_row(fit) for fit in fits]
-    plain = bench.plain_row(best, whole=device != "cpu" and len(chosen) == len(lightmaps.times))
-    return rows + ([plain] if plain else [])
+    whole = bench.device != "cpu" and len(chosen) == len(lightmaps.times)
+    return rows + bench.plain_rows(best, whole=whole)
 
 
 def _quick_times(times: np.ndarray) -> np.ndarray:
-    """Places of the three hours, or of three times spread evenly."""
+    """Indices of the three hours, or of three times spread evenly."""
     if np.isin(_QUICK_HOURS, times).all():
         return np.searchsorted(times, _QUICK_HOURS)
     return np.unique(np.linspace(0, len(times) - 1, 3).round().astype(int))
@@ -175,155 +152,131 @@ def _hours(times: Sequence[float]) -> str:
 
 def _repeated(model: LightmapModel, count: int) -> LightmapModel:
     """The model of a map that holds the tiles of this one several times over."""
-    parts = (
-        "kind",
-        "uv",
-        "uvt",
-        "ut",
-        "vt",
-        "net",
-        "net_static",
-        "scale",
-        "scale_static",
-        "peak",
-        "affine",
-        "constant",
-    )
-    arrays = {part: np.concatenate([getattr(model, part)] * count) for part in parts}
+    arrays = {name: np.concatenate([array] * count) for name, array in model.parts.items()}
     return replace(model, width=TILE * len(model.kind), height=TILE * count, **arrays)
 
 
-@dataclass(frozen=True)
-class _Fit:
-    profile: Profile
-    model: LightmapModel  # as read back from the file
-    bytes: int
-    fit_seconds: float
-    write_seconds: float
+class _LightmapBench(Bench):
+    """A set, and the times of it that are scored."""
 
-
-class _Bench:
-    """A set, where it is decoded, and the times that are scored."""
-
-    def __init__(self, lightmaps: LightmapSet, device: str, chosen: np.ndarray, report: Report):
-        self.lightmaps, self.device, self.chosen, self.report = lightmaps, device, chosen, report
+    def __init__(
+        self, lightmaps: LightmapSet, chosen: np.ndarray, device: str, progress: Note | None, repeats: int | None
+    ) -> None:
+        super().__init__("lightmap", device, progress, scene=lightmaps.name, repeats=repeats)
+        self.lightmaps, self.chosen = lightmaps, chosen
         self.times = [float(t) for t in lightmaps.times[chosen]]
         self.grid = TileGrid.of(*lightmaps.mask.shape)
-        count = len(lightmaps.times)
-        if len(chosen) == count:
-            self.scored = f"scored at all {count} times"
-        else:
-            self.scored = f"scored at {_hours(self.times)} of {count} times"
+        places = np.linspace(0, len(self.times) - 1, min(_ERROR_TIMES, len(self.times))).round().astype(int)
+        self.error_times = [self.times[i] for i in places]
+        """Those at which the float64 path is run too."""
+        self.scored = {"times": len(lightmaps.times), "times_scored": len(chosen)}
+        whole = len(chosen) == len(lightmaps.times)
+        self.scored_at = "" if whole else f"scored at {_hours(self.times)}; "
 
-    def fit(self, profile: Profile, folder: Path) -> _Fit:
+    def fit_profile(self, profile: Profile) -> Fit:
         """Fits and writes a profile; compiling its kernels is no part of either time."""
-        self.report(f"{profile.name}: fitting {self.grid.count} tiles, {profile.steps:,} steps")
+        self.note(f"{profile.name}: fitting {self.grid.count} tiles, {profile.steps:,} steps")
         compress(self.lightmaps, profile.model_copy(update={"steps": 10}), device=self.device)
-        start = time.perf_counter()
-        model = compress(self.lightmaps, profile, device=self.device)
-        fitted = time.perf_counter()
-        path = folder / f"{profile.name}.wlm"
-        size = model.save(path)
-        written = time.perf_counter()
-        return _Fit(profile, wlm.load(path), size, fitted - start, written - fitted)
+        return self.fit(profile.name, lambda: compress(self.lightmaps, profile, device=self.device))
 
-    def profile_row(self, fit: _Fit) -> tuple[Row, Callable[[], object]]:
-        """What a profile costs and gives, but for the time of its decode, which is the function's."""
-        self.report(f"{fit.profile.name}: scoring")
+    def profile_row(self, fit: Fit) -> tuple[Row, Callable[[], object]]:
+        """What a profile costs and yields; and its decode, to be timed."""
+        self.note(f"{fit.option}: scoring")
         model = fit.model
         decoder = Decoder(model, self.device)
         frames = {t: decoder.frame(t) for t in self.times}
         error = 0.0
-        for t in self._error_times():
-            tiles = np.stack([decode_tile64(model, number, t) for number in range(self.grid.count)])
-            exact = assemble(tiles, np.arange(self.grid.count), self.grid)
+        for t in self.error_times:
+            exact = self._assembled(np.stack([decode_tile64(model, number, t) for number in range(self.grid.count)]))
             error = max(error, float(np.abs(frames[t] - exact).max()))
-        row = self._row(
+        row = self.row(
             "ours",
-            fit.profile.name,
-            self._score(frames.values(), fit.profile.name),
+            fit.option,
+            f"{self.scored_at}errors of the float decode; time of the whole map to 8 bits, {self.mode}",
             bytes=fit.bytes,
             bpp=bits_per_texel(model, self.lightmaps.mask, fit.bytes),
-            encode_seconds=fit.fit_seconds + fit.write_seconds,
+            encode_seconds=fit.seconds,
             max_error=error,
-            notes=f"{self._kinds(model)}; {fit.profile.steps:,} steps; {self.scored}; errors of the float decode, "
-            f"max error in radiance; {self._timed('the whole map to 8 bits')}",
+            steps=model.profile.steps,
+            **self._score(frames.values(), fit.option),
+            **self._tiles(model),
         )
         return row, self._decode(self._decoders(model, "strip", None))
 
-    def option_row(self, fit: _Fit, path: str, gelu: str) -> tuple[Row, Callable[[], object]]:
+    def option_row(self, fit: Fit, path: str, gelu: str) -> tuple[Row, Callable[[], object]]:
         """One way to decode a profile to 8 bits."""
-        self.report(f"{fit.profile.name}: {path} decode with {gelu} GELU")
+        self.note(f"{fit.option}: {path} decode with {gelu} GELU")
         model = fit.model
         decoders = self._decoders(model, path, gelu)
         # A small map leaves most of a GPU idle: there the time is that of 1024 x 1024, the same tiles repeated.
         repeat = 1 if self.device == "cpu" else max(1, _FULL_TILES // self.grid.count)
         timed = _repeated(model, repeat)
-        what = "the whole map" if repeat == 1 else f"{len(timed.kind)} tiles, the map's {repeat} times over"
-        frames, error, few = [], 0.0, self._error_times()
+        frames, error = [], 0.0
         for t in self.times:
-            tiles, worst = self._tiles_8bit(model, decoders, t, compare=t in few)
-            frames.append(assemble(tiles, np.arange(self.grid.count), self.grid))
+            tiles, worst = self._tiles_8bit(model, decoders, t, compare=t in self.error_times)
+            frames.append(self._assembled(tiles))
             error = max(error, worst)
-        own = ", the model's own" if gelu == model.profile.gelu else ""
-        row = self._row(
+        trained = ", as trained" if gelu == model.profile.gelu else ""
+        row = self.row(
             path,
             _GELUS[gelu],
-            # What an option costs shows in PSNR and in its largest error; FLIP would take most of the run.
-            self._score(frames, path, ("psnr",)),
+            f"profile {fit.option}, GELU by {_GELUS[gelu]}{trained}; {self.scored_at}errors of the 8-bit output, the "
+            f"largest as a share of 255 at {_hours(self.error_times)}; time {self.mode}",
             max_error=error,
-            notes=f"profile {fit.profile.name}, GELU by {_GELUS[gelu]}{own}; {self.scored}, float64 at {_hours(few)}; "
-            f"errors of the 8-bit output, max error as a share of 255; {self._timed(what)}",
+            tiles_timed=len(timed.kind),
+            # What an option costs shows in PSNR and in its largest error; FLIP would take most of the run.
+            **self._score(frames, path, ("psnr",)),
         )
         return row, self._decode(self._decoders(timed, path, gelu))
 
     def codec_row(self, name: str) -> Row:
-        """A block codec on the same lightmaps, each time on its own."""
+        """A block codec on the same lightmaps, each time alone."""
         method, option = _CODECS[name]
-        self.report(f"{method} {option}".strip())
-        encode = BASELINES[name]
+        self.note(f"{method} {option}".strip())
         try:
-            results = [encode(self.lightmaps.frames[i], self.lightmaps.mask) for i in self.chosen]
-        except WlmError as error:  # a codec's package is missing, or one that it needs
-            return Row("lightmap", self.lightmaps.name, method, option, notes=f"not measured: {error}")
-        count, used = len(self.lightmaps.times), len(results)
-        p10, median, p90 = np.percentile([1e3 * result.decode_seconds for result in results], [10, 50, 90])
-        size = count * results[0].bytes  # a fixed rate: every time weighs the same
-        row = self._row(
+            rivals = [RIVALS[name](self.lightmaps.frames[i], self.lightmaps.mask) for i in self.chosen]
+        except WlmError as error:
+            return self.missing_row(method, option, error)
+        count = len(self.lightmaps.times)
+        size = count * rivals[0].bytes  # a fixed rate: every time has as many bytes
+        row = self.row(
             method,
             option,
-            self._score([result.decoded for result in results], method),
+            f"{self.scored_at}size and encode time of all times; one CPU thread",
             bytes=size,
             bpp=size * 8 / (self.lightmaps.mask.size * count),
-            encode_seconds=sum(result.encode_seconds for result in results) * count / used,
-            notes=f"{self.scored}, sizes of all {count}; one CPU thread"
-            + ("" if used == count else f"; encode time of {used} scaled to {count}"),
+            encode_seconds=sum(rival.encode_seconds for rival in rivals) * count / len(rivals),
+            **self._score([rival.decoded for rival in rivals], method),
         )
-        if self.device == "cpu":
-            row = replace(row, decode_ms=float(median), decode_ms_spread=float(p90 - p10))
-        return row
+        if self.device != "cpu":
+            return row
+        p10, median, p90 = np.percentile([1e3 * rival.decode_seconds for rival in rivals], [10, 50, 90])
+        return row.with_figures(decode_ms=float(median), decode_ms_spread=float(p90 - p10))
 
-    def fit_row(self, fit: _Fit) -> Row:
+    def fit_row(self, fit: Fit) -> Row:
         """The speed of a fit."""
-        profile = fit.profile
-        step_ms = 1e3 * fit.fit_seconds / profile.steps
-        return Row(
-            "lightmap",
-            self.lightmaps.name,
+        profile = fit.model.profile
+        return self.row(
             "fit",
-            f"{profile.name} {profile.steps:,} steps",
+            f"{fit.option} {profile.steps:,} steps",
+            "all tiles together",
             encode_seconds=fit.fit_seconds,
-            notes=f"{self._kinds(fit.model)} together, {profile.samples:,} samples each: {step_ms:.3g} ms a step",
+            step_ms=1e3 * fit.fit_seconds / profile.steps,
+            steps=profile.steps,
+            samples=profile.samples,
+            **self._tiles(fit.model),
         )
 
-    def plain_row(self, fit: _Fit, whole: bool) -> Row | None:
-        """The same fit in plain torch, all of its steps or a few; None where no tile is dynamic."""
-        profile = fit.profile.model_copy(update={"metric_weight": 0.0})
+    def plain_rows(self, fit: Fit, whole: bool) -> list[Row]:
+        """The same fit in plain torch, all of its steps or a few; none where no tile is dynamic."""
+        profile = fit.model.profile.model_copy(update={"metric_weight": 0.0})
         targets = dynamic_targets(self.lightmaps, profile)
         if targets is None:
-            return None
-        self.report(f"{profile.name}: the fit in plain torch")
+            return []
+        self.note(f"{fit.option}: the fit in plain torch")
         tau, encoding = encode_time(TimeAxis(self.lightmaps.times, self.lightmaps.period, profile.time_axis))
+        sizes = ("hidden", "uvt_resolution", "uvt_slices", "plane_columns", "plane_rows")
+        rates = ("samples", "steps", "map_rate", "net_rate", "final_rate")
         peer = PlainFit(
             tau=tau,
             encoding=encoding,
@@ -331,14 +284,8 @@ class _Bench:
             texels=targets.texels,
             count=targets.count,
             weight=targets.weight,
-            sizes=(
-                profile.hidden,
-                profile.uvt_resolution,
-                profile.uvt_slices,
-                profile.plane_columns,
-                profile.plane_rows,
-            ),
-            rates=(profile.samples, profile.steps, profile.map_rate, profile.net_rate, profile.final_rate),
+            sizes=tuple(getattr(profile, name) for name in sizes),
+            rates=tuple(getattr(profile, name) for name in rates),
             seed=0,
             device=self.device,
         )
@@ -349,47 +296,37 @@ class _Bench:
             loss = peer.step()
         loss.item()  # waits for the device
         seconds = time.perf_counter() - start
-        ours = fit.fit_seconds / fit.profile.steps
-        return Row(
-            "lightmap",
-            self.lightmaps.name,
+        row = self.row(
             "fit in plain torch",
-            f"{profile.name} {steps:,} steps",
+            f"{fit.option} {steps:,} steps",
+            "maps stay continuous, no file",
             encode_seconds=seconds,
-            notes=f"maps stay continuous, no file; {1e3 * seconds / steps:.3g} ms a step, {seconds / steps / ours:.3g} "
-            f"times ours",
+            step_ms=1e3 * seconds / steps,
+            times_ours=seconds / steps / (fit.fit_seconds / profile.steps),
+            steps=steps,
         )
+        return [row]
 
-    def _row(self, method: str, option: str, summary: Summary, **values) -> Row:
-        scores = {"psnr": summary.psnr, "ssim": summary.ssim, "flip": summary.flip}
-        scores = {name: value if np.isfinite(value) else None for name, value in scores.items()}
-        return Row("lightmap", self.lightmaps.name, method, option, **scores, **values)
+    def _assembled(self, tiles: np.ndarray) -> np.ndarray:
+        return assemble(tiles, np.arange(self.grid.count), self.grid)
 
-    def _kinds(self, model: LightmapModel) -> str:
-        kinds = [
-            (int((model.kind == kind).sum()), kind.name.lower())
-            for kind in reversed(TileKind)
-            if kind != TileKind.EMPTY
-        ]
-        return ", ".join(f"{count} {name}" for count, name in kinds if count) + " tiles"
+    def _tiles(self, model: LightmapModel) -> dict[str, int]:
+        """Counts tiles by kind; those without valid texels are left out."""
+        kinds = count_kinds(model).items()
+        return {f"{kind}_tiles": count for kind, count in kinds if count and kind != "empty"}
 
-    def _timed(self, what: str) -> str:
-        return f"time of {what}, {'one thread' if self.device == 'cpu' else 'replayed as a graph'}"
-
-    def _error_times(self) -> list[float]:
-        places = np.linspace(0, len(self.times) - 1, min(_ERROR_TIMES, len(self.times))).round().astype(int)
-        return [self.times[i] for i in places]
-
-    def _score(self, frames: Iterable[np.ndarray], name: str, metrics: Sequence[str] = METRICS) -> Summary:
-        return summarise(
+    def _score(self, frames: Iterable[np.ndarray], name: str, metrics: Sequence[str] = METRICS) -> dict[str, float]:
+        """PSNR, SSIM and FLIP of lightmaps at the chosen times, and how many these are."""
+        summary: Summary = summarise(
             [
                 evaluate_frame(self.lightmaps.frames[i], frame, self.lightmaps.mask, TILE, metrics, name=name)
                 for i, frame in zip(self.chosen, frames, strict=True)
             ]
         )
+        return {"psnr": summary.psnr, "ssim": summary.ssim, "flip": summary.flip, **self.scored}
 
     def _decoders(self, model: LightmapModel, path: str, gelu: str | None) -> list[StripDecoder | ExactDecoder]:
-        """What decodes the tiles with maps; a constant tile needs no launch."""
+        """Decoders of the tiles with maps; a constant tile needs no launch."""
         decoders: list[StripDecoder | ExactDecoder] = []
         if (model.kind == TileKind.DYNAMIC).any():
             make = StripDecoder if path == "strip" else ExactDecoder
@@ -406,7 +343,7 @@ class _Bench:
                 decoder.decode()
 
         # Without any launch there is nothing to capture.
-        return interop.StepGraph(decode, self.device, warmup=1) if decoders else decode
+        return self.replay(decode) if decoders else decode
 
     def _tiles_8bit(
         self, model: LightmapModel, decoders: Sequence[StripDecoder | ExactDecoder], t: float, compare: bool

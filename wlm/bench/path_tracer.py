@@ -1,8 +1,8 @@
 """Six-way lightmaps by Mitsuba's volumetric path tracer at one bounce, and Open Image Denoise: the extra `bake`.
 
-Another's way to the same integral: it checks the march where there are many samples, and shows at few of them what a
-path tracer makes of a frame's time. Mitsuba traces on the CPU, or on a GPU where the driver comes with OptiX, which
-many that only compute lack; the denoiser is the CPU's.
+An independent estimate of the same integral: with many samples it checks the march, with few it shows the quality that
+a path tracer has in the time of a frame. Mitsuba traces on the CPU, or on a GPU whose driver has OptiX, which drivers
+for computing alone often lack; the denoiser runs on the CPU.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ GPU = "cuda_ad_rgb"
 """Mitsuba's variant for a GPU."""
 
 _FILTER = "RTLightmap"  # of one image without normals or albedo, in linear light
-_NEVER = 100  # bounces after which paths are ended at random
-_LLVM = 19  # older ones can't translate what Mitsuba asks for, and end the process
+_NEVER = 100  # bounces after which Russian roulette begins
+_LLVM = 19  # older versions can't compile Mitsuba's kernels, and end the process
 _TRIAL = f"from wlm.bench.path_tracer import try_variant; try_variant({GPU!r})"
-_PATIENCE = 180.0  # seconds of a trial, most of which are for the first kernels
-_TOLD = 160  # characters of why it failed
+_PATIENCE = 180.0  # seconds of a trial, most of which compile the first kernels
+_REASON = 160  # characters of why it failed
 
 
 def has_tracer() -> bool:
@@ -40,18 +40,18 @@ def has_tracer() -> bool:
 
 
 def has_denoiser() -> bool:
-    """Whether Open Image Denoise is."""
+    """Whether Open Image Denoise is installed."""
     return importlib.util.find_spec("pyoidn") is not None
 
 
 def choose_variant(device: str = "cpu") -> tuple[str, str]:
-    """Finds Mitsuba's quickest variant for a device.
+    """Chooses Mitsuba's fastest variant for a device.
 
     Args:
         device: "cpu" or "cuda:0".
 
     Returns:
-        The variant, and why it is the CPU's although a GPU was asked for; empty otherwise.
+        The variant, and the reason why it is one of the CPU although a GPU was asked for, else an empty string.
 
     Raises:
         WlmError: Mitsuba isn't installed.
@@ -69,13 +69,13 @@ def choose_variant(device: str = "cpu") -> tuple[str, str]:
     return "llvm_ad_rgb" if fast else "scalar_rgb", reason
 
 
-def _no_gpu(device: str, found: bool) -> str:
+def _no_gpu(device: str, has_cuda: bool) -> str:
     """Why Mitsuba can't trace on a GPU; empty if it can."""
     if device != "cuda:0":
         return "Mitsuba takes the first GPU alone"
-    if not found:
+    if not has_cuda:
         return "Dr.Jit finds no CUDA"
-    # By itself: without OptiX, or with one that is too old, it may end the process.
+    # In a process of its own, which Mitsuba may end where OptiX is missing or too old.
     try:
         trial = subprocess.run([sys.executable, "-c", _TRIAL], capture_output=True, text=True, timeout=_PATIENCE)
     except subprocess.TimeoutExpired:
@@ -84,8 +84,8 @@ def _no_gpu(device: str, found: bool) -> str:
         return f"a second process can't be started, {error.strerror}"
     if trial.returncode == 0:
         return ""
-    said = trial.stderr.strip().splitlines()
-    return one_line(said[-1] if said else f"a first image ended with {trial.returncode}", _TOLD)
+    lines = trial.stderr.strip().splitlines()
+    return one_line(lines[-1] if lines else f"a first image ended with {trial.returncode}", _REASON)
 
 
 def try_variant(variant: str) -> None:
@@ -103,19 +103,19 @@ def try_variant(variant: str) -> None:
 
 
 class PathTracer:
-    """Smoke as seen by a camera, lit from one of the six directions at a time.
+    """Images of smoke under one of the six lights at a time.
 
     Attributes:
         variant: Mitsuba's.
     """
 
     def __init__(self, volume: DensityVolume, camera: Camera, *, variant: str | None = None) -> None:
-        """Hands smoke and camera over.
+        """Loads smoke and camera into Mitsuba.
 
         Args:
-            volume: The smoke; on a GPU it is copied from there.
+            volume: The smoke, on any device.
             camera: Orthographic.
-            variant: Mitsuba's, as `choose_variant` gives it; None: the quickest that there is on a CPU.
+            variant: As ``choose_variant`` gives it; None: the fastest on the CPU.
 
         Raises:
             ValueError: The camera is in perspective.
@@ -130,36 +130,28 @@ class PathTracer:
         self.variant = variant or choose_variant()[0]
         mitsuba.set_variant(self.variant)
         self._mitsuba, self._camera = mitsuba, camera
-        self._smoke = self._load(volume)
-        self._sensor = self._sight(volume)
+        self._smoke = self._load_smoke(volume)
+        self._sensor = self._load_sensor(volume)
 
     def __call__(self, samples: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
         """Traces all six lightmaps.
 
         Args:
-            samples: Of each pixel of each.
+            samples: Of each pixel of each lightmap.
             seed: Of the paths.
 
         Returns:
             Lightmaps float32 [6, H, W] as those of `SixWay`, and the transparency [H, W], which is noisy too.
         """
         # Each is a copy on the CPU, which waits for the device.
-        images = np.stack([self.traced(way, samples, seed) for way in VECTORS])
+        images = np.stack([self.trace(direction, samples, seed) for direction in VECTORS])
         return images[..., 0], 1.0 - images[..., 3].mean(0)
 
-    def traced(self, way: np.ndarray, samples: int, seed: int = 0) -> np.ndarray:
-        """Traces the smoke under one light of irradiance 4 pi.
-
-        Args:
-            way: [3], to the light in the camera's axes.
-            samples, seed: As above.
-
-        Returns:
-            RGBA float32 [H, W, 4].
-        """
+    def trace(self, direction: np.ndarray, samples: int, seed: int = 0) -> np.ndarray:
+        """RGBA float32 [H, W, 4] under one light of irradiance 4 pi; its direction [3] is in the camera's axes."""
         light = {
             "type": "directional",
-            "direction": [float(-w) for w in self._camera.axes.T @ way],
+            "direction": [float(-w) for w in self._camera.axes.T @ direction],
             "irradiance": {"type": "rgb", "value": 4 * math.pi},
         }
         integrator = {"type": "volpath", "max_depth": 2, "rr_depth": _NEVER, "hide_emitters": True}
@@ -167,12 +159,12 @@ class PathTracer:
         scene = self._mitsuba.load_dict({"type": "scene", **parts})
         return np.array(self._mitsuba.render(scene, spp=samples, seed=seed))
 
-    def _load(self, volume: DensityVolume) -> Any:
-        """The smoke, in voxels; a border of empty ones makes Mitsuba's clamped grid end as ours does."""
-        turn = self._mitsuba.ScalarTransform4f
+    def _load_smoke(self, volume: DensityVolume) -> Any:
+        """The smoke, in voxels; a border of empty voxels makes Mitsuba's clamped grid end as ours does."""
+        transform = self._mitsuba.ScalarTransform4f
         size = np.array(volume.shape, np.float64)
         grid = np.pad(volume.density.float().cpu().numpy(), 1).transpose(2, 1, 0)[..., None]
-        box = turn().translate([-1.0] * 3).scale([float(s + 2) for s in size])
+        box = transform().translate([-1.0] * 3).scale([float(s + 2) for s in size])
         values = self._mitsuba.VolumeGrid(np.ascontiguousarray(grid))
         medium = {
             "type": "heterogeneous",
@@ -185,27 +177,27 @@ class PathTracer:
         return self._mitsuba.load_dict(
             {
                 "type": "cube",
-                "to_world": turn().translate(centre).scale([float(0.5 * s + 0.999) for s in size]),
+                "to_world": transform().translate(centre).scale([float(0.5 * s + 0.999) for s in size]),
                 "bsdf": {"type": "null"},
                 "interior": medium,
             }
         )
 
-    def _sight(self, volume: DensityVolume) -> Any:
-        camera, turn = self._camera, self._mitsuba.ScalarTransform4f
+    def _load_sensor(self, volume: DensityVolume) -> Any:
+        camera, transform = self._camera, self._mitsuba.ScalarTransform4f
         position = (np.asarray(camera.position) - np.asarray(volume.origin)) / volume.voxel
         half = 0.5 * camera.extent / volume.voxel
         target = position - np.asarray(camera.toward)
-        way = {"origin": position.tolist(), "target": target.tolist(), "up": list(camera.up)}
-        sight = turn().look_at(**way).scale([half * camera.width / camera.height, half, 1.0])
+        view = {"origin": position.tolist(), "target": target.tolist(), "up": list(camera.up)}
+        to_world = transform().look_at(**view).scale([half * camera.width / camera.height, half, 1.0])
         film = {"type": "hdrfilm", "width": camera.width, "height": camera.height, "rfilter": {"type": "box"}}
         film |= {"pixel_format": "rgba", "component_format": "float32"}
         sampler = {"type": "independent"}
-        return self._mitsuba.load_dict({"type": "orthographic", "to_world": sight, "film": film, "sampler": sampler})
+        return self._mitsuba.load_dict({"type": "orthographic", "to_world": to_world, "film": film, "sampler": sampler})
 
 
 def denoise(lightmaps: np.ndarray) -> np.ndarray:
-    """Takes the noise of lightmaps [N, H, W] away, of each by itself.
+    """Denoises lightmaps [N, H, W], each alone.
 
     Raises:
         WlmError: Open Image Denoise isn't installed.

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from wlm.bench.runner import Row
+from wlm.bench.figures import FIGURES
+from wlm.bench.rows import Row
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_path
 
@@ -28,10 +29,6 @@ _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#
 # A second sign for the method, so that a plot survives grey printing; their number shares no factor with the
 # colours'.
 _MARKERS = ("o", "s", "^", "D", "v", "P")
-_AXES = {"decode_ms": "time (ms)", "bpp": "size (bpp)"}
-_DECODERS = ("lightmap", "atlas", "probe")
-"""Systems whose time is that of a decode."""
-_UPRIGHT = {"psnr": "PSNR (dB)", "max_error": "largest error"}
 # Above this ratio of largest to smallest, a linear axis squeezes the small ones together.
 _LOG_RATIO = 8.0
 _MARKER_POINTS = 7.0
@@ -46,12 +43,12 @@ _FRONT_COLOUR = "#707070"
 
 @dataclass(frozen=True)
 class Panel:
-    """What a panel shows.
+    """One figure of some methods against another.
 
     Attributes:
-        x: `"decode_ms"` or `"bpp"`.
-        y: `"psnr"`, or `"max_error"`, of which less is better.
-        methods: The methods that it shows; None for all.
+        x: The cost, a figure of which less is better, such as ``"decode_ms"`` or ``"bpp"``.
+        y: ``"psnr"``, or an error, of which less is better.
+        methods: Those that it shows; None for all.
     """
 
     x: str
@@ -59,31 +56,30 @@ class Panel:
     methods: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
-        for quantity, known in ((self.x, _AXES), (self.y, _UPRIGHT)):
-            if quantity not in known:
-                raise WlmError(f"plot: unknown quantity {quantity!r}, expected {' or '.join(known)}")
+        for name in (self.x, self.y):
+            if name not in FIGURES:
+                raise WlmError(f"plot: unknown figure {name!r}")
 
     def position(self, row: Row) -> tuple[float, float] | None:
         """Where a row stands; None if it doesn't belong here, or lacks one of the two."""
-        x, y = getattr(row, self.x), getattr(row, self.y)
         if self.methods is not None and row.method not in self.methods:
             return None
-        return (x, y) if x is not None and y is not None and math.isfinite(x) and math.isfinite(y) else None
+        return (row[self.x], row[self.y]) if {self.x, self.y} <= row.figures.keys() else None
 
 
 def pareto_front(points: Iterable[tuple[float, float]]) -> list[int]:
-    """Points that no other beats: none costs no more, is no worse, and is better in one of the two.
+    """Points that no other dominates: none costs no more, is no worse, and is better in one of the two.
 
     Args:
-        points: `(cost, quality)` pairs; less cost and more quality are better. A pair with a NaN is never on
-            the front.
+        points: ``(cost, quality)`` pairs; less cost and more quality are better. A pair with a NaN is never on the
+            front.
 
     Returns:
-        Indices of the front by rising cost (and so rising quality). Of equal points the first stands for all.
+        Indices of the front by rising cost (and so rising quality). Of equal points only the first.
     """
-    known = [(x, -y, i) for i, (x, y) in enumerate(points) if not (math.isnan(x) or math.isnan(y))]
+    finite = [(x, -y, i) for i, (x, y) in enumerate(points) if not (math.isnan(x) or math.isnan(y))]
     front, best = [], math.inf
-    for _, negated, index in sorted(known):
+    for _, negated, index in sorted(finite):
         if negated < best or not front:
             front.append(index)
             best = negated
@@ -91,25 +87,26 @@ def pareto_front(points: Iterable[tuple[float, float]]) -> list[int]:
 
 
 def plot(rows: Sequence[Row], path: str | Path, x: str | Panel | Sequence[str | Panel] = ("decode_ms", "bpp")) -> None:
-    """Draw quality against cost: one line of panels a scene.
+    """Draws quality against cost: one line of panels for each scene.
 
-    Rows of one method share a colour and a marker; each is labelled where it stands; the Pareto front is
-    drawn as steps. Rows without one of a panel's two quantities are left out of it.
+    Rows of one method share a colour and a marker; each is labelled; the Pareto front is drawn as steps. Rows without
+    one of a panel's two figures are left out of it.
 
     Args:
         rows: The results.
-        path: Picture to write, `.png`, `.svg` or `.pdf`.
-        x: One panel or several; a name stands for the PSNR of all methods against that.
+        path: Picture to write, ``.png``, ``.svg`` or ``.pdf``.
+        x: One panel or several; a name stands for the PSNR of all methods against that figure.
 
     Raises:
-        WlmError: The quantity or the file's suffix is unknown, no row has what a panel needs, or the file
-            can't be written.
+        WlmError: The figure or the file's suffix is unknown, no row has what a panel needs, or the file can't be
+            written.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     path = Path(path)
-    panels = [Panel(one) if isinstance(one, str) else one for one in ((x,) if isinstance(x, str | Panel) else x)]
+    quantities = (x,) if isinstance(x, str | Panel) else x
+    panels = [Panel(quantity) if isinstance(quantity, str) else quantity for quantity in quantities]
     if path.suffix.lower() not in (".png", ".svg", ".pdf"):
         raise WlmError(f"{path}: expected a picture's name that ends in .png, .svg or .pdf")
     scenes = list(dict.fromkeys(row.scene for row in rows))
@@ -125,15 +122,15 @@ def plot(rows: Sequence[Row], path: str | Path, x: str | Panel | Sequence[str | 
     drawn = []
     for i, scene in enumerate(scenes):
         for j, panel in enumerate(panels):
-            mine = [row for row in rows if row.scene == scene and panel.position(row)]
-            _draw_panel(grid[i, j], mine, panel, methods)
+            members = [row for row in rows if row.scene == scene and panel.position(row)]
+            _draw_panel(grid[i, j], members, panel, methods)
             grid[i, j].set_title(scene, fontsize=11)
-            drawn.append((grid[i, j], mine, panel))
+            drawn.append((grid[i, j], members, panel))
     # The layout must be settled before labels can be placed in pixels, and must not move afterwards.
     figure.draw_without_rendering()
     figure.set_layout_engine("none")
-    for axes, mine, panel in drawn:
-        _label_points(figure, axes, mine, panel, methods)
+    for axes, members, panel in drawn:
+        _label_points(figure, axes, members, panel, methods)
     with atomic_path(path) as part:
         figure.savefig(part, format=path.suffix[1:].lower())
 
@@ -154,9 +151,8 @@ def _draw_panel(axes: Axes, rows: Sequence[Row], panel: Panel, methods: Sequence
     from matplotlib.ticker import LogLocator, NullFormatter
 
     points = [panel.position(row) for row in rows]
-    decoded = panel.x == "decode_ms" and any(row.system in _DECODERS for row in rows)
-    axes.set_xlabel(f"decode {_AXES[panel.x]}" if decoded else _AXES[panel.x])
-    axes.set_ylabel(_UPRIGHT[panel.y])
+    axes.set_xlabel(FIGURES[panel.x].label)
+    axes.set_ylabel(FIGURES[panel.y].label)
     axes.grid(True, color="#e4e4e4", linewidth=0.7)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
@@ -169,7 +165,7 @@ def _draw_panel(axes: Axes, rows: Sequence[Row], panel: Panel, methods: Sequence
         axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
         axes.xaxis.set_minor_formatter(NullFormatter())
-    falling = panel.y == "max_error"
+    falling = panel.y != "psnr"
     if falling and _wide(heights):
         axes.set_yscale("log")
     # Room around the points for their labels.
@@ -211,7 +207,7 @@ def _wide(values: Sequence[float]) -> bool:
 
 
 def _label_points(figure: Figure, axes: Axes, rows: Sequence[Row], panel: Panel, methods: Sequence[str]) -> None:
-    """Put each row's name beside its marker, where it covers least of what else is drawn."""
+    """Puts each row's name beside its marker, where it covers least of what else is drawn."""
     if not rows:
         return
     pixels = figure.dpi / 72.0

@@ -7,15 +7,15 @@ The methods, each a table of its own:
   marks the sphere's cells and finds its links anew at each step.
 - "lattice storage": velocities of 16 bits against 32 in a jet, over the inlet's speed, and the share by which the mass
   drifts.
-- "advection": a step of smoke in eddies, dense, with and without a sphere; and what is wrong with a smooth ball after
-  a whole turn: over its own RMS, the largest difference (its peak is 1), and the smoke that was gained.
+- "advection": a step of smoke in eddies, dense, with and without a sphere; and the error of a smooth ball after a whole
+  turn: the RMS over the ball's own, the largest difference (its peak is 1), and the smoke that was gained.
 - "advection bricks": the same step where only a cube in a corner has smoke.
 - "guide": guiding maps against a march in steps of half a voxel with no jitter and no cutoff. PSNR is of the light, its
   greatest value the peak.
-- "six ways": the fine march, with what it says of its own error by halving its step.
-- "weights": six lightmaps weighed for twelve lights against a march to each.
+- "six ways": the fine march, with its own estimate of its error by halving its step.
+- "weights": six lightmaps weighted for twelve lights against a march to each.
 - "frame": the stages of a frame of the scene `jet-sphere`, but for the network that turns the guide into lightmaps,
-  which `smoke_network` measures; the march that it stands for is beside it.
+  which `smoke_network` measures; the march that it replaces is beside it.
 
 A largest error has the unit of what is compared: cells a step, light, or density. Times are of the calls that a user
 makes; on CUDA the lattice replays graphs by itself where it does many steps, and steps of advection are replayed as
@@ -27,19 +27,19 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from wlm.bench.plot import Panel
-from wlm.bench.runner import Row
+from wlm.bench.rows import Row
+from wlm.bench.runner import Note
 from wlm.bench.smoke_air import advection_rows, lattice_rows, smoke_brick_rows, storage_rows
 from wlm.bench.smoke_light import frame_rows, guide_rows, six_rows, weight_rows
-from wlm.bench.smoke_setup import FULL, QUICK, Bench, Sizes
-from wlm.interop import check_device
+from wlm.bench.smoke_setup import FULL, QUICK, Sizes, SmokeBench
 
 __all__ = ["PANELS", "plotted", "run", "run_rows"]
 
-PANELS = (Panel("decode_ms", "psnr", ("guide",)), Panel("decode_ms", "max_error", ("guide", "six ways")))
-"""What a plot shows: the time of guiding maps and of the fine march against what is wrong with them."""
+PANELS = (Panel("time_ms", "psnr", ("guide",)), Panel("time_ms", "max_error", ("guide", "six ways")))
+"""What a plot shows: PSNR and error of guiding maps and of the fine march against their time."""
 
-# The lattice's comes first: it measures the copy that others are held against.
-_PARTS: tuple[Callable[[Bench], list[Row]], ...] = (
+# The lattice comes first: it measures the copy that others are compared with.
+_PARTS: tuple[Callable[[SmokeBench], list[Row]], ...] = (
     lattice_rows,
     storage_rows,
     advection_rows,
@@ -51,7 +51,7 @@ _PARTS: tuple[Callable[[Bench], list[Row]], ...] = (
 )
 
 
-def run(*, quick: bool, device: str, progress: Callable[[str], None] | None = None) -> list[Row]:
+def run(*, quick: bool, device: str, progress: Note | None = None) -> list[Row]:
     """Measures the smoke system.
 
     Args:
@@ -68,21 +68,9 @@ def run(*, quick: bool, device: str, progress: Callable[[str], None] | None = No
     return run_rows(QUICK if quick else FULL, device=device, progress=progress)
 
 
-def run_rows(sizes: Sizes, *, device: str, progress: Callable[[str], None] | None = None) -> list[Row]:
-    """Measures it on given grids.
-
-    Args:
-        sizes: Of the grids.
-        device: "cpu" or "cuda:0".
-        progress: As for ``run``.
-
-    Returns:
-        The rows.
-
-    Raises:
-        WlmError: As ``run``.
-    """
-    bench = Bench(check_device(device), sizes, progress)
+def run_rows(sizes: Sizes, *, device: str, progress: Note | None = None) -> list[Row]:
+    """Measures it on grids of the given sizes; the rest as for ``run``."""
+    bench = SmokeBench(device, sizes, progress)
     return [row for part in _PARTS for row in part(bench)]
 
 

@@ -1,19 +1,19 @@
-"""What each part of the network, of its losses and of its guiding map is worth (section 5, figures 6 and 15).
+"""Ablation of the network, of its losses and of its guiding map (section 5, figures 6 and 15).
 
-One profile is trained again and again, each time with one thing changed: from the same seed, for as many steps, on the
-same samples, and is held against the same validation of other sequences. These are short trainings of small images: the
-rows say what differs between them, and not how good a network gets. What is changed:
+One profile is trained again and again, each time with one change: from the same seed, for as many steps, on the same
+samples, and is scored on the same validation of other sequences. These are short trainings of small images: the rows
+show what differs between them, and not how good a network gets. The changes:
 
 - "no adapters", "one level less", "stem 1": the network's shape;
 - "no depth": the guide's depth isn't read;
 - "no sRGB", "no temporal loss", "with perceptual loss": the loss. Our profiles have no perceptual part, so that the
-  paper's row of it is here the other way round. The other weights stay: a mean square in linear light is a tenth or so
-  smaller than one in sRGB, and the rest counts for as much more beside it. Without a temporal part a step learns from
+  paper's row of it is here the other way round. The other weights stay: a mean square in linear light is about a tenth
+  smaller than one in sRGB, so that the other parts weigh that much more. Without a temporal part a step learns from
   single frames, of twice as many samples;
 - "guide of ...": another guiding map, for the network and in its samples;
-- "coarse march": nothing is trained, the guide of kind "six" is shown as it is.
+- "coarse march": nothing is trained, the guide of kind "six" is scored as it is.
 
-What a profile is already, or what needs a package that isn't installed, is left out.
+Changes that change nothing in a profile, or that need a package that isn't installed, are left out.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ from typing import TypeVar
 import torch
 from pydantic import BaseModel
 
-from wlm.bench.runner import Row
-from wlm.bench.smoke_setup import number
-from wlm.bench.smoke_setup import row as smoke_row
+from wlm.baselines.smoke import COARSE, coarse
+from wlm.bench.rows import Row
+from wlm.bench.runner import Bench, Note
 from wlm.errors import WlmError
-from wlm.interop import check_device
-from wlm.smoke.evaluation import COARSE, Evaluation, coarse, compare, evaluate
-from wlm.smoke.fit import NetworkProfile, load_profile
-from wlm.smoke.learn.dataset import DatasetSettings, make_pool, make_validation
+from wlm.smoke.evaluation import Score, of_network, score
+from wlm.smoke.learn.dataset import make_pool, make_validation
 from wlm.smoke.learn.losses import Losses
+from wlm.smoke.learn.pool import Pool
+from wlm.smoke.learn.settings import DatasetSettings
 from wlm.smoke.learn.trainer import Trainer, plan_round
-from wlm.smoke.model import SixWayNetwork, parameter_count
-from wlm.smoke.planes import PLANES, Pool
+from wlm.smoke.model import Profile, SixWayNetwork, parameter_count
+from wlm.smoke.planes import PLANES
 
 __all__ = ["FULL", "METHOD", "QUICK", "AblationSizes", "run", "run_rows", "variants"]
 
@@ -65,12 +65,12 @@ _Settings = TypeVar("_Settings", bound=BaseModel)
 
 @dataclass(frozen=True)
 class AblationSizes:
-    """What is learned from, and for how long.
+    """Samples and length of the trainings.
 
     Attributes:
-        dataset: Settings of the samples that replace the profile's.
-        validation: Settings of the validation that replace those.
-        rounds, steps: Of each training.
+        dataset: Settings of the samples, in place of the profile's.
+        validation: Settings of the validation, in place of those.
+        rounds, steps: Rounds of each training, and steps of each round.
     """
 
     dataset: Mapping[str, int]
@@ -93,7 +93,7 @@ QUICK = AblationSizes(
     rounds=2,
     steps=4,
 )
-"""For a CPU, to see that all of it works: so few steps tell nothing."""
+"""For a CPU, to see that all of it works: so few steps show nothing."""
 
 
 def run(
@@ -104,7 +104,7 @@ def run(
     device: str,
     rounds: int | None = None,
     steps: int | None = None,
-    progress: Callable[[str], None] | None = None,
+    progress: Note | None = None,
     done: Callable[[list[Row]], None] | None = None,
 ) -> list[Row]:
     """Trains the variants of a profile and compares them.
@@ -114,83 +114,67 @@ def run(
         only: Names of variants; none: all.
         quick: Small images and few steps, for seconds on a CPU.
         device: "cpu" or "cuda:0".
-        rounds, steps: Of each training; None: those of the sizes.
+        rounds, steps: As in ``AblationSizes``; None: those of the sizes.
         progress: Called with a line before each part of the work, and for each variant that is left out.
-        done: Called after each row with all that there are.
+        done: Called after each row with all rows so far.
 
     Returns:
-        A row a variant.
+        One row for each variant.
 
     Raises:
         WlmError: The profile can't be read, no variant has such a name, one that was named can't be made, or the device
             isn't there or hasn't the memory.
     """
     sizes = QUICK if quick else FULL
-    given = {name: value for name, value in {"rounds": rounds, "steps": steps}.items() if value is not None}
-    return run_rows(replace(sizes, **given), load_profile(profile), only, device=device, progress=progress, done=done)
+    changes = {name: value for name, value in {"rounds": rounds, "steps": steps}.items() if value is not None}
+    return run_rows(replace(sizes, **changes), Profile.load(profile), only, device=device, progress=progress, done=done)
 
 
 def run_rows(
     sizes: AblationSizes,
-    base: NetworkProfile,
+    base: Profile,
     only: Sequence[str] = (),
     *,
     device: str,
-    progress: Callable[[str], None] | None = None,
+    progress: Note | None = None,
     done: Callable[[list[Row]], None] | None = None,
 ) -> list[Row]:
-    """Trains the variants of a profile at given sizes.
-
-    Args:
-        sizes: Of the samples and the trainings.
-        base: The profile.
-        only, device, progress, done: As for ``run``.
-
-    Raises:
-        WlmError: As ``run``.
-    """
-    device, note = check_device(device), progress or (lambda line: None)
+    """Trains the variants of a profile at the given sizes; the rest as for ``run``."""
+    bench = Bench("smoke-network", device, progress, scene=f"validation, {base.name}")
     training = {"rounds": sizes.rounds, "steps": sizes.steps, "crop": None}
     base = _changed(base, {"dataset": sizes.dataset, "training": training})
-    chosen = _chosen(base, only, note)
-    samples, scene = _Samples(sizes, device, note), f"validation, {base.name}"
+    chosen = _chosen(base, only, bench.note)
+    samples = _Samples(sizes, bench)
     rows = []
     for name, profile in chosen.items():
         if profile is None:
             validation = samples.validation(_changed(base.dataset, {"guide": "six"}))
-            found = compare({COARSE: coarse}, validation)[COARSE]
-            rows.append(_row(scene, name, found, {}, "no network"))
+            rows.append(_row(bench, name, score(coarse, validation), "no network"))
         else:
-            rows.append(_trained_row(scene, name, profile, samples, note, device))
+            rows.append(_trained_row(bench, name, profile, samples))
         if done is not None:
             done(rows)
     return rows
 
 
-def _trained_row(
-    scene: str, name: str, profile: NetworkProfile, samples: _Samples, note: Callable[[str], None], device: str
-) -> Row:
+def _trained_row(bench: Bench, name: str, profile: Profile, samples: _Samples) -> Row:
     validation, pools = samples.validation(profile.dataset), samples.pools(profile.dataset, profile.training.rounds)
-    note(f"trains {name}")
-    network, skipped, seconds, ms = _train(profile, pools, device)
-    figures = {
-        "training s": number(seconds),
-        "ms a step": f"{ms:.3g}",
-        "parameters": number(parameter_count(network)),
-    }
-    lost = f"{skipped} steps gave NaN or infinity" if skipped else ""
-    return _row(scene, name, evaluate(network, validation), figures, lost, encode_seconds=seconds)
+    bench.note(f"trains {name}")
+    network, skipped, seconds, step_ms = _train(profile, pools, bench.device)
+    figures = {"encode_seconds": seconds, "step_ms": step_ms, "parameters": parameter_count(network)}
+    note = f"{skipped} steps gave NaN or infinity" if skipped else ""
+    return _row(bench, name, score(of_network(network), validation), note, **figures)
 
 
-def variants(base: NetworkProfile) -> dict[str, NetworkProfile | None]:
+def variants(base: Profile) -> dict[str, Profile | None]:
     """The profiles that are compared.
 
     Args:
         base: What each is with one change.
 
     Returns:
-        Profiles by their rows' names, and None for the march that needs none. Those that the base is already are equal
-        to it.
+        Profiles by their rows' names, and None for the march, which needs none. Where a change changes nothing, the
+        profile equals the base.
     """
     losses = base.training.losses
     changes = {
@@ -204,24 +188,20 @@ def variants(base: NetworkProfile) -> dict[str, NetworkProfile | None]:
         "stem 1": {"network": {"stem": 1}},
     }
     for kind, name in _GUIDES.items():
-        changes[name] = {"network": {"guide": kind}, "dataset": _seen_by(kind)}
-    made = {name: _changed(base, change) for name, change in changes.items()}
-    return {"base": base, **made, COARSE: None}
+        # The paper's guide has no nodes, and so no distance between them.
+        dataset = {"guide": kind} | ({"guide_spacing": None} if kind == "paper" else {})
+        changes[name] = {"network": {"guide": kind}, "dataset": dataset}
+    return {"base": base, **{name: _changed(base, change) for name, change in changes.items()}, COARSE: None}
 
 
-def _seen_by(kind: str) -> dict[str, object]:
-    """Changes to the settings of samples for another kind of guide: the paper's has no nodes to be set apart."""
-    return {"guide": kind} | ({"guide_spacing": None} if kind == "paper" else {})
-
-
-def _chosen(base: NetworkProfile, only: Sequence[str], note: Callable[[str], None]) -> dict[str, NetworkProfile | None]:
-    """Those variants that are wanted and can be trained."""
-    known = variants(base)
+def _chosen(base: Profile, only: Sequence[str], note: Note) -> dict[str, Profile | None]:
+    """The variants that were asked for and can be trained."""
+    profiles = variants(base)
     for name in only:
-        if name not in known:
-            raise WlmError(f"bench: --only: expected one of {', '.join(known)}; found '{name}'")
+        if name not in profiles:
+            raise WlmError(f"bench: --only: expected one of {', '.join(profiles)}; found '{name}'")
     chosen = {}
-    for name, profile in known.items():
+    for name, profile in profiles.items():
         if only and name not in only:
             continue
         reason = "" if profile is None or name == "base" else _left_out(profile, base)
@@ -234,7 +214,7 @@ def _chosen(base: NetworkProfile, only: Sequence[str], note: Callable[[str], Non
     return chosen
 
 
-def _left_out(profile: NetworkProfile, base: NetworkProfile) -> str:
+def _left_out(profile: Profile, base: Profile) -> str:
     """Why a variant isn't trained; empty if it is."""
     if profile == base:
         return f"{base.name} is so already"
@@ -247,33 +227,33 @@ def _left_out(profile: NetworkProfile, base: NetworkProfile) -> str:
 
 
 class _Samples:
-    """Samples, each made once: those of the validations stay, a training's until others are asked for."""
+    """Samples, each made once: validations stay, a training's samples until others are asked for."""
 
-    def __init__(self, sizes: AblationSizes, device: str, note: Callable[[str], None]) -> None:
-        self._sizes, self._device, self._note = sizes, device, note
+    def __init__(self, sizes: AblationSizes, bench: Bench) -> None:
+        self._sizes, self._device, self._note = sizes, bench.device, bench.note
         self._validations: dict[DatasetSettings, Pool] = {}
         self._pools: tuple[DatasetSettings | None, list[Pool]] = None, []
 
     def validation(self, settings: DatasetSettings) -> Pool:
-        """What all variants with these settings are held against."""
+        """The validation of all variants with these settings."""
         if settings not in self._validations:
             self._note(f"makes the validation, guide {settings.guide}")
-            made = make_validation(_changed(settings, self._sizes.validation), self._device)
-            self._validations[settings] = _with_smoke("the validation", made)
+            pool = make_validation(_changed(settings, self._sizes.validation), self._device)
+            self._validations[settings] = _with_smoke("the validation", pool)
         return self._validations[settings]
 
     def pools(self, settings: DatasetSettings, rounds: int) -> list[Pool]:
-        """One a round."""
+        """The samples of each round."""
         if self._pools[0] != settings:
             # Their memory goes back first, and not to torch alone: the simulation is Warp's.
             self._pools = None, []
             torch.cuda.empty_cache()
-            made = []
+            pools = []
             for i in range(rounds):
                 self._note(f"makes samples, guide {settings.guide}, round {i + 1} of {rounds}")
                 pool = make_pool(settings, seed=_SEED, round=i, device=self._device)
-                made.append(_with_smoke(f"round {i}", pool))
-            self._pools = settings, made
+                pools.append(_with_smoke(f"round {i}", pool))
+            self._pools = settings, pools
         return self._pools[1]
 
 
@@ -283,8 +263,8 @@ def _with_smoke(where: str, pool: Pool) -> Pool:
     return pool
 
 
-def _train(profile: NetworkProfile, pools: Sequence[Pool], device: str) -> tuple[SixWayNetwork, int, float, float]:
-    """Trains a network; returns also the steps left out, the seconds in all and a step's milliseconds, the median."""
+def _train(profile: Profile, pools: Sequence[Pool], device: str) -> tuple[SixWayNetwork, int, float, float]:
+    """Trains a network; returns also the skipped steps, the seconds in all and the median milliseconds of a step."""
     gc.collect()  # a trainer and its graph hold each other, and much memory
     settings = profile.training
     trainer = Trainer(profile.network, settings, seed=_SEED, device=device)
@@ -309,18 +289,24 @@ def _wait(device: str) -> None:
         torch.cuda.synchronize(device)
 
 
-def _row(scene: str, name: str, found: Evaluation, figures: dict[str, str], note: str, **values) -> Row:
-    decibels = {"least": found.lowest, "most": found.highest}
-    decibels |= {plane: found.planes[PLANES.index(plane)] for plane in _PLANES}
-    quality = {f"{title} dB": f"{value:.2f}" for title, value in decibels.items()}
-    quality["flicker over the reference's"] = f"{found.flicker_ratio:.3f}"
-    return smoke_row(scene, METHOD, name, quality | figures, note, system="smoke-network", psnr=found.psnr, **values)
+def _row(bench: Bench, name: str, evaluation: Score, note: str = "", **figures: float) -> Row:
+    return bench.row(
+        METHOD,
+        name,
+        note,
+        psnr=evaluation.psnr,
+        psnr_min=evaluation.lowest,
+        psnr_max=evaluation.highest,
+        flicker_ratio=evaluation.flicker_ratio,
+        **{f"{plane}_psnr": evaluation.planes[PLANES.index(plane)] for plane in _PLANES},
+        **figures,
+    )
 
 
 def _changed(settings: _Settings, changes: Mapping[str, object]) -> _Settings:
-    """Settings with some of them, and some of their parts', replaced, and all checked again."""
-    given = {
+    """Settings with some of them replaced, at any depth, and all checked again."""
+    values = {
         name: _changed(getattr(settings, name), value) if isinstance(value, Mapping) else value
         for name, value in changes.items()
     }
-    return type(settings).model_validate({**dict(settings), **given})
+    return type(settings).model_validate({**dict(settings), **values})

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import torch
 import warp as wp
 
-from wlm.bench.runner import Row
-from wlm.bench.smoke_setup import Bench, number, percent, row
+from wlm.bench.rows import Row
+from wlm.bench.smoke_setup import SmokeBench
 from wlm.fluid.lattice import Lattice
-from wlm.interop import StepGraph, stream, to_warp
+from wlm.interop import stream, to_warp
 from wlm_kernels.fluid import advection, advection_places, advection_sources
 from wlm_kernels.fluid.lattice_sets import lattice as velocity_set
 from wlm_kernels.fluid.lattice_solids import voxelise_sphere
@@ -33,7 +34,7 @@ _SCHEMES = ("semi-lagrangian", "maccormack")
 _PASSES = {"semi-lagrangian": 2, "maccormack": 2 + 3}
 
 
-def lattice_rows(bench: Bench) -> list[Row]:
+def lattice_rows(bench: SmokeBench) -> list[Row]:
     """A copy, and steps of lattices in the same run: with each kind of boundary, storage and operator."""
     bench.note("lattice")
     cells, small = bench.sizes.lattice, bench.sizes.small
@@ -57,31 +58,26 @@ def lattice_rows(bench: Bench) -> list[Row]:
     calls["copy"] = lambda: target.copy_(source)
     calls["kernel"] = lambda: torch.neg(source, out=target)
     for name, (size, settings) in cases.items():
-        calls[name] = _stepper(_jet(bench, size, **settings), chunk)
+        calls[name] = partial(_jet(bench, size, **settings).step, chunk)
     sphere = f"float32, moving sphere, {small}³"
     calls[sphere], moved = _moving(bench, small)
     times = bench.time(calls)
-    # Whichever moves more: what a copy is done by isn't the same everywhere.
+    # The faster of a memcpy and a kernel: devices differ.
     copy = min((times.pop("copy"), times.pop("kernel")), key=lambda timing: timing.median_ms)
     bench.bandwidth = 8 * floats / (1e-3 * copy.median_ms)
-    rows = [row("jet", "lattice", "a copy", {"GB/s": f"{1e-9 * bench.bandwidth:.4g}"}, timing=copy)]
+    rows = [bench.row("lattice", "a copy", scene="jet", timing=copy, bandwidth=1e-9 * bench.bandwidth)]
     for name, (size, settings) in cases.items():
         timing = times[name]
         ms = timing.median_ms / chunk
-        bytes_moved = _bytes(**settings) * size**3
-        figures = {
-            "cells": f"{size}³",
-            "MLUPS": number(1e-3 * size**3 / ms),
-            "of the copy": bench.of_copy(bytes_moved, ms),
-        }
-        rows.append(row("jet", "lattice", name, figures, timing=timing, calls=chunk))
-    figures = {"cells": f"{small}³", "MLUPS": number(1e-3 * small**3 * moved / times[sphere].median_ms)}
-    rows.append(row("jet", "lattice", sphere, figures, "put anew each step", timing=times[sphere], calls=moved))
-    return rows
+        figures = {"mlups": 1e-3 * size**3 / ms, "of_copy": bench.of_copy(_bytes(**settings) * size**3, ms)}
+        rows.append(bench.row("lattice", name, scene="jet", timing=timing, calls=chunk, cells=size, **figures))
+    figures = {"cells": small, "mlups": 1e-3 * small**3 * moved / times[sphere].median_ms}
+    note = "marked anew each step"
+    return [*rows, bench.row("lattice", sphere, note, scene="jet", timing=times[sphere], calls=moved, **figures)]
 
 
-def storage_rows(bench: Bench) -> list[Row]:
-    """What 16 bits get wrong against 32, and the mass of both."""
+def storage_rows(bench: SmokeBench) -> list[Row]:
+    """The error of 16 bits against 32, and the mass of both."""
     bench.note("lattice: 16 bits against 32")
     sizes = bench.sizes
     exact, half = (_jet(bench, sizes.small, storage=storage) for storage in ("float32", "float16"))
@@ -91,20 +87,18 @@ def storage_rows(bench: Bench) -> list[Row]:
         for lattice in (exact, half):
             lattice.step(steps - lattice.steps)
         a, b = (wp.to_torch(lattice.velocity()).double() for lattice in (exact, half))
-        figures = {
-            "cells": f"{sizes.small}³",
-            "RMS": percent(float((a - b).square().sum(-1).mean().sqrt()) / _SPEED),
-            "largest": percent(float((a - b).abs().max()) / _SPEED),
-        }
-        rows.append(row("jet", "lattice storage", f"float16, {steps:,} steps", figures))
+        rms = float((a - b).square().sum(-1).mean().sqrt()) / _SPEED
+        largest = float((a - b).abs().max()) / _SPEED
+        figures = {"cells": sizes.small, "rms": rms, "largest": largest}
+        rows.append(bench.row("lattice storage", f"float16, {steps:,} steps", scene="jet", **figures))
     for name, lattice, mass in (("float32", exact, before[0]), ("float16", half, before[1])):
         lattice.step(sizes.drift - lattice.steps)
-        figures = {"cells": f"{sizes.small}³", "mass drift": f"{lattice.mass() / mass - 1.0:.2g}"}
-        rows.append(row("jet", "lattice storage", f"{name}, {sizes.drift:,} steps", figures))
+        figures = {"cells": sizes.small, "mass_drift": lattice.mass() / mass - 1.0}
+        rows.append(bench.row("lattice storage", f"{name}, {sizes.drift:,} steps", scene="jet", **figures))
     return rows
 
 
-def advection_rows(bench: Bench) -> list[Row]:
+def advection_rows(bench: SmokeBench) -> list[Row]:
     """Schemes and storages: the time of a step with and without solids, and the error after a ball's whole turn."""
     rows = []
     n = bench.sizes.coarse
@@ -120,25 +114,23 @@ def advection_rows(bench: Bench) -> list[Row]:
             walls = _walls(box, bench.device, radius)
             for scheme in _SCHEMES:
                 option = f"{scheme}, {storage}{solid}"
-                calls[option] = _carry(bench, scheme, box, velocity, walls, fields, _SUBSTEPS)
+                calls[option] = _carry(bench, scheme, box, velocity, walls, fields)
         times = bench.time(calls)
         for option, timing in times.items():
             scheme = option.split(",")[0]
             moved = cells * _PASSES[scheme] * (2 if storage == "float16" else 4)
             figures = {
-                "voxels": f"{_RATIO * n}³",
-                "M voxels/s": number(1e-3 * cells / timing.median_ms),
-                "of the copy": bench.of_copy(moved, timing.median_ms),
+                "voxels": _RATIO * n,
+                "voxel_rate": 1e-3 * cells / timing.median_ms,
+                "of_copy": bench.of_copy(moved, timing.median_ms),
             }
-            off = None
             if not option.endswith("sphere"):
-                found, off, kept = _turn(bench, scheme, storage)
-                figures |= {"RMS": percent(found), "smoke gained": f"{100.0 * (kept - 1.0):+.2g}%"}
-            rows.append(row("ball", "advection", option, figures, timing=timing, max_error=off))
+                figures |= _turn(bench, scheme, storage)
+            rows.append(bench.row("advection", option, scene="ball", timing=timing, **figures))
     return rows
 
 
-def smoke_brick_rows(bench: Bench) -> list[Row]:
+def smoke_brick_rows(bench: SmokeBench) -> list[Row]:
     """Bricks of smoke: a step's time by the share of the box that has some."""
     bench.note("advection: bricks")
     n, rows = bench.sizes.coarse, []
@@ -146,39 +138,37 @@ def smoke_brick_rows(bench: Bench) -> list[Row]:
     box, velocity = _box(n), _swirl(n, bench.device)
     walls = _walls(box, bench.device, 0.0)
     for scheme in _SCHEMES:
-        dense = _carry(bench, scheme, box, velocity, walls, _cubes(bench, 1.0, scheme), _SUBSTEPS)
+        dense = _carry(bench, scheme, box, velocity, walls, _cubes(bench, 1.0, scheme))
         calls, lists = {"dense": dense}, {}
         for fill in bench.sizes.fills:
-            name = f"smoke in {percent(fill)}"
+            name = f"smoke in {100 * fill:g}%"
             calls[name], lists[name] = _carry_bricks(bench, scheme, fill, box, velocity, walls)
         times = bench.time(calls)
         for name, timing in times.items():
-            figures = {"voxels": f"{edge}³"}
+            figures = {"voxels": edge}
             if name != "dense":
                 worked = int(lists[name].count.numpy()[0]) * advection_places.BRICK**3 / edge**3
-                figures |= {
-                    "worked on": percent(min(worked, 1.0)),
-                    "speedup": f"{times['dense'].median_ms / timing.median_ms:.2f}",
-                }
-            rows.append(row("cube", "advection bricks", f"{scheme}, {name}", figures, timing=timing))
+                figures["worked_on"] = min(worked, 1.0)
+                figures["speedup"] = times["dense"].median_ms / timing.median_ms
+            rows.append(bench.row("advection bricks", f"{scheme}, {name}", scene="cube", timing=timing, **figures))
     return rows
 
 
 # Lattices.
 
 
-def _jet(bench: Bench, size: int, faces: str = "all", **settings) -> Lattice:
+def _jet(bench: SmokeBench, size: int, faces: str = "all", **settings) -> Lattice:
     """Air in through a round inlet, past a sphere, out at the other end between walls; or at rest."""
-    made = Lattice((size,) * 3, viscosity=_VISCOSITY, ramp=4 * size, device=bench.device, **settings)
+    lattice = Lattice((size,) * 3, viscosity=_VISCOSITY, ramp=4 * size, device=bench.device, **settings)
     if faces != "periodic":
         for face in ("-x", "+x", "-y", "+y", "-z", "+z"):
-            made.set_wall(face)
+            lattice.set_wall(face)
     if faces == "all":
         across = (np.indices((size, size)) + 0.5) / size - 0.5
-        made.set_inlet("-x", (_SPEED, 0.0, 0.0), where=np.hypot(*across) < 0.15)
-        made.set_outlet("+x")
-        made.set_solid(_sphere(wp.zeros((size,) * 3, dtype=wp.uint8, device=bench.device), 0.0))
-    return made
+        lattice.set_inlet("-x", (_SPEED, 0.0, 0.0), where=np.hypot(*across) < 0.15)
+        lattice.set_outlet("+x")
+        lattice.set_solid(_sphere(wp.zeros((size,) * 3, dtype=wp.uint8, device=bench.device), 0.0))
+    return lattice
 
 
 def _sphere(mask: wp.array, moved: float) -> wp.array:
@@ -187,7 +177,7 @@ def _sphere(mask: wp.array, moved: float) -> wp.array:
     return mask
 
 
-def _moving(bench: Bench, size: int) -> tuple[Callable[[], None], int]:
+def _moving(bench: SmokeBench, size: int) -> tuple[Callable[[], None], int]:
     """Steps of a jet whose sphere goes to and fro, and how many they are."""
     lattice, speed, steps = _jet(bench, size), 0.05, 10
     mask = wp.zeros((size,) * 3, dtype=wp.uint8, device=bench.device)
@@ -203,12 +193,8 @@ def _moving(bench: Bench, size: int) -> tuple[Callable[[], None], int]:
     return go, steps
 
 
-def _stepper(lattice: Lattice, steps: int) -> Callable[[], None]:
-    return lambda: lattice.step(steps)
-
-
 def _bytes(lattice: str = "D3Q19", storage: str = "float32", faces: str = "all", **_) -> int:
-    """That a step has to read and write of a cell: populations, and whether it is solid."""
+    """Bytes of one cell that a step has to read and write: populations, and whether it is solid."""
     return 2 * len(velocity_set(lattice).c) * (2 if storage == "float16" else 4) + int(faces == "all")
 
 
@@ -227,7 +213,7 @@ def _fields(density: torch.Tensor, storage: str, device: str) -> advection.Field
 
 
 def _walls(box: advection_places.Box, device: str, radius: float) -> wp.array:
-    """Where a sphere in the middle is, of a radius of a share of the edge; none of 0."""
+    """Cells of a sphere in the middle, whose radius is a share of the edge; none for a radius of 0."""
     n = box.coarse[0]
     walls = wp.zeros(n**3 if radius else 0, dtype=wp.uint8, device=device)
     if radius:
@@ -238,26 +224,26 @@ def _walls(box: advection_places.Box, device: str, radius: float) -> wp.array:
 
 
 def _swirl(n: int, device: str) -> wp.array:
-    """Eddies of the size of the box, as fast as air on a lattice is."""
+    """Eddies of the size of the box, at the speed of air on a lattice."""
     at = 2 * np.pi * (np.arange(n) + 0.5) / n
     x, y, _ = np.meshgrid(at, at, at, indexing="ij")
     u = _SPEED * np.stack([np.sin(x) * np.cos(y), -np.cos(x) * np.sin(y), 0.5 * np.sin(x + y)], -1)
     return wp.array(u.reshape(-1, 3).astype(np.float32), dtype=wp.vec3, device=device)
 
 
-def _carry(bench, scheme: str, box, velocity, walls, fields, dt: float, **where) -> Callable[[], None]:
-    """A step that leaves what it carries as it was: replayed, it does the same again."""
+def _carry(bench: SmokeBench, scheme: str, box, velocity, walls, fields) -> Callable[[], None]:
+    """A step that writes to a second field: replayed, it does the same again."""
 
     def step() -> None:
-        advection.advect(box, velocity, walls, fields[0], fields[1], dt, **where)
+        advection.advect(box, velocity, walls, fields[0], fields[1], _SUBSTEPS)
         if scheme == "maccormack":
-            advection.correct(box, velocity, walls, *fields, dt, **where)
+            advection.correct(box, velocity, walls, *fields, _SUBSTEPS)
 
-    return StepGraph(step, bench.device, warmup=1)
+    return bench.replay(step)
 
 
-def _cubes(bench: Bench, fill: float, scheme: str) -> list[advection.Fields]:
-    """Smoke in a cube in the box's corner, of a share of the box."""
+def _cubes(bench: SmokeBench, fill: float, scheme: str) -> list[advection.Fields]:
+    """Smoke in a cube in the box's corner that is a share of the box."""
     edge = _RATIO * bench.sizes.coarse
     density = torch.zeros((edge,) * 3, device=bench.device)
     full = round(fill ** (1 / 3) * edge)
@@ -288,15 +274,14 @@ def _carry_bricks(bench, scheme: str, fill: float, box, velocity, walls):
         if scheme == "maccormack":
             advection.correct(box, velocity, walls, *fields, _SUBSTEPS, bricks=bricks)
 
-    return StepGraph(step, bench.device, warmup=1), bricks
+    return bench.replay(step), bricks
 
 
-def _turn(bench: Bench, scheme: str, storage: str) -> tuple[float, float, float]:
+def _turn(bench: SmokeBench, scheme: str, storage: str) -> dict[str, float]:
     """Turns a smooth ball once about the box's axis, after which it should be where it was.
 
     Returns:
-        The RMS difference over the ball's own RMS, the largest difference, where the ball's greatest density is 1, and
-        what is left of all smoke.
+        ``rms``, over the ball's own RMS; ``max_error``, where the ball's greatest density is 1; ``smoke_gained``.
     """
     n, device = bench.sizes.coarse, bench.device
     edge, box = _RATIO * n, _box(n)
@@ -319,7 +304,10 @@ def _turn(bench: Bench, scheme: str, storage: str) -> tuple[float, float, float]
                 advection.correct(box, velocity, nothing, *fields, 1.0)
                 fields[1], fields[2] = fields[2], fields[1]
             fields[0], fields[1] = fields[1], fields[0]
-        off = (wp.to_torch(fields[0].density).reshape(ball.shape).float() - ball).double()
+        error = (wp.to_torch(fields[0].density).reshape(ball.shape).float() - ball).double()
         total = ball.double()
-        rms = float(off.square().mean().sqrt() / total.square().mean().sqrt())
-        return rms, float(off.abs().max()), float(1.0 + off.sum() / total.sum())
+        return {
+            "rms": float(error.square().mean().sqrt() / total.square().mean().sqrt()),
+            "max_error": float(error.abs().max()),
+            "smoke_gained": float(error.sum() / total.sum()),
+        }

@@ -1,21 +1,24 @@
-"""What a frame's lightmaps could be made by instead of a network: a flip book seen from aside, a path tracer."""
+"""Rivals of the network: a flip book seen from aside, a path tracer."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 import torch
 
 from wlm.baselines.smoke import billboard
 from wlm.bench.path_tracer import GPU, PathTracer, choose_variant, denoise, has_denoiser, has_tracer
-from wlm.bench.runner import Row
-from wlm.bench.smoke_network_setup import EXACT, NetworkBench, Scores, Whole, row, score
+from wlm.bench.rows import Row
+from wlm.bench.smoke_network_setup import EXACT, NetworkBench, Pipeline, score
 from wlm.bench.timing import time_together
 from wlm.errors import one_line
-from wlm.smoke.baking import SixWay, six_way
-from wlm.smoke.coarse import coarse_six_way
+from wlm.smoke.baking import bake
+from wlm.smoke.coarse import march
+from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.planes import encode_lightmaps, to_srgb
+from wlm_kernels.smoke.settings import March
 
 __all__ = ["flipbook_rows", "traced_rows"]
 
@@ -26,11 +29,11 @@ def flipbook_rows(bench: NetworkBench) -> list[Row]:
     """A flip book baked from the first camera, under cameras that turn away from it."""
     bench.note("flip book")
     frames = bench.frames[:: bench.sizes.frames]  # one of each scene
-    baked = [six_way(frame.later, bench.camera, step=EXACT, estimate=False) for frame in frames]
+    baked = [bake(frame.later, bench.camera, step=EXACT, estimate=False) for frame in frames]
     pivots = [frame.later.centre for frame in frames]
-    ours = Whole(bench, bench.trained[0], half=True) if bench.trained else None
+    ours = Pipeline(bench, bench.trained[0], half=True) if bench.trained else None
     settings = bench.settings if ours is None else ours.subject.settings
-    step = settings.look(frames[0].later.shape)["step"]
+    step = settings.look(frames[0].later.shape).step
     rows = []
     for degrees in bench.sizes.turns:
         camera = bench.turned(degrees)
@@ -39,25 +42,24 @@ def flipbook_rows(bench: NetworkBench) -> list[Row]:
         def turned(camera=camera) -> list[SixWay]:
             return [billboard(six, bench.camera, camera, at) for six, at in zip(baked, pivots, strict=True)]
 
-        marched = [coarse_six_way(frame.later, camera, step=step, seed=frame.seed + 1).six for frame in frames]
-        found = score([encode_lightmaps(six) for six in turned()], references)
-        beside = score([encode_lightmaps(six) for six in marched], references)
-        figures = found.figures | {f"coarse march, h {step:g}, dB": f"{beside.mean:.2f}"}
+        marched = [march(frame.later, camera, March(step, seed=frame.seed + 1)) for frame in frames]
+        figures = score([encode_lightmaps(six) for six in turned()], references)
+        figures["coarse_psnr"] = score([encode_lightmaps(six) for six in marched], references)["psnr"]
+        notes = f"coarse march of h {step:g}"
         if ours is not None:
-            made = [ours.planes(frame.later, camera, frame.seed + 1) for frame in frames]
-            figures[f"{ours.subject.name}, dB"] = f"{score(made, references).mean:.2f}"
+            planes = [ours.planes(frame.later, camera, frame.seed + 1) for frame in frames]
+            figures["network_psnr"] = score(planes, references)["psnr"]
+            notes += f", network {ours.subject.name}"
         timing = bench.time({"": turned}, few=True)[""]
-        rows.append(
-            row("flip book", f"turned {degrees:g}°", figures, timing=timing, calls=len(frames), psnr=found.mean)
-        )
+        rows.append(bench.row("flip book", f"turned {degrees:g}°", notes, timing=timing, calls=len(frames), **figures))
     return rows
 
 
 def traced_rows(bench: NetworkBench) -> list[Row]:
     """All six lightmaps by a path tracer, with and without a denoiser, where they are installed.
 
-    It is another's, with a driver of its own: if it fails on the bench's GPU it traces on the CPU, which the rows say,
-    and if it fails there too, there are none.
+    Mitsuba needs a driver with OptiX: where it fails on the bench's GPU it traces on the CPU, which the rows say, and
+    where it fails there too, there are none.
     """
     if not has_tracer():
         bench.note("path tracing: left out, mitsuba isn't installed: wlm[bake]")
@@ -79,28 +81,28 @@ def traced_rows(bench: NetworkBench) -> list[Row]:
 
 
 def _rows_of(bench: NetworkBench, variant: str, trouble: str) -> list[Row]:
-    """The rows of one of Mitsuba's variants, and in their notes why it isn't the GPU's."""
+    """The rows of one of Mitsuba's variants; their notes say why it isn't the GPU's."""
     numbers = range(0, len(bench.frames), bench.sizes.frames)  # one frame of each scene
     tracers = [PathTracer(bench.frames[i].later, bench.camera, variant=variant) for i in numbers]
     references = [bench.references[i].cpu() for i in numbers]
-    made = {count: [tracer(count)[0] for tracer in tracers] for count in bench.sizes.samples}
-    calls: dict[str, Callable[[], object]] = {_name(count): _traced(tracers[0], count) for count in made}
+    traced = {count: [tracer(count)[0] for tracer in tracers] for count in bench.sizes.samples}
+    calls: dict[str, Callable[[], object]] = {_name(count): partial(tracers[0], count) for count in traced}
     if has_denoiser():
-        calls[_DENOISED] = _cleaned(made[bench.sizes.samples[0]][0])
-    times = {name: found.median_ms for name, found in time_together(calls, "cpu", 1, bench.sizes.few).items()}
+        calls[_DENOISED] = partial(denoise, traced[bench.sizes.samples[0]][0])
     # By the CPU's clock on both: an image is a copy there.
-    on = {"pixels": f"{bench.sizes.resolution}²", "on": f"{'GPU' if variant == GPU else 'CPU'}, {variant}"}
-    # In notes, a colon would make a figure and a semicolon end it.
-    note = f"not on the GPU ({trouble.replace(':', ',').replace(';', ',')})" if trouble else ""
+    times = {name: timing.median_ms for name, timing in time_together(calls, "cpu", 1, bench.sizes.few).items()}
+    notes = f"on the {'GPU' if variant == GPU else 'CPU'}, {variant}" + (f": not on the GPU, {trouble}" * bool(trouble))
+    pixels = bench.sizes.resolution
     rows = []
-    for count, images in made.items():
+    for count, images in traced.items():
         name = _name(count)
-        found = _score(images, references)
-        rows.append(row("path tracing", name, found.figures | on, note, decode_ms=times[name], psnr=found.mean))
+        rows.append(
+            bench.row("path tracing", name, notes, time_ms=times[name], pixels=pixels, **_score(images, references))
+        )
         if _DENOISED in times:
-            found, total = _score([denoise(image) for image in images], references), times[name] + times[_DENOISED]
+            figures, total = _score([denoise(image) for image in images], references), times[name] + times[_DENOISED]
             option = f"{name}, {_DENOISED}" + (" on the CPU" if variant == GPU else "")
-            rows.append(row("path tracing", option, found.figures | on, note, decode_ms=total, psnr=found.mean))
+            rows.append(bench.row("path tracing", option, notes, time_ms=total, pixels=pixels, **figures))
     return rows
 
 
@@ -108,13 +110,5 @@ def _name(count: int) -> str:
     return "1 sample" if count == 1 else f"{count} samples"
 
 
-def _traced(tracer: PathTracer, samples: int) -> Callable[[], object]:
-    return lambda: tracer(samples)
-
-
-def _cleaned(image: np.ndarray) -> Callable[[], object]:
-    return lambda: denoise(image)
-
-
-def _score(images: Sequence[np.ndarray], references: Sequence[torch.Tensor]) -> Scores:
+def _score(images: Sequence[np.ndarray], references: Sequence[torch.Tensor]) -> dict[str, float]:
     return score([to_srgb(torch.from_numpy(image)) for image in images], references)

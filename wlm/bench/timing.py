@@ -1,7 +1,7 @@
 """How long a call takes, on the CPU or on a CUDA device.
 
-A number here is the time of one call among many made back to back, after a warm-up that compiles kernels and
-fills caches. On CUDA that includes the launch wherever launching takes longer than the kernels; capture the
+A number here is the time of one call among many, back to back, after a warm-up that compiles kernels and fills
+caches. On CUDA that includes the launch wherever launching takes longer than the kernels; capture the
 call in a graph to leave it out.
 """
 
@@ -17,7 +17,7 @@ import numpy as np
 
 from wlm.errors import WlmError
 
-__all__ = ["Timing", "cpu_threads", "time_call", "time_together"]
+__all__ = ["Timing", "time_together"]
 
 # One sample lasts at least this long: CUDA events resolve half a microsecond, and an event pair around one
 # short kernel measures mostly the pair.
@@ -42,36 +42,18 @@ class Timing:
     n: int
 
 
-def time_call(fn: Callable[[], object], device: str = "cpu", warmup: int = 5, repeats: int = 30) -> Timing:
-    """Time one function; see `time_together`, which compares several fairly.
-
-    Args:
-        fn: Called without arguments; its result is dropped.
-        device: `"cpu"` or `"cuda:0"`.
-        warmup: Calls before the first that is timed, at least 1.
-        repeats: Samples to take, at least 1.
-
-    Returns:
-        The distribution of the time of one call.
-
-    Raises:
-        WlmError: The device is unknown or absent, or a number is below 1.
-    """
-    return time_together({"": fn}, device, warmup, repeats)[""]
-
-
 def time_together(
     calls: Mapping[str, Callable[[], object]], device: str = "cpu", warmup: int = 5, repeats: int = 30
 ) -> dict[str, Timing]:
-    """Time peers in one run, in turns, so that a drifting clock or a busy neighbour slows all alike.
+    """Times peers in one run, in turns, so that a drifting clock or a busy neighbour slows all alike.
 
     Each round takes one sample of every peer, and each round starts with the next peer. On CUDA all of them
-    run on the stream of `wlm.interop.stream`, which the events are recorded on; a function that launches on a
-    stream of its own must make that stream wait for this one and this one for it.
+    run on the stream of ``wlm.interop.stream``, which the events are recorded on; a function that launches on another
+    stream must make the two streams wait for each other.
 
     Args:
         calls: Functions without arguments, by name; their results are dropped.
-        device: `"cpu"` or `"cuda:0"`.
+        device: "cpu" or "cuda:0".
         warmup: Calls of each before the first that is timed, at least 1.
         repeats: Samples of each, at least 1.
 
@@ -95,32 +77,6 @@ def time_together(
             for name in names[first:] + names[:first]:
                 times[name].append(sample(calls[name], batch[name]))
     return {name: _timing(samples) for name, samples in times.items()}
-
-
-@contextlib.contextmanager
-def cpu_threads(count: int) -> Iterator[None]:
-    """Run torch's CPU operators on `count` threads inside the block, and as before after it.
-
-    This is torch's own pool alone. A Warp launch on the CPU is one serial loop whatever this says, and the
-    pools of NumPy's BLAS and of OpenMP libraries (FLIP's among them) are fixed when they are loaded: set
-    `OMP_NUM_THREADS` before the process starts for those. `describe_environment` records both.
-
-    Args:
-        count: Threads, at least 1.
-
-    Raises:
-        WlmError: The number is below 1.
-    """
-    import torch
-
-    if count < 1:
-        raise WlmError(f"timing: expected at least 1 thread, got {count}")
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 _Sampler = Callable[[Callable[[], object], int], float]

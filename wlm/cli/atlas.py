@@ -92,29 +92,25 @@ def evaluate(
     if json_path is not None:
         check_output(json_path, ".json")
     quiet_warp()
-    from wlm.atlas.evaluation import compare, evaluate
+    from wlm.atlas.evaluation import evaluate
     from wlm.atlas.exporter import read_folder, read_inputs
-    from wlm.atlas.model import SOURCE_BITS
-    from wlm.baselines.atlas import downsampling
+    from wlm.baselines.atlas import evaluate_rivals, share_of
     from wlm.interop import check_device
 
     output = read_folder(folder)
     original = read_inputs(output, mesh, lightmap, mask)
     device = check_device(device)
-    texels = original.mask.size
-    bits = round((1.0 - output.model.compression_ratio) * texels * SOURCE_BITS)
-    # Half a bit more, so that rounding takes none away.
-    rival = downsampling(original, (bits + 0.5) / (texels * SOURCE_BITS))
     options = {"views": views, "resolution": resolution, "device": device}
     with running("evaluate") as progress:
         report = evaluate(output.model, original, **options, progress=progress, file_bytes=output.model_bytes)
-        score = compare(original, {rival.name: rival.sample}, **options)[rival.name]
+        ((rival, score),) = evaluate_rivals(output.model, original, **options)
+    rival_cr = 1.0 - share_of(rival, original)
     if json_path is not None:
-        rest = {"size": list(rival.size), "cr": 1.0 - rival.share, "seconds": rival.seconds}
+        rest = {"size": list(rival.size), "cr": rival_cr, "seconds": rival.encode_seconds}
         settings = {"cameras": views, "resolution": resolution, "device": device}
         write_json(json_path, report.to_json() | settings | {rival.name: score.to_json() | rest})
     rows = table(f"{folder}: {report.views} views", ["", "ours", rival.name])
-    rows.add_row("CR (eq. 9)", f"{report.cr:.2%}", f"{1.0 - rival.share:.2%}")
+    rows.add_row("CR (eq. 9)", f"{report.cr:.2%}", f"{rival_cr:.2%}")
     rows.add_row("CR on disk", f"{report.cr_disk:.2%}", "–")
     for label, name, form in _ROWS:
         rows.add_row(label, *(number(getattr(each, name), form) for each in (report, score)))

@@ -3,104 +3,100 @@
 import shlex
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from wlm.cli.console import check_output, note, quiet_warp
+from wlm.cli.options import Device, output_option
 from wlm.errors import WlmError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from wlm.bench import Panel, Row
 
 __all__ = ["app"]
 
 app = typer.Typer(help="Speed against error, ours and the baselines.")
 
+_Quick = Annotated[bool, typer.Option("--quick", help="Fewer steps and rows, for a check in minutes.")]
+_SmallGrids = Annotated[
+    bool, typer.Option("--quick", help="Small grids, for a minute on a CPU; else the paper's, for a GPU.")
+]
+_RowsFile = Annotated[
+    Path | None, typer.Option("--json", metavar="FILE.json", help="Write the rows and the environment.")
+]
+_PlotFile = Annotated[
+    Path | None,
+    typer.Option("--plot", metavar="FILE.png", help="Draw quality against size or time, error against time."),
+]
+_Rivals = Annotated[bool, typer.Option("--rivals/--no-rivals", help="With the rivals, which take minutes on the CPU.")]
+_RivalsAt = Annotated[
+    Path | None,
+    typer.Option(
+        "--rivals-at", metavar="FILE.json", help="The rivals alone, at the sizes that ours have in this result file."
+    ),
+]
+
 
 @app.command()
 def lightmap(
-    quick: Annotated[bool, typer.Option("--quick", help="Fewer steps and rows, for a check in minutes.")] = False,
-    device: Annotated[str, typer.Option(help='Where it computes: "cpu", "cuda" or "cuda:N".')] = "cpu",
+    quick: _Quick = False,
+    device: Device = "cpu",
     set_path: Annotated[
         Path | None, typer.Option("--set", metavar="SET", help="A lightmap set; default the demo's.")
     ] = None,
-    json_path: Annotated[
-        Path | None, typer.Option("--json", metavar="FILE.json", help="Write the rows and the environment.")
-    ] = None,
-    plot_path: Annotated[
-        Path | None, typer.Option("--plot", metavar="FILE.png", help="Draw PSNR against time and size.")
-    ] = None,
+    json_path: _RowsFile = None,
+    plot_path: _PlotFile = None,
 ) -> None:
     """Lightmaps over time: PSNR, bits a texel and decode time of the profiles and of block codecs."""
-    _check_outputs(json_path, plot_path)
-    quiet_warp()
-    from wlm.bench.lightmap import run
-    from wlm.interop import check_device
+    device = _prepare(device, json_path, plot_path)
+    from wlm.bench.lightmap import PANELS, run
 
-    device = check_device(device)
     rows = run(quick=quick, device=device, set_path=set_path, progress=note)
-    command = f"wlm bench lightmap{' --quick' if quick else ''} --device {device}"
-    if set_path is not None:
-        command += f" --set {rows[0].scene}"
-    _finish(rows, device, command, json_path, plot_path, ("decode_ms", "bpp"))
+    command = _command("lightmap", quick=quick, device=device, set=set_path and rows[0].scene)
+    _finish(rows, command, device, json_path, plot_path, PANELS)
 
 
 @app.command()
 def probe(
-    quick: Annotated[bool, typer.Option("--quick", help="Fewer steps and rows, for a check in minutes.")] = False,
-    device: Annotated[str, typer.Option(help='Where it computes: "cpu", "cuda" or "cuda:N".')] = "cpu",
+    quick: _Quick = False,
+    device: Device = "cpu",
     probes_path: Annotated[
         Path | None, typer.Option("--probes", metavar="FILE", help="Light probes; default the demo's.")
     ] = None,
     keys: Annotated[
         list[str] | None, typer.Option("--key", help="Which of the file's arrays; may be given several times.")
     ] = None,
-    rivals: Annotated[
-        bool, typer.Option("--rivals/--no-rivals", help="With the PCA family, which takes minutes on the CPU.")
-    ] = True,
-    rivals_at: Annotated[
-        Path | None,
-        typer.Option(
-            "--rivals-at",
-            metavar="FILE.json",
-            help="The PCA family alone, at the bytes that our files have in this result file.",
-        ),
-    ] = None,
-    json_path: Annotated[
-        Path | None, typer.Option("--json", metavar="FILE.json", help="Write the rows and the environment.")
-    ] = None,
-    plot_path: Annotated[
-        Path | None, typer.Option("--plot", metavar="FILE.png", help="Draw PSNR against size, error against time.")
-    ] = None,
+    rivals: _Rivals = True,
+    rivals_at: _RivalsAt = None,
+    json_path: _RowsFile = None,
+    plot_path: _PlotFile = None,
 ) -> None:
     """Light probes: PSNR, size and decode time of the profiles, of their decodes and of the PCA family."""
-    _check_outputs(json_path, plot_path)
-    quiet_warp()
-    from wlm.bench import read_json
+    device = _prepare(device, json_path, plot_path)
     from wlm.bench.probe import PANELS, run, run_rivals
-    from wlm.interop import check_device
 
-    device = check_device(device)
-    beside: list = []  # what the plot shows besides the rows
     common = {"probes_path": probes_path, "keys": keys or (), "progress": note}
+    files = {"probes": probes_path, "key": keys}
+    beside: list[Row] = []
     if rivals_at is not None:
         if quick or not rivals or device != "cpu":
             raise WlmError("--rivals-at: expected without --quick, --no-rivals and --device: the rivals need no GPU")
         rows = run_rivals(rivals_at, **common)
-        scenes = {row.scene for row in rows}
-        beside = [row for row in read_json(rivals_at)[0] if row.system == "probe" and row.scene in scenes]
-        command = f"wlm bench probe --rivals-at {rivals_at.name}"
+        beside = _measured(rivals_at, rows)
+        command = _command("probe", rivals_at=rivals_at, **files)
     else:
         rows = run(quick=quick, device=device, rivals=rivals, **common)
-        command = f"wlm bench probe{' --quick' if quick else ''}{'' if rivals else ' --no-rivals'} --device {device}"
-    if probes_path is not None:
-        command += f" --probes {probes_path.name}"
-    command += "".join(f" --key {key}" for key in keys or ())
-    _finish(rows, device, command, json_path, plot_path, PANELS, beside)
+        command = _command("probe", quick=quick, no_rivals=not rivals, device=device, **files)
+    _finish(rows, command, device, json_path, plot_path, PANELS, [*beside, *rows])
 
 
 @app.command()
 def atlas(
-    quick: Annotated[bool, typer.Option("--quick", help="Fewer steps and rows, for a check in minutes.")] = False,
-    device: Annotated[str, typer.Option(help='Where it computes: "cpu", "cuda" or "cuda:N".')] = "cpu",
+    quick: _Quick = False,
+    device: Device = "cpu",
     meshes_path: Annotated[
         Path | None,
         typer.Option(
@@ -120,82 +116,47 @@ def atlas(
     profiles: Annotated[
         list[str] | None, typer.Option("--profile", metavar="NAME", help="Profiles; default all. Several times.")
     ] = None,
-    rivals: Annotated[
-        bool, typer.Option("--rivals/--no-rivals", help="With the block codecs, which take minutes on the CPU.")
-    ] = True,
-    rivals_at: Annotated[
-        Path | None,
-        typer.Option(
-            "--rivals-at", metavar="FILE.json", help="The rivals alone, at the bits that ours have in this result file."
-        ),
-    ] = None,
-    json_path: Annotated[
-        Path | None, typer.Option("--json", metavar="FILE.json", help="Write the rows and the environment.")
-    ] = None,
-    plot_path: Annotated[
-        Path | None, typer.Option("--plot", metavar="FILE.png", help="Draw PSNR against size, error against time.")
-    ] = None,
+    rivals: _Rivals = True,
+    rivals_at: _RivalsAt = None,
+    json_path: _RowsFile = None,
+    plot_path: _PlotFile = None,
 ) -> None:
     """Lightmaps of meshes: PSNR, SSIM, size and decode time of the profiles, smaller lightmaps and block codecs."""
-    _check_outputs(json_path, plot_path)
-    quiet_warp()
-    from wlm.bench import read_json
+    device = _prepare(device, json_path, plot_path)
     from wlm.bench.atlas import PANELS, plotted, run, run_rivals
     from wlm.bench.atlas_inputs import load
-    from wlm.interop import check_device
 
-    device = check_device(device)
     lightmaps = load(meshes_path, mesh_path, lightmap_paths or (), mask_path)
-    beside: list = []  # what the plot shows besides the rows
+    files = {"meshes": meshes_path, "mesh": mesh_path, "lightmap": lightmap_paths, "mask": mask_path}
+    beside: list[Row] = []
     if rivals_at is not None:
         if quick or not rivals or profiles or device != "cpu":
             raise WlmError("--rivals-at: expected without --quick, --profile, --no-rivals and --device")
         rows = run_rivals(rivals_at, lightmaps, progress=note)
-        scenes = {row.scene for row in rows}
-        beside = plotted([row for row in read_json(rivals_at)[0] if row.system == "atlas" and row.scene in scenes])
-        command = f"wlm bench atlas --rivals-at {rivals_at.name}"
+        beside = _measured(rivals_at, rows)
+        command = _command("atlas", rivals_at=rivals_at, **files)
     else:
         rows = run(lightmaps, profiles or (), quick=quick, device=device, rivals=rivals, progress=note)
-        command = f"wlm bench atlas{' --quick' if quick else ''}{'' if rivals else ' --no-rivals'} --device {device}"
-    for option, path in (("meshes", meshes_path), ("mesh", mesh_path)):
-        command += "" if path is None else f" --{option} {path.name}"
-    command += "".join(f" --lightmap {path.name}" for path in lightmap_paths or ())
-    command += "" if mask_path is None else f" --mask {mask_path.name}"
-    command += "".join(f" --profile {name}" for name in profiles or ())
-    _finish(rows, device, command, json_path, plot_path, PANELS, beside, plotted(rows))
+        command = _command("atlas", quick=quick, no_rivals=not rivals, device=device, **files, profile=profiles)
+    _finish(rows, command, device, json_path, plot_path, PANELS, [*plotted(beside), *plotted(rows)])
 
 
 @app.command()
 def smoke(
-    quick: Annotated[
-        bool, typer.Option("--quick", help="Small grids, for a minute on a CPU; else the paper's, for a GPU.")
-    ] = False,
-    device: Annotated[str, typer.Option(help='Where it computes: "cpu", "cuda" or "cuda:N".')] = "cpu",
-    json_path: Annotated[
-        Path | None, typer.Option("--json", metavar="FILE.json", help="Write the rows and the environment.")
-    ] = None,
-    plot_path: Annotated[
-        Path | None, typer.Option("--plot", metavar="FILE.png", help="Draw the error of marches against their time.")
-    ] = None,
+    quick: _SmallGrids = False, device: Device = "cpu", json_path: _RowsFile = None, plot_path: _PlotFile = None
 ) -> None:
     """Smoke: the lattice beside a copy, advection, guiding maps, six-way lightmaps and a frame, with their errors."""
-    _check_outputs(json_path, plot_path)
-    quiet_warp()
+    device = _prepare(device, json_path, plot_path)
     from wlm.bench.smoke import PANELS, plotted, run
-    from wlm.interop import check_device
 
-    device = check_device(device)
     rows = run(quick=quick, device=device, progress=note)
-    command = f"wlm bench smoke{' --quick' if quick else ''} --device {device}"
-    _finish(rows, device, command, json_path, plot_path, PANELS, shown=plotted(rows))
+    _finish(rows, _command("smoke", quick=quick, device=device), device, json_path, plot_path, PANELS, plotted(rows))
 
 
 @app.command("smoke-network")
 def smoke_network(
-    quick: Annotated[
-        bool, typer.Option("--quick", help="Small grids, for a minute on a CPU; else the paper's, for a GPU.")
-    ] = False,
-    device: Annotated[str, typer.Option(help='Where it computes: "cpu", "cuda" or "cuda:N".')] = "cpu",
+    quick: _SmallGrids = False,
+    device: Device = "cpu",
     networks: Annotated[
         list[Path] | None,
         typer.Option(
@@ -212,27 +173,18 @@ def smoke_network(
             help="A profile, or a YAML file, whose untrained network is timed. Several times.",
         ),
     ] = None,
-    json_path: Annotated[
-        Path | None, typer.Option("--json", metavar="FILE.json", help="Write the rows and the environment.")
-    ] = None,
-    plot_path: Annotated[
-        Path | None, typer.Option("--plot", metavar="FILE.png", help="Draw PSNR against time.")
-    ] = None,
+    json_path: _RowsFile = None,
+    plot_path: _PlotFile = None,
 ) -> None:
     """Neural six-way lightmaps: time and error beside marches, flip books and path tracing, by parts and by profile."""
-    _check_outputs(json_path, plot_path)
-    quiet_warp()
+    device = _prepare(device, json_path, plot_path)
     from wlm.bench.smoke_network import PANELS, plotted, run
-    from wlm.interop import check_device
     from wlm.smoke.codec import shipped
 
-    device = check_device(device)
-    measured = networks or ([] if profiles else [shipped()])
-    rows = run(measured, profiles or (), quick=quick, device=device, progress=note)
-    command = f"wlm bench smoke-network{' --quick' if quick else ''} --device {device}"
-    command += "".join(f" --network {path.name}" for path in networks or ())
-    command += "".join(f" --profile {Path(name).name}" for name in profiles or ())
-    _finish(rows, device, command, json_path, plot_path, PANELS, shown=plotted(rows))
+    rows = run(networks or ([] if profiles else [shipped()]), profiles or (), quick=quick, device=device, progress=note)
+    names = [Path(name).name for name in profiles or ()]
+    command = _command("smoke-network", quick=quick, device=device, network=networks, profile=names)
+    _finish(rows, command, device, json_path, plot_path, PANELS, plotted(rows))
 
 
 @app.command("smoke-ablation")
@@ -243,87 +195,103 @@ def smoke_ablation(
     quick: Annotated[
         bool, typer.Option("--quick", help="Small images and few steps, for seconds on a CPU; else for a GPU.")
     ] = False,
-    device: Annotated[str, typer.Option(help='Where it computes: "cpu", "cuda" or "cuda:N".')] = "cpu",
+    device: Device = "cpu",
     rounds: Annotated[int | None, typer.Option(min=1, help="Of each training, with samples of its own.")] = None,
     steps: Annotated[int | None, typer.Option(min=1, help="Of each round.")] = None,
     only: Annotated[
         list[str] | None, typer.Option("--only", metavar="ROW", help="A row by its name; default all. Several times.")
     ] = None,
-    json_path: Annotated[
-        Path | None, typer.Option("--json", metavar="FILE.json", help="Write the rows and the environment.")
-    ] = None,
+    json_path: _RowsFile = None,
 ) -> None:
     """Neural six-way lightmaps: short trainings of a profile with one thing changed at a time, beside each other."""
-    _check_outputs(json_path, None)
-    quiet_warp()
+    device = _prepare(device, json_path, None)
     from wlm.bench import describe_environment, write_json
     from wlm.bench.smoke_ablation import run
-    from wlm.interop import check_device
 
-    device = check_device(device)
-    command = f"wlm bench smoke-ablation{' --quick' if quick else ''} --profile {Path(profile).name} --device {device}"
-    command += "".join(f" --{name} {value}" for name, value in (("rounds", rounds), ("steps", steps)) if value)
-    command += "".join(f" --only {shlex.quote(name)}" for name in only or ())
+    lengths = {"rounds": rounds, "steps": steps}
+    command = _command("smoke-ablation", quick=quick, profile=Path(profile).name, device=device, **lengths, only=only)
 
-    def keep(rows: list) -> None:
-        # What took minutes outlives a stop.
+    def write(rows: "Sequence[Row]") -> None:
+        # Rows take minutes each: those that are done outlive a stop.
         if json_path is not None:
             write_json(json_path, rows, describe_environment(device, command))
 
-    options = {"quick": quick, "device": device, "rounds": rounds, "steps": steps}
-    rows = run(profile, only or (), **options, progress=note, done=keep)
-    _finish(rows, device, command, None, None, ())
+    rows = run(profile, only or (), quick=quick, device=device, **lengths, progress=note, done=write)
+    _finish(rows, command, device, None, None)
 
 
 @app.command()
 def report(
     files: Annotated[list[Path], typer.Argument(metavar="FILE.json...", help="What `wlm bench ... --json` wrote.")],
-    output: Annotated[Path | None, typer.Option("--output", "-o", metavar="PAGE.md", help="Default: print it.")] = None,
+    output: Annotated[
+        Path | None, output_option("INDEX.md", "The index; the pages go to a folder beside it. Default: print them.")
+    ] = None,
 ) -> None:
-    """Make a Markdown page of benchmark files."""
-    from wlm.bench.report import report as make
+    """Make Markdown pages of benchmark files: one for each system, and an index."""
+    from wlm.bench import pages
 
-    page = make(files)
     if output is None:
-        sys.stdout.write(page)
+        sys.stdout.write("\n".join(pages(files).values()))
         return
     check_output(output, ".md")
     from wlm.formats.atomic import atomic_write
 
-    atomic_write(output, page.encode())
+    for name, page in pages(files, output).items():
+        path = output.parent / name
+        path.parent.mkdir(exist_ok=True)
+        atomic_write(path, page.encode())
 
 
-def _check_outputs(json_path: Path | None, plot_path: Path | None) -> None:
-    """Checks, before long work, that its results can be written."""
+def _prepare(device: str, json_path: Path | None, plot_path: Path | None) -> str:
+    """Checks, before long work, that the device is there and that results can be written; returns the device."""
     if json_path is not None:
         check_output(json_path, ".json")
         if json_path.exists():
             from wlm.bench import read_runs
 
-            read_runs(json_path)  # what other systems left there is kept, so it has to be whole
+            read_runs(json_path)  # the rows of other systems in it stay, so it has to be whole
     if plot_path is not None:
         check_output(plot_path, ".png", ".svg", ".pdf")
+    quiet_warp()
+    from wlm.interop import check_device
+
+    return check_device(device)
+
+
+def _command(name: str, **options: object) -> str:
+    """Writes a command with its options in their order, as another machine would repeat it: files by their names."""
+    words = ["wlm", "bench", name]
+    for option, value in options.items():
+        for item in value if isinstance(value, list) else [value]:
+            if item is not None and item is not False:
+                words.append(f"--{option.replace('_', '-')}")
+                if item is not True:
+                    words.append(shlex.quote(item.name if isinstance(item, Path) else str(item)))
+    return " ".join(words)
+
+
+def _measured(results: Path, rows: "Sequence[Row]") -> "list[Row]":
+    """Rows of the same system and scenes in a result file."""
+    from wlm.bench import read_json
+
+    scenes = {(row.system, row.scene) for row in rows}
+    return [row for row in read_json(results)[0] if (row.system, row.scene) in scenes]
 
 
 def _finish(
-    rows: list,
-    device: str,
+    rows: "Sequence[Row]",
     command: str,
+    device: str,
     json_path: Path | None,
     plot_path: Path | None,
-    panels,
-    beside=(),
-    shown: list | None = None,
+    panels: "Sequence[Panel]" = (),
+    plotted: "Sequence[Row] | None" = None,
 ) -> None:
-    """Writes what was asked for, and prints the tables.
-
-    A plot has the rows that are ``shown``, all unless told, and those ``beside`` them.
-    """
-    from wlm.bench import describe_environment, plot, write_json
-    from wlm.bench.report import tables
+    """Writes the result file and the plot, of all rows unless told which, and prints the tables."""
+    from wlm.bench import describe_environment, plot, tables, write_json
 
     if json_path is not None:
         write_json(json_path, rows, describe_environment(device, command))
     if plot_path is not None:
-        plot([*beside, *(rows if shown is None else shown)], plot_path, panels)
+        plot(rows if plotted is None else plotted, plot_path, panels)
     sys.stdout.write(tables(rows))

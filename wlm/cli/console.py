@@ -238,7 +238,7 @@ def deferred_interrupt() -> Iterator[Callable[[], None]]:
 
 
 @contextmanager
-def running(what: str, checkpoint: Path | None = None) -> "Iterator[OnProgress]":
+def running(what: str, checkpoint: Path | None = None, unit: str = "step") -> "Iterator[OnProgress]":
     """Shows the progress of long work and, where it has a checkpoint, lets Ctrl-C stop it between two steps.
 
     Each stage that isn't ``what`` has a bar of its own, named ``what: stage``.
@@ -246,6 +246,7 @@ def running(what: str, checkpoint: Path | None = None) -> "Iterator[OnProgress]"
     Args:
         what: The work, in a word or two.
         checkpoint: The file that keeps an interrupted run; None: Ctrl-C ends the work at once.
+        unit: What the work's progress counts.
 
     Yields:
         A callback for the work. Once it has been called and Ctrl-C stopped the work, a line says how to go on.
@@ -271,7 +272,7 @@ def running(what: str, checkpoint: Path | None = None) -> "Iterator[OnProgress]"
                 yield report
         except KeyboardInterrupt:
             if checkpoint is not None and checkpoint.exists():
-                step = f" at step {last.done}" if last is not None else ""
+                step = f" at {unit} {last.done}" if last is not None else ""
                 note(f"stopped{step}: the same command with --resume goes on from {checkpoint}")
             raise
 

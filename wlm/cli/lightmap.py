@@ -11,7 +11,6 @@ from wlm.cli.console import (
     escape,
     note,
     number,
-    progress_bar,
     quiet_warp,
     running,
     show,
@@ -22,8 +21,9 @@ from wlm.cli.console import (
 from wlm.cli.options import AsJson, Device, ModelFile, ReportFile, Resume, Seed, output_option
 
 if TYPE_CHECKING:
+    from wlm.baselines.lightmap import Score
+    from wlm.baselines.rival import Rival
     from wlm.lightmap import LightmapSet, Report
-    from wlm.lightmap.evaluation import BaselineReport
 
 __all__ = ["app"]
 
@@ -141,7 +141,7 @@ def evaluate(
         check_output(json_path, ".json")
     quiet_warp()
     from wlm.interop import check_device
-    from wlm.lightmap.evaluation import evaluate, evaluate_baselines
+    from wlm.lightmap.evaluation import evaluate
     from wlm.system import load
 
     device = check_device(device)
@@ -149,14 +149,14 @@ def evaluate(
     lightmaps = _load(set_path, times, mask, period)
     with running("score") as progress:
         report = evaluate(model, lightmaps, device=device, progress=progress, file_bytes=file.stat().st_size)
-    rivals: list[BaselineReport] = []
+    rivals: list[tuple[Rival, Score]] = []
     if baselines:
-        with progress_bar("baselines") as bar:
-            rivals = evaluate_baselines(
-                model, lightmaps, tuple(_NAMES), progress=lambda done, total: bar(done, total, "")
-            )
+        from wlm.baselines.lightmap import evaluate_rivals
+
+        with running("baselines") as progress:
+            rivals = evaluate_rivals(model, lightmaps, tuple(_NAMES), progress=progress)
     if json_path is not None:
-        extra = {"baselines": [rival.to_json() for rival in rivals]} if baselines else {}
+        extra = {"baselines": [rival.to_json() | score.to_json() for rival, score in rivals]} if baselines else {}
         write_json(json_path, report.to_json() | extra)
     _show_report(file, report, rivals)
 
@@ -244,14 +244,13 @@ def _load(path: Path, times: str | None, mask: str | None, period: float | None)
     return lightmaps
 
 
-def _show_report(file: Path, report: "Report", rivals: "list[BaselineReport]") -> None:
+def _show_report(file: Path, report: "Report", rivals: "list[tuple[Rival, Score]]") -> None:
     rows = table(str(file), ["", "PSNR dB", "SSIM", "FLIP", "bytes", "bpp"])
 
     def add(name: str, psnr: float, ssim: float, flip: float, size: str = "", bpp: str = "") -> None:
         rows.add_row(name, number(psnr, ".2f"), number(ssim, ".4f"), number(flip, ".4f"), size, bpp)
 
-    names = [f"wlm {escape(report.profile)}", *(_NAMES[rival.name] for rival in rivals)]
-    for name, score in zip(names, (report, *rivals), strict=True):
+    for name, score in [(f"wlm {escape(report.profile)}", report), *((_NAMES[r.name], score) for r, score in rivals)]:
         add(name, score.psnr, score.ssim, score.flip, f"{score.bytes:,}", f"{score.bpp:.3f}")
     rows.add_section()
     scores = (report.psnr_by_time, report.ssim_by_time, report.flip_by_time)

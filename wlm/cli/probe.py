@@ -11,7 +11,6 @@ from wlm.cli.console import (
     escape,
     note,
     number,
-    progress_bar,
     quiet_warp,
     running,
     show,
@@ -25,6 +24,7 @@ from wlm.errors import WlmError
 if TYPE_CHECKING:
     import numpy as np
 
+    from wlm.baselines.rival import Rival
     from wlm.probe import ProbeModel, ProbeSet, Report
 
 __all__ = ["app"]
@@ -174,11 +174,16 @@ def evaluate(
     report = evaluate(model, probes, device=device, file_bytes=file.stat().st_size)
     if probes.source != model.source:
         note(f"warning: {probes_path}: not what {file} was made of; another key, convention or file?")
-    others = _baselines(probes, report.bytes) if baselines else []
+    rivals = []
+    if baselines:
+        from wlm.baselines.probe import evaluate_rivals
+
+        with running("baselines") as progress:
+            rivals = evaluate_rivals(probes, report.bytes, progress=progress, skipped=lambda error: note(str(error)))
     if json_path is not None:
-        extra = {"baselines": [facts | other.to_json() for facts, other in others]} if baselines else {}
-        write_json(json_path, report.to_json() | extra)
-    _show_report(file, model.profile.name, report, others)
+        scores = [{"method": rival.name} | rival.to_json() | score.to_json() for rival, score in rivals]
+        write_json(json_path, report.to_json() | ({"baselines": scores} if baselines else {}))
+    _show_report(file, model.profile.name, report, rivals)
 
 
 @app.command()
@@ -332,39 +337,14 @@ def _positions(model: "ProbeModel", path: Path | None) -> "tuple[np.ndarray, boo
     return position, model.has_probes_at(position)
 
 
-def _baselines(probes: "ProbeSet", size: int) -> "list[tuple[dict[str, Any], Report]]":
-    """Scores what the rivals make of as many bytes; those for which they are too few are named."""
-    from wlm.baselines.probe import PROBE_BASELINES, at_bytes
-    from wlm.probe import score
-
-    rows = []
-    with progress_bar("baselines") as bar:
-        for done, method in enumerate(PROBE_BASELINES, 1):
-            try:
-                result = at_bytes(method, probes.position, probes.values, size)
-            except WlmError as error:
-                note(str(error))
-                continue
-            finally:
-                bar(done, len(PROBE_BASELINES), method)
-            facts = {
-                "method": method,
-                "option": result.option,
-                "encode_seconds": result.encode_seconds,
-                "decode_seconds": result.decode_seconds,
-            }
-            rows.append((facts, score(result.decoded, probes, result.bytes)))
-    return rows
-
-
-def _show_report(file: Path, profile: str, report: "Report", others: "list[tuple[dict[str, Any], Report]]") -> None:
+def _show_report(file: Path, profile: str, report: "Report", rivals: "list[tuple[Rival, Report]]") -> None:
     columns = ["", "PSNR dB", "live dB", "irradiance dB", "bytes", "of float32", "bits a probe"]
     rows = table(str(file), columns)
     named = [(f"wlm {escape(profile)}", report)]
-    named += [(f"{_NAMES.get(facts['method'], facts['method'])}, {facts['option']}", other) for facts, other in others]
-    for name, one in named:
-        scores = (number(score, ".2f") for score in (one.psnr, one.psnr_live, one.irradiance_psnr))
-        rows.add_row(name, *scores, f"{one.bytes:,}", f"{one.ratio:.2%}", f"{one.bits_per_probe:.2f}")
+    named += [(f"{_NAMES.get(rival.name, rival.name)}, {rival.option}", score) for rival, score in rivals]
+    for name, score in named:
+        psnr = (number(value, ".2f") for value in (score.psnr, score.psnr_live, score.irradiance_psnr))
+        rows.add_row(name, *psnr, f"{score.bytes:,}", f"{score.ratio:.2%}", f"{score.bits_per_probe:.2f}")
     if report.psnr_by_band is not None:
         rows.add_section()
         for band, psnr in enumerate(report.psnr_by_band):

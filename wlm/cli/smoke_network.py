@@ -1,7 +1,6 @@
 """`wlm smoke`: make samples, train the network that lightmaps come from, use it, measure it, export it."""
 
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -9,44 +8,31 @@ import typer
 
 from wlm.cli.console import (
     check_output,
-    deferred_interrupt,
     escape,
     note,
     number,
     progress_bar,
     quiet_warp,
+    running,
     show,
     table,
     write_json,
 )
-from wlm.cli.smoke_options import (
-    Device,
-    Distance,
-    Emission,
-    Extent,
-    Extinction,
-    Input,
-    Resolution,
-    Toward,
-    Turn,
-    open_smoke,
-    write_lightmaps,
-)
+from wlm.cli.options import Device, ReportFile, Resume, Seed, output_option
+from wlm.cli.smoke_options import Input, SmokeOptions, with_smoke, write_lightmaps
 from wlm.errors import WlmError
 
 if TYPE_CHECKING:
     from wlm.fluid.volume import DensityVolume
-    from wlm.smoke.baking import SixWay
     from wlm.smoke.camera import Camera
     from wlm.smoke.evaluation import Comparison
-    from wlm.smoke.model import SixWayNetwork
+    from wlm.smoke.lightmaps import SixWay
+    from wlm.smoke.model import SmokeModel
+    from wlm.system import Progress
 
 __all__ = ["register"]
 
 _POOL, _SHEET = "pool.safetensors", "sheet.png"
-_SUFFIX = ".safetensors"
-_NEAR = 1.25  # times as many pixels as a network has learned from, or as few, that still count as that
-
 _MARCH = 130  # steps of `predict --coarse` along the longest edge
 
 _Network = Annotated[
@@ -63,12 +49,12 @@ def register(app: typer.Typer) -> None:
 
 def train(
     profile: Annotated[str, typer.Argument(metavar="PROFILE", help="fast, 16, 24, 32, paper, or a YAML file.")],
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="NETWORK", help="The .safetensors to write.")],
+    output: Annotated[Path, output_option("NETWORK", "The .safetensors to write.")],
     minutes: Annotated[
         float | None, typer.Option(min=0.0, help="After which it stops and can be resumed; default at its end.")
     ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with an interrupted training of NETWORK.")] = False,
-    seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="One seed gives one result on one device.")] = 0,
+    resume: Resume = False,
+    seed: Seed = 0,
     device: Device = "cpu",
 ) -> None:
     """Train a network on smoke that is simulated as it is needed, and keep the best of its validations.
@@ -76,70 +62,39 @@ def train(
     Ctrl-C keeps the training in NETWORK.partial; the same command with --resume goes on exactly. The curves are in
     NETWORK.csv.
     """
-    check_output(output, _SUFFIX)
+    check_output(output, ".safetensors")
     quiet_warp()
     from wlm.formats.checkpoint import SUFFIX
-    from wlm.smoke.fit import Progress, load_profile
     from wlm.smoke.fit import train as fit
-    from wlm.smoke.learn.dataset import make_pool, make_validation
+    from wlm.smoke.model import Profile
 
-    settings = load_profile(profile)
-    kept = Path(f"{output}{SUFFIX}")
-    if resume and not kept.exists() and not output.exists():
-        note(f"{kept}: there is nothing to resume; starting at step 0")
-    at, begun = 0, False
-    try:
-        with deferred_interrupt() as check_interrupt, progress_bar("train") as bar:
-
-            def validated(*_: object) -> None:
-                check_interrupt()
-
-            def made(*_: object) -> None:
-                # Between two sequences of a pool nothing is lost: what came before the pool is kept already.
-                nonlocal begun
-                begun = True
-                check_interrupt()
-
-            def report(now: Progress) -> None:
-                nonlocal at
-                at = now.step
-                bar(now.step, now.steps, f"PSNR {number(now.psnr, '.2f')} dB, loss {number(now.loss, '.3g')}")
-                check_interrupt()
-
-            result = fit(
-                output,
-                settings,
-                make_pool=partial(make_pool, progress=made),
-                make_validation=partial(make_validation, progress=validated),
-                seed=seed,
-                device=device,
-                minutes=minutes,
-                resume=resume,
-                progress=report,
-            )
-    except KeyboardInterrupt:
-        if begun or (resume and kept.exists()):
-            told = f"at step {at}" if at else "before another step"
-            note(f"stopped {told}: the same command with --resume goes on from {kept}")
-        raise
-    if not result.finished:
-        note(f"out of time at step {result.steps}: the same command with --resume goes on from {kept}")
+    settings = Profile.load(profile)
+    checkpoint = Path(f"{output}{SUFFIX}")
+    if resume and not checkpoint.exists() and not output.exists():
+        note(f"{checkpoint}: there is nothing to resume; starting at step 0")
+    options = {"seed": seed, "device": device, "minutes": minutes, "resume": resume}
+    with running("train", checkpoint) as progress:
+        training = fit(settings, output, progress=progress, **options)
+    if not training.finished:
+        note(f"out of time at step {training.steps}: the same command with --resume goes on from {checkpoint}")
     rows = table(f"{output}: {settings.name}", ["", "value"])
-    rows.add_row("steps", f"{result.steps:,} of {settings.training.total:,}")
-    rows.add_row("steps left out", f"{result.skipped:,}")
-    rows.add_row("best validation, dB", number(result.best, ".2f"))
-    if result.score is not None:
-        rows.add_row("last validation, dB", number(result.score.psnr, ".2f"))
-        rows.add_row("its flicker over the reference's", number(result.score.flicker_ratio, ".3f"))
-    rows.add_row("seconds", f"{result.seconds:.1f}")
-    if output.is_file():
+    rows.add_row("steps", f"{training.steps:,} of {settings.training.total:,}")
+    rows.add_row("steps skipped", f"{training.skipped:,}")
+    rows.add_row("best validation, dB", number(training.best, ".2f"))
+    if training.score is not None:
+        rows.add_row("last validation, dB", number(training.score.psnr, ".2f"))
+        rows.add_row("its flicker over the reference's", number(training.score.flicker_ratio, ".3f"))
+    rows.add_row("seconds", f"{training.seconds:.1f}")
+    if training.model is not None:
         rows.add_row("bytes", f"{output.stat().st_size:,}")
     show(rows)
 
 
+@with_smoke
 def predict(
     smoke: Input,
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="OUT", help="A .exr, or of frames a folder.")],
+    output: Annotated[Path, output_option("OUT", "A .exr, or of frames a folder.")],
+    options: SmokeOptions,
     network: Annotated[
         Path | None, typer.Option(metavar="FILE", help="A network that train wrote; default the one that wlm has.")
     ] = None,
@@ -153,15 +108,7 @@ def predict(
             help=f"Voxels, of the march of --coarse; default 1/{_MARCH} of the longest edge.",
         ),
     ] = None,
-    resolution: Resolution = None,
-    seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Of the march's jitter.")] = 0,
-    toward: Toward = None,
-    turn: Turn = 0.0,
-    extent: Extent = None,
-    distance: Distance = None,
-    extinction: Extinction = None,
-    emission: Emission = None,
-    device: Device = "cpu",
+    seed: Seed = 0,
 ) -> None:
     """Make six-way lightmaps by the network, from a guiding map as it was trained with: what bake makes, sooner.
 
@@ -172,24 +119,21 @@ def predict(
     if step is not None and not coarse:
         raise WlmError("--step: expected --coarse beside it: a network looks as it was trained to")
     quiet_warp()
-    from wlm.smoke.codec import shipped
-
-    footage = open_smoke(smoke, extinction, emission, device)
-    make = _coarse(step, seed) if coarse else _predicted(network or shipped(), seed, footage.device)
-    view = {"resolution": resolution, "toward": toward, "turn": turn, "extent": extent, "distance": distance}
-    write_lightmaps(footage, output, view, make)
+    frames = options.open(smoke)
+    make = _coarse(step, seed) if coarse else _predicted(network, seed, frames.device)
+    write_lightmaps(frames, options.camera(frames), output, make)
 
 
 def evaluate(
     network: _Network = None,
     smoke: Annotated[
-        list[Path] | None, typer.Option(metavar="FILE", help="A .npz or .nvdb volume to look at too; repeat for more.")
+        list[Path] | None, typer.Option(metavar="FILE", help="A .npz or .nvdb volume to score too; repeat for more.")
     ] = None,
     resolution: Annotated[int, typer.Option(min=8, max=4096, help="Pixels along an image's edges.")] = 512,
     cells: Annotated[
         int | None, typer.Option(min=16, max=512, help="Of the air along the box's edges; default as it was trained.")
     ] = None,
-    json_path: Annotated[Path | None, typer.Option("--json", metavar="REPORT.json", help="Write a report.")] = None,
+    json_path: ReportFile = None,
     device: Device = "cpu",
 ) -> None:
     """Measure a network on smoke that it hasn't learned from, beside a coarse march and a flip book.
@@ -201,38 +145,41 @@ def evaluate(
     if json_path is not None:
         check_output(json_path, ".json")
     quiet_warp()
+    from wlm.baselines.smoke import RIVALS
     from wlm.interop import check_device
-    from wlm.smoke.codec import load_network, settings_of, shipped
-    from wlm.smoke.evaluation import evaluate_all
+    from wlm.smoke.codec import open_network, shipped
+    from wlm.smoke.evaluation import compare
 
     device, network = check_device(device), network or shipped()
-    loaded, summary = load_network(network, device=device)
-    settings = settings_of(network, summary)
-    changed = {"resolution": resolution, "cells": settings.cells if cells is None else cells}
-    with progress_bar("evaluate") as bar:
-        found = evaluate_all(loaded, settings.model_copy(update=changed), smoke or (), device=device, progress=bar)
+    model = open_network(network)
+    sizes = {"resolution": resolution, "cells": model.dataset.cells if cells is None else cells}
+    settings = model.dataset.model_copy(update=sizes)
+    with running("evaluate") as progress:
+        comparisons = compare(model, settings, smoke or (), rivals=RIVALS, device=device, progress=progress)
     if json_path is not None:
-        facts = {"network": _described(network, loaded, summary), "device": device, **changed}
-        write_json(json_path, facts | {"sets": [one.to_json() for one in found]})
-    _show_evaluation(network, found)
+        facts = {"network": _facts(network, model), "device": device, **sizes}
+        write_json(json_path, facts | {"sets": [comparison.to_json() for comparison in comparisons]})
+    _show_comparisons(network, comparisons)
 
 
 def export(
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE.onnx", help="The file to write.")],
+    output: Annotated[Path, output_option("FILE.onnx", "The file to write.")],
     network: _Network = None,
     resolution: Annotated[int, typer.Option(min=1, max=16384, help="Pixels along the image's edges.")] = 512,
 ) -> None:
     """Write a network as ONNX: encoded guiding maps to encoded lightmaps, of one size, in float32."""
     check_output(output, ".onnx")
     quiet_warp()
-    from wlm.smoke.codec import export_onnx, load_network, shipped
+    from wlm.smoke import onnx_file
+    from wlm.smoke.codec import shipped
     from wlm.smoke.planes import GUIDES, PLANES
+    from wlm.system import load
 
     network = network or shipped()
-    loaded, _ = load_network(network)
-    size = export_onnx(loaded, output, resolution, resolution)
+    model: SmokeModel = load(network, "smoke-network")
+    size = onnx_file.export(model, output, height=resolution, width=resolution)
     rows = table(str(network), ["", "planes"], text=["planes"])
-    rows.add_row("guide", " ".join(GUIDES[loaded.settings.guide]))
+    rows.add_row("guide", " ".join(GUIDES[model.settings.guide]))
     rows.add_row("lightmaps", " ".join(PLANES))
     rows.add_row(escape(str(output)), f"{size:,} bytes, {resolution} x {resolution} pixels")
     show(rows)
@@ -242,7 +189,7 @@ def dataset(
     settings_file: Annotated[
         Path, typer.Argument(metavar="SETTINGS", help="A YAML file of dataset settings, each with a default.")
     ],
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="The folder to write to.")],
+    output: Annotated[Path, output_option("DIR", "The folder to write to.")],
     seed: Annotated[int, typer.Option(min=0, help="Of all rounds.")] = 0,
     round_number: Annotated[int, typer.Option("--round", min=0, help="Which round of samples.")] = 0,
     validation: Annotated[
@@ -257,23 +204,22 @@ def dataset(
     """
     quiet_warp()
     from wlm.config import load_settings
-    from wlm.interop import check_device
-    from wlm.smoke.learn.dataset import STAGES, DatasetSettings, make_pool, make_validation
-    from wlm.smoke.learn.pool_file import save_pool
+    from wlm.smoke.learn.dataset import STAGES, make_pool, make_validation
+    from wlm.smoke.learn.pool import save_pool
+    from wlm.smoke.learn.settings import DatasetSettings
     from wlm.view.smoke_pool import pool_sheet
 
-    settings, device = load_settings(DatasetSettings, settings_file), check_device(device)
+    settings = load_settings(DatasetSettings, settings_file)
     try:
         output.mkdir(exist_ok=True)
     except OSError as error:
         raise WlmError(f"{output}: cannot write there: {error.strerror or error}") from error
-    total = settings.validation_sequences if validation else settings.sequences
     figures: dict[str, float] = {}
     with progress_bar("dataset") as bar:
 
-        def report(done: int, found: dict[str, float]) -> None:
-            figures.update(found)
-            bar(done, total, f"{found['samples']:.0f} samples")
+        def report(progress: "Progress") -> None:
+            figures.update(progress.figures)
+            bar(progress.done, progress.total, f"{progress.figures['samples']:.0f} samples")
 
         if validation:
             pool = make_validation(settings, device, progress=report)
@@ -283,7 +229,7 @@ def dataset(
         raise WlmError(f"{settings_file}: expected frames with smoke, found none: use a longer warmup")
     source = f"validation-{settings.validation_seed}" if validation else f"seed-{seed}-round-{round_number}"
     size = save_pool(output / _POOL, pool, settings, source)
-    shown = pool_sheet(output / _SHEET, pool, columns=columns)
+    chosen = pool_sheet(output / _SHEET, pool, columns=columns)
     rows = table(f"{output}: {source}", ["", "value"])
     rows.add_row("samples", f"{len(pool):,}")
     rows.add_row("pixels", f"{settings.resolution} x {settings.resolution}")
@@ -294,68 +240,63 @@ def dataset(
         rows.add_row(f"seconds: {stage}", f"{figures[stage]:.3g}")
     rows.add_row(escape(str(output / _POOL)), f"{size:,} bytes")
     show(rows)
-    note(f"{output / _SHEET}: samples {', '.join(map(str, shown))}")
+    note(f"{output / _SHEET}: samples {', '.join(map(str, chosen))}")
 
 
 def _coarse(step: float | None, seed: int) -> "Callable[[DensityVolume, Camera], SixWay]":
     """Makes lightmaps by a march whose nodes are as far apart as its steps."""
-    from wlm.smoke.coarse import coarse_six_way
+    from wlm.smoke.coarse import march
+    from wlm_kernels.smoke.settings import March
 
     def make(volume: "DensityVolume", camera: "Camera") -> "SixWay":
         voxels = max(volume.shape) / _MARCH if step is None else step
-        return coarse_six_way(volume, camera, step=voxels, seed=seed).six
+        return march(volume, camera, March(voxels, seed=seed))
 
     return make
 
 
-def _predicted(path: Path, seed: int, device: str) -> "Callable[[DensityVolume, Camera], SixWay]":
-    """Makes lightmaps by a network, which looks as it was trained to."""
-    from wlm.smoke.codec import load_network, settings_of
-    from wlm.smoke.decode import Predictor
-    from wlm.smoke.decode import predict as run
+def _predicted(path: Path | None, seed: int, device: str) -> "Callable[[DensityVolume, Camera], SixWay]":
+    """Makes lightmaps by a network; notes once where it wasn't trained for the image's size."""
+    from wlm.smoke.prediction import SmokePredictor
 
-    loaded, summary = load_network(path)
-    settings = settings_of(path, summary)
-    predictors: dict[tuple[int, int], Any] = {}
-    fewest, most = settings.pixels
+    predictor, first = SmokePredictor(path, device), True
 
     def make(volume: "DensityVolume", camera: "Camera") -> "SixWay":
-        size = (camera.height, camera.width)
-        pixels = camera.height * volume.voxel * max(volume.shape) / camera.extent
-        if not predictors and not fewest / _NEAR <= pixels <= most * _NEAR:
-            learned = f"{path.stem} has learned from {fewest:.0f} to {most:.0f}"
-            note(f"{pixels:.0f} pixels show the smoke's longest edge, {learned}: --coarse may be nearer")
-        if size not in predictors:
-            predictors[size] = Predictor(loaded, *size, device=device)
-        return run(volume, camera, predictors[size], seed=seed, **settings.look(volume.shape))
+        nonlocal first
+        if first and (warning := predictor.warning(volume, camera)):
+            note(warning)
+        first = False
+        return predictor(volume, camera, seed)
 
     return make
 
 
-def _described(path: Path, network: "SixWayNetwork", summary: dict[str, Any]) -> dict[str, Any]:
-    """Which network it is, and how it was trained as far as its file says."""
+def _facts(path: Path, model: "SmokeModel") -> dict[str, Any]:
+    """The network, and what its file says of its training."""
     from wlm.smoke.model import parameter_count
 
-    known = {name: summary[name] for name in ("profile", "seed", "steps", "seconds", "device") if name in summary}
-    settings = network.settings.model_dump(mode="json")
-    return {"name": path.stem, **settings, "parameters": parameter_count(network), **known}
+    names = ("profile", "seed", "steps", "seconds", "device")
+    training = {name: model.summary[name] for name in names if name in model.summary}
+    settings = model.settings.model_dump(mode="json")
+    return {"name": path.stem, **settings, "parameters": parameter_count(model.network), **training}
 
 
-def _show_evaluation(path: Path, found: "list[Comparison]") -> None:
+def _show_comparisons(path: Path, comparisons: "list[Comparison]") -> None:
     from wlm.smoke.planes import PLANES
 
     scores = table(str(path), ["smoke", "method", "PSNR", "lowest", "highest", "flicker"], text=["method"])
     planes = table(f"{path}: PSNR of each plane", ["smoke", "method", *PLANES], text=["method"])
-    for one in found:
-        for place, (name, method) in enumerate(one.methods.items()):
-            first = ("" if place else escape(one.name), name)
-            decibels = (number(value, ".2f") for value in (method.psnr, method.lowest, method.highest))
-            scores.add_row(*first, *decibels, number(method.flicker_ratio, ".3f"))
-            planes.add_row(*first, *(number(value, ".2f") for value in method.planes))
+    for comparison in comparisons:
+        smoke = escape(comparison.name)
+        for name, score in comparison.methods.items():
+            decibels = (number(value, ".2f") for value in (score.psnr, score.lowest, score.highest))
+            scores.add_row(smoke, name, *decibels, number(score.flicker_ratio, ".3f"))
+            planes.add_row(smoke, name, *(number(value, ".2f") for value in score.planes))
+            smoke = ""
         scores.add_section()
         planes.add_section()
     show(scores)
     show(planes)
-    for one in found:
-        if one.half_loss is not None:
-            note(f"{one.name}: half floats lose {one.half_loss:.3f} dB")
+    for comparison in comparisons:
+        if comparison.half_loss is not None:
+            note(f"{comparison.name}: half floats lose {comparison.half_loss:.3f} dB")

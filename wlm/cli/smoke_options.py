@@ -1,61 +1,107 @@
-"""What the commands of `wlm smoke` share: options, smoke to be opened, cameras, and lightmaps on their way to files."""
+"""What the commands of ``wlm smoke`` share: options of the smoke and its camera, output files, tables of lightmaps."""
 
+import functools
+import inspect
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from wlm.cli.console import check_output, escape, note, number, progress_bar, show, table
+from wlm.cli.console import check_output, escape, note, number, running, show, table
+from wlm.cli.options import Device
 from wlm.errors import WlmError
 
 if TYPE_CHECKING:
     from wlm.fluid.volume import DensityVolume
-    from wlm.smoke.baking import SixWay
     from wlm.smoke.camera import Camera
-    from wlm.smoke.data import Footage
+    from wlm.smoke.data import Frames
+    from wlm.smoke.lightmaps import SixWay
+    from wlm.smoke.scene import CameraSettings
 
-__all__ = [
-    "SHEET",
-    "Device",
-    "Distance",
-    "Emission",
-    "Extent",
-    "Extinction",
-    "Input",
-    "Resolution",
-    "Toward",
-    "Turn",
-    "camera_of",
-    "cleared",
-    "load",
-    "made_of",
-    "open_smoke",
-    "places",
-    "vector",
-    "volumes",
-    "write_lightmaps",
-]
-
-Input = Annotated[Path, typer.Argument(metavar="SMOKE", help="A .npz or .nvdb volume, or a folder of simulate.")]
-Device = Annotated[str, typer.Option(help='Where it computes: "cpu", "cuda" or "cuda:N".')]
-Resolution = Annotated[
-    int | None, typer.Option(min=1, max=16384, help="Pixels along the image's height; default the scene's, or 512.")
-]
-Toward = Annotated[
-    str | None, typer.Option(metavar="X,Y,Z", help="From the smoke to the camera; default the scene's, or 0,0,1.")
-]
-Turn = Annotated[float, typer.Option(help="Degrees by which the camera is turned about what is up.")]
-Extent = Annotated[float | None, typer.Option(help="Height of the image in the world; default what holds the box.")]
-Distance = Annotated[
-    float | None, typer.Option(help="Of the camera from its target; what is behind it isn't seen. Default outside.")
-]
-Extinction = Annotated[float | None, typer.Option(help="Per length, of density 1; default the scene's, or 1.")]
-Emission = Annotated[float | None, typer.Option(help="Per length, of temperature 1; default the scene's, or 1.")]
+__all__ = ["SHEET", "Input", "SmokeOptions", "marched", "outputs", "vector", "with_smoke", "write_lightmaps"]
 
 SHEET = "sheet.png"
 
-_T = TypeVar("_T")
+Input = Annotated[Path, typer.Argument(metavar="SMOKE", help="A .npz or .nvdb volume, or a folder of simulate.")]
+
+
+@dataclass(frozen=True)
+class SmokeOptions:
+    """Options of the smoke, its camera and the device, each spelled out once for all commands ``with_smoke``."""
+
+    resolution: Annotated[
+        int | None, typer.Option(min=1, max=16384, help="Pixels along the image's height; default the scene's, or 512.")
+    ] = None
+    toward: Annotated[
+        str | None, typer.Option(metavar="X,Y,Z", help="From the smoke to the camera; default the scene's, or 0,0,1.")
+    ] = None
+    turn: Annotated[float, typer.Option(help="Degrees by which the camera is turned about the upward direction.")] = 0.0
+    extent: Annotated[
+        float | None, typer.Option(help="Height of the image in the world; default what holds the box.")
+    ] = None
+    distance: Annotated[
+        float | None, typer.Option(help="Of the camera from its target; what is behind it isn't seen. Default outside.")
+    ] = None
+    extinction: Annotated[float | None, typer.Option(help="Per length of density 1; default the scene's, or 1.")] = None
+    emission: Annotated[float | None, typer.Option(help="Per length of temperature 1; default the scene's, or 1.")] = (
+        None
+    )
+    device: Device = "cpu"
+
+    def given(self) -> dict[str, Any]:
+        """The options that differ from their defaults, but for the device."""
+        values = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "device"}
+        return {name: value for name, value in values.items() if value != getattr(SmokeOptions, name)}
+
+    def open(self, smoke: Path) -> "Frames":
+        """Opens a volume or a folder of frames, on a device that there is."""
+        from wlm.interop import check_device
+        from wlm.smoke.data import load_frames
+
+        device = check_device(self.device)
+        return load_frames(smoke, extinction=self.extinction, emission=self.emission, device=device)
+
+    def camera(self, frames: "Frames", *, orthographic: bool = True, perspective: bool = False) -> "CameraSettings":
+        """The scene's camera, or the default one, with what the options change.
+
+        Raises:
+            WlmError: An option is out of its range, or lightmaps are to be made in perspective.
+        """
+        from wlm.config import check_settings
+        from wlm.smoke.scene import CameraSettings
+
+        names = ("resolution", "toward", "extent", "distance")
+        changes = {name: value for name, value in self.given().items() if name in names}
+        if self.toward is not None:
+            changes["toward"] = vector("--toward", self.toward)
+        if perspective:
+            changes["perspective"] = True
+        settings = check_settings(CameraSettings, frames.camera.model_dump() | changes, "--").turned(self.turn)
+        if orthographic and settings.perspective:
+            raise WlmError(f"{frames.path}: camera.perspective: expected false for six-way lightmaps, found true")
+        return settings
+
+
+def with_smoke(command: Callable[..., None]) -> Callable[..., None]:
+    """Gives a command the options of ``SmokeOptions``, which it takes as its parameter ``options``."""
+    signature = inspect.signature(command)
+    names = [field.name for field in fields(SmokeOptions)]
+
+    @functools.wraps(command)
+    def run(**values: Any) -> None:
+        command(options=SmokeOptions(**{name: values.pop(name) for name in names}), **values)
+
+    own = [parameter for name, parameter in signature.parameters.items() if name != "options"]
+    shared = [
+        inspect.Parameter(field.name, inspect.Parameter.KEYWORD_ONLY, default=field.default, annotation=field.type)
+        for field in fields(SmokeOptions)
+    ]
+    # What typer reads.
+    run.__signature__ = signature.replace(parameters=[*own, *shared])  # type: ignore[attr-defined]
+    run.__annotations__ = {parameter.name: parameter.annotation for parameter in (*own, *shared)}
+    return run
 
 
 def vector(option: str, text: str) -> tuple[float, float, float]:
@@ -69,123 +115,65 @@ def vector(option: str, text: str) -> tuple[float, float, float]:
     return x, y, z
 
 
-def made_of(cls: Any, values: dict[str, Any], options: dict[str, str]) -> Any:
-    """Checks settings that options gave, and names the option that is wrong."""
-    from pydantic import ValidationError
-
-    try:
-        return cls(**values)
-    except ValidationError as error:
-        problem = error.errors(include_url=False)[0]
-        field = str(problem["loc"][0]) if problem["loc"] else "settings"
-        expected = problem["msg"].replace("Input should be", "expected", 1)
-        raise WlmError(f"{options.get(field, '--' + field)}: {expected}, got {problem['input']}") from error
-
-
-def open_smoke(smoke: Path, extinction: float | None, emission: float | None, device: str) -> "Footage":
-    """A volume or a folder of frames, on a device that there is."""
-    from wlm.interop import check_device
-    from wlm.smoke.data import open_footage
-
-    return open_footage(smoke, extinction=extinction, emission=emission, device=check_device(device))
-
-
-def places(smoke: Path, numbers: "tuple[int, ...]", single: bool, output: Path, stem: str, suffix: str) -> list[Path]:
-    """Where each frame goes: into a file, or numbered into a folder, which is looked at and not changed yet."""
-    from wlm.smoke.data import check_folder
+def outputs(smoke: Path, single: bool, output: Path, stem: str, suffix: str) -> Callable[[int], Path]:
+    """Checks where results go, a file or for frames a folder; returns the file of a frame, ready to be written."""
+    from wlm.smoke.data import NumberedFiles
 
     if single:
         check_output(output, suffix)
-        return [output]
+        return lambda number: output
     if output.resolve() == smoke.resolve():
         raise WlmError(f"{output}: expected another folder than that of the frames")
-    folder = check_folder(output, stem, suffix, SHEET)
-    return [folder / f"{stem}_{number:04d}{suffix}" for number in numbers]
+    return NumberedFiles(output, stem, suffix, SHEET).file
 
 
-def cleared(results: Iterator[_T], single: bool, output: Path, stem: str, suffix: str) -> Iterator[_T]:
-    """The same results; what an earlier run left in the folder goes when the first is there, and not before."""
-    from wlm.smoke.data import clear_folder
+def marched(
+    frames: "Frames", camera: "CameraSettings", output: Path, stem: str
+) -> "Iterator[tuple[Callable[[], Path], DensityVolume, Camera]]":
+    """Yields each frame's volume and camera, and a function that returns the EXR of its result when it is ready."""
+    from wlm.smoke.scene import make_camera
 
-    for done, result in enumerate(results):
-        if done == 0 and not single:
-            clear_folder(output, stem, suffix, SHEET)
-        yield result
-
-
-def volumes(
-    footage: "Footage", output: Path, stem: str, suffix: str, view: dict[str, Any], *, flat: bool = False
-) -> "Iterator[tuple[Path, DensityVolume, Camera]]":
-    """Volumes with where their result goes and their camera; says what was repaired, and how far it is."""
-    single = footage.scene is None
-    paths = places(footage.path, footage.numbers, single, output, stem, suffix)
-
-    def seen() -> "Iterator[tuple[Path, DensityVolume, Camera]]":
-        with progress_bar(stem) as bar:
-            for done, (path, frame) in enumerate(zip(paths, footage.numbers, strict=True), 1):
-                volume = load(footage, frame)
-                yield path, volume, camera_of(footage, volume, view, flat=flat)
-                bar(done, len(paths), "")
-
-    return cleared(seen(), single, output, stem, suffix)
-
-
-def load(footage: "Footage", frame: int) -> "DensityVolume":
-    """Reads a frame, and says what was repaired in it."""
-    volume = footage.load(frame)
-    for warning in volume.warnings:
-        note(f"warning: {warning}")
-    return volume
-
-
-def camera_of(footage: "Footage", volume: "DensityVolume", view: dict[str, Any], *, flat: bool = False) -> "Camera":
-    """The scene's camera, or one before the volume, as far as the options don't say otherwise."""
-    import numpy as np
-
-    from wlm.smoke.scene import CameraSettings, make_camera
-
-    base = CameraSettings() if footage.scene is None else footage.scene.camera
-    given = {name: value for name, value in view.items() if value is not None and name != "turn"}
-    if "toward" in given:
-        given["toward"] = vector("--toward", given["toward"])
-    settings = made_of(CameraSettings, base.model_dump() | given, {}).turned(view["turn"])
-    if flat and settings.perspective:
-        raise WlmError(f"{footage.path}: camera.perspective: expected false for six-way lightmaps, found true")
-    return make_camera(settings, volume.origin, volume.voxel * np.asarray(volume.shape))
+    file = outputs(frames.path, frames.scene is None, output, stem, ".exr")
+    with running(stem) as progress:
+        for frame, volume in frames.volumes(progress=progress):
+            for warning in volume.warnings:
+                note(f"warning: {warning}")
+            view = make_camera(camera, volume.origin, [volume.voxel * n for n in volume.shape])
+            yield functools.partial(file, frame), volume, view
 
 
 def write_lightmaps(
-    footage: "Footage",
+    frames: "Frames",
+    camera: "CameraSettings",
     output: Path,
-    view: dict[str, Any],
     make: "Callable[[DensityVolume, Camera], SixWay]",
     *,
     errors: bool = False,
 ) -> None:
-    """Makes lightmaps of each volume, writes them and shows a table; says where they aren't what their names say.
+    """Makes lightmaps of each frame, writes them and shows a table; notes lightmaps that aren't bright where named.
 
     Args:
-        footage: The smoke.
-        output: As for `places`.
-        view: Options of the camera.
-        make: What makes them.
+        frames: The smoke.
+        camera: Before each.
+        output: A file, or for frames a folder.
+        make: Makes the lightmaps.
         errors: Whether they come with the error of their step.
     """
     from wlm.smoke.camera import axis_faults
     from wlm.smoke.data import write_six_way
 
-    rows = table(str(footage.path), ["file", "covered", "mean light", *(["largest error", "RMS error"] * errors)])
-    for path, volume, camera in volumes(footage, output, "six", ".exr", view, flat=True):
-        six = make(volume, camera)
-        write_six_way(path, six, camera)
+    rows = table(str(frames.path), ["file", "covered", "mean light", *(["largest error", "RMS error"] * errors)])
+    for file, volume, view in marched(frames, camera, output, "six"):
+        six = make(volume, view)
+        path = file()
+        write_six_way(path, six)
         covered = six.transparency < 0.99
         for fault in axis_faults(six.lightmaps.cpu().numpy()) if covered.any() else ():
             note(f"{path}: note: {fault}")
-        told = (f"{six.error.largest:.2g}", f"{six.error.rms:.2g}") if errors else ()
         rows.add_row(
             escape(path.name),
             f"{float(covered.float().mean()):.1%}",
             number(float(six.lightmaps[:, covered].mean()) if covered.any() else None, ".4g"),
-            *told,
+            *((f"{six.error.largest:.2g}", f"{six.error.rms:.2g}") if errors else ()),
         )
     show(rows)

@@ -2,14 +2,20 @@
 
     from wlm import fluid
 
-    air = fluid.Lattice((64, 32, 32), viscosity=1e-4)
+    air = fluid.Lattice((64, 32, 32), viscosity=1e-5)
     air.set_inlet("-x", (0.1, 0.0, 0.0))
     air.set_outlet("+x")
-    for face in fluid.FACES[2:]:
+    for face in ("-y", "+y", "-z", "+z"):
         air.set_wall(face, slip=True)
-    nozzle = fluid.Source("sphere", centre=(2, 16, 16), size=(2, 5, 5), density=1.0, fixed=True)
-    sphere = fluid.Sphere(fluid.Trajectory.of((20, 16, 16)), radius=5)
-    smoke = fluid.Solver(air, refinement=2, sources=[nozzle], obstacles=[sphere])
+
+    smoke = fluid.Solver(
+        air,
+        refinement=2,
+        temperature=True,
+        buoyancy=fluid.Buoyancy(lift=1e-4),
+        sources=[fluid.Source("sphere", (2, 16, 16), (2, 5, 5), density=1.0, temperature=1.0, fixed=True)],
+        obstacles=[fluid.Sphere(fluid.Trajectory.of((20, 16, 16)), radius=5)],
+    )
     smoke.step(100)
     fluid.save_volume("smoke.npz", smoke.frame(extinction=0.2))
 
@@ -18,33 +24,25 @@ Lengths are in cells of the lattice, times in its steps; ``Domain`` converts fro
 
 from wlm._facade import facade
 
-__all__ = [
-    "FACES",
-    "Buoyancy",
-    "DensityVolume",
-    "Domain",
-    "Lattice",
-    "Mesh",
-    "Obstacle",
-    "Solver",
-    "Source",
-    "Sphere",
-    "Trajectory",
-    "box_mesh",
-    "from_array",
-    "from_grid",
-    "load_volume",
-    "save_volume",
-]
-
-_MODULES = {
-    "faces": ("FACES",),
-    "lattice": ("Domain", "Lattice"),
-    "obstacles": ("Mesh", "Obstacle", "Sphere", "Trajectory", "box_mesh"),
-    "solver": ("Buoyancy", "Solver", "Source"),
-    "volume": ("DensityVolume", "from_array", "from_grid", "load_volume", "save_volume"),
+_PLACES = {
+    "Buoyancy": "wlm.fluid.solver",
+    "DensityVolume": "wlm.fluid.volume",
+    "Domain": "wlm.fluid.lattice",
+    "FACES": "wlm.fluid.faces",
+    "Lattice": "wlm.fluid.lattice",
+    "Mesh": "wlm.fluid.obstacles",
+    "Obstacle": "wlm.fluid.obstacles",
+    "Solver": "wlm.fluid.solver",
+    "Source": "wlm.fluid.solver",
+    "Sphere": "wlm.fluid.obstacles",
+    "Trajectory": "wlm.fluid.obstacles",
+    "box_mesh": "wlm.fluid.obstacles",
+    "from_array": "wlm.fluid.volume",
+    "from_grid": "wlm.fluid.volume",
+    "load_volume": "wlm.fluid.volume",
+    "save_volume": "wlm.fluid.volume",
 }
 
-__getattr__, __dir__ = facade(
-    __name__, {name: f"{__name__}.{module}" for module, names in _MODULES.items() for name in names}
-)
+__all__ = sorted(_PLACES)
+
+__getattr__, __dir__ = facade(__name__, _PLACES)

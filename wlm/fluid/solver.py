@@ -16,8 +16,7 @@ smoke in an obstacle                   none; smoke that a moving one covers is l
 smoke at faces                         leaves through inlets and outlets, and clean air comes in; held at walls. A
                                        face with an inlet is open as a whole, beside the inlet too
 a grid of one voxel                    fine
-grids too large for the memory         error before any smoke is allocated: what it needs and what there is;
-                                       ``wlm.smoke.simulate.make_solver`` checks air and smoke together
+grids too large for the memory         error before any smoke is allocated: what it needs and what there is
 =====================================  ===================================================================
 """
 

@@ -1,31 +1,26 @@
 """Scoring a compressed lightmap set against its input, by the paper's protocol (neural-dynamic-gi, section 10.2)."""
 
-import dataclasses
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from wlm import interop
-from wlm.baselines import BASELINES
 from wlm.errors import WlmError
 from wlm.lightmap.data import LightmapSet
 from wlm.lightmap.decode import Decoder
 from wlm.lightmap.model import TILE, LightmapModel
 from wlm.lightmap.tiles import TileGrid, TileKind
 from wlm.metrics import METRICS, FrameMetrics, Summary, evaluate_frame, summarise
-from wlm.system import Meter, OnProgress, plain
+from wlm.system import Meter, OnProgress
 from wlm.system import Report as BaseReport
 
 __all__ = [
-    "BaselineReport",
     "Report",
     "bits_per_texel",
     "count_kinds",
     "evaluate",
-    "evaluate_baselines",
     "part_bytes",
     "scored_mask",
 ]
@@ -50,7 +45,7 @@ class Report(BaseReport):
         psnr_by_tile, ssim_by_tile, flip_by_tile: float64 [rows, columns] of the grid, means over the times.
         psnr_by_time, ssim_by_time, flip_by_time: float64 [T], means over the tiles.
         time_values: float64 [T], the stored times.
-        worst_psnr: Lowest PSNR of a tile at a time.
+        worst_psnr: Lowest PSNR of any tile at any time.
         worst_tile: Where that is: ``time``, ``tile`` (its number), ``row``, ``column``; None without a score.
         max_abs_error: Largest absolute error of a valid texel, scored or not, in the input's units.
         max_abs_error_unscored: The same over what has no score.
@@ -96,31 +91,6 @@ class Report(BaseReport):
     warnings: list[str]
 
 
-@dataclass(frozen=True)
-class BaselineReport:
-    """A block codec on the same lightmaps, scored over the same texels.
-
-    Attributes:
-        name: As in ``wlm.baselines.BASELINES``.
-        psnr, ssim, flip: As in ``Report``.
-        bpp: Bits a texel and time. These codecs have a fixed rate, so this holds for any part of the map.
-        bytes: Of all times of the whole map, also where only some tiles are scored.
-        encode_seconds: Wall-clock time of the encoder over all times, one thread.
-    """
-
-    name: str
-    psnr: float
-    ssim: float
-    flip: float
-    bpp: float
-    bytes: int
-    encode_seconds: float
-
-    def to_json(self) -> dict[str, Any]:
-        """The report as JSON's own types; NaN is None."""
-        return plain(dataclasses.asdict(self))
-
-
 def evaluate(
     model: LightmapModel,
     lightmaps: LightmapSet,
@@ -163,49 +133,6 @@ def evaluate(
             meter.report(i + 1)
     file_bytes = model.file_bytes() if file_bytes is None else file_bytes
     return _report(model, lightmaps, file_bytes, device, frames, time.perf_counter() - start)
-
-
-def evaluate_baselines(
-    model: LightmapModel,
-    lightmaps: LightmapSet,
-    names: Sequence[str] = ("bc6h", "bc7", "astc12", "astc10", "8bit"),
-    *,
-    metrics: Sequence[str] = METRICS,
-    progress: Callable[[int, int], None] | None = None,
-) -> list[BaselineReport]:
-    """Puts every time through block codecs, one time at once, and scores the texels that ``evaluate`` scores.
-
-    Args:
-        model: The model to compare with: it says which tiles are scored.
-        lightmaps: The input.
-        names: Keys of ``wlm.baselines.BASELINES``.
-        metrics: As for ``evaluate``.
-        progress: Called after each codec and time with the number done and the number in all.
-
-    Returns:
-        One report a name, in their order.
-
-    Raises:
-        WlmError: As ``evaluate``, an unknown name, or the extra `baselines` is missing.
-    """
-    for name in names:
-        if name not in BASELINES:
-            raise WlmError(f"baselines: unknown codec {name!r}, expected one of {', '.join(BASELINES)}")
-    mask = scored_mask(model, lightmaps)
-    reports = []
-    texels = lightmaps.mask.size * len(lightmaps.frames)
-    for k, name in enumerate(names):
-        frames, size, seconds = [], 0, 0.0
-        for i, frame in enumerate(lightmaps.frames):
-            # The whole map's mask: an engine would encode all of it, whatever we score.
-            result = BASELINES[name](frame, lightmaps.mask)
-            size, seconds = size + result.bytes, seconds + result.encode_seconds
-            frames.append(evaluate_frame(frame, result.decoded, mask, TILE, metrics, name=name))
-            if progress is not None:
-                progress(k * len(lightmaps.frames) + i + 1, len(names) * len(lightmaps.frames))
-        summary = summarise(frames)
-        reports.append(BaselineReport(name, summary.psnr, summary.ssim, summary.flip, size * 8 / texels, size, seconds))
-    return reports
 
 
 def bits_per_texel(model: LightmapModel, mask: np.ndarray, file_bytes: int) -> float:

@@ -197,5 +197,5 @@ def _kind(value: object) -> str:
         return "an object"
     if isinstance(value, list):
         return f"a list of {len(value)}" if value else "an empty list"
-    shown = json.dumps(value) if not isinstance(value, int) or abs(value) < 1e300 else "a very large number"
-    return shown if len(shown) <= 60 else shown[:57] + "..."
+    text = json.dumps(value) if not isinstance(value, int) or abs(value) < 1e300 else "a very large number"
+    return text if len(text) <= 60 else text[:57] + "..."

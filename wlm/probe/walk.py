@@ -142,32 +142,28 @@ def summary(figures: Sequence[FrameFigures]) -> dict[str, object]:
     cached, updated = sum(s.cached for s in stats), sum(s.updated for s in stats)
     result["from_cache"] = cached / (cached + updated) if cached + updated else None
     for name in counts:
-        result[name] = _high([getattr(s, name) for s in stats])
+        result[name] = _statistics([getattr(s, name) for s in stats])
     stages = {name: [1e3 * getattr(s, f"{name}_seconds") for s in stats] for name in ("find", "decode", "upload")}
-    result["update_ms"] = _high(np.sum(list(stages.values()), 0))
+    result["update_ms"] = _statistics(np.sum(list(stages.values()), 0))
     for name, values in stages.items():
-        result[f"{name}_ms"] = _high(values)
-    result["read_ms"] = _high([1e3 * figure.read_seconds for figure in figures])
+        result[f"{name}_ms"] = _statistics(values)
+    result["read_ms"] = _statistics([1e3 * figure.read_seconds for figure in figures])
     sampled = [figure for figure in figures if figure.samples]
-    result["coverage"] = _low([figure.coverage for figure in sampled])
+    result["coverage"] = _statistics([figure.coverage for figure in sampled], more_is_worse=False)
     result["by_level"] = np.mean([figure.by_level for figure in sampled], 0).tolist() if sampled else None
-    result["rmse"] = _high([figure.rmse for figure in sampled])
-    result["rms"] = _high([figure.rms for figure in sampled])
+    result["rmse"] = _statistics([figure.rmse for figure in sampled])
+    result["rms"] = _statistics([figure.rms for figure in sampled])
     return result
 
 
-def _high(values: Sequence[float] | np.ndarray) -> dict[str, float] | None:
-    """Where more is worse."""
+def _statistics(values: Sequence[float] | np.ndarray, more_is_worse: bool = True) -> dict[str, float] | None:
+    """Mean, the percentile that only 5% of the values exceed in the bad direction, and the worst value."""
     if len(values) == 0:
         return None
-    return {"mean": float(np.mean(values)), "p95": float(np.percentile(values, 95)), "max": float(np.max(values))}
-
-
-def _low(values: Sequence[float]) -> dict[str, float] | None:
-    """Where less is worse."""
-    if len(values) == 0:
-        return None
-    return {"mean": float(np.mean(values)), "p5": float(np.percentile(values, 5)), "min": float(np.min(values))}
+    mean = {"mean": float(np.mean(values))}
+    if more_is_worse:
+        return mean | {"p95": float(np.percentile(values, 95)), "max": float(np.max(values))}
+    return mean | {"p5": float(np.percentile(values, 5)), "min": float(np.min(values))}
 
 
 def camera_path(position: np.ndarray, frames: int, eye_height: float = EYE_HEIGHT, up: int = 1) -> np.ndarray:

@@ -1,1 +1,39 @@
-"""Smoke as six-way lightmaps predicted from a guiding map (neural-six-way-lightmaps)."""
+"""Smoke as six-way lightmaps, predicted from a guiding map (neural-six-way-lightmaps), marched, or baked."""
+
+from wlm._facade import facade
+
+_PLACES = {
+    "Camera": "wlm.smoke.camera",
+    "DatasetSettings": "wlm.smoke.learn.settings",
+    "Decoder": "wlm.smoke.decode",
+    "DensityVolume": "wlm.fluid.volume",
+    "Light": "wlm.smoke.shading",
+    "March": "wlm_kernels.smoke.settings",
+    "NetworkSettings": "wlm.smoke.model",
+    "Profile": "wlm.smoke.model",
+    "Ramp": "wlm.smoke.shading",
+    "Report": "wlm.smoke.evaluation",
+    "SixWay": "wlm.smoke.lightmaps",
+    "SmokeModel": "wlm.smoke.model",
+    "SmokePredictor": "wlm.smoke.prediction",
+    "TrainSettings": "wlm.smoke.learn.settings",
+    "bake": "wlm.smoke.baking",
+    "evaluate": "wlm.smoke.evaluation",
+    "export": "wlm.smoke.onnx_file",
+    "guide": "wlm.smoke.guiding",
+    "load": "wlm.smoke.data",
+    "load_frames": "wlm.smoke.data",
+    "load_scene": "wlm.smoke.scene",
+    "march": "wlm.smoke.coarse",
+    "open_frames": "wlm.smoke.data",
+    "predict": "wlm.smoke.prediction",
+    "read_six_way": "wlm.smoke.data",
+    "simulate": "wlm.smoke.simulation",
+    "train": "wlm.smoke.fit",
+    "write_flipbook": "wlm.smoke.exporter",
+    "write_six_way": "wlm.smoke.data",
+}
+
+__all__ = sorted(_PLACES)
+
+__getattr__, __dir__ = facade(__name__, _PLACES)

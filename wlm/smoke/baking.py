@@ -1,75 +1,27 @@
-"""Six-way lightmaps of smoke by a fine march: single scattering with no noise, and with its own error beside it.
+"""Six-way lightmaps of smoke by a fine march: single scattering without noise, and with its own error beside it.
 
-The paper's references are one bounce by path tracing, 512 samples a pixel (section 5); one bounce is an integral that
-can be had without. What a lightmap holds is the light that smoke of albedo 1 sends to the camera under one light of
-irradiance 4 pi from its direction: with g = 0 at most 1/2 from the front and 1 from a side. The lightmaps are
-orthographic, as a flat billboard has no other; so must the camera be.
+The paper's references are one bounce by path tracing, 512 samples a pixel (section 5). One bounce is an integral, which
+is computed here as such. The camera must be orthographic, as the lightmaps are.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import torch
 
 from wlm.fluid.volume import DensityVolume
 from wlm.interop import device_name, stream, to_warp, torch_memory
-from wlm.smoke.camera import DIRECTIONS, Camera
-from wlm.smoke.guide import check_march
+from wlm.smoke.camera import Camera, unit
+from wlm.smoke.lightmaps import SixWay, StepError
 from wlm_kernels.smoke import march_six
+from wlm_kernels.smoke.settings import March
 
-__all__ = ["SixWay", "StepError", "lit", "six_way"]
-
-
-@dataclass(frozen=True)
-class StepError:
-    """What halving the step changed.
-
-    It bounds the error of the finer result where the error falls at least in proportion to the step, as it does down to
-    rounding: by experience with its square, so that a third of this remains.
-
-    Attributes:
-        largest: Greatest difference of a pixel in any lightmap.
-        rms: Root of the mean square of the differences, over that of the lightmaps; 0 where these are black.
-        transparency: Greatest difference of a pixel's transparency.
-    """
-
-    largest: float
-    rms: float
-    transparency: float
+__all__ = ["bake", "lit"]
 
 
-@dataclass(frozen=True, eq=False)
-class SixWay:
-    """Six-way lightmaps of one frame; H x W pixels.
-
-    Attributes:
-        lightmaps: float32 tensor [6, H, W], in the order of `axes.DIRECTIONS`, linear.
-        transparency: float32 tensor [H, W], or None: not known, as in files without it.
-        emission: float32 tensor [H, W], the light that the smoke gives off itself, or None: it is cold.
-        error: Of the march, or None: not estimated.
-    """
-
-    lightmaps: torch.Tensor
-    transparency: torch.Tensor | None
-    emission: torch.Tensor | None = None
-    error: StepError | None = None
-
-    def __post_init__(self) -> None:
-        if self.lightmaps.ndim != 3 or self.lightmaps.shape[0] != 6:
-            raise ValueError(f"lightmaps: expected [6, H, W], got {tuple(self.lightmaps.shape)}")
-        for name, plane in (("transparency", self.transparency), ("emission", self.emission)):
-            if plane is not None and plane.shape != self.lightmaps.shape[1:]:
-                raise ValueError(f"{name}: expected {tuple(self.lightmaps.shape[1:])}, got {tuple(plane.shape)}")
-
-    def __getitem__(self, direction: str) -> torch.Tensor:
-        """The lightmap of a direction by its name, [H, W]."""
-        return self.lightmaps[DIRECTIONS.index(direction)]
-
-
-def six_way(
+def bake(
     volume: DensityVolume,
     camera: Camera,
     *,
@@ -83,8 +35,8 @@ def six_way(
     Args:
         volume: The smoke.
         camera: Orthographic. Smoke behind its plane or outside the image isn't seen and still casts its shadow.
-        step: The longest step, in voxels, along rays and to the lights.
-        g: Henyey and Greenstein's mean cosine, within -1 and 1.
+        step: The longest step, in voxels, along rays and to the lights. Samples lie in their steps' middles.
+        g: Mean cosine of the Henyey-Greenstein phase function, within -1 and 1.
         supersample: Rays along a pixel's edge, whose mean is the pixel; 1: the ray through its centre.
         estimate: Whether to march in steps of twice the length too, for the error: half as much work again.
 
@@ -94,23 +46,22 @@ def six_way(
     Raises:
         ValueError: A setting is out of its range, or the camera is in perspective.
     """
-    check_march(step, g)
     if supersample < 1:
         raise ValueError(f"supersample: expected at least 1, got {supersample}")
     with stream(device_name(volume.device)):
-        fine = _march(volume, camera, step, g, supersample)
+        fine = _planes(volume, camera, March(step=step, g=g), supersample)
         error = None
         if estimate:
-            coarse = _march(volume, camera, 2.0 * step, g, supersample)
-            off = (fine - coarse).double()
+            coarse = _planes(volume, camera, March(step=2.0 * step, g=g), supersample)
+            difference = (fine - coarse).double()
             energy = float(fine[:6].double().square().mean())
             error = StepError(
-                float(off[:6].abs().max()),
-                (float(off[:6].square().mean()) / energy) ** 0.5 if energy > 0 else 0.0,
-                float(off[march_six.TRANSPARENCY].abs().max()),
+                float(difference[:6].abs().max()),
+                (float(difference[:6].square().mean()) / energy) ** 0.5 if energy > 0 else 0.0,
+                float(difference[march_six.TRANSPARENCY].abs().max()),
             )
     hot = fine[march_six.EMISSION] if volume.temperature is not None else None
-    return SixWay(fine[:6], fine[march_six.TRANSPARENCY], hot, error)
+    return SixWay(fine[:6], fine[march_six.TRANSPARENCY], hot, camera, error=error)
 
 
 def lit(
@@ -123,55 +74,41 @@ def lit(
 ) -> torch.Tensor:
     """Smoke under one light from anywhere, of irradiance 4 pi: what six-way shading approximates.
 
-    Each sample of each ray marches to the light: slow, and apart from the marcher of the lightmaps, which it checks.
+    Each sample of each ray marches to the light: slow, and independent of ``bake``, so that it serves as its check.
 
     Args:
         volume: The smoke, of albedo 1.
         camera: Any.
         toward: [3], the direction to the light in the world, of any length but 0.
         step: In voxels.
-        g: Henyey and Greenstein's mean cosine, within -1 and 1.
+        g: Mean cosine of the Henyey-Greenstein phase function, within -1 and 1.
 
     Returns:
         float32 [H, W].
 
     Raises:
-        ValueError: The direction has no length.
+        ValueError: The direction has no length, or a setting is out of its range.
     """
-    direction = np.asarray(toward, np.float64)
-    length = np.linalg.norm(direction)
-    if direction.shape != (3,) or not 1e-12 < length < np.inf:
-        raise ValueError(f"toward: expected a direction of some length, got {direction.tolist()}")
-    view, _ = camera.view(volume.origin, volume.voxel, volume.shape)
+    direction, march = unit(toward), March(step=step, g=g)
     with stream(device_name(volume.device)):
         out = torch.empty((camera.height, camera.width), dtype=torch.float32, device=volume.device)
         density, _ = volume.arrays()
-        extinction = volume.extinction * volume.voxel
-        march_six.lit(
-            density,
-            extinction,
-            view,
-            direction / length,
-            to_warp(out),
-            step=step,
-            g=g,
-            empty=torch_memory(volume.device),
-        )
+        extinction, view = volume.extinction * volume.voxel, camera.view(volume)
+        march_six.lit(density, extinction, view, direction, march, to_warp(out), torch_memory(volume.device))
     return out
 
 
-def _march(volume: DensityVolume, camera: Camera, step: float, g: float, supersample: int) -> torch.Tensor:
+def _planes(volume: DensityVolume, camera: Camera, march: March, supersample: int) -> torch.Tensor:
+    """Lightmaps, transparency and emission, [8, H, W]."""
     finer = camera.finer(supersample)
-    view, _ = finer.view(volume.origin, volume.voxel, volume.shape)
     out = torch.empty((8, finer.height, finer.width), dtype=torch.float32, device=volume.device)
     density, temperature = volume.arrays()
     march_six.six_way(
         density,
         volume.extinction * volume.voxel,
-        view,
+        finer.view(volume),
+        march,
         to_warp(out),
-        step=step,
-        g=g,
         temperature=temperature,
         emission=volume.emission * volume.voxel,
         empty=torch_memory(volume.device),

@@ -1,4 +1,4 @@
-"""Which way is which: the six directions, the camera, the weights of a light, the channels of engines.
+"""Conventions of directions: the six lightmaps, the camera, the weights of a light, the channels of engines.
 
 Directions are the camera's: x to the right, y up, z from the smoke towards the camera. A lightmap is named for where
 its light comes from, so that "right" is brighter on the image's right side, "front" is lit from the camera's side and
@@ -10,14 +10,15 @@ Unity's local z is minus the billboard's normal: a light behind is +z there, and
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 
-from wlm_kernels.smoke import march
+from wlm.fluid.volume import DensityVolume
+from wlm_kernels.smoke.march import View, make_view
 
-__all__ = ["ALPHA", "DIRECTIONS", "EMISSION", "LAYOUTS", "RULES", "VECTORS", "Camera", "axis_faults", "weights"]
+__all__ = ["ALPHA", "DIRECTIONS", "EMISSION", "LAYOUTS", "RULES", "VECTORS", "Camera", "axis_faults", "unit", "weights"]
 
 DIRECTIONS = ("right", "left", "top", "bottom", "front", "back")
 """The order of the lightmaps in all arrays."""
@@ -26,7 +27,7 @@ VECTORS = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0,
 """Towards the light of each lightmap, in the camera's axes."""
 
 ALPHA, EMISSION = "alpha", "emission"
-"""What a channel of a file may hold besides a lightmap; alpha is opacity, 1 - transparency."""
+"""Channels of a file besides the lightmaps; alpha is opacity, 1 - transparency."""
 
 LAYOUTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "unity": (("right", "top", "back", ALPHA), ("left", "bottom", "front", EMISSION)),
@@ -37,18 +38,32 @@ LAYOUTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
 """Channels R, G, B, A of an engine's two textures. O3DE takes opacity from a third, which this alpha may be."""
 
 RULES = ("squared", "absolute", "normalised")
-"""How a light's direction w weighs the lightmaps: w_p^2; |w_p|, the paper's eq. 5; |w_p| / (|w_x| + |w_y| + |w_z|)."""
+"""The weight of lightmap p under a light from w: w_p^2; |w_p|, the paper's eq. 5; |w_p| / (|w_x| + |w_y| + |w_z|)."""
 
 _SHORTEST = 1e-12
 # A map's centre of brightness must lie this share of the image farther out than its opposite's.
-_MARGIN = 1e-3
+_LEAST_SHIFT = 1e-3
+_MARGIN = 1.05  # of an image's height over the box's, so that no smoke touches the edge
+
+
+def unit(vector: Sequence[float] | np.ndarray, name: str = "toward") -> np.ndarray:
+    """A direction, float64 [3], of length 1.
+
+    Raises:
+        ValueError: It has no length, or isn't three finite numbers.
+    """
+    vector = np.asarray(vector, np.float64)
+    length = np.linalg.norm(vector)
+    if vector.shape != (3,) or not _SHORTEST < length < np.inf:
+        raise ValueError(f"{name}: expected a direction of some length, got {vector.tolist()}")
+    return vector / length
 
 
 def weights(toward: Sequence[float] | np.ndarray, rule: str = "squared") -> np.ndarray:
-    """What each lightmap counts for under a light, in the order of ``DIRECTIONS``.
+    """Weights of the lightmaps under a light, in the order of ``DIRECTIONS``.
 
-    Eq. 5 of the paper weighs by |w|, whose sum for oblique lights is up to 1.73 times that along an axis: too bright by
-    half on average, as path tracing shows. The squares' sum is 1, and engines use them.
+    The weights |w| of the paper's eq. 5 add up to as much as 1.73 for oblique lights: too bright by half on average, as
+    path tracing shows. The squares add up to 1, and engines use them.
 
     Args:
         toward: [..., 3], the directions to the lights in the camera's axes, of any length but 0.
@@ -58,7 +73,7 @@ def weights(toward: Sequence[float] | np.ndarray, rule: str = "squared") -> np.n
         float64 [..., 6], not negative.
 
     Raises:
-        ValueError: No such rule, or a direction of no length or that isn't finite.
+        ValueError: No such rule, or a direction without length or that isn't finite.
     """
     if rule not in RULES:
         raise ValueError(f"rule: expected one of {', '.join(RULES)}, got {rule!r}")
@@ -73,7 +88,7 @@ def weights(toward: Sequence[float] | np.ndarray, rule: str = "squared") -> np.n
 
 
 def axis_faults(lightmaps: np.ndarray) -> tuple[str, ...]:
-    """Checks that lightmaps are what their names say, by where each is bright.
+    """Checks that each lightmap is bright where its name says.
 
     Only smoke that stops some light can tell: in thin smoke the maps are alike, and that counts as a fault.
 
@@ -81,8 +96,8 @@ def axis_faults(lightmaps: np.ndarray) -> tuple[str, ...]:
         lightmaps: [..., 6, H, W], one frame or many, in the order of ``DIRECTIONS``.
 
     Returns:
-        One line a fault: "right" must be brighter on the right than "left", "top" above "bottom", "front" brighter
-        than "back". Two opposites that changed places are always found; "right" for "top" need not be.
+        One line per fault: "right" must be brighter on the right than "left", "top" above "bottom", "front" brighter
+        than "back". Two exchanged opposites are always found; "right" in the place of "top" need not be.
 
     Raises:
         ValueError: The shape isn't that of lightmaps.
@@ -99,9 +114,9 @@ def axis_faults(lightmaps: np.ndarray) -> tuple[str, ...]:
     x = (sums.sum(1) @ (np.arange(width) + 0.5)) / total / width
     y = 1.0 - (sums.sum(2) @ (np.arange(height) + 0.5)) / total / height
     faults = []
-    if not x[0] > x[1] + _MARGIN:
+    if not x[0] > x[1] + _LEAST_SHIFT:
         faults.append(f"right isn't brighter on the right than left: centres at {x[0]:.3f} and {x[1]:.3f} of the width")
-    if not y[2] > y[3] + _MARGIN:
+    if not y[2] > y[3] + _LEAST_SHIFT:
         faults.append(f"top isn't brighter above than bottom: centres at {y[2]:.3f} and {y[3]:.3f} of the height")
     if not total[4] > total[5]:
         faults.append(f"front isn't brighter than back: {total[4]:.4g} and {total[5]:.4g} in all")
@@ -110,12 +125,12 @@ def axis_faults(lightmaps: np.ndarray) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class Camera:
-    """Where smoke is seen from.
+    """An orthographic or perspective camera.
 
     Attributes:
         position: The image's centre in the camera's plane, or the eye, in the world's unit. Nothing behind it is seen.
         right, up, toward: The image's axes in the world, orthogonal and of length 1; right x up = toward, which
-            points from what is seen to the camera.
+            points from the smoke to the camera.
         extent: The image's height in the world's unit; in perspective that at distance 1.
         height, width: H and W in pixels, which are square.
         perspective: Whether rays meet in the eye; the six-way lightmaps themselves are orthographic.
@@ -156,7 +171,7 @@ class Camera:
     ) -> Camera:
         """Makes a camera that looks from a position to a target.
 
-        Where it looks straight up or down, "up" is chosen among the axes of the world, the same at every call.
+        Where it looks along ``world_up``, "up" is chosen among the axes of the world, the same at every call.
 
         Raises:
             ValueError: The position is the target, or a size is wrong.
@@ -174,6 +189,57 @@ class Camera:
         axes = (tuple(map(float, axis)) for axis in (position, right, up, toward))
         return Camera(*axes, float(extent), height, width, perspective)
 
+    @staticmethod
+    def around(
+        smoke: DensityVolume | tuple[Sequence[float], Sequence[float]],
+        *,
+        toward: Sequence[float] = (0.0, 0.0, 1.0),
+        pixels: int = 512,
+        aspect: float = 1.0,
+        target: Sequence[float] | None = None,
+        extent: float | None = None,
+        distance: float | None = None,
+        up: Sequence[float] = (0.0, 1.0, 0.0),
+        perspective: bool = False,
+    ) -> Camera:
+        """Makes a camera outside smoke that shows all of it.
+
+        Args:
+            smoke: A volume, or a box in the world: its corner [3] and its edges [3].
+            toward: The direction from the smoke to the camera, of any length but 0.
+            pixels: H.
+            aspect: W over H.
+            target: The point in the image's middle; None: the box's centre.
+            extent: The image's height in the world's unit, in perspective at distance 1; None: what holds the box.
+            distance: Of the camera from its target; None: outside the box. What is behind the camera isn't seen.
+            up: Upwards in the image, as far as it can be.
+            perspective: Whether rays meet in the eye; the six-way lightmaps are orthographic.
+
+        Raises:
+            ValueError: A direction without length, or a size is wrong.
+        """
+        if isinstance(smoke, DensityVolume):
+            smoke = (smoke.origin, smoke.voxel * np.asarray(smoke.shape))
+        origin, size = (np.asarray(part, np.float64) for part in smoke)
+        target = origin + 0.5 * size if target is None else np.asarray(target, np.float64)
+        toward = unit(toward)
+        corners = origin + size * np.array([[i >> 2 & 1, i >> 1 & 1, i & 1] for i in range(8)]) - target
+        nearest = float((corners @ toward).max())
+        if distance is None:
+            # In perspective as far off as the box is large, so that it isn't seen through a keyhole.
+            distance = nearest + float(np.linalg.norm(size))
+        width = max(round(pixels * aspect), 1)
+        shape = {"height": pixels, "width": width, "world_up": up, "perspective": perspective}
+        camera = Camera.look_at(target + distance * toward, target, extent=1.0 if extent is None else extent, **shape)
+        if extent is not None:
+            return camera
+        across, rise, _ = np.abs(corners @ camera.axes.T).max(axis=0)
+        extent = 2.0 * _MARGIN * max(float(rise), float(across) * pixels / width)
+        if perspective:
+            # Of the box's nearest side, or of the sphere round it where the camera is inside.
+            extent /= distance - nearest if distance > nearest else distance
+        return replace(camera, extent=extent)
+
     @property
     def axes(self) -> np.ndarray:
         """Right, up, toward: float64 [3, 3], which takes a direction in the world to one in the camera's axes."""
@@ -186,8 +252,7 @@ class Camera:
 
     def finer(self, factor: int) -> Camera:
         """The same view with each pixel cut in factor x factor."""
-        size = (self.height * factor, self.width * factor)
-        return Camera(self.position, self.right, self.up, self.toward, self.extent, *size, self.perspective)
+        return replace(self, height=self.height * factor, width=self.width * factor)
 
     def rays(self, device: torch.device | str = "cpu") -> tuple[torch.Tensor, torch.Tensor]:
         """Origins and directions of length 1 of the pixels' rays in the world, both float64 [H, W, 3]."""
@@ -202,28 +267,19 @@ class Camera:
             return position.expand_as(across), torch.nn.functional.normalize(across - toward, dim=-1)
         return across + position, (-toward).expand_as(across)
 
-    def view(self, origin: np.ndarray, voxel: float, shape: tuple[int, int, int]) -> tuple[march.View, float]:
-        """The camera in the voxels of a grid.
+    def view(self, volume: DensityVolume) -> View:
+        """The camera in a volume's voxels, as kernels take it.
 
         An orthographic camera far from the grid is moved along its axis to just before it, which changes nothing but
         the rounding.
-
-        Args:
-            origin: [3], the grid's corner in the world.
-            voxel: A voxel's edge in the world's unit.
-            shape: Of the grid.
-
-        Returns:
-            The view, and how far it was moved, in voxels: what depths lack.
         """
-        position = (np.asarray(self.position, np.float64) - np.asarray(origin, np.float64)) / voxel
+        position = (np.asarray(self.position, np.float64) - np.asarray(volume.origin, np.float64)) / volume.voxel
         right, up, toward = self.axes
-        moved = 0.0
+        moved, pitch = 0.0, self.pitch
         if not self.perspective:
-            ends = (-0.5 - position, np.asarray(shape) + 0.5 - position)
+            ends = (-0.5 - position, np.asarray(volume.shape) + 0.5 - position)
             moved = max(float(sum(min(-a * t, -b * t) for a, b, t in zip(*ends, toward, strict=True))) - 1.0, 0.0)
             position = position - moved * toward
-            pitch = self.pitch / voxel
-        else:
-            pitch = self.pitch
-        return march.view(position, right, up, -toward, pitch, self.width, self.height, self.perspective), moved
+            pitch = self.pitch / volume.voxel
+        size = (self.width, self.height)
+        return make_view(position, right, up, -toward, pitch, *size, self.perspective, volume.voxel, moved)

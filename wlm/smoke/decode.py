@@ -1,10 +1,10 @@
-"""A trained network at work: one image at a time, in half floats and as a CUDA graph on a GPU, in float32 on a CPU.
+"""A trained network at run time: one image at a time, on a GPU in half floats and as a CUDA graph, on a CPU in float32.
 
-The weights of the adapters are folded, which changes nothing but the rounding: a norm's scale and shift go into the
-1 x 1 convolution behind it, beta and gamma into the one before; the channel attention multiplies the weights of the
-convolution behind it, which are few, instead of the image. The adapters run side by side, and their heads as one
-convolution. Pixels lie as rows of channels, so that 1 x 1 convolutions are plain matrix products; what is between these
-is done by `wlm_kernels.smoke.naf_block`, and what comes behind the heads by `wlm_kernels.smoke.planes`.
+The adapters' weights are folded, which changes rounding alone: a norm's scale and shift go into the 1 x 1 convolution
+after it, beta and gamma into the one before; the channel attention multiplies the weights of the convolution after it,
+which are fewer than the pixels. The adapters run side by side, and their heads as one convolution. Pixels are rows of
+channels, so that 1 x 1 convolutions are plain matrix products. Between these run the kernels of
+``wlm_kernels.smoke.naf_block``, and after the heads those of ``wlm_kernels.smoke.planes``.
 """
 
 from __future__ import annotations
@@ -16,40 +16,35 @@ import torch.nn.functional as F
 import warp as wp
 from torch import nn
 
-from wlm.fluid.volume import DensityVolume
 from wlm.interop import StepGraph, check_device, to_warp
-from wlm.smoke.baking import SixWay
-from wlm.smoke.camera import Camera
-from wlm.smoke.model import REACH, NafBlock, SixWayNetwork
-from wlm.smoke.planes import GUIDES, PLANES, decode_lightmaps, look_at
+from wlm.smoke.model import REACH, NafBlock, SixWayNetwork, SmokeModel
+from wlm.smoke.planes import GUIDES, PLANES
 from wlm_kernels.smoke import naf_block
 from wlm_kernels.smoke import planes as smoke_planes
 
-__all__ = ["Predictor", "predict"]
+__all__ = ["Decoder"]
 
 _WARMUP = 2
 
 
-class Predictor:
-    """Turns encoded guides of one size into planes, with a network's weights as they are when it is made.
+class Decoder:
+    """Turns encoded guiding maps of one size into planes.
 
     Attributes:
         height, width: H and W of the images.
         device: Where it runs.
-        emission: Whether the network makes emission.
-        guide: Which kind of guiding map it reads, one of `samples.GUIDES`.
+        emission: Whether the network predicts emission.
+        guide: Kind of guiding map, a key of ``planes.GUIDES``.
         half: Whether it computes in half floats.
     """
 
-    def __init__(
-        self, network: SixWayNetwork, height: int, width: int, *, device: str = "cpu", half: bool = True
-    ) -> None:
-        """Folds the weights and allocates the buffers.
+    def __init__(self, model: SmokeModel, device: str = "cpu", *, height: int, width: int, half: bool = True) -> None:
+        """Folds the weights, as they are now, and allocates buffers.
 
         Args:
-            network: Trained; it isn't changed.
-            height, width: H and W, any from 1.
-            device: As `check_device` takes it.
+            model: The network; it isn't changed.
+            device: "cpu", "cuda" or "cuda:N".
+            height, width: H and W, at least 1.
             half: Whether a GPU computes in half floats; a CPU always computes in float32.
 
         Raises:
@@ -58,110 +53,77 @@ class Predictor:
         """
         if height < 1 or width < 1:
             raise ValueError(f"expected at least one pixel, got {height} x {width}")
+        settings = model.settings
         self.device = check_device(device)
-        self.height, self.width, self.emission = height, width, network.settings.emission
-        self.guide = network.settings.guide
+        self.height, self.width, self.emission, self.guide = height, width, settings.emission, settings.guide
         self.half = half and self.device != "cpu"
-        kind = torch.float16 if self.half else torch.float32
+        dtype = torch.float16 if self.half else torch.float32
         with torch.no_grad():
-            still = SixWayNetwork(network.settings)
-            still.load_state_dict(network.state_dict())
-            self._folded = _Folded(still, height, width, self.device, kind)
-            self._tail = _Tail(still, height, width, self.device, kind)
-        self._guide = torch.zeros(1, len(GUIDES[network.settings.guide]), height, width, device=self.device, dtype=kind)
+            network = SixWayNetwork(settings)
+            network.load_state_dict(model.network.state_dict())
+            self._body = _Body(network, height, width, self.device, dtype)
+            self._tail = _Tail(network, height, width, self.device, dtype)
+        self._guide = torch.zeros(1, len(GUIDES[self.guide]), height, width, device=self.device, dtype=dtype)
         self._planes = torch.zeros(len(PLANES), height, width, device=self.device)
         self._run = StepGraph(self._work, self.device, warmup=_WARMUP)
 
     def __call__(self, encoded: torch.Tensor) -> torch.Tensor:
-        """Makes the planes of one image; on CUDA it is queued, not awaited.
+        """Predicts the planes of one image; on CUDA the work is queued, not awaited.
 
         Args:
-            encoded: [C, H, W], of `samples.look_at` and the network's kind, on the device.
+            encoded: [C, H, W], a guiding map of ``planes.render_guide`` of the kind ``guide``, on the device.
 
         Returns:
-            float32 [8, H, W] in the order of `samples.PLANES`, clamped to what each can be. It is overwritten by the
-            next call.
+            float32 [8, H, W] in the order of ``PLANES``, clamped to their ranges. The next call overwrites it.
 
         Raises:
             ValueError: Another size, or another device.
         """
         if encoded.shape != self._guide.shape[1:] or encoded.device != self._guide.device:
-            wanted = f"{list(self._guide.shape[1:])} on {self.device}"
-            raise ValueError(f"encoded: expected {wanted}, got {list(encoded.shape)} on {encoded.device}")
+            expected = f"{list(self._guide.shape[1:])} on {self.device}"
+            raise ValueError(f"encoded: expected {expected}, got {list(encoded.shape)} on {encoded.device}")
         self._guide[0].copy_(encoded)
         self._run()
         return self._planes
 
     @torch.no_grad()
     def _work(self) -> None:
-        # The quickest of cuDNN's ways, tried out before the graph; where float32 is asked for, it shall be that.
+        # cuDNN tries out its algorithms before the graph is captured; without half floats, TF32 stays off.
         with torch.backends.cudnn.flags(enabled=True, benchmark=True, deterministic=False, allow_tf32=self.half):
-            heads = self._folded(self._guide)
+            heads = self._body(self._guide)
         self._tail(heads, self._guide[0], self._planes)
 
 
-def predict(
-    volume: DensityVolume,
-    camera: Camera,
-    predictor: Predictor,
-    *,
-    step: float = 10.0,
-    jitter: float = 1.0,
-    seed: int = 0,
-    threshold: float = 0.01,
-    spacing: float | None = None,
-) -> SixWay:
-    """Makes six-way lightmaps of smoke: its guiding map, the network, and its planes decoded.
-
-    Args:
-        volume: On the predictor's device.
-        camera: Orthographic; of the predictor's height and width.
-        predictor: The network.
-        step, jitter, seed, threshold, spacing: Of the guiding map, as for `look_at`: what the network was trained
-            with, which `DatasetSettings.look` gives.
-
-    Returns:
-        The lightmaps, with emission if the smoke has a temperature and the network makes it.
-
-    Raises:
-        ValueError: Another size or device, or a setting out of its range.
-    """
-    look = {"step": step, "jitter": jitter, "seed": seed, "threshold": threshold, "spacing": spacing}
-    planes = predictor(look_at(volume, camera, predictor.guide, **look))
-    return decode_lightmaps(planes, hot=predictor.emission and volume.temperature is not None)
-
-
 class _Adapters:
-    """G NAFBlocks side by side on one image of H x W pixels of c channels.
+    """G NAFBlocks side by side on one image of H x W pixels and c channels.
 
-    What a block adds to every pixel alike isn't added: it is kept apart as a shift, which the norm adds.
+    Constants that a block adds to all pixels are kept apart: the norm's kernel adds those of the first correction, and
+    the caller adds ``shift``.
 
     Attributes:
-        shift: [G, c], what the outputs lack.
+        shift: [G, c], to be added to the outputs.
     """
 
-    def __init__(self, blocks: list[NafBlock], height: int, width: int, device: str, kind: torch.dtype) -> None:
-        """Folds the weights and makes the buffers.
+    def __init__(self, blocks: list[NafBlock], height: int, width: int, device: str, dtype: torch.dtype) -> None:
+        """Folds the weights and allocates buffers.
 
         Args:
-            blocks: G of them.
+            blocks: The G blocks.
             height, width: H and W.
-            device, kind: Where and in which numbers they run.
+            device, dtype: Where, and in which type, they run.
         """
         channels, groups, rows, cuda = blocks[0].attend.in_features, len(blocks), height * width, device != "cpu"
         self.height, self.width, self.channels, self.groups, self.device = height, width, channels, groups, device
-        self.kernels = naf_block.kernels(channels, kind == torch.float16, cuda)
+        self.kernels = naf_block.kernels(channels, dtype == torch.float16, cuda)
         self.lanes = naf_block.lanes(channels, cuda)
         expand, expand_bias = zip(*(_after_norm(b.norm1, b.expand) for b in blocks), strict=True)
-        self.expand = _halves(expand).t().to(device, kind)
-        self.expand_bias = _halves(expand_bias).to(device, kind)
-        self.widen, self.widen_bias = (
-            torch.stack(part).to(device, kind)
-            for part in zip(*(_after_norm(b.norm2, b.widen) for b in blocks), strict=True)
-        )
-        self.widen, self.widen_bias = self.widen.transpose(1, 2), self.widen_bias[:, None]
+        self.expand = _halves(expand).t().to(device, dtype)
+        self.expand_bias = _halves(expand_bias).to(device, dtype)
+        widen, widen_bias = zip(*(_after_norm(b.norm2, b.widen) for b in blocks), strict=True)
+        self.widen = torch.stack(widen).to(device, dtype).transpose(1, 2)
+        self.widen_bias = torch.stack(widen_bias).to(device, dtype)[:, None]
         narrow = torch.stack([b.narrow.weight[:, :, 0, 0] * b.gamma[:, :, 0] for b in blocks])
-        self.narrow = narrow.to(device, kind).transpose(1, 2)
+        self.narrow = narrow.to(device, dtype).transpose(1, 2)
         depthwise = _halves([b.depthwise.weight.flatten(1) for b in blocks]).t()
         attend = torch.stack([b.attend.weight for b in blocks])
         attend_bias = torch.stack([b.attend.bias for b in blocks])
@@ -170,10 +132,10 @@ class _Adapters:
         self.shift = middle + torch.stack([b.narrow.bias * b.gamma[:, 0, 0] for b in blocks])
         depthwise_bias = _halves([b.depthwise.bias for b in blocks])
         parts = (torch.zeros(1, channels), middle, depthwise, depthwise_bias, attend, attend_bias, project)
-        self._nothing, self._middle, self._depthwise, self._depthwise_bias, *self._attention = (
+        self._zero, self._middle, self._depthwise, self._depthwise_bias, *self._attention = (
             to_warp(value.detach().float().contiguous().to(device)) for value in parts
         )
-        options = {"device": device, "dtype": kind}
+        options = {"device": device, "dtype": dtype}
         self._x = torch.empty(rows, channels, **options)
         self._between = torch.empty(groups, rows, channels, **options)
         self._normed = torch.empty(rows * groups, channels, **options)
@@ -183,10 +145,10 @@ class _Adapters:
         self._project = torch.empty(groups, channels, channels, **options)
 
     def __call__(self, image: torch.Tensor) -> torch.Tensor:
-        """Works on [1, c, H, W], and gives [G, P, c], which the next call overwrites."""
+        """Runs on [1, c, H, W]; returns [G, H * W, c], which the next call overwrites."""
         rows, channels, groups = len(self._x), self.channels, self.groups
         self._x.copy_(image[0].permute(1, 2, 0).reshape_as(self._x))
-        self._launch("norm", self.lanes * rows, [to_warp(self._x), self._nothing, rows], self._normed)
+        self._launch("norm", self.lanes * rows, [to_warp(self._x), self._zero, rows], self._normed)
         torch.addmm(self.expand_bias, self._normed[:rows], self.expand, out=self._wide)
         size = (-(-self.height // naf_block.STRIP), self.width, groups * channels)
         planes = (self.height, self.width, -1)
@@ -209,16 +171,16 @@ class _Adapters:
         wp.launch(kernel, dim, inputs=inputs, outputs=[to_warp(output)], device=self.device)
 
 
-class _Folded:
+class _Body:
     """A network's U-Net, adapters and heads for images of one size."""
 
-    def __init__(self, network: SixWayNetwork, height: int, width: int, device: str, kind: torch.dtype) -> None:
+    def __init__(self, network: SixWayNetwork, height: int, width: int, device: str, dtype: torch.dtype) -> None:
         self.settings = settings = network.settings
         self.fused = device != "cpu"
         multiple = settings.multiple
         self.padding = (0, -width % multiple, 0, -height % multiple)
         rows, columns = (height + self.padding[3]) // settings.stem, (width + self.padding[1]) // settings.stem
-        options = (device, kind)
+        options = (device, dtype)
         self.encoder, self.decoder = (
             [[_weights(layer, *options) for layer in level if isinstance(layer, nn.Conv2d)] for level in levels]
             for levels in (network.encoder, network.decoder)
@@ -231,7 +193,7 @@ class _Folded:
         self.heads = torch.cat([h.weight for h in heads]).to(*options), torch.cat([h.bias for h in heads]).to(*options)
 
     def __call__(self, guide: torch.Tensor) -> torch.Tensor:
-        """Of [1, C, H, W] what all heads make of each adapter, [G, N, H / stem, W / stem] of the padded image."""
+        """All heads' outputs for each adapter, [G, N, H / stem, W / stem], of a guide [1, C, H, W] that is padded."""
         settings, stem = self.settings, self.settings.stem
         padded = F.pad(guide, self.padding)[:, : settings.channels]
         x = F.pixel_unshuffle(padded, stem) if stem > 1 else padded
@@ -243,7 +205,7 @@ class _Folded:
         for level in reversed(range(len(self.up))):
             above = F.interpolate(F.conv2d(x, *self.up[level]), scale_factor=2.0, mode="nearest")
             x = self._twice(torch.cat([above, skips[level]], 1), self.decoder[level])
-        # Each adapter through all heads: of those only its own count, but one convolution is quicker than four.
+        # Each adapter through all heads, of which only its own count: one convolution is quicker than four.
         y = self.adapters(x) + self.shift
         y = y.view(-1, *self.size, settings.width).permute(0, 3, 1, 2)
         return F.conv2d(y, *self.heads, padding=1)
@@ -258,52 +220,54 @@ class _Folded:
 
 
 class _Tail:
-    """Makes planes of what the heads make: their pixels in place, the filter of the guide, no smoke where none is near.
+    """Turns the heads' outputs into planes: pixels in place, the guide's filter added, 0 far from smoke.
 
     The filter runs in float32.
     """
 
-    def __init__(self, network: SixWayNetwork, height: int, width: int, device: str, kind: torch.dtype) -> None:
+    def __init__(self, network: SixWayNetwork, height: int, width: int, device: str, dtype: torch.dtype) -> None:
         settings = network.settings
         self.device, self.stem, area = device, settings.stem, settings.stem**2
-        order = [PLANES.index(name) for group in network.groups for name in group]
+        order = [PLANES.index(name) for name in network.names]
+        adapters = [i for i, group in enumerate(network.groups) for _ in group]
+        # For each plane its adapter, -1 if it isn't predicted, and its first channel.
         places = torch.tensor([[-1, 0]] * len(PLANES), dtype=torch.int32)
-        owner = [i for i, group in enumerate(network.groups) for _ in group]
-        places[order] = torch.tensor([[i, n * area] for n, i in enumerate(owner)], dtype=torch.int32)
+        places[order] = torch.tensor([[adapter, n * area] for n, adapter in enumerate(adapters)], dtype=torch.int32)
         filters = network.filter.weight if settings.residual else torch.zeros(len(order), 0, 1, 1)
         edge = filters.shape[-1]
-        # Down a column first, as a thread goes.
-        weights = torch.zeros(filters.shape[1], edge, edge, len(PLANES))
-        weights[..., order] = filters.permute(1, 3, 2, 0)
+        # Columns first, in the order in which a thread reads them.
+        taps = torch.zeros(filters.shape[1], edge, edge, len(PLANES))
+        taps[..., order] = filters.permute(1, 3, 2, 0)
         self._places = to_warp(places.to(device))
-        self._weights = to_warp(weights.view(-1, len(PLANES)).to(device), smoke_planes.Taps)
-        self._kernels = smoke_planes.kernels(edge, REACH, kind == torch.float16, device != "cpu")
+        self._taps = to_warp(taps.view(-1, len(PLANES)).to(device), smoke_planes.Taps)
+        self._kernels = smoke_planes.kernels(edge, REACH, dtype == torch.float16, device != "cpu")
         blocks = (-(-height // REACH), -(-width // REACH))
         self._smoke = to_warp(torch.empty(blocks, dtype=torch.int32, device=device))
 
     def __call__(self, heads: torch.Tensor, guide: torch.Tensor, planes: torch.Tensor) -> None:
-        """Writes planes [8, H, W], of `_Folded`'s outputs and its guide [C, H, W]."""
-        made, seen = self._kernels, to_warp(guide)
-        self._launch(made.near, made.lanes * self._smoke.size, [seen], self._smoke)
+        """Writes planes [8, H, W] from the outputs of ``_Body`` and the guide [C, H, W]."""
+        kernels, source = self._kernels, to_warp(guide)
+        self._launch(kernels.near, kernels.lanes * self._smoke.size, [source], self._smoke)
         pixels = to_warp(heads.permute(0, 2, 3, 1))
-        inputs = [pixels, seen, self._weights, self._places, self.stem, self._smoke]
-        self._launch(made.compose, (-(-guide.shape[1] // smoke_planes.STRIP), guide.shape[2]), inputs, to_warp(planes))
+        inputs = [pixels, source, self._taps, self._places, self.stem, self._smoke]
+        size = (-(-guide.shape[1] // smoke_planes.STRIP), guide.shape[2])
+        self._launch(kernels.compose, size, inputs, to_warp(planes))
 
     def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: list, output: wp.array) -> None:
         wp.launch(kernel, dim, inputs=inputs, outputs=[output], device=self.device)
 
 
-def _weights(layer: nn.Conv2d, device: str, kind: torch.dtype) -> tuple[torch.Tensor, torch.Tensor]:
-    """A convolution's weights, their channels together as the image's, and its biases."""
-    return layer.weight.to(device, kind, memory_format=torch.channels_last), layer.bias.to(device, kind)
+def _weights(layer: nn.Conv2d, device: str, dtype: torch.dtype) -> tuple[torch.Tensor, torch.Tensor]:
+    """A convolution's weights, in the images' memory layout, and biases."""
+    return layer.weight.to(device, dtype, memory_format=torch.channels_last), layer.bias.to(device, dtype)
 
 
 def _halves(parts: Sequence[torch.Tensor]) -> torch.Tensor:
-    """Joins what G groups expand to such that all first halves come before all second ones."""
+    """Joins G expanded groups so that all first halves come before all second halves."""
     return torch.cat([half for side in (0, 1) for half in (part.chunk(2)[side] for part in parts)])
 
 
 def _after_norm(norm: nn.Module, conv: nn.Conv2d) -> tuple[torch.Tensor, torch.Tensor]:
-    """Weights and biases of a 1 x 1 convolution that take in those of the norm before it."""
+    """Weights and biases of a 1 x 1 convolution with the norm before it folded in."""
     weight = conv.weight[:, :, 0, 0]
     return weight * norm.weight[:, 0, 0], conv.bias + weight @ norm.bias[:, 0, 0]

@@ -1,72 +1,82 @@
-"""How near planes come to their reference, and how much they flicker: of a network, and of what it is compared with.
+"""Scores of lightmaps: a network's, and those of any other method on the same samples.
 
-All figures are of encoded planes, that is in sRGB, as the paper's PSNR is (section 5). A method is any function that
-makes planes of a pool's samples; those here are the network itself, a `Predictor`, the coarse march of all six lights,
-which needs no network, and a flip book that was baked from one side and is shown from all.
+All scores are of encoded planes, that is in sRGB, as the paper's PSNR is (section 5).
+
+=====================================  =====================================================
+an exact prediction                    120 dB, as everywhere (``wlm.metrics``)
+no visible smoke                       the flicker is NaN
+a target that doesn't change           the ratio of flickers is NaN
+no samples, or planes of another size  error
+=====================================  =====================================================
 """
 
 from __future__ import annotations
 
+import copy
 import math
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from functools import partial
+from typing import Any
 
 import torch
 
+from wlm import system
 from wlm.errors import WlmError
+from wlm.interop import check_device
 from wlm.metrics.error import psnr_from_mse
 from wlm.smoke.camera import DIRECTIONS
-from wlm.smoke.decode import Predictor
-from wlm.smoke.learn.dataset import DatasetSettings, covered, load_probe_volume, make_validation
+from wlm.smoke.decode import Decoder
+from wlm.smoke.learn.dataset import make_validation, pool_of_volume
 from wlm.smoke.learn.losses import residual
-from wlm.smoke.model import SixWayNetwork
-from wlm.smoke.planes import GUIDES, OPACITY_PLANE, PLANES, Pool
+from wlm.smoke.learn.pool import Pool
+from wlm.smoke.learn.settings import DatasetSettings
+from wlm.smoke.model import SmokeModel
+from wlm.smoke.planes import OPACITY_PLANE, PLANES
+from wlm.system import Meter, OnProgress
 
 __all__ = [
-    "COARSE",
     "DENSITIES",
-    "FLIP_BOOK",
     "HALF",
     "NETWORK",
     "Comparison",
-    "Evaluation",
+    "Contender",
+    "HeldOut",
     "Method",
-    "coarse",
+    "Report",
+    "Score",
     "compare",
     "evaluate",
-    "evaluate_all",
-    "flip_book",
+    "of_decoder",
     "of_network",
-    "of_predictor",
+    "score",
 ]
 
 Method = Callable[[Pool, slice], torch.Tensor]
-"""Planes [n, 2, 8, H, W] for both frames of the samples that a slice takes from a pool; they needn't be clamped."""
+"""Predicts planes [n, 2, 8, H, W] of both frames of the samples that a slice takes from a pool; ``score`` clamps."""
 
-NETWORK, HALF, COARSE, FLIP_BOOK = "network", "network, half floats", "coarse march", "flip book"
-"""Names of methods in a `Comparison`."""
+NETWORK, HALF = "network", "network, half floats"
+"""Names of a network's own methods in a ``Comparison``."""
 
 DENSITIES = (0.5, 1.0, 2.0)
 """Factors on the density, those of the paper's ablation (figure 5)."""
 
-_BATCH = 8
-_STILL = 1e-4  # a fortieth of what a byte can show
-_BESIDE = GUIDES["six"]
+_BATCH = 8  # samples
+_STILL = 1e-4  # a flicker of no more than this, a fortieth of a byte's step, counts as none
 
 
 @dataclass(frozen=True)
-class Evaluation:
-    """How well planes fit a pool; decibels in sRGB, of 1 as the peak, over whole images.
+class Score(system.Report):
+    """How well predicted planes fit a pool; decibels in sRGB with a peak of 1, over whole images.
 
     Attributes:
         psnr: Mean over the images, each over its six lightmaps, as in the paper.
-        lowest, highest: Of the images.
-        planes: Of each of `samples.PLANES`, from the mean square over all images.
-        flicker: Mean change of the six lightmaps from a frame to the next where smoke is seen, after the earlier one
-            has been moved as the smoke has: what is left of it is shadows that move otherwise, smoke that is new, and
-            flicker. NaN where no smoke is seen.
-        reference_flicker: The same of the reference, in which nothing flickers.
+        lowest, highest: Over the images.
+        planes: For each of ``PLANES``, of the mean square error over all images.
+        flicker: Mean absolute change of the six lightmaps from frame to frame where smoke is visible, after warping the
+            earlier frame by the smoke's motion. Shadows that move otherwise and new smoke count too.
+        reference_flicker: The same of the targets, in which nothing flickers.
     """
 
     psnr: float
@@ -78,19 +88,69 @@ class Evaluation:
 
     @property
     def flicker_ratio(self) -> float:
-        """Flicker over that of the reference: 1 is as steady as it; NaN where that doesn't change, but by rounding."""
+        """Flicker over the targets': 1 is as steady as these; NaN where the targets don't change."""
         return self.flicker / self.reference_flicker if self.reference_flicker > _STILL else math.nan
 
-    def to_json(self) -> dict[str, object]:
-        """For a file, with null for NaN."""
-        values = {name: getattr(self, name) for name in ("psnr", "lowest", "highest", "flicker", "reference_flicker")}
-        values["flicker_ratio"] = self.flicker_ratio
-        known = {name: None if math.isnan(value) else value for name, value in values.items()}
-        return {**known, "planes": dict(zip(PLANES, self.planes, strict=True))}
+    def to_json(self) -> dict[str, Any]:
+        """As ``wlm.system.Report.to_json``, with the ratio of flickers, and planes by name."""
+        names = ("psnr", "lowest", "highest", "flicker", "reference_flicker", "flicker_ratio")
+        planes = dict(zip(PLANES, self.planes, strict=True))
+        return system.plain({name: getattr(self, name) for name in names} | {"planes": planes})
+
+
+@dataclass(frozen=True)
+class Report(Score):
+    """The score of a network at run time.
+
+    Attributes:
+        samples: Number of samples.
+        bytes: Size of the network's file.
+    """
+
+    samples: int
+    bytes: int
+
+    def to_json(self) -> dict[str, Any]:
+        return super().to_json() | {"samples": self.samples, "bytes": self.bytes}
+
+
+def evaluate(
+    model: SmokeModel,
+    data: Pool | DatasetSettings | None = None,
+    *,
+    device: str = "cpu",
+    progress: OnProgress | None = None,
+    file_bytes: int | None = None,
+    half: bool = True,
+) -> Report:
+    """Scores a network as it runs: one image at a time through its ``Decoder``.
+
+    Args:
+        model: The network.
+        data: Samples with guiding maps of its kind; or settings, of which the test set is simulated, which no network
+            was trained on or selected by; None: the settings that it was trained with.
+        device: "cpu", "cuda" or "cuda:N".
+        progress: Called about twice a second.
+        file_bytes: Size of the network's file; None: ``model.file_bytes()``.
+        half: Whether a GPU computes in half floats.
+
+    Raises:
+        WlmError: No such device, the file lacks its settings, the memory isn't enough, or no frame has smoke.
+        ValueError: The samples don't fit the network.
+    """
+    device = check_device(device)
+    if not isinstance(data, Pool):
+        settings = _with_guide(data or model.dataset, model.settings.guide)
+        data = make_validation(settings, device, test=True, progress=progress)
+        if not len(data):
+            raise WlmError("test set: expected frames with smoke, found none")
+    pool, method = _at_run_time(model, device, data.to(device), half)
+    scores = score(method, pool, progress=progress)
+    return Report(**vars(scores), samples=len(pool), bytes=model.file_bytes() if file_bytes is None else file_bytes)
 
 
 def of_network(network: torch.nn.Module) -> Method:
-    """A network as it is, in float32, many images at once."""
+    """A network in float32, several images at once, as training validates it."""
 
     def method(pool: Pool, part: slice) -> torch.Tensor:
         guides = pool.guides[part]
@@ -99,197 +159,186 @@ def of_network(network: torch.nn.Module) -> Method:
     return method
 
 
-def of_predictor(predictor: Predictor) -> Method:
-    """A network as it is used: folded, one image at a time, on a GPU in half floats if the predictor is."""
+def of_decoder(decoder: Decoder) -> Method:
+    """A network at run time."""
 
     def method(pool: Pool, part: slice) -> torch.Tensor:
         guides = pool.guides[part]
-        # A copy each: the next call overwrites them.
-        made = [predictor(guide).clone() for guide in guides.flatten(0, 1).float()]
-        return torch.stack(made).unflatten(0, guides.shape[:2])
+        # Copied, since the next call overwrites them.
+        planes = [decoder(guide).clone() for guide in guides.flatten(0, 1).float()]
+        return torch.stack(planes).unflatten(0, guides.shape[:2])
 
     return method
 
 
-def coarse(pool: Pool, part: slice) -> torch.Tensor:
-    """The march in large steps that is the guide of kind "six", as it is: what the network has to be better than.
-
-    Raises:
-        ValueError: The pool's guides are of another kind.
-    """
-    if pool.guides.shape[2] != len(_BESIDE):
-        raise ValueError(f"pool: expected guides of kind six, [N, 2, {len(_BESIDE)}, H, W]")
-    return pool.guides[part][:, :, [_BESIDE.index(name) for name in PLANES]].float()
-
-
-def flip_book(pool: Pool, views: int, keep: torch.Tensor | None = None) -> tuple[Pool, Method]:
-    """What a flip book that was baked from the first view shows in the others.
-
-    A billboard that turns with the camera shows the same from all sides (`baselines.billboard`), so that these are the
-    first view's own planes.
-
-    Args:
-        pool: Of a validation or a volume, of which nothing was left out: pairs of frames one after the other, each
-            from all views, which turn about the box's centre.
-        views: So many.
-        keep: bool [N], the samples to be looked at; None: all.
-
-    Returns:
-        The samples of the other views, and the method for them; no samples where there is no other view.
-
-    Raises:
-        ValueError: The pool isn't whole.
-    """
-    if views < 1 or len(pool) % views:
-        raise ValueError(f"pool: expected whole sets of {views} views, got {len(pool)} samples")
-    number = torch.arange(len(pool), device=pool.device)
-    others = number % views > 0
-    if keep is not None:
-        others &= keep
-    others = number[others]
-    baked = pool.targets[others - others % views]
-    return pool.take(others), lambda _, part: baked[part].float()
-
-
-def evaluate(
-    network: SixWayNetwork, pool: Pool, predictor: Predictor | None = None, *, batch: int = _BATCH
-) -> Evaluation:
-    """Runs a network over both frames of all samples, its outputs clamped as `decode_lightmaps` does.
-
-    Args:
-        network: On the pool's device; it runs in float32.
-        pool: With guides of its kind.
-        predictor: What is run instead, if given: of the pool's size, on its device.
-        batch: Samples at once.
-
-    Raises:
-        ValueError: The pool is empty, or doesn't fit.
-    """
-    method = of_network(network) if predictor is None else of_predictor(predictor)
-    return _evaluate(method, pool, batch)
-
-
-def compare(methods: Mapping[str, Method], pool: Pool, *, batch: int = _BATCH) -> dict[str, Evaluation]:
-    """Runs several methods over the same samples.
-
-    Args:
-        methods: By the names that the result has.
-        pool: With what they read.
-        batch: Samples at once.
-
-    Raises:
-        ValueError: The pool is empty, or a method gives planes of another shape.
-    """
-    return {name: _evaluate(method, pool, batch) for name, method in methods.items()}
-
-
 @torch.no_grad()
-def _evaluate(method: Method, pool: Pool, batch: int) -> Evaluation:
+def score(method: Method, pool: Pool, *, batch: int = _BATCH, progress: OnProgress | None = None) -> Score:
+    """Scores a method on both frames of all samples; its planes are clamped as ``decode_lightmaps`` does.
+
+    Args:
+        method: The method.
+        pool: The samples, with what the method reads.
+        batch: Samples at once.
+        progress: Called about twice a second.
+
+    Raises:
+        ValueError: The pool is empty, or the method's planes have another shape.
+    """
     if len(pool) == 0:
         raise ValueError("pool: expected samples, got none")
+    meter = Meter(progress, "evaluate", len(pool))
     lights = len(DIRECTIONS)
     squares, changes = [], []
     for begin in range(0, len(pool), batch):
         part = slice(begin, begin + batch)
-        wanted = pool.targets[part].float()
-        made = method(pool, part).float()
-        if made.shape != wanted.shape:
-            raise ValueError(f"planes: expected {list(wanted.shape)}, got {list(made.shape)}")
-        made = torch.cat([made[:, :, :lights].clamp(min=0.0), made[:, :, lights:].clamp(0.0, 1.0)], 2)
-        squares.append((made - wanted).square().mean((3, 4)).flatten(0, 1))
-        motion, opacity = pool.motion[part].float(), wanted[:, 1, OPACITY_PLANE]
-        found = [residual(frames[:, :, :lights], motion, opacity) for frames in (made, wanted)]
-        (own, count), (known, _) = found
-        changes.append(torch.stack([own, known, count]).double())
-    error = torch.cat(squares).double().cpu()
-    images = [psnr_from_mse(value, 1.0) for value in error[:, :lights].mean(1).tolist()]
-    planes = tuple(psnr_from_mse(value, 1.0) for value in error.mean(0).tolist())
-    own, known, count = torch.stack(changes).sum(0).tolist()
-    flicker = (own / count, known / count) if count else (math.nan, math.nan)
-    return Evaluation(sum(images) / len(images), min(images), max(images), planes, *flicker)
+        target = pool.targets[part].float()
+        predicted = method(pool, part).float()
+        if predicted.shape != target.shape:
+            raise ValueError(f"planes: expected {list(target.shape)}, got {list(predicted.shape)}")
+        predicted = torch.cat([predicted[:, :, :lights].clamp(min=0.0), predicted[:, :, lights:].clamp(0.0, 1.0)], 2)
+        squares.append((predicted - target).square().mean((3, 4)).flatten(0, 1))
+        motion, opacity = pool.motion[part].float(), target[:, 1, OPACITY_PLANE]
+        flicker, count = residual(predicted[:, :, :lights], motion, opacity)
+        target_flicker, _ = residual(target[:, :, :lights], motion, opacity)
+        changes.append(torch.stack([flicker, target_flicker, count]).double())
+        if meter.due(done := min(begin + batch, len(pool))):
+            meter.report(done)
+    errors = torch.cat(squares).double().cpu()
+    images = [psnr_from_mse(value, 1.0) for value in errors[:, :lights].mean(1).tolist()]
+    planes = tuple(psnr_from_mse(value, 1.0) for value in errors.mean(0).tolist())
+    flicker, target_flicker, count = torch.stack(changes).sum(0).tolist()
+    means = (flicker / count, target_flicker / count) if count else (math.nan, math.nan)
+    return Score(sum(images) / len(images), min(images), max(images), planes, *means)
+
+
+@dataclass(frozen=True, eq=False)
+class HeldOut:
+    """Held-out samples of one smoke: all frame pairs, each from all views.
+
+    Attributes:
+        whole: All samples, ordered by frame pair and then by view; the views turn about the box's centre.
+        keep: bool [N], the samples that count: those that aren't almost empty.
+        settings: How they were made.
+        make: Makes them anew with other settings.
+    """
+
+    whole: Pool
+    keep: torch.Tensor
+    settings: DatasetSettings
+    make: Callable[[DatasetSettings], Pool]
+
+    def pool(self, guide: str) -> Pool:
+        """The samples that count, with guiding maps of a kind; nothing else depends on that."""
+        same = guide == self.settings.guide
+        return (self.whole if same else self.make(_with_guide(self.settings, guide))).take(self.keep)
+
+
+Contender = Callable[[HeldOut], tuple[Pool, Method]]
+"""Takes those held-out samples that a method is scored on, maybe none, and gives the method."""
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Methods on one set of images.
+    """Methods on one held-out set.
 
     Attributes:
-        name: What the images are of.
-        samples: Pairs of frames.
-        methods: By name; the flip book's own view isn't among its images.
+        name: What the samples show.
+        samples: Number of frame pairs and views.
+        methods: Scores by name.
     """
 
     name: str
     samples: int
-    methods: dict[str, Evaluation]
+    methods: dict[str, Score]
 
     @property
     def half_loss(self) -> float | None:
-        """Decibels by which half floats are worse; None where they weren't tried."""
+        """Decibels lost by half floats; None where they weren't tried."""
         half = self.methods.get(HALF)
         return None if half is None else self.methods[NETWORK].psnr - half.psnr
 
-    def to_json(self) -> dict[str, object]:
-        """For a file."""
-        methods = {name: found.to_json() for name, found in self.methods.items()}
+    def to_json(self) -> dict[str, Any]:
+        """As JSON's own types."""
+        methods = {name: scores.to_json() for name, scores in self.methods.items()}
         return {"name": self.name, "samples": self.samples, "half_loss": self.half_loss, "methods": methods}
 
 
-def evaluate_all(
-    network: SixWayNetwork,
-    settings: DatasetSettings,
-    volumes: Sequence[Path] = (),
+def compare(
+    model: SmokeModel,
+    settings: DatasetSettings | None = None,
+    volumes: Sequence[str | os.PathLike[str]] = (),
     *,
+    rivals: Mapping[str, Contender] | None = None,
     densities: Sequence[float] = DENSITIES,
     device: str = "cpu",
-    progress: Callable[[int, int, str], None] | None = None,
+    progress: OnProgress | None = None,
 ) -> list[Comparison]:
-    """Evaluates a network on sequences that it hasn't learned from nor was chosen by, and what needs no network.
+    """Scores a network and its rivals on the test set at several densities, and on volumes.
 
     Args:
-        network: On the device.
-        settings: Those that it was trained with, but for sizes.
-        volumes: Files for `load_probe_volume`, each seen from all fixed views.
-        densities: Factors on the density of the sequences' smoke.
-        device: As `check_device` returns it.
-        progress: Called after each set with how many are done, how many there are, and which this was.
+        model: The network.
+        settings: Of the test set; None: those that it was trained with.
+        volumes: Files for ``pool_of_volume``.
+        rivals: Other methods, by name.
+        densities: Factors on the test set's extinction.
+        device: "cpu", "cuda" or "cuda:N".
+        progress: Called after each set, with the network's "PSNR dB".
 
     Returns:
         A comparison for each density, then for each volume.
 
     Raises:
-        WlmError: The memory isn't enough, a volume can't be read, or there is no smoke in the sequences.
+        WlmError: No such device, the file lacks its settings, the memory isn't enough, a volume can't be read, or no
+            frame has smoke.
     """
-    own, six = (settings.model_copy(update={"guide": kind}) for kind in (network.settings.guide, "six"))
-
-    def sequences(scale: float) -> Callable[[DatasetSettings], Pool]:
-        # Of all frames, so that each has its first view; those almost empty are left out below.
-        return lambda made: make_validation(made.model_copy(update={"kept_empty": 1.0}), device, test=True, scale=scale)
-
-    def volume(path: Path) -> Callable[[DatasetSettings], Pool]:
-        return lambda made: load_probe_volume(path, made, device=device)
-
-    sets = {f"density x {scale:g}": sequences(scale) for scale in densities}
-    sets |= {str(path): volume(path) for path in volumes}
-    found = []
-    for done, (name, make) in enumerate(sets.items(), 1):
-        whole = make(own)
-        keep = torch.ones(len(whole), dtype=torch.bool, device=whole.device)
-        if done <= len(densities):
-            keep = covered(whole.targets) > settings.least_coverage
-        pool = whole.take(keep)
-        if not len(pool):
+    device, guide = check_device(device), model.settings.guide
+    settings = _with_guide(settings or model.dataset, guide)
+    network = copy.deepcopy(model.network).to(device)
+    contenders: dict[str, Contender] = {NETWORK: lambda held_out: (held_out.pool(guide), of_network(network))}
+    if device != "cpu":
+        contenders[HALF] = lambda held_out: _at_run_time(model, device, held_out.pool(guide))
+    contenders |= rivals or {}
+    sets = {f"density x {scale:g}": partial(_test_set, settings, device, scale) for scale in densities}
+    sets |= {os.fspath(path): partial(_volume_set, settings, device, path) for path in volumes}
+    meter = Meter(progress, "evaluate", len(sets))
+    comparisons = []
+    for name, make in sets.items():
+        held_out = make()
+        count = int(held_out.keep.sum())
+        if not count:
             raise WlmError(f"{name}: expected frames with smoke, found none")
-        methods = compare({NETWORK: of_network(network)}, pool)
-        if device != "cpu":
-            predictor = Predictor(network, *pool.guides.shape[-2:], device=device)
-            methods |= compare({HALF: of_predictor(predictor)}, pool)
-        # The same smoke and views: the kind of guide changes nothing else.
-        methods |= compare({COARSE: coarse}, pool if own == six else make(six).take(keep))
-        others, shown = flip_book(whole, settings.views, keep)
-        if len(others):
-            methods |= compare({FLIP_BOOK: shown}, others)
-        found.append(Comparison(name, len(pool), methods))
-        if progress is not None:
-            progress(done, len(sets), name)
-    return found
+        scores = {}
+        for method_name, contender in contenders.items():
+            # One after the other: each pool is a copy.
+            pool, method = contender(held_out)
+            if len(pool):
+                scores[method_name] = score(method, pool)
+        comparisons.append(Comparison(name, count, scores))
+        meter.report(len(comparisons), PSNR_dB=scores[NETWORK].psnr)
+    return comparisons
+
+
+def _at_run_time(model: SmokeModel, device: str, pool: Pool, half: bool = True) -> tuple[Pool, Method]:
+    height, width = pool.guides.shape[-2:]
+    return pool, of_decoder(Decoder(model, device, height=height, width=width, half=half))
+
+
+def _test_set(settings: DatasetSettings, device: str, scale: float) -> HeldOut:
+    # All frames are made, so that each has its first view; almost empty ones are left out here.
+    whole_settings = settings.model_copy(update={"kept_empty": 1.0})
+
+    def make(settings: DatasetSettings) -> Pool:
+        return make_validation(settings, device, test=True, scale=scale)
+
+    whole = make(whole_settings)
+    return HeldOut(whole, whole.covered() > settings.least_coverage, whole_settings, make)
+
+
+def _volume_set(settings: DatasetSettings, device: str, path: str | os.PathLike[str]) -> HeldOut:
+    make = partial(pool_of_volume, path, device=device)
+    whole = make(settings)
+    return HeldOut(whole, torch.ones(len(whole), dtype=torch.bool, device=whole.device), settings, make)
+
+
+def _with_guide(settings: DatasetSettings, kind: str) -> DatasetSettings:
+    return settings.model_copy(update={"guide": kind})

@@ -1,12 +1,13 @@
 """Flip books of six-way lightmaps, as engines read them: two textures with the frames in rows, from the top left.
 
-EXR holds half floats as they are. PNG and TGA hold 8 bits a channel, linear, so that 1 is the brightest: a texture is
-to be imported without sRGB decoding. Light is premultiplied: it is added to what is behind, times 1 - alpha.
-`axes.LAYOUTS` says which channel is what.
+EXR holds half floats as they are. PNG and TGA hold 8 bits a channel, linear, so that 1 is the brightest: import the
+textures without sRGB decoding. Light is premultiplied: it is added to the background times 1 - alpha.
+``wlm.smoke.camera.LAYOUTS`` lists the channels.
 """
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,14 +19,34 @@ from PIL import Image, UnidentifiedImageError
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_path
 from wlm.formats.exr import read_exr, write_exr
-from wlm.smoke.baking import SixWay
 from wlm.smoke.camera import ALPHA, DIRECTIONS, EMISSION, LAYOUTS
+from wlm.smoke.lightmaps import SixWay
 
-__all__ = ["pack", "read_flipbook", "unpack", "write_flipbook"]
+__all__ = ["brightest_gain", "cells", "channels", "pack", "read_flipbook", "unpack", "write_flipbook"]
 
 _SUFFIXES = (".exr", ".png", ".tga")
 _MODES = ("RGB", "RGBA")
 _BAD_FILE = (OSError, ValueError, SyntaxError, EOFError, UnidentifiedImageError, Image.DecompressionBombError)
+
+
+def cells(count: int, columns: int | None = None) -> tuple[int, int]:
+    """Rows and columns of cells for frames: of at most so many columns; None: as near to a square as can be."""
+    columns = min(columns or math.ceil(count**0.5), count)
+    return -(-count // columns), columns
+
+
+def brightest_gain(frames: Sequence[SixWay]) -> float:
+    """The gain by which the brightest light of the frames becomes 1; 1 where all is black."""
+    planes = [plane for six in frames for plane in (six.lightmaps, six.emission) if plane is not None]
+    brightest = max(float(plane.max()) for plane in planes)
+    return 1.0 / brightest if brightest > 0 else 1.0
+
+
+def channels(frames: Sequence[SixWay], layout: str) -> tuple[tuple[str, ...], ...]:
+    """Channels of the two textures; one that is last and that no frame fills is left out."""
+    planes = {ALPHA: "transparency", EMISSION: "emission"}
+    absent = [name for name, plane in planes.items() if all(getattr(frame, plane) is None for frame in frames)]
+    return tuple(names[:-1] if names[-1] in absent else names for names in LAYOUTS[layout])
 
 
 def pack(
@@ -33,11 +54,11 @@ def pack(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Lays frames out in two textures.
 
-    A channel that is last and that no frame fills is left out: the second texture of cold smoke has three.
+    Channels are those of ``channels``: the second texture of cold smoke has three.
 
     Args:
         frames: At least one, at most rows x columns, all of one size. Cells without a frame are empty: black, alpha 0.
-        layout: One of `axes.LAYOUTS`.
+        layout: One of ``LAYOUTS``.
         rows, columns: Of cells.
         gain: Factor on the lightmaps and the emission, to use the range of 8 bits.
 
@@ -51,13 +72,8 @@ def pack(
     if not 1 <= len(frames) <= rows * columns:
         raise ValueError(f"expected 1 to {rows * columns} frames, got {len(frames)}")
     height, width = frames[0].lightmaps.shape[1:]
-    filled = set(DIRECTIONS)
-    for name, wanted in ((ALPHA, "transparency"), (EMISSION, "emission")):
-        if any(getattr(frame, wanted) is not None for frame in frames):
-            filled.add(name)
     pages = []
-    for names in LAYOUTS[layout]:
-        names = names if names[-1] in filled else names[:-1]
+    for names in channels(frames, layout):
         page = np.zeros((rows, height, columns, width, len(names)), np.float32)
         for i, frame in enumerate(frames):
             if tuple(frame.lightmaps.shape[1:]) != (height, width):
@@ -78,17 +94,17 @@ def unpack(
     count: int | None = None,
     gain: float = 1.0,
 ) -> list[SixWay]:
-    """Cuts two textures into frames, the reverse of `pack`.
+    """Cuts two textures into frames, the inverse of ``pack``.
 
     Args:
-        first, second: [rows * H, columns * W, 3 or 4]; a channel that isn't there isn't known.
-        layout: One of `axes.LAYOUTS`.
+        first, second: [rows * H, columns * W, 3 or 4].
+        layout: One of ``LAYOUTS``.
         rows, columns: Of cells.
         count: Frames; None: all cells.
-        gain: What the light was multiplied by.
+        gain: The factor on the light.
 
     Returns:
-        The frames, float32 on the CPU.
+        The frames, float32 on the CPU, without a camera; None for a plane without a channel.
 
     Raises:
         ValueError: The shapes don't fit each other, the cells or the layout.
@@ -111,11 +127,9 @@ def unpack(
     if missing:
         raise ValueError(f"layout {layout}: expected channels for {', '.join(missing)}")
     maps = torch.from_numpy(np.stack([planes[name] for name in DIRECTIONS], 1) / np.float32(gain))
-    clear = torch.from_numpy(1.0 - planes[ALPHA]) if ALPHA in planes else None
-    glow = torch.from_numpy(planes[EMISSION] / np.float32(gain)) if EMISSION in planes else None
-    return [
-        SixWay(maps[i], None if clear is None else clear[i], None if glow is None else glow[i]) for i in range(count)
-    ]
+    transparency = torch.from_numpy(1.0 - planes[ALPHA]) if ALPHA in planes else [None] * count
+    glow = torch.from_numpy(planes[EMISSION] / np.float32(gain)) if EMISSION in planes else [None] * count
+    return [SixWay(*parts) for parts in zip(maps, transparency, glow, strict=True)]
 
 
 def write_flipbook(
@@ -131,13 +145,13 @@ def write_flipbook(
 
     Args:
         paths: The two files, .exr, .png or .tga; their folders must exist.
-        frames, layout, rows, columns, gain: As for `pack`.
+        frames, layout, rows, columns, gain: As for ``pack``.
 
     Returns:
-        How many numbers were too bright for their file and became its brightest.
+        How many numbers were above their file's range and became its greatest.
 
     Raises:
-        ValueError: As for `pack`.
+        ValueError: As for ``pack``.
         WlmError: Another suffix, a number that isn't finite, or a file that can't be written.
     """
     for path in paths:
@@ -170,10 +184,10 @@ def read_flipbook(
 
     Args:
         paths: The two files, .exr, .png or .tga (8 bits a channel, linear).
-        layout, rows, columns, count, gain: As for `unpack`.
+        layout, rows, columns, count, gain: As for ``unpack``.
 
     Returns:
-        The frames, on the CPU. What a file has no channel for, transparency or emission, is None.
+        As ``unpack``.
 
     Raises:
         WlmError: A file is missing, damaged, of another kind or size, holds numbers that aren't finite, or lacks a
@@ -203,7 +217,7 @@ def _read(path: str | os.PathLike[str]) -> np.ndarray:
 
 def _plane(frame: SixWay, name: str, gain: float) -> np.ndarray | float:
     if name == ALPHA:
-        # A frame without transparency among others that have it: where nothing is known, nothing is hidden.
+        # A frame without transparency among others that have it is taken as transparent.
         return 0.0 if frame.transparency is None else 1.0 - frame.transparency.cpu().numpy()
     if name == EMISSION:
         return 0.0 if frame.emission is None else gain * frame.emission.cpu().numpy()

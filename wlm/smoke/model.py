@@ -1,29 +1,35 @@
-"""The network that turns a guiding map into six-way lightmaps (section 4.3): a U-Net and adapters, four or one.
+"""The network that turns a guiding map into six-way lightmaps (neural-six-way-lightmaps, section 4.3).
 
-The U-Net is Ronneberger's (2015): two 3 x 3 convolutions a level, maxima on the way down. What its last level finds is
-shared by the adapters, each a NAFBlock (Chen et al. 2022) for two opposite planes, or goes through one for all. A
-NAFBlock has no activation but the product of one half of its channels with the other; its channel attention multiplies
-by a linear map of the channels' means over the whole image.
+A U-Net (Ronneberger et al. 2015; two 3 x 3 convolutions per level, max pooling) computes features. Adapters turn these
+into planes: each is a NAFBlock (Chen et al. 2022), either one for each two opposite planes or one for all. A NAFBlock's
+only nonlinearity is the product of the two halves of its channels; its channel attention multiplies by a linear map of
+the channels' means over the whole image.
 
-Two things are known without learning and are built in:
+Two facts are built in rather than learned:
 
-- opacity differs little from the guide's, and light from the guide's light, but for the noise of its jitter: the
-  outputs are a learned filter of the guide's planes, which begins as what least squares found of a pixel's own, plus
-  what the U-Net finds, which begins as 0;
-- where no smoke is near, all planes are 0: outputs are multiplied by a mask of where the guide, whose large steps can
-  miss a wisp in one pixel and find it in the next, saw some within 8 to 16 pixels.
+- Opacity and light differ little from the guide's but for the noise of its jitter. So the output is a learned filter of
+  the guide's planes, initialised by a least squares fit, plus the U-Net's output, initialised to 0.
+- Far from smoke all planes are 0. Outputs are multiplied by a mask, which is 1 within 8 to 16 pixels of smoke in the
+  guide: its large steps can miss a wisp in one pixel and hit it in the next.
 """
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal, Self
 
 import torch
 import torch.nn.functional as F
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic_core import PydanticCustomError
 from torch import nn
 
+from wlm.config import check_settings
+from wlm.errors import WlmError
+from wlm.smoke.learn.settings import DatasetSettings, GuideKind, TrainSettings
 from wlm.smoke.planes import GUIDES, PLANES
+from wlm.system import Model, Settings
 
 __all__ = [
     "ADAPTERS",
@@ -31,21 +37,26 @@ __all__ = [
     "REACH",
     "NafBlock",
     "NetworkSettings",
+    "Profile",
     "SixWayNetwork",
+    "SmokeModel",
     "parameter_count",
     "support",
 ]
 
 ADAPTERS = (("front", "back"), ("right", "left"), ("top", "bottom"), ("opacity", "emission"))
-"""The planes that each adapter makes."""
+"""The planes of each adapter."""
 
 REACH = 8
-"""Pixels within which smoke in the guide lets lightmaps differ from 0, at least."""
+"""Pixels around smoke in the guide within which lightmaps may differ from 0, at least."""
 
-_FILTER = 5  # pixels along the edge of what the filter of the guide sees
+EPSILON = 1e-6
+"""Added to the variance in a channel norm."""
 
-# What a plane begins as that the guide lacks: shares of its light, opacity and depth. Least squares over plumes of
-# optical depths of 1 to 30 and the paper's guide, rounded, and alike for opposite sides.
+_FILTER = 5  # edge of the guide's filter, pixels
+
+# Initial weights on the guide's light, opacity and depth of planes that the guide lacks: least squares over plumes of
+# optical depths 1 to 30 and the paper's guide, rounded, and alike for opposite sides.
 _START = {
     "right": (0.45, 0.0, 0.1),
     "left": (0.45, 0.0, 0.1),
@@ -55,22 +66,21 @@ _START = {
     "back": (1.05, -0.7, -0.15),
     "emission": (0.0, 0.0, 0.0),
 }
-EPSILON = 1e-6
 
 
 class NetworkSettings(BaseModel):
-    """The shape of a network.
+    """The network's shape.
 
     Attributes:
-        width: Channels at the first level; each level has twice those of the one before, at half the resolution.
-        levels: Of the U-Net, the bottom too.
-        adapters: Whether each of the four groups of planes has a NAFBlock of its own; otherwise all share one.
-        emission: Whether the last plane is made; otherwise it is 0.
-        guide: What it reads, one of `samples.GUIDES`.
+        width: Channels of the first level; each level has twice those of the one before, at half the resolution.
+        levels: Levels of the U-Net, the lowest included.
+        adapters: Whether each of the four groups of planes has a NAFBlock; otherwise all share one.
+        emission: Whether emission is predicted; otherwise it is 0.
+        guide: Kind of the guiding map.
         depth: Whether the guide's depth, its last plane, is read.
-        stem: Pixels along the edge of the squares that the first convolution takes as one: 1 is the paper's, 2 runs the
-            whole network at half the resolution, a quarter of the work.
-        residual: Whether a filter of the guide's planes is added to the outputs.
+        stem: Edge in pixels of the squares that the first convolution takes as one pixel. The paper's is 1; 2 runs the
+            network at half the resolution, for a quarter of the work.
+        residual: Whether the filtered guide is added to the output.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -79,7 +89,7 @@ class NetworkSettings(BaseModel):
     levels: int = Field(5, ge=2, le=6)
     adapters: bool = True
     emission: bool = True
-    guide: Literal["paper", "front", "sides", "six"] = "paper"
+    guide: GuideKind = "paper"
     depth: bool = True
     stem: Literal[1, 2] = 1
     residual: bool = True
@@ -91,14 +101,59 @@ class NetworkSettings(BaseModel):
 
     @property
     def multiple(self) -> int:
-        """Pixels of which an image's height and width are made multiples by zeros at its end."""
+        """Pixels: images are padded with zeros to multiples of this."""
         return self.stem * 2 ** (self.levels - 1)
 
 
-class ChannelNorm(nn.Module):
-    """Layer norm over the channels of a pixel, [N, C, H, W].
+class Profile(Settings):
+    """What ``configs/smoke-network-*.yaml`` hold.
 
-    torch's own wants the channels together in memory, and gives a GPU a block of threads a pixel, for 16 numbers.
+    Attributes:
+        name: Shown in reports.
+        network, training, dataset: Settings of the parts.
+    """
+
+    FILES: ClassVar[str] = "smoke-network"
+
+    network: NetworkSettings = NetworkSettings()
+    training: TrainSettings = TrainSettings()
+    dataset: DatasetSettings = DatasetSettings()
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.network.guide != self.dataset.guide:
+            kinds = {"network": self.network.guide, "dataset": self.dataset.guide}
+            message = "dataset.guide: expected {network}, which network.guide is, found {dataset}"
+            raise PydanticCustomError("guide", message, kinds)
+        if (self.training.crop or 0) > self.dataset.resolution:
+            sizes = {"most": self.dataset.resolution, "crop": self.training.crop}
+            message = "training.crop: expected at most {most}, which dataset.resolution is, found {crop}"
+            raise PydanticCustomError("crop", message, sizes)
+        return self
+
+    def override(self, values: Mapping[str, Any], prefix: str = "") -> Self:
+        """As ``Settings.override``, inside the parts too: ``{"training": {"steps": 500}}`` leaves their other settings.
+
+        Raises:
+            WlmError: Unknown or out of range.
+        """
+        return super().override(_merged(self.model_dump(), values), prefix) if values else self
+
+
+def _merged(settings: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings with some values replaced, in nested mappings too."""
+
+    def value_of(name: str) -> Any:
+        old, new = settings.get(name), values[name]
+        return _merged(old, new) if isinstance(old, Mapping) and isinstance(new, Mapping) else new
+
+    return {**settings, **{name: value_of(name) for name in values}}
+
+
+class ChannelNorm(nn.Module):
+    """Layer norm over the channels of each pixel, [N, C, H, W].
+
+    torch's own needs the channels contiguous in memory, and gives a GPU a block of threads per pixel, for 16 numbers.
     """
 
     def __init__(self, channels: int) -> None:
@@ -119,7 +174,7 @@ def _normalised(x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 class _Norm(torch.autograd.Function):
-    """With its gradient by hand: autograd's goes through the variance, and keeps twice as much."""
+    """With a hand-written backward pass: autograd's goes through the variance and keeps twice as much."""
 
     @staticmethod
     def forward(ctx, x, weight, bias):
@@ -130,17 +185,18 @@ class _Norm(torch.autograd.Function):
     @staticmethod
     def backward(ctx, gradient):
         y, inverse, weight = ctx.saved_tensors
-        along = gradient * y
         inner = gradient * weight.to(y.dtype)
-        of_x = (inner - y * (inner * y).mean(1, keepdim=True) - inner.mean(1, keepdim=True)) * inverse
-        of_weight = along.sum((0, 2, 3), dtype=torch.float32)[:, None, None]
-        return of_x, of_weight, gradient.sum((0, 2, 3), dtype=torch.float32)[:, None, None]
+        grad_x = (inner - y * (inner * y).mean(1, keepdim=True) - inner.mean(1, keepdim=True)) * inverse
+        grad_weight, grad_bias = (
+            part.sum((0, 2, 3), dtype=torch.float32)[:, None, None] for part in (gradient * y, gradient)
+        )
+        return grad_x, grad_weight, grad_bias
 
 
 class NafBlock(nn.Module):
-    """Mixes neighbours and channels, each as a correction to what came in; at first, both corrections are 0.
+    """Adds two corrections to its input, one that mixes neighbours and one that mixes channels; both start at 0.
 
-    7 c^2 + 33 c parameters for c channels.
+    It has 7 c^2 + 33 c parameters for c channels.
     """
 
     def __init__(self, channels: int) -> None:
@@ -160,7 +216,7 @@ class NafBlock(nn.Module):
         y = self.depthwise(self.expand(self.norm1(x)))
         left, right = y.chunk(2, 1)
         y = left * right
-        # Summed in float32: over a whole image, half floats would overflow.
+        # In float32: summed over a whole image, half floats would overflow.
         mean = y.mean((2, 3), dtype=torch.float32)
         y = y * self.attend(mean.to(self.attend.weight.dtype))[:, :, None, None].to(y.dtype)
         x = x + self.beta * self.project(y)
@@ -169,13 +225,13 @@ class NafBlock(nn.Module):
 
 
 def support(opacity: torch.Tensor) -> torch.Tensor:
-    """Where smoke may be: within ``REACH`` pixels of where the guide has some; at most twice as far.
+    """The mask of where smoke may be: within ``REACH`` to twice ``REACH`` pixels of smoke in the guide.
 
     Args:
         opacity: [N, 1, H, W] of the guide.
 
     Returns:
-        As the opacity, 0 or 1.
+        [N, 1, H, W], 0 or 1, of the opacity's type.
     """
     height, width = opacity.shape[-2:]
     coarse = F.max_pool2d(opacity, REACH, ceil_mode=True)
@@ -184,9 +240,13 @@ def support(opacity: torch.Tensor) -> torch.Tensor:
 
 
 class SixWayNetwork(nn.Module):
-    """Guiding maps to lightmaps, both as planes of `samples`, at any resolution.
+    """Encoded guiding maps to encoded lightmaps, at any resolution.
 
-    The outputs aren't clamped, so that there is a gradient everywhere; `decode_lightmaps` clamps them.
+    Outputs aren't clamped, so that there is a gradient everywhere; ``decode_lightmaps`` clamps them.
+
+    Attributes:
+        groups: The planes of each adapter.
+        names: All of these, in order.
     """
 
     def __init__(self, settings: NetworkSettings) -> None:
@@ -196,24 +256,28 @@ class SixWayNetwork(nn.Module):
         first, area = widths[0], settings.stem**2
         inputs = [settings.channels * area, *widths[:-1]]
         self.encoder = nn.ModuleList(_twice(before, c) for before, c in zip(inputs, widths, strict=True))
-        # With pixels repeated, in place of up-convolutions of 2 x 2 pixels: a quarter of their weights.
+        # After repeating pixels; transposed 2 x 2 convolutions would have four times the weights.
         self.up = nn.ModuleList(nn.Conv2d(2 * c, c, 1) for c in widths[:-1])
         self.decoder = nn.ModuleList(_twice(2 * c, c) for c in widths[:-1])
-        self.groups = _groups(settings)
+        groups = [tuple(name for name in group if settings.emission or name != "emission") for group in ADAPTERS]
+        self.groups = groups if settings.adapters else [sum(groups, ())]
+        self.names = [name for group in self.groups for name in group]
         self.adapters = nn.ModuleList(NafBlock(first) for _ in self.groups)
         self.heads = nn.ModuleList(nn.Conv2d(first, len(group) * area, 3, padding=1) for group in self.groups)
         if settings.residual:
-            shares = torch.tensor([_start(name, GUIDES[settings.guide]) for group in self.groups for name in group])
-            self.filter = nn.Conv2d(settings.channels, len(shares), _FILTER, padding=_FILTER // 2, bias=False)
+            # A plane that the guide has starts as that, another one as a mix.
+            guide = GUIDES[settings.guide]
+            mixes = [[float(p == name) for p in guide] if name in guide else _START[name] for name in self.names]
+            self.filter = nn.Conv2d(settings.channels, len(mixes), _FILTER, padding=_FILTER // 2, bias=False)
             with torch.no_grad():
                 self.filter.weight.zero_()
-                self.filter.weight[:, :, _FILTER // 2, _FILTER // 2] = shares[:, : settings.channels]
+                self.filter.weight[:, :, _FILTER // 2, _FILTER // 2] = torch.tensor(mixes)[:, : settings.channels]
             for head in self.heads:
                 nn.init.zeros_(head.weight)
                 nn.init.zeros_(head.bias)
 
     def features(self, guide: torch.Tensor) -> torch.Tensor:
-        """What the U-Net finds, [N, C, H / stem, W / stem], of a guide whose sides are multiples."""
+        """The U-Net's output, [N, C, H / stem, W / stem], of a guide whose sides are multiples of ``multiple``."""
         x = guide[:, : self.settings.channels]
         if self.settings.stem > 1:
             x = F.pixel_unshuffle(x, self.settings.stem)
@@ -228,46 +292,67 @@ class SixWayNetwork(nn.Module):
         return x
 
     def forward(self, guide: torch.Tensor) -> torch.Tensor:
-        """Makes the planes.
+        """Predicts the planes.
 
         Args:
             guide: [N, C, H, W], encoded, of the settings' kind.
 
         Returns:
-            [N, 8, H, W] in the order of `samples.PLANES`, of the guide's type.
+            [N, 8, H, W] in the order of ``PLANES``, of the guide's type.
         """
         height, width = guide.shape[-2:]
         multiple = self.settings.multiple
         padded = F.pad(guide, (0, -width % multiple, 0, -height % multiple))
         x = self.features(padded)
-        made = torch.cat([head(adapter(x)) for adapter, head in zip(self.adapters, self.heads, strict=True)], 1)
+        planes = torch.cat([head(adapter(x)) for adapter, head in zip(self.adapters, self.heads, strict=True)], 1)
         if self.settings.stem > 1:
-            made = F.pixel_shuffle(made, self.settings.stem)
+            planes = F.pixel_shuffle(planes, self.settings.stem)
         if self.settings.residual:
-            made = made + self.filter(padded[:, : self.settings.channels])
-        made = made[:, :, :height, :width] * support(guide[:, -2:-1])
-        return self.order(made.to(guide.dtype))
+            planes = planes + self.filter(padded[:, : self.settings.channels])
+        planes = (planes[:, :, :height, :width] * support(guide[:, -2:-1])).to(guide.dtype)
+        predicted = dict(zip(self.names, planes.unbind(1), strict=True))
+        zero = torch.zeros_like(planes[:, 0])  # for planes that aren't predicted
+        return torch.stack([predicted.get(name, zero) for name in PLANES], 1)
 
-    def order(self, made: torch.Tensor) -> torch.Tensor:
-        """The adapters' planes in the order of `samples.PLANES`, with zeros for one that isn't made."""
-        names = [name for group in self.groups for name in group]
-        planes = dict(zip(names, made.unbind(1), strict=True))
-        nothing = torch.zeros_like(made[:, 0])
-        return torch.stack([planes.get(name, nothing) for name in PLANES], 1)
+
+@dataclass(frozen=True, eq=False)
+class SmokeModel(Model):
+    """A trained network.
+
+    Attributes:
+        network: The network in float32.
+        summary: Facts of its training, JSON values; "dataset" holds the settings of its samples.
+    """
+
+    SYSTEM: ClassVar[str] = "smoke-network"
+
+    network: SixWayNetwork
+    summary: Mapping[str, Any]
+
+    @property
+    def settings(self) -> NetworkSettings:
+        """The network's shape."""
+        return self.network.settings
+
+    @property
+    def dataset(self) -> DatasetSettings:
+        """The settings of the samples that it was trained on, which say how to make its guiding maps.
+
+        Raises:
+            WlmError: The summary lacks them, or they don't fit.
+        """
+        if "dataset" not in self.summary:
+            raise WlmError("summary.dataset: expected the settings of the network's samples, found none")
+        return check_settings(DatasetSettings, self.summary["dataset"], "summary.dataset.")
 
 
 def parameter_count(network: nn.Module) -> int:
-    """Numbers that are learned."""
+    """Number of trained parameters."""
     return sum(parameter.numel() for parameter in network.parameters())
 
 
-def _start(name: str, planes: tuple[str, ...]) -> tuple[float, ...]:
-    """Of a guide's planes those that an output begins as."""
-    return tuple(float(plane == name) for plane in planes) if name in planes else _START[name]
-
-
 def _twice(before: int, after: int) -> nn.Sequential:
-    """Two convolutions, which keep the size of what goes through them."""
+    """Two convolutions with ReLU that keep the scale of activations."""
     layers = []
     for inputs in (before, after):
         convolution = nn.Conv2d(inputs, after, 3, padding=1)
@@ -275,8 +360,3 @@ def _twice(before: int, after: int) -> nn.Sequential:
         nn.init.zeros_(convolution.bias)
         layers += [convolution, nn.ReLU(inplace=True)]
     return nn.Sequential(*layers)
-
-
-def _groups(settings: NetworkSettings) -> tuple[tuple[str, ...], ...]:
-    kept = [tuple(name for name in group if settings.emission or name != "emission") for group in ADAPTERS]
-    return tuple(kept) if settings.adapters else (tuple(name for group in kept for name in group),)

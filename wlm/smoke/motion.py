@@ -1,5 +1,7 @@
-"""How smoke moves across the image between two frames, from the solver's own velocities: the optical flow that the
-paper's temporal loss estimates from pictures (neural-six-way-lightmaps, eq. 9) is known here."""
+"""How smoke moves across the image between two frames, from the solver's own velocities.
+
+The paper's temporal loss estimates this optical flow from images (neural-six-way-lightmaps, eq. 9).
+"""
 
 from __future__ import annotations
 
@@ -11,10 +13,12 @@ import warp as wp
 from wlm.fluid.volume import DensityVolume
 from wlm.interop import device_name, stream, to_warp, torch_memory
 from wlm.smoke.camera import Camera
-from wlm.smoke.guide import check_march
 from wlm_kernels.smoke import march_motion
+from wlm_kernels.smoke.settings import March
 
 __all__ = ["motion"]
+
+_CUTOFF = 1e-3  # of a ray's transparency: smoke behind it hardly counts
 
 
 def motion(
@@ -22,8 +26,8 @@ def motion(
 ) -> torch.Tensor:
     """Projects the air's motion into the image, weighted by what the camera sees of the smoke that it carries.
 
-    A pixel shows smoke at many depths, of which each moves otherwise: this is their mean, and hidden smoke hardly
-    counts. Light that moves while smoke doesn't, a shadow's edge, isn't in it.
+    A pixel shows smoke at many depths, each with a motion of its own: this is their mean, and hidden smoke hardly
+    counts. Light that moves while smoke doesn't, such as a shadow's edge, isn't in it.
 
     Args:
         volume: The later frame's smoke.
@@ -41,17 +45,22 @@ def motion(
     Raises:
         ValueError: The camera is in perspective, the velocity isn't vec3 [A, B, C], or a number is out of its range.
     """
-    check_march(step)
+    march = March(step=step, cutoff=_CUTOFF)
     if not math.isfinite(reach):
         raise ValueError(f"reach: expected a finite length, got {reach}")
     if velocity.dtype is not wp.vec3 or velocity.ndim != 3 or 0 in velocity.shape:
         raise ValueError(f"velocity: expected vec3 [A, B, C], got {velocity.dtype.__name__} {velocity.shape}")
-    view, _ = camera.view(volume.origin, volume.voxel, volume.shape)
     with stream(device_name(volume.device)):
         out = torch.empty((2, camera.height, camera.width), dtype=torch.float32, device=volume.device)
         density, _ = volume.arrays()
-        extinction, reached = volume.extinction * volume.voxel, reach / volume.voxel
         march_motion.motion(
-            density, extinction, velocity, reached, view, to_warp(out), step=step, empty=torch_memory(volume.device)
+            density,
+            volume.extinction * volume.voxel,
+            velocity,
+            reach / volume.voxel,
+            camera.view(volume),
+            march,
+            to_warp(out),
+            torch_memory(volume.device),
         )
     return out

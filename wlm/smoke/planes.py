@@ -1,19 +1,19 @@
-"""What the network reads and learns: guiding maps and lightmaps as planes of a like range, and pools of such pairs."""
+"""Guiding maps and lightmaps as the network reads and learns them: planes in sRGB and of about the same range."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass, fields
 
 import torch
 
 from wlm.fluid.volume import DensityVolume
 from wlm.interop import device_name, stream, to_warp
-from wlm.smoke.baking import SixWay
 from wlm.smoke.camera import DIRECTIONS, Camera
-from wlm.smoke.coarse import coarse_six_way
-from wlm.smoke.guide import guide
+from wlm.smoke.coarse import march_planes
+from wlm.smoke.guiding import guide
+from wlm.smoke.lightmaps import SixWay
+from wlm_kernels.smoke import march_coarse
 from wlm_kernels.smoke import planes as smoke_planes
 from wlm_kernels.smoke.planes import FOOT, FOOT_CODE
+from wlm_kernels.smoke.settings import March
 
 __all__ = [
     "EMISSION_PLANE",
@@ -21,12 +21,11 @@ __all__ = [
     "OPACITY_PLANE",
     "PLANES",
     "VISIBLE",
-    "Pool",
     "decode_lightmaps",
     "encode_guide",
     "encode_lightmaps",
     "from_srgb",
-    "look_at",
+    "render_guide",
     "span",
     "to_srgb",
 ]
@@ -40,9 +39,9 @@ GUIDES = {
     "sides": ("light", "opacity", "depth"),
     "six": (*DIRECTIONS, "emission", "opacity", "depth"),
 }
-"""Planes of the guiding maps that a network may read, opacity and depth last. The light is that of the front, the top
-and the bottom together, as in the paper; of the front alone; or of the front, the right and the left. "six" is ours:
-the same march with its lights kept apart."""
+"""Planes of each kind of guiding map, opacity and depth last. The light is that of the front, the top and the bottom
+together, as in the paper; of the front alone; or of the front, the right and the left. "six" is ours: the coarse march,
+with its lights kept apart."""
 
 _LIT = {"front": ("front",), "sides": ("front", "right", "left")}
 
@@ -53,14 +52,14 @@ VISIBLE = 0.05
 
 
 def to_srgb(linear: torch.Tensor) -> torch.Tensor:
-    """Linear light to sRGB's curve, which goes on above 1; what is below 0 counts as 0."""
+    """Linear light to sRGB's curve, continued above 1; values below 0 count as 0."""
     # Kept off 0, where the power's slope is infinite and would turn a gradient into NaN.
     curve = 1.055 * linear.clamp(min=FOOT) ** (1 / 2.4) - 0.055
     return torch.where(linear <= FOOT, 12.92 * linear.clamp(min=0.0), curve)
 
 
 def from_srgb(code: torch.Tensor) -> torch.Tensor:
-    """The inverse of `to_srgb`; what is below 0 counts as 0."""
+    """The inverse of ``to_srgb``; values below 0 count as 0."""
     curve = ((code.clamp(min=FOOT_CODE) + 0.055) / 1.055) ** 2.4
     return torch.where(code <= FOOT_CODE, code.clamp(min=0.0) / 12.92, curve)
 
@@ -87,11 +86,11 @@ def encode_guide(maps: torch.Tensor, near: float, far: float) -> torch.Tensor:
     """A guiding map as the network reads it: all three planes are 0 where there is no smoke.
 
     Args:
-        maps: [..., 3, H, W]: light, transparency, depth, as `guide` gives them.
-        near, far: From `span`.
+        maps: [..., 3, H, W]: light, transparency, depth, as ``guide`` gives them.
+        near, far: From ``span``.
 
     Returns:
-        [..., 3, H, W]: light in sRGB; opacity; depth as a share of the span, 1 at its near end, 0 where none was found.
+        [..., 3, H, W]: light in sRGB; opacity; depth as a share of the span, 1 at its near end, 0 without a surface.
 
     Raises:
         ValueError: Another number of planes, or a span of no length.
@@ -109,53 +108,39 @@ def _check_span(near: float, far: float) -> None:
         raise ValueError(f"near, far: expected near < far, got {near} and {far}")
 
 
-def look_at(
-    volume: DensityVolume,
-    camera: Camera,
-    kind: str = "paper",
-    *,
-    step: float,
-    jitter: float,
-    threshold: float,
-    seed: int,
-    spacing: float | None = None,
-) -> torch.Tensor:
-    """A guiding map of a kind, encoded.
+def render_guide(volume: DensityVolume, camera: Camera, kind: str, march: March) -> torch.Tensor:
+    """Marches through smoke and encodes a guiding map of a kind.
 
     Args:
         volume: The smoke.
         camera: Orthographic.
         kind: One of ``GUIDES``.
-        step, jitter, threshold, seed: As for `guide`.
-        spacing: As for `coarse_six_way`; not of the kind "paper".
+        march: As for ``guide`` where the kind is "paper", else as for ``wlm.smoke.coarse.march``.
 
     Returns:
         float32 [C, H, W], the planes of ``GUIDES``, all 0 where there is no smoke, but for an emission without any.
 
     Raises:
-        ValueError: No such kind, or a setting is out of its range.
+        ValueError: No such kind, or a camera in perspective.
     """
-    settings = {"step": step, "jitter": jitter, "threshold": threshold, "seed": seed}
     near, far = span(volume, camera)
     if kind == "paper":
-        if spacing is not None:
-            raise ValueError(f"spacing: expected none for the paper's guiding map, got {spacing}")
-        return encode_guide(guide(volume, camera, **settings).maps, near, far)
+        return encode_guide(guide(volume, camera, march).maps, near, far)
     if kind not in GUIDES:
         raise ValueError(f"kind: expected one of {', '.join(GUIDES)}, got {kind!r}")
-    found = coarse_six_way(volume, camera, spacing=spacing, **settings)
+    planes = march_planes(volume, camera, march)
     if kind == "six":
         _check_span(near, far)
         with stream(device_name(volume.device)):
-            encoded = torch.empty_like(found.planes)
-            smoke_planes.encode_six(to_warp(found.planes), near, far, found.hot, to_warp(encoded))
+            encoded = torch.empty_like(planes)
+            smoke_planes.encode_six(to_warp(planes), near, far, volume.temperature is not None, to_warp(encoded))
         return encoded
-    six = found.six
-    light = sum(six[name] for name in _LIT[kind])
-    return encode_guide(torch.stack([light, six.transparency, found.depth]), near, far)
+    of = dict(zip(march_coarse.PLANES, planes, strict=True))
+    light = sum(of[name] for name in _LIT[kind])
+    return encode_guide(torch.stack([light, of["transparency"], of["depth"]]), near, far)
 
 
-def encode_lightmaps(six_way: SixWay) -> torch.Tensor:
+def encode_lightmaps(six: SixWay) -> torch.Tensor:
     """Lightmaps as the network learns them.
 
     Returns:
@@ -165,19 +150,20 @@ def encode_lightmaps(six_way: SixWay) -> torch.Tensor:
     Raises:
         ValueError: The transparency isn't known.
     """
-    if six_way.transparency is None:
-        raise ValueError("six_way: expected lightmaps with transparency")
-    clear = six_way.transparency
-    glow = torch.zeros_like(clear) if six_way.emission is None else six_way.emission.clamp(min=0.0)
-    return torch.cat([to_srgb(six_way.lightmaps), torch.stack([1.0 - clear, to_srgb(glow / (1.0 + glow))])])
+    if six.transparency is None:
+        raise ValueError("six: expected lightmaps with transparency")
+    transparency = six.transparency
+    glow = torch.zeros_like(transparency) if six.emission is None else six.emission.clamp(min=0.0)
+    return torch.cat([to_srgb(six.lightmaps), torch.stack([1.0 - transparency, to_srgb(glow / (1.0 + glow))])])
 
 
-def decode_lightmaps(planes: torch.Tensor, *, hot: bool = True) -> SixWay:
-    """The inverse of `encode_lightmaps`, in float32 and without a gradient; what a plane can't be is clamped.
+def decode_lightmaps(planes: torch.Tensor, *, hot: bool = True, camera: Camera | None = None) -> SixWay:
+    """The inverse of ``encode_lightmaps``, in float32 and without a gradient; each plane is clamped to its range.
 
     Args:
         planes: [8, H, W].
         hot: Whether there is emission; False leaves that plane out.
+        camera: The view of the lightmaps, if it is known.
 
     Raises:
         ValueError: Another number of planes.
@@ -188,53 +174,5 @@ def decode_lightmaps(planes: torch.Tensor, *, hot: bool = True) -> SixWay:
         planes = planes.detach().float().contiguous()
         light = torch.empty_like(planes)
         smoke_planes.decode(to_warp(planes), to_warp(light))
-    return SixWay(light[: len(DIRECTIONS)], light[OPACITY_PLANE], light[EMISSION_PLANE] if hot else None)
-
-
-@dataclass(frozen=True, eq=False)
-class Pool:
-    """Pairs of frames to learn from; all tensors on one device, the floats half.
-
-    Attributes:
-        guides: [N, 2, C, H, W], encoded, of one of ``GUIDES``; two frames that follow each other, the earlier first.
-        targets: [N, 2, 8, H, W], encoded.
-        motion: [N, 2, H, W], pixels, x to the right and y down, by which what the later frame shows has moved since
-            the earlier one.
-        sequence: int [N], the sequence that a sample is of; sets are split by these, never by frames.
-    """
-
-    guides: torch.Tensor
-    targets: torch.Tensor
-    motion: torch.Tensor
-    sequence: torch.Tensor
-
-    def __post_init__(self) -> None:
-        count, size = len(self.guides), tuple(self.guides.shape[-2:])
-        channels = self.guides.shape[2] if self.guides.ndim == 5 else 0
-        if channels not in map(len, GUIDES.values()):
-            raise ValueError(f"guides: expected [N, 2, C, H, W] of one of GUIDES, got {list(self.guides.shape)}")
-        wanted = {
-            "guides": (count, 2, channels, *size),
-            "targets": (count, 2, len(PLANES), *size),
-            "motion": (count, 2, *size),
-            "sequence": (count,),
-        }
-        for name, shape in wanted.items():
-            if tuple(getattr(self, name).shape) != shape:
-                raise ValueError(f"{name}: expected {list(shape)}, got {list(getattr(self, name).shape)}")
-
-    def __len__(self) -> int:
-        return len(self.guides)
-
-    @property
-    def device(self) -> torch.device:
-        """Where the samples are."""
-        return self.guides.device
-
-    def take(self, which: torch.Tensor) -> Pool:
-        """Some of the samples, by an index or a mask."""
-        return Pool(*(getattr(self, field.name)[which] for field in fields(self)))
-
-    def to(self, device: str | torch.device) -> Pool:
-        """The same samples on another device."""
-        return Pool(*(getattr(self, field.name).to(device) for field in fields(self)))
+    glow = light[EMISSION_PLANE] if hot else None
+    return SixWay(light[: len(DIRECTIONS)], light[OPACITY_PLANE], glow, camera)

@@ -1,7 +1,7 @@
-"""A scene to simulate and to look at, as its YAML file says it: the box, its air and smoke, what moves, camera, lights.
+"""The settings of a scene to simulate and render, a YAML file: the box, air, smoke, inlets, obstacles, camera, lights.
 
-Lengths are metres, times seconds, directions the world's, +y up unless the scene says otherwise. What smoke comes in
-as, without a scene, is `volume`; what a simulation leaves is `frames`. The stated behaviours:
+Lengths are in metres, times in seconds, directions the world's, +y up unless the scene says otherwise. A class is named
+``...Settings`` where the object that is made of it has the plain name. The stated behaviours:
 
 =======================================  =============================================================
 a number NaN or infinite                 error that names the field
@@ -14,8 +14,8 @@ an obstacle over an inlet                fine: nothing comes in where it lies
 a camera or a light along an axis        fine, along the vertical too
 a light of no direction                  error
 a box of one cell                        fine
-a time step that would be too long for   error when it is simulated: it names the obstacle or the inlet
-a fast obstacle
+an obstacle or an inlet too fast for     error when it is simulated: it names the obstacle or the inlet
+the time step
 =======================================  =============================================================
 """
 
@@ -30,7 +30,7 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 from pydantic_core import PydanticCustomError
 
-from wlm.config import load_settings, profile_path
+from wlm.config import check_settings, load_settings, profile_path
 from wlm.fluid.faces import FACES
 from wlm.fluid.shapes import box, cylinder, sphere
 from wlm.smoke.camera import Camera
@@ -39,20 +39,19 @@ from wlm.smoke.shading import Light, Ramp
 __all__ = [
     "Air",
     "CameraSettings",
-    "Smoke",
     "Grid",
     "Inlet",
     "LightSettings",
-    "Obstacle",
+    "ObstacleSettings",
     "Scene",
-    "Source",
+    "Smoke",
+    "SourceSettings",
     "load_scene",
     "make_camera",
     "obstacle_mesh",
 ]
 
 _SHORTEST = 1e-12
-_MARGIN = 1.05  # of an image's height over the box's, so that no smoke touches the edge
 
 
 def _directed(vector: tuple[float, float, float]) -> tuple[float, float, float]:
@@ -80,21 +79,21 @@ _Count = Annotated[int, Field(ge=1, le=4096)]
 _Face = Literal["-x", "+x", "-y", "+y", "-z", "+z"]
 
 
-class _Part(BaseModel):
+class _Settings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
-class Grid(_Part):
-    """The box and what closes it.
+class Grid(_Settings):
+    """The box and its faces.
 
     Attributes:
         cells: X, Y, Z of the velocity's grid.
         cell: Metres along a cell's edge.
-        refine: Voxels of density along a cell's edge; the paper's 400 over 100.
+        refine: Voxels of density along a cell's edge; in the paper 400 over 100.
         origin: The box's corner.
-        faces: What each face is: a "wall", a wall without friction ("slip"), "open", or "periodic" like the one
-            opposite, which has to be too. A face with an inlet is a wall around it to the air, and lets smoke out as a
-            whole. Faces that aren't named are open.
+        faces: The boundary condition of each face: "wall", "slip" (a wall without friction), "open", or "periodic", as
+            the opposite one must then be too. Around an inlet its face is a wall to the air, and open to smoke as a
+            whole. The default is open.
     """
 
     cells: tuple[_Count, _Count, _Count]
@@ -112,7 +111,7 @@ class Grid(_Part):
         return self
 
     def face(self, name: str) -> str:
-        """What a face is."""
+        """The boundary condition of a face."""
         return self.faces.get(name, "open")
 
     @property
@@ -127,18 +126,18 @@ class Grid(_Part):
 
     @property
     def size(self) -> np.ndarray:
-        """Of the box, float64 [3]."""
+        """The box's edges in metres, float64 [3]."""
         return self.cell * np.asarray(self.cells, np.float64)
 
 
-class Air(_Part):
-    """How the air moves.
+class Air(_Settings):
+    """The air's flow.
 
     Attributes:
-        viscosity: Kinematic, square metres a second; air's is 1.5e-5.
-        speed: Metres a second that are `lattice_speed` cells a step; null: the fastest inlet or obstacle.
-        lattice_speed: Cells a step. Errors grow with its square, the number of steps with its inverse.
-        operator, smagorinsky, storage: As for `wlm.fluid.lattice.Lattice`.
+        viscosity: Kinematic, square metres per second; air's is 1.5e-5.
+        speed: Metres per second that are ``lattice_speed`` cells per step; null: the fastest inlet or obstacle.
+        lattice_speed: Cells per step. Errors grow with its square, the number of steps with its inverse.
+        operator, smagorinsky, storage: As for ``wlm.fluid.lattice.Lattice``.
     """
 
     viscosity: _Positive = 1.5e-5
@@ -149,17 +148,17 @@ class Air(_Part):
     storage: Literal["float32", "float16"] = "float32"
 
 
-class Smoke(_Part):
-    """What the smoke itself does and how it looks.
+class Smoke(_Settings):
+    """The smoke's motion and appearance.
 
     Attributes:
         extinction: Per metre, of density 1.
         emission: Light given off per metre at temperature 1.
-        dissipation, cooling: Rates at which density and temperature decay, a second: exp(-rate t) is left.
-        buoyancy: Metres a second squared, upwards, at temperature 1.
-        weight: Metres a second squared, downwards, at density 1.
-        up: The direction that is up.
-        scheme, storage, bricks, substeps: How smoke is carried, as for `wlm.fluid.solver.Solver`.
+        dissipation, cooling: Rates of decay of density and temperature, per second: exp(-rate t) is left.
+        buoyancy: Metres per second squared, upwards, at temperature 1.
+        weight: Metres per second squared, downwards, at density 1.
+        up: The direction opposite to gravity.
+        scheme, storage, bricks, substeps: The advection, as for ``wlm.fluid.solver.Solver``.
         glow: Colours of the emission: stops of emission, R, G, B; none: grey, as it is.
     """
 
@@ -184,18 +183,18 @@ class Smoke(_Part):
 
     @property
     def hot(self) -> bool:
-        """Whether temperature shows or moves anything."""
+        """Whether temperature has any effect."""
         return self.emission > 0.0 or self.buoyancy > 0.0
 
     @property
     def ramp(self) -> Ramp | None:
-        """The glow's colours as shading takes them."""
+        """The glow's colours; None: grey."""
         if not self.glow:
             return None
         return Ramp(tuple(stop[0] for stop in self.glow), tuple(stop[1:] for stop in self.glow))
 
 
-class _Timed(_Part):
+class _Timed(_Settings):
     start: float = 0.0
     stop: float | None = None
 
@@ -206,18 +205,18 @@ class _Timed(_Part):
         return self
 
     def active(self, time: float) -> bool:
-        """Whether it works at a time."""
+        """Whether it is on at a time, in seconds."""
         return self.start <= time and (self.stop is None or time < self.stop)
 
 
-class Inlet(_Part):
-    """Where air and smoke come in through a face, all the time.
+class Inlet(_Settings):
+    """A steady inflow of air and smoke through a face.
 
     Attributes:
         face: Of the box.
-        centre, radius: The round part of the face that lets air in; radius null: the whole face.
-        velocity: Metres a second, into the box.
-        density, temperature: Of what comes in.
+        centre, radius: The round opening in the face; radius null: the whole face.
+        velocity: Metres per second, into the box.
+        density, temperature: Of the smoke that comes in.
     """
 
     face: _Face
@@ -235,12 +234,12 @@ class Inlet(_Part):
         return self
 
 
-class Source(_Timed):
-    """Where smoke arises within the box.
+class SourceSettings(_Timed):
+    """A ball within the box in which smoke arises.
 
     Attributes:
-        centre, radius: A ball.
-        density, temperature: What the ball is held at, while the source works.
+        centre, radius: Of the ball.
+        density, temperature: The values that the ball is held at while the source is on.
         start, stop: Seconds; stop null: to the end.
     """
 
@@ -250,14 +249,14 @@ class Source(_Timed):
     temperature: _NotNegative = 0.0
 
 
-class Obstacle(_Part):
-    """A solid body.
+class ObstacleSettings(_Settings):
+    """A solid obstacle.
 
     Attributes:
-        shape: "sphere", "box" or "cylinder", which stands along y.
+        shape: "sphere", "box" or "cylinder", whose axis is y.
         radius: Of a sphere; of the others half their extents along x, y and z.
-        path: Where its centre is: time, x, y, z. In between it moves evenly, before and after it rests.
-        colour: What it reflects, in pictures.
+        path: Positions of its centre: time, x, y, z. It moves evenly between them, and rests before and after.
+        colour: Its albedo in pictures.
     """
 
     shape: Literal["sphere", "box", "cylinder"] = "sphere"
@@ -266,19 +265,19 @@ class Obstacle(_Part):
     colour: _Colour = (0.12, 0.12, 0.13)
 
     @model_validator(mode="after")
-    def _sizes(self) -> Obstacle:
+    def _sizes(self) -> ObstacleSettings:
         if (self.shape == "sphere") == isinstance(self.radius, tuple):
             raise PydanticCustomError("radius", "expected one radius of a sphere, three half extents of another body")
         return self
 
     def centre(self, time: float) -> np.ndarray:
-        """Where it is, float64 [3]."""
+        """Its position at a time, float64 [3]."""
         keys = np.array(self.path)
         return np.array([np.interp(time, keys[:, 0], keys[:, axis]) for axis in (1, 2, 3)])
 
     @property
     def fastest(self) -> float:
-        """Metres a second."""
+        """Its greatest speed, metres per second."""
         keys = np.array(self.path)
         distance = np.linalg.norm(np.diff(keys[:, 1:], axis=0), axis=1)
         return float((distance / np.diff(keys[:, 0])).max(initial=0.0))
@@ -289,18 +288,12 @@ class Obstacle(_Part):
         return points * np.asarray(self.radius), triangles
 
 
-class CameraSettings(_Part):
-    """From where smoke is seen.
+class CameraSettings(_Settings):
+    """The camera, as ``Camera.around`` takes it; null is its None.
 
     Attributes:
-        toward: From the smoke to the camera.
-        target: What is in the image's middle; null: the box's centre.
-        extent: Height of the image in metres, in perspective at distance 1; null: as much as holds the box.
-        distance: Of the camera from its target; null: outside the box. What is behind the camera isn't seen.
-        up: What is up in the image, as far as it can be.
+        toward, target, extent, distance, up, aspect, perspective: As there; lengths in metres.
         resolution: Pixels along the height.
-        aspect: Width over height.
-        perspective: For guiding maps; six-way lightmaps are orthographic.
     """
 
     toward: _Direction = (0.0, 0.0, 1.0)
@@ -313,7 +306,7 @@ class CameraSettings(_Part):
     perspective: bool = False
 
     def turned(self, degrees: float) -> CameraSettings:
-        """The same camera, turned about what is up: the paper's references are seen from 9 sides, 10 degrees apart."""
+        """The same camera, turned about ``up``: the paper's references are seen from 9 sides, 10 degrees apart."""
         axis = np.array(self.up) / np.linalg.norm(self.up)
         toward, angle = np.array(self.toward), math.radians(degrees)
         along = axis * (axis @ toward)
@@ -322,7 +315,7 @@ class CameraSettings(_Part):
         return self.model_copy(update={"toward": tuple(map(float, turned))})
 
 
-class LightSettings(_Part):
+class LightSettings(_Settings):
     """A directional light.
 
     Attributes:
@@ -334,20 +327,20 @@ class LightSettings(_Part):
     irradiance: _Colour = (4 * math.pi,) * 3
 
     def light(self) -> Light:
-        """As shading takes it."""
+        """The light."""
         return Light(self.toward, self.irradiance)
 
 
-class Scene(_Part):
-    """All of it.
+class Scene(_Settings):
+    """A scene.
 
     Attributes:
         name: Shown in reports.
-        grid, air, smoke: The box and what fills it.
-        inlets, sources, obstacles: What acts on it.
-        camera, lights, background: How it is seen; the background is a linear colour.
-        frames: How many.
-        rate: Frames a second; the first is one interval after the start.
+        grid, air, smoke: The box and its contents.
+        inlets, sources, obstacles: In the box.
+        camera, lights, background: Of its pictures; the background is a linear colour.
+        frames: Number of frames.
+        rate: Frames per second; the first is one interval after the start.
     """
 
     name: str
@@ -355,8 +348,8 @@ class Scene(_Part):
     air: Air = Air()
     smoke: Smoke = Smoke()
     inlets: tuple[Inlet, ...] = ()
-    sources: tuple[Source, ...] = ()
-    obstacles: tuple[Obstacle, ...] = Field((), max_length=255)
+    sources: tuple[SourceSettings, ...] = ()
+    obstacles: tuple[ObstacleSettings, ...] = Field((), max_length=255)
     camera: CameraSettings = CameraSettings()
     lights: tuple[LightSettings, ...] = (LightSettings(toward=(1.0, 1.0, 1.0)),)
     background: _Colour = (0.0, 0.0, 0.0)
@@ -365,33 +358,37 @@ class Scene(_Part):
 
     @model_validator(mode="after")
     def _flow(self) -> Scene:
-        taken = {inlet.face for inlet in self.inlets}
-        if any(self.grid.face(face) == "periodic" for face in taken):
+        faces = {inlet.face for inlet in self.inlets}
+        if any(self.grid.face(face) == "periodic" for face in faces):
             raise PydanticCustomError("inlets", "expected inlets on faces that aren't periodic")
-        if taken and all(face in taken or self.grid.face(face) != "open" for face in FACES):
-            raise PydanticCustomError("inlets", "expected an open face for what the inlets let in")
+        if faces and all(face in faces or self.grid.face(face) != "open" for face in FACES):
+            raise PydanticCustomError("inlets", "expected an open face for the air that the inlets let in")
         return self
 
     def time(self, frame: int) -> float:
-        """When a frame is, which count from 1."""
+        """The time of a frame in seconds; frames count from 1."""
         return frame / self.rate
 
     def scaled(self, factor: float) -> Scene:
         """The same scene on a grid of a multiple of its cells along each axis, rounded; no axis gets fewer than one.
 
         The longest axis keeps its length, the others keep theirs to half a cell.
+
+        Raises:
+            ValueError: The factor isn't above 0.
+            WlmError: More cells than a grid may have.
         """
         if not 0 < factor < math.inf:
             raise ValueError(f"factor: expected a number above 0, got {factor}")
         cells = tuple(max(round(n * factor), 1) for n in self.grid.cells)
         longest = int(np.argmax(self.grid.cells))
         cell = self.grid.cell * self.grid.cells[longest] / cells[longest]
-        grid = self.grid.model_dump() | {"cells": cells, "cell": cell}
-        return self.model_copy(update={"grid": Grid(**grid)})
+        grid = check_settings(Grid, self.grid.model_dump() | {"cells": cells, "cell": cell}, f"{self.name}: grid.")
+        return self.model_copy(update={"grid": grid})
 
     @property
     def fastest(self) -> float:
-        """Metres a second that make `air.lattice_speed`; 1 where nothing says."""
+        """Metres per second that are ``air.lattice_speed``; 1 where nothing moves."""
         if self.air.speed is not None:
             return self.air.speed
         speeds = [float(np.linalg.norm(inlet.velocity)) for inlet in self.inlets]
@@ -399,7 +396,7 @@ class Scene(_Part):
 
     @property
     def steps(self) -> int:
-        """Steps of the air in a frame, as many as keep `fastest` at or below `air.lattice_speed`, in whole substeps."""
+        """Steps of the air per frame: as few as keep ``fastest`` within ``air.lattice_speed``, in whole substeps."""
         least = self.fastest / (self.rate * self.air.lattice_speed * self.grid.cell)
         return max(math.ceil(least / self.smoke.substeps - 1e-9), 1) * self.smoke.substeps
 
@@ -410,7 +407,7 @@ class Scene(_Part):
 
 
 def load_scene(name: str | os.PathLike[str]) -> Scene:
-    """Loads ``configs/smoke-NAME.yaml``, or a YAML file of one's own.
+    """Loads ``configs/smoke-NAME.yaml``, or any YAML file.
 
     Raises:
         WlmError: Unknown scene, unreadable file, or a wrong setting.
@@ -428,34 +425,15 @@ def make_camera(
         settings: The camera.
         origin, size: The box's corner and edges in the world, [3].
     """
-    origin, size = np.asarray(origin, np.float64), np.asarray(size, np.float64)
-    target = origin + 0.5 * size if settings.target is None else np.array(settings.target)
-    toward = np.array(settings.toward) / np.linalg.norm(settings.toward)
-    corners = origin + size * np.array([[i >> 2 & 1, i >> 1 & 1, i & 1] for i in range(8)]) - target
-    distance = settings.distance
-    if distance is None:
-        # In perspective as far off as the box is large, so that it isn't seen through a keyhole.
-        distance = float((corners @ toward).max()) + float(np.linalg.norm(size))
-    height = settings.resolution
-    width = max(round(height * settings.aspect), 1)
-    shape = {"height": height, "width": width, "world_up": settings.up, "perspective": settings.perspective}
-    camera = Camera.look_at(target + distance * toward, target, extent=1.0, **shape)
-    extent = settings.extent
-    if extent is None:
-        right, up, _ = np.abs(corners @ camera.axes.T).max(axis=0)
-        extent = 2.0 * _MARGIN * max(float(up), float(right) * height / width)
-        if settings.perspective:
-            # Of the box's nearest side, or of the sphere round it where the camera is inside.
-            nearest = distance - float((corners @ toward).max())
-            extent /= nearest if nearest > 0.0 else distance
-    return Camera.look_at(target + distance * toward, target, extent=extent, **shape)
+    values = settings.model_dump()
+    return Camera.around((origin, size), pixels=values.pop("resolution"), **values)
 
 
-def obstacle_mesh(obstacles: Sequence[Obstacle], time: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def obstacle_mesh(obstacles: Sequence[ObstacleSettings], time: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The surfaces of obstacles as triangles, for their pictures and shadows.
 
     Returns:
-        Corners float32 [V, 3] in the world, triangles int32 [F, 3], and which obstacle each is of, int32 [F].
+        Corners float32 [V, 3] in the world, triangles int32 [F, 3], and each one's obstacle by its number, int32 [F].
     """
     corners, triangles, owner = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], [np.zeros(0, np.int64)]
     first = 0

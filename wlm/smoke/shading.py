@@ -1,7 +1,6 @@
-"""Smoke in a scene's light: six-way lightmaps weighed for any lights, glow, and the shadows of obstacles.
+"""A scene's light on smoke: directional lights, the colour of a glow, and the shadows of obstacles.
 
-All in linear light. A lightmap is what one light of irradiance 4 pi gives, so that a light of irradiance E counts for
-E / (4 pi) of it (eq. 5, with the weights of `axes.weights`).
+All in linear light. ``SixWay.shade`` puts them together.
 """
 
 from __future__ import annotations
@@ -14,10 +13,9 @@ import numpy as np
 import torch
 
 from wlm.ops.raster import rasterize
-from wlm.smoke.baking import SixWay
-from wlm.smoke.camera import Camera, weights
+from wlm.smoke.camera import Camera, unit
 
-__all__ = ["Light", "Ramp", "composite", "obstacle_visibility", "shade"]
+__all__ = ["Light", "Ramp", "obstacle_visibility"]
 
 _SMALLEST_MAP = 8  # texels along an edge, of which four are the empty border
 
@@ -64,59 +62,6 @@ class Ramp:
         return (1 - share) * colours[after - 1] + share * colours[after]
 
 
-def shade(
-    six: SixWay, camera: Camera, lights: Sequence[Light], *, rule: str = "squared", ramp: Ramp | None = None
-) -> torch.Tensor:
-    """The light that comes from the smoke.
-
-    Args:
-        six: Lightmaps as seen by the camera.
-        camera: From where the billboard is seen; its axes turn the lights' directions.
-        lights: Any number.
-        rule: How a direction weighs the lightmaps, one of `axes.RULES`.
-        ramp: Colour of the emission; None: grey, as it is.
-
-    Returns:
-        float32 [H, W, 3], to be added to what is behind the smoke times its transparency.
-
-    Raises:
-        ValueError: A light has no direction, a negative irradiance or a visibility of another shape.
-    """
-    height, width = six.lightmaps.shape[1:]
-    light = torch.zeros((height, width, 3), dtype=torch.float32, device=six.lightmaps.device)
-    for given in lights:
-        irradiance = np.asarray(given.irradiance, np.float64)
-        if irradiance.shape != (3,) or not ((irradiance >= 0) & np.isfinite(irradiance)).all():
-            raise ValueError(f"irradiance: expected three numbers of at least 0, got {given.irradiance}")
-        share = weights(camera.axes @ np.asarray(given.toward, np.float64), rule)
-        grey = torch.einsum("c,chw->hw", torch.tensor(share).to(six.lightmaps), six.lightmaps)
-        if given.visibility is not None:
-            if given.visibility.shape != grey.shape:
-                raise ValueError(f"visibility: expected {tuple(grey.shape)}, got {tuple(given.visibility.shape)}")
-            grey = grey * given.visibility
-        light += grey[..., None] * torch.tensor(irradiance / (4 * math.pi)).to(light)
-    if six.emission is not None:
-        light += six.emission[..., None] if ramp is None else ramp(six.emission)
-    return light
-
-
-def composite(
-    light: torch.Tensor, transparency: torch.Tensor, background: torch.Tensor | Sequence[float]
-) -> torch.Tensor:
-    """Puts smoke in front of a picture (eq. 4).
-
-    Args:
-        light: float32 [H, W, 3], as `shade` gives it.
-        transparency: float32 [H, W].
-        background: [H, W, 3], or one colour.
-
-    Returns:
-        float32 [H, W, 3].
-    """
-    behind = torch.as_tensor(background, dtype=light.dtype, device=light.device)
-    return light + transparency[..., None] * behind
-
-
 def obstacle_visibility(
     depth: torch.Tensor,
     camera: Camera,
@@ -127,13 +72,13 @@ def obstacle_visibility(
     resolution: int = 512,
     bias: float | None = None,
 ) -> torch.Tensor:
-    """What of a light the obstacles leave to the smoke's surface, by a shadow map (section 4.5).
+    """The share of a light that obstacles leave to the smoke's surface, by a shadow map (section 4.5).
 
-    The map is drawn from the light over the obstacles. Each pixel's smoke is looked up at its surface's depth alone, so
-    that a shadow through the depth of the smoke falls on its surface whole or not at all.
+    The map is drawn from the light over the obstacles. Each pixel is looked up at the depth of its smoke's surface
+    alone, so that a shadow through the depth of the smoke falls on its surface whole or not at all.
 
     Args:
-        depth: float32 [H, W], distance along the ray to the smoke's surface, as the guiding map has it; 0: none.
+        depth: float32 [H, W], distance along the ray to the smoke's surface, as a guiding map has it; 0: none.
         camera: That of the depths.
         toward: [3], the direction to the light in the world, of any length but 0.
         vertices: float32 [V, 3], the obstacles' corners in the world.
@@ -150,18 +95,15 @@ def obstacle_visibility(
     size = (camera.height, camera.width)
     if depth.shape != size:
         raise ValueError(f"depth: expected {size}, got {tuple(depth.shape)}")
-    direction = np.asarray(toward, np.float64)
-    length = np.linalg.norm(direction)
-    if direction.shape != (3,) or not 1e-12 < length < np.inf:
-        raise ValueError(f"toward: expected a direction of some length, got {direction.tolist()}")
+    direction = unit(toward)
     lit = torch.ones(size, dtype=torch.float32, device=depth.device)
     if resolution < _SMALLEST_MAP:
         raise ValueError(f"resolution: expected at least {_SMALLEST_MAP}, got {resolution}")
     if not len(triangles):
         return lit
     # Any turn about the light's direction will do.
-    sight = Camera.look_at(direction / length, np.zeros(3), extent=1.0, height=1, width=1)
-    axes = torch.tensor(sight.axes, dtype=torch.float64, device=depth.device)
+    from_light = Camera.look_at(direction, np.zeros(3), extent=1.0, height=1, width=1)
+    axes = torch.tensor(from_light.axes, dtype=torch.float64, device=depth.device)
     corners = vertices.double() @ axes.T
     low, high = corners[triangles.reshape(-1)].aminmax(dim=0)
     middle = 0.5 * (low + high)
@@ -175,8 +117,8 @@ def obstacle_visibility(
     drawn = rasterize(clip.float(), triangles, resolution, resolution)
     nearest = torch.where(drawn.triangle >= 0, middle[2] - drawn.depth.double() * behind, -math.inf)
 
-    origin, way = camera.rays(depth.device)
-    at = (origin + depth.double()[..., None] * way) @ axes.T
+    origin, direction = camera.rays(depth.device)
+    at = (origin + depth.double()[..., None] * direction) @ axes.T
     column = ((at[..., 0] - middle[0]) / half + 1.0) * 0.5 * resolution - 0.5
     row = (1.0 - (at[..., 1] - middle[1]) / half) * 0.5 * resolution - 0.5
     offset = 1.5 * texel if bias is None else bias
@@ -186,6 +128,6 @@ def obstacle_visibility(
             r, c = row.floor() + down, column.floor() + across
             weight = (1.0 - (row - r).abs()) * (1.0 - (column - c).abs())
             # The border's texels are empty: what lies outside is lit.
-            found = nearest[r.clamp(0, resolution - 1).long(), c.clamp(0, resolution - 1).long()]
-            hidden += torch.where(found > at[..., 2] + offset, weight, 0.0)
+            occluder = nearest[r.clamp(0, resolution - 1).long(), c.clamp(0, resolution - 1).long()]
+            hidden += torch.where(occluder > at[..., 2] + offset, weight, 0.0)
     return torch.where(depth > 0, (1.0 - hidden).clamp(0, 1).float(), lit)

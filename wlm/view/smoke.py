@@ -1,4 +1,4 @@
-"""Pictures of smoke: shaded frames with the scene's obstacles, guiding maps, sequences and contact sheets."""
+"""Pictures of smoke: shaded frames with a scene's obstacles, guiding maps, sequences and contact sheets."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from PIL import Image, ImageDraw, ImageFont
 
 from wlm.errors import WlmError
 from wlm.ops.raster import rasterize
-from wlm.smoke.baking import SixWay
 from wlm.smoke.camera import DIRECTIONS, Camera
-from wlm.smoke.guide import Guide
-from wlm.smoke.scene import Obstacle, obstacle_mesh
-from wlm.smoke.shading import Light, Ramp, composite, obstacle_visibility, shade
+from wlm.smoke.guiding import Guide
+from wlm.smoke.lightmaps import SixWay
+from wlm.smoke.scene import ObstacleSettings, obstacle_mesh
+from wlm.smoke.shading import Light, Ramp, obstacle_visibility
 from wlm.view.atlas import encode, save_png
 
 __all__ = [
@@ -37,7 +37,7 @@ MOST_COLUMNS = 8
 
 _GREY = 96  # of a sheet: neither smoke nor shadow
 _MARGIN, _FONT = 4, 14  # pixels
-_AMBIENT = 0.2  # of an obstacle's colour, so that its dark side can be told from a black background
+_AMBIENT = 0.2  # of an obstacle's colour, so that its dark side stands out from a black background
 
 
 def to_bytes(light: torch.Tensor | np.ndarray, white: float = 1.0) -> np.ndarray:
@@ -45,7 +45,7 @@ def to_bytes(light: torch.Tensor | np.ndarray, white: float = 1.0) -> np.ndarray
 
     Args:
         light: [H, W, 3], or [H, W]: grey.
-        white: The light that is shown as white; what is brighter clips.
+        white: The light that becomes white; brighter light clips.
 
     Returns:
         uint8 [H, W, 3].
@@ -62,14 +62,14 @@ def to_bytes(light: torch.Tensor | np.ndarray, white: float = 1.0) -> np.ndarray
 
 
 def draw_obstacles(
-    obstacles: Sequence[Obstacle], time: float, camera: Camera, lights: Sequence[Light], device: str = "cpu"
+    obstacles: Sequence[ObstacleSettings], time: float, camera: Camera, lights: Sequence[Light], device: str = "cpu"
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Draws obstacles, matt, under directional lights. They cast no shadows on each other, nor does the smoke on them.
+    """Draws diffuse obstacles under directional lights. They cast no shadows on each other, nor does the smoke on them.
 
     Args:
         obstacles: Any number.
-        time: When, in seconds.
-        camera: From where.
+        time: Seconds.
+        camera: The view.
         lights: Any number.
         device: "cpu" or "cuda:N".
 
@@ -80,48 +80,46 @@ def draw_obstacles(
     light = torch.zeros((camera.height, camera.width, 3), dtype=torch.float32, device=device)
     depth = torch.full(light.shape[:2], math.inf, device=device)
     axes = torch.tensor(camera.axes, dtype=torch.float32, device=device)
-    seen = (points - torch.tensor(camera.position, dtype=torch.float32, device=device)) @ axes.T
-    away = -seen[:, 2]
-    # Where rays are parallel nothing tells what is behind the camera but its sign.
+    local = (points - torch.tensor(camera.position, dtype=torch.float32, device=device)) @ axes.T
+    away = -local[:, 2]
+    # With parallel rays the rasteriser doesn't cut off what is behind the camera.
     ahead = (away[triangles.long()] > 0).all(1) if not camera.perspective else torch.ones_like(owner, dtype=torch.bool)
     triangles, owner = triangles[ahead].contiguous(), owner[ahead]
     if not len(triangles):
         return light, depth
     half = 0.5 * camera.extent
-    flat = [seen[:, 0] / (half * camera.width / camera.height), seen[:, 1] / half]
+    flat = [local[:, 0] / (half * camera.width / camera.height), local[:, 1] / half]
     far = float(away.abs().max())
     ends = [away - 1.0, away] if camera.perspective else [away / far, torch.ones_like(away)]
-    found = rasterize(torch.stack(flat + ends, 1), triangles, camera.height, camera.width)
-    hit = found.triangle >= 0
-    number = found.triangle[hit].long()
+    drawn = rasterize(torch.stack(flat + ends, 1), triangles, camera.height, camera.width)
+    hit = drawn.triangle >= 0
+    number = drawn.triangle[hit].long()
     corners = points[triangles[number].long()]
-    weight = torch.cat([found.barycentric[hit], 1.0 - found.barycentric[hit].sum(1, keepdim=True)], 1)
+    weight = torch.cat([drawn.barycentric[hit], 1.0 - drawn.barycentric[hit].sum(1, keepdim=True)], 1)
     at = (corners * weight[..., None]).sum(1)
-    origin, way = (part.float() for part in camera.rays(device))
-    depth[hit] = ((at - origin[hit]) * way[hit]).sum(1)
+    origin, direction = (part.float() for part in camera.rays(device))
+    depth[hit] = ((at - origin[hit]) * direction[hit]).sum(1)
     normal = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normal = torch.nn.functional.normalize(normal, dim=1)
-    normal = torch.where((normal * way[hit]).sum(1, keepdim=True) > 0, -normal, normal)
+    normal = torch.where((normal * direction[hit]).sum(1, keepdim=True) > 0, -normal, normal)
     colour = torch.tensor([o.colour for o in obstacles], dtype=torch.float32, device=device)[owner[number].long()]
     total = torch.full_like(colour, _AMBIENT)
-    for given in lights:
-        toward = torch.tensor(given.toward, dtype=torch.float32, device=device)
+    for lamp in lights:
+        toward = torch.tensor(lamp.toward, dtype=torch.float32, device=device)
         facing = (normal @ (toward / toward.norm())).clamp(min=0)[:, None]
-        total = total + facing * torch.tensor(given.irradiance, dtype=torch.float32, device=device) / math.pi
+        total = total + facing * torch.tensor(lamp.irradiance, dtype=torch.float32, device=device) / math.pi
     light[hit] = colour * total
     return light, depth
 
 
 def picture(
     six: SixWay,
-    camera: Camera,
     lights: Sequence[Light],
     *,
     background: Sequence[float] = (0.0, 0.0, 0.0),
     ramp: Ramp | None = None,
-    obstacles: Sequence[Obstacle] = (),
+    obstacles: Sequence[ObstacleSettings] = (),
     time: float = 0.0,
-    depth: torch.Tensor | None = None,
     rule: str = "squared",
 ) -> torch.Tensor:
     """Puts shaded smoke and a scene's obstacles into one picture.
@@ -130,40 +128,35 @@ def picture(
     smoke's surface.
 
     Args:
-        six: Lightmaps as seen by the camera, with their transparency.
-        camera: From where.
+        six: Lightmaps with their camera and transparency; with obstacles, with their depth too.
         lights: Any number.
         background: A linear colour.
         ramp: Colour of the emission.
-        obstacles: They are drawn, and keep the lights off the smoke's surface.
-        time: Of the obstacles.
-        depth: float32 [H, W], of the smoke's surface, 0 where there is none, as a guiding map has it; needed with
-            obstacles.
+        obstacles: They are drawn, and cast shadows on the smoke's surface.
+        time: Of the obstacles, seconds.
         rule: How a light's direction weighs the lightmaps.
 
     Returns:
         float32 [H, W, 3], linear.
 
     Raises:
-        ValueError: The lightmaps have no transparency, or there are obstacles and no depth.
+        ValueError: The lightmaps lack their camera, transparency or, with obstacles, depth.
     """
-    if six.transparency is None:
-        raise ValueError("six: expected lightmaps with their transparency")
-    plain = torch.tensor(background, dtype=torch.float32, device=six.lightmaps.device)
     if not len(obstacles):
-        return composite(shade(six, camera, lights, rule=rule, ramp=ramp), six.transparency, plain)
-    if depth is None:
-        raise ValueError("depth: expected that of the smoke's surface, for the obstacles")
+        return six.shade(lights, background=background, ramp=ramp, rule=rule)
+    if six.camera is None or six.depth is None:
+        raise ValueError("six: expected lightmaps with their camera and depth, for the obstacles")
     device = str(six.lightmaps.device)
     points, triangles, _ = (torch.from_numpy(a).to(device) for a in obstacle_mesh(obstacles, time))
     shadowed = [
-        replace(light, visibility=obstacle_visibility(depth, camera, light.toward, points, triangles))
+        replace(light, visibility=obstacle_visibility(six.depth, six.camera, light.toward, points, triangles))
         for light in lights
     ]
-    drawn, away = draw_obstacles(obstacles, time, camera, lights, device)
+    drawn, away = draw_obstacles(obstacles, time, six.camera, lights, device)
+    plain = torch.tensor(background, dtype=torch.float32, device=device)
     behind = torch.where(torch.isfinite(away)[..., None], drawn, plain)
-    smoky = composite(shade(six, camera, shadowed, rule=rule, ramp=ramp), six.transparency, behind)
-    return torch.where((away < depth)[..., None], drawn, smoky)
+    smoky = six.shade(shadowed, background=behind, ramp=ramp, rule=rule)
+    return torch.where((away < six.depth)[..., None], drawn, smoky)
 
 
 def six_pictures(six: SixWay, white: float = 1.0) -> dict[str, np.ndarray]:
@@ -176,26 +169,26 @@ def six_pictures(six: SixWay, white: float = 1.0) -> dict[str, np.ndarray]:
     return {name: to_bytes(plane, 1.0 if name == "alpha" else white) for name, plane in planes.items()}
 
 
-def guide_pictures(found: Guide, white: float = 2.0) -> dict[str, np.ndarray]:
-    """Light, transparency and depth, uint8 [H, W, 3] each, by name; what is nearest is white, no smoke is black."""
-    depth = found.depth.cpu()
+def guide_pictures(guide: Guide, white: float = 2.0) -> dict[str, np.ndarray]:
+    """Light, transparency and depth, uint8 [H, W, 3] each, by name; the nearest depth is white, no smoke is black."""
+    depth = guide.depth.cpu()
     smoke = depth > 0
     near, far = (float(depth[smoke].min()), float(depth[smoke].max())) if smoke.any() else (0.0, 0.0)
-    shown = torch.where(smoke, 1.0 - 0.8 * (depth - near) / max(far - near, 1e-12), 0.0)
+    grey = torch.where(smoke, 1.0 - 0.8 * (depth - near) / max(far - near, 1e-12), 0.0)
     return {
-        "light": to_bytes(found.light, white),
-        "transparency": to_bytes(found.transparency),
-        "depth": np.repeat((shown.numpy() * 255.0 + 0.5).astype(np.uint8)[..., None], 3, axis=2),
+        "light": to_bytes(guide.light, white),
+        "transparency": to_bytes(guide.transparency),
+        "depth": np.repeat((grey.numpy() * 255.0 + 0.5).astype(np.uint8)[..., None], 3, axis=2),
     }
 
 
 def write_sequence(folder: str | os.PathLike[str], pictures: Iterable[np.ndarray], stem: str = "frame") -> list[Path]:
-    """Writes pictures as `STEM_0001.png` and so on, each whole or not at all.
+    """Writes pictures as ``STEM_0001.png`` and so on, each whole or not at all.
 
     Args:
-        folder: It is made if its parent is there.
+        folder: Made if its parent is there.
         pictures: uint8 [H, W, 3].
-        stem: What the names begin with.
+        stem: First part of the names.
 
     Returns:
         The files.
@@ -222,7 +215,7 @@ def contact_sheet(
     *,
     columns: int = MOST_COLUMNS,
 ) -> tuple[int, ...]:
-    """Writes a PNG of pictures in rows, a label before each; of more than fit in a row those evenly spread are shown.
+    """Writes a PNG of pictures in labelled rows; of more than fit in a row, evenly spread ones are chosen.
 
     Args:
         path: The PNG to write; its folder must exist.
@@ -231,7 +224,7 @@ def contact_sheet(
         columns: Pictures in a row at most.
 
     Returns:
-        The numbers, from 0, of the pictures shown.
+        The numbers, from 0, of the chosen pictures.
 
     Raises:
         ValueError: No picture, or they differ in size or number.

@@ -1,4 +1,4 @@
-"""Pictures of what a network learns from: guiding maps, lightmaps and motion, a column a sample."""
+"""Contact sheets of training samples: guiding maps, lightmaps and motion, one column per sample."""
 
 from __future__ import annotations
 
@@ -7,25 +7,26 @@ import os
 import numpy as np
 import torch
 
-from wlm.smoke.planes import GUIDES, PLANES, Pool
+from wlm.smoke.learn.pool import Pool
+from wlm.smoke.planes import GUIDES, PLANES
 from wlm.view.smoke import MOST_COLUMNS, contact_sheet
 
 __all__ = ["pool_sheet"]
 
 
 def pool_sheet(path: str | os.PathLike[str], pool: Pool, *, columns: int = MOST_COLUMNS) -> tuple[int, ...]:
-    """Writes a contact sheet of the later frames; the planes are shown as they are encoded, 1 is white.
+    """Writes a contact sheet of the later frames, with planes as they are encoded, 1 in white.
 
-    Motion is red where it goes to the right and green where it goes up, dark in these the other way; half of both is no
-    motion, and the strongest in the pool is the fullest.
+    Motion to the right is red and motion upwards green, the opposite ways dark; both at half is no motion. The fastest
+    motion in the pool has the full colour.
 
     Args:
         path: The PNG to write; its folder must exist.
         pool: At least one sample.
-        columns: Samples shown at most, evenly spread.
+        columns: Most samples shown, evenly spread.
 
     Returns:
-        The numbers of those.
+        Their numbers.
 
     Raises:
         ValueError: The pool is empty.
@@ -37,19 +38,19 @@ def pool_sheet(path: str | os.PathLike[str], pool: Pool, *, columns: int = MOST_
     planes = next(names for names in GUIDES.values() if len(names) == pool.guides.shape[2])
     rows = {f"guide: {name}": [_grey(pool.guides[i, 1, k]) for i in chosen] for k, name in enumerate(planes)}
     rows |= {name: [_grey(pool.targets[i, 1, k]) for i in chosen] for k, name in enumerate(PLANES)}
-    strongest = max(float(pool.motion.abs().max()), 1e-6)
-    rows["motion"] = [_arrows(pool.motion[i], strongest) for i in chosen]
+    fastest = max(float(pool.motion.abs().max()), 1e-6)
+    rows["motion"] = [_colour(pool.motion[i], fastest) for i in chosen]
     titles = [f"{int(i)} of {int(pool.sequence[i])}" for i in chosen]
     contact_sheet(path, rows, titles, columns=len(chosen))
     return tuple(map(int, chosen))
 
 
 def _grey(plane: torch.Tensor) -> np.ndarray:
-    shown = (plane.float().clamp(0.0, 1.0) * 255.0 + 0.5).to(torch.uint8).cpu().numpy()
-    return np.repeat(shown[..., None], 3, axis=2)
+    levels = (plane.float().clamp(0.0, 1.0) * 255.0 + 0.5).to(torch.uint8).cpu().numpy()
+    return np.repeat(levels[..., None], 3, axis=2)
 
 
-def _arrows(motion: torch.Tensor, strongest: float) -> np.ndarray:
-    right, down = (motion.float() / strongest).cpu().numpy()
+def _colour(motion: torch.Tensor, fastest: float) -> np.ndarray:
+    right, down = (motion.float() / fastest).cpu().numpy()
     colour = 0.5 + 0.5 * np.stack([right, -down, np.zeros_like(right)], -1)
     return (np.clip(colour, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)

@@ -61,15 +61,15 @@ def render_probes(
     width: int = 1800,
     error_gain: float = 8.0,
 ) -> int:
-    """Write a PNG of probes: original, decoded and their absolute difference times a gain, side by side.
+    """Writes a PNG of probes: original, decoded and their absolute difference times a gain, side by side.
 
     A point of a sphere shows the light of its normal: irradiance / pi, which is what a white diffuse surface shows, or
     the radiance that arrives from there. All three pictures share one exposure: the original's 99.5 percentile is
     white, what is negative is black, and light is encoded as sRGB. The difference is taken before that.
 
     The view is parallel, from above and from between two axes, along (-1, -0.8, -1) with y up and (-1, 1, -0.8) with z
-    up, in right-handed axes; probes from an engine with left-handed ones are seen mirrored. It holds all probes shown.
-    Of more than ``MAX_PROBES`` so many are shown, chosen at random with a fixed seed, and the title says so. Probes
+    up, in right-handed axes; probes from an engine with left-handed ones appear mirrored. It holds all probes drawn.
+    Of more than ``MAX_PROBES`` so many are drawn, chosen at random with a fixed seed, and the title says so. Probes
     without light are black and may hide others: pass the live ones alone.
 
     Rendering is VTK's, on the GPU or in software, and needs no screen, but it does need an OpenGL library of the
@@ -88,7 +88,7 @@ def render_probes(
         error_gain: What the difference is multiplied by.
 
     Returns:
-        The number of probes shown.
+        The number of probes drawn.
 
     Raises:
         WlmError: Shapes differ, there is no probe, D is not 3 (l + 1)², a number is NaN or infinite, an argument is
@@ -136,9 +136,9 @@ def _check(position, original, decoded, up, radius, shade, width, error_gain) ->
     with np.errstate(over="ignore"):
         if not np.isfinite(np.ptp(position, axis=0)).all():
             raise WlmError("spheres: the positions span more than float64 holds")
-    for label, value, known in (("up", up, ("y", "z")), ("shade", shade, ("irradiance", "radiance"))):
-        if value not in known:
-            raise WlmError(f"spheres: {label}: expected {' or '.join(known)}, got {value!r}")
+    for label, value, choices in (("up", up, ("y", "z")), ("shade", shade, ("irradiance", "radiance"))):
+        if value not in choices:
+            raise WlmError(f"spheres: {label}: expected {' or '.join(choices)}, got {value!r}")
     for label, value in (("radius", radius), ("error_gain", error_gain)):
         if value is not None and not (math.isfinite(value) and value > 0):
             raise WlmError(f"spheres: {label}: expected a finite number above 0, got {value}")
@@ -157,7 +157,7 @@ def _normalise(position: np.ndarray, radius: float | None) -> tuple[np.ndarray, 
         return place, min(max(radius / scale, _RADIUS_RANGE[0]), _RADIUS_RANGE[1])
     nearest = cKDTree(place).query(place, k=2)[0][:, 1]
     spread = np.linalg.norm((high - low) / scale)
-    # Of coincident probes one is seen; they say nothing about the distance of the others.
+    # Coincident probes tell nothing about the distance of the others.
     return place, max(0.5 * float(np.median(nearest[nearest > 0])), _SMALLEST_RADIUS * spread)
 
 
@@ -187,15 +187,15 @@ def _encode(linear: np.ndarray) -> np.ndarray:
 
 
 def _camera(points: np.ndarray, up: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Towards the eye, upwards in the picture, the middle of what is seen, and its half width and half height."""
+    """Towards the eye, upwards in the picture, the middle of the points, and their half width and half height."""
     x, y, z = _VIEW
     eye = np.array([x, y, z] if up == "y" else [x, -z, y])
     eye /= np.linalg.norm(eye)
     above = np.array([0.0, 1.0, 0.0] if up == "y" else [0.0, 0.0, 1.0])
     above -= (above @ eye) * eye
     above /= np.linalg.norm(above)
-    seen = points @ np.stack([np.cross(above, eye), above], axis=1)
-    low, high = seen.min(0), seen.max(0)
+    plane = points @ np.stack([np.cross(above, eye), above], axis=1)
+    low, high = plane.min(0), plane.max(0)
     middle = 0.5 * (low + high)
     return eye, above, middle[0] * np.cross(above, eye) + middle[1] * above, 0.5 * (high - low)
 
@@ -207,7 +207,7 @@ def _render(pyvista, mesh, points, pictures, titles, up, width) -> np.ndarray:
     panel = width / len(pictures)
     aspect = min(max(half[1] / half[0], 1 / _LARGEST_ASPECT), _LARGEST_ASPECT)
     tall = round(panel * aspect)
-    # Half the height of a panel in the mesh's unit; the strip of the title lies above what is to be seen.
+    # Half the height of a panel in the mesh's unit; the strip of the title lies above the spheres.
     reach = _MARGIN * max(half[1], half[0] * tall / panel)
     strip = reach * _TITLE_PIXELS / tall
     focus = middle + strip * above

@@ -309,7 +309,7 @@ def frame_volume_at(volume: wp.array3d[wp.vec4], n: int, y: int, x: int) -> wp.v
     return (1.0 - fy) * top + fy * bottom
 
 
-STRIP_BOUNDS = (128, 3)  # threads of a block, blocks of a multiprocessor: 168 registers a thread, no spills
+STRIP_BOUNDS = (128, 3)  # threads of a block, blocks of a multiprocessor: 168 registers per thread, no spills
 
 
 @functools.cache

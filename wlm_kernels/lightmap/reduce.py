@@ -1,14 +1,14 @@
 """Sums over a CUDA block of samples, in native code: see ``native/block_sums.cuh``, and why there.
 
-Read first: ``tests/reference/network.py``, whose gradients by autograd these sums are.
+Read first: ``tests/reference/temporal.py``, ``losses``, whose gradients by autograd these sums are.
 """
 
-from pathlib import Path
 from typing import Any
 
 import warp as wp
 
 from wlm_kernels import mlp
+from wlm_kernels.native import native_source
 
 __all__ = ["BLOCK", "block_reduction", "reload"]
 
@@ -57,11 +57,9 @@ def block_reduction(net: mlp.MlpKernels) -> Any:
         "B3": sizes[4] // 4,
         "ACROSS": across,
     }
-    text = (Path(__file__).parent / "native" / "block_sums.cuh").read_text(encoding="utf-8")
-    snippet = "".join(f"constexpr int {name} = {value};\n" for name, value in constants.items()) + text
     vec_in, vec_hidden = net.vec_in, net.vec_hidden
 
-    @wp.func_native(snippet)
+    @wp.func_native(native_source(__package__, "block_sums", **constants))
     def reduce(
         f: vec_in,
         h1: vec_hidden,

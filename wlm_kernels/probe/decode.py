@@ -23,18 +23,16 @@ __all__ = ["DecodeKernels", "decode_kernels"]
 
 @dataclass(frozen=True)
 class DecodeKernels:
-    """The decode of one network shape on one kind of device."""
+    """The decode of one network shape on one kind of device.
 
-    latent: int
-    hidden: int
-    outputs: int
+    Attributes:
+        device_kind: "cpu" or "cuda".
+        points: Points that a block of threads takes on CUDA.
+    """
+
     device_kind: str
     points: int
     _kernel: Any
-
-    def load(self, device) -> None:
-        """Compiles it for a device now."""
-        self._kernel.module.load(wp.get_device(device))
 
     def launch(self, rows, shapes, cubes, cut, net, gain, x, out) -> None:
         """Decodes points.
@@ -138,12 +136,12 @@ def decode_kernels(latent: int, hidden: int, outputs: int, device_kind: str) -> 
             for c in range(wp.static(outputs)):
                 out[i, c] = gain * y[c]
 
-    return DecodeKernels(latent, hidden, outputs, device_kind, points, kernel)
+    return DecodeKernels(device_kind, points, kernel)
 
 
 def _finish(latent: int, hidden: int, outputs: int, points: int, vec_latent):
     """The network of a block of points, from the parts of their sums."""
-    snippet = f"\n    {layer_code(latent, hidden, outputs, points)}{native_source(__package__, 'decode')}"
+    snippet = layer_code(latent, hidden, outputs, points) + native_source(__package__, "decode")
 
     @wp.func_native(snippet)
     def finish(

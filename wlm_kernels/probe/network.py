@@ -48,17 +48,8 @@ def probes_at_once(latent: int, hidden: int, outputs: int) -> int:
 
 def layer_code(latent: int, hidden: int, outputs: int, probes: int) -> str:
     """CUDA code for the forward pass of a block of ``THREADS`` threads: the beginning of a body, see its file."""
-    return native_source(
-        __package__,
-        "layers",
-        latent=latent,
-        inputs=latent + 3,
-        hidden=hidden,
-        outputs=outputs,
-        padded=padded(outputs),
-        threads=THREADS,
-        probes=probes,
-    )
+    sizes = {"L": latent, "H": hidden, "D": outputs, "DP": padded(outputs)}
+    return native_source(__package__, "layers", **sizes, P=probes, T=THREADS)
 
 
 @dataclass(frozen=True)
@@ -134,7 +125,7 @@ def network_kernels(latent: int, hidden: int, outputs: int, device_kind: str) ->
     """
     options = {"enable_backward": False}
     probes = probes_at_once(latent, hidden, outputs)
-    snippet = f"\n    {layer_code(latent, hidden, outputs, probes)}{native_source(__package__, 'network')}"
+    snippet = layer_code(latent, hidden, outputs, probes) + native_source(__package__, "network")
     if device_kind == "cuda":
 
         @wp.func_native(snippet)

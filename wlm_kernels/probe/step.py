@@ -162,7 +162,6 @@ def touch(groups, shapes, by_group, by_gaussian) -> None:
 class StepKernels:
     """The launches of one latent length on one kind of device."""
 
-    latent: int
     device_kind: str
     _shapes: Any
     _features: Any
@@ -413,12 +412,12 @@ def step_kernels(latent: int, device_kind: str) -> StepKernels:
             for c in range(wp.static(SHAPE_NUMBERS + latent)):
                 sums[k, c] = s[c]
 
-    return StepKernels(latent, device_kind, shapes_kernel, features, collect, update_kernel(latent))
+    return StepKernels(device_kind, shapes_kernel, features, collect, update_kernel(latent))
 
 
 def _block_sum(vec_sums, numbers: int):
     """The sum of a vector over a CUDA block, in a fixed order, into row k of an array."""
-    @wp.func_native(native_source(__package__, "block_sum", numbers=numbers, warps=_COLLECTORS // 32))
+    @wp.func_native(native_source(__package__, "block_sum", N=numbers, WARPS=_COLLECTORS // 32))
     def block_sum(v: vec_sums, k: int, out: wp.array2d[float]): ...
 
     return block_sum

@@ -2,7 +2,7 @@
 
 ``wlm_kernels.raster.rasterize`` defines barycentrics. Visibility is a constant to all gradients.
 
-Read ``tests/reference/raster.py`` first (``weights``): barycentrics in float64 torch, differentiated by autograd.
+Read ``wlm/ops/plain.py`` first (``corner_weights``): barycentrics in torch, differentiated by autograd.
 """
 
 import warp as wp

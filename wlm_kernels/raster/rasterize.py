@@ -18,8 +18,8 @@ space, glTF's, v points down, the centre is u = (i + 1/2) / W, v = (j + 1/2) / H
 
 A triangle covers nothing if a corner isn't finite or doesn't exist, or if it has no area.
 
-Edge functions are in ``edges``; interpolation and backward passes in ``gradient``. Read ``tests/reference/raster.py``
-first: the same by solving for the corners' weights at each pixel.
+Edge functions are in ``edges``; interpolation and backward passes in ``gradient``. Read ``wlm/ops/plain.py`` first
+(``rasterize``): the same by solving for the corners' weights at each pixel.
 """
 
 import math

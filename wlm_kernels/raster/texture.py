@@ -14,7 +14,7 @@ coordinate that is NaN, or infinite and not clamped, reads NaN; it has no gradie
 ``axis_at``, ``read``, ``read_slope`` and ``add`` serve other kernels that read textures; one ``Axis`` for u and one for
 v serve all channels, forward and backward.
 
-Read ``tests/reference/texture.py`` first: the same by torch's ``grid_sample`` in float64.
+Read ``wlm/ops/plain.py`` first (``texture``): the same by torch's ``grid_sample``.
 """
 
 import warp as wp

@@ -1,10 +1,11 @@
 """How smoke moves across the image: what is seen along a ray, and how far the air carried it between two frames.
 
-Units, sampling and cameras are those of ``marching``. What a ray sees of a step is what the step keeps of the light,
+Units, sampling and cameras are those of ``march``. What a ray sees of a step is what the step keeps of the light,
 T (1 - exp(-sigma h)): hidden smoke counts as little as it is seen. The air's velocities lie on a grid of their own over
-the same box, as ``advection`` has them: trilinear between cell centres, constant beyond the outermost. Smoke is traced
-back by the midpoint, as the solver carries it; the velocities are taken to be those of the later frame all the while.
-What came into the box since counts as having been where smoke at its border looks the same.
+the same box, as ``wlm_kernels.fluid.advection`` has them: trilinear between cell centres, constant beyond the
+outermost. Smoke is traced back by the midpoint rule, as the solver carries it; the velocities are taken to be those of
+the later frame all the while. Smoke that came into the box since counts as having been where smoke at its border looks
+the same. Read first: ``_loop`` of ``tests/smoke/test_motion.py``, the same in float64, pixel by pixel.
 """
 
 import functools
@@ -12,7 +13,19 @@ from typing import Any
 
 import warp as wp
 
-from wlm_kernels.smoke.march import Empty, View, absorbed, occupied, ray, size_of, skipping_at, steps_along
+from wlm_kernels.smoke.march import (
+    Empty,
+    MarchParameters,
+    View,
+    absorbed,
+    marched_ray,
+    occupied,
+    parameters,
+    point_on,
+    sample,
+    size_of,
+)
+from wlm_kernels.smoke.settings import March
 
 __all__ = ["motion", "motion_kernel"]
 
@@ -20,6 +33,7 @@ _OPTIONS = {"enable_backward": False}
 
 # Voxels from the box's faces: nearer to them a picture of the smoke fades.
 _BORDER = wp.constant(1.0)
+_CLEAR = wp.constant(1e-3)  # the opacity up to which a pixel counts as one without smoke
 
 
 @wp.func
@@ -59,39 +73,36 @@ def motion_kernel(dtype: Any) -> wp.Kernel:
         velocity: wp.array3d[wp.vec3],
         reach: float,
         view: View,
-        h: float,
-        cutoff: float,
-        least: float,
+        march: MarchParameters,
         # out:
         out: wp.array3d[float],
     ):
         row, column = wp.tid()
-        r = ray(view, row, column)
         size = size_of(density)
+        r = marched_ray(view, row, column, size, march.step)
         cells = wp.vec3(float(velocity.shape[0]), float(velocity.shape[1]), float(velocity.shape[2]))
         share = wp.cw_div(cells, size)
         border = wp.vec3(_BORDER, _BORDER, _BORDER)
-        steps = steps_along(size, r.origin, r.direction, h)
         moved = wp.vec3()
-        seen = float(0.0)
+        opacity = float(0.0)
         t = float(1.0)
-        for n in range(steps.count):
-            p = r.origin + (steps.first + (float(n) + 0.5) * steps.length) * r.direction
-            x = extinction * skipping_at(density, bricks, p) * steps.length
+        for n in range(r.count):
+            p = point_on(r, n, 0.5)
+            x = extinction * sample(density, bricks, p) * r.length
             if x > 0.0:
                 middle = p - 0.5 * reach * _velocity_at(velocity, wp.cw_mul(share, p))
                 weight = t * absorbed(x)
                 begin = p - reach * _velocity_at(velocity, wp.cw_mul(share, middle))
                 begin = wp.min(wp.max(begin, wp.min(p, border)), wp.max(p, size - border))
                 moved += weight * (p - begin)
-                seen += weight
+                opacity += weight
                 t *= wp.exp(-x)
-                if t < cutoff:
+                if t < march.cutoff:
                     break
         across = float(0.0)
         down = float(0.0)
-        if seen > least:
-            scale = 1.0 / (seen * view.pitch)
+        if opacity > _CLEAR:
+            scale = 1.0 / (opacity * view.pitch)
             across = scale * wp.dot(moved, view.right)
             down = -scale * wp.dot(moved, view.up)
         out[0, row, column] = across
@@ -101,16 +112,13 @@ def motion_kernel(dtype: Any) -> wp.Kernel:
 
 
 def motion(
-    density,
+    density: wp.array,
     extinction: float,
-    velocity,
+    velocity: wp.array,
     reach: float,
-    seen: View,
-    out,
-    *,
-    step: float = 2.0,
-    cutoff: float = 1e-3,
-    least: float = 1e-3,
+    view: View,
+    march: March,
+    out: wp.array,
     empty: Empty | None = None,
 ) -> None:
     """By how many pixels what each pixel shows has moved since the frame before.
@@ -120,17 +128,15 @@ def motion(
         extinction: Per voxel, of density 1.
         velocity: vec3 [A, B, C], of the air over the same box, of any number of cells.
         reach: Voxels that a velocity of 1 goes between the frames.
-        seen: An orthographic camera, [H, W] pixels, the same for both frames.
+        view: An orthographic camera, [H, W] pixels, the same for both frames.
+        march: Its step and cutoff; samples lie in their steps' middles.
         out: float [2, H, W], written: pixels to the right and down; 0 where there is no smoke.
-        step: The longest step, in voxels.
-        cutoff: A ray ends where less than this is left of its transparency.
-        least: The opacity up to which a pixel counts as one without smoke.
-        empty: As for ``marching.occupied``.
+        empty: As for ``march.occupied``.
 
     Raises:
         ValueError: The camera is in perspective.
     """
-    if seen.perspective:
+    if view.perspective:
         raise ValueError("motion needs an orthographic camera, as the lightmaps do")
-    inputs = [density, occupied(density, empty), extinction, velocity, reach, seen, step, cutoff, least]
+    inputs = [density, occupied(density, empty), extinction, velocity, reach, view, parameters(march)]
     wp.launch(motion_kernel(density.dtype), out.shape[1:], inputs=inputs, outputs=[out], device=density.device)

@@ -1,16 +1,18 @@
 """Six-way lightmaps without noise: single scattering in a grid of density (neural-six-way-lightmaps, eq. 1 to 4).
 
-One bounce needs no random paths: it is an integral along the pixel's ray of what the light leaves there, itself an
-integral. For an orthographic camera, whose axes the six lights follow, neither is marched for each other. The rays'
+One bounce needs no random paths: it is an integral along the pixel's ray of the light that arrives there, itself an
+integral. For an orthographic camera, whose axes the six lights follow, no sample has to march to its lights. The rays'
 samples at one depth make a plane of pixels in which the light from the right comes along the rows and that from the
 top along the columns, so that the optical depths of a whole row are one running sum. The light from the front and
 the back comes along the ray itself, where it is integrated in closed form.
 
-The planes are worked off in slabs of as many as the buffers hold. Units and sampling are those of ``marching``.
+The planes are worked off in slabs of as many as the buffers hold. Units and sampling are those of ``march``.
+Read first: ``six_way`` of ``tests/reference/marching.py``, the same samples with nothing shared.
 """
 
 import functools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,19 +20,23 @@ import warp as wp
 
 from wlm_kernels.smoke.march import (
     Empty,
+    MarchParameters,
     View,
     absorbed,
     clip,
     density_at,
+    marched_ray,
     occupied,
     optical_depth,
+    parameters,
     phase,
+    point_on,
     ray,
+    sample,
     size_of,
-    skipping_at,
-    steps_along,
     warp_memory,
 )
+from wlm_kernels.smoke.settings import March
 
 __all__ = ["EMISSION", "TRANSPARENCY", "lit", "six_kernels", "six_way"]
 
@@ -43,14 +49,36 @@ EMISSION = 7
 _SLAB_BYTES = 2**28  # of the four optical depths of a slab
 
 
+@wp.struct
+class _Slab:
+    """Planes of samples across the view, ``gap`` apart; sample n lies at distance ``start + (n + 1/2) gap``."""
+
+    start: float
+    gap: float
+    planes: int
+
+
+@wp.struct
+class _Depths:
+    """Optical depths of a slab's samples to each light, [planes, H, W], and of the rays before and behind the camera's
+    plane, [H, W]."""
+
+    right: wp.array3d[float]
+    left: wp.array3d[float]
+    top: wp.array3d[float]
+    bottom: wp.array3d[float]
+    behind: wp.array2d[float]
+    ahead: wp.array2d[float]
+
+
 @dataclass(frozen=True)
 class _Kernels:
     """Of one type of density."""
 
-    column: Any
-    sweep: Any
-    gather: Any
-    lit: Any
+    column: wp.Kernel
+    sweep: wp.Kernel
+    gather: wp.Kernel
+    lit: wp.Kernel
 
 
 @functools.cache
@@ -64,9 +92,7 @@ def six_kernels(dtype: Any) -> _Kernels:
         bricks: wp.array3d[wp.uint8],
         extinction: float,
         view: View,
-        start: float,
-        dz: float,
-        planes: int,
+        slab: _Slab,
         # out:
         tau: wp.array2d[float],
     ):
@@ -74,10 +100,10 @@ def six_kernels(dtype: Any) -> _Kernels:
         r = ray(view, row, col)
         span = clip(size_of(density), r.origin, r.direction)
         total = float(0.0)
-        for n in range(planes):
-            s = start + (float(n) + 0.5) * dz
+        for n in range(slab.planes):
+            s = slab.start + (float(n) + 0.5) * slab.gap
             if s > span[0] and s < span[1]:
-                total += extinction * skipping_at(density, bricks, r.origin + s * r.direction) * dz
+                total += extinction * sample(density, bricks, r.origin + s * r.direction) * slab.gap
         tau[row, col] = total
 
     @wp.kernel(module="unique", module_options=_OPTIONS)
@@ -87,16 +113,15 @@ def six_kernels(dtype: Any) -> _Kernels:
         bricks: wp.array3d[wp.uint8],
         extinction: float,
         view: View,
-        start: float,
-        dz: float,
+        slab: _Slab,
         along: int,
         parts: int,
         # out:
         tau: wp.array3d[float],
     ):
-        """Optical depths to a side: along 0 right, 1 left, 2 top, 3 bottom; a thread a row or column of a plane."""
+        """Optical depths to a side: along 0 right, 1 left, 2 top, 3 bottom; one row or column of a plane per thread."""
         plane, line = wp.tid()
-        s = start + (float(plane) + 0.5) * dz
+        s = slab.start + (float(plane) + 0.5) * slab.gap
         u = (float(line) + 0.5 - 0.5 * float(view.width)) * view.pitch
         v = (0.5 * float(view.height) - float(line) - 0.5) * view.pitch
         base = view.origin + s * view.forward
@@ -122,7 +147,7 @@ def six_kernels(dtype: Any) -> _Kernels:
             for n in range(inside):
                 d = top + (float(steps - n) - 0.5) * dt
                 if d > span[0] and d < span[1]:
-                    total += extinction * skipping_at(density, bricks, base + d * toward) * dt
+                    total += extinction * sample(density, bricks, base + d * toward) * dt
         for k in range(count):
             if k > 0:
                 middle = top - (float(k) - 0.5) * view.pitch
@@ -130,7 +155,7 @@ def six_kernels(dtype: Any) -> _Kernels:
                     for n in range(parts):
                         d = middle + (0.5 - (float(n) + 0.5) / float(parts)) * view.pitch
                         if d > span[0] and d < span[1]:
-                            total += extinction * skipping_at(density, bricks, base + d * toward) * dt
+                            total += extinction * sample(density, bricks, base + d * toward) * dt
             if along == 0:
                 tau[plane, line, count - 1 - k] = total
             elif along == 1:
@@ -149,16 +174,9 @@ def six_kernels(dtype: Any) -> _Kernels:
         extinction: float,
         emission: float,
         view: View,
-        start: float,
-        dz: float,
-        planes: int,
-        g: float,
-        right: wp.array3d[float],
-        left: wp.array3d[float],
-        top: wp.array3d[float],
-        bottom: wp.array3d[float],
-        behind: wp.array2d[float],
-        ahead: wp.array2d[float],
+        slab: _Slab,
+        march: MarchParameters,
+        depths: _Depths,
         # in and out:
         passed: wp.array2d[float],
         out: wp.array3d[float],
@@ -167,17 +185,17 @@ def six_kernels(dtype: Any) -> _Kernels:
         r = ray(view, row, col)
         size = size_of(density)
         span = clip(size, r.origin, r.direction)
-        side = phase(g, 0.0)
-        front = phase(g, -1.0) * wp.exp(-behind[row, col])
-        back = phase(g, 1.0) * wp.exp(-ahead[row, col])
+        side = phase(march.g, 0.0)
+        front = phase(march.g, -1.0) * wp.exp(-depths.behind[row, col])
+        back = phase(march.g, 1.0) * wp.exp(-depths.ahead[row, col])
         tau = passed[row, col]
         a = wp.vec4()
         b = wp.vec3()
-        for n in range(planes):
-            s = start + (float(n) + 0.5) * dz
+        for n in range(slab.planes):
+            s = slab.start + (float(n) + 0.5) * slab.gap
             if s > span[0] and s < span[1]:
                 p = r.origin + s * r.direction
-                x = extinction * skipping_at(density, bricks, p) * dz
+                x = extinction * sample(density, bricks, p) * slab.gap
                 t = wp.exp(-tau)
                 share = t * absorbed(x)
                 if x > 0.0:
@@ -185,16 +203,17 @@ def six_kernels(dtype: Any) -> _Kernels:
                         share
                         * side
                         * wp.vec4(
-                            wp.exp(-right[n, row, col]),
-                            wp.exp(-left[n, row, col]),
-                            wp.exp(-top[n, row, col]),
-                            wp.exp(-bottom[n, row, col]),
+                            wp.exp(-depths.right[n, row, col]),
+                            wp.exp(-depths.left[n, row, col]),
+                            wp.exp(-depths.top[n, row, col]),
+                            wp.exp(-depths.bottom[n, row, col]),
                         )
                     )
-                    # sigma exp(-2 sigma s) over the step; and to the back, where T and the light's even out, sigma.
+                    # The integral of sigma exp(-2 sigma s) over the step; for the back that of sigma alone, since the
+                    # ways to the camera and to the light make up the whole ray.
                     b += wp.vec3(front * t * t * 0.5 * absorbed(2.0 * x), back * x, 0.0)
                 if emission > 0.0:
-                    hot = emission * density_at(temperature, p) * dz
+                    hot = emission * density_at(temperature, p) * slab.gap
                     if x > 0.0:
                         b += wp.vec3(0.0, 0.0, hot * share / x)
                     else:
@@ -216,24 +235,22 @@ def six_kernels(dtype: Any) -> _Kernels:
         extinction: float,
         view: View,
         toward: wp.vec3,
-        h: float,
-        g: float,
+        march: MarchParameters,
         # out:
         out: wp.array2d[float],
     ):
         row, col = wp.tid()
-        r = ray(view, row, col)
-        steps = steps_along(size_of(density), r.origin, r.direction, h)
+        r = marched_ray(view, row, col, size_of(density), march.step)
         light = float(0.0)
         tau = float(0.0)
-        for n in range(steps.count):
-            p = r.origin + (steps.first + (float(n) + 0.5) * steps.length) * r.direction
-            x = extinction * skipping_at(density, bricks, p) * steps.length
+        for n in range(r.count):
+            p = point_on(r, n, 0.5)
+            x = extinction * sample(density, bricks, p) * r.length
             if x > 0.0:
-                other = optical_depth(density, bricks, p, toward, extinction, h)
-                light += wp.exp(-tau - other) * absorbed(x)
+                shadow = optical_depth(density, bricks, p, toward, extinction, march.step)
+                light += wp.exp(-tau - shadow) * absorbed(x)
                 tau += x
-        out[row, col] = light * phase(g, wp.dot(toward, r.direction))
+        out[row, col] = light * phase(march.g, wp.dot(toward, r.direction))
 
     return _Kernels(column, sweep, gather, lit)
 
@@ -246,14 +263,13 @@ def _extent(shape, origin, direction) -> tuple[float, float]:
 
 
 def six_way(
-    density,
+    density: wp.array,
     extinction: float,
-    seen: View,
-    out,
+    view: View,
+    march: March,
+    out: wp.array,
     *,
-    step: float = 0.5,
-    g: float = 0.0,
-    temperature=None,
+    temperature: wp.array | None = None,
     emission: float = 0.0,
     empty: Empty | None = None,
 ) -> None:
@@ -265,69 +281,75 @@ def six_way(
     Args:
         density: float or half [X, Y, Z].
         extinction: Per voxel, of density 1.
-        seen: An orthographic camera, [H, W] pixels. Pixel centres alone are looked at.
+        view: An orthographic camera, [H, W] pixels. Pixel centres alone are looked at.
+        march: Its step, along rays and to the lights, and g; samples lie in their steps' middles. The error falls with
+            the step's square where the density is smooth.
         out: float [8, H, W], written: the light that reaches the camera from smoke lit from the right, left, top,
             bottom, front and back, each light of irradiance 4 pi; the transparency; the emission.
-        step: The longest step, in voxels, along rays and to the lights. The error falls with its square where the
-            density is smooth.
-        g: Henyey and Greenstein's mean cosine, within -1 and 1.
         temperature: As the density, of its shape; None: nothing emits.
         emission: Light given off per voxel of way where the temperature is 1.
-        empty: As for ``marching.occupied``.
+        empty: As for ``march.occupied``.
 
     Raises:
         ValueError: The camera is in perspective.
     """
-    if seen.perspective:
+    if view.perspective:
         raise ValueError("six-way lightmaps need an orthographic camera: their lights follow its axes")
     device = density.device
-    height, width = seen.height, seen.width
+    height, width = view.height, view.width
     kernels = six_kernels(density.dtype)
     empty = empty or warp_memory(device)
     bricks = occupied(density, empty)
     out.zero_()
-    near, far = _extent(density.shape, seen.origin, seen.forward)
+    near, far = _extent(density.shape, view.origin, view.forward)
     start = max(near, 0.0)
     behind, ahead, passed = (empty((height, width), float) for _ in range(3))
     for plane in (behind, ahead, passed):
         plane.zero_()
-    common = [density, bricks, extinction, seen]
+    common = [density, bricks, extinction, view]
 
-    def columns(first: float, last: float, tau) -> tuple[float, int]:
-        planes = max(math.ceil((last - first) / step), 0)
-        dz = (last - first) / max(planes, 1)
-        inputs = [*common, first, dz, planes]
+    def column(first: float, last: float, tau: wp.array) -> tuple[float, int]:
+        planes = max(math.ceil((last - first) / march.step), 0)
+        gap = (last - first) / max(planes, 1)
+        inputs = [*common, _slab(first, gap, planes)]
         wp.launch(kernels.column, (height, width), inputs=inputs, outputs=[tau], device=device)
-        return dz, planes
+        return gap, planes
 
-    columns(near, min(far, 0.0), behind)
-    dz, planes = columns(start, far, ahead)
-    parts = max(1, math.ceil(seen.pitch / step))
-    slab = max(1, min(planes, _SLAB_BYTES // (16 * height * width)))
-    sides = [empty((slab, height, width), float) for _ in range(4)]
+    column(near, min(far, 0.0), behind)
+    gap, planes = column(start, far, ahead)
+    parts = max(1, math.ceil(view.pitch / march.step))
+    capacity = max(1, min(planes, _SLAB_BYTES // (16 * height * width)))
+    depths = _Depths()
+    sides = [empty((capacity, height, width), float) for _ in range(4)]
+    depths.right, depths.left, depths.top, depths.bottom = sides
+    depths.behind, depths.ahead = behind, ahead
     hot = density if temperature is None else temperature
-    given = 0.0 if temperature is None else emission
+    emission = 0.0 if temperature is None else emission
     # Once even without a plane, for the transparency.
-    for first in range(0, max(planes, 1), slab):
-        count = min(slab, planes - first)
-        at = start + first * dz
+    for first in range(0, max(planes, 1), capacity):
+        count = min(capacity, planes - first)
+        slab = _slab(start + first * gap, gap, count)
         for along, tau in enumerate(sides):
             lines = height if along < 2 else width
-            inputs = [*common, at, dz, along, parts]
+            inputs = [*common, slab, along, parts]
             wp.launch(kernels.sweep, (count, lines), inputs=inputs, outputs=[tau], device=device)
-        inputs = [density, hot, bricks, extinction, given, seen, at, dz, count, g, *sides, behind, ahead]
+        inputs = [density, hot, bricks, extinction, emission, view, slab, parameters(march), depths]
         wp.launch(kernels.gather, (height, width), inputs=inputs, outputs=[passed, out], device=device)
 
 
+def _slab(start: float, gap: float, planes: int) -> _Slab:
+    slab = _Slab()
+    slab.start, slab.gap, slab.planes = start, gap, planes
+    return slab
+
+
 def lit(
-    density,
+    density: wp.array,
     extinction: float,
-    seen: View,
-    toward,
-    out,
-    *,
-    step: float = 0.5,
-    g: float = 0.0,
+    view: View,
+    toward: Sequence[float],
+    march: March,
+    out: wp.array,
     empty: Empty | None = None,
 ) -> None:
     """Smoke under one light from any direction: every sample of a ray marches to it, with nothing shared.
@@ -337,12 +359,11 @@ def lit(
     Args:
         density: float or half [X, Y, Z].
         extinction: Per voxel, of density 1.
-        seen: The camera, [H, W] pixels.
-        toward: Three numbers, the direction to the light, of length 1; its irradiance is 4 pi.
+        view: The camera, [H, W] pixels.
+        toward: The direction to the light, of length 1; its irradiance is 4 pi.
+        march: Its step, along rays and to the light, and g; samples lie in their steps' middles.
         out: float [H, W], written.
-        step: The longest step, in voxels, along rays and to the light.
-        g: Henyey and Greenstein's mean cosine, within -1 and 1.
-        empty: As for ``marching.occupied``.
+        empty: As for ``march.occupied``.
     """
-    inputs = [density, occupied(density, empty), extinction, seen, wp.vec3(*map(float, toward)), step, g]
+    inputs = [density, occupied(density, empty), extinction, view, wp.vec3(*map(float, toward)), parameters(march)]
     wp.launch(six_kernels(density.dtype).lit, out.shape, inputs=inputs, outputs=[out], device=density.device)

@@ -1,7 +1,8 @@
-"""What a NAFBlock does besides matrix products, for one image whose pixels lie as rows of channels.
+"""The parts of a NAFBlock besides its matrix products, for one image whose pixels lie as rows of channels.
 
-``kernels`` builds and caches them for a number type and for what a thread does; sums are float32 whatever the type is.
-Nothing has a gradient: training is torch's.
+``kernels`` builds and caches them for a number of channels and a number type; sums are float32 whatever the type is.
+Nothing has a gradient: training is torch's. Read first: ``NafBlock`` of ``wlm/smoke/model.py``, the whole block in
+torch.
 """
 
 import functools
@@ -13,7 +14,7 @@ import warp as wp
 __all__ = ["STRIP", "NafKernels", "kernels", "lane_sum", "lanes"]
 
 STRIP = 4
-"""Pixels below each other that a thread of ``gate`` makes."""
+"""Pixels below each other that one thread of ``gate`` computes."""
 
 _EPSILON = 1e-6
 _WARP = 32
@@ -39,8 +40,8 @@ def lanes(channels: int, cuda: bool) -> int:
     """Threads that share a row of channels: a power of 2 up to a warp on a GPU, 1 on a CPU."""
     if not cuda:
         return 1
-    wanted = -(-channels // _PER_LANE)
-    return min(_WARP, 1 << (wanted - 1).bit_length())
+    count = -(-channels // _PER_LANE)
+    return min(_WARP, 1 << (count - 1).bit_length())
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,7 @@ class NafKernels:
         gate: [ceil(H / STRIP), W, C]: a 3 x 3 convolution of each channel by itself, with zeros outside; then the
             product of the first half of the channels with the second. In: x T [H, W, 2 C], weights float [9, 2 C],
             biases float [2 C]. Out: T [H, W, C].
-        attend: [G c L]: weights of a product times what channel attention makes of the means. In: means float [G c],
+        attend: [G c L]: weights of a product times the factors of the channel attention. In: means float [G c],
             weights float [G, c, c] and biases float [G, c] of the attention, weights float [G, c, c], from input to
             output. Out: T [G, c, c].
     """
@@ -65,7 +66,7 @@ class NafKernels:
 
 @functools.cache
 def kernels(channels: int, half: bool, cuda: bool) -> NafKernels:
-    """The kernels for rows of so many channels, of half floats or float32, for a GPU or a CPU."""
+    """Builds (once) the kernels for rows of so many channels, of half floats or float32, for a GPU or a CPU."""
     number: Any = wp.float16 if half else wp.float32
     count = lanes(channels, cuda)
     each = -(-channels // count)
@@ -116,8 +117,8 @@ def kernels(channels: int, half: bool, cuda: bool) -> NafKernels:
         strip, column, c = wp.tid()
         row = strip * wp.static(STRIP)
         d = c + out.shape[2]
-        one = wp.vec4(bias[c])
-        other = wp.vec4(bias[d])
+        left = wp.vec4(bias[c])
+        right = wp.vec4(bias[d])
         for j in range(3):
             q = column + j - 1
             across = float(q >= 0 and q < x.shape[1])
@@ -131,11 +132,11 @@ def kernels(channels: int, half: bool, cuda: bool) -> NafKernels:
                 b = inside * float(x[r, q, d])
                 for k in range(wp.static(STRIP)):
                     if i - k >= 0 and i - k < 3:
-                        one[k] = one[k] + weight[3 * (i - k) + j, c] * a
-                        other[k] = other[k] + weight[3 * (i - k) + j, d] * b
+                        left[k] = left[k] + weight[3 * (i - k) + j, c] * a
+                        right[k] = right[k] + weight[3 * (i - k) + j, d] * b
         for k in range(wp.static(STRIP)):
             if row + k < out.shape[0]:
-                out[row + k, column, c] = number(one[k] * other[k])
+                out[row + k, column, c] = number(left[k] * right[k])
 
     @wp.kernel(enable_backward=False, module="unique")
     def attend(

@@ -1,9 +1,11 @@
 """Planes of six lights before the network and behind it: the guide that it reads, and the lightmaps that it makes.
 
-Each is a pass over the image in place of some tens of small ones. ``encode_six`` makes the guide of what the coarse
-march finds, ``decode`` light of the planes that the network makes. ``kernels`` builds and caches, for a number type,
-what makes these planes of the outputs of the network's heads and of a filter of the guide, where smoke is near; sums
-are float32 whatever the type is. Nothing has a gradient: training is torch's.
+Each is one pass over the image in place of some tens of small ones. ``encode_six`` turns the coarse march's planes into
+the guide, ``decode`` the network's planes into light. ``kernels`` builds and caches, for a number type, the kernels
+that add the outputs of the network's heads and a filter of the guide, where smoke is near; sums are float32 whatever
+the type is. Nothing has a gradient: training is torch's.
+Read first: ``encode_guide``, ``encode_lightmaps`` and ``decode_lightmaps`` of ``wlm/smoke/planes.py`` for the
+encodings, and ``_wanted`` of ``tests/kernels/test_six_planes.py``, which is ``compose`` in a few lines of torch.
 """
 
 import functools
@@ -32,10 +34,10 @@ LIGHTS = 6
 """Planes of light, which come first; they may be above 1, the others may not."""
 
 PLANES = LIGHTS + 2
-"""That are made: the lights, opacity and emission."""
+"""Planes of the network's output: the lights, opacity and emission."""
 
 STRIP = 4
-"""Pixels below each other that a thread of ``compose`` makes."""
+"""Pixels below each other that one thread of ``compose`` computes."""
 
 Taps = wp.types.vector(PLANES, wp.float32)
 """What one pixel of one of the guide's planes adds to each plane."""
@@ -119,14 +121,14 @@ def _encode_six(
 
 
 def encode_six(planes: wp.array, near: float, far: float, hot: bool, out: wp.array) -> None:
-    """What the coarse march finds as the network reads it.
+    """The planes of the coarse march as the network reads them.
 
     Args:
-        planes: float [9, H, W], of `marching_coarse.PLANES`.
+        planes: float [9, H, W], of ``march_coarse.PLANES``.
         near, far: Distances at which the smoke begins and ends, near < far.
         hot: Whether the emission counts; otherwise it is 0.
-        out: float [9, H, W], is written: six lights in sRGB; emission e as e / (1 + e) in sRGB; opacity; depth as a
-            share of the span, 1 at its near end, 0 where none was found. A NaN stays one.
+        out: float [9, H, W], written: six lights in sRGB; emission e as e / (1 + e) in sRGB; opacity; depth as a
+            share of the span, 1 at its near end, 0 where there is no surface. A NaN stays one.
     """
     inputs = [planes, far, far - near, hot]
     wp.launch(_encode_six, planes.shape[1:], inputs=inputs, outputs=[out], device=planes.device)
@@ -150,11 +152,11 @@ def _decode(
 
 
 def decode(planes: wp.array, out: wp.array) -> None:
-    """Light of planes.
+    """Turns the network's planes into light.
 
     Args:
         planes: float [PLANES, H, W]: the lights and the emission e as e / (1 + e) in sRGB, the opacity before it.
-        out: float [PLANES, H, W], is written: six lights, transparency, emission up to the largest half float. What is
+        out: float [PLANES, H, W], written: six lights, transparency, emission up to the largest half float. What is
             outside a plane's range is clamped to it; a NaN stays one.
     """
     wp.launch(_decode, planes.shape[1:], inputs=[planes], outputs=[out], device=planes.device)
@@ -168,12 +170,12 @@ class PlaneKernels:
         lanes: L, threads of ``near`` that share a block.
         near: [blocks L], of reach x reach pixels: whether there is smoke in them. In: the guide. Out: int
             [ceil(H / reach), ceil(W / reach)], 0 or 1. A NaN is no smoke.
-        compose: [ceil(H / STRIP), W]: the planes, clamped to what each can be, and 0 where neither a block nor one of
+        compose: [ceil(H / STRIP), W]: the planes, clamped to each one's range, and 0 where neither a block nor one of
             its eight neighbours has smoke; elsewhere a NaN stays one. In: T [G, ceil(H / stem), ceil(W / stem), N] or
             larger, N outputs of heads from each of G groups; the guide; weights Taps [c edge edge] of a filter of its
-            first c planes, from column to row within each, aligned to 16 bytes, with zeros outside the image; of
+            first c planes, from column to row within each, aligned to 16 bytes, with zeros outside the image; for
             each plane the group and the first of its stem x stem outputs, int [PLANES, 2], or a group below 0 where
-            it isn't made and is 0; stem; ``near``. Out: float [PLANES, H, W].
+            the plane is left out and is 0; stem; ``near``. Out: float [PLANES, H, W].
     """
 
     lanes: int
@@ -183,7 +185,7 @@ class PlaneKernels:
 
 @functools.cache
 def kernels(edge: int, reach: int, half: bool, cuda: bool) -> PlaneKernels:
-    """The kernels for half floats or float32, on a GPU or a CPU.
+    """Builds (once) the kernels for half floats or float32, on a GPU or a CPU.
 
     Args:
         edge: Pixels along the edge of the filter, odd, at most 15.
@@ -192,7 +194,7 @@ def kernels(edge: int, reach: int, half: bool, cuda: bool) -> PlaneKernels:
         cuda: Whether for a GPU.
 
     Raises:
-        ValueError: An edge or a reach that isn't one of those.
+        ValueError: An edge or a reach out of its range.
     """
     if edge not in range(1, 16, 2):
         raise ValueError(f"edge: expected an odd number, at most 15, got {edge}")
@@ -218,16 +220,16 @@ def kernels(edge: int, reach: int, half: bool, cuda: bool) -> PlaneKernels:
         i = t // wp.static(count) // smoke.shape[1]
         j = t // wp.static(count) % smoke.shape[1]
         opacity = guide.shape[0] - 2
-        found = float(0.0)
+        pixels = float(0.0)
         for y in range(wp.static(reach)):
             # Past the image's end its last pixels again, which are of the same block.
             row = wp.min(i * wp.static(reach) + y, guide.shape[1] - 1)
             for x in range(wp.static(reach // count)):
                 column = wp.min(j * wp.static(reach) + x * wp.static(count) + lane, guide.shape[2] - 1)
-                found += float(float(guide[opacity, row, column]) > 0.0)
-        found = lane_sum(found, wp.static(count))
+                pixels += float(float(guide[opacity, row, column]) > 0.0)
+        pixels = lane_sum(pixels, wp.static(count))
         if lane == 0:
-            smoke[i, j] = int(found > 0.0)
+            smoke[i, j] = int(pixels > 0.0)
 
     @wp.kernel(module="unique", module_options=_OPTIONS, launch_bounds=_BOUNDS)
     def compose(
@@ -246,12 +248,12 @@ def kernels(edge: int, reach: int, half: bool, cuda: bool) -> PlaneKernels:
         # A block's rows are whole strips.
         i = row // wp.static(reach)
         j = column // wp.static(reach)
-        found = int(0)
+        blocks = int(0)
         for y in range(3):
             for x in range(3):
-                found += smoke[wp.clamp(i + y - 1, 0, smoke.shape[0] - 1), wp.clamp(j + x - 1, 0, smoke.shape[1] - 1)]
+                blocks += smoke[wp.clamp(i + y - 1, 0, smoke.shape[0] - 1), wp.clamp(j + x - 1, 0, smoke.shape[1] - 1)]
         total = sums()
-        if found > 0:
+        if blocks > 0:
             for c in range(weights.shape[0] // wp.static(edge * edge)):
                 for x in range(wp.static(edge)):
                     q = column + x - wp.static(middle)
@@ -273,11 +275,11 @@ def kernels(edge: int, reach: int, half: bool, cuda: bool) -> PlaneKernels:
             for y in range(wp.static(STRIP)):
                 r = row + y
                 if r < out.shape[1]:
-                    made = float(0.0)
-                    if found > 0 and group >= 0:
+                    value = float(0.0)
+                    if blocks > 0 and group >= 0:
                         place = places[k, 1] + (r % stem) * stem + column % stem
-                        made = _at_least_zero(total[y, k] + float(heads[group, r // stem, column // stem, place]))
-                        made = wp.where(k < wp.static(LIGHTS), made, _at_most_one(made))
-                    out[k, r, column] = made
+                        value = _at_least_zero(total[y, k] + float(heads[group, r // stem, column // stem, place]))
+                        value = wp.where(k < wp.static(LIGHTS), value, _at_most_one(value))
+                    out[k, r, column] = value
 
     return PlaneKernels(count, near, compose)

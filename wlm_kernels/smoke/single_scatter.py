@@ -266,8 +266,8 @@ def depths(density, toward, step: float, nodes) -> None:
         density: float [X, Y, Z], extinction per voxel, at least 0.
         toward: vec3 [L], the directions to the lights, of length 1.
         step: The longest step, in voxels.
-        nodes: float [L, A, B, C], written; ``march.nodes_along`` has the number of nodes, ``march.node_position`` their
-            places.
+        nodes: float [L, A, B, C], written; ``march_guide.nodes_along`` has the number of nodes,
+            ``march.node_position`` their places.
     """
     inputs = [density, toward, step * _SLACK]
     wp.launch(_depths, nodes.shape, inputs=inputs, outputs=[nodes], device=density.device)

@@ -1,54 +1,49 @@
-"""Scenes drawn at random, to learn from: jets, plumes and bursts past obstacles (neural-six-way-lightmaps, section 5).
+"""Random scenes: jets, plumes, flames and bursts past obstacles (neural-six-way-lightmaps, section 5).
 
-The paper has 14 jets past cylinders. A scene here is one of four kinds, in a box of 1 m whose fastest air is meant to
-go 1 m a second, so that a second is the time in which it would cross the box:
+The paper has 14 jets past cylinders. A scene here is one of four kinds, in a box of 1 m whose fastest air is to move at
+1 m/s, so that it crosses the box in a second:
 
 =======  =====================================================  ====================
 kind     smoke                                                  obstacles
 =======  =====================================================  ====================
-jet      one or two inlets in the bottom, sometimes in wind     1 to 3
-plume    a ball that goes on smoking, and its warm air rises    0 to 3
-flame    a jet that is hot, glows and cools                     0 to 2
-burst    one to three balls, hot for a moment, that glow        0 to 2
+jet      one or two inlets in the floor, sometimes in wind      1 to 3
+plume    a sphere that keeps emitting warm, rising smoke        0 to 3
+flame    a hot jet that glows and cools                         0 to 2
+burst    one to three spheres, hot for a moment, that glow      0 to 2
 =======  =====================================================  ====================
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from wlm.fluid.solver import LEAST_HALF_LOSS
-from wlm.smoke.scene import Air, Grid, Inlet, Obstacle, Scene, Smoke, Source
+from wlm.smoke.learn.settings import EDGE, LATTICE_SPEED, SPEED, DatasetSettings
+from wlm.smoke.scene import Air, Grid, Inlet, ObstacleSettings, Scene, Smoke, SourceSettings
 
-if TYPE_CHECKING:
-    from wlm.smoke.learn.dataset import DatasetSettings
+__all__ = ["Tilted", "draw_scene", "generator"]
 
-__all__ = ["EDGE", "LATTICE_SPEED", "SPEED", "Tilted", "draw_scene", "generator"]
-
-EDGE, SPEED, LATTICE_SPEED = 1.0, 1.0, 0.1
-"""The box's edge in metres; a speed in metres a second, and what it is in cells a step of the air."""
-
-# Of the air; at its low end the eddies are the model's, at its high end smoke is smooth.
+# Of the air, m^2/s: at the low end the eddies come from the turbulence model, at the high end the smoke is smooth.
 _VISCOSITY = (1.5e-5, 6e-4)
-_RADIUS = (0.055, 0.14)  # of inlets and balls, at least a cell of the coarsest grid
-_CYLINDERS, _BALLS = 0.65, 0.85  # shares of obstacles, running; the rest are boxes
-# No faster than a smoke's source itself, or it would sweep the box empty.
-_CROSSING = (0.9, 1.6)  # seconds in which a moving obstacle crosses the box
+_RADIUS = (0.055, 0.14)  # of inlets and spheres; at least a cell of the coarsest grid
+_CYLINDERS, _SPHERES = 0.65, 0.85  # cumulative shares of the obstacles' shapes; the rest are boxes
+# A moving obstacle is no faster than the smoke's source, or it would sweep the box empty.
+_CROSSING = (0.9, 1.6)  # seconds in which it crosses the box
 
 
-class Tilted(Obstacle):
-    """A body that is turned such that its y axis points along another.
+class Tilted(ObstacleSettings):
+    """An obstacle whose y axis is turned to another direction.
 
     Attributes:
-        axis: Direction, of any length but 0.
+        axis: The direction, of any length but 0.
     """
 
     axis: tuple[float, float, float] = (0.0, 1.0, 0.0)
 
     def mesh(self) -> tuple[np.ndarray, np.ndarray]:
-        """As `Obstacle.mesh`, turned."""
+        """As ``ObstacleSettings.mesh``, turned."""
         points, triangles = super().mesh()
         up = np.array(self.axis) / np.linalg.norm(self.axis)
         right = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
@@ -57,21 +52,21 @@ class Tilted(Obstacle):
 
 
 def generator(validation: bool, *numbers: int) -> np.random.Generator:
-    """Random numbers of what is numbered so; those of the validation are others whatever the numbers are."""
+    """The random generator of a sequence's part; validation and training never share one."""
     return np.random.default_rng([int(validation), *numbers])
 
 
 def draw_scene(settings: DatasetSettings, seed: int, index: int, *, validation: bool = False) -> Scene:
-    """Draws a scene; the same arguments give the same.
+    """Draws a scene; the same arguments give the same scene.
 
     Args:
-        settings: Grids, the time between frames, the shares of kinds.
-        seed: Of all scenes, at least 0.
-        index: Of this one, at least 0.
-        validation: Whether it is one of those that aren't learned from.
+        settings: Grids, times and shares.
+        seed: Seed of a set of scenes, at least 0.
+        index: Number of the scene in its set, at least 0.
+        validation: Whether the set is held out from training.
 
     Returns:
-        The scene. Its rate is that of the two frames of a pair.
+        The scene; its frame rate is that of the two frames of a pair.
     """
     random = generator(validation, seed, index, 0)
     if random.random() < settings.hot:
@@ -114,12 +109,12 @@ def _place(random: np.random.Generator, low: tuple, high: tuple) -> tuple[float,
 
 
 def _jet(random: np.random.Generator) -> dict[str, Any]:
-    """Smoke blown up from the bottom, upright or leaning."""
+    """Smoke blown up from the floor, upright or leaning."""
     inlets = []
     for number in range(1 + (random.random() < 0.3)):
         speed = SPEED * (1.0 if number == 0 else random.uniform(0.5, 1.0))
         lean, around = np.radians(random.uniform(0.0, 28.0)), random.uniform(0.0, 2 * np.pi)
-        # Those that lean start where they have the box before them.
+        # Leaning jets start off the middle, so that they lean into the box.
         back = -0.35 * np.tan(lean) * np.array([np.cos(around), 0.0, np.sin(around)])
         centre = np.array(_place(random, (0.38, 0.0, 0.38), (0.62, 0.0, 0.62))) + EDGE * back
         velocity = speed * np.array([np.sin(lean) * np.cos(around), np.cos(lean), np.sin(lean) * np.sin(around)])
@@ -141,7 +136,7 @@ def _jet(random: np.random.Generator) -> dict[str, Any]:
 
 
 def _flame(random: np.random.Generator) -> dict[str, Any]:
-    """A jet that is hot where it comes in."""
+    """A jet that enters hot."""
     parts = _jet(random)
     inlets = tuple(inlet.model_copy(update={"temperature": float(inlet.density > 0.0)}) for inlet in parts["inlets"])
     smoke = {"buoyancy": random.uniform(0.5, 2.0), "cooling": random.uniform(1.0, 3.0)}
@@ -149,21 +144,21 @@ def _flame(random: np.random.Generator) -> dict[str, Any]:
 
 
 def _plume(random: np.random.Generator) -> dict[str, Any]:
-    """A ball that is held at a density and a temperature; smoke rises from it and rolls up."""
-    ball = Source(
+    """A sphere held at a density and a temperature; smoke rises from it and rolls up."""
+    sphere = SourceSettings(
         centre=_place(random, (0.35, 0.1, 0.35), (0.65, 0.16, 0.65)),
         radius=EDGE * _log(random, *_RADIUS),
         density=random.uniform(0.6, 1.0),
         temperature=1.0,
     )
     smoke = {"buoyancy": random.uniform(2.0, 4.0), "cooling": random.uniform(0.5, 1.0)}
-    return {"inlets": (), "sources": (ball,), "faces": {"-y": "wall"}, "smoke": smoke, "hot": False}
+    return {"inlets": (), "sources": (sphere,), "faces": {"-y": "wall"}, "smoke": smoke, "hot": False}
 
 
 def _burst(random: np.random.Generator) -> dict[str, Any]:
-    """Balls that are hot for a moment, beside each other."""
-    balls = [
-        Source(
+    """Spheres side by side, hot for a moment."""
+    spheres = [
+        SourceSettings(
             centre=_place(random, (0.32, 0.12, 0.32), (0.68, 0.3, 0.68)),
             radius=EDGE * random.uniform(0.08, 0.17),
             density=random.uniform(0.7, 1.0),
@@ -174,13 +169,13 @@ def _burst(random: np.random.Generator) -> dict[str, Any]:
         for number in range(random.integers(1, 4))
     ]
     smoke = {"buoyancy": random.uniform(3.0, 6.0), "cooling": random.uniform(0.5, 2.0)}
-    return {"inlets": (), "sources": tuple(balls), "faces": {"-y": "wall"}, "smoke": smoke, "hot": True}
+    return {"inlets": (), "sources": tuple(spheres), "faces": {"-y": "wall"}, "smoke": smoke, "hot": True}
 
 
 def _obstacle(random: np.random.Generator) -> Tilted:
     kind = random.random()
     centre = _place(random, (0.28, 0.28, 0.28), (0.72, 0.7, 0.72))
-    shape = "cylinder" if kind < _CYLINDERS else "sphere" if kind < _BALLS else "box"
+    shape = "cylinder" if kind < _CYLINDERS else "sphere" if kind < _SPHERES else "box"
     radius: Any = EDGE * random.uniform(0.06, 0.13)
     if shape == "cylinder":
         radius = (radius, EDGE * random.uniform(0.15, 0.5), radius)
@@ -191,7 +186,7 @@ def _obstacle(random: np.random.Generator) -> Tilted:
 
 
 def _moving(random: np.random.Generator, obstacle: Tilted, begin: float) -> Tilted:
-    """The same body on its way through the box, from one side to the other."""
+    """The same obstacle on a path through the box, from one side to the other."""
     _, *middle = obstacle.path[0]
     around = random.uniform(0.0, 2 * np.pi)
     half = 0.36 * EDGE * np.array([np.cos(around), 0.0, np.sin(around)])

@@ -2,26 +2,26 @@
 // of Gaussians meet in shared memory, and the outputs leave it in rows.
 // The twin to read first: wlm/probe/exact.py. Native for the reason that layers.cuh gives.
 
-    const int t = threadIdx.x, first = block * P, part = t / P, point = t % P;
-    const float* w1 = net.data, *w2 = w1 + SECOND, *w3 = w1 + THIRD;
-    if (part == 0) {
-        for (int c = 0; c < 3; ++c) X[(L + c) * LD + point] = x[c];
-    }
-    for (int turn = 0; turn < T / P; ++turn) {
-        if (part == turn) {
-            #pragma unroll
-            for (int c = 0; c < L; ++c) {
-                float& sum = X[c * LD + point];
-                sum = turn == 0 ? f.c[c] : sum + f.c[c];
-            }
+const int t = threadIdx.x, first = block * P, part = t / P, point = t % P;
+const float* w1 = net.data, *w2 = w1 + SECOND, *w3 = w1 + THIRD;
+if (part == 0) {
+    for (int c = 0; c < 3; ++c) X[(L + c) * LD + point] = x[c];
+}
+for (int turn = 0; turn < T / P; ++turn) {
+    if (part == turn) {
+        #pragma unroll
+        for (int c = 0; c < L; ++c) {
+            float& sum = X[c * LD + point];
+            sum = turn == 0 ? f.c[c] : sum + f.c[c];
         }
-        __syncthreads();
     }
-    forward(X, I, w1, A);
-    forward(A, H, w2, B);
-    last(B, w3, [&](int c, int p, float y) { E[c * LD + p] = gain * y; });
     __syncthreads();
-    for (int m = t; m < P * D; m += T) {
-        const int p = m / D;
-        if (first + p < count) out.data[size_t(first) * D + m] = E[m % D * LD + p];
-    }
+}
+forward(X, I, w1, A);
+forward(A, H, w2, B);
+last(B, w3, [&](int c, int p, float y) { E[c * LD + p] = gain * y; });
+__syncthreads();
+for (int m = t; m < P * D; m += T) {
+    const int p = m / D;
+    if (first + p < count) out.data[size_t(first) * D + m] = E[m % D * LD + p];
+}

@@ -1,0 +1,29 @@
+"""The package as a user meets it: its public names, and the example of its docstring and of its page."""
+
+import pkgutil
+from pathlib import Path
+
+import pytest
+
+from wlm import fluid
+
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "fluid.md"
+
+
+def test_every_public_name_is_there():
+    modules = {module.name for module in pkgutil.iter_modules(fluid.__path__)}
+    for name in fluid.__all__:
+        assert getattr(fluid, name) is not None and name in dir(fluid)
+        assert name not in modules, "importing the module would take the name's place"
+    with pytest.raises(AttributeError, match="'wlm.fluid' has no attribute 'nothing'"):
+        _ = fluid.nothing
+
+
+@pytest.mark.parametrize("text", [fluid.__doc__, PAGE.read_text(encoding="utf-8").split("A lattice Boltzmann")[0]])
+def test_the_example_runs(text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """In fewer steps."""
+    monkeypatch.chdir(tmp_path)
+    code = "\n".join(line[4:] for line in text.splitlines() if line.startswith("    "))
+    assert "smoke.step(100)" in code
+    exec(code.replace("smoke.step(100)", "smoke.step(2)"), {})
+    assert float(fluid.load_volume("smoke.npz").density.sum()) > 0.0

@@ -1,0 +1,64 @@
+"""The calls of ``wlm.smoke`` as a user writes them: the README's snippet, and the three ways to lightmaps."""
+
+import numpy as np
+import pytest
+import torch
+from builders.smoke_plumes import plume
+
+import wlm
+from wlm.fluid.volume import save_volume
+
+
+@pytest.fixture
+def smoke(tmp_path):
+    save_volume(tmp_path / "cloud.npz", plume(hot=True))
+    return wlm.smoke.load(tmp_path / "cloud.npz", extinction=0.2)
+
+
+def test_the_snippet(smoke):
+    camera = wlm.smoke.Camera.around(smoke, toward=(1, 0, 1), pixels=64)
+    six = wlm.smoke.predict(smoke, camera)
+    image = six.shade([wlm.smoke.Light((1, 1, 0.5))])
+    assert image.shape == (64, 64, 3) and six.transparency.shape == (64, 64) and six.camera == camera
+    assert torch.isfinite(image).all() and image.max() > 0
+    over = six.shade([wlm.smoke.Light((1, 1, 0.5))], background=(0.5, 0.5, 0.5))
+    torch.testing.assert_close(over, image + 0.5 * six.transparency[..., None])
+
+
+def test_three_ways_to_the_same_lightmaps(smoke):
+    """On dense smoke each is near the fine march, in its own planes."""
+    dense = wlm.smoke.DensityVolume(smoke.density, 8.0, smoke.voxel, smoke.origin, smoke.temperature)
+    camera = wlm.smoke.Camera.around(dense, toward=(0.3, 0.2, 1.0), pixels=96)
+    baked = wlm.smoke.bake(dense, camera)
+    march = wlm.smoke.March(step=0.5, jitter=0.0)
+    for six, most in ((wlm.smoke.march(dense, camera, march), 0.02), (wlm.smoke.predict(dense, camera, seed=3), 0.1)):
+        assert six.camera == camera and six.emission is not None
+        for name in ("lightmaps", "transparency"):
+            difference = getattr(six, name) - getattr(baked, name)
+            assert difference.square().mean().sqrt() < most * getattr(baked, name).square().mean().sqrt(), name
+    assert baked.error.rms < 0.05
+
+
+def test_a_predictor_for_many_frames(smoke):
+    """One network, several sizes; the seed is that of the guiding map."""
+    predictor = wlm.smoke.SmokePredictor()
+    cameras = [wlm.smoke.Camera.around(smoke, pixels=pixels) for pixels in (16, 24, 32, 40, 48)]
+    first = [wlm.smoke.predict(smoke, camera, predictor, seed=1) for camera in cameras]
+    again = [predictor(smoke, camera, 1) for camera in cameras]
+    assert all(torch.equal(a.lightmaps, b.lightmaps) for a, b in zip(first, again, strict=True))
+    assert not torch.equal(predictor(smoke, cameras[0], 2).lightmaps, first[0].lightmaps)
+    assert "the coarse march may be nearer" in predictor.warning(smoke, cameras[0])
+    assert predictor.warning(smoke, wlm.smoke.Camera.around(smoke, pixels=512)) is None
+
+
+@pytest.mark.parametrize("options", [{}, {"perspective": True}, {"aspect": 2.0, "toward": (0, 1, 0)}])
+def test_a_camera_around_smoke_shows_all_of_it(smoke, options):
+    camera = wlm.smoke.Camera.around(smoke, pixels=20, **options)
+    size = smoke.voxel * np.array(smoke.shape)
+    assert camera == wlm.smoke.Camera.around((smoke.origin, size), pixels=20, **options)
+    corners = (smoke.origin + size * np.array(list(np.ndindex(2, 2, 2))) - camera.position) @ camera.axes.T
+    depth = -corners[:, 2:] if camera.perspective else 1.0
+    half = 0.5 * camera.extent * np.array([camera.width / camera.height, 1.0])
+    assert (corners[:, 2] < 0).all() and (np.abs(corners[:, :2] / depth) < half).all()
+    with pytest.raises(ValueError, match="toward: expected a direction"):
+        wlm.smoke.Camera.around(smoke, toward=(0, 0, 0))

@@ -1,0 +1,72 @@
+"""Every march at its limits: no smoke, a wall, one voxel, NaN, a camera inside the smoke or that doesn't see it."""
+
+import numpy as np
+import pytest
+import torch
+
+from wlm.fluid.volume import DensityVolume, from_array
+from wlm.smoke.baking import bake
+from wlm.smoke.camera import Camera
+from wlm.smoke.coarse import march
+from wlm.smoke.guiding import guide
+from wlm_kernels.smoke.settings import March
+
+STEPS = March(2.0, jitter=0.0, threshold=1e-6)
+MARCHES = {
+    "bake": lambda volume, camera: bake(volume, camera, step=0.25),
+    "march": lambda volume, camera: march(volume, camera, STEPS),
+    "march in bricks": lambda volume, camera: march(volume, camera, March(0.25, jitter=0.0)),
+    "guide": lambda volume, camera: guide(volume, camera, STEPS),
+}
+CLEAR = ("empty", "not a number", "away", "beside")
+
+
+def _case(name: str, dtype: type, device: str) -> tuple[DensityVolume, Camera]:
+    density, extinction = np.ones((6, 6, 6), dtype), 1.0
+    if name == "empty":
+        density[:] = 0
+    elif name == "opaque":
+        extinction = 1e6
+    elif name == "one voxel":
+        density = density[:1, :1, :1]
+    elif name == "not a number":
+        density[:] = np.nan
+    volume = from_array(density, extinction=extinction, device=device)
+    distance = {"away": -30.0, "inside": 0.1}.get(name, 30.0)
+    eye = volume.centre + [500.0 if name == "beside" else 0.0, 0.0, distance]
+    target = eye - [0.0, 0.0, 1.0]
+    return volume, Camera.look_at(eye, target, extent=2.25, height=9, width=9)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float16])
+@pytest.mark.parametrize("name", [*CLEAR, "opaque", "one voxel", "inside"])
+@pytest.mark.parametrize("way", MARCHES)
+def test_hard_smoke(device: str, way: str, name: str, dtype: type):
+    volume, camera = _case(name, dtype, device)
+    assert len(volume.warnings) == (name == "not a number")
+    result = MARCHES[way](volume, camera)
+    light = result.light[None] if way == "guide" else result.lightmaps
+    clear, centre = result.transparency, result.transparency[4, 4].item()
+    most = 2.5 if way == "guide" else 1.0
+    assert torch.isfinite(light).all() and light.min() >= 0 and light.max() <= most
+    assert clear.min() >= 0 and clear.max() <= 1
+    if way == "bake":
+        assert np.isfinite(result.error.rms) and (result.error.rms == 0 or name not in CLEAR)
+    else:
+        assert torch.isfinite(result.depth).all() and (result.depth > 0).any() == (name not in CLEAR)
+    if name in CLEAR:
+        assert not light.any() and (clear == 1).all()
+    elif name == "opaque":
+        assert centre < 1e-4
+        if way != "guide":
+            # A wall is lit from the front alone.
+            assert result["front"][4, 4].item() == pytest.approx(0.5, abs=1e-3)
+            assert way == "march" or light[[0, 1, 2, 3, 5], 4, 4].max() < 1e-3
+    elif name == "one voxel":
+        # Tent functions: the integral of the density along the middle is that of one voxel.
+        if "guide" != way != "march":
+            assert centre == pytest.approx(np.exp(-1.0), rel=0.02)
+            assert result["front"][4, 4].item() == pytest.approx(-np.expm1(-2.0) / 2, rel=0.02)
+        assert way == "bake" or 29 < result.depth[4, 4].item() < 31
+    else:
+        assert centre < 0.9 and light[:, 4, 4].max() > 0.05

@@ -1,0 +1,170 @@
+"""The figures of all benchmarks: the heading, unit and number format of each, by the name that a ``Row`` has it under.
+
+``TABLES`` is in the order of the columns, and says in which table a figure stands where one would be too wide.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+__all__ = ["FIGURES", "TABLES", "Figure"]
+
+
+@dataclass(frozen=True)
+class Figure:
+    """How one figure is shown.
+
+    Attributes:
+        title: What it is, in a word or two.
+        unit: Its unit; ``"%"`` for a share, which rows hold as a number around 1. Empty for a pure number.
+        form: Format specification; empty: three digits, and from 100 on the whole part.
+    """
+
+    title: str
+    unit: str = ""
+    form: str = ""
+
+    @property
+    def heading(self) -> str:
+        """The heading of a column."""
+        return f"{self.title}, {self.unit}" if self.unit else self.title
+
+    @property
+    def label(self) -> str:
+        """The label of an axis."""
+        return f"{self.title} ({self.unit})" if self.unit else self.title
+
+    def text(self, value: float, form: str = "") -> str:
+        """The number without its unit, in this format or in another."""
+        if self.unit == "%":
+            value *= 100.0
+        form = form or self.form or (",.0f" if abs(value) >= 100.0 else ".3g")
+        return format(value, form)
+
+
+_WHOLE = ",.0f"
+
+TABLES: dict[str, dict[str, Figure]] = {
+    "Size and error": {
+        "bytes": Figure("size", "bytes", _WHOLE),
+        "bpp": Figure("size", "bpp", ".3f"),  # bits for each texel and time, or for each probe
+        "compression_ratio": Figure("CR", "%", ".1f"),  # eq. 9 of lightmap-uv-clustering-cascade
+        "share_of_float32": Figure("of float32", "%", ".2f"),
+        "psnr": Figure("PSNR", "dB", ".2f"),
+        "psnr_min": Figure("least", "dB", ".2f"),
+        "psnr_max": Figure("most", "dB", ".2f"),
+        "psnr_worst": Figure("worst view", "dB", ".2f"),
+        "texel_psnr": Figure("texels", "dB", ".2f"),
+        "irradiance_psnr": Figure("irradiance", "dB", ".2f"),
+        "coarse_psnr": Figure("coarse march", "dB", ".2f"),
+        "network_psnr": Figure("network", "dB", ".2f"),
+        "right_psnr": Figure("right", "dB", ".2f"),
+        "left_psnr": Figure("left", "dB", ".2f"),
+        "opacity_psnr": Figure("opacity", "dB", ".2f"),
+        "emission_psnr": Figure("emission", "dB", ".2f"),
+        "ssim": Figure("SSIM", form=".4f"),
+        "one_minus_ssim": Figure("1 − SSIM", form=".2g"),
+        "one_minus_ssim_min": Figure("least", form=".2g"),
+        "one_minus_ssim_max": Figure("most", form=".2g"),
+        "flip": Figure("FLIP", form=".4f"),
+        "seam_ratio": Figure("seams", form=".2f"),  # error at charts' borders over that elsewhere
+        "seam_ratio_min": Figure("least", form=".2f"),
+        "seam_ratio_max": Figure("most", form=".2f"),
+        "light_rms": Figure("light RMS", "%", ".3g"),
+        "still_light_rms": Figure("without jitter", "%", ".3g"),
+        "transparency_rms": Figure("transparency RMS", form=".3g"),
+        "bias": Figure("bias", "%", "+.1f"),
+        "bias_min": Figure("least", "%", "+.1f"),
+        "bias_max": Figure("most", "%", "+.1f"),
+        "rms": Figure("RMS", "%", ".3g"),  # of a difference, over that of the exact values
+        "worst_rms": Figure("worst light's RMS", "%", ".3g"),
+        "halving_rms": Figure("RMS by halving", "%", ".3g"),
+        "finest_rms": Figure("RMS from the finest", "%", ".3g"),
+        "largest": Figure("largest", "%", ".3g"),
+        "mass_drift": Figure("mass drift", form=".2g"),
+        "smoke_gained": Figure("smoke gained", "%", "+.2g"),
+        "max_error": Figure("largest error", form=".2g"),
+        "error_999": Figure("99.9% within", form=".2g"),  # of points, against the float64 decode
+        "flicker": Figure("flicker", "levels", ".3g"),  # of 255
+        "flicker_ratio": Figure("over the reference's", form=".3f"),
+    },
+    "Time": {
+        "encode_seconds": Figure("encode", "s", ".3g"),
+        "decode_ms": Figure("decode time", "ms", ".3g"),
+        "decode_ms_spread": Figure("p90−p10", "ms", ".2g"),
+        "time_ms": Figure("time", "ms", ".3g"),
+        "time_ms_spread": Figure("p90−p10", "ms", ".2g"),
+        "replay_ms": Figure("replayed", "ms", ".3g"),
+        "call_ms": Figure("as calls", "ms", ".3g"),
+        "step_ms": Figure("a step", "ms", ".3g"),
+        "times_ours": Figure("times ours", form=".3g"),
+        "bandwidth": Figure("bandwidth", "GB/s", ".4g"),
+        "mlups": Figure("MLUPS"),  # million lattice cells a second
+        "voxel_rate": Figure("voxels", "M/s"),
+        "of_copy": Figure("of the copy", "%", ".3g"),  # the copy's bandwidth, at the bytes that must be moved
+        "worked_on": Figure("worked on", "%", ".3g"),
+        "speedup": Figure("speedup", form=".2f"),
+        "frame_rate": Figure("frames/s", form=".3g"),
+    },
+    "Stages": {  # of an atlas' compression
+        "weights_seconds": Figure("weights", "s", ".2g"),
+        "curves_seconds": Figure("curves", "s", ".2g"),
+        "allocate_seconds": Figure("allocate", "s", ".2g"),
+        "solve_seconds": Figure("solve", "s", ".2g"),
+        "cluster_seconds": Figure("cluster", "s", ".2g"),
+        "pack_seconds": Figure("pack", "s", ".2g"),
+        "regenerate_seconds": Figure("regenerate", "s", ".2g"),
+        "fit_seconds": Figure("fit", "s", ".2g"),
+        "write_seconds": Figure("write", "s", ".2g"),
+        "compare_seconds": Figure("compare", "s", ".2g"),
+    },
+    "Volume": {  # around a viewer of probes
+        "coverage": Figure("coverage", "%", ".1f"),
+        "light_rmse": Figure("RMSE", form=".3g"),
+        "light": Figure("light's RMS", form=".3g"),
+        "first_coverage": Figure("first frame's", "%", ".1f"),
+        "first_light_rmse": Figure("RMSE", form=".3g"),
+        "first_light": Figure("light's RMS", form=".3g"),
+        "first_ms": Figure("first frame", "ms", ".3g"),
+        "update_ms": Figure("update", "ms", ".3g"),
+        "update_ms_p95": Figure("95%", "ms", ".3g"),
+        "update_decode_ms": Figure("of it decode", "ms", ".3g"),
+        "update_decode_ms_p95": Figure("95%", "ms", ".3g"),
+        "blocks": Figure("blocks", form=".3g"),
+        "blocks_p95": Figure("95%", form=".3g"),
+        "probes_decoded": Figure("probes decoded", form=".3g"),
+        "probes_decoded_p95": Figure("95%", form=".3g"),
+        "memory": Figure("memory", "MiB", ".1f"),
+    },
+    "Settings": {
+        "steps": Figure("steps", form=_WHOLE),
+        "samples": Figure("samples", form=_WHOLE),
+        "times": Figure("times", form=_WHOLE),
+        "times_scored": Figure("scored", form=_WHOLE),
+        "constant_tiles": Figure("constant tiles", form=_WHOLE),
+        "static_tiles": Figure("static tiles", form=_WHOLE),
+        "dynamic_tiles": Figure("dynamic tiles", form=_WHOLE),
+        "tiles_timed": Figure("tiles timed", form=_WHOLE),
+        "lightmaps": Figure("lightmaps", form=_WHOLE),
+        "resolution": Figure("resolution", "pixels", _WHOLE),
+        "colour_width": Figure("colour width", "texels", _WHOLE),
+        "colour_height": Figure("height", "texels", _WHOLE),
+        "lut_width": Figure("table width", "texels", _WHOLE),
+        "lut_height": Figure("height", "texels", _WHOLE),
+        "probes": Figure("probes", form=_WHOLE),
+        "gaussians": Figure("Gaussians", form=_WHOLE),
+        "dropped": Figure("dropped", form=_WHOLE),
+        "list_entries": Figure("list entries", form=_WHOLE),
+        "frames": Figure("frames", form=_WHOLE),
+        "cells": Figure("edge", "cells", _WHOLE),
+        "voxels": Figure("edge", "voxels", _WHOLE),
+        "pixels": Figure("edge", "pixels", _WHOLE),
+        "lights": Figure("lights", form=_WHOLE),
+        "parameters": Figure("parameters", form=_WHOLE),
+        "file_size": Figure("file", "MB", ".2f"),
+    },
+}
+"""By the table's title, then by name."""
+
+FIGURES: dict[str, Figure] = {name: figure for table in TABLES.values() for name, figure in table.items()}
+"""All of them by name."""

@@ -1,0 +1,137 @@
+"""Frames to be drawn: lightmaps, baked from smoke or read from files, with what a scene adds to their pictures."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from wlm.errors import WlmError
+from wlm.smoke.baking import bake
+from wlm.smoke.data import SCENE_FILE, Frames, numbered, read_six_way, spread
+from wlm.smoke.guiding import guide
+from wlm.smoke.lightmaps import SixWay
+from wlm.smoke.scene import CameraSettings, ObstacleSettings, Scene, make_camera
+from wlm.smoke.shading import Ramp
+from wlm.system import Meter, OnProgress
+from wlm_kernels.smoke.settings import March
+
+__all__ = ["BakedFiles", "FramesToBake", "Shot", "baked_files"]
+
+_SURFACE = March(step=1.0, jitter=0.0)  # of the depth at which obstacles' shadows fall
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """One frame to be drawn.
+
+    Attributes:
+        number: Of the frame.
+        six: Lightmaps with their camera; with obstacles, with their depth too.
+        ramp: The scene's colours of the emission.
+        obstacles: The scene's.
+        time: Of the obstacles, seconds.
+        warnings: What was repaired in the volume, one line each.
+    """
+
+    number: int
+    six: SixWay
+    ramp: Ramp | None = None
+    obstacles: tuple[ObstacleSettings, ...] = ()
+    time: float = 0.0
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class FramesToBake:
+    """Smoke whose lightmaps are baked for each frame.
+
+    Attributes:
+        frames: The smoke.
+        camera: Orthographic.
+        step, supersample: As for ``bake``.
+    """
+
+    frames: Frames
+    camera: CameraSettings
+    step: float = 1.0
+    supersample: int = 1
+
+    @property
+    def scene(self) -> Scene | None:
+        """Of the frames; None: a single volume."""
+        return self.frames.scene
+
+    @property
+    def single(self) -> bool:
+        """Whether it is one file and not a folder."""
+        return self.frames.scene is None
+
+    def shots(self, count: int | None = None, progress: OnProgress | None = None) -> Iterator[Shot]:
+        """Bakes one frame after the other.
+
+        Args:
+            count: At most so many frames, evenly spread; None: all.
+            progress: Called after each.
+
+        Raises:
+            WlmError: A frame is missing or damaged.
+        """
+        for number, volume in self.frames.volumes(spread(self.frames.numbers, count), progress):
+            camera = make_camera(self.camera, volume.origin, [volume.voxel * n for n in volume.shape])
+            six = bake(volume, camera, step=self.step, supersample=self.supersample, estimate=False)
+            shot = Shot(number, six, time=self.frames.time(number), warnings=volume.warnings)
+            if self.scene is not None:
+                if self.scene.obstacles:
+                    shot = replace(shot, six=replace(six, depth=guide(volume, camera, _SURFACE).depth))
+                shot = replace(shot, ramp=self.scene.smoke.ramp, obstacles=self.scene.obstacles)
+            yield shot
+
+
+@dataclass(frozen=True)
+class BakedFiles:
+    """Lightmaps that ``bake`` or ``predict`` wrote.
+
+    Attributes:
+        files: The EXR files by number.
+        single: Whether it is one file and not a folder.
+        device: Where the lightmaps go.
+    """
+
+    files: dict[int, Path]
+    single: bool
+    device: str = "cpu"
+    scene: None = None
+
+    def shots(self, count: int | None = None, progress: OnProgress | None = None) -> Iterator[Shot]:
+        """Reads one frame after the other; arguments as for ``FramesToBake.shots``.
+
+        Raises:
+            WlmError: A file is damaged or of another kind.
+        """
+        numbers = spread(tuple(self.files), count)
+        meter = Meter(progress, "read", len(numbers))
+        for done, number in enumerate(numbers, 1):
+            yield Shot(number, read_six_way(self.files[number], self.device))
+            meter.report(done)
+
+
+def baked_files(path: str | os.PathLike[str], device: str = "cpu") -> BakedFiles | None:
+    """Finds what ``bake`` or ``predict`` wrote: the file itself, or those of a folder.
+
+    Returns:
+        None where the path is a volume or a folder of a simulation.
+
+    Raises:
+        WlmError: A folder of neither kind.
+    """
+    path = Path(path)
+    if path.suffix.lower() == ".exr":
+        return BakedFiles({1: path}, True, device)
+    if not path.is_dir() or (path / SCENE_FILE).exists():
+        return None
+    files = numbered(path, "six", ".exr")
+    if not files:
+        raise WlmError(f"{path}: expected a folder that simulate or bake wrote")
+    return BakedFiles(files, False, device)

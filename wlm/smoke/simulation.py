@@ -1,0 +1,266 @@
+"""The simulation of a scene: its solver, and a folder with a volume for each of its frames."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+
+import numpy as np
+import warp as wp
+
+from wlm.errors import WlmError
+from wlm.fluid import solver as fluid
+from wlm.fluid.faces import FACES
+from wlm.fluid.lattice import Domain, Lattice
+from wlm.fluid.obstacles import Mesh, Obstacle, Sphere, Trajectory
+from wlm.fluid.volume import DensityVolume, save_volume
+from wlm.interop import free_memory
+from wlm.smoke.data import CHECKPOINT, Frames
+from wlm.smoke.scene import Inlet, Scene, SourceSettings
+from wlm.system import Meter, OnProgress
+
+__all__ = ["CHECKPOINT_EVERY", "make_solver", "simulate", "volume_of"]
+
+CHECKPOINT_EVERY = 10
+"""Frames between two checkpoints."""
+
+# Cells by which smoke at an inlet reaches into the box, so that the air carries on smoke of full density.
+_INLET_DEPTH = 1.0
+# Steps in which inlets open, per cell of the longest axis: a sudden start is a sound wave.
+_RAMP = 4
+
+
+def make_solver(scene: Scene, *, device: str = "cpu") -> fluid.Solver:
+    """Builds a scene's solver.
+
+    Args:
+        scene: The scene.
+        device: As ``wlm.interop.check_device`` returns it.
+
+    Raises:
+        WlmError: The memory isn't enough for air and smoke, before any is allocated, or an inlet is too fast for the
+            time step.
+    """
+    smoke = scene.smoke
+    _require_memory(scene, device)
+    try:
+        lattice = _make_lattice(scene, device)
+        return fluid.Solver(
+            lattice,
+            refinement=scene.grid.refine,
+            scheme=smoke.scheme,
+            storage=smoke.storage,
+            temperature=smoke.hot,
+            sources=[source for source, _ in _sources(scene)],
+            obstacles=_obstacles(scene),
+            dissipation=smoke.dissipation * scene.step,
+            cooling=smoke.cooling * scene.step if smoke.hot else 0.0,
+            buoyancy=_buoyancy(scene),
+            substeps=smoke.substeps,
+            bricks=smoke.bricks,
+        )
+    except ValueError as error:
+        # Settings each within its range, and too small or too large together.
+        raise WlmError(f"{scene.name}: {error}") from error
+
+
+def volume_of(scene: Scene, solver: fluid.Solver) -> DensityVolume:
+    """The solver's smoke, in the solver's memory: valid until the next step."""
+    smoke, grid = scene.smoke, scene.grid
+    return solver.frame(extinction=smoke.extinction, emission=smoke.emission, cell=grid.cell, origin=grid.origin)
+
+
+def simulate(
+    frames: Frames,
+    *,
+    solver: fluid.Solver | None = None,
+    device: str = "cpu",
+    resume: bool = False,
+    progress: OnProgress | None = None,
+) -> int:
+    """Runs a scene and writes its frames.
+
+    The state is saved in the folder every ``CHECKPOINT_EVERY`` frames, after the frame itself, and when ``progress``
+    raises KeyboardInterrupt. Going on from it gives the same frames: on the CPU to the last bit, on a GPU as far as its
+    atomic sums come out alike, and with smoke in bricks to their threshold.
+
+    Args:
+        frames: The folder, as ``wlm.smoke.data.open_frames`` prepares it.
+        solver: From ``make_solver``, not yet stepped; None: it is made here, on ``device``. Whoever makes it before the
+            folder is opened loses no earlier frames if it can't be made.
+        device: As ``wlm.interop.check_device`` returns it.
+        resume: Whether to go on from a state that was saved there, if there is one. A state past the last frame asked
+            for stays there.
+        progress: Called after each frame, with the figures ``smoke``, the density's integral over the box, and
+            ``frame s``, the seconds that the frame took.
+
+    Returns:
+        The number of the first frame that was simulated; one more than there are if all were there.
+
+    Raises:
+        WlmError: As ``make_solver``; an obstacle is too fast; the air blew up; a file is damaged or can't be written; a
+            frame before the saved state is missing.
+    """
+    scene, checkpoint = frames.scene, frames.path / CHECKPOINT
+    missing = sorted(set(range(1, scene.frames + 1)) - set(frames.numbers))
+    saved = resume and checkpoint.exists()
+    if resume and not saved and not missing:
+        return scene.frames + 1
+    if solver is None:
+        solver = make_solver(scene, device=device)
+    per_frame = scene.steps // scene.smoke.substeps
+    done = 0
+    if saved:
+        solver.load(checkpoint)
+        done = solver.steps // per_frame
+        if missing and missing[0] <= done:
+            raise WlmError(
+                f"{frames.path}: expected {frames.file(missing[0]).name}, since the saved state is of frame {done},"
+                " found none; start anew without --resume"
+            )
+    sources, meter = _sources(scene), Meter(progress, "simulate", scene.frames)
+    for frame in range(done + 1, scene.frames + 1):
+        begin = time.perf_counter()
+        for step in range(per_frame):
+            now = (frame - 1 + step / per_frame) / scene.rate
+            solver.sources = tuple(source for source, active in sources if active(now))
+            solver.step()
+        solver.check()
+        volume = volume_of(scene, solver)
+        save_volume(frames.file(frame), volume)
+        # After the frame: a state whose frame is missing would be resumed past it.
+        if frame % CHECKPOINT_EVERY == 0:
+            solver.save(checkpoint)
+        if progress is None:
+            continue
+        mass = float(volume.density.double().sum()) * volume.voxel**3
+        try:
+            meter.report(frame, smoke=mass, frame_s=time.perf_counter() - begin)
+        except KeyboardInterrupt:
+            solver.save(checkpoint)
+            raise
+    if done <= scene.frames:
+        checkpoint.unlink(missing_ok=True)
+    return min(done, scene.frames) + 1
+
+
+def _require_memory(scene: Scene, device: str) -> None:
+    """Checks, before either is allocated, that air and smoke fit into the memory together."""
+    grid, smoke = scene.grid, scene.smoke
+    voxel = fluid.voxel_bytes(smoke.scheme, smoke.storage, smoke.hot)
+    needed = Lattice.bytes_needed(grid.cells, scene.air.storage) + voxel * math.prod(grid.shape)
+    warp_device = wp.get_device(device)
+    free = free_memory(warp_device)
+    if needed > free:
+        air, dense = (" x ".join(map(str, shape)) for shape in (grid.cells, grid.shape))
+        raise WlmError(
+            f"{scene.name}: {air} cells of air and {dense} of smoke need {needed / 2**30:.1f} GiB on {device}: expected"
+            f" at most the {free / 2**30:.1f} GiB that are free: use fewer cells, a lower refine or storage: float16"
+        )
+    # A grid may also have more voxels than can be numbered.
+    fluid.require_memory(grid.shape, voxel, warp_device)
+
+
+def _make_lattice(scene: Scene, device: str) -> Lattice:
+    grid, air = scene.grid, scene.air
+    domain = Domain(grid.cell, scene.step)
+    lattice = Lattice(
+        grid.cells,
+        viscosity=domain.viscosity(air.viscosity),
+        operator=air.operator,
+        smagorinsky=air.smagorinsky,
+        storage=air.storage,
+        device=device,
+        ramp=_RAMP * max(grid.cells),
+    )
+    _set_faces(lattice, scene, domain)
+    return lattice
+
+
+def _buoyancy(scene: Scene) -> fluid.Buoyancy | None:
+    smoke, domain = scene.smoke, Domain(scene.grid.cell, scene.step)
+    if not (smoke.buoyancy or smoke.weight):
+        return None
+    up = np.array(smoke.up) / np.linalg.norm(smoke.up)
+    lift, weight = (domain.acceleration(value) for value in (smoke.buoyancy, smoke.weight))
+    return fluid.Buoyancy(lift, weight, tuple(map(float, up)))
+
+
+def _set_faces(lattice: Lattice, scene: Scene, domain: Domain) -> None:
+    grid = scene.grid
+    for name in FACES:
+        inlets = [(i, inlet) for i, inlet in enumerate(scene.inlets) if inlet.face == name]
+        kind = grid.face(name)
+        if inlets:
+            _set_inlets(lattice, scene, domain, name, inlets)
+        elif kind in ("wall", "slip"):
+            lattice.set_wall(name, slip=kind == "slip")
+        elif kind == "open":
+            # With inlets, as much leaves as comes in; without, the outside is at rest.
+            lattice.set_outlet(name, density=None if scene.inlets else 1.0)
+
+
+def _set_inlets(lattice: Lattice, scene: Scene, domain: Domain, name: str, inlets: list[tuple[int, Inlet]]) -> None:
+    """Opens a face's inlets; where two overlap the later one counts."""
+    grid = scene.grid
+    across = [axis for axis in range(3) if axis != FACES.index(name) // 2]
+    places = [grid.origin[axis] + grid.cell * (np.arange(grid.cells[axis]) + 0.5) for axis in across]
+    first, second = np.meshgrid(*places, indexing="ij")
+    velocity, opened = np.zeros((*first.shape, 3)), np.zeros(first.shape, bool)
+    for number, inlet in inlets:
+        here = np.ones(first.shape, bool)
+        if inlet.radius is not None:
+            here = np.hypot(first - inlet.centre[across[0]], second - inlet.centre[across[1]]) <= inlet.radius
+        if not here.any():
+            raise WlmError(f"{scene.name}: inlets.{number}: expected a cell's centre within its radius, found none")
+        velocity[here] = [domain.speed(v) for v in inlet.velocity]
+        opened |= here
+    lattice.set_inlet(name, velocity, opened)
+
+
+def _sources(scene: Scene) -> list[tuple[fluid.Source, Callable[[float], bool]]]:
+    """The solver's sources, in cells, at inlets and within the box; and whether each is on at a time."""
+    sources: list[tuple[fluid.Source, Callable[[float], bool]]] = []
+
+    def add(
+        shape: str,
+        centre: np.ndarray,
+        size: np.ndarray,
+        settings: Inlet | SourceSettings,
+        active: Callable[[float], bool],
+    ) -> None:
+        place = tuple(map(float, centre)), tuple(map(float, size))
+        temperature = settings.temperature if scene.smoke.hot else 0.0
+        sources.append((fluid.Source(shape, *place, settings.density, temperature, fixed=True), active))
+
+    grid = scene.grid
+    half = 0.5 * np.array(grid.cells, float)
+    for inlet in scene.inlets:
+        axis, high = divmod(FACES.index(inlet.face), 2)
+        if inlet.radius is None:
+            shape, centre, size = "box", half.copy(), half.copy()
+        else:
+            shape, centre = "sphere", (np.asarray(inlet.centre) - grid.origin) / grid.cell
+            size = np.full(3, inlet.radius / grid.cell)
+        centre[axis] = grid.cells[axis] * high
+        size[axis] = _INLET_DEPTH
+        add(shape, centre, size, inlet, lambda time: True)
+    for ball in scene.sources:
+        centre = (np.asarray(ball.centre) - grid.origin) / grid.cell
+        add("sphere", centre, np.full(3, ball.radius / grid.cell), ball, ball.active)
+    return sources
+
+
+def _obstacles(scene: Scene) -> list[Obstacle]:
+    grid = scene.grid
+    obstacles: list[Obstacle] = []
+    for settings in scene.obstacles:
+        keys = np.array(settings.path)
+        path = Trajectory.of((keys[:, 1:] - grid.origin) / grid.cell, keys[:, 0] / scene.step)
+        if settings.shape == "sphere":
+            obstacles.append(Sphere(path, settings.radius / grid.cell))
+        else:
+            points, triangles = settings.mesh()
+            obstacles.append(Mesh(path, points.astype(np.float32), triangles.astype(np.int32), scale=1.0 / grid.cell))
+    return obstacles
