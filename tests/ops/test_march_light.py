@@ -9,8 +9,9 @@ import warp as wp
 from kernels.compare import array, close
 
 from wlm import ops
-from wlm_kernels.smoke import march as smoke_march
-from wlm_kernels.smoke import march_six
+from wlm_kernels.smoke import march_guide, march_six
+from wlm_kernels.smoke.march import make_view
+from wlm_kernels.smoke.settings import March
 
 AHEAD = torch.tensor([0.0, 0.0, 1.0])
 
@@ -65,16 +66,16 @@ def _cloud(seed: int = 3) -> np.ndarray:
 
 
 def test_against_the_smoke_systems_marches(device: str):
-    """``march_six.lit``, which marches to the light from every sample, and the transmittance of ``march``."""
+    """``march_six.lit``, which marches to the light from every sample, and the transmittance of ``march_guide``."""
     density = _cloud()
     turn = np.linalg.qr(np.random.default_rng(4).normal(size=(3, 3)))[0]
     right, up, forward = turn * np.linalg.det(turn)
     middle = np.array(density.shape) / 2
-    view = smoke_march.view(middle - 20.0 * forward, right, up, forward, 1.0, 20, 18)
+    view = make_view(middle - 20.0 * forward, right, up, forward, 1.0, 20, 18)
     toward = np.array([0.5, 0.7, -0.51]) / np.linalg.norm([0.5, 0.7, -0.51])
     lit = wp.zeros((18, 20), dtype=float, device=device)
     on_device = array(density, float, device)
-    march_six.lit(on_device, 1.0, view, toward, lit, step=0.5, g=0.3)
+    march_six.lit(on_device, 1.0, view, toward, March(step=0.5, g=0.3), lit)
 
     u, v = np.meshgrid(np.arange(20) + 0.5 - 10.0, 9.0 - np.arange(18) - 0.5)
     origin = middle - 20.0 * forward + u[..., None] * right + v[..., None] * up
@@ -88,7 +89,7 @@ def test_against_the_smoke_systems_marches(device: str):
     close(radiance[..., 0], lit, 0.012)
     behind = wp.zeros(18 * 20, dtype=float, device=device)
     points = array(origin.reshape(-1, 3).astype(np.float32), wp.vec3, device)
-    smoke_march.transmittance(on_device, 1.0, points, forward, 0.5, behind)
+    march_guide.transmittance(on_device, 1.0, points, forward, 0.5, behind)
     close(transmittance, behind.numpy().reshape(18, 20), 1e-5)
 
 
