@@ -12,6 +12,8 @@ demo: $(STAMP)
 	$(BIN)/python demos/probe.py
 	$(BIN)/python demos/smoke.py
 	$(BIN)/python demos/smoke_network.py
+	$(BIN)/python demos/ops_march.py
+	$(BIN)/python demos/ops_bc7.py
 	$(BIN)/python demos/gallery.py
 
 demo-network: $(STAMP)

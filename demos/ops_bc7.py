@@ -19,8 +19,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from wlm import ops
-from wlm.atlas.data import LightmappedMesh, load_mesh
+from wlm import atlas, ops
+from wlm.atlas.data import LightmappedMesh
 from wlm.atlas.views import View, visible_uv
 from wlm.cli.console import quiet_warp, show_figures
 from wlm.errors import WlmError
@@ -81,7 +81,7 @@ def fit(endpoints: torch.Tensor, weights: torch.Tensor, uv: torch.Tensor, target
 def run(out: Path, device: str) -> dict[str, float]:
     """Runs the demo, writes its picture and its blocks, and returns its figures."""
     data = HERE / "data" / "atlas"
-    mesh = load_mesh(data / "room.glb", data / "room.exr")
+    mesh = atlas.load(data / "room.glb", data / "room.exr")
     filled = fill_gaps(mesh.lightmap, mesh.mask)
     everywhere = np.ones(mesh.mask.shape, bool)
     colours = encode(filled, everywhere, white_of(mesh.lightmap[mesh.mask])).astype(np.float32) / 255.0

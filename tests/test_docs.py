@@ -12,9 +12,9 @@ line and its figures in the order of the text::
 A source is a file, then system, scene, method and option of a row; ``FILE/SET/METHOD`` of a report of ``wlm smoke
 evaluate --json``; ``FILE.csv/STEP`` of a training's curve. `` - `` between two sources is their difference, `` / ``
 their ratio. A figure has the format of ``wlm.bench.figures`` unless another follows its name. Above a table of all rows
-of a method one line is enough, with the figures of the columns after the first, which is the option::
+whose source begins alike one line is enough; its first columns are the rest of the source::
 
-    <!-- table nvidia-h200/atlas/AntiqueCamera day/ours: psnr bytes -->
+    <!-- table nvidia-h200/atlas/AntiqueCamera day/ours: psnr | bytes -->
 """
 
 import csv
@@ -31,7 +31,7 @@ from wlm.bench import FIGURES, pages, read_json
 ROOT = Path(__file__).resolve().parents[1]
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 STATED = re.compile(r"<!-- figures\n((?:[^\n>]+: [^\n>]+\n)+)-->\n((?:.+\n)+)")
-TABLE = re.compile(r"<!-- table ([^:\n]+): ([\w ]+) -->\n\|.*\n\|[-:| ]*\n((?:\|.*\n)+)")
+TABLE = re.compile(r"<!-- table ([^:\n]+): ([^:\n]+) -->\n\|.*\n\|[-:| ]*\n((?:\|.*\n)+)")
 
 
 @functools.cache
@@ -51,6 +51,10 @@ def expected(source: str, figure: str, form: str = "") -> str:
     parts = re.split(r" ([-/]) ", source)
     values = [sources(file)[key][figure] for file, key in (part.split("/", 1) for part in parts[::2])]
     value = values[0] if len(values) == 1 else values[0] - values[1] if parts[1] == "-" else values[0] / values[1]
+    return text_of(value, figure, form)
+
+
+def text_of(value: float, figure: str, form: str = "") -> str:
     return FIGURES[figure].text(value, form) if figure in FIGURES else format(value, form)
 
 
@@ -66,13 +70,14 @@ def test_figures_are_those_of_the_benchmarks(document):
                 match = re.compile(rf"(?<![\w.,]){re.escape(number)}(?![\w]|[.,]\d)").search(paragraph, start)
                 assert match, f"{source}: {figure}: expected {number} in {paragraph[start:]!r}"
                 start = match.end()
-    for source, names, table in TABLE.findall(text):
-        file, method = source.split("/", 1)
+    for source, figures, table in TABLE.findall(text):
+        file, slash, method = source.partition("/")
         lines = []
         for key, row in sources(file).items():
-            if key.startswith(f"{method}/"):
-                cells = (FIGURES[name].text(row[name]) if name in row else "" for name in names.split())
-                lines.append(f"| {' | '.join([key[len(method) + 1 :], *cells])} |")
+            if key.startswith(method + slash):
+                numbers = ((row.get(figure.split()[0]), figure.split()) for figure in figures.split(" | "))
+                cells = ("" if number is None else text_of(number, *figure) for number, figure in numbers)
+                lines.append(f"| {' | '.join([*key.removeprefix(method + slash).split('/'), *cells])} |")
         assert table.splitlines() == lines
 
 

@@ -274,7 +274,5 @@ def test_wrong_arguments():
     mesh = _mesh(_quad(5, 5, 8, 6))
     with pytest.raises(ValueError, match="scale: expected above 0, got 0"):
         pack(mesh, None, 0.0)
-    with pytest.raises(ValueError, match="padding: expected at least 1, got 0"):
-        pack(mesh, None, 0.5, padding=0)
     with pytest.raises(ValueError, match="clusters: expected 2 triangles, got 3"):
         pack(mesh, grouped([0, 1, 2]), 0.5)

@@ -239,5 +239,5 @@ def test_pages_by_system(tmp_path, monkeypatch):
     assert all(head in page for page in made.values())
     assert "- [lightmap](all/lightmap.md): a CPU, cpu" in made["all.md"]
     assert "## a CPU: `a.json`" in made["all/lightmap.md"] and "## cpu: `b.json`" in made["all/lightmap.md"]
-    assert "### smoke-network, 2026-01-02\n\n`wlm bench`; 1 threads, Python 3" in made["all/smoke.md"]
+    assert "### smoke-network, 2026-01-02\n\n`wlm bench --json a.json`; 1 threads, Python 3" in made["all/smoke.md"]
     assert "torch 2, CUDA 13.0.\n\n#### city\n" in made["all/lightmap.md"]

@@ -73,20 +73,14 @@ def test_samples_are_exact_at_texels(device: str):
 
 
 def test_orders_are_those_of_permuted_vertices(device: str):
-    """``patch_orders`` of a patch equals, exactly, the patches of the triangle with its vertices permuted."""
+    """A patch reordered equals, exactly, the patch of the triangle with its vertices permuted."""
     image, (corners, level) = _image(), _triangles(12)
     plain = _unpacked(_sampled(image, corners, level, device)[0], level)
-    for o, p in enumerate(ORDERS):
+    for p in ORDERS:
         permuted = np.empty_like(corners)
         permuted[:, list(p)] = corners
         for t, got in enumerate(_unpacked(_sampled(image, permuted, level, device)[0], level)):
-            np.testing.assert_array_equal(got, kernels.patch_orders(plain[t])[o])
-
-
-def test_patch_orders_wants_a_patch():
-    with pytest.raises(ValueError, match="samples"):
-        kernels.patch_orders(np.zeros((4, 3)))
-    assert kernels.patch_orders(np.ones((1, 3))).shape == (6, 1, 3)
+            np.testing.assert_array_equal(got, reference.reordered(plain[t], SIZES[level[t]], p))
 
 
 def test_distances(device: str):

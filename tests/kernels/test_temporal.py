@@ -7,7 +7,7 @@ from kernels.compare import close
 from kernels.stepping import TILE, Case, Step, draw, drawn_noise, fused_step, problem, trainer
 
 TOLERANCE = 2e-5  # of the largest gradient of an array; float32 gives 1e-6
-WIDTHS = (8, 16, 17, 32, 64)
+WIDTHS = [pytest.param(width, marks=[] if width in (16, 17) else pytest.mark.slow) for width in (8, 16, 17, 32, 64)]
 # Each axis and shape at its least, and both ends of a clamped time axis.
 VARIANTS = {
     "periodic": {"periodic": True},
@@ -16,11 +16,11 @@ VARIANTS = {
 }
 
 
-def _hold(got: Step, want: Step) -> None:
-    close(got.loss, want.loss, TOLERANCE, "loss")
-    assert got.grads.keys() == want.grads.keys()
-    for key, grad in want.grads.items():
-        close(got.grads[key], grad, TOLERANCE, f"gradient of {key}")
+def _hold(fused: Step, expected: Step) -> None:
+    close(fused.loss, expected.loss, TOLERANCE, "loss")
+    assert fused.grads.keys() == expected.grads.keys()
+    for key, grad in expected.grads.items():
+        close(fused.grads[key], grad, TOLERANCE, f"gradient of {key}")
 
 
 @pytest.mark.parametrize("quantised", [False, True], ids=["continuous", "quantised"])
@@ -30,26 +30,25 @@ def test_temporal_step(device: str, hidden: int, variant: str, quantised: bool):
     """Loss, maps and network of dynamic tiles, against autograd."""
     case = Case(hidden=hidden, **VARIANTS[variant])
     fit = trainer(case, device)
-    want = problem(fit, case, quantised)
+    twin = problem(fit, case, quantised)
     _, features = draw(fit, quantised)
-    close(features, want.features(), 2e-6, "features")
-    got = fused_step(fit, quantised)
-    expected = want.step()
-    _hold(got, expected)
+    close(features, twin.features(), 2e-6, "features")
+    expected = twin.step()
+    _hold(fused_step(fit, quantised), expected)
     # A gradient that is 0 everywhere would hold anything: one slice or cell moves nothing only by design.
     assert all(np.abs(grad).max() > 0 for grad in expected.grads.values())
     fit.close()
 
 
 @pytest.mark.parametrize("quantised", [False, True], ids=["continuous", "quantised"])
-@pytest.mark.parametrize("hidden", [16, *(pytest.param(w, marks=pytest.mark.slow) for w in (8, 17, 32, 64))])
+@pytest.mark.parametrize("hidden", WIDTHS)
 def test_static_step(device: str, hidden: int, quantised: bool):
     """Tiles without temporal maps, one of them of three valid texels."""
     case = Case(temporal=False, hidden=hidden, emphasis=0.7, texels=(5000, 3))
     fit = trainer(case, device)
-    want = problem(fit, case, quantised)
-    close(draw(fit, quantised)[1], want.features(), 2e-6, "features")
-    _hold(fused_step(fit, quantised), want.step())
+    twin = problem(fit, case, quantised)
+    close(draw(fit, quantised)[1], twin.features(), 2e-6, "features")
+    _hold(fused_step(fit, quantised), twin.step())
     fit.close()
 
 
@@ -57,8 +56,8 @@ def test_tanh_step(device: str):
     """The cheaper GELU that a fit may use."""
     case = Case(gelu="tanh", emphasis=1.0)
     fit = trainer(case, device)
-    want = problem(fit, case, False)
-    _hold(fused_step(fit, False), want.step())
+    twin = problem(fit, case, False)
+    _hold(fused_step(fit, False), twin.step())
     fit.close()
 
 
@@ -68,14 +67,14 @@ def test_samples_between_times(device: str, emphasis: float, periodic: bool):
     """A share of the samples lies between two times and follows their interpolated colour (eq. 2)."""
     case = Case(samples=1024, periodic=periodic, emphasis=emphasis, settings={"between": 0.4})
     fit = trainer(case, device)
-    want = problem(fit, case, False)
-    close(draw(fit, False)[1], want.features(), 5e-6, "features")
-    moved = want.share > 0
+    twin = problem(fit, case, False)
+    close(draw(fit, False)[1], twin.features(), 5e-6, "features")
+    moved = twin.share > 0
     drawn = moved.double().mean()
     # Nothing follows the last time of a clamped axis; five standard deviations of 2,048 draws.
     assert abs(drawn - 0.4 * (1.0 if periodic else 0.8)) < 5 * (0.24 / 2048) ** 0.5
-    assert abs(want.share[moved].mean() - 0.5) < 5 * (1 / 12 / (0.3 * 2048)) ** 0.5
-    _hold(fused_step(fit, False), want.step())
+    assert abs(twin.share[moved].mean() - 0.5) < 5 * (1 / 12 / (0.3 * 2048)) ** 0.5
+    _hold(fused_step(fit, False), twin.step())
     fit.close()
 
 
@@ -85,8 +84,8 @@ def test_later_steps(device: str):
     fit = trainer(case, device)
     for _ in range(5):
         fused_step(fit, False)
-    want = problem(fit, case, False)
-    _hold(fused_step(fit, False), want.step())
+    twin = problem(fit, case, False)
+    _hold(fused_step(fit, False), twin.step())
     fit.close()
 
 
@@ -141,18 +140,16 @@ def test_tile_is_the_same_alone_and_in_a_batch(device: str):
 def test_two_lanes_equal_one():
     """On the CPU two threads sum halves of the samples in buffers of their own; one lane gives the same sum."""
     case = Case()
-    one, two = (trainer(case, "cpu") for _ in range(2))
-    lanes = fused_step(two, False)
-    hidden, output = one._launch_args
-    acc, partial, partial_out, loss = one._launch_sums
-    one._kernels.launch(
-        one._maps, one._offsets, hidden, output, one.batch, case.samples, *one._launch_sums, 0, case.samples
-    )
-    flat = np.concatenate([grad.ravel() for key, grad in lanes.grads.items() if key in one.views])
+    single, double = (trainer(case, "cpu") for _ in range(2))
+    lanes = fused_step(double, False)
+    sums = acc, partial, partial_out, loss = single._launch_sums
+    networks = single._launch_args
+    single._kernels.launch(single._maps, single._offsets, *networks, single.batch, case.samples, *sums, 0, case.samples)
+    flat = np.concatenate([grad.ravel() for key, grad in lanes.grads.items() if key in single.views])
     assert not acc.numpy()[1].any()
     close(flat, acc.numpy()[0], 1e-6, "maps")
     close(lanes.grads["hidden"], partial.numpy()[0], 1e-6, "hidden")
     close(lanes.grads["output"], partial_out.numpy()[0], 1e-6, "output")
     close(lanes.loss, loss.numpy()[0], 1e-5, "loss")
-    one.close()
-    two.close()
+    single.close()
+    double.close()

@@ -261,6 +261,20 @@ def test_the_eight_bit_path_is_the_float_path_rounded(tmp_path):
     assert (pixels[..., 3] == 255).all()
 
 
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"stepps": 10}, "unknown key 'stepps'; did you mean 'steps'?"),
+        ({"steps": 1}, "steps: expected greater than or equal to 10"),
+        ({"quantise_from": 1.0, "freeze_from": 0.5}, "quantise_from must not be later than freeze_from"),
+    ],
+)
+def test_wrong_settings_are_one_line(options, says):
+    with pytest.raises(WlmError) as error:
+        compress(moving_light(8, 8), PROFILE, **options)
+    assert says in str(error.value) and "\n" not in str(error.value)
+
+
 def test_a_missing_device_and_a_missing_gelu_are_one_line():
     with pytest.raises(WlmError, match="device 'tpu'"):
         compress(moving_light(8, 8), PROFILE, device="tpu")

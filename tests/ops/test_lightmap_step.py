@@ -51,8 +51,8 @@ def _composed(problem: Problem, device: str) -> Step:
 @pytest.mark.parametrize("periodic", [False, True], ids=["clamped", "periodic"])
 def test_training_step(device: str, periodic: bool, quantised: bool):
     """Six operations under torch's autograd give the loss and the gradients of the kernel that does all at once."""
-    fit = trainer(Case(periodic=periodic, hidden=17), device)
-    composed = _composed(problem(fit, Case(periodic=periodic, hidden=17), quantised), device)
+    fit = trainer(Case(periodic=periodic), device)
+    composed = _composed(problem(fit, Case(periodic=periodic), quantised), device)
     fused = fused_step(fit, quantised)
     fit.close()
     close(fused.loss, composed.loss, 2e-5, "loss")

@@ -30,6 +30,13 @@ def patch(image: np.ndarray, corners: np.ndarray, size: int) -> np.ndarray:
     return bilinear(image, at[:, 0], at[:, 1])
 
 
+def reordered(samples: np.ndarray, size: int, order: tuple[int, int, int]) -> np.ndarray:
+    """The patch [N, ...] of the triangle whose vertex ``order[k]`` is this one's vertex k (section 3.1, figure 3)."""
+    lattice = np.rint(barycentrics(size) * (size - 1)).astype(int)
+    index = {tuple(weights): i for i, weights in enumerate(lattice.tolist())}
+    return samples[[index[tuple(weights)] for weights in lattice[:, list(order)].tolist()]]
+
+
 def dominant(levels: np.ndarray) -> tuple[int, int, int]:
     """The commonest of 32 x 32 x 32 bins of 8-bit colours [N, 3], the lowest of equals."""
     counts: dict[tuple[int, int, int], int] = {}

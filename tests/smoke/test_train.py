@@ -90,6 +90,8 @@ def test_a_stopped_training_ends_as_if_it_had_not_been(tmp_path, monkeypatch, lo
     path = tmp_path / "parts"
     with pytest.raises(KeyboardInterrupt):
         _train(path, profile, seed=1, progress=stop)
+    # The untrained network, until there is a better one.
+    assert wlm.load(path).summary["steps"] == 0
     steps = []
     while not (training := _train(path, profile, seed=1, resume=True, minutes=0.0)).finished:
         steps.append(training.steps)
@@ -187,13 +189,6 @@ def test_the_best_network_is_kept(tmp_path):
     assert training.model.summary["psnr"] == training.best
 
 
-def test_an_untrained_network_is_kept_until_there_is_a_better_one(tmp_path, monkeypatch):
-    monkeypatch.setattr("wlm.smoke.fit._CHUNK", 2)
-    training = _train(tmp_path / "a", _profile(), minutes=0.0)
-    assert not training.finished and training.steps == 2
-    assert training.model.summary["steps"] == 0 and training.model.summary["psnr"] == training.best
-
-
 @pytest.mark.parametrize("name", ["guides", "targets", "motion"])
 def test_nan_in_a_pool_is_an_error(tmp_path, name):
     def broken(settings, *, round, **options) -> Pool:
@@ -204,10 +199,7 @@ def test_nan_in_a_pool_is_an_error(tmp_path, name):
 
     with pytest.raises(WlmError, match=f"round 1: {name}: sample 2: expected finite"):
         _train(tmp_path / "a", _profile(steps=2), make_pool=broken)
-
-
-def test_an_empty_pool_is_an_error(tmp_path):
-    empty = Pool(*(tensor[:0] for tensor in vars(small_pool()).values()))
+    empty = small_pool().take(torch.zeros(6, dtype=torch.bool))
     with pytest.raises(WlmError, match="validation: expected samples, found none"):
         _train(tmp_path / "a", _profile(), make_validation=lambda *a, **k: empty)
 

@@ -2,37 +2,22 @@
 
 from wlm._facade import facade
 
-__all__ = [
-    "AtlasModel",
-    "Decoder",
-    "LightmappedMesh",
-    "Profile",
-    "Report",
-    "View",
-    "compare",
-    "compress",
-    "evaluate",
-    "export",
-    "from_arrays",
-    "load",
-    "read_folder",
-]
+_PLACES = {
+    "AtlasModel": "wlm.atlas.model",
+    "Decoder": "wlm.atlas.decode",
+    "LightmappedMesh": "wlm.atlas.data",
+    "Profile": "wlm.atlas.model",
+    "Report": "wlm.atlas.evaluation",
+    "View": "wlm.atlas.views",
+    "compare": "wlm.atlas.evaluation",
+    "compress": "wlm.atlas.fit",
+    "evaluate": "wlm.atlas.evaluation",
+    "export": "wlm.atlas.exporter",
+    "from_arrays": "wlm.atlas.data",
+    "load": "wlm.atlas.data",
+    "read_folder": "wlm.atlas.exporter",
+}
 
-__getattr__, __dir__ = facade(
-    __name__,
-    {
-        "AtlasModel": "wlm.atlas.model",
-        "Decoder": "wlm.atlas.decode",
-        "LightmappedMesh": "wlm.atlas.data",
-        "Profile": "wlm.atlas.model",
-        "Report": "wlm.atlas.evaluation",
-        "View": "wlm.atlas.views",
-        "compare": "wlm.atlas.evaluation",
-        "compress": "wlm.atlas.fit",
-        "evaluate": "wlm.atlas.evaluation",
-        "export": "wlm.atlas.exporter",
-        "from_arrays": "wlm.atlas.data",
-        "load": "wlm.atlas.data",
-        "read_folder": "wlm.atlas.exporter",
-    },
-)
+__all__ = sorted(_PLACES)
+
+__getattr__, __dir__ = facade(__name__, _PLACES)

@@ -5,7 +5,7 @@ share an edge under the old UVs stay together in one chart. A chart moves rigidl
 stretched and never mirrored, and all charts are scaled by one epsilon, in texels. ``uvunwrap`` packs them in float32;
 each chart's rigid motion is fitted to its result by least squares and then applied exactly.
 
-Where the paper is silent: charts have two texels between them (``padding`` around each), so that a bilinear read in one
+Where the paper is silent: charts have two texels between them (one around each), so that a bilinear read in one
 never meets a texel of another; a triangle that is too thin for the packer gets a place of its own, half a texel high.
 The atlas is as large as its charts need, W_r x H_r of eq. 9, be that less or more than epsilon W x epsilon H.
 
@@ -36,6 +36,7 @@ from wlm.ops.raster import rasterize_uv, texture
 
 __all__ = ["Packed", "pack", "regenerate"]
 
+_PADDING = 1  # texels around each chart
 _MOST = 16384  # texels that can be drawn along a side
 _STRETCH = 1e-2  # texels by which the packer, in float32, may deviate from a rigid motion
 _THIN = 0.5  # texels: height of the place of a triangle that is too thin for the packer
@@ -68,26 +69,23 @@ class Packed:
     to_lightmap: np.ndarray
 
 
-def pack(mesh: LightmappedMesh, clusters: Clusters | None, scale: float, *, padding: int = 1) -> Packed:
+def pack(mesh: LightmappedMesh, clusters: Clusters | None, scale: float) -> Packed:
     """Gives the mesh new UVs in which the triangles of a group share texels.
 
     Args:
         mesh: The mesh.
         clusters: Its groups; None: no triangle shares.
         scale: epsilon, texels of the atlas per texel of the lightmap, along a side.
-        padding: Texels around each chart, at least 1.
 
     Returns:
         The new UVs.
 
     Raises:
         WlmError: ``uvunwrap`` isn't installed or fails, or the atlas gets too large.
-        ValueError: ``scale`` isn't above 0, ``padding`` is below 1, or the groups are of another mesh.
+        ValueError: ``scale`` isn't above 0, or the groups are of another mesh.
     """
     if not 0.0 < scale < math.inf:
         raise ValueError(f"scale: expected above 0, got {scale}")
-    if padding < 1:
-        raise ValueError(f"padding: expected at least 1, got {padding}")
     count = len(mesh.triangle)
     source, order = np.arange(count, dtype=np.int32), np.zeros((count, 3), np.int64) + np.arange(3)
     if clusters is not None:
@@ -101,7 +99,7 @@ def pack(mesh: LightmappedMesh, clusters: Clusters | None, scale: float, *, padd
     numbers = welded(mesh.position, mesh.uv, mesh.triangle)
     old = (mesh.uv * [width, height])[mesh.triangle]
     heads = np.flatnonzero(source == np.arange(count))  # those that keep their texels
-    head_chart, rotation, shift, size = _pack_charts(mesh.name, old[heads], numbers[heads], scale, padding)
+    head_chart, rotation, shift, size = _pack_charts(mesh.name, old[heads], numbers[heads], scale)
 
     chart = np.full(count, -1, np.int32)
     chart[heads] = head_chart
@@ -158,7 +156,7 @@ def regenerate(mesh: LightmappedMesh, packed: Packed, device: str = "cpu") -> tu
 
 
 def _pack_charts(
-    name: str, old: np.ndarray, numbers: np.ndarray, scale: float, padding: int
+    name: str, old: np.ndarray, numbers: np.ndarray, scale: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Packs the charts.
 
@@ -166,7 +164,7 @@ def _pack_charts(
         name: The mesh's name, for messages.
         old: float64 [N, 3, 2], corners in texels of the lightmap.
         numbers: int [N, 3], the corners' numbers, equal where corners coincide.
-        scale, padding: As for ``pack``.
+        scale: As for ``pack``.
 
     Returns:
         int [N], the chart of each triangle; complex [C] twice, its motion, as ``_motions``; float64 [2], W_r and H_r.
@@ -176,7 +174,7 @@ def _pack_charts(
     winding = np.where((_signed_area(old) < 0)[:, None], [0, 2, 1], [0, 1, 2])
     numbers = np.take_along_axis(numbers, winding, 1)
     points = np.take_along_axis(old, winding[..., None], 1)
-    place, chart, placed, size = _uvunwrap(name, points, numbers, label, scale, padding)
+    place, chart, placed, size = _uvunwrap(name, points, numbers, label, scale)
     thin = chart < 0
     if thin.any():
         # Each becomes a chart of its own: a larger triangle that holds it.
@@ -184,7 +182,7 @@ def _pack_charts(
         extra = np.arange(int(thin.sum()))
         numbers[thin] = numbers.max() + 1 + np.arange(3 * len(extra)).reshape(-1, 3)
         label[thin] = label.max() + 1 + extra
-        place, chart, placed, size = _uvunwrap(name, points, numbers, label, scale, padding)
+        place, chart, placed, size = _uvunwrap(name, points, numbers, label, scale)
     if (chart < 0).any():
         raise WlmError(f"{name}: uvunwrap left out {np.count_nonzero(chart < 0)} triangles: expected a place for each")
     rotation, shift = _motions(name, points[placed], place[placed], chart[placed], scale)
@@ -192,7 +190,7 @@ def _pack_charts(
 
 
 def _uvunwrap(
-    name: str, points: np.ndarray, numbers: np.ndarray, label: np.ndarray, scale: float, padding: int
+    name: str, points: np.ndarray, numbers: np.ndarray, label: np.ndarray, scale: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Calls the packer, which leaves out triangles that are too thin for it.
 
@@ -212,7 +210,7 @@ def _uvunwrap(
             [uvunwrap.Mesh(vertex, triangle, existing_uvs=uv) for vertex, triangle, uv in meshes],
             page_size=None,
             texels_per_unit=scale,
-            padding=padding,
+            padding=_PADDING,
             packing="shape" if len(meshes) <= _FEW else "fast",
             max_chart_angle=89.0,
             max_area_distortion=1e9,
@@ -231,7 +229,7 @@ def _uvunwrap(
     used = np.unique(chart[placed])
     chart = np.where(np.isin(chart, used), np.searchsorted(used, chart), -1)
     # The page may be larger than its charts need.
-    size = np.ceil(place[placed].reshape(-1, 2).max(0, initial=0.0) + padding - 1e-3)
+    size = np.ceil(place[placed].reshape(-1, 2).max(0, initial=0.0) + _PADDING - 1e-3)
     if size.max() > _MOST:
         shape = f"{size[0]:.0f}x{size[1]:.0f}"
         raise WlmError(f"{name}: the packed lightmap: expected at most {_MOST} texels along a side, got {shape}")

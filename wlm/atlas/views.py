@@ -77,11 +77,6 @@ class View:
         right = right / np.linalg.norm(right)
         return cls(np.stack([right, np.cross(back, right), back]))
 
-    @property
-    def eye(self) -> np.ndarray:
-        """The camera's position, float64 [3]."""
-        return DISTANCE * self.axes[2]
-
 
 def sphere_views(count: int, seed: int | np.random.Generator | None = None) -> list[View]:
     """Makes cameras on the sphere.
@@ -116,21 +111,17 @@ def normalised(mesh: LightmappedMesh) -> np.ndarray:
     return (mesh.position - (low + high) / 2.0) * (2.0 / (high - low).max())
 
 
-def clip_positions(mesh: LightmappedMesh, view: View) -> np.ndarray:
-    """The vertices in a camera's clip space, for ``wlm.ops.raster.rasterize``.
+def clip_positions(position: np.ndarray, view: View) -> np.ndarray:
+    """The vertices in a camera's clip space, for ``wlm.ops.rasterize``.
 
     Args:
-        mesh: The mesh.
+        position: float64 [V, 3], ``normalised``.
         view: The camera.
 
     Returns:
         float32 [V, 4]: x, y, z, w; w is the distance along the camera's axis, z / w is -1 and 1 where the sphere
         around the cube is nearest and farthest. Vertices at one place have equal numbers.
     """
-    return _project(normalised(mesh), view)
-
-
-def _project(position: np.ndarray, view: View) -> np.ndarray:
     # Written out: a matrix product may round rows differently, and shared edges would come apart.
     x, y, back = (position[:, 0] * a + position[:, 1] * b + position[:, 2] * c for a, b, c in view.axes)
     w = DISTANCE - back
@@ -166,7 +157,7 @@ def visible_uv(
     for view in views:
         with torch.no_grad():
             raster = ops_raster.rasterize(
-                torch.tensor(_project(position, view), device=device), triangle, resolution, resolution
+                torch.tensor(clip_positions(position, view), device=device), triangle, resolution, resolution
             )
             visible, barycentric = raster.triangle, raster.barycentric
             pixel_uv = ops_raster.interpolate(uv, triangle, raster)

@@ -31,17 +31,17 @@ def pages(paths: Sequence[str | os.PathLike[str]], index: str | os.PathLike[str]
     """
     index = Path(index)
     head = f"Made by `wlm bench report {' '.join(map(str, paths))} -o {index}`; changes by hand are lost."
-    files = {Path(path).name: read_runs(path) for path in paths}
+    files = {path: read_runs(path) for path in paths}
     contents, links = {}, []
     for system in _SYSTEMS:
         parts, machines = [], []
-        for file, runs in files.items():
+        for path, runs in files.items():
             measured = [run for run in runs if any(row.system.partition("-")[0] == system for row in run.rows)]
             if measured:
                 environment = measured[0].environment
                 machines.append(str(environment["device_name"] or environment["device"]))
-                parts.append(f"## {machines[-1]}: `{file}`\n")
-                parts += map(_section, sorted(measured, key=_order))
+                parts.append(f"## {machines[-1]}: `{Path(path).name}`\n")
+                parts += [_section(run, path) for run in sorted(measured, key=_order)]
         if parts:
             pictures = sorted((index.parent / "images").glob(f"bench-{system}*.png"))
             plots = [f"![{picture.stem}](../images/{picture.name})\n" for picture in pictures]
@@ -49,8 +49,7 @@ def pages(paths: Sequence[str | os.PathLike[str]], index: str | os.PathLike[str]
             contents[page] = "\n".join([f"# Results: {system}\n", f"{head}\n", *plots, *parts])
             links.append(f"- [{system}]({page}): {', '.join(machines)}")
     foot = (
-        "Each page has the command of each run. With `--json FILE.json` it replaces the rows of its scenes in a file,\n"
-        "with `--plot docs/images/bench-SYSTEM.png` it draws a plot.\n"
+        "Each page has the commands that measure its runs again; `--plot docs/images/bench-SYSTEM.png` draws a plot.\n"
     )
     return {index.name: "\n".join(["# Results\n", f"{head}\n", *links, "", foot]), **contents}
 
@@ -107,13 +106,13 @@ def _table(
     return [f"| {' | '.join(line)} |" for line in lines]
 
 
-def _section(run: Run) -> str:
-    """What a run was measured with, and its rows."""
+def _section(run: Run, path: str | os.PathLike[str]) -> str:
+    """The command that measures a run again, into its file, what it was measured with, and its rows."""
     environment = run.environment
     cuda = f", CUDA {environment['cuda']}" if environment.get("cuda") else ""
     return (
         f"### {run.rows[0].system}, {environment['date'][:10]}\n\n"
-        f"`{environment['command']}`; {environment['threads']} threads, Python "
+        f"`{environment['command']} --json {path}`; {environment['threads']} threads, Python "
         f"{environment['python']}, Warp {environment['warp']}, torch {environment['torch']}{cuda}.\n\n"
     ) + tables(run.rows)
 

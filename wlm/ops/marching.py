@@ -10,7 +10,7 @@ from wlm.interop import to_warp
 from wlm.ops.plain import henyey_greenstein
 from wlm.ops.tensors import check, check_finite, dense, on_stream, optional_array, zeros_for
 from wlm_kernels.smoke import single_scatter
-from wlm_kernels.smoke.march import nodes_along
+from wlm_kernels.smoke.march_guide import nodes_along
 
 __all__ = ["march"]
 
@@ -30,30 +30,30 @@ def march(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Marches rays through a density grid; ``plain.march`` is the twin.
 
-    Radiative transfer with one bounce and albedo 1 (neural-six-way-lightmaps, eq. 1 to 3): at each sample of a ray the
-    light of directional lights that reaches it, scattered towards the ray's origin by Henyey and Greenstein's phase
-    function, and what is emitted there, both seen through what lies before. A colour has the albedo in it, if it isn't
-    1. Steps are equal on a ray and integrated exactly, for the density at their middle. The optical depth to a light is
-    marched to from a lattice with a node each step (each voxel, of smaller steps), and is linear between them.
+    Single scattering at albedo 1 (neural-six-way-lightmaps, eq. 1 to 3; another albedo is a factor of the colours):
+    each sample of a ray scatters the directional lights that reach it towards the ray's origin, by the phase function
+    of Henyey and Greenstein, and emits; both are attenuated on the way. The steps of a ray are equal, and each is
+    integrated exactly for the density at its middle. The optical depth to a light is marched from the nodes of a
+    lattice, a step apart but at least a voxel, and is trilinear between them.
 
     All is in voxels: the grid fills the box from 0 to (X, Y, Z), the centre of voxel i is at i + 1/2, and between
-    centres density and emission are trilinear, with zero outside the grid. Time and memory grow with the rays times the
-    steps, and with the voxels times the steps for each light.
+    centres density and emission are trilinear, with zero outside the grid. Time grows with the rays times the steps,
+    and for each light with the voxels times the steps.
 
     Gradients reach the density, the lights' colours and the emission, each exact for the result as it is computed. The
     rays and the directions to the lights have none: to find where light comes from, fit the colours of many lights. On
     CUDA the samples near a voxel are added in any order, so that the last bits change from run to run.
 
     Args:
-        density: float [X, Y, Z], extinction per voxel of way, at least 0.
+        density: float [X, Y, Z], the extinction coefficient per voxel edge, at least 0.
         origin: float [..., 3], where rays begin, in voxels; inside the grid or out of it.
         direction: float [..., 3], of length 1.
         toward: float [L, 3], the directions to the lights, of length 1.
-        colour: float [L, 3], the lights' irradiance over 4 pi: from a light of 1, isotropic smoke that hides all behind
-            it and stands in its full light scatters 1.
-        emission: float [X, Y, Z, 3], radiance given off per voxel of way.
+        colour: float [L, 3], the lights' irradiance over 4 pi: opaque isotropic smoke in the full light of one of 1
+            scatters 1.
+        emission: float [X, Y, Z, 3], the radiance emitted per voxel edge.
         step: The longest step, in voxels; the error falls with its square where the density is smooth.
-        g: The phase function's mean cosine, within -1 and 1: above 0 light goes on ahead.
+        g: The phase function's mean cosine, within -1 and 1; above 0 it scatters forward.
 
     Returns:
         The radiance that comes to the origins, float [..., 3], and the transmittance, float [...]: over a background b

@@ -67,12 +67,12 @@ def triplane(
     """Samples three planes at the projections of points in space; ``plain.triplane`` is the twin.
 
     Args:
-        xy: float [H, W, C], u is x and v is y (Chan et al., "Efficient Geometry-aware 3D Generative Adversarial
-            Networks", section 3.2); with a gradient, as all of these.
+        xy: float [H, W, C], u is x and v is y (the tri-plane of Chan et al. 2022, "Efficient Geometry-aware 3D
+            Generative Adversarial Networks"); with a gradient, as all of these.
         xz: float [H', W', C], u is x and v is z.
         yz: float [H'', W'', C], u is y and v is z.
         points: float [..., 3], x, y, z in [0, 1].
-        reduce: How the three are joined: "sum"; "product" (Fridovich-Keil et al., "K-Planes", eq. 1); or
+        reduce: How the three are joined: "sum"; "product" (Fridovich-Keil et al. 2023, "K-Planes"); or
             "concatenate", in the order of the arguments, where each plane may have a C of its own.
 
     Returns:

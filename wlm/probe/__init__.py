@@ -2,41 +2,24 @@
 
 from wlm._facade import facade
 
-__all__ = [
-    "Decoder",
-    "ProbeModel",
-    "ProbeSet",
-    "Profile",
-    "Report",
-    "Volume",
-    "compress",
-    "evaluate",
-    "export",
-    "from_arrays",
-    "load",
-    "load_positions",
-    "open_checkpoint",
-    "save_probes",
-    "score",
-]
+_PLACES = {
+    "Decoder": "wlm.probe.decode",
+    "ProbeModel": "wlm.probe.model",
+    "ProbeSet": "wlm.probe.data",
+    "Profile": "wlm.probe.model",
+    "Report": "wlm.probe.evaluation",
+    "Volume": "wlm.probe.volume",
+    "compress": "wlm.probe.fit",
+    "evaluate": "wlm.probe.evaluation",
+    "export": "wlm.probe.exporter",
+    "from_arrays": "wlm.probe.data",
+    "load": "wlm.probe.data",
+    "load_positions": "wlm.probe.data",
+    "open_checkpoint": "wlm.probe.fit",
+    "save_probes": "wlm.probe.data",
+    "score": "wlm.probe.evaluation",
+}
 
-__getattr__, __dir__ = facade(
-    __name__,
-    {
-        "Decoder": "wlm.probe.decode",
-        "ProbeModel": "wlm.probe.model",
-        "ProbeSet": "wlm.probe.data",
-        "Profile": "wlm.probe.model",
-        "Report": "wlm.probe.evaluation",
-        "Volume": "wlm.probe.volume",
-        "compress": "wlm.probe.fit",
-        "evaluate": "wlm.probe.evaluation",
-        "export": "wlm.probe.exporter",
-        "from_arrays": "wlm.probe.data",
-        "load": "wlm.probe.data",
-        "load_positions": "wlm.probe.data",
-        "open_checkpoint": "wlm.probe.fit",
-        "save_probes": "wlm.probe.data",
-        "score": "wlm.probe.evaluation",
-    },
-)
+__all__ = sorted(_PLACES)
+
+__getattr__, __dir__ = facade(__name__, _PLACES)

@@ -228,7 +228,7 @@ class _Tail:
     def __init__(self, network: SixWayNetwork, height: int, width: int, device: str, dtype: torch.dtype) -> None:
         settings = network.settings
         self.device, self.stem, area = device, settings.stem, settings.stem**2
-        order = [PLANES.index(name) for group in network.groups for name in group]
+        order = [PLANES.index(name) for name in network.names]
         adapters = [i for i, group in enumerate(network.groups) for _ in group]
         # For each plane its adapter, -1 if it isn't predicted, and its first channel.
         places = torch.tensor([[-1, 0]] * len(PLANES), dtype=torch.int32)

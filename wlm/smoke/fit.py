@@ -120,13 +120,15 @@ def train(
     checkpoint = Checkpoint(output, SmokeModel.SYSTEM, fit, source, resume=resume)
     if resume and not checkpoint.resumed and Path(output).exists():
         raise WlmError(f"{output}: is finished; without --resume it is trained anew")
-    run = _Run(Path(output), profile, seed, device, checkpoint, progress, minutes)
-    make_pool = make_pool or dataset.make_pool
-    validation = (make_validation or dataset.make_validation)(profile.dataset, device, progress=run.on_sequence)
+    meter = Meter(progress, "train", profile.training.total)
+    run = _Run(profile, Path(output), device, checkpoint, meter, seed, minutes)
+    make_pool, make_validation = make_pool or dataset.make_pool, make_validation or dataset.make_validation
+    # Between two sequences of a pool nothing is lost: earlier steps are in the checkpoint.
+    validation = make_validation(profile.dataset, device, progress=run.report)
     _check_pool("validation", validation)
     run.begin(validation)
     while run.round < profile.training.rounds:
-        pool = make_pool(profile.dataset, seed=seed, round=run.round, device=device, progress=run.on_sequence)
+        pool = make_pool(profile.dataset, seed=seed, round=run.round, device=device, progress=run.report)
         _check_pool(f"round {run.round}", pool)
         if not run.do_round(pool):
             return run.result(False)
@@ -142,18 +144,17 @@ class _Run:
 
     def __init__(
         self,
-        output: Path,
         profile: Profile,
-        seed: int,
+        output: Path,
         device: str,
         checkpoint: Checkpoint,
-        progress: OnProgress | None,
+        meter: Meter,
+        seed: int,
         minutes: float | None,
     ) -> None:
-        self.output, self.profile, self.settings, self.seed = output, profile, profile.training, seed
-        self.device, self.checkpoint = device, checkpoint
+        self.profile, self.settings, self.output, self.checkpoint = profile, profile.training, output, checkpoint
+        self.meter, self.seed, self.device = meter, seed, device
         self.trainer = Trainer(profile.network, profile.training, seed=seed, device=device)
-        self.meter = Meter(progress, "train", profile.training.total)
         self.limit = math.inf if minutes is None else 60.0 * minutes
         # Seconds of earlier runs; validation PSNR of the best and of the untrained network.
         self.before, self.best, self.untrained = 0.0, math.nan, math.nan
@@ -200,16 +201,21 @@ class _Run:
 
     def do_round(self, pool: Pool) -> bool:
         """Runs the remaining steps of a round; False: out of time."""
-        begin, end = self.round * self.settings.steps, (self.round + 1) * self.settings.steps
-        plan = plan_round(self.settings, pool, seed=self.seed, round=self.round)
+        number, begin = self.round, self.round * self.settings.steps
+        plan = plan_round(self.settings, pool, seed=self.seed, round=number)
         if self.trainer.step == begin:
             self.first_skipped = self.trainer.skipped
         while True:
             done = self.trainer.step - begin
             self.trainer.run(pool, plan.part(done, done + _CHUNK))
-            self._check_skipped()
+            skipped = self.trainer.skipped - self.first_skipped
+            if skipped > max(_LEAST_SKIPPED, _MOST_SKIPPED * self.settings.steps):
+                raise WlmError(
+                    f"{self.output}: the training diverged: {skipped} steps of round {number} gave NaN or infinity; "
+                    f"expected a smaller rate than {self.settings.rate:g}"
+                )
             self.loss = self._losses()[0]
-            if self.trainer.step == end:
+            if self.round > number:
                 return True  # validated before anything can stop it
             try:
                 self.report()
@@ -238,14 +244,9 @@ class _Run:
         self.save()
         self.report()
 
-    def report(self) -> None:
-        self.meter.report(
-            self.trainer.step, PSNR_dB=math.nan if self.score is None else self.score.psnr, loss=self.loss
-        )
-
-    def on_sequence(self, progress: Progress) -> None:
-        """Reports between two sequences of a pool, where nothing is lost: earlier steps are in the checkpoint."""
-        self.report()
+    def report(self, _: Progress | None = None) -> None:
+        psnr = math.nan if self.score is None else self.score.psnr
+        self.meter.report(self.trainer.step, PSNR_dB=psnr, loss=self.loss)
 
     def save(self) -> None:
         """Writes the checkpoint."""
@@ -286,15 +287,6 @@ class _Run:
         steps, skipped = (self.columns.index(name) for name in ("step", "skipped"))
         count = self.trainer.step - last[steps] - (self.trainer.skipped - last[skipped])
         return [float(value / count) if count else math.nan for value in self.trainer.take_losses()]
-
-    def _check_skipped(self) -> None:
-        skipped = self.trainer.skipped - self.first_skipped
-        if skipped > max(_LEAST_SKIPPED, _MOST_SKIPPED * self.settings.steps):
-            number = (self.trainer.step - 1) // self.settings.steps
-            raise WlmError(
-                f"{self.output}: the training diverged: {skipped} steps of round {number} gave NaN or infinity; "
-                f"expected a smaller rate than {self.settings.rate:g}"
-            )
 
     def _add_to_curve(self, validated: bool) -> None:
         """Adds the round's row, with NaN for what it hasn't validated, and writes the curves."""

@@ -243,6 +243,10 @@ class SixWayNetwork(nn.Module):
     """Encoded guiding maps to encoded lightmaps, at any resolution.
 
     Outputs aren't clamped, so that there is a gradient everywhere; ``decode_lightmaps`` clamps them.
+
+    Attributes:
+        groups: The planes of each adapter.
+        names: All of these, in order.
     """
 
     def __init__(self, settings: NetworkSettings) -> None:
@@ -255,15 +259,19 @@ class SixWayNetwork(nn.Module):
         # After repeating pixels; transposed 2 x 2 convolutions would have four times the weights.
         self.up = nn.ModuleList(nn.Conv2d(2 * c, c, 1) for c in widths[:-1])
         self.decoder = nn.ModuleList(_twice(2 * c, c) for c in widths[:-1])
-        self.groups = _groups(settings)
+        groups = [tuple(name for name in group if settings.emission or name != "emission") for group in ADAPTERS]
+        self.groups = groups if settings.adapters else [sum(groups, ())]
+        self.names = [name for group in self.groups for name in group]
         self.adapters = nn.ModuleList(NafBlock(first) for _ in self.groups)
         self.heads = nn.ModuleList(nn.Conv2d(first, len(group) * area, 3, padding=1) for group in self.groups)
         if settings.residual:
-            shares = torch.tensor([_start(name, GUIDES[settings.guide]) for group in self.groups for name in group])
-            self.filter = nn.Conv2d(settings.channels, len(shares), _FILTER, padding=_FILTER // 2, bias=False)
+            # A plane that the guide has starts as that, another one as a mix.
+            guide = GUIDES[settings.guide]
+            mixes = [[float(p == name) for p in guide] if name in guide else _START[name] for name in self.names]
+            self.filter = nn.Conv2d(settings.channels, len(mixes), _FILTER, padding=_FILTER // 2, bias=False)
             with torch.no_grad():
                 self.filter.weight.zero_()
-                self.filter.weight[:, :, _FILTER // 2, _FILTER // 2] = shares[:, : settings.channels]
+                self.filter.weight[:, :, _FILTER // 2, _FILTER // 2] = torch.tensor(mixes)[:, : settings.channels]
             for head in self.heads:
                 nn.init.zeros_(head.weight)
                 nn.init.zeros_(head.bias)
@@ -301,14 +309,9 @@ class SixWayNetwork(nn.Module):
             planes = F.pixel_shuffle(planes, self.settings.stem)
         if self.settings.residual:
             planes = planes + self.filter(padded[:, : self.settings.channels])
-        planes = planes[:, :, :height, :width] * support(guide[:, -2:-1])
-        return self.order(planes.to(guide.dtype))
-
-    def order(self, planes: torch.Tensor) -> torch.Tensor:
-        """Reorders the adapters' planes to ``PLANES``, with zeros for those that aren't predicted."""
-        names = [name for group in self.groups for name in group]
-        predicted = dict(zip(names, planes.unbind(1), strict=True))
-        zero = torch.zeros_like(planes[:, 0])
+        planes = (planes[:, :, :height, :width] * support(guide[:, -2:-1])).to(guide.dtype)
+        predicted = dict(zip(self.names, planes.unbind(1), strict=True))
+        zero = torch.zeros_like(planes[:, 0])  # for planes that aren't predicted
         return torch.stack([predicted.get(name, zero) for name in PLANES], 1)
 
 
@@ -348,11 +351,6 @@ def parameter_count(network: nn.Module) -> int:
     return sum(parameter.numel() for parameter in network.parameters())
 
 
-def _start(name: str, planes: tuple[str, ...]) -> tuple[float, ...]:
-    """Initial weights of a plane on the guide's planes."""
-    return tuple(float(plane == name) for plane in planes) if name in planes else _START[name]
-
-
 def _twice(before: int, after: int) -> nn.Sequential:
     """Two convolutions with ReLU that keep the scale of activations."""
     layers = []
@@ -362,8 +360,3 @@ def _twice(before: int, after: int) -> nn.Sequential:
         nn.init.zeros_(convolution.bias)
         layers += [convolution, nn.ReLU(inplace=True)]
     return nn.Sequential(*layers)
-
-
-def _groups(settings: NetworkSettings) -> tuple[tuple[str, ...], ...]:
-    groups = [tuple(name for name in group if settings.emission or name != "emission") for group in ADAPTERS]
-    return tuple(groups) if settings.adapters else (tuple(name for group in groups for name in group),)

@@ -37,7 +37,6 @@ __all__ = [
     "compare",
     "distance_sum",
     "dominant",
-    "patch_orders",
     "sample",
     "samples_of",
     "size_of",
@@ -86,27 +85,6 @@ class Patch:
 def samples_of(size):
     """Number of samples of a patch of size n, n (n + 1) / 2."""
     return size * (size + 1) // 2
-
-
-def patch_orders(samples: np.ndarray) -> np.ndarray:
-    """Gives a patch in all six orders (section 3.1, figure 3).
-
-    Args:
-        samples: [N, ...], the samples of one patch as stored.
-
-    Returns:
-        [6, N, ...]. Entry o is the patch of the triangle whose vertex p[k] is this one's vertex k, p = ``ORDERS[o]``.
-
-    Raises:
-        ValueError: N isn't the samples of a patch.
-    """
-    size = int((2 * len(samples)) ** 0.5)
-    if size < 1 or samples_of(size) != len(samples):
-        raise ValueError(f"samples: expected n (n + 1) / 2 of them, got {len(samples)}")
-    j, i = np.array([(j, i) for j in range(size) for i in range(size - j)]).T
-    weights = np.stack([i, j, size - 1 - i - j])
-    permuted = [weights[list(order)] for order in ORDERS]
-    return np.stack([samples[j * size - j * (j - 1) // 2 + i] for i, j, _ in permuted])
 
 
 @wp.func

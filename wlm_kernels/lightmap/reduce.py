@@ -57,10 +57,9 @@ def block_reduction(net: mlp.MlpKernels) -> Any:
         "B3": sizes[4] // 4,
         "ACROSS": across,
     }
-    snippet = native_source(__package__, "block_sums", **constants)
     vec_in, vec_hidden = net.vec_in, net.vec_hidden
 
-    @wp.func_native(snippet)
+    @wp.func_native(native_source(__package__, "block_sums", **constants))
     def reduce(
         f: vec_in,
         h1: vec_hidden,

@@ -7,8 +7,8 @@ x_n = sigma(p_n) h and T_n = exp(-x_0 - ... - x_(n-1)) (neural-six-way-lightmaps
     emitted                 sum_n T_n (1 - exp(-x_n)) / x_n h e(p_n)
     depth                   sum_n x_n
 
-where tau_l, the optical depth from a point to a light, is marched to from the nodes of a lattice that all rays share,
-and is linear between them. All is exact in its derivatives: steps depend on the geometry alone, and a ray ends early
+where tau_l, the optical depth from a point to a light, is marched from the nodes of a lattice that all rays share, and
+is linear between them. All is exact in its derivatives: steps depend on the geometry alone, and a ray ends early
 only where float32 has nothing left of it. ``wlm.ops.plain.march`` is the same in torch.
 
 Adjoints run from a ray's end to its start, so that what a sample hides is a running sum. They add to the density, the
@@ -233,7 +233,7 @@ def _march_backward(
     size = size_of(density)
     steps = steps_along(size, origin[r], direction[r], step)
     tau = depth[r]
-    hidden = float(0.0)  # the objective's share that comes from behind the sample
+    hidden = float(0.0)  # what the samples behind this one give to the objective
     for back in range(count[r]):
         n = count[r] - 1 - back
         p = origin[r] + (steps.first + (float(n) + 0.5) * steps.length) * direction[r]
@@ -266,8 +266,8 @@ def depths(density, toward, step: float, nodes) -> None:
         density: float [X, Y, Z], extinction per voxel, at least 0.
         toward: vec3 [L], the directions to the lights, of length 1.
         step: The longest step, in voxels.
-        nodes: float [L, A, B, C], written; ``march.nodes_along`` has the number of nodes, ``march.node_position`` their
-            places.
+        nodes: float [L, A, B, C], written; ``march_guide.nodes_along`` has the number of nodes,
+            ``march.node_position`` their places.
     """
     inputs = [density, toward, step * _SLACK]
     wp.launch(_depths, nodes.shape, inputs=inputs, outputs=[nodes], device=density.device)
@@ -286,11 +286,11 @@ def depths_backward(toward, step: float, grad_nodes, grad_density) -> None:
 
 
 def march(density, emission, nodes, origin, direction, step: float, scattered, emitted, depth, count) -> None:
-    """What comes along rays from lights of colour 1, with a phase function of 1.
+    """Marches rays, for lights of colour 1 and a phase function of 1.
 
     Args:
         density: float [X, Y, Z], extinction per voxel, at least 0.
-        emission: vec3 [X, Y, Z], light given off per voxel of way; of shape [0, 0, 0]: nothing emits.
+        emission: vec3 [X, Y, Z], radiance emitted per voxel; of shape [0, 0, 0]: nothing emits.
         nodes: float [L, A, B, C] from ``depths``; L may be 0.
         origin, direction: vec3 [R], in voxels; directions of length 1.
         step: The longest step, in voxels.
