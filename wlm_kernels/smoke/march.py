@@ -7,7 +7,8 @@ integrated exactly: 1 - exp(-sigma h), not sigma h. A density below zero or NaN 
 out.
 
 A light is a direction towards it, of irradiance 4 pi, so that an isotropic phase function is 1 and not 1 / (4 pi).
-``march_guide``, ``march_coarse``, ``march_six`` and ``march_motion`` are the marches themselves; none has a gradient.
+``march_guide``, ``march_coarse``, ``march_six`` and ``march_motion`` are the marches themselves; none has a gradient,
+but ``single_scatter`` has.
 Read first: ``tests/reference/marching.py``, the same in float64 NumPy, with nothing shared.
 """
 
