@@ -1,4 +1,4 @@
-"""One picture of all four systems, of the pictures that the other demos leave: ``docs/images/gallery.png``."""
+"""One picture of all four systems, of the pictures that the other demos leave: `docs/images/gallery.png`."""
 
 import argparse
 import sys

@@ -43,9 +43,7 @@ DRAWN, ERROR_GAIN = 320, 8.0  # pixels of a picture with its border, and what er
 LEAST_PSNR, LEAST_GAIN = 35.5, 2.0
 
 
-def visible(
-    mesh: LightmappedMesh, directions: Sequence, pixels: int, device: str
-) -> tuple[torch.Tensor, torch.Tensor]:
+def visible(mesh: LightmappedMesh, directions: Sequence, pixels: int, device: str) -> tuple[torch.Tensor, torch.Tensor]:
     """Where pixels see the mesh, bool [views, pixels, pixels], and at which UV [views, pixels, pixels, 2]."""
     views = visible_uv(mesh, [View.of(direction) for direction in directions], pixels, device)
     triangle, _, uv = map(torch.stack, zip(*views, strict=True))
@@ -66,7 +64,7 @@ def endpoints_of(texels: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def fit(endpoints: torch.Tensor, weights: torch.Tensor, uv: torch.Tensor, target: torch.Tensor) -> None:
-    """Moves endpoints and weights to where the map read at ``uv`` [N, 2] is nearest to ``target`` [N, 3]."""
+    """Moves endpoints and weights to where the map read at `uv` [N, 2] is nearest to `target` [N, 3]."""
     optimizer = torch.optim.Adam([endpoints.requires_grad_(), weights.requires_grad_()], lr=RATE)
     for step in range(STEPS):
         # The second half runs on the levels that the file has, with smaller steps: a level is 1/255 or 1/15.

@@ -123,7 +123,5 @@ def test_a_profile_is_found_in_the_installed_package(tmp_path, monkeypatch):
         (site / "wlm" / file).write_bytes(source.with_name(file).read_bytes())
     code = "import wlm.config as c; print(c.profile_names('atlas'), c.profile_path('atlas', 'M'))"
     environment = {**os.environ, "PYTHONPATH": str(site)}
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True
-    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert done.stdout.strip() == f"['M'] {site / 'wlm' / 'configs' / 'atlas-M.yaml'}", done.stderr

@@ -1,6 +1,6 @@
 """The documents: their figures are those of the benchmarks, and the pages of results those that the command makes.
 
-A document states figures of ``benchmarks/`` in a comment right above a paragraph, a list or a table, a source on each
+A document states figures of `benchmarks/` in a comment right above a paragraph, a list or a table, a source on each
 line and its figures in the order of the text::
 
     <!-- figures
@@ -9,9 +9,9 @@ line and its figures in the order of the text::
     -->
     Profile M has 45.98 dB at 0.7 bits a texel, 2 dB more than L.
 
-A source is a file, then system, scene, method and option of a row; ``FILE/SET/METHOD`` of a report of ``wlm smoke
-evaluate --json``; ``FILE.csv/STEP`` of a training's curve. `` - `` between two sources is their difference, `` / ``
-their ratio. A figure has the format of ``wlm.bench.figures`` unless another follows its name. Above a table of all rows
+A source is a file, then system, scene, method and option of a row; `FILE/SET/METHOD` of a report of ``wlm smoke
+evaluate --json`; `FILE.csv/STEP` of a training's curve. ` - ` between two sources is their difference, ` / ``
+their ratio. A figure has the format of `wlm.bench.figures` unless another follows its name. Above a table of all rows
 whose source begins alike one line is enough; its first columns are the rest of the source::
 
     <!-- table nvidia-h200/atlas/AntiqueCamera day/ours: psnr | bytes -->
@@ -36,7 +36,7 @@ TABLE = re.compile(r"<!-- table ([^:\n]+): ([^:\n]+) -->\n\|.*\n\|[-:| ]*\n((?:\
 
 @functools.cache
 def sources(file: str) -> dict[str, Mapping[str, float]]:
-    """The figures in a file of ``benchmarks/``, by the rest of their source."""
+    """The figures in a file of `benchmarks/`, by the rest of their source."""
     path = ROOT / "benchmarks" / file
     if path.suffix == ".csv":
         lines = csv.DictReader(path.read_text(encoding="utf-8").splitlines())

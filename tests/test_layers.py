@@ -19,7 +19,7 @@ FLOOR_OF = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms}
 
 
 def room_of(module: str) -> str:
-    """``wlm.probe`` of ``wlm.probe.fit``; the kernels are one room."""
+    """`wlm.probe` of `wlm.probe.fit`; the kernels are one room."""
     return "wlm_kernels" if module.startswith("wlm_kernels") else ".".join(module.split(".")[:2])
 
 

@@ -7,8 +7,8 @@
     model.save("city.wlm")
     frame = wlm.load("city.wlm").decoder("cpu").frame(18.5)
 
-``wlm.lightmap``, ``wlm.atlas``, ``wlm.probe`` and ``wlm.smoke`` have the same verbs; ``wlm.fluid`` simulates what smoke
-is seen of; ``wlm.ops`` has the kernels as differentiable torch operations. ``load`` reads any file of theirs.
+`wlm.lightmap`, `wlm.atlas`, `wlm.probe` and `wlm.smoke` have the same verbs; `wlm.fluid` simulates what smoke
+is seen of; `wlm.ops` has the kernels as differentiable torch operations. `load` reads any file of theirs.
 """
 
 from wlm._facade import facade

@@ -9,17 +9,17 @@ __all__ = ["facade"]
 
 
 def facade(package: str, places: Mapping[str, str]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
-    """Makes the ``__getattr__`` and ``__dir__`` of a package.
+    """Makes the `__getattr__` and `__dir__` of a package.
 
     A public name must not be a submodule's: importing the submodule would put it in the name's place.
 
     Args:
-        package: The package's ``__name__``.
+        package: The package's `__name__`.
         places: For each public name the module that defines it under the same name; for a subpackage its own full
             name.
 
     Returns:
-        ``__getattr__`` and ``__dir__``.
+        `__getattr__` and `__dir__`.
     """
 
     def get(name: str) -> Any:

@@ -56,7 +56,7 @@ def check_settings(cls: type[_Settings], values: Any, prefix: str = "") -> _Sett
     Args:
         cls: The pydantic model.
         values: A mapping of its fields, plain values.
-        prefix: Text before the field's name in an error: ``"scene.yaml: "``, ``"--"`` or ``"file: profile."``.
+        prefix: Text before the field's name in an error: `"scene.yaml: "`, `"--"` or `"file: profile."`.
 
     Returns:
         The checked settings.
@@ -74,7 +74,7 @@ def profile_path(system: str, name: str) -> Path:
     """Finds a profile, `configs/<system>-<name>.yaml`, in a checkout or in the installed package.
 
     Args:
-        system: ``lightmap``, ``atlas``, ``probe`` or ``smoke-network``.
+        system: `lightmap`, `atlas`, `probe` or `smoke-network`.
         name: The profile's name, `M` for example.
 
     Returns:
@@ -97,7 +97,7 @@ def profile_names(system: str) -> list[str]:
     """Lists the profiles of a system, sorted.
 
     Args:
-        system: ``lightmap``, ``atlas``, ``probe`` or ``smoke-network``.
+        system: `lightmap`, `atlas`, `probe` or `smoke-network`.
     """
     prefix = f"{system}-"
     files = {file.stem for folder in _profile_folders() for file in folder.glob(f"{prefix}*.yaml")}

@@ -2,14 +2,14 @@
 
 Only manners are shared here; each system's mathematics stays in its own rooms:
 
-    data.py        what comes in, checked          ``load``
-    model.py       settings and arrays             ``Profile``, the model
-    fit.py         training                        ``compress`` (smoke: ``train``)
-    codec.py       model to parts and back         ``encode``, ``decode``
-    decode.py      the runtime path                ``Decoder``
+    data.py        what comes in, checked          `load`
+    model.py       settings and arrays             `Profile`, the model
+    fit.py         training                        `compress` (smoke: `train`)
+    codec.py       model to parts and back         `encode`, `decode`
+    decode.py      the runtime path                `Decoder`
     exact.py       the same in float64, to check
-    evaluation.py  scores                          ``evaluate``
-    exporter.py    files for engines               ``export``
+    evaluation.py  scores                          `evaluate`
+    exporter.py    files for engines               `export`
 """
 
 from __future__ import annotations
@@ -54,10 +54,10 @@ _REPORT_EVERY = 0.5  # seconds between two reports of progress
 
 
 class Settings(BaseModel):
-    """Settings of a fit, loaded by name: the base of each system's ``Profile``.
+    """Settings of a fit, loaded by name: the base of each system's `Profile`.
 
     Attributes:
-        FILES: First part of the names of its files, ``configs/FILES-NAME.yaml``.
+        FILES: First part of the names of its files, `configs/FILES-NAME.yaml`.
         name: Shown in reports.
     """
 
@@ -71,7 +71,7 @@ class Settings(BaseModel):
         """Loads a profile.
 
         Args:
-            profile: A name (``configs/FILES-NAME.yaml``), the path of a YAML file, or settings, which are returned.
+            profile: A name (`configs/FILES-NAME.yaml`), the path of a YAML file, or settings, which are returned.
 
         Raises:
             WlmError: Unknown profile, unreadable file, or a wrong setting.
@@ -86,7 +86,7 @@ class Settings(BaseModel):
 
         Args:
             values: By name; None leaves a setting as it is.
-            prefix: Text before the setting's name in an error, ``"--"`` where they are options.
+            prefix: Text before the setting's name in an error, `"--"` where they are options.
 
         Raises:
             WlmError: Unknown or out of range.
@@ -108,7 +108,7 @@ class Progress:
         stage: What is being done, in a word or two: "fit", "cluster".
         done, total: Steps done and in all; a total of 0 is unknown.
         seconds: Since the work began.
-        figures: What can be said so far, by name with the unit: ``{"PSNR dB": 41.2}``. NaN is unknown.
+        figures: What can be said so far, by name with the unit: `{"PSNR dB": 41.2}`. NaN is unknown.
     """
 
     stage: str
@@ -135,8 +135,8 @@ class Meter:
 
         Args:
             progress: The callback, or None for no reports.
-            stage: As in ``Progress``.
-            total: As in ``Progress``.
+            stage: As in `Progress`.
+            total: As in `Progress`.
             every: Seconds between two reports.
         """
         self._progress, self._stage, self._total, self._every = progress, stage, total, every
@@ -153,7 +153,7 @@ class Meter:
         return done >= self._total > 0 or time.perf_counter() - self._last >= self._every
 
     def report(self, done: int, **figures: float) -> None:
-        """Reports at once; ``figures`` have their names' spaces as underscores: ``PSNR_dB=41.2``."""
+        """Reports at once; `figures` have their names' spaces as underscores: `PSNR_dB=41.2`."""
         if self._progress is None:
             return
         self._last = time.perf_counter()
@@ -191,7 +191,7 @@ class Part:
     Attributes:
         dtype: NumPy type, or the types of which it is one.
         shape: Sizes; None where any size will do. A part with a size of 0 is left out of the file.
-        optional: Whether the file may lack it; it is then of size 0 where ``shape`` says None.
+        optional: Whether the file may lack it; it is then of size 0 where `shape` says None.
     """
 
     dtype: type | tuple[type, ...]
@@ -240,8 +240,8 @@ def check_parts(tensors: Mapping[str, np.ndarray], table: Mapping[str, Part]) ->
 class Model:
     """Base of a system's model: what its file holds.
 
-    Saving, loading and decoding are asked for here and done in the system's ``codec`` and ``decode``. These stand above
-    its ``model``, so they are looked up when they are called.
+    Saving, loading and decoding are asked for here and done in the system's `codec` and `decode`. These stand above
+    its `model`, so they are looked up when they are called.
 
     Attributes:
         SYSTEM: The system's name in files.
@@ -261,7 +261,7 @@ class Model:
         return write_artifact(path, self.SYSTEM, *self._encoded())
 
     def file_bytes(self) -> int:
-        """Size of the file that ``save`` writes, bytes."""
+        """Size of the file that `save` writes, bytes."""
         return sum(memoryview(part).nbytes for part in encode_artifact(self.SYSTEM, *self._encoded()))
 
     def decoder(self, device: str = "cpu", **options: Any) -> Any:
@@ -269,10 +269,10 @@ class Model:
 
         Args:
             device: "cpu", "cuda" or "cuda:N".
-            options: As the system's ``Decoder`` takes them.
+            options: As the system's `Decoder` takes them.
 
         Returns:
-            The system's ``Decoder``.
+            The system's `Decoder`.
 
         Raises:
             WlmError: No such device.
@@ -311,7 +311,7 @@ def decode(path: str | os.PathLike[str], artifact: Artifact, make: Callable[[Art
     Args:
         path: The file, for messages.
         artifact: Its content.
-        make: A codec's ``decode``, which raises WlmError, ValueError, TypeError, LookupError or AttributeError on parts
+        make: A codec's `decode`, which raises WlmError, ValueError, TypeError, LookupError or AttributeError on parts
             that don't fit.
     """
     try:

@@ -1,8 +1,8 @@
 """Planes and volumes of features, sampled linearly, with a last axis that is clamped or periodic.
 
-A plane is ``[T, W, C]``: row = time (or v), column = u. A volume is ``[T, H, W, C]``. Space is clamped to the border;
-the first axis is clamped, or wraps round when ``periodic`` (its last slice is the first's neighbour). Coordinates are
-in [0, 1], cell centres at (i + 1/2) / size. Any number of channels C. Twins in torch: ``wlm.ops.plain``.
+A plane is `[T, W, C]`: row = time (or v), column = u. A volume is `[T, H, W, C]`. Space is clamped to the border;
+the first axis is clamped, or wraps round when `periodic` (its last slice is the first's neighbour). Coordinates are
+in [0, 1], cell centres at (i + 1/2) / size. Any number of channels C. Twins in torch: `wlm.ops.plain`.
 """
 
 import warp as wp
@@ -19,7 +19,7 @@ _CLAMP, _WRAP = (wp.constant(BOUNDARIES.index(name)) for name in ("clamp", "wrap
 
 @wp.func
 def cell(coordinate: float, size: int) -> int:
-    """The lower neighbour of a coordinate in [0, 1] on an axis of ``size`` cells; may be -1."""
+    """The lower neighbour of a coordinate in [0, 1] on an axis of `size` cells; may be -1."""
     return int(wp.floor(coordinate * float(size) - 0.5))
 
 
@@ -39,7 +39,7 @@ def axis_index(i: int, size: int, periodic: int) -> int:
 
 @wp.struct
 class _Cell:
-    """Where a point lies in its volume: along the width, the height and the first axis, of which ``base`` is row 0.
+    """Where a point lies in its volume: along the width, the height and the first axis, of which `base` is row 0.
 
     A plane is a volume of height 1, in which only the first four of eight corners differ.
     """
@@ -166,15 +166,15 @@ def sample(values, times: int, layers, points, out, periodic: bool = False) -> N
 def sample_backward(
     values, times: int, layers, points, grad_out, grad_values, grad_points, periodic: bool = False
 ) -> None:
-    """The adjoint of ``sample``; by a coordinate it is the slope between two cell centres, 0 where it is clamped.
+    """The adjoint of `sample`; by a coordinate it is the slope between two cell centres, 0 where it is clamped.
 
-    On CUDA points are added to ``grad_values`` in any order, so that the last bits change from run to run.
+    On CUDA points are added to `grad_values` in any order, so that the last bits change from run to run.
 
     Args:
-        values, times, layers, points, periodic: As for ``sample``.
+        values, times, layers, points, periodic: As for `sample`.
         grad_out: float [N, C].
         grad_values: float [L * T, H, W, C], added to; of shape [0, 0, 0, 0]: not computed.
-        grad_points: float, like ``points``, written; of shape [0, 0]: not computed.
+        grad_points: float, like `points`, written; of shape [0, 0]: not computed.
     """
     inputs = [values, times, layers, points, int(periodic), grad_out]
     outputs = [grad_values, grad_points]

@@ -1,16 +1,16 @@
 """A small MLP with two hidden layers of one width, GELU between and no activation at the output.
 
-The weights of N networks lie in two arrays, column by column, so that a layer is ``h += column[c] * x[c]``:
+The weights of N networks lie in two arrays, column by column, so that a layer is `h += column[c] * x[c]`:
 
     hidden  [N, I + 1 + H + 1] of vecH: I columns of the first layer, its bias, H columns of the second, its bias
     output  [N, H + 1] of vecO:         H columns of the third layer, its bias
 
-I inputs, H units (any width; 8 to 64 are tested), O outputs. ``kernels`` builds and caches the functions of one
+I inputs, H units (any width; 8 to 64 are tested), O outputs. `kernels` builds and caches the functions of one
 shape. GELU is "exact" (erf), "tanh" (the tanh form, within 4.8e-4 of it) or "fast" (the tanh form with the GPU's own
 tanh instruction, 2^-11 relative; on the CPU the same as "tanh").
 
-``MlpKernels.backward`` is the adjoint of the inputs and of each layer; the gradients of the weights are matrix products
-of what it writes, which ``wlm.ops.mlp`` leaves to torch. ``wlm.ops.plain.mlp`` is the same network in ten lines.
+`MlpKernels.backward` is the adjoint of the inputs and of each layer; the gradients of the weights are matrix products
+of what it writes, which `wlm.ops.mlp` leaves to torch. `wlm.ops.plain.mlp` is the same network in ten lines.
 """
 
 import functools
@@ -86,12 +86,12 @@ class MlpKernels:
         vec_in: vec of I floats.
         vec_hidden: vec of H floats.
         vec_out: vec of O floats.
-        first, second, third: ``wp.func`` of each layer before its activation.
-        act: ``wp.func`` vecH -> vecH, GELU.
-        gate, slope: ``wp.func``s with act(a) = a gate(a), and its derivative slope(a, gate(a)).
-        back_hidden: ``wp.func``: delta of the second layer -> gradient of its input.
-        back_output: ``wp.func``: delta of the third layer -> gradient of its input.
-        back_input: ``wp.func``: delta of the first layer -> gradient of the network's input.
+        first, second, third: `wp.func` of each layer before its activation.
+        act: `wp.func` vecH -> vecH, GELU.
+        gate, slope: `wp.func`s with act(a) = a gate(a), and its derivative slope(a, gate(a)).
+        back_hidden: `wp.func`: delta of the second layer -> gradient of its input.
+        back_output: `wp.func`: delta of the third layer -> gradient of its input.
+        back_input: `wp.func`: delta of the first layer -> gradient of the network's input.
     """
 
     inputs: int
@@ -129,7 +129,7 @@ class MlpKernels:
         before the activation: x and d1, h1 and d2, h2 and grad_y.
 
         Args:
-            hidden, output, x: As for ``forward``.
+            hidden, output, x: As for `forward`.
             grad_y: vecO [N, B].
             grad_x: vecI [N, B], written.
             h1, h2: vecH [N, B], written: the layers' results.
@@ -151,7 +151,7 @@ def kernels(inputs: int, hidden: int, gelu: str = "exact", outputs: int = 3) -> 
     Args:
         inputs: I >= 1.
         hidden: H >= 1.
-        gelu: One of ``GELUS``.
+        gelu: One of `GELUS`.
         outputs: O >= 1.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Bodies of native functions: CUDA C++ in files of its own, in the folder ``native`` beside the kernels that use it."""
+"""Bodies of native functions: CUDA C++ in files of its own, in the folder `native` beside the kernels that use it."""
 
 from importlib import resources
 
@@ -6,11 +6,11 @@ __all__ = ["native_source"]
 
 
 def native_source(package: str, name: str, **constants: int) -> str:
-    """Reads the body of a native function for ``wp.func_native``, or a part of one.
+    """Reads the body of a native function for `wp.func_native`, or a part of one.
 
     Args:
-        package: The package whose folder ``native`` has the file ``NAME.cuh``: ``__package__`` of the kernels.
-        name: See ``package``.
+        package: The package whose folder `native` has the file `NAME.cuh`: `__package__` of the kernels.
+        name: See `package`.
         constants: Integers that the code uses, by name.
 
     Returns:

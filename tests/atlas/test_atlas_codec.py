@@ -31,7 +31,7 @@ def assert_same(a: AtlasModel, b: AtlasModel) -> None:
 @pytest.mark.parametrize("stored", ["half", "bc6h", "astc"])
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_model_comes_back(kind, stored, tmp_path, monkeypatch):
-    """So do the facts of ``describe``, which decodes nothing; and the size is the bits of the textures and a header."""
+    """So do the facts of `describe`, which decodes nothing; and the size is the bits of the textures and a header."""
     mesh, path = sheet(), tmp_path / "a.wlm"
     model = random_model(mesh, kind, stored)
     size = model.save(path)

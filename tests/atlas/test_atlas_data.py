@@ -1,4 +1,4 @@
-"""Input: every stated behaviour of ``wlm.atlas.data``, the coverage of texels, and a mesh with new UVs."""
+"""Input: every stated behaviour of `wlm.atlas.data`, the coverage of texels, and a mesh with new UVs."""
 
 import json
 from pathlib import Path

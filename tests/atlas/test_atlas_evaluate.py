@@ -1,4 +1,4 @@
-"""Scoring a decoded lightmap: known errors, agreement with ``wlm.metrics``, seams, and every stated behaviour."""
+"""Scoring a decoded lightmap: known errors, agreement with `wlm.metrics`, seams, and every stated behaviour."""
 
 import json
 import math
@@ -73,7 +73,7 @@ def test_a_known_error(device):
 
 @pytest.mark.parametrize("resolution", [40, 90])
 def test_against_the_metrics_of_pictures(device, resolution):
-    """A blurred lightmap in views that cut nothing off; each view by ``wlm.metrics`` on its whole pictures."""
+    """A blurred lightmap in views that cut nothing off; each view by `wlm.metrics` on its whole pictures."""
     mesh, views = lit_cube(3), sphere_views(4, seed=3)
     small = torch.tensor(waves(12, 18))
 

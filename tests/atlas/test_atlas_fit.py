@@ -288,7 +288,7 @@ def test_one_seed_gives_one_file(name: str, tmp_path):
 
 @pytest.mark.parametrize("name", CODECS)
 def test_tiles_of_blocks(name: str):
-    """No block holds two tiles; sizes are chosen by the error after the codec; ``texels`` are the decoded blocks."""
+    """No block holds two tiles; sizes are chosen by the error after the codec; `texels` are the decoded blocks."""
     from wlm.atlas import colour
 
     mesh = sheet(height=90, width=70)

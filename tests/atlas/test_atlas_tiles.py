@@ -122,7 +122,7 @@ def _kron(nx: int, ny: int, points: int) -> np.ndarray:
 
 
 def _least_squares(tiles: grid.Tiles, nx: int, ny: int, pull: float) -> np.ndarray:
-    """The samples [T, ny, nx, 3] in float64, pulled towards those of equal weights as ``solve`` says."""
+    """The samples [T, ny, nx, 3] in float64, pulled towards those of equal weights as `solve` says."""
     points = grid.SUPERSAMPLING * tiles.size
     both = _kron(nx, ny, points)
     out = []

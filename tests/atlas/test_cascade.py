@@ -95,7 +95,7 @@ def test_the_least_textures():
 
 @pytest.mark.parametrize("lut_scale", [0.7, 0.0])
 def test_a_steps_gradient_of_a_view(device: str, lut_scale: float):
-    """Against autograd through the drawing of ``wlm.ops.raster``, a float64 reading and the image losses."""
+    """Against autograd through the drawing of `wlm.ops.raster`, a float64 reading and the image losses."""
     mesh, profile = _box(), _profile(lut_scale=lut_scale, gradient=0.6)
     uv, start = _start(mesh, profile)
     random = np.random.default_rng(1)

@@ -104,7 +104,7 @@ def test_the_real_trial():
 
 @pytest.fixture
 def bench(monkeypatch):
-    """Two scenes of grey smoke, and a tracer that works on the variants in ``works`` alone."""
+    """Two scenes of grey smoke, and a tracer that works on the variants in `works` alone."""
     works, lines = set(), []
     references = [torch.full((8, 16, 16), 0.5) for _ in range(4)]
 

@@ -35,7 +35,7 @@ def constant(*colour: float) -> Light:
 def sheet(
     light: Light = soft, height: int = 40, width: int = 48, quads: int = 4, name: str = "sheet"
 ) -> LightmappedMesh:
-    """A bent sheet of ``quads`` x ``quads``, one chart that fills the whole lightmap."""
+    """A bent sheet of `quads` x `quads`, one chart that fills the whole lightmap."""
     v, u = np.meshgrid(*[np.linspace(0.0, 1.0, quads + 1)] * 2, indexing="ij")
     position = np.stack([u, v, 0.3 * np.sin(3.0 * u)], -1).reshape(-1, 3)
     uv = np.stack([u, v], -1).reshape(-1, 2)
@@ -67,7 +67,7 @@ def triangle(light: Light = soft, height: int = 16, width: int = 16, name: str =
 
 
 def write_files(folder: Path, mesh: LightmappedMesh) -> tuple[Path, Path]:
-    """Writes a mesh and its lightmap as ``mesh.glb`` and ``light.exr``."""
+    """Writes a mesh and its lightmap as `mesh.glb` and `light.exr`."""
     write_glb(folder / "mesh.glb", mesh.document, [], 1)
     write_exr(folder / "light.exr", mesh.lightmap)
     return folder / "mesh.glb", folder / "light.exr"

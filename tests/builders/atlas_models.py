@@ -13,7 +13,7 @@ KINDS = ("tiles", "cascade", "plain", "plain with uv")
 
 
 def random_model(mesh: LightmappedMesh, kind: str, colour: str = "half", seed: int = 0, tile: int = 7) -> AtlasModel:
-    """Makes a model of one of ``KINDS`` for a mesh."""
+    """Makes a model of one of `KINDS` for a mesh."""
     random = np.random.default_rng(seed)
     height, width = mesh.mask.shape
     method = kind.split()[0]

@@ -42,10 +42,10 @@ def check_outputs(rows, folder: Path, panels, plotted=None) -> None:
 
 
 def check_command(monkeypatch, module, rows, words: list, folder: Path) -> tuple[str, tuple, dict]:
-    """Runs ``wlm bench`` with a ``run`` that gives these rows; checks what it writes.
+    """Runs `wlm bench` with a `run` that gives these rows; checks what it writes.
 
     Returns:
-        The command line in the result file, and the arguments that ``run`` was called with.
+        The command line in the result file, and the arguments that `run` was called with.
     """
     calls = []
 

@@ -23,10 +23,10 @@ class Subject:
     Attributes:
         name: Of its package.
         file: Written before the systems had a contract.
-        decode: Turns a loaded model into arrays, by the names of ``stored``.
+        decode: Turns a loaded model into arrays, by the names of `stored`.
         stored: What the file decoded to when it was written; None: nothing is kept of it.
         data: Makes a small input.
-        compress: Fits it within seconds; takes the keywords of ``compress``.
+        compress: Fits it within seconds; takes the keywords of `compress`.
         evaluate: Scores a model of that data within a second.
         export: Exports a model into a folder.
         open_checkpoint: Opens a checkpoint of that fit: (output, resume); None: the fit keeps none.

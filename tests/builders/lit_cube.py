@@ -6,7 +6,7 @@ from wlm.atlas.data import LightmappedMesh, from_arrays
 
 HEIGHT, WIDTH = 64, 96
 DIRECTIONS = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], np.float64)
-"""Normals. Face k has the triangles [k t, (k + 1) t), t = 2 ``parts``², and its chart in cell k of 2 x 3."""
+"""Normals. Face k has the triangles [k t, (k + 1) t), t = 2 `parts`², and its chart in cell k of 2 x 3."""
 
 
 def corners(parts: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

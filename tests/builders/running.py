@@ -12,7 +12,7 @@ from wlm.system import Meter
 
 
 def call(*words, code=0):
-    """Runs the command in this process and returns what it printed to stdout; ``call.stderr`` has the rest."""
+    """Runs the command in this process and returns what it printed to stdout; `call.stderr` has the rest."""
     result = CliRunner().invoke(app, [str(word) for word in words])
     if result.exception is not None and not isinstance(result.exception, SystemExit):
         raise result.exception

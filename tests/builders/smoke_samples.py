@@ -41,7 +41,7 @@ def sample(
 
 @functools.cache
 def small_pool(count: int = 6, first: int = 0, resolution: int = 32, kind: str = "paper") -> Pool:
-    """Samples on the CPU, those of odd numbers hot; numbers begin at ``first``."""
+    """Samples on the CPU, those of odd numbers hot; numbers begin at `first`."""
     guides, targets = [], []
     for i in range(first, first + count):
         pair = []

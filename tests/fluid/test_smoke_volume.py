@@ -1,4 +1,4 @@
-"""Reading volumes: arrays, ``.npz`` and NanoVDB files, repairs and refusals."""
+"""Reading volumes: arrays, `.npz` and NanoVDB files, repairs and refusals."""
 
 import struct
 from pathlib import Path

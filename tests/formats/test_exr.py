@@ -225,11 +225,7 @@ def test_other_shapes_are_a_value_error(tmp_path, shape):
 def test_a_closed_stderr_does_no_harm(tmp_path):
     path = tmp_path / "a.exr"
     write_exr(path, _pixels(3))
-    code = (
-        "import os, sys; os.close(2)\n"
-        "from wlm.formats.exr import read_exr\n"
-        "print(read_exr(sys.argv[1])[0].shape)"
-    )
+    code = "import os, sys; os.close(2)\nfrom wlm.formats.exr import read_exr\nprint(read_exr(sys.argv[1])[0].shape)"
     done = subprocess.run([sys.executable, "-c", code, str(path)], stdout=subprocess.PIPE, text=True)
     assert done.stdout.strip() == "(37, 21, 3)"
 

@@ -1,1 +1,1 @@
-"""The kernels against ``reference``, on every device."""
+"""The kernels against `reference`, on every device."""

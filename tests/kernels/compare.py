@@ -6,7 +6,7 @@ import warp as wp
 
 
 def array(values: np.ndarray, dtype, device: str, grad: bool = False) -> wp.array:
-    """Puts values on a device; ``dtype`` is the Warp type of an element."""
+    """Puts values on a device; `dtype` is the Warp type of an element."""
     return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device, requires_grad=grad)
 
 
@@ -26,7 +26,7 @@ def error(got, want) -> float:
 
 
 def close(got, want, tolerance: float = 1e-4, name: str = "values") -> None:
-    """Asserts that ``error`` is within a tolerance."""
+    """Asserts that `error` is within a tolerance."""
     found = error(got, want)
     assert found <= tolerance, f"{name}: error {found:.3g} of the largest value, allowed {tolerance:.3g}"
 

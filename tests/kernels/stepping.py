@@ -21,13 +21,13 @@ class Case:
 
     Attributes:
         temporal: Whether the tiles have temporal maps.
-        hidden, gelu, samples: As in ``Profile``.
+        hidden, gelu, samples: As in `Profile`.
         shape: Resolution and slices of F_uvt, columns and rows of the planes.
         periodic: A periodic axis of evenly spaced frames, or a clamped one from 0 to 1 in uneven steps.
-        emphasis: See ``wlm_kernels.lightmap.features.Batch``; the weights are random where it isn't 0.
+        emphasis: See `wlm_kernels.lightmap.features.Batch`; the weights are random where it isn't 0.
         numbers: Of the tiles in their grid.
         texels: How many texels of each tile are valid.
-        settings: Other fields of ``Profile``.
+        settings: Other fields of `Profile`.
     """
 
     temporal: bool = True
@@ -42,7 +42,7 @@ class Case:
     settings: dict = field(default_factory=dict)
 
     def profile(self) -> Profile:
-        """The settings; ten steps and no samples between times unless ``settings`` has others."""
+        """The settings; ten steps and no samples between times unless `settings` has others."""
         resolution, slices, columns, rows = self.shape
         return Profile(
             name="test",
@@ -83,7 +83,7 @@ class Case:
 
 
 def trainer(case: Case, device: str, seed: int = 3, spread: bool = True) -> Trainer:
-    """A trainer; with ``spread`` its maps and networks are random with values out of range, not the initial ones."""
+    """A trainer; with `spread` its maps and networks are random with values out of range, not the initial ones."""
     result = Trainer(case.profile(), case.axis(), case.targets(), case.temporal, seed, device)
     if spread:
         for key, values in _clear_values(result).items():
@@ -236,7 +236,7 @@ def _between(
 
 
 def problem(trainer: Trainer, case: Case, quantised: bool) -> Problem:
-    """The coming step of a trainer as a ``Problem``."""
+    """The coming step of a trainer as a `Problem`."""
     place, features = draw(trainer, quantised)
     place = torch.from_numpy(place).long()
     targets = case.targets()

@@ -52,7 +52,7 @@ class Grid:
         reach: float | None = None,
         threshold: float = 0.0,
     ):
-        """``reach``: fine cells that a trace goes in a step, with bricks; None: without bricks."""
+        """`reach`: fine cells that a trace goes in a step, with bricks; None: without bricks."""
         coarse = u.shape[:3]
         self.box, self.device, self.scheme = make_box(coarse, refinement, ends), device, scheme
         self.dtype = STORAGES[storage]

@@ -34,7 +34,7 @@ class Reading:
 
 
 def _case(shape: tuple, lut_shape: tuple | None, spread: float, count: int = 400):
-    """Textures, points inside and outside, and a direction for gradients; T_c reaches ``spread`` periods away.
+    """Textures, points inside and outside, and a direction for gradients; T_c reaches `spread` periods away.
 
     Points whose slope float32 may tell otherwise than float64 (at a texel's centre or the end of a wave) are left out.
     """

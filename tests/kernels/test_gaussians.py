@@ -49,7 +49,7 @@ def _problem(latent: int, anisotropy: float, gaussians: int = 24, points: int = 
 
 
 class Sums:
-    """A problem on a device; ``test`` names the cubes' lists, None is no lists."""
+    """A problem on a device; `test` names the cubes' lists, None is no lists."""
 
     def __init__(self, problem: Problem, device: str, support: str = "ellipsoid", test: str | None = None, cut=CUT):
         self.support, self.cut = support, cut
@@ -83,7 +83,7 @@ def _in_own_size(grad: np.ndarray, rows: np.ndarray) -> np.ndarray:
 
 
 def _hold(got: np.ndarray, want: np.ndarray, rows: np.ndarray, turns: bool = True, name: str = "") -> None:
-    """Compares gradients by group; ``turns``: whether any Gaussian feels a turn."""
+    """Compares gradients by group; `turns`: whether any Gaussian feels a turn."""
     got, want = _in_own_size(got, rows), _in_own_size(want, rows)
     for group, part in GROUPS.items():
         if group == "rotation" and not turns:

@@ -37,7 +37,7 @@ def _view(scene: Scene) -> View:
 
 
 def _run(launch, planes: tuple, scene: Scene, device: str, *arguments, dtype=wp.float32, hot=None, **options):
-    """A march's result; ``hot``: temperature and emission."""
+    """A march's result; `hot`: temperature and emission."""
     heat = () if hot is None else (array(hot[0], dtype, device), hot[1])
     medium = Medium(array(scene.density, dtype, device), scene.extinction, *heat)
     out = wp.full((*planes, scene.height, scene.width), np.nan, dtype=float, device=device)

@@ -1,6 +1,6 @@
 """The MLP as an operation: networks far out, of zeros, the same bits every time, and shapes that there are none of.
 
-``tests/ops/test_operations.py`` holds values and gradients to the twin, at all widths that the settings allow.
+`tests/ops/test_operations.py` holds values and gradients to the twin, at all widths that the settings allow.
 """
 
 import numpy as np

@@ -13,7 +13,7 @@ RATES = {"map_rate": 0.02, "net_rate": 0.005, "final_rate": 0.1}
 
 
 def _share(step: int, steps: int, final: float) -> float:
-    """Half a cosine from 1 at the first step to ``final`` at the last."""
+    """Half a cosine from 1 at the first step to `final` at the last."""
     return final + (1.0 - final) * 0.5 * (1.0 + math.cos(math.pi * step / (steps - 1)))
 
 

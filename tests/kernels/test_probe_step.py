@@ -91,14 +91,12 @@ class Step:
         whole = np.zeros((len(grad_f), self.padded), np.float32)
         whole[:, : grad_f.shape[1]] = grad_f
         grad = array(whole, float, self.device)
-        self.launches.collect(
-            self.groups, self.shapes, self.used, self.by_gaussian, grad, self.cut, self.sums, *lane
-        )
+        self.launches.collect(self.groups, self.shapes, self.used, self.by_gaussian, grad, self.cut, self.sums, *lane)
         return self.sums.numpy()
 
 
 def _bits(words: wp.array, count: int) -> np.ndarray:
-    """The first ``count`` bits of each row of words; what lies behind them must be 0."""
+    """The first `count` bits of each row of words; what lies behind them must be 0."""
     bits = np.unpackbits(words.numpy().view(np.uint8), axis=1, bitorder="little").astype(bool)
     assert not bits[:, count:].any()
     return bits[:, :count]
@@ -331,7 +329,7 @@ def test_bounds(device: str):
 
 
 def test_fixed_gaussians(device: str):
-    """Without ``move`` the network goes on alone."""
+    """Without `move` the network goes on alone."""
     free, fixed = Training(device), Training(device, move=0)
     rows, net = fixed.run()
     np.testing.assert_array_equal(rows, fixed.step.rows)

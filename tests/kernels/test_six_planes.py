@@ -32,7 +32,7 @@ def _near(guide: torch.Tensor, reach: int, half: bool, device: str) -> np.ndarra
 
 
 def _compose(heads, guide, filters, places, stem, smoke, *, reach=8, half=False, device="cpu") -> torch.Tensor:
-    """``heads``: [G, N, h, w]; ``filters``: [PLANES, c, edge, edge]; ``smoke``: [blocks]."""
+    """`heads`: [G, N, h, w]; `filters`: [PLANES, c, edge, edge]; `smoke`: [blocks]."""
     edge = filters.shape[-1]
     weights = filters.permute(1, 3, 2, 0).reshape(-1, PLANES).contiguous()
     height, width = guide.shape[1:]

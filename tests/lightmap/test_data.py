@@ -1,4 +1,4 @@
-"""Reading and checking sets: every stated behaviour of ``wlm.lightmap.data``."""
+"""Reading and checking sets: every stated behaviour of `wlm.lightmap.data`."""
 
 from __future__ import annotations
 
@@ -405,9 +405,7 @@ def test_parse_times_rounds_no_step_in():
     assert len(parse_times("0:1:0.3")) == 4
 
 
-@pytest.mark.parametrize(
-    "text", ["", "a", "1,,2", "0:24", "0:24:0", "0:24:-1", "3:3:1", "nan", "0:inf:1", "0:24:1e-9"]
-)
+@pytest.mark.parametrize("text", ["", "a", "1,,2", "0:24", "0:24:0", "0:24:-1", "3:3:1", "nan", "0:inf:1", "0:24:1e-9"])
 def test_parse_times_refuses(text):
     assert "times" in _message(parse_times, text)
 

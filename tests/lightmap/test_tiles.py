@@ -74,9 +74,7 @@ def test_split_encodes_gamma(lightmaps):
     plain, encoded = split(lightmaps, 1.0, [0]), split(lightmaps, GAMMA, [0])
     np.testing.assert_allclose(encoded.colour.astype(np.float64) ** GAMMA, plain.colour, rtol=1e-5)
     valid = plain.mask[0]
-    np.testing.assert_allclose(
-        encoded.colour[0][:, valid], plain.colour[0][:, valid] ** (1 / GAMMA), rtol=1e-5
-    )
+    np.testing.assert_allclose(encoded.colour[0][:, valid], plain.colour[0][:, valid] ** (1 / GAMMA), rtol=1e-5)
 
 
 def test_split_takes_tiles_in_the_order_given(lightmaps):

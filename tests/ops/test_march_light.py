@@ -68,7 +68,7 @@ def _cloud(seed: int = 3) -> np.ndarray:
 
 
 def test_against_the_smoke_systems_marches(device: str):
-    """``march_six.lit``, which marches to the light from every sample, and the transparency of the guiding map."""
+    """`march_six.lit`, which marches to the light from every sample, and the transparency of the guiding map."""
     density = _cloud()
     turn = np.linalg.qr(np.random.default_rng(4).normal(size=(3, 3)))[0]
     right, up, forward = turn * np.linalg.det(turn)

@@ -23,7 +23,7 @@ class Case:
     """Arguments of an operation.
 
     Attributes:
-        op: Its name in ``wlm.ops`` and in ``plain``.
+        op: Its name in `wlm.ops` and in `plain`.
         leaves: Tensors with a gradient, by argument.
         constants: Other tensors, by argument.
         options: Other arguments.
@@ -90,7 +90,7 @@ def _gaussians(count: int, latent: int) -> np.ndarray:
 
 
 def _rays(count: int, middle: tuple[float, ...], radius: float, distance: float) -> dict[str, np.ndarray]:
-    """Rays that begin ``distance`` before random points round the middle."""
+    """Rays that begin `distance` before random points round the middle."""
     direction = _units(count)
     origin = np.array(middle, np.float32) + radius * _normal(count, 3) - distance * direction
     return {"origin": origin, "direction": direction}

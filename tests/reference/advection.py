@@ -1,6 +1,6 @@
 """Advection in float64, cell by cell, without any code of the kernels.
 
-``Domain.semi_lagrangian`` and ``Domain.maccormack`` are the two steps. Positions are in fine cells; ``ends`` gives for
+`Domain.semi_lagrangian` and `Domain.maccormack` are the two steps. Positions are in fine cells; `ends` gives for
 each axis its low and high end: 0 periodic, 1 open, 2 closed.
 """
 
@@ -36,7 +36,7 @@ class Domain:
         return np.kron(self.solid, np.ones((self.refinement,) * 3, bool))
 
     def corners(self, p: np.ndarray, shape: np.ndarray, about: np.ndarray | None = None):
-        """The eight cells around p (or around ``about``), among cells of size 1, with their trilinear weights for p."""
+        """The eight cells around p (or around `about`), among cells of size 1, with their trilinear weights for p."""
         base = np.floor((p if about is None else about) - 0.5)
         f = p - 0.5 - base
         for corner in itertools.product((0, 1), repeat=3):

@@ -1,4 +1,4 @@
-"""3D Gaussians in float64: gradients by autograd, and what reaches what; the sum is ``wlm.ops.plain``'s."""
+"""3D Gaussians in float64: gradients by autograd, and what reaches what; the sum is `wlm.ops.plain`'s."""
 
 import numpy as np
 import torch

@@ -26,7 +26,7 @@ class Box:
     Attributes:
         c, w: Velocities [Q, 3] and weights [Q].
         solid: int [X, Y, Z], 0 is fluid.
-        faces: For some of ``FACES``: one of ``RANKS``, and the velocity or the density (None: mass is conserved).
+        faces: For some of `FACES`: one of `RANKS`, and the velocity or the density (None: mass is conserved).
         motion: (body, position in cells) -> velocity of its surface.
     """
 
@@ -37,12 +37,12 @@ class Box:
     motion: Callable = lambda body, x: np.zeros(3)
 
     def crossed(self, source: np.ndarray) -> list[int]:
-        """The faces, by their numbers in ``FACES``, beyond which a cell lies; periodic ones don't count."""
+        """The faces, by their numbers in `FACES`, beyond which a cell lies; periodic ones don't count."""
         beyond = np.stack([source < 0, source >= self.solid.shape], 1).ravel()
         return [number for number in np.flatnonzero(beyond) if FACES[number] in self.faces]
 
     def face_of(self, source: np.ndarray) -> tuple[str, object] | None:
-        """The condition of a population that comes from ``source``; None inside or across a periodic face."""
+        """The condition of a population that comes from `source`; None inside or across a periodic face."""
         ranked = []
         for number in self.crossed(source):
             kind, value = self.faces[FACES[number]]

@@ -7,7 +7,7 @@ import numpy as np
 
 @dataclass
 class Scene:
-    """A grid [X, Y, Z], its extinction per voxel, and a camera in voxels as ``marching.View`` has it."""
+    """A grid [X, Y, Z], its extinction per voxel, and a camera in voxels as `marching.View` has it."""
 
     density: np.ndarray
     extinction: float

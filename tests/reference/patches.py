@@ -31,7 +31,7 @@ def patch(image: np.ndarray, corners: np.ndarray, size: int) -> np.ndarray:
 
 
 def reordered(samples: np.ndarray, size: int, order: tuple[int, int, int]) -> np.ndarray:
-    """The patch [N, ...] of the triangle whose vertex ``order[k]`` is this one's vertex k (section 3.1, figure 3)."""
+    """The patch [N, ...] of the triangle whose vertex `order[k]` is this one's vertex k (section 3.1, figure 3)."""
     lattice = np.rint(barycentrics(size) * (size - 1)).astype(int)
     index = {tuple(weights): i for i, weights in enumerate(lattice.tolist())}
     return samples[[index[tuple(weights)] for weights in lattice[:, list(order)].tolist()]]

@@ -1,4 +1,4 @@
-"""Rasterizing by its definition, with how sure it is: ``wlm.ops.plain`` says how a pixel is weighed."""
+"""Rasterizing by its definition, with how sure it is: `wlm.ops.plain` says how a pixel is weighed."""
 
 from fractions import Fraction
 

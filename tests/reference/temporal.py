@@ -69,7 +69,7 @@ def train_features(
     periodic: bool,
     quantised: bool,
 ) -> torch.Tensor:
-    """``features_of`` from maps in training; keys and shapes as in ``wlm.lightmap.trainer.Trainer.views``."""
+    """`features_of` from maps in training; keys and shapes as in `wlm.lightmap.trainer.Trainer.views`."""
     uv = plain.bc7_texels(maps["uv_endpoints"], maps["uv_weights"], quantised=quantised)
     temporal = None
     if "uvt_weights" in maps:
@@ -104,7 +104,7 @@ def decode(
     """Colour in gamma space, >= 0, of one tile.
 
     Args:
-        features: [M, I] of ``features_of``.
+        features: [M, I] of `features_of`.
         hidden, output: The tile's network, [I + H + 2, H] and [H + 1, 3].
         kind: The GELU.
         affine: Shift and spread, [2, 3].

@@ -1,4 +1,4 @@
-"""Reading a tiled lightmap in float64, one point at a time, by ``numpy.interp``."""
+"""Reading a tiled lightmap in float64, one point at a time, by `numpy.interp`."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""The calls of ``wlm.smoke`` as a user writes them: the README's snippet, and the three ways to lightmaps."""
+"""The calls of `wlm.smoke` as a user writes them: the README's snippet, and the three ways to lightmaps."""
 
 import numpy as np
 import pytest

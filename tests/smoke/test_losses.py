@@ -89,7 +89,7 @@ def test_warping_by_nan_or_infinity_is_outside():
 
 @pytest.mark.parametrize("size", [(7, 9), (1, 5), (1, 1)])
 def test_warping_and_its_gradient_are_those_of_torch(size):
-    """Against ``grid_sample``, which clamps likewise."""
+    """Against `grid_sample`, which clamps likewise."""
     height, width = size
     image = torch.randn(2, 3, height, width, dtype=torch.float64, requires_grad=True)
     motion = 4 * torch.randn(2, 2, height, width, dtype=torch.float64)

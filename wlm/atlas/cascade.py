@@ -2,11 +2,11 @@
 (lightmap-uv-clustering-cascade, sections 3.1 to 3.3).
 
 T_p begins as the regenerated lightmap made smaller by epsilon_p, T_c as the coordinates of its own texels' centres;
-``wlm_kernels.atlas.cascade`` says how they are read. Adam then tunes both:
+`wlm_kernels.atlas.cascade` says how they are read. Adam then tunes both:
 
-    space "views"   A step draws the mesh from one random camera of ``views``, once with the old UVs and the lightmap,
+    space "views"   A step draws the mesh from one random camera of `views`, once with the old UVs and the lightmap,
                     its gaps filled, and once with the new UVs and the cascade. The loss is the L1 of the colours plus
-                    ``gradient`` times the L1 of the images' gradients. The paper's.
+                    `gradient` times the L1 of the images' gradients. The paper's.
     space "uv"      A step draws random points on the mesh, uniform over its area, as many as a quarter of a view's
                     pixels, in pairs one texel of the lightmap apart on one triangle. The loss is the same, with the
                     difference within a pair in place of an image's gradient. Places that no camera sees count too;
@@ -15,7 +15,7 @@ T_p begins as the regenerated lightmap made smaller by epsilon_p, T_c as the coo
 Where the paper is silent: the loss is a sum and not a mean, which changes Adam's steps by its epsilon alone; radiance,
 and so T_p's rate, is in units of the lightmap's mean, since a map of a dark room would else be tuned more coarsely than
 that of a bright one; after each step T_p is clamped to the range of half floats and T_c to [0, 1], which is the range
-of its 16 bits and where F is the identity. The paper's rates stay as they are; ``Profile.final_rate`` lets them decay,
+of its 16 bits and where F is the identity. The paper's rates stay as they are; `Profile.final_rate` lets them decay,
 so that less of the last steps' noise is stored, and start higher: 5e-3 and 1e-3 decaying to a hundredth are 0.6 to
 1.3 dB better than the best constant rates, with 300 steps as with 2,000.
 
@@ -69,7 +69,7 @@ def group_triangles(mesh: LightmappedMesh, profile: Profile, stages: Stages) -> 
 
     Args:
         mesh: The mesh.
-        profile: ``threshold``, ``colour_threshold`` and ``max_radiance``.
+        profile: `threshold`, `colour_threshold` and `max_radiance`.
         stages: Reports and times the stage.
 
     Returns:
@@ -106,10 +106,10 @@ def fit_cascade(
         stages: Reports and times the stages.
 
     Returns:
-        A model of method "cascade", or "plain" where ``lut_scale`` is 0: T_p alone, under the new UVs.
+        A model of method "cascade", or "plain" where `lut_scale` is 0: T_p alone, under the new UVs.
 
     Raises:
-        WlmError: As ``pack`` and ``tune``; or a package for the blocks of T_p is missing.
+        WlmError: As `pack` and `tune`; or a package for the blocks of T_p is missing.
     """
     with stages("pack"):
         packed = pack(mesh, clusters, profile.scale)
@@ -150,10 +150,10 @@ def initial(lightmap: np.ndarray, mask: np.ndarray, profile: Profile) -> Texture
     Args:
         lightmap: float32 [H_r, W_r, 3], the regenerated lightmap.
         mask: bool [H_r, W_r], its texels that are used; the others are filled from them.
-        profile: ``colour_scale`` and ``lut_scale``; a side is rounded, to at least one texel.
+        profile: `colour_scale` and `lut_scale`; a side is rounded, to at least one texel.
 
     Returns:
-        T_p, each texel the mean of those it covers, and T_c; no T_c if ``lut_scale`` is 0.
+        T_p, each texel the mean of those it covers, and T_c; no T_c if `lut_scale` is 0.
     """
     height, width = mask.shape
     colour = resize(lightmap, mask, *_sides(height, width, profile.colour_scale), "box").astype(np.float32)
@@ -180,7 +180,7 @@ def tune(
         mesh: The mesh.
         uv: float32 [F, 3, 2], the corners' UVs under which the cascade is read.
         textures: Initial values.
-        profile: ``space``, ``steps``, ``colour_rate``, ``lut_rate``, ``final_rate``, ``resolution`` and ``gradient``.
+        profile: `space`, `steps`, `colour_rate`, `lut_rate`, `final_rate`, `resolution` and `gradient`.
         seed: Seed of the cameras or points.
         device: "cpu" or "cuda:N".
         progress: Called about twice a second with the steps done.
@@ -314,7 +314,7 @@ class _Views:
 
     def draw(self) -> None:
         axes = self._axes.index_select(0, self._step)[0]
-        # Sums by hand, as in ``views``: vertices at one place must stay at one.
+        # Sums by hand, as in `views`: vertices at one place must stay at one.
         x, y, back = (sum(self._position[:, k] * axes[i, k] for k in range(3)) for i in range(3))
         w = DISTANCE - back
         # z / w only has to increase with the distance.

@@ -32,7 +32,7 @@ def charts(corner: np.ndarray, active: np.ndarray | None = None) -> np.ndarray:
     """Numbers the charts: triangles that share an edge are in one chart, those that share a corner alone are not.
 
     Args:
-        corner: int [F, 3], the corners' numbers, ``welded``.
+        corner: int [F, 3], the corners' numbers, `welded`.
         active: bool [F], triangles that take part; None: all.
 
     Returns:

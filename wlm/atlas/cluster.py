@@ -1,20 +1,20 @@
 """Groups of triangles whose lighting is alike (lightmap-uv-clustering-cascade, sections 3.1 and 3.2).
 
-Patches of the triangles (``wlm_kernels.atlas.patches``) are the nodes of a graph, with an edge where Dist is below
+Patches of the triangles (`wlm_kernels.atlas.patches`) are the nodes of a graph, with an edge where Dist is below
 lambda in one of the six orders of the vertices. The node with most edges (the lowest number of equals) represents a
 group: itself and its neighbours. The group is removed and the edges of the rest are counted again, until no edge is
 left (eq. 6).
 
 Edges are never stored but recomputed from the patches, so that memory grows with the triangles and the texels that
-they cover alone: at most ``samples_of(largest)`` words per triangle.
+they cover alone: at most `samples_of(largest)` words per triangle.
 
 Where the paper is silent or we differ:
 
-- The sizes of patches are 2 ** k + 1, the next that is at least R_s (eq. 1), and at most ``largest``.
+- The sizes of patches are 2 ** k + 1, the next that is at least R_s (eq. 1), and at most `largest`.
 - R_s takes lengths in texels, which is right where the lightmap isn't square too.
-- A triangle is excluded if its patch reads a texel above ``max_radiance`` in any channel; one at exactly that isn't.
-  The samples of a triangle larger than ``largest`` lie more than a texel apart, and texels between them are not read.
-- Colours are fractions of ``max_radiance``, and so are lambda and lambda_h: a dark map needs a lower maximum.
+- A triangle is excluded if its patch reads a texel above `max_radiance` in any channel; one at exactly that isn't.
+  The samples of a triangle larger than `largest` lie more than a texel apart, and texels between them are not read.
+- Colours are fractions of `max_radiance`, and so are lambda and lambda_h: a dark map needs a lower maximum.
 
 The stated behaviours:
 
@@ -72,7 +72,7 @@ class Clusters:
         group: int32 [F], number of each triangle's group. Groups of several come first, in the order in which they
             were formed, then single triangles, by number.
         representative: int32 [G], a triangle of each group.
-        order: int8 [F]: vertex k of the triangle goes to vertex p[k] of its representative, p = ``ORDERS[order]``. Of
+        order: int8 [F]: vertex k of the triangle goes to vertex p[k] of its representative, p = `ORDERS[order]`. Of
             orders that fit equally well the first; 0 for representatives.
         distance: float64 [F], Dist to the representative in this order (eq. 2), below lambda.
         excluded: bool [F], too bright or not active: each is a group of its own.
@@ -106,12 +106,12 @@ def cluster(
         uv: [V, 2], of the lightmap; v = 0 is the top of row 0.
         triangle: int [F, 3], vertices.
         lightmap: [H, W, 3], linear RGB.
-        threshold: lambda of eq. 4, a fraction of ``max_radiance``: the largest mean difference of two patches' samples
+        threshold: lambda of eq. 4, a fraction of `max_radiance`: the largest mean difference of two patches' samples
             and channels; above 0.
         colour_threshold: lambda_h, the largest distance of two dominant colours (section 3.2.1); at least 0.
         max_radiance: Triangles that are brighter stay alone (section 4.1.1); it also maps to 255 of 8 bits; above 0.
         active: bool [F], which triangles take part; None for all.
-        largest: The largest size of a patch, one of ``wlm_kernels.atlas.patches.SIZES``.
+        largest: The largest size of a patch, one of `wlm_kernels.atlas.patches.SIZES`.
         device: "cpu" or "cuda:N"; the result is the same on all.
         progress: Called with the triangles done, in stage "compare patches" while edges are counted, then in stage
             "cluster" while groups are formed.
@@ -199,7 +199,7 @@ def _corners(uv: np.ndarray, triangle: np.ndarray, shape: tuple[int, ...]) -> np
 
 
 def _levels(corner: np.ndarray, largest: int) -> np.ndarray:
-    """Each patch's size as a level, int32 [F]: R_s (eq. 1), or the next larger of ``SIZES``, at most ``largest``."""
+    """Each patch's size as a level, int32 [F]: R_s (eq. 1), or the next larger of `SIZES`, at most `largest`."""
     edge = (corner - np.roll(corner, 1, 1)) / 65536.0
     longest = np.hypot(edge[..., 0], edge[..., 1]).max(1, initial=0.0)
     return np.searchsorted(SIZES, np.minimum(np.ceil(longest), largest)).astype(np.int32)
@@ -231,7 +231,7 @@ def _greedy(
         graph: The graph, of M nodes.
         number: int [M], the triangle of each node, which settles ties.
         degree: int [M], reduced to those among the nodes that remain.
-        progress: As for ``cluster``.
+        progress: As for `cluster`.
 
     Yields:
         The node that represents a group, and the nodes of the group; groups of one are left out.

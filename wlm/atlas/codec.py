@@ -1,7 +1,7 @@
 """The artifact of an atlas model: both textures in one file.
 
-Parts: ``colour`` (half [Hp, Wp, 3], or uint8 [B, 16] where T_p is stored as blocks) and, where the model has them,
-``lut`` (uint16 [Hc, Wc, 2]) and ``uv`` (float32 [F, 3, 2]).
+Parts: `colour` (half [Hp, Wp, 3], or uint8 [B, 16] where T_p is stored as blocks) and, where the model has them,
+`lut` (uint16 [Hc, Wc, 2]) and `uv` (float32 [F, 3, 2]).
 """
 
 import os
@@ -69,7 +69,7 @@ def describe(path: str | os.PathLike[str]) -> dict[str, Any]:
         compression ratios by eq. 9 and on disk, source, bytes by part, the model's report and the profile.
 
     Raises:
-        WlmError: As ``wlm.load``, but for the blocks.
+        WlmError: As `wlm.load`, but for the blocks.
     """
     artifact = read_artifact(path, AtlasModel.SYSTEM)
     fields, texels, parts = system.decode(path, artifact, _checked)
@@ -96,7 +96,7 @@ def _checked(artifact: Artifact) -> tuple[dict[str, Any], tuple[int, int], dict[
     """Checks the settings and the parts, but not what blocks decode to.
 
     Returns:
-        The fields of ``AtlasModel`` but for its arrays; rows and columns of T_p; and the parts.
+        The fields of `AtlasModel` but for its arrays; rows and columns of T_p; and the parts.
     """
     settings = artifact.settings
     profile = check_settings(Profile, settings["profile"], "profile: ")

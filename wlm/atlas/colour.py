@@ -1,7 +1,7 @@
 """The colour texture as stored: half floats, or blocks that GPUs decode, BC6H or ASTC HDR 4x4.
 
 Both block formats take 16 bytes for 4x4 texels, 8 bits per texel. lightmap-uv-clustering-cascade, section 4.4, counts 6
-for ASTC 4x4, which the format doesn't have; we count 8. Both need the extra ``atlas``.
+for ASTC 4x4, which the format doesn't have; we count 8. Both need the extra `atlas`.
 """
 
 import math
@@ -34,7 +34,7 @@ def quantise(texels: np.ndarray, colour: str) -> dict[str, np.ndarray]:
         colour: "half", "bc6h" or "astc".
 
     Returns:
-        ``texels`` and, of a block format, ``blocks`` of ``AtlasModel``.
+        `texels` and, of a block format, `blocks` of `AtlasModel`.
 
     Raises:
         WlmError: A package is missing; the line names the extra.

@@ -1,7 +1,7 @@
 """Input: a mesh with lightmap UVs and its lightmap, read from files or arrays and checked; writing it with new UVs.
 
 The stated behaviours. "Inside" means inside the mask. Each kind of repair or oddity is one line of
-``LightmappedMesh.warnings``, with its count.
+`LightmappedMesh.warnings`, with its count.
 
 ====================================  ================================================================
 input                                 behaviour
@@ -11,7 +11,7 @@ a primitive without the UV set        left out, and unchanged in what is written
 a position or UV NaN or infinite,     error that names the primitive and the vertex
 a position beyond float32
 a UV outside [0, 1]                   clamped to it, as a lightmap is read clamped; warning
-triangles without area, in space or   kept, but not ``active``: they take no part; warning
+triangles without area, in space or   kept, but not `active`: they take no part; warning
 in UV
 no triangle with area                 error
 overlapping UVs, a mesh drawn twice   fine: what shares texels is lit alike; warning
@@ -81,7 +81,7 @@ class LightmappedMesh:
         active: bool [F], false where a triangle has no area; at least one is true.
         lightmap: float32 [H, W, 3], linear, finite, in [0, 65504].
         mask: bool [H, W], true where a texel belongs to a chart; at least one is.
-        uv_set: n of the ``TEXCOORD_n`` that was read; 0 where the input is no glTF.
+        uv_set: n of the `TEXCOORD_n` that was read; 0 where the input is no glTF.
         source: 16 hexadecimal digits of BLAKE2b over the mesh, the lightmap and the mask.
         warnings: Repairs and oddities, one line each.
         document: The file that the mesh came from, or one made for it.
@@ -114,15 +114,15 @@ def load(
     mask_path: str | os.PathLike[str] | None = None,
     uv_set: int | None = None,
 ) -> LightmappedMesh:
-    """Reads a mesh (``.glb``, ``.gltf``, ``.obj``) and its lightmap (EXR).
+    """Reads a mesh (`.glb`, `.gltf`, `.obj`) and its lightmap (EXR).
 
     Args:
         mesh_path: The mesh. All primitives that its scene draws and that have the UV set make one mesh.
-        lightmap_path: Linear RGB; row 0 is v = 0 of glTF, v = 1 of an ``.obj``.
+        lightmap_path: Linear RGB; row 0 is v = 0 of glTF, v = 1 of an `.obj`.
         mask_path: A PNG of the lightmap's size; a texel belongs to a chart where any colour channel is above 0. None
             derives it from the triangles.
-        uv_set: n of ``TEXCOORD_n``, the lightmap's UVs. None takes 1, where engines and viewers look for them, if any
-            primitive has it, else 0. An ``.obj`` has only 0.
+        uv_set: n of `TEXCOORD_n`, the lightmap's UVs. None takes 1, where engines and viewers look for them, if any
+            primitive has it, else 0. An `.obj` has only 0.
 
     Returns:
         The mesh, repaired as the module's table says.
@@ -161,7 +161,7 @@ def from_arrays(
     mask: np.ndarray | None = None,
     name: str = "array",
 ) -> LightmappedMesh:
-    """Makes a checked mesh of arrays, under the same rules as ``load``.
+    """Makes a checked mesh of arrays, under the same rules as `load`.
 
     Args:
         position: [V, 3] of numbers, in any unit; rounded to float32, as files hold it.
@@ -198,10 +198,10 @@ def write_mesh(
     same attributes.
 
     Args:
-        path: The ``.glb`` to write; its folder must exist.
+        path: The `.glb` to write; its folder must exist.
         mesh: The mesh.
         corner_uv: [F, 3, 2], the new UV of each triangle's corners; u right, v down; stored as float32.
-        uv_set: n of the new ``TEXCOORD_n``; None takes the one after the last that a primitive of the mesh has.
+        uv_set: n of the new `TEXCOORD_n`; None takes the one after the last that a primitive of the mesh has.
 
     Returns:
         n of the new set.
@@ -245,7 +245,7 @@ def _document(
             f"{where}: triangle: expected vertices 0 to {len(position) - 1}, found {triangle.min()} to {triangle.max()}"
         )
     used, corner = np.unique(triangle, return_inverse=True)
-    with np.errstate(over="ignore"):  # ``_check_finite`` reports it as infinite
+    with np.errstate(over="ignore"):  # `_check_finite` reports it as infinite
         return document_from_arrays(position[used], corner.reshape(-1, 3), uv[used], name)
 
 

@@ -16,7 +16,7 @@ __all__ = ["Decoder"]
 
 
 class Decoder:
-    """A model on a device. It is a ``wlm.atlas.evaluation.Sampler``.
+    """A model on a device. It is a `wlm.atlas.evaluation.Sampler`.
 
     Attributes:
         model: The model.

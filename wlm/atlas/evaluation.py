@@ -1,6 +1,6 @@
 """Error of a decoded lightmap in views of the mesh (lightmap-uv-clustering-cascade, section 4.1.4).
 
-The mesh is drawn from cameras around it, ``wlm.atlas.views``. A pixel is the lightmap's linear RGB at its surface
+The mesh is drawn from cameras around it, `wlm.atlas.views`. A pixel is the lightmap's linear RGB at its surface
 point, without any shading. The reference is the original lightmap read bilinearly, clamped, its gaps filled from the
 nearest texel of a chart. Only covered pixels count; a view without any is left out.
 
@@ -12,13 +12,13 @@ The stated behaviours:
 ====================================  ================================================================
 input                                 behaviour
 ====================================  ================================================================
-decoded exactly                       PSNR is ``PSNR_CAP_DB``, 120 dB, in a view as in the mean;
+decoded exactly                       PSNR is `PSNR_CAP_DB`, 120 dB, in a view as in the mean;
                                       1 - SSIM is 0; the seam ratio is NaN
 the reference is one grey, to within  the peak is 0, PSNR and SSIM are NaN, null in JSON: there is no
 a millionth                           range to measure against
 nothing covered in any view           the same, and the errors are NaN too
-no seam on any screen                 ``seam_error`` and ``seam_ratio`` are NaN
-an error at seams alone               ``seam_ratio`` is infinite, null in JSON
+no seam on any screen                 `seam_error` and `seam_ratio` are NaN
+an error at seams alone               `seam_ratio` is infinite, null in JSON
 NaN or Inf in decoded colours         error that names the decoder
 ====================================  ================================================================
 """
@@ -54,7 +54,7 @@ linear RGB float [N, 3] or, for labels, to int [N]; all on one device."""
 VIEWS, RESOLUTION = 50, 512
 """Cameras of a score, as many as in section 4.1.4, and pixels along a side of a view, which the paper doesn't state."""
 
-# Wang et al. 2004, as in ``wlm.metrics.structural``.
+# Wang et al. 2004, as in `wlm.metrics.structural`.
 _SIGMA, _C1, _C2 = 1.5, 0.01, 0.03
 _HALF = SSIM_WINDOW // 2
 # Relative rounding error of reading a constant colour bilinearly in float32.
@@ -78,7 +78,7 @@ class Score(system.Report):
             pictures have the reference's nearest covered value.
         seam_error: Mean absolute error of the covered pixels within 2 pixels of a chart's border, over all views.
         rest_error: Mean absolute error of all others.
-        seam_ratio: ``seam_error`` over ``rest_error``: 1 where seams don't stand out.
+        seam_ratio: `seam_error` over `rest_error`: 1 where seams don't stand out.
         texel_psnr: dB, over the lightmap's texels that are in the mask and have their centre in a triangle.
     """
 
@@ -132,8 +132,8 @@ def evaluate(
     Args:
         model: The model.
         mesh: The mesh that was compressed, with its original lightmap.
-        views, resolution, device, progress: As for ``compare``.
-        file_bytes: Size of the model's file; None: ``model.file_bytes()``.
+        views, resolution, device, progress: As for `compare`.
+        file_bytes: Size of the model's file; None: `model.file_bytes()`.
 
     Raises:
         WlmError: There is no such device.
@@ -169,12 +169,12 @@ def compare(
 
     Args:
         mesh: The mesh with its original lightmap.
-        decoders: By name; see ``Sampler``.
+        decoders: By name; see `Sampler`.
         views: Number of cameras, spread evenly on the sphere; or the cameras.
         resolution: Pixels along a side of a view, 1 to 16,384.
         device: "cpu" or "cuda:N", where the decoders are called.
         labels: For some of the decoders, numbers of their own charts or tiles: their seams are where these change.
-            Those of the others are the borders of the lightmap's charts, ``mesh_charts``. Either way a border lies
+            Those of the others are the borders of the lightmap's charts, `mesh_charts`. Either way a border lies
             between neighbouring pixels that show one triangle or two that share a corner in space, so that an outline
             in front of something else is none.
         progress: Called with the views done.
@@ -256,7 +256,7 @@ def _peak(mesh: LightmappedMesh, image: torch.Tensor, cameras: Sequence[View], r
 
 
 _Points = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
-"""The arguments of a ``Sampler``: UVs, triangles and corner weights of points."""
+"""The arguments of a `Sampler`: UVs, triangles and corner weights of points."""
 
 
 def _colours(decoder: Sampler, points: _Points, mesh: LightmappedMesh, name: str) -> torch.Tensor:
@@ -371,7 +371,7 @@ def _near_border(visible: torch.Tensor, label: torch.Tensor, place: torch.Tensor
 
 
 class _Similarity:
-    """SSIM of one view's decoders, equal to ``wlm.metrics.ssim`` of the whole pictures.
+    """SSIM of one view's decoders, equal to `wlm.metrics.ssim` of the whole pictures.
 
     That one compares two images on the host; this one computes the reference's part once for all decoders, on their
     device, and only where the mesh is.

@@ -1,12 +1,12 @@
 """The folder of a compression: the model, a mesh, textures for engines and viewers, a shader, a report.
 
-    atlas.wlm                       the model in one file, see ``codec``
-    mesh.glb                        the mesh, with its new UVs as one more set if it has any
-    mask.png                        the texels that belong to charts, unless those are all that triangles touch
-    lut.exr, .ktx2, .dds            T_c, unless the model is "plain"
-    colour.exr, .ktx2, .dds         T_p; blocks of ASTC have no DDS
-    atlas.glsl                      a function that reads them
-    report.json                     settings, sizes, times, warnings, and where the inputs were
+atlas.wlm                       the model in one file, see `codec`
+mesh.glb                        the mesh, with its new UVs as one more set if it has any
+mask.png                        the texels that belong to charts, unless those are all that triangles touch
+lut.exr, .ktx2, .dds            T_c, unless the model is "plain"
+colour.exr, .ktx2, .dds         T_p; blocks of ASTC have no DDS
+atlas.glsl                      a function that reads them
+report.json                     settings, sizes, times, warnings, and where the inputs were
 """
 
 import dataclasses
@@ -87,7 +87,7 @@ def export(
 ) -> list[Path]:
     """Writes a model and all that an engine needs.
 
-    All files are made beside the folder and moved into it at the end, ``report.json`` last. Into a folder of an earlier
+    All files are made beside the folder and moved into it at the end, `report.json` last. Into a folder of an earlier
     output the new one is written over the old; other files there stay. Where the moving is stopped half-way the folder
     can't be read, but can be written again.
 
@@ -95,11 +95,11 @@ def export(
         model: The model.
         directory: The folder; made if it isn't there.
         mesh: The mesh that was compressed.
-        facts: More entries of ``report.json``, plain JSON values. "inputs", a mapping with the paths "mesh",
-            "lightmap" and "mask" (None: none), is what ``read_inputs`` reads.
+        facts: More entries of `report.json`, plain JSON values. "inputs", a mapping with the paths "mesh",
+            "lightmap" and "mask" (None: none), is what `read_inputs` reads.
 
     Returns:
-        The files written, ``report.json`` last.
+        The files written, `report.json` last.
 
     Raises:
         ValueError: The model is of another mesh.
@@ -121,7 +121,7 @@ def export(
         else:
             # The number is of a set to be added, and there is none.
             write_glb(temporary / MESH_FILE, mesh.document, [], 1)
-        # ``geometry`` derives the mask from the triangles where there is no file of it.
+        # `geometry` derives the mask from the triangles where there is no file of it.
         if not np.array_equal(mesh.mask, touched_texels(mesh.uv, mesh.triangle[mesh.active], *mesh.mask.shape)):
             write_mask(temporary / MASK_FILE, mesh.mask)
         if model.method != "plain":
@@ -136,7 +136,7 @@ def export(
 
 
 def read_folder(directory: str | os.PathLike[str]) -> Output:
-    """Reads what ``export`` wrote: the model and the report.
+    """Reads what `export` wrote: the model and the report.
 
     Raises:
         WlmError: There is no such folder, it isn't an exported one, its files were never all there, or the model is
@@ -149,10 +149,10 @@ def read_folder(directory: str | os.PathLike[str]) -> Output:
 
 
 def describe(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Says what an exported folder's model, or a model's file, holds: ``codec.describe``.
+    """Says what an exported folder's model, or a model's file, holds: `codec.describe`.
 
     Raises:
-        WlmError: As ``read_folder`` for a folder, and as ``codec.describe``.
+        WlmError: As `read_folder` for a folder, and as `codec.describe`.
     """
     if not os.path.isdir(path):
         return codec.describe(path)
@@ -170,7 +170,7 @@ def geometry(output: Output) -> LightmappedMesh:
 
     Returns:
         The mesh, its triangles in the model's order, with the mask that it was compressed with. Its lightmap is all
-        ones. ``source`` is the model's.
+        ones. `source` is the model's.
 
     Raises:
         WlmError: mesh.glb, or a mask that the report names, is missing, damaged, or not of this model.
@@ -211,7 +211,7 @@ def read_inputs(
 
     Raises:
         WlmError: A path isn't known, a file is missing or damaged, or it isn't what was compressed. The line names
-            the option of ``wlm atlas evaluate`` that gives the path.
+            the option of `wlm atlas evaluate` that gives the path.
     """
     stored = output.report.get("inputs")
     stored = stored if isinstance(stored, dict) else {}

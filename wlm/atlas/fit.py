@@ -1,6 +1,6 @@
 """From a mesh with a lightmap to an atlas model.
 
-The method of the profile, ``tiles`` or ``cascade``, makes a model; a plain smaller lightmap of as many bits replaces it
+The method of the profile, `tiles` or `cascade`, makes a model; a plain smaller lightmap of as many bits replaces it
 where that has no larger error.
 """
 
@@ -44,11 +44,11 @@ def compress(
 
     Args:
         mesh: The mesh.
-        profile: The settings: a profile's name, a YAML file or a ``Profile``.
+        profile: The settings: a profile's name, a YAML file or a `Profile`.
         seed: Of the random views.
         device: "cpu" or "cuda:N".
         progress: Called as each stage begins, and about twice a second in stages of many steps.
-        overrides: Settings that replace the profile's, by name: ``budget=0.1``.
+        overrides: Settings that replace the profile's, by name: `budget=0.1`.
 
     Returns:
         The model. It is "plain", a smaller lightmap of as many bits, where that has no larger error than the method.

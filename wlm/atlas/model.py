@@ -113,7 +113,7 @@ class Profile(Settings):
     gradient: float = Field(1.0, ge=0.0)
 
     def override(self, values: Mapping[str, Any], prefix: str = "") -> Self:
-        """Replaces some settings, as ``wlm.system.Settings.override``.
+        """Replaces some settings, as `wlm.system.Settings.override`.
 
         Raises:
             WlmError: Unknown or out of range; or a budget for the cascade, which has none.
@@ -131,15 +131,15 @@ class AtlasModel(Model):
 
     Attributes:
         name: The mesh's name.
-        source: ``LightmappedMesh.source``.
+        source: `LightmappedMesh.source`.
         profile: The settings of the compression.
         method: "tiles", "cascade" or "plain"; "plain" also where the profile's method does not pay.
-        colour: How T_p is stored, as in ``Profile``.
+        colour: How T_p is stored, as in `Profile`.
         height, width: Texels of the lightmap.
-        texels: half [Hp, Wp, 3], T_p, finite, not negative; what ``blocks`` decode to where there are any.
+        texels: half [Hp, Wp, 3], T_p, finite, not negative; what `blocks` decode to where there are any.
         blocks: uint8 [B, 16], the blocks of T_p, row by row; [0, 16] for half floats.
-        lut: uint16 [Hc, Wc, 2], T_c: for "tiles" ``pack_entries``' [ty, tx, 2]; for "cascade" coordinates in units of
-            1 / ``LUT_STEPS``; [0, 0, 2] for "plain".
+        lut: uint16 [Hc, Wc, 2], T_c: for "tiles" `pack_entries`' [ty, tx, 2]; for "cascade" coordinates in units of
+            1 / `LUT_STEPS`; [0, 0, 2] for "plain".
         uv: float32 [F, 3, 2] in [0, 1], the corners' new UVs; [0, 3, 2] where the mesh keeps its own.
         report: Facts about the compression, for people: "seconds" by stage (not saved, since they differ from run to
             run), groups, why it is plain.
@@ -173,7 +173,7 @@ def compression_ratio(texels: tuple[int, int], lut: tuple[int, int], size: tuple
         texels: Rows and columns of T_p. Blocks count whole.
         lut: Rows and columns of T_c, (0, 0) for none.
         size: Rows and columns of the lightmap.
-        colour: How T_p is stored, as in ``Profile``.
+        colour: How T_p is stored, as in `Profile`.
     """
     side = 1 if colour == "half" else BLOCK_SIDE
     rows, columns = (-(-count // side) * side for count in texels)
@@ -203,11 +203,11 @@ def pack_entries(first: np.ndarray, size: np.ndarray) -> np.ndarray:
     """Encodes entries of T_c for tiles.
 
     Args:
-        first: int [..., 2], x and y of the rectangle's first texel, below ``MOST_SIZE``.
+        first: int [..., 2], x and y of the rectangle's first texel, below `MOST_SIZE`.
         size: int [..., 2], the rectangle's texels along x and y, 1 to 16.
 
     Returns:
-        uint16 [..., 2]: ``first`` shifted left by 4, plus ``size`` - 1.
+        uint16 [..., 2]: `first` shifted left by 4, plus `size` - 1.
 
     Raises:
         ValueError: A number is out of range.
@@ -219,6 +219,6 @@ def pack_entries(first: np.ndarray, size: np.ndarray) -> np.ndarray:
 
 
 def unpack_entries(lut: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Decodes ``pack_entries``: first texels and sizes, int64 [..., 2] each."""
+    """Decodes `pack_entries`: first texels and sizes, int64 [..., 2] each."""
     lut = np.asarray(lut).astype(np.int64)
     return lut >> SIDE_BITS, (lut & ((1 << SIDE_BITS) - 1)) + 1

@@ -2,7 +2,7 @@
 
 The members of a group take the corners of its representative, so their own texels are dropped. Representatives that
 share an edge under the old UVs stay together in one chart. A chart moves rigidly: it is rotated and translated, never
-stretched and never mirrored, and all charts are scaled by one epsilon, in texels. ``uvunwrap`` packs them in float32;
+stretched and never mirrored, and all charts are scaled by one epsilon, in texels. `uvunwrap` packs them in float32;
 each chart's rigid motion is fitted to its result by least squares and then applied exactly.
 
 Where the paper is silent: charts have two texels between them (one around each), so that a bilinear read in one
@@ -14,7 +14,7 @@ The stated behaviours:
 ================================================  ===============================================================
 input                                             behaviour
 ================================================  ===============================================================
-a triangle that isn't ``active``                  no texels; it reads one point of a neighbour, else (0, 0)
+a triangle that isn't `active`                  no texels; it reads one point of a neighbour, else (0, 0)
 a triangle smaller than a texel                   keeps its size, in the texels that it touches
 triangles that fold over each other in a chart    separate charts
 three and more triangles at one edge              separate charts; grouped first if they are alike
@@ -81,8 +81,8 @@ def pack(mesh: LightmappedMesh, clusters: Clusters | None, scale: float) -> Pack
         The new UVs.
 
     Raises:
-        WlmError: ``uvunwrap`` isn't installed or fails, or the atlas gets too large.
-        ValueError: ``scale`` isn't above 0, or the groups are of another mesh.
+        WlmError: `uvunwrap` isn't installed or fails, or the atlas gets too large.
+        ValueError: `scale` isn't above 0, or the groups are of another mesh.
     """
     if not 0.0 < scale < math.inf:
         raise ValueError(f"scale: expected above 0, got {scale}")
@@ -164,10 +164,10 @@ def _pack_charts(
         name: The mesh's name, for messages.
         old: float64 [N, 3, 2], corners in texels of the lightmap.
         numbers: int [N, 3], the corners' numbers, equal where corners coincide.
-        scale: As for ``pack``.
+        scale: As for `pack`.
 
     Returns:
-        int [N], the chart of each triangle; complex [C] twice, its motion, as ``_motions``; float64 [2], W_r and H_r.
+        int [N], the chart of each triangle; complex [C] twice, its motion, as `_motions`; float64 [2], W_r and H_r.
     """
     label = charts(numbers)
     # Counter-clockwise, since the packer would mirror clockwise ones.

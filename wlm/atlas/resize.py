@@ -91,7 +91,7 @@ def _fit(filled: np.ndarray, mask: np.ndarray, start: np.ndarray) -> np.ndarray:
 
 
 def _bilinear(new: int, old: int) -> sparse.csr_matrix:
-    """[new, old], reads ``old`` texels at the centres of ``new`` ones, clamped."""
+    """[new, old], reads `old` texels at the centres of `new` ones, clamped."""
     place = (np.arange(new) + 0.5) * old / new - 0.5
     first = np.floor(place).astype(np.int64)
     column = np.clip(np.stack([first, first + 1]), 0, old - 1)
@@ -101,14 +101,14 @@ def _bilinear(new: int, old: int) -> sparse.csr_matrix:
 
 
 def _box(new: int, old: int) -> sparse.csr_matrix:
-    """[new, old], means of ``old`` texels over the squares of ``new`` ones."""
+    """[new, old], means of `old` texels over the squares of `new` ones."""
     side, texel = np.arange(new + 1) * (old / new), np.arange(old)
     weight = np.minimum(side[1:, None], texel + 1.0) - np.maximum(side[:-1, None], texel)
     return _normalised(np.maximum(weight, 0.0))
 
 
 def _lanczos(new: int, old: int) -> sparse.csr_matrix:
-    """[new, old], a windowed sinc with the bandwidth of ``new`` texels."""
+    """[new, old], a windowed sinc with the bandwidth of `new` texels."""
     scale = old / new
     x = (np.arange(old) + 0.5 - (np.arange(new) + 0.5)[:, None] * scale) / scale
     return _normalised(np.where(np.abs(x) < _LOBES, np.sinc(x) * np.sinc(x / _LOBES), 0.0))

@@ -1,4 +1,4 @@
-"""The GLSL that reads an exported atlas (lightmap-uv-clustering-cascade, eq. 7); ``wlm.atlas.exporter`` writes it."""
+"""The GLSL that reads an exported atlas (lightmap-uv-clustering-cascade, eq. 7); `wlm.atlas.exporter` writes it."""
 
 from wlm.atlas.model import SIDE_BITS, AtlasModel
 
@@ -103,7 +103,7 @@ _WHAT = {
 
 
 def atlas_glsl(model: AtlasModel) -> str:
-    """The shader text for a model: functions alone, to be included below ``#version``.
+    """The shader text for a model: functions alone, to be included below `#version`.
 
     Args:
         model: Its method chooses the text; of tiles the lightmap's size and the tile's are constants in it.

@@ -73,7 +73,7 @@ def fit_tiles(grid: FineGrid, profile: Profile, seed: int, stages: Stages) -> At
 
     Args:
         grid: The mesh, with its lightmap, and the device.
-        profile: ``budget``, ``colour``, ``tile`` and the settings of ``weights``.
+        profile: `budget`, `colour`, `tile` and the settings of `weights`.
         seed: Seed of the random views.
         stages: Reports and times the stages.
 
@@ -145,10 +145,10 @@ def layout(
     """Allocates sizes whose rectangles fit in a T_p of a given number of texels, and places them.
 
     Args:
-        error: float64 [sizes, T], ``curves``.
+        error: float64 [sizes, T], `curves`.
         sizes: int [sizes, 2], nx and ny.
         room: Most texels of T_p.
-        least: As for ``allocate``.
+        least: As for `allocate`.
         blocks: Whether T_p is made of blocks.
 
     Returns:
@@ -246,7 +246,7 @@ def _between(image: np.ndarray, texels: int, axis: int) -> np.ndarray:
 
 
 def _folded(weight: np.ndarray, texels: int, axis: int) -> np.ndarray:
-    """Weights along an axis at ``_between``'s points; those beyond the outermost texel centres go to these centres."""
+    """Weights along an axis at `_between`'s points; those beyond the outermost texel centres go to these centres."""
     weight = np.moveaxis(weight, axis, 0)
     inner = weight[1:-1].copy()
     if not len(inner):  # a single texel, whose quarters all lie beyond its centre

@@ -4,7 +4,7 @@ The mesh is scaled into [-1, 1]³: the longest side of its box is 2 long, the bo
 a distance of 3 and look at the origin. Their field of view just holds the sphere around that cube, of radius sqrt 3:
 2 asin(sqrt 3 / 3), 70.5 degrees both ways, so that nothing is ever cut off. Pictures are square; row 0 is their top.
 
-A triangle that isn't ``active`` hides what is behind it, but its pixels count as uncovered.
+A triangle that isn't `active` hides what is behind it, but its pixels count as uncovered.
 """
 
 import math
@@ -112,10 +112,10 @@ def normalised(mesh: LightmappedMesh) -> np.ndarray:
 
 
 def clip_positions(position: np.ndarray, view: View) -> np.ndarray:
-    """The vertices in a camera's clip space, for ``wlm.ops.rasterize``.
+    """The vertices in a camera's clip space, for `wlm.ops.rasterize`.
 
     Args:
-        position: float64 [V, 3], ``normalised``.
+        position: float64 [V, 3], `normalised`.
         view: The camera.
 
     Returns:

@@ -35,7 +35,7 @@ class FineGrid:
 
     @cached_property
     def triangle(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """The triangle that holds each cell's centre, and the weights of its corners, as ``texel_triangles``."""
+        """The triangle that holds each cell's centre, and the weights of its corners, as `texel_triangles`."""
         return texel_triangles(self.mesh, self.height, self.width, self.device)
 
     @cached_property

@@ -1,12 +1,12 @@
 """What a compressed lightmap of a mesh is compared with (lightmap-uv-clustering-cascade, sections 4.3 and 4.4).
 
 A budget is a share of the lightmap's bits at 48 a texel, 1 - CR of eq. 9. Each method gives the best that it has within
-the share; its ``bytes`` are those of all that a decoder needs but the UVs, which cost nothing in eq. 9, and ``decoded``
-is a ``Sampler`` of ``wlm.atlas.evaluation``. Charts are dilated from the nearest texel before anything is resized.
+the share; its `bytes` are those of all that a decoder needs but the UVs, which cost nothing in eq. 9, and `decoded`
+is a `Sampler` of `wlm.atlas.evaluation`. Charts are dilated from the nearest texel before anything is resized.
 
 The paper's DownSampling is "bilinear". The smaller texture that has the least squares where it is read at the charts'
 texels takes a few tenths of a second more, and on 18 lightmaps of 512² at a share of 0.17 it is 1.7 dB above bilinear
-reading, 1.5 dB above Lanczos and 2.0 dB above a box filter; so it is ``downsampling`` unless told otherwise.
+reading, 1.5 dB above Lanczos and 2.0 dB above a box filter; so it is `downsampling` unless told otherwise.
 """
 
 from __future__ import annotations
@@ -53,11 +53,11 @@ def evaluate_rivals(
     Args:
         model: It says how many bits.
         mesh: The mesh with its original lightmap.
-        names: Keys of ``RIVALS``.
-        options: As for ``wlm.atlas.evaluation.compare``.
+        names: Keys of `RIVALS`.
+        options: As for `wlm.atlas.evaluation.compare`.
 
     Raises:
-        WlmError, ValueError: As ``compare`` or the rival.
+        WlmError, ValueError: As `compare` or the rival.
     """
     bits = round((1.0 - model.compression_ratio) * mesh.mask.size * SOURCE_BITS)
     # Half a bit more, so that rounding takes none away.
@@ -72,7 +72,7 @@ def downsampling(mesh: LightmappedMesh, share: float, filter: str = "fit") -> Ri
     Args:
         mesh: The mesh and its lightmap.
         share: The budget; at 1 and above the lightmap keeps its size, and is exact but for rounding to half.
-        filter: "fit", "bilinear", "box" or "lanczos", see ``wlm.atlas.resize``.
+        filter: "fit", "bilinear", "box" or "lanczos", see `wlm.atlas.resize`.
 
     Raises:
         ValueError: No such filter, or a share that has no room for one texel.
@@ -90,7 +90,7 @@ def block_codec(mesh: LightmappedMesh, share: float, codec: str) -> Rival:
     Args:
         mesh: The mesh and its lightmap.
         share: The budget.
-        codec: "bc6h", or "astcWxH" with one of ``hdr_blocks.ASTC_BLOCKS``, "astc6x5" for example.
+        codec: "bc6h", or "astcWxH" with one of `hdr_blocks.ASTC_BLOCKS`, "astc6x5" for example.
 
     Raises:
         ValueError: No such codec, or a share that has no room for one block.
@@ -114,7 +114,7 @@ def block_codec(mesh: LightmappedMesh, share: float, codec: str) -> Rival:
 
 
 def best_astc(mesh: LightmappedMesh, share: float) -> Rival:
-    """ASTC with the smallest blocks that hold the lightmap at its own size within the budget, else ``astc12x12``.
+    """ASTC with the smallest blocks that hold the lightmap at its own size within the budget, else `astc12x12`.
 
     Resizing a lightmap by little costs more than larger blocks do.
     """

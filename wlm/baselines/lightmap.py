@@ -1,12 +1,12 @@
 """Block codecs that engines ship lightmaps in: BC6H, BC7 with a gamma, ASTC HDR; and plain 8 bits.
 
 Each encoder takes one lightmap [H, W, 3] in linear RGB and its mask [H, W], true where a texel is valid, and returns a
-``Rival`` whose ``decoded`` is the lightmap, float32 [H, W, 3]. Negative radiance becomes 0, and values above 65,504,
+`Rival` whose `decoded` is the lightmap, float32 [H, W, 3]. Negative radiance becomes 0, and values above 65,504,
 half float's largest, become that; with an empty mask a black lightmap is encoded. Gaps between charts are dilated from
 the nearest valid texel first, as every engine does: zeros there cost 10 dB at charts' edges. Times are those of one
 thread, for the codec alone: dilation does not count. A size has padding to whole blocks in it.
 
-All raise a ``WlmError`` where shapes do not fit, a valid texel is NaN or infinite, a setting is out of range, or a
+All raise a `WlmError` where shapes do not fit, a valid texel is NaN or infinite, a setting is out of range, or a
 package is missing.
 """
 
@@ -46,7 +46,7 @@ def encode_bc6h(frame: np.ndarray, mask: np.ndarray, profile: str = "slow") -> R
 
     Args:
         frame, mask: The lightmap.
-        profile: ``veryfast``, ``fast``, ``basic``, ``slow`` or ``veryslow``.
+        profile: `veryfast`, `fast`, `basic`, `slow` or `veryslow`.
     """
     for package in ("ispc_texcomp", "imagecodecs"):  # the time to import them isn't the codec's
         need(package, _EXTRA)
@@ -66,7 +66,7 @@ def encode_bc7(frame: np.ndarray, mask: np.ndarray, profile: str = "basic") -> R
 
     Args:
         frame, mask: The lightmap.
-        profile: ``ultrafast``, ``veryfast``, ``fast``, ``basic`` or ``slow``.
+        profile: `ultrafast`, `veryfast`, `fast`, `basic` or `slow`.
     """
     texcomp, codecs = need("ispc_texcomp", _EXTRA), need("imagecodecs", _EXTRA)
     _check_profile("bc7", profile, ("ultrafast", "veryfast", "fast", "basic", "slow"))
@@ -89,7 +89,7 @@ def encode_bc7(frame: np.ndarray, mask: np.ndarray, profile: str = "basic") -> R
 def encode_astc(frame: np.ndarray, mask: np.ndarray, block: int = 12, quality: float = ASTC_MEDIUM) -> Rival:
     """ASTC HDR in square blocks of 16 bytes, with astcenc: 0.89 bits a texel at 12x12, 1.28 at 10x10.
 
-    The HDR profile has no early stop on decibels (astcenc ignores ``tune_db_limit`` there); in an LDR profile that stop
+    The HDR profile has no early stop on decibels (astcenc ignores `tune_db_limit` there); in an LDR profile that stop
     must be raised, or the baseline is worse than the format.
 
     Args:
@@ -126,7 +126,7 @@ RIVALS: dict[str, Callable[[np.ndarray, np.ndarray], Rival]] = {
     "astc12": functools.partial(encode_astc, block=12),
     "8bit": encode_8bit,
 }
-"""By name, each as the published comparisons set it: a lightmap and its mask to a ``Rival``."""
+"""By name, each as the published comparisons set it: a lightmap and its mask to a `Rival`."""
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,7 @@ class Score(Report):
     """How wrong a block codec is on a set, over the texels that ours is scored over.
 
     Attributes:
-        psnr, ssim, flip: As in the report of ``wlm.lightmap.evaluate``.
+        psnr, ssim, flip: As in the report of `wlm.lightmap.evaluate`.
         bpp: Bits for each texel and time. These codecs have a fixed rate, so this holds for any part of the map.
         bytes: Of all times of the whole map, also where only some tiles are scored.
     """
@@ -154,20 +154,20 @@ def evaluate_rivals(
     metrics: Sequence[str] = METRICS,
     progress: OnProgress | None = None,
 ) -> list[tuple[Rival, Score]]:
-    """Puts every time through block codecs, one time after the other, and scores the texels that ``evaluate`` scores.
+    """Puts every time through block codecs, one time after the other, and scores the texels that `evaluate` scores.
 
     Args:
         model: The model to compare with: it says which tiles are scored.
         lightmaps: The input.
-        names: Keys of ``RIVALS``.
-        metrics: As for ``wlm.lightmap.evaluate``.
+        names: Keys of `RIVALS`.
+        metrics: As for `wlm.lightmap.evaluate`.
         progress: Called about twice a second.
 
     Returns:
         For each name the rival, with bytes and seconds of all times and without what was decoded, and its score.
 
     Raises:
-        WlmError: As ``wlm.lightmap.evaluate``, an unknown name, or the extra `baselines` is missing.
+        WlmError: As `wlm.lightmap.evaluate`, an unknown name, or the extra `baselines` is missing.
     """
     for name in names:
         if name not in RIVALS:

@@ -1,7 +1,7 @@
 """The temporal lightmap fit in plain torch: the peer that the fused kernels are timed and checked against.
 
-The same model, samples a step, optimiser and schedule as ``wlm.lightmap``, written with batched matrix products,
-``grid_sample`` and autograd as neural-dynamic-gi, section 4, describes it. It stops short of the file: its maps stay
+The same model, samples a step, optimiser and schedule as `wlm.lightmap`, written with batched matrix products,
+`grid_sample` and autograd as neural-dynamic-gi, section 4, describes it. It stops short of the file: its maps stay
 continuous, so its loss compares with ours before quantisation.
 """
 

@@ -1,14 +1,14 @@
 """What a compressed probe set is compared with: the PCA family, a moving basis, and an engine's 8-bit packing.
 
-Each function takes N probes, their positions [N, 3] and values [N, D] in any unit, and returns a ``Rival`` whose
-``decoded`` is float32 [N, D], read from the byte string that ``bytes`` counts (gaussian-probe-compression, sections 2.2
+Each function takes N probes, their positions [N, 3] and values [N, D] in any unit, and returns a `Rival` whose
+`decoded` is float32 [N, D], read from the byte string that `bytes` counts (gaussian-probe-compression, sections 2.2
 and 5.1). The positions are an engine's own and cost nothing here, as in the paper. The paper gives its rivals no bits
 to choose; weights of 4 or 5 bits leave room for more components and gain several decibels at the same size, so
-``at_bytes`` tries them too.
+`at_bytes` tries them too.
 
-The settings that the functions share are the number of ``components``, basis vectors of a part, 1 to D, and the
-``bits`` of a weight, 1 to 16, over the range of each part and component; None for half floats. Means and bases are half
-floats always. All raise a ``WlmError`` where there are no probes, or NaN or infinite numbers, and a ``ValueError`` for
+The settings that the functions share are the number of `components`, basis vectors of a part, 1 to D, and the
+`bits` of a weight, 1 to 16, over the range of each part and component; None for half floats. Means and bases are half
+floats always. All raise a `WlmError` where there are no probes, or NaN or infinite numbers, and a `ValueError` for
 wrong shapes or a setting out of range.
 """
 
@@ -102,7 +102,7 @@ def window_pca(
 
     Args:
         position, values, components, bits: See the module.
-        blocks: As ``block_pca``.
+        blocks: As `block_pca`.
         overlap: How far the window reaches over its block on all sides, in sides of a block, at least 0.
     """
     position, values = _checked(position, values, components, bits)
@@ -183,7 +183,7 @@ def unreal_packing(position: np.ndarray, values: np.ndarray, bands: int | None =
 
     Args:
         position: Only their number counts.
-        values: D = 3, 12 or 27 (else a ``WlmError``): SH coefficients from L00, for each its red, green and blue.
+        values: D = 3, 12 or 27 (else a `WlmError`): SH coefficients from L00, for each its red, green and blue.
         bands: 1 to 3, SH bands that are kept, 4, 13 or 28 bytes a probe; the rest decode to zero. None for all.
     """
     position, values = _checked(position, values)
@@ -200,7 +200,7 @@ def unreal_packing(position: np.ndarray, values: np.ndarray, bands: int | None =
 
 
 def pack_unreal(values: np.ndarray, bands: int) -> bytes:
-    """The bytes of ``unreal_packing``: uint32 [N] ambient colours, then uint8 [N, 3, bands² - 1] ratios."""
+    """The bytes of `unreal_packing`: uint32 [N] ambient colours, then uint8 [N, 3, bands² - 1] ratios."""
     sh = np.asarray(values, np.float64).reshape(len(values), -1, 3)
     colour = np.clip(sh[:, 0], 0.0, _PACKED_MAX)
     step = np.exp2(np.maximum(np.frexp(colour)[1] - 1, -14) - 10.0 + _DROPPED)
@@ -214,7 +214,7 @@ def pack_unreal(values: np.ndarray, bands: int) -> bytes:
 
 
 def unpack_unreal(payload: bytes, width: int, bands: int) -> np.ndarray:
-    """Reads what ``pack_unreal`` wrote, float32 [N, D]."""
+    """Reads what `pack_unreal` wrote, float32 [N, D]."""
     probes = len(payload) // (4 + 3 * (bands**2 - 1))
     ambient = _ambient(np.frombuffer(payload, "<u4", probes))
     level = np.frombuffer(payload, np.uint8, offset=4 * probes).reshape(probes, 3, bands**2 - 1)
@@ -235,13 +235,13 @@ def at_bytes(
     """The settings of one method with the least squared error that a size allows, by a small search.
 
     For each number of bits the component counts are tried from the largest downwards until two in a row gain
-    nothing, each with as many parts as fit, at most ``MAX_PARTS`` or ``MAX_GRID`` cells.
+    nothing, each with as many parts as fit, at most `MAX_PARTS` or `MAX_GRID` cells.
 
     Args:
-        name: A key of ``RIVALS``.
+        name: A key of `RIVALS`.
         position, values: See the module.
         budget_bytes: The largest size.
-        bits: Bits of a weight to try; ``(None,)`` keeps to half floats as gaussian-probe-compression's table has them.
+        bits: Bits of a weight to try; `(None,)` keeps to half floats as gaussian-probe-compression's table has them.
             The engine's packing has none to choose.
 
     Returns:
@@ -274,7 +274,7 @@ def evaluate_rivals(
     Args:
         probes: The input.
         budget_bytes: The largest size, that of our file.
-        names: Keys of ``RIVALS``; none: all.
+        names: Keys of `RIVALS`; none: all.
         progress: Called after each rival.
         skipped: Called for a rival that can't be that small, or that can't hold such probes, with the reason.
 
@@ -302,9 +302,9 @@ def _search(
     largest: Callable[[int, int | None], int],
     make: Callable[[int, int, int | None], Rival],
 ) -> tuple[Rival, tuple[int, int, int | None]] | None:
-    """``at_bytes`` for a method with components, parts and bits.
+    """`at_bytes` for a method with components, parts and bits.
 
-    ``largest`` gives the most parts for components and bits, 0 where nothing fits; ``make`` a result for all three.
+    `largest` gives the most parts for components and bits, 0 where nothing fits; `make` a result for all three.
     Returns the best result with its three settings, or None.
     """
     tried: list[tuple[float, Rival, tuple[int, int, int | None]]] = []
@@ -388,7 +388,7 @@ RIVALS: dict[str, Callable[[np.ndarray, np.ndarray, int, Sequence[int | None]], 
     "moving_basis": _moving_at,
     "unreal": _unreal_at,
 }
-"""By name, each as ``at_bytes`` calls it: positions, values, bytes and the bits to try, to the best ``Rival``."""
+"""By name, each as `at_bytes` calls it: positions, values, bytes and the bits to try, to the best `Rival`."""
 
 
 def _pca(

@@ -9,7 +9,7 @@ gaussian-probe-compression, section 2.2, holds against the method, ask for nothi
 
 What is stored, in this order and little-endian: a header (bits of a weight, 0 for half floats; D, K, cells along the
 box's longest side, scale), float16 [V, K + 1, D] means and bases in units of the scale, and the weights as in
-``probe_pca``, a cell of the grid being a part. Only corners that some probe feels and cells that hold one are stored;
+`probe_pca`, a cell of the grid being a part. Only corners that some probe feels and cells that hold one are stored;
 which those are follows from the positions.
 """
 
@@ -126,7 +126,7 @@ def encode(
         position: float64 [N, 3].
         values: float64 [N, D].
         components: K, 1 to D.
-        grid: Cells along the longest side of the probes' box, 1 to ``MAX_CELLS``.
+        grid: Cells along the longest side of the probes' box, 1 to `MAX_CELLS`.
         iterations: Rounds of the solver, at least 0; with none this is global PCA.
         bits: Of a weight, 1 to 16, over the range of each cell and component; None for half floats.
 
@@ -147,7 +147,7 @@ def encode(
 
 
 def decode(payload: bytes, position: np.ndarray) -> np.ndarray:
-    """Reads what ``encode`` wrote.
+    """Reads what `encode` wrote.
 
     Args:
         payload: The layout of this module.
@@ -177,7 +177,7 @@ def decode(payload: bytes, position: np.ndarray) -> np.ndarray:
 
 
 def payload_bytes(probes: int, width: int, components: int, parts: tuple[int, int], bits: int | None) -> int:
-    """Length of a payload, from N, D, K, the ``grid_parts`` and the bits of a weight."""
+    """Length of a payload, from N, D, K, the `grid_parts` and the bits of a weight."""
     corners, cells = parts
     return _HEADER.size + corners * (components + 1) * width * 2 + weight_bytes(probes, components, cells, bits)
 

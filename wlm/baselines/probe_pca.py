@@ -127,11 +127,11 @@ def by_blocks(position: np.ndarray, blocks: int) -> tuple[Partition, float]:
 
 
 def windows(position: np.ndarray, partition: Partition, side: float, overlap: float) -> list[np.ndarray]:
-    """The probes in each cube of ``by_blocks`` widened on all sides.
+    """The probes in each cube of `by_blocks` widened on all sides.
 
     Args:
         position: float64 [N, 3].
-        partition: Of ``by_blocks``.
+        partition: Of `by_blocks`.
         side: Of the cubes.
         overlap: How far a window reaches over its cube, in sides; 1 takes in the 26 cubes around it.
 
@@ -255,7 +255,7 @@ def encode(
 
 
 def decode(payload: bytes, position: np.ndarray) -> np.ndarray:
-    """Reads what ``encode`` wrote.
+    """Reads what `encode` wrote.
 
     Args:
         payload: The layout of this module.
@@ -294,7 +294,7 @@ def part_count(payload: bytes) -> int:
 
 
 def payload_bytes(kind: int, probes: int, width: int, components: int, count: int, bits: int | None) -> int:
-    """Length of a payload, from the kind of ``Partition``, N, D, K, C and the bits of a weight."""
+    """Length of a payload, from the kind of `Partition`, N, D, K, C and the bits of a weight."""
     size = HEADER.size + _PARTITION_BYTES[kind](probes, count) + count * (components + 1) * width * 2
     return size + weight_bytes(probes, components, count, bits)
 
@@ -311,7 +311,7 @@ def rescale(decoded: np.ndarray, scale: float) -> np.ndarray:
 
 
 def weight_bytes(probes: int, components: int, count: int, bits: int | None) -> int:
-    """Bytes of ``write_weights`` for N probes in C parts."""
+    """Bytes of `write_weights` for N probes in C parts."""
     if bits is None:
         return probes * components * 2
     return count * components * 4 + -(-probes * components * bits // 8)
@@ -327,7 +327,7 @@ def write_weights(weight: np.ndarray, label: np.ndarray, count: int, bits: int |
         bits: 1 to 16, or None.
 
     Returns:
-        ``weight_bytes`` bytes.
+        `weight_bytes` bytes.
     """
     weight = np.clip(weight, -HALF_MAX, HALF_MAX)
     if bits is None:
@@ -347,7 +347,7 @@ def write_weights(weight: np.ndarray, label: np.ndarray, count: int, bits: int |
 
 
 def read_weights(data: bytes, label: np.ndarray, count: int, components: int, bits: int | None) -> np.ndarray:
-    """Reads what ``write_weights`` wrote, float32 [N, K]."""
+    """Reads what `write_weights` wrote, float32 [N, K]."""
     probes = len(label)
     if bits is None:
         return np.frombuffer(data, "<f2", probes * components).reshape(probes, components).astype(np.float32)
@@ -358,7 +358,7 @@ def read_weights(data: bytes, label: np.ndarray, count: int, components: int, bi
 
 
 def _read_numbers(data: bytes, count: int, bits: int) -> np.ndarray:
-    """Reads ``count`` numbers of so many bits each, int64."""
+    """Reads `count` numbers of so many bits each, int64."""
     return unpack_bits(np.frombuffer(data, np.uint8), [bits], count)[:, 0].astype(np.int64)
 
 

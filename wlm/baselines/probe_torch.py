@@ -1,6 +1,6 @@
 """The probe fit in plain torch: the reference that the kernels' fit is held to, for speed and for quality.
 
-The same model as ``wlm.probe`` (gaussian-probe-compression, eq. 2 to 10), but every Gaussian counts at every probe
+The same model as `wlm.probe` (gaussian-probe-compression, eq. 2 to 10), but every Gaussian counts at every probe
 (eq. 5 without eq. 6), with autograd, on dense matrices of probes times Gaussians. Its start is the paper's: centres by
 k-means, scales from the nearest centre. It stops short of the file: the network stays in float32.
 """
@@ -29,7 +29,7 @@ class DenseFit:
         parameters: The tensors that the optimiser moves: centres [K, 3], logs of the scales [K, 3], quaternions
             w x y z [K, 4], latents [K, L], then the network's weights and biases, layer by layer.
         steps_done: Steps so far.
-        seconds: What ``run`` has taken so far, with the device awaited.
+        seconds: What `run` has taken so far, with the device awaited.
     """
 
     def __init__(
@@ -117,7 +117,7 @@ class DenseFit:
         return loss.detach()
 
     def run(self, steps: int) -> None:
-        """Does some steps, waits for the device, and adds the time to ``seconds``."""
+        """Does some steps, waits for the device, and adds the time to `seconds`."""
         self._wait()
         start = time.perf_counter()
         for _ in range(steps):

@@ -17,12 +17,12 @@ class Rival:
     """An input that went through one method.
 
     Attributes:
-        name: The method, a key of its module's ``RIVALS``.
+        name: The method, a key of its module's `RIVALS`.
         bytes: Size of everything that a decoder needs.
         encode_seconds: Wall-clock time on the CPU from the input to these bytes.
-        decode_seconds: Wall-clock time on the CPU from these bytes to ``decoded``; None where it isn't measured. A GPU
+        decode_seconds: Wall-clock time on the CPU from these bytes to `decoded`; None where it isn't measured. A GPU
             decodes block formats in its texture unit: this says nothing of what they cost there.
-        decoded: What the system's evaluation scores: a lightmap float32 [H, W, 3], an atlas' ``Sampler``, probes
+        decoded: What the system's evaluation scores: a lightmap float32 [H, W, 3], an atlas' `Sampler`, probes
             float32 [N, D].
         option: Settings that the method chose, for a table.
         size: Rows and columns of its texture; None where it has none.

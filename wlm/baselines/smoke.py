@@ -30,7 +30,7 @@ def coarse(pool: Pool, part: slice) -> torch.Tensor:
 
 
 def flip_book(held_out: HeldOut) -> tuple[Pool, Method]:
-    """What a flip book baked from the first view shows in the others: that view's own planes, as ``billboard`` does.
+    """What a flip book baked from the first view shows in the others: that view's own planes, as `billboard` does.
 
     Returns:
         The samples of the other views, none where there is one view, and the method for them.
@@ -48,7 +48,7 @@ def flip_book(held_out: HeldOut) -> tuple[Pool, Method]:
 
 
 RIVALS: dict[str, Contender] = {COARSE: lambda held_out: (held_out.pool("six"), coarse), FLIP_BOOK: flip_book}
-"""What ``wlm smoke evaluate`` compares a network with."""
+"""What `wlm smoke evaluate` compares a network with."""
 
 
 def billboard(baked: SixWay, source: Camera, camera: Camera, pivot: np.ndarray) -> SixWay:
@@ -59,16 +59,16 @@ def billboard(baked: SixWay, source: Camera, camera: Camera, pivot: np.ndarray) 
     the new camera, as engines do.
 
     Args:
-        baked: From ``source``.
+        baked: From `source`.
         source: Orthographic.
         camera: Orthographic, from where the billboard is seen.
         pivot: [3], the point of the world about which the billboard turns: the smoke's centre.
 
     Returns:
-        Lightmaps for ``camera``; transparent beyond what was baked.
+        Lightmaps for `camera`; transparent beyond what was baked.
 
     Raises:
-        ValueError: A camera is in perspective, or the lightmaps aren't those of ``source``.
+        ValueError: A camera is in perspective, or the lightmaps aren't those of `source`.
     """
     if source.perspective or camera.perspective:
         raise ValueError("a billboard needs orthographic cameras, as the lightmaps do")

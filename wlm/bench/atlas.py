@@ -6,7 +6,7 @@ For each lightmap of each mesh these kinds of rows:
   from around, and the time to read a million random points of its surface. In a full run also the first profile at the
   bits that the paper's method came to.
 - method "lightmap": the time to read the same points from the lightmap itself, in half floats.
-- the rivals of ``wlm.baselines.atlas`` at the bits of the first profile; in a full run also at those of the others.
+- the rivals of `wlm.baselines.atlas` at the bits of the first profile; in a full run also at those of the others.
   Bits are those of eq. 9 of lightmap-uv-clustering-cascade, which leave out UVs and headers; a rival's bytes are these
   bits alone, it has no file.
 - method "fit", of the first lightmap alone: the cascade tuned in views, as the paper does it, and at points of the
@@ -16,7 +16,7 @@ Where there are several lightmaps the last rows are the means over them, with th
 their largest error is the largest of all.
 
 A largest error is that against the float64 decode of the same model. A decode on CUDA is timed as the replay of a
-graph, so that gaps between launches do not count. The peaks of PSNR are those of ``wlm.atlas.evaluation``.
+graph, so that gaps between launches do not count. The peaks of PSNR are those of `wlm.atlas.evaluation`.
 """
 
 import math
@@ -85,12 +85,12 @@ def run(
     """Measures the atlas system.
 
     Args:
-        lightmaps: At least one, as ``wlm.bench.atlas_inputs.load`` reads them.
-        names: Profiles; none: ``PROFILES``.
+        lightmaps: At least one, as `wlm.bench.atlas_inputs.load` reads them.
+        names: Profiles; none: `PROFILES`.
         quick: 8 small views instead of 50, the cascade tuned for a few steps, rivals at one size: under 90 seconds on
             two CPU cores with the demo's mesh. The cascade's error is that of an unfinished fit.
         device: "cpu" or "cuda:0", for compressions, views and decodes; the rivals are compressed on the CPU.
-        rivals: With the block codecs and single-colour merging, which take minutes on the CPU: ``run_rivals`` has them
+        rivals: With the block codecs and single-colour merging, which take minutes on the CPU: `run_rivals` has them
             alone. Downsampling is always there.
         progress: Called with a line before each part of the work.
 
@@ -123,13 +123,13 @@ def run_rivals(
     Args:
         results: What that run wrote.
         lightmaps: At least one; those of that run.
-        progress: As for ``run``.
+        progress: As for `run`.
 
     Returns:
         The rows of the rivals, of the CPU, and their means.
 
     Raises:
-        WlmError: ``results`` can't be read, or has no row of a lightmap.
+        WlmError: `results` can't be read, or has no row of a lightmap.
     """
     ours = [row for row in read_json(results)[0] if (row.system, row.method) == ("atlas", "ours")]
     rows: list[Row] = []
@@ -159,7 +159,7 @@ def run_rows(
     repeats: int | None = None,
     progress: Note | None = None,
 ) -> list[Row]:
-    """Measures the given profiles; the rest as for ``run``.
+    """Measures the given profiles; the rest as for `run`.
 
     Args:
         lightmaps: At least one.
@@ -168,7 +168,7 @@ def run_rows(
         whole: With the first profile at the bits of a cascade, and rivals at the bits of all profiles.
         methods: The rivals.
         points: Read by a timed decode.
-        repeats: As for ``Bench``.
+        repeats: As for `Bench`.
     """
     if not lightmaps or not profiles:
         raise ValueError("expected at least one lightmap and one profile")

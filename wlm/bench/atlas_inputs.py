@@ -30,14 +30,14 @@ def load(
     """Reads the lightmaps of a run.
 
     Args:
-        meshes_path: A folder of a mesh, or of such folders: each has one ``.glb``, its lightmaps, ``.exr``, and maybe
-            their ``mask.png``.
+        meshes_path: A folder of a mesh, or of such folders: each has one `.glb`, its lightmaps, `.exr`, and maybe
+            their `mask.png`.
         mesh_path: Instead, one mesh.
         lightmap_paths: Its lightmaps.
         mask_path: Their mask; None derives it.
 
     Returns:
-        The lightmaps. Without any path those of the checkout's ``demos/data/atlas``.
+        The lightmaps. Without any path those of the checkout's `demos/data/atlas`.
 
     Raises:
         WlmError: A file is missing or damaged, a folder has no mesh with a lightmap, or paths were given that don't go

@@ -1,6 +1,6 @@
-"""The figures of all benchmarks: the heading, unit and number format of each, by the name that a ``Row`` has it under.
+"""The figures of all benchmarks: the heading, unit and number format of each, by the name that a `Row` has it under.
 
-``TABLES`` is in the order of the columns, and says in which table a figure stands where one would be too wide.
+`TABLES` is in the order of the columns, and says in which table a figure stands where one would be too wide.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ class Figure:
 
     Attributes:
         title: What it is, in a word or two.
-        unit: Its unit; ``"%"`` for a share, which rows hold as a number around 1. Empty for a pure number.
+        unit: Its unit; `"%"` for a share, which rows hold as a number around 1. Empty for a pure number.
         form: Format specification; empty: three digits, and from 100 on the whole part.
     """
 

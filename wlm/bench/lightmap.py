@@ -7,7 +7,7 @@ Four kinds of rows:
 - methods "exact" (one texel per thread) and "strip" (the fast path), one row for each form of the GELU, of profile M:
   the 8-bit output against the input, and its largest error against the float64 path as a share of 255. Half a level of
   8 bits, 0.00196, is the rounding itself.
-- the block codecs of ``wlm.baselines.lightmap``, on the same lightmaps.
+- the block codecs of `wlm.baselines.lightmap`, on the same lightmaps.
 - method "fit", one row for each profile: the speed of the fit alone; and the same fit in plain torch, all of it on CUDA
   in a full run, else a few steps.
 
@@ -83,7 +83,7 @@ def run(
         quick: Three profiles with short fits, scored at three times (9, 12 and 21 h if the set has them): four
             minutes on two CPU cores for 16 tiles. Its errors are those of unfinished fits.
         device: "cpu" or "cuda:0", for fits and decodes.
-        set_path: A lightmap set; None: the checkout's ``demos/data/city``, two tiles of the city.
+        set_path: A lightmap set; None: the checkout's `demos/data/city`, two tiles of the city.
         progress: Called with a line before each part of the work.
 
     Returns:
@@ -114,13 +114,13 @@ def run_rows(
     repeats: int | None = None,
     progress: Note | None = None,
 ) -> list[Row]:
-    """Measures the given profiles on a given set; the rest as for ``run``.
+    """Measures the given profiles on a given set; the rest as for `run`.
 
     Args:
         lightmaps: The set.
         profiles: At least one. The rows of decode options are of the one named "M", else of the first.
         chosen: Indices of the times that are scored, int [K], at least one.
-        repeats: As for ``Bench``.
+        repeats: As for `Bench`.
     """
     if not profiles or len(chosen) == 0:
         raise ValueError("expected at least one profile and one time")

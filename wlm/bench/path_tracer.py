@@ -115,7 +115,7 @@ class PathTracer:
         Args:
             volume: The smoke, on any device.
             camera: Orthographic.
-            variant: As ``choose_variant`` gives it; None: the fastest on the CPU.
+            variant: As `choose_variant` gives it; None: the fastest on the CPU.
 
         Raises:
             ValueError: The camera is in perspective.

@@ -46,8 +46,8 @@ class Panel:
     """One figure of some methods against another.
 
     Attributes:
-        x: The cost, a figure of which less is better, such as ``"decode_ms"`` or ``"bpp"``.
-        y: ``"psnr"``, or an error, of which less is better.
+        x: The cost, a figure of which less is better, such as `"decode_ms"` or `"bpp"`.
+        y: `"psnr"`, or an error, of which less is better.
         methods: Those that it shows; None for all.
     """
 
@@ -71,7 +71,7 @@ def pareto_front(points: Iterable[tuple[float, float]]) -> list[int]:
     """Points that no other dominates: none costs no more, is no worse, and is better in one of the two.
 
     Args:
-        points: ``(cost, quality)`` pairs; less cost and more quality are better. A pair with a NaN is never on the
+        points: `(cost, quality)` pairs; less cost and more quality are better. A pair with a NaN is never on the
             front.
 
     Returns:
@@ -94,7 +94,7 @@ def plot(rows: Sequence[Row], path: str | Path, x: str | Panel | Sequence[str | 
 
     Args:
         rows: The results.
-        path: Picture to write, ``.png``, ``.svg`` or ``.pdf``.
+        path: Picture to write, `.png`, `.svg` or `.pdf`.
         x: One panel or several; a name stands for the PSNR of all methods against that figure.
 
     Raises:

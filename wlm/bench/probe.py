@@ -10,7 +10,7 @@ For each set these kinds of rows, but where another is named:
   ellipsoids of the first fit by their spheres. The cuts below the profile's are those of the decode alone.
 - method "fit", the first profile on the first set alone: the speed of the fit, and method "dense torch": as many steps
   in plain torch, all of them on CUDA, else a few.
-- the rivals of ``wlm.baselines.probe`` at the bytes of the first profile's file and at three times as many, and
+- the rivals of `wlm.baselines.probe` at the bytes of the first profile's file and at three times as many, and
   Unreal's packing, which has one size. The list of dead probes is counted for them too.
 - method "volume": a walk with the cascaded volume over the decoder, whose figures are means and 95th percentiles of a
   frame, and a teleport into an empty volume: its first frame, and the frame after which nothing waits. The light's RMS
@@ -93,10 +93,10 @@ def run(
         quick: Short fits, no other ratios than the profiles', rivals of one size, a short walk, and of the demo noon
             alone: under two minutes on two CPU cores. Its errors are those of unfinished fits.
         device: "cpu" or "cuda:0", for fits, decodes and the volume.
-        probes_path: A file as ``wlm.probe.load`` reads it; None: the checkout's
-            ``demos/data/probes/street.npz``.
+        probes_path: A file as `wlm.probe.load` reads it; None: the checkout's
+            `demos/data/probes/street.npz`.
         keys: Which of the file's arrays, one set of rows each; none: the only one, or noon and night of the demo's.
-        rivals: With the PCA family and Unreal's packing, which take minutes on the CPU and no GPU: ``run_rivals``
+        rivals: With the PCA family and Unreal's packing, which take minutes on the CPU and no GPU: `run_rivals`
             has them alone.
         progress: Called with a line before each part of the work.
 
@@ -133,15 +133,15 @@ def run_rivals(
 
     Args:
         results: What a former run wrote, maybe without rivals.
-        probes_path: As for ``run``.
-        keys: As for ``run``.
-        progress: As for ``run``.
+        probes_path: As for `run`.
+        keys: As for `run`.
+        progress: As for `run`.
 
     Returns:
         The rows of the rivals, computed on the CPU.
 
     Raises:
-        WlmError: As ``run``, or ``results`` lacks the first profile of a set.
+        WlmError: As `run`, or `results` lacks the first profile of a set.
     """
     rows = read_json(results)[0]
     ours = {row.scene: row.get("bytes") for row in rows if (row.method, row.option) == ("ours", PROFILES[0])}
@@ -170,7 +170,7 @@ def run_rows(
     repeats: int | None = None,
     progress: Note | None = None,
 ) -> list[Row]:
-    """Measures the given profiles on given sets; the rest as for ``run``.
+    """Measures the given profiles on given sets; the rest as for `run`.
 
     Args:
         sets: At least one.
@@ -178,7 +178,7 @@ def run_rows(
         ratios: Further ratios of the first profile; the profile's ratio is left out.
         sizes: Of the rivals, in bytes of the first profile's file: 1, 3; none: no rivals.
         frames: Frames of the walk, at least one.
-        repeats: As for ``Bench``.
+        repeats: As for `Bench`.
     """
     if not sets or not profiles:
         raise ValueError("expected at least one set and one profile")

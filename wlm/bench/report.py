@@ -19,11 +19,11 @@ def pages(paths: Sequence[str | os.PathLike[str]], index: str | os.PathLike[str]
     """Makes pages of result files: one page for each system, and an index of them.
 
     Args:
-        paths: Files that ``write_json`` wrote.
+        paths: Files that `write_json` wrote.
         index: The index; the pages are in a folder beside it that has its name without the suffix.
 
     Returns:
-        The pages by their paths from the index's folder. Each has the plots ``images/bench-SYSTEM*.png`` beside the
+        The pages by their paths from the index's folder. Each has the plots `images/bench-SYSTEM*.png` beside the
         index and of each run where and with what it was measured, the command that measures it again, and its rows.
 
     Raises:

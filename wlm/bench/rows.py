@@ -39,11 +39,11 @@ class Row:
     """One method with one option on one scene.
 
     Attributes:
-        system: ``lightmap``, ``atlas``, ``probe``, ``smoke`` or ``smoke-network``.
+        system: `lightmap`, `atlas`, `probe`, `smoke` or `smoke-network`.
         scene: Name of the data.
         method: What was run, ours or a rival.
         option: Profile or setting that tells rows of one method apart; may be empty.
-        figures: What was measured, by the names of ``wlm.bench.figures``. Those that are None, NaN or infinite were
+        figures: What was measured, by the names of `wlm.bench.figures`. Those that are None, NaN or infinite were
             not measured or have no meaning, and are left out.
         notes: What a reader must know besides; free text.
     """
@@ -98,7 +98,7 @@ class Run:
     """Rows that were measured together.
 
     Attributes:
-        environment: As ``describe_environment`` gives it.
+        environment: As `describe_environment` gives it.
         rows: The results.
     """
 
@@ -114,8 +114,8 @@ def describe_environment(device: str, command: str) -> dict[str, object]:
         command: The command that made the rows, as a reader would repeat it.
 
     Returns:
-        Values for JSON: ``date`` (UTC), ``command``, ``device``, ``device_name``, versions of ``python``, ``numpy``,
-        ``torch``, ``warp``, ``wlm`` and, on CUDA, ``cuda``; ``threads`` (torch's) and ``omp_num_threads`` (the
+        Values for JSON: `date` (UTC), `command`, `device`, `device_name`, versions of `python`, `numpy`,
+        `torch`, `warp`, `wlm` and, on CUDA, `cuda`; `threads` (torch's) and `omp_num_threads` (the
         variable, or null).
 
     Raises:
@@ -149,7 +149,7 @@ def write_json(path: str | Path, rows: Sequence[Row], environment: Mapping[str, 
     Args:
         path: File to write; its folder must exist.
         rows: The results.
-        environment: As ``describe_environment`` gives it.
+        environment: As `describe_environment` gives it.
 
     Raises:
         WlmError: The environment does not fit JSON, the file can't be written, or what is there is no result file.
@@ -174,7 +174,7 @@ def read_runs(path: str | Path) -> list[Run]:
     """Reads a result file.
 
     Args:
-        path: File that ``write_json`` wrote.
+        path: File that `write_json` wrote.
 
     Returns:
         Its runs, from the oldest; at least one.
@@ -205,7 +205,7 @@ def read_json(path: str | Path) -> tuple[list[Row], dict[str, object]]:
     """Reads the rows of all runs of a result file, and the environment of the newest.
 
     Raises:
-        WlmError: As ``read_runs``.
+        WlmError: As `read_runs`.
     """
     runs = read_runs(path)
     return [row for run in runs for row in run.rows], runs[-1].environment

@@ -112,9 +112,9 @@ class Bench:
         """Makes a row.
 
         Args:
-            method, option, notes: As in ``Row``.
+            method, option, notes: As in `Row`.
             scene: Another one than the bench's.
-            timing, calls: As for ``Row.with_timing``.
+            timing, calls: As for `Row.with_timing`.
             figures: By name.
         """
         row = Row(self.system, self.scene if scene is None else scene, method, option, figures, notes)
@@ -167,7 +167,7 @@ def exact_errors(decoded: np.ndarray, exact: np.ndarray) -> dict[str, float]:
         exact: float64 [N, C].
 
     Returns:
-        The figures ``max_error`` and ``error_999``, the error that 99.9% of the points stay within.
+        The figures `max_error` and `error_999`, the error that 99.9% of the points stay within.
     """
     error = np.abs(decoded - exact).max(1)
     return {"max_error": float(error.max()), "error_999": float(np.percentile(error, 99.9))}
@@ -177,7 +177,7 @@ def demo_data(name: str, option: str) -> Path:
     """Finds data of the demos.
 
     Args:
-        name: Its path in ``demos/data``.
+        name: Its path in `demos/data`.
         option: The option that names other data.
 
     Raises:

@@ -69,7 +69,7 @@ def run(*, quick: bool, device: str, progress: Note | None = None) -> list[Row]:
 
 
 def run_rows(sizes: Sizes, *, device: str, progress: Note | None = None) -> list[Row]:
-    """Measures it on grids of the given sizes; the rest as for ``run``."""
+    """Measures it on grids of the given sizes; the rest as for `run`."""
     bench = SmokeBench(device, sizes, progress)
     return [row for part in _PARTS for row in part(bench)]
 

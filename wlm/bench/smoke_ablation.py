@@ -114,7 +114,7 @@ def run(
         only: Names of variants; none: all.
         quick: Small images and few steps, for seconds on a CPU.
         device: "cpu" or "cuda:0".
-        rounds, steps: As in ``AblationSizes``; None: those of the sizes.
+        rounds, steps: As in `AblationSizes`; None: those of the sizes.
         progress: Called with a line before each part of the work, and for each variant that is left out.
         done: Called after each row with all rows so far.
 
@@ -139,7 +139,7 @@ def run_rows(
     progress: Note | None = None,
     done: Callable[[list[Row]], None] | None = None,
 ) -> list[Row]:
-    """Trains the variants of a profile at the given sizes; the rest as for ``run``."""
+    """Trains the variants of a profile at the given sizes; the rest as for `run`."""
     bench = Bench("smoke-network", device, progress, scene=f"validation, {base.name}")
     training = {"rounds": sizes.rounds, "steps": sizes.steps, "crop": None}
     base = _changed(base, {"dataset": sizes.dataset, "training": training})

@@ -281,7 +281,7 @@ def _turn(bench: SmokeBench, scheme: str, storage: str) -> dict[str, float]:
     """Turns a smooth ball once about the box's axis, after which it should be where it was.
 
     Returns:
-        ``rms``, over the ball's own RMS; ``max_error``, where the ball's greatest density is 1; ``smoke_gained``.
+        `rms`, over the ball's own RMS; `max_error`, where the ball's greatest density is 1; `smoke_gained`.
     """
     n, device = bench.sizes.coarse, bench.device
     edge, box = _RATIO * n, _box(n)

@@ -55,7 +55,7 @@ from wlm_kernels.smoke.settings import March
 __all__ = ["PANELS", "plotted", "run", "run_rows"]
 
 PANELS = (Panel("time_ms", "psnr"),)
-"""What a plot of ``plotted`` rows shows."""
+"""What a plot of `plotted` rows shows."""
 
 _TABLE = "time against error"
 _LONG = 5.0  # voxels: six-way marches with no longer steps take long
@@ -93,7 +93,7 @@ def run(
 def run_rows(
     sizes: NetworkSizes, subjects: Sequence[Subject], *, device: str, progress: Note | None = None
 ) -> list[Row]:
-    """Measures networks on grids of the given sizes; the rest as for ``run``."""
+    """Measures networks on grids of the given sizes; the rest as for `run`."""
     bench = NetworkBench(device, sizes, subjects, progress)
     parts = (error_rows, frame_rows, flipbook_rows, traced_rows, profile_rows, density_rows)
     return [row for part in parts for row in part(bench)]

@@ -48,7 +48,7 @@ def time_together(
     """Times peers in one run, in turns, so that a drifting clock or a busy neighbour slows all alike.
 
     Each round takes one sample of every peer, and each round starts with the next peer. On CUDA all of them
-    run on the stream of ``wlm.interop.stream``, which the events are recorded on; a function that launches on another
+    run on the stream of `wlm.interop.stream`, which the events are recorded on; a function that launches on another
     stream must make the two streams wait for each other.
 
     Args:

@@ -14,7 +14,7 @@ __all__ = ["app"]
 app = typer.Typer(help="The lightmap of a mesh: a small colour texture, read through a small table.")
 
 _Folder = Annotated[Path, typer.Argument(metavar="DIR", help="A folder that compress wrote.")]
-_VIEWS, _RESOLUTION = 50, 512  # as in ``wlm.atlas.evaluation``, which takes long to import
+_VIEWS, _RESOLUTION = 50, 512  # as in `wlm.atlas.evaluation`, which takes long to import
 
 
 @app.command()

@@ -53,7 +53,7 @@ def _console(stderr: bool = False) -> Console:
 
 
 def table(title: str, columns: Sequence[str], text: Sequence[str] = ()) -> Table:
-    """Starts a table: the first column and those named in ``text`` hold text, the others numbers."""
+    """Starts a table: the first column and those named in `text` hold text, the others numbers."""
     rows = Table(title=title, header_style="bold")
     for i, heading in enumerate(columns):
         rows.add_column(heading, justify="right" if i and heading not in text else "left", overflow="fold")
@@ -241,7 +241,7 @@ def deferred_interrupt() -> Iterator[Callable[[], None]]:
 def running(what: str, checkpoint: Path | None = None, unit: str = "step") -> "Iterator[OnProgress]":
     """Shows the progress of long work and, where it has a checkpoint, lets Ctrl-C stop it between two steps.
 
-    Each stage that isn't ``what`` has a bar of its own, named ``what: stage``.
+    Each stage that isn't `what` has a bar of its own, named `what: stage`.
 
     Args:
         what: The work, in a word or two.
@@ -278,7 +278,7 @@ def running(what: str, checkpoint: Path | None = None, unit: str = "step") -> "I
 
 
 def _named_figure(name: str, value: float) -> str:
-    """``PSNR dB`` of 41.2 is written "PSNR 41.2 dB"."""
+    """`PSNR dB` of 41.2 is written "PSNR 41.2 dB"."""
     label, _, unit = name.partition(" ")
     return " ".join(filter(None, (label, number(value, ".4g"), unit)))
 

@@ -16,5 +16,5 @@ ModelFile = Annotated[Path, typer.Argument(metavar="FILE.wlm", help="A file that
 
 
 def output_option(metavar: str, help_text: str) -> Any:
-    """``--output`` or ``-o``, for ``Annotated[Path, output_option(...)]``."""
+    """`--output` or `-o`, for `Annotated[Path, output_option(...)]`."""
     return typer.Option("--output", "-o", metavar=metavar, help=help_text)

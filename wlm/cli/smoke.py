@@ -267,7 +267,7 @@ def flipbook(
 
 
 def _light(text: str) -> "Light":
-    """A light of ``X,Y,Z[:R,G,B]`` or ``X,Y,Z[:E]``, a white one."""
+    """A light of `X,Y,Z[:R,G,B]` or `X,Y,Z[:E]`, a white one."""
     from wlm.config import check_settings
     from wlm.smoke.scene import LightSettings
 

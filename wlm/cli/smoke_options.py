@@ -1,4 +1,4 @@
-"""What the commands of ``wlm smoke`` share: options of the smoke and its camera, output files, tables of lightmaps."""
+"""What the commands of `wlm smoke` share: options of the smoke and its camera, output files, tables of lightmaps."""
 
 import functools
 import inspect
@@ -29,7 +29,7 @@ Input = Annotated[Path, typer.Argument(metavar="SMOKE", help="A .npz or .nvdb vo
 
 @dataclass(frozen=True)
 class SmokeOptions:
-    """Options of the smoke, its camera and the device, each spelled out once for all commands ``with_smoke``."""
+    """Options of the smoke, its camera and the device, each spelled out once for all commands `with_smoke`."""
 
     resolution: Annotated[
         int | None, typer.Option(min=1, max=16384, help="Pixels along the image's height; default the scene's, or 512.")
@@ -85,7 +85,7 @@ class SmokeOptions:
 
 
 def with_smoke(command: Callable[..., None]) -> Callable[..., None]:
-    """Gives a command the options of ``SmokeOptions``, which it takes as its parameter ``options``."""
+    """Gives a command the options of `SmokeOptions`, which it takes as its parameter `options`."""
     signature = inspect.signature(command)
     names = [field.name for field in fields(SmokeOptions)]
 

@@ -19,7 +19,7 @@
     smoke.step(100)
     fluid.save_volume("smoke.npz", smoke.frame(extinction=0.2))
 
-Lengths are in cells of the lattice, times in its steps; ``Domain`` converts from SI units.
+Lengths are in cells of the lattice, times in its steps; `Domain` converts from SI units.
 """
 
 from wlm._facade import facade

@@ -1,4 +1,4 @@
-"""The arrays of a lattice on its device, and the launches that make a step; ``lattice`` checks what goes in."""
+"""The arrays of a lattice on its device, and the launches that make a step; `lattice` checks what goes in."""
 
 import math
 from collections.abc import Mapping
@@ -47,8 +47,8 @@ class Engine:
         spec: The settings that change the code of a step.
         device: The device.
         cells: X Y Z.
-        done: Steps done by this object's own launches; replays of a graph that a user made count in ``clock`` alone.
-        clock, trouble: See ``wlm_kernels.fluid.lattice.step_kernel``.
+        done: Steps done by this object's own launches; replays of a graph that a user made count in `clock` alone.
+        clock, trouble: See `wlm_kernels.fluid.lattice.step_kernel`.
         solid: uint8 [N], or [0] as long as no cell was ever solid.
         bodies: The motion of the solids.
     """
@@ -91,7 +91,7 @@ class Engine:
     # Setting up.
 
     def set_faces(self, faces: Mapping[str, Face]) -> None:
-        """Sets the conditions at the domain's faces; ``prepare`` makes their links."""
+        """Sets the conditions at the domain's faces; `prepare` makes their links."""
         self._faces = dict(faces)
         self._links: lattice_links.Links | None = None
         self._graph: wp.Graph | None = None
@@ -174,7 +174,7 @@ class Engine:
         return fastest
 
     def _make_links(self, columns, size: int) -> lattice_links.Links:
-        """Puts the links of faces on the device, in arrays of ``size`` elements."""
+        """Puts the links of faces on the device, in arrays of `size` elements."""
         links = lattice_links.Links()
         links.faces = len(columns[0])
         dtypes = {"cell": np.int32, "code": np.uint8, "term": np.float32}
@@ -199,7 +199,7 @@ class Engine:
             self._step()
 
     def run_in_graphs(self, steps: int) -> None:
-        """Does the same by replays of a CUDA graph of ``PERIOD`` steps; what remains runs without it."""
+        """Does the same by replays of a CUDA graph of `PERIOD` steps; what remains runs without it."""
         while steps > 0:
             if steps < PERIOD or self.done % PERIOD or self._graph is None:
                 # The first steps load the kernels' modules, which a capture must not.

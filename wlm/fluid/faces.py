@@ -1,4 +1,4 @@
-"""Boundary conditions on the six faces of a lattice's domain, and their links (``wlm_kernels.fluid.lattice_links``)."""
+"""Boundary conditions on the six faces of a lattice's domain, and their links (`wlm_kernels.fluid.lattice_links`)."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ class Face:
 
     Attributes:
         rank: uint8 [A, B], precedence along the domain's edges.
-        kind: uint8 [A, B], kinds of ``lattice_links``.
+        kind: uint8 [A, B], kinds of `lattice_links`.
         velocity: float64 [A, B, 3], of a wall or an inlet, cells a step.
         excess: Density less 1 of an outlet with a given density.
     """
@@ -62,7 +62,7 @@ def wall(shape: tuple[int, int, int], face: str, velocity=(0.0, 0.0, 0.0), slip:
 
 
 def inlet(shape: tuple[int, int, int], face: str, velocity, where=None) -> Face:
-    """An inlet where ``where`` (bool [A, B], None: all) is true, a wall elsewhere."""
+    """An inlet where `where` (bool [A, B], None: all) is true, a wall elsewhere."""
     size = _size(shape, face)
     opened = np.ones(size, bool) if where is None else np.asarray(where, bool)
     if opened.shape != size:
@@ -102,7 +102,7 @@ def walled_axes(faces: Mapping[str, Face]) -> tuple[bool, bool, bool]:
 
 
 def axis_ends(faces: Mapping[str, Face]) -> tuple[tuple[int, int], ...]:
-    """The kinds of each axis' two ends for smoke, see ``advection_places``; a face that isn't all wall is open."""
+    """The kinds of each axis' two ends for smoke, see `advection_places`; a face that isn't all wall is open."""
     ends = []
     for name in FACES:
         walled = name in faces and np.isin(faces[name].kind, (BOUNCE, SLIP)).all()
@@ -118,7 +118,7 @@ def face_links(
     They include those of solid cells, which the kernels skip.
 
     Returns:
-        ``cell`` int32 [L], ``code`` uint8 [L] and ``term`` float32 [L] of ``wlm_kernels.fluid.lattice_links.Links``.
+        `cell` int32 [L], `code` uint8 [L] and `term` float32 [L] of `wlm_kernels.fluid.lattice_links.Links`.
     """
     bounded = bounded_axes(faces)
     closed = np.array(walled_axes(faces))

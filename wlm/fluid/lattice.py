@@ -1,11 +1,11 @@
 """A lattice Boltzmann solver of air (neural-six-way-lightmaps, section 5).
 
-Lengths are in cells, times in steps, and the density of air at rest is 1; ``Domain`` converts. Arrays are [X, Y, Z],
+Lengths are in cells, times in steps, and the density of air at rest is 1; `Domain` converts. Arrays are [X, Y, Z],
 cell centres at half integers. Stated behaviours:
 
 ====================================  =================================================================
-a flow that blows up                  error within ``CHECK_EVERY`` steps: the first step and cell, and why
-a wall, body or inlet too fast        error: the speed and ``MAX_SPEED``
+a flow that blows up                  error within `CHECK_EVERY` steps: the first step and cell, and why
+a wall, body or inlet too fast        error: the speed and `MAX_SPEED`
 a body over an inlet                  nothing comes in where it lies; with all covered, nothing at all
 a body over everything                nothing moves
 a grid of one voxel                   fine, as is any axis of one cell
@@ -60,7 +60,7 @@ class Domain:
 
     @classmethod
     def of_speed(cls, cell: float, speed: float, lattice_speed: float = 0.1) -> "Domain":
-        """The domain in which ``speed`` (m/s) is ``lattice_speed`` (cells a step)."""
+        """The domain in which `speed` (m/s) is `lattice_speed` (cells a step)."""
         return cls(cell, lattice_speed * cell / speed)
 
     def speed(self, value: float) -> float:
@@ -79,12 +79,12 @@ class Domain:
 class Lattice:
     """A box of air, at rest at first, periodic along every axis without faces.
 
-    Set faces first, then ``set_flow`` unless the air begins at rest, then step; bodies and forces at any time.
+    Set faces first, then `set_flow` unless the air begins at rest, then step; bodies and forces at any time.
 
     Args:
         shape: Cells along x, y and z.
         viscosity: Kinematic, square cells a step; above 0.
-        operator: Of collision: "bgk", "regularised" or "recursive", see ``wlm_kernels.fluid.lattice``.
+        operator: Of collision: "bgk", "regularised" or "recursive", see `wlm_kernels.fluid.lattice`.
         smagorinsky: C of the eddy viscosity; 0 is none. With 0.17 the default operator is stable at viscosity 1e-6.
         storage: "float32" or "float16": half the memory and traffic; a jet's velocity then differs by less than 0.2% of
             its speed (RMS, until chaos separates the two), and its mass drifts by some 3e-5 in 5,000 steps.
@@ -94,7 +94,7 @@ class Lattice:
             walls and outlets that conserve mass reflect: four times the longest axis makes it weak.
 
     Attributes:
-        period: Steps after which a CUDA graph of them can be replayed, see ``step``.
+        period: Steps after which a CUDA graph of them can be replayed, see `step`.
 
     Raises:
         ValueError: A wrong argument.
@@ -142,7 +142,7 @@ class Lattice:
         """Closes a face.
 
         Args:
-            face: One of ``wlm.fluid.faces.FACES``, "-x" for example.
+            face: One of `wlm.fluid.faces.FACES`, "-x" for example.
             velocity: Of the wall, cells a step, along it; (3,) or [A, B, 3] for the face's cells.
             slip: Whether it is without friction, and so without a velocity.
         """
@@ -152,7 +152,7 @@ class Lattice:
         """Lets air in through a face, or a part of it.
 
         Args:
-            face: As for ``set_wall``.
+            face: As for `set_wall`.
             velocity: Cells a step; (3,) or [A, B, 3] for the face's cells.
             where: bool [A, B], the part that is open; None: the whole face. The rest is a wall.
         """
@@ -162,7 +162,7 @@ class Lattice:
         """Lets air out through a face.
 
         Args:
-            face: As for ``set_wall``.
+            face: As for `set_wall`.
             density: None: as much leaves, through all such outlets together, as comes in elsewhere, which conserves
                 mass. A number: the density relaxes to it, slowly enough to let sound out, and mass isn't conserved.
         """
@@ -176,13 +176,13 @@ class Lattice:
 
         Args:
             mask: bool, or the bodies' numbers 1 to 255 and 0 for fluid, [X, Y, Z]; a NumPy array, or a Warp array of
-                uint8 on the device as ``wlm_kernels.fluid.lattice_solids`` makes it.
+                uint8 on the device as `wlm_kernels.fluid.lattice_solids` makes it.
             velocity: Of the bodies' centres, cells a step; (3,) for body 1 or [K, 3] for bodies 1 to K.
             spin: Angular velocity, radians a step, likewise.
             centre: Cells, likewise; used where a body spins.
 
         Raises:
-            WlmError: A surface is faster than ``MAX_SPEED``.
+            WlmError: A surface is faster than `MAX_SPEED`.
         """
         new, bodies = self._mask(mask), self._engine.bodies
         for field, value in (("velocity", velocity), ("spin", spin), ("centre", centre)):
@@ -242,13 +242,13 @@ class Lattice:
     # Running.
 
     def step(self, steps: int = 1) -> None:
-        """Runs some steps, and ``check`` after every ``CHECK_EVERY`` of them.
+        """Runs some steps, and `check` after every `CHECK_EVERY` of them.
 
-        Within the capture of a CUDA graph it doesn't check: call ``check`` between replays. The number of steps must
-        be a multiple of ``period`` there, and so must be those done before.
+        Within the capture of a CUDA graph it doesn't check: call `check` between replays. The number of steps must
+        be a multiple of `period` there, and so must be those done before.
 
         Raises:
-            WlmError: As ``check``.
+            WlmError: As `check`.
         """
         if steps < 0:
             raise ValueError(f"steps: expected at least 0, got {steps}")
@@ -327,7 +327,7 @@ class Lattice:
         return self._engine.force_on_bodies()[body]
 
     def state(self) -> dict[str, np.ndarray]:
-        """The state, for ``load``: scaled populations, solid cells and their motion, steps done."""
+        """The state, for `load`: scaled populations, solid cells and their motion, steps done."""
         engine = self._engine
         # On a CPU .numpy() shares the array's memory, which the next step changes.
         return {

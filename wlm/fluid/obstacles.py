@@ -1,6 +1,6 @@
 """Solid obstacles in the air of a simulation, at rest or moving: spheres and closed meshes, and their paths.
 
-Lengths are in cells of the lattice, times in its steps, as in ``wlm.fluid.lattice``.
+Lengths are in cells of the lattice, times in its steps, as in `wlm.fluid.lattice`.
 """
 
 import hashlib
@@ -101,7 +101,7 @@ class Mesh:
 
     Attributes:
         path: Of its origin.
-        vertices: float32 [V, 3] around its origin, in units of ``scale`` cells.
+        vertices: float32 [V, 3] around its origin, in units of `scale` cells.
         triangles: int32 [T, 3], anticlockwise from outside.
         scale: Cells per unit.
     """
@@ -122,7 +122,7 @@ class Mesh:
             raise ValueError(f"scale: expected a number above 0, got {self.scale}")
 
     def cover(self, solid: wp.array, body: int, position: np.ndarray) -> None:
-        """As ``Sphere.cover``."""
+        """As `Sphere.cover`."""
         device = str(solid.device)
         if device not in self._meshes:
             points = wp.array(np.asarray(self.vertices, np.float32), dtype=wp.vec3, device=device)
@@ -131,7 +131,7 @@ class Mesh:
         voxelise_mesh(solid, body, self._meshes[device], position.tolist(), scale=self.scale)
 
     def describe(self) -> dict:
-        """As ``Sphere.describe``, with a hash of its arrays."""
+        """As `Sphere.describe`, with a hash of its arrays."""
         digest = hashlib.blake2b(np.asarray(self.vertices, np.float32).tobytes(), digest_size=16)
         digest.update(np.asarray(self.triangles, np.int32).tobytes())
         return self.path.describe() | {"mesh": digest.hexdigest(), "scale": self.scale}

@@ -1,7 +1,7 @@
 """A simulation of smoke: air on a lattice, and smoke carried by it on a finer grid, with sources and obstacles
 (neural-six-way-lightmaps, section 5: 100^3 velocities, 400^3 densities).
 
-Lengths are in cells of the lattice, times in its steps. A step of the solver is ``substeps`` of the lattice, in this
+Lengths are in cells of the lattice, times in its steps. A step of the solver is `substeps` of the lattice, in this
 order: obstacles move, smoke accelerates the air (buoyancy), the air moves, it carries the smoke, sources give. Stated
 behaviours:
 
@@ -9,7 +9,7 @@ behaviours:
 no smoke                               fine: the air moves, every density is 0
 an obstacle that covers an inlet       nothing comes in where it lies
 an obstacle or an inlet too fast       error of the lattice: the speed and its limit
-air that blows up                      error of the lattice, within ``wlm.fluid.lattice.CHECK_EVERY`` of its
+air that blows up                      error of the lattice, within `wlm.fluid.lattice.CHECK_EVERY` of its
                                        steps: step, cell and cause, and the last good checkpoint, which stays
 smoke in an obstacle                   none; smoke that a moving one covers is lost, cells that it frees get
                                        the mean of the cells beside them
@@ -109,7 +109,7 @@ class Buoyancy:
 
 
 def voxel_bytes(scheme: str, storage: str, temperature: bool) -> int:
-    """Memory of a cell of smoke, bytes; arguments as for ``Solver``."""
+    """Memory of a cell of smoke, bytes; arguments as for `Solver`."""
     fields = _buffers(scheme) * (2 if temperature else 1)
     return fields * wp.types.type_size_in_bytes(advection.STORAGES[storage])
 
@@ -136,7 +136,7 @@ class Solver:
     Args:
         lattice: The air.
         refinement: Cells of smoke along an edge of a cell of the lattice.
-        scheme: Of advection, one of ``SCHEMES``.
+        scheme: Of advection, one of `SCHEMES`.
         storage: "float32" or "float16": half the memory and as fast, but each step rounds to 11 bits.
         temperature: Whether smoke has one.
         sources: Where smoke comes from.
@@ -151,7 +151,7 @@ class Solver:
         checkpoint_every: Steps of the solver between two checkpoints.
 
     Attributes:
-        period: Steps after which a CUDA graph of them can be replayed, see ``step``.
+        period: Steps after which a CUDA graph of them can be replayed, see `step`.
 
     Raises:
         ValueError: A wrong argument.
@@ -242,9 +242,9 @@ class Solver:
     def step(self, steps: int = 1) -> None:
         """Runs some steps, and writes checkpoints.
 
-        Within the capture of a CUDA graph it neither checks nor writes: call ``check`` between replays. The number of
-        steps there, and of those done before, must be a multiple of ``period``, ``substeps`` one of the lattice's
-        ``period``, and obstacles must be at rest.
+        Within the capture of a CUDA graph it neither checks nor writes: call `check` between replays. The number of
+        steps there, and of those done before, must be a multiple of `period`, `substeps` one of the lattice's
+        `period`, and obstacles must be at rest.
 
         Raises:
             WlmError: The air blew up, an obstacle is too fast, or the checkpoint can't be written.

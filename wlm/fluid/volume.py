@@ -1,6 +1,6 @@
-"""Density volumes of smoke, checked, from arrays, ``.npz`` or NanoVDB (``.nvdb``) files; and writing ``.npz``.
+"""Density volumes of smoke, checked, from arrays, `.npz` or NanoVDB (`.nvdb`) files; and writing `.npz`.
 
-Stated behaviours. Repairs are listed in ``DensityVolume.warnings``, one line for each kind.
+Stated behaviours. Repairs are listed in `DensityVolume.warnings`, one line for each kind.
 
 ====================================  ================================================================
 input                                 behaviour
@@ -14,13 +14,13 @@ float16                               stays half; float32, float64 and integers 
 float64 beyond float32                as infinite: 0, warning
 other types, other than 3 dimensions  error
 temperature of another shape          error
-transform of a ``.nvdb`` that turns,  error
+transform of a `.nvdb` that turns,  error
 shears or stretches
-a ``.nvdb`` of points, vectors, ints  error
+a `.nvdb` of points, vectors, ints  error
 a file missing or damaged             error that names the file, and the field
 ====================================  ================================================================
 
-A grid's density has no unit of its own: the extinction per length is ``extinction`` times it.
+A grid's density has no unit of its own: the extinction per length is `extinction` times it.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ _LARGEST = 2**31 - 1  # voxels that a kernel can index
 class DensityVolume:
     """Smoke in a box of cubic voxels.
 
-    The constructor doesn't check: a solver's frames are used as they lie on the device. ``from_array`` does.
+    The constructor doesn't check: a solver's frames are used as they lie on the device. `from_array` does.
 
     Attributes:
         density: float32 or float16 tensor [X, Y, Z], finite, not negative.
@@ -153,10 +153,10 @@ def load_volume(
 ) -> DensityVolume:
     """Reads a volume from a file.
 
-    - ``.npz``: an array ``density`` [X, Y, Z], and optionally ``temperature`` of the same shape and the numbers
-      ``voxel`` and ``origin`` [3].
-    - ``.nvdb``: a float grid named ``density``, else the first one, over the box of its active voxels; and a grid named
-      ``temperature``, over the same box. Its transform gives the size and the position of the voxels.
+    - `.npz`: an array `density` [X, Y, Z], and optionally `temperature` of the same shape and the numbers
+      `voxel` and `origin` [3].
+    - `.nvdb`: a float grid named `density`, else the first one, over the box of its active voxels; and a grid named
+      `temperature`, over the same box. Its transform gives the size and the position of the voxels.
 
     Args:
         path: The file; its suffix tells the format.
@@ -193,7 +193,7 @@ def load_volume(
 
 
 def save_volume(path: str | os.PathLike[str], volume: DensityVolume) -> None:
-    """Writes a volume as ``.npz``, atomically, such that ``load_volume`` reads it back.
+    """Writes a volume as `.npz`, atomically, such that `load_volume` reads it back.
 
     Raises:
         WlmError: Another suffix, or the file can't be written.

@@ -89,7 +89,7 @@ def write_artifact(
 
     Args:
         path: The file to write; its folder must exist.
-        system, settings, tensors, source: As for ``encode_artifact``.
+        system, settings, tensors, source: As for `encode_artifact`.
 
     Returns:
         The size of the file, bytes.

@@ -28,7 +28,7 @@ def pack_bits(values: np.ndarray, widths: np.ndarray | Sequence[int]) -> np.ndar
 
 
 def unpack_bits(packed: np.ndarray, widths: np.ndarray | Sequence[int], count: int) -> np.ndarray:
-    """Undoes ``pack_bits`` for ``count`` rows; uint16 [count, C].
+    """Undoes `pack_bits` for `count` rows; uint16 [count, C].
 
     Raises:
         ValueError: Another number of bytes than so many rows take.

@@ -24,7 +24,7 @@ _FINISHED, _RUNNING = "finished", "running"
 
 
 class Checkpoint:
-    """The state of one fit, in the file ``OUTPUT.partial``.
+    """The state of one fit, in the file `OUTPUT.partial`.
 
     Made for a system's fit, which asks it for what is done already and hands it what gets done. Batches are
     numbered from 0; at most one is running. A fit of one batch calls it number 0.
@@ -56,8 +56,8 @@ class Checkpoint:
                 first save.
 
         Raises:
-            WlmError: With ``resume``: the file is damaged, or of another fit; the line names what differs.
-            ValueError: ``fit`` holds NaN or Inf, which JSON has not.
+            WlmError: With `resume`: the file is damaged, or of another fit; the line names what differs.
+            ValueError: `fit` holds NaN or Inf, which JSON has not.
         """
         self.path = Path(f"{os.fspath(output)}{SUFFIX}")
         self.system = f"{system}-checkpoint"

@@ -1,6 +1,6 @@
 """Folders of files that belong together: claimed before long work, made beside their place and moved in whole.
 
-An index file, JSON with a ``format`` of its own, says whose folder it is. It is written last: a folder whose index is
+An index file, JSON with a `format` of its own, says whose folder it is. It is written last: a folder whose index is
 whole holds all that the index names.
 """
 
@@ -33,7 +33,7 @@ def claim(folder: Path, index: str, format_name: str) -> None:
     Args:
         folder: Where; it need not exist.
         index: Name of the index file.
-        format_name: The index's ``format``.
+        format_name: The index's `format`.
 
     Raises:
         WlmError: It is a file, holds something other than an earlier output, or it or its parent can't be written.
@@ -55,13 +55,13 @@ def claim(folder: Path, index: str, format_name: str) -> None:
 def staged(folder: Path, index: str, format_name: str, ours: Callable[[str], bool]) -> Iterator[Path]:
     """Yields a new folder beside the real one, and moves its files there at the end if nothing went wrong.
 
-    The index is moved last. Where the moving is stopped half-way, the folder's index says ``UNFINISHED``: it can't be
+    The index is moved last. Where the moving is stopped half-way, the folder's index says `UNFINISHED`: it can't be
     read, but can be written again.
 
     Args:
         folder: Where; claimed, made if it isn't there.
         index: Name of the index file, which the block has to write.
-        format_name: The index's ``format``.
+        format_name: The index's `format`.
         ours: Whether a name is one that such an output may have: files of an earlier output that the new one lacks are
             removed.
 
@@ -103,7 +103,7 @@ def read_index(path: Path) -> dict[str, Any]:
 
 
 def write_index(path: Path, content: dict[str, Any]) -> int:
-    """Writes an index, whole or not at all, as ``compact_json``."""
+    """Writes an index, whole or not at all, as `compact_json`."""
     return atomic_write(path, compact_json(content).encode())
 
 

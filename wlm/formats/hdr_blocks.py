@@ -51,7 +51,7 @@ def encode_bc6h(texels: np.ndarray, profile: str, extra: str) -> bytes:
 
     Args:
         texels: half [H, W, 3], finite, not negative; H and W multiples of 4.
-        profile: One of ``BC6H_PROFILES``, from the fastest to the best.
+        profile: One of `BC6H_PROFILES`, from the fastest to the best.
         extra: The extra that a message names.
 
     Raises:
@@ -74,7 +74,7 @@ def decode_bc6h(blocks: bytes, height: int, width: int, extra: str) -> np.ndarra
 
 
 class Astc:
-    """ASTC HDR in blocks of one size, by astcenc; made by ``astc``."""
+    """ASTC HDR in blocks of one size, by astcenc; made by `astc`."""
 
     def __init__(self, codec: ModuleType, block: tuple[int, int], quality: float) -> None:
         config = codec.ASTCConfig(codec.ASTCProfile.HDR_RGB_LDR_A, *block, 1, quality)
@@ -98,7 +98,7 @@ def astc(block: tuple[int, int], quality: float, extra: str) -> Astc:
     """Gives the codec of a setting, the same one every time.
 
     Args:
-        block: One of ``ASTC_BLOCKS``.
+        block: One of `ASTC_BLOCKS`.
         quality: astcenc's effort, 0 (fastest) to 100 (exhaustive); decoding is the same for all.
         extra: The extra that a message names.
 

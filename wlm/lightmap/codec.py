@@ -36,7 +36,7 @@ def decode(artifact: Artifact) -> LightmapModel:
     """Makes a model of the parts of its file.
 
     Raises:
-        WlmError, ValueError, TypeError, LookupError: The parts don't fit the settings; see ``wlm.system.decode``.
+        WlmError, ValueError, TypeError, LookupError: The parts don't fit the settings; see `wlm.system.decode`.
     """
     settings, tensors = artifact.settings, artifact.tensors
     profile = check_settings(Profile, settings["profile"], "profile.")

@@ -1,7 +1,7 @@
 """What comes in: a set of lightmaps over time, read from EXR files or arrays and checked.
 
 The stated behaviours. "Inside" is inside the mask. Repairs are counted in texels, whichever channels they touch, and
-listed in ``LightmapSet.warnings``, one line per file and kind.
+listed in `LightmapSet.warnings`, one line per file and kind.
 
 ====================================  ================================================================
 input                                 behaviour
@@ -19,10 +19,10 @@ times out of order                    sorted, with their frames; warning
 two equal times                       error that names both files
 a time outside [0, period)            error: 24 h is 0 h, and wrapping would hide a mistake in the list
 a NaN or infinite time                error
-frames, mask or ``set.json`` that     error that names both files
+frames, mask or `set.json` that     error that names both files
 disagree in size
 a file missing or damaged, a          error that names the file, and the field
-malformed ``set.json``
+malformed `set.json`
 ====================================  ================================================================
 
 Layout of a set and its evaluation: neural-dynamic-gi, section 10.1.
@@ -58,10 +58,10 @@ class LightmapSet:
 
     Attributes:
         name: The set's name.
-        times: ``[T]`` float64, strictly increasing, in hours or any other unit.
-        frames: ``[T, H, W, 3]`` float32, linear RGB irradiance, finite, in [0, 65504]. Row 0 is v = 0.
-        mask: ``[H, W]`` bool, true where a texel belongs to a chart; at least one is.
-        period: Length of the day in the unit of ``times``, all of which are then in [0, period); None where the
+        times: `[T]` float64, strictly increasing, in hours or any other unit.
+        frames: `[T, H, W, 3]` float32, linear RGB irradiance, finite, in [0, 65504]. Row 0 is v = 0.
+        mask: `[H, W]` bool, true where a texel belongs to a chart; at least one is.
+        period: Length of the day in the unit of `times`, all of which are then in [0, period); None where the
             set is not periodic and times outside its ends are clamped.
         source: 16 hexadecimal digits of BLAKE2b over the checked pixels, the times and the mask.
         warnings: What was repaired, one line each.
@@ -83,23 +83,23 @@ def load(
     mask: str | os.PathLike[str] | None = None,
     period: float | None = None,
 ) -> LightmapSet:
-    """Reads a lightmap set: a ``set.json``, a folder that holds one, or a plain folder of EXR files.
+    """Reads a lightmap set: a `set.json`, a folder that holds one, or a plain folder of EXR files.
 
-    ``set.json`` is an object with ``width``, ``height`` and ``lightmaps`` (a list of ``{"time_hours", "file"}``), and
-    may have ``name``, ``period_hours`` and ``mask`` (a PNG's name, or "alpha"; absent means that all texels are
+    `set.json` is an object with `width`, `height` and `lightmaps` (a list of `{"time_hours", "file"}`), and
+    may have `name`, `period_hours` and `mask` (a PNG's name, or "alpha"; absent means that all texels are
     valid). Other keys are ignored. Names of files are relative to it.
 
-    The files of a plain folder are taken in natural order of their names ("2" before "10"). Without ``times``,
-    the hours are read from the names if every one ends like ``_18_55h``, ``_18.55h``, ``_18h`` or ``_18.55``, the
-    digits after the second separator being decimals, not minutes. A ``mask.png`` among them is the mask unless
-    ``mask`` says otherwise.
+    The files of a plain folder are taken in natural order of their names ("2" before "10"). Without `times`,
+    the hours are read from the names if every one ends like `_18_55h`, `_18.55h`, `_18h` or `_18.55`, the
+    digits after the second separator being decimals, not minutes. A `mask.png` among them is the mask unless
+    `mask` says otherwise.
 
     Args:
-        path: The ``set.json`` or the folder.
-        times: One time for each lightmap in the order of the list or the names; replaces those of ``set.json``.
+        path: The `set.json` or the folder.
+        times: One time for each lightmap in the order of the list or the names; replaces those of `set.json`.
         mask: A PNG (a texel is valid where any colour channel is above 0), "alpha" (valid where the alpha
             channel of every frame is above 0) or "all"; None takes what the set says.
-        period: Length of the day in the unit of the times; None takes the set's ``period_hours``, if any.
+        period: Length of the day in the unit of the times; None takes the set's `period_hours`, if any.
 
     Returns:
         The set, repaired as the module's table says.
@@ -147,12 +147,12 @@ def from_arrays(
     period: float | None = None,
     name: str = "array",
 ) -> LightmapSet:
-    """Makes a checked set from arrays, under the same rules as ``load``.
+    """Makes a checked set from arrays, under the same rules as `load`.
 
     Args:
-        frames: ``[T, H, W, 3]`` of numbers, linear RGB irradiance; copied.
-        times: ``[T]``, in any order.
-        mask: ``[H, W]``, true where a texel is valid; None for all.
+        frames: `[T, H, W, 3]` of numbers, linear RGB irradiance; copied.
+        times: `[T]`, in any order.
+        mask: `[H, W]`, true where a texel is valid; None for all.
         period: Length of the day in the unit of the times; None for a set that is not periodic.
         name: The set's name, used in messages too.
 
@@ -178,9 +178,9 @@ def from_arrays(
 
 
 def parse_times(text: str) -> list[float]:
-    """Reads a list of times: numbers and ``start:stop:step`` ranges, separated by commas.
+    """Reads a list of times: numbers and `start:stop:step` ranges, separated by commas.
 
-    A range leaves ``stop`` out, as Python's do: "0:24:1" is 0, 1, ... 23, one day without its first hour twice.
+    A range leaves `stop` out, as Python's do: "0:24:1" is 0, 1, ... 23, one day without its first hour twice.
 
     Args:
         text: Such as "0,1,2.5", "0:24:1" or "0:18:1,18.45,18.55,19:24:1".

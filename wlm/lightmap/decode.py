@@ -113,7 +113,7 @@ class Decoder:
         return assemble(tiles, numbers, self._grid), peak
 
     def _constant(self, numbers: Sequence[int], time: float) -> list[tuple[int, np.ndarray]]:
-        """The constant tiles among ``numbers``: their places there and their radiance [3]."""
+        """The constant tiles among `numbers`: their places there and their radiance [3]."""
         before, after, share = self._times.neighbours(time)
         rows = self.model.constant.astype(np.float32)
         return [
@@ -143,7 +143,7 @@ class Decoder:
 
 
 def gelu_of(model: LightmapModel, gelu: str | None) -> str:
-    """The GELU to decode with: ``gelu``, or the model's for None.
+    """The GELU to decode with: `gelu`, or the model's for None.
 
     Raises:
         WlmError: There is no such GELU.
@@ -165,7 +165,7 @@ class TimeTable:
         self._shift, self._spread = (wp.array(values, dtype=wp.vec3, device=device) for values in affine)
 
     def neighbours(self, time: float) -> tuple[int, int, float]:
-        """As ``TimeAxis.neighbours``.
+        """As `TimeAxis.neighbours`.
 
         Raises:
             WlmError: The time isn't finite.
@@ -206,8 +206,8 @@ class StoredTiles:
     Attributes:
         numbers: int [n], their numbers in the grid.
         rows: int [n], their places among the model's mapped tiles.
-        places: ``rows`` on the device.
-        arguments: What each decode kernel takes first: ``Stored``, hidden vecH [n, I + H + 2], output vec3 [n, H + 1].
+        places: `rows` on the device.
+        arguments: What each decode kernel takes first: `Stored`, hidden vecH [n, I + H + 2], output vec3 [n, H + 1].
         device_bytes: Memory that they take up on the device, bytes.
     """
 
@@ -248,5 +248,5 @@ class StoredTiles:
         self._row_of = {int(number): i for i, number in enumerate(self.numbers)}
 
     def among(self, numbers: Sequence[int]) -> list[tuple[int, int]]:
-        """Those of ``numbers`` that are here: their places in ``numbers`` and in ``self.numbers``."""
+        """Those of `numbers` that are here: their places in `numbers` and in `self.numbers`."""
         return [(i, self._row_of[number]) for i, number in enumerate(numbers) if number in self._row_of]

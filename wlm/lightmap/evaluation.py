@@ -25,7 +25,7 @@ __all__ = [
     "scored_mask",
 ]
 
-# Stored times are float32 where that keeps them apart; see ``wlm.lightmap.codec``.
+# Stored times are float32 where that keeps them apart; see `wlm.lightmap.codec`.
 _TIME_TOLERANCE = 1e-6
 
 
@@ -36,8 +36,8 @@ class Report(BaseReport):
     Attributes:
         psnr, ssim, flip: Means over every scored tile at every time; decibels (120 for an exact tile), in [-1, 1], in
             [0, 1].
-        psnr_unlimited: The mean of PSNR without the tiles of ``format_limited``.
-        bpp: Bits per texel and time, see ``bits_per_texel``.
+        psnr_unlimited: The mean of PSNR without the tiles of `format_limited`.
+        bpp: Bits per texel and time, see `bits_per_texel`.
         bytes: Size of the file on disk.
         tiles, times: Tiles that the file holds, and times.
         device: Where it was decoded.
@@ -46,17 +46,17 @@ class Report(BaseReport):
         psnr_by_time, ssim_by_time, flip_by_time: float64 [T], means over the tiles.
         time_values: float64 [T], the stored times.
         worst_psnr: Lowest PSNR of any tile at any time.
-        worst_tile: Where that is: ``time``, ``tile`` (its number), ``row``, ``column``; None without a score.
+        worst_tile: Where that is: `time`, `tile` (its number), `row`, `column`; None without a score.
         max_abs_error: Largest absolute error of a valid texel, scored or not, in the input's units.
         max_abs_error_unscored: The same over what has no score.
         scored: Tiles times times that count in the means.
-        not_scored: The rest, by reason: ``empty`` (no valid texel), ``not_held`` (valid texels, but not in the
-            file), ``few_texels``, ``zero_range`` (see ``wlm.metrics``).
+        not_scored: The rest, by reason: `empty` (no valid texel), `not_held` (valid texels, but not in the
+            file), `few_texels`, `zero_range` (see `wlm.metrics`).
         no_ssim: Scored ones without an SSIM.
-        format_limited: ``time``, ``tile`` of the scored ones that span only a few steps of half float.
-        parts: Bytes of the file by part, see ``part_bytes``.
+        format_limited: `time`, `tile` of the scored ones that span only a few steps of half float.
+        parts: Bytes of the file by part, see `part_bytes`.
         profile: Name of the settings.
-        kinds: Tiles of the grid by kind: ``empty``, ``constant``, ``static``, ``dynamic``.
+        kinds: Tiles of the grid by kind: `empty`, `constant`, `static`, `dynamic`.
         warnings: Tiles that were not scored, or another input than the file's.
     """
 
@@ -118,7 +118,7 @@ def evaluate(
     Raises:
         WlmError: The set's size or times are not the model's, no tile of the model has a valid texel, the device
             isn't there, or a metric is unknown.
-        ValueError: ``file_bytes`` is less than the model's parts take.
+        ValueError: `file_bytes` is less than the model's parts take.
     """
     start = time.perf_counter()
     device = interop.check_device(device)
@@ -136,7 +136,7 @@ def evaluate(
 
 
 def bits_per_texel(model: LightmapModel, mask: np.ndarray, file_bytes: int) -> float:
-    """Bits per texel and time: ``file_bytes * 8 / (area * times)``.
+    """Bits per texel and time: `file_bytes * 8 / (area * times)`.
 
     The area is the whole map with the gaps between charts, as the file replaces textures of that size. Where the model
     holds only some of the tiles with a valid texel, it is the part of the map that these cover.
@@ -162,10 +162,10 @@ def count_kinds(model: LightmapModel) -> dict[str, int]:
 
 
 def part_bytes(model: LightmapModel, file_bytes: int) -> dict[str, int]:
-    """Bytes of a model's file by part, the largest first; ``header`` is the rest: the header and the times.
+    """Bytes of a model's file by part, the largest first; `header` is the rest: the header and the times.
 
     Raises:
-        ValueError: ``file_bytes`` is less than the parts take.
+        ValueError: `file_bytes` is less than the parts take.
     """
     parts = {name: value.nbytes for name, value in model.parts.items()}
     parts["header"] = file_bytes - sum(parts.values())
@@ -188,7 +188,7 @@ def scored_mask(model: LightmapModel, lightmaps: LightmapSet) -> np.ndarray:
         bool [H, W], the valid texels that the model holds: those that are scored.
 
     Raises:
-        WlmError: As ``evaluate``.
+        WlmError: As `evaluate`.
     """
     count, height, width = lightmaps.frames.shape[:3]
     if (height, width) != (model.height, model.width):

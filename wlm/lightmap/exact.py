@@ -23,7 +23,7 @@ def decode_tile64(model: LightmapModel, number: int, time: float) -> np.ndarray:
         model: The model.
         number: Of the tile in the grid, row-major.
         time: In the unit of the set's times; at times between the stored ones what depends on the time is
-            interpolated, as ``wlm.lightmap.decode.Decoder`` does.
+            interpolated, as `wlm.lightmap.decode.Decoder` does.
 
     Returns:
         Linear radiance, float64 [128, 128, 3]; 0 in an empty tile.
@@ -38,7 +38,7 @@ def decode_tile64(model: LightmapModel, number: int, time: float) -> np.ndarray:
 
 
 def colour_tile64(model: LightmapModel, number: int, time: float) -> np.ndarray:
-    """The same tile in gamma space, radiance ** (1 / gamma): float64 [128, 128, 3]; see ``decode_tile64``."""
+    """The same tile in gamma space, radiance ** (1 / gamma): float64 [128, 128, 3]; see `decode_tile64`."""
     _check(model, number, time)
     kind = model.kind[number]
     if kind == TileKind.EMPTY:
@@ -63,7 +63,7 @@ def bound64(model: LightmapModel, number: int, time: float) -> float:
         time: Between two stored times the larger of the two bounds holds.
 
     Raises:
-        WlmError: As ``decode_tile64``.
+        WlmError: As `decode_tile64`.
     """
     _check(model, number, time)
     if model.kind[number] == TileKind.EMPTY:

@@ -53,13 +53,13 @@ _ABOUT = {
 def export(model: LightmapModel, directory: str | os.PathLike[str], *, device: str = "cpu") -> list[Path]:
     """Writes a model as textures, weights and a shader, and a frame to compare with.
 
-    For tile N of the grid, with four digits: ``tile_N_uv.dds``, F_uv in BC7, and of a dynamic tile also
-    ``tile_N_uvt.dds``, F_uvt as a BC7 volume whose depth is time, and ``tile_N_ut.dds`` and ``tile_N_vt.dds``,
+    For tile N of the grid, with four digits: `tile_N_uv.dds`, F_uv in BC7, and of a dynamic tile also
+    `tile_N_uvt.dds`, F_uvt as a BC7 volume whose depth is time, and `tile_N_ut.dds` and `tile_N_vt.dds`,
     F_ut and F_vt in R8G8_UNORM with time down the rows (neural-dynamic-gi, Table 1). The blocks are the model's
-    own bytes. ``decode.glsl`` is the decoder; ``frame.exr`` is the map at the first stored time, as the shader should
-    show it; ``weights.json`` explains itself under "about".
+    own bytes. `decode.glsl` is the decoder; `frame.exr` is the map at the first stored time, as the shader should
+    show it; `weights.json` explains itself under "about".
 
-    The files are written beside the folder and moved in together, ``weights.json`` last. An earlier export is replaced,
+    The files are written beside the folder and moved in together, `weights.json` last. An earlier export is replaced,
     and textures of tiles that are no longer there are removed; other files stay.
 
     Args:
@@ -113,7 +113,7 @@ def write_8bit(path: str | os.PathLike[str], decoder: Decoder, time: float) -> N
 
 
 def _write_maps(folder: Path, number: int, model: LightmapModel, place: int, row: int | None) -> list[Path]:
-    """Writes the textures of one tile; ``row`` is its place among the dynamic ones, None for a static one."""
+    """Writes the textures of one tile; `row` is its place among the dynamic ones, None for a static one."""
     profile = model.profile
 
     def put(part: str, values: np.ndarray, *size: int, **options: Any) -> Path:

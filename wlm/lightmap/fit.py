@@ -36,21 +36,21 @@ def compress(
 
     Args:
         lightmaps: The set.
-        profile: The settings: a name, the path of a YAML file, or a ``Profile``.
+        profile: The settings: a name, the path of a YAML file, or a `Profile`.
         tiles: Numbers of the tiles to compress; None: all. The others are stored as empty.
         seed: One seed gives one result on one device.
         device: "cpu", "cuda" or "cuda:N".
         progress: Called about twice a second; its figures are the loss and "PSNR dB", of the samples since the last
             report, by the tiled protocol.
-        checkpoint: From ``open_checkpoint``: where an interrupted fit is kept and resumed.
-        overrides: Settings in place of the profile's: ``steps=500``.
+        checkpoint: From `open_checkpoint`: where an interrupted fit is kept and resumed.
+        overrides: Settings in place of the profile's: `steps=500`.
 
     Returns:
         The model.
 
     Raises:
         WlmError: No such profile, setting, device or tile; or the fit diverged.
-        KeyboardInterrupt: Raised by ``progress``, after the checkpoint, if there is one, has been written.
+        KeyboardInterrupt: Raised by `progress`, after the checkpoint, if there is one, has been written.
     """
     device = interop.check_device(device)
     fit = _Fit(lightmaps, Profile.load(profile).override(overrides), tiles)
@@ -85,17 +85,17 @@ def open_checkpoint(
     resume: bool = False,
     **overrides: Any,
 ) -> Checkpoint:
-    """Opens the checkpoint of a fit: the file ``OUTPUT.partial``, which names everything that the fit depends on.
+    """Opens the checkpoint of a fit: the file `OUTPUT.partial`, which names everything that the fit depends on.
 
     Args:
         output: The file that the fit is for.
-        lightmaps, profile, tiles, seed, overrides: As for ``compress``.
+        lightmaps, profile, tiles, seed, overrides: As for `compress`.
         device: Only its kind matters: a fit may go on on another GPU.
         resume: Whether to go on from the file, if there is one. Otherwise it is ignored, and replaced at the first
             save.
 
     Raises:
-        WlmError: With ``resume``: the file is damaged, or of another fit; the line names what differs.
+        WlmError: With `resume`: the file is damaged, or of another fit; the line names what differs.
     """
     fit = {
         "input": lightmaps.source,
@@ -137,7 +137,7 @@ class _Fit:
     Attributes:
         profile: The settings.
         data: The N tiles, by number.
-        kinds: int [N], ``TileKind`` of each.
+        kinds: int [N], `TileKind` of each.
         model: Complete but for the maps and networks of the batches that have not been stored.
     """
 
@@ -194,7 +194,7 @@ class _Fit:
                 model.affine[i, :, c] = shift, max(spread, 1e-4)
 
     def batches(self) -> list[_Batch]:
-        """Batches of ``BATCH_TEXELS``, dynamic tiles first."""
+        """Batches of `BATCH_TEXELS`, dynamic tiles first."""
         size = max(1, BATCH_TEXELS // (len(self.model.times) * TILE * TILE))
         result = []
         for kind in (TileKind.DYNAMIC, TileKind.STATIC):
@@ -224,7 +224,7 @@ class _Fit:
 
 
 def _run(trainer: Trainer, number: int, meter: Meter, checkpoint: Checkpoint | None) -> None:
-    """Trains batch ``number`` to its end, from its checkpoint if it has one."""
+    """Trains batch `number` to its end, from its checkpoint if it has one."""
     steps = trainer.profile.steps
     if checkpoint is not None and (state := checkpoint.running(number)) is not None:
         trainer.load(state)

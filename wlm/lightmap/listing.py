@@ -1,4 +1,4 @@
-"""The files of a lightmap set and their times: from a ``set.json``, or from the names in a folder.
+"""The files of a lightmap set and their times: from a `set.json`, or from the names in a folder.
 
 No pixels are read here. The layout follows the scene configuration of neural-dynamic-gi, section 10.1.
 """
@@ -48,7 +48,7 @@ class Listing:
 
 
 def list_folder(folder: Path, times: Sequence[float] | None) -> Listing:
-    """Lists a folder of EXR files without a ``set.json``, as ``wlm.lightmap.load`` states.
+    """Lists a folder of EXR files without a `set.json`, as `wlm.lightmap.load` states.
 
     Args:
         folder: The folder.
@@ -109,7 +109,7 @@ def _check_count(where: Path, files: Sequence[Path], times: Sequence[float]) -> 
 
 
 def parse_set(path: Path, times: Sequence[float] | None) -> Listing:
-    """Reads and checks a ``set.json``, as ``wlm.lightmap.load`` states.
+    """Reads and checks a `set.json`, as `wlm.lightmap.load` states.
 
     Args:
         path: The file.

@@ -5,7 +5,7 @@ network's output y is normalised colour; decoding undoes the normalisation:
 
     colour(u, v, t) = (shift + spread y) * scale(t),     radiance = max(colour, 0) ** gamma
 
-``colour`` is in gamma space. ``scale`` is the mean of each channel at each time (section 4), ``shift`` and ``spread``
+`colour` is in gamma space. `scale` is the mean of each channel at each time (section 4), `shift` and `spread`
 are the mean and the standard deviation, over all times, of colour / scale. The paper stops at the mean; the network of
 a tile whose lighting hardly varies would then have to output 1 +- 0.001. All three are stored rounded, and the fit
 divides by the rounded values, so that rounding them costs nothing.
@@ -62,7 +62,7 @@ class Profile(Settings):
             (eq. 2); with 0 those times are whatever the network extrapolates.
         quantise_from: Fraction of the steps after which the maps are quantised to the exact levels of the file.
         freeze_from: Fraction of the steps after which the maps are frozen and the network alone is trained.
-        static_budget_db: See ``wlm.lightmap.tiles.classify``.
+        static_budget_db: See `wlm.lightmap.tiles.classify`.
     """
 
     FILES: ClassVar[str] = "lightmap"
@@ -107,7 +107,7 @@ class Profile(Settings):
 
 @dataclass(frozen=True)
 class TimeAxis:
-    """Places a time on the features' time axis; see ``Profile.time_axis``.
+    """Places a time on the features' time axis; see `Profile.time_axis`.
 
     Attributes:
         times: float64 [T], increasing.
@@ -167,7 +167,7 @@ class TimeAxis:
 
 
 def encode_scale(values: np.ndarray, gamma: float, up: bool = False) -> np.ndarray:
-    """8-bit logarithmic codes of values >= 0: 0 is exactly 0, codes 1 to 255 share ``SCALE_SPAN`` evenly.
+    """8-bit logarithmic codes of values >= 0: 0 is exactly 0, codes 1 to 255 share `SCALE_SPAN` evenly.
 
     That makes steps of 4.7% at gamma 2.2. The span is fixed, so that a tile's bytes don't depend on its
     neighbours'. Smaller values take code 1.
@@ -186,7 +186,7 @@ def encode_scale(values: np.ndarray, gamma: float, up: bool = False) -> np.ndarr
 
 
 def decode_scale(codes: np.ndarray, gamma: float) -> np.ndarray:
-    """The values that ``encode_scale`` stands for, float32."""
+    """The values that `encode_scale` stands for, float32."""
     low, high = (bound / gamma for bound in SCALE_SPAN)
     value = np.exp2(low + (codes.astype(np.float64) - 1.0) * ((high - low) / 254.0))
     return np.where(codes > 0, value, 0.0).astype(np.float32)
@@ -199,7 +199,7 @@ def part_table(profile: Profile, kind: np.ndarray, times: int) -> dict[str, Part
 
     Args:
         profile: The settings.
-        kind: uint8 [tiles], as in ``LightmapModel``.
+        kind: uint8 [tiles], as in `LightmapModel`.
         times: T.
     """
     dynamic, static, constant = (
@@ -225,16 +225,16 @@ def part_table(profile: Profile, kind: np.ndarray, times: int) -> dict[str, Part
 
 @dataclass
 class LightmapModel(Model):
-    """A compressed lightmap set: what the file holds, as arrays. Their types and shapes are in ``part_table``.
+    """A compressed lightmap set: what the file holds, as arrays. Their types and shapes are in `part_table`.
 
     Attributes:
-        name, width, height, times, period, source: Of the input, see ``LightmapSet``.
+        name, width, height, times, period, source: Of the input, see `LightmapSet`.
         profile: The settings of the fit.
-        kind: uint8 [tiles], ``TileKind`` of each tile of the grid, row-major; EMPTY also where not compressed.
+        kind: uint8 [tiles], `TileKind` of each tile of the grid, row-major; EMPTY also where not compressed.
         uv: BC7 blocks of F_uv.
         uvt: BC7 blocks of F_uvt, slice by slice.
         ut, vt: F_ut and F_vt, time down the rows.
-        net: Networks of dynamic tiles, ``hidden`` rows and then ``output`` rows, see ``wlm_kernels.mlp``.
+        net: Networks of dynamic tiles, `hidden` rows and then `output` rows, see `wlm_kernels.mlp`.
         net_static: Those of static tiles.
         scale: Codes of the mean of each channel at each time, in gamma space.
         scale_static: The means themselves in static tiles: their network doesn't know the time, so it can't make up
@@ -268,7 +268,7 @@ class LightmapModel(Model):
 
     @property
     def parts(self) -> dict[str, np.ndarray]:
-        """The arrays by name, in the order of the file; ``kind`` is the last."""
+        """The arrays by name, in the order of the file; `kind` is the last."""
         return {name: getattr(self, name) for name in (*part_table(self.profile, self.kind, len(self.times)), "kind")}
 
     @property
@@ -278,7 +278,7 @@ class LightmapModel(Model):
 
     @property
     def mapped(self) -> np.ndarray:
-        """int [N_m], numbers of the tiles that have maps; ``uv``, ``peak`` and ``affine`` have their rows."""
+        """int [N_m], numbers of the tiles that have maps; `uv`, `peak` and `affine` have their rows."""
         return np.flatnonzero(self.kind >= TileKind.STATIC)
 
     @property

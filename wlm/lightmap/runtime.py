@@ -1,8 +1,8 @@
 """Decoding to 8 bits at runtime: everything stays on the device, and a decode is launches alone.
 
-``wlm.lightmap.Decoder`` returns arrays on the host; these two are for a renderer's loop. Each holds the tiles of one
-kind: a whole map is a ``StripDecoder``, an ``ExactDecoder`` of the static tiles if there are any, and
-``Decoder.tiles_8bit`` for the constant tiles, one colour each, which need no launch.
+`wlm.lightmap.Decoder` returns arrays on the host; these two are for a renderer's loop. Each holds the tiles of one
+kind: a whole map is a `StripDecoder`, an `ExactDecoder` of the static tiles if there are any, and
+`Decoder.tiles_8bit` for the constant tiles, one colour each, which need no launch.
 """
 
 import numpy as np
@@ -36,7 +36,7 @@ class _TileDecoder:
         launches: a CUDA graph captured before is out of date and must be captured again.
 
         Args:
-            time: In the unit of the set's times, stored or between; see ``Decoder``.
+            time: In the unit of the set's times, stored or between; see `Decoder`.
 
         Raises:
             WlmError: It isn't finite.
@@ -54,8 +54,8 @@ class StripDecoder(_TileDecoder):
     """The fast path of dynamic tiles: one thread decodes four texels (section 3.5).
 
     Attributes:
-        numbers: int [n], numbers of the dynamic tiles in the grid, in the order of ``out``.
-        out: ``wp.array`` uint32 [n, 128, 128], RGBA from the lowest byte, alpha 255; written by ``decode``.
+        numbers: int [n], numbers of the dynamic tiles in the grid, in the order of `out`.
+        out: `wp.array` uint32 [n, 128, 128], RGBA from the lowest byte, alpha 255; written by `decode`.
         gelu: The GELU in use.
     """
 
@@ -65,7 +65,7 @@ class StripDecoder(_TileDecoder):
         Args:
             model: The model.
             device: "cpu", "cuda" or "cuda:N".
-            gelu: Another GELU than the model's, see ``wlm_kernels.mlp``; None: the model's.
+            gelu: Another GELU than the model's, see `wlm_kernels.mlp`; None: the model's.
 
         Raises:
             WlmError: No such device or GELU, or a model without dynamic tiles.
@@ -81,7 +81,7 @@ class StripDecoder(_TileDecoder):
         self.out = wp.zeros((n, TILE, TILE), dtype=wp.uint32, device=self.device)
 
     def decode(self) -> None:
-        """Decodes all tiles into ``out``: three launches, no allocation, no wait; can be captured."""
+        """Decodes all tiles into `out`: three launches, no allocation, no wait; can be captured."""
         stored = self._stored
         self._kernels.decode(*stored.arguments, self._state, *self._scratch, stored.places, self._tiles, self.out)
 
@@ -95,8 +95,8 @@ class ExactDecoder(_TileDecoder):
     """The plain path of static or dynamic tiles: one thread decodes one texel, in training's order of operations.
 
     Attributes:
-        numbers: int [n], numbers of the tiles of that kind in the grid, in the order of ``out``.
-        out: ``wp.array`` vec4ub [n, 128, 128], RGBA, alpha 255; written by ``decode``.
+        numbers: int [n], numbers of the tiles of that kind in the grid, in the order of `out`.
+        out: `wp.array` vec4ub [n, 128, 128], RGBA, alpha 255; written by `decode`.
         gelu: The GELU in use.
     """
 
@@ -107,7 +107,7 @@ class ExactDecoder(_TileDecoder):
         gelu: str | None = None,
         kind: TileKind = TileKind.DYNAMIC,
     ) -> None:
-        """Uploads the model's tiles of one kind; the other arguments and errors are those of ``StripDecoder``.
+        """Uploads the model's tiles of one kind; the other arguments and errors are those of `StripDecoder`.
 
         Args:
             kind: STATIC or DYNAMIC.
@@ -117,7 +117,7 @@ class ExactDecoder(_TileDecoder):
         self.out = wp.zeros((len(self.numbers), TILE, TILE), dtype=wp.vec4ub, device=self.device)
 
     def decode(self) -> None:
-        """Decodes all tiles into ``out``: one launch, no allocation, no wait; can be captured."""
+        """Decodes all tiles into `out`: one launch, no allocation, no wait; can be captured."""
         stored = self._stored
         wp.launch(
             self._kernel,

@@ -1,4 +1,4 @@
-"""The GLSL that decodes an exported lightmap; ``wlm.lightmap.exporter`` writes it beside the textures."""
+"""The GLSL that decodes an exported lightmap; `wlm.lightmap.exporter` writes it beside the textures."""
 
 from wlm.lightmap.model import LightmapModel
 from wlm_kernels.lightmap.features import STATIC_INPUTS, TEMPORAL_INPUTS
@@ -153,7 +153,7 @@ vec3 wlm_radiance(vec3 colour)
 
 
 def decode_glsl(model: LightmapModel) -> str:
-    """The shader text for a model: functions alone, to be included below ``#version``.
+    """The shader text for a model: functions alone, to be included below `#version`.
 
     Args:
         model: Its settings choose the constants, the GELU and what the time axis does at its ends.

@@ -97,11 +97,11 @@ class TileData:
     """A batch of N tiles, ready for fitting.
 
     Attributes:
-        index: ``[N]`` int64, number of each tile in its grid, row-major.
-        colour: ``[N, T, 128, 128, 3]`` float32, ``irradiance ** (1 / gamma)``. Texels outside the mask hold the
+        index: `[N]` int64, number of each tile in its grid, row-major.
+        colour: `[N, T, 128, 128, 3]` float32, `irradiance ** (1 / gamma)`. Texels outside the mask hold the
             nearest valid one of the tile; past the map's end its last row and column repeat. All zero in an empty
             tile.
-        mask: ``[N, 128, 128]`` bool, true where a texel is valid; false past the map's end.
+        mask: `[N, 128, 128]` bool, true where a texel is valid; false past the map's end.
     """
 
     index: np.ndarray
@@ -126,8 +126,8 @@ def split(lightmaps: LightmapSet, gamma: float, tiles: Sequence[int] | None = No
     """Cuts a set into tiles of gamma-encoded colour (neural-dynamic-gi, section 4).
 
     Args:
-        lightmaps: The set, ``[T, H, W, 3]``.
-        gamma: Colours are stored as ``x ** (1 / gamma)``, which spends precision on the dark; above 0.
+        lightmaps: The set, `[T, H, W, 3]`.
+        gamma: Colours are stored as `x ** (1 / gamma)`, which spends precision on the dark; above 0.
         tiles: Numbers of the tiles, in the order of the result; None for all. They take N * T * 192 KiB of memory.
 
     Returns:
@@ -164,11 +164,11 @@ def channel_means(colour: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """Mean of each channel of each tile at each time, over the valid texels (neural-dynamic-gi, section 4).
 
     Args:
-        colour: ``[N, T, 128, 128, 3]``, as in ``TileData``.
-        mask: ``[N, 128, 128]`` bool.
+        colour: `[N, T, 128, 128, 3]`, as in `TileData`.
+        mask: `[N, 128, 128]` bool.
 
     Returns:
-        ``[N, T, 3]`` float64, summed in float64; 0 for an empty tile.
+        `[N, T, 3]` float64, summed in float64; 0 for an empty tile.
     """
     means = np.zeros((*colour.shape[:2], 3))
     for n, valid in enumerate(mask):
@@ -183,15 +183,15 @@ def static_pattern(colour: np.ndarray, means: np.ndarray) -> np.ndarray:
 
     It is the sum over t of colour over the sum over t of means: weighted by the means, so that a nearly black time,
     whose texels are a few steps of half float apart, hardly counts, and a mean of 0 is never divided by.
-    ``means * pattern`` is exact where the tile is the product of one colour per time and a pattern, in gamma-encoded
+    `means * pattern` is exact where the tile is the product of one colour per time and a pattern, in gamma-encoded
     and so in linear space.
 
     Args:
-        colour: ``[N, T, 128, 128, 3]``, as in ``TileData``.
-        means: ``[N, T, 3]``, from ``channel_means``.
+        colour: `[N, T, 128, 128, 3]`, as in `TileData`.
+        means: `[N, T, 3]`, from `channel_means`.
 
     Returns:
-        ``[N, 128, 128, 3]`` float64 with a mean of 1 over the valid texels; 0 in a channel that is black at
+        `[N, 128, 128, 3]` float64 with a mean of 1 over the valid texels; 0 in a channel that is black at
         every time.
     """
     total = means.sum(axis=1)[:, None, None, :]
@@ -205,23 +205,23 @@ def classify(tiles: TileData, gamma: float, static_budget_db: float = 60.0) -> n
 
     In linear space, over the valid texels:
 
-    - ``EMPTY``: there is none.
-    - ``CONSTANT``: at every time no channel spans more than one step of half float, as wide as it is at the
+    - `EMPTY`: there is none.
+    - `CONSTANT`: at every time no channel spans more than one step of half float, as wide as it is at the
       channel's least value. A half-float source holds nothing finer. An all-zero tile is one.
-    - ``STATIC``: ``means * static_pattern`` is good enough at every time: its PSNR, with the range of the tile at
+    - `STATIC`: `means * static_pattern` is good enough at every time: its PSNR, with the range of the tile at
       that time as the peak (neural-dynamic-gi, section 10.2), is at least the budget, or no channel of any
       texel is more than one step of half float off. The second covers times whose range is zero or so small
       that the PSNR would measure the half float. A set of one time is such a product exactly.
-    - ``DYNAMIC``: the rest.
+    - `DYNAMIC`: the rest.
 
     Args:
-        tiles: From ``split``.
-        gamma: The one given to ``split``.
+        tiles: From `split`.
+        gamma: The one given to `split`.
         static_budget_db: The lowest PSNR in decibels that makes a tile static; infinite admits only what is within a
             step of half float.
 
     Returns:
-        ``[N]`` int64 of ``TileKind``.
+        `[N]` int64 of `TileKind`.
 
     Raises:
         WlmError: Gamma is not above 0, or the budget is NaN.
@@ -278,16 +278,16 @@ def parse_tiles(text: str, count: int) -> list[int]:
 
 
 def assemble(tiles: np.ndarray, index: np.ndarray, grid: TileGrid, fill: float = 0.0) -> np.ndarray:
-    """Puts tiles back into a map; the inverse of ``split``.
+    """Puts tiles back into a map; the inverse of `split`.
 
     Args:
-        tiles: ``[N, 128, 128, C]``, any dtype.
-        index: ``[N]``, number of each tile in the grid.
+        tiles: `[N, 128, 128, C]`, any dtype.
+        index: `[N]`, number of each tile in the grid.
         grid: The map's.
-        fill: Value of the texels of tiles that ``index`` lacks.
+        fill: Value of the texels of tiles that `index` lacks.
 
     Returns:
-        ``[H, W, C]``, of the tiles' dtype. What the tiles hold past the map's end is dropped.
+        `[H, W, C]`, of the tiles' dtype. What the tiles hold past the map's end is dropped.
 
     Raises:
         WlmError: Shapes do not fit, or a number is outside the grid or given twice.

@@ -32,7 +32,7 @@ class Targets:
         colour: float32 [N, T, 128 * 128, 3], (colour / scale - shift) / spread.
         texels: int32 [N, K], flat indices of valid texels, padded.
         count: int32 [N], number of valid texels.
-        weight, emphasis: float32 [N, T, 3] and a number, see ``wlm_kernels.lightmap.features.Batch``.
+        weight, emphasis: float32 [N, T, 3] and a number, see `wlm_kernels.lightmap.features.Batch`.
         shift, spread: float32 [N, 3].
         scale: float32 [N, T, 3].
         range: float32 [N, T], of radiance.
@@ -56,7 +56,7 @@ class Targets:
             mask: bool [N, 128, 128], valid texels.
             scale: float32 [N, T, 3], as rounded for the file.
             affine: float32 [N, 2, 3], shift and spread, as rounded for the file.
-            gamma, metric_weight: Of the ``Profile``.
+            gamma, metric_weight: Of the `Profile`.
         """
         n, times = colour.shape[:2]
         self.number = number.astype(np.int32)
@@ -87,21 +87,21 @@ class Targets:
 
 
 class Trainer:
-    """Trains N tiles of one kind together; see ``Profile`` for the stages.
+    """Trains N tiles of one kind together; see `Profile` for the stages.
 
-    ``state`` holds everything that a later step depends on, so that a resumed fit goes on exactly.
+    `state` holds everything that a later step depends on, so that a resumed fit goes on exactly.
 
     Attributes:
         profile: The settings.
         axis: The time axis.
-        device: As ``interop.check_device`` returns it.
+        device: As `interop.check_device` returns it.
         temporal: Whether the tiles are DYNAMIC rather than STATIC.
         numbers: int32 [N], numbers of the tiles in their grid.
         tiles: N.
         inputs: Inputs of the network.
-        views: The maps by name, as ``wlm_kernels.lightmap.features.Maps`` has them: views of ``maps``.
+        views: The maps by name, as `wlm_kernels.lightmap.features.Maps` has them: views of `maps`.
         maps, maps_grad: float32 [M], all maps and their gradients.
-        hidden, output: The networks, see ``wlm_kernels.mlp``.
+        hidden, output: The networks, see `wlm_kernels.mlp`.
         loss: float32 [N], running mean of each tile's loss over about 50 steps.
         control: int32 [1], steps done.
         batch: The targets as the kernels take them.
@@ -125,8 +125,8 @@ class Trainer:
             targets: The training data.
             temporal_maps: Whether the tiles are DYNAMIC rather than STATIC.
             seed: Of the initial parameters and of all samples.
-            device: As ``interop.check_device`` returns it.
-            track: Whether to sum what ``psnr`` needs.
+            device: As `interop.check_device` returns it.
+            track: Whether to sum what `psnr` needs.
         """
         self._track = track
         self.profile, self.axis, self.device, self.temporal = profile, axis, device, temporal_maps
@@ -360,7 +360,7 @@ class Trainer:
         self._adam_net.step()
 
     def _share(self, work: Callable[[int], None]) -> None:
-        """Runs ``work(lane)`` for each lane on the CPU's threads; a launch releases the interpreter's lock."""
+        """Runs `work(lane)` for each lane on the CPU's threads; a launch releases the interpreter's lock."""
         list(self._pool.map(work, range(CPU_LANES)))
 
     def losses(self) -> np.ndarray:
@@ -368,7 +368,7 @@ class Trainer:
         return self.loss.cpu().numpy()
 
     def psnr(self) -> float:
-        """Mean PSNR over tiles and stored times of the samples since the last call; NaN without ``track``."""
+        """Mean PSNR over tiles and stored times of the samples since the last call; NaN without `track`."""
         with interop.stream(self.device):
             sums = self._tracked.sum(0).cpu()
             self._tracked.zero_()
@@ -380,8 +380,8 @@ class Trainer:
         """The maps and networks as the file holds them.
 
         Returns:
-            ``net`` and ``uv``, of dynamic tiles also ``uvt``, ``ut`` and ``vt``, as ``LightmapModel`` has them; ``net``
-            is ``net_static`` of static tiles.
+            `net` and `uv`, of dynamic tiles also `uvt`, `ut` and `vt`, as `LightmapModel` has them; `net`
+            is `net_static` of static tiles.
         """
         net = torch.cat([self.hidden.detach().flatten(1), self.output.detach().flatten(1)], 1)
         result = {"net": net.cpu().numpy().astype(np.float16), "uv": self._blocks("uv")}
@@ -418,7 +418,7 @@ class Trainer:
         return {key: np.array(value.detach().cpu().numpy()) for key, value in result.items()}
 
     def load(self, state: dict[str, np.ndarray]) -> None:
-        """Goes back to a ``state``; arrays of other shapes raise ValueError."""
+        """Goes back to a `state`; arrays of other shapes raise ValueError."""
 
         def put(target: torch.Tensor, key: str) -> None:
             value = torch.from_numpy(np.array(state[key]))

@@ -1,7 +1,7 @@
 """Differentiable operations for torch on Warp kernels.
 
 Functions with gradients by autograd, on the device of their tensors; on CUDA they queue work on torch's current stream.
-All floats are float32, and there is no second derivative. ``plain`` has each of them again in a few lines of torch, of
+All floats are float32, and there is no second derivative. `plain` has each of them again in a few lines of torch, of
 any float type: the definition that the kernels are held to. The page is docs/ops.md.
 
     bc7_map, bc7_texels, bc7_blocks     a feature map in BC7 mode 6 blocks: sampled, whole, and as a file's bytes

@@ -1,9 +1,9 @@
 """Feature maps in simulated BC7 mode 6 blocks, of which the endpoints and the weights are trained.
 
 A map of 4 channels is cut into blocks of 4 x 4 texels. A block has two endpoints, e0 and e1, and a weight w for each
-texel, which is (1 - w) e0 + w e1 (neural-dynamic-gi, eq. 7 and 8). ``quantised`` evaluates that on exactly the levels
+texel, which is (1 - w) e0 + w e1 (neural-dynamic-gi, eq. 7 and 8). `quantised` evaluates that on exactly the levels
 that a file of 16 bytes a block holds, and rounds as its decoder does; roundings and clamps are straight-through, with
-derivative 1. Train without it first, and with it at the end; ``bc7_blocks`` then gives the file's bytes.
+derivative 1. Train without it first, and with it at the end; `bc7_blocks` then gives the file's bytes.
 """
 
 import numpy as np
@@ -28,12 +28,12 @@ def bc7_map(
     layer: torch.Tensor | None = None,
     quantised: bool = False,
 ) -> torch.Tensor:
-    """Samples a map of blocks bilinearly, clamped at its border; ``plain.bc7_map`` is the twin.
+    """Samples a map of blocks bilinearly, clamped at its border; `plain.bc7_map` is the twin.
 
     All texels are decoded, once: to read a few of a large map it is not made.
 
     Args:
-        endpoints: float [H/4, W/4, 2, 4], or [L, H/4, W/4, 2, 4] with ``layer``: two RGBA colours a block, used as
+        endpoints: float [H/4, W/4, 2, 4], or [L, H/4, W/4, 2, 4] with `layer`: two RGBA colours a block, used as
             clamped to [0, 1]. With a gradient, which those outside keep.
         weights: float [H, W] or [L, H, W], one a texel, as the endpoints.
         uv: float [..., 2], u right, v down, the centre of texel i of n at (i + 1/2) / n; with a gradient.
@@ -54,18 +54,18 @@ def bc7_map(
 
 
 def bc7_texels(endpoints: torch.Tensor, weights: torch.Tensor, *, quantised: bool = False) -> torch.Tensor:
-    """Decodes whole maps; ``plain.bc7_texels`` is the twin. The gradients have the same bits at each run.
+    """Decodes whole maps; `plain.bc7_texels` is the twin. The gradients have the same bits at each run.
 
     Args:
-        endpoints: float [H/4, W/4, 2, 4] or [L, H/4, W/4, 2, 4], see ``bc7_map``.
+        endpoints: float [H/4, W/4, 2, 4] or [L, H/4, W/4, 2, 4], see `bc7_map`.
         weights: float [H, W] or [L, H, W].
         quantised: Whether to evaluate on the exact levels of BC7 mode 6.
 
     Returns:
-        float [H, W, 4] or [L, H, W, 4]: what ``plane`` samples, or ``volume`` if the maps are its slices.
+        float [H, W, 4] or [L, H, W, 4]: what `plane` samples, or `volume` if the maps are its slices.
 
     Raises:
-        ValueError: As for ``bc7_map``.
+        ValueError: As for `bc7_map`.
     """
     _check(endpoints, weights)
     shape = (-1 if weights.numel() else 0, *weights.shape[-2:])
@@ -74,17 +74,17 @@ def bc7_texels(endpoints: torch.Tensor, weights: torch.Tensor, *, quantised: boo
 
 
 def bc7_blocks(endpoints: torch.Tensor, weights: torch.Tensor) -> np.ndarray:
-    """Packs maps into the bytes of a file, which decode to ``bc7_texels`` with ``quantised``; without a gradient.
+    """Packs maps into the bytes of a file, which decode to `bc7_texels` with `quantised`; without a gradient.
 
     Args:
-        endpoints: float [H/4, W/4, 2, 4] or [L, H/4, W/4, 2, 4], see ``bc7_map``.
+        endpoints: float [H/4, W/4, 2, 4] or [L, H/4, W/4, 2, 4], see `bc7_map`.
         weights: float [H, W] or [L, H, W].
 
     Returns:
         uint8 [H/4, W/4, 16] or [L, H/4, W/4, 16], BC7 blocks of mode 6.
 
     Raises:
-        ValueError: As for ``bc7_map``.
+        ValueError: As for `bc7_map`.
     """
     _check(endpoints, weights)
     *layers, height, width = weights.shape

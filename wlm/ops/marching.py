@@ -28,7 +28,7 @@ def march(
     step: float = 1.0,
     g: float = 0.0,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Marches rays through a density grid; ``plain.march`` is the twin.
+    """Marches rays through a density grid; `plain.march` is the twin.
 
     Single scattering at albedo 1 (neural-six-way-lightmaps, eq. 1 to 3; another albedo is a factor of the colours):
     each sample of a ray scatters the directional lights that reach it towards the ray's origin, by the phase function

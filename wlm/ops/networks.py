@@ -14,7 +14,7 @@ WIDEST = 64
 
 
 def mlp(x: torch.Tensor, hidden: torch.Tensor, output: torch.Tensor, *, gelu: str = "exact") -> torch.Tensor:
-    """Evaluates networks of two hidden layers of H units with GELU between; ``plain.mlp`` is the twin.
+    """Evaluates networks of two hidden layers of H units with GELU between; `plain.mlp` is the twin.
 
     y = gelu(gelu(x W1 + b1) W2 + b2) W3 + b3 (neural-dynamic-gi, section 3.3). A shape's kernels are compiled at its
     first use, in some seconds.
@@ -22,7 +22,7 @@ def mlp(x: torch.Tensor, hidden: torch.Tensor, output: torch.Tensor, *, gelu: st
     Args:
         x: float [B, I], or [N, B, I] for N networks with B inputs each; with a gradient, as all three.
         hidden: float [I + H + 2, H] or [N, I + H + 2, H], one behind the other: W1 [I, H], b1 [1, H], W2 [H, H],
-            b2 [1, H]. A matrix of ``torch.nn.Linear`` is the transpose of these.
+            b2 [1, H]. A matrix of `torch.nn.Linear` is the transpose of these.
         output: float [H + 1, O] or [N, H + 1, O]: W3 [H, O], b3 [1, O].
         gelu: "exact" (erf); "tanh", within 4.8e-4 of it; "fast": as "tanh", with the GPU's own instruction, 2^-11
             relative, and its gradients within 5e-3. On the CPU "fast" is "tanh".

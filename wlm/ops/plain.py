@@ -1,6 +1,6 @@
 """The operations in plain torch, of any float type and on any device: the definitions that the kernels are held to.
 
-Each has the name, the arguments and the result of its twin in ``wlm.ops``, and checks nothing. They are written to be
+Each has the name, the arguments and the result of its twin in `wlm.ops`, and checks nothing. They are written to be
 read, take more time and memory, and have their gradients by autograd: in float64 they are the reference in the tests.
 """
 
@@ -37,12 +37,12 @@ Tensor = torch.Tensor
 
 
 def straight_through(value: Tensor, used: Tensor) -> Tensor:
-    """``used`` in the forward pass, the derivative of ``value`` in the backward pass."""
+    """`used` in the forward pass, the derivative of `value` in the backward pass."""
     return value + (used - value).detach()
 
 
 def bc7_map(endpoints, weights, uv, *, layer=None, quantised: bool = False) -> Tensor:
-    """Bilinear samples [..., 4] of a map of blocks at ``uv`` [..., 2]."""
+    """Bilinear samples [..., 4] of a map of blocks at `uv` [..., 2]."""
     return plane(bc7_texels(endpoints, weights, quantised=quantised), uv, layer=layer)
 
 
@@ -75,16 +75,16 @@ def _per_texel(blocks: Tensor) -> Tensor:
     return blocks.repeat_interleave(4, -3).repeat_interleave(4, -2)
 
 
-# Feature grids, by torch's own ``grid_sample``
+# Feature grids, by torch's own `grid_sample`
 
 
 def plane(values, points, *, layer=None, periodic: bool = False) -> Tensor:
-    """Samples [H, W, C], or plane ``layer`` of [L, H, W, C], at (u, v): [..., 2] -> [..., C]."""
+    """Samples [H, W, C], or plane `layer` of [L, H, W, C], at (u, v): [..., 2] -> [..., C]."""
     return _sample(values, points, layer, periodic, 2)
 
 
 def volume(values, points, *, layer=None, periodic: bool = False) -> Tensor:
-    """Samples [D, H, W, C], or volume ``layer`` of [L, D, H, W, C], at (u, v, w): [..., 3] -> [..., C]."""
+    """Samples [D, H, W, C], or volume `layer` of [L, D, H, W, C], at (u, v, w): [..., 3] -> [..., C]."""
     return _sample(values, points, layer, periodic, 3)
 
 
@@ -178,7 +178,7 @@ def pixel_centres(height: int, width: int) -> Tensor:
 def corner_weights(position: Tensor, triangle: Tensor, pixels: Tensor, height: int, width: int) -> Tensor:
     """b of triangles at places in pixels, broadcast: triangle [..., 3], pixels [..., 2], result [..., 3].
 
-    ``position`` is [V, 4] in clip space or [V, 2] in UV space.
+    `position` is [V, 4] in clip space or [V, 2] in UV space.
     """
     x, y = pixels[..., 0] / width, pixels[..., 1] / height
     if position.shape[1] == 4:
@@ -193,7 +193,7 @@ def corner_weights(position: Tensor, triangle: Tensor, pixels: Tensor, height: i
 def rasterize(clip: Tensor, triangle: Tensor, height: int, width: int) -> Raster:
     """Looks at all triangles in all pixels, and sees the nearest.
 
-    No triangle may be of no area. A centre on an edge belongs to both sides, where ``wlm.ops.rasterize`` gives it to
+    No triangle may be of no area. A centre on an edge belongs to both sides, where `wlm.ops.rasterize` gives it to
     one of them.
     """
     pixels = pixel_centres(height, width).to(clip)
@@ -209,7 +209,7 @@ def rasterize(clip: Tensor, triangle: Tensor, height: int, width: int) -> Raster
 
 
 def rasterize_uv(uv: Tensor, triangle: Tensor, height: int, width: int) -> Raster:
-    """As ``rasterize``, for corners [V, 2] in a texture; of triangles that overlap the first is seen."""
+    """As `rasterize`, for corners [V, 2] in a texture; of triangles that overlap the first is seen."""
     return rasterize(uv, triangle, height, width)
 
 
@@ -273,7 +273,7 @@ def march(
 
 
 def henyey_greenstein(g: float, cosine: Tensor) -> Tensor:
-    """The phase function times 4 pi; ``cosine`` is 1 where the light goes straight on."""
+    """The phase function times 4 pi; `cosine` is 1 where the light goes straight on."""
     return (1.0 - g * g) / (1.0 + g * g - 2.0 * g * cosine) ** 1.5
 
 

@@ -1,7 +1,7 @@
 """Triangles to pixels: rasterization, attributes and textures at the point that each pixel sees.
 
-Row 0 of an image is its top row. ``wlm_kernels.raster.rasterize`` says where pixel centres are and what covers them,
-``wlm_kernels.raster.texture`` how a texture is read. On CUDA gradients that many pixels give to one number are added in
+Row 0 of an image is its top row. `wlm_kernels.raster.rasterize` says where pixel centres are and what covers them,
+`wlm_kernels.raster.texture` how a texture is read. On CUDA gradients that many pixels give to one number are added in
 any order, so that its last bits change from run to run.
 """
 
@@ -59,14 +59,14 @@ def rasterize(
     Args:
         clip: float [V, 4], x, y, z, w; the image shows x/w and y/w in [-1, 1], y up. The barycentrics' gradient reaches
             x, y and w, for the triangle that is seen; that another may come to be seen has none.
-        triangle: int32 or int64 [F, 3], rows of ``clip``, with either winding.
+        triangle: int32 or int64 [F, 3], rows of `clip`, with either winding.
         height, width: H and W in pixels, 1 to 16,384.
         cull: Whether to leave out triangles whose corners run clockwise on the screen.
-        derivative, coverage: Whether to fill these of ``Raster``.
+        derivative, coverage: Whether to fill these of `Raster`.
 
     Raises:
         ValueError: A tensor's shape, type, device or size doesn't fit, or a triangle has a corner that isn't in
-            ``clip``. Finding that out waits for the GPU; while a CUDA graph is captured it isn't looked for, and such
+            `clip`. Finding that out waits for the GPU; while a CUDA graph is captured it isn't looked for, and such
             triangles aren't drawn.
     """
     return _rasterize(clip, triangle, height, width, "clip", cull, derivative, coverage)
@@ -87,13 +87,13 @@ def rasterize_uv(
     Args:
         uv: float [V, 2], u right, v down (glTF): the texture is [0, 1] x [0, 1], row 0 is v = 0, and texel i of n has
             its centre at (i + 1/2) / n. What lies outside isn't drawn. The barycentrics' gradient reaches it.
-        triangle: int32 or int64 [F, 3], rows of ``uv``.
+        triangle: int32 or int64 [F, 3], rows of `uv`.
         height, width: H and W in texels, 1 to 16,384.
         cull: Whether to leave out triangles whose corners run clockwise where u points right and v up.
-        derivative, coverage: Whether to fill these of ``Raster``.
+        derivative, coverage: Whether to fill these of `Raster`.
 
     Raises:
-        ValueError: As for ``rasterize``.
+        ValueError: As for `rasterize`.
     """
     return _rasterize(uv, triangle, height, width, "uv", cull, derivative, coverage)
 
@@ -103,7 +103,7 @@ def interpolate(attribute: torch.Tensor, triangle: torch.Tensor, raster: Raster)
 
     Args:
         attribute: float [V, C], with a gradient.
-        triangle: int32 or int64 [F, 3], rows of ``attribute``: as many triangles as were drawn, but a corner may have
+        triangle: int32 or int64 [F, 3], rows of `attribute`: as many triangles as were drawn, but a corner may have
             other numbers here than there.
         raster: What was drawn; its barycentrics have a gradient.
 
@@ -111,7 +111,7 @@ def interpolate(attribute: torch.Tensor, triangle: torch.Tensor, raster: Raster)
         float [H, W, C].
 
     Raises:
-        ValueError: As for ``rasterize``.
+        ValueError: As for `rasterize`.
     """
     check("attribute", attribute, (None, None))
     triangle = _checked_triangles(triangle, attribute)

@@ -22,10 +22,10 @@ REDUCTIONS = ("sum", "product", "concatenate")
 def plane(
     values: torch.Tensor, points: torch.Tensor, *, layer: torch.Tensor | None = None, periodic: bool = False
 ) -> torch.Tensor:
-    """Samples a plane of features bilinearly; ``plain.plane`` is the twin.
+    """Samples a plane of features bilinearly; `plain.plane` is the twin.
 
     Args:
-        values: float [H, W, C], or [L, H, W, C] with ``layer``; with a gradient.
+        values: float [H, W, C], or [L, H, W, C] with `layer`; with a gradient.
         points: float [..., 2], u along the width, v along the height (the time, in a lightmap's planes;
             neural-dynamic-gi, eq. 5). With a gradient: the slope between the cells that a point lies between.
         layer: int32 or int64 [...], 0 to L - 1: the plane of each point.
@@ -44,10 +44,10 @@ def plane(
 def volume(
     values: torch.Tensor, points: torch.Tensor, *, layer: torch.Tensor | None = None, periodic: bool = False
 ) -> torch.Tensor:
-    """Samples a volume of features trilinearly; ``plain.volume`` is the twin.
+    """Samples a volume of features trilinearly; `plain.volume` is the twin.
 
     Args:
-        values: float [D, H, W, C], or [L, D, H, W, C] with ``layer``; with a gradient.
+        values: float [D, H, W, C], or [L, D, H, W, C] with `layer`; with a gradient.
         points: float [..., 3], u along the width, v along the height, w along the depth; with a gradient.
         layer: int32 or int64 [...], 0 to L - 1: the volume of each point.
         periodic: Whether w wraps round.
@@ -56,7 +56,7 @@ def volume(
         float [..., C].
 
     Raises:
-        ValueError: As for ``plane``.
+        ValueError: As for `plane`.
     """
     return sample(values, points, layer, periodic, axes=3)
 
@@ -64,7 +64,7 @@ def volume(
 def triplane(
     xy: torch.Tensor, xz: torch.Tensor, yz: torch.Tensor, points: torch.Tensor, *, reduce: str = "sum"
 ) -> torch.Tensor:
-    """Samples three planes at the projections of points in space; ``plain.triplane`` is the twin.
+    """Samples three planes at the projections of points in space; `plain.triplane` is the twin.
 
     Args:
         xy: float [H, W, C], u is x and v is y (the tri-plane of Chan et al. 2022, "Efficient Geometry-aware 3D
@@ -79,7 +79,7 @@ def triplane(
         float [..., C], or [..., the sum of the three C].
 
     Raises:
-        ValueError: As for ``plane``, or there is no such reduction.
+        ValueError: As for `plane`, or there is no such reduction.
     """
     if reduce not in REDUCTIONS:
         raise ValueError(f"reduce: expected one of {', '.join(REDUCTIONS)}, got {reduce!r}")
@@ -109,7 +109,7 @@ def sample(
     axes: int,
     names: tuple[str, str] = ("values", "points"),
 ) -> torch.Tensor:
-    """``plane`` for 2 axes, ``volume`` for 3; ``names`` are what messages call the values and the points."""
+    """`plane` for 2 axes, `volume` for 3; `names` are what messages call the values and the points."""
     check(names[0], values, (None,) * (axes + 1 if layer is None else axes + 2))
     if 0 in values.shape:
         raise ValueError(f"{names[0]}: expected cells and channels, got {tuple(values.shape)}")

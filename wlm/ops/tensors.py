@@ -20,7 +20,7 @@ def check(name: str, tensor: torch.Tensor, shape: Shape, device: torch.device | 
 
     Args:
         name: What the message calls it.
-        tensor: On ``device``, or on any that Warp has.
+        tensor: On `device`, or on any that Warp has.
         shape: Its sizes.
         device: Where it has to be.
 
@@ -33,7 +33,7 @@ def check(name: str, tensor: torch.Tensor, shape: Shape, device: torch.device | 
 
 
 def check_index(name: str, index: torch.Tensor, count: int, shape: Shape, device: torch.device) -> None:
-    """Checks an integer tensor of numbers from 0 to ``count`` - 1; the numbers not while a CUDA graph is captured.
+    """Checks an integer tensor of numbers from 0 to `count` - 1; the numbers not while a CUDA graph is captured.
 
     Raises:
         ValueError: Its shape, type, device or a number doesn't fit.
@@ -47,9 +47,7 @@ def check_index(name: str, index: torch.Tensor, count: int, shape: Shape, device
             raise ValueError(f"{name}: expected numbers from 0 to {count - 1}, found {low if low < 0 else high}")
 
 
-def check_finite(
-    ranges: dict[str, tuple[float, float]] | None = None, **tensors: torch.Tensor | None
-) -> None:
+def check_finite(ranges: dict[str, tuple[float, float]] | None = None, **tensors: torch.Tensor | None) -> None:
     """Checks that tensors of one device hold finite numbers; not while a CUDA graph is captured.
 
     Args:

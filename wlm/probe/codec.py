@@ -1,7 +1,7 @@
 """Probe models in files: packed Gaussians and a half-float network.
 
-``gaussians`` holds for every Gaussian three centres of 16 bits and 7 + L codes of b bits, packed without a gap, the
-lowest bit first; ``frame`` is origin, extent, size of the box and gain; ``dead`` is a bit for each probe, deflated.
+`gaussians` holds for every Gaussian three centres of 16 bits and 7 + L codes of b bits, packed without a gap, the
+lowest bit first; `frame` is origin, extent, size of the box and gain; `dead` is a bit for each probe, deflated.
 """
 
 import zlib
@@ -53,7 +53,7 @@ def encode(model: ProbeModel) -> tuple[dict[str, Any], dict[str, np.ndarray], st
 
 
 def decode(artifact: Artifact) -> ProbeModel:
-    """Makes the model of a file; what ``encode`` gave comes back bit for bit.
+    """Makes the model of a file; what `encode` gave comes back bit for bit.
 
     Raises:
         WlmError, ValueError, LookupError: A setting or a part is missing, or they don't fit each other.

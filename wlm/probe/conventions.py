@@ -14,12 +14,12 @@ unreal   FSHVector2, FSHVector3, FSHVectorRGB3       L0 to L2  (-1)^m, the Condo
 unity    SphericalHarmonicsL2 (LightProbes)          L0 to L2  K_lm A_l / pi
 =======  ==========================================  ========  ========================================
 
-- three.js: ``getAt`` is the radiance and ``getIrradianceAt`` the irradiance.
+- three.js: `getAt` is the radiance and `getIrradianceAt` the irradiance.
 - Godot: the baker averages 4 L Y over the sphere where the integral is 4 pi times the average, so that its shader,
   which folds in pi, 2 pi / 3 and pi / 4, gets irradiance / pi without a division. Not convolved.
 - Unreal: y, x, yz and xz have a minus sign, z, xy, 3z2-1 and x2-y2 have none. Its tables end with band 2. These are the
   vectors of the engine's own maths, not the packed bricks of a volumetric lightmap.
-- Unity: ``Evaluate`` and the shader's ShadeSH9 are plain polynomials that yield irradiance / pi. The basis' constants
+- Unity: `Evaluate` and the shader's ShadeSH9 are plain polynomials that yield irradiance / pi. The basis' constants
   K_lm (0.2821; 0.4886; 1.0925, 0.3154 for 3z2-1, 0.5463 for x2-y2) and the clamped cosine's A_l / pi = 1, 2/3, 1/4
   (Ramamoorthi and Hanrahan 2001) are therefore in the numbers already, and are taken out here. C# indexes them
   [channel, coefficient]; here, as everywhere in this package, the channel is last.
@@ -56,10 +56,10 @@ def to_canonical(values: np.ndarray, name: str) -> np.ndarray:
 
     Args:
         values: [N, C, 3], C = 1, 4, 9 ... coefficients, RGB last. NaN and Inf stay what they are.
-        name: One of ``CONVENTIONS``.
+        name: One of `CONVENTIONS`.
 
     Returns:
-        float64 [N, C, 3]; ``from_canonical`` leads back, without any rounding for "threejs" and "unreal".
+        float64 [N, C, 3]; `from_canonical` leads back, without any rounding for "threejs" and "unreal".
 
     Raises:
         WlmError: The name is unknown, C isn't a whole number of bands, or the engine has no such band.
@@ -69,7 +69,7 @@ def to_canonical(values: np.ndarray, name: str) -> np.ndarray:
 
 
 def from_canonical(values: np.ndarray, name: str) -> np.ndarray:
-    """Converts canonical coefficients to an engine's; arguments and errors as for ``to_canonical``."""
+    """Converts canonical coefficients to an engine's; arguments and errors as for `to_canonical`."""
     return _checked(values) * _factors(values.shape[1], name)[:, None]
 
 

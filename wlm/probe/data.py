@@ -1,6 +1,6 @@
-"""What comes in: light probes at free positions, read from ``.npz``, ``.json`` or Godot's ``.lmbake`` and checked.
+"""What comes in: light probes at free positions, read from `.npz`, `.json` or Godot's `.lmbake` and checked.
 
-The stated behaviours. ``ProbeSet.warnings`` says what was repaired, in one line for each kind; probes count from 0.
+The stated behaviours. `ProbeSet.warnings` says what was repaired, in one line for each kind; probes count from 0.
 
 ====================================  ================================================================
 input                                 behaviour
@@ -22,7 +22,7 @@ a number beyond +-1.8e19              error that names the probe: the loss is a 
 float16, float64, integers            converted to float32; what is too small for it becomes 0
 other types, text, ragged lists       error that names the field
 one probe, one number per probe       fine
-several arrays named ``sh...``          error that lists them, unless ``key`` names one
+several arrays named `sh...`          error that lists them, unless `key` names one
 a convention of an engine             error where the numbers are not 1, 4 or 9 RGB coefficients (any
                                       square for Godot's)
 a file missing or damaged             error that names the file, and the field
@@ -86,7 +86,7 @@ class ProbeSet:
         name: The set's name.
         position: float64 [N, 3], in the input's unit and axes.
         values: float32 [N, D], finite; zero where a probe is not live. For spherical harmonics D = 3 C, and
-            ``values.reshape(N, C, 3)`` are canonical coefficients of radiance (``wlm.probe.conventions``), RGB last.
+            `values.reshape(N, C, 3)` are canonical coefficients of radiance (`wlm.probe.conventions`), RGB last.
         key: Name of the array that was read.
         live: bool [N], false where the probe takes no part in the fit and decodes to zero; at least one is true.
         source: 16 hexadecimal digits of BLAKE2b over the positions, the values and which are live.
@@ -119,7 +119,7 @@ class ProbeSet:
 
 @dataclass(frozen=True)
 class _Raw:
-    """The content of a file, not yet checked; ``key`` names the array of values, ``convention`` is what it states."""
+    """The content of a file, not yet checked; `key` names the array of values, `convention` is what it states."""
 
     position: np.ndarray
     values: np.ndarray
@@ -130,18 +130,18 @@ class _Raw:
 def load(path: str | os.PathLike[str], *, key: str | None = None, convention: str | None = None) -> ProbeSet:
     """Reads light probes from a file.
 
-    - ``.npz``: arrays ``position`` (N, 3) and ``sh...`` (N, C, 3) or (N, D), and a string ``convention`` if they aren't
+    - `.npz`: arrays `position` (N, 3) and `sh...` (N, C, 3) or (N, D), and a string `convention` if they aren't
       canonical.
-    - ``.json``: ``{"position": [[x, y, z], ...], "sh": [[[r, g, b], ...], ...]}``, or
-      ``{"probes": [{"position": [x, y, z], "sh": [[r, g, b], ...]}, ...]}``, and ``"convention"`` likewise.
-    - ``.lmbake``: a lightmap bake of Godot 4.
+    - `.json`: `{"position": [[x, y, z], ...], "sh": [[[r, g, b], ...], ...]}`, or
+      `{"probes": [{"position": [x, y, z], "sh": [[r, g, b], ...]}, ...]}`, and `"convention"` likewise.
+    - `.lmbake`: a lightmap bake of Godot 4.
 
     Args:
         path: The file; its suffix tells the kind.
         key: Name of the array of values, or that name without "sh_" in front of it ("12.00" for "sh_12.00"). None
             takes the only one whose name begins with "sh".
-        convention: One of ``wlm.probe.conventions.CONVENTIONS``, in which the file's numbers are. None takes what the
-            file states: "godot" for ``.lmbake``, else its ``convention``, else the canonical one.
+        convention: One of `wlm.probe.conventions.CONVENTIONS`, in which the file's numbers are. None takes what the
+            file states: "godot" for `.lmbake`, else its `convention`, else the canonical one.
 
     Returns:
         The set, repaired as the module's table says.
@@ -164,7 +164,7 @@ def load_positions(path: str | os.PathLike[str]) -> np.ndarray:
     """Reads the positions of a probe file, whatever else is in it, or a list of points.
 
     Args:
-        path: A file as for ``load``, which needs to hold no values, or JSON, ``[[x, y, z], ...]``. What ends neither in
+        path: A file as for `load`, which needs to hold no values, or JSON, `[[x, y, z], ...]`. What ends neither in
             .npz nor in .lmbake is taken for JSON.
 
     Returns:
@@ -198,14 +198,14 @@ def from_arrays(
     key: str = _SH,
     convention: str = CANONICAL,
 ) -> ProbeSet:
-    """Makes a checked set of arrays, under the same rules as ``load``.
+    """Makes a checked set of arrays, under the same rules as `load`.
 
     Args:
         position: [N, 3] of numbers; copied.
         values: [N, C, 3], RGB last, or [N, D] of numbers; copied.
         name: The set's name, used in messages too.
         key: What the values are called.
-        convention: One of ``wlm.probe.conventions.CONVENTIONS``, in which the values are.
+        convention: One of `wlm.probe.conventions.CONVENTIONS`, in which the values are.
 
     Returns:
         The set, repaired as the module's table says.
@@ -224,7 +224,7 @@ def save_probes(
     key: str = _SH,
     convention: str = CANONICAL,
 ) -> None:
-    """Writes probes as ``.npz`` or ``.json``, whole or not at all, such that ``load`` reads them back.
+    """Writes probes as `.npz` or `.json`, whole or not at all, such that `load` reads them back.
 
     Where D is that of RGB spherical harmonics, they are written as (N, C, 3), else as (N, D). The file states the
     convention.
@@ -234,7 +234,7 @@ def save_probes(
         position: [N, 3].
         values: float32 [N, D], finite, canonical.
         key: Name of the array of values.
-        convention: One of ``wlm.probe.conventions.CONVENTIONS``, to write the values in.
+        convention: One of `wlm.probe.conventions.CONVENTIONS`, to write the values in.
 
     Raises:
         ValueError: The shapes don't fit, or a number is NaN or infinite.
@@ -275,7 +275,7 @@ def _read_npz(path: Path, key: str | None) -> _Raw:
 
 
 def _read_arrays(path: Path, read: Callable[[np.lib.npyio.NpzFile], _T]) -> _T:
-    """What ``read`` takes from a ``.npz`` file."""
+    """What `read` takes from a `.npz` file."""
     try:
         loaded = np.load(path, allow_pickle=False)
         if not isinstance(loaded, np.lib.npyio.NpzFile):

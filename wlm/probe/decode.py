@@ -18,7 +18,7 @@ __all__ = ["CULLINGS", "Decoder", "Points"]
 
 Culling = Literal["box", "sphere", "exact", "none"]
 CULLINGS = ("exact", "box", "sphere", "none")
-"""How a cube's list of Gaussians is made; see ``Decoder``."""
+"""How a cube's list of Gaussians is made; see `Decoder`."""
 
 
 class Points:
@@ -27,7 +27,7 @@ class Points:
     Attributes:
         x: vec3 [M], normalised, along a Z-curve.
         order: int [M], the place that each had in the input.
-        out: float [M, D], filled by ``Decoder.run``.
+        out: float [M, D], filled by `Decoder.run`.
     """
 
     def __init__(self, position: np.ndarray, model: ProbeModel, device: str):
@@ -140,7 +140,7 @@ class Decoder:
             )
 
     def decode(self, position: np.ndarray) -> np.ndarray:
-        """Light at any points, float32 [M, D]; arguments and errors are those of ``points``."""
+        """Light at any points, float32 [M, D]; arguments and errors are those of `points`."""
         points = self.points(position)
         self.run(points)
         return points.values()

@@ -8,11 +8,11 @@ The stated behaviours:
 ====================================  ================================================================
 input                                 behaviour
 ====================================  ================================================================
-decoded exactly                       PSNR is 120 dB, the cap of ``wlm.metrics``; its error is 0
+decoded exactly                       PSNR is 120 dB, the cap of `wlm.metrics`; its error is 0
 all coefficients equal (range 0)      PSNR is NaN, null in JSON: there is no scale to measure against
 irradiance the same everywhere        the same for its PSNR
 D is not 3 (l + 1)²                   no bands and no irradiance: None
-no live probe                         ``psnr_live`` and ``irradiance_psnr`` are NaN
+no live probe                         `psnr_live` and `irradiance_psnr` are NaN
 one probe, one coefficient            fine
 NaN or Inf in what was decoded        error that names the first probe
 another number of probes or outputs   error
@@ -45,25 +45,25 @@ _ROWS = 32768  # of probes in one piece, so that float64 copies stay at some ten
 class Report(BaseReport):
     """Size and errors of compressed probes.
 
-    Every PSNR is ``10 log10(peak² / mse)``. For coefficients the peak is one number, largest less smallest of all
+    Every PSNR is `10 log10(peak² / mse)`. For coefficients the peak is one number, largest less smallest of all
     coefficients of all probes of the input, so that the bands and the coefficients can be compared.
 
     Attributes:
         name: The set's name.
         probes, live, outputs: N, how many of them are live, D.
         bytes: Size of the file on disk.
-        bits_per_probe: ``bytes * 8 / N``, of all probes; the paper's bpp.
-        ratio: File bytes over those of the input as float32, ``N * D * 4``.
+        bits_per_probe: `bytes * 8 / N`, of all probes; the paper's bpp.
+        ratio: File bytes over those of the input as float32, `N * D * 4`.
         peak: Range of the input's coefficients.
         psnr: dB, over all coefficients of all probes.
         psnr_live: dB, of the live probes alone: the others decode to zero exactly.
         mse, mean_abs_error, max_abs_error: Over all coefficients of all probes.
-        worst_probe: The probe of the largest mean squared error: ``probe`` (its number), ``psnr`` and
-            ``position``; None where all are exact.
+        worst_probe: The probe of the largest mean squared error: `probe` (its number), `psnr` and
+            `position`; None where all are exact.
         psnr_by_band: dB, for each SH band over all probes and RGB; None where D is not 3 (l + 1)².
         psnr_by_coefficient: dB, float64 [D], over all probes.
-        irradiance_psnr: dB, over ``NORMALS`` fixed normals of every live probe in RGB; its peak is the range of the
-            input's irradiance there. None as ``psnr_by_band``.
+        irradiance_psnr: dB, over `NORMALS` fixed normals of every live probe in RGB; its peak is the range of the
+            input's irradiance there. None as `psnr_by_band`.
     """
 
     name: str
@@ -100,13 +100,13 @@ def evaluate(
         probes: The input, in the order of the fit.
         device: Where it is decoded.
         progress: Called after the decode and at the end.
-        file_bytes: Size of the model's file; None: of the one that ``model.save`` writes.
+        file_bytes: Size of the model's file; None: of the one that `model.save` writes.
 
     Returns:
         The report.
 
     Raises:
-        WlmError: No such device, or as ``score``.
+        WlmError: No such device, or as `score`.
     """
     meter = Meter(progress, "evaluate", 2)
     decoded = Decoder(model, device).decode_probes(probes.position)
@@ -129,7 +129,7 @@ def score(decoded: np.ndarray, probes: ProbeSet, file_bytes: int) -> Report:
 
     Raises:
         WlmError: The probes or their numbers are not as many as the input's, or one decodes to NaN or infinity.
-        ValueError: ``file_bytes`` is not positive, or ``decoded`` is no matrix.
+        ValueError: `file_bytes` is not positive, or `decoded` is no matrix.
     """
     if file_bytes <= 0:
         raise ValueError(f"file_bytes: expected a positive number, got {file_bytes}")

@@ -72,11 +72,11 @@ _ABOUT = {
 def export(model: ProbeModel, directory: str | os.PathLike[str], *, device: str = "cpu") -> list[Path]:
     """Writes a model as buffers, numbers and a shader.
 
-    ``gaussians.bin`` and ``network.bin`` are laid out as ``probe.glsl`` says at its head, ``positions.bin`` is written
-    if the model has positions, ``reference.json`` has the light at some places to compare with, and ``probe.json``
+    `gaussians.bin` and `network.bin` are laid out as `probe.glsl` says at its head, `positions.bin` is written
+    if the model has positions, `reference.json` has the light at some places to compare with, and `probe.json`
     explains itself under "about".
 
-    All files are made beside the folder and moved in together, ``probe.json`` last. A new export replaces an earlier
+    All files are made beside the folder and moved in together, `probe.json` last. A new export replaces an earlier
     one in its folder; other files there stay.
 
     Args:
@@ -85,7 +85,7 @@ def export(model: ProbeModel, directory: str | os.PathLike[str], *, device: str 
         device: Where the reference is decoded.
 
     Returns:
-        The files written, ``probe.json`` last.
+        The files written, `probe.json` last.
 
     Raises:
         WlmError: The folder holds something other than an earlier export, or can't be written; no such device; or a

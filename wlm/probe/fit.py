@@ -29,16 +29,16 @@ def open_checkpoint(
     device: str = "cpu",
     resume: bool = False,
 ) -> Checkpoint:
-    """Opens the checkpoint of a fit, the file ``OUTPUT.partial``.
+    """Opens the checkpoint of a fit, the file `OUTPUT.partial`.
 
     Args:
         output: The file that the fit is for.
-        probes, profile, seed: As for ``compress``: what the fit depends on.
+        probes, profile, seed: As for `compress`: what the fit depends on.
         device: Only its kind matters: a fit may go on on another GPU.
         resume: Whether to go on from the file, if there is one.
 
     Raises:
-        WlmError: With ``resume``: the file is damaged, or of another fit; the line names what differs.
+        WlmError: With `resume`: the file is damaged, or of another fit; the line names what differs.
     """
     fit = {
         "input": probes.source,
@@ -66,21 +66,21 @@ def compress(
 
     Args:
         probes: The set.
-        profile: The settings: a name, a YAML file, or a ``Profile``.
+        profile: The settings: a name, a YAML file, or a `Profile`.
         seed: One seed gives one result on one device.
         device: "cpu" or "cuda:0".
         progress: Called about twice a second, with the PSNR of all numbers of all probes.
-        checkpoint: From ``open_checkpoint`` for the same settings, or None: where an interrupted fit is kept and
+        checkpoint: From `open_checkpoint` for the same settings, or None: where an interrupted fit is kept and
             resumed.
         positions: Whether the model carries the probes' positions, 16 bits an axis; an engine has them anyway.
-        overrides: Settings that replace the profile's: ``steps=500``.
+        overrides: Settings that replace the profile's: `steps=500`.
 
     Returns:
         The model.
 
     Raises:
         WlmError: A profile, a setting or a device that isn't there, or a fit that diverged.
-        KeyboardInterrupt: Raised by ``progress``, after the checkpoint, if there is one, has been written.
+        KeyboardInterrupt: Raised by `progress`, after the checkpoint, if there is one, has been written.
     """
     profile = Profile.load(profile).override(overrides)
     device = interop.check_device(device)

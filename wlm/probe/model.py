@@ -28,7 +28,7 @@ __all__ = [
     "layer_shapes",
 ]
 
-# Channels of a Gaussian, in the order of ``ProbeModel.bounds``; the last three groups share ``Profile.bits``.
+# Channels of a Gaussian, in the order of `ProbeModel.bounds`; the last three groups share `Profile.bits`.
 CENTRE = slice(0, 3)
 SCALE = slice(3, 6)
 ROTATION = slice(6, 10)
@@ -45,7 +45,7 @@ class Profile(Settings):
         bits: Bits of each number of a Gaussian's scale, rotation and latent.
         latent: Numbers in a Gaussian's latent.
         hidden: Width of both hidden layers.
-        support: What a Gaussian reaches: its own "ellipsoid" out to ``cut``, or the "sphere" of its longest axis
+        support: What a Gaussian reaches: its own "ellipsoid" out to `cut`, or the "sphere" of its longest axis
             (eq. 6).
         cut: How far it reaches, in standard deviations.
         optimiser: Of the Gaussians: "adam" or "adan". The network's is Adam.
@@ -153,7 +153,7 @@ class ProbeModel(Model):
 
     @property
     def codes(self) -> np.ndarray:
-        """All codes of each Gaussian, uint16 [K, 10 + L], in the order of ``bounds``."""
+        """All codes of each Gaussian, uint16 [K, 10 + L], in the order of `bounds`."""
         return np.concatenate([self.centre, self.code], 1)
 
     @property
@@ -170,7 +170,7 @@ class ProbeModel(Model):
         return self.bounds[0] + self.codes.astype(np.float32) * self.steps
 
     def layers(self) -> list[np.ndarray]:
-        """The three layers of ``net``, float16, as ``layer_shapes`` has them."""
+        """The three layers of `net`, float16, as `layer_shapes` has them."""
         shapes = layer_shapes(self.profile.latent, self.profile.hidden, self.outputs)
         parts = np.split(self.net, np.cumsum([rows * columns for rows, columns in shapes])[:-1])
         return [part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)]

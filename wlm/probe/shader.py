@@ -1,4 +1,4 @@
-"""The GLSL that decodes an exported probe model; ``wlm.probe.exporter`` writes it beside the numbers."""
+"""The GLSL that decodes an exported probe model; `wlm.probe.exporter` writes it beside the numbers."""
 
 from wlm.probe.model import LATENT, ProbeModel
 from wlm.probe.sphere import sh_count
@@ -231,7 +231,7 @@ _LONGEST = """
 
 
 def probe_glsl(model: ProbeModel) -> str:
-    """The shader text for models of one shape: functions alone, to be included below ``#version``.
+    """The shader text for models of one shape: functions alone, to be included below `#version`.
 
     Args:
         model: Its latents, units, outputs and support choose the text; its numbers are not in it.

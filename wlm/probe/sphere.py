@@ -16,7 +16,7 @@ _UNIT_TOLERANCE = 1e-3  # of a direction's length; float16 normals are within 6e
 
 
 def sh_count(outputs: int) -> int | None:
-    """Coefficients C of a probe of ``outputs`` numbers, if it holds whole bands in RGB (3, 12, 27, 48, ...)."""
+    """Coefficients C of a probe of `outputs` numbers, if it holds whole bands in RGB (3, 12, 27, 48, ...)."""
     count = outputs // 3
     return count if count > 0 and outputs == 3 * count and math.isqrt(count) ** 2 == count else None
 
@@ -101,7 +101,7 @@ def radiance(values: np.ndarray, directions: np.ndarray) -> np.ndarray:
         float64 [..., M, 3].
 
     Raises:
-        ValueError: As ``basis``.
+        ValueError: As `basis`.
     """
     values = _checked(values)
     return basis(directions, values.shape[-2]) @ values
@@ -118,7 +118,7 @@ def irradiance(values: np.ndarray, normals: np.ndarray) -> np.ndarray:
         float64 [..., M, 3], pi times the radiance where that is the same from everywhere.
 
     Raises:
-        ValueError: As ``basis``.
+        ValueError: As `basis`.
     """
     values = _checked(values)
     factors = [cosine_factor(band) for band in coefficient_bands(values.shape[-2]).tolist()]

@@ -49,7 +49,7 @@ def first_gaussians(
         x: float32 [N, 3], normalised positions.
         values: float32 [N, D].
         count: Number of Gaussians, at most that of the distinct positions.
-        detail, first_scale: See ``wlm.probe.model.Profile``.
+        detail, first_scale: See `wlm.probe.model.Profile`.
         random: Where the draw comes from.
 
     Returns:

@@ -245,7 +245,7 @@ class Trainer:
         self._share(self._groups.x.shape[0], lambda *lane: self._step_kernels.features(*args, *lane))
 
     def _share(self, total: int, work) -> None:
-        """Runs ``work`` over all rows: at once on CUDA, in two halves on the CPU's threads."""
+        """Runs `work` over all rows: at once on CUDA, in two halves on the CPU's threads."""
         if self._cuda:
             work()
             return
@@ -309,9 +309,9 @@ class Trainer:
         return float(self._tensors["loss"].sum()) * self._unit if self.step else math.nan
 
     def quantised(self) -> dict[str, np.ndarray]:
-        """The fit as stored: ``centre``, ``code``, ``bounds`` and ``net`` of ``wlm.probe.model.ProbeModel``.
+        """The fit as stored: `centre`, `code`, `bounds` and `net` of `wlm.probe.model.ProbeModel`.
 
-        The network's last layer gives the probes' own numbers over ``gain``, its largest weight.
+        The network's last layer gives the probes' own numbers over `gain`, its largest weight.
         """
         p, d = self.profile, self._outputs
         t = {key: self._tensors[key].cpu().numpy().astype(np.float64) for key in ("used", "bounds", "net")}
@@ -339,7 +339,7 @@ class Trainer:
         return result | {"kept": self.needed.copy(), "entered": np.array(self._entered)}
 
     def load(self, state: dict[str, np.ndarray]) -> None:
-        """Goes back to a ``state``; arrays of other shapes raise ValueError."""
+        """Goes back to a `state`; arrays of other shapes raise ValueError."""
         for key in _STATE:
             value, target = torch.from_numpy(np.array(state[key])), self._tensors[key]
             if value.shape != target.shape:

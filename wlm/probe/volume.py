@@ -17,7 +17,7 @@ Follows gaussian-probe-compression, section 3.4, with the settings of section 5.
   together: after a teleport the first frame already covers what is near, if coarsely, where the finest level first
   would leave the rest of the scene black until that level was done.
 - Which level answers a point follows from the windows and from the blocks that are there: the finest that has it, as
-  ``wlm_kernels.probe.volume.read`` says. With every block there that is the paper's choice by the distance to the
+  `wlm_kernels.probe.volume.read` says. With every block there that is the paper's choice by the distance to the
   viewer.
 """
 
@@ -93,7 +93,7 @@ class Reading:
 
 
 class Volume:
-    """A cascaded lighting volume on a device. Call ``update`` once a frame, then ``read``.
+    """A cascaded lighting volume on a device. Call `update` once a frame, then `read`.
 
     Attributes:
         index: The live probes by place.
@@ -123,7 +123,7 @@ class Volume:
         """Makes an empty volume.
 
         Args:
-            position: [N, 3], of all probes, in the unit of ``sizes``.
+            position: [N, 3], of all probes, in the unit of `sizes`.
             decode: From positions float64 [M, 3] to the probes' numbers, float32 [M, D].
             channels: D, 27 for L2 in RGB.
             live: bool [N], false for probes to leave out; None: all are live.
@@ -137,7 +137,7 @@ class Volume:
 
         Raises:
             WlmError: A setting is out of its range, or the device isn't there.
-            ValueError: ``position`` or ``live`` has a wrong shape, or a position isn't finite.
+            ValueError: `position` or `live` has a wrong shape, or a position isn't finite.
         """
         self.sizes = tuple(float(size) * float(scale) for size in sizes)
         rising = all(a < b for a, b in zip(self.sizes, self.sizes[1:], strict=False))
@@ -195,7 +195,7 @@ class Volume:
         return sum(array.nbytes for array in tables) + self.index.memory_bytes + self._cache.memory_bytes
 
     def update(self, viewpoint: np.ndarray) -> FrameStats:
-        """Moves the windows to a viewpoint and fills up to ``budget`` of the blocks that are missing.
+        """Moves the windows to a viewpoint and fills up to `budget` of the blocks that are missing.
 
         Blocks wait in the order of the distance of their centre to the viewpoint over their side; of two alike, the
         finer goes first, then the one of the lower slot. Those that leave their window are dropped.
@@ -208,7 +208,7 @@ class Volume:
 
         Raises:
             WlmError: The viewpoint isn't three finite numbers, or so far out that a block has no number.
-            ValueError: ``decode`` gave another shape than [M, D], or a number that isn't finite.
+            ValueError: `decode` gave another shape than [M, D], or a number that isn't finite.
         """
         clock = _Clock()
         viewpoint = np.array(viewpoint, np.float64)
@@ -250,7 +250,7 @@ class Volume:
         )
 
     def read(self, points: np.ndarray) -> Reading:
-        """Reads the light at points, as ``wlm_kernels.probe.volume.read`` says; at float32's precision near the viewer.
+        """Reads the light at points, as `wlm_kernels.probe.volume.read` says; at float32's precision near the viewer.
 
         Args:
             points: [M, 3], in the unit of the positions. One that is NaN or infinite is covered by nothing.
@@ -279,7 +279,7 @@ class Volume:
 
         Args:
             points: vec3 [M], relative to the viewpoint of the last update.
-            values: float [M, D], written; this and the next two as in ``Reading``.
+            values: float [M, D], written; this and the next two as in `Reading`.
             level: int [M], written.
             weight: float [M], written.
         """
@@ -292,7 +292,7 @@ class Volume:
 
         Returns:
             float32 [L, side, side, side, D], by level, x, y and z, 0 where a block isn't there; and bool
-            [L, side, side, side], true where it is. The first block of each level is that of ``base``.
+            [L, side, side, side], true where it is. The first block of each level is that of `base`.
         """
         out = wp.empty(self._values.shape, dtype=float, device=self.device)
         valid = wp.empty(len(self._held_device), dtype=wp.uint8, device=self.device)
@@ -361,7 +361,7 @@ class Volume:
         return waiting[np.argsort((away**2).sum(1), kind="stable")[: self.budget]]
 
     def _find(self, slots: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The probes in the blocks of slots, as ``ProbeIndex.query`` gives them."""
+        """The probes in the blocks of slots, as `ProbeIndex.query` gives them."""
         size = self._size[self._level[slots], None]
         # The upper corner as the next block computes its lower one: a probe lies in one of the two, rounding or not.
         return self.index.query(self._block[slots] * size, (self._block[slots] + 1) * size)
@@ -399,7 +399,7 @@ class Volume:
 
 
 def _thin(probes: np.ndarray, offsets: np.ndarray, most: int | None) -> tuple[np.ndarray, np.ndarray]:
-    """Keeps at most so many probes of each block of ``ProbeIndex.query``, evenly spaced in their order."""
+    """Keeps at most so many probes of each block of `ProbeIndex.query`, evenly spaced in their order."""
     count = np.diff(offsets)
     if most is None or (count <= most).all():
         return probes, offsets

@@ -120,15 +120,15 @@ def summary(figures: Sequence[FrameFigures]) -> dict[str, object]:
     """Statistics of a walk, in numbers, lists and None alone.
 
     Args:
-        figures: From ``walk``, at least one frame.
+        figures: From `walk`, at least one frame.
 
     Returns:
-        - ``frames``, their number; ``settled``, share of the frames that left nothing waiting; ``from_cache``, share
+        - `frames`, their number; `settled`, share of the frames that left nothing waiting; `from_cache`, share
           of the blocks written that came from the cache, None if none was written.
-        - ``mean``, ``p95`` and ``max`` over the frames of the counts of ``FrameStats`` by their names, of
-          ``update_ms`` and its parts ``find_ms``, ``decode_ms`` and ``upload_ms``, and of ``read_ms``.
-        - Over the frames that have samples, None where no frame has: the same of ``rmse`` and ``rms``; ``mean``,
-          ``p5`` and ``min`` of ``coverage``; mean shares ``by_level``.
+        - `mean`, `p95` and `max` over the frames of the counts of `FrameStats` by their names, of
+          `update_ms` and its parts `find_ms`, `decode_ms` and `upload_ms`, and of `read_ms`.
+        - Over the frames that have samples, None where no frame has: the same of `rmse` and `rms`; `mean`,
+          `p5` and `min` of `coverage`; mean shares `by_level`.
 
     Raises:
         ValueError: There is no frame.

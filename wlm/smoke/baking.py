@@ -75,7 +75,7 @@ def lit(
 ) -> torch.Tensor:
     """Smoke under one light from anywhere, of irradiance 4 pi: what six-way shading approximates.
 
-    Each sample of each ray marches to the light: slow, and independent of ``bake``, so that it serves as its check.
+    Each sample of each ray marches to the light: slow, and independent of `bake`, so that it serves as its check.
 
     Args:
         volume: The smoke, of albedo 1.

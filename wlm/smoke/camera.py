@@ -60,14 +60,14 @@ def unit(vector: Sequence[float] | np.ndarray, name: str = "toward") -> np.ndarr
 
 
 def weights(toward: Sequence[float] | np.ndarray, rule: str = "squared") -> np.ndarray:
-    """Weights of the lightmaps under a light, in the order of ``DIRECTIONS``.
+    """Weights of the lightmaps under a light, in the order of `DIRECTIONS`.
 
     The weights |w| of the paper's eq. 5 add up to as much as 1.73 for oblique lights: too bright by half on average, as
     path tracing shows. The squares add up to 1, and engines use them.
 
     Args:
         toward: [..., 3], the directions to the lights in the camera's axes, of any length but 0.
-        rule: One of ``RULES``.
+        rule: One of `RULES`.
 
     Returns:
         float64 [..., 6], not negative.
@@ -93,7 +93,7 @@ def axis_faults(lightmaps: np.ndarray) -> tuple[str, ...]:
     Only smoke that stops some light can tell: in thin smoke the maps are alike, and that counts as a fault.
 
     Args:
-        lightmaps: [..., 6, H, W], one frame or many, in the order of ``DIRECTIONS``.
+        lightmaps: [..., 6, H, W], one frame or many, in the order of `DIRECTIONS`.
 
     Returns:
         One line per fault: "right" must be brighter on the right than "left", "top" above "bottom", "front" brighter
@@ -171,7 +171,7 @@ class Camera:
     ) -> Camera:
         """Makes a camera that looks from a position to a target.
 
-        Where it looks along ``world_up``, "up" is chosen among the axes of the world, the same at every call.
+        Where it looks along `world_up`, "up" is chosen among the axes of the world, the same at every call.
 
         Raises:
             ValueError: The position is the target, or a size is wrong.

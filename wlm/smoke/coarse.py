@@ -4,7 +4,7 @@ The paper marches in steps of 10 voxels for the sum of three lights, and leaves 
 from it (section 4.2). The same march can keep the lights apart: those from the sides are marched to along the lines of
 a lattice, once for all pixels; those from the front and the back follow from the ray's transparency T alone, exactly,
 as (1 - T^2) / 2 and -T ln T. Its errors are those of its steps: along the rays, in T too, of the distance between the
-lattice's nodes, where light is interpolated, and of the steps to the lights. Each is a setting of ``March``.
+lattice's nodes, where light is interpolated, and of the steps to the lights. Each is a setting of `March`.
 """
 
 from __future__ import annotations
@@ -45,5 +45,5 @@ def march(volume: DensityVolume, camera: Camera, march: March = March()) -> SixW
 
 
 def march_planes(volume: DensityVolume, camera: Camera, march: March) -> torch.Tensor:
-    """``march`` as one tensor, float32 [9, H, W]: ``wlm_kernels.smoke.march_coarse.PLANES``. Cold smoke emits 0."""
+    """`march` as one tensor, float32 [9, H, W]: `wlm_kernels.smoke.march_coarse.PLANES`. Cold smoke emits 0."""
     return run(march_coarse.coarse_six_way, volume, camera, (len(march_coarse.PLANES),), march)

@@ -81,7 +81,7 @@ def open_network(path: str | os.PathLike[str] | None = None) -> SmokeModel:
         path: The file; None: the network that comes with wlm.
 
     Raises:
-        WlmError: As ``wlm.load``; or the file lacks the settings of the network's samples.
+        WlmError: As `wlm.load`; or the file lacks the settings of the network's samples.
     """
     path = shipped() if path is None else path
     model = load(path, SmokeModel.SYSTEM)

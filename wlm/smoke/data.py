@@ -1,7 +1,7 @@
 """Smoke in files: one volume or a folder of a scene's frames, guiding maps and lightmaps as EXR, numbered results.
 
-A folder of frames holds ``scene.json`` and ``frame_0001.npz``, ``frame_0002.npz`` and so on, each a volume as
-``wlm.smoke.load`` reads it. ``simulate`` writes it, and can be stopped and resumed.
+A folder of frames holds `scene.json` and `frame_0001.npz`, `frame_0002.npz` and so on, each a volume as
+`wlm.smoke.load` reads it. `simulate` writes it, and can be stopped and resumed.
 """
 
 from __future__ import annotations
@@ -105,7 +105,7 @@ class Frames:
     def volumes(
         self, numbers: Sequence[int] | None = None, progress: OnProgress | None = None
     ) -> Iterator[tuple[int, DensityVolume]]:
-        """Yields frames with their numbers; ``progress`` is called after each has been dealt with.
+        """Yields frames with their numbers; `progress` is called after each has been dealt with.
 
         Raises:
             WlmError: A frame is missing or damaged.
@@ -124,10 +124,10 @@ def load_frames(
     emission: float | None = None,
     device: str = "cpu",
 ) -> Frames:
-    """Opens a volume, ``.npz`` or ``.nvdb``, or a folder that ``simulate`` wrote.
+    """Opens a volume, `.npz` or `.nvdb`, or a folder that `simulate` wrote.
 
     Raises:
-        WlmError: A folder without frames or a damaged ``scene.json``.
+        WlmError: A folder without frames or a damaged `scene.json`.
     """
     path = Path(path)
     if not path.is_dir():
@@ -143,7 +143,7 @@ def load_frames(
 def open_frames(folder: str | os.PathLike[str], scene: Scene, *, resume: bool = False) -> Frames:
     """Prepares a folder for a simulation's frames.
 
-    Frames appear one by one beside the checkpoint, so they aren't staged as ``wlm.formats.folder`` does for files that
+    Frames appear one by one beside the checkpoint, so they aren't staged as `wlm.formats.folder` does for files that
     are only of use together.
 
     Args:
@@ -171,14 +171,14 @@ def open_frames(folder: str | os.PathLike[str], scene: Scene, *, resume: bool = 
 
 
 def numbered(folder: Path, stem: str, suffix: str) -> dict[int, Path]:
-    """Files such as ``six_0001.exr``, by their rising number."""
+    """Files such as `six_0001.exr`, by their rising number."""
     pattern = re.compile(rf"{re.escape(stem)}_(\d+){re.escape(suffix)}")
     files = {int(match[1]): path for path in folder.iterdir() if (match := pattern.fullmatch(path.name))}
     return dict(sorted(files.items()))
 
 
 def spread(numbers: Sequence[int], count: int | None) -> tuple[int, ...]:
-    """At most ``count`` of some frames, evenly spread, the first and the last among them; None: all."""
+    """At most `count` of some frames, evenly spread, the first and the last among them; None: all."""
     if count is None or count >= len(numbers):
         return tuple(numbers)
     last = len(numbers) - 1
@@ -197,7 +197,7 @@ class NumberedFiles:
 
         Args:
             folder: Made if its parent is there.
-            stem, suffix: Of the files, as for ``numbered``.
+            stem, suffix: Of the files, as for `numbered`.
             others: Names of files that such a run writes beside them.
 
         Raises:
@@ -241,8 +241,8 @@ def write_guide(path: str | os.PathLike[str], guide: Guide) -> None:
 
 
 def write_six_way(path: str | os.PathLike[str], six: SixWay) -> None:
-    """Writes lightmaps as an EXR of half floats: a channel for each direction, ``transparency`` and, of hot smoke,
-    ``emission``; the camera is in its header.
+    """Writes lightmaps as an EXR of half floats: a channel for each direction, `transparency` and, of hot smoke,
+    `emission`; the camera is in its header.
 
     Raises:
         ValueError: The camera isn't known.
@@ -258,7 +258,7 @@ def write_six_way(path: str | os.PathLike[str], six: SixWay) -> None:
 
 
 def read_six_way(path: str | os.PathLike[str], device: str = "cpu") -> SixWay:
-    """Reads what ``write_six_way`` wrote.
+    """Reads what `write_six_way` wrote.
 
     Raises:
         WlmError: The file is missing or damaged, lacks a channel or its camera, or holds a number that isn't finite.

@@ -4,7 +4,7 @@ The adapters' weights are folded, which changes rounding alone: a norm's scale a
 after it, beta and gamma into the one before; the channel attention multiplies the weights of the convolution after it,
 which are fewer than the pixels. The adapters run side by side, and their heads as one convolution. Pixels are rows of
 channels, so that 1 x 1 convolutions are plain matrix products. Between these run the kernels of
-``wlm_kernels.smoke.naf_block``, and after the heads those of ``wlm_kernels.smoke.planes``.
+`wlm_kernels.smoke.naf_block`, and after the heads those of `wlm_kernels.smoke.planes`.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Decoder:
         height, width: H and W of the images.
         device: Where it runs.
         emission: Whether the network predicts emission.
-        guide: Kind of guiding map, a key of ``planes.GUIDES``.
+        guide: Kind of guiding map, a key of `planes.GUIDES`.
         half: Whether it computes in half floats.
     """
 
@@ -71,10 +71,10 @@ class Decoder:
         """Predicts the planes of one image; on CUDA the work is queued, not awaited.
 
         Args:
-            encoded: [C, H, W], a guiding map of ``planes.render_guide`` of the kind ``guide``, on the device.
+            encoded: [C, H, W], a guiding map of `planes.render_guide` of the kind `guide`, on the device.
 
         Returns:
-            float32 [8, H, W] in the order of ``PLANES``, clamped to their ranges. The next call overwrites it.
+            float32 [8, H, W] in the order of `PLANES`, clamped to their ranges. The next call overwrites it.
 
         Raises:
             ValueError: Another size, or another device.
@@ -98,7 +98,7 @@ class _Adapters:
     """G NAFBlocks side by side on one image of H x W pixels and c channels.
 
     Constants that a block adds to all pixels are kept apart: the norm's kernel adds those of the first correction, and
-    the caller adds ``shift``.
+    the caller adds `shift`.
 
     Attributes:
         shift: [G, c], to be added to the outputs.
@@ -245,7 +245,7 @@ class _Tail:
         self._smoke = to_warp(torch.empty(blocks, dtype=torch.int32, device=device))
 
     def __call__(self, heads: torch.Tensor, guide: torch.Tensor, planes: torch.Tensor) -> None:
-        """Writes planes [8, H, W] from the outputs of ``_Body`` and the guide [C, H, W]."""
+        """Writes planes [8, H, W] from the outputs of `_Body` and the guide [C, H, W]."""
         kernels, source = self._kernels, to_warp(guide)
         self._launch(kernels.near, kernels.lanes * self._smoke.size, [source], self._smoke)
         pixels = to_warp(heads.permute(0, 2, 3, 1))

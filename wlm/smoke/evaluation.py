@@ -3,7 +3,7 @@
 All scores are of encoded planes, that is in sRGB, as the paper's PSNR is (section 5).
 
 =====================================  =====================================================
-an exact prediction                    120 dB, as everywhere (``wlm.metrics``)
+an exact prediction                    120 dB, as everywhere (`wlm.metrics`)
 no visible smoke                       the flicker is NaN
 a target that doesn't change           the ratio of flickers is NaN
 no samples, or planes of another size  error
@@ -54,10 +54,10 @@ __all__ = [
 ]
 
 Method = Callable[[Pool, slice], torch.Tensor]
-"""Predicts planes [n, 2, 8, H, W] of both frames of the samples that a slice takes from a pool; ``score`` clamps."""
+"""Predicts planes [n, 2, 8, H, W] of both frames of the samples that a slice takes from a pool; `score` clamps."""
 
 NETWORK, HALF = "network", "network, half floats"
-"""Names of a network's own methods in a ``Comparison``."""
+"""Names of a network's own methods in a `Comparison`."""
 
 DENSITIES = (0.5, 1.0, 2.0)
 """Factors on the density, those of the paper's ablation (figure 5)."""
@@ -73,7 +73,7 @@ class Score(system.Report):
     Attributes:
         psnr: Mean over the images, each over its six lightmaps, as in the paper.
         lowest, highest: Over the images.
-        planes: For each of ``PLANES``, of the mean square error over all images.
+        planes: For each of `PLANES`, of the mean square error over all images.
         flicker: Mean absolute change of the six lightmaps from frame to frame where smoke is visible, after warping the
             earlier frame by the smoke's motion. Shadows that move otherwise and new smoke count too.
         reference_flicker: The same of the targets, in which nothing flickers.
@@ -92,7 +92,7 @@ class Score(system.Report):
         return self.flicker / self.reference_flicker if self.reference_flicker > _STILL else math.nan
 
     def to_json(self) -> dict[str, Any]:
-        """As ``wlm.system.Report.to_json``, with the ratio of flickers, and planes by name."""
+        """As `wlm.system.Report.to_json`, with the ratio of flickers, and planes by name."""
         names = ("psnr", "lowest", "highest", "flicker", "reference_flicker", "flicker_ratio")
         planes = dict(zip(PLANES, self.planes, strict=True))
         return system.plain({name: getattr(self, name) for name in names} | {"planes": planes})
@@ -123,7 +123,7 @@ def evaluate(
     file_bytes: int | None = None,
     half: bool = True,
 ) -> Report:
-    """Scores a network as it runs: one image at a time through its ``Decoder``.
+    """Scores a network as it runs: one image at a time through its `Decoder`.
 
     Args:
         model: The network.
@@ -131,7 +131,7 @@ def evaluate(
             was trained on or selected by; None: the settings that it was trained with.
         device: "cpu", "cuda" or "cuda:N".
         progress: Called about twice a second.
-        file_bytes: Size of the network's file; None: ``model.file_bytes()``.
+        file_bytes: Size of the network's file; None: `model.file_bytes()`.
         half: Whether a GPU computes in half floats.
 
     Raises:
@@ -173,7 +173,7 @@ def of_decoder(decoder: Decoder) -> Method:
 
 @torch.no_grad()
 def score(method: Method, pool: Pool, *, batch: int = _BATCH, progress: OnProgress | None = None) -> Score:
-    """Scores a method on both frames of all samples; its planes are clamped as ``decode_lightmaps`` does.
+    """Scores a method on both frames of all samples; its planes are clamped as `decode_lightmaps` does.
 
     Args:
         method: The method.
@@ -278,7 +278,7 @@ def compare(
     Args:
         model: The network.
         settings: Of the test set; None: those that it was trained with.
-        volumes: Files for ``pool_of_volume``.
+        volumes: Files for `pool_of_volume`.
         rivals: Other methods, by name.
         densities: Factors on the test set's extinction.
         device: "cpu", "cuda" or "cuda:N".

@@ -2,7 +2,7 @@
 
 EXR holds half floats as they are. PNG and TGA hold 8 bits a channel, linear, so that 1 is the brightest: import the
 textures without sRGB decoding. Light is premultiplied: it is added to the background times 1 - alpha.
-``wlm.smoke.camera.LAYOUTS`` lists the channels.
+`wlm.smoke.camera.LAYOUTS` lists the channels.
 """
 
 from __future__ import annotations
@@ -54,11 +54,11 @@ def pack(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Lays frames out in two textures.
 
-    Channels are those of ``channels``: the second texture of cold smoke has three.
+    Channels are those of `channels`: the second texture of cold smoke has three.
 
     Args:
         frames: At least one, at most rows x columns, all of one size. Cells without a frame are empty: black, alpha 0.
-        layout: One of ``LAYOUTS``.
+        layout: One of `LAYOUTS`.
         rows, columns: Of cells.
         gain: Factor on the lightmaps and the emission, to use the range of 8 bits.
 
@@ -94,11 +94,11 @@ def unpack(
     count: int | None = None,
     gain: float = 1.0,
 ) -> list[SixWay]:
-    """Cuts two textures into frames, the inverse of ``pack``.
+    """Cuts two textures into frames, the inverse of `pack`.
 
     Args:
         first, second: [rows * H, columns * W, 3 or 4].
-        layout: One of ``LAYOUTS``.
+        layout: One of `LAYOUTS`.
         rows, columns: Of cells.
         count: Frames; None: all cells.
         gain: The factor on the light.
@@ -145,13 +145,13 @@ def write_flipbook(
 
     Args:
         paths: The two files, .exr, .png or .tga; their folders must exist.
-        frames, layout, rows, columns, gain: As for ``pack``.
+        frames, layout, rows, columns, gain: As for `pack`.
 
     Returns:
         How many numbers were above their file's range and became its greatest.
 
     Raises:
-        ValueError: As for ``pack``.
+        ValueError: As for `pack`.
         WlmError: Another suffix, a number that isn't finite, or a file that can't be written.
     """
     for path in paths:
@@ -184,10 +184,10 @@ def read_flipbook(
 
     Args:
         paths: The two files, .exr, .png or .tga (8 bits a channel, linear).
-        layout, rows, columns, count, gain: As for ``unpack``.
+        layout, rows, columns, count, gain: As for `unpack`.
 
     Returns:
-        As ``unpack``.
+        As `unpack`.
 
     Raises:
         WlmError: A file is missing, damaged, of another kind or size, holds numbers that aren't finite, or lacks a

@@ -91,24 +91,24 @@ def train(
 ) -> Training:
     """Trains a network and saves the one with the best validation.
 
-    Beside ``output`` it writes ``OUTPUT.csv``, the curves, and until it is finished ``OUTPUT.partial``, the checkpoint.
+    Beside `output` it writes `OUTPUT.csv`, the curves, and until it is finished `OUTPUT.partial`, the checkpoint.
 
     Args:
         profile: A profile's name, the path of a YAML file, or the profile itself.
         output: The network's file.
         seed: Determines the initial weights, the pools and the order of samples.
         device: "cpu", "cuda" or "cuda:N".
-        minutes: Time limit, at which it stops with a checkpoint, after at least ``_CHUNK`` steps; None: no limit.
+        minutes: Time limit, at which it stops with a checkpoint, after at least `_CHUNK` steps; None: no limit.
         resume: Whether to continue from the checkpoint, if there is one.
         progress: Called after each sequence simulated and about every 50 steps, with "PSNR dB" at the last validation
             and the mean "loss" since then.
-        make_pool, make_validation: Replace those of ``learn.dataset``.
-        **overrides: Settings of the profile's parts that differ: ``training={"rounds": 2}``.
+        make_pool, make_validation: Replace those of `learn.dataset`.
+        **overrides: Settings of the profile's parts that differ: `training={"rounds": 2}`.
 
     Raises:
         WlmError: A wrong setting, no such device, a checkpoint that is damaged or of another training, a finished
             training to resume, unusable samples, a training that diverged, or a file that can't be written.
-        KeyboardInterrupt: Raised by ``progress``, after the checkpoint has been written.
+        KeyboardInterrupt: Raised by `progress`, after the checkpoint has been written.
     """
     profile, device = Profile.load(profile).override(overrides), check_device(device)
     fit = {

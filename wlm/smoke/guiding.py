@@ -50,7 +50,7 @@ def guide(volume: DensityVolume, camera: Camera, march: March = March(), *, shar
         volume: The smoke.
         camera: Orthographic or in perspective; inside the smoke it sees what is in front of it, lit from the front by a
             light in its own place.
-        march: Without ``spacing`` and ``light_step``: nodes and steps to the lights are those of the rays.
+        march: Without `spacing` and `light_step`: nodes and steps to the lights are those of the rays.
         shared: Whether pixels share marches to the lights, on a lattice with a node each step. Far quicker; the light
             between nodes is then interpolated.
 

@@ -43,7 +43,7 @@ class SixWay:
     """Six-way lightmaps of one frame; H x W pixels.
 
     Attributes:
-        lightmaps: float32 tensor [6, H, W], in the order of ``wlm.smoke.camera.DIRECTIONS``.
+        lightmaps: float32 tensor [6, H, W], in the order of `wlm.smoke.camera.DIRECTIONS`.
         transparency: float32 tensor [H, W], or None: not known, as in files without it.
         emission: float32 tensor [H, W], the light that the smoke gives off itself, or None: it is cold.
         camera: The view, or None: not known, as in an engine's textures.
@@ -89,7 +89,7 @@ class SixWay:
             lights: Any number.
             background: Linear light behind the smoke, [H, W, 3] or one colour; None: the smoke's light alone, to be
                 added to what is behind times the transparency.
-            rule: How a light's direction weighs the lightmaps, one of ``wlm.smoke.camera.RULES``.
+            rule: How a light's direction weighs the lightmaps, one of `wlm.smoke.camera.RULES`.
             ramp: Colour of the emission; None: grey, as it is.
 
         Returns:

@@ -26,7 +26,7 @@ def run(
     """Runs a march.
 
     Args:
-        launch: ``launch(medium, view, *arguments, out, **options)``, of ``wlm_kernels.smoke``.
+        launch: `launch(medium, view, *arguments, out, **options)`, of `wlm_kernels.smoke`.
         volume: The smoke.
         camera: The view.
         planes: Sizes of the result before those of the image.

@@ -106,7 +106,7 @@ class NetworkSettings(BaseModel):
 
 
 class Profile(Settings):
-    """What ``configs/smoke-network-*.yaml`` hold.
+    """What `configs/smoke-network-*.yaml` hold.
 
     Attributes:
         name: Shown in reports.
@@ -132,7 +132,7 @@ class Profile(Settings):
         return self
 
     def override(self, values: Mapping[str, Any], prefix: str = "") -> Self:
-        """As ``Settings.override``, inside the parts too: ``{"training": {"steps": 500}}`` leaves their other settings.
+        """As `Settings.override`, inside the parts too: `{"training": {"steps": 500}}` leaves their other settings.
 
         Raises:
             WlmError: Unknown or out of range.
@@ -225,7 +225,7 @@ class NafBlock(nn.Module):
 
 
 def support(opacity: torch.Tensor) -> torch.Tensor:
-    """The mask of where smoke may be: within ``REACH`` to twice ``REACH`` pixels of smoke in the guide.
+    """The mask of where smoke may be: within `REACH` to twice `REACH` pixels of smoke in the guide.
 
     Args:
         opacity: [N, 1, H, W] of the guide.
@@ -242,7 +242,7 @@ def support(opacity: torch.Tensor) -> torch.Tensor:
 class SixWayNetwork(nn.Module):
     """Encoded guiding maps to encoded lightmaps, at any resolution.
 
-    Outputs aren't clamped, so that there is a gradient everywhere; ``decode_lightmaps`` clamps them.
+    Outputs aren't clamped, so that there is a gradient everywhere; `decode_lightmaps` clamps them.
 
     Attributes:
         groups: The planes of each adapter.
@@ -277,7 +277,7 @@ class SixWayNetwork(nn.Module):
                 nn.init.zeros_(head.bias)
 
     def features(self, guide: torch.Tensor) -> torch.Tensor:
-        """The U-Net's output, [N, C, H / stem, W / stem], of a guide whose sides are multiples of ``multiple``."""
+        """The U-Net's output, [N, C, H / stem, W / stem], of a guide whose sides are multiples of `multiple`."""
         x = guide[:, : self.settings.channels]
         if self.settings.stem > 1:
             x = F.pixel_unshuffle(x, self.settings.stem)
@@ -298,7 +298,7 @@ class SixWayNetwork(nn.Module):
             guide: [N, C, H, W], encoded, of the settings' kind.
 
         Returns:
-            [N, 8, H, W] in the order of ``PLANES``, of the guide's type.
+            [N, 8, H, W] in the order of `PLANES`, of the guide's type.
         """
         height, width = guide.shape[-2:]
         multiple = self.settings.multiple

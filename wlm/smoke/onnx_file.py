@@ -21,9 +21,9 @@ _OPSET = 20
 
 
 def export(model: SmokeModel, path: str | os.PathLike[str], *, height: int = 512, width: int = 512) -> int:
-    """Writes a network as ONNX for one image size: ``guide`` [1, C, H, W] to ``lightmaps`` [1, 8, H, W], float32.
+    """Writes a network as ONNX for one image size: `guide` [1, C, H, W] to `lightmaps` [1, 8, H, W], float32.
 
-    Both are encoded planes, as ``wlm.smoke.planes`` defines them; the lightmaps aren't clamped.
+    Both are encoded planes, as `wlm.smoke.planes` defines them; the lightmaps aren't clamped.
 
     Args:
         model: The network.
@@ -35,7 +35,7 @@ def export(model: SmokeModel, path: str | os.PathLike[str], *, height: int = 512
 
     Raises:
         ValueError: A size below 1.
-        WlmError: The extra ``onnx`` isn't installed, or the file can't be written.
+        WlmError: The extra `onnx` isn't installed, or the file can't be written.
     """
     if height < 1 or width < 1:
         raise ValueError(f"expected at least one pixel, got {height} x {width}")

@@ -59,7 +59,7 @@ def to_srgb(linear: torch.Tensor) -> torch.Tensor:
 
 
 def from_srgb(code: torch.Tensor) -> torch.Tensor:
-    """The inverse of ``to_srgb``; values below 0 count as 0."""
+    """The inverse of `to_srgb`; values below 0 count as 0."""
     curve = ((code.clamp(min=FOOT_CODE) + 0.055) / 1.055) ** 2.4
     return torch.where(code <= FOOT_CODE, code.clamp(min=0.0) / 12.92, curve)
 
@@ -86,8 +86,8 @@ def encode_guide(maps: torch.Tensor, near: float, far: float) -> torch.Tensor:
     """A guiding map as the network reads it: all three planes are 0 where there is no smoke.
 
     Args:
-        maps: [..., 3, H, W]: light, transparency, depth, as ``guide`` gives them.
-        near, far: From ``span``.
+        maps: [..., 3, H, W]: light, transparency, depth, as `guide` gives them.
+        near, far: From `span`.
 
     Returns:
         [..., 3, H, W]: light in sRGB; opacity; depth as a share of the span, 1 at its near end, 0 without a surface.
@@ -114,11 +114,11 @@ def render_guide(volume: DensityVolume, camera: Camera, kind: str, march: March)
     Args:
         volume: The smoke.
         camera: Orthographic.
-        kind: One of ``GUIDES``.
-        march: As for ``guide`` where the kind is "paper", else as for ``wlm.smoke.coarse.march``.
+        kind: One of `GUIDES`.
+        march: As for `guide` where the kind is "paper", else as for `wlm.smoke.coarse.march`.
 
     Returns:
-        float32 [C, H, W], the planes of ``GUIDES``, all 0 where there is no smoke, but for an emission without any.
+        float32 [C, H, W], the planes of `GUIDES`, all 0 where there is no smoke, but for an emission without any.
 
     Raises:
         ValueError: No such kind, or a camera in perspective.
@@ -144,7 +144,7 @@ def encode_lightmaps(six: SixWay) -> torch.Tensor:
     """Lightmaps as the network learns them.
 
     Returns:
-        [8, H, W] in the order of ``PLANES``: six lightmaps in sRGB, opacity, and emission e as e / (1 + e) in sRGB, 0
+        [8, H, W] in the order of `PLANES`: six lightmaps in sRGB, opacity, and emission e as e / (1 + e) in sRGB, 0
         where the smoke is cold.
 
     Raises:
@@ -158,7 +158,7 @@ def encode_lightmaps(six: SixWay) -> torch.Tensor:
 
 
 def decode_lightmaps(planes: torch.Tensor, *, hot: bool = True, camera: Camera | None = None) -> SixWay:
-    """The inverse of ``encode_lightmaps``, in float32 and without a gradient; each plane is clamped to its range.
+    """The inverse of `encode_lightmaps`, in float32 and without a gradient; each plane is clamped to its range.
 
     Args:
         planes: [8, H, W].

@@ -90,12 +90,12 @@ def predict(
     device: str | None = None,
     seed: int = 0,
 ) -> SixWay:
-    """Makes six-way lightmaps of smoke by a network: what ``bake`` makes, sooner.
+    """Makes six-way lightmaps of smoke by a network: what `bake` makes, sooner.
 
     Args:
         smoke: On any device.
         camera: Orthographic.
-        model: A network, its file, or a ``SmokePredictor`` for many frames; None: the network that comes with wlm,
+        model: A network, its file, or a `SmokePredictor` for many frames; None: the network that comes with wlm,
             which is loaded once for each device.
         device: Where a network that isn't loaded runs; None: where the smoke is.
         seed: Of the guiding map's jitter.
@@ -105,7 +105,7 @@ def predict(
 
     Raises:
         ValueError: The camera is in perspective.
-        WlmError: As ``SmokePredictor``.
+        WlmError: As `SmokePredictor`.
     """
     if not isinstance(model, SmokePredictor):
         device = check_device(device_name(smoke.device) if device is None else device)

@@ -1,7 +1,7 @@
 """The settings of a scene to simulate and render, a YAML file: the box, air, smoke, inlets, obstacles, camera, lights.
 
 Lengths are in metres, times in seconds, directions the world's, +y up unless the scene says otherwise. A class is named
-``...Settings`` where the object that is made of it has the plain name. The stated behaviours:
+`...Settings` where the object that is made of it has the plain name. The stated behaviours:
 
 =======================================  =============================================================
 a number NaN or infinite                 error that names the field
@@ -135,9 +135,9 @@ class Air(_Settings):
 
     Attributes:
         viscosity: Kinematic, square metres per second; air's is 1.5e-5.
-        speed: Metres per second that are ``lattice_speed`` cells per step; null: the fastest inlet or obstacle.
+        speed: Metres per second that are `lattice_speed` cells per step; null: the fastest inlet or obstacle.
         lattice_speed: Cells per step. Errors grow with its square, the number of steps with its inverse.
-        operator, smagorinsky, storage: As for ``wlm.fluid.lattice.Lattice``.
+        operator, smagorinsky, storage: As for `wlm.fluid.lattice.Lattice`.
     """
 
     viscosity: _Positive = 1.5e-5
@@ -158,7 +158,7 @@ class Smoke(_Settings):
         buoyancy: Metres per second squared, upwards, at temperature 1.
         weight: Metres per second squared, downwards, at density 1.
         up: The direction opposite to gravity.
-        scheme, storage, bricks, substeps: The advection, as for ``wlm.fluid.solver.Solver``.
+        scheme, storage, bricks, substeps: The advection, as for `wlm.fluid.solver.Solver`.
         glow: Colours of the emission: stops of emission, R, G, B; none: grey, as it is.
     """
 
@@ -289,7 +289,7 @@ class ObstacleSettings(_Settings):
 
 
 class CameraSettings(_Settings):
-    """The camera, as ``Camera.around`` takes it; null is its None.
+    """The camera, as `Camera.around` takes it; null is its None.
 
     Attributes:
         toward, target, extent, distance, up, aspect, perspective: As there; lengths in metres.
@@ -306,7 +306,7 @@ class CameraSettings(_Settings):
     perspective: bool = False
 
     def turned(self, degrees: float) -> CameraSettings:
-        """The same camera, turned about ``up``: the paper's references are seen from 9 sides, 10 degrees apart."""
+        """The same camera, turned about `up`: the paper's references are seen from 9 sides, 10 degrees apart."""
         axis = np.array(self.up) / np.linalg.norm(self.up)
         toward, angle = np.array(self.toward), math.radians(degrees)
         along = axis * (axis @ toward)
@@ -388,7 +388,7 @@ class Scene(_Settings):
 
     @property
     def fastest(self) -> float:
-        """Metres per second that are ``air.lattice_speed``; 1 where nothing moves."""
+        """Metres per second that are `air.lattice_speed`; 1 where nothing moves."""
         if self.air.speed is not None:
             return self.air.speed
         speeds = [float(np.linalg.norm(inlet.velocity)) for inlet in self.inlets]
@@ -396,7 +396,7 @@ class Scene(_Settings):
 
     @property
     def steps(self) -> int:
-        """Steps of the air per frame: as few as keep ``fastest`` within ``air.lattice_speed``, in whole substeps."""
+        """Steps of the air per frame: as few as keep `fastest` within `air.lattice_speed`, in whole substeps."""
         least = self.fastest / (self.rate * self.air.lattice_speed * self.grid.cell)
         return max(math.ceil(least / self.smoke.substeps - 1e-9), 1) * self.smoke.substeps
 
@@ -407,7 +407,7 @@ class Scene(_Settings):
 
 
 def load_scene(name: str | os.PathLike[str]) -> Scene:
-    """Loads ``configs/smoke-NAME.yaml``, or any YAML file.
+    """Loads `configs/smoke-NAME.yaml`, or any YAML file.
 
     Raises:
         WlmError: Unknown scene, unreadable file, or a wrong setting.

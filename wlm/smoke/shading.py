@@ -1,6 +1,6 @@
 """A scene's light on smoke: directional lights, the colour of a glow, and the shadows of obstacles.
 
-All in linear light. ``SixWay.shade`` puts them together.
+All in linear light. `SixWay.shade` puts them together.
 """
 
 from __future__ import annotations

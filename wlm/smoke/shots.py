@@ -50,7 +50,7 @@ class FramesToBake:
     Attributes:
         frames: The smoke.
         camera: Orthographic.
-        step, supersample: As for ``bake``.
+        step, supersample: As for `bake`.
     """
 
     frames: Frames
@@ -91,7 +91,7 @@ class FramesToBake:
 
 @dataclass(frozen=True)
 class BakedFiles:
-    """Lightmaps that ``bake`` or ``predict`` wrote.
+    """Lightmaps that `bake` or `predict` wrote.
 
     Attributes:
         files: The EXR files by number.
@@ -105,7 +105,7 @@ class BakedFiles:
     scene: None = None
 
     def shots(self, count: int | None = None, progress: OnProgress | None = None) -> Iterator[Shot]:
-        """Reads one frame after the other; arguments as for ``FramesToBake.shots``.
+        """Reads one frame after the other; arguments as for `FramesToBake.shots`.
 
         Raises:
             WlmError: A file is damaged or of another kind.
@@ -118,7 +118,7 @@ class BakedFiles:
 
 
 def baked_files(path: str | os.PathLike[str], device: str = "cpu") -> BakedFiles | None:
-    """Finds what ``bake`` or ``predict`` wrote: the file itself, or those of a folder.
+    """Finds what `bake` or `predict` wrote: the file itself, or those of a folder.
 
     Returns:
         None where the path is a volume or a folder of a simulation.

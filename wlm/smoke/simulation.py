@@ -36,7 +36,7 @@ def make_solver(scene: Scene, *, device: str = "cpu") -> fluid.Solver:
 
     Args:
         scene: The scene.
-        device: As ``wlm.interop.check_device`` returns it.
+        device: As `wlm.interop.check_device` returns it.
 
     Raises:
         WlmError: The memory isn't enough for air and smoke, before any is allocated, or an inlet is too fast for the
@@ -81,25 +81,25 @@ def simulate(
 ) -> int:
     """Runs a scene and writes its frames.
 
-    The state is saved in the folder every ``CHECKPOINT_EVERY`` frames, after the frame itself, and when ``progress``
+    The state is saved in the folder every `CHECKPOINT_EVERY` frames, after the frame itself, and when `progress`
     raises KeyboardInterrupt. Going on from it gives the same frames: on the CPU to the last bit, on a GPU as far as its
     atomic sums come out alike, and with smoke in bricks to their threshold.
 
     Args:
-        frames: The folder, as ``wlm.smoke.data.open_frames`` prepares it.
-        solver: From ``make_solver``, not yet stepped; None: it is made here, on ``device``. Whoever makes it before the
+        frames: The folder, as `wlm.smoke.data.open_frames` prepares it.
+        solver: From `make_solver`, not yet stepped; None: it is made here, on `device`. Whoever makes it before the
             folder is opened loses no earlier frames if it can't be made.
-        device: As ``wlm.interop.check_device`` returns it.
+        device: As `wlm.interop.check_device` returns it.
         resume: Whether to go on from a state that was saved there, if there is one. A state past the last frame asked
             for stays there.
-        progress: Called after each frame, with the figures ``smoke``, the density's integral over the box, and
-            ``frame s``, the seconds that the frame took.
+        progress: Called after each frame, with the figures `smoke`, the density's integral over the box, and
+            `frame s`, the seconds that the frame took.
 
     Returns:
         The number of the first frame that was simulated; one more than there are if all were there.
 
     Raises:
-        WlmError: As ``make_solver``; an obstacle is too fast; the air blew up; a file is damaged or can't be written; a
+        WlmError: As `make_solver`; an obstacle is too fast; the air blew up; a file is damaged or can't be written; a
             frame before the saved state is missing.
     """
     scene, checkpoint = frames.scene, frames.path / CHECKPOINT

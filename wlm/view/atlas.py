@@ -17,7 +17,7 @@ from wlm.ops import raster
 
 __all__ = ["comparison", "draw", "encode", "original", "save_png", "white_of"]
 
-_WHITE_PERCENTILE = 99.5  # as in ``wlm.view.sheet``
+_WHITE_PERCENTILE = 99.5  # as in `wlm.view.sheet`
 _BACKGROUND = 128  # light and dark surfaces stand out from it
 _MARGIN, _TITLE, _FONT = 6, 26, 16  # pixels
 
@@ -35,7 +35,7 @@ def original(mesh: LightmappedMesh, device: str = "cpu") -> Sampler:
 def draw(
     mesh: LightmappedMesh, samplers: Mapping[str, Sampler], view: View, resolution: int = 512, device: str = "cpu"
 ) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Draws a mesh from one camera, as ``wlm.atlas.evaluation`` does.
+    """Draws a mesh from one camera, as `wlm.atlas.evaluation` does.
 
     Args:
         mesh: The mesh.

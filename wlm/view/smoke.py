@@ -183,7 +183,7 @@ def guide_pictures(guide: Guide, white: float = 2.0) -> dict[str, np.ndarray]:
 
 
 def write_sequence(folder: str | os.PathLike[str], pictures: Iterable[np.ndarray], stem: str = "frame") -> list[Path]:
-    """Writes pictures as ``STEM_0001.png`` and so on, each whole or not at all.
+    """Writes pictures as `STEM_0001.png` and so on, each whole or not at all.
 
     Args:
         folder: Made if its parent is there.

@@ -28,7 +28,7 @@ _SEED = 0  # of the choice among more
 _SUBDIVISIONS = ((64, 3), (1024, 2), (MAX_PROBES, 1))
 _SMALLEST_RADIUS = 1 / 250  # of the box's diagonal: one probe far off must not shrink the others to nothing
 _RADIUS_RANGE = 1e-6, 1e6  # of the box's longest side; float32 tells no more apart
-_WHITE_PERCENTILE = 99.5  # as in ``wlm.view.sheet``
+_WHITE_PERCENTILE = 99.5  # as in `wlm.view.sheet`
 # From where the box is seen, y up: half from above, so that the sides of the spheres show what their tops do.
 _VIEW = (1.0, 0.8, 1.0)
 _LARGEST_ASPECT = 1.6  # of a panel, either way
@@ -69,7 +69,7 @@ def render_probes(
 
     The view is parallel, from above and from between two axes, along (-1, -0.8, -1) with y up and (-1, 1, -0.8) with z
     up, in right-handed axes; probes from an engine with left-handed ones appear mirrored. It holds all probes drawn.
-    Of more than ``MAX_PROBES`` so many are drawn, chosen at random with a fixed seed, and the title says so. Probes
+    Of more than `MAX_PROBES` so many are drawn, chosen at random with a fixed seed, and the title says so. Probes
     without light are black and may hide others: pass the live ones alone.
 
     Rendering is VTK's, on the GPU or in software, and needs no screen, but it does need an OpenGL library of the
@@ -78,7 +78,7 @@ def render_probes(
     Args:
         path: The PNG to write, whole or not at all; its folder must exist.
         position: [N, 3], in any unit.
-        original: [N, D], D = 3 C, SH radiance in the convention of ``wlm.probe.sphere``, RGB last.
+        original: [N, D], D = 3 C, SH radiance in the convention of `wlm.probe.sphere`, RGB last.
         decoded: [N, D].
         up: The axis that points up.
         radius: Of the spheres, in the unit of the positions; None takes half of the median distance to the nearest

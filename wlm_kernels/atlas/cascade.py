@@ -2,7 +2,7 @@
 (lightmap-uv-clustering-cascade, sections 3.3.2 and 3.3.3).
 
 C(u) = T_p(F(T_c(u))) (eq. 7): T_c gives a coordinate, the triangle wave F folds it into [0, 1], T_p gives the colour.
-Both textures are read bilinearly and clamped at their borders, see ``wlm_kernels.raster.texture``. An empty T_c stands
+Both textures are read bilinearly and clamped at their borders, see `wlm_kernels.raster.texture`. An empty T_c stands
 for none: C(u) = T_p(u).
 
 Two points of the paper had to be settled. Eq. 8 has a floor where an absolute value must be, and would be -2 or 0
@@ -13,7 +13,7 @@ point; acting on T_c's texels it would be eight, with the same result where they
 A point is a coordinate u. A NaN coordinate is an empty point: it reads NaN, its loss is 0, it has no gradient.
 Gradients of textures are added by atomics: on CUDA in any order, so that the last bits change from run to run.
 
-Read ``tests/reference/cascade.py`` first: eq. 7 and both losses in float64, differentiated by autograd.
+Read `tests/reference/cascade.py` first: eq. 7 and both losses in float64, differentiated by autograd.
 """
 
 import warp as wp
@@ -171,7 +171,7 @@ def _or_zero(x: float) -> float:
 
 @wp.func
 def _sign(x: float) -> float:
-    """The sign, 0 at 0 where L1 has no slope; ``wp.sign`` is 1 there."""
+    """The sign, 0 at 0 where L1 has no slope; `wp.sign` is 1 there."""
     return wp.where(x > 0.0, 1.0, wp.where(x < 0.0, -1.0, 0.0))
 
 
@@ -241,13 +241,13 @@ def sample(colour, lut, uv, out) -> None:
 
 
 def sample_backward(colour, lut, uv, grad_out, grad_colour, grad_lut) -> None:
-    """Backward pass of ``sample``: the gradients of its textures.
+    """Backward pass of `sample`: the gradients of its textures.
 
     Args:
-        colour, lut, uv: As for ``sample``.
+        colour, lut, uv: As for `sample`.
         grad_out: float [N, 3].
         grad_colour: float [Hp, Wp, 3], added to.
-        grad_lut: float [Hc, Wc, 2] as ``lut``, added to.
+        grad_lut: float [Hc, Wc, 2] as `lut`, added to.
 
     Raises:
         ValueError: A texture's shape is wrong.
@@ -292,7 +292,7 @@ def surface_points(area, corner, distance: float, seed: int, step, triangle, bar
 def image_loss(difference, weight: float, grad) -> None:
     """Computes the gradient of an image's loss: L1 of the colours and of the images' gradients (section 3.3.3).
 
-    The loss is the sum of |d| over all pixels and channels plus ``weight`` times the sum of |d_p - d_q| over pairs of
+    The loss is the sum of |d| over all pixels and channels plus `weight` times the sum of |d_p - d_q| over pairs of
     neighbours p and q, horizontal and vertical.
 
     Args:
@@ -305,7 +305,7 @@ def image_loss(difference, weight: float, grad) -> None:
 
 
 def pair_loss(difference, weight: float, grad) -> None:
-    """Computes the gradient of the loss of pairs of points: the sums of |d| and of ``weight`` |d_i - d_(N + i)|.
+    """Computes the gradient of the loss of pairs of points: the sums of |d| and of `weight` |d_i - d_(N + i)|.
 
     Args:
         difference: float [2 N, 3], d; NaN counts as 0.

@@ -3,7 +3,7 @@
 Tile (i, j) of size B spans the lightmap's texel centres i B to (i + 1) B along x, and j B to (j + 1) B along y; its
 entry names the rectangle of the texture that holds it. The rectangle's outermost samples lie on the tile's borders.
 
-Read ``wlm/atlas/exact.py`` first: the same in float64 NumPy.
+Read `wlm/atlas/exact.py` first: the same in float64 NumPy.
 """
 
 import warp as wp

@@ -1,9 +1,9 @@
 """The graph of patches that are alike (lightmap-uv-clustering-cascade, section 3.2), without storing its edges.
 
-Few pairs need all their samples compared. Bounds of the distance from below and from above (``Bounds``) settle most;
+Few pairs need all their samples compared. Bounds of the distance from below and from above (`Bounds`) settle most;
 they are in float32, with a margin larger than its rounding, and so never change a result.
 
-Read ``tests/reference/patches.py`` first (``distances``, ``adjacency``, ``greedy``): the same with the whole matrix.
+Read `tests/reference/patches.py` first (`distances`, `adjacency`, `greedy`): the same with the whole matrix.
 """
 
 import math
@@ -69,7 +69,7 @@ class Rule:
     Attributes:
         colour: Largest squared distance of two dominant colours, in bins.
         level: Mean difference, summed over the channels, in levels.
-        whole: The same rounded up: a whole number is below ``level`` where it is below this one.
+        whole: The same rounded up: a whole number is below `level` where it is below this one.
         same: [len(SIZES)], for two patches of one size: sum of the differences of all samples and channels, in levels.
         mixed: [len(SIZES)], the same where the larger has this size, in 1 / (n - 1) of a level.
     """
@@ -314,10 +314,10 @@ def rule(threshold: float, colour_threshold: float, device) -> Rule:
 
 
 def bounds(samples, patches, levels: int):
-    """Computes ``Bounds`` [F, levels] of patches.
+    """Computes `Bounds` [F, levels] of patches.
 
     Args:
-        samples, patches: As of ``sample``.
+        samples, patches: As of `sample`.
         levels: One more than the highest level of a patch.
     """
     out = wp.empty((patches.shape[0], levels), dtype=Bounds, device=samples.device)
@@ -350,7 +350,7 @@ class Graph:
 
 
 def graph(samples, patches, bounds, rule: Rule) -> Graph:
-    """Makes the graph of patches that are sorted by ``bin_numbers``."""
+    """Makes the graph of patches that are sorted by `bin_numbers`."""
     bins = bin_numbers(patches.numpy()["colour"])
     _, first, cell = np.unique(bins, return_index=True, return_inverse=True)
     first = np.append(first, len(bins))
@@ -360,7 +360,7 @@ def graph(samples, patches, bounds, rule: Rule) -> Graph:
 
 
 def count_neighbours(graph: Graph, begin: int, end: int, degree, compared) -> None:
-    """Adds the edges between patches ``begin`` to ``end`` - 1 and any later one to the degrees of both.
+    """Adds the edges between patches `begin` to `end` - 1 and any later one to the degrees of both.
 
     Args:
         graph: The graph.
@@ -379,7 +379,7 @@ def mark_neighbours(graph: Graph, nodes, node: int, marked) -> None:
         graph: The graph.
         nodes: int [L], the patches to look at.
         node: The patch.
-        marked: uint8 [L], written: 1 for ``node`` and its neighbours, else 0.
+        marked: uint8 [L], written: 1 for `node` and its neighbours, else 0.
     """
     inputs = [*graph._inputs(), nodes, node]
     wp.launch(_mark, nodes.shape, inputs=inputs, outputs=[marked], device=nodes.device)

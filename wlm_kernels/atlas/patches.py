@@ -1,11 +1,11 @@
 """Feature patches of triangles and whether two are alike (lightmap-uv-clustering-cascade, section 3.1, eq. 1 to 4).
 
 A patch of size n holds a triangle's colours on a triangular lattice: sample (i, j, k), i + j + k = n - 1, lies at
-the barycentrics (i, j, k) / (n - 1), and is stored at ``j n - j (j - 1) / 2 + i``. On this lattice another order of the
+the barycentrics (i, j, k) / (n - 1), and is stored at `j n - j (j - 1) / 2 + i`. On this lattice another order of the
 vertices is another order of (i, j, k), so one stored patch serves all six. Order o is the permutation p =
-``ORDERS[o]``: vertex k of a triangle goes to vertex p[k] of the other.
+`ORDERS[o]`: vertex k of a triangle goes to vertex p[k] of the other.
 
-Sizes are 2, 3, 5, 9 and so on (``SIZES``), so that every lattice lies in all larger ones. A patch of one colour has
+Sizes are 2, 3, 5, 9 and so on (`SIZES`), so that every lattice lies in all larger ones. A patch of one colour has
 the smallest size, whatever the triangle's, since interpolating it gives that colour everywhere.
 
 Colours have 8 bits per channel, packed as r + 256 g + 65536 b. Every decision is made in integers, so that no result
@@ -19,7 +19,7 @@ depends on the device:
 
 The paper does not define |.| of a colour: here it is the mean of the three channels', so that Dist is in [0, 1].
 
-Read ``tests/reference/patches.py`` first: the same per triangle in float64 NumPy.
+Read `tests/reference/patches.py` first: the same per triangle in float64 NumPy.
 """
 
 import itertools
@@ -69,7 +69,7 @@ class Patch:
 
     Attributes:
         start: Its first sample in the array of all samples.
-        level: Level of its size, n = ``SIZES[level]`` = 2 ** level + 1.
+        level: Level of its size, n = `SIZES[level]` = 2 ** level + 1.
         low: Lowest level of each channel, packed.
         high: Highest level of each channel, packed.
         colour: Bin of the dominant colour, packed as a colour.
@@ -104,7 +104,7 @@ def channel(colour: int, c: int) -> int:
 
 @wp.func
 def _place(i: int, j: int, k: int, a: wp.int64, b: wp.int64, c: wp.int64, side: int) -> int:
-    """A sample's place along an axis of ``side`` texels, in 1/256 of a texel, clamped to the outermost centres."""
+    """A sample's place along an axis of `side` texels, in 1/256 of a texel, clamped to the outermost centres."""
     steps = wp.int64(i + j + k)
     last = wp.int64(side - 1) * wp.int64(65536) * steps
     at = wp.clamp(wp.int64(i) * a + wp.int64(j) * b + wp.int64(k) * c, wp.int64(0), last)
@@ -255,7 +255,7 @@ def _inverse(order: int) -> int:
 
 @wp.func
 def spread(samples: wp.array1d[int], small: Patch, i: int, j: int, level: int) -> wp.vec3i:
-    """``2 ** level`` times a patch's colour at (i, j) of the lattice of this level, its own or a higher one."""
+    """`2 ** level` times a patch's colour at (i, j) of the lattice of this level, its own or a higher one."""
     # One step of the small lattice is 2 ** shift steps of the other.
     shift = level - small.level
     size = size_of(small.level)
@@ -366,7 +366,7 @@ def sample(lightmap: np.ndarray, corner: np.ndarray, level: np.ndarray, device) 
         device: Where the arrays go.
 
     Returns:
-        The samples of all patches, int [sum of ``samples_of(SIZES[level])``]; Patch [F], without their dominant
+        The samples of all patches, int [sum of `samples_of(SIZES[level])`]; Patch [F], without their dominant
         colours; and uint8 [F], 1 where a patch reads a texel that is too bright.
 
     Raises:
@@ -394,8 +394,8 @@ def dominant(samples, patches, level: np.ndarray) -> None:
     A limited number of samples is sorted at once, so that sorting takes little memory.
 
     Args:
-        samples, patches: As of ``sample``; the latter's ``colour`` is written.
-        level: int32 [F], as passed to ``sample``.
+        samples, patches: As of `sample`; the latter's `colour` is written.
+        level: int32 [F], as passed to `sample`.
     """
     device = samples.device
     start = _starts(level)
@@ -420,11 +420,11 @@ def compare(samples, patches, member, representative) -> tuple[np.ndarray, np.nd
     """Finds the order with the least distance of each pair, the first of equals, and that distance (eq. 2 and 3).
 
     Args:
-        samples, patches: As of ``sample``.
+        samples, patches: As of `sample`.
         member, representative: int [N], numbers of patches.
 
     Returns:
-        int8 [N], o such that vertex k of the member goes to vertex ``ORDERS[o][k]`` of the representative; and
+        int8 [N], o such that vertex k of the member goes to vertex `ORDERS[o][k]` of the representative; and
         float64 [N], Dist, in [0, 1].
     """
     device, count = samples.device, member.shape[0]

@@ -1,10 +1,10 @@
 """Advection of smoke, d rho / dt + u . grad rho = 0, on a grid finer than that of the velocities
 (neural-six-way-lightmaps, section 5: 100^3 velocities, 400^3 densities).
 
-Read ``tests/reference/advection.py`` first: the same step in float64 NumPy, cell by cell.
+Read `tests/reference/advection.py` first: the same step in float64 NumPy, cell by cell.
 
 - Semi-Lagrangian: rho'(x) = rho(x_d), trilinear, at the departure point x_d = x - dt u(x - dt u(x) / 2), the midpoint
-  rule (second-order Runge-Kutta). Unconditionally stable, no new extrema, first order. A midpoint within ``REACH`` of
+  rule (second-order Runge-Kutta). Unconditionally stable, no new extrema, first order. A midpoint within `REACH` of
   the eight velocities around x is extrapolated from these.
 - MacCormack (Selle et al. 2008): with A a semi-Lagrangian step and A* the step back in time, rho' = A rho + (rho - A* A
   rho) / 2, clamped to the eight values that A interpolates. Second order where smooth.
@@ -79,7 +79,7 @@ _BRICK_RUNS = wp.constant(BRICK * BRICK * BRICK // BRICK_RUN)
 
 @functools.cache
 def fields_struct(stored: type) -> Any:
-    """Builds (once) the struct by which kernels take fields of ``wp.float32`` or ``wp.float16``."""
+    """Builds (once) the struct by which kernels take fields of `wp.float32` or `wp.float16`."""
 
     @wp.struct
     class FieldArrays:
@@ -106,13 +106,13 @@ class Fields:
 
 @functools.cache
 def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, hot: bool) -> wp.Kernel:
-    """Builds (once) a kernel over runs of ``RUN`` cells along x, with bricks over workers times a brick's runs.
+    """Builds (once) a kernel over runs of `RUN` cells along x, with bricks over workers times a brick's runs.
 
     Without solids it is half the code, and without temperatures it uses fewer registers.
 
     Args:
         correcting: Whether it is the second half of a MacCormack step; else it is a semi-Lagrangian step.
-        stored: ``wp.float32`` or ``wp.float16``.
+        stored: `wp.float32` or `wp.float16`.
         in_bricks: Whether only listed bricks are computed.
         solids: Whether there are solid cells.
         hot: Whether there are temperatures.
@@ -167,7 +167,7 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
 
     @wp.func
     def limited(field: wp.array1d[stored], at: FlatStencil, value: float) -> float:
-        """A value clamped to those that ``interpolate`` reads."""
+        """A value clamped to those that `interpolate` reads."""
         i00 = at.base
         i01 = at.base + at.step[1]
         i10 = at.base + at.step[0]
@@ -193,7 +193,7 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
         wall: wp.uint8,
     ):
         """Where a trace from x ends in the domain, whether it left through an open face, and whether the end is beside
-        a solid; ``wall`` is the mark of the cell that it starts in."""
+        a solid; `wall` is the mark of the cell that it starts in."""
         end = trace_back(box, u, around, f, x, v, dt)
         p = wp.vec3(end)
         left = bool(False)
@@ -360,9 +360,9 @@ def advect(
     """A semi-Lagrangian step, or the first half of a MacCormack step.
 
     Args:
-        box: The domain, see ``advection_places.make_box``.
+        box: The domain, see `advection_places.make_box`.
         velocity: vec3 [coarse cells], cells a step.
-        walls: uint8 [coarse cells] as ``advection_places.mark_walls`` makes it, or [0] without solids.
+        walls: uint8 [coarse cells] as `advection_places.mark_walls` makes it, or [0] without solids.
         fields: What is carried.
         out: Other arrays of the same shapes and types, set.
         dt: Steps.
@@ -383,5 +383,5 @@ def correct(
     decay: tuple[float, float] = (1.0, 1.0),
     bricks: Bricks = DENSE,
 ) -> None:
-    """The second half of a MacCormack step; ``predicted`` is the ``out`` of ``advect``, and this ``out`` is a third."""
+    """The second half of a MacCormack step; `predicted` is the `out` of `advect`, and this `out` is a third."""
     _launch(box, velocity, walls, fields, predicted, out, dt, decay, bricks)

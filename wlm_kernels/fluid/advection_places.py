@@ -1,12 +1,12 @@
-"""The geometry of advection: the grids, solids and faces that ``advection`` traces through, and the bricks of 8^3 cells
+"""The geometry of advection: the grids, solids and faces that `advection` traces through, and the bricks of 8^3 cells
 in which there is smoke.
 
-Read ``tests/reference/advection.py`` first: ``Domain`` there has the same grids, faces and solids in NumPy.
+Read `tests/reference/advection.py` first: `Domain` there has the same grids, faces and solids in NumPy.
 
-The fine grid (smoke) has ``refinement`` cells along each edge of a cell of the coarse grid (air). Solids are whole
+The fine grid (smoke) has `refinement` cells along each edge of a cell of the coarse grid (air). Solids are whole
 coarse cells. Each axis is periodic, or each of its two ends is open (clean air comes in) or closed.
 
-Bricks: a brick is busy if a value in it exceeds the threshold, and is listed if a brick within ``rings`` of it is busy.
+Bricks: a brick is busy if a value in it exceeds the threshold, and is listed if a brick within `rings` of it is busy.
 Bricks that aren't listed are 0 in every buffer. The error against the dense step is what lies below the threshold in
 bricks without a busy brick around them: at most the threshold for each cell and step, and none with a threshold of 0.
 """
@@ -95,8 +95,8 @@ class Bricks:
         threshold: The largest value of a brick that counts as empty.
         busy: int [B], 1 where a value above the threshold was written since the last list.
         active: int [B], 1 where listed.
-        listed: int [B], the numbers of the active bricks in any order; ``count`` int [1] of them.
-        retired: int [B], the bricks that were active in the list before; ``retired_count`` int [1] of them.
+        listed: int [B], the numbers of the active bricks in any order; `count` int [1] of them.
+        retired: int [B], the bricks that were active in the list before; `retired_count` int [1] of them.
     """
 
     rings: int
@@ -305,7 +305,7 @@ def wall_at(box: Box, walls: wp.array1d[wp.uint8], p: wp.vec3) -> wp.uint8:
 
 @wp.func
 def is_solid(box: Box, walls: wp.array1d[wp.uint8], cell: wp.vec3i) -> bool:
-    """Whether a fine cell is solid; never if ``walls`` is empty."""
+    """Whether a fine cell is solid; never if `walls` is empty."""
     if walls.shape[0] == 0:
         return False
     x = cell[0] // box.refinement
@@ -318,7 +318,7 @@ def is_solid(box: Box, walls: wp.array1d[wp.uint8], cell: wp.vec3i) -> bool:
 def trace_back(
     box: Box, u: wp.array1d[wp.vec3], around: TrilinearVelocity, f: wp.vec3, x: wp.vec3, v: wp.vec3, dt: float
 ) -> wp.vec3:
-    """The departure point x - dt u(x - dt v / 2); ``v`` is the velocity at x, where ``around`` has the fractions f."""
+    """The departure point x - dt u(x - dt v / 2); `v` is the velocity at x, where `around` has the fractions f."""
     fine = dt * float(box.refinement)
     half = f - 0.5 * dt * v
     least = wp.min(half[0], wp.min(half[1], half[2]))
@@ -352,7 +352,7 @@ def make_box(coarse: Sequence[int], refinement: int, ends: Sequence[tuple[int, i
     Args:
         coarse: Coarse cells along x, y and z.
         refinement: Fine cells along an edge of a coarse one, at least 1.
-        ends: For each axis the kind of its low and its high end: ``PERIODIC``, ``OPEN`` or ``CLOSED``.
+        ends: For each axis the kind of its low and its high end: `PERIODIC`, `OPEN` or `CLOSED`.
 
     Raises:
         ValueError: The refinement is below 1, one end alone of an axis is periodic, or there are 2^31 fine cells.
@@ -412,7 +412,7 @@ def rings_for(cells: float) -> int:
 
 
 def make_bricks(box: Box, rings: int, threshold: float, device: str) -> Bricks:
-    """Makes the bricks of a domain, all of them busy, none of them listed yet; arguments as for ``Bricks``."""
+    """Makes the bricks of a domain, all of them busy, none of them listed yet; arguments as for `Bricks`."""
     total = box.bricks[0] * box.bricks[1] * box.bricks[2]
     bricks = Bricks()
     # Across a periodic face lies perhaps a brick that is cut short, and behind it the next.

@@ -1,8 +1,8 @@
 """Smoke apart from its transport: sources, solids that come and go, and buoyancy, by which smoke moves the air.
 
-Read ``test_sources`` and ``test_buoyancy_is_of_means`` in ``tests/kernels/test_advection.py`` first: the same in NumPy.
+Read `test_sources` and `test_buoyancy_is_of_means` in `tests/kernels/test_advection.py` first: the same in NumPy.
 
-Fields and domains are those of ``advection`` and ``advection_places``. Stated behaviour:
+Fields and domains are those of `advection` and `advection_places`. Stated behaviour:
 
 ==============================  ======================================================================
 a source in a solid             gives nothing there
@@ -62,7 +62,7 @@ def _mark_busy(box: Box, p: wp.vec3i, value: float, bricks: Bricks):
 
 @functools.cache
 def source_kernels(stored: type) -> SourceKernels:
-    """Builds (once) the kernels for fields of ``wp.float32`` or ``wp.float16``."""
+    """Builds (once) the kernels for fields of `wp.float32` or `wp.float16`."""
     fields_type = fields_struct(stored)
 
     @wp.func
@@ -237,8 +237,8 @@ def add_source(
 
     Args:
         box: The domain.
-        walls: As for ``advection.advect``.
-        shape: ``SPHERE`` or ``BOX``.
+        walls: As for `advection.advect`.
+        shape: `SPHERE` or `BOX`.
         centre: In fine cells.
         size: Radii or half edges, fine cells, above 0.
         value: Density and temperature to add or to set.
@@ -261,9 +261,9 @@ def change_solids(box: Box, before: wp.array, after: wp.array, fields: Fields, b
 
     Args:
         box: The domain.
-        before, after: uint8 [coarse cells], from ``advection_places.mark_walls``.
+        before, after: uint8 [coarse cells], from `advection_places.mark_walls`.
         fields: Changed.
-        bricks: As for ``add_source``.
+        bricks: As for `add_source`.
     """
     _launch("cover", before.shape[0], [box, before, after, bricks], fields.arrays, fields)
 
@@ -281,7 +281,7 @@ def buoyancy(
 
     Args:
         box: The domain.
-        walls: As for ``advection.advect``.
+        walls: As for `advection.advect`.
         fields: The smoke.
         by_density, by_temperature: (3,), at density 1 and at temperature 1, coarse cells a step squared.
         force: vec3 [coarse cells], set; 0 in solids.
@@ -292,5 +292,5 @@ def buoyancy(
 
 
 def empty_retired(box: Box, bricks: Bricks, fields: Fields) -> None:
-    """Empties the bricks that ``advection_places.relist`` retired; needed in every buffer."""
+    """Empties the bricks that `advection_places.relist` retired; needed in every buffer."""
     _launch("empty", bricks.workers * int(_BRICK_CELLS), [box, bricks], fields.arrays, fields)

@@ -1,10 +1,10 @@
 """The lattice Boltzmann step: streaming and collision in one pass over two buffers.
 
-Read ``tests/reference/lattice.py`` first: the same step in float64 NumPy, cell by cell.
+Read `tests/reference/lattice.py` first: the same step in float64 NumPy, cell by cell.
 
 A cell pulls the populations that arrive, f_q(x, t + 1) = f*_q(x - c_q, t), and writes those that leave, f*. From a wall
 at rest that closes an axis it pulls what it sent there (half-way bounce-back). It knows no other boundary: nothing else
-reads the element that it would pull from beyond a face or out of a solid, and ``lattice_links`` writes there what comes
+reads the element that it would pull from beyond a face or out of a solid, and `lattice_links` writes there what comes
 back. So the kernel has no branch but the one that skips solid cells.
 
 Collision, with Kupershtokh's exact difference for a force F; the velocity of the fluid is u + F / (2 rho):
@@ -73,13 +73,13 @@ class Spec:
 
     Attributes:
         lattice: "D2Q9", "D3Q19" or "D3Q27".
-        operator: One of ``OPERATORS``.
+        operator: One of `OPERATORS`.
         storage: "float32" or "float16".
         eddies: Whether Smagorinsky's C is above 0.
         solids: Whether any cell may be solid.
-        force: One of ``FORCES``.
+        force: One of `FORCES`.
         walls: The axes of which both faces are walls at rest.
-        wide: Whether elements are indexed in 64 bits, see ``lattice_sets.memory_functions``.
+        wide: Whether elements are indexed in 64 bits, see `lattice_sets.memory_functions`.
     """
 
     lattice: str
@@ -144,7 +144,7 @@ def _relax(spec: Spec) -> Any:
 
     @wp.func
     def product(drho: float, u: wp.vec3, after: wp.vec3, diagonal: wp.vec3, off: wp.vec3) -> vec:
-        """Equilibrium of all orders at ``after``, plus a stress and the orders that follow from it at ``u``."""
+        """Equilibrium of all orders at `after`, plus a stress and the orders that follow from it at `u`."""
         unit = wp.static(scale)
         mass = unit * (1.0 + drho)
         trace = unit * diagonal
@@ -241,15 +241,15 @@ def step_kernel(spec: Spec) -> wp.Kernel:
     Args of the kernel:
         n: Cells along x, y and z.
         f: [Q, N], the populations that left every cell in the last step.
-        solid: uint8 [N], above 0 where a cell is solid; used if ``spec.solids``.
+        solid: uint8 [N], above 0 where a cell is solid; used if `spec.solids`.
         tau: Relaxation time, 1/2 + 3 nu.
-        eddy: ``eddy_factor``, used if ``spec.eddies``.
-        force: Force on a cell's fluid, used if ``spec.force`` is "uniform".
+        eddy: `eddy_factor`, used if `spec.eddies`.
+        force: Force on a cell's fluid, used if `spec.force` is "uniform".
         forces: vec3 [N], used if it is "field".
-        parity: Which of the two elements of ``clock`` is this step's.
+        parity: Which of the two elements of `clock` is this step's.
         clock: int [2], counts steps.
         trouble: int64 [1], lowered to the key of the first cell that went wrong.
-        sums: float64 [2], set to 0 for ``lattice_links``.
+        sums: float64 [2], set to 0 for `lattice_links`.
         out: [Q, N], the populations that leave every cell now.
     """
     memory, relax = memory_functions(spec.lattice, spec.storage, spec.walls, spec.wide), _relax(spec)

@@ -1,6 +1,6 @@
 """Velocity and density of the air on a lattice, its start, and the refill of cells that are no longer solid.
 
-Read ``tests/reference/lattice.py`` first: ``fields`` and ``equilibrium`` there are the same moments in float64 NumPy.
+Read `tests/reference/lattice.py` first: `fields` and `equilibrium` there are the same moments in float64 NumPy.
 """
 
 import functools
@@ -43,7 +43,7 @@ class FluidKernels:
 
 @functools.cache
 def fluid_kernels(lattice_name: str, storage: str, walls: tuple[bool, bool, bool]) -> FluidKernels:
-    """Builds (once) the kernels that don't run at every step; arguments as for ``memory_functions``."""
+    """Builds (once) the kernels that don't run at every step; arguments as for `memory_functions`."""
     memory = memory_functions(lattice_name, storage, walls)
     gather, moments, load, store = memory.gather, memory.moments, memory.load, memory.store
     stored = STORAGES[storage][0]

@@ -1,9 +1,9 @@
 """Boundary conditions of the lattice: what comes back from walls, and in through inlets and outlets.
 
-Read ``tests/reference/lattice.py`` first: ``stream`` there has the same conditions in float64 NumPy, link by link.
+Read `tests/reference/lattice.py` first: `stream` there has the same conditions in float64 NumPy, link by link.
 
 A link is a fluid cell a and a direction q in which a population comes to it from beyond a face of the domain or out of
-a solid. (Axes closed by walls at rest have none: the step of ``lattice`` does those.) The element that cell a pulls it
+a solid. (Axes closed by walls at rest have none: the step of `lattice` does those.) The element that cell a pulls it
 from, population q of the periodic image of the cell a - c_q, is read by a alone. So after every step the links' values
 are computed from the populations f* that have just left the cells, and then written into those elements: two passes,
 since the element of one link may hold what another reads.
@@ -88,7 +88,7 @@ class LinkKernels:
     """The kernels of one lattice and storage.
 
     Attributes:
-        values: First pass, over the links, rounded up to ``BLOCK``.
+        values: First pass, over the links, rounded up to `BLOCK`.
         write: Second pass, over the links.
         force: The force of the fluid on each body, over the links.
     """
@@ -105,7 +105,7 @@ def _beyond(x: int, n: int, bounded: int) -> bool:
 
 @functools.cache
 def link_kernels(lattice_name: str, storage: str, balance: bool) -> LinkKernels:
-    """Builds (once) the kernels of a lattice and a storage; ``balance``: whether there is an outlet."""
+    """Builds (once) the kernels of a lattice and a storage; `balance`: whether there is an outlet."""
     memory = memory_functions(lattice_name, storage, (False, False, False))
     load, store = memory.load, memory.store
     stored = STORAGES[storage][0]
@@ -301,7 +301,7 @@ def _find(
 
 
 def find_links(tables: Tables, n: wp.vec3i, bounded: wp.vec3i, solid: wp.array, bodies: Bodies, links: Links):
-    """Lists the links of solid cells, in any order, after those of faces; ``used`` stays as it is.
+    """Lists the links of solid cells, in any order, after those of faces; `used` stays as it is.
 
     Args:
         tables: The velocity set.
@@ -333,17 +333,17 @@ def apply(
     f: wp.array,
     sums: wp.array,
 ) -> None:
-    """Runs both passes over the links from element ``first`` on.
+    """Runs both passes over the links from element `first` on.
 
     Args:
-        kernels: Of the lattice and storage of ``f``.
+        kernels: Of the lattice and storage of `f`.
         tables: The velocity set.
         n: Cells along x, y and z.
         bounded: 1 for each axis that isn't periodic.
         first: 0, or the first link of a solid.
-        links: The links; ``value`` is changed.
+        links: The links; `value` is changed.
         solid: uint8 [N], or [0] if no cell is solid.
-        clock: int [2], see ``lattice.step_kernel``.
+        clock: int [2], see `lattice.step_kernel`.
         rise: Inlets are at their full velocity after 1 / rise steps.
         f: [Q, N], the populations that have just left the cells, changed.
         sums: float64 [2], 0 before: the mass that all links let in without the shift, and the weight of the outlets.

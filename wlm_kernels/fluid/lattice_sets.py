@@ -1,6 +1,6 @@
 """Shared parts of the lattice Boltzmann kernels: velocity sets, cells, moments, equilibria, storage.
 
-Read ``tests/reference/lattice.py`` first: the same velocities and equilibria in float64 NumPy.
+Read `tests/reference/lattice.py` first: the same velocities and equilibria in float64 NumPy.
 
 Cells are counted with the last axis fastest, as arrays [X, Y, Z] lie in memory: cell = (x Y + y) Z + z. Velocities
 come in pairs, q and its opposite side by side: 0 rests, 1 and 2 are opposite, 3 and 4 are, and so on.
@@ -34,6 +34,7 @@ HALF_SCALE = 32768.0
 
 STORAGES = {"float32": (wp.float32, 1.0), "float16": (wp.float16, HALF_SCALE)}
 
+
 @dataclass(frozen=True)
 class VelocitySet:
     """A set of velocities.
@@ -52,7 +53,7 @@ class VelocitySet:
 
 
 def _make(name: str, axes: int, weights: tuple[float, ...]) -> VelocitySet:
-    """A set of velocities of -1, 0 and 1; ``weights`` are by the squared length, and what has no weight is left out."""
+    """A set of velocities of -1, 0 and 1; `weights` are by the squared length, and what has no weight is left out."""
     signs = itertools.product(*[(-1, 0, 1) if a < axes else (0,) for a in range(3)])
     half = [c for c in signs if c > (0, 0, 0) and sum(map(abs, c)) < len(weights)]
     half.sort(key=lambda c: (sum(map(abs, c)), c))
@@ -70,7 +71,7 @@ LATTICES = {
 
 
 def lattice(name: str) -> VelocitySet:
-    """One of ``LATTICES``.
+    """One of `LATTICES`.
 
     Raises:
         ValueError: There is no such lattice.
@@ -153,7 +154,7 @@ def owned(n: wp.vec3i, bounded: wp.vec3i, walled: wp.vec3i, p: wp.vec3i) -> bool
 
 @wp.func
 def equilibrium(w: float, c: wp.vec3i, drho: float, u: wp.vec3) -> float:
-    """Second-order equilibrium less its weight, f_eq - w; ``drho`` is rho - 1.
+    """Second-order equilibrium less its weight, f_eq - w; `drho` is rho - 1.
 
     f_eq = w rho (1 + 3 c.u + 9/2 (c.u)^2 - 3/2 u.u)
     """
@@ -167,7 +168,7 @@ NARROW = 2**31 - 1
 
 @dataclass(frozen=True)
 class MemoryFunctions:
-    """``wp.func``s on populations in memory, of one lattice and storage.
+    """`wp.func`s on populations in memory, of one lattice and storage.
 
     Attributes:
         vec: vec of Q floats.
@@ -194,11 +195,11 @@ def memory_functions(
     """Builds (once) the functions of a lattice and a storage.
 
     Args:
-        lattice_name: One of ``LATTICES``.
-        storage: One of ``STORAGES``; scaled numbers are times its scale.
+        lattice_name: One of `LATTICES`.
+        storage: One of `STORAGES`; scaled numbers are times its scale.
         walls: The axes that walls at rest close.
         wide: Whether elements are indexed in 64 bits, which costs a sixth of a step's instructions; without, there may
-            be ``NARROW`` populations.
+            be `NARROW` populations.
 
     Raises:
         ValueError: There is no such lattice or storage.
@@ -241,7 +242,7 @@ def memory_functions(
         y = wp.vec3i(wp.where(p[1] == 0, n[1], p[1]) - 1, p[1], wp.where(p[1] == n[1] - 1, 0, p[1] + 1))
         z = wp.vec3i(wp.where(p[2] == 0, n[2], p[2]) - 1, p[2], wp.where(p[2] == n[2] - 1, 0, p[2] + 1))
         i = index_of(n, p)
-        # Warp's hash of a function leaves out what ``wp.static`` makes of a loop's variable: without these constants
+        # Warp's hash of a function leaves out what `wp.static` makes of a loop's variable: without these constants
         # of its own, a gather with other walls would be taken for this one, and loaded in its place.
         closed = wp.vec3i(wp.static(int(walls[0])), wp.static(int(walls[1])), wp.static(int(walls[2])))
         low = wp.cw_mul(

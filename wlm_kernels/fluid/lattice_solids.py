@@ -1,6 +1,6 @@
 """Solid bodies on a lattice: the cells that they cover and the velocity of their surfaces.
 
-Read ``test_sphere_voxels`` and ``test_mesh_voxels`` in ``tests/kernels/test_lattice.py`` first: the same in NumPy.
+Read `test_sphere_voxels` and `test_mesh_voxels` in `tests/kernels/test_lattice.py` first: the same in NumPy.
 
 An array of uint8 holds for each cell the number of its body, 1 to 255, or 0 for fluid. Cell centres lie at half
 integers, in units of a cell. Bodies are rigid: u(x) = velocity + spin x (x - centre).
@@ -107,9 +107,9 @@ def voxelise_mesh(solid, body: int, mesh: wp.Mesh, position=(0.0, 0.0, 0.0), rot
     Args:
         solid: uint8 [X, Y, Z], changed.
         body: The body's number, 1 to 255.
-        mesh: On the device of ``solid``, made with ``support_winding_number=True``.
+        mesh: On the device of `solid`, made with `support_winding_number=True`.
         position: In cells, of the mesh's origin.
-        rotation: ``wp.quat``, None for none.
+        rotation: `wp.quat`, None for none.
         scale: Cells a unit of the mesh.
     """
     n = wp.vec3i(*solid.shape)

@@ -3,7 +3,7 @@
 On CUDA gradients are added as 64-bit integers, since the result of integer addition does not depend on the order and
 one seed must give one result; on the CPU each lane (a range of samples, run by one thread) has its own float buffers.
 
-Read first: ``tests/reference/temporal.py``, ``train_features``, whose gradients by autograd these are.
+Read first: `tests/reference/temporal.py`, `train_features`, whose gradients by autograd these are.
 """
 
 import functools
@@ -20,7 +20,7 @@ __all__ = ["scatters"]
 
 @wp.func
 def corner_weights(first: int, second: int, f: float, block: int) -> wp.vec2:
-    """The linear weights of an axis's two cells; 0 for a cell outside ``block``."""
+    """The linear weights of an axis's two cells; 0 for a cell outside `block`."""
     a = wp.where(first // 4 == block, 1.0 - f, 0.0)
     b = wp.where(second // 4 == block, f, 0.0)
     return wp.vec2(a, b)
@@ -53,7 +53,7 @@ def scatters(device_kind: str) -> tuple[Any, Any, Any, Any]:
         device_kind: "cpu" or "cuda".
 
     Returns:
-        Three ``wp.func``s and the scalar type of the sums that they add to.
+        Three `wp.func`s and the scalar type of the sums that they add to.
     """
     add, scalar = _adders(device_kind)
 

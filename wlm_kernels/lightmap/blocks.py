@@ -1,15 +1,15 @@
 """Feature maps stored as BC7 mode 6 blocks: endpoints and weights, their exact levels, and their texels.
 
-A map of 4 channels is cut into blocks of 4x4 texels. A block holds two endpoints ``e0, e1`` in [0, 1]^4 and one
-weight in [0, 1] a texel; a texel is ``(1 - w) e0 + w e1`` (neural-dynamic-gi, eq. 7 and 8). BC7 mode 6 stores the
+A map of 4 channels is cut into blocks of 4x4 texels. A block holds two endpoints `e0, e1` in [0, 1]^4 and one
+weight in [0, 1] a texel; a texel is `(1 - w) e0 + w e1` (neural-dynamic-gi, eq. 7 and 8). BC7 mode 6 stores the
 endpoints with 7 bits a channel plus one lowest bit shared by the four channels, and the weights with 4 bits.
 
-``quantised=1`` evaluates the map on exactly those levels, so that what is trained is what the file decodes to; the
+`quantised=1` evaluates the map on exactly those levels, so that what is trained is what the file decodes to; the
 adjoint is straight-through: each rounding has derivative 1, and values outside [0, 1] keep their gradient, so that
-Adam can bring them back. ``wlm.ops.plain.bc7_texels`` is the same in a few lines of torch.
+Adam can bring them back. `wlm.ops.plain.bc7_texels` is the same in a few lines of torch.
 
-Arrays: endpoints ``[S, H/4, W/4, 2]`` of vec4, weights ``[S, H, W]``, where S counts slices (tiles, or tiles x
-times). Blocks of the file are ``[S, H/4, W/4, 2]`` of uint64, the low and the high half of 16 little-endian bytes.
+Arrays: endpoints `[S, H/4, W/4, 2]` of vec4, weights `[S, H, W]`, where S counts slices (tiles, or tiles x
+times). Blocks of the file are `[S, H/4, W/4, 2]` of uint64, the low and the high half of 16 little-endian bytes.
 """
 
 import warp as wp
@@ -210,13 +210,11 @@ def reconstruct(endpoints, weights, out, quantised: bool = False) -> None:
     wp.launch(_reconstruct, weights.shape, inputs=inputs, outputs=[out], device=weights.device)
 
 
-def reconstruct_backward(
-    endpoints, weights, grad_out, grad_endpoints, grad_weights, quantised: bool = False
-) -> None:
-    """The adjoint of ``reconstruct``, straight through clamps and roundings; the same bits at each run.
+def reconstruct_backward(endpoints, weights, grad_out, grad_endpoints, grad_weights, quantised: bool = False) -> None:
+    """The adjoint of `reconstruct`, straight through clamps and roundings; the same bits at each run.
 
     Args:
-        endpoints, weights, quantised: As for ``reconstruct``.
+        endpoints, weights, quantised: As for `reconstruct`.
         grad_out: vec4 [S, H, W].
         grad_endpoints: vec4 [S, H/4, W/4, 2], written.
         grad_weights: float [S, H, W], written.
@@ -227,7 +225,7 @@ def reconstruct_backward(
 
 
 def quantise(endpoints, weights, bytes_out, index_out) -> None:
-    """The integers that the file stores: the levels on which ``quantised=True`` evaluates.
+    """The integers that the file stores: the levels on which `quantised=True` evaluates.
 
     Args:
         endpoints: vec4 [S, H/4, W/4, 2].

@@ -1,11 +1,11 @@
 """Reading temporal lightmap tiles from their stored bytes: BC7 blocks, 8-bit planes and a small MLP.
 
-``exact_kernels`` evaluates one texel per thread, in the same order of operations as training. ``StripKernels`` is the
+`exact_kernels` evaluates one texel per thread, in the same order of operations as training. `StripKernels` is the
 runtime path: what depends on the time alone is computed once per frame (the two slices of F_uvt are mixed; F_ut and the
 encoded time pass the first layer for each column), and a thread decodes four texels, so that each weight is loaded once
 for four.
 
-Read first: ``wlm/lightmap/exact.py``, the same decode in NumPy.
+Read first: `wlm/lightmap/exact.py`, the same decode in NumPy.
 """
 
 import functools
@@ -127,11 +127,11 @@ def exact_kernels(temporal: bool, hidden: int, gelu: str) -> tuple[Any, Any]:
     Args:
         temporal: Whether the tiles have temporal maps.
         hidden: H, width of the hidden layers.
-        gelu: One of ``mlp.GELUS``.
+        gelu: One of `mlp.GELUS`.
 
     Returns:
-        Two kernels over (tiles, 128, 128). Their inputs are ``Stored``, hidden vecH [N, I + H + 2], output vec3
-        [N, H + 1], ``TimeState``, places int [N] (of each tile in ``TimeState``) and tiles int [n]. Their output is
+        Two kernels over (tiles, 128, 128). Their inputs are `Stored`, hidden vecH [N, I + H + 2], output vec3
+        [N, H + 1], `TimeState`, places int [N] (of each tile in `TimeState`) and tiles int [n]. Their output is
         [n, 128, 128]: linear radiance as vec3, or 8-bit colour as vec4ub.
     """
     inputs = TEMPORAL_INPUTS if temporal else STATIC_INPUTS
@@ -212,7 +212,7 @@ def _frame_volume(
 
 @dataclass(frozen=True)
 class StripKernels:
-    """The runtime path of one network shape; see ``decode``.
+    """The runtime path of one network shape; see `decode`.
 
     Attributes:
         hidden: H, width of the hidden layers.
@@ -247,7 +247,7 @@ class StripKernels:
             volume: vec4 [N, R, R], scratch.
             columns: float [N, H, 128], scratch.
             rows: vec2 [N, 128], scratch.
-            places: int [N], each tile's place in ``time``.
+            places: int [N], each tile's place in `time`.
             tiles: int [n], the tiles to decode. The scratch of all N is filled.
             out: uint32 [n, 128, 128], RGBA from the lowest byte.
         """
@@ -318,7 +318,7 @@ def strip_kernels(hidden: int, gelu: str) -> StripKernels:
 
     Args:
         hidden: H, width of the hidden layers.
-        gelu: One of ``mlp.GELUS``.
+        gelu: One of `mlp.GELUS`.
     """
     net = mlp.kernels(TEMPORAL_INPUTS, hidden, gelu)
     units, vec_hidden, act = net.hidden, net.vec_hidden, net.act

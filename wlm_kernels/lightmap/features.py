@@ -4,10 +4,10 @@ A tile is F_uv, F_uvt, F_ut, F_vt and an MLP (neural-dynamic-gi, eq. 5 and table
 order: F_uv 4, F_uvt 4, F_ut 2, F_vt 2, the encoded time 4; tiles without temporal maps use F_uv alone. Features v in
 [0, 1] enter as (v - 1/2) sqrt(12): mean 0 and variance 1 where v is uniform.
 
-``step`` trains with these, ``gather`` turns its sums into gradients, ``adjoint`` has the hand-written adjoints of
-sampling, ``decode`` reads tiles from their stored bytes.
+`step` trains with these, `gather` turns its sums into gradients, `adjoint` has the hand-written adjoints of
+sampling, `decode` reads tiles from their stored bytes.
 
-Read first: ``tests/reference/temporal.py``, ``train_features``.
+Read first: `tests/reference/temporal.py`, `train_features`.
 """
 
 import warp as wp
@@ -48,7 +48,7 @@ class Offsets:
 
 @wp.func
 def ste_byte(v: float, quantised: int) -> float:
-    """A plane's value, clamped or on its 8-bit level; its adjoint is straight-through, in ``scatter_plane``."""
+    """A plane's value, clamped or on its 8-bit level; its adjoint is straight-through, in `scatter_plane`."""
     c = wp.clamp(v, 0.0, 1.0)
     if quantised == 0:
         return c
@@ -138,7 +138,7 @@ def draw_state(batch: Batch, n: int, b: int, samples: int) -> wp.uint32:
 
 @wp.struct
 class Moment:
-    """The time of a sample: stored time k, or ``share`` of the way from it to the next."""
+    """The time of a sample: stored time k, or `share` of the way from it to the next."""
 
     k: int
     next: int

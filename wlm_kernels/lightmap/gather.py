@@ -1,6 +1,6 @@
-"""Turns the sums of ``step`` into gradients, and advances the schedule.
+"""Turns the sums of `step` into gradients, and advances the schedule.
 
-Read first: ``kernels/stepping.py`` in the tests, which reads these gradients and holds them to autograd's.
+Read first: `kernels/stepping.py` in the tests, which reads these gradients and holds them to autograd's.
 """
 
 import warp as wp
@@ -10,7 +10,7 @@ __all__ = ["gather_maps", "gather_net"]
 
 @wp.func
 def drain(partial: wp.array2d[float], i: int, clear: int) -> float:
-    """The sum of column i, which is cleared if ``clear`` isn't 0."""
+    """The sum of column i, which is cleared if `clear` isn't 0."""
     s = float(0.0)
     for p in range(partial.shape[0]):
         s += partial[p, i]
@@ -42,7 +42,7 @@ def _gather_maps_cuda(
     grad: wp.array1d[float],
 ):
     i = wp.tid()
-    grad[i] = float(acc[0, i]) * 9.094947017729282e-13  # steps of 2^-40, as ``adjoint`` adds them
+    grad[i] = float(acc[0, i]) * 9.094947017729282e-13  # steps of 2^-40, as `adjoint` adds them
     acc[0, i] = wp.int64(0)
     parameters[i] = wp.clamp(parameters[i], 0.0, 1.0)
 
@@ -78,10 +78,8 @@ def _gather_net(
         control[0] = control[0] + 1
 
 
-def gather_maps(
-    acc: wp.array, parameters: wp.array, grad: wp.array, base: int = 0, count: int | None = None
-) -> None:
-    """Turns the maps' sums that ``StepKernels.launch`` left into gradients, and clears them.
+def gather_maps(acc: wp.array, parameters: wp.array, grad: wp.array, base: int = 0, count: int | None = None) -> None:
+    """Turns the maps' sums that `StepKernels.launch` left into gradients, and clears them.
 
     Args:
         acc: [lanes, M], the sums; cleared.

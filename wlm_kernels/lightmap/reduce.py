@@ -1,6 +1,6 @@
-"""Sums over a CUDA block of samples, in native code: see ``native/block_sums.cuh``, and why there.
+"""Sums over a CUDA block of samples, in native code: see `native/block_sums.cuh`, and why there.
 
-Read first: ``tests/reference/temporal.py``, ``losses``, whose gradients by autograd these sums are.
+Read first: `tests/reference/temporal.py`, `losses`, whose gradients by autograd these sums are.
 """
 
 from typing import Any
@@ -30,11 +30,11 @@ def reload():
 
 
 def block_reduction(net: mlp.MlpKernels) -> Any:
-    """Builds the ``wp.func`` that sums the gradients of a network over a block of ``BLOCK`` samples, on CUDA.
+    """Builds the `wp.func` that sums the gradients of a network over a block of `BLOCK` samples, on CUDA.
 
-    Its arguments are, of each sample, the layers' inputs ``f``, ``h1``, ``h2``, the deltas behind them ``d1``, ``d2``,
-    ``d3`` and the loss ``value``; ``row``, the row of the outputs that the block fills; and the outputs, written:
-    ``partial`` [rows * (I + H + 2), H], ``partial_out`` [rows * (H + 1), 3] and ``loss`` [rows].
+    Its arguments are, of each sample, the layers' inputs `f`, `h1`, `h2`, the deltas behind them `d1`, `d2`,
+    `d3` and the loss `value`; `row`, the row of the outputs that the block fills; and the outputs, written:
+    `partial` [rows * (I + H + 2), H], `partial_out` [rows * (H + 1), 3] and `loss` [rows].
     """
     inputs, hidden = net.inputs, net.hidden
 

@@ -2,12 +2,12 @@
 
 It handles B random samples of each of N tiles (neural-dynamic-gi, section 3.3, 3.4 and 4): draws a valid texel and a
 time, samples F_uv, F_uvt, F_ut and F_vt, adds the uniform noise of eq. 6, centres the features, runs the network,
-computes the weighted squared error and sums the gradients. ``gather`` turns the sums into gradient arrays.
+computes the weighted squared error and sums the gradients. `gather` turns the sums into gradient arrays.
 
 The sums are in a fixed order or of integers, so that one seed gives one result on one device. A tile's samples depend
 on the seed, the step and its number alone, so that a tile fits to the same result in any batch.
 
-Read first: ``tests/reference/temporal.py``, ``train_features`` and ``losses``: the same loss in torch.
+Read first: `tests/reference/temporal.py`, `train_features` and `losses`: the same loss in torch.
 """
 
 import functools
@@ -45,7 +45,7 @@ NOISE = wp.constant(1.0 / 256.0)  # alpha of eq. 6: one step of 8 bits
 
 @dataclass(frozen=True)
 class StepKernels:
-    """The training step of one network shape on one kind of device; see ``launch``.
+    """The training step of one network shape on one kind of device; see `launch`.
 
     Attributes:
         inputs, hidden: I and H of the network.
@@ -86,11 +86,11 @@ class StepKernels:
 
         Args:
             maps: The parameters.
-            offsets: Of their gradients in ``acc``.
-            hidden: vecH [N, I + H + 2], see ``wlm_kernels.mlp``.
+            offsets: Of their gradients in `acc`.
+            hidden: vecH [N, I + H + 2], see `wlm_kernels.mlp`.
             output: vec3 [N, H + 1].
             batch: The training data.
-            samples: B; on CUDA a multiple of ``BLOCK``.
+            samples: B; on CUDA a multiple of `BLOCK`.
             acc: [lanes, M], gradient sums of the maps: int64 on CUDA (one lane), float on the CPU.
             partial: float [P, N, I + H + 2, H]: written on CUDA, one P per block; added to on the CPU, one P per lane.
             partial_out: float [P, N, H + 1, 3], likewise.

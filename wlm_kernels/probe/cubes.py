@@ -14,7 +14,7 @@ All are made looser by more than what float32 loses, so no list lacks a Gaussian
 Cubes at the border of the grid have no outer faces but go on for ever: a point outside takes the nearest cube's list,
 and that list is right for it too.
 
-The twin to read first: ``reach`` and ``nearest`` in ``tests/reference/gaussians.py``.
+The twin to read first: `reach` and `nearest` in `tests/reference/gaussians.py`.
 """
 
 import math
@@ -49,13 +49,13 @@ _BOX, _SPHERE, _EXACT = (wp.constant(TESTS.index(test)) for test in ("box", "sph
 
 @wp.struct
 class Cubes:
-    """A grid of cubes with a list of Gaussians each; cube (i, j, k) is number ``(i * counts[1] + j) * counts[2] + k``.
+    """A grid of cubes with a list of Gaussians each; cube (i, j, k) is number `(i * counts[1] + j) * counts[2] + k`.
 
     Attributes:
         low: Lowest corner of the grid.
         size: Side of a cube.
         counts: Cubes along each axis; C in all.
-        start: [C + 1], where each cube's list begins in ``item``; the last is the number of pairs.
+        start: [C + 1], where each cube's list begins in `item`; the last is the number of pairs.
         item: [pairs], numbers of Gaussians, rising within a list.
     """
 
@@ -103,7 +103,7 @@ def _place_margin(cubes: Cubes) -> float:
 
 @wp.func
 def span(cubes: Cubes, centre: wp.vec3, reach: wp.vec3):
-    """First and last cell, along each axis, of the cubes that meet the box of all within ``reach`` of ``centre``.
+    """First and last cell, along each axis, of the cubes that meet the box of all within `reach` of `centre`.
 
     All cells where these aren't numbers: what can't be told here is tested again at each point.
     """
@@ -302,7 +302,7 @@ def _find_starts(
     start: wp.array1d[int],
 ):
     key = wp.tid()
-    # It never answers the end that it is given; given one more it can answer ``count``, and still reads no further.
+    # It never answers the end that it is given; given one more it can answer `count`, and still reads no further.
     start[key] = wp.lower_bound(keys, 0, count + 1, key)
 
 
@@ -336,7 +336,7 @@ def build(shapes, low, high, size: float | None = None, *, test: str = "box") ->
         The lists, on the shapes' device.
 
     Raises:
-        ValueError: A wrong argument, or more than ``MOST_PAIRS`` cubes, or pairs to test; nothing of that size is
+        ValueError: A wrong argument, or more than `MOST_PAIRS` cubes, or pairs to test; nothing of that size is
             allocated before.
     """
     if test not in TESTS:
@@ -369,7 +369,7 @@ def build(shapes, low, high, size: float | None = None, *, test: str = "box") ->
     cubes.start = wp.empty(total + 1, dtype=int, device=device)
     sort_by_cube(keys, items, pairs, total, cubes.start)
     cubes.item = wp.empty(pairs, dtype=int, device=device)
-    if pairs:  # to ``copy`` a count of 0 is all
+    if pairs:  # to `copy` a count of 0 is all
         wp.copy(cubes.item, items, count=pairs)
     return cubes
 

@@ -1,10 +1,10 @@
 """Decoding points: the Gaussians' sum and the network in one launch (gaussian-probe-compression, eq. 5 to 7).
 
 On CUDA a block of 128 threads takes up to 64 points: the threads share out the Gaussians that each point's cube lists,
-the sums meet in shared memory, and the network runs on all points together (``native/layers.cuh``, then
-``native/decode.cuh``). On the CPU a thread takes one point.
+the sums meet in shared memory, and the network runs on all points together (`native/layers.cuh`, then
+`native/decode.cuh`). On the CPU a thread takes one point.
 
-The twin to read first: ``wlm/probe/exact.py``.
+The twin to read first: `wlm/probe/exact.py`.
 """
 
 import functools
@@ -40,9 +40,9 @@ class DecodeKernels:
         Args:
             rows: float [K, 10 + L].
             shapes: Shape [K], made of the rows with this cut.
-            cubes: ``cubes.Cubes`` of the shapes; points outside take the nearest cube's list.
+            cubes: `cubes.Cubes` of the shapes; points outside take the nearest cube's list.
             cut: How far a Gaussian reaches, in standard deviations.
-            net: float [P], see ``network``.
+            net: float [P], see `network`.
             gain: Factor of the network's outputs.
             x: vec3 [M], in the normalised frame.
             out: float [M, D], written.

@@ -1,11 +1,11 @@
 """The Gaussians' sum at any points and its gradients (gaussian-probe-compression, eq. 2 to 6, 11 and 12).
 
-``cubes`` says which Gaussians a point looks at; without it each looks at all, with the same result. ``backward`` gives
-the gradient of the rows, one Gaussian per thread over the points of the cubes in its reach, ``backward_points`` that of
+`cubes` says which Gaussians a point looks at; without it each looks at all, with the same result. `backward` gives
+the gradient of the rows, one Gaussian per thread over the points of the cubes in its reach, `backward_points` that of
 the points, one point per thread: nothing is added by atomics. What a Gaussian reaches is a constant to both. The twin
-in torch is ``wlm.ops.plain.gaussian_sum``.
+in torch is `wlm.ops.plain.gaussian_sum`.
 
-A training step over probes that stand still is quicker by ``step``.
+A training step over probes that stand still is quicker by `step`.
 """
 
 import functools
@@ -73,7 +73,7 @@ class _Kernels:
 
 @functools.cache
 def sum_kernels(latent: int) -> _Kernels:
-    """Builds (once) the kernels of ``sum`` and its adjoints for latents of length L."""
+    """Builds (once) the kernels of `sum` and its adjoints for latents of length L."""
     fn = functions(latent)
     vec_latent, vec_sums = fn.vec_latent, fn.vec_sums
     add, accumulate, chain, slope = fn.add, fn.accumulate, fn.chain, fn.slope
@@ -175,10 +175,10 @@ def _sphere(support: str) -> int:
 
 
 def shapes(rows, cut: float, support: str = "ellipsoid"):
-    """Builds the ``Shape`` of each row.
+    """Builds the `Shape` of each row.
 
     Args:
-        rows: float [K, 10 + L], see ``gaussians``.
+        rows: float [K, 10 + L], see `gaussians`.
         cut: How far a Gaussian reaches, in standard deviations.
         support: "ellipsoid": as far along each axis as it is long; "sphere": everywhere as far as along the longest
             (eq. 6).
@@ -199,7 +199,7 @@ def sum(rows, shapes, cubes, x, f, cut: float) -> None:
     Args:
         rows: float [K, 10 + L].
         shapes: Shape [K], made of the rows with this cut.
-        cubes: ``gaussian_cubes.Cubes`` of the shapes; None: every point looks at all Gaussians.
+        cubes: `gaussian_cubes.Cubes` of the shapes; None: every point looks at all Gaussians.
         x: vec3 [N]; one that is NaN is reached by none.
         f: float [L, N], written.
         cut: How far a Gaussian reaches, in standard deviations.
@@ -210,10 +210,10 @@ def sum(rows, shapes, cubes, x, f, cut: float) -> None:
 
 
 def backward(rows, shapes, cubes, x, grad_f, grad, cut: float) -> None:
-    """The gradient of ``sum`` by its rows.
+    """The gradient of `sum` by its rows.
 
     Args:
-        rows, shapes, cubes, x, cut: As for ``sum``.
+        rows, shapes, cubes, x, cut: As for `sum`.
         grad_f: float [L, N], the gradient of f.
         grad: float [K, 10 + L], written.
     """
@@ -230,10 +230,10 @@ def backward(rows, shapes, cubes, x, grad_f, grad, cut: float) -> None:
 
 
 def backward_points(rows, shapes, cubes, x, grad_f, grad, cut: float) -> None:
-    """The gradient of ``sum`` by its points.
+    """The gradient of `sum` by its points.
 
     Args:
-        rows, shapes, cubes, x, grad_f, cut: As for ``backward``.
+        rows, shapes, cubes, x, grad_f, cut: As for `backward`.
         grad: vec3 [N], written.
     """
     cubes = cubes or everything(rows.shape[0], rows.device)

@@ -5,11 +5,11 @@ S = diag(scale), R the rotation and W = S^-1 R^T,
 
     F(x) = sum_k F_k w_k(x),   w_k(x) = exp(-|u|^2 / 2),   u = W_k (x - centre_k),   over the k that reach x.
 
-``Shape`` is a row prepared for use. The backward pass sums, over the points, the symmetric a w u u^T and the vector
-a w u with a = dL/dF . F_k, and ``chain`` makes gradients of the row of them. No difference of large numbers is left in
+`Shape` is a row prepared for use. The backward pass sums, over the points, the symmetric a w u u^T and the vector
+a w u with a = dL/dF . F_k, and `chain` makes gradients of the row of them. No difference of large numbers is left in
 it. Where a Gaussian is a needle or a sheet, u itself is one: it is then computed in float64, for these Gaussians alone.
 
-The twin to read first: ``tests/reference/gaussians.py``.
+The twin to read first: `tests/reference/gaussians.py`.
 """
 
 import functools
@@ -71,7 +71,7 @@ def _rotation(q: wp.vec4d) -> wp.mat33d:
 
 @wp.func
 def shape_of(centre: wp.vec3, log_scale: wp.vec3, q: wp.vec4, cut: float, sphere: int) -> Shape:
-    """Builds the ``Shape`` of one row.
+    """Builds the `Shape` of one row.
 
     Args:
         centre, log_scale, q: The row's first ten numbers.
@@ -136,12 +136,12 @@ def touches(shape: Shape, middle: wp.vec3, half: wp.vec3) -> bool:
 
 @dataclass(frozen=True)
 class GaussianFunctions:
-    """``wp.func``s for latents of one length. ``rows`` is float [K, 10 + L], ``cut`` in standard deviations.
+    """`wp.func`s for latents of one length. `rows` is float [K, 10 + L], `cut` in standard deviations.
 
     Attributes:
         latent: L.
         vec_latent: vec of L floats.
-        vec_sums: vec of 9 + L floats, what ``accumulate`` adds up over points.
+        vec_sums: vec of 9 + L floats, what `accumulate` adds up over points.
         add: (f, shape, rows, k, x, cut) -> f with Gaussian k at x added.
         accumulate: (sums, shape, rows, k, x, grad_f, cut) -> sums with the point x added.
         slope: (shape, rows, k, x, grad_f, cut) -> what Gaussian k gives to the gradient of x.

@@ -5,10 +5,10 @@ input, then the biases; a row of the last layer is padded to a multiple of four 
 
 On CUDA a block of threads takes up to 64 probes through all layers in shared memory, each thread a piece of 4 probes by
 8 units at a time: fourteen small matrix products, for which one probe per thread would spill its registers. That is
-CUDA C++, in ``native/layers.cuh`` and ``native/network.cuh``. On the CPU a thread takes one probe. Parts of the
+CUDA C++, in `native/layers.cuh` and `native/network.cuh`. On the CPU a thread takes one probe. Parts of the
 gradient of the weights are written by block, to be added in a fixed order.
 
-The twin to read first: ``tests/reference/probe_network.py``.
+The twin to read first: `tests/reference/probe_network.py`.
 """
 
 import functools
@@ -47,7 +47,7 @@ def probes_at_once(latent: int, hidden: int, outputs: int) -> int:
 
 
 def layer_code(latent: int, hidden: int, outputs: int, probes: int) -> str:
-    """CUDA code for the forward pass of a block of ``THREADS`` threads: the beginning of a body, see its file."""
+    """CUDA code for the forward pass of a block of `THREADS` threads: the beginning of a body, see its file."""
     sizes = {"L": latent, "H": hidden, "D": outputs, "DP": padded(outputs)}
     return native_source(__package__, "layers", **sizes, P=probes, T=THREADS)
 
@@ -88,15 +88,15 @@ class NetworkKernels:
         """The loss, sum over live probes and numbers of weight * error^2, and its gradients.
 
         Args:
-            groups: ``step.Groups``.
+            groups: `step.Groups`.
             f: float [S, L, N], the Gaussians' sums in S parts.
             target: float [D, N].
             weight: float [D].
             net: float [P].
             grad_f: float [L, N], written.
-            partial: float [B, P], B = ``parts(N)``: written on CUDA, added to on the CPU.
+            partial: float [B, P], B = `parts(N)`: written on CUDA, added to on the CPU.
             loss: float [B], likewise.
-            base, count: On the CPU, the probes from ``base`` on; one lane has base 0.
+            base, count: On the CPU, the probes from `base` on; one lane has base 0.
         """
         probes = groups.x.shape[0]
         if self.device_kind == "cuda":
@@ -167,12 +167,12 @@ def network_kernels(latent: int, hidden: int, outputs: int, device_kind: str) ->
 
 @dataclass(frozen=True)
 class CpuNetwork:
-    """The network's ``wp.func``s of a CPU thread; vectors of inputs, of units and of padded outputs.
+    """The network's `wp.func`s of a CPU thread; vectors of inputs, of units and of padded outputs.
 
     Attributes:
         vec_in, vec_hidden, vec_out: The types.
         forward: (net, inputs) -> both hidden layers and the outputs.
-        hidden_row, output_row: (net, at) -> the numbers of the array from ``at`` on.
+        hidden_row, output_row: (net, at) -> the numbers of the array from `at` on.
     """
 
     vec_in: Any

@@ -2,7 +2,7 @@
 
 They are ours because a whole step has to be in one CUDA graph, which libraries that count steps in Python can't be.
 
-The twins to read first: torch's Adam and pytorch-optimizer's Adan, to which ``tests/kernels/test_probe_step.py`` holds
+The twins to read first: torch's Adam and pytorch-optimizer's Adan, to which `tests/kernels/test_probe_step.py` holds
 these.
 """
 
@@ -33,7 +33,7 @@ class Optimiser:
         rates: float [10 + L], of each channel of a Gaussian.
         net_rate: Of the network.
         bounds: float [2, 10 + L].
-        keep: 1 to keep the rows within ``bounds``.
+        keep: 1 to keep the rows within `bounds`.
         move: 0 leaves the Gaussians where they are.
         adan: 1 for Adan (Xie et al. 2024), 0 for Adam, for the Gaussians; the network's is always Adam.
     """
@@ -50,7 +50,7 @@ class Optimiser:
 
 @functools.cache
 def update_kernel(latent: int):
-    """Builds (once) the kernel of ``step.StepKernels.update`` for latents of length L."""
+    """Builds (once) the kernel of `step.StepKernels.update` for latents of length L."""
     fn = functions(latent)
     vec_sums, chain = fn.vec_sums, fn.chain
     channels = LATENT + latent

@@ -1,15 +1,15 @@
-"""A training step of the Gaussians (gaussian-probe-compression, section 3.2 and 3.3); ``network`` has the rest of it.
+"""A training step of the Gaussians (gaussian-probe-compression, section 3.2 and 3.3); `network` has the rest of it.
 
 Probes are sorted along a space-filling curve and taken in groups of 64 neighbours, each with a box. A step is five
-launches: which Gaussians meet which groups, as bit masks (``touch``); the Gaussians' sum at each probe (``features``);
-the network, forward and backward (``network``); the sums that the gradients of each Gaussian are made of
-(``collect``); and the optimisers (``update``). A launch runs over probes, or over Gaussians, and nothing is added up by
+launches: which Gaussians meet which groups, as bit masks (`touch`); the Gaussians' sum at each probe (`features`);
+the network, forward and backward (`network`); the sums that the gradients of each Gaussian are made of
+(`collect`); and the optimisers (`update`). A launch runs over probes, or over Gaussians, and nothing is added up by
 atomics: one seed gives one result, on either device.
 
 The masks take the place of the paper's sorted lists of cubes in training, where the probes stand still: there is
-nothing to count, scan and sort (``cubes`` does, for points at any place).
+nothing to count, scan and sort (`cubes` does, for points at any place).
 
-The twin to read first: ``tests/reference/gaussians.py``.
+The twin to read first: `tests/reference/gaussians.py`.
 """
 
 import functools
@@ -40,10 +40,10 @@ _COLLECTORS = 256  # threads that share a Gaussian's gradient on CUDA: the wides
 
 @wp.struct
 class Groups:
-    """Probes in groups; N is a multiple of ``GROUP``, G = N / GROUP.
+    """Probes in groups; N is a multiple of `GROUP`, G = N / GROUP.
 
     Attributes:
-        x: [N], positions in the normalised frame; those behind ``count`` only fill the last group.
+        x: [N], positions in the normalised frame; those behind `count` only fill the last group.
         middle, half: [G], the groups' boxes.
         count: Probes.
     """
@@ -62,7 +62,7 @@ class Groups:
 #endif
 """)
 def next_bit(bits: wp.uint32) -> int:
-    """Place of the lowest bit that is set; ``bits`` must not be 0."""
+    """Place of the lowest bit that is set; `bits` must not be 0."""
     ...
 
 
@@ -136,7 +136,7 @@ def _touch_cuda(
 
 
 def count_step(control) -> None:
-    """Adds one to ``control``, int [1], the number of the step."""
+    """Adds one to `control`, int [1], the number of the step."""
     wp.launch(_count_step, 1, outputs=[control], device=control.device)
 
 
@@ -144,7 +144,7 @@ def touch(groups, shapes, by_group, by_gaussian) -> None:
     """Finds which Gaussians may reach which groups.
 
     Args:
-        groups: ``Groups``.
+        groups: `Groups`.
         shapes: Shape [K].
         by_group: uint32 [G, ceil(K / 32)], written: bit b of word w is Gaussian 32 w + b.
         by_gaussian: uint32 [K, ceil(G / 32)], written.
@@ -181,7 +181,7 @@ class StepKernels:
             bounds: float [2, 10 + L], lowest and highest value of each channel.
             quantised: 1 to round to the levels of the file (eq. 13 and 14), 0 to use the rows as they are.
             levels: float [10 + L], each channel's highest code.
-            cut, sphere: As for ``gaussians.shape_of``.
+            cut, sphere: As for `gaussians.shape_of`.
             used: float [K, 10 + L], written.
             shapes: Shape [K], written.
         """
@@ -198,8 +198,8 @@ class StepKernels:
 
         Args:
             groups, shapes, used, by_group, cut: As above.
-            f: float [S, L, N], written: S parts of the sum, S = ``SPLITS`` on CUDA and 1 on the CPU.
-            base, count: On the CPU, the probes from ``base`` on.
+            f: float [S, L, N], written: S parts of the sum, S = `SPLITS` on CUDA and 1 on the CPU.
+            base, count: On the CPU, the probes from `base` on.
         """
         probes = groups.x.shape[0]
         dims = (probes // GROUP, SPLITS, GROUP) if self.device_kind == "cuda" else count or probes
@@ -217,9 +217,9 @@ class StepKernels:
 
         Args:
             groups, shapes, used, by_gaussian, cut: As above.
-            grad_f: float [L, N], the gradient of the sum; 0 behind ``groups.count``.
+            grad_f: float [L, N], the gradient of the sum; 0 behind `groups.count`.
             sums: float [K, 9 + L], written.
-            base, count: On the CPU, the Gaussians from ``base`` on.
+            base, count: On the CPU, the Gaussians from `base` on.
         """
         gaussians = used.shape[0]
         dims = (gaussians, _COLLECTORS) if self.device_kind == "cuda" else count or gaussians
@@ -236,11 +236,11 @@ class StepKernels:
         """One step of Adan for the Gaussians and of Adam for the network.
 
         Args:
-            optimiser: ``optimiser.Optimiser``.
+            optimiser: `optimiser.Optimiser`.
             rows: float [K, 10 + L], updated.
             used: float [K, 10 + L], what the gradients were taken at.
             shapes: Shape [K].
-            sums: float [K, 9 + L], of ``collect``.
+            sums: float [K, 9 + L], of `collect`.
             moments: float [4, K, 10 + L], updated.
             net: float [P], updated.
             net_moments: float [2, P], updated.
@@ -417,6 +417,7 @@ def step_kernels(latent: int, device_kind: str) -> StepKernels:
 
 def _block_sum(vec_sums, numbers: int):
     """The sum of a vector over a CUDA block, in a fixed order, into row k of an array."""
+
     @wp.func_native(native_source(__package__, "block_sum", N=numbers, WARPS=_COLLECTORS // 32))
     def block_sum(v: vec_sums, k: int, out: wp.array2d[float]): ...
 

@@ -1,15 +1,15 @@
 """Nested grids of blocks round a viewer: writing blocks into their slots, and reading the light at any point.
 
-A block of level l is the cell ``[b s, (b + 1) s)`` of a grid of cubes of side s_l, named by its integer coordinates b;
-its D numbers stand for its centre. Level l keeps the window of ``side`` blocks along each axis that starts at base_l.
-The slot of a block is its coordinates modulo ``side``, so that a window that moves by one block changes one slab of
+A block of level l is the cell `[b s, (b + 1) s)` of a grid of cubes of side s_l, named by its integer coordinates b;
+its D numbers stand for its centre. Level l keeps the window of `side` blocks along each axis that starts at base_l.
+The slot of a block is its coordinates modulo `side`, so that a window that moves by one block changes one slab of
 slots (gaussian-probe-compression, section 3.4). Each slot says which block it holds; a block is there if it lies in
 its level's window and its slot holds it.
 
 Arrays: values float [L * side^3, D] and held vec3i [L * side^3], by slot; bases vec3i [L]; views vec4 [L], where the
-points' origin lies in the grid, ``origin / s - (base + side / 2 + 1/2)``, and 1 / s. None has a gradient.
+points' origin lies in the grid, `origin / s - (base + side / 2 + 1/2)`, and 1 / s. None has a gradient.
 
-The twin to read first: ``tests/reference/volume.py``.
+The twin to read first: `tests/reference/volume.py`.
 """
 
 import warp as wp
@@ -178,7 +178,7 @@ def scatter(slots, blocks, source, values, held) -> None:
 
 
 def unscroll(values, held, bases, side: int, out, valid) -> None:
-    """Puts the slots into the windows' own order: row ``((l * side + x) * side + y) * side + z`` is base_l + (x, y, z).
+    """Puts the slots into the windows' own order: row `((l * side + x) * side + y) * side + z` is base_l + (x, y, z).
 
     Args:
         values: float [L * side^3, D].
@@ -206,7 +206,7 @@ def read(values, held, bases, views, side: int, points, out, answered, weight) -
         bases: vec3i [L].
         views: vec4 [L].
         side: Blocks along an axis of a window, even.
-        points: vec3 [M], relative to the origin of ``views``. One that is NaN or far out is covered by nothing.
+        points: vec3 [M], relative to the origin of `views`. One that is NaN or far out is covered by nothing.
         out: float [M, D]; 0 where nothing covers the point.
         answered: int [M], the level with the largest share, -1 where none has any.
         weight: float [M], how much of the light was found at any level, 0 to 1.

@@ -1,6 +1,6 @@
 """Edge functions of triangles in homogeneous coordinates, and their exact signs.
 
-``wlm_kernels.raster.rasterize`` defines them. Read ``tests/reference/raster.py`` first: coverage in Python's integers.
+`wlm_kernels.raster.rasterize` defines them. Read `tests/reference/raster.py` first: coverage in Python's integers.
 """
 
 import warp as wp
@@ -93,7 +93,7 @@ class Edges:
 
     Attributes:
         x, y, c: Coefficients; component i belongs to the edge opposite corner i.
-        limit: Bound of the rounding error; set by ``edges_of``.
+        limit: Bound of the rounding error; set by `edges_of`.
         sign: Sign of the determinant of the corners; 0: covers nothing.
     """
 
@@ -125,7 +125,7 @@ def corners_of(position: wp.array2d[float], triangle: wp.array2d[int], t: int) -
 
 @wp.func
 def has_corners(triangle: wp.array2d[int], t: int, count: int) -> bool:
-    """Whether the numbers of a triangle's corners are from 0 to ``count`` - 1."""
+    """Whether the numbers of a triangle's corners are from 0 to `count` - 1."""
     i = triangle[t, 0]
     j = triangle[t, 1]
     k = triangle[t, 2]

@@ -1,8 +1,8 @@
 """Interpolation of attributes at each pixel's surface point, and backward passes to attributes and positions.
 
-``wlm_kernels.raster.rasterize`` defines barycentrics. Visibility is a constant to all gradients.
+`wlm_kernels.raster.rasterize` defines barycentrics. Visibility is a constant to all gradients.
 
-Read ``wlm/ops/plain.py`` first (``corner_weights``): barycentrics in torch, differentiated by autograd.
+Read `wlm/ops/plain.py` first (`corner_weights`): barycentrics in torch, differentiated by autograd.
 """
 
 import warp as wp
@@ -19,7 +19,7 @@ _ONE = wp.constant(wp.float64(1.0))
 
 @wp.func
 def _readable(triangle: wp.array2d[int], t: int, count: int) -> bool:
-    """Whether there is such a triangle, with corners from 0 to ``count`` - 1."""
+    """Whether there is such a triangle, with corners from 0 to `count` - 1."""
     if t < 0 or t >= triangle.shape[0]:
         return False
     return has_corners(triangle, t, count)
@@ -138,7 +138,7 @@ def rasterize_backward(position, triangle, visible, grad_barycentric, grad, spac
         visible: int [H, W], the visible triangle of each pixel.
         grad_barycentric: vec2 [H, W].
         grad: Like position; added to.
-        space: As for ``Rasterizer``.
+        space: As for `Rasterizer`.
     """
     check_position(position, space)
     inputs = [position, triangle, frame(*visible.shape, space), visible, grad_barycentric]
@@ -152,7 +152,7 @@ def interpolate(attribute, triangle, visible, barycentric, out) -> None:
 
     Args:
         attribute: float [V, C].
-        triangle: int [F, 3], rows of ``attribute``; they need not be the numbers that were drawn with.
+        triangle: int [F, 3], rows of `attribute`; they need not be the numbers that were drawn with.
         visible: int [H, W], the visible triangle of each pixel.
         barycentric: vec2 [H, W], weights of its corners 0 and 1.
         out: float [H, W, C], written.
@@ -162,12 +162,12 @@ def interpolate(attribute, triangle, visible, barycentric, out) -> None:
 
 
 def interpolate_backward(attribute, triangle, visible, barycentric, grad_out, grad_attribute, grad_barycentric) -> None:
-    """Backward pass of ``interpolate``.
+    """Backward pass of `interpolate`.
 
-    On CUDA pixels are added to ``grad_attribute`` in any order, so that the last bits change from run to run.
+    On CUDA pixels are added to `grad_attribute` in any order, so that the last bits change from run to run.
 
     Args:
-        attribute, triangle, visible, barycentric: As for ``interpolate``.
+        attribute, triangle, visible, barycentric: As for `interpolate`.
         grad_out: float [H, W, C].
         grad_attribute: float [V, C], added to; of shape [0, 0]: not computed.
         grad_barycentric: vec2 [H, W], written; of shape [0, 0]: not computed.

@@ -18,8 +18,8 @@ space, glTF's, v points down, the centre is u = (i + 1/2) / W, v = (j + 1/2) / H
 
 A triangle covers nothing if a corner isn't finite or doesn't exist, or if it has no area.
 
-Edge functions are in ``edges``; interpolation and backward passes in ``gradient``. Read ``wlm/ops/plain.py`` first
-(``rasterize``): the same by solving for the corners' weights at each pixel.
+Edge functions are in `edges`; interpolation and backward passes in `gradient`. Read `wlm/ops/plain.py` first
+(`rasterize`): the same by solving for the corners' weights at each pixel.
 """
 
 import math
@@ -151,7 +151,7 @@ def _draw_small(
 ):
     """One triangle per thread: draws small ones and queues the others.
 
-    ``queued`` counts triangles in multiples of ``unit`` and tiles below that, in one atomic addition, so that the
+    `queued` counts triangles in multiples of `unit` and tiles below that, in one atomic addition, so that the
     queue's starts rise.
     """
     t = wp.tid()
@@ -289,21 +289,21 @@ class Raster:
 
 
 class Rasterizer:
-    """Draws the same triangles many times. Buffers are allocated once: ``run`` may be captured in a CUDA graph.
+    """Draws the same triangles many times. Buffers are allocated once: `run` may be captured in a CUDA graph.
 
     Beside the result it holds 8 bytes per pixel and 12 per triangle: tiles of triangles are counted, not stored.
 
     Args:
         triangle: int [F, 3], numbers of corners.
-        height, width: Size of the image, 1 to ``MOST_PIXELS``.
+        height, width: Size of the image, 1 to `MOST_PIXELS`.
         space: "clip" or "uv", see the module.
         cull: Whether to leave out clockwise triangles: on the screen in clip space, in a frame with v up in UV space.
-        derivative, coverage: Whether to compute these of ``Raster``.
+        derivative, coverage: Whether to compute these of `Raster`.
         split: Most pixels in the box of a triangle that one thread draws; None: 64 on CUDA, no limit on the CPU.
-        empty: Allocates a buffer, ``empty(shape, dtype=...)`` on the triangles' device; default Warp's.
+        empty: Allocates a buffer, `empty(shape, dtype=...)` on the triangles' device; default Warp's.
 
     Attributes:
-        raster: ``Raster``, what ``run`` fills.
+        raster: `Raster`, what `run` fills.
 
     Raises:
         ValueError: A wrong argument, or so many triangles and pixels that their tiles can't be counted.
@@ -362,10 +362,10 @@ class Rasterizer:
             position: float [V, 4], clip coordinates x, y, z, w; or in UV space float [V, 2], u and v.
 
         Returns:
-            ``raster``, overwritten by the next run.
+            `raster`, overwritten by the next run.
 
         Raises:
-            ValueError: ``position`` has a wrong shape for the space.
+            ValueError: `position` has a wrong shape for the space.
         """
         check_position(position, self._space)
         device, count = self._triangle.device, self._triangle.shape[0]

@@ -11,10 +11,10 @@ depends on the boundary:
 Coordinates are float32, but weights are computed in float64: at 4,096 texels float32 would leave them 12 bits. A
 coordinate that is NaN, or infinite and not clamped, reads NaN; it has no gradient and gives the texels none.
 
-``axis_at``, ``read``, ``read_slope`` and ``add`` serve other kernels that read textures; one ``Axis`` for u and one for
+`axis_at`, `read`, `read_slope` and `add` serve other kernels that read textures; one `Axis` for u and one for
 v serve all channels, forward and backward.
 
-Read ``wlm/ops/plain.py`` first (``texture``): the same by torch's ``grid_sample``.
+Read `wlm/ops/plain.py` first (`texture`): the same by torch's `grid_sample`.
 """
 
 import warp as wp
@@ -49,8 +49,8 @@ class Axis:
 
     Attributes:
         low, high: The texels on its two sides, equal at a border; always in the texture.
-        weight: Weight of ``high``, in [0, 1]; ``low`` has the rest. NaN: the coordinate reads NaN.
-        slope: Derivative of ``weight`` by the coordinate.
+        weight: Weight of `high`, in [0, 1]; `low` has the rest. NaN: the coordinate reads NaN.
+        slope: Derivative of `weight` by the coordinate.
     """
 
     low: int
@@ -84,7 +84,7 @@ def axis_at(x: float, size: int, filter: int, boundary: int) -> Axis:
     Args:
         x: u or v.
         size: Texels along the axis, at least 1.
-        filter, boundary: Numbers by ``codes``.
+        filter, boundary: Numbers by `codes`.
     """
     out = Axis()
     n = wp.float64(size)
@@ -152,7 +152,7 @@ def read_slope(texture: wp.array3d[float], x: Axis, y: Axis, c: int) -> wp.vec2:
 
 @wp.func
 def add(grad: wp.array3d[float], x: Axis, y: Axis, c: int, g: float):
-    """Adds the gradient of a value of ``read`` to the gradients of its texels."""
+    """Adds the gradient of a value of `read` to the gradients of its texels."""
     if wp.isnan(x.weight) or wp.isnan(y.weight):
         return
     top = (1.0 - y.weight) * g
@@ -242,7 +242,7 @@ def sample(texture, uv, out, *, filter: str = "linear", boundary: str = "clamp")
         texture: float [H, W, C].
         uv: vec2 [N].
         out: float [N, C], written.
-        filter, boundary: As for ``codes``.
+        filter, boundary: As for `codes`.
     """
     _check(texture)
     inputs = [texture, uv, *codes(filter, boundary)]
@@ -252,12 +252,12 @@ def sample(texture, uv, out, *, filter: str = "linear", boundary: str = "clamp")
 def sample_backward(
     texture, uv, grad_out, grad_texture, grad_uv, *, filter: str = "linear", boundary: str = "clamp"
 ) -> None:
-    """Backward pass of ``sample``. The gradient of uv is the slope between its texels, 0 at a clamped border.
+    """Backward pass of `sample`. The gradient of uv is the slope between its texels, 0 at a clamped border.
 
-    On CUDA samples are added to ``grad_texture`` in any order, so that the last bits change from run to run.
+    On CUDA samples are added to `grad_texture` in any order, so that the last bits change from run to run.
 
     Args:
-        texture, uv, filter, boundary: As for ``sample``.
+        texture, uv, filter, boundary: As for `sample`.
         grad_out: float [N, C].
         grad_texture: float [H, W, C], added to; of shape [0, 0, 0]: not computed.
         grad_uv: vec2 [N], written; of shape [0]: not computed.

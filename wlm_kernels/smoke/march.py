@@ -1,15 +1,15 @@
 """What every march through smoke shares: the medium, cameras, rays and their steps, samples, the phase function.
 
-All is in voxels: the grid ``[X, Y, Z]`` fills the box from 0 to (X, Y, Z), the centre of voxel i is at i + 1/2, and
+All is in voxels: the grid `[X, Y, Z]` fills the box from 0 to (X, Y, Z), the centre of voxel i is at i + 1/2, and
 between centres the density is trilinear, with zero outside the grid; so there is smoke up to half a voxel beyond the
-box. Extinction is ``extinction * density`` per voxel. A step is taken as of one density, that at its sample, and is
+box. Extinction is `extinction * density` per voxel. A step is taken as of one density, that at its sample, and is
 integrated exactly: 1 - exp(-sigma h), not sigma h. A density below zero or NaN isn't looked for; the caller keeps them
 out.
 
 A light is a direction towards it, of irradiance 4 pi, so that an isotropic phase function is 1 and not 1 / (4 pi).
-``march_guide``, ``march_coarse``, ``march_six`` and ``march_motion`` are the marches themselves; none has a gradient,
-but ``single_scatter`` has.
-Read first: ``tests/reference/marching.py``, the same in float64 NumPy, with nothing shared.
+`march_guide`, `march_coarse`, `march_six` and `march_motion` are the marches themselves; none has a gradient,
+but `single_scatter` has.
+Read first: `tests/reference/marching.py`, the same in float64 NumPy, with nothing shared.
 """
 
 import functools
@@ -72,7 +72,7 @@ class Medium:
         extinction: Per voxel, of density 1.
         temperature: As the density, of its shape; None: nothing emits.
         emission: Light given off per voxel of way where the temperature is 1.
-        empty: Makes buffers, ``empty(shape, dtype)`` on the density's device; None: in Warp's own memory.
+        empty: Makes buffers, `empty(shape, dtype)` on the density's device; None: in Warp's own memory.
     """
 
     density: wp.array
@@ -97,9 +97,9 @@ class Medium:
 class View:
     """A camera, in voxels. Row 0 is the top row; a pixel is seen at its centre.
 
-    ``pitch`` is a pixel's size: in voxels where the view is orthographic, at distance 1 where it is in perspective.
-    ``origin`` is the image's centre in the camera's plane, or the eye; nothing behind it is seen. ``voxel`` is a
-    voxel's edge in the unit of depths, which are measured from ``moved`` voxels behind the origin.
+    `pitch` is a pixel's size: in voxels where the view is orthographic, at distance 1 where it is in perspective.
+    `origin` is the image's centre in the camera's plane, or the eye; nothing behind it is seen. `voxel` is a
+    voxel's edge in the unit of depths, which are measured from `moved` voxels behind the origin.
     """
 
     origin: wp.vec3
@@ -116,7 +116,7 @@ class View:
 
 @wp.struct
 class MarchParameters:
-    """``March`` as kernels take it. Its ``spacing`` and ``light_step`` become a lattice before a kernel runs."""
+    """`March` as kernels take it. Its `spacing` and `light_step` become a lattice before a kernel runs."""
 
     step: float
     jitter: float
@@ -128,7 +128,7 @@ class MarchParameters:
 
 @wp.struct
 class Ray:
-    """A pixel's ray, and equal steps along it, of which the first begins ``first`` from its origin."""
+    """A pixel's ray, and equal steps along it, of which the first begins `first` from its origin."""
 
     origin: wp.vec3
     direction: wp.vec3
@@ -176,7 +176,7 @@ def size_of(density: wp.array3d[Any]) -> wp.vec3:
 
 @wp.func
 def steps_along(size: wp.vec3, origin: wp.vec3, direction: wp.vec3, step: float) -> Ray:
-    """A ray with steps no longer than ``step`` through all of the smoke before the origin; none where it is missed."""
+    """A ray with steps no longer than `step` through all of the smoke before the origin; none where it is missed."""
     r = Ray()
     r.origin = origin
     r.direction = direction
@@ -197,13 +197,13 @@ def marched_ray(view: View, row: int, column: int, size: wp.vec3, step: float) -
 
 @wp.func
 def point_on(r: Ray, n: int, offset: float) -> wp.vec3:
-    """Where the n-th step's sample is; ``offset`` is 1/2 in the step's middle."""
+    """Where the n-th step's sample is; `offset` is 1/2 in the step's middle."""
     return r.origin + (r.first + (float(n) + offset) * r.length) * r.direction
 
 
 @wp.func
 def density_at(density: wp.array3d[Any], p: wp.vec3) -> float:
-    """Trilinear, zero outside; ``p`` is no farther out than half a voxel and rounding."""
+    """Trilinear, zero outside; `p` is no farther out than half a voxel and rounding."""
     x = p[0] - 0.5
     y = p[1] - 0.5
     z = p[2] - 0.5
@@ -238,7 +238,7 @@ def density_at(density: wp.array3d[Any], p: wp.vec3) -> float:
 
 @wp.func
 def sample(density: wp.array3d[Any], bricks: wp.array3d[wp.uint8], p: wp.vec3) -> float:
-    """``density_at``, which looks no further where the brick is empty: the same number."""
+    """`density_at`, which looks no further where the brick is empty: the same number."""
     i = wp.clamp(int(p[0]) // BRICK, 0, bricks.shape[0] - 1)
     j = wp.clamp(int(p[1]) // BRICK, 0, bricks.shape[1] - 1)
     k = wp.clamp(int(p[2]) // BRICK, 0, bricks.shape[2] - 1)
@@ -249,7 +249,7 @@ def sample(density: wp.array3d[Any], bricks: wp.array3d[wp.uint8], p: wp.vec3) -
 
 @wp.func
 def sample(density: wp.array3d[Any], no_bricks: int, p: wp.vec3) -> float:  # noqa: F811, Warp overloads by type
-    """``density_at``: of ``NO_BRICKS``."""
+    """`density_at`: of `NO_BRICKS`."""
     return density_at(density, p)
 
 
@@ -263,7 +263,7 @@ def absorbed(x: float) -> float:
 
 @wp.func
 def phase(g: float, cosine: float) -> float:
-    """Henyey-Greenstein phase function times 4 pi; ``cosine`` is 1 where the light goes straight on."""
+    """Henyey-Greenstein phase function times 4 pi; `cosine` is 1 where the light goes straight on."""
     d = 1.0 + g * g - 2.0 * g * cosine
     return (1.0 - g * g) / (d * wp.sqrt(d))
 
@@ -272,7 +272,7 @@ def phase(g: float, cosine: float) -> float:
 def optical_depth(
     density: wp.array3d[Any], bricks: Any, p: wp.vec3, toward: wp.vec3, extinction: float, step: float
 ) -> float:
-    """From p out of the smoke, in equal steps no longer than ``step``, each sampled at its middle (eq. 3)."""
+    """From p out of the smoke, in equal steps no longer than `step`, each sampled at its middle (eq. 3)."""
     r = steps_along(size_of(density), p, toward, step)
     tau = float(0.0)
     for n in range(r.count):
@@ -298,7 +298,7 @@ def nodes_along(shape: Sequence[int], step: float) -> tuple[int, ...]:
 
 @functools.cache
 def occupied_kernel(dtype: Any) -> wp.Kernel:
-    """Builds (once) the kernel for densities of a type, ``wp.float32`` or ``wp.float16``."""
+    """Builds (once) the kernel for densities of a type, `wp.float32` or `wp.float16`."""
 
     @wp.kernel(module="unique", module_options=_OPTIONS)
     def occupied(
@@ -345,7 +345,7 @@ def make_view(
     voxel: float = 1.0,
     moved: float = 0.0,
 ) -> View:
-    """Makes a ``View``; the three directions are orthogonal and of length 1."""
+    """Makes a `View`; the three directions are orthogonal and of length 1."""
     view = View()
     view.origin, view.right, view.up, view.forward = (wp.vec3(*map(float, v)) for v in (origin, right, up, forward))
     view.pitch, view.width, view.height, view.perspective = float(pitch), width, height, int(perspective)

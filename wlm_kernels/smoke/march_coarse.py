@@ -12,7 +12,7 @@ ray's smoke wherever it is scattered: -T ln T. Both are exact, whatever the step
 
 Samples of neighbouring pixels are shifted by interleaved gradient noise (Jimenez 2014), whose sum over a few pixels
 varies less than that of random numbers: a filter over the image, a network for one, leaves less of it.
-Read first: ``lit`` of ``tests/reference/marching.py``, one such light with nothing shared.
+Read first: `lit` of `tests/reference/marching.py`, one such light with nothing shared.
 """
 
 import functools
@@ -83,7 +83,7 @@ def _noise(row: int, column: int, seed: int) -> float:
 
 @wp.func
 def _in_plane(nodes: wp.array3d[wp.vec4], i: int, j: int, k: int, fx: float, fy: float) -> wp.vec4:
-    """Bilinear between the nodes of plane ``k``."""
+    """Bilinear between the nodes of plane `k`."""
     a = wp.lerp(nodes[i, j, k], nodes[i, j + 1, k], fy)
     b = wp.lerp(nodes[i + 1, j, k], nodes[i + 1, j + 1, k], fy)
     return wp.lerp(a, b, fx)
@@ -97,7 +97,7 @@ def _add_up(
     # out:
     nodes: wp.array3d[wp.vec4],
 ):
-    """Depths from each node to either end of its line: the first ``across`` lines run to the right, the others up."""
+    """Depths from each node to either end of its line: the first `across` lines run to the right, the others up."""
     line, k = wp.tid()
     if line < across:
         right = float(0.0)
@@ -127,7 +127,7 @@ def _add_up(
 
 @functools.cache
 def coarse_kernels(dtype: Any, hot: bool):
-    """Builds (once) the kernels for densities of a type; ``hot``: with a temperature of the same type."""
+    """Builds (once) the kernels for densities of a type; `hot`: with a temperature of the same type."""
 
     @wp.kernel(module="unique", module_options=_OPTIONS)
     def measure(
@@ -190,7 +190,7 @@ def coarse_kernels(dtype: Any, hot: bool):
             j = wp.clamp(int(y), 0, nodes.shape[1] - 2)
             fx = wp.clamp(x - float(i), 0.0, 1.0)
             fy = wp.clamp(y - float(j), 0.0, 1.0)
-            loaded = int(-1)  # the plane of nodes that ``near`` holds
+            loaded = int(-1)  # the plane of nodes that `near` holds
             near = wp.vec4()
             far = wp.vec4()
             for n in range(r.count):
@@ -255,7 +255,7 @@ def _lattice(shape: Sequence[int], view: View, spacing: float) -> tuple[_Lattice
 def coarse_six_way(medium: Medium, view: View, march: March, out: wp.array) -> None:
     """Six-way lightmaps, transparency, emission and depth by one march in large steps.
 
-    Below a brick's edge, ``march.step`` makes both rays and ways to the lights look no further in bricks without smoke.
+    Below a brick's edge, `march.step` makes both rays and ways to the lights look no further in bricks without smoke.
     It changes no result.
 
     Args:
@@ -263,7 +263,7 @@ def coarse_six_way(medium: Medium, view: View, march: March, out: wp.array) -> N
         view: The camera, [H, W] pixels, orthographic.
         march: Its spacing is a quarter of a voxel at least, and as much more as makes the nodes about 2^28 at most. A
             node takes 24 bytes. 64 seeds differ. What the cutoff leaves out is less than 1e-3 in every plane.
-        out: float [9, H, W], written: ``PLANES``, each light of irradiance 4 pi.
+        out: float [9, H, W], written: `PLANES`, each light of irradiance 4 pi.
 
     Raises:
         ValueError: The camera is in perspective.

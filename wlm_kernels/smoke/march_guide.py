@@ -1,8 +1,8 @@
 """Guiding maps by a march in large steps (neural-six-way-lightmaps, algorithm 1).
 
-Units and sampling are those of ``march``. The lights from the top and the bottom are marched to from each sample, or,
+Units and sampling are those of `march`. The lights from the top and the bottom are marched to from each sample, or,
 far sooner, from the nodes of a lattice over the grid's box, between which their optical depths are trilinear.
-Read first: ``guide`` of ``tests/reference/marching.py``, which is algorithm 1 in 20 lines.
+Read first: `guide` of `tests/reference/marching.py`, which is algorithm 1 in 20 lines.
 """
 
 import functools
@@ -78,7 +78,7 @@ class _Kernels:
 
 @functools.cache
 def guide_kernels(dtype: Any) -> _Kernels:
-    """Builds (once) the kernels for densities of a type, ``wp.float32`` or ``wp.float16``."""
+    """Builds (once) the kernels for densities of a type, `wp.float32` or `wp.float16`."""
 
     @wp.kernel(module="unique", module_options=_OPTIONS)
     def lattice(

@@ -1,11 +1,11 @@
 """How smoke moves across the image: what is seen along a ray, and how far the air carried it between two frames.
 
-Units, sampling and cameras are those of ``march``. What a ray sees of a step is what the step keeps of the light,
+Units, sampling and cameras are those of `march`. What a ray sees of a step is what the step keeps of the light,
 T (1 - exp(-sigma h)): hidden smoke counts as little as it is seen. The air's velocities lie on a grid of their own over
-the same box, as ``wlm_kernels.fluid.advection`` has them: trilinear between cell centres, constant beyond the
+the same box, as `wlm_kernels.fluid.advection` has them: trilinear between cell centres, constant beyond the
 outermost. Smoke is traced back by the midpoint rule, as the solver carries it; the velocities are taken to be those of
 the later frame all the while. Smoke that came into the box since counts as having been where smoke at its border looks
-the same. Read first: ``_loop`` of ``tests/smoke/test_motion.py``, the same in float64, pixel by pixel.
+the same. Read first: `_loop` of `tests/smoke/test_motion.py`, the same in float64, pixel by pixel.
 """
 
 import functools
@@ -62,7 +62,7 @@ def _velocity_at(velocity: wp.array3d[wp.vec3], p: wp.vec3) -> wp.vec3:
 
 @functools.cache
 def motion_kernel(dtype: Any) -> wp.Kernel:
-    """Builds (once) the kernel for densities of a type, ``wp.float32`` or ``wp.float16``."""
+    """Builds (once) the kernel for densities of a type, `wp.float32` or `wp.float16`."""
 
     @wp.kernel(module="unique", module_options=_OPTIONS)
     def motion(

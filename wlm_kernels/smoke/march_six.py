@@ -6,8 +6,8 @@ samples at one depth make a plane of pixels in which the light from the right co
 top along the columns, so that the optical depths of a whole row are one running sum. The light from the front and
 the back comes along the ray itself, where it is integrated in closed form.
 
-The planes are worked off in slabs of as many as the buffers hold. Units and sampling are those of ``march``.
-Read first: ``six_way`` of ``tests/reference/marching.py``, the same samples with nothing shared.
+The planes are worked off in slabs of as many as the buffers hold. Units and sampling are those of `march`.
+Read first: `six_way` of `tests/reference/marching.py`, the same samples with nothing shared.
 """
 
 import functools
@@ -50,7 +50,7 @@ _SLAB_BYTES = 2**28  # of the four optical depths of a slab
 
 @wp.struct
 class _Slab:
-    """Planes of samples across the view, ``gap`` apart; sample n lies at distance ``start + (n + 1/2) gap``."""
+    """Planes of samples across the view, `gap` apart; sample n lies at distance `start + (n + 1/2) gap`."""
 
     start: float
     gap: float
@@ -82,7 +82,7 @@ class _Kernels:
 
 @functools.cache
 def six_kernels(dtype: Any) -> _Kernels:
-    """Builds (once) the kernels for densities of a type, ``wp.float32`` or ``wp.float16``."""
+    """Builds (once) the kernels for densities of a type, `wp.float32` or `wp.float16`."""
 
     @wp.kernel(module="unique", module_options=_OPTIONS)
     def column(

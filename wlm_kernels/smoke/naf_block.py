@@ -1,7 +1,7 @@
 """The parts of a NAFBlock besides its matrix products, for one image whose pixels lie as rows of channels.
 
-``kernels`` builds and caches them for a number of channels and a number type; sums are float32 whatever the type is.
-Nothing has a gradient: training is torch's. Read first: ``NafBlock`` of ``wlm/smoke/model.py``, the whole block in
+`kernels` builds and caches them for a number of channels and a number type; sums are float32 whatever the type is.
+Nothing has a gradient: training is torch's. Read first: `NafBlock` of `wlm/smoke/model.py`, the whole block in
 torch.
 """
 
@@ -14,7 +14,7 @@ import warp as wp
 __all__ = ["STRIP", "NafKernels", "kernels", "lane_sum", "lanes"]
 
 STRIP = 4
-"""Pixels below each other that one thread of ``gate`` computes."""
+"""Pixels below each other that one thread of `gate` computes."""
 
 _EPSILON = 1e-6
 _WARP = 32
@@ -32,7 +32,7 @@ _PER_LANE = 4
     return value;
 """)
 def lane_sum(value: float, count: int) -> float:
-    """The sum of a value over the ``count`` threads of a group, a power of 2 up to a warp; on a CPU the value."""
+    """The sum of a value over the `count` threads of a group, a power of 2 up to a warp; on a CPU the value."""
     ...
 
 

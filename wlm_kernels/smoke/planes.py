@@ -1,11 +1,11 @@
 """Planes of six lights before the network and behind it: the guide that it reads, and the lightmaps that it makes.
 
-Each is one pass over the image in place of some tens of small ones. ``encode_six`` turns the coarse march's planes into
-the guide, ``decode`` the network's planes into light. ``kernels`` builds and caches, for a number type, the kernels
+Each is one pass over the image in place of some tens of small ones. `encode_six` turns the coarse march's planes into
+the guide, `decode` the network's planes into light. `kernels` builds and caches, for a number type, the kernels
 that add the outputs of the network's heads and a filter of the guide, where smoke is near; sums are float32 whatever
 the type is. Nothing has a gradient: training is torch's.
-Read first: ``encode_guide``, ``encode_lightmaps`` and ``decode_lightmaps`` of ``wlm/smoke/planes.py`` for the
-encodings, and ``_wanted`` of ``tests/kernels/test_six_planes.py``, which is ``compose`` in a few lines of torch.
+Read first: `encode_guide`, `encode_lightmaps` and `decode_lightmaps` of `wlm/smoke/planes.py` for the
+encodings, and `_wanted` of `tests/kernels/test_six_planes.py`, which is `compose` in a few lines of torch.
 """
 
 import functools
@@ -37,7 +37,7 @@ PLANES = LIGHTS + 2
 """Planes of the network's output: the lights, opacity and emission."""
 
 STRIP = 4
-"""Pixels below each other that one thread of ``compose`` computes."""
+"""Pixels below each other that one thread of `compose` computes."""
 
 Taps = wp.types.vector(PLANES, wp.float32)
 """What one pixel of one of the guide's planes adds to each plane."""
@@ -87,13 +87,13 @@ def _linear(code: float) -> float:
 
 @wp.func
 def _at_most_one(value: float) -> float:
-    """Not ``wp.min``, which would make a NaN 1."""
+    """Not `wp.min`, which would make a NaN 1."""
     return wp.where(value > 1.0, 1.0, value)
 
 
 @wp.func
 def _at_least_zero(value: float) -> float:
-    """Not ``wp.max``, which would make a NaN 0."""
+    """Not `wp.max`, which would make a NaN 0."""
     return wp.where(value < 0.0, 0.0, value)
 
 
@@ -124,7 +124,7 @@ def encode_six(planes: wp.array, near: float, far: float, hot: bool, out: wp.arr
     """The planes of the coarse march as the network reads them.
 
     Args:
-        planes: float [9, H, W], of ``march_coarse.PLANES``.
+        planes: float [9, H, W], of `march_coarse.PLANES`.
         near, far: Distances at which the smoke begins and ends, near < far.
         hot: Whether the emission counts; otherwise it is 0.
         out: float [9, H, W], written: six lights in sRGB; emission e as e / (1 + e) in sRGB; opacity; depth as a
@@ -167,7 +167,7 @@ class PlaneKernels:
     """The kernels of a number type T; the guide is T [C, H, W], its last planes opacity and depth.
 
     Attributes:
-        lanes: L, threads of ``near`` that share a block.
+        lanes: L, threads of `near` that share a block.
         near: [blocks L], of reach x reach pixels: whether there is smoke in them. In: the guide. Out: int
             [ceil(H / reach), ceil(W / reach)], 0 or 1. A NaN is no smoke.
         compose: [ceil(H / STRIP), W]: the planes, clamped to each one's range, and 0 where neither a block nor one of
@@ -175,7 +175,7 @@ class PlaneKernels:
             larger, N outputs of heads from each of G groups; the guide; weights Taps [c edge edge] of a filter of its
             first c planes, from column to row within each, aligned to 16 bytes, with zeros outside the image; for
             each plane the group and the first of its stem x stem outputs, int [PLANES, 2], or a group below 0 where
-            the plane is left out and is 0; stem; ``near``. Out: float [PLANES, H, W].
+            the plane is left out and is 0; stem; `near`. Out: float [PLANES, H, W].
     """
 
     lanes: int

@@ -14,8 +14,8 @@ class March:
     Attributes:
         step: h, the longest step along a ray.
         spacing: The largest distance between the nodes at which optical depths to the lights are known; None: as
-            ``step``. For the coarse march of six lights, as ``light_step`` is.
-        light_step: The longest step between two nodes; None: as ``spacing``.
+            `step`. For the coarse march of six lights, as `light_step` is.
+        light_step: The longest step between two nodes; None: as `spacing`.
         jitter: Share of a step by which the samples of a pixel are shifted, 0 (each in its step's middle) to 1.
         seed: Of the jitter, any whole number.
         threshold: tau, the extinction per voxel above which smoke has a surface, whose distance is the depth.

@@ -1,6 +1,6 @@
 """Single scattering, emission and optical depth along any rays through a density grid, and their adjoints.
 
-Units, sampling and steps are those of ``march``; the density is the extinction per voxel. Along a ray of steps h, with
+Units, sampling and steps are those of `march`; the density is the extinction per voxel. Along a ray of steps h, with
 x_n = sigma(p_n) h and T_n = exp(-x_0 - ... - x_(n-1)) (neural-six-way-lightmaps, eq. 1 to 3),
 
     scattered of light l    sum_n T_n (1 - exp(-x_n)) exp(-tau_l(p_n))        without phase function and colour
@@ -9,7 +9,7 @@ x_n = sigma(p_n) h and T_n = exp(-x_0 - ... - x_(n-1)) (neural-six-way-lightmaps
 
 where tau_l, the optical depth from a point to a light, is marched from the nodes of a lattice that all rays share, and
 is linear between them. All is exact in its derivatives: steps depend on the geometry alone, and a ray ends early
-only where float32 has nothing left of it. ``wlm.ops.plain.march`` is the same in torch.
+only where float32 has nothing left of it. `wlm.ops.plain.march` is the same in torch.
 
 Adjoints run from a ray's end to its start, so that what a sample hides is a running sum. They add to the density, the
 emission and the nodes by atomics: on CUDA in any order, so that the last bits change from run to run.
@@ -45,7 +45,7 @@ class _Cell:
 
 @wp.func
 def _cell(q: wp.vec3, counts: wp.vec3i) -> _Cell:
-    """Where ``q`` lies, in units of the grid, whose value i is at i."""
+    """Where `q` lies, in units of the grid, whose value i is at i."""
     cell = _Cell()
     for axis in range(3):
         i = int(wp.floor(q[axis]))
@@ -123,7 +123,7 @@ def _share(x: float) -> float:
 
 @wp.func
 def _share_slope(x: float) -> float:
-    """The derivative of ``_share``, without cancellation where x is small."""
+    """The derivative of `_share`, without cancellation where x is small."""
     if x < 0.05:
         return -0.5 + x * (1.0 / 3.0 - x * (0.125 - x * (1.0 / 30.0 - x / 144.0)))
     return (wp.exp(-x) - absorbed(x) / x) / x
@@ -264,18 +264,18 @@ def depths(density, toward, step: float, nodes) -> None:
         density: float [X, Y, Z], extinction per voxel, at least 0.
         toward: vec3 [L], the directions to the lights, of length 1.
         step: The longest step, in voxels.
-        nodes: float [L, A, B, C], written; ``march_guide.nodes_along`` has the number of nodes,
-            ``march.node_position`` their places.
+        nodes: float [L, A, B, C], written; `march_guide.nodes_along` has the number of nodes,
+            `march.node_position` their places.
     """
     inputs = [density, toward, step * _SLACK]
     wp.launch(_depths, nodes.shape, inputs=inputs, outputs=[nodes], device=density.device)
 
 
 def depths_backward(toward, step: float, grad_nodes, grad_density) -> None:
-    """The adjoint of ``depths``.
+    """The adjoint of `depths`.
 
     Args:
-        toward, step: As for ``depths``.
+        toward, step: As for `depths`.
         grad_nodes: float [L, A, B, C].
         grad_density: float [X, Y, Z], added to.
     """
@@ -289,7 +289,7 @@ def march(density, emission, nodes, origin, direction, step: float, scattered, e
     Args:
         density: float [X, Y, Z], extinction per voxel, at least 0.
         emission: vec3 [X, Y, Z], radiance emitted per voxel; of shape [0, 0, 0]: nothing emits.
-        nodes: float [L, A, B, C] from ``depths``; L may be 0.
+        nodes: float [L, A, B, C] from `depths`; L may be 0.
         origin, direction: vec3 [R], in voxels; directions of length 1.
         step: The longest step, in voxels.
         scattered: float [R, L], written.
@@ -317,10 +317,10 @@ def march_backward(
     grad_emission,
     grad_nodes,
 ) -> None:
-    """The adjoint of ``march``; the density's share by way of the nodes is that of ``depths_backward``.
+    """The adjoint of `march`; the density's share by way of the nodes is that of `depths_backward`.
 
     Args:
-        density, emission, nodes, origin, direction, step, depth, count: As for ``march``, and as it wrote them.
+        density, emission, nodes, origin, direction, step, depth, count: As for `march`, and as it wrote them.
         grad_scattered: float [R, L].
         grad_emitted: vec3 [R].
         grad_depth: float [R].

@@ -3,21 +3,21 @@
 A network turns a guiding map, a cheap render of smoke, into six-way lightmaps. It learns that from pairs of the two,
 rendered from simulated smoke while it trains. To read it all, in order:
 
-1.  ``wlm/smoke/planes.py``: the planes of a guiding map and of lightmaps, encoded to a common range. All that follows
+1.  `wlm/smoke/planes.py`: the planes of a guiding map and of lightmaps, encoded to a common range. All that follows
     is in these.
-2.  ``wlm/smoke/model.py``: the network, a U-Net with NAFBlocks behind it: ``NetworkSettings``, ``SixWayNetwork``.
-3.  ``settings.py``: how samples are made (``DatasetSettings``), weights of the losses (``LossSettings``), the
-    optimiser's settings (``TrainSettings``). ``Profile`` in ``model.py`` holds the network's, the training's and the
-    dataset's; ``configs/smoke-network-*.yaml`` are profiles.
-4.  ``pool.py``: ``Pool``, the samples: [N, 2, C, H, W] guides and [N, 2, 8, H, W] targets, the motion between the two
+2.  `wlm/smoke/model.py`: the network, a U-Net with NAFBlocks behind it: `NetworkSettings`, `SixWayNetwork`.
+3.  `settings.py`: how samples are made (`DatasetSettings`), weights of the losses (`LossSettings`), the
+    optimiser's settings (`TrainSettings`). `Profile` in `model.py` holds the network's, the training's and the
+    dataset's; `configs/smoke-network-*.yaml` are profiles.
+4.  `pool.py`: `Pool`, the samples: [N, 2, C, H, W] guides and [N, 2, 8, H, W] targets, the motion between the two
     frames of each; in memory and in files.
-5.  ``scenes.py``: ``draw_scene``, a random jet, plume, flame or burst.
-6.  ``dataset.py``: ``make_pool`` and ``make_validation`` simulate such scenes and render their samples.
-7.  ``losses.py``: reconstruction, perceptual and temporal loss.
-8.  ``trainer.py``: ``plan_round`` draws the order of samples, ``Trainer.run`` takes steps.
-9.  ``wlm/smoke/fit.py``: ``train``, the loop over rounds: make a pool, take the steps, validate, save the best network
+5.  `scenes.py`: `draw_scene`, a random jet, plume, flame or burst.
+6.  `dataset.py`: `make_pool` and `make_validation` simulate such scenes and render their samples.
+7.  `losses.py`: reconstruction, perceptual and temporal loss.
+8.  `trainer.py`: `plan_round` draws the order of samples, `Trainer.run` takes steps.
+9.  `wlm/smoke/fit.py`: `train`, the loop over rounds: make a pool, take the steps, validate, save the best network
     and a checkpoint.
-10. ``wlm/smoke/evaluation.py``: ``score``, by which the best network is selected; ``evaluate`` and ``compare``, on
+10. `wlm/smoke/evaluation.py`: `score`, by which the best network is selected; `evaluate` and `compare`, on
     sequences held out from both.
 
 The whole in a few lines, without checkpoints:
@@ -31,5 +31,5 @@ The whole in a few lines, without checkpoints:
     SmokeModel(trainer.average, {"dataset": profile.dataset.model_dump(mode="json")}).save("network.safetensors")
 
 Everything random depends on a seed, a round and a number alone: pools, orders and weights repeat to the bit on one
-device. ``synthetic.py`` makes smoke of noise, for demos and measurements; no training uses it.
+device. `synthetic.py` makes smoke of noise, for demos and measurements; no training uses it.
 """

@@ -8,7 +8,7 @@ guiding map and its lightmaps, and the motion between them. Images show smoke al
 The paper's sizes, 400^3 voxels, 512^2 pixels and steps of 10 voxels, are more than learning needs. Lengths are shares
 of the box, so that a smaller grid shows the same: the guiding map's step is 1/40 of its edge, and so is the density
 from which smoke counts as a surface. A trained network's guiding maps must be made with its own
-``DatasetSettings.look``.
+`DatasetSettings.look`.
 
 =======================================  =============================================================
 an unstable flow, NaN or infinity        the scene is skipped and counted; another is drawn in its place
@@ -69,7 +69,7 @@ def make_pool(
         round: Number of the round, from 0.
         device: "cpu", "cuda" or "cuda:N".
         progress: Called after each sequence with the figures "samples", "skipped" scenes, "dropped" samples without
-            smoke, and the seconds of each of ``STAGES``.
+            smoke, and the seconds of each of `STAGES`.
 
     Returns:
         At most sequences x frames x views_a_frame samples, on the device. The same arguments give the same bits on one
@@ -92,12 +92,12 @@ def make_validation(
     """Makes samples of sequences that no round has, each pair seen from every fixed view.
 
     Args:
-        settings, device, progress: As for ``make_pool``.
-        test: Use ``test_seed``, which is held out from model selection.
+        settings, device, progress: As for `make_pool`.
+        test: Use `test_seed`, which is held out from model selection.
         scale: Factor on the extinction of the same smoke, 0.5 and 2 in the paper's ablation.
 
     Raises:
-        WlmError: As ``make_pool``.
+        WlmError: As `make_pool`.
     """
     seed = settings.test_seed if test else settings.validation_seed
     return _Maker(settings, seed, True, device, scale).pool(0, settings.validation_sequences, progress)
@@ -114,7 +114,7 @@ def pool_of_volume(
     """Makes samples of any volume, one from each fixed view: a test on smoke from elsewhere.
 
     Args:
-        path: A ``.npz`` or ``.nvdb`` volume, as ``load_volume`` reads it.
+        path: A `.npz` or `.nvdb` volume, as `load_volume` reads it.
         settings: Views and march; the volume's longest edge counts as the box's.
         device: "cpu", "cuda" or "cuda:N".
         extinction: Extinction of density 1, per unit of length; None: such that its dense smoke is as opaque as a
@@ -125,7 +125,7 @@ def pool_of_volume(
         The samples. There is one frame: both of a sample are equal, the motion is 0, and so is the sequence.
 
     Raises:
-        WlmError: As ``load_volume``; or the volume is empty and no extinction is given.
+        WlmError: As `load_volume`; or the volume is empty and no extinction is given.
     """
     volume = load_volume(path, extinction=1.0, emission=emission, device=check_device(device))
     if extinction is None:
@@ -222,7 +222,7 @@ class _Maker:
     def _render(
         self, settings: DatasetSettings, scene: Scene, solver: Solver, random: np.random.Generator
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Simulates a scene and renders its pairs: guides, targets and motion of a ``Pool``."""
+        """Simulates a scene and renders its pairs: guides, targets and motion of a `Pool`."""
         clock, simulation = self._clock, _Simulation(scene, solver)
         views = settings.views if self._validation else settings.views_a_frame
         size = (settings.frames * views, 2)

@@ -1,4 +1,4 @@
-"""Training losses (neural-six-way-lightmaps, section 4.4, eq. 7 to 10), of encoded planes as ``planes`` defines them.
+"""Training losses (neural-six-way-lightmaps, section 4.4, eq. 7 to 10), of encoded planes as `planes` defines them.
 
 - Reconstruction, eq. 7: the mean square error over all planes that the network predicts.
 - Perceptual, eq. 8: L1 between features of a VGG16's first three blocks. The one that comes in a package was tuned to
@@ -73,7 +73,7 @@ class Perceptual(nn.Module):
         return features
 
     def forward(self, predicted: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
-        """The mean over the blocks of the mean over their features; planes as for ``features``."""
+        """The mean over the blocks of the mean over their features; planes as for `features`."""
         with torch.no_grad():
             expected = self.features(target)
         parts = [F.l1_loss(a.float(), b.float()) for a, b in zip(self.features(predicted), expected, strict=True)]
@@ -85,7 +85,7 @@ def warp(earlier: torch.Tensor, motion: torch.Tensor) -> tuple[torch.Tensor, tor
 
     Args:
         earlier: [N, C, H, W].
-        motion: [N, 2, H, W], as ``Pool.motion``.
+        motion: [N, 2, H, W], as `Pool.motion`.
 
     Returns:
         The warped frame, and a mask [N, 1, H, W], 1 where it was read inside the image.
@@ -151,7 +151,7 @@ def residual(frames: torch.Tensor, motion: torch.Tensor, opacity: torch.Tensor) 
 
     Args:
         frames: [N, 2, P, H, W], the earlier first.
-        motion: [N, 2, H, W], as ``Pool.motion``.
+        motion: [N, 2, H, W], as `Pool.motion`.
         opacity: [N, H, W] of the later frame. Only visible smoke counts that was inside the image before.
 
     Returns:
@@ -168,8 +168,8 @@ def temporal(predicted: torch.Tensor, target: torch.Tensor, motion: torch.Tensor
     Warping is linear, so the difference of the two changes is the error's change, and takes one warp.
 
     Args:
-        predicted, target: [N, 2, P, H, W], the first P of ``PLANES``, opacity among them.
-        motion: [N, 2, H, W], as ``Pool.motion``.
+        predicted, target: [N, 2, P, H, W], the first P of `PLANES`, opacity among them.
+        motion: [N, 2, H, W], as `Pool.motion`.
 
     Returns:
         The mean over visible smoke that was inside the image before; 0 where there is none.
@@ -198,7 +198,7 @@ class Losses(nn.Module):
     def forward(
         self, predicted: torch.Tensor, target: torch.Tensor, motion: torch.Tensor | None
     ) -> dict[str, torch.Tensor]:
-        """Computes ``loss``, the weighted sum, and its unweighted parts by name.
+        """Computes `loss`, the weighted sum, and its unweighted parts by name.
 
         Args:
             predicted, target: [N, K, 8, H, W], encoded; K = 2 frames for the temporal part.

@@ -23,8 +23,8 @@ class Pool:
     """N samples on one device, each of two successive frames, the earlier first; floats are half precision.
 
     Attributes:
-        guides: [N, 2, C, H, W], encoded guiding maps of one of ``GUIDES``.
-        targets: [N, 2, 8, H, W], encoded lightmaps, ``PLANES``.
+        guides: [N, 2, C, H, W], encoded guiding maps of one of `GUIDES`.
+        targets: [N, 2, 8, H, W], encoded lightmaps, `PLANES`.
         motion: [N, 2, H, W], pixels, x to the right and y down, by which the smoke that the later frame shows has moved
             since the earlier one.
         sequence: int [N], the sequence that a sample is of; sets are split by sequences, never by frames.
@@ -91,7 +91,7 @@ def save_pool(path: str | os.PathLike[str], pool: Pool, settings: DatasetSetting
 
 
 def load_pool(path: str | os.PathLike[str], device: str = "cpu") -> Pool:
-    """Reads a file of ``save_pool``.
+    """Reads a file of `save_pool`.
 
     Raises:
         WlmError: The file is missing, damaged or of another kind.

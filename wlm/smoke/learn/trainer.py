@@ -72,7 +72,7 @@ class Trainer:
         return int(self._skipped)
 
     def take_losses(self) -> list[float]:
-        """Sums of the loss and its parts over the steps since the last ``clear_losses``; waits for the device."""
+        """Sums of the loss and its parts over the steps since the last `clear_losses`; waits for the device."""
         return self._sums.tolist()
 
     def clear_losses(self) -> None:
@@ -84,7 +84,7 @@ class Trainer:
 
         Args:
             pool: The samples, on any device.
-            plan: Rows of ``plan_round``, one per step.
+            plan: Rows of `plan_round`, one per step.
         """
         # Deterministic kernels, so that one seed gives one result.
         flags = {"enabled": True, "benchmark": False, "deterministic": True, "allow_tf32": self.settings.half}
@@ -128,7 +128,7 @@ class Trainer:
         return guides, targets, motion
 
     def _work(self) -> None:
-        """One step on the batch in ``_batch``, without waiting for the device."""
+        """One step on the batch in `_batch`, without waiting for the device."""
         guides, targets, motion = self._batch
         for weight in self._weights:
             weight.grad = None
@@ -161,7 +161,7 @@ class Trainer:
 
     @torch.no_grad()
     def load(self, state: dict[str, np.ndarray]) -> None:
-        """Restores a ``state``.
+        """Restores a `state`.
 
         Raises:
             ValueError: A part is missing or has another shape.
