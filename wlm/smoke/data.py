@@ -148,7 +148,7 @@ def open_frames(folder: str | os.PathLike[str], scene: Scene, *, resume: bool = 
 
     Args:
         folder: Made if its parent is there.
-        scene: What is simulated.
+        scene: The scene to simulate.
         resume: Whether to go on with a simulation of the same scene. Otherwise an earlier one's frames are removed.
 
     Raises:
@@ -258,7 +258,7 @@ def write_six_way(path: str | os.PathLike[str], six: SixWay) -> None:
 
 
 def read_six_way(path: str | os.PathLike[str], device: str = "cpu") -> SixWay:
-    """Reads what ``write_six_way`` wrote.
+    """Reads lightmaps that ``write_six_way`` wrote.
 
     Raises:
         WlmError: The file is missing or damaged, lacks a channel or its camera, or holds a number that isn't finite.

@@ -1,4 +1,4 @@
-"""Six-way lightmaps of one frame: what each march and the network return, and how they are lit.
+"""Six-way lightmaps of one frame, the result of each march and of the network, and their shading.
 
 A lightmap holds the light that smoke of albedo 1 sends to the camera under one light of irradiance 4 pi from its
 direction: with g = 0 at most 1/2 from the front and 1 from a side. All is linear. The lightmaps are orthographic, as a
@@ -88,7 +88,7 @@ class SixWay:
         Args:
             lights: Any number.
             background: Linear light behind the smoke, [H, W, 3] or one colour; None: the smoke's light alone, to be
-                added to what is behind times the transparency.
+                added to the background times the transparency.
             rule: How a light's direction weighs the lightmaps, one of ``wlm.smoke.camera.RULES``.
             ramp: Colour of the emission; None: grey, as it is.
 

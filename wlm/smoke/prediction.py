@@ -90,7 +90,7 @@ def predict(
     device: str | None = None,
     seed: int = 0,
 ) -> SixWay:
-    """Makes six-way lightmaps of smoke by a network: what ``bake`` makes, sooner.
+    """Makes six-way lightmaps of smoke by a network, which approximates ``bake`` in less time.
 
     Args:
         smoke: On any device.

@@ -1,10 +1,10 @@
-"""What every march through smoke shares: the medium, cameras, rays and their steps, samples, the phase function.
+"""The common parts of all marches through smoke: medium, cameras, rays and their steps, samples, phase function.
 
 All is in voxels: the grid ``[X, Y, Z]`` fills the box from 0 to (X, Y, Z), the centre of voxel i is at i + 1/2, and
 between centres the density is trilinear, with zero outside the grid; so there is smoke up to half a voxel beyond the
 box. Extinction is ``extinction * density`` per voxel. A step is taken as of one density, that at its sample, and is
-integrated exactly: 1 - exp(-sigma h), not sigma h. A density below zero or NaN isn't looked for; the caller keeps them
-out.
+integrated exactly: 1 - exp(-sigma h), not sigma h. Densities aren't checked: the caller keeps out NaN and values below
+0.
 
 A light is a direction towards it, of irradiance 4 pi, so that an isotropic phase function is 1 and not 1 / (4 pi).
 ``march_guide``, ``march_coarse``, ``march_six`` and ``march_motion`` are the marches themselves; none has a gradient,
@@ -139,7 +139,7 @@ class Ray:
 
 @wp.func
 def ray(view: View, row: int, column: int) -> Ray:
-    """What a pixel sees along; without steps."""
+    """The ray of a pixel, without steps."""
     u = (float(column) + 0.5 - 0.5 * float(view.width)) * view.pitch
     v = (0.5 * float(view.height) - float(row) - 0.5) * view.pitch
     r = Ray()
@@ -213,7 +213,7 @@ def density_at(density: wp.array3d[Any], p: wp.vec3) -> float:
     fx = x - float(i)
     fy = y - float(j)
     fz = z - float(k)
-    # What lies outside has no weight, and its index is moved to one that can be read.
+    # Voxels outside have no weight, and an index that can be read.
     nx = density.shape[0]
     ny = density.shape[1]
     nz = density.shape[2]
@@ -238,7 +238,7 @@ def density_at(density: wp.array3d[Any], p: wp.vec3) -> float:
 
 @wp.func
 def sample(density: wp.array3d[Any], bricks: wp.array3d[wp.uint8], p: wp.vec3) -> float:
-    """``density_at``, which looks no further where the brick is empty: the same number."""
+    """``density_at``, which reads no voxel where the brick is empty: the same number."""
     i = wp.clamp(int(p[0]) // BRICK, 0, bricks.shape[0] - 1)
     j = wp.clamp(int(p[1]) // BRICK, 0, bricks.shape[1] - 1)
     k = wp.clamp(int(p[2]) // BRICK, 0, bricks.shape[2] - 1)

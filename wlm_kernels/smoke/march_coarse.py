@@ -198,7 +198,7 @@ def coarse_kernels(dtype: Any, hot: bool):
                 p = r.origin + s * r.direction
                 sigma = extinction * _sample(density, bricks, p)
                 if wp.static(hot):
-                    # The mean of what is left along the step: fire without smoke shines too.
+                    # The mean transparency along the step: fire without smoke shines too.
                     x = sigma * dt
                     share = wp.where(x > 1.0e-6, absorbed(x) / wp.max(x, 1.0e-6), 1.0)
                     glow += t * share * emission * dt * density_at(temperature, p)
@@ -255,14 +255,13 @@ def _lattice(shape: Sequence[int], view: View, spacing: float) -> tuple[_Lattice
 def coarse_six_way(medium: Medium, view: View, march: March, out: wp.array) -> None:
     """Six-way lightmaps, transparency, emission and depth by one march in large steps.
 
-    Below a brick's edge, ``march.step`` makes both rays and ways to the lights look no further in bricks without smoke.
-    It changes no result.
+    With steps shorter than a brick's edge, bricks without smoke are skipped, which changes no result.
 
     Args:
         medium: The smoke, of albedo 1.
         view: The camera, [H, W] pixels, orthographic.
         march: Its spacing is a quarter of a voxel at least, and as much more as makes the nodes about 2^28 at most. A
-            node takes 24 bytes. 64 seeds differ. What the cutoff leaves out is less than 1e-3 in every plane.
+            node takes 24 bytes. 64 seeds differ. The cutoff's error is less than 1e-3 in every plane.
         out: float [9, H, W], written: ``PLANES``, each light of irradiance 4 pi.
 
     Raises:
