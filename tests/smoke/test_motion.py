@@ -12,8 +12,8 @@ from wlm.fluid.volume import from_array
 from wlm.smoke.baking import bake
 from wlm.smoke.learn.dataset import make_validation
 from wlm.smoke.learn.losses import warp
+from wlm.smoke.learn.motion import motion
 from wlm.smoke.learn.settings import DatasetSettings
-from wlm.smoke.motion import motion
 from wlm.smoke.planes import OPACITY_PLANE
 
 SIZE = 24
