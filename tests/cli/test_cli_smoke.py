@@ -313,10 +313,10 @@ def test_bake(volume, tmp_path):
     loaded = load_volume(volume, emission=2.0)
     camera = camera_of(loaded)
     expected = bake(loaded, camera, step=1.0, supersample=2, g=0.3)
-    found = read_six_way(out)
-    assert found.camera == camera
+    result = read_six_way(out)
+    assert result.camera == camera
     for name in ("lightmaps", "transparency", "emission"):
-        torch.testing.assert_close(getattr(found, name), getattr(expected, name).half().float(), rtol=0, atol=0)
+        torch.testing.assert_close(getattr(result, name), getattr(expected, name).half().float(), rtol=0, atol=0)
     assert f"{expected.error.largest:.2g}" in text and f"{expected.error.rms:.2g}" in text
 
 
@@ -366,9 +366,9 @@ def test_a_scenes_glow(tmp_path):
     folder = write_frames(tmp_path / "a", smoke=smoke, lights=[], frames=1).path
     save_volume(folder / "frame_0001.npz", plume(hot=True))
     call("smoke", "shade", folder, "-o", tmp_path / "s", *SMALL)
-    found = png(tmp_path / "s" / "shade_0001.png")
+    result = png(tmp_path / "s" / "shade_0001.png")
     # sRGB of a half is 188.
-    assert found.reshape(-1, 3).max(0).tolist() == [255, 188, 0]
+    assert result.reshape(-1, 3).max(0).tolist() == [255, 188, 0]
 
 
 @pytest.mark.parametrize("layout", ["unity", "o3de", "o3de-tlrb", "embergen"])
@@ -376,8 +376,8 @@ def test_flipbook(layout, baked, volume, tmp_path):
     text = call("smoke", "flipbook", baked, "-o", tmp_path / "f.exr", "--layout", layout)
     assert sorted(os.listdir(tmp_path)) == ["f_1.exr", "f_2.exr"] and "2 x 2 cells of 20 x 20" in text
     paths = (tmp_path / "f_1.exr", tmp_path / "f_2.exr")
-    found = read_flipbook(paths, layout, rows=2, columns=2, count=3)
-    for number, frame in enumerate(found, 1):
+    result = read_flipbook(paths, layout, rows=2, columns=2, count=3)
+    for number, frame in enumerate(result, 1):
         six = read_six_way(baked / f"six_{number:04d}.exr")
         torch.testing.assert_close(frame.lightmaps, six.lightmaps)
         torch.testing.assert_close(frame.transparency, six.transparency, rtol=0, atol=1e-3)
@@ -393,14 +393,14 @@ def test_flipbook_of_volumes(volume, frames, tmp_path):
     assert gain == pytest.approx(1 / brightest, rel=1e-3)
     gain = 1 / brightest
     assert " 0 numbers clipped" in text
-    found = read_flipbook((tmp_path / "f_1.png", tmp_path / "f_2.png"), "unity", rows=1, columns=1, gain=gain)[0]
-    torch.testing.assert_close(found.lightmaps, six.lightmaps, rtol=0, atol=0.51 / 255 / gain)
-    torch.testing.assert_close(found.emission, six.emission, rtol=0, atol=0.51 / 255 / gain)
+    result = read_flipbook((tmp_path / "f_1.png", tmp_path / "f_2.png"), "unity", rows=1, columns=1, gain=gain)[0]
+    torch.testing.assert_close(result.lightmaps, six.lightmaps, rtol=0, atol=0.51 / 255 / gain)
+    torch.testing.assert_close(result.emission, six.emission, rtol=0, atol=0.51 / 255 / gain)
     words = ["--count", 2, "--columns", 9, "--gain", 9]
     text = call("smoke", "flipbook", frames, "-o", tmp_path / "g.tga", *SMALL, *words)
     assert "1 x 2 cells of 20 x 20" in text and " 0 numbers clipped" not in text
-    found = read_flipbook((tmp_path / "g_1.tga", tmp_path / "g_2.tga"), "unity", rows=1, columns=2, gain=9.0)
-    opaque = [1 - float(frame.transparency.mean()) for frame in found]
+    result = read_flipbook((tmp_path / "g_1.tga", tmp_path / "g_2.tga"), "unity", rows=1, columns=2, gain=9.0)
+    opaque = [1 - float(frame.transparency.mean()) for frame in result]
     assert opaque[1] > 3 * opaque[0], "the first and the last"
 
 

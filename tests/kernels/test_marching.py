@@ -63,10 +63,10 @@ def _lit(scene: Scene, device: str, toward: np.ndarray, **march) -> np.ndarray:
 def test_guide_against_reference(device: str, turned: bool, perspective: bool, kind: str):
     """Algorithm 1 with a march from each sample, at a step that is no divisor of anything."""
     scene = _scene(turned, perspective)
-    got = _guide(scene, device, TYPES[kind], step=2.37, jitter=0.0, g=0.3, threshold=0.1, cutoff=0.0, shared=False)
-    want = reference.guide(scene, 2.37, 0.3, 0.1)
+    result = _guide(scene, device, TYPES[kind], step=2.37, jitter=0.0, g=0.3, threshold=0.1, cutoff=0.0, shared=False)
+    expected = reference.guide(scene, 2.37, 0.3, 0.1)
     for plane in range(3):
-        close(got[plane], want[plane], LOOSE, f"plane {plane}")
+        close(result[plane], expected[plane], LOOSE, f"plane {plane}")
 
 
 def test_shared_lights(device: str):
@@ -79,7 +79,7 @@ def test_shared_lights(device: str):
         _guide(scene, device, step=step, jitter=0.0, shared=shared)[0]
         for step, shared in ((0.1, False), (2.0, True), (0.1, True))
     )
-    error = [np.sqrt(np.square(got - marched).mean() / np.square(marched).mean()) for got in (coarse, fine)]
+    error = [np.sqrt(np.square(result - marched).mean() / np.square(marched).mean()) for result in (coarse, fine)]
     # Of noise from voxel to voxel, the worst that a lattice can meet.
     assert error[1] < 0.012 < error[0] < 0.2
     nodes = march_guide.lattice(medium, scene.up, 0.01)
@@ -95,8 +95,8 @@ def test_jitter(device: str):
     still = _guide(scene, device, step=0.2, jitter=0.0)
     np.testing.assert_array_equal(first, again)
     assert (first != other).any(0).mean() > 0.3
-    for got in (first, other):
-        np.testing.assert_allclose(got[1].mean(), still[1].mean(), rtol=0.02)
+    for result in (first, other):
+        np.testing.assert_allclose(result[1].mean(), still[1].mean(), rtol=0.02)
 
 
 def test_cutoff(device: str):
@@ -119,11 +119,11 @@ def test_six_way_against_reference(device: str, turned: bool, inside: bool, kind
     scene = _scene(turned, inside=inside)
     hot = np.random.default_rng(1).uniform(0, 1, scene.density.shape).astype(np.float16).astype(np.float32)
     monkeypatch.setattr(march_six, "_SLAB_BYTES", 16 * scene.height * scene.width * 5)
-    got = _six(scene, device, TYPES[kind], (hot, 0.2), step=0.8, g=0.4)
-    want = reference.six_way(scene, 0.8, 0.4, hot, 0.2)
+    result = _six(scene, device, TYPES[kind], (hot, 0.2), step=0.8, g=0.4)
+    expected = reference.six_way(scene, 0.8, 0.4, hot, 0.2)
     for plane in range(8):
-        assert want[plane].max() > 0.01
-        close(got[plane], want[plane], LOOSE, f"plane {plane}")
+        assert expected[plane].max() > 0.01
+        close(result[plane], expected[plane], LOOSE, f"plane {plane}")
 
 
 def test_image_smaller_than_the_smoke(device: str):
@@ -159,20 +159,20 @@ def test_slab_closed_forms(device: str, extinction: float):
     tau = extinction * n
     # The light from the sides falls off quickly within the dense block's face.
     step = 0.05 if extinction < 1 else 0.01
-    got = _six(scene, device, step=step)[:, 0, 0]
-    assert got[6] == pytest.approx(np.exp(-tau), rel=1e-4)
-    assert got[4] == pytest.approx(-np.expm1(-2 * tau) / 2, rel=1e-4)
-    assert got[5] == pytest.approx(tau * np.exp(-tau), rel=1e-4)
+    result = _six(scene, device, step=step)[:, 0, 0]
+    assert result[6] == pytest.approx(np.exp(-tau), rel=1e-4)
+    assert result[4] == pytest.approx(-np.expm1(-2 * tau) / 2, rel=1e-4)
+    assert result[5] == pytest.approx(tau * np.exp(-tau), rel=1e-4)
     # The density rises over one voxel at either face, and so does a side's optical depth.
     z = (np.arange(200_000) + 0.5) * (n + 1) / 200_000 - 0.5
     rise = np.clip(np.minimum(z + 0.5, n + 0.5 - z), 0, 1)
     dz = z[1] - z[0]
     passed = extinction * (np.cumsum(rise) - rise / 2) * dz
     side = np.sum(extinction * rise * np.exp(-passed - extinction * rise * n / 2)) * dz
-    np.testing.assert_allclose(got[:4], side, rtol=2e-3 if extinction > 1 else 2e-4)
+    np.testing.assert_allclose(result[:4], side, rtol=2e-3 if extinction > 1 else 2e-4)
     guide = _guide(scene, device, step=step, jitter=0.0, shared=False, cutoff=0.0)[:, 0, 0]
-    np.testing.assert_allclose(guide[0], got[4] + 2 * side, rtol=2e-3)
-    assert guide[1] == pytest.approx(got[6], rel=1e-4)
+    np.testing.assert_allclose(guide[0], result[4] + 2 * side, rtol=2e-3)
+    assert guide[1] == pytest.approx(result[6], rel=1e-4)
 
 
 def test_empty_bricks(device: str):
@@ -186,9 +186,9 @@ def test_empty_bricks(device: str):
     middle = np.array(sparse.shape) / 2
     scene = Scene(sparse, 5.0, middle + 30.0 * askew.toward, askew.right, askew.up, askew.toward, 2.0, 20, 20)
     toward = np.array([0.6, 0.0, 0.8])
-    want = reference.lit(scene, toward, 0.4, 0.0)
-    assert want.max() > 0.1
-    close(_lit(scene, device, toward, step=0.4), want, LOOSE, "light")
+    expected = reference.lit(scene, toward, 0.4, 0.0)
+    assert expected.max() > 0.1
+    close(_lit(scene, device, toward, step=0.4), expected, LOOSE, "light")
 
 
 def test_wrong_camera():

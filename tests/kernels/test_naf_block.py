@@ -32,10 +32,10 @@ def test_norm(device, half, error, channels):
     inputs = [_array(x, half, device), _array(shift, False, device), 5]
     cuda = device != "cpu"
     dim = 10 * lanes(channels, cuda)
-    found = _run(kernels(channels, half, cuda).norm, dim, inputs, (10, channels), half, device)
+    result = _run(kernels(channels, half, cuda).norm, dim, inputs, (10, channels), half, device)
     shifted = x.double() + shift.double().repeat_interleave(5, 0)
-    wanted = torch.nn.functional.layer_norm(shifted, (channels,), eps=1e-6).numpy()
-    assert np.abs(found - wanted).max() < error * max(np.abs(wanted).max(), 1)
+    expected = torch.nn.functional.layer_norm(shifted, (channels,), eps=1e-6).numpy()
+    assert np.abs(result - expected).max() < error * max(np.abs(expected).max(), 1)
 
 
 @pytest.mark.parametrize("half, error", [(False, 1e-5), (True, 2e-3)])
@@ -45,12 +45,12 @@ def test_gate(device, half, error, size):
     x, weight, bias = _random(half, *size, 6), _random(False, 9, 6), _random(False, 6)
     inputs = [_array(x, half, device), _array(weight, False, device), _array(bias, False, device)]
     dim = (-(-size[0] // STRIP), size[1], channels)
-    found = _run(kernels(channels, half, device != "cpu").gate, dim, inputs, (*size, channels), half, device)
+    result = _run(kernels(channels, half, device != "cpu").gate, dim, inputs, (*size, channels), half, device)
     image = x.double().permute(2, 0, 1)[None]
     kernel = weight.double().t().reshape(6, 1, 3, 3)
     made = torch.nn.functional.conv2d(image, kernel, bias.double(), padding=1, groups=6)[0].permute(1, 2, 0)
-    wanted = (made[..., :3] * made[..., 3:]).numpy()
-    assert np.abs(found - wanted).max() < error * np.abs(wanted).max()
+    expected = (made[..., :3] * made[..., 3:]).numpy()
+    assert np.abs(result - expected).max() < error * np.abs(expected).max()
 
 
 @pytest.mark.parametrize("half, error", [(False, 1e-5), (True, 2e-3)])
@@ -60,10 +60,10 @@ def test_attend(device, half, error, channels):
     n = channels
     mean, weight, bias, product = (_random(False, *shape) for shape in ((2 * n,), (2, n, n), (2, n), (2, n, n)))
     inputs = [_array(values, False, device) for values in (mean, weight, bias, product)]
-    found = _run(kernels(n, half, cuda).attend, 2 * n * lanes(n, cuda), inputs, (2, n, n), half, device)
+    result = _run(kernels(n, half, cuda).attend, 2 * n * lanes(n, cuda), inputs, (2, n, n), half, device)
     factor = torch.einsum("gic,gc->gi", weight.double(), mean.double().view(2, n)) + bias.double()
-    wanted = (factor[:, :, None] * product.double()).numpy()
-    assert np.abs(found - wanted).max() < error * np.abs(wanted).max()
+    expected = (factor[:, :, None] * product.double()).numpy()
+    assert np.abs(result - expected).max() < error * np.abs(expected).max()
 
 
 @pytest.mark.parametrize("channels, half", [(24, False), (24, True), (128, True)])

@@ -78,11 +78,11 @@ def test_planes_of_heads_and_a_filter(device, size, stem, half):
     heads = _random(half, 2, 5 * PLANES + 4, *(-(-extent // stem) + 1 for extent in size))
     guide, filters = _random(half, 4, *size), _random(False, PLANES, 3, 5, 5)
     smoke = [[int(i == j == 0) for j in range(-(-size[1] // 8))] for i in range(-(-size[0] // 8))]
-    found = _compose(heads, guide, filters, _EVERY, stem, smoke, half=half, device=device)
-    wanted = _wanted(heads, guide, filters, _EVERY, stem, smoke)
+    result = _compose(heads, guide, filters, _EVERY, stem, smoke, half=half, device=device)
+    expected = _wanted(heads, guide, filters, _EVERY, stem, smoke)
     # Two blocks in each direction are near the one with smoke, all others not.
-    assert (found[:, 16:] == 0).all() and (found[:, :, 16:] == 0).all() and wanted.max() > 0.5
-    assert found[LIGHTS:].max() <= 1 and (found - wanted).abs().max() < 1e-5 * wanted.max()
+    assert (result[:, 16:] == 0).all() and (result[:, :, 16:] == 0).all() and expected.max() > 0.5
+    assert result[LIGHTS:].max() <= 1 and (result - expected).abs().max() < 1e-5 * expected.max()
 
 
 @pytest.mark.parametrize("edge, planes", [(1, 0), (1, 2), (3, 1)])
@@ -96,17 +96,17 @@ def test_other_filters_and_reaches(device, edge, planes, reach):
     # One plane isn't made, whatever the filter says of it.
     places = [*_EVERY[:3], (-1, 0), *_EVERY[4:]]
     arguments = (heads, guide, filters, places, 1, smoke.tolist())
-    found = _compose(*arguments, reach=reach, device=device)
-    wanted = _wanted(*arguments, reach=reach)
-    assert (found[3] == 0).all() and wanted.max() > 1 and (found - wanted).abs().max() < 1e-5 * wanted.max()
+    result = _compose(*arguments, reach=reach, device=device)
+    expected = _wanted(*arguments, reach=reach)
+    assert (result[3] == 0).all() and expected.max() > 1 and (result - expected).abs().max() < 1e-5 * expected.max()
 
 
 def test_a_nan_stays_where_smoke_is_near_and_only_there(device):
     heads, guide, filters = _random(False, 2, 40, 32, 32), _random(False, 3, 32, 32), _random(False, PLANES, 2, 3, 3)
     heads[:, :, 2, 2] = heads[:, :, 20, 20] = guide[:, 9, 30] = torch.nan
     smoke = [[1, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0]]
-    found = _compose(heads, guide, filters, _EVERY, 1, smoke, device=device)
-    assert found[:, 2, 2].isnan().all() and int(found.isnan().sum()) == PLANES
+    result = _compose(heads, guide, filters, _EVERY, 1, smoke, device=device)
+    assert result[:, 2, 2].isnan().all() and int(result.isnan().sum()) == PLANES
 
 
 @pytest.mark.parametrize("half", [False, True])
@@ -118,13 +118,13 @@ def test_blocks_with_smoke(device, size, reach, half):
     some = torch.rand(size, generator=torch.Generator().manual_seed(1))
     guide[2] = torch.where(some < 0.01, 1e-3, torch.where(some < 0.5, torch.nan, -(some > 0.9).float()))
     guide[2, -1, -1] = 1e-6
-    found = _near(guide, reach, half, device)
+    result = _near(guide, reach, half, device)
     has = (guide[2] > 0).numpy()
-    wanted = [
+    expected = [
         [int(has[i : i + reach, j : j + reach].any()) for j in range(0, size[1], reach)]
         for i in range(0, size[0], reach)
     ]
-    assert found.tolist() == wanted and found[-1, -1] == 1
+    assert result.tolist() == expected and result[-1, -1] == 1
 
 
 def _srgb(linear: torch.Tensor) -> torch.Tensor:
@@ -141,14 +141,14 @@ def test_the_guide_of_six_lights(device, size, hot):
     near, far = -0.5, 1.75
     out = wp.full(planes.shape, -1.0, dtype=float, device=device)
     encode_six(_array(planes, False, device), near, far, hot, out)
-    found = torch.from_numpy(out.numpy()).double()
+    result = torch.from_numpy(out.numpy()).double()
     of = dict(zip(march_coarse.PLANES, planes.double(), strict=True))
     glow = of["emission"].clamp(min=0) if hot else torch.zeros(size, dtype=torch.float64)
     depth = ((far - of["depth"]) / (far - near)).clamp(0, 1) * (of["depth"] > 0)
     lights = [_srgb(of[name]) for name in ("right", "left", "top", "bottom", "front", "back")]
-    wanted = torch.stack([*lights, _srgb(glow / (1 + glow)), 1 - of["transparency"], depth])
-    torch.testing.assert_close(found, wanted, rtol=1e-6, atol=1e-6, equal_nan=True)
-    assert hot or (found[LIGHTS] == 0).all()
+    expected = torch.stack([*lights, _srgb(glow / (1 + glow)), 1 - of["transparency"], depth])
+    torch.testing.assert_close(result, expected, rtol=1e-6, atol=1e-6, equal_nan=True)
+    assert hot or (result[LIGHTS] == 0).all()
 
 
 def test_decode(device):
@@ -157,16 +157,16 @@ def test_decode(device):
         planes[:, i // 7, i % 7] = value
     out = wp.full(planes.shape, -1.0, dtype=float, device=device)
     decode(_array(planes, False, device), out)
-    found, code = torch.from_numpy(out.numpy()).double(), planes.double()
+    result, code = torch.from_numpy(out.numpy()).double(), planes.double()
     light = torch.where(code <= 0.04045, code.clamp(min=0) / 12.92, ((code.clamp(min=0.04) + 0.055) / 1.055) ** 2.4)
-    torch.testing.assert_close(found[:LIGHTS], light[:LIGHTS].float().double(), rtol=3e-6, atol=0, equal_nan=True)
-    torch.testing.assert_close(found[LIGHTS], 1 - code[LIGHTS].clamp(0, 1), rtol=0, atol=1e-7, equal_nan=True)
+    torch.testing.assert_close(result[:LIGHTS], light[:LIGHTS].float().double(), rtol=3e-6, atol=0, equal_nan=True)
+    torch.testing.assert_close(result[LIGHTS], 1 - code[LIGHTS].clamp(0, 1), rtol=0, atol=1e-7, equal_nan=True)
     share = light[LIGHTS + 1].clamp(max=1)
     glow = (share / (1 - share)).clamp(max=65504.0)
     # Near 1 what is left of it has few digits.
     near = share > 0.99
-    torch.testing.assert_close(found[LIGHTS + 1][~near], glow[~near], rtol=1e-4, atol=1e-7, equal_nan=True)
-    assert (found[LIGHTS + 1][near] > 90).all() and found[LIGHTS + 1][share == 1].eq(65504.0).all()
+    torch.testing.assert_close(result[LIGHTS + 1][~near], glow[~near], rtol=1e-4, atol=1e-7, equal_nan=True)
+    assert (result[LIGHTS + 1][near] > 90).all() and result[LIGHTS + 1][share == 1].eq(65504.0).all()
 
 
 def test_wrong_edges_and_reaches_are_refused():

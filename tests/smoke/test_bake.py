@@ -91,12 +91,12 @@ def test_shading_approximates_oblique_lights(device: str):
     corners = [np.roll((0, a, b * golden), k) for k in range(3) for a in (-1, 1) for b in (-1, 1)]
     turn = np.linalg.qr(np.random.default_rng(4).normal(size=(3, 3)))[0]
     ways = np.array(corners) @ turn / math.sqrt(1 + golden**2)
-    want = torch.stack([lit(volume, camera, camera.axes.T @ way, step=0.7) for way in ways]).double().cpu()
+    expected = torch.stack([lit(volume, camera, camera.axes.T @ way, step=0.7) for way in ways]).double().cpu()
     ratio, error = {}, {}
     for rule in RULES:
-        got = torch.einsum("lc,chw->lhw", torch.tensor(weights(ways, rule)), six)
-        ratio[rule] = float(got.sum() / want.sum())
-        error[rule] = float((got - want).square().mean().sqrt())
+        result = torch.einsum("lc,chw->lhw", torch.tensor(weights(ways, rule)), six)
+        ratio[rule] = float(result.sum() / expected.sum())
+        error[rule] = float((result - expected).square().mean().sqrt())
     assert 0.9 < ratio["squared"] < 1.05 and 0.9 < ratio["normalised"] < 1.05
     assert 1.3 < ratio["absolute"] < 1.65
     assert error["squared"] < 0.6 * error["absolute"]
@@ -118,11 +118,11 @@ def test_supersampling(device: str):
     """A pixel of n x n rays is the mean of the n x n pixels of a finer image."""
     volume = _plume(device)
     camera = facing(volume, size=12)
-    got = bake(volume, camera, step=1.0, supersample=3)
+    result = bake(volume, camera, step=1.0, supersample=3)
     fine = bake(volume, camera.finer(3), step=1.0)
-    want = torch.nn.functional.avg_pool2d(fine.lightmaps[None], 3)[0]
-    np.testing.assert_allclose(got.lightmaps.cpu(), want.cpu(), rtol=1e-6)
-    assert got.lightmaps.shape == (6, 12, 12) and got.error.rms > 0
+    expected = torch.nn.functional.avg_pool2d(fine.lightmaps[None], 3)[0]
+    np.testing.assert_allclose(result.lightmaps.cpu(), expected.cpu(), rtol=1e-6)
+    assert result.lightmaps.shape == (6, 12, 12) and result.error.rms > 0
 
 
 def test_emission(device: str):
@@ -182,13 +182,13 @@ def test_against_a_path_tracer(name: str):
     ours = bake(volume, camera, step=0.25, supersample=4, estimate=False)
     for index, way in enumerate(VECTORS):
         runs = np.stack([trace.trace(way, 2048, seed) for seed in range(4)])
-        want = ours.lightmaps[index].double().numpy()
+        expected = ours.lightmaps[index].double().numpy()
         light = runs[..., 0].astype(np.float64)
-        energy, noise = np.square(want).mean(), light.var(0, ddof=1).mean() / len(light)
-        above = np.square(light.mean(0) - want).mean() - noise
+        energy, noise = np.square(expected).mean(), light.var(0, ddof=1).mean() / len(light)
+        above = np.square(light.mean(0) - expected).mean() - noise
         # The noise itself is known to a few times sqrt(2 / pixels) of it, and the mean to its standard error.
-        assert above < 1e-4 * energy + 4.0 * noise * math.sqrt(2.0 / want.size), DIRECTIONS[index]
-        assert abs(light.mean() - want.mean()) < 0.002 * want.mean() + 4.0 * math.sqrt(noise / want.size)
+        assert above < 1e-4 * energy + 4.0 * noise * math.sqrt(2.0 / expected.size), DIRECTIONS[index]
+        assert abs(light.mean() - expected.mean()) < 0.002 * expected.mean() + 4.0 * math.sqrt(noise / expected.size)
     assert np.abs(1 - runs[..., 3].mean(0) - ours.transparency.numpy()).max() < 0.05
 
 
@@ -203,10 +203,10 @@ def test_oblique_lights_against_a_path_tracer(way: tuple):
     unit = np.array(way) / np.linalg.norm(way)
     rays = 16
     fine = lit(volume, camera.finer(rays), camera.axes.T @ unit, step=0.25)
-    want = torch.nn.functional.avg_pool2d(fine[None], rays)[0].double().numpy()
+    expected = torch.nn.functional.avg_pool2d(fine[None], rays)[0].double().numpy()
     runs = np.stack([trace.trace(unit, 2048, seed)[..., 0] for seed in range(4)])
     runs = runs.astype(np.float64)
-    energy, noise = np.square(want).mean(), runs.var(0, ddof=1).mean() / len(runs)
-    above = np.square(runs.mean(0) - want).mean() - noise
-    assert above < 1e-4 * energy + 4.0 * noise * math.sqrt(2.0 / want.size)
-    assert abs(runs.mean() - want.mean()) < 0.002 * want.mean() + 4.0 * math.sqrt(noise / want.size)
+    energy, noise = np.square(expected).mean(), runs.var(0, ddof=1).mean() / len(runs)
+    above = np.square(runs.mean(0) - expected).mean() - noise
+    assert above < 1e-4 * energy + 4.0 * noise * math.sqrt(2.0 / expected.size)
+    assert abs(runs.mean() - expected.mean()) < 0.002 * expected.mean() + 4.0 * math.sqrt(noise / expected.size)

@@ -34,11 +34,11 @@ def _planes(volume: DensityVolume, camera: Camera, **settings) -> torch.Tensor:
     return march_planes(volume, camera, March(**settings))
 
 
-def _errors(found: SixWay, exact: SixWay) -> tuple[float, float]:
+def _errors(result: SixWay, exact: SixWay) -> tuple[float, float]:
     """Greatest and mean error of any plane, over the plane's greatest value."""
-    pairs = [*zip(found.lightmaps, exact.lightmaps, strict=True), (found.transparency, exact.transparency)]
+    pairs = [*zip(result.lightmaps, exact.lightmaps, strict=True), (result.transparency, exact.transparency)]
     if exact.emission is not None:
-        pairs += [(found.emission, exact.emission)]
+        pairs += [(result.emission, exact.emission)]
     errors = [(a - b).abs() / b.abs().max() for a, b in pairs]
     return max(float(e.max()) for e in errors), max(float(e.mean()) for e in errors)
 
@@ -59,8 +59,8 @@ def test_small_steps_give_the_fine_march(device: str, view: str):
     exact = bake(volume, camera, step=0.25, g=0.4, estimate=False)
     errors = []
     for step, spacing in ((4.0, 4.0), (2.0, 2.0), (0.5, 1.0)):
-        found = _march(volume, camera, step=step, spacing=spacing, jitter=0.0, g=0.4)
-        errors.append(_errors(found, exact))
+        result = _march(volume, camera, step=step, spacing=spacing, jitter=0.0, g=0.4)
+        errors.append(_errors(result, exact))
     # Where the box cuts smoke off, the shadow ends within a gap between nodes.
     assert errors[2][0] < 0.06 and errors[2][1] < 0.004
     assert errors[2][1] < 0.5 * errors[1][1] < 0.3 * errors[0][1]
@@ -74,8 +74,8 @@ def test_boxes(device: str, shape: tuple[int, int, int], view: str):
     volume = from_array(rng.uniform(0.5, 1.0, shape).astype(np.float32), extinction=0.1, device=device)
     camera = _camera(volume, 32, VIEWS[view])
     exact = bake(volume, camera, step=0.25, estimate=False)
-    found = _march(volume, camera, step=0.5, spacing=1.0, jitter=0.0)
-    most, mean = _errors(found, exact)
+    result = _march(volume, camera, step=0.5, spacing=1.0, jitter=0.0)
+    most, mean = _errors(result, exact)
     # Light that grazes a sheet changes within it by more than nodes a voxel apart can follow.
     limits = (0.03, 0.004) if min(shape) > 1 else (0.12, 0.02)
     assert most < limits[0] and mean < limits[1]
@@ -117,14 +117,14 @@ def test_a_pixel_by_float64(device: str):
     x = volume.extinction * h * density(ray)
     passed = np.cumsum(x) - x
     share = np.exp(-passed) * -np.expm1(-x)
-    found = _march(volume, camera, step=0.1, spacing=1.0, light_step=0.1, jitter=0.0, cutoff=0.0)
+    result = _march(volume, camera, step=0.1, spacing=1.0, light_step=0.1, jitter=0.0, cutoff=0.0)
     for name, light in (("right", right), ("left", -right), ("top", up), ("bottom", -up)):
         tau = volume.extinction * h * density(ray[:, None] + way[:, None] * light).sum(1)
-        assert float(found[name]) == pytest.approx(float((share * np.exp(-tau)).sum()), rel=0.01)
+        assert float(result[name]) == pytest.approx(float((share * np.exp(-tau)).sum()), rel=0.01)
     t = np.exp(-x.sum())
-    assert float(found.transparency) == pytest.approx(t, rel=1e-3)
-    assert float(found["front"]) == pytest.approx(0.5 * (1 - t * t), rel=1e-3)
-    assert float(found["back"]) == pytest.approx(-t * np.log(t), rel=1e-3)
+    assert float(result.transparency) == pytest.approx(t, rel=1e-3)
+    assert float(result["front"]) == pytest.approx(0.5 * (1 - t * t), rel=1e-3)
+    assert float(result["back"]) == pytest.approx(-t * np.log(t), rel=1e-3)
 
 
 def test_shadows_to_all_sides(device: str):
@@ -199,49 +199,49 @@ def test_front_and_back_follow_from_the_transparency(device: str):
     torch.testing.assert_close(exact["front"].double(), 0.5 * (1 - t * t), rtol=0, atol=2e-4)
     back = torch.where(t > 0, -t * t.clamp(min=1e-30).log(), 0.0)
     torch.testing.assert_close(exact["back"].double(), back, rtol=0, atol=2e-4)
-    found = _march(volume, _camera(volume), step=4.0)
-    t = found.transparency.double()
-    torch.testing.assert_close(found["front"].double(), 0.5 * (1 - t * t), rtol=0, atol=1e-6)
+    result = _march(volume, _camera(volume), step=4.0)
+    t = result.transparency.double()
+    torch.testing.assert_close(result["front"].double(), 0.5 * (1 - t * t), rtol=0, atol=1e-6)
 
 
 def _shifts(seed: int, device: str, size: int = 64, jitter: float = 1.0) -> torch.Tensor:
     """The jitter of a single step through the box, by the depth of its sample."""
     volume = from_array(np.ones((8, 8, 8), np.float32), device=device)
     camera = Camera.look_at((4.0, 4.0, 18.5), (4.0, 4.0, 4.0), extent=6.0, height=size, width=size)
-    found = _march(volume, camera, step=9.0, jitter=jitter, seed=seed, threshold=0.0)
-    return (found.depth.cpu().double() - 10.0) / 9.0
+    result = _march(volume, camera, step=9.0, jitter=jitter, seed=seed, threshold=0.0)
+    return (result.depth.cpu().double() - 10.0) / 9.0
 
 
 @pytest.mark.parametrize("seed", [1, 63, 64 * 10**12 + 9, -3])
 def test_jitter(device: str, seed: int):
     """Jimenez's noise, of which 64 patterns differ; half of it is half as wide."""
-    found = _shifts(seed, device)
-    assert float(found.min()) > -1e-6 and float(found.max()) < 1.0
+    result = _shifts(seed, device)
+    assert float(result.min()) > -1e-6 and float(result.max()) < 1.0
     y, x = np.mgrid[:64, :64] + 5.588238 * (seed % 64)
-    wanted = np.mod(52.9829189 * np.mod(0.06711056 * x + 0.00583715 * y, 1.0), 1.0)
-    off = np.abs(found.numpy() - wanted)
+    expected = np.mod(52.9829189 * np.mod(0.06711056 * x + 0.00583715 * y, 1.0), 1.0)
+    off = np.abs(result.numpy() - expected)
     assert np.minimum(off, 1.0 - off).max() < 2e-3
-    assert torch.equal(found, _shifts(seed, device)) and torch.equal(found, _shifts(seed % 64 + 128, device))
-    assert float((found - _shifts(seed + 1, device)).abs().mean()) > 0.1
+    assert torch.equal(result, _shifts(seed, device)) and torch.equal(result, _shifts(seed % 64 + 128, device))
+    assert float((result - _shifts(seed + 1, device)).abs().mean()) > 0.1
     half = _shifts(seed, device, jitter=0.5)
-    torch.testing.assert_close(half, 0.5 + 0.5 * (found - 0.5), rtol=0, atol=1e-6)
+    torch.testing.assert_close(half, 0.5 + 0.5 * (result - 0.5), rtol=0, atol=1e-6)
 
 
 def test_jitter_over_a_few_pixels(device: str):
     """Their mean varies far less than that of independent numbers, and all numbers are as frequent."""
-    found = _shifts(11, device)
-    means = torch.nn.functional.avg_pool2d(found[None], 5)[0]
+    result = _shifts(11, device)
+    means = torch.nn.functional.avg_pool2d(result[None], 5)[0]
     assert float(means.std()) < 0.5 * (1 / 12) ** 0.5 / 5
-    counts = torch.histc(found.float(), 8, 0.0, 1.0)
-    assert float(counts.min()) > 0.85 * found.numel() / 8
+    counts = torch.histc(result.float(), 8, 0.0, 1.0)
+    assert float(counts.min()) > 0.85 * result.numel() / 8
 
 
 def test_nodes_are_bounded(device: str):
     """However close they are asked for, and however thin the box."""
     volume = _blob((12, 9, 10), device)
     camera = _camera(volume)
-    wanted = _planes(volume, camera, step=1.0, spacing=0.25)
-    assert torch.equal(_planes(volume, camera, step=1.0, spacing=0.01, light_step=0.25), wanted)
+    expected = _planes(volume, camera, step=1.0, spacing=0.25)
+    assert torch.equal(_planes(volume, camera, step=1.0, spacing=0.01, light_step=0.25), expected)
     for shape, spacing in (((400, 400, 400), 1.0), ((10**6, 1, 1), 5.0), ((2, 30000, 30000), 1e-3)):
         box = SimpleNamespace(origin=np.zeros(3), voxel=1.0, shape=shape)
         view = _camera(volume, toward=VIEWS["diagonal"]).view(box)

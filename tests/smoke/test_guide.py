@@ -32,9 +32,9 @@ def test_depth_is_in_the_world(device: str, perspective: bool):
     """A pixel's depth along its ray ends on the ball's face; scale and shift change nothing else."""
     volume = _ball(device)
     camera = _camera(volume, extent=0.4 if perspective else 16.0, perspective=perspective)
-    got = guide(volume, camera, March(0.5, jitter=0.0, threshold=0.05))
+    result = guide(volume, camera, March(0.5, jitter=0.0, threshold=0.05))
     origin, way = (part.numpy() for part in camera.rays())
-    depth = got.depth.cpu().numpy().astype(np.float64)
+    depth = result.depth.cpu().numpy().astype(np.float64)
     hit = depth > 0
     assert 50 < hit.sum() < 24 * 24
     distance = np.linalg.norm((origin + depth[..., None] * way - volume.centre)[hit], axis=1)
@@ -43,8 +43,8 @@ def test_depth_is_in_the_world(device: str, perspective: bool):
     twice = DensityVolume(volume.density, 0.5 * volume.extinction, 2 * volume.voxel, (0.0, 0.0, 0.0))
     far = _camera(twice, distance=60.0, extent=0.4 if perspective else 32.0, perspective=perspective)
     other = guide(twice, far, March(0.5, jitter=0.0, threshold=0.05))
-    np.testing.assert_allclose(other.light.cpu(), got.light.cpu(), atol=2e-4)
-    np.testing.assert_allclose(other.depth.cpu(), 2 * got.depth.cpu(), atol=2e-3)
+    np.testing.assert_allclose(other.light.cpu(), result.light.cpu(), atol=2e-4)
+    np.testing.assert_allclose(other.depth.cpu(), 2 * result.depth.cpu(), atol=2e-3)
 
 
 def test_distance_of_an_orthographic_camera(device: str):

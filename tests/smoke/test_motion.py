@@ -12,8 +12,8 @@ from wlm.fluid.volume import from_array
 from wlm.smoke.baking import bake
 from wlm.smoke.learn.dataset import make_validation
 from wlm.smoke.learn.losses import warp
+from wlm.smoke.learn.motion import motion
 from wlm.smoke.learn.settings import DatasetSettings
-from wlm.smoke.motion import motion
 from wlm.smoke.planes import OPACITY_PLANE
 
 SIZE = 24
@@ -48,8 +48,8 @@ def test_uniform_motion(device: str, way: tuple):
     opacity = 1.0 - bake(after, camera, estimate=False).transparency
     right, up, _ = camera.axes @ (0.5 * shift) / camera.pitch
     smoke = opacity > 0.01
-    for plane, want in zip(moved, (right, -up), strict=True):
-        np.testing.assert_allclose(plane[smoke].cpu(), want, atol=1e-4)
+    for plane, expected in zip(moved, (right, -up), strict=True):
+        np.testing.assert_allclose(plane[smoke].cpu(), expected, atol=1e-4)
         assert (plane[opacity == 0] == 0).all() and smoke.any() and not smoke.all()
     # What the smoke has left behind has no motion: it shows none any more.
     earlier = 1.0 - bake(before, camera, estimate=False).transparency
@@ -71,10 +71,10 @@ def test_rotation(device: str):
     origin, _ = (part.numpy() for part in camera.rays())
     x, y = origin[..., 0], origin[..., 1]
     cos, sin = np.cos(angle), np.sin(angle)
-    want = np.stack([x - (cos * x + sin * y), -(y - (cos * y - sin * x))]) / camera.pitch
+    expected = np.stack([x - (cos * x + sin * y), -(y - (cos * y - sin * x))]) / camera.pitch
     smoke = np.hypot(x, y) < 17
-    np.testing.assert_allclose(moved[:, smoke], want[:, smoke], atol=angle**3 / 4 * 18 / camera.pitch)
-    assert np.abs(want[:, smoke]).max() > 2
+    np.testing.assert_allclose(moved[:, smoke], expected[:, smoke], atol=angle**3 / 4 * 18 / camera.pitch)
+    assert np.abs(expected[:, smoke]).max() > 2
 
 
 @pytest.mark.parametrize("thickness", [0.02, 0.3, 20.0])
@@ -88,8 +88,8 @@ def test_hidden_smoke(device: str, thickness: float):
     moved = motion(volume, _velocity(velocity, device), facing(volume, size=12), reach=1.5, step=0.125)
     before = 1 - np.exp(-4 * thickness)
     behind = (1 - before) * before
-    want = 1.5 * (behind - before) / (behind + before) / (1.1 * 16 / 12)
-    np.testing.assert_allclose(moved[0, 4:8, 4:8].cpu(), want, rtol=0.01)
+    expected = 1.5 * (behind - before) / (behind + before) / (1.1 * 16 / 12)
+    np.testing.assert_allclose(moved[0, 4:8, 4:8].cpu(), expected, rtol=0.01)
     assert not moved[1].any()
 
 
@@ -104,9 +104,9 @@ def test_against_a_loop(device: str, dtype: type):
     assert volume.density.dtype == (torch.float16 if dtype is np.float16 else torch.float32)
     camera = facing(volume, (0.7, 0.3, 1.0), 9)
     moved = motion(volume, _velocity(air, device), camera, reach=0.6, step=1.37).cpu().numpy()
-    want, opacity = _loop(density.astype(np.float64), 0.2, air, 1.2, camera, volume, 1.37)
-    np.testing.assert_allclose(moved, want, atol=2e-4)
-    assert (opacity > 0.01).sum() > 30 and np.abs(want).max() > 0.5
+    expected, opacity = _loop(density.astype(np.float64), 0.2, air, 1.2, camera, volume, 1.37)
+    np.testing.assert_allclose(moved, expected, atol=2e-4)
+    assert (opacity > 0.01).sum() > 30 and np.abs(expected).max() > 0.5
 
 
 def _loop(density, extinction, air, reach, camera, volume, h):
@@ -198,12 +198,12 @@ def test_optical_flow_sees_the_same_motion():
     for opacity, moved in zip(pool.targets[:, :, OPACITY_PLANE].float(), pool.motion.float(), strict=True):
         earlier, later = ((255 * picture).byte().numpy() for picture in opacity)
         # From the later frame back to the earlier one, which is what a pixel's motion is told by.
-        found = -flow.calc(later, earlier, None).transpose(2, 0, 1)
+        result = -flow.calc(later, earlier, None).transpose(2, 0, 1)
         slope = np.stack(np.gradient(opacity[1].numpy())[::-1])
         steep = np.linalg.norm(slope, axis=0)
         edges = (opacity[1].numpy() > 0.1) & (steep > 0.01)
         across = (slope / np.maximum(steep, 1e-6))[:, edges]
-        theirs, ours = ((part[:, edges] * across).sum(0) for part in (found, moved.numpy()))
+        theirs, ours = ((part[:, edges] * across).sum(0) for part in (result, moved.numpy()))
         alike.append(np.corrcoef(theirs, ours)[0, 1])
         still, followed = (
             float((picture - opacity[1])[torch.from_numpy(edges)].abs().mean())

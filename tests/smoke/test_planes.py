@@ -91,14 +91,14 @@ def test_a_guide_of_each_kind(device, kind):
 def test_the_light_of_a_kind_is_the_sum_of_its_lights(device):
     volume = plume(device=device)
     camera = view_of(volume)
-    found = {kind: render_guide(volume, camera, kind, replace(STILL, step=1.0)) for kind in GUIDES}
-    six = dict(zip(GUIDES["six"], from_srgb(found["six"]), strict=True))
+    result = {kind: render_guide(volume, camera, kind, replace(STILL, step=1.0)) for kind in GUIDES}
+    six = dict(zip(GUIDES["six"], from_srgb(result["six"]), strict=True))
     for kind, names in {
         "paper": ("front", "top", "bottom"),
         "front": ("front",),
         "sides": ("front", "right", "left"),
     }.items():
-        light = from_srgb(found[kind][0])
+        light = from_srgb(result[kind][0])
         assert torch.allclose(light, sum(six[name] for name in names), atol=1e-5), kind
     assert not six["emission"].any()
 
@@ -107,12 +107,12 @@ def test_six_are_the_coarse_march_as_lightmaps_are_encoded(device):
     volume = replace(plume(hot=True, device=device), emission=30.0)
     camera = view_of(volume)
     planes = render_guide(volume, camera, "six", MARCH)
-    wanted = encode_lightmaps(march(volume, camera, MARCH))
-    for name, plane in zip(PLANES, wanted, strict=True):
+    expected = encode_lightmaps(march(volume, camera, MARCH))
+    for name, plane in zip(PLANES, expected, strict=True):
         torch.testing.assert_close(planes[GUIDES["six"].index(name)], plane, rtol=1e-6, atol=1e-6, msg=name)
     assert planes[GUIDES["six"].index("emission")].max() > 0.5
     # As the other kinds' is, by torch.
-    maps = torch.stack([wanted[0], wanted[OPACITY_PLANE], march(volume, camera, MARCH).depth])
+    maps = torch.stack([expected[0], expected[OPACITY_PLANE], march(volume, camera, MARCH).depth])
     depth = encode_guide(maps, *span(volume, camera))[2]
     torch.testing.assert_close(planes[GUIDES["six"].index("depth")], depth, rtol=1e-6, atol=1e-6)
     cold = render_guide(replace(volume, temperature=None), camera, "six", MARCH)
@@ -144,21 +144,21 @@ def test_lightmaps_come_back(device, hot):
     assert six.lightmaps.max() > 1
     planes = encode_lightmaps(six)
     assert planes.shape == (len(PLANES), 32, 32) and torch.isfinite(planes).all() and planes[6:].max() < 1
-    found = decode_lightmaps(planes, hot=hot)
-    assert torch.allclose(found.lightmaps, six.lightmaps, atol=1e-5)
-    assert torch.allclose(found.transparency, six.transparency, atol=1e-6)
+    result = decode_lightmaps(planes, hot=hot)
+    assert torch.allclose(result.lightmaps, six.lightmaps, atol=1e-5)
+    assert torch.allclose(result.transparency, six.transparency, atol=1e-6)
     if hot:
         assert six.emission.max() > 1
-        assert torch.allclose(found.emission, six.emission, rtol=1e-4, atol=1e-5)
+        assert torch.allclose(result.emission, six.emission, rtol=1e-4, atol=1e-5)
     else:
-        assert (planes[7] == 0).all() and found.emission is None
+        assert (planes[7] == 0).all() and result.emission is None
 
 
 def test_decoding_clamps_what_no_plane_can_be():
     planes = torch.stack([torch.full((2, 2), value) for value in (-1, -0.1, 0, 0.5, 1, 2, 1.5, 1.2)])
-    found = decode_lightmaps(planes)
-    assert found.lightmaps.min() == 0 and found.transparency.max() == 0
-    assert torch.isfinite(found.emission).all() and found.emission.half().isfinite().all()
+    result = decode_lightmaps(planes)
+    assert result.lightmaps.min() == 0 and result.transparency.max() == 0
+    assert torch.isfinite(result.emission).all() and result.emission.half().isfinite().all()
 
 
 def test_wrong_shapes_are_refused():

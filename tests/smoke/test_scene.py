@@ -295,10 +295,10 @@ def test_frames_evenly_spread():
 def test_a_volume_comes_back(tmp_path, hot, device):
     volume = plume(hot=hot, device=device)
     save_volume(tmp_path / "a.npz", volume)
-    found = load_volume(tmp_path / "a.npz", device=device)
-    assert torch.equal(found.density, volume.density)
-    assert (found.temperature is not None) == hot
-    assert not hot or torch.equal(found.temperature, volume.temperature)
+    result = load_volume(tmp_path / "a.npz", device=device)
+    assert torch.equal(result.density, volume.density)
+    assert (result.temperature is not None) == hot
+    assert not hot or torch.equal(result.temperature, volume.temperature)
 
 
 @pytest.mark.parametrize("hot", [False, True])
@@ -310,23 +310,23 @@ def test_lightmaps_in_a_file(tmp_path, hot, device):
     planes, _ = read_planes(tmp_path / "a.exr")
     names = ["right", "left", "top", "bottom", "front", "back", "transparency", *(["emission"] if hot else [])]
     assert sorted(planes) == sorted(names)
-    found = read_six_way(tmp_path / "a.exr", device)
-    assert found.camera == camera and (found.emission is not None) == hot
-    torch.testing.assert_close(found.lightmaps, six.lightmaps.half().float(), rtol=0, atol=0)
-    torch.testing.assert_close(found.transparency, six.transparency.half().float(), rtol=0, atol=0)
+    result = read_six_way(tmp_path / "a.exr", device)
+    assert result.camera == camera and (result.emission is not None) == hot
+    torch.testing.assert_close(result.lightmaps, six.lightmaps.half().float(), rtol=0, atol=0)
+    torch.testing.assert_close(result.transparency, six.transparency.half().float(), rtol=0, atol=0)
 
 
 def test_a_guiding_map_in_a_file(tmp_path):
     volume = plume()
     camera = make_camera(CameraSettings(resolution=16, distance=9e4), volume.origin, (1, 1.2, 1))
-    found = guide(volume, camera)
-    write_guide(tmp_path / "a.exr", found)
+    result = guide(volume, camera)
+    write_guide(tmp_path / "a.exr", result)
     planes, note = read_planes(tmp_path / "a.exr")
     assert note["camera"]["extent"] == camera.extent
     # Not half floats: depths are far beyond them.
-    np.testing.assert_array_equal(planes["depth"], found.depth.numpy())
-    np.testing.assert_array_equal(planes["light"], found.light.numpy())
-    np.testing.assert_array_equal(planes["transparency"], found.transparency.numpy())
+    np.testing.assert_array_equal(planes["depth"], result.depth.numpy())
+    np.testing.assert_array_equal(planes["light"], result.light.numpy())
+    np.testing.assert_array_equal(planes["transparency"], result.transparency.numpy())
     assert planes["depth"].max() > 65504
 
 

@@ -35,9 +35,9 @@ def test_one_light_along_each_axis(device: str):
     six = _six(device)
     for index, way in enumerate(VECTORS):
         toward = tuple(5.0 * six.camera.axes.T @ way)
-        got = six.shade([Light(toward, (4 * math.pi, 2 * math.pi, 0.0))])
-        want = six.lightmaps[index][..., None] * torch.tensor([1.0, 0.5, 0.0], device=device)
-        np.testing.assert_allclose(got.cpu(), want.cpu(), atol=1e-6)
+        result = six.shade([Light(toward, (4 * math.pi, 2 * math.pi, 0.0))])
+        expected = six.lightmaps[index][..., None] * torch.tensor([1.0, 0.5, 0.0], device=device)
+        np.testing.assert_allclose(result.cpu(), expected.cpu(), atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -48,8 +48,8 @@ def test_rules(device: str, rule: str, share: tuple):
     """A light to the left and the back, by each rule; eq. 5 is "absolute"."""
     six = _six(device)
     toward = tuple(six.camera.axes.T @ np.array([-3.0, 0.0, -4.0]))
-    got = six.shade([Light(toward, FULL)], rule=rule)[..., 0]
-    np.testing.assert_allclose(got.cpu(), (share[0] * six["left"] + share[1] * six["back"]).cpu(), atol=1e-6)
+    result = six.shade([Light(toward, FULL)], rule=rule)[..., 0]
+    np.testing.assert_allclose(result.cpu(), (share[0] * six["left"] + share[1] * six["back"]).cpu(), atol=1e-6)
 
 
 def test_lights_add_up(device: str):
@@ -60,8 +60,8 @@ def test_lights_add_up(device: str):
     np.testing.assert_allclose(six.shade(lights).cpu(), both.cpu(), rtol=1e-5)
     assert not six.shade([]).any()
     half = Light(lights[0].toward, lights[0].irradiance, torch.full((8, 8), 0.5, device=device))
-    want = 0.5 * six.shade(lights[:1])
-    np.testing.assert_allclose(six.shade([half]).cpu(), want.cpu(), rtol=1e-5)
+    expected = 0.5 * six.shade(lights[:1])
+    np.testing.assert_allclose(six.shade([half]).cpu(), expected.cpu(), rtol=1e-5)
 
 
 def test_glow(device: str):
@@ -69,10 +69,10 @@ def test_glow(device: str):
     six = _six(device, emission=True)
     np.testing.assert_allclose(six.shade([]).cpu(), six.emission[..., None].expand(8, 8, 3).cpu())
     ramp = Ramp((0.5, 1.0, 1.5), ((0, 0, 0), (1, 0.5, 0), (4, 4, 2)))
-    got = six.shade([], ramp=ramp).cpu().numpy()
+    result = six.shade([], ramp=ramp).cpu().numpy()
     for c in range(3):
-        want = np.interp(six.emission.cpu(), ramp.stops, [colour[c] for colour in ramp.colours])
-        np.testing.assert_allclose(got[..., c], want, atol=1e-5)
+        expected = np.interp(six.emission.cpu(), ramp.stops, [colour[c] for colour in ramp.colours])
+        np.testing.assert_allclose(result[..., c], expected, atol=1e-5)
     for wrong in (((1.0,), ((1, 1, 1),)), ((1.0, 1.0), ((0, 0, 0),) * 2), ((0.0, 1.0), ((0, 0, 0), (0, math.nan, 0)))):
         with pytest.raises(ValueError, match="ramp"):
             Ramp(*wrong)
@@ -83,9 +83,9 @@ def test_background(device: str):
     six = _six(device)
     light = six.shade([Light((0.0, 0.0, 1.0))])
     for background in ((1.0, 2.0, 3.0), torch.rand((8, 8, 3), device=device)):
-        got = six.shade([Light((0.0, 0.0, 1.0))], background=background)
-        want = light + six.transparency[..., None] * torch.as_tensor(background, device=device)
-        np.testing.assert_allclose(got.cpu(), want.cpu(), rtol=1e-6)
+        result = six.shade([Light((0.0, 0.0, 1.0))], background=background)
+        expected = light + six.transparency[..., None] * torch.as_tensor(background, device=device)
+        np.testing.assert_allclose(result.cpu(), expected.cpu(), rtol=1e-6)
 
 
 @pytest.mark.parametrize("perspective", [False, True])
@@ -104,7 +104,7 @@ def test_shadow_of_a_box(device: str, toward: tuple, perspective: bool):
     depth = (0.3 - origin @ normal) / (ray @ normal)
     depth[:, :3] = 0.0
     depths = torch.tensor(depth, dtype=torch.float32, device=device)
-    got = obstacle_visibility(depths, camera, toward, *_box(low, high, device), resolution=512)
+    result = obstacle_visibility(depths, camera, toward, *_box(low, high, device), resolution=512)
     at = origin + depth[..., None] * ray
     light = np.array(toward) / np.linalg.norm(toward)
 
@@ -115,22 +115,22 @@ def test_shadow_of_a_box(device: str, toward: tuple, perspective: bool):
         return (near < far) & (far > shrink)
 
     rim = 0.03
-    got = got.cpu().numpy()
+    result = result.cpu().numpy()
     sure = depth > 0
     assert (hidden(rim) & sure).sum() > 20
-    assert (got[sure & hidden(rim)] < 1e-6).all()
-    assert (got[sure & ~hidden(-rim)] == 1).all()
-    assert (got[~sure] == 1).all()
+    assert (result[sure & hidden(rim)] < 1e-6).all()
+    assert (result[sure & ~hidden(-rim)] == 1).all()
+    assert (result[~sure] == 1).all()
 
 
 def test_shadow_falls_behind_only(device: str):
     """Smoke between the light and the obstacle is lit; a greater bias spares what is close behind."""
     camera = Camera.look_at((0, 0, 10), (0, 0, 0), extent=4.0, height=9, width=9)
     box = _box((-1, -1, -0.1), (1, 1, 0.1), device)
-    for depth, bias, want in ((8.0, None, 1.0), (12.0, None, 0.0), (12.0, 3.0, 1.0)):
+    for depth, bias, expected in ((8.0, None, 1.0), (12.0, None, 0.0), (12.0, 3.0, 1.0)):
         depths = torch.full((9, 9), depth, device=device)
-        got = obstacle_visibility(depths, camera, (0, 0, 1), *box, bias=bias)
-        assert float(got[4, 4]) == want and float(got[0, 0]) == 1.0
+        result = obstacle_visibility(depths, camera, (0, 0, 1), *box, bias=bias)
+        assert float(result[4, 4]) == expected and float(result[0, 0]) == 1.0
     none = torch.zeros((0, 3), dtype=torch.int64, device=device)
     assert (obstacle_visibility(depths, camera, (0, 0, 1), box[0], none) == 1).all()
 

@@ -34,9 +34,9 @@ def _paths(folder: Path, suffix: str) -> tuple[Path, Path]:
 def test_there_and_back(tmp_path: Path, layout: str, suffix: str):
     paths, frames = _paths(tmp_path, suffix), _frames()
     assert write_flipbook(paths, frames, layout, rows=2, columns=3) == 0
-    got = read_flipbook(paths, layout, rows=2, columns=3, count=5)
-    assert len(got) == 5
-    for one, frame in zip(got, frames, strict=True):
+    result = read_flipbook(paths, layout, rows=2, columns=3, count=5)
+    assert len(result) == 5
+    for one, frame in zip(result, frames, strict=True):
         for field in ("lightmaps", "transparency", "emission"):
             np.testing.assert_allclose(getattr(one, field), getattr(frame, field), atol=KINDS[suffix], err_msg=field)
 
@@ -91,9 +91,9 @@ def test_gain_and_clipping(tmp_path: Path):
     dim = [SixWay(0.1 * frames[0].lightmaps, frames[0].transparency)]
     paths = _paths(tmp_path, ".png")
     assert write_flipbook(paths, dim, rows=1, columns=1, gain=10.0) == 0
-    got = read_flipbook(paths, rows=1, columns=1, gain=10.0)[0]
-    np.testing.assert_allclose(got.lightmaps, dim[0].lightmaps, atol=0.051 / 255)
-    np.testing.assert_allclose(got.transparency, dim[0].transparency, atol=0.51 / 255)
+    result = read_flipbook(paths, rows=1, columns=1, gain=10.0)[0]
+    np.testing.assert_allclose(result.lightmaps, dim[0].lightmaps, atol=0.051 / 255)
+    np.testing.assert_allclose(result.transparency, dim[0].transparency, atol=0.51 / 255)
     assert write_flipbook(paths, frames, rows=1, columns=1, gain=2.0) == int((frames[0].lightmaps > 0.5).sum())
     bright = [SixWay(70_000.0 * torch.ones(6, 2, 2), torch.zeros(2, 2))]
     assert write_flipbook(_paths(tmp_path, ".exr"), bright, rows=1, columns=1) == 24

@@ -230,7 +230,8 @@ def flipbook(
     columns: Annotated[int | None, typer.Option(min=1, max=64, help="Of cells; default as square as can be.")] = None,
     count: Annotated[int | None, typer.Option(min=1, max=4096, help="Frames, evenly spread; default all.")] = None,
     gain: Annotated[
-        float | None, typer.Option(help="Factor on the light; default 1 in an EXR, else what just doesn't clip.")
+        float | None,
+        typer.Option(help="Factor on the light; default 1 in an EXR, else the greatest without clipping."),
     ] = None,
     step: _BakeStep = None,
     supersample: _BakeSupersample = None,
@@ -295,7 +296,7 @@ def _source(
 
 
 def _shots(source: "BakedFiles | FramesToBake", progress: "OnProgress", count: int | None = None) -> "Iterator[Shot]":
-    """The source's shots; notes what was repaired in their volumes."""
+    """The source's shots; notes repairs of their volumes."""
     for shot in source.shots(count, progress):
         for warning in shot.warnings:
             note(f"warning: {warning}")

@@ -39,7 +39,7 @@ class SmokeOptions:
     ] = None
     turn: Annotated[float, typer.Option(help="Degrees by which the camera is turned about the upward direction.")] = 0.0
     extent: Annotated[
-        float | None, typer.Option(help="Height of the image in the world; default what holds the box.")
+        float | None, typer.Option(help="Height of the image in the world; default such that the box fits.")
     ] = None
     distance: Annotated[
         float | None, typer.Option(help="Of the camera from its target; what is behind it isn't seen. Default outside.")
@@ -64,7 +64,7 @@ class SmokeOptions:
         return load_frames(smoke, extinction=self.extinction, emission=self.emission, device=device)
 
     def camera(self, frames: "Frames", *, orthographic: bool = True, perspective: bool = False) -> "CameraSettings":
-        """The scene's camera, or the default one, with what the options change.
+        """The scene's camera, or the default one, changed by the options.
 
         Raises:
             WlmError: An option is out of its range, or lightmaps are to be made in perspective.
@@ -98,7 +98,7 @@ def with_smoke(command: Callable[..., None]) -> Callable[..., None]:
         inspect.Parameter(field.name, inspect.Parameter.KEYWORD_ONLY, default=field.default, annotation=field.type)
         for field in fields(SmokeOptions)
     ]
-    # What typer reads.
+    # typer reads both.
     run.__signature__ = signature.replace(parameters=[*own, *shared])  # type: ignore[attr-defined]
     run.__annotations__ = {parameter.name: parameter.annotation for parameter in (*own, *shared)}
     return run

@@ -73,7 +73,7 @@ def lit(
     step: float = 0.5,
     g: float = 0.0,
 ) -> torch.Tensor:
-    """Smoke under one light from anywhere, of irradiance 4 pi: what six-way shading approximates.
+    """Smoke under one light from any direction, of irradiance 4 pi, which six-way shading approximates.
 
     Each sample of each ray marches to the light: slow, and independent of `bake`, so that it serves as its check.
 

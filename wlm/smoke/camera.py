@@ -210,7 +210,7 @@ class Camera:
             pixels: H.
             aspect: W over H.
             target: The point in the image's middle; None: the box's centre.
-            extent: The image's height in the world's unit, in perspective at distance 1; None: what holds the box.
+            extent: The image's height in the world's unit, in perspective at distance 1; None: such that the box fits.
             distance: Of the camera from its target; None: outside the box. What is behind the camera isn't seen.
             up: Upwards in the image, as far as it can be.
             perspective: Whether rays meet in the eye; the six-way lightmaps are orthographic.

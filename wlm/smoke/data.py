@@ -148,7 +148,7 @@ def open_frames(folder: str | os.PathLike[str], scene: Scene, *, resume: bool = 
 
     Args:
         folder: Made if its parent is there.
-        scene: What is simulated.
+        scene: The scene to simulate.
         resume: Whether to go on with a simulation of the same scene. Otherwise an earlier one's frames are removed.
 
     Raises:

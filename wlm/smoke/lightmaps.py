@@ -1,4 +1,4 @@
-"""Six-way lightmaps of one frame: what each march and the network return, and how they are lit.
+"""Six-way lightmaps of one frame, the result of each march and of the network, and their shading.
 
 A lightmap holds the light that smoke of albedo 1 sends to the camera under one light of irradiance 4 pi from its
 direction: with g = 0 at most 1/2 from the front and 1 from a side. All is linear. The lightmaps are orthographic, as a

@@ -1,4 +1,4 @@
-"""Frames to be drawn: lightmaps, baked from smoke or read from files, with what a scene adds to their pictures."""
+"""Frames to be drawn: lightmaps, baked from smoke or read from files, with a scene's obstacles and colours."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Shot:
         ramp: The scene's colours of the emission.
         obstacles: The scene's.
         time: Of the obstacles, seconds.
-        warnings: What was repaired in the volume, one line each.
+        warnings: The volume's repairs, one line each.
     """
 
     number: int

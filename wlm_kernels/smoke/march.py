@@ -1,4 +1,4 @@
-"""What every march through smoke shares: the medium, cameras, rays and their steps, samples, the phase function.
+"""The common parts of all marches through smoke: medium, cameras, rays and their steps, samples, phase function.
 
 All is in voxels: the grid `[X, Y, Z]` fills the box from 0 to (X, Y, Z), the centre of voxel i is at i + 1/2, and
 between centres the density is trilinear, with zero outside the grid; so there is smoke up to half a voxel beyond the
@@ -139,7 +139,7 @@ class Ray:
 
 @wp.func
 def ray(view: View, row: int, column: int) -> Ray:
-    """What a pixel sees along; without steps."""
+    """The ray of a pixel, without steps."""
     u = (float(column) + 0.5 - 0.5 * float(view.width)) * view.pitch
     v = (0.5 * float(view.height) - float(row) - 0.5) * view.pitch
     r = Ray()
@@ -213,7 +213,7 @@ def density_at(density: wp.array3d[Any], p: wp.vec3) -> float:
     fx = x - float(i)
     fy = y - float(j)
     fz = z - float(k)
-    # What lies outside has no weight, and its index is moved to one that can be read.
+    # Voxels outside have no weight, and an index that can be read.
     nx = density.shape[0]
     ny = density.shape[1]
     nz = density.shape[2]

@@ -198,7 +198,7 @@ def coarse_kernels(dtype: Any, hot: bool):
                 p = r.origin + s * r.direction
                 sigma = extinction * _sample(density, bricks, p)
                 if wp.static(hot):
-                    # The mean of what is left along the step: fire without smoke shines too.
+                    # The mean transparency along the step: fire without smoke shines too.
                     x = sigma * dt
                     share = wp.where(x > 1.0e-6, absorbed(x) / wp.max(x, 1.0e-6), 1.0)
                     glow += t * share * emission * dt * density_at(temperature, p)

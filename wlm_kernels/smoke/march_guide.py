@@ -131,7 +131,7 @@ def guide_kernels(dtype: Any) -> _Kernels:
                         else:
                             tau = _both_depths(density, p, view.up, extinction, march.step)
                         x = sigma * r.length
-                        # The light from the front comes along the ray, through what the ray has come through.
+                        # The light from the front comes along the ray, through the smoke that the ray has passed.
                         light += 0.5 * front * t * t * absorbed(2.0 * x)
                         light += t * absorbed(x) * (above * wp.exp(-tau[0]) + below * wp.exp(-tau[1]))
                         t *= wp.exp(-x)
@@ -167,15 +167,15 @@ def lattice(medium: Medium, up: Sequence[float], step: float) -> wp.array:
 def guide(medium: Medium, view: View, march: March, out: wp.array, *, shared: bool = True) -> None:
     """A guiding map (algorithm 1): smoke lit from the front, the top and the bottom, its transparency and its depth.
 
-    Where the paper's algorithm leaves h out of a step's share of the light, and takes what it can for sigma h, it is
-    integrated exactly here. Steps are shortened so that a whole number of them fills a ray's way through the grid. The
+    The paper's algorithm lacks the step h in a step's share of the light (line 9); here each step is integrated
+    exactly. Steps are shortened so that a whole number of them fills a ray's way through the grid. The
     paper's side lights, along the cross product of the view and the world's z, would be to the left and right where z
     points up; ours are along the camera's own up and down.
 
     Args:
         medium: The smoke, of albedo 1.
         view: The camera, [H, W] pixels.
-        march: Its steps are those to the lights too. What the cutoff leaves out is less than it in transparency and 2.5
+        march: Its steps are those to the lights too. The cutoff's error is less than it in transparency and 2.5
             times it (for g = 0) in light.
         out: float [3, H, W], written: scattered light under lights of irradiance 4 pi, transparency, and the distance
             from the camera to the first sample denser than the threshold, 0: none.

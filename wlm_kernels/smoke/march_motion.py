@@ -1,4 +1,4 @@
-"""How smoke moves across the image: what is seen along a ray, and how far the air carried it between two frames.
+"""How smoke moves across the image: the visible smoke along a ray, and how far the air carried it between two frames.
 
 Units, sampling and cameras are those of `march`. What a ray sees of a step is what the step keeps of the light,
 T (1 - exp(-sigma h)): hidden smoke counts as little as it is seen. The air's velocities lie on a grid of their own over
@@ -31,7 +31,7 @@ __all__ = ["motion", "motion_kernel"]
 
 _OPTIONS = {"enable_backward": False}
 
-# Voxels from the box's faces: nearer to them a picture of the smoke fades.
+# Voxels from the box's faces, nearer to which the trilinear density fades.
 _BORDER = wp.constant(1.0)
 _CLEAR = wp.constant(1e-3)  # the opacity up to which a pixel counts as one without smoke
 
@@ -112,7 +112,7 @@ def motion_kernel(dtype: Any) -> wp.Kernel:
 
 
 def motion(medium: Medium, view: View, velocity: wp.array, reach: float, march: March, out: wp.array) -> None:
-    """By how many pixels what each pixel shows has moved since the frame before.
+    """By how many pixels the smoke of each pixel has moved since the frame before.
 
     Args:
         medium: The smoke of the later frame.

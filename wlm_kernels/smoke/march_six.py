@@ -264,12 +264,11 @@ def _extent(shape, origin, direction) -> tuple[float, float]:
 def six_way(medium: Medium, view: View, march: March, out: wp.array) -> None:
     """The six lightmaps, the transparency and the emission (eq. 4).
 
-    The camera's plane cuts off what lies behind it: that isn't seen, yet keeps light from the front away. Smoke outside
-    the image, to the sides, does so too.
+    Smoke behind the camera's plane isn't seen, yet takes light from the front; so does smoke outside the image.
 
     Args:
         medium: The smoke, of albedo 1.
-        view: An orthographic camera, [H, W] pixels. Pixel centres alone are looked at.
+        view: An orthographic camera, [H, W] pixels. Rays go through pixel centres.
         march: Its step, along rays and to the lights, and g; samples lie in their steps' middles. The error falls with
             the step's square where the density is smooth.
         out: float [8, H, W], written: the light that reaches the camera from smoke lit from the right, left, top,
@@ -329,7 +328,7 @@ def _slab(start: float, gap: float, planes: int) -> _Slab:
 def lit(medium: Medium, view: View, toward: Sequence[float], march: March, out: wp.array) -> None:
     """Smoke under one light from any direction: every sample of a ray marches to it, with nothing shared.
 
-    What the six lightmaps approximate for a light between their axes (eq. 5), and a check of them along these.
+    The six lightmaps approximate it for a light between their axes (eq. 5); along these it is a check of them.
 
     Args:
         medium: The smoke, of albedo 1.

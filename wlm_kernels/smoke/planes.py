@@ -40,7 +40,7 @@ STRIP = 4
 """Pixels below each other that one thread of `compose` computes."""
 
 Taps = wp.types.vector(PLANES, wp.float32)
-"""What one pixel of one of the guide's planes adds to each plane."""
+"""The weights by which one pixel of one plane of the guide adds to each plane."""
 
 FOOT, FOOT_CODE = 0.0031308, 0.04045
 """Where sRGB's straight foot ends (IEC 61966-2-1), in linear light and encoded."""
@@ -71,7 +71,7 @@ def _load(weights: wp.array1d[Taps], i: int) -> Taps:
 
 @wp.func
 def _srgb(linear: float) -> float:
-    """Linear light to sRGB's curve, which goes on above 1; what is below 0 counts as 0."""
+    """Linear light to sRGB's curve, continued above 1; values below 0 count as 0."""
     if linear <= FOOT:
         return 12.92 * wp.max(linear, 0.0)
     return 1.055 * wp.pow(linear, 1.0 / 2.4) - 0.055
@@ -79,7 +79,7 @@ def _srgb(linear: float) -> float:
 
 @wp.func
 def _linear(code: float) -> float:
-    """The inverse; what is below 0 counts as 0."""
+    """The inverse; values below 0 count as 0."""
     if code <= FOOT_CODE:
         return wp.max(code, 0.0) / 12.92
     return wp.pow((code + 0.055) / 1.055, 2.4)
@@ -156,8 +156,8 @@ def decode(planes: wp.array, out: wp.array) -> None:
 
     Args:
         planes: float [PLANES, H, W]: the lights and the emission e as e / (1 + e) in sRGB, the opacity before it.
-        out: float [PLANES, H, W], written: six lights, transparency, emission up to the largest half float. What is
-            outside a plane's range is clamped to it; a NaN stays one.
+        out: float [PLANES, H, W], written: six lights, transparency, emission up to the largest half float. Values
+            outside a plane's range are clamped to it; a NaN stays one.
     """
     wp.launch(_decode, planes.shape[1:], inputs=[planes], outputs=[out], device=planes.device)
 

@@ -36,10 +36,10 @@ from wlm.fluid.volume import load_volume
 from wlm.interop import check_device, no_collection, stream
 from wlm.smoke.baking import bake
 from wlm.smoke.camera import Camera
+from wlm.smoke.learn.motion import motion
 from wlm.smoke.learn.pool import Pool
 from wlm.smoke.learn.scenes import draw_scene, generator
 from wlm.smoke.learn.settings import EDGE, PERIOD, DatasetSettings
-from wlm.smoke.motion import motion
 from wlm.smoke.planes import GUIDES, PLANES, encode_lightmaps, render_guide
 from wlm.smoke.scene import CameraSettings, Scene, make_camera
 from wlm.smoke.simulation import make_solver, volume_of

@@ -24,7 +24,7 @@ _CUTOFF = 1e-3  # of a ray's transparency: smoke behind it hardly counts
 def motion(
     volume: DensityVolume, velocity: wp.array, camera: Camera, *, reach: float, step: float = 2.0
 ) -> torch.Tensor:
-    """Projects the air's motion into the image, weighted by what the camera sees of the smoke that it carries.
+    """Projects the air's motion into the image, weighted by the visibility of the smoke that it carries.
 
     A pixel shows smoke at many depths, each with a motion of its own: this is their mean, and hidden smoke hardly
     counts. Light that moves while smoke doesn't, such as a shadow's edge, isn't in it.
@@ -39,8 +39,8 @@ def motion(
         step: The longest step, in voxels.
 
     Returns:
-        float32 [2, H, W]: pixels to the right and down by which what a pixel shows has moved since the earlier frame; 0
-        where there is no smoke. So the earlier frame, read at the pixel less this, shows the same smoke.
+        float32 [2, H, W]: pixels to the right and down by which the smoke of a pixel has moved since the earlier frame;
+        0 where there is no smoke. So the earlier frame, read at the pixel less this, shows the same smoke.
 
     Raises:
         ValueError: The camera is in perspective, the velocity isn't vec3 [A, B, C], or a number is out of its range.
