@@ -19,10 +19,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from wlm import ops
+from wlm import ops, smoke
 from wlm.cli.console import quiet_warp, show_figures
 from wlm.errors import WlmError
-from wlm.fluid.volume import load_volume
 from wlm.interop import check_device
 from wlm.view.smoke import contact_sheet, to_bytes
 
@@ -91,7 +90,7 @@ def reconstruct(pictures: tuple[torch.Tensor, torch.Tensor], size: int) -> torch
 
 def run(out: Path, device: str) -> dict[str, float]:
     """Runs the demo, writes its picture and returns its figures."""
-    volume = load_volume(HERE / "data" / "smoke" / "plume.npz", extinction=14.0, device=device)
+    volume = smoke.load(HERE / "data" / "smoke" / "plume.npz", extinction=14.0, device=device)
     # Half the resolution, and the extinction of a voxel of that.
     density = torch.nn.functional.avg_pool3d(volume.density[None], 2)[0] * volume.extinction * 2.0 * volume.voxel
     angles, fitted = (*VIEWS, HELD_OUT), len(VIEWS)

@@ -256,14 +256,6 @@ def test_little_lightmaps_at_the_profiles_budget(name: str, texels: tuple[int, i
         assert model.method == "plain"
 
 
-def test_the_fallback_counts_what_no_view_shows():
-    """With no views the area decides: tiles keep what is hidden."""
-    mesh = charts(lambda place: np.random.default_rng(0).random((64, 64, 3)), 64, 64)
-    model = compress(mesh, STANDARD, views=0, fallback=True)
-    plain = compress(mesh, STANDARD, views=0, fallback=True, budget=0.03)
-    assert plain.method == "plain" and model.report["error against a plain lightmap of as many bits"] is not None
-
-
 @pytest.mark.parametrize("blocks", [False, True])
 def test_the_packed_texture_has_room(blocks: bool):
     """Gaps between tiles count too; where even the smallest tiles can't be packed there is nothing."""

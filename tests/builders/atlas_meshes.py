@@ -43,7 +43,7 @@ def sheet(
 
 
 def charts(light: Light = soft, height: int = 48, width: int = 64, name: str = "charts") -> LightmappedMesh:
-    """The six sides of a cube, a chart each, apart from each other; a seventh chart inside it is never seen."""
+    """The six sides of a cube, one separate chart per side; a seventh chart inside it is hidden from all views."""
     position, triangle, uv = [], [], []
     for side in range(7):
         axis, end = side // 2 % 3, side % 2

@@ -6,7 +6,7 @@ from wlm.atlas.data import LightmappedMesh, from_arrays
 
 HEIGHT, WIDTH = 64, 96
 DIRECTIONS = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], np.float64)
-"""Of the faces: face k has the triangles [k t, (k + 1) t), t = 2 ``parts``², and its chart in cell k of 2 x 3."""
+"""Normals. Face k has the triangles [k t, (k + 1) t), t = 2 ``parts``², and its chart in cell k of 2 x 3."""
 
 
 def corners(parts: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -28,7 +28,7 @@ def corners(parts: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def waves(height: int = HEIGHT, width: int = WIDTH) -> np.ndarray:
-    """A smooth light that differs everywhere, [H, W, 3], 0.1 to 2.1."""
+    """A smooth light that varies everywhere, [H, W, 3], 0.1 to 2.1."""
     y, x = (np.mgrid[:height, :width] + 0.5) / np.array([height, width]).reshape(2, 1, 1)
     base = 1.1 + np.sin(9.0 * y + 1.0) * np.cos(14.0 * x * x)
     return np.stack([base, 0.1 + 0.8 * base, 2.2 - base], axis=-1).astype(np.float32)

@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 from wlm.errors import WlmError
-from wlm.fluid import lattice as module
+from wlm.fluid import engine
 from wlm.fluid.faces import FACES
 from wlm.fluid.lattice import CHECK_EVERY, MAX_SPEED, Domain, Lattice
 from wlm_kernels.fluid.lattice_solids import voxelise_sphere
@@ -127,7 +127,7 @@ def test_too_fast(device: str):
 
 def test_too_large_for_the_memory(device: str, monkeypatch: pytest.MonkeyPatch):
     """The error names the memory needed and that available, before anything is allocated."""
-    monkeypatch.setattr(module, "free_memory", lambda _device: 3 * 2**29)
+    monkeypatch.setattr(engine, "free_memory", lambda _device: 3 * 2**29)
     with pytest.raises(WlmError, match=r"256 x 256 x 256 cells need 2\.4 GiB on .*: expected at most the 1\.5 GiB"):
         Lattice((256, 256, 256), viscosity=0.02, device=device)
     with pytest.raises(WlmError, match="fewer than 2"):
@@ -135,7 +135,7 @@ def test_too_large_for_the_memory(device: str, monkeypatch: pytest.MonkeyPatch):
 
 
 def test_free_memory_is_known(device: str):
-    assert 2**20 < module.free_memory(wp.get_device(device)) < 2**50
+    assert 2**20 < engine.free_memory(wp.get_device(device)) < 2**50
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Guiding maps, transmittance and six-way lightmaps: against float64 references, closed forms and each other."""
+"""Guiding maps and six-way lightmaps: against float64 references, closed forms and each other."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from reference.marching import Scene
 
 from kernels.compare import array, close
 from wlm_kernels.smoke import march_guide, march_six
-from wlm_kernels.smoke.march import View, make_view, occupied
+from wlm_kernels.smoke.march import Medium, View, make_view, occupied
 from wlm_kernels.smoke.settings import March
 
 TYPES = {"float": wp.float32, "half": wp.float16}
@@ -36,27 +36,25 @@ def _view(scene: Scene) -> View:
     )
 
 
+def _run(launch, planes: tuple, scene: Scene, device: str, *arguments, dtype=wp.float32, hot=None, **options):
+    """A march's result; ``hot``: temperature and emission."""
+    heat = () if hot is None else (array(hot[0], dtype, device), hot[1])
+    medium = Medium(array(scene.density, dtype, device), scene.extinction, *heat)
+    out = wp.full((*planes, scene.height, scene.width), np.nan, dtype=float, device=device)
+    launch(medium, _view(scene), *arguments, out, **options)
+    return out.numpy()
+
+
 def _guide(scene: Scene, device: str, dtype=wp.float32, shared: bool = True, **march) -> np.ndarray:
-    out = wp.full((3, scene.height, scene.width), np.nan, dtype=float, device=device)
-    grid = array(scene.density, dtype, device)
-    march_guide.guide(grid, scene.extinction, _view(scene), March(**march), out, shared=shared)
-    return out.numpy()
+    return _run(march_guide.guide, (3,), scene, device, March(**march), dtype=dtype, shared=shared)
 
 
-def _six(scene: Scene, device: str, dtype=wp.float32, temperature=None, emission=0.0, **march) -> np.ndarray:
-    out = wp.full((8, scene.height, scene.width), np.nan, dtype=float, device=device)
-    grid = array(scene.density, dtype, device)
-    hot = None if temperature is None else array(temperature, dtype, device)
-    options = {"temperature": hot, "emission": emission}
-    march_six.six_way(grid, scene.extinction, _view(scene), March(**march), out, **options)
-    return out.numpy()
+def _six(scene: Scene, device: str, dtype=wp.float32, hot=None, **march) -> np.ndarray:
+    return _run(march_six.six_way, (8,), scene, device, March(**march), dtype=dtype, hot=hot)
 
 
 def _lit(scene: Scene, device: str, toward: np.ndarray, **march) -> np.ndarray:
-    out = wp.full((scene.height, scene.width), np.nan, dtype=float, device=device)
-    grid = array(scene.density, float, device)
-    march_six.lit(grid, scene.extinction, _view(scene), toward, March(**march), out)
-    return out.numpy()
+    return _run(march_six.lit, (), scene, device, toward, March(**march))
 
 
 @pytest.mark.parametrize("kind", TYPES)
@@ -74,7 +72,8 @@ def test_guide_against_reference(device: str, turned: bool, perspective: bool, k
 def test_shared_lights(device: str):
     """The lattice holds what the reference marches; with nodes a voxel apart the map is nearly the marched one."""
     scene = _scene(True)
-    nodes = march_guide.lattice(array(scene.density, float, device), scene.extinction, scene.up, 2.5)
+    medium = Medium(array(scene.density, float, device), scene.extinction)
+    nodes = march_guide.lattice(medium, scene.up, 2.5)
     close(nodes.numpy(), reference.nodes(scene, 2.5), LOOSE, "nodes")
     marched, coarse, fine = (
         _guide(scene, device, step=step, jitter=0.0, shared=shared)[0]
@@ -83,7 +82,7 @@ def test_shared_lights(device: str):
     error = [np.sqrt(np.square(got - marched).mean() / np.square(marched).mean()) for got in (coarse, fine)]
     # Of noise from voxel to voxel, the worst that a lattice can meet.
     assert error[1] < 0.012 < error[0] < 0.2
-    nodes = march_guide.lattice(array(scene.density, float, device), scene.extinction, scene.up, 0.01)
+    nodes = march_guide.lattice(medium, scene.up, 0.01)
     assert nodes.shape == (11, 14, 12)
 
 
@@ -120,7 +119,7 @@ def test_six_way_against_reference(device: str, turned: bool, inside: bool, kind
     scene = _scene(turned, inside=inside)
     hot = np.random.default_rng(1).uniform(0, 1, scene.density.shape).astype(np.float16).astype(np.float32)
     monkeypatch.setattr(march_six, "_SLAB_BYTES", 16 * scene.height * scene.width * 5)
-    got = _six(scene, device, TYPES[kind], hot, step=0.8, g=0.4, emission=0.2)
+    got = _six(scene, device, TYPES[kind], (hot, 0.2), step=0.8, g=0.4)
     want = reference.six_way(scene, 0.8, 0.4, hot, 0.2)
     for plane in range(8):
         assert want[plane].max() > 0.01
@@ -176,28 +175,27 @@ def test_slab_closed_forms(device: str, extinction: float):
     assert guide[1] == pytest.approx(got[6], rel=1e-4)
 
 
-def test_transmittance(device: str):
-    """Through the whole of a block, half of it and none; with skipped bricks as without."""
+def test_empty_bricks(device: str):
+    """They are those without smoke within reach, and a march that skips them finds what one without bricks does."""
     density = np.zeros((40, 20, 9), np.float32)
     density[24:] = 1.0
-    points = np.array([[-5, 10, 4.5], [32, 10, 4.5], [50, 10, 4.5], [32, 100, 4.5], [32, 10, 4.5]])
-    out = wp.full(5, np.nan, dtype=float, device=device)
-    grid, at = array(density, float, device), array(points, wp.vec3, device)
-    march_guide.transmittance(grid, 0.1, at, (1.0, 0.0, 0.0), 0.25, out)
-    np.testing.assert_allclose(out.numpy(), np.exp([-1.6, -0.8, 0, 0, -0.8]), rtol=1e-5)
-    np.testing.assert_array_equal(occupied(grid).numpy()[:, 0, 0], [0, 0, 1, 1, 1])
-    random = np.random.default_rng(7)
-    sparse = np.where(random.random((40, 20, 9)) < 0.02, 1.0, 0.0).astype(np.float32)
-    scene = Scene(sparse, 0.5, *np.zeros((4, 3)), 1, 1, 1)
-    p, way = random.uniform(0, [40, 20, 9], (50, 3)), np.array([0.6, 0.0, 0.8])
-    out = wp.full(50, np.nan, dtype=float, device=device)
-    grid = array(scene.density, float, device)
-    march_guide.transmittance(grid, 0.5, array(p, wp.vec3, device), way, 0.4, out)
-    close(out, np.exp(-reference.depth_to(scene, p.astype(np.float32), way, 0.4)), LOOSE, "transmittance")
+    assert occupied(Medium(array(density, float, device), 1.0)).numpy()[:, 0, 0].tolist() == [0, 0, 1, 1, 1]
+    sparse = (np.random.default_rng(7).random((40, 20, 9)) < 0.003).astype(np.float32)
+    assert 0.2 < occupied(Medium(array(sparse, float, device), 1.0)).numpy().mean() < 0.9
+    askew = _scene(True)
+    middle = np.array(sparse.shape) / 2
+    scene = Scene(sparse, 5.0, middle + 30.0 * askew.toward, askew.right, askew.up, askew.toward, 2.0, 20, 20)
+    toward = np.array([0.6, 0.0, 0.8])
+    want = reference.lit(scene, toward, 0.4, 0.0)
+    assert want.max() > 0.1
+    close(_lit(scene, device, toward, step=0.4), want, LOOSE, "light")
 
 
 def test_wrong_camera():
-    grid, out = wp.zeros((2, 2, 2), dtype=float, device="cpu"), wp.zeros((8, 2, 2), dtype=float, device="cpu")
+    medium, out = (
+        Medium(wp.zeros((2, 2, 2), dtype=float, device="cpu"), 1.0),
+        wp.zeros((8, 2, 2), dtype=float, device="cpu"),
+    )
     view = make_view((0, 0, 5), (1, 0, 0), (0, 1, 0), (0, 0, -1), 0.1, 2, 2, perspective=True)
     with pytest.raises(ValueError, match="need an orthographic camera"):
-        march_six.six_way(grid, 1.0, view, March(), out)
+        march_six.six_way(medium, view, March(), out)

@@ -9,8 +9,9 @@ import warp as wp
 from kernels.compare import array, close
 
 from wlm import ops
-from wlm_kernels.smoke import march as smoke_march
-from wlm_kernels.smoke import march_six
+from wlm_kernels.smoke import march_guide, march_six
+from wlm_kernels.smoke.march import Medium, make_view
+from wlm_kernels.smoke.settings import March
 
 AHEAD = torch.tensor([0.0, 0.0, 1.0])
 
@@ -47,10 +48,12 @@ def test_phase_function(device: str, g: float):
     """Light from behind, from the side and from the front, in smoke so thin that all of it gets through."""
     density = torch.full((8, 8, 8), 1e-5, device=device)
     toward = torch.stack([AHEAD, AHEAD.roll(1), -AHEAD]).to(device)
-    light = torch.cat([
-        ops.march(density, **_rays(device, 1), toward=t[None], colour=torch.ones(1, 3, device=device), g=g)[0][:, 0]
-        for t in toward
-    ])
+    light = torch.cat(
+        [
+            ops.march(density, **_rays(device, 1), toward=t[None], colour=torch.ones(1, 3, device=device), g=g)[0][:, 0]
+            for t in toward
+        ]
+    )
     cosine = torch.tensor([1.0, 0.0, -1.0], dtype=torch.float64)
     want = 8e-5 * (1.0 - g * g) / (1.0 + g * g - 2.0 * g * cosine) ** 1.5
     close(light, want, 1e-3)
@@ -65,16 +68,16 @@ def _cloud(seed: int = 3) -> np.ndarray:
 
 
 def test_against_the_smoke_systems_marches(device: str):
-    """``march_six.lit``, which marches to the light from every sample, and the transmittance of ``march``."""
+    """``march_six.lit``, which marches to the light from every sample, and the transparency of the guiding map."""
     density = _cloud()
     turn = np.linalg.qr(np.random.default_rng(4).normal(size=(3, 3)))[0]
     right, up, forward = turn * np.linalg.det(turn)
     middle = np.array(density.shape) / 2
-    view = smoke_march.view(middle - 20.0 * forward, right, up, forward, 1.0, 20, 18)
+    view = make_view(middle - 20.0 * forward, right, up, forward, 1.0, 20, 18)
     toward = np.array([0.5, 0.7, -0.51]) / np.linalg.norm([0.5, 0.7, -0.51])
     lit = wp.zeros((18, 20), dtype=float, device=device)
-    on_device = array(density, float, device)
-    march_six.lit(on_device, 1.0, view, toward, lit, step=0.5, g=0.3)
+    medium = Medium(array(density, float, device), 1.0)
+    march_six.lit(medium, view, toward, March(0.5, g=0.3), lit)
 
     u, v = np.meshgrid(np.arange(20) + 0.5 - 10.0, 9.0 - np.arange(18) - 0.5)
     origin = middle - 20.0 * forward + u[..., None] * right + v[..., None] * up
@@ -86,10 +89,9 @@ def test_against_the_smoke_systems_marches(device: str):
     assert lit.numpy().max() > 0.1
     # What the lattice of optical depths, a voxel wide, leaves.
     close(radiance[..., 0], lit, 0.012)
-    behind = wp.zeros(18 * 20, dtype=float, device=device)
-    points = array(origin.reshape(-1, 3).astype(np.float32), wp.vec3, device)
-    smoke_march.transmittance(on_device, 1.0, points, forward, 0.5, behind)
-    close(transmittance, behind.numpy().reshape(18, 20), 1e-5)
+    maps = wp.zeros((3, 18, 20), dtype=float, device=device)
+    march_guide.guide(medium, view, March(0.5, jitter=0.0, cutoff=0.0), maps)
+    close(transmittance, maps.numpy()[1], 1e-5)
 
 
 def test_rays_that_miss(device: str):

@@ -182,7 +182,7 @@ def test_empty_bricks_change_nothing(device: str, dtype: torch.dtype, monkeypatc
     skipped = _planes(volume, camera, step=1.5)
     made = []
     occupied = march_coarse.occupied
-    monkeypatch.setattr(march_coarse, "occupied", lambda *args: made.append(occupied(*args)) or made[-1])
+    monkeypatch.setattr(march_coarse, "occupied", lambda medium: made.append(occupied(medium)) or made[-1])
     _march(volume, camera, step=7.9)
     (bricks,) = made
     assert 0 < bricks.numpy().sum() < bricks.size

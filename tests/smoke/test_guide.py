@@ -1,4 +1,4 @@
-"""Guiding maps and transmittance in the world: units, cameras, hard smoke and the error of a large step."""
+"""Guiding maps in the world: units, cameras and the error of a large step."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from builders.smoke_plumes import unit_grid
 
 from wlm.fluid.volume import DensityVolume, from_array
 from wlm.smoke.camera import Camera
-from wlm.smoke.guiding import guide, transmittance
+from wlm.smoke.guiding import guide
 from wlm_kernels.smoke.settings import March
 
 
@@ -82,30 +82,6 @@ def test_steps_against_a_fine_march(device: str):
         errors.append(float((maps[0] - fine[0]).square().mean().sqrt() / fine[0].square().mean().sqrt()))
     assert errors[0] < 0.02 and errors[2] < 0.5
     assert errors[0] < errors[1] < errors[2] < errors[3]
-
-
-def test_half(device: str):
-    """Half densities give what their values in float do."""
-    volume = _ball(device)
-    half = DensityVolume(volume.density.half(), volume.extinction, volume.voxel, volume.origin)
-    full = DensityVolume(volume.density.half().float(), volume.extinction, volume.voxel, volume.origin)
-    got, want = (guide(v, _camera(volume), March(2.0)).maps.cpu() for v in (half, full))
-    # A GPU may contract products and sums of the two in different ways.
-    np.testing.assert_allclose(got, want, rtol=1e-6, atol=1e-6)
-
-
-def test_transmittance(device: str):
-    """Through a block of 4 m with 0.5 a metre, from its middle, from behind it and from outside."""
-    volume = from_array(
-        np.full((8, 8, 8), 0.25, np.float32), extinction=2.0, voxel=0.5, origin=(1.0, 1.0, 1.0), device=device
-    )
-    points = torch.tensor([[3.0, 3, 3], [3, 3, -7], [3, 3, 20]], device=device)
-    got = transmittance(volume, points, (0.0, 0.0, 7.0))
-    np.testing.assert_allclose(got.cpu(), np.exp([-1.0, -2.0, 0.0]), rtol=1e-5)
-    with pytest.raises(ValueError, match="toward"):
-        transmittance(volume, points, (0.0, 0.0, 0.0))
-    with pytest.raises(ValueError, match=r"points: expected \[N, 3\]"):
-        transmittance(volume, points[0], (0.0, 0.0, 1.0))
 
 
 @pytest.mark.parametrize("name", ["spacing", "light_step"])

@@ -381,16 +381,6 @@ def test_planes_that_cannot_be_written(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["a.exr"]
 
 
-def test_empty_smoke_and_one_voxel(tmp_path):
-    for density in (np.zeros((4, 4, 4)), np.ones((1, 1, 1))):
-        volume = from_array(density)
-        camera = make_camera(CameraSettings(resolution=6), volume.origin, density.shape)
-        six = bake(volume, camera, estimate=False)
-        write_six_way(tmp_path / "a.exr", six)
-        found = read_six_way(tmp_path / "a.exr")
-        assert bool((found.transparency < 1).any()) == bool(density.any())
-
-
 def test_the_scene_in_the_document(tmp_path):
     """The page's scene "in full" is one, and names every setting that there is."""
     page = (Path(__file__).resolve().parents[2] / "docs" / "fluid.md").read_text(encoding="utf-8")

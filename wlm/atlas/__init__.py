@@ -11,6 +11,7 @@ _PLACES = {
     "View": "wlm.atlas.views",
     "compare": "wlm.atlas.evaluation",
     "compress": "wlm.atlas.fit",
+    "describe": "wlm.atlas.exporter",
     "evaluate": "wlm.atlas.evaluation",
     "export": "wlm.atlas.exporter",
     "from_arrays": "wlm.atlas.data",

@@ -19,7 +19,7 @@ a millionth                           range to measure against
 nothing covered in any view           the same, and the errors are NaN too
 no seam on any screen                 ``seam_error`` and ``seam_ratio`` are NaN
 an error at seams alone               ``seam_ratio`` is infinite, null in JSON
-NaN or Inf in what was decoded        error that names the decoder
+NaN or Inf in decoded colours         error that names the decoder
 ====================================  ================================================================
 """
 
@@ -256,7 +256,7 @@ def _peak(mesh: LightmappedMesh, image: torch.Tensor, cameras: Sequence[View], r
 
 
 _Points = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
-"""What a ``Sampler`` takes."""
+"""The arguments of a ``Sampler``: UVs, triangles and corner weights of points."""
 
 
 def _colours(decoder: Sampler, points: _Points, mesh: LightmappedMesh, name: str) -> torch.Tensor:

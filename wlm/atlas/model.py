@@ -50,7 +50,7 @@ LUT_BITS = 32
 """Bits per entry of T_c: two numbers of 16 bits."""
 
 LUT_STEPS = 65535.0
-"""Of method "cascade": a coordinate of 1 in T_c."""
+"""The integer that is a coordinate of 1 in T_c of method "cascade"."""
 
 # An entry of a tile has one number per axis: the rectangle's first texel, and its number of texels less one.
 SIDE_BITS = 4
@@ -132,7 +132,7 @@ class AtlasModel(Model):
     Attributes:
         name: The mesh's name.
         source: ``LightmappedMesh.source``.
-        profile: The settings that were asked for.
+        profile: The settings of the compression.
         method: "tiles", "cascade" or "plain"; "plain" also where the profile's method does not pay.
         colour: How T_p is stored, as in ``Profile``.
         height, width: Texels of the lightmap.

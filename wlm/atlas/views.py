@@ -34,7 +34,7 @@ __all__ = [
 ]
 
 DISTANCE = 3.0
-"""Of a camera from the origin."""
+"""Distance of a camera from the origin."""
 
 _SPHERE = math.sqrt(3.0)
 

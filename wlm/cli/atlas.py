@@ -117,7 +117,7 @@ def evaluate(
     show(rows)
 
 
-# Of a report: what the table calls a field, the field, its format.
+# Label in the table, attribute of a report, format.
 _ROWS = (
     ("PSNR dB", "psnr", ".2f"),
     ("PSNR dB, worst view", "psnr_worst", ".2f"),

@@ -7,21 +7,37 @@ from dataclasses import replace
 import numpy as np
 import warp as wp
 
+from wlm.errors import WlmError
 from wlm.fluid.faces import Face, bounded_axes, face_links, walled_axes
-from wlm.interop import no_collection
+from wlm.interop import free_memory, no_collection
 from wlm_kernels.fluid import lattice_links, lattice_solids
 from wlm_kernels.fluid.lattice import QUIET, Spec, step_kernel
 from wlm_kernels.fluid.lattice_fields import fluid_kernels
 from wlm_kernels.fluid.lattice_sets import NARROW, STORAGES, tables
 from wlm_kernels.fluid.lattice_sets import lattice as velocity_set
 
-__all__ = ["BODIES", "PERIOD", "Engine"]
+__all__ = ["BODIES", "PERIOD", "Engine", "require_free"]
 
 BODIES = 256
 """Bodies that uint8 can number, the fluid counted in."""
 
 PERIOD = 2
 """Steps after which the two buffers have changed places and back: a CUDA graph must hold a multiple of it."""
+
+
+def require_free(name: str, shape: tuple[int, int, int], needed: int, device: wp.Device, remedy: str) -> None:
+    """Checks that a grid's bytes are free.
+
+    Raises:
+        WlmError: They aren't; the line names the grid, both sizes and a remedy.
+    """
+    free = free_memory(device)
+    if needed > free:
+        cells = " x ".join(map(str, shape))
+        raise WlmError(
+            f"{name}: {cells} cells need {needed / 2**30:.1f} GiB on {device}: expected at most the"
+            f" {free / 2**30:.1f} GiB that are free: use {remedy}"
+        )
 
 
 class Engine:

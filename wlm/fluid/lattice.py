@@ -23,8 +23,7 @@ import warp as wp
 
 from wlm.errors import WlmError
 from wlm.fluid import faces as fluid_faces
-from wlm.fluid.engine import BODIES, PERIOD, Engine
-from wlm.interop import free_memory
+from wlm.fluid.engine import BODIES, PERIOD, Engine, require_free
 from wlm_kernels.fluid.lattice import QUIET, Spec, eddy_factor, trouble_of
 
 __all__ = ["CHECK_EVERY", "MAX_SPEED", "Domain", "Lattice"]
@@ -124,7 +123,8 @@ class Lattice:
             raise ValueError(f"ramp: expected at least 0 steps, got {ramp}")
         self.device = wp.get_device(device)
         spec = Spec(lattice, operator, storage, eddies=smagorinsky > 0.0)
-        _require_memory(self.bytes_needed(self.shape, storage, lattice), self.shape, self.device)
+        needed = self.bytes_needed(self.shape, storage, lattice)
+        require_free("lattice", self.shape, needed, self.device, "fewer cells or storage='float16'")
         tau, eddy = 0.5 + 3.0 * viscosity, eddy_factor(smagorinsky)
         # A ramp of one step is none: the first air comes in after it.
         self._engine = Engine(self.shape, spec, tau, eddy, 1.0 / max(ramp, 1), self.device)
@@ -405,14 +405,4 @@ def _check_speed(speed: float, what: str) -> None:
     if speed > MAX_SPEED:
         raise WlmError(
             f"lattice: {what} moves at {speed:.3g} cells a step: expected at most {MAX_SPEED}: use a shorter time step"
-        )
-
-
-def _require_memory(needed: int, shape: tuple[int, int, int], device: wp.Device) -> None:
-    free = free_memory(device)
-    if needed > free:
-        x, y, z = shape
-        raise WlmError(
-            f"lattice: {x} x {y} x {z} cells need {needed / 2**30:.1f} GiB on {device}: expected at most the"
-            f" {free / 2**30:.1f} GiB that are free: use fewer cells or storage='float16'"
         )

@@ -33,12 +33,12 @@ import numpy as np
 import warp as wp
 
 from wlm.errors import WlmError
+from wlm.fluid.engine import require_free
 from wlm.fluid.faces import axis_ends
 from wlm.fluid.lattice import Lattice
 from wlm.fluid.obstacles import Obstacle
 from wlm.fluid.volume import DensityVolume
 from wlm.formats.artifact import read_artifact, write_artifact
-from wlm.interop import free_memory
 from wlm_kernels.fluid import advection, advection_places, advection_sources
 from wlm_kernels.fluid.advection_places import DENSE
 
@@ -123,14 +123,8 @@ def require_memory(shape: tuple[int, int, int], cell_bytes: int, device: wp.Devi
     x, y, z = shape
     if x * y * z >= 2**31:
         raise WlmError(f"smoke: {x} x {y} x {z} cells: expected fewer than 2^31: use a lower refinement")
-    needed = cell_bytes * x * y * z
-    free = free_memory(device)
-    if needed > free:
-        raise WlmError(
-            f"smoke: {x} x {y} x {z} cells need {needed / 2**30:.1f} GiB on {device}: expected at most the"
-            f" {free / 2**30:.1f} GiB that are free: use a lower refinement, storage='float16' or the scheme"
-            " 'semi-lagrangian'"
-        )
+    remedy = "a lower refinement, storage='float16' or the scheme 'semi-lagrangian'"
+    require_free("smoke", shape, cell_bytes * x * y * z, device, remedy)
 
 
 class Solver:

@@ -10,7 +10,7 @@ from wlm.interop import to_warp
 from wlm.ops.plain import henyey_greenstein
 from wlm.ops.tensors import check, check_finite, dense, on_stream, optional_array, zeros_for
 from wlm_kernels.smoke import single_scatter
-from wlm_kernels.smoke.march_guide import nodes_along
+from wlm_kernels.smoke.march import nodes_along
 
 __all__ = ["march"]
 

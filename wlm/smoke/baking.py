@@ -12,9 +12,10 @@ import numpy as np
 import torch
 
 from wlm.fluid.volume import DensityVolume
-from wlm.interop import device_name, stream, to_warp, torch_memory
+from wlm.interop import device_name, stream
 from wlm.smoke.camera import Camera, unit
 from wlm.smoke.lightmaps import SixWay, StepError
+from wlm.smoke.marching import run
 from wlm_kernels.smoke import march_six
 from wlm_kernels.smoke.settings import March
 
@@ -89,30 +90,10 @@ def lit(
     Raises:
         ValueError: The direction has no length, or a setting is out of its range.
     """
-    direction, march = unit(toward), March(step=step, g=g)
-    with stream(device_name(volume.device)):
-        out = torch.empty((camera.height, camera.width), dtype=torch.float32, device=volume.device)
-        density, _ = volume.arrays()
-        extinction, view = volume.extinction * volume.voxel, camera.view(volume)
-        march_six.lit(density, extinction, view, direction, march, to_warp(out), torch_memory(volume.device))
-    return out
+    return run(march_six.lit, volume, camera, (), unit(toward), March(step=step, g=g))
 
 
 def _planes(volume: DensityVolume, camera: Camera, march: March, supersample: int) -> torch.Tensor:
     """Lightmaps, transparency and emission, [8, H, W]."""
-    finer = camera.finer(supersample)
-    out = torch.empty((8, finer.height, finer.width), dtype=torch.float32, device=volume.device)
-    density, temperature = volume.arrays()
-    march_six.six_way(
-        density,
-        volume.extinction * volume.voxel,
-        finer.view(volume),
-        march,
-        to_warp(out),
-        temperature=temperature,
-        emission=volume.emission * volume.voxel,
-        empty=torch_memory(volume.device),
-    )
-    if supersample == 1:
-        return out
-    return torch.nn.functional.avg_pool2d(out[None], supersample)[0]
+    out = run(march_six.six_way, volume, camera.finer(supersample), (8,), march)
+    return out if supersample == 1 else torch.nn.functional.avg_pool2d(out[None], supersample)[0]

@@ -12,9 +12,9 @@ from __future__ import annotations
 import torch
 
 from wlm.fluid.volume import DensityVolume
-from wlm.interop import device_name, stream, to_warp, torch_memory
 from wlm.smoke.camera import DIRECTIONS, Camera
 from wlm.smoke.lightmaps import SixWay
+from wlm.smoke.marching import run
 from wlm_kernels.smoke import march_coarse
 from wlm_kernels.smoke.settings import March
 
@@ -46,18 +46,4 @@ def march(volume: DensityVolume, camera: Camera, march: March = March()) -> SixW
 
 def march_planes(volume: DensityVolume, camera: Camera, march: March) -> torch.Tensor:
     """``march`` as one tensor, float32 [9, H, W]: ``wlm_kernels.smoke.march_coarse.PLANES``. Cold smoke emits 0."""
-    with stream(device_name(volume.device)):
-        size = (len(march_coarse.PLANES), camera.height, camera.width)
-        planes = torch.empty(size, dtype=torch.float32, device=volume.device)
-        density, temperature = volume.arrays()
-        march_coarse.coarse_six_way(
-            density,
-            volume.extinction * volume.voxel,
-            camera.view(volume),
-            march,
-            to_warp(planes),
-            temperature=temperature,
-            emission=volume.emission * volume.voxel,
-            empty=torch_memory(volume.device),
-        )
-    return planes
+    return run(march_coarse.coarse_six_way, volume, camera, (len(march_coarse.PLANES),), march)

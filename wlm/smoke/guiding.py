@@ -1,20 +1,18 @@
-"""Guiding maps: a rough image of smoke, which a network turns into six-way lightmaps (section 4.2); transmittance."""
+"""Guiding maps: a rough image of smoke, which a network turns into six-way lightmaps (section 4.2)."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-import warp as wp
 
 from wlm.fluid.volume import DensityVolume
-from wlm.interop import device_name, stream, to_warp, torch_memory
-from wlm.smoke.camera import Camera, unit
+from wlm.smoke.camera import Camera
+from wlm.smoke.marching import run
 from wlm_kernels.smoke import march_guide
 from wlm_kernels.smoke.settings import March
 
-__all__ = ["Guide", "guide", "transmittance"]
+__all__ = ["Guide", "guide"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,53 +63,4 @@ def guide(volume: DensityVolume, camera: Camera, march: March = March(), *, shar
     for name in ("spacing", "light_step"):
         if getattr(march, name) is not None:
             raise ValueError(f"{name}: expected none for the paper's guiding map, got {getattr(march, name)}")
-    with stream(device_name(volume.device)):
-        maps = torch.empty((3, camera.height, camera.width), dtype=torch.float32, device=volume.device)
-        density, _ = volume.arrays()
-        march_guide.guide(
-            density,
-            volume.extinction * volume.voxel,
-            camera.view(volume),
-            march,
-            to_warp(maps),
-            shared=shared,
-            empty=torch_memory(volume.device),
-        )
-    return Guide(maps, camera)
-
-
-def transmittance(
-    volume: DensityVolume, points: torch.Tensor, toward: Sequence[float], *, step: float = 0.5
-) -> torch.Tensor:
-    """The share of light from a direction that reaches points (eq. 3).
-
-    Args:
-        volume: The smoke.
-        points: float32 [N, 3], in the world, on the smoke's device.
-        toward: The direction to the light in the world, of any length but 0.
-        step: In voxels.
-
-    Returns:
-        float32 [N], in [0, 1].
-
-    Raises:
-        ValueError: The points' shape or the step is wrong, or the direction has no length.
-    """
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise ValueError(f"points: expected [N, 3], got {tuple(points.shape)}")
-    direction, march = unit(toward), March(step=step)
-    with stream(device_name(volume.device)):
-        origin = torch.tensor(volume.origin, dtype=torch.float32, device=points.device)
-        at = ((points - origin) / volume.voxel).contiguous()
-        out = torch.empty(len(points), dtype=torch.float32, device=points.device)
-        density, _ = volume.arrays()
-        march_guide.transmittance(
-            density,
-            volume.extinction * volume.voxel,
-            to_warp(at, wp.vec3),
-            direction,
-            march.step,
-            to_warp(out),
-            torch_memory(volume.device),
-        )
-    return out
+    return Guide(run(march_guide.guide, volume, camera, (3,), march, shared=shared), camera)

@@ -11,8 +11,8 @@ import torch
 import warp as wp
 
 from wlm.fluid.volume import DensityVolume
-from wlm.interop import device_name, stream, to_warp, torch_memory
 from wlm.smoke.camera import Camera
+from wlm.smoke.marching import run
 from wlm_kernels.smoke import march_motion
 from wlm_kernels.smoke.settings import March
 
@@ -50,17 +50,4 @@ def motion(
         raise ValueError(f"reach: expected a finite length, got {reach}")
     if velocity.dtype is not wp.vec3 or velocity.ndim != 3 or 0 in velocity.shape:
         raise ValueError(f"velocity: expected vec3 [A, B, C], got {velocity.dtype.__name__} {velocity.shape}")
-    with stream(device_name(volume.device)):
-        out = torch.empty((2, camera.height, camera.width), dtype=torch.float32, device=volume.device)
-        density, _ = volume.arrays()
-        march_motion.motion(
-            density,
-            volume.extinction * volume.voxel,
-            velocity,
-            reach / volume.voxel,
-            camera.view(volume),
-            march,
-            to_warp(out),
-            torch_memory(volume.device),
-        )
-    return out
+    return run(march_motion.motion, volume, camera, (2,), velocity, reach / volume.voxel, march)

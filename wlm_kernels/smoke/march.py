@@ -1,4 +1,4 @@
-"""What every march through a grid of density shares: cameras, rays and their steps, samples, the phase function.
+"""What every march through smoke shares: the medium, cameras, rays and their steps, samples, the phase function.
 
 All is in voxels: the grid ``[X, Y, Z]`` fills the box from 0 to (X, Y, Z), the centre of voxel i is at i + 1/2, and
 between centres the density is trilinear, with zero outside the grid; so there is smoke up to half a voxel beyond the
@@ -7,12 +7,15 @@ integrated exactly: 1 - exp(-sigma h), not sigma h. A density below zero or NaN 
 out.
 
 A light is a direction towards it, of irradiance 4 pi, so that an isotropic phase function is 1 and not 1 / (4 pi).
-``march_guide``, ``march_coarse``, ``march_six`` and ``march_motion`` are the marches themselves; none has a gradient.
+``march_guide``, ``march_coarse``, ``march_six`` and ``march_motion`` are the marches themselves; none has a gradient,
+but ``single_scatter`` has.
 Read first: ``tests/reference/marching.py``, the same in float64 NumPy, with nothing shared.
 """
 
 import functools
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import warp as wp
@@ -24,6 +27,7 @@ __all__ = [
     "NO_BRICKS",
     "Empty",
     "MarchParameters",
+    "Medium",
     "Ray",
     "View",
     "absorbed",
@@ -32,6 +36,7 @@ __all__ = [
     "make_view",
     "marched_ray",
     "node_position",
+    "nodes_along",
     "occupied",
     "occupied_kernel",
     "optical_depth",
@@ -42,7 +47,6 @@ __all__ = [
     "sample",
     "size_of",
     "steps_along",
-    "warp_memory",
 ]
 
 Empty = Callable[[tuple[int, ...], Any], wp.array]
@@ -57,6 +61,36 @@ NO_BRICKS = wp.constant(0)
 _OPTIONS = {"enable_backward": False}
 _NEVER = 1.0e30
 _SEEDS = 2**32  # of which kernels tell apart
+
+
+@dataclass(frozen=True)
+class Medium:
+    """Smoke on a device, as the functions that launch marches take it.
+
+    Attributes:
+        density: float or half [X, Y, Z].
+        extinction: Per voxel, of density 1.
+        temperature: As the density, of its shape; None: nothing emits.
+        emission: Light given off per voxel of way where the temperature is 1.
+        empty: Makes buffers, ``empty(shape, dtype)`` on the density's device; None: in Warp's own memory.
+    """
+
+    density: wp.array
+    extinction: float
+    temperature: wp.array | None = None
+    emission: float = 0.0
+    empty: Empty | None = None
+
+    def buffer(self, shape: tuple[int, ...], dtype: Any) -> wp.array:
+        """Makes a buffer, not set."""
+        if self.empty is None:
+            return wp.empty(shape, dtype=dtype, device=self.density.device)
+        return self.empty(shape, dtype)
+
+    @property
+    def glow(self) -> tuple[wp.array, float]:
+        """Temperature and emission for a kernel: of cold smoke any array, and 0."""
+        return (self.density, 0.0) if self.temperature is None else (self.temperature, self.emission)
 
 
 @wp.struct
@@ -256,6 +290,12 @@ def node_position(nodes: wp.array3d[Any], size: wp.vec3, i: int, j: int, k: int)
     )
 
 
+def nodes_along(shape: Sequence[int], step: float) -> tuple[int, ...]:
+    """Nodes of a lattice no farther apart than a step, or a voxel, from half a voxel out of the grid to half beyond."""
+    # Each marches to its lights by itself: of closer ones the time would grow with the fourth power.
+    return tuple(math.ceil((n + 1) / max(step, 1.0)) + 1 for n in shape)
+
+
 @functools.cache
 def occupied_kernel(dtype: Any) -> wp.Kernel:
     """Builds (once) the kernel for densities of a type, ``wp.float32`` or ``wp.float16``."""
@@ -280,18 +320,15 @@ def occupied_kernel(dtype: Any) -> wp.Kernel:
     return occupied
 
 
-def occupied(density: wp.array, empty: Empty | None = None) -> wp.array:
+def occupied(medium: Medium) -> wp.array:
     """Which bricks have smoke within reach of a sample in them.
-
-    Args:
-        density: float or half [X, Y, Z].
-        empty: Makes a buffer, ``empty(shape, dtype)`` on the density's device; default Warp's.
 
     Returns:
         uint8 [X / 8, Y / 8, Z / 8], rounded up, 1 where there is any.
     """
+    density = medium.density
     shape = tuple(-(-n // BRICK) for n in density.shape)
-    bricks = (empty or warp_memory(density.device))(shape, wp.uint8)
+    bricks = medium.buffer(shape, wp.uint8)
     wp.launch(occupied_kernel(density.dtype), shape, [density], [bricks], device=density.device)
     return bricks
 
@@ -324,8 +361,3 @@ def parameters(march: March) -> MarchParameters:
     # Any whole number as one of 32 bits with a sign.
     values.seed = (march.seed + _SEEDS // 2) % _SEEDS - _SEEDS // 2
     return values
-
-
-def warp_memory(device: wp.Device) -> Empty:
-    """Makes buffers in Warp's own memory: what calls use that are given no other."""
-    return lambda shape, dtype: wp.empty(shape, dtype=dtype, device=device)

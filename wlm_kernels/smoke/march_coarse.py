@@ -24,8 +24,8 @@ import warp as wp
 
 from wlm_kernels.smoke.march import (
     BRICK,
-    Empty,
     MarchParameters,
+    Medium,
     View,
     absorbed,
     density_at,
@@ -35,7 +35,6 @@ from wlm_kernels.smoke.march import (
     phase,
     sample,
     size_of,
-    warp_memory,
 )
 from wlm_kernels.smoke.settings import March
 
@@ -253,32 +252,18 @@ def _lattice(shape: Sequence[int], view: View, spacing: float) -> tuple[_Lattice
     return lattice, tuple(n + 1 for n in parts)
 
 
-def coarse_six_way(
-    density: wp.array,
-    extinction: float,
-    view: View,
-    march: March,
-    out: wp.array,
-    *,
-    temperature: wp.array | None = None,
-    emission: float = 0.0,
-    empty: Empty | None = None,
-) -> None:
+def coarse_six_way(medium: Medium, view: View, march: March, out: wp.array) -> None:
     """Six-way lightmaps, transparency, emission and depth by one march in large steps.
 
     Below a brick's edge, ``march.step`` makes both rays and ways to the lights look no further in bricks without smoke.
     It changes no result.
 
     Args:
-        density: float or half [X, Y, Z].
-        extinction: Per voxel, of density 1.
+        medium: The smoke, of albedo 1.
         view: The camera, [H, W] pixels, orthographic.
         march: Its spacing is a quarter of a voxel at least, and as much more as makes the nodes about 2^28 at most. A
             node takes 24 bytes. 64 seeds differ. What the cutoff leaves out is less than 1e-3 in every plane.
-        out: float [9, H, W], written: ``PLANES``, each light of irradiance 4 pi, an albedo of 1.
-        temperature: As the density, of its shape; None: nothing emits.
-        emission: Light given off per voxel of way where the temperature is 1.
-        empty: As for ``march.occupied``.
+        out: float [9, H, W], written: ``PLANES``, each light of irradiance 4 pi.
 
     Raises:
         ValueError: The camera is in perspective.
@@ -287,17 +272,17 @@ def coarse_six_way(
         raise ValueError("six-way lightmaps need an orthographic camera: their lights follow its axes")
     spacing = march.step if march.spacing is None else march.spacing
     light_step = spacing if march.light_step is None else march.light_step
+    density, extinction = medium.density, medium.extinction
     device = density.device
-    empty = empty or warp_memory(device)
-    measure, add_up, gather = coarse_kernels(density.dtype, temperature is not None)
-    bricks = occupied(density, empty) if march.step < BRICK else empty((0, 0, 0), wp.uint8)
+    measure, add_up, gather = coarse_kernels(density.dtype, medium.temperature is not None)
+    bricks = occupied(medium) if march.step < BRICK else medium.buffer((0, 0, 0), wp.uint8)
     lattice, counts = _lattice(density.shape, view, spacing)
-    gaps, nodes = empty(counts, wp.vec2), empty(counts, wp.vec4)
+    gaps, nodes = medium.buffer(counts, wp.vec2), medium.buffer(counts, wp.vec4)
     parts = wp.vec2i(*(max(math.ceil(lattice.gap[axis] / light_step - _ROUNDING), 1) for axis in range(2)))
     inputs = [density, bricks, extinction, view, lattice, parts]
     wp.launch(measure, counts, inputs=inputs, outputs=[gaps], device=device)
     lines = (counts[1] + counts[0], counts[2])
     wp.launch(add_up, lines, inputs=[gaps, counts[1]], outputs=[nodes], device=device)
-    hot = density if temperature is None else temperature
-    inputs = [density, hot, bricks, nodes, extinction, emission, view, lattice, parameters(march)]
+    temperature, emission = medium.glow
+    inputs = [density, temperature, bricks, nodes, extinction, emission, view, lattice, parameters(march)]
     wp.launch(gather, out.shape[1:], inputs=inputs, outputs=[out], device=device)

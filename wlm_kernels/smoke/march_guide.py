@@ -1,4 +1,4 @@
-"""Guiding maps and transmittance by marches in large steps (neural-six-way-lightmaps, eq. 3, 6, algorithm 1).
+"""Guiding maps by a march in large steps (neural-six-way-lightmaps, algorithm 1).
 
 Units and sampling are those of ``march``. The lights from the top and the bottom are marched to from each sample, or,
 far sooner, from the nodes of a lattice over the grid's box, between which their optical depths are trilinear.
@@ -6,7 +6,6 @@ Read first: ``guide`` of ``tests/reference/marching.py``, which is algorithm 1 i
 """
 
 import functools
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -15,23 +14,22 @@ import warp as wp
 
 from wlm_kernels.smoke.march import (
     NO_BRICKS,
-    Empty,
     MarchParameters,
+    Medium,
     View,
     absorbed,
     density_at,
     marched_ray,
     node_position,
-    occupied,
+    nodes_along,
     optical_depth,
     parameters,
     phase,
     size_of,
-    warp_memory,
 )
 from wlm_kernels.smoke.settings import March
 
-__all__ = ["guide", "guide_kernels", "lattice", "nodes_along", "transmittance"]
+__all__ = ["guide", "guide_kernels", "lattice"]
 
 _OPTIONS = {"enable_backward": False}
 
@@ -74,7 +72,6 @@ class _Kernels:
     """Of one type of density."""
 
     lattice: wp.Kernel
-    transmittance: wp.Kernel
     guide: wp.Kernel
     guide_marching: wp.Kernel
 
@@ -96,21 +93,6 @@ def guide_kernels(dtype: Any) -> _Kernels:
         a, b, c = wp.tid()
         p = node_position(nodes, size_of(density), a, b, c)
         nodes[a, b, c] = _both_depths(density, p, up, extinction, step)
-
-    @wp.kernel(module="unique", module_options=_OPTIONS)
-    def transmittance(
-        # in:
-        density: wp.array3d[dtype],
-        bricks: wp.array3d[wp.uint8],
-        extinction: float,
-        points: wp.array1d[wp.vec3],
-        toward: wp.vec3,
-        step: float,
-        # out:
-        out: wp.array1d[float],
-    ):
-        i = wp.tid()
-        out[i] = wp.exp(-optical_depth(density, bricks, points[i], toward, extinction, step))
 
     def make_guide(from_lattice: bool) -> wp.Kernel:
         @wp.kernel(module="unique", module_options=_OPTIONS)
@@ -161,71 +143,28 @@ def guide_kernels(dtype: Any) -> _Kernels:
 
         return guide
 
-    return _Kernels(lattice, transmittance, make_guide(True), make_guide(False))
+    return _Kernels(lattice, make_guide(True), make_guide(False))
 
 
-def transmittance(
-    density: wp.array,
-    extinction: float,
-    points: wp.array,
-    toward: Sequence[float],
-    step: float,
-    out: wp.array,
-    empty: Empty | None = None,
-) -> None:
-    """What is left of light that comes to points from a direction (eq. 3).
-
-    Args:
-        density: float or half [X, Y, Z].
-        extinction: Per voxel, of density 1.
-        points: vec3 [N], in voxels.
-        toward: The direction to the light, of length 1.
-        step: The longest step, in voxels; the error falls with its square where the density is smooth.
-        out: float [N], written.
-        empty: As for ``occupied``.
-    """
-    inputs = [density, occupied(density, empty), extinction, points, wp.vec3(*map(float, toward)), step]
-    kernel = guide_kernels(density.dtype).transmittance
-    wp.launch(kernel, points.shape, inputs=inputs, outputs=[out], device=density.device)
-
-
-def nodes_along(shape: Sequence[int], step: float) -> tuple[int, ...]:
-    """Nodes of a lattice no farther apart than a step, or a voxel, from half a voxel out of the grid to half beyond."""
-    # Each marches to its lights by itself: of closer ones the time would grow with the fourth power.
-    return tuple(math.ceil((n + 1) / max(step, 1.0)) + 1 for n in shape)
-
-
-def lattice(
-    density: wp.array, extinction: float, up: Sequence[float], step: float, empty: Empty | None = None
-) -> wp.array:
+def lattice(medium: Medium, up: Sequence[float], step: float) -> wp.array:
     """Optical depths towards the top and the bottom on a lattice of nodes no farther apart than a step, or a voxel.
 
     Args:
-        density: float or half [X, Y, Z].
-        extinction: Per voxel, of density 1.
+        medium: The smoke.
         up: The direction to the top, of length 1.
         step: In voxels, of the nodes, which are a voxel apart at least, and of the march from each.
-        empty: As for ``occupied``.
 
     Returns:
         vec2 [A, B, C], to the top and to the bottom; the first and the last nodes lie half a voxel out of the grid.
     """
-    nodes = (empty or warp_memory(density.device))(nodes_along(density.shape, step), wp.vec2)
-    inputs = [density, extinction, wp.vec3(*map(float, up)), step]
+    density = medium.density
+    nodes = medium.buffer(nodes_along(density.shape, step), wp.vec2)
+    inputs = [density, medium.extinction, wp.vec3(*map(float, up)), step]
     wp.launch(guide_kernels(density.dtype).lattice, nodes.shape, inputs, [nodes], device=density.device)
     return nodes
 
 
-def guide(
-    density: wp.array,
-    extinction: float,
-    view: View,
-    march: March,
-    out: wp.array,
-    *,
-    shared: bool = True,
-    empty: Empty | None = None,
-) -> None:
+def guide(medium: Medium, view: View, march: March, out: wp.array, *, shared: bool = True) -> None:
     """A guiding map (algorithm 1): smoke lit from the front, the top and the bottom, its transparency and its depth.
 
     Where the paper's algorithm leaves h out of a step's share of the light, and takes what it can for sigma h, it is
@@ -234,21 +173,20 @@ def guide(
     points up; ours are along the camera's own up and down.
 
     Args:
-        density: float or half [X, Y, Z].
-        extinction: Per voxel, of density 1.
+        medium: The smoke, of albedo 1.
         view: The camera, [H, W] pixels.
         march: Its steps are those to the lights too. What the cutoff leaves out is less than it in transparency and 2.5
             times it (for g = 0) in light.
-        out: float [3, H, W], written: scattered light under lights of irradiance 4 pi and an albedo of 1,
-            transparency, and the distance from the camera to the first sample denser than the threshold, 0: none.
+        out: float [3, H, W], written: scattered light under lights of irradiance 4 pi, transparency, and the distance
+            from the camera to the first sample denser than the threshold, 0: none.
         shared: Whether the lights from the top and bottom are marched to from a lattice with a node each step (each
             voxel, of smaller steps), and interpolated, instead of from each sample.
-        empty: As for ``occupied``.
     """
+    density = medium.density
     kernels = guide_kernels(density.dtype)
     if shared:
-        nodes, kernel = lattice(density, extinction, view.up, march.step, empty), kernels.guide
+        nodes, kernel = lattice(medium, view.up, march.step), kernels.guide
     else:
-        nodes, kernel = warp_memory(density.device)((0, 0, 0), wp.vec2), kernels.guide_marching
-    inputs = [density, nodes, extinction, view, parameters(march)]
+        nodes, kernel = medium.buffer((0, 0, 0), wp.vec2), kernels.guide_marching
+    inputs = [density, nodes, medium.extinction, view, parameters(march)]
     wp.launch(kernel, out.shape[1:], inputs=inputs, outputs=[out], device=density.device)

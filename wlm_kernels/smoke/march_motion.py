@@ -14,8 +14,8 @@ from typing import Any
 import warp as wp
 
 from wlm_kernels.smoke.march import (
-    Empty,
     MarchParameters,
+    Medium,
     View,
     absorbed,
     marched_ray,
@@ -111,32 +111,22 @@ def motion_kernel(dtype: Any) -> wp.Kernel:
     return motion
 
 
-def motion(
-    density: wp.array,
-    extinction: float,
-    velocity: wp.array,
-    reach: float,
-    view: View,
-    march: March,
-    out: wp.array,
-    empty: Empty | None = None,
-) -> None:
+def motion(medium: Medium, view: View, velocity: wp.array, reach: float, march: March, out: wp.array) -> None:
     """By how many pixels what each pixel shows has moved since the frame before.
 
     Args:
-        density: float or half [X, Y, Z], of the later frame.
-        extinction: Per voxel, of density 1.
+        medium: The smoke of the later frame.
+        view: An orthographic camera, [H, W] pixels, the same for both frames.
         velocity: vec3 [A, B, C], of the air over the same box, of any number of cells.
         reach: Voxels that a velocity of 1 goes between the frames.
-        view: An orthographic camera, [H, W] pixels, the same for both frames.
         march: Its step and cutoff; samples lie in their steps' middles.
         out: float [2, H, W], written: pixels to the right and down; 0 where there is no smoke.
-        empty: As for ``march.occupied``.
 
     Raises:
         ValueError: The camera is in perspective.
     """
     if view.perspective:
         raise ValueError("motion needs an orthographic camera, as the lightmaps do")
-    inputs = [density, occupied(density, empty), extinction, velocity, reach, view, parameters(march)]
+    density = medium.density
+    inputs = [density, occupied(medium), medium.extinction, velocity, reach, view, parameters(march)]
     wp.launch(motion_kernel(density.dtype), out.shape[1:], inputs=inputs, outputs=[out], device=density.device)

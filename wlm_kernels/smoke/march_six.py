@@ -19,8 +19,8 @@ from typing import Any
 import warp as wp
 
 from wlm_kernels.smoke.march import (
-    Empty,
     MarchParameters,
+    Medium,
     View,
     absorbed,
     clip,
@@ -34,7 +34,6 @@ from wlm_kernels.smoke.march import (
     ray,
     sample,
     size_of,
-    warp_memory,
 )
 from wlm_kernels.smoke.settings import March
 
@@ -262,49 +261,36 @@ def _extent(shape, origin, direction) -> tuple[float, float]:
     return start + sum(min(s, 0.0) for s in spans), start + sum(max(s, 0.0) for s in spans)
 
 
-def six_way(
-    density: wp.array,
-    extinction: float,
-    view: View,
-    march: March,
-    out: wp.array,
-    *,
-    temperature: wp.array | None = None,
-    emission: float = 0.0,
-    empty: Empty | None = None,
-) -> None:
-    """The six lightmaps, the transparency and the emission of smoke of albedo 1 (eq. 4).
+def six_way(medium: Medium, view: View, march: March, out: wp.array) -> None:
+    """The six lightmaps, the transparency and the emission (eq. 4).
 
     The camera's plane cuts off what lies behind it: that isn't seen, yet keeps light from the front away. Smoke outside
     the image, to the sides, does so too.
 
     Args:
-        density: float or half [X, Y, Z].
-        extinction: Per voxel, of density 1.
+        medium: The smoke, of albedo 1.
         view: An orthographic camera, [H, W] pixels. Pixel centres alone are looked at.
         march: Its step, along rays and to the lights, and g; samples lie in their steps' middles. The error falls with
             the step's square where the density is smooth.
         out: float [8, H, W], written: the light that reaches the camera from smoke lit from the right, left, top,
             bottom, front and back, each light of irradiance 4 pi; the transparency; the emission.
-        temperature: As the density, of its shape; None: nothing emits.
-        emission: Light given off per voxel of way where the temperature is 1.
-        empty: As for ``march.occupied``.
 
     Raises:
         ValueError: The camera is in perspective.
     """
     if view.perspective:
         raise ValueError("six-way lightmaps need an orthographic camera: their lights follow its axes")
+    density, extinction = medium.density, medium.extinction
     device = density.device
     height, width = view.height, view.width
     kernels = six_kernels(density.dtype)
-    empty = empty or warp_memory(device)
-    bricks = occupied(density, empty)
+    bricks = occupied(medium)
     out.zero_()
     near, far = _extent(density.shape, view.origin, view.forward)
     start = max(near, 0.0)
-    behind, ahead, passed = (empty((height, width), float) for _ in range(3))
-    for plane in (behind, ahead, passed):
+    depths = _Depths()
+    passed, depths.behind, depths.ahead = (medium.buffer((height, width), float) for _ in range(3))
+    for plane in (passed, depths.behind, depths.ahead):
         plane.zero_()
     common = [density, bricks, extinction, view]
 
@@ -315,16 +301,13 @@ def six_way(
         wp.launch(kernels.column, (height, width), inputs=inputs, outputs=[tau], device=device)
         return gap, planes
 
-    column(near, min(far, 0.0), behind)
-    gap, planes = column(start, far, ahead)
+    column(near, min(far, 0.0), depths.behind)
+    gap, planes = column(start, far, depths.ahead)
     parts = max(1, math.ceil(view.pitch / march.step))
     capacity = max(1, min(planes, _SLAB_BYTES // (16 * height * width)))
-    depths = _Depths()
-    sides = [empty((capacity, height, width), float) for _ in range(4)]
+    sides = [medium.buffer((capacity, height, width), float) for _ in range(4)]
     depths.right, depths.left, depths.top, depths.bottom = sides
-    depths.behind, depths.ahead = behind, ahead
-    hot = density if temperature is None else temperature
-    emission = 0.0 if temperature is None else emission
+    temperature, emission = medium.glow
     # Once even without a plane, for the transparency.
     for first in range(0, max(planes, 1), capacity):
         count = min(capacity, planes - first)
@@ -333,7 +316,7 @@ def six_way(
             lines = height if along < 2 else width
             inputs = [*common, slab, along, parts]
             wp.launch(kernels.sweep, (count, lines), inputs=inputs, outputs=[tau], device=device)
-        inputs = [density, hot, bricks, extinction, emission, view, slab, parameters(march), depths]
+        inputs = [density, temperature, bricks, extinction, emission, view, slab, parameters(march), depths]
         wp.launch(kernels.gather, (height, width), inputs=inputs, outputs=[passed, out], device=device)
 
 
@@ -343,27 +326,18 @@ def _slab(start: float, gap: float, planes: int) -> _Slab:
     return slab
 
 
-def lit(
-    density: wp.array,
-    extinction: float,
-    view: View,
-    toward: Sequence[float],
-    march: March,
-    out: wp.array,
-    empty: Empty | None = None,
-) -> None:
+def lit(medium: Medium, view: View, toward: Sequence[float], march: March, out: wp.array) -> None:
     """Smoke under one light from any direction: every sample of a ray marches to it, with nothing shared.
 
     What the six lightmaps approximate for a light between their axes (eq. 5), and a check of them along these.
 
     Args:
-        density: float or half [X, Y, Z].
-        extinction: Per voxel, of density 1.
+        medium: The smoke, of albedo 1.
         view: The camera, [H, W] pixels.
         toward: The direction to the light, of length 1; its irradiance is 4 pi.
         march: Its step, along rays and to the light, and g; samples lie in their steps' middles.
         out: float [H, W], written.
-        empty: As for ``march.occupied``.
     """
-    inputs = [density, occupied(density, empty), extinction, view, wp.vec3(*map(float, toward)), parameters(march)]
+    density, direction = medium.density, wp.vec3(*map(float, toward))
+    inputs = [density, occupied(medium), medium.extinction, view, direction, parameters(march)]
     wp.launch(six_kernels(density.dtype).lit, out.shape, inputs=inputs, outputs=[out], device=density.device)

@@ -19,7 +19,7 @@ from typing import Any
 
 import warp as wp
 
-from wlm_kernels.smoke.march import absorbed, node_position, size_of, steps_along
+from wlm_kernels.smoke.march import absorbed, node_position, point_on, size_of, steps_along
 
 __all__ = ["depths", "depths_backward", "march", "march_backward"]
 
@@ -141,12 +141,11 @@ def _depths(
     light, a, b, c = wp.tid()
     size = size_of(density)
     p = node_position(nodes[light], size, a, b, c)
-    steps = steps_along(size, p, toward[light], step)
+    r = steps_along(size, p, toward[light], step)
     tau = float(0.0)
-    for n in range(steps.count):
-        s = steps.first + (float(n) + 0.5) * steps.length
-        tau += _read(density, _voxel(density, p + s * toward[light]))
-    nodes[light, a, b, c] = tau * steps.length
+    for n in range(r.count):
+        tau += _read(density, _voxel(density, point_on(r, n, 0.5)))
+    nodes[light, a, b, c] = tau * r.length
 
 
 @wp.kernel
@@ -163,10 +162,9 @@ def _depths_backward(
     if g != 0.0:
         size = size_of(grad_density)
         p = node_position(grad_nodes[light], size, a, b, c)
-        steps = steps_along(size, p, toward[light], step)
-        for n in range(steps.count):
-            s = steps.first + (float(n) + 0.5) * steps.length
-            _add(grad_density, _voxel(grad_density, p + s * toward[light]), g * steps.length)
+        r = steps_along(size, p, toward[light], step)
+        for n in range(r.count):
+            _add(grad_density, _voxel(grad_density, point_on(r, n, 0.5)), g * r.length)
 
 
 @wp.kernel
@@ -184,30 +182,30 @@ def _march(
     depth: wp.array1d[float],
     count: wp.array1d[int],
 ):
-    r = wp.tid()
+    i = wp.tid()
     size = size_of(density)
-    steps = steps_along(size, origin[r], direction[r], step)
+    r = steps_along(size, origin[i], direction[i], step)
     for light in range(nodes.shape[0]):
-        scattered[r, light] = 0.0
+        scattered[i, light] = 0.0
     glow = wp.vec3()
     tau = float(0.0)
     n = int(0)
-    while n < steps.count and tau < _OPAQUE:
-        p = origin[r] + (steps.first + (float(n) + 0.5) * steps.length) * direction[r]
+    while n < r.count and tau < _OPAQUE:
+        p = point_on(r, n, 0.5)
         voxel = _voxel(density, p)
-        x = _read(density, voxel) * steps.length
+        x = _read(density, voxel) * r.length
         t = wp.exp(-tau)
         if emission.shape[0] > 0:
-            glow += t * _share(x) * steps.length * _read(emission, voxel)
+            glow += t * _share(x) * r.length * _read(emission, voxel)
         if nodes.shape[0] > 0 and x > 0.0:
             node = _node(nodes[0], size, p)
             for light in range(nodes.shape[0]):
-                scattered[r, light] += t * absorbed(x) * wp.exp(-_read(nodes[light], node))
+                scattered[i, light] += t * absorbed(x) * wp.exp(-_read(nodes[light], node))
         tau += wp.min(x, _OPAQUE)
         n += 1
-    emitted[r] = glow
-    depth[r] = tau
-    count[r] = n
+    emitted[i] = glow
+    depth[i] = tau
+    count[i] = n
 
 
 @wp.kernel
@@ -229,33 +227,33 @@ def _march_backward(
     grad_emission: wp.array3d[wp.vec3],
     grad_nodes: wp.array4d[float],
 ):
-    r = wp.tid()
+    i = wp.tid()
     size = size_of(density)
-    steps = steps_along(size, origin[r], direction[r], step)
-    tau = depth[r]
+    r = steps_along(size, origin[i], direction[i], step)
+    tau = depth[i]
     hidden = float(0.0)  # what the samples behind this one give to the objective
-    for back in range(count[r]):
-        n = count[r] - 1 - back
-        p = origin[r] + (steps.first + (float(n) + 0.5) * steps.length) * direction[r]
+    for back in range(count[i]):
+        n = count[i] - 1 - back
+        p = point_on(r, n, 0.5)
         voxel = _voxel(density, p)
-        x = _read(density, voxel) * steps.length
+        x = _read(density, voxel) * r.length
         tau -= wp.min(x, _OPAQUE)
         t = wp.exp(-tau)
         lit = float(0.0)
         if nodes.shape[0] > 0:
             node = _node(nodes[0], size, p)
             for light in range(nodes.shape[0]):
-                share = grad_scattered[r, light] * wp.exp(-_read(nodes[light], node))
+                share = grad_scattered[i, light] * wp.exp(-_read(nodes[light], node))
                 lit += share
                 if x > 0.0:
                     _add(grad_nodes[light], node, -t * absorbed(x) * share)
         glow = float(0.0)
         if emission.shape[0] > 0:
-            glow = steps.length * wp.dot(_read(emission, voxel), grad_emitted[r])
+            glow = r.length * wp.dot(_read(emission, voxel), grad_emitted[i])
             if grad_emission.shape[0] > 0:
-                _add(grad_emission, voxel, t * _share(x) * steps.length * grad_emitted[r])
-        on_x = t * (wp.exp(-x) * lit + _share_slope(x) * glow) - hidden + grad_depth[r]
-        _add(grad_density, voxel, on_x * steps.length)
+                _add(grad_emission, voxel, t * _share(x) * r.length * grad_emitted[i])
+        on_x = t * (wp.exp(-x) * lit + _share_slope(x) * glow) - hidden + grad_depth[i]
+        _add(grad_density, voxel, on_x * r.length)
         hidden += t * (absorbed(x) * lit + _share(x) * glow)
 
 
