@@ -16,7 +16,7 @@ from wlm.system import Meter
 SYSTEMS = ("lightmap", "atlas", "probe", "smoke")
 VERBS = {"load", "evaluate", "export", "Profile", "Report", "Decoder"}
 PROFILES = {"lightmap": "M", "atlas": "standard", "probe": "small", "smoke": "fast"}
-FITTED = [name for name in SUBJECTS if not name.startswith("atlas-") or name == "atlas-tiles"]
+FITTED = ["lightmap", "probe", "atlas-tiles"]
 
 
 @pytest.fixture

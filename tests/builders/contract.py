@@ -35,12 +35,12 @@ class Subject:
     name: str
     file: Path
     decode: Callable[[Any], dict[str, np.ndarray]]
-    stored: Path | None
-    data: Callable[[], Any]
-    compress: Callable[..., Any]
-    evaluate: Callable[[Any, Any], Any]
-    export: Callable[[Any, Any, Path], list[Path]]
-    open_checkpoint: Callable[[Any, Path, bool], Any] | None
+    stored: Path
+    data: Callable[[], Any] | None = None
+    compress: Callable[..., Any] | None = None
+    evaluate: Callable[[Any, Any], Any] | None = None
+    export: Callable[[Any, Any, Path], list[Path]] | None = None
+    open_checkpoint: Callable[[Any, Path, bool], Any] | None = None
 
 
 def _lightmap() -> Subject:
@@ -106,9 +106,20 @@ def _atlas(kind: str) -> Subject:
     )
 
 
+def _smoke() -> Subject:
+    def decode(model: Any) -> dict[str, np.ndarray]:
+        with np.load(FILES / "smoke.npz") as stored:
+            guide = stored["guide"]
+        decoder = model.decoder(height=guide.shape[1], width=guide.shape[2])
+        return {"guide": guide, "planes": decoder(torch.from_numpy(guide)).numpy()}
+
+    return Subject("smoke", FILES / "smoke.wlm", decode, FILES / "smoke.npz")
+
+
 SUBJECTS: dict[str, Callable[[], Subject]] = {
     "lightmap": _lightmap,
     "probe": _probe,
     **{f"atlas-{kind}": lambda kind=kind: _atlas(kind) for kind in ("tiles", "cascade", "bc6h", "plain")},
+    "smoke": _smoke,
 }
 """By name; made when asked for, since importing a system takes time."""

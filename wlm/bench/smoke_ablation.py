@@ -23,10 +23,8 @@ import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar
 
 import torch
-from pydantic import BaseModel
 
 from wlm.baselines.smoke import COARSE, coarse
 from wlm.bench.rows import Row
@@ -59,8 +57,6 @@ _GUIDES = {
     "sides": "guide of front and sides",
 }
 _PLANES = ("right", "left")  # with a column of their own
-
-_Settings = TypeVar("_Settings", bound=BaseModel)
 
 
 @dataclass(frozen=True)
@@ -142,13 +138,13 @@ def run_rows(
     """Trains the variants of a profile at the given sizes; the rest as for `run`."""
     bench = Bench("smoke-network", device, progress, scene=f"validation, {base.name}")
     training = {"rounds": sizes.rounds, "steps": sizes.steps, "crop": None}
-    base = _changed(base, {"dataset": sizes.dataset, "training": training})
+    base = base.override({"dataset": sizes.dataset, "training": training})
     chosen = _chosen(base, only, bench.note)
     samples = _Samples(sizes, bench)
     rows = []
     for name, profile in chosen.items():
         if profile is None:
-            validation = samples.validation(_changed(base.dataset, {"guide": "six"}))
+            validation = samples.validation(base.dataset.model_copy(update={"guide": "six"}))
             rows.append(_row(bench, name, score(coarse, validation), "no network"))
         else:
             rows.append(_trained_row(bench, name, profile, samples))
@@ -191,7 +187,7 @@ def variants(base: Profile) -> dict[str, Profile | None]:
         # The paper's guide has no nodes, and so no distance between them.
         dataset = {"guide": kind} | ({"guide_spacing": None} if kind == "paper" else {})
         changes[name] = {"network": {"guide": kind}, "dataset": dataset}
-    return {"base": base, **{name: _changed(base, change) for name, change in changes.items()}, COARSE: None}
+    return {"base": base, **{name: base.override(change) for name, change in changes.items()}, COARSE: None}
 
 
 def _chosen(base: Profile, only: Sequence[str], note: Note) -> dict[str, Profile | None]:
@@ -238,7 +234,7 @@ class _Samples:
         """The validation of all variants with these settings."""
         if settings not in self._validations:
             self._note(f"makes the validation, guide {settings.guide}")
-            pool = make_validation(_changed(settings, self._sizes.validation), self._device)
+            pool = make_validation(settings.model_copy(update=self._sizes.validation), self._device)
             self._validations[settings] = _with_smoke("the validation", pool)
         return self._validations[settings]
 
@@ -301,12 +297,3 @@ def _row(bench: Bench, name: str, evaluation: Score, note: str = "", **figures: 
         **{f"{plane}_psnr": evaluation.planes[PLANES.index(plane)] for plane in _PLANES},
         **figures,
     )
-
-
-def _changed(settings: _Settings, changes: Mapping[str, object]) -> _Settings:
-    """Settings with some of them replaced, at any depth, and all checked again."""
-    values = {
-        name: _changed(getattr(settings, name), value) if isinstance(value, Mapping) else value
-        for name, value in changes.items()
-    }
-    return type(settings).model_validate({**dict(settings), **values})

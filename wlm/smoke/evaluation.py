@@ -298,12 +298,21 @@ def compare(
     if device != "cpu":
         contenders[HALF] = lambda held_out: _at_run_time(model, device, held_out.pool(guide))
     contenders |= rivals or {}
-    sets = {f"density x {scale:g}": partial(_test_set, settings, device, scale) for scale in densities}
-    sets |= {os.fspath(path): partial(_volume_set, settings, device, path) for path in volumes}
+    # All frames are made, so that each has its first view; almost empty ones don't count, but in volumes all do.
+    complete = settings.model_copy(update={"kept_empty": 1.0})
+    sets = {
+        f"density x {scale:g}": (
+            partial(make_validation, device=device, test=True, scale=scale),
+            settings.least_coverage,
+        )
+        for scale in densities
+    }
+    sets |= {os.fspath(path): (partial(pool_of_volume, path, device=device), -1.0) for path in volumes}
     meter = Meter(progress, "evaluate", len(sets))
     comparisons = []
-    for name, make in sets.items():
-        held_out = make()
+    for name, (make, least_coverage) in sets.items():
+        whole = make(complete)
+        held_out = HeldOut(whole, whole.covered() > least_coverage, complete, make)
         count = int(held_out.keep.sum())
         if not count:
             raise WlmError(f"{name}: expected frames with smoke, found none")
@@ -321,23 +330,6 @@ def compare(
 def _at_run_time(model: SmokeModel, device: str, pool: Pool, half: bool = True) -> tuple[Pool, Method]:
     height, width = pool.guides.shape[-2:]
     return pool, of_decoder(Decoder(model, device, height=height, width=width, half=half))
-
-
-def _test_set(settings: DatasetSettings, device: str, scale: float) -> HeldOut:
-    # All frames are made, so that each has its first view; almost empty ones are left out here.
-    whole_settings = settings.model_copy(update={"kept_empty": 1.0})
-
-    def make(settings: DatasetSettings) -> Pool:
-        return make_validation(settings, device, test=True, scale=scale)
-
-    whole = make(whole_settings)
-    return HeldOut(whole, whole.covered() > settings.least_coverage, whole_settings, make)
-
-
-def _volume_set(settings: DatasetSettings, device: str, path: str | os.PathLike[str]) -> HeldOut:
-    make = partial(pool_of_volume, path, device=device)
-    whole = make(settings)
-    return HeldOut(whole, torch.ones(len(whole), dtype=torch.bool, device=whole.device), settings, make)
 
 
 def _with_guide(settings: DatasetSettings, kind: str) -> DatasetSettings:
