@@ -9,7 +9,7 @@ from PIL import Image, ImageDraw, ImageFont
 HERE = Path(__file__).resolve().parent
 LEFT = {
     "city.png": "lightmap: a tile over the day; reference, decoded, error x 8",
-    "plume.png": "smoke: a simulated plume under a moving light; its six-way lightmaps",
+    "smoke/plume.png": "smoke: a simulated plume under a moving light; its six-way lightmaps",
 }
 RIGHT = {
     "room.png": "atlas: a room's lightmap; original, decoded, downsampled to as many bytes, errors x 8",
