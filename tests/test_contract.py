@@ -11,7 +11,7 @@ from builders.contract import SUBJECTS, Subject
 
 import wlm
 from wlm.formats.artifact import read_artifact, write_artifact
-from wlm.system import Meter
+from wlm.system import Meter, load
 
 SYSTEMS = ("lightmap", "atlas", "probe", "smoke")
 VERBS = {"load", "evaluate", "export", "Profile", "Report", "Decoder"}
@@ -112,6 +112,13 @@ def test_parts_that_are_missing_or_of_another_kind_are_one_line(subject, tmp_pat
 
 
 @every_file
+def test_a_file_of_another_system_is_refused(subject):
+    system = read_artifact(subject.file).system
+    other = "atlas" if system == "probe" else "probe"
+    one_line(lambda: load(subject.file, other), subject.file.name, f"of {other}, found one of {system}")
+
+
+@every_file
 def test_settings_that_are_missing_are_one_line(subject, tmp_path):
     artifact = read_artifact(subject.file)
     path = tmp_path / "wrong.wlm"
@@ -175,8 +182,10 @@ def test_an_export_keeps_to_its_own_folder(subject, tmp_path):
     files = subject.export(model, data, folder)
     content = {path: path.read_bytes() for path in files}
     assert files and all(path.parent == folder for path in files) and set(folder.iterdir()) == set(files)
+    (folder / "readme.txt").write_text("mine")
     assert set(subject.export(model, data, folder)) == set(files), "an earlier export is written over"
     assert {path: path.read_bytes() for path in files} == content
+    assert (folder / "readme.txt").read_text() == "mine", "and nothing else"
     foreign = tmp_path / "foreign"
     foreign.mkdir()
     (foreign / "notes.txt").write_text("mine")

@@ -10,7 +10,6 @@ import wlm
 from wlm.errors import WlmError
 from wlm.formats.artifact import read_artifact, write_artifact
 from wlm.lightmap.model import LightmapModel, Profile
-from wlm.system import load
 
 ARRAYS = [field.name for field in dataclasses.fields(LightmapModel) if field.type is np.ndarray]
 
@@ -107,9 +106,3 @@ def test_parts_that_do_not_fit_are_one_line(tmp_path, changes):
     with pytest.raises(WlmError, match="a.wlm: (the file's parts do not fit|profile.)") as error:
         wlm.load(tmp_path / "a.wlm")
     assert "\n" not in str(error.value)
-
-
-def test_a_file_of_another_system_is_refused(tmp_path):
-    write_artifact(tmp_path / "a.wlm", "probe", {}, {}, "0")
-    with pytest.raises(WlmError, match="expected an artifact of lightmap, found one of probe"):
-        load(tmp_path / "a.wlm", "lightmap")

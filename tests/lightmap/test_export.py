@@ -161,27 +161,6 @@ def test_networks_lie_one_after_another(tmp_path):
     assert np.shape(tiles[0]["W1"]) == (4, 8) and np.shape(tiles[1]["W1"]) == (16, 8)
 
 
-def test_a_second_export_replaces_the_first_and_nothing_else(tmp_path):
-    folder = tmp_path / "made" / "here"
-    export(random_model((3, 3)), folder)
-    (folder / "readme.txt").write_text("mine")
-    export(random_model((2, 0), seed=1), folder)
-    names = sorted(path.name for path in folder.iterdir())
-    assert names == ["decode.glsl", "frame.exr", "readme.txt", "tile_0000_uv.dds", "weights.json"]
-    assert [path.name for path in folder.parent.iterdir()] == ["here"]
-
-
-@pytest.mark.parametrize("content", [None, "{}", "[1]", "not json"])
-def test_a_folder_of_other_files_is_left_alone(content, tmp_path):
-    (tmp_path / "tile_0009_uv.dds").write_bytes(b"not ours")
-    if content is not None:
-        (tmp_path / "weights.json").write_text(content)
-    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
-    with pytest.raises(WlmError, match="expected an empty folder or one of an earlier output"):
-        export(random_model((2, 0)), tmp_path)
-    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
-
-
 def test_what_cannot_be_exported(tmp_path):
     model = random_model((2, 0))
     net = model.net_static.copy()

@@ -158,27 +158,6 @@ def test_what_is_written(tmp_path):
     assert info["bytes"]["gaussians.bin"] == 40 * 40 + 4 * (10 + 2 * 19)
 
 
-def test_a_second_export_replaces_the_first_and_nothing_else(tmp_path):
-    folder = tmp_path / "made" / "here"
-    export(random_model(positions=True), folder)
-    (folder / "readme.txt").write_text("mine")
-    export(random_model(seed=1, dead=0), folder)
-    names = sorted(path.name for path in folder.iterdir())
-    assert names == ["gaussians.bin", "network.bin", "probe.glsl", "probe.json", "readme.txt", "reference.json"]
-    assert json.loads((folder / "probe.json").read_text())["dead"] == []
-
-
-@pytest.mark.parametrize("content", [None, "{}", "[1]", "not json", '{"format": "wlm-lightmap-export"}'])
-def test_a_folder_of_other_files_is_left_alone(content, tmp_path):
-    (tmp_path / "gaussians.bin").write_bytes(b"not ours")
-    if content is not None:
-        (tmp_path / "probe.json").write_text(content)
-    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
-    with pytest.raises(WlmError, match="expected an empty folder or one of an earlier output"):
-        export(random_model(), tmp_path)
-    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
-
-
 def test_what_cannot_be_exported(tmp_path):
     model = random_model()
     net = model.net.copy()
