@@ -19,11 +19,12 @@ demo: $(STAMP)
 demo-network: $(STAMP)
 	$(BIN)/python demos/smoke_network.py --train
 
+# A file's tests stay on one worker, so that each kernel is compiled by few of them.
 test: lint
-	$(BIN)/pytest -n 2
+	$(BIN)/pytest -n 2 --dist loadfile
 
 test-all: lint
-	$(BIN)/pytest -n 2 -m ""
+	$(BIN)/pytest -n 2 --dist loadfile -m ""
 
 bench: $(STAMP)
 	mkdir -p out

@@ -149,6 +149,7 @@ def test_rows(requests, no_package, device, tmp_path):
     assert all(any(line.startswith(f"| {row.option} | {row['psnr']:.2f} |") for line in lines) for row in rows)
 
 
+@pytest.mark.slow
 def test_variants_learn_from_the_same_samples(requests, no_package):
     run_rows(SIZES, BASE, device="cpu")
     kinds = ["six", "paper", "front", "sides"]
@@ -196,6 +197,7 @@ def test_no_smoke(requests, monkeypatch):
         run_rows(SIZES, BASE, ["base"], device="cpu")
 
 
+@pytest.mark.slow
 def test_simulated_smoke():
     """At the size of a check on a CPU, the march alone: it is that of the profile's own validation."""
     (row,) = run_rows(QUICK, BASE, ["coarse march"], device="cpu")
