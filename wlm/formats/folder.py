@@ -19,7 +19,7 @@ import numpy as np
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_write
 
-__all__ = ["UNFINISHED", "claim", "compact_json", "read_index", "rounded", "staged", "write_index"]
+__all__ = ["UNFINISHED", "claim", "compact_json", "make_parents", "read_index", "rounded", "staged", "write_index"]
 
 UNFINISHED = "unfinished"
 """Key of an index that stands in while files are being moved in."""
@@ -49,6 +49,18 @@ def claim(folder: Path, index: str, format_name: str) -> None:
     for place in (parent, folder):
         if place.exists() and not os.access(place, os.W_OK):
             raise WlmError(f"{folder}: cannot write: the folder {place} is read-only")
+
+
+def make_parents(folder: Path) -> None:
+    """Makes the folders above a folder, for an output that may lie deeper than `claim` allows.
+
+    Raises:
+        WlmError: They can't be made.
+    """
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise WlmError(f"{folder}: cannot write there: {error.strerror or error}") from error
 
 
 @contextmanager

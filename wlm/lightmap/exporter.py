@@ -14,7 +14,7 @@ from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_path
 from wlm.formats.dds import write_dds
 from wlm.formats.exr import write_exr
-from wlm.formats.folder import compact_json, rounded, staged
+from wlm.formats.folder import compact_json, make_parents, rounded, staged
 from wlm.lightmap.decode import Decoder
 from wlm.lightmap.exact import SQRT_12
 from wlm.lightmap.model import TILE, LightmapModel, decode_scale, encode_time
@@ -77,10 +77,7 @@ def export(model: LightmapModel, directory: str | os.PathLike[str], *, device: s
     folder = Path(directory)
     frame = Decoder(model, device).frame(float(model.times[0]))
     text = _document(model)
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise WlmError(f"{folder}: cannot write there: {error.strerror or error}") from error
+    make_parents(folder)
     dynamic = np.flatnonzero(model.kind == TileKind.DYNAMIC).tolist()
     with staged(folder, WEIGHTS_FILE, FORMAT, lambda name: bool(_TEXTURE.fullmatch(name))) as staging:
         written = []

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from wlm.errors import WlmError
-from wlm.formats.folder import compact_json, rounded, staged
+from wlm.formats.folder import make_parents, rounded, staged, write_index
 from wlm.probe.conventions import CANONICAL
 from wlm.probe.data import save_probes
 from wlm.probe.decode import Decoder
@@ -107,15 +107,12 @@ def export(model: ProbeModel, directory: str | os.PathLike[str], *, device: str 
     if len(model.positions):
         files[POSITIONS_FILE] = np.ascontiguousarray(model.positions, "<u2").tobytes()
     document = _document(model, {name: len(content) for name, content in files.items()})
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise WlmError(f"{folder}: cannot write there: {error.strerror or error}") from error
+    make_parents(folder)
     with staged(folder, INFO_FILE, FORMAT, _FILES.__contains__) as temporary:
         for name, content in files.items():
             (temporary / name).write_bytes(content)
         save_probes(temporary / REFERENCE_FILE, position, values)
-        (temporary / INFO_FILE).write_text(compact_json(document), encoding="utf-8")
+        write_index(temporary / INFO_FILE, document)
     return [folder / name for name in (*files, REFERENCE_FILE, INFO_FILE)]
 
 
