@@ -21,6 +21,7 @@ __all__ = ["Targets", "Trainer"]
 _STATE = ("maps", "hidden", "output", "loss", "control")
 _ADAM_STATE = ("step", "exp_avg", "exp_avg_sq")
 
+_VECTOR = 16  # numbers of the widest vector of a CPU that torch knows (AVX-512)
 CPU_LANES = 2  # ranges of samples with separate sums; fixed, so that results don't depend on the number of cores
 
 
@@ -86,6 +87,25 @@ class Targets:
         self.emphasis = 2.0 * (gamma - 1.0) * metric_weight
 
 
+def _padded(count: int) -> int:
+    """Numbers that an optimiser's tensor of `count` has.
+
+    Torch's fused Adam treats what is left over from whole vectors in a loop of its own, which rounds otherwise on some
+    CPUs: with no remainder, a tile is the same in any batch.
+    """
+    return -(-count // _VECTOR) * _VECTOR
+
+
+def _parameter(shape: tuple[int, ...], device: str) -> tuple[torch.Tensor, torch.Tensor]:
+    """Zeros as an optimiser takes them, flat and padded, and a view of them in their shape; each has its gradient."""
+    count = math.prod(shape)
+    stored = torch.zeros(_padded(count), device=device).requires_grad_()
+    stored.grad = torch.zeros_like(stored)
+    view = stored.detach()[:count].view(shape).requires_grad_()
+    view.grad = stored.grad[:count].view(shape)
+    return stored, view
+
+
 class Trainer:
     """Trains N tiles of one kind together; see `Profile` for the stages.
 
@@ -100,7 +120,7 @@ class Trainer:
         tiles: N.
         inputs: Inputs of the network.
         views: The maps by name, as `wlm_kernels.lightmap.features.Maps` has them: views of `maps`.
-        maps, maps_grad: float32 [M], all maps and their gradients.
+        maps, maps_grad: float32 [M], all maps and their gradients, padded.
         hidden, output: The networks, see `wlm_kernels.mlp`.
         loss: float32 [N], running mean of each tile's loss over about 50 steps.
         control: int32 [1], steps done.
@@ -167,16 +187,14 @@ class Trainer:
         shapes = self._shapes()
         device, n, hidden = self.device, self.tiles, self.profile.hidden
         lengths = {key: math.prod(shape) for key, shape in shapes.items()}
-        total = sum(lengths.values())
+        total = _padded(sum(lengths.values()))
 
         def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> torch.Tensor:
             return torch.zeros(shape, dtype=dtype, device=device)
 
         self.maps, self.maps_grad = zeros(total), zeros(total)
-        self.hidden = zeros(n, self.inputs + hidden + 2, hidden).requires_grad_()
-        self.output = zeros(n, hidden + 1, 3).requires_grad_()
-        for parameter in (self.hidden, self.output):
-            parameter.grad = torch.zeros_like(parameter)
+        stored_hidden, self.hidden = _parameter((n, self.inputs + hidden + 2, hidden), device)
+        stored_output, self.output = _parameter((n, hidden + 1, 3), device)
         self.views, at = {}, 0
         self._offsets = features.Offsets()
         for key, shape in shapes.items():
@@ -202,7 +220,7 @@ class Trainer:
         self._rates = rates
         fused = {"eps": self.profile.adam_epsilon, "fused": True, "capturable": self._cuda}
         self._adam_maps = torch.optim.Adam(self._pieces(), lr=rates[0] if self._cuda else 1.0, **fused)
-        self._adam_net = torch.optim.Adam([self.hidden, self.output], lr=rates[1] if self._cuda else 1.0, **fused)
+        self._adam_net = torch.optim.Adam([stored_hidden, stored_output], lr=rates[1] if self._cuda else 1.0, **fused)
 
         wrap = interop.to_warp
         vec = self._kernels.net.vec_hidden
