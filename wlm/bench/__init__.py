@@ -1,5 +1,6 @@
 """Speed against error: timing, the rows that every system reports, and their tables and plots."""
 
+from wlm.bench.compare import Change, compare
 from wlm.bench.figures import FIGURES
 from wlm.bench.plot import Panel, pareto_front, plot
 from wlm.bench.report import pages, tables
@@ -8,10 +9,12 @@ from wlm.bench.timing import Timing, time_together
 
 __all__ = [
     "FIGURES",
+    "Change",
     "Panel",
     "Row",
     "Run",
     "Timing",
+    "compare",
     "describe_environment",
     "pages",
     "pareto_front",

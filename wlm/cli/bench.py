@@ -31,6 +31,14 @@ _PlotFile = Annotated[
     Path | None,
     typer.Option("--plot", metavar="FILE.png", help="Draw quality against size or time, error against time."),
 ]
+_Baseline = Annotated[
+    Path | None,
+    typer.Option(
+        "--baseline",
+        metavar="OLD.json",
+        help="Fail where rows of this result file were better: by more than 0.05 dB, or by 5% of time on this machine.",
+    ),
+]
 _Rivals = Annotated[bool, typer.Option("--rivals/--no-rivals", help="With the rivals, which take minutes on the CPU.")]
 _RivalsAt = Annotated[
     Path | None,
@@ -49,14 +57,15 @@ def lightmap(
     ] = None,
     json_path: _RowsFile = None,
     plot_path: _PlotFile = None,
+    baseline: _Baseline = None,
 ) -> None:
     """Lightmaps over time: PSNR, bits a texel and decode time of the profiles and of block codecs."""
-    device = _prepare(device, json_path, plot_path)
+    device = _prepare(device, json_path, plot_path, baseline)
     from wlm.bench.lightmap import PANELS, run
 
     rows = run(quick=quick, device=device, set_path=set_path, progress=note)
     command = _command("lightmap", quick=quick, device=device, set=set_path and rows[0].scene)
-    _finish(rows, command, device, json_path, plot_path, PANELS)
+    _finish(rows, command, device, json_path, plot_path, PANELS, baseline=baseline)
 
 
 @app.command()
@@ -73,9 +82,10 @@ def probe(
     rivals_at: _RivalsAt = None,
     json_path: _RowsFile = None,
     plot_path: _PlotFile = None,
+    baseline: _Baseline = None,
 ) -> None:
     """Light probes: PSNR, size and decode time of the profiles, of their decodes and of the PCA family."""
-    device = _prepare(device, json_path, plot_path)
+    device = _prepare(device, json_path, plot_path, baseline)
     from wlm.bench.probe import PANELS, run, run_rivals
 
     common = {"probes_path": probes_path, "keys": keys or (), "progress": note}
@@ -90,7 +100,7 @@ def probe(
     else:
         rows = run(quick=quick, device=device, rivals=rivals, **common)
         command = _command("probe", quick=quick, no_rivals=not rivals, device=device, **files)
-    _finish(rows, command, device, json_path, plot_path, PANELS, [*beside, *rows])
+    _finish(rows, command, device, json_path, plot_path, PANELS, [*beside, *rows], baseline)
 
 
 @app.command()
@@ -120,9 +130,10 @@ def atlas(
     rivals_at: _RivalsAt = None,
     json_path: _RowsFile = None,
     plot_path: _PlotFile = None,
+    baseline: _Baseline = None,
 ) -> None:
     """Lightmaps of meshes: PSNR, SSIM, size and decode time of the profiles, smaller lightmaps and block codecs."""
-    device = _prepare(device, json_path, plot_path)
+    device = _prepare(device, json_path, plot_path, baseline)
     from wlm.bench.atlas import PANELS, plotted, run, run_rivals
     from wlm.bench.atlas_inputs import load
 
@@ -138,19 +149,24 @@ def atlas(
     else:
         rows = run(lightmaps, profiles or (), quick=quick, device=device, rivals=rivals, progress=note)
         command = _command("atlas", quick=quick, no_rivals=not rivals, device=device, **files, profile=profiles)
-    _finish(rows, command, device, json_path, plot_path, PANELS, [*plotted(beside), *plotted(rows)])
+    _finish(rows, command, device, json_path, plot_path, PANELS, [*plotted(beside), *plotted(rows)], baseline)
 
 
 @app.command()
 def smoke(
-    quick: _SmallGrids = False, device: Device = "cpu", json_path: _RowsFile = None, plot_path: _PlotFile = None
+    quick: _SmallGrids = False,
+    device: Device = "cpu",
+    json_path: _RowsFile = None,
+    plot_path: _PlotFile = None,
+    baseline: _Baseline = None,
 ) -> None:
     """Smoke: the lattice beside a copy, advection, guiding maps, six-way lightmaps and a frame, with their errors."""
-    device = _prepare(device, json_path, plot_path)
+    device = _prepare(device, json_path, plot_path, baseline)
     from wlm.bench.smoke import PANELS, plotted, run
 
     rows = run(quick=quick, device=device, progress=note)
-    _finish(rows, _command("smoke", quick=quick, device=device), device, json_path, plot_path, PANELS, plotted(rows))
+    command = _command("smoke", quick=quick, device=device)
+    _finish(rows, command, device, json_path, plot_path, PANELS, plotted(rows), baseline)
 
 
 @app.command("smoke-network")
@@ -175,16 +191,17 @@ def smoke_network(
     ] = None,
     json_path: _RowsFile = None,
     plot_path: _PlotFile = None,
+    baseline: _Baseline = None,
 ) -> None:
     """Neural six-way lightmaps: time and error beside marches, flip books and path tracing, by parts and by profile."""
-    device = _prepare(device, json_path, plot_path)
+    device = _prepare(device, json_path, plot_path, baseline)
     from wlm.bench.smoke_network import PANELS, plotted, run
     from wlm.smoke.codec import shipped
 
     rows = run(networks or ([] if profiles else [shipped()]), profiles or (), quick=quick, device=device, progress=note)
     names = [Path(name).name for name in profiles or ()]
     command = _command("smoke-network", quick=quick, device=device, network=networks, profile=names)
-    _finish(rows, command, device, json_path, plot_path, PANELS, plotted(rows))
+    _finish(rows, command, device, json_path, plot_path, PANELS, plotted(rows), baseline)
 
 
 @app.command("smoke-ablation")
@@ -202,9 +219,10 @@ def smoke_ablation(
         list[str] | None, typer.Option("--only", metavar="ROW", help="A row by its name; default all. Several times.")
     ] = None,
     json_path: _RowsFile = None,
+    baseline: _Baseline = None,
 ) -> None:
     """Neural six-way lightmaps: short trainings of a profile with one thing changed at a time, beside each other."""
-    device = _prepare(device, json_path, None)
+    device = _prepare(device, json_path, None, baseline)
     from wlm.bench import describe_environment, write_json
     from wlm.bench.smoke_ablation import run
 
@@ -217,7 +235,7 @@ def smoke_ablation(
             write_json(json_path, rows, describe_environment(device, command))
 
     rows = run(profile, only or (), quick=quick, device=device, **lengths, progress=note, done=write)
-    _finish(rows, command, device, None, None)
+    _finish(rows, command, device, None, None, baseline=baseline)
 
 
 @app.command()
@@ -242,8 +260,14 @@ def report(
         atomic_write(path, page.encode())
 
 
-def _prepare(device: str, json_path: Path | None, plot_path: Path | None) -> str:
-    """Checks, before long work, that the device is there and that results can be written; returns the device."""
+def _prepare(device: str, json_path: Path | None, plot_path: Path | None, baseline: Path | None) -> str:
+    """Checks, before long work, the device, where results go and what they are compared with; returns the device."""
+    if baseline is not None:
+        from wlm.bench import read_runs
+
+        read_runs(baseline)
+        if json_path is not None and json_path.resolve() == baseline.resolve():
+            raise WlmError(f"--baseline {baseline}: expected another file than --json, whose rows are replaced")
     if json_path is not None:
         check_output(json_path, ".json")
         if json_path.exists():
@@ -286,8 +310,9 @@ def _finish(
     plot_path: Path | None,
     panels: "Sequence[Panel]" = (),
     plotted: "Sequence[Row] | None" = None,
+    baseline: Path | None = None,
 ) -> None:
-    """Writes the result file and the plot, of all rows unless told which, and prints the tables."""
+    """Writes the result file and the plot, of all rows unless told which, prints the tables, and compares."""
     from wlm.bench import describe_environment, plot, tables, write_json
 
     if json_path is not None:
@@ -295,3 +320,22 @@ def _finish(
     if plot_path is not None:
         plot(rows if plotted is None else plotted, plot_path, panels)
     sys.stdout.write(tables(rows))
+    if baseline is not None:
+        _compare(rows, device, baseline)
+
+
+def _compare(rows: "Sequence[Row]", device: str, baseline: Path) -> None:
+    """Prints the figures that are worse than in an older file, and fails if there are any."""
+    from wlm.bench import FIGURES, compare, describe_environment, read_runs
+
+    changes = compare(rows, read_runs(baseline), describe_environment(device, "")["device_name"])
+    if not changes:
+        raise WlmError(f"{baseline}: expected rows of the same method, option and scene, found none")
+    worse = [change for change in changes if change.worse]
+    for change in worse:
+        row, figure = change.row, FIGURES[change.name]
+        name = " ".join(filter(None, (row.scene, row.method, row.option)))
+        note(f"worse: {name}: {figure.heading}: {figure.text(change.old)} before, {figure.text(change.new)} now")
+    note(f"{len(changes)} figures compared with {baseline}: {len(worse)} are worse")
+    if worse:
+        raise typer.Exit(1)
