@@ -10,7 +10,7 @@ FLOORS = (
     GROUND.split(),
     ["wlm.ops", "wlm.fluid"],
     ["wlm.lightmap", "wlm.atlas", "wlm.probe", "wlm.smoke"],
-    ["wlm.baselines", "wlm.view"],
+    ["wlm.baselines", "wlm.view", "wlm.web"],
     ["wlm.bench"],
     ["wlm.cli"],
     ["wlm.__main__"],

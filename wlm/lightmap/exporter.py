@@ -21,7 +21,7 @@ from wlm.lightmap.model import TILE, LightmapModel, decode_scale, encode_time
 from wlm.lightmap.shader import decode_glsl
 from wlm.lightmap.tiles import TileKind
 
-__all__ = ["FORMAT", "FRAME_FILE", "SHADER_FILE", "WEIGHTS_FILE", "export", "write_8bit"]
+__all__ = ["FORMAT", "FRAME_FILE", "SHADER_FILE", "WEIGHTS_FILE", "document", "export", "write_8bit"]
 
 FORMAT = "wlm-lightmap-export"
 _VERSION = 1
@@ -76,7 +76,10 @@ def export(model: LightmapModel, directory: str | os.PathLike[str], *, device: s
     """
     folder = Path(directory)
     frame = Decoder(model, device).frame(float(model.times[0]))
-    text = _document(model)
+    try:
+        text = compact_json(document(model))
+    except ValueError as error:
+        raise WlmError(f"{model.name}: cannot export: a weight is NaN or infinite") from error
     make_parents(folder)
     dynamic = np.flatnonzero(model.kind == TileKind.DYNAMIC).tolist()
     with staged(folder, WEIGHTS_FILE, FORMAT, lambda name: bool(_TEXTURE.fullmatch(name))) as staging:
@@ -171,10 +174,11 @@ def _tiles(model: LightmapModel) -> tuple[list[dict[str, Any]], int]:
     return tiles, offset
 
 
-def _document(model: LightmapModel) -> str:
+def document(model: LightmapModel) -> dict[str, Any]:
+    """What `weights.json` holds: networks, scales and bounds by tile, and how to read them ("about")."""
     profile, axis = model.profile, model.axis
     tiles, floats = _tiles(model)
-    document = {
+    return {
         "format": FORMAT,
         "version": _VERSION,
         "about": _ABOUT,
@@ -194,7 +198,3 @@ def _document(model: LightmapModel) -> str:
         "tau": rounded(encode_time(axis)[0]),
         "tiles": tiles,
     }
-    try:
-        return compact_json(document)
-    except ValueError as error:
-        raise WlmError(f"{model.name}: cannot export: a weight is NaN or infinite") from error

@@ -29,6 +29,8 @@ __all__ = [
     "REFERENCE_FILE",
     "SHADER_FILE",
     "export",
+    "gaussian_bytes",
+    "network_bytes",
 ]
 
 FORMAT = "wlm-probe-export"
@@ -100,8 +102,8 @@ def export(model: ProbeModel, directory: str | os.PathLike[str], *, device: str 
     if not np.isfinite(values).all():
         raise WlmError(f"{model.name}: cannot export: it decodes to NaN or infinity")
     files = {
-        GAUSSIANS_FILE: _gaussian_bytes(model),
-        NETWORK_FILE: _network_bytes(model),
+        GAUSSIANS_FILE: gaussian_bytes(model),
+        NETWORK_FILE: network_bytes(model),
         SHADER_FILE: probe_glsl(model).encode(),
     }
     if len(model.positions):
@@ -116,7 +118,12 @@ def export(model: ProbeModel, directory: str | os.PathLike[str], *, device: str 
     return [folder / name for name in (*files, REFERENCE_FILE, INFO_FILE)]
 
 
-def _gaussian_bytes(model: ProbeModel) -> bytes:
+def gaussian_bytes(model: ProbeModel) -> bytes:
+    """What `gaussians.bin` holds.
+
+    Raises:
+        WlmError: The probes' box has no floats.
+    """
     words = gaussian_words(model.profile.latent)
     codes = np.zeros((model.count, 2 * words), "<u2")
     codes[:, : model.codes.shape[1]] = model.codes
@@ -129,8 +136,8 @@ def _gaussian_bytes(model: ProbeModel) -> bytes:
     return head.tobytes() + count.tobytes() + numbers.tobytes() + codes.tobytes()
 
 
-def _network_bytes(model: ProbeModel) -> bytes:
-    """The network in 4 x 4 blocks, as the shader reads it."""
+def network_bytes(model: ProbeModel) -> bytes:
+    """What `network.bin` holds: the network in 4 x 4 blocks, as the shader reads it."""
     pieces = []
     for layer in model.layers():
         inputs, outputs = len(layer) - 1, layer.shape[1]

@@ -1,0 +1,43 @@
+"""`wlm web`: a page that shows a file in any browser."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from wlm.cli.console import check_output, escape, quiet_warp, show, table
+from wlm.cli.options import output_option
+
+__all__ = ["web"]
+
+
+def web(
+    files: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="FILE...",
+            help="A .wlm of lightmaps or probes, the folder of wlm atlas compress, or six-way EXRs, one a frame.",
+        ),
+    ],
+    output: Annotated[Path, output_option("PAGE.html", "The page to write.")],
+    mesh: Annotated[
+        Path | None, typer.Option(metavar="SCENE.glb", help="The scene that the light belongs to: .glb, .gltf or .obj.")
+    ] = None,
+    original: Annotated[
+        Path | None,
+        typer.Option(metavar="PATH", help="What was compressed, to compare with: a set, a lightmap or a probe file."),
+    ] = None,
+    key: Annotated[str | None, typer.Option(help="Which of the original's arrays of probes.")] = None,
+    hours: Annotated[int, typer.Option(min=1, help="Most frames of the original set that the page carries.")] = 6,
+    rate: Annotated[float, typer.Option(help="Frames a second of smoke that plays.")] = 30.0,
+    up: Annotated[Literal["y", "z"], typer.Option(help="The axis that points up in the scene.")] = "y",
+) -> None:
+    """Write one HTML file that shows the light, decoded by the browser's GPU; it needs no network."""
+    check_output(output, ".html")
+    quiet_warp()
+    from wlm.web import write_page
+
+    size = write_page(output, files, mesh=mesh, original=original, key=key, hours=hours, rate=rate, up=up)
+    rows = table(str(files[0]), ["page", "bytes"])
+    rows.add_row(escape(str(output)), f"{size:,}")
+    show(rows)

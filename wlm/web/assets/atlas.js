@@ -1,0 +1,49 @@
+// A mesh's lightmap, read in the fragment shader by the exported function.
+
+class AtlasPage {
+  constructor(graphics, page, panel, changed) {
+    const {manifest} = page, {gl} = graphics, [width, height] = manifest.atlas.colour;
+    this.graphics = graphics;
+    this.manifest = manifest;
+    const half = [gl.RGB16F, gl.RGB, gl.HALF_FLOAT];
+    this.textures = {
+      wlm_atlas_colour: graphics.plain(width, height, half, page.array('colour', Uint16Array), gl.LINEAR),
+    };
+    if (page.has('lut')) {
+      const [across, down] = manifest.atlas.lut, tiles = manifest.atlas.method === 'tiles';
+      const lut = page.array('lut', Uint16Array);
+      // Normalised 16-bit textures are missing in browsers, so coordinates travel on as floats.
+      this.textures.wlm_atlas_lut = tiles
+        ? graphics.plain(across, down, [gl.RG16UI, gl.RG_INTEGER, gl.UNSIGNED_SHORT], lut, gl.NEAREST)
+        : graphics.plain(across, down, [gl.RG32F, gl.RG, gl.FLOAT], Float32Array.from(lut, (x) => x / 65535),
+          graphics.floatLinear ? gl.LINEAR : gl.NEAREST);
+    }
+    // Four texels mixed in floats: the filter unit's eight bits show in large tiles.
+    this.source = `#define WLM_ATLAS_EXACT\n${manifest.shader}\nvec3 wlm_light() { return wlm_atlas(v_coordinate); }`;
+    this.display = new Display(page, panel, changed);
+    this.surface = new Surface(graphics, page, this.source, this.display, panel, changed);
+    this.originals = new Originals(graphics, page);
+  }
+
+  draw() {
+    this.surface.draw(this.textures, this.display.compares ? this.originals.get(0) : undefined);
+  }
+
+  // For scripts: light at coordinates [N, 2], RGBA.
+  async read(coordinates) {
+    const {graphics} = this, {gl} = graphics, count = coordinates.length / 2;
+    const program = graphics.program(WHOLE, `${HEAD}
+uniform sampler2D u_places;
+out vec4 light;
+vec2 v_coordinate;
+${this.source}
+void main() { v_coordinate = texelFetch(u_places, ivec2(gl_FragCoord.xy), 0).xy; light = vec4(wlm_light(), 1.0); }`);
+    const places = graphics.plain(count, 1, [gl.RG32F, gl.RG, gl.FLOAT], Float32Array.from(coordinates), gl.NEAREST);
+    const target = graphics.target(count, 1, graphics.single(), gl.NEAREST);
+    gl.viewport(0, 0, count, 1);
+    gl.disable(gl.DEPTH_TEST);
+    graphics.use(program, {...this.textures, u_places: places});
+    graphics.draw(3);
+    return graphics.read(target);
+  }
+}

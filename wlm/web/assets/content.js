@@ -1,0 +1,22 @@
+// What the page carries: a manifest in JSON, and arrays in one block that zlib packed and base64 made text of.
+
+async function readContent() {
+  const manifest = JSON.parse(document.getElementById('manifest').textContent);
+  const text = atob(document.getElementById('content').textContent.trim());
+  const packed = Uint8Array.from(text, (letter) => letter.charCodeAt(0));
+  if (typeof DecompressionStream === 'undefined') throw new Error('this browser is too old to unpack the page');
+  let bytes;
+  try {
+    // The stream checks zlib's sum over everything that it gives.
+    const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream('deflate'));
+    bytes = await new Response(stream).arrayBuffer();
+  } catch {
+    throw new Error('the page is damaged: its content can not be unpacked');
+  }
+  if (bytes.byteLength !== manifest.bytes) throw new Error('the page is damaged: its content has another size');
+  const array = (name, Type) => {
+    const [offset, length] = manifest.arrays[name] ?? [0, 0];
+    return new Type(bytes, offset, length / Type.BYTES_PER_ELEMENT);
+  };
+  return {manifest, array, has: (name) => name in manifest.arrays};
+}

@@ -1,0 +1,177 @@
+// Lightmaps over the day: the exported shader decodes tiles into a texture at each change of the hour.
+
+const MAIN_DYNAMIC = `
+uniform sampler2D u_uv, u_ut, u_vt;
+uniform sampler3D u_uvt;
+uniform ivec2 u_origin;
+uniform float u_tau;
+uniform int u_offset;
+uniform vec3 u_scale, u_shift, u_spread;
+out vec4 radiance;
+void main()
+{
+    ivec2 texel = ivec2(gl_FragCoord.xy) - u_origin;
+    vec3 colour = wlm_decode_dynamic(u_uv, u_uvt, u_ut, u_vt, texel, u_tau, u_offset, u_scale, u_shift, u_spread);
+    radiance = vec4(wlm_radiance(colour), 1.0);
+}`;
+const MAIN_STATIC = `
+uniform sampler2D u_uv;
+uniform ivec2 u_origin;
+uniform int u_offset;
+uniform vec3 u_scale, u_shift, u_spread;
+out vec4 radiance;
+void main()
+{
+    ivec2 texel = ivec2(gl_FragCoord.xy) - u_origin;
+    radiance = vec4(wlm_radiance(wlm_decode_static(u_uv, texel, u_offset, u_scale, u_shift, u_spread)), 1.0);
+}`;
+const READ_NETWORK = `
+uniform sampler2D u_network;
+#define WLM_NET(i) texelFetch(u_network, ivec2((i) & 1023, (i) >> 10), 0).r
+`;
+const LONG_FRAME = 40, SHORT_FRAME = 25;  // milliseconds between two pictures
+
+// Where a time lies between the stored ones: their numbers, the share of the later one, and tau.
+function place(lightmap, time) {
+  const {times, period, tau, time_axis: axis} = lightmap, count = times.length;
+  if (period) time = ((time % period) + period) % period;
+  else time = Math.min(Math.max(time, times[0]), times[count - 1]);
+  let before = times.findLastIndex((t) => t <= time), after = before + 1, span, since;
+  if (period) {
+    [before, after] = [(before + count) % count, after % count];
+    span = (times[after] - times[before] + period) % period || period;
+    since = (time - times[before] + period) % period;
+  } else {
+    after = Math.min(after, count - 1);
+    [span, since] = [times[after] - times[before] || 1, time - times[before]];
+  }
+  const share = since / span;
+  let place = axis.rule === 'paper' && period ? time / period
+    : tau[before] + share * (axis.repeats ? 1 / count : tau[after] - tau[before]);
+  if (axis.repeats) place -= Math.floor(place);
+  return {before, after, share, tau: place};
+}
+
+class LightmapPage {
+  constructor(graphics, page, panel, changed) {
+    const {manifest} = page, {gl} = graphics;
+    Object.assign(this, {graphics, page, manifest, lightmap: manifest.lightmap, panel});
+    const {lightmap} = this;
+    this.networks = graphics.numbers(page.array('networks', Float32Array));
+    const shader = (main) => graphics.program(WHOLE, HEAD + READ_NETWORK + manifest.shader + main);
+    const kinds = new Set(lightmap.tiles.map((tile) => tile.kind));
+    this.programs = {
+      dynamic: kinds.has('dynamic') && shader(MAIN_DYNAMIC),
+      static: kinds.has('static') && shader(MAIN_STATIC),
+    };
+    this.tiles = lightmap.tiles.map((tile) => this.#upload(tile));
+    const texture = () => graphics.target(manifest.width, manifest.height, graphics.half(), gl.LINEAR);
+    // An hour is seen when it is whole; until the first is, its tiles appear one by one.
+    [this.seen, this.next] = [texture(), texture()];
+    this.batch = 1;
+    this.waiting = [];
+    const first = lightmap.times[0], last = lightmap.period ?? lightmap.times.at(-1);
+    this.time = manifest.time;
+    this.setTime = panel.slider('hour', {
+      min: lightmap.period ? 0 : first, max: last, step: 'any', value: this.time,
+      text: (value) => this.#clock(value), keys: ['arrowleft', 'arrowright', (last - first) / 96],
+      changed: (value) => { this.time = value; changed(); },
+    });
+    const play = panel.button('play', ' ', () => {
+      this.playing = this.playing === undefined ? performance.now() : undefined;
+      play.textContent = this.playing === undefined ? 'play' : 'pause';
+      changed();
+    });
+    this.display = new Display(page, panel, changed);
+    this.surface = new Surface(
+      graphics, page, 'uniform sampler2D u_light;\nvec3 wlm_light() { return texture(u_light, v_uv).rgb; }',
+      this.display, panel, changed);
+    this.originals = new Originals(graphics, page);
+  }
+
+  #clock(value) {
+    if (this.lightmap.period !== 24) return value.toFixed(2);
+    const minutes = Math.round(value * 60) % 1440;
+    return `${Math.floor(minutes / 60)}:${String(minutes % 60).padStart(2, '0')}`;
+  }
+
+  #upload(tile) {
+    const {graphics, page, lightmap} = this, {gl} = graphics, {resolution, slices, columns, rows} = lightmap.maps;
+    const bytes = (map) => page.array(`${tile.number}_${map}`, Uint8Array), repeats = lightmap.time_axis.repeats;
+    const textures = {};
+    if (tile.kind !== 'constant') textures.u_uv = graphics.blocks(128, 128, 1, bytes('uv'), gl.NEAREST);
+    if (tile.kind === 'dynamic') {
+      const two = [gl.RG8, gl.RG, gl.UNSIGNED_BYTE], wrap = {T: repeats};
+      textures.u_uvt = graphics.blocks(resolution, resolution, slices, bytes('uvt'), gl.LINEAR, {R: repeats});
+      textures.u_ut = graphics.plain(columns, rows, two, bytes('ut'), gl.LINEAR, wrap);
+      textures.u_vt = graphics.plain(columns, rows, two, bytes('vt'), gl.LINEAR, wrap);
+    }
+    return {...tile, textures};
+  }
+
+  #decode(tile, now) {
+    const {graphics, next} = this, {gl} = graphics, origin = [128 * tile.column, 128 * tile.row];
+    gl.bindFramebuffer(gl.FRAMEBUFFER, next.buffer);
+    gl.disable(gl.DEPTH_TEST);
+    gl.viewport(...origin, 128, 128);
+    const between = (rows) => rows[now.before].map((value, c) => mix(value, rows[now.after][c], now.share));
+    if (tile.kind === 'constant') {
+      gl.enable(gl.SCISSOR_TEST);
+      gl.scissor(...origin, 128, 128);
+      gl.clearColor(...between(tile.radiance), 1);
+      gl.clear(gl.COLOR_BUFFER_BIT);
+      gl.disable(gl.SCISSOR_TEST);
+      return;
+    }
+    graphics.use(this.programs[tile.kind], {
+      ...tile.textures, u_network: this.networks, u_origin: origin, u_tau: now.tau, u_offset: tile.network_offset,
+      u_scale: between(tile.scale), u_shift: tile.shift, u_spread: tile.spread,
+    });
+    graphics.draw(3);
+  }
+
+  // Decodes some tiles of the wanted hour; returns whether there are more.
+  work(elapsed) {
+    if (!this.waiting.length) {
+      if (this.asked === this.time) return false;
+      this.asked = this.time;
+      this.waiting = [...this.tiles];
+      this.began = performance.now();
+    }
+    // As many tiles between two pictures as leave the page responsive.
+    if (elapsed > LONG_FRAME) this.batch = Math.max(Math.floor(this.batch / 2), 1);
+    else if (elapsed < SHORT_FRAME) this.batch = Math.min(2 * this.batch, this.tiles.length);
+    const now = place(this.lightmap, this.asked);
+    for (const tile of this.waiting.splice(0, this.batch)) this.#decode(tile, now);
+    if (this.waiting.length) return true;
+    this.graphics.read(this.next, 1, 1);
+    this.panel.figure('decoded in', `${(performance.now() - this.began).toFixed(0)} ms`);
+    [this.seen, this.next] = [this.next, this.seen];
+    this.shown = this.asked;
+    return this.asked !== this.time;
+  }
+
+  advance(elapsed) {
+    if (this.playing === undefined || this.waiting.length) return;
+    const {period, times} = this.lightmap, first = period ? 0 : times[0], length = period ?? times.at(-1) - first;
+    // A day in twelve seconds.
+    this.setTime(first + (this.time - first + Math.min(elapsed, 250) / 12000 * length) % length);
+  }
+
+  draw() {
+    const index = this.originals.nearest(this.time, this.lightmap.period);
+    // An original is there at its own hour alone.
+    if (this.display.compares && this.playing === undefined && this.originals.times[index] !== this.time) {
+      this.setTime(this.originals.times[index]);
+    }
+    const original = this.display.compares ? this.originals.get(index) : undefined;
+    this.surface.draw({u_light: this.shown === undefined ? this.next : this.seen}, original);
+  }
+
+  // For scripts: radiance of the whole map at an hour, RGBA by rows.
+  async read(time) {
+    this.setTime(time);
+    while (this.shown !== this.time || this.waiting.length) await new Promise(requestAnimationFrame);
+    return this.graphics.read(this.seen);
+  }
+}

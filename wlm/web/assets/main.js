@@ -1,0 +1,48 @@
+// Starts the page: its kind, the loop that draws when something has changed, and what scripts may call.
+
+const KINDS = {
+  lightmap: typeof LightmapPage === 'undefined' ? null : LightmapPage,
+  atlas: typeof AtlasPage === 'undefined' ? null : AtlasPage,
+  probe: typeof ProbePage === 'undefined' ? null : ProbePage,
+  smoke: typeof SmokePage === 'undefined' ? null : SmokePage,
+};
+
+function fail(error) {
+  const message = document.getElementById('message');
+  message.textContent = String(error.message ?? error);
+  message.hidden = false;
+}
+
+async function start() {
+  const page = await readContent(), {manifest} = page;
+  const graphics = new Graphics(document.getElementById('view'));
+  graphics.black = graphics.plain(1, 1, graphics.shared(), new Uint32Array(1), graphics.gl.NEAREST);
+  const panel = new Panel(document.getElementById('panel'), manifest.title, manifest.note);
+  let dirty = true, last = performance.now();
+  const changed = () => { dirty = true; };
+  const kind = new KINDS[manifest.kind](graphics, page, panel, changed);
+  for (const [name, text] of manifest.figures) panel.figure(name, text);
+  panel.help.textContent = kind.help ?? manifest.help;
+  const loop = (time) => {
+    const elapsed = time - last;
+    last = time;
+    try {
+      kind.advance?.(elapsed);
+      if (kind.work?.(elapsed)) dirty = true;
+      if (dirty || kind.playing !== undefined) {
+        dirty = false;
+        kind.draw();
+      }
+    } catch (error) {
+      fail(error);
+      return;
+    }
+    requestAnimationFrame(loop);
+  };
+  window.addEventListener('resize', changed);
+  requestAnimationFrame(loop);
+  return {kind, manifest, graphics};
+}
+
+// A script awaits `wlm` and calls `kind.read(...)`.
+window.wlm = start().catch((error) => { fail(error); throw error; });

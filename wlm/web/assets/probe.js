@@ -1,0 +1,222 @@
+// Light probes as spheres, and a mesh lit by the light at its vertices. All light is decoded by the exported shader.
+
+const WIDTH = 256;  // places a row of the table of coefficients
+const ROW = 32;     // places that are decoded before the browser is asked whether it has time
+
+const DECODE = `
+uniform highp usampler2D u_gaussians, u_network;
+#define WLM_PROBE_GAUSSIANS(i) texelFetch(u_gaussians, ivec2((i) & 1023, (i) >> 10), 0).r
+#define WLM_PROBE_NETWORK(i) texelFetch(u_network, ivec2((i) & 1023, (i) >> 10), 0).r
+`;
+const STORE = `
+uniform sampler2D u_places;
+layout(location = 0) out vec4 out_0;
+layout(location = 1) out vec4 out_1;
+layout(location = 2) out vec4 out_2;
+layout(location = 3) out vec4 out_3;
+layout(location = 4) out vec4 out_4;
+layout(location = 5) out vec4 out_5;
+layout(location = 6) out vec4 out_6;
+void main()
+{
+    vec3 sh[COUNT];
+    wlm_probe_sh(texelFetch(u_places, ivec2(gl_FragCoord.xy), 0).xyz, sh);
+    vec3 c[9];  // 27 numbers, four in a texel
+    for (int i = 0; i < 9; ++i)
+        c[i] = i < COUNT ? sh[min(i, COUNT - 1)] : vec3(0.0);
+    out_0 = vec4(c[0], c[1].x);
+    out_1 = vec4(c[1].yz, c[2].xy);
+    out_2 = vec4(c[2].z, c[3]);
+    out_3 = vec4(c[4], c[5].x);
+    out_4 = vec4(c[5].yz, c[6].xy);
+    out_5 = vec4(c[6].z, c[7]);
+    out_6 = vec4(c[8], 1.0);
+}`;
+const TABLES = 7;
+
+// What a white diffuse surface shows under spherical harmonics of radiance: irradiance / pi.
+const LIT = `${HEAD}
+in vec3 a_position;
+in vec3 a_normal;
+uniform mat4 u_camera;
+uniform sampler2D u_centres, u_original;
+uniform sampler2D u_table_0, u_table_1, u_table_2, u_table_3, u_table_4, u_table_5, u_table_6;
+uniform int u_view;      // 0: the original is not seen
+uniform float u_radius;  // of spheres; 0: the vertices are a mesh's own
+out vec3 v_decoded;
+out vec3 v_original;
+int wlm_row;
+
+vec3 wlm_diffuse(vec3 n, vec3 c[9])
+{
+    vec3 light = 0.2820948 * c[0] + 0.3257350 * (n.y * c[1] + n.z * c[2] + n.x * c[3]);
+    light += 0.2731371 * (n.x * n.y * c[4] + n.y * n.z * c[5] + n.x * n.z * c[7]);
+    return light + 0.0788479 * (3.0 * n.z * n.z - 1.0) * c[6] + 0.1365686 * (n.x * n.x - n.y * n.y) * c[8];
+}
+
+void main()
+{
+    int row = u_radius > 0.0 ? gl_InstanceID : gl_VertexID;
+    ivec2 at = ivec2(row % ${WIDTH}, row / ${WIDTH});
+    vec4 t0 = texelFetch(u_table_0, at, 0), t1 = texelFetch(u_table_1, at, 0), t2 = texelFetch(u_table_2, at, 0);
+    vec4 t3 = texelFetch(u_table_3, at, 0), t4 = texelFetch(u_table_4, at, 0), t5 = texelFetch(u_table_5, at, 0);
+    vec3 c[9] = vec3[9](t0.xyz, vec3(t0.w, t1.xy), vec3(t1.zw, t2.x), t2.yzw, t3.xyz, vec3(t3.w, t4.xy),
+                        vec3(t4.zw, t5.x), t5.yzw, texelFetch(u_table_6, at, 0).xyz);
+    v_decoded = wlm_diffuse(a_normal, c);
+    for (int i = 0; i < 9 && u_view > 0; ++i)
+        c[i] = texelFetch(u_original, ivec2((9 * row + i) & 1023, (9 * row + i) >> 10), 0).rgb;
+    v_original = wlm_diffuse(a_normal, c);
+    vec3 centre = u_radius > 0.0 ? texelFetch(u_centres, at, 0).xyz : vec3(0.0);
+    gl_Position = u_camera * vec4(centre + (u_radius > 0.0 ? u_radius : 1.0) * a_position, 1.0);
+}`;
+
+// A sphere of radius 1 as rows of triangles.
+function sphere(rows) {
+  const points = [], indices = [], columns = 2 * rows;
+  for (let r = 0; r <= rows; ++r) {
+    for (let c = 0; c <= columns; ++c) {
+      const [a, b] = [Math.PI * r / rows, Math.PI * c / rows];
+      points.push(Math.sin(a) * Math.cos(b), Math.cos(a), Math.sin(a) * Math.sin(b));
+      if (r === rows || c === columns) continue;
+      const at = r * (columns + 1) + c;
+      indices.push(at, at + columns + 1, at + 1, at + 1, at + columns + 1, at + columns + 2);
+    }
+  }
+  return [new Float32Array(points), new Uint32Array(indices)];
+}
+
+// Normals of a mesh's vertices, weighted by the area of the triangles around each.
+function normals(position, triangles) {
+  const sums = new Float32Array(position.length);
+  const at = (i) => [position[3 * i], position[3 * i + 1], position[3 * i + 2]];
+  for (let i = 0; i < triangles.length; i += 3) {
+    const corners = [triangles[i], triangles[i + 1], triangles[i + 2]], [a, b, c] = corners.map(at);
+    const normal = cross([0, 1, 2].map((k) => b[k] - a[k]), [0, 1, 2].map((k) => c[k] - a[k]));
+    for (const corner of corners) for (const k of [0, 1, 2]) sums[3 * corner + k] += normal[k];
+  }
+  for (let i = 0; i < sums.length; i += 3) {
+    const length = Math.hypot(sums[i], sums[i + 1], sums[i + 2]) || 1;
+    for (const k of [0, 1, 2]) sums[i + k] /= length;
+  }
+  return sums;
+}
+
+class ProbePage {
+  constructor(graphics, page, panel, changed) {
+    const {manifest} = page, {gl} = graphics;
+    Object.assign(this, {graphics, manifest, panel});
+    this.buffers = {
+      u_gaussians: graphics.numbers(page.array('gaussians', Uint32Array)),
+      u_network: graphics.numbers(page.array('network', Uint32Array)),
+    };
+    const count = manifest.probe.coefficients;
+    this.decoder = graphics.program(WHOLE, HEAD + DECODE + manifest.shader + STORE.replaceAll('COUNT', String(count)));
+    this.drawer = graphics.program(LIT, `${HEAD}
+in vec3 v_decoded;
+in vec3 v_original;
+out vec4 colour;
+${DISPLAY}
+void main() { colour = vec4(wlm_shown(v_decoded, v_original), 1.0); }`);
+    this.display = new Display(page, panel, changed);
+    this.camera = new Camera(graphics.canvas, manifest.low, manifest.high, {up: manifest.up, changed});
+    const [points, indices] = sphere(manifest.probe.count > 512 ? 8 : 16);
+    this.groups = [{
+      places: this.#places(page.array('places', Float32Array)),
+      geometry: graphics.geometry(this.drawer, {a_position: [3, points], a_normal: [3, points]}, indices),
+      radius: manifest.probe.radius,
+      instances: manifest.probe.count,
+      original: page.has('original') ? this.#originals(page.array('original', Uint16Array)) : graphics.black,
+    }];
+    if (page.has('position')) {
+      const position = page.array('position', Float32Array), triangles = page.array('triangles', Uint32Array);
+      const attributes = {a_position: [3, position], a_normal: [3, normals(position, triangles)]};
+      this.groups.push({
+        places: this.#places(position), geometry: graphics.geometry(this.drawer, attributes, triangles), radius: 0,
+        instances: 1, original: graphics.black,
+      });
+      this.hidden = 0;
+      panel.choices(['spheres', 'mesh', 'both'], 'both', (name) => {
+        this.hidden = {both: 0, spheres: 2, mesh: 1}[name];
+        changed();
+      });
+    }
+  }
+
+  // Places to decode at, as a texture, and the table of the coefficients there.
+  #places(values) {
+    const {graphics} = this, {gl} = graphics, count = values.length / 3, rows = Math.max(Math.ceil(count / WIDTH), 1);
+    const texels = new Float32Array(WIDTH * rows * 4);
+    for (let i = 0; i < count; ++i) texels.set(values.subarray(3 * i, 3 * i + 3), 4 * i);
+    const tables = Array.from({length: TABLES}, () => graphics.plain(WIDTH, rows, graphics.single(), null, gl.NEAREST));
+    const buffer = gl.createFramebuffer(), targets = tables.map((_, i) => gl.COLOR_ATTACHMENT0 + i);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, buffer);
+    tables.forEach(({texture}, i) => gl.framebufferTexture2D(gl.FRAMEBUFFER, targets[i], gl.TEXTURE_2D, texture, 0));
+    gl.drawBuffers(targets);
+    return {texture: graphics.plain(WIDTH, rows, graphics.single(), texels, gl.NEAREST), count, tables, buffer, done: 0};
+  }
+
+  #originals(values) {
+    const {graphics} = this, {gl} = graphics, rows = Math.ceil(values.length / 3072);
+    const padded = new Uint16Array(3072 * rows);
+    padded.set(values);
+    return graphics.plain(1024, rows, [gl.RGB16F, gl.RGB, gl.HALF_FLOAT], padded, gl.NEAREST);
+  }
+
+  // Decodes some places; returns whether there are more.
+  work(elapsed) {
+    const {graphics} = this, {gl} = graphics;
+    const places = this.groups.map((group) => group.places).find((each) => each.done < each.count);
+    if (!places) return false;
+    this.began ??= performance.now();
+    gl.disable(gl.DEPTH_TEST);
+    gl.enable(gl.SCISSOR_TEST);
+    // Half of the time at least, however long a picture takes.
+    const until = performance.now() + Math.max(30, elapsed);
+    while (places.done < places.count && performance.now() < until) {
+      const column = places.done % WIDTH, row = Math.floor(places.done / WIDTH);
+      const many = Math.min(ROW, WIDTH - column, places.count - places.done);
+      gl.bindFramebuffer(gl.FRAMEBUFFER, places.buffer);
+      gl.viewport(0, 0, places.texture.width, places.texture.height);
+      gl.scissor(column, row, many, 1);
+      graphics.use(this.decoder, {...this.buffers, u_places: places.texture});
+      graphics.draw(3);
+      places.done += many;
+      // Waits, so that the clock tells what has been done.
+      gl.readBuffer(gl.COLOR_ATTACHMENT0);
+      gl.readPixels(column, row, 1, 1, gl.RGBA, gl.FLOAT, new Float32Array(4));
+    }
+    gl.disable(gl.SCISSOR_TEST);
+    const left = this.groups.some((group) => group.places.done < group.places.count);
+    if (!left) this.panel.figure('decoded in', `${(performance.now() - this.began).toFixed(0)} ms`);
+    return left;
+  }
+
+  draw() {
+    const {graphics} = this, {width} = graphics.begin();
+    for (const [i, group] of this.groups.entries()) {
+      if (this.hidden === i + 1) continue;
+      const tables = Object.fromEntries(group.places.tables.map((table, c) => [`u_table_${c}`, table]));
+      graphics.use(this.drawer, {
+        ...tables, ...this.display.uniforms(width), u_camera: this.camera.matrix(), u_radius: group.radius,
+        u_centres: group.places.texture, u_original: group.original,
+      });
+      graphics.drawGeometry(group.geometry, group.instances);
+    }
+  }
+
+  // For scripts: the 27 numbers of every probe, by probes.
+  async read() {
+    const {places} = this.groups[0], {gl} = this.graphics, {width, height} = places.texture;
+    while (places.done < places.count) await new Promise(requestAnimationFrame);
+    const numbers = new Float32Array(27 * places.count), values = new Float32Array(4 * width * height);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, places.buffer);
+    for (let table = 0; table < TABLES; ++table) {
+      gl.readBuffer(gl.COLOR_ATTACHMENT0 + table);
+      gl.readPixels(0, 0, width, height, gl.RGBA, gl.FLOAT, values);
+      for (let i = 0; i < places.count; ++i) {
+        for (let k = 4 * table; k < Math.min(4 * table + 4, 27); ++k) numbers[27 * i + k] = values[4 * i + k - 4 * table];
+      }
+    }
+    return numbers;
+  }
+}

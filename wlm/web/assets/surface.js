@@ -1,0 +1,86 @@
+// A lightmap on a mesh, or unwrapped as a picture.
+
+const SURFACE = `${HEAD}
+in vec3 a_position;
+in vec2 a_uv;
+in vec2 a_coordinate;
+uniform mat4 u_camera;
+uniform bool u_unwrapped;
+uniform float u_aspect;
+out vec2 v_uv;
+out vec2 v_coordinate;
+void main()
+{
+    v_uv = a_uv;
+    v_coordinate = a_coordinate;
+    gl_Position = u_camera * vec4(u_unwrapped ? vec3(a_uv.x * u_aspect, -a_uv.y, 0.0) : a_position, 1.0);
+}`;
+
+// What a page of this kind adds: `source`, GLSL with vec3 wlm_light(), and `textures`, its uniforms.
+class Surface {
+  constructor(graphics, page, source, display, panel, changed) {
+    const {manifest} = page;
+    Object.assign(this, {graphics, display, changed, aspect: manifest.width / manifest.height});
+    this.program = graphics.program(SURFACE, `${HEAD}
+in vec2 v_uv;
+in vec2 v_coordinate;
+uniform sampler2D u_original;
+out vec4 colour;
+${source}
+${DISPLAY}
+void main() { colour = vec4(wlm_shown(wlm_light(), texture(u_original, v_uv).rgb), 1.0); }`);
+    const uv = page.has('uv') ? page.array('uv', Float32Array) : new Float32Array([0, 0, 1, 0, 1, 1, 0, 1]);
+    const indices = page.has('triangles') ? page.array('triangles', Uint32Array) : new Uint32Array([0, 1, 2, 0, 2, 3]);
+    const position = page.has('position') ? page.array('position', Float32Array) : new Float32Array(uv.length * 1.5);
+    const coordinate = page.has('coordinate') ? page.array('coordinate', Float32Array) : uv;
+    this.geometry = graphics.geometry(this.program, {
+      a_position: [3, position], a_uv: [2, uv], a_coordinate: [2, coordinate],
+    }, indices);
+    const canvas = graphics.canvas;
+    this.picture = new Camera(canvas, [0, -1, 0], [this.aspect, 0, 0], {flat: true, changed});
+    this.mesh = page.has('position') ? new Camera(canvas, manifest.low, manifest.high, {up: manifest.up, changed}) : null;
+    this.unwrapped = !this.mesh;
+    this.#choose();
+    if (this.mesh) {
+      panel.choices(['mesh', 'unwrapped'], 'mesh', (name) => {
+        this.unwrapped = name === 'unwrapped';
+        this.#choose();
+        changed();
+      });
+    }
+  }
+
+  #choose() {
+    this.picture.active = this.unwrapped;
+    if (this.mesh) this.mesh.active = !this.unwrapped;
+  }
+
+  draw(uniforms, original) {
+    const {graphics} = this, {width} = graphics.begin();
+    const camera = this.unwrapped ? this.picture : this.mesh;
+    graphics.use(this.program, {
+      ...uniforms, ...this.display.uniforms(width), u_original: original ?? graphics.black,
+      u_camera: camera.matrix(), u_unwrapped: this.unwrapped, u_aspect: this.aspect,
+    });
+    graphics.drawGeometry(this.geometry);
+  }
+}
+
+// Frames to compare with, each uploaded when it is first seen.
+class Originals {
+  constructor(graphics, page) {
+    const {manifest} = page;
+    this.times = manifest.reference?.times ?? [];
+    this.get = (index) => {
+      this.frames ??= [];
+      return this.frames[index] ??= graphics.plain(
+        manifest.width, manifest.height, graphics.shared(), page.array(`original_${index}`, Uint32Array), graphics.gl.LINEAR);
+    };
+  }
+
+  // The number of the stored frame that is nearest to a time.
+  nearest(time, period) {
+    const apart = (t) => period ? Math.min(Math.abs(t - time) % period, period - Math.abs(t - time) % period) : Math.abs(t - time);
+    return this.times.reduce((best, t, i) => apart(t) < apart(this.times[best]) ? i : best, 0);
+  }
+}

@@ -1,0 +1,76 @@
+"""The page of a mesh's compressed lightmap."""
+
+from __future__ import annotations
+
+import os
+from typing import Any, Literal
+
+import numpy as np
+
+from wlm.atlas.exporter import geometry, read_folder
+from wlm.atlas.shader import atlas_glsl
+from wlm.errors import WlmError
+from wlm.formats.exr import read_exr
+from wlm.texels import fill_gaps
+from wlm.web.geometry import Geometry
+from wlm.web.page import Page, pack_rgb9e5
+
+__all__ = ["folder_page"]
+
+_WHITE, _PERCENTILE = 0.8, 99.0  # where that share of the light is on the screen
+
+
+def folder_page(
+    folder: str | os.PathLike[str], *, original: str | os.PathLike[str] | None = None, up: Literal["y", "z"] = "y"
+) -> Page:
+    """Makes the page of what `wlm atlas compress` wrote.
+
+    Args:
+        folder: The folder: its mesh is shown.
+        original: The lightmap that was compressed, to compare with.
+        up: The axis that points up in the scene.
+
+    Raises:
+        WlmError: The folder isn't a whole one, or the lightmap can't be read or is of another size.
+    """
+    output = read_folder(folder)
+    model, mesh = output.model, geometry(output)
+    triangles = mesh.triangle[mesh.active]
+    # One vertex a corner: new UVs are of corners.
+    corners = triangles.reshape(-1)
+    position, uv = mesh.position[corners].astype(np.float32), mesh.uv[corners].astype(np.float32)
+    drawn = Geometry(position, np.arange(len(corners), dtype=np.uint32).reshape(-1, 3), uv)
+    texels = np.ascontiguousarray(model.texels, np.float16)
+    arrays = drawn.arrays() | {"colour": texels}
+    if len(model.uv):
+        arrays["coordinate"] = model.uv[mesh.active].reshape(-1, 2).astype(np.float32)
+    if model.method != "plain":
+        arrays["lut"] = np.ascontiguousarray(model.lut, np.uint16)
+    bright = float(np.percentile(texels.astype(np.float32), _PERCENTILE))
+    manifest: dict[str, Any] = {
+        "width": model.width,
+        "height": model.height,
+        "shader": atlas_glsl(model),
+        "exposure": _WHITE / bright if bright > 0 else 1.0,
+        "atlas": {"method": model.method, "colour": texels.shape[1::-1], "lut": model.lut.shape[1::-1]},
+        **drawn.manifest(up),
+    }
+    if original is not None:
+        lightmap = read_exr(original)[0][..., :3]
+        if lightmap.shape[:2] != (model.height, model.width):
+            raise WlmError(
+                f"{original}: expected a lightmap of {model.width}x{model.height}, found {lightmap.shape[1]}x"
+                f"{lightmap.shape[0]}"
+            )
+        light = np.nan_to_num(lightmap.astype(np.float32), posinf=65504.0)
+        arrays["original_0"] = pack_rgb9e5(fill_gaps(light, mesh.mask))
+        manifest["reference"] = {"times": [0.0]}
+    figures = [
+        ("file", f"{output.model_bytes:,} bytes"),
+        ("saved", f"{100 * model.compression_ratio:.1f} % (eq. 9)"),
+        ("lightmap", f"{model.width} × {model.height}"),
+        ("colours", f"{texels.shape[1]} × {texels.shape[0]}, {model.colour}"),
+        ("triangles", f"{len(triangles):,}"),
+        ("profile", model.profile.name),
+    ]
+    return Page("atlas", model.name, "A lightmap read through a table, on this GPU.", figures, manifest, arrays)

@@ -1,0 +1,79 @@
+"""The triangles that a page draws light on."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from wlm.errors import WlmError
+from wlm.formats.gltf import read_gltf
+from wlm.formats.obj import read_obj
+
+__all__ = ["Geometry", "read_geometry"]
+
+
+@dataclass(frozen=True, eq=False)
+class Geometry:
+    """Triangles and their lightmap UVs.
+
+    Attributes:
+        position: float32 [V, 3].
+        triangle: uint32 [F, 3].
+        uv: float32 [V, 2], u right, v down; None: not needed.
+    """
+
+    position: np.ndarray
+    triangle: np.ndarray
+    uv: np.ndarray | None = None
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The arrays by the names that the page's script knows."""
+        parts = {"position": self.position, "triangles": self.triangle, "uv": self.uv}
+        return {name: values for name, values in parts.items() if values is not None}
+
+    def manifest(self, up: Literal["y", "z"]) -> Mapping[str, Any]:
+        """The box that the camera looks at."""
+        used = self.position[self.triangle.reshape(-1)]
+        return {"low": used.min(0).tolist(), "high": used.max(0).tolist(), "up": "xyz".index(up)}
+
+
+def read_geometry(path: str | os.PathLike[str], uv_set: int | None = None, *, with_uv: bool = True) -> Geometry:
+    """Reads a mesh.
+
+    Args:
+        path: `.glb`, `.gltf` or `.obj`.
+        uv_set: n of `TEXCOORD_n`, the lightmap's UVs; None takes 1 if any primitive has it, else 0.
+        with_uv: Whether UVs are needed: primitives without them are then left out.
+
+    Raises:
+        WlmError: The file is missing or damaged, or has no triangles, or none with these UVs.
+    """
+    path = Path(path)
+    if path.suffix.lower() == ".obj":
+        mesh = read_obj(path)
+        parts = [(mesh.position, mesh.triangle, mesh.uv)] if mesh.uv is not None or not with_uv else []
+    else:
+        primitives = read_gltf(path)[1]
+        sets = {number for each in primitives for number in each.uv}
+        number = (1 if 1 in sets else 0) if uv_set is None else uv_set
+        parts = [
+            (each.position, each.triangle, each.uv.get(number))
+            for each in primitives
+            if number in each.uv or not with_uv
+        ]
+    parts = [part for part in parts if len(part[1])]
+    if not parts:
+        raise WlmError(f"{path}: expected triangles{' with lightmap UVs' if with_uv else ''}, found none")
+    first = np.cumsum([0, *(len(position) for position, _, _ in parts)])
+    with np.errstate(over="ignore"):
+        position = np.concatenate([position for position, _, _ in parts]).astype(np.float32)
+    uv = np.concatenate([uv for _, _, uv in parts]).astype(np.float32) if with_uv else None
+    if not np.isfinite(position).all() or (uv is not None and not np.isfinite(uv).all()):
+        raise WlmError(f"{path}: expected finite positions and UVs, found NaN or infinity")
+    triangle = np.concatenate([triangle + start for (_, triangle, _), start in zip(parts, first[:-1], strict=True)])
+    return Geometry(position, triangle.astype(np.uint32), uv)

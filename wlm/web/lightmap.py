@@ -1,0 +1,115 @@
+"""The page of lightmaps over the day."""
+
+from __future__ import annotations
+
+import os
+from typing import Any, Literal
+
+import numpy as np
+
+from wlm.errors import WlmError
+from wlm.lightmap.data import load
+from wlm.lightmap.decode import Decoder
+from wlm.lightmap.evaluation import count_kinds
+from wlm.lightmap.exporter import document
+from wlm.lightmap.model import LightmapModel
+from wlm.lightmap.shader import decode_glsl
+from wlm.lightmap.tiles import TileKind
+from wlm.texels import fill_gaps
+from wlm.web.geometry import read_geometry
+from wlm.web.page import Page, pack_rgb9e5
+
+__all__ = ["lightmap_page"]
+
+_LAYERS = ("W1", "b1", "W2", "b2", "W3", "b3")
+_WHITE, _PERCENTILE = 0.8, 99.0  # where that share of the light is on the screen
+
+
+def lightmap_page(
+    model: LightmapModel,
+    file_bytes: int,
+    *,
+    mesh: str | os.PathLike[str] | None = None,
+    original: str | os.PathLike[str] | None = None,
+    hours: int = 6,
+    up: Literal["y", "z"] = "y",
+) -> Page:
+    """Makes the page of a lightmap model.
+
+    Args:
+        model: The model.
+        file_bytes: Size of its file.
+        mesh, original, hours, up: As for `wlm.web.pages.make_page`.
+
+    Raises:
+        WlmError: The mesh or the set can't be read, or the set is of another size.
+    """
+    described = document(model)
+    networks = [
+        np.concatenate([np.ravel(tile.pop(layer)) for layer in _LAYERS]) for tile in described["tiles"] if "W1" in tile
+    ]
+    arrays: dict[str, np.ndarray] = {"networks": np.concatenate(networks or [np.zeros(0)]).astype(np.float32)}
+    dynamic = np.flatnonzero(model.kind == TileKind.DYNAMIC).tolist()
+    for place, number in enumerate(model.mapped.tolist()):
+        arrays[f"{number}_uv"] = model.uv[place]
+        if number in dynamic:
+            row = dynamic.index(number)
+            arrays |= {f"{number}_{name}": getattr(model, name)[row] for name in ("uvt", "ut", "vt")}
+    profile, times = model.profile, model.times
+    time = float(times[len(times) // 2])
+    manifest: dict[str, Any] = {
+        "width": model.width,
+        "height": model.height,
+        "shader": decode_glsl(model),
+        "exposure": _exposure(model, time),
+        "time": time,
+        "lightmap": {name: described[name] for name in ("times", "period", "time_axis", "tau", "tiles")}
+        | {
+            "maps": {
+                "resolution": profile.uvt_resolution,
+                "slices": profile.uvt_slices,
+                "columns": profile.plane_columns,
+                "rows": profile.plane_rows,
+            }
+        },
+    }
+    if mesh is not None:
+        geometry = read_geometry(mesh)
+        arrays |= geometry.arrays()
+        manifest |= geometry.manifest(up)
+    if original is not None:
+        manifest["reference"], frames = _originals(model, original, hours)
+        arrays |= frames
+    kinds = ", ".join(f"{count} {kind}" for kind, count in count_kinds(model).items() if count)
+    figures = [
+        ("file", f"{file_bytes:,} bytes"),
+        ("bits per texel", f"{file_bytes * 8 / (model.width * model.height * len(times)):.3f}"),
+        ("size", f"{model.width} × {model.height}, {len(times)} times"),
+        ("tiles", kinds),
+        ("profile", profile.name),
+    ]
+    return Page("lightmap", model.name, "Lightmaps over the day, decoded on this GPU.", figures, manifest, arrays)
+
+
+def _exposure(model: LightmapModel, time: float) -> float:
+    """Puts most of the light of one time below white."""
+    light = Decoder(model).frame(time)
+    bright = float(np.percentile(light[light > 0], _PERCENTILE)) if (light > 0).any() else 0.0
+    return _WHITE / bright if bright > 0 else 1.0
+
+
+def _originals(
+    model: LightmapModel, path: str | os.PathLike[str], hours: int
+) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Some frames of the set, spread evenly, their gaps filled: what a filter would read there."""
+    if hours < 1:
+        raise WlmError(f"--hours: expected at least 1, got {hours}")
+    lightmaps = load(path)
+    size = lightmaps.mask.shape
+    if size != (model.height, model.width):
+        raise WlmError(f"{path}: expected lightmaps of {model.width}x{model.height}, found {size[1]}x{size[0]}")
+    count = len(lightmaps.times)
+    chosen = np.unique(np.linspace(0, count - 1, min(hours, count)).round().astype(int))
+    frames = fill_gaps(lightmaps.frames[chosen], lightmaps.mask)
+    arrays = {f"original_{i}": pack_rgb9e5(frame) for i, frame in enumerate(frames)}
+    return {"times": lightmaps.times[chosen].tolist()}, arrays

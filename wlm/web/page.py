@@ -1,0 +1,113 @@
+"""One HTML file: our script and style, a manifest, and arrays that zlib packed and base64 made text of."""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+import os
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib import resources
+from typing import Any
+
+import numpy as np
+
+from wlm.errors import WlmError
+from wlm.formats.atomic import atomic_write
+
+__all__ = ["Page", "pack_rgb9e5"]
+
+_ALIGNMENT = 16  # bytes, of an array in the content
+_COMMON = ("content.js", "graphics.js", "blocks.js", "camera.js", "panel.js", "light.js", "surface.js")
+_HELP = (
+    "Drag to turn or move, two fingers or the wheel to zoom, shift and drag to move, double-click to begin again. "
+    "Keys: arrows for the hour or frame, space plays, [ and ] change the exposure, T the tone mapping, 1 to 4 the view, "
+    "H folds this panel."
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Page:
+    """What a page shows.
+
+    Attributes:
+        kind: `lightmap`, `atlas`, `probe` or `smoke`: whose script it runs.
+        title: Above the panel, and of the browser's window.
+        note: A sentence below it; may be empty.
+        figures: Names and texts of the panel's table.
+        manifest: JSON values for the script.
+        arrays: By name; bytes are carried as they are.
+    """
+
+    kind: str
+    title: str
+    note: str
+    figures: Sequence[tuple[str, str]]
+    manifest: Mapping[str, Any]
+    arrays: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+    def write(self, path: str | os.PathLike[str]) -> int:
+        """Writes the page, whole or not at all.
+
+        Returns:
+            The file's size, bytes.
+
+        Raises:
+            WlmError: A number of the manifest isn't finite, or the file can't be written.
+        """
+        content, places = bytearray(), {}
+        for name, values in self.arrays.items():
+            part = np.ascontiguousarray(values).tobytes()
+            content += bytes(-len(content) % _ALIGNMENT)
+            places[name] = [len(content), len(part)]
+            content += part
+        manifest = {
+            "kind": self.kind,
+            "title": self.title,
+            "note": self.note,
+            "figures": [list(figure) for figure in self.figures],
+            "help": _HELP,
+            **self.manifest,
+            "arrays": places,
+            "bytes": len(content),
+        }
+        try:
+            # No "<" in a script: a name could otherwise end it.
+            text = json.dumps(manifest, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
+        except ValueError as error:
+            raise WlmError(f"{self.title}: cannot be shown: a number is NaN or infinite") from error
+        pieces = {
+            "TITLE": html.escape(self.title),
+            "STYLE": _asset("page.css"),
+            "MANIFEST": text,
+            "CONTENT": base64.b64encode(zlib.compress(bytes(content), 9)).decode(),
+            "SCRIPT": "\n".join(_asset(name) for name in (*_COMMON, f"{self.kind}.js", "main.js")),
+        }
+        # Cut first, then filled: what goes in may hold a mark too.
+        first, *rest = _asset("page.html").split("@")
+        page = [first, *(pieces.get(part, part) for part in rest)]
+        return atomic_write(path, "".join(page).encode())
+
+
+def pack_rgb9e5(light: np.ndarray) -> np.ndarray:
+    """Packs light as WebGL's RGB9_E5: nine bits a channel and one exponent.
+
+    Args:
+        light: [..., 3], finite; below 0 counts as 0, above 65408 as that.
+
+    Returns:
+        uint32 [...], within 1/512 of a texel's largest channel.
+    """
+    light = np.clip(np.asarray(light, np.float64), 0.0, 65408.0)
+    largest = light.max(-1)
+    # A mantissa of 9 bits without a hidden one: largest / 2 ** (exponent - 24) below 512.
+    exponent = np.clip(np.floor(np.log2(np.maximum(largest, 2.0**-20))) + 16, 0, 31).astype(np.int64)
+    exponent += np.round(largest / 2.0 ** (exponent - 24)) >= 512
+    codes = np.round(light / 2.0 ** (exponent - 24)[..., None]).astype(np.uint32)
+    return codes[..., 0] | codes[..., 1] << 9 | codes[..., 2] << 18 | exponent.astype(np.uint32) << 27
+
+
+def _asset(name: str) -> str:
+    return (resources.files("wlm.web") / "assets" / name).read_text(encoding="utf-8").rstrip("\n")

@@ -1,0 +1,93 @@
+"""Pages of our files, by what a file holds."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+from wlm.errors import WlmError
+from wlm.system import load
+from wlm.web.page import Page
+
+__all__ = ["make_page", "write_page"]
+
+
+def write_page(path: str | os.PathLike[str], files: Sequence[str | os.PathLike[str]], **options: Any) -> int:
+    """Writes a page that shows a file of ours: HTML that needs no network.
+
+    Args:
+        path: The page, `.html`; its folder must exist.
+        files: As for `make_page`.
+        options: As for `make_page`.
+
+    Returns:
+        The page's size, bytes.
+
+    Raises:
+        WlmError: A file is missing, damaged, or of a kind that no page shows; an option doesn't fit it.
+    """
+    return make_page(files, **options).write(path)
+
+
+def make_page(
+    files: Sequence[str | os.PathLike[str]],
+    *,
+    mesh: str | os.PathLike[str] | None = None,
+    original: str | os.PathLike[str] | None = None,
+    key: str | None = None,
+    hours: int = 6,
+    rate: float = 30.0,
+    up: Literal["y", "z"] = "y",
+) -> Page:
+    """Makes the page of a file.
+
+    Args:
+        files: One `.wlm` of lightmaps, of an atlas or of probes; or the folder that `wlm atlas compress` wrote; or
+            six-way lightmaps of smoke, one EXR a frame.
+        mesh: The scene: `.glb`, `.gltf` or `.obj`; of lightmaps with their UVs, of probes any.
+        original: What was compressed, to compare with: a lightmap set, an atlas' lightmap, a probe file.
+        key: Of a probe file with several arrays, the one that was compressed.
+        hours: Most frames of the original lightmaps that the page carries, spread evenly.
+        rate: Frames a second of smoke that plays.
+        up: The axis that points up in the scene.
+
+    Raises:
+        WlmError: As `write_page`.
+    """
+    paths = [Path(file) for file in files]
+    if not paths:
+        raise WlmError("expected a file to show, found none")
+    if paths[0].suffix.lower() == ".exr":
+        from wlm.web.smoke import smoke_page
+
+        _refuse(paths[0], mesh=mesh, original=original, key=key)
+        return smoke_page(paths, rate=rate)
+    if len(paths) > 1:
+        raise WlmError(f"{paths[1]}: expected one file; only smoke has several, one EXR a frame")
+    path = paths[0]
+    if path.is_dir():
+        from wlm.web.atlas import folder_page
+
+        _refuse(path, mesh=mesh, key=key)
+        return folder_page(path, original=original, up=up)
+    model = load(path)
+    if model.SYSTEM == "lightmap":
+        from wlm.web.lightmap import lightmap_page
+
+        _refuse(path, key=key)
+        return lightmap_page(model, path.stat().st_size, mesh=mesh, original=original, hours=hours, up=up)
+    if model.SYSTEM == "probe":
+        from wlm.web.probe import probe_page
+
+        return probe_page(model, path.stat().st_size, mesh=mesh, original=original, key=key, up=up)
+    if model.SYSTEM == "atlas":
+        raise WlmError(f"{path}: expected the folder that wlm atlas compress wrote, which has the mesh")
+    raise WlmError(f"{path}: a network has no picture of its own; expected the lightmaps that it predicts")
+
+
+def _refuse(path: Path, **options: object) -> None:
+    for name, value in options.items():
+        if value is not None:
+            raise WlmError(f"{path}: --{name} means nothing to this file")

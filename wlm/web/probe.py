@@ -1,0 +1,109 @@
+"""The page of light probes."""
+
+from __future__ import annotations
+
+import os
+from typing import Any, Literal
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from wlm.errors import WlmError
+from wlm.probe.data import load
+from wlm.probe.decode import Decoder
+from wlm.probe.exporter import gaussian_bytes, network_bytes
+from wlm.probe.model import ProbeModel
+from wlm.probe.shader import probe_glsl
+from wlm.probe.sphere import irradiance, sh_count
+from wlm.web.geometry import read_geometry
+from wlm.web.page import Page
+
+__all__ = ["probe_page"]
+
+_BANDS = 9  # coefficients that diffuse light needs
+_WHITE, _PERCENTILE = 0.8, 99.0
+_SPHERE = 0.45  # of the median distance between neighbours
+_UP = np.array([[0.0, 1.0, 0.0]])
+
+
+def probe_page(
+    model: ProbeModel,
+    file_bytes: int,
+    *,
+    mesh: str | os.PathLike[str] | None = None,
+    original: str | os.PathLike[str] | None = None,
+    key: str | None = None,
+    up: Literal["y", "z"] = "y",
+) -> Page:
+    """Makes the page of a probe model: spheres at its positions or at those of the original.
+
+    Args:
+        model: The model.
+        file_bytes: Size of its file.
+        mesh, original, key, up: As for `wlm.web.pages.make_page`.
+
+    Raises:
+        WlmError: A probe's numbers are no spherical harmonics; the positions are not known; the mesh or the original
+            can't be read, or is of other probes.
+    """
+    coefficients = sh_count(model.outputs)
+    if coefficients is None:
+        raise WlmError(f"{model.name}: expected spherical harmonics, found {model.outputs} numbers a probe")
+    values = None
+    if original is not None:
+        probes = load(original, key=key)
+        if len(probes.position) != model.probes or probes.values.shape[1] != model.outputs:
+            raise WlmError(
+                f"{original}: expected {model.probes} probes of {model.outputs} numbers, found "
+                f"{len(probes.position)} of {probes.values.shape[1]}"
+            )
+        position, values = probes.position, probes.values
+    elif len(model.positions):
+        position = model.stored_positions()
+    else:
+        raise WlmError(f"{model.name}: the file has no positions; expected --original, the file that was compressed")
+    live = ~model.dead
+    places = position[live].astype(np.float32)
+    arrays = {
+        "gaussians": np.frombuffer(_whole(gaussian_bytes(model)), "<u4"),
+        "network": np.frombuffer(_whole(network_bytes(model)), "<u4"),
+        "places": places,
+    }
+    spread = cKDTree(places).query(places, k=2)[0][:, 1] if len(places) > 1 else np.ones(1)
+    radius = _SPHERE * float(np.median(spread[spread > 0], axis=None)) if (spread > 0).any() else 1.0
+    light = Decoder(model).decode(position[live]).reshape(len(places), coefficients, 3)
+    bright = float(np.percentile(irradiance(light, _UP) / np.pi, _PERCENTILE))
+    manifest: dict[str, Any] = {
+        "shader": probe_glsl(model),
+        "exposure": _WHITE / bright if bright > 0 else 1.0,
+        "low": (places.min(0) - radius).tolist(),
+        "high": (places.max(0) + radius).tolist(),
+        "up": "xyz".index(up),
+        "probe": {"count": len(places), "radius": radius, "coefficients": min(coefficients, _BANDS)},
+    }
+    if values is not None:
+        stored = np.zeros((len(places), _BANDS, 3), np.float16)
+        shown = values[live].reshape(len(places), coefficients, 3)[:, :_BANDS]
+        stored[:, : shown.shape[1]] = shown.clip(-65504, 65504)
+        arrays["original"] = stored
+        manifest["reference"] = {"times": [0.0]}
+    if mesh is not None:
+        geometry = read_geometry(mesh, with_uv=False)
+        arrays |= geometry.arrays()
+        box = geometry.manifest(up)
+        manifest["low"] = np.minimum(manifest["low"], box["low"]).tolist()
+        manifest["high"] = np.maximum(manifest["high"], box["high"]).tolist()
+    figures = [
+        ("file", f"{file_bytes:,} bytes"),
+        ("bits per probe", f"{file_bytes * 8 / model.probes:.1f}"),
+        ("of float32", f"{100 * file_bytes / (4 * model.outputs * model.probes):.2f} %"),
+        ("probes", f"{model.probes:,}, {int(model.dead.sum()):,} dead"),
+        ("Gaussians", f"{model.count:,}"),
+        ("profile", model.profile.name),
+    ]
+    return Page("probe", model.name, "Light probes, decoded on this GPU.", figures, manifest, arrays)
+
+
+def _whole(content: bytes) -> bytes:
+    """Filled up to whole words of 32 bits."""
+    return content + bytes(-len(content) % 4)
