@@ -1,10 +1,16 @@
-"""One picture of all four systems, of the pictures that the other demos leave: `docs/images/gallery.png`."""
+"""One picture and one page of all four systems, of what the other demos leave.
+
+`gallery.png` is `docs/images/gallery.png`; `gallery.html` opens by double click, with the four pages beside it.
+"""
 
 import argparse
 import sys
 from pathlib import Path
 
 from PIL import Image, ImageDraw, ImageFont
+
+from wlm.errors import WlmError
+from wlm.web import write_page
 
 HERE = Path(__file__).resolve().parent
 LEFT = {
@@ -15,6 +21,31 @@ RIGHT = {
     "room.png": "atlas: a room's lightmap; original, decoded, downsampled to as many bytes, errors x 8",
     "street.png": "probe: light probes as lit spheres; original, decoded, error x 8",
 }
+DATA = HERE / "data"
+PAGES = {
+    "city": ("Lightmaps over the day", ["city.wlm"], {"original": DATA / "city"}),
+    "room": ("A mesh's lightmap", ["room-standard"], {"original": DATA / "atlas" / "room.exr"}),
+    "street": ("Light probes", ["street.wlm"], {"original": DATA / "probes" / "street.npz", "key": "12.00"}),
+    "plume": ("Six-way lightmaps of smoke", [f"smoke/plume_{a:02}.exr" for a in (0, 30, 60, 90)], {"rate": 2.0}),
+}
+FRAME = """<!doctype html>
+<html lang="en">
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>wlm: compressed precomputed lighting</title>
+<style>
+body {{ margin: 0; background: #202024; color: #e6e6e6; font: 15px/1.5 system-ui, sans-serif; }}
+main {{ display: grid; gap: 12px; padding: 12px; }}
+main {{ grid-template-columns: repeat(auto-fit, minmax(min(100%, 640px), 1fr)); }}
+h2 {{ font-size: 16px; margin: 0 0 6px; }}
+a {{ color: #ffb454; }}
+iframe {{ width: 100%; height: 540px; border: 1px solid #3a3a42; }}
+</style>
+<main>
+{}
+</main>
+</html>
+"""
 WIDTH, LEFT_WIDTH, LINE, MARGIN = 1500, 516, 26, 8
 PAPER, INK = (32, 32, 32), (230, 230, 230)
 
@@ -36,21 +67,34 @@ def column(folder: Path, captions: dict[str, str], width: int) -> Image.Image:
     return sheet
 
 
+def pages(out: Path) -> int:
+    """Writes a page of each system and one that frames them; returns their bytes."""
+    sections, size = [], 0
+    for name, (title, files, options) in PAGES.items():
+        size += write_page(out / f"{name}.html", [out / file for file in files], **options)
+        link = f'<a href="{name}.html">{title}</a>'
+        sections.append(f'<section><h2>{link}</h2><iframe src="{name}.html" title="{title}"></iframe></section>')
+    (out / "gallery.html").write_text(FRAME.format("\n".join(sections)), encoding="utf-8")
+    return size
+
+
 def main() -> None:
-    """Reads the command line and writes the picture."""
+    """Reads the command line and writes the picture and the pages."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=HERE / "out", help="the folder of the demos' pictures")
     out = parser.parse_args().out
     try:
         left = column(out, LEFT, LEFT_WIDTH)
         right = column(out, RIGHT, WIDTH - LEFT_WIDTH - MARGIN)
-    except OSError as error:
-        sys.exit(f"error: {error}; expected the pictures of the other demos")
+        size = pages(out)
+    except (OSError, WlmError) as error:
+        sys.exit(f"error: {error}; expected what the other demos leave")
     sheet = Image.new("RGB", (WIDTH, max(left.height, right.height)), PAPER)
     sheet.paste(left, (0, 0))
     sheet.paste(right, (left.width + MARGIN, 0))
     sheet.save(out / "gallery.png")
     print(f"{out.name}/gallery.png: {sheet.width} x {sheet.height} pixels")
+    print(f"{out.name}/gallery.html: {len(PAGES)} pages, {size:,} bytes")
 
 
 if __name__ == "__main__":

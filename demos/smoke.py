@@ -25,7 +25,7 @@ from wlm.formats.atomic import atomic_write
 from wlm.interop import check_device
 from wlm.smoke.baking import bake, lit
 from wlm.smoke.camera import DIRECTIONS, Camera, axis_faults
-from wlm.smoke.data import load_frames, open_frames
+from wlm.smoke.data import load_frames, open_frames, write_six_way
 from wlm.smoke.exporter import brightest_gain, read_flipbook, write_flipbook
 from wlm.smoke.guiding import guide
 from wlm.smoke.learn.synthetic import make_plume
@@ -131,6 +131,7 @@ def plume(out: Path, device: str) -> dict[str, float]:
         toward = CameraSettings().turned(degrees).toward
         view = Camera.around(volume, toward=toward, pixels=RESOLUTION)
         sides.append(bake(volume, view, step=1.0, estimate=False))
+        write_six_way(out / f"plume_{degrees:02.0f}.exr", sides[-1])
     books = (out / "plume_1.png", out / "plume_2.png")
     cells = {"rows": 2, "columns": 2, "gain": brightest_gain(sides)}
     clipped = write_flipbook(books, sides, "unity", **cells)

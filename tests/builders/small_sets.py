@@ -1,7 +1,10 @@
 """Lightmap sets of one to four tiles, and settings with which a fit takes a moment."""
 
+from pathlib import Path
+
 import numpy as np
 
+from wlm.formats.exr import write_exr
 from wlm.lightmap.data import LightmapSet, from_arrays
 from wlm.lightmap.model import Profile
 
@@ -31,3 +34,10 @@ def static_light(height=128, width=128, hours=HOURS, period=24.0) -> LightmapSet
     pattern = np.random.default_rng(1).uniform(0.1, 1.0, (height, width, 3))
     frames = np.stack([pattern * (1.0 + hour) for hour in hours])
     return from_arrays(frames, hours, period=period, name="static")
+
+
+def write_set(folder: Path, lightmaps: LightmapSet) -> None:
+    """Writes the frames of a set into a new folder; their names tell their hours."""
+    folder.mkdir()
+    for time, frame in zip(lightmaps.times, lightmaps.frames, strict=True):
+        write_exr(folder / f"light_{time:05.2f}h.exr".replace(".", "_", 1), frame, half=False)

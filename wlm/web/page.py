@@ -23,8 +23,8 @@ _ALIGNMENT = 16  # bytes, of an array in the content
 _COMMON = ("content.js", "graphics.js", "blocks.js", "camera.js", "panel.js", "light.js", "surface.js")
 _HELP = (
     "Drag to turn or move, two fingers or the wheel to zoom, shift and drag to move, double-click to begin again. "
-    "Keys: arrows for the hour or frame, space plays, [ and ] change the exposure, T the tone mapping, 1 to 4 the view, "
-    "H folds this panel."
+    "Keys: arrows for the hour or frame, space plays, [ and ] change the exposure, T the tone mapping, 1 to 4 the "
+    "view, H folds this panel."
 )
 
 

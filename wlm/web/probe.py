@@ -79,7 +79,7 @@ def probe_page(
         "low": (places.min(0) - radius).tolist(),
         "high": (places.max(0) + radius).tolist(),
         "up": "xyz".index(up),
-        "probe": {"count": len(places), "radius": radius, "coefficients": min(coefficients, _BANDS)},
+        "probe": {"count": len(places), "radius": radius, "coefficients": coefficients},
     }
     if values is not None:
         stored = np.zeros((len(places), _BANDS, 3), np.float16)

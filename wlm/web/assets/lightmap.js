@@ -130,7 +130,7 @@ class LightmapPage {
     graphics.draw(3);
   }
 
-  // Decodes some tiles of the wanted hour; returns whether there are more.
+  // Decodes some tiles of the wanted hour; returns whether it did.
   work(elapsed) {
     if (!this.waiting.length) {
       if (this.asked === this.time) return false;
@@ -148,7 +148,7 @@ class LightmapPage {
     this.panel.figure('decoded in', `${(performance.now() - this.began).toFixed(0)} ms`);
     [this.seen, this.next] = [this.next, this.seen];
     this.shown = this.asked;
-    return this.asked !== this.time;
+    return true;
   }
 
   advance(elapsed) {

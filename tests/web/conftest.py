@@ -1,0 +1,43 @@
+"""A browser for the pages, where one is installed."""
+
+import shutil
+
+import pytest
+
+_PROGRAMS = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome")
+_OPTIONS = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+
+
+@pytest.fixture(scope="module")
+def browser():
+    """Headless Chromium with WebGL2 in software."""
+    program = next(filter(None, map(shutil.which, _PROGRAMS)), None)
+    if program is None:
+        pytest.skip("no browser is installed")
+    playwright = pytest.importorskip("playwright.sync_api")
+    with playwright.sync_playwright() as started:
+        opened = started.chromium.launch(executable_path=program, args=list(_OPTIONS))
+        yield opened
+        opened.close()
+
+
+@pytest.fixture
+def show(browser):
+    """Opens a page, and at the end checks that nothing went wrong in it; `unpacked` goes without block compression."""
+    errors, contexts = [], []
+
+    def load(path, *, unpacked=False, width=900, height=600):
+        context = browser.new_context(viewport={"width": width, "height": height})
+        contexts.append(context)
+        page = context.new_page()
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
+        page.goto(path.as_uri() + ("#unpacked" if unpacked else ""))
+        page.evaluate("wlm.then(() => 0, () => 1)")
+        return page
+
+    load.errors = errors
+    yield load
+    for context in contexts:
+        context.close()
+    assert not errors

@@ -1,0 +1,186 @@
+"""Pages in a browser: the light that they decode is that of Python, and their controls change the picture."""
+
+import base64
+import io
+
+import numpy as np
+import pytest
+import torch
+from builders import atlas_meshes, atlas_models, probe_models, small_sets
+from PIL import Image
+
+import wlm
+from wlm.formats.gltf import document_from_arrays
+from wlm.formats.gltf_writer import write_glb
+from wlm.lightmap.data import from_arrays
+from wlm.smoke.camera import Camera
+from wlm.smoke.data import write_six_way
+from wlm.smoke.lightmaps import SixWay
+from wlm.smoke.shading import Light
+from wlm.web import write_page
+
+TIMES = (0.0, 6.25, 12.0, 18.5, 23.9)
+
+
+def numbers(page, script: str) -> np.ndarray:
+    """The float32 numbers that a script gives."""
+    text = page.evaluate(
+        f"""(async () => {{
+            const {{kind}} = await wlm, bytes = new Uint8Array((await ({script})).buffer.slice(0));
+            let text = '';
+            for (let i = 0; i < bytes.length; i += 8192) text += String.fromCharCode(...bytes.subarray(i, i + 8192));
+            return btoa(text);
+        }})()"""
+    )
+    return np.frombuffer(base64.b64decode(text), np.float32)
+
+
+def picture(page) -> np.ndarray:
+    """What is on the canvas, after the next frame."""
+    page.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+    return np.asarray(Image.open(io.BytesIO(page.locator("#view").screenshot())).convert("RGB")).astype(int)
+
+
+@pytest.fixture(scope="module")
+def lightmaps():
+    """A dynamic, a static, a constant and an empty tile."""
+    frames = np.zeros((5, 256, 256, 3), np.float32)
+    frames[:, :128, :128] = small_sets.moving_light().frames
+    frames[:, :128, 128:] = small_sets.static_light().frames / 24.0
+    frames[:, 128:, :128] = (1.0 + np.arange(5.0))[:, None, None, None] / 5.0
+    mask = np.ones((256, 256), bool)
+    mask[128:, 128:] = False
+    return from_arrays(frames, small_sets.HOURS, mask, 24.0, name="four tiles")
+
+
+@pytest.fixture(scope="module")
+def model(lightmaps):
+    return wlm.lightmap.compress(lightmaps, small_sets.tiny_profile(static_budget_db=20.0))
+
+
+@pytest.mark.parametrize("unpacked", [False, True])
+def test_lightmaps_decode_as_in_python(model, tmp_path, show, unpacked):
+    assert sorted(model.kind.tolist()) == [0, 1, 2, 3]
+    model.save(tmp_path / "four.wlm")
+    write_page(tmp_path / "page.html", [tmp_path / "four.wlm"])
+    page = show(tmp_path / "page.html", unpacked=unpacked)
+    decoder, gamma = model.decoder(), model.profile.gamma
+    for time in TIMES:
+        expected = decoder.frame(time)
+        seen = numbers(page, f"kind.read({time})").reshape(256, 256, 4)[..., :3]
+        bound = expected.max() ** (1 / gamma)
+        apart = np.abs(np.maximum(seen, 0.0) ** (1 / gamma) - expected ** (1 / gamma)) / bound
+        assert apart.max() < 2 / 255
+
+
+def test_the_hour_and_the_exposure_change_the_picture(model, tmp_path, show):
+    model.save(tmp_path / "four.wlm")
+    write_page(tmp_path / "page.html", [tmp_path / "four.wlm"])
+    page = show(tmp_path / "page.html")
+    page.evaluate("wlm.then(({kind}) => kind.read(5))")
+    before = picture(page)
+    assert before.max() > 100
+    page.evaluate("wlm.then(({kind}) => kind.read(11))")
+    assert np.abs(picture(page) - before).max() > 20
+    page.keyboard.press("]")
+    brighter = picture(page)
+    assert brighter.mean() > before.mean()
+    page.keyboard.press("t")
+    assert np.abs(picture(page) - brighter).max() > 5
+    page.keyboard.press("h")
+    assert page.locator("#panel.folded").count() == 1
+
+
+def test_the_original_its_error_and_the_wipe(tmp_path, show):
+    lightmaps = small_sets.moving_light(hours=(0.0, 1.0, 2.0), period=None)
+    model = wlm.lightmap.compress(lightmaps, small_sets.tiny_profile())
+    model.save(tmp_path / "one.wlm")
+    small_sets.write_set(tmp_path / "set", lightmaps)
+    write_page(tmp_path / "page.html", [tmp_path / "one.wlm"], original=tmp_path / "set")
+    page = show(tmp_path / "page.html")
+    page.evaluate("wlm.then(({kind}) => kind.read(1))")
+    decoded = picture(page)
+    page.get_by_role("button", name="original", exact=True).click()
+    original = picture(page)
+    middle = decoded.shape[1] // 2
+    assert np.abs(decoded - original).mean() > 1
+    page.get_by_role("button", name="split").click()
+    page.evaluate("document.getElementById('wipe').style.visibility = 'hidden'")
+    split = picture(page)
+    np.testing.assert_array_equal(split[:, : middle - 2], original[:, : middle - 2])
+    np.testing.assert_array_equal(split[:, middle + 2 :], decoded[:, middle + 2 :])
+    page.get_by_role("button", name="error", exact=True).click()
+    assert np.abs(picture(page) - decoded).max() > 50
+
+
+@pytest.mark.parametrize("kind", atlas_models.KINDS)
+def test_atlases_read_as_in_python(kind, tmp_path, show):
+    mesh = atlas_meshes.sheet()
+    model = atlas_models.random_model(mesh, kind)
+    wlm.atlas.export(model, tmp_path / "sheet", mesh)
+    write_page(tmp_path / "page.html", [tmp_path / "sheet"])
+    page = show(tmp_path / "page.html")
+    uv = np.random.default_rng(0).random((500, 2)).astype(np.float32)
+    expected = model.decoder().read(torch.from_numpy(uv)).numpy()
+    seen = numbers(page, f"kind.read({uv.ravel().tolist()})").reshape(-1, 4)[:, :3]
+    assert np.abs(seen - expected).max() < 2 / 255 * expected.max()
+    assert picture(page).max() > 100
+    before = picture(page)
+    page.get_by_role("button", name="unwrapped").click()
+    assert np.abs(picture(page) - before).max() > 20
+
+
+@pytest.mark.parametrize("outputs", [27, 12, 48])
+def test_probes_decode_as_in_python(outputs, tmp_path, show):
+    model = probe_models.random_model(count=12, probes=40, outputs=outputs, positions=True)
+    model.save(tmp_path / "probe.wlm")
+    position = np.array([[0.0, 0, 0], [4, 0, 0], [0, 2, 0]]) + model.origin
+    document, _ = document_from_arrays(position, np.array([[0, 1, 2]]), np.zeros((3, 2)), "triangle")
+    write_glb(tmp_path / "triangle.glb", document, [], 0)
+    write_page(tmp_path / "page.html", [tmp_path / "probe.wlm"], mesh=tmp_path / "triangle.glb")
+    page = show(tmp_path / "page.html")
+    live = ~model.dead
+    expected = model.decoder().decode(model.stored_positions()[live])[:, :27]
+    seen = numbers(page, "kind.read()").reshape(-1, 27)[:, : expected.shape[1]]
+    assert np.abs(seen - expected).max() < 3 / 255 * np.abs(expected).max()
+    assert picture(page).max() > 100
+
+
+def test_smoke_is_shaded_as_in_python(tmp_path, show):
+    rows, columns = np.mgrid[:32, :32] / 32.0
+    maps = np.stack([0.1 + 0.1 * i + 0.2 * rows * columns for i in range(6)]).astype(np.float32)
+    camera = Camera.look_at((0.0, 0.0, 1.0), np.zeros(3), extent=1.0, height=32, width=32)
+    six = SixWay(torch.from_numpy(maps), torch.full((32, 32), 0.0), camera=camera)
+    for number in range(2):
+        write_six_way(tmp_path / f"{number}.exr", six)
+    write_page(tmp_path / "page.html", [tmp_path / "0.exr", tmp_path / "1.exr"], rate=10.0)
+    page = show(tmp_path / "page.html", width=700, height=400)
+    for toward in ((1.0, 0.0, 0.0), (-0.6, 0.0, 0.8), (0.0, 0.6, -0.8)):
+        page.evaluate(
+            f"wlm.then(({{kind}}) => {{ kind.toward = {list(toward)}; kind.draw(); kind.camera.changed(); }})"
+        )
+        exposure = page.evaluate("wlm.then(({manifest}) => manifest.exposure)")
+        light = six.shade([Light(toward)]).numpy()[16, 16] * exposure
+        expected = 255 * (1.055 * min(light[0], 1.0) ** (1 / 2.4) - 0.055)
+        seen = picture(page)
+        at = seen[seen.shape[0] // 2, seen.shape[1] // 2]
+        assert np.abs(at - expected).max() <= 4
+    before = picture(page)
+    box = page.locator("#view").bounding_box()
+    page.mouse.move(box["x"] + 20, box["y"] + 200)
+    page.mouse.down()
+    page.mouse.move(box["x"] + 60, box["y"] + 220)
+    page.mouse.up()
+    assert np.abs(picture(page) - before).max() > 5
+
+
+def test_a_damaged_page_says_so(model, tmp_path, show):
+    model.save(tmp_path / "four.wlm")
+    write_page(tmp_path / "page.html", [tmp_path / "four.wlm"])
+    text = (tmp_path / "page.html").read_text(encoding="utf-8")
+    middle = text.index('id="content"') + 3000
+    letter = "A" if text[middle] != "A" else "B"
+    (tmp_path / "page.html").write_text(text[:middle] + letter + text[middle + 1 :], encoding="utf-8")
+    page = show(tmp_path / "page.html")
+    assert "damaged" in page.locator("#message").inner_text()
+    show.errors.clear()  # the page also throws it, for the console
