@@ -17,7 +17,7 @@ import typer
 from typer.core import TyperGroup
 
 from wlm import __version__
-from wlm.cli import atlas, bench, doctor, lightmap, probe, smoke, web
+from wlm.cli import atlas, bench, compare, doctor, lightmap, probe, smoke, web
 from wlm.errors import WlmError, one_line
 
 __all__ = ["BAD_INPUT", "INTERRUPTED", "app", "main"]
@@ -66,6 +66,7 @@ app.add_typer(atlas.app, name="atlas")
 app.add_typer(probe.app, name="probe")
 app.add_typer(smoke.app, name="smoke")
 app.add_typer(bench.app, name="bench")
+app.command()(compare.compare)
 app.command()(web.web)
 app.command()(doctor.doctor)
 

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from wlm.cli.console import check_output, escape, note, number, quiet_warp, running, show, show_json, table, write_json
-from wlm.cli.options import AsJson, Device, ReportFile, Seed, output_option
+from wlm.cli.options import AsJson, Device, PageFile, ReportFile, Seed, output_option
 from wlm.errors import WlmError
 
 __all__ = ["app"]
@@ -83,6 +83,7 @@ def evaluate(
     views: Annotated[int, typer.Option(min=1, max=4096, help="Cameras, spread evenly on a sphere.")] = _VIEWS,
     resolution: Annotated[int, typer.Option(min=16, max=16384, help="Pixels along a side of a view.")] = _RESOLUTION,
     json_path: ReportFile = None,
+    html_path: PageFile = None,
     mesh: Annotated[Path | None, typer.Option(help="The mesh; default where it was.")] = None,
     lightmap: Annotated[Path | None, typer.Option(help="The lightmap; default where it was.")] = None,
     mask: Annotated[Path | None, typer.Option(help="The mask; default where it was, if there was one.")] = None,
@@ -91,6 +92,8 @@ def evaluate(
     """Compare with the original lightmap on views of the mesh, beside a smaller lightmap of equal bits."""
     if json_path is not None:
         check_output(json_path, ".json")
+    if html_path is not None:
+        check_output(html_path, ".html")
     quiet_warp()
     from wlm.atlas.evaluation import evaluate
     from wlm.atlas.exporter import read_folder, read_inputs
@@ -104,6 +107,10 @@ def evaluate(
     with running("evaluate") as progress:
         report = evaluate(output.model, original, **options, progress=progress, file_bytes=output.model_bytes)
         ((rival, score),) = evaluate_rivals(output.model, original, **options)
+    if html_path is not None:
+        from wlm.view.reports import atlas_report
+
+        atlas_report(html_path, output.model, original, report, views)
     rival_cr = 1.0 - share_of(rival, original)
     if json_path is not None:
         rest = {"size": list(rival.size), "cr": rival_cr, "seconds": rival.encode_seconds}

@@ -18,7 +18,7 @@ from wlm.cli.console import (
     table,
     write_json,
 )
-from wlm.cli.options import AsJson, Device, ModelFile, ReportFile, Resume, Seed, output_option
+from wlm.cli.options import AsJson, Device, ModelFile, PageFile, ReportFile, Resume, Seed, output_option
 
 if TYPE_CHECKING:
     from wlm.baselines.lightmap import Score
@@ -128,6 +128,7 @@ def evaluate(
     file: ModelFile,
     set_path: _Set,
     json_path: ReportFile = None,
+    html_path: PageFile = None,
     baselines: Annotated[
         bool, typer.Option("--baselines", help="Add BC6H, BC7, ASTC and plain 8 bits (extra `baselines`).")
     ] = False,
@@ -139,6 +140,8 @@ def evaluate(
     """Compare every stored time with the input: PSNR, SSIM and FLIP by tile and by time, and bits per texel."""
     if json_path is not None:
         check_output(json_path, ".json")
+    if html_path is not None:
+        check_output(html_path, ".html")
     quiet_warp()
     from wlm.interop import check_device
     from wlm.lightmap.evaluation import evaluate
@@ -149,6 +152,10 @@ def evaluate(
     lightmaps = _load(set_path, times, mask, period)
     with running("score") as progress:
         report = evaluate(model, lightmaps, device=device, progress=progress, file_bytes=file.stat().st_size)
+    if html_path is not None:
+        from wlm.view.reports import lightmap_report
+
+        lightmap_report(html_path, model, lightmaps, report)
     rivals: list[tuple[Rival, Score]] = []
     if baselines:
         from wlm.baselines.lightmap import evaluate_rivals

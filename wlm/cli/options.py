@@ -5,12 +5,15 @@ from typing import Annotated, Any
 
 import typer
 
-__all__ = ["AsJson", "Device", "ModelFile", "ReportFile", "Resume", "Seed", "output_option"]
+__all__ = ["AsJson", "Device", "ModelFile", "PageFile", "ReportFile", "Resume", "Seed", "output_option"]
 
 Device = Annotated[str, typer.Option(help='Where it computes: "cpu", "cuda" or "cuda:N".')]
 Seed = Annotated[int, typer.Option(min=0, max=2**31 - 1, help="One seed gives one result on one device.")]
 Resume = Annotated[bool, typer.Option("--resume", help="Go on with an interrupted run of the same output.")]
 ReportFile = Annotated[Path | None, typer.Option("--json", metavar="REPORT.json", help="Write a report.")]
+PageFile = Annotated[
+    Path | None, typer.Option("--html", metavar="REPORT.html", help="Write a page with tables, plots and pictures.")
+]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")]
 ModelFile = Annotated[Path, typer.Argument(metavar="FILE.wlm", help="A file that compress wrote.")]
 

@@ -18,7 +18,7 @@ from wlm.cli.console import (
     table,
     write_json,
 )
-from wlm.cli.options import AsJson, Device, ModelFile, ReportFile, Resume, Seed, output_option
+from wlm.cli.options import AsJson, Device, ModelFile, PageFile, ReportFile, Resume, Seed, output_option
 from wlm.errors import WlmError
 
 if TYPE_CHECKING:
@@ -155,6 +155,7 @@ def evaluate(
     file: ModelFile,
     probes_path: _Probes,
     json_path: ReportFile = None,
+    html_path: PageFile = None,
     baselines: Annotated[
         bool, typer.Option("--baselines", help="Add the PCA family, a moving basis and 8 bits, at equal bytes.")
     ] = False,
@@ -165,6 +166,8 @@ def evaluate(
     """Compare the decoded probes with the input: PSNR of coefficients and of irradiance, and bits per probe."""
     if json_path is not None:
         check_output(json_path, ".json")
+    if html_path is not None:
+        check_output(html_path, ".html")
     quiet_warp()
     from wlm.probe import evaluate
     from wlm.system import load
@@ -174,6 +177,10 @@ def evaluate(
     report = evaluate(model, probes, device=device, file_bytes=file.stat().st_size)
     if probes.source != model.source:
         note(f"warning: {probes_path}: not what {file} was made of; another key, convention or file?")
+    if html_path is not None:
+        from wlm.view.reports import probe_report
+
+        probe_report(html_path, model, probes, report)
     rivals = []
     if baselines:
         from wlm.baselines.probe import evaluate_rivals

@@ -1,0 +1,67 @@
+"""Reports as pages: what a score says stands there, with pictures, and a name stays text."""
+
+import dataclasses
+import re
+
+import numpy as np
+import pytest
+from builders.contract import SUBJECTS
+
+from wlm.view.document import Document
+from wlm.view.reports import atlas_report, lightmap_report, probe_report
+
+
+@pytest.fixture(scope="module", params=["lightmap", "atlas-tiles", "probe"])
+def scored(request):
+    """A model, its data, and its report."""
+    subject = SUBJECTS[request.param]()
+    data = subject.data()
+    model = subject.compress(data)
+    return subject.name, model, data, subject.evaluate(model, data)
+
+
+def write(path, name, model, data, report) -> str:
+    if name == "atlas":
+        size = atlas_report(path, model, data, report, 2)
+    else:
+        size = {"lightmap": lightmap_report, "probe": probe_report}[name](path, model, data, report)
+    assert size == path.stat().st_size
+    return path.read_text(encoding="utf-8")
+
+
+def test_a_report_shows_its_score_with_pictures_and_loads_nothing(scored, tmp_path):
+    text = write(tmp_path / "report.html", *scored)
+    assert f"{scored[-1].psnr:.2f} dB" in text
+    assert "<script" not in text and not re.search(r'(?:src|href)="(?!data:)', text)
+    pictures = text.count("data:image/png;base64,")
+    assert pictures >= {"lightmap": 5, "atlas": 6, "probe": 1}[scored[0]]
+
+
+def test_a_report_of_a_strange_name_and_without_scores(scored, tmp_path):
+    name, model, data, report = scored
+    gone = {
+        item.name: np.full_like(value, np.nan) if isinstance(value, np.ndarray) else np.nan
+        for item in dataclasses.fields(report)
+        if isinstance(value := getattr(report, item.name), float | np.ndarray) and item.name != "time_values"
+    }
+    model = dataclasses.replace(model, name="<b>\u2028</b>")
+    report = dataclasses.replace(report, **gone, **({"name": "<b>"} if name == "probe" else {}))
+    if name == "atlas":
+        report = dataclasses.replace(report, worst_view=-1, views=0)
+    text = write(tmp_path / "report.html", name, model, data, report)
+    assert "<b>" not in text and "–" in text and ">nan" not in text
+    assert name != "atlas" or "No camera" in text
+
+
+def test_parts_of_a_document(tmp_path):
+    page = Document("a & b")
+    page.text("note")
+    page.table("", ("", "x"), [("<i>", "1")])
+    page.lines("lines", "dB", np.arange(3.0), {"one": np.array([1.0, np.nan, 2.0]), "two": np.zeros(3)})
+    page.grid("grid", "dB", np.array([[1.0, np.nan], [np.nan, np.nan]]))
+    page.grid("no numbers", "dB", np.full((2, 2), np.nan))
+    page.histogram("histogram", "dB", np.array([np.inf, 1.0, 2.0]))
+    page.pictures("pictures", {"one": np.zeros((2, 2, 3), np.uint8)})
+    page.write(tmp_path / "page.html")
+    text = (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert "a &amp; b" in text and "&lt;i&gt;" in text and text.count("<img") == 5

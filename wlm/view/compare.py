@@ -1,0 +1,215 @@
+"""Two models of one input beside each other: their bytes, settings and scores, and how far apart they decode."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from wlm import atlas, lightmap, probe
+from wlm.atlas.exporter import MODEL_FILE, geometry, read_folder, read_inputs
+from wlm.errors import WlmError
+from wlm.formats.artifact import read_artifact
+from wlm.metrics import PSNR_CAP_DB, psnr
+from wlm.system import Model, load
+from wlm.view.document import Document, as_picture, white_of
+
+__all__ = ["Comparison", "compare"]
+
+_Path = str | os.PathLike[str]
+
+_GAIN = 8.0  # of differences in pictures
+_SIDE = 300  # of a picture, in the page's pixels
+_VIEWS, _RESOLUTION = 50, 512  # of an atlas' score
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Two models, A and B.
+
+    Attributes:
+        names: Of the files.
+        system: Of both.
+        bytes: Sizes of the files.
+        parts: Bytes of each part, 0 where a file has none.
+        settings: Those that differ; None where a profile has none of the name.
+        apart: dB, PSNR of B with A as the reference; 120 where both decode alike.
+        scores: Of each against the original, by name; empty without one.
+        pictures: Linear light of A and B, and of the original if it is given, where A and B are furthest apart.
+        where: Of what the pictures are.
+    """
+
+    names: tuple[str, str]
+    system: str
+    bytes: tuple[int, int]
+    parts: Mapping[str, tuple[int, int]]
+    settings: Mapping[str, tuple[Any, Any]]
+    apart: float
+    scores: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    pictures: Mapping[str, np.ndarray] = field(default_factory=dict)
+    where: str = ""
+
+    def rows(self) -> list[tuple[str, str, str]]:
+        """The figures as text: what, of A, of B."""
+        rows = [("bytes", *(f"{size:,}" for size in self.bytes))]
+        rows += [(name, *(_number(value) for value in pair)) for name, pair in self.scores.items()]
+        rows += [("PSNR between the two, dB", "", f"{self.apart:.2f}")]
+        rows += [(name, *(_text(value) for value in pair)) for name, pair in self.settings.items()]
+        return rows + [(f"bytes of {name}", *(f"{size:,}" for size in pair)) for name, pair in self.parts.items()]
+
+    def write(self, path: str | os.PathLike[str]) -> int:
+        """Writes the comparison as a page, `.html`; returns its bytes.
+
+        Raises:
+            WlmError: The file can't be written.
+        """
+        page = Document(f"{self.names[0]} and {self.names[1]}")
+        page.table("", ("", *self.names), self.rows())
+        if self.pictures:
+            white = white_of(next(iter(self.pictures.values())))
+            a, b, *rest = self.pictures.values()
+            shown = {name: as_picture(light, white) for name, light in self.pictures.items()}
+            shown[f"difference × {_GAIN:g}"] = as_picture(np.abs(a - b) * _GAIN, white)
+            for original in rest:
+                for name, light in (("A", a), ("B", b)):
+                    shown[f"error of {name} × {_GAIN:g}"] = as_picture(np.abs(light - original) * _GAIN, white)
+            page.pictures(self.where, shown, _SIDE)
+        return page.write(path)
+
+
+def compare(
+    first: _Path,
+    second: _Path,
+    *,
+    original: _Path | None = None,
+    key: str | None = None,
+    device: str = "cpu",
+) -> Comparison:
+    """Compares two models of one input.
+
+    Args:
+        first, second: Two `.wlm` of lightmaps or of probes, or two folders of `wlm atlas compress`.
+        original: What was compressed: a lightmap set, a probe file, or of folders the lightmap; None: no scores.
+        key: Of a probe file with several arrays, the one that was compressed.
+        device: Where both are decoded.
+
+    Raises:
+        WlmError: A file can't be read, they are of different systems or sizes, or nothing of theirs can be compared.
+    """
+    paths = Path(first), Path(second)
+    if all(path.is_dir() for path in paths):
+        return _atlases(paths, original, device)
+    models = load(paths[0]), load(paths[1])
+    systems = [model.SYSTEM for model in models]
+    if systems[0] != systems[1]:
+        raise WlmError(f"{paths[1]}: expected a model of {systems[0]} like {paths[0]}, found one of {systems[1]}")
+    if systems[0] == "lightmap":
+        return _lightmaps(paths, models, original, device)
+    if systems[0] == "probe":
+        return _probes(paths, models, original, key, device)
+    if systems[0] == "atlas":
+        raise WlmError(f"{paths[0]}: expected the folder that wlm atlas compress wrote, which has the mesh")
+    raise WlmError(f"{paths[0]}: networks are compared by wlm smoke evaluate, which gives each the same smoke")
+
+
+def _facts(paths: Sequence[Path], models: Sequence[Model]) -> dict[str, Any]:
+    """What all systems have."""
+    parts = [read_artifact(path).parts for path in paths]
+    profiles = [model.profile.model_dump(mode="json") for model in models]
+    names = list(dict.fromkeys([*profiles[0], *profiles[1]]))
+    settings = {name: tuple(profile.get(name) for profile in profiles) for name in names}
+    return {
+        "names": (str(paths[0]), str(paths[1])),
+        "system": models[0].SYSTEM,
+        "bytes": tuple(path.stat().st_size for path in paths),
+        "parts": {name: tuple(each.get(name, 0) for each in parts) for name in dict.fromkeys([*parts[0], *parts[1]])},
+        "settings": {name: pair for name, pair in settings.items() if pair[0] != pair[1]},
+    }
+
+
+def _lightmaps(paths: Sequence[Path], models: Sequence[Any], original: _Path | None, device: str) -> Comparison:
+    sizes = [(model.width, model.height) for model in models]
+    if sizes[0] != sizes[1]:
+        raise WlmError(f"{paths[1]}: expected lightmaps of {_size(sizes[0])}, found {_size(sizes[1])}")
+    decoders = [model.decoder(device) for model in models]
+    times = models[0].times
+    frames = [[decoder.frame(time) for decoder in decoders] for time in times]
+    # A frame of one colour has no range to measure against.
+    by_time = [psnr(a, b) for a, b in frames]
+    by_time = np.where(np.isnan(by_time), PSNR_CAP_DB, by_time)
+    furthest = int(np.argmin(by_time))
+    pictures = {"A": frames[furthest][0], "B": frames[furthest][1]}
+    scores = {}
+    if original is not None:
+        lightmaps = lightmap.load(original)
+        reports = [lightmap.evaluate(model, lightmaps, device=device) for model in models]
+        names = {"PSNR dB": "psnr", "worst PSNR dB": "worst_psnr", "SSIM": "ssim", "FLIP": "flip"}
+        scores = {title: tuple(getattr(report, name) for report in reports) for title, name in names.items()}
+        nearest = int(np.abs(lightmaps.times - times[furthest]).argmin())
+        mask = lightmaps.mask[..., None]
+        pictures = {name: light * mask for name, light in pictures.items()}
+        pictures["original"] = lightmaps.frames[nearest] * mask
+    where = f"Furthest apart at {times[furthest]:g}: {by_time[furthest]:.2f} dB"
+    mean = float(np.mean(by_time))
+    return Comparison(**_facts(paths, models), apart=mean, scores=scores, pictures=pictures, where=where)
+
+
+def _probes(
+    paths: Sequence[Path], models: Sequence[Any], original: _Path | None, key: str | None, device: str
+) -> Comparison:
+    counts = [(model.probes, model.outputs) for model in models]
+    if counts[0] != counts[1]:
+        probes, numbers = counts[0]
+        raise WlmError(f"{paths[1]}: expected {probes} probes of {numbers} numbers, found {counts[1]}")
+    scores, position = {}, None
+    if original is not None:
+        probes = probe.load(original, key=key)
+        reports = [probe.evaluate(model, probes, device=device) for model in models]
+        names = {"PSNR dB": "psnr", "PSNR of irradiance, dB": "irradiance_psnr", "largest error": "max_abs_error"}
+        scores = {title: tuple(getattr(report, name) for report in reports) for title, name in names.items()}
+        position = probes.position
+    elif len(models[0].positions):
+        position = models[0].stored_positions()
+    else:
+        raise WlmError(f"{paths[0]}: the file has no positions; expected --original, the file that was compressed")
+    values = [model.decoder(device).decode_probes(position) for model in models]
+    return Comparison(**_facts(paths, models), apart=psnr(*(each[:, None] for each in values)), scores=scores)
+
+
+def _atlases(paths: Sequence[Path], original: _Path | None, device: str) -> Comparison:
+    outputs = [read_folder(path) for path in paths]
+    sizes = [(output.model.width, output.model.height) for output in outputs]
+    if sizes[0] != sizes[1]:
+        raise WlmError(f"{paths[1]}: expected a lightmap of {_size(sizes[0])}, found {_size(sizes[1])}")
+    meshes = [geometry(output) for output in outputs]
+    light = [
+        output.model.decoder(device).lightmap(mesh) * meshes[0].mask[..., None]
+        for output, mesh in zip(outputs, meshes, strict=True)
+    ]
+    pictures, scores = {"A": light[0], "B": light[1]}, {}
+    if original is not None:
+        inputs = [read_inputs(output, lightmap_path=original) for output in outputs]
+        options = {"views": _VIEWS, "resolution": _RESOLUTION, "device": device}
+        reports = [atlas.evaluate(each.model, mesh, **options) for each, mesh in zip(outputs, inputs, strict=True)]
+        names = {"PSNR of views, dB": "psnr", "PSNR of texels, dB": "texel_psnr", "1 - SSIM": "one_minus_ssim"}
+        scores = {title: tuple(getattr(report, name) for report in reports) for title, name in names.items()}
+        pictures["original"] = inputs[0].lightmap * meshes[0].mask[..., None]
+    facts = _facts([output.folder / MODEL_FILE for output in outputs], [output.model for output in outputs])
+    apart = psnr(*light, meshes[0].mask)
+    return Comparison(**facts, apart=apart, scores=scores, pictures=pictures, where="The lightmap")
+
+
+def _size(size: tuple[int, int]) -> str:
+    return f"{size[0]}x{size[1]}"
+
+
+def _number(value: float | None) -> str:
+    return "–" if value is None or value != value else f"{value:.4g}"
+
+
+def _text(value: Any) -> str:
+    return "–" if value is None else str(value)
