@@ -12,8 +12,6 @@ Only manners are shared here; each system's mathematics stays in its own rooms:
     exporter.py    files for engines               `export`
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import os

@@ -1,7 +1,5 @@
 """Operations on masked images that the metrics, the baselines and the systems share."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 

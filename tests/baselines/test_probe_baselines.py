@@ -1,7 +1,5 @@
 """Baselines of probe compression: known answers, sizes, hard cases, and the search at a size."""
 
-from __future__ import annotations
-
 import functools
 
 import numpy as np

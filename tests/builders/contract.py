@@ -1,7 +1,5 @@
 """The four systems as the contract's tests take them: a file each, what it decodes to, and a fit of a moment."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Small smoke for tests: a leaning plume, alone and as the frames of a scene; cameras before it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

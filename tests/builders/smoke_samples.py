@@ -1,7 +1,5 @@
 """Small pools and networks for tests: a rising plume at several densities, from several sides; random weights."""
 
-from __future__ import annotations
-
 import functools
 import os
 from dataclasses import replace

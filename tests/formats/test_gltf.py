@@ -1,7 +1,5 @@
 """glTF files read: every stated behaviour of `wlm.formats.gltf`."""
 
-from __future__ import annotations
-
 import base64
 import copy
 import json

@@ -1,7 +1,5 @@
 """Copies of glTF files with one more UV set: what changes, what stays, and the format's rules."""
 
-from __future__ import annotations
-
 import copy
 import io
 import json

@@ -1,7 +1,5 @@
 """KTX2 files: the header's and descriptor's numbers, and what is refused."""
 
-from __future__ import annotations
-
 import os
 import struct
 

@@ -1,7 +1,5 @@
 """OBJ files read: every stated behaviour of `wlm.formats.obj`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Reading and checking sets: every stated behaviour of `wlm.lightmap.data`."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

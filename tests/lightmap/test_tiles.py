@@ -1,7 +1,5 @@
 """Cutting into tiles, putting back together, and what each tile needs."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

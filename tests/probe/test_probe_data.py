@@ -1,7 +1,5 @@
 """What comes in: every stated behaviour of `wlm.probe.data`."""
 
-from __future__ import annotations
-
 import io
 import json
 import zipfile

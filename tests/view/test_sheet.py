@@ -1,7 +1,5 @@
 """The contact sheet: which times it shows, what its pictures hold, and what it refuses."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from PIL import Image

@@ -9,8 +9,6 @@ texels takes a few tenths of a second more, and on 18 lightmaps of 512² at a sh
 reading, 1.5 dB above Lanczos and 2.0 dB above a box filter; so it is `downsampling` unless told otherwise.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 import time

@@ -10,8 +10,6 @@ All raise a `WlmError` where shapes do not fit, a valid texel is NaN or infinite
 package is missing.
 """
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

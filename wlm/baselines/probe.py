@@ -12,8 +12,6 @@ floats always. All raise a `WlmError` where there are no probes, or NaN or infin
 wrong shapes or a setting out of range.
 """
 
-from __future__ import annotations
-
 import bisect
 import functools
 from collections.abc import Callable, Sequence

@@ -13,8 +13,6 @@ box's longest side, scale), float16 [V, K + 1, D] means and bases in units of th
 which those are follows from the positions.
 """
 
-from __future__ import annotations
-
 import struct
 
 import numpy as np

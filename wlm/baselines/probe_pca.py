@@ -19,8 +19,6 @@ The positions are the engine's own, so parts that follow from them cost no index
 largest magnitude among them first: no half float overflows, and values near 1e-6 keep their digits.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass

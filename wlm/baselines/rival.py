@@ -1,7 +1,5 @@
 """The shape that every rival has, whichever system it is compared with."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """What the network's lightmaps are compared with: a flip book that was baked from one side."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 

@@ -3,8 +3,6 @@
 `TABLES` is in the order of the columns, and says in which table a figure stands where one would be too wide.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 __all__ = ["FIGURES", "TABLES", "Figure"]

@@ -5,8 +5,6 @@ a path tracer has in the time of a frame. Mitsuba traces on the CPU, or on a GPU
 for computing alone often lack; the denoiser runs on the CPU.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import math
 import subprocess

@@ -1,7 +1,5 @@
 """Rows as Markdown: tables, and pages made of result files."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What every benchmark does: report progress, fit and store models, time calls in turns, and make rows."""
 
-from __future__ import annotations
-
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence

@@ -22,8 +22,6 @@ makes; on CUDA the lattice replays graphs by itself where it does many steps, an
 graphs, so that gaps between launches do not count.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 from wlm.bench.plot import Panel

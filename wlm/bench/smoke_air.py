@@ -1,7 +1,5 @@
 """Air and smoke in motion: the lattice beside a copy, 16 bits, and the schemes that carry smoke."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from functools import partial

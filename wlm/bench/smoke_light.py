@@ -1,7 +1,5 @@
 """Images of smoke: guiding maps, six-way lightmaps and their weights, each against a finer march, and a frame."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import numpy as np

@@ -18,8 +18,6 @@ and most over the images. The methods, each a table of its own:
   the lightmaps along the motion, in levels of 255, also over that of the reference, in which nothing flickers.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path

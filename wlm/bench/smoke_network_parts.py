@@ -1,7 +1,5 @@
 """The stages of a frame with a network, the time of each profile, and other densities and motion."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from functools import partial
 

@@ -1,7 +1,5 @@
 """Rivals of the network: a flip book seen from aside, a path tracer."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from functools import partial
 

@@ -1,7 +1,5 @@
 """What the parts of the smoke benchmark share: sizes, and the bandwidth of a copy."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

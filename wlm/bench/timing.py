@@ -5,8 +5,6 @@ caches. On CUDA that includes the launch wherever launching takes longer than th
 call in a graph to leave it out.
 """
 
-from __future__ import annotations
-
 import contextlib
 import math
 import time

@@ -23,8 +23,6 @@ a file missing or damaged             error that names the file, and the field
 ====================================  ================================================================
 """
 
-from __future__ import annotations
-
 import base64
 import binascii
 import json

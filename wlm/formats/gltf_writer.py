@@ -1,7 +1,5 @@
 """Copies of a glTF file, as `.glb`, in which some primitives have other vertices and one more UV set."""
 
-from __future__ import annotations
-
 import copy
 import hashlib
 import json

@@ -3,8 +3,6 @@
 Blocks follow each other row by row. All runs on the CPU with one thread. The packages are imported when they are used.
 """
 
-from __future__ import annotations
-
 import functools
 import importlib
 from types import ModuleType

@@ -4,8 +4,6 @@ Layout: the KTX file format specification 2.0; the data format descriptor: Khron
 basic descriptor block.
 """
 
-from __future__ import annotations
-
 import math
 import os
 import struct

@@ -28,8 +28,6 @@ malformed `set.json`
 Layout of a set and its evaluation: neural-dynamic-gi, section 10.1.
 """
 
-from __future__ import annotations
-
 import hashlib
 import math
 import os

@@ -3,8 +3,6 @@
 No pixels are read here. The layout follows the scene configuration of neural-dynamic-gi, section 10.1.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """Pointwise error over the valid texels of linear HDR images, accumulated in float64."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

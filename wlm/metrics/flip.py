@@ -6,8 +6,6 @@ exposures, each tone mapped. The computation is NVIDIA's `flip_evaluator`; what 
 safe on lightmaps.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """SSIM over valid texels, with the range of the reference as the scale."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

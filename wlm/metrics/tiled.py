@@ -11,8 +11,6 @@ and on the display and not on a range, is computed over the whole lightmap and i
 the paper's LPIPS, a network trained on display-referred photographs, gives way to FLIP.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -29,8 +29,6 @@ right-handed with y up, Unity left-handed with y up, Unreal left-handed with z u
 comes in goes out. Windowing against ringing and exposure, where a bake applied them, stay in the numbers.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -31,8 +31,6 @@ a file missing or damaged             error that names the file, and the field
 What a probe holds: gaussian-probe-compression, eq. 1 (there 3, 12 or 27 numbers; here any).
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

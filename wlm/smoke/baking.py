@@ -4,8 +4,6 @@ The paper's references are one bounce by path tracing, 512 samples a pixel (sect
 is computed here as such. The camera must be orthographic, as the lightmaps are.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -7,8 +7,6 @@ as (1 - T^2) / 2 and -T ln T. Its errors are those of its steps: along the rays,
 lattice's nodes, where light is interpolated, and of the steps to the lights. Each is a setting of `March`.
 """
 
-from __future__ import annotations
-
 import torch
 
 from wlm.fluid.volume import DensityVolume

@@ -1,7 +1,5 @@
 """A trained network's file: its settings, its weights as half floats, and a summary of the training."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 from pathlib import Path

@@ -4,8 +4,6 @@ A folder of frames holds `scene.json` and `frame_0001.npz`, `frame_0002.npz` and
 `wlm.smoke.load` reads it. `simulate` writes it, and can be stopped and resumed.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import re

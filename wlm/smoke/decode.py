@@ -7,8 +7,6 @@ channels, so that 1 x 1 convolutions are plain matrix products. Between these ru
 `wlm_kernels.smoke.naf_block`, and after the heads those of `wlm_kernels.smoke.planes`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

@@ -10,8 +10,6 @@ no samples, or planes of another size  error
 =====================================  =====================================================
 """
 
-from __future__ import annotations
-
 import copy
 import math
 import os

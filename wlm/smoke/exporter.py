@@ -5,8 +5,6 @@ textures without sRGB decoding. Light is premultiplied: it is added to the backg
 `wlm.smoke.camera.LAYOUTS` lists the channels.
 """
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Sequence

@@ -17,8 +17,6 @@ resumed after the end                            error
 ===============================================  ========================================================
 """
 
-from __future__ import annotations
-
 import csv
 import hashlib
 import io

@@ -1,7 +1,5 @@
 """Guiding maps: a rough image of smoke, which a network turns into six-way lightmaps (section 4.2)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

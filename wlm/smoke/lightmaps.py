@@ -5,8 +5,6 @@ direction: with g = 0 at most 1/2 from the front and 1 from a side. All is linea
 flat billboard has no other view.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

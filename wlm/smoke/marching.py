@@ -1,7 +1,5 @@
 """Marches over a volume, on its device and in torch's memory."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

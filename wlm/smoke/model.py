@@ -13,8 +13,6 @@ Two facts are built in rather than learned:
   guide: its large steps can miss a wisp in one pixel and hit it in the next.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, Self

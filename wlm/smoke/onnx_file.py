@@ -1,7 +1,5 @@
 """A trained network as ONNX, for engines."""
 
-from __future__ import annotations
-
 import logging
 import os
 import warnings

@@ -1,7 +1,5 @@
 """Guiding maps and lightmaps as the network reads and learns them: planes in sRGB and of about the same range."""
 
-from __future__ import annotations
-
 import torch
 
 from wlm.fluid.volume import DensityVolume

@@ -1,7 +1,5 @@
 """Six-way lightmaps of smoke by a trained network: guiding map, network and decoded planes in one call."""
 
-from __future__ import annotations
-
 import functools
 import os
 from dataclasses import replace

@@ -3,8 +3,6 @@
 All in linear light. `SixWay.shade` puts them together.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Frames to be drawn: lightmaps, baked from smoke or read from files, with a scene's obstacles and colours."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """The simulation of a scene: its solver, and a folder with a volume for each of its frames."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """A contact sheet: what went in, what came out, and the error between them, over time."""
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Sequence

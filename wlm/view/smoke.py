@@ -1,7 +1,5 @@
 """Pictures of smoke: shaded frames with a scene's obstacles, guiding maps, sequences and contact sheets."""
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Iterable, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Contact sheets of training samples: guiding maps, lightmaps and motion, one column per sample."""
 
-from __future__ import annotations
-
 import os
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Probes as little spheres at their places, each shaded by its own light: what went in, what came out, the error."""
 
-from __future__ import annotations
-
 import functools
 import math
 import os

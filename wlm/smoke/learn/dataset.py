@@ -17,8 +17,6 @@ a frame with almost no smoke             a small random share of these is kept
 =======================================  =============================================================
 """
 
-from __future__ import annotations
-
 import os
 import time
 from collections.abc import Callable, Iterator, Sequence

@@ -7,8 +7,6 @@
   smoke does): L1 over visible smoke that the warp reads inside the image.
 """
 
-from __future__ import annotations
-
 import torch
 import torch.nn.functional as F
 from torch import nn

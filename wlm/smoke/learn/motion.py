@@ -3,8 +3,6 @@
 The paper's temporal loss estimates this optical flow from images (neural-six-way-lightmaps, eq. 9).
 """
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -13,8 +13,6 @@ burst    one to three spheres, hot for a moment, that glow      0 to 2
 =======  =====================================================  ====================
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

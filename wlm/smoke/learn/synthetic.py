@@ -1,7 +1,5 @@
 """Smoke made of noise, where none from a simulation or a file is at hand: for demos and measurements."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from wlm.fluid.volume import DensityVolume, from_array
