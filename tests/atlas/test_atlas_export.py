@@ -11,6 +11,7 @@ import pytest
 import torch
 from builders.atlas_meshes import charts, sheet
 from builders.atlas_models import KINDS, random_model
+from builders.textures import open_dds, open_ktx2
 
 import wlm
 from wlm.atlas import colour, exporter
@@ -19,10 +20,8 @@ from wlm.atlas.decode import Decoder
 from wlm.atlas.exact import decode64
 from wlm.atlas.shader import atlas_glsl
 from wlm.errors import WlmError
-from wlm.formats.dds import read_dds
 from wlm.formats.exr import read_exr
 from wlm.formats.gltf import read_gltf
-from wlm.formats.ktx2 import read_ktx2
 
 ALWAYS = {"atlas.wlm", "mesh.glb", "colour.exr", "colour.ktx2", "atlas.glsl", "report.json"}
 LUT = {"lut.exr", "lut.ktx2", "lut.dds"}
@@ -54,11 +53,11 @@ def test_what_is_written(kind, stored, tmp_path):
 def test_the_table_is_exact_in_every_format(kind, tmp_path):
     model, _, _ = written(tmp_path, kind)
     height, width = model.lut.shape[:2]
-    ktx2, dds = read_ktx2(tmp_path / "lut.ktx2"), read_dds(tmp_path / "lut.dds")
+    ktx2, dds = open_ktx2(tmp_path / "lut.ktx2"), open_dds(tmp_path / "lut.dds")
     exr, _ = read_exr(tmp_path / "lut.exr")
     assert (ktx2.fmt, dds.fmt) == (("R16G16_UINT",) * 2 if kind == "tiles" else ("R16G16_UNORM",) * 2)
     assert (ktx2.width, ktx2.height, dds.width, dds.height) == (width, height) * 2
-    for data in (ktx2.data, dds.blocks):
+    for data in (ktx2.data, dds.data):
         np.testing.assert_array_equal(np.frombuffer(data, "<u2").reshape(model.lut.shape), model.lut)
     scale = 1 if kind == "tiles" else 65535
     np.testing.assert_array_equal(np.rint(exr[..., :2].astype(np.float64) * scale), model.lut)
@@ -69,20 +68,20 @@ def test_the_table_is_exact_in_every_format(kind, tmp_path):
 def test_the_colours_are_exact_in_every_format(stored, tmp_path):
     model, _, _ = written(tmp_path, "plain", stored)
     np.testing.assert_array_equal(read_exr(tmp_path / "colour.exr")[0], model.texels.astype(np.float32))
-    ktx2 = read_ktx2(tmp_path / "colour.ktx2")
-    dds = None if stored == "astc" else read_dds(tmp_path / "colour.dds")
+    ktx2 = open_ktx2(tmp_path / "colour.ktx2")
+    dds = None if stored == "astc" else open_dds(tmp_path / "colour.dds")
     assert (ktx2.width, ktx2.height) == (23, 18)
     if stored == "half":
         assert (ktx2.fmt, dds.fmt) == ("R16G16B16_SFLOAT", "R16G16B16A16_FLOAT")
         np.testing.assert_array_equal(np.frombuffer(ktx2.data, "<f2").reshape(18, 23, 3), model.texels)
-        whole = np.frombuffer(dds.blocks, "<f2").reshape(18, 23, 4)
+        whole = np.frombuffer(dds.data, "<f2").reshape(18, 23, 4)
         np.testing.assert_array_equal(whole[..., :3], model.texels)
         assert (whole[..., 3] == 1).all()
         return
     assert ktx2.fmt == {"bc6h": "BC6H_UFLOAT_BLOCK", "astc": "ASTC_4x4_SFLOAT_BLOCK"}[stored]
     blocks = np.frombuffer(ktx2.data, np.uint8).reshape(-1, 16)
     np.testing.assert_array_equal(colour.decode(blocks, 18, 23, stored), model.texels.astype(np.float32))
-    assert dds is None or (dds.fmt == "BC6H_UF16" and dds.blocks == ktx2.data)
+    assert dds is None or (dds.fmt == "BC6H_UF16" and dds.data == ktx2.data)
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -3,11 +3,11 @@ import struct
 
 import numpy as np
 import pytest
+from builders.textures import Texture, open_dds
 from PIL import Image
 
-from wlm.errors import WlmError
 from wlm.formats.bc7 import decode_image
-from wlm.formats.dds import DXGI_FORMATS, DdsTexture, read_dds, write_dds
+from wlm.formats.dds import DXGI_FORMATS, write_dds
 
 # Byte offsets, from Microsoft's description of DDS_HEADER and DDS_HEADER_DXT10.
 FLAGS, HEIGHT, WIDTH, PITCH, DEPTH, MIPS = 8, 12, 16, 20, 24, 28
@@ -58,7 +58,7 @@ def test_a_volume_of_one_slice(tmp_path):
     write_dds(path, _blocks(2), width=8, height=4, volume=True)
     data = path.read_bytes()
     assert [_field(data, at) for at in (FLAGS, DEPTH, DIMENSION)] == [0x881007, 1, 4]
-    assert read_dds(path) == DdsTexture(8, 4, 1, "BC7_UNORM", True, _blocks(2))
+    assert data[148:] == _blocks(2)
 
 
 def test_two_bytes_a_texel(tmp_path):
@@ -71,72 +71,20 @@ def test_two_bytes_a_texel(tmp_path):
     assert data[148:] == texels
     with pytest.raises(ValueError, match="expected 32 bytes, got 30"):
         write_dds(path, texels, width=4, height=4, fmt="R8G8_UNORM")
-    path.write_bytes(data[:-1])
-    with pytest.raises(WlmError, match="expected 30 bytes of blocks, found 29"):
-        read_dds(path)
 
 
 @pytest.mark.parametrize("fmt", DXGI_FORMATS)
 @pytest.mark.parametrize("depth", [1, 3])
-def test_what_was_written_is_read(tmp_path, fmt, depth):
+def test_every_format(tmp_path, fmt, depth):
     path = tmp_path / "a.dds"
     texel = {"R16G16B16A16_FLOAT": 8, "R16G16_FLOAT": 4, "R16G16_UNORM": 4, "R16G16_UINT": 4, "R8G8_UNORM": 2}.get(fmt)
     blocks = _blocks(10 * depth)[: (5 * 4 * texel if texel else 2 * 16) * depth]
     write_dds(path, blocks, width=5, height=4, depth=depth, fmt=fmt)
-    assert read_dds(path) == DdsTexture(5, 4, depth, fmt, depth > 1, blocks)
+    data = path.read_bytes()
+    volume = depth > 1
+    assert open_dds(path) == Texture(5, 4, fmt, blocks)
+    assert [_field(data, at) for at in (DEPTH, DIMENSION)] == ([depth, 4] if volume else [0, 3])
     assert os.listdir(tmp_path) == ["a.dds"]
-
-
-@pytest.mark.parametrize(
-    ("at", "value", "words"),
-    [
-        (4, 125, "header size: expected 124, found 125"),
-        (FLAGS, 0x1003, "flags: expected at least 0x1007, found 0x1003"),
-        (76, 24, "pixel format size: expected 32, found 24"),
-        (PIXEL_FLAGS, 0x40, "pixel format: expected DX10"),
-        (FOUR_CC, 0x31545844, "pixel format: expected DX10, found b'DXT1'"),
-        (FORMAT, 71, "DXGI format: expected one of"),
-        (FORMAT, 49, "expected 64 bytes of blocks, found 32"),
-        (DIMENSION, 2, "dimension: expected 3 (2D) or 4 (volume), found 2"),
-        (DIMENSION, 4, "volume flag: expected that of the dimension"),
-        (CAPS2, 0x200000, "volume flag: expected that of the dimension"),
-        (WIDTH, 0, "width: expected 1 to 16384, found 0"),
-        (HEIGHT, 0xFFFFFFFF, "height: expected 1 to 16384"),
-        (DEPTH, 2, "depth: expected that of the dimension, found 2"),
-        (MIPS, 4, "mip levels: expected one, found 4"),
-        (MISC, 4, "DX10 flags: expected none (no cube), found 0x4"),
-        (ARRAY, 6, "array size: expected 1, found 6"),
-        (ALPHA, 5, "alpha mode: expected 0 to 4, found 5"),
-        (WIDTH, 9, "expected 48 bytes of blocks, found 32"),
-    ],
-)
-def test_a_wrong_field_is_named(tmp_path, at, value, words):
-    path = tmp_path / "a.dds"
-    write_dds(path, _blocks(2), width=8, height=4)
-    data = bytearray(path.read_bytes())
-    struct.pack_into("<I", data, at, value)
-    path.write_bytes(data)
-    with pytest.raises(WlmError) as caught:
-        read_dds(path)
-    assert str(caught.value).startswith(f"{path}: {words}")
-
-
-def test_other_files_and_other_lengths_are_refused(tmp_path):
-    path = tmp_path / "a.dds"
-    with pytest.raises(WlmError, match="No such file"):
-        read_dds(path)
-    path.write_bytes(b"\x89PNG")
-    with pytest.raises(WlmError, match="expected a DDS file, found other content"):
-        read_dds(path)
-    write_dds(path, _blocks(2), width=8, height=4)
-    whole = path.read_bytes()
-    for length in range(len(whole)):
-        path.write_bytes(whole[:length])
-        with pytest.raises(WlmError):
-            read_dds(path)
-    path.write_bytes(whole + b"\0")
-    with pytest.raises(WlmError, match="expected 32 bytes of blocks, found 33"):
-        read_dds(path)
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""KTX2 files: the header's and descriptor's numbers, and what is refused."""
+"""KTX2 files: the header's and descriptor's numbers, and what can't be written."""
 
 import os
 import struct
@@ -6,8 +6,7 @@ import struct
 import numpy as np
 import pytest
 
-from wlm.errors import WlmError
-from wlm.formats.ktx2 import VK_FORMATS, Ktx2Texture, read_ktx2, write_ktx2
+from wlm.formats.ktx2 import VK_FORMATS, write_ktx2
 
 # Byte offsets, from the KTX specification's section on the file's structure.
 FORMAT, TYPE_SIZE, WIDTH, HEIGHT, DEPTH, LAYERS, FACES, LEVELS, SCHEME = range(12, 48, 4)
@@ -32,7 +31,7 @@ def _word(data: bytes, at: int) -> int:
 
 
 @pytest.mark.parametrize("fmt", VK_FORMATS)
-def test_the_header_and_the_way_back(tmp_path, fmt):
+def test_the_header(tmp_path, fmt):
     path = tmp_path / "a.ktx2"
     assert write_ktx2(path, _data(fmt), 5, 3, fmt) == path.stat().st_size
     data = path.read_bytes()
@@ -48,7 +47,6 @@ def test_the_header_and_the_way_back(tmp_path, fmt):
     assert 0 <= start - _word(data, PAIRS) - _word(data, PAIRS_BYTES) < 16
     pairs = data[_word(data, PAIRS) :][: _word(data, PAIRS_BYTES)]
     assert pairs == b"\x12\0\0\0KTXorientation\0rd\0\0\0\x0e\0\0\0KTXwriter\0wlm\0\0\0"
-    assert read_ktx2(path) == Ktx2Texture(5, 3, fmt, _data(fmt))
     assert os.listdir(tmp_path) == ["a.ktx2"]
 
 
@@ -75,49 +73,6 @@ def test_the_data_format_descriptor(tmp_path, fmt, model, sides, plane, samples)
     assert words[:7] == (size, 0, 2 | block << 16, model | 1 << 8 | 1 << 16, sides, plane, 0) and size == 4 + block
     for i, (offset, bits, channel, lower, upper) in enumerate(samples):
         assert words[7 + 4 * i :][:4] == (offset | bits << 16 | channel << 24, 0, lower, upper)
-
-
-@pytest.mark.parametrize(
-    ("at", "value", "words"),
-    [
-        (FORMAT, 43, "vkFormat: expected one of [77, 81, 83, 90, 97, 143, 1000066000], found 43"),
-        (FORMAT, 83, "the data format descriptor: expected that of R16G16_SFLOAT, found another"),
-        (WIDTH, 0, "pixelWidth: expected 1 to 16384, found 0"),
-        (WIDTH, 6, "byteLength of level 0: expected 72, found 60"),
-        (HEIGHT, 2**31, "pixelHeight: expected 1 to 16384"),
-        (DEPTH, 1, "pixelDepth: expected 0 (no volume), found 1"),
-        (LAYERS, 1, "layerCount: expected 0 (no array), found 1"),
-        (FACES, 6, "faceCount: expected 1 (no cube), found 6"),
-        (LEVELS, 0, "levelCount: expected 1, found 0"),
-        (SCHEME, 2, "supercompressionScheme: expected 0 (none), found 2"),
-        (LEVEL, 500, "the file is cut short: expected 560 bytes"),
-        (LEVEL_BYTES, 64, "byteLength of level 0: expected 60, found 64"),
-    ],
-)
-def test_a_wrong_field_is_named(tmp_path, at, value, words):
-    path = tmp_path / "a.ktx2"
-    write_ktx2(path, _data("R16G16_UNORM"), 5, 3, "R16G16_UNORM")
-    data = bytearray(path.read_bytes())
-    struct.pack_into("<I", data, at, value)
-    path.write_bytes(data)
-    with pytest.raises(WlmError) as caught:
-        read_ktx2(path)
-    assert str(caught.value).startswith(f"{path}: {words}")
-
-
-def test_other_files_and_other_lengths_are_refused(tmp_path):
-    path = tmp_path / "a.ktx2"
-    with pytest.raises(WlmError, match="No such file"):
-        read_ktx2(path)
-    path.write_bytes(b"\xabKTX 11\xbb\r\n\x1a\n")
-    with pytest.raises(WlmError, match="expected a KTX2 file, found other content"):
-        read_ktx2(path)
-    write_ktx2(path, _data("R16G16_UNORM"), 5, 3, "R16G16_UNORM")
-    whole = path.read_bytes()
-    for length in range(len(whole)):
-        path.write_bytes(whole[:length])
-        with pytest.raises(WlmError):
-            read_ktx2(path)
 
 
 @pytest.mark.parametrize("change", [{"fmt": "R8_UNORM"}, {"width": 0}, {"height": 16385}, {"data": b"\0" * 61}])

@@ -6,13 +6,10 @@ A volume's slices follow each other, each a 2D grid of blocks (or of texels, row
 
 import os
 import struct
-from dataclasses import dataclass
-from pathlib import Path
 
-from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_write
 
-__all__ = ["DXGI_FORMATS", "DdsTexture", "read_dds", "write_dds"]
+__all__ = ["DXGI_FORMATS", "write_dds"]
 
 DXGI_FORMATS = {
     "R16G16B16A16_FLOAT": 10,
@@ -54,28 +51,6 @@ _FOUR_CC = 0x4
 _CAPS_COMPLEX, _CAPS_TEXTURE = 0x8, 0x1000
 _CAPS2_VOLUME = 0x200000
 _DIMENSION_2D, _DIMENSION_3D = 3, 4
-_ALPHA_MODES = range(5)
-
-
-@dataclass(frozen=True)
-class DdsTexture:
-    """What a DDS file holds.
-
-    Attributes:
-        width: Texels.
-        height: Texels.
-        depth: Slices; 1 for a 2D texture.
-        fmt: A key of `DXGI_FORMATS`.
-        volume: Whether it is a volume, which may have just one slice.
-        blocks: The payload: slice by slice, rows of blocks or of texels.
-    """
-
-    width: int
-    height: int
-    depth: int
-    fmt: str
-    volume: bool
-    blocks: bytes
 
 
 def write_dds(
@@ -139,60 +114,6 @@ def write_dds(
         *(0, 1, 0),
     )
     atomic_write(path, [header, blocks])
-
-
-def read_dds(path: str | os.PathLike[str]) -> DdsTexture:
-    """Reads a DDS file of the kind that `write_dds` writes.
-
-    Args:
-        path: The file.
-
-    Returns:
-        The texture.
-
-    Raises:
-        WlmError: The file is missing, not a DDS with a DX10 header, of another format, with mip levels, an
-            array or a cube, or not of the length that its header says.
-    """
-    try:
-        data = Path(path).read_bytes()
-    except OSError as error:
-        raise WlmError(f"{path}: cannot read the DDS file: {error.strerror or error}") from error
-    if data[:4] != _MAGIC:
-        raise WlmError(f"{path}: expected a DDS file, found other content")
-    if len(data) < _HEADER.size:
-        raise WlmError(f"{path}: expected a DX10 header of {_HEADER.size} bytes, found {len(data)}")
-    fields = _HEADER.unpack_from(data)
-    size, flags, height, width, _, depth, mips, pixel_size, pixel_flags, code = fields[1:11]
-    caps2 = fields[17]
-    number, dimension, misc, array_size, alpha_mode = fields[20:]
-    volume = dimension == _DIMENSION_3D
-    names = {value: name for name, value in DXGI_FORMATS.items()}
-    checks = (
-        ("header size", size, size == _HEADER_SIZE, _HEADER_SIZE),
-        ("flags", hex(flags), flags & _REQUIRED == _REQUIRED, f"at least {_REQUIRED:#x}"),
-        ("pixel format size", pixel_size, pixel_size == _PIXEL_FORMAT_SIZE, _PIXEL_FORMAT_SIZE),
-        ("pixel format", code, bool(pixel_flags & _FOUR_CC) and code == b"DX10", "DX10"),
-        ("DXGI format", number, number in names, f"one of {sorted(names)}"),
-        ("dimension", dimension, dimension in (_DIMENSION_2D, _DIMENSION_3D), "3 (2D) or 4 (volume)"),
-        ("volume flag", hex(caps2), bool(caps2 & _CAPS2_VOLUME) == volume, "that of the dimension"),
-        ("width", width, 1 <= width <= _MAX_SIDE, f"1 to {_MAX_SIDE}"),
-        ("height", height, 1 <= height <= _MAX_SIDE, f"1 to {_MAX_SIDE}"),
-        ("depth", depth, 1 <= depth <= _MAX_DEPTH if volume else depth <= 1, "that of the dimension"),
-        ("mip levels", mips, mips <= 1, "one"),
-        ("DX10 flags", hex(misc), misc == 0, "none (no cube)"),
-        ("array size", array_size, array_size == 1, 1),
-        ("alpha mode", alpha_mode, alpha_mode in _ALPHA_MODES, "0 to 4"),
-    )
-    for field, found, fits, expected in checks:
-        if not fits:
-            raise WlmError(f"{path}: {field}: expected {expected}, found {found}")
-    slices = depth if volume else 1
-    blocks = data[_HEADER.size :]
-    expected_bytes = slices * _slice_bytes(names[number], width, height)
-    if len(blocks) != expected_bytes:
-        raise WlmError(f"{path}: expected {expected_bytes} bytes of blocks, found {len(blocks)}")
-    return DdsTexture(width, height, slices, names[number], volume, blocks)
 
 
 def _slice_bytes(fmt: str, width: int, height: int) -> int:

@@ -7,13 +7,10 @@ basic descriptor block.
 import math
 import os
 import struct
-from dataclasses import dataclass
-from pathlib import Path
 
-from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_write
 
-__all__ = ["VK_FORMATS", "Ktx2Texture", "read_ktx2", "write_ktx2"]
+__all__ = ["VK_FORMATS", "write_ktx2"]
 
 VK_FORMATS = {
     "R16G16_UNORM": 77,
@@ -45,23 +42,6 @@ _RGBSDA, _BC6H, _ASTC = 1, 133, 162  # colour models
 _CHANNEL_IDS = (0, 1, 2, 15)  # red, green, blue, alpha
 _VERSION, _BT709, _LINEAR = 2, 1, 1
 _FLOAT, _SIGNED = 0x80, 0x40  # a sample's qualifiers
-
-
-@dataclass(frozen=True)
-class Ktx2Texture:
-    """What a KTX2 file holds.
-
-    Attributes:
-        width: Texels.
-        height: Texels.
-        fmt: A key of `VK_FORMATS`.
-        data: Rows of texels or of blocks from the top, without padding.
-    """
-
-    width: int
-    height: int
-    fmt: str
-    data: bytes
 
 
 def write_ktx2(path: str | os.PathLike[str], data: bytes, width: int, height: int, fmt: str) -> int:
@@ -109,55 +89,6 @@ def write_ktx2(path: str | os.PathLike[str], data: bytes, width: int, height: in
         *(start, len(data), len(data)),
     )
     return atomic_write(path, [header, descriptor, pairs, bytes(start - end), data])
-
-
-def read_ktx2(path: str | os.PathLike[str]) -> Ktx2Texture:
-    """Reads a KTX2 file of the kind that `write_ktx2` writes.
-
-    Args:
-        path: The file.
-
-    Returns:
-        The texture.
-
-    Raises:
-        WlmError: The file is missing, not a KTX2, of another format, a volume, an array, a cube, with several mip
-            levels or supercompressed, or has another descriptor or length than its format and size say.
-    """
-    try:
-        content = Path(path).read_bytes()
-    except OSError as error:
-        raise WlmError(f"{path}: cannot read the KTX2 file: {error.strerror or error}") from error
-    if content[: len(_IDENTIFIER)] != _IDENTIFIER:
-        raise WlmError(f"{path}: expected a KTX2 file, found other content")
-    if len(content) < _HEADER.size:
-        raise WlmError(f"{path}: the file is cut short: expected {_HEADER.size} bytes, found {len(content)}")
-    fields = _HEADER.unpack_from(content)
-    number, _, width, height, depth, layers, faces, levels, scheme, describes, describes_bytes = fields[1:12]
-    start, length = fields[16:18]
-    names = {value: name for name, value in VK_FORMATS.items()}
-    checks = (
-        ("vkFormat", number, number in names, f"one of {sorted(names)}"),
-        ("pixelWidth", width, 1 <= width <= _MAX_SIDE, f"1 to {_MAX_SIDE}"),
-        ("pixelHeight", height, 1 <= height <= _MAX_SIDE, f"1 to {_MAX_SIDE}"),
-        ("pixelDepth", depth, depth == 0, "0 (no volume)"),
-        ("layerCount", layers, layers == 0, "0 (no array)"),
-        ("faceCount", faces, faces == 1, "1 (no cube)"),
-        ("levelCount", levels, levels == 1, 1),
-        ("supercompressionScheme", scheme, scheme == 0, "0 (none)"),
-    )
-    for field, found, fits, expected in checks:
-        if not fits:
-            raise WlmError(f"{path}: {field}: expected {expected}, found {found}")
-    fmt = names[number]
-    if content[describes : describes + describes_bytes] != _descriptor(fmt):
-        raise WlmError(f"{path}: the data format descriptor: expected that of {fmt}, found another")
-    size = _size(fmt, width, height)
-    if length != size:
-        raise WlmError(f"{path}: byteLength of level 0: expected {size}, found {length}")
-    if start + length > len(content):
-        raise WlmError(f"{path}: the file is cut short: expected {start + length} bytes, found {len(content)}")
-    return Ktx2Texture(width, height, fmt, content[start : start + length])
 
 
 def _texel_bytes(fmt: str) -> int:
