@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Literal
 
 import pytest
+from builders.checks import error_of
 from pydantic import BaseModel, Field
 
 import wlm.config
@@ -64,10 +65,8 @@ def test_settings_are_read_and_typed(tmp_path):
     ],
 )
 def test_a_wrong_file_is_one_line(tmp_path, text, words):
-    with pytest.raises(WlmError) as caught:
-        _load(tmp_path, text)
-    line = str(caught.value)
-    assert "\n" not in line and len(line) < 400
+    line = error_of(_load, tmp_path, text)
+    assert len(line) < 400
     assert line.startswith(f"{tmp_path / 's.yaml'}: ")
     for word in words:
         assert word in line

@@ -1,31 +1,18 @@
 """The file: a model comes back bit for bit, its size is arithmetic, and contradictions in it are one line."""
 
 import dataclasses
-from collections.abc import Callable
 
 import numpy as np
 import pytest
 from builders.atlas_meshes import charts, sheet, triangle
 from builders.atlas_models import KINDS, random_model
+from builders.checks import assert_same, put
 
 import wlm
 from wlm.atlas import codec, colour
-from wlm.atlas.model import MOST_SIZE, AtlasModel, pack_entries
+from wlm.atlas.model import MOST_SIZE, pack_entries
 from wlm.errors import WlmError
 from wlm.formats.artifact import read_artifact, write_artifact
-
-
-def assert_same(a: AtlasModel, b: AtlasModel) -> None:
-    """All but the times, which aren't saved."""
-    for field in dataclasses.fields(AtlasModel):
-        x, y = getattr(a, field.name), getattr(b, field.name)
-        if isinstance(x, np.ndarray):
-            assert x.shape == y.shape and x.dtype == y.dtype, field.name
-            np.testing.assert_array_equal(x, y, err_msg=field.name)
-        elif field.name == "report":
-            assert x == {key: value for key, value in y.items() if key != "seconds"}
-        else:
-            assert x == y, field.name
 
 
 @pytest.mark.parametrize("stored", ["half", "bc6h", "astc"])
@@ -94,33 +81,24 @@ def _refused(tmp_path, kind: str, words: str, settings=None, tensors=None, store
         assert str(error.value).startswith(f"{path}: ") and "\n" not in str(error.value)
 
 
-def _put(index, value) -> Callable[[np.ndarray], np.ndarray]:
-    def change(array: np.ndarray) -> np.ndarray:
-        array = array.copy()
-        array[index] = value
-        return array
-
-    return change
-
-
 @pytest.mark.parametrize(
     ("kind", "part", "change", "words"),
     [
         ("tiles", "colour", lambda v: v[:-1], "colour is float16 .17, 23, 3., expected float16 .18, 23, 3."),
-        ("tiles", "colour", _put((3, 4, 1), np.inf), "colour: expected finite numbers"),
-        ("tiles", "colour", _put((3, 4, 1), -1.0), "colour: a texel is negative"),
+        ("tiles", "colour", put((3, 4, 1), np.inf), "colour: expected finite numbers"),
+        ("tiles", "colour", put((3, 4, 1), -1.0), "colour: a texel is negative"),
         ("tiles", "colour", None, "colour is missing"),
         ("tiles", "lut", lambda v: np.ascontiguousarray(v[:, :-1]), "lut is uint16"),
-        ("tiles", "lut", _put((0, 0), pack_entries(np.array([20, 0]), np.array([4, 1]))), "beyond the colour texture"),
-        ("tiles", "lut", _put((0, 0), pack_entries(np.array([0, 17]), np.array([1, 2]))), "beyond the colour texture"),
+        ("tiles", "lut", put((0, 0), pack_entries(np.array([20, 0]), np.array([4, 1]))), "beyond the colour texture"),
+        ("tiles", "lut", put((0, 0), pack_entries(np.array([0, 17]), np.array([1, 2]))), "beyond the colour texture"),
         ("tiles", "lut", None, "lut is missing"),
         ("cascade", "lut", None, "lut is missing"),
         ("cascade", "lut", lambda v: v[:0], "lut is empty"),
         ("cascade", "lut", lambda v: np.ascontiguousarray(v[..., :1]), "lut is uint16"),
         ("plain", "lut", lambda v: np.zeros((2, 2, 2), np.uint16), "lut is uint16"),
         ("cascade", "uv", lambda v: np.ascontiguousarray(v[:, :2]), "uv is float32"),
-        ("cascade", "uv", _put((0, 1, 0), -0.1), r"uv: outside \[0, 1\]"),
-        ("plain with uv", "uv", _put((0, 1, 0), 1.5), r"uv: outside \[0, 1\]"),
+        ("cascade", "uv", put((0, 1, 0), -0.1), r"uv: outside \[0, 1\]"),
+        ("plain with uv", "uv", put((0, 1, 0), 1.5), r"uv: outside \[0, 1\]"),
     ],
 )
 def test_parts_that_do_not_fit_are_refused(kind, part, change, words, tmp_path):

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from builders.checks import error_of
 from PIL import Image
 
 from wlm.atlas.coverage import covered_texels, touched_texels
 from wlm.atlas.data import from_arrays, load, write_mesh
-from wlm.errors import WlmError
 from wlm.formats.exr import HALF_MAX, write_exr
 from wlm.formats.gltf import document_from_arrays, read_gltf
 from wlm.formats.gltf_writer import Replacement, write_glb
@@ -42,13 +42,6 @@ def _files(folder: Path, second: np.ndarray | None = None) -> tuple[Path, Path]:
     write_glb(folder / "square.glb", document, new, 1)
     write_exr(folder / "light.exr", _lightmap())
     return folder / "square.glb", folder / "light.exr"
-
-
-def _message(call, *args: object, **options: object) -> str:
-    with pytest.raises(WlmError) as caught:
-        call(*args, **options)
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
 
 
 def _with(array: np.ndarray, at: object, value: object) -> np.ndarray:
@@ -95,7 +88,7 @@ def test_the_second_set_is_the_lightmaps_unless_told(tmp_path):
     mesh = load(*files, uv_set=0)
     assert mesh.uv_set == 0
     np.testing.assert_array_equal(mesh.uv, UV)
-    assert "expected the UV set TEXCOORD_2, found TEXCOORD_0, TEXCOORD_1" in _message(load, *files, uv_set=2)
+    assert "expected the UV set TEXCOORD_2, found TEXCOORD_0, TEXCOORD_1" in error_of(load, *files, uv_set=2)
     write_mesh(files[0], mesh, mesh.uv[mesh.triangle] * 0.5)
     assert sorted(load(*files).parts[0].primitive.uv) == [0, 1, 2] and load(*files).uv_set == 1
 
@@ -131,15 +124,15 @@ def test_no_uvs_no_triangles_and_other_names(tmp_path):
     document, _ = read_gltf(glb)
     del document.content["meshes"][0]["primitives"][0]["attributes"]["TEXCOORD_0"]
     write_glb(glb, document, [], 1)
-    assert "the mesh has no UVs: expected TEXCOORD_0 or TEXCOORD_1" in _message(load, glb, light)
+    assert "the mesh has no UVs: expected TEXCOORD_0 or TEXCOORD_1" in error_of(load, glb, light)
     (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3")
-    assert "the mesh has no UVs: expected vt" in _message(load, tmp_path / "a.obj", light)
+    assert "the mesh has no UVs: expected vt" in error_of(load, tmp_path / "a.obj", light)
     (tmp_path / "a.gltf").write_text(json.dumps({"asset": {"version": "2.0"}}))
-    assert "a.gltf: has no triangles" in _message(load, tmp_path / "a.gltf", light)
+    assert "a.gltf: has no triangles" in error_of(load, tmp_path / "a.gltf", light)
     (tmp_path / "a.obj").write_text("v 0 0 0\nvt 0 0\n")
-    assert "a.obj: has no triangles" in _message(load, tmp_path / "a.obj", light)
-    assert "expected a name that ends in .glb" in _message(load, tmp_path / "a.fbx", light)
-    assert "has no triangles" in _message(from_arrays, POSITION, TRIANGLE[:0], UV, _lightmap())
+    assert "a.obj: has no triangles" in error_of(load, tmp_path / "a.obj", light)
+    assert "expected a name that ends in .glb" in error_of(load, tmp_path / "a.fbx", light)
+    assert "has no triangles" in error_of(from_arrays, POSITION, TRIANGLE[:0], UV, _lightmap())
 
 
 @pytest.mark.parametrize(
@@ -166,7 +159,7 @@ def test_no_uvs_no_triangles_and_other_names(tmp_path):
 )
 def test_what_is_refused(change, words):
     arrays = {"position": POSITION, "triangle": TRIANGLE, "uv": UV, "lightmap": _lightmap(), **change}
-    text = _message(from_arrays, **arrays, name="thing")
+    text = error_of(from_arrays, **arrays, name="thing")
     assert words in text and text.startswith("thing")
 
 
@@ -191,7 +184,7 @@ def test_triangles_without_area_are_kept_and_take_no_part():
     np.testing.assert_array_equal(mesh.mask, _chart())
     flat = from_arrays(POSITION, np.array([[0, 1, 2], [0, 1, 3]]), _with(UV, 3, [0.5, 0]), _lightmap())
     assert flat.active.tolist() == [True, False]
-    assert "no triangle has an area" in _message(from_arrays, POSITION, TRIANGLE, UV * 0, _lightmap())
+    assert "no triangle has an area" in error_of(from_arrays, POSITION, TRIANGLE, UV * 0, _lightmap())
 
 
 @pytest.mark.parametrize("scale", [1e-30, 1e-12, 1e30])
@@ -257,13 +250,13 @@ def test_a_mask_that_is_derived_leaves_out_what_was_never_baked():
 def test_masks_that_do_not_fit(tmp_path):
     files = _files(tmp_path)
     path = tmp_path / "mask.png"
-    assert "no such mask; expected a PNG of 8x6" in _message(load, *files, mask_path=path)
+    assert "no such mask; expected a PNG of 8x6" in error_of(load, *files, mask_path=path)
     Image.fromarray(np.ones((WIDTH, HEIGHT), np.uint8)).save(path)
-    assert _message(load, *files, mask_path=path) == f"{path}: the mask is 6x8, but {files[1]} is 8x6"
+    assert error_of(load, *files, mask_path=path) == f"{path}: the mask is 6x8, but {files[1]} is 8x6"
     Image.fromarray(np.zeros((HEIGHT, WIDTH), np.uint8)).save(path)
-    assert _message(load, *files, mask_path=path).startswith(f"{path}: the mask is empty")
+    assert error_of(load, *files, mask_path=path).startswith(f"{path}: the mask is empty")
     path.write_bytes(b"no picture")
-    assert "cannot read the mask" in _message(load, *files, mask_path=path)
+    assert "cannot read the mask" in error_of(load, *files, mask_path=path)
 
 
 def test_a_mesh_is_written_with_new_uvs(tmp_path):

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import safetensors
 import safetensors.numpy
+from builders.checks import error_of
 
-from wlm.errors import WlmError
 from wlm.formats.artifact import FORMAT_VERSION, read_artifact, write_artifact
 
 SOURCE = "0123456789abcdef" * 2
@@ -50,10 +50,8 @@ def _refusal(path: Path, content: bytes | bytearray | None = None, system: str |
     """Reads what must be refused and gives the line, without the path at its start."""
     if content is not None:
         path.write_bytes(content)
-    with pytest.raises(WlmError) as caught:
-        read_artifact(path, system)
-    line = str(caught.value)
-    assert "\n" not in line and line.startswith(f"{path}: ")
+    line = error_of(read_artifact, path, system)
+    assert line.startswith(f"{path}: ")
     return line.removeprefix(f"{path}: ")
 
 

@@ -6,6 +6,7 @@ import tracemalloc
 
 import numpy as np
 import pytest
+from builders.checks import error_of
 
 from wlm.errors import WlmError
 from wlm.formats.godot import read_lmbake
@@ -141,10 +142,8 @@ def message(tmp_path, data, name="a.lmbake"):
     """The error of reading these bytes; it names the file and is one line."""
     path = tmp_path / name
     path.write_bytes(data)
-    with pytest.raises(WlmError) as caught:
-        read_lmbake(path)
-    text = str(caught.value)
-    assert text.startswith(f"{path}: ") and "\n" not in text
+    text = error_of(read_lmbake, path)
+    assert text.startswith(f"{path}: ")
     return text
 
 

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from builders.checks import error_of
 
 from wlm.errors import WlmError
 from wlm.formats.obj import ObjMesh, read_obj
@@ -32,10 +33,9 @@ def _read(folder: Path, text: str) -> ObjMesh:
 
 
 def _message(folder: Path, text: str) -> str:
-    with pytest.raises(WlmError) as caught:
-        _read(folder, text)
-    assert "\n" not in str(caught.value) and str(caught.value).startswith(str(folder / "a.obj"))
-    return str(caught.value)
+    line = error_of(_read, folder, text)
+    assert line.startswith(str(folder / "a.obj"))
+    return line
 
 
 @pytest.mark.parametrize(

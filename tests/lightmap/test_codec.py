@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from builders.checks import assert_same
 from builders.synthetic import random_model
 
 import wlm
@@ -12,16 +13,6 @@ from wlm.formats.artifact import read_artifact, write_artifact
 from wlm.lightmap.model import LightmapModel, Profile
 
 ARRAYS = [field.name for field in dataclasses.fields(LightmapModel) if field.type is np.ndarray]
-
-
-def assert_same(a: LightmapModel, b: LightmapModel) -> None:
-    for field in dataclasses.fields(LightmapModel):
-        x, y = getattr(a, field.name), getattr(b, field.name)
-        if isinstance(x, np.ndarray):
-            assert x.shape == y.shape and x.dtype == y.dtype, field.name
-            np.testing.assert_array_equal(x, y, err_msg=field.name)
-        else:
-            assert x == y, field.name
 
 
 @pytest.mark.parametrize("kinds", [(3, 2, 1, 0), (3, 3), (2, 2), (1, 1), (0, 0), (0, 3)])

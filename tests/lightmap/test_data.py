@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from builders.checks import error_of
 from PIL import Image
 
-from wlm.errors import WlmError
 from wlm.formats.exr import write_exr
 from wlm.lightmap.data import from_arrays, load, parse_times
 
@@ -46,15 +46,6 @@ def _save_mask(path: Path, mask: np.ndarray, mode: str = "L") -> None:
     Image.fromarray(np.where(mask, 255, 0).astype(np.uint8)).convert(mode).save(path)
 
 
-def _message(call, *args: object, **options: object) -> str:
-    """Returns the error of a call; it must be one line."""
-    with pytest.raises(WlmError) as error:
-        call(*args, **options)
-    text = str(error.value)
-    assert "\n" not in text
-    return text
-
-
 def test_set_json_and_its_folder_are_read_alike(tmp_path):
     frames = _frames()
     path = _write_set(tmp_path, frames)
@@ -78,7 +69,7 @@ def test_times_and_period_given_replace_those_of_the_set(tmp_path):
     lightmaps = load(path, times=[1, 2, 30], period=40)
     np.testing.assert_array_equal(lightmaps.times, [1, 2, 30])
     assert lightmaps.period == 40.0
-    assert "2 times for 3 lightmaps" in _message(load, path, times=[1, 2])
+    assert "2 times for 3 lightmaps" in error_of(load, path, times=[1, 2])
 
 
 def test_source_names_pixels_times_and_mask(tmp_path):
@@ -118,7 +109,7 @@ def test_mask_argument_replaces_that_of_the_set(tmp_path):
     path = _write_set(tmp_path, _frames(), mask="missing.png")
     np.testing.assert_array_equal(load(path, mask=other).mask, mask)
     assert load(path, mask="all").mask.all()
-    assert "missing.png" in _message(load, path)
+    assert "missing.png" in error_of(load, path)
 
 
 def test_mask_from_alpha_needs_all_frames(tmp_path):
@@ -135,19 +126,19 @@ def test_mask_from_alpha_needs_all_frames(tmp_path):
 
 
 def test_mask_from_alpha_without_alpha_names_the_file(tmp_path):
-    message = _message(load, _write_set(tmp_path, _frames(), mask="alpha"))
+    message = error_of(load, _write_set(tmp_path, _frames(), mask="alpha"))
     assert "a.exr" in message and "channel A" in message
 
 
 def test_mask_errors(tmp_path):
     path = _write_set(tmp_path, _frames(), mask="mask.png")
     _save_mask(tmp_path / "mask.png", np.ones((HEIGHT, WIDTH + 1), bool))
-    message = _message(load, path)
+    message = error_of(load, path)
     assert "mask.png" in message and "8x5" in message and "7x5" in message
     _save_mask(tmp_path / "mask.png", np.zeros((HEIGHT, WIDTH), bool))
-    assert "mask is empty" in _message(load, path)
+    assert "mask is empty" in error_of(load, path)
     (tmp_path / "mask.png").write_bytes(b"no picture")
-    assert "mask.png: cannot read the mask" in _message(load, path)
+    assert "mask.png: cannot read the mask" in error_of(load, path)
 
 
 def test_nan_and_inf_inside_take_the_nearest_finite_texel(tmp_path):
@@ -179,7 +170,7 @@ def test_frame_without_a_finite_texel_inside_is_an_error(tmp_path):
     mask = np.ones((HEIGHT, WIDTH), bool)
     mask[:, 0] = False
     _save_mask(tmp_path / "mask.png", mask)
-    message = _message(load, _write_set(tmp_path, frames, mask="mask.png"))
+    message = error_of(load, _write_set(tmp_path, frames, mask="mask.png"))
     assert "b.exr" in message and "finite" in message
 
 
@@ -241,14 +232,14 @@ def test_warnings_after_sorting_name_the_right_file(tmp_path):
 
 def test_equal_times_name_both_files(tmp_path):
     entries = [{"time_hours": t, "file": f} for t, f in zip((3, 5, 3), FILES, strict=True)]
-    message = _message(load, _write_set(tmp_path, _frames(), lightmaps=entries))
+    message = error_of(load, _write_set(tmp_path, _frames(), lightmaps=entries))
     assert "a.exr and c.exr" in message and "3" in message
 
 
 @pytest.mark.parametrize("time", [24.0, -0.5, 25.0])
 def test_time_outside_the_period_is_an_error(tmp_path, time):
     path = _write_set(tmp_path, _frames())
-    message = _message(load, path, times=[0, 1, time])
+    message = error_of(load, path, times=[0, 1, time])
     assert "c.exr" in message and "24" in message
     _write_set(tmp_path, _frames(), period_hours=None)
     assert time in load(path, times=[0, 1, time]).times
@@ -256,21 +247,21 @@ def test_time_outside_the_period_is_an_error(tmp_path, time):
 
 @pytest.mark.parametrize("time", [float("nan"), float("inf")])
 def test_time_that_is_not_finite_is_an_error(time):
-    assert "frame 1" in _message(from_arrays, _frames(), [0, time, 2])
+    assert "frame 1" in error_of(from_arrays, _frames(), [0, time, 2])
 
 
 @pytest.mark.parametrize("period", [0.0, -24.0, float("nan"), float("inf")])
 def test_bad_period_is_an_error(period):
-    assert "period" in _message(from_arrays, _frames(), TIMES, period=period)
+    assert "period" in error_of(from_arrays, _frames(), TIMES, period=period)
 
 
 def test_sizes_that_disagree_name_both_files(tmp_path):
     path = _write_set(tmp_path, _frames())
     write_exr(tmp_path / "b.exr", np.zeros((HEIGHT, WIDTH - 1, 3), np.float32))
-    message = _message(load, path)
+    message = error_of(load, path)
     assert "b.exr: is 6x5" in message and "a.exr is 7x5" in message
     path = _write_set(tmp_path, _frames(), width=WIDTH + 1)
-    message = _message(load, path)
+    message = error_of(load, path)
     assert "a.exr: is 7x5" in message and "set.json states 8x5" in message
 
 
@@ -278,12 +269,12 @@ def test_missing_truncated_and_misnamed_exr_name_the_file(tmp_path):
     path = _write_set(tmp_path, _frames())
     whole = (tmp_path / "b.exr").read_bytes()
     (tmp_path / "b.exr").write_bytes(whole[: len(whole) // 2])
-    assert "b.exr" in _message(load, path)
+    assert "b.exr" in error_of(load, path)
     (tmp_path / "b.exr").unlink()
-    assert "b.exr" in _message(load, path)
+    assert "b.exr" in error_of(load, path)
     # One letter in the list of channels: R becomes X.
     (tmp_path / "b.exr").write_bytes(whole.replace(b"R\0\x02\0\0\0", b"X\0\x02\0\0\0", 1))
-    message = _message(load, path)
+    message = error_of(load, path)
     assert "b.exr" in message and "X" in message
 
 
@@ -320,7 +311,7 @@ def test_malformed_set_names_the_field(tmp_path, changes, expected):
         if value is None:
             del content[key]
     path.write_text(json.dumps(content))
-    message = _message(load, path)
+    message = error_of(load, path)
     assert message.startswith(f"{path}: ") and expected in message
 
 
@@ -328,12 +319,12 @@ def test_malformed_set_names_the_field(tmp_path, changes, expected):
 def test_set_that_is_no_json_object_names_the_file(tmp_path, text):
     path = tmp_path / "set.json"
     path.write_bytes(text.encode("latin-1"))
-    assert str(path) in _message(load, path)
+    assert str(path) in error_of(load, path)
 
 
 def test_path_that_does_not_exist(tmp_path):
-    assert "nowhere" in _message(load, tmp_path / "nowhere")
-    assert "expected a set.json or EXR files" in _message(load, tmp_path)
+    assert "nowhere" in error_of(load, tmp_path / "nowhere")
+    assert "expected a set.json or EXR files" in error_of(load, tmp_path)
 
 
 def test_plain_folder_takes_files_in_natural_order(tmp_path):
@@ -344,7 +335,7 @@ def test_plain_folder_takes_files_in_natural_order(tmp_path):
     lightmaps = load(tmp_path, times=[1, 2, 3])
     np.testing.assert_array_equal(lightmaps.frames, frames[::-1])
     assert (lightmaps.name, lightmaps.period, lightmaps.warnings) == (tmp_path.name, None, ())
-    assert "2 times for 3 lightmaps" in _message(load, tmp_path, times=[1, 2])
+    assert "2 times for 3 lightmaps" in error_of(load, tmp_path, times=[1, 2])
 
 
 def test_plain_folder_uses_its_mask(tmp_path):
@@ -370,16 +361,16 @@ def test_plain_folder_reads_hours_from_names(tmp_path):
 def test_plain_folder_with_a_name_that_tells_no_hour(tmp_path, odd):
     for name in ("m_05_00h", odd):
         write_exr(tmp_path / f"{name}.exr", _frames()[0])
-    message = _message(load, tmp_path)
+    message = error_of(load, tmp_path)
     assert "2 EXR files" in message and "--times" in message and odd in message
 
 
 def test_from_arrays_checks_shapes():
     frames = _frames()
-    assert "[T, H, W, 3]" in _message(from_arrays, frames[..., :2], TIMES)
-    assert "[T, H, W, 3]" in _message(from_arrays, frames[:0], [])
-    assert "3 times" in _message(from_arrays, frames, [0, 1])
-    assert "mask" in _message(from_arrays, frames, TIMES, np.ones((WIDTH, HEIGHT), bool))
+    assert "[T, H, W, 3]" in error_of(from_arrays, frames[..., :2], TIMES)
+    assert "[T, H, W, 3]" in error_of(from_arrays, frames[:0], [])
+    assert "3 times" in error_of(from_arrays, frames, [0, 1])
+    assert "mask" in error_of(from_arrays, frames, TIMES, np.ones((WIDTH, HEIGHT), bool))
 
 
 @pytest.mark.parametrize(
@@ -405,7 +396,7 @@ def test_parse_times_rounds_no_step_in():
 
 @pytest.mark.parametrize("text", ["", "a", "1,,2", "0:24", "0:24:0", "0:24:-1", "3:3:1", "nan", "0:inf:1", "0:24:1e-9"])
 def test_parse_times_refuses(text):
-    assert "times" in _message(parse_times, text)
+    assert "times" in error_of(parse_times, text)
 
 
 def test_demo_set_loads_without_a_repair(tmp_path):

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from builders.checks import error_of
 from builders.small_sets import HOURS, moving_light, static_light, tiny_profile
 
 import wlm
@@ -270,9 +271,7 @@ def test_the_eight_bit_path_is_the_float_path_rounded(tmp_path):
     ],
 )
 def test_wrong_settings_are_one_line(options, says):
-    with pytest.raises(WlmError) as error:
-        compress(moving_light(8, 8), PROFILE, **options)
-    assert says in str(error.value) and "\n" not in str(error.value)
+    assert says in error_of(compress, moving_light(8, 8), PROFILE, **options)
 
 
 def test_a_missing_device_and_a_missing_gelu_are_one_line():

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from builders.checks import error_of
 
 from wlm.errors import WlmError
 from wlm.lightmap.data import LightmapSet, from_arrays
@@ -279,6 +280,4 @@ def test_parse_tiles(text, expected):
     ],
 )
 def test_parse_tiles_refuses(text, expected):
-    with pytest.raises(WlmError) as error:
-        parse_tiles(text, 8)
-    assert expected in str(error.value) and "\n" not in str(error.value)
+    assert expected in error_of(parse_tiles, text, 8)

@@ -5,22 +5,13 @@ import zlib
 
 import numpy as np
 import pytest
+from builders.checks import assert_same, put
 from builders.probe_models import random_model
 
 from wlm.errors import WlmError
 from wlm.formats.artifact import read_artifact, write_artifact
 from wlm.probe.model import ProbeModel
 from wlm.system import load
-
-
-def assert_same(a: ProbeModel, b: ProbeModel) -> None:
-    for field in dataclasses.fields(ProbeModel):
-        x, y = getattr(a, field.name), getattr(b, field.name)
-        if isinstance(x, np.ndarray):
-            assert x.shape == y.shape and x.dtype == y.dtype, field.name
-            np.testing.assert_array_equal(x, y, err_msg=field.name)
-        else:
-            assert x == y, field.name
 
 
 @pytest.mark.parametrize(
@@ -72,15 +63,6 @@ def test_dead_probes_cost_a_bit_each_at_most(tmp_path):
     noise = np.random.default_rng(0).random(20000) < 0.5
     worst = dataclasses.replace(model, dead=noise).save(tmp_path / "a.wlm")
     assert worst < sizes[0] + 2500 + 200
-
-
-def put(index, value):
-    def change(array):
-        array = array.copy()
-        array[index] = value
-        return array
-
-    return change
 
 
 def deflated(count):

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from builders.checks import error_of
 from builders.probe_sets import synthetic
 
 from wlm.errors import WlmError
@@ -38,15 +39,6 @@ def _write_json(path: Path, content: object) -> Path:
     return path
 
 
-def _message(call, *args: object, **options: object) -> str:
-    """Returns the error of a call; it must be one line."""
-    with pytest.raises(WlmError) as caught:
-        call(*args, **options)
-    text = str(caught.value)
-    assert "\n" not in text
-    return text
-
-
 def _same(a: ProbeSet, b: ProbeSet) -> None:
     np.testing.assert_array_equal(a.position, b.position)
     np.testing.assert_array_equal(a.values, b.values)
@@ -76,29 +68,29 @@ def test_any_count_of_probes_and_numbers(shape):
 
 def test_several_arrays_need_a_key(tmp_path):
     path = _write(tmp_path / "a.npz", **{"sh": _values(N, 3), "sh_09.00": _values(N, 12), "sh_12.00": _values(N, 27)})
-    assert "give the key of one: sh, sh_09.00, sh_12.00" in _message(load, path)
+    assert "give the key of one: sh, sh_09.00, sh_12.00" in error_of(load, path)
     for key, outputs, name in (("12.00", 27, "sh_12.00"), ("sh_09.00", 12, "sh_09.00"), ("sh", 3, "sh")):
         loaded = load(path, key=key)
         assert (loaded.outputs, loaded.key) == (outputs, name)
-    message = _message(load, path, key="21.00")
+    message = error_of(load, path, key="21.00")
     assert str(path) in message and "21.00" in message and "sh, sh_09.00, sh_12.00" in message
-    assert "expected values named position" in _message(load, path, key="position")
+    assert "expected values named position" in error_of(load, path, key="position")
 
 
 def test_an_exact_name_goes_before_one_with_sh(tmp_path):
     path = _write(tmp_path / "a.npz", noon=_values(N, 1), sh_noon=_values(N, 2))
     assert load(path, key="noon").outputs == 1
     np.savez(path, position=_position(), noon=_values(N, 1))
-    assert "begins with sh" in _message(load, path) and "noon" in _message(load, path)
+    assert "begins with sh" in error_of(load, path) and "noon" in error_of(load, path)
     assert load(path, key="noon").key == "noon"
 
 
 def test_missing_arrays(tmp_path):
     path = tmp_path / "a.npz"
     np.savez(path, sh=_values(N, 3))
-    assert "position is missing; found sh" in _message(load, path)
+    assert "position is missing; found sh" in error_of(load, path)
     np.savez(path, position=_position())
-    assert "found nothing" in _message(load, path)
+    assert "found nothing" in error_of(load, path)
 
 
 def test_both_forms_of_json(tmp_path):
@@ -131,22 +123,22 @@ def test_a_convention_from_the_file_or_the_caller(tmp_path):
 def test_conventions_that_do_not_fit(tmp_path):
     path = _write(tmp_path / "a.npz", sh=_values(N, 16, 3))
     assert load(path, convention="godot").outputs == 48
-    message = _message(load, path, convention="unity")
+    message = error_of(load, path, convention="unity")
     assert str(path) in message and "knows L0 to L2, got L3" in message
     for values in (_values(N, 5), _values(N, 6), _values(N, 5, 3)):
         assert from_arrays(_position(), values).outputs == np.prod(values.shape[1:])
-        assert "expected spherical harmonics" in _message(from_arrays, _position(), values, convention="unreal")
+        assert "expected spherical harmonics" in error_of(from_arrays, _position(), values, convention="unreal")
     for call in (
         lambda: load(path, convention="Unity"),
         lambda: save_probes(path, _position(), _values(N, 5), convention="Unity"),
     ):
-        message = _message(call)
+        message = error_of(call)
         assert str(path) in message and "expected threejs, godot, unreal, unity, got 'Unity'" in message
     for wrong in (np.array(3), np.array(["unity"])):
-        message = _message(load, _write(tmp_path / "b.npz", convention=wrong))
+        message = error_of(load, _write(tmp_path / "b.npz", convention=wrong))
         assert "b.npz: convention: expected a name, got" in message
     content = {"position": [[0, 0, 0]], "sh": [[1]], "convention": {}}
-    assert "expected a name, got an object" in _message(load, _write_json(tmp_path / "b.json", content))
+    assert "expected a name, got an object" in error_of(load, _write_json(tmp_path / "b.json", content))
 
 
 def test_godot_file(tmp_path, monkeypatch):
@@ -159,16 +151,16 @@ def test_godot_file(tmp_path, monkeypatch):
     _same(loaded, from_arrays(_position(), _values(N, 9, 3), convention="godot"))
     np.testing.assert_allclose(loaded.values.ravel(), _values(N * 27) * np.pi, rtol=2e-7)
     assert load(path, key="sh").outputs == 27
-    assert "expected values named 12.00" in _message(load, path, key="12.00")
+    assert "expected values named 12.00" in error_of(load, path, key="12.00")
     _same(load(path, convention="threejs"), from_arrays(_position(), _values(N, 9, 3)))
 
 
 def test_suffix_and_path(tmp_path):
-    assert "ends in .npz or .json or .lmbake, found .exr" in _message(load, tmp_path / "a.exr")
-    assert "found none" in _message(load, tmp_path / "a")
-    assert "missing.json: no such file" in _message(load, tmp_path / "missing.json")
+    assert "ends in .npz or .json or .lmbake, found .exr" in error_of(load, tmp_path / "a.exr")
+    assert "found none" in error_of(load, tmp_path / "a")
+    assert "missing.json: no such file" in error_of(load, tmp_path / "missing.json")
     (tmp_path / "folder.npz").mkdir()
-    assert "no such file" in _message(load, tmp_path / "folder.npz")
+    assert "no such file" in error_of(load, tmp_path / "folder.npz")
 
 
 def test_source_names_positions_values_and_live():
@@ -203,19 +195,19 @@ def test_dead_probes():
 
 def test_no_live_probe_and_no_probe(tmp_path):
     for values in (np.zeros((N, 27)), np.full((N, 27), np.nan), np.full((N, 27), 1e-60)):
-        assert "array: sh: every probe is zero or not finite" in _message(from_arrays, _position(), values)
+        assert "array: sh: every probe is zero or not finite" in error_of(from_arrays, _position(), values)
     path = _write(tmp_path / "a.npz", position=np.zeros((0, 3)), sh=np.zeros((0, 9, 3)))
-    assert "a.npz: position: expected at least one, found none" in _message(load, path)
+    assert "a.npz: position: expected at least one, found none" in error_of(load, path)
     for content in ({"probes": []}, {"position": [], "sh": []}):
         path = _write_json(tmp_path / "a.json", content)
-        assert "position: expected at least one, found none" in _message(load, path)
+        assert "position: expected at least one, found none" in error_of(load, path)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_a_position_that_is_not_finite(bad):
     position = _position()
     position[4, 2] = bad
-    text = _message(from_arrays, position, _values(N, 27))
+    text = error_of(from_arrays, position, _values(N, 27))
     assert "position[4]: expected finite numbers, got (0.5, 0.625," in text
 
 
@@ -225,7 +217,7 @@ def test_positions_far_away_are_kept():
     np.testing.assert_array_equal(loaded.position, position)
     assert loaded.warnings == ()
     position[0, 0], position[1, 0] = -1.5e308, 1.5e308
-    assert "further apart than float64 can tell" in _message(from_arrays, position, _values(N, 27))
+    assert "further apart than float64 can tell" in error_of(from_arrays, position, _values(N, 27))
 
 
 def test_coincident_positions():
@@ -257,7 +249,7 @@ def test_numbers_as_large_and_as_small_as_float32_allows():
         wide = values.astype(np.float64)
         wide[3, 8], wide[5, 1] = bad, np.inf
         for convention in ("threejs", "godot"):
-            message = _message(from_arrays, _position(), wide, convention=convention)
+            message = error_of(from_arrays, _position(), wide, convention=convention)
             assert "sh[3]: expected numbers within 1.8e+19, got " in message
 
 
@@ -293,7 +285,7 @@ def test_number_types_are_converted(tmp_path, dtype):
 )
 def test_wrong_shapes_and_types(tmp_path, changes, expected):
     path = _write(tmp_path / "a.npz", **changes)
-    message = _message(load, path)
+    message = error_of(load, path)
     assert message.startswith(f"{path}: ") and expected in message
 
 
@@ -301,14 +293,14 @@ def test_damaged_npz(tmp_path):
     path = tmp_path / "a.npz"
     for content in (b"", b"PK\3\4", b"no archive", np.random.default_rng(0).bytes(500)):
         path.write_bytes(content)
-        assert "a.npz: cannot read the arrays" in _message(load, path)
+        assert "a.npz: cannot read the arrays" in error_of(load, path)
     with open(path, "wb") as file:
         np.save(file, _values(N, 27))
-    assert "found a single array" in _message(load, path)
+    assert "found a single array" in error_of(load, path)
     whole = _write(tmp_path / "whole.npz", sh=_values(N, 27)).read_bytes()
     for end in range(0, len(whole), 37):
         path.write_bytes(whole[:end])
-        assert "a.npz: cannot read the arrays" in _message(load, path)
+        assert "a.npz: cannot read the arrays" in error_of(load, path)
 
 
 def test_any_damaged_byte_of_an_npz_is_read_or_is_one_line(tmp_path):
@@ -333,7 +325,7 @@ def test_an_array_that_claims_to_be_huge(tmp_path):
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("position.npy", header.getvalue())
         archive.writestr("sh.npy", header.getvalue())
-    assert "a.npz: cannot read the arrays" in _message(load, path)
+    assert "a.npz: cannot read the arrays" in error_of(load, path)
 
 
 @pytest.mark.parametrize(
@@ -368,7 +360,7 @@ def test_an_array_that_claims_to_be_huge(tmp_path):
 def test_malformed_json_names_the_field(tmp_path, content, expected):
     path = tmp_path / "a.json"
     path.write_bytes(content.encode("latin-1"))
-    message = _message(load, path)
+    message = error_of(load, path)
     assert message.startswith(f"{path}: ") and expected in message
 
 
@@ -416,9 +408,9 @@ def test_what_holds_no_positions(tmp_path, content, expected):
         path.write_bytes(content.encode("latin-1"))
     else:
         np.savez(path, **content)
-    message = _message(load_positions, path)
+    message = error_of(load_positions, path)
     assert message.startswith(f"{path}: ") and expected in message
-    assert "no such file" in _message(load_positions, tmp_path / "absent.npz")
+    assert "no such file" in error_of(load_positions, tmp_path / "absent.npz")
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".json", ".JSON"])
@@ -466,10 +458,10 @@ def test_writing_is_refused_without_touching_the_file(tmp_path):
     path.write_bytes(b"precious")
     arguments = path, _position(), _values(N, 27)
     for key in ("position", "convention", "probes", "file", "allow_pickle"):
-        assert "means something else" in _message(save_probes, *arguments, key=key)
-    assert "expected spherical harmonics" in _message(save_probes, path, _position(), _values(N, 5), convention="unity")
-    assert "ends in .npz or .json, found .lmbake" in _message(save_probes, tmp_path / "a.lmbake", *arguments[1:])
-    assert "does not exist" in _message(save_probes, tmp_path / "no" / "a.json", *arguments[1:])
+        assert "means something else" in error_of(save_probes, *arguments, key=key)
+    assert "expected spherical harmonics" in error_of(save_probes, path, _position(), _values(N, 5), convention="unity")
+    assert "ends in .npz or .json, found .lmbake" in error_of(save_probes, tmp_path / "a.lmbake", *arguments[1:])
+    assert "does not exist" in error_of(save_probes, tmp_path / "no" / "a.json", *arguments[1:])
     for position, values in (
         (_position()[:4], _values(N, 27)),
         (_position()[:, :2], _values(N, 27)),

@@ -1,0 +1,44 @@
+"""Checks that many tests make: of an error that is meant for the user, and of two models that should be equal."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from wlm.errors import WlmError
+
+
+def error_of(call: Callable, *args: Any, **options: Any) -> str:
+    """The error that a call must end with; it is one line."""
+    with pytest.raises(WlmError) as caught:
+        call(*args, **options)
+    text = str(caught.value)
+    assert "\n" not in text
+    return text
+
+
+def assert_same(a: Any, b: Any) -> None:
+    """Compares two models field by field; of a report all but the times, which aren't saved."""
+    assert type(a) is type(b)
+    for field in dataclasses.fields(a):
+        x, y = getattr(a, field.name), getattr(b, field.name)
+        if isinstance(x, np.ndarray):
+            assert x.shape == y.shape and x.dtype == y.dtype, field.name
+            np.testing.assert_array_equal(x, y, err_msg=field.name)
+        elif field.name == "report":
+            assert x == {key: value for key, value in y.items() if key != "seconds"}
+        else:
+            assert x == y, field.name
+
+
+def put(index: Any, value: Any) -> Callable[[np.ndarray], np.ndarray]:
+    """A change of an array: a copy with a value put in."""
+
+    def change(array: np.ndarray) -> np.ndarray:
+        array = array.copy()
+        array[index] = value
+        return array
+
+    return change
