@@ -44,3 +44,21 @@ def press_ctrl_c(monkeypatch):
 
     report_always(monkeypatch)
     monkeypatch.setattr(wlm.cli.console, "progress_bar", bar)
+
+
+def check_a_stop_is_resumed(monkeypatch, folder, words):
+    """Stops a compression by Ctrl-C: it is kept, not taken for one of another seed, and resumed to the same bytes."""
+    whole, out = folder / "whole.wlm", folder / "a.wlm"
+    call(*words, "-o", whole)
+    with monkeypatch.context() as patched:
+        press_ctrl_c(patched)
+        assert call(*words, "-o", out, code=130) == ""
+    assert call.stderr.splitlines() == [f"stopped at step 5: the same command with --resume goes on from {out}.partial"]
+    assert sorted(path.name for path in folder.iterdir()) == ["a.wlm.partial", "whole.wlm"]
+
+    assert "made with seed 0, not 1" in fails(*words, "-o", out, "--resume", "--seed", 1)
+    call(*words, "-o", out, "--resume")
+    assert out.read_bytes() == whole.read_bytes()
+    assert sorted(path.name for path in folder.iterdir()) == ["a.wlm", "whole.wlm"]
+    call(*words, "-o", out, "--resume")
+    assert "there is nothing to resume; starting at step 0" in call.stderr

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from builders.running import call, fails, press_ctrl_c
+from builders.running import call, check_a_stop_is_resumed, fails
 from builders.small_sets import HOURS, moving_light, tiny_profile
 from PIL import Image
 
@@ -256,20 +256,7 @@ def test_a_full_disk_is_one_line_and_keeps_what_was_there(fitted, folder, profil
 
 def test_a_ctrl_c_is_kept_and_resumed_to_the_same_bytes(folder, profile, tmp_path, monkeypatch):
     words = ["lightmap", "compress", folder, "--profile", profile, "--steps", 40]
-    whole, out = tmp_path / "whole.wlm", tmp_path / "a.wlm"
-    call(*words, "-o", whole)
-    with monkeypatch.context() as patched:
-        press_ctrl_c(patched)
-        assert call(*words, "-o", out, code=130) == ""
-    assert call.stderr.splitlines() == [f"stopped at step 5: the same command with --resume goes on from {out}.partial"]
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.wlm.partial", "whole.wlm"]
-
-    assert "made with seed 0, not 1" in fails(*words, "-o", out, "--resume", "--seed", 1)
-    call(*words, "-o", out, "--resume")
-    assert out.read_bytes() == whole.read_bytes()
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.wlm", "whole.wlm"]
-    call(*words, "-o", out, "--resume")
-    assert "there is nothing to resume; starting at step 0" in call.stderr
+    check_a_stop_is_resumed(monkeypatch, tmp_path, words)
 
 
 def test_a_ctrl_c_in_a_terminal_ends_with_130(folder, profile, tmp_path):

@@ -1,20 +1,16 @@
 import json
-import os
 import re
-import signal
-from contextlib import contextmanager
 from functools import partial
 
 import numpy as np
 import pytest
 import yaml
 from builders.probe_sets import synthetic
-from builders.running import call, fails
+from builders.running import call, check_a_stop_is_resumed, fails
 
 import wlm.cli.console
 from wlm.baselines import probe as baselines
-from wlm.probe import data, evaluate, fit, save_probes
-from wlm.system import Meter
+from wlm.probe import data, evaluate, save_probes
 
 PROBES, DEAD = 160, 5
 
@@ -302,27 +298,7 @@ def test_bad_input_is_one_line_and_exit_code_2(words, says, room, fitted, tmp_pa
 
 
 def test_a_ctrl_c_is_kept_and_resumed_to_the_same_bytes(room, profile, tmp_path, monkeypatch):
-    words = ["probe", "compress", room, "--profile", profile]
-    whole, out = tmp_path / "whole.wlm", tmp_path / "a.wlm"
-    call(*words, "-o", whole)
-
-    @contextmanager
-    def press_ctrl_c(what):
-        yield lambda done, total, text: os.kill(os.getpid(), signal.SIGINT)
-
-    with monkeypatch.context() as patched:
-        patched.setattr(fit, "Meter", partial(Meter, every=0.0))
-        patched.setattr(wlm.cli.console, "progress_bar", press_ctrl_c)
-        assert call(*words, "-o", out, code=130) == ""
-    assert call.stderr.splitlines() == [f"stopped at step 5: the same command with --resume goes on from {out}.partial"]
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.wlm.partial", "whole.wlm"]
-
-    assert "made with seed 0, not 1" in fails(*words, "-o", out, "--resume", "--seed", 1)
-    call(*words, "-o", out, "--resume")
-    assert out.read_bytes() == whole.read_bytes()
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.wlm", "whole.wlm"]
-    call(*words, "-o", out, "--resume")
-    assert "there is nothing to resume; starting at step 0" in call.stderr
+    check_a_stop_is_resumed(monkeypatch, tmp_path, ["probe", "compress", room, "--profile", profile])
 
 
 def test_an_unknown_exception_is_a_bug_and_shows(room, profile, monkeypatch, tmp_path):
