@@ -13,8 +13,6 @@ from pydantic import BaseModel, ValidationError
 
 from wlm.errors import WlmError, one_line
 
-__all__ = ["check_settings", "load_settings", "profile_names", "profile_path"]
-
 _Settings = TypeVar("_Settings", bound=BaseModel)
 
 _SHOWN_VALUE = 60  # characters of a wrong value that an error repeats

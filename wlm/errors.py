@@ -1,7 +1,5 @@
 """The one kind of error that is meant for the user."""
 
-__all__ = ["WlmError", "one_line"]
-
 _LIMIT = 2000  # characters: room for several long paths
 
 

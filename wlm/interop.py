@@ -12,19 +12,6 @@ import warp as wp
 
 from wlm.errors import WlmError
 
-__all__ = [
-    "StepGraph",
-    "available_devices",
-    "check_device",
-    "device_name",
-    "free_memory",
-    "no_collection",
-    "stream",
-    "to_warp",
-    "torch_memory",
-]
-
-
 _TENSORS = {
     int: (torch.int32, ()),
     wp.uint8: (torch.uint8, ()),

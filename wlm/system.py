@@ -28,19 +28,6 @@ from wlm.config import check_settings, load_settings, profile_path
 from wlm.errors import WlmError
 from wlm.formats.artifact import Artifact, encode_artifact, read_artifact, write_artifact
 
-__all__ = [
-    "Meter",
-    "Model",
-    "OnProgress",
-    "Part",
-    "Progress",
-    "Report",
-    "Settings",
-    "check_parts",
-    "load",
-    "plain",
-]
-
 # Which package reads which system's files.
 _PACKAGES = {
     "lightmap": "wlm.lightmap",

@@ -6,8 +6,6 @@ from scipy.ndimage import distance_transform_edt
 from wlm.errors import WlmError
 from wlm.formats.exr import HALF_MAX
 
-__all__ = ["fill_gaps", "repair"]
-
 
 def fill_gaps(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """Gives every texel outside the mask the value of the nearest texel inside it (Euclidean distance).

@@ -9,8 +9,6 @@ import warp as wp
 
 from wlm_kernels.raster.texture import BOUNDARIES, Axis, axis_at
 
-__all__ = ["sample", "sample_backward"]
-
 wp.set_module_options({"enable_backward": False})
 
 _LINEAR = wp.constant(0)

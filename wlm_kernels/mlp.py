@@ -19,8 +19,6 @@ from typing import Any
 
 import warp as wp
 
-__all__ = ["GELUS", "MlpKernels", "kernels", "parameter_count"]
-
 GELUS = ("exact", "tanh", "fast")
 
 

@@ -2,8 +2,6 @@
 
 from importlib import resources
 
-__all__ = ["native_source"]
-
 
 def native_source(package: str, name: str, **constants: int) -> str:
     """Reads the body of a native function for `wp.func_native`, or a part of one.

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from reference import patches as reference
 
-from wlm.atlas.cluster import ORDERS, Clusters, cluster
+from wlm.atlas.cluster import Clusters, cluster
 from wlm_kernels.atlas import patches as kernels
-from wlm_kernels.atlas.patches import SIZES
+from wlm_kernels.atlas.patches import ORDERS, SIZES
 
 SIDE = (48, 64)  # rows, columns
 

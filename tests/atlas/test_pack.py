@@ -8,10 +8,10 @@ import pytest
 from builders.atlas_models import grouped
 
 from wlm.atlas import pack as packing
-from wlm.atlas.cluster import ORDERS
 from wlm.atlas.data import LightmappedMesh, from_arrays
 from wlm.atlas.pack import Packed, pack, regenerate
 from wlm.errors import WlmError
+from wlm_kernels.atlas.patches import ORDERS
 
 pytest.importorskip("uvunwrap")
 

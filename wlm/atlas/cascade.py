@@ -45,8 +45,6 @@ from wlm_kernels.atlas import cascade as kernels
 from wlm_kernels.raster import texture as texture_kernels
 from wlm_kernels.raster.rasterize import Rasterizer
 
-__all__ = ["Textures", "fit_cascade", "group_triangles", "initial", "tune"]
-
 _CHUNK = {"cpu": 5, "cuda": 100}  # steps between two looks at the clock
 _PIXELS_PER_POINT = 4  # of space "uv": about that share of a view's pixels show the mesh
 

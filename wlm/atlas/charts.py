@@ -6,8 +6,6 @@ from scipy.sparse.csgraph import connected_components
 
 from wlm.atlas.data import LightmappedMesh
 
-__all__ = ["charts", "mesh_charts", "welded"]
-
 
 def welded(position: np.ndarray, uv: np.ndarray, triangle: np.ndarray) -> np.ndarray:
     """Numbers the corners so that those with equal position and UV have one number.

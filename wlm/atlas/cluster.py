@@ -39,9 +39,7 @@ import warp as wp
 from wlm.system import Meter, OnProgress
 from wlm_kernels.atlas import patch_graph as graphs
 from wlm_kernels.atlas import patches as kernels
-from wlm_kernels.atlas.patches import ORDERS, SIZES
-
-__all__ = ["ORDERS", "Clusters", "Stats", "cluster"]
+from wlm_kernels.atlas.patches import SIZES
 
 # Against 65, measured on six meshes with lightmaps of 512 x 512, lambda = 0.03, 0.01 and 0.003: mostly 2 to 6 times as
 # fast; edges within 1%; groups within a seventh, or within one group where there are ten or fewer.
@@ -72,8 +70,8 @@ class Clusters:
         group: int32 [F], number of each triangle's group. Groups of several come first, in the order in which they
             were formed, then single triangles, by number.
         representative: int32 [G], a triangle of each group.
-        order: int8 [F]: vertex k of the triangle goes to vertex p[k] of its representative, p = `ORDERS[order]`. Of
-            orders that fit equally well the first; 0 for representatives.
+        order: int8 [F]: vertex k of the triangle goes to vertex p[k] of its representative, p = `ORDERS[order]` of
+            `wlm_kernels.atlas.patches`. Of orders that fit equally well the first; 0 for representatives.
         distance: float64 [F], Dist to the representative in this order (eq. 2), below lambda.
         excluded: bool [F], too bright or not active: each is a group of its own.
         stats: Figures of the graph.

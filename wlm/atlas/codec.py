@@ -25,8 +25,6 @@ from wlm.config import check_settings
 from wlm.formats.artifact import Artifact, read_artifact
 from wlm.system import Part, check_parts
 
-__all__ = ["decode", "describe", "encode"]
-
 _METHODS = ("tiles", "cascade", "plain")
 _MOST_SIDE = 65536  # texels that a file may claim, checked before anything of that size is allocated
 

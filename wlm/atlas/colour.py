@@ -13,8 +13,6 @@ from wlm.errors import WlmError
 from wlm.formats import hdr_blocks
 from wlm.formats.exr import HALF_MAX
 
-__all__ = ["BLOCK_CODECS", "block_grid", "decode", "encode", "quantise"]
-
 BLOCK_CODECS = ("bc6h", "astc")
 _EXTRA = "atlas"
 # A third of the time of "slow" for 0.2 dB less, and every size of every tile is encoded once to measure its error.

@@ -8,8 +8,6 @@ from collections.abc import Iterator
 
 import numpy as np
 
-__all__ = ["covered_texels", "touched_texels"]
-
 _SPANS_AT_ONCE = 1 << 20  # about 200 bytes each while they are worked on
 
 

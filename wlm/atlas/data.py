@@ -48,8 +48,6 @@ from wlm.formats.mask import read_mask
 from wlm.formats.obj import read_obj
 from wlm.texels import fill_gaps, repair
 
-__all__ = ["LightmappedMesh", "Part", "from_arrays", "load", "write_mesh"]
-
 _FLAT = 1e-12  # ratio of area to longest side squared below which float64 can't tell a triangle from one without area
 _MISSED = 0.01  # fraction of covered texels that a mask may miss without a warning
 

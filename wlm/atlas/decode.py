@@ -12,8 +12,6 @@ from wlm.errors import WlmError
 from wlm.texels import fill_gaps
 from wlm_kernels.atlas import cascade, decode
 
-__all__ = ["Decoder"]
-
 
 class Decoder:
     """A model on a device. It is a `wlm.atlas.evaluation.Sampler`.

@@ -45,8 +45,6 @@ from wlm.metrics.error import psnr_from_mse
 from wlm.ops import raster
 from wlm.system import Meter, OnProgress
 
-__all__ = ["RESOLUTION", "VIEWS", "Report", "Sampler", "Score", "compare", "evaluate"]
-
 Sampler = Callable[[torch.Tensor, torch.Tensor, torch.Tensor], torch.Tensor]
 """A decoder: the mesh's own UVs float32 [N, 2], triangles int32 [N] and barycentrics float32 [N, 3] of points, to
 linear RGB float [N, 3] or, for labels, to int [N]; all on one device."""

@@ -4,8 +4,6 @@ import numpy as np
 
 from wlm.atlas.model import LUT_STEPS, AtlasModel, unpack_entries
 
-__all__ = ["decode64"]
-
 
 def decode64(model: AtlasModel, uv: np.ndarray) -> np.ndarray:
     """Reads light at points (lightmap-uv-clustering-cascade, eq. 7).

@@ -35,20 +35,6 @@ from wlm.formats.gltf_writer import write_glb
 from wlm.formats.ktx2 import write_ktx2
 from wlm.formats.mask import read_mask, write_mask
 
-__all__ = [
-    "FORMAT",
-    "MASK_FILE",
-    "MESH_FILE",
-    "MODEL_FILE",
-    "REPORT_FILE",
-    "Output",
-    "describe",
-    "export",
-    "geometry",
-    "read_folder",
-    "read_inputs",
-]
-
 FORMAT = "wlm-atlas"
 _VERSION = 1
 MODEL_FILE = "atlas.wlm"

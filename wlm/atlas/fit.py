@@ -26,8 +26,6 @@ from wlm.errors import WlmError
 from wlm.ops.raster import texture
 from wlm.system import OnProgress
 
-__all__ = ["compress"]
-
 _NO_ROOM = "budget: {:g} of {}x{} texels is less than the smallest tiles and their table take: expected more"
 
 

@@ -20,23 +20,6 @@ from pydantic import Field
 from wlm.errors import WlmError
 from wlm.system import Model, Settings
 
-__all__ = [
-    "BLOCK_SIDE",
-    "COLOUR_BITS",
-    "LUT_BITS",
-    "LUT_STEPS",
-    "MOST_SIZE",
-    "SIDE_BITS",
-    "SOURCE_BITS",
-    "AtlasModel",
-    "Profile",
-    "compression_ratio",
-    "disk_ratio",
-    "pack_entries",
-    "tile_counts",
-    "unpack_entries",
-]
-
 SOURCE_BITS = 48
 """Bits per texel of the lightmap: three half floats (eq. 9)."""
 

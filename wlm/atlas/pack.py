@@ -29,12 +29,11 @@ import numpy as np
 import torch
 
 from wlm.atlas.charts import charts, welded
-from wlm.atlas.cluster import ORDERS, Clusters
+from wlm.atlas.cluster import Clusters
 from wlm.atlas.data import LightmappedMesh
 from wlm.errors import WlmError
 from wlm.ops.raster import rasterize_uv, texture
-
-__all__ = ["Packed", "pack", "regenerate"]
+from wlm_kernels.atlas.patches import ORDERS
 
 _PADDING = 1  # texels around each chart
 _MOST = 16384  # texels that can be drawn along a side

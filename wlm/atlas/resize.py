@@ -6,8 +6,6 @@ import scipy.sparse as sparse
 from wlm.formats.exr import HALF_MAX
 from wlm.texels import fill_gaps
 
-__all__ = ["FILTERS", "fitting_size", "resize"]
-
 FILTERS = ("bilinear", "box", "lanczos", "fit")
 _LOBES = 3
 # Of conjugate gradients: 5 are within 0.1 dB of these, and three times as many gain nothing.

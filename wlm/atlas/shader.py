@@ -2,8 +2,6 @@
 
 from wlm.atlas.model import SIDE_BITS, AtlasModel
 
-__all__ = ["atlas_glsl"]
-
 _HEAD = """\
 // Light from a compressed lightmap: {what}
 // (Lightmap Compression with Color-Coherent UV Clustering and Cascade Texture Optimization, eq. 7).

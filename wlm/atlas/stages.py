@@ -7,8 +7,6 @@ import torch
 
 from wlm.system import Meter, OnProgress
 
-__all__ = ["Stages"]
-
 
 class Stages:
     """Reports and times stages.

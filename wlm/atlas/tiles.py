@@ -36,8 +36,6 @@ from wlm.errors import WlmError
 from wlm.formats.exr import HALF_MAX
 from wlm.system import Meter, OnProgress
 
-__all__ = ["Tiles", "allocate", "curves", "cut", "errors", "layout", "fit_tiles", "linear", "place", "solve", "solved"]
-
 SUPERSAMPLING = 2
 """Points per texel and axis that a tile is fitted to."""
 

@@ -19,20 +19,6 @@ from wlm.atlas.data import LightmappedMesh
 from wlm.interop import check_device
 from wlm.ops import raster as ops_raster
 
-__all__ = [
-    "DISTANCE",
-    "ZOOM",
-    "View",
-    "clip_positions",
-    "corner_weights",
-    "normalised",
-    "sphere_views",
-    "surface_points",
-    "texel_triangles",
-    "visibility",
-    "visible_uv",
-]
-
 DISTANCE = 3.0
 """Distance of a camera from the origin."""
 

@@ -12,8 +12,6 @@ from wlm.atlas.data import LightmappedMesh
 from wlm.atlas.model import Profile
 from wlm.atlas.views import sphere_views, surface_points, texel_triangles, visibility
 
-__all__ = ["FineGrid", "weights"]
-
 _BORDER = 2  # cells of the fine grid: one texel
 _RESOLUTION = 768  # pixels along a side of a view that visibility is counted in
 _POINTS = 4  # random points of the surface per cell, where there are no views

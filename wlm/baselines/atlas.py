@@ -28,8 +28,6 @@ from wlm.formats import hdr_blocks
 from wlm.ops import raster
 from wlm.texels import fill_gaps
 
-__all__ = ["RIVALS", "best_astc", "block_codec", "downsampling", "evaluate_rivals", "share_of", "single_colour"]
-
 _BLOCK_BITS = 128
 _BC6H = (4, 4)
 _EXTRA = "baselines"

@@ -27,8 +27,6 @@ from wlm.metrics import METRICS, evaluate_frame, summarise
 from wlm.system import Meter, OnProgress, Report
 from wlm.texels import fill_gaps
 
-__all__ = ["RIVALS", "Score", "encode_8bit", "encode_astc", "encode_bc6h", "encode_bc7", "evaluate_rivals"]
-
 HALF_MAX = 65504.0
 # The usual display gamma: 8 bits of it are spaced about as the eye and as a lightmap's errors are.
 GAMMA = 2.2

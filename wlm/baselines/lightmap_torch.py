@@ -11,8 +11,6 @@ import numpy as np
 import torch
 from torch.nn import functional
 
-__all__ = ["PlainFit"]
-
 TILE = 128
 
 

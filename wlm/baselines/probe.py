@@ -25,21 +25,6 @@ from wlm.probe.data import ProbeSet
 from wlm.probe.evaluation import Report, score
 from wlm.system import Meter, OnProgress
 
-__all__ = [
-    "RIVALS",
-    "WEIGHT_BITS",
-    "at_bytes",
-    "block_pca",
-    "clustered_pca",
-    "evaluate_rivals",
-    "global_pca",
-    "moving_basis",
-    "pack_unreal",
-    "unpack_unreal",
-    "unreal_packing",
-    "window_pca",
-]
-
 # Bits of a weight that `at_bytes` tries; None for half floats. Below 4 the rounding is the larger error.
 WEIGHT_BITS = (4, 5, 6, 8, 10, None)
 # `at_bytes` stops here: more parts are slow to find, and twice as many gain little.

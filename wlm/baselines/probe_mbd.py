@@ -33,8 +33,6 @@ from wlm.baselines.probe_pca import (
 )
 from wlm.errors import WlmError
 
-__all__ = ["Solver", "decode", "encode", "grid_parts", "payload_bytes"]
-
 _HEADER = struct.Struct("<BHHIf")
 # Weight of staying where the last round was, against the mean of the normal equations' diagonal. It makes every
 # system definite, also at corners that hardly any probe feels, and cannot raise the error.

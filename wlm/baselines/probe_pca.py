@@ -29,34 +29,6 @@ from scipy.spatial import cKDTree
 from wlm.errors import WlmError
 from wlm.formats.bits import pack_bits, unpack_bits
 
-__all__ = [
-    "BLOCKS",
-    "HALF_MAX",
-    "MAX_CELLS",
-    "PLACE",
-    "SIGNAL",
-    "WHOLE",
-    "Partition",
-    "by_blocks",
-    "by_place",
-    "by_signal",
-    "cell_keys",
-    "compact",
-    "decode",
-    "encode",
-    "extent_of",
-    "fit_subspaces",
-    "part_count",
-    "payload_bytes",
-    "read_weights",
-    "rescale",
-    "scale_of",
-    "weight_bytes",
-    "whole",
-    "windows",
-    "write_weights",
-]
-
 HEADER = struct.Struct("<BBHHIf")
 HALF_MAX = 65504.0
 # How a decoder finds the parts.

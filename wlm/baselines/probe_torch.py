@@ -13,8 +13,6 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-__all__ = ["DenseFit"]
-
 _ROUNDS = 20  # of k-means
 _SMALLEST = 1e-4  # of the box: first scales are no smaller
 _FIRST_LATENT = 0.1  # spread of the first latents

@@ -5,8 +5,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-__all__ = ["Rival", "measure"]
-
 _Payload = TypeVar("_Payload")
 
 

@@ -9,8 +9,6 @@ from wlm.smoke.learn.pool import Pool
 from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.planes import GUIDES, PLANES
 
-__all__ = ["COARSE", "FLIP_BOOK", "RIVALS", "billboard", "coarse", "flip_book"]
-
 COARSE, FLIP_BOOK = "coarse march", "flip book"
 
 _SIX = GUIDES["six"]

@@ -45,8 +45,6 @@ from wlm.bench.runner import Bench, Note, exact_errors
 from wlm.errors import WlmError
 from wlm.texels import fill_gaps
 
-__all__ = ["PANELS", "PROFILES", "plotted", "run", "run_rivals", "run_rows"]
-
 PROFILES = ("standard", "bc6h", "astc", "compact", "cascade", "paper")
 """Profiles of a run; the first has the bits of the first cascade too."""
 

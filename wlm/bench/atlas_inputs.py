@@ -10,8 +10,6 @@ from wlm.atlas.data import LightmappedMesh
 from wlm.atlas.data import load as load_mesh
 from wlm.errors import WlmError
 
-__all__ = ["Lightmap", "load"]
-
 
 @dataclass(frozen=True, eq=False)
 class Lightmap:

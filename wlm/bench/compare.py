@@ -8,8 +8,6 @@ from dataclasses import dataclass
 from wlm.bench.figures import FIGURES
 from wlm.bench.rows import Row, Run
 
-__all__ = ["Change", "compare"]
-
 _LEAST_DB = 0.05
 _LEAST_TIME = 0.05  # of the old time
 _SPREAD = "_spread"

@@ -5,8 +5,6 @@
 
 from dataclasses import dataclass
 
-__all__ = ["FIGURES", "TABLES", "Figure"]
-
 
 @dataclass(frozen=True)
 class Figure:

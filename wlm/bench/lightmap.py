@@ -38,8 +38,6 @@ from wlm.lightmap.runtime import ExactDecoder, StripDecoder
 from wlm.lightmap.tiles import TileGrid, TileKind, assemble
 from wlm.metrics import METRICS, Summary, evaluate_frame, summarise
 
-__all__ = ["PANELS", "PROFILES", "QUICK_PROFILES", "run", "run_rows"]
-
 PROFILES = ("L", "M", "H", "M64", "M-paper")
 """Profiles of a full run: the paper's table 3, and M as the paper fits it."""
 

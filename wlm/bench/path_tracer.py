@@ -19,8 +19,6 @@ from wlm.smoke.camera import VECTORS, Camera
 from wlm.smoke.learn.synthetic import make_plume
 from wlm.smoke.scene import CameraSettings, make_camera
 
-__all__ = ["GPU", "PathTracer", "choose_variant", "denoise", "has_denoiser", "has_tracer", "try_variant"]
-
 GPU = "cuda_ad_rgb"
 """Mitsuba's variant for a GPU."""
 

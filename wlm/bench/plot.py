@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.transforms import Bbox
 
-__all__ = ["Panel", "pareto_front", "plot"]
-
 # Okabe and Ito 2008, "Color Universal Design": told apart with any common colour vision. Its yellow is too
 # pale for white.
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")

@@ -45,8 +45,6 @@ from wlm.probe.model import ProbeModel, Profile
 from wlm.probe.volume import SIZES, Volume
 from wlm.probe.walk import EYE_HEIGHT, camera_path, summary, walk
 
-__all__ = ["PANELS", "PROFILES", "RATIOS", "run", "run_rivals", "run_rows"]
-
 PROFILES = ("standard", "compact", "paper")
 """Profiles of a run; the first is the one that the other rows are about."""
 

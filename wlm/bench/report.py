@@ -7,8 +7,6 @@ from pathlib import Path
 from wlm.bench.figures import TABLES, Figure
 from wlm.bench.rows import MEAN, Row, Run, read_runs
 
-__all__ = ["pages", "tables"]
-
 _WIDTH = 140  # characters of a line that a screen shows
 _SYSTEMS = ("lightmap", "atlas", "probe", "smoke")
 

@@ -24,8 +24,6 @@ from wlm.bench.timing import Timing
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_write
 
-__all__ = ["MEAN", "Row", "Run", "describe_environment", "read_json", "read_runs", "write_json"]
-
 MEAN = "mean over"
 """How the scene of a row begins that has means over several scenes."""
 

@@ -16,8 +16,6 @@ from wlm.errors import WlmError
 from wlm.interop import StepGraph, check_device
 from wlm.system import Model, load
 
-__all__ = ["Bench", "Fit", "Note", "demo_data", "exact_errors"]
-
 Note = Callable[[str], None]
 """Called with a line before each part of the work."""
 

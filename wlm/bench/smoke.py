@@ -31,8 +31,6 @@ from wlm.bench.smoke_air import advection_rows, lattice_rows, smoke_brick_rows, 
 from wlm.bench.smoke_light import frame_rows, guide_rows, six_rows, weight_rows
 from wlm.bench.smoke_setup import FULL, QUICK, Sizes, SmokeBench
 
-__all__ = ["PANELS", "plotted", "run", "run_rows"]
-
 PANELS = (Panel("time_ms", "psnr", ("guide",)), Panel("time_ms", "max_error", ("guide", "six ways")))
 """What a plot shows: PSNR and error of guiding maps and of the fine march against their time."""
 

@@ -37,8 +37,6 @@ from wlm.smoke.learn.trainer import Trainer, plan_round
 from wlm.smoke.model import Profile, SixWayNetwork, parameter_count
 from wlm.smoke.planes import PLANES
 
-__all__ = ["FULL", "METHOD", "QUICK", "AblationSizes", "run", "run_rows", "variants"]
-
 METHOD = "ablation"
 """The table of these rows."""
 

@@ -16,8 +16,6 @@ from wlm_kernels.fluid import advection, advection_places, advection_sources
 from wlm_kernels.fluid.lattice_sets import lattice as velocity_set
 from wlm_kernels.fluid.lattice_solids import voxelise_sphere
 
-__all__ = ["advection_rows", "lattice_rows", "smoke_brick_rows", "storage_rows"]
-
 _SPEED = 0.1  # of the inlet, cells a step
 _VISCOSITY = 1e-6
 _COPIED = {"cpu": 1 << 24, "cuda": 1 << 28}  # floats: far more than caches hold

@@ -20,8 +20,6 @@ from wlm.smoke.shading import Light, obstacle_visibility
 from wlm.smoke.simulation import make_solver, volume_of
 from wlm_kernels.smoke.settings import March
 
-__all__ = ["frame_rows", "guide_rows", "make_cloud", "six_rows", "weight_rows"]
-
 _CLOUD = "cloud"
 _DEPTH = 8.0  # optical, through the cloud's box at density 1
 _OCTAVES = range(2, 7)

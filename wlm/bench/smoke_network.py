@@ -50,8 +50,6 @@ from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.planes import EMISSION_PLANE, OPACITY_PLANE, decode_lightmaps, encode_lightmaps, render_guide
 from wlm_kernels.smoke.settings import March
 
-__all__ = ["PANELS", "plotted", "run", "run_rows"]
-
 PANELS = (Panel("time_ms", "psnr"),)
 """What a plot of `plotted` rows shows."""
 

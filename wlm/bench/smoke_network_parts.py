@@ -16,8 +16,6 @@ from wlm.smoke.model import Profile, SixWayNetwork, SmokeModel, parameter_count
 from wlm.smoke.planes import GUIDES, decode_lightmaps, render_guide
 from wlm.smoke.scene import LightSettings
 
-__all__ = ["density_rows", "frame_rows", "profile_rows"]
-
 _LIGHTS = (
     LightSettings(toward=(1.0, 0.8, 0.6), irradiance=(11.0, 10.3, 9.4)),
     LightSettings(toward=(-1.0, 0.3, 0.5), irradiance=(1.6, 2.2, 3.2)),

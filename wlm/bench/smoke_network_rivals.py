@@ -18,8 +18,6 @@ from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.planes import encode_lightmaps, to_srgb
 from wlm_kernels.smoke.settings import March
 
-__all__ = ["flipbook_rows", "traced_rows"]
-
 _DENOISED = "denoised"
 
 

@@ -27,20 +27,6 @@ from wlm.smoke.planes import decode_lightmaps, encode_lightmaps, render_guide
 from wlm.smoke.scene import CameraSettings, Scene, make_camera
 from wlm.smoke.simulation import make_solver, volume_of
 
-__all__ = [
-    "EXACT",
-    "FULL",
-    "QUICK",
-    "SCENE",
-    "Frame",
-    "NetworkBench",
-    "NetworkSizes",
-    "Subject",
-    "Pipeline",
-    "open_subjects",
-    "score",
-]
-
 SCENE = "unseen smoke"
 EXACT = 0.5
 """Voxels, the step of the reference march."""

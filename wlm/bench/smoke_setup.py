@@ -5,8 +5,6 @@ from dataclasses import dataclass
 
 from wlm.bench.runner import Bench, Note
 
-__all__ = ["FULL", "QUICK", "Sizes", "SmokeBench"]
-
 
 @dataclass(frozen=True)
 class Sizes:

@@ -15,8 +15,6 @@ import numpy as np
 
 from wlm.errors import WlmError
 
-__all__ = ["Timing", "time_together"]
-
 # One sample lasts at least this long: CUDA events resolve half a microsecond, and an event pair around one
 # short kernel measures mostly the pair.
 _MIN_SAMPLE_MS = 1.0

@@ -20,8 +20,6 @@ from wlm import __version__
 from wlm.cli import atlas, bench, compare, doctor, lightmap, probe, smoke, web
 from wlm.errors import WlmError, one_line
 
-__all__ = ["BAD_INPUT", "INTERRUPTED", "app", "main"]
-
 BAD_INPUT = 2
 INTERRUPTED = 130  # 128 and the number of SIGINT, as shells have it
 

@@ -9,8 +9,6 @@ from wlm.cli.console import check_output, escape, note, number, quiet_warp, runn
 from wlm.cli.options import AsJson, Device, PageFile, ReportFile, Seed, output_option
 from wlm.errors import WlmError
 
-__all__ = ["app"]
-
 app = typer.Typer(help="The lightmap of a mesh: a small colour texture, read through a small table.")
 
 _Folder = Annotated[Path, typer.Argument(metavar="DIR", help="A folder that compress wrote.")]

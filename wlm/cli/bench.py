@@ -16,8 +16,6 @@ if TYPE_CHECKING:
 
     from wlm.bench import Panel, Row
 
-__all__ = ["app"]
-
 app = typer.Typer(help="Speed against error, ours and the baselines.")
 
 _Quick = Annotated[bool, typer.Option("--quick", help="Fewer steps and rows, for a check in minutes.")]

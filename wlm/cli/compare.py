@@ -8,8 +8,6 @@ import typer
 from wlm.cli.console import check_output, escape, quiet_warp, show, table
 from wlm.cli.options import Device, PageFile
 
-__all__ = ["compare"]
-
 
 def compare(
     first: Annotated[Path, typer.Argument(metavar="A", help="A .wlm, or a folder of wlm atlas compress.")],

@@ -9,8 +9,6 @@ from pathlib import Path
 from wlm import __version__
 from wlm.cli.console import escape, quiet_warp, show, table
 
-__all__ = ["doctor"]
-
 
 def doctor() -> None:
     """Show Python, devices, libraries, extras and the kernel cache."""

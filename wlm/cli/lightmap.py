@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from wlm.baselines.rival import Rival
     from wlm.lightmap import LightmapSet, Report
 
-__all__ = ["app"]
-
 app = typer.Typer(help="Lightmaps over time: BC7 feature maps and a tiny network for each 128² tile.")
 
 _Set = Annotated[Path, typer.Argument(metavar="SET", help="A set.json, or a folder of EXR files.")]

@@ -5,8 +5,6 @@ from typing import Annotated, Any
 
 import typer
 
-__all__ = ["AsJson", "Device", "ModelFile", "PageFile", "ReportFile", "Resume", "Seed", "output_option"]
-
 Device = Annotated[str, typer.Option(help='Where it computes: "cpu", "cuda" or "cuda:N".')]
 Seed = Annotated[int, typer.Option(min=0, max=2**31 - 1, help="One seed gives one result on one device.")]
 Resume = Annotated[bool, typer.Option("--resume", help="Go on with an interrupted run of the same output.")]

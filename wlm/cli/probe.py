@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from wlm.baselines.rival import Rival
     from wlm.probe import ProbeModel, ProbeSet, Report
 
-__all__ = ["app"]
-
 app = typer.Typer(help="Light probes: quantised 3D Gaussians and a small network, read through a cascaded volume.")
 
 _Probes = Annotated[Path, typer.Argument(metavar="PROBES", help="A .npz, .json or .lmbake file of probes.")]

@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     from wlm.smoke.shots import BakedFiles, FramesToBake, Shot
     from wlm.system import OnProgress
 
-__all__ = ["app"]
-
 app = typer.Typer(help="Smoke: simulated, and rendered through six-way lightmaps.")
 
 _Baked = Annotated[

@@ -30,8 +30,6 @@ if TYPE_CHECKING:
     from wlm.smoke.model import SmokeModel
     from wlm.system import Progress
 
-__all__ = ["register"]
-
 _POOL, _SHEET = "pool.safetensors", "sheet.png"
 _MARCH = 130  # steps of `predict --coarse` along the longest edge
 

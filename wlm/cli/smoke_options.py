@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from wlm.smoke.lightmaps import SixWay
     from wlm.smoke.scene import CameraSettings
 
-__all__ = ["SHEET", "Input", "SmokeOptions", "marched", "outputs", "vector", "with_smoke", "write_lightmaps"]
-
 SHEET = "sheet.png"
 
 Input = Annotated[Path, typer.Argument(metavar="SMOKE", help="A .npz or .nvdb volume, or a folder of simulate.")]

@@ -8,8 +8,6 @@ import typer
 from wlm.cli.console import check_output, escape, quiet_warp, show, table
 from wlm.cli.options import output_option
 
-__all__ = ["web"]
-
 
 def web(
     files: Annotated[

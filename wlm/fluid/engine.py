@@ -16,8 +16,6 @@ from wlm_kernels.fluid.lattice_fields import fluid_kernels
 from wlm_kernels.fluid.lattice_sets import NARROW, STORAGES, tables
 from wlm_kernels.fluid.lattice_sets import lattice as velocity_set
 
-__all__ = ["BODIES", "PERIOD", "Engine", "require_free"]
-
 BODIES = 256
 """Bodies that uint8 can number, the fluid counted in."""
 

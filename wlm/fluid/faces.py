@@ -9,8 +9,6 @@ from wlm_kernels.fluid.advection_places import CLOSED, OPEN, PERIODIC
 from wlm_kernels.fluid.lattice_links import BOUNCE, INLET, OUTLET, PRESSURE, SLIP
 from wlm_kernels.fluid.lattice_sets import VelocitySet
 
-__all__ = ["FACES", "Face", "axis_ends", "bounded_axes", "face_links", "inlet", "outlet", "wall", "walled_axes"]
-
 FACES = ("-x", "+x", "-y", "+y", "-z", "+z")
 """The faces, by the axis that they close and the end of it."""
 

@@ -26,8 +26,6 @@ from wlm.fluid import faces as fluid_faces
 from wlm.fluid.engine import BODIES, PERIOD, Engine, require_free
 from wlm_kernels.fluid.lattice import QUIET, Spec, eddy_factor, trouble_of
 
-__all__ = ["CHECK_EVERY", "MAX_SPEED", "Domain", "Lattice"]
-
 CHECK_EVERY = 48
 """Steps between two checks for a flow that blew up; a multiple of what a graph holds."""
 

@@ -13,8 +13,6 @@ import warp as wp
 from wlm.fluid import shapes
 from wlm_kernels.fluid.lattice_solids import voxelise_mesh, voxelise_sphere
 
-__all__ = ["Mesh", "Obstacle", "Sphere", "Trajectory", "box_mesh"]
-
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:

@@ -2,8 +2,6 @@
 
 import numpy as np
 
-__all__ = ["box", "cylinder", "sphere"]
-
 _SIDES = 24  # of a sphere, from pole to pole; twice as many around it
 
 

@@ -42,8 +42,6 @@ from wlm.formats.artifact import read_artifact, write_artifact
 from wlm_kernels.fluid import advection, advection_places, advection_sources
 from wlm_kernels.fluid.advection_places import DENSE
 
-__all__ = ["LEAST_HALF_LOSS", "SCHEMES", "Buoyancy", "Solver", "Source", "require_memory", "voxel_bytes"]
-
 SCHEMES = ("maccormack", "semi-lagrangian")
 
 LEAST_HALF_LOSS = 2.0**-10

@@ -38,8 +38,6 @@ from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_path
 from wlm.interop import check_device, to_warp
 
-__all__ = ["DensityVolume", "from_array", "from_grid", "load_volume", "save_volume"]
-
 _DENSITY, _TEMPERATURE = "density", "temperature"
 _BAD_FILE = (OSError, ValueError, EOFError, KeyError, MemoryError, NotImplementedError, zipfile.BadZipFile, zlib.error)
 _LARGEST = 2**31 - 1  # voxels that a kernel can index

@@ -26,8 +26,6 @@ import numpy as np
 from wlm.errors import WlmError, one_line
 from wlm.formats.atomic import atomic_write
 
-__all__ = ["FORMAT_VERSION", "Artifact", "encode_artifact", "read_artifact", "write_artifact"]
-
 FORMAT_VERSION = 1
 
 _LENGTH = struct.Struct("<Q")

@@ -9,8 +9,6 @@ from pathlib import Path
 
 from wlm.errors import WlmError
 
-__all__ = ["atomic_path", "atomic_write"]
-
 
 @contextmanager
 def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:

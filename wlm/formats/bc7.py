@@ -9,8 +9,6 @@ import numpy as np
 
 from wlm.errors import WlmError
 
-__all__ = ["BLOCK_BYTES", "WEIGHTS", "decode_image", "decode_mode6", "pack_mode6", "unpack_mode6"]
-
 BLOCK_BYTES = 16
 """Bytes of a block of 4 x 4 texels."""
 

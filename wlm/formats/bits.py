@@ -4,8 +4,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-__all__ = ["pack_bits", "unpack_bits"]
-
 
 def pack_bits(values: np.ndarray, widths: np.ndarray | Sequence[int]) -> np.ndarray:
     """Packs integers of given widths, row after row.

@@ -16,8 +16,6 @@ from wlm import __version__
 from wlm.errors import WlmError
 from wlm.formats.artifact import read_artifact, write_artifact
 
-__all__ = ["SUFFIX", "Checkpoint"]
-
 SUFFIX = ".partial"
 
 _FINISHED, _RUNNING = "finished", "running"

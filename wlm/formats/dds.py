@@ -9,8 +9,6 @@ import struct
 
 from wlm.formats.atomic import atomic_write
 
-__all__ = ["DXGI_FORMATS", "write_dds"]
-
 DXGI_FORMATS = {
     "R16G16B16A16_FLOAT": 10,
     "R16G16_FLOAT": 34,

@@ -7,8 +7,6 @@ import numpy as np
 from wlm.errors import WlmError
 from wlm.formats.exr_file import read_part, write_part
 
-__all__ = ["HALF_MAX", "read_exr", "write_exr"]
-
 HALF_MAX = 65504.0
 """The largest finite half float."""
 

@@ -15,8 +15,6 @@ import OpenEXR
 from wlm.errors import WlmError, one_line
 from wlm.formats.atomic import atomic_path
 
-__all__ = ["read_part", "write_part"]
-
 _MAGIC = b"\x76\x2f\x31\x01"
 _STDERR = 2
 _STDERR_LOCK = threading.Lock()

@@ -11,8 +11,6 @@ from wlm.errors import WlmError
 from wlm.formats.exr import HALF_MAX
 from wlm.formats.exr_file import read_part, write_part
 
-__all__ = ["read_planes", "write_planes"]
-
 _NOTE = "wlm"  # the header's attribute
 
 

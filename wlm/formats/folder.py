@@ -19,8 +19,6 @@ import numpy as np
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_write
 
-__all__ = ["UNFINISHED", "claim", "compact_json", "make_parents", "read_index", "rounded", "staged", "write_index"]
-
 UNFINISHED = "unfinished"
 """Key of an index that stands in while files are being moved in."""
 

@@ -39,8 +39,6 @@ import numpy as np
 
 from wlm.errors import WlmError
 
-__all__ = ["GltfDocument", "GltfPrimitive", "components", "document_from_arrays", "elements", "read_gltf"]
-
 MAGIC = b"glTF"
 JSON_CHUNK, BINARY_CHUNK = 0x4E4F534A, 0x004E4942
 TRIANGLES, STRIP, FAN = 4, 5, 6

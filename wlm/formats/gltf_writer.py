@@ -26,8 +26,6 @@ from wlm.formats.gltf import (
     reported,
 )
 
-__all__ = ["Replacement", "write_glb"]
-
 _VERTICES, _INDICES = 34962, 34963  # targets of buffer views
 _FLOAT, _UINT16, _UINT32 = 5126, 5123, 5125
 _MAX_GLB = 2**32 - 1

@@ -20,8 +20,6 @@ import numpy as np
 
 from wlm.errors import WlmError
 
-__all__ = ["read_lmbake"]
-
 COEFFICIENTS = 9
 _TYPE = "LightmapGIData"
 _PROPERTY = "probe_data"

@@ -11,17 +11,6 @@ import numpy as np
 
 from wlm.errors import WlmError
 
-__all__ = [
-    "ASTC_BLOCKS",
-    "ASTC_MEDIUM",
-    "BC6H_PROFILES",
-    "Astc",
-    "astc",
-    "decode_bc6h",
-    "encode_bc6h",
-    "need",
-]
-
 BC6H_PROFILES = ("veryfast", "fast", "basic", "slow", "veryslow")
 ASTC_BLOCKS = (
     (4, 4), (5, 4), (5, 5), (6, 5), (6, 6), (8, 5), (8, 6), (8, 8), (10, 5), (10, 6), (10, 8), (10, 10), (12, 10),

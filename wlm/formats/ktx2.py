@@ -10,8 +10,6 @@ import struct
 
 from wlm.formats.atomic import atomic_write
 
-__all__ = ["VK_FORMATS", "write_ktx2"]
-
 VK_FORMATS = {
     "R16G16_UNORM": 77,
     "R16G16_UINT": 81,

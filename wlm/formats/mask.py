@@ -9,8 +9,6 @@ from PIL import Image
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_path
 
-__all__ = ["read_mask", "write_mask"]
-
 
 def read_mask(path: Path, beside: str | os.PathLike[str], size: tuple[int, int], others: str = "") -> np.ndarray:
     """Reads a PNG as [H, W] bool: valid where any colour channel is above 0.

@@ -14,8 +14,6 @@ import numpy as np
 
 from wlm.errors import WlmError
 
-__all__ = ["ObjMesh", "read_obj"]
-
 
 @dataclass(frozen=True, eq=False)
 class ObjMesh:

@@ -10,8 +10,6 @@ from wlm.lightmap.model import LightmapModel, Profile, part_table
 from wlm.lightmap.tiles import TileGrid, TileKind
 from wlm.system import Part, check_parts
 
-__all__ = ["decode", "encode"]
-
 
 def encode(model: LightmapModel) -> tuple[dict[str, Any], dict[str, np.ndarray], str]:
     """Lays a model out for its file: the settings, the parts and the hash of its source."""

@@ -44,8 +44,6 @@ from wlm.formats.mask import read_mask
 from wlm.lightmap.listing import SET_FILE, Listing, list_folder, parse_set
 from wlm.texels import repair
 
-__all__ = ["LightmapSet", "from_arrays", "load", "parse_times"]
-
 _READERS = 2  # decompression releases the GIL; more threads than this only fight over the disk
 _MAX_TIMES = 100_000  # far above any real set; "0:24:1e-9" must not fill the memory
 

@@ -14,8 +14,6 @@ from wlm.lightmap.tiles import TileGrid, TileKind, assemble
 from wlm_kernels.lightmap import decode as lightmap_decode
 from wlm_kernels.mlp import GELUS
 
-__all__ = ["Decoder", "StoredTiles", "TimeTable", "gelu_of"]
-
 
 class Decoder:
     """Holds a model's stored bytes on a device and decodes from them.

@@ -16,15 +16,6 @@ from wlm.metrics import METRICS, FrameMetrics, Summary, evaluate_frame, summaris
 from wlm.system import Meter, OnProgress
 from wlm.system import Report as BaseReport
 
-__all__ = [
-    "Report",
-    "bits_per_texel",
-    "count_kinds",
-    "evaluate",
-    "part_bytes",
-    "scored_mask",
-]
-
 # Stored times are float32 where that keeps them apart; see `wlm.lightmap.codec`.
 _TIME_TOLERANCE = 1e-6
 

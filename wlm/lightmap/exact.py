@@ -10,8 +10,6 @@ from wlm.formats.bc7 import decode_image
 from wlm.lightmap.model import TILE, LightmapModel, decode_scale
 from wlm.lightmap.tiles import TileGrid, TileKind
 
-__all__ = ["bound64", "colour_tile64", "decode_tile64"]
-
 SQRT_12 = math.sqrt(12.0)
 """Features in [0, 1] are fed to the network as (f - 1/2) sqrt(12): mean 0 and deviation 1 if they are uniform."""
 

@@ -21,8 +21,6 @@ from wlm.lightmap.model import TILE, LightmapModel, decode_scale, encode_time
 from wlm.lightmap.shader import decode_glsl
 from wlm.lightmap.tiles import TileKind
 
-__all__ = ["FORMAT", "FRAME_FILE", "SHADER_FILE", "WEIGHTS_FILE", "document", "export", "write_8bit"]
-
 FORMAT = "wlm-lightmap-export"
 _VERSION = 1
 WEIGHTS_FILE = "weights.json"

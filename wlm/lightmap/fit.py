@@ -16,8 +16,6 @@ from wlm.lightmap.tiles import TILE, TileGrid, TileKind, channel_means, classify
 from wlm.lightmap.trainer import Targets, Trainer
 from wlm.system import Meter, OnProgress
 
-__all__ = ["compress", "dynamic_targets", "open_checkpoint"]
-
 BATCH_TEXELS = 64 * 26 * TILE * TILE  # texels times times in a batch: 64 tiles of 26 times, 330 MB of targets
 
 

@@ -11,8 +11,6 @@ from pathlib import Path
 
 from wlm.errors import WlmError
 
-__all__ = ["SET_FILE", "Listing", "list_folder", "parse_set"]
-
 SET_FILE = "set.json"
 
 # The hour at the end of a file's name: `_18_55h` and `_18.55h` are 18.55, `_18h` is 18. A bare `_18` may as well be

@@ -23,16 +23,6 @@ from wlm.system import Model, Part, Settings
 from wlm_kernels import mlp
 from wlm_kernels.lightmap.features import STATIC_INPUTS, TEMPORAL_INPUTS
 
-__all__ = [
-    "LightmapModel",
-    "Profile",
-    "TimeAxis",
-    "decode_scale",
-    "encode_scale",
-    "encode_time",
-    "part_table",
-]
-
 SCALE_SPAN = (-21.0, 16.0)  # log2 of radiance: from half float's small numbers to its largest
 
 

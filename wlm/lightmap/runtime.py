@@ -14,8 +14,6 @@ from wlm.lightmap.model import TILE, LightmapModel
 from wlm.lightmap.tiles import TileKind
 from wlm_kernels.lightmap import decode as lightmap_decode
 
-__all__ = ["ExactDecoder", "StripDecoder"]
-
 
 class _TileDecoder:
     """The tiles of one kind on a device, and the time at which they are decoded."""

@@ -3,8 +3,6 @@
 from wlm.lightmap.model import LightmapModel
 from wlm_kernels.lightmap.features import STATIC_INPUTS, TEMPORAL_INPUTS
 
-__all__ = ["decode_glsl"]
-
 _GELU = {
     "exact": """\
 // x Phi(x). erf as in Abramowitz and Stegun, Handbook of Mathematical Functions, 7.1.26: within 1.5e-7, which leaves

@@ -18,19 +18,6 @@ from wlm.errors import WlmError
 from wlm.lightmap.data import LightmapSet
 from wlm.texels import fill_gaps
 
-__all__ = [
-    "TILE",
-    "TileData",
-    "TileGrid",
-    "TileKind",
-    "assemble",
-    "channel_means",
-    "classify",
-    "parse_tiles",
-    "split",
-    "static_pattern",
-]
-
 TILE = 128  # texels a side: the paper's tile (Table 1)
 
 # A colour that was encoded and decoded again in float32 is off by a few parts in 10^6; a half float's step is at

@@ -15,8 +15,6 @@ from wlm_kernels.lightmap import blocks, features, gather
 from wlm_kernels.lightmap import step as lightmap_step
 from wlm_kernels.lightmap.gather import gather_maps, gather_net
 
-__all__ = ["Targets", "Trainer"]
-
 # What a checkpoint keeps: attributes of a trainer, and of each of Adam's parameters.
 _STATE = ("maps", "hidden", "output", "loss", "control")
 _ADAM_STATE = ("step", "exp_avg", "exp_avg_sq")

@@ -6,8 +6,6 @@ import numpy as np
 
 from wlm.errors import WlmError
 
-__all__ = ["PSNR_CAP_DB", "dynamic_range", "half_ulp", "max_abs_error", "mse", "psnr"]
-
 # An exact reconstruction has infinite PSNR and would swallow every mean. Rounding to half float alone leaves,
 # in a tile that reaches down to black, 70 to 90 dB, so no lossy half-float codec comes near 120; a float32
 # path within rounding of its reference does, and counts as exact.

@@ -14,8 +14,6 @@ from wlm.errors import WlmError
 from wlm.metrics.error import check_pair
 from wlm.texels import fill_gaps
 
-__all__ = ["flip_exposures", "flip_map"]
-
 # HDR-FLIP chooses the exposures so that the reference's brightest luminance (at the first) and its median (at
 # the last) are tone mapped to 0.85. With the ACES curve that flip_evaluator takes by default, this is the
 # input that gives 0.85.

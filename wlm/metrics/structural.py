@@ -8,8 +8,6 @@ from wlm.errors import WlmError
 from wlm.metrics.error import check_pair
 from wlm.texels import fill_gaps
 
-__all__ = ["SSIM_WINDOW", "ssim", "ssim_map"]
-
 # Wang et al. 2004, "Image quality assessment: from error visibility to structural similarity", section III-B:
 # a Gaussian window of 11x11 with a standard deviation of 1.5 and population (not sample) covariances.
 SSIM_WINDOW = 11

@@ -23,16 +23,6 @@ from wlm.metrics.flip import flip_exposures, flip_filled
 from wlm.metrics.structural import ssim_filled
 from wlm.texels import fill_gaps
 
-__all__ = [
-    "FORMAT_LIMITED_ULPS",
-    "METRICS",
-    "MIN_VALID_TEXELS",
-    "FrameMetrics",
-    "Summary",
-    "evaluate_frame",
-    "summarise",
-]
-
 METRICS = ("psnr", "ssim", "flip")
 # Four 4x4 blocks: below that one bad block is the tile's whole score.
 MIN_VALID_TEXELS = 64

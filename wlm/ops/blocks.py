@@ -17,8 +17,6 @@ from wlm.ops.sampling import sample
 from wlm.ops.tensors import check, check_finite, dense, on_stream
 from wlm_kernels.lightmap import blocks
 
-__all__ = ["bc7_blocks", "bc7_map", "bc7_texels"]
-
 
 def bc7_map(
     endpoints: torch.Tensor,

@@ -12,8 +12,6 @@ from wlm_kernels.probe import cubes as cubes_kernels
 from wlm_kernels.probe import gaussian_sum as kernels
 from wlm_kernels.probe.gaussians import LATENT
 
-__all__ = ["gaussian_sum"]
-
 PAIRS_FOR_LISTS = 2**17
 """Gaussians times points from which on a point looks only at those that a cube lists: making the lists has to pay."""
 

@@ -12,8 +12,6 @@ from wlm.ops.tensors import check, check_finite, dense, on_stream, optional_arra
 from wlm_kernels.smoke import single_scatter
 from wlm_kernels.smoke.march import nodes_along
 
-__all__ = ["march"]
-
 _UNIT = (0.999, 1.001)  # what a direction's length may be
 
 

@@ -7,8 +7,6 @@ from wlm.interop import to_warp
 from wlm.ops.tensors import check, check_finite, dense, on_stream
 from wlm_kernels.mlp import GELUS, MlpKernels, kernels
 
-__all__ = ["mlp"]
-
 WIDEST = 64
 """Units of a hidden layer: a thread holds a layer in registers, and more would spill."""
 

@@ -10,26 +10,6 @@ from torch.nn.functional import grid_sample, pad
 
 from wlm.ops.raster import Raster
 
-__all__ = [
-    "bc7_map",
-    "bc7_texels",
-    "corner_weights",
-    "gaussian_sum",
-    "henyey_greenstein",
-    "interpolate",
-    "march",
-    "mlp",
-    "pixel_centres",
-    "plane",
-    "rasterize",
-    "rasterize_uv",
-    "rotations",
-    "straight_through",
-    "texture",
-    "triplane",
-    "volume",
-]
-
 Tensor = torch.Tensor
 
 

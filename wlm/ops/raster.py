@@ -17,8 +17,6 @@ from wlm_kernels.raster import gradient as raster_gradient
 from wlm_kernels.raster import rasterize as kernels
 from wlm_kernels.raster import texture as texture_kernels
 
-__all__ = ["Raster", "interpolate", "rasterize", "rasterize_uv", "texture"]
-
 
 @dataclass(frozen=True)
 class Raster:

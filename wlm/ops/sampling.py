@@ -14,8 +14,6 @@ from wlm.interop import to_warp
 from wlm.ops.tensors import check, check_finite, check_index, on_stream, optional_array, zeros_for
 from wlm_kernels import interpolate
 
-__all__ = ["plane", "triplane", "volume"]
-
 REDUCTIONS = ("sum", "product", "concatenate")
 
 

@@ -9,8 +9,6 @@ import warp as wp
 
 from wlm.interop import to_warp
 
-__all__ = ["check", "check_finite", "check_index", "optional_array", "on_stream", "zeros_for"]
-
 Shape = tuple[int | None, ...]
 """Sizes of a tensor's axes; None: any."""
 

@@ -15,8 +15,6 @@ from wlm.formats.bits import pack_bits, unpack_bits
 from wlm.probe.model import LATENT, ProbeModel, Profile, layer_shapes
 from wlm.system import Part, check_parts
 
-__all__ = ["decode", "encode", "pack_dead"]
-
 
 def _parts(profile: Profile, outputs: int) -> dict[str, Part]:
     """The table of parts."""

@@ -36,8 +36,6 @@ import numpy as np
 from wlm.errors import WlmError
 from wlm.probe.sphere import coefficient_bands, cosine_factor, sh_count
 
-__all__ = ["CONVENTIONS", "CANONICAL", "from_canonical", "to_canonical"]
-
 CANONICAL = "threejs"
 CONVENTIONS = (CANONICAL, "godot", "unreal", "unity")
 

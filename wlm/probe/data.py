@@ -51,8 +51,6 @@ from wlm.formats.godot import read_lmbake
 from wlm.probe.conventions import CANONICAL, CONVENTIONS, from_canonical, to_canonical
 from wlm.probe.sphere import sh_count
 
-__all__ = ["LARGEST", "ProbeSet", "from_arrays", "load", "load_positions", "save_probes"]
-
 LARGEST = float(np.sqrt(np.finfo(np.float32).max))
 """The largest number whose square float32 still holds."""
 

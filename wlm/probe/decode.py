@@ -14,8 +14,6 @@ from wlm_kernels.probe import gaussian_sum
 from wlm_kernels.probe import network as probe_network
 from wlm_kernels.probe.decode import decode_kernels
 
-__all__ = ["CULLINGS", "Decoder", "Points"]
-
 Culling = Literal["box", "sphere", "exact", "none"]
 CULLINGS = ("exact", "box", "sphere", "none")
 """How a cube's list of Gaussians is made; see `Decoder`."""

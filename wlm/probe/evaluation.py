@@ -34,8 +34,6 @@ from wlm.probe.sphere import coefficient_bands, fibonacci_sphere, irradiance, sh
 from wlm.system import Meter, OnProgress
 from wlm.system import Report as BaseReport
 
-__all__ = ["NORMALS", "Report", "evaluate", "score"]
-
 # The mean square of any L2 irradiance over these is within 6% of that over the sphere: a score within 0.3 dB.
 NORMALS = 32
 _ROWS = 32768  # of probes in one piece, so that float64 copies stay at some tens of MB

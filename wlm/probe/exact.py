@@ -6,8 +6,6 @@ from scipy.special import expit
 
 from wlm.probe.model import CENTRE, LATENT, ROTATION, SCALE, ProbeModel
 
-__all__ = ["decode64"]
-
 _PAIRS = 1 << 20  # points times Gaussians in one piece: some 100 MB
 _SHORTEST = 1e-12  # of a quaternion that has a direction
 

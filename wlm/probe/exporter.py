@@ -20,19 +20,6 @@ from wlm.probe.model import CENTRE, SCALE, ProbeModel
 from wlm.probe.shader import HEAD_WORDS, gaussian_words, probe_glsl
 from wlm.probe.sphere import sh_count
 
-__all__ = [
-    "FORMAT",
-    "GAUSSIANS_FILE",
-    "INFO_FILE",
-    "NETWORK_FILE",
-    "POSITIONS_FILE",
-    "REFERENCE_FILE",
-    "SHADER_FILE",
-    "export",
-    "gaussian_bytes",
-    "network_bytes",
-]
-
 FORMAT = "wlm-probe-export"
 _VERSION = 1
 INFO_FILE = "probe.json"

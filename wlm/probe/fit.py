@@ -15,8 +15,6 @@ from wlm.probe.model import ProbeModel, Profile
 from wlm.probe.trainer import Trainer
 from wlm.system import Meter, OnProgress
 
-__all__ = ["compress", "open_checkpoint"]
-
 _CHUNK = {"cpu": 5, "cuda": 500}  # steps between two looks at the clock
 
 

@@ -10,8 +10,6 @@ import math
 
 import numpy as np
 
-__all__ = ["ProbeIndex", "morton_keys"]
-
 _BITS = 21  # of a Morton key for each axis: three of them fill 63 bits
 # The grid starts at a multiple of so many cells: boxes of 2, 4 ... 1024 cells that are aligned to the origin of the
 # positions are then cells of the octree themselves, and need one range instead of 8.

@@ -17,17 +17,6 @@ from pydantic import Field, model_validator
 from wlm.errors import WlmError
 from wlm.system import Model, Settings
 
-__all__ = [
-    "CENTRE",
-    "CENTRE_BITS",
-    "LATENT",
-    "ROTATION",
-    "SCALE",
-    "ProbeModel",
-    "Profile",
-    "layer_shapes",
-]
-
 # Channels of a Gaussian, in the order of `ProbeModel.bounds`; the last three groups share `Profile.bits`.
 CENTRE = slice(0, 3)
 SCALE = slice(3, 6)

@@ -3,8 +3,6 @@
 from wlm.probe.model import LATENT, ProbeModel
 from wlm.probe.sphere import sh_count
 
-__all__ = ["HEAD_WORDS", "gaussian_words", "probe_glsl"]
-
 HEAD_WORDS = 10  # of gaussians.bin, in front of the bounds: see _TEMPLATE
 
 

@@ -10,8 +10,6 @@ import math
 
 import numpy as np
 
-__all__ = ["basis", "coefficient_bands", "cosine_factor", "fibonacci_sphere", "irradiance", "radiance", "sh_count"]
-
 _UNIT_TOLERANCE = 1e-3  # of a direction's length; float16 normals are within 6e-4
 
 

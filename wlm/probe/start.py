@@ -5,8 +5,6 @@ from scipy.spatial import cKDTree
 
 from wlm.probe.index import morton_keys
 
-__all__ = ["first_gaussians", "local_spread", "morton_order"]
-
 _MORTON_CELLS = 1023  # along an axis of the unit cube
 _NEIGHBOURS = 9  # that a probe's surroundings are judged by, itself among them
 _PIECE = 4096  # probes at once

@@ -17,8 +17,6 @@ from wlm_kernels.probe.network import CPU_LANES
 from wlm_kernels.probe.optimiser import Optimiser
 from wlm_kernels.probe.step import GROUP
 
-__all__ = ["Trainer"]
-
 _STATE = ("rows", "net", "moments", "net_moments", "bounds", "control", "loss")
 _BOX_MARGIN = 1e-6  # of the unit cube: rounding must not lose a probe at the edge of its group's box
 

@@ -34,8 +34,6 @@ from wlm.errors import WlmError
 from wlm.probe.index import ProbeIndex
 from wlm_kernels.probe import volume as kernels
 
-__all__ = ["BUDGET", "CACHE", "PROBES", "SIDE", "SIZES", "FrameStats", "Reading", "Volume"]
-
 SIZES = (2.0, 4.0, 8.0, 32.0)  # sides of a block, in metres
 SIDE = 16  # blocks along an axis of a window
 BUDGET = 64  # blocks decoded in a frame

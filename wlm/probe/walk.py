@@ -12,8 +12,6 @@ from wlm.errors import WlmError
 from wlm.probe.volume import FrameStats, Volume
 from wlm.system import Meter, OnProgress
 
-__all__ = ["EYE_HEIGHT", "FrameFigures", "camera_path", "summary", "walk"]
-
 EYE_HEIGHT = 1.6  # metres
 
 _LOOP = 0.35  # half axes of the loop over the box's sides: it stays inside, and passes near the rim

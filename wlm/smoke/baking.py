@@ -17,8 +17,6 @@ from wlm.smoke.marching import run
 from wlm_kernels.smoke import march_six
 from wlm_kernels.smoke.settings import March
 
-__all__ = ["bake", "lit"]
-
 
 def bake(
     volume: DensityVolume,

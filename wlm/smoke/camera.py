@@ -18,8 +18,6 @@ import torch
 from wlm.fluid.volume import DensityVolume
 from wlm_kernels.smoke.march import View, make_view
 
-__all__ = ["ALPHA", "DIRECTIONS", "EMISSION", "LAYOUTS", "RULES", "VECTORS", "Camera", "axis_faults", "unit", "weights"]
-
 DIRECTIONS = ("right", "left", "top", "bottom", "front", "back")
 """The order of the lightmaps in all arrays."""
 

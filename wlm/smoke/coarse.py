@@ -16,8 +16,6 @@ from wlm.smoke.marching import run
 from wlm_kernels.smoke import march_coarse
 from wlm_kernels.smoke.settings import March
 
-__all__ = ["march", "march_planes"]
-
 _TRANSPARENCY, _EMISSION = (march_coarse.PLANES.index(name) for name in ("transparency", "emission"))
 
 

@@ -14,8 +14,6 @@ from wlm.formats.artifact import Artifact
 from wlm.smoke.model import NetworkSettings, SixWayNetwork, SmokeModel
 from wlm.system import Part, check_parts, load
 
-__all__ = ["decode", "encode", "open_network", "shipped"]
-
 _SHIPPED = Path(__file__).resolve().parents[1] / "data" / "smoke-six-fast.safetensors"
 
 

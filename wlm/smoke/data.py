@@ -28,21 +28,6 @@ from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.scene import CameraSettings, Scene
 from wlm.system import Meter, OnProgress
 
-__all__ = [
-    "CHECKPOINT",
-    "SCENE_FILE",
-    "Frames",
-    "NumberedFiles",
-    "load",
-    "load_frames",
-    "numbered",
-    "open_frames",
-    "read_six_way",
-    "spread",
-    "write_guide",
-    "write_six_way",
-]
-
 SCENE_FILE = "scene.json"
 CHECKPOINT = "simulation.partial"
 """In the folder of frames, as long as the simulation isn't done."""

@@ -20,8 +20,6 @@ from wlm.smoke.planes import GUIDES, PLANES
 from wlm_kernels.smoke import naf_block
 from wlm_kernels.smoke import planes as smoke_planes
 
-__all__ = ["Decoder"]
-
 _WARMUP = 2
 
 

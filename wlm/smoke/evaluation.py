@@ -34,23 +34,6 @@ from wlm.smoke.model import SmokeModel
 from wlm.smoke.planes import OPACITY_PLANE, PLANES
 from wlm.system import Meter, OnProgress
 
-__all__ = [
-    "DENSITIES",
-    "HALF",
-    "NETWORK",
-    "Comparison",
-    "Contender",
-    "HeldOut",
-    "Method",
-    "Report",
-    "Score",
-    "compare",
-    "evaluate",
-    "of_decoder",
-    "of_network",
-    "score",
-]
-
 Method = Callable[[Pool, slice], torch.Tensor]
 """Predicts planes [n, 2, 8, H, W] of both frames of the samples that a slice takes from a pool; `score` clamps."""
 

@@ -20,8 +20,6 @@ from wlm.formats.exr import read_exr, write_exr
 from wlm.smoke.camera import ALPHA, DIRECTIONS, EMISSION, LAYOUTS
 from wlm.smoke.lightmaps import SixWay
 
-__all__ = ["brightest_gain", "cells", "channels", "pack", "read_flipbook", "unpack", "write_flipbook"]
-
 _SUFFIXES = (".exr", ".png", ".tga")
 _MODES = ("RGB", "RGBA")
 _BAD_FILE = (OSError, ValueError, SyntaxError, EOFError, UnidentifiedImageError, Image.DecompressionBombError)

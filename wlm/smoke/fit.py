@@ -43,8 +43,6 @@ from wlm.smoke.model import Profile, SmokeModel
 from wlm.smoke.planes import PLANES
 from wlm.system import Meter, OnProgress, Progress, load
 
-__all__ = ["Training", "train"]
-
 _CHUNK = 50  # steps between two reports
 _LEAST_SKIPPED = 10
 _MOST_SKIPPED = 0.1  # of a round's steps

@@ -10,8 +10,6 @@ from wlm.smoke.marching import run
 from wlm_kernels.smoke import march_guide
 from wlm_kernels.smoke.settings import March
 
-__all__ = ["Guide", "guide"]
-
 
 @dataclass(frozen=True, eq=False)
 class Guide:

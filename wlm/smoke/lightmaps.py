@@ -15,8 +15,6 @@ import torch
 from wlm.smoke.camera import DIRECTIONS, Camera, weights
 from wlm.smoke.shading import Light, Ramp
 
-__all__ = ["SixWay", "StepError"]
-
 
 @dataclass(frozen=True)
 class StepError:

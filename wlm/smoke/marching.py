@@ -10,8 +10,6 @@ from wlm.interop import device_name, stream, to_warp, torch_memory
 from wlm.smoke.camera import Camera
 from wlm_kernels.smoke.march import Medium
 
-__all__ = ["run"]
-
 
 def run(
     launch: Callable[..., None],

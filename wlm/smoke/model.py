@@ -29,19 +29,6 @@ from wlm.smoke.learn.settings import DatasetSettings, GuideKind, TrainSettings
 from wlm.smoke.planes import GUIDES, PLANES
 from wlm.system import Model, Settings
 
-__all__ = [
-    "ADAPTERS",
-    "EPSILON",
-    "REACH",
-    "NafBlock",
-    "NetworkSettings",
-    "Profile",
-    "SixWayNetwork",
-    "SmokeModel",
-    "parameter_count",
-    "support",
-]
-
 ADAPTERS = (("front", "back"), ("right", "left"), ("top", "bottom"), ("opacity", "emission"))
 """The planes of each adapter."""
 

@@ -13,8 +13,6 @@ from wlm.formats.atomic import atomic_path
 from wlm.smoke.model import SixWayNetwork, SmokeModel
 from wlm.smoke.planes import GUIDES
 
-__all__ = ["export"]
-
 _OPSET = 20
 
 

@@ -13,21 +13,6 @@ from wlm_kernels.smoke import planes as smoke_planes
 from wlm_kernels.smoke.planes import FOOT, FOOT_CODE
 from wlm_kernels.smoke.settings import March
 
-__all__ = [
-    "EMISSION_PLANE",
-    "GUIDES",
-    "OPACITY_PLANE",
-    "PLANES",
-    "VISIBLE",
-    "decode_lightmaps",
-    "encode_guide",
-    "encode_lightmaps",
-    "from_srgb",
-    "render_guide",
-    "span",
-    "to_srgb",
-]
-
 PLANES = (*DIRECTIONS, "opacity", "emission")
 """The planes that the network learns, in order."""
 

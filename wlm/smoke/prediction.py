@@ -13,8 +13,6 @@ from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.model import SmokeModel
 from wlm.smoke.planes import decode_lightmaps, render_guide
 
-__all__ = ["SmokePredictor", "predict"]
-
 _SLACK = 1.25  # the factor by which images may be larger or smaller than those of the training
 _SIZES = 4  # of images whose buffers are kept
 

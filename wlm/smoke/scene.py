@@ -36,21 +36,6 @@ from wlm.fluid.shapes import box, cylinder, sphere
 from wlm.smoke.camera import Camera
 from wlm.smoke.shading import Light, Ramp
 
-__all__ = [
-    "Air",
-    "CameraSettings",
-    "Grid",
-    "Inlet",
-    "LightSettings",
-    "ObstacleSettings",
-    "Scene",
-    "Smoke",
-    "SourceSettings",
-    "load_scene",
-    "make_camera",
-    "obstacle_mesh",
-]
-
 _SHORTEST = 1e-12
 
 

@@ -13,8 +13,6 @@ import torch
 from wlm.ops.raster import rasterize
 from wlm.smoke.camera import Camera, unit
 
-__all__ = ["Light", "Ramp", "obstacle_visibility"]
-
 _SMALLEST_MAP = 8  # texels along an edge, of which four are the empty border
 
 

@@ -15,8 +15,6 @@ from wlm.smoke.shading import Ramp
 from wlm.system import Meter, OnProgress
 from wlm_kernels.smoke.settings import March
 
-__all__ = ["BakedFiles", "FramesToBake", "Shot", "baked_files"]
-
 _SURFACE = March(step=1.0, jitter=0.0)  # of the depth at which obstacles' shadows fall
 
 

@@ -18,8 +18,6 @@ from wlm.smoke.data import CHECKPOINT, Frames
 from wlm.smoke.scene import Inlet, Scene, SourceSettings
 from wlm.system import Meter, OnProgress
 
-__all__ = ["CHECKPOINT_EVERY", "make_solver", "simulate", "volume_of"]
-
 CHECKPOINT_EVERY = 10
 """Frames between two checkpoints."""
 

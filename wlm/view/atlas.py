@@ -15,8 +15,6 @@ from wlm.formats.atomic import atomic_path
 from wlm.interop import check_device
 from wlm.ops import raster
 
-__all__ = ["comparison", "draw", "encode", "original", "save_png", "white_of"]
-
 _WHITE_PERCENTILE = 99.5  # as in `wlm.view.sheet`
 _BACKGROUND = 128  # light and dark surfaces stand out from it
 _MARGIN, _TITLE, _FONT = 6, 26, 16  # pixels

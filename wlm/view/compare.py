@@ -18,8 +18,6 @@ from wlm.metrics import PSNR_CAP_DB, psnr
 from wlm.system import Model, load
 from wlm.view.document import Document, as_picture, white_of
 
-__all__ = ["Comparison", "compare"]
-
 _Path = str | os.PathLike[str]
 
 _GAIN = 8.0  # of differences in pictures

@@ -16,8 +16,6 @@ from PIL import Image
 
 from wlm.formats.atomic import atomic_write
 
-__all__ = ["Document", "as_picture", "white_of"]
-
 _WHITE_PERCENTILE = 99.5  # as in `wlm.view.sheet`
 _WIDTH, _HEIGHT, _DPI = 7.0, 2.6, 160  # inches, dots an inch: sharp on dense screens
 _LINES = ("#c2571a", "#3a6ea5", "#5b8c3a", "#8a5aa8")

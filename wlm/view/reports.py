@@ -23,8 +23,6 @@ from wlm.probe.model import ProbeModel
 from wlm.view.atlas import draw, original
 from wlm.view.document import Document, as_picture, white_of
 
-__all__ = ["atlas_report", "lightmap_report", "probe_report"]
-
 _WORST_TILES, _WORST_PROBES = 3, 10
 _GAIN = 8.0  # of errors in pictures
 _SIDE = 300  # of a picture, in the page's pixels

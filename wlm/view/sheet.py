@@ -14,8 +14,6 @@ from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_path
 from wlm.metrics import PSNR_CAP_DB, psnr
 
-__all__ = ["MAX_COLUMNS", "before_after_error"]
-
 MAX_COLUMNS = 6  # more of them are stamps at the 900 pixels of a README
 
 _WHITE_PERCENTILE = 99.5  # the brightest half percent may clip: a lamp's foot must not darken the picture

@@ -19,17 +19,6 @@ from wlm.smoke.scene import ObstacleSettings, obstacle_mesh
 from wlm.smoke.shading import Light, Ramp, obstacle_visibility
 from wlm.view.atlas import encode, save_png
 
-__all__ = [
-    "MOST_COLUMNS",
-    "contact_sheet",
-    "draw_obstacles",
-    "guide_pictures",
-    "picture",
-    "six_pictures",
-    "to_bytes",
-    "write_sequence",
-]
-
 MOST_COLUMNS = 8
 """Pictures in a row of a contact sheet."""
 

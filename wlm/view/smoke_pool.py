@@ -9,8 +9,6 @@ from wlm.smoke.learn.pool import Pool
 from wlm.smoke.planes import GUIDES, PLANES
 from wlm.view.smoke import MOST_COLUMNS, contact_sheet
 
-__all__ = ["pool_sheet"]
-
 
 def pool_sheet(path: str | os.PathLike[str], pool: Pool, *, columns: int = MOST_COLUMNS) -> tuple[int, ...]:
     """Writes a contact sheet of the later frames, with planes as they are encoded, 1 in white.

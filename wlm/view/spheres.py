@@ -16,8 +16,6 @@ from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_path
 from wlm.probe.sphere import irradiance, radiance, sh_count
 
-__all__ = ["MAX_PROBES", "render_probes"]
-
 MAX_PROBES = 4096  # more of them overlap in a picture's 600 pixels, and take seconds without a GPU
 _SEED = 0  # of the choice among more
 

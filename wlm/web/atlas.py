@@ -15,8 +15,6 @@ from wlm.texels import fill_gaps
 from wlm.web.geometry import Geometry
 from wlm.web.page import Page, pack_rgb9e5
 
-__all__ = ["folder_page"]
-
 _WHITE, _PERCENTILE = 0.8, 99.0  # where that share of the light is on the screen
 
 

@@ -14,8 +14,6 @@ from wlm.errors import WlmError
 from wlm.formats.gltf import read_gltf
 from wlm.formats.obj import read_obj
 
-__all__ = ["Geometry", "read_geometry"]
-
 
 @dataclass(frozen=True, eq=False)
 class Geometry:

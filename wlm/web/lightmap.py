@@ -19,8 +19,6 @@ from wlm.texels import fill_gaps
 from wlm.web.geometry import read_geometry
 from wlm.web.page import Page, pack_rgb9e5
 
-__all__ = ["lightmap_page"]
-
 _LAYERS = ("W1", "b1", "W2", "b2", "W3", "b3")
 _WHITE, _PERCENTILE = 0.8, 99.0  # where that share of the light is on the screen
 

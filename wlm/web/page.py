@@ -17,8 +17,6 @@ import numpy as np
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_write
 
-__all__ = ["Page", "pack_rgb9e5"]
-
 _ALIGNMENT = 16  # bytes, of an array in the content
 _COMMON = ("content.js", "graphics.js", "blocks.js", "camera.js", "panel.js", "light.js", "surface.js")
 _HELP = (

@@ -11,8 +11,6 @@ from wlm.errors import WlmError
 from wlm.system import load
 from wlm.web.page import Page
 
-__all__ = ["make_page", "write_page"]
-
 
 def write_page(path: str | os.PathLike[str], files: Sequence[str | os.PathLike[str]], **options: Any) -> int:
     """Writes a page that shows a file of ours: HTML that needs no network.

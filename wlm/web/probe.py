@@ -18,8 +18,6 @@ from wlm.probe.sphere import irradiance, sh_count
 from wlm.web.geometry import read_geometry
 from wlm.web.page import Page
 
-__all__ = ["probe_page"]
-
 _BANDS = 9  # coefficients that diffuse light needs
 _WHITE, _PERCENTILE = 0.8, 99.0
 _SPHERE = 0.45  # of the median distance between neighbours

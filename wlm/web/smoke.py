@@ -13,8 +13,6 @@ from wlm.smoke.data import read_six_way
 from wlm.smoke.lightmaps import SixWay
 from wlm.web.page import Page
 
-__all__ = ["smoke_page"]
-
 _WHITE = 0.8  # of the screen, where the brightest lightmap is
 
 

@@ -20,8 +20,6 @@ import warp as wp
 
 from wlm_kernels.raster.texture import Axis, add, axis_at, codes, read, read_slope
 
-__all__ = ["corner_points", "image_loss", "pair_loss", "sample", "sample_backward", "surface_points"]
-
 wp.set_module_options({"enable_backward": False})
 
 _LINEAR, _CLAMP = (wp.constant(code) for code in codes("linear", "clamp"))

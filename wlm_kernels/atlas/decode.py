@@ -8,8 +8,6 @@ Read `wlm/atlas/exact.py` first: the same in float64 NumPy.
 
 import warp as wp
 
-__all__ = ["SIDE_BITS", "decode"]
-
 SIDE_BITS = wp.constant(4)
 _SIDE_MASK = wp.constant(15)
 

@@ -25,18 +25,6 @@ from wlm_kernels.atlas.patches import (
     turned,
 )
 
-__all__ = [
-    "Bounds",
-    "Graph",
-    "Rule",
-    "bounds",
-    "count_neighbours",
-    "graph",
-    "mark_neighbours",
-    "remove_neighbours",
-    "rule",
-]
-
 # More than the rounding of a bound in float32: 6e-8 of up to 765 levels, a few dozen times.
 _MARGIN = wp.constant(4.0e-3)
 

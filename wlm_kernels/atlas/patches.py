@@ -27,23 +27,6 @@ import itertools
 import numpy as np
 import warp as wp
 
-__all__ = [
-    "BINS",
-    "ORDERS",
-    "SIZES",
-    "Patch",
-    "bin_numbers",
-    "channel",
-    "compare",
-    "distance_sum",
-    "dominant",
-    "sample",
-    "samples_of",
-    "size_of",
-    "spread",
-    "turned",
-]
-
 ORDERS = tuple(itertools.permutations(range(3)))
 """Permutation p of each order; order 0 is the identity."""
 

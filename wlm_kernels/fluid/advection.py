@@ -62,8 +62,6 @@ from wlm_kernels.fluid.advection_places import (
 )
 from wlm_kernels.fluid.lattice_sets import cell_of, index_of
 
-__all__ = ["STORAGES", "Fields", "advect", "carry_kernel", "correct"]
-
 # Loops over eight cells are for places beside solids: unrolled they would take the registers of all others.
 _OPTIONS = {"enable_backward": False, "max_unroll": 4}
 

@@ -17,26 +17,6 @@ import warp as wp
 
 from wlm_kernels.fluid.lattice_sets import cell_of, index_of
 
-__all__ = [
-    "BRICK",
-    "BRICK_RUN",
-    "CLOSED",
-    "DENSE",
-    "FREE",
-    "OPEN",
-    "PERIODIC",
-    "REACH",
-    "RUN",
-    "SOLID",
-    "Box",
-    "Bricks",
-    "make_box",
-    "make_bricks",
-    "mark_walls",
-    "relist",
-    "rings_for",
-]
-
 wp.set_module_options({"enable_backward": False})
 
 PERIODIC, OPEN, CLOSED = 0, 1, 2

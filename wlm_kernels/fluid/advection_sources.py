@@ -24,8 +24,6 @@ from wlm_kernels.fluid.advection import Fields, fields_struct
 from wlm_kernels.fluid.advection_places import BRICK, DENSE, SOLID, Box, Bricks, is_solid
 from wlm_kernels.fluid.lattice_sets import cell_of, index_of
 
-__all__ = ["BOX", "SPHERE", "add_source", "buoyancy", "change_solids", "empty_retired", "source_kernels"]
-
 _OPTIONS = {"enable_backward": False}
 
 SPHERE, BOX = 0, 1

@@ -35,8 +35,6 @@ import warp as wp
 
 from wlm_kernels.fluid.lattice_sets import STORAGES, cell_of, lattice, memory_functions
 
-__all__ = ["CAUSES", "FORCES", "OPERATORS", "QUIET", "Spec", "eddy_factor", "step_kernel", "trouble_of"]
-
 OPERATORS = ("bgk", "regularised", "recursive")
 FORCES = ("none", "uniform", "field")
 

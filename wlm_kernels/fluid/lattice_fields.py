@@ -21,8 +21,6 @@ from wlm_kernels.fluid.lattice_sets import (
 )
 from wlm_kernels.fluid.lattice_solids import Bodies, body_velocity
 
-__all__ = ["FluidKernels", "fluid_kernels"]
-
 
 @dataclass(frozen=True)
 class FluidKernels:

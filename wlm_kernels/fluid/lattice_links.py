@@ -36,20 +36,6 @@ from wlm_kernels.fluid.lattice_sets import (
 )
 from wlm_kernels.fluid.lattice_solids import Bodies, velocity_at
 
-__all__ = [
-    "BLOCK",
-    "BOUNCE",
-    "INLET",
-    "OUTLET",
-    "PRESSURE",
-    "SLIP",
-    "LinkKernels",
-    "Links",
-    "apply",
-    "find_links",
-    "link_kernels",
-]
-
 wp.set_module_options({"enable_backward": False})
 
 BOUNCE, SLIP, OUTLET, PRESSURE, INLET = range(5)

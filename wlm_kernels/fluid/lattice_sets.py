@@ -16,19 +16,6 @@ from typing import Any
 
 import warp as wp
 
-__all__ = [
-    "HALF_SCALE",
-    "LATTICES",
-    "NARROW",
-    "STORAGES",
-    "VelocitySet",
-    "Tables",
-    "lattice",
-    "memory_functions",
-    "opposite",
-    "tables",
-]
-
 HALF_SCALE = 32768.0
 """16-bit populations are stored times this: +-2 is the range, 1.9e-9 the smallest that keeps all 11 bits."""
 

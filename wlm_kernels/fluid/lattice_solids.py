@@ -10,8 +10,6 @@ import warp as wp
 
 from wlm_kernels.fluid.lattice_sets import cell_of
 
-__all__ = ["Bodies", "body_velocity", "velocity_at", "voxelise_mesh", "voxelise_sphere"]
-
 wp.set_module_options({"enable_backward": False})
 
 # A sign of the distance by rays is wrong where a ray only grazes a triangle; the winding number casts none.

@@ -15,8 +15,6 @@ from wlm_kernels.interpolate import axis_index, cell, fraction
 from wlm_kernels.lightmap.blocks import ste_endpoint, ste_weight
 from wlm_kernels.lightmap.features import Maps, Offsets
 
-__all__ = ["scatters"]
-
 
 @wp.func
 def corner_weights(first: int, second: int, f: float, block: int) -> wp.vec2:

@@ -14,8 +14,6 @@ times). Blocks of the file are `[S, H/4, W/4, 2]` of uint64, the low and the hig
 
 import warp as wp
 
-__all__ = ["quantise", "reconstruct", "reconstruct_backward"]
-
 wp.set_module_options({"enable_backward": False})
 
 

@@ -19,8 +19,6 @@ from wlm_kernels.interpolate import axis_index, cell, fraction
 from wlm_kernels.lightmap.blocks import bits7, byte_mix, index_level, stored_texel
 from wlm_kernels.lightmap.features import CENTRE, STATIC_INPUTS, TEMPORAL_INPUTS
 
-__all__ = ["Stored", "StripKernels", "TimeState", "exact_kernels", "strip_kernels"]
-
 
 @wp.struct
 class Stored:

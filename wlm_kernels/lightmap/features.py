@@ -15,8 +15,6 @@ import warp as wp
 from wlm_kernels.interpolate import axis_index, cell, fraction
 from wlm_kernels.lightmap.blocks import texel
 
-__all__ = ["CENTRE", "STATIC_INPUTS", "TEMPORAL_INPUTS", "Batch", "Maps", "Moment", "Offsets", "Sample"]
-
 TEMPORAL_INPUTS = 16
 STATIC_INPUTS = 4
 CENTRE = wp.constant(3.4641016151377544)  # sqrt(12)

@@ -5,8 +5,6 @@ Read first: `kernels/stepping.py` in the tests, which reads these gradients and 
 
 import warp as wp
 
-__all__ = ["gather_maps", "gather_net"]
-
 
 @wp.func
 def drain(partial: wp.array2d[float], i: int, clear: int) -> float:

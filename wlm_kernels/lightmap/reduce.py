@@ -10,8 +10,6 @@ import warp as wp
 from wlm_kernels import mlp
 from wlm_kernels.native import native_source
 
-__all__ = ["BLOCK", "block_reduction", "reload"]
-
 BLOCK = 128  # threads of a CUDA block; the samples of a tile are a multiple of it there
 
 _SHARED = 46 * 1024  # bytes of shared memory that the staged samples of a block may take

@@ -37,8 +37,6 @@ from wlm_kernels.lightmap.features import (
 )
 from wlm_kernels.lightmap.reduce import BLOCK, block_reduction, reload
 
-__all__ = ["BLOCK", "StepKernels", "step_kernels"]
-
 LAUNCH_BOUNDS = (BLOCK, 2)  # two blocks per multiprocessor leave 255 registers per thread: no spills at width 16
 NOISE = wp.constant(1.0 / 256.0)  # alpha of eq. 6: one step of 8 bits
 

@@ -24,8 +24,6 @@ import warp as wp
 
 from wlm_kernels.probe.gaussians import Shape
 
-__all__ = ["MOST_PAIRS", "TESTS", "Cubes", "build", "cube_of", "everything", "span"]
-
 TESTS = ("box", "sphere", "exact")
 
 # Sorting takes twice as many entries, and Warp counts an array's entries in 31 bits.

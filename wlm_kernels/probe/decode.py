@@ -18,8 +18,6 @@ from wlm_kernels.probe.cubes import Cubes, cube_of
 from wlm_kernels.probe.gaussians import Shape, functions
 from wlm_kernels.probe.network import THREADS, cpu_network, layer_code, probes_at_once
 
-__all__ = ["DecodeKernels", "decode_kernels"]
-
 
 @dataclass(frozen=True)
 class DecodeKernels:

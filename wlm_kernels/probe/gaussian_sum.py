@@ -17,8 +17,6 @@ import warp as wp
 from wlm_kernels.probe.cubes import REACH_MARGIN, Cubes, cube_of, everything, sort_by_cube, span
 from wlm_kernels.probe.gaussians import LATENT, SHAPE_NUMBERS, Shape, functions, shape_of, touches
 
-__all__ = ["SUPPORTS", "backward", "backward_points", "shapes", "sum", "sum_kernels"]
-
 wp.set_module_options({"enable_backward": False})
 
 SUPPORTS = ("ellipsoid", "sphere")

@@ -18,8 +18,6 @@ from typing import Any
 
 import warp as wp
 
-__all__ = ["LATENT", "SHAPE_NUMBERS", "GaussianFunctions", "Shape", "functions", "shape_of", "touches"]
-
 # Where the latent begins in a row, behind centre, log of the scale and rotation.
 LATENT = 10
 SHAPE_NUMBERS = 9  # sums for the gradients of centre (3), scale and rotation (6)

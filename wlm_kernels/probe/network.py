@@ -19,17 +19,6 @@ import warp as wp
 
 from wlm_kernels.native import native_source
 
-__all__ = [
-    "CPU_LANES",
-    "THREADS",
-    "NetworkKernels",
-    "cpu_network",
-    "layer_code",
-    "network_kernels",
-    "padded",
-    "probes_at_once",
-]
-
 THREADS = 128
 _SHARED = 47 * 1024  # bytes of shared memory that a block can have without asking for more
 CPU_LANES = 2

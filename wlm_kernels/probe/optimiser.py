@@ -12,8 +12,6 @@ import warp as wp
 
 from wlm_kernels.probe.gaussians import LATENT, SHAPE_NUMBERS, Shape, functions
 
-__all__ = ["ADAM", "ADAN", "EPSILON", "LOG_SCALES", "Optimiser", "update_kernel"]
-
 # log of the scale, in the normalised frame: a Gaussian can't collapse to nothing nor grow past all use.
 LOG_SCALES = wp.constant(wp.vec2(-9.21, 1.39))  # 1e-4 to 4
 ADAM = wp.constant(wp.vec2(0.9, 0.999))

@@ -22,17 +22,6 @@ from wlm_kernels.native import native_source
 from wlm_kernels.probe.gaussians import LATENT, SHAPE_NUMBERS, Shape, functions, shape_of, touches
 from wlm_kernels.probe.optimiser import update_kernel
 
-__all__ = [
-    "GROUP",
-    "SPLITS",
-    "Groups",
-    "StepKernels",
-    "count_step",
-    "next_bit",
-    "step_kernels",
-    "touch",
-]
-
 GROUP = 64  # probes
 SPLITS = 4  # threads that share a probe's sum on CUDA, where 15,000 probes alone leave most of a GPU idle
 _COLLECTORS = 256  # threads that share a Gaussian's gradient on CUDA: the widest one sets the pace

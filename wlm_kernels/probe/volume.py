@@ -14,8 +14,6 @@ The twin to read first: `tests/reference/volume.py`.
 
 import warp as wp
 
-__all__ = ["NOTHING", "read", "scatter", "unscroll"]
-
 NOTHING = -(2**31)  # each coordinate of what a slot holds that holds no block
 
 _CHUNK = 4  # numbers that a GPU's thread reads: 16 bytes of a row, and 7 threads for a point of 27

@@ -5,30 +5,6 @@
 
 import warp as wp
 
-__all__ = [
-    "MOST_PIXELS",
-    "SPACES",
-    "Box",
-    "Corners",
-    "Edges",
-    "Frame",
-    "box_of",
-    "centre",
-    "check_position",
-    "corners_of",
-    "covers",
-    "edges_at",
-    "edges_of",
-    "exact_sign",
-    "finite",
-    "first_pixel",
-    "frame",
-    "functions",
-    "has_corners",
-    "last_pixel",
-    "total_of",
-]
-
 wp.set_module_options({"enable_backward": False, "max_unroll": 4})
 
 SPACES = ("clip", "uv")

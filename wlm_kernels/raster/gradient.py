@@ -9,8 +9,6 @@ import warp as wp
 
 from wlm_kernels.raster.edges import Frame, centre, check_position, corners_of, frame, functions, has_corners, total_of
 
-__all__ = ["interpolate", "interpolate_backward", "rasterize_backward"]
-
 wp.set_module_options({"enable_backward": False})
 
 _ZERO = wp.constant(wp.float64(0.0))

@@ -49,8 +49,6 @@ from wlm_kernels.raster.edges import (
     total_of,
 )
 
-__all__ = ["MOST_PIXELS", "SPACES", "Raster", "Rasterizer"]
-
 wp.set_module_options({"enable_backward": False, "max_unroll": 4})
 
 # Large triangles are cut into tiles of this side, one thread per tile of 64 pixels.

@@ -19,21 +19,6 @@ Read `wlm/ops/plain.py` first (`texture`): the same by torch's `grid_sample`.
 
 import warp as wp
 
-__all__ = [
-    "BOUNDARIES",
-    "FILTERS",
-    "Axis",
-    "add",
-    "axis_at",
-    "codes",
-    "read",
-    "read_slope",
-    "sample",
-    "sample_backward",
-    "triangle_wave",
-    "triangle_wave_slope",
-]
-
 wp.set_module_options({"enable_backward": False})
 
 BOUNDARIES = ("clamp", "wrap", "mirror")

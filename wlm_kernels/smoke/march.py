@@ -22,33 +22,6 @@ import warp as wp
 
 from wlm_kernels.smoke.settings import March
 
-__all__ = [
-    "BRICK",
-    "NO_BRICKS",
-    "Empty",
-    "MarchParameters",
-    "Medium",
-    "Ray",
-    "View",
-    "absorbed",
-    "clip",
-    "density_at",
-    "make_view",
-    "marched_ray",
-    "node_position",
-    "nodes_along",
-    "occupied",
-    "occupied_kernel",
-    "optical_depth",
-    "parameters",
-    "phase",
-    "point_on",
-    "ray",
-    "sample",
-    "size_of",
-    "steps_along",
-]
-
 Empty = Callable[[tuple[int, ...], Any], wp.array]
 """Makes a buffer, not set, of a shape and a type."""
 

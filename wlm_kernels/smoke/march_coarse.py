@@ -38,8 +38,6 @@ from wlm_kernels.smoke.march import (
 )
 from wlm_kernels.smoke.settings import March
 
-__all__ = ["DEPTH", "PLANES", "coarse_kernels", "coarse_six_way"]
-
 _OPTIONS = {"enable_backward": False}
 
 PLANES = ("right", "left", "top", "bottom", "front", "back", "transparency", "emission", "depth")

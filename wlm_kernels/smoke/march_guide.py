@@ -29,8 +29,6 @@ from wlm_kernels.smoke.march import (
 )
 from wlm_kernels.smoke.settings import March
 
-__all__ = ["guide", "guide_kernels", "lattice"]
-
 _OPTIONS = {"enable_backward": False}
 
 

@@ -27,8 +27,6 @@ from wlm_kernels.smoke.march import (
 )
 from wlm_kernels.smoke.settings import March
 
-__all__ = ["motion", "motion_kernel"]
-
 _OPTIONS = {"enable_backward": False}
 
 # Voxels from the box's faces, nearer to which the trilinear density fades.

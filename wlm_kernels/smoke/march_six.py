@@ -37,8 +37,6 @@ from wlm_kernels.smoke.march import (
 )
 from wlm_kernels.smoke.settings import March
 
-__all__ = ["EMISSION", "TRANSPARENCY", "lit", "six_kernels", "six_way"]
-
 _OPTIONS = {"enable_backward": False}
 
 TRANSPARENCY = 6

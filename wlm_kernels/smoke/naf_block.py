@@ -11,8 +11,6 @@ from typing import Any
 
 import warp as wp
 
-__all__ = ["STRIP", "NafKernels", "kernels", "lane_sum", "lanes"]
-
 STRIP = 4
 """Pixels below each other that one thread of `gate` computes."""
 

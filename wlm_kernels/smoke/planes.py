@@ -17,19 +17,6 @@ import warp as wp
 from wlm_kernels.smoke import march_coarse
 from wlm_kernels.smoke.naf_block import lane_sum
 
-__all__ = [
-    "FOOT",
-    "FOOT_CODE",
-    "LIGHTS",
-    "PLANES",
-    "STRIP",
-    "PlaneKernels",
-    "Taps",
-    "decode",
-    "encode_six",
-    "kernels",
-]
-
 LIGHTS = 6
 """Planes of light, which come first; they may be above 1, the others may not."""
 

@@ -2,8 +2,6 @@
 
 from dataclasses import dataclass
 
-__all__ = ["March"]
-
 _LEAST_STEP = 0.01  # voxels: a march in shorter steps would hardly end
 
 

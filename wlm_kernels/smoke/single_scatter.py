@@ -21,8 +21,6 @@ import warp as wp
 
 from wlm_kernels.smoke.march import absorbed, node_position, point_on, size_of, steps_along
 
-__all__ = ["depths", "depths_backward", "march", "march_backward"]
-
 wp.set_module_options({"enable_backward": False})
 
 # A length that is a whole number of steps mustn't be cut into one more by rounding.

@@ -43,8 +43,6 @@ from wlm.smoke.scene import CameraSettings, Scene, make_camera
 from wlm.smoke.simulation import make_solver, volume_of
 from wlm.system import Meter, OnProgress
 
-__all__ = ["ATTEMPTS", "STAGES", "fixed_cameras", "make_pool", "make_validation", "pool_of_volume"]
-
 ATTEMPTS = 8
 """Scenes drawn for one sequence before it is given up."""
 

@@ -14,8 +14,6 @@ from torch import nn
 from wlm.smoke.learn.settings import LossSettings
 from wlm.smoke.planes import OPACITY_PLANE, PLANES, from_srgb
 
-__all__ = ["Losses", "residual", "temporal", "warp"]
-
 _BITS = 40  # of the largest number in an integer sum; there are 22 more for the sum itself
 _VISIBLE = 0.01  # opacity above which change counts
 

@@ -14,8 +14,6 @@ from wlm.smoke.marching import run
 from wlm_kernels.smoke import march_motion
 from wlm_kernels.smoke.settings import March
 
-__all__ = ["motion"]
-
 _CUTOFF = 1e-3  # of a ray's transparency: smoke behind it hardly counts
 
 

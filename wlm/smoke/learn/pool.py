@@ -13,8 +13,6 @@ from wlm.smoke.learn.settings import DatasetSettings
 from wlm.smoke.planes import GUIDES, OPACITY_PLANE, PLANES, VISIBLE
 from wlm.system import decode
 
-__all__ = ["Pool", "load_pool", "save_pool"]
-
 _SYSTEM = "smoke-pool"
 
 

@@ -21,8 +21,6 @@ from wlm.fluid.solver import LEAST_HALF_LOSS
 from wlm.smoke.learn.settings import EDGE, LATTICE_SPEED, SPEED, DatasetSettings
 from wlm.smoke.scene import Air, Grid, Inlet, ObstacleSettings, Scene, Smoke, SourceSettings
 
-__all__ = ["Tilted", "draw_scene", "generator"]
-
 # Of the air, m^2/s: at the low end the eddies come from the turbulence model, at the high end the smoke is smooth.
 _VISCOSITY = (1.5e-5, 6e-4)
 _RADIUS = (0.055, 0.14)  # of inlets and spheres; at least a cell of the coarsest grid

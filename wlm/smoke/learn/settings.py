@@ -11,8 +11,6 @@ from pydantic_core import PydanticCustomError
 
 from wlm_kernels.smoke.settings import March
 
-__all__ = ["EDGE", "LATTICE_SPEED", "PERIOD", "SPEED", "DatasetSettings", "GuideKind", "LossSettings", "TrainSettings"]
-
 EDGE, SPEED, LATTICE_SPEED = 1.0, 1.0, 0.1
 """The box's edge in metres; the fastest air in metres a second, and the same speed in cells per air step."""
 

@@ -4,8 +4,6 @@ import numpy as np
 
 from wlm.fluid.volume import DensityVolume, from_array
 
-__all__ = ["make_plume"]
-
 _BILLOWS = 160
 _MOST = 1.5  # density
 _HOT = 0.3  # height up to which it is

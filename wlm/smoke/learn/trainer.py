@@ -16,8 +16,6 @@ from wlm.smoke.learn.settings import TrainSettings
 from wlm.smoke.model import NetworkSettings, SixWayNetwork
 from wlm.smoke.planes import GUIDES, OPACITY_PLANE, PLANES, VISIBLE
 
-__all__ = ["Plan", "Trainer", "plan_round"]
-
 _BLOCK = 16  # edge in pixels of the blocks in which crops look for smoke
 
 # Planes that a mirror exchanges: left to right, then upside down.
