@@ -64,8 +64,15 @@ def test_the_version_is_quick_to_tell():
 
 
 def test_help_lists_the_commands():
-    assert {"lightmap", "bench", "doctor"} <= set(call().split())
-    assert {"compress", "decode", "evaluate", "info", "export"} <= set(call("lightmap", "--help").split())
+    systems = {
+        "lightmap": "compress decode evaluate info export",
+        "atlas": "compress decode evaluate info",
+        "probe": "compress decode evaluate info export walk",
+        "smoke": "simulate guide bake shade flipbook",
+    }
+    assert {*systems, "bench", "doctor"} <= set(call().split())
+    for system, commands in systems.items():
+        assert set(commands.split()) <= set(call(system, "--help").split())
 
 
 def test_doctor_names_the_devices_and_the_cache():

@@ -44,11 +44,6 @@ def cascade(inputs, tmp_path_factory):
     return folder / "out"
 
 
-def test_help_lists_the_commands():
-    assert "atlas" in call().split()
-    assert {"compress", "decode", "evaluate", "info"} <= set(call("atlas", "--help").split())
-
-
 def test_compress_prints_one_table(inputs, tmp_path):
     out = tmp_path / "out"
     text = call("atlas", "compress", *inputs, "-o", out, *QUICK)

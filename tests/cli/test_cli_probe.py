@@ -47,12 +47,6 @@ def carrying(room, profile, tmp_path_factory):
     return path
 
 
-def test_help_lists_the_commands():
-    assert "probe" in call().split()
-    commands = {"compress", "decode", "evaluate", "info", "export", "walk"}
-    assert commands <= set(call("probe", "--help").split())
-
-
 def test_compress_prints_one_table(room, profile, tmp_path):
     out = tmp_path / "a.wlm"
     text = call("probe", "compress", room, "-o", out, "--profile", profile)

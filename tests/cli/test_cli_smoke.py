@@ -75,11 +75,6 @@ def png(path):
         return np.asarray(image)
 
 
-def test_help_lists_the_commands():
-    assert "smoke" in call().split()
-    assert {"simulate", "guide", "bake", "shade", "flipbook"} <= set(call("smoke", "--help").split())
-
-
 def test_simulate(jet, tmp_path):
     scene, out = jet / "jet.yaml", tmp_path / "out"
     text = call("smoke", "simulate", scene, "-o", out)

@@ -1,7 +1,5 @@
 """Results beside older ones: what has become worse."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -15,8 +15,6 @@ show what differs between them, and not how good a network gets. The changes:
 Changes that change nothing in a profile are left out.
 """
 
-from __future__ import annotations
-
 import gc
 import statistics
 import time
@@ -146,7 +144,7 @@ def run_rows(
     return rows
 
 
-def _trained_row(bench: Bench, name: str, profile: Profile, samples: _Samples) -> Row:
+def _trained_row(bench: Bench, name: str, profile: Profile, samples: "_Samples") -> Row:
     validation, pools = samples.validation(profile.dataset), samples.pools(profile.dataset, profile.training.rounds)
     bench.note(f"trains {name}")
     network, skipped, seconds, step_ms = _train(profile, pools, bench.device)

@@ -1,7 +1,5 @@
 """What the parts of the networks' benchmark share: sizes, held-out frames, networks, scores."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -117,7 +115,7 @@ class Frame:
         """Both, in order."""
         return self.earlier, self.later
 
-    def scaled(self, factor: float) -> Frame:
+    def scaled(self, factor: float) -> "Frame":
         """The pair with another density."""
         parts = (replace(part, extinction=part.extinction * factor) for part in self.smoke)
         return Frame(*parts, self.motion, self.seed)

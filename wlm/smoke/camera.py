@@ -7,8 +7,6 @@ its light comes from, so that "right" is brighter on the image's right side, "fr
 Unity's local z is minus the billboard's normal: a light behind is +z there, and -z here.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -166,7 +164,7 @@ class Camera:
         width: int,
         world_up: Sequence[float] = (0.0, 1.0, 0.0),
         perspective: bool = False,
-    ) -> Camera:
+    ) -> "Camera":
         """Makes a camera that looks from a position to a target.
 
         Where it looks along `world_up`, "up" is chosen among the axes of the world, the same at every call.
@@ -199,7 +197,7 @@ class Camera:
         distance: float | None = None,
         up: Sequence[float] = (0.0, 1.0, 0.0),
         perspective: bool = False,
-    ) -> Camera:
+    ) -> "Camera":
         """Makes a camera outside smoke that shows all of it.
 
         Args:
@@ -248,7 +246,7 @@ class Camera:
         """A pixel's edge in the world's unit, in perspective at distance 1."""
         return self.extent / self.height
 
-    def finer(self, factor: int) -> Camera:
+    def finer(self, factor: int) -> "Camera":
         """The same view with each pixel cut in factor x factor."""
         return replace(self, height=self.height * factor, width=self.width * factor)
 

@@ -1,7 +1,5 @@
 """Settings of the network's training: samples, losses, optimiser; and the units in which scenes are drawn."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Annotated, Literal
@@ -96,7 +94,7 @@ class DatasetSettings(BaseModel):
     test_seed: int = Field(2027, ge=0)
 
     @model_validator(mode="after")
-    def _check(self) -> DatasetSettings:
+    def _check(self) -> "DatasetSettings":
         if self.least_cells is not None and self.least_cells > self.cells:
             raise PydanticCustomError("range", "least_cells: expected at most cells")
         for name in ("zoom", "density_scales"):
@@ -155,7 +153,7 @@ class LossSettings(BaseModel):
     temporal: float = Field(0.0, ge=0.0)
 
     @model_validator(mode="after")
-    def _check(self) -> LossSettings:
+    def _check(self) -> "LossSettings":
         if not self.parts:
             raise PydanticCustomError("weights", "expected mse or temporal above 0, found 0 for both")
         return self
