@@ -1,12 +1,10 @@
-"""What the commands share: tables, notes, progress, and a Ctrl-C that waits for a whole step."""
+"""What the commands share: tables, notes, and progress."""
 
 import json
 import os
-import signal
 import stat
 import sys
 import tempfile
-import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext
@@ -19,6 +17,7 @@ from rich.progress import BarColumn, TaskProgressColumn, TextColumn
 from rich.progress import Progress as Bar
 from rich.table import Table
 
+from wlm.cli.signals import deferred_interrupt
 from wlm.errors import WlmError
 
 if TYPE_CHECKING:
@@ -26,7 +25,6 @@ if TYPE_CHECKING:
 
 __all__ = [
     "check_output",
-    "deferred_interrupt",
     "escape",
     "note",
     "number",
@@ -204,52 +202,20 @@ def progress_bar(what: str) -> Iterator[Callable[[int, int, str], None]]:
 
 
 @contextmanager
-def deferred_interrupt() -> Iterator[Callable[[], None]]:
-    """Holds the first Ctrl-C back until the work says that it is between two steps.
-
-    An interrupt in the middle of a step would leave half of it done, and a fit that went on from there would not be
-    the fit that was not interrupted. The second one ends the command at once, and nothing is saved.
-
-    Yields:
-        A function to call between steps; it raises KeyboardInterrupt if there was a Ctrl-C.
-    """
-    if threading.current_thread() is not threading.main_thread():
-        # Only the main thread gets signals: here nothing can interrupt.
-        yield lambda: None
-        return
-    asked = False
-
-    def handle(_signal: int, _frame: object) -> None:
-        nonlocal asked
-        if asked:
-            # Not KeyboardInterrupt: that would be saved as if it came between two steps.
-            raise SystemExit(128 + signal.SIGINT)
-        asked = True
-
-    def check() -> None:
-        if asked:
-            raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGINT, handle)
-    try:
-        yield check
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
-@contextmanager
 def running(what: str, checkpoint: Path | None = None, unit: str = "step") -> "Iterator[OnProgress]":
-    """Shows the progress of long work and, where it has a checkpoint, lets Ctrl-C stop it between two steps.
+    """Shows the progress of long work and, where it has a checkpoint, lets a signal stop it between two steps.
+
+    What has to be whole once the work is done, its output above all, is written inside the block too.
 
     Each stage that isn't `what` has a bar of its own, named `what: stage`.
 
     Args:
         what: The work, in a word or two.
-        checkpoint: The file that keeps an interrupted run; None: Ctrl-C ends the work at once.
+        checkpoint: The file that keeps an interrupted run; None: Ctrl-C and SIGTERM end the work at once.
         unit: What the work's progress counts.
 
     Yields:
-        A callback for the work. Once it has been called and Ctrl-C stopped the work, a line says how to go on.
+        A callback for the work. Once it has been called and a signal stopped the work, a line says how to go on.
     """
     last: Any = None
     with deferred_interrupt() if checkpoint is not None else nullcontext(lambda: None) as check_interrupt:
@@ -270,6 +236,7 @@ def running(what: str, checkpoint: Path | None = None, unit: str = "step") -> "I
                     check_interrupt()
 
                 yield report
+            check_interrupt()
         except KeyboardInterrupt:
             if checkpoint is not None and checkpoint.exists():
                 step = f" at {unit} {last.done}" if last is not None else ""

@@ -56,7 +56,7 @@ def compress(
 ) -> None:
     """Compress a lightmap set into one file.
 
-    Ctrl-C keeps the fit in OUT.wlm.partial; the same command with --resume goes on exactly.
+    Ctrl-C and SIGTERM keep the fit in OUT.wlm.partial; the same command with --resume goes on exactly.
     """
     check_output(output, ".wlm")
     quiet_warp()
@@ -77,9 +77,9 @@ def compress(
     start = clock.perf_counter()
     with running("fit", checkpoint.path) as progress:
         model = compress(lightmaps, settings, progress=progress, checkpoint=checkpoint, **options)
-    seconds = clock.perf_counter() - start
-    size = model.save(output)
-    checkpoint.remove()
+        seconds = clock.perf_counter() - start
+        size = model.save(output)
+        checkpoint.remove()
     kinds = ", ".join(f"{count} {kind}" for kind, count in count_kinds(model).items() if count)
     rows = table(model.name, ["file", "bytes", "bpp", "tiles", "seconds"], text=["tiles"])
     # Tiles without a valid texel leave nothing to count.

@@ -71,7 +71,7 @@ def compress(
 ) -> None:
     """Compress a probe set into one file.
 
-    Ctrl-C keeps the fit in OUT.wlm.partial; the same command with --resume goes on exactly.
+    Ctrl-C and SIGTERM keep the fit in OUT.wlm.partial; the same command with --resume goes on exactly.
     """
     check_output(output, ".wlm")
     quiet_warp()
@@ -96,9 +96,9 @@ def compress(
             checkpoint=checkpoint,
             positions=positions,
         )
-    seconds = time.perf_counter() - start
-    size = model.save(output)
-    checkpoint.remove()
+        seconds = time.perf_counter() - start
+        size = model.save(output)
+        checkpoint.remove()
     rows = table(model.name, ["file", "bytes", "of float32", "bits per probe", "Gaussians", "dropped", "seconds"])
     rows.add_row(
         escape(str(output)),

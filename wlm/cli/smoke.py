@@ -60,7 +60,7 @@ def simulate(
 ) -> None:
     """Simulate a scene into a folder of volumes, one a frame.
 
-    Ctrl-C keeps the state in DIR; the same command with --resume goes on to the same frames.
+    Ctrl-C and SIGTERM keep the state in DIR; the same command with --resume goes on to the same frames.
     """
     quiet_warp()
     from wlm.interop import check_device

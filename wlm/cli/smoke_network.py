@@ -59,8 +59,8 @@ def train(
 ) -> None:
     """Train a network on smoke that is simulated as it is needed, and keep the best of its validations.
 
-    Ctrl-C keeps the training in NETWORK.partial; the same command with --resume goes on exactly. The curves are in
-    NETWORK.csv.
+    Ctrl-C and SIGTERM keep the training in NETWORK.partial; the same command with --resume goes on exactly. The curves
+    are in NETWORK.csv.
     """
     check_output(output, ".safetensors")
     quiet_warp()
