@@ -5,7 +5,19 @@ from typing import Annotated
 
 import typer
 
-from wlm.cli.console import check_output, escape, note, number, quiet_warp, running, show, show_json, table, write_json
+from wlm.cli.console import (
+    check_output,
+    escape,
+    exclusive,
+    note,
+    number,
+    quiet_warp,
+    running,
+    show,
+    show_json,
+    table,
+    write_json,
+)
 from wlm.cli.options import AsJson, Device, PageFile, ReportFile, Seed, output_option
 from wlm.errors import WlmError
 
@@ -18,6 +30,7 @@ _VIEWS, _RESOLUTION = 50, 512  # as in `wlm.atlas.evaluation`, which takes long 
 
 
 @app.command()
+@exclusive
 def compress(
     mesh_path: Annotated[Path, typer.Argument(metavar="MESH", help="A .glb, .gltf or .obj file.")],
     lightmap_path: Annotated[Path, typer.Argument(metavar="LIGHTMAP", help="Its lightmap, an EXR.")],

@@ -1,5 +1,6 @@
 """What the commands share: tables, notes, and progress."""
 
+import functools
 import json
 import os
 import stat
@@ -19,6 +20,7 @@ from rich.table import Table
 
 from wlm.cli.signals import deferred_interrupt
 from wlm.errors import WlmError
+from wlm.formats.lock import locked
 
 if TYPE_CHECKING:
     from wlm.system import OnProgress, Progress
@@ -26,6 +28,7 @@ if TYPE_CHECKING:
 __all__ = [
     "check_output",
     "escape",
+    "exclusive",
     "note",
     "number",
     "progress_bar",
@@ -132,6 +135,21 @@ def check_output(path: Path, *suffixes: str) -> None:
         raise WlmError(f"{path}: cannot write: it exists and is not a regular file")
     if not os.access(folder, os.W_OK):
         raise WlmError(f"{path}: cannot write: the folder {folder} is read-only")
+
+
+def exclusive(command: Callable[..., None]) -> Callable[..., None]:
+    """Keeps other processes from writing a command's `output` while it runs, and removes what killed ones left of it.
+
+    Raises:
+        WlmError: Another process is writing it.
+    """
+
+    @functools.wraps(command)
+    def run(**values: Any) -> None:
+        with locked(values["output"]):
+            command(**values)
+
+    return run
 
 
 def quiet_warp() -> None:

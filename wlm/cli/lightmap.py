@@ -9,6 +9,7 @@ import typer
 from wlm.cli.console import (
     check_output,
     escape,
+    exclusive,
     note,
     number,
     quiet_warp,
@@ -40,6 +41,7 @@ _NAMES = {"bc6h": "BC6H", "bc7": "BC7", "astc12": "ASTC 12x12", "astc10": "ASTC 
 
 
 @app.command()
+@exclusive
 def compress(
     set_path: _Set,
     output: Annotated[Path, output_option("OUT.wlm", "The file to write.")],

@@ -9,6 +9,7 @@ import typer
 from wlm.cli.console import (
     check_output,
     escape,
+    exclusive,
     note,
     number,
     quiet_warp,
@@ -50,6 +51,7 @@ _NAMES = {
 
 
 @app.command()
+@exclusive
 def compress(
     probes_path: _Probes,
     output: Annotated[Path, output_option("OUT.wlm", "The file to write.")],

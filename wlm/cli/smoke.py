@@ -6,7 +6,18 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from wlm.cli.console import check_output, escape, note, number, quiet_warp, running, show, show_figures, table
+from wlm.cli.console import (
+    check_output,
+    escape,
+    exclusive,
+    note,
+    number,
+    quiet_warp,
+    running,
+    show,
+    show_figures,
+    table,
+)
 from wlm.cli.options import Device, Resume, output_option
 from wlm.cli.smoke_network import register
 from wlm.cli.smoke_options import (
@@ -48,6 +59,7 @@ _G = Annotated[float, typer.Option(min=-0.99, max=0.99, help="Mean cosine of the
 
 
 @app.command()
+@exclusive
 def simulate(
     scene_name: Annotated[str, typer.Argument(metavar="SCENE", help="jet-sphere, jet-moving, explosion, or a YAML.")],
     output: Annotated[Path, output_option("DIR", "The folder of frames to write.")],
@@ -101,6 +113,7 @@ def simulate(
 
 @app.command()
 @with_smoke
+@exclusive
 def guide(
     smoke: Input,
     output: _Output,
@@ -143,6 +156,7 @@ def guide(
 
 @app.command()
 @with_smoke
+@exclusive
 def bake(
     smoke: Input,
     output: _Output,
@@ -165,6 +179,7 @@ def bake(
 
 @app.command()
 @with_smoke
+@exclusive
 def shade(
     smoke: _Baked,
     output: Annotated[Path, output_option("OUT", "A .png, or for frames a folder.")],

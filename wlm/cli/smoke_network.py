@@ -9,6 +9,7 @@ import typer
 from wlm.cli.console import (
     check_output,
     escape,
+    exclusive,
     note,
     number,
     progress_bar,
@@ -47,6 +48,7 @@ def register(app: typer.Typer) -> None:
         app.command()(command)
 
 
+@exclusive
 def train(
     profile: Annotated[str, typer.Argument(metavar="PROFILE", help="fast, 16, 24, 32, paper, or a YAML file.")],
     output: Annotated[Path, output_option("NETWORK", "The .safetensors to write.")],
@@ -91,6 +93,7 @@ def train(
 
 
 @with_smoke
+@exclusive
 def predict(
     smoke: Input,
     output: Annotated[Path, output_option("OUT", "A .exr, or of frames a folder.")],
@@ -185,6 +188,7 @@ def export(
     show(rows)
 
 
+@exclusive
 def dataset(
     settings_file: Annotated[
         Path, typer.Argument(metavar="SETTINGS", help="A YAML file of dataset settings, each with a default.")

@@ -15,6 +15,7 @@ import numpy as np
 from wlm import __version__
 from wlm.errors import WlmError
 from wlm.formats.artifact import read_artifact, write_artifact
+from wlm.formats.lock import sweep
 
 __all__ = ["SUFFIX", "Checkpoint"]
 
@@ -67,6 +68,8 @@ class Checkpoint:
         self._key: dict[str, Any] = json.loads(json.dumps({**fit, "wlm": __version__}, allow_nan=False))
         self._finished: dict[int, dict[str, np.ndarray]] = {}
         self._running: tuple[int, dict[str, np.ndarray]] | None = None
+        # The run that goes on may end before it saves anything.
+        sweep(Path(os.path.realpath(self.path)))
         if resume and self.path.exists():
             self._read()
             self.resumed = True

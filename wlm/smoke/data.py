@@ -24,6 +24,7 @@ from wlm.fluid.volume import DensityVolume, load_volume
 from wlm.formats.atomic import atomic_write
 from wlm.formats.exr_planes import read_planes, write_planes
 from wlm.formats.folder import claim, read_index
+from wlm.formats.lock import is_passing
 from wlm.smoke.camera import DIRECTIONS, EMISSION, Camera
 from wlm.smoke.guiding import Guide
 from wlm.smoke.lightmaps import SixWay
@@ -208,7 +209,8 @@ class NumberedFiles:
         with _writing(self.folder):
             self.folder.mkdir(exist_ok=True)
             earlier = self._earlier()
-            foreign = next((path for path in sorted(self.folder.iterdir()) if path not in earlier), None)
+            others = (path for path in sorted(self.folder.iterdir()) if path not in earlier)
+            foreign = next((path for path in others if not is_passing(path.name)), None)
         if foreign is not None:
             raise WlmError(f"{folder}: expected an empty folder or one of an earlier run, found {foreign.name}")
 
