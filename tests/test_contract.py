@@ -3,11 +3,13 @@
 import dataclasses
 import json
 import shutil
+from contextlib import suppress
 from pkgutil import iter_modules
 
 import numpy as np
 import pytest
 from builders.contract import SUBJECTS, Subject
+from builders.running import report_always
 
 import wlm
 from wlm.formats.artifact import read_artifact, write_artifact
@@ -26,6 +28,7 @@ def subject(request) -> Subject:
 
 every_file = pytest.mark.parametrize("subject", SUBJECTS, indirect=True)
 every_fit = pytest.mark.parametrize("subject", FITTED, indirect=True)
+every_kept_fit = pytest.mark.parametrize("subject", ["lightmap", "probe"], indirect=True)
 
 
 def one_line(call, *words: str) -> None:
@@ -156,7 +159,7 @@ def test_an_unknown_setting_is_one_line(subject):
     one_line(lambda: subject.compress(subject.data(), nothing=1), "unknown key 'nothing'")
 
 
-@pytest.mark.parametrize("subject", ["lightmap", "probe"], indirect=True)
+@every_kept_fit
 def test_a_stopped_fit_goes_on_to_the_same_bytes(subject, tmp_path, monkeypatch):
     monkeypatch.setattr(Meter, "due", lambda self, done: True)
     data = subject.data()
@@ -171,6 +174,32 @@ def test_a_stopped_fit_goes_on_to_the_same_bytes(subject, tmp_path, monkeypatch)
     checkpoint = subject.open_checkpoint(data, output, True)
     assert checkpoint.resumed and not output.exists()
     subject.compress(data, checkpoint=checkpoint).save(output)
+    assert output.read_bytes() == (tmp_path / "whole.wlm").read_bytes()
+
+
+@every_kept_fit
+def test_a_killed_fit_goes_on_from_its_last_save(subject, tmp_path, monkeypatch):
+    """Nothing is saved on the way out; what was saved before, and how often, changes no byte."""
+    report_always(monkeypatch)
+    data, places, output = subject.data(), [], tmp_path / "part.wlm"
+    subject.compress(data, progress=places.append).save(tmp_path / "whole.wlm")
+    places = [(report.stage, report.done) for report in places]
+
+    def kill(progress):
+        done.append((progress.stage, progress.done))
+        if len(done) == 3:
+            raise ZeroDivisionError
+
+    first = None
+    while True:
+        done = []
+        checkpoint = subject.open_checkpoint(data, output, True, every=0.0)
+        with suppress(ZeroDivisionError):
+            subject.compress(data, progress=kill, checkpoint=checkpoint).save(output)
+            break
+        assert first is None or done[0] == first, "it goes on where it was killed"
+        first = done[-1]
+    assert places.index(first) > len(places) // 2, "it was killed again and again"
     assert output.read_bytes() == (tmp_path / "whole.wlm").read_bytes()
 
 

@@ -29,7 +29,7 @@ class Subject:
         compress: Fits it within seconds; takes the keywords of `compress`.
         evaluate: Scores a model of that data within a second.
         export: Exports a model into a folder.
-        open_checkpoint: Opens a checkpoint of that fit: (output, resume); None: the fit keeps none.
+        open_checkpoint: Opens a checkpoint of that fit: (data, output, resume) and `every`; None: nothing is fitted.
     """
 
     name: str
@@ -40,16 +40,16 @@ class Subject:
     compress: Callable[..., Any] | None = None
     evaluate: Callable[[Any, Any], Any] | None = None
     export: Callable[[Any, Any, Path], list[Path]] | None = None
-    open_checkpoint: Callable[[Any, Path, bool], Any] | None = None
+    open_checkpoint: Callable[..., Any] | None = None
 
 
 def _lightmap() -> Subject:
     profile = small_sets.tiny_profile(steps=40)
 
-    def checkpoint(data: Any, output: Path, resume: bool) -> Any:
+    def checkpoint(data: Any, output: Path, resume: bool, **options: Any) -> Any:
         from wlm.lightmap.fit import open_checkpoint
 
-        return open_checkpoint(output, data, profile, resume=resume)
+        return open_checkpoint(output, data, profile, resume=resume, **options)
 
     return Subject(
         "lightmap",
@@ -67,10 +67,10 @@ def _lightmap() -> Subject:
 def _probe() -> Subject:
     profile = wlm.probe.Profile(name="tiny", ratio=0.1, steps=60, hidden=16, latent=3)
 
-    def checkpoint(data: Any, output: Path, resume: bool) -> Any:
+    def checkpoint(data: Any, output: Path, resume: bool, **options: Any) -> Any:
         from wlm.probe.fit import open_checkpoint
 
-        return open_checkpoint(output, data, profile, resume=resume)
+        return open_checkpoint(output, data, profile, resume=resume, **options)
 
     return Subject(
         "probe",

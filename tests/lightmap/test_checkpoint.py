@@ -97,6 +97,20 @@ def test_what_is_kept_comes_back(tmp_path):
     assert open_checkpoint(tmp_path / "a.wlm", lightmaps, PROFILE, resume=True).running(1) is None
 
 
+def test_it_is_due_a_while_after_the_last_save(tmp_path, monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    checkpoint = open_checkpoint(tmp_path / "a.wlm", moving_light(40, 24), PROFILE, every=2.0)
+    dues = []
+    for now[0] in (101.0, 102.0, 103.0, 104.0, 105.0, 106.0):
+        dues.append(checkpoint.due())
+        if dues[-1]:
+            checkpoint.save_running(0, {"step": np.array(now[0])})
+    assert dues == [False, True, False, True, False, True]
+    checkpoint.add_finished(0, {"uv": np.zeros(4, np.uint8)})
+    assert not checkpoint.due()
+
+
 def test_without_resume_an_old_checkpoint_is_left_out_and_replaced(tmp_path):
     lightmaps = moving_light(40, 24)
     old = open_checkpoint(tmp_path / "a.wlm", lightmaps, PROFILE, seed=1)

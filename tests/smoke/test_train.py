@@ -108,6 +108,31 @@ def test_a_stopped_training_ends_as_if_it_had_not_been(tmp_path, monkeypatch, lo
     assert path.read_bytes() == content and not (tmp_path / "parts.partial").exists()
 
 
+def test_a_killed_training_goes_on_from_its_last_save(tmp_path, monkeypatch):
+    """Killed at every place where it could be, one after the other."""
+    monkeypatch.setattr("wlm.smoke.fit._CHUNK", 2)
+    profile, path, steps = _profile(), tmp_path / "parts", []
+    whole = _train(tmp_path / "whole", profile, seed=1)
+
+    def kill(progress) -> None:
+        steps.append(progress.done)
+        if len(steps) == 2:
+            raise ZeroDivisionError
+
+    starts = []
+    while True:
+        steps.clear()
+        try:
+            training = _train(path, profile, seed=1, resume=True, checkpoint_every=0.0, progress=kill)
+            break
+        except ZeroDivisionError:
+            starts.append(steps[0])
+    # The end of a round is saved before it is reported.
+    assert starts == [2, 4, 8, 10] and not steps
+    assert file_content(path) == file_content(tmp_path / "whole")
+    assert replace(training, seconds=0) == replace(whole, seconds=0)
+
+
 def test_a_training_stopped_in_its_first_pool_is_resumed(tmp_path):
     profile = _profile()
     _train(tmp_path / "whole", profile)

@@ -19,7 +19,17 @@ from wlm.cli.console import (
     table,
     write_json,
 )
-from wlm.cli.options import AsJson, Device, ModelFile, PageFile, ReportFile, Resume, Seed, output_option
+from wlm.cli.options import (
+    AsJson,
+    CheckpointEvery,
+    Device,
+    ModelFile,
+    PageFile,
+    ReportFile,
+    Resume,
+    Seed,
+    output_option,
+)
 
 if TYPE_CHECKING:
     from wlm.baselines.lightmap import Score
@@ -52,13 +62,15 @@ def compress(
     seed: Seed = 0,
     device: Device = "cpu",
     resume: Resume = False,
+    checkpoint_every: CheckpointEvery = 30.0,
     times: _Times = None,
     mask: _Mask = None,
     period: _Period = None,
 ) -> None:
     """Compress a lightmap set into one file.
 
-    Ctrl-C and SIGTERM keep the fit in OUT.wlm.partial; the same command with --resume goes on exactly.
+    The fit is kept in OUT.wlm.partial from time to time, and by Ctrl-C and SIGTERM; the same command with --resume goes
+    on exactly.
     """
     check_output(output, ".wlm")
     quiet_warp()
@@ -73,7 +85,7 @@ def compress(
     lightmaps = _load(set_path, times, mask, period)
     numbers = None if tiles is None else parse_tiles(tiles, TileGrid.of(*lightmaps.mask.shape).count)
     options = {"tiles": numbers, "seed": seed, "device": device}
-    checkpoint = open_checkpoint(output, lightmaps, settings, resume=resume, **options)
+    checkpoint = open_checkpoint(output, lightmaps, settings, resume=resume, every=checkpoint_every, **options)
     if resume and not checkpoint.resumed:
         note(f"{checkpoint.path}: there is nothing to resume; starting at step 0")
     start = clock.perf_counter()

@@ -18,7 +18,7 @@ from wlm.cli.console import (
     show_figures,
     table,
 )
-from wlm.cli.options import Device, Resume, output_option
+from wlm.cli.options import CheckpointEvery, Device, Resume, output_option
 from wlm.cli.smoke_network import register
 from wlm.cli.smoke_options import (
     SHEET,
@@ -68,11 +68,13 @@ def simulate(
         float, typer.Option(min=0.001, max=100.0, help="Cells along each axis, as a multiple of the scene's.")
     ] = 1.0,
     resume: Resume = False,
+    checkpoint_every: CheckpointEvery = 30.0,
     device: Device = "cpu",
 ) -> None:
     """Simulate a scene into a folder of volumes, one a frame.
 
-    Ctrl-C and SIGTERM keep the state in DIR; the same command with --resume goes on to the same frames.
+    The state is kept in DIR from time to time, and by Ctrl-C and SIGTERM; the same command with --resume goes on to the
+    same frames.
     """
     quiet_warp()
     from wlm.interop import check_device
@@ -97,7 +99,8 @@ def simulate(
             figures.update(now.figures)
             report(now)
 
-        first = simulate(folder, solver=solver, resume=resume, progress=progress)
+        options = {"resume": resume, "checkpoint_every": checkpoint_every}
+        first = simulate(folder, solver=solver, progress=progress, **options)
     if resume and first == 1:
         note(f"{output}: there was nothing to resume; started at frame 1")
     rows = [

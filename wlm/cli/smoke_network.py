@@ -19,7 +19,7 @@ from wlm.cli.console import (
     table,
     write_json,
 )
-from wlm.cli.options import Device, ReportFile, Resume, Seed, output_option
+from wlm.cli.options import CheckpointEvery, Device, ReportFile, Resume, Seed, output_option
 from wlm.cli.smoke_options import Input, SmokeOptions, with_smoke, write_lightmaps
 from wlm.errors import WlmError
 
@@ -56,13 +56,14 @@ def train(
         float | None, typer.Option(min=0.0, help="After which it stops and can be resumed; default at its end.")
     ] = None,
     resume: Resume = False,
+    checkpoint_every: CheckpointEvery = 30.0,
     seed: Seed = 0,
     device: Device = "cpu",
 ) -> None:
     """Train a network on smoke that is simulated as it is needed, and keep the best of its validations.
 
-    Ctrl-C and SIGTERM keep the training in NETWORK.partial; the same command with --resume goes on exactly. The curves
-    are in NETWORK.csv.
+    The training is kept in NETWORK.partial from time to time, and by Ctrl-C and SIGTERM; the same command with --resume
+    goes on exactly. The curves are in NETWORK.csv.
     """
     check_output(output, ".safetensors")
     quiet_warp()
@@ -75,6 +76,7 @@ def train(
     if resume and not checkpoint.exists() and not output.exists():
         note(f"{checkpoint}: there is nothing to resume; starting at step 0")
     options = {"seed": seed, "device": device, "minutes": minutes, "resume": resume}
+    options["checkpoint_every"] = checkpoint_every
     with running("train", checkpoint) as progress:
         training = fit(settings, output, progress=progress, **options)
     if not training.finished:

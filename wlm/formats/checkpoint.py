@@ -1,4 +1,4 @@
-"""Where an interrupted fit is kept: finished batches as they will be stored, and the running one's exact state.
+"""Where a fit is kept while it runs: finished batches as they will be stored, and the running one's exact state.
 
 One file beside the output, an artifact of its own system, so that it is written whole or not at all and every byte
 of it is checked when it is read. It names what the fit depends on, and goes on with no other fit.
@@ -6,6 +6,7 @@ of it is checked when it is read. It names what the fit depends on, and goes on 
 
 import json
 import os
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -17,9 +18,11 @@ from wlm.errors import WlmError
 from wlm.formats.artifact import read_artifact, write_artifact
 from wlm.formats.lock import sweep
 
-__all__ = ["SUFFIX", "Checkpoint"]
+__all__ = ["EVERY", "SUFFIX", "Checkpoint"]
 
 SUFFIX = ".partial"
+EVERY = 30.0
+"""Seconds between two saves of running work: what a killed process loses at most, beside the step that it was in."""
 
 _FINISHED, _RUNNING = "finished", "running"
 
@@ -44,6 +47,7 @@ class Checkpoint:
         source: str,
         *,
         resume: bool = False,
+        every: float = EVERY,
     ) -> None:
         """Opens the checkpoint of a fit.
 
@@ -55,6 +59,7 @@ class Checkpoint:
             source: A hash of the input, one ASCII word.
             resume: Whether to go on from the file, if there is one. Otherwise it is ignored, and replaced at the
                 first save.
+            every: Seconds from one save to the next, at least 0; see `due`.
 
         Raises:
             WlmError: With `resume`: the file is damaged, or of another fit; the line names what differs.
@@ -68,6 +73,7 @@ class Checkpoint:
         self._key: dict[str, Any] = json.loads(json.dumps({**fit, "wlm": __version__}, allow_nan=False))
         self._finished: dict[int, dict[str, np.ndarray]] = {}
         self._running: tuple[int, dict[str, np.ndarray]] | None = None
+        self._every, self._saved = every, time.monotonic()
         # The run that goes on may end before it saves anything.
         sweep(Path(os.path.realpath(self.path)))
         if resume and self.path.exists():
@@ -81,6 +87,10 @@ class Checkpoint:
     def running(self, number: int) -> dict[str, np.ndarray] | None:
         """The state of the batch that was running when the fit was stopped, or None if it was another or none."""
         return self._running[1] if self._running is not None and self._running[0] == number else None
+
+    def due(self) -> bool:
+        """Whether the running batch should be saved: since the last save, or the opening, `every` seconds are over."""
+        return time.monotonic() - self._saved >= self._every
 
     def save_running(self, number: int, state: Mapping[str, np.ndarray]) -> None:
         """Writes the state of the running batch, in place of an older one.
@@ -122,6 +132,8 @@ class Checkpoint:
             number, state = self._running
             tensors |= {f"{_RUNNING}.{number}.{key}": value for key, value in state.items()}
         write_artifact(self.path, self.system, {"fit": self._key}, tensors, self._source)
+        # After the writing: on a slow disk the work still goes on for most of the time.
+        self._saved = time.monotonic()
 
     def _read(self) -> None:
         artifact = read_artifact(self.path, self.system)
