@@ -86,7 +86,13 @@ def _probe() -> Subject:
 
 
 def _atlas(kind: str) -> Subject:
-    profile = wlm.atlas.Profile(name="tiny", views=0)
+    settings = {"method": "cascade", "steps": 40, "resolution": 32, "fallback": False} if kind == "cascade" else {}
+    profile = wlm.atlas.Profile(name="tiny", views=0, **settings)
+
+    def checkpoint(data: Any, output: Path, resume: bool, **options: Any) -> Any:
+        from wlm.atlas.fit import open_checkpoint
+
+        return open_checkpoint(output, data, profile, resume=resume, **options)
 
     def decode(model: Any) -> dict[str, np.ndarray]:
         with np.load(FILES / f"atlas-{kind}.npz") as stored:
@@ -102,7 +108,7 @@ def _atlas(kind: str) -> Subject:
         lambda data, **options: wlm.atlas.compress(data, profile, **options),
         lambda model, data: wlm.atlas.evaluate(model, data, views=2, resolution=32),
         lambda model, data, folder: wlm.atlas.export(model, folder, data),
-        None,
+        checkpoint,
     )
 
 

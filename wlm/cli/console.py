@@ -257,8 +257,10 @@ def running(what: str, checkpoint: Path | None = None, unit: str = "step") -> "I
             check_interrupt()
         except KeyboardInterrupt:
             if checkpoint is not None and checkpoint.exists():
-                step = f" at {unit} {last.done}" if last is not None else ""
-                note(f"stopped{step}: the same command with --resume goes on from {checkpoint}")
+                place = ""
+                if last is not None:
+                    place = f" at {unit} {last.done}" if last.stage == what else f" in {last.stage}"
+                note(f"stopped{place}: the same command with --resume goes on from {checkpoint}")
             raise
 
 
