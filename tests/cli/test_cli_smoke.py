@@ -3,6 +3,7 @@ import math
 import os
 import re
 import signal
+from importlib import import_module
 
 import numpy as np
 import pytest
@@ -279,6 +280,47 @@ def test_hard_scenes(case, tmp_path):
     if case == "hot":
         rows = last.density.sum((0, 2)) * torch.arange(last.shape[1])
         assert float(rows.sum() / last.density.sum()) > 0.4 / last.voxel, "it rises"
+
+
+@pytest.mark.parametrize(
+    ("words", "place", "stem", "other"),
+    [
+        (["bake", "--step", 1], "wlm.smoke.baking.bake", "six", ["--step", 2]),
+        (["guide"], "wlm.smoke.guiding.guide", "guide", ["--seed", 7]),
+        (["predict", "--coarse"], "wlm.smoke.coarse.march", "six", ["--seed", 7]),
+    ],
+)
+def test_frames_that_were_made_are_not_made_again(words, place, stem, other, frames, tmp_path, monkeypatch):
+    words = ["smoke", words[0], frames, *words[1:], "--resolution", 8]
+    whole, out = tmp_path / "whole", tmp_path / "out"
+    call(*words, "-o", whole)
+    (module, _, name), made = place.rpartition("."), []
+    make = getattr(import_module(module), name)
+
+    def interrupted(*args, **options):
+        made.append(1)
+        if len(made) == 3:
+            raise KeyboardInterrupt
+        return make(*args, **options)
+
+    monkeypatch.setattr(place, interrupted)
+    call(*words, "-o", out, code=130)
+    assert f"stopped at frame 2: the same command with --resume goes on from {out / stem}.partial" in call.stderr
+    names = [f"{stem}_0001.exr", f"{stem}_0002.exr", f"{stem}.partial"]
+    assert sorted(os.listdir(out)) == sorted(names)
+    before = [(out / name).stat().st_mtime_ns for name in names[:2]]
+    for change, says in ((other, f"{stem}.partial: of another run, whose"), (["--turn", 5], "whose camera differs")):
+        assert says in fails(*words, *change, "-o", out, "--resume")
+    call(*words, "-o", out, "--resume")
+    assert len(made) == 4 and "2 frames are there" in call.stderr
+    assert [(out / name).stat().st_mtime_ns for name in names[:2]] == before
+    assert sorted(os.listdir(out)) == sorted(os.listdir(whole))
+    for path in whole.iterdir():
+        assert path.read_bytes() == (out / path.name).read_bytes()
+    call(*words, "-o", out, "--resume")
+    assert len(made) == 7 and "there is nothing to resume" in call.stderr
+    line = fails(*words[:2], frames / "frame_0001.npz", "-o", tmp_path / "a.exr", "--resume")
+    assert "--resume: expected a folder of frames" in line
 
 
 def test_guide(volume, tmp_path):

@@ -220,7 +220,9 @@ def progress_bar(what: str) -> Iterator[Callable[[int, int, str], None]]:
 
 
 @contextmanager
-def running(what: str, checkpoint: Path | None = None, unit: str = "step") -> "Iterator[OnProgress]":
+def running(
+    what: str, checkpoint: Path | None = None, unit: str = "step", *, whole: bool = True
+) -> "Iterator[OnProgress]":
     """Shows the progress of long work and, where it has a checkpoint, lets a signal stop it between two steps.
 
     What has to be whole once the work is done, its output above all, is written inside the block too.
@@ -231,12 +233,14 @@ def running(what: str, checkpoint: Path | None = None, unit: str = "step") -> "I
         what: The work, in a word or two.
         checkpoint: The file that keeps an interrupted run; None: Ctrl-C and SIGTERM end the work at once.
         unit: What the work's progress counts.
+        whole: Whether a signal waits for the end of a step; what is written at the end of each can do without.
 
     Yields:
         A callback for the work. Once it has been called and a signal stopped the work, a line says how to go on.
     """
     last: Any = None
-    with deferred_interrupt() if checkpoint is not None else nullcontext(lambda: None) as check_interrupt:
+    hold = checkpoint is not None and whole
+    with deferred_interrupt() if hold else nullcontext(lambda: None) as check_interrupt:
         try:
             with ExitStack() as bars:
                 bar = bars.enter_context(progress_bar(what))
@@ -259,7 +263,7 @@ def running(what: str, checkpoint: Path | None = None, unit: str = "step") -> "I
             if checkpoint is not None and checkpoint.exists():
                 place = ""
                 if last is not None:
-                    place = f" at {unit} {last.done}" if last.stage == what else f" in {last.stage}"
+                    place = f" at {unit} {last.done}" if last.stage in (what, f"{unit}s") else f" in {last.stage}"
                 note(f"stopped{place}: the same command with --resume goes on from {checkpoint}")
             raise
 

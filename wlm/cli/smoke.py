@@ -1,5 +1,6 @@
 """`wlm smoke`: simulate smoke, render guiding maps, bake six-way lightmaps, light them, pack them for an engine."""
 
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -24,7 +25,7 @@ from wlm.cli.smoke_options import (
     SHEET,
     Input,
     SmokeOptions,
-    marched,
+    march_frames,
     outputs,
     vector,
     with_smoke,
@@ -34,8 +35,10 @@ from wlm.errors import WlmError
 from wlm_kernels.smoke.settings import March
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
+    from wlm.fluid.volume import DensityVolume
+    from wlm.smoke.camera import Camera
     from wlm.smoke.shading import Light
     from wlm.smoke.shots import BakedFiles, FramesToBake, Shot
     from wlm.system import OnProgress
@@ -131,8 +134,12 @@ def guide(
     ] = March.threshold,
     g: _G = March.g,
     perspective: Annotated[bool, typer.Option("--perspective", help="Rays meet in the eye.")] = False,
+    resume: Resume = False,
 ) -> None:
-    """Make guiding maps: light, transparency and depth, by a march in large steps (algorithm 1)."""
+    """Make guiding maps: light, transparency and depth, by a march in large steps (algorithm 1).
+
+    Of frames, those done are kept when it is stopped; the same command with --resume makes the others.
+    """
     quiet_warp()
     from wlm.smoke.data import write_guide
     from wlm.smoke.guiding import guide
@@ -141,7 +148,8 @@ def guide(
     frames = options.open(smoke)
     camera = options.camera(frames, orthographic=False, perspective=perspective)
     rows = table(str(smoke), ["file", "covered", "mean light", "nearest", "farthest"])
-    for file, volume, view in marched(frames, camera, output, "guide"):
+
+    def make(file: "Callable[[], Path]", volume: "DensityVolume", view: "Camera") -> None:
         maps = guide(volume, view, march)
         path = file()
         write_guide(path, maps)
@@ -154,6 +162,8 @@ def guide(
             number(float(depth.min()) if len(depth) else None, ".4g"),
             number(float(depth.max()) if len(depth) else None, ".4g"),
         )
+
+    march_frames(frames, camera, output, "guide", make, asdict(march), resume=resume)
     show(rows)
 
 
@@ -167,17 +177,20 @@ def bake(
     step: Annotated[float, typer.Option(min=0.01, max=1000.0, help="The longest step in voxels.")] = 0.5,
     supersample: Annotated[int, typer.Option(min=1, max=16, help="Rays along a pixel's edge.")] = 1,
     g: _G = March.g,
+    resume: Resume = False,
 ) -> None:
     """Make six-way lightmaps by a fine march, and say how far a step twice as long is from them.
 
-    An EXR has the channels right, left, top, bottom, front, back, transparency and, of hot smoke, emission.
+    An EXR has the channels right, left, top, bottom, front, back, transparency and, of hot smoke, emission. Of frames,
+    those done are kept when it is stopped; the same command with --resume makes the others.
     """
     quiet_warp()
     from wlm.smoke.baking import bake
 
     frames = options.open(smoke)
-    make = partial(bake, step=step, g=g, supersample=supersample)
-    write_lightmaps(frames, options.camera(frames), output, make, errors=True)
+    settings = {"step": step, "g": g, "supersample": supersample}
+    make, made = partial(bake, **settings), {"made": "bake"} | settings
+    write_lightmaps(frames, options.camera(frames), output, make, made, resume=resume, errors=True)
 
 
 @app.command()

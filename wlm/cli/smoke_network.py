@@ -114,19 +114,29 @@ def predict(
         ),
     ] = None,
     seed: Seed = 0,
+    resume: Resume = False,
 ) -> None:
     """Make six-way lightmaps by the network, from a guiding map as it was trained with: what bake makes, sooner.
 
-    What is written is as of bake: shade and flipbook take it.
+    What is written is as of bake: shade and flipbook take it. Of frames, those done are kept when it is stopped; the
+    same command with --resume makes the others.
     """
     if coarse and network is not None:
         raise WlmError("--coarse: expected no --network beside it")
     if step is not None and not coarse:
         raise WlmError("--step: expected --coarse beside it: a network looks as it was trained to")
     quiet_warp()
+    from wlm.smoke.codec import open_network
+
     frames = options.open(smoke)
-    make = _coarse(step, seed) if coarse else _predicted(network, seed, frames.device)
-    write_lightmaps(frames, options.camera(frames), output, make)
+    if coarse:
+        made = {"made": "coarse", "step": step, "seed": seed}
+        make = _coarse(step, seed)
+    else:
+        model = open_network(network)
+        made = {"made": "network", "of": dict(model.summary), "seed": seed}
+        make = _predicted(model, seed, frames.device)
+    write_lightmaps(frames, options.camera(frames), output, make, made, resume=resume)
 
 
 def evaluate(
@@ -261,11 +271,11 @@ def _coarse(step: float | None, seed: int) -> "Callable[[DensityVolume, Camera],
     return make
 
 
-def _predicted(path: Path | None, seed: int, device: str) -> "Callable[[DensityVolume, Camera], SixWay]":
+def _predicted(model: "SmokeModel", seed: int, device: str) -> "Callable[[DensityVolume, Camera], SixWay]":
     """Makes lightmaps by a network; notes once where it wasn't trained for the image's size."""
     from wlm.smoke.prediction import SmokePredictor
 
-    predictor, first = SmokePredictor(path, device), True
+    predictor, first = SmokePredictor(model, device), True
 
     def make(volume: "DensityVolume", camera: "Camera") -> "SixWay":
         nonlocal first

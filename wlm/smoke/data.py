@@ -191,8 +191,13 @@ class NumberedFiles:
     """A run's results in a folder, one file per frame, in place of those of an earlier run.
 
     The earlier files are removed when the first new one is about to be written: a run that fails before loses none.
-    Each file is of use by itself, so there is no index, and nothing is staged. A run that can be resumed says what it is
-    in `STEM.partial` as long as it isn't done.
+    Each file is of use by itself, so there is no index, and nothing is staged. As long as it isn't done, a run that can
+    be resumed says in `STEM.partial` what it is.
+
+    Attributes:
+        folder: The folder.
+        partial: The file that says what an unfinished run is.
+        done: Numbers of the results that the run which is resumed has already.
     """
 
     def __init__(
@@ -218,6 +223,7 @@ class NumberedFiles:
         """
         self.folder, self._stem, self._suffix, self._others = Path(folder), stem, suffix, others
         self._cleared = False
+        self.done: frozenset[int] = frozenset()
         self.partial = self.folder / f"{stem}.partial"
         # Compared with what JSON gives back, which has no tuples.
         self._run = None if run is None else json.loads(json.dumps({**run, "wlm": __version__}))
@@ -233,11 +239,7 @@ class NumberedFiles:
             if (field := next((key for key in self._run if earlier.get(key) != self._run[key]), None)) is not None:
                 raise WlmError(f"{self.partial}: of another run, whose {field} differs; start anew without --resume")
             self._cleared = True
-
-    @property
-    def done(self) -> frozenset[int]:
-        """Numbers of the results of the run that is resumed."""
-        return frozenset(numbered(self.folder, self._stem, self._suffix)) if self._cleared else frozenset()
+            self.done = frozenset(numbered(self.folder, stem, suffix))
 
     def finish(self) -> None:
         """Ends the run: there is nothing to resume."""
