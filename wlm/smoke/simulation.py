@@ -15,7 +15,7 @@ from wlm.fluid.faces import FACES
 from wlm.fluid.lattice import Domain, Lattice
 from wlm.fluid.obstacles import Mesh, Obstacle, Sphere, Trajectory
 from wlm.fluid.volume import DensityVolume, save_volume
-from wlm.formats.checkpoint import EVERY
+from wlm.formats.checkpoint import EVERY, Pace
 from wlm.formats.lock import locked
 from wlm.interop import free_memory
 from wlm.smoke.data import CHECKPOINT, Frames
@@ -81,7 +81,7 @@ def simulate(
 ) -> int:
     """Runs a scene and writes its frames.
 
-    The state is saved in the folder every `checkpoint_every` seconds, also within a frame, and when `progress` raises
+    The state is saved in the folder every `checkpoint_every` seconds, within a frame too, and when `progress` raises
     KeyboardInterrupt. Going on from it gives the same frames: on the CPU to the last bit, on a GPU as far as its
     atomic sums come out alike, and with smoke in bricks to their threshold.
 
@@ -135,7 +135,7 @@ def _simulate(
             " found none; start anew without --resume"
         )
     sources, meter = _sources(scene), Meter(progress, "simulate", scene.frames)
-    kept, figures = time.monotonic(), {}
+    pace, figures = Pace(checkpoint_every), {}
     for frame in range(done + 1, scene.frames + 1):
         begin = time.perf_counter()
         for step in range(solver.steps % per_frame, per_frame):
@@ -148,9 +148,9 @@ def _simulate(
                 volume = volume_of(scene, solver)
                 # Before the state: one whose frame is missing would be resumed past it.
                 save_volume(frames.file(frame), volume)
-            if time.monotonic() - kept >= checkpoint_every:
-                solver.save(checkpoint)
-                kept = time.monotonic()
+            if pace.due():
+                with pace.saving():
+                    solver.save(checkpoint)
             try:
                 if last and progress is not None:
                     mass = float(volume.density.double().sum()) * volume.voxel**3
