@@ -127,8 +127,10 @@ def test_a_system_without_locks(tmp_path, monkeypatch):
     with another_process(f"with atomic_path({str(tmp_path / 'a')!r}):"):
         left = os.listdir(tmp_path)
     monkeypatch.setattr(lock, "fcntl", None)
+    before = len(os.listdir("/dev/fd"))
     with locked(tmp_path / "a"), atomic_path(tmp_path / "a") as part:
         part.write_text("a")
+        assert len(os.listdir("/dev/fd")) == before, "Windows renames no file that is open"
     with staged(tmp_path / "out", "index.json", "f", "b".__eq__) as made:
         write_index(made / "index.json", {"format": "f"})
     assert sorted(os.listdir(tmp_path)) == [*left, "a", "out"]

@@ -89,7 +89,8 @@ def temporary(target: Path, *, folder: bool = False) -> Iterator[Path]:
             # Another process may have taken it for a dead one's before it was locked.
             if path.exists():
                 break
-            os.close(handle)
+            if handle is not None:
+                os.close(handle)
         yield path
     finally:
         with suppress(OSError):
@@ -139,17 +140,18 @@ def _acquire(lock: Path, output: str | os.PathLike[str]) -> int | None:
 
 
 def _make(path: Path, folder: bool) -> int | None:
-    """Makes a file or folder and locks it; returns its handle, None of a folder that can't have one."""
+    """Makes a file or folder and locks it; returns the lock's handle, None where there are no locks."""
     if folder:
         path.mkdir()
-        if fcntl is None:
-            return None
-        handle = os.open(path, os.O_RDONLY)
     else:
-        handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
-    if fcntl is not None:
-        with suppress(OSError):
-            fcntl.flock(handle, fcntl.LOCK_EX)
+        os.close(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
+    # Windows renames no file that is open.
+    if fcntl is None:
+        return None
+    handle = None
+    with suppress(OSError):
+        handle = os.open(path, os.O_RDONLY if folder else os.O_RDWR)
+        fcntl.flock(handle, fcntl.LOCK_EX)
     return handle
 
 
