@@ -3,11 +3,13 @@
 import dataclasses
 import json
 import shutil
+from contextlib import suppress
 from pkgutil import iter_modules
 
 import numpy as np
 import pytest
 from builders.contract import SUBJECTS, Subject
+from builders.running import report_always
 
 import wlm
 from wlm.formats.artifact import read_artifact, write_artifact
@@ -26,6 +28,7 @@ def subject(request) -> Subject:
 
 every_file = pytest.mark.parametrize("subject", SUBJECTS, indirect=True)
 every_fit = pytest.mark.parametrize("subject", FITTED, indirect=True)
+every_kept_fit = pytest.mark.parametrize("subject", [*FITTED, "atlas-cascade"], indirect=True)
 
 
 def one_line(call, *words: str) -> None:
@@ -62,6 +65,11 @@ def test_a_profile_is_a_name_a_file_or_itself(name, tmp_path):
     assert profile.load(tmp_path / "mine.yaml").name == "mine"
     one_line(lambda: profile.load("nothing"), "profile 'nothing'", PROFILES[name])
     one_line(lambda: loaded.override({"nothing": 1}), "unknown key 'nothing'")
+
+
+def in_steps(progress) -> bool:
+    """Whether it is the stage that is kept from time to time; others, of atlases, are done again."""
+    return progress.stage in ("fit", "curves") and progress.total > 0
 
 
 @every_file
@@ -156,14 +164,15 @@ def test_an_unknown_setting_is_one_line(subject):
     one_line(lambda: subject.compress(subject.data(), nothing=1), "unknown key 'nothing'")
 
 
-@pytest.mark.parametrize("subject", ["lightmap", "probe"], indirect=True)
+@every_kept_fit
 def test_a_stopped_fit_goes_on_to_the_same_bytes(subject, tmp_path, monkeypatch):
     monkeypatch.setattr(Meter, "due", lambda self, done: True)
     data = subject.data()
     subject.compress(data).save(tmp_path / "whole.wlm")
 
     def stop(progress):
-        raise KeyboardInterrupt
+        if in_steps(progress) and progress.done:
+            raise KeyboardInterrupt
 
     output = tmp_path / "part.wlm"
     with pytest.raises(KeyboardInterrupt):
@@ -171,6 +180,33 @@ def test_a_stopped_fit_goes_on_to_the_same_bytes(subject, tmp_path, monkeypatch)
     checkpoint = subject.open_checkpoint(data, output, True)
     assert checkpoint.resumed and not output.exists()
     subject.compress(data, checkpoint=checkpoint).save(output)
+    assert output.read_bytes() == (tmp_path / "whole.wlm").read_bytes()
+
+
+@every_kept_fit
+def test_a_killed_fit_goes_on_from_its_last_save(subject, tmp_path, monkeypatch):
+    """Nothing is saved on the way out; what was saved before, and how often, changes no byte."""
+    report_always(monkeypatch)
+    data, reports, output = subject.data(), [], tmp_path / "part.wlm"
+    subject.compress(data, progress=reports.append).save(tmp_path / "whole.wlm")
+    places = [report.done for report in reports if in_steps(report)]
+
+    def kill(progress):
+        if in_steps(progress):
+            done.append(progress.done)
+        if len(done) == 3:
+            raise ZeroDivisionError
+
+    first = None
+    while True:
+        done = []
+        checkpoint = subject.open_checkpoint(data, output, True, every=0.0)
+        with suppress(ZeroDivisionError):
+            subject.compress(data, progress=kill, checkpoint=checkpoint).save(output)
+            break
+        assert first in (None, done[0]), "it goes on where it was killed"
+        first = done[-1]
+    assert places.index(first) > len(places) // 2, "it was killed again and again"
     assert output.read_bytes() == (tmp_path / "whole.wlm").read_bytes()
 
 

@@ -27,7 +27,7 @@ class Subject:
         compress: Fits it within seconds; takes the keywords of `compress`.
         evaluate: Scores a model of that data within a second.
         export: Exports a model into a folder.
-        open_checkpoint: Opens a checkpoint of that fit: (output, resume); None: the fit keeps none.
+        open_checkpoint: Opens a checkpoint of that fit: (data, output, resume) and `every`; None: nothing is fitted.
     """
 
     name: str
@@ -38,16 +38,16 @@ class Subject:
     compress: Callable[..., Any] | None = None
     evaluate: Callable[[Any, Any], Any] | None = None
     export: Callable[[Any, Any, Path], list[Path]] | None = None
-    open_checkpoint: Callable[[Any, Path, bool], Any] | None = None
+    open_checkpoint: Callable[..., Any] | None = None
 
 
 def _lightmap() -> Subject:
     profile = small_sets.tiny_profile(steps=40)
 
-    def checkpoint(data: Any, output: Path, resume: bool) -> Any:
+    def checkpoint(data: Any, output: Path, resume: bool, **options: Any) -> Any:
         from wlm.lightmap.fit import open_checkpoint
 
-        return open_checkpoint(output, data, profile, resume=resume)
+        return open_checkpoint(output, data, profile, resume=resume, **options)
 
     return Subject(
         "lightmap",
@@ -65,10 +65,10 @@ def _lightmap() -> Subject:
 def _probe() -> Subject:
     profile = wlm.probe.Profile(name="tiny", ratio=0.1, steps=60, hidden=16, latent=3)
 
-    def checkpoint(data: Any, output: Path, resume: bool) -> Any:
+    def checkpoint(data: Any, output: Path, resume: bool, **options: Any) -> Any:
         from wlm.probe.fit import open_checkpoint
 
-        return open_checkpoint(output, data, profile, resume=resume)
+        return open_checkpoint(output, data, profile, resume=resume, **options)
 
     return Subject(
         "probe",
@@ -84,7 +84,13 @@ def _probe() -> Subject:
 
 
 def _atlas(kind: str) -> Subject:
-    profile = wlm.atlas.Profile(name="tiny", views=0)
+    settings = {"method": "cascade", "steps": 40, "resolution": 32, "fallback": False} if kind == "cascade" else {}
+    profile = wlm.atlas.Profile(name="tiny", views=0, **settings)
+
+    def checkpoint(data: Any, output: Path, resume: bool, **options: Any) -> Any:
+        from wlm.atlas.fit import open_checkpoint
+
+        return open_checkpoint(output, data, profile, resume=resume, **options)
 
     def decode(model: Any) -> dict[str, np.ndarray]:
         with np.load(FILES / f"atlas-{kind}.npz") as stored:
@@ -100,7 +106,7 @@ def _atlas(kind: str) -> Subject:
         lambda data, **options: wlm.atlas.compress(data, profile, **options),
         lambda model, data: wlm.atlas.evaluate(model, data, views=2, resolution=32),
         lambda model, data, folder: wlm.atlas.export(model, folder, data),
-        None,
+        checkpoint,
     )
 
 

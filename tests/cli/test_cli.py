@@ -266,20 +266,21 @@ def test_a_ctrl_c_is_kept_and_resumed_to_the_same_bytes(folder, profile, tmp_pat
     check_a_stop_is_resumed(monkeypatch, tmp_path, words)
 
 
-def test_a_ctrl_c_in_a_terminal_ends_with_130(folder, profile, tmp_path):
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_keeps_the_fit(number, code, folder, profile, tmp_path):
     # Ten thousand times more steps than can be done before the signal comes.
     words = ["lightmap", "compress", folder, "--profile", profile, "--steps", 3_000_000]
-    code = (
+    program = (
         "import sys\nfrom wlm.cli import main\nfrom wlm.cli import console\n"
         "console._PLAIN_REPORTS = 10**7\nmain()\n"  # a line at every report
     )
-    with spawn(*words, "-o", tmp_path / "a.wlm", code=code) as process:
+    with spawn(*words, "-o", tmp_path / "a.wlm", code=program) as process:
         for line in process.stderr:
             if line.startswith("fit: "):
-                process.send_signal(signal.SIGINT)
+                process.send_signal(number)
                 break
         text, errors = process.communicate()
-    assert process.returncode == 130 and text == ""
+    assert process.returncode == code and text == ""
     assert re.search(r"^stopped at step \d+: .* --resume goes on from \S+a\.wlm\.partial$", errors, re.MULTILINE)
     assert "Traceback" not in errors
     assert [path.name for path in tmp_path.iterdir()] == ["a.wlm.partial"]

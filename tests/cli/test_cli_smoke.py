@@ -3,6 +3,7 @@ import math
 import os
 import re
 import signal
+from importlib import import_module
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from PIL import Image
 from wlm.errors import WlmError
 from wlm.fluid.solver import Solver
 from wlm.fluid.volume import from_array, load_volume, save_volume
+from wlm.formats.artifact import read_artifact
 from wlm.formats.exr_planes import read_planes
 from wlm.smoke import simulation
 from wlm.smoke.baking import bake
@@ -24,6 +26,7 @@ from wlm.smoke.exporter import read_flipbook
 from wlm.smoke.guiding import guide
 from wlm.smoke.scene import CameraSettings, LightSettings, Scene, make_camera
 from wlm.smoke.simulation import simulate
+from wlm.system import Meter
 from wlm.view.smoke import picture, to_bytes
 from wlm_kernels.smoke.settings import March
 
@@ -124,8 +127,9 @@ def test_simulate_as_told(jet, tmp_path):
     assert "found other files" in fails("smoke", "simulate", jet / "jet.yaml", "-o", tmp_path)
 
 
-def test_a_simulation_is_stopped_and_resumed(jet, tmp_path, monkeypatch):
-    """Ctrl-C during the second frame keeps it; the rest comes out the same to the last bit."""
+@pytest.mark.parametrize("within", [False, True])
+def test_a_simulation_is_stopped_and_resumed(within, jet, tmp_path, monkeypatch):
+    """Ctrl-C during the second frame keeps it, or what there is of it; the rest comes out the same to the last bit."""
     out, scene = tmp_path / "out", jet / "jet.yaml"
     step, done = Solver.step, []
 
@@ -136,16 +140,20 @@ def test_a_simulation_is_stopped_and_resumed(jet, tmp_path, monkeypatch):
             os.kill(os.getpid(), signal.SIGINT)
 
     per_frame = Scene.model_validate(JET).steps // 2
-    assert per_frame < 9 <= 2 * per_frame
+    assert per_frame < 9 < 2 * per_frame
     monkeypatch.setattr(Solver, "step", interrupted)
+    monkeypatch.setattr(Meter, "due", lambda self, done: within)
     call("smoke", "simulate", scene, "-o", out, code=130)
     monkeypatch.undo()
-    assert f"stopped at frame 2: the same command with --resume goes on from {out / CHECKPOINT}" in call.stderr
-    assert sorted(os.listdir(out)) == ["frame_0001.npz", "frame_0002.npz", "scene.json", CHECKPOINT]
+    whole = ["frame_0001.npz", *["frame_0002.npz"] * (not within)]
+    assert f"stopped at frame {len(whole)}: the same command with --resume goes on from {out}" in call.stderr
+    assert sorted(os.listdir(out)) == [*whole, "scene.json", CHECKPOINT]
     # With another scene it isn't resumed, and nothing is lost by the attempt.
     (tmp_path / "other.yaml").write_text(yaml.safe_dump(JET | {"air": {"viscosity": 1.0}}))
     assert "whose air differs" in fails("smoke", "simulate", tmp_path / "other.yaml", "-o", out, "--resume")
-    call("smoke", "simulate", scene, "-o", out, "--resume")
+    monkeypatch.setattr(Solver, "step", lambda self, steps=1: done.append(1) or step(self, steps))
+    call("smoke", "simulate", scene, "-o", out, "--resume", "--checkpoint-every", 0)
+    assert len(done) == 4 * per_frame, "no step is done twice"
     assert sorted(os.listdir(out)) == [*(f"frame_{i:04d}.npz" for i in range(1, 5)), "scene.json"]
     for number in range(1, 5):
         name = f"frame_{number:04d}.npz"
@@ -158,21 +166,19 @@ def test_a_simulation_is_stopped_and_resumed(jet, tmp_path, monkeypatch):
 
 
 def test_a_blow_up_keeps_the_last_good_state(tmp_path, monkeypatch):
-    monkeypatch.setattr(simulation, "CHECKPOINT_EVERY", 1)
     scene = Scene.model_validate(JET)
-    out = tmp_path / "out"
-    check, calls = Solver.check, []
+    out, check = tmp_path / "out", Solver.check
+    last = 2 * (scene.steps // 2) + 1
 
     def failing(self):
-        calls.append(self.steps)
-        if len(calls) > 4:
+        if self.steps > last:
             raise WlmError("lattice: blew up in step 9 at cell (1, 2, 3): not a number" + self._kept)
         check(self)
 
     monkeypatch.setattr(Solver, "check", failing)
     with pytest.raises(WlmError, match="blew up in step 9"):
-        simulate(open_frames(out, scene))
-    assert (out / CHECKPOINT).exists()
+        simulate(open_frames(out, scene), checkpoint_every=0.0)
+    assert int(read_artifact(out / CHECKPOINT).tensors["lattice.steps"]) == 2 * last
     monkeypatch.undo()
     first = simulate(open_frames(out, scene, resume=True), resume=True)
     assert first == 3 and not (out / CHECKPOINT).exists() and load_frames(out).numbers == (1, 2, 3, 4)
@@ -180,7 +186,6 @@ def test_a_blow_up_keeps_the_last_good_state(tmp_path, monkeypatch):
 
 def test_a_frame_that_cannot_be_written_is_not_resumed_past(tmp_path, monkeypatch):
     """A state is kept after its frame: where the frame isn't there, it is simulated again."""
-    monkeypatch.setattr(simulation, "CHECKPOINT_EVERY", 1)
     scene, out, save = Scene.model_validate(JET), tmp_path / "out", save_volume
 
     def full(path, volume):
@@ -190,7 +195,7 @@ def test_a_frame_that_cannot_be_written_is_not_resumed_past(tmp_path, monkeypatc
 
     monkeypatch.setattr(simulation, "save_volume", full)
     with pytest.raises(WlmError, match="no space left"):
-        simulate(open_frames(out, scene))
+        simulate(open_frames(out, scene), checkpoint_every=0.0)
     monkeypatch.setattr(simulation, "save_volume", save)
     kept = (out / CHECKPOINT).read_bytes()
     # A frame that was lost otherwise can't be made of the state that is kept.
@@ -258,16 +263,59 @@ def test_hard_scenes(case, tmp_path):
         },
     }[case]
     scene = Scene.model_validate(JET | {"obstacles": []} | changed | {"frames": 2})
-    amounts = []
-    simulate(open_frames(tmp_path / "a", scene), progress=lambda progress: amounts.append(progress.figures["smoke"]))
+    reports = []
+    simulate(open_frames(tmp_path / "a", scene), progress=reports.append)
+    # A slow frame has reports of its own, without figures or with those of the last one.
+    amounts = {report.done: report.figures["smoke"] for report in reports if report.figures}
     last = load_frames(tmp_path / "a").load(2)
     assert len(amounts) == 2 and last.warnings == ()
-    assert (amounts[-1] > 0) == (case in ("hot", "bricks of halves"))
+    assert (amounts[2] > 0) == (case in ("hot", "bricks of halves"))
     assert (last.temperature is not None) == (case == "hot")
     assert (last.density.dtype == torch.float16) == (case == "bricks of halves")
     if case == "hot":
         rows = last.density.sum((0, 2)) * torch.arange(last.shape[1])
         assert float(rows.sum() / last.density.sum()) > 0.4 / last.voxel, "it rises"
+
+
+@pytest.mark.parametrize(
+    ("words", "place", "stem", "other"),
+    [
+        (["bake", "--step", 1], "wlm.smoke.baking.bake", "six", ["--step", 2]),
+        (["guide"], "wlm.smoke.guiding.guide", "guide", ["--seed", 7]),
+        (["predict", "--coarse"], "wlm.smoke.coarse.march", "six", ["--seed", 7]),
+    ],
+)
+def test_frames_that_were_made_are_not_made_again(words, place, stem, other, frames, tmp_path, monkeypatch):
+    words = ["smoke", words[0], frames, *words[1:], "--resolution", 8]
+    whole, out = tmp_path / "whole", tmp_path / "out"
+    call(*words, "-o", whole)
+    (module, _, name), made = place.rpartition("."), []
+    make = getattr(import_module(module), name)
+
+    def interrupted(*args, **options):
+        made.append(1)
+        if len(made) == 3:
+            raise KeyboardInterrupt
+        return make(*args, **options)
+
+    monkeypatch.setattr(place, interrupted)
+    call(*words, "-o", out, code=130)
+    assert f"stopped at frame 2: the same command with --resume goes on from {out / stem}.partial" in call.stderr
+    names = [f"{stem}_0001.exr", f"{stem}_0002.exr", f"{stem}.partial"]
+    assert sorted(os.listdir(out)) == sorted(names)
+    before = [(out / name).stat().st_mtime_ns for name in names[:2]]
+    for change, says in ((other, f"{stem}.partial: of another run, whose"), (["--turn", 5], "whose camera differs")):
+        assert says in fails(*words, *change, "-o", out, "--resume")
+    call(*words, "-o", out, "--resume")
+    assert len(made) == 4 and "2 frames are there" in call.stderr
+    assert [(out / name).stat().st_mtime_ns for name in names[:2]] == before
+    assert sorted(os.listdir(out)) == sorted(os.listdir(whole))
+    for path in whole.iterdir():
+        assert path.read_bytes() == (out / path.name).read_bytes()
+    call(*words, "-o", out, "--resume")
+    assert len(made) == 7 and "there is nothing to resume" in call.stderr
+    line = fails(*words[:2], frames / "frame_0001.npz", "-o", tmp_path / "a.exr", "--resume")
+    assert "--resume: expected a folder of frames" in line
 
 
 def test_guide(volume, tmp_path):

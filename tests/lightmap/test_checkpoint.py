@@ -7,7 +7,7 @@ from builders.small_sets import moving_light, static_light, tiny_profile
 
 from wlm.errors import WlmError
 from wlm.formats.artifact import read_artifact, write_artifact
-from wlm.formats.checkpoint import Checkpoint
+from wlm.formats.checkpoint import Checkpoint, Pace
 from wlm.lightmap.data import from_arrays
 from wlm.lightmap.fit import compress, open_checkpoint
 
@@ -95,6 +95,34 @@ def test_what_is_kept_comes_back(tmp_path):
 
     back.add_finished(1, parts)
     assert open_checkpoint(tmp_path / "a.wlm", lightmaps, PROFILE, resume=True).running(1) is None
+
+
+def test_it_is_due_a_while_after_the_last_save(tmp_path, monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    checkpoint = open_checkpoint(tmp_path / "a.wlm", moving_light(40, 24), PROFILE, every=2.0)
+    dues = []
+    for now[0] in (101.0, 102.0, 103.0, 104.0, 105.0, 106.0):
+        dues.append(checkpoint.due())
+        if dues[-1]:
+            checkpoint.save_running(0, {"step": np.array(now[0])})
+    assert dues == [False, True, False, True, False, True]
+    checkpoint.add_finished(0, {"uv": np.zeros(4, np.uint8)})
+    assert not checkpoint.due()
+
+
+@pytest.mark.parametrize(("every", "waits"), [(10.0, [10.0, 10.0, 57.0]), (0.0, [0.0, 0.0, 0.0])])
+def test_saving_takes_a_small_share_of_the_time(every, waits, monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    pace = Pace(every)
+    for seconds, wait in zip((0.25, 3.0, 0.0), waits, strict=True):
+        now[0] += wait - 1e-6 if wait else 0.0
+        assert pace.due() == (wait == 0.0)
+        now[0] += 2e-6
+        assert pace.due()
+        with pace.saving():
+            now[0] += seconds
 
 
 def test_without_resume_an_old_checkpoint_is_left_out_and_replaced(tmp_path):

@@ -23,14 +23,14 @@ On CUDA gradients are added in any order: two fits with one seed differ in the l
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass, fields
 
 import numpy as np
 import torch
 import warp as wp
 
 from wlm import interop
-from wlm.atlas.cluster import Clusters, cluster
+from wlm.atlas.cluster import Clusters, Stats, cluster
 from wlm.atlas.colour import quantise
 from wlm.atlas.data import LightmappedMesh
 from wlm.atlas.model import LUT_STEPS, AtlasModel, Profile
@@ -39,6 +39,7 @@ from wlm.atlas.resize import resize
 from wlm.atlas.stages import Stages
 from wlm.atlas.views import DISTANCE, ZOOM, normalised, sphere_views
 from wlm.errors import WlmError
+from wlm.formats.checkpoint import Checkpoint
 from wlm.formats.exr import HALF_MAX
 from wlm.system import Meter, OnProgress
 from wlm_kernels.atlas import cascade as kernels
@@ -46,6 +47,7 @@ from wlm_kernels.raster import texture as texture_kernels
 from wlm_kernels.raster.rasterize import Rasterizer
 
 _CHUNK = {"cpu": 5, "cuda": 100}  # steps between two looks at the clock
+_MOMENTS = ("step", "exp_avg", "exp_avg_sq")  # of Adam
 _PIXELS_PER_POINT = 4  # of space "uv": about that share of a view's pixels show the mesh
 
 
@@ -78,7 +80,9 @@ def group_triangles(mesh: LightmappedMesh, profile: Profile, stages: Stages) -> 
     # Any number will do for a black lightmap, whose triangles are all alike.
     brightest = float(mesh.lightmap[mesh.mask].max()) or 1.0
     with stages("cluster"):
-        return cluster(
+        if stages.checkpoint is not None and (kept := stages.checkpoint.finished(0)) is not None:
+            return Clusters(**{**kept, "stats": Stats(*map(int, kept["stats"]))})
+        clusters = cluster(
             mesh.uv,
             mesh.triangle,
             mesh.filled,
@@ -89,6 +93,10 @@ def group_triangles(mesh: LightmappedMesh, profile: Profile, stages: Stages) -> 
             device=stages.device,
             progress=stages.progress,
         )
+        if stages.checkpoint is not None:
+            parts = {field.name: getattr(clusters, field.name) for field in fields(Clusters)}
+            stages.checkpoint.add_finished(0, parts | {"stats": np.array(astuple(clusters.stats))})
+        return clusters
 
 
 def fit_cascade(
@@ -114,7 +122,8 @@ def fit_cascade(
     with stages("regenerate"):
         start = initial(*regenerate(mesh, packed, stages.device), profile)
     with stages("fit"):
-        textures = tune(mesh, packed.uv, start, profile, seed=seed, device=stages.device, progress=stages.progress)
+        options = {"device": stages.device, "progress": stages.progress, "checkpoint": stages.checkpoint}
+        textures = tune(mesh, packed.uv, start, profile, seed=seed, **options)
     with stages("write"):
         stored = quantise(textures.colour, profile.colour)
     count = len(mesh.triangle)
@@ -171,6 +180,7 @@ def tune(
     seed: int = 0,
     device: str = "cpu",
     progress: OnProgress | None = None,
+    checkpoint: Checkpoint | None = None,
 ) -> Textures:
     """Tunes a cascade to show the mesh as its lightmap does.
 
@@ -182,6 +192,7 @@ def tune(
         seed: Seed of the cameras or points.
         device: "cpu" or "cuda:N".
         progress: Called about twice a second with the steps done.
+        checkpoint: Where the steps' state is kept, as batch 1.
 
     Returns:
         The tuned cascade.
@@ -194,17 +205,24 @@ def tune(
         step = _Step(mesh, uv, textures, profile, seed, device)
         graph = interop.StepGraph(step, device)
         meter, done = Meter(progress, "fit", profile.steps), 0
+        if checkpoint is not None and (state := checkpoint.running(1)) is not None:
+            done = step.load(state)
         while done < profile.steps:
             count = min(_CHUNK["cpu" if device == "cpu" else "cuda"], profile.steps - done)
             for _ in range(count):
                 graph()
             done += count
-            if progress is None:
-                continue
-            if device != "cpu":
+            if device != "cpu" and not (progress is None and checkpoint is None):
                 torch.cuda.synchronize(device)
             if meter.due(done):
-                meter.report(done)
+                try:
+                    meter.report(done)
+                except KeyboardInterrupt:
+                    if checkpoint is not None:
+                        checkpoint.save_running(1, step.state())
+                    raise
+            if checkpoint is not None and checkpoint.due():
+                checkpoint.save_running(1, step.state())
         tuned = step.textures()
     if not (np.isfinite(tuned.colour).all() and np.isfinite(tuned.lut).all()):
         raise WlmError(f"{mesh.name}: the fit diverged; expected smaller rates than those of {profile.name}")
@@ -287,6 +305,32 @@ class _Step:
         with torch.no_grad():
             self._colour.clamp_(0.0, HALF_MAX / self._unit)
             self._lut.clamp_(0.0, 1.0)
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Everything that later steps depend on."""
+        tensors = {"step": self._step}
+        for group in self._adam.param_groups:
+            for parameter in group["params"]:
+                name = "colour" if parameter is self._colour else "lut"
+                moments = self._adam.state[parameter]
+                tensors |= {name: parameter} | {f"{name}.{key}": moments[key] for key in _MOMENTS}
+        return {name: np.array(value.detach().cpu().numpy()) for name, value in tensors.items()}
+
+    @torch.no_grad()
+    def load(self, state: dict[str, np.ndarray]) -> int:
+        """Goes back to a `state`; returns the number of steps done."""
+        values = {name: torch.from_numpy(np.array(value)) for name, value in state.items()}
+        self._step.copy_(values["step"])
+        for group in self._adam.param_groups:
+            for parameter in group["params"]:
+                name = "colour" if parameter is self._colour else "lut"
+                parameter.copy_(values[name])
+                moments = self._adam.state[parameter]
+                moments["step"] = values[f"{name}.step"].to(parameter.device)
+                for key in _MOMENTS[1:]:
+                    # In the parameter's order of memory: the fused step takes both as they lie there.
+                    moments[key] = torch.zeros_like(parameter).copy_(values[f"{name}.{key}"])
+        return int(values["step"].item())
 
     def textures(self) -> Textures:
         colour, lut = (each.detach().cpu().numpy() for each in (self._colour, self._lut))

@@ -23,6 +23,7 @@ from wlm.atlas.tiles import fit_tiles
 from wlm.atlas.views import corner_weights
 from wlm.atlas.weights import FineGrid, weights
 from wlm.errors import WlmError
+from wlm.formats.checkpoint import EVERY, Checkpoint
 from wlm.ops.raster import texture
 from wlm.system import OnProgress
 
@@ -36,6 +37,7 @@ def compress(
     seed: int = 0,
     device: str = "cpu",
     progress: OnProgress | None = None,
+    checkpoint: Checkpoint | None = None,
     **overrides: Any,
 ) -> AtlasModel:
     """Compresses the lightmap of a mesh.
@@ -46,6 +48,8 @@ def compress(
         seed: Of the random views.
         device: "cpu" or "cuda:N".
         progress: Called as each stage begins, and about twice a second in stages of many steps.
+        checkpoint: From `open_checkpoint` for the same settings, or None: where a running compression is kept, and an
+            interrupted one resumed.
         overrides: Settings that replace the profile's, by name: `budget=0.1`.
 
     Returns:
@@ -54,10 +58,12 @@ def compress(
     Raises:
         WlmError: No such profile or device, a wrong setting, a missing package, or a budget that the smallest model
             exceeds.
+        KeyboardInterrupt: Raised by `progress`, after the checkpoint, if there is one, has been written in a stage that
+            it keeps.
     """
     device = interop.check_device(device)
     profile = Profile.load(profile).override(overrides)
-    stages, grid = Stages(device, progress), FineGrid(mesh, device)
+    stages, grid = Stages(device, progress, checkpoint), FineGrid(mesh, device)
     if profile.method == "cascade":
         model = fit_cascade(mesh, group_triangles(mesh, profile, stages), profile, seed, stages)
     else:
@@ -68,6 +74,42 @@ def compress(
     elif model is None:
         raise WlmError(_NO_ROOM.format(profile.budget, *mesh.mask.shape[::-1]))
     return replace(model, report=model.report | {"seconds": stages.seconds})
+
+
+def open_checkpoint(
+    output: str | os.PathLike[str],
+    mesh: LightmappedMesh,
+    profile: str | os.PathLike[str] | Profile = "standard",
+    *,
+    seed: int = 0,
+    device: str = "cpu",
+    resume: bool = False,
+    every: float = EVERY,
+    **overrides: Any,
+) -> Checkpoint:
+    """Opens the checkpoint of a compression, the file `OUTPUT.partial`.
+
+    It keeps what takes long: of tiles the errors of their sizes, of a cascade the groups of triangles and the state of
+    the fit. The other stages are done again.
+
+    Args:
+        output: The folder that the compression is for.
+        mesh, profile, seed, overrides: As for `compress`: what the compression depends on.
+        device: Only its kind matters: a compression may go on on another GPU.
+        resume: Whether to go on from the file, if there is one.
+        every: Seconds between two saves of a running stage; 0: after every few steps.
+
+    Raises:
+        WlmError: With `resume`: the file is damaged, or of another compression; the line names what differs.
+    """
+    fit = {
+        "input": mesh.source,
+        "profile": Profile.load(profile).override(overrides).model_dump(mode="json"),
+        "seed": int(seed),
+        "device": "cpu" if device == "cpu" else "cuda",
+    }
+    # Resolved: the folder's own name may be `.`.
+    return Checkpoint(os.path.realpath(output), AtlasModel.SYSTEM, fit, mesh.source, resume=resume, every=every)
 
 
 def _better(grid: FineGrid, model: AtlasModel | None, profile: Profile, seed: int) -> AtlasModel:

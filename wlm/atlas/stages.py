@@ -1,24 +1,28 @@
-"""The stages of a compression: reported as they begin, and timed."""
+"""The stages of a compression: reported as they begin, timed, and what takes long in them kept."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 import torch
 
+from wlm.formats.checkpoint import Checkpoint
 from wlm.system import Meter, OnProgress
 
 
 class Stages:
     """Reports and times stages.
 
+    A checkpoint has the stages that take long as batches, by number: 0 is the first of the method's, 1 the second.
+
     Attributes:
         device: "cpu" or "cuda:N".
         progress: The callback, which a stage of many steps calls on its own; or None.
+        checkpoint: What is kept of an interrupted compression; or None.
         seconds: By name, of the stages that are over.
     """
 
-    def __init__(self, device: str, progress: OnProgress | None = None) -> None:
-        self.device, self.progress = device, progress
+    def __init__(self, device: str, progress: OnProgress | None = None, checkpoint: Checkpoint | None = None) -> None:
+        self.device, self.progress, self.checkpoint = device, progress, checkpoint
         self.seconds: dict[str, float] = {}
 
     @contextmanager

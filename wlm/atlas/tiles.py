@@ -33,6 +33,7 @@ from wlm.atlas.model import (
 from wlm.atlas.stages import Stages
 from wlm.atlas.weights import FineGrid, weights
 from wlm.errors import WlmError
+from wlm.formats.checkpoint import Checkpoint
 from wlm.formats.exr import HALF_MAX
 from wlm.system import Meter, OnProgress
 
@@ -93,7 +94,7 @@ def fit_tiles(grid: FineGrid, profile: Profile, seed: int, stages: Stages) -> At
         return None
     with stages("curves"):
         stored = None if profile.colour == "half" else _round_trip(profile.colour)
-        error = curves(tiles, sizes, stored, stages.progress)
+        error = curves(tiles, sizes, stored, stages.progress, stages.checkpoint)
     with stages("allocate"):
         peak = float(np.ptp(mesh.filled[mesh.mask]))
         least = peak**2 * _LEAST_GAIN / (height * width)
@@ -332,6 +333,7 @@ def curves(
     sizes: list[tuple[int, int]],
     stored: Callable[[torch.Tensor], torch.Tensor] | None = None,
     progress: OnProgress | None = None,
+    checkpoint: Checkpoint | None = None,
 ) -> np.ndarray:
     """The error of every tile at every size, float64 [sizes, T].
 
@@ -340,15 +342,27 @@ def curves(
         sizes: nx and ny.
         stored: Maps samples [T, ny, nx, 3] to their values in the file; None: they stay.
         progress: Called with the sizes done.
+        checkpoint: Where the errors of the sizes done are kept, as batch 0.
     """
     rounds = _ROUGH if stored is None else _FINE  # a codec's error deserves an exact solution
     result, meter = np.empty((len(sizes), len(tiles.index))), Meter(progress, "curves", len(sizes))
-    for i, (nx, ny) in enumerate(sizes):
+    kept = None if checkpoint is None else checkpoint.running(0)
+    begin = 0 if kept is None else len(kept["error"])
+    if begin:
+        result[:begin] = kept["error"]
+    for i, (nx, ny) in enumerate(sizes[begin:], begin):
         if meter.due(i):
-            meter.report(i)
+            try:
+                meter.report(i)
+            except KeyboardInterrupt:
+                if checkpoint is not None:
+                    checkpoint.save_running(0, {"error": result[:i]})
+                raise
         for part, piece in _pieces(tiles):
             samples = solve(piece, nx, ny, rounds).clamp(min=0.0)
             result[i, part] = errors(piece, samples if stored is None else stored(samples)).cpu().numpy()
+        if checkpoint is not None and checkpoint.due():
+            checkpoint.save_running(0, {"error": result[: i + 1]})
     return result
 
 

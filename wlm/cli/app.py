@@ -1,7 +1,8 @@
 """The command's root: its groups, its version, and what becomes of an error.
 
 Exit codes: 0 done; 1 the reader of our output went away; 2 bad input or an unwritable output, with one line on
-stderr that starts with `error:`; 130 interrupted by Ctrl-C. Any other exception is a bug and shows its traceback.
+stderr that starts with `error:`; 130 stopped by Ctrl-C; 143 stopped by SIGTERM. Any other exception is a bug and shows
+its traceback.
 
 What takes long to import (torch, Warp) is imported by the commands that need it, so that `wlm --version` answers at
 once.
@@ -9,6 +10,7 @@ once.
 
 import errno
 import os
+import signal
 import sys
 from collections.abc import Sequence
 from typing import Annotated, Any
@@ -18,10 +20,11 @@ from typer.core import TyperGroup
 
 from wlm import __version__
 from wlm.cli import atlas, bench, compare, doctor, lightmap, probe, smoke, web
+from wlm.cli.signals import exit_code, handled
 from wlm.errors import WlmError, one_line
 
 BAD_INPUT = 2
-INTERRUPTED = 130  # 128 and the number of SIGINT, as shells have it
+_INTERRUPTED = 130  # what typer makes of KeyboardInterrupt
 
 # The base of all that the parser says of an argument; typer names only this child of it.
 _UsageError = typer.BadParameter.__base__
@@ -35,7 +38,8 @@ class _Group(TyperGroup):
         extra["standalone_mode"] = False
         try:
             # A returned number is that of an `Exit`, which an interrupt becomes too.
-            sys.exit(super().main(args=args or ["--help"], **extra))
+            code = super().main(args=args or ["--help"], **extra)
+            sys.exit(exit_code() if code == _INTERRUPTED else code)
         except WlmError as error:
             line = str(error)
         except _UsageError as error:
@@ -71,7 +75,12 @@ app.command()(doctor.doctor)
 
 def main() -> None:
     """Runs the command line; the entry point of `wlm`."""
-    app()
+    try:
+        # All is written when it ends: a signal then comes too late to stop anything, and must not change its exit code.
+        with handled(after=signal.SIG_IGN):
+            app()
+    except KeyboardInterrupt:
+        sys.exit(exit_code())
 
 
 def _show_version(wanted: bool) -> None:

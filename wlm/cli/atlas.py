@@ -5,8 +5,20 @@ from typing import Annotated
 
 import typer
 
-from wlm.cli.console import check_output, escape, note, number, quiet_warp, running, show, show_json, table, write_json
-from wlm.cli.options import AsJson, Device, PageFile, ReportFile, Seed, output_option
+from wlm.cli.console import (
+    check_output,
+    escape,
+    exclusive,
+    note,
+    number,
+    quiet_warp,
+    running,
+    show,
+    show_json,
+    table,
+    write_json,
+)
+from wlm.cli.options import AsJson, CheckpointEvery, Device, PageFile, ReportFile, Resume, Seed, output_option
 from wlm.errors import WlmError
 
 app = typer.Typer(help="The lightmap of a mesh: a small colour texture, read through a small table.")
@@ -16,6 +28,7 @@ _VIEWS, _RESOLUTION = 50, 512  # as in `wlm.atlas.evaluation`, which takes long 
 
 
 @app.command()
+@exclusive
 def compress(
     mesh_path: Annotated[Path, typer.Argument(metavar="MESH", help="A .glb, .gltf or .obj file.")],
     lightmap_path: Annotated[Path, typer.Argument(metavar="LIGHTMAP", help="Its lightmap, an EXR.")],
@@ -38,15 +51,21 @@ def compress(
     ] = None,
     seed: Seed = 0,
     device: Device = "cpu",
+    resume: Resume = False,
+    checkpoint_every: CheckpointEvery = 30.0,
 ) -> None:
-    """Compress the lightmap of a mesh into a folder: the model, the mesh, textures for engines, a shader, a report."""
+    """Compress the lightmap of a mesh into a folder: the model, the mesh, textures for engines, a shader, a report.
+
+    What takes long is kept in DIR.partial from time to time, and by Ctrl-C and SIGTERM; the same command with --resume
+    goes on exactly.
+    """
     from wlm.atlas.model import Profile
 
     settings = Profile.load(profile).override({"budget": budget, "colour": colour, "views": views}, "--")
     quiet_warp()
     from wlm.atlas.data import load
     from wlm.atlas.exporter import FORMAT, MODEL_FILE, REPORT_FILE, export
-    from wlm.atlas.fit import compress
+    from wlm.atlas.fit import compress, open_checkpoint
     from wlm.atlas.model import disk_ratio
     from wlm.formats.folder import claim
     from wlm.interop import check_device
@@ -56,16 +75,18 @@ def compress(
     mesh = load(mesh_path, lightmap_path, mask_path=mask, uv_set=uv_set)
     for warning in mesh.warnings:
         note(f"warning: {warning}")
-    with running("compress") as progress:
-        model = compress(mesh, settings, seed=seed, device=device, progress=progress)
+    options = {"seed": seed, "device": device}
+    checkpoint = open_checkpoint(output, mesh, settings, resume=resume, every=checkpoint_every, **options)
+    if resume and not checkpoint.resumed:
+        note(f"{checkpoint.path}: there is nothing to resume; starting at the first stage")
     inputs = {"mesh": mesh_path, "lightmap": lightmap_path, "mask": mask}
-    facts = {
-        "inputs": {name: None if path is None else str(path.resolve()) for name, path in inputs.items()},
-        "seed": seed,
-        "device": device,
-    }
+    facts = {"inputs": {name: None if path is None else str(path.resolve()) for name, path in inputs.items()}}
+    with running("compress", checkpoint.path) as progress:
+        model = compress(mesh, settings, progress=progress, checkpoint=checkpoint, **options)
+        files = export(model, output, mesh, facts | options)
+        checkpoint.remove()
     rows = table(str(output), ["file", "bytes"])
-    for path in export(model, output, mesh, facts):
+    for path in files:
         rows.add_row(escape(path.name), f"{path.stat().st_size:,}")
     rows.add_section()
     rows.add_row("method", model.method)

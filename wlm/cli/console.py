@@ -1,12 +1,11 @@
-"""What the commands share: tables, notes, progress, and a Ctrl-C that waits for a whole step."""
+"""What the commands share: tables, notes, and progress."""
 
+import functools
 import json
 import os
-import signal
 import stat
 import sys
 import tempfile
-import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext
@@ -19,15 +18,17 @@ from rich.progress import BarColumn, TaskProgressColumn, TextColumn
 from rich.progress import Progress as Bar
 from rich.table import Table
 
+from wlm.cli.signals import deferred_interrupt
 from wlm.errors import WlmError
+from wlm.formats.lock import locked
 
 if TYPE_CHECKING:
     from wlm.system import OnProgress, Progress
 
 __all__ = [
     "check_output",
-    "deferred_interrupt",
     "escape",
+    "exclusive",
     "note",
     "number",
     "progress_bar",
@@ -136,6 +137,21 @@ def check_output(path: Path, *suffixes: str) -> None:
         raise WlmError(f"{path}: cannot write: the folder {folder} is read-only")
 
 
+def exclusive(command: Callable[..., None]) -> Callable[..., None]:
+    """Keeps other processes from writing a command's `output` while it runs, and removes what killed ones left of it.
+
+    Raises:
+        WlmError: Another process is writing it.
+    """
+
+    @functools.wraps(command)
+    def run(**values: Any) -> None:
+        with locked(values["output"]):
+            command(**values)
+
+    return run
+
+
 def quiet_warp() -> None:
     """Starts Warp without its banner, its notes on compiling, and its line on a missing GPU driver.
 
@@ -204,55 +220,27 @@ def progress_bar(what: str) -> Iterator[Callable[[int, int, str], None]]:
 
 
 @contextmanager
-def deferred_interrupt() -> Iterator[Callable[[], None]]:
-    """Holds the first Ctrl-C back until the work says that it is between two steps.
+def running(
+    what: str, checkpoint: Path | None = None, unit: str = "step", *, whole: bool = True
+) -> "Iterator[OnProgress]":
+    """Shows the progress of long work and, where it has a checkpoint, lets a signal stop it between two steps.
 
-    An interrupt in the middle of a step would leave half of it done, and a fit that went on from there would not be
-    the fit that was not interrupted. The second one ends the command at once, and nothing is saved.
-
-    Yields:
-        A function to call between steps; it raises KeyboardInterrupt if there was a Ctrl-C.
-    """
-    if threading.current_thread() is not threading.main_thread():
-        # Only the main thread gets signals: here nothing can interrupt.
-        yield lambda: None
-        return
-    asked = False
-
-    def handle(_signal: int, _frame: object) -> None:
-        nonlocal asked
-        if asked:
-            # Not KeyboardInterrupt: that would be saved as if it came between two steps.
-            raise SystemExit(128 + signal.SIGINT)
-        asked = True
-
-    def check() -> None:
-        if asked:
-            raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGINT, handle)
-    try:
-        yield check
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
-@contextmanager
-def running(what: str, checkpoint: Path | None = None, unit: str = "step") -> "Iterator[OnProgress]":
-    """Shows the progress of long work and, where it has a checkpoint, lets Ctrl-C stop it between two steps.
+    What has to be whole once the work is done, its output above all, is written inside the block too.
 
     Each stage that isn't `what` has a bar of its own, named `what: stage`.
 
     Args:
         what: The work, in a word or two.
-        checkpoint: The file that keeps an interrupted run; None: Ctrl-C ends the work at once.
+        checkpoint: The file that keeps an interrupted run; None: Ctrl-C and SIGTERM end the work at once.
         unit: What the work's progress counts.
+        whole: Whether a signal waits for the end of a step; what is written at the end of each can do without.
 
     Yields:
-        A callback for the work. Once it has been called and Ctrl-C stopped the work, a line says how to go on.
+        A callback for the work. Once it has been called and a signal stopped the work, a line says how to go on.
     """
     last: Any = None
-    with deferred_interrupt() if checkpoint is not None else nullcontext(lambda: None) as check_interrupt:
+    hold = checkpoint is not None and whole
+    with deferred_interrupt() if hold else nullcontext(lambda: None) as check_interrupt:
         try:
             with ExitStack() as bars:
                 bar = bars.enter_context(progress_bar(what))
@@ -270,10 +258,13 @@ def running(what: str, checkpoint: Path | None = None, unit: str = "step") -> "I
                     check_interrupt()
 
                 yield report
+            check_interrupt()
         except KeyboardInterrupt:
             if checkpoint is not None and checkpoint.exists():
-                step = f" at {unit} {last.done}" if last is not None else ""
-                note(f"stopped{step}: the same command with --resume goes on from {checkpoint}")
+                place = ""
+                if last is not None:
+                    place = f" at {unit} {last.done}" if last.stage in (what, f"{unit}s") else f" in {last.stage}"
+                note(f"stopped{place}: the same command with --resume goes on from {checkpoint}")
             raise
 
 

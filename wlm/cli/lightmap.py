@@ -9,6 +9,7 @@ import typer
 from wlm.cli.console import (
     check_output,
     escape,
+    exclusive,
     note,
     number,
     quiet_warp,
@@ -18,7 +19,17 @@ from wlm.cli.console import (
     table,
     write_json,
 )
-from wlm.cli.options import AsJson, Device, ModelFile, PageFile, ReportFile, Resume, Seed, output_option
+from wlm.cli.options import (
+    AsJson,
+    CheckpointEvery,
+    Device,
+    ModelFile,
+    PageFile,
+    ReportFile,
+    Resume,
+    Seed,
+    output_option,
+)
 
 if TYPE_CHECKING:
     from wlm.baselines.lightmap import Score
@@ -38,6 +49,7 @@ _NAMES = {"bc6h": "BC6H", "bc7": "BC7", "astc12": "ASTC 12x12", "astc10": "ASTC 
 
 
 @app.command()
+@exclusive
 def compress(
     set_path: _Set,
     output: Annotated[Path, output_option("OUT.wlm", "The file to write.")],
@@ -48,13 +60,15 @@ def compress(
     seed: Seed = 0,
     device: Device = "cpu",
     resume: Resume = False,
+    checkpoint_every: CheckpointEvery = 30.0,
     times: _Times = None,
     mask: _Mask = None,
     period: _Period = None,
 ) -> None:
     """Compress a lightmap set into one file.
 
-    Ctrl-C keeps the fit in OUT.wlm.partial; the same command with --resume goes on exactly.
+    The fit is kept in OUT.wlm.partial from time to time, and by Ctrl-C and SIGTERM; the same command with --resume goes
+    on exactly.
     """
     check_output(output, ".wlm")
     quiet_warp()
@@ -69,15 +83,15 @@ def compress(
     lightmaps = _load(set_path, times, mask, period)
     numbers = None if tiles is None else parse_tiles(tiles, TileGrid.of(*lightmaps.mask.shape).count)
     options = {"tiles": numbers, "seed": seed, "device": device}
-    checkpoint = open_checkpoint(output, lightmaps, settings, resume=resume, **options)
+    checkpoint = open_checkpoint(output, lightmaps, settings, resume=resume, every=checkpoint_every, **options)
     if resume and not checkpoint.resumed:
         note(f"{checkpoint.path}: there is nothing to resume; starting at step 0")
     start = clock.perf_counter()
     with running("fit", checkpoint.path) as progress:
         model = compress(lightmaps, settings, progress=progress, checkpoint=checkpoint, **options)
-    seconds = clock.perf_counter() - start
-    size = model.save(output)
-    checkpoint.remove()
+        seconds = clock.perf_counter() - start
+        size = model.save(output)
+        checkpoint.remove()
     kinds = ", ".join(f"{count} {kind}" for kind, count in count_kinds(model).items() if count)
     rows = table(model.name, ["file", "bytes", "bpp", "tiles", "seconds"], text=["tiles"])
     # Tiles without a valid texel leave nothing to count.

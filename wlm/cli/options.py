@@ -8,6 +8,15 @@ import typer
 Device = Annotated[str, typer.Option(help='Where it computes: "cpu", "cuda" or "cuda:N".')]
 Seed = Annotated[int, typer.Option(min=0, max=2**31 - 1, help="One seed gives one result on one device.")]
 Resume = Annotated[bool, typer.Option("--resume", help="Go on with an interrupted run of the same output.")]
+CheckpointEvery = Annotated[
+    float,
+    typer.Option(
+        "--checkpoint-every",
+        min=0.0,
+        metavar="SECONDS",
+        help="Between two saves of the running work, which --resume goes on from after a crash.",
+    ),
+]
 ReportFile = Annotated[Path | None, typer.Option("--json", metavar="REPORT.json", help="Write a report.")]
 PageFile = Annotated[
     Path | None, typer.Option("--html", metavar="REPORT.html", help="Write a page with tables, plots and pictures.")

@@ -9,6 +9,7 @@ import typer
 from wlm.cli.console import (
     check_output,
     escape,
+    exclusive,
     note,
     number,
     quiet_warp,
@@ -18,7 +19,17 @@ from wlm.cli.console import (
     table,
     write_json,
 )
-from wlm.cli.options import AsJson, Device, ModelFile, PageFile, ReportFile, Resume, Seed, output_option
+from wlm.cli.options import (
+    AsJson,
+    CheckpointEvery,
+    Device,
+    ModelFile,
+    PageFile,
+    ReportFile,
+    Resume,
+    Seed,
+    output_option,
+)
 from wlm.errors import WlmError
 
 if TYPE_CHECKING:
@@ -48,6 +59,7 @@ _NAMES = {
 
 
 @app.command()
+@exclusive
 def compress(
     probes_path: _Probes,
     output: Annotated[Path, output_option("OUT.wlm", "The file to write.")],
@@ -61,6 +73,7 @@ def compress(
     seed: Seed = 0,
     device: Device = "cpu",
     resume: Resume = False,
+    checkpoint_every: CheckpointEvery = 30.0,
     positions: Annotated[
         bool, typer.Option("--positions", help="Store the probes' positions too, 16 bits per axis.")
     ] = False,
@@ -69,7 +82,8 @@ def compress(
 ) -> None:
     """Compress a probe set into one file.
 
-    Ctrl-C keeps the fit in OUT.wlm.partial; the same command with --resume goes on exactly.
+    The fit is kept in OUT.wlm.partial from time to time, and by Ctrl-C and SIGTERM; the same command with --resume goes
+    on exactly.
     """
     check_output(output, ".wlm")
     quiet_warp()
@@ -80,23 +94,16 @@ def compress(
     settings = Profile.load(profile).override(overrides, "--")
     device = check_device(device)
     probes = _load(probes_path, key, convention)
-    checkpoint = open_checkpoint(output, probes, settings, seed=seed, device=device, resume=resume)
+    options = {"seed": seed, "device": device}
+    checkpoint = open_checkpoint(output, probes, settings, resume=resume, every=checkpoint_every, **options)
     if resume and not checkpoint.resumed:
         note(f"{checkpoint.path}: there is nothing to resume; starting at step 0")
     start = time.perf_counter()
     with running("fit", checkpoint.path) as progress:
-        model = compress(
-            probes,
-            settings,
-            seed=seed,
-            device=device,
-            progress=progress,
-            checkpoint=checkpoint,
-            positions=positions,
-        )
-    seconds = time.perf_counter() - start
-    size = model.save(output)
-    checkpoint.remove()
+        model = compress(probes, settings, progress=progress, checkpoint=checkpoint, positions=positions, **options)
+        seconds = time.perf_counter() - start
+        size = model.save(output)
+        checkpoint.remove()
     rows = table(model.name, ["file", "bytes", "of float32", "bits per probe", "Gaussians", "dropped", "seconds"])
     rows.add_row(
         escape(str(output)),

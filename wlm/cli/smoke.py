@@ -1,19 +1,31 @@
 """`wlm smoke`: simulate smoke, render guiding maps, bake six-way lightmaps, light them, pack them for an engine."""
 
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from wlm.cli.console import check_output, escape, note, number, quiet_warp, running, show, show_figures, table
-from wlm.cli.options import Device, Resume, output_option
+from wlm.cli.console import (
+    check_output,
+    escape,
+    exclusive,
+    note,
+    number,
+    quiet_warp,
+    running,
+    show,
+    show_figures,
+    table,
+)
+from wlm.cli.options import CheckpointEvery, Device, Resume, output_option
 from wlm.cli.smoke_network import register
 from wlm.cli.smoke_options import (
     SHEET,
     Input,
     SmokeOptions,
-    marched,
+    march_frames,
     outputs,
     vector,
     with_smoke,
@@ -23,8 +35,10 @@ from wlm.errors import WlmError
 from wlm_kernels.smoke.settings import March
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
+    from wlm.fluid.volume import DensityVolume
+    from wlm.smoke.camera import Camera
     from wlm.smoke.shading import Light
     from wlm.smoke.shots import BakedFiles, FramesToBake, Shot
     from wlm.system import OnProgress
@@ -46,6 +60,7 @@ _G = Annotated[float, typer.Option(min=-0.99, max=0.99, help="Mean cosine of the
 
 
 @app.command()
+@exclusive
 def simulate(
     scene_name: Annotated[str, typer.Argument(metavar="SCENE", help="jet-sphere, jet-moving, explosion, or a YAML.")],
     output: Annotated[Path, output_option("DIR", "The folder of frames to write.")],
@@ -54,11 +69,13 @@ def simulate(
         float, typer.Option(min=0.001, max=100.0, help="Cells along each axis, as a multiple of the scene's.")
     ] = 1.0,
     resume: Resume = False,
+    checkpoint_every: CheckpointEvery = 30.0,
     device: Device = "cpu",
 ) -> None:
     """Simulate a scene into a folder of volumes, one a frame.
 
-    Ctrl-C keeps the state in DIR; the same command with --resume goes on to the same frames.
+    The state is kept in DIR from time to time, and by Ctrl-C and SIGTERM; the same command with --resume goes on to the
+    same frames.
     """
     quiet_warp()
     from wlm.interop import check_device
@@ -83,7 +100,8 @@ def simulate(
             figures.update(now.figures)
             report(now)
 
-        first = simulate(folder, solver=solver, resume=resume, progress=progress)
+        options = {"resume": resume, "checkpoint_every": checkpoint_every}
+        first = simulate(folder, solver=solver, progress=progress, **options)
     if resume and first == 1:
         note(f"{output}: there was nothing to resume; started at frame 1")
     rows = [
@@ -99,6 +117,7 @@ def simulate(
 
 @app.command()
 @with_smoke
+@exclusive
 def guide(
     smoke: Input,
     output: _Output,
@@ -113,8 +132,12 @@ def guide(
     ] = March.threshold,
     g: _G = March.g,
     perspective: Annotated[bool, typer.Option("--perspective", help="Rays meet in the eye.")] = False,
+    resume: Resume = False,
 ) -> None:
-    """Make guiding maps: light, transparency and depth, by a march in large steps (algorithm 1)."""
+    """Make guiding maps: light, transparency and depth, by a march in large steps (algorithm 1).
+
+    Of frames, those done are kept when it is stopped; the same command with --resume makes the others.
+    """
     quiet_warp()
     from wlm.smoke.data import write_guide
     from wlm.smoke.guiding import guide
@@ -123,7 +146,8 @@ def guide(
     frames = options.open(smoke)
     camera = options.camera(frames, orthographic=False, perspective=perspective)
     rows = table(str(smoke), ["file", "covered", "mean light", "nearest", "farthest"])
-    for file, volume, view in marched(frames, camera, output, "guide"):
+
+    def make(file: "Callable[[], Path]", volume: "DensityVolume", view: "Camera") -> None:
         maps = guide(volume, view, march)
         path = file()
         write_guide(path, maps)
@@ -136,11 +160,14 @@ def guide(
             number(float(depth.min()) if len(depth) else None, ".4g"),
             number(float(depth.max()) if len(depth) else None, ".4g"),
         )
+
+    march_frames(frames, camera, output, "guide", make, asdict(march), resume=resume)
     show(rows)
 
 
 @app.command()
 @with_smoke
+@exclusive
 def bake(
     smoke: Input,
     output: _Output,
@@ -148,21 +175,25 @@ def bake(
     step: Annotated[float, typer.Option(min=0.01, max=1000.0, help="The longest step in voxels.")] = 0.5,
     supersample: Annotated[int, typer.Option(min=1, max=16, help="Rays along a pixel's edge.")] = 1,
     g: _G = March.g,
+    resume: Resume = False,
 ) -> None:
     """Make six-way lightmaps by a fine march, and say how far a step twice as long is from them.
 
-    An EXR has the channels right, left, top, bottom, front, back, transparency and, of hot smoke, emission.
+    An EXR has the channels right, left, top, bottom, front, back, transparency and, of hot smoke, emission. Of frames,
+    those done are kept when it is stopped; the same command with --resume makes the others.
     """
     quiet_warp()
     from wlm.smoke.baking import bake
 
     frames = options.open(smoke)
-    make = partial(bake, step=step, g=g, supersample=supersample)
-    write_lightmaps(frames, options.camera(frames), output, make, errors=True)
+    settings = {"step": step, "g": g, "supersample": supersample}
+    make, made = partial(bake, **settings), {"made": "bake"} | settings
+    write_lightmaps(frames, options.camera(frames), output, make, made, resume=resume, errors=True)
 
 
 @app.command()
 @with_smoke
+@exclusive
 def shade(
     smoke: _Baked,
     output: Annotated[Path, output_option("OUT", "A .png, or for frames a folder.")],

@@ -9,6 +9,7 @@ import typer
 from wlm.cli.console import (
     check_output,
     escape,
+    exclusive,
     note,
     number,
     progress_bar,
@@ -18,7 +19,7 @@ from wlm.cli.console import (
     table,
     write_json,
 )
-from wlm.cli.options import Device, ReportFile, Resume, Seed, output_option
+from wlm.cli.options import CheckpointEvery, Device, ReportFile, Resume, Seed, output_option
 from wlm.cli.smoke_options import Input, SmokeOptions, with_smoke, write_lightmaps
 from wlm.errors import WlmError
 
@@ -45,6 +46,7 @@ def register(app: typer.Typer) -> None:
         app.command()(command)
 
 
+@exclusive
 def train(
     profile: Annotated[str, typer.Argument(metavar="PROFILE", help="fast, 16, 24, 32, paper, or a YAML file.")],
     output: Annotated[Path, output_option("NETWORK", "The .safetensors to write.")],
@@ -52,13 +54,14 @@ def train(
         float | None, typer.Option(min=0.0, help="After which it stops and can be resumed; default at its end.")
     ] = None,
     resume: Resume = False,
+    checkpoint_every: CheckpointEvery = 30.0,
     seed: Seed = 0,
     device: Device = "cpu",
 ) -> None:
     """Train a network on smoke that is simulated as it is needed, and keep the best of its validations.
 
-    Ctrl-C keeps the training in NETWORK.partial; the same command with --resume goes on exactly. The curves are in
-    NETWORK.csv.
+    The training is kept in NETWORK.partial from time to time, and by Ctrl-C and SIGTERM; the same command with --resume
+    goes on exactly. The curves are in NETWORK.csv.
     """
     check_output(output, ".safetensors")
     quiet_warp()
@@ -71,6 +74,7 @@ def train(
     if resume and not checkpoint.exists() and not output.exists():
         note(f"{checkpoint}: there is nothing to resume; starting at step 0")
     options = {"seed": seed, "device": device, "minutes": minutes, "resume": resume}
+    options["checkpoint_every"] = checkpoint_every
     with running("train", checkpoint) as progress:
         training = fit(settings, output, progress=progress, **options)
     if not training.finished:
@@ -89,6 +93,7 @@ def train(
 
 
 @with_smoke
+@exclusive
 def predict(
     smoke: Input,
     output: Annotated[Path, output_option("OUT", "A .exr, or of frames a folder.")],
@@ -107,19 +112,29 @@ def predict(
         ),
     ] = None,
     seed: Seed = 0,
+    resume: Resume = False,
 ) -> None:
     """Make six-way lightmaps by the network, from a guiding map as it was trained with: what bake makes, sooner.
 
-    What is written is as of bake: shade and flipbook take it.
+    What is written is as of bake: shade and flipbook take it. Of frames, those done are kept when it is stopped; the
+    same command with --resume makes the others.
     """
     if coarse and network is not None:
         raise WlmError("--coarse: expected no --network beside it")
     if step is not None and not coarse:
         raise WlmError("--step: expected --coarse beside it: a network looks as it was trained to")
     quiet_warp()
+    from wlm.smoke.codec import open_network
+
     frames = options.open(smoke)
-    make = _coarse(step, seed) if coarse else _predicted(network, seed, frames.device)
-    write_lightmaps(frames, options.camera(frames), output, make)
+    if coarse:
+        made = {"made": "coarse", "step": step, "seed": seed}
+        make = _coarse(step, seed)
+    else:
+        model = open_network(network)
+        made = {"made": "network", "of": dict(model.summary), "seed": seed}
+        make = _predicted(model, seed, frames.device)
+    write_lightmaps(frames, options.camera(frames), output, make, made, resume=resume)
 
 
 def evaluate(
@@ -183,6 +198,7 @@ def export(
     show(rows)
 
 
+@exclusive
 def dataset(
     settings_file: Annotated[
         Path, typer.Argument(metavar="SETTINGS", help="A YAML file of dataset settings, each with a default.")
@@ -253,11 +269,11 @@ def _coarse(step: float | None, seed: int) -> "Callable[[DensityVolume, Camera],
     return make
 
 
-def _predicted(path: Path | None, seed: int, device: str) -> "Callable[[DensityVolume, Camera], SixWay]":
+def _predicted(model: "SmokeModel", seed: int, device: str) -> "Callable[[DensityVolume, Camera], SixWay]":
     """Makes lightmaps by a network; notes once where it wasn't trained for the image's size."""
     from wlm.smoke.prediction import SmokePredictor
 
-    predictor, first = SmokePredictor(path, device), True
+    predictor, first = SmokePredictor(model, device), True
 
     def make(volume: "DensityVolume", camera: "Camera") -> "SixWay":
         nonlocal first

@@ -2,7 +2,7 @@
 
 import functools
 import inspect
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -120,24 +120,61 @@ def outputs(smoke: Path, single: bool, output: Path, stem: str, suffix: str) -> 
     if single:
         check_output(output, suffix)
         return lambda number: output
-    if output.resolve() == smoke.resolve():
-        raise WlmError(f"{output}: expected another folder than that of the frames")
+    _check_folder(smoke, output)
     return NumberedFiles(output, stem, suffix, SHEET).file
 
 
-def marched(
-    frames: "Frames", camera: "CameraSettings", output: Path, stem: str
-) -> "Iterator[tuple[Callable[[], Path], DensityVolume, Camera]]":
-    """Yields each frame's volume and camera, and a function that returns the EXR of its result when it is ready."""
+def _check_folder(smoke: Path, output: Path) -> None:
+    if output.resolve() == smoke.resolve():
+        raise WlmError(f"{output}: expected another folder than that of the frames")
+
+
+def march_frames(
+    frames: "Frames",
+    camera: "CameraSettings",
+    output: Path,
+    stem: str,
+    make: "Callable[[Callable[[], Path], DensityVolume, Camera], None]",
+    settings: dict[str, Any],
+    *,
+    resume: bool,
+) -> None:
+    """Makes an EXR of each frame.
+
+    Args:
+        frames: The smoke.
+        camera: Before each frame.
+        output: A file, or for frames a folder.
+        stem: Of the folder's files.
+        make: Makes one, of a volume and a camera; it gets the path from a function when there is something to write.
+        settings: What results depend on beside smoke and camera, as JSON values.
+        resume: Whether to leave out the frames that an interrupted run of the same settings has made.
+    """
+    from wlm.smoke.data import NumberedFiles
     from wlm.smoke.scene import make_camera
 
-    file = outputs(frames.path, frames.scene is None, output, stem, ".exr")
-    with running(stem) as progress:
-        for frame, volume in frames.volumes(progress=progress):
+    if frames.scene is None:
+        if resume:
+            raise WlmError(f"--resume: expected a folder of frames, {frames.path} is one volume")
+        check_output(output, ".exr")
+        file, numbers, partial = (lambda number: output), frames.numbers, None
+    else:
+        _check_folder(frames.path, output)
+        smoke = {"extinction": frames.extinction, "emission": frames.emission, "device": frames.device[:4]}
+        views = {"scene": frames.scene.model_dump(mode="json"), "camera": camera.model_dump(mode="json")}
+        files = NumberedFiles(output, stem, ".exr", SHEET, run=settings | smoke | views, resume=resume)
+        file, numbers, partial = files.file, [each for each in frames.numbers if each not in files.done], files.partial
+        if resume:
+            done = len(files.done)
+            note(f"{output}: {done} frames are there" if done else f"{partial}: there is nothing to resume")
+    with running(stem, partial, "frame", whole=False) as progress:
+        for frame, volume in frames.volumes(numbers, progress):
             for warning in volume.warnings:
                 note(f"warning: {warning}")
             view = make_camera(camera, volume.origin, [volume.voxel * n for n in volume.shape])
-            yield functools.partial(file, frame), volume, view
+            make(functools.partial(file, frame), volume, view)
+    if partial is not None:
+        files.finish()
 
 
 def write_lightmaps(
@@ -145,7 +182,9 @@ def write_lightmaps(
     camera: "CameraSettings",
     output: Path,
     make: "Callable[[DensityVolume, Camera], SixWay]",
+    settings: dict[str, Any],
     *,
+    resume: bool,
     errors: bool = False,
 ) -> None:
     """Makes lightmaps of each frame, writes them and shows a table; notes lightmaps that aren't bright where named.
@@ -155,13 +194,15 @@ def write_lightmaps(
         camera: Before each.
         output: A file, or for frames a folder.
         make: Makes the lightmaps.
+        settings, resume: As for `march_frames`.
         errors: Whether they come with the error of their step.
     """
     from wlm.smoke.camera import axis_faults
     from wlm.smoke.data import write_six_way
 
     rows = table(str(frames.path), ["file", "covered", "mean light", *(["largest error", "RMS error"] * errors)])
-    for file, volume, view in marched(frames, camera, output, "six"):
+
+    def write(file: Callable[[], Path], volume: "DensityVolume", view: "Camera") -> None:
         six = make(volume, view)
         path = file()
         write_six_way(path, six)
@@ -174,4 +215,6 @@ def write_lightmaps(
             number(float(six.lightmaps[:, covered].mean()) if covered.any() else None, ".4g"),
             *((f"{six.error.largest:.2g}", f"{six.error.rms:.2g}") if errors else ()),
         )
+
+    march_frames(frames, camera, output, "six", write, settings, resume=resume)
     show(rows)

@@ -1,21 +1,22 @@
 """Writing a file whole or not at all."""
 
 import os
-import secrets
 import stat
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from wlm.errors import WlmError
+from wlm.formats.lock import temporary
 
 
 @contextmanager
 def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Gives a temporary name beside `path`, and moves what was written there onto `path` at the end.
 
-    If the block raises, the temporary file is removed and `path` keeps what it held. A link is followed: the
-    file that it points to is replaced.
+    If the block raises, the temporary file is removed and `path` keeps what it held; so it is where the process is
+    killed, but that the next write to `path` removes the file. A link is followed: the file that it points to is
+    replaced.
 
     Args:
         path: The file to write; its folder must exist.
@@ -34,23 +35,26 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
             raise WlmError(f"{path}: cannot write: it exists and is not a regular file")
         if not target.parent.is_dir():
             raise WlmError(f"{path}: cannot write: the folder {target.parent} does not exist")
-        # A short name of its own: the destination's may already be as long as the system allows.
-        temporary = target.parent / f".wlm-{secrets.token_hex(8)}.tmp"
-        os.close(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
-    try:
-        with _as_wlm_error(path):
-            yield temporary
+        with temporary(target) as part:
+            yield part
             # Without it a crash of the machine after the rename could leave an empty file.
-            handle = os.open(temporary, os.O_RDWR)
+            handle = os.open(part, os.O_RDWR)
             try:
                 os.fsync(handle)
             finally:
                 os.close(handle)
-            os.replace(temporary, target)
-    except BaseException:
-        with suppress(OSError):
-            os.unlink(temporary)
-        raise
+            os.replace(part, target)
+            sync_folder(target.parent)
+
+
+def sync_folder(folder: Path) -> None:
+    """Makes the renames in a folder outlast a crash of the machine, where the system can (Windows can't)."""
+    with suppress(OSError):
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
 
 
 def atomic_write(path: str | os.PathLike[str], data: bytes | Iterable[bytes]) -> int:
@@ -68,8 +72,8 @@ def atomic_write(path: str | os.PathLike[str], data: bytes | Iterable[bytes]) ->
     """
     chunks = [data] if isinstance(data, bytes | bytearray | memoryview) else data
     total = 0
-    with atomic_path(path) as temporary:
-        handle = os.open(temporary, os.O_WRONLY)
+    with atomic_path(path) as part:
+        handle = os.open(part, os.O_WRONLY)
         try:
             for chunk in chunks:
                 view = memoryview(chunk)

@@ -1,4 +1,4 @@
-"""Where an interrupted fit is kept: finished batches as they will be stored, and the running one's exact state.
+"""Where a fit is kept while it runs: finished batches as they will be stored, and the running one's exact state.
 
 One file beside the output, an artifact of its own system, so that it is written whole or not at all and every byte
 of it is checked when it is read. It names what the fit depends on, and goes on with no other fit.
@@ -6,7 +6,9 @@ of it is checked when it is read. It names what the fit depends on, and goes on 
 
 import json
 import os
-from collections.abc import Mapping
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +17,41 @@ import numpy as np
 from wlm import __version__
 from wlm.errors import WlmError
 from wlm.formats.artifact import read_artifact, write_artifact
+from wlm.formats.lock import sweep
 
 SUFFIX = ".partial"
+EVERY = 30.0
+"""Seconds between two saves of running work: what a killed process loses at most, beside the step that it was in."""
+
+_SHARE = 0.05  # of the time that saving may take
 
 _FINISHED, _RUNNING = "finished", "running"
+
+
+class Pace:
+    """When running work is saved: every so many seconds, or so seldom that it takes a twentieth of the time."""
+
+    def __init__(self, every: float) -> None:
+        """Starts the clock.
+
+        Args:
+            every: Seconds from one save to the next; 0: always, whatever it takes.
+        """
+        self._every = self._wait = every
+        self._last = time.monotonic()
+
+    def due(self) -> bool:
+        """Whether it is time for a save."""
+        return time.monotonic() - self._last >= self._wait
+
+    @contextmanager
+    def saving(self) -> Iterator[None]:
+        """Times a save, from whose end the wait for the next one counts."""
+        begin = time.monotonic()
+        yield
+        self._last = time.monotonic()
+        if self._every:
+            self._wait = max(self._every, (self._last - begin) * (1.0 / _SHARE - 1.0))
 
 
 class Checkpoint:
@@ -41,6 +74,7 @@ class Checkpoint:
         source: str,
         *,
         resume: bool = False,
+        every: float = EVERY,
     ) -> None:
         """Opens the checkpoint of a fit.
 
@@ -52,6 +86,7 @@ class Checkpoint:
             source: A hash of the input, one ASCII word.
             resume: Whether to go on from the file, if there is one. Otherwise it is ignored, and replaced at the
                 first save.
+            every: Seconds between two saves of a running batch, as `Pace` has it.
 
         Raises:
             WlmError: With `resume`: the file is damaged, or of another fit; the line names what differs.
@@ -65,6 +100,9 @@ class Checkpoint:
         self._key: dict[str, Any] = json.loads(json.dumps({**fit, "wlm": __version__}, allow_nan=False))
         self._finished: dict[int, dict[str, np.ndarray]] = {}
         self._running: tuple[int, dict[str, np.ndarray]] | None = None
+        self._pace = Pace(every)
+        # The run that goes on may end before it saves anything.
+        sweep(Path(os.path.realpath(self.path)))
         if resume and self.path.exists():
             self._read()
             self.resumed = True
@@ -76,6 +114,10 @@ class Checkpoint:
     def running(self, number: int) -> dict[str, np.ndarray] | None:
         """The state of the batch that was running when the fit was stopped, or None if it was another or none."""
         return self._running[1] if self._running is not None and self._running[0] == number else None
+
+    def due(self) -> bool:
+        """Whether it is time to save the running batch."""
+        return self._pace.due()
 
     def save_running(self, number: int, state: Mapping[str, np.ndarray]) -> None:
         """Writes the state of the running batch, in place of an older one.
@@ -116,7 +158,8 @@ class Checkpoint:
         if self._running is not None:
             number, state = self._running
             tensors |= {f"{_RUNNING}.{number}.{key}": value for key, value in state.items()}
-        write_artifact(self.path, self.system, {"fit": self._key}, tensors, self._source)
+        with self._pace.saving():
+            write_artifact(self.path, self.system, {"fit": self._key}, tensors, self._source)
 
     def _read(self) -> None:
         artifact = read_artifact(self.path, self.system)

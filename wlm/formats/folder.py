@@ -7,17 +7,16 @@ whole holds all that the index names.
 import json
 import os
 import re
-import secrets
-import shutil
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from wlm.errors import WlmError
-from wlm.formats.atomic import atomic_write
+from wlm.formats.atomic import atomic_write, sync_folder
+from wlm.formats.lock import is_passing, locked, temporary
 
 UNFINISHED = "unfinished"
 """Key of an index that stands in while files are being moved in."""
@@ -37,8 +36,10 @@ def claim(folder: Path, index: str, format_name: str) -> None:
         WlmError: It is a file, holds something other than an earlier output, or it or its parent can't be written.
     """
     try:
-        if folder.exists() and any(folder.iterdir()) and read_index(folder / index).get("format") != format_name:
-            raise WlmError(f"{folder}: expected an empty folder or one of an earlier output, found other files")
+        if folder.exists() and read_index(folder / index).get("format") != format_name:
+            # What a killed process left in the making is no file of anybody's.
+            if not all(is_passing(path.name) for path in folder.iterdir()):
+                raise WlmError(f"{folder}: expected an empty folder or one of an earlier output, found other files")
     except OSError as error:
         raise WlmError(f"{folder}: cannot write there: {error.strerror or error}") from error
     parent = folder.resolve().parent
@@ -76,31 +77,34 @@ def staged(folder: Path, index: str, format_name: str, ours: Callable[[str], boo
             removed.
 
     Raises:
-        WlmError: A file can't be written; messages name the real folder.
+        WlmError: A file can't be written, messages name the real folder; or another process is writing there.
     """
-    claim(folder, index, format_name)
-    temporary = folder.resolve().parent / f".wlm-{secrets.token_hex(8)}.tmp"
-    try:
-        temporary.mkdir()
-        yield temporary
-        names = {path.name for path in temporary.iterdir()}
-        marker = temporary / UNFINISHED
-        marker.write_text(json.dumps({"format": format_name, UNFINISHED: True}))
-        folder.mkdir(exist_ok=True)
-        # An old index must not vouch for new files, nor may the folder become one that can't be written again.
-        os.replace(marker, folder / index)
-        for path in sorted(folder.iterdir()):
-            if path.name != index and path.name not in names and ours(path.name):
-                path.unlink(missing_ok=True)
-        for name in sorted(names, key=lambda name: name == index):
-            os.replace(temporary / name, folder / name)
-    except OSError as error:
-        raise WlmError(f"{folder}: cannot write there: {error.strerror or error}") from error
-    except WlmError as error:
-        raise WlmError(str(error).replace(str(temporary), str(folder))) from error
-    finally:
-        with suppress(OSError):
-            shutil.rmtree(temporary)
+    with locked(folder):
+        claim(folder, index, format_name)
+        try:
+            with temporary(Path(os.path.realpath(folder)), folder=True) as made:
+                yield made
+                _move(made, folder, index, format_name, ours)
+        except OSError as error:
+            raise WlmError(f"{folder}: cannot write there: {error.strerror or error}") from error
+        except WlmError as error:
+            raise WlmError(str(error).replace(str(made), str(folder))) from error
+
+
+def _move(made: Path, folder: Path, index: str, format_name: str, ours: Callable[[str], bool]) -> None:
+    """Moves an output's files into their folder."""
+    names = {path.name for path in made.iterdir()}
+    folder.mkdir(exist_ok=True)
+    # An old index must not vouch for new files, nor may the folder become one that can't be written again.
+    write_index(folder / index, {"format": format_name, UNFINISHED: True})
+    for path in sorted(folder.iterdir()):
+        if path.name != index and path.name not in names and ours(path.name):
+            path.unlink(missing_ok=True)
+    for name in sorted(names - {index}):
+        os.replace(made / name, folder / name)
+    sync_folder(folder)
+    os.replace(made / index, folder / index)
+    sync_folder(folder)
 
 
 def read_index(path: Path) -> dict[str, Any]:

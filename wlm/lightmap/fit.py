@@ -9,7 +9,7 @@ import numpy as np
 
 from wlm import interop
 from wlm.errors import WlmError
-from wlm.formats.checkpoint import Checkpoint
+from wlm.formats.checkpoint import EVERY, Checkpoint
 from wlm.lightmap.data import LightmapSet
 from wlm.lightmap.model import LightmapModel, Profile, encode_scale, part_table
 from wlm.lightmap.tiles import TILE, TileGrid, TileKind, channel_means, classify, split
@@ -40,7 +40,7 @@ def compress(
         device: "cpu", "cuda" or "cuda:N".
         progress: Called about twice a second; its figures are the loss and "PSNR dB", of the samples since the last
             report, by the tiled protocol.
-        checkpoint: From `open_checkpoint`: where an interrupted fit is kept and resumed.
+        checkpoint: From `open_checkpoint`: where a running fit is kept, and an interrupted one resumed.
         overrides: Settings in place of the profile's: `steps=500`.
 
     Returns:
@@ -81,6 +81,7 @@ def open_checkpoint(
     seed: int = 0,
     device: str = "cpu",
     resume: bool = False,
+    every: float = EVERY,
     **overrides: Any,
 ) -> Checkpoint:
     """Opens the checkpoint of a fit: the file `OUTPUT.partial`, which names everything that the fit depends on.
@@ -91,6 +92,7 @@ def open_checkpoint(
         device: Only its kind matters: a fit may go on on another GPU.
         resume: Whether to go on from the file, if there is one. Otherwise it is ignored, and replaced at the first
             save.
+        every: Seconds between two saves of a running fit; 0: after every few steps.
 
     Raises:
         WlmError: With `resume`: the file is damaged, or of another fit; the line names what differs.
@@ -104,7 +106,7 @@ def open_checkpoint(
         "seed": int(seed),
         "device": "cpu" if device == "cpu" else "cuda",
     }
-    return Checkpoint(output, "lightmap", fit, lightmaps.source, resume=resume)
+    return Checkpoint(output, "lightmap", fit, lightmaps.source, resume=resume, every=every)
 
 
 def dynamic_targets(lightmaps: LightmapSet, profile: Profile) -> Targets | None:
@@ -233,15 +235,16 @@ def _run(trainer: Trainer, number: int, meter: Meter, checkpoint: Checkpoint | N
         trainer.run(count)
         step += count
         done = number * steps + step
-        if not meter.due(done):
-            continue
-        try:
-            meter.report(done, loss=float(trainer.losses().mean()), PSNR_dB=trainer.psnr())
-        except KeyboardInterrupt:
-            # Between two steps the state is whole; anywhere else an interrupt keeps nothing.
-            if checkpoint is not None:
-                checkpoint.save_running(number, trainer.state())
-            raise
+        if meter.due(done):
+            try:
+                meter.report(done, loss=float(trainer.losses().mean()), PSNR_dB=trainer.psnr())
+            except KeyboardInterrupt:
+                # Between two steps the state is whole; anywhere else an interrupt keeps nothing.
+                if checkpoint is not None:
+                    checkpoint.save_running(number, trainer.state())
+                raise
+        if checkpoint is not None and checkpoint.due():
+            checkpoint.save_running(number, trainer.state())
     diverged = ~np.isfinite(trainer.losses())
     if diverged.any():
         raise WlmError(

@@ -8,7 +8,7 @@ import numpy as np
 
 from wlm import interop
 from wlm.errors import WlmError
-from wlm.formats.checkpoint import Checkpoint
+from wlm.formats.checkpoint import EVERY, Checkpoint
 from wlm.metrics import psnr_from_mse
 from wlm.probe.data import ProbeSet
 from wlm.probe.model import ProbeModel, Profile
@@ -26,6 +26,7 @@ def open_checkpoint(
     seed: int = 0,
     device: str = "cpu",
     resume: bool = False,
+    every: float = EVERY,
 ) -> Checkpoint:
     """Opens the checkpoint of a fit, the file `OUTPUT.partial`.
 
@@ -34,6 +35,7 @@ def open_checkpoint(
         probes, profile, seed: As for `compress`: what the fit depends on.
         device: Only its kind matters: a fit may go on on another GPU.
         resume: Whether to go on from the file, if there is one.
+        every: Seconds between two saves of a running fit; 0: after every few steps.
 
     Raises:
         WlmError: With `resume`: the file is damaged, or of another fit; the line names what differs.
@@ -44,7 +46,7 @@ def open_checkpoint(
         "seed": int(seed),
         "device": "cpu" if device == "cpu" else "cuda",
     }
-    return Checkpoint(output, ProbeModel.SYSTEM, fit, probes.source, resume=resume)
+    return Checkpoint(output, ProbeModel.SYSTEM, fit, probes.source, resume=resume, every=every)
 
 
 def compress(
@@ -68,8 +70,8 @@ def compress(
         seed: One seed gives one result on one device.
         device: "cpu" or "cuda:0".
         progress: Called about twice a second, with the PSNR of all numbers of all probes.
-        checkpoint: From `open_checkpoint` for the same settings, or None: where an interrupted fit is kept and
-            resumed.
+        checkpoint: From `open_checkpoint` for the same settings, or None: where a running fit is kept, and an
+            interrupted one resumed.
         positions: Whether the model carries the probes' positions, 16 bits an axis; an engine has them anyway.
         overrides: Settings that replace the profile's: `steps=500`.
 
@@ -143,11 +145,12 @@ def _run(
         count = min(_CHUNK["cpu" if device == "cpu" else "cuda"], profile.steps - step)
         trainer.run(count)
         step += count
-        if not meter.due(step):
-            continue
-        try:
-            meter.report(step, PSNR_dB=psnr_from_mse(trainer.mse() * live, peak))
-        except KeyboardInterrupt:
-            if checkpoint is not None:
-                checkpoint.save_running(0, trainer.state())
-            raise
+        if meter.due(step):
+            try:
+                meter.report(step, PSNR_dB=psnr_from_mse(trainer.mse() * live, peak))
+            except KeyboardInterrupt:
+                if checkpoint is not None:
+                    checkpoint.save_running(0, trainer.state())
+                raise
+        if checkpoint is not None and checkpoint.due():
+            checkpoint.save_running(0, trainer.state())

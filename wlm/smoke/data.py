@@ -7,7 +7,7 @@ A folder of frames holds `scene.json` and `frame_0001.npz`, `frame_0002.npz` and
 import json
 import os
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -16,12 +16,14 @@ from typing import Any
 import numpy as np
 import torch
 
+from wlm import __version__
 from wlm.config import check_settings
 from wlm.errors import WlmError
 from wlm.fluid.volume import DensityVolume, load_volume
 from wlm.formats.atomic import atomic_write
 from wlm.formats.exr_planes import read_planes, write_planes
-from wlm.formats.folder import claim, read_index
+from wlm.formats.folder import claim, read_index, write_index
+from wlm.formats.lock import is_passing
 from wlm.smoke.camera import DIRECTIONS, EMISSION, Camera
 from wlm.smoke.guiding import Guide
 from wlm.smoke.lightmaps import SixWay
@@ -172,28 +174,60 @@ class NumberedFiles:
     """A run's results in a folder, one file per frame, in place of those of an earlier run.
 
     The earlier files are removed when the first new one is about to be written: a run that fails before loses none.
-    Each file is of use by itself, so there is no index, and nothing is staged.
+    Each file is of use by itself, so there is no index, and nothing is staged. As long as it isn't done, a run that can
+    be resumed says in `STEM.partial` what it is.
+
+    Attributes:
+        folder: The folder.
+        partial: The file that says what an unfinished run is.
+        done: Numbers of the results that the run which is resumed has already.
     """
 
-    def __init__(self, folder: str | os.PathLike[str], stem: str, suffix: str, *others: str) -> None:
+    def __init__(
+        self,
+        folder: str | os.PathLike[str],
+        stem: str,
+        suffix: str,
+        *others: str,
+        run: Mapping[str, Any] | None = None,
+        resume: bool = False,
+    ) -> None:
         """Makes the folder, or checks that it holds nothing but files of an earlier run.
 
         Args:
             folder: Made if its parent is there.
             stem, suffix: Of the files, as for `numbered`.
             others: Names of files that such a run writes beside them.
+            run: What the results depend on, as JSON values; None: such a run isn't resumed.
+            resume: Whether to keep the files of an interrupted run, if there was one.
 
         Raises:
-            WlmError: It holds other files, or can't be written.
+            WlmError: It holds other files, can't be written, or is of a run that depends on something else.
         """
         self.folder, self._stem, self._suffix, self._others = Path(folder), stem, suffix, others
         self._cleared = False
+        self.done: frozenset[int] = frozenset()
+        self.partial = self.folder / f"{stem}.partial"
+        # Compared with what JSON gives back, which has no tuples.
+        self._run = None if run is None else json.loads(json.dumps({**run, "wlm": __version__}))
         with _writing(self.folder):
             self.folder.mkdir(exist_ok=True)
             earlier = self._earlier()
-            foreign = next((path for path in sorted(self.folder.iterdir()) if path not in earlier), None)
+            others = (path for path in sorted(self.folder.iterdir()) if path not in earlier)
+            foreign = next((path for path in others if not is_passing(path.name)), None)
         if foreign is not None:
             raise WlmError(f"{folder}: expected an empty folder or one of an earlier run, found {foreign.name}")
+        if resume and self.partial.is_file():
+            earlier = read_index(self.partial)
+            if (field := next((key for key in self._run if earlier.get(key) != self._run[key]), None)) is not None:
+                raise WlmError(f"{self.partial}: of another run, whose {field} differs; start anew without --resume")
+            self._cleared = True
+            self.done = frozenset(numbered(self.folder, stem, suffix))
+
+    def finish(self) -> None:
+        """Ends the run: there is nothing to resume."""
+        with _writing(self.folder):
+            self.partial.unlink(missing_ok=True)
 
     def file(self, number: int) -> Path:
         """The file for a frame's result, which is ready to be written.
@@ -205,12 +239,14 @@ class NumberedFiles:
             with _writing(self.folder):
                 for path in self._earlier():
                     path.unlink(missing_ok=True)
+            if self._run is not None:
+                write_index(self.partial, self._run)
             self._cleared = True
         return self.folder / f"{self._stem}_{number:04d}{self._suffix}"
 
     def _earlier(self) -> list[Path]:
         files = numbered(self.folder, self._stem, self._suffix).values()
-        return [*files, *(self.folder / name for name in self._others)]
+        return [*files, self.partial, *(self.folder / name for name in self._others)]
 
 
 def write_guide(path: str | os.PathLike[str], guide: Guide) -> None:

@@ -33,7 +33,8 @@ import torch
 
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_write
-from wlm.formats.checkpoint import Checkpoint
+from wlm.formats.checkpoint import EVERY, Checkpoint
+from wlm.formats.lock import locked
 from wlm.interop import check_device
 from wlm.smoke.evaluation import Score, of_network, score
 from wlm.smoke.learn import dataset
@@ -80,6 +81,7 @@ def train(
     device: str = "cpu",
     minutes: float | None = None,
     resume: bool = False,
+    checkpoint_every: float = EVERY,
     progress: OnProgress | None = None,
     make_pool: Callable[..., Pool] | None = None,
     make_validation: Callable[..., Pool] | None = None,
@@ -96,6 +98,8 @@ def train(
         device: "cpu", "cuda" or "cuda:N".
         minutes: Time limit, at which it stops with a checkpoint, after at least `_CHUNK` steps; None: no limit.
         resume: Whether to continue from the checkpoint, if there is one.
+        checkpoint_every: Seconds between two checkpoints while steps are taken; 0: after every `_CHUNK` of them. There
+            is one at the end of each round too.
         progress: Called after each sequence simulated and about every 50 steps, with "PSNR dB" at the last validation
             and the mean "loss" since then.
         make_pool, make_validation: Replace those of `learn.dataset`.
@@ -103,7 +107,8 @@ def train(
 
     Raises:
         WlmError: A wrong setting, no such device, a checkpoint that is damaged or of another training, a finished
-            training to resume, unusable samples, a training that diverged, or a file that can't be written.
+            training to resume, unusable samples, a training that diverged, or a file that can't be written or that
+            another process is writing.
         KeyboardInterrupt: Raised by `progress`, after the checkpoint has been written.
     """
     profile, device = Profile.load(profile).override(overrides), check_device(device)
@@ -113,26 +118,27 @@ def train(
         "device": "cpu" if device == "cpu" else "cuda",
     }
     source = hashlib.blake2b(json.dumps(fit, sort_keys=True).encode(), digest_size=16).hexdigest()
-    checkpoint = Checkpoint(output, SmokeModel.SYSTEM, fit, source, resume=resume)
-    if resume and not checkpoint.resumed and Path(output).exists():
-        raise WlmError(f"{output}: is finished; without --resume it is trained anew")
-    meter = Meter(progress, "train", profile.training.total)
-    run = _Run(profile, Path(output), device, checkpoint, meter, seed, minutes)
-    make_pool, make_validation = make_pool or dataset.make_pool, make_validation or dataset.make_validation
-    # Between two sequences of a pool nothing is lost: earlier steps are in the checkpoint.
-    validation = make_validation(profile.dataset, device, progress=run.report)
-    _check_pool("validation", validation)
-    run.begin(validation)
-    while run.round < profile.training.rounds:
-        pool = make_pool(profile.dataset, seed=seed, round=run.round, device=device, progress=run.report)
-        _check_pool(f"round {run.round}", pool)
-        if not run.do_round(pool):
-            return run.result(False)
-        run.end_round(validation)
-        if run.late and run.round < profile.training.rounds:
-            return run.result(False)
-    checkpoint.remove()
-    return run.result(True)
+    with locked(output):
+        checkpoint = Checkpoint(output, SmokeModel.SYSTEM, fit, source, resume=resume, every=checkpoint_every)
+        if resume and not checkpoint.resumed and Path(output).exists():
+            raise WlmError(f"{output}: is finished; without --resume it is trained anew")
+        meter = Meter(progress, "train", profile.training.total)
+        run = _Run(profile, Path(output), device, checkpoint, meter, seed, minutes)
+        make_pool, make_validation = make_pool or dataset.make_pool, make_validation or dataset.make_validation
+        # Between two sequences of a pool nothing is lost: earlier steps are in the checkpoint.
+        validation = make_validation(profile.dataset, device, progress=run.report)
+        _check_pool("validation", validation)
+        run.begin(validation)
+        while run.round < profile.training.rounds:
+            pool = make_pool(profile.dataset, seed=seed, round=run.round, device=device, progress=run.report)
+            _check_pool(f"round {run.round}", pool)
+            if not run.do_round(pool):
+                return run.result(False)
+            run.end_round(validation)
+            if run.late and run.round < profile.training.rounds:
+                return run.result(False)
+        checkpoint.remove()
+        return run.result(True)
 
 
 class _Run:
@@ -221,6 +227,8 @@ class _Run:
             if self.late:
                 self.save()
                 return False
+            if self.checkpoint.due():
+                self.save()
 
     def end_round(self, validation: Pool) -> None:
         """Validates, saves the network if it is the best, and writes curves and checkpoint."""

@@ -13,13 +13,12 @@ from wlm.fluid.faces import FACES
 from wlm.fluid.lattice import Domain, Lattice
 from wlm.fluid.obstacles import Mesh, Obstacle, Sphere, Trajectory
 from wlm.fluid.volume import DensityVolume, save_volume
+from wlm.formats.checkpoint import EVERY, Pace
+from wlm.formats.lock import locked
 from wlm.interop import free_memory
 from wlm.smoke.data import CHECKPOINT, Frames
 from wlm.smoke.scene import Inlet, Scene, SourceSettings
 from wlm.system import Meter, OnProgress
-
-CHECKPOINT_EVERY = 10
-"""Frames between two checkpoints."""
 
 # Cells by which smoke at an inlet reaches into the box, so that the air carries on smoke of full density.
 _INLET_DEPTH = 1.0
@@ -73,12 +72,13 @@ def simulate(
     solver: fluid.Solver | None = None,
     device: str = "cpu",
     resume: bool = False,
+    checkpoint_every: float = EVERY,
     progress: OnProgress | None = None,
 ) -> int:
     """Runs a scene and writes its frames.
 
-    The state is saved in the folder every `CHECKPOINT_EVERY` frames, after the frame itself, and when `progress`
-    raises KeyboardInterrupt. Going on from it gives the same frames: on the CPU to the last bit, on a GPU as far as its
+    The state is saved in the folder every `checkpoint_every` seconds, within a frame too, and when `progress` raises
+    KeyboardInterrupt. Going on from it gives the same frames: on the CPU to the last bit, on a GPU as far as its
     atomic sums come out alike, and with smoke in bricks to their threshold.
 
     Args:
@@ -88,16 +88,30 @@ def simulate(
         device: As `wlm.interop.check_device` returns it.
         resume: Whether to go on from a state that was saved there, if there is one. A state past the last frame asked
             for stays there.
+        checkpoint_every: Seconds between two saves; 0: after every step.
         progress: Called after each frame, with the figures `smoke`, the density's integral over the box, and
-            `frame s`, the seconds that the frame took.
+            `frame s`, the seconds that the frame took; and about twice a second within a frame, with the last one's.
 
     Returns:
         The number of the first frame that was simulated; one more than there are if all were there.
 
     Raises:
         WlmError: As `make_solver`; an obstacle is too fast; the air blew up; a file is damaged or can't be written; a
-            frame before the saved state is missing.
+            frame before the saved state is missing; another process is writing the folder.
     """
+    with locked(frames.path):
+        return _simulate(frames, solver, device, resume, checkpoint_every, progress)
+
+
+def _simulate(
+    frames: Frames,
+    solver: fluid.Solver | None,
+    device: str,
+    resume: bool,
+    checkpoint_every: float,
+    progress: OnProgress | None,
+) -> int:
+    """`simulate`, once the folder is locked."""
     scene, checkpoint = frames.scene, frames.path / CHECKPOINT
     missing = sorted(set(range(1, scene.frames + 1)) - set(frames.numbers))
     saved = resume and checkpoint.exists()
@@ -106,37 +120,44 @@ def simulate(
     if solver is None:
         solver = make_solver(scene, device=device)
     per_frame = scene.steps // scene.smoke.substeps
-    done = 0
+    begun = 0  # steps of earlier runs
     if saved:
         solver.load(checkpoint)
-        done = solver.steps // per_frame
-        if missing and missing[0] <= done:
-            raise WlmError(
-                f"{frames.path}: expected {frames.file(missing[0]).name}, since the saved state is of frame {done},"
-                " found none; start anew without --resume"
-            )
+        begun = solver.steps
+    done = begun // per_frame
+    if saved and missing and missing[0] <= done:
+        raise WlmError(
+            f"{frames.path}: expected {frames.file(missing[0]).name}, since the saved state is of frame {done},"
+            " found none; start anew without --resume"
+        )
     sources, meter = _sources(scene), Meter(progress, "simulate", scene.frames)
+    pace, figures = Pace(checkpoint_every), {}
     for frame in range(done + 1, scene.frames + 1):
         begin = time.perf_counter()
-        for step in range(per_frame):
+        for step in range(solver.steps % per_frame, per_frame):
             now = (frame - 1 + step / per_frame) / scene.rate
             solver.sources = tuple(source for source, active in sources if active(now))
             solver.step()
-        solver.check()
-        volume = volume_of(scene, solver)
-        save_volume(frames.file(frame), volume)
-        # After the frame: a state whose frame is missing would be resumed past it.
-        if frame % CHECKPOINT_EVERY == 0:
-            solver.save(checkpoint)
-        if progress is None:
-            continue
-        mass = float(volume.density.double().sum()) * volume.voxel**3
-        try:
-            meter.report(frame, smoke=mass, frame_s=time.perf_counter() - begin)
-        except KeyboardInterrupt:
-            solver.save(checkpoint)
-            raise
-    if done <= scene.frames:
+            last = step + 1 == per_frame
+            if last:
+                solver.check()
+                volume = volume_of(scene, solver)
+                # Before the state: one whose frame is missing would be resumed past it.
+                save_volume(frames.file(frame), volume)
+            if pace.due():
+                with pace.saving():
+                    solver.save(checkpoint)
+            try:
+                if last and progress is not None:
+                    mass = float(volume.density.double().sum()) * volume.voxel**3
+                    figures = {"smoke": mass, "frame_s": time.perf_counter() - begin}
+                    meter.report(frame, **figures)
+                elif meter.due(frame - 1):
+                    meter.report(frame - 1, **figures)
+            except KeyboardInterrupt:
+                solver.save(checkpoint)
+                raise
+    if begun <= scene.frames * per_frame:
         checkpoint.unlink(missing_ok=True)
     return min(done, scene.frames) + 1
 

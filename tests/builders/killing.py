@@ -1,0 +1,188 @@
+"""Long commands in processes of their own, killed at random moments and run again until they end."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[2]
+EARLY = 0.15  # share of the kills before the work begins
+LONGEST = 600.0  # seconds that a process may take
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command whose output has to outlast kills.
+
+    Attributes:
+        words: All but the output.
+        output: The output's name.
+        earlier: Writes an output of an earlier run to a path.
+        content: What an output holds, by name, without what differs from run to run.
+        state: Checks, of a path after a kill, what may be there: (path, earlier content, whole content).
+        partial: The checkpoint's path, of the output's; None: the command starts anew.
+    """
+
+    words: tuple[Any, ...]
+    output: str
+    earlier: Callable[[Path], None]
+    content: Callable[[Path], dict[str, Any]]
+    state: Callable[[Path, dict[str, Any], dict[str, Any]], None]
+    partial: Callable[[Path], Path] | None
+
+
+@dataclass
+class Counts:
+    """What came of a command's kills.
+
+    Attributes:
+        kills: By the signal's name.
+        runs: Outputs that came out the same as without kills.
+        saved: Kills after a checkpoint had been written, in this process or an earlier one.
+        lost: Largest number of seconds of work since the last checkpoint when SIGKILL came.
+    """
+
+    kills: dict[str, int] = field(default_factory=lambda: {"SIGKILL": 0, "SIGTERM": 0})
+    runs: int = 0
+    saved: int = 0
+    lost: float = 0.0
+
+
+def drive(command: Command, folder: Path, *, kills: int, seed: int, numbers: tuple[int, ...] = ()) -> Counts:
+    """Runs a command, kills it, runs it again until it ends, and all that until it was killed often enough.
+
+    Args:
+        command: The command.
+        folder: An empty folder.
+        kills: How many.
+        seed: Of the moments and signals.
+        numbers: The signals, in turn; empty: at random.
+    """
+    chance, counts = random.Random(seed), Counts()
+    (folder / "whole").mkdir()
+    whole = folder / "whole" / command.output
+    run = _Run(command, whole, False)
+    begin = run.wait_for_work()
+    assert run.wait() == 0, run.errors()
+    span = time.monotonic() - run.start - begin
+    expected = command.content(whole)
+    while sum(counts.kills.values()) < kills:
+        place = folder / f"run{counts.runs}"
+        place.mkdir()
+        output = place / command.output
+        command.earlier(output)
+        earlier, resume = command.content(output), False
+        while True:
+            run = _Run(command, output, resume)
+            count = sum(counts.kills.values())
+            if count < kills:
+                number = numbers[count % len(numbers)] if numbers else chance.choice([signal.SIGKILL, signal.SIGTERM])
+                if chance.random() < EARLY and not numbers:
+                    run.sleep(chance.uniform(0.0, begin))
+                else:
+                    run.wait_for_work()
+                    run.sleep(chance.uniform(0.0, 0.7 * span))
+                if run.process.poll() is None:
+                    run.kill(number, counts)
+            code = run.wait()
+            # Ended by itself; or nothing was left to stop.
+            if code == 0:
+                break
+            # Before Python has come to its handler the signal itself ends the process.
+            assert code in (-run.number, 128 + run.number), (code, run.errors())
+            assert "Traceback" not in run.errors(), run.errors()
+            command.state(output, earlier, expected)
+            resume = command.partial is not None and command.partial(output).exists()
+        assert command.content(output) == expected
+        left = set(os.listdir(place)) - set(os.listdir(whole.parent))
+        assert not left, left
+        counts.runs += 1
+        shutil.rmtree(place)
+    return counts
+
+
+class _Run:
+    """One process of a command.
+
+    Attributes:
+        start: When it was started.
+        number: The signal it was sent, or 0.
+    """
+
+    def __init__(self, command: Command, output: Path, resume: bool) -> None:
+        self.command, self.output = command, output
+        words = [*command.words, "-o", output, *["--resume"] * resume]
+        self._errors = output.parent.parent / "stderr"
+        environment = os.environ | {"PYTHONPATH": str(ROOT)}
+        with open(self._errors, "wb") as errors:
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", "wlm", *map(str, words)],
+                stdout=subprocess.DEVNULL,
+                stderr=errors,
+                env=environment,
+            )
+        self.start, self.number, self._begin = time.monotonic(), 0, None
+
+    def wait_for_work(self) -> float:
+        """Waits for a sign of work; returns the seconds since the start."""
+        while self.process.poll() is None and not self._works():
+            time.sleep(0.002)
+        self._begin = time.time()
+        return time.monotonic() - self.start
+
+    def _works(self) -> bool:
+        if self.command.partial is None:
+            # Of an export: files in the making.
+            return any(name.startswith(".wlm-") for name in os.listdir(self.output.parent))
+        return any(line.split(":")[0] in _WORKS for line in self.errors().splitlines())
+
+    def sleep(self, seconds: float) -> None:
+        """Waits, but not past the end."""
+        end = time.monotonic() + seconds
+        while self.process.poll() is None and time.monotonic() < end:
+            time.sleep(0.002)
+
+    def kill(self, number: int, counts: Counts) -> None:
+        """Sends a signal, and counts it if the process is stopped by it."""
+        self.number = number
+        self.process.send_signal(number)
+        now = time.time()
+        if self.wait() == 0:
+            return
+        counts.kills[signal.Signals(number).name] += 1
+        partial = None if self.command.partial is None else self.command.partial(self.output)
+        saved = partial.stat().st_mtime if partial is not None and partial.exists() else None
+        counts.saved += saved is not None
+        if number == signal.SIGKILL and partial is not None and self._begin is not None:
+            counts.lost = max(counts.lost, now - max(self._begin, saved or 0.0))
+
+    def wait(self) -> int:
+        return self.process.wait(LONGEST)
+
+    def errors(self) -> str:
+        return self._errors.read_text(encoding="utf-8")
+
+
+_WORKS = ("fit", "train", "simulate", "compress", "six", "guide")  # the first word of a report
+
+
+def file_bytes(path: Path) -> dict[str, Any]:
+    """The bytes of a file, or of each file in a folder."""
+    files = sorted(path.iterdir()) if path.is_dir() else [path]
+    return {file.name: file.read_bytes() for file in files}
+
+
+def without_seconds(path: Path) -> dict[str, Any]:
+    """The files of an atlas, but for the seconds in its report."""
+    content = file_bytes(path)
+    return content | {"report.json": json.loads(content["report.json"]) | {"seconds": 0, "inputs": 0}}
