@@ -20,6 +20,8 @@ __all__ = ["compress", "dynamic_targets", "open_checkpoint"]
 
 BATCH_TEXELS = 64 * 26 * TILE * TILE  # texels times times in a batch: 64 tiles of 26 times, 330 MB of targets
 
+_CONSTANT_ERROR = 0.01  # of a constant tile's radiance: half floats near their end, 6e-8, are further off
+
 
 def compress(
     lightmaps: LightmapSet,
@@ -158,10 +160,10 @@ class _Fit:
             source=lightmaps.source,
             profile=profile,
             kind=kind,
-            **{name: np.zeros(part.shape, part.dtype) for name, part in table.items()},
+            constant=self._constants(len(lightmaps.times)),
+            **{name: np.zeros(part.shape, part.dtype) for name, part in table.items() if name != "constant"},
         )
         self._mapped = np.flatnonzero(self.kinds >= TileKind.STATIC)
-        self._set_constants()
         self._set_scales()
         self._scale = self.model.scales
 
@@ -169,11 +171,16 @@ class _Fit:
         """Colour of a tile's K valid texels, [T, K, 3] in gamma space."""
         return self.data.colour[row][:, self.data.mask[row]]
 
-    def _set_constants(self) -> None:
-        for i, row in enumerate(np.flatnonzero(self.kinds == TileKind.CONSTANT)):
+    def _constants(self, times: int) -> np.ndarray:
+        """Radiance of the constant tiles, [N_c, T, 3]: half floats, or float32 where one would be over 1% off."""
+        rows = np.flatnonzero(self.kinds == TileKind.CONSTANT)
+        values = np.zeros((len(rows), times, 3))
+        for i, row in enumerate(rows):
             radiance = self._valid(row).astype(np.float64) ** self.profile.gamma
             # The middle of the range: at most half a step of half float off.
-            self.model.constant[i] = 0.5 * (radiance.min(1) + radiance.max(1))
+            values[i] = 0.5 * (radiance.min(1) + radiance.max(1))
+        half = values.astype(np.float16)
+        return half if (np.abs(half - values) <= _CONSTANT_ERROR * values).all() else values.astype(np.float32)
 
     def _set_scales(self) -> None:
         """Sets scale, bound, shift and spread of the tiles that have maps (section 4), rounded as in the file."""

@@ -16,7 +16,7 @@ import numpy as np
 
 from wlm.errors import WlmError
 from wlm.lightmap.data import LightmapSet
-from wlm.texels import fill_gaps
+from wlm.texels import check_size, fill_gaps
 
 __all__ = [
     "TILE",
@@ -66,10 +66,9 @@ class TileGrid:
             width: In texels, at least 1.
 
         Raises:
-            WlmError: A size is below 1.
+            WlmError: A size is below 1, or beyond what `wlm.texels.check_size` allows.
         """
-        if height < 1 or width < 1:
-            raise WlmError(f"tiles: expected a map of at least 1x1 texels, got {width}x{height}")
+        check_size(height, width)
         return cls(height, width, -(-height // TILE), -(-width // TILE))
 
     @property

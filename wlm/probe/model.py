@@ -21,6 +21,8 @@ __all__ = [
     "CENTRE",
     "CENTRE_BITS",
     "LATENT",
+    "MOST_OUTPUTS",
+    "MOST_PROBES",
     "ROTATION",
     "SCALE",
     "ProbeModel",
@@ -34,6 +36,12 @@ SCALE = slice(3, 6)
 ROTATION = slice(6, 10)
 LATENT = slice(10, None)
 CENTRE_BITS = 16
+
+MOST_PROBES = 1 << 27
+"""Probes of a model, at most: flags of dead ones take 128 MiB."""
+
+MOST_OUTPUTS = 1024
+"""Numbers of a probe, at most: a network of any width and so many outputs fits a GPU's shared memory."""
 
 
 class Profile(Settings):
