@@ -1,18 +1,17 @@
 """The file: a model comes back bit for bit, its size is arithmetic, and contradictions in it are one line."""
 
 import dataclasses
-from collections.abc import Callable
 
 import numpy as np
 import pytest
 from builders.atlas_meshes import charts, sheet, triangle
 from builders.atlas_models import KINDS, random_model
+from builders.resigned import GONE, put, rewrite
 
 import wlm
 from wlm.atlas import codec, colour
 from wlm.atlas.model import MOST_SIZE, AtlasModel, pack_entries
 from wlm.errors import WlmError
-from wlm.formats.artifact import read_artifact, write_artifact
 
 
 def assert_same(a: AtlasModel, b: AtlasModel) -> None:
@@ -79,48 +78,34 @@ def test_the_smallest_and_the_largest_numbers(tmp_path):
 
 
 def _refused(tmp_path, kind: str, words: str, settings=None, tensors=None, stored: str = "half") -> None:
-    """Saves a model with other settings or tensors (None: without it); reading and describing it are one line."""
+    """Saves a model with other settings or tensors; reading and describing it are one line."""
     path = tmp_path / "a.wlm"
     random_model(sheet(), kind, stored).save(path)
-    artifact = read_artifact(path)
-    contents = []
-    for values, changes in ((artifact.settings, settings or {}), (artifact.tensors, tensors or {})):
-        changed = {name: change(values.get(name)) for name, change in changes.items() if change is not None}
-        contents.append({name: value for name, value in values.items() if name not in changes} | changed)
-    write_artifact(path, "atlas", *contents, artifact.source)
+    rewrite(path, settings, tensors)
     for read in (wlm.load, codec.describe):
         with pytest.raises(WlmError, match=words) as error:
             read(path)
         assert str(error.value).startswith(f"{path}: ") and "\n" not in str(error.value)
 
 
-def _put(index, value) -> Callable[[np.ndarray], np.ndarray]:
-    def change(array: np.ndarray) -> np.ndarray:
-        array = array.copy()
-        array[index] = value
-        return array
-
-    return change
-
-
 @pytest.mark.parametrize(
     ("kind", "part", "change", "words"),
     [
         ("tiles", "colour", lambda v: v[:-1], "colour is float16 .17, 23, 3., expected float16 .18, 23, 3."),
-        ("tiles", "colour", _put((3, 4, 1), np.inf), "colour: expected finite numbers"),
-        ("tiles", "colour", _put((3, 4, 1), -1.0), "colour: expected numbers of at least 0, found -1"),
-        ("tiles", "colour", None, "colour is missing"),
+        ("tiles", "colour", put((3, 4, 1), np.inf), "colour: expected finite numbers"),
+        ("tiles", "colour", put((3, 4, 1), -1.0), "colour: expected numbers of at least 0, found -1"),
+        ("tiles", "colour", GONE, "colour is missing"),
         ("tiles", "lut", lambda v: np.ascontiguousarray(v[:, :-1]), "lut is uint16"),
-        ("tiles", "lut", _put((0, 0), pack_entries(np.array([20, 0]), np.array([4, 1]))), "beyond the colour texture"),
-        ("tiles", "lut", _put((0, 0), pack_entries(np.array([0, 17]), np.array([1, 2]))), "beyond the colour texture"),
-        ("tiles", "lut", None, "lut is missing"),
-        ("cascade", "lut", None, "lut is missing"),
+        ("tiles", "lut", put((0, 0), pack_entries(np.array([20, 0]), np.array([4, 1]))), "beyond the colour texture"),
+        ("tiles", "lut", put((0, 0), pack_entries(np.array([0, 17]), np.array([1, 2]))), "beyond the colour texture"),
+        ("tiles", "lut", GONE, "lut is missing"),
+        ("cascade", "lut", GONE, "lut is missing"),
         ("cascade", "lut", lambda v: v[:0], "lut is empty"),
         ("cascade", "lut", lambda v: np.ascontiguousarray(v[..., :1]), "lut is uint16"),
-        ("plain", "lut", lambda v: np.zeros((2, 2, 2), np.uint16), "lut is uint16"),
+        ("plain", "lut", np.zeros((2, 2, 2), np.uint16), "lut is uint16"),
         ("cascade", "uv", lambda v: np.ascontiguousarray(v[:, :2]), "uv is float32"),
-        ("cascade", "uv", _put((0, 1, 0), -0.1), "uv: expected 0 to 1, found -0.1"),
-        ("plain with uv", "uv", _put((0, 1, 0), 1.5), "uv: expected 0 to 1, found 1.5"),
+        ("cascade", "uv", put((0, 1, 0), -0.1), "uv: expected 0 to 1, found -0.1"),
+        ("plain with uv", "uv", put((0, 1, 0), 1.5), "uv: expected 0 to 1, found 1.5"),
     ],
 )
 def test_parts_that_do_not_fit_are_refused(kind, part, change, words, tmp_path):
@@ -148,21 +133,26 @@ def test_parts_that_do_not_fit_are_refused(kind, part, change, words, tmp_path):
     ],
 )
 def test_settings_that_do_not_fit_are_refused(change, words, tmp_path):
-    _refused(tmp_path, "tiles", words, {name: lambda _, value=value: value for name, value in change.items()})
+    _refused(tmp_path, "tiles", words, change)
 
 
 def test_blocks_that_are_none_of_the_format(tmp_path):
     blocks = {"colour": lambda v: np.zeros((29, 16), np.uint8)}
     _refused(tmp_path, "plain", "colour is uint8 .29, 16., expected uint8 .30, 16.", tensors=blocks, stored="astc")
     model = random_model(sheet(), "plain", "astc")
-    model.blocks[7] = 0  # a reserved mode
     model.save(tmp_path / "a.wlm")
+    rewrite(tmp_path / "a.wlm", tensors={"colour": put(7, 0)})  # a reserved mode
     with pytest.raises(WlmError, match="a.wlm: astc: expected blocks of the format"):
         wlm.load(tmp_path / "a.wlm")
 
 
 def test_a_texture_beyond_what_entries_reach(tmp_path):
     model = random_model(sheet(), "tiles")
-    dataclasses.replace(model, texels=np.zeros((18, MOST_SIZE + 1, 3), np.float16)).save(tmp_path / "a.wlm")
+    wide = dataclasses.replace(model, texels=np.zeros((18, MOST_SIZE + 1, 3), np.float16))
+    with pytest.raises(WlmError, match="a.wlm: not written: .*beyond the colour texture"):
+        wide.save(tmp_path / "a.wlm")
+    assert not (tmp_path / "a.wlm").exists()
+    model.save(tmp_path / "a.wlm")
+    rewrite(tmp_path / "a.wlm", {"texels": [18, MOST_SIZE + 1]}, {"colour": wide.texels})
     with pytest.raises(WlmError, match="beyond the colour texture"):
         wlm.load(tmp_path / "a.wlm")

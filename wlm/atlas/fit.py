@@ -23,6 +23,7 @@ from wlm.atlas.tiles import fit_tiles
 from wlm.atlas.views import corner_weights
 from wlm.atlas.weights import FineGrid, weights
 from wlm.errors import WlmError
+from wlm.metrics import LostLight
 from wlm.ops.raster import texture
 from wlm.system import OnProgress
 from wlm.texels import check_size
@@ -53,6 +54,7 @@ def compress(
 
     Returns:
         The model. It is "plain", a smaller lightmap of as many bits, where that has no larger error than the method.
+        Its report has "lost light", a line, where bright texels lost more than half of theirs.
 
     Raises:
         WlmError: No such profile or device, a wrong setting, a missing package, a lightmap that is too large, or a
@@ -72,6 +74,11 @@ def compress(
     elif model is None:
         raise WlmError(_NO_ROOM.format(profile.budget, *mesh.mask.shape[::-1]))
     check_area(mesh.mask.shape, model.texels.shape[:2], model.lut.shape[:2])
+    with stages("check"):
+        lost = LostLight()
+        lost.add(mesh.lightmap[mesh.mask], Decoder(model, device).lightmap(mesh)[mesh.mask])
+    if warnings := lost.warnings(mesh.name, "texel", "the lightmap"):
+        model = replace(model, report=model.report | {"lost light": warnings[0]})
     return replace(model, report=model.report | {"seconds": stages.seconds})
 
 

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from wlm import interop
-from wlm.errors import WlmError
 from wlm.formats.checkpoint import Checkpoint
+from wlm.formats.parts import Part
 from wlm.lightmap.data import LightmapSet
 from wlm.lightmap.model import LightmapModel, Profile, encode_scale, part_table
 from wlm.lightmap.tiles import TILE, TileGrid, TileKind, channel_means, classify, split
@@ -51,7 +51,7 @@ def compress(
         The model.
 
     Raises:
-        WlmError: No such profile, setting, device or tile; or the fit diverged.
+        WlmError: No such profile, setting, device or tile; a checkpoint that isn't of this fit; or the fit diverged.
         KeyboardInterrupt: Raised by `progress`, after the checkpoint, if there is one, has been written.
     """
     device = interop.check_device(device)
@@ -59,7 +59,7 @@ def compress(
     steps, batches = fit.profile.steps, fit.batches()
     meter = Meter(progress, "fit", steps * len(batches))
     for number, batch in enumerate(batches):
-        parts = checkpoint.finished(number) if checkpoint is not None else None
+        parts = checkpoint.finished(number, fit.table(batch)) if checkpoint is not None else None
         if parts is None:
             targets = fit.targets(batch.rows)
             dynamic = batch.kind == TileKind.DYNAMIC
@@ -222,6 +222,14 @@ class _Fit:
             self.profile.metric_weight,
         )
 
+    def table(self, batch: _Batch) -> dict[str, Part]:
+        """The parts of a batch that is finished, as the trainer gives them."""
+        kind = np.full(len(batch.rows), batch.kind, np.uint8)
+        table = part_table(self.profile, kind, len(self.model.times))
+        if batch.kind == TileKind.STATIC:
+            return {"net": table["net_static"], "uv": table["uv"]}
+        return {name: table[name] for name in ("net", "uv", "uvt", "ut", "vt")}
+
     def store(self, batch: _Batch, parts: dict[str, np.ndarray]) -> None:
         """Puts the maps and networks of a batch into the model."""
         self.model.uv[np.searchsorted(self._mapped, batch.rows)] = parts["uv"]
@@ -233,8 +241,8 @@ class _Fit:
 def _run(trainer: Trainer, number: int, meter: Meter, checkpoint: Checkpoint | None) -> None:
     """Trains batch `number` to its end, from its checkpoint if it has one."""
     steps = trainer.profile.steps
-    if checkpoint is not None and (state := checkpoint.running(number)) is not None:
-        trainer.load(state)
+    if checkpoint is not None:
+        checkpoint.restore(number, trainer.load)
     chunk = 200 if trainer.device != "cpu" else 5
     step = trainer.step
     while step < steps:
@@ -251,9 +259,4 @@ def _run(trainer: Trainer, number: int, meter: Meter, checkpoint: Checkpoint | N
             if checkpoint is not None:
                 checkpoint.save_running(number, trainer.state())
             raise
-    diverged = ~np.isfinite(trainer.losses())
-    if diverged.any():
-        raise WlmError(
-            f"tile {trainer.numbers[diverged][0]}: the fit diverged; expected a smaller map_rate or net_rate than "
-            f"{trainer.profile.name}'s"
-        )
+    trainer.check()

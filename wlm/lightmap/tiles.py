@@ -27,6 +27,7 @@ __all__ = [
     "channel_means",
     "classify",
     "parse_tiles",
+    "place",
     "split",
     "static_pattern",
 ]
@@ -299,11 +300,23 @@ def assemble(tiles: np.ndarray, index: np.ndarray, grid: TileGrid, fill: float =
         )
     _check_index(index, grid)
     image = np.full((grid.height, grid.width, tiles.shape[3]), fill, tiles.dtype)
+    place(image, tiles, index, grid)
+    return image
+
+
+def place(image: np.ndarray, tiles: np.ndarray, index: np.ndarray, grid: TileGrid) -> None:
+    """Writes tiles into a map.
+
+    Args:
+        image: `[H, W, C]`, written.
+        tiles: `[N, 128, 128, C]`. What they hold past the map's end is dropped.
+        index: `[N]`, number of each tile in the grid.
+        grid: The map's.
+    """
     for tile, number in zip(tiles, index, strict=True):
         y, x = grid.origin(number)
         part = image[y : y + TILE, x : x + TILE]
         part[...] = tile[: part.shape[0], : part.shape[1]]
-    return image
 
 
 def _check_gamma(gamma: float) -> None:

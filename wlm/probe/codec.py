@@ -33,17 +33,19 @@ class _Header(Header):
     profile: Profile
 
 
-def _parts(profile: Profile, probes: int, outputs: int) -> dict[str, Part]:
+def _parts(header: _Header) -> dict[str, Part]:
     """The table of parts."""
-    layers = layer_shapes(profile.latent, profile.hidden, outputs)
+    profile = header.profile
+    layers = layer_shapes(profile.latent, profile.hidden, header.outputs)
+    bits = header.gaussians * int(profile.code_bits().sum())
     return {
-        "gaussians": Part(np.uint8, (None,)),
+        "gaussians": Part(np.uint8, (-(-bits // 8),)),
         # The difference of any two is finite.
         "bounds": Part(np.float32, (2, LATENT.start + profile.latent), least=-1e38, most=1e38),
         "net": Part(np.float16, (sum(rows * columns for rows, columns in layers),)),
         "frame": Part(np.float64, (8,)),
         "dead": Part(np.uint8, (None,), optional=True),
-        "positions": Part(np.uint16, (probes, 3), optional=True),
+        "positions": Part(np.uint16, (header.probes, 3), optional=True),
     }
 
 
@@ -75,17 +77,16 @@ def decode(artifact: Artifact) -> ProbeModel:
         WlmError, ValueError: A setting or a part is missing or wrong, or they don't fit each other.
     """
     header = check_settings(_Header, artifact.settings, "setting ")
-    profile, probes = header.profile, header.probes
-    parts = check_parts(artifact.tensors, _parts(profile, probes, header.outputs))
+    parts = check_parts(artifact.tensors, _parts(header))
     _check_frame(parts["frame"])
     _check_bounds(parts["bounds"])
     frame = parts["frame"]
-    codes = unpack_bits(parts["gaussians"], profile.code_bits(), header.gaussians)
+    codes = unpack_bits(parts["gaussians"], header.profile.code_bits(), header.gaussians)
     return ProbeModel(
         name=header.name,
         source=artifact.source,
-        profile=profile,
-        probes=probes,
+        profile=header.profile,
+        probes=header.probes,
         outputs=header.outputs,
         origin=frame[:3].copy(),
         extent=float(frame[3]),
@@ -95,7 +96,7 @@ def decode(artifact: Artifact) -> ProbeModel:
         code=codes[:, 3:],
         bounds=parts["bounds"],
         net=parts["net"],
-        dead=_unpack_dead(parts["dead"], probes),
+        dead=_unpack_dead(parts["dead"], header.probes),
         positions=parts["positions"],
         dropped=header.dropped,
     )

@@ -94,8 +94,8 @@ def compress(
     x = ((probes.position - origin) / extent).astype(np.float32)
     trainer = Trainer(x[probes.live], probes.values[probes.live], profile, seed, device)
     try:
-        if checkpoint is not None and (state := checkpoint.running(0)) is not None:
-            trainer.load(state)
+        if checkpoint is not None:
+            checkpoint.restore(0, trainer.load)
         _run(trainer, probes, profile, device, progress, checkpoint)
         trainer.finish()
         mse = trainer.mse()
