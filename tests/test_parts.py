@@ -14,7 +14,7 @@ from wlm.errors import WlmError
 from wlm.formats.artifact import read_artifact, write_artifact
 
 MODELS = ("lightmap", "probe", "atlas-tiles", "atlas-cascade", "atlas-bc6h", "smoke")
-MOST = 16  # parts of a file that are tried: a network's weights are all alike
+MOST = 10  # parts of a file that are tried: a network's weights are all alike
 
 WEIRD = {
     "none": None,

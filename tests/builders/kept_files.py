@@ -91,7 +91,7 @@ def _samples() -> Any:
     return Pool(*(torch.rand(shape, generator=random).half() for shape in shapes), torch.arange(2))
 
 
-def _lightmap_fit() -> tuple[Any, Any]:
+def lightmap_fit() -> tuple[Any, Any]:
     """A fit of one dynamic tile, and a trainer of it after three steps."""
     from builders.small_sets import moving_light, tiny_profile
 
@@ -111,7 +111,7 @@ def _opened(path: Path, system: str) -> Checkpoint:
 
 
 def _lightmap_running() -> Kept:
-    _, trainer = _lightmap_fit()
+    _, trainer = lightmap_fit()
     content = _written(lambda path: Checkpoint(path, "lightmap", {}, "0f").save_running(0, trainer.state()))
     ranges = {"control": (0, 21), "adam_net.0.exp_avg_sq": (0, -1.0), "adam_maps.0.step": ((), 9.0)}
     return Kept(
@@ -123,7 +123,7 @@ def _lightmap_running() -> Kept:
 
 
 def _lightmap_finished() -> Kept:
-    fit, trainer = _lightmap_fit()
+    fit, trainer = lightmap_fit()
     (batch,) = fit.batches()
     content = _written(lambda path: Checkpoint(path, "lightmap", {}, "0f").add_finished(0, trainer.quantised()))
     return Kept(content, lambda path: _opened(path, "lightmap").finished(0, fit.table(batch)), {}, {})

@@ -54,7 +54,7 @@ def compress(
 
     Returns:
         The model. It is "plain", a smaller lightmap of as many bits, where that has no larger error than the method.
-        Its report has "lost light", a line, where bright texels lost more than half of theirs.
+        Its report has "lost light", lines, where texels lost more than half of theirs and PSNR doesn't show it.
 
     Raises:
         WlmError: No such profile or device, a wrong setting, a missing package, a lightmap that is too large, or a
@@ -78,7 +78,7 @@ def compress(
         lost = LostLight()
         lost.add(mesh.lightmap[mesh.mask], Decoder(model, device).lightmap(mesh)[mesh.mask])
     if warnings := lost.warnings(mesh.name, "texel", "the lightmap"):
-        model = replace(model, report=model.report | {"lost light": warnings[0]})
+        model = replace(model, report=model.report | {"lost light": warnings})
     return replace(model, report=model.report | {"seconds": stages.seconds})
 
 

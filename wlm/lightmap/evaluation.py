@@ -26,7 +26,7 @@ __all__ = [
     "scored_mask",
 ]
 
-_LOST = "texel", "their tiles"
+_LOST = "texel", "their tile"
 _FEW_TEXELS = 16  # of a tile's 16,384
 
 # Stored times are float32 where that keeps them apart; see `wlm.lightmap.codec`.
@@ -155,7 +155,7 @@ def lost_light(model: LightmapModel, lightmaps: LightmapSet, device: str = "cpu"
         device: Where it is decoded.
 
     Returns:
-        One line with the texels and the largest loss, or none.
+        Lines with the texels and the largest loss.
 
     Raises:
         WlmError: As `evaluate`.
