@@ -74,9 +74,8 @@ def compress(
     elif model is None:
         raise WlmError(_NO_ROOM.format(profile.budget, *mesh.mask.shape[::-1]))
     check_area(mesh.mask.shape, model.texels.shape[:2], model.lut.shape[:2])
-    with stages("check"):
-        lost = LostLight()
-        lost.add(mesh.lightmap[mesh.mask], Decoder(model, device).lightmap(mesh)[mesh.mask])
+    lost = LostLight()
+    lost.add(mesh.lightmap[mesh.mask], Decoder(model, device).lightmap(mesh)[mesh.mask])
     if warnings := lost.warnings(mesh.name, "texel", "the lightmap"):
         model = replace(model, report=model.report | {"lost light": warnings})
     return replace(model, report=model.report | {"seconds": stages.seconds})
