@@ -1,4 +1,4 @@
-"""What the four systems share: settings by name, progress, reports, the table of a file's parts, save and load.
+"""What the four systems share: settings by name, progress, reports, headers of files, save and load.
 
 Only manners are shared here; each system's mathematics stays in its own rooms:
 
@@ -19,14 +19,14 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
-from typing import Any, ClassVar, Self
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
+from pydantic import AfterValidator, BaseModel, ConfigDict
 
 from wlm.config import check_settings, load_settings, profile_path
 from wlm.errors import WlmError
-from wlm.formats.artifact import Artifact, encode_artifact, read_artifact, write_artifact
+from wlm.formats.artifact import FORMAT_VERSION, Artifact, encode_artifact, read_artifact, write_artifact
 
 # Which package reads which system's files.
 _PACKAGES = {
@@ -38,6 +38,14 @@ _PACKAGES = {
 _REPORT_EVERY = 0.5  # seconds between two reports of progress
 
 
+def _printable(text: str) -> str:
+    return "".join(letter if letter.isprintable() else " " for letter in text)
+
+
+Name = Annotated[str, AfterValidator(_printable)]
+"""A name from a file: what a terminal would obey rather than show has become spaces."""
+
+
 class Settings(BaseModel):
     """Settings of a fit, loaded by name: the base of each system's `Profile`.
 
@@ -46,10 +54,10 @@ class Settings(BaseModel):
         name: Shown in reports.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     FILES: ClassVar[str]
-    name: str
+    name: Name
 
     @classmethod
     def load(cls, profile: str | os.PathLike[str] | Self) -> Self:
@@ -169,57 +177,13 @@ def plain(value: Any) -> Any:
     return value
 
 
-@dataclass(frozen=True)
-class Part:
-    """One part of a system's file: a row of its table of parts.
+class Header(BaseModel):
+    """What a file's header says beside its parts: the base of each codec's table of settings.
 
-    Attributes:
-        dtype: NumPy type, or the types of which it is one.
-        shape: Sizes; None where any size will do. A part with a size of 0 is left out of the file.
-        optional: Whether the file may lack it; it is then of size 0 where `shape` says None.
+    Types are exact: no number is taken from a text, no count from a float. No number is NaN or infinite.
     """
 
-    dtype: type | tuple[type, ...]
-    shape: tuple[int | None, ...]
-    optional: bool = False
-
-
-def check_parts(tensors: Mapping[str, np.ndarray], table: Mapping[str, Part]) -> dict[str, np.ndarray]:
-    """Checks the tensors of a file against its table of parts.
-
-    Args:
-        tensors: By name, as read.
-        table: By name. Tensors that it does not name are left alone.
-
-    Returns:
-        Every part of the table; those that the file leaves out are empty.
-
-    Raises:
-        ValueError: A part is missing, of another type or shape, or holds NaN or infinity.
-    """
-    parts = {}
-    for name, part in table.items():
-        kinds = part.dtype if isinstance(part.dtype, tuple) else (part.dtype,)
-        if name in tensors:
-            value = tensors[name]
-        elif part.optional or 0 in part.shape:
-            value = np.zeros([size or 0 for size in part.shape], kinds[0])
-        else:
-            raise ValueError(f"part {name} is missing")
-        sizes = value.shape
-        fits = len(sizes) == len(part.shape) and all(
-            expected in (None, size) for size, expected in zip(sizes, part.shape, strict=True)
-        )
-        # An optional part is whole or not there.
-        absent = part.optional and value.size == 0
-        if value.dtype not in kinds or not (fits or absent):
-            types = " or ".join(np.dtype(kind).name for kind in kinds)
-            shape = ", ".join("any" if size is None else str(size) for size in part.shape)
-            raise ValueError(f"part {name} is {value.dtype} {sizes}, expected {types} ({shape})")
-        if value.dtype.kind == "f" and not np.isfinite(value).all():
-            raise ValueError(f"part {name}: expected finite numbers, found NaN or infinity")
-        parts[name] = value
-    return parts
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
 
 class Model:
@@ -241,9 +205,13 @@ class Model:
             The file's size, bytes.
 
         Raises:
-            WlmError: The file can't be written; what was there before stays.
+            WlmError: What the file would hold can't be read again, NaN from a fit that diverged for example; or the
+                file can't be written. What was there before stays.
         """
-        return write_artifact(path, self.SYSTEM, *self._encoded())
+        settings, parts, source = self._encoded()
+        content = Artifact(self.SYSTEM, FORMAT_VERSION, settings, source, parts, {}, 0, 0)
+        decode(f"{path}: not written", content, _room(self.SYSTEM, "codec").decode)
+        return write_artifact(path, self.SYSTEM, settings, parts, source)
 
     def file_bytes(self) -> int:
         """Size of the file that `save` writes, bytes."""

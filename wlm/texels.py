@@ -6,6 +6,25 @@ from scipy.ndimage import distance_transform_edt
 from wlm.errors import WlmError
 from wlm.formats.exr import HALF_MAX
 
+MOST_SIDE = 65536
+"""Texels of a lightmap along a side, at most."""
+
+MOST_TEXELS = 1 << 28
+"""Texels of a lightmap, at most: 16,384 x 16,384, of which one decoded frame takes 3 GiB."""
+
+
+def check_size(height: int, width: int) -> None:
+    """Checks the size of a lightmap, before memory is taken for it.
+
+    Raises:
+        WlmError: It has no texel, or more than `MOST_SIDE` along a side or `MOST_TEXELS` in all.
+    """
+    if min(height, width) < 1 or max(height, width) > MOST_SIDE or height * width > MOST_TEXELS:
+        raise WlmError(
+            f"size: expected at least 1x1 texels, at most {MOST_SIDE} along a side and {MOST_TEXELS} in all, "
+            f"found {width}x{height}"
+        )
+
 
 def fill_gaps(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """Gives every texel outside the mask the value of the nearest texel inside it (Euclidean distance).

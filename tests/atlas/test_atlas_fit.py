@@ -1,5 +1,6 @@
 """Compressing: the budget, hard cases, the fallback, stages, and quality against smaller lightmaps."""
 
+from dataclasses import replace
 from itertools import groupby
 
 import numpy as np
@@ -344,3 +345,14 @@ def test_on_every_device(device: str):
     mesh = sheet(height=64, width=64)
     model, reference = compress(mesh, STANDARD, device=device), compress(mesh, STANDARD)
     assert psnr(model, mesh) == pytest.approx(psnr(reference, mesh), abs=0.2)
+
+
+def test_light_that_a_small_budget_loses_is_said():
+    mesh = sheet()
+    lightmap = mesh.lightmap.copy()
+    lightmap[20, 20] = 1e4
+    report = compress(replace(mesh, lightmap=lightmap), "standard", views=0, budget=0.02).report
+    first, second = report["lost light"]
+    assert "1 texel among the brightest of the lightmap lost more than half" in first and "of 1e+04 decodes" in first
+    assert "most of the lightmap, are off by more than half of their own light" in second
+    assert "lost light" not in compress(mesh, "standard", views=0).report

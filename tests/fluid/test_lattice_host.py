@@ -38,7 +38,7 @@ def test_not_a_number_is_reported(where: tuple[int, int, int], device: str):
     q = 4
     populations = state["populations"].reshape(-1, *SHAPE)
     populations[(q, *where)] = np.nan
-    box.load(state)
+    box._engine.buffers[0].assign(state["populations"])
     with pytest.raises(WlmError, match=r"blew up in step 5 at cell \(\d+, \d+, \d+\): not a number") as caught:
         box.step(CHECK_EVERY)
     assert "\n" not in str(caught.value)
@@ -234,11 +234,13 @@ def test_states_are_checked(device: str):
     state = box.state()
     missing = {name: value for name, value in state.items() if name != "bodies"}
     for wrong, match in (
-        (missing, "bodies: missing"),
-        (state | {"populations": state["populations"][:9]}, "populations: expected float32"),
-        (state | {"populations": state["populations"].astype(np.float16)}, "found float16"),
-        (state | {"solid": np.zeros(3, np.uint8)}, "solid: expected uint8"),
-        (state | {"steps": np.array(2.5)}, "steps: expected int64"),
+        (missing, "part bodies is missing"),
+        (state | {"populations": state["populations"][:9]}, "populations is float32"),
+        (state | {"populations": state["populations"].astype(np.float16)}, "part populations is float16"),
+        (state | {"solid": np.zeros(3, np.uint8)}, r"part solid is uint8 \(3,\), expected uint8"),
+        (state | {"populations": np.full_like(state["populations"], np.nan)}, "part populations: expected finite"),
+        (state | {"steps": np.array(-1)}, "part steps: expected 0 to 2.14748e.09, found -1"),
+        (state | {"steps": np.array(2.5)}, "part steps is float64 .*, expected int64"),
     ):
         with pytest.raises(WlmError, match=match):
             box.load(wrong)

@@ -232,9 +232,13 @@ def test_checkpoints_are_checked(device: str, tmp_path: Path):
             different.load(path)
     stored = read_artifact(path)
     for name, value, match in (
-        ("density", np.zeros((2, 2, 2), np.float32), r"density: expected float32 \(40, 20, 20\), found float32"),
-        ("lattice.populations", None, "populations: missing"),
-        ("placed", None, "placed: expected float64 .*, found none"),
+        (
+            "density",
+            np.zeros((2, 2, 2), np.float32),
+            r"density is float32 \(2, 2, 2\), expected float32 \(40, 20, 20\)",
+        ),
+        ("lattice.populations", None, "part populations is missing"),
+        ("placed", None, "part placed is missing"),
     ):
         tensors = {key: np.array(v) for key, v in stored.tensors.items() if key != name}
         if value is not None:

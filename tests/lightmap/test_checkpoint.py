@@ -8,6 +8,7 @@ from builders.small_sets import moving_light, static_light, tiny_profile
 from wlm.errors import WlmError
 from wlm.formats.artifact import read_artifact, write_artifact
 from wlm.formats.checkpoint import Checkpoint, Pace
+from wlm.formats.parts import Part
 from wlm.lightmap.data import from_arrays
 from wlm.lightmap.fit import compress, open_checkpoint
 
@@ -80,7 +81,8 @@ def test_a_fit_may_be_interrupted_again_and_again(tmp_path):
 def test_what_is_kept_comes_back(tmp_path):
     lightmaps = moving_light(40, 24)
     checkpoint = open_checkpoint(tmp_path / "a.wlm", lightmaps, PROFILE)
-    assert checkpoint.finished(0) is None and checkpoint.running(0) is None
+    assert checkpoint.finished(0, {}) is None and checkpoint.running(0) is None
+    table = {"uv": Part(np.uint8, (2, 3, 4)), "net": Part(np.float16, (2, 5))}
     parts = {"uv": np.arange(24, dtype=np.uint8).reshape(2, 3, 4), "net": np.ones((2, 5), np.float16)}
     checkpoint.add_finished(0, parts)
     checkpoint.save_running(1, {"maps": np.arange(5.0, dtype=np.float32), "adam.0.step": np.array(7.0, np.float32)})
@@ -88,10 +90,10 @@ def test_what_is_kept_comes_back(tmp_path):
     back = open_checkpoint(tmp_path / "a.wlm", lightmaps, PROFILE, resume=True)
     assert back.resumed
     for name, value in parts.items():
-        np.testing.assert_array_equal(back.finished(0)[name], value)
-        assert back.finished(0)[name].dtype == value.dtype
+        np.testing.assert_array_equal(back.finished(0, table)[name], value)
+        assert back.finished(0, table)[name].dtype == value.dtype
     assert back.running(1)["adam.0.step"] == 7.0 and back.running(1)["adam.0.step"].shape == ()
-    assert back.finished(1) is None and back.running(0) is None
+    assert back.finished(1, table) is None and back.running(0) is None
 
     back.add_finished(1, parts)
     assert open_checkpoint(tmp_path / "a.wlm", lightmaps, PROFILE, resume=True).running(1) is None
@@ -130,9 +132,10 @@ def test_without_resume_an_old_checkpoint_is_left_out_and_replaced(tmp_path):
     old = open_checkpoint(tmp_path / "a.wlm", lightmaps, PROFILE, seed=1)
     old.add_finished(0, {"uv": np.zeros(4, np.uint8)})
     new = open_checkpoint(tmp_path / "a.wlm", lightmaps, PROFILE, seed=2)
-    assert not new.resumed and new.finished(0) is None
+    assert not new.resumed and new.finished(0, {}) is None
     new.add_finished(0, {"uv": np.ones(4, np.uint8)})
-    assert open_checkpoint(tmp_path / "a.wlm", lightmaps, PROFILE, seed=2, resume=True).finished(0)["uv"].all()
+    again = open_checkpoint(tmp_path / "a.wlm", lightmaps, PROFILE, seed=2, resume=True)
+    assert again.finished(0, {"uv": Part(np.uint8, (4,))})["uv"].all()
 
 
 def test_nothing_to_resume_is_a_fresh_start(tmp_path):
@@ -165,7 +168,7 @@ def test_the_order_of_tiles_and_the_number_of_the_gpu_do_not_matter(tmp_path):
     first = open_checkpoint(tmp_path / "a.wlm", lightmaps, PROFILE, tiles=[2, 0], device="cuda:1")
     first.add_finished(0, {"uv": np.zeros(4, np.uint8)})
     same = open_checkpoint(tmp_path / "a.wlm", lightmaps, PROFILE, tiles=[0, 2], device="cuda:0", resume=True)
-    assert same.finished(0)
+    assert same.finished(0, {"uv": Part(np.uint8, (4,))})
 
 
 def test_a_checkpoint_of_another_system_is_refused(tmp_path):

@@ -12,7 +12,7 @@ import wlm
 from wlm.errors import WlmError
 from wlm.lightmap.data import from_arrays
 from wlm.lightmap.decode import Decoder
-from wlm.lightmap.evaluation import bits_per_texel, evaluate, part_bytes
+from wlm.lightmap.evaluation import bits_per_texel, evaluate, lost_light, part_bytes
 from wlm.lightmap.fit import compress
 from wlm.metrics import evaluate_frame, summarise
 
@@ -136,3 +136,17 @@ def test_a_set_that_does_not_fit_is_one_line(fitted):
         evaluate(model, lightmaps, device="tpu")
     with pytest.raises(ValueError, match="file_bytes"):
         evaluate(model, lightmaps, file_bytes=100, metrics=("psnr",))
+
+
+def test_a_firefly_that_is_lost_is_said():
+    """By the fit's own look at the few tiles that may have one, and by the evaluation; of the times that hold it."""
+    plain = moving_light(128, 150)
+    frames = plain.frames.copy()
+    frames[2, 60, 60] = 1e4
+    lightmaps = from_arrays(frames, plain.times, period=24.0, name="fly")
+    model = compress(lightmaps, tiny_profile(steps=60))
+    (line,) = lost_light(model, lightmaps)
+    assert line.startswith("fly: 1 texel among the brightest of their tile lost more than half of the light; the larg")
+    assert "of 1e+04 decodes to 0." in line and line.endswith("(tile 0 at 11)")
+    assert line in evaluate(model, lightmaps, metrics=("psnr",)).warnings
+    assert lost_light(compress(plain, tiny_profile(steps=60)), plain) == []

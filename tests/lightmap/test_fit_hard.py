@@ -2,7 +2,9 @@
 
 import numpy as np
 import pytest
+import torch
 from builders.checks import error_of
+from builders.kept_files import lightmap_fit
 from builders.small_sets import HOURS, moving_light, static_light, tiny_profile
 
 import wlm
@@ -57,6 +59,31 @@ def test_a_constant_tile_is_within_half_a_step_of_half_float(tmp_path):
     np.testing.assert_allclose(decoder.frame(0.25)[5, 5], 0.75 * levels[0] + 0.25 * levels[1], rtol=2**-10)
     pixels, peak = decoder.frame_8bit(2.0)
     np.testing.assert_allclose((pixels[3, 3, :3] / 255.0 * peak[0]) ** 2.2, levels[2], rtol=1e-3)
+
+
+@pytest.mark.parametrize("level", [1e-40, 1e-7, 6.26e-7])
+def test_a_constant_below_what_half_floats_hold_is_kept(tmp_path, level):
+    """Beside one that they hold, in as many bytes as before where all are such."""
+    frames = np.full((2, 128, 256, 3), level, np.float32)
+    frames[:, :, 128:] = 1e-3
+    decoder = through_file(tmp_path, from_arrays(frames, (0.0, 1.0)))
+    assert only(decoder, "constant") and decoder.model.constant.dtype == np.float32
+    np.testing.assert_allclose(decoded(decoder), frames, rtol=1e-3)
+    plain = compress(from_arrays(np.full_like(frames, 1e-3), (0.0, 1.0)), PROFILE)
+    assert plain.constant.dtype == np.float16
+
+
+def test_a_fit_that_diverged_keeps_nothing():
+    _, trainer = lightmap_fit()
+    for wrong in (np.nan, 1e5):
+        trainer.state()
+        kept = trainer.hidden[0, 2, 1].item()
+        with torch.no_grad():
+            trainer.hidden[0, 2, 1] = wrong
+        with pytest.raises(WlmError, match="tile 0: the fit diverged; expected a smaller map_rate or net_rate than"):
+            trainer.state()
+        with torch.no_grad():
+            trainer.hidden[0, 2, 1] = kept
 
 
 def test_a_static_tile_stores_no_temporal_maps_and_follows_the_brightness(tmp_path):

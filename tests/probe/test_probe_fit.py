@@ -1,5 +1,7 @@
 """The fit: that it learns, repeats, resumes, prunes, and lives through hard sets."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from builders.probe_sets import synthetic
@@ -182,3 +184,26 @@ def test_first_places():
     keen, _ = first_gaussians(x, values, 50, 1.0, 1.0, np.random.default_rng(0))
     assert plain.shape == keen.shape == (50, 3) and (scale > 0).all()
     assert (keen[:, 0] > 0.75).sum() > 1.5 * (plain[:, 0] > 0.75).sum()
+
+
+def test_a_probe_that_outshines_the_others_is_said():
+    probes = synthetic(130)
+    values = probes.values.copy()
+    values[100] *= 1e4
+    bright = dataclasses.replace(probes, values=values)
+    report = evaluate(compress(bright, SMALL), bright)
+    assert report.psnr > 30.0 and "most of the set, are off by more than half of their own light" in report.warnings[-1]
+    assert evaluate(compress(probes, SMALL, steps=200), probes).warnings == []
+
+
+def test_more_numbers_a_probe_than_a_network_has_outputs():
+    wide = from_arrays(RANDOM.random((3, 3)), RANDOM.normal(size=(3, 1025)).astype(np.float32))
+    with pytest.raises(WlmError, match="expected at most 134217728 probes of 1024 numbers, found 3 of 1025"):
+        compress(wide, SMALL)
+
+
+def test_a_fit_that_diverged_keeps_no_state():
+    trainer = Trainer(*_input(synthetic(60)), SMALL, 0, "cpu")
+    trainer._tensors["net"][5] = np.nan
+    with pytest.raises(WlmError, match="the fit diverged; expected smaller rates than those of small"):
+        trainer.state()

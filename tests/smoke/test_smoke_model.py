@@ -199,10 +199,10 @@ def test_a_file_says_how_its_network_looks_at_smoke(tmp_path):
 @pytest.mark.parametrize(
     "change, message",
     [
-        (lambda settings, tensors: tensors.update(more=np.zeros(3, np.float16)), "part more is none of its network's"),
+        (lambda settings, tensors: tensors.update(more=np.zeros(3, np.float16)), "part more is none of the file's"),
         (
             lambda settings, tensors: settings["network"].update(width=16),
-            r"\(8, 3, 3, 3\), expected float16 \(16, 3, 3, 3\)",
+            r"encoder.2.2.weight is float16 \(32, 32, 3, 3\), expected float16 \(64, 64, 3, 3\)",
         ),
         (lambda settings, tensors: settings["network"].update(width=7), "network.width"),
         (lambda settings, tensors: settings.update(summary=3), "summary"),

@@ -41,8 +41,10 @@ from wlm.atlas.views import DISTANCE, ZOOM, normalised, sphere_views
 from wlm.errors import WlmError
 from wlm.formats.checkpoint import Checkpoint
 from wlm.formats.exr import HALF_MAX
+from wlm.formats.parts import Part, check_parts
 from wlm.system import Meter, OnProgress
 from wlm_kernels.atlas import cascade as kernels
+from wlm_kernels.atlas.patches import ORDERS
 from wlm_kernels.raster import texture as texture_kernels
 from wlm_kernels.raster.rasterize import Rasterizer
 
@@ -80,8 +82,11 @@ def group_triangles(mesh: LightmappedMesh, profile: Profile, stages: Stages) -> 
     # Any number will do for a black lightmap, whose triangles are all alike.
     brightest = float(mesh.lightmap[mesh.mask].max()) or 1.0
     with stages("cluster"):
-        if stages.checkpoint is not None and (kept := stages.checkpoint.finished(0)) is not None:
-            return Clusters(**{**kept, "stats": Stats(*map(int, kept["stats"]))})
+        if (
+            stages.checkpoint is not None
+            and (kept := _kept_clusters(stages.checkpoint, len(mesh.triangle))) is not None
+        ):
+            return kept
         clusters = cluster(
             mesh.uv,
             mesh.triangle,
@@ -205,8 +210,8 @@ def tune(
         step = _Step(mesh, uv, textures, profile, seed, device)
         graph = interop.StepGraph(step, device)
         meter, done = Meter(progress, "fit", profile.steps), 0
-        if checkpoint is not None and (state := checkpoint.running(1)) is not None:
-            done = step.load(state)
+        if checkpoint is not None and checkpoint.restore(1, step.load):
+            done = step.done
         while done < profile.steps:
             count = min(_CHUNK["cpu" if device == "cpu" else "cuda"], profile.steps - done)
             for _ in range(count):
@@ -227,6 +232,24 @@ def tune(
     if not (np.isfinite(tuned.colour).all() and np.isfinite(tuned.lut).all()):
         raise WlmError(f"{mesh.name}: the fit diverged; expected smaller rates than those of {profile.name}")
     return tuned
+
+
+def _kept_clusters(checkpoint: Checkpoint, count: int) -> Clusters | None:
+    """The groups of `count` triangles that an interrupted compression had formed, or None."""
+    triangle = Part(np.int32, (count,), least=0, most=count - 1)
+    table = {
+        "group": triangle,
+        "representative": Part(np.int32, (None,), least=0, most=count - 1),
+        "order": Part(np.int8, (count,), least=0, most=len(ORDERS) - 1),
+        "distance": Part(np.float64, (count,), least=0.0),
+        "excluded": Part(np.bool_, (count,)),
+        "stats": Part(np.int64, (2,), least=0),
+    }
+    if (kept := checkpoint.finished(0, table)) is None:
+        return None
+    if kept["group"].max() >= len(kept["representative"]):
+        raise WlmError(f"{checkpoint.path}: finished batch 0: part group: expected one of the representatives' groups")
+    return Clusters(**{**kept, "stats": Stats(*map(int, kept["stats"]))})
 
 
 def _sides(height: int, width: int, scale: float) -> tuple[int, int]:
@@ -317,8 +340,19 @@ class _Step:
         return {name: np.array(value.detach().cpu().numpy()) for name, value in tensors.items()}
 
     @torch.no_grad()
-    def load(self, state: dict[str, np.ndarray]) -> int:
-        """Goes back to a `state`; returns the number of steps done."""
+    def load(self, state: dict[str, np.ndarray]) -> None:
+        """Goes back to a `state`.
+
+        Raises:
+            ValueError: It is none of this tuning; nothing has changed.
+        """
+        table = {"step": Part(np.int32, (1,), least=0, most=len(self._rates))}
+        for group in self._adam.param_groups:
+            for parameter in group["params"]:
+                name, shape = "colour" if parameter is self._colour else "lut", tuple(parameter.shape)
+                table |= {name: Part(np.float32, shape), f"{name}.step": Part(np.float32, (), least=0.0)}
+                table |= {f"{name}.{key}": Part(np.float32, shape) for key in _MOMENTS[1:]}
+        check_parts(state, table)
         values = {name: torch.from_numpy(np.array(value)) for name, value in state.items()}
         self._step.copy_(values["step"])
         for group in self._adam.param_groups:
@@ -330,7 +364,11 @@ class _Step:
                 for key in _MOMENTS[1:]:
                     # In the parameter's order of memory: the fused step takes both as they lie there.
                     moments[key] = torch.zeros_like(parameter).copy_(values[f"{name}.{key}"])
-        return int(values["step"].item())
+
+    @property
+    def done(self) -> int:
+        """Steps done."""
+        return int(self._step.item())
 
     def textures(self) -> Textures:
         colour, lut = (each.detach().cpu().numpy() for each in (self._colour, self._lut))

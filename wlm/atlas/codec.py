@@ -4,18 +4,20 @@ Parts: `colour` (half [Hp, Wp, 3], or uint8 [B, 16] where T_p is stored as block
 `lut` (uint16 [Hc, Wc, 2]) and `uv` (float32 [F, 3, 2]).
 """
 
+import math
 import os
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from pydantic import Field, JsonValue
 
 from wlm import system
 from wlm.atlas import colour
 from wlm.atlas.model import (
-    COLOUR_BITS,
     MOST_SIZE,
     AtlasModel,
     Profile,
+    check_area,
     compression_ratio,
     disk_ratio,
     tile_counts,
@@ -23,10 +25,11 @@ from wlm.atlas.model import (
 )
 from wlm.config import check_settings
 from wlm.formats.artifact import Artifact, read_artifact
-from wlm.system import Part, check_parts
+from wlm.formats.parts import Part, check_parts
+from wlm.system import Header, Name
+from wlm.texels import MOST_SIDE
 
-_METHODS = ("tiles", "cascade", "plain")
-_MOST_SIDE = 65536  # texels that a file may claim, checked before anything of that size is allocated
+_Size = Annotated[list[Annotated[int, Field(ge=1, le=MOST_SIDE)]], Field(min_length=2, max_length=2)]
 
 
 def encode(model: AtlasModel) -> tuple[dict[str, Any], dict[str, np.ndarray], str]:
@@ -90,54 +93,54 @@ def describe(path: str | os.PathLike[str]) -> dict[str, Any]:
     }
 
 
+class _Header(Header):
+    """The settings of a file; `size` and `texels` are rows and columns of the lightmap and of T_p."""
+
+    name: Name
+    method: Literal["tiles", "cascade", "plain"]
+    colour: Literal["half", "bc6h", "astc"]
+    size: _Size
+    texels: _Size
+    profile: Profile
+    report: dict[str, JsonValue]
+
+
 def _checked(artifact: Artifact) -> tuple[dict[str, Any], tuple[int, int], dict[str, np.ndarray]]:
     """Checks the settings and the parts, but not what blocks decode to.
 
     Returns:
         The fields of `AtlasModel` but for its arrays; rows and columns of T_p; and the parts.
     """
-    settings = artifact.settings
-    profile = check_settings(Profile, settings["profile"], "profile: ")
-    method, stored = settings["method"], settings["colour"]
-    if method not in _METHODS or stored not in COLOUR_BITS:
-        raise ValueError(f"method {method!r} with colour {stored!r}")
-    (height, width), texels = (_size(settings[key]) for key in ("size", "texels"))
-    blocks = int(np.prod(colour.block_grid(*texels)))
+    header = check_settings(_Header, artifact.settings, "setting ")
+    (height, width), texels = header.size, tuple(header.texels)
+    blocks = math.prod(colour.block_grid(*texels))
+    half = header.colour == "half"
     table = {
-        "colour": Part(np.float16, (*texels, 3)) if stored == "half" else Part(np.uint8, (blocks, 16)),
+        "colour": Part(np.float16, (*texels, 3), least=0.0) if half else Part(np.uint8, (blocks, 16)),
         "lut": {
-            "tiles": Part(np.uint16, (*tile_counts(height, width, profile.tile), 2)),
+            "tiles": Part(np.uint16, (*tile_counts(height, width, header.profile.tile), 2)),
             "cascade": Part(np.uint16, (None, None, 2)),
             "plain": Part(np.uint16, (0, 0, 2)),
-        }[method],
-        "uv": Part(np.float32, (None, 3, 2), optional=True),
+        }[header.method],
+        "uv": Part(np.float32, (None, 3, 2), optional=True, least=0.0, most=1.0),
     }
     parts = check_parts(artifact.tensors, table)
-    if (parts["colour"] < 0).any():
-        raise ValueError("part colour: a texel is negative")
-    if method == "cascade" and not parts["lut"].size:
+    lut = parts["lut"]
+    if header.method == "cascade" and not lut.size:
         raise ValueError("part lut is empty")
-    if method == "tiles":
-        first, size = unpack_entries(parts["lut"])
+    if header.method == "tiles":
+        first, size = unpack_entries(lut)
         if max(texels) > MOST_SIZE or ((first + size) > texels[::-1]).any():
             raise ValueError("part lut: a tile reaches beyond the colour texture")
-    if not ((parts["uv"] >= 0) & (parts["uv"] <= 1)).all():
-        raise ValueError("part uv: outside [0, 1]")
+    check_area((height, width), texels, lut.shape[:2])
     fields = {
-        "name": str(settings["name"]),
+        "name": header.name,
         "source": artifact.source,
-        "profile": profile,
-        "method": method,
-        "colour": stored,
+        "profile": header.profile,
+        "method": header.method,
+        "colour": header.colour,
         "height": height,
         "width": width,
-        "report": dict(settings["report"]),
+        "report": header.report,
     }
     return fields, texels, parts
-
-
-def _size(value: object) -> tuple[int, int]:
-    rows, columns = value
-    if not all(isinstance(n, int) and 1 <= n <= _MOST_SIDE for n in (rows, columns)):
-        raise ValueError(f"a size of {rows} x {columns}")
-    return rows, columns

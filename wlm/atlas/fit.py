@@ -16,7 +16,7 @@ from wlm.atlas import colour
 from wlm.atlas.cascade import fit_cascade, group_triangles
 from wlm.atlas.data import LightmappedMesh
 from wlm.atlas.decode import Decoder
-from wlm.atlas.model import BLOCK_SIDE, COLOUR_BITS, SOURCE_BITS, AtlasModel, Profile
+from wlm.atlas.model import BLOCK_SIDE, COLOUR_BITS, SOURCE_BITS, AtlasModel, Profile, check_area
 from wlm.atlas.resize import fitting_size, resize
 from wlm.atlas.stages import Stages
 from wlm.atlas.tiles import fit_tiles
@@ -24,8 +24,10 @@ from wlm.atlas.views import corner_weights
 from wlm.atlas.weights import FineGrid, weights
 from wlm.errors import WlmError
 from wlm.formats.checkpoint import EVERY, Checkpoint
+from wlm.metrics import LostLight
 from wlm.ops.raster import texture
 from wlm.system import OnProgress
+from wlm.texels import check_size
 
 _NO_ROOM = "budget: {:g} of {}x{} texels is less than the smallest tiles and their table take: expected more"
 
@@ -54,15 +56,17 @@ def compress(
 
     Returns:
         The model. It is "plain", a smaller lightmap of as many bits, where that has no larger error than the method.
+        Its report has "lost light", lines, where texels lost more than half of theirs and PSNR doesn't show it.
 
     Raises:
-        WlmError: No such profile or device, a wrong setting, a missing package, or a budget that the smallest model
-            exceeds.
+        WlmError: No such profile or device, a wrong setting, a missing package, a lightmap that is too large, or a
+            budget that the smallest model exceeds.
         KeyboardInterrupt: Raised by `progress`, after the checkpoint, if there is one, has been written in a stage that
             it keeps.
     """
     device = interop.check_device(device)
     profile = Profile.load(profile).override(overrides)
+    check_size(*mesh.mask.shape)
     stages, grid = Stages(device, progress, checkpoint), FineGrid(mesh, device)
     if profile.method == "cascade":
         model = fit_cascade(mesh, group_triangles(mesh, profile, stages), profile, seed, stages)
@@ -73,6 +77,11 @@ def compress(
             model = _better(grid, model, profile, seed)
     elif model is None:
         raise WlmError(_NO_ROOM.format(profile.budget, *mesh.mask.shape[::-1]))
+    check_area(mesh.mask.shape, model.texels.shape[:2], model.lut.shape[:2])
+    lost = LostLight()
+    lost.add(mesh.lightmap[mesh.mask], Decoder(model, device).lightmap(mesh)[mesh.mask])
+    if warnings := lost.warnings(mesh.name, "texel", "the lightmap"):
+        model = replace(model, report=model.report | {"lost light": warnings})
     return replace(model, report=model.report | {"seconds": stages.seconds})
 
 

@@ -10,6 +10,7 @@ small table, T_p the small colour texture and one of these for F:
     plain    No table: the lightmap at a lower resolution, or under new UVs.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal, Self
@@ -19,6 +20,7 @@ from pydantic import Field
 
 from wlm.errors import WlmError
 from wlm.system import Model, Settings
+from wlm.texels import check_size
 
 SOURCE_BITS = 48
 """Bits per texel of the lightmap: three half floats (eq. 9)."""
@@ -72,7 +74,6 @@ class Profile(Settings):
 
     FILES: ClassVar[str] = "atlas"
 
-    name: str
     method: Literal["tiles", "cascade"] = "tiles"
     colour: Literal["half", "bc6h", "astc"] = "half"
     budget: float = Field(0.17, gt=0.0, le=2.0)
@@ -106,6 +107,10 @@ class Profile(Settings):
                 f"{prefix}budget: profiles of the cascade have sizes of their own; expected one of tiles, or none"
             )
         return super().override(values, prefix)
+
+
+_FREE_TEXELS = 1 << 24  # 4,096 x 4,096, of which a decoded lightmap takes 192 MiB
+_MOST_SHARE = 65536
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,6 +152,27 @@ class AtlasModel(Model):
     def compression_ratio(self) -> float:
         """CR of eq. 9."""
         return compression_ratio(self.texels.shape[:2], self.lut.shape[:2], (self.height, self.width), self.colour)
+
+
+def check_area(size: tuple[int, int], texels: tuple[int, int], lut: tuple[int, int]) -> None:
+    """Checks that a lightmap is no larger than its textures can make plausible: a few bytes must not claim gigabytes.
+
+    Args:
+        size: Rows and columns of the lightmap.
+        texels: Those of T_p.
+        lut: Those of T_c, (0, 0) for none.
+
+    Raises:
+        WlmError: The lightmap is beyond what `wlm.texels.check_size` allows; or it has more than 2^24 texels, and more
+            than 65,536 for each texel of T_p and T_c.
+    """
+    check_size(*size)
+    stored = math.prod(texels) + math.prod(lut)
+    if math.prod(size) > max(_FREE_TEXELS, _MOST_SHARE * stored):
+        raise WlmError(
+            f"size: expected a lightmap of at most {_MOST_SHARE} texels for each of the {stored} that its textures "
+            f"hold, found {size[1]}x{size[0]}"
+        )
 
 
 def compression_ratio(texels: tuple[int, int], lut: tuple[int, int], size: tuple[int, int], colour: str) -> float:

@@ -35,6 +35,7 @@ from wlm.atlas.weights import FineGrid, weights
 from wlm.errors import WlmError
 from wlm.formats.checkpoint import Checkpoint
 from wlm.formats.exr import HALF_MAX
+from wlm.formats.parts import Part, check_parts
 from wlm.system import Meter, OnProgress
 
 SUPERSAMPLING = 2
@@ -346,10 +347,16 @@ def curves(
     """
     rounds = _ROUGH if stored is None else _FINE  # a codec's error deserves an exact solution
     result, meter = np.empty((len(sizes), len(tiles.index))), Meter(progress, "curves", len(sizes))
-    kept = None if checkpoint is None else checkpoint.running(0)
-    begin = 0 if kept is None else len(kept["error"])
-    if begin:
-        result[:begin] = kept["error"]
+    begin = 0
+
+    def load(state: dict[str, np.ndarray]) -> None:
+        nonlocal begin
+        done = check_parts(state, {"error": Part(np.float64, (None, len(tiles.index)), least=0.0)})["error"]
+        begin = min(len(done), len(sizes))
+        result[:begin] = done[:begin]
+
+    if checkpoint is not None:
+        checkpoint.restore(0, load)
     for i, (nx, ny) in enumerate(sizes[begin:], begin):
         if meter.due(i):
             try:

@@ -94,6 +94,8 @@ def compress(
     rows.add_row(f"CR of {MODEL_FILE}", f"{disk_ratio((output / MODEL_FILE).stat().st_size, mesh.mask.shape):.2%}")
     rows.add_row("seconds", f"{sum(model.report['seconds'].values()):.1f}")
     show(rows)
+    for warning in model.report.get("lost light", ()):
+        note(f"warning: {warning}")
 
 
 @app.command()

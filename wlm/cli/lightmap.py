@@ -73,7 +73,7 @@ def compress(
     check_output(output, ".wlm")
     quiet_warp()
     from wlm.interop import check_device
-    from wlm.lightmap.evaluation import bits_per_texel, count_kinds
+    from wlm.lightmap.evaluation import bits_per_texel, count_kinds, lost_light
     from wlm.lightmap.fit import compress, open_checkpoint
     from wlm.lightmap.model import Profile
     from wlm.lightmap.tiles import TileGrid, parse_tiles
@@ -98,6 +98,8 @@ def compress(
     bpp = bits_per_texel(model, lightmaps.mask, size) if model.kind.any() else None
     rows.add_row(escape(str(output)), f"{size:,}", number(bpp, ".3f"), kinds, f"{seconds:.1f}")
     show(rows)
+    for warning in lost_light(model, lightmaps, device) if model.kind.any() else ():
+        note(f"warning: {warning}")
 
 
 @app.command()

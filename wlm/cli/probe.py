@@ -366,6 +366,8 @@ def _show_report(file: Path, profile: str, report: "Report", rivals: "list[tuple
         worst = report.worst_probe
         place = ", ".join(f"{x:.4g}" for x in worst["position"])
         note(f"worst: {number(worst['psnr'], '.2f')} dB, probe {worst['probe']} at ({place})")
+    for warning in report.warnings:
+        note(f"warning: {warning}")
 
 
 def _show_walk(file: Path, figures: dict[str, Any], memory: dict[str, int]) -> None:

@@ -24,6 +24,7 @@ import warp as wp
 from wlm.errors import WlmError
 from wlm.fluid import faces as fluid_faces
 from wlm.fluid.engine import BODIES, PERIOD, Engine, require_free
+from wlm.formats.parts import Part, check_parts
 from wlm_kernels.fluid.lattice import QUIET, Spec, eddy_factor, trouble_of
 
 CHECK_EVERY = 48
@@ -33,6 +34,7 @@ MAX_SPEED = 0.3
 """Limit of the speed of walls, bodies and inlets, cells a step: half the speed of sound, where the error of order Ma^2
 reaches a quarter."""
 
+_MOST_STEPS = 2**31 - 1  # that a device counts
 _MOTION = ("velocity", "spin", "centre")
 # From this many steps on a graph repays its capture.
 _GRAPH_FROM = 16
@@ -341,23 +343,21 @@ class Lattice:
         On a CPU the steps that follow are bit for bit the same; on a GPU but for the order of its outlets' atomic sums.
 
         Raises:
-            WlmError: The state is of another shape, lattice or storage.
+            WlmError: The state is of another shape, lattice or storage, or holds NaN or infinity.
         """
         engine = self._engine
         now = engine.buffers[0]
-        expected = {
-            "populations": ([now.shape], wp.dtype_to_numpy(now.dtype)),
-            "solid": ([(0,), (engine.cells,)], np.uint8),
-            "bodies": ([(len(_MOTION), BODIES, 3)], np.float32),
-            "steps": ([()], np.int64),
+        table = {
+            "populations": Part(wp.dtype_to_numpy(now.dtype), now.shape),
+            # Empty before the first step.
+            "solid": Part(np.uint8, (0 if np.shape(state.get("solid")) == (0,) else engine.cells,)),
+            "bodies": Part(np.float32, (len(_MOTION), BODIES, 3)),
+            "steps": Part(np.int64, (), least=0, most=_MOST_STEPS),
         }
-        for name, (shapes, dtype) in expected.items():
-            if name not in state:
-                raise WlmError(f"lattice state: {name}: missing")
-            part = np.asarray(state[name])
-            if part.shape not in shapes or part.dtype != dtype:
-                allowed = f"{np.dtype(dtype)} {' or '.join(str(shape) for shape in shapes)}"
-                raise WlmError(f"lattice state: {name}: expected {allowed}, found {part.dtype} {part.shape}")
+        try:
+            state = check_parts(state, table)
+        except ValueError as error:
+            raise WlmError(f"lattice state: {error}") from error
         self._prepare()
         for field, rows in zip(_MOTION, state["bodies"], strict=True):
             getattr(engine.bodies, field).assign(rows)

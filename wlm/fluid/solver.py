@@ -39,6 +39,7 @@ from wlm.fluid.lattice import Lattice
 from wlm.fluid.obstacles import Obstacle
 from wlm.fluid.volume import DensityVolume
 from wlm.formats.artifact import read_artifact, write_artifact
+from wlm.formats.parts import Part, check_parts
 from wlm_kernels.fluid import advection, advection_places, advection_sources
 from wlm_kernels.fluid.advection_places import DENSE
 
@@ -367,14 +368,17 @@ class Solver:
             if (stored := artifact.settings.get(name)) != value:
                 raise WlmError(f"{path}: {name}: expected {value}, found {stored}: a checkpoint of another simulation")
         state, now = artifact.tensors, self._fields[0]
-        expected = {"density": self.density.numpy(), "placed": self._placed}
+        field = Part(wp.dtype_to_numpy(self.density.dtype), self.density.shape)
+        # NaN before the first step: no obstacle is placed yet.
+        nowhere = np.isnan(state.get("placed", 0.0)).all()
+        table = {"density": field, "placed": Part(np.float64, self._placed.shape, finite=not nowhere)}
         if self.temperature is not None:
-            expected["temperature"] = self.temperature.numpy()
-        for name, like in expected.items():
-            part = state.get(name)
-            if part is None or part.shape != like.shape or part.dtype != like.dtype:
-                raise WlmError(f"{path}: {name}: expected {like.dtype} {like.shape}, found {_described(part)}")
+            table["temperature"] = field
         air = {name.removeprefix("lattice."): v for name, v in state.items() if name.startswith("lattice.")}
+        try:
+            check_parts({name: v for name, v in state.items() if not name.startswith("lattice.")}, table)
+        except ValueError as error:
+            raise WlmError(f"{path}: {error}") from error
         try:
             self.lattice.load(air)
         except WlmError as error:
@@ -472,7 +476,3 @@ class Solver:
 
 def _buffers(scheme: str) -> int:
     return 3 if scheme == "maccormack" else 2
-
-
-def _described(array: np.ndarray | None) -> str:
-    return "none" if array is None else f"{array.dtype} {array.shape}"

@@ -51,6 +51,16 @@ _TYPES = {
 _TYPE_NAMES = {np.dtype(kind): name for name, kind in _TYPES.items()}
 
 
+def _finite(text: str) -> float:
+    """A number of JSON; for Python's parser NaN, Infinity and 1e999 are some too."""
+    if not math.isfinite(value := float(text)):
+        raise ValueError(f"expected finite numbers, found {one_line(text, 30)}")
+    return value
+
+
+_JSON = json.JSONDecoder(parse_float=_finite, parse_constant=_finite)
+
+
 @dataclass(frozen=True)
 class Artifact:
     """What an artifact holds.
@@ -226,7 +236,7 @@ def _map(path: str | os.PathLike[str]) -> mmap.mmap | bytes:
 
 def _parse_json(path: str | os.PathLike[str], text: bytes | str, what: str) -> dict[str, Any]:
     try:
-        value = json.loads(text)
+        value = _JSON.decode(text if isinstance(text, str) else text.decode())
     except (ValueError, RecursionError) as error:
         raise WlmError(f"{path}: the artifact's {what} is damaged: {one_line(error, 120)}") from error
     if not isinstance(value, dict):
@@ -237,14 +247,16 @@ def _parse_json(path: str | os.PathLike[str], text: bytes | str, what: str) -> d
 def _metadata(path: str | os.PathLike[str], header: dict[str, Any]) -> tuple[tuple[int, str, str, str], str]:
     """Splits the metadata into (version, system, source, digest) and the settings' text."""
     metadata = header.get("__metadata__")
-    if not isinstance(metadata, dict) or "wlm" not in metadata:
+    if not isinstance(metadata, dict) or not isinstance(metadata.get("wlm"), str):
         raise WlmError(f"{path}: expected an artifact of wlm, found a safetensors file without its metadata")
-    words = str(metadata["wlm"]).split(" ")
+    words = metadata["wlm"].split(" ")
     if not (words[0].isascii() and words[0].isdecimal()):
         raise WlmError(f"{path}: the artifact's version is damaged: expected an integer, found {words[0]!r}")
     version = int(words[0][:9])
     if version <= FORMAT_VERSION and (len(words) != 4 or not isinstance(metadata.get("settings"), str)):
         raise WlmError(f"{path}: the artifact's metadata is damaged: expected four words and settings")
+    if version <= FORMAT_VERSION and not (metadata["wlm"].isascii() and metadata["wlm"].isprintable()):
+        raise WlmError(f"{path}: the artifact's metadata is damaged: expected words in printable ASCII")
     system, source, digest = (*words[1:], "", "", "")[:3]
     return (version, system, source, digest), str(metadata.get("settings"))
 

@@ -6,8 +6,9 @@ of it is checked when it is read. It names what the fit depends on, and goes on 
 
 import json
 import os
+import re
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -15,9 +16,10 @@ from typing import Any
 import numpy as np
 
 from wlm import __version__
-from wlm.errors import WlmError
+from wlm.errors import WlmError, one_line
 from wlm.formats.artifact import read_artifact, write_artifact
 from wlm.formats.lock import sweep
+from wlm.formats.parts import Part, check_parts
 
 SUFFIX = ".partial"
 EVERY = 30.0
@@ -107,13 +109,43 @@ class Checkpoint:
             self._read()
             self.resumed = True
 
-    def finished(self, number: int) -> dict[str, np.ndarray] | None:
-        """The stored parts of a finished batch, or None if it isn't finished."""
-        return self._finished.get(number)
+    def finished(self, number: int, table: Mapping[str, Part]) -> dict[str, np.ndarray] | None:
+        """The stored parts of a finished batch, or None if it isn't finished.
+
+        Raises:
+            WlmError: They are not what the table says.
+        """
+        if (parts := self._finished.get(number)) is None:
+            return None
+        try:
+            return check_parts(parts, table)
+        except ValueError as error:
+            raise WlmError(f"{self.path}: finished batch {number}: {error}") from error
 
     def running(self, number: int) -> dict[str, np.ndarray] | None:
         """The state of the batch that was running when the fit was stopped, or None if it was another or none."""
         return self._running[1] if self._running is not None and self._running[0] == number else None
+
+    def restore(self, number: int, load: Callable[[dict[str, np.ndarray]], None]) -> bool:
+        """Hands the state of batch `number`, if it was running, to the fit.
+
+        Args:
+            number: The batch.
+            load: Goes back to a state; checks it, and raises ValueError before anything is changed by a wrong one.
+
+        Returns:
+            Whether there was one.
+
+        Raises:
+            WlmError: The state is wrong.
+        """
+        if (state := self.running(number)) is None:
+            return False
+        try:
+            load(state)
+        except ValueError as error:
+            raise WlmError(f"{self.path}: state of batch {number}: {error}") from error
+        return True
 
     def due(self) -> bool:
         """Whether it is time to save the running batch."""
@@ -173,8 +205,11 @@ class Checkpoint:
             )
         for name, value in artifact.tensors.items():
             state, number, key = (*name.split(".", 2), "", "")[:3]
-            if state not in (_FINISHED, _RUNNING) or not number.isdecimal() or not key:
-                raise WlmError(f"{self.path}: part {name!r}: expected one of a finished or a running batch")
+            # Nine digits: a longer number is no batch, and int() refuses very long ones in its own words.
+            if state not in (_FINISHED, _RUNNING) or not re.fullmatch("[0-9]{1,9}", number) or not key:
+                raise WlmError(
+                    f"{self.path}: part {one_line(repr(name), 60)}: expected one of a finished or a running batch"
+                )
             # A copy: the file is replaced at the next save, and a mapped one would stay on the disk.
             if state == _FINISHED:
                 self._finished.setdefault(int(number), {})[key] = np.array(value)

@@ -1,14 +1,28 @@
 """A lightmap model as the parts of its file, and back: quantised maps, networks and scales."""
 
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import Field
 
 from wlm.config import check_settings
 from wlm.formats.artifact import Artifact
+from wlm.formats.parts import Part, check_part, check_parts
 from wlm.lightmap.model import LightmapModel, Profile, part_table
 from wlm.lightmap.tiles import TileGrid, TileKind
-from wlm.system import Part, check_parts
+from wlm.system import Header, Name
+
+_ROUNDING = 2e-7  # relative, of stored times
+_TIMES = Part((np.float32, np.float64), (None,))
+
+
+class _Header(Header):
+    """The settings of a file; `size` is width and height in texels."""
+
+    name: Name
+    size: Annotated[list[int], Field(min_length=2, max_length=2)]
+    period: float | None = Field(gt=0)
+    profile: Profile
 
 
 def encode(model: LightmapModel) -> tuple[dict[str, Any], dict[str, np.ndarray], str]:
@@ -24,35 +38,42 @@ def encode(model: LightmapModel) -> tuple[dict[str, Any], dict[str, np.ndarray],
 
 
 def _shortened(times: np.ndarray) -> np.ndarray:
-    """Times as float32 where that keeps them distinct and within 2e-7 of their value."""
+    """Times as float32 where that keeps them distinct and within `_ROUNDING` of their value."""
     short = times.astype(np.float32)
     distinct = len(times) < 2 or np.all(np.diff(short) > 0)
-    return short if distinct and np.allclose(short, times, rtol=2e-7, atol=0) else times
+    return short if distinct and np.allclose(short, times, rtol=_ROUNDING, atol=0) else times
 
 
 def decode(artifact: Artifact) -> LightmapModel:
     """Makes a model of the parts of its file.
 
     Raises:
-        WlmError, ValueError, TypeError, LookupError: The parts don't fit the settings; see `wlm.system.decode`.
+        WlmError, ValueError: A setting or a part is missing or wrong, or they don't fit each other.
     """
-    settings, tensors = artifact.settings, artifact.tensors
-    profile = check_settings(Profile, settings["profile"], "profile.")
-    width, height = (int(size) for size in settings["size"])
-    tiles = Part(np.uint8, (TileGrid.of(height, width).count,))
-    kind, times = check_parts(tensors, {"kind": tiles, "times": Part((np.float32, np.float64), (None,))}).values()
-    if kind.max() > max(TileKind):
-        raise ValueError(f"part kind: expected 0 to {max(TileKind)}, found {kind.max()}")
-    if len(times) < 1 or (np.diff(times) <= 0).any():
-        raise ValueError("part times: expected times that increase")
+    tensors = artifact.tensors
+    header = check_settings(_Header, artifact.settings, "setting ")
+    width, height = header.size
+    tiles = Part(np.uint8, (TileGrid.of(height, width).count,), most=max(TileKind))
+    kind, times = check_part(tensors, "kind", tiles), check_part(tensors, "times", _TIMES)
+    _check_times(times, header.period)
+    table = part_table(header.profile, kind, len(times)) | {"kind": tiles, "times": _TIMES}
+    parts = check_parts(tensors, table)
     return LightmapModel(
-        name=str(settings["name"]),
+        name=header.name,
         width=width,
         height=height,
-        times=times.astype(np.float64),
-        period=None if settings["period"] is None else float(settings["period"]),
+        period=header.period,
         source=artifact.source,
-        profile=profile,
-        kind=kind,
-        **check_parts(tensors, part_table(profile, kind, len(times))),
+        profile=header.profile,
+        **parts | {"times": times.astype(np.float64)},
     )
+
+
+def _check_times(times: np.ndarray, period: float | None) -> None:
+    with np.errstate(over="ignore"):
+        steps = np.diff(times.astype(np.float64))
+    if len(times) < 1 or not ((steps > 0) & (steps < np.inf)).all():
+        raise ValueError("part times: expected times that increase")
+    # Files may hold a time that was rounded up to the period.
+    if period is not None and not (times[0] >= 0 and times[-1] <= period * (1 + _ROUNDING)):
+        raise ValueError(f"part times: expected 0 to {period:g}, the period, found {times[0]:g} to {times[-1]:g}")

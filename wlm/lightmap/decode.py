@@ -10,9 +10,11 @@ import warp as wp
 from wlm import interop
 from wlm.errors import WlmError
 from wlm.lightmap.model import TILE, LightmapModel, decode_scale
-from wlm.lightmap.tiles import TileGrid, TileKind, assemble
+from wlm.lightmap.tiles import TileGrid, TileKind, place
 from wlm_kernels.lightmap import decode as lightmap_decode
 from wlm_kernels.mlp import GELUS
+
+_PIECE = 1024  # tiles that are decoded at once: 192 MiB
 
 
 class Decoder:
@@ -101,14 +103,24 @@ class Decoder:
 
     def frame(self, time: float) -> np.ndarray:
         """Decodes the whole map to linear radiance, float32 [H, W, 3]; texels of empty tiles are 0."""
-        numbers = np.arange(self._grid.count)
-        return assemble(self.tiles(numbers.tolist(), time), numbers, self._grid)
+        image = np.zeros((self._grid.height, self._grid.width, 3), np.float32)
+        for numbers in self._held():
+            place(image, self.tiles(numbers.tolist(), time), numbers, self._grid)
+        return image
 
     def frame_8bit(self, time: float) -> tuple[np.ndarray, np.ndarray]:
         """Decodes the whole map to 8 bits: uint8 [H, W, 4], and the bound of each tile, float32 [tiles]."""
-        numbers = np.arange(self._grid.count)
-        tiles, peak = self.tiles_8bit(numbers.tolist(), time)
-        return assemble(tiles, numbers, self._grid), peak
+        image = np.zeros((self._grid.height, self._grid.width, 4), np.uint8)
+        bounds = np.zeros(self._grid.count, np.float32)
+        for numbers in self._held():
+            tiles, bounds[numbers] = self.tiles_8bit(numbers.tolist(), time)
+            place(image, tiles, numbers, self._grid)
+        return image, bounds
+
+    def _held(self) -> list[np.ndarray]:
+        """Numbers of the tiles that aren't empty, in pieces: a large map isn't in memory twice."""
+        held = np.flatnonzero(self.model.kind != TileKind.EMPTY)
+        return np.split(held, range(_PIECE, len(held), _PIECE))
 
     def _constant(self, numbers: Sequence[int], time: float) -> list[tuple[int, np.ndarray]]:
         """The constant tiles among `numbers`: their places there and their radiance [3]."""

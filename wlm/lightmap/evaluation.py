@@ -1,8 +1,8 @@
 """Scoring a compressed lightmap set against its input, by the paper's protocol (neural-dynamic-gi, section 10.2)."""
 
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -12,9 +12,12 @@ from wlm.lightmap.data import LightmapSet
 from wlm.lightmap.decode import Decoder
 from wlm.lightmap.model import TILE, LightmapModel
 from wlm.lightmap.tiles import TileGrid, TileKind
-from wlm.metrics import METRICS, FrameMetrics, Summary, evaluate_frame, summarise
+from wlm.metrics import METRICS, FrameMetrics, LostLight, Summary, evaluate_frame, summarise
 from wlm.system import Meter, OnProgress
 from wlm.system import Report as BaseReport
+
+_LOST = "texel", "their tile"
+_FEW_TEXELS = 16  # of a tile's 16,384
 
 # Stored times are float32 where that keeps them apart; see `wlm.lightmap.codec`.
 _TIME_TOLERANCE = 1e-6
@@ -48,7 +51,8 @@ class Report(BaseReport):
         parts: Bytes of the file by part, see `part_bytes`.
         profile: Name of the settings.
         kinds: Tiles of the grid by kind: `empty`, `constant`, `static`, `dynamic`.
-        warnings: Tiles that were not scored, or another input than the file's.
+        warnings: Tiles that were not scored, another input than the file's, or light that was lost and that the means
+            hide.
     """
 
     psnr: float
@@ -116,14 +120,60 @@ def evaluate(
     mask = scored_mask(model, lightmaps)
     decoder = Decoder(model, device)
     meter = Meter(progress, "score", len(model.times))
-    frames = []
+    frames, lost = [], LostLight()
     for i, stamp in enumerate(model.times):
-        name = f"{model.name} at {stamp:g}"
-        frames.append(evaluate_frame(lightmaps.frames[i], decoder.frame(stamp), mask, TILE, metrics, name=name))
+        name, decoded = f"{model.name} at {stamp:g}", decoder.frame(stamp)
+        frames.append(evaluate_frame(lightmaps.frames[i], decoded, mask, TILE, metrics, name=name))
+        for tile, window in _windows(model):
+            valid = mask[window]
+            lost.add(lightmaps.frames[i][window][valid], decoded[window][valid], _place(tile, stamp))
         if meter.due(i + 1):
             meter.report(i + 1)
     file_bytes = model.file_bytes() if file_bytes is None else file_bytes
-    return _report(model, lightmaps, file_bytes, device, frames, time.perf_counter() - start)
+    report = _report(model, lightmaps, file_bytes, device, frames, time.perf_counter() - start)
+    return replace(report, warnings=report.warnings + lost.warnings(model.name, *_LOST))
+
+
+def lost_light(model: LightmapModel, lightmaps: LightmapSet, device: str = "cpu") -> list[str]:
+    """Looks for fireflies that a fit lost: tiles whose light is in few texels are decoded at their times alone.
+
+    `evaluate` looks at all tiles. A light of more texels than these can't vanish unseen: PSNR would be below 30 dB.
+
+    Args:
+        model: The model.
+        lightmaps: The input.
+        device: Where it is decoded.
+
+    Returns:
+        Lines with the texels and the largest loss.
+
+    Raises:
+        WlmError: As `evaluate`.
+    """
+    mask, lost = scored_mask(model, lightmaps), LostLight()
+    decoder = None
+    for frame, stamp in zip(lightmaps.frames, model.times, strict=True):
+        for tile, window in _windows(model):
+            valid, texels = mask[window], frame[window]
+            light = texels.max(2, where=valid[..., None], initial=0.0)
+            if not 0 < np.count_nonzero(2.0 * light >= light.max()) <= _FEW_TEXELS < np.count_nonzero(valid):
+                continue
+            decoder = decoder or Decoder(model, device)
+            decoded = decoder.tile(tile, stamp)[: valid.shape[0], : valid.shape[1]]
+            lost.add(texels[valid], decoded[valid], _place(tile, stamp))
+    return lost.warnings(model.name, *_LOST)
+
+
+def _windows(model: LightmapModel) -> Iterator[tuple[int, tuple[slice, slice]]]:
+    """The tiles that a model holds, each with its place in the map."""
+    grid = TileGrid.of(model.height, model.width)
+    for tile in np.flatnonzero(model.kind != TileKind.EMPTY).tolist():
+        y, x = grid.origin(tile)
+        yield tile, (slice(y, min(y + TILE, grid.height)), slice(x, min(x + TILE, grid.width)))
+
+
+def _place(tile: int, stamp: float) -> str:
+    return f"tile {tile} at {stamp:g}"
 
 
 def bits_per_texel(model: LightmapModel, mask: np.ndarray, file_bytes: int) -> float:

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from wlm import interop
-from wlm.errors import WlmError
 from wlm.formats.checkpoint import EVERY, Checkpoint
+from wlm.formats.parts import Part
 from wlm.lightmap.data import LightmapSet
 from wlm.lightmap.model import LightmapModel, Profile, encode_scale, part_table
 from wlm.lightmap.tiles import TILE, TileGrid, TileKind, channel_means, classify, split
@@ -17,6 +17,8 @@ from wlm.lightmap.trainer import Targets, Trainer
 from wlm.system import Meter, OnProgress
 
 BATCH_TEXELS = 64 * 26 * TILE * TILE  # texels times times in a batch: 64 tiles of 26 times, 330 MB of targets
+
+_CONSTANT_ERROR = 0.01  # of a constant tile's radiance: half floats near their end, 6e-8, are further off
 
 
 def compress(
@@ -47,7 +49,7 @@ def compress(
         The model.
 
     Raises:
-        WlmError: No such profile, setting, device or tile; or the fit diverged.
+        WlmError: No such profile, setting, device or tile; a checkpoint that isn't of this fit; or the fit diverged.
         KeyboardInterrupt: Raised by `progress`, after the checkpoint, if there is one, has been written.
     """
     device = interop.check_device(device)
@@ -55,7 +57,7 @@ def compress(
     steps, batches = fit.profile.steps, fit.batches()
     meter = Meter(progress, "fit", steps * len(batches))
     for number, batch in enumerate(batches):
-        parts = checkpoint.finished(number) if checkpoint is not None else None
+        parts = checkpoint.finished(number, fit.table(batch)) if checkpoint is not None else None
         if parts is None:
             targets = fit.targets(batch.rows)
             dynamic = batch.kind == TileKind.DYNAMIC
@@ -158,10 +160,10 @@ class _Fit:
             source=lightmaps.source,
             profile=profile,
             kind=kind,
-            **{name: np.zeros(part.shape, part.dtype) for name, part in table.items()},
+            constant=self._constants(len(lightmaps.times)),
+            **{name: np.zeros(part.shape, part.dtype) for name, part in table.items() if name != "constant"},
         )
         self._mapped = np.flatnonzero(self.kinds >= TileKind.STATIC)
-        self._set_constants()
         self._set_scales()
         self._scale = self.model.scales
 
@@ -169,11 +171,16 @@ class _Fit:
         """Colour of a tile's K valid texels, [T, K, 3] in gamma space."""
         return self.data.colour[row][:, self.data.mask[row]]
 
-    def _set_constants(self) -> None:
-        for i, row in enumerate(np.flatnonzero(self.kinds == TileKind.CONSTANT)):
+    def _constants(self, times: int) -> np.ndarray:
+        """Radiance of the constant tiles, [N_c, T, 3]: half floats, or float32 where one would be over 1% off."""
+        rows = np.flatnonzero(self.kinds == TileKind.CONSTANT)
+        values = np.zeros((len(rows), times, 3))
+        for i, row in enumerate(rows):
             radiance = self._valid(row).astype(np.float64) ** self.profile.gamma
             # The middle of the range: at most half a step of half float off.
-            self.model.constant[i] = 0.5 * (radiance.min(1) + radiance.max(1))
+            values[i] = 0.5 * (radiance.min(1) + radiance.max(1))
+        half = values.astype(np.float16)
+        return half if (np.abs(half - values) <= _CONSTANT_ERROR * values).all() else values.astype(np.float32)
 
     def _set_scales(self) -> None:
         """Sets scale, bound, shift and spread of the tiles that have maps (section 4), rounded as in the file."""
@@ -215,6 +222,14 @@ class _Fit:
             self.profile.metric_weight,
         )
 
+    def table(self, batch: _Batch) -> dict[str, Part]:
+        """The parts of a batch that is finished, as the trainer gives them."""
+        kind = np.full(len(batch.rows), batch.kind, np.uint8)
+        table = part_table(self.profile, kind, len(self.model.times))
+        if batch.kind == TileKind.STATIC:
+            return {"net": table["net_static"], "uv": table["uv"]}
+        return {name: table[name] for name in ("net", "uv", "uvt", "ut", "vt")}
+
     def store(self, batch: _Batch, parts: dict[str, np.ndarray]) -> None:
         """Puts the maps and networks of a batch into the model."""
         self.model.uv[np.searchsorted(self._mapped, batch.rows)] = parts["uv"]
@@ -226,8 +241,8 @@ class _Fit:
 def _run(trainer: Trainer, number: int, meter: Meter, checkpoint: Checkpoint | None) -> None:
     """Trains batch `number` to its end, from its checkpoint if it has one."""
     steps = trainer.profile.steps
-    if checkpoint is not None and (state := checkpoint.running(number)) is not None:
-        trainer.load(state)
+    if checkpoint is not None:
+        checkpoint.restore(number, trainer.load)
     chunk = 200 if trainer.device != "cpu" else 5
     step = trainer.step
     while step < steps:
@@ -245,9 +260,4 @@ def _run(trainer: Trainer, number: int, meter: Meter, checkpoint: Checkpoint | N
                 raise
         if checkpoint is not None and checkpoint.due():
             checkpoint.save_running(number, trainer.state())
-    diverged = ~np.isfinite(trainer.losses())
-    if diverged.any():
-        raise WlmError(
-            f"tile {trainer.numbers[diverged][0]}: the fit diverged; expected a smaller map_rate or net_rate than "
-            f"{trainer.profile.name}'s"
-        )
+    trainer.check()

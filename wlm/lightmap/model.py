@@ -18,8 +18,10 @@ from typing import ClassVar, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
+from wlm.formats.exr import HALF_MAX
+from wlm.formats.parts import Part
 from wlm.lightmap.tiles import TILE, TileKind
-from wlm.system import Model, Part, Settings
+from wlm.system import Model, Settings
 from wlm_kernels import mlp
 from wlm_kernels.lightmap.features import STATIC_INPUTS, TEMPORAL_INPUTS
 
@@ -206,10 +208,10 @@ def part_table(profile: Profile, kind: np.ndarray, times: int) -> dict[str, Part
         "net": Part(np.float16, (dynamic, parameters)),
         "net_static": Part(np.float16, (static, static_parameters)),
         "scale": Part(np.uint8, (dynamic, times, 3)),
-        "scale_static": Part(np.float16, (static, times, 3)),
+        "scale_static": Part(np.float16, (static, times, 3), least=0.0),
         "peak": Part(np.uint8, (mapped, times)),
-        "affine": Part(np.float16, (mapped, 2, 3)),
-        "constant": Part(np.float16, (constant, times, 3)),
+        "affine": Part(np.float16, (mapped, 2, 3), least=0.0),
+        "constant": Part((np.float16, np.float32), (constant, times, 3), least=0.0, most=HALF_MAX),
     }
 
 
@@ -231,7 +233,7 @@ class LightmapModel(Model):
             for rounding.
         peak: Codes of an upper bound of the tile at each time, in gamma space: 255 of the 8-bit output.
         affine: Shift and spread.
-        constant: Radiance of constant tiles.
+        constant: Radiance of constant tiles: half floats, or float32 where one would be more than 1% off.
     """
 
     SYSTEM: ClassVar[str] = "lightmap"

@@ -16,7 +16,7 @@ import numpy as np
 
 from wlm.errors import WlmError
 from wlm.lightmap.data import LightmapSet
-from wlm.texels import fill_gaps
+from wlm.texels import check_size, fill_gaps
 
 TILE = 128  # texels a side: the paper's tile (Table 1)
 
@@ -53,10 +53,9 @@ class TileGrid:
             width: In texels, at least 1.
 
         Raises:
-            WlmError: A size is below 1.
+            WlmError: A size is below 1, or beyond what `wlm.texels.check_size` allows.
         """
-        if height < 1 or width < 1:
-            raise WlmError(f"tiles: expected a map of at least 1x1 texels, got {width}x{height}")
+        check_size(height, width)
         return cls(height, width, -(-height // TILE), -(-width // TILE))
 
     @property
@@ -287,11 +286,23 @@ def assemble(tiles: np.ndarray, index: np.ndarray, grid: TileGrid, fill: float =
         )
     _check_index(index, grid)
     image = np.full((grid.height, grid.width, tiles.shape[3]), fill, tiles.dtype)
+    place(image, tiles, index, grid)
+    return image
+
+
+def place(image: np.ndarray, tiles: np.ndarray, index: np.ndarray, grid: TileGrid) -> None:
+    """Writes tiles into a map.
+
+    Args:
+        image: `[H, W, C]`, written.
+        tiles: `[N, 128, 128, C]`. What they hold past the map's end is dropped.
+        index: `[N]`, number of each tile in the grid.
+        grid: The map's.
+    """
     for tile, number in zip(tiles, index, strict=True):
         y, x = grid.origin(number)
         part = image[y : y + TILE, x : x + TILE]
         part[...] = tile[: part.shape[0], : part.shape[1]]
-    return image
 
 
 def _check_gamma(gamma: float) -> None:

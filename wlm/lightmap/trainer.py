@@ -9,7 +9,9 @@ import torch
 import warp as wp
 
 from wlm import interop
+from wlm.errors import WlmError
 from wlm.formats.bc7 import pack_mode6
+from wlm.formats.parts import Part, check_part, check_parts
 from wlm.lightmap.model import TILE, Profile, TimeAxis, encode_time
 from wlm_kernels.lightmap import blocks, features, gather
 from wlm_kernels.lightmap import step as lightmap_step
@@ -424,8 +426,28 @@ class Trainer:
     def _adams(self) -> tuple[tuple[str, torch.optim.Adam], ...]:
         return ("adam_maps", self._adam_maps), ("adam_net", self._adam_net)
 
+    def check(self) -> None:
+        """Holds that the fit is sound.
+
+        Raises:
+            WlmError: It diverged: a tile's loss or maps are not finite, or its network is not in half floats.
+        """
+        broken = ~torch.isfinite(self.loss)
+        for values in (*self.views.values(), self.hidden.detach().half(), self.output.detach().half()):
+            broken |= ~torch.isfinite(values.reshape(self.tiles, -1)).all(1)
+        if bool(broken.any()):
+            tile = self.numbers[broken.cpu().numpy()][0]
+            raise WlmError(
+                f"tile {tile}: the fit diverged; expected a smaller map_rate or net_rate than {self.profile.name}'s"
+            )
+
     def state(self) -> dict[str, np.ndarray]:
-        """Everything that later steps depend on."""
+        """Everything that later steps depend on.
+
+        Raises:
+            WlmError: As `check`.
+        """
+        self.check()
         result = {key: getattr(self, key) for key in _STATE}
         for name, adam in self._adams():
             for i, values in enumerate(adam.state.values()):
@@ -433,26 +455,39 @@ class Trainer:
         # Copies, and numbers stay without a dimension.
         return {key: np.array(value.detach().cpu().numpy()) for key, value in result.items()}
 
+    def table(self, step: int) -> dict[str, Part]:
+        """The parts of a `state` after so many steps."""
+        table = {key: Part(np.float32, tuple(getattr(self, key).shape)) for key in _STATE}
+        table["control"] = Part(np.int32, (1,), least=step, most=step)
+        for name, adam in self._adams():
+            # Maps that are frozen from the start have no optimiser.
+            if step == 0 or (name == "adam_maps" and self.stage(0) == 2):
+                continue
+            for i, parameter in enumerate(adam.param_groups[0]["params"]):
+                shape = tuple(parameter.shape)
+                table |= {
+                    f"{name}.{i}.step": Part(np.float32, (), least=0, most=step),
+                    f"{name}.{i}.exp_avg": Part(np.float32, shape),
+                    f"{name}.{i}.exp_avg_sq": Part(np.float32, shape, least=0.0),
+                }
+        return table
+
     def load(self, state: dict[str, np.ndarray]) -> None:
-        """Goes back to a `state`; arrays of other shapes raise ValueError."""
+        """Goes back to a `state`.
 
-        def put(target: torch.Tensor, key: str) -> None:
-            value = torch.from_numpy(np.array(state[key]))
-            if value.shape != target.shape:
-                raise ValueError(f"{key}: expected shape {tuple(target.shape)}, got {tuple(value.shape)}")
-            target.copy_(value)
-
+        Raises:
+            ValueError: A part is missing, of another shape or out of its range; the trainer is as it was.
+        """
+        done = check_part(state, "control", Part(np.int32, (1,), least=0, most=self.profile.steps))
+        parts = check_parts(state, self.table(int(done[0])))
+        values = {name: torch.tensor(part, device=self.device) for name, part in parts.items()}
         with interop.stream(self.device), torch.no_grad():
             for key in _STATE:
-                put(getattr(self, key), key)
+                getattr(self, key).copy_(values[key])
             for name, adam in self._adams():
                 for i, parameter in enumerate(adam.param_groups[0]["params"]):
-                    if f"{name}.{i}.step" in state:
-                        slot = adam.state[parameter]
-                        slot["step"] = torch.zeros((), device=self.device)
-                        slot["exp_avg"], slot["exp_avg_sq"] = (torch.zeros_like(parameter) for _ in range(2))
-                        for key in _ADAM_STATE:
-                            put(slot[key], f"{name}.{i}.{key}")
+                    if f"{name}.{i}.step" in values:
+                        adam.state[parameter] = {key: values[f"{name}.{i}.{key}"] for key in _ADAM_STATE}
 
     def close(self) -> None:
         """Ends the CPU lanes' threads."""

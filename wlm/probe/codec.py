@@ -8,24 +8,42 @@ import zlib
 from typing import Any
 
 import numpy as np
+from pydantic import Field
 
 from wlm.config import check_settings
 from wlm.formats.artifact import Artifact
 from wlm.formats.bits import pack_bits, unpack_bits
-from wlm.probe.model import LATENT, ProbeModel, Profile, layer_shapes
-from wlm.system import Part, check_parts
+from wlm.formats.parts import Part, check_parts
+from wlm.probe.model import LATENT, MOST_OUTPUTS, MOST_PROBES, SCALE, ProbeModel, Profile, layer_shapes
+from wlm.system import Header, Name
+
+_MOST_LOG = 40.0
 
 
-def _parts(profile: Profile, outputs: int) -> dict[str, Part]:
+class _Header(Header):
+    """The settings of a file."""
+
+    name: Name
+    probes: int = Field(ge=1, le=MOST_PROBES)
+    outputs: int = Field(ge=1, le=MOST_OUTPUTS)
+    gaussians: int = Field(ge=1, le=MOST_PROBES)
+    dropped: int = Field(ge=0, le=MOST_PROBES)
+    profile: Profile
+
+
+def _parts(header: _Header) -> dict[str, Part]:
     """The table of parts."""
-    layers = layer_shapes(profile.latent, profile.hidden, outputs)
+    profile = header.profile
+    layers = layer_shapes(profile.latent, profile.hidden, header.outputs)
+    bits = header.gaussians * int(profile.code_bits().sum())
     return {
-        "gaussians": Part(np.uint8, (None,)),
-        "bounds": Part(np.float32, (2, LATENT.start + profile.latent)),
+        "gaussians": Part(np.uint8, (-(-bits // 8),)),
+        # The difference of any two is finite.
+        "bounds": Part(np.float32, (2, LATENT.start + profile.latent), least=-1e38, most=1e38),
         "net": Part(np.float16, (sum(rows * columns for rows, columns in layers),)),
         "frame": Part(np.float64, (8,)),
         "dead": Part(np.uint8, (None,), optional=True),
-        "positions": Part(np.uint16, (None, 3), optional=True),
+        "positions": Part(np.uint16, (header.probes, 3), optional=True),
     }
 
 
@@ -54,27 +72,20 @@ def decode(artifact: Artifact) -> ProbeModel:
     """Makes the model of a file; what `encode` gave comes back bit for bit.
 
     Raises:
-        WlmError, ValueError, LookupError: A setting or a part is missing, or they don't fit each other.
+        WlmError, ValueError: A setting or a part is missing or wrong, or they don't fit each other.
     """
-    settings = artifact.settings
-    profile = check_settings(Profile, settings["profile"], "profile: ")
-    sizes = [settings[key] for key in ("probes", "outputs", "gaussians", "dropped")]
-    if not all(type(size) is int for size in sizes) or min(sizes[:3]) < 1 or sizes[3] < 0:
-        raise ValueError(f"probes, outputs, gaussians, dropped: expected whole numbers, got {sizes}")
-    probes, outputs, count, dropped = sizes
-    parts = check_parts(artifact.tensors, _parts(profile, outputs))
-    frame, positions = parts["frame"], parts["positions"]
-    if not (frame[3] > 0 and (frame[4:7] >= 0).all() and (frame[4:7] <= 1).all()):
-        raise ValueError("part frame: expected a positive extent and a size within it")
-    if len(positions) not in (0, probes):
-        raise ValueError(f"part positions holds {len(positions)}, expected {probes}")
-    codes = unpack_bits(parts["gaussians"], profile.code_bits(), count)
+    header = check_settings(_Header, artifact.settings, "setting ")
+    parts = check_parts(artifact.tensors, _parts(header))
+    _check_frame(parts["frame"])
+    _check_bounds(parts["bounds"])
+    frame = parts["frame"]
+    codes = unpack_bits(parts["gaussians"], header.profile.code_bits(), header.gaussians)
     return ProbeModel(
-        name=str(settings["name"]),
+        name=header.name,
         source=artifact.source,
-        profile=profile,
-        probes=probes,
-        outputs=outputs,
+        profile=header.profile,
+        probes=header.probes,
+        outputs=header.outputs,
         origin=frame[:3].copy(),
         extent=float(frame[3]),
         size=frame[4:7].copy(),
@@ -83,10 +94,28 @@ def decode(artifact: Artifact) -> ProbeModel:
         code=codes[:, 3:],
         bounds=parts["bounds"],
         net=parts["net"],
-        dead=_unpack_dead(parts["dead"], probes),
-        positions=positions,
-        dropped=dropped,
+        dead=_unpack_dead(parts["dead"], header.probes),
+        positions=parts["positions"],
+        dropped=header.dropped,
     )
+
+
+def _check_frame(frame: np.ndarray) -> None:
+    origin, extent, size, gain = frame[:3], frame[3], frame[4:7], frame[7]
+    with np.errstate(over="ignore"):
+        reaches = np.isfinite(origin + extent * size).all()
+    if not (extent > 0 and reaches and (size >= 0).all() and (size <= 1).all()):
+        raise ValueError("part frame: expected a positive extent and a size within it")
+    if not 0 < gain <= np.finfo(np.float32).max:
+        raise ValueError(f"part frame: expected a positive gain that float32 holds, found {gain:g}")
+
+
+def _check_bounds(bounds: np.ndarray) -> None:
+    if (bounds[0] > bounds[1]).any():
+        raise ValueError("part bounds: expected no lowest value above its highest")
+    # Scales are logarithms: their squares, and the squares' inverses, must be float32.
+    if np.abs(bounds[:, SCALE]).max() > _MOST_LOG:
+        raise ValueError(f"part bounds: expected logs of scales of at most {_MOST_LOG:g} either way")
 
 
 def pack_dead(dead: np.ndarray) -> np.ndarray:

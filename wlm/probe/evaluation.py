@@ -20,13 +20,13 @@ another number of probes or outputs   error
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from wlm.errors import WlmError
-from wlm.metrics import psnr_from_mse
+from wlm.metrics import LostLight, psnr_from_mse
 from wlm.probe.data import ProbeSet
 from wlm.probe.decode import Decoder
 from wlm.probe.model import ProbeModel
@@ -62,6 +62,7 @@ class Report(BaseReport):
         psnr_by_coefficient: dB, float64 [D], over all probes.
         irradiance_psnr: dB, over `NORMALS` fixed normals of every live probe in RGB; its peak is the range of the
             input's irradiance there. None as `psnr_by_band`.
+        warnings: Light that was lost and that the means hide.
     """
 
     name: str
@@ -81,6 +82,7 @@ class Report(BaseReport):
     psnr_by_band: list[float] | None
     psnr_by_coefficient: np.ndarray
     irradiance_psnr: float | None
+    warnings: list[str] = field(default_factory=list)
 
 
 def evaluate(
@@ -110,6 +112,9 @@ def evaluate(
     decoded = Decoder(model, device).decode_probes(probes.position)
     meter.report(1)
     report = score(decoded, probes, model.file_bytes() if file_bytes is None else file_bytes)
+    lost = LostLight()
+    lost.add(probes.values, decoded)
+    report = replace(report, warnings=lost.warnings(probes.name, "probe", "the set"))
     meter.report(2, PSNR_dB=report.psnr)
     return report
 

@@ -11,7 +11,7 @@ from wlm.errors import WlmError
 from wlm.formats.checkpoint import EVERY, Checkpoint
 from wlm.metrics import psnr_from_mse
 from wlm.probe.data import ProbeSet
-from wlm.probe.model import ProbeModel, Profile
+from wlm.probe.model import MOST_OUTPUTS, MOST_PROBES, ProbeModel, Profile
 from wlm.probe.trainer import Trainer
 from wlm.system import Meter, OnProgress
 
@@ -79,17 +79,23 @@ def compress(
         The model.
 
     Raises:
-        WlmError: A profile, a setting or a device that isn't there, or a fit that diverged.
+        WlmError: A profile, a setting or a device that isn't there, too many probes or numbers of a probe, a checkpoint
+            that isn't of this fit, or a fit that diverged.
         KeyboardInterrupt: Raised by `progress`, after the checkpoint, if there is one, has been written.
     """
     profile = Profile.load(profile).override(overrides)
     device = interop.check_device(device)
+    if probes.probes > MOST_PROBES or probes.outputs > MOST_OUTPUTS:
+        raise WlmError(
+            f"{probes.name}: expected at most {MOST_PROBES} probes of {MOST_OUTPUTS} numbers, found {probes.probes} of "
+            f"{probes.outputs}"
+        )
     origin, extent, size = _frame(probes.position)
     x = ((probes.position - origin) / extent).astype(np.float32)
     trainer = Trainer(x[probes.live], probes.values[probes.live], profile, seed, device)
     try:
-        if checkpoint is not None and (state := checkpoint.running(0)) is not None:
-            trainer.load(state)
+        if checkpoint is not None:
+            checkpoint.restore(0, trainer.load)
         _run(trainer, probes, profile, device, progress, checkpoint)
         trainer.finish()
         mse = trainer.mse()

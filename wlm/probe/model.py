@@ -24,6 +24,12 @@ ROTATION = slice(6, 10)
 LATENT = slice(10, None)
 CENTRE_BITS = 16
 
+MOST_PROBES = 1 << 27
+"""Probes of a model, at most: flags of dead ones take 128 MiB."""
+
+MOST_OUTPUTS = 1024
+"""Numbers of a probe, at most: a network of any width and so many outputs fits a GPU's shared memory."""
+
 
 class Profile(Settings):
     """Settings of a fit.

@@ -8,6 +8,8 @@ import torch
 import warp as wp
 
 from wlm import interop
+from wlm.errors import WlmError
+from wlm.formats.parts import Part, all_finite, check_part, check_parts
 from wlm.probe.model import CENTRE, LATENT, ROTATION, SCALE, Profile, layer_shapes
 from wlm.probe.start import first_gaussians, morton_order
 from wlm_kernels.probe import network as probe_network
@@ -332,17 +334,38 @@ class Trainer:
         }
 
     def state(self) -> dict[str, np.ndarray]:
-        """Everything that later steps depend on."""
+        """Everything that later steps depend on.
+
+        Raises:
+            WlmError: The fit diverged: a number isn't finite.
+        """
         result = {key: self._tensors[key].cpu().numpy().copy() for key in _STATE}
+        if not all(map(all_finite, result.values())):
+            raise WlmError(f"the fit diverged; expected smaller rates than those of {self.profile.name}")
         return result | {"kept": self.needed.copy(), "entered": np.array(self._entered)}
 
+    def table(self, step: int) -> dict[str, Part]:
+        """The parts of a `state` after so many steps."""
+        entered = self.stage(step - 1) if step else 0
+        table = {key: Part(np.float32, tuple(self._tensors[key].shape)) for key in _STATE}
+        return table | {
+            "control": Part(np.int32, (1,), least=step, most=step),
+            "kept": Part(np.bool_, (self.count,)),
+            "entered": Part(np.int64, (), least=entered, most=entered),
+        }
+
     def load(self, state: dict[str, np.ndarray]) -> None:
-        """Goes back to a `state`; arrays of other shapes raise ValueError."""
+        """Goes back to a `state`.
+
+        Raises:
+            ValueError: A part is missing, of another shape or out of its range; the trainer is as it was.
+        """
+        done = check_part(state, "control", Part(np.int32, (1,), least=0, most=self.profile.steps))
+        state = check_parts(state, self.table(int(done[0])))
+        if not state["kept"].any() or (state["bounds"][0] > state["bounds"][1]).any():
+            raise ValueError("parts kept, bounds: expected a Gaussian, and no lowest value above its highest")
         for key in _STATE:
-            value, target = torch.from_numpy(np.array(state[key])), self._tensors[key]
-            if value.shape != target.shape:
-                raise ValueError(f"{key}: expected shape {tuple(target.shape)}, got {tuple(value.shape)}")
-            target.copy_(value)
+            self._tensors[key].copy_(torch.from_numpy(np.array(state[key])))
         self.needed, self._entered = np.array(state["kept"]), int(state["entered"])
         if self._entered == 2:
             with interop.stream(self.device):

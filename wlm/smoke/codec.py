@@ -7,14 +7,23 @@ from typing import Any
 
 import numpy as np
 import torch
+from pydantic import JsonValue
 
 from wlm.config import check_settings
 from wlm.errors import WlmError
 from wlm.formats.artifact import Artifact
+from wlm.formats.parts import Part, check_part, check_parts
 from wlm.smoke.model import NetworkSettings, SixWayNetwork, SmokeModel
-from wlm.system import Part, check_parts, load
+from wlm.system import Header, load
 
 _SHIPPED = Path(__file__).resolve().parents[1] / "data" / "smoke-six-fast.safetensors"
+
+
+class _Header(Header):
+    """The settings of a file."""
+
+    network: NetworkSettings
+    summary: dict[str, JsonValue]
 
 
 def encode(model: SmokeModel) -> tuple[dict[str, Any], dict[str, np.ndarray], str]:
@@ -42,21 +51,19 @@ def decode(artifact: Artifact) -> SmokeModel:
     """Makes a network of a file's parts, in float32 on the CPU.
 
     Raises:
-        WlmError: A setting is out of range.
+        WlmError: A setting is wrong.
         ValueError: The weights aren't those of the settings.
     """
-    settings = check_settings(NetworkSettings, artifact.settings.get("network"), "network.")
-    summary = artifact.settings.get("summary")
-    if not isinstance(summary, dict):
-        raise WlmError(f"summary: expected a mapping, found {type(summary).__name__}")
-    network = SixWayNetwork(settings)
+    header = check_settings(_Header, artifact.settings, "setting ")
+    # The largest part first: without it no memory is taken for the network.
+    lowest, channels = header.network.levels - 1, header.network.width * 2 ** (header.network.levels - 1)
+    check_part(artifact.tensors, f"encoder.{lowest}.2.weight", Part(np.float16, (channels, channels, 3, 3)))
+    network = SixWayNetwork(header.network)
     weights = network.state_dict()
     parts = check_parts(artifact.tensors, {name: Part(np.float16, tuple(w.shape)) for name, w in weights.items()})
-    if extra := artifact.tensors.keys() - parts.keys():
-        raise ValueError(f"part {min(extra)} is none of its network's")
     for name, weight in weights.items():
         weight.copy_(torch.from_numpy(parts[name].astype(np.float32)))
-    return SmokeModel(network.eval(), summary)
+    return SmokeModel(network.eval(), header.summary)
 
 
 def shipped() -> Path:

@@ -35,6 +35,7 @@ from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_write
 from wlm.formats.checkpoint import EVERY, Checkpoint
 from wlm.formats.lock import locked
+from wlm.formats.parts import Part, check_parts
 from wlm.interop import check_device
 from wlm.smoke.evaluation import Score, of_network, score
 from wlm.smoke.learn import dataset
@@ -166,18 +167,24 @@ class _Run:
         self.columns = ["step", "seconds", "rate", "loss", *self.settings.losses.parts, "skipped"]
         self.columns += [*_SCORES, *PLANES]
         self.curve = np.zeros((0, len(self.columns)))
-        if (state := checkpoint.running(0)) is None:
+        if not checkpoint.restore(0, self._load):
             return
-        try:
-            self.trainer.load(state)
-            self.before, self.best, self.untrained = (float(value) for value in state["clock"])
-            self.best_step, self.first_skipped = (int(value) for value in state["counts"])
-            self.curve = state["curve"].reshape(-1, len(self.columns))
-        except (KeyError, ValueError) as error:
-            raise WlmError(f"{checkpoint.path}: expected the state of a training: {error}") from error
         saved = self._saved()
         if saved is None or (saved.summary.get("steps"), saved.summary.get("psnr")) != (self.best_step, self.best):
             self.best = math.nan
+
+    def _load(self, state: dict[str, np.ndarray]) -> None:
+        table = {
+            # NaN where nothing has been validated.
+            "clock": Part(np.float64, (3,), finite=False),
+            "counts": Part(np.int64, (2,), least=0, most=self.settings.total),
+            "curve": Part(np.float64, (None, len(self.columns)), finite=False),
+        }
+        own = check_parts({name: state[name] for name in table if name in state}, table)
+        self.trainer.load({name: value for name, value in state.items() if name not in table})
+        self.before, self.best, self.untrained = (float(value) for value in own["clock"])
+        self.best_step, self.first_skipped = (int(value) for value in own["counts"])
+        self.curve = own["curve"]
 
     @property
     def late(self) -> bool:

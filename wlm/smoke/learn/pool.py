@@ -9,11 +9,20 @@ import numpy as np
 import torch
 
 from wlm.formats.artifact import Artifact, read_artifact, write_artifact
+from wlm.formats.parts import Part, check_parts
 from wlm.smoke.learn.settings import DatasetSettings
 from wlm.smoke.planes import GUIDES, OPACITY_PLANE, PLANES, VISIBLE
 from wlm.system import decode
 
 _SYSTEM = "smoke-pool"
+
+# `Pool` holds how their shapes fit each other.
+_PARTS = {
+    "guides": Part(np.float16, (None, 2, None, None, None)),
+    "targets": Part(np.float16, (None, 2, len(PLANES), None, None)),
+    "motion": Part(np.float16, (None, 2, None, None)),
+    "sequence": Part(np.int64, (None,)),
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,11 +101,12 @@ def load_pool(path: str | os.PathLike[str], device: str = "cpu") -> Pool:
     """Reads a file of `save_pool`.
 
     Raises:
-        WlmError: The file is missing, damaged or of another kind.
+        WlmError: The file is missing, damaged or of another kind, or a part is of another type, or not finite.
     """
 
     def make(artifact: Artifact) -> Pool:
+        parts = check_parts(artifact.tensors, _PARTS)
         # Copied: a mapped file is read-only, which a tensor can't be.
-        return Pool(*(torch.from_numpy(np.array(artifact.tensors[field.name])) for field in fields(Pool))).to(device)
+        return Pool(*(torch.from_numpy(np.array(parts[field.name])) for field in fields(Pool))).to(device)
 
     return decode(path, read_artifact(path, _SYSTEM), make)

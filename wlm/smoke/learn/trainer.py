@@ -9,6 +9,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
+from wlm.formats.parts import Part, check_part, check_parts
 from wlm.interop import StepGraph
 from wlm.smoke.learn.losses import Losses
 from wlm.smoke.learn.pool import Pool
@@ -157,29 +158,46 @@ class Trainer:
         # Copied: on the CPU a tensor's array is the tensor's own memory.
         return {name: np.array(value.detach().cpu().numpy(), order="C") for name, value in tensors.items()}
 
+    def table(self, step: int) -> dict[str, Part]:
+        """The parts of a `state` after so many steps."""
+        table = {
+            "step": Part(np.int64, (), least=step, most=step),
+            "sums": Part(np.float32, tuple(self._sums.shape)),
+            "skipped": Part(np.float32, (), least=0, most=step),
+        }
+        for kind, network in (("network", self.network), ("average", self.average)):
+            table |= {f"{kind}.{name}": Part(np.float32, tuple(v.shape)) for name, v in network.state_dict().items()}
+        for name, weight in self.network.named_parameters() if step else ():
+            shape = tuple(weight.shape)
+            table |= {
+                f"adam.step.{name}": Part(np.float32, (), least=0, most=step),
+                f"adam.exp_avg.{name}": Part(np.float32, shape),
+                f"adam.exp_avg_sq.{name}": Part(np.float32, shape, least=0.0),
+            }
+        return table
+
     @torch.no_grad()
     def load(self, state: dict[str, np.ndarray]) -> None:
         """Restores a `state`.
 
         Raises:
-            ValueError: A part is missing or has another shape.
+            ValueError: A part is missing, of another shape or out of its range; the trainer is as it was.
         """
+        done = check_part(state, "step", Part(np.int64, (), least=0, most=self.settings.total))
+        state = check_parts(state, self.table(int(done)))
         values = {name: torch.from_numpy(np.array(value)) for name, value in state.items()}
-        try:
-            self.step = int(values["step"])
-            self._sums.copy_(values["sums"])
-            self._skipped.copy_(values["skipped"])
-            for kind, network in (("network", self.network), ("average", self.average)):
-                for name, value in network.state_dict().items():
-                    value.copy_(values[f"{kind}.{name}"])
-            for name, weight in self.network.named_parameters():
-                keys = [key for key in ("step", "exp_avg", "exp_avg_sq") if f"adam.{key}.{name}" in values]
-                moments = {key: values[f"adam.{key}.{name}"].to(self.device) for key in keys}
-                # In the weight's memory layout.
-                moments |= {key: torch.empty_like(weight).copy_(moments[key]) for key in keys[1:]}
-                self._adam.state[weight] = moments
-        except (KeyError, RuntimeError) as error:
-            raise ValueError(f"the state is of another network: {error}") from error
+        self.step = int(done)
+        self._sums.copy_(values["sums"])
+        self._skipped.copy_(values["skipped"])
+        for kind, network in (("network", self.network), ("average", self.average)):
+            for name, value in network.state_dict().items():
+                value.copy_(values[f"{kind}.{name}"])
+        for name, weight in self.network.named_parameters() if self.step else ():
+            moments = {"step": values[f"adam.step.{name}"].to(self.device)}
+            # In the weight's memory layout.
+            for key in ("exp_avg", "exp_avg_sq"):
+                moments[key] = torch.empty_like(weight).copy_(values[f"adam.{key}.{name}"])
+            self._adam.state[weight] = moments
 
 
 def _mirrored(planes: tuple[str, ...], device: str) -> list[torch.Tensor]:

@@ -1,0 +1,212 @@
+"""A small file of each kind that wlm reads back: models, checkpoints, a pool of samples; each made once."""
+
+from __future__ import annotations
+
+import functools
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import numpy as np
+
+import wlm
+from wlm.formats.checkpoint import Checkpoint
+
+
+@dataclass(frozen=True)
+class Kept:
+    """A file.
+
+    Attributes:
+        content: Its bytes.
+        read: Reads a file of that kind; raises WlmError where it is wrong.
+        free: What parts may be, by name: "missing", "nan", or of another "size" along their first axis, "sizes" along
+            two.
+        ranges: A number out of range for parts that have one: the place and the value.
+    """
+
+    content: bytes
+    read: Callable[[Path], Any]
+    free: dict[str, str]
+    ranges: dict[str, tuple[Any, float]]
+
+
+def _written(write: Callable[[Path], Any]) -> bytes:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "kept.wlm")
+        write(path)
+        return next(Path(folder).iterdir()).read_bytes()
+
+
+def _lightmap() -> Kept:
+    from builders.synthetic import random_model
+
+    ranges = {"kind": (2, 4), "times": (3, 24.5), "constant": (0, -1.0), "scale_static": (0, -0.5), "affine": (0, -1.0)}
+    return Kept(_written(random_model(uvt_slices=1).save), wlm.load, {}, ranges)
+
+
+def _probe() -> Kept:
+    from builders.probe_models import random_model
+
+    ranges = {"bounds": ((0, 4), 41.0), "frame": (3, 0.0)}
+    return Kept(
+        _written(random_model(positions=True).save), wlm.load, {"dead": "missing", "positions": "missing"}, ranges
+    )
+
+
+def _atlas(kind: str, colour: str) -> Kept:
+    from builders.atlas_meshes import sheet
+    from builders.atlas_models import random_model
+
+    free = {"uv": "missing size", "lut": "sizes" if kind == "cascade" else ""}
+    ranges = {"lut": (0, 65535)} if kind == "tiles" else {"uv": (0, 1.5)}
+    ranges |= {"colour": (0, -1.0)} if colour == "half" else {}
+    return Kept(_written(random_model(sheet(), kind, colour).save), wlm.load, free, ranges)
+
+
+def _smoke() -> Kept:
+    from builders.smoke_samples import random_model
+
+    return Kept(_written(random_model(levels=2).save), wlm.load, {}, {})
+
+
+def _pool() -> Kept:
+    from wlm.smoke.learn.pool import load_pool, save_pool
+    from wlm.smoke.learn.settings import DatasetSettings
+
+    content = _written(lambda path: save_pool(path, _samples(), DatasetSettings(), "seed-0"))
+    return Kept(content, load_pool, {}, {})
+
+
+def _samples() -> Any:
+    import torch
+
+    from wlm.smoke.learn.pool import Pool
+
+    random = torch.Generator().manual_seed(0)
+    shapes = ((2, 2, 3, 16, 16), (2, 2, 8, 16, 16), (2, 2, 16, 16))
+    return Pool(*(torch.rand(shape, generator=random).half() for shape in shapes), torch.arange(2))
+
+
+def lightmap_fit() -> tuple[Any, Any]:
+    """A fit of one dynamic tile, and a trainer of it after three steps."""
+    from builders.small_sets import moving_light, tiny_profile
+
+    from wlm.lightmap.fit import _Fit
+    from wlm.lightmap.trainer import Trainer
+
+    fit = _Fit(moving_light(40, 24), tiny_profile())
+    (batch,) = fit.batches()
+    trainer = Trainer(fit.profile, fit.model.axis, fit.targets(batch.rows), True, 0, "cpu")
+    trainer.run(3)
+    return fit, trainer
+
+
+def _opened(path: Path, system: str) -> Checkpoint:
+    """The checkpoint in a file, whatever it is called."""
+    return Checkpoint(str(path).removesuffix(".partial"), system, {}, "0f", resume=True)
+
+
+def _lightmap_running() -> Kept:
+    _, trainer = lightmap_fit()
+    content = _written(lambda path: Checkpoint(path, "lightmap", {}, "0f").save_running(0, trainer.state()))
+    ranges = {"control": (0, 21), "adam_net.0.exp_avg_sq": (0, -1.0), "adam_maps.0.step": ((), 9.0)}
+    return Kept(
+        content,
+        lambda path: _opened(path, "lightmap").restore(0, trainer.load),
+        {},
+        {f"running.0.{name}": wrong for name, wrong in ranges.items()},
+    )
+
+
+def _lightmap_finished() -> Kept:
+    fit, trainer = lightmap_fit()
+    (batch,) = fit.batches()
+    content = _written(lambda path: Checkpoint(path, "lightmap", {}, "0f").add_finished(0, trainer.quantised()))
+    return Kept(content, lambda path: _opened(path, "lightmap").finished(0, fit.table(batch)), {}, {})
+
+
+def _probe_running() -> Kept:
+    from builders.probe_sets import synthetic
+
+    from wlm.probe import Profile
+    from wlm.probe.fit import _frame
+    from wlm.probe.trainer import Trainer
+
+    probes = synthetic(60)
+    origin, extent, _ = _frame(probes.position)
+    profile = Profile(name="small", ratio=0.1, latent=3, hidden=16, steps=60)
+    trainer = Trainer(((probes.position - origin) / extent).astype(np.float32), probes.values, profile, 0, "cpu")
+    trainer.run(52)
+    content = _written(lambda path: Checkpoint(path, "probe", {}, "0f").save_running(0, trainer.state()))
+    ranges = {"control": (0, -1), "entered": ((), 2), "bounds": ((0, 0), 9.0)}
+    return Kept(
+        content,
+        lambda path: _opened(path, "probe").restore(0, trainer.load),
+        {},
+        {f"running.0.{name}": wrong for name, wrong in ranges.items()},
+    )
+
+
+def _training() -> Kept:
+    from wlm.smoke.fit import train
+    from wlm.smoke.learn.settings import TrainSettings
+    from wlm.smoke.model import NetworkSettings, Profile
+
+    settings = TrainSettings(rounds=1, steps=4, batch=2, warmup=2, average=0.5)
+    profile = Profile(name="tiny", network=NetworkSettings(width=8, levels=2), training=settings)
+    pools = {"make_pool": lambda *a, **k: _samples(), "make_validation": lambda *a, **k: _samples()}
+
+    def write(path: Path) -> None:
+        # Out of time after the first two steps.
+        with mock.patch("wlm.smoke.fit._CHUNK", 2):
+            train(profile, path, minutes=0.0, **pools)
+        for other in (path, Path(f"{path}.csv")):
+            other.unlink(missing_ok=True)
+
+    def read(path: Path) -> None:
+        with mock.patch("wlm.smoke.fit._CHUNK", 2):
+            train(profile, str(path).removesuffix(".partial"), resume=True, minutes=0.0, **pools)
+
+    free = {"clock": "nan", "curve": "nan size"}
+    ranges = {"step": ((), -1), "skipped": ((), 99.0), "counts": (0, -1), "adam.step.heads.0.bias": ((), -1.0)}
+    return Kept(
+        _written(write),
+        read,
+        {f"running.0.{name}": words for name, words in free.items()},
+        {f"running.0.{name}": wrong for name, wrong in ranges.items()},
+    )
+
+
+def _simulation() -> Kept:
+    from wlm.fluid.lattice import Lattice
+    from wlm.fluid.obstacles import Sphere, Trajectory
+    from wlm.fluid.solver import Solver
+
+    ball = Sphere(Trajectory.of(np.array([[4.0, 4.0, 4.0]]), np.array([0.0])), 1.5)
+    solver = Solver(Lattice((8, 8, 8), viscosity=0.1), refinement=1, obstacles=[ball])
+    solver.step(2)
+    return Kept(_written(solver.save), solver.load, {}, {"lattice.steps": ((), -1)})
+
+
+KEPT: dict[str, Callable[[], Kept]] = {
+    name: functools.cache(make)
+    for name, make in {
+        "lightmap": _lightmap,
+        "probe": _probe,
+        "atlas-tiles": lambda: _atlas("tiles", "half"),
+        "atlas-cascade": lambda: _atlas("cascade", "half"),
+        "atlas-bc6h": lambda: _atlas("plain with uv", "bc6h"),
+        "smoke": _smoke,
+        "pool": _pool,
+        "lightmap-running": _lightmap_running,
+        "lightmap-finished": _lightmap_finished,
+        "probe-running": _probe_running,
+        "training": _training,
+        "simulation": _simulation,
+    }.items()
+}
+"""By name; made when first asked for."""

@@ -1,0 +1,241 @@
+"""A digest says that a file is whole, not that it is sane: each part and setting is checked before it is used."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from builders.kept_files import KEPT, Kept
+from builders.resigned import GONE, put, rewrite, rewrite_number
+
+import wlm
+from wlm.errors import WlmError
+from wlm.formats.artifact import read_artifact, write_artifact
+
+MODELS = ("lightmap", "probe", "atlas-tiles", "atlas-cascade", "atlas-bc6h", "smoke")
+MOST = 10  # parts of a file that are tried: a network's weights are all alike
+
+WEIRD = {
+    "none": None,
+    "true": True,
+    "negative": -1,
+    "zero": 0,
+    "fraction": 1.5,
+    "huge": 10**400,
+    "text": "24",
+    "list": [],
+    "table": [[1, 2], [3, 4]],
+    "mapping": {"a": {"b": 1}},
+}
+# What is a good value after all.
+ACCEPTED = {
+    ("name", "text"),
+    ("period", "none"),
+    ("dropped", "zero"),
+    ("report", "mapping"),
+    ("summary", "mapping"),
+}
+COUNTS = ("size", "texels", "probes", "outputs", "gaussians", "dropped", "period")
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "kept.wlm.partial"
+
+
+def written(path: Path, name: str) -> Kept:
+    kept = KEPT[name]()
+    path.write_bytes(kept.content)
+    return kept
+
+
+def refused(kept: Kept, path: Path, *words: str) -> str:
+    with pytest.raises(WlmError) as caught:
+        kept.read(path)
+    line = str(caught.value)
+    assert "\n" not in line and "kept.wlm.partial" in line and all(word in line for word in words), line
+    return line
+
+
+def last(name: str) -> str:
+    """A part's name as its reader has it: without its batch or its lattice."""
+    return name.split(".", 2)[2] if name.startswith(("running.", "finished.")) else name.removeprefix("lattice.")
+
+
+def longer(value: np.ndarray, axis: int) -> np.ndarray:
+    return np.concatenate([value, value.take([0], axis)], axis)
+
+
+@pytest.mark.parametrize("name", KEPT)
+def test_a_good_file_is_read(name, path):
+    written(path, name).read(path)
+
+
+@pytest.mark.parametrize("name", KEPT)
+def test_wrong_parts_are_one_line(name, path):
+    kept = written(path, name)
+    tensors = read_artifact(path).tensors
+    for part in list(tensors)[:: -(-len(tensors) // MOST)]:
+        value, free = tensors[part], kept.free.get(part, "")
+        changes = [(value.astype(np.float32 if value.dtype == np.int64 else np.int64), True), (value[None], True)]
+        if "missing" not in free:
+            changes.append((GONE, True))
+        # Another length may as well be the fault of the parts that don't fit it.
+        changes += [
+            (longer(value, axis), False) for axis in range(free.count("size") + free.count("sizes"), value.ndim)
+        ]
+        if value.dtype.kind == "f" and "nan" not in free:
+            changes += [(put((0,) * value.ndim, number)(value), True) for number in (np.nan, np.inf)]
+        for change, named in changes:
+            written(path, name)
+            rewrite(path, tensors={part: change})
+            refused(kept, path, *[last(part)] * named)
+
+
+@pytest.mark.parametrize("name", KEPT)
+def test_numbers_out_of_range_are_one_line(name, path):
+    kept = KEPT[name]()
+    for part, (place, value) in kept.ranges.items():
+        written(path, name)
+        rewrite(path, tensors={part: put(place, value)})
+        refused(kept, path, last(part))
+
+
+@pytest.mark.parametrize("name", KEPT)
+def test_a_part_that_is_none_of_the_files_is_one_line(name, path):
+    kept = written(path, name)
+    prefix = next(iter(read_artifact(path).tensors)).rpartition(".")[0] if "-" in name or name == "training" else ""
+    prefix = ".".join(prefix.split(".")[:2])
+    rewrite(path, tensors={f"{prefix}.more".lstrip("."): np.zeros(3, np.float16)})
+    refused(kept, path, "more")
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_weird_settings_are_one_line(name, path):
+    kept = written(path, name)
+    for key in read_artifact(path).settings:
+        for kind, value in [*WEIRD.items(), ("gone", GONE)]:
+            written(path, name)
+            rewrite(path, {key: value})
+            if (key, kind) in ACCEPTED:
+                kept.read(path)
+            elif (key, kind) == ("period", "fraction"):
+                refused(kept, path, "times: expected 0 to 1.5")
+            else:
+                refused(kept, path, "setting ", key)
+        for text in ("NaN", "Infinity", "-Infinity", "1e999"):
+            written(path, name)
+            rewrite_number(path, key, text)
+            refused(kept, path, f"expected finite numbers, found {text}")
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "words"),
+    [
+        ("lightmap", {"size": [1e300, 1]}, "setting size.0: expected a valid integer"),
+        ("lightmap", {"size": [128]}, "setting size"),
+        ("lightmap", {"size": [128, 128, 3]}, "setting size"),
+        ("lightmap", {"size": [True, 128]}, "setting size.0"),
+        ("lightmap", {"size": [128, -128]}, "found 128x-128"),
+        ("lightmap", {"size": [10**12, 10**12]}, "size: expected at least 1x1 texels, at most 65536 along a side"),
+        ("lightmap", {"period": -5}, "setting period: expected greater than 0, got -5"),
+        ("lightmap", {"period": 1e-320}, "part times: expected 0 to 9.99989e-321, the period, found 0 to 19"),
+        ("lightmap", {"profile": {"name": "a", "hidden": 9999}}, "setting profile.hidden"),
+        ("lightmap", {"profile": {"name": "a", "gamma": "NaN"}}, "setting profile.gamma"),
+        ("lightmap", {"unheard": 1}, "setting unknown key 'unheard'"),
+        ("probe", {"outputs": 1025}, "setting outputs: expected less than or equal to 1024"),
+        ("probe", {"probes": 2**40}, "setting probes: expected less than or equal to 134217728"),
+        ("probe", {"gaussians": 41}, "part gaussians is uint8 (1040,), expected uint8 (1066)"),
+        ("atlas-tiles", {"size": [65536, 65536]}, "part lut is uint16"),
+        ("atlas-tiles", {"size": [0, 48]}, "setting size.0"),
+        ("atlas-bc6h", {"size": [16384, 16384]}, "at most 65536 texels for each of the 414 that its textures hold"),
+        ("atlas-cascade", {"size": [65536, 65536]}, "and 268435456 in all, found 65536x65536"),
+        ("smoke", {"network": {"width": 64, "levels": 6}}, "part encoder.5.2.weight is missing"),
+        ("smoke", {"network": {"width": 2**70}}, "setting network.width"),
+    ],
+)
+def test_settings_out_of_range_are_one_line(name, settings, words, path):
+    kept = written(path, name)
+    rewrite(path, settings)
+    refused(kept, path, words)
+
+
+# Files that were once accepted, or took the machine.
+
+
+def test_tables_in_place_of_lists(path):
+    kept = written(path, "lightmap")
+    rewrite(path, tensors={"times": lambda v: v.reshape(2, 2)})
+    refused(kept, path, "part times is float32 (2, 2), expected float32 or float64 (any)")
+    for wrong in (lambda v: v.reshape(2, 2), lambda v: v.astype(np.float32)):
+        written(path, "lightmap")
+        rewrite(path, tensors={"kind": wrong})
+        refused(kept, path, "part kind is ", "expected uint8 (4)")
+
+
+def test_a_few_bytes_that_claim_a_large_lightmap(path):
+    """Of empty tiles alone; the largest that is read takes no memory for them either."""
+    kept = written(path, "lightmap")
+    parts = {name: GONE for name in read_artifact(path).tensors if name not in ("kind", "times")}
+    rewrite(path, {"size": [32768, 32768]}, parts | {"kind": np.zeros(65536, np.uint8)})
+    refused(kept, path, "size: expected at least 1x1 texels, at most 65536 along a side and 268435456 in all")
+    rewrite(path, {"size": [16384, 16384]}, {"kind": np.zeros(16384, np.uint8)})
+    assert wlm.load(path).width == 16384
+
+
+def test_a_few_bytes_that_claim_a_large_atlas(path):
+    kept = written(path, "atlas-bc6h")
+    settings = {"size": [65536, 65536], "texels": [1, 1], "colour": "half"}
+    rewrite(path, settings, {"colour": np.zeros((1, 1, 3), np.float16)})
+    refused(kept, path, "found 65536x65536")
+    rewrite(path, {"size": [8192, 8192]})
+    refused(kept, path, "at most 65536 texels for each of the 1 that its textures hold, found 8192x8192")
+
+
+def test_a_few_bytes_that_claim_a_large_network(path):
+    kept = written(path, "smoke")
+    weights = dict.fromkeys(read_artifact(path).tensors, GONE)
+    rewrite(path, {"network": {"width": 64, "levels": 6}}, weights)
+    refused(kept, path, "part encoder.5.2.weight is missing")
+
+
+@pytest.mark.parametrize("name", [name for name in MODELS if name != "smoke"])
+def test_a_name_does_not_reach_the_terminal_as_orders(name, path):
+    written(path, name)
+    profile = read_artifact(path).settings["profile"] | {"name": "p\x9b2J"}
+    rewrite(path, {"name": "a\x1b]0;title\x07\x1b[2J\u202eb\ud7ff é", "profile": profile})
+    model = wlm.load(path)
+    assert model.name == "a ]0;title  [2J b  é" and model.profile.name == "p 2J"
+
+
+def test_a_source_that_is_no_word(path):
+    kept = written(path, "probe")
+    content = path.read_bytes()
+    path.write_bytes(content.replace(b"0123456789abcdef", b"012345678\\u001bf", 1))
+    refused(kept, path, "expected words in printable ASCII")
+
+
+def test_writing_holds_what_reading_asks(tmp_path):
+    """A fit that diverged leaves no file."""
+    model = wlm.load(_good(tmp_path, "lightmap"))
+    model.net = model.net.copy()
+    model.net[0, 3] = np.nan
+    with pytest.raises(WlmError, match=r"new.wlm: not written: .*part net: expected finite numbers"):
+        model.save(tmp_path / "new.wlm")
+    assert not (tmp_path / "new.wlm").exists()
+
+
+def _good(folder: Path, name: str) -> Path:
+    path = folder / "good.wlm"
+    written(path, name)
+    return path
+
+
+def test_a_batch_with_a_number_that_is_none(path):
+    written(path, "lightmap-running")
+    artifact = read_artifact(path)
+    for number in ("9" * 5000, "٣", "-1", ""):
+        tensors = {f"running.{number}.loss": np.zeros(1, np.float32)}
+        write_artifact(path, artifact.system, artifact.settings, tensors, artifact.source)
+        refused(KEPT["lightmap-running"](), path, "expected one of a finished or a running batch")

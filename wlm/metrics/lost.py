@@ -1,0 +1,73 @@
+"""Light that an approximation lost and a mean hides.
+
+One texel of 16,384 that is ten thousand times the others may vanish, and PSNR, whose peak it is, still be 48 dB. Or it
+stays, and the others vanish.
+"""
+
+import numpy as np
+
+_BRIGHT = 0.5  # of the largest: what counts as among the brightest
+_KEPT = 0.5  # of its own: what is left of light that isn't lost; and by how much of its own light a point is off
+_BRIGHTER = 10.0  # times the median: what hides an error of the others
+
+
+class LostLight:
+    """Counts the points of some groups that lost more than half of their light where PSNR doesn't show it.
+
+    Attributes:
+        count: Points among the brightest of their group.
+        worst: The largest of them, what it decodes to, and where; None without any.
+        hidden: Points of groups most of which are off by more than half of their own light, beside something that is
+            ten times as bright as the median.
+    """
+
+    def __init__(self) -> None:
+        self.count = self.hidden = 0
+        self.worst: tuple[float, float, str] | None = None
+
+    def add(self, reference: np.ndarray, decoded: np.ndarray, where: str = "") -> None:
+        """Looks at a group: a tile at one time, or a whole set.
+
+        Args:
+            reference, decoded: [K, C]; a point's light is the largest magnitude of its channels.
+            where: Words for the group in the warning.
+        """
+        if not len(reference) or not (largest := np.abs(reference).max()) > 0:
+            return
+        light, kept = (np.abs(values).max(1) for values in (reference, decoded))
+        lost = (light >= _BRIGHT * largest) & (kept < _KEPT * light)
+        if lost.any():
+            self.count += int(np.count_nonzero(lost))
+            worst = int(np.argmax(np.where(lost, light, 0.0)))
+            if self.worst is None or light[worst] > self.worst[0]:
+                self.worst = float(light[worst]), float(kept[worst]), where
+        if largest > _BRIGHTER * np.median(light):
+            lit = light > 0
+            off = np.abs(decoded - reference).max(1)[lit] > _KEPT * light[lit]
+            if 2 * np.count_nonzero(off) > len(off):
+                self.hidden += int(np.count_nonzero(off))
+
+    def warnings(self, name: str, point: str, group: str) -> list[str]:
+        """A line for each kind of loss that there was.
+
+        Args:
+            name: Of what was compressed.
+            point, group: Words for a point, and for what it is a part of: "texel", "its tile".
+        """
+        lines = []
+        if self.worst is not None:
+            light, kept, where = self.worst
+            lines.append(
+                f"{name}: {_count(self.count, point)} among the brightest of {group} lost more than half of the light; "
+                f"the largest of {light:.4g} decodes to {kept:.4g}{where and f' ({where})'}"
+            )
+        if self.hidden:
+            lines.append(
+                f"{name}: {_count(self.hidden, point)}, most of {group}, are off by more than half of their own light; "
+                "PSNR hides it, since others are over ten times as bright"
+            )
+        return lines
+
+
+def _count(number: int, point: str) -> str:
+    return f"1 {point}" if number == 1 else f"{number} {point}s"
