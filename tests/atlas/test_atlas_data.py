@@ -257,7 +257,7 @@ def test_a_mask_that_is_derived_leaves_out_what_was_never_baked():
 def test_masks_that_do_not_fit(tmp_path):
     files = _files(tmp_path)
     path = tmp_path / "mask.png"
-    assert "no such mask; expected a PNG of 8x6" in _message(load, *files, mask_path=path)
+    assert "cannot read the mask (expected a PNG of 8x6): No such file" in _message(load, *files, mask_path=path)
     Image.fromarray(np.ones((WIDTH, HEIGHT), np.uint8)).save(path)
     assert _message(load, *files, mask_path=path) == f"{path}: the mask is 6x8, but {files[1]} is 8x6"
     Image.fromarray(np.zeros((HEIGHT, WIDTH), np.uint8)).save(path)

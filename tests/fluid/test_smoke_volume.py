@@ -169,7 +169,7 @@ def test_wrong_files(tmp_path: Path):
     (tmp_path / "c.npy").rename(tmp_path / "c.npz")
     for name, message in (
         ("a.vdb", "expected a name that ends in .npz or .nvdb, found .vdb"),
-        ("a.npz", "no such file"),
+        ("a.npz", "No such file"),
         ("b.npz", "cannot read the arrays"),
         ("c.npz", "expected a .npz file of several arrays"),
     ):

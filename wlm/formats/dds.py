@@ -7,10 +7,11 @@ A volume's slices follow each other, each a 2D grid of blocks (or of texels, row
 import os
 import struct
 from dataclasses import dataclass
-from pathlib import Path
 
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_write
+from wlm.formats.limits import TEXTURE_BYTES
+from wlm.formats.reading import read_file
 
 __all__ = ["DXGI_FORMATS", "DdsTexture", "read_dds", "write_dds"]
 
@@ -154,10 +155,7 @@ def read_dds(path: str | os.PathLike[str]) -> DdsTexture:
         WlmError: The file is missing, not a DDS with a DX10 header, of another format, with mip levels, an
             array or a cube, or not of the length that its header says.
     """
-    try:
-        data = Path(path).read_bytes()
-    except OSError as error:
-        raise WlmError(f"{path}: cannot read the DDS file: {error.strerror or error}") from error
+    data = read_file(path, TEXTURE_BYTES, "the DDS file")
     if data[:4] != _MAGIC:
         raise WlmError(f"{path}: expected a DDS file, found other content")
     if len(data) < _HEADER.size:

@@ -18,6 +18,7 @@ import numpy as np
 
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_write
+from wlm.formats.reading import read_json_file
 
 __all__ = ["UNFINISHED", "claim", "compact_json", "make_parents", "read_index", "rounded", "staged", "write_index"]
 
@@ -108,8 +109,8 @@ def staged(folder: Path, index: str, format_name: str, ours: Callable[[str], boo
 def read_index(path: Path) -> dict[str, Any]:
     """Reads an index; empty where there is none or it isn't a JSON object."""
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        content = read_json_file(path, "the index")
+    except WlmError:
         content = None
     return content if isinstance(content, dict) else {}
 

@@ -10,10 +10,11 @@ import math
 import os
 import struct
 from dataclasses import dataclass
-from pathlib import Path
 
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_write
+from wlm.formats.limits import TEXTURE_BYTES
+from wlm.formats.reading import read_file
 
 __all__ = ["VK_FORMATS", "Ktx2Texture", "read_ktx2", "write_ktx2"]
 
@@ -126,10 +127,7 @@ def read_ktx2(path: str | os.PathLike[str]) -> Ktx2Texture:
         WlmError: The file is missing, not a KTX2, of another format, a volume, an array, a cube, with several mip
             levels or supercompressed, or has another descriptor or length than its format and size say.
     """
-    try:
-        content = Path(path).read_bytes()
-    except OSError as error:
-        raise WlmError(f"{path}: cannot read the KTX2 file: {error.strerror or error}") from error
+    content = read_file(path, TEXTURE_BYTES, "the KTX2 file")
     if content[: len(_IDENTIFIER)] != _IDENTIFIER:
         raise WlmError(f"{path}: expected a KTX2 file, found other content")
     if len(content) < _HEADER.size:

@@ -36,13 +36,10 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import struct
-import zipfile
-import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -50,6 +47,9 @@ from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_path, atomic_write
 from wlm.formats.folder import rounded
 from wlm.formats.godot import read_lmbake
+from wlm.formats.limits import JSON_BYTES, NUMBERS, PROBES
+from wlm.formats.npz import read_npz
+from wlm.formats.reading import read_json_file
 from wlm.probe.conventions import CANONICAL, CONVENTIONS, from_canonical, to_canonical
 from wlm.probe.sphere import sh_count
 
@@ -58,24 +58,7 @@ __all__ = ["LARGEST", "ProbeSet", "from_arrays", "load", "load_positions", "save
 LARGEST = float(np.sqrt(np.finfo(np.float32).max))
 """The largest number whose square float32 still holds."""
 
-_T = TypeVar("_T")
-
 _POSITION, _CONVENTION, _PROBES, _SH = "position", "convention", "probes", "sh"
-# What NumPy and the modules below it raise on a file that is none, is cut short, or lies about its sizes.
-_BAD_FILE = (
-    OSError,
-    ValueError,
-    EOFError,
-    KeyError,
-    MemoryError,
-    NotImplementedError,
-    RuntimeError,
-    SyntaxError,
-    TypeError,
-    struct.error,
-    zipfile.BadZipFile,
-    zlib.error,
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,8 +136,6 @@ def load(path: str | os.PathLike[str], *, key: str | None = None, convention: st
     reader = _READERS.get(path.suffix.lower())
     if reader is None:
         raise WlmError(f"{path}: expected a name that ends in {' or '.join(_READERS)}, found {path.suffix or 'none'}")
-    if not path.is_file():
-        raise WlmError(f"{path}: no such file")
     raw = reader(path, key)
     stated = raw.convention if convention is None else convention
     return _check(str(path), path.stem, raw.position, raw.values, raw.key, stated)
@@ -174,11 +155,9 @@ def load_positions(path: str | os.PathLike[str]) -> np.ndarray:
         WlmError: The file is missing, damaged, or holds something else.
     """
     path = Path(path)
-    if not path.is_file():
-        raise WlmError(f"{path}: no such file")
     kind = path.suffix.lower()
     if kind == ".npz":
-        position = _read_arrays(path, lambda file: file[_POSITION])
+        position = read_npz(path, lambda _: [_POSITION], numbers=3 * PROBES)[_POSITION]
     elif kind == ".lmbake":
         position = read_lmbake(path)[0]
     else:
@@ -266,24 +245,18 @@ def save_probes(
 
 
 def _read_npz(path: Path, key: str | None) -> _Raw:
-    def read(file: np.lib.npyio.NpzFile) -> _Raw:
-        name = _choose(path, file.files, key)
-        stated = file[_CONVENTION].tolist() if _CONVENTION in file.files else CANONICAL
-        return _Raw(file[_POSITION], file[name], name, _text(path, stated))
+    name = ""
 
-    return _read_arrays(path, read)
+    def choose(names: Sequence[str]) -> list[str]:
+        nonlocal name
+        name = _choose(path, names, key)
+        return [_POSITION, name, *({_CONVENTION} & set(names))]
 
-
-def _read_arrays(path: Path, read: Callable[[np.lib.npyio.NpzFile], _T]) -> _T:
-    """What `read` takes from a `.npz` file."""
-    try:
-        loaded = np.load(path, allow_pickle=False)
-        if not isinstance(loaded, np.lib.npyio.NpzFile):
-            raise WlmError(f"{path}: expected a .npz file of several arrays, found a single array")
-        with loaded as file:
-            return read(file)
-    except _BAD_FILE as error:
-        raise WlmError(f"{path}: cannot read the arrays: {error or type(error).__name__}") from error
+    arrays = read_npz(path, choose, numbers=PROBES * NUMBERS)
+    stated = arrays[_CONVENTION] if _CONVENTION in arrays else np.array(CANONICAL)
+    if stated.dtype.kind != "U" or stated.ndim:
+        raise WlmError(f"{path}: {_CONVENTION}: expected a name, got {stated.dtype} {stated.shape}")
+    return _Raw(arrays[_POSITION], arrays[name], name, str(stated))
 
 
 def _read_json(path: Path, key: str | None) -> _Raw:
@@ -294,12 +267,7 @@ def _read_json(path: Path, key: str | None) -> _Raw:
 
 
 def _json(path: Path) -> Any:
-    try:
-        return json.loads(path.read_bytes())
-    except OSError as error:
-        raise WlmError(f"{path}: cannot read: {error.strerror or error}") from error
-    except (ValueError, RecursionError) as error:
-        raise WlmError(f"{path}: not valid JSON: {error}") from error
+    return read_json_file(path, "the probes", JSON_BYTES)
 
 
 def _fields(path: Path, content: Any) -> tuple[list[str], Callable[[str], np.ndarray]]:
