@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from wlm.cli.console import check_output, escape, note, number, quiet_warp, running, show, show_json, table, write_json
-from wlm.cli.options import AsJson, Device, PageFile, ReportFile, Seed, output_option
+from wlm.cli.options import AsJson, Device, PageFile, ReportFile, Seed, Trust, output_option
 from wlm.errors import WlmError
 
 __all__ = ["app"]
@@ -40,6 +40,7 @@ def compress(
     ] = None,
     seed: Seed = 0,
     device: Device = "cpu",
+    trust: Trust = False,
 ) -> None:
     """Compress the lightmap of a mesh into a folder: the model, the mesh, textures for engines, a shader, a report."""
     from wlm.atlas.model import Profile
@@ -55,7 +56,7 @@ def compress(
 
     device = check_device(device)
     claim(output, REPORT_FILE, FORMAT)
-    mesh = load(mesh_path, lightmap_path, mask_path=mask, uv_set=uv_set)
+    mesh = load(mesh_path, lightmap_path, mask_path=mask, uv_set=uv_set, trust=trust)
     for warning in mesh.warnings:
         note(f"warning: {warning}")
     with running("compress") as progress:
@@ -88,6 +89,7 @@ def evaluate(
     lightmap: Annotated[Path | None, typer.Option(help="The lightmap; default where it was.")] = None,
     mask: Annotated[Path | None, typer.Option(help="The mask; default where it was, if there was one.")] = None,
     device: Device = "cpu",
+    trust: Trust = False,
 ) -> None:
     """Compare with the original lightmap on views of the mesh, beside a smaller lightmap of equal bits."""
     if json_path is not None:
@@ -101,7 +103,7 @@ def evaluate(
     from wlm.interop import check_device
 
     output = read_folder(folder)
-    original = read_inputs(output, mesh, lightmap, mask)
+    original = read_inputs(output, mesh, lightmap, mask, trust)
     device = check_device(device)
     options = {"views": views, "resolution": resolution, "device": device}
     with running("evaluate") as progress:

@@ -249,7 +249,7 @@ def report(
     from wlm.bench import pages
 
     if output is None:
-        sys.stdout.write("\n".join(pages(files).values()))
+        show_text("\n".join(pages(files).values()))
         return
     check_output(output, ".md")
     from wlm.formats.atomic import atomic_write
@@ -319,7 +319,7 @@ def _finish(
         write_json(json_path, rows, describe_environment(device, command))
     if plot_path is not None:
         plot(rows if plotted is None else plotted, plot_path, panels)
-    sys.stdout.write(tables(rows))
+    show_text(tables(rows))
     if baseline is not None:
         _compare(rows, device, baseline)
 

@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
-__all__ = ["AsJson", "Device", "ModelFile", "PageFile", "ReportFile", "Resume", "Seed", "output_option"]
+__all__ = ["AsJson", "Device", "ModelFile", "PageFile", "ReportFile", "Resume", "Seed", "Trust", "output_option"]
 
 Device = Annotated[str, typer.Option(help='Where it computes: "cpu", "cuda" or "cuda:N".')]
 Seed = Annotated[int, typer.Option(min=0, max=2**31 - 1, help="One seed gives one result on one device.")]
@@ -15,6 +15,10 @@ PageFile = Annotated[
     Path | None, typer.Option("--html", metavar="REPORT.html", help="Write a page with tables, plots and pictures.")
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")]
+Trust = Annotated[
+    bool,
+    typer.Option("--trust", help="Trust the input's author: it may name files elsewhere, and be as large as it says."),
+]
 ModelFile = Annotated[Path, typer.Argument(metavar="FILE.wlm", help="A file that compress wrote.")]
 
 

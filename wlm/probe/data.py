@@ -22,6 +22,8 @@ a number beyond +-1.8e19              error that names the probe: the loss is a 
 float16, float64, integers            converted to float32; what is too small for it becomes 0
 other types, text, ragged lists       error that names the field
 one probe, one number per probe       fine
+more than 16,777,216 probes, or 4,096 error; on CUDA some 1,400 numbers, which is told when the fit begins
+numbers of a probe
 several arrays named `sh...`          error that lists them, unless `key` names one
 a convention of an engine             error where the numbers are not 1, 4 or 9 RGB coefficients (any
                                       square for Godot's)
@@ -395,6 +397,8 @@ def _check(
             f"{where}: {key}: expected ({count}, C, 3) with RGB last or ({count}, D), a row for each position, "
             f"got {values.shape}"
         )
+    if values.size > NUMBERS * count:
+        raise WlmError(f"{where}: {key}: expected at most {NUMBERS} numbers a probe, got {values.size // count}")
 
     # float64, so that what doesn't fit float32 is told from Inf; integers have no NaN to look for.
     wide = values.astype(np.float64)
@@ -432,6 +436,8 @@ def _check_positions(where: str, position: np.ndarray) -> np.ndarray:
         raise WlmError(f"{where}: {_POSITION}: expected at least one, found none")
     if position.shape != (count, 3):
         raise WlmError(f"{where}: {_POSITION}: expected (N, 3), got {position.shape}")
+    if count > PROBES:
+        raise WlmError(f"{where}: {_POSITION}: expected at most {PROBES} probes, got {count}")
     position = position.astype(np.float64)
     bad = np.flatnonzero(~np.isfinite(position).all(axis=1))
     if len(bad):
