@@ -21,6 +21,7 @@ __all__ = ["check_settings", "load_settings", "profile_names", "profile_path"]
 _Settings = TypeVar("_Settings", bound=BaseModel)
 
 _SHOWN_VALUE = 60  # characters of a wrong value that an error repeats
+_DEEPEST = 50
 _MERGE = "tag:yaml.org,2002:merge"
 _INTEGER_LENGTH = 80  # characters: 64 binary digits with signs between them
 
@@ -123,16 +124,25 @@ class _Loader(yaml.SafeLoader):
     """A safe loader that refuses what settings don't need and strangers misuse.
 
     A key given twice, of which YAML would silently keep the last; `&name`, `*name` and `<<`, with which a few lines
-    stand for billions of values; integers beyond 64 bits.
+    stand for billions of values; integers beyond 64 bits; values in values without end.
     """
+
+    _depth = 0
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
         event = self.peek_event()
+        if self._depth > _DEEPEST:
+            raise yaml.composer.ComposerError(
+                None, None, f"expected values at most {_DEEPEST} deep in others", event.start_mark
+            )
         if getattr(event, "anchor", None) is not None:
             raise yaml.composer.ComposerError(
                 None, None, f"expected a value, found the anchor or alias '{event.anchor}'", event.start_mark
             )
-        return super().compose_node(parent, index)
+        self._depth += 1
+        node = super().compose_node(parent, index)
+        self._depth -= 1
+        return node
 
     def flatten_mapping(self, node: yaml.MappingNode) -> None:
         for key, _ in node.value:

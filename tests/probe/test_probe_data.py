@@ -287,6 +287,7 @@ def test_number_types_are_converted(tmp_path, dtype):
         ({"sh": np.float32(2)}, "got ()"),
         ({"sh": _values(N, 1, 9, 3)}, "got (6, 1, 9, 3)"),
         ({"sh": np.zeros((N, 0))}, "got (6, 0)"),
+        ({"sh": np.ones((N, 4097))}, "sh: expected at most 4096 numbers a probe, got 4097"),
         ({"sh": np.zeros((N, 0, 3))}, "got (6, 0, 3)"),
         ({"sh": np.ones((N, 27), bool)}, "sh: expected numbers, got bool"),
         ({"sh": np.ones((N, 27), complex)}, "sh: expected numbers, got complex128"),

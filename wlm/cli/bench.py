@@ -1,13 +1,12 @@
 """`wlm bench`: speed against error, ours and the baselines."""
 
 import shlex
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from wlm.cli.console import check_output, note, quiet_warp
+from wlm.cli.console import check_output, note, quiet_warp, show_text
 from wlm.cli.options import Device, output_option
 from wlm.errors import WlmError
 

@@ -13,7 +13,7 @@ no voxel                              error
 float16                               stays half; float32, float64 and integers become float32
 float64 beyond float32                as infinite: 0, warning
 other types, other than 3 dimensions  error
-more than 1024^3 voxels; above 640^3  error, unless the file is trusted
+more than 1024^3 voxels; above 512^3  error, unless the file is trusted
 those that a small file only claims
 temperature of another shape          error
 temperature so high that one voxel    lowered to that; warning with the count and the first
@@ -46,7 +46,16 @@ import warp as wp
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_path
 from wlm.formats.exr import HALF_MAX
-from wlm.formats.limits import GROWTH, SURE_BOX, SURE_VOXELS, VOLUME_BYTES, VOXELS, VOXELS_A_BYTE, check_growth
+from wlm.formats.limits import (
+    GROWTH,
+    SURE_BOX,
+    SURE_BYTES,
+    SURE_VOXELS,
+    VOLUME_BYTES,
+    VOXELS,
+    VOXELS_A_BYTE,
+    check_growth,
+)
 from wlm.formats.npz import read_npz
 from wlm.formats.reading import read_file
 from wlm.interop import check_device, to_warp
@@ -253,6 +262,9 @@ def _check(
         raise WlmError(f"{name}: {field}: expected [X, Y, Z] voxels, found {tuple(values.shape)}")
     dtype = dtype or (torch.float16 if values.dtype == torch.float16 else torch.float32)
     values = values.detach().to(device, dtype).contiguous()
+    low, high = torch.aminmax(values)
+    if low >= 0 and torch.isfinite(high):  # NaN would be both; most volumes need no masks as large as they are
+        return values
     for bad, kind in ((~torch.isfinite(values), "NaN or infinite"), (values < 0, "negative")):
         if bad.any():
             count, first = _found(bad)
@@ -373,7 +385,7 @@ def _read_nvdb(path: Path, trust: bool) -> tuple[wp.Volume, wp.Volume | None]:
     data = read_file(path, VOLUME_BYTES, "the NanoVDB file")
     try:
         if not trust:
-            check_growth(str(path), len(data), _unpacked_size(data, GROWTH * len(data)))
+            check_growth(str(path), len(data), _unpacked_size(data, max(SURE_BYTES, GROWTH * len(data))))
         volume = wp.Volume.load_from_nvdb(data, device="cpu")
         grids = []
         while volume is not None:

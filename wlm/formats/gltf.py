@@ -53,7 +53,7 @@ COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 512
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 _MATRIX_SIDES = {"MAT2": 2, "MAT3": 3, "MAT4": 4}
 _LONGEST_STRIDE = 252  # bytes
-_OVERHEAD = 64  # corners that take about as long as a primitive without any
+_OVERHEAD = 256  # corners that take about as long as a primitive without any
 _UV_NAME = re.compile(r"TEXCOORD_(0|[1-9]\d{0,3})")
 _REFUSED = {
     "KHR_draco_mesh_compression": "decompress the mesh first",

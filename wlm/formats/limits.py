@@ -38,8 +38,8 @@ __all__ = [
     "check_growth",
 ]
 
-SETTINGS_BYTES = 256 << 10
-"""Of a YAML file: settings have some kilobytes, and the parser takes seconds a megabyte."""
+SETTINGS_BYTES = 64 << 10
+"""Of a YAML file: settings have some kilobytes, a path of a thousand positions 40, and the parser is slow."""
 
 INTEGER = 1 << 63
 """Integers of settings are below it, either way: beyond, arrays and counters can't hold them."""
@@ -101,8 +101,8 @@ FRAMES = 1 << 30
 VOXELS = 1 << 30
 """Voxels of a volume: 1024^3."""
 
-SURE_VOXELS = 1 << 28
-"""Voxels that a volume may have however small its file is: 640^3, empty frames of a simulation too."""
+SURE_VOXELS = 1 << 27
+"""Voxels that a volume may have however small its file is: 512^3, for a simulation's frames without smoke."""
 
 SURE_BOX = 1 << 24
 """Voxels that the box of a NanoVDB grid may have however small the grid is: 256^3."""

@@ -18,6 +18,8 @@ __all__ = ["named_file", "open_file", "read_file", "read_json_file"]
 # Windows lacks the first two: there, no name of a file blocks. The last keeps its bytes as they are.
 _FLAGS = os.O_RDONLY | sum(getattr(os, name, 0) for name in ("O_NONBLOCK", "O_NOCTTY", "O_BINARY"))
 
+_LONGEST_NAME = 1024  # characters; systems allow 255 between two slashes
+
 
 @contextmanager
 def open_file(path: str | os.PathLike[str], what: str) -> Iterator[BinaryIO]:
@@ -113,6 +115,8 @@ def named_file(document: str | os.PathLike[str], name: str, where: str, trust: b
     Raises:
         WlmError: It lies elsewhere.
     """
+    if len(name) > _LONGEST_NAME:
+        raise WlmError(f"{where}: expected a name of at most {_LONGEST_NAME} characters, found {len(name)}")
     folder = Path(document).parent
     path = folder / name
     try:
