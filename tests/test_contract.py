@@ -130,7 +130,7 @@ def test_settings_that_are_missing_are_one_line(subject, tmp_path):
 
 def test_files_of_no_system_are_one_line(tmp_path):
     one_line(lambda: wlm.load(tmp_path / "absent.wlm"), "absent.wlm")
-    one_line(lambda: wlm.load(tmp_path), "expected an artifact")
+    one_line(lambda: wlm.load(tmp_path), "expected a file, found a folder")
     write_artifact(tmp_path / "a.wlm", "lightmap-checkpoint", {}, {}, "0")
     one_line(lambda: wlm.load(tmp_path / "a.wlm"), "a.wlm", "lightmap-checkpoint")
 

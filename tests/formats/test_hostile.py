@@ -260,7 +260,7 @@ BARE = [{"primitives": [{"attributes": {"POSITION": 0}}]}]
         ({"buffers": [{"byteLength": 60, "uri": "pipe"}]}, "expected a file, found a folder, a device or a pipe"),
         ({"buffers": [{"byteLength": 61, "uri": "in.bin"}]}, "expected 61 bytes, found 60"),
         ({"buffers": [{"byteLength": 60, "uri": f"{'./' * i}in.bin"} for i in range(99)]}, "another file than that of"),
-        ({"buffers": [{"byteLength": 60, "uri": "\ud800"}]}, "buffers[0]"),
+        ({"buffers": [{"byteLength": 60, "uri": "\ud800"}]}, "a.gltf: "),
         (
             {
                 "accessors": [
