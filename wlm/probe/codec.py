@@ -13,8 +13,9 @@ from pydantic import Field
 from wlm.config import check_settings
 from wlm.formats.artifact import Artifact
 from wlm.formats.bits import pack_bits, unpack_bits
+from wlm.formats.limits import NUMBERS, PROBES
 from wlm.formats.parts import Part, check_parts
-from wlm.probe.model import LATENT, MOST_OUTPUTS, MOST_PROBES, SCALE, ProbeModel, Profile, layer_shapes
+from wlm.probe.model import LATENT, SCALE, ProbeModel, Profile, layer_shapes
 from wlm.system import Header, Name
 
 _MOST_LOG = 40.0
@@ -24,10 +25,10 @@ class _Header(Header):
     """The settings of a file."""
 
     name: Name
-    probes: int = Field(ge=1, le=MOST_PROBES)
-    outputs: int = Field(ge=1, le=MOST_OUTPUTS)
-    gaussians: int = Field(ge=1, le=MOST_PROBES)
-    dropped: int = Field(ge=0, le=MOST_PROBES)
+    probes: int = Field(ge=1, le=PROBES)
+    outputs: int = Field(ge=1, le=NUMBERS)
+    gaussians: int = Field(ge=1, le=PROBES)
+    dropped: int = Field(ge=0, le=PROBES)
     profile: Profile
 
 
