@@ -28,12 +28,10 @@ from wlm.config import load_settings
 from wlm.errors import WlmError, printable
 from wlm.fluid.volume import load_volume
 from wlm.formats.artifact import read_artifact
-from wlm.formats.dds import read_dds
 from wlm.formats.exr import read_exr, write_exr
 from wlm.formats.folder import read_index, staged, write_index
 from wlm.formats.gltf import read_gltf
 from wlm.formats.godot import read_lmbake
-from wlm.formats.ktx2 import read_ktx2
 from wlm.formats.mask import read_mask
 from wlm.formats.obj import read_obj
 from wlm.formats.reading import named_file, read_file
@@ -83,8 +81,6 @@ def write(path: Path, content: object) -> Path:
     [
         (lambda path: load_settings(Profile, path), ".yaml"),
         (read_artifact, ".wlm"),
-        (read_dds, ".dds"),
-        (read_ktx2, ".ktx2"),
         (read_exr, ".exr"),
         (read_gltf, ".gltf"),
         (read_obj, ".obj"),
