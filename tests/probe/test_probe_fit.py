@@ -197,8 +197,8 @@ def test_a_probe_that_outshines_the_others_is_said():
 
 
 def test_more_numbers_a_probe_than_a_network_has_outputs():
-    wide = from_arrays(RANDOM.random((3, 3)), RANDOM.normal(size=(3, 1025)).astype(np.float32))
-    with pytest.raises(WlmError, match="expected at most 134217728 probes of 1024 numbers, found 3 of 1025"):
+    wide = from_arrays(RANDOM.random((3, 3)), RANDOM.normal(size=(3, 4097)).astype(np.float32))
+    with pytest.raises(WlmError, match="expected at most 4096 numbers a probe, found 4097"):
         compress(wide, SMALL)
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from wlm.errors import WlmError
+from wlm.formats.limits import NUMBERS
 from wlm.system import Model, Settings
 from wlm_kernels.probe.network import most_outputs
 
@@ -89,11 +90,13 @@ class Profile(Settings):
 
 
 def check_outputs(name: str, profile: Profile, outputs: int, device: str) -> None:
-    """Checks that a device's kernels can be made for so many numbers a probe; those of the CPU can for any.
+    """Checks that files hold so many numbers a probe, and that a device's kernels can be made for them.
 
     Raises:
-        WlmError: They can't.
+        WlmError: They don't, or they can't.
     """
+    if outputs > NUMBERS:
+        raise WlmError(f"{name}: expected at most {NUMBERS} numbers a probe, found {outputs}")
     most = most_outputs(profile.latent, profile.hidden)
     if device != "cpu" and outputs > most:
         raise WlmError(
