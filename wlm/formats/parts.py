@@ -64,8 +64,9 @@ def check_part(tensors: Mapping[str, np.ndarray], name: str, part: Part) -> np.n
             return np.zeros([size or 0 for size in part.shape], kinds[0])
         raise ValueError(f"part {name} is missing")
     sizes = value.shape
-    fits = len(sizes) == len(part.shape) and all(
-        expected in (None, size) for size, expected in zip(sizes, part.shape, strict=True)
+    fits = sizes == part.shape or (
+        len(sizes) == len(part.shape)
+        and all(expected in (None, size) for size, expected in zip(sizes, part.shape, strict=True))
     )
     if value.dtype not in kinds or not fits:
         types = " or ".join(np.dtype(kind).name for kind in kinds)
@@ -74,10 +75,12 @@ def check_part(tensors: Mapping[str, np.ndarray], name: str, part: Part) -> np.n
     if part.finite and not all_finite(value):
         raise ValueError(f"part {name}: expected finite numbers, found NaN or infinity")
     if value.size and (part.least is not None or part.most is not None):
-        for found in (value.min(), value.max()):
-            # The other way round, NaN would pass.
-            if not ((part.least is None or found >= part.least) and (part.most is None or found <= part.most)):
-                raise ValueError(f"part {name}: expected {_range(part)}, found {found:g}")
+        low, high = np.minimum.reduce(value, axis=None), np.maximum.reduce(value, axis=None)
+        # This way round NaN is out of range.
+        if part.least is not None and not low >= part.least:
+            raise ValueError(f"part {name}: expected {_range(part)}, found {low:g}")
+        if part.most is not None and not high <= part.most:
+            raise ValueError(f"part {name}: expected {_range(part)}, found {high:g}")
     return value
 
 
@@ -85,6 +88,8 @@ def all_finite(value: np.ndarray) -> bool:
     """Whether an array holds neither NaN nor infinity."""
     if value.dtype.kind != "f":
         return True
+    if value.size <= _PIECE:
+        return bool(np.isfinite(value).all())
     flat = value.reshape(-1)
     return all(np.isfinite(flat[start : start + _PIECE]).all() for start in range(0, flat.size, _PIECE))
 

@@ -1,5 +1,7 @@
 """A lightmap model as the parts of its file, and back: quantised maps, networks and scales."""
 
+import math
+from itertools import pairwise
 from typing import Annotated, Any
 
 import numpy as np
@@ -54,10 +56,10 @@ def decode(artifact: Artifact) -> LightmapModel:
     header = check_settings(_Header, artifact.settings, "setting ")
     width, height = header.size
     tiles = Part(np.uint8, (TileGrid.of(height, width).count,), most=max(TileKind))
-    kind, times = check_part(tensors, "kind", tiles), check_part(tensors, "times", _TIMES)
-    _check_times(times, header.period)
-    table = part_table(header.profile, kind, len(times)) | {"kind": tiles, "times": _TIMES}
-    parts = check_parts(tensors, table)
+    kind = check_part(tensors, "kind", tiles)
+    times = check_part(tensors, "times", _TIMES).astype(np.float64)
+    _check_times(times.tolist(), header.period)
+    others = {name: part for name, part in tensors.items() if name not in ("kind", "times")}
     return LightmapModel(
         name=header.name,
         width=width,
@@ -65,14 +67,14 @@ def decode(artifact: Artifact) -> LightmapModel:
         period=header.period,
         source=artifact.source,
         profile=header.profile,
-        **parts | {"times": times.astype(np.float64)},
+        kind=kind,
+        times=times,
+        **check_parts(others, part_table(header.profile, kind, len(times))),
     )
 
 
-def _check_times(times: np.ndarray, period: float | None) -> None:
-    with np.errstate(over="ignore"):
-        steps = np.diff(times.astype(np.float64))
-    if len(times) < 1 or not ((steps > 0) & (steps < np.inf)).all():
+def _check_times(times: list[float], period: float | None) -> None:
+    if len(times) < 1 or not math.isfinite(times[-1] - times[0]) or not all(a < b for a, b in pairwise(times)):
         raise ValueError("part times: expected times that increase")
     # Files may hold a time that was rounded up to the period.
     if period is not None and not (times[0] >= 0 and times[-1] <= period * (1 + _ROUNDING)):
