@@ -15,7 +15,6 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from wlm.errors import WlmError
-from wlm.formats.limits import NUMBERS
 from wlm.system import Model, Settings
 from wlm_kernels.probe.network import most_outputs
 
@@ -90,13 +89,11 @@ class Profile(Settings):
 
 
 def check_outputs(name: str, profile: Profile, outputs: int, device: str) -> None:
-    """Checks that files hold so many numbers a probe, and that a device's kernels can be made for them.
+    """Checks that a device's kernels can be made for so many numbers a probe; those of the CPU can for any.
 
     Raises:
-        WlmError: They don't, or they can't.
+        WlmError: They can't.
     """
-    if outputs > NUMBERS:
-        raise WlmError(f"{name}: expected at most {NUMBERS} numbers a probe, found {outputs}")
     most = most_outputs(profile.latent, profile.hidden)
     if device != "cpu" and outputs > most:
         raise WlmError(
