@@ -75,7 +75,7 @@ def test_a_wrong_file_is_one_line(tmp_path, text, words):
 def test_a_missing_file_or_a_folder_is_one_line(tmp_path):
     with pytest.raises(WlmError, match="no.yaml: cannot read the settings: No such file"):
         load_settings(Settings, tmp_path / "no.yaml")
-    with pytest.raises(WlmError, match="Is a directory"):
+    with pytest.raises(WlmError, match="expected a file, found a folder"):
         load_settings(Settings, tmp_path)
 
 
@@ -118,8 +118,10 @@ def test_a_profile_is_found_in_the_installed_package(tmp_path, monkeypatch):
     (site / "configs").mkdir()
     (site / "configs" / "atlas-X.yaml").touch()
     source = Path(wlm.config.__file__)
-    for file in ("__init__.py", "config.py", "errors.py"):
-        (site / "wlm" / file).write_bytes(source.with_name(file).read_bytes())
+    (site / "wlm" / "formats").mkdir()
+    formats = [f"formats/{name}.py" for name in ("__init__", "limits", "reading")]
+    for file in ("__init__.py", "config.py", "errors.py", *formats):
+        (site / "wlm" / file).write_bytes((source.parent / file).read_bytes())
     code = "import wlm.config as c; print(c.profile_names('atlas'), c.profile_path('atlas', 'M'))"
     environment = {**os.environ, "PYTHONPATH": str(site)}
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True)

@@ -112,7 +112,7 @@ def test_a_file_of_another_system_is_refused(subject):
 
 def test_files_of_no_system_are_one_line(tmp_path):
     one_line(lambda: wlm.load(tmp_path / "absent.wlm"), "absent.wlm")
-    one_line(lambda: wlm.load(tmp_path), "expected an artifact")
+    one_line(lambda: wlm.load(tmp_path), "expected a file, found a folder")
     write_artifact(tmp_path / "a.wlm", "lightmap-checkpoint", {}, {}, "0")
     one_line(lambda: wlm.load(tmp_path / "a.wlm"), "a.wlm", "lightmap-checkpoint")
 

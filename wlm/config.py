@@ -2,6 +2,7 @@
 
 import difflib
 import os
+import reprlib
 from collections.abc import Iterator
 from contextlib import suppress
 from importlib import resources
@@ -12,10 +13,15 @@ import yaml
 from pydantic import BaseModel, ValidationError
 
 from wlm.errors import WlmError, one_line
+from wlm.formats.limits import INTEGER, SETTINGS_BYTES
+from wlm.formats.reading import read_file
 
 _Settings = TypeVar("_Settings", bound=BaseModel)
 
 _SHOWN_VALUE = 60  # characters of a wrong value that an error repeats
+_DEEPEST = 50
+_MERGE = "tag:yaml.org,2002:merge"
+_INTEGER_LENGTH = 80  # characters: 64 binary digits with signs between them
 
 
 def load_settings(cls: type[_Settings], path: str | os.PathLike[str]) -> _Settings:
@@ -32,14 +38,12 @@ def load_settings(cls: type[_Settings], path: str | os.PathLike[str]) -> _Settin
         WlmError: One line with the file, the field, what was expected and what was found.
     """
     try:
-        text = Path(path).read_text(encoding="utf-8")
-    except OSError as error:
-        raise WlmError(f"{path}: cannot read the settings: {error.strerror or error}") from error
+        text = read_file(path, SETTINGS_BYTES, "the settings").decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise WlmError(f"{path}: expected YAML in UTF-8, found another byte at {error.start}") from error
     try:
         values = yaml.load(text, _Loader)
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
+    except (yaml.YAMLError, ValueError, TypeError, LookupError, AttributeError, RecursionError) as error:
         raise WlmError(f"{path}: expected YAML: {_yaml_problem(error)}") from error
     if values is None:
         raise WlmError(f"{path}: expected a mapping of settings, found an empty file")
@@ -115,7 +119,45 @@ def _profile_folders() -> Iterator[Path]:
 
 
 class _Loader(yaml.SafeLoader):
-    """A safe loader that refuses a key given twice, of which YAML would silently keep the last."""
+    """A safe loader that refuses what settings don't need and strangers misuse.
+
+    A key given twice, of which YAML would silently keep the last; `&name`, `*name` and `<<`, with which a few lines
+    stand for billions of values; integers beyond 64 bits; values in values without end.
+    """
+
+    _depth = 0
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        event = self.peek_event()
+        if self._depth > _DEEPEST:
+            raise yaml.composer.ComposerError(
+                None, None, f"expected values at most {_DEEPEST} deep in others", event.start_mark
+            )
+        if getattr(event, "anchor", None) is not None:
+            raise yaml.composer.ComposerError(
+                None, None, f"expected a value, found the anchor or alias '{event.anchor}'", event.start_mark
+            )
+        self._depth += 1
+        node = super().compose_node(parent, index)
+        self._depth -= 1
+        return node
+
+    def flatten_mapping(self, node: yaml.MappingNode) -> None:
+        for key, _ in node.value:
+            if key.tag == _MERGE:
+                raise yaml.constructor.ConstructorError(
+                    None, None, "expected keys of settings, found '<<'", key.start_mark
+                )
+        super().flatten_mapping(node)
+
+    def construct_yaml_int(self, node: yaml.ScalarNode) -> int:
+        # Its length first: the value of a million digits takes long to compute.
+        value = super().construct_yaml_int(node) if len(node.value) <= _INTEGER_LENGTH else INTEGER
+        if not -INTEGER < value < INTEGER:
+            raise yaml.constructor.ConstructorError(
+                None, None, "expected an integer within 64 bits, found a larger one", node.start_mark
+            )
+        return value
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         keys = set()
@@ -127,6 +169,9 @@ class _Loader(yaml.SafeLoader):
                     )
                 keys.add(key_node.value)
         return super().construct_mapping(node, deep)
+
+
+_Loader.add_constructor("tag:yaml.org,2002:int", _Loader.construct_yaml_int)
 
 
 def _yaml_problem(error: Exception) -> str:
@@ -166,4 +211,18 @@ def _suggestion(cls: type[BaseModel], location: tuple[int | str, ...]) -> str:
 
 
 def _shown(value: object) -> str:
-    return one_line(repr(value), _SHOWN_VALUE)
+    return one_line(_Short().repr(value), _SHOWN_VALUE)
+
+
+class _Short(reprlib.Repr):
+    """Writes the beginning of a value, however large it is."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.maxlevel = 3
+        self.maxlist = self.maxtuple = self.maxdict = self.maxset = 16
+        self.maxstring = self.maxother = 2 * _SHOWN_VALUE
+
+    def repr_int(self, value: int, level: int) -> str:
+        # Python refuses to write integers of thousands of digits.
+        return repr(value) if abs(value) < 10**_SHOWN_VALUE else "a huge integer"

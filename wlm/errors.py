@@ -2,9 +2,27 @@
 
 _LIMIT = 2000  # characters: room for several long paths
 
+# Control characters, which a terminal obeys, and marks that turn the direction of text and so hide part of it.
+_CONTROLS = (*range(0x20), *range(0x7F, 0xA0))
+_MARKS = (0x061C, 0x200E, 0x200F, *range(0x2028, 0x202F), *range(0x2066, 0x206A))
+_ESCAPES = {code: f"\\x{code:02x}" for code in _CONTROLS} | {code: f"\\u{code:04x}" for code in _MARKS}
+_ESCAPES[ord("\t")] = " "
+
+
+def printable(text: str) -> str:
+    """Escapes what a terminal would obey, and halves of characters: names come from files, and files from strangers.
+
+    Args:
+        text: One line.
+
+    Returns:
+        The text with `\\x1b` in place of an escape character, for example.
+    """
+    return text.translate(_ESCAPES).encode("utf-8", "backslashreplace").decode()
+
 
 def one_line(text: object, limit: int = _LIMIT) -> str:
-    """Joins the lines of a message and cuts it to a length.
+    """Joins the lines of a message, escapes what a terminal would obey, and cuts it to a length.
 
     Args:
         text: Anything whose `str` is the message.
@@ -13,7 +31,7 @@ def one_line(text: object, limit: int = _LIMIT) -> str:
     Returns:
         The message on one line.
     """
-    line = " ".join(part.strip() for part in str(text).splitlines() if part.strip())
+    line = printable(" ".join(part.strip() for part in str(text).splitlines() if part.strip()))
     return line if len(line) <= limit else line[: limit - 3].rstrip() + "..."
 
 

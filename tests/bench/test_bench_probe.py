@@ -98,7 +98,7 @@ def test_the_command(rows, tmp_path, monkeypatch):
 
 
 def test_what_is_refused(sets, tmp_path):
-    with pytest.raises(WlmError, match="no such file"):
+    with pytest.raises(WlmError, match="No such file"):
         run(quick=True, device="cpu", probes_path=tmp_path / "absent.npz")
     with pytest.raises(WlmError, match="device 'tpu'"):
         run_rows(sets, PROFILES, device="tpu", ratios=(), sizes=(), frames=1)

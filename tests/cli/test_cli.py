@@ -193,6 +193,14 @@ def test_names_that_look_like_markup_are_shown_as_they_are(fitted, tmp_path):
     assert "[red]a[b].wlm" in call("lightmap", "info", odd).replace("\n", "")
 
 
+def test_a_set_that_names_files_elsewhere_needs_trust(folder, fitted, tmp_path):
+    entries = [{"time_hours": hour, "file": str(folder / f"light_{hour:g}h.exr")} for hour in HOURS]
+    path = tmp_path / "set.json"
+    path.write_text(json.dumps({"width": 24, "height": 40, "period_hours": 24, "lightmaps": entries}))
+    assert "lightmaps[0].file: expected a file within" in fails("lightmap", "evaluate", fitted, path)
+    assert "PSNR" in call("lightmap", "evaluate", fitted, path, "--trust")
+
+
 @pytest.mark.parametrize(
     ("words", "says"),
     [
@@ -220,7 +228,7 @@ def test_names_that_look_like_markup_are_shown_as_they_are(fitted, tmp_path):
         (["decode", "absent.wlm", "--time", "1", "-o", "{tmp}/f.exr"], "absent.wlm"),
         (["evaluate", "{fit}", "{set}", "--times", "1,2,3,4,5"], "time 0 is 1"),
         (["evaluate", "{fit}", "{set}", "--json", "{tmp}"], "ends in .json"),
-        (["info", "{tmp}"], "expected an artifact"),
+        (["info", "{tmp}"], "expected a file, found a folder"),
         (["info"], "Missing argument"),
         (["frobnicate"], "frobnicate"),
         ([], "Missing command"),

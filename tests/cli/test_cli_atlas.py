@@ -96,7 +96,7 @@ def test_wrong_words_are_one_line(inputs, tmp_path):
     assert "'none'" in fails(*words, "--profile", "none")
     assert "TEXCOORD_3" in fails(*words, "--uv-set", 3)
     assert "device 'tpu'" in fails(*words, "--device", "tpu")
-    assert "no such mask" in fails(*words, "--mask", tmp_path / "a.png")
+    assert "cannot read the mask" in fails(*words, "--mask", tmp_path / "a.png")
     assert "gone.glb" in fails("atlas", "compress", tmp_path / "gone.glb", inputs[1], *out)
     assert "gone.exr" in fails("atlas", "compress", inputs[0], tmp_path / "gone.exr", *out)
     assert "none does not exist" in fails("atlas", "compress", *inputs, "-o", tmp_path / "none" / "out")

@@ -475,7 +475,7 @@ def test_wrong_words_are_one_line(volume, frames, baked, tmp_path):
     assert "--step" in fails(*made, "--step", 0)
     assert "device 'tpu'" in fails(*made, "--device", "tpu")
     assert "ends in .exr" in fails("smoke", "bake", volume, "-o", tmp_path / "a.png")
-    assert "gone.npz: no such file" in fails("smoke", "bake", tmp_path / "gone.npz", "-o", out)
+    assert "gone.npz: cannot read the arrays: No such file" in fails("smoke", "bake", tmp_path / "gone.npz", "-o", out)
     assert "expected a name that ends in .npz or .nvdb" in fails("smoke", "bake", tmp_path / "a.vdb", "-o", out)
     shaded = ("smoke", "shade", volume, "-o", tmp_path / "a.png")
     assert "--light: expected three numbers" in fails(*shaded, "--light", "up")

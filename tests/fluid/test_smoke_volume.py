@@ -169,7 +169,7 @@ def test_wrong_files(tmp_path: Path):
     (tmp_path / "c.npy").rename(tmp_path / "c.npz")
     for name, message in (
         ("a.vdb", "expected a name that ends in .npz or .nvdb, found .vdb"),
-        ("a.npz", "no such file"),
+        ("a.npz", "No such file"),
         ("b.npz", "cannot read the arrays"),
         ("c.npz", "expected a .npz file of several arrays"),
     ):
@@ -180,6 +180,32 @@ def test_wrong_files(tmp_path: Path):
         ({"emission": -1.0}, "emission: expected"),
         ({"device": "cuda:99"}, "cuda:99"),
         ({"voxel": -1.0}, "voxel: expected a length above 0"),
+        ({"voxel": 1e-60}, "voxel: expected a length above 0 that float32 holds"),
+        ({"extinction": 1e308}, "extinction: expected a number above 0 that float32 holds"),
+        ({"extinction": float("nan")}, "extinction: expected"),
+        ({"emission": 1e39}, "emission: expected a number of at least 0 that float32 holds"),
+        ({"origin": (0.0, 0.0, 1e39)}, "origin: expected three numbers that float32 holds"),
     ):
         with pytest.raises(WlmError, match=message):
             from_array(np.ones((1, 1, 1)), **options)
+
+
+def test_emission_beyond_what_pictures_hold_is_lowered(device: str):
+    heat = np.ones((2, 3, 4), np.float32)
+    heat[1, 2, 3] = heat[0, 1, 2] = 1e30
+    volume = from_array(np.ones_like(heat), temperature=heat, emission=1e30, voxel=0.5, device=device)
+    light = volume.temperature.double().cpu() * volume.emission * volume.voxel
+    assert light.max() <= 65504 * (1 + 1e-6)
+    assert volume.warnings == (
+        "array: temperature: 24 voxels that each give off more than 65,504 are lowered to it, the first is (0, 0, 0)",
+    )
+    # Bright, but no brighter than a picture can be.
+    assert from_array(np.ones_like(heat), temperature=np.full_like(heat, 65504), voxel=0.999).warnings == ()
+    assert from_array(np.ones_like(heat), temperature=heat, emission=0.0).warnings == ()
+
+
+def test_a_temperature_beyond_half_beside_half_density_is_told():
+    heat = np.array([[[1.0, 1e5]]], np.float32)
+    volume = from_array(np.ones((1, 1, 2), np.float16), temperature=heat)
+    assert volume.temperature.tolist() == [[[1.0, 0.0]]]
+    assert volume.warnings == ("array: temperature: 1 NaN or infinite voxels count as 0, the first is (0, 0, 1)",)

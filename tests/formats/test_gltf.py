@@ -294,7 +294,7 @@ def test_an_index_beyond_the_vertices(tmp_path):
 @pytest.mark.parametrize(
     ("uri", "words"),
     [
-        ("gone.bin", "buffers[0].uri: cannot read"),
+        ("gone.bin", "gone.bin: cannot read buffers[0] of "),
         ("http://a.example/b.bin", "buffers[0].uri: expected a file relative to it, found http"),
         ("/b.bin", "buffers[0].uri: expected a file relative to it, found /b.bin"),
         ("data:;base64,?", "buffers[0].uri: expected base64"),
@@ -347,7 +347,7 @@ def test_damage_gives_no_traceback(tmp_path):
 def test_a_count_beyond_the_memory_is_one_line(tmp_path):
     maker = Maker()
     maker.content["accessors"][0] = {"componentType": 5126, "type": "VEC3", "count": 2**58}
-    assert "malformed glTF" in error_of(read_gltf, maker.save(tmp_path / "a.glb"))
+    assert "draws more than 4194304 corners" in error_of(read_gltf, maker.save(tmp_path / "a.glb"))
 
 
 def test_a_document_of_arrays():

@@ -88,7 +88,7 @@ def _document(folder: Path) -> GltfDocument:
         "buffers": [{"byteLength": len(blob), "uri": "a.bin"}],
     }
     (folder / "a.bin").write_bytes(blob)
-    (folder / "a b.png").write_bytes(b"a picture")
+    (folder / "a b.png").write_bytes(b"\x89PNG\r\n\x1a\n a picture")
     (folder / "in.gltf").write_text(json.dumps(content))
     return read_gltf(folder / "in.gltf")[0]
 
@@ -204,7 +204,11 @@ def test_skins_animations_and_images_find_their_data(tmp_path):
 
     images = content["images"]
     assert payload(images[0]) == b"\x89PNG, say"
-    assert payload(images[1]) == b"a picture" and images[1]["mimeType"] == "image/png" and "uri" not in images[1]
+    assert (
+        payload(images[1]) == b"\x89PNG\r\n\x1a\n a picture"
+        and images[1]["mimeType"] == "image/png"
+        and "uri" not in images[1]
+    )
     assert images[2] == {"uri": "gone.jpg"}
 
 

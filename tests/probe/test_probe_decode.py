@@ -7,6 +7,8 @@ from builders.probe_models import EXTENT, ORIGIN, SIZE, random_model
 from wlm.errors import WlmError
 from wlm.probe.decode import CULLINGS, Decoder
 from wlm.probe.exact import decode64
+from wlm.probe.model import check_outputs
+from wlm_kernels.probe.network import most_outputs, probes_at_once
 
 RANDOM = np.random.default_rng(11)
 
@@ -109,3 +111,24 @@ def test_wrong_positions():
 def test_it_says_what_memory_it_takes():
     model = random_model()
     assert Decoder(model).device_bytes > 4 * (40 * 19 + len(model.net))
+
+
+def test_more_numbers_than_a_block_of_cuda_threads_can_hold():
+    model = random_model(outputs=1501, count=3)
+    position = points(20, model)
+    close(model.decoder("cpu").decode(position), model, position)
+    most = most_outputs(model.profile.latent, model.profile.hidden)
+    check_outputs("x", model.profile, most, "cuda:0")
+    with pytest.raises(WlmError, match=f"expected at most {most} numbers a probe on CUDA with latent .* found 1501"):
+        check_outputs("x", model.profile, 1501, "cuda:0")
+
+
+@pytest.mark.parametrize(("latent", "hidden"), [(1, 8), (9, 64), (32, 128)])
+def test_the_most_outputs_are_those_that_still_fit(latent, hidden):
+    most = most_outputs(latent, hidden)
+    assert most % 4 == 0 and probes_at_once(latent, hidden, most) == 4
+
+    def shared_bytes(outputs: int) -> int:
+        return (latent + 3 + 2 * hidden + outputs) * (4 + 4) * 4
+
+    assert shared_bytes(most) <= 47 * 1024 < shared_bytes(most + 4)

@@ -196,12 +196,6 @@ def test_a_probe_that_outshines_the_others_is_said():
     assert evaluate(compress(probes, SMALL, steps=200), probes).warnings == []
 
 
-def test_more_numbers_a_probe_than_a_network_has_outputs():
-    wide = from_arrays(RANDOM.random((3, 3)), RANDOM.normal(size=(3, 1025)).astype(np.float32))
-    with pytest.raises(WlmError, match="expected at most 134217728 probes of 1024 numbers, found 3 of 1025"):
-        compress(wide, SMALL)
-
-
 def test_a_fit_that_diverged_keeps_no_state():
     trainer = Trainer(*_input(synthetic(60)), SMALL, 0, "cpu")
     trainer._tensors["net"][5] = np.nan

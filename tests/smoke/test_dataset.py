@@ -381,7 +381,7 @@ def test_pool_of_a_volume(tmp_path, device: str):
     np.savez(tmp_path / "none.npz", density=np.zeros((4, 4, 4)))
     with pytest.raises(WlmError, match=r"none.npz: density: expected smoke"):
         pool_of_volume(tmp_path / "none.npz", FEW, device=device)
-    with pytest.raises(WlmError, match="no such file"):
+    with pytest.raises(WlmError, match="No such file"):
         pool_of_volume(tmp_path / "missing.npz", FEW, device=device)
 
 

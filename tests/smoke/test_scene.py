@@ -93,7 +93,10 @@ def test_scaling_keeps_one_cell(tmp_path):
     [
         ({"grid": {"cells": [4, 4], "cell": 0.1}}, "grid.cells"),
         ({"grid": {"cells": [4, 4, 0], "cell": 0.1}}, "grid.cells.2: expected greater than or equal to 1, got 0"),
-        ({"grid": {"cells": [4, 4, 4], "cell": -1}}, "grid.cell: expected greater than 0, got -1"),
+        (
+            {"grid": {"cells": [4, 4, 4], "cell": -1}},
+            "grid.cell: expected greater than or equal to 0.000000001, got -1",
+        ),
         ({"grid": {"cells": [4, 4, 4], "cell": 1, "faces": {"up": "wall"}}}, "grid.faces.up"),
         ({"grid": {"cells": [4, 4, 4], "cell": 1, "faces": {"-x": "periodic"}}}, "both faces of an axis"),
         ({"smoke": {"extinction": 0}}, "smoke.extinction: expected greater than 0"),

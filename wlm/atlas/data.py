@@ -14,6 +14,7 @@ a UV outside [0, 1]                   clamped to it, as a lightmap is read clamp
 triangles without area, in space or   kept, but not `active`: they take no part; warning
 in UV
 no triangle with area                 error
+UVs of less than a texel in all       warning
 overlapping UVs, a mesh drawn twice   fine: what shares texels is lit alike; warning
 NaN, Inf inside                       the texel takes the value of the nearest finite one inside; warning
 no finite texel inside                error
@@ -111,6 +112,7 @@ def load(
     *,
     mask_path: str | os.PathLike[str] | None = None,
     uv_set: int | None = None,
+    trust: bool = False,
 ) -> LightmappedMesh:
     """Reads a mesh (`.glb`, `.gltf`, `.obj`) and its lightmap (EXR).
 
@@ -121,6 +123,8 @@ def load(
             derives it from the triangles.
         uv_set: n of `TEXCOORD_n`, the lightmap's UVs. None takes 1, where engines and viewers look for them, if any
             primitive has it, else 0. An `.obj` has only 0.
+        trust: Whether a glTF file may name files outside its folder, and draw more than its bytes account for
+            (`wlm.formats.limits`).
 
     Returns:
         The mesh, repaired as the module's table says.
@@ -142,7 +146,7 @@ def load(
         document, primitive = _document(str(path), path.stem, arrays.position, arrays.triangle, arrays.uv)
         primitives = [primitive]
     else:
-        document, primitives = read_gltf(path)
+        document, primitives = read_gltf(path, trust)
     lightmap, _ = read_exr(lightmap_path)
     lightmap = np.array(lightmap[..., :3], np.float32, order="C")
     mask = None if mask_path is None else read_mask(Path(mask_path), lightmap_path, lightmap.shape[:2])
@@ -286,6 +290,12 @@ def _check(
         warnings.append(f"{name}: {_count(flat, 'triangle')} without area in space or in UV: left out")
 
     height, width = lightmap.shape[:2]
+    texels = _uv_area(uv, triangle[active]) * height * width
+    if texels < 1.0:
+        warnings.append(
+            f"{name}: all triangles together have {texels:.2g} texels of {width} x {height} in TEXCOORD_{uv_set}: are "
+            "its UVs in [0, 1]?"
+        )
     coverage = covered_texels(uv, triangle[active], height, width)
     overlaps = np.count_nonzero(coverage > 1)
     if overlaps:
@@ -361,6 +371,12 @@ def _has_area(point: np.ndarray, triangle: np.ndarray) -> np.ndarray:
     else:
         twice_area = np.linalg.norm(np.cross(ab, ac), axis=1)
     return twice_area > 2 * _FLAT
+
+
+def _uv_area(uv: np.ndarray, triangle: np.ndarray) -> float:
+    """Sum of the triangles' areas in UV."""
+    ab, ac = uv[triangle[:, 1]] - uv[triangle[:, 0]], uv[triangle[:, 2]] - uv[triangle[:, 0]]
+    return 0.5 * float(np.abs(ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0]).sum())
 
 
 def _count(number: int, singular: str, plural: str | None = None) -> str:

@@ -188,12 +188,14 @@ def read_inputs(
     mesh_path: str | os.PathLike[str] | None = None,
     lightmap_path: str | os.PathLike[str] | None = None,
     mask_path: str | os.PathLike[str] | None = None,
+    trust: bool = False,
 ) -> LightmappedMesh:
     """Reads the mesh and lightmap that were compressed.
 
     Args:
         output: The folder; its report names them ("inputs").
         mesh_path, lightmap_path, mask_path: Where they are now; None: where they were.
+        trust: As for `load`.
 
     Raises:
         WlmError: A path isn't known, a file is missing or damaged, or it isn't what was compressed. The line names
@@ -208,7 +210,8 @@ def read_inputs(
             raise WlmError(f"{output.folder / REPORT_FILE}: inputs.{name}: expected a path, found none; give --{name}")
         if not paths[name].is_file():
             raise WlmError(f"{paths[name]}: no such {name}; if it has moved, give --{name}")
-    mesh = load(paths["mesh"], paths["lightmap"], mask_path=paths.get("mask"), uv_set=output.report.get("uv_set"))
+    options = {"mask_path": paths.get("mask"), "uv_set": output.report.get("uv_set"), "trust": trust}
+    mesh = load(paths["mesh"], paths["lightmap"], **options)
     if mesh.source != output.model.source:
         names = ", ".join(map(str, paths.values()))
         raise WlmError(

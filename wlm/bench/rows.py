@@ -23,6 +23,7 @@ from wlm.bench.figures import FIGURES
 from wlm.bench.timing import Timing
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_write
+from wlm.formats.reading import read_json_file
 
 MEAN = "mean over"
 """How the scene of a row begins that has means over several scenes."""
@@ -181,11 +182,7 @@ def read_runs(path: str | Path) -> list[Run]:
         WlmError: The file can't be read, is no result file of this version, or a row has an unknown, missing or
             mistyped field or figure; the message names it.
     """
-    path = Path(path)
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise WlmError(f"{path}: can't read the results: {error}") from error
+    document = read_json_file(path, "the results")
     if not isinstance(document, dict) or document.get("format") != _FORMAT:
         raise WlmError(f"{path}: not a result file, expected format {_FORMAT!r}")
     if document.get("version") != _VERSION:

@@ -18,7 +18,7 @@ from wlm.cli.console import (
     table,
     write_json,
 )
-from wlm.cli.options import AsJson, CheckpointEvery, Device, PageFile, ReportFile, Resume, Seed, output_option
+from wlm.cli.options import AsJson, CheckpointEvery, Device, PageFile, ReportFile, Resume, Seed, Trust, output_option
 from wlm.errors import WlmError
 
 app = typer.Typer(help="The lightmap of a mesh: a small colour texture, read through a small table.")
@@ -53,6 +53,7 @@ def compress(
     device: Device = "cpu",
     resume: Resume = False,
     checkpoint_every: CheckpointEvery = 30.0,
+    trust: Trust = False,
 ) -> None:
     """Compress the lightmap of a mesh into a folder: the model, the mesh, textures for engines, a shader, a report.
 
@@ -72,7 +73,7 @@ def compress(
 
     device = check_device(device)
     claim(output, REPORT_FILE, FORMAT)
-    mesh = load(mesh_path, lightmap_path, mask_path=mask, uv_set=uv_set)
+    mesh = load(mesh_path, lightmap_path, mask_path=mask, uv_set=uv_set, trust=trust)
     for warning in mesh.warnings:
         note(f"warning: {warning}")
     options = {"seed": seed, "device": device}
@@ -109,6 +110,7 @@ def evaluate(
     lightmap: Annotated[Path | None, typer.Option(help="The lightmap; default where it was.")] = None,
     mask: Annotated[Path | None, typer.Option(help="The mask; default where it was, if there was one.")] = None,
     device: Device = "cpu",
+    trust: Trust = False,
 ) -> None:
     """Compare with the original lightmap on views of the mesh, beside a smaller lightmap of equal bits."""
     if json_path is not None:
@@ -122,7 +124,7 @@ def evaluate(
     from wlm.interop import check_device
 
     output = read_folder(folder)
-    original = read_inputs(output, mesh, lightmap, mask)
+    original = read_inputs(output, mesh, lightmap, mask, trust)
     device = check_device(device)
     options = {"views": views, "resolution": resolution, "device": device}
     with running("evaluate") as progress:

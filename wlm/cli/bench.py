@@ -1,13 +1,12 @@
 """`wlm bench`: speed against error, ours and the baselines."""
 
 import shlex
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from wlm.cli.console import check_output, note, quiet_warp
+from wlm.cli.console import check_output, note, quiet_warp, show_text
 from wlm.cli.options import Device, output_option
 from wlm.errors import WlmError
 
@@ -247,7 +246,7 @@ def report(
     from wlm.bench import pages
 
     if output is None:
-        sys.stdout.write("\n".join(pages(files).values()))
+        show_text("\n".join(pages(files).values()))
         return
     check_output(output, ".md")
     from wlm.formats.atomic import atomic_write
@@ -317,7 +316,7 @@ def _finish(
         write_json(json_path, rows, describe_environment(device, command))
     if plot_path is not None:
         plot(rows if plotted is None else plotted, plot_path, panels)
-    sys.stdout.write(tables(rows))
+    show_text(tables(rows))
     if baseline is not None:
         _compare(rows, device, baseline)
 

@@ -19,7 +19,7 @@ from rich.progress import Progress as Bar
 from rich.table import Table
 
 from wlm.cli.signals import deferred_interrupt
-from wlm.errors import WlmError
+from wlm.errors import WlmError, printable
 from wlm.formats.lock import locked
 
 if TYPE_CHECKING:
@@ -37,6 +37,7 @@ __all__ = [
     "show",
     "show_figures",
     "show_json",
+    "show_text",
     "table",
     "write_json",
 ]
@@ -53,9 +54,16 @@ def _console(stderr: bool = False) -> Console:
     return console if console.is_terminal else Console(stderr=stderr, highlight=False, width=_PLAIN_WIDTH)
 
 
+class _Table(Table):
+    """A table whose cells can't obey a terminal: names come from files."""
+
+    def add_row(self, *cells: Any, **options: Any) -> None:
+        super().add_row(*(printable(cell) if isinstance(cell, str) else cell for cell in cells), **options)
+
+
 def table(title: str, columns: Sequence[str], text: Sequence[str] = ()) -> Table:
     """Starts a table: the first column and those named in `text` hold text, the others numbers."""
-    rows = Table(title=title, header_style="bold")
+    rows = _Table(title=title, header_style="bold")
     for i, heading in enumerate(columns):
         rows.add_column(heading, justify="right" if i and heading not in text else "left", overflow="fold")
     return rows
@@ -65,7 +73,7 @@ def show(content: Table) -> None:
     """Prints a table to stdout, its title in a line above it, which wraps at no width but the terminal's."""
     # Rich would wrap it at the width of the columns.
     title, content.title = content.title, None
-    _console().print(title, style="bold", markup=False, soft_wrap=True)
+    _console().print(printable(str(title)), style="bold", markup=False, soft_wrap=True)
     _console().print(content)
 
 
@@ -92,7 +100,12 @@ def _figure(value: str | float) -> str:
 
 def note(text: str) -> None:
     """Prints a line to stderr, as it is: paths may hold what rich takes for markup."""
-    _console(stderr=True).print(text, markup=False, soft_wrap=True)
+    _console(stderr=True).print(printable(text), markup=False, soft_wrap=True)
+
+
+def show_text(text: str) -> None:
+    """Prints lines to stdout as they are, unwrapped and uncoloured, but for what a terminal would obey."""
+    sys.stdout.write("\n".join(map(printable, text.split("\n"))))
 
 
 def number(value: float | None, form: str) -> str:

@@ -28,6 +28,7 @@ from wlm.cli.options import (
     ReportFile,
     Resume,
     Seed,
+    Trust,
     output_option,
 )
 
@@ -64,6 +65,7 @@ def compress(
     times: _Times = None,
     mask: _Mask = None,
     period: _Period = None,
+    trust: Trust = False,
 ) -> None:
     """Compress a lightmap set into one file.
 
@@ -80,7 +82,7 @@ def compress(
 
     settings = Profile.load(profile).override({"steps": steps, "samples": samples}, "--")
     device = check_device(device)
-    lightmaps = _load(set_path, times, mask, period)
+    lightmaps = _load(set_path, times, mask, period, trust)
     numbers = None if tiles is None else parse_tiles(tiles, TileGrid.of(*lightmaps.mask.shape).count)
     options = {"tiles": numbers, "seed": seed, "device": device}
     checkpoint = open_checkpoint(output, lightmaps, settings, resume=resume, every=checkpoint_every, **options)
@@ -150,6 +152,7 @@ def evaluate(
     times: _Times = None,
     mask: _Mask = None,
     period: _Period = None,
+    trust: Trust = False,
 ) -> None:
     """Compare every stored time with the input: PSNR, SSIM and FLIP by tile and by time, and bits per texel."""
     if json_path is not None:
@@ -163,7 +166,7 @@ def evaluate(
 
     device = check_device(device)
     model = load(file, "lightmap")
-    lightmaps = _load(set_path, times, mask, period)
+    lightmaps = _load(set_path, times, mask, period, trust)
     with running("score") as progress:
         report = evaluate(model, lightmaps, device=device, progress=progress, file_bytes=file.stat().st_size)
     if html_path is not None:
@@ -255,11 +258,12 @@ def export(
     show(rows)
 
 
-def _load(path: Path, times: str | None, mask: str | None, period: float | None) -> "LightmapSet":
+def _load(path: Path, times: str | None, mask: str | None, period: float | None, trust: bool) -> "LightmapSet":
     """Reads a set and prints what was repaired in it."""
     from wlm.lightmap.data import load, parse_times
 
-    lightmaps = load(path, times=None if times is None else parse_times(times), mask=mask, period=period)
+    stamps = None if times is None else parse_times(times)
+    lightmaps = load(path, times=stamps, mask=mask, period=period, trust=trust)
     for warning in lightmaps.warnings:
         note(f"warning: {warning}")
     return lightmaps

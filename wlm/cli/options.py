@@ -22,6 +22,10 @@ PageFile = Annotated[
     Path | None, typer.Option("--html", metavar="REPORT.html", help="Write a page with tables, plots and pictures.")
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")]
+Trust = Annotated[
+    bool,
+    typer.Option("--trust", help="Trust the input's author: it may name files elsewhere, and be as large as it says."),
+]
 ModelFile = Annotated[Path, typer.Argument(metavar="FILE.wlm", help="A file that compress wrote.")]
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from wlm.cli.console import check_output, escape, note, number, running, show, table
-from wlm.cli.options import Device
+from wlm.cli.options import Device, Trust
 from wlm.errors import WlmError
 
 if TYPE_CHECKING:
@@ -46,11 +46,13 @@ class SmokeOptions:
     emission: Annotated[float | None, typer.Option(help="Per length of temperature 1; default the scene's, or 1.")] = (
         None
     )
+    trust: Trust = False
     device: Device = "cpu"
 
     def given(self) -> dict[str, Any]:
-        """The options that differ from their defaults, but for the device."""
-        values = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "device"}
+        """The options that differ from their defaults, but for those of any input."""
+        names = [field.name for field in fields(self) if field.name not in ("device", "trust")]
+        values = {name: getattr(self, name) for name in names}
         return {name: value for name, value in values.items() if value != getattr(SmokeOptions, name)}
 
     def open(self, smoke: Path) -> "Frames":
@@ -59,7 +61,8 @@ class SmokeOptions:
         from wlm.smoke.data import load_frames
 
         device = check_device(self.device)
-        return load_frames(smoke, extinction=self.extinction, emission=self.emission, device=device)
+        options = {"extinction": self.extinction, "emission": self.emission, "trust": self.trust}
+        return load_frames(smoke, **options, device=device)
 
     def camera(self, frames: "Frames", *, orthographic: bool = True, perspective: bool = False) -> "CameraSettings":
         """The scene's camera, or the default one, changed by the options.

@@ -18,13 +18,13 @@ import os
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from wlm.errors import WlmError, one_line
 from wlm.formats.atomic import atomic_write
+from wlm.formats.reading import open_file
 
 FORMAT_VERSION = 1
 
@@ -222,16 +222,11 @@ def _little_endian(name: str, array: np.ndarray) -> np.ndarray:
 
 
 def _map(path: str | os.PathLike[str]) -> mmap.mmap | bytes:
-    try:
-        if Path(path).exists() and not Path(path).is_file():
-            raise WlmError(f"{path}: expected an artifact, found a folder or a device")
-        with open(path, "rb") as file:
-            # An empty file can't be mapped.
-            if os.fstat(file.fileno()).st_size == 0:
-                return b""
-            return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-    except OSError as error:
-        raise WlmError(f"{path}: cannot read the artifact: {error.strerror or error}") from error
+    with open_file(path, "the artifact") as file:
+        # An empty file can't be mapped.
+        if os.fstat(file.fileno()).st_size == 0:
+            return b""
+        return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
 
 
 def _parse_json(path: str | os.PathLike[str], text: bytes | str, what: str) -> dict[str, Any]:

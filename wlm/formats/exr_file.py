@@ -14,8 +14,11 @@ import OpenEXR
 
 from wlm.errors import WlmError, one_line
 from wlm.formats.atomic import atomic_path
+from wlm.formats.limits import PICTURE_BYTES, PICTURE_GROWTH, PICTURE_SIDE, PICTURE_TEXELS, check_growth
+from wlm.formats.reading import open_file
 
 _MAGIC = b"\x76\x2f\x31\x01"
+_SAMPLE_BYTES = 2  # of a half: the header as the library gives it doesn't tell halves from floats
 _STDERR = 2
 _STDERR_LOCK = threading.Lock()
 
@@ -29,8 +32,8 @@ def read_part(path: str | os.PathLike[str]) -> OpenEXR.Part:
     Raises:
         WlmError: The file is missing, not an EXR, cut short or damaged, of several parts or deep.
     """
-    _check_magic(path)
-    file, complaints = _open(path)
+    size = _check_magic(path)
+    file, complaints = _open(path, size)
     parts = file.parts if file is not None else []
     if not parts:
         raise WlmError(f"{path}: the EXR file is cut short or damaged: {complaints or 'no pixels found'}")
@@ -76,24 +79,37 @@ def write_part(
             raise WlmError(f"{path}: cannot write: {reason}; is the disk full?") from error
 
 
-def _check_magic(path: str | os.PathLike[str]) -> None:
-    try:
-        # A FIFO would block and a device has no end.
-        if Path(path).exists() and not Path(path).is_file():
-            raise WlmError(f"{path}: expected an EXR file, found a folder or a device")
-        with open(path, "rb") as file:
-            magic = file.read(len(_MAGIC))
-    except OSError as error:
-        raise WlmError(f"{path}: cannot read the EXR file: {error.strerror or error}") from error
+def _check_magic(path: str | os.PathLike[str]) -> int:
+    """Checks that it is an EXR file; gives its size in bytes."""
+    with open_file(path, "the EXR file") as file:
+        magic, size = file.read(len(_MAGIC)), os.fstat(file.fileno()).st_size
     if magic != _MAGIC:
         raise WlmError(f"{path}: expected an EXR file, found other content")
+    return size
 
 
-def _open(path: str | os.PathLike[str]) -> tuple["OpenEXR.File | None", str]:
+def _check_size(path: str | os.PathLike[str], held: int, parts: list[OpenEXR.Part]) -> None:
+    """Says where a file of so many bytes claims more pixels than it may have, or than it can hold."""
+    total = 0
+    for part in parts:
+        first, last = (np.asarray(corner).tolist() for corner in part.header["dataWindow"])
+        width, height = (end - begin + 1 for begin, end in zip(first, last, strict=True))
+        if max(width, height) > PICTURE_SIDE or width * height > PICTURE_TEXELS:
+            raise WlmError(
+                f"{path}: expected at most {PICTURE_TEXELS} texels, {PICTURE_SIDE} along a side, "
+                f"found {width} x {height}"
+            )
+        total += width * height * _SAMPLE_BYTES * len(part.header["channels"])
+    check_growth(str(path), held, total, PICTURE_GROWTH, PICTURE_BYTES)
+
+
+def _open(path: str | os.PathLike[str], size: int) -> tuple["OpenEXR.File | None", str]:
     """Opens a file; gives None or a file without parts where that failed, and what the library said."""
     with _captured_chatter() as chatter:
         try:
             # Separate channels: joined, `RGB` and `RGBA` would differ in name and layered files would be odd.
+            # The header first: the library makes room for all that it claims before it reads a pixel.
+            _check_size(path, size, OpenEXR.File(str(path), separate_channels=True, header_only=True).parts)
             file = OpenEXR.File(str(path), separate_channels=True)
         except (RuntimeError, ValueError, MemoryError) as error:
             return None, chatter.text or one_line(error)

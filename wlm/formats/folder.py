@@ -17,6 +17,7 @@ import numpy as np
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_write, sync_folder
 from wlm.formats.lock import is_passing, locked, temporary
+from wlm.formats.reading import read_json_file
 
 UNFINISHED = "unfinished"
 """Key of an index that stands in while files are being moved in."""
@@ -110,8 +111,8 @@ def _move(made: Path, folder: Path, index: str, format_name: str, ours: Callable
 def read_index(path: Path) -> dict[str, Any]:
     """Reads an index; empty where there is none or it isn't a JSON object."""
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        content = read_json_file(path, "the index")
+    except WlmError:
         content = None
     return content if isinstance(content, dict) else {}
 

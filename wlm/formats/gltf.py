@@ -17,30 +17,30 @@ a node that mirrors                   vertices keep the file's order: such trian
 skins, morph targets, animations      left out: the mesh is given at rest, under its node's transform
 nodes outside the scene               left out; kept in copies
 external `.bin`, `data:` URIs         read; in copies all in the one `.glb`
-external images                       in copies inside the `.glb`; one that is missing keeps its URI
+external images                       in copies inside the `.glb`; one that is missing or isn't PNG, JPEG,
+                                      WebP, KTX2 or DDS keeps its URI
+a buffer outside the file's folder    error, unless the file is trusted; such an image keeps its URI
+more corners and vertices than        error, unless the file is trusted (`wlm.formats.limits`)
+`limits` allow
 Draco, meshopt, GPU instances         error that names the extension
 a file missing or damaged             error that names the file, and the field
 ====================================  ================================================================
 """
 
-import base64
-import binascii
 import json
 import os
 import re
-import struct
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
-from urllib.parse import unquote, unquote_to_bytes
 
 import numpy as np
 
 from wlm.errors import WlmError
+from wlm.formats.gltf_container import MAGIC, load_buffers, split_glb
+from wlm.formats.limits import CORNERS, CORNERS_A_BYTE, JSON_BYTES, MESH_BYTES, SURE_CORNERS
+from wlm.formats.reading import read_file
 
-MAGIC = b"glTF"
-JSON_CHUNK, BINARY_CHUNK = 0x4E4F534A, 0x004E4942
 TRIANGLES, STRIP, FAN = 4, 5, 6
 
 COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
@@ -48,8 +48,9 @@ COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 512
 
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 _MATRIX_SIDES = {"MAT2": 2, "MAT3": 3, "MAT4": 4}
+_LONGEST_STRIDE = 252  # bytes
+_OVERHEAD = 256  # corners that take about as long as a primitive without any
 _UV_NAME = re.compile(r"TEXCOORD_(0|[1-9]\d{0,3})")
-_URI_SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:")
 _REFUSED = {
     "KHR_draco_mesh_compression": "decompress the mesh first",
     "EXT_meshopt_compression": "decompress the mesh first",
@@ -66,11 +67,15 @@ class GltfDocument:
         path: Its name, for messages and for what it refers to.
         content: The JSON tree; not to be changed.
         buffers: The bytes of each of its buffers.
+        trust: Whether it may name files outside its folder, and draw more than its bytes account for.
+        most: Corners and vertices that it may draw, and elements that an accessor without data may have.
     """
 
     path: str
     content: dict
     buffers: tuple[bytes, ...]
+    trust: bool = False
+    most: int = CORNERS
 
     def item(self, kind: str, number: object) -> dict:
         """Gives an entry of one of the tree's lists, `accessors` for example.
@@ -109,11 +114,12 @@ class GltfPrimitive:
     row: np.ndarray
 
 
-def read_gltf(path: str | os.PathLike[str]) -> tuple[GltfDocument, list[GltfPrimitive]]:
+def read_gltf(path: str | os.PathLike[str], trust: bool = False) -> tuple[GltfDocument, list[GltfPrimitive]]:
     """Reads a `.glb` or `.gltf` file; its first bytes tell which it is.
 
     Args:
         path: The file.
+        trust: As in `GltfDocument`.
 
     Returns:
         The document, and the primitives with triangles that its scene draws (the default scene, else the first,
@@ -122,12 +128,11 @@ def read_gltf(path: str | os.PathLike[str]) -> tuple[GltfDocument, list[GltfPrim
     Raises:
         WlmError: One line that names the file and the field, for each error of the module's table.
     """
-    try:
-        data = Path(path).read_bytes()
-    except OSError as error:
-        raise WlmError(f"{path}: cannot read the glTF file: {error.strerror or error}") from error
+    data = read_file(path, MESH_BYTES, "the glTF file")
     with reported(path):
-        text, binary = _split_glb(path, data) if data[:4] == MAGIC else (data, None)
+        text, binary = split_glb(path, data) if data[:4] == MAGIC else (data, None)
+        if len(text) > JSON_BYTES:
+            raise WlmError(f"{path}: expected at most {JSON_BYTES} bytes of JSON, found {len(text)}")
         content = json.loads(text.decode("utf-8-sig"))
         if not isinstance(content, dict) or not isinstance(content.get("asset"), dict):
             raise WlmError(f"{path}: expected a glTF file, found other content")
@@ -137,8 +142,10 @@ def read_gltf(path: str | os.PathLike[str]) -> tuple[GltfDocument, list[GltfPrim
         for name in (*content.get("extensionsUsed", []), *content.get("extensionsRequired", [])):
             if name in _REFUSED:
                 raise WlmError(f"{path}: uses the extension {name}, which is not read here: {_REFUSED[name]}")
-        buffers = [_load_buffer(path, i, each, binary) for i, each in enumerate(content.get("buffers", []))]
-        document = GltfDocument(str(path), content, tuple(buffers))
+        buffers = load_buffers(path, content.get("buffers", []), binary, trust)
+        held = len(text) + sum(map(len, buffers))
+        most = CORNERS if trust else min(CORNERS, max(SURE_CORNERS, CORNERS_A_BYTE * held))
+        document = GltfDocument(str(path), content, buffers, trust, most)
         for i, view in enumerate(content.get("bufferViews", [])):
             _check_view(document, i, view)
         return document, _read_primitives(document)
@@ -214,12 +221,16 @@ def elements(document: GltfDocument, number: int) -> np.ndarray:
         size = -(-size * _MATRIX_SIDES[kind] // 4) * 4 * _MATRIX_SIDES[kind]
     if "bufferView" in accessor:
         rows = _rows(document, where, accessor, count, size, strided=True)
+    elif count > document.most:
+        raise WlmError(f"{where}: count: expected at most {document.most} without a bufferView, found {count}")
     else:
         rows = np.zeros((count, size), np.uint8)
     if "sparse" in accessor:
         sparse = accessor["sparse"]
         places = sparse["indices"]
         wide = np.dtype(COMPONENTS[places["componentType"]])
+        if wide.kind != "u":
+            raise WlmError(f"{where}.sparse.indices: expected unsigned integers, found {wide}")
         at = _rows(document, f"{where}.sparse.indices", places, sparse["count"], wide.itemsize)
         at = np.ascontiguousarray(at).view(wide)[:, 0]
         if at.max() >= count:
@@ -249,14 +260,6 @@ def components(document: GltfDocument, number: int, kind: str) -> np.ndarray:
     return np.ascontiguousarray(elements(document, number)).view(COMPONENTS[accessor["componentType"]])
 
 
-def local_file(document_path: str, uri: str) -> Path | None:
-    """Gives the file that a URI names relative to the document; None for one with a scheme or an absolute path."""
-    name = unquote(uri)
-    if _URI_SCHEME.match(uri) or Path(name).is_absolute():
-        return None
-    return Path(document_path).parent / name
-
-
 @contextmanager
 def reported(path: str | os.PathLike[str]) -> Iterator[None]:
     """Turns what Python raises on a malformed tree into one line."""
@@ -268,58 +271,6 @@ def reported(path: str | os.PathLike[str]) -> Iterator[None]:
         raise WlmError(f"{path}: malformed glTF: {error}") from error
     except MemoryError as error:
         raise WlmError(f"{path}: malformed glTF: a count too large for the memory") from error
-
-
-def _split_glb(path: str | os.PathLike[str], data: bytes) -> tuple[bytes, bytes | None]:
-    """Gives the JSON and the binary chunk of a `.glb`."""
-    if len(data) < 12:
-        raise WlmError(f"{path}: the file is cut short: expected a header of 12 bytes, found {len(data)}")
-    version, length = struct.unpack_from("<2I", data, 4)
-    if version != 2:
-        raise WlmError(f"{path}: expected version 2 of the .glb format, found {version}")
-    if length > len(data):
-        raise WlmError(f"{path}: the file is cut short: expected {length} bytes, found {len(data)}")
-    chunks: dict[int, bytes] = {}
-    at = 12
-    while at + 8 <= length:
-        size, kind = struct.unpack_from("<2I", data, at)
-        if at + 8 + size > length:
-            raise WlmError(f"{path}: a chunk at byte {at} of {size} bytes goes beyond the file's {length}")
-        chunks.setdefault(kind, data[at + 8 : at + 8 + size])
-        at += 8 + size
-    if JSON_CHUNK not in chunks:
-        raise WlmError(f"{path}: the .glb file has no JSON chunk")
-    return chunks[JSON_CHUNK], chunks.get(BINARY_CHUNK)
-
-
-def _load_buffer(path: str | os.PathLike[str], number: int, buffer: dict, binary: bytes | None) -> bytes:
-    uri, length = buffer.get("uri"), buffer["byteLength"]
-    where = f"{path}: buffers[{number}]"
-    if uri is None:
-        if number or binary is None:
-            raise WlmError(f"{where}: has no uri, and the file no binary chunk for it")
-        data = binary
-    elif uri.startswith("data:"):
-        head, comma, body = uri.partition(",")
-        if not comma:
-            raise WlmError(f"{where}.uri: expected data: with a comma before its content")
-        data = unquote_to_bytes(body)
-        if head.endswith(";base64"):
-            try:
-                data = base64.b64decode(data, validate=True)
-            except binascii.Error as error:
-                raise WlmError(f"{where}.uri: expected base64: {error}") from error
-    else:
-        file = local_file(str(path), uri)
-        if file is None:
-            raise WlmError(f"{where}.uri: expected a file relative to it, found {uri}")
-        try:
-            data = file.read_bytes()
-        except OSError as error:
-            raise WlmError(f"{where}.uri: cannot read {file}: {error.strerror or error}") from error
-    if len(data) < length:
-        raise WlmError(f"{where}: expected {length} bytes, found {len(data)}")
-    return data
 
 
 def _check_view(document: GltfDocument, number: int, view: dict) -> None:
@@ -338,8 +289,10 @@ def _rows(document: GltfDocument, where: str, place: dict, count: int, size: int
     view = document.item("bufferViews", place["bufferView"])
     offset, length = place.get("byteOffset", 0), view["byteLength"]
     stride = view.get("byteStride", size) if strided else size
-    if not all(isinstance(each, int) and each >= least for each, least in ((count, 1), (offset, 0), (stride, 0))):
-        raise WlmError(f"{where}: expected whole numbers of 0 or more as count, byteOffset and byteStride")
+    if not all(isinstance(each, int) and each >= least for each, least in ((count, 1), (offset, 0), (stride, 1))):
+        raise WlmError(f"{where}: expected whole numbers as count, byteOffset and byteStride")
+    if stride != size and not (size <= stride <= _LONGEST_STRIDE and stride % 4 == 0):
+        raise WlmError(f"{where}: byteStride: expected a multiple of 4, {size} to {_LONGEST_STRIDE}, found {stride}")
     needed = offset + (count - 1) * stride + size
     if needed > length:
         raise WlmError(f"{where}: needs {needed} bytes of bufferViews[{place['bufferView']}], which has {length}")
@@ -351,9 +304,20 @@ def _rows(document: GltfDocument, where: str, place: dict, count: int, size: int
 def _read_primitives(document: GltfDocument) -> list[GltfPrimitive]:
     primitives = []
     cache: dict[tuple[int, str], np.ndarray] = {}  # primitives often share their accessors
+    drawn = 0
+
+    def spend(count: int) -> None:
+        nonlocal drawn
+        drawn += count
+        if drawn > document.most:
+            raise WlmError(
+                f"{document.path}: draws more than {document.most} corners and vertices, which is more than its data "
+                "accounts for; trust=True (--trust of compress and evaluate) allows it, where the author is trusted"
+            )
 
     def floats(number: int, kind: str) -> np.ndarray:
         if (number, kind) not in cache:
+            spend(_count(document, number))
             cache[number, kind] = _floats(document, number, kind)
         return cache[number, kind]
 
@@ -368,6 +332,9 @@ def _read_primitives(document: GltfDocument) -> list[GltfPrimitive]:
                 continue
             local = floats(attributes["POSITION"], "VEC3")
             where = f"{document.path}: meshes[{mesh_number}].primitives[{i}]"
+            # Of strips and fans three for each index; each attribute is gathered in copies.
+            corners = _count(document, primitive["indices"]) if "indices" in primitive else len(local)
+            spend(corners * (1 if mode == TRIANGLES else 3) + min(corners, len(local)) * len(attributes) + _OVERHEAD)
             triangle = _triangles(_corners(document, where, primitive, len(local)), mode, where)
             if not len(triangle):
                 continue
@@ -392,6 +359,12 @@ def _read_primitives(document: GltfDocument) -> list[GltfPrimitive]:
                 )
             )
     return primitives
+
+
+def _count(document: GltfDocument, number: int) -> int:
+    """Elements that an accessor states; 0 where it states none, which is told when it is read."""
+    count = document.item("accessors", number).get("count")
+    return count if isinstance(count, int) else 0
 
 
 def _floats(document: GltfDocument, number: int, kind: str) -> np.ndarray:

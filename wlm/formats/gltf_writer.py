@@ -4,6 +4,7 @@ import copy
 import hashlib
 import json
 import os
+import re
 import struct
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -13,29 +14,21 @@ import numpy as np
 
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_write
-from wlm.formats.gltf import (
-    BINARY_CHUNK,
-    COMPONENTS,
-    JSON_CHUNK,
-    MAGIC,
-    TRIANGLES,
-    GltfDocument,
-    GltfPrimitive,
-    elements,
-    local_file,
-    reported,
-)
+from wlm.formats.gltf import COMPONENTS, TRIANGLES, GltfDocument, GltfPrimitive, elements, reported
+from wlm.formats.gltf_container import BINARY_CHUNK, JSON_CHUNK, MAGIC, local_file
+from wlm.formats.limits import MESH_BYTES
+from wlm.formats.reading import read_file
 
 _VERTICES, _INDICES = 34962, 34963  # targets of buffer views
 _FLOAT, _UINT16, _UINT32 = 5126, 5123, 5125
 _MAX_GLB = 2**32 - 1
+# By a file's first bytes; "." stands for any.
 _IMAGE_TYPES = {
-    ".png": "image/png",
-    ".jpg": "image/jpeg",
-    ".jpeg": "image/jpeg",
-    ".webp": "image/webp",
-    ".ktx2": "image/ktx2",
-    ".dds": "image/vnd-ms.dds",
+    rb"\x89PNG\r\n\x1a\n": "image/png",
+    rb"\xff\xd8\xff": "image/jpeg",
+    rb"RIFF....WEBP": "image/webp",
+    rb"\xabKTX 20\xbb\r\n\x1a\n": "image/ktx2",
+    rb"DDS ": "image/vnd-ms.dds",
 }
 # Extensions that number a primitive's vertices and would be wrong for the new ones.
 _OF_VERTICES = ("CESIUM_primitive_outline", "EXT_mesh_primitive_edge_visibility")
@@ -149,15 +142,18 @@ class _Tree:
             del primitive["extensions"]
 
     def embed_images(self) -> None:
-        """Takes images of files into the tree; what can't be read keeps its URI."""
-        for image in self.content.get("images", []):
-            file = local_file(self._document.path, image["uri"]) if "uri" in image else None
-            kind = None if file is None else _IMAGE_TYPES.get(file.suffix.lower())
-            if kind is None:
+        """Takes images of files into the tree; what can't be read, or is no image, keeps its URI."""
+        for number, image in enumerate(self.content.get("images", [])):
+            if "uri" not in image:
                 continue
+            where = f"{self._document.path}: images[{number}].uri"
             try:
-                data = file.read_bytes()
-            except (OSError, ValueError):  # ValueError: a zero byte in the name
+                file = local_file(self._document.path, image["uri"], where, self._document.trust)
+                data = read_file(file, MESH_BYTES, where)
+            except WlmError:
+                continue
+            kind = next((kind for head, kind in _IMAGE_TYPES.items() if re.match(head, data, re.DOTALL)), None)
+            if kind is None:
                 continue
             del image["uri"]
             image |= {"bufferView": self._view(data, {}), "mimeType": kind}
@@ -278,7 +274,8 @@ def _pack(path: str | os.PathLike[str], content: dict, payloads: Sequence[bytes 
     for kind in ("accessors", "bufferViews"):  # glTF has no empty lists
         if not content[kind]:
             del content[kind]
-    text = json.dumps(content, ensure_ascii=False, separators=(",", ":")).encode()
+    # Half a character can't be written but as JSON's escape, which is Python's.
+    text = json.dumps(content, ensure_ascii=False, separators=(",", ":")).encode("utf-8", "backslashreplace")
     text += b" " * (-len(text) % 4)
     length = 12 + 8 + len(text) + 8 + start
     if length > _MAX_GLB:

@@ -14,11 +14,12 @@ from __future__ import annotations
 import os
 import struct
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 
 from wlm.errors import WlmError
+from wlm.formats.limits import BAKE_BYTES, check_growth
+from wlm.formats.reading import read_file
 
 COEFFICIENTS = 9
 _TYPE = "LightmapGIData"
@@ -98,10 +99,7 @@ def read_lmbake(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray]:
         WlmError: The file is missing, not a Godot resource, of another version or type, cut short or damaged, has no
             probes, or is compressed and imagecodecs is not installed.
     """
-    try:
-        data = Path(path).read_bytes()
-    except OSError as error:
-        raise WlmError(f"{path}: cannot read: {error.strerror or error}") from error
+    data = read_file(path, BAKE_BYTES, "the bake")
     magic = data[:4]
     if magic == b"RSCC":
         # A compressed resource has no magic of its own inside, and its offsets count from there.
@@ -316,6 +314,7 @@ def _decompress(reader: _Reader) -> bytes:
     # The last block, of what is left, is stored even where nothing is.
     full, rest = divmod(total, block)
     sizes = np.frombuffer(reader.take(4 * (full + 1)), "<u4")
+    check_growth(f"{path}: compression", len(reader.data), total)
     pieces = []
     for i, size in enumerate(sizes.tolist()):
         expected = block if i < full else rest

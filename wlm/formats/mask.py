@@ -1,13 +1,34 @@
 """Masks of lightmaps: PNGs that say which texels belong to a chart."""
 
 import os
+import struct
+import zlib
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
+from PIL.PngImagePlugin import PngImageFile
 
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_path
+from wlm.formats.reading import open_file
+
+DAMAGED_PICTURE = (
+    OSError,
+    SyntaxError,
+    ValueError,
+    TypeError,
+    LookupError,
+    ArithmeticError,
+    AttributeError,
+    EOFError,
+    MemoryError,
+    NotImplementedError,
+    struct.error,
+    zlib.error,
+    Image.DecompressionBombError,
+)
+"""What Pillow raises on a picture that is none, or damaged."""
 
 
 def read_mask(path: Path, beside: str | os.PathLike[str], size: tuple[int, int], others: str = "") -> np.ndarray:
@@ -22,17 +43,19 @@ def read_mask(path: Path, beside: str | os.PathLike[str], size: tuple[int, int],
     Raises:
         WlmError: It is missing, damaged or of another size.
     """
-    if not path.is_file():
-        raise WlmError(f"{path}: no such mask; expected a PNG of {size[1]}x{size[0]}{others}")
-    try:
-        with Image.open(path) as image:
-            # The header's size first: a wrong one need not be decoded.
-            if (image.height, image.width) != size:
-                raise WlmError(f"{path}: the mask is {image.width}x{image.height}, but {beside} is {size[1]}x{size[0]}")
-            # A palette's index says nothing; an alpha channel is not coverage here.
-            colour = np.asarray(image.convert("RGB") if image.mode in ("P", "PA", "RGBA", "LA") else image)
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise WlmError(f"{path}: cannot read the mask: {error}") from error
+    with open_file(path, f"the mask (expected a PNG of {size[1]}x{size[0]}{others})") as file:
+        try:
+            # Not `Image.open`: it would try other formats' readers too, and refuses masks of 16384 x 16384.
+            with PngImageFile(file) as image:
+                # The header's size first: a wrong one need not be decoded.
+                if (image.height, image.width) != size:
+                    raise WlmError(
+                        f"{path}: the mask is {image.width}x{image.height}, but {beside} is {size[1]}x{size[0]}"
+                    )
+                # A palette's index says nothing; an alpha channel is not coverage here.
+                colour = np.asarray(image.convert("RGB") if image.mode in ("P", "PA", "RGBA", "LA") else image)
+        except DAMAGED_PICTURE as error:
+            raise WlmError(f"{path}: cannot read the mask: expected a PNG: {error or type(error).__name__}") from error
     return colour > 0 if colour.ndim == 2 else (colour > 0).any(axis=2)
 
 

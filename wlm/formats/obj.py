@@ -5,14 +5,16 @@ into a fan about its first corner, which is right for convex ones. `vt`'s v poin
 Normals, groups, materials, lines, points and curves are left out.
 """
 
+import io
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from wlm.errors import WlmError
+from wlm.formats.limits import OBJ_BYTES
+from wlm.formats.reading import read_file
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,15 +45,12 @@ def read_obj(path: str | os.PathLike[str]) -> ObjMesh:
         WlmError: The file is missing, a line is malformed (its number is named), or some faces have UVs and
             others none.
     """
-    try:
-        text = Path(path).read_bytes().decode("utf-8", errors="replace")
-    except OSError as error:
-        raise WlmError(f"{path}: cannot read the OBJ file: {error.strerror or error}") from error
+    data = read_file(path, OBJ_BYTES, "the OBJ file")
     points: list[tuple[float, float, float]] = []
     places: list[tuple[float, float]] = []
     corners: list[tuple[int, int]] = []  # (v, vt), three a triangle; vt is -1 where there is none
     bare = None  # the line of the first face without UVs
-    for number, words in _statements(text):
+    for number, words in _statements(data):
         kind = words[0]
         try:
             if kind == "v":
@@ -81,10 +80,12 @@ def read_obj(path: str | os.PathLike[str]) -> ObjMesh:
     )
 
 
-def _statements(text: str) -> Iterator[tuple[int, list[str]]]:
+def _statements(data: bytes) -> Iterator[tuple[int, list[str]]]:
     """Yields each statement's line number and words, lines that end in a backslash joined, comments left out."""
     held: list[str] = []
-    for number, line in enumerate(text.splitlines(), 1):
+    # Line by line: a list of all lines would be many times the file.
+    lines = io.TextIOWrapper(io.BytesIO(data), encoding="utf-8", errors="replace")
+    for number, line in enumerate(lines, 1):
         line = line.partition("#")[0].rstrip()
         if line.endswith("\\"):
             held += line[:-1].split()

@@ -17,6 +17,12 @@ an empty mask                         error
 one time                              fine
 times out of order                    sorted, with their frames; warning
 two equal times                       error that names both files
+more than 100,000 times               error
+an alpha NaN or infinite              the texel is outside a mask from alpha; warning
+files or a mask outside the folder    error, unless the set is trusted
+of their `set.json`
+frames beyond 1 GiB that small files  error, unless the set is trusted
+only claim
 a time outside [0, period)            error: 24 h is 0 h, and wrapping would hide a mistake in the list
 a NaN or infinite time                error
 frames, mask or `set.json` that     error that names both files
@@ -34,18 +40,19 @@ import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import chain, pairwise
 from pathlib import Path
 
 import numpy as np
 
 from wlm.errors import WlmError
 from wlm.formats.exr import read_exr
+from wlm.formats.limits import FRAMES, PICTURE_GROWTH, TIMES, check_growth
 from wlm.formats.mask import read_mask
 from wlm.lightmap.listing import SET_FILE, Listing, list_folder, parse_set
 from wlm.texels import repair
 
 _READERS = 2  # decompression releases the GIL; more threads than this only fight over the disk
-_MAX_TIMES = 100_000  # far above any real set; "0:24:1e-9" must not fill the memory
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +85,7 @@ def load(
     times: Sequence[float] | None = None,
     mask: str | os.PathLike[str] | None = None,
     period: float | None = None,
+    trust: bool = False,
 ) -> LightmapSet:
     """Reads a lightmap set: a `set.json`, a folder that holds one, or a plain folder of EXR files.
 
@@ -96,6 +104,8 @@ def load(
         mask: A PNG (a texel is valid where any colour channel is above 0), "alpha" (valid where the alpha
             channel of every frame is above 0) or "all"; None takes what the set says.
         period: Length of the day in the unit of the times; None takes the set's `period_hours`, if any.
+        trust: Whether a `set.json` may name files outside its folder, and small files may hold large frames
+            (`wlm.formats.limits`).
 
     Returns:
         The set, repaired as the module's table says.
@@ -109,13 +119,18 @@ def load(
     if path.is_dir():
         listing = list_folder(path, times)
     elif path.is_file():
-        listing = parse_set(path, times)
+        listing = parse_set(path, times, trust)
     else:
         raise WlmError(f"{path}: no such file or folder; expected a {SET_FILE} or a folder of EXR files")
 
+    labels = [file.name for file in listing.files]
+    stamps = np.asarray(listing.times, np.float64)
+    period = listing.period if period is None else period
+    # Before the files are read: of a bad list that would be in vain.
+    _check_times(str(path), labels, stamps, period)
     mask_source = str(mask) if mask is not None else listing.mask
     need_alpha = mask_source == "alpha"
-    frames, alpha = _read_frames(listing, need_alpha)
+    frames, alpha, warnings = _read_frames(listing, need_alpha, trust)
     height, width = frames.shape[1:3]
     if need_alpha:
         valid = alpha
@@ -125,14 +140,15 @@ def load(
         valid = read_mask(Path(mask_source), listing.files[0], (height, width), ', "alpha" or "all"')
     return _check(
         listing.name,
-        [file.name for file in listing.files],
-        np.asarray(listing.times, np.float64),
+        labels,
+        stamps,
         frames,
         valid,
-        listing.period if period is None else period,
+        period,
         where=str(path),
         mask_from="the alpha channels" if need_alpha else mask_source,
         warn_order=listing.warn_order,
+        warnings=warnings,
     )
 
 
@@ -168,6 +184,7 @@ def from_arrays(
     if valid.shape != frames.shape[1:3]:
         raise WlmError(f"{name}: expected a mask of {frames.shape[1:3]}, got {valid.shape}")
     labels = [f"frame {i} (time {time:g})" for i, time in enumerate(stamps)]
+    _check_times(name, labels, stamps, period)
     with np.errstate(over="ignore"):  # float64 beyond float32 becomes Inf and is repaired as Inf
         copied = np.array(frames, dtype=np.float32, order="C")
     return _check(name, labels, stamps, copied, valid.copy(), period, where=name, mask_from="the mask")
@@ -204,21 +221,30 @@ def parse_times(text: str) -> list[float]:
         steps = (stop - start) / step - 1e-9 if step else 0.0
         if not 0.0 < steps < math.inf:
             raise WlmError(f"times: the range {part.strip()!r} holds no time before its stop")
-        if len(times) + steps > _MAX_TIMES:
-            raise WlmError(f"times: the range {part.strip()!r} holds more than {_MAX_TIMES:,} times")
+        if len(times) + steps > TIMES:
+            raise WlmError(f"times: the range {part.strip()!r} holds more than {TIMES:,} times")
         times.extend(start + i * step for i in range(math.ceil(steps)))
     return times
 
 
-def _read_frames(listing: Listing, need_alpha: bool) -> tuple[np.ndarray, np.ndarray | None]:
-    """Reads all files into one array [T, H, W, 3]; if asked for, also where every alpha is above 0 [H, W]."""
-    first, covered = _read_rgb(listing.files[0], need_alpha)
+def _read_frames(
+    listing: Listing, need_alpha: bool, trust: bool
+) -> tuple[np.ndarray, np.ndarray | None, tuple[str, ...]]:
+    """Reads all files into one array [T, H, W, 3]; if asked for, also where every alpha is above 0 [H, W]; warnings."""
+    first, alpha = _read_rgb(listing.files[0], need_alpha)
     size = first.shape[:2]
     if listing.size is not None and size != listing.size:
         raise WlmError(f"{listing.files[0]}: is {_size(size)}, but {listing.stated_by} states {_size(listing.size)}")
+    if not trust:
+        held = sum(os.path.getsize(file) for file in set(listing.files) if os.path.exists(file))
+        check_growth(f"{listing.stated_by}: lightmaps", held, len(listing.files) * first.nbytes, PICTURE_GROWTH, FRAMES)
     # One array from the start: a list of frames stacked at the end would need twice the memory.
-    frames = np.empty((len(listing.files), *first.shape), np.float32)
+    try:
+        frames = np.empty((len(listing.files), *first.shape), np.float32)
+    except MemoryError as error:
+        raise WlmError(f"{listing.stated_by}: {len(listing.files)} lightmaps of {_size(size)}: {error}") from error
     frames[0] = first
+    covered, warnings = np.ones(size, bool) if need_alpha else None, []
 
     def read(index: int) -> np.ndarray | None:
         rgb, alpha = _read_rgb(listing.files[index], need_alpha)
@@ -233,25 +259,44 @@ def _read_frames(listing: Listing, need_alpha: bool) -> tuple[np.ndarray, np.nda
     pool = ThreadPoolExecutor(_READERS)
     try:
         # In order, so that of several bad files the first is the one named.
-        for alpha in pool.map(read, range(1, len(listing.files))):
-            if covered is not None:
-                covered &= alpha
+        alphas = chain([alpha], pool.map(read, range(1, len(listing.files))))
+        for file, alpha in zip(listing.files, alphas, strict=True):
+            if covered is None:
+                continue
+            covered &= np.isfinite(alpha) & (alpha > 0)
+            if broken := np.count_nonzero(~np.isfinite(alpha)):
+                warnings.append(f"{file.name}: {broken} texels with an alpha NaN or infinite: not valid")
     finally:
         pool.shutdown(cancel_futures=True)
-    return frames, covered
+    return frames, covered, tuple(warnings)
 
 
 def _read_rgb(path: Path, need_alpha: bool) -> tuple[np.ndarray, np.ndarray | None]:
-    """Reads one file: colour [H, W, 3] and, if asked for, where its alpha is above 0 [H, W]."""
+    """Reads one file: colour [H, W, 3] and, if asked for, its alpha [H, W]."""
     pixels, names = read_exr(path)
     if need_alpha and "A" not in names:
         raise WlmError(f"{path}: expected a channel A, which the mask is to come from, found {', '.join(names)}")
-    return pixels[..., :3], pixels[..., 3] > 0 if need_alpha else None
+    return pixels[..., :3], pixels[..., 3] if need_alpha else None
 
 
 def _size(shape: Sequence[int]) -> str:
     """Writes [H, W, ...] with the width first."""
     return f"{shape[1]}x{shape[0]}"
+
+
+def _check_times(where: str, labels: Sequence[str], times: np.ndarray, period: float | None) -> None:
+    """Applies the module's table to the times [T] of the frames of these labels."""
+    if period is not None and not (math.isfinite(period) and period > 0):
+        raise WlmError(f"{where}: expected a finite period above 0, got {period:g}")
+    for label, time in zip(labels, times, strict=True):
+        if not math.isfinite(time):
+            raise WlmError(f"{where}: the time of {label} is {time:g}; expected a finite number")
+        if period is not None and not 0 <= time < period:
+            raise WlmError(f"{where}: the time of {label} is {time:g}; expected 0 to below {period:g}, the period")
+    order = np.argsort(times, kind="stable")
+    for i, j in pairwise(order):
+        if times[i] == times[j]:
+            raise WlmError(f"{where}: {labels[i]} and {labels[j]} have the same time, {times[i]:g}")
 
 
 def _check(
@@ -265,26 +310,17 @@ def _check(
     where: str,
     mask_from: str,
     warn_order: bool = True,
+    warnings: Sequence[str] = (),
 ) -> LightmapSet:
-    """Applies the module's table to frames from files or arrays."""
+    """Applies the module's table to frames from files or arrays, whose times have been checked."""
     if not mask.any():
         raise WlmError(f"{where}: the mask is empty: no texel is valid ({mask_from})")
-    if period is not None and not (math.isfinite(period) and period > 0):
-        raise WlmError(f"{where}: expected a finite period above 0, got {period:g}")
-    warnings = []
-    for label, time in zip(labels, times, strict=True):
-        if not math.isfinite(time):
-            raise WlmError(f"{where}: the time of {label} is {time:g}; expected a finite number")
-        if period is not None and not 0 <= time < period:
-            raise WlmError(f"{where}: the time of {label} is {time:g}; expected 0 to below {period:g}, the period")
+    warnings = list(warnings)
     order = np.argsort(times, kind="stable")
     if (np.diff(order) < 0).any():
         if warn_order:
             warnings.append(f"{where}: the times were not in order: sorted, with their frames")
         times, frames, labels = times[order], frames[order], [labels[i] for i in order]
-    for i in range(len(times) - 1):
-        if times[i] == times[i + 1]:
-            raise WlmError(f"{where}: {labels[i]} and {labels[i + 1]} have the same time, {times[i]:g}")
     for label, frame in zip(labels, frames, strict=True):
         warnings += [f"{label}: {text}" for text in repair(frame, mask, f"{where}: {label}")]
     return LightmapSet(

@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from wlm.errors import WlmError
+from wlm.formats.limits import TIMES
+from wlm.formats.reading import named_file, read_json_file
 
 SET_FILE = "set.json"
 
@@ -104,26 +106,22 @@ def _check_count(where: Path, files: Sequence[Path], times: Sequence[float]) -> 
         raise WlmError(f"{where}: {_count(times, 'time')} for {_count(files, 'lightmap')}; expected one each")
 
 
-def parse_set(path: Path, times: Sequence[float] | None) -> Listing:
+def parse_set(path: Path, times: Sequence[float] | None, trust: bool = False) -> Listing:
     """Reads and checks a `set.json`, as `wlm.lightmap.load` states.
 
     Args:
         path: The file.
         times: One for each lightmap, in place of those of the file; None takes those of the file.
+        trust: Whether its files and its mask may lie outside its folder.
 
     Returns:
         The listing, with paths relative to the file resolved.
 
     Raises:
-        WlmError: The file cannot be read, is not JSON, or a field is missing or of a wrong kind; the message
-            names the file and the field.
+        WlmError: The file cannot be read, is not JSON, a field is missing or of a wrong kind, a file lies outside the
+            folder, or there are too many; the message names the file and the field.
     """
-    try:
-        content = json.loads(path.read_bytes())
-    except OSError as error:
-        raise WlmError(f"{path}: cannot read: {error.strerror or error}") from error
-    except (ValueError, RecursionError) as error:
-        raise WlmError(f"{path}: not valid JSON: {error}") from error
+    content = read_json_file(path, "the set")
     if not isinstance(content, dict):
         raise WlmError(f"{path}: expected a JSON object, got {_kind(content)}")
 
@@ -147,14 +145,19 @@ def parse_set(path: Path, times: Sequence[float] | None) -> Listing:
     if content.get("mask") is not None:
         mask = field(content, "mask", "", _is_text, 'the name of a PNG, "alpha" or "all"')
         if mask not in ("all", "alpha"):
-            mask = str(path.parent / mask)
+            mask = str(named_file(path, mask, f"{path}: mask", trust))
 
-    files, stamps = [], []
+    if len(entries) > TIMES:
+        raise WlmError(f"{path}: lightmaps: expected at most {TIMES:,}, got {len(entries):,}")
+    files, stamps, found = [], [], {}
     for i, entry in enumerate(entries):
         place = f"lightmaps[{i}]"
         if not isinstance(entry, dict):
             raise WlmError(f"{path}: {place}: expected an object (time_hours, file), got {_kind(entry)}")
-        files.append(path.parent / field(entry, "file", f"{place}.", _is_text, "the name of an EXR file"))
+        file = field(entry, "file", f"{place}.", _is_text, "the name of an EXR file")
+        if file not in found:  # links are followed once
+            found[file] = named_file(path, file, f"{path}: {place}.file", trust)
+        files.append(found[file])
         if times is None:
             stamps.append(float(field(entry, "time_hours", f"{place}.", _is_number, "a finite number")))
     if times is not None:
@@ -164,8 +167,10 @@ def parse_set(path: Path, times: Sequence[float] | None) -> Listing:
 
 
 def _is_text(value: object) -> bool:
-    # A NUL makes open() raise ValueError, not OSError.
-    return isinstance(value, str) and bool(value.strip()) and "\0" not in value
+    # No file can have a NUL or half a character in its name.
+    if not isinstance(value, str) or not value.strip() or "\0" in value:
+        return False
+    return not any("\ud800" <= character <= "\udfff" for character in value)
 
 
 def _is_number(value: object) -> bool:

@@ -22,6 +22,8 @@ a number beyond +-1.8e19              error that names the probe: the loss is a 
 float16, float64, integers            converted to float32; what is too small for it becomes 0
 other types, text, ragged lists       error that names the field
 one probe, one number per probe       fine
+more than 16,777,216 probes, or 4,096 error; on CUDA some 1,400 numbers, which is told when the fit begins
+numbers of a probe
 several arrays named `sh...`          error that lists them, unless `key` names one
 a convention of an engine             error where the numbers are not 1, 4 or 9 RGB coefficients (any
                                       square for Godot's)
@@ -34,13 +36,10 @@ What a probe holds: gaussian-probe-compression, eq. 1 (there 3, 12 or 27 numbers
 import hashlib
 import json
 import os
-import struct
-import zipfile
-import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -48,30 +47,16 @@ from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_path, atomic_write
 from wlm.formats.folder import rounded
 from wlm.formats.godot import read_lmbake
+from wlm.formats.limits import JSON_BYTES, NUMBERS, PROBES
+from wlm.formats.npz import read_npz
+from wlm.formats.reading import read_json_file
 from wlm.probe.conventions import CANONICAL, CONVENTIONS, from_canonical, to_canonical
 from wlm.probe.sphere import sh_count
 
 LARGEST = float(np.sqrt(np.finfo(np.float32).max))
 """The largest number whose square float32 still holds."""
 
-_T = TypeVar("_T")
-
 _POSITION, _CONVENTION, _PROBES, _SH = "position", "convention", "probes", "sh"
-# What NumPy and the modules below it raise on a file that is none, is cut short, or lies about its sizes.
-_BAD_FILE = (
-    OSError,
-    ValueError,
-    EOFError,
-    KeyError,
-    MemoryError,
-    NotImplementedError,
-    RuntimeError,
-    SyntaxError,
-    TypeError,
-    struct.error,
-    zipfile.BadZipFile,
-    zlib.error,
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,8 +134,6 @@ def load(path: str | os.PathLike[str], *, key: str | None = None, convention: st
     reader = _READERS.get(path.suffix.lower())
     if reader is None:
         raise WlmError(f"{path}: expected a name that ends in {' or '.join(_READERS)}, found {path.suffix or 'none'}")
-    if not path.is_file():
-        raise WlmError(f"{path}: no such file")
     raw = reader(path, key)
     stated = raw.convention if convention is None else convention
     return _check(str(path), path.stem, raw.position, raw.values, raw.key, stated)
@@ -170,11 +153,9 @@ def load_positions(path: str | os.PathLike[str]) -> np.ndarray:
         WlmError: The file is missing, damaged, or holds something else.
     """
     path = Path(path)
-    if not path.is_file():
-        raise WlmError(f"{path}: no such file")
     kind = path.suffix.lower()
     if kind == ".npz":
-        position = _read_arrays(path, lambda file: file[_POSITION])
+        position = read_npz(path, lambda _: [_POSITION], numbers=3 * PROBES)[_POSITION]
     elif kind == ".lmbake":
         position = read_lmbake(path)[0]
     else:
@@ -262,24 +243,18 @@ def save_probes(
 
 
 def _read_npz(path: Path, key: str | None) -> _Raw:
-    def read(file: np.lib.npyio.NpzFile) -> _Raw:
-        name = _choose(path, file.files, key)
-        stated = file[_CONVENTION].tolist() if _CONVENTION in file.files else CANONICAL
-        return _Raw(file[_POSITION], file[name], name, _text(path, stated))
+    name = ""
 
-    return _read_arrays(path, read)
+    def choose(names: Sequence[str]) -> list[str]:
+        nonlocal name
+        name = _choose(path, names, key)
+        return [_POSITION, name, *({_CONVENTION} & set(names))]
 
-
-def _read_arrays(path: Path, read: Callable[[np.lib.npyio.NpzFile], _T]) -> _T:
-    """What `read` takes from a `.npz` file."""
-    try:
-        loaded = np.load(path, allow_pickle=False)
-        if not isinstance(loaded, np.lib.npyio.NpzFile):
-            raise WlmError(f"{path}: expected a .npz file of several arrays, found a single array")
-        with loaded as file:
-            return read(file)
-    except _BAD_FILE as error:
-        raise WlmError(f"{path}: cannot read the arrays: {error or type(error).__name__}") from error
+    arrays = read_npz(path, choose, numbers=PROBES * NUMBERS)
+    stated = arrays[_CONVENTION] if _CONVENTION in arrays else np.array(CANONICAL)
+    if stated.dtype.kind != "U" or stated.ndim:
+        raise WlmError(f"{path}: {_CONVENTION}: expected a name, got {stated.dtype} {stated.shape}")
+    return _Raw(arrays[_POSITION], arrays[name], name, str(stated))
 
 
 def _read_json(path: Path, key: str | None) -> _Raw:
@@ -290,12 +265,7 @@ def _read_json(path: Path, key: str | None) -> _Raw:
 
 
 def _json(path: Path) -> Any:
-    try:
-        return json.loads(path.read_bytes())
-    except OSError as error:
-        raise WlmError(f"{path}: cannot read: {error.strerror or error}") from error
-    except (ValueError, RecursionError) as error:
-        raise WlmError(f"{path}: not valid JSON: {error}") from error
+    return read_json_file(path, "the probes", JSON_BYTES)
 
 
 def _fields(path: Path, content: Any) -> tuple[list[str], Callable[[str], np.ndarray]]:
@@ -423,6 +393,8 @@ def _check(
             f"{where}: {key}: expected ({count}, C, 3) with RGB last or ({count}, D), a row for each position, "
             f"got {values.shape}"
         )
+    if values.size > NUMBERS * count:
+        raise WlmError(f"{where}: {key}: expected at most {NUMBERS} numbers a probe, got {values.size // count}")
 
     # float64, so that what doesn't fit float32 is told from Inf; integers have no NaN to look for.
     wide = values.astype(np.float64)
@@ -460,6 +432,8 @@ def _check_positions(where: str, position: np.ndarray) -> np.ndarray:
         raise WlmError(f"{where}: {_POSITION}: expected at least one, found none")
     if position.shape != (count, 3):
         raise WlmError(f"{where}: {_POSITION}: expected (N, 3), got {position.shape}")
+    if count > PROBES:
+        raise WlmError(f"{where}: {_POSITION}: expected at most {PROBES} probes, got {count}")
     position = position.astype(np.float64)
     bad = np.flatnonzero(~np.isfinite(position).all(axis=1))
     if len(bad):

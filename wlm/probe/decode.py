@@ -7,7 +7,7 @@ import warp as wp
 
 from wlm import interop
 from wlm.errors import WlmError
-from wlm.probe.model import ProbeModel
+from wlm.probe.model import ProbeModel, check_outputs
 from wlm.probe.start import morton_order
 from wlm_kernels.probe import cubes as probe_cubes
 from wlm_kernels.probe import gaussian_sum
@@ -79,6 +79,7 @@ class Decoder:
         self.model, self.device = model, interop.check_device(device)
         kind = "cpu" if self.device == "cpu" else "cuda"
         p, count = model.profile, model.count
+        check_outputs(model.name, p, model.outputs, self.device)
         self._cut = p.cut if cut is None else cut
         sphere = (p.support if support is None else support) == "sphere"
         if sphere and culling != "none":

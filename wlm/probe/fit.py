@@ -11,7 +11,7 @@ from wlm.errors import WlmError
 from wlm.formats.checkpoint import EVERY, Checkpoint
 from wlm.metrics import psnr_from_mse
 from wlm.probe.data import ProbeSet
-from wlm.probe.model import MOST_OUTPUTS, MOST_PROBES, ProbeModel, Profile
+from wlm.probe.model import ProbeModel, Profile, check_outputs
 from wlm.probe.trainer import Trainer
 from wlm.system import Meter, OnProgress
 
@@ -85,11 +85,7 @@ def compress(
     """
     profile = Profile.load(profile).override(overrides)
     device = interop.check_device(device)
-    if probes.probes > MOST_PROBES or probes.outputs > MOST_OUTPUTS:
-        raise WlmError(
-            f"{probes.name}: expected at most {MOST_PROBES} probes of {MOST_OUTPUTS} numbers, found {probes.probes} of "
-            f"{probes.outputs}"
-        )
+    check_outputs(probes.name, profile, probes.outputs, device)
     origin, extent, size = _frame(probes.position)
     x = ((probes.position - origin) / extent).astype(np.float32)
     trainer = Trainer(x[probes.live], probes.values[probes.live], profile, seed, device)

@@ -15,7 +15,9 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from wlm.errors import WlmError
+from wlm.formats.limits import NUMBERS
 from wlm.system import Model, Settings
+from wlm_kernels.probe.network import most_outputs
 
 # Channels of a Gaussian, in the order of `ProbeModel.bounds`; the last three groups share `Profile.bits`.
 CENTRE = slice(0, 3)
@@ -27,8 +29,8 @@ CENTRE_BITS = 16
 MOST_PROBES = 1 << 27
 """Probes of a model, at most: flags of dead ones take 128 MiB."""
 
-MOST_OUTPUTS = 1024
-"""Numbers of a probe, at most: a network of any width and so many outputs fits a GPU's shared memory."""
+MOST_OUTPUTS = NUMBERS
+"""Numbers of a probe, at most; `check_outputs` says how many a GPU takes."""
 
 
 class Profile(Settings):
@@ -91,6 +93,20 @@ class Profile(Settings):
     def code_bits(self) -> np.ndarray:
         """Bits of each number of a Gaussian in the file, int [10 + L]."""
         return np.array([CENTRE_BITS] * 3 + [self.bits] * (7 + self.latent))
+
+
+def check_outputs(name: str, profile: Profile, outputs: int, device: str) -> None:
+    """Checks that a device's kernels can be made for so many numbers a probe; those of the CPU can for any.
+
+    Raises:
+        WlmError: They can't.
+    """
+    most = most_outputs(profile.latent, profile.hidden)
+    if device != "cpu" and outputs > most:
+        raise WlmError(
+            f"{name}: expected at most {most} numbers a probe on CUDA with latent {profile.latent} and hidden "
+            f"{profile.hidden}, found {outputs}; the CPU takes more"
+        )
 
 
 def layer_shapes(latent: int, hidden: int, outputs: int) -> list[tuple[int, int]]:

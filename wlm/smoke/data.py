@@ -52,6 +52,7 @@ class Frames:
         numbers: Of the frames that are there, rising; (1,) of a single volume.
         device: Where volumes go.
         extinction, emission: In place of the scene's, or of 1; None: those.
+        trust: As for `load`.
     """
 
     path: Path
@@ -60,6 +61,7 @@ class Frames:
     device: str = "cpu"
     extinction: float | None = None
     emission: float | None = None
+    trust: bool = False
 
     @property
     def camera(self) -> CameraSettings:
@@ -85,7 +87,7 @@ class Frames:
         for name in ("extinction", "emission"):
             override = getattr(self, name)
             factors[name] = override if override is not None else getattr(smoke, name, 1.0)
-        return load_volume(self.file(number), **factors, device=self.device)
+        return load_volume(self.file(number), **factors, device=self.device, trust=self.trust)
 
     def volumes(
         self, numbers: Sequence[int] | None = None, progress: OnProgress | None = None
@@ -108,18 +110,23 @@ def load_frames(
     extinction: float | None = None,
     emission: float | None = None,
     device: str = "cpu",
+    trust: bool = False,
 ) -> Frames:
     """Opens a volume, `.npz` or `.nvdb`, or a folder that `simulate` wrote.
+
+    Args:
+        path: The file or the folder.
+        extinction, emission, device, trust: As in `Frames`.
 
     Raises:
         WlmError: A folder without frames or a damaged `scene.json`.
     """
     path = Path(path)
     if not path.is_dir():
-        return Frames(path, None, (1,), device, extinction, emission)
+        return Frames(path, None, (1,), device, extinction, emission, trust)
     if not (path / SCENE_FILE).is_file():
         raise WlmError(f"{path}: expected a folder that simulate wrote, found no {SCENE_FILE}")
-    frames = Frames(path, _read_scene(path), _numbers(path), device, extinction, emission)
+    frames = Frames(path, _read_scene(path), _numbers(path), device, extinction, emission, trust)
     if not frames.numbers:
         raise WlmError(f"{path}: expected frames such as {frames.file(1).name}, found none")
     return frames

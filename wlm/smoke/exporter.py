@@ -12,17 +12,18 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_path
 from wlm.formats.exr import read_exr, write_exr
+from wlm.formats.mask import DAMAGED_PICTURE
+from wlm.formats.reading import open_file
 from wlm.smoke.camera import ALPHA, DIRECTIONS, EMISSION, LAYOUTS
 from wlm.smoke.lightmaps import SixWay
 
 _SUFFIXES = (".exr", ".png", ".tga")
 _MODES = ("RGB", "RGBA")
-_BAD_FILE = (OSError, ValueError, SyntaxError, EOFError, UnidentifiedImageError, Image.DecompressionBombError)
 
 
 def cells(count: int, columns: int | None = None) -> tuple[int, int]:
@@ -202,13 +203,14 @@ def _read(path: str | os.PathLike[str]) -> np.ndarray:
         if not np.isfinite(page).all():
             raise WlmError(f"{path}: expected finite light, found NaN or infinity")
         return page
-    try:
-        with Image.open(path, formats=[_suffix(path)[1:].upper()]) as image:
-            if image.mode not in _MODES:
-                raise WlmError(f"{path}: expected RGB or RGBA of 8 bits, found {image.mode}")
-            return np.asarray(image).astype(np.float32) / np.float32(255.0)
-    except _BAD_FILE as error:
-        raise WlmError(f"{path}: cannot read the picture: {error}") from error
+    with open_file(path, "the picture") as file:
+        try:
+            with Image.open(file, formats=[_suffix(path)[1:].upper()]) as image:
+                if image.mode not in _MODES:
+                    raise WlmError(f"{path}: expected RGB or RGBA of 8 bits, found {image.mode}")
+                return np.asarray(image).astype(np.float32) / np.float32(255.0)
+        except DAMAGED_PICTURE as error:
+            raise WlmError(f"{path}: cannot read the picture: {error or type(error).__name__}") from error
 
 
 def _plane(frame: SixWay, name: str, gain: float) -> np.ndarray | float:

@@ -4,7 +4,9 @@ Lengths are in metres, times in seconds, directions the world's, +y up unless th
 `...Settings` where the object that is made of it has the plain name. The stated behaviours:
 
 =======================================  =============================================================
-a number NaN or infinite                 error that names the field
+a number NaN, infinite or beyond 1e18    error that names the field
+a cell not of 1e-9 to 1e9 metres         error
+more than 1,000,000 steps a frame        error that says what asks for them
 an unknown or a repeated key             error
 a path whose times don't rise            error
 an inlet's or a source's end before      error
@@ -37,6 +39,7 @@ from wlm.smoke.camera import Camera
 from wlm.smoke.shading import Light, Ramp
 
 _SHORTEST = 1e-12
+_MOST_STEPS = 1_000_000  # a frame; real scenes have some hundred
 
 
 def _directed(vector: tuple[float, float, float]) -> tuple[float, float, float]:
@@ -51,15 +54,13 @@ def _rising(path: tuple[tuple[float, float, float, float], ...]) -> tuple[tuple[
     return path
 
 
-_Vector = tuple[float, float, float]
+_LARGEST = 1e18  # float32 holds its square
+_Number = Annotated[float, Field(ge=-_LARGEST, le=_LARGEST)]
+_Vector = tuple[_Number, _Number, _Number]
 _Direction = Annotated[_Vector, AfterValidator(_directed)]
-_Colour = tuple[
-    Annotated[float, Field(ge=0.0)],
-    Annotated[float, Field(ge=0.0)],
-    Annotated[float, Field(ge=0.0)],
-]
-_Positive = Annotated[float, Field(gt=0.0)]
-_NotNegative = Annotated[float, Field(ge=0.0)]
+_Positive = Annotated[float, Field(gt=0.0, le=_LARGEST)]
+_NotNegative = Annotated[float, Field(ge=0.0, le=_LARGEST)]
+_Colour = tuple[_NotNegative, _NotNegative, _NotNegative]
 _Count = Annotated[int, Field(ge=1, le=4096)]
 _Face = Literal["-x", "+x", "-y", "+y", "-z", "+z"]
 
@@ -82,7 +83,7 @@ class Grid(_Settings):
     """
 
     cells: tuple[_Count, _Count, _Count]
-    cell: _Positive
+    cell: float = Field(ge=1e-9, le=1e9)
     refine: int = Field(4, ge=1, le=16)
     origin: _Vector = (0.0, 0.0, 0.0)
     faces: dict[_Face, Literal["wall", "slip", "open", "periodic"]] = {}
@@ -158,7 +159,7 @@ class Smoke(_Settings):
     storage: Literal["float32", "float16"] = "float32"
     bricks: bool = False
     substeps: int = Field(2, ge=1, le=16)
-    glow: tuple[tuple[float, _NotNegative, _NotNegative, _NotNegative], ...] = ()
+    glow: tuple[tuple[_Number, _NotNegative, _NotNegative, _NotNegative], ...] = ()
 
     @model_validator(mode="after")
     def _stops(self) -> Smoke:
@@ -180,8 +181,8 @@ class Smoke(_Settings):
 
 
 class _Timed(_Settings):
-    start: float = 0.0
-    stop: float | None = None
+    start: _Number = 0.0
+    stop: _Number | None = None
 
     @model_validator(mode="after")
     def _order(self) -> _Timed:
@@ -246,7 +247,7 @@ class ObstacleSettings(_Settings):
 
     shape: Literal["sphere", "box", "cylinder"] = "sphere"
     radius: _Positive | tuple[_Positive, _Positive, _Positive]
-    path: Annotated[tuple[tuple[float, float, float, float], ...], Field(min_length=1), AfterValidator(_rising)]
+    path: Annotated[tuple[tuple[_Number, _Number, _Number, _Number], ...], Field(min_length=1), AfterValidator(_rising)]
     colour: _Colour = (0.12, 0.12, 0.13)
 
     @model_validator(mode="after")
@@ -339,7 +340,7 @@ class Scene(_Settings):
     lights: tuple[LightSettings, ...] = (LightSettings(toward=(1.0, 1.0, 1.0)),)
     background: _Colour = (0.0, 0.0, 0.0)
     frames: int = Field(100, ge=1, le=9999)
-    rate: _Positive = 25.0
+    rate: float = Field(25.0, ge=1e-6, le=1e6)
 
     @model_validator(mode="after")
     def _flow(self) -> Scene:
@@ -348,6 +349,12 @@ class Scene(_Settings):
             raise PydanticCustomError("inlets", "expected inlets on faces that aren't periodic")
         if faces and all(face in faces or self.grid.face(face) != "open" for face in FACES):
             raise PydanticCustomError("inlets", "expected an open face for the air that the inlets let in")
+        if not self.fastest <= _MOST_STEPS * self._speed_of_one_step:
+            raise PydanticCustomError(
+                "steps",
+                f"expected at most {_MOST_STEPS:,} steps a frame, found a speed of {self.fastest:g} m/s over cells of "
+                f"{self.grid.cell:g} m at {self.rate:g} frames a second",
+            )
         return self
 
     def time(self, frame: int) -> float:
@@ -380,9 +387,14 @@ class Scene(_Settings):
         return max([*speeds, *(obstacle.fastest for obstacle in self.obstacles)], default=0.0) or 1.0
 
     @property
+    def _speed_of_one_step(self) -> float:
+        """Metres per second that one step a frame allows."""
+        return self.rate * self.air.lattice_speed * self.grid.cell
+
+    @property
     def steps(self) -> int:
         """Steps of the air per frame: as few as keep `fastest` within `air.lattice_speed`, in whole substeps."""
-        least = self.fastest / (self.rate * self.air.lattice_speed * self.grid.cell)
+        least = self.fastest / self._speed_of_one_step
         return max(math.ceil(least / self.smoke.substeps - 1e-9), 1) * self.smoke.substeps
 
     @property

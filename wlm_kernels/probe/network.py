@@ -20,6 +20,7 @@ import warp as wp
 from wlm_kernels.native import native_source
 
 THREADS = 128
+_AT_ONCE = (64, 32, 16, 8, 4)
 _SHARED = 47 * 1024  # bytes of shared memory that a block can have without asking for more
 CPU_LANES = 2
 
@@ -29,10 +30,19 @@ def padded(outputs: int) -> int:
     return -(-outputs // 4) * 4
 
 
+def most_outputs(latent: int, hidden: int) -> int:
+    """The most outputs with which the fewest probes of a block still fit its shared memory on CUDA."""
+    rows = _SHARED // (4 * (_AT_ONCE[-1] + 4))
+    return (rows - (latent + 3 + 2 * hidden)) // 4 * 4
+
+
 def probes_at_once(latent: int, hidden: int, outputs: int) -> int:
-    """Probes that a block of threads takes on CUDA: as many as fit its shared memory, 64 at most."""
+    """Probes that a block of threads takes on CUDA: as many as fit its shared memory, 64 at most.
+
+    Above `most_outputs` none fit, and the kernels are for the CPU alone, where the number means nothing.
+    """
     rows = latent + 3 + 2 * hidden + padded(outputs)
-    return next(p for p in (64, 32, 16, 8, 4) if rows * (p + 4) * 4 <= _SHARED)
+    return next((p for p in _AT_ONCE if rows * (p + 4) * 4 <= _SHARED), _AT_ONCE[-1])
 
 
 def layer_code(latent: int, hidden: int, outputs: int, probes: int) -> str:

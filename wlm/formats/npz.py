@@ -1,0 +1,99 @@
+"""Reading `.npz` files: named arrays in a ZIP file. What each claims to be is looked at before it is inflated."""
+
+import io
+import math
+import os
+import zipfile
+from collections.abc import Callable, Iterable, Sequence
+from typing import BinaryIO
+
+import numpy as np
+
+from wlm.errors import WlmError
+from wlm.formats.limits import SURE_BYTES, VOLUME_BYTES, check_growth
+from wlm.formats.reading import open_file
+
+_SUFFIX = ".npy"
+_PIECE = 1 << 20  # bytes inflated at once
+
+
+def read_npz(
+    path: str | os.PathLike[str],
+    choose: Callable[[Sequence[str]], Iterable[str]],
+    *,
+    numbers: int,
+    sure: int = SURE_BYTES,
+) -> dict[str, np.ndarray]:
+    """Reads arrays of a `.npz` file.
+
+    Args:
+        path: The file.
+        choose: Takes the names of the arrays and gives those to be read. It may raise WlmError.
+        numbers: Most numbers of an array.
+        sure: Bytes that an array may have however few are stored; see `check_growth`.
+
+    Returns:
+        The chosen arrays by name. None of them is an array of Python objects.
+
+    Raises:
+        WlmError: The file is missing, damaged or no `.npz`, or an array claims to be larger than it may be.
+    """
+    try:
+        with open_file(path, "the arrays") as file:
+            if os.fstat(file.fileno()).st_size > VOLUME_BYTES:
+                raise WlmError(f"{path}: cannot read the arrays: expected at most {VOLUME_BYTES} bytes")
+            if file.read(len(np.lib.format.MAGIC_PREFIX)) == np.lib.format.MAGIC_PREFIX:
+                raise WlmError(f"{path}: expected a .npz file of several arrays, found a single array")
+            with zipfile.ZipFile(file) as archive:
+                members = {info.filename.removesuffix(_SUFFIX): info for info in archive.infolist()}
+                arrays = {}
+                for name in choose(list(members)):
+                    if name not in members:
+                        raise WlmError(f"{path}: {name} is missing; found {', '.join(members) or 'nothing'}")
+                    arrays[name] = _read(f"{path}: {name}", archive, members[name], numbers, sure)
+                return arrays
+    except WlmError:
+        raise
+    # Whatever a stranger's file can make zipfile and NumPy raise, and that is nearly anything: they parse its header
+    # as Python.
+    except Exception as error:
+        raise WlmError(f"{path}: cannot read the arrays: {error or type(error).__name__}") from error
+
+
+def _read(where: str, archive: zipfile.ZipFile, info: zipfile.ZipInfo, numbers: int, sure: int) -> np.ndarray:
+    with archive.open(info) as member:
+        # NumPy would inflate a header of any length before it looks at it.
+        begin = io.BytesIO(member.read(_PIECE))
+        shape, by_columns, dtype = _header(where, begin)
+        count = math.prod(shape)
+        if count > numbers:
+            raise WlmError(f"{where}: expected at most {numbers} numbers, found the shape {shape}")
+        size, stated = count * dtype.itemsize, info.file_size - begin.tell()
+        if stated != size:
+            raise WlmError(f"{where}: expected {size} bytes of numbers, found {stated}")
+        check_growth(where, info.compress_size, size, sure=sure)
+        flat = np.empty(count, dtype)
+        unfilled = memoryview(flat.view(np.uint8)) if size else memoryview(b"")
+        piece = begin.read()
+        while piece and len(piece) <= len(unfilled):
+            unfilled[: len(piece)] = piece
+            unfilled = unfilled[len(piece) :]
+            # At the member's end this compares its checksum.
+            piece = member.read(_PIECE)
+        if piece or unfilled:
+            raise WlmError(f"{where}: the array is {'longer' if piece else 'shorter'} than its file states")
+        if dtype.kind == "U":
+            flat.tolist()  # what is no character fails here, not when it is used
+    return flat.reshape(shape, order="F" if by_columns else "C")
+
+
+def _header(where: str, file: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype]:
+    """Shape, whether it is stored by columns, and type."""
+    version = np.lib.format.read_magic(file)
+    readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+    if version not in readers:
+        raise WlmError(f"{where}: expected version 1.0 or 2.0 of the array's format, found {version}")
+    shape, by_columns, dtype = readers[version](file)
+    if dtype.hasobject or dtype.itemsize == 0 or any(size < 0 for size in shape):
+        raise WlmError(f"{where}: expected an array of plain values, found {dtype} {shape}")
+    return shape, by_columns, dtype
