@@ -30,8 +30,6 @@ a file missing or damaged             error that names the file, and the field
 A grid's density has no unit of its own: the extinction per length is `extinction` times it.
 """
 
-from __future__ import annotations
-
 import math
 import os
 import struct

@@ -27,8 +27,6 @@ a file missing or damaged             error that names the file, and the field
 ====================================  ================================================================
 """
 
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -314,7 +312,7 @@ def _read_primitives(document: GltfDocument) -> list[GltfPrimitive]:
         if drawn > document.most:
             raise WlmError(
                 f"{document.path}: draws more than {document.most} corners and vertices, which is more than its data "
-                "accounts for; where its author is trusted, use --trust (trust=True)"
+                "accounts for; trust=True (--trust of compress and evaluate) allows it, where the author is trusted"
             )
 
     def floats(number: int, kind: str) -> np.ndarray:

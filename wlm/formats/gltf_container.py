@@ -1,7 +1,5 @@
 """The bytes of a glTF file: a `.glb`'s chunks, and buffers inside it, in `data:` URIs or in files beside it."""
 
-from __future__ import annotations
-
 import base64
 import binascii
 import os

@@ -1,7 +1,5 @@
 """Reading `.npz` files: named arrays in a ZIP file. What each claims to be is looked at before it is inflated."""
 
-from __future__ import annotations
-
 import io
 import math
 import os

@@ -5,8 +5,6 @@ into a fan about its first corner, which is right for convex ones. `vt`'s v poin
 Normals, groups, materials, lines, points and curves are left out.
 """
 
-from __future__ import annotations
-
 import io
 import os
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Files from strangers: opened once, regular files only, read up to a stated size; and what a file may name."""
 
-from __future__ import annotations
-
 import json
 import os
 import stat
@@ -125,7 +123,7 @@ def named_file(document: str | os.PathLike[str], name: str, where: str, trust: b
         raise WlmError(f"{where}: cannot follow the name {name}: {error}") from error
     if not inside:
         raise WlmError(
-            f"{where}: expected a file within {folder}, found {name}: where its author is trusted, use --trust "
-            "(trust=True)"
+            f"{where}: expected a file within {folder}, found {name}; trust=True (--trust of compress and evaluate) "
+            "allows it, where the author is trusted"
         )
     return path
