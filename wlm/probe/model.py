@@ -15,7 +15,6 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from wlm.errors import WlmError
-from wlm.formats.limits import NUMBERS
 from wlm.system import Model, Settings
 from wlm_kernels.probe.network import most_outputs
 
@@ -25,12 +24,6 @@ SCALE = slice(3, 6)
 ROTATION = slice(6, 10)
 LATENT = slice(10, None)
 CENTRE_BITS = 16
-
-MOST_PROBES = 1 << 27
-"""Probes of a model, at most: flags of dead ones take 128 MiB."""
-
-MOST_OUTPUTS = NUMBERS
-"""Numbers of a probe, at most; `check_outputs` says how many a GPU takes."""
 
 
 class Profile(Settings):
