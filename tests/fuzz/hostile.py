@@ -17,6 +17,8 @@ from typing import Any
 
 import numpy as np
 
+from wlm.formats.exr import write_exr
+
 from .containers import edit_artifact
 from .reader import corpus, stored
 
@@ -105,13 +107,6 @@ def _gltf(count: int, nodes: int = 1, view: dict[str, Any] | None = None, **buff
     return lambda path: path.write_text(json.dumps(content))
 
 
-def _outside(path: Path) -> None:
-    """An image in the folder above, which a mesh written again would hold."""
-    (path.parent.parent / "secret.png").write_bytes(b"secret")
-    path.write_bytes((_FILES / "image-outside.gltf").read_bytes())
-    path.with_name("light.exr").write_bytes(corpus("light.exr")()[0])
-
-
 def _fifo_beside(path: Path) -> None:
     os.mkfifo(path.with_name("fifo"))
     _gltf(3, byteLength=64, uri="fifo")(path)
@@ -161,11 +156,11 @@ def _set(change: Callable[[dict[str, Any]], None]) -> Write:
     return write
 
 
-def _same_again(count: int) -> Callable[[dict[str, Any]], None]:
-    def change(content: dict[str, Any]) -> None:
-        content["lightmaps"] = [{"time_hours": i / 2000, "file": "a.exr"} for i in range(count)]
-
-    return change
+def _same_again(path: Path) -> None:
+    """One lightmap of 3 MB, which black has in some kilobytes, at 40,000 times."""
+    entries = [{"time_hours": i / 2000, "file": "a.exr"} for i in range(40_000)]
+    path.write_text(json.dumps({"width": 512, "height": 512, "lightmaps": entries}))
+    write_exr(path.with_name("a.exr"), np.zeros((512, 512, 3)))
 
 
 def _file(name: str) -> Callable[[dict[str, Any]], None]:
@@ -212,21 +207,23 @@ HOSTILE: dict[str, tuple[Sequence[str], Write]] = {
     "no-weights.wlm": (["smoke-network"], _artifact("smoke.wlm", _no_weights)),
     **{f"{name}.npz": (_ARCHIVES, _copy(f"{name}.npz")) for name in ("paren", "huge", "huge-mem", "indent")},
     **{f"{name}.npz": (_ARCHIVES, _copy(f"{name}.npz")) for name in ("member-not-npy", "encrypted", "bytes-key")},
-    "zeros-volume.npz": (["volume-npz"], _zip_bomb("density.npy", _header((1 << 10,) * 3, "<f4"), 1 << 32)),
-    "zeros-probes.npz": (["probes-npz"], _zip_bomb("sh.npy", _header((1 << 25, 9, 3), "<f4"), 3 << 30, **_POINTS)),
-    "zeros-points.npz": (["positions-npz"], _zip_bomb("position.npy", _header((1 << 28, 3), "<f4"), 3 << 30)),
+    "zeros-volume.npz": (
+        ["volume-npz"],
+        _zip_bomb("density.npy", _header((1 << 10, 1 << 10, 1000), "<f4"), 4000 << 20),
+    ),
+    "zeros-probes.npz": (["probes-npz"], _zip_bomb("sh.npy", _header((1 << 25, 9, 3), "<f4"), 3456 << 20, **_POINTS)),
+    "zeros-points.npz": (["positions-npz"], _zip_bomb("position.npy", _header((1 << 24, 3), "<f8"), 384 << 20)),
     "count.gltf": (["gltf"], _gltf(300_000_000)),
     "stride-0.gltf": (["gltf"], _gltf(300_000_000, 1, {"byteStride": 0}, byteLength=64, uri="data:," + "a" * 64)),
     "instances.gltf": (["gltf"], _gltf(300_000, nodes=1000)),
     "device.gltf": (["gltf"], _gltf(3, byteLength=64, uri="../" * 30 + "dev/zero")),
     "fifo-beside.gltf": (["gltf"], _fifo_beside),
-    "image-outside.gltf": (["gltf"], _outside),
     "b44-wide.exr": (["exr"], _copy("b44-wide.exr")),
     "bbox-700.nvdb": (
         ["volume-nvdb"],
         lambda path: path.write_bytes(gzip.decompress((_FILES / "bbox-700.nvdb.gz").read_bytes())),
     ),
-    "many/set.json": (["lightmap-set"], _set(_same_again(40_000))),
+    "many/set.json": (["lightmap-set"], _same_again),
     "above/set.json": (["lightmap-set"], _set(_file("../b.exr"))),
     "device/set.json": (["lightmap-set"], _set(_file("/dev/zero"))),
     "surrogate/set.json": (["lightmap-set"], _set(_file("\ud800"))),
