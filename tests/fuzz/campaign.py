@@ -14,6 +14,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from itertools import count
 from pathlib import Path
 from threading import local
 from typing import Any
@@ -30,9 +31,9 @@ _CHUNK = 500  # cases of a job
 class Worker:
     """A process that runs cases, started when it is first needed and again after a case that ended it."""
 
-    def __init__(self, limits: Limits | None = None, module: str = "tests.fuzz.readers") -> None:
-        """Takes the limits of a case and the module whose `READERS` are run."""
-        self.limits, self.module = limits or Limits(), module
+    def __init__(self, limits: Limits | None = None, module: str = "tests.fuzz.readers", number: int = 0) -> None:
+        """Takes the limits of a case, the module whose `READERS` are run, and a number among workers."""
+        self.limits, self.module, self.number = limits or Limits(), module, number
         self._process: subprocess.Popen[bytes] | None = None
         self._folder: str | None = None
         self._pending, self._ended = b"", False
@@ -98,7 +99,9 @@ class Worker:
         # One thread: workers are as many as there are cores. No GPU: its driver isn't what is looked at.
         self._folder = tempfile.mkdtemp(prefix="wlm-fuzz-")
         environment = os.environ | {"OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": "", "TMPDIR": self._folder}
-        environment.setdefault("WARP_CACHE_PATH", str(ROOT / ".cache" / "warp-main"))
+        cache = environment.get("WARP_CACHE_PATH", str(ROOT / ".cache" / "warp-main"))
+        # Two that compile one kernel at once would race for its files.
+        environment["WARP_CACHE_PATH"] = f"{cache}-{self.number}" if self.number else cache
         self._process = subprocess.Popen(
             [sys.executable, "-m", "tests.fuzz.worker", *words],
             cwd=ROOT,
@@ -193,23 +196,23 @@ def campaign(
     Returns:
         What came of them, by reader.
     """
-    own, all_workers = local(), []
+    own, all_workers, numbers = local(), [], count()
 
-    def job(reader: str, begin: int, count: int) -> Sequence[Outcome]:
+    def job(reader: str, begin: int, size: int) -> Sequence[Outcome]:
         if not hasattr(own, "worker"):
-            own.worker = Worker(limits)
+            own.worker = Worker(limits, number=next(numbers))
             all_workers.append(own.worker)
-        return list(own.worker.run(reader, begin, count))
+        return list(own.worker.run(reader, begin, size))
 
     tallies = {}
     with ThreadPoolExecutor(workers) as pool:
         try:
             futures = {
                 reader: [
-                    pool.submit(job, reader, first + begin, min(_CHUNK, count - begin))
-                    for begin in range(0, count, _CHUNK)
+                    pool.submit(job, reader, first + begin, min(_CHUNK, cases - begin))
+                    for begin in range(0, cases, _CHUNK)
                 ]
-                for reader, count in counts.items()
+                for reader, cases in counts.items()
             }
             for reader, pieces in futures.items():
                 tallies[reader] = Tally()

@@ -23,7 +23,10 @@ def _raise(path: Path) -> None:
 
 
 def _control(path: Path) -> None:
-    raise WlmError(f"{path}: found \x1b[31m")
+    error = WlmError(path)
+    # Its maker escapes them.
+    error.args = (f"{path}: found \x1b[31m",)
+    raise error
 
 
 def _nameless(path: Path) -> None:

@@ -105,7 +105,6 @@ def _words_of(header: int) -> Callable[[Random, bytes], bytes]:
 
 def _mesh(path: Path) -> None:
     document, primitives = read_gltf(path)
-    check_finite(**{f"primitive {i}": each.position for i, each in enumerate(primitives)})
     again = path.with_name("again.glb")
     try:
         write_glb(again, document, [], 1)
