@@ -1,7 +1,5 @@
 """Many cases on worker processes that are started again after a crash, and the table of what came of them."""
 
-from __future__ import annotations
-
 import json
 import os
 import selectors
@@ -17,12 +15,10 @@ from dataclasses import dataclass, field
 from itertools import count
 from pathlib import Path
 from threading import local
-from typing import Any
+from typing import Any, Self
 
 from .limits import Limits
 from .worker import FAILURES, ROOT, Outcome
-
-__all__ = ["Tally", "Worker", "campaign"]
 
 _START = 600.0  # seconds in which a worker must have imported and compiled what a reader needs
 _CHUNK = 500  # cases of a job
@@ -38,7 +34,7 @@ class Worker:
         self._folder: str | None = None
         self._pending, self._ended = b"", False
 
-    def __enter__(self) -> Worker:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -19,8 +19,6 @@ from numpy.lib import format as npy
 
 from .mutate import corrupt, vary_array, vary_json, vary_numbers
 
-__all__ = ["edit_artifact", "vary_artifact", "vary_exr", "vary_glb", "vary_gltf", "vary_npz", "vary_png"]
-
 # Artifacts.
 
 _TYPES = {"BOOL": "?", "U8": "u1", "I8": "i1", "U16": "<u2", "I16": "<i2", "F16": "<f2", "U32": "<u4", "I32": "<i4"}

@@ -1,7 +1,5 @@
 """The good files in `corpus/`, each made by our own writer of its format and as small as still has every feature."""
 
-from __future__ import annotations
-
 import base64
 import gzip
 import json
@@ -27,8 +25,6 @@ from wlm.smoke.data import open_frames, write_six_way
 from wlm.smoke.learn.pool import Pool, save_pool
 from wlm.smoke.learn.settings import DatasetSettings
 from wlm.smoke.scene import Scene
-
-__all__ = ["write_corpus"]
 
 _HEIGHT, _WIDTH = 12, 10  # of every picture
 

@@ -9,8 +9,6 @@ from wlm.errors import WlmError
 
 from .reader import Reader
 
-__all__ = ["READERS"]
-
 _GOOD = b"good"
 
 

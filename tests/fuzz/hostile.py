@@ -22,8 +22,6 @@ from wlm.formats.exr import write_exr
 from .containers import edit_artifact
 from .reader import corpus, stored
 
-__all__ = ["HOSTILE"]
-
 _FILES = Path(__file__).resolve().parents[1] / "files" / "hostile"
 
 Write = Callable[[Path], None]

@@ -7,8 +7,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-__all__ = ["Limits", "out_of_memory"]
-
 
 @dataclass(frozen=True)
 class Limits:

@@ -1,7 +1,5 @@
 """Readers of artifacts: the models of the four systems, the checkpoints of their fits, and pools of samples."""
 
-from __future__ import annotations
-
 import functools
 import tempfile
 from collections.abc import Sequence
@@ -22,8 +20,6 @@ from wlm.system import Meter
 
 from .containers import vary_artifact
 from .reader import Reader, check_digest, check_finite, corpus, stored
-
-__all__ = ["READERS"]
 
 
 def _lightmap(path: Path) -> None:

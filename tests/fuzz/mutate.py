@@ -9,8 +9,6 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["corrupt", "vary_array", "vary_json", "vary_numbers", "vary_text"]
-
 # Around the widths of integers and the sizes at which buffers, images and strings tend to end.
 _NEAR = (8, 16, 32, 64, 128, 256, 512, 1000, 4096, 16384, 65536, 1 << 20, 1 << 24, 1 << 31, 1 << 32, 1 << 48, 1 << 63)
 INTEGERS = (*range(10), *(value + shift for value in _NEAR for shift in (-1, 0, 1)))

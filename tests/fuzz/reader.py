@@ -12,8 +12,6 @@ import numpy as np
 
 from .mutate import corrupt
 
-__all__ = ["Reader", "check_digest", "check_finite", "corpus", "stored"]
-
 _CORPUS = Path(__file__).parent / "corpus"
 _FILES = Path(__file__).resolve().parents[1] / "files"
 

@@ -4,8 +4,6 @@ A new reader is a row: its good files (in `corpus.py`, or made here), how to cha
 format, and a function that reads it as users do and asserts what the format's page forbids.
 """
 
-from __future__ import annotations
-
 import functools
 import gzip
 import json
@@ -39,8 +37,6 @@ from . import models
 from .containers import vary_exr, vary_glb, vary_gltf, vary_npz, vary_png
 from .mutate import corrupt, vary_json, vary_numbers, vary_text
 from .reader import Reader, check_finite, corpus, stored
-
-__all__ = ["READERS"]
 
 _PROFILES = Path(__file__).resolve().parents[2] / "configs"
 

@@ -7,8 +7,6 @@ a file that is there. It answers `"ready"` once the reader's good files were acc
 packages imported before anything is timed, and then `[index, outcome, detail]` for each case.
 """
 
-from __future__ import annotations
-
 import importlib
 import json
 import os
@@ -20,14 +18,10 @@ import unicodedata
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, TextIO
+from typing import TextIO
 
 from .limits import Limits, out_of_memory
-
-if TYPE_CHECKING:
-    from .readers import Reader
-
-__all__ = ["FAILURES", "Outcome", "judge"]
+from .reader import Reader
 
 ROOT = Path(__file__).resolve().parents[2]
 
