@@ -15,10 +15,8 @@ from PIL import Image
 
 from wlm.bench import Row, write_json
 from wlm.fluid.volume import from_array, save_volume
-from wlm.formats.dds import write_dds
 from wlm.formats.exr import write_exr
 from wlm.formats.gltf_writer import write_glb
-from wlm.formats.ktx2 import write_ktx2
 from wlm.probe.data import save_probes
 from wlm.smoke.baking import bake as bake_smoke
 from wlm.smoke.data import open_frames, write_six_way
@@ -32,7 +30,7 @@ _HEIGHT, _WIDTH = 12, 10  # of every picture
 def write_corpus(folder: Path) -> None:
     """Writes all files; the bytes of some depend on the versions of the libraries that pack them."""
     folder.mkdir(exist_ok=True)
-    for write in (_exrs, _pictures, _textures, _meshes, _probe_files, _volumes, _smoke, _settings):
+    for write in (_exrs, _pictures, _meshes, _probe_files, _volumes, _smoke, _settings):
         write(folder)
 
 
@@ -67,16 +65,6 @@ def _pictures(folder: Path) -> None:
     image.convert("P").save(folder / "mask-palette.png")
     image.save(folder / "flipbook.png")
     image.save(folder / "flipbook.tga", compression="tga_rle")
-
-
-def _textures(folder: Path) -> None:
-    half = _pixels(3).astype("<f2")
-    whole = np.concatenate([half, np.ones((_HEIGHT, _WIDTH, 1), "<f2")], 2)
-    blocks = np.random.default_rng(1).integers(0, 256, (2, 3, 3, 16)).astype(np.uint8)
-    write_ktx2(folder / "half.ktx2", half.tobytes(), _WIDTH, _HEIGHT, "R16G16B16_SFLOAT")
-    write_ktx2(folder / "bc6h.ktx2", blocks[0].tobytes(), _WIDTH, _HEIGHT, "BC6H_UFLOAT_BLOCK")
-    write_dds(folder / "half.dds", whole.tobytes(), _WIDTH, _HEIGHT, fmt="R16G16B16A16_FLOAT")
-    write_dds(folder / "volume.dds", blocks.tobytes(), _WIDTH, _HEIGHT, 2, fmt="BC7_UNORM")
 
 
 def _meshes(folder: Path) -> None:

@@ -242,8 +242,6 @@ HOSTILE: dict[str, tuple[Sequence[str], Write]] = {
             (".partial", "probe-checkpoint"),
             (".safetensors", "smoke-pool"),
             (".exr", "exr"),
-            (".ktx2", "ktx2"),
-            (".dds", "dds"),
             (".gltf", "gltf"),
             (".obj", "obj"),
             (".npz", "volume-npz"),

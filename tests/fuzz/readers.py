@@ -20,11 +20,9 @@ from wlm.atlas.exporter import geometry, read_folder
 from wlm.bench.rows import read_json
 from wlm.config import load_settings
 from wlm.fluid.volume import load_volume
-from wlm.formats.dds import read_dds
 from wlm.formats.exr import read_exr
 from wlm.formats.gltf import read_gltf
 from wlm.formats.gltf_writer import write_glb
-from wlm.formats.ktx2 import read_ktx2
 from wlm.formats.mask import read_mask
 from wlm.formats.obj import read_obj
 from wlm.probe.data import load_positions
@@ -64,16 +62,6 @@ def _six_way(path: Path) -> None:
     assert six.lightmaps.shape[1:] == (six.camera.height, six.camera.width), "accepted with another size"
 
 
-def _ktx2(path: Path) -> None:
-    texture = read_ktx2(path)
-    assert texture.width >= 1 and texture.height >= 1 and len(texture.data) <= path.stat().st_size, "too much data"
-
-
-def _dds(path: Path) -> None:
-    texture = read_dds(path)
-    assert texture.width >= 1 and texture.height >= 1 and len(texture.blocks) <= path.stat().st_size, "too much data"
-
-
 def _mask(path: Path) -> None:
     mask = read_mask(path, "light.exr", (12, 10))
     assert mask.shape == (12, 10) and mask.dtype == bool, f"accepted as {mask.dtype} {mask.shape}"
@@ -89,11 +77,6 @@ def _tga(draw: Random, data: bytes) -> bytes:
     # Lengths, kinds, colour map, origin, size, depth, flags.
     head = [(0, 1), (1, 1), (2, 1), (3, 2), (5, 2), (7, 1), (8, 2), (10, 2), (12, 2), (14, 2), (16, 1), (17, 1)]
     return vary_numbers(draw, data, head)
-
-
-def _words_of(header: int) -> Callable[[Random, bytes], bytes]:
-    """Changes the 32-bit fields of a header of some bytes."""
-    return lambda draw, data: vary_numbers(draw, data, [(at, 4) for at in range(4, min(header, len(data) - 3), 4)])
 
 
 # Meshes.
@@ -301,8 +284,6 @@ _ALL = (
     Reader("png-mask", "mask.png", corpus("mask-grey.png", "mask-palette.png", "mask-rgba.png"), vary_png, _mask),
     Reader("png-flipbook", "a.png", corpus("flipbook.png"), vary_png, _flipbook),
     Reader("tga-flipbook", "a.tga", corpus("flipbook.tga"), _tga, _flipbook),
-    Reader("ktx2", "a.ktx2", corpus("half.ktx2", "bc6h.ktx2"), _words_of(200), _ktx2),
-    Reader("dds", "a.dds", corpus("half.dds", "volume.dds"), _words_of(148), _dds),
     Reader("gltf", "a.gltf", corpus("mesh.gltf"), vary_gltf, _mesh, _light, cost=2),
     Reader("glb", "a.glb", corpus("mesh.glb"), vary_glb, _mesh, _light, cost=2),
     Reader(
