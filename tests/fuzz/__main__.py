@@ -15,6 +15,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from wlm.errors import WlmError
+
 from .campaign import Tally, campaign
 from .limits import Limits
 from .worker import FAILURES, ROOT
@@ -51,7 +53,7 @@ def main() -> int:
 
 
 def _one(reader: Any, index: int, target: Path | None) -> int:
-    """Writes a case, or reads it here and shows all that comes of it."""
+    """Writes a case, or reads it here; what it fails with is shown in full."""
     data = reader.case(index)
     if target is not None:
         target.write_bytes(data)
@@ -61,10 +63,13 @@ def _one(reader: Any, index: int, target: Path | None) -> int:
             (Path(folder) / name).write_bytes(content)
         path = Path(folder) / reader.file
         path.write_bytes(data)
-        with Limits().held():
-            # A traceback is what is looked for.
-            reader.read(path)
-    print("accepted")
+        try:
+            with Limits().held():
+                reader.read(path)
+        except WlmError as error:
+            print(f"refused: {error}")
+        else:
+            print("accepted")
     return 0
 
 
