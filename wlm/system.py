@@ -208,7 +208,10 @@ class Model:
             WlmError: What the file would hold can't be read again, NaN from a fit that diverged for example; or the
                 file can't be written. What was there before stays.
         """
-        settings, parts, source = self._encoded()
+        try:
+            settings, parts, source = self._encoded()
+        except WlmError as error:
+            raise WlmError(f"{path}: {error}") from error
         content = Artifact(self.SYSTEM, FORMAT_VERSION, settings, source, parts, {}, 0, 0)
         decode(f"{path}: not written", content, _room(self.SYSTEM, "codec").decode)
         return write_artifact(path, self.SYSTEM, settings, parts, source)

@@ -170,7 +170,12 @@ def test_a_folder_of_something_else(tmp_path):
         (tmp_path / "report.json").write_text(json.dumps(report | change))
         with pytest.raises(WlmError, match=words):
             exporter.read_folder(tmp_path)
-    for change, words in (({"triangles": 7}, "expected 7 triangles"), ({"uv_set": 4}, "TEXCOORD_4, found 0")):
+    for change, words in (
+        ({"triangles": 7}, "expected 7 triangles"),
+        ({"uv_set": 4}, "TEXCOORD_4, found 0"),
+        ({"uv_set": 4, "triangles": 0}, "TEXCOORD_4, found 0"),
+        ({"uv_set": [0]}, r"uv_set: expected a whole number, found \[0\]"),
+    ):
         (tmp_path / "report.json").write_text(json.dumps(report | change))
         with pytest.raises(WlmError, match=words):
             exporter.geometry(exporter.read_folder(tmp_path))

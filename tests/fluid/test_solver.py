@@ -237,6 +237,7 @@ def test_checkpoints_are_checked(device: str, tmp_path: Path):
             np.zeros((2, 2, 2), np.float32),
             r"density is float32 \(2, 2, 2\), expected float32 \(40, 20, 20\)",
         ),
+        ("density", np.full((40, 20, 20), -1, np.float32), "part density: expected numbers of at least 0, found -1"),
         ("lattice.populations", None, "part populations is missing"),
         ("placed", None, "part placed is missing"),
     ):

@@ -352,6 +352,7 @@ def test_files_that_are_no_lightmaps(tmp_path):
     refused(planes | {"top": planes["top"] * np.nan}, note, "channel top: expected finite numbers")
     refused(planes, None, "camera: expected that of bake")
     refused(planes, {"camera": {"extent": 1}}, "camera: expected that of bake")
+    refused(planes, {"camera": note["camera"] | {"up": [0, 10**400, 0]}}, "camera: expected that of bake")
     refused({k: v[:4] for k, v in planes.items()}, note, "expected the camera's 8 x 8 pixels")
     damaged = path.read_bytes()
     path.write_bytes(damaged[: len(damaged) // 2])

@@ -25,7 +25,7 @@ from wlm.atlas.coverage import touched_texels
 from wlm.atlas.data import LightmappedMesh, from_arrays, load, write_mesh
 from wlm.atlas.model import LUT_STEPS, AtlasModel, disk_ratio
 from wlm.atlas.shader import atlas_glsl
-from wlm.errors import WlmError
+from wlm.errors import WlmError, one_line
 from wlm.formats.atomic import atomic_write
 from wlm.formats.dds import write_dds
 from wlm.formats.exr import write_exr
@@ -162,10 +162,12 @@ def geometry(output: Output) -> LightmappedMesh:
         WlmError: mesh.glb, or a mask that the report names, is missing, damaged, or not of this model.
     """
     path, number = output.folder / MESH_FILE, output.report.get("uv_set")
+    if type(number) is not int:
+        raise WlmError(f"{output.folder / REPORT_FILE}: uv_set: expected a whole number, found {one_line(number, 60)}")
     _, primitives = read_gltf(path)
     parts = [each for each in primitives if number in each.uv]
     triangles, expected = sum(len(each.triangle) for each in parts), output.report.get("triangles")
-    if triangles != expected:
+    if triangles != expected or not triangles:
         raise WlmError(f"{path}: expected {expected} triangles with TEXCOORD_{number}, found {triangles}")
     first = np.cumsum([0, *(len(each.position) for each in parts)])
     model, mask, files = output.model, None, output.report.get("bytes")

@@ -368,7 +368,7 @@ class Solver:
             if (stored := artifact.settings.get(name)) != value:
                 raise WlmError(f"{path}: {name}: expected {value}, found {stored}: a checkpoint of another simulation")
         state, now = artifact.tensors, self._fields[0]
-        field = Part(wp.dtype_to_numpy(self.density.dtype), self.density.shape)
+        field = Part(wp.dtype_to_numpy(self.density.dtype), self.density.shape, least=0)
         # NaN before the first step: no obstacle is placed yet.
         nowhere = np.isnan(state.get("placed", 0.0)).all()
         table = {"density": field, "placed": Part(np.float64, self._placed.shape, finite=not nowhere)}
@@ -376,7 +376,7 @@ class Solver:
             table["temperature"] = field
         air = {name.removeprefix("lattice."): v for name, v in state.items() if name.startswith("lattice.")}
         try:
-            check_parts({name: v for name, v in state.items() if not name.startswith("lattice.")}, table)
+            parts = check_parts({name: v for name, v in state.items() if not name.startswith("lattice.")}, table)
         except ValueError as error:
             raise WlmError(f"{path}: {error}") from error
         try:
@@ -386,10 +386,10 @@ class Solver:
         for fields in self._fields[1:]:
             fields.density.zero_()
             fields.temperature.zero_()
-        now.density.assign(state["density"].ravel())
+        now.density.assign(parts["density"].ravel())
         if self.temperature is not None:
-            now.temperature.assign(state["temperature"].ravel())
-        self._placed = np.array(state["placed"])
+            now.temperature.assign(parts["temperature"].ravel())
+        self._placed = np.array(parts["placed"])
         self._done = self.steps
         if self.obstacles:
             # The lattice of a state before the first step has no solid yet.

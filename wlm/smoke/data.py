@@ -300,7 +300,7 @@ def read_six_way(path: str | os.PathLike[str], device: str = "cpu") -> SixWay:
         # JSON has lists for tuples.
         fields = {key: tuple(value) if isinstance(value, list) else value for key, value in note["camera"].items()}
         camera = Camera(**fields)
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
+    except (AttributeError, KeyError, TypeError, ValueError, OverflowError) as error:
         raise WlmError(f"{path}: header attribute wlm: camera: expected that of bake: {error}") from error
     size = next(iter(planes.values())).shape
     if size != (camera.height, camera.width):

@@ -1,0 +1,14 @@
+"""Fuzzing of every reader of files: seeded changes of good files, each read within a time and a memory limit.
+
+    mutate.py      changes of bytes, numbers, JSON, text and arrays
+    containers.py  the same inside a container, which is closed again: digests, CRCs, lengths
+    readers.py     the table of readers: what a case is made of, how it is read, what an accepted one must be
+    models.py      those of artifacts and checkpoints
+    corpus.py      the small good files in `corpus/`, and how they are made
+    worker.py      a process that runs cases; limits.py, its limits
+    campaign.py    workers for many cases, and the table of counts
+    __main__.py    `python -m tests.fuzz`
+
+A case depends on its reader's name and its index alone. It must be accepted, or be refused with one `WlmError` of one
+line; an accepted one must be what docs/formats.md says. Anything else is a failure.
+"""

@@ -1,0 +1,101 @@
+"""Runs cases by hand.
+
+python -m tests.fuzz READER INDEX [--write FILE]    makes a case again, and reads it
+python -m tests.fuzz --cases 20000 --json FILE      many cases of all readers, with a table of counts
+python -m tests.fuzz --corpus                       makes the files of `corpus/` again
+"""
+
+import argparse
+import json
+import os
+import sys
+import tempfile
+import time
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from wlm.errors import WlmError
+
+from .campaign import Tally, campaign
+from .limits import Limits
+from .worker import FAILURES, ROOT
+
+_ROW = "{:26} {:>9} {:>9} {:>9} {:>9}"
+
+
+def main() -> int:
+    """Runs what the command line asks for; 1 where a case failed."""
+    parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description="Fuzz the readers of files.")
+    parser.add_argument("reader", nargs="?", help="the reader of one case")
+    parser.add_argument("index", nargs="?", type=int, help="its index")
+    parser.add_argument("--write", type=Path, metavar="FILE", help="write the case there instead of reading it")
+    parser.add_argument("--cases", type=int, metavar="N", help="cases a reader")
+    parser.add_argument("--first", type=int, default=0, metavar="INDEX", help="index of each reader's first case")
+    parser.add_argument("--readers", nargs="+", metavar="READER", help="these readers alone")
+    parser.add_argument("--workers", type=int, default=os.cpu_count(), metavar="N", help="processes")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the counts there")
+    parser.add_argument("--corpus", action="store_true", help="make the corpus again")
+    words = parser.parse_args()
+    sys.path.append(str(ROOT / "tests"))
+    os.environ.setdefault("WARP_CACHE_PATH", str(ROOT / ".cache" / "warp-main"))
+    if words.corpus:
+        import_module("tests.fuzz.corpus").write_corpus(Path(__file__).parent / "corpus")
+        return 0
+    readers = import_module("tests.fuzz.readers").READERS
+    unknown = {*(words.readers or ()), *filter(None, [words.reader])} - readers.keys()
+    if unknown or (words.cases is None and words.index is None):
+        parser.error(f"expected a reader and an index, or --cases; readers are {', '.join(readers)}")
+    if words.cases is None:
+        return _one(readers[words.reader], words.index, words.write)
+    counts = {name: max(words.cases // readers[name].cost, 1) for name in words.readers or readers}
+    return _many(counts, words)
+
+
+def _one(reader: Any, index: int, target: Path | None) -> int:
+    """Writes a case, or reads it here; what it fails with is shown in full."""
+    data = reader.case(index)
+    if target is not None:
+        target.write_bytes(data)
+        return 0
+    with tempfile.TemporaryDirectory(prefix="wlm-fuzz-") as folder:
+        for name, content in reader.beside().items():
+            (Path(folder) / name).write_bytes(content)
+        path = Path(folder) / reader.file
+        path.write_bytes(data)
+        try:
+            with Limits().held():
+                reader.read(path)
+        except WlmError as error:
+            print(f"refused: {error}")
+        else:
+            print("accepted")
+    return 0
+
+
+def _many(counts: dict[str, int], words: argparse.Namespace) -> int:
+    print(_ROW.format("reader", "cases", "refused", "accepted", "failed"), flush=True)
+
+    def show(name: str, tally: Tally) -> None:
+        figures = tally.to_json()
+        print(_ROW.format(name, *(figures[key] for key in ("cases", "refused", "accepted", "failed"))), flush=True)
+        for each in figures["failures"]:
+            line = ascii(each["detail"])[1:-1].replace("\\\\", "\\")[:160]
+            print(f"    {each['count']} x {each['kind']}, first {each['index']}: {line}", flush=True)
+
+    begin = time.perf_counter()
+    tallies = campaign(counts, words.workers, first=words.first, done=show)
+    seconds = time.perf_counter() - begin
+    rows = {name: tally.to_json() for name, tally in tallies.items()}
+    sums = {key: sum(row[key] for row in rows.values()) for key in ("cases", "refused", "accepted", "failed")}
+    print(_ROW.format(f"all, in {seconds:.0f} s", *sums.values()))
+    if words.json is not None:
+        kinds = {kind: sum(tally.counts[kind] for tally in tallies.values()) for kind in FAILURES}
+        result = {"first": words.first, "seconds": round(seconds, 1)} | sums | {"kinds": kinds, "readers": rows}
+        words.json.parent.mkdir(parents=True, exist_ok=True)
+        words.json.write_text(json.dumps(result, indent=1) + "\n")
+    return 1 if sums["failed"] else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

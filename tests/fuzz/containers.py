@@ -1,0 +1,312 @@
+"""Changes inside containers, which are then closed as their writers close them: digests, CRCs, lengths, offsets.
+
+A blind change seldom gets past a digest or a CRC, so whatever is behind them needs these. Anyone can make such files.
+"""
+
+import base64
+import hashlib
+import io
+import json
+import struct
+import zipfile
+import zlib
+from collections.abc import Callable, Sequence
+from random import Random
+from typing import Any
+
+import numpy as np
+from numpy.lib import format as npy
+
+from .mutate import corrupt, vary_array, vary_json, vary_numbers
+
+# Artifacts.
+
+_TYPES = {"BOOL": "?", "U8": "u1", "I8": "i1", "U16": "<u2", "I16": "<i2", "F16": "<f2", "U32": "<u4", "I32": "<i4"}
+_TYPES |= {"F32": "<f4", "U64": "<u8", "I64": "<i8", "F64": "<f8"}
+_TYPE_NAMES = {np.dtype(kind): name for name, kind in _TYPES.items()}
+_QUOTES = str.maketrans({'"': "'", "'": '"'})
+_NAMES = (
+    "x",
+    "uv",
+    "lut",
+    "kind",
+    "times",
+    "colour",
+    "finished.0.uv",
+    "running.0.step",
+    "running.1.x",
+    "running.x",
+    "",
+)
+
+
+def _open_artifact(data: bytes) -> tuple[dict[str, Any], bytes]:
+    """The header's JSON and the bytes of all parts."""
+    length = struct.unpack_from("<Q", data)[0]
+    return json.loads(data[8 : 8 + length]), data[8 + length :]
+
+
+def _sign(header: Any, body: bytes) -> bytes:
+    """An artifact of a header, whatever it says, with the digest that fits it."""
+    metadata = header.get("__metadata__") if isinstance(header, dict) else None
+    digest = "0" * 32
+    if isinstance(metadata, dict) and isinstance(metadata.get("wlm"), str) and metadata["wlm"].count(" ") == 3:
+        metadata["wlm"] = f"{metadata['wlm'].rpartition(' ')[0]} {digest}"
+    text = json.dumps(header, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 8)
+    head = struct.pack("<Q", len(text)) + text
+    actual = hashlib.blake2b(head + body, digest_size=16).hexdigest()
+    return head.replace(f' {digest}"'.encode(), f' {actual}"'.encode(), 1) + body
+
+
+def vary_artifact(draw: Random, data: bytes) -> bytes:
+    """Changes settings, parts, the header or the parts' bytes, and signs the whole again."""
+    kind = draw.randrange(8)
+    if kind <= 1:
+        header, body = _open_artifact(data)
+        return _sign(vary_json(draw, header), body) if kind else _sign(header, corrupt(draw, body))
+
+    def change(settings: Any, parts: dict[str, np.ndarray]) -> Any:
+        if kind >= 4:
+            for _ in range(draw.choice((1, 1, 2))):
+                name, what = draw.choice(sorted(parts) or ["x"]), draw.randrange(8)
+                if what == 0:
+                    parts.pop(name, None)
+                elif what == 1:
+                    parts[draw.choice(_NAMES)] = parts.get(name, np.zeros(3, np.float32))
+                elif name in parts:
+                    parts[name] = vary_array(draw, parts[name])
+        return vary_json(draw, settings) if kind <= 4 else settings
+
+    return edit_artifact(data, change)
+
+
+def edit_artifact(data: bytes, change: Callable[[Any, dict[str, np.ndarray]], Any]) -> bytes:
+    """An artifact with other settings, which `change` returns, and the parts as `change` leaves them; signed."""
+    header, body = _open_artifact(data)
+    metadata = header.pop("__metadata__")
+    parts = {}
+    for name, entry in header.items():
+        begin, end = entry["data_offsets"]
+        parts[name] = np.frombuffer(body[begin:end], _TYPES[entry["dtype"]]).reshape(entry["shape"])
+    settings = change(json.loads(metadata["settings"].translate(_QUOTES)), parts)
+    return _pack_artifact(metadata["wlm"], settings, parts)
+
+
+def _pack_artifact(words: str, settings: Any, parts: dict[str, np.ndarray]) -> bytes:
+    header: dict[str, Any] = {
+        "__metadata__": {"wlm": words, "settings": json.dumps(settings, separators=(",", ":")).translate(_QUOTES)}
+    }
+    body = b""
+    for name, array in sorted(parts.items(), key=lambda item: -item[1].dtype.itemsize):
+        if array.dtype not in _TYPE_NAMES:
+            array = np.frombuffer(array.tobytes(), np.uint8)
+        raw = array.tobytes()
+        offsets = [len(body), len(body) + len(raw)]
+        header[name] = {"dtype": _TYPE_NAMES[array.dtype], "shape": list(array.shape), "data_offsets": offsets}
+        body += raw
+    return _sign(header, body)
+
+
+# NumPy archives.
+
+_WRONG_HEADERS = (
+    "(((((",
+    "\n  x\n y",
+    "{}",
+    "[1]",
+    "{'descr': '<f4', 'fortran_order': False, 'shape': (99999999999999999999,), }",
+    "{'descr': '<f4', 'fortran_order': False, 'shape': (999999999999,), }",
+    "{'descr': '<f4', 'fortran_order': True, 'shape': (2, -3), }",
+    "{'descr': '<f4', 'fortran_order': False, 'shape': (True, 2.5), }",
+    "{'descr': '|O', 'fortran_order': False, 'shape': (3,), }",
+    "{'descr': 'x', 'fortran_order': 3, 'shape': (3,), }",
+    "{'descr': ('<f4', (100000, 100000)), 'fortran_order': False, 'shape': (3,), }",
+    "{b'a': 1, 'descr': '<f4', 'fortran_order': False, 'shape': (3,)}",
+    "{'descr': [('a', '<f4'), ('b', 'O')], 'fortran_order': False, 'shape': (3,), }",
+    "{'descr': '<f4', 'fortran_order': False, 'shape': " + "(" * 300 + ")" * 300 + ", }",
+    "9" * 5000,
+)
+_OBJECTS = (
+    np.array([None, {}], object),
+    np.array("x"),
+    np.array(["a", "b"]),
+    np.zeros(2, [("a", "f4")]),
+    np.float64(3),
+)
+
+
+def _member(array: np.ndarray) -> bytes:
+    """A `.npy` file."""
+    buffer = io.BytesIO()
+    npy.write_array(buffer, np.asanyarray(array))
+    return buffer.getvalue()
+
+
+def vary_npz(draw: Random, data: bytes) -> bytes:
+    """Changes members of an archive: their arrays, headers, bytes or names; every CRC is right."""
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    # Each at most once: what has been changed may be no array any more.
+    for name in draw.sample(sorted(members), min(draw.choice((1, 1, 2)), len(members))):
+        content, kind = members[name], draw.randrange(9)
+        if kind <= 3:
+            content = _member(vary_array(draw, npy.read_array(io.BytesIO(content))))
+        elif kind == 4:
+            text = draw.choice(_WRONG_HEADERS).encode()
+            content = b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text + bytes(64)
+        elif kind == 5:
+            content = _member(draw.choice(_OBJECTS))
+        elif kind == 6:
+            content = corrupt(draw, content)
+        elif kind == 7:
+            members.pop(name)
+            name = draw.choice(("x.npy", "sh.npy", "sh_x.npy", name[:-4], f"../{name}", "position", "\u202e.npy"))
+        else:
+            # Bytes without an array's header, or nothing.
+            content = draw.choice((b"", b"xx", content[:9], content[:64]))
+        members[name] = content
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", draw.choice((zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED))) as archive:
+        for name, content in members.items():
+            # A fixed date: a case is the same on every day.
+            archive.writestr(zipfile.ZipInfo(name, (2000, 1, 1, 0, 0, 0)), content)
+    result = buffer.getvalue()
+    # The flags, the method and the sizes that the directory states.
+    return vary_numbers(draw, result, _zip_fields(result)) if draw.random() < 0.2 else result
+
+
+def _zip_fields(data: bytes) -> list[tuple[int, int]]:
+    places = []
+    for magic, fields in (
+        (b"PK\x03\x04", ((6, 2), (8, 2), (18, 4), (22, 4), (26, 2), (28, 2))),
+        (b"PK\x01\x02", ((8, 2), (10, 2), (20, 4), (24, 4), (28, 2), (42, 4))),
+        (b"PK\x05\x06", ((8, 2), (10, 2), (12, 4), (16, 4), (20, 2))),
+    ):
+        at = data.find(magic)
+        while at >= 0:
+            places += [(at + offset, width) for offset, width in fields if at + offset + width <= len(data)]
+            at = data.find(magic, at + 4)
+    return places
+
+
+# glTF.
+
+
+def vary_gltf(draw: Random, data: bytes) -> bytes:
+    """Changes the JSON of a `.gltf`, or what a buffer inside it holds."""
+    content = json.loads(data)
+    if draw.random() < 0.15:
+        buffer = draw.choice(content["buffers"])
+        head, _, body = buffer["uri"].partition(",")
+        buffer["uri"] = f"{head},{base64.b64encode(corrupt(draw, base64.b64decode(body))).decode()}"
+    else:
+        content = vary_json(draw, content)
+    return json.dumps(content).encode()
+
+
+def vary_glb(draw: Random, data: bytes) -> bytes:
+    """Changes the JSON or the binary chunk of a `.glb`; the lengths fit."""
+    size = struct.unpack_from("<I", data, 12)[0]
+    text, binary = data[20 : 20 + size], data[28 + size :]
+    if draw.random() < 0.2:
+        binary = corrupt(draw, binary)
+    else:
+        text = json.dumps(vary_json(draw, json.loads(text))).encode()
+    text += b" " * (-len(text) % 4)
+    binary += b"\0" * (-len(binary) % 4)
+    chunks = struct.pack("<2I", len(text), 0x4E4F534A) + text + struct.pack("<2I", len(binary), 0x004E4942) + binary
+    return b"glTF" + struct.pack("<2I", 2, 12 + len(chunks)) + chunks
+
+
+# OpenEXR.
+
+_WINDOWS = (0, -1, 1, 15, 16, 4095, 32767, 65535, 1 << 20, 1 << 24, 1 << 30, (1 << 31) - 1, -(1 << 30), -(1 << 31))
+_KINDS = ("box2i", "chlist", "compression", "float", "int", "lineOrder", "string", "v2f", "tiledesc", "x")
+
+
+def vary_exr(draw: Random, data: bytes, note: str = "") -> bytes:
+    """Changes attributes of an EXR's header; their lengths and the offsets of the pixels fit.
+
+    Args:
+        draw: The source of all choices.
+        data: A file of one part.
+        note: Name of an attribute of JSON, which is what is changed most often.
+    """
+    attributes, at = [], 8
+    while data[at]:
+        name, kind, rest = data[at:].split(b"\0", 2)
+        at += len(name) + len(kind) + 2
+        size = struct.unpack("<I", rest[:4])[0]
+        attributes.append([name, kind, rest[4 : 4 + size]])
+        at += 4 + size
+    table = at + 1
+    for each in attributes:
+        if each[0] == note.encode() and draw.random() < 0.7:
+            each[2] = json.dumps(vary_json(draw, json.loads(each[2]))).encode()
+    for _ in range(draw.choice((0, 1, 1) if note else (1, 1, 2))):
+        chosen, kind = draw.choice(attributes), draw.randrange(8)
+        if kind == 0 and len(attributes) > 1:
+            attributes.remove(chosen)
+        elif kind == 1:
+            attributes.append(list(draw.choice(attributes)))
+        elif kind == 2:
+            chosen[draw.randrange(2)] = draw.choice((*_KINDS, chosen[0].decode("latin-1"))).encode("latin-1")
+        elif kind <= 5 and chosen[1] == b"box2i" and len(chosen[2]) == 16:
+            window = list(struct.unpack("<4i", chosen[2]))
+            for _ in range(draw.choice((1, 2, 2, 4))):
+                window[draw.randrange(4)] = draw.choice(_WINDOWS)
+            chosen[2] = struct.pack("<4i", *window)
+        else:
+            chosen[2] = corrupt(draw, chosen[2])
+    header = b"".join(
+        name + b"\0" + kind + b"\0" + struct.pack("<I", len(value)) + value for name, kind, value in attributes
+    )
+    moved = 8 + len(header) + 1 - table
+    body = bytearray(data[table:])
+    for place in range(0, struct.unpack_from("<Q", data, table)[0] - table, 8):
+        struct.pack_into("<Q", body, place, struct.unpack_from("<Q", body, place)[0] + moved)
+    return data[:8] + header + b"\0" + bytes(body)
+
+
+# PNG.
+
+
+def vary_png(draw: Random, data: bytes) -> bytes:
+    """Changes chunks of a PNG; every CRC is right."""
+    chunks, at = [], 8
+    while at + 12 <= len(data):
+        size = struct.unpack_from(">I", data, at)[0]
+        chunks.append((data[at + 4 : at + 8], data[at + 8 : at + 8 + size]))
+        at += 12 + size
+    for _ in range(draw.choice((1, 1, 2))):
+        number, kind = draw.randrange(len(chunks)), draw.randrange(6)
+        name, content = chunks[number]
+        if kind == 0 and len(chunks) > 1:
+            del chunks[number]
+        elif kind == 1:
+            chunks.insert(number, draw.choice(chunks))
+        elif kind == 2:
+            name = draw.choice(
+                (b"IHDR", b"PLTE", b"IDAT", b"IEND", b"tRNS", b"zTXt", b"iCCP", b"acTL", b"eXIf", b"xxxx")
+            )
+            chunks.insert(number, (name, draw.choice((b"", content, b"x\0\0" + zlib.compress(bytes(1 << 20))))))
+        elif name == b"IDAT" and kind == 3:
+            chunks[number] = (name, zlib.compress(corrupt(draw, _inflated(content))))
+        elif name == b"IHDR":
+            # Width, height, depth, colour, compression, filter, interlace.
+            places = ((0, 4), (4, 4), (8, 1), (9, 1), (10, 1), (11, 1), (12, 1))
+            chunks[number] = (name, vary_numbers(draw, content, places))
+        else:
+            chunks[number] = (name, corrupt(draw, content))
+    return data[:8] + b"".join(
+        struct.pack(">I", len(content)) + name + content + struct.pack(">I", zlib.crc32(name + content))
+        for name, content in chunks
+    )
+
+
+def _inflated(data: Sequence[int] | bytes) -> bytes:
+    try:
+        return zlib.decompress(data)
+    except zlib.error:
+        return b""

@@ -1,0 +1,177 @@
+"""The good files in `corpus/`, each made by our own writer of its format and as small as still has every feature."""
+
+import base64
+import gzip
+import json
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+import torch
+import warp as wp
+from builders import atlas_meshes, bench_rows, probe_sets, smoke_plumes
+from builders.godot_bakes import Writer, bake, probes
+from PIL import Image
+
+from wlm.bench import Row, write_json
+from wlm.fluid.volume import from_array, save_volume
+from wlm.formats.exr import write_exr
+from wlm.formats.gltf_writer import write_glb
+from wlm.probe.data import save_probes
+from wlm.smoke.baking import bake as bake_smoke
+from wlm.smoke.data import open_frames, write_six_way
+from wlm.smoke.learn.pool import Pool, save_pool
+from wlm.smoke.learn.settings import DatasetSettings
+from wlm.smoke.scene import Scene
+
+_HEIGHT, _WIDTH = 12, 10  # of every picture
+
+
+def write_corpus(folder: Path) -> None:
+    """Writes all files; the bytes of some depend on the versions of the libraries that pack them."""
+    folder.mkdir(exist_ok=True)
+    for write in (_exrs, _pictures, _meshes, _probe_files, _volumes, _smoke, _settings):
+        write(folder)
+
+
+def _pixels(channels: int) -> np.ndarray:
+    """float32 [12, 10, channels], 0 to 1: a gradient with some noise."""
+    y, x = np.mgrid[:_HEIGHT, :_WIDTH]
+    ramp = (y[..., None] + 2 * x[..., None] + np.arange(channels)) / 40
+    return (0.9 * ramp + 0.1 * np.random.default_rng(0).random((_HEIGHT, _WIDTH, channels))).astype(np.float32)
+
+
+def _exrs(folder: Path) -> None:
+    write_exr(folder / "light.exr", _pixels(3))
+    planes = dict(zip("RGBA", np.moveaxis(_pixels(4), -1, 0), strict=True))
+    for name, compression, kind, dtype in (
+        ("zip", OpenEXR.ZIP_COMPRESSION, OpenEXR.scanlineimage, np.float32),
+        ("piz", OpenEXR.PIZ_COMPRESSION, OpenEXR.scanlineimage, np.float16),
+        ("b44", OpenEXR.B44_COMPRESSION, OpenEXR.scanlineimage, np.float16),
+        ("dwaa", OpenEXR.DWAA_COMPRESSION, OpenEXR.scanlineimage, np.float16),
+        ("tiled", OpenEXR.RLE_COMPRESSION, OpenEXR.tiledimage, np.float16),
+    ):
+        header = {"compression": compression, "type": kind}
+        if kind == OpenEXR.tiledimage:
+            header["tiles"] = OpenEXR.TileDescription()
+        content = {channel: np.ascontiguousarray(plane, dtype) for channel, plane in planes.items()}
+        OpenEXR.File(header, content).write(str(folder / f"{name}.exr"))
+
+
+def _pictures(folder: Path) -> None:
+    image = Image.fromarray(np.uint8(255 * _pixels(4)), "RGBA")
+    image.save(folder / "mask-rgba.png")
+    image.convert("L").point(lambda value: 255 * (value > 90)).save(folder / "mask-grey.png")
+    image.convert("P").save(folder / "mask-palette.png")
+    image.save(folder / "flipbook.png")
+    image.save(folder / "flipbook.tga", compression="tga_rle")
+
+
+def _meshes(folder: Path) -> None:
+    sheet = atlas_meshes.sheet(quads=2)
+    write_glb(folder / "mesh.glb", sheet.document, [], 1)
+    corners = [(0, 0), (1, 0), (0, 1), (1, 1)]
+    lines = ["# a square", "o square"]
+    lines += [f"v {x} {y} 0.5" for x, y in corners] + [f"vt {x} {y}" for x, y in corners]
+    lines += ["vn 0 0 1", "g all", "usemtl white", "f 1/1/1 2/2/1 4/4/1 \\", "  3/3/1", "f -4/-4 -3/-3 -1/-1", ""]
+    (folder / "mesh.obj").write_text("\n".join(lines))
+    (folder / "mesh.gltf").write_text(json.dumps(_gltf()))
+    report = {"format": "wlm-atlas", "version": 1, "source": "2ff375949fdc4fb2", "uv_set": 0, "bytes": {"mesh.glb": 1}}
+    report |= {"triangles": len(sheet.triangle), "inputs": {"mesh": "mesh.glb", "lightmap": "light.exr"}}
+    (folder / "report.json").write_text(json.dumps(report))
+
+
+def _gltf() -> dict:
+    """A square twice, below nodes that turn and mirror it; strided, normalised, sparse and absent accessors."""
+    corner = np.array([[0, 0], [1, 0], [0, 1], [1, 1]])
+    vertices = np.zeros(4, [("position", "<3f4"), ("uv", "<2u2")])
+    vertices["position"][:, :2], vertices["uv"] = corner, 65535 * corner
+    index, at, moved = np.array([0, 1, 3, 0, 3, 2], "<u2"), np.array([1, 3], "<u2"), np.ones((2, 3), "<f4")
+    pieces = [vertices.tobytes(), index.tobytes(), at.tobytes(), moved.tobytes()]
+    views, start = [], 0
+    for number, piece in enumerate(pieces):
+        views.append(
+            {"buffer": 0, "byteOffset": start, "byteLength": len(piece)} | ({} if number else {"byteStride": 16})
+        )
+        start += len(piece)
+    sparse = {"indices": {"bufferView": 2, "componentType": 5123}, "values": {"bufferView": 3}, "count": 2}
+    accessors = [
+        {"bufferView": 0, "componentType": 5126, "count": 4, "type": "VEC3", "min": [0, 0, 0], "max": [1, 1, 0]},
+        {"bufferView": 0, "byteOffset": 12, "componentType": 5123, "normalized": True, "count": 4, "type": "VEC2"},
+        {"bufferView": 1, "componentType": 5123, "count": 6, "type": "SCALAR"},
+        {"componentType": 5126, "count": 4, "type": "VEC3", "sparse": sparse},
+    ]
+    attributes = {"POSITION": 0, "TEXCOORD_0": 1, "TEXCOORD_1": 1, "NORMAL": 3}
+    primitives = [{"attributes": attributes, "indices": 2, "material": 0}, {"attributes": attributes, "mode": 5}]
+    primitives[0]["targets"] = [{"POSITION": 3}]
+    body = base64.b64encode(b"".join(pieces)).decode()
+    return {
+        "asset": {"version": "2.0"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [
+            {"children": [1, 2], "scale": [2, -1, 1], "rotation": [0, 0, 0.6, 0.8]},
+            {"mesh": 0, "translation": [1, 2, 3], "name": "left"},
+            {"mesh": 0, "matrix": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 4, 5, 6, 1], "extras": {"lit": True}},
+        ],
+        "meshes": [{"primitives": primitives, "weights": [0.5]}],
+        "materials": [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0, "texCoord": 0}}}],
+        "textures": [{"source": 0}],
+        "images": [{"uri": "image.png"}],
+        "animations": [
+            {
+                "channels": [{"sampler": 0, "target": {"node": 1, "path": "translation"}}],
+                "samplers": [{"input": 2, "output": 3}],
+            }
+        ],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": start, "uri": f"data:application/octet-stream;base64,{body}"}],
+    }
+
+
+def _probe_files(folder: Path) -> None:
+    room = probe_sets.synthetic(6, coefficients=4)
+    for name in ("probes.npz", "probes.json"):
+        save_probes(folder / name, room.position, room.values)
+    points, sh = probes(4)
+    each = [{"position": place, "sh": light} for place, light in zip(points.tolist(), sh.tolist(), strict=True)]
+    (folder / "probes-list.json").write_text(json.dumps({"convention": "godot", "probes": each}))
+    writer = Writer()
+    (folder / "probes.lmbake").write_bytes(writer.file(bake(writer, points, sh)))
+    np.savez(folder / "positions.npz", position=room.position)
+    (folder / "positions.json").write_text(json.dumps(room.position.round(3).tolist()))
+
+
+def _volumes(folder: Path) -> None:
+    density = np.random.default_rng(0).random((6, 5, 7)).astype(np.float16)
+    volume = from_array(density, voxel=0.25, origin=(1.0, 2.0, 3.0), temperature=density**2)
+    save_volume(folder / "volume.npz", volume)
+    grid = wp.Volume.load_from_numpy(density.astype(np.float32), (1.0, 2.0, 3.0), 0.5, 0.0, device="cpu")
+    grid.save_to_nvdb(folder / "cloud.nvdb")
+    # A node near the root has room for thousands of children: almost all of the file is zeros.
+    (folder / "cloud.nvdb.gz").write_bytes(gzip.compress((folder / "cloud.nvdb").read_bytes(), mtime=0))
+    (folder / "cloud.nvdb").unlink()
+
+
+def _smoke(folder: Path) -> None:
+    plume = smoke_plumes.plume(hot=True)
+    write_six_way(folder / "six-way.exr", bake_smoke(plume, smoke_plumes.facing(plume, size=12), estimate=False))
+    guides, targets = (torch.linspace(0, 1, 2 * planes * 16).reshape(1, 2, planes, 4, 4).half() for planes in (3, 8))
+    pool = Pool(guides, targets, torch.zeros(1, 2, 4, 4).half(), torch.zeros(1, dtype=torch.int64))
+    save_pool(folder / "pool.safetensors", pool, DatasetSettings(), "seed-0")
+    scene = Scene.model_validate(smoke_plumes.SCENE | {"obstacles": [smoke_plumes.SPHERE], "frames": 1})
+    open_frames(folder / "frames", scene)
+    (folder / "frames" / "scene.json").rename(folder / "scene.json")
+    (folder / "frames").rmdir()
+
+
+def _settings(folder: Path) -> None:
+    lightmaps = [{"time_hours": 2.5 * i, "file": f"{name}.exr"} for i, name in enumerate("ab")]
+    content = {"name": "day", "width": _WIDTH, "height": _HEIGHT, "period_hours": 24, "mask": "mask.png"}
+    (folder / "set.json").write_text(json.dumps(content | {"lightmaps": lightmaps}))
+    (folder / "dataset.yaml").write_text(
+        "cells: 20\nguide: six\nzoom: [0.8, 1.2]\nmoving: 0.25\nleast_coverage: 0.01\n"
+    )
+    row = Row("lightmap", "room", "ours", "M", {"psnr": 41.5, "bpp": 0.7})
+    write_json(folder / "rows.json", [row], bench_rows.ENVIRONMENT)

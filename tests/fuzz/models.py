@@ -1,0 +1,264 @@
+"""Readers of artifacts: the models of the four systems, the checkpoints of their fits, and pools of samples."""
+
+import functools
+import tempfile
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+import torch
+
+import wlm
+from wlm.errors import WlmError
+from wlm.lightmap import fit as lightmap_fit
+from wlm.probe import fit as probe_fit
+from wlm.smoke.learn.pool import load_pool
+from wlm.system import Meter
+
+from .containers import vary_artifact
+from .reader import Reader, check_digest, check_finite, corpus, stored
+
+
+def _lightmap(path: Path) -> None:
+    model = wlm.load(path, "lightmap")
+    check_digest(path)
+    check_finite(**model.parts, times=model.times)
+    frame = model.decoder().frame(float(model.times.mean()))
+    check_finite(frame=frame)
+    assert frame.shape == (model.height, model.width, 3) and (frame >= 0).all(), "decodes to another size, or below 0"
+
+
+def _probe(path: Path) -> None:
+    model = wlm.load(path, "probe")
+    check_digest(path)
+    check_finite(bounds=model.bounds, net=model.net, origin=model.origin, extent=model.extent, gain=model.gain)
+    places = np.linspace(0.0, 1.0, 8)[:, None]
+    with np.errstate(over="ignore"):
+        position = model.origin + model.extent * model.size * places
+    if np.isfinite(position).all():
+        check_finite(values=model.decoder().decode(position))
+
+
+def _atlas(path: Path) -> None:
+    model = wlm.load(path, "atlas")
+    check_digest(path)
+    check_finite(texels=model.texels, uv=model.uv)
+    generator = torch.Generator().manual_seed(0)
+    light = model.decoder().read(torch.rand(64, 2, generator=generator))
+    check_finite(light=light)
+    assert (light >= 0).all(), "decodes to negative light"
+
+
+def _network(path: Path) -> None:
+    model = wlm.load(path, "smoke-network")
+    check_digest(path)
+    check_finite(**model.network.state_dict())
+    guide = torch.linspace(0.0, 1.0, 3 * 16 * 16).reshape(3, 16, 16)
+    if model.settings.guide == "paper":
+        planes = model.decoder(height=16, width=16)(guide)
+        assert planes.shape == (8, 16, 16), f"decodes to {tuple(planes.shape)}"
+
+
+def _pool(path: Path) -> None:
+    pool = load_pool(path)
+    check_digest(path)
+    parts = {"guides": pool.guides, "targets": pool.targets, "motion": pool.motion}
+    check_finite(**parts)
+    assert all(part.dtype == torch.half for part in parts.values()), "accepted parts that aren't half floats"
+    assert pool.sequence.dtype == torch.int64, "accepted sequences that aren't 64-bit"
+
+
+# Checkpoints: a fit goes on from each, to its end.
+
+
+def _bytes_of(make: Any) -> bytes:
+    """The content of the file `x.partial` that `make` writes for the output `x` in an empty folder."""
+    with tempfile.TemporaryDirectory() as folder:
+        make(Path(folder) / "x")
+        return (Path(folder) / "x.partial").read_bytes()
+
+
+def _stop(progress: Any) -> None:
+    raise KeyboardInterrupt
+
+
+def _interrupted(fit: Any) -> None:
+    """Runs a fit until its first report, after which it stops with a checkpoint."""
+    with patch.object(Meter, "due", lambda self, done: True), suppress(KeyboardInterrupt):
+        fit(_stop)
+
+
+def _again(model: Any, path: Path) -> None:
+    """What a fit makes of an accepted checkpoint must be a file that is accepted."""
+    again = path.with_name("again.wlm")
+    try:
+        model.save(again)
+        try:
+            wlm.load(again, model.SYSTEM)
+        except WlmError as error:
+            raise AssertionError(f"made a file that can't be read: {error}") from error
+    finally:
+        again.unlink(missing_ok=True)
+
+
+@functools.cache
+def _lightmap_fit() -> tuple[Any, Any]:
+    from builders.small_sets import moving_light, tiny_profile
+
+    return moving_light(hours=(0.0, 11.0)), tiny_profile(steps=10)
+
+
+@functools.cache
+def _lightmap_states() -> Sequence[bytes]:
+    """Of a running batch, and of a finished one."""
+    lightmaps, profile = _lightmap_fit()
+
+    def running(output: Path) -> None:
+        checkpoint = lightmap_fit.open_checkpoint(output, lightmaps, profile)
+        _interrupted(lambda stop: lightmap_fit.compress(lightmaps, profile, progress=stop, checkpoint=checkpoint))
+
+    def finished(output: Path) -> None:
+        checkpoint = lightmap_fit.open_checkpoint(output, lightmaps, profile)
+        lightmap_fit.compress(lightmaps, profile, checkpoint=checkpoint)
+
+    return _bytes_of(running), _bytes_of(finished)
+
+
+def _lightmap_checkpoint(path: Path) -> None:
+    lightmaps, profile = _lightmap_fit()
+    checkpoint = lightmap_fit.open_checkpoint(path.with_suffix(""), lightmaps, profile, resume=True)
+    check_digest(path)
+    with _diverging():
+        _again(lightmap_fit.compress(lightmaps, profile, checkpoint=checkpoint), path)
+
+
+@functools.cache
+def _probe_fit() -> tuple[Any, Any]:
+    from builders.probe_sets import synthetic
+
+    return synthetic(60), wlm.probe.Profile(name="tiny", ratio=0.1, steps=10, hidden=16, latent=3)
+
+
+@functools.cache
+def _probe_states() -> Sequence[bytes]:
+    probes, profile = _probe_fit()
+
+    def running(output: Path) -> None:
+        checkpoint = probe_fit.open_checkpoint(output, probes, profile)
+        _interrupted(lambda stop: probe_fit.compress(probes, profile, progress=stop, checkpoint=checkpoint))
+
+    return (_bytes_of(running),)
+
+
+def _probe_checkpoint(path: Path) -> None:
+    probes, profile = _probe_fit()
+    checkpoint = probe_fit.open_checkpoint(path.with_suffix(""), probes, profile, resume=True)
+    check_digest(path)
+    with _diverging():
+        _again(probe_fit.compress(probes, profile, checkpoint=checkpoint), path)
+
+
+@functools.cache
+def _solver() -> Any:
+    from wlm.smoke.scene import Scene
+    from wlm.smoke.simulation import make_solver
+
+    scene = {"name": "small", "grid": {"cells": [4, 6, 4], "cell": 0.25}, "frames": 1, "rate": 10.0}
+    inlet = {"face": "-y", "velocity": [0, 1, 0], "radius": 0.3}
+    return make_solver(Scene.model_validate(scene | {"inlets": [inlet]}))
+
+
+@functools.cache
+def _solver_states() -> Sequence[bytes]:
+    def first(output: Path) -> None:
+        _solver().save(f"{output}.partial")
+
+    def later(output: Path) -> None:
+        for _ in range(4):
+            _solver().step()
+        _solver().save(f"{output}.partial")
+
+    return _bytes_of(first), _bytes_of(later)
+
+
+def _smoke_checkpoint(path: Path) -> None:
+    solver = _solver()
+    solver.load(path)
+    check_digest(path)
+    check_finite(density=solver.density.numpy())
+    assert (solver.density.numpy() >= 0).all(), "accepted a negative density"
+    # Any air may blow up, which is said.
+    with suppress(WlmError):
+        solver.step()
+        solver.check()
+
+
+@functools.cache
+def _training() -> tuple[Any, Any]:
+    from wlm.smoke.fit import Profile
+    from wlm.smoke.learn.pool import Pool
+    from wlm.smoke.learn.settings import TrainSettings
+    from wlm.smoke.model import NetworkSettings
+
+    settings = TrainSettings(rounds=2, steps=1, batch=2, warmup=1)
+    profile = Profile(name="tiny", network=NetworkSettings(width=8, levels=2), training=settings)
+    guides, targets = torch.linspace(0, 1, 2 * 3 * 256), torch.linspace(1, 0, 2 * 8 * 256)
+    motion = torch.zeros(1, 2, 16, 16)
+    shapes = guides.reshape(1, 2, 3, 16, 16), targets.reshape(1, 2, 8, 16, 16)
+    return profile, Pool(*(part.half() for part in (*shapes, motion)), torch.zeros(1, dtype=torch.int64))
+
+
+def _train(output: Path, **options: Any) -> Any:
+    from wlm.smoke.fit import train
+
+    profile, pool = _training()
+    pools = {"make_pool": lambda *a, **k: pool, "make_validation": lambda *a, **k: pool}
+    return train(profile, output, **pools, **options)
+
+
+@functools.cache
+def _training_states() -> Sequence[bytes]:
+    return (_bytes_of(lambda output: _train(output, minutes=0.0)),)
+
+
+def _network_checkpoint(path: Path) -> None:
+    output = path.with_suffix("")
+    try:
+        with _diverging():
+            training = _train(output, resume=True)
+            _again(training.model, path)
+    finally:
+        for written in (output, Path(f"{output}.csv")):
+            written.unlink(missing_ok=True)
+
+
+class _diverging:
+    """Passes over the error of a fit that diverged from a state of valid but absurd numbers: it names no file."""
+
+    def __enter__(self) -> None:
+        return None
+
+    def __exit__(self, kind: type | None, error: BaseException | None, trace: object) -> bool:
+        return isinstance(error, WlmError) and "diverged" in str(error)
+
+
+READERS = (
+    Reader("lightmap", "a.wlm", stored("lightmap.wlm"), vary_artifact, _lightmap),
+    Reader("probe", "a.wlm", stored("probe.wlm"), vary_artifact, _probe),
+    Reader(
+        "atlas",
+        "a.wlm",
+        stored("atlas-tiles.wlm", "atlas-cascade.wlm", "atlas-bc6h.wlm", "atlas-plain.wlm"),
+        vary_artifact,
+        _atlas,
+    ),
+    Reader("smoke-network", "a.wlm", stored("smoke.wlm"), vary_artifact, _network),
+    Reader("smoke-pool", "pool.safetensors", corpus("pool.safetensors"), vary_artifact, _pool),
+    Reader("lightmap-checkpoint", "a.partial", _lightmap_states, vary_artifact, _lightmap_checkpoint, cost=8),
+    Reader("probe-checkpoint", "a.partial", _probe_states, vary_artifact, _probe_checkpoint, cost=4),
+    Reader("smoke-checkpoint", "a.partial", _solver_states, vary_artifact, _smoke_checkpoint, cost=2),
+    Reader("smoke-network-checkpoint", "a.partial", _training_states, vary_artifact, _network_checkpoint, cost=8),
+)

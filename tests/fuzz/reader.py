@@ -1,0 +1,73 @@
+"""What one reader of files is fuzzed with, and what all tables of readers share."""
+
+import functools
+import hashlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import numpy as np
+
+from .mutate import corrupt
+
+_CORPUS = Path(__file__).parent / "corpus"
+_FILES = Path(__file__).resolve().parents[1] / "files"
+
+
+@dataclass(frozen=True)
+class Reader:
+    """One way into the package for a file.
+
+    Attributes:
+        name: Of the reader; with a case's index it determines the case.
+        file: Name of the case's file; readers go by suffixes.
+        seeds: Makes the good files that are changed, the same at every call.
+        vary: Changes one of them, with some knowledge of the format.
+        read: Reads a file at a path as users do. An `AssertionError` says what an accepted one must not be.
+        beside: Makes the files that lie beside the case's, by name.
+        cost: Cases in `make test` are divided by this.
+        blind: Share of the cases that are changed without knowledge of the format.
+    """
+
+    name: str
+    file: str
+    seeds: Callable[[], Sequence[bytes]]
+    vary: Callable[[Random, bytes], bytes]
+    read: Callable[[Path], Any]
+    beside: Callable[[], Mapping[str, bytes]] = field(default=dict)
+    cost: int = 1
+    blind: float = 0.2
+
+    def case(self, index: int) -> bytes:
+        """Makes case `index`."""
+        draw, seeds = Random(f"{self.name}:{index}"), self.seeds()
+        seed = draw.choice(seeds)
+        return corrupt(draw, seed, seeds) if draw.random() < self.blind else self.vary(draw, seed)
+
+
+def corpus(*names: str) -> Callable[[], Sequence[bytes]]:
+    """The committed good files of these names."""
+    return functools.cache(lambda: tuple((_CORPUS / name).read_bytes() for name in names))
+
+
+def stored(*names: str) -> Callable[[], Sequence[bytes]]:
+    """Good files of the other tests."""
+    return functools.cache(lambda: tuple((_FILES / name).read_bytes() for name in names))
+
+
+def check_finite(**arrays: Any) -> None:
+    """Fails where an accepted array holds NaN or infinity."""
+    for name, array in arrays.items():
+        assert np.isfinite(np.asarray(array)).all(), f"accepted, but {name} holds NaN or infinity"
+
+
+def check_digest(path: Path) -> None:
+    """Fails where an accepted artifact's digest isn't that of its bytes."""
+    data = path.read_bytes()
+    header = data[8 : 8 + int.from_bytes(data[:8], "little")]
+    digest = next(word[:32] for word in header.split(b" ")[3:] if word[32:33] == b'"')
+    content = data.replace(b" " + digest + b'"', b" " + b"0" * 32 + b'"', 1)
+    actual = hashlib.blake2b(content, digest_size=16).hexdigest()
+    assert digest.decode() == actual, "accepted, but its digest is another's"

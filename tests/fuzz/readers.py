@@ -1,0 +1,344 @@
+"""The table of readers: of what each case is made, how it is read, and what an accepted file must be.
+
+A new reader is a row: its good files (in `corpus.py`, or made here), how to change one with some knowledge of the
+format, and a function that reads it as users do and asserts what the format's page forbids.
+"""
+
+import functools
+import gzip
+import json
+import struct
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import numpy as np
+
+import wlm
+from wlm.atlas.exporter import geometry, read_folder
+from wlm.bench.rows import read_json
+from wlm.config import load_settings
+from wlm.fluid.volume import load_volume
+from wlm.formats.exr import read_exr
+from wlm.formats.gltf import read_gltf
+from wlm.formats.gltf_writer import write_glb
+from wlm.formats.mask import read_mask
+from wlm.formats.obj import read_obj
+from wlm.probe.data import load_positions
+from wlm.smoke.data import load_frames, read_six_way
+from wlm.smoke.exporter import read_flipbook
+from wlm.smoke.learn.settings import DatasetSettings
+from wlm.smoke.scene import Scene
+
+from . import models
+from .containers import vary_exr, vary_glb, vary_gltf, vary_npz, vary_png
+from .mutate import corrupt, vary_json, vary_numbers, vary_text
+from .reader import Reader, check_finite, corpus, stored
+
+_PROFILES = Path(__file__).resolve().parents[2] / "configs"
+
+
+def _json(draw: Random, data: bytes) -> bytes:
+    """Changes a JSON value; now and then its text is nested deeper than any stack."""
+    text = json.dumps(vary_json(draw, json.loads(data))).encode()
+    if draw.random() > 0.03:
+        return text
+    at = draw.randrange(len(text))
+    return text[:at] + draw.choice((b"[", b'{"a":')) * 100_000 + text[at:]
+
+
+# Pictures and textures.
+
+
+def _exr(path: Path) -> None:
+    pixels, names = read_exr(path)
+    assert pixels.dtype == np.float32 and pixels.shape[2] == len(names), f"accepted as {pixels.dtype} {pixels.shape}"
+
+
+def _six_way(path: Path) -> None:
+    six = read_six_way(path)
+    check_finite(lightmaps=six.lightmaps, transparency=six.transparency, axes=six.camera.axes)
+    assert six.lightmaps.shape[1:] == (six.camera.height, six.camera.width), "accepted with another size"
+
+
+def _mask(path: Path) -> None:
+    mask = read_mask(path, "light.exr", (12, 10))
+    assert mask.shape == (12, 10) and mask.dtype == bool, f"accepted as {mask.dtype} {mask.shape}"
+    assert path.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n", "accepted a file that isn't a PNG"
+
+
+def _flipbook(path: Path) -> None:
+    for frame in read_flipbook((path, path), "unity", rows=2, columns=2):
+        check_finite(lightmaps=frame.lightmaps)
+
+
+def _tga(draw: Random, data: bytes) -> bytes:
+    # Lengths, kinds, colour map, origin, size, depth, flags.
+    head = [(0, 1), (1, 1), (2, 1), (3, 2), (5, 2), (7, 1), (8, 2), (10, 2), (12, 2), (14, 2), (16, 1), (17, 1)]
+    return vary_numbers(draw, data, head)
+
+
+# Meshes.
+
+
+def _mesh(path: Path) -> None:
+    document, primitives = read_gltf(path)
+    again = path.with_name("again.glb")
+    try:
+        write_glb(again, document, [], 1)
+        assert len(read_gltf(again)[1]) == len(primitives), "written again with other primitives"
+    finally:
+        again.unlink(missing_ok=True)
+    _lit(path)
+
+
+def _obj(path: Path) -> None:
+    mesh = read_obj(path)
+    assert not len(mesh.triangle) or mesh.triangle.max() < len(mesh.position), "a corner beyond the vertices"
+    _lit(path)
+
+
+def _lit(path: Path) -> None:
+    mesh = wlm.atlas.load(path, path.with_name("light.exr"))
+    check_finite(position=mesh.position, uv=mesh.uv, lightmap=mesh.lightmap)
+    assert mesh.triangle.max() < len(mesh.position), "a corner beyond the vertices"
+
+
+def _light() -> Mapping[str, bytes]:
+    return {"light.exr": corpus("light.exr")()[0], "image.png": corpus("mask-grey.png")()[0]}
+
+
+def _exported(path: Path) -> None:
+    output = read_folder(path.parent)
+    check_finite(position=geometry(output).position)
+
+
+# Probes and volumes.
+
+
+def _probes(path: Path) -> None:
+    probes = wlm.probe.load(path)
+    check_finite(position=probes.position, values=probes.values)
+    assert probes.values.shape[0] == len(probes.position) > 0, "accepted without probes"
+
+
+def _positions(path: Path) -> None:
+    position = load_positions(path)
+    check_finite(position=position)
+    assert position.ndim == 2 and position.shape[1] == 3 and len(position), f"accepted as {position.shape}"
+
+
+def _volume(path: Path) -> None:
+    volume = load_volume(path)
+    check_finite(density=volume.density, voxel=volume.voxel, origin=np.array(volume.origin))
+    assert volume.voxel > 0 and bool((volume.density >= 0).all()), "accepted below 0"
+
+
+@functools.cache
+def _grids() -> Sequence[bytes]:
+    return tuple(gzip.decompress(data) for data in corpus("cloud.nvdb.gz")())
+
+
+@functools.cache
+def _grid_fields(data: bytes) -> list[tuple[int, int]]:
+    """The headers of file, grid, tree and root, and the 64-bit words of the nodes that aren't 0: offsets and masks."""
+    headers = [(at, width) for width in (4, 8) for at in range(0, 1100 - width, 4)]
+    words = np.frombuffer(data, "<u8", (len(data) - 1) // 8, 1)
+    return headers + [(1 + 8 * int(at), 8) for at in np.flatnonzero(words)]
+
+
+def _godot(draw: Random, data: bytes) -> bytes:
+    """Changes a plain resource, or the content of one in compressed blocks, which are compressed again."""
+    import imagecodecs
+
+    changed = corrupt(draw, data)
+    if draw.random() < 0.5:
+        return changed
+    size = draw.choice((64, 4096, 1 << 20))
+    blocks = [imagecodecs.zstd_encode(changed[at : at + size]) for at in range(0, len(changed) + 1, size)]
+    head = struct.pack("<3I", 2, size, len(changed)) + struct.pack(f"<{len(blocks)}I", *map(len, blocks))
+    return b"RSCC" + head + b"".join(blocks) + b"RSCC"
+
+
+# Folders with an index.
+
+_ELSEWHERE = (
+    "../a.exr",
+    "/etc/passwd",
+    "/dev/zero",
+    "/dev/stdin",
+    "..",
+    ".",
+    "x" * 5000,
+    "\ud800",
+    "a.exr\n",
+    "mask.png",
+)
+
+
+def _set(draw: Random, data: bytes) -> bytes:
+    content = vary_json(draw, json.loads(data))
+    entries = content.get("lightmaps") if isinstance(content, dict) else None
+    if isinstance(entries, list) and entries and isinstance(entries[0], dict) and draw.random() < 0.3:
+        entries[0]["file"] = draw.choice(_ELSEWHERE)
+    if isinstance(content, dict) and draw.random() < 0.2:
+        content["mask"] = draw.choice(_ELSEWHERE)
+    return json.dumps(content).encode()
+
+
+def _lightmap_set(path: Path) -> None:
+    lightmaps = wlm.lightmap.load(path.parent)
+    check_finite(frames=lightmaps.frames, times=lightmaps.times)
+    assert (lightmaps.frames >= 0).all() and (np.diff(lightmaps.times) > 0).all(), "negative, or times out of order"
+
+
+def _frames(path: Path) -> None:
+    _scene_figures(load_frames(path.parent).scene)
+
+
+# Settings.
+
+# What YAML does with words, one a line.
+_FRAGMENTS = [
+    *r"""
+!!python/object/apply:os.system ['id']
+!!python/name:os.system
+!<tag:yaml.org,2002:x> {}
+!!timestamp x
+!!timestamp 2001-13-45
+!!binary aGk=
+!!float x
+!!int x
+!!set {a, b}
+!!omap [a: 1]
+&a [*a]
+*a
+&a 1
+{<<: {steps: 1}}
+<<: *a
+? [1, 2]
+2001-99-99
+1:99:99:99
+1e999
+.nan
+.inf
+-.inf
+0b2
+0o9
+1_000
+"\x1b[31m"
+"\uD800"
+yes
+~
+'
+"
+%YAML 9.9
+---
+...
+[1, 2
+{a: 1
+:
+""".strip().split("\n"),
+    *("0x" + "f" * 5000, "1" * 5000, "[" * 300, "{" * 300, "- " * 300, "\0", "\t"),
+]
+
+
+def _settings(name: str, model: Callable[[], type], files: str, check: Callable[[Any], None] | None = None) -> Reader:
+    """The reader of a settings model's YAML."""
+
+    @functools.cache
+    def seeds() -> Sequence[bytes]:
+        paths = sorted(_PROFILES.glob(f"{files}.yaml"))
+        if model() is Scene:
+            paths = [path for path in paths if not path.name.startswith("smoke-network")]
+        return tuple(path.read_bytes() for path in paths) or corpus(f"{files}.yaml")()
+
+    def read(path: Path) -> None:
+        settings = load_settings(model(), path)
+        if check is not None:
+            check(settings)
+
+    def vary(draw: Random, data: bytes) -> bytes:
+        return vary_text(draw, data.decode(), _FRAGMENTS)
+
+    return Reader(name, "a.yaml", seeds, vary, read)
+
+
+def _scene_figures(scene: Scene) -> None:
+    """What follows from an accepted scene's numbers is of use too."""
+    check_finite(fastest=scene.fastest, step=scene.step)
+    assert 1 <= scene.steps, f"accepted with {scene.steps} steps a frame"
+
+
+_ALL = (
+    *models.READERS,
+    Reader("exr", "a.exr", corpus("zip.exr", "piz.exr", "b44.exr", "dwaa.exr", "tiled.exr"), vary_exr, _exr),
+    Reader(
+        "exr-six-way",
+        "a.exr",
+        corpus("six-way.exr"),
+        lambda draw, data: vary_exr(draw, data, "wlm"),
+        _six_way,
+    ),
+    Reader("png-mask", "mask.png", corpus("mask-grey.png", "mask-palette.png", "mask-rgba.png"), vary_png, _mask),
+    Reader("png-flipbook", "a.png", corpus("flipbook.png"), vary_png, _flipbook),
+    Reader("tga-flipbook", "a.tga", corpus("flipbook.tga"), _tga, _flipbook),
+    Reader("gltf", "a.gltf", corpus("mesh.gltf"), vary_gltf, _mesh, _light, cost=2),
+    Reader("glb", "a.glb", corpus("mesh.glb"), vary_glb, _mesh, _light, cost=2),
+    Reader(
+        "obj", "a.obj", corpus("mesh.obj"), lambda draw, data: vary_text(draw, data.decode(), ("f", "v")), _obj, _light
+    ),
+    Reader("probes-npz", "a.npz", corpus("probes.npz"), vary_npz, _probes),
+    Reader("probes-json", "a.json", corpus("probes.json", "probes-list.json"), _json, _probes),
+    Reader("probes-lmbake", "a.lmbake", corpus("probes.lmbake"), _godot, _probes),
+    Reader("positions-npz", "a.npz", corpus("positions.npz"), vary_npz, _positions),
+    Reader("positions-json", "a.json", corpus("positions.json"), _json, _positions),
+    Reader("volume-npz", "a.npz", corpus("volume.npz"), vary_npz, _volume),
+    Reader(
+        "volume-nvdb",
+        "a.nvdb",
+        _grids,
+        lambda draw, data: vary_numbers(draw, data, _grid_fields(data)),
+        _volume,
+        cost=2,
+    ),
+    Reader(
+        "lightmap-set",
+        "set.json",
+        corpus("set.json"),
+        _set,
+        _lightmap_set,
+        lambda: {
+            "a.exr": corpus("light.exr")()[0],
+            "b.exr": corpus("zip.exr")()[0],
+            "mask.png": corpus("mask-grey.png")()[0],
+        },
+    ),
+    Reader(
+        "smoke-frames",
+        "scene.json",
+        corpus("scene.json"),
+        _json,
+        _frames,
+        lambda: {"frame_0001.npz": corpus("volume.npz")()[0]},
+    ),
+    Reader(
+        "atlas-export",
+        "report.json",
+        corpus("report.json"),
+        _json,
+        _exported,
+        lambda: {"atlas.wlm": stored("atlas-tiles.wlm")()[0], "mesh.glb": corpus("mesh.glb")()[0]},
+    ),
+    Reader("bench-rows", "a.json", corpus("rows.json"), _json, read_json),
+    _settings("yaml-lightmap", lambda: wlm.lightmap.Profile, "lightmap-*"),
+    _settings("yaml-probe", lambda: wlm.probe.Profile, "probe-*"),
+    _settings("yaml-atlas", lambda: wlm.atlas.Profile, "atlas-*"),
+    _settings("yaml-smoke-network", lambda: wlm.smoke.Profile, "smoke-network-*"),
+    _settings("yaml-scene", lambda: Scene, "smoke-*", _scene_figures),
+    _settings("yaml-dataset", lambda: DatasetSettings, "dataset"),
+)
+
+READERS: dict[str, Reader] = {reader.name: reader for reader in _ALL}
+"""By name."""
