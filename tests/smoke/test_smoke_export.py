@@ -1,5 +1,7 @@
 """Flip books: every layout and kind of file there and back, the order of cells, what is refused."""
 
+import struct
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -133,6 +135,11 @@ def test_wrong_files(tmp_path: Path):
     whole = paths[0].read_bytes()
     paths[0].write_bytes(whole[: len(whole) // 2])
     with pytest.raises(WlmError, match="a.png: cannot read the picture"):
+        read_flipbook(paths, rows=1, columns=1)
+    # The header alone says how large it is; the rest of it is as before.
+    header = b"IHDR" + struct.pack(">2I", 9400, 9400) + whole[24:29]
+    paths[0].write_bytes(whole[:12] + header + struct.pack(">I", zlib.crc32(header)) + whole[33:])
+    with pytest.raises(WlmError, match=f"a.png: expected at most 2048 times its {len(whole)} bytes once unpacked"):
         read_flipbook(paths, rows=1, columns=1)
     Image.new("RGB", (9, 6)).save(paths[0])
     Image.new("RGB", (9, 6)).save(paths[1])
