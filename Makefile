@@ -26,7 +26,7 @@ test: lint
 test-all: lint
 	$(BIN)/pytest -n 2 --dist loadfile -m ""
 
-# 20,000 changed files of each kind: about an hour on two cores; the counts are in out/fuzz.json.
+# 20,000 changed files of each kind: about half an hour on two cores; the counts are in out/fuzz.json.
 fuzz: $(STAMP)
 	$(BIN)/python -m tests.fuzz --cases 20000 --json out/fuzz.json
 
