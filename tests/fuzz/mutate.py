@@ -193,8 +193,12 @@ def vary_array(draw: Random, array: np.ndarray) -> np.ndarray:
     if kind == 1:
         return draw.choice((array.reshape(-1), array[None], array[..., None], array[:0] if array.ndim else array))
     if kind == 2:
-        with np.errstate(all="ignore"):
-            return array.astype(draw.choice(_TYPES[-2:] if array.dtype.kind in "SU" else _TYPES))
+        target = draw.choice(_TYPES[-2:] if array.dtype.kind in "SU" else _TYPES)
+        try:
+            with np.errstate(all="ignore"):
+                return array.astype(target)
+        except UnicodeError:  # bytes that are no text
+            return array
     if kind == 3:
         data, dtype = array.tobytes(), np.dtype(draw.choice(_TYPES))
         return np.frombuffer(data[: len(data) - len(data) % dtype.itemsize], dtype)
