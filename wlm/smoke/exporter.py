@@ -17,7 +17,7 @@ from PIL import Image
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_path
 from wlm.formats.exr import read_exr, write_exr
-from wlm.formats.limits import PICTURE_BYTES, PICTURE_GROWTH, check_growth
+from wlm.formats.limits import PICTURE_GROWTH, check_growth
 from wlm.formats.mask import DAMAGED_PICTURE
 from wlm.formats.reading import open_file
 from wlm.smoke.camera import ALPHA, DIRECTIONS, EMISSION, LAYOUTS
@@ -209,8 +209,8 @@ def _read(path: str | os.PathLike[str]) -> np.ndarray:
             with Image.open(file, formats=[_suffix(path)[1:].upper()]) as image:
                 if image.mode not in _MODES:
                     raise WlmError(f"{path}: expected RGB or RGBA of 8 bits, found {image.mode}")
-                held, pixels = os.fstat(file.fileno()).st_size, image.width * image.height * len(image.mode)
-                check_growth(str(path), held, pixels, PICTURE_GROWTH, PICTURE_BYTES)
+                floats = 4 * image.width * image.height * len(image.mode)
+                check_growth(str(path), os.fstat(file.fileno()).st_size, floats, PICTURE_GROWTH)
                 return np.asarray(image).astype(np.float32) / np.float32(255.0)
         except DAMAGED_PICTURE as error:
             raise WlmError(f"{path}: cannot read the picture: {error or type(error).__name__}") from error
