@@ -12,6 +12,7 @@ import safetensors
 import safetensors.numpy
 from builders.checks import error_of
 
+from wlm.errors import WlmError
 from wlm.formats.artifact import FORMAT_VERSION, read_artifact, write_artifact
 
 SOURCE = "0123456789abcdef" * 2
@@ -284,3 +285,15 @@ def test_a_full_disk_leaves_the_old_artifact(artifact):
     done = subprocess.run([sys.executable, "-c", code, str(artifact)], capture_output=True, text=True)
     assert done.stdout.strip() == f"{artifact}: cannot write: File too large", done.stderr
     assert artifact.read_bytes() == before and os.listdir(artifact.parent) == [artifact.name]
+
+
+@pytest.mark.parametrize("shape", [[0, 1 << 62], [0] + [1 << 20] * 4, [1] * 9, [0] * 100])
+def test_sizes_of_an_empty_part_are_bounded(tmp_path, shape):
+    write_artifact(tmp_path / "a.wlm", "lightmap", {}, {"part": np.zeros(0, np.uint8)}, "0")
+    content = (tmp_path / "a.wlm").read_bytes()
+    header = json.loads(content[8:])
+    header["part"] = {"dtype": "U8", "shape": shape, "data_offsets": [0, int(0 not in shape)]}
+    text = json.dumps(header).encode()
+    (tmp_path / "a.wlm").write_bytes(len(text).to_bytes(8, "little") + text + b"\0" * (0 not in shape))
+    with pytest.raises(WlmError, match="part: expected at most 8 axes"):
+        read_artifact(tmp_path / "a.wlm")

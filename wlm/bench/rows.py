@@ -228,7 +228,7 @@ def _read_row(values: object, where: str) -> Row:
             raise WlmError(f"{where}: figure {name!r}: expected a number, got {value!r}")
     try:
         return Row(**values)
-    except ValueError as error:
+    except (ValueError, OverflowError) as error:
         raise WlmError(f"{where}: {error}") from error
 
 

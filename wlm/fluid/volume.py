@@ -388,7 +388,7 @@ def _read_nvdb(path: Path, trust: bool) -> tuple[wp.Volume, wp.Volume | None]:
             grids.append(volume)
             volume = volume.load_next_grid()
     except _BAD_GRID as error:
-        raise WlmError(f"{path}: cannot read the NanoVDB file: {error or type(error).__name__}") from error
+        raise WlmError(f"{path}: cannot read the NanoVDB file: {str(error) or type(error).__name__}") from error
     names = [grid.get_grid_info().name for grid in grids]
     density = grids[names.index(_DENSITY)] if _DENSITY in names else grids[0]
     return density, grids[names.index(_TEMPERATURE)] if _TEMPERATURE in names else None

@@ -34,6 +34,8 @@ _EXCHANGED_QUOTES = str.maketrans({'"': "'", "'": '"'})
 _ALIGNMENT = 8  # of the first tensor, in bytes: that of the widest type
 _HEADER_LIMIT = 100_000_000  # bytes; the safetensors library refuses a longer header too
 
+_MOST_AXES, _MOST_NUMBERS = 8, 1 << 48  # of a part
+
 _TYPES = {
     "BOOL": np.bool_,
     "U8": np.uint8,
@@ -266,6 +268,11 @@ def _entry(path: str | os.PathLike[str], name: str, entry: Any) -> tuple[str, tu
         valid = False
     if not valid:
         raise WlmError(f"{path}: part {one_line(name, 60)}: expected a type, a shape and two offsets")
+    # An empty part's other sizes are bounded by no bytes, and NumPy's arrays are.
+    if len(shape) > _MOST_AXES or math.prod(max(size, 1) for size in shape) > _MOST_NUMBERS:
+        raise WlmError(
+            f"{path}: part {one_line(name, 60)}: expected at most {_MOST_AXES} axes of {_MOST_NUMBERS} numbers in all"
+        )
     expected = math.prod(shape) * np.dtype(_TYPES[kind]).itemsize
     if end - begin != expected:
         raise WlmError(f"{path}: part {one_line(name, 60)}: expected {expected} bytes, found {end - begin}")

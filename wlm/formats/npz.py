@@ -57,7 +57,7 @@ def read_npz(
     # Whatever a stranger's file can make zipfile and NumPy raise, and that is nearly anything: they parse its header
     # as Python.
     except Exception as error:
-        raise WlmError(f"{path}: cannot read the arrays: {error or type(error).__name__}") from error
+        raise WlmError(f"{path}: cannot read the arrays: {str(error) or type(error).__name__}") from error
 
 
 def _read(where: str, archive: zipfile.ZipFile, info: zipfile.ZipInfo, numbers: int, sure: int) -> np.ndarray:

@@ -5,6 +5,7 @@ lowest bit first; `frame` is origin, extent, size of the box and gain; `dead` is
 """
 
 import zlib
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -79,6 +80,7 @@ def decode(artifact: Artifact) -> ProbeModel:
     parts = check_parts(artifact.tensors, _parts(header))
     _check_frame(parts["frame"])
     _check_bounds(parts["bounds"])
+    _check_values(header, parts)
     frame = parts["frame"]
     codes = unpack_bits(parts["gaussians"], header.profile.code_bits(), header.gaussians)
     return ProbeModel(
@@ -117,6 +119,20 @@ def _check_bounds(bounds: np.ndarray) -> None:
     # Scales are logarithms: their squares, and the squares' inverses, must be float32.
     if np.abs(bounds[:, SCALE]).max() > _MOST_LOG:
         raise ValueError(f"part bounds: expected logs of scales of at most {_MOST_LOG:g} either way")
+
+
+def _check_values(header: _Header, parts: Mapping[str, np.ndarray]) -> None:
+    """Checks that no number on the way to a probe's values is beyond float32, wherever it is decoded."""
+    layers, begin = [], 0
+    for rows, columns in layer_shapes(header.profile.latent, header.profile.hidden, header.outputs):
+        # The sum of what each output may become, of inputs in [-1, 1].
+        layers.append(np.abs(parts["net"][begin : begin + rows * columns].reshape(rows, columns).astype(np.float64)))
+        begin += rows * columns
+    sums = header.gaussians * np.abs(parts["bounds"][:, LATENT].astype(np.float64)).max(0)
+    first = layers[0] * np.concatenate([np.maximum(sums, 1.0), np.ones(4)])[:, None]
+    most = max(first.sum(0).max(), parts["frame"][7] * layers[2].sum(0).max())
+    if not most <= np.finfo(np.float32).max:
+        raise ValueError("parts net, bounds and frame: expected values that float32 holds")
 
 
 def pack_dead(dead: np.ndarray) -> np.ndarray:

@@ -213,7 +213,7 @@ def _read(path: str | os.PathLike[str]) -> np.ndarray:
                 check_growth(str(path), os.fstat(file.fileno()).st_size, floats, PICTURE_GROWTH)
                 return np.asarray(image).astype(np.float32) / np.float32(255.0)
         except DAMAGED_PICTURE as error:
-            raise WlmError(f"{path}: cannot read the picture: {error or type(error).__name__}") from error
+            raise WlmError(f"{path}: cannot read the picture: {str(error) or type(error).__name__}") from error
 
 
 def _plane(frame: SixWay, name: str, gain: float) -> np.ndarray | float:
