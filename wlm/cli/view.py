@@ -42,7 +42,9 @@ def view(
     walk: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Viewpoints of the volume, as wlm probe walk --path takes.")
     ] = None,
-    scale: Annotated[float | None, typer.Option(help="Of the volume's blocks: units in a metre.")] = None,
+    scale: Annotated[
+        float | None, typer.Option(help="Of the volume's blocks: units in a metre; default 1, less in a small scene.")
+    ] = None,
     extinction: Annotated[float | None, typer.Option(help="Of a volume of smoke, at density 1.")] = None,
     up: Annotated[Literal["y", "z"], typer.Option(help="The axis that points up in the scene.")] = "y",
     rate: Annotated[float, typer.Option(help="Frames a second of a movie, and of frames that are played.")] = 24.0,

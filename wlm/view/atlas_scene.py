@@ -80,12 +80,12 @@ def _scene(
     )
 
 
-@dataclass
+@dataclass(kw_only=True)
 class _AtlasScene(SurfaceScene):
-    model: AtlasModel | None = None
-    light: dict[str, np.ndarray] = None
-    mask: np.ndarray = None
-    note: str = ""
+    model: AtlasModel | None
+    light: dict[str, np.ndarray]
+    mask: np.ndarray
+    note: str
 
     def lights(self, state: State) -> dict[str, np.ndarray]:
         return self.light

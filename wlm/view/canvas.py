@@ -142,18 +142,14 @@ class Canvas:
         """
         codes = np.concatenate([colour, (density[..., None] * 255.0 + 0.5).astype(np.uint8)], -1)
         codes = np.ascontiguousarray(codes.transpose(2, 1, 0, 3).reshape(-1, 4))
-        drawn = self._drawn.get((panel, name))
-        if drawn is not None and drawn[1].dimensions == density.shape:
-            drawn[1].point_data["smoke"] = codes
-            drawn[0].visibility = True
-            return
         grid = self._pyvista.ImageData(
             dimensions=density.shape, spacing=(voxel,) * 3, origin=np.asarray(origin) + 0.5 * voxel
         )
         grid.point_data["smoke"] = codes
         self._plotter.subplot(0, panel)
         options = {"name": f"{panel} {name}", "render": False, "reset_camera": False, "show_scalar_bar": False}
-        # On GPUs VTK 9.7 takes opacities of colours for much less, and ignores their unit of length.
+        # Made anew, since this mapper doesn't see that voxels changed. On GPUs VTK 9.7 takes the opacities of coloured
+        # voxels for much less, and ignores their unit of length.
         actor = self._plotter.add_volume(grid, scalars="smoke", mapper="fixed_point", **options)
         actor.mapper.SetAutoAdjustSampleDistances(False)
         actor.mapper.SetSampleDistance(voxel)

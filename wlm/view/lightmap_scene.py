@@ -79,10 +79,10 @@ def lightmap_scene(
     return scene
 
 
-@dataclass
+@dataclass(kw_only=True)
 class _LightmapScene(SurfaceScene):
-    model: LightmapModel | None = None
-    lightmaps: LightmapSet | None = None
+    model: LightmapModel | None
+    lightmaps: LightmapSet | None
 
     def __post_init__(self) -> None:
         self._shown: tuple[float, dict[str, np.ndarray]] | None = None

@@ -49,7 +49,7 @@ def open_scene(
         original: What was compressed, to compare with: a lightmap set, an atlas' lightmap, a probe file.
         key: Of a probe file with several arrays, the one to show.
         walk: Viewpoints of the cascaded volume, as `wlm probe walk --path` takes.
-        scale: Of the cascaded volume's blocks: units in a metre.
+        scale: Of the cascaded volume's blocks: units in a metre; None: 1, or less in a small scene.
         extinction: Of a volume of smoke, per unit of length at density 1.
         flat: Whether a lightmap is shown unwrapped though its mesh is there.
         up: The axis that points up.
@@ -196,8 +196,7 @@ class _Request:
 
         geometry = None if self.mesh is None else read_geometry(self.mesh, with_uv=False)
         walk = None if self.walk is None else load_positions(self.walk)
-        scale = 1.0 if self.scale is None else self.scale
-        return probe_scene(probes, title=self.path.name, geometry=geometry, walk=walk, scale=scale, up=self._up)
+        return probe_scene(probes, title=self.path.name, geometry=geometry, walk=walk, scale=self.scale, up=self._up)
 
 
 def _is_six_way(path: Path) -> bool:

@@ -16,7 +16,7 @@ from wlm.probe.decode import Decoder
 from wlm.probe.model import CENTRE, ROTATION, SCALE, ProbeModel
 from wlm.probe.places import ball_radius
 from wlm.probe.sphere import basis, coefficient_bands, cosine_factor, irradiance, sh_count
-from wlm.probe.volume import Volume
+from wlm.probe.volume import SIDE, SIZES, Volume
 from wlm.probe.walk import EYE_HEIGHT, camera_path
 from wlm.texels import exposure
 from wlm.view.canvas import Canvas, Hit
@@ -103,7 +103,7 @@ def probe_scene(
     title: str,
     geometry: Geometry | None = None,
     walk: np.ndarray | None = None,
-    scale: float = 1.0,
+    scale: float | None = None,
     up: int = 1,
 ) -> Scene:
     """Makes the scene of probes.
@@ -113,15 +113,18 @@ def probe_scene(
         title: Of the window.
         geometry: The scene's mesh, lit at its vertices; None: none.
         walk: [F, 3], viewpoints of the cascaded volume; None: a loop through the scene.
-        scale: Of the volume's blocks: units in a metre.
+        scale: Of the volume's blocks: units in a metre. None: 1, or less where the finest window would span more than
+            half of the scene.
         up: The axis that points up.
 
     Raises:
         WlmError: The scale isn't above 0.
     """
+    if scale is None:
+        longest = float(np.ptp(probes.position, axis=0).max())
+        scale = min(1.0, longest / (2.0 * SIDE * SIZES[0])) if longest > 0 else 1.0
     volume = Volume(probes.position, probes.decode, 3 * probes.coefficients, scale=scale)
-    given = walk is not None
-    path = walk if given else camera_path(volume.position, _LOOP, EYE_HEIGHT * scale, up)
+    path = walk if walk is not None else camera_path(volume.position, _LOOP, EYE_HEIGHT * scale, up)
     views = ("balls", "gaussians", "volume") if probes.model is not None else ("balls", "volume")
     frame = Slider("frame", 0, len(path) - 1, 0, 1, ".0f", whole=True, views=("volume",))
     sliders = (frame,) * (len(path) > 1) + (_SIGMAS,) * (probes.model is not None)
@@ -130,7 +133,7 @@ def probe_scene(
         compared("decoded" in probes.values, "original" in probes.values),
         views=views,
         sliders=sliders,
-        plays="frame" if given and len(path) > 1 else None,
+        plays="frame" if len(path) > 1 else None,
         up=up,
         probes=probes,
         geometry=geometry,
@@ -139,12 +142,12 @@ def probe_scene(
     )
 
 
-@dataclass
+@dataclass(kw_only=True)
 class _ProbeScene(Scene):
-    probes: Probes = None
-    geometry: Geometry | None = None
-    path: np.ndarray = None
-    volume: Volume = None
+    probes: Probes
+    geometry: Geometry | None
+    path: np.ndarray
+    volume: Volume
 
     def __post_init__(self) -> None:
         probes = self.probes
@@ -187,11 +190,18 @@ class _ProbeScene(Scene):
         elif state.view == "volume":
             self._draw_volume(canvas, state, windows)
 
+    def box(self) -> tuple[np.ndarray, np.ndarray]:
+        points = self.probes.position
+        if self.geometry is not None:
+            points = np.concatenate([points, *np.stack(self.geometry.box)[:, None]])
+        return points.min(0) - self._radius, points.max(0) + self._radius
+
     def caption(self, state: State) -> str:
         text = self.probes.note
         if state.view == "volume" and self._stats is not None:
             held, waiting = self.volume.unscroll()[1].sum(), self._stats.left
-            text += f"; volume of {held:,} blocks, {self._stats.updated} new, {waiting:,} waiting"
+            size = self.volume.sizes[0]
+            text += f"; {held:,} blocks from {size:.3g} up, {self._stats.updated} new, {waiting:,} waiting"
         return text
 
     def describe(self, hit: Hit, state: State) -> str:
@@ -253,7 +263,7 @@ class _ProbeScene(Scene):
         if len(self.path) > 1:
             canvas.line(0, _PATH, self.path, "#ff4040")
         ball, faces = _icosphere(2)
-        viewer = self.path[frame] + 0.5 * self.volume.sizes[0] * ball
+        viewer = self.path[frame] + self.volume.sizes[0] * ball
         canvas.coloured(0, _VIEWER, viewer, faces, np.full(ball.shape, (255, 60, 60), np.uint8), shape=True)
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
+import numpy as np
+
 from wlm.view.canvas import Canvas, Hit
 from wlm.view.display import TONES, Display
 
@@ -74,10 +76,9 @@ class Scene(ABC):
         panels: A title for each picture, from left to right.
         views: What the first of them can show besides; the first view is the usual one.
         sliders: Its own; the window adds those of the exposure and of the error.
-        plays: The slider that runs when the scene is played; None: the camera turns.
+        plays: The slider that runs when the scene is played; None, or in views without it: the camera turns.
         flat: Whether it lies in a plane, which isn't turned.
         up: 0 to 2, the axis that points up.
-        lit: Whether exposure and tone mapping change it.
     """
 
     title: str
@@ -87,7 +88,6 @@ class Scene(ABC):
     plays: str | None = None
     flat: bool = False
     up: int = 1
-    lit: bool = True
 
     @abstractmethod
     def draw(self, canvas: Canvas, state: State) -> None:
@@ -96,6 +96,10 @@ class Scene(ABC):
     @abstractmethod
     def caption(self, state: State) -> str:
         """A line on what is shown."""
+
+    def box(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """The lowest and highest corner of what the camera shall see at first; None: of all that is drawn."""
+        return None
 
     def describe(self, hit: Hit, state: State) -> str:
         """A line on what lies under the cursor; empty: nothing to tell."""

@@ -105,9 +105,9 @@ def transmittance(volume: DensityVolume, toward: np.ndarray) -> np.ndarray:
     return torch.exp(-volume.extinction * volume.voxel * depth).numpy()
 
 
-@dataclass
+@dataclass(kw_only=True)
 class _SixWayScene(Scene):
-    frames: Sequence[SixWay] = ()
+    frames: Sequence[SixWay]
 
     def __post_init__(self) -> None:
         self._brightness = _WHITE / max(max(float(frame.lightmaps.max()) for frame in self.frames), 1e-12)
@@ -148,9 +148,9 @@ class _SixWayScene(Scene):
         return self.frames[int(state.values.get("frame", 0))]
 
 
-@dataclass
+@dataclass(kw_only=True)
 class _VolumeScene(Scene):
-    frames: Frames = None
+    frames: Frames
 
     def __post_init__(self) -> None:
         self._loaded: tuple[int, DensityVolume, DensityVolume] | None = None

@@ -32,7 +32,7 @@ def compared(decoded: bool, original: bool) -> tuple[str, ...]:
     return ("decoded",) if decoded else ("original",)
 
 
-@dataclass
+@dataclass(kw_only=True)
 class SurfaceScene(Scene):
     """A scene of one lightmap.
 
@@ -42,10 +42,10 @@ class SurfaceScene(Scene):
         height, width: Texels.
     """
 
-    geometry: Geometry = None
+    geometry: Geometry
     brightness: float = 1.0
-    height: int = 0
-    width: int = 0
+    height: int
+    width: int
 
     @abstractmethod
     def lights(self, state: State) -> dict[str, np.ndarray]:
@@ -55,9 +55,9 @@ class SurfaceScene(Scene):
     def tell_texel(self, row: int, column: int, state: State) -> str:
         """A line on a texel, less its place and its light."""
 
+    @abstractmethod
     def tile_colours(self) -> np.ndarray:
-        """A colour for each texel, of its tile, [H, W, 3] in [0, 1]; for scenes with the view "tiles"."""
-        raise NotImplementedError(f"{type(self).__name__} has no tiles")
+        """A colour for each texel, of its tile, [H, W, 3] in [0, 1]; asked for in the view "tiles" alone."""
 
     def draw(self, canvas: Canvas, state: State) -> None:
         display, lights = state.display(self.brightness), self.lights(state)

@@ -13,7 +13,7 @@ from PIL import Image
 
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_path
-from wlm.view.canvas import Canvas
+from wlm.view.canvas import Canvas, Hit
 from wlm.view.display import TONES
 from wlm.view.rendering import import_pyvista, require_opengl
 from wlm.view.scene import Scene, Slider, State
@@ -31,6 +31,7 @@ _EYE = (1.0, 0.8, 1.0)  # from where a scene is first seen, y up
 _MARGIN = 1.06
 _SWEEP = 12.0  # seconds in which a slider without whole values is played
 _TICK = 30  # milliseconds
+_FRAMES = 48  # of a movie
 _EXPOSURE = Slider("exposure", -8.0, 8.0, 0.0, 0.5, "+.1f", unit=" EV")
 _ERROR = Slider("error", 1.0, 64.0, 8.0, 1.0, ".0f", "×", whole=True)
 
@@ -62,7 +63,7 @@ class Window:
         pyvista = import_pyvista("view")
         require_opengl("view")
         self.scene, self.playing, self._rate = scene, False, rate
-        common = [_EXPOSURE] * scene.lit + [_ERROR] * ("error" in scene.panels)
+        common = [_EXPOSURE] + [_ERROR] * ("error" in scene.panels)
         self.sliders = {slider.name: slider for slider in (*scene.sliders, *common)}
         self.state = State({name: slider.value for name, slider in self.sliders.items()}, scene.views[0])
         count, self._share = len(scene.panels), min(_STRIP_PIXELS / size[1], 0.5)
@@ -77,7 +78,7 @@ class Window:
             raise WlmError("view: expected a display, found none; --screenshot and --movie need none")
         self.canvas = Canvas(pyvista, self._plotter, count)
         self._widgets: dict[str, tuple[Any, Any]] = {}
-        self._told = ""
+        self._hit: Hit | None = None
         self._furnish()
         self.draw()
         self.look()
@@ -127,7 +128,7 @@ class Window:
 
     def advance(self, seconds: float) -> None:
         """Plays the scene by some time."""
-        name = self.scene.plays
+        name = self._player()
         if name is None:
             self.turn(360.0 * seconds / _SWEEP)
             return
@@ -146,16 +147,14 @@ class Window:
         self._lay_out()
         views = self.scene.views
         chosen = "   ".join(f"[{i} {v}]" if v == self.state.view else f"{i} {v}" for i, v in enumerate(views, 1))
-        parts = [self.scene.caption(self.state), chosen if len(views) > 1 else "", self.state.tone * self.scene.lit]
+        parts = [chosen if len(views) > 1 else "", self.state.tone, self.scene.caption(self.state)]
         self._texts["caption"].SetInput("      ".join(filter(None, parts)))
-        self._texts["told"].SetInput(self._told)
+        self._tell()
 
     def tell(self, x: int, y: int) -> str:
         """Says, also in the window, what lies at a pixel, counted from the lower left."""
-        hit = self.canvas.hit(x, y)
-        self._told = self.scene.describe(hit, self.state) if hit is not None else ""
-        self._texts["told"].SetInput(self._told)
-        return self._told
+        self._hit = self.canvas.hit(x, y)
+        return self._tell()
 
     def picture(self) -> np.ndarray:
         """What the window shows, uint8 [H, W, 3]."""
@@ -177,7 +176,7 @@ class Window:
 
         Args:
             path: Ends in one of `MOVIES`.
-            frames: Pictures; None: 48, or all frames of a scene that has frames.
+            frames: Pictures; None: 48, or all frames where frames are played.
 
         Returns:
             The number of pictures.
@@ -252,7 +251,6 @@ class Window:
             shape.GetSliderProperty().SetColor(_rgb(_BAR))
             shape.GetTubeProperty().SetColor(_rgb(_INK))
             self._widgets[name] = widget, label
-        main = self.scene.plays or (self.scene.sliders[0].name if self.scene.sliders else None)
         self._keys = {
             "space": self._toggle,
             "t": lambda: self.tone(TONES[1 - TONES.index(self.state.tone)]),
@@ -261,8 +259,8 @@ class Window:
             "bracketright": lambda: self._move("exposure", 1),
             "minus": lambda: self._move("error", -1),
             "plus": lambda: self._move("error", 1),
-            "Left": lambda: self._move(main, -1),
-            "Right": lambda: self._move(main, 1),
+            "Left": lambda: self._move(self._main(), -1),
+            "Right": lambda: self._move(self._main(), 1),
         }
         for number, view in enumerate(self.scene.views, 1):
             self._keys[str(number)] = lambda view=view: self.choose(view)
@@ -273,9 +271,24 @@ class Window:
         for key in self._keys:
             plotter.add_key_event(key, lambda key=key: self.press(key))
 
+    def _shows(self, name: str) -> bool:
+        """Whether a slider does something in this view."""
+        views = self.sliders[name].views
+        return not views or self.state.view in views
+
+    def _player(self) -> str | None:
+        """The slider that playing moves in this view; None: the camera turns."""
+        name = self.scene.plays
+        return name if name is not None and self._shows(name) else None
+
+    def _tell(self) -> str:
+        told = self.scene.describe(self._hit, self.state) if self._hit is not None else ""
+        self._texts["told"].SetInput(told)
+        return told
+
     def _lay_out(self) -> None:
         """Shows the sliders of the view side by side, with their values."""
-        shown = [s.name for s in self.sliders.values() if not s.views or self.state.view in s.views]
+        shown = [name for name in self.sliders if self._shows(name)]
         cell = 1.0 / max(len(shown), _LEAST_CELLS)
         for name, slider in self.sliders.items():
             widget, text = self._widgets[name]
@@ -289,10 +302,16 @@ class Window:
                 text.SetPosition(left + _INDENT, _LABELS)
                 for point, x in ((shape.GetPoint1Coordinate(), 0.0), (shape.GetPoint2Coordinate(), cell - 0.02)):
                     point.SetValue(left + _INDENT + x, _BARS * self._share)
+            # It doesn't see that its ends moved.
+            shape.Modified()
 
     def _move(self, name: str | None, steps: int) -> None:
         if name in self.sliders:
             self.set(name, self.state.values[name] + steps * self.sliders[name].step)
+
+    def _main(self) -> str | None:
+        """The slider of the arrow keys: the first of the scene's own in this view."""
+        return next((slider.name for slider in self.scene.sliders if self._shows(slider.name)), None)
 
     def _toggle(self) -> None:
         self.playing, self._last = not self.playing, time.perf_counter()
@@ -305,21 +324,21 @@ class Window:
             self._plotter.render()
 
     def _hover(self) -> None:
-        before = self._told
+        before = self._texts["told"].GetInput()
         if self.tell(*self._plotter.iren.interactor.GetEventPosition()) != before:
             self._plotter.render()
 
     def _played_once(self, frames: int | None) -> Iterator[np.ndarray]:
-        name = self.scene.plays
+        name = self._player()
         if name is None:
-            count = frames or 48
+            count = frames or _FRAMES
             for _ in range(count):
                 yield self.picture()
                 self.turn(360.0 / count)
             return
         slider = self.sliders[name]
         ends = slider.high - slider.low
-        count = frames or (round(ends) + 1 if slider.whole else 48)
+        count = frames or (round(ends) + 1 if slider.whole else _FRAMES)
         for number in range(count):
             self.set(name, slider.low + ends * number / (count if slider.wraps else max(count - 1, 1)))
             yield self.picture()
@@ -328,7 +347,7 @@ class Window:
         """Puts the camera where it sees all of the scene."""
         first = self.canvas.renderers[0]
         camera = first.camera
-        low, high = np.array(first.ComputeVisiblePropBounds()).reshape(3, 2).T
+        low, high = self.scene.box() or np.array(first.ComputeVisiblePropBounds()).reshape(3, 2).T
         middle = 0.5 * (low + high)
         x, y, z = _EYE
         toward, above = np.array([x, y, z] if self.scene.up == 1 else [x, -z, y]), np.eye(3)[self.scene.up]
