@@ -24,7 +24,7 @@ from wlm.probe.data import save_probes
 from wlm.smoke.camera import Camera
 from wlm.smoke.data import write_six_way
 from wlm.smoke.lightmaps import SixWay
-from wlm.view import rendering
+from wlm.view import rendering, smoke_scene
 from wlm.view.display import Display, heat
 from wlm.view.opening import open_scene
 from wlm.view.scene import Slider
@@ -287,6 +287,25 @@ def test_a_volume_of_smoke_under_a_light(hot, tmp_path, show):
     assert changed(window, before)
     thick, thin = before, scene_of(show(tmp_path / "plume.npz", extinction=0.01))
     assert np.abs(thick - thin).max() > 60
+
+
+def test_the_frames_of_a_simulation_are_played(tmp_path, show):
+    smoke_plumes.write_frames(tmp_path / "jet")
+    window = show(tmp_path / "jet")
+    assert window.scene.plays == "frame" and "frame 1 at 0.10 s" in window._texts["caption"].GetInput()
+    before = scene_of(window)
+    window.advance(2 / 24)  # two frames of 24 a second
+    assert "frame 3 at 0.30 s" in window._texts["caption"].GetInput() and changed(window, before)
+    window.advance(1 / 24)
+    assert window.state.values["frame"] == 0.0  # from the beginning
+
+
+def test_a_large_volume_is_drawn_coarser(tmp_path, show, monkeypatch):
+    monkeypatch.setattr(smoke_scene, "_MOST_VOXELS", 2500)
+    save_volume(tmp_path / "plume.npz", smoke_plumes.plume())
+    window = show(tmp_path / "plume.npz", extinction=20.0)
+    assert "20 × 24 × 20 voxels, drawn as 10 × 12 × 10" in window._texts["caption"].GetInput()
+    assert np.ptp(scene_of(window)) > 60
 
 
 def test_light_falls_off_through_smoke_as_it_should():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -30,7 +31,7 @@ _HEIGHT = Slider("height", -90.0, 90.0, 35.0, 5.0, ".0f", "°")
 _WHITE = 0.8  # of the screen, where the brightest light is
 _GLOW = np.array([1.0, 0.45, 0.12], np.float32)  # of heat, as the pages for a browser have it
 _DARK, _BRIGHT, _SQUARES = 0.03, 0.06, 8  # the ground that shows through, of white, and its squares along a side
-_MOST_VOXELS, _MOST_LIT = 128, 64  # along a side: of what is drawn, and of what the light is marched through
+_MOST_VOXELS, _MOST_LIT = 4_000_000, 250_000  # of what is drawn, and of what the light is marched through
 _AMBIENT = 0.15  # of the light, everywhere in the smoke, so that its dark side has a shape
 _COLUMNS, _LEAST_PLANE, _NAME = 3, 160, 1 / 12  # of the sheet of planes: pixels, and share of a plane
 _EMPTY = "#5a5d63"  # where the sheet has no plane
@@ -207,8 +208,8 @@ def _toward(state: State) -> np.ndarray:
 
 
 def _coarser(volume: DensityVolume, most: int) -> DensityVolume:
-    """A volume of at most so many voxels along a side: means of cubes, the last ones filled up with emptiness."""
-    factor = -(-max(volume.shape) // most)
+    """A volume of at most so many voxels: means of cubes, of which the last are cut off where the volume ends."""
+    factor = next(n for n in itertools.count(1) if math.prod(-(-side // n) for side in volume.shape) <= most)
     if factor == 1:
         return volume
 

@@ -23,6 +23,7 @@ __all__ = ["MOVIES", "Window"]
 MOVIES = {".gif": "GIF", ".webp": "WEBP"}
 """Kinds of movies, by the name's end."""
 
+_HIDDEN = ("vtkEGLRenderWindow", "vtkOSOpenGLRenderWindow")  # what VTK takes where it finds no display
 _BACKGROUND, _STRIP, _INK, _BAR = "#5a5d63", "#25272b", "#e8e8ea", "#8ab4f8"
 _STRIP_PIXELS, _TITLE_PIXELS, _FONT, _TITLE_FONT = 108, 26, 9, 10
 # Places in the strip, as shares of its height and of the width.
@@ -73,7 +74,7 @@ class Window:
             self._plotter = pyvista.Plotter(
                 **layout, off_screen=off_screen, border=False, window_size=size, title=scene.title
             )
-        if not off_screen and "X" not in self._plotter.render_window.GetClassName().removeprefix("vtk")[:1]:
+        if not off_screen and self._plotter.render_window.GetClassName() in _HIDDEN:
             self._plotter.close()
             raise WlmError("view: expected a display, found none; --screenshot and --movie need none")
         self.canvas = Canvas(pyvista, self._plotter, count)
@@ -201,7 +202,6 @@ class Window:
         interactor.initialize()
         if self.scene.flat:
             interactor.enable_2d_style()
-        self._last = time.perf_counter()
         interactor.add_observer("TimerEvent", lambda *_: self._tick())
         interactor.add_observer("MouseMoveEvent", lambda *_: self._hover())
         interactor.create_timer(_TICK, repeating=True)
