@@ -8,8 +8,6 @@ import typer
 from wlm.cli.console import check_output, escape, quiet_warp, show, table
 from wlm.errors import WlmError
 
-__all__ = ["view"]
-
 
 def view(
     files: Annotated[

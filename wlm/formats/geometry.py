@@ -1,7 +1,5 @@
 """The triangles that light is drawn on."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import dataclass
 from pathlib import Path

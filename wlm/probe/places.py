@@ -1,7 +1,5 @@
 """Where a model's probes are, and how large a ball may stand for each."""
 
-from __future__ import annotations
-
 import os
 
 import numpy as np
@@ -10,8 +8,6 @@ from scipy.spatial import cKDTree
 from wlm.errors import WlmError
 from wlm.probe.data import load
 from wlm.probe.model import ProbeModel
-
-__all__ = ["ball_radius", "probes_of"]
 
 _SHARE = 0.45  # of the median distance between neighbours: balls don't touch
 

@@ -1,7 +1,5 @@
 """A mesh's lightmap in a window: what was compressed of it, the lightmap itself, or both."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,8 +14,6 @@ from wlm.texels import exposure, fill_gaps
 from wlm.view.display import heat
 from wlm.view.scene import State
 from wlm.view.surface import SurfaceScene, compared, flat_geometry
-
-__all__ = ["atlas_scene", "input_scene"]
 
 
 def atlas_scene(

@@ -1,15 +1,11 @@
 """What scenes draw with: meshes, lines and volumes in the panels of a window, known by name and brought up to date."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
 
 import numpy as np
-
-__all__ = ["Canvas", "Hit"]
 
 _LEVELS = 256  # of the opacity of smoke
 

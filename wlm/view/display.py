@@ -3,13 +3,9 @@
 The same as the pages for a browser have (`wlm/web/assets/light.js`), so that a picture of either is that of the other.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
-
-__all__ = ["TONES", "Display", "heat", "to_srgb"]
 
 TONES = ("clamped", "filmic")
 """What becomes of light above white: it clips, or Reinhard's curve takes 4 to white."""

@@ -1,7 +1,5 @@
 """Lightmaps over the day in a window: a model, its input, or both."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,8 +14,6 @@ from wlm.lightmap.tiles import TILE, TileGrid, TileKind
 from wlm.texels import exposure, fill_gaps
 from wlm.view.scene import Slider, State
 from wlm.view.surface import SurfaceScene, compared, flat_geometry
-
-__all__ = ["lightmap_scene"]
 
 _COLOURS = {
     TileKind.EMPTY: (0.15, 0.15, 0.15),

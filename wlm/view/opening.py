@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +13,7 @@ from wlm.errors import WlmError
 from wlm.formats.exr import read_exr
 from wlm.formats.exr_file import read_part
 from wlm.formats.geometry import read_geometry
+from wlm.formats.npz import read_npz
 from wlm.lightmap.listing import SET_FILE
 from wlm.smoke.camera import DIRECTIONS
 from wlm.smoke.data import SCENE_FILE
@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from wlm.lightmap.data import LightmapSet
     from wlm.lightmap.model import LightmapModel
     from wlm.view.probe_scene import Probes
-
-__all__ = ["open_scene"]
 
 
 def open_scene(
@@ -75,7 +73,7 @@ def open_scene(
         return request.model()
     if suffix == ".exr":
         return request.lightmap()
-    if suffix == ".nvdb" or (suffix == ".npz" and _holds(path, "density.npy")):
+    if suffix == ".nvdb" or (suffix == ".npz" and "density" in _names(path)):
         return request.volume(path)
     if path.name == SET_FILE:
         return request.lightmap_set()
@@ -206,10 +204,13 @@ def _is_six_way(path: Path) -> bool:
     return all(name in read_part(path).channels for name in DIRECTIONS)
 
 
-def _holds(path: Path, member: str) -> bool:
-    """Whether an archive of arrays has one of a name; what is no archive has none, and the readers say so."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            return member in archive.namelist()
-    except (OSError, ValueError, NotImplementedError, zipfile.BadZipFile):
-        return False
+def _names(path: Path) -> list[str]:
+    """The names of the arrays in a `.npz` file."""
+    found: list[str] = []
+
+    def look(names: Sequence[str]) -> Sequence[str]:
+        found.extend(names)
+        return ()
+
+    read_npz(path, look, numbers=0)
+    return found

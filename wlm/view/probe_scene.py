@@ -1,10 +1,9 @@
 """Light probes in a window: balls, Gaussians, and the cascaded volume round a viewer who walks."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -23,8 +22,6 @@ from wlm.view.canvas import Canvas, Hit
 from wlm.view.rendering import import_pyvista
 from wlm.view.scene import Scene, Slider, State
 from wlm.view.surface import compared
-
-__all__ = ["Probes", "probe_scene"]
 
 _BALLS, _MESH, _GAUSSIANS, _BLOCKS, _PATH, _VIEWER = "balls", "mesh", "gaussians", "blocks", "path", "viewer"
 _DETAIL = ((64, 3), (1024, 2), (8192, 1), (10**9, 0))  # balls, then subdivisions of an icosahedron
@@ -64,7 +61,7 @@ class Probes:
     @classmethod
     def of_model(
         cls, model: ProbeModel, position: np.ndarray, original: np.ndarray | None, live: np.ndarray, title: str
-    ) -> Probes:
+    ) -> Self:
         """Takes what `wlm.probe.places.probes_of` found of a model.
 
         Raises:
@@ -79,7 +76,7 @@ class Probes:
         return cls(places, np.flatnonzero(live), count, values, decoder.decode, model, note)
 
     @classmethod
-    def of_set(cls, probes: ProbeSet, title: str) -> Probes:
+    def of_set(cls, probes: ProbeSet, title: str) -> Self:
         """Takes an input; between probes its light is that of the nearest.
 
         Raises:

@@ -1,15 +1,11 @@
 """VTK by way of pyvista, an optional package, with errors of one line where it is missing or can't render."""
 
-from __future__ import annotations
-
 import functools
 import subprocess
 import sys
 from types import ModuleType
 
 from wlm.errors import WlmError
-
-__all__ = ["import_pyvista", "require_opengl"]
 
 _TRIAL = """
 import vtkmodules.vtkRenderingOpenGL2

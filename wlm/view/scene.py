@@ -1,7 +1,5 @@
 """What a window shows: panels, sliders and views, made by one class for each kind of file."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
@@ -9,8 +7,6 @@ import numpy as np
 
 from wlm.view.canvas import Canvas, Hit
 from wlm.view.display import TONES, Display
-
-__all__ = ["Scene", "Slider", "State"]
 
 
 @dataclass(frozen=True)

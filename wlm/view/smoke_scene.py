@@ -1,7 +1,5 @@
 """Smoke in a window: volumes under a light, and six-way lightmaps as the billboard that they light."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Sequence
@@ -23,8 +21,6 @@ from wlm.view.canvas import Canvas, Hit
 from wlm.view.display import Display
 from wlm.view.scene import Scene, Slider, State
 from wlm.view.surface import flat_geometry
-
-__all__ = ["six_way_scene", "transmittance", "volume_scene"]
 
 _TURN = Slider("turn", -180.0, 180.0, 40.0, 5.0, ".0f", "°", wraps=True)
 _HEIGHT = Slider("height", -90.0, 90.0, 35.0, 5.0, ".0f", "°")

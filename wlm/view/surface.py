@@ -1,7 +1,5 @@
 """A lightmap on its mesh, or as a flat picture: what lightmaps over the day and atlases have in common."""
 
-from __future__ import annotations
-
 from abc import abstractmethod
 from dataclasses import dataclass
 
@@ -10,8 +8,6 @@ import numpy as np
 from wlm.formats.geometry import Geometry
 from wlm.view.canvas import Canvas, Hit
 from wlm.view.scene import Scene, State
-
-__all__ = ["SurfaceScene", "compared", "flat_geometry"]
 
 _SHARE = 0.6  # of a tile's colour over the light
 _MESH = "mesh"

@@ -1,7 +1,5 @@
 """A window on a scene: panels side by side, sliders below them, keys; on a screen, as a picture or as a movie."""
 
-from __future__ import annotations
-
 import os
 import time
 from collections.abc import Iterator
@@ -17,8 +15,6 @@ from wlm.view.canvas import Canvas, Hit
 from wlm.view.display import TONES
 from wlm.view.rendering import import_pyvista, require_opengl
 from wlm.view.scene import Scene, Slider, State
-
-__all__ = ["MOVIES", "Window"]
 
 MOVIES = {".gif": "GIF", ".webp": "WEBP"}
 """Kinds of movies, by the name's end."""

@@ -16,7 +16,6 @@ from wlm.texels import exposure, fill_gaps
 from wlm.web.page import Page, pack_rgb9e5, pack_triangles
 
 
-
 def folder_page(
     folder: str | os.PathLike[str], *, original: str | os.PathLike[str] | None = None, up: Literal["y", "z"] = "y"
 ) -> Page:
