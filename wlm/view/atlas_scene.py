@@ -8,7 +8,6 @@ from wlm.atlas.data import LightmappedMesh
 from wlm.atlas.exporter import Output
 from wlm.atlas.exporter import geometry as mesh_of
 from wlm.atlas.model import AtlasModel, unpack_entries
-from wlm.errors import WlmError
 from wlm.formats.geometry import Geometry
 from wlm.texels import exposure, fill_gaps
 from wlm.view.display import heat
@@ -23,20 +22,17 @@ def atlas_scene(
 
     Args:
         output: The folder's content.
-        original: [H, W, 3], the lightmap; None: not shown.
-        title: Of the window, for messages too.
+        original: [H, W, 3], the lightmap, of the model's size; None: not shown.
+        title: Of the window.
         flat: Whether the lightmap is shown unwrapped, not on its mesh.
         up: The axis that points up.
 
     Raises:
-        WlmError: The folder's mesh is damaged, or the lightmap is of another size.
+        WlmError: The folder's mesh is damaged.
     """
     model, mesh = output.model, mesh_of(output)
     lights = {"decoded": fill_gaps(model.decoder().lightmap(mesh), mesh.mask)}
     if original is not None:
-        if original.shape[:2] != mesh.mask.shape:
-            height, width = original.shape[:2]
-            raise WlmError(f"{title}: expected a lightmap of {model.width}x{model.height}, found {width}x{height}")
         lights["original"] = fill_gaps(np.nan_to_num(original[..., :3], posinf=65504.0), mesh.mask)
     views = ("light", "tiles") if model.method == "tiles" else ("light",)
     return _scene(title, mesh, lights, flat, up, views, model, f"{100 * model.compression_ratio:.1f} % saved (eq. 9)")

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from wlm.errors import WlmError
 from wlm.formats.geometry import Geometry
 from wlm.lightmap.data import LightmapSet
 from wlm.lightmap.decode import Decoder
@@ -36,18 +35,11 @@ def lightmap_scene(
 
     Args:
         model: The model; None: the set alone.
-        lightmaps: The set; None: the model alone.
-        title: Of the window, for messages too.
+        lightmaps: The set, of the model's size; None: the model alone.
+        title: Of the window.
         geometry: The mesh, with lightmap UVs; None: the lightmap is a flat picture.
         up: The axis that points up.
-
-    Raises:
-        WlmError: The set is of another size than the model.
     """
-    if model is not None and lightmaps is not None:
-        height, width = lightmaps.mask.shape
-        if (height, width) != (model.height, model.width):
-            raise WlmError(f"{title}: expected lightmaps of {model.width}x{model.height}, found {width}x{height}")
     first = model if model is not None else lightmaps
     height, width = (model.height, model.width) if model is not None else lightmaps.mask.shape
     times = first.times

@@ -114,7 +114,10 @@ class _Request:
             from wlm.lightmap.data import load as load_set
 
             self._refuse("key", "walk", "scale", "extinction")
-            return self._lightmaps(model, None if self.original is None else load_set(self.original))
+            given = None if self.original is None else load_set(self.original)
+            if given is not None:
+                self._check_size(given.mask.shape, (model.height, model.width))
+            return self._lightmaps(model, given)
         if model.SYSTEM == "probe":
             from wlm.probe.places import probes_of
             from wlm.view.probe_scene import Probes
@@ -148,8 +151,11 @@ class _Request:
         from wlm.view.atlas_scene import atlas_scene
 
         self._refuse("mesh", "key", "walk", "scale", "extinction")
-        light = None if self.original is None else read_exr(self.original)[0]
-        return atlas_scene(read_folder(self.path), light, title=self.path.name, flat=self.flat, up=self._up)
+        output, light = read_folder(self.path), None
+        if self.original is not None:
+            light = read_exr(self.original)[0]
+            self._check_size(light.shape[:2], (output.model.height, output.model.width))
+        return atlas_scene(output, light, title=self.path.name, flat=self.flat, up=self._up)
 
     def probes(self) -> Scene:
         from wlm.probe.data import load as load_probes
@@ -179,6 +185,12 @@ class _Request:
         for name in names:
             if getattr(self, name) not in (None, False):
                 raise WlmError(f"{self.path}: --{name} means nothing to this file")
+
+    def _check_size(self, found: tuple[int, ...], expected: tuple[int, int]) -> None:
+        if found != expected:
+            raise WlmError(
+                f"{self.original}: expected a lightmap of {expected[1]}x{expected[0]}, found {found[1]}x{found[0]}"
+            )
 
     def _lightmaps(self, model: LightmapModel | None, lightmaps: LightmapSet | None) -> Scene:
         from wlm.view.lightmap_scene import lightmap_scene

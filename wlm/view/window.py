@@ -116,7 +116,13 @@ class Window:
         self.draw()
 
     def turn(self, degrees: float) -> None:
-        """Turns the camera about the scene's upward axis."""
+        """Turns the camera about the scene's upward axis.
+
+        Raises:
+            WlmError: The angle isn't finite.
+        """
+        if not np.isfinite(degrees):
+            raise WlmError(f"--turn: expected a finite number, got {degrees}")
         camera, axis = self.canvas.renderers[0].camera, np.eye(3)[self.scene.up]
         focus = np.array(camera.focal_point)
         camera.position = focus + _turned(np.array(camera.position) - focus, axis, np.radians(degrees))
