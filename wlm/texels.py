@@ -1,4 +1,4 @@
-"""Operations on masked images that the metrics, the baselines and the systems share."""
+"""Operations on images of light that the metrics, the baselines, the systems and their pictures share."""
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt
@@ -12,6 +12,8 @@ MOST_SIDE = 65536
 MOST_TEXELS = 1 << 28
 """Texels of a lightmap, at most: 16,384 x 16,384, of which one decoded frame takes 3 GiB."""
 
+_WHITE, _PERCENTILE = 0.8, 99.0  # where that share of the light is on the screen
+
 
 def check_size(height: int, width: int) -> None:
     """Checks the size of a lightmap, before memory is taken for it.
@@ -24,6 +26,12 @@ def check_size(height: int, width: int) -> None:
             f"size: expected at least 1x1 texels, at most {MOST_SIDE} along a side and {MOST_TEXELS} in all, "
             f"found {width}x{height}"
         )
+
+
+def exposure(light: np.ndarray) -> float:
+    """The factor that puts nearly all of some linear light, of any shape, below white; 1 where all is dark."""
+    lit = light[light > 0]
+    return _WHITE / float(np.percentile(lit, _PERCENTILE)) if lit.size else 1.0
 
 
 def fill_gaps(image: np.ndarray, mask: np.ndarray) -> np.ndarray:

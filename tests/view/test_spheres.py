@@ -8,7 +8,7 @@ from PIL import Image
 
 from wlm.errors import WlmError
 from wlm.probe.sphere import basis
-from wlm.view import spheres
+from wlm.view import rendering, spheres
 from wlm.view.spheres import render_probes
 
 GREY = 128
@@ -21,7 +21,7 @@ RED, GREEN, BLUE = np.array([[1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0]])
 def opengl():
     pytest.importorskip("pyvista")
     try:
-        spheres._require_opengl()
+        rendering.require_opengl("spheres")
     except WlmError as error:
         pytest.skip(str(error))
 
@@ -254,9 +254,9 @@ def test_without_the_extra_it_is_named(tmp_path, monkeypatch):
 @pytest.mark.parametrize("trial", ["import os; os.abort()", "raise SystemExit(1)", "import time; time.sleep(9)"])
 def test_a_machine_without_opengl_is_one_line_and_no_crash(tmp_path, monkeypatch, trial):
     pytest.importorskip("pyvista")
-    monkeypatch.setattr(spheres, "_TRIAL", trial)
-    monkeypatch.setattr(spheres, "_TRIAL_SECONDS", 1.0)
-    spheres._require_opengl.cache_clear()
+    monkeypatch.setattr(rendering, "_TRIAL", trial)
+    monkeypatch.setattr(rendering, "_TRIAL_SECONDS", 1.0)
+    rendering.require_opengl.cache_clear()
     with pytest.raises(WlmError, match="found no OpenGL that works") as error:
         render_probes(tmp_path / "a.png", [[0, 0, 0]], from_everywhere(1.0), from_everywhere(1.0))
     assert "\n" not in str(error.value) and not list(tmp_path.iterdir())

@@ -102,6 +102,11 @@ def test_what_has_no_page_is_said_in_one_line(tmp_path):
         assert "\n" not in str(caught.value)
 
 
+def test_probes_of_which_none_is_dead_have_a_page(tmp_path):
+    probe_models.random_model(probes=50, dead=0, positions=True).save(tmp_path / "live.wlm")
+    assert make_page([tmp_path / "live.wlm"]).manifest["probe"]["count"] == 50
+
+
 def test_a_tampered_file_makes_no_page(tmp_path):
     content = bytearray((FILES / "lightmap.wlm").read_bytes())
     content[-1] ^= 1

@@ -14,6 +14,7 @@ from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_path
 from wlm.interop import check_device
 from wlm.ops import raster
+from wlm.view.display import Display
 
 _WHITE_PERCENTILE = 99.5  # as in `wlm.view.sheet`
 _BACKGROUND = 128  # light and dark surfaces stand out from it
@@ -65,9 +66,7 @@ def white_of(light: np.ndarray) -> float:
 
 def encode(light: np.ndarray, hit: np.ndarray, white: float) -> np.ndarray:
     """Encodes linear light [H, W, 3] as sRGB bytes, grey beside the mesh."""
-    linear = np.clip(light / white, 0.0, 1.0)
-    encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-    return np.where(hit[..., None], encoded * 255.0 + 0.5, _BACKGROUND).astype(np.uint8)
+    return np.where(hit[..., None], Display(1.0 / white).picture(light), np.uint8(_BACKGROUND))
 
 
 def save_png(path: str | os.PathLike[str], pixels: np.ndarray) -> None:

@@ -1,11 +1,7 @@
 """Probes as little spheres at their places, each shaded by its own light: what went in, what came out, the error."""
 
-import functools
 import math
 import os
-import subprocess
-import sys
-from types import ModuleType
 from typing import Literal
 
 import numpy as np
@@ -15,6 +11,8 @@ from scipy.spatial import cKDTree
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_path
 from wlm.probe.sphere import irradiance, radiance, sh_count
+from wlm.view.display import Display
+from wlm.view.rendering import import_pyvista, require_opengl
 
 MAX_PROBES = 4096  # more of them overlap in a picture's 600 pixels, and take seconds without a GPU
 _SEED = 0  # of the choice among more
@@ -32,17 +30,6 @@ _MARGIN = 1.05
 _BACKGROUND = "#808080"  # neither light nor dark probes vanish in it
 _TITLE_PIXELS = 44
 _FONT_SIZE = 11
-
-_TRIAL = """
-import vtkmodules.vtkRenderingOpenGL2
-from vtkmodules.vtkRenderingCore import vtkRenderer, vtkRenderWindow
-window = vtkRenderWindow()
-window.SetOffScreenRendering(1)
-window.SetSize(8, 8)
-window.AddRenderer(vtkRenderer())
-window.Render()
-"""
-_TRIAL_SECONDS = 60.0
 
 
 def render_probes(
@@ -98,7 +85,7 @@ def render_probes(
     if total > MAX_PROBES:
         chosen = np.sort(np.random.default_rng(_SEED).choice(total, MAX_PROBES, replace=False))
         position, original, decoded = position[chosen], original[chosen], decoded[chosen]
-    pyvista = _pyvista()
+    pyvista = import_pyvista("spheres")
     place, size = _normalise(position, radius)
     sphere = pyvista.Icosphere(nsub=next(level for most, level in _SUBDIVISIONS if len(place) <= most))
     normals = sphere.points / np.linalg.norm(sphere.points, axis=1, keepdims=True)
@@ -171,15 +158,9 @@ def _shade(
     white = float(np.percentile(light[0], _WHITE_PERCENTILE))
     if white <= 0:
         white = max(float(light[0].max()), 0.0) or 1.0  # all dark, or nearly: one lamp still shows
+    display = Display(1.0 / white)
     error = np.abs(light[1] - light[0]) * gain
-    return tuple(_encode(picture / white).reshape(-1, 3) for picture in (*light, error))
-
-
-def _encode(linear: np.ndarray) -> np.ndarray:
-    """Linear light to sRGB bytes (IEC 61966-2-1), clipped to [0, 1]."""
-    linear = np.clip(linear, 0.0, 1.0)
-    encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-    return (encoded * 255.0 + 0.5).astype(np.uint8)
+    return tuple(display.picture(picture).reshape(-1, 3) for picture in (*light, error))
 
 
 def _camera(points: np.ndarray, up: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -198,7 +179,7 @@ def _camera(points: np.ndarray, up: str) -> tuple[np.ndarray, np.ndarray, np.nda
 
 def _render(pyvista, mesh, points, pictures, titles, up, width) -> np.ndarray:
     """Three panels of one mesh, uint8 [H, W, 3]."""
-    _require_opengl()
+    require_opengl("spheres")
     eye, above, middle, half = _camera(points, up)
     panel = width / len(pictures)
     aspect = min(max(half[1] / half[0], 1 / _LARGEST_ASPECT), _LARGEST_ASPECT)
@@ -230,26 +211,3 @@ def _render(pyvista, mesh, points, pictures, titles, up, width) -> np.ndarray:
             return plotter.screenshot(return_img=True)
         finally:
             plotter.close()
-
-
-def _pyvista() -> ModuleType:
-    try:
-        import pyvista
-    except ImportError as error:
-        raise WlmError("spheres: pyvista is missing; needs the extra: pip install 'wlm[view]'") from error
-    return pyvista
-
-
-@functools.cache
-def _require_opengl() -> None:
-    """Lets a child process render first: where VTK finds no OpenGL that works, it ends its process with a crash."""
-    try:
-        trial = subprocess.run([sys.executable, "-c", _TRIAL], capture_output=True, timeout=_TRIAL_SECONDS)
-        works = trial.returncode == 0
-    except (OSError, subprocess.SubprocessError):
-        works = False
-    if not works:
-        raise WlmError(
-            "spheres: VTK cannot render here: it found no OpenGL that works; expected a display, EGL or OSMesa; on "
-            "Debian or Ubuntu: apt install libegl1"
-        )

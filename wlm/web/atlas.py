@@ -11,11 +11,9 @@ from wlm.atlas.exporter import geometry, read_folder
 from wlm.atlas.shader import atlas_glsl
 from wlm.errors import WlmError
 from wlm.formats.exr import read_exr
-from wlm.texels import fill_gaps
-from wlm.web.geometry import Geometry
-from wlm.web.page import Page, pack_rgb9e5
-
-_WHITE, _PERCENTILE = 0.8, 99.0  # where that share of the light is on the screen
+from wlm.formats.geometry import Geometry
+from wlm.texels import exposure, fill_gaps
+from wlm.web.page import Page, pack_rgb9e5, pack_triangles
 
 
 def folder_page(
@@ -39,19 +37,19 @@ def folder_page(
     position, uv = mesh.position[corners].astype(np.float32), mesh.uv[corners].astype(np.float32)
     drawn = Geometry(position, np.arange(len(corners), dtype=np.uint32).reshape(-1, 3), uv)
     texels = np.ascontiguousarray(model.texels, np.float16)
-    arrays = drawn.arrays() | {"colour": texels}
+    arrays, box = pack_triangles(drawn, up)
+    arrays["colour"] = texels
     if len(model.uv):
         arrays["coordinate"] = model.uv[mesh.active].reshape(-1, 2).astype(np.float32)
     if model.method != "plain":
         arrays["lut"] = np.ascontiguousarray(model.lut, np.uint16)
-    bright = float(np.percentile(texels.astype(np.float32), _PERCENTILE))
     manifest: dict[str, Any] = {
         "width": model.width,
         "height": model.height,
         "shader": atlas_glsl(model),
-        "exposure": _WHITE / bright if bright > 0 else 1.0,
+        "exposure": exposure(texels.astype(np.float32)),
         "atlas": {"method": model.method, "colour": texels.shape[1::-1], "lut": model.lut.shape[1::-1]},
-        **drawn.manifest(up),
+        **box,
     }
     if original is not None:
         lightmap = read_exr(original)[0][..., :3]

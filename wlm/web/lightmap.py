@@ -8,6 +8,7 @@ from typing import Any, Literal
 import numpy as np
 
 from wlm.errors import WlmError
+from wlm.formats.geometry import read_geometry
 from wlm.lightmap.data import load
 from wlm.lightmap.decode import Decoder
 from wlm.lightmap.evaluation import count_kinds
@@ -15,12 +16,10 @@ from wlm.lightmap.exporter import document
 from wlm.lightmap.model import LightmapModel
 from wlm.lightmap.shader import decode_glsl
 from wlm.lightmap.tiles import TileKind
-from wlm.texels import fill_gaps
-from wlm.web.geometry import read_geometry
-from wlm.web.page import Page, pack_rgb9e5
+from wlm.texels import exposure, fill_gaps
+from wlm.web.page import Page, pack_rgb9e5, pack_triangles
 
 _LAYERS = ("W1", "b1", "W2", "b2", "W3", "b3")
-_WHITE, _PERCENTILE = 0.8, 99.0  # where that share of the light is on the screen
 
 
 def lightmap_page(
@@ -59,7 +58,7 @@ def lightmap_page(
         "width": model.width,
         "height": model.height,
         "shader": decode_glsl(model),
-        "exposure": _exposure(model, time),
+        "exposure": exposure(Decoder(model).frame(time)),
         "time": time,
         "lightmap": {name: described[name] for name in ("times", "period", "time_axis", "tau", "tiles")}
         | {
@@ -72,9 +71,9 @@ def lightmap_page(
         },
     }
     if mesh is not None:
-        geometry = read_geometry(mesh)
-        arrays |= geometry.arrays()
-        manifest |= geometry.manifest(up)
+        triangles, box = pack_triangles(read_geometry(mesh), up)
+        arrays |= triangles
+        manifest |= box
     if original is not None:
         manifest["reference"], frames = _originals(model, original, hours)
         arrays |= frames
@@ -87,13 +86,6 @@ def lightmap_page(
         ("profile", profile.name),
     ]
     return Page("lightmap", model.name, "Lightmaps over the day, decoded on this GPU.", figures, manifest, arrays)
-
-
-def _exposure(model: LightmapModel, time: float) -> float:
-    """Puts most of the light of one time below white."""
-    light = Decoder(model).frame(time)
-    bright = float(np.percentile(light[light > 0], _PERCENTILE)) if (light > 0).any() else 0.0
-    return _WHITE / bright if bright > 0 else 1.0
 
 
 def _originals(

@@ -10,12 +10,13 @@ import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import resources
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_write
+from wlm.formats.geometry import Geometry
 
 _ALIGNMENT = 16  # bytes, of an array in the content
 _COMMON = ("content.js", "graphics.js", "blocks.js", "camera.js", "panel.js", "light.js", "surface.js")
@@ -87,6 +88,14 @@ class Page:
         first, *rest = _asset("page.html").split("@")
         page = [first, *(pieces.get(part, part) for part in rest)]
         return atomic_write(path, "".join(page).encode())
+
+
+def pack_triangles(geometry: Geometry, up: Literal["y", "z"]) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """The arrays of triangles by the names that the script knows, and for the manifest the box that its camera sees."""
+    parts = {"position": geometry.position, "triangles": geometry.triangle, "uv": geometry.uv}
+    low, high = geometry.box
+    box = {"low": low.tolist(), "high": high.tolist(), "up": "xyz".index(up)}
+    return {name: values for name, values in parts.items() if values is not None}, box
 
 
 def pack_rgb9e5(light: np.ndarray) -> np.ndarray:

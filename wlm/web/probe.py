@@ -6,21 +6,19 @@ import os
 from typing import Any, Literal
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from wlm.errors import WlmError
-from wlm.probe.data import load
+from wlm.formats.geometry import read_geometry
 from wlm.probe.decode import Decoder
 from wlm.probe.exporter import gaussian_bytes, network_bytes
 from wlm.probe.model import ProbeModel
+from wlm.probe.places import ball_radius, probes_of
 from wlm.probe.shader import probe_glsl
 from wlm.probe.sphere import irradiance, sh_count
-from wlm.web.geometry import read_geometry
-from wlm.web.page import Page
+from wlm.texels import exposure
+from wlm.web.page import Page, pack_triangles
 
 _BANDS = 9  # coefficients that diffuse light needs
-_WHITE, _PERCENTILE = 0.8, 99.0
-_SPHERE = 0.45  # of the median distance between neighbours
 _UP = np.array([[0.0, 1.0, 0.0]])
 
 
@@ -47,33 +45,18 @@ def probe_page(
     coefficients = sh_count(model.outputs)
     if coefficients is None:
         raise WlmError(f"{model.name}: expected spherical harmonics, found {model.outputs} numbers a probe")
-    values = None
-    if original is not None:
-        probes = load(original, key=key)
-        if len(probes.position) != model.probes or probes.values.shape[1] != model.outputs:
-            raise WlmError(
-                f"{original}: expected {model.probes} probes of {model.outputs} numbers, found "
-                f"{len(probes.position)} of {probes.values.shape[1]}"
-            )
-        position, values = probes.position, probes.values
-    elif len(model.positions):
-        position = model.stored_positions()
-    else:
-        raise WlmError(f"{model.name}: the file has no positions; expected --original, the file that was compressed")
-    live = ~model.dead
+    position, values, live = probes_of(model, original, key)
     places = position[live].astype(np.float32)
     arrays = {
         "gaussians": np.frombuffer(_whole(gaussian_bytes(model)), "<u4"),
         "network": np.frombuffer(_whole(network_bytes(model)), "<u4"),
         "places": places,
     }
-    spread = cKDTree(places).query(places, k=2)[0][:, 1] if len(places) > 1 else np.ones(1)
-    radius = _SPHERE * float(np.median(spread[spread > 0], axis=None)) if (spread > 0).any() else 1.0
+    radius = ball_radius(places)
     light = Decoder(model).decode(position[live]).reshape(len(places), coefficients, 3)
-    bright = float(np.percentile(irradiance(light, _UP) / np.pi, _PERCENTILE))
     manifest: dict[str, Any] = {
         "shader": probe_glsl(model),
-        "exposure": _WHITE / bright if bright > 0 else 1.0,
+        "exposure": exposure(irradiance(light, _UP) / np.pi),
         "low": (places.min(0) - radius).tolist(),
         "high": (places.max(0) + radius).tolist(),
         "up": "xyz".index(up),
@@ -86,9 +69,8 @@ def probe_page(
         arrays["original"] = stored
         manifest["reference"] = {"times": [0.0]}
     if mesh is not None:
-        geometry = read_geometry(mesh, with_uv=False)
-        arrays |= geometry.arrays()
-        box = geometry.manifest(up)
+        triangles, box = pack_triangles(read_geometry(mesh, with_uv=False), up)
+        arrays |= triangles
         manifest["low"] = np.minimum(manifest["low"], box["low"]).tolist()
         manifest["high"] = np.maximum(manifest["high"], box["high"]).tolist()
     figures = [

@@ -1,12 +1,8 @@
-"""The triangles that a page draws light on."""
-
-from __future__ import annotations
+"""The triangles that light is drawn on."""
 
 import os
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
 
 import numpy as np
 
@@ -29,15 +25,11 @@ class Geometry:
     triangle: np.ndarray
     uv: np.ndarray | None = None
 
-    def arrays(self) -> dict[str, np.ndarray]:
-        """The arrays by the names that the page's script knows."""
-        parts = {"position": self.position, "triangles": self.triangle, "uv": self.uv}
-        return {name: values for name, values in parts.items() if values is not None}
-
-    def manifest(self, up: Literal["y", "z"]) -> Mapping[str, Any]:
-        """The box that the camera looks at."""
+    @property
+    def box(self) -> tuple[np.ndarray, np.ndarray]:
+        """The lowest and the highest corner of what the triangles span, float32 [3] each."""
         used = self.position[self.triangle.reshape(-1)]
-        return {"low": used.min(0).tolist(), "high": used.max(0).tolist(), "up": "xyz".index(up)}
+        return used.min(0), used.max(0)
 
 
 def read_geometry(path: str | os.PathLike[str], uv_set: int | None = None, *, with_uv: bool = True) -> Geometry:

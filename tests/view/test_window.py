@@ -1,0 +1,415 @@
+"""The window: every kind of file has a picture that follows its controls, and what has none is said in one line."""
+
+import re
+import sys
+
+import numpy as np
+import pytest
+import torch
+from builders import atlas_meshes, atlas_models, probe_models, probe_sets, small_sets, smoke_plumes
+from builders.contract import FILES
+from PIL import Image
+from typer.testing import CliRunner
+
+import wlm
+from wlm.cli.app import app
+from wlm.errors import WlmError
+from wlm.fluid.volume import save_volume
+from wlm.formats.exr import write_exr
+from wlm.formats.gltf import document_from_arrays
+from wlm.formats.gltf_writer import write_glb
+from wlm.lightmap.data import from_arrays
+from wlm.lightmap.tiles import TileKind
+from wlm.probe.data import save_probes
+from wlm.smoke.camera import Camera
+from wlm.smoke.data import write_six_way
+from wlm.smoke.lightmaps import SixWay
+from wlm.view import rendering, smoke_scene
+from wlm.view.display import Display, heat
+from wlm.view.opening import open_scene
+from wlm.view.scene import Slider
+from wlm.view.smoke_scene import transmittance
+from wlm.view.window import Window
+
+SIZE = (480, 300)
+STRIP = 108
+
+
+@pytest.fixture
+def show():
+    """Opens files in a window that is never shown."""
+    pytest.importorskip("pyvista")
+    try:
+        rendering.require_opengl("view")
+    except WlmError as error:
+        pytest.skip(str(error))
+    windows = []
+
+    def opened(*files, **options):
+        windows.append(Window(open_scene(files, **options), size=SIZE))
+        return windows[-1]
+
+    yield opened
+    for window in windows:
+        window.close()
+
+
+def scene_of(window) -> np.ndarray:
+    """The panels without the strip of controls, int [H, W, 3]."""
+    return window.picture()[:-STRIP].astype(int)
+
+
+def changed(window, before: np.ndarray) -> bool:
+    return np.abs(scene_of(window) - before).max() > 12
+
+
+def drag(window, name: str, value: float) -> None:
+    """Moves a slider as a mouse does."""
+    widget = window._widgets[name][0]
+    widget.GetRepresentation().SetValue(value)
+    widget.InvokeEvent("InteractionEvent")
+
+
+@pytest.fixture(scope="module")
+def lightmaps(tmp_path_factory):
+    """A model of a dynamic, a static, a constant and an empty tile as `four.wlm`; its set; a quad with lightmap UVs."""
+    folder = tmp_path_factory.mktemp("lightmaps")
+    frames = np.zeros((5, 256, 256, 3), np.float32)
+    frames[:, :128, :128] = small_sets.moving_light().frames
+    frames[:, :128, 128:] = small_sets.static_light().frames / 24.0
+    frames[:, 128:, :128] = (1.0 + np.arange(5.0))[:, None, None, None] / 5.0
+    mask = np.ones((256, 256), bool)
+    mask[128:, 128:] = False
+    given = from_arrays(frames, small_sets.HOURS, mask, 24.0, name="four")
+    wlm.lightmap.compress(given, small_sets.tiny_profile(static_budget_db=20.0, steps=20)).save(folder / "four.wlm")
+    small_sets.write_set(folder / "set", given)
+    corners = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+    uv = np.array([[0.0, 1], [1, 1], [1, 0], [0, 0]])
+    document, _ = document_from_arrays(corners, np.array([[0, 1, 2], [0, 2, 3]]), uv, "quad")
+    write_glb(folder / "quad.glb", document, [], 0)
+    return folder
+
+
+def test_lightmaps_follow_the_hour_the_exposure_and_the_tone(lightmaps, show):
+    window = show(lightmaps / "four.wlm")
+    assert set(window.sliders) == {"hour", "exposure"}
+    before = scene_of(window)
+    assert np.ptp(before) > 100
+    drag(window, "hour", 18.5)
+    assert window.state.values["hour"] == 18.5 and changed(window, before)
+    before = scene_of(window)
+    window.press("bracketright")
+    assert scene_of(window).mean() > before.mean()
+    before = scene_of(window)
+    window.press("t")
+    assert window.state.tone == "filmic" and changed(window, before)
+    window.press("Right")
+    assert window.state.values["hour"] == 18.75
+    window.set("hour", 25.0)
+    assert window.state.values["hour"] == 1.0  # the day wraps round
+    window.press("space")
+    assert window.playing
+    window.advance(3.0)  # a quarter of the twelve seconds that a day takes
+    assert window.state.values["hour"] == pytest.approx(7.0)
+
+
+def test_a_texel_tells_its_tile_and_its_light(lightmaps, show):
+    window = show(lightmaps / "four.wlm", original=lightmaps / "set", flat=True, mesh=lightmaps / "quad.glb")
+    assert window.scene.panels == ("decoded", "original", "error") and window.scene.flat
+    model, panel = wlm.load(lightmaps / "four.wlm"), SIZE[0] // 3
+    middle = STRIP + (SIZE[1] - STRIP) // 2
+    for x, y, kind in ((-20, 20, "dynamic"), (20, 20, "static"), (-20, -20, "constant"), (20, -20, "empty")):
+        told = window.tell(panel // 2 + x, middle + y)
+        column, row = map(int, re.match(r"texel (\d+), (\d+)", told).groups())
+        number = row // 128 * 2 + column // 128
+        assert f"tile {number} ({kind})" in told and TileKind(model.kind[number]).name.lower() == kind
+        decoded = model.decoder().frame(window.state.values["hour"])[row, column]
+        assert f"decoded {' '.join(f'{value:.4g}' for value in decoded)}" in told and "original" in told
+    told = window.tell(panel // 2 - 20, middle + 20)
+    window.set("hour", 1.0)
+    assert window._texts["told"].GetInput().split("decoded")[0] == told.split("decoded")[0]
+    assert window._texts["told"].GetInput() != told  # the light of that texel at the new hour
+    assert window.tell(panel // 2, SIZE[1] - 2) == ""
+
+
+def test_panels_show_decoded_original_and_error(lightmaps, show):
+    window = show(lightmaps / "four.wlm", original=lightmaps / "set", mesh=lightmaps / "quad.glb")
+    decoded, original, error = np.split(scene_of(window)[40:], 3, axis=1)
+    assert np.abs(decoded - original).max() > 5 and np.abs(error - original).max() > 100
+    drag(window, "error", 64)
+    assert np.split(scene_of(window)[40:], 3, axis=1)[2].mean() > error.mean()
+    window.turn(180.0)
+    turned = np.split(scene_of(window)[40:], 3, axis=1)
+    assert np.abs(turned[0] - decoded).max() > 20 and np.abs(turned[1] - original).max() > 20  # one camera for all
+
+
+def test_tiles_have_the_colours_of_their_kinds(lightmaps, show):
+    window = show(lightmaps / "four.wlm")
+    window.press("2")
+    picture = scene_of(window)
+    height, width = picture.shape[:2]
+    at = {
+        kind: picture[height // 2 + y, width // 2 + x]
+        for kind, x, y in (("dynamic", -40, -40), ("static", 40, -40), ("constant", -40, 40), ("empty", 40, 40))
+    }
+    assert at["dynamic"].argmax() == 0 and at["static"].argmax() == 1 and at["constant"].argmax() == 2
+    assert np.ptp(at["empty"]) < 3
+    assert "1 dynamic (orange)" in window._texts["caption"].GetInput()
+    with pytest.raises(WlmError, match="--view: expected light or tiles, got balls"):
+        window.choose("balls")
+
+
+def test_a_lightmap_is_upright_and_not_mirrored(tmp_path, show):
+    light = np.zeros((64, 64, 3), np.float32)
+    light[:16, :16] = [1, 0, 0]
+    light[-16:, :16] = [0, 1, 0]
+    write_exr(tmp_path / "corner.exr", light)
+    picture = scene_of(show(tmp_path / "corner.exr"))
+    red, green = (np.argwhere(picture[..., channel] > 150 + picture[..., 2]).mean(0) for channel in (0, 1))
+    height, width = picture.shape[:2]
+    assert red[0] < height / 2 and red[1] < width / 2 and green[0] > height / 2 and green[1] < width / 2
+
+
+@pytest.mark.parametrize("kind", ["tiles", "cascade"])
+def test_atlases_of_each_method(kind, tmp_path, show):
+    mesh = atlas_meshes.sheet()
+    model = atlas_models.random_model(mesh, kind)
+    wlm.atlas.export(model, tmp_path / "sheet", mesh)
+    _, light = atlas_meshes.write_files(tmp_path, mesh)
+    window = show(tmp_path / "sheet", original=light)
+    decoded, original, _ = np.split(scene_of(window)[40:], 3, axis=1)
+    assert np.ptp(decoded) > 100 and np.abs(decoded - original).max() > 20
+    if kind == "cascade":
+        assert window.scene.views == ("light",)
+        return
+    window.choose("tiles")
+    assert np.abs(np.split(scene_of(window)[40:], 3, axis=1)[0] - decoded).max() > 20
+    told = window.tell(SIZE[0] // 6, STRIP + (SIZE[1] - STRIP) // 2)
+    x, y, wide, high = map(int, re.search(r"tile (\d+), (\d+): (\d+) × (\d+) texels", told).groups())
+    size = (model.lut[y, x] & 15) + 1
+    assert [wide, high] == size.tolist()
+
+
+def test_the_input_of_an_atlas(tmp_path, show):
+    mesh, light = atlas_meshes.write_files(tmp_path, atlas_meshes.sheet())
+    window = show(light, mesh=mesh)
+    assert window.scene.panels == ("original",) and np.ptp(scene_of(window)) > 100
+    before = scene_of(window)
+    window.advance(3.0)
+    assert changed(window, before)  # the camera turned
+
+
+def test_probes_as_balls_gaussians_and_a_volume(tmp_path, show):
+    model = probe_models.random_model(probes=200, positions=True)
+    model.save(tmp_path / "room.wlm")
+    places = model.stored_positions()
+    save_probes(tmp_path / "room.npz", places, probe_sets.synthetic(200).values)
+    low, high = places.min(0), places.max(0)
+    floor = np.array([low, [high[0], low[1], low[2]], [low[0], low[1], high[2]]])
+    document, _ = document_from_arrays(floor, np.array([[0, 2, 1]]), np.zeros((3, 2)), "floor")
+    write_glb(tmp_path / "floor.glb", document, [], 0)
+    np.savez(tmp_path / "walk.npz", position=low + (high - low) * np.array([[0.2], [0.5], [0.8]]))
+    options = {"mesh": tmp_path / "floor.glb", "walk": tmp_path / "walk.npz"}
+    window = show(tmp_path / "room.wlm", original=tmp_path / "room.npz", **options)
+    assert window.scene.views == ("balls", "gaussians", "volume")
+    views = {}
+    for key, name in enumerate(window.scene.views, 1):
+        window.press(str(key))
+        assert window.state.view == name
+        views[name] = scene_of(window)[40:, : SIZE[0] // 3]
+        shown = {
+            s.name for s in window.sliders.values() if window._widgets[s.name][0].GetRepresentation().GetVisibility()
+        }
+        assert shown - {"exposure", "error"} == {"balls": set(), "gaussians": {"sigma"}, "volume": {"frame"}}[name]
+    assert np.abs(views["balls"] - views["gaussians"]).max() > 40
+    assert np.abs(views["gaussians"] - views["volume"]).max() > 40
+    assert "blocks" in window._texts["caption"].GetInput()
+    before = scene_of(window)
+    drag(window, "frame", 2.2)
+    assert window.state.values["frame"] == 2.0 and changed(window, before)
+    window.choose("gaussians")
+    before = scene_of(window)
+    drag(window, "sigma", 0.3)
+    assert changed(window, before)
+
+
+def test_a_file_of_probes_alone(tmp_path, show):
+    probes = probe_sets.synthetic(60, dead=2)
+    save_probes(tmp_path / "room.json", probes.position, probes.values)
+    window = show(tmp_path / "room.json")
+    assert window.scene.views == ("balls", "volume") and np.ptp(scene_of(window)) > 80
+    low, high = window.scene.box()
+    middle = 0.5 * (low + high)
+    ball = np.linalg.norm(probes.position - middle, axis=1).argmin()
+    window.canvas.renderers[0].camera.focal_point = probes.position[ball]
+    window.canvas.renderers[0].camera.position = probes.position[ball] + [0, 0.7, 0.7]
+    told = window.tell(SIZE[0] // 2, STRIP + (SIZE[1] - STRIP) // 2)
+    assert told.startswith(f"probe {ball} at") and "mean radiance" in told
+    before = scene_of(window)
+    window.choose("volume")
+    assert changed(window, before)
+
+
+def six_way(path, light=1.0, size=24):
+    """Lightmaps that differ, with a camera that looks along -z."""
+    maps = torch.arange(1.0, 7.0)[:, None, None].expand(6, size, size) / 10.0 * light
+    camera = Camera.look_at((0.0, 0.0, 1.0), np.zeros(3), extent=1.0, height=size, width=size)
+    write_six_way(path, SixWay(maps.contiguous(), torch.full((size, size), 0.3), camera=camera))
+
+
+def test_six_way_lightmaps_turn_with_the_light(tmp_path, show):
+    for number, light in enumerate((1.0, 0.3), 1):
+        six_way(tmp_path / f"six_{number:04d}.exr", light)
+    window = show(tmp_path)
+    assert window.scene.panels == ("smoke", "lightmaps") and window.scene.plays == "frame"
+    seen = []
+    for turn, height in ((90.0, 0.0), (-90.0, 0.0), (0.0, 90.0), (0.0, -90.0), (0.0, 0.0), (180.0, 0.0)):
+        window.set("turn", turn)
+        window.set("height", height)
+        seen.append(scene_of(window)[40:, : SIZE[0] // 2].mean())
+    assert seen == sorted(seen)  # right, left, top, bottom, front, back, as dark to bright as they were made
+    before = scene_of(window)
+    drag(window, "frame", 1.0)
+    assert scene_of(window).mean() < before.mean()
+    told = window.tell(SIZE[0] // 4, STRIP + (SIZE[1] - STRIP) // 2)
+    assert "right 0.03" in told and "alpha 0.7" in told
+
+
+@pytest.mark.parametrize("hot", [False, True])
+def test_a_volume_of_smoke_under_a_light(hot, tmp_path, show):
+    save_volume(tmp_path / "plume.npz", smoke_plumes.plume(hot=hot))
+    window = show(tmp_path / "plume.npz", extinction=20.0)
+    before = scene_of(window)
+    assert "extinction 20" in window._texts["caption"].GetInput()
+    red = (before[..., 0] - before[..., 2]).max()
+    assert red > 30 if hot else red < 5
+    drag(window, "turn", -140.0)
+    assert changed(window, before)
+    thick, thin = before, scene_of(show(tmp_path / "plume.npz", extinction=0.01))
+    assert np.abs(thick - thin).max() > 60
+
+
+def test_the_frames_of_a_simulation_are_played(tmp_path, show):
+    smoke_plumes.write_frames(tmp_path / "jet")
+    window = show(tmp_path / "jet")
+    assert window.scene.plays == "frame" and "frame 1 at 0.10 s" in window._texts["caption"].GetInput()
+    before = scene_of(window)
+    window.advance(2 / 24)  # two frames of 24 a second
+    assert "frame 3 at 0.30 s" in window._texts["caption"].GetInput() and changed(window, before)
+    window.advance(1 / 24)
+    assert window.state.values["frame"] == 0.0  # from the beginning
+
+
+def test_a_large_volume_is_drawn_coarser(tmp_path, show, monkeypatch):
+    monkeypatch.setattr(smoke_scene, "_MOST_VOXELS", 2500)
+    save_volume(tmp_path / "plume.npz", smoke_plumes.plume())
+    window = show(tmp_path / "plume.npz", extinction=20.0)
+    assert "20 × 24 × 20 voxels, drawn as 10 × 12 × 10" in window._texts["caption"].GetInput()
+    assert np.ptp(scene_of(window)) > 60
+
+
+def test_light_falls_off_through_smoke_as_it_should():
+    volume = wlm.fluid.from_array(np.ones((6, 5, 4)), extinction=0.5, voxel=0.2)
+    light = transmittance(volume, np.array([1.0, 0.0, 0.0]))
+    # A voxel's centre has half a voxel and all those behind it between itself and the light.
+    expected = np.exp(-0.5 * 0.2 * (np.arange(6)[::-1] + 0.5))
+    np.testing.assert_allclose(light[:, 2, 2], expected, rtol=0.06)
+
+
+def test_a_movie_plays_the_day_once(lightmaps, tmp_path, show):
+    window = show(lightmaps / "four.wlm")
+    assert window.movie(tmp_path / "day.gif", 4) == 4
+    with Image.open(tmp_path / "day.gif") as movie:
+        assert movie.n_frames == 4 and movie.size == SIZE
+        frames = []
+        for number in range(4):
+            movie.seek(number)
+            frames.append(np.asarray(movie.convert("RGB")).astype(int))
+    assert all(np.abs(one - two).max() > 12 for one, two in zip(frames, frames[1:], strict=False))
+    with pytest.raises(WlmError, match="ends in .gif or .webp, found .mp4"):
+        window.movie(tmp_path / "day.mp4")
+
+
+def test_the_command_writes_a_picture_and_a_movie(lightmaps, tmp_path, show):
+    del show  # only for its check of OpenGL
+    out, movie = tmp_path / "out.png", tmp_path / "out.webp"
+    options = ["--hour", "18.5", "--exposure", "1", "--view", "tiles", "--size", "400x300", "--tone", "filmic"]
+    outputs = ["--screenshot", str(out), "--movie", str(movie), "--frames", "2"]
+    result = CliRunner().invoke(app, ["view", str(lightmaps / "four.wlm"), *options, *outputs])
+    assert result.exit_code == 0, result.output
+    with Image.open(out) as picture:
+        assert picture.size == (400, 300) and np.ptp(np.asarray(picture)) > 100
+    with Image.open(movie) as played:
+        assert played.n_frames == 2
+
+
+def test_what_has_no_picture_is_said_in_one_line(lightmaps, tmp_path):
+    probe_models.random_model(positions=False).save(tmp_path / "probe.wlm")
+    probe_models.random_model(outputs=5, positions=True).save(tmp_path / "five.wlm")
+    small_sets.write_set(tmp_path / "half", small_sets.moving_light(height=64))
+    (tmp_path / "bad.npz").write_bytes(b"PK\x03\x04 no archive")
+    six_way(tmp_path / "a.exr", size=8)
+    six_way(tmp_path / "b.exr", size=4)
+    four = lightmaps / "four.wlm"
+    for files, options, said in (
+        ([], {}, "found none"),
+        ([tmp_path / "absent.wlm"], {}, "absent.wlm: no such file or folder"),
+        ([tmp_path / "bad.npz"], {}, "bad.npz"),
+        ([FILES / "smoke.wlm"], {}, "no picture of its own"),
+        ([FILES / "atlas-tiles.wlm"], {}, "expected the folder"),
+        ([four, four], {}, "expected one file"),
+        ([four], {"key": "sh"}, "--key means nothing"),
+        ([four], {"walk": four}, "--walk means nothing"),
+        ([four], {"mesh": tmp_path / "absent.glb"}, "absent.glb"),
+        ([four], {"original": tmp_path / "half"}, "half: expected a lightmap of 256x256, found 128x64"),
+        ([lightmaps / "set"], {"original": four}, "--original means nothing"),
+        ([tmp_path / "probe.wlm"], {}, "--original"),
+        ([tmp_path / "probe.wlm"], {"flat": True}, "--flat means nothing"),
+        ([tmp_path / "five.wlm"], {}, "spherical harmonics"),
+        ([tmp_path / "a.exr", tmp_path / "b.exr"], {}, "expected 8x8 pixels as the first frame, found 4x4"),
+        ([tmp_path / "a.exr"], {"extinction": 2.0}, "--extinction means nothing"),
+        ([lightmaps / "quad.glb"], {}, "found .glb"),
+    ):
+        with pytest.raises(WlmError, match=re.escape(said)) as caught:
+            open_scene(files, **options)
+        assert "\n" not in str(caught.value)
+
+
+def test_the_command_refuses_in_one_line(lightmaps, tmp_path, monkeypatch, show):
+    del show  # only for its check of OpenGL
+    out = ["--screenshot", str(tmp_path / "out.png")]
+    monkeypatch.delenv("DISPLAY", raising=False)
+    for options, said in (
+        ([], "expected a display"),
+        (["--turn", "3", "--frame", "2", *out], "--frame means nothing"),
+        (["--hour", "nan", *out], "--hour: expected a finite number"),
+        (["--mesh", str(lightmaps / "quad.glb"), "--turn", "inf", *out], "--turn: expected a finite number"),
+        (["--view", "volume", *out], "--view: expected light or tiles"),
+        (["--size", "10", *out], "--size: expected a width and a height"),
+        (["--rate", "0", *out], "--rate"),
+        (["--frames", "3", *out], "--frames: means nothing without --movie"),
+        (["--movie", str(tmp_path / "a.gif"), "--frames", "0"], "--frames: expected at least 1"),
+        (["--screenshot", str(tmp_path / "out.jpg")], "ends in .png"),
+    ):
+        result = CliRunner().invoke(app, ["view", str(lightmaps / "four.wlm"), *options])
+        assert result.exit_code == 2 and said in result.stderr and result.stderr.count("\n") == 1, result.output
+    monkeypatch.setitem(sys.modules, "pyvista", None)
+    result = CliRunner().invoke(app, ["view", str(lightmaps / "four.wlm"), *out])
+    assert result.exit_code == 2 and "view: pyvista is missing" in result.stderr
+    assert not list(tmp_path.iterdir())
+
+
+def test_light_on_the_screen():
+    light = np.array([0.0, 0.0031308, 0.18, 1.0, 4.0])
+    clamped, filmic = Display().picture(light), Display(tone="filmic").picture(light)
+    assert clamped.tolist() == [0, 10, 118, 255, 255] and filmic[-1] == 255 and filmic[3] < 255
+    assert (Display(2.0).screen(light / 2.0) == Display().screen(light)).all()
+    assert heat(np.array([-1.0, 0.0, 1.0, 2.0])).tolist() == [[0] * 3, [0] * 3, [255] * 3, [255] * 3]
+    one = np.full((2, 3), 0.5)
+    assert Display().error(one, one).max() == 0
+
+
+def test_sliders_stay_between_their_ends():
+    day, frames = Slider("hour", 0, 24, 12, 1, wraps=True), Slider("frame", 0, 9, 0, 1, whole=True)
+    assert [day.fit(x) for x in (-1.0, 24.0, 30.0)] == [23.0, 24.0, 6.0]
+    assert [frames.fit(x) for x in (-3.0, 4.4, 12.0)] == [0.0, 4.0, 9.0]

@@ -1,0 +1,49 @@
+"""Where a model's probes are, and how large a ball may stand for each."""
+
+import os
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from wlm.errors import WlmError
+from wlm.probe.data import load
+from wlm.probe.model import ProbeModel
+
+_SHARE = 0.45  # of the median distance between neighbours: balls don't touch
+
+
+def probes_of(
+    model: ProbeModel, original: str | os.PathLike[str] | None, key: str | None = None
+) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
+    """The places of a model's probes, with the file that was compressed their numbers, and which of them are live.
+
+    Args:
+        model: The model.
+        original: The file that was compressed; None: the positions stored with the model.
+        key: Which of the file's arrays, as for `wlm.probe.load`.
+
+    Returns:
+        float64 [N, 3]; float32 [N, D] or None; bool [N].
+
+    Raises:
+        WlmError: No positions are known, or the file can't be read or is of other probes.
+    """
+    live = ~model.dead if len(model.dead) else np.ones(model.probes, bool)
+    if original is not None:
+        probes = load(original, key=key)
+        if len(probes.position) != model.probes or probes.values.shape[1] != model.outputs:
+            raise WlmError(
+                f"{original}: expected {model.probes} probes of {model.outputs} numbers, found "
+                f"{len(probes.position)} of {probes.values.shape[1]}"
+            )
+        return probes.position, probes.values, live
+    if not len(model.positions):
+        raise WlmError(f"{model.name}: the file has no positions; expected --original, the file that was compressed")
+    return model.stored_positions(), None, live
+
+
+def ball_radius(position: np.ndarray) -> float:
+    """A radius at which balls at places [N, 3] stay apart; 1 where there is but one place."""
+    nearest = cKDTree(position).query(position, k=2)[0][:, 1] if len(position) > 1 else np.zeros(0)
+    apart = nearest[nearest > 0]
+    return _SHARE * float(np.median(apart)) if apart.size else 1.0

@@ -1,0 +1,115 @@
+"""A mesh's lightmap in a window: what was compressed of it, the lightmap itself, or both."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from wlm.atlas.data import LightmappedMesh
+from wlm.atlas.exporter import Output
+from wlm.atlas.exporter import geometry as mesh_of
+from wlm.atlas.model import AtlasModel, unpack_entries
+from wlm.formats.geometry import Geometry
+from wlm.texels import exposure, fill_gaps
+from wlm.view.display import heat
+from wlm.view.scene import State
+from wlm.view.surface import SurfaceScene, compared, flat_geometry
+
+
+def atlas_scene(
+    output: Output, original: np.ndarray | None, *, title: str, flat: bool = False, up: int = 1
+) -> SurfaceScene:
+    """Makes the scene of a compression, with the lightmap that was compressed beside it.
+
+    Args:
+        output: The folder's content.
+        original: [H, W, 3], the lightmap, of the model's size; None: not shown.
+        title: Of the window.
+        flat: Whether the lightmap is shown unwrapped, not on its mesh.
+        up: The axis that points up.
+
+    Raises:
+        WlmError: The folder's mesh is damaged.
+    """
+    model, mesh = output.model, mesh_of(output)
+    lights = {"decoded": fill_gaps(model.decoder().lightmap(mesh), mesh.mask)}
+    if original is not None:
+        lights["original"] = fill_gaps(np.nan_to_num(original[..., :3], posinf=65504.0), mesh.mask)
+    views = ("light", "tiles") if model.method == "tiles" else ("light",)
+    return _scene(title, mesh, lights, flat, up, views, model, f"{100 * model.compression_ratio:.1f} % saved (eq. 9)")
+
+
+def input_scene(mesh: LightmappedMesh, *, title: str, flat: bool = False, up: int = 1) -> SurfaceScene:
+    """Makes the scene of a mesh under its lightmap; arguments as for `atlas_scene`."""
+    return _scene(title, mesh, {"original": mesh.filled}, flat, up, ("light",), None, "input")
+
+
+def _scene(
+    title: str,
+    mesh: LightmappedMesh,
+    lights: dict[str, np.ndarray],
+    flat: bool,
+    up: int,
+    views: tuple[str, ...],
+    model: AtlasModel | None,
+    note: str,
+) -> SurfaceScene:
+    height, width = mesh.mask.shape
+    shape = Geometry(mesh.position.astype(np.float32), mesh.triangle[mesh.active].astype(np.uint32), mesh.uv)
+    return _AtlasScene(
+        title,
+        compared("decoded" in lights, "original" in lights),
+        views=views,
+        flat=flat,
+        up=up,
+        geometry=flat_geometry(height, width) if flat else shape,
+        brightness=exposure(lights.get("original", next(iter(lights.values())))[mesh.mask]),
+        height=height,
+        width=width,
+        model=model,
+        light=lights,
+        mask=mesh.mask,
+        note=note,
+    )
+
+
+@dataclass(kw_only=True)
+class _AtlasScene(SurfaceScene):
+    model: AtlasModel | None
+    light: dict[str, np.ndarray]
+    mask: np.ndarray
+    note: str
+
+    def lights(self, state: State) -> dict[str, np.ndarray]:
+        return self.light
+
+    def tile_colours(self) -> np.ndarray:
+        first, size = unpack_entries(self.model.lut)
+        side = self.model.profile.tile
+        share = size.prod(-1) / (side + 1) ** 2
+        rows, columns = (
+            np.minimum(np.arange(n) // side, count - 1) for n, count in zip(self.mask.shape, share.shape, strict=True)
+        )
+        colours = heat(share)[rows][:, columns] / 255.0
+        colours[::side] *= 0.7
+        colours[:, ::side] *= 0.7
+        return colours
+
+    def tell_texel(self, row: int, column: int, state: State) -> str:
+        outside = "" if self.mask[row, column] else "outside of the charts"
+        if self.model is None or self.model.method != "tiles":
+            return outside
+        side = self.model.profile.tile
+        y, x = (
+            min(place // side, count - 1) for place, count in zip((row, column), self.model.lut.shape, strict=False)
+        )
+        (left, top), (wide, high) = (part[y, x] for part in unpack_entries(self.model.lut))
+        return f"tile {x}, {y}: {wide} × {high} texels at {left}, {top}" + f"   {outside}" * bool(outside)
+
+    def caption(self, state: State) -> str:
+        text = f"{self.width} × {self.height}, {self.note}"
+        if self.model is None:
+            return text
+        text += f", method {self.model.method}"
+        if state.view == "tiles":
+            text += f"; a tile's texels: 1 is black, {(self.model.profile.tile + 1) ** 2} is white"
+        return text

@@ -1,0 +1,228 @@
+"""Scenes of files, by what a file holds."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from wlm.atlas.exporter import REPORT_FILE
+from wlm.errors import WlmError
+from wlm.formats.exr import read_exr
+from wlm.formats.exr_file import read_part
+from wlm.formats.geometry import read_geometry
+from wlm.formats.npz import read_npz
+from wlm.lightmap.listing import SET_FILE
+from wlm.smoke.camera import DIRECTIONS
+from wlm.smoke.data import SCENE_FILE
+from wlm.system import load
+from wlm.view.scene import Scene
+
+if TYPE_CHECKING:
+    from wlm.lightmap.data import LightmapSet
+    from wlm.lightmap.model import LightmapModel
+    from wlm.view.probe_scene import Probes
+
+
+def open_scene(
+    files: Sequence[str | os.PathLike[str]],
+    *,
+    mesh: str | os.PathLike[str] | None = None,
+    original: str | os.PathLike[str] | None = None,
+    key: str | None = None,
+    walk: str | os.PathLike[str] | None = None,
+    scale: float | None = None,
+    extinction: float | None = None,
+    flat: bool = False,
+    up: Literal["y", "z"] = "y",
+) -> Scene:
+    """Makes the scene of a file.
+
+    Args:
+        files: One file or folder, or six-way lightmaps of smoke, one EXR a frame; what is shown of each is in
+            docs/view.md.
+        mesh: The scene that the light belongs to: `.glb`, `.gltf` or `.obj`; of lightmaps with their UVs.
+        original: What was compressed, to compare with: a lightmap set, an atlas' lightmap, a probe file.
+        key: Of a probe file with several arrays, the one to show.
+        walk: Viewpoints of the cascaded volume, as `wlm probe walk --path` takes.
+        scale: Of the cascaded volume's blocks: units in a metre; None: 1, or less in a small scene.
+        extinction: Of a volume of smoke, per unit of length at density 1.
+        flat: Whether a lightmap is shown unwrapped though its mesh is there.
+        up: The axis that points up.
+
+    Raises:
+        WlmError: A file is missing, damaged, or of a kind that has no picture; an option doesn't fit it.
+    """
+    paths = [Path(file) for file in files]
+    if not paths:
+        raise WlmError("expected a file to show, found none")
+    path = paths[0]
+    request = _Request(path, mesh, original, key, walk, scale, extinction, flat, up)
+    if not path.exists():
+        raise WlmError(f"{path}: no such file or folder")
+    if _is_six_way(path):
+        return request.six_way(paths)
+    if len(paths) > 1:
+        raise WlmError(f"{paths[1]}: expected one file; only smoke has several, one EXR a frame")
+    if path.is_dir():
+        return request.folder()
+    suffix = path.suffix.lower()
+    if suffix == ".wlm":
+        return request.model()
+    if suffix == ".exr":
+        return request.lightmap()
+    if suffix == ".nvdb" or (suffix == ".npz" and "density" in _names(path)):
+        return request.volume(path)
+    if path.name == SET_FILE:
+        return request.lightmap_set()
+    if suffix in (".npz", ".json", ".lmbake"):
+        return request.probes()
+    raise WlmError(
+        f"{path}: expected a folder or .wlm, .exr, .npz, .nvdb, .json or .lmbake, found {path.suffix or 'none'}"
+    )
+
+
+@dataclass(frozen=True)
+class _Request:
+    """The arguments of `open_scene`, and a method for each kind of file. What a kind can't use, it refuses."""
+
+    path: Path
+    mesh: str | os.PathLike[str] | None
+    original: str | os.PathLike[str] | None
+    key: str | None
+    walk: str | os.PathLike[str] | None
+    scale: float | None
+    extinction: float | None
+    flat: bool
+    up: Literal["y", "z"]
+
+    def folder(self) -> Scene:
+        if (self.path / REPORT_FILE).is_file():
+            return self.atlas()
+        if (self.path / SCENE_FILE).is_file():
+            return self.volume(self.path)
+        frames = sorted(self.path.glob("*.exr"))
+        if frames and _is_six_way(frames[0]):
+            return self.six_way(frames)
+        return self.lightmap_set()
+
+    def model(self) -> Scene:
+        model = load(self.path)
+        if model.SYSTEM == "lightmap":
+            from wlm.lightmap.data import load as load_set
+
+            self._refuse("key", "walk", "scale", "extinction")
+            given = None if self.original is None else load_set(self.original)
+            if given is not None:
+                self._check_size(given.mask.shape, (model.height, model.width))
+            return self._lightmaps(model, given)
+        if model.SYSTEM == "probe":
+            from wlm.probe.places import probes_of
+            from wlm.view.probe_scene import Probes
+
+            self._refuse("extinction", "flat")
+            position, values, live = probes_of(model, self.original, self.key)
+            return self._probes(Probes.of_model(model, position, values, live, self.path.name))
+        if model.SYSTEM == "atlas":
+            raise WlmError(f"{self.path}: expected the folder that wlm atlas compress wrote, which has the mesh")
+        raise WlmError(f"{self.path}: a network has no picture of its own; expected the lightmaps that it predicts")
+
+    def lightmap_set(self) -> Scene:
+        from wlm.lightmap.data import load as load_set
+
+        self._refuse("original", "key", "walk", "scale", "extinction")
+        return self._lightmaps(None, load_set(self.path))
+
+    def lightmap(self) -> Scene:
+        self._refuse("original", "key", "walk", "scale", "extinction")
+        if self.mesh is None:
+            from wlm.lightmap.data import from_arrays
+
+            return self._lightmaps(None, from_arrays(read_exr(self.path)[0][None, ..., :3], [0.0], name=self.path.name))
+        from wlm.atlas.data import load as load_mesh
+        from wlm.view.atlas_scene import input_scene
+
+        return input_scene(load_mesh(self.mesh, self.path), title=self.path.name, flat=self.flat, up=self._up)
+
+    def atlas(self) -> Scene:
+        from wlm.atlas.exporter import read_folder
+        from wlm.view.atlas_scene import atlas_scene
+
+        self._refuse("mesh", "key", "walk", "scale", "extinction")
+        output, light = read_folder(self.path), None
+        if self.original is not None:
+            light = read_exr(self.original)[0]
+            self._check_size(light.shape[:2], (output.model.height, output.model.width))
+        return atlas_scene(output, light, title=self.path.name, flat=self.flat, up=self._up)
+
+    def probes(self) -> Scene:
+        from wlm.probe.data import load as load_probes
+        from wlm.view.probe_scene import Probes
+
+        self._refuse("original", "extinction", "flat")
+        return self._probes(Probes.of_set(load_probes(self.path, key=self.key), self.path.name))
+
+    def volume(self, path: Path) -> Scene:
+        from wlm.smoke.data import load_frames
+        from wlm.view.smoke_scene import volume_scene
+
+        self._refuse("mesh", "original", "key", "walk", "scale", "flat")
+        return volume_scene(load_frames(path, extinction=self.extinction), title=path.name, up=self._up)
+
+    def six_way(self, paths: Sequence[Path]) -> Scene:
+        from wlm.view.smoke_scene import six_way_scene
+
+        self._refuse("mesh", "original", "key", "walk", "scale", "extinction", "flat")
+        return six_way_scene(paths, title=self.path.name)
+
+    @property
+    def _up(self) -> int:
+        return "xyz".index(self.up)
+
+    def _refuse(self, *names: str) -> None:
+        for name in names:
+            if getattr(self, name) not in (None, False):
+                raise WlmError(f"{self.path}: --{name} means nothing to this file")
+
+    def _check_size(self, found: tuple[int, ...], expected: tuple[int, int]) -> None:
+        if found != expected:
+            raise WlmError(
+                f"{self.original}: expected a lightmap of {expected[1]}x{expected[0]}, found {found[1]}x{found[0]}"
+            )
+
+    def _lightmaps(self, model: LightmapModel | None, lightmaps: LightmapSet | None) -> Scene:
+        from wlm.view.lightmap_scene import lightmap_scene
+
+        geometry = None if self.mesh is None else read_geometry(self.mesh)
+        if self.flat:
+            geometry = None
+        return lightmap_scene(model, lightmaps, title=self.path.name, geometry=geometry, up=self._up)
+
+    def _probes(self, probes: Probes) -> Scene:
+        from wlm.probe.data import load_positions
+        from wlm.view.probe_scene import probe_scene
+
+        geometry = None if self.mesh is None else read_geometry(self.mesh, with_uv=False)
+        walk = None if self.walk is None else load_positions(self.walk)
+        return probe_scene(probes, title=self.path.name, geometry=geometry, walk=walk, scale=self.scale, up=self._up)
+
+
+def _is_six_way(path: Path) -> bool:
+    """Whether a file is an EXR with a channel for each direction."""
+    if path.suffix.lower() != ".exr" or not path.is_file():
+        return False
+    return all(name in read_part(path).channels for name in DIRECTIONS)
+
+
+def _names(path: Path) -> list[str]:
+    """The names of the arrays in a `.npz` file."""
+    found: list[str] = []
+
+    def look(names: Sequence[str]) -> Sequence[str]:
+        found.extend(names)
+        return ()
+
+    read_npz(path, look, numbers=0)
+    return found

@@ -1,0 +1,322 @@
+"""Light probes in a window: balls, Gaussians, and the cascaded volume round a viewer who walks."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from wlm.errors import WlmError
+from wlm.formats.geometry import Geometry
+from wlm.probe.data import ProbeSet
+from wlm.probe.decode import Decoder
+from wlm.probe.model import CENTRE, ROTATION, SCALE, ProbeModel
+from wlm.probe.places import ball_radius
+from wlm.probe.sphere import basis, coefficient_bands, cosine_factor, irradiance, sh_count
+from wlm.probe.volume import SIDE, SIZES, Volume
+from wlm.probe.walk import EYE_HEIGHT, camera_path
+from wlm.texels import exposure
+from wlm.view.canvas import Canvas, Hit
+from wlm.view.rendering import import_pyvista
+from wlm.view.scene import Scene, Slider, State
+from wlm.view.surface import compared
+
+_BALLS, _MESH, _GAUSSIANS, _BLOCKS, _PATH, _VIEWER = "balls", "mesh", "gaussians", "blocks", "path", "viewer"
+_DETAIL = ((64, 3), (1024, 2), (8192, 1), (10**9, 0))  # balls, then subdivisions of an icosahedron
+_LOOP = 120  # frames of the walk where none is given
+_SIGMAS = Slider("sigma", 0.1, 3.0, 1.0, 0.1, views=("gaussians",))
+_GREY = 40  # of the mesh in the panel of the error, which is of probes alone
+_WINDOWS = ((1.0, 1.0, 1.0), (1.0, 0.8, 0.3), (1.0, 0.5, 0.3), (0.8, 0.3, 0.9))  # of the levels, the finest first
+# The corners of a block's six sides, from which its light is seen.
+_SIDES = np.array(
+    [[axis, end, *corner] for axis in range(3) for end in (0, 1) for corner in ((0, 0), (1, 0), (1, 1), (0, 1))]
+)
+_SHRUNK = 0.8  # of a block's side, so that neighbours stay apart
+
+
+@dataclass(frozen=True, eq=False)
+class Probes:
+    """What there is of a set of probes, live ones alone.
+
+    Attributes:
+        position: float64 [N, 3].
+        number: int [N], of each in its file.
+        coefficients: C.
+        values: By "decoded" and "original", as there are, float32 [N, C, 3].
+        decode: Light float32 [M, 3 C] at points [M, 3].
+        model: The model; None: the input alone.
+        note: For the caption.
+    """
+
+    position: np.ndarray
+    number: np.ndarray
+    coefficients: int
+    values: dict[str, np.ndarray]
+    decode: Callable[[np.ndarray], np.ndarray]
+    model: ProbeModel | None
+    note: str
+
+    @classmethod
+    def of_model(
+        cls, model: ProbeModel, position: np.ndarray, original: np.ndarray | None, live: np.ndarray, title: str
+    ) -> Self:
+        """Takes what `wlm.probe.places.probes_of` found of a model.
+
+        Raises:
+            WlmError: A probe's numbers are no spherical harmonics.
+        """
+        count = _coefficients(model.outputs, title)
+        decoder, places = Decoder(model), position[live]
+        values = {"decoded": decoder.decode(places).reshape(-1, count, 3)}
+        if original is not None:
+            values["original"] = original[live].reshape(-1, count, 3)
+        note = f"{model.name}, {len(places):,} probes, {model.count:,} Gaussians, profile {model.profile.name}"
+        return cls(places, np.flatnonzero(live), count, values, decoder.decode, model, note)
+
+    @classmethod
+    def of_set(cls, probes: ProbeSet, title: str) -> Self:
+        """Takes an input; between probes its light is that of the nearest.
+
+        Raises:
+            WlmError: A probe's numbers are no spherical harmonics.
+        """
+        count = _coefficients(probes.outputs, title)
+        places, values = probes.position[probes.live], probes.values[probes.live]
+        tree = cKDTree(places)
+
+        def nearest(points: np.ndarray) -> np.ndarray:
+            return values[tree.query(points)[1]]
+
+        shown = {"original": values.reshape(-1, count, 3)}
+        note = f"{probes.name}, {len(places):,} live probes, {probes.key}"
+        return cls(places, np.flatnonzero(probes.live), count, shown, nearest, None, note)
+
+
+def probe_scene(
+    probes: Probes,
+    *,
+    title: str,
+    geometry: Geometry | None = None,
+    walk: np.ndarray | None = None,
+    scale: float | None = None,
+    up: int = 1,
+) -> Scene:
+    """Makes the scene of probes.
+
+    Args:
+        probes: The probes.
+        title: Of the window.
+        geometry: The scene's mesh, lit at its vertices; None: none.
+        walk: [F, 3], viewpoints of the cascaded volume; None: a loop through the scene.
+        scale: Of the volume's blocks: units in a metre. None: 1, or less where the finest window would span more than
+            half of the scene.
+        up: The axis that points up.
+
+    Raises:
+        WlmError: The scale isn't above 0.
+    """
+    if scale is None:
+        longest = float(np.ptp(probes.position, axis=0).max())
+        scale = min(1.0, longest / (2.0 * SIDE * SIZES[0])) if longest > 0 else 1.0
+    volume = Volume(probes.position, probes.decode, 3 * probes.coefficients, scale=scale)
+    path = walk if walk is not None else camera_path(volume.position, _LOOP, EYE_HEIGHT * scale, up)
+    views = ("balls", "gaussians", "volume") if probes.model is not None else ("balls", "volume")
+    frame = Slider("frame", 0, len(path) - 1, 0, 1, ".0f", whole=True, views=("volume",))
+    sliders = (frame,) * (len(path) > 1) + (_SIGMAS,) * (probes.model is not None)
+    return _ProbeScene(
+        title,
+        compared("decoded" in probes.values, "original" in probes.values),
+        views=views,
+        sliders=sliders,
+        plays="frame" if len(path) > 1 else None,
+        up=up,
+        probes=probes,
+        geometry=geometry,
+        path=path,
+        volume=volume,
+    )
+
+
+@dataclass(kw_only=True)
+class _ProbeScene(Scene):
+    probes: Probes
+    geometry: Geometry | None
+    path: np.ndarray
+    volume: Volume
+
+    def __post_init__(self) -> None:
+        probes = self.probes
+        self._frame, self._stats = None, None
+        self._radius = ball_radius(probes.position)
+        subdivisions = next(level for most, level in _DETAIL if len(probes.position) <= most)
+        self._ball, self._ball_faces = _icosphere(subdivisions)
+        points = probes.position[:, None] + self._radius * self._ball
+        faces = self._ball_faces + len(self._ball) * np.arange(len(probes.position))[:, None, None]
+        self._balls = points.reshape(-1, 3), faces.reshape(-1, 3)
+        self._light = {name: irradiance(values, self._ball) / math.pi for name, values in probes.values.items()}
+        self._brightness = exposure(self._light.get("original", next(iter(self._light.values()))))
+        self._surface: np.ndarray | None = None
+        if self.geometry is not None:
+            at_vertices = probes.decode(self.geometry.position.astype(np.float64))
+            self._surface = _facing(at_vertices.reshape(-1, probes.coefficients, 3), _normals(self.geometry)) / math.pi
+
+    def draw(self, canvas: Canvas, state: State) -> None:
+        display = state.display(self._brightness)
+        for panel, name in enumerate(self.panels):
+            if name == "error":
+                colours = display.error(self._light["decoded"], self._light["original"])
+            else:
+                colours = display.picture(self._light[name])
+            if panel or state.view == "balls":
+                canvas.coloured(panel, _BALLS, *self._balls, colours.reshape(-1, 3))
+            if self._surface is not None:
+                decoded = name != "error" and (name == "decoded" or "decoded" not in self.panels)
+                lit = display.picture(self._surface) if decoded else np.full(self._surface.shape, _GREY, np.uint8)
+                canvas.coloured(panel, _MESH, self.geometry.position, self.geometry.triangle, lit, shape=not decoded)
+        windows = [f"window {level}" for level in range(len(self.volume.sizes))]
+        if state.view != "balls":
+            canvas.hide(0, _BALLS, _MESH)
+        if state.view != "gaussians":
+            canvas.hide(0, _GAUSSIANS)
+        if state.view != "volume":
+            canvas.hide(0, _BLOCKS, _PATH, _VIEWER, *windows)
+        if state.view == "gaussians":
+            self._draw_gaussians(canvas, state)
+        elif state.view == "volume":
+            self._draw_volume(canvas, state, windows)
+
+    def box(self) -> tuple[np.ndarray, np.ndarray]:
+        points = self.probes.position
+        if self.geometry is not None:
+            points = np.concatenate([points, *np.stack(self.geometry.box)[:, None]])
+        return points.min(0) - self._radius, points.max(0) + self._radius
+
+    def caption(self, state: State) -> str:
+        text = self.probes.note
+        if state.view == "volume" and self._stats is not None:
+            held, waiting = self.volume.unscroll()[1].sum(), self._stats.left
+            size = self.volume.sizes[0]
+            text += f"; {held:,} blocks from {size:.3g} up, {self._stats.updated} new, {waiting:,} waiting"
+        return text
+
+    def describe(self, hit: Hit, state: State) -> str:
+        if hit.name == _BALLS:
+            probe = hit.cell // len(self._ball_faces)
+            place = ", ".join(f"{x:.4g}" for x in self.probes.position[probe])
+            values = (f"{name} {_mean(sh[probe])}" for name, sh in self.probes.values.items())
+            return f"probe {self.probes.number[probe]} at {place}   mean radiance: {', '.join(values)}"
+        if hit.name == _GAUSSIANS:
+            return f"Gaussian {hit.cell // len(self._ball_faces)}"
+        return ""
+
+    def _draw_gaussians(self, canvas: Canvas, state: State) -> None:
+        model = self.probes.model
+        rows = model.rows().astype(np.float64)
+        shape = _rotations(rows[:, ROTATION]) * np.exp(rows[:, SCALE])[:, None, :]
+        centre = model.origin + model.extent * rows[:, CENTRE]
+        ball, faces = _icosphere(1)
+        reach = state.values["sigma"] * model.extent
+        points = centre[:, None] + reach * np.einsum("kij,vj->kvi", shape, ball)
+        values = self.probes.decode(centre).reshape(len(centre), -1, 3)
+        light = np.maximum(values[:, 0] / math.sqrt(4.0 * math.pi), 0.0)
+        colours = state.display(self._brightness).picture(light).repeat(len(ball), 0)
+        faces = faces + len(ball) * np.arange(len(centre))[:, None, None]
+        canvas.coloured(0, _GAUSSIANS, points.reshape(-1, 3), faces.reshape(-1, 3), colours, shape=True)
+
+    def _draw_volume(self, canvas: Canvas, state: State, windows: list[str]) -> None:
+        frame = int(state.values.get("frame", 0))
+        if frame != self._frame:
+            # A jump is waited for; the next frame shows what a frame's budget fills.
+            self._stats = self.volume.update(self.path[frame])
+            while self._stats.left and (self._frame is None or frame != self._frame + 1):
+                self._stats = self.volume.update(self.path[frame])
+            self._frame = frame
+        values, valid = self.volume.unscroll()
+        centres, sides, light = [], [], []
+        side, inner = self.volume.side, None
+        for level, size in enumerate(self.volume.sizes):
+            place = np.argwhere(valid[level])
+            centre = (self.volume.base[level] + place + 0.5) * size
+            # What a finer window covers answers from there.
+            seen = np.ones(len(centre), bool)
+            if inner is not None:
+                seen = ((centre < inner[0]) | (centre > inner[1])).any(1)
+            low = self.volume.base[level] * size
+            inner = low, low + side * size
+            canvas.box(0, windows[level], *inner, _WINDOWS[level % len(_WINDOWS)])
+            centres.append(centre[seen])
+            sides.append(np.full(seen.sum(), _SHRUNK * size))
+            light.append(values[level][tuple(place[seen].T)])
+        centre, size, values = np.concatenate(centres), np.concatenate(sides), np.concatenate(light)
+        offsets, normals = _block()
+        points = centre[:, None] + size[:, None, None] * offsets
+        shown = irradiance(values.reshape(len(values), -1, 3), normals) / math.pi
+        colours = state.display(self._brightness).picture(shown).reshape(-1, 3)
+        quads = np.arange(len(points) * len(offsets)).reshape(-1, 4)
+        triangles = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
+        canvas.coloured(0, _BLOCKS, points.reshape(-1, 3), triangles, colours)
+        if len(self.path) > 1:
+            canvas.line(0, _PATH, self.path, "#ff4040")
+        ball, faces = _icosphere(2)
+        viewer = self.path[frame] + self.volume.sizes[0] * ball
+        canvas.coloured(0, _VIEWER, viewer, faces, np.full(ball.shape, (255, 60, 60), np.uint8), shape=True)
+
+
+def _coefficients(outputs: int, title: str) -> int:
+    count = sh_count(outputs)
+    if count is None:
+        raise WlmError(f"{title}: expected spherical harmonics, found {outputs} numbers a probe")
+    return count
+
+
+def _mean(values: np.ndarray) -> str:
+    return " ".join(f"{value:.4g}" for value in values[0] / math.sqrt(4.0 * math.pi))
+
+
+def _icosphere(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices [V, 3] of length 1 and triangles [F, 3]."""
+    sphere = import_pyvista("view").Icosphere(nsub=subdivisions)
+    points = np.asarray(sphere.points, np.float64)
+    return points / np.linalg.norm(points, axis=1, keepdims=True), sphere.regular_faces
+
+
+def _block() -> tuple[np.ndarray, np.ndarray]:
+    """The corners [24, 3] of the six sides of a cube of side 1 about the origin, and the sides' normals there."""
+    offsets, normals = np.zeros((len(_SIDES), 3)), np.zeros((len(_SIDES), 3))
+    for number, (axis, end, first, second) in enumerate(_SIDES):
+        offsets[number, [axis, (axis + 1) % 3, (axis + 2) % 3]] = np.array([end, first, second]) - 0.5
+        normals[number, axis] = 2.0 * end - 1.0
+    return offsets, normals
+
+
+def _rotations(quaternion: np.ndarray) -> np.ndarray:
+    """Rotations float64 [K, 3, 3] of quaternions w, x, y, z of any length; of length zero: none."""
+    length = np.linalg.norm(quaternion, axis=1, keepdims=True)
+    unit = np.where(length > 0, quaternion / np.maximum(length, 1e-30), [1.0, 0.0, 0.0, 0.0])
+    w, x, y, z = unit.T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.array(rows).transpose(2, 0, 1)
+
+
+def _normals(geometry: Geometry) -> np.ndarray:
+    """A normal for each vertex, the mean of its triangles' by area, float64 [V, 3]; upwards where there is none."""
+    corners = geometry.position.astype(np.float64)[geometry.triangle]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    total = np.zeros(geometry.position.shape)
+    for corner in range(3):
+        np.add.at(total, geometry.triangle[:, corner], normal)
+    length = np.linalg.norm(total, axis=1, keepdims=True)
+    return np.where(length > 0, total / np.maximum(length, 1e-30), [0.0, 1.0, 0.0])
+
+
+def _facing(values: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Irradiance float64 [V, 3] of SH [V, C, 3] at normals [V, 3], one each."""
+    count = values.shape[1]
+    factors = [cosine_factor(band) for band in coefficient_bands(count).tolist()]
+    return np.einsum("vc,vcd->vd", basis(normals, count) * factors, values)

@@ -1,0 +1,57 @@
+"""VTK by way of pyvista, an optional package, with errors of one line where it is missing or can't render."""
+
+import functools
+import subprocess
+import sys
+from types import ModuleType
+
+from wlm.errors import WlmError
+
+_TRIAL = """
+import vtkmodules.vtkRenderingOpenGL2
+from vtkmodules.vtkRenderingCore import vtkRenderer, vtkRenderWindow
+window = vtkRenderWindow()
+window.SetOffScreenRendering(1)
+window.SetSize(8, 8)
+window.AddRenderer(vtkRenderer())
+window.Render()
+"""
+_TRIAL_SECONDS = 60.0
+
+
+def import_pyvista(what: str) -> ModuleType:
+    """The package.
+
+    Args:
+        what: What needs it, for the error.
+
+    Raises:
+        WlmError: It isn't installed.
+    """
+    try:
+        import pyvista
+    except ImportError as error:
+        raise WlmError(f"{what}: pyvista is missing; needs the extra: pip install 'wlm[view]'") from error
+    return pyvista
+
+
+@functools.cache
+def require_opengl(what: str) -> None:
+    """Lets a child process render first: where VTK finds no OpenGL that works, it ends its process with a crash.
+
+    Args:
+        what: What needs it, for the error.
+
+    Raises:
+        WlmError: The child failed.
+    """
+    try:
+        trial = subprocess.run([sys.executable, "-c", _TRIAL], capture_output=True, timeout=_TRIAL_SECONDS)
+        works = trial.returncode == 0
+    except (OSError, subprocess.SubprocessError):
+        works = False
+    if not works:
+        raise WlmError(
+            f"{what}: VTK cannot render here: it found no OpenGL that works; expected a display, EGL or OSMesa; on "
+            "Debian or Ubuntu: apt install libegl1"
+        )

@@ -1,0 +1,102 @@
+"""What a window shows: panels, sliders and views, made by one class for each kind of file."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import numpy as np
+
+from wlm.view.canvas import Canvas, Hit
+from wlm.view.display import TONES, Display
+
+
+@dataclass(frozen=True)
+class Slider:
+    """A number that a user moves.
+
+    Attributes:
+        name: Shown beside it, and that of the command's option.
+        low, high: Its ends.
+        value: Where it begins.
+        step: What a key moves it by.
+        form: Of its value in text.
+        unit: Behind its value in text.
+        whole: Whether it has only whole values.
+        wraps: Whether its end is its beginning again, as midnight is.
+        views: The views in which it does something; empty: all.
+    """
+
+    name: str
+    low: float
+    high: float
+    value: float
+    step: float
+    form: str = ".2f"
+    unit: str = ""
+    whole: bool = False
+    wraps: bool = False
+    views: tuple[str, ...] = ()
+
+    def fit(self, value: float) -> float:
+        """The nearest value that it may have."""
+        if self.wraps and not self.low <= value <= self.high:
+            value = self.low + (value - self.low) % (self.high - self.low)
+        value = min(max(value, self.low), self.high)
+        return float(round(value)) if self.whole else value
+
+
+@dataclass
+class State:
+    """What a user has chosen.
+
+    Attributes:
+        values: Of the sliders, by name.
+        view: One of the scene's views.
+        tone: One of `wlm.view.display.TONES`.
+    """
+
+    values: dict[str, float]
+    view: str
+    tone: str = TONES[0]
+
+    def display(self, exposure: float) -> Display:
+        """How light is shown; `exposure` is that of 0 EV."""
+        return Display(exposure * 2.0 ** self.values.get("exposure", 0.0), self.tone, self.values.get("error", 1.0))
+
+
+@dataclass
+class Scene(ABC):
+    """One file, as a window shows it.
+
+    Attributes:
+        title: Of the window.
+        panels: A title for each picture, from left to right.
+        views: What the first of them can show besides; the first view is the usual one.
+        sliders: Its own; the window adds those of the exposure and of the error.
+        plays: The slider that runs when the scene is played; None, or in views without it: the camera turns.
+        flat: Whether it lies in a plane, which isn't turned.
+        up: 0 to 2, the axis that points up.
+    """
+
+    title: str
+    panels: tuple[str, ...]
+    views: tuple[str, ...] = ("light",)
+    sliders: tuple[Slider, ...] = ()
+    plays: str | None = None
+    flat: bool = False
+    up: int = 1
+
+    @abstractmethod
+    def draw(self, canvas: Canvas, state: State) -> None:
+        """Brings what the panels show up to date; the first call fills them."""
+
+    @abstractmethod
+    def caption(self, state: State) -> str:
+        """A line on what is shown."""
+
+    def box(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """The lowest and highest corner of what the camera shall see at first; None: of all that is drawn."""
+        return None
+
+    def describe(self, hit: Hit, state: State) -> str:
+        """A line on what lies under the cursor; empty: nothing to tell."""
+        return ""

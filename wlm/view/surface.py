@@ -1,0 +1,80 @@
+"""A lightmap on its mesh, or as a flat picture: what lightmaps over the day and atlases have in common."""
+
+from abc import abstractmethod
+from dataclasses import dataclass
+
+import numpy as np
+
+from wlm.formats.geometry import Geometry
+from wlm.view.canvas import Canvas, Hit
+from wlm.view.scene import Scene, State
+
+_SHARE = 0.6  # of a tile's colour over the light
+_MESH = "mesh"
+
+
+def flat_geometry(height: int, width: int) -> Geometry:
+    """Two triangles that show a whole lightmap, its longer side 1."""
+    x, y = np.array([width, height]) / (2.0 * max(width, height))
+    position = np.array([[-x, y, 0], [x, y, 0], [x, -y, 0], [-x, -y, 0]], np.float32)
+    uv = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
+    return Geometry(position, np.array([[0, 2, 1], [0, 3, 2]], np.uint32), uv)
+
+
+def compared(decoded: bool, original: bool) -> tuple[str, ...]:
+    """The titles of panels for what there is."""
+    if decoded and original:
+        return ("decoded", "original", "error")
+    return ("decoded",) if decoded else ("original",)
+
+
+@dataclass(kw_only=True)
+class SurfaceScene(Scene):
+    """A scene of one lightmap.
+
+    Attributes:
+        geometry: Where it lies, with lightmap UVs.
+        brightness: Exposure at 0 EV.
+        height, width: Texels.
+    """
+
+    geometry: Geometry
+    brightness: float = 1.0
+    height: int
+    width: int
+
+    @abstractmethod
+    def lights(self, state: State) -> dict[str, np.ndarray]:
+        """The light of "decoded" and "original", as there are, float32 [H, W, 3], gaps between charts filled."""
+
+    @abstractmethod
+    def tell_texel(self, row: int, column: int, state: State) -> str:
+        """A line on a texel, less its place and its light."""
+
+    @abstractmethod
+    def tile_colours(self) -> np.ndarray:
+        """A colour for each texel, of its tile, [H, W, 3] in [0, 1]; asked for in the view "tiles" alone."""
+
+    def draw(self, canvas: Canvas, state: State) -> None:
+        display, lights = state.display(self.brightness), self.lights(state)
+        for panel, name in enumerate(self.panels):
+            if name == "error":
+                picture = display.error(lights["decoded"], lights["original"])
+            else:
+                picture = display.picture(lights[name])
+            if panel == 0 and state.view == "tiles":
+                mixed = _SHARE * 255.0 * self.tile_colours() + (1.0 - _SHARE) * picture
+                picture = (mixed + 0.5).astype(np.uint8)
+            shape = self.geometry
+            canvas.textured(panel, _MESH, shape.position, shape.triangle, shape.uv, picture, nearest=self.flat)
+
+    def describe(self, hit: Hit, state: State) -> str:
+        u, v = hit.weights @ self.geometry.uv[self.geometry.triangle[hit.cell]]
+        column = int(np.clip(np.floor(u * self.width), 0, self.width - 1))
+        row = int(np.clip(np.floor(v * self.height), 0, self.height - 1))
+        values = ", ".join(f"{name} {_rgb(light[row, column])}" for name, light in self.lights(state).items())
+        return "   ".join(filter(None, (f"texel {column}, {row}", self.tell_texel(row, column, state), values)))
+
+
+def _rgb(light: np.ndarray) -> str:
+    return " ".join(f"{value:.4g}" for value in light)

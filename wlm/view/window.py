@@ -1,0 +1,389 @@
+"""A window on a scene: panels side by side, sliders below them, keys; on a screen, as a picture or as a movie."""
+
+import os
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from wlm.errors import WlmError
+from wlm.formats.atomic import atomic_path
+from wlm.view.canvas import Canvas, Hit
+from wlm.view.display import TONES
+from wlm.view.rendering import import_pyvista, require_opengl
+from wlm.view.scene import Scene, Slider, State
+
+MOVIES = {".gif": "GIF", ".webp": "WEBP"}
+"""Kinds of movies, by the name's end."""
+
+_HIDDEN = ("vtkEGLRenderWindow", "vtkOSOpenGLRenderWindow")  # what VTK takes where it finds no display
+_BACKGROUND, _STRIP, _INK, _BAR = "#5a5d63", "#25272b", "#e8e8ea", "#8ab4f8"
+_STRIP_PIXELS, _TITLE_PIXELS, _FONT, _TITLE_FONT = 108, 26, 9, 10
+# Places in the strip, as shares of its height and of the width.
+_LABELS, _BARS, _CAPTION, _TOLD, _INDENT, _LEAST_CELLS = 0.76, 0.64, 0.30, 0.06, 0.01, 3
+_EYE = (1.0, 0.8, 1.0)  # from where a scene is first seen, y up
+_MARGIN = 1.06
+_SWEEP = 12.0  # seconds in which a slider without whole values is played
+_TICK = 30  # milliseconds
+_FRAMES = 48  # of a movie
+_EXPOSURE = Slider("exposure", -8.0, 8.0, 0.0, 0.5, "+.1f", unit=" EV")
+_ERROR = Slider("error", 1.0, 64.0, 8.0, 1.0, ".0f", "×", whole=True)
+
+
+class Window:
+    """A scene on a plotter.
+
+    Attributes:
+        scene: The scene.
+        state: What the user has chosen; change it by `set`, `choose` and `tone`.
+        playing: Whether it runs.
+        sliders: By name.
+    """
+
+    def __init__(
+        self, scene: Scene, *, size: tuple[int, int] = (1280, 720), rate: float = 24.0, off_screen: bool = True
+    ) -> None:
+        """Makes the window and draws the scene.
+
+        Args:
+            scene: The scene.
+            size: Width and height, pixels.
+            rate: Frames a second of a played scene that has frames.
+            off_screen: Whether it is never shown.
+
+        Raises:
+            WlmError: pyvista is missing, VTK finds no OpenGL, there is no display, or the scene can't be drawn.
+        """
+        pyvista = import_pyvista("view")
+        require_opengl("view")
+        self.scene, self.playing, self._rate = scene, False, rate
+        common = [_EXPOSURE] + [_ERROR] * ("error" in scene.panels)
+        self.sliders = {slider.name: slider for slider in (*scene.sliders, *common)}
+        self.state = State({name: slider.value for name, slider in self.sliders.items()}, scene.views[0])
+        count, self._share = len(scene.panels), min(_STRIP_PIXELS / size[1], 0.5)
+        layout = {"shape": (2, count), "groups": [(1, slice(None))], "row_weights": [1.0 - self._share, self._share]}
+        # Messages about a missing display would alarm for nothing where rendering is off screen.
+        with pyvista.vtk_verbosity("off"):
+            self._plotter = pyvista.Plotter(
+                **layout, off_screen=off_screen, border=False, window_size=size, title=scene.title
+            )
+        if not off_screen and self._plotter.render_window.GetClassName() in _HIDDEN:
+            self._plotter.close()
+            raise WlmError("view: expected a display, found none; --screenshot and --movie need none")
+        self.canvas = Canvas(pyvista, self._plotter, count)
+        self._widgets: dict[str, tuple[Any, Any]] = {}
+        self._hit: Hit | None = None
+        self._furnish()
+        self.draw()
+        self.look()
+
+    def set(self, name: str, value: float) -> None:
+        """Moves a slider; what lies beyond its ends is taken for them.
+
+        Raises:
+            WlmError: The scene has no such slider, or the value isn't finite.
+        """
+        if name not in self.sliders:
+            raise WlmError(f"{self.scene.title}: --{name} means nothing to this file")
+        if not np.isfinite(value):
+            raise WlmError(f"--{name}: expected a finite number, got {value}")
+        self.state.values[name] = self.sliders[name].fit(value)
+        self.draw()
+
+    def choose(self, view: str) -> None:
+        """Changes the view.
+
+        Raises:
+            WlmError: The scene has no such view.
+        """
+        if view not in self.scene.views:
+            raise WlmError(f"{self.scene.title}: --view: expected {' or '.join(self.scene.views)}, got {view}")
+        self.state.view = view
+        self.draw()
+
+    def tone(self, name: str) -> None:
+        """Changes the tone mapping.
+
+        Raises:
+            WlmError: There is no such one.
+        """
+        if name not in TONES:
+            raise WlmError(f"--tone: expected {' or '.join(TONES)}, got {name}")
+        self.state.tone = name
+        self.draw()
+
+    def turn(self, degrees: float) -> None:
+        """Turns the camera about the scene's upward axis.
+
+        Raises:
+            WlmError: The angle isn't finite.
+        """
+        if not np.isfinite(degrees):
+            raise WlmError(f"--turn: expected a finite number, got {degrees}")
+        camera, axis = self.canvas.renderers[0].camera, np.eye(3)[self.scene.up]
+        focus = np.array(camera.focal_point)
+        camera.position = focus + _turned(np.array(camera.position) - focus, axis, np.radians(degrees))
+        camera.up = axis
+        self._clip()
+
+    def advance(self, seconds: float) -> None:
+        """Plays the scene by some time."""
+        name = self._player()
+        if name is None:
+            self.turn(360.0 * seconds / _SWEEP)
+            return
+        slider = self.sliders[name]
+        speed = self._rate if slider.whole else (slider.high - slider.low) / _SWEEP
+        value = self._played + speed * seconds
+        if value > slider.high:
+            value = slider.low + (value - slider.low) % (slider.high - slider.low + slider.whole)
+        self.set(name, value)
+        self._played = value
+
+    def draw(self) -> None:
+        """Brings all up to date with the state."""
+        self.scene.draw(self.canvas, self.state)
+        self._played = self.state.values.get(self.scene.plays, 0.0)
+        self._lay_out()
+        views = self.scene.views
+        chosen = "   ".join(f"[{i} {v}]" if v == self.state.view else f"{i} {v}" for i, v in enumerate(views, 1))
+        parts = [chosen if len(views) > 1 else "", self.state.tone, self.scene.caption(self.state)]
+        self._texts["caption"].SetInput("      ".join(filter(None, parts)))
+        self._tell()
+
+    def tell(self, x: int, y: int) -> str:
+        """Says, also in the window, what lies at a pixel, counted from the lower left."""
+        self._hit = self.canvas.hit(x, y)
+        return self._tell()
+
+    def picture(self) -> np.ndarray:
+        """What the window shows, uint8 [H, W, 3]."""
+        self._clip()
+        self._plotter.render()
+        return np.array(self._plotter.screenshot(return_img=True)[..., :3])
+
+    def screenshot(self, path: str | os.PathLike[str]) -> None:
+        """Writes what the window shows as a PNG, whole or not at all.
+
+        Raises:
+            WlmError: It can't be written.
+        """
+        with atomic_path(path) as temporary:
+            Image.fromarray(self.picture()).save(temporary, format="PNG")
+
+    def movie(self, path: str | os.PathLike[str], frames: int | None = None) -> int:
+        """Writes the scene, played once, as a GIF or WebP that begins again for ever.
+
+        Args:
+            path: Ends in one of `MOVIES`.
+            frames: Pictures; None: 48, or all frames where frames are played.
+
+        Returns:
+            The number of pictures.
+
+        Raises:
+            WlmError: It can't be written, or no picture is asked for.
+        """
+        suffix = Path(path).suffix.lower()
+        if suffix not in MOVIES:
+            raise WlmError(f"{path}: expected a name that ends in {' or '.join(MOVIES)}, found {suffix or 'none'}")
+        if frames is not None and frames < 1:
+            raise WlmError(f"--frames: expected at least 1, got {frames}")
+        pictures = [Image.fromarray(picture) for picture in self._played_once(frames)]
+        options = {"save_all": True, "append_images": pictures[1:], "duration": 1000.0 / self._rate, "loop": 0}
+        with atomic_path(path) as temporary:
+            pictures[0].save(temporary, format=MOVIES[suffix], **options)
+        return len(pictures)
+
+    def show(self) -> None:
+        """Opens the window until the user closes it."""
+        interactor = self._plotter.iren
+        interactor.initialize()
+        if self.scene.flat:
+            interactor.enable_2d_style()
+        interactor.add_observer("TimerEvent", lambda *_: self._tick())
+        interactor.add_observer("MouseMoveEvent", lambda *_: self._hover())
+        interactor.create_timer(_TICK, repeating=True)
+        self._plotter.show(auto_close=True)
+
+    def close(self) -> None:
+        """Gives the window back."""
+        self._plotter.close()
+
+    def press(self, key: str) -> None:
+        """Does what a key does, by VTK's name of it."""
+        if key in self._keys:
+            self._keys[key]()
+            self._plotter.render()
+
+    def _furnish(self) -> None:
+        """Titles, sliders, texts and keys."""
+        plotter = self._plotter
+        for number, title in enumerate(self.scene.panels):
+            plotter.subplot(0, number)
+            plotter.set_background(_BACKGROUND, all_renderers=False)
+            if len(self.scene.panels) > 1:
+                plotter.add_text(title, position="upper_edge", font_size=_TITLE_FONT, color=_INK)
+        plotter.subplot(1, 0)
+        plotter.set_background(_STRIP, all_renderers=False)
+
+        def text(name: str, x: float, y: float) -> Any:
+            return plotter.add_text(
+                "", position=(x, y), viewport=True, font_size=_FONT, color=_INK, name=name, font="arial"
+            )
+
+        self._texts = {"caption": text("caption", _INDENT, _CAPTION), "told": text("told", _INDENT, _TOLD)}
+        for name, slider in self.sliders.items():
+            label = text(f"slider {name}", 0.0, _LABELS)
+            widget = plotter.add_slider_widget(
+                None, rng=(slider.low, slider.high), value=slider.value, interaction_event="always"
+            )
+            # The plotter's own callback would also be called now, and turn errors into warnings.
+            moved = lambda widget, _, name=name: self.set(name, widget.GetRepresentation().GetValue())  # noqa: E731
+            widget.AddObserver("InteractionEvent", moved)
+            shape = widget.GetRepresentation()
+            shape.ShowSliderLabelOff()
+            shape.SetSliderLength(0.02)
+            shape.SetSliderWidth(0.16)
+            shape.SetTubeWidth(0.04)
+            shape.SetEndCapLength(0.0)
+            shape.GetSliderProperty().SetColor(_rgb(_BAR))
+            shape.GetTubeProperty().SetColor(_rgb(_INK))
+            self._widgets[name] = widget, label
+        self._keys = {
+            "space": self._toggle,
+            "t": lambda: self.tone(TONES[1 - TONES.index(self.state.tone)]),
+            "r": self.look,
+            "bracketleft": lambda: self._move("exposure", -1),
+            "bracketright": lambda: self._move("exposure", 1),
+            "minus": lambda: self._move("error", -1),
+            "plus": lambda: self._move("error", 1),
+            "Left": lambda: self._move(self._main(), -1),
+            "Right": lambda: self._move(self._main(), 1),
+        }
+        for number, view in enumerate(self.scene.views, 1):
+            self._keys[str(number)] = lambda view=view: self.choose(view)
+        # The plotter's and VTK's own keys would turn stereo and wires on.
+        plotter.iren.clear_key_event_callbacks()
+        plotter.iren.interactor.RemoveObservers("CharEvent")
+        plotter.add_key_event("q", plotter.iren.terminate_app)
+        for key in self._keys:
+            plotter.add_key_event(key, lambda key=key: self.press(key))
+
+    def _shows(self, name: str) -> bool:
+        """Whether a slider does something in this view."""
+        views = self.sliders[name].views
+        return not views or self.state.view in views
+
+    def _player(self) -> str | None:
+        """The slider that playing moves in this view; None: the camera turns."""
+        name = self.scene.plays
+        return name if name is not None and self._shows(name) else None
+
+    def _tell(self) -> str:
+        told = self.scene.describe(self._hit, self.state) if self._hit is not None else ""
+        self._texts["told"].SetInput(told)
+        return told
+
+    def _lay_out(self) -> None:
+        """Shows the sliders of the view side by side, with their values."""
+        shown = [name for name in self.sliders if self._shows(name)]
+        cell = 1.0 / max(len(shown), _LEAST_CELLS)
+        for name, slider in self.sliders.items():
+            widget, text = self._widgets[name]
+            shape, value = widget.GetRepresentation(), self.state.values[name]
+            shape.SetValue(value)
+            shape.SetVisibility(name in shown)
+            text.SetVisibility(name in shown)
+            if name in shown:
+                left = cell * shown.index(name)
+                text.SetInput(f"{name} {value:{slider.form}}{slider.unit}")
+                text.SetPosition(left + _INDENT, _LABELS)
+                for point, x in ((shape.GetPoint1Coordinate(), 0.0), (shape.GetPoint2Coordinate(), cell - 0.02)):
+                    point.SetValue(left + _INDENT + x, _BARS * self._share)
+            # It doesn't see that its ends moved.
+            shape.Modified()
+
+    def _move(self, name: str | None, steps: int) -> None:
+        if name in self.sliders:
+            self.set(name, self.state.values[name] + steps * self.sliders[name].step)
+
+    def _main(self) -> str | None:
+        """The slider of the arrow keys: the first of the scene's own in this view."""
+        return next((slider.name for slider in self.scene.sliders if self._shows(slider.name)), None)
+
+    def _toggle(self) -> None:
+        self.playing, self._last = not self.playing, time.perf_counter()
+
+    def _tick(self) -> None:
+        if self.playing:
+            now = time.perf_counter()
+            self.advance(now - self._last)
+            self._last = now
+            self._plotter.render()
+
+    def _hover(self) -> None:
+        before = self._texts["told"].GetInput()
+        if self.tell(*self._plotter.iren.interactor.GetEventPosition()) != before:
+            self._plotter.render()
+
+    def _played_once(self, frames: int | None) -> Iterator[np.ndarray]:
+        name = self._player()
+        if name is None:
+            count = frames or _FRAMES
+            for _ in range(count):
+                yield self.picture()
+                self.turn(360.0 / count)
+            return
+        slider = self.sliders[name]
+        ends = slider.high - slider.low
+        count = frames or (round(ends) + 1 if slider.whole else _FRAMES)
+        for number in range(count):
+            self.set(name, slider.low + ends * number / (count if slider.wraps else max(count - 1, 1)))
+            yield self.picture()
+
+    def look(self) -> None:
+        """Puts the camera where it sees all of the scene."""
+        first = self.canvas.renderers[0]
+        camera = first.camera
+        low, high = self.scene.box() or np.array(first.ComputeVisiblePropBounds()).reshape(3, 2).T
+        middle = 0.5 * (low + high)
+        x, y, z = _EYE
+        toward, above = np.array([x, y, z] if self.scene.up == 1 else [x, -z, y]), np.eye(3)[self.scene.up]
+        if self.scene.flat:
+            toward, above = np.eye(3)[2], np.eye(3)[1]
+        toward = toward / np.linalg.norm(toward)
+        right = np.cross(above, toward)
+        axes = np.stack([right, np.cross(toward, right), toward])
+        axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+        corners = np.array([[(low, high)[i >> k & 1][k] for k in range(3)] for i in range(8)]) - middle
+        across, rise, near = axes @ corners.T
+        width, height = first.GetSize()
+        # The titles' strip stays free, above and, since the scene is in the middle, below.
+        free = max(height - 2 * _TITLE_PIXELS, 1) if len(self.scene.panels) > 1 else height
+        reach = _MARGIN * np.maximum(np.abs(rise) * height / free, np.abs(across) * height / width)
+        away = float((reach / np.tan(np.radians(camera.view_angle) / 2) + near).max())
+        camera.focal_point, camera.up = middle, axes[1]
+        camera.position = middle + max(away, 1e-6) * toward
+        camera.parallel_projection, camera.parallel_scale = self.scene.flat, max(float(reach.max()), 1e-6)
+        for renderer in self.canvas.renderers[1:]:
+            renderer.camera = camera
+        self._clip()
+
+    def _clip(self) -> None:
+        for renderer in self.canvas.renderers:
+            renderer.ResetCameraClippingRange()
+
+
+def _turned(vector: np.ndarray, axis: np.ndarray, angle: float) -> np.ndarray:
+    """A vector turned about an axis of length 1 (Rodrigues)."""
+    return (
+        vector * np.cos(angle) + np.cross(axis, vector) * np.sin(angle) + axis * (axis @ vector) * (1.0 - np.cos(angle))
+    )
+
+
+def _rgb(colour: str) -> tuple[float, ...]:
+    return tuple(int(colour[i : i + 2], 16) / 255.0 for i in (1, 3, 5))
