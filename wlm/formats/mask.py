@@ -55,7 +55,8 @@ def read_mask(path: Path, beside: str | os.PathLike[str], size: tuple[int, int],
                 # A palette's index says nothing; an alpha channel is not coverage here.
                 colour = np.asarray(image.convert("RGB") if image.mode in ("P", "PA", "RGBA", "LA") else image)
         except DAMAGED_PICTURE as error:
-            raise WlmError(f"{path}: cannot read the mask: expected a PNG: {str(error) or type(error).__name__}") from error
+            problem = str(error) or type(error).__name__
+            raise WlmError(f"{path}: cannot read the mask: expected a PNG: {problem}") from error
     return colour > 0 if colour.ndim == 2 else (colour > 0).any(axis=2)
 
 
