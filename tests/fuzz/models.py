@@ -229,7 +229,9 @@ def _network_checkpoint(path: Path) -> None:
     try:
         with _diverging():
             training = _train(output, resume=True)
-            _again(training.model, path)
+            # A training whose time was up before its first validation has no network yet.
+            if training.model is not None:
+                _again(training.model, path)
     finally:
         for written in (output, Path(f"{output}.csv")):
             written.unlink(missing_ok=True)

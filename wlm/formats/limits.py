@@ -59,6 +59,9 @@ PICTURE_GROWTH = 2048
 PICTURE_BYTES = 256 << 20
 """Bytes of pixels that an EXR may have however small it is: 6000 x 6000 black texels under any compression."""
 
+IMAGE_BYTES = 2 << 30
+"""Of a PNG or TGA: 16384 x 16384 texels of 8 bytes."""
+
 TIMES = 100_000
 """Lightmaps of a set."""
 

@@ -1,5 +1,6 @@
 """Masks of lightmaps: PNGs that say which texels belong to a chart."""
 
+import io
 import os
 import struct
 import zlib
@@ -11,7 +12,8 @@ from PIL.PngImagePlugin import PngImageFile
 
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_path
-from wlm.formats.reading import open_file
+from wlm.formats.limits import IMAGE_BYTES
+from wlm.formats.reading import read_file
 
 DAMAGED_PICTURE = (
     OSError,
@@ -43,20 +45,19 @@ def read_mask(path: Path, beside: str | os.PathLike[str], size: tuple[int, int],
     Raises:
         WlmError: It is missing, damaged or of another size.
     """
-    with open_file(path, f"the mask (expected a PNG of {size[1]}x{size[0]}{others})") as file:
-        try:
-            # Not `Image.open`: it would try other formats' readers too, and refuses masks of 16384 x 16384.
-            with PngImageFile(file) as image:
-                # The header's size first: a wrong one need not be decoded.
-                if (image.height, image.width) != size:
-                    raise WlmError(
-                        f"{path}: the mask is {image.width}x{image.height}, but {beside} is {size[1]}x{size[0]}"
-                    )
-                # A palette's index says nothing; an alpha channel is not coverage here.
-                colour = np.asarray(image.convert("RGB") if image.mode in ("P", "PA", "RGBA", "LA") else image)
-        except DAMAGED_PICTURE as error:
-            problem = str(error) or type(error).__name__
-            raise WlmError(f"{path}: cannot read the mask: expected a PNG: {problem}") from error
+    data = read_file(path, IMAGE_BYTES, f"the mask (expected a PNG of {size[1]}x{size[0]}{others})")
+    try:
+        # Not `Image.open`: it would try other formats' readers too, and refuses masks of 16384 x 16384. Of a file on
+        # disk it would make room for as many bytes as a chunk claims to have.
+        with PngImageFile(io.BytesIO(data)) as image:
+            # The header's size first: a wrong one need not be decoded.
+            if (image.height, image.width) != size:
+                raise WlmError(f"{path}: the mask is {image.width}x{image.height}, but {beside} is {size[1]}x{size[0]}")
+            # A palette's index says nothing; an alpha channel is not coverage here.
+            colour = np.asarray(image.convert("RGB") if image.mode in ("P", "PA", "RGBA", "LA") else image)
+    except DAMAGED_PICTURE as error:
+        problem = str(error) or type(error).__name__
+        raise WlmError(f"{path}: cannot read the mask: expected a PNG: {problem}") from error
     return colour > 0 if colour.ndim == 2 else (colour > 0).any(axis=2)
 
 

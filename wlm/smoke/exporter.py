@@ -5,6 +5,7 @@ textures without sRGB decoding. Light is premultiplied: it is added to the backg
 `wlm.smoke.camera.LAYOUTS` lists the channels.
 """
 
+import io
 import math
 import os
 from collections.abc import Sequence
@@ -17,9 +18,9 @@ from PIL import Image
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_path
 from wlm.formats.exr import read_exr, write_exr
-from wlm.formats.limits import PICTURE_GROWTH, check_growth
+from wlm.formats.limits import IMAGE_BYTES, PICTURE_GROWTH, check_growth
 from wlm.formats.mask import DAMAGED_PICTURE
-from wlm.formats.reading import open_file
+from wlm.formats.reading import read_file
 from wlm.smoke.camera import ALPHA, DIRECTIONS, EMISSION, LAYOUTS
 from wlm.smoke.lightmaps import SixWay
 
@@ -204,16 +205,17 @@ def _read(path: str | os.PathLike[str]) -> np.ndarray:
         if not np.isfinite(page).all():
             raise WlmError(f"{path}: expected finite light, found NaN or infinity")
         return page
-    with open_file(path, "the picture") as file:
-        try:
-            with Image.open(file, formats=[_suffix(path)[1:].upper()]) as image:
-                if image.mode not in _MODES:
-                    raise WlmError(f"{path}: expected RGB or RGBA of 8 bits, found {image.mode}")
-                floats = 4 * image.width * image.height * len(image.mode)
-                check_growth(str(path), os.fstat(file.fileno()).st_size, floats, PICTURE_GROWTH)
-                return np.asarray(image).astype(np.float32) / np.float32(255.0)
-        except DAMAGED_PICTURE as error:
-            raise WlmError(f"{path}: cannot read the picture: {str(error) or type(error).__name__}") from error
+    data = read_file(path, IMAGE_BYTES, "the picture")
+    try:
+        # From memory: of a file on disk Pillow would make room for as many bytes as a chunk claims to have.
+        with Image.open(io.BytesIO(data), formats=[_suffix(path)[1:].upper()]) as image:
+            if image.mode not in _MODES:
+                raise WlmError(f"{path}: expected RGB or RGBA of 8 bits, found {image.mode}")
+            floats = 4 * image.width * image.height * len(image.mode)
+            check_growth(str(path), len(data), floats, PICTURE_GROWTH)
+            return np.asarray(image).astype(np.float32) / np.float32(255.0)
+    except DAMAGED_PICTURE as error:
+        raise WlmError(f"{path}: cannot read the picture: {str(error) or type(error).__name__}") from error
 
 
 def _plane(frame: SixWay, name: str, gain: float) -> np.ndarray | float:
