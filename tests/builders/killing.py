@@ -160,11 +160,14 @@ class _Run:
         if self.wait() == 0:
             return
         counts.kills[signal.Signals(number).name] += 1
-        partial = None if self.command.partial is None else self.command.partial(self.output)
-        saved = partial.stat().st_mtime if partial is not None and partial.exists() else None
-        counts.saved += saved is not None
-        if number == signal.SIGKILL and partial is not None and self._begin is not None:
-            counts.lost = max(counts.lost, now - max(self._begin, saved or 0.0))
+        if self.command.partial is None:
+            return
+        # Of frames each is a save.
+        kept = [self.command.partial(self.output), *(self.output.iterdir() if self.output.is_dir() else ())]
+        saves = [path.stat().st_mtime for path in kept if path.exists()]
+        counts.saved += kept[0].exists()
+        if number == signal.SIGKILL and self._begin is not None:
+            counts.lost = max(counts.lost, now - max([self._begin, *saves]))
 
     def wait(self) -> int:
         return self.process.wait(LONGEST)

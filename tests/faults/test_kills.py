@@ -37,7 +37,7 @@ JET = SCENE | {"grid": {"cells": [16, 20, 16], "cell": 0.0625, "refine": 2, "ori
 NETWORK = {
     "name": "tiny",
     "network": {"guide": "six", "width": 8, "levels": 2, "stem": 2},
-    "training": {"rounds": 3, "steps": 60, "batch": 2, "rate": 2e-4, "warmup": 1, "average": 0.5},
+    "training": {"rounds": 3, "steps": 60, "batch": 2, "rate": 2e-5, "warmup": 1, "average": 0.5},
     "dataset": {
         "guide": "six", "guide_step": 0.1, "cells": 16, "refine": 2, "resolution": 16, "sequences": 1, "frames": 1,
         "views": 2, "views_a_frame": 1, "warmup": 0.6, "validation_sequences": 1, "moving": 0.0,
@@ -108,7 +108,7 @@ def command(request, tmp_path_factory):
         case "probe compress":
             probes = probe_sets.synthetic(300, dead=5)
             save_probes(place / "room.npz", probes.position, probes.values)
-            profile = settings({"name": "tiny", "ratio": 0.1, "hidden": 16, "latent": 4, "steps": 2000})
+            profile = settings({"name": "tiny", "ratio": 0.1, "hidden": 16, "latent": 4, "steps": 800})
             words += (place / "room.npz", "--profile", profile, *EVERY)
             return Command(words, "a.wlm", older("probe.wlm"), file_bytes, kept_or_whole, beside)
         case "atlas compress" | "atlas compress cascade":
