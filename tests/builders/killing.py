@@ -123,7 +123,7 @@ class _Run:
         self.command, self.output = command, output
         words = [*command.words, "-o", output, *["--resume"] * resume]
         self._errors = output.parent.parent / "stderr"
-        environment = os.environ | {"PYTHONPATH": str(ROOT)}
+        environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
         with open(self._errors, "wb") as errors:
             self.process = subprocess.Popen(
                 [sys.executable, "-m", "wlm", *map(str, words)],
