@@ -1,4 +1,4 @@
-.PHONY: .venv demo demo-network test test-all fuzz bench lint clean
+.PHONY: .venv demo demo-network test test-all fuzz bench docs lint clean
 
 PYTHON ?= python3
 BIN := .venv/bin
@@ -29,6 +29,11 @@ test-all: lint
 # 20,000 changed files of each kind: about half an hour on two cores; the counts are in out/fuzz.json.
 fuzz: $(STAMP)
 	$(BIN)/python -m tests.fuzz --cases 20000 --json out/fuzz.json
+
+# The documents as a site, out/docs/index.html.
+docs: $(STAMP)
+	$(BIN)/pip install -q -c constraints.txt -e '.[docs]'
+	$(BIN)/mkdocs build --quiet
 
 bench: $(STAMP)
 	mkdir -p out
