@@ -4,6 +4,8 @@ import re
 from pathlib import Path
 from typing import Any
 
+from mkdocs.structure.files import File, Files
+
 import wlm.atlas
 import wlm.fluid
 import wlm.lightmap
@@ -11,7 +13,6 @@ import wlm.ops
 import wlm.probe
 import wlm.smoke
 import wlm.web
-from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = (wlm.lightmap, wlm.atlas, wlm.probe, wlm.smoke, wlm.fluid, wlm.ops, wlm.web)
