@@ -15,6 +15,7 @@ import wlm.smoke
 import wlm.web
 
 ROOT = Path(__file__).resolve().parents[2]
+OTHERS = "wlm|benchmarks|demos|tests|configs|LICENSE|README"
 PACKAGES = (wlm.lightmap, wlm.atlas, wlm.probe, wlm.smoke, wlm.fluid, wlm.ops, wlm.web)
 
 
@@ -42,4 +43,4 @@ def api_page(package: Any) -> str:
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
     """Links to the repository's own files stay as text: the site has the pages alone."""
-    return re.sub(r"\[([^\]]+)\]\((?:\.\./)+(?:wlm|benchmarks|demos|tests|configs|LICENSE|README)[^)]*\)", r"\1", markdown)
+    return re.sub(rf"\[([^\]]+)\]\((?:\.\./)+(?:{OTHERS})[^)]*\)", r"\1", markdown)
