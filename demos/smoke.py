@@ -34,6 +34,7 @@ from wlm.smoke.scene import CameraSettings, Grid, Scene, load_scene
 from wlm.smoke.shading import Light
 from wlm.smoke.shots import FramesToBake
 from wlm.smoke.simulation import simulate
+from wlm.system import Progress
 from wlm.view.smoke import contact_sheet, guide_pictures, picture, six_pictures, to_bytes, write_sequence
 from wlm_kernels.smoke.settings import March
 
@@ -66,7 +67,12 @@ def jet(out: Path, name: str, device: str) -> dict[str, float]:
     clock = time.perf_counter()
     amounts: list[float] = []
     frames = open_frames(out / name, scene)
-    simulate(frames, device=device, progress=lambda progress: amounts.append(progress.figures["smoke"]))
+
+    def note_smoke(progress: Progress) -> None:
+        if progress.figures:  # none within a frame
+            amounts.append(progress.figures["smoke"])
+
+    simulate(frames, device=device, progress=note_smoke)
     simulated, clock = time.perf_counter() - clock, time.perf_counter()
     frames = load_frames(out / name, device=device)
     for number, volume in frames.volumes():

@@ -90,7 +90,7 @@ def simulate(
             for stays there.
         checkpoint_every: Seconds between two saves; 0: after every step.
         progress: Called after each frame, with the figures `smoke`, the density's integral over the box, and
-            `frame s`, the seconds that the frame took; and about twice a second within a frame, with the last one's.
+            `frame s`, the seconds that the frame took; and about twice a second within a frame, without figures.
 
     Returns:
         The number of the first frame that was simulated; one more than there are if all were there.
@@ -131,7 +131,7 @@ def _simulate(
             " found none; start anew without --resume"
         )
     sources, meter = _sources(scene), Meter(progress, "simulate", scene.frames)
-    pace, figures = Pace(checkpoint_every), {}
+    pace = Pace(checkpoint_every)
     for frame in range(done + 1, scene.frames + 1):
         begin = time.perf_counter()
         for step in range(solver.steps % per_frame, per_frame):
@@ -150,10 +150,9 @@ def _simulate(
             try:
                 if last and progress is not None:
                     mass = float(volume.density.double().sum()) * volume.voxel**3
-                    figures = {"smoke": mass, "frame_s": time.perf_counter() - begin}
-                    meter.report(frame, **figures)
+                    meter.report(frame, smoke=mass, frame_s=time.perf_counter() - begin)
                 elif meter.due(frame - 1):
-                    meter.report(frame - 1, **figures)
+                    meter.report(frame - 1)
             except KeyboardInterrupt:
                 solver.save(checkpoint)
                 raise
