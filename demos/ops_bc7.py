@@ -28,7 +28,8 @@ from wlm.formats.atomic import atomic_write
 from wlm.formats.bc7 import decode_image
 from wlm.interop import check_device
 from wlm.texels import fill_gaps
-from wlm.view.atlas import encode, white_of
+from wlm.view.atlas import encode
+from wlm.view.display import white_of
 from wlm.view.smoke import contact_sheet
 
 HERE = Path(__file__).resolve().parent

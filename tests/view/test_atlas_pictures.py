@@ -8,7 +8,8 @@ from PIL import Image
 
 from wlm.atlas.views import View
 from wlm.errors import WlmError
-from wlm.view.atlas import comparison, draw, encode, original, save_png, white_of
+from wlm.view.atlas import comparison, draw, encode, original, save_png
+from wlm.view.display import white_of
 
 FRONT = View.of((0.2, 0.1, 1.0))
 

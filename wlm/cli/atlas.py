@@ -197,7 +197,8 @@ def decode(
         write_exr(output, picture)
     else:
         from wlm.atlas.views import sphere_views
-        from wlm.view.atlas import draw, encode, save_png, white_of
+        from wlm.view.atlas import draw, encode, save_png
+        from wlm.view.display import white_of
 
         pictures, covered = draw(mesh, {"ours": decoder}, sphere_views(views)[view], resolution, decoder.device)
         picture = pictures["ours"]

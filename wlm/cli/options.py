@@ -1,7 +1,7 @@
 """Options that several commands have, each spelled out once."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -21,6 +21,14 @@ ReportFile = Annotated[Path | None, typer.Option("--json", metavar="REPORT.json"
 PageFile = Annotated[
     Path | None, typer.Option("--html", metavar="REPORT.html", help="Write a page with tables, plots and pictures.")
 ]
+SceneFile = Annotated[
+    Path | None, typer.Option("--mesh", metavar="SCENE.glb", help="The scene of the light: .glb, .gltf or .obj.")
+]
+Original = Annotated[
+    Path | None,
+    typer.Option(metavar="PATH", help="What was compressed, to compare with: a set, a lightmap or a probe file."),
+]
+Up = Annotated[Literal["y", "z"], typer.Option(help="The axis that points up in the scene.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")]
 Trust = Annotated[
     bool,

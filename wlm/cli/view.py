@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 import typer
 
 from wlm.cli.console import check_output, escape, quiet_warp, show, table
+from wlm.cli.options import Original, SceneFile, Up
 from wlm.errors import WlmError
 
 
@@ -17,13 +18,8 @@ def view(
             help="A .wlm, the folder of wlm atlas compress, an input of ours, or six-way EXRs, one a frame.",
         ),
     ],
-    mesh: Annotated[
-        Path | None, typer.Option(metavar="SCENE.glb", help="The scene that the light belongs to: .glb, .gltf or .obj.")
-    ] = None,
-    original: Annotated[
-        Path | None,
-        typer.Option(metavar="PATH", help="What was compressed, to compare with: a set, a lightmap or a probe file."),
-    ] = None,
+    mesh: SceneFile = None,
+    original: Original = None,
     key: Annotated[str | None, typer.Option(help="Which of a file's arrays of probes.")] = None,
     view: Annotated[str | None, typer.Option(help="light or tiles; of probes balls, gaussians or volume.")] = None,
     flat: Annotated[bool, typer.Option("--flat", help="Show a lightmap unwrapped, not on its mesh.")] = False,
@@ -44,7 +40,7 @@ def view(
         float | None, typer.Option(help="Of the volume's blocks: units in a metre; default 1, less in a small scene.")
     ] = None,
     extinction: Annotated[float | None, typer.Option(help="Of a volume of smoke, at density 1.")] = None,
-    up: Annotated[Literal["y", "z"], typer.Option(help="The axis that points up in the scene.")] = "y",
+    up: Up = "y",
     rate: Annotated[float, typer.Option(help="Frames a second of a movie, and of frames that are played.")] = 24.0,
     frames: Annotated[int | None, typer.Option(help="Pictures of a movie; default 48, or all frames.")] = None,
     size: Annotated[str, typer.Option(metavar="WxH", help="Of the window, pixels.")] = "1280x720",

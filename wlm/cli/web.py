@@ -1,12 +1,12 @@
 """`wlm web`: a page that shows a file in any browser."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
 
 from wlm.cli.console import check_output, escape, quiet_warp, show, table
-from wlm.cli.options import output_option
+from wlm.cli.options import Original, SceneFile, Up, output_option
 
 
 def web(
@@ -18,17 +18,12 @@ def web(
         ),
     ],
     output: Annotated[Path, output_option("PAGE.html", "The page to write.")],
-    mesh: Annotated[
-        Path | None, typer.Option(metavar="SCENE.glb", help="The scene that the light belongs to: .glb, .gltf or .obj.")
-    ] = None,
-    original: Annotated[
-        Path | None,
-        typer.Option(metavar="PATH", help="What was compressed, to compare with: a set, a lightmap or a probe file."),
-    ] = None,
+    mesh: SceneFile = None,
+    original: Original = None,
     key: Annotated[str | None, typer.Option(help="Which of the original's arrays of probes.")] = None,
     hours: Annotated[int, typer.Option(min=1, help="Most frames of the original set that the page carries.")] = 6,
     rate: Annotated[float, typer.Option(help="Frames a second of smoke that plays.")] = 30.0,
-    up: Annotated[Literal["y", "z"], typer.Option(help="The axis that points up in the scene.")] = "y",
+    up: Up = "y",
 ) -> None:
     """Write one HTML file that shows the light, decoded by the browser's GPU; it needs no network."""
     check_output(output, ".html")

@@ -14,9 +14,8 @@ from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_path
 from wlm.interop import check_device
 from wlm.ops import raster
-from wlm.view.display import Display
+from wlm.view.display import Display, white_of
 
-_WHITE_PERCENTILE = 99.5  # as in `wlm.view.sheet`
 _BACKGROUND = 128  # light and dark surfaces stand out from it
 _MARGIN, _TITLE, _FONT = 6, 26, 16  # pixels
 
@@ -56,12 +55,6 @@ def draw(
         picture[hit] = sampler(uv[hit], visible[hit], weight).float()
         pictures[name] = picture.cpu().numpy()
     return pictures, hit.cpu().numpy()
-
-
-def white_of(light: np.ndarray) -> float:
-    """The radiance that is shown as white: the 99.5th percentile; 1 where there is no light."""
-    white = float(np.percentile(light, _WHITE_PERCENTILE)) if light.size else 0.0
-    return white if white > 0 else float(light.max(initial=0.0)) or 1.0
 
 
 def encode(light: np.ndarray, hit: np.ndarray, white: float) -> np.ndarray:

@@ -16,7 +16,8 @@ from wlm.errors import WlmError
 from wlm.formats.artifact import read_artifact
 from wlm.metrics import PSNR_CAP_DB, psnr
 from wlm.system import Model, load
-from wlm.view.document import Document, as_picture, white_of
+from wlm.view.display import Display, white_of
+from wlm.view.document import Document
 
 _Path = str | os.PathLike[str]
 
@@ -68,13 +69,13 @@ class Comparison:
         page = Document(f"{self.names[0]} and {self.names[1]}")
         page.table("", ("", *self.names), self.rows())
         if self.pictures:
-            white = white_of(next(iter(self.pictures.values())))
+            display = Display(1.0 / white_of(next(iter(self.pictures.values()))))
             a, b, *rest = self.pictures.values()
-            shown = {name: as_picture(light, white) for name, light in self.pictures.items()}
-            shown[f"difference × {_GAIN:g}"] = as_picture(np.abs(a - b) * _GAIN, white)
+            shown = {name: display.picture(light) for name, light in self.pictures.items()}
+            shown[f"difference × {_GAIN:g}"] = display.picture(np.abs(a - b) * _GAIN)
             for original in rest:
                 for name, light in (("A", a), ("B", b)):
-                    shown[f"error of {name} × {_GAIN:g}"] = as_picture(np.abs(light - original) * _GAIN, white)
+                    shown[f"error of {name} × {_GAIN:g}"] = display.picture(np.abs(light - original) * _GAIN)
             page.pictures(self.where, shown, _SIDE)
         return page.write(path)
 

@@ -16,7 +16,6 @@ from PIL import Image
 
 from wlm.formats.atomic import atomic_write
 
-_WHITE_PERCENTILE = 99.5  # as in `wlm.view.sheet`
 _WIDTH, _HEIGHT, _DPI = 7.0, 2.6, 160  # inches, dots an inch: sharp on dense screens
 _LINES = ("#c2571a", "#3a6ea5", "#5b8c3a", "#8a5aa8")
 _STYLE = """
@@ -115,19 +114,6 @@ class Document:
 
     def _add(self, heading: str, content: str) -> None:
         self._parts.append((f"<h2>{html.escape(heading)}</h2>\n" if heading else "") + content)
-
-
-def white_of(light: np.ndarray) -> float:
-    """The light that is shown as white: the 99.5th percentile; 1 where all is black."""
-    white = float(np.percentile(light, _WHITE_PERCENTILE)) if light.size else 0.0
-    return white if white > 0 else 1.0
-
-
-def as_picture(light: np.ndarray, white: float) -> np.ndarray:
-    """Linear light [H, W, 3] as sRGB bytes, `white` as white."""
-    linear = np.clip(light / white, 0.0, 1.0)
-    encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-    return (encoded * 255.0 + 0.5).astype(np.uint8)
 
 
 def _png_of(figure: Figure) -> str:

@@ -21,7 +21,8 @@ from wlm.probe.decode import Decoder as ProbeDecoder
 from wlm.probe.evaluation import Report as ProbeReport
 from wlm.probe.model import ProbeModel
 from wlm.view.atlas import draw, original
-from wlm.view.document import Document, as_picture, white_of
+from wlm.view.display import Display, white_of
+from wlm.view.document import Document
 
 _WORST_TILES, _WORST_PROBES = 3, 10
 _GAIN = 8.0  # of errors in pictures
@@ -85,11 +86,11 @@ def _worst_tiles(page: Document, model: LightmapModel, lightmaps: LightmapSet, r
             span = valid.max() - valid.min()
             found.append((psnr_from_mse(mse, span) if span > 0 else np.inf, i, then, now))
         least, i, then, now = min(found, key=lambda each: each[0])
-        white = white_of(then[mask])
+        display = Display(1.0 / white_of(then[mask]))
         pictures = {
-            "original": as_picture(then, white),
-            "decoded": as_picture(now * mask[..., None], white),
-            f"error × {_GAIN:g}": as_picture(np.abs(then - now) * mask[..., None] * _GAIN, white),
+            "original": display.picture(then),
+            "decoded": display.picture(now * mask[..., None]),
+            f"error × {_GAIN:g}": display.picture(np.abs(then - now) * mask[..., None] * _GAIN),
         }
         heading = f"Tile {number}, mean {scores[number]:.2f} dB; worst at {model.times[i]:g}: {least:.2f} dB"
         page.pictures(heading, pictures, _SIDE)
@@ -131,18 +132,18 @@ def atlas_report(
     if report.worst_view >= 0:
         view = sphere_views(views)[report.worst_view]
         drawn, hit = draw(mesh, {"original": original(mesh), "decoded": decoder}, view)
-        white = white_of(drawn["original"][hit])
+        display = Display(1.0 / white_of(drawn["original"][hit]))
         error = np.abs(drawn["original"] - drawn["decoded"])
-        pictures = {name: as_picture(light, white) for name, light in drawn.items()}
-        pictures[f"error × {_GAIN:g}"] = as_picture(error * _GAIN, white)
+        pictures = {name: display.picture(light) for name, light in drawn.items()}
+        pictures[f"error × {_GAIN:g}"] = display.picture(error * _GAIN)
         page.pictures(f"The worst view, camera {report.worst_view}", pictures, _SIDE)
     lightmap = decoder.lightmap(mesh)
     then, mask = mesh.lightmap * mesh.mask[..., None], mesh.mask[..., None]
-    white = white_of(mesh.lightmap[mesh.mask])
+    display = Display(1.0 / white_of(mesh.lightmap[mesh.mask]))
     pictures = {
-        "original": as_picture(then, white),
-        "decoded": as_picture(lightmap * mask, white),
-        f"error × {_GAIN:g}": as_picture(np.abs(then - lightmap * mask) * _GAIN, white),
+        "original": display.picture(then),
+        "decoded": display.picture(lightmap * mask),
+        f"error × {_GAIN:g}": display.picture(np.abs(then - lightmap * mask) * _GAIN),
     }
     page.pictures("The lightmap", pictures, _SIDE)
     return page.write(path)
