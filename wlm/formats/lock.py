@@ -128,7 +128,8 @@ def _acquire(lock: Path, output: str | os.PathLike[str]) -> int | None:
             raise WlmError(f"{output}: is being written by another process") from None
         except FileNotFoundError:
             # Its holder ended, and took it along, after it was opened.
-            pass
+            os.close(handle)
+            continue
         except OSError:
             os.close(handle)
             lock.unlink(missing_ok=True)
