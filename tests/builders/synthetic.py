@@ -9,9 +9,9 @@ from wlm_kernels import mlp
 
 
 def random_model(
-    kinds=(3, 2, 1, 0), columns=2, times=(0.0, 7.5, 13.0, 19.0), period=24.0, seed=0, **settings
+    kinds=(3, 2, 1, 0), columns=2, times=(0.0, 7.5, 13.0, 19.0), period=24.0, seed=0, mask=None, **settings
 ) -> LightmapModel:
-    """Makes a model with tiles of these kinds, `columns` in a row; `settings` are the profile's."""
+    """Makes a model with tiles of these kinds, `columns` in a row; no `mask` is one without gaps; `settings` are the profile's."""
     rng = np.random.default_rng(seed)
     profile = Profile(name="random", **{"hidden": 8, "uvt_resolution": 8, "uvt_slices": 3} | settings)
     kind = np.array(kinds, np.uint8)
@@ -44,6 +44,7 @@ def random_model(
         period=period,
         source="0123456789abcdef",
         profile=profile,
+        mask=np.ones((height, width), bool) if mask is None else mask,
         kind=kind,
         uv=blocks(mapped, 32, 32),
         uvt=blocks(dynamic, profile.uvt_slices, r, r),

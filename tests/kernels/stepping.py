@@ -42,7 +42,7 @@ class Case:
     settings: dict = field(default_factory=dict)
 
     def profile(self) -> Profile:
-        """The settings; ten steps and no samples between times unless `settings` has others."""
+        """The settings; ten steps unless `settings` has others."""
         resolution, slices, columns, rows = self.shape
         return Profile(
             name="test",
@@ -54,7 +54,7 @@ class Case:
             plane_columns=columns,
             plane_rows=rows,
             time_axis="frames" if self.periodic else "paper",
-            **{"steps": 10, "between": 0.0} | self.settings,
+            **{"steps": 10} | self.settings,
         )
 
     def axis(self) -> TimeAxis:
@@ -182,7 +182,6 @@ class Problem:
     noise: torch.Tensor  # [N, B, I]
     tau: torch.Tensor  # [N, B]
     encoding: torch.Tensor  # [N, B, 4]
-    share: torch.Tensor  # [N, B], of the next stored time in the sample's colour
     target: torch.Tensor  # [N, B, 3]
     weight: torch.Tensor  # [N, B, 3]
     quantised: bool
@@ -221,20 +220,6 @@ class Problem:
         return Step(loss.detach().numpy(), {key: value.grad.numpy() for key, value in named.items()})
 
 
-def _between(
-    axis: TimeAxis, tau: torch.Tensor, k: torch.Tensor, encoding: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """The next time, its share and the place of samples between times, read back from their encoded time."""
-    place = torch.atan2(encoding[..., 0], encoding[..., 1]) % (2.0 * np.pi) / axis.turn
-    after = (k + 1) % len(tau) if axis.periodic else (k + 1).clamp(max=len(tau) - 1)
-    way, gap = place - tau[k], tau[after] - tau[k]
-    if axis.periodic:
-        way, gap = (way + 1e-4) % 1.0 - 1e-4, gap % 1.0
-    share = torch.where(gap > 0, way / gap.clamp(min=1e-12), 0.0)
-    assert float(share.min()) > -1e-5 and float(share.max()) < 1.0 + 1e-5
-    return after, torch.where(share.abs() < 1e-5, 0.0, share), place
-
-
 def problem(trainer: Trainer, case: Case, quantised: bool) -> Problem:
     """The coming step of a trainer as a `Problem`."""
     place, features = draw(trainer, quantised)
@@ -242,24 +227,10 @@ def problem(trainer: Trainer, case: Case, quantised: bool) -> Problem:
     targets = case.targets()
     tau, encoding = (torch.from_numpy(values).double() for values in encode_time(trainer.axis))
     k = place[..., 2]
-    after, share, tau_at, encoding_at = k, torch.zeros(k.shape).double(), tau[k], encoding[k]
-    if trainer.profile.between > 0.0:
-        encoding_at = torch.from_numpy(features[..., 12:]).double()
-        after, share, tau_at = _between(trainer.axis, tau, k, encoding_at)
     n = torch.arange(trainer.tiles)[:, None]
     shift, spread = (torch.from_numpy(v).double()[:, None] for v in (targets.shift, targets.spread))
-    texel = place[..., 0] * TILE + place[..., 1]
-
-    def mixed(values: np.ndarray, *rest: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """The shares of a sample's two times of an array [N, T, ...]."""
-        values = torch.from_numpy(values).double()
-        return (1.0 - share[..., None]) * values[n, k, *rest], share[..., None] * values[n, after, *rest]
-
-    scale, weight = mixed(targets.scale), mixed(targets.weight)
-    scales = torch.from_numpy(targets.scale).double()[:, :, None]
-    colours = (shift + spread * torch.from_numpy(targets.colour).flatten(1, 2)).reshape(targets.colour.shape) * scales
-    colour = mixed(colours.numpy(), texel)
-    target = (sum(colour) / sum(scale) - shift) / spread
+    target = torch.from_numpy(targets.colour).double()[n, k, place[..., 0] * TILE + place[..., 1]]
+    weight = torch.from_numpy(targets.weight).double()[n, k]
 
     def leaf(values: torch.Tensor) -> torch.Tensor:
         return values.detach().cpu().double().clone().requires_grad_()
@@ -270,11 +241,10 @@ def problem(trainer: Trainer, case: Case, quantised: bool) -> Problem:
         output=leaf(trainer.output),
         place=place,
         noise=torch.from_numpy(drawn_noise(trainer, quantised)).double(),
-        tau=tau_at,
-        encoding=encoding_at,
-        share=share,
+        tau=tau[k],
+        encoding=encoding[k],
         target=target,
-        weight=reference.emphasised(sum(weight), shift, spread, target, targets.emphasis),
+        weight=reference.emphasised(weight, shift, spread, target, targets.emphasis),
         quantised=quantised,
         periodic=case.periodic,
         gelu=case.gelu,

@@ -34,6 +34,7 @@ def _model(hidden: int, gelu: str, periodic: bool = True, **settings) -> Lightma
         hidden=hidden,
         gelu=gelu,
         time_axis="frames" if periodic else "paper",
+        interpolation="radiance" if periodic else "network",
         **settings,
     )
     scale = random.integers(143, 148, model.scale.shape, np.uint8)
@@ -44,7 +45,17 @@ def _model(hidden: int, gelu: str, periodic: bool = True, **settings) -> Lightma
 
 
 def _reference_colour(model: LightmapModel, number: int, time: float, gelu: str) -> np.ndarray:
-    """Colour in gamma space, float64 [128, 128, 3], from the bytes that the model holds."""
+    """Colour in gamma space, float64 [128, 128, 3], from the bytes that the model holds; between times by eq. 2."""
+    if model.profile.interpolation == "network":
+        return _network_colour(model, number, time, gelu)
+    before, after, share = model.axis.neighbours(time)
+    gamma = model.profile.gamma
+    early, late = (_network_colour(model, number, model.times[k], gelu) ** gamma for k in (before, after))
+    return ((1.0 - share) * early + share * late) ** (1.0 / gamma)
+
+
+def _network_colour(model: LightmapModel, number: int, time: float, gelu: str) -> np.ndarray:
+    """What the network makes of one time."""
     row = int((model.kind[:number] >= TileKind.STATIC).sum())
     of_kind = int((model.kind[:number] == model.kind[number]).sum())
     temporal, net = None, model.net_static
@@ -110,12 +121,18 @@ def test_extreme_sizes(device: str, resolution: int, slices: int, columns: int, 
 
 
 def _hold_strip(model: LightmapModel, device: str, times: tuple[float, ...]) -> None:
-    """The runtime path: within one code of the plain path, and equal in 99 of 100."""
+    """The runtime path: within one code of the plain path, and equal in 99 of 100.
+
+    Between stored times, which it mixes after each was rounded, within two.
+    """
     strip, decoder = StripDecoder(model, device), Decoder(model, device)
     for time in times:
         strip.set_time(time)
         strip.decode()
         off = np.abs(strip.numpy().astype(int) - decoder.tiles_8bit(list(strip.numbers), time)[0])
+        if len(model.axis.reads(time)) == 2:
+            assert off.max() <= 2 and (off == 0).mean() >= 0.7
+            continue
         assert off.max() <= 1
         assert (off == 0).mean() >= 0.99, f"{(off == 0).mean():.4f} of the codes are equal"
 

@@ -61,23 +61,6 @@ def test_tanh_step(device: str):
     fit.close()
 
 
-@pytest.mark.parametrize("periodic", [True, False], ids=["periodic", "clamped"])
-@pytest.mark.parametrize("emphasis", [0.0, 1.2])
-def test_samples_between_times(device: str, emphasis: float, periodic: bool):
-    """A share of the samples lies between two times and follows their interpolated colour (eq. 2)."""
-    case = Case(samples=1024, periodic=periodic, emphasis=emphasis, settings={"between": 0.4})
-    fit = trainer(case, device)
-    twin = problem(fit, case, False)
-    close(draw(fit, False)[1], twin.features(), 5e-6, "features")
-    moved = twin.share > 0
-    drawn = moved.double().mean()
-    # Nothing follows the last time of a clamped axis; five standard deviations of 2,048 draws.
-    assert abs(drawn - 0.4 * (1.0 if periodic else 0.8)) < 5 * (0.24 / 2048) ** 0.5
-    assert abs(twin.share[moved].mean() - 0.5) < 5 * (1 / 12 / (0.3 * 2048)) ** 0.5
-    _hold(fused_step(fit, False), twin.step())
-    fit.close()
-
-
 def test_later_steps(device: str):
     """Five steps on, with sums cleared and parameters moved, a step is still the reference's."""
     case = Case()

@@ -24,7 +24,7 @@ def test_what_is_written_comes_back(tmp_path, kinds, period):
 
 
 def test_the_arrays_are_all_tested():
-    assert len(ARRAYS) == 13 and {*ARRAYS} == {*random_model().parts, "times"}
+    assert len(ARRAYS) == 14 and {*ARRAYS} == {*random_model().parts, "times", "mask"}
 
 
 @pytest.mark.parametrize("times", [(0.0, 1e-9), (18.45, 18.55), (7.0,), (1e6, 1e6 + 1e-4)])

@@ -24,8 +24,10 @@ def test_strip_and_exact_agree_at_any_time(device):
                 runtime.set_time(time)
             runtime.decode()
         codes, bounds = decoder.tiles_8bit([0, 2, 5], model.times[0] if time is None else time)
-        assert np.array_equal(exact.numpy(), codes)
-        assert np.abs(strip.numpy().astype(int) - codes).max() <= 1
+        # Between stored times the two are mixed after each was rounded.
+        stored = time in (None, 13.0)
+        assert np.abs(exact.numpy().astype(int) - codes).max() <= (0 if stored else 2)
+        assert np.abs(strip.numpy().astype(int) - codes).max() <= (1 if stored else 2)
         np.testing.assert_allclose(strip.bounds, bounds, rtol=1e-6)
 
 
@@ -33,19 +35,36 @@ def test_strip_and_exact_agree_at_any_time(device):
 def test_a_cheaper_gelu_stays_close(gelu, most, device):
     model = random_model((3,), columns=1)
     strip = StripDecoder(model, device, gelu)
-    strip.set_time(9.0)
+    strip.set_time(7.5)
     strip.decode()
-    share = np.minimum(colour_tile64(model, 0, 9.0) / strip.bounds[0], 1.0)
+    share = np.minimum(colour_tile64(model, 0, 7.5) / strip.bounds[0], 1.0)
     assert np.abs(strip.numpy()[0, ..., :3] / 255.0 - share).max() < 0.5 / 255.0 + most
 
 
 def test_static_tiles(device):
     model = random_model(KINDS)
     exact = ExactDecoder(model, device, kind=TileKind.STATIC)
-    exact.set_time(16.0)
+    exact.set_time(13.0)
     exact.decode()
     assert exact.numbers.tolist() == [1]
-    assert np.array_equal(exact.numpy(), Decoder(model, device).tiles_8bit([1], 16.0)[0])
+    assert np.array_equal(exact.numpy(), Decoder(model, device).tiles_8bit([1], 13.0)[0])
+
+
+def test_gaps_take_the_light_of_charts(device):
+    mask = np.zeros((236, 247), bool)
+    mask[20:60, 30:128] = mask[100:180, 60:90] = True  # across tiles, and near the edge of one
+    model = random_model((3, 3, 3, 2), mask=mask, hidden=16)
+    decoder, runtime = Decoder(model, device), StripDecoder(model, device)
+    for time in (7.5, 9.0):
+        runtime.set_time(time)
+        runtime.decode()
+        image, bounds = decoder.frame_8bit(time)
+        np.testing.assert_allclose(runtime.bounds, bounds[:3], rtol=1e-6)
+        for row, number in enumerate((0, 1, 2)):
+            y, x = number // 2 * 128, number % 2 * 128
+            part = image[y : y + 128, x : x + 128].astype(int)
+            off = np.abs(runtime.numpy()[row, : part.shape[0], : part.shape[1]] - part)
+            assert off.max() <= 3, "what is rounded for another tile's bound may be off by one more"
 
 
 def test_a_captured_decode_repeats(device):

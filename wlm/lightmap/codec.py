@@ -1,6 +1,8 @@
 """A lightmap model as the parts of its file, and back: quantised maps, networks and scales."""
 
 import math
+import zlib
+from collections.abc import Mapping
 from itertools import pairwise
 from typing import Annotated, Any
 
@@ -16,6 +18,10 @@ from wlm.system import Header, Name
 
 _ROUNDING = 2e-7  # relative, of stored times
 _TIMES = Part((np.float32, np.float64), (None,))
+_MASK = Part(np.uint8, (None,))
+# What files of before the setting `interpolation` were made with.
+_OLD_PROFILE = {"interpolation": "network"}
+_OLD_SETTINGS = ("between",)
 
 
 class _Header(Header):
@@ -33,9 +39,11 @@ def encode(model: LightmapModel) -> tuple[dict[str, Any], dict[str, np.ndarray],
         "name": model.name,
         "size": [model.width, model.height],
         "period": model.period,
-        "profile": model.profile.changes(),
+        "profile": model.profile.changes() | {"interpolation": model.profile.interpolation},
     }
     parts = {name: value for name, value in model.parts.items() if value.size}
+    if not model.mask.all():
+        parts["mask"] = np.frombuffer(zlib.compress(np.packbits(model.mask).tobytes(), 9), np.uint8)
     return settings, parts | {"times": _shortened(model.times)}, model.source
 
 
@@ -53,13 +61,13 @@ def decode(artifact: Artifact) -> LightmapModel:
         WlmError, ValueError: A setting or a part is missing or wrong, or they don't fit each other.
     """
     tensors = artifact.tensors
-    header = check_settings(_Header, artifact.settings, "setting ")
+    header = check_settings(_Header, _renewed(artifact.settings), "setting ")
     width, height = header.size
     tiles = Part(np.uint8, (TileGrid.of(height, width).count,), most=max(TileKind))
     kind = check_part(tensors, "kind", tiles)
     times = check_part(tensors, "times", _TIMES).astype(np.float64)
     _check_times(times.tolist(), header.period)
-    others = {name: part for name, part in tensors.items() if name not in ("kind", "times")}
+    others = {name: part for name, part in tensors.items() if name not in ("kind", "times", "mask")}
     return LightmapModel(
         name=header.name,
         width=width,
@@ -67,10 +75,35 @@ def decode(artifact: Artifact) -> LightmapModel:
         period=header.period,
         source=artifact.source,
         profile=header.profile,
+        mask=_mask(tensors, height, width),
         kind=kind,
         times=times,
         **check_parts(others, part_table(header.profile, kind, len(times))),
     )
+
+
+def _renewed(settings: dict[str, Any]) -> dict[str, Any]:
+    """Settings of a file as today's names have them."""
+    profile = settings.get("profile")
+    if not isinstance(profile, dict) or "interpolation" in profile:
+        return settings
+    kept = {name: value for name, value in profile.items() if name not in _OLD_SETTINGS}
+    return settings | {"profile": kept | _OLD_PROFILE}
+
+
+def _mask(tensors: Mapping[str, np.ndarray], height: int, width: int) -> np.ndarray:
+    """The mask, bool [H, W]; a file without one has no gaps."""
+    if "mask" not in tensors:
+        return np.ones((height, width), bool)
+    size = -(-height * width // 8)
+    reader = zlib.decompressobj()
+    try:
+        bits = reader.decompress(check_part(tensors, "mask", _MASK).tobytes(), size + 1)
+    except zlib.error as error:
+        raise ValueError(f"part mask: {error}") from error
+    if len(bits) != size or not reader.eof or reader.unused_data:
+        raise ValueError(f"part mask: expected {size} bytes, compressed, found others")
+    return np.unpackbits(np.frombuffer(bits, np.uint8), count=height * width).reshape(height, width).astype(bool)
 
 
 def _check_times(times: list[float], period: float | None) -> None:

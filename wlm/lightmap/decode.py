@@ -9,6 +9,7 @@ import warp as wp
 
 from wlm import interop
 from wlm.errors import WlmError
+from wlm.lightmap.gaps import Gaps
 from wlm.lightmap.model import TILE, LightmapModel, decode_scale
 from wlm.lightmap.tiles import TileGrid, TileKind, place
 from wlm_kernels.lightmap import decode as lightmap_decode
@@ -20,8 +21,10 @@ _PIECE = 1024  # tiles that are decoded at once: 192 MiB
 class Decoder:
     """Holds a model's stored bytes on a device and decodes from them.
 
-    At times between the stored ones the features, the scales and the bounds are interpolated, so that light moves
-    smoothly; times outside the day wrap round, or stop at the first and last where the set isn't periodic.
+    Between two stored times light is the mix of their radiance (eq. 2), or what the network makes of features that are
+    interpolated, see `Profile.interpolation`; times outside the day wrap round, or stop at the first and last where
+    the set isn't periodic. Texels of the gaps within two of a chart have the light of the nearest valid texel, so that
+    a map can be filtered.
     """
 
     def __init__(self, model: LightmapModel, device: str = "cpu", gelu: str | None = None) -> None:
@@ -45,6 +48,7 @@ class Decoder:
                 kernels = lightmap_decode.exact_kernels(kind == TileKind.DYNAMIC, model.profile.hidden, self.gelu)
                 self._groups.append((tiles, kernels))
         self._constants = {int(tile): i for i, tile in enumerate(np.flatnonzero(model.kind == TileKind.CONSTANT))}
+        self._gaps = gaps_of(model)
 
     @property
     def device_bytes(self) -> int:
@@ -57,7 +61,8 @@ class Decoder:
         Args:
             number: Of the tile in the grid, row-major.
             time: In the unit of the set's times.
-            border: Texels added on each side, mirrored (section 9), so that a texture of tiles can be filtered.
+            border: Texels added on each side from the neighbouring tiles, so that a texture of tiles can be filtered;
+                past the map's ends its last texels are mirrored (section 9).
 
         Returns:
             Linear radiance, float32 [128 + 2 border, 128 + 2 border, 3].
@@ -65,40 +70,74 @@ class Decoder:
         Raises:
             WlmError: There is no such tile, the time isn't finite, or the border isn't in 0..128.
         """
-        self._grid.origin(number)
+        y, x = self._grid.origin(number)
         if not 0 <= border <= TILE:
             raise WlmError(f"border: expected 0 to {TILE} texels, got {border}")
-        tile = self.tiles([number], time)[0]
-        return np.pad(tile, ((border, border), (border, border), (0, 0)), mode="symmetric")
+        window = tuple(slice(max(at - border, 0), at + TILE + border) for at in (y, x))
+        gaps = self._gaps.within(window)
+        # The rows and columns that are needed: the border's, and those of the gaps' sources.
+        needed = np.concatenate([[[part.start for part in window], [part.stop - 1 for part in window]], gaps.source])
+        rows, columns = (
+            range(max(low // TILE, 0), min(high // TILE, last - 1) + 1)
+            for low, high, last in zip(needed.min(0), needed.max(0), (self._grid.rows, self._grid.cols), strict=True)
+        )
+        numbers = [row * self._grid.cols + column for row in rows for column in columns]
+        light = self.tiles(numbers, time).reshape(len(rows), len(columns), TILE, TILE, 3).swapaxes(1, 2)
+        light = light.reshape(len(rows) * TILE, len(columns) * TILE, 3)
+        first = np.array([rows[0], columns[0]]) * TILE
+        Gaps(gaps.target - first, gaps.source - first).fill(light)
+        corner = np.array([y, x]) - border - first
+        before = np.maximum(-corner, 0)
+        after = np.maximum(corner + TILE + 2 * border - light.shape[:2], 0)
+        light = np.pad(light, (*zip(before, after, strict=True), (0, 0)), mode="symmetric")
+        top, left = corner + before
+        return np.ascontiguousarray(light[top : top + TILE + 2 * border, left : left + TILE + 2 * border])
 
     def tiles(self, numbers: Sequence[int], time: float) -> np.ndarray:
-        """Decodes tiles to linear radiance, float32 [n, 128, 128, 3]; empty ones are 0."""
+        """Decodes tiles, gaps unfilled, to linear radiance, float32 [n, 128, 128, 3]; empty ones are 0.
+
+        Raises:
+            WlmError: The time isn't finite.
+        """
         out = np.zeros((len(numbers), TILE, TILE, 3), np.float32)
-        for i, radiance in self._constant(numbers, time):
-            out[i] = radiance
-        self._decode(numbers, time, out, as_bytes=False)
+        for stamp, share in self._times.reads(time):
+            light = np.zeros_like(out) if share < 1.0 else out
+            for i, radiance in self._constant(numbers, stamp):
+                light[i] = radiance
+            self._decode(numbers, stamp, light, as_bytes=False)
+            if share < 1.0:
+                out += np.float32(share) * light
         return out
 
     def tiles_8bit(self, numbers: Sequence[int], time: float) -> tuple[np.ndarray, np.ndarray]:
-        """Decodes tiles to what a texture cache holds.
+        """Decodes tiles, gaps unfilled, to what a texture cache holds.
 
         Returns:
             uint8 [n, 128, 128, 4] and the bound b, float32 [n]: radiance = (byte / 255 * b) ** gamma. Alpha is 255,
             0 in empty tiles.
+
+        Raises:
+            WlmError: The time isn't finite.
         """
         out = np.zeros((len(numbers), TILE, TILE, 4), np.uint8)
         peak = np.zeros(len(numbers), np.float32)
-        for i, radiance in self._constant(numbers, time):
-            colour = radiance ** (1.0 / self.model.profile.gamma)
-            peak[i] = colour.max()
-            if peak[i] > 0:
-                out[i, ..., :3] = np.floor(colour / peak[i] * 255.0 + 0.5)
-            out[i, ..., 3] = 255
+        exponent = 1.0 / self.model.profile.gamma
+        constant = self._constant(numbers, time)
+        for i, radiance in constant:
+            peak[i] = (radiance**exponent).max()
         bounds = self._times.bounds(time)
         for tiles, _ in self._groups:
             for i, row in tiles.among(numbers):
                 peak[i] = bounds[tiles.rows[row]]
-        self._decode(numbers, time, out, as_bytes=True)
+                out[i, ..., 3] = 255
+        if len(self._times.reads(time)) == 1:
+            self._decode(numbers, time, out, as_bytes=True)
+        else:
+            factor = np.divide(1.0, peak, out=np.zeros_like(peak), where=peak > 0)[:, None, None, None]
+            out[..., :3] = np.clip(self.tiles(numbers, time) ** exponent * factor, 0.0, 1.0) * 255.0 + 0.5
+        for i, radiance in constant:
+            out[i, ..., :3] = np.floor(radiance**exponent / (peak[i] or 1.0) * 255.0 + 0.5)
+            out[i, ..., 3] = 255
         return out, peak
 
     def frame(self, time: float) -> np.ndarray:
@@ -106,6 +145,7 @@ class Decoder:
         image = np.zeros((self._grid.height, self._grid.width, 3), np.float32)
         for numbers in self._held():
             place(image, self.tiles(numbers.tolist(), time), numbers, self._grid)
+        self._gaps.fill(image)
         return image
 
     def frame_8bit(self, time: float) -> tuple[np.ndarray, np.ndarray]:
@@ -115,7 +155,17 @@ class Decoder:
         for numbers in self._held():
             tiles, bounds[numbers] = self.tiles_8bit(numbers.tolist(), time)
             place(image, tiles, numbers, self._grid)
+        # Tiles have bounds of their own.
+        target, source = (bounds[self._tile_of(at)] for at in (self._gaps.target, self._gaps.source))
+        factor = np.divide(source, target, out=np.zeros_like(source), where=target > 0)
+        light = image[tuple(self._gaps.source.T)][:, :3] * factor[:, None]
+        image[tuple(self._gaps.target.T)] = 255
+        image[..., :3][tuple(self._gaps.target.T)] = np.minimum(light, 255.0) + 0.5
         return image, bounds
+
+    def _tile_of(self, at: np.ndarray) -> np.ndarray:
+        """Numbers of the tiles of texels, rows and columns [G, 2]."""
+        return at[:, 0] // TILE * self._grid.cols + at[:, 1] // TILE
 
     def _held(self) -> list[np.ndarray]:
         """Numbers of the tiles that aren't empty, in pieces: a large map isn't in memory twice."""
@@ -141,7 +191,7 @@ class Decoder:
             if not chosen:
                 continue
             places, rows = (np.array(values, np.int32) for values in zip(*chosen, strict=True))
-            decoded = wp.empty((len(rows), TILE, TILE), dtype=wp.vec4ub if as_bytes else wp.vec3, device=self.device)
+            decoded = wp.empty((len(rows), TILE, TILE), dtype=wp.uint32 if as_bytes else wp.vec3, device=self.device)
             wp.launch(
                 kernels[int(as_bytes)],
                 decoded.shape,
@@ -149,7 +199,20 @@ class Decoder:
                 outputs=[decoded],
                 device=self.device,
             )
-            out[places] = decoded.numpy()
+            out[places] = rgba(decoded) if as_bytes else decoded.numpy()
+
+
+def rgba(words: wp.array) -> np.ndarray:
+    """Words of a decode to 8 bits, uint32 [...], on the host as uint8 [..., 4]."""
+    host = np.ascontiguousarray(words.numpy().astype("<u4"))
+    return host.view(np.uint8).reshape(*host.shape, 4)
+
+
+def gaps_of(model: LightmapModel) -> Gaps:
+    """The gaps that are filled from the tiles that a model holds."""
+    held = (model.kind != TileKind.EMPTY).reshape(-1, model.tile_columns)
+    held = held.repeat(TILE, 0).repeat(TILE, 1)[: model.height, : model.width]
+    return Gaps.of(model.mask & held)
 
 
 def gelu_of(model: LightmapModel, gelu: str | None) -> str:
@@ -183,6 +246,15 @@ class TimeTable:
         if not np.isfinite(time):
             raise WlmError(f"time: expected a finite number, got {time}")
         return self._axis.neighbours(time)
+
+    def reads(self, time: float) -> list[tuple[float, float]]:
+        """As `TimeAxis.reads`.
+
+        Raises:
+            WlmError: The time isn't finite.
+        """
+        self.neighbours(time)
+        return self._axis.reads(time)
 
     def bounds(self, time: float) -> np.ndarray:
         """Bound of each mapped tile, float32 [N_m]; between two times the larger, since a texel may follow either."""

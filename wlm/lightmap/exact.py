@@ -20,8 +20,7 @@ def decode_tile64(model: LightmapModel, number: int, time: float) -> np.ndarray:
     Args:
         model: The model.
         number: Of the tile in the grid, row-major.
-        time: In the unit of the set's times; at times between the stored ones what depends on the time is
-            interpolated, as `wlm.lightmap.decode.Decoder` does.
+        time: In the unit of the set's times, stored or between, as for `wlm.lightmap.decode.Decoder`; gaps are left.
 
     Returns:
         Linear radiance, float64 [128, 128, 3]; 0 in an empty tile.
@@ -32,7 +31,7 @@ def decode_tile64(model: LightmapModel, number: int, time: float) -> np.ndarray:
     _check(model, number, time)
     if model.kind[number] == TileKind.CONSTANT:
         return _filled(_constant(model, number, time))
-    return colour_tile64(model, number, time) ** model.profile.gamma
+    return sum(share * _colour(model, number, at) ** model.profile.gamma for at, share in model.axis.reads(time))
 
 
 def colour_tile64(model: LightmapModel, number: int, time: float) -> np.ndarray:
@@ -43,6 +42,16 @@ def colour_tile64(model: LightmapModel, number: int, time: float) -> np.ndarray:
         return np.zeros((TILE, TILE, 3))
     if kind == TileKind.CONSTANT:
         return _filled(_constant(model, number, time) ** (1.0 / model.profile.gamma))
+    reads = model.axis.reads(time)
+    if len(reads) == 1:
+        return _colour(model, number, reads[0][0])
+    return decode_tile64(model, number, time) ** (1.0 / model.profile.gamma)
+
+
+def _colour(model: LightmapModel, number: int, time: float) -> np.ndarray:
+    """What the network of a tile makes of one time, in gamma space [128, 128, 3]; 0 in an empty tile."""
+    if model.kind[number] == TileKind.EMPTY:
+        return np.zeros((TILE, TILE, 3))
     before, after, share = model.axis.neighbours(time)
     place = _place(model, number)
     scale = model.scales[place].astype(np.float64)  # [T, 3]

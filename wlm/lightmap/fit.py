@@ -159,6 +159,7 @@ class _Fit:
             period=lightmaps.period,
             source=lightmaps.source,
             profile=profile,
+            mask=lightmaps.mask,
             kind=kind,
             constant=self._constants(len(lightmaps.times)),
             **{name: np.zeros(part.shape, part.dtype) for name, part in table.items() if name != "constant"},

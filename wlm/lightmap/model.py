@@ -42,6 +42,9 @@ class Profile(Settings):
         time_axis: "paper": the features' time axis is the hour over the period, clamped at its ends. "frames": every
             interval between stored times gets an equal part of it, so that a lamp switched within minutes has as much
             room as an hour of afternoon; it wraps round where the set is periodic.
+        interpolation: What light there is between two stored times. "radiance": the radiance of both, mixed (eq. 2), so
+            that it is as exact there as at the stored times. "network": whatever the network makes of features that are
+            interpolated in time, as the paper decodes.
         steps: Steps of the fit.
         samples: Random samples of each tile in one step.
         map_rate, net_rate: Adam's initial learning rate of the maps and of the network.
@@ -50,8 +53,6 @@ class Profile(Settings):
         metric_weight: 0: the squared error in normalised gamma space, as the paper; 1: each texel, channel and time
             weighted so that the loss is the squared error of linear radiance over the tile's range at that time,
             which is what PSNR measures; between: the geometric mean.
-        between: Fraction of the samples at times between two stored ones, whose target is the interpolated radiance
-            (eq. 2); with 0 those times are whatever the network extrapolates.
         quantise_from: Fraction of the steps after which the maps are quantised to the exact levels of the file.
         freeze_from: Fraction of the steps after which the maps are frozen and the network alone is trained.
         static_budget_db: See `wlm.lightmap.tiles.classify`.
@@ -67,6 +68,7 @@ class Profile(Settings):
     gelu: Literal["exact", "tanh"] = "tanh"
     gamma: float = Field(2.2, ge=1.0, le=4.0)
     time_axis: Literal["paper", "frames"] = "frames"
+    interpolation: Literal["radiance", "network"] = "radiance"
     steps: int = Field(20000, ge=10)
     samples: int = Field(4096, ge=128, multiple_of=128)
     map_rate: float = Field(2e-2, gt=0.0, lt=1.0)
@@ -74,7 +76,6 @@ class Profile(Settings):
     final_rate: float = Field(1e-3, ge=0.0, le=1.0)
     adam_epsilon: float = Field(1e-8, gt=0.0)
     metric_weight: float = Field(0.5, ge=0.0, le=1.0)
-    between: float = Field(0.25, ge=0.0, lt=1.0)
     quantise_from: float = Field(0.5, ge=0.0, le=1.0)
     freeze_from: float = Field(0.95, ge=0.0, le=1.0)
     static_budget_db: float = Field(60.0, gt=0.0)
@@ -105,11 +106,13 @@ class TimeAxis:
         times: float64 [T], increasing.
         period: Length of the day, or None.
         kind: "paper" or "frames".
+        interpolation: "radiance" or "network", see `Profile.interpolation`.
     """
 
     times: np.ndarray
     period: float | None
     kind: str
+    interpolation: str = "radiance"
 
     @property
     def periodic(self) -> bool:
@@ -151,6 +154,14 @@ class TimeAxis:
         before, _, share = self.neighbours(t)
         tau = (before + share + 0.5) / len(self.times)
         return tau % 1.0 if self.periodic else tau
+
+    def reads(self, t: float) -> list[tuple[float, float]]:
+        """The times at which the network is evaluated for a time, each with its share of the radiance."""
+        before, after, share = self.neighbours(t)
+        if self.interpolation == "network":
+            return [(t, 1.0)]
+        pair = [(float(self.times[before]), 1.0 - share), (float(self.times[after]), share)]
+        return [read for read in pair if read[1] > 0.0]
 
     def encode(self, t: float) -> np.ndarray:
         """gamma(t) of eq. 4, float32 [4]."""
@@ -222,6 +233,7 @@ class LightmapModel(Model):
     Attributes:
         name, width, height, times, period, source: Of the input, see `LightmapSet`.
         profile: The settings of the fit.
+        mask: bool [H, W], true where a texel is valid; the gaps are filled by `wlm.lightmap.gaps` after decoding.
         kind: uint8 [tiles], `TileKind` of each tile of the grid, row-major; EMPTY also where not compressed.
         uv: BC7 blocks of F_uv.
         uvt: BC7 blocks of F_uvt, slice by slice.
@@ -245,6 +257,7 @@ class LightmapModel(Model):
     period: float | None
     source: str
     profile: Profile
+    mask: np.ndarray
     kind: np.ndarray
     uv: np.ndarray
     uvt: np.ndarray
@@ -266,7 +279,7 @@ class LightmapModel(Model):
     @property
     def axis(self) -> TimeAxis:
         """The time axis of the features."""
-        return TimeAxis(self.times, self.period, self.profile.time_axis)
+        return TimeAxis(self.times, self.period, self.profile.time_axis, self.profile.interpolation)
 
     @property
     def mapped(self) -> np.ndarray:

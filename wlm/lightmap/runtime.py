@@ -2,17 +2,19 @@
 
 `wlm.lightmap.Decoder` returns arrays on the host; these two are for a renderer's loop. Each holds the tiles of one
 kind: a whole map is a `StripDecoder`, an `ExactDecoder` of the static tiles if there are any, and
-`Decoder.tiles_8bit` for the constant tiles, one colour each, which need no launch.
+`Decoder.tiles_8bit` for the constant tiles, one colour each, which need no launch. Gaps take the light of charts in
+tiles of the same decoder.
 """
 
 import numpy as np
 import warp as wp
 
 from wlm import interop
-from wlm.lightmap.decode import StoredTiles, TimeTable, gelu_of
+from wlm.lightmap.decode import StoredTiles, TimeTable, gaps_of, gelu_of, rgba
 from wlm.lightmap.model import TILE, LightmapModel
 from wlm.lightmap.tiles import TileKind
 from wlm_kernels.lightmap import decode as lightmap_decode
+from wlm_kernels.lightmap import output
 
 
 class _TileDecoder:
@@ -24,14 +26,36 @@ class _TileDecoder:
         self.numbers = self._stored.numbers
         self._tiles = wp.array(np.arange(len(self.numbers), dtype=np.int32), dtype=int, device=self.device)
         self._times = TimeTable(model, self.device)
-        self._state = None
+        self.out, self._early, self._late = (self._empty() for _ in range(3))
+        self._states = [None, None]
+        self._limits = wp.empty(len(self.numbers), dtype=float, device=self.device)
+        self._filled = self._gaps()
         self.set_time(float(model.times[0]))
+
+    def _empty(self) -> wp.array:
+        return wp.zeros((len(self.numbers), TILE, TILE), dtype=wp.uint32, device=self.device)
+
+    def _gaps(self) -> tuple[wp.array, wp.array]:
+        """Places in `out` of the texels that are filled, and of those whose light they take."""
+        gaps, columns = gaps_of(self.model), self.model.tile_columns
+        row = np.full(len(self.model.kind), -1)
+        row[self.numbers] = np.arange(len(self.numbers))
+
+        def place(at: np.ndarray) -> np.ndarray:
+            tile = row[at[:, 0] // TILE * columns + at[:, 1] // TILE]
+            return np.where(tile < 0, -1, (tile * TILE + at[:, 0] % TILE) * TILE + at[:, 1] % TILE)
+
+        places = np.stack([place(gaps.target), place(gaps.source)])
+        held = places[:, (places >= 0).all(0)].astype(np.int32)
+        target, source = (wp.array(values, dtype=int, device=self.device) for values in held)
+        return target, source
 
     def set_time(self, time: float) -> None:
         """Sets the time of the decodes that follow.
 
         The arrays of the old time are overwritten in place, but its place on the time axis is an argument of the
-        launches: a CUDA graph captured before is out of date and must be captured again.
+        launches: a CUDA graph captured before is out of date and must be captured again. Between two stored times both
+        are decoded and mixed: a renderer that keeps the two and mixes them itself decodes once for each stored time.
 
         Args:
             time: In the unit of the set's times, stored or between; see `Decoder`.
@@ -39,8 +63,30 @@ class _TileDecoder:
         Raises:
             WlmError: It isn't finite.
         """
-        self._state = self._times.at(time, self._state)
+        self._reads = self._times.reads(time)
+        for i, (stamp, _) in enumerate(self._reads):
+            self._states[i] = self._times.at(stamp, self._states[i])
         self._bounds = self._times.bounds(time)[self._stored.rows]
+        self._limits.assign(self._bounds)
+
+    def decode(self) -> None:
+        """Decodes all tiles into `out`: launches alone, no allocation, no wait; can be captured."""
+        if len(self._reads) == 1:
+            self._launch(self._states[0], self.out)
+        else:
+            early, late = self._states
+            self._launch(early, self._early)
+            self._launch(late, self._late)
+            words = [array.reshape((len(self.numbers), -1)) for array in (self._early, self._late, self.out)]
+            inverse = early.inverse_peak, late.inverse_peak
+            share, gamma = self._reads[1][1], self.model.profile.gamma
+            output.blend(*words[:2], *inverse, self._stored.places, share, gamma, words[2])
+        if len(self._filled[0]):
+            output.fill(*self._filled, self._limits, self.out.flatten())
+
+    def numpy(self) -> np.ndarray:
+        """The last decode on the host, uint8 [n, 128, 128, 4]."""
+        return rgba(self.out)
 
     @property
     def bounds(self) -> np.ndarray:
@@ -76,17 +122,10 @@ class StripDecoder(_TileDecoder):
             wp.empty((n, model.profile.hidden, TILE), dtype=float, device=self.device),
             wp.empty((n, TILE), dtype=wp.vec2, device=self.device),
         )
-        self.out = wp.zeros((n, TILE, TILE), dtype=wp.uint32, device=self.device)
 
-    def decode(self) -> None:
-        """Decodes all tiles into `out`: three launches, no allocation, no wait; can be captured."""
+    def _launch(self, state: lightmap_decode.TimeState, out: wp.array) -> None:
         stored = self._stored
-        self._kernels.decode(*stored.arguments, self._state, *self._scratch, stored.places, self._tiles, self.out)
-
-    def numpy(self) -> np.ndarray:
-        """The last decode on the host, uint8 [n, 128, 128, 4]."""
-        words = np.ascontiguousarray(self.out.numpy().astype("<u4"))
-        return words.view(np.uint8).reshape(*words.shape, 4)
+        self._kernels.decode(*stored.arguments, state, *self._scratch, stored.places, self._tiles, out)
 
 
 class ExactDecoder(_TileDecoder):
@@ -94,7 +133,7 @@ class ExactDecoder(_TileDecoder):
 
     Attributes:
         numbers: int [n], numbers of the tiles of that kind in the grid, in the order of `out`.
-        out: `wp.array` vec4ub [n, 128, 128], RGBA, alpha 255; written by `decode`.
+        out: `wp.array` uint32 [n, 128, 128], RGBA from the lowest byte, alpha 255; written by `decode`.
         gelu: The GELU in use.
     """
 
@@ -112,19 +151,13 @@ class ExactDecoder(_TileDecoder):
         """
         super().__init__(model, device, gelu, kind)
         self._kernel = lightmap_decode.exact_kernels(kind == TileKind.DYNAMIC, model.profile.hidden, self.gelu)[1]
-        self.out = wp.zeros((len(self.numbers), TILE, TILE), dtype=wp.vec4ub, device=self.device)
 
-    def decode(self) -> None:
-        """Decodes all tiles into `out`: one launch, no allocation, no wait; can be captured."""
+    def _launch(self, state: lightmap_decode.TimeState, out: wp.array) -> None:
         stored = self._stored
         wp.launch(
             self._kernel,
-            self.out.shape,
-            inputs=[*stored.arguments, self._state, stored.places, self._tiles],
-            outputs=[self.out],
+            out.shape,
+            inputs=[*stored.arguments, state, stored.places, self._tiles],
+            outputs=[out],
             device=self.device,
         )
-
-    def numpy(self) -> np.ndarray:
-        """The last decode on the host, uint8 [n, 128, 128, 4]."""
-        return self.out.numpy()

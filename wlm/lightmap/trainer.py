@@ -282,8 +282,6 @@ class Trainer:
         batch.shift = put(targets.shift, wp.vec3)
         batch.spread = put(targets.spread, wp.vec3)
         batch.scale = put(targets.scale, wp.vec3)
-        batch.turn = self.axis.turn
-        batch.between = self.profile.between
         batch.gamma = self.profile.gamma
         squared = np.square(targets.range, dtype=np.float32)
         batch.inverse_range = put(np.divide(1.0, squared, out=np.zeros_like(squared), where=squared > 0), wp.float32)

@@ -106,16 +106,26 @@ def finish_radiance(time: TimeState, n: int, y: wp.vec3) -> wp.vec3:
 
 
 @wp.func
+def pack(v: wp.vec4ub) -> wp.uint32:
+    return (
+        wp.uint32(v[0])
+        | wp.lshift(wp.uint32(v[1]), wp.uint32(8))
+        | wp.lshift(wp.uint32(v[2]), wp.uint32(16))
+        | wp.lshift(wp.uint32(v[3]), wp.uint32(24))
+    )
+
+
+@wp.func
 def finish_byte(c: float, inverse_peak: float) -> wp.uint8:
     return wp.uint8(int(wp.clamp(c * inverse_peak, 0.0, 1.0) * 255.0 + 0.5))
 
 
 @wp.func
-def finish_bytes(time: TimeState, n: int, y: wp.vec3) -> wp.vec4ub:
+def finish_bytes(time: TimeState, n: int, y: wp.vec3) -> wp.uint32:
     """The 8-bit output: gamma-space colour over the tile's bound at this time; alpha is 255."""
     c = finish_colour(time, n, y)
     p = time.inverse_peak[n]
-    return wp.vec4ub(finish_byte(c[0], p), finish_byte(c[1], p), finish_byte(c[2], p), wp.uint8(255))
+    return pack(wp.vec4ub(finish_byte(c[0], p), finish_byte(c[1], p), finish_byte(c[2], p), wp.uint8(255)))
 
 
 @functools.cache
@@ -130,7 +140,7 @@ def exact_kernels(temporal: bool, hidden: int, gelu: str) -> tuple[Any, Any]:
     Returns:
         Two kernels over (tiles, 128, 128). Their inputs are `Stored`, hidden vecH [N, I + H + 2], output vec3
         [N, H + 1], `TimeState`, places int [N] (of each tile in `TimeState`) and tiles int [n]. Their output is
-        [n, 128, 128]: linear radiance as vec3, or 8-bit colour as vec4ub.
+        [n, 128, 128]: linear radiance as vec3, or 8-bit colour as uint32, RGBA from the lowest byte.
     """
     inputs = TEMPORAL_INPUTS if temporal else STATIC_INPUTS
     centred = 12 if temporal else 4
@@ -187,7 +197,7 @@ def exact_kernels(temporal: bool, hidden: int, gelu: str) -> tuple[Any, Any]:
 
         return decode
 
-    return decode_kernel(wp.vec3, finish_radiance), decode_kernel(wp.vec4ub, finish_bytes)
+    return decode_kernel(wp.vec3, finish_radiance), decode_kernel(wp.uint32, finish_bytes)
 
 
 @wp.kernel(enable_backward=False)
@@ -266,16 +276,6 @@ class StripKernels:
             device=device,
             block_dim=128,
         )
-
-
-@wp.func
-def pack(v: wp.vec4ub) -> wp.uint32:
-    return (
-        wp.uint32(v[0])
-        | wp.lshift(wp.uint32(v[1]), wp.uint32(8))
-        | wp.lshift(wp.uint32(v[2]), wp.uint32(16))
-        | wp.lshift(wp.uint32(v[3]), wp.uint32(24))
-    )
 
 
 @wp.func
@@ -437,9 +437,9 @@ def strip_kernels(hidden: int, gelu: str) -> StripKernels:
             y1 += colour * k1[c]
             y2 += colour * k2[c]
             y3 += colour * k3[c]
-        out[i, y, x] = pack(finish_bytes(time, place, y0))
-        out[i, y + 1, x] = pack(finish_bytes(time, place, y1))
-        out[i, y + 2, x] = pack(finish_bytes(time, place, y2))
-        out[i, y + 3, x] = pack(finish_bytes(time, place, y3))
+        out[i, y, x] = finish_bytes(time, place, y0)
+        out[i, y + 1, x] = finish_bytes(time, place, y1)
+        out[i, y + 2, x] = finish_bytes(time, place, y2)
+        out[i, y + 3, x] = finish_bytes(time, place, y3)
 
     return StripKernels(hidden, vec_hidden, frame_lines, decode)

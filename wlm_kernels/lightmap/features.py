@@ -116,8 +116,6 @@ class Batch:
     scale: wp.array2d[wp.vec3]  # [N, T] divisor of the colours at each time
     control: wp.array1d[int]  # [0] step
     slices: int  # S of F_uvt
-    turn: float  # gamma(t) is sine and cosine of turn tau and of 2 turn tau
-    between: float  # fraction of the samples at times between two stored ones
     gamma: float
     inverse_range: wp.array2d[float]  # [N, T] 1 / the squared range of radiance; 0 where there is none
     tracked: wp.array4d[float]  # [lanes, N, T, 2] sum and count of squared errors of radiance; empty: not tracked
@@ -135,94 +133,28 @@ def draw_state(batch: Batch, n: int, b: int, samples: int) -> wp.uint32:
 
 
 @wp.struct
-class Moment:
-    """The time of a sample: stored time k, or `share` of the way from it to the next."""
-
-    k: int
-    next: int
-    share: float
-    tau: float
-    encoding: wp.vec4
-
-
-@wp.func
-def stored_moment(batch: Batch, k: int) -> Moment:
-    m = Moment()
-    m.k = k
-    m.next = k
-    m.share = 0.0
-    m.tau = batch.tau[k]
-    m.encoding = batch.encoding[k]
-    return m
-
-
-@wp.func
-def moment_between(batch: Batch, k: int, share: float) -> Moment:
-    """A time between k and the next one; after the last comes the first where the axis is periodic."""
-    m = stored_moment(batch, k)
-    last = batch.tau.shape[0] - 1
-    if k < last or batch.periodic != 0:
-        m.next = wp.where(k < last, k + 1, 0)
-        m.share = share
-        gap = batch.tau[m.next] - m.tau
-        if gap < 0.0:
-            gap += 1.0
-        m.tau += share * gap
-        if m.tau >= 1.0 and batch.periodic != 0:
-            m.tau -= 1.0
-        a = batch.turn * m.tau
-        m.encoding = wp.vec4(wp.sin(a), wp.cos(a), wp.sin(2.0 * a), wp.cos(2.0 * a))
-    return m
-
-
-@wp.struct
 class Sample:
     """A random sample of a tile."""
 
     flat: int  # index of its texel
-    moment: Moment
+    k: int  # stored time
     state: wp.uint32  # of the generator, for what is drawn next
 
 
 @wp.func
 def draw_sample(batch: Batch, n: int, b: int, samples: int) -> Sample:
-    """Sample b of tile n at this step: a valid texel and a time."""
+    """Sample b of tile n at this step: a valid texel and a stored time."""
     state = draw_state(batch, n, b, samples)
     s = Sample()
     s.flat = batch.texels[n, wp.randi(state, 0, batch.texel_count[n])]
-    k = wp.randi(state, 0, batch.tau.shape[0])
-    s.moment = stored_moment(batch, k)
-    if batch.between > 0.0:  # without it nothing is drawn, so that the samples of such profiles stay the same
-        share = wp.randf(state)
-        if wp.randf(state) < batch.between:
-            s.moment = moment_between(batch, k, share)
+    s.k = wp.randi(state, 0, batch.tau.shape[0])
     s.state = state
     return s
 
 
 @wp.func
-def target_at(batch: Batch, n: int, m: Moment, flat: int) -> wp.vec3:
-    """The target of the network: at a time between two, their interpolated colours (eq. 2)."""
-    a = batch.targets[n, m.k, flat]
-    if m.share == 0.0:
-        return a
-    b = batch.targets[n, m.next, flat]
-    early = (1.0 - m.share) * batch.scale[n, m.k]
-    late = m.share * batch.scale[n, m.next]
-    colour = wp.cw_mul(batch.shift[n] + wp.cw_mul(batch.spread[n], a), early) + wp.cw_mul(
-        batch.shift[n] + wp.cw_mul(batch.spread[n], b), late
-    )
-    scale = early + late
-    y = wp.vec3()
-    for c in range(3):
-        if scale[c] > 0.0:
-            y[c] = (colour[c] / scale[c] - batch.shift[n][c]) / batch.spread[n][c]
-    return y
-
-
-@wp.func
-def texel_weight(batch: Batch, n: int, m: Moment, target: wp.vec3) -> wp.vec3:
-    weight = (1.0 - m.share) * batch.weight[n, m.k] + m.share * batch.weight[n, m.next]
+def texel_weight(batch: Batch, n: int, k: int, target: wp.vec3) -> wp.vec3:
+    weight = batch.weight[n, k]
     if batch.emphasis == 0.0:
         return weight
     colour = batch.shift[n] + wp.cw_mul(batch.spread[n], target)
@@ -248,9 +180,9 @@ def radiance_of(batch: Batch, n: int, k: int, y: wp.vec3) -> wp.vec3:
 
 
 @wp.func
-def track_error(batch: Batch, lane: int, n: int, m: Moment, target: wp.vec3, error: wp.vec3):
+def track_error(batch: Batch, lane: int, n: int, k: int, target: wp.vec3, error: wp.vec3):
     """Adds a sample's error as PSNR measures it, for progress reports alone."""
-    if batch.tracked.shape[0] > 0 and m.share == 0.0:
-        e = radiance_of(batch, n, m.k, target + error) - radiance_of(batch, n, m.k, target)
-        wp.atomic_add(batch.tracked, lane, n, m.k, 0, wp.dot(e, e) / 3.0 * batch.inverse_range[n, m.k])
-        wp.atomic_add(batch.tracked, lane, n, m.k, 1, 1.0)
+    if batch.tracked.shape[0] > 0:
+        e = radiance_of(batch, n, k, target + error) - radiance_of(batch, n, k, target)
+        wp.atomic_add(batch.tracked, lane, n, k, 0, wp.dot(e, e) / 3.0 * batch.inverse_range[n, k])
+        wp.atomic_add(batch.tracked, lane, n, k, 1, 1.0)

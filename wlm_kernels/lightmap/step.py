@@ -25,12 +25,10 @@ from wlm_kernels.lightmap.features import (
     TEMPORAL_INPUTS,
     Batch,
     Maps,
-    Moment,
     Offsets,
     Sample,
     draw_sample,
     plane_at,
-    target_at,
     texel_weight,
     track_error,
     volume_at,
@@ -128,7 +126,7 @@ def step_kernels(temporal: bool, hidden: int, gelu: str, device_kind: str) -> St
     units, columns_2 = net.hidden, inputs + 1
 
     @wp.func
-    def features(maps: Maps, batch: Batch, n: int, y: int, x: int, m: Moment, state: wp.uint32) -> vec_in:
+    def features(maps: Maps, batch: Batch, n: int, y: int, x: int, k: int, state: wp.uint32) -> vec_in:
         f = vec_in()
         uv = texel(maps.uv_endpoints, maps.uv_weights, n, y, x, batch.quantised)
         for c in range(4):
@@ -136,11 +134,11 @@ def step_kernels(temporal: bool, hidden: int, gelu: str, device_kind: str) -> St
         if wp.static(temporal):
             u = (float(x) + 0.5) / 128.0
             v = (float(y) + 0.5) / 128.0
-            tau = m.tau
+            tau = batch.tau[k]
             uvt = volume_at(maps, n, batch.slices, u, v, tau, batch.periodic, batch.quantised)
             ut = plane_at(maps.ut, n, u, tau, batch.periodic, batch.quantised)
             vt = plane_at(maps.vt, n, v, tau, batch.periodic, batch.quantised)
-            e = m.encoding
+            e = batch.encoding[k]
             for c in range(4):
                 f[4 + c] = uvt[c]
                 f[12 + c] = e[c]
@@ -171,7 +169,7 @@ def step_kernels(temporal: bool, hidden: int, gelu: str, device_kind: str) -> St
         if wp.static(temporal):
             u = (float(x) + 0.5) / 128.0
             v = (float(y) + 0.5) / 128.0
-            tau = sample.moment.tau
+            tau = batch.tau[sample.k]
             scatter_volume(
                 acc,
                 lane,
@@ -214,18 +212,18 @@ def step_kernels(temporal: bool, hidden: int, gelu: str, device_kind: str) -> St
         sample: Sample,
         samples: int,
     ) -> Pass:
-        m = sample.moment
-        f = features(maps, batch, n, sample.flat // 128, sample.flat % 128, m, sample.state)
+        k = sample.k
+        f = features(maps, batch, n, sample.flat // 128, sample.flat % 128, k, sample.state)
         a1 = first(hidden, n, f)
         g1 = gate(a1)
         h1 = wp.cw_mul(a1, g1)
         a2 = second(hidden, n, h1)
         g2 = gate(a2)
         h2 = wp.cw_mul(a2, g2)
-        target = target_at(batch, n, m, sample.flat)
+        target = batch.targets[n, k, sample.flat]
         error = third(output, n, h2) - target
-        track_error(batch, lane, n, m, target, error)
-        half = wp.cw_mul(texel_weight(batch, n, m, target), error) / (3.0 * float(samples))
+        track_error(batch, lane, n, k, target, error)
+        half = wp.cw_mul(texel_weight(batch, n, k, target), error) / (3.0 * float(samples))
         d3 = 2.0 * half
         reload()
         d2 = wp.cw_mul(back_output(output, n, d3), slope(a2, g2))
@@ -257,8 +255,8 @@ def step_kernels(temporal: bool, hidden: int, gelu: str, device_kind: str) -> St
         sample = draw_sample(batch, n, b, samples)
         y = sample.flat // 128
         x = sample.flat % 128
-        place[n, b] = wp.vec3i(y, x, sample.moment.k)
-        f[n, b] = features(maps, batch, n, y, x, sample.moment, sample.state)
+        place[n, b] = wp.vec3i(y, x, sample.k)
+        f[n, b] = features(maps, batch, n, y, x, sample.k, sample.state)
 
     if device_kind == "cpu":
 

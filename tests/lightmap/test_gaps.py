@@ -1,0 +1,110 @@
+"""Gaps between charts: which texels are filled, and from where, on every path that decodes a map."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from builders.checks import error_of
+from builders.synthetic import random_model
+
+import wlm
+from wlm.lightmap.decode import Decoder
+from wlm.lightmap.gaps import REACH, Gaps
+from wlm.texels import fill_gaps
+
+
+def _mask(seed: int = 0, shape: tuple[int, int] = (40, 50), share: float = 0.05) -> np.ndarray:
+    return np.random.default_rng(seed).random(shape) < share
+
+
+@pytest.mark.parametrize("share", [0.0, 0.005, 0.05, 0.5, 1.0])
+def test_each_takes_the_nearest_within_reach(share):
+    mask = _mask(share=share)
+    gaps, valid = Gaps.of(mask), np.argwhere(mask)
+    expected = set()
+    for at in np.argwhere(~mask):
+        if len(valid) and np.abs(valid - at).max(1).min() <= REACH:
+            expected.add(tuple(at))
+    assert {tuple(at) for at in gaps.target} == expected
+    for at, source in zip(gaps.target, gaps.source, strict=True):
+        assert mask[tuple(source)]
+        assert np.square(source - at).sum() == np.square(valid - at).sum(1).min()
+
+
+def test_they_are_filled_as_a_baker_dilates():
+    mask = _mask(3)
+    image = np.random.default_rng(1).random((40, 50, 3))
+    gaps, expected = Gaps.of(mask), fill_gaps(image, mask)
+    gaps.fill(image)
+    distance = [np.square(np.argwhere(mask) - at).sum(1) for at in gaps.target]
+    alone = np.array([(d == d.min()).sum() == 1 for d in distance])
+    assert alone.sum() > 100
+    where = tuple(gaps.target[alone].T)
+    np.testing.assert_array_equal(image[where], expected[where])
+
+
+@pytest.fixture(scope="module")
+def model():
+    mask = np.zeros((236, 247), bool)
+    mask[20:60, 30:128] = mask[100:180, 60:90] = mask[235, 246] = True
+    return random_model((3, 3, 2, 1), mask=mask)
+
+
+@pytest.mark.parametrize("time", [7.5, 10.0])
+def test_a_map_and_its_tiles_agree(model, time):
+    decoder = Decoder(model)
+    frame = decoder.frame(time)
+    raw = np.zeros((256, 256, 3), np.float32)
+    for number, light in enumerate(decoder.tiles(range(4), time)):
+        y, x = number // 2 * 128, number % 2 * 128
+        raw[y : y + 128, x : x + 128] = light
+    assert np.array_equal(frame[model.mask], raw[:236, :247][model.mask])
+    gaps = Gaps.of(model.mask)
+    assert np.array_equal(frame[tuple(gaps.target.T)], raw[tuple(gaps.source.T)])
+    crossing = (gaps.target // 128 != gaps.source // 128).any(1)
+    assert crossing.any()
+    for border in (0, 4):
+        tile = decoder.tile(0, time, border)
+        assert np.array_equal(tile[border:, border:], frame[: 128 + border, : 128 + border])
+        assert np.array_equal(tile[border, :border], tile[border, border : 2 * border][::-1]), "mirrored at the map's end"
+        last = decoder.tile(3, time, border)
+        seen = frame[128 - border :, 128 - border :]
+        assert np.array_equal(last[: seen.shape[0], : seen.shape[1]], seen)
+
+
+def test_eight_bits_follow(model):
+    decoder = Decoder(model)
+    for time in (7.5, 10.0):
+        pixels, bounds = decoder.frame_8bit(time)
+        held = np.repeat(np.repeat(bounds.reshape(2, 2), 128, 0), 128, 1)[:236, :247, None]
+        colour = np.minimum(decoder.frame(time) ** (1.0 / 2.2) / held, 1.0)
+        assert np.abs(pixels[..., :3] / 255.0 - colour).max() < 1.6 / 255.0
+        assert (pixels[..., 3] == 255).all()
+
+
+def test_the_file_holds_the_mask(model, tmp_path):
+    path = tmp_path / "m.wlm"
+    model.save(path)
+    assert np.array_equal(wlm.load(path).mask, model.mask)
+    whole = dataclasses.replace(model, mask=np.ones_like(model.mask))
+    whole.save(path)
+    assert wlm.load(path).mask.all()
+    assert not len(Gaps.of(whole.mask).target)
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [(b"x", "part mask: "), (b"", "part mask: "), (None, "part mask: expected 7287 bytes, compressed, found others")],
+)
+def test_a_wrong_mask_is_one_line(model, tmp_path, content, says):
+    import zlib
+
+    from wlm.formats.artifact import read_artifact, write_artifact
+
+    path = tmp_path / "m.wlm"
+    model.save(path)
+    artifact = read_artifact(path)
+    content = zlib.compress(bytes(7288)) if content is None else content
+    tensors = artifact.tensors | {"mask": np.frombuffer(content, np.uint8)}
+    write_artifact(tmp_path / "bad.wlm", "lightmap", artifact.settings, tensors, artifact.source)
+    assert says in error_of(lambda: wlm.load(tmp_path / "bad.wlm"))

@@ -1,0 +1,106 @@
+"""What follows a decode to 8 bits: two stored times are mixed in radiance, and gaps take the light of charts.
+
+Tiles are uint32 [n, 128 * 128], RGBA from the lowest byte, each with a bound of its own: radiance is
+(byte / 255 * bound) ** gamma.
+
+Read first: `wlm.lightmap.decode.Decoder.tiles_8bit` and `frame_8bit`, the same on the host.
+"""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def byte_at(word: wp.uint32, c: int) -> float:
+    return float(int(wp.rshift(word, wp.uint32(8 * c)) & wp.uint32(255)))
+
+
+@wp.func
+def with_byte(word: wp.uint32, c: int, share: float) -> wp.uint32:
+    """A word with channel c at a share of 255."""
+    return word | wp.lshift(wp.uint32(int(wp.clamp(share, 0.0, 1.0) * 255.0 + 0.5)), wp.uint32(8 * c))
+
+
+@wp.func
+def bound_of(inverse: float) -> float:
+    if inverse > 0.0:
+        return 1.0 / inverse
+    return 0.0
+
+
+@wp.kernel
+def _blend(
+    # in:
+    early: wp.array2d[wp.uint32],
+    late: wp.array2d[wp.uint32],
+    early_inverse: wp.array1d[float],
+    late_inverse: wp.array1d[float],
+    places: wp.array1d[int],
+    share: float,
+    gamma: float,
+    # out:
+    out: wp.array2d[wp.uint32],
+):
+    i, j = wp.tid()
+    place = places[i]
+    a = bound_of(early_inverse[place])
+    b = bound_of(late_inverse[place])
+    most = wp.max(a, b)
+    word = wp.lshift(wp.uint32(255), wp.uint32(24))
+    if most > 0.0:
+        for c in range(3):
+            x = wp.pow(byte_at(early[i, j], c) / 255.0 * a, gamma)
+            y = wp.pow(byte_at(late[i, j], c) / 255.0 * b, gamma)
+            word = with_byte(word, c, wp.pow((1.0 - share) * x + share * y, 1.0 / gamma) / most)
+    out[i, j] = word
+
+
+@wp.kernel
+def _fill(
+    # in:
+    target: wp.array1d[int],
+    source: wp.array1d[int],
+    bounds: wp.array1d[float],
+    # in and out:
+    out: wp.array1d[wp.uint32],
+):
+    g = wp.tid()
+    to = target[g]
+    come = source[g]
+    word = out[come]
+    a = bounds[come // 16384]
+    b = bounds[to // 16384]
+    if a != b and b > 0.0:
+        filled = wp.lshift(wp.uint32(255), wp.uint32(24))
+        for c in range(3):
+            filled = with_byte(filled, c, byte_at(word, c) / 255.0 * a / b)
+        word = filled
+    out[to] = word
+
+
+def blend(early, late, early_inverse, late_inverse, places, share: float, gamma: float, out) -> None:
+    """Mixes two decodes in radiance (neural-dynamic-gi, eq. 2).
+
+    Args:
+        early, late: uint32 [n, 128 * 128], the tiles at two stored times.
+        early_inverse, late_inverse: float [N_m], 1 / the bound of each mapped tile at those times; 0 for a black one.
+        places: int [n], the tiles' places among the mapped ones.
+        share: Of the later time, 0 to 1.
+        gamma: Of the colours.
+        out: uint32 [n, 128 * 128], written; its bound is the larger of the two.
+    """
+    inputs = [early, late, early_inverse, late_inverse, places, share, gamma]
+    wp.launch(_blend, out.shape, inputs=inputs, outputs=[out], device=out.device)
+
+
+def fill(target, source, bounds, out) -> None:
+    """Gives texels in gaps the light of others.
+
+    Args:
+        target: int [G], places in `out` of the texels that are filled.
+        source: int [G], those whose light they take; none is a target.
+        bounds: float [n], of each tile: where two differ, light beyond the target's is cut off.
+        out: uint32 [n * 128 * 128], changed.
+    """
+    wp.launch(_fill, target.shape, inputs=[target, source, bounds], outputs=[out], device=out.device)
