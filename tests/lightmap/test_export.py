@@ -19,6 +19,7 @@ from wlm.formats.exr import read_exr
 from wlm.lightmap.decode import Decoder
 from wlm.lightmap.exact import colour_tile64, decode_tile64
 from wlm.lightmap.exporter import export
+from wlm.lightmap.gaps import Gaps
 from wlm.lightmap.shader import decode_glsl
 
 TIMES = (7.5, 3.3, 21.7)  # stored, between, and across midnight (or past the end)
@@ -26,7 +27,8 @@ AXES = [
     {},
     {"period": None},
     {"time_axis": "paper", "gelu": "tanh"},
-    {"time_axis": "paper", "period": None, "times": (2.0, 7.5, 20.0)},
+    {"interpolation": "network"},
+    {"time_axis": "paper", "period": None, "times": (2.0, 7.5, 20.0), "interpolation": "network"},
 ]
 
 
@@ -92,6 +94,9 @@ def frame_from_files(folder, t):
     """The whole map in float64 from the exported files alone."""
     document = json.loads((folder / "weights.json").read_text())
     before, after, share, tau = place_in_time(document, t)
+    if document["interpolation"] == "radiance" and share > 0.0:
+        early, late = (frame_from_files(folder, document["times"][k]) for k in (before, after))
+        return (1.0 - share) * early + share * late
     height, width, columns = document["height"], document["width"], document["tile_columns"]
     image = np.zeros((-(-height // 128) * 128, columns * 128, 3))
 
@@ -125,9 +130,9 @@ def test_the_files_alone_give_the_decoders_light(settings, tmp_path):
     decoder = Decoder(model)
     np.testing.assert_array_equal(read_exr(tmp_path / "frame.exr")[0], decoder.frame(model.times[0]))
     for time in TIMES:
-        expected = decoder.frame(time)
+        expected, found = decoder.frame(time), frame_from_files(tmp_path, time)
         # float32 in the decoder, 9 digits in the file: 1e-6 of the brightest texel measured.
-        np.testing.assert_allclose(frame_from_files(tmp_path, time), expected, rtol=0, atol=1e-5 * expected.max())
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5 * expected.max())
 
 
 def test_other_decoders_read_the_textures(tmp_path):
@@ -137,7 +142,7 @@ def test_other_decoders_read_the_textures(tmp_path):
     assert sorted(names) == sorted(path.name for path in tmp_path.iterdir())
     parts = ["uv", "uvt", "ut", "vt"]
     stems = [f"tile_0000_{p}" for p in parts] + ["tile_0001_uv"] + [f"tile_0003_{p}" for p in parts]
-    assert names == [f"{stem}.dds" for stem in stems] + ["decode.glsl", "frame.exr", "weights.json"]
+    assert names == [f"{stem}.dds" for stem in stems] + ["decode.glsl", "frame.exr", "valid.png", "weights.json"]
     for place, number in enumerate((0, 1, 3)):
         with Image.open(tmp_path / f"tile_{number:04d}_uv.dds") as image:
             assert np.array_equal(np.asarray(image), decode_image(model.uv[place]))
@@ -214,7 +219,7 @@ using std::exp; using std::sin; using std::cos; using std::tanh; using std::abs;
 struct vec2 { double x, y; vec2(double x, double y) : x(x), y(y) {} };
 struct vec3 { double x, y, z; vec3(double x, double y, double z) : x(x), y(y), z(z) {} };
 struct vec4 { double x, y, z, w; };
-struct ivec2 { int x, y; };
+struct ivec2 { int x, y; ivec2(int x, int y) : x(x), y(y) {} };
 vec3 operator*(double s, vec3 a) { return vec3(s * a.x, s * a.y, s * a.z); }
 vec3 operator*(vec3 a, vec3 b) { return vec3(a.x * b.x, a.y * b.y, a.z * b.z); }
 vec3 operator+(vec3 a, vec3 b) { return vec3(a.x + b.x, a.y + b.y, a.z + b.z); }
@@ -250,12 +255,15 @@ typedef const texture& sampler2D;
 struct volume : texture {};
 typedef const volume& sampler3D;
 vec4 texelFetch(sampler2D s, ivec2 p, int) { return s.at(p.x, p.y, 0); }
+ivec2 textureSize(sampler2D s, int) { return ivec2(s.size[0], s.size[1]); }
 vec4 textureLod(sampler2D s, vec2 p, double) { double at[3] = {p.x, p.y, 0.5}; return s.sample(at, 1); }
 vec4 textureLod(sampler3D s, vec3 p, double) { double at[3] = {p.x, p.y, p.z}; return s.sample(at, 2); }
 std::vector<double> net;
 #define WLM_NET(i) net[i]
 #define float double
 #include "decode.glsl"
+"""
+DECODE = """
 int main()
 {
     int dynamic, offset, floats; double tau, c[9];
@@ -277,6 +285,29 @@ int main()
     }
 }
 """
+
+FILL = """
+int main()
+{
+    texture valid;
+    valid.read();
+    for (int y = 0; y < valid.size[1]; ++y) for (int x = 0; x < valid.size[0]; ++x) {
+        ivec2 found = wlm_source(valid, ivec2(x, y));
+        int out[2] = {found.y, found.x};
+        fwrite(out, 4, 2, stdout);
+    }
+}
+"""
+
+
+def compile_shader(folder, main):
+    """A program of the exported shader and a C++ function that calls it."""
+    source, program = folder / "run.cpp", folder / "run"
+    source.write_text(SHIM + main)
+    command = ["g++", "-O1", "-std=c++14", "-I", folder, "-o", program, source]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return program
 
 
 def run_shader(program, folder, number, time):
@@ -303,19 +334,27 @@ def run_shader(program, folder, number, time):
 @pytest.mark.skipif(shutil.which("g++") is None, reason="no C++ compiler is installed")
 @pytest.mark.parametrize("settings", [{"gelu": "exact"}, {"gelu": "tanh", "period": None}], ids=str)
 def test_the_shaders_arithmetic(settings, tmp_path):
-    model = random_model((2, 3, 1, 3), **settings)
-    folder = tmp_path / "export"
-    export(model, folder)
-    (tmp_path / "run.cpp").write_text(SHIM)
-    program = tmp_path / "run"
-    done = subprocess.run(
-        ["g++", "-O1", "-std=c++14", "-I", folder, "-o", program, tmp_path / "run.cpp"],
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stderr
+    model = random_model((2, 3, 1, 3), interpolation="network", **settings)
+    export(model, tmp_path / "export")
+    program, folder = compile_shader(tmp_path / "export", DECODE), tmp_path / "export"
     for number, time in ((0, 3.3), (1, 7.5), (3, 21.7)):
         colour, radiance = run_shader(program, folder, number, time)
         # The constants' 8 digits, the file's 9, and in the exact form erf's 1.5e-7: 1e-7 measured.
         np.testing.assert_allclose(colour, colour_tile64(model, number, time), rtol=0, atol=2e-6)
         np.testing.assert_allclose(radiance, decode_tile64(model, number, time), rtol=0, atol=1e-5)
+
+
+@pytest.mark.skipif(shutil.which("g++") is None, reason="no C++ compiler is installed")
+def test_the_shader_fills_gaps(tmp_path):
+    mask = np.random.default_rng(0).random((236, 247)) < 0.03
+    export(random_model(mask=mask), tmp_path)
+    with Image.open(tmp_path / "valid.png") as image:
+        valid = np.asarray(image).astype(np.float64)
+    data = struct.pack("<4i", 247, 236, 1, 2) + np.stack([valid, valid], 2).tobytes()
+    out = subprocess.run([compile_shader(tmp_path, FILL)], input=data, capture_output=True, check=True).stdout
+    found = np.frombuffer(out, np.int32).reshape(236, 247, 2)
+    assert np.array_equal(valid, mask)
+    expected = np.moveaxis(np.indices(mask.shape), 0, 2)
+    gaps = Gaps.of(mask)
+    expected[tuple(gaps.target.T)] = gaps.source
+    np.testing.assert_array_equal(found, expected)

@@ -66,7 +66,7 @@ def test_a_map_and_its_tiles_agree(model, time):
     for border in (0, 4):
         tile = decoder.tile(0, time, border)
         assert np.array_equal(tile[border:, border:], frame[: 128 + border, : 128 + border])
-        assert np.array_equal(tile[border, :border], tile[border, border : 2 * border][::-1]), "mirrored at the map's end"
+        assert np.array_equal(tile[border, :border], tile[border, border : 2 * border][::-1])  # mirrored there
         last = decoder.tile(3, time, border)
         seen = frame[128 - border :, 128 - border :]
         assert np.array_equal(last[: seen.shape[0], : seen.shape[1]], seen)

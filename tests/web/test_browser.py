@@ -49,7 +49,7 @@ def lightmaps():
     frames[:, :128, 128:] = small_sets.static_light().frames / 24.0
     frames[:, 128:, :128] = (1.0 + np.arange(5.0))[:, None, None, None] / 5.0
     mask = np.ones((256, 256), bool)
-    mask[128:, 128:] = False
+    mask[128:, 128:] = mask[50:60, 90:200] = mask[::16, ::8] = False
     return from_arrays(frames, small_sets.HOURS, mask, 24.0, name="four tiles")
 
 

@@ -19,7 +19,7 @@ from wlm.system import Header, Name
 _ROUNDING = 2e-7  # relative, of stored times
 _TIMES = Part((np.float32, np.float64), (None,))
 _MASK = Part(np.uint8, (None,))
-# What files of before the setting `interpolation` were made with.
+# What files that don't state it were made with, and a setting of the fit that is no more.
 _OLD_PROFILE = {"interpolation": "network"}
 _OLD_SETTINGS = ("between",)
 
@@ -39,7 +39,7 @@ def encode(model: LightmapModel) -> tuple[dict[str, Any], dict[str, np.ndarray],
         "name": model.name,
         "size": [model.width, model.height],
         "period": model.period,
-        "profile": model.profile.changes() | {"interpolation": model.profile.interpolation},
+        "profile": _dated(model.profile),
     }
     parts = {name: value for name, value in model.parts.items() if value.size}
     if not model.mask.all():
@@ -80,6 +80,14 @@ def decode(artifact: Artifact) -> LightmapModel:
         times=times,
         **check_parts(others, part_table(header.profile, kind, len(times))),
     )
+
+
+def _dated(profile: Profile) -> dict[str, Any]:
+    """Settings for a file: those that differ from the defaults, and `interpolation`, whose default was "network"."""
+    changes = profile.changes()
+    if changes.pop("interpolation", None) is None:
+        changes["interpolation"] = profile.interpolation
+    return changes
 
 
 def _renewed(settings: dict[str, Any]) -> dict[str, Any]:

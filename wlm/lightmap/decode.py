@@ -48,7 +48,7 @@ class Decoder:
                 kernels = lightmap_decode.exact_kernels(kind == TileKind.DYNAMIC, model.profile.hidden, self.gelu)
                 self._groups.append((tiles, kernels))
         self._constants = {int(tile): i for i, tile in enumerate(np.flatnonzero(model.kind == TileKind.CONSTANT))}
-        self._gaps = gaps_of(model)
+        self._gaps = Gaps.of(model.mask)
 
     @property
     def device_bytes(self) -> int:
@@ -206,13 +206,6 @@ def rgba(words: wp.array) -> np.ndarray:
     """Words of a decode to 8 bits, uint32 [...], on the host as uint8 [..., 4]."""
     host = np.ascontiguousarray(words.numpy().astype("<u4"))
     return host.view(np.uint8).reshape(*host.shape, 4)
-
-
-def gaps_of(model: LightmapModel) -> Gaps:
-    """The gaps that are filled from the tiles that a model holds."""
-    held = (model.kind != TileKind.EMPTY).reshape(-1, model.tile_columns)
-    held = held.repeat(TILE, 0).repeat(TILE, 1)[: model.height, : model.width]
-    return Gaps.of(model.mask & held)
 
 
 def gelu_of(model: LightmapModel, gelu: str | None) -> str:

@@ -26,6 +26,7 @@ _VERSION = 1
 WEIGHTS_FILE = "weights.json"
 SHADER_FILE = "decode.glsl"
 FRAME_FILE = "frame.exr"
+VALID_FILE = "valid.png"
 
 _TEXTURE = re.compile(r"tile_\d{4,}_(uv|uvt|ut|vt)\.dds")
 _CENTRED_DYNAMIC, _CENTRED_STATIC = 12, 4  # inputs that come from textures; the encoded time is not centred
@@ -34,6 +35,8 @@ _ABOUT = {
     "tiles": "Tiles of tile_size texels at (column, row) of the grid. A tile that is not listed is empty: 0.",
     "time": "Wrap t modulo the period (without one clamp it to the stored times) and find the stored times around it; "
     "with a period the last and the first are neighbours. share is where t lies between the two, 0 to 1.",
+    "interpolation": "Of light between two stored times. radiance: decode both and mix their linear radiance by share "
+    "(eq. 2). network: decode once, with tau and scale interpolated.",
     "tau": "Place on the textures' time axis: tau[i] of stored time i. Between two, tau[i] + share * (step), the step "
     "to the next one; for the rule 'frames' it is 1/T, and tau is taken modulo 1 if time_axis.repeats. For the rule "
     "'paper' with a period tau is t / period.",
@@ -54,8 +57,9 @@ def export(model: LightmapModel, directory: str | os.PathLike[str], *, device: s
     For tile N of the grid, with four digits: `tile_N_uv.dds`, F_uv in BC7, and of a dynamic tile also
     `tile_N_uvt.dds`, F_uvt as a BC7 volume whose depth is time, and `tile_N_ut.dds` and `tile_N_vt.dds`,
     F_ut and F_vt in R8G8_UNORM with time down the rows (neural-dynamic-gi, Table 1). The blocks are the model's
-    own bytes. `decode.glsl` is the decoder; `frame.exr` is the map at the first stored time, as the shader should
-    show it; `weights.json` explains itself under "about".
+    own bytes. `decode.glsl` is the decoder; `valid.png` is white inside charts, for the pass that fills the gaps;
+    `frame.exr` is the map at the first stored time, as the shader should show it; `weights.json` explains itself under
+    "about".
 
     The files are written beside the folder and moved in together, `weights.json` last. An earlier export is replaced,
     and textures of tiles that are no longer there are removed; other files stay.
@@ -87,8 +91,9 @@ def export(model: LightmapModel, directory: str | os.PathLike[str], *, device: s
             written += _write_maps(staging, number, model, place, row)
         (staging / SHADER_FILE).write_bytes(decode_glsl(model).encode())
         write_exr(staging / FRAME_FILE, frame, half=False)
+        Image.fromarray(model.mask).save(staging / VALID_FILE)
         (staging / WEIGHTS_FILE).write_bytes(text.encode())
-        written += [staging / name for name in (SHADER_FILE, FRAME_FILE, WEIGHTS_FILE)]
+        written += [staging / name for name in (SHADER_FILE, FRAME_FILE, VALID_FILE, WEIGHTS_FILE)]
     return [folder / path.name for path in written]
 
 
@@ -191,6 +196,7 @@ def document(model: LightmapModel) -> dict[str, Any]:
         "gelu": "exact" if profile.gelu == "exact" else "tanh",
         "network_floats": floats,
         "times": model.times.tolist(),
+        "interpolation": profile.interpolation,
         "period": model.period,
         "time_axis": {"rule": axis.kind, "repeats": axis.periodic},
         "tau": rounded(encode_time(axis)[0]),

@@ -10,7 +10,8 @@ import numpy as np
 import warp as wp
 
 from wlm import interop
-from wlm.lightmap.decode import StoredTiles, TimeTable, gaps_of, gelu_of, rgba
+from wlm.lightmap.decode import StoredTiles, TimeTable, gelu_of, rgba
+from wlm.lightmap.gaps import Gaps
 from wlm.lightmap.model import TILE, LightmapModel
 from wlm.lightmap.tiles import TileKind
 from wlm_kernels.lightmap import decode as lightmap_decode
@@ -37,7 +38,7 @@ class _TileDecoder:
 
     def _gaps(self) -> tuple[wp.array, wp.array]:
         """Places in `out` of the texels that are filled, and of those whose light they take."""
-        gaps, columns = gaps_of(self.model), self.model.tile_columns
+        gaps, columns = Gaps.of(self.model.mask), self.model.tile_columns
         row = np.full(len(self.model.kind), -1)
         row[self.numbers] = np.arange(len(self.numbers))
 

@@ -1,5 +1,6 @@
 """The GLSL that decodes an exported lightmap; `wlm.lightmap.exporter` writes it beside the textures."""
 
+from wlm.lightmap.gaps import REACH
 from wlm.lightmap.model import LightmapModel
 from wlm_kernels.lightmap.features import STATIC_INPUTS, TEMPORAL_INPUTS
 
@@ -32,9 +33,10 @@ _TEMPLATE = """\
 // (Neural Dynamic GI, sections 3.2 to 3.4). For GLSL 4.30 and later, with or without Vulkan; include it below #version.
 //
 // weights.json has everything else; see "about" there. What the caller does once a frame, for the time t:
-//   tau      from "tau", which belongs to "times": linear between the stored times around t;
-//   scale    of each tile, from its "scale": linear likewise;
-//   bound    of each tile, from its "peak": the larger of the two, if colour is to be kept in 8 bits.
+{frame}//
+// Gaps. A bilinear read at a chart's edge takes in texels outside it, which are decoded to anything. Once all tiles are
+// in a texture of linear radiance, a pass over it gives each texel the light of the texel wlm_source(f_valid, texel);
+// f_valid is valid.png, R8, {width} x {height}, white inside charts.
 //
 // Textures. u runs along x and v along y, row 0 is v = 0. Filters are linear, without mip levels; u and v clamp to the
 // edge; the axis of time (z of F_uvt, y of F_ut and F_vt) {wrap}. At texel centres the
@@ -142,12 +144,47 @@ vec3 wlm_decode_static(sampler2D f_uv, ivec2 texel, int offset, vec3 scale, vec3
     return wlm_finish(wlm_network(f, WLM_STATIC_INPUTS, offset), scale, shift, spread);
 }}
 
+// The texel whose light a texel of the map shows: itself inside a chart; in a gap the nearest inside within {reach}
+// texels, in reading order of several as near; beyond that itself.
+ivec2 wlm_source(sampler2D f_valid, ivec2 texel)
+{{
+    if (texelFetch(f_valid, texel, 0).x > 0.5)
+        return texel;
+    ivec2 size = textureSize(f_valid, 0);
+    ivec2 found = texel;
+    int least = {beyond};
+    for (int y = -{reach}; y <= {reach}; ++y)
+        for (int x = -{reach}; x <= {reach}; ++x) {{
+            ivec2 at = ivec2(texel.x + x, texel.y + y);
+            if (x * x + y * y < least && at.x >= 0 && at.y >= 0 && at.x < size.x && at.y < size.y
+                && texelFetch(f_valid, at, 0).x > 0.5) {{
+                least = x * x + y * y;
+                found = at;
+            }}
+        }}
+    return found;
+}}
+
 // Linear radiance of a colour in gamma space.
 vec3 wlm_radiance(vec3 colour)
 {{
     return pow(colour, vec3(WLM_GAMMA, WLM_GAMMA, WLM_GAMMA));
 }}
 """
+
+
+_FRAME = {
+    "radiance": """\
+//   t lies between two stored times: decode each with its own "tau", "scale" and "peak" and mix their radiance (eq. 2);
+//   a cache that keeps both is decoded again only when t passes a stored time;
+//   bound    of each tile, from its "peak", if colour is to be kept in 8 bits.
+""",
+    "network": """\
+//   tau      from "tau", which belongs to "times": linear between the stored times around t;
+//   scale    of each tile, from its "scale": linear likewise;
+//   bound    of each tile, from its "peak": the larger of the two, if colour is to be kept in 8 bits.
+""",
+}
 
 
 def decode_glsl(model: LightmapModel) -> str:
@@ -163,6 +200,11 @@ def decode_glsl(model: LightmapModel) -> str:
     periodic = model.axis.periodic
     # repr gives the shortest decimals that are the number again, and always a point or an exponent.
     return _TEMPLATE.format(
+        frame=_FRAME[profile.interpolation],
+        width=model.width,
+        height=model.height,
+        reach=REACH,
+        beyond=2 * REACH * REACH + 1,
         wrap="repeats" if periodic else "clamps to the edge",
         resolution=profile.uvt_resolution,
         slices=profile.uvt_slices,

@@ -19,6 +19,7 @@ from wlm.lightmap.tiles import TileKind
 from wlm.texels import exposure, fill_gaps
 from wlm.web.page import Page, pack_rgb9e5, pack_triangles
 
+_TIMES = ("times", "period", "interpolation", "time_axis", "tau", "tiles")
 _LAYERS = ("W1", "b1", "W2", "b2", "W3", "b3")
 
 
@@ -45,7 +46,10 @@ def lightmap_page(
     networks = [
         np.concatenate([np.ravel(tile.pop(layer)) for layer in _LAYERS]) for tile in described["tiles"] if "W1" in tile
     ]
-    arrays: dict[str, np.ndarray] = {"networks": np.concatenate(networks or [np.zeros(0)]).astype(np.float32)}
+    arrays: dict[str, np.ndarray] = {
+        "networks": np.concatenate(networks or [np.zeros(0)]).astype(np.float32),
+        "valid": np.packbits(model.mask),
+    }
     dynamic = np.flatnonzero(model.kind == TileKind.DYNAMIC).tolist()
     for place, number in enumerate(model.mapped.tolist()):
         arrays[f"{number}_uv"] = model.uv[place]
@@ -60,7 +64,7 @@ def lightmap_page(
         "shader": decode_glsl(model),
         "exposure": exposure(Decoder(model).frame(time)),
         "time": time,
-        "lightmap": {name: described[name] for name in ("times", "period", "time_axis", "tau", "tiles")}
+        "lightmap": {name: described[name] for name in _TIMES}
         | {
             "maps": {
                 "resolution": profile.uvt_resolution,

@@ -1,4 +1,4 @@
-// Lightmaps over the day: the exported shader decodes tiles into a texture at each change of the hour.
+// Lightmaps over the day: the exported shader decodes stored hours into textures, which are mixed between two hours.
 
 const MAIN_DYNAMIC = `
 uniform sampler2D u_uv, u_ut, u_vt;
@@ -25,10 +25,18 @@ void main()
     ivec2 texel = ivec2(gl_FragCoord.xy) - u_origin;
     radiance = vec4(wlm_radiance(wlm_decode_static(u_uv, texel, u_offset, u_scale, u_shift, u_spread)), 1.0);
 }`;
+const MAIN_FILL = `
+uniform sampler2D u_map, u_valid;
+out vec4 radiance;
+void main() { radiance = texelFetch(u_map, wlm_source(u_valid, ivec2(gl_FragCoord.xy)), 0); }`;
 const READ_NETWORK = `
 uniform sampler2D u_network;
 #define WLM_NET(i) texelFetch(u_network, ivec2((i) & 1023, (i) >> 10), 0).r
 `;
+const MIXED = `
+uniform sampler2D u_early, u_late;
+uniform float u_share;
+vec3 wlm_light() { return mix(texture(u_early, v_uv).rgb, texture(u_late, v_uv).rgb, u_share); }`;
 const LONG_FRAME = 40, SHORT_FRAME = 25;  // milliseconds between two pictures
 
 // Where a time lies between the stored ones: their numbers, the share of the later one, and tau.
@@ -63,11 +71,16 @@ class LightmapPage {
     this.programs = {
       dynamic: kinds.has('dynamic') && shader(MAIN_DYNAMIC),
       static: kinds.has('static') && shader(MAIN_STATIC),
+      fill: shader(MAIN_FILL),
     };
+    this.valid = this.#mask(page.array('valid', Uint8Array));
     this.tiles = lightmap.tiles.map((tile) => this.#upload(tile));
     const texture = () => graphics.target(manifest.width, manifest.height, graphics.half(), gl.LINEAR);
-    // An hour is seen when it is whole; until the first is, its tiles appear one by one.
-    [this.seen, this.next] = [texture(), texture()];
+    // An hour is decoded into `next`, and kept in one of two maps when it is whole; until the first is, its tiles
+    // appear one by one. What is seen are one or two of the maps, the later one by its share.
+    this.next = texture();
+    this.maps = [texture(), texture()];
+    this.seen = [];
     this.batch = 1;
     this.waiting = [];
     const first = lightmap.times[0], last = lightmap.period ?? lightmap.times.at(-1);
@@ -84,7 +97,7 @@ class LightmapPage {
     });
     this.display = new Display(page, panel, changed);
     this.surface = new Surface(
-      graphics, page, 'uniform sampler2D u_light;\nvec3 wlm_light() { return texture(u_light, v_uv).rgb; }',
+      graphics, page, MIXED,
       this.display, panel, changed);
     this.originals = new Originals(graphics, page);
   }
@@ -109,6 +122,13 @@ class LightmapPage {
     return {...tile, textures};
   }
 
+  // Valid texels from one bit each, the first the highest of its byte.
+  #mask(bits) {
+    const {graphics, manifest: {width, height}} = this, {gl} = graphics, texels = new Uint8Array(width * height);
+    for (let i = 0; i < texels.length; ++i) texels[i] = bits[i >> 3] >> (7 - (i & 7)) & 1 ? 255 : 0;
+    return graphics.plain(width, height, [gl.R8, gl.RED, gl.UNSIGNED_BYTE], texels, gl.NEAREST);
+  }
+
   #decode(tile, now) {
     const {graphics, next} = this, {gl} = graphics, origin = [128 * tile.column, 128 * tile.row];
     gl.bindFramebuffer(gl.FRAMEBUFFER, next.buffer);
@@ -130,25 +150,52 @@ class LightmapPage {
     graphics.draw(3);
   }
 
-  // Decodes some tiles of the wanted hour; returns whether it did.
+  // What is decoded for a time: one or two stored times, or, where the network interpolates, the time itself.
+  #reads(time) {
+    const {lightmap} = this, now = place(lightmap, time);
+    if (lightmap.interpolation === 'network') return [{...now, key: time, weight: 1}];
+    const stored = (k, weight) => ({before: k, after: k, share: 0, tau: lightmap.tau[k], key: k, weight});
+    return [stored(now.before, 1 - now.share), stored(now.after, now.share)].filter((read) => read.weight > 0);
+  }
+
+  #map(read) { return this.maps.find((map) => map.key === read.key); }
+
+  // Decodes some tiles of a wanted hour; returns whether it did.
   work(elapsed) {
+    const reads = this.#reads(this.time), missing = reads.find((read) => !this.#map(read));
     if (!this.waiting.length) {
-      if (this.asked === this.time) return false;
-      this.asked = this.time;
+      if (!missing) {
+        const changed = this.shown !== this.time;
+        [this.seen, this.shown] = [reads, this.time];
+        return changed;
+      }
+      this.asked = missing;
       this.waiting = [...this.tiles];
       this.began = performance.now();
     }
     // As many tiles between two pictures as leave the page responsive.
     if (elapsed > LONG_FRAME) this.batch = Math.max(Math.floor(this.batch / 2), 1);
     else if (elapsed < SHORT_FRAME) this.batch = Math.min(2 * this.batch, this.tiles.length);
-    const now = place(this.lightmap, this.asked);
-    for (const tile of this.waiting.splice(0, this.batch)) this.#decode(tile, now);
+    for (const tile of this.waiting.splice(0, this.batch)) this.#decode(tile, this.asked);
     if (this.waiting.length) return true;
-    this.graphics.read(this.next, 1, 1);
+    this.#keep(this.asked, reads);
     this.panel.figure('decoded in', `${(performance.now() - this.began).toFixed(0)} ms`);
-    [this.seen, this.next] = [this.next, this.seen];
-    this.shown = this.asked;
     return true;
+  }
+
+  // Fills the gaps of the hour that is whole, in the map that is wanted least.
+  #keep(read, wanted) {
+    const {graphics, maps, manifest} = this, {gl} = graphics;
+    const map = maps.find(({key}) => !wanted.some((other) => other.key === key)) ?? maps[0];
+    gl.bindFramebuffer(gl.FRAMEBUFFER, map.buffer);
+    gl.disable(gl.DEPTH_TEST);
+    gl.viewport(0, 0, manifest.width, manifest.height);
+    graphics.use(this.programs.fill, {u_map: this.next, u_valid: this.valid});
+    graphics.draw(3);
+    graphics.read(map, 1, 1);
+    map.key = read.key;
+    // Alone until the other one is there.
+    if (!this.seen.length || !this.seen.every((other) => this.#map(other))) this.seen = [{...read, weight: 1}];
   }
 
   advance(elapsed) {
@@ -165,13 +212,19 @@ class LightmapPage {
       this.setTime(this.originals.times[index]);
     }
     const original = this.display.compares ? this.originals.get(index) : undefined;
-    this.surface.draw({u_light: this.shown === undefined ? this.next : this.seen}, original);
+    const [early, late] = this.seen.map((read) => this.#map(read));
+    this.surface.draw({
+      u_early: early ?? this.next, u_late: late ?? early ?? this.next, u_share: late ? this.seen[1].weight : 0,
+    }, original);
   }
 
   // For scripts: radiance of the whole map at an hour, RGBA by rows.
   async read(time) {
     this.setTime(time);
     while (this.shown !== this.time || this.waiting.length) await new Promise(requestAnimationFrame);
-    return this.graphics.read(this.seen);
+    const maps = this.seen.map((read) => this.graphics.read(this.#map(read)));
+    if (maps.length === 1) return maps[0];
+    const share = this.seen[1].weight;
+    return maps[0].map((value, i) => mix(value, maps[1][i], share));
   }
 }
