@@ -8,8 +8,8 @@ from builders.checks import assert_same
 from builders.synthetic import random_model
 
 import wlm
-from wlm.formats.artifact import read_artifact
 from wlm.lightmap.model import LightmapModel, Profile
+from wlm.lightmap.packing import PACKED
 
 ARRAYS = [field.name for field in dataclasses.fields(LightmapModel) if field.type is np.ndarray]
 
@@ -41,13 +41,12 @@ def test_the_size_is_the_arithmetic_of_table_3(tmp_path, kind):
     sizes = {"hidden": 16, "uvt_resolution": 32, "uvt_slices": 12}
     times = tuple(float(hour) for hour in range(24))
     tiles = 16
-    size = random_model((kind,) * tiles, columns=4, times=times, **sizes).save(tmp_path / "a.wlm")
+    model = random_model((kind,) * tiles, columns=4, times=times, **sizes)
     profile = Profile(name="", **sizes)
-    # Scale (codes, or half floats of static tiles) and codes of the bound, shift and spread in half float, the kind.
-    scales = len(times) * (3 * (1 if kind == 3 else 2) + 1) + 2 * 3 * 2 + 1
-    header = size - tiles * (profile.tile_bytes(kind == 3) + scales) - 4 * len(times)
-    assert 0 < header <= 1024 * tiles
-    assert header == read_artifact(tmp_path / "a.wlm").header_bytes
+    assert sum(getattr(model, name).nbytes for name in PACKED) == tiles * profile.tile_bytes(kind == 3)
+    # Noise hardly deflates: the file is as large but for some bytes of a stream, and the bits that say the mode.
+    size = model.save(tmp_path / "a.wlm")
+    assert 0.93 < size / (tiles * profile.tile_bytes(kind == 3)) < 1.02
     # Table 3 of the paper: 34 KiB of maps for profile M, and 16 KiB for F_uv alone.
     model = random_model((kind, kind), **sizes)
     networks = (model.net if kind == 3 else model.net_static).nbytes // 2

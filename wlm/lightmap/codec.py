@@ -13,6 +13,7 @@ from wlm.config import check_settings
 from wlm.formats.artifact import Artifact
 from wlm.formats.parts import Part, check_part, check_parts
 from wlm.lightmap.model import LightmapModel, Profile, part_table
+from wlm.lightmap.packing import PACKED, SIZES, TILES, pack_tiles, unpack_tiles
 from wlm.lightmap.tiles import TileGrid, TileKind
 from wlm.system import Header, Name
 
@@ -41,7 +42,10 @@ def encode(model: LightmapModel) -> tuple[dict[str, Any], dict[str, np.ndarray],
         "period": model.period,
         "profile": _dated(model.profile),
     }
-    parts = {name: value for name, value in model.parts.items() if value.size}
+    plain = {name: value for name, value in model.parts.items() if name not in PACKED}
+    parts = {name: value for name, value in plain.items() if value.size}
+    if len(model.mapped):
+        parts |= pack_tiles(model.parts, model.kind, model.mask)
     if not model.mask.all():
         parts["mask"] = np.frombuffer(zlib.compress(np.packbits(model.mask).tobytes(), 9), np.uint8)
     return settings, parts | {"times": _shortened(model.times)}, model.source
@@ -67,7 +71,13 @@ def decode(artifact: Artifact) -> LightmapModel:
     kind = check_part(tensors, "kind", tiles)
     times = check_part(tensors, "times", _TIMES).astype(np.float64)
     _check_times(times.tolist(), header.period)
+    mask = _mask(tensors, height, width)
     others = {name: part for name, part in tensors.items() if name not in ("kind", "times", "mask")}
+    table = part_table(header.profile, kind, len(times))
+    if "tiles" in others:
+        packed = check_part(others, "tiles", TILES), check_part(others, "sizes", SIZES)
+        del others["tiles"], others["sizes"]
+        others |= unpack_tiles(*packed, table, kind, mask)
     return LightmapModel(
         name=header.name,
         width=width,
@@ -75,10 +85,10 @@ def decode(artifact: Artifact) -> LightmapModel:
         period=header.period,
         source=artifact.source,
         profile=header.profile,
-        mask=_mask(tensors, height, width),
+        mask=mask,
         kind=kind,
         times=times,
-        **check_parts(others, part_table(header.profile, kind, len(times))),
+        **check_parts(others, table),
     )
 
 

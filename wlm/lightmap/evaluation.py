@@ -8,9 +8,11 @@ import numpy as np
 
 from wlm import interop
 from wlm.errors import WlmError
+from wlm.lightmap.codec import encode
 from wlm.lightmap.data import LightmapSet
 from wlm.lightmap.decode import Decoder
 from wlm.lightmap.model import TILE, LightmapModel
+from wlm.lightmap.packing import STREAMS
 from wlm.lightmap.tiles import TileGrid, TileKind
 from wlm.metrics import METRICS, FrameMetrics, LostLight, Summary, evaluate_frame, summarise
 from wlm.system import Meter, OnProgress
@@ -203,12 +205,17 @@ def count_kinds(model: LightmapModel) -> dict[str, int]:
 
 
 def part_bytes(model: LightmapModel, file_bytes: int) -> dict[str, int]:
-    """Bytes of a model's file by part, the largest first; `header` is the rest: the header and the times.
+    """Bytes of a model's file by part, the largest first; `header` is the rest: the header and the sizes of streams.
+
+    What is packed by tile is told by stream, see `wlm.lightmap.packing`.
 
     Raises:
         ValueError: `file_bytes` is less than the parts take.
     """
-    parts = {name: value.nbytes for name, value in model.parts.items()}
+    stored = encode(model)[1]
+    parts = {name: value.nbytes for name, value in stored.items() if name not in ("tiles", "sizes")}
+    if "sizes" in stored:
+        parts |= zip(STREAMS, stored["sizes"].sum(0, dtype=int).tolist(), strict=True)
     parts["header"] = file_bytes - sum(parts.values())
     if parts["header"] < 0:
         raise ValueError(f"file_bytes: expected at least {file_bytes - parts['header']}, got {file_bytes}")

@@ -12,6 +12,7 @@ from wlm.formats.checkpoint import EVERY, Checkpoint
 from wlm.formats.parts import Part
 from wlm.lightmap.data import LightmapSet
 from wlm.lightmap.model import LightmapModel, Profile, encode_scale, part_table
+from wlm.lightmap.packing import clear_unused
 from wlm.lightmap.tiles import TILE, TileGrid, TileKind, channel_means, classify, split
 from wlm.lightmap.trainer import Targets, Trainer
 from wlm.system import Meter, OnProgress
@@ -233,7 +234,8 @@ class _Fit:
 
     def store(self, batch: _Batch, parts: dict[str, np.ndarray]) -> None:
         """Puts the maps and networks of a batch into the model."""
-        self.model.uv[np.searchsorted(self._mapped, batch.rows)] = parts["uv"]
+        for row, blocks in zip(batch.rows, parts["uv"], strict=True):
+            self.model.uv[np.searchsorted(self._mapped, row)] = clear_unused(blocks, self.data.mask[row])
         for name in parts.keys() - {"uv"}:
             target = "net_static" if batch.kind == TileKind.STATIC else name
             getattr(self.model, target)[batch.first : batch.first + len(batch.rows)] = parts[name]
