@@ -4,6 +4,8 @@ import dataclasses
 
 import numpy as np
 import pytest
+import torch
+from builders import small_sets
 from builders.checks import assert_same, error_of
 from builders.synthetic import random_model
 
@@ -13,6 +15,7 @@ from wlm.formats.bc7 import decode_image
 from wlm.lightmap.decode import Decoder
 from wlm.lightmap.evaluation import part_bytes
 from wlm.lightmap.packing import STREAMS, clear_unused
+from wlm.lightmap.weights import put_on_levels
 
 
 def _mask(seed: int = 0) -> np.ndarray:
@@ -109,3 +112,48 @@ def test_a_stream_of_another_length_is_one_line(tmp_path):
     assert "expected 8448 bytes, deflated" in replaced(bytes(10))
     assert "expected 8448 bytes, deflated" in replaced(bytes(1 << 24))
     assert "uv indices: expected 8192 bytes, deflated" in replaced(bytes(8448))
+
+
+def _on_levels(model):
+    """The model with networks on 8-bit levels."""
+    profile, nets = model.profile, {}
+    for name, temporal in (("net", True), ("net_static", False)):
+        inputs, width = profile.inputs(temporal), profile.hidden
+        values = torch.from_numpy(getattr(model, name).astype(np.float32))
+        split = (inputs + width + 2) * width
+        parts = values[:, :split].reshape(-1, inputs + width + 2, width), values[:, split:].reshape(-1, width + 1, 3)
+        nets[name] = (
+            torch.cat([part.flatten(1) for part in put_on_levels(*parts, inputs)], 1).numpy().astype(np.float16)
+        )
+    return dataclasses.replace(model, profile=profile.override({"net_bits": 8}), **nets)
+
+
+@pytest.mark.parametrize("factor", [1.0, 1e-6, 1e4, 0.0])
+def test_networks_of_bytes_come_back(tmp_path, factor):
+    model = random_model((3, 2, 3, 2), hidden=17)
+    nets = {name: (getattr(model, name) * np.float16(factor)).astype(np.float16) for name in ("net", "net_static")}
+    other = _on_levels(dataclasses.replace(model, **nets))
+    size = other.save(tmp_path / "a.wlm")
+    assert_same(wlm.load(tmp_path / "a.wlm"), other)
+    if factor == 1.0:
+        assert part_bytes(other, size)["net"] < 0.65 * part_bytes(model, model.file_bytes())["net"]
+        apart = np.abs(other.net.astype(float) - model.net).max() / np.abs(model.net).max()
+        assert 0 < apart < 0.5 / 127 + 1e-3
+
+
+def test_networks_off_their_levels_are_one_line(tmp_path):
+    model = random_model((3, 0))
+    wrong = dataclasses.replace(model, profile=model.profile.override({"net_bits": 8}))
+    assert "net: expected weights on 8-bit levels" in error_of(wrong.save, tmp_path / "a.wlm")
+
+
+def test_a_fit_on_levels_is_what_its_file_decodes_to(tmp_path):
+    profile = small_sets.tiny_profile(net_bits=8, steps=60)
+    lightmaps = small_sets.moving_light()
+    model = wlm.lightmap.compress(lightmaps, profile)
+    model.save(tmp_path / "a.wlm")
+    assert_same(wlm.load(tmp_path / "a.wlm"), model)
+    plain = wlm.lightmap.compress(lightmaps, small_sets.tiny_profile(steps=60))
+    scores = [wlm.lightmap.evaluate(each, lightmaps, metrics=["psnr"]).psnr for each in (model, plain)]
+    assert abs(scores[0] - scores[1]) < 2.0
+    assert not np.array_equal(model.net, plain.net)

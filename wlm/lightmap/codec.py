@@ -45,7 +45,7 @@ def encode(model: LightmapModel) -> tuple[dict[str, Any], dict[str, np.ndarray],
     plain = {name: value for name, value in model.parts.items() if name not in PACKED}
     parts = {name: value for name, value in plain.items() if value.size}
     if len(model.mapped):
-        parts |= pack_tiles(model.parts, model.kind, model.mask)
+        parts |= pack_tiles(model.parts, model.profile, model.kind, model.mask)
     if not model.mask.all():
         parts["mask"] = np.frombuffer(zlib.compress(np.packbits(model.mask).tobytes(), 9), np.uint8)
     return settings, parts | {"times": _shortened(model.times)}, model.source
@@ -77,7 +77,7 @@ def decode(artifact: Artifact) -> LightmapModel:
     if "tiles" in others:
         packed = check_part(others, "tiles", TILES), check_part(others, "sizes", SIZES)
         del others["tiles"], others["sizes"]
-        others |= unpack_tiles(*packed, table, kind, mask)
+        others |= unpack_tiles(*packed, table, header.profile, kind, mask)
     return LightmapModel(
         name=header.name,
         width=width,

@@ -21,6 +21,7 @@ from pydantic import Field, model_validator
 from wlm.formats.exr import HALF_MAX
 from wlm.formats.parts import Part
 from wlm.lightmap.tiles import TILE, TileKind
+from wlm.lightmap.weights import packed_bytes
 from wlm.system import Model, Settings
 from wlm_kernels import mlp
 from wlm_kernels.lightmap.features import STATIC_INPUTS, TEMPORAL_INPUTS
@@ -37,6 +38,7 @@ class Profile(Settings):
         uvt_resolution: Texels of F_uvt along u and along v.
         uvt_slices: Slices of F_uvt along time.
         plane_columns, plane_rows: Size of F_ut and F_vt: along u or v, and along time.
+        net_bits: Bits of a network's weight in the file: 16, half floats, or 8, see `wlm.lightmap.weights`.
         gelu: "exact", or its "tanh" form, for which GPUs have an instruction.
         gamma: The maps hold radiance ** (1 / gamma).
         time_axis: "paper": the features' time axis is the hour over the period, clamped at its ends. "frames": every
@@ -65,6 +67,7 @@ class Profile(Settings):
     uvt_slices: int = Field(12, ge=1, le=64)
     plane_columns: int = Field(64, ge=1, le=128)
     plane_rows: int = Field(24, ge=1, le=64)
+    net_bits: Literal[8, 16] = 16
     gelu: Literal["exact", "tanh"] = "tanh"
     gamma: float = Field(2.2, ge=1.0, le=4.0)
     time_axis: Literal["paper", "frames"] = "frames"
@@ -91,8 +94,10 @@ class Profile(Settings):
         return TEMPORAL_INPUTS if temporal else STATIC_INPUTS
 
     def tile_bytes(self, temporal: bool) -> int:
-        """Bytes of one tile's maps and network as stored: the arithmetic of table 3."""
-        size = TILE * TILE + 2 * mlp.parameter_count(self.inputs(temporal), self.hidden)
+        """Bytes of one tile's maps and network before they are deflated: the arithmetic of table 3."""
+        inputs = self.inputs(temporal)
+        count = 2 * mlp.parameter_count(inputs, self.hidden)
+        size = TILE * TILE + (packed_bytes(inputs, self.hidden) if self.net_bits == 8 else count)
         if temporal:
             size += self.uvt_slices * self.uvt_resolution**2 + 2 * 2 * self.plane_rows * self.plane_columns
         return size

@@ -15,7 +15,9 @@ import numpy as np
 
 from wlm.errors import WlmError
 from wlm.formats.parts import Part
+from wlm.lightmap.model import Profile
 from wlm.lightmap.tiles import TILE, TileGrid, TileKind
+from wlm.lightmap.weights import pack_net, packed_bytes, unpack_net
 
 STREAMS = ("uv ends", "uv indices", "uvt ends", "uvt indices", "ut", "vt", "net")
 """The streams of a tile; a static one has the first two and the last."""
@@ -46,11 +48,14 @@ def clear_unused(uv: np.ndarray, used: np.ndarray) -> np.ndarray:
     return _blocks_of(ends * blocks[:, None], bits * blocks[:, None], indices * texels).reshape(uv.shape)
 
 
-def pack_tiles(parts: Mapping[str, np.ndarray], kind: np.ndarray, mask: np.ndarray) -> dict[str, np.ndarray]:
+def pack_tiles(
+    parts: Mapping[str, np.ndarray], profile: Profile, kind: np.ndarray, mask: np.ndarray
+) -> dict[str, np.ndarray]:
     """Packs the maps and networks of all tiles.
 
     Args:
         parts: `uv`, `uvt`, `ut`, `vt`, `net` and `net_static` as `LightmapModel` has them.
+        profile: The settings.
         kind: uint8 [tiles], `TileKind` of each tile of the grid.
         mask: bool [H, W], true where a texel is valid.
 
@@ -58,7 +63,7 @@ def pack_tiles(parts: Mapping[str, np.ndarray], kind: np.ndarray, mask: np.ndarr
         `tiles`, uint8 [bytes], and `sizes`, uint32 [N_m, 7], the bytes of each stream, 0 of those that a tile lacks.
 
     Raises:
-        WlmError: A block isn't of BC7 mode 6.
+        WlmError: A block isn't of BC7 mode 6, or a network not on the levels that the settings say.
     """
     streams, sizes = [], []
     for place, number, row in _mapped(kind):
@@ -67,9 +72,12 @@ def pack_tiles(parts: Mapping[str, np.ndarray], kind: np.ndarray, mask: np.ndarr
         if kind[number] == TileKind.DYNAMIC:
             raw["uvt ends"], raw["uvt indices"] = _packed_blocks(parts["uvt"][row])
             raw |= {name: np.moveaxis(parts[name][row], 2, 0) for name in ("ut", "vt")}
-        net = parts["net" if kind[number] == TileKind.DYNAMIC else "net_static"][row]
-        # The high bytes of half floats are alike, the low ones noise.
-        raw["net"] = net.view(np.uint8).reshape(-1, 2).T
+        dynamic = bool(kind[number] == TileKind.DYNAMIC)
+        net = parts["net" if dynamic else "net_static"][row]
+        if profile.net_bits == 8:
+            raw["net"] = pack_net(net, profile.inputs(dynamic), profile.hidden)
+        else:  # the high bytes of half floats are alike, the low ones noise
+            raw["net"] = net.view(np.uint8).reshape(-1, 2).T
         packed = [
             zlib.compress(np.ascontiguousarray(values).tobytes(), 9) if values.size else b"" for values in raw.values()
         ]
@@ -82,14 +90,19 @@ def pack_tiles(parts: Mapping[str, np.ndarray], kind: np.ndarray, mask: np.ndarr
 
 
 def unpack_tiles(
-    tiles: np.ndarray, sizes: np.ndarray, table: Mapping[str, Part], kind: np.ndarray, mask: np.ndarray
+    tiles: np.ndarray,
+    sizes: np.ndarray,
+    table: Mapping[str, Part],
+    profile: Profile,
+    kind: np.ndarray,
+    mask: np.ndarray,
 ) -> dict[str, np.ndarray]:
     """Reads what `pack_tiles` wrote.
 
     Args:
         tiles, sizes: Its result.
         table: The parts, with the sizes that they must have.
-        kind, mask: As for `pack_tiles`.
+        profile, kind, mask: As for `pack_tiles`.
 
     Returns:
         `uv`, `uvt`, `ut`, `vt`, `net` and `net_static`.
@@ -120,6 +133,10 @@ def unpack_tiles(
             for name in ("ut", "vt"):
                 rows, columns = parts[name].shape[1:3]
                 parts[name][row] = np.moveaxis(read(name, rows * columns * 2).reshape(2, rows, columns), 0, 2)
+        if profile.net_bits == 8:
+            shape = profile.inputs(bool(dynamic)), profile.hidden
+            parts[net][row] = unpack_net(read("net", packed_bytes(*shape)), *shape)
+            continue
         count = parts[net].shape[1]
         parts[net][row] = np.ascontiguousarray(read("net", 2 * count).reshape(2, count).T).view("<f2").ravel()
     return parts

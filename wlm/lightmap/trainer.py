@@ -13,6 +13,7 @@ from wlm.errors import WlmError
 from wlm.formats.bc7 import pack_mode6
 from wlm.formats.parts import Part, check_part, check_parts
 from wlm.lightmap.model import TILE, Profile, TimeAxis, encode_time
+from wlm.lightmap.weights import put_on_levels
 from wlm_kernels.lightmap import blocks, features, gather
 from wlm_kernels.lightmap import step as lightmap_step
 from wlm_kernels.lightmap.gather import gather_maps, gather_net
@@ -234,7 +235,11 @@ class Trainer:
             if self._cuda
             else (wrap(self._partial, vec), wrap(self._partial_out, wp.vec3), wrap(self._loss_parts))
         )
-        self._launch_args = (wrap(self.hidden, vec), wrap(self.output, wp.vec3))
+        # What the kernels read: the networks, or their levels.
+        self._used = self.hidden.detach(), self.output.detach()
+        if self.profile.net_bits == 8:
+            self._used = tuple(torch.empty_like(values) for values in self._used)
+        self._launch_args = (wrap(self._used[0], vec), wrap(self._used[1], wp.vec3))
         self._launch_sums = (wrap(self._acc), *shaped)
         self._maps_sums = (wrap(self._acc), wrap(self.maps), wrap(self.maps_grad))
         self._net_sums = (
@@ -345,8 +350,16 @@ class Trainer:
         finally:
             torch.set_num_threads(threads)
 
+    def _levels(self, quantised: bool) -> tuple[torch.Tensor, torch.Tensor]:
+        """The networks as they are evaluated."""
+        nets = self.hidden.detach(), self.output.detach()
+        return put_on_levels(*nets, self.inputs) if quantised and self.profile.net_bits == 8 else nets
+
     def _step(self, quantised: bool, move_maps: bool) -> None:
         self.batch.quantised = int(quantised)
+        if self.profile.net_bits == 8:
+            for used, values in zip(self._used, self._levels(quantised), strict=True):
+                used.copy_(values)
         hidden, output = self._launch_args
         args = (
             self._maps,
@@ -399,7 +412,7 @@ class Trainer:
             `net` and `uv`, of dynamic tiles also `uvt`, `ut` and `vt`, as `LightmapModel` has them; `net`
             is `net_static` of static tiles.
         """
-        net = torch.cat([self.hidden.detach().flatten(1), self.output.detach().flatten(1)], 1)
+        net = torch.cat([values.flatten(1) for values in self._levels(True)], 1)
         result = {"net": net.cpu().numpy().astype(np.float16), "uv": self._blocks("uv")}
         if self.temporal:
             uvt = self._blocks("uvt")
