@@ -10,6 +10,7 @@ import warp as wp
 from wlm_kernels import mlp
 from wlm_kernels.fluid import advection, advection_sources, lattice, lattice_fields, lattice_links
 from wlm_kernels.lightmap import decode as lightmap_decode
+from wlm_kernels.lightmap import matrix_decode
 from wlm_kernels.lightmap import step as lightmap_step
 from wlm_kernels.probe import decode as probe_decode
 from wlm_kernels.probe import gaussian_sum, optimiser
@@ -31,6 +32,8 @@ MODULES = (
     "lightmap.blocks",
     "lightmap.decode",
     "lightmap.gather",
+    "lightmap.matrix_decode",
+    "lightmap.output",
     "probe.cubes",
     "probe.gaussian_sum",
     "probe.step",
@@ -99,6 +102,12 @@ def test_exact_decode(dynamic: bool, hidden: int, tmp_path: Path):
 def test_strip_decode(hidden: int, tmp_path: Path):
     """Decoding four texels a thread."""
     _compile_all(vars(lightmap_decode.strip_kernels(hidden, "fast")).values(), tmp_path)
+
+
+@pytest.mark.parametrize("hidden", _slow_but(64, [16, 32, 48]))
+def test_matrix_decode(hidden: int, tmp_path: Path):
+    """Decoding on matrix units, which a GPU alone has."""
+    _compile_all(vars(matrix_decode.matrix_kernels(hidden)).values(), tmp_path)
 
 
 @pytest.mark.parametrize("latent", _slow_but(9, [1, 12, 32]))

@@ -8,7 +8,7 @@ from wlm import interop
 from wlm.errors import WlmError
 from wlm.lightmap.decode import Decoder
 from wlm.lightmap.exact import colour_tile64
-from wlm.lightmap.runtime import ExactDecoder, StripDecoder
+from wlm.lightmap.runtime import ExactDecoder, MatrixDecoder, StripDecoder
 from wlm.lightmap.tiles import TileKind
 
 KINDS = (3, 2, 3, 1, 0, 3)  # the static tile's place lies between two dynamic ones
@@ -50,6 +50,21 @@ def test_static_tiles(device):
     assert np.array_equal(exact.numpy(), Decoder(model, device).tiles_8bit([1], 13.0)[0])
 
 
+@pytest.mark.parametrize("hidden", [16, 48, 64])
+def test_matrix_units_are_close(hidden, device):
+    if device == "cpu":
+        pytest.skip("a CPU has none")
+    model = random_model(KINDS, hidden=hidden, gelu="tanh")
+    matrix, exact = MatrixDecoder(model, device), ExactDecoder(model, device)
+    assert matrix.numbers.tolist() == [0, 2, 5]
+    for time in (13.0, 21.7):
+        for runtime in (matrix, exact):
+            runtime.set_time(time)
+            runtime.decode()
+        off = np.abs(matrix.numpy().astype(int) - exact.numpy())
+        assert off.max() <= 3 and off.mean() < 0.2, "half floats: some thousandths of an activation"
+
+
 def test_gaps_take_the_light_of_charts(device):
     mask = np.zeros((236, 247), bool)
     mask[20:60, 30:128] = mask[100:180, 60:90] = True  # across tiles, and near the edge of one
@@ -85,6 +100,8 @@ def test_what_is_refused():
         StripDecoder(random_model((2, 0)))
     with pytest.raises(WlmError, match="expected at least one static tile, found none"):
         ExactDecoder(random_model((3, 0)), kind=TileKind.STATIC)
+    with pytest.raises(WlmError, match="expected cuda for the matrix path, got cpu"):
+        MatrixDecoder(random_model((3, 0)), "cpu")
     with pytest.raises(WlmError, match="gelu: expected one of"):
         StripDecoder(random_model((3, 0)), gelu="relu")
     with pytest.raises(WlmError, match="finite"):

@@ -1,21 +1,22 @@
 """Decoding to 8 bits at runtime: everything stays on the device, and a decode is launches alone.
 
-`wlm.lightmap.Decoder` returns arrays on the host; these two are for a renderer's loop. Each holds the tiles of one
-kind: a whole map is a `StripDecoder`, an `ExactDecoder` of the static tiles if there are any, and
-`Decoder.tiles_8bit` for the constant tiles, one colour each, which need no launch. Gaps take the light of charts in
-tiles of the same decoder.
+`wlm.lightmap.Decoder` returns arrays on the host; these are for a renderer's loop. Each holds the tiles of one kind: a
+whole map is a `StripDecoder`, or on CUDA a `MatrixDecoder` where networks are wide, an `ExactDecoder` of the static
+tiles if there are any, and `Decoder.tiles_8bit` for the constant tiles, one colour each, which need no launch. Gaps
+take the light of charts in tiles of the same decoder.
 """
 
 import numpy as np
 import warp as wp
 
 from wlm import interop
+from wlm.errors import WlmError
 from wlm.lightmap.decode import StoredTiles, TimeTable, gelu_of, rgba
 from wlm.lightmap.gaps import Gaps
 from wlm.lightmap.model import TILE, LightmapModel
 from wlm.lightmap.tiles import TileKind
 from wlm_kernels.lightmap import decode as lightmap_decode
-from wlm_kernels.lightmap import output
+from wlm_kernels.lightmap import matrix_decode, output
 
 
 class _TileDecoder:
@@ -122,6 +123,42 @@ class StripDecoder(_TileDecoder):
             wp.empty((n, resolution, resolution), dtype=wp.vec4, device=self.device),
             wp.empty((n, model.profile.hidden, TILE), dtype=float, device=self.device),
             wp.empty((n, TILE), dtype=wp.vec2, device=self.device),
+        )
+
+    def _launch(self, state: lightmap_decode.TimeState, out: wp.array) -> None:
+        stored = self._stored
+        self._kernels.decode(*stored.arguments, state, *self._scratch, stored.places, self._tiles, out)
+
+
+class MatrixDecoder(_TileDecoder):
+    """The fast path of dynamic tiles with wide networks, on a GPU's matrix units, in half floats.
+
+    Attributes:
+        numbers, out: As of `StripDecoder`.
+        gelu: "fast".
+    """
+
+    def __init__(self, model: LightmapModel, device: str = "cuda") -> None:
+        """Uploads the model's dynamic tiles and allocates all buffers; the time is the first stored one.
+
+        Args:
+            model: The model, of a hidden width that is a multiple of 16.
+            device: "cuda" or "cuda:N".
+
+        Raises:
+            WlmError: No such device, another width, or a model without dynamic tiles.
+        """
+        name, hidden = interop.check_device(device), model.profile.hidden
+        if name == "cpu":
+            raise WlmError("device: expected cuda for the matrix path, got cpu")
+        if hidden % 16:
+            raise WlmError(f"hidden: expected a multiple of 16 for the matrix path, got {hidden}")
+        super().__init__(model, name, "fast", TileKind.DYNAMIC)
+        n, resolution = len(self.numbers), model.profile.uvt_resolution
+        self._kernels = matrix_decode.matrix_kernels(hidden)
+        self._scratch = (
+            wp.empty((n, resolution, resolution), dtype=wp.vec4, device=self.device),
+            *(wp.empty((n, TILE), dtype=wp.vec2, device=self.device) for _ in range(2)),
         )
 
     def _launch(self, state: lightmap_decode.TimeState, out: wp.array) -> None:

@@ -201,7 +201,7 @@ def exact_kernels(temporal: bool, hidden: int, gelu: str) -> tuple[Any, Any]:
 
 
 @wp.kernel(enable_backward=False)
-def _frame_volume(
+def frame_volume(
     # in:
     stored: Stored,
     tau: float,
@@ -260,7 +260,7 @@ class StripKernels:
             out: uint32 [n, 128, 128], RGBA from the lowest byte.
         """
         device = out.device
-        wp.launch(_frame_volume, volume.shape, inputs=[stored, time.tau], outputs=[volume], device=device)
+        wp.launch(frame_volume, volume.shape, inputs=[stored, time.tau], outputs=[volume], device=device)
         wp.launch(
             self._frame_lines,
             rows.shape,

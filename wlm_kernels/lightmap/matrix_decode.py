@@ -1,0 +1,158 @@
+"""Decoding wide networks on a GPU's matrix units: the runtime path of dynamic tiles with 32 hidden units or more.
+
+Activations and weights are half floats and sums float32; GELU is the tanh form with the GPU's own instruction. A thread
+decodes eight texels of a column, one after another, so that a block loads its tile's weights once for 1,024 texels.
+
+Read first: `wlm_kernels/lightmap/decode.py`, the exact path.
+"""
+
+import functools
+from dataclasses import dataclass
+from typing import Any
+
+import warp as wp
+
+from wlm_kernels.lightmap.blocks import bits7
+from wlm_kernels.lightmap.decode import (
+    Stored,
+    TimeState,
+    centred_texel,
+    finish_bytes,
+    frame_volume,
+    frame_volume_at,
+    stored_plane_at,
+)
+from wlm_kernels.lightmap.features import CENTRE, TEMPORAL_INPUTS
+from wlm_kernels.native import native_source
+
+ROWS = 8
+"""Texels that a thread decodes."""
+
+_STEP = 16  # of a matrix product: the hidden width is a multiple of it
+
+
+@wp.kernel(enable_backward=False)
+def _frame_planes(
+    # in:
+    stored: Stored,
+    tau: float,
+    # out:
+    ut: wp.array2d[wp.vec2],
+    vt: wp.array2d[wp.vec2],
+):
+    """F_ut and F_vt at one time, centred: [N, 128] each."""
+    n, i = wp.tid()
+    p = (float(i) + 0.5) / 128.0
+    half = wp.vec2(0.5)
+    ut[n, i] = (stored_plane_at(stored.ut, n, p, tau, stored.periodic) - half) * CENTRE
+    vt[n, i] = (stored_plane_at(stored.vt, n, p, tau, stored.periodic) - half) * CENTRE
+
+
+@dataclass(frozen=True)
+class MatrixKernels:
+    """The path of one hidden width; see `decode`."""
+
+    hidden: int
+    _decode: Any
+
+    def decode(
+        self,
+        stored: Stored,
+        hidden: wp.array,
+        output: wp.array,
+        time: TimeState,
+        volume: wp.array,
+        ut: wp.array,
+        vt: wp.array,
+        places: wp.array,
+        tiles: wp.array,
+        out: wp.array,
+    ) -> None:
+        """Decodes tiles to 8-bit colour at one time, on CUDA.
+
+        Args:
+            stored: Dynamic tiles.
+            hidden: vecH [N, I + H + 2], of half floats.
+            output: vec3 [N, H + 1], of half floats.
+            time: The time.
+            volume: vec4 [N, R, R], scratch.
+            ut, vt: vec2 [N, 128], scratch.
+            places: int [N], each tile's place in `time`.
+            tiles: int [n], the tiles to decode. The scratch of all N is filled.
+            out: uint32 [n, 128, 128], RGBA from the lowest byte.
+        """
+        device = out.device
+        wp.launch(frame_volume, volume.shape, inputs=[stored, time.tau], outputs=[volume], device=device)
+        wp.launch(_frame_planes, ut.shape, inputs=[stored, time.tau], outputs=[ut, vt], device=device)
+        wp.launch(
+            self._decode,
+            (out.shape[0], 128 // ROWS, 128),
+            inputs=[stored, hidden, output, time, volume, ut, vt, places, tiles],
+            outputs=[out],
+            device=device,
+            block_dim=128,
+        )
+
+
+@functools.cache
+def matrix_kernels(hidden: int) -> MatrixKernels:
+    """Builds (once) the path of a hidden width.
+
+    Args:
+        hidden: H, a multiple of 16.
+
+    Raises:
+        ValueError: Another width.
+    """
+    if hidden % _STEP or hidden < _STEP:
+        raise ValueError(f"hidden: expected a multiple of {_STEP}, got {hidden}")
+    vec_in, vec_hidden = wp.types.vector(TEMPORAL_INPUTS, float), wp.types.vector(hidden, float)
+    constants = {"H": hidden, "NT": hidden // 8, "KT": hidden // _STEP}
+
+    @wp.func_native(native_source(__package__, "matrix_forward", **constants))
+    def forward(
+        hidden: wp.array2d[vec_hidden], output: wp.array2d[wp.vec3], n: int, fresh: int, f: vec_in
+    ) -> wp.vec3: ...
+
+    @wp.kernel(module="unique", module_options={"enable_backward": False})
+    def decode(
+        # in:
+        stored: Stored,
+        hidden: wp.array2d[vec_hidden],
+        output: wp.array2d[wp.vec3],
+        time: TimeState,
+        volume: wp.array3d[wp.vec4],
+        ut: wp.array2d[wp.vec2],
+        vt: wp.array2d[wp.vec2],
+        places: wp.array1d[int],
+        tiles: wp.array1d[int],
+        # out:
+        out: wp.array3d[wp.uint32],
+    ):
+        i, part, x = wp.tid()
+        n = tiles[i]
+        place = places[n]
+        across = ut[n, x]
+        rows = int(wp.static(ROWS))  # a variable keeps the loop rolled
+        for r in range(rows):
+            y = part * wp.static(ROWS) + r
+            low = stored.uv[n, y // 4, x // 4, 0]
+            high = stored.uv[n, y // 4, x // 4, 1]
+            p0 = float(int(wp.rshift(low, wp.uint64(63))))
+            p1 = float(int(high & wp.uint64(1)))
+            a = wp.vec4(bits7(low, 7), bits7(low, 21), bits7(low, 35), bits7(low, 49)) * 2.0 + wp.vec4(p0)
+            b = wp.vec4(bits7(low, 14), bits7(low, 28), bits7(low, 42), bits7(low, 56)) * 2.0 + wp.vec4(p1)
+            uv = centred_texel(a, b, high, (y % 4) * 4 + x % 4)
+            uvt = frame_volume_at(volume, n, y, x)
+            down = vt[n, y]
+            f = vec_in()
+            for c in range(4):
+                f[c] = uv[c]
+                f[4 + c] = uvt[c]
+                f[12 + c] = time.encoding[c]
+            for c in range(2):
+                f[8 + c] = across[c]
+                f[10 + c] = down[c]
+            out[i, y, x] = finish_bytes(time, place, forward(hidden, output, n, wp.where(r == 0, 1, 0), f))
+
+    return MatrixKernels(hidden, decode)
