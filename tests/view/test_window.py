@@ -121,6 +121,8 @@ def test_a_texel_tells_its_tile_and_its_light(lightmaps, show):
     for x, y, kind in ((-20, 20, "dynamic"), (20, 20, "static"), (-20, -20, "constant"), (20, -20, "empty")):
         told = window.tell(panel // 2 + x, middle + y)
         column, row = map(int, re.match(r"texel (\d+), (\d+)", told).groups())
+        u, v = map(float, re.search(r"UV (\S+) (\S+)", told).groups())
+        assert (int(u * 256), int(v * 256)) == (column, row)
         number = row // 128 * 2 + column // 128
         assert f"tile {number} ({kind})" in told and TileKind(model.kind[number]).name.lower() == kind
         decoded = model.decoder().frame(window.state.values["hour"])[row, column]

@@ -73,7 +73,8 @@ class SurfaceScene(Scene):
         column = int(np.clip(np.floor(u * self.width), 0, self.width - 1))
         row = int(np.clip(np.floor(v * self.height), 0, self.height - 1))
         values = ", ".join(f"{name} {_rgb(light[row, column])}" for name, light in self.lights(state).items())
-        return "   ".join(filter(None, (f"texel {column}, {row}", self.tell_texel(row, column, state), values)))
+        parts = (f"texel {column}, {row}", f"UV {u:.4f} {v:.4f}", self.tell_texel(row, column, state), values)
+        return "   ".join(filter(None, parts))
 
 
 def _rgb(light: np.ndarray) -> str:

@@ -85,7 +85,7 @@ class LightmapPage {
     this.display = new Display(page, panel, changed);
     this.surface = new Surface(
       graphics, page, 'uniform sampler2D u_light;\nvec3 wlm_light() { return texture(u_light, v_uv).rgb; }',
-      this.display, panel, changed);
+      this.display, panel, changed, (column, row) => this.#tell(column, row));
     this.originals = new Originals(graphics, page);
   }
 
@@ -165,8 +165,23 @@ class LightmapPage {
       this.setTime(this.originals.times[index]);
     }
     const original = this.display.compares ? this.originals.get(index) : undefined;
-    this.surface.draw({u_light: this.shown === undefined ? this.next : this.seen}, original);
+    this.surface.draw({u_light: this.#picture()}, original);
   }
+
+  // What is known of a texel.
+  #tell(column, row) {
+    const {graphics, manifest, lightmap, originals} = this, index = originals.nearest(this.time, lightmap.period);
+    const number = Math.floor(row / 128) * Math.ceil(manifest.width / 128) + Math.floor(column / 128);
+    const kind = lightmap.tiles.find((tile) => tile.number === number)?.kind ?? 'empty';
+    const [red, green, blue] = graphics.read(this.#picture(), 1, 1, column, row);
+    return {
+      tile: `tile ${number} (${kind})`,
+      decoded: [red, green, blue],
+      original: originals.times[index] === this.shown ? originals.texel(index, column, row) : undefined,
+    };
+  }
+
+  #picture() { return this.shown === undefined ? this.next : this.seen; }
 
   // For scripts: radiance of the whole map at an hour, RGBA by rows.
   async read(time) {
