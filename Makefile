@@ -1,4 +1,4 @@
-.PHONY: .venv demo demo-network test test-all fuzz bench docs lint clean
+.PHONY: .venv demo demo-network pictures test test-all fuzz bench docs lint clean
 
 PYTHON ?= python3
 BIN := .venv/bin
@@ -18,6 +18,10 @@ demo: $(STAMP)
 
 demo-network: $(STAMP)
 	$(BIN)/python demos/smoke_network.py --train
+
+# The pictures of README and docs, of what the demos leave.
+pictures: demo
+	$(BIN)/python demos/pictures.py
 
 # A file's tests stay on one worker, so that each kernel is compiled by few of them.
 test: lint

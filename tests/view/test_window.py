@@ -138,6 +138,10 @@ def test_panels_show_decoded_original_and_error(lightmaps, show):
     window = show(lightmaps / "four.wlm", original=lightmaps / "set", mesh=lightmaps / "quad.glb")
     decoded, original, error = np.split(scene_of(window)[40:], 3, axis=1)
     assert np.abs(decoded - original).max() > 5 and np.abs(error - original).max() > 100
+    # The last quarter is outside of the mask: filled in the original, 0 in the decoded light, and no error.
+    flat = np.split(scene_of(show(lightmaps / "four.wlm", original=lightmaps / "set"))[40:], 3, axis=1)
+    quarter = [part[part.shape[0] // 2 + 5 :, part.shape[1] // 2 + 2 :][:15, :15] for part in flat]
+    assert quarter[0].max() == 0 and quarter[1].min() > 50 and quarter[2].max() == 0
     drag(window, "error", 64)
     assert np.split(scene_of(window)[40:], 3, axis=1)[2].mean() > error.mean()
     window.turn(180.0)

@@ -24,11 +24,18 @@ class Surface {
     this.program = graphics.program(SURFACE, `${HEAD}
 in vec2 v_uv;
 in vec2 v_coordinate;
-uniform sampler2D u_original;
+uniform sampler2D u_original, u_mask;
 out vec4 colour;
 ${source}
 ${DISPLAY}
-void main() { colour = vec4(wlm_shown(wlm_light(), texture(u_original, v_uv).rgb), 1.0); }`);
+void main()
+{
+    colour = vec4(wlm_shown(wlm_light(), texture(u_original, v_uv).rgb), 1.0);
+    if (u_view == 3) colour.rgb *= texture(u_mask, v_uv).r;
+}`);
+    const [width, height] = page.has('mask') ? [manifest.width, manifest.height] : [1, 1], {gl} = graphics;
+    const mask = page.has('mask') ? page.array('mask', Uint8Array) : new Uint8Array([255]);
+    this.mask = graphics.plain(width, height, [gl.R8, gl.RED, gl.UNSIGNED_BYTE], mask, gl.NEAREST);
     const uv = page.has('uv') ? page.array('uv', Float32Array) : new Float32Array([0, 0, 1, 0, 1, 1, 0, 1]);
     const indices = page.has('triangles') ? page.array('triangles', Uint32Array) : new Uint32Array([0, 1, 2, 0, 2, 3]);
     const position = page.has('position') ? page.array('position', Float32Array) : new Float32Array(uv.length * 1.5);
@@ -65,7 +72,8 @@ void main() { colour = vec4(wlm_shown(wlm_light(), texture(u_original, v_uv).rgb
   draw(uniforms, original) {
     const {graphics} = this, {width} = graphics.begin();
     graphics.use(this.program, {
-      ...uniforms, ...this.display.uniforms(width), ...this.shape(), u_original: original ?? graphics.black,
+      ...uniforms, ...this.display.uniforms(width), ...this.shape(), u_mask: this.mask,
+      u_original: original ?? graphics.black,
     });
     graphics.drawGeometry(this.geometry);
     this.reading.show();
