@@ -1,4 +1,4 @@
-.PHONY: .venv demo demo-network test test-all fuzz bench docs lint clean
+.PHONY: .venv demo demo-network pictures test test-all fuzz bench docs lint clean
 
 PYTHON ?= python3
 BIN := .venv/bin
@@ -19,6 +19,10 @@ demo: $(STAMP)
 demo-network: $(STAMP)
 	$(BIN)/python demos/smoke_network.py --train
 
+# The pictures of README and docs, of what the demos leave.
+pictures: demo
+	$(BIN)/python demos/pictures.py
+
 # A file's tests stay on one worker, so that each kernel is compiled by few of them.
 test: lint
 	$(BIN)/pytest -n 2 --dist loadfile
@@ -30,10 +34,10 @@ test-all: lint
 fuzz: $(STAMP)
 	$(BIN)/python -m tests.fuzz --cases 20000 --json out/fuzz.json
 
-# The documents as a site, out/docs/index.html.
+# The documents as a site, out/docs/index.html; a link that leads nowhere is an error.
 docs: $(STAMP)
 	$(BIN)/pip install -q -c constraints.txt -e '.[docs]'
-	$(BIN)/mkdocs build --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 bench: $(STAMP)
 	mkdir -p out

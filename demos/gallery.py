@@ -1,26 +1,16 @@
-"""One picture and one page of all four systems, of what the other demos leave.
+"""One page of all four systems, of what the other demos leave.
 
-`gallery.png` is `docs/images/gallery.png`; `gallery.html` opens by double click, with the four pages beside it.
+`gallery.html` opens by double click, with the four pages beside it.
 """
 
 import argparse
 import sys
 from pathlib import Path
 
-from PIL import Image, ImageDraw, ImageFont
-
 from wlm.errors import WlmError
 from wlm.web import write_page
 
 HERE = Path(__file__).resolve().parent
-LEFT = {
-    "city.png": "lightmap: a tile over the day; reference, decoded, error x 8",
-    "smoke/plume.png": "smoke: a simulated plume under a moving light; its six-way lightmaps",
-}
-RIGHT = {
-    "room.png": "atlas: a room's lightmap; original, decoded, downsampled to as many bytes, errors x 8",
-    "street.png": "probe: light probes as lit spheres; original, decoded, error x 8",
-}
 DATA = HERE / "data"
 PAGES = {
     "city": ("Lightmaps over the day", ["city.wlm"], {"original": DATA / "city"}),
@@ -46,25 +36,6 @@ iframe {{ width: 100%; height: 540px; border: 1px solid #3a3a42; }}
 </main>
 </html>
 """
-WIDTH, LEFT_WIDTH, LINE, MARGIN = 1500, 516, 26, 8
-PAPER, INK = (32, 32, 32), (230, 230, 230)
-
-
-def column(folder: Path, captions: dict[str, str], width: int) -> Image.Image:
-    """Pictures below each other, each under its caption and as wide as the column."""
-    font = ImageFont.load_default(15)
-    parts = []
-    for name, caption in captions.items():
-        picture = Image.open(folder / name).convert("RGB")
-        picture = picture.resize((width, round(picture.height * width / picture.width)), Image.Resampling.LANCZOS)
-        parts.append((caption, picture))
-    sheet = Image.new("RGB", (width, sum(LINE + picture.height + MARGIN for _, picture in parts)), PAPER)
-    top = 0
-    for caption, picture in parts:
-        ImageDraw.Draw(sheet).text((4, top + 4), caption, INK, font=font)
-        sheet.paste(picture, (0, top + LINE))
-        top += LINE + picture.height + MARGIN
-    return sheet
 
 
 def pages(out: Path) -> int:
@@ -79,21 +50,14 @@ def pages(out: Path) -> int:
 
 
 def main() -> None:
-    """Reads the command line and writes the picture and the pages."""
+    """Reads the command line and writes the pages."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--out", type=Path, default=HERE / "out", help="the folder of the demos' pictures")
+    parser.add_argument("--out", type=Path, default=HERE / "out", help="the folder of the demos' files")
     out = parser.parse_args().out
     try:
-        left = column(out, LEFT, LEFT_WIDTH)
-        right = column(out, RIGHT, WIDTH - LEFT_WIDTH - MARGIN)
         size = pages(out)
     except (OSError, WlmError) as error:
         sys.exit(f"error: {error}; expected what the other demos leave")
-    sheet = Image.new("RGB", (WIDTH, max(left.height, right.height)), PAPER)
-    sheet.paste(left, (0, 0))
-    sheet.paste(right, (left.width + MARGIN, 0))
-    sheet.save(out / "gallery.png")
-    print(f"{out.name}/gallery.png: {sheet.width} x {sheet.height} pixels")
     print(f"{out.name}/gallery.html: {len(PAGES)} pages, {size:,} bytes")
 
 

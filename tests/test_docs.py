@@ -87,6 +87,14 @@ def test_pages_of_results_are_those_that_the_command_makes(monkeypatch):
         assert (ROOT / "docs" / name).read_text(encoding="utf-8") == page, name
 
 
+def test_every_picture_is_shown_and_small():
+    pages = [*DOCUMENTS, *sorted((ROOT / "docs" / "results").glob("*.md"))]
+    shown = {name for page in pages for name in re.findall(r"images/([\w.-]+)\)", page.read_text(encoding="utf-8"))}
+    pictures = {path.name: path.stat().st_size for path in (ROOT / "docs" / "images").iterdir()}
+    assert pictures.keys() == shown
+    assert max(pictures.values()) <= 400_000
+
+
 def test_files_that_documents_link_are_there():
     for document in [*DOCUMENTS, *sorted((ROOT / "docs" / "results").glob("*.md"))]:
         for link in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", document.read_text(encoding="utf-8")):

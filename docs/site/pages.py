@@ -1,46 +1,66 @@
 """Pages of the site that are made: the API from the packages' public names, and the home page from the README."""
 
+from __future__ import annotations
+
 import re
+from importlib import import_module
 from pathlib import Path
-from typing import Any
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
 
-from mkdocs.structure.files import File, Files
-
-import wlm.atlas
-import wlm.fluid
-import wlm.lightmap
-import wlm.ops
-import wlm.probe
-import wlm.smoke
-import wlm.web
+if TYPE_CHECKING:
+    from mkdocs.structure.files import Files
 
 ROOT = Path(__file__).resolve().parents[2]
-OTHERS = "wlm|benchmarks|demos|tests|configs|LICENSE|README"
-PACKAGES = (wlm.lightmap, wlm.atlas, wlm.probe, wlm.smoke, wlm.fluid, wlm.ops, wlm.web)
+PACKAGES = ("wlm", "wlm.lightmap", "wlm.atlas", "wlm.probe", "wlm.smoke", "wlm.fluid", "wlm.ops", "wlm.web")
+_OUTSIDE = re.compile(
+    r"\[([^\]]+)\]\((?:\.\./)*(?:wlm|wlm_kernels|benchmarks|demos|tests|configs|LICENSE|README\.md)(?:[/#][^)]*)?\)"
+)
 
 
 def on_files(files: Files, config: Any) -> Files:
     """Adds the home page and a page for each package."""
+    from mkdocs.structure.files import File
+
     readme = (ROOT / "README.md").read_text(encoding="utf-8").replace("](docs/", "](")
     files.append(File.generated(config, "index.md", content=readme))
-    for package in PACKAGES:
-        name = package.__name__.rpartition(".")[2]
-        files.append(File.generated(config, f"api/{name}.md", content=api_page(package)))
+    for name in PACKAGES:
+        files.append(File.generated(config, f"api/{page_of(name)}", content=api_page(import_module(name))))
     return files
-
-
-def api_page(package: Any) -> str:
-    """The package's docstring and each public name, where it is defined."""
-    lines = [f"# {package.__name__}", "", package.__doc__.strip(), ""]
-    for name in package.__all__:
-        value = getattr(package, name)
-        place = getattr(value, "__module__", None)
-        # Constants have no place of their own; subpackages have docstrings.
-        if place is not None and place.startswith("wlm"):
-            lines += [f"::: {place}.{value.__qualname__}", ""]
-    return "\n".join(lines)
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
     """Links to the repository's own files stay as text: the site has the pages alone."""
-    return re.sub(rf"\[([^\]]+)\]\((?:\.\./)+(?:{OTHERS})[^)]*\)", r"\1", markdown)
+    return _OUTSIDE.sub(r"\1", markdown)
+
+
+def page_of(package: str) -> str:
+    """The name of a package's page."""
+    return f"{package.rpartition('.')[2]}.md"
+
+
+def api_page(package: ModuleType) -> str:
+    """The package's docstring and each public name: where it is defined, or a link to the package that it is of."""
+    rooms = [each for each in PACKAGES if each.rpartition(".")[0] == package.__name__]
+    lines = [f"# {package.__name__}", "", package.__doc__.strip(), ""]
+    lines += [f"- [`{room}`]({page_of(room)}): {import_module(room).__doc__.splitlines()[0]}" for room in rooms]
+    lines += [""]
+    for name, module in sorted(package._PLACES.items()):
+        public, place = f"{package.__name__}.{name}", _place(getattr(package, name), module, name)
+        home = next((each for each in PACKAGES[1:] if place == each or place.startswith(f"{each}.")), "wlm")
+        if public in rooms:
+            continue
+        if home in (package.__name__, "wlm"):
+            lines += [f"::: {place}", "    options:", f"      heading: {public}", f"      toc_label: {name}", ""]
+        else:
+            lines += [f"### {public}", "", f"[`{home}.{place.rpartition('.')[2]}`]({page_of(home)}#{place})", ""]
+    return "\n".join(lines)
+
+
+def _place(value: Any, module: str, name: str) -> str:
+    """The full name of a public name's definition."""
+    if isinstance(value, ModuleType):
+        return value.__name__
+    if isinstance(value, type) or callable(value):
+        return f"{value.__module__}.{value.__qualname__}"
+    return f"{module}.{name}"

@@ -101,7 +101,8 @@ def test_a_flip_book_is_the_billboard(tmp_path, device):
         changed = settings.model_copy(update={"views": views})
         return HeldOut(pool, torch.tensor(keep, device=device), changed, lambda settings: pool)
 
-    others, method = flip_book(held_out([True, True, True]))
+    numbers, others, method = flip_book(held_out([True, True, True]))
+    assert numbers.tolist() == [1, 2]
     assert len(pool) == 3 and len(others) == 2 and torch.equal(others.targets, pool.targets[1:])
     volume = plume(device=device)
     first, *rest = fixed_cameras(settings, volume.origin, volume.voxel * np.array(volume.shape))
@@ -109,8 +110,9 @@ def test_a_flip_book_is_the_billboard(tmp_path, device):
     for planes, camera in zip(method(others, slice(0, 2)), rest, strict=True):
         expected = encode_lightmaps(billboard(baked, first, camera, volume.centre))
         assert (planes - expected).abs().max() < 4e-3
-    others, method = flip_book(held_out([False, False, True]))
-    assert len(others) == 1 and torch.equal(method(others, slice(0, 4)), pool.targets[:1].float())
-    assert len(flip_book(held_out([True] * 3, views=1))[0]) == 0
+    numbers, others, method = flip_book(held_out([False, False, True]))
+    assert numbers.tolist() == [2] and len(others) == 1
+    assert torch.equal(method(others, slice(0, 4)), pool.targets[:1].float())
+    assert len(flip_book(held_out([True] * 3, views=1)).pool) == 0
     with pytest.raises(ValueError, match="whole sets of 2 views, got 3"):
         flip_book(held_out([True] * 3, views=2))

@@ -242,4 +242,4 @@ def test_the_command(monkeypatch, tmp_path):
 
 
 def _evaluation():
-    return Score(31.0, 30.0, 32.0, (31.0,) * 8, 0.1, 0.1)
+    return Score(31.0, 30.0, 32.0, (31.0,) * 8, 0.1, 0.1, (30.0, 32.0))

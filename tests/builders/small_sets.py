@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 from wlm.formats.exr import write_exr
 from wlm.lightmap.data import LightmapSet, from_arrays
@@ -37,7 +38,9 @@ def static_light(height=128, width=128, hours=HOURS, period=24.0) -> LightmapSet
 
 
 def write_set(folder: Path, lightmaps: LightmapSet) -> None:
-    """Writes the frames of a set into a new folder; their names tell their hours."""
+    """Writes the frames of a set into a new folder, and its mask if not all is valid; their names tell their hours."""
     folder.mkdir()
+    if not lightmaps.mask.all():
+        Image.fromarray(lightmaps.mask.astype(np.uint8) * 255).save(folder / "mask.png")
     for time, frame in zip(lightmaps.times, lightmaps.frames, strict=True):
         write_exr(folder / f"light_{time:05.2f}h.exr".replace(".", "_", 1), frame, half=False)

@@ -1,42 +1,30 @@
+"""Volumes and frames from the command line: guided, baked, shaded, packed for an engine."""
+
 import json
 import math
 import os
 import re
-import signal
 from importlib import import_module
 
 import numpy as np
 import pytest
 import torch
-import yaml
 from builders.running import call, fails
-from builders.smoke_plumes import SCENE, SPHERE, plume, write_frames
+from builders.smoke_plumes import SPHERE, plume, write_frames
 from PIL import Image
 
-from wlm.errors import WlmError
-from wlm.fluid.solver import Solver
 from wlm.fluid.volume import from_array, load_volume, save_volume
-from wlm.formats.artifact import read_artifact
 from wlm.formats.exr_planes import read_planes
-from wlm.smoke import simulation
 from wlm.smoke.baking import bake
 from wlm.smoke.camera import axis_faults
-from wlm.smoke.data import CHECKPOINT, load_frames, open_frames, read_six_way
+from wlm.smoke.data import read_six_way
 from wlm.smoke.exporter import read_flipbook
 from wlm.smoke.guiding import guide
-from wlm.smoke.scene import CameraSettings, LightSettings, Scene, make_camera
-from wlm.smoke.simulation import simulate
-from wlm.system import Meter
+from wlm.smoke.scene import CameraSettings, LightSettings, make_camera
 from wlm.view.smoke import picture, to_bytes
 from wlm_kernels.smoke.settings import March
 
 SMALL = ("--resolution", 20, "--step", 1)
-JET = SCENE | {
-    "grid": {"cells": [8, 10, 8], "cell": 0.125, "refine": 2, "origin": [-0.5, 0, -0.5]},
-    "obstacles": [{"radius": 0.17, "path": [[0, -0.25, 0.6, 0], [1, 0.25, 0.6, 0]]}],
-    "frames": 4,
-    "rate": 8.0,
-}
 
 
 @pytest.fixture(scope="session")
@@ -59,15 +47,6 @@ def baked(frames, tmp_path_factory):
     return folder
 
 
-@pytest.fixture(scope="session")
-def jet(tmp_path_factory):
-    """A scene to simulate, and what it leaves."""
-    folder = tmp_path_factory.mktemp("jet")
-    (folder / "jet.yaml").write_text(yaml.safe_dump(JET))
-    call("smoke", "simulate", folder / "jet.yaml", "-o", folder / "a")
-    return folder
-
-
 def camera_of(volume, **settings):
     size = volume.voxel * np.array(volume.shape)
     return make_camera(CameraSettings(**{"resolution": 20} | settings), volume.origin, size)
@@ -76,205 +55,6 @@ def camera_of(volume, **settings):
 def png(path):
     with Image.open(path) as image:
         return np.asarray(image)
-
-
-def test_simulate(jet, tmp_path):
-    scene, out = jet / "jet.yaml", tmp_path / "out"
-    text = call("smoke", "simulate", scene, "-o", out)
-    assert re.search(r"density +│ +16 x 20 x 16 │", text) and "simulate: 4 of 4, smoke" in call.stderr
-    assert sorted(os.listdir(out)) == [*(f"frame_{i:04d}.npz" for i in range(1, 5)), "scene.json"]
-    footage = load_frames(out)
-    assert footage.scene == Scene.model_validate(JET)
-    amounts = [float(footage.load(number).density.sum()) for number in footage.numbers]
-    assert all(b > a > 0 for a, b in zip(amounts, amounts[1:], strict=False))
-    last = footage.load(4)
-    assert (last.voxel, last.extinction, last.temperature) == (0.0625, 8.0, None)
-    # The jet goes up, and none of it is in the sphere.
-    heights = last.density.sum((0, 2)).numpy()
-    assert heights[:4].min() > 1.0 > 0.01 > heights[-2:].max()
-    places = [last.origin[i] + last.voxel * (np.arange(n) + 0.5) for i, n in enumerate(last.shape)]
-    away = np.stack(np.meshgrid(*places, indexing="ij"), -1) - footage.scene.obstacles[0].centre(0.5)
-    assert not last.density[torch.from_numpy(np.linalg.norm(away, axis=-1) < 0.06)].any()
-    # One scene gives one result, however often.
-    for number in footage.numbers:
-        name = f"frame_{number:04d}.npz"
-        assert torch.equal(load_volume(out / name).density, load_volume(jet / "a" / name).density)
-
-
-def test_simulate_as_told(jet, tmp_path):
-    call("smoke", "simulate", jet / "jet.yaml", "-o", tmp_path / "a", "--frames", 1, "--scale", 0.5, "--resume")
-    assert "there was nothing to resume" in call.stderr
-    footage = load_frames(tmp_path / "a")
-    assert footage.numbers == (1,) and footage.scene.grid.cells == (4, 5, 4) and footage.scene.grid.cell == 0.25
-    line = fails("smoke", "simulate", "jet-sphere", "-o", tmp_path / "b", "--scale", 50)
-    assert "jet past a sphere: grid.cells.0: expected less than or equal to 4096, got 5000" in line
-    assert not (tmp_path / "b").exists()
-    big = yaml.safe_dump(JET | {"grid": {"cells": [4096, 4096, 4096], "cell": 0.1, "faces": {}}})
-    (tmp_path / "big.yaml").write_text(big)
-    line = fails("smoke", "simulate", tmp_path / "big.yaml", "-o", tmp_path / "b")
-    assert "4096 x 4096 x 4096 cells" in line
-    (tmp_path / "fast.yaml").write_text(yaml.safe_dump(JET | {"air": {"speed": 0.1}}))
-    line = fails("smoke", "simulate", tmp_path / "fast.yaml", "-o", tmp_path / "b")
-    assert "cells a step: expected at most 0.3" in line
-    narrow = [SCENE["inlets"][0] | {"radius": 0.01}]
-    (tmp_path / "thin.yaml").write_text(yaml.safe_dump(JET | {"inlets": narrow}))
-    line = fails("smoke", "simulate", tmp_path / "thin.yaml", "-o", tmp_path / "b")
-    assert "inlets.0: expected a cell's centre within its radius" in line
-    slow = {"smoke": {"storage": "float16", "dissipation": 1e-3}}
-    (tmp_path / "half.yaml").write_text(yaml.safe_dump(JET | slow))
-    assert "with float16" in fails("smoke", "simulate", tmp_path / "half.yaml", "-o", tmp_path / "b")
-    assert "jet-sphere" in fails("smoke", "simulate", "none", "-o", tmp_path / "b")
-    assert "found other files" in fails("smoke", "simulate", jet / "jet.yaml", "-o", tmp_path)
-
-
-@pytest.mark.parametrize("within", [False, True])
-def test_a_simulation_is_stopped_and_resumed(within, jet, tmp_path, monkeypatch):
-    """Ctrl-C during the second frame keeps it, or what there is of it; the rest comes out the same to the last bit."""
-    out, scene = tmp_path / "out", jet / "jet.yaml"
-    step, done = Solver.step, []
-
-    def interrupted(self, steps=1):
-        step(self, steps)
-        done.append(1)
-        if len(done) == 9:
-            os.kill(os.getpid(), signal.SIGINT)
-
-    per_frame = Scene.model_validate(JET).steps // 2
-    assert per_frame < 9 < 2 * per_frame
-    monkeypatch.setattr(Solver, "step", interrupted)
-    monkeypatch.setattr(Meter, "due", lambda self, done: within)
-    call("smoke", "simulate", scene, "-o", out, code=130)
-    monkeypatch.undo()
-    whole = ["frame_0001.npz", *["frame_0002.npz"] * (not within)]
-    assert f"stopped at frame {len(whole)}: the same command with --resume goes on from {out}" in call.stderr
-    assert sorted(os.listdir(out)) == [*whole, "scene.json", CHECKPOINT]
-    # With another scene it isn't resumed, and nothing is lost by the attempt.
-    (tmp_path / "other.yaml").write_text(yaml.safe_dump(JET | {"air": {"viscosity": 1.0}}))
-    assert "whose air differs" in fails("smoke", "simulate", tmp_path / "other.yaml", "-o", out, "--resume")
-    monkeypatch.setattr(Solver, "step", lambda self, steps=1: done.append(1) or step(self, steps))
-    call("smoke", "simulate", scene, "-o", out, "--resume", "--checkpoint-every", 0)
-    assert len(done) == 4 * per_frame, "no step is done twice"
-    assert sorted(os.listdir(out)) == [*(f"frame_{i:04d}.npz" for i in range(1, 5)), "scene.json"]
-    for number in range(1, 5):
-        name = f"frame_{number:04d}.npz"
-        assert torch.equal(load_volume(out / name).density, load_volume(jet / "a" / name).density)
-    # All is there: nothing is done again.
-    before = (out / "frame_0004.npz").stat().st_mtime_ns
-    call("smoke", "simulate", scene, "-o", out, "--resume")
-    assert "nothing to resume" not in call.stderr
-    assert (out / "frame_0004.npz").stat().st_mtime_ns == before
-
-
-def test_a_blow_up_keeps_the_last_good_state(tmp_path, monkeypatch):
-    scene = Scene.model_validate(JET)
-    out, check = tmp_path / "out", Solver.check
-    last = 2 * (scene.steps // 2) + 1
-
-    def failing(self):
-        if self.steps > last:
-            raise WlmError("lattice: blew up in step 9 at cell (1, 2, 3): not a number" + self._kept)
-        check(self)
-
-    monkeypatch.setattr(Solver, "check", failing)
-    with pytest.raises(WlmError, match="blew up in step 9"):
-        simulate(open_frames(out, scene), checkpoint_every=0.0)
-    assert int(read_artifact(out / CHECKPOINT).tensors["lattice.steps"]) == 2 * last
-    monkeypatch.undo()
-    first = simulate(open_frames(out, scene, resume=True), resume=True)
-    assert first == 3 and not (out / CHECKPOINT).exists() and load_frames(out).numbers == (1, 2, 3, 4)
-
-
-def test_a_frame_that_cannot_be_written_is_not_resumed_past(tmp_path, monkeypatch):
-    """A state is kept after its frame: where the frame isn't there, it is simulated again."""
-    scene, out, save = Scene.model_validate(JET), tmp_path / "out", save_volume
-
-    def full(path, volume):
-        if path.name == "frame_0003.npz":
-            raise WlmError(f"{path}: cannot write: no space left")
-        save(path, volume)
-
-    monkeypatch.setattr(simulation, "save_volume", full)
-    with pytest.raises(WlmError, match="no space left"):
-        simulate(open_frames(out, scene), checkpoint_every=0.0)
-    monkeypatch.setattr(simulation, "save_volume", save)
-    kept = (out / CHECKPOINT).read_bytes()
-    # A frame that was lost otherwise can't be made of the state that is kept.
-    (out / "frame_0001.npz").rename(tmp_path / "one.npz")
-    with pytest.raises(WlmError, match="expected frame_0001.npz, since the saved state is of frame 2"):
-        simulate(open_frames(out, scene, resume=True), resume=True)
-    (tmp_path / "one.npz").rename(out / "frame_0001.npz")
-    assert (out / CHECKPOINT).read_bytes() == kept
-    assert simulate(open_frames(out, scene, resume=True), resume=True) == 3
-    assert load_frames(out).numbers == (1, 2, 3, 4) and not (out / CHECKPOINT).exists()
-
-
-def test_fewer_frames_leave_the_state_that_is_past_them(tmp_path):
-    scene, out = Scene.model_validate(JET), tmp_path / "out"
-
-    def stopped(progress):
-        if progress.done == 3:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        simulate(open_frames(out, scene), progress=stopped)
-    kept = (out / CHECKPOINT).read_bytes()
-    fewer = scene.model_copy(update={"frames": 2})
-    assert simulate(open_frames(out, fewer, resume=True), resume=True) == 3
-    assert (out / CHECKPOINT).read_bytes() == kept
-    assert simulate(open_frames(out, scene, resume=True), resume=True) == 4
-    assert load_frames(out).numbers == (1, 2, 3, 4) and not (out / CHECKPOINT).exists()
-
-
-def test_earlier_results_outlast_a_command_that_cannot_be(jet, tmp_path, monkeypatch):
-    """Frames, and lightmaps, guides and pictures made of them, when the next run ends before its first result."""
-    frames = write_frames(tmp_path / "frames", frames=2).path
-    made = {"bake": "bake", "guide": "guide", "shade": "shade"}
-    for command, folder in made.items():
-        call("smoke", command, frames, "-o", tmp_path / folder, "--resolution", 8)
-    call("smoke", "shade", tmp_path / "bake", "-o", tmp_path / "baked")
-    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
-    for command, folder in made.items():
-        line = fails("smoke", command, frames, "-o", tmp_path / folder, "--toward", "0,0,0")
-        assert "--toward: expected a direction" in line
-    for path in (frames / "frame_0001.npz", tmp_path / "bake" / "six_0001.exr"):
-        path.write_bytes(b"x")
-    fails("smoke", "guide", frames, "-o", tmp_path / "guide")
-    fails("smoke", "shade", tmp_path / "bake", "-o", tmp_path / "baked")
-    monkeypatch.setattr(simulation, "free_memory", lambda device: 3 * 2**10)
-    line = fails("smoke", "simulate", jet / "jet.yaml", "-o", frames)
-    assert re.search(r"8 x 10 x 8 cells of air and 16 x 20 x 16 of smoke need .* the 0.0 GiB that are free", line)
-    changed = {path for path, content in before.items() if not path.exists() or path.read_bytes() != content}
-    assert changed == {frames / "frame_0001.npz", tmp_path / "bake" / "six_0001.exr"}
-
-
-@pytest.mark.parametrize("case", ["empty", "covered", "one cell", "hot", "bricks of halves"])
-def test_hard_scenes(case, tmp_path):
-    changed = {
-        "empty": {"inlets": []},
-        # The body lies over the inlet: no smoke comes in.
-        "covered": {"obstacles": [{"radius": [0.6, 0.2, 0.6], "shape": "box", "path": [[0, 0, 0, 0]]}]},
-        "one cell": {"grid": {"cells": [1, 1, 1], "cell": 1.0, "refine": 1}, "inlets": [], "obstacles": []},
-        "bricks of halves": {"smoke": {"bricks": True, "storage": "float16", "scheme": "semi-lagrangian"}},
-        "hot": {
-            "inlets": [],
-            "obstacles": [{"radius": [0.1, 0.1, 0.1], "shape": "cylinder", "path": [[0, 0, 1.0, 0]]}],
-            "smoke": {"buoyancy": 20.0, "weight": 1.0, "emission": 4.0, "cooling": 0.5, "dissipation": 0.1},
-            "sources": [{"centre": [0, 0.4, 0], "radius": 0.25, "temperature": 1.0, "stop": 0.2}],
-        },
-    }[case]
-    scene = Scene.model_validate(JET | {"obstacles": []} | changed | {"frames": 2})
-    reports = []
-    simulate(open_frames(tmp_path / "a", scene), progress=reports.append)
-    # A slow frame has reports of its own, without figures or with those of the last one.
-    amounts = {report.done: report.figures["smoke"] for report in reports if report.figures}
-    last = load_frames(tmp_path / "a").load(2)
-    assert len(amounts) == 2 and last.warnings == ()
-    assert (amounts[2] > 0) == (case in ("hot", "bricks of halves"))
-    assert (last.temperature is not None) == (case == "hot")
-    assert (last.density.dtype == torch.float16) == (case == "bricks of halves")
-    if case == "hot":
-        rows = last.density.sum((0, 2)) * torch.arange(last.shape[1])
-        assert float(rows.sum() / last.density.sum()) > 0.4 / last.voxel, "it rises"
 
 
 @pytest.mark.parametrize(

@@ -5,10 +5,14 @@ import re
 
 import numpy as np
 import pytest
+import torch
 from builders.contract import SUBJECTS
+from builders.smoke_samples import random_model
 
+from wlm.smoke.evaluation import NETWORK, REFERENCE, Comparison, Example, Score
+from wlm.smoke.planes import PLANES
 from wlm.view.document import Document
-from wlm.view.reports import atlas_report, lightmap_report, probe_report
+from wlm.view.reports import atlas_report, lightmap_report, probe_report, smoke_report
 
 
 @pytest.fixture(scope="module", params=["lightmap", "atlas-tiles", "probe"])
@@ -53,15 +57,51 @@ def test_a_report_of_a_strange_name_and_without_scores(scored, tmp_path):
     assert name != "atlas" or "No camera" in text
 
 
+def smoke_comparison(name, frames, views, hot=True):
+    """A network, and a rival that has no image of the first view."""
+    random = np.random.default_rng(0)
+    images = {NETWORK: 30 + 10 * random.random((frames, views)), "flip book": 20 + random.random((frames, views))}
+    images["flip book"][:, 0] = np.nan
+    scores = {}
+    for method, values in images.items():
+        seen = values[np.isfinite(values)].tolist() or [12.0]
+        planes = tuple(np.linspace(31.5, 38.5, len(PLANES)).tolist())
+        scores[method] = Score(float(np.mean(seen)), min(seen), max(seen), planes, 0.02, 0.01, tuple(seen))
+    shown = {name: torch.rand(len(PLANES), 12, 12).half() for name in (REFERENCE, NETWORK, "flip book")}
+    if not hot:
+        shown[REFERENCE][PLANES.index("emission")] = 0
+    worst = Example(frames - 1, views - 1, shown), Example(0, 0, {key: shown[key] for key in (REFERENCE, NETWORK)})
+    turns = 90.0 / views * np.arange(views)
+    return Comparison(name, frames * views // 2, scores, turns, images, worst)
+
+
+def test_a_report_of_smoke(tmp_path):
+    comparisons = [smoke_comparison("density x 1", 8, 3), smoke_comparison("<b>.npz", 2, 1, hot=False)]
+    size = smoke_report(tmp_path / "report.html", "<i>", random_model(), comparisons)
+    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert size == len(text.encode()) and "<b>" not in text and "<i>" not in text and "<script" not in text
+    for comparison in comparisons:
+        for score in comparison.methods.values():
+            assert f"<td>{score.psnr:.2f}</td><td>{score.lowest:.2f}</td><td>{score.highest:.2f}</td>" in text
+    assert "<td>2.000</td>" in text
+    worst = comparisons[0].images[NETWORK][7, 2]
+    assert f"density x 1: frame 8 from 60°, {worst:.2f} dB" in text
+    # Three plots of the first, one of the volume, which has neither several frames nor views.
+    assert [text.count(f"PSNR by {what}") for what in ("light", "frame", "the view")] == [2, 1, 1]
+    # In each of the two worst images of both: what there is, and errors of all but the reference.
+    assert text.count("<figure>") == 2 * (5 + 3)
+
+
 def test_parts_of_a_document(tmp_path):
     page = Document("a & b")
     page.text("note")
     page.table("", ("", "x"), [("<i>", "1")])
     page.lines("lines", "dB", np.arange(3.0), {"one": np.array([1.0, np.nan, 2.0]), "two": np.zeros(3)})
+    page.points("points", "dB", ("a", "b"), {"one": (1.0, np.nan), "two": (2.0, 3.0)})
     page.grid("grid", "dB", np.array([[1.0, np.nan], [np.nan, np.nan]]))
     page.grid("no numbers", "dB", np.full((2, 2), np.nan))
     page.histogram("histogram", "dB", np.array([np.inf, 1.0, 2.0]))
     page.pictures("pictures", {"one": np.zeros((2, 2, 3), np.uint8)})
     page.write(tmp_path / "page.html")
     text = (tmp_path / "page.html").read_text(encoding="utf-8")
-    assert "a &amp; b" in text and "&lt;i&gt;" in text and text.count("<img") == 5
+    assert "a &amp; b" in text and "&lt;i&gt;" in text and text.count("<img") == 6

@@ -121,6 +121,8 @@ def test_a_texel_tells_its_tile_and_its_light(lightmaps, show):
     for x, y, kind in ((-20, 20, "dynamic"), (20, 20, "static"), (-20, -20, "constant"), (20, -20, "empty")):
         told = window.tell(panel // 2 + x, middle + y)
         column, row = map(int, re.match(r"texel (\d+), (\d+)", told).groups())
+        u, v = map(float, re.search(r"UV (\S+) (\S+)", told).groups())
+        assert (int(u * 256), int(v * 256)) == (column, row)
         number = row // 128 * 2 + column // 128
         assert f"tile {number} ({kind})" in told and TileKind(model.kind[number]).name.lower() == kind
         decoded = model.decoder().frame(window.state.values["hour"])[row, column]
@@ -136,6 +138,10 @@ def test_panels_show_decoded_original_and_error(lightmaps, show):
     window = show(lightmaps / "four.wlm", original=lightmaps / "set", mesh=lightmaps / "quad.glb")
     decoded, original, error = np.split(scene_of(window)[40:], 3, axis=1)
     assert np.abs(decoded - original).max() > 5 and np.abs(error - original).max() > 100
+    # The last quarter is outside of the mask: filled in the original, 0 in the decoded light, and no error.
+    flat = np.split(scene_of(show(lightmaps / "four.wlm", original=lightmaps / "set"))[40:], 3, axis=1)
+    quarter = [part[part.shape[0] // 2 + 5 :, part.shape[1] // 2 + 2 :][:15, :15] for part in flat]
+    assert quarter[0].max() == 0 and quarter[1].min() > 50 and quarter[2].max() == 0
     drag(window, "error", 64)
     assert np.split(scene_of(window)[40:], 3, axis=1)[2].mean() > error.mean()
     window.turn(180.0)

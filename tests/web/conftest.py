@@ -26,8 +26,8 @@ def show(browser):
     """Opens a page, and at the end checks that nothing went wrong in it; `unpacked` goes without block compression."""
     errors, contexts = [], []
 
-    def load(path, *, unpacked=False, width=900, height=600):
-        context = browser.new_context(viewport={"width": width, "height": height})
+    def load(path, *, unpacked=False, width=900, height=600, touch=False):
+        context = browser.new_context(viewport={"width": width, "height": height}, has_touch=touch)
         contexts.append(context)
         page = context.new_page()
         page.on("pageerror", lambda error: errors.append(str(error)))

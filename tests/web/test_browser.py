@@ -2,6 +2,7 @@
 
 import base64
 import io
+import re
 
 import numpy as np
 import pytest
@@ -10,9 +11,11 @@ from builders import atlas_meshes, atlas_models, probe_models, small_sets
 from PIL import Image
 
 import wlm
+from wlm.atlas.model import unpack_entries
 from wlm.formats.gltf import document_from_arrays
 from wlm.formats.gltf_writer import write_glb
 from wlm.lightmap.data import from_arrays
+from wlm.lightmap.tiles import TileKind
 from wlm.smoke.camera import Camera
 from wlm.smoke.data import write_six_way
 from wlm.smoke.lightmaps import SixWay
@@ -39,6 +42,21 @@ def picture(page) -> np.ndarray:
     """What is on the canvas, after the next frame."""
     page.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
     return np.asarray(Image.open(io.BytesIO(page.locator("#view").screenshot())).convert("RGB")).astype(int)
+
+
+def told(page) -> str:
+    """What the panel says of the pointer's place, after the next frame."""
+    page.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+    return "   ".join(page.locator("#panel .told span").all_inner_texts())
+
+
+def light_of(text: str, name: str) -> np.ndarray:
+    """A light that the panel tells."""
+    return np.array([float(x) for x in re.search(rf"{name} (\S+) (\S+) (\S+)", text).groups()])
+
+
+def texel_of(text: str) -> tuple[int, int]:
+    return tuple(map(int, re.match(r"texel (\d+), (\d+)   UV ", text).groups()))
 
 
 @pytest.fixture(scope="module")
@@ -111,6 +129,88 @@ def test_the_original_its_error_and_the_wipe(tmp_path, show):
     np.testing.assert_array_equal(split[:, middle + 2 :], decoded[:, middle + 2 :])
     page.get_by_role("button", name="error", exact=True).click()
     assert np.abs(picture(page) - decoded).max() > 50
+
+
+@pytest.mark.parametrize("touch", [False, True])
+def test_a_texel_tells_its_tile_and_its_light(model, lightmaps, tmp_path, show, touch):
+    model.save(tmp_path / "four.wlm")
+    small_sets.write_set(tmp_path / "set", lightmaps)
+    write_page(tmp_path / "page.html", [tmp_path / "four.wlm"], original=tmp_path / "set", hours=5)
+    page = show(tmp_path / "page.html", touch=touch)
+    point = page.touchscreen.tap if touch else page.mouse.move
+    box, hour, decoder = page.locator("#view").bounding_box(), lightmaps.times[2], model.decoder()
+    page.evaluate(f"wlm.then(({{kind}}) => kind.read({hour}))")
+    assert told(page) == "point at the picture to read a texel"
+    middle = np.array([box["x"] + box["width"] / 2, box["y"] + box["height"] / 2])
+    for x, y, kind in ((-100, -60, "dynamic"), (60, -100, "static"), (-100, 60, "constant"), (60, 60, "empty")):
+        point(*(middle + [x, y]))
+        text = told(page)
+        column, row = texel_of(text)
+        # The picture's 256 texels are square, and fill the height but for a margin.
+        expected = 128 + np.array([x, y]) * 256 * 1.08 / box["height"]
+        assert np.abs([column + 0.5, row + 0.5] - expected).max() < 1
+        u, v = map(float, re.search(r"UV (\S+) (\S+)", text).groups())
+        assert np.abs(np.array([u, v]) * 256 - expected).max() < 0.1
+        number = row // 128 * 2 + column // 128
+        assert f"tile {number} ({kind})" in text and TileKind(model.kind[number]).name.lower() == kind
+        gamma, radiance = model.profile.gamma, decoder.frame(hour)
+        apart = light_of(text, "decoded") ** (1 / gamma) - radiance[row, column] ** (1 / gamma)
+        assert np.abs(apart).max() < 2 / 255 * radiance.max() ** (1 / gamma)
+        if kind != "empty":
+            original = lightmaps.frames[2][row, column]
+            assert np.abs(light_of(text, "original") - original).max() <= original.max() / 400
+    if not touch:
+        # What is outside of the mask has no error, though the original was filled there and the decoded light is 0.
+        page.get_by_role("button", name="error", exact=True).click()
+        seen = picture(page)
+        rows, columns = (size // 2 + np.arange(5, 100) for size in seen.shape[:2])
+        assert seen[rows][:, columns].max() == 0 and seen[rows - 105][:, columns - 105].max() > 50
+        page.get_by_role("button", name="decoded", exact=True).click()
+    point(*(middle - 100))
+    before = told(page)
+    page.evaluate(f"wlm.then(({{kind}}) => kind.read({hour + 1}))")
+    after = told(page)
+    assert after.startswith(before.split("decoded")[0]) and after != before and "original" not in after
+    point(box["x"] + 2, middle[1])
+    assert told(page) == "point at the picture to read a texel"
+
+
+@pytest.mark.parametrize("kind", atlas_models.KINDS)
+def test_a_texel_of_an_atlas(kind, tmp_path, show):
+    """A cube of six charts, and one inside that is never seen."""
+    mesh = atlas_meshes.charts()
+    model = atlas_models.random_model(mesh, kind)
+    wlm.atlas.export(model, tmp_path / "cube", mesh)
+    _, light = atlas_meshes.write_files(tmp_path, mesh)
+    write_page(tmp_path / "page.html", [tmp_path / "cube"], original=light)
+    page = show(tmp_path / "page.html")
+    box, exposure = page.locator("#view").bounding_box(), page.evaluate("wlm.then(({manifest}) => manifest.exposure)")
+    shown, decoder, seen = picture(page), model.decoder(), set()
+    for x, y in ((0.5, 0.35), (0.4, 0.6), (0.6, 0.6), (0.45, 0.4), (0.55, 0.7)):
+        x, y = int(x * box["width"]), int(y * box["height"])
+        page.mouse.move(box["x"] + x + 0.5, box["y"] + y + 0.5)
+        text = told(page)
+        column, row = texel_of(text)
+        seen.add((row // 24, column // 16))
+        decoded = light_of(text, "decoded")
+        if len(model.uv):
+            # Read where the pixel reads it; elsewhere it is that of the texel.
+            code = np.clip(decoded * exposure, 0, 1)
+            code = np.where(code <= 0.0031308, 12.92 * code, 1.055 * code ** (1 / 2.4) - 0.055)
+            assert np.abs(shown[y, x] - 255 * code).max() <= 4
+        else:
+            place = torch.tensor([[(column + 0.5) / 64, (row + 0.5) / 48]], dtype=torch.float32)
+            assert np.abs(decoded - decoder.read(place).numpy()[0]).max() < 2 / 255 * 3
+        original = mesh.filled[row, column]
+        assert np.abs(light_of(text, "original") - original).max() <= original.max() / 400
+        if kind == "tiles":
+            wide, high, left, top = map(int, re.search(r"(\d+) × (\d+) texels at (\d+), (\d+)", text).groups())
+            first, size = unpack_entries(
+                model.lut[min(row // 7, len(model.lut) - 1), min(column // 7, len(model.lut[0]) - 1)]
+            )
+            assert [left, top] == first.tolist() and [wide, high] == size.tolist()
+        assert ("tile" in text) == (kind == "tiles")
+    assert len(seen) == 3 and (1, 2) not in seen, "three sides of the cube, and nothing of what is inside"
 
 
 @pytest.mark.parametrize("kind", atlas_models.KINDS)

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from wlm.smoke.camera import Camera
-from wlm.smoke.evaluation import Contender, HeldOut, Method
+from wlm.smoke.evaluation import Contender, Entry, HeldOut
 from wlm.smoke.learn.pool import Pool
 from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.planes import GUIDES, PLANES
@@ -25,11 +25,11 @@ def coarse(pool: Pool, part: slice) -> torch.Tensor:
     return pool.guides[part][:, :, [_SIX.index(name) for name in PLANES]].float()
 
 
-def flip_book(held_out: HeldOut) -> tuple[Pool, Method]:
+def flip_book(held_out: HeldOut) -> Entry:
     """What a flip book baked from the first view shows in the others: that view's own planes, as `billboard` does.
 
     Returns:
-        The samples of the other views, none where there is one view, and the method for them.
+        It, with the samples of the other views, none where there is one view.
 
     Raises:
         ValueError: The samples aren't whole sets of views.
@@ -40,10 +40,13 @@ def flip_book(held_out: HeldOut) -> tuple[Pool, Method]:
     number = torch.arange(len(pool), device=pool.device)
     others = number[(number % views > 0) & held_out.keep]
     baked = pool.targets[others - others % views]
-    return pool.take(others), lambda _, part: baked[part].float()
+    return Entry(others, pool.take(others), lambda _, part: baked[part].float())
 
 
-RIVALS: dict[str, Contender] = {COARSE: lambda held_out: (held_out.pool("six"), coarse), FLIP_BOOK: flip_book}
+RIVALS: dict[str, Contender] = {
+    COARSE: lambda held_out: Entry(held_out.kept, held_out.pool("six"), coarse),
+    FLIP_BOOK: flip_book,
+}
 """What `wlm smoke evaluate` compares a network with."""
 
 

@@ -19,7 +19,7 @@ from wlm.cli.console import (
     table,
     write_json,
 )
-from wlm.cli.options import CheckpointEvery, Device, ReportFile, Resume, Seed, output_option
+from wlm.cli.options import CheckpointEvery, Device, PageFile, ReportFile, Resume, Seed, output_option
 from wlm.cli.smoke_options import Input, SmokeOptions, with_smoke, write_lightmaps
 from wlm.errors import WlmError
 
@@ -147,6 +147,7 @@ def evaluate(
         int | None, typer.Option(min=16, max=512, help="Of the air along the box's edges; default as it was trained.")
     ] = None,
     json_path: ReportFile = None,
+    html_path: PageFile = None,
     device: Device = "cpu",
 ) -> None:
     """Measure a network on smoke that it hasn't learned from, beside a coarse march and a flip book.
@@ -157,6 +158,8 @@ def evaluate(
     """
     if json_path is not None:
         check_output(json_path, ".json")
+    if html_path is not None:
+        check_output(html_path, ".html")
     quiet_warp()
     from wlm.baselines.smoke import RIVALS
     from wlm.interop import check_device
@@ -172,6 +175,10 @@ def evaluate(
     if json_path is not None:
         facts = {"network": _facts(network, model), "device": device, **sizes}
         write_json(json_path, facts | {"sets": [comparison.to_json() for comparison in comparisons]})
+    if html_path is not None:
+        from wlm.view.reports import smoke_report
+
+        smoke_report(html_path, network.stem, model, comparisons)
     _show_comparisons(network, comparisons)
 
 

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
+from numpy.typing import ArrayLike
 
 from wlm.errors import WlmError
 from wlm.fluid import faces as fluid_faces
@@ -138,7 +139,7 @@ class Lattice:
 
     # Setting up.
 
-    def set_wall(self, face: str, velocity=(0.0, 0.0, 0.0), *, slip: bool = False) -> None:
+    def set_wall(self, face: str, velocity: ArrayLike = (0.0, 0.0, 0.0), *, slip: bool = False) -> None:
         """Closes a face.
 
         Args:
@@ -148,7 +149,7 @@ class Lattice:
         """
         self._set_face(face, fluid_faces.wall(self.shape, face, velocity, slip))
 
-    def set_inlet(self, face: str, velocity, where=None) -> None:
+    def set_inlet(self, face: str, velocity: ArrayLike, where: ArrayLike | None = None) -> None:
         """Lets air in through a face, or a part of it.
 
         Args:
@@ -168,7 +169,14 @@ class Lattice:
         """
         self._set_face(face, fluid_faces.outlet(self.shape, face, density))
 
-    def set_solid(self, mask, velocity=(0.0, 0.0, 0.0), *, spin=(0.0, 0.0, 0.0), centre=(0.0, 0.0, 0.0)) -> None:
+    def set_solid(
+        self,
+        mask: ArrayLike | wp.array,
+        velocity: ArrayLike = (0.0, 0.0, 0.0),
+        *,
+        spin: ArrayLike = (0.0, 0.0, 0.0),
+        centre: ArrayLike = (0.0, 0.0, 0.0),
+    ) -> None:
         """Sets which cells are solid and how they move; call it again when they have moved.
 
         Cells that are no longer solid get the equilibrium of the mean of their neighbours. It syncs with the device and
@@ -195,7 +203,7 @@ class Lattice:
         self._prepare()
         _check_speed(self._engine.cover(new), "a solid's surface")
 
-    def set_force(self, force) -> None:
+    def set_force(self, force: ArrayLike | wp.array | None) -> None:
         """Sets the force on the air.
 
         Args:
@@ -218,7 +226,7 @@ class Lattice:
         else:
             self._engine.set_force(None, wp.array(vectors.reshape(-1, 3), dtype=wp.vec3, device=self.device))
 
-    def set_flow(self, velocity=(0.0, 0.0, 0.0), density=1.0) -> None:
+    def set_flow(self, velocity: ArrayLike = (0.0, 0.0, 0.0), density: ArrayLike = 1.0) -> None:
         """Sets all air to the equilibrium of a velocity and a density.
 
         Args:

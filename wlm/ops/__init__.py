@@ -4,51 +4,35 @@ Functions with gradients by autograd, on the device of their tensors; on CUDA th
 All floats are float32, and there is no second derivative. `plain` has each of them again in a few lines of torch, of
 any float type: the definition that the kernels are held to. The page is docs/ops.md.
 
-    bc7_map, bc7_texels, bc7_blocks     a feature map in BC7 mode 6 blocks: sampled, whole, and as a file's bytes
-    plane, triplane, volume     feature grids, sampled linearly
-    mlp                     small networks of two hidden layers
-    gaussian_sum            a sum of 3D Gaussians at any points
-    rasterize, rasterize_uv, interpolate, texture       triangles to pixels
-    march                   transmittance and single-scattered light through a density grid
+    bc7_map, bc7_texels, bc7_blocks     feature maps in BC7 blocks
+    plane, triplane, volume             feature grids, sampled linearly
+    mlp                                 networks of two hidden layers
+    gaussian_sum                        3D Gaussians at any points
+    rasterize, rasterize_uv             triangles to pixels
+    interpolate, texture                what a pixel then shows
+    march                               light through a density grid
 """
 
 from wlm._facade import facade
 
-__all__ = [
-    "Raster",
-    "bc7_blocks",
-    "bc7_map",
-    "bc7_texels",
-    "gaussian_sum",
-    "interpolate",
-    "march",
-    "mlp",
-    "plain",
-    "plane",
-    "rasterize",
-    "rasterize_uv",
-    "texture",
-    "triplane",
-    "volume",
-]
+_PLACES = {
+    "Raster": "wlm.ops.raster",
+    "bc7_blocks": "wlm.ops.blocks",
+    "bc7_map": "wlm.ops.blocks",
+    "bc7_texels": "wlm.ops.blocks",
+    "gaussian_sum": "wlm.ops.gaussians",
+    "interpolate": "wlm.ops.raster",
+    "march": "wlm.ops.marching",
+    "mlp": "wlm.ops.networks",
+    "plain": "wlm.ops.plain",
+    "plane": "wlm.ops.sampling",
+    "rasterize": "wlm.ops.raster",
+    "rasterize_uv": "wlm.ops.raster",
+    "texture": "wlm.ops.raster",
+    "triplane": "wlm.ops.sampling",
+    "volume": "wlm.ops.sampling",
+}
 
-__getattr__, __dir__ = facade(
-    __name__,
-    {
-        "Raster": "wlm.ops.raster",
-        "bc7_blocks": "wlm.ops.blocks",
-        "bc7_map": "wlm.ops.blocks",
-        "bc7_texels": "wlm.ops.blocks",
-        "gaussian_sum": "wlm.ops.gaussians",
-        "interpolate": "wlm.ops.raster",
-        "march": "wlm.ops.marching",
-        "mlp": "wlm.ops.networks",
-        "plain": "wlm.ops.plain",
-        "plane": "wlm.ops.sampling",
-        "rasterize": "wlm.ops.raster",
-        "rasterize_uv": "wlm.ops.raster",
-        "texture": "wlm.ops.raster",
-        "triplane": "wlm.ops.sampling",
-        "volume": "wlm.ops.sampling",
-    },
-)
+__all__ = sorted(_PLACES)
+
+__getattr__, __dir__ = facade(__name__, _PLACES)

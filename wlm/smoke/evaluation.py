@@ -16,8 +16,9 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 
 from wlm import system
@@ -40,10 +41,14 @@ Method = Callable[[Pool, slice], torch.Tensor]
 NETWORK, HALF = "network", "network, half floats"
 """Names of a network's own methods in a `Comparison`."""
 
+REFERENCE = "reference"
+"""The fine march's name in an `Example`."""
+
 DENSITIES = (0.5, 1.0, 2.0)
 """Factors on the density, those of the paper's ablation (figure 5)."""
 
 _BATCH = 8  # samples
+_EXAMPLES = 2  # of a comparison
 _STILL = 1e-4  # a flicker of no more than this, a fortieth of a byte's step, counts as none
 
 
@@ -58,6 +63,7 @@ class Score(system.Report):
         flicker: Mean absolute change of the six lightmaps from frame to frame where smoke is visible, after warping the
             earlier frame by the smoke's motion. Shadows that move otherwise and new smoke count too.
         reference_flicker: The same of the targets, in which nothing flickers.
+        images: PSNR of each image: of both frames of the first sample, then of the second.
     """
 
     psnr: float
@@ -66,6 +72,7 @@ class Score(system.Report):
     planes: tuple[float, ...]
     flicker: float
     reference_flicker: float
+    images: tuple[float, ...]
 
     @property
     def flicker_ratio(self) -> float:
@@ -125,8 +132,8 @@ def evaluate(
         data = make_validation(settings, device, test=True, progress=progress)
         if not len(data):
             raise WlmError("test set: expected frames with smoke, found none")
-    pool, method = _at_run_time(model, device, data.to(device), half)
-    scores = score(method, pool, progress=progress)
+    pool = data.to(device)
+    scores = score(_at_run_time(model, device, pool, half), pool, progress=progress)
     return Report(**vars(scores), samples=len(pool), bytes=model.file_bytes() if file_bytes is None else file_bytes)
 
 
@@ -189,7 +196,7 @@ def score(method: Method, pool: Pool, *, batch: int = _BATCH, progress: OnProgre
     planes = tuple(psnr_from_mse(value, 1.0) for value in errors.mean(0).tolist())
     flicker, target_flicker, count = torch.stack(changes).sum(0).tolist()
     means = (flicker / count, target_flicker / count) if count else (math.nan, math.nan)
-    return Score(sum(images) / len(images), min(images), max(images), planes, *means)
+    return Score(sum(images) / len(images), min(images), max(images), planes, *means, tuple(images))
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,12 +220,45 @@ class HeldOut:
         same = guide == self.settings.guide
         return (self.whole if same else self.make(_with_guide(self.settings, guide))).take(self.keep)
 
+    @property
+    def kept(self) -> torch.Tensor:
+        """int [n], the numbers of the samples that count."""
+        return self.keep.nonzero().flatten()
 
-Contender = Callable[[HeldOut], tuple[Pool, Method]]
-"""Takes those held-out samples that a method is scored on, maybe none, and gives the method."""
+
+class Entry(NamedTuple):
+    """A method, with what it is scored on.
+
+    Attributes:
+        numbers: int [n], which of all held-out samples; maybe none.
+        pool: These samples, with what the method reads.
+        method: The method.
+    """
+
+    numbers: torch.Tensor
+    pool: Pool
+    method: Method
 
 
-@dataclass(frozen=True)
+Contender = Callable[[HeldOut], Entry]
+"""Enters a method for held-out samples."""
+
+
+@dataclass(frozen=True, eq=False)
+class Example:
+    """An image on which the network does badly.
+
+    Attributes:
+        frame, view: Its place in `Comparison.images`.
+        planes: float16 [8, H, W] on the CPU, encoded lightmaps of `REFERENCE` and of each method that has this image.
+    """
+
+    frame: int
+    view: int
+    planes: dict[str, torch.Tensor]
+
+
+@dataclass(frozen=True, eq=False)
 class Comparison:
     """Methods on one held-out set.
 
@@ -226,11 +266,18 @@ class Comparison:
         name: What the samples show.
         samples: Number of frame pairs and views.
         methods: Scores by name.
+        turns: float [views], degrees by which each view is turned about the smoke.
+        images: PSNR of each image by the method's name, [frames, views]; NaN where the method has no such image. Both
+            frames of a pair follow each other; those of a volume are alike.
+        worst: The samples on which the network does worst, each by its worse frame, the worst first.
     """
 
     name: str
     samples: int
     methods: dict[str, Score]
+    turns: np.ndarray
+    images: dict[str, np.ndarray]
+    worst: tuple[Example, ...]
 
     @property
     def half_loss(self) -> float | None:
@@ -275,9 +322,16 @@ def compare(
     device, guide = check_device(device), model.settings.guide
     settings = _with_guide(settings or model.dataset, guide)
     network = copy.deepcopy(model.network).to(device)
-    contenders: dict[str, Contender] = {NETWORK: lambda held_out: (held_out.pool(guide), of_network(network))}
+
+    def at_run_time(held_out: HeldOut) -> Entry:
+        pool = held_out.pool(guide)
+        return Entry(held_out.kept, pool, _at_run_time(model, device, pool))
+
+    contenders: dict[str, Contender] = {
+        NETWORK: lambda held_out: Entry(held_out.kept, held_out.pool(guide), of_network(network))
+    }
     if device != "cpu":
-        contenders[HALF] = lambda held_out: _at_run_time(model, device, held_out.pool(guide))
+        contenders[HALF] = at_run_time
     contenders |= rivals or {}
     # All frames are made, so that each has its first view; almost empty ones don't count, but in volumes all do.
     complete = settings.model_copy(update={"kept_empty": 1.0})
@@ -294,23 +348,49 @@ def compare(
     for name, (make, least_coverage) in sets.items():
         whole = make(complete)
         held_out = HeldOut(whole, whole.covered() > least_coverage, complete, make)
-        count = int(held_out.keep.sum())
-        if not count:
+        if not len(held_out.kept):
             raise WlmError(f"{name}: expected frames with smoke, found none")
-        scores = {}
-        for method_name, contender in contenders.items():
-            # One after the other: each pool is a copy.
-            pool, method = contender(held_out)
-            if len(pool):
-                scores[method_name] = score(method, pool)
-        comparisons.append(Comparison(name, count, scores))
-        meter.report(len(comparisons), PSNR_dB=scores[NETWORK].psnr)
+        comparisons.append(_compare(name, held_out, contenders))
+        meter.report(len(comparisons), PSNR_dB=comparisons[-1].methods[NETWORK].psnr)
     return comparisons
 
 
-def _at_run_time(model: SmokeModel, device: str, pool: Pool, half: bool = True) -> tuple[Pool, Method]:
+@torch.no_grad()
+def _compare(name: str, held_out: HeldOut, contenders: Mapping[str, Contender]) -> Comparison:
+    """Scores methods on one smoke; the first is the network, whose worst images all show."""
+    views = held_out.settings.views
+    scores: dict[str, Score] = {}
+    images: dict[str, np.ndarray] = {}
+    worst: list[tuple[int, int]] = []  # a sample and its worse frame
+    planes: list[dict[str, torch.Tensor]] = []
+    for method_name, contender in contenders.items():
+        # One after the other: each pool is a copy.
+        numbers, pool, method = contender(held_out)
+        if not len(pool):
+            continue
+        scores[method_name] = score(method, pool)
+        found = np.full((len(held_out.whole), 2), np.nan)
+        found[numbers.cpu().numpy()] = np.reshape(scores[method_name].images, (-1, 2))
+        images[method_name] = found.reshape(-1, views, 2).swapaxes(1, 2).reshape(-1, views)
+        if not worst:
+            order = np.argsort(np.nan_to_num(found.min(1), nan=np.inf))[: min(len(pool), _EXAMPLES)]
+            worst = [(int(sample), int(found[sample].argmin())) for sample in order]
+            planes = [{REFERENCE: held_out.whole.targets[place].cpu()} for place in worst]
+        for (sample, frame), shown in zip(worst, planes, strict=True):
+            for i in (numbers == sample).nonzero().flatten().tolist():
+                shown[method_name] = method(pool, slice(i, i + 1))[0, frame].half().cpu()
+    examples = tuple(
+        Example(2 * (sample // views) + frame, sample % views, shown)
+        for (sample, frame), shown in zip(worst, planes, strict=True)
+    )
+    turns = held_out.settings.arc / views * np.arange(views)
+    return Comparison(name, len(held_out.kept), scores, turns, images, examples)
+
+
+def _at_run_time(model: SmokeModel, device: str, pool: Pool, half: bool = True) -> Method:
+    """The network's decoder, for images of the pool's size."""
     height, width = pool.guides.shape[-2:]
-    return pool, of_decoder(Decoder(model, device, height=height, width=width, half=half))
+    return of_decoder(Decoder(model, device, height=height, width=width, half=half))
 
 
 def _with_guide(settings: DatasetSettings, kind: str) -> DatasetSettings:

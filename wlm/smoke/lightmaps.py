@@ -44,8 +44,7 @@ class SixWay:
         emission: float32 tensor [H, W], the light that the smoke gives off itself, or None: it is cold.
         camera: The view, or None: not known, as in an engine's textures.
         depth: float32 tensor [H, W], distance along the ray to the smoke's surface in the world's unit, 0 where there
-        is
-            none; or None: not known.
+            is none; or None: not known.
         error: Of the march, or None: not estimated.
     """
 

@@ -76,7 +76,6 @@ def _scene(
 class _AtlasScene(SurfaceScene):
     model: AtlasModel | None
     light: dict[str, np.ndarray]
-    mask: np.ndarray
     note: str
 
     def lights(self, state: State) -> dict[str, np.ndarray]:

@@ -1,4 +1,4 @@
-"""Scores as a page: tables, plots by hour, tile and band, and pictures of what is worst. One HTML file, no script."""
+"""Scores as a page: tables, plots by hour, tile or frame, and pictures of what is worst. One HTML file, no script."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import io
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -17,7 +18,7 @@ from PIL import Image
 from wlm.formats.atomic import atomic_write
 
 _WIDTH, _HEIGHT, _DPI = 7.0, 2.6, 160  # inches, dots an inch: sharp on dense screens
-_LINES = ("#c2571a", "#3a6ea5", "#5b8c3a", "#8a5aa8")
+_LOOKS = (("#c2571a", "o"), ("#3a6ea5", "s"), ("#5b8c3a", "^"), ("#8a5aa8", "D"))  # of series
 _STYLE = """
 :root { color-scheme: light dark; }
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 980px; margin: 24px auto; padding: 0 16px; }
@@ -56,15 +57,11 @@ class Document:
 
     def lines(self, heading: str, unit: str, places: np.ndarray, series: Mapping[str, np.ndarray]) -> None:
         """Adds a plot of numbers over times or other places [N]; NaN leaves a gap."""
-        figure = Figure(figsize=(_WIDTH, _HEIGHT), layout="constrained")
-        axes = figure.add_subplot()
-        for colour, (name, values) in zip(_LINES * len(series), series.items(), strict=False):
-            axes.plot(places, values, ".-", color=colour, label=name)
-        axes.set_ylabel(unit)
-        axes.grid(alpha=0.3)
-        if len(series) > 1:
-            axes.legend()
-        self._add(heading, _png_of(figure))
+        self._plot(heading, unit, places, series, "-")
+
+    def points(self, heading: str, unit: str, names: Sequence[str], series: Mapping[str, Sequence[float]]) -> None:
+        """Adds a plot of a number for each name; NaN leaves a gap."""
+        self._plot(heading, unit, names, series, "none")
 
     def grid(self, heading: str, unit: str, values: np.ndarray) -> None:
         """Adds a map of numbers [rows, columns], one a tile; NaN stays empty."""
@@ -87,7 +84,7 @@ class Document:
         """Adds how often numbers of each size are; those that aren't finite are left out."""
         figure = Figure(figsize=(_WIDTH, _HEIGHT), layout="constrained")
         axes = figure.add_subplot()
-        axes.hist(values[np.isfinite(values)], bins=60, color=_LINES[1])
+        axes.hist(values[np.isfinite(values)], bins=60, color=_LOOKS[1][0])
         axes.set_xlabel(unit)
         self._add(heading, _png_of(figure))
 
@@ -111,6 +108,20 @@ class Document:
         head = f"{meta}\n<title>{title}</title>\n<style>{_STYLE}</style>"
         page = f'<!doctype html>\n<html lang="en">\n{head}\n<h1>{title}</h1>\n'
         return atomic_write(path, (page + "\n".join(self._parts) + "\n</html>\n").encode())
+
+    def _plot(
+        self, heading: str, unit: str, places: Sequence[float] | Sequence[str], series: Mapping[str, Any], line: str
+    ) -> None:
+        figure = Figure(figsize=(_WIDTH, _HEIGHT), layout="constrained")
+        axes = figure.add_subplot()
+        for i, (name, values) in enumerate(series.items()):
+            colour, mark = _LOOKS[i % len(_LOOKS)]
+            axes.plot(places, values, mark, linestyle=line, markersize=4, color=colour, label=name)
+        axes.set_ylabel(unit)
+        axes.grid(alpha=0.3)
+        if len(series) > 1:
+            axes.legend()
+        self._add(heading, _png_of(figure))
 
     def _add(self, heading: str, content: str) -> None:
         self._parts.append((f"<h2>{html.escape(heading)}</h2>\n" if heading else "") + content)

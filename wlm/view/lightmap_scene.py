@@ -59,6 +59,7 @@ def lightmap_scene(
         geometry=flat_geometry(height, width) if geometry is None else geometry,
         height=height,
         width=width,
+        mask=None if lightmaps is None else lightmaps.mask,
         model=model,
         lightmaps=lightmaps,
     )

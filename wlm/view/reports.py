@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping, Sequence
 
 import numpy as np
+import torch
 
 from wlm.atlas.data import LightmappedMesh
 from wlm.atlas.evaluation import Report as AtlasReport
@@ -20,13 +22,20 @@ from wlm.probe.data import ProbeSet
 from wlm.probe.decode import Decoder as ProbeDecoder
 from wlm.probe.evaluation import Report as ProbeReport
 from wlm.probe.model import ProbeModel
+from wlm.smoke.camera import Camera
+from wlm.smoke.evaluation import NETWORK, REFERENCE, Comparison, Example
+from wlm.smoke.model import SmokeModel, parameter_count
+from wlm.smoke.planes import EMISSION_PLANE, PLANES, decode_lightmaps
+from wlm.smoke.shading import Light
 from wlm.view.atlas import draw, original
 from wlm.view.display import Display, white_of
 from wlm.view.document import Document
 
 _WORST_TILES, _WORST_PROBES = 3, 10
 _GAIN = 8.0  # of errors in pictures
-_SIDE = 300  # of a picture, in the page's pixels
+_SIDE, _SMALL_SIDE = 300, 220  # of pictures, three or four in a row, in the page's pixels
+_LIT_FROM = (1.0, 1.0, 1.0)  # smoke, in the camera's axes
+_BEHIND = (0.1, 0.12, 0.15)  # smoke
 
 
 def lightmap_report(
@@ -44,9 +53,6 @@ def lightmap_report(
     Raises:
         WlmError: The file can't be written.
     """
-    page = Document(f"{model.name}: {report.profile}")
-    for warning in report.warnings:
-        page.text(warning, warning=True)
     kinds = ", ".join(f"{count} {kind}" for kind, count in report.kinds.items() if count)
     rows = [
         ("PSNR", _number(report.psnr, ".2f", "dB")),
@@ -57,7 +63,7 @@ def lightmap_report(
         ("bits per texel and time", _number(report.bpp, ".3f")),
         ("tiles", kinds),
     ]
-    page.table("", ("", ""), rows)
+    page = _begin(model.name, report.profile, report.warnings, rows)
     page.lines("PSNR by hour, mean of the tiles", "dB", report.time_values, {"PSNR": report.psnr_by_time})
     if np.isfinite(report.flip_by_time).any():
         page.lines("FLIP by hour, mean of the tiles", "FLIP", report.time_values, {"FLIP": report.flip_by_time})
@@ -86,14 +92,8 @@ def _worst_tiles(page: Document, model: LightmapModel, lightmaps: LightmapSet, r
             span = valid.max() - valid.min()
             found.append((psnr_from_mse(mse, span) if span > 0 else np.inf, i, then, now))
         least, i, then, now = min(found, key=lambda each: each[0])
-        display = Display(1.0 / white_of(then[mask]))
-        pictures = {
-            "original": display.picture(then),
-            "decoded": display.picture(now * mask[..., None]),
-            f"error × {_GAIN:g}": display.picture(np.abs(then - now) * mask[..., None] * _GAIN),
-        }
         heading = f"Tile {number}, mean {scores[number]:.2f} dB; worst at {model.times[i]:g}: {least:.2f} dB"
-        page.pictures(heading, pictures, _SIDE)
+        _beside(page, heading, "original", then, {"decoded": now}, mask)
 
 
 def atlas_report(
@@ -112,11 +112,7 @@ def atlas_report(
     Raises:
         WlmError: The file can't be written.
     """
-    page = Document(f"{model.name}: {model.profile.name}")
-    for warning in mesh.warnings:
-        page.text(warning, warning=True)
-    if not report.views:
-        page.text("No camera outside the mesh sees its front: the scores of views are missing.", warning=True)
+    unseen = "No camera outside the mesh sees its front: the scores of views are missing."
     rows = [
         ("PSNR in views", _number(report.psnr, ".2f", "dB")),
         ("PSNR of the worst view", _number(report.psnr_worst, ".2f", "dB")),
@@ -127,25 +123,15 @@ def atlas_report(
         ("saved on disk", _number(100 * report.cr_disk, ".2f", "%")),
         ("views that see the mesh", f"{report.views}"),
     ]
-    page.table("", ("", ""), rows)
+    warnings = [*mesh.warnings, *([] if report.views else [unseen])]
+    page = _begin(model.name, model.profile.name, warnings, rows)
     decoder = model.decoder()
     if report.worst_view >= 0:
         view = sphere_views(views)[report.worst_view]
         drawn, hit = draw(mesh, {"original": original(mesh), "decoded": decoder}, view)
-        display = Display(1.0 / white_of(drawn["original"][hit]))
-        error = np.abs(drawn["original"] - drawn["decoded"])
-        pictures = {name: display.picture(light) for name, light in drawn.items()}
-        pictures[f"error × {_GAIN:g}"] = display.picture(error * _GAIN)
-        page.pictures(f"The worst view, camera {report.worst_view}", pictures, _SIDE)
-    lightmap = decoder.lightmap(mesh)
-    then, mask = mesh.lightmap * mesh.mask[..., None], mesh.mask[..., None]
-    display = Display(1.0 / white_of(mesh.lightmap[mesh.mask]))
-    pictures = {
-        "original": display.picture(then),
-        "decoded": display.picture(lightmap * mask),
-        f"error × {_GAIN:g}": display.picture(np.abs(then - lightmap * mask) * _GAIN),
-    }
-    page.pictures("The lightmap", pictures, _SIDE)
+        then = drawn.pop("original")
+        _beside(page, f"The worst view, camera {report.worst_view}", "original", then, drawn, hit)
+    _beside(page, "The lightmap", "original", mesh.lightmap, {"decoded": decoder.lightmap(mesh)}, mesh.mask)
     return page.write(path)
 
 
@@ -162,9 +148,6 @@ def probe_report(path: str | os.PathLike[str], model: ProbeModel, probes: ProbeS
     Raises:
         WlmError: The file can't be written.
     """
-    page = Document(f"{report.name}: {model.profile.name}")
-    for warning in probes.warnings:
-        page.text(warning, warning=True)
     rows = [
         ("PSNR of coefficients", _number(report.psnr, ".2f", "dB")),
         ("PSNR of the live probes", _number(report.psnr_live, ".2f", "dB")),
@@ -174,7 +157,7 @@ def probe_report(path: str | os.PathLike[str], model: ProbeModel, probes: ProbeS
         ("of float32", _number(100 * report.ratio, ".2f", "%")),
         ("probes", f"{report.probes:,}, {report.live:,} live"),
     ]
-    page.table("", ("", ""), rows)
+    page = _begin(report.name, model.profile.name, probes.warnings, rows)
     if report.psnr_by_band is not None:
         bands = np.asarray(report.psnr_by_band, np.float64)
         page.table("PSNR by band", ("band", "dB"), [(str(i), _number(value, ".2f")) for i, value in enumerate(bands)])
@@ -188,6 +171,110 @@ def probe_report(path: str | os.PathLike[str], model: ProbeModel, probes: ProbeS
     rows = [(str(i), _number(psnr[i], ".2f"), *(f"{x:.4g}" for x in probes.position[i])) for i in worst]
     page.table("The worst probes", ("probe", "dB", "x", "y", "z"), rows)
     return page.write(path)
+
+
+def smoke_report(path: str | os.PathLike[str], name: str, model: SmokeModel, comparisons: Sequence[Comparison]) -> int:
+    """Writes a smoke report: scores of the network and its rivals by plane, frame and view, and the worst images.
+
+    Args:
+        path: The page, `.html`; its folder must exist.
+        name: The network's.
+        model, comparisons: As they were given to `wlm.smoke.evaluation.compare` and came from it.
+
+    Returns:
+        The page's bytes.
+
+    Raises:
+        WlmError: The file can't be written.
+    """
+    rows = [
+        ("parameters", f"{parameter_count(model.network):,}"),
+        ("file", f"{model.file_bytes():,} bytes"),
+        ("guiding map", model.settings.guide),
+    ]
+    page = _begin(name, str(model.summary.get("profile", "network")), (), rows)
+    scores = [
+        (comparison.name, method, *(_number(value, ".2f") for value in (score.psnr, score.lowest, score.highest)))
+        + (_number(score.flicker_ratio, ".3f"),)
+        for comparison in comparisons
+        for method, score in comparison.methods.items()
+    ]
+    page.text(
+        "PSNR is of the six lightmaps in sRGB, of both frames of each pair; lowest and highest are over the images. "
+        "Flicker is what changes from frame to frame beside the motion, over the same of the reference."
+    )
+    page.table("Scores", ("smoke", "method", "PSNR dB", "lowest", "highest", "flicker"), scores)
+    for comparison in comparisons:
+        _smoke(page, comparison)
+    return page.write(path)
+
+
+def _smoke(page: Document, comparison: Comparison) -> None:
+    """What a comparison's scores are made of."""
+    name = comparison.name
+    planes = {method: score.planes for method, score in comparison.methods.items()}
+    page.points(f"{name}: PSNR by light, of opacity and of emission", "dB", PLANES, planes)
+    frames = len(next(iter(comparison.images.values())))
+    # A volume has one frame, twice.
+    if frames > 2:
+        means = {method: _means(images) for method, images in comparison.images.items()}
+        page.lines(f"{name}: PSNR by frame, mean of the views", "dB", np.arange(1.0, frames + 1), means)
+    if len(comparison.turns) > 1:
+        means = {method: _means(images.T) for method, images in comparison.images.items()}
+        page.lines(f"{name}: PSNR by the view's turn in degrees, mean of the frames", "dB", comparison.turns, means)
+    for example in comparison.worst:
+        _worst_image(page, comparison, example)
+
+
+def _means(rows: np.ndarray) -> np.ndarray:
+    """Means of the numbers in each row; NaN where a row has none."""
+    count = np.isfinite(rows).sum(1)
+    return np.where(count > 0, np.nansum(rows, 1) / np.maximum(count, 1), np.nan)
+
+
+def _worst_image(page: Document, comparison: Comparison, example: Example) -> None:
+    height, width = example.planes[REFERENCE].shape[1:]
+    camera = Camera.look_at((0.0, 0.0, 1.0), np.zeros(3), extent=1.0, height=height, width=width)
+    hot = bool(example.planes[REFERENCE][EMISSION_PLANE].any())
+
+    def lit(planes: torch.Tensor) -> np.ndarray:
+        return decode_lightmaps(planes, hot=hot, camera=camera).shade([Light(_LIT_FROM)], background=_BEHIND).numpy()
+
+    shown = {method: lit(planes) for method, planes in example.planes.items()}
+    psnr = comparison.images[NETWORK][example.frame, example.view]
+    place = f"frame {example.frame + 1} from {comparison.turns[example.view]:g}°"
+    heading = f"{comparison.name}: {place}, {psnr:.2f} dB, under a light from the upper right in front"
+    _beside(page, heading, REFERENCE, shown.pop(REFERENCE), shown, np.ones((height, width), bool))
+
+
+def _begin(name: str, profile: str, warnings: Sequence[str], rows: Sequence[tuple[str, str]]) -> Document:
+    """A page with its title, warnings and summary."""
+    page = Document(f"{name}: {profile}")
+    for warning in warnings:
+        page.text(warning, warning=True)
+    page.table("", ("", ""), rows)
+    return page
+
+
+def _beside(
+    page: Document, heading: str, name: str, original: np.ndarray, others: Mapping[str, np.ndarray], mask: np.ndarray
+) -> None:
+    """Adds pictures of linear light [H, W, 3] where a mask [H, W] holds: an original, others, and their errors."""
+    display = Display(1.0 / white_of(original[mask]))
+    lights = {key: np.where(mask[..., None], light, 0.0) for key, light in {name: original, **others}.items()}
+    pictures = {key: display.picture(light) for key, light in lights.items()}
+    single = len(others) == 1
+    errors = {
+        f"error × {_GAIN:g}" if single else f"{key}: error × {_GAIN:g}": display.picture(
+            np.abs(lights[key] - lights[name]) * _GAIN
+        )
+        for key in others
+    }
+    if single:
+        page.pictures(heading, pictures | errors, _SIDE)
+    else:
+        page.pictures(heading, pictures, _SMALL_SIDE)
+        page.pictures("", errors, _SMALL_SIDE)
 
 
 def _number(value: float | None, form: str, unit: str = "") -> str:

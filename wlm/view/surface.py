@@ -36,12 +36,14 @@ class SurfaceScene(Scene):
         geometry: Where it lies, with lightmap UVs.
         brightness: Exposure at 0 EV.
         height, width: Texels.
+        mask: bool [H, W], the texels whose light counts; None: all.
     """
 
     geometry: Geometry
     brightness: float = 1.0
     height: int
     width: int
+    mask: np.ndarray | None = None
 
     @abstractmethod
     def lights(self, state: State) -> dict[str, np.ndarray]:
@@ -60,6 +62,8 @@ class SurfaceScene(Scene):
         for panel, name in enumerate(self.panels):
             if name == "error":
                 picture = display.error(lights["decoded"], lights["original"])
+                if self.mask is not None:
+                    picture[~self.mask] = 0
             else:
                 picture = display.picture(lights[name])
             if panel == 0 and state.view == "tiles":
@@ -73,7 +77,8 @@ class SurfaceScene(Scene):
         column = int(np.clip(np.floor(u * self.width), 0, self.width - 1))
         row = int(np.clip(np.floor(v * self.height), 0, self.height - 1))
         values = ", ".join(f"{name} {_rgb(light[row, column])}" for name, light in self.lights(state).items())
-        return "   ".join(filter(None, (f"texel {column}, {row}", self.tell_texel(row, column, state), values)))
+        parts = (f"texel {column}, {row}", f"UV {u:.4f} {v:.4f}", self.tell_texel(row, column, state), values)
+        return "   ".join(filter(None, parts))
 
 
 def _rgb(light: np.ndarray) -> str:

@@ -19,9 +19,12 @@ from wlm.view.scene import Scene, Slider, State
 MOVIES = {".gif": "GIF", ".webp": "WEBP"}
 """Kinds of movies, by the name's end."""
 
+STRIP = 108
+"""Height of the sliders' strip at the bottom, pixels; at most half of the window's."""
+
 _HIDDEN = ("vtkEGLRenderWindow", "vtkOSOpenGLRenderWindow")  # what VTK takes where it finds no display
 _BACKGROUND, _STRIP, _INK, _BAR = "#5a5d63", "#25272b", "#e8e8ea", "#8ab4f8"
-_STRIP_PIXELS, _TITLE_PIXELS, _FONT, _TITLE_FONT = 108, 26, 9, 10
+_TITLE_PIXELS, _FONT, _TITLE_FONT = 26, 9, 10
 # Places in the strip, as shares of its height and of the width.
 _LABELS, _BARS, _CAPTION, _TOLD, _INDENT, _LEAST_CELLS = 0.76, 0.64, 0.30, 0.06, 0.01, 3
 _EYE = (1.0, 0.8, 1.0)  # from where a scene is first seen, y up
@@ -63,7 +66,7 @@ class Window:
         common = [_EXPOSURE] + [_ERROR] * ("error" in scene.panels)
         self.sliders = {slider.name: slider for slider in (*scene.sliders, *common)}
         self.state = State({name: slider.value for name, slider in self.sliders.items()}, scene.views[0])
-        count, self._share = len(scene.panels), min(_STRIP_PIXELS / size[1], 0.5)
+        count, self._share = len(scene.panels), min(STRIP / size[1], 0.5)
         layout = {"shape": (2, count), "groups": [(1, slice(None))], "row_weights": [1.0 - self._share, self._share]}
         # Messages about a missing display would alarm for nothing where rendering is off screen.
         with pyvista.vtk_verbosity("off"):

@@ -8,6 +8,7 @@ from typing import Any, Literal
 import numpy as np
 
 from wlm.atlas.exporter import geometry, read_folder
+from wlm.atlas.model import SIDE_BITS
 from wlm.atlas.shader import atlas_glsl
 from wlm.errors import WlmError
 from wlm.formats.exr import read_exr
@@ -48,7 +49,13 @@ def folder_page(
         "height": model.height,
         "shader": atlas_glsl(model),
         "exposure": exposure(texels.astype(np.float32)),
-        "atlas": {"method": model.method, "colour": texels.shape[1::-1], "lut": model.lut.shape[1::-1]},
+        "atlas": {
+            "method": model.method,
+            "colour": texels.shape[1::-1],
+            "lut": model.lut.shape[1::-1],
+            "tile": model.profile.tile,
+            "size_bits": SIDE_BITS,
+        },
         **box,
     }
     if original is not None:

@@ -106,4 +106,6 @@ def _originals(
     chosen = np.unique(np.linspace(0, count - 1, min(hours, count)).round().astype(int))
     frames = fill_gaps(lightmaps.frames[chosen], lightmaps.mask)
     arrays = {f"original_{i}": pack_rgb9e5(frame) for i, frame in enumerate(frames)}
+    # Texels outside of it were never compressed: they have no error.
+    arrays["mask"] = lightmaps.mask.astype(np.uint8) * 255
     return {"times": lightmaps.times[chosen].tolist()}, arrays

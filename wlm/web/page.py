@@ -19,7 +19,7 @@ from wlm.formats.atomic import atomic_write
 from wlm.formats.geometry import Geometry
 
 _ALIGNMENT = 16  # bytes, of an array in the content
-_COMMON = ("content.js", "graphics.js", "blocks.js", "camera.js", "panel.js", "light.js", "surface.js")
+_COMMON = ("content.js", "graphics.js", "blocks.js", "camera.js", "panel.js", "light.js", "surface.js", "reading.js")
 _HELP = (
     "Drag to turn or move, two fingers or the wheel to zoom, shift and drag to move, double-click to begin again. "
     "Keys: arrows for the hour or frame, space plays, [ and ] change the exposure, T the tone mapping, 1 to 4 the "

@@ -11,7 +11,7 @@ class AtlasPage {
     };
     if (page.has('lut')) {
       const [across, down] = manifest.atlas.lut, tiles = manifest.atlas.method === 'tiles';
-      const lut = page.array('lut', Uint16Array);
+      const lut = this.lut = page.array('lut', Uint16Array);
       // Normalised 16-bit textures are missing in browsers, so coordinates travel on as floats.
       this.textures.wlm_atlas_lut = tiles
         ? graphics.plain(across, down, [gl.RG16UI, gl.RG_INTEGER, gl.UNSIGNED_SHORT], lut, gl.NEAREST)
@@ -21,7 +21,8 @@ class AtlasPage {
     // Four texels mixed in floats: the filter unit's eight bits show in large tiles.
     this.source = `#define WLM_ATLAS_EXACT\n${manifest.shader}\nvec3 wlm_light() { return wlm_atlas(v_coordinate); }`;
     this.display = new Display(page, panel, changed);
-    this.surface = new Surface(graphics, page, this.source, this.display, panel, changed);
+    const tell = (...texel) => this.#tell(...texel);
+    this.surface = new Surface(graphics, page, this.source, this.display, panel, changed, tell);
     this.originals = new Originals(graphics, page);
   }
 
@@ -29,10 +30,31 @@ class AtlasPage {
     this.surface.draw(this.textures, this.display.compares ? this.originals.get(0) : undefined);
   }
 
+  // What is known of a texel.
+  #tell(column, row, coordinate) {
+    const {originals} = this, [red, green, blue] = this.#light(coordinate);
+    return {
+      tile: this.manifest.atlas.method === 'tiles' ? this.#tile(column, row) : undefined,
+      decoded: [red, green, blue],
+      original: originals.times.length ? originals.texel(0, column, row) : undefined,
+    };
+  }
+
+  #tile(column, row) {
+    const {lut: [across, down], tile, size_bits: bits} = this.manifest.atlas;
+    const x = Math.min(Math.floor(column / tile), across - 1), y = Math.min(Math.floor(row / tile), down - 1);
+    const entry = [0, 1].map((i) => this.lut[2 * (y * across + x) + i]);
+    const [wide, high] = entry.map((code) => (code & ((1 << bits) - 1)) + 1);
+    const [left, top] = entry.map((code) => code >> bits);
+    return `tile ${x}, ${y}: ${wide} × ${high} texels at ${left}, ${top}`;
+  }
+
   // For scripts: light at coordinates [N, 2], RGBA.
-  async read(coordinates) {
+  async read(coordinates) { return this.#light(coordinates); }
+
+  #light(coordinates) {
     const {graphics} = this, {gl} = graphics, count = coordinates.length / 2;
-    const program = graphics.program(WHOLE, `${HEAD}
+    this.reader ??= graphics.program(WHOLE, `${HEAD}
 uniform sampler2D u_places;
 out vec4 light;
 vec2 v_coordinate;
@@ -42,8 +64,10 @@ void main() { v_coordinate = texelFetch(u_places, ivec2(gl_FragCoord.xy), 0).xy;
     const target = graphics.target(count, 1, graphics.single(), gl.NEAREST);
     gl.viewport(0, 0, count, 1);
     gl.disable(gl.DEPTH_TEST);
-    graphics.use(program, {...this.textures, u_places: places});
+    graphics.use(this.reader, {...this.textures, u_places: places});
     graphics.draw(3);
-    return graphics.read(target);
+    const light = graphics.read(target);
+    graphics.discard(places, target);
+    return light;
   }
 }

@@ -107,13 +107,26 @@ class Graphics {
     return this.plain(1024, rows, form, padded, gl.NEAREST);
   }
 
-  // A texture to draw into, with its frame buffer.
-  target(width, height, form, filter) {
+  // A texture to draw into, with its frame buffer; `depth`: what is nearer hides what is behind it.
+  target(width, height, form, filter, {depth = false} = {}) {
     const {gl} = this, result = this.plain(width, height, form, null, filter);
     result.buffer = gl.createFramebuffer();
     gl.bindFramebuffer(gl.FRAMEBUFFER, result.buffer);
     gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, result.texture, 0);
+    if (depth) {
+      gl.bindRenderbuffer(gl.RENDERBUFFER, gl.createRenderbuffer());
+      gl.renderbufferStorage(gl.RENDERBUFFER, gl.DEPTH_COMPONENT24, width, height);
+      gl.framebufferRenderbuffer(gl.FRAMEBUFFER, gl.DEPTH_ATTACHMENT, gl.RENDERBUFFER, gl.getParameter(gl.RENDERBUFFER_BINDING));
+    }
     return result;
+  }
+
+  // Gives the memory of textures and targets back.
+  discard(...items) {
+    for (const {texture, buffer} of items) {
+      this.gl.deleteTexture(texture);
+      if (buffer) this.gl.deleteFramebuffer(buffer);
+    }
   }
 
   half() { return [this.gl.RGBA16F, this.gl.RGBA, this.gl.HALF_FLOAT]; }
@@ -123,10 +136,10 @@ class Graphics {
   draw(vertices) { this.gl.drawArrays(this.gl.TRIANGLES, 0, vertices); }
 
   // RGBA of a target, as floats, row 0 first. Waits for all that was drawn before.
-  read(target, width = target.width, height = target.height) {
+  read(target, width = target.width, height = target.height, left = 0, top = 0) {
     const {gl} = this, values = new Float32Array(4 * width * height);
     gl.bindFramebuffer(gl.FRAMEBUFFER, target.buffer);
-    gl.readPixels(0, 0, width, height, gl.RGBA, gl.FLOAT, values);
+    gl.readPixels(left, top, width, height, gl.RGBA, gl.FLOAT, values);
     return values;
   }
 

@@ -97,8 +97,7 @@ class LightmapPage {
     });
     this.display = new Display(page, panel, changed);
     this.surface = new Surface(
-      graphics, page, MIXED,
-      this.display, panel, changed);
+      graphics, page, MIXED, this.display, panel, changed, (column, row) => this.#tell(column, row));
     this.originals = new Originals(graphics, page);
   }
 
@@ -212,11 +211,26 @@ class LightmapPage {
       this.setTime(this.originals.times[index]);
     }
     const original = this.display.compares ? this.originals.get(index) : undefined;
-    const [early, late] = this.seen.map((read) => this.#map(read));
-    this.surface.draw({
-      u_early: early ?? this.next, u_late: late ?? early ?? this.next, u_share: late ? this.seen[1].weight : 0,
-    }, original);
+    const [early, late] = this.#pictures();
+    this.surface.draw({u_early: early, u_late: late ?? early, u_share: late ? this.seen[1].weight : 0}, original);
   }
+
+  // What is known of a texel.
+  #tell(column, row) {
+    const {graphics, manifest, lightmap, originals} = this, index = originals.nearest(this.time, lightmap.period);
+    const number = Math.floor(row / 128) * Math.ceil(manifest.width / 128) + Math.floor(column / 128);
+    const kind = lightmap.tiles.find((tile) => tile.number === number)?.kind ?? 'empty';
+    const [early, late] = this.#pictures().map((map) => graphics.read(map, 1, 1, column, row));
+    const [red, green, blue] = late ? early.map((value, i) => mix(value, late[i], this.seen[1].weight)) : early;
+    return {
+      tile: `tile ${number} (${kind})`,
+      decoded: [red, green, blue],
+      original: originals.times[index] === this.shown ? originals.texel(index, column, row) : undefined,
+    };
+  }
+
+  // What is seen: one map or, between two stored hours, two.
+  #pictures() { return this.seen.length ? this.seen.map((read) => this.#map(read)) : [this.next]; }
 
   // For scripts: radiance of the whole map at an hour, RGBA by rows.
   async read(time) {

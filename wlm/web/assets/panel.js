@@ -12,6 +12,8 @@ class Panel {
     fold.onclick = () => { root.classList.toggle('folded'); window.dispatchEvent(new Event('resize')); };
     this.fold = fold;
     if (note) this.#add(root, 'p').textContent = note;
+    this.told = this.#add(root, 'p');
+    this.told.className = 'told';
     this.controls = this.#add(root, 'div');
     this.figures = this.#add(root, 'table');
     const help = this.#add(root, 'details');
@@ -79,6 +81,16 @@ class Panel {
     button.onclick = () => action(button);
     if (key) this.keys.set(key, button.onclick);
     return button;
+  }
+
+  // Says what lies under the pointer, in pieces; what is undefined is left out.
+  tell(pieces) {
+    const texts = pieces.filter(Boolean);
+    this.told.replaceChildren(...(texts.length ? texts : ['point at the picture to read a texel']).map((text) => {
+      const span = document.createElement('span');
+      span.textContent = text;
+      return span;
+    }));
   }
 
   // Sets one row of the table.

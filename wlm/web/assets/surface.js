@@ -16,23 +16,32 @@ void main()
     gl_Position = u_camera * vec4(u_unwrapped ? vec3(a_uv.x * u_aspect, -a_uv.y, 0.0) : a_position, 1.0);
 }`;
 
-// What a page of this kind adds: `source`, GLSL with vec3 wlm_light(), and `textures`, its uniforms.
+// What a page of this kind adds: `source`, GLSL with vec3 wlm_light(), its uniforms, and `tell`, as `Reading` takes it.
 class Surface {
-  constructor(graphics, page, source, display, panel, changed) {
+  constructor(graphics, page, source, display, panel, changed, tell) {
     const {manifest} = page;
     Object.assign(this, {graphics, display, changed, aspect: manifest.width / manifest.height});
     this.program = graphics.program(SURFACE, `${HEAD}
 in vec2 v_uv;
 in vec2 v_coordinate;
-uniform sampler2D u_original;
+uniform sampler2D u_original, u_mask;
 out vec4 colour;
 ${source}
 ${DISPLAY}
-void main() { colour = vec4(wlm_shown(wlm_light(), texture(u_original, v_uv).rgb), 1.0); }`);
+void main()
+{
+    colour = vec4(wlm_shown(wlm_light(), texture(u_original, v_uv).rgb), 1.0);
+    if (u_view == 3) colour.rgb *= texture(u_mask, v_uv).r;
+}`);
+    const [width, height] = page.has('mask') ? [manifest.width, manifest.height] : [1, 1], {gl} = graphics;
+    const mask = page.has('mask') ? page.array('mask', Uint8Array) : new Uint8Array([255]);
+    this.mask = graphics.plain(width, height, [gl.R8, gl.RED, gl.UNSIGNED_BYTE], mask, gl.NEAREST);
     const uv = page.has('uv') ? page.array('uv', Float32Array) : new Float32Array([0, 0, 1, 0, 1, 1, 0, 1]);
     const indices = page.has('triangles') ? page.array('triangles', Uint32Array) : new Uint32Array([0, 1, 2, 0, 2, 3]);
     const position = page.has('position') ? page.array('position', Float32Array) : new Float32Array(uv.length * 1.5);
-    const coordinate = page.has('coordinate') ? page.array('coordinate', Float32Array) : uv;
+    // Whether light is read elsewhere than at the lightmap's UV.
+    this.apart = page.has('coordinate');
+    const coordinate = this.apart ? page.array('coordinate', Float32Array) : uv;
     this.geometry = graphics.geometry(this.program, {
       a_position: [3, position], a_uv: [2, uv], a_coordinate: [2, coordinate],
     }, indices);
@@ -48,6 +57,7 @@ void main() { colour = vec4(wlm_shown(wlm_light(), texture(u_original, v_uv).rgb
         changed();
       });
     }
+    this.reading = new Reading(graphics, this, manifest, panel, tell);
   }
 
   #choose() {
@@ -55,26 +65,35 @@ void main() { colour = vec4(wlm_shown(wlm_light(), texture(u_original, v_uv).rgb
     if (this.mesh) this.mesh.active = !this.unwrapped;
   }
 
+  get camera() { return this.unwrapped ? this.picture : this.mesh; }
+
+  shape() { return {u_camera: this.camera.matrix(), u_unwrapped: this.unwrapped, u_aspect: this.aspect}; }
+
   draw(uniforms, original) {
     const {graphics} = this, {width} = graphics.begin();
-    const camera = this.unwrapped ? this.picture : this.mesh;
     graphics.use(this.program, {
-      ...uniforms, ...this.display.uniforms(width), u_original: original ?? graphics.black,
-      u_camera: camera.matrix(), u_unwrapped: this.unwrapped, u_aspect: this.aspect,
+      ...uniforms, ...this.display.uniforms(width), ...this.shape(), u_mask: this.mask,
+      u_original: original ?? graphics.black,
     });
     graphics.drawGeometry(this.geometry);
+    this.reading.show();
   }
 }
 
 // Frames to compare with, each uploaded when it is first seen.
 class Originals {
   constructor(graphics, page) {
-    const {manifest} = page;
-    this.times = manifest.reference?.times ?? [];
+    const {manifest: {width, height, reference}} = page;
+    const frame = (index) => page.array(`original_${index}`, Uint32Array);
+    this.times = reference?.times ?? [];
     this.get = (index) => {
       this.frames ??= [];
-      return this.frames[index] ??= graphics.plain(
-        manifest.width, manifest.height, graphics.shared(), page.array(`original_${index}`, Uint32Array), graphics.gl.LINEAR);
+      return this.frames[index] ??= graphics.plain(width, height, graphics.shared(), frame(index), graphics.gl.LINEAR);
+    };
+    // Nine bits a channel and one exponent.
+    this.texel = (index, column, row) => {
+      const code = frame(index)[row * width + column];
+      return [0, 9, 18].map((shift) => (code >> shift & 511) * 2 ** ((code >>> 27) - 24));
     };
   }
 
