@@ -9,13 +9,13 @@ import numpy as np
 from wlm.atlas.data import LightmappedMesh
 from wlm.atlas.evaluation import Report as AtlasReport
 from wlm.atlas.model import AtlasModel
-from wlm.atlas.views import sphere_views
 from wlm.lightmap.data import LightmapSet
 from wlm.lightmap.decode import Decoder as LightmapDecoder
 from wlm.lightmap.evaluation import Report as LightmapReport
 from wlm.lightmap.model import TILE, LightmapModel
 from wlm.lightmap.tiles import TileGrid
 from wlm.metrics.error import psnr_from_mse
+from wlm.ops.views import sphere_views
 from wlm.probe.data import ProbeSet
 from wlm.probe.decode import Decoder as ProbeDecoder
 from wlm.probe.evaluation import Report as ProbeReport
