@@ -302,17 +302,20 @@ def _show_report(file: Path, report: "Report", rivals: "list[tuple[Rival, Score]
     if report.worst_tile is not None:
         worst = report.worst_tile
         note(f"worst: {report.worst_psnr:.2f} dB, tile {worst['tile']} at {worst['time']:g}")
-    for name, worst in {"seen": report.worst_seen, "between": report.worst_between}.items():
+    for what, worst in (("seen", report.worst_seen), ("between times", report.worst_between)):
         if worst is not None:
-            note(f"worst {name}: {worst['psnr']:.2f} dB, tile {worst['tile']} at {worst['time']:g}")
+            note(f"worst {what}: {worst['psnr']:.2f} dB, tile {worst['tile']} at {worst['time']:g}")
     if report.worst_seen_time is not None:
-        hour, tile = report.worst_seen_time, report.worst_seen_tile
-        note(
-            f"worst seen by time: {hour['psnr']:.2f} dB at {hour['time']:g}; by tile: {tile['psnr']:.2f} dB, {tile['tile']}"
-        )
+        worst = report.worst_seen_time
+        note(f"worst time, mean of its tiles seen: {worst['psnr']:.2f} dB at {worst['time']:g}")
+    if report.worst_seen_tile is not None:
+        worst = report.worst_seen_tile
+        note(f"worst tile, mean of its times seen: {worst['psnr']:.2f} dB, tile {worst['tile']}")
     if report.worst_view is not None:
-        view = report.worst_view
-        note(f"worst view: {view['psnr']:.2f} dB, FLIP {view['flip']:.4f}, camera {view['view']} at {view['time']:g}")
+        worst = report.worst_view
+        note(
+            f"worst view: {worst['psnr']:.2f} dB, FLIP {worst['flip']:.4f}, camera {worst['view']} at {worst['time']:g}"
+        )
     left_out = ", ".join(f"{count} {reason}" for reason, count in report.not_scored.items() if count)
     if left_out:
         note(f"without a score, tiles times times: {left_out}")

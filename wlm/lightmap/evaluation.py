@@ -1,5 +1,5 @@
-"""Scoring a compressed lightmap set against its input, by the paper's protocol (neural-dynamic-gi, section 10.2), and as
-it is seen (`wlm.lightmap.seen`)."""
+"""Scoring a compressed lightmap set against its input: by the paper's protocol (neural-dynamic-gi, section 10.2), and
+as it is seen (`wlm.lightmap.seen`)."""
 
 import time
 from collections.abc import Iterator, Sequence

@@ -30,12 +30,12 @@ import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from scipy.ndimage import binary_dilation
 from scipy.sparse import csr_array
 
-from wlm import system
 from wlm.errors import WlmError
 from wlm.lightmap.data import LightmapSet
 from wlm.lightmap.tiles import TILE, TileGrid
@@ -107,16 +107,10 @@ class Tally:
         """
         self._lightmaps, self._mask, self._decode, self._views, self._name = lightmaps, mask, decode, views, name
         self._grid = grid = TileGrid.of(*mask.shape)
-        self._nearest = nearest_valid(lightmaps.mask)
-        self._ring = _Texels(binary_dilation(lightmaps.mask, np.ones((3, 3))) & ~lightmaps.mask, grid)
-        self._valid = _Texels(mask, grid)
-        self._left_out = _tiles_with(lightmaps.mask, grid) & ~_tiles_with(mask, grid)
         self._count = count = len(lightmaps.times)
         # Lengths of the intervals between stored times, that from the last to the first among them.
-        ends = (
-            lightmaps.times if lightmaps.period is None else [*lightmaps.times, lightmaps.times[0] + lightmaps.period]
-        )
-        self._gaps = np.diff(ends if count > 1 else [])
+        again = [] if lightmaps.period is None else [lightmaps.times[0] + lightmaps.period]
+        self._gaps = np.diff([*lightmaps.times, *again] if count > 1 else [])
         self._middles = lightmaps.times[: len(self._gaps)] + self._gaps / 2.0
         if lightmaps.period is not None:
             self._middles %= lightmaps.period
@@ -127,8 +121,8 @@ class Tally:
         self._moving = set(chosen.round().astype(int).tolist())
         self._flicker: list[np.ndarray] = []
         self._border = np.zeros(2)
-        self._first: tuple[int, np.ndarray | None] | None = None
-        self._last: tuple[int, np.ndarray | None] | None = None
+        # What was decoded at the first time and at the last that was added; None where `decode` gives it again.
+        self._added: dict[int, np.ndarray | None] = {}
 
     def add(self, index: int, decoded: np.ndarray, metrics: FrameMetrics) -> None:
         """Adds a stored time; an interval is scored where both of its ends are added.
@@ -143,24 +137,27 @@ class Tally:
         """
         filled = self._lightmaps.frames[index][self._nearest]
         decoded = np.asarray(decoded, np.float32)
-        if self._left_out.any():
-            decoded = np.where(_spread(self._left_out, self._grid)[..., None], filled, decoded)
+        if self._left_out is not None:
+            decoded = np.where(self._left_out[..., None], filled, decoded)
         with np.errstate(invalid="ignore"):
             error = decoded - filled
+        ring = error[self._ring.at]
+        if not np.isfinite(ring).all():
+            y, x = (int(at[np.argmin(np.isfinite(ring).all(1))]) for at in self._ring.at)
+            raise WlmError(f"{self._name}: decodes to NaN or infinity beside a chart, first at row {y}, column {x}")
         self._add_points(index, error, metrics)
-        squared = self._ring.sums(np.square(error[self._ring.at], dtype=np.float64))
+        squared = self._ring.sums(np.square(ring, dtype=np.float64))
         counted = metrics.scored & (self._ring.count >= MIN_VALID_TEXELS)
         self._rings[index] = _psnr(squared / (3 * self._ring.count.clip(1)), metrics.range, counted)
         if self._views is not None:
             self._views.add(index, filled, decoded)
 
-        here = index, decoded if self._decode is None else None
-        if self._last is not None and self._last[0] == index - 1:
-            self._add_interval(index - 1, self._last[1], here[1])
-        self._first, self._last = self._first or here, here
-        # From the last time to the first: two times are two intervals.
-        if self._count > 1 and len(self._gaps) == self._count == index + 1 and self._first[0] == 0:
-            self._add_interval(index, here[1], self._first[1])
+        self._added[index] = decoded if self._decode is None else None
+        if index - 1 in self._added:
+            self._add_interval(index - 1)
+        if len(self._gaps) == self._count == index + 1 and 0 in self._added:
+            self._add_interval(index)
+        self._added = {kept: self._added[kept] for kept in (0, index) if kept in self._added}
 
     def score(self) -> SeenScore:
         """The scores of what was added."""
@@ -168,14 +165,15 @@ class Tally:
         by_time, by_tile = nanmean(self._seen, axis=(1, 2)), nanmean(self._seen, axis=0)
         across, inside = self._border
         border = math.sqrt(across / inside) if inside > 0 else (math.inf if across > 0 else math.nan)
-        worst = _lowest(by_time)
+        hour = _lowest(by_time)
+        worst_time = None if hour is None else {"psnr": float(by_time[hour]), "time": float(lightmaps.times[hour])}
         return SeenScore(
             **vars(NO_VIEWS if self._views is None else self._views.score()),
             seen=float(nanmean(self._seen)),
             seen_by_tile=by_tile,
             seen_by_time=by_time,
             worst_seen=self._place(self._seen, lightmaps.times),
-            worst_seen_time=worst and {"psnr": float(by_time[worst]), "time": float(lightmaps.times[worst])},
+            worst_seen_time=worst_time,
             worst_seen_tile=self._place(by_tile[None]),
             ring=float(nanmean(self._rings)),
             between=float(nanmean(self._between)),
@@ -183,6 +181,26 @@ class Tally:
             border=border,
             flicker=float(nanmean(np.array(self._flicker))),
         )
+
+    @functools.cached_property
+    def _nearest(self) -> tuple[np.ndarray, np.ndarray]:
+        return nearest_valid(self._lightmaps.mask)
+
+    @functools.cached_property
+    def _ring(self) -> "_Texels":
+        mask = self._lightmaps.mask
+        return _Texels(binary_dilation(mask, np.ones((3, 3))) & ~mask, self._grid)
+
+    @functools.cached_property
+    def _valid(self) -> "_Texels":
+        return _Texels(self._mask, self._grid)
+
+    @functools.cached_property
+    def _left_out(self) -> np.ndarray | None:
+        """bool [H, W], the tiles whose valid texels aren't scored; None: there is none."""
+        grid = self._grid
+        tiles = _tiles_with(self._lightmaps.mask, grid) & ~_tiles_with(self._mask, grid)
+        return tiles.repeat(TILE, 0).repeat(TILE, 1)[: grid.height, : grid.width] if tiles.any() else None
 
     def _add_points(self, index: int, error: np.ndarray, metrics: FrameMetrics) -> None:
         """Scores the reads at points; of a difference they are the difference of the reads."""
@@ -197,9 +215,6 @@ class Tally:
             own = valid.ravel().repeat(POINTS)
             reads = read @ padded[y : y + TILE + 2, x : x + TILE + 2].reshape(-1, 3)
             squared = np.square(reads[own], dtype=np.float64).mean(1)
-            if not np.isfinite(squared).all():
-                tile = row * grid.cols + column
-                raise WlmError(f"{self._name}: tile {tile} decodes to NaN or infinity in the gaps beside its charts")
             span = metrics.range[row, column]
             self._seen[index, row, column] = psnr_from_mse(squared.mean(), span)
             # At the map's ends reads are clamped.
@@ -209,36 +224,35 @@ class Tally:
             if 0 < count < len(two):
                 self._border += count / span**2 * np.array([squared[two].mean(), squared[~two].mean()])
 
-    def _add_interval(self, index: int, before: np.ndarray | None, after: np.ndarray | None) -> None:
-        """Scores the interval after a stored time; the decoded ends are needed where there is no `decode`."""
-        lightmaps, start, gap = self._lightmaps, self._lightmaps.times[index], self._gaps[index]
-        ends = lightmaps.frames[index], lightmaps.frames[(index + 1) % self._count]
+    def _add_interval(self, index: int) -> None:
+        """Scores the interval after a stored time."""
+        after = (index + 1) % self._count
+        first, second = self._lightmaps.frames[index], self._lightmaps.frames[after]
         middle = float(self._middles[index])
-        light = 0.5 * (before + after) if self._decode is None else self._decode(middle)
+        if self._decode is None:
+            light = 0.5 * (self._added[index] + self._added[after])
+        else:
+            light = self._decode(middle)
         name = f"{self._name} at {middle:g}"
-        metrics = evaluate_frame(0.5 * (ends[0] + ends[1]), light, self._mask, TILE, ("psnr",), name=name)
+        metrics = evaluate_frame(0.5 * (first + second), light, self._mask, TILE, ("psnr",), name=name)
         self._between[index] = metrics.psnr
         if index not in self._moving:
             return
-        step = min(_STEP if lightmaps.period is None else lightmaps.period / _STEPS_OF_PERIOD, gap / _STEPS)
-        share = np.float32(step / gap)
-        allowed = share * self._between_texels(*ends)
+        gap, period = self._gaps[index], self._lightmaps.period
+        step = min(_STEP if period is None else period / _STEPS_OF_PERIOD, gap / _STEPS)
+        share, at = np.float32(step / gap), self._valid.at
+        allowed = share * np.abs(second[at] - first[at])
         if self._decode is None:
-            moved = [share * self._between_texels(before, after)]  # the same at every step
+            changes = [share * np.abs(self._added[after][at] - self._added[index][at])]  # the same in every step
         else:
-            first = start + np.random.default_rng((_SEED, index)).random() * (gap - _STEPS * step)
-            lights = [self._decode(float(first + k * step))[self._valid.at] for k in range(_STEPS + 1)]
-            moved = [np.abs(b - a) for a, b in zip(lights, lights[1:], strict=False)]
-        for change in moved:
+            start = np.random.default_rng((_SEED, index)).random() * (gap - _STEPS * step)
+            times = self._lightmaps.times[index] + start + step * np.arange(_STEPS + 1)
+            lights = [self._decode(float(time))[at] for time in (times if period is None else times % period)]
+            changes = [np.abs(b - a) for a, b in pairwise(lights)]
+        for change in changes:
             beyond = self._valid.sums(np.maximum(change - allowed, 0.0, dtype=np.float64))
-            mean = beyond / (3 * self._valid.count.clip(1))
-            self._flicker.append(
-                np.divide(mean, metrics.range, out=np.full(mean.shape, math.nan), where=metrics.scored)
-            )
-
-    def _between_texels(self, before: np.ndarray, after: np.ndarray) -> np.ndarray:
-        """Absolute change of the valid texels, float32 [K, 3]."""
-        return np.abs(after[self._valid.at] - before[self._valid.at])
+            scale = 3 * self._valid.count * metrics.range
+            self._flicker.append(np.divide(beyond, scale, out=np.full(scale.shape, math.nan), where=metrics.scored))
 
     def _place(self, psnr: np.ndarray, times: np.ndarray | None = None) -> dict[str, float | int] | None:
         """The lowest of PSNRs [n, rows, columns], and where it is."""
@@ -297,11 +311,6 @@ def _tiles_with(mask: np.ndarray, grid: TileGrid) -> np.ndarray:
     whole = np.zeros((grid.rows * TILE, grid.cols * TILE), bool)
     whole[: grid.height, : grid.width] = mask
     return whole.reshape(grid.rows, TILE, grid.cols, TILE).any(axis=(1, 3))
-
-
-def _spread(tiles: np.ndarray, grid: TileGrid) -> np.ndarray:
-    """bool [H, W]: the texels of tiles [rows, columns]."""
-    return tiles.repeat(TILE, 0).repeat(TILE, 1)[: grid.height, : grid.width]
 
 
 def _psnr(mse: np.ndarray, span: np.ndarray, counted: np.ndarray) -> np.ndarray:

@@ -2,9 +2,9 @@
 
 Cameras are spread evenly on a sphere around the mesh (`wlm.ops.views`), each at one of the set's times in turn. What is
 seen from behind isn't drawn, so that a room is seen through its walls. A pixel is the lightmap's light at its surface
-point, read bilinearly, on a white surface without any shading; the original's gaps between charts are filled. Both are
-shown alike: the exposure of that time, from the original's valid texels (`wlm.texels.exposure`), Reinhard's curve, sRGB.
-Pixels that show no surface are black in both, and don't count.
+point, read bilinearly, without any shading; the original's gaps between charts are filled. Both are shown alike: the
+exposure of that time, from the original's valid texels (`wlm.texels.exposure`), Reinhard's curve, sRGB. Pixels without
+a surface are black in both, and don't count.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ class Views:
         drawn = visible_points(mesh.position, mesh.triangle, mesh.uv, cameras, RESOLUTION, self._device, cull=True)
         for number, (visible, _, uv) in zip(numbers, drawn, strict=True):
             hit = (visible >= 0).cpu().numpy()
-            count = np.count_nonzero(hit)
+            count = int(np.count_nonzero(hit))
             if not count:
                 continue
             pictures = []
