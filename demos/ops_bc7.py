@@ -21,12 +21,13 @@ import torch
 
 from wlm import atlas, ops
 from wlm.atlas.data import LightmappedMesh
-from wlm.atlas.views import View, visible_uv
+from wlm.atlas.views import visible_uv
 from wlm.cli.console import quiet_warp, show_figures
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_write
 from wlm.formats.bc7 import decode_image
 from wlm.interop import check_device
+from wlm.ops.views import View
 from wlm.texels import fill_gaps
 from wlm.view.atlas import encode
 from wlm.view.display import white_of

@@ -13,6 +13,7 @@ MOST_TEXELS = 1 << 28
 """Texels of a lightmap, at most: 16,384 x 16,384, of which one decoded frame takes 3 GiB."""
 
 _WHITE, _PERCENTILE = 0.8, 99.0  # where that share of the light is on the screen
+_FILMIC_WHITE = 4.0
 
 
 def check_size(height: int, width: int) -> None:
@@ -32,6 +33,18 @@ def exposure(light: np.ndarray) -> float:
     """The factor that puts nearly all of some linear light, of any shape, below white; 1 where all is dark."""
     lit = light[light > 0]
     return _WHITE / float(np.percentile(lit, _PERCENTILE)) if lit.size else 1.0
+
+
+def filmic(light: np.ndarray) -> np.ndarray:
+    """Linear light, at least 0, of any shape, below white: Reinhard's curve, which takes 4 to 1 (Reinhard et al. 2002,
+    eq. 4)."""
+    return light * (1 + light / _FILMIC_WHITE**2) / (1 + light)
+
+
+def to_srgb(linear: np.ndarray) -> np.ndarray:
+    """Linear light to sRGB (IEC 61966-2-1), clipped to [0, 1]."""
+    linear = np.clip(linear, 0.0, 1.0)
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
 
 
 def fill_gaps(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
@@ -60,8 +73,21 @@ def fill_gaps(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
         return np.zeros_like(image)
     if valid.all():
         return image.copy()
-    rows, columns = distance_transform_edt(~valid, return_distances=False, return_indices=True)
+    rows, columns = nearest_valid(valid)
     return image[..., rows, columns, :]
+
+
+def nearest_valid(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Finds the valid texel that is nearest to each texel of a lightmap (Euclidean distance), itself where it is valid.
+
+    Args:
+        mask: bool [H, W], true where a texel is valid; at least one is.
+
+    Returns:
+        Its row and its column, int32 [H, W] each: `image[rows, columns]` is the image with its gaps filled.
+    """
+    rows, columns = distance_transform_edt(~mask, return_distances=False, return_indices=True)
+    return rows, columns
 
 
 def repair(frame: np.ndarray, mask: np.ndarray, where: str) -> list[str]:

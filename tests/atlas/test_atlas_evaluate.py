@@ -14,9 +14,10 @@ from wlm import metrics
 from wlm.atlas.charts import mesh_charts
 from wlm.atlas.data import from_arrays
 from wlm.atlas.evaluation import compare, evaluate
-from wlm.atlas.views import View, sphere_views, visible_uv
+from wlm.atlas.views import visible_uv
 from wlm.errors import WlmError
 from wlm.ops import raster
+from wlm.ops.views import View, sphere_views
 
 FACES = [View.of(direction) for direction in DIRECTIONS]
 SQUARE = np.array([[-1, -1, 0], [1, -1, 0], [-1, 1, 0], [1, 1, 0]], np.float64)

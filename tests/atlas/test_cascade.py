@@ -15,9 +15,9 @@ from wlm.atlas.data import LightmappedMesh, from_arrays
 from wlm.atlas.model import Profile
 from wlm.atlas.pack import pack, regenerate
 from wlm.atlas.stages import Stages
-from wlm.atlas.views import clip_positions, normalised, sphere_views
 from wlm.errors import WlmError
 from wlm.ops import raster as ops_raster
+from wlm.ops.views import clip_positions, normalised, sphere_views
 
 pytest.importorskip("uvunwrap")
 
@@ -109,7 +109,7 @@ def test_a_steps_gradient_of_a_view(device: str, lut_scale: float):
         grads = [grad.cpu().numpy() for grad in step._grads]
         after = step.textures()
 
-    clip = torch.tensor(clip_positions(normalised(mesh), sphere_views(profile.steps, 5)[0]))
+    clip = torch.tensor(clip_positions(normalised(mesh.position, mesh.triangle), sphere_views(profile.steps, 5)[0]))
     raster = ops_raster.rasterize(clip, torch.tensor(mesh.triangle), 48, 48)
     hit = raster.triangle >= 0
     weights = torch.cat([raster.barycentric, 1 - raster.barycentric.sum(-1, keepdim=True)], -1)[hit].double()

@@ -54,6 +54,10 @@ def test_every_row_has_its_figures(rows):
             assert measured == {"psnr", "decode_ms"}
             continue
         assert measured == scored | weighed | timed
+        # There are no gaps and no mesh.
+        assert 10.0 < row["worst_seen"] < row["seen"] < 70.0 and row["worst_between"] < row["between"]
+        assert row["between"] > 15.0 and row["border"] > 0.0 and row["excess_change"] >= 0.0
+        assert not {"ring", "view_psnr", "view_flip"} & row.figures.keys()
         assert 0.0 < row["ssim"] <= 1.0 and 0.0 <= row["flip"] < 1.0 and row["encode_seconds"] > 0
         assert row["bpp"] == pytest.approx(row["bytes"] * 8 / (104 * 384 * 4))
 

@@ -56,7 +56,7 @@ def _lightmap() -> Subject:
         FILES / "lightmap.npz",
         small_sets.moving_light,
         lambda data, **options: wlm.lightmap.compress(data, profile, **options),
-        lambda model, data: wlm.lightmap.evaluate(model, data, metrics=("psnr",)),
+        lambda model, data: wlm.lightmap.evaluate(model, data, metrics=("psnr", "seen")),
         lambda model, data, folder: wlm.lightmap.export(model, folder),
         checkpoint,
     )

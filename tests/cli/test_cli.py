@@ -155,7 +155,11 @@ def test_evaluate_prints_and_writes_the_report(fitted, folder, tmp_path):
     assert [row["name"] for row in baselines] == names
     for name in ("BC6H", "BC7", "ASTC 12x12", "ASTC 10x10", "8 bits"):
         assert name in text
-    assert "worst:" in call.stderr
+    assert "worst:" in call.stderr and "worst seen:" in call.stderr and "worst between times:" in call.stderr
+    scores = text.split("as it is seen")[1]
+    assert f"{report.seen:.2f}" in scores and f"{report.between:.2f}" in scores
+    # No gaps, one tile and no mesh.
+    assert not any(title in scores for title in ("ring", "border", "views"))
     call(*words)
     assert "baselines" not in json.loads((tmp_path / "r.json").read_text())
 

@@ -8,7 +8,7 @@ import pytest
 from skimage.metrics import structural_similarity
 
 from wlm.errors import WlmError
-from wlm.metrics import flip_exposures, flip_map, ssim
+from wlm.metrics import flip_display, flip_exposures, flip_map, ssim
 
 
 def make_pair(height=48, width=40, seed=0):
@@ -164,3 +164,15 @@ def test_flip_rejects_what_the_library_would_answer_wrongly():
         flip_map(ref, test)
     with pytest.raises(WlmError, match="RGB"):
         flip_map(ref[..., :2], ref[..., :2])
+
+
+def test_flip_of_what_a_display_shows_is_the_librarys():
+    shown = np.random.default_rng(5).uniform(0.0, 1.0, (2, 40, 48, 3))
+    options = {"inputsRGB": True, "applyMagma": False, "computeMeanError": False}
+    expected, _, _ = flip_evaluator.evaluate(*shown.astype(np.float32), "LDR", **options)
+    np.testing.assert_array_equal(flip_display(*shown), expected[..., 0])
+    assert flip_display(shown[0], shown[0]).max() == 0.0 and flip_display(*shown).mean() > 0.1
+    with pytest.raises(WlmError, match="test image is NaN or infinite"):
+        flip_display(shown[0], shown[1] * np.nan)
+    with pytest.raises(WlmError, match="expected RGB"):
+        flip_display(shown[0][..., :1], shown[1][..., :1])

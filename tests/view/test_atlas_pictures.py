@@ -6,8 +6,8 @@ import torch
 from builders.atlas_meshes import charts, constant, sheet, triangle
 from PIL import Image
 
-from wlm.atlas.views import View
 from wlm.errors import WlmError
+from wlm.ops.views import View
 from wlm.view.atlas import comparison, draw, encode, original, save_png
 from wlm.view.display import white_of
 

@@ -8,7 +8,7 @@ _PLACES = {
     "LightmappedMesh": "wlm.atlas.data",
     "Profile": "wlm.atlas.model",
     "Report": "wlm.atlas.evaluation",
-    "View": "wlm.atlas.views",
+    "View": "wlm.ops.views",
     "compare": "wlm.atlas.evaluation",
     "compress": "wlm.atlas.fit",
     "describe": "wlm.atlas.exporter",

@@ -37,11 +37,11 @@ from wlm.atlas.model import LUT_STEPS, AtlasModel, Profile
 from wlm.atlas.pack import pack, regenerate
 from wlm.atlas.resize import resize
 from wlm.atlas.stages import Stages
-from wlm.atlas.views import DISTANCE, ZOOM, normalised, sphere_views
 from wlm.errors import WlmError
 from wlm.formats.checkpoint import Checkpoint
 from wlm.formats.exr import HALF_MAX
 from wlm.formats.parts import Part, check_parts
+from wlm.ops.views import DISTANCE, ZOOM, normalised, sphere_views
 from wlm.system import Meter, OnProgress
 from wlm_kernels.atlas import cascade as kernels
 from wlm_kernels.atlas.patches import ORDERS
@@ -384,7 +384,7 @@ class _Views:
         axes = np.array([view.axes for view in sphere_views(profile.steps, seed)], np.float32).reshape(-1, 3, 3)
         self._axes = torch.tensor(axes, device=device)
         self._step = step
-        self._position = torch.tensor(normalised(mesh), dtype=torch.float32, device=device)
+        self._position = torch.tensor(normalised(mesh.position, mesh.triangle), dtype=torch.float32, device=device)
         self._clip = torch.zeros(len(mesh.position), 4, device=device)
         triangle = wp.array(mesh.triangle, dtype=int, device=device)
         self._rasterizer = Rasterizer(triangle, side, side)
@@ -413,7 +413,7 @@ class _Surface:
         pairs = max(1, profile.resolution**2 // (2 * _PIXELS_PER_POINT))
         self.count, self.shape = 2 * pairs, (2 * pairs, 3)
         self._seed = int(seed) % (1 << 30)
-        position = normalised(mesh)[mesh.triangle]
+        position = normalised(mesh.position, mesh.triangle)[mesh.triangle]
         normal = np.cross(position[:, 1] - position[:, 0], position[:, 2] - position[:, 0])
         area = np.where(mesh.active, np.linalg.norm(normal, axis=1), 0.0)
         self._area = wp.array(np.cumsum(area), dtype=wp.float64, device=device)

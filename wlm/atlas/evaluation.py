@@ -1,6 +1,6 @@
 """Error of a decoded lightmap in views of the mesh (lightmap-uv-clustering-cascade, section 4.1.4).
 
-The mesh is drawn from cameras around it, `wlm.atlas.views`. A pixel is the lightmap's linear RGB at its surface
+The mesh is drawn from cameras around it, `wlm.ops.views`. A pixel is the lightmap's linear RGB at its surface
 point, without any shading. The reference is the original lightmap read bilinearly, clamped, its gaps filled from the
 nearest texel of a chart. Only covered pixels count; a view without any is left out.
 
@@ -37,12 +37,13 @@ from wlm.atlas.charts import charts, mesh_charts, welded
 from wlm.atlas.data import LightmappedMesh
 from wlm.atlas.decode import Decoder
 from wlm.atlas.model import AtlasModel, disk_ratio
-from wlm.atlas.views import View, corner_weights, sphere_views, texel_triangles, visible_uv
+from wlm.atlas.views import corner_weights, texel_triangles, visible_uv
 from wlm.errors import WlmError
 from wlm.interop import check_device
 from wlm.metrics import SSIM_WINDOW
 from wlm.metrics.error import psnr_from_mse
 from wlm.ops import raster
+from wlm.ops.views import View, sphere_views
 from wlm.system import Meter, OnProgress
 
 Sampler = Callable[[torch.Tensor, torch.Tensor, torch.Tensor], torch.Tensor]

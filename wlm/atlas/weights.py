@@ -10,7 +10,8 @@ from wlm.atlas.charts import mesh_charts
 from wlm.atlas.coverage import covered_texels
 from wlm.atlas.data import LightmappedMesh
 from wlm.atlas.model import Profile
-from wlm.atlas.views import sphere_views, surface_points, texel_triangles, visibility
+from wlm.atlas.views import surface_points, texel_triangles, visibility
+from wlm.ops.views import sphere_views
 
 _BORDER = 2  # cells of the fine grid: one texel
 _RESOLUTION = 768  # pixels along a side of a view that visibility is counted in

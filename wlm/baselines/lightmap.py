@@ -21,10 +21,12 @@ from wlm.errors import WlmError
 from wlm.formats import hdr_blocks
 from wlm.formats.hdr_blocks import ASTC_MEDIUM, need
 from wlm.lightmap.data import LightmapSet
-from wlm.lightmap.evaluation import scored_mask
+from wlm.lightmap.evaluation import SCORES, scored_mask
 from wlm.lightmap.model import TILE, LightmapModel
-from wlm.metrics import METRICS, evaluate_frame, summarise
-from wlm.system import Meter, OnProgress, Report
+from wlm.lightmap.seen import SeenScore, Tally
+from wlm.lightmap.views import VIEWS, views_of
+from wlm.metrics import evaluate_frame, summarise
+from wlm.system import Meter, OnProgress
 from wlm.texels import fill_gaps
 
 HALF_MAX = 65504.0
@@ -126,8 +128,10 @@ RIVALS: dict[str, Callable[[np.ndarray, np.ndarray], Rival]] = {
 
 
 @dataclass(frozen=True)
-class Score(Report):
+class Score(SeenScore):
     """How wrong a block codec is on a set, over the texels that ours is scored over.
+
+    Between stored times its light is the mix of the two lightmaps. The scores of `SeenScore` are attributes too.
 
     Attributes:
         psnr, ssim, flip: As in the report of `wlm.lightmap.evaluate`.
@@ -147,7 +151,8 @@ def evaluate_rivals(
     lightmaps: LightmapSet,
     names: Sequence[str] = ("bc6h", "bc7", "astc12", "astc10", "8bit"),
     *,
-    metrics: Sequence[str] = METRICS,
+    metrics: Sequence[str] = SCORES,
+    views: int = VIEWS,
     progress: OnProgress | None = None,
 ) -> list[tuple[Rival, Score]]:
     """Puts every time through block codecs, one time after the other, and scores the texels that `evaluate` scores.
@@ -156,7 +161,7 @@ def evaluate_rivals(
         model: The model to compare with: it says which tiles are scored.
         lightmaps: The input.
         names: Keys of `RIVALS`.
-        metrics: As for `wlm.lightmap.evaluate`.
+        metrics, views: As for `wlm.lightmap.evaluate`.
         progress: Called about twice a second.
 
     Returns:
@@ -169,21 +174,26 @@ def evaluate_rivals(
         if name not in RIVALS:
             raise WlmError(f"baselines: unknown codec {name!r}, expected one of {', '.join(RIVALS)}")
     mask, count = scored_mask(model, lightmaps), len(lightmaps.frames)
+    plain, seen = [metric for metric in metrics if metric != "seen"], "seen" in metrics
     meter = Meter(progress, "baselines", len(names) * count)
     results = []
     for k, name in enumerate(names):
         rivals, frames = [], []
+        tally = Tally(lightmaps, mask, views=views_of(lightmaps, views if seen else 0)[0], name=name)
         for i, frame in enumerate(lightmaps.frames):
             # The whole map's mask: an engine would encode all of it, whatever we score.
             rival = RIVALS[name](frame, lightmaps.mask)
-            frames.append(evaluate_frame(frame, rival.decoded, mask, TILE, metrics, name=name))
+            frames.append(evaluate_frame(frame, rival.decoded, mask, TILE, plain, name=name))
+            if seen:
+                tally.add(i, rival.decoded, frames[i])
             rivals.append(replace(rival, decoded=None))  # a set of them is too much memory
             if meter.due(k * count + i + 1):
                 meter.report(k * count + i + 1)
         summed = {key: sum(getattr(rival, key) for rival in rivals) for key in _SUMMED}
         rival, summary = replace(rivals[0], **summed), summarise(frames)
         bpp = rival.bytes * 8 / (lightmaps.mask.size * count)
-        results.append((rival, Score(summary.psnr, summary.ssim, summary.flip, bpp, rival.bytes)))
+        scores = {"psnr": summary.psnr, "ssim": summary.ssim, "flip": summary.flip, **vars(tally.score())}
+        results.append((rival, Score(**scores, bpp=bpp, bytes=rival.bytes)))
     return results
 
 

@@ -7,9 +7,12 @@ Four kinds of rows:
 - methods "exact" (one texel per thread) and "strip" (the fast path), one row for each form of the GELU, of profile M:
   the 8-bit output against the input, and its largest error against the float64 path as a share of 255. Half a level of
   8 bits, 0.00196, is the rounding itself.
-- the block codecs of `wlm.baselines.lightmap`, on the same lightmaps.
+- the block codecs of `wlm.baselines.lightmap`, on the same lightmaps; between stored times their light is mixed.
 - method "fit", one row for each profile: the speed of the fit alone; and the same fit in plain torch, all of it on CUDA
   in a full run, else a few steps.
+
+Profiles and codecs have the scores of `wlm.lightmap.seen` too: those between stored times where both are scored, those
+of views in a full run.
 
 A decode on CUDA is timed as the replay of a graph, so that gaps between launches do not count; block codecs decode on
 the CPU alone, and in a texture unit on a GPU, so that they have a decode time on the CPU alone.
@@ -35,7 +38,9 @@ from wlm.lightmap.exact import bound64, colour_tile64, decode_tile64
 from wlm.lightmap.fit import compress, dynamic_targets
 from wlm.lightmap.model import TILE, LightmapModel, Profile, TimeAxis, encode_time
 from wlm.lightmap.runtime import ExactDecoder, StripDecoder
+from wlm.lightmap.seen import Tally
 from wlm.lightmap.tiles import TileGrid, TileKind, assemble
+from wlm.lightmap.views import VIEWS, views_of
 from wlm.metrics import METRICS, Summary, evaluate_frame, summarise
 
 PROFILES = ("L", "M", "H", "M64", "M-paper")
@@ -54,6 +59,8 @@ _QUICK_HOURS = (9.0, 12.0, 21.0)  # morning, noon and lamps
 _FULL_TILES = 64  # of 1024 x 1024
 _PLAIN_STEPS = 10  # of the fit in plain torch, where it isn't run to its end
 _ERROR_TIMES = 3  # the float64 path takes 30 ms for one tile at one time
+
+_SEEN = ("seen", "ring", "between", "border", "view_psnr", "view_flip")  # scores that are figures by their names
 
 # GELU by its gate, which is shorter to read in a plot.
 _GELUS = {"exact": "erf", "tanh": "tanh", "fast": "fast tanh"}
@@ -198,7 +205,7 @@ class _LightmapBench(Bench):
             encode_seconds=fit.seconds,
             max_error=error,
             steps=model.profile.steps,
-            **self._score(frames.values(), fit.option),
+            **self._score(frames.values(), fit.option, seen=True, decode=decoder.frame),
             **self._tiles(model),
         )
         return row, self._decode(self._decoders(model, "strip", None))
@@ -246,7 +253,7 @@ class _LightmapBench(Bench):
             bytes=size,
             bpp=size * 8 / (self.lightmaps.mask.size * count),
             encode_seconds=sum(rival.encode_seconds for rival in rivals) * count / len(rivals),
-            **self._score([rival.decoded for rival in rivals], method),
+            **self._score([rival.decoded for rival in rivals], method, seen=True),
         )
         if self.device != "cpu":
             return row
@@ -315,15 +322,32 @@ class _LightmapBench(Bench):
         kinds = count_kinds(model).items()
         return {f"{kind}_tiles": count for kind, count in kinds if count and kind != "empty"}
 
-    def _score(self, frames: Iterable[np.ndarray], name: str, metrics: Sequence[str] = METRICS) -> dict[str, float]:
-        """PSNR, SSIM and FLIP of lightmaps at the chosen times, and how many these are."""
-        summary: Summary = summarise(
-            [
-                evaluate_frame(self.lightmaps.frames[i], frame, self.lightmaps.mask, TILE, metrics, name=name)
-                for i, frame in zip(self.chosen, frames, strict=True)
-            ]
-        )
-        return {"psnr": summary.psnr, "ssim": summary.ssim, "flip": summary.flip, **self.scored}
+    def _score(
+        self,
+        frames: Iterable[np.ndarray],
+        name: str,
+        metrics: Sequence[str] = METRICS,
+        *,
+        seen: bool = False,
+        decode: Callable[[float], np.ndarray] | None = None,
+    ) -> dict[str, float]:
+        """PSNR, SSIM and FLIP of lightmaps at the chosen times, how many these are, and how they look as seen."""
+        lightmaps, whole = self.lightmaps, len(self.chosen) == len(self.lightmaps.times)
+        views, _ = views_of(lightmaps, VIEWS if seen and whole else 0, device=self.device)
+        tally = Tally(lightmaps, lightmaps.mask, decode, views, name)
+        scored = []
+        for i, frame in zip(self.chosen.tolist(), frames, strict=True):
+            scored.append(evaluate_frame(lightmaps.frames[i], frame, lightmaps.mask, TILE, metrics, name=name))
+            if seen:
+                tally.add(i, frame, scored[-1])
+        summary: Summary = summarise(scored)
+        figures = {"psnr": summary.psnr, "ssim": summary.ssim, "flip": summary.flip, **self.scored}
+        if not seen:
+            return figures
+        score = tally.score()
+        figures |= {key: getattr(score, key) for key in _SEEN} | {"excess_change": score.flicker}
+        worst = {"worst_seen": score.worst_seen, "worst_between": score.worst_between}
+        return figures | {key: where["psnr"] for key, where in worst.items() if where is not None}
 
     def _decoders(self, model: LightmapModel, path: str, gelu: str | None) -> list[StripDecoder | ExactDecoder]:
         """Decoders of the tiles with maps; a constant tile needs no launch."""

@@ -196,7 +196,7 @@ def decode(
         picture, covered = decoder.lightmap(mesh), mesh.mask
         write_exr(output, picture)
     else:
-        from wlm.atlas.views import sphere_views
+        from wlm.ops.views import sphere_views
         from wlm.view.atlas import draw, encode, save_png
         from wlm.view.display import white_of
 

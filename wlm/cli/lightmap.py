@@ -1,5 +1,6 @@
 """`wlm lightmap`: compress a set of lightmaps over time, decode it, score it, look into it, export it."""
 
+import math
 import time as clock
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -148,13 +149,20 @@ def evaluate(
     baselines: Annotated[
         bool, typer.Option("--baselines", help="Add BC6H, BC7, ASTC and plain 8 bits (extra `baselines`).")
     ] = False,
+    views: Annotated[
+        int, typer.Option(min=0, help="Views of the set's mesh, if it names one, that are scored; 0 for none.")
+    ] = 50,
     device: Device = "cpu",
     times: _Times = None,
     mask: _Mask = None,
     period: _Period = None,
     trust: Trust = False,
 ) -> None:
-    """Compare every stored time with the input: PSNR, SSIM and FLIP by tile and by time, and bits per texel."""
+    """Compare a file with its input: PSNR, SSIM and FLIP by tile and by time, bits per texel, and what is seen of it.
+
+    As it is seen: filtered, in the gaps beside charts, between stored times, across tiles, over time, in views of the
+    set's mesh.
+    """
     if json_path is not None:
         check_output(json_path, ".json")
     if html_path is not None:
@@ -168,7 +176,8 @@ def evaluate(
     model = load(file, "lightmap")
     lightmaps = _load(set_path, times, mask, period, trust)
     with running("score") as progress:
-        report = evaluate(model, lightmaps, device=device, progress=progress, file_bytes=file.stat().st_size)
+        size = file.stat().st_size
+        report = evaluate(model, lightmaps, views=views, device=device, progress=progress, file_bytes=size)
     if html_path is not None:
         from wlm.view.reports import lightmap_report
 
@@ -178,7 +187,7 @@ def evaluate(
         from wlm.baselines.lightmap import evaluate_rivals
 
         with running("baselines") as progress:
-            rivals = evaluate_rivals(model, lightmaps, tuple(_NAMES), progress=progress)
+            rivals = evaluate_rivals(model, lightmaps, tuple(_NAMES), views=views, progress=progress)
     if json_path is not None:
         extra = {"baselines": [rival.to_json() | score.to_json() for rival, score in rivals]} if baselines else {}
         write_json(json_path, report.to_json() | extra)
@@ -275,7 +284,8 @@ def _show_report(file: Path, report: "Report", rivals: "list[tuple[Rival, Score]
     def add(name: str, psnr: float, ssim: float, flip: float, size: str = "", bpp: str = "") -> None:
         rows.add_row(name, number(psnr, ".2f"), number(ssim, ".4f"), number(flip, ".4f"), size, bpp)
 
-    for name, score in [(f"wlm {escape(report.profile)}", report), *((_NAMES[r.name], score) for r, score in rivals)]:
+    named = [(f"wlm {escape(report.profile)}", report), *((_NAMES[r.name], score) for r, score in rivals)]
+    for name, score in named:
         add(name, score.psnr, score.ssim, score.flip, f"{score.bytes:,}", f"{score.bpp:.3f}")
     rows.add_section()
     scores = (report.psnr_by_time, report.ssim_by_time, report.flip_by_time)
@@ -288,9 +298,24 @@ def _show_report(file: Path, report: "Report", rivals: "list[tuple[Rival, Score]
         if any(value == value for value in values):
             add(f"tile {tile}", *values)
     show(rows)
+    _show_seen(named)
     if report.worst_tile is not None:
         worst = report.worst_tile
         note(f"worst: {report.worst_psnr:.2f} dB, tile {worst['tile']} at {worst['time']:g}")
+    for what, worst in (("seen", report.worst_seen), ("between times", report.worst_between)):
+        if worst is not None:
+            note(f"worst {what}: {worst['psnr']:.2f} dB, tile {worst['tile']} at {worst['time']:g}")
+    if report.worst_seen_time is not None:
+        worst = report.worst_seen_time
+        note(f"worst time, mean of its tiles seen: {worst['psnr']:.2f} dB at {worst['time']:g}")
+    if report.worst_seen_tile is not None:
+        worst = report.worst_seen_tile
+        note(f"worst tile, mean of its times seen: {worst['psnr']:.2f} dB, tile {worst['tile']}")
+    if report.worst_view is not None:
+        worst = report.worst_view
+        note(
+            f"worst view: {worst['psnr']:.2f} dB, FLIP {worst['flip']:.4f}, camera {worst['view']} at {worst['time']:g}"
+        )
     left_out = ", ".join(f"{count} {reason}" for reason, count in report.not_scored.items() if count)
     if left_out:
         note(f"without a score, tiles times times: {left_out}")
@@ -301,3 +326,27 @@ def _show_report(file: Path, report: "Report", rivals: "list[tuple[Rival, Score]
         )
     for warning in report.warnings:
         note(f"warning: {warning}")
+
+
+def _show_seen(named: "list[tuple[str, Report | Score]]") -> None:
+    """Shows the scores of `wlm.lightmap.seen`; columns without any number are left out."""
+    columns = {
+        "texels dB": ("psnr", ".2f", 1.0),
+        "seen dB": ("seen", ".2f", 1.0),
+        "ring dB": ("ring", ".2f", 1.0),
+        "between dB": ("between", ".2f", 1.0),
+        "border ×": ("border", ".2f", 1.0),
+        "flicker %": ("flicker", ".3f", 100.0),
+        "views dB": ("view_psnr", ".2f", 1.0),
+        "views FLIP": ("view_flip", ".4f", 1.0),
+    }
+    found = {
+        title: [number(scale * getattr(score, name), form) for _, score in named]
+        for title, (name, form, scale) in columns.items()
+        if any(math.isfinite(getattr(score, name)) for _, score in named)
+    }
+    if len(found) > 1:
+        rows = table("as it is seen", ["", *found])
+        for name, *cells in zip((name for name, _ in named), *found.values(), strict=True):
+            rows.add_row(name, *cells)
+        show(rows)

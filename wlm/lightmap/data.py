@@ -19,8 +19,8 @@ times out of order                    sorted, with their frames; warning
 two equal times                       error that names both files
 more than 100,000 times               error
 an alpha NaN or infinite              the texel is outside a mask from alpha; warning
-files or a mask outside the folder    error, unless the set is trusted
-of their `set.json`
+files, mask or mesh outside the       error, unless the set is trusted
+folder of their `set.json`
 frames beyond 1 GiB that small files  error, unless the set is trusted
 only claim
 a time outside [0, period)            error: 24 h is 0 h, and wrapping would hide a mistake in the list
@@ -39,7 +39,7 @@ import math
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain, pairwise
 from pathlib import Path
 
@@ -68,6 +68,7 @@ class LightmapSet:
             set is not periodic and times outside its ends are clamped.
         source: 16 hexadecimal digits of BLAKE2b over the checked pixels, the times and the mask.
         warnings: What was repaired, one line each.
+        mesh: The mesh that the lightmaps belong to, as the set names it; it need not be there. None: no name.
     """
 
     name: str
@@ -77,6 +78,7 @@ class LightmapSet:
     period: float | None
     source: str
     warnings: tuple[str, ...]
+    mesh: Path | None = None
 
 
 def load(
@@ -90,8 +92,9 @@ def load(
     """Reads a lightmap set: a `set.json`, a folder that holds one, or a plain folder of EXR files.
 
     `set.json` is an object with `width`, `height` and `lightmaps` (a list of `{"time_hours", "file"}`), and
-    may have `name`, `period_hours` and `mask` (a PNG's name, or "alpha"; absent means that all texels are
-    valid). Other keys are ignored. Names of files are relative to it.
+    may have `name`, `period_hours`, `mask` (a PNG's name, or "alpha"; absent means that all texels are valid) and
+    `mesh` (a glTF or OBJ file's name, read by `evaluate` alone). Other keys are ignored. Names of files are relative
+    to it.
 
     The files of a plain folder are taken in natural order of their names ("2" before "10"). Without `times`,
     the hours are read from the names if every one ends like `_18_55h`, `_18.55h`, `_18h` or `_18.55`, the
@@ -138,7 +141,7 @@ def load(
         valid = np.ones((height, width), bool)
     else:
         valid = read_mask(Path(mask_source), listing.files[0], (height, width), ', "alpha" or "all"')
-    return _check(
+    lightmaps = _check(
         listing.name,
         labels,
         stamps,
@@ -150,6 +153,7 @@ def load(
         warn_order=listing.warn_order,
         warnings=warnings,
     )
+    return replace(lightmaps, mesh=listing.mesh)
 
 
 def from_arrays(

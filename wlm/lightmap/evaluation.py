@@ -1,4 +1,5 @@
-"""Scoring a compressed lightmap set against its input, by the paper's protocol (neural-dynamic-gi, section 10.2)."""
+"""Scoring a compressed lightmap set against its input: by the paper's protocol (neural-dynamic-gi, section 10.2), and
+as it is seen (`wlm.lightmap.seen`)."""
 
 import time
 from collections.abc import Iterator, Sequence
@@ -13,10 +14,14 @@ from wlm.lightmap.data import LightmapSet
 from wlm.lightmap.decode import Decoder
 from wlm.lightmap.model import TILE, LightmapModel
 from wlm.lightmap.packing import STREAMS
+from wlm.lightmap.seen import SeenScore, Tally
 from wlm.lightmap.tiles import TileGrid, TileKind
+from wlm.lightmap.views import VIEWS, views_of
 from wlm.metrics import METRICS, FrameMetrics, LostLight, Summary, evaluate_frame, summarise
 from wlm.system import Meter, OnProgress
-from wlm.system import Report as BaseReport
+
+SCORES = (*METRICS, "seen")
+"""What `evaluate` computes: the metrics of the paper's protocol, and the scores of `wlm.lightmap.seen`."""
 
 _LOST = "texel", "their tile"
 _FEW_TEXELS = 16  # of a tile's 16,384
@@ -26,8 +31,10 @@ _TIME_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True)
-class Report(BaseReport):
+class Report(SeenScore):
     """Size and error of a compressed set. A mean over nothing, and a metric that was not computed, is NaN.
+
+    The scores of `SeenScore` and `ViewScore` are attributes too.
 
     Attributes:
         psnr, ssim, flip: Means over every scored tile at every time; decibels (120 for an exact tile), in [-1, 1], in
@@ -93,11 +100,12 @@ def evaluate(
     lightmaps: LightmapSet,
     *,
     device: str = "cpu",
-    metrics: Sequence[str] = METRICS,
+    metrics: Sequence[str] = SCORES,
+    views: int = VIEWS,
     progress: OnProgress | None = None,
     file_bytes: int | None = None,
 ) -> Report:
-    """Decodes every stored time from the stored bytes and compares it with the input.
+    """Decodes every stored time, and times between them, from the stored bytes and compares them with the input.
 
     Only what the model holds is scored: where it was made of some tiles, the texels of the others are masked out.
 
@@ -105,7 +113,8 @@ def evaluate(
         model: The model.
         lightmaps: The input. Another set of the same size and times is scored too, with a warning.
         device: Where it is decoded: "cpu", "cuda" or "cuda:N".
-        metrics: Any of "psnr", "ssim" and "flip"; FLIP takes most of the time.
+        metrics: Any of "psnr", "ssim", "flip" and "seen"; FLIP takes most of the time.
+        views: Views of the set's mesh, of "seen"; 0 for none. Without a mesh there are none.
         progress: Called about twice a second.
         file_bytes: Size of the model's file; None: that of the file that it would be saved to.
 
@@ -114,7 +123,7 @@ def evaluate(
 
     Raises:
         WlmError: The set's size or times are not the model's, no tile of the model has a valid texel, the device
-            isn't there, or a metric is unknown.
+            isn't there, a metric is unknown, or the number of views is negative.
         ValueError: `file_bytes` is less than the model's parts take.
     """
     start = time.perf_counter()
@@ -122,18 +131,24 @@ def evaluate(
     mask = scored_mask(model, lightmaps)
     decoder = Decoder(model, device)
     meter = Meter(progress, "score", len(model.times))
+    plain = [metric for metric in metrics if metric != "seen"]
+    drawn, warnings = views_of(lightmaps, views if "seen" in metrics else 0, device=device)
+    tally = Tally(lightmaps, mask, decoder.frame, drawn, model.name)
     frames, lost = [], LostLight()
     for i, stamp in enumerate(model.times):
         name, decoded = f"{model.name} at {stamp:g}", decoder.frame(stamp)
-        frames.append(evaluate_frame(lightmaps.frames[i], decoded, mask, TILE, metrics, name=name))
+        frames.append(evaluate_frame(lightmaps.frames[i], decoded, mask, TILE, plain, name=name))
+        if "seen" in metrics:
+            tally.add(i, decoded, frames[i])
         for tile, window in _windows(model):
             valid = mask[window]
             lost.add(lightmaps.frames[i][window][valid], decoded[window][valid], _place(tile, stamp))
         if meter.due(i + 1):
             meter.report(i + 1)
     file_bytes = model.file_bytes() if file_bytes is None else file_bytes
-    report = _report(model, lightmaps, file_bytes, device, frames, time.perf_counter() - start)
-    return replace(report, warnings=report.warnings + lost.warnings(model.name, *_LOST))
+    seconds = time.perf_counter() - start
+    report = _report(model, lightmaps, file_bytes, device, frames, tally.score(), seconds)
+    return replace(report, warnings=report.warnings + warnings + lost.warnings(model.name, *_LOST))
 
 
 def lost_light(model: LightmapModel, lightmaps: LightmapSet, device: str = "cpu") -> list[str]:
@@ -264,6 +279,7 @@ def _report(
     file_bytes: int,
     device: str,
     frames: Sequence[FrameMetrics],
+    seen: SeenScore,
     seconds: float,
 ) -> Report:
     summary = summarise(frames)
@@ -286,6 +302,7 @@ def _report(
     scores = (f"{name}{suffix}" for name in METRICS for suffix in ("", "_by_tile", "_by_time"))
     return Report(
         **{name: getattr(summary, name) for name in scores},
+        **vars(seen),
         psnr_unlimited=summary.psnr_unlimited,
         bpp=bits_per_texel(model, lightmaps.mask, file_bytes),
         bytes=file_bytes,

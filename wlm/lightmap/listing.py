@@ -33,6 +33,7 @@ class Listing:
         size: Height and width in texels where the set states them, else None.
         stated_by: The file that states the size, or the folder.
         warn_order: Whether times that are out of order deserve a warning.
+        mesh: The mesh that the lightmaps belong to, which need not be there, or None.
     """
 
     name: str
@@ -43,6 +44,7 @@ class Listing:
     size: tuple[int, int] | None
     stated_by: Path
     warn_order: bool
+    mesh: Path | None = None
 
 
 def list_folder(folder: Path, times: Sequence[float] | None) -> Listing:
@@ -112,7 +114,7 @@ def parse_set(path: Path, times: Sequence[float] | None, trust: bool = False) ->
     Args:
         path: The file.
         times: One for each lightmap, in place of those of the file; None takes those of the file.
-        trust: Whether its files and its mask may lie outside its folder.
+        trust: Whether its files, its mask and its mesh may lie outside its folder.
 
     Returns:
         The listing, with paths relative to the file resolved.
@@ -147,6 +149,10 @@ def parse_set(path: Path, times: Sequence[float] | None, trust: bool = False) ->
         if mask not in ("all", "alpha"):
             mask = str(named_file(path, mask, f"{path}: mask", trust))
 
+    mesh = None
+    if content.get("mesh") is not None:
+        mesh = named_file(path, field(content, "mesh", "", _is_text, "the name of a mesh"), f"{path}: mesh", trust)
+
     if len(entries) > TIMES:
         raise WlmError(f"{path}: lightmaps: expected at most {TIMES:,}, got {len(entries):,}")
     files, stamps, found = [], [], {}
@@ -163,7 +169,7 @@ def parse_set(path: Path, times: Sequence[float] | None, trust: bool = False) ->
     if times is not None:
         _check_count(path, files, times)
         stamps = times
-    return Listing(name, files, stamps, mask, period, (height, width), path, True)
+    return Listing(name, files, stamps, mask, period, (height, width), path, True, mesh)
 
 
 def _is_text(value: object) -> bool:

@@ -1,7 +1,7 @@
 """Error of HDR lightmaps: PSNR, SSIM and HDR-FLIP, masked, and in tiles as the paper scores them."""
 
 from wlm.metrics.error import PSNR_CAP_DB, dynamic_range, half_ulp, max_abs_error, mse, psnr, psnr_from_mse
-from wlm.metrics.flip import flip_exposures, flip_map
+from wlm.metrics.flip import flip_display, flip_exposures, flip_map
 from wlm.metrics.lost import LostLight
 from wlm.metrics.structural import SSIM_WINDOW, ssim, ssim_map
 from wlm.metrics.tiled import (
@@ -25,6 +25,7 @@ __all__ = [
     "Summary",
     "dynamic_range",
     "evaluate_frame",
+    "flip_display",
     "flip_exposures",
     "flip_map",
     "half_ulp",

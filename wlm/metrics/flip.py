@@ -88,6 +88,24 @@ def flip_map(ref: np.ndarray, test: np.ndarray, mask: np.ndarray | None = None, 
     return flip_filled(filled, same_outside, flip_exposures(ref, valid), exposures)
 
 
+def flip_display(ref: np.ndarray, test: np.ndarray) -> np.ndarray:
+    """LDR-FLIP of what a display shows, at flip_evaluator's default of 67 pixels a degree.
+
+    Args:
+        ref: `[H, W, 3]`, sRGB in [0, 1].
+        test: `[H, W, 3]`, likewise.
+
+    Returns:
+        `[H, W]` float64 in [0, 1].
+
+    Raises:
+        WlmError: Shapes differ, the images are not RGB, or a value is NaN or infinite.
+    """
+    ref, test, _ = check_pair(ref, test, None, "flip")
+    _check_rgb(ref)
+    return _ldr_flip(ref, test, srgb=True)
+
+
 def flip_filled(ref: np.ndarray, test: np.ndarray, span: tuple[float, float] | None, exposures: int) -> np.ndarray:
     """`flip_map` for images that are checked and equal outside the mask; `span` is `flip_exposures`'."""
     import flip_evaluator  # here for the same reason as scikit-image in structural.py
@@ -99,12 +117,7 @@ def flip_filled(ref: np.ndarray, test: np.ndarray, span: tuple[float, float] | N
     if span is None:
         if not test.any():
             return np.zeros(ref.shape[:2])
-        black = np.zeros(ref.shape, np.float32)
-        clipped = np.clip(test, 0.0, 1.0).astype(np.float32)
-        error, _, _ = flip_evaluator.evaluate(
-            black, clipped, "LDR", inputsRGB=False, applyMagma=False, computeMeanError=False
-        )
-        return error[..., 0].astype(np.float64)
+        return _ldr_flip(np.zeros(ref.shape), np.clip(test, 0.0, 1.0), srgb=False)
     start, stop = span
     # One power of two moves the images and the exposures alike, so the result is the same, while float32
     # inputs stay far from overflow and from subnormals however bright or dim the scene is.
@@ -119,6 +132,14 @@ def flip_filled(ref: np.ndarray, test: np.ndarray, span: tuple[float, float] | N
         computeMeanError=False,
         parameters={"startExposure": start - shift, "stopExposure": stop - shift, "numExposures": exposures},
     )
+    return error[..., 0].astype(np.float64)
+
+
+def _ldr_flip(ref: np.ndarray, test: np.ndarray, srgb: bool) -> np.ndarray:
+    import flip_evaluator
+
+    images = (image.astype(np.float32) for image in (ref, test))
+    error, _, _ = flip_evaluator.evaluate(*images, "LDR", inputsRGB=srgb, applyMagma=False, computeMeanError=False)
     return error[..., 0].astype(np.float64)
 
 

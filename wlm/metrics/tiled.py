@@ -216,16 +216,16 @@ def summarise(frames: Sequence[FrameMetrics]) -> Summary:
     if not np.isnan(psnr).all():
         worst_tile = tuple(int(i) for i in np.unravel_index(np.nanargmin(psnr), psnr.shape))
     return Summary(
-        psnr=float(_nanmean(psnr)),
-        ssim=float(_nanmean(ssim)),
-        flip=float(_nanmean(flip)),
-        psnr_unlimited=float(_nanmean(np.where(limited, math.nan, psnr))),
-        psnr_by_tile=_nanmean(psnr, axis=0),
-        ssim_by_tile=_nanmean(ssim, axis=0),
-        flip_by_tile=_nanmean(flip, axis=0),
-        psnr_by_time=_nanmean(psnr, axis=(1, 2)),
-        ssim_by_time=_nanmean(ssim, axis=(1, 2)),
-        flip_by_time=_nanmean(flip, axis=(1, 2)),
+        psnr=float(nanmean(psnr)),
+        ssim=float(nanmean(ssim)),
+        flip=float(nanmean(flip)),
+        psnr_unlimited=float(nanmean(np.where(limited, math.nan, psnr))),
+        psnr_by_tile=nanmean(psnr, axis=0),
+        ssim_by_tile=nanmean(ssim, axis=0),
+        flip_by_tile=nanmean(flip, axis=0),
+        psnr_by_time=nanmean(psnr, axis=(1, 2)),
+        ssim_by_time=nanmean(ssim, axis=(1, 2)),
+        flip_by_time=nanmean(flip, axis=(1, 2)),
         worst_psnr=math.nan if worst_tile is None else float(psnr[worst_tile]),
         worst_tile=worst_tile,
         max_abs_error=_nanmax(errors),
@@ -239,7 +239,7 @@ def summarise(frames: Sequence[FrameMetrics]) -> Summary:
     )
 
 
-def _nanmean(values: np.ndarray, axis: int | tuple[int, ...] | None = None) -> np.ndarray:
+def nanmean(values: np.ndarray, axis: int | tuple[int, ...] | None = None) -> np.ndarray:
     """`np.nanmean` without its warning: a mean over nothing is NaN and is expected here."""
     valid = ~np.isnan(values)
     count = valid.sum(axis=axis)

@@ -9,11 +9,12 @@ from PIL import Image, ImageDraw, ImageFont
 
 from wlm.atlas.data import LightmappedMesh
 from wlm.atlas.evaluation import Sampler
-from wlm.atlas.views import View, corner_weights, visible_uv
+from wlm.atlas.views import corner_weights, visible_uv
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_path
 from wlm.interop import check_device
 from wlm.ops import raster
+from wlm.ops.views import View
 from wlm.view.display import Display, white_of
 
 _BACKGROUND = 128  # light and dark surfaces stand out from it

@@ -145,8 +145,8 @@ def _lightmaps(paths: Sequence[Path], models: Sequence[Any], original: _Path | N
     scores = {}
     if original is not None:
         lightmaps = lightmap.load(original)
-        reports = [lightmap.evaluate(model, lightmaps, device=device) for model in models]
-        names = {"PSNR dB": "psnr", "worst PSNR dB": "worst_psnr", "SSIM": "ssim", "FLIP": "flip"}
+        reports = [lightmap.evaluate(model, lightmaps, views=0, device=device) for model in models]
+        names = {"PSNR dB": "psnr", "worst PSNR dB": "worst_psnr", "seen dB": "seen", "SSIM": "ssim", "FLIP": "flip"}
         scores = {title: tuple(getattr(report, name) for report in reports) for title, name in names.items()}
         nearest = int(np.abs(lightmaps.times - times[furthest]).argmin())
         mask = lightmaps.mask[..., None]

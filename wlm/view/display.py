@@ -7,11 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from wlm.texels import filmic, to_srgb
+
 TONES = ("clamped", "filmic")
 """What becomes of light above white: it clips, or Reinhard's curve takes 4 to white."""
 
 _WHITE_PERCENTILE = 99.5  # as in `wlm.view.sheet`
-_FILMIC_WHITE = 4.0
 _HEAT = np.array([[0.0, 0.0, 0.0], [0.45, 0.1, 0.5], [1.0, 0.6, 0.1], [1.0, 1.0, 1.0]])
 _HEAT_AT = (0.0, 0.33, 0.66, 1.0)
 
@@ -34,7 +35,7 @@ class Display:
         """Linear light of any shape to display values in [0, 1], float32."""
         x = np.maximum(np.asarray(light, np.float32) * np.float32(self.exposure), np.float32(0))
         if self.tone == "filmic":
-            x = x * (1 + x / np.float32(_FILMIC_WHITE**2)) / (1 + x)
+            x = filmic(x)
         return to_srgb(x)
 
     def picture(self, light: np.ndarray) -> np.ndarray:
@@ -70,12 +71,6 @@ def white_of(light: np.ndarray) -> float:
     """The radiance that is shown as white: the 99.5th percentile; 1 where there is no light."""
     white = float(np.percentile(light, _WHITE_PERCENTILE)) if light.size else 0.0
     return white if white > 0 else float(light.max(initial=0.0)) or 1.0
-
-
-def to_srgb(linear: np.ndarray) -> np.ndarray:
-    """Linear light to sRGB (IEC 61966-2-1), clipped to [0, 1]."""
-    linear = np.clip(linear, 0.0, 1.0)
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
 
 
 def _bytes(values: np.ndarray) -> np.ndarray:

@@ -11,13 +11,13 @@ import torch
 from wlm.atlas.data import LightmappedMesh
 from wlm.atlas.evaluation import Report as AtlasReport
 from wlm.atlas.model import AtlasModel
-from wlm.atlas.views import sphere_views
 from wlm.lightmap.data import LightmapSet
 from wlm.lightmap.decode import Decoder as LightmapDecoder
 from wlm.lightmap.evaluation import Report as LightmapReport
 from wlm.lightmap.model import TILE, LightmapModel
 from wlm.lightmap.tiles import TileGrid
 from wlm.metrics.error import psnr_from_mse
+from wlm.ops.views import sphere_views
 from wlm.probe.data import ProbeSet
 from wlm.probe.decode import Decoder as ProbeDecoder
 from wlm.probe.evaluation import Report as ProbeReport
@@ -64,7 +64,11 @@ def lightmap_report(
         ("tiles", kinds),
     ]
     page = _begin(model.name, report.profile, report.warnings, rows)
-    page.lines("PSNR by hour, mean of the tiles", "dB", report.time_values, {"PSNR": report.psnr_by_time})
+    by_time = {"texels": report.psnr_by_time}
+    if np.isfinite(report.seen_by_time).any():
+        page.table("As it is seen", ("", "", "worst"), _seen_rows(report))
+        by_time["seen"] = report.seen_by_time
+    page.lines("PSNR by hour, mean of the tiles", "dB", report.time_values, by_time)
     if np.isfinite(report.flip_by_time).any():
         page.lines("FLIP by hour, mean of the tiles", "FLIP", report.time_values, {"FLIP": report.flip_by_time})
     if np.isfinite(report.psnr_by_tile).any():
@@ -72,6 +76,25 @@ def lightmap_report(
         _worst_tiles(page, model, lightmaps, report)
     page.table("Bytes of the file", ("part", "bytes"), [(name, f"{size:,}") for name, size in report.parts.items()])
     return page.write(path)
+
+
+def _seen_rows(report: LightmapReport) -> list[tuple[str, str, str]]:
+    def place(worst: dict[str, float | int] | None) -> str:
+        if worst is None:
+            return ""
+        where = f"camera {worst['view']}" if "view" in worst else f"tile {worst['tile']}"
+        return f"{worst['psnr']:.2f} dB, {where} at {worst['time']:g}"
+
+    views = f"{_number(report.view_psnr, '.2f', 'dB')}, FLIP {_number(report.view_flip, '.4f')}"
+    rows = [
+        ("seen: filtered at random points", _number(report.seen, ".2f", "dB"), place(report.worst_seen)),
+        ("ring: gaps beside charts", _number(report.ring, ".2f", "dB"), ""),
+        ("between stored times", _number(report.between, ".2f", "dB"), place(report.worst_between)),
+        ("error across tiles / within", _number(report.border, ".2f"), ""),
+        ("flicker, of the range in 3 minutes", _number(100 * report.flicker, ".3f", "%"), ""),
+        (f"{report.views} views", views, place(report.worst_view)),
+    ]
+    return [row for row in rows if not row[1].startswith("–")]
 
 
 def _worst_tiles(page: Document, model: LightmapModel, lightmaps: LightmapSet, report: LightmapReport) -> None:

@@ -1,0 +1,163 @@
+"""Views of a mesh from all around: cameras on a sphere, and the surface point at each pixel.
+
+The mesh is scaled into [-1, 1]³: the longest side of its box is 2 long, the box's centre is the origin. Cameras are at
+a distance of 3 and look at the origin (lightmap-uv-clustering-cascade, section 4.1.4). Their field of view just holds
+the sphere around that cube, of radius sqrt 3: 2 asin(sqrt 3 / 3), 70.5 degrees both ways, so that nothing is ever cut
+off. Pictures are square; row 0 is their top.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+import torch
+
+from wlm.interop import check_device
+from wlm.ops import raster as ops_raster
+
+DISTANCE = 3.0
+"""Distance of a camera from the origin."""
+
+_SPHERE = math.sqrt(3.0)
+
+ZOOM = math.sqrt(DISTANCE**2 - _SPHERE**2) / _SPHERE
+"""Clip x over the distance from the camera's axis; w is the distance along it."""
+
+_NEAR, _FAR = DISTANCE - _SPHERE, DISTANCE + _SPHERE
+# Where y in the direction is larger, within 26 degrees of a pole, the picture's up is z instead of y.
+_STEEP = 0.9
+_GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A camera.
+
+    Attributes:
+        axes: float64 [3, 3], rows of unit length at right angles: the picture's right and up, and the direction from
+            the origin to the camera.
+    """
+
+    axes: np.ndarray
+
+    @classmethod
+    def of(cls, direction: Sequence[float] | np.ndarray) -> Self:
+        """Makes the camera in a direction from the origin.
+
+        Args:
+            direction: [3], of any length but 0. The picture's up is +y, or +z where the direction is near y's axis.
+
+        Raises:
+            ValueError: The direction has no length or isn't finite.
+        """
+        back = np.asarray(direction, np.float64)
+        if back.shape != (3,) or not np.isfinite(back).all() or not back.any():
+            raise ValueError(f"direction: expected three finite numbers, not all 0, got {direction}")
+        back = back / np.abs(back).max()
+        back = back / np.linalg.norm(back)
+        right = np.cross([0.0, 1.0, 0.0] if abs(back[1]) <= _STEEP else [0.0, 0.0, 1.0], back)
+        right = right / np.linalg.norm(right)
+        return cls(np.stack([right, np.cross(back, right), back]))
+
+
+def sphere_views(count: int, seed: int | np.random.Generator | None = None) -> list[View]:
+    """Makes cameras on the sphere.
+
+    Args:
+        count: Number of cameras, at least 0.
+        seed: None spreads them evenly (a Fibonacci sphere); else they are random, independent and uniform. A generator
+            goes on where it was.
+
+    Raises:
+        ValueError: A negative count.
+    """
+    if count < 0:
+        raise ValueError(f"count: expected at least 0, got {count}")
+    if seed is None:
+        number = np.arange(count)
+        y = 1.0 - (2.0 * number + 1.0) / max(count, 1)
+        azimuth = number * _GOLDEN_ANGLE
+    else:
+        random = np.random.default_rng(seed)
+        y = random.uniform(-1.0, 1.0, count)
+        azimuth = random.uniform(0.0, 2.0 * math.pi, count)
+    # Bands of equal height have equal areas on a sphere.
+    radius = np.sqrt(1.0 - y * y)
+    return [View.of(each) for each in np.stack([radius * np.cos(azimuth), y, radius * np.sin(azimuth)], axis=-1)]
+
+
+def normalised(position: np.ndarray, triangle: np.ndarray) -> np.ndarray:
+    """Scales a mesh into [-1, 1]³.
+
+    Args:
+        position: float [V, 3].
+        triangle: int [F, 3], at least one; the box is that of all triangles, and has a size.
+
+    Returns:
+        The positions, float64 [V, 3].
+    """
+    used = position[triangle.reshape(-1)].astype(np.float64)
+    low, high = used.min(axis=0), used.max(axis=0)
+    return (position - (low + high) / 2.0) * (2.0 / (high - low).max())
+
+
+def clip_positions(position: np.ndarray, view: View) -> np.ndarray:
+    """The vertices in a camera's clip space, for `wlm.ops.rasterize`.
+
+    Args:
+        position: float64 [V, 3], `normalised`.
+        view: The camera.
+
+    Returns:
+        float32 [V, 4]: x, y, z, w; w is the distance along the camera's axis, z / w is -1 and 1 where the sphere
+        around the cube is nearest and farthest. Vertices at one place have equal numbers.
+    """
+    # Written out: a matrix product may round rows differently, and shared edges would come apart.
+    x, y, back = (position[:, 0] * a + position[:, 1] * b + position[:, 2] * c for a, b, c in view.axes)
+    w = DISTANCE - back
+    z = ((_FAR + _NEAR) * w - 2.0 * _FAR * _NEAR) / (_FAR - _NEAR)
+    return np.stack([ZOOM * x, ZOOM * y, z, w], axis=1).astype(np.float32)
+
+
+def visible_points(
+    position: np.ndarray,
+    triangle: np.ndarray,
+    uv: np.ndarray,
+    views: Sequence[View],
+    resolution: int,
+    device: str,
+    *,
+    cull: bool = False,
+) -> Iterator[tuple[torch.Tensor, torch.Tensor, torch.Tensor]]:
+    """Draws a mesh from each camera.
+
+    Args:
+        position: float [V, 3], in any unit; scaled here.
+        triangle: int [F, 3].
+        uv: float [V, 2].
+        views: The cameras.
+        resolution: Pixels along a side, 1 to 16,384.
+        device: "cpu" or "cuda:N".
+        cull: Whether triangles that are seen from behind are left out, so that a room is seen through its walls.
+
+    Yields:
+        For each camera, on the device: int32 [h, w], the visible triangle, -1 for none; float32 [h, w, 2], the weights
+        of its corners 0 and 1, corner 2 has the rest; float32 [h, w, 2], the UVs there. The latter two are 0 in
+        uncovered pixels.
+
+    Raises:
+        WlmError: There is no such device.
+        ValueError: The resolution is out of range.
+    """
+    device = check_device(device)
+    scaled = normalised(position, triangle)
+    corner = torch.tensor(triangle.astype(np.int32), device=device)
+    coordinate = torch.tensor(uv, dtype=torch.float32, device=device)
+    for view in views:
+        with torch.no_grad():
+            clip = torch.tensor(clip_positions(scaled, view), device=device)
+            raster = ops_raster.rasterize(clip, corner, resolution, resolution, cull=cull)
+            seen = ops_raster.interpolate(coordinate, corner, raster)
+        yield raster.triangle, raster.barycentric, seen
