@@ -4,7 +4,8 @@ Four kinds of rows:
 
 - method "ours", one row for each profile: the file, the fit, the errors of the float decode against the input, and the
   decode time of the whole map to 8 bits on the fast path. The largest error is in radiance, against the float64 path.
-- methods "exact" (one texel per thread) and "strip" (the fast path), one row for each form of the GELU, of profile M:
+- methods "exact" (one texel per thread) and "strip" (the fast path), one row for each form of the GELU, and on CUDA
+  "matrix" (the fast path on matrix units), of profile M:
   the 8-bit output against the input, and its largest error against the float64 path as a share of 255. Half a level of
   8 bits, 0.00196, is the rounding itself.
 - the block codecs of `wlm.baselines.lightmap`, on the same lightmaps; between stored times their light is mixed.
@@ -37,14 +38,14 @@ from wlm.lightmap.evaluation import bits_per_texel, count_kinds
 from wlm.lightmap.exact import bound64, colour_tile64, decode_tile64
 from wlm.lightmap.fit import compress, dynamic_targets
 from wlm.lightmap.model import TILE, LightmapModel, Profile, TimeAxis, encode_time
-from wlm.lightmap.runtime import ExactDecoder, StripDecoder
+from wlm.lightmap.runtime import ExactDecoder, MatrixDecoder, StripDecoder, fast_decoder
 from wlm.lightmap.seen import Tally
 from wlm.lightmap.tiles import TileGrid, TileKind, assemble
 from wlm.lightmap.views import VIEWS, views_of
 from wlm.metrics import METRICS, Summary, evaluate_frame, summarise
 
-PROFILES = ("L", "M", "H", "M64", "M-paper")
-"""Profiles of a full run: the paper's table 3, and M as the paper fits it."""
+PROFILES = ("L", "M", "H", "M64", "standard", "fine", "M-paper")
+"""Profiles of a full run: the paper's table 3, ours, and M as the paper fits it."""
 
 QUICK_PROFILES = ("L", "M", "M-paper")
 """Profiles of a quick run."""
@@ -61,6 +62,8 @@ _PLAIN_STEPS = 10  # of the fit in plain torch, where it isn't run to its end
 _ERROR_TIMES = 3  # the float64 path takes 30 ms for one tile at one time
 
 _SEEN = ("seen", "ring", "between", "border", "view_psnr", "view_flip")  # scores that are figures by their names
+
+_Runtime = StripDecoder | MatrixDecoder | ExactDecoder
 
 # GELU by its gate, which is shorter to read in a plot.
 _GELUS = {"exact": "erf", "tanh": "tanh", "fast": "fast tanh"}
@@ -137,6 +140,8 @@ def run_rows(
         # On the CPU "fast" is "tanh".
         gelus = [gelu for gelu in _GELUS if bench.device != "cpu" or gelu != "fast"]
         peers += [bench.option_row(best, path, gelu) for path in ("exact", "strip") for gelu in gelus]
+        if bench.device != "cpu" and best.model.profile.hidden % 16 == 0:
+            peers.append(bench.option_row(best, "matrix", "fast"))
     rows = bench.time_rows(peers)
     rows += [bench.codec_row(name) for name in _CODECS]
     rows += [bench.fit_row(fit) for fit in fits]
@@ -160,6 +165,14 @@ def _repeated(model: LightmapModel, count: int) -> LightmapModel:
     arrays = {name: np.concatenate([array] * count) for name, array in model.parts.items()}
     width, height = TILE * len(model.kind), TILE * count
     return replace(model, width=width, height=height, mask=np.ones((height, width), bool), **arrays)
+
+
+def _matrix(model: LightmapModel, device: str, gelu: str | None) -> MatrixDecoder:
+    return MatrixDecoder(model, device)
+
+
+def _fast(model: LightmapModel, device: str, gelu: str | None) -> StripDecoder | MatrixDecoder:
+    return fast_decoder(model, device)
 
 
 class _LightmapBench(Bench):
@@ -208,7 +221,7 @@ class _LightmapBench(Bench):
             **self._score(frames.values(), fit.option, seen=True, decode=decoder.frame),
             **self._tiles(model),
         )
-        return row, self._decode(self._decoders(model, "strip", None))
+        return row, self._decode(self._decoders(model, "fast", None))
 
     def option_row(self, fit: Fit, path: str, gelu: str) -> tuple[Row, Callable[[], object]]:
         """One way to decode a profile to 8 bits."""
@@ -349,11 +362,11 @@ class _LightmapBench(Bench):
         worst = {"worst_seen": score.worst_seen, "worst_between": score.worst_between}
         return figures | {key: where["psnr"] for key, where in worst.items() if where is not None}
 
-    def _decoders(self, model: LightmapModel, path: str, gelu: str | None) -> list[StripDecoder | ExactDecoder]:
+    def _decoders(self, model: LightmapModel, path: str, gelu: str | None) -> list[_Runtime]:
         """Decoders of the tiles with maps; a constant tile needs no launch."""
-        decoders: list[StripDecoder | ExactDecoder] = []
+        decoders: list[_Runtime] = []
         if (model.kind == TileKind.DYNAMIC).any():
-            make = StripDecoder if path == "strip" else ExactDecoder
+            make = {"exact": ExactDecoder, "strip": StripDecoder, "matrix": _matrix, "fast": _fast}[path]
             decoders.append(make(model, self.device, gelu))
         if (model.kind == TileKind.STATIC).any():
             decoders.append(ExactDecoder(model, self.device, gelu, TileKind.STATIC))
@@ -361,7 +374,7 @@ class _LightmapBench(Bench):
             decoder.set_time(self.times[0])
         return decoders
 
-    def _decode(self, decoders: Sequence[StripDecoder | ExactDecoder]) -> Callable[[], object]:
+    def _decode(self, decoders: Sequence[_Runtime]) -> Callable[[], object]:
         def decode() -> None:
             for decoder in decoders:
                 decoder.decode()
@@ -370,7 +383,7 @@ class _LightmapBench(Bench):
         return self.replay(decode) if decoders else decode
 
     def _tiles_8bit(
-        self, model: LightmapModel, decoders: Sequence[StripDecoder | ExactDecoder], t: float, compare: bool
+        self, model: LightmapModel, decoders: Sequence[_Runtime], t: float, compare: bool
     ) -> tuple[np.ndarray, float]:
         """Radiance of all tiles through 8 bits, and the largest error of a byte over 255 if it is to be compared."""
         tiles = np.zeros((self.grid.count, TILE, TILE, 3))

@@ -199,3 +199,16 @@ class ExactDecoder(_TileDecoder):
             outputs=[out],
             device=self.device,
         )
+
+
+def fast_decoder(model: LightmapModel, device: str = "cpu") -> StripDecoder | MatrixDecoder:
+    """The fastest decoder of a model's dynamic tiles: on CUDA a `MatrixDecoder`, where its width and GELU allow it.
+
+    Raises:
+        WlmError: As `StripDecoder`.
+    """
+    device = interop.check_device(device)
+    tanh = device != "cpu" and model.profile.gelu == "tanh"
+    if tanh and model.profile.hidden % 16 == 0:
+        return MatrixDecoder(model, device)
+    return StripDecoder(model, device, "fast" if tanh else None)

@@ -7,6 +7,8 @@ const KINDS = {
   smoke: typeof SmokePage === 'undefined' ? null : SmokePage,
 };
 
+const BUSY_FRAME = 400;  // milliseconds between two pictures while an hour is decoded
+
 function fail(error) {
   const message = document.getElementById('message');
   message.textContent = String(error.message ?? error);
@@ -18,7 +20,7 @@ async function start() {
   const graphics = new Graphics(document.getElementById('view'));
   graphics.black = graphics.plain(1, 1, graphics.shared(), new Uint32Array(1), graphics.gl.NEAREST);
   const panel = new Panel(document.getElementById('panel'), manifest.title, manifest.note);
-  let dirty = true, last = performance.now();
+  let dirty = true, last = performance.now(), drawn = -Infinity;
   const changed = () => { dirty = true; };
   const kind = new KINDS[manifest.kind](graphics, page, panel, changed);
   for (const [name, text] of manifest.figures) panel.figure(name, text);
@@ -29,8 +31,11 @@ async function start() {
     try {
       kind.advance?.(elapsed);
       if (kind.work?.(elapsed)) dirty = true;
-      if (dirty || kind.playing !== undefined) {
+      // A large scene may take longer to draw than a tile to decode: while an hour is decoded it is drawn now and then.
+      const busy = kind.waiting?.length && kind.playing === undefined && time - drawn < BUSY_FRAME;
+      if ((dirty || kind.playing !== undefined) && !busy) {
         dirty = false;
+        drawn = time;
         kind.draw();
       }
     } catch (error) {
