@@ -11,12 +11,10 @@ from typing import TYPE_CHECKING, Literal
 from wlm.atlas.exporter import REPORT_FILE
 from wlm.errors import WlmError
 from wlm.formats.exr import read_exr
-from wlm.formats.exr_file import read_part
 from wlm.formats.geometry import read_geometry
 from wlm.formats.npz import read_npz
 from wlm.lightmap.listing import SET_FILE
-from wlm.smoke.camera import DIRECTIONS
-from wlm.smoke.data import SCENE_FILE
+from wlm.smoke.data import SCENE_FILE, is_six_way, six_way_files
 from wlm.system import load
 from wlm.view.scene import Scene
 
@@ -62,7 +60,7 @@ def open_scene(
     request = _Request(path, mesh, original, key, walk, scale, extinction, flat, up)
     if not path.exists():
         raise WlmError(f"{path}: no such file or folder")
-    if _is_six_way(path):
+    if is_six_way(path):
         return request.six_way(paths)
     if len(paths) > 1:
         raise WlmError(f"{paths[1]}: expected one file; only smoke has several, one EXR a frame")
@@ -103,8 +101,7 @@ class _Request:
             return self.atlas()
         if (self.path / SCENE_FILE).is_file():
             return self.volume(self.path)
-        frames = sorted(self.path.glob("*.exr"))
-        if frames and _is_six_way(frames[0]):
+        if frames := six_way_files(self.path):
             return self.six_way(frames)
         return self.lightmap_set()
 
@@ -207,13 +204,6 @@ class _Request:
         geometry = None if self.mesh is None else read_geometry(self.mesh, with_uv=False)
         walk = None if self.walk is None else load_positions(self.walk)
         return probe_scene(probes, title=self.path.name, geometry=geometry, walk=walk, scale=self.scale, up=self._up)
-
-
-def _is_six_way(path: Path) -> bool:
-    """Whether a file is an EXR with a channel for each direction."""
-    if path.suffix.lower() != ".exr" or not path.is_file():
-        return False
-    return all(name in read_part(path).channels for name in DIRECTIONS)
 
 
 def _names(path: Path) -> list[str]:
