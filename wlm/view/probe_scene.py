@@ -13,11 +13,10 @@ from wlm.formats.geometry import Geometry
 from wlm.probe.data import ProbeSet
 from wlm.probe.decode import Decoder
 from wlm.probe.model import CENTRE, ROTATION, SCALE, ProbeModel
-from wlm.probe.places import ball_radius
+from wlm.probe.places import ball_exposure, ball_radius
 from wlm.probe.sphere import basis, coefficient_bands, cosine_factor, irradiance, sh_count
 from wlm.probe.volume import SIDE, SIZES, Volume
 from wlm.probe.walk import EYE_HEIGHT, camera_path
-from wlm.texels import exposure
 from wlm.view.canvas import Canvas, Hit
 from wlm.view.rendering import import_pyvista
 from wlm.view.scene import Scene, Slider, State
@@ -156,7 +155,7 @@ class _ProbeScene(Scene):
         faces = self._ball_faces + len(self._ball) * np.arange(len(probes.position))[:, None, None]
         self._balls = points.reshape(-1, 3), faces.reshape(-1, 3)
         self._light = {name: irradiance(values, self._ball) / math.pi for name, values in probes.values.items()}
-        self._brightness = exposure(self._light.get("original", next(iter(self._light.values()))))
+        self._brightness = ball_exposure(probes.values.get("original", next(iter(probes.values.values()))))
         self._surface: np.ndarray | None = None
         if self.geometry is not None:
             at_vertices = probes.decode(self.geometry.position.astype(np.float64))
