@@ -24,11 +24,20 @@ class Surface {
     this.program = graphics.program(SURFACE, `${HEAD}
 in vec2 v_uv;
 in vec2 v_coordinate;
-uniform sampler2D u_original;
+uniform sampler2D u_original, u_mask;
+uniform bool u_unwrapped;
 out vec4 colour;
 ${source}
 ${DISPLAY}
-void main() { colour = vec4(wlm_shown(wlm_light(), texture(u_original, v_uv).rgb), 1.0); }`);
+void main()
+{
+    colour = vec4(wlm_shown(wlm_light(), texture(u_original, v_uv).rgb), 1.0);
+    // Texels of no chart are never seen on the mesh, and no score has them.
+    if (u_view == ${VIEWS.indexOf('error')} && u_unwrapped && texture(u_mask, v_uv).r == 0.0) colour.rgb = vec3(0.3);
+}`);
+    this.mask = page.has('mask') ? graphics.plain(
+      manifest.width, manifest.height, [graphics.gl.R8, graphics.gl.RED, graphics.gl.UNSIGNED_BYTE],
+      page.array('mask', Uint8Array), graphics.gl.NEAREST) : graphics.black;
     const uv = page.has('uv') ? page.array('uv', Float32Array) : new Float32Array([0, 0, 1, 0, 1, 1, 0, 1]);
     const indices = page.has('triangles') ? page.array('triangles', Uint32Array) : new Uint32Array([0, 1, 2, 0, 2, 3]);
     const position = page.has('position') ? page.array('position', Float32Array) : new Float32Array(uv.length * 1.5);
@@ -42,12 +51,20 @@ void main() { colour = vec4(wlm_shown(wlm_light(), texture(u_original, v_uv).rgb
     this.unwrapped = !this.mesh;
     this.#choose();
     if (this.mesh) {
-      panel.choices(['mesh', 'unwrapped'], 'mesh', (name) => {
+      panel.choices('show', ['mesh', 'unwrapped'], 'mesh', (name) => {
         this.unwrapped = name === 'unwrapped';
         this.#choose();
         changed();
       });
+      if (page.manifest.inward) {
+        this.oneSided = true;
+        panel.toggle('walls from outside', 'b', false, (seen) => { this.oneSided = !seen; changed(); });
+      }
     }
+    tellCamera(panel, this.mesh ? 'turn the camera; unwrapped: move' : 'move', () => {
+      this.picture.reset();
+      this.mesh?.reset();
+    });
   }
 
   #choose() {
@@ -60,9 +77,9 @@ void main() { colour = vec4(wlm_shown(wlm_light(), texture(u_original, v_uv).rgb
     const camera = this.unwrapped ? this.picture : this.mesh;
     graphics.use(this.program, {
       ...uniforms, ...this.display.uniforms(width), u_original: original ?? graphics.black,
-      u_camera: camera.matrix(), u_unwrapped: this.unwrapped, u_aspect: this.aspect,
+      u_mask: this.mask, u_camera: camera.matrix(), u_unwrapped: this.unwrapped, u_aspect: this.aspect,
     });
-    graphics.drawGeometry(this.geometry);
+    graphics.drawGeometry(this.geometry, 1, this.oneSided && !this.unwrapped);
   }
 }
 
