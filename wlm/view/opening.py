@@ -15,7 +15,7 @@ from wlm.formats.geometry import read_geometry
 from wlm.formats.npz import read_npz
 from wlm.lightmap.listing import SET_FILE
 from wlm.smoke.data import SCENE_FILE, is_six_way, six_way_files
-from wlm.system import load
+from wlm.system import OnProgress, load
 from wlm.view.scene import Scene
 
 if TYPE_CHECKING:
@@ -35,6 +35,7 @@ def open_scene(
     extinction: float | None = None,
     flat: bool = False,
     up: Literal["y", "z"] = "y",
+    progress: OnProgress | None = None,
 ) -> Scene:
     """Makes the scene of a file.
 
@@ -49,6 +50,7 @@ def open_scene(
         extinction: Of a volume of smoke, per unit of length at density 1.
         flat: Whether a lightmap is shown unwrapped though its mesh is there.
         up: The axis that points up.
+        progress: Called about twice a second while frames of smoke are read.
 
     Raises:
         WlmError: A file is missing, damaged, or of a kind that has no picture; an option doesn't fit it.
@@ -57,7 +59,7 @@ def open_scene(
     if not paths:
         raise WlmError("expected a file to show, found none")
     path = paths[0]
-    request = _Request(path, mesh, original, key, walk, scale, extinction, flat, up)
+    request = _Request(path, mesh, original, key, walk, scale, extinction, flat, up, progress)
     if not path.exists():
         raise WlmError(f"{path}: no such file or folder")
     if is_six_way(path):
@@ -77,6 +79,8 @@ def open_scene(
         return request.lightmap_set()
     if suffix in (".npz", ".json", ".lmbake"):
         return request.probes()
+    if suffix in (".glb", ".gltf", ".obj"):
+        raise WlmError(f"{path}: a mesh has no light of its own; expected the light, with this as --mesh")
     raise WlmError(
         f"{path}: expected a folder or .wlm, .exr, .npz, .nvdb, .json or .lmbake, found {path.suffix or 'none'}"
     )
@@ -95,6 +99,7 @@ class _Request:
     extinction: float | None
     flat: bool
     up: Literal["y", "z"]
+    progress: OnProgress | None
 
     def folder(self) -> Scene:
         if (self.path / REPORT_FILE).is_file():
@@ -172,7 +177,7 @@ class _Request:
         from wlm.view.smoke_scene import six_way_scene
 
         self._refuse("mesh", "original", "key", "walk", "scale", "extinction", "flat")
-        return six_way_scene(paths, title=self.path.name)
+        return six_way_scene(paths, title=self.path.name, progress=self.progress)
 
     @property
     def _up(self) -> int:
