@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 _LEVELS = 256  # of the opacity of smoke
+_STEP = 0.5  # voxels between two samples of smoke: whole ones show as stripes, and small ones round the colour away
 
 
 @dataclass(frozen=True)
@@ -155,7 +156,7 @@ class Canvas:
         # voxels for much less, and ignores their unit of length.
         actor = self._plotter.add_volume(grid, scalars="smoke", mapper="fixed_point", **options)
         actor.mapper.SetAutoAdjustSampleDistances(False)
-        actor.mapper.SetSampleDistance(voxel)
+        actor.mapper.SetSampleDistance(_STEP * voxel)
         actor.mapper.SetImageSampleDistance(1.0 if self._plotter.off_screen else 2.0)
         opacity = actor.prop.GetScalarOpacity(0)
         opacity.RemoveAllPoints()

@@ -8,7 +8,7 @@ const unit = (a) => a.map((x) => x / Math.hypot(...a));
 // The lines of the help on the mouse and on fingers; `drag` is what one of them does, `reset` begins again.
 function tellCamera(panel, drag, reset) {
   panel.tell('drag', drag);
-  panel.tell('shift + drag', 'move');
+  if (drag !== 'move') panel.tell('shift + drag', 'move');
   panel.tell('wheel, two fingers', 'zoom, move');
   panel.key('r', 'R, double-click', 'begin again', reset);
 }
