@@ -78,12 +78,7 @@ def _scene(
 class _AtlasScene(SurfaceScene):
     model: AtlasModel | None
     light: dict[str, np.ndarray]
-    mask: np.ndarray
     note: str
-
-    @property
-    def charts(self) -> np.ndarray:
-        return self.mask
 
     def lights(self, state: State) -> dict[str, np.ndarray]:
         return self.light

@@ -62,6 +62,7 @@ def lightmap_scene(
         geometry=flat_geometry(height, width) if geometry is None else geometry,
         height=height,
         width=width,
+        mask=None if lightmaps is None else lightmaps.mask,
         model=model,
         lightmaps=lightmaps,
     )
@@ -101,10 +102,6 @@ class _LightmapScene(SurfaceScene):
             self._shown = hour, lights, note
         return self._shown[1]
 
-    @property
-    def charts(self) -> np.ndarray:
-        return np.ones((self.height, self.width), bool) if self.lightmaps is None else self.lightmaps.mask
-
     def tile_colours(self) -> np.ndarray:
         grid = TileGrid.of(self.height, self.width)
         table = np.array([_COLOURS[kind] for kind in sorted(_COLOURS)], np.float32)
@@ -116,7 +113,7 @@ class _LightmapScene(SurfaceScene):
         return whole[: self.height, : self.width]
 
     def tell_texel(self, row: int, column: int, state: State) -> str:
-        outside = "" if self.charts[row, column] else "outside of the mask"
+        outside = "" if self.mask is None or self.mask[row, column] else "outside of the mask"
         if self.model is None:
             return outside
         number = row // TILE * self.model.tile_columns + column // TILE

@@ -37,21 +37,18 @@ class SurfaceScene(Scene):
         geometry: Where it lies, with lightmap UVs.
         brightness: Exposure at 0 EV.
         height, width: Texels.
+        mask: bool [H, W], the texels that belong to a chart; None: nobody knows.
     """
 
     geometry: Geometry
     brightness: float = 1.0
     height: int
     width: int
+    mask: np.ndarray | None = None
 
     @abstractmethod
     def lights(self, state: State) -> dict[str, np.ndarray]:
         """The light of "decoded" and "original", as there are, float32 [H, W, 3], gaps between charts filled."""
-
-    @property
-    @abstractmethod
-    def charts(self) -> np.ndarray:
-        """The texels that belong to a chart, bool [H, W]; all where nobody knows."""
 
     @abstractmethod
     def tell_texel(self, row: int, column: int, state: State) -> str:
@@ -66,9 +63,9 @@ class SurfaceScene(Scene):
         for panel, name in enumerate(self.panels):
             if name == "error":
                 picture = display.error(lights["decoded"], lights["original"])
-                if self.flat:
+                if self.flat and self.mask is not None:
                     # Never seen on the mesh, and no score has them.
-                    picture[~self.charts] = _NO_CHART
+                    picture[~self.mask] = _NO_CHART
             else:
                 picture = display.picture(lights[name])
             if panel == 0 and state.view == "tiles":

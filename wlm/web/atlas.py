@@ -62,7 +62,7 @@ def folder_page(
             )
         light = np.nan_to_num(lightmap.astype(np.float32), posinf=65504.0)
         arrays["original_0"] = pack_rgb9e5(fill_gaps(light, mesh.mask))
-        arrays["mask"] = mesh.mask.astype(np.uint8)
+        arrays["mask"] = mesh.mask.astype(np.uint8) * 255
         manifest["reference"] = {"times": [0.0]}
     figures = [
         ("file", f"{output.model_bytes:,} bytes"),

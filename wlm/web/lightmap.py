@@ -110,7 +110,7 @@ def _originals(
     chosen = np.unique(np.linspace(0, count - 1, min(hours, count)).round().astype(int))
     frames = fill_gaps(lightmaps.frames[chosen], lightmaps.mask)
     arrays = {f"original_{i}": pack_rgb9e5(frame) for i, frame in enumerate(frames)}
-    arrays["mask"] = lightmaps.mask.astype(np.uint8)
+    arrays["mask"] = lightmaps.mask.astype(np.uint8) * 255
     times, decoder, scores = lightmaps.times[chosen].tolist(), Decoder(model), []
     meter = Meter(progress, "score", len(times))
     for number, time in zip(chosen.tolist(), times, strict=True):

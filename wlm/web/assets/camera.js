@@ -6,10 +6,10 @@ const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a
 const unit = (a) => a.map((x) => x / Math.hypot(...a));
 
 // The lines of the help on the mouse and on fingers; `drag` is what one of them does, `reset` begins again.
-function tellCamera(panel, drag, reset) {
-  panel.tell('drag', drag);
-  if (drag !== 'move') panel.tell('shift + drag', 'move');
-  panel.tell('wheel, two fingers', 'zoom, move');
+function explainCamera(panel, drag, reset) {
+  panel.explain('drag', drag);
+  if (drag !== 'move') panel.explain('shift + drag', 'move');
+  panel.explain('wheel, two fingers', 'zoom, move');
   panel.key('r', 'R, double-click', 'begin again', reset);
 }
 

@@ -41,7 +41,7 @@ class Panel {
   #add(parent, kind) { return parent.appendChild(document.createElement(kind)); }
 
   // A line of the help: what one does with the mouse, a finger or a key, and what for.
-  tell(how, what) {
+  explain(how, what) {
     const row = this.#add(this.help, 'tr');
     this.#add(row, 'td').textContent = how;
     this.#add(row, 'td').textContent = what;
@@ -50,7 +50,7 @@ class Panel {
   // A key, by the browser's name of it in small letters, with its line of the help.
   key(key, how, what, action) {
     this.keys.set(key, action);
-    if (how) this.tell(how, what);
+    if (how) this.explain(how, what);
   }
 
   // A slider; gives a function that sets it and tells `changed`. `keys` move it, by `by` or to what `next` says.
@@ -76,7 +76,7 @@ class Panel {
       this.keys.set(key, () => set(next(Number(input.value), 2 * i - 1)));
     });
     const names = {arrowleft: '←', arrowright: '→'};
-    if (keys.length) this.tell(keys.map((key) => names[key] ?? key).join(' '), told ?? name);
+    if (keys.length) this.explain(keys.map((key) => names[key] ?? key).join(' '), told ?? name);
     return set;
   }
 
@@ -93,7 +93,7 @@ class Panel {
       button.setAttribute('aria-pressed', name === value);
       if (firstKey) this.keys.set(String(firstKey + i), button.onclick);
     });
-    if (firstKey) this.tell(`${firstKey} to ${firstKey + names.length - 1}`, names.join(', '));
+    if (firstKey) this.explain(`${firstKey} to ${firstKey + names.length - 1}`, names.join(', '));
     return press;
   }
 

@@ -119,7 +119,7 @@ ${DISPLAY}
 void main() { colour = vec4(wlm_shown(v_decoded, v_original), 1.0); }`);
     this.display = new Display(page, panel, changed);
     this.camera = new Camera(graphics.canvas, manifest.low, manifest.high, {up: manifest.up, changed});
-    tellCamera(panel, 'turn the camera', () => this.camera.reset());
+    explainCamera(panel, 'turn the camera', () => this.camera.reset());
     const [points, indices] = sphere(manifest.probe.count > 512 ? 8 : 16);
     this.groups = [{
       places: this.#places(page.array('places', Float32Array)),

@@ -78,7 +78,7 @@ class SmokePage {
       changed();
     });
     pan.still = true;
-    tellCamera(panel, 'turn the light', () => pan.reset());
+    explainCamera(panel, 'turn the light', () => pan.reset());
     const level = (name, set) => panel.slider(name, {
       min: 0, max: 4, step: 0.05, value: 1, text: (value) => `${value.toFixed(2)}×`, changed: (value) => { set(value); changed(); },
     });

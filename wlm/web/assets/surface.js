@@ -61,7 +61,7 @@ void main()
         panel.toggle('walls from outside', 'b', false, (seen) => { this.oneSided = !seen; changed(); });
       }
     }
-    tellCamera(panel, this.mesh ? 'turn the camera; unwrapped: move' : 'move', () => {
+    explainCamera(panel, this.mesh ? 'turn the camera; unwrapped: move' : 'move', () => {
       this.picture.reset();
       this.mesh?.reset();
     });
@@ -72,6 +72,9 @@ void main()
     if (this.mesh) this.mesh.active = !this.unwrapped;
   }
 
+  // Whether what faces away is left out.
+  get culled() { return Boolean(this.oneSided && !this.unwrapped); }
+
   draw(uniforms, original) {
     const {graphics} = this, {width} = graphics.begin();
     const camera = this.unwrapped ? this.picture : this.mesh;
@@ -79,7 +82,7 @@ void main()
       ...uniforms, ...this.display.uniforms(width), u_original: original ?? graphics.black,
       u_mask: this.mask, u_camera: camera.matrix(), u_unwrapped: this.unwrapped, u_aspect: this.aspect,
     });
-    graphics.drawGeometry(this.geometry, 1, this.oneSided && !this.unwrapped);
+    graphics.drawGeometry(this.geometry, 1, this.culled);
   }
 }
 
