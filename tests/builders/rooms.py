@@ -22,8 +22,9 @@ def box() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return np.concatenate(position), np.concatenate(triangle).astype(np.uint32), np.tile(0.5 + 0.5 * corners, (6, 1))
 
 
-def write_room(path: Path) -> None:
-    """Writes the box as a mesh whose sides face its middle."""
+def write_room(path: Path, low: np.ndarray | float = -1.0, high: np.ndarray | float = 1.0) -> None:
+    """Writes the box, between two corners, as a mesh whose sides face its middle."""
     position, triangle, uv = box()
+    position = low + (0.5 + 0.5 * position) * np.subtract(high, low)
     document, _ = document_from_arrays(position, triangle[:, ::-1], uv, "room")
     write_glb(path, document, [], 0)
