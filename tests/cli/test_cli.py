@@ -173,7 +173,8 @@ def test_info_says_what_is_in_the_file(fitted):
     text = call("lightmap", "info", fitted)
     assert f"{facts['bytes']:,}" in text and facts["source"] in text and "24x40" in text
     # The maps as stored, the network in float32.
-    stored = sum(facts["parts"][part] for part in ("uv", "uvt", "ut", "vt")) + 2 * facts["parts"]["net"]
+    model = wlm.load(fitted)
+    stored = sum(getattr(model, part).nbytes for part in ("uv", "uvt", "ut", "vt")) + 2 * model.net.nbytes
     assert facts["device"] == "cpu" and facts["device_bytes"] == stored
     assert "device 'tpu'" in fails("lightmap", "info", fitted, "--device", "tpu")
 

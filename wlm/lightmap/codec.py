@@ -74,9 +74,9 @@ def decode(artifact: Artifact) -> LightmapModel:
     mask = _mask(tensors, height, width)
     others = {name: part for name, part in tensors.items() if name not in ("kind", "times", "mask")}
     table = part_table(header.profile, kind, len(times))
-    if "tiles" in others:
+    if "tiles" in others or "sizes" in others:
         packed = check_part(others, "tiles", TILES), check_part(others, "sizes", SIZES)
-        del others["tiles"], others["sizes"]
+        others = {name: part for name, part in others.items() if name not in ("tiles", "sizes")}
         others |= unpack_tiles(*packed, table, header.profile, kind, mask)
     return LightmapModel(
         name=header.name,
