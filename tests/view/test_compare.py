@@ -20,7 +20,12 @@ def test_lightmaps_of_two_profiles(tmp_path):
     files = tmp_path / "a.wlm", tmp_path / "b.wlm"
     alike = compare(files[0], files[0])
     assert alike.apart == 120.0 and not alike.settings and not alike.scores
-    both = compare(*files, original=tmp_path / "set")
+    reports = []
+    both = compare(*files, original=tmp_path / "set", progress=reports.append)
+    assert {report.stage for report in reports} == {"decode", "score A", "score B"}
+    assert both.names == ("a.wlm", "b.wlm") and alike.names == (str(files[0]),) * 2
+    sizes = [max(pair) for pair in both.parts.values()]
+    assert sizes == sorted(sizes, reverse=True)
     assert both.settings == {"steps": (40, 20)}
     assert both.bytes == tuple(file.stat().st_size for file in files)
     report = wlm.lightmap.evaluate(wlm.load(files[1]), wlm.lightmap.load(tmp_path / "set"))
@@ -30,6 +35,9 @@ def test_lightmaps_of_two_profiles(tmp_path):
     result = CliRunner().invoke(app, ["compare", *map(str, files), "--html", str(page)])
     assert result.exit_code == 0 and "steps" in result.output
     assert page.read_text(encoding="utf-8").count("data:image/png") == 3
+    quick = small_sets.tiny_profile(steps=10).model_copy(update={"name": "quick"})
+    wlm.lightmap.compress(lightmaps, quick).save(files[1])
+    assert ("profile", "tiny", "quick") in compare(*files).rows()
 
 
 def test_probes(tmp_path):
@@ -37,7 +45,7 @@ def test_probes(tmp_path):
         probe_models.random_model(positions=True, seed=seed).save(tmp_path / f"{seed}.wlm")
     both = compare(tmp_path / "0.wlm", tmp_path / "1.wlm")
     assert np.isfinite(both.apart) and both.apart < 40.0
-    assert ("PSNR between the two, dB", "", f"{both.apart:.2f}") in both.rows()
+    assert ("PSNR of B against A, dB", "", f"{both.apart:.2f}") in both.rows()
 
 
 def test_atlases(tmp_path):
@@ -48,7 +56,12 @@ def test_atlases(tmp_path):
             wlm.atlas.compress(mesh, wlm.atlas.Profile(name="t", views=0, budget=budget)), tmp_path / name, mesh
         )
     both = compare(tmp_path / "a", tmp_path / "b")
-    assert both.settings == {"budget": (0.2, 0.5)} and both.bytes[0] < both.bytes[1] and both.apart > 10.0
+    assert (
+        both.names == ("a", "b")
+        and both.settings == {"budget": (0.2, 0.5)}
+        and both.bytes[0] < both.bytes[1]
+        and both.apart > 10.0
+    )
 
 
 def test_what_cannot_be_compared(tmp_path):

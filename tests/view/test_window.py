@@ -6,7 +6,7 @@ import sys
 import numpy as np
 import pytest
 import torch
-from builders import atlas_meshes, atlas_models, probe_models, probe_sets, small_sets, smoke_plumes
+from builders import atlas_meshes, atlas_models, probe_models, probe_sets, rooms, small_sets, smoke_plumes
 from builders.contract import FILES
 from PIL import Image
 from typer.testing import CliRunner
@@ -63,6 +63,15 @@ def changed(window, before: np.ndarray) -> bool:
     return np.abs(scene_of(window) - before).max() > 12
 
 
+def label(window, name: str) -> str:
+    """What is written beside a slider."""
+    return window._widgets[name][1].GetInput()
+
+
+def caption(window) -> str:
+    return window._texts["caption"].GetInput()
+
+
 def drag(window, name: str, value: float) -> None:
     """Moves a slider as a mouse does."""
     widget = window._widgets[name][0]
@@ -97,12 +106,16 @@ def test_lightmaps_follow_the_hour_the_exposure_and_the_tone(lightmaps, show):
     assert np.ptp(before) > 100
     drag(window, "hour", 18.5)
     assert window.state.values["hour"] == 18.5 and changed(window, before)
+    assert label(window, "hour") == "hour 18.50 (18:30)"
+    assert caption(window).startswith("view: [1 light]   2 tiles   ")
     before = scene_of(window)
     window.press("bracketright")
     assert scene_of(window).mean() > before.mean()
     before = scene_of(window)
+    assert label(window, "exposure") == "exposure +0.5 EV, clamped"
     window.press("t")
     assert window.state.tone == "filmic" and changed(window, before)
+    assert label(window, "exposure") == "exposure +0.5 EV, filmic"
     window.press("Right")
     assert window.state.values["hour"] == 18.75
     window.set("hour", 25.0)
@@ -138,10 +151,10 @@ def test_panels_show_decoded_original_and_error(lightmaps, show):
     window = show(lightmaps / "four.wlm", original=lightmaps / "set", mesh=lightmaps / "quad.glb")
     decoded, original, error = np.split(scene_of(window)[40:], 3, axis=1)
     assert np.abs(decoded - original).max() > 5 and np.abs(error - original).max() > 100
-    # The last quarter is outside of the mask: filled in the original, 0 in the decoded light, and no error.
+    # The last quarter is outside of the mask: filled in the original, 0 in the decoded light, and grey.
     flat = np.split(scene_of(show(lightmaps / "four.wlm", original=lightmaps / "set"))[40:], 3, axis=1)
     quarter = [part[part.shape[0] // 2 + 5 :, part.shape[1] // 2 + 2 :][:15, :15] for part in flat]
-    assert quarter[0].max() == 0 and quarter[1].min() > 50 and quarter[2].max() == 0
+    assert quarter[0].max() == 0 and quarter[1].min() > 50 and (quarter[2] == 77).all()
     drag(window, "error", 64)
     assert np.split(scene_of(window)[40:], 3, axis=1)[2].mean() > error.mean()
     window.turn(180.0)
@@ -233,6 +246,7 @@ def test_probes_as_balls_gaussians_and_a_volume(tmp_path, show):
     before = scene_of(window)
     drag(window, "frame", 2.2)
     assert window.state.values["frame"] == 2.0 and changed(window, before)
+    assert "frame 2 of " in label(window, "frame")
     window.choose("gaussians")
     before = scene_of(window)
     drag(window, "sigma", 0.3)
@@ -275,7 +289,8 @@ def test_six_way_lightmaps_turn_with_the_light(tmp_path, show):
         seen.append(scene_of(window)[40:, : SIZE[0] // 2].mean())
     assert seen == sorted(seen)  # right, left, top, bottom, front, back, as dark to bright as they were made
     before = scene_of(window)
-    drag(window, "frame", 1.0)
+    assert label(window, "frame") == "frame 1 of 2"
+    drag(window, "frame", 2.0)
     assert scene_of(window).mean() < before.mean()
     told = window.tell(SIZE[0] // 4, STRIP + (SIZE[1] - STRIP) // 2)
     assert "right 0.03" in told and "alpha 0.7" in told
@@ -303,7 +318,7 @@ def test_the_frames_of_a_simulation_are_played(tmp_path, show):
     window.advance(2 / 24)  # two frames of 24 a second
     assert "frame 3 at 0.30 s" in window._texts["caption"].GetInput() and changed(window, before)
     window.advance(1 / 24)
-    assert window.state.values["frame"] == 0.0  # from the beginning
+    assert window.state.values["frame"] == 1.0  # from the beginning
 
 
 def test_a_large_volume_is_drawn_coarser(tmp_path, show, monkeypatch):
@@ -322,9 +337,69 @@ def test_light_falls_off_through_smoke_as_it_should():
     np.testing.assert_allclose(light[:, 2, 2], expected, rtol=0.06)
 
 
+def test_the_error_is_that_of_the_charts_and_has_the_score_of_evaluate(lightmaps, tmp_path, show):
+    given = wlm.lightmap.load(lightmaps / "set")
+    mask = given.mask.copy()
+    mask[40:80, 30:90] = False
+    small_sets.write_set(tmp_path / "set", given)
+    Image.fromarray(mask).save(tmp_path / "set" / "mask.png")
+    window = show(lightmaps / "four.wlm", original=tmp_path / "set")
+    model, masked = wlm.load(lightmaps / "four.wlm"), wlm.lightmap.load(tmp_path / "set")
+    report = wlm.lightmap.evaluate(model, masked, metrics=("psnr",))
+    for hour, score in zip(report.time_values, report.psnr_by_time, strict=True):
+        window.set("hour", hour)
+        assert f"PSNR {score:.2f} dB" in caption(window)
+    before, after = report.time_values[1:3]
+    window.set("hour", 0.5 * (before + after))
+    assert f"original interpolated from {before:g} and {after:g}" in caption(window)
+    texture = window.canvas._drawn[2, "mesh"][0].texture
+    pixels = np.asarray(texture.to_array()).reshape(256, 256, 3)
+    grey = (pixels == 77).all(-1)
+    assert grey[mask].sum() == 0 and grey[~mask].all()
+    assert "outside of the mask" in window.scene.tell_texel(50, 50, window.state)
+
+
+def test_the_walls_of_a_room_are_left_out_from_outside(lightmaps, tmp_path, show):
+    rooms.write_room(tmp_path / "room.glb")
+    window = show(lightmaps / "four.wlm", mesh=tmp_path / "room.glb")
+    assert window.scene.room and "B walls from outside" in window.help()
+    inside, middle = scene_of(window), (SIZE[0] // 2, STRIP + (SIZE[1] - STRIP) // 2)
+    hits = [window.canvas.hit(*middle)]
+    window.press("b")
+    assert changed(window, inside)
+    hits.append(window.canvas.hit(*middle))
+    shape, eye = window.scene.geometry, np.array(window.canvas.renderers[0].camera.position)
+    far, near = (hit.weights @ shape.position[shape.triangle[hit.cell]] - eye for hit in hits)
+    # Both lie on one line from the eye, the one that is now in sight first.
+    assert np.linalg.norm(far) > np.linalg.norm(near) + 0.5
+    np.testing.assert_allclose(far / np.linalg.norm(far), near / np.linalg.norm(near), atol=1e-3)
+    window.press("b")
+    assert not changed(window, inside)
+    assert "B " not in show(lightmaps / "four.wlm").help()
+
+
+def test_a_ball_in_a_room_is_under_the_cursor_before_the_wall_behind_it(tmp_path, show):
+    model = probe_models.random_model(count=12, probes=40, positions=True)
+    model.save(tmp_path / "probe.wlm")
+    places = model.stored_positions()
+    rooms.write_room(tmp_path / "room.glb", places.min(0) - 1.0, places.max(0) + 1.0)
+    window = show(tmp_path / "probe.wlm", mesh=tmp_path / "room.glb")
+    assert window.scene.room
+
+    def seen() -> set[str]:
+        pixels = [(x, y) for x in range(0, SIZE[0], 12) for y in range(STRIP + 4, SIZE[1], 12)]
+        return {hit.name for pixel in pixels if (hit := window.canvas.hit(*pixel)) is not None}
+
+    assert seen() == {"balls", "mesh"}
+    window.outside(True)
+    assert seen() == {"mesh"}
+
+
 def test_a_movie_plays_the_day_once(lightmaps, tmp_path, show):
     window = show(lightmaps / "four.wlm")
-    assert window.movie(tmp_path / "day.gif", 4) == 4
+    reports = []
+    assert window.movie(tmp_path / "day.gif", 4, progress=reports.append) == 4
+    assert reports[-1].done == reports[-1].total == 4
     with Image.open(tmp_path / "day.gif") as movie:
         assert movie.n_frames == 4 and movie.size == SIZE
         frames = []
@@ -374,7 +449,8 @@ def test_what_has_no_picture_is_said_in_one_line(lightmaps, tmp_path):
         ([tmp_path / "five.wlm"], {}, "spherical harmonics"),
         ([tmp_path / "a.exr", tmp_path / "b.exr"], {}, "expected 8x8 pixels as the first frame, found 4x4"),
         ([tmp_path / "a.exr"], {"extinction": 2.0}, "--extinction means nothing"),
-        ([lightmaps / "quad.glb"], {}, "found .glb"),
+        ([lightmaps / "quad.glb"], {}, "quad.glb: a mesh has no light of its own"),
+        ([__file__], {}, "found .py"),
     ):
         with pytest.raises(WlmError, match=re.escape(said)) as caught:
             open_scene(files, **options)
@@ -391,6 +467,7 @@ def test_the_command_refuses_in_one_line(lightmaps, tmp_path, monkeypatch, show)
         (["--hour", "nan", *out], "--hour: expected a finite number"),
         (["--mesh", str(lightmaps / "quad.glb"), "--turn", "inf", *out], "--turn: expected a finite number"),
         (["--view", "volume", *out], "--view: expected light or tiles"),
+        (["--outside", *out], "--outside: expected the mesh of a room"),
         (["--size", "10", *out], "--size: expected a width and a height"),
         (["--rate", "0", *out], "--rate"),
         (["--frames", "3", *out], "--frames: means nothing without --movie"),
@@ -416,6 +493,7 @@ def test_light_on_the_screen():
 
 
 def test_sliders_stay_between_their_ends():
-    day, frames = Slider("hour", 0, 24, 12, 1, wraps=True), Slider("frame", 0, 9, 0, 1, whole=True)
+    day, frames = Slider("hour", 0, 24, 12, 1, ".2f", wraps=True, clock=True), Slider("frame", 0, 9, 0, 1, whole=True)
+    assert [day.text(x) for x in (0.0, 18.45, 24.0)] == ["hour 0.00 (0:00)", "hour 18.45 (18:27)", "hour 24.00 (0:00)"]
     assert [day.fit(x) for x in (-1.0, 24.0, 30.0)] == [23.0, 24.0, 6.0]
     assert [frames.fit(x) for x in (-3.0, 4.4, 12.0)] == [0.0, 4.0, 9.0]

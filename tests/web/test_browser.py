@@ -7,7 +7,7 @@ import re
 import numpy as np
 import pytest
 import torch
-from builders import atlas_meshes, atlas_models, probe_models, small_sets
+from builders import atlas_meshes, atlas_models, probe_models, rooms, small_sets
 from PIL import Image
 
 import wlm
@@ -59,6 +59,11 @@ def texel_of(text: str) -> tuple[int, int]:
     return tuple(map(int, re.match(r"texel (\d+), (\d+)   UV ", text).groups()))
 
 
+def figure(page, name: str) -> str:
+    """What the panel's table says beside a name."""
+    return page.locator(f"#panel > table tr:has(td:text-is('{name}')) td:last-child").inner_text()
+
+
 @pytest.fixture(scope="module")
 def lightmaps():
     """A dynamic, a static, a constant and an empty tile."""
@@ -107,6 +112,8 @@ def test_the_hour_and_the_exposure_change_the_picture(model, tmp_path, show):
     assert np.abs(picture(page) - brighter).max() > 5
     page.keyboard.press("h")
     assert page.locator("#panel.folded").count() == 1
+    fold = page.locator("header button")
+    assert fold.get_attribute("aria-label") == "unfold the panel (H)" and fold.inner_text() == "+"
 
 
 def test_the_original_its_error_and_the_wipe(tmp_path, show):
@@ -146,8 +153,8 @@ def test_a_texel_tells_its_tile_and_its_light(model, lightmaps, tmp_path, show, 
         point(*(middle + [x, y]))
         text = told(page)
         column, row = texel_of(text)
-        # The picture's 256 texels are square, and fill the height but for a margin.
-        expected = 128 + np.array([x, y]) * 256 * 1.08 / box["height"]
+        # The picture's 256 texels are square, and fill the shorter side but for a margin.
+        expected = 128 + np.array([x, y]) * 256 * 1.08 / min(box["width"], box["height"])
         assert np.abs([column + 0.5, row + 0.5] - expected).max() < 1
         u, v = map(float, re.search(r"UV (\S+) (\S+)", text).groups())
         assert np.abs(np.array([u, v]) * 256 - expected).max() < 0.1
@@ -164,7 +171,7 @@ def test_a_texel_tells_its_tile_and_its_light(model, lightmaps, tmp_path, show, 
         page.get_by_role("button", name="error", exact=True).click()
         seen = picture(page)
         rows, columns = (size // 2 + np.arange(5, 100) for size in seen.shape[:2])
-        assert seen[rows][:, columns].max() == 0 and seen[rows - 105][:, columns - 105].max() > 50
+        assert np.abs(seen[rows][:, columns] - 76.5).max() < 1 and seen[rows - 105][:, columns - 105].max() > 50
         page.get_by_role("button", name="decoded", exact=True).click()
     point(*(middle - 100))
     before = told(page)
@@ -211,6 +218,117 @@ def test_a_texel_of_an_atlas(kind, tmp_path, show):
             assert [left, top] == first.tolist() and [wide, high] == size.tolist()
         assert ("tile" in text) == (kind == "tiles")
     assert len(seen) == 3 and (1, 2) not in seen, "three sides of the cube, and nothing of what is inside"
+
+
+@pytest.fixture
+def compared(tmp_path, show):
+    """A page of a day with its original at 0, 8 and 16 h, of which the lower half belongs to no chart."""
+    mask = np.ones((128, 128), bool)
+    mask[64:] = False
+    lightmaps = small_sets.moving_light(hours=(0.0, 8.0, 16.0), mask=mask)
+    wlm.lightmap.compress(lightmaps, small_sets.tiny_profile()).save(tmp_path / "day.wlm")
+    small_sets.write_set(tmp_path / "set", lightmaps)
+    Image.fromarray(mask).save(tmp_path / "set" / "mask.png")
+    write_page(tmp_path / "page.html", [tmp_path / "day.wlm"], original=tmp_path / "set")
+    return show(tmp_path / "page.html")
+
+
+def wait_for(page, condition: str) -> None:
+    """Waits until a script says yes of `kind`, for ten seconds."""
+    page.evaluate(f"""wlm.then(async ({{kind}}) => {{
+        const end = performance.now() + 10000;
+        while (!({condition})) {{
+            if (performance.now() > end) throw new Error('expected {condition}, found ' + [kind.time, kind.shown]);
+            await new Promise(requestAnimationFrame);
+        }}
+    }})""")
+
+
+def wait_for_hour(page, hour: float) -> None:
+    wait_for(page, f"kind.shown === {hour} && kind.time === {hour}")
+
+
+def test_arrows_go_from_original_to_original_where_one_is_seen(compared):
+    wait_for_hour(compared, 8.0)
+    compared.keyboard.press("ArrowRight")
+    wait_for_hour(compared, 8.25)
+    assert figure(compared, "PSNR at this hour") == "–"
+    compared.keyboard.press("4")
+    for key, hour in (("", 8.0), ("ArrowRight", 16.0), ("ArrowRight", 0.0), ("ArrowLeft", 16.0)):
+        if key:
+            compared.keyboard.press(key)
+        wait_for_hour(compared, hour)
+        assert figure(compared, "PSNR at this hour").endswith(" dB")
+    assert figure(compared, "originals at") == "0:00, 8:00, 16:00"
+    # A slider that has the focus moves by the same steps.
+    compared.locator("input").first.focus()
+    compared.keyboard.press("ArrowRight")
+    wait_for_hour(compared, 0.0)
+
+
+def test_a_played_day_is_compared_at_the_originals_hours(compared):
+    wait_for_hour(compared, 8.0)
+    compared.keyboard.press("3")
+    compared.evaluate("""wlm.then(({kind}) => {
+        window.seen = [];
+        const draw = kind.surface.draw.bind(kind.surface);
+        kind.surface.draw = (...all) => { window.seen.push(kind.shown); draw(...all); };
+    })""")
+    compared.get_by_role("button", name="play").click()
+    wait_for(compared, "new Set(window.seen).size > 1")
+    # After a click on the button the space bar still plays and pauses.
+    compared.keyboard.press(" ")
+    assert compared.get_by_role("button", name="play").count() == 1
+    assert set(compared.evaluate("window.seen")) <= {0.0, 8.0, 16.0}
+    compared.keyboard.press("1")
+    compared.keyboard.press(" ")
+    wait_for(compared, "kind.shown % 8 !== 0")
+
+
+def test_texels_of_no_chart_have_no_error(compared):
+    wait_for_hour(compared, 8.0)
+    compared.keyboard.press("4")
+    seen = picture(compared)
+    height, middle = seen.shape[0], seen.shape[1] // 2
+    upper, lower = seen[height // 10 : height // 2 - 5, middle], seen[height // 2 + 5 : height - height // 10, middle]
+    assert (lower == 76).all() or (lower == 77).all()
+    assert np.abs(upper - 76).max() > 50
+
+
+def test_the_walls_of_a_room_are_seen_from_inside_alone(model, tmp_path, show):
+    model.save(tmp_path / "four.wlm")
+    rooms.write_room(tmp_path / "room.glb")
+    write_page(tmp_path / "page.html", [tmp_path / "four.wlm"], mesh=tmp_path / "room.glb")
+    page = show(tmp_path / "page.html")
+    page.evaluate("wlm.then(({kind}) => kind.read(5))")
+    inside = picture(page)
+    page.keyboard.press("b")
+    outside = picture(page)
+    assert np.abs(inside - outside).max() > 20
+    page.keyboard.press("b")
+    np.testing.assert_array_equal(picture(page), inside)
+    # The whole box is in the picture, and fills it in one direction.
+    lit = np.argwhere((outside != outside[0, 0]).any(-1))
+    room = np.array(outside.shape[:2])
+    assert (lit.min(0) > 0).all() and (lit.max(0) < room - 1).all()
+    assert ((lit.max(0) - lit.min(0)) / room).max() > 0.8
+
+
+def test_the_help_tells_what_the_page_can_do(compared, tmp_path, show):
+    def told(page):
+        page.locator("summary").click()
+        return page.locator("details").inner_text()
+
+    text = told(compared)
+    for words in ("the hour", "play, pause", "decoded, original, split, error", "error factor", "fold this panel"):
+        assert words in text
+    mesh = atlas_meshes.sheet()
+    wlm.atlas.export(atlas_models.random_model(mesh, atlas_models.KINDS[0]), tmp_path / "sheet", mesh)
+    write_page(tmp_path / "atlas.html", [tmp_path / "sheet"])
+    text = told(show(tmp_path / "atlas.html"))
+    assert "exposure" in text and "turn the camera" in text
+    for words in ("hour", "frame", "play", "original", "error"):
+        assert words not in text
 
 
 @pytest.mark.parametrize("kind", atlas_models.KINDS)

@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 import wlm
 from wlm.cli.app import app
 from wlm.errors import WlmError
+from wlm.formats.exr import write_exr
 from wlm.smoke.camera import Camera
 from wlm.smoke.data import write_six_way
 from wlm.smoke.lightmaps import SixWay
@@ -71,8 +72,11 @@ def test_frames_of_the_original_are_spread_over_the_day(tmp_path):
     wlm.lightmap.compress(lightmaps, small_sets.tiny_profile()).save(tmp_path / "city.wlm")
     folder = tmp_path / "set"
     small_sets.write_set(folder, lightmaps)
-    page = make_page([tmp_path / "city.wlm"], original=folder, hours=3)
+    reports = []
+    page = make_page([tmp_path / "city.wlm"], original=folder, hours=3, progress=reports.append)
     assert page.manifest["reference"]["times"] == [lightmaps.times[i] for i in (0, 2, 4)]
+    assert page.manifest["time"] == lightmaps.times[2] and reports[-1].done == reports[-1].total == 3
+    assert ((page.arrays["mask"] > 0) == lightmaps.mask).all()
     assert sorted(name for name in page.arrays if name.startswith("original")) == [f"original_{i}" for i in range(3)]
     with pytest.raises(WlmError, match="--hours"):
         make_page([tmp_path / "city.wlm"], original=folder, hours=0)
@@ -84,6 +88,9 @@ def test_frames_of_the_original_are_spread_over_the_day(tmp_path):
 def test_what_has_no_page_is_said_in_one_line(tmp_path):
     probe_models.random_model(positions=False).save(tmp_path / "probe.wlm")
     probe_models.random_model(outputs=5, positions=True).save(tmp_path / "five.wlm")
+    probes = tmp_path / "probes.npz"
+    np.savez(probes, position=np.zeros((2, 3)))
+    write_exr(tmp_path / "day.exr", np.ones((4, 4, 3), np.float32))
     for files, options, said in (
         ([], {}, "found none"),
         ([tmp_path / "absent.wlm"], {}, "absent.wlm"),
@@ -94,12 +101,44 @@ def test_what_has_no_page_is_said_in_one_line(tmp_path):
         ([FILES / "lightmap.wlm"], {"mesh": tmp_path / "absent.glb"}, "absent.glb"),
         ([tmp_path / "probe.wlm"], {}, "--original"),
         ([tmp_path / "five.wlm"], {}, "spherical harmonics"),
-        ([tmp_path], {}, "expected a folder that compress wrote"),
-        ([tmp_path / "absent.exr"], {}, "absent.exr"),
+        ([tmp_path], {}, "wlm view shows inputs"),
+        ([tmp_path / "day.exr"], {}, "day.exr: expected a .wlm"),
+        ([probes], {}, "probes.npz: expected a .wlm"),
+        ([FILES / "lightmap.wlm"], {"original": probes}, "probes.npz: expected a set.json or a folder"),
+        ([tmp_path / "absent.exr"], {}, "absent.exr: no such file or folder"),
     ):
         with pytest.raises(WlmError, match=re.escape(said)) as caught:
             make_page(files, **options)
         assert "\n" not in str(caught.value)
+
+
+def test_the_scores_of_a_page_are_those_of_evaluate(tmp_path):
+    lightmaps = small_sets.moving_light()
+    model = wlm.lightmap.compress(lightmaps, small_sets.tiny_profile())
+    model.save(tmp_path / "city.wlm")
+    small_sets.write_set(tmp_path / "set", lightmaps)
+    page = make_page([tmp_path / "city.wlm"], original=tmp_path / "set", hours=3)
+    expected = wlm.lightmap.evaluate(model, lightmaps, metrics=("psnr",)).psnr_by_time[[0, 2, 4]]
+    np.testing.assert_allclose(page.manifest["reference"]["psnr"], expected)
+    probes = probe_models.random_model(positions=True)
+    probes.save(tmp_path / "probe.wlm")
+    values = np.random.default_rng(0).random((probes.probes, 9, 3), np.float32)
+    values[probes.dead] = 0.0
+    np.savez(tmp_path / "probes.npz", position=probes.stored_positions(), sh=values)
+    page = make_page([tmp_path / "probe.wlm"], original=tmp_path / "probes.npz")
+    score = wlm.probe.evaluate(probes, wlm.probe.load(tmp_path / "probes.npz")).psnr
+    assert dict(page.figures)["PSNR of coefficients"] == f"{score:.2f} dB"
+
+
+def test_a_dark_hour_has_no_score_and_its_page_is_made(tmp_path):
+    lightmaps = small_sets.moving_light(hours=(0.0, 6.0))
+    model = wlm.lightmap.compress(lightmaps, small_sets.tiny_profile())
+    model.save(tmp_path / "city.wlm")
+    lightmaps.frames[1] = 0.0
+    small_sets.write_set(tmp_path / "set", lightmaps)
+    write_page(tmp_path / "page.html", [tmp_path / "city.wlm"], original=tmp_path / "set")
+    scores = parts(tmp_path / "page.html")[0]["reference"]["psnr"]
+    assert scores[0] > 0 and scores[1] is None
 
 
 def test_probes_of_which_none_is_dead_have_a_page(tmp_path):
@@ -125,6 +164,10 @@ def test_frames_of_smoke_are_of_one_size(tmp_path):
         make_page([tmp_path / "a.exr", tmp_path / "b.exr"])
     with pytest.raises(WlmError, match="--rate"):
         make_page([tmp_path / "a.exr"], rate=0.0)
+    assert make_page([tmp_path / "a.exr"]).title == "a"
+    (tmp_path / "b.exr").write_bytes((tmp_path / "a.exr").read_bytes())
+    folder, files = make_page([tmp_path]), make_page([tmp_path / "a.exr", tmp_path / "b.exr"])
+    assert folder.manifest == files.manifest and folder.title == files.title == tmp_path.name
 
 
 def test_the_command_writes_a_page_of_a_folder(tmp_path):

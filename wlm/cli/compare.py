@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from wlm.cli.console import check_output, escape, quiet_warp, show, table
+from wlm.cli.console import check_output, escape, quiet_warp, running, show, table
 from wlm.cli.options import Device, PageFile
 
 
@@ -27,10 +27,12 @@ def compare(
     from wlm.interop import check_device
     from wlm.view.compare import compare
 
-    comparison = compare(first, second, original=original, key=key, device=check_device(device))
+    device = check_device(device)
+    with running("compare") as progress:
+        comparison = compare(first, second, original=original, key=key, device=device, progress=progress)
     if html_path is not None:
         comparison.write(html_path)
-    rows = table(comparison.system, ["", *map(str, comparison.names)])
+    rows = table(comparison.system, ["", *comparison.headings])
     for row in comparison.rows():
         rows.add_row(*map(escape, row))
     show(rows)

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from wlm.cli.console import check_output, escape, quiet_warp, show, table
+from wlm.cli.console import check_output, escape, quiet_warp, running, show, table
 from wlm.cli.options import Original, SceneFile, Up
 from wlm.errors import WlmError
 
@@ -22,14 +22,17 @@ def view(
     original: Original = None,
     key: Annotated[str | None, typer.Option(help="Which of a file's arrays of probes.")] = None,
     view: Annotated[str | None, typer.Option(help="light or tiles; of probes balls, gaussians or volume.")] = None,
+    outside: Annotated[
+        bool, typer.Option("--outside", help="Draw a room's walls from outside too, where they hide it.")
+    ] = False,
     flat: Annotated[bool, typer.Option("--flat", help="Show a lightmap unwrapped, not on its mesh.")] = False,
-    hour: Annotated[float | None, typer.Option(help="Of lightmaps.")] = None,
-    frame: Annotated[float | None, typer.Option(help="Of smoke, or of the walk; the first is 0.")] = None,
+    hour: Annotated[float | None, typer.Option(help="Of lightmaps; half past six in the evening is 18.5.")] = None,
+    frame: Annotated[float | None, typer.Option(help="Of smoke, or of the walk; the first is 1.")] = None,
     turn: Annotated[
         float | None, typer.Option(help="Of smoke's light, degrees to the right; else of the camera.")
     ] = None,
     height: Annotated[float | None, typer.Option(help="Of smoke's light, degrees up.")] = None,
-    sigma: Annotated[float | None, typer.Option(help="How large Gaussians are drawn.")] = None,
+    sigma: Annotated[float | None, typer.Option(help="How large Gaussians are drawn, in standard deviations.")] = None,
     exposure: Annotated[float | None, typer.Option(help="Stops above or below what fits the light.")] = None,
     error: Annotated[float | None, typer.Option(help="Factor on the error, 1 to 64.")] = None,
     tone: Annotated[Literal["clamped", "filmic"], typer.Option(help="What becomes of light above white.")] = "clamped",
@@ -67,20 +70,24 @@ def view(
     from wlm.view.window import Window
 
     import_pyvista("view")
-    scene = open_scene(
-        files,
-        mesh=mesh,
-        original=original,
-        key=key,
-        walk=walk,
-        scale=scale,
-        extinction=extinction,
-        flat=flat,
-        up=up,
-    )
+    with running("view") as progress:
+        scene = open_scene(
+            files,
+            mesh=mesh,
+            original=original,
+            key=key,
+            walk=walk,
+            scale=scale,
+            extinction=extinction,
+            flat=flat,
+            up=up,
+            progress=progress if len(files) > 1 or files[0].is_dir() else None,
+        )
     window = Window(scene, size=pixels, rate=rate, off_screen=screenshot is not None or movie is not None)
     try:
         window.tone(tone)
+        if outside:
+            window.outside(True)
         if view is not None or walk is not None:
             window.choose(view or "volume")
         window.look()
@@ -100,7 +107,8 @@ def view(
             window.screenshot(screenshot)
             rows.add_row(escape(str(screenshot)), f"{screenshot.stat().st_size:,}")
         if movie is not None:
-            window.movie(movie, frames)
+            with running("movie") as progress:
+                window.movie(movie, frames, progress=progress)
             rows.add_row(escape(str(movie)), f"{movie.stat().st_size:,}")
         show(rows)
     finally:

@@ -10,6 +10,8 @@ from wlm.errors import WlmError
 from wlm.formats.gltf import read_gltf
 from wlm.formats.obj import read_obj
 
+_ROOM = 0.25  # of the box's volume
+
 
 @dataclass(frozen=True, eq=False)
 class Geometry:
@@ -30,6 +32,21 @@ class Geometry:
         """The lowest and the highest corner of what the triangles span, float32 [3] each."""
         used = self.position[self.triangle.reshape(-1)]
         return used.min(0), used.max(0)
+
+    @property
+    def is_room(self) -> bool:
+        """Whether most of the triangles face the middle, as the walls of a room do that is seen from inside.
+
+        The volume that triangles enclose is positive where they face outwards, counter-clockwise as seen.
+        """
+        if not len(self.triangle):
+            return False
+        low, high = (corner.astype(np.float64) for corner in self.box)
+        if not (high > low).all():
+            return False
+        # In shares of the box, so that no size over- or underflows.
+        a, b, c = ((self.position[self.triangle] - low) / (high - low) - 0.5).transpose(1, 0, 2)
+        return float(np.einsum("fk,fk->", a, np.cross(b, c))) / 6.0 < -_ROOM
 
 
 def read_geometry(path: str | os.PathLike[str], uv_set: int | None = None, *, with_uv: bool = True) -> Geometry:

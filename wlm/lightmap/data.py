@@ -122,6 +122,8 @@ def load(
     if path.is_dir():
         listing = list_folder(path, times)
     elif path.is_file():
+        if path.suffix.lower() != ".json":
+            raise WlmError(f"{path}: expected a {SET_FILE} or a folder of EXR files, found a file of another kind")
         listing = parse_set(path, times, trust)
     else:
         raise WlmError(f"{path}: no such file or folder; expected a {SET_FILE} or a folder of EXR files")

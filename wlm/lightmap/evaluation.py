@@ -151,6 +151,22 @@ def evaluate(
     return replace(report, warnings=report.warnings + warnings + lost.warnings(model.name, *_LOST))
 
 
+def psnr_of(model: LightmapModel, lightmaps: LightmapSet, number: int, decoded: np.ndarray) -> float:
+    """PSNR of one lightmap of a set, dB: `Report.psnr_by_time` of its hour, without the hours beside it.
+
+    Args:
+        model: The model.
+        lightmaps: The input, of the model's size.
+        number: Of the lightmap in the set.
+        decoded: float32 [H, W, 3], what the model decodes to at its hour.
+
+    Returns:
+        The mean over the tiles; NaN where none has a score.
+    """
+    mask, name = lightmaps.mask & _held(model), f"{model.name} at {lightmaps.times[number]:g}"
+    return float(summarise([evaluate_frame(lightmaps.frames[number], decoded, mask, TILE, ("psnr",), name=name)]).psnr)
+
+
 def lost_light(model: LightmapModel, lightmaps: LightmapSet, device: str = "cpu") -> list[str]:
     """Looks for fireflies that a fit lost: tiles whose light is in few texels are decoded at their times alone.
 

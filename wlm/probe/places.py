@@ -1,4 +1,4 @@
-"""Where a model's probes are, and how large a ball may stand for each."""
+"""Where a model's probes are, and how large and how bright a ball may stand for each."""
 
 import os
 
@@ -8,7 +8,10 @@ from scipy.spatial import cKDTree
 from wlm.errors import WlmError
 from wlm.probe.data import load
 from wlm.probe.model import ProbeModel
+from wlm.probe.sphere import fibonacci_sphere, irradiance
+from wlm.texels import exposure
 
+_NORMALS = 32
 _SHARE = 0.45  # of the median distance between neighbours: balls don't touch
 
 
@@ -40,6 +43,11 @@ def probes_of(
     if not len(model.positions):
         raise WlmError(f"{model.name}: the file has no positions; expected --original, the file that was compressed")
     return model.stored_positions(), None, live
+
+
+def ball_exposure(values: np.ndarray) -> float:
+    """The exposure at which nearly all of white diffuse balls under SH radiance [N, C, 3] is below white."""
+    return exposure(irradiance(values, fibonacci_sphere(_NORMALS)) / np.pi)
 
 
 def ball_radius(position: np.ndarray) -> float:

@@ -21,6 +21,7 @@ from wlm.config import check_settings
 from wlm.errors import WlmError
 from wlm.fluid.volume import DensityVolume, load_volume
 from wlm.formats.atomic import atomic_write
+from wlm.formats.exr_file import read_part
 from wlm.formats.exr_planes import read_planes, write_planes
 from wlm.formats.folder import claim, read_index, write_index
 from wlm.formats.lock import is_passing
@@ -281,6 +282,27 @@ def write_six_way(path: str | os.PathLike[str], six: SixWay) -> None:
         if plane is not None:
             planes[name] = plane.cpu().numpy()
     write_planes(path, planes, {"camera": asdict(six.camera)})
+
+
+def is_six_way(path: Path) -> bool:
+    """Whether a file is an EXR with a channel for each direction.
+
+    Raises:
+        WlmError: It is called an EXR and can't be read.
+    """
+    if path.suffix.lower() != ".exr" or not path.is_file():
+        return False
+    return all(name in read_part(path).channels for name in DIRECTIONS)
+
+
+def six_way_files(folder: Path) -> list[Path]:
+    """The six-way lightmaps in a folder, one a frame, by name; empty where its EXR files are something else.
+
+    Raises:
+        WlmError: The first EXR file can't be read.
+    """
+    files = sorted(path for path in folder.glob("*.exr") if path.name[0] != ".")
+    return files if files and is_six_way(files[0]) else []
 
 
 def read_six_way(path: str | os.PathLike[str], device: str = "cpu") -> SixWay:

@@ -35,7 +35,8 @@ def atlas_scene(
     if original is not None:
         lights["original"] = fill_gaps(np.nan_to_num(original[..., :3], posinf=65504.0), mesh.mask)
     views = ("light", "tiles") if model.method == "tiles" else ("light",)
-    return _scene(title, mesh, lights, flat, up, views, model, f"{100 * model.compression_ratio:.1f} % saved (eq. 9)")
+    size = f"textures {100 * (1.0 - model.compression_ratio):.1f}% of half floats"
+    return _scene(title, mesh, lights, flat, up, views, model, size)
 
 
 def input_scene(mesh: LightmappedMesh, *, title: str, flat: bool = False, up: int = 1) -> SurfaceScene:
@@ -61,6 +62,7 @@ def _scene(
         views=views,
         flat=flat,
         up=up,
+        room=not flat and shape.is_room,
         geometry=flat_geometry(height, width) if flat else shape,
         brightness=exposure(lights.get("original", next(iter(lights.values())))[mesh.mask]),
         height=height,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from wlm.atlas.exporter import MODEL_FILE, geometry, read_folder, read_inputs
 from wlm.errors import WlmError
 from wlm.formats.artifact import read_artifact
 from wlm.metrics import PSNR_CAP_DB, psnr
-from wlm.system import Model, load
+from wlm.system import Meter, Model, OnProgress, load
 from wlm.view.display import Display, white_of
 from wlm.view.document import Document
 
@@ -31,10 +31,10 @@ class Comparison:
     """Two models, A and B.
 
     Attributes:
-        names: Of the files.
+        names: Of the files or folders, with their folders where they are alike.
         system: Of both.
         bytes: Sizes of the files.
-        parts: Bytes of each part, 0 where a file has none.
+        parts: Bytes of each part, the largest first, 0 where a file has none.
         settings: Those that differ; None where a profile has none of the name.
         apart: dB, PSNR of B with A as the reference; 120 where both decode alike.
         scores: Of each against the original, by name; empty without one.
@@ -52,12 +52,18 @@ class Comparison:
     pictures: Mapping[str, np.ndarray] = field(default_factory=dict)
     where: str = ""
 
+    @property
+    def headings(self) -> tuple[str, str]:
+        """Of the columns of A and of B."""
+        return f"A: {self.names[0]}", f"B: {self.names[1]}"
+
     def rows(self) -> list[tuple[str, str, str]]:
         """The figures as text: what, of A, of B."""
         rows = [("bytes", *(f"{size:,}" for size in self.bytes))]
         rows += [(name, *(_number(value) for value in pair)) for name, pair in self.scores.items()]
-        rows += [("PSNR between the two, dB", "", f"{self.apart:.2f}")]
-        rows += [(name, *(_text(value) for value in pair)) for name, pair in self.settings.items()]
+        rows += [("PSNR of B against A, dB", "", f"{self.apart:.2f}")]
+        settings = {"profile" if name == "name" else name: pair for name, pair in self.settings.items()}
+        rows += [(name, *(_text(value) for value in pair)) for name, pair in settings.items()]
         return rows + [(f"bytes of {name}", *(f"{size:,}" for size in pair)) for name, pair in self.parts.items()]
 
     def write(self, path: str | os.PathLike[str]) -> int:
@@ -66,13 +72,13 @@ class Comparison:
         Raises:
             WlmError: The file can't be written.
         """
-        page = Document(f"{self.names[0]} and {self.names[1]}")
-        page.table("", ("", *self.names), self.rows())
+        page = Document(" and ".join(self.names))
+        page.table("", ("", *self.headings), self.rows())
         if self.pictures:
             display = Display(1.0 / white_of(next(iter(self.pictures.values()))))
             a, b, *rest = self.pictures.values()
             shown = {name: display.picture(light) for name, light in self.pictures.items()}
-            shown[f"difference × {_GAIN:g}"] = display.picture(np.abs(a - b) * _GAIN)
+            shown[f"|A - B| × {_GAIN:g}"] = display.picture(np.abs(a - b) * _GAIN)
             for original in rest:
                 for name, light in (("A", a), ("B", b)):
                     shown[f"error of {name} × {_GAIN:g}"] = display.picture(np.abs(light - original) * _GAIN)
@@ -87,6 +93,7 @@ def compare(
     original: _Path | None = None,
     key: str | None = None,
     device: str = "cpu",
+    progress: OnProgress | None = None,
 ) -> Comparison:
     """Compares two models of one input.
 
@@ -95,21 +102,22 @@ def compare(
         original: What was compressed: a lightmap set, a probe file, or of folders the lightmap; None: no scores.
         key: Of a probe file with several arrays, the one that was compressed.
         device: Where both are decoded.
+        progress: Called about twice a second.
 
     Raises:
         WlmError: A file can't be read, they are of different systems or sizes, or nothing of theirs can be compared.
     """
     paths = Path(first), Path(second)
     if all(path.is_dir() for path in paths):
-        return _atlases(paths, original, device)
+        return _atlases(paths, original, device, progress)
     models = load(paths[0]), load(paths[1])
     systems = [model.SYSTEM for model in models]
     if systems[0] != systems[1]:
         raise WlmError(f"{paths[1]}: expected a model of {systems[0]} like {paths[0]}, found one of {systems[1]}")
     if systems[0] == "lightmap":
-        return _lightmaps(paths, models, original, device)
+        return _lightmaps(paths, models, original, device, progress)
     if systems[0] == "probe":
-        return _probes(paths, models, original, key, device)
+        return _probes(paths, models, original, key, device, progress)
     if systems[0] == "atlas":
         raise WlmError(f"{paths[0]}: expected the folder that wlm atlas compress wrote, which has the mesh")
     raise WlmError(f"{paths[0]}: networks are compared by wlm smoke evaluate, which gives each the same smoke")
@@ -121,22 +129,32 @@ def _facts(paths: Sequence[Path], models: Sequence[Model]) -> dict[str, Any]:
     profiles = [model.profile.model_dump(mode="json") for model in models]
     names = list(dict.fromkeys([*profiles[0], *profiles[1]]))
     settings = {name: tuple(profile.get(name) for profile in profiles) for name in names}
+    sizes = {name: tuple(each.get(name, 0) for each in parts) for name in dict.fromkeys([*parts[0], *parts[1]])}
+    # Of an atlas the folder has the name.
+    shown = [path.parent if path.name == MODEL_FILE else path for path in paths]
+    alike = shown[0].resolve().name == shown[1].resolve().name
     return {
-        "names": (str(paths[0]), str(paths[1])),
+        "names": tuple(str(path) if alike else path.resolve().name for path in shown),
         "system": models[0].SYSTEM,
         "bytes": tuple(path.stat().st_size for path in paths),
-        "parts": {name: tuple(each.get(name, 0) for each in parts) for name in dict.fromkeys([*parts[0], *parts[1]])},
+        "parts": dict(sorted(sizes.items(), key=lambda part: -max(part[1]))),
         "settings": {name: pair for name, pair in settings.items() if pair[0] != pair[1]},
     }
 
 
-def _lightmaps(paths: Sequence[Path], models: Sequence[Any], original: _Path | None, device: str) -> Comparison:
+def _lightmaps(
+    paths: Sequence[Path], models: Sequence[Any], original: _Path | None, device: str, progress: OnProgress | None
+) -> Comparison:
     sizes = [(model.width, model.height) for model in models]
     if sizes[0] != sizes[1]:
         raise WlmError(f"{paths[1]}: expected lightmaps of {_size(sizes[0])}, found {_size(sizes[1])}")
     decoders = [model.decoder(device) for model in models]
     times = models[0].times
-    frames = [[decoder.frame(time) for decoder in decoders] for time in times]
+    frames, meter = [], Meter(progress, "decode", len(times))
+    for time in times:
+        frames.append([decoder.frame(time) for decoder in decoders])
+        if meter.due(len(frames)):
+            meter.report(len(frames))
     # A frame of one colour has no range to measure against.
     by_time = [psnr(a, b) for a, b in frames]
     by_time = np.where(np.isnan(by_time), PSNR_CAP_DB, by_time)
@@ -145,20 +163,28 @@ def _lightmaps(paths: Sequence[Path], models: Sequence[Any], original: _Path | N
     scores = {}
     if original is not None:
         lightmaps = lightmap.load(original)
-        reports = [lightmap.evaluate(model, lightmaps, views=0, device=device) for model in models]
+        reports = [
+            lightmap.evaluate(model, lightmaps, views=0, device=device, progress=_stage(progress, name))
+            for model, name in zip(models, "AB", strict=True)
+        ]
         names = {"PSNR dB": "psnr", "worst PSNR dB": "worst_psnr", "seen dB": "seen", "SSIM": "ssim", "FLIP": "flip"}
         scores = {title: tuple(getattr(report, name) for report in reports) for title, name in names.items()}
         nearest = int(np.abs(lightmaps.times - times[furthest]).argmin())
         mask = lightmaps.mask[..., None]
         pictures = {name: light * mask for name, light in pictures.items()}
         pictures["original"] = lightmaps.frames[nearest] * mask
-    where = f"Furthest apart at {times[furthest]:g}: {by_time[furthest]:.2f} dB"
+    where = f"Furthest apart at time {times[furthest]:g}: {by_time[furthest]:.2f} dB"
     mean = float(np.mean(by_time))
     return Comparison(**_facts(paths, models), apart=mean, scores=scores, pictures=pictures, where=where)
 
 
 def _probes(
-    paths: Sequence[Path], models: Sequence[Any], original: _Path | None, key: str | None, device: str
+    paths: Sequence[Path],
+    models: Sequence[Any],
+    original: _Path | None,
+    key: str | None,
+    device: str,
+    progress: OnProgress | None,
 ) -> Comparison:
     counts = [(model.probes, model.outputs) for model in models]
     if counts[0] != counts[1]:
@@ -167,7 +193,10 @@ def _probes(
     scores, position = {}, None
     if original is not None:
         probes = probe.load(original, key=key)
-        reports = [probe.evaluate(model, probes, device=device) for model in models]
+        reports = [
+            probe.evaluate(model, probes, device=device, progress=_stage(progress, name))
+            for model, name in zip(models, "AB", strict=True)
+        ]
         names = {"PSNR dB": "psnr", "PSNR of irradiance, dB": "irradiance_psnr", "largest error": "max_abs_error"}
         scores = {title: tuple(getattr(report, name) for report in reports) for title, name in names.items()}
         position = probes.position
@@ -179,7 +208,7 @@ def _probes(
     return Comparison(**_facts(paths, models), apart=psnr(*(each[:, None] for each in values)), scores=scores)
 
 
-def _atlases(paths: Sequence[Path], original: _Path | None, device: str) -> Comparison:
+def _atlases(paths: Sequence[Path], original: _Path | None, device: str, progress: OnProgress | None) -> Comparison:
     outputs = [read_folder(path) for path in paths]
     sizes = [(output.model.width, output.model.height) for output in outputs]
     if sizes[0] != sizes[1]:
@@ -193,13 +222,23 @@ def _atlases(paths: Sequence[Path], original: _Path | None, device: str) -> Comp
     if original is not None:
         inputs = [read_inputs(output, lightmap_path=original) for output in outputs]
         options = {"views": _VIEWS, "resolution": _RESOLUTION, "device": device}
-        reports = [atlas.evaluate(each.model, mesh, **options) for each, mesh in zip(outputs, inputs, strict=True)]
+        reports = [
+            atlas.evaluate(each.model, mesh, **options, progress=_stage(progress, name))
+            for each, mesh, name in zip(outputs, inputs, "AB", strict=True)
+        ]
         names = {"PSNR of views, dB": "psnr", "PSNR of texels, dB": "texel_psnr", "1 - SSIM": "one_minus_ssim"}
         scores = {title: tuple(getattr(report, name) for report in reports) for title, name in names.items()}
         pictures["original"] = inputs[0].lightmap * meshes[0].mask[..., None]
     facts = _facts([output.folder / MODEL_FILE for output in outputs], [output.model for output in outputs])
     apart = psnr(*light, meshes[0].mask)
     return Comparison(**facts, apart=apart, scores=scores, pictures=pictures, where="The lightmap")
+
+
+def _stage(progress: OnProgress | None, name: str) -> OnProgress | None:
+    """Reports the progress of one of the two as a stage of its own."""
+    if progress is None:
+        return None
+    return lambda report: progress(replace(report, stage=f"{report.stage} {name}"))
 
 
 def _size(size: tuple[int, int]) -> str:

@@ -1,5 +1,6 @@
 """Lightmaps over the day in a window: a model, its input, or both."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -7,7 +8,7 @@ import numpy as np
 from wlm.formats.geometry import Geometry
 from wlm.lightmap.data import LightmapSet
 from wlm.lightmap.decode import Decoder
-from wlm.lightmap.evaluation import count_kinds
+from wlm.lightmap.evaluation import count_kinds, psnr_of
 from wlm.lightmap.model import LightmapModel, TimeAxis
 from wlm.lightmap.tiles import TILE, TileGrid, TileKind
 from wlm.texels import exposure, fill_gaps
@@ -47,7 +48,8 @@ def lightmap_scene(
     noon = float(times[len(times) // 2])
     sliders = ()
     if len(times) > 1:
-        sliders = (Slider("hour", low, high, noon, (high - low) / 96, wraps=first.period is not None),)
+        wraps = first.period is not None
+        sliders = (Slider("hour", low, high, noon, (high - low) / 96, wraps=wraps, clock=first.period == 24.0),)
     scene = _LightmapScene(
         title,
         compared(model is not None, lightmaps is not None),
@@ -56,6 +58,7 @@ def lightmap_scene(
         plays="hour" if sliders else None,
         flat=geometry is None,
         up=up,
+        room=geometry is not None and geometry.is_room,
         geometry=flat_geometry(height, width) if geometry is None else geometry,
         height=height,
         width=width,
@@ -74,7 +77,7 @@ class _LightmapScene(SurfaceScene):
     lightmaps: LightmapSet | None
 
     def __post_init__(self) -> None:
-        self._shown: tuple[float, dict[str, np.ndarray]] | None = None
+        self._shown: tuple[float, dict[str, np.ndarray], str] | None = None
         self._decoder = None if self.model is None else Decoder(self.model)
         if self.lightmaps is not None:
             given = self.lightmaps
@@ -84,14 +87,19 @@ class _LightmapScene(SurfaceScene):
     def lights(self, state: State) -> dict[str, np.ndarray]:
         hour = self._hour(state)
         if self._shown is None or self._shown[0] != hour:
-            lights = {}
+            lights, note = {}, ""
             if self._decoder is not None:
                 lights["decoded"] = self._decoder.frame(hour)
             if self.lightmaps is not None:
                 before, after, share = self._axis.neighbours(hour)
                 mixed = (1.0 - share) * self._frames[before] + share * self._frames[after]
                 lights["original"] = mixed.astype(np.float32)
-            self._shown = hour, lights
+                if self.model is not None and share == 0.0:
+                    score = psnr_of(self.model, self.lightmaps, before, lights["decoded"])
+                    note = "" if math.isnan(score) else f"PSNR {score:.2f} dB"
+                elif share:
+                    note = f"original interpolated from {self._axis.times[before]:g} and {self._axis.times[after]:g}"
+            self._shown = hour, lights, note
         return self._shown[1]
 
     def tile_colours(self) -> np.ndarray:
@@ -105,19 +113,25 @@ class _LightmapScene(SurfaceScene):
         return whole[: self.height, : self.width]
 
     def tell_texel(self, row: int, column: int, state: State) -> str:
+        outside = "" if self.mask is None or self.mask[row, column] else "outside of the mask"
         if self.model is None:
-            return "" if self.lightmaps.mask[row, column] else "outside of the mask"
+            return outside
         number = row // TILE * self.model.tile_columns + column // TILE
-        return f"tile {number} ({TileKind(self.model.kind[number]).name.lower()})"
+        told = f"tile {number} ({TileKind(self.model.kind[number]).name.lower()})"
+        return "   ".join(filter(None, (told, outside)))
 
     def caption(self, state: State) -> str:
+        self.lights(state)
+        note = f"; {self._shown[2]}" if self._shown[2] else ""
         if self.model is None:
-            return f"{self.lightmaps.name}, {self.width} × {self.height}, {len(self.lightmaps.times)} times"
+            count = len(self.lightmaps.times)
+            hours = f", {count} hours" if count > 1 else ""
+            return f"{self.lightmaps.name}, {self.width} × {self.height}{hours}{note}"
         size = f"{self.model.name}, {self.width} × {self.height}, profile {self.model.profile.name}"
         counts = count_kinds(self.model)
         kinds = [(kind.name.lower(), _NAMED[kind]) for kind in TileKind if counts[kind.name.lower()]]
         told = (f"{counts[name]} {name}{f' ({colour})' * (state.view == 'tiles')}" for name, colour in kinds)
-        return f"{size}, tiles: {', '.join(told)}"
+        return f"{size}, tiles: {', '.join(told)}{note}"
 
     def _hour(self, state: State) -> float:
         first = self.model if self.model is not None else self.lightmaps

@@ -11,13 +11,11 @@ from typing import TYPE_CHECKING, Literal
 from wlm.atlas.exporter import REPORT_FILE
 from wlm.errors import WlmError
 from wlm.formats.exr import read_exr
-from wlm.formats.exr_file import read_part
 from wlm.formats.geometry import read_geometry
 from wlm.formats.npz import read_npz
 from wlm.lightmap.listing import SET_FILE
-from wlm.smoke.camera import DIRECTIONS
-from wlm.smoke.data import SCENE_FILE
-from wlm.system import load
+from wlm.smoke.data import SCENE_FILE, is_six_way, six_way_files
+from wlm.system import OnProgress, load
 from wlm.view.scene import Scene
 
 if TYPE_CHECKING:
@@ -37,6 +35,7 @@ def open_scene(
     extinction: float | None = None,
     flat: bool = False,
     up: Literal["y", "z"] = "y",
+    progress: OnProgress | None = None,
 ) -> Scene:
     """Makes the scene of a file.
 
@@ -51,6 +50,7 @@ def open_scene(
         extinction: Of a volume of smoke, per unit of length at density 1.
         flat: Whether a lightmap is shown unwrapped though its mesh is there.
         up: The axis that points up.
+        progress: Called about twice a second while frames of smoke are read.
 
     Raises:
         WlmError: A file is missing, damaged, or of a kind that has no picture; an option doesn't fit it.
@@ -59,10 +59,10 @@ def open_scene(
     if not paths:
         raise WlmError("expected a file to show, found none")
     path = paths[0]
-    request = _Request(path, mesh, original, key, walk, scale, extinction, flat, up)
+    request = _Request(path, mesh, original, key, walk, scale, extinction, flat, up, progress)
     if not path.exists():
         raise WlmError(f"{path}: no such file or folder")
-    if _is_six_way(path):
+    if is_six_way(path):
         return request.six_way(paths)
     if len(paths) > 1:
         raise WlmError(f"{paths[1]}: expected one file; only smoke has several, one EXR a frame")
@@ -79,6 +79,8 @@ def open_scene(
         return request.lightmap_set()
     if suffix in (".npz", ".json", ".lmbake"):
         return request.probes()
+    if suffix in (".glb", ".gltf", ".obj"):
+        raise WlmError(f"{path}: a mesh has no light of its own; expected the light, with this as --mesh")
     raise WlmError(
         f"{path}: expected a folder or .wlm, .exr, .npz, .nvdb, .json or .lmbake, found {path.suffix or 'none'}"
     )
@@ -97,14 +99,14 @@ class _Request:
     extinction: float | None
     flat: bool
     up: Literal["y", "z"]
+    progress: OnProgress | None
 
     def folder(self) -> Scene:
         if (self.path / REPORT_FILE).is_file():
             return self.atlas()
         if (self.path / SCENE_FILE).is_file():
             return self.volume(self.path)
-        frames = sorted(self.path.glob("*.exr"))
-        if frames and _is_six_way(frames[0]):
+        if frames := six_way_files(self.path):
             return self.six_way(frames)
         return self.lightmap_set()
 
@@ -175,7 +177,7 @@ class _Request:
         from wlm.view.smoke_scene import six_way_scene
 
         self._refuse("mesh", "original", "key", "walk", "scale", "extinction", "flat")
-        return six_way_scene(paths, title=self.path.name)
+        return six_way_scene(paths, title=self.path.name, progress=self.progress)
 
     @property
     def _up(self) -> int:
@@ -207,13 +209,6 @@ class _Request:
         geometry = None if self.mesh is None else read_geometry(self.mesh, with_uv=False)
         walk = None if self.walk is None else load_positions(self.walk)
         return probe_scene(probes, title=self.path.name, geometry=geometry, walk=walk, scale=self.scale, up=self._up)
-
-
-def _is_six_way(path: Path) -> bool:
-    """Whether a file is an EXR with a channel for each direction."""
-    if path.suffix.lower() != ".exr" or not path.is_file():
-        return False
-    return all(name in read_part(path).channels for name in DIRECTIONS)
 
 
 def _names(path: Path) -> list[str]:

@@ -13,14 +13,13 @@ from wlm.formats.geometry import Geometry
 from wlm.probe.data import ProbeSet
 from wlm.probe.decode import Decoder
 from wlm.probe.model import CENTRE, ROTATION, SCALE, ProbeModel
-from wlm.probe.places import ball_radius
+from wlm.probe.places import ball_exposure, ball_radius
 from wlm.probe.sphere import basis, coefficient_bands, cosine_factor, irradiance, sh_count
 from wlm.probe.volume import SIDE, SIZES, Volume
 from wlm.probe.walk import EYE_HEIGHT, camera_path
-from wlm.texels import exposure
 from wlm.view.canvas import Canvas, Hit
 from wlm.view.rendering import import_pyvista
-from wlm.view.scene import Scene, Slider, State
+from wlm.view.scene import Scene, Slider, State, frame_slider
 from wlm.view.surface import compared
 
 _BALLS, _MESH, _GAUSSIANS, _BLOCKS, _PATH, _VIEWER = "balls", "mesh", "gaussians", "blocks", "path", "viewer"
@@ -123,8 +122,7 @@ def probe_scene(
     volume = Volume(probes.position, probes.decode, 3 * probes.coefficients, scale=scale)
     path = walk if walk is not None else camera_path(volume.position, _LOOP, EYE_HEIGHT * scale, up)
     views = ("balls", "gaussians", "volume") if probes.model is not None else ("balls", "volume")
-    frame = Slider("frame", 0, len(path) - 1, 0, 1, ".0f", whole=True, views=("volume",))
-    sliders = (frame,) * (len(path) > 1) + (_SIGMAS,) * (probes.model is not None)
+    sliders = frame_slider(len(path), ("volume",)) + (_SIGMAS,) * (probes.model is not None)
     return _ProbeScene(
         title,
         compared("decoded" in probes.values, "original" in probes.values),
@@ -132,6 +130,7 @@ def probe_scene(
         sliders=sliders,
         plays="frame" if len(path) > 1 else None,
         up=up,
+        room=geometry is not None and geometry.is_room,
         probes=probes,
         geometry=geometry,
         path=path,
@@ -156,7 +155,7 @@ class _ProbeScene(Scene):
         faces = self._ball_faces + len(self._ball) * np.arange(len(probes.position))[:, None, None]
         self._balls = points.reshape(-1, 3), faces.reshape(-1, 3)
         self._light = {name: irradiance(values, self._ball) / math.pi for name, values in probes.values.items()}
-        self._brightness = exposure(self._light.get("original", next(iter(self._light.values()))))
+        self._brightness = ball_exposure(probes.values.get("original", next(iter(probes.values.values()))))
         self._surface: np.ndarray | None = None
         if self.geometry is not None:
             at_vertices = probes.decode(self.geometry.position.astype(np.float64))
@@ -174,7 +173,9 @@ class _ProbeScene(Scene):
             if self._surface is not None:
                 decoded = name != "error" and (name == "decoded" or "decoded" not in self.panels)
                 lit = display.picture(self._surface) if decoded else np.full(self._surface.shape, _GREY, np.uint8)
-                canvas.coloured(panel, _MESH, self.geometry.position, self.geometry.triangle, lit, shape=not decoded)
+                place = self.geometry.position, self.geometry.triangle
+                hidden = self.room and not state.outside
+                canvas.coloured(panel, _MESH, *place, lit, shape=not decoded, one_sided=hidden)
         windows = [f"window {level}" for level in range(len(self.volume.sizes))]
         if state.view != "balls":
             canvas.hide(0, _BALLS, _MESH)
@@ -198,7 +199,7 @@ class _ProbeScene(Scene):
         if state.view == "volume" and self._stats is not None:
             held, waiting = self.volume.unscroll()[1].sum(), self._stats.left
             size = self.volume.sizes[0]
-            text += f"; {held:,} blocks from {size:.3g} up, {self._stats.updated} new, {waiting:,} waiting"
+            text += f"; {held:,} blocks, the least {size:.3g} wide, {self._stats.updated} new, {waiting:,} waiting"
         return text
 
     def describe(self, hit: Hit, state: State) -> str:
@@ -226,7 +227,7 @@ class _ProbeScene(Scene):
         canvas.coloured(0, _GAUSSIANS, points.reshape(-1, 3), faces.reshape(-1, 3), colours, shape=True)
 
     def _draw_volume(self, canvas: Canvas, state: State, windows: list[str]) -> None:
-        frame = int(state.values.get("frame", 0))
+        frame = state.frame
         if frame != self._frame:
             # A jump is waited for; the next frame shows what a frame's budget fills.
             self._stats = self.volume.update(self.path[frame])

@@ -22,6 +22,7 @@ class Slider:
         unit: Behind its value in text.
         whole: Whether it has only whole values.
         wraps: Whether its end is its beginning again, as midnight is.
+        clock: Whether it is in hours of a day, which its text also has as a clock shows them.
         views: The views in which it does something; empty: all.
     """
 
@@ -34,7 +35,14 @@ class Slider:
     unit: str = ""
     whole: bool = False
     wraps: bool = False
+    clock: bool = False
     views: tuple[str, ...] = ()
+
+    def text(self, value: float) -> str:
+        """Its name and a value of it."""
+        shown = f"{self.name} {value:{self.form}}{self.unit}"
+        minutes = round(value * 60.0) % 1440
+        return f"{shown} ({minutes // 60}:{minutes % 60:02})" if self.clock else shown
 
     def fit(self, value: float) -> float:
         """The nearest value that it may have."""
@@ -42,6 +50,13 @@ class Slider:
             value = self.low + (value - self.low) % (self.high - self.low)
         value = min(max(value, self.low), self.high)
         return float(round(value)) if self.whole else value
+
+
+def frame_slider(count: int, views: tuple[str, ...] = ()) -> tuple[Slider, ...]:
+    """A slider of so many frames, which users count from 1; none for one frame."""
+    if count < 2:
+        return ()
+    return (Slider("frame", 1, count, 1, 1, ".0f", f" of {count}", whole=True, views=views),)
 
 
 @dataclass
@@ -52,11 +67,18 @@ class State:
         values: Of the sliders, by name.
         view: One of the scene's views.
         tone: One of `wlm.view.display.TONES`.
+        outside: Whether the walls of a room are drawn from outside too, where they hide it.
     """
 
     values: dict[str, float]
     view: str
     tone: str = TONES[0]
+    outside: bool = False
+
+    @property
+    def frame(self) -> int:
+        """The index of the frame; users count them from 1."""
+        return int(self.values.get("frame", 1)) - 1
 
     def display(self, exposure: float) -> Display:
         """How light is shown; `exposure` is that of 0 EV."""
@@ -75,6 +97,7 @@ class Scene(ABC):
         plays: The slider that runs when the scene is played; None, or in views without it: the camera turns.
         flat: Whether it lies in a plane, which isn't turned.
         up: 0 to 2, the axis that points up.
+        room: Whether its mesh is a room that hides what is lit unless one looks through its walls from outside.
     """
 
     title: str
@@ -84,6 +107,7 @@ class Scene(ABC):
     plays: str | None = None
     flat: bool = False
     up: int = 1
+    room: bool = False
 
     @abstractmethod
     def draw(self, canvas: Canvas, state: State) -> None:

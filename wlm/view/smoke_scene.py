@@ -17,9 +17,10 @@ from wlm.smoke.camera import DIRECTIONS
 from wlm.smoke.data import Frames, read_six_way
 from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.shading import Light
+from wlm.system import Meter, OnProgress
 from wlm.view.canvas import Canvas, Hit
 from wlm.view.display import Display
-from wlm.view.scene import Scene, Slider, State
+from wlm.view.scene import Scene, Slider, State, frame_slider
 from wlm.view.surface import flat_geometry
 
 _TURN = Slider("turn", -180.0, 180.0, 40.0, 5.0, ".0f", "°", wraps=True)
@@ -34,25 +35,29 @@ _EMPTY = "#5a5d63"  # where the sheet has no plane
 _PLANES, _SMOKE, _BOX = "planes", "smoke", "box"
 
 
-def six_way_scene(paths: Sequence[Path], *, title: str) -> Scene:
+def six_way_scene(paths: Sequence[Path], *, title: str, progress: OnProgress | None = None) -> Scene:
     """Makes the scene of six-way lightmaps.
 
     Args:
         paths: One EXR a frame, of one size, as `wlm smoke bake` or `predict` wrote them.
         title: Of the window.
+        progress: Called about twice a second.
 
     Raises:
         WlmError: A file can't be read, or is of another size than the first.
     """
-    frames = [read_six_way(path) for path in paths]
-    first = frames[0].lightmaps.shape
-    for path, frame in zip(paths, frames, strict=True):
-        size = frame.lightmaps.shape
+    frames: list[SixWay] = []
+    meter = Meter(progress, "read", len(paths))
+    for path in paths:
+        frames.append(read_six_way(path))
+        first, size = frames[0].lightmaps.shape, frames[-1].lightmaps.shape
         if size != first:
             raise WlmError(
                 f"{path}: expected {first[2]}x{first[1]} pixels as the first frame, found {size[2]}x{size[1]}"
             )
-    number = _frame_slider(len(frames))
+        if meter.due(len(frames)):
+            meter.report(len(frames))
+    number = frame_slider(len(frames))
     return _SixWayScene(
         title,
         ("smoke", "lightmaps"),
@@ -75,7 +80,7 @@ def volume_scene(frames: Frames, *, title: str, up: int = 1) -> Scene:
         WlmError: The first frame is missing or damaged.
     """
     frames.load(frames.numbers[0])
-    number = _frame_slider(len(frames.numbers))
+    number = frame_slider(len(frames.numbers))
     plays = "frame" if number else "turn"
     return _VolumeScene(title, ("smoke",), sliders=(*number, _TURN, _HEIGHT), plays=plays, up=up, frames=frames)
 
@@ -142,7 +147,7 @@ class _SixWayScene(Scene):
         return f"pixel {column}, {row}   {', '.join(values)}"
 
     def _frame(self, state: State) -> SixWay:
-        return self.frames[int(state.values.get("frame", 0))]
+        return self.frames[state.frame]
 
 
 @dataclass(kw_only=True)
@@ -185,16 +190,12 @@ class _VolumeScene(Scene):
         return np.array([x, y, z] if self.up == 1 else [x, -z, y])
 
     def _volume(self, state: State) -> tuple[int, DensityVolume, DensityVolume]:
-        number = self.frames.numbers[int(state.values.get("frame", 0))]
+        number = self.frames.numbers[state.frame]
         if self._loaded is None or self._loaded[0] != number:
             volume = self.frames.load(number)
             self._full = volume.shape
             self._loaded = number, _coarser(volume, _MOST_VOXELS), _coarser(volume, _MOST_LIT)
         return self._loaded
-
-
-def _frame_slider(count: int) -> tuple[Slider, ...]:
-    return (Slider("frame", 0, count - 1, 0, 1, ".0f", whole=True),) if count > 1 else ()
 
 
 def _toward(state: State) -> np.ndarray:

@@ -9,6 +9,7 @@ from wlm.formats.geometry import Geometry
 from wlm.view.canvas import Canvas, Hit
 from wlm.view.scene import Scene, State
 
+_NO_CHART = 77  # of 255, as on the pages for a browser
 _SHARE = 0.6  # of a tile's colour over the light
 _MESH = "mesh"
 
@@ -36,7 +37,7 @@ class SurfaceScene(Scene):
         geometry: Where it lies, with lightmap UVs.
         brightness: Exposure at 0 EV.
         height, width: Texels.
-        mask: bool [H, W], the texels whose light counts; None: all.
+        mask: bool [H, W], the texels that belong to a chart; None: nobody knows.
     """
 
     geometry: Geometry
@@ -62,15 +63,17 @@ class SurfaceScene(Scene):
         for panel, name in enumerate(self.panels):
             if name == "error":
                 picture = display.error(lights["decoded"], lights["original"])
-                if self.mask is not None:
-                    picture[~self.mask] = 0
+                if self.flat and self.mask is not None:
+                    # Never seen on the mesh, and no score has them.
+                    picture[~self.mask] = _NO_CHART
             else:
                 picture = display.picture(lights[name])
             if panel == 0 and state.view == "tiles":
                 mixed = _SHARE * 255.0 * self.tile_colours() + (1.0 - _SHARE) * picture
                 picture = (mixed + 0.5).astype(np.uint8)
             shape = self.geometry
-            canvas.textured(panel, _MESH, shape.position, shape.triangle, shape.uv, picture, nearest=self.flat)
+            place, hidden = (shape.position, shape.triangle, shape.uv), self.room and not state.outside
+            canvas.textured(panel, _MESH, *place, picture, nearest=self.flat, one_sided=hidden)
 
     def describe(self, hit: Hit, state: State) -> str:
         u, v = hit.weights @ self.geometry.uv[self.geometry.triangle[hit.cell]]

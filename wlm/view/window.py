@@ -11,6 +11,7 @@ from PIL import Image
 
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_path
+from wlm.system import Meter, OnProgress
 from wlm.view.canvas import Canvas, Hit
 from wlm.view.display import TONES
 from wlm.view.rendering import import_pyvista, require_opengl
@@ -118,6 +119,17 @@ class Window:
         self.state.tone = name
         self.draw()
 
+    def outside(self, seen: bool) -> None:
+        """Draws the walls of a room from outside too, or leaves them out there.
+
+        Raises:
+            WlmError: The scene is no room.
+        """
+        if not self.scene.room:
+            raise WlmError(f"{self.scene.title}: --outside: expected the mesh of a room, whose walls face its middle")
+        self.state.outside = seen
+        self.draw()
+
     def turn(self, degrees: float) -> None:
         """Turns the camera about the scene's upward axis.
 
@@ -153,7 +165,7 @@ class Window:
         self._lay_out()
         views = self.scene.views
         chosen = "   ".join(f"[{i} {v}]" if v == self.state.view else f"{i} {v}" for i, v in enumerate(views, 1))
-        parts = [chosen if len(views) > 1 else "", self.state.tone, self.scene.caption(self.state)]
+        parts = [f"view: {chosen}" if len(views) > 1 else "", self.scene.caption(self.state)]
         self._texts["caption"].SetInput("      ".join(filter(None, parts)))
         self._tell()
 
@@ -177,12 +189,15 @@ class Window:
         with atomic_path(path) as temporary:
             Image.fromarray(self.picture()).save(temporary, format="PNG")
 
-    def movie(self, path: str | os.PathLike[str], frames: int | None = None) -> int:
+    def movie(
+        self, path: str | os.PathLike[str], frames: int | None = None, *, progress: OnProgress | None = None
+    ) -> int:
         """Writes the scene, played once, as a GIF or WebP that begins again for ever.
 
         Args:
             path: Ends in one of `MOVIES`.
             frames: Pictures; None: 48, or all frames where frames are played.
+            progress: Called about twice a second.
 
         Returns:
             The number of pictures.
@@ -195,7 +210,12 @@ class Window:
             raise WlmError(f"{path}: expected a name that ends in {' or '.join(MOVIES)}, found {suffix or 'none'}")
         if frames is not None and frames < 1:
             raise WlmError(f"--frames: expected at least 1, got {frames}")
-        pictures = [Image.fromarray(picture) for picture in self._played_once(frames)]
+        count = self._count(frames)
+        pictures, meter = [], Meter(progress, "draw", count)
+        for picture in self._played_once(count):
+            pictures.append(Image.fromarray(picture))
+            if meter.due(len(pictures)):
+                meter.report(len(pictures))
         options = {"save_all": True, "append_images": pictures[1:], "duration": 1000.0 / self._rate, "loop": 0}
         with atomic_path(path) as temporary:
             pictures[0].save(temporary, format=MOVIES[suffix], **options)
@@ -267,6 +287,8 @@ class Window:
             "Left": lambda: self._move(self._main(), -1),
             "Right": lambda: self._move(self._main(), 1),
         }
+        if self.scene.room:
+            self._keys["b"] = lambda: self.outside(not self.state.outside)
         for number, view in enumerate(self.scene.views, 1):
             self._keys[str(number)] = lambda view=view: self.choose(view)
         # The plotter's and VTK's own keys would turn stereo and wires on.
@@ -288,8 +310,25 @@ class Window:
 
     def _tell(self) -> str:
         told = self.scene.describe(self._hit, self.state) if self._hit is not None else ""
-        self._texts["told"].SetInput(told)
+        # A picture or a movie has no keys.
+        self._texts["told"].SetInput(told or ("" if self._plotter.off_screen else self.help()))
         return told
+
+    def help(self) -> str:
+        """A line on the keys that do something in this view."""
+        moved, views = self._main(), len(self.scene.views)
+        does = {
+            "space": "turns" if self._player() is None else "plays",
+            "arrows": moved,
+            "[ ]": "exposure",
+            "- +": "error" if "error" in self.sliders else None,
+            "T": "tone",
+            f"1 to {views}": "view" if views > 1 else None,
+            "B": "walls from outside" if self.scene.room else None,
+            "R": "first camera",
+            "Q": "closes",
+        }
+        return "keys:   " + "   ".join(f"{key} {what}" for key, what in does.items() if what)
 
     def _lay_out(self) -> None:
         """Shows the sliders of the view side by side, with their values."""
@@ -303,7 +342,7 @@ class Window:
             text.SetVisibility(name in shown)
             if name in shown:
                 left = cell * shown.index(name)
-                text.SetInput(f"{name} {value:{slider.form}}{slider.unit}")
+                text.SetInput(slider.text(value) + f", {self.state.tone}" * (name == _EXPOSURE.name))
                 text.SetPosition(left + _INDENT, _LABELS)
                 for point, x in ((shape.GetPoint1Coordinate(), 0.0), (shape.GetPoint2Coordinate(), cell - 0.02)):
                     point.SetValue(left + _INDENT + x, _BARS * self._share)
@@ -333,17 +372,21 @@ class Window:
         if self.tell(*self._plotter.iren.interactor.GetEventPosition()) != before:
             self._plotter.render()
 
-    def _played_once(self, frames: int | None) -> Iterator[np.ndarray]:
+    def _count(self, frames: int | None) -> int:
+        """Pictures of a movie."""
+        name = self._player()
+        slider = None if name is None else self.sliders[name]
+        return frames or (round(slider.high - slider.low) + 1 if slider is not None and slider.whole else _FRAMES)
+
+    def _played_once(self, count: int) -> Iterator[np.ndarray]:
         name = self._player()
         if name is None:
-            count = frames or _FRAMES
             for _ in range(count):
                 yield self.picture()
                 self.turn(360.0 / count)
             return
         slider = self.sliders[name]
         ends = slider.high - slider.low
-        count = frames or (round(ends) + 1 if slider.whole else _FRAMES)
         for number in range(count):
             self.set(name, slider.low + ends * number / (count if slider.wraps else max(count - 1, 1)))
             yield self.picture()

@@ -16,6 +16,8 @@ from wlm.formats.geometry import Geometry
 from wlm.texels import exposure, fill_gaps
 from wlm.web.page import Page, pack_rgb9e5, pack_triangles
 
+_FORMATS = {"half": "half floats", "bc6h": "BC6H", "astc": "ASTC"}
+
 
 def folder_page(
     folder: str | os.PathLike[str], *, original: str | os.PathLike[str] | None = None, up: Literal["y", "z"] = "y"
@@ -67,12 +69,14 @@ def folder_page(
             )
         light = np.nan_to_num(lightmap.astype(np.float32), posinf=65504.0)
         arrays["original_0"] = pack_rgb9e5(fill_gaps(light, mesh.mask))
+        arrays["mask"] = mesh.mask.astype(np.uint8) * 255
         manifest["reference"] = {"times": [0.0]}
     figures = [
         ("file", f"{output.model_bytes:,} bytes"),
-        ("saved", f"{100 * model.compression_ratio:.1f} % (eq. 9)"),
-        ("lightmap", f"{model.width} × {model.height}"),
-        ("colours", f"{texels.shape[1]} × {texels.shape[0]}, {model.colour}"),
+        ("size of textures", f"{100 * (1.0 - model.compression_ratio):.1f}% of half floats"),
+        ("lightmap", f"{model.width} × {model.height} texels"),
+        ("colour texture", f"{texels.shape[1]} × {texels.shape[0]}, {_FORMATS[model.colour]}"),
+        ("method", model.method),
         ("triangles", f"{len(triangles):,}"),
         ("profile", model.profile.name),
     ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from typing import Any, Literal
 
@@ -11,11 +12,12 @@ from wlm.errors import WlmError
 from wlm.formats.geometry import read_geometry
 from wlm.lightmap.data import load
 from wlm.lightmap.decode import Decoder
-from wlm.lightmap.evaluation import count_kinds
+from wlm.lightmap.evaluation import count_kinds, psnr_of
 from wlm.lightmap.exporter import document
 from wlm.lightmap.model import LightmapModel
 from wlm.lightmap.shader import decode_glsl
 from wlm.lightmap.tiles import TileKind
+from wlm.system import Meter, OnProgress
 from wlm.texels import exposure, fill_gaps
 from wlm.web.page import Page, pack_rgb9e5, pack_triangles
 
@@ -31,13 +33,14 @@ def lightmap_page(
     original: str | os.PathLike[str] | None = None,
     hours: int = 6,
     up: Literal["y", "z"] = "y",
+    progress: OnProgress | None = None,
 ) -> Page:
     """Makes the page of a lightmap model.
 
     Args:
         model: The model.
         file_bytes: Size of its file.
-        mesh, original, hours, up: As for `wlm.web.pages.make_page`.
+        mesh, original, hours, up, progress: As for `wlm.web.pages.make_page`.
 
     Raises:
         WlmError: The mesh or the set can't be read, or the set is of another size.
@@ -58,6 +61,12 @@ def lightmap_page(
             arrays |= {f"{number}_{name}": getattr(model, name)[row] for name in ("uvt", "ut", "vt")}
     profile, times = model.profile, model.times
     time = float(times[len(times) // 2])
+    reference: dict[str, Any] | None = None
+    if original is not None:
+        reference, originals = _originals(model, original, hours, progress)
+        arrays |= originals
+        # A page begins where its original is.
+        time = min(reference["times"], key=lambda stored: abs(stored - time))
     manifest: dict[str, Any] = {
         "width": model.width,
         "height": model.height,
@@ -78,24 +87,23 @@ def lightmap_page(
         triangles, box = pack_triangles(read_geometry(mesh), up)
         arrays |= triangles
         manifest |= box
-    if original is not None:
-        manifest["reference"], frames = _originals(model, original, hours)
-        arrays |= frames
     kinds = ", ".join(f"{count} {kind}" for kind, count in count_kinds(model).items() if count)
     figures = [
         ("file", f"{file_bytes:,} bytes"),
-        ("bits per texel", f"{file_bytes * 8 / (model.width * model.height * len(times)):.3f}"),
-        ("size", f"{model.width} × {model.height}, {len(times)} times"),
+        ("bits per texel and hour", f"{file_bytes * 8 / (model.width * model.height * len(times)):.3f}"),
+        ("lightmaps", f"{model.width} × {model.height}, {len(times)} {'hour' if len(times) == 1 else 'hours'}"),
         ("tiles", kinds),
         ("profile", profile.name),
     ]
+    if reference is not None:
+        manifest["reference"] = reference
     return Page("lightmap", model.name, "Lightmaps over the day, decoded on this GPU.", figures, manifest, arrays)
 
 
 def _originals(
-    model: LightmapModel, path: str | os.PathLike[str], hours: int
+    model: LightmapModel, path: str | os.PathLike[str], hours: int, progress: OnProgress | None
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Some frames of the set, spread evenly, their gaps filled: what a filter would read there."""
+    """Some frames of the set, spread evenly, their gaps filled: what a filter would read there; with their scores."""
     if hours < 1:
         raise WlmError(f"--hours: expected at least 1, got {hours}")
     lightmaps = load(path)
@@ -108,4 +116,10 @@ def _originals(
     arrays = {f"original_{i}": pack_rgb9e5(frame) for i, frame in enumerate(frames)}
     # Texels outside of it were never compressed: they have no error.
     arrays["mask"] = lightmaps.mask.astype(np.uint8) * 255
-    return {"times": lightmaps.times[chosen].tolist()}, arrays
+    times, decoder, scores = lightmaps.times[chosen].tolist(), Decoder(model), []
+    meter = Meter(progress, "score", len(times))
+    for number, time in zip(chosen.tolist(), times, strict=True):
+        scores.append(psnr_of(model, lightmaps, number, decoder.frame(time)))
+        if meter.due(len(scores)):
+            meter.report(len(scores))
+    return {"times": times, "psnr": [None if math.isnan(score) else score for score in scores]}, arrays

@@ -20,11 +20,6 @@ from wlm.formats.geometry import Geometry
 
 _ALIGNMENT = 16  # bytes, of an array in the content
 _COMMON = ("content.js", "graphics.js", "blocks.js", "camera.js", "panel.js", "light.js", "surface.js", "reading.js")
-_HELP = (
-    "Drag to turn or move, two fingers or the wheel to zoom, shift and drag to move, double-click to begin again. "
-    "Keys: arrows for the hour or frame, space plays, [ and ] change the exposure, T the tone mapping, 1 to 4 the "
-    "view, H folds this panel."
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +62,6 @@ class Page:
             "title": self.title,
             "note": self.note,
             "figures": [list(figure) for figure in self.figures],
-            "help": _HELP,
             **self.manifest,
             "arrays": places,
             "bytes": len(content),
@@ -94,7 +88,7 @@ def pack_triangles(geometry: Geometry, up: Literal["y", "z"]) -> tuple[dict[str,
     """The arrays of triangles by the names that the script knows, and for the manifest the box that its camera sees."""
     parts = {"position": geometry.position, "triangles": geometry.triangle, "uv": geometry.uv}
     low, high = geometry.box
-    box = {"low": low.tolist(), "high": high.tolist(), "up": "xyz".index(up)}
+    box = {"low": low.tolist(), "high": high.tolist(), "up": "xyz".index(up), "inward": geometry.is_room}
     return {name: values for name, values in parts.items() if values is not None}, box
 
 

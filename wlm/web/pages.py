@@ -7,8 +7,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
+from wlm.atlas.exporter import REPORT_FILE
 from wlm.errors import WlmError
-from wlm.system import load
+from wlm.smoke.data import is_six_way, six_way_files
+from wlm.system import OnProgress, load
 from wlm.web.page import Page
 
 
@@ -38,18 +40,20 @@ def make_page(
     hours: int = 6,
     rate: float = 30.0,
     up: Literal["y", "z"] = "y",
+    progress: OnProgress | None = None,
 ) -> Page:
     """Makes the page of a file.
 
     Args:
-        files: One `.wlm` of lightmaps, of an atlas or of probes; or the folder that `wlm atlas compress` wrote; or
-            six-way lightmaps of smoke, one EXR a frame.
+        files: One `.wlm` of lightmaps or of probes; or the folder that `wlm atlas compress` wrote; or six-way lightmaps
+            of smoke, one EXR a frame, or their folder.
         mesh: The scene: `.glb`, `.gltf` or `.obj`; of lightmaps with their UVs, of probes any.
         original: What was compressed, to compare with: a lightmap set, an atlas' lightmap, a probe file.
         key: Of a probe file with several arrays, the one that was compressed.
         hours: Most frames of the original lightmaps that the page carries, spread evenly.
         rate: Frames a second of smoke that plays.
         up: The axis that points up in the scene.
+        progress: Called about twice a second, of originals and of frames of smoke.
 
     Raises:
         WlmError: As `write_page`.
@@ -57,25 +61,35 @@ def make_page(
     paths = [Path(file) for file in files]
     if not paths:
         raise WlmError("expected a file to show, found none")
-    if paths[0].suffix.lower() == ".exr":
+    path = paths[0]
+    if not path.exists():
+        raise WlmError(f"{path}: no such file or folder")
+    if len(paths) == 1 and path.is_dir():
+        paths = six_way_files(path) or paths
+    if is_six_way(paths[0]):
         from wlm.web.smoke import smoke_page
 
-        _refuse(paths[0], mesh=mesh, original=original, key=key)
-        return smoke_page(paths, rate=rate)
+        _refuse(path, mesh=mesh, original=original, key=key)
+        return smoke_page(paths, rate=rate, progress=progress)
     if len(paths) > 1:
         raise WlmError(f"{paths[1]}: expected one file; only smoke has several, one EXR a frame")
-    path = paths[0]
-    if path.is_dir():
+    if path.is_dir() and (path / REPORT_FILE).is_file():
         from wlm.web.atlas import folder_page
 
         _refuse(path, mesh=mesh, key=key)
         return folder_page(path, original=original, up=up)
+    if path.is_dir() or path.suffix.lower() != ".wlm":
+        raise WlmError(
+            f"{path}: expected a .wlm, a folder of wlm atlas compress, or six-way EXRs; wlm view shows inputs too"
+        )
     model = load(path)
     if model.SYSTEM == "lightmap":
         from wlm.web.lightmap import lightmap_page
 
         _refuse(path, key=key)
-        return lightmap_page(model, path.stat().st_size, mesh=mesh, original=original, hours=hours, up=up)
+        return lightmap_page(
+            model, path.stat().st_size, mesh=mesh, original=original, hours=hours, up=up, progress=progress
+        )
     if model.SYSTEM == "probe":
         from wlm.web.probe import probe_page
 

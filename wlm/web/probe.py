@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from typing import Any, Literal
 
@@ -9,17 +10,17 @@ import numpy as np
 
 from wlm.errors import WlmError
 from wlm.formats.geometry import read_geometry
+from wlm.probe.data import load
 from wlm.probe.decode import Decoder
+from wlm.probe.evaluation import evaluate
 from wlm.probe.exporter import gaussian_bytes, network_bytes
 from wlm.probe.model import ProbeModel
-from wlm.probe.places import ball_radius, probes_of
+from wlm.probe.places import ball_exposure, ball_radius, probes_of
 from wlm.probe.shader import probe_glsl
-from wlm.probe.sphere import irradiance, sh_count
-from wlm.texels import exposure
+from wlm.probe.sphere import sh_count
 from wlm.web.page import Page, pack_triangles
 
 _BANDS = 9  # coefficients that diffuse light needs
-_UP = np.array([[0.0, 1.0, 0.0]])
 
 
 def probe_page(
@@ -53,10 +54,10 @@ def probe_page(
         "places": places,
     }
     radius = ball_radius(places)
-    light = Decoder(model).decode(position[live]).reshape(len(places), coefficients, 3)
+    light = Decoder(model).decode(position[live]) if values is None else values[live]
     manifest: dict[str, Any] = {
         "shader": probe_glsl(model),
-        "exposure": exposure(irradiance(light, _UP) / np.pi),
+        "exposure": ball_exposure(light.reshape(len(places), coefficients, 3)),
         "low": (places.min(0) - radius).tolist(),
         "high": (places.max(0) + radius).tolist(),
         "up": "xyz".index(up),
@@ -73,14 +74,18 @@ def probe_page(
         arrays |= triangles
         manifest["low"] = np.minimum(manifest["low"], box["low"]).tolist()
         manifest["high"] = np.maximum(manifest["high"], box["high"]).tolist()
+        manifest["inward"] = box["inward"]
     figures = [
         ("file", f"{file_bytes:,} bytes"),
         ("bits per probe", f"{file_bytes * 8 / model.probes:.1f}"),
-        ("of float32", f"{100 * file_bytes / (4 * model.outputs * model.probes):.2f} %"),
-        ("probes", f"{model.probes:,}, {int(model.dead.sum()):,} dead"),
+        ("size", f"{100 * file_bytes / (4 * model.outputs * model.probes):.2f}% of float32"),
+        ("live probes", f"{len(places):,} of {model.probes:,}"),
         ("Gaussians", f"{model.count:,}"),
         ("profile", model.profile.name),
     ]
+    if original is not None:
+        score = evaluate(model, load(original, key=key), file_bytes=file_bytes).psnr
+        figures.append(("PSNR of coefficients", "–" if math.isnan(score) else f"{score:.2f} dB"))
     return Page("probe", model.name, "Light probes, decoded on this GPU.", figures, manifest, arrays)
 
 

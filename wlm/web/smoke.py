@@ -11,51 +11,58 @@ from wlm.errors import WlmError
 from wlm.smoke.camera import DIRECTIONS
 from wlm.smoke.data import read_six_way
 from wlm.smoke.lightmaps import SixWay
+from wlm.system import Meter, OnProgress
 from wlm.web.page import Page
 
 _WHITE = 0.8  # of the screen, where the brightest lightmap is
 
 
-def smoke_page(paths: Sequence[Path], *, rate: float = 30.0) -> Page:
+def smoke_page(paths: Sequence[Path], *, rate: float = 30.0, progress: OnProgress | None = None) -> Page:
     """Makes the page of six-way lightmaps.
 
     Args:
         paths: One EXR a frame, of one size, as `wlm smoke bake` or `predict` wrote them.
         rate: Frames a second.
+        progress: Called about twice a second.
 
     Raises:
         WlmError: A file can't be read or is of another size, or the rate isn't above 0.
     """
     if not 0 < rate < float("inf"):
         raise WlmError(f"--rate: expected a number above 0, got {rate}")
-    frames = [read_six_way(path) for path in paths]
-    height, width = frames[0].lightmaps.shape[1:]
     arrays: dict[str, np.ndarray] = {}
-    most = []
-    for i, (path, frame) in enumerate(zip(paths, frames, strict=True)):
-        if tuple(frame.lightmaps.shape[1:]) != (height, width):
-            size = frame.lightmaps.shape
-            raise WlmError(f"{path}: expected {width}x{height} pixels as the first frame, found {size[2]}x{size[1]}")
+    most, hot, sizes = [], False, []
+    meter = Meter(progress, "read", len(paths))
+    for i, path in enumerate(paths):
+        frame = read_six_way(path)
+        hot |= frame.emission is not None
+        sizes.append("{2}x{1}".format(*frame.lightmaps.shape))
+        if sizes[i] != sizes[0]:
+            raise WlmError(f"{path}: expected {sizes[0]} pixels as the first frame, found {sizes[i]}")
         planes, scales = _planes(frame)
         # sRGB-like codes of 8 bits: what a flip book has.
         codes = np.round(np.sqrt(planes) * 255.0).astype(np.uint8).transpose(1, 2, 0)
         arrays[f"first_{i}"], arrays[f"second_{i}"] = codes[..., :4], codes[..., 4:]
         most.append(scales)
-    shown = [*DIRECTIONS, "opacity"] + ["emission"] * any(frame.emission is not None for frame in frames)
+        if meter.due(len(most)):
+            meter.report(len(most))
+    height, width = frame.lightmaps.shape[1:]
+    shown = [*DIRECTIONS, "opacity"] + ["emission"] * hot
     manifest = {
         "width": width,
         "height": height,
         "exposure": _WHITE / max(scales[0] for scales in most),
-        "smoke": {"frames": len(frames), "planes": shown, "most": most, "rate": rate},
+        "smoke": {"frames": len(paths), "planes": shown, "most": most, "rate": rate},
     }
     figures = [
         ("files", f"{sum(path.stat().st_size for path in paths):,} bytes"),
-        ("frames", f"{len(frames)}"),
-        ("size", f"{width} × {height}"),
-        ("light at most", f"{max(scales[0] for scales in most):.3g}"),
+        ("frames", f"{len(paths)}"),
+        ("lightmaps", f"{width} × {height} texels"),
+        ("brightest texel", f"{max(scales[0] for scales in most):.3g}"),
     ]
+    title = paths[0].stem if len(paths) == 1 else paths[0].resolve().parent.name
     note = "Six-way lightmaps of smoke. Drag over the picture: the light follows the pointer."
-    return Page("smoke", paths[0].stem, note, figures, manifest, arrays)
+    return Page("smoke", title, note, figures, manifest, arrays)
 
 
 def _planes(frame: SixWay) -> tuple[np.ndarray, list[float]]:

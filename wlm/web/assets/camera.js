@@ -5,7 +5,16 @@ const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
 const unit = (a) => a.map((x) => x / Math.hypot(...a));
 
+// The lines of the help on the mouse and on fingers; `drag` is what one of them does, `reset` begins again.
+function explainCamera(panel, drag, reset) {
+  panel.explain('drag', drag);
+  if (drag !== 'move') panel.explain('shift + drag', 'move');
+  panel.explain('wheel, two fingers', 'zoom, move');
+  panel.key('r', 'R, double-click', 'begin again', reset);
+}
+
 const FOCAL = 2.4;  // of the perspective, in halves of the picture's height
+const FILLED = 0.93;  // of the picture, at first
 
 class Camera {
   // `low`, `high`: the corners of what is to be seen; `up`: 1 for y, 2 for z.
@@ -24,7 +33,10 @@ class Camera {
       event.preventDefault();
       if (this.active) this.#zoom(Math.exp(event.deltaY * 0.001));
     }, {passive: false});
-    canvas.addEventListener('dblclick', () => { this.reset(); changed(); });
+    canvas.addEventListener('dblclick', () => this.reset());
+    // The right button moves too.
+    canvas.addEventListener('contextmenu', (event) => event.preventDefault());
+    this.started = true;
   }
 
   reset() {
@@ -32,6 +44,10 @@ class Camera {
     this.radius = Math.max(0.5 * Math.hypot(...this.low.map((x, i) => this.high[i] - x)), 1e-9);
     this.distance = 1;
     [this.yaw, this.pitch] = [0.7, 0.5];
+    const {right, above, toward} = this.#axes(), half = this.low.map((x, i) => 0.5 * (this.high[i] - x));
+    const corners = Array.from({length: 8}, (_, n) => half.map((x, i) => n >> i & 1 ? x : -x));
+    this.corners = corners.map((corner) => [dot(right, corner), dot(above, corner), dot(toward, corner)]);
+    if (this.started) this.changed();
   }
 
   #zoom(factor) {
@@ -68,7 +84,11 @@ class Camera {
   // Half the height of what is seen, in the scene's unit.
   #reach() {
     const aspect = this.canvas.clientWidth / this.canvas.clientHeight;
-    if (!this.flat) return this.distance * this.radius * 1.05 / Math.min(aspect, 1);
+    if (!this.flat) {
+      // At first each corner of the box is within the picture; a near one seems further from its middle.
+      const each = this.corners.map(([x, y, z]) => Math.max(Math.abs(y), Math.abs(x) / aspect) / FILLED + z / FOCAL);
+      return this.distance * Math.max(...each, 1e-9);
+    }
     const [width, height] = [0, 1].map((i) => this.high[i] - this.low[i]);
     return this.distance * 0.54 * Math.max(height, width / aspect);
   }

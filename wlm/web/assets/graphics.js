@@ -161,10 +161,13 @@ class Graphics {
     return {array, count: indices.length};
   }
 
-  drawGeometry(geometry, instances = 1) {
+  // `oneSided`: triangles that face away, clockwise on the screen, are left out.
+  drawGeometry(geometry, instances = 1, oneSided = false) {
     const {gl} = this;
     gl.bindVertexArray(geometry.array);
+    if (oneSided) gl.enable(gl.CULL_FACE);
     gl.drawElementsInstanced(gl.TRIANGLES, geometry.count, gl.UNSIGNED_INT, 0, instances);
+    gl.disable(gl.CULL_FACE);
     gl.bindVertexArray(null);
   }
 

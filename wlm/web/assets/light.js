@@ -49,20 +49,23 @@ class Display {
     this.share = 0.5;
     const stops = (value) => `${value > 0 ? '+' : ''}${value.toFixed(1)} EV`;
     panel.slider('exposure', {
-      min: -8, max: 8, step: 0.1, value: 0, text: stops, keys: ['[', ']', 0.5],
+      min: -8, max: 8, step: 0.1, value: 0, text: stops, keys: ['[', ']'], by: 0.5,
       changed: (value) => { this.values.u_exposure = page.manifest.exposure * 2 ** value; changed(); },
     });
-    const tone = panel.choices(TONES, TONES[0], (name) => { this.values.u_tone = TONES.indexOf(name); changed(); });
-    panel.keys.set('t', () => tone(TONES[1 - this.values.u_tone]));
+    const tone = panel.choices('tone', TONES, TONES[0], (name) => {
+      this.values.u_tone = TONES.indexOf(name);
+      changed();
+    });
+    panel.key('t', 'T', 'tone mapping', () => tone(TONES[1 - this.values.u_tone]));
     if (!page.manifest.reference) return;
     const wipe = document.getElementById('wipe');
-    this.view = panel.choices(VIEWS, VIEWS[0], (name) => {
+    this.view = panel.choices('view', VIEWS, VIEWS[0], (name) => {
       this.values.u_view = VIEWS.indexOf(name);
       wipe.hidden = name !== 'split';
       changed();
     }, 1);
-    panel.slider('error times', {
-      min: 1, max: 64, step: 1, value: 8, text: (value) => `× ${value}`,
+    panel.slider('error factor', {
+      min: 1, max: 64, step: 1, value: 8, text: (value) => `${value}×`, keys: ['-', '+'],
       changed: (value) => { this.values.u_gain = value; changed(); },
     });
     const place = () => { wipe.style.left = `${100 * this.share}%`; };

@@ -83,22 +83,41 @@ class LightmapPage {
     this.seen = [];
     this.batch = 1;
     this.waiting = [];
-    const first = lightmap.times[0], last = lightmap.period ?? lightmap.times.at(-1);
     this.time = manifest.time;
-    this.setTime = panel.slider('hour', {
-      min: lightmap.period ? 0 : first, max: last, step: 'any', value: this.time,
-      text: (value) => this.#clock(value), keys: ['arrowleft', 'arrowright', (last - first) / 96],
-      changed: (value) => { this.time = value; changed(); },
-    });
-    const play = panel.button('play', ' ', () => {
-      this.playing = this.playing === undefined ? performance.now() : undefined;
-      play.textContent = this.playing === undefined ? 'play' : 'pause';
-      changed();
-    });
+    this.first = lightmap.period ? 0 : lightmap.times[0];
+    this.length = lightmap.period ?? lightmap.times.at(-1) - this.first;
+    this.originals = new Originals(graphics, page);
+    if (this.length > 0) {
+      this.setTime = panel.slider('hour', {
+        min: this.first, max: this.first + this.length, step: 'any', value: this.time,
+        text: (value) => this.#clock(value), keys: ['arrowleft', 'arrowright'], told: 'the hour',
+        next: (value, direction) => this.#beside(value, direction),
+        changed: (value) => { this.time = value; changed(); },
+      });
+      panel.player((playing) => {
+        this.playing = playing ? this.time - this.first : undefined;
+        changed();
+      });
+    }
     this.display = new Display(page, panel, changed);
     this.surface = new Surface(
       graphics, page, MIXED, this.display, panel, changed, (column, row) => this.#tell(column, row));
-    this.originals = new Originals(graphics, page);
+  }
+
+  // The hour that an arrow key goes to: a quarter of an hour on, or the next that has an original.
+  #beside(time, direction) {
+    const {times} = this.originals, {period} = this.lightmap;
+    if (this.display.compares) {
+      const at = this.originals.nearest(time, period) + direction;
+      return times[period ? (at + times.length) % times.length : Math.min(Math.max(at, 0), times.length - 1)];
+    }
+    const next = time + direction * this.length / 96, since = next - this.first;
+    return period ? this.first + (since + period) % period : next;
+  }
+
+  // The nearest hour that the view can show: those that need the original have it at some hours alone.
+  #shown(time) {
+    return this.display.compares ? this.originals.times[this.originals.nearest(time, this.lightmap.period)] : time;
   }
 
   #clock(value) {
@@ -166,6 +185,7 @@ class LightmapPage {
       if (!missing) {
         const changed = this.shown !== this.time;
         [this.seen, this.shown] = [reads, this.time];
+        if (changed) this.#score();
         return changed;
       }
       this.asked = missing;
@@ -176,7 +196,10 @@ class LightmapPage {
     if (elapsed > LONG_FRAME) this.batch = Math.max(Math.floor(this.batch / 2), 1);
     else if (elapsed < SHORT_FRAME) this.batch = Math.min(2 * this.batch, this.tiles.length);
     for (const tile of this.waiting.splice(0, this.batch)) this.#decode(tile, this.asked);
-    if (this.waiting.length) return true;
+    if (this.waiting.length) {
+      this.panel.figure('decoded in', `${this.tiles.length - this.waiting.length} of ${this.tiles.length} tiles so far`);
+      return true;
+    }
     this.#keep(this.asked, reads);
     this.panel.figure('decoded in', `${(performance.now() - this.began).toFixed(0)} ms`);
     return true;
@@ -197,22 +220,40 @@ class LightmapPage {
     if (!this.seen.length || !this.seen.every((other) => this.#map(other))) this.seen = [{...read, weight: 1}];
   }
 
+  // Tells the score of the hour that is seen, if it has an original here.
+  #score() {
+    const {times} = this.originals;
+    if (!times.length) return;
+    const score = this.manifest.reference.psnr[times.indexOf(this.shown)];
+    this.panel.figure('PSNR at this hour', score == null ? '–' : `${score.toFixed(2)} dB`);
+    this.panel.figure('originals at', times.map((time) => this.#clock(time)).join(', '));
+  }
+
   advance(elapsed) {
     if (this.playing === undefined || this.waiting.length) return;
-    const {period, times} = this.lightmap, first = period ? 0 : times[0], length = period ?? times.at(-1) - first;
+    // The slider was moved meanwhile.
+    if (this.time !== this.played) this.playing = this.time - this.first;
     // A day in twelve seconds.
-    this.setTime(first + (this.time - first + Math.min(elapsed, 250) / 12000 * length) % length);
+    this.playing = (this.playing + Math.min(elapsed, 250) / 12000 * this.length) % this.length;
+    this.setTime(this.#shown(this.first + this.playing));
+    this.played = this.time;
   }
 
   draw() {
-    const index = this.originals.nearest(this.time, this.lightmap.period);
-    // An original is there at its own hour alone.
-    if (this.display.compares && this.playing === undefined && this.originals.times[index] !== this.time) {
-      this.setTime(this.originals.times[index]);
+    if (!this.display.compares) {
+      this.surface.draw(this.#light());
+      return;
     }
-    const original = this.display.compares ? this.originals.get(index) : undefined;
+    if (this.#shown(this.time) !== this.time) this.setTime(this.#shown(this.time));
+    // Until both are of one hour, the last picture stays.
+    const index = this.originals.times.indexOf(this.shown);
+    if (index >= 0) this.surface.draw(this.#light(), this.originals.get(index));
+  }
+
+  // The uniforms of what is seen.
+  #light() {
     const [early, late] = this.#pictures();
-    this.surface.draw({u_early: early, u_late: late ?? early, u_share: late ? this.seen[1].weight : 0}, original);
+    return {u_early: early, u_late: late ?? early, u_share: late ? this.seen[1].weight : 0};
   }
 
   // What is known of a texel.
@@ -234,7 +275,7 @@ class LightmapPage {
 
   // For scripts: radiance of the whole map at an hour, RGBA by rows.
   async read(time) {
-    this.setTime(time);
+    this.setTime?.(time);
     while (this.shown !== this.time || this.waiting.length) await new Promise(requestAnimationFrame);
     const maps = this.seen.map((read) => this.graphics.read(this.#map(read)));
     if (maps.length === 1) return maps[0];

@@ -24,7 +24,8 @@ async function start() {
   const changed = () => { dirty = true; };
   const kind = new KINDS[manifest.kind](graphics, page, panel, changed);
   for (const [name, text] of manifest.figures) panel.figure(name, text);
-  panel.help.textContent = kind.help ?? manifest.help;
+  panel.key('h', 'H', 'fold this panel', panel.fold);
+  document.getElementById('message').hidden = true;
   const loop = (time) => {
     const elapsed = time - last;
     last = time;

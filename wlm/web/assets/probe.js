@@ -119,6 +119,7 @@ ${DISPLAY}
 void main() { colour = vec4(wlm_shown(v_decoded, v_original), 1.0); }`);
     this.display = new Display(page, panel, changed);
     this.camera = new Camera(graphics.canvas, manifest.low, manifest.high, {up: manifest.up, changed});
+    explainCamera(panel, 'turn the camera', () => this.camera.reset());
     const [points, indices] = sphere(manifest.probe.count > 512 ? 8 : 16);
     this.groups = [{
       places: this.#places(page.array('places', Float32Array)),
@@ -135,7 +136,11 @@ void main() { colour = vec4(wlm_shown(v_decoded, v_original), 1.0); }`);
         instances: 1, original: graphics.black,
       });
       this.hidden = 0;
-      panel.choices(['spheres', 'mesh', 'both'], 'both', (name) => {
+      if (manifest.inward) {
+        this.oneSided = true;
+        panel.toggle('walls from outside', 'b', false, (seen) => { this.oneSided = !seen; changed(); });
+      }
+      panel.choices('show', ['spheres', 'mesh', 'both'], 'both', (name) => {
         this.hidden = {both: 0, spheres: 2, mesh: 1}[name];
         changed();
       });
@@ -187,7 +192,9 @@ void main() { colour = vec4(wlm_shown(v_decoded, v_original), 1.0); }`);
     }
     gl.disable(gl.SCISSOR_TEST);
     const left = this.groups.some((group) => group.places.done < group.places.count);
-    if (!left) this.panel.figure('decoded in', `${(performance.now() - this.began).toFixed(0)} ms`);
+    const [done, all] = ['done', 'count'].map((key) => this.groups.reduce((sum, {places}) => sum + places[key], 0));
+    const share = `${Math.floor(100 * done / all)}%`, spent = `${(performance.now() - this.began).toFixed(0)} ms`;
+    this.panel.figure('decoded in', left ? `${share} so far` : spent);
     return true;
   }
 
@@ -200,7 +207,7 @@ void main() { colour = vec4(wlm_shown(v_decoded, v_original), 1.0); }`);
         ...tables, ...this.display.uniforms(width), u_camera: this.camera.matrix(), u_radius: group.radius,
         u_centres: group.places.texture, u_original: group.original,
       });
-      graphics.drawGeometry(group.geometry, group.instances);
+      graphics.drawGeometry(group.geometry, group.instances, this.oneSided && group.radius === 0);
     }
   }
 

@@ -58,7 +58,7 @@ class Reading {
     gl.clearBufferfv(gl.COLOR, 0, [NOWHERE, 0, 0, 0]);
     gl.clear(gl.DEPTH_BUFFER_BIT);
     graphics.use(this.program, {...surface.shape(), u_camera: matrix});
-    graphics.drawGeometry(surface.geometry);
+    graphics.drawGeometry(surface.geometry, 1, surface.culled);
     const [u, v, ...coordinate] = graphics.read(target);
     return u === NOWHERE ? null : {uv: [u, v], coordinate};
   }

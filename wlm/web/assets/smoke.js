@@ -52,6 +52,17 @@ class SmokePage {
       u_first: texture(`first_${i}`), u_second: texture(`second_${i}`), u_most: manifest.smoke.most[i],
     }));
     this.program = graphics.program(BILLBOARD, SHADE);
+    if (frames > 1) {
+      this.setFrame = panel.slider('frame', {
+        min: 0, max: frames - 1, step: 1, value: 0, text: (value) => `${value + 1}/${frames}`,
+        keys: ['arrowleft', 'arrowright'], next: (value, direction) => (value + direction + frames) % frames,
+        changed: (value) => { this.frame = value; changed(); },
+      });
+      panel.player((playing) => {
+        this.playing = playing ? this.frame : undefined;
+        changed();
+      });
+    }
     this.display = new Display(page, panel, changed);
     this.aspect = width / height;
     this.camera = new Camera(graphics.canvas, [0, -1, 0], [this.aspect, 0, 0], {flat: true, changed});
@@ -67,23 +78,13 @@ class SmokePage {
       changed();
     });
     pan.still = true;
-    if (frames > 1) {
-      this.setFrame = panel.slider('frame', {
-        min: 0, max: frames - 1, step: 1, value: 0, text: (value) => String(value + 1), keys: ['arrowleft', 'arrowright'],
-        changed: (value) => { this.frame = value; changed(); },
-      });
-      const play = panel.button('play', ' ', () => {
-        this.playing = this.playing === undefined ? 0 : undefined;
-        play.textContent = this.playing === undefined ? 'play' : 'pause';
-        changed();
-      });
-    }
+    explainCamera(panel, 'turn the light', () => pan.reset());
     const level = (name, set) => panel.slider(name, {
-      min: 0, max: 4, step: 0.05, value: 1, text: (value) => value.toFixed(2), changed: (value) => { set(value); changed(); },
+      min: 0, max: 4, step: 0.05, value: 1, text: (value) => `${value.toFixed(2)}×`, changed: (value) => { set(value); changed(); },
     });
     level('light', (value) => { this.light = value; });
     if (planes.includes('emission')) level('glow', (value) => { this.glow = value; });
-    panel.choices(['shaded', ...planes], 'shaded', (name) => {
+    panel.choices('show', ['shaded', ...planes], 'shaded', (name) => {
       this.plane = name === 'shaded' ? 0 : 1 + ['right', 'left', 'top', 'bottom', 'front', 'back', 'opacity', 'emission'].indexOf(name);
       changed();
     });
@@ -91,6 +92,8 @@ class SmokePage {
 
   advance(elapsed) {
     if (this.playing === undefined) return;
+    // The slider was moved meanwhile.
+    if (Math.floor(this.playing) % this.frames.length !== this.frame) this.playing = this.frame;
     this.playing += elapsed / 1000 * this.manifest.smoke.rate;
     const frame = Math.floor(this.playing) % this.frames.length;
     if (frame !== this.frame) this.setFrame(frame);

@@ -25,13 +25,15 @@ class Surface {
 in vec2 v_uv;
 in vec2 v_coordinate;
 uniform sampler2D u_original, u_mask;
+uniform bool u_unwrapped;
 out vec4 colour;
 ${source}
 ${DISPLAY}
 void main()
 {
     colour = vec4(wlm_shown(wlm_light(), texture(u_original, v_uv).rgb), 1.0);
-    if (u_view == 3) colour.rgb *= texture(u_mask, v_uv).r;
+    // Texels of no chart are never seen on the mesh, and no score has them.
+    if (u_view == ${VIEWS.indexOf('error')} && u_unwrapped && texture(u_mask, v_uv).r == 0.0) colour.rgb = vec3(0.3);
 }`);
     const [width, height] = page.has('mask') ? [manifest.width, manifest.height] : [1, 1], {gl} = graphics;
     const mask = page.has('mask') ? page.array('mask', Uint8Array) : new Uint8Array([255]);
@@ -51,13 +53,21 @@ void main()
     this.unwrapped = !this.mesh;
     this.#choose();
     if (this.mesh) {
-      panel.choices(['mesh', 'unwrapped'], 'mesh', (name) => {
+      panel.choices('show', ['mesh', 'unwrapped'], 'mesh', (name) => {
         this.unwrapped = name === 'unwrapped';
         this.#choose();
         changed();
       });
+      if (page.manifest.inward) {
+        this.oneSided = true;
+        panel.toggle('walls from outside', 'b', false, (seen) => { this.oneSided = !seen; changed(); });
+      }
     }
     this.reading = new Reading(graphics, this, manifest, panel, tell);
+    explainCamera(panel, this.mesh ? 'turn the camera; unwrapped: move' : 'move', () => {
+      this.picture.reset();
+      this.mesh?.reset();
+    });
   }
 
   #choose() {
@@ -67,6 +77,9 @@ void main()
 
   get camera() { return this.unwrapped ? this.picture : this.mesh; }
 
+  // Whether what faces away is left out.
+  get culled() { return Boolean(this.oneSided && !this.unwrapped); }
+
   shape() { return {u_camera: this.camera.matrix(), u_unwrapped: this.unwrapped, u_aspect: this.aspect}; }
 
   draw(uniforms, original) {
@@ -75,7 +88,7 @@ void main()
       ...uniforms, ...this.display.uniforms(width), ...this.shape(), u_mask: this.mask,
       u_original: original ?? graphics.black,
     });
-    graphics.drawGeometry(this.geometry);
+    graphics.drawGeometry(this.geometry, 1, this.culled);
     this.reading.show();
   }
 }
