@@ -112,17 +112,47 @@ def test_mask_argument_replaces_that_of_the_set(tmp_path):
     assert "missing.png" in error_of(load, path)
 
 
-def test_mask_from_alpha_needs_all_frames(tmp_path):
+def test_mask_from_alpha_may_differ_by_frame(tmp_path):
     frames = _frames(channels=4)
     frames[..., 3] = 1.0
     frames[0, 0, 0, 3] = 0.0
     frames[2, 3, 4, 3] = -1.0
+    frames[:, 1, 1, 3] = 0.0
     frames[1, 2, 2, 3] = 0.25
     lightmaps = load(_write_set(tmp_path, frames, mask="alpha"))
     expected = np.ones((HEIGHT, WIDTH), bool)
-    expected[0, 0] = expected[3, 4] = False
+    expected[1, 1] = False
     np.testing.assert_array_equal(lightmaps.mask, expected)
-    np.testing.assert_array_equal(lightmaps.frames, frames[..., :3])
+    np.testing.assert_array_equal(lightmaps.covered, frames[..., 3] > 0)
+    assert "2 texels are in some lightmaps alone" in lightmaps.warnings[0]
+    # What a frame lacks is the nearest frame's; the rest is as it was.
+    for i in range(len(frames)):
+        assert np.array_equal(lightmaps.valid(i), frames[i, ..., 3] > 0)
+        assert np.array_equal(lightmaps.frames[i][lightmaps.valid(i)], frames[i, ..., :3][lightmaps.valid(i)])
+    for i, y, x in ((0, 0, 0), (2, 3, 4)):
+        apart = np.abs(lightmaps.times - lightmaps.times[i])
+        apart = np.minimum(apart, lightmaps.period - apart) if lightmaps.period else apart
+        apart[i] = np.inf
+        assert np.array_equal(lightmaps.frames[i, y, x], frames[np.argmin(apart), y, x, :3])
+
+
+@pytest.mark.parametrize(("period", "taken"), [(None, 6.0), (24.0, 22.0)])
+def test_what_a_frame_lacks_comes_from_the_nearest_in_time(period, taken):
+    times = (1.0, 6.0, 22.0)
+    frames = np.ones((3, 4, 4, 3)) * np.array(times)[:, None, None, None]
+    mask = np.ones((3, 4, 4), bool)
+    mask[0, 2, 2] = False
+    frames[0, 2, 2] = np.nan
+    lightmaps = from_arrays(frames, times, mask, period)
+    assert (lightmaps.frames[0, 2, 2] == taken).all() and lightmaps.mask.all()
+    assert len(lightmaps.warnings) == 1 and lightmaps.source != from_arrays(lightmaps.frames, times).source
+
+
+def test_a_mask_of_each_frame_that_is_the_same_is_one_mask():
+    mask = np.random.default_rng(0).random((4, 5)) < 0.5
+    frames = np.ones((2, 4, 5, 3))
+    lightmaps = from_arrays(frames, (0.0, 1.0), np.stack([mask, mask]))
+    assert lightmaps.covered is None and lightmaps.source == from_arrays(frames, (0.0, 1.0), mask).source
 
 
 def test_mask_from_alpha_without_alpha_names_the_file(tmp_path):

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 from builders.running import report_always
-from builders.small_sets import moving_light, static_light, tiny_profile
+from builders.small_sets import HOURS, moving_light, static_light, tiny_profile
 
 import wlm
 from wlm.errors import WlmError
@@ -150,3 +150,23 @@ def test_a_firefly_that_is_lost_is_said():
     assert "of 1e+04 decodes to 0." in line and line.endswith("(tile 0 at 11)")
     assert line in evaluate(model, lightmaps, metrics=("psnr",)).warnings
     assert lost_light(compress(plain, tiny_profile(steps=60)), plain) == []
+
+
+def test_each_hour_is_scored_on_its_own_texels():
+    """An object that is there at one hour alone: it is fitted, and no other hour is blamed for it."""
+    lightmaps = moving_light(128, 128)
+    mask = np.ones(lightmaps.frames.shape[:3], bool)
+    mask[:, 40:80, 40:80] = False
+    mask[2] = True
+    frames = np.where(mask[..., None], lightmaps.frames, 0.0)
+    differing = from_arrays(frames, HOURS, mask, 24.0)
+    model = compress(differing, tiny_profile(steps=200))
+    report = evaluate(model, differing, metrics=["psnr"])
+    decoded = model.decoder().frame(HOURS[2])
+    inside = np.abs(decoded - differing.frames[2])[40:80, 40:80]
+    assert inside.mean() < 0.1 * np.ptp(differing.frames[2])
+    expected = [
+        evaluate_frame(differing.frames[i], model.decoder().frame(hour), mask[i], metrics=["psnr"]).psnr
+        for i, hour in enumerate(HOURS)
+    ]
+    np.testing.assert_allclose(report.psnr_by_time, np.ravel(expected), rtol=1e-6)

@@ -183,7 +183,8 @@ def evaluate_rivals(
         for i, frame in enumerate(lightmaps.frames):
             # The whole map's mask: an engine would encode all of it, whatever we score.
             rival = RIVALS[name](frame, lightmaps.mask)
-            frames.append(evaluate_frame(frame, rival.decoded, mask, TILE, plain, name=name))
+            valid = mask & lightmaps.valid(i)
+            frames.append(evaluate_frame(frame, rival.decoded, valid, TILE, plain, name=name))
             if seen:
                 tally.add(i, rival.decoded, frames[i])
             rivals.append(replace(rival, decoded=None))  # a set of them is too much memory

@@ -350,7 +350,7 @@ class _LightmapBench(Bench):
         tally = Tally(lightmaps, lightmaps.mask, decode, views, name)
         scored = []
         for i, frame in zip(self.chosen.tolist(), frames, strict=True):
-            scored.append(evaluate_frame(lightmaps.frames[i], frame, lightmaps.mask, TILE, metrics, name=name))
+            scored.append(evaluate_frame(lightmaps.frames[i], frame, lightmaps.valid(i), TILE, metrics, name=name))
             if seen:
                 tally.add(i, frame, scored[-1])
         summary: Summary = summarise(scored)

@@ -19,6 +19,8 @@ times out of order                    sorted, with their frames; warning
 two equal times                       error that names both files
 more than 100,000 times               error
 an alpha NaN or infinite              the texel is outside a mask from alpha; warning
+texels that some frames alone have    kept: fitted at the other times to the frame nearest in time
+                                      that has them, and scored at their own; warning
 files, mask or mesh outside the       error, unless the set is trusted
 folder of their `set.json`
 frames beyond 1 GiB that small files  error, unless the set is trusted
@@ -69,6 +71,8 @@ class LightmapSet:
         source: 16 hexadecimal digits of BLAKE2b over the checked pixels, the times and the mask.
         warnings: What was repaired, one line each.
         mesh: The mesh that the lightmaps belong to, as the set names it; it need not be there. None: no name.
+        covered: `[T, H, W]` bool, the valid texels that each frame has; None where every frame has all of them.
+            What a frame lacks holds the light of the frame nearest in time that has it.
     """
 
     name: str
@@ -79,6 +83,11 @@ class LightmapSet:
     source: str
     warnings: tuple[str, ...]
     mesh: Path | None = None
+    covered: np.ndarray | None = None
+
+    def valid(self, index: int) -> np.ndarray:
+        """The valid texels that a frame has, bool [H, W]."""
+        return self.mask if self.covered is None else self.covered[index]
 
 
 def load(
@@ -105,7 +114,7 @@ def load(
         path: The `set.json` or the folder.
         times: One time for each lightmap in the order of the list or the names; replaces those of `set.json`.
         mask: A PNG (a texel is valid where any colour channel is above 0), "alpha" (valid where the alpha
-            channel of every frame is above 0) or "all"; None takes what the set says.
+            channel of a frame is above 0; frames may differ) or "all"; None takes what the set says.
         period: Length of the day in the unit of the times; None takes the set's `period_hours`, if any.
         trust: Whether a `set.json` may name files outside its folder, and small files may hold large frames
             (`wlm.formats.limits`).
@@ -135,10 +144,10 @@ def load(
     _check_times(str(path), labels, stamps, period)
     mask_source = str(mask) if mask is not None else listing.mask
     need_alpha = mask_source == "alpha"
-    frames, alpha, warnings = _read_frames(listing, need_alpha, trust)
+    frames, covered, warnings = _read_frames(listing, need_alpha, trust)
     height, width = frames.shape[1:3]
     if need_alpha:
-        valid = alpha
+        valid = covered
     elif mask_source == "all":
         valid = np.ones((height, width), bool)
     else:
@@ -170,7 +179,7 @@ def from_arrays(
     Args:
         frames: `[T, H, W, 3]` of numbers, linear RGB irradiance; copied.
         times: `[T]`, in any order.
-        mask: `[H, W]`, true where a texel is valid; None for all.
+        mask: `[H, W]`, true where a texel is valid, or `[T, H, W]`, where each frame has it; None for all.
         period: Length of the day in the unit of the times; None for a set that is not periodic.
         name: The set's name, used in messages too.
 
@@ -187,7 +196,7 @@ def from_arrays(
     if stamps.shape != frames.shape[:1]:
         raise WlmError(f"{name}: expected {len(frames)} times, one per frame, got shape {stamps.shape}")
     valid = np.ones(frames.shape[1:3], bool) if mask is None else np.asarray(mask).astype(bool)
-    if valid.shape != frames.shape[1:3]:
+    if valid.shape not in (frames.shape[1:3], frames.shape[:3]):
         raise WlmError(f"{name}: expected a mask of {frames.shape[1:3]}, got {valid.shape}")
     labels = [f"frame {i} (time {time:g})" for i, time in enumerate(stamps)]
     _check_times(name, labels, stamps, period)
@@ -236,7 +245,7 @@ def parse_times(text: str) -> list[float]:
 def _read_frames(
     listing: Listing, need_alpha: bool, trust: bool
 ) -> tuple[np.ndarray, np.ndarray | None, tuple[str, ...]]:
-    """Reads all files into one array [T, H, W, 3]; if asked for, also where every alpha is above 0 [H, W]; warnings."""
+    """Reads all files into one array [T, H, W, 3]; if asked for, also where alphas are above 0 [T, H, W]; warnings."""
     first, alpha = _read_rgb(listing.files[0], need_alpha)
     size = first.shape[:2]
     if listing.size is not None and size != listing.size:
@@ -250,7 +259,7 @@ def _read_frames(
     except MemoryError as error:
         raise WlmError(f"{listing.stated_by}: {len(listing.files)} lightmaps of {_size(size)}: {error}") from error
     frames[0] = first
-    covered, warnings = np.ones(size, bool) if need_alpha else None, []
+    covered, warnings = np.zeros(frames.shape[:3], bool) if need_alpha else None, []
 
     def read(index: int) -> np.ndarray | None:
         rgb, alpha = _read_rgb(listing.files[index], need_alpha)
@@ -266,10 +275,10 @@ def _read_frames(
     try:
         # In order, so that of several bad files the first is the one named.
         alphas = chain([alpha], pool.map(read, range(1, len(listing.files))))
-        for file, alpha in zip(listing.files, alphas, strict=True):
+        for i, (file, alpha) in enumerate(zip(listing.files, alphas, strict=True)):
             if covered is None:
                 continue
-            covered &= np.isfinite(alpha) & (alpha > 0)
+            covered[i] = np.isfinite(alpha) & (alpha > 0)
             if broken := np.count_nonzero(~np.isfinite(alpha)):
                 warnings.append(f"{file.name}: {broken} texels with an alpha NaN or infinite: not valid")
     finally:
@@ -310,7 +319,7 @@ def _check(
     labels: Sequence[str],
     times: np.ndarray,  # [T]
     frames: np.ndarray,  # [T, H, W, 3], repaired in place
-    mask: np.ndarray,  # [H, W]
+    mask: np.ndarray,  # [H, W] or [T, H, W]
     period: float | None,
     *,
     where: str,
@@ -327,17 +336,46 @@ def _check(
         if warn_order:
             warnings.append(f"{where}: the times were not in order: sorted, with their frames")
         times, frames, labels = times[order], frames[order], [labels[i] for i in order]
-    for label, frame in zip(labels, frames, strict=True):
-        warnings += [f"{label}: {text}" for text in repair(frame, mask, f"{where}: {label}")]
+        mask = mask[order] if mask.ndim == 3 else mask
+    covered = mask if mask.ndim == 3 and (mask != mask[0]).any() else None
+    mask = mask.any(0) if mask.ndim == 3 else mask
+    for i, (label, frame) in enumerate(zip(labels, frames, strict=True)):
+        inside = mask if covered is None else covered[i]
+        warnings += [f"{label}: {text}" for text in repair(frame, inside, f"{where}: {label}")]
+    if covered is not None:
+        covered = covered & mask
+        _fill_in_time(frames, covered, times, period)
+        missing = np.count_nonzero(mask & ~covered.all(0))
+        warnings.append(
+            f"{where}: {missing} texels are in some lightmaps alone: at the other times they are fitted to the nearest "
+            "lightmap that has them, and not scored"
+        )
     return LightmapSet(
         name=name,
         times=times,
         frames=frames,
         mask=mask,
         period=None if period is None else float(period),
-        source=_hash(frames, times, mask),
+        source=_hash(frames, times, mask if covered is None else covered),
         warnings=tuple(warnings),
+        covered=covered,
     )
+
+
+def _fill_in_time(frames: np.ndarray, covered: np.ndarray, times: np.ndarray, period: float | None) -> None:
+    """Gives texels that a frame lacks the light of the frame nearest in time that has them, in place."""
+    mask = covered.any(0)
+    for i, time in enumerate(times):
+        apart = np.abs(times - time)
+        if period is not None:
+            apart = np.minimum(apart, period - apart)
+        missing = mask & ~covered[i]
+        for j in np.argsort(apart, kind="stable"):
+            found = missing & covered[j]
+            frames[i][found] = frames[j][found]
+            missing &= ~found
+            if not missing.any():
+                break
 
 
 def _hash(frames: np.ndarray, times: np.ndarray, mask: np.ndarray) -> str:

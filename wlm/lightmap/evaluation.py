@@ -137,11 +137,12 @@ def evaluate(
     frames, lost = [], LostLight()
     for i, stamp in enumerate(model.times):
         name, decoded = f"{model.name} at {stamp:g}", decoder.frame(stamp)
-        frames.append(evaluate_frame(lightmaps.frames[i], decoded, mask, TILE, plain, name=name))
+        inside = mask & lightmaps.valid(i)
+        frames.append(evaluate_frame(lightmaps.frames[i], decoded, inside, TILE, plain, name=name))
         if "seen" in metrics:
             tally.add(i, decoded, frames[i])
         for tile, window in _windows(model):
-            valid = mask[window]
+            valid = inside[window]
             lost.add(lightmaps.frames[i][window][valid], decoded[window][valid], _place(tile, stamp))
         if meter.due(i + 1):
             meter.report(i + 1)
@@ -185,9 +186,9 @@ def lost_light(model: LightmapModel, lightmaps: LightmapSet, device: str = "cpu"
     """
     mask, lost = scored_mask(model, lightmaps), LostLight()
     decoder = None
-    for frame, stamp in zip(lightmaps.frames, model.times, strict=True):
+    for i, (frame, stamp) in enumerate(zip(lightmaps.frames, model.times, strict=True)):
         for tile, window in _windows(model):
-            valid, texels = mask[window], frame[window]
+            valid, texels = (mask & lightmaps.valid(i))[window], frame[window]
             light = texels.max(2, where=valid[..., None], initial=0.0)
             if not 0 < np.count_nonzero(2.0 * light >= light.max()) <= _FEW_TEXELS < np.count_nonzero(valid):
                 continue
