@@ -7,14 +7,16 @@ Four kinds of rows:
 - methods "exact" (one texel per thread) and "strip" (the fast path), one row for each form of the GELU, of profile M:
   the 8-bit output against the input, and its largest error against the float64 path as a share of 255. Half a level of
   8 bits, 0.00196, is the rounding itself.
-- the block codecs of `wlm.baselines.lightmap`, on the same lightmaps.
+- the rivals of `wlm.baselines.lightmap`, on the same lightmaps: block codecs, temporal PCA and a video codec.
 - method "fit", one row for each profile: the speed of the fit alone; and the same fit in plain torch, all of it on CUDA
   in a full run, else a few steps.
 
-A decode on CUDA is timed as the replay of a graph, so that gaps between launches do not count; block codecs decode on
-the CPU alone, and in a texture unit on a GPU, so that they have a decode time on the CPU alone.
+A decode on CUDA is timed as the replay of a graph, so that gaps between launches do not count; rivals decode on the CPU
+alone, blocks in a texture unit on a GPU, so that they have a decode time on the CPU alone. `bytes` and `bpp` are in
+memory, `disk_bytes` and `disk_bpp` after lossless compression; what has no random access has the latter alone.
 """
 
+import functools
 import os
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -22,7 +24,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from wlm.baselines.lightmap import RIVALS
+from wlm.baselines.lightmap import FEW, RIVALS, encode_set
 from wlm.baselines.lightmap_torch import PlainFit
 from wlm.bench.plot import Panel
 from wlm.bench.rows import Row
@@ -36,7 +38,7 @@ from wlm.lightmap.fit import compress, dynamic_targets
 from wlm.lightmap.model import TILE, LightmapModel, Profile, TimeAxis, encode_time
 from wlm.lightmap.runtime import ExactDecoder, StripDecoder
 from wlm.lightmap.tiles import TileGrid, TileKind, assemble
-from wlm.metrics import METRICS, Summary, evaluate_frame, summarise
+from wlm.metrics import METRICS, FrameMetrics, evaluate_frame, summarise
 
 PROFILES = ("L", "M", "H", "M64", "M-paper")
 """Profiles of a full run: the paper's table 3, and M as the paper fits it."""
@@ -44,7 +46,7 @@ PROFILES = ("L", "M", "H", "M64", "M-paper")
 QUICK_PROFILES = ("L", "M", "M-paper")
 """Profiles of a quick run."""
 
-PANELS = (Panel("decode_ms"), Panel("bpp"))
+PANELS = (Panel("decode_ms"), Panel("bpp"), Panel("disk_bpp"))
 """What a plot of the rows shows: quality against time and size."""
 
 # A quick fit is worth this many steps of one tile, however many tiles there are: under a minute on two CPU cores.
@@ -58,15 +60,6 @@ _ERROR_TIMES = 3  # the float64 path takes 30 ms for one tile at one time
 # GELU by its gate, which is shorter to read in a plot.
 _GELUS = {"exact": "erf", "tanh": "tanh", "fast": "fast tanh"}
 
-# Method and option of each codec.
-_CODECS = {
-    "bc6h": ("BC6H", ""),
-    "bc7": ("BC7", ""),
-    "astc12": ("ASTC", "12x12"),
-    "astc10": ("ASTC", "10x10"),
-    "8bit": ("8 bits", ""),
-}
-
 
 def run(
     *,
@@ -78,8 +71,8 @@ def run(
     """Measures the lightmap system on one set.
 
     Args:
-        quick: Three profiles with short fits, scored at three times (9, 12 and 21 h if the set has them): four
-            minutes on two CPU cores for 16 tiles. Its errors are those of unfinished fits.
+        quick: Three profiles with short fits and a third of the rivals, scored at three times (9, 12 and 21 h if the
+            set has them): five minutes on two CPU cores for 16 tiles. Its errors are those of unfinished fits.
         device: "cpu" or "cuda:0", for fits and decodes.
         set_path: A lightmap set; None: the checkout's `demos/data/city`, two tiles of the city.
         progress: Called with a line before each part of the work.
@@ -100,7 +93,8 @@ def run(
             for profile in profiles
         ]
         chosen = _quick_times(lightmaps.times)
-    return run_rows(lightmaps, profiles, device=device, chosen=chosen, progress=progress)
+    rivals = FEW if quick else tuple(RIVALS)
+    return run_rows(lightmaps, profiles, device=device, chosen=chosen, rivals=rivals, progress=progress)
 
 
 def run_rows(
@@ -109,6 +103,7 @@ def run_rows(
     *,
     device: str,
     chosen: Sequence[int] | np.ndarray,
+    rivals: Sequence[str] = FEW,
     repeats: int | None = None,
     progress: Note | None = None,
 ) -> list[Row]:
@@ -118,6 +113,7 @@ def run_rows(
         lightmaps: The set.
         profiles: At least one. The rows of decode options are of the one named "M", else of the first.
         chosen: Indices of the times that are scored, int [K], at least one.
+        rivals: Keys of `wlm.baselines.lightmap.RIVALS`.
         repeats: As for `Bench`.
     """
     if not profiles or len(chosen) == 0:
@@ -131,7 +127,7 @@ def run_rows(
         gelus = [gelu for gelu in _GELUS if bench.device != "cpu" or gelu != "fast"]
         peers += [bench.option_row(best, path, gelu) for path in ("exact", "strip") for gelu in gelus]
     rows = bench.time_rows(peers)
-    rows += [bench.codec_row(name) for name in _CODECS]
+    rows += [bench.rival_row(name) for name in rivals]
     rows += [bench.fit_row(fit) for fit in fits]
     whole = bench.device != "cpu" and len(chosen) == len(lightmaps.times)
     return rows + bench.plain_rows(best, whole=whole)
@@ -193,6 +189,8 @@ class _LightmapBench(Bench):
             f"{self.scored_at}errors of the float decode; time of the whole map to 8 bits, {self.mode}",
             bytes=fit.bytes,
             bpp=bits_per_texel(model, self.lightmaps.mask, fit.bytes),
+            disk_bytes=fit.bytes,
+            disk_bpp=bits_per_texel(model, self.lightmaps.mask, fit.bytes),
             encode_seconds=fit.seconds,
             max_error=error,
             steps=model.profile.steps,
@@ -227,29 +225,26 @@ class _LightmapBench(Bench):
         )
         return row, self._decode(self._decoders(timed, path, gelu))
 
-    def codec_row(self, name: str) -> Row:
-        """A block codec on the same lightmaps, each time alone."""
-        method, option = _CODECS[name]
-        self.note(f"{method} {option}".strip())
+    def rival_row(self, name: str) -> Row:
+        """A rival on the same lightmaps."""
+        method = RIVALS[name]
+        self.note(method.label)
         try:
-            rivals = [RIVALS[name](self.lightmaps.frames[i], self.lightmaps.mask) for i in self.chosen]
+            rival, frames = encode_set(name, self.lightmaps, functools.partial(self._frame, name), self.chosen)
         except WlmError as error:
-            return self.missing_row(method, option, error)
+            return self.missing_row(method.title, method.option, error)
         count = len(self.lightmaps.times)
-        size = count * rivals[0].bytes  # a fixed rate: every time has as many bytes
-        row = self.row(
-            method,
-            option,
-            f"{self.scored_at}size and encode time of all times; one CPU thread",
-            bytes=size,
-            bpp=size * 8 / (self.lightmaps.mask.size * count),
-            encode_seconds=sum(rival.encode_seconds for rival in rivals) * count / len(rivals),
-            **self._score([rival.decoded for rival in rivals], method),
-        )
-        if self.device != "cpu":
-            return row
-        p10, median, p90 = np.percentile([1e3 * rival.decode_seconds for rival in rivals], [10, 50, 90])
-        return row.with_figures(decode_ms=float(median), decode_ms_spread=float(p90 - p10))
+        bits = 8 / (self.lightmaps.mask.size * count)
+        notes = [self.scored_at + "size and encode time of all times, on one CPU thread", rival.option]
+        figures = {"disk_bytes": rival.disk_bytes, "disk_bpp": rival.disk_bytes * bits}
+        if method.random_access:
+            figures |= {"bytes": rival.bytes, "bpp": rival.bytes * bits}
+        else:
+            notes.append("no random access")
+        if self.device == "cpu":
+            figures["decode_ms"] = 1e3 * rival.decode_seconds / count
+        figures |= {"encode_seconds": rival.encode_seconds, **self._figures(frames)}
+        return self.row(method.title, method.option, "; ".join(filter(None, notes)), **figures)
 
     def fit_row(self, fit: Fit) -> Row:
         """The speed of a fit."""
@@ -314,13 +309,16 @@ class _LightmapBench(Bench):
         return {f"{kind}_tiles": count for kind, count in kinds if count and kind != "empty"}
 
     def _score(self, frames: Iterable[np.ndarray], name: str, metrics: Sequence[str] = METRICS) -> dict[str, float]:
-        """PSNR, SSIM and FLIP of lightmaps at the chosen times, and how many these are."""
-        summary: Summary = summarise(
-            [
-                evaluate_frame(self.lightmaps.frames[i], frame, self.lightmaps.mask, TILE, metrics, name=name)
-                for i, frame in zip(self.chosen, frames, strict=True)
-            ]
-        )
+        """The figures of lightmaps at the chosen times."""
+        scores = [self._frame(name, i, frame, metrics) for i, frame in zip(self.chosen, frames, strict=True)]
+        return self._figures(scores)
+
+    def _frame(self, name: str, i: int, decoded: np.ndarray, metrics: Sequence[str] = METRICS) -> FrameMetrics:
+        return evaluate_frame(self.lightmaps.frames[i], decoded, self.lightmaps.mask, TILE, metrics, name=name)
+
+    def _figures(self, frames: Sequence[FrameMetrics]) -> dict[str, float]:
+        """PSNR, SSIM and FLIP, and at how many times."""
+        summary = summarise(frames)
         return {"psnr": summary.psnr, "ssim": summary.ssim, "flip": summary.flip, **self.scored}
 
     def _decoders(self, model: LightmapModel, path: str, gelu: str | None) -> list[StripDecoder | ExactDecoder]:

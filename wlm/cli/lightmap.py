@@ -34,7 +34,6 @@ from wlm.cli.options import (
 
 if TYPE_CHECKING:
     from wlm.baselines.lightmap import Score
-    from wlm.baselines.rival import Rival
     from wlm.lightmap import LightmapSet, Report
 
 app = typer.Typer(help="Lightmaps over time: BC7 feature maps and a tiny network for each 128² tile.")
@@ -45,8 +44,6 @@ _Times = Annotated[
 ]
 _Mask = Annotated[str | None, typer.Option(help='Valid texels: a PNG, "alpha" or "all"; default as the set says.')]
 _Period = Annotated[float | None, typer.Option(help="Length of the day; default as the set says.")]
-
-_NAMES = {"bc6h": "BC6H", "bc7": "BC7", "astc12": "ASTC 12x12", "astc10": "ASTC 10x10", "8bit": "8 bits"}
 
 
 @app.command()
@@ -146,7 +143,7 @@ def evaluate(
     json_path: ReportFile = None,
     html_path: PageFile = None,
     baselines: Annotated[
-        bool, typer.Option("--baselines", help="Add BC6H, BC7, ASTC and plain 8 bits (extra `baselines`).")
+        bool, typer.Option("--baselines", help="Add block codecs, temporal PCA and a video codec (extra `baselines`).")
     ] = False,
     device: Device = "cpu",
     times: _Times = None,
@@ -173,16 +170,17 @@ def evaluate(
         from wlm.view.reports import lightmap_report
 
         lightmap_report(html_path, model, lightmaps, report)
-    rivals: list[tuple[Rival, Score]] = []
+    extra, scores = {}, {}
     if baselines:
-        from wlm.baselines.lightmap import evaluate_rivals
+        from wlm.baselines.lightmap import RIVALS, evaluate_rivals
 
         with running("baselines") as progress:
-            rivals = evaluate_rivals(model, lightmaps, tuple(_NAMES), progress=progress)
+            rivals = evaluate_rivals(model, lightmaps, progress=progress)
+        extra = {"baselines": [rival.to_json() | score.to_json() for rival, score in rivals]}
+        scores = {RIVALS[rival.name].label: score for rival, score in rivals}
     if json_path is not None:
-        extra = {"baselines": [rival.to_json() | score.to_json() for rival, score in rivals]} if baselines else {}
         write_json(json_path, report.to_json() | extra)
-    _show_report(file, report, rivals)
+    _show_report(file, report, scores)
 
 
 @app.command()
@@ -269,14 +267,18 @@ def _load(path: Path, times: str | None, mask: str | None, period: float | None,
     return lightmaps
 
 
-def _show_report(file: Path, report: "Report", rivals: "list[tuple[Rival, Score]]") -> None:
-    rows = table(str(file), ["", "PSNR dB", "SSIM", "FLIP", "bytes", "bpp"])
+def _show_report(file: Path, report: "Report", rivals: "dict[str, Score]") -> None:
+    rows = table(str(file), ["", "PSNR dB", "SSIM", "FLIP", "bytes", "bpp", *(["bpp on disk"] if rivals else [])])
 
-    def add(name: str, psnr: float, ssim: float, flip: float, size: str = "", bpp: str = "") -> None:
-        rows.add_row(name, number(psnr, ".2f"), number(ssim, ".4f"), number(flip, ".4f"), size, bpp)
+    def add(name: str, psnr: float, ssim: float, flip: float, *sizes: str) -> None:
+        rows.add_row(name, number(psnr, ".2f"), number(ssim, ".4f"), number(flip, ".4f"), *sizes)
 
-    for name, score in [(f"wlm {escape(report.profile)}", report), *((_NAMES[r.name], score) for r, score in rivals)]:
-        add(name, score.psnr, score.ssim, score.flip, f"{score.bytes:,}", f"{score.bpp:.3f}")
+    def sizes(score: "Report | Score", disk_bpp: float) -> list[str]:
+        return [f"{score.bytes:,}", f"{score.bpp:.3f}", *([f"{disk_bpp:.3f}"] if rivals else [])]
+
+    add(f"wlm {escape(report.profile)}", report.psnr, report.ssim, report.flip, *sizes(report, report.bpp))
+    for label, score in rivals.items():
+        add(label, score.psnr, score.ssim, score.flip, *sizes(score, score.disk_bpp))
     rows.add_section()
     scores = (report.psnr_by_time, report.ssim_by_time, report.flip_by_time)
     for stamp, *values in zip(report.time_values, *scores, strict=True):
