@@ -15,6 +15,7 @@ from builders.small_sets import HOURS, moving_light, tiny_profile
 from PIL import Image
 
 import wlm
+from wlm.baselines.lightmap import FEW, RIVALS
 from wlm.formats.exr import read_exr, write_exr
 from wlm.lightmap import codec
 
@@ -151,16 +152,16 @@ def test_evaluate_prints_and_writes_the_report(fitted, folder, tmp_path):
     assert f"{report.psnr:.2f}" in text and f"{report.bpp:.3f}" in text and "tile 0" in text
     for hour, psnr in zip(HOURS, report.psnr_by_time, strict=True):
         assert re.search(rf"time {hour:g} .*{psnr:.2f}", text)
-    names = ["bc6h", "bc7", "astc12", "astc10", "8bit"]
-    assert [row["name"] for row in baselines] == names
-    for name in ("BC6H", "BC7", "ASTC 12x12", "ASTC 10x10", "8 bits"):
-        assert name in text
+    assert [row["name"] for row in baselines] == list(FEW)
+    for row in baselines:
+        assert RIVALS[row["name"]].label in text and f"{row['psnr']:.2f}" in text and f"{row['disk_bpp']:.3f}" in text
+    assert "on disk" in text and "worst:" in call.stderr
     assert "worst:" in call.stderr and "worst seen:" in call.stderr and "worst between times:" in call.stderr
     scores = text.split("as it is seen")[1]
     assert f"{report.seen:.2f}" in scores and f"{report.between:.2f}" in scores
     # No gaps, one tile and no mesh.
     assert not any(title in scores for title in ("ring", "border", "views"))
-    call(*words)
+    assert "on disk" not in call(*words)
     assert "baselines" not in json.loads((tmp_path / "r.json").read_text())
 
 

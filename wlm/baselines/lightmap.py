@@ -1,142 +1,103 @@
-"""Block codecs that engines ship lightmaps in: BC6H, BC7 with a gamma, ASTC HDR; and plain 8 bits.
+"""What compressed lightmaps over time are compared with, each tuned as well as ours is.
 
-Each encoder takes one lightmap [H, W, 3] in linear RGB and its mask [H, W], true where a texel is valid, and returns a
-`Rival` whose `decoded` is the lightmap, float32 [H, W, 3]. Negative radiance becomes 0, and values above 65,504,
-half float's largest, become that; with an empty mask a black lightmap is encoded. Gaps between charts are dilated from
-the nearest valid texel first, as every engine does: zeros there cost 10 dB at charts' edges. Times are those of one
-thread, for the codec alone: dilation does not count. A size has padding to whole blocks in it.
-
-All raise a `WlmError` where shapes do not fit, a valid texel is NaN or infinite, a setting is out of range, or a
-package is missing.
+`RIVALS` has them by name: block codecs that engines ship (`lightmap_blocks`), principal components over the hours
+(`lightmap_pca`), and a video codec (`lightmap_video`). `bytes` are those in a GPU's memory, with all that a decoder
+needs; `disk_bytes` the same under lossless compression, each lightmap of a block codec on its own. A video has only the
+latter, and no random access.
 """
 
 import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 
-from wlm.baselines.rival import Rival, measure
+from wlm.baselines.lightmap_blocks import encode_8bit, encode_astc, encode_bc6h, encode_bc7
+from wlm.baselines.lightmap_pca import encode_pca, encode_pca_bc4
+from wlm.baselines.lightmap_video import encode_av1
+from wlm.baselines.rival import Rival
 from wlm.errors import WlmError
-from wlm.formats import hdr_blocks
-from wlm.formats.hdr_blocks import ASTC_MEDIUM, need
 from wlm.lightmap.data import LightmapSet
 from wlm.lightmap.evaluation import SCORES, scored_mask
 from wlm.lightmap.model import TILE, LightmapModel
 from wlm.lightmap.seen import SeenScore, Tally
 from wlm.lightmap.views import VIEWS, views_of
-from wlm.metrics import evaluate_frame, summarise
+from wlm.metrics import FrameMetrics, evaluate_frame, summarise
 from wlm.system import Meter, OnProgress
-from wlm.texels import fill_gaps
 
-HALF_MAX = 65504.0
-# The usual display gamma: 8 bits of it are spaced about as the eye and as a lightmap's errors are.
-GAMMA = 2.2
-_BC_BLOCK = 4  # texels along a block's side
-# An 8-bit lightmap is stored relative to its brightest texel, which must be kept with it as one float32.
-_SCALE_BYTES = 4
-_EXTRA = "baselines"  # with the codecs' packages
-_SUMMED = ("bytes", "encode_seconds", "decode_seconds")  # of a set: over its times
+_Scored = TypeVar("_Scored")
 
 
-def encode_bc6h(frame: np.ndarray, mask: np.ndarray, profile: str = "slow") -> Rival:
-    """BC6H, unsigned, 8 bits a texel, with Intel's ISPC texture compressor.
+@dataclass(frozen=True)
+class Method:
+    """One way to compress a set of lightmaps.
 
-    Args:
-        frame, mask: The lightmap.
-        profile: `veryfast`, `fast`, `basic`, `slow` or `veryslow`.
+    Attributes:
+        title, option: What a table calls it.
+        encode: Makes a `Rival` of lightmaps and their mask [H, W].
+        alone: Whether it takes one lightmap [H, W, 3] at a time; else all, [T, H, W, 3].
+        random_access: Whether a GPU reads a texel at an hour from what it holds.
     """
-    for package in ("ispc_texcomp", "imagecodecs"):  # the time to import them isn't the codec's
-        need(package, _EXTRA)
-    _check_profile("bc6h", profile, hdr_blocks.BC6H_PROFILES)
-    image = _prepare(frame, mask)
-    padded = _pad(image).astype(np.float16)
-    rival = measure(
-        "bc6h",
-        lambda: hdr_blocks.encode_bc6h(padded, profile, _EXTRA),
-        lambda data: hdr_blocks.decode_bc6h(data, *padded.shape[:2], _EXTRA),
-    )
-    return _cropped(rival, image)
+
+    title: str
+    option: str
+    encode: Callable[[np.ndarray, np.ndarray], Rival]
+    alone: bool = True
+    random_access: bool = True
+
+    @property
+    def label(self) -> str:
+        """Title and option."""
+        return f"{self.title} {self.option}".strip()
 
 
-def encode_bc7(frame: np.ndarray, mask: np.ndarray, profile: str = "basic") -> Rival:
-    """BC7 with gamma 2.2, relative to the brightest valid texel; 8 bits a texel and one float32.
-
-    Args:
-        frame, mask: The lightmap.
-        profile: `ultrafast`, `veryfast`, `fast`, `basic` or `slow`.
-    """
-    texcomp, codecs = need("ispc_texcomp", _EXTRA), need("imagecodecs", _EXTRA)
-    _check_profile("bc7", profile, ("ultrafast", "veryfast", "fast", "basic", "slow"))
-    image = _prepare(frame, mask)
-    levels, scale = _to_levels(image)
-    padded = _pad(levels)
-    height, width = padded.shape[:2]
-    opaque = np.concatenate([padded, np.full((height, width, 1), 255, np.uint8)], axis=2)
-    surface = texcomp.RGBASurface(opaque.tobytes(), width, height)
-    settings = texcomp.BC7EncSettings.from_profile(profile)
-    rival = measure(
-        "bc7",
-        lambda: texcomp.compress_blocks_bc7(surface, settings),
-        lambda data: codecs.bcn_decode(data, 7, shape=(height, width, 4)),
-        bytes=lambda data: len(data) + _SCALE_BYTES,
-    )
-    return _cropped(replace(rival, decoded=_from_levels(rival.decoded[..., :3], scale)), image)
+_AV1_QUALITIES = (50, 65, 75, 85, 92, 97)
 
 
-def encode_astc(frame: np.ndarray, mask: np.ndarray, block: int = 12, quality: float = ASTC_MEDIUM) -> Rival:
-    """ASTC HDR in square blocks of 16 bytes, with astcenc: 0.89 bits a texel at 12x12, 1.28 at 10x10.
-
-    The HDR profile has no early stop on decibels (astcenc ignores `tune_db_limit` there); in an LDR profile that stop
-    must be raised, or the baseline is worse than the format.
-
-    Args:
-        frame, mask: The lightmap.
-        block: Side of a block in texels: 4, 5, 6, 8, 10 or 12.
-        quality: astcenc's effort, 0 (fastest) to 100 (exhaustive); 60 is its "medium".
-    """
-    if block not in (4, 5, 6, 8, 10, 12):
-        raise WlmError(f"astc: expected a block side of 4, 5, 6, 8, 10 or 12, got {block}")
-    if not 0.0 <= quality <= 100.0:
-        raise WlmError(f"astc: expected a quality from 0 to 100, got {quality}")
-    image = _prepare(frame, mask)
-    texels, codec = image.astype(np.float16), hdr_blocks.astc((block, block), quality, _EXTRA)
-    rival = measure(f"astc{block}", lambda: codec.encode(texels), lambda data: codec.decode(data, *texels.shape[:2]))
-    return _cropped(rival, image)
+def _av1(title: str, quality: int, ranges: str) -> Method:
+    encode = functools.partial(encode_av1, quality=quality, ranges=ranges)
+    return Method(title, f"{quality}", encode, alone=False, random_access=False)
 
 
-def encode_8bit(frame: np.ndarray, mask: np.ndarray) -> Rival:
-    """Three bytes a texel with gamma 2.2, relative to the brightest valid texel: about BC7's upper bound."""
-    image = _prepare(frame, mask)
-    rival = measure(
-        "8bit",
-        lambda: _to_levels(image),
-        lambda payload: _from_levels(*payload),
-        bytes=lambda payload: payload[0].nbytes + _SCALE_BYTES,
-    )
-    return _cropped(rival, image)
-
-
-RIVALS: dict[str, Callable[[np.ndarray, np.ndarray], Rival]] = {
-    "bc6h": encode_bc6h,
-    "bc7": encode_bc7,
-    "astc10": functools.partial(encode_astc, block=10),
-    "astc12": functools.partial(encode_astc, block=12),
-    "8bit": encode_8bit,
+RIVALS: dict[str, Method] = {
+    "bc6h": Method("BC6H", "", encode_bc6h),
+    "bc7": Method("BC7", "", encode_bc7),
+    **{
+        f"astc{side}": Method("ASTC", f"{side}x{side}", functools.partial(encode_astc, block=side))
+        for side in (4, 5, 6, 8, 10, 12)
+    },
+    "8bit": Method("8 bits", "", encode_8bit),
+    **{
+        f"pca-bc4-{count}": Method(
+            "PCA in BC4", f"{count}", functools.partial(encode_pca_bc4, components=count), alone=False
+        )
+        for count in (2, 4, 8, 16)
+    },
+    **{
+        f"pca-{step:g}": Method("PCA", f"step {step:g}", functools.partial(encode_pca, step=step), alone=False)
+        for step in (0.16, 0.08, 0.04, 0.02)
+    },
+    **{f"av1-{quality}": _av1("AV1", quality, "day") for quality in _AV1_QUALITIES},
+    **{f"av1-{quality}-hour": _av1("AV1 by hour", quality, "hour") for quality in _AV1_QUALITIES},
 }
-"""By name, each as the published comparisons set it: a lightmap and its mask to a `Rival`."""
+"""All methods by name."""
+
+FEW = ("bc6h", "bc7", "astc6", "astc8", "astc12", "8bit", "pca-bc4-4", "av1-75", "av1-92")
+"""Those of a quick look."""
 
 
 @dataclass(frozen=True)
 class Score(SeenScore):
-    """How wrong a block codec is on a set, over the texels that ours is scored over.
+    """How wrong a rival is on a set, over the texels that ours is scored over.
 
     Between stored times its light is the mix of the two lightmaps. The scores of `SeenScore` are attributes too.
 
     Attributes:
         psnr, ssim, flip: As in the report of `wlm.lightmap.evaluate`.
-        bpp: Bits for each texel and time. These codecs have a fixed rate, so this holds for any part of the map.
-        bytes: Of all times of the whole map, also where only some tiles are scored.
+        bpp: Bits in memory for each texel and time, of the whole map, also where only some tiles are scored.
+        bytes: Of all times of the whole map; a video's are those on the disk.
+        disk_bpp, disk_bytes: The same after lossless compression.
     """
 
     psnr: float
@@ -144,18 +105,64 @@ class Score(SeenScore):
     flip: float
     bpp: float
     bytes: int
+    disk_bpp: float
+    disk_bytes: int
+
+
+def encode_set(
+    name: str,
+    lightmaps: LightmapSet,
+    visit: Callable[[int, np.ndarray], _Scored],
+    chosen: Sequence[int] | np.ndarray | None = None,
+) -> tuple[Rival, list[_Scored]]:
+    """Puts a set through a method.
+
+    Args:
+        name: A key of `RIVALS`.
+        lightmaps: The set.
+        visit: Called with the index of a time and its decoded lightmap, float32 [H, W, 3], in the order of `chosen`.
+        chosen: Indices of the times to visit, at least one; None for all. A method that takes one lightmap at a time
+            encodes these alone; the sizes and the seconds of all times are then estimated from them.
+
+    Returns:
+        The rival, with bytes and seconds of all times and without what was decoded, and what the visits returned.
+
+    Raises:
+        WlmError: An unknown name, or a package is missing.
+    """
+    if name not in RIVALS:
+        raise WlmError(f"baselines: unknown method {name!r}, expected one of {', '.join(RIVALS)}")
+    method, count = RIVALS[name], len(lightmaps.frames)
+    chosen = range(count) if chosen is None else [int(i) for i in chosen]
+    # The whole map's mask: an engine would encode all of it, whatever we score.
+    if not method.alone:
+        rival = method.encode(lightmaps.frames, lightmaps.mask)
+        return replace(rival, decoded=None), [visit(i, rival.decoded[i]) for i in chosen]
+    rivals, visits = [], []
+    for i in chosen:
+        rival = method.encode(lightmaps.frames[i], lightmaps.mask)
+        visits.append(visit(i, rival.decoded))
+        rivals.append(replace(rival, decoded=None))  # a set of them is too much memory
+
+    def total(key: str) -> float:
+        return sum(getattr(rival, key) for rival in rivals) * count / len(rivals)
+
+    options = sorted({rival.option for rival in rivals})
+    sizes = {key: round(total(key)) for key in ("bytes", "disk_bytes")}
+    seconds = {key: total(key) for key in ("encode_seconds", "decode_seconds")}
+    return replace(rivals[0], option=" and ".join(options), **sizes, **seconds), visits
 
 
 def evaluate_rivals(
     model: LightmapModel,
     lightmaps: LightmapSet,
-    names: Sequence[str] = ("bc6h", "bc7", "astc12", "astc10", "8bit"),
+    names: Sequence[str] = FEW,
     *,
     metrics: Sequence[str] = SCORES,
     views: int = VIEWS,
     progress: OnProgress | None = None,
 ) -> list[tuple[Rival, Score]]:
-    """Puts every time through block codecs, one time after the other, and scores the texels that `evaluate` scores.
+    """Puts a set through rivals and scores the texels that `evaluate` scores.
 
     Args:
         model: The model to compare with: it says which tiles are scored.
@@ -170,69 +177,26 @@ def evaluate_rivals(
     Raises:
         WlmError: As `wlm.lightmap.evaluate`, an unknown name, or the extra `baselines` is missing.
     """
-    for name in names:
-        if name not in RIVALS:
-            raise WlmError(f"baselines: unknown codec {name!r}, expected one of {', '.join(RIVALS)}")
     mask, count = scored_mask(model, lightmaps), len(lightmaps.frames)
     plain, seen = [metric for metric in metrics if metric != "seen"], "seen" in metrics
     meter = Meter(progress, "baselines", len(names) * count)
     results = []
     for k, name in enumerate(names):
-        rivals, frames = [], []
         tally = Tally(lightmaps, mask, views=views_of(lightmaps, views if seen else 0)[0], name=name)
-        for i, frame in enumerate(lightmaps.frames):
-            # The whole map's mask: an engine would encode all of it, whatever we score.
-            rival = RIVALS[name](frame, lightmaps.mask)
-            valid = mask & lightmaps.valid(i)
-            frames.append(evaluate_frame(frame, rival.decoded, valid, TILE, plain, name=name))
+
+        def score(i: int, decoded: np.ndarray, k: int = k, name: str = name, tally: Tally = tally) -> FrameMetrics:
+            inside = mask & lightmaps.valid(i)
+            frame = evaluate_frame(lightmaps.frames[i], decoded, inside, TILE, plain, name=name)
             if seen:
-                tally.add(i, rival.decoded, frames[i])
-            rivals.append(replace(rival, decoded=None))  # a set of them is too much memory
+                tally.add(i, decoded, frame)
             if meter.due(k * count + i + 1):
                 meter.report(k * count + i + 1)
-        summed = {key: sum(getattr(rival, key) for rival in rivals) for key in _SUMMED}
-        rival, summary = replace(rivals[0], **summed), summarise(frames)
-        bpp = rival.bytes * 8 / (lightmaps.mask.size * count)
+            return frame
+
+        rival, frames = encode_set(name, lightmaps, score)
+        summary, texels = summarise(frames), lightmaps.mask.size * count
         scores = {"psnr": summary.psnr, "ssim": summary.ssim, "flip": summary.flip, **vars(tally.score())}
-        results.append((rival, Score(**scores, bpp=bpp, bytes=rival.bytes)))
+        sizes = rival.bytes * 8 / texels, rival.bytes, rival.disk_bytes * 8 / texels, rival.disk_bytes
+        names = ("bpp", "bytes", "disk_bpp", "disk_bytes")
+        results.append((rival, Score(**scores, **dict(zip(names, sizes, strict=True)))))
     return results
-
-
-def _check_profile(codec: str, profile: str, names: Sequence[str]) -> None:
-    if profile not in names:
-        raise WlmError(f"{codec}: unknown profile {profile!r}, expected one of {', '.join(names)}")
-
-
-def _prepare(frame: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Checks a lightmap, dilates its charts and brings it into half float's range, as float32."""
-    frame = np.asarray(frame)
-    if frame.ndim != 3 or frame.shape[2] != 3 or 0 in frame.shape:
-        raise WlmError(f"baselines: expected a lightmap [H, W, 3], got {frame.shape}")
-    filled = fill_gaps(frame, mask)
-    if not np.isfinite(filled).all():
-        raise WlmError("baselines: the lightmap is NaN or infinite at valid texels")
-    return np.clip(filled, 0.0, HALF_MAX).astype(np.float32)
-
-
-def _pad(image: np.ndarray) -> np.ndarray:
-    """Repeats the last row and column up to whole BC blocks."""
-    height, width = image.shape[:2]
-    return np.pad(image, ((0, -height % _BC_BLOCK), (0, -width % _BC_BLOCK), (0, 0)), mode="edge")
-
-
-def _to_levels(image: np.ndarray) -> tuple[np.ndarray, float]:
-    # A filled image holds no value that is not a valid texel's, so its maximum is theirs.
-    scale = float(image.max()) or 1.0
-    return (np.power(image / np.float32(scale), 1.0 / GAMMA) * 255.0 + 0.5).astype(np.uint8), scale
-
-
-def _from_levels(levels: np.ndarray, scale: float) -> np.ndarray:
-    table = ((np.arange(256) / 255.0) ** GAMMA * scale).astype(np.float32)
-    return table[levels]
-
-
-def _cropped(rival: Rival, image: np.ndarray) -> Rival:
-    """Without the padding of blocks."""
-    height, width = image.shape[:2]
-    decoded = np.ascontiguousarray(rival.decoded[:height, :width], dtype=np.float32)
-    return replace(rival, decoded=decoded, size=(height, width))

@@ -2,8 +2,15 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TypeVar
+
+from wlm.formats.hdr_blocks import need
+
+EXTRA = "baselines"
+"""The extra with the packages of block codecs, video and zstd."""
+
+_ZSTD_LEVEL = 19  # the strongest without the options for which a decoder needs much memory
 
 _Payload = TypeVar("_Payload")
 
@@ -22,6 +29,8 @@ class Rival:
             float32 [N, D].
         option: Settings that the method chose, for a table.
         size: Rows and columns of its texture; None where it has none.
+        disk_bytes: Size of the same after lossless compression, where it is kept on a disk; None where that isn't
+            measured.
     """
 
     name: str
@@ -31,6 +40,7 @@ class Rival:
     decoded: Any
     option: str = ""
     size: tuple[int, int] | None = None
+    disk_bytes: int | None = None
 
     def to_json(self) -> dict[str, Any]:
         """What a report says of it besides its score."""
@@ -44,6 +54,7 @@ def measure(
     decode: Callable[[_Payload], Any],
     *,
     bytes: Callable[[_Payload], int] = len,
+    disk_bytes: Callable[[_Payload], int] | None = None,
     option: Callable[[_Payload], str] = lambda payload: "",
 ) -> Rival:
     """Encodes and decodes, and takes the time of both.
@@ -53,6 +64,7 @@ def measure(
         encode: Makes the payload.
         decode: Reads it.
         bytes: The payload's size.
+        disk_bytes: Its size on a disk; compressing for that takes no part in the times.
         option: What to tell of it.
     """
     start = time.perf_counter()
@@ -60,4 +72,14 @@ def measure(
     encoded = time.perf_counter()
     decoded = decode(payload)
     end = time.perf_counter()
-    return Rival(name, bytes(payload), encoded - start, end - encoded, decoded, option(payload))
+    rival = Rival(name, bytes(payload), encoded - start, end - encoded, decoded, option(payload))
+    return rival if disk_bytes is None else replace(rival, disk_bytes=disk_bytes(payload))
+
+
+def disk_size(data: bytes) -> int:
+    """Size of some bytes under zstd, as KTX2 files and engines' packages have them, or as they are if that is less.
+
+    Raises:
+        WlmError: imagecodecs, of the extra `baselines`, is missing.
+    """
+    return min(len(data), len(need("imagecodecs", EXTRA).zstd_encode(data, level=_ZSTD_LEVEL)))

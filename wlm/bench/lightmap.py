@@ -8,17 +8,20 @@ Four kinds of rows:
   "matrix" (the fast path on matrix units), of profile M:
   the 8-bit output against the input, and its largest error against the float64 path as a share of 255. Half a level of
   8 bits, 0.00196, is the rounding itself.
-- the block codecs of `wlm.baselines.lightmap`, on the same lightmaps; between stored times their light is mixed.
+- the rivals of `wlm.baselines.lightmap`, on the same lightmaps: block codecs, temporal PCA and a video codec; between
+  stored times their light is mixed.
 - method "fit", one row for each profile: the speed of the fit alone; and the same fit in plain torch, all of it on CUDA
   in a full run, else a few steps.
 
-Profiles and codecs have the scores of `wlm.lightmap.seen` too: those between stored times where both are scored, those
+Profiles and rivals have the scores of `wlm.lightmap.seen` too: those between stored times where both are scored, those
 of views in a full run.
 
-A decode on CUDA is timed as the replay of a graph, so that gaps between launches do not count; block codecs decode on
-the CPU alone, and in a texture unit on a GPU, so that they have a decode time on the CPU alone.
+A decode on CUDA is timed as the replay of a graph, so that gaps between launches do not count; rivals decode on the CPU
+alone, blocks in a texture unit on a GPU, so that they have a decode time on the CPU alone. `bytes` and `bpp` are in
+memory, `disk_bytes` and `disk_bpp` after lossless compression; what has no random access has the latter alone.
 """
 
+import functools
 import os
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -26,7 +29,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from wlm.baselines.lightmap import RIVALS
+from wlm.baselines.lightmap import FEW, RIVALS, encode_set
 from wlm.baselines.lightmap_torch import PlainFit
 from wlm.bench.plot import Panel
 from wlm.bench.rows import Row
@@ -34,7 +37,7 @@ from wlm.bench.runner import Bench, Fit, Note, demo_data
 from wlm.errors import WlmError
 from wlm.lightmap.data import LightmapSet, load
 from wlm.lightmap.decode import Decoder
-from wlm.lightmap.evaluation import bits_per_texel, count_kinds
+from wlm.lightmap.evaluation import bits_per_texel, count_kinds, memory_bytes
 from wlm.lightmap.exact import bound64, colour_tile64, decode_tile64
 from wlm.lightmap.fit import compress, dynamic_targets
 from wlm.lightmap.model import TILE, LightmapModel, Profile, TimeAxis, encode_time
@@ -42,7 +45,7 @@ from wlm.lightmap.runtime import ExactDecoder, MatrixDecoder, StripDecoder, fast
 from wlm.lightmap.seen import Tally
 from wlm.lightmap.tiles import TileGrid, TileKind, assemble
 from wlm.lightmap.views import VIEWS, views_of
-from wlm.metrics import METRICS, Summary, evaluate_frame, summarise
+from wlm.metrics import METRICS, FrameMetrics, evaluate_frame, summarise
 
 PROFILES = ("L", "M", "H", "M64", "standard", "fine", "M-paper")
 """Profiles of a full run: the paper's table 3, ours, and M as the paper fits it."""
@@ -50,7 +53,7 @@ PROFILES = ("L", "M", "H", "M64", "standard", "fine", "M-paper")
 QUICK_PROFILES = ("L", "M", "M-paper")
 """Profiles of a quick run."""
 
-PANELS = (Panel("decode_ms"), Panel("bpp"))
+PANELS = (Panel("decode_ms"), Panel("bpp"), Panel("disk_bpp"))
 """What a plot of the rows shows: quality against time and size."""
 
 # A quick fit is worth this many steps of one tile, however many tiles there are: under a minute on two CPU cores.
@@ -68,15 +71,6 @@ _Runtime = StripDecoder | MatrixDecoder | ExactDecoder
 # GELU by its gate, which is shorter to read in a plot.
 _GELUS = {"exact": "erf", "tanh": "tanh", "fast": "fast tanh"}
 
-# Method and option of each codec.
-_CODECS = {
-    "bc6h": ("BC6H", ""),
-    "bc7": ("BC7", ""),
-    "astc12": ("ASTC", "12x12"),
-    "astc10": ("ASTC", "10x10"),
-    "8bit": ("8 bits", ""),
-}
-
 
 def run(
     *,
@@ -88,8 +82,8 @@ def run(
     """Measures the lightmap system on one set.
 
     Args:
-        quick: Three profiles with short fits, scored at three times (9, 12 and 21 h if the set has them): four
-            minutes on two CPU cores for 16 tiles. Its errors are those of unfinished fits.
+        quick: Three profiles with short fits and a third of the rivals, scored at three times (9, 12 and 21 h if the
+            set has them): five minutes on two CPU cores for 16 tiles. Its errors are those of unfinished fits.
         device: "cpu" or "cuda:0", for fits and decodes.
         set_path: A lightmap set; None: the checkout's `demos/data/city`, two tiles of the city.
         progress: Called with a line before each part of the work.
@@ -110,7 +104,8 @@ def run(
             for profile in profiles
         ]
         chosen = _quick_times(lightmaps.times)
-    return run_rows(lightmaps, profiles, device=device, chosen=chosen, progress=progress)
+    rivals = FEW if quick else tuple(RIVALS)
+    return run_rows(lightmaps, profiles, device=device, chosen=chosen, rivals=rivals, progress=progress)
 
 
 def run_rows(
@@ -119,6 +114,7 @@ def run_rows(
     *,
     device: str,
     chosen: Sequence[int] | np.ndarray,
+    rivals: Sequence[str] = FEW,
     repeats: int | None = None,
     progress: Note | None = None,
 ) -> list[Row]:
@@ -128,6 +124,7 @@ def run_rows(
         lightmaps: The set.
         profiles: At least one. The rows of decode options are of the one named "M", else of the first.
         chosen: Indices of the times that are scored, int [K], at least one.
+        rivals: Keys of `wlm.baselines.lightmap.RIVALS`.
         repeats: As for `Bench`.
     """
     if not profiles or len(chosen) == 0:
@@ -143,7 +140,7 @@ def run_rows(
         if bench.device != "cpu" and best.model.profile.hidden % 16 == 0:
             peers.append(bench.option_row(best, "matrix", "fast"))
     rows = bench.time_rows(peers)
-    rows += [bench.codec_row(name) for name in _CODECS]
+    rows += [bench.rival_row(name) for name in rivals]
     rows += [bench.fit_row(fit) for fit in fits]
     whole = bench.device != "cpu" and len(chosen) == len(lightmaps.times)
     return rows + bench.plain_rows(best, whole=whole)
@@ -213,12 +210,14 @@ class _LightmapBench(Bench):
             "ours",
             fit.option,
             f"{self.scored_at}errors of the float decode; time of the whole map to 8 bits, {self.mode}",
-            bytes=fit.bytes,
-            bpp=bits_per_texel(model, self.lightmaps.mask, fit.bytes),
+            bytes=memory_bytes(model),
+            bpp=bits_per_texel(model, self.lightmaps.mask, memory_bytes(model)),
+            disk_bytes=fit.bytes,
+            disk_bpp=bits_per_texel(model, self.lightmaps.mask, fit.bytes),
             encode_seconds=fit.seconds,
             max_error=error,
             steps=model.profile.steps,
-            **self._score(frames.values(), fit.option, seen=True, decode=decoder.frame),
+            **self._score(frames.values(), fit.option, decode=decoder.frame),
             **self._tiles(model),
         )
         return row, self._decode(self._decoders(model, "fast", None))
@@ -249,29 +248,28 @@ class _LightmapBench(Bench):
         )
         return row, self._decode(self._decoders(timed, path, gelu))
 
-    def codec_row(self, name: str) -> Row:
-        """A block codec on the same lightmaps, each time alone."""
-        method, option = _CODECS[name]
-        self.note(f"{method} {option}".strip())
+    def rival_row(self, name: str) -> Row:
+        """A rival on the same lightmaps."""
+        method = RIVALS[name]
+        self.note(method.label)
         try:
-            rivals = [RIVALS[name](self.lightmaps.frames[i], self.lightmaps.mask) for i in self.chosen]
+            tally = self._tally(name)
+            score = functools.partial(self._frame, name, tally)
+            rival, frames = encode_set(name, self.lightmaps, score, self.chosen)
         except WlmError as error:
-            return self.missing_row(method, option, error)
+            return self.missing_row(method.title, method.option, error)
         count = len(self.lightmaps.times)
-        size = count * rivals[0].bytes  # a fixed rate: every time has as many bytes
-        row = self.row(
-            method,
-            option,
-            f"{self.scored_at}size and encode time of all times; one CPU thread",
-            bytes=size,
-            bpp=size * 8 / (self.lightmaps.mask.size * count),
-            encode_seconds=sum(rival.encode_seconds for rival in rivals) * count / len(rivals),
-            **self._score([rival.decoded for rival in rivals], method, seen=True),
-        )
-        if self.device != "cpu":
-            return row
-        p10, median, p90 = np.percentile([1e3 * rival.decode_seconds for rival in rivals], [10, 50, 90])
-        return row.with_figures(decode_ms=float(median), decode_ms_spread=float(p90 - p10))
+        bits = 8 / (self.lightmaps.mask.size * count)
+        notes = [self.scored_at + "size and encode time of all times, on one CPU thread", rival.option]
+        figures = {"disk_bytes": rival.disk_bytes, "disk_bpp": rival.disk_bytes * bits}
+        if method.random_access:
+            figures |= {"bytes": rival.bytes, "bpp": rival.bytes * bits}
+        else:
+            notes.append("no random access")
+        if self.device == "cpu":
+            figures["decode_ms"] = 1e3 * rival.decode_seconds / count
+        figures |= {"encode_seconds": rival.encode_seconds, **self._figures(frames, tally)}
+        return self.row(method.title, method.option, "; ".join(filter(None, notes)), **figures)
 
     def fit_row(self, fit: Fit) -> Row:
         """The speed of a fit."""
@@ -340,22 +338,33 @@ class _LightmapBench(Bench):
         frames: Iterable[np.ndarray],
         name: str,
         metrics: Sequence[str] = METRICS,
-        *,
-        seen: bool = False,
         decode: Callable[[float], np.ndarray] | None = None,
     ) -> dict[str, float]:
-        """PSNR, SSIM and FLIP of lightmaps at the chosen times, how many these are, and how they look as seen."""
-        lightmaps, whole = self.lightmaps, len(self.chosen) == len(self.lightmaps.times)
-        views, _ = views_of(lightmaps, VIEWS if seen and whole else 0, device=self.device)
-        tally = Tally(lightmaps, lightmaps.mask, decode, views, name)
-        scored = []
-        for i, frame in zip(self.chosen.tolist(), frames, strict=True):
-            scored.append(evaluate_frame(lightmaps.frames[i], frame, lightmaps.valid(i), TILE, metrics, name=name))
-            if seen:
-                tally.add(i, frame, scored[-1])
-        summary: Summary = summarise(scored)
+        """The figures of lightmaps at the chosen times and, with a decoder of any time, of how they are seen."""
+        tally = None if decode is None else self._tally(name, decode)
+        pairs = zip(self.chosen.tolist(), frames, strict=True)
+        return self._figures([self._frame(name, tally, i, frame, metrics) for i, frame in pairs], tally)
+
+    def _tally(self, name: str, decode: Callable[[float], np.ndarray] | None = None) -> Tally:
+        """The scores of `wlm.lightmap.seen`, to be filled."""
+        whole = len(self.chosen) == len(self.lightmaps.times)
+        views, _ = views_of(self.lightmaps, VIEWS if whole else 0, device=self.device)
+        return Tally(self.lightmaps, self.lightmaps.mask, decode, views, name)
+
+    def _frame(
+        self, name: str, tally: Tally | None, i: int, decoded: np.ndarray, metrics: Sequence[str] = METRICS
+    ) -> FrameMetrics:
+        frame, valid = self.lightmaps.frames[i], self.lightmaps.valid(i)
+        scores = evaluate_frame(frame, decoded, valid, TILE, metrics, name=name)
+        if tally is not None:
+            tally.add(i, decoded, scores)
+        return scores
+
+    def _figures(self, frames: Sequence[FrameMetrics], tally: Tally | None) -> dict[str, float]:
+        """PSNR, SSIM and FLIP, at how many times, and how the lightmaps are seen."""
+        summary = summarise(frames)
         figures = {"psnr": summary.psnr, "ssim": summary.ssim, "flip": summary.flip, **self.scored}
-        if not seen:
+        if tally is None:
             return figures
         score = tally.score()
         figures |= {key: getattr(score, key) for key in _SEEN} | {"excess_change": score.flicker}

@@ -35,7 +35,6 @@ from wlm.cli.options import (
 
 if TYPE_CHECKING:
     from wlm.baselines.lightmap import Score
-    from wlm.baselines.rival import Rival
     from wlm.lightmap import LightmapSet, Report
 
 app = typer.Typer(help="Lightmaps over time: BC7 feature maps and a tiny network for each 128² tile.")
@@ -46,8 +45,6 @@ _Times = Annotated[
 ]
 _Mask = Annotated[str | None, typer.Option(help='Valid texels: a PNG, "alpha" or "all"; default as the set says.')]
 _Period = Annotated[float | None, typer.Option(help="Length of the day; default as the set says.")]
-
-_NAMES = {"bc6h": "BC6H", "bc7": "BC7", "astc12": "ASTC 12x12", "astc10": "ASTC 10x10", "8bit": "8 bits"}
 
 
 @app.command()
@@ -147,7 +144,7 @@ def evaluate(
     json_path: ReportFile = None,
     html_path: PageFile = None,
     baselines: Annotated[
-        bool, typer.Option("--baselines", help="Add BC6H, BC7, ASTC and plain 8 bits (extra `baselines`).")
+        bool, typer.Option("--baselines", help="Add block codecs, temporal PCA and a video codec (extra `baselines`).")
     ] = False,
     views: Annotated[
         int, typer.Option(min=0, help="Views of the set's mesh, if it names one, that are scored; 0 for none.")
@@ -182,16 +179,17 @@ def evaluate(
         from wlm.view.reports import lightmap_report
 
         lightmap_report(html_path, model, lightmaps, report)
-    rivals: list[tuple[Rival, Score]] = []
+    extra, scores = {}, {}
     if baselines:
-        from wlm.baselines.lightmap import evaluate_rivals
+        from wlm.baselines.lightmap import RIVALS, evaluate_rivals
 
         with running("baselines") as progress:
-            rivals = evaluate_rivals(model, lightmaps, tuple(_NAMES), views=views, progress=progress)
+            rivals = evaluate_rivals(model, lightmaps, views=views, progress=progress)
+        extra = {"baselines": [rival.to_json() | score.to_json() for rival, score in rivals]}
+        scores = {RIVALS[rival.name].label: score for rival, score in rivals}
     if json_path is not None:
-        extra = {"baselines": [rival.to_json() | score.to_json() for rival, score in rivals]} if baselines else {}
         write_json(json_path, report.to_json() | extra)
-    _show_report(file, report, rivals)
+    _show_report(file, report, scores)
 
 
 @app.command()
@@ -278,15 +276,22 @@ def _load(path: Path, times: str | None, mask: str | None, period: float | None,
     return lightmaps
 
 
-def _show_report(file: Path, report: "Report", rivals: "list[tuple[Rival, Score]]") -> None:
-    rows = table(str(file), ["", "PSNR dB", "SSIM", "FLIP", "bytes", "bpp"])
+def _show_report(file: Path, report: "Report", rivals: "dict[str, Score]") -> None:
+    sizes = ["bytes on disk", "bpp on disk", "bpp in memory"] if rivals else ["bytes", "bpp"]
+    rows = table(str(file), ["", "PSNR dB", "SSIM", "FLIP", *sizes])
 
-    def add(name: str, psnr: float, ssim: float, flip: float, size: str = "", bpp: str = "") -> None:
-        rows.add_row(name, number(psnr, ".2f"), number(ssim, ".4f"), number(flip, ".4f"), size, bpp)
+    def add(name: str, psnr: float, ssim: float, flip: float, *sizes: str) -> None:
+        rows.add_row(name, number(psnr, ".2f"), number(ssim, ".4f"), number(flip, ".4f"), *sizes)
 
-    named = [(f"wlm {escape(report.profile)}", report), *((_NAMES[r.name], score) for r, score in rivals)]
-    for name, score in named:
-        add(name, score.psnr, score.ssim, score.flip, f"{score.bytes:,}", f"{score.bpp:.3f}")
+    own = f"wlm {escape(report.profile)}"
+    named: list[tuple[str, Report | Score]] = [(own, report), *rivals.items()]
+    for label, score in named:
+        ours = score is report
+        kept, bits, held = (
+            (score.bytes, score.bpp, score.memory_bpp) if ours else (score.disk_bytes, score.disk_bpp, score.bpp)
+        )
+        memory = [f"{held:.3f}"] if rivals else []
+        add(label, score.psnr, score.ssim, score.flip, f"{kept:,}", f"{bits:.3f}", *memory)
     rows.add_section()
     scores = (report.psnr_by_time, report.ssim_by_time, report.flip_by_time)
     for stamp, *values in zip(report.time_values, *scores, strict=True):

@@ -1,4 +1,4 @@
-"""BC6H and ASTC HDR blocks of 16 bytes, by the packages of an extra: half-float RGB in and out.
+"""BC6H and ASTC blocks of 16 bytes, by the packages of an extra: half-float RGB in and out.
 
 Blocks follow each other row by row. All runs on the CPU with one thread. The packages are imported when they are used.
 """
@@ -17,8 +17,11 @@ ASTC_BLOCKS = (
     (12, 12),
 )  # fmt: skip
 """Width and height of every block that the format has in two dimensions."""
-# astcenc's "medium" preset.
+# astcenc's presets "medium" and "thorough".
 ASTC_MEDIUM = 60.0
+ASTC_THOROUGH = 98.0
+# Beyond any block's PSNR: in the LDR profile the presets stop a block's search at 29 to 32 dB.
+_NO_LIMIT_DB = 999.0
 
 
 def need(package: str, extra: str) -> ModuleType:
@@ -61,42 +64,46 @@ def decode_bc6h(blocks: bytes, height: int, width: int, extra: str) -> np.ndarra
 
 
 class Astc:
-    """ASTC HDR in blocks of one size, by astcenc; made by `astc`."""
+    """ASTC in blocks of one size, by astcenc; made by `astc`."""
 
-    def __init__(self, codec: ModuleType, block: tuple[int, int], quality: float) -> None:
-        config = codec.ASTCConfig(codec.ASTCProfile.HDR_RGB_LDR_A, *block, 1, quality)
+    def __init__(self, codec: ModuleType, block: tuple[int, int], quality: float, ldr: bool) -> None:
+        profile = codec.ASTCProfile.LDR if ldr else codec.ASTCProfile.HDR_RGB_LDR_A
+        config = codec.ASTCConfig(profile, *block, 1, quality)
+        if ldr:
+            config.tune_db_limit = _NO_LIMIT_DB  # HDR has no such stop
         self._codec, self._context = codec, codec.ASTCContext(config, 1)
 
     def encode(self, texels: np.ndarray) -> bytes:
-        """Encodes half [H, W, 3], finite, not negative; astcenc repeats the border where no block ends."""
+        """Encodes half [H, W, 3], finite, not negative, in LDR up to 1; astcenc repeats the border to whole blocks."""
         codec, (height, width) = self._codec, texels.shape[:2]
         source = codec.ASTCImage(codec.ASTCType.F16, width, height, 1, _with_alpha(texels).tobytes())
         return self._context.compress(source, codec.ASTCSwizzle.from_str("RGB1"))
 
     def decode(self, blocks: bytes, height: int, width: int) -> np.ndarray:
-        """Decodes to half [H, W, 3]; blocks that break the format are NaN."""
+        """Decodes to half [H, W, 3]; blocks that break the format are NaN in HDR, magenta in LDR."""
         codec = self._codec
         target = codec.ASTCImage(codec.ASTCType.F16, width, height, 1)
         self._context.decompress(blocks, target, codec.ASTCSwizzle.from_str("RGBA"))
         return np.frombuffer(target.data, np.float16).reshape(height, width, 4)[..., :3]
 
 
-def astc(block: tuple[int, int], quality: float, extra: str) -> Astc:
+def astc(block: tuple[int, int], quality: float, extra: str, ldr: bool = False) -> Astc:
     """Gives the codec of a setting, the same one every time.
 
     Args:
         block: One of `ASTC_BLOCKS`.
         quality: astcenc's effort, 0 (fastest) to 100 (exhaustive); decoding is the same for all.
         extra: The extra that a message names.
+        ldr: Whether texels are in [0, 1], linear in what is stored; else HDR.
 
     Raises:
         WlmError: The package is missing.
     """
-    return _astc(need("astc_encoder", extra), block, float(quality))
+    return _astc(need("astc_encoder", extra), block, float(quality), ldr)
 
 
 # Building a context's tables takes 15 ms.
-_astc = functools.lru_cache(maxsize=len(ASTC_BLOCKS))(Astc)
+_astc = functools.lru_cache(maxsize=2 * len(ASTC_BLOCKS))(Astc)
 
 
 def _with_alpha(texels: np.ndarray) -> np.ndarray:

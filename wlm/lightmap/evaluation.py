@@ -40,8 +40,9 @@ class Report(SeenScore):
         psnr, ssim, flip: Means over every scored tile at every time; decibels (120 for an exact tile), in [-1, 1], in
             [0, 1].
         psnr_unlimited: The mean of PSNR without the tiles of `format_limited`.
-        bpp: Bits per texel and time, see `bits_per_texel`.
+        bpp: Bits per texel and time of the file, see `bits_per_texel`.
         bytes: Size of the file on disk.
+        memory_bpp: Bits per texel and time in a GPU's memory, see `memory_bytes`.
         tiles, times: Tiles that the file holds, and times.
         device: Where it was decoded.
         seconds: Wall-clock time to decode and score all times; scoring takes most of it.
@@ -70,6 +71,7 @@ class Report(SeenScore):
     psnr_unlimited: float
     bpp: float
     bytes: int
+    memory_bpp: float
     tiles: int
     times: int
     device: str
@@ -231,6 +233,11 @@ def bits_per_texel(model: LightmapModel, mask: np.ndarray, file_bytes: int) -> f
     return file_bytes * 8 / (area * len(model.times))
 
 
+def memory_bytes(model: LightmapModel) -> int:
+    """Bytes of a model's maps, networks and scales as a GPU holds them: blocks as they are, networks in half floats."""
+    return sum(value.nbytes for value in model.parts.values())
+
+
 def count_kinds(model: LightmapModel) -> dict[str, int]:
     """Number of tiles of the grid by kind: empty (or not compressed), constant, static, dynamic."""
     return {kind.name.lower(): int((model.kind == kind).sum()) for kind in TileKind}
@@ -323,6 +330,7 @@ def _report(
         psnr_unlimited=summary.psnr_unlimited,
         bpp=bits_per_texel(model, lightmaps.mask, file_bytes),
         bytes=file_bytes,
+        memory_bpp=bits_per_texel(model, lightmaps.mask, memory_bytes(model)),
         tiles=int((model.kind != TileKind.EMPTY).sum()),
         times=len(model.times),
         device=device,
