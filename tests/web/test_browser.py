@@ -1,6 +1,7 @@
 """Pages in a browser: the light that they decode is that of Python, and their controls change the picture."""
 
 import base64
+import dataclasses
 import io
 import re
 
@@ -81,9 +82,10 @@ def model(lightmaps):
     return wlm.lightmap.compress(lightmaps, small_sets.tiny_profile(static_budget_db=20.0))
 
 
-@pytest.mark.parametrize("unpacked", [False, True])
-def test_lightmaps_decode_as_in_python(model, tmp_path, show, unpacked):
+@pytest.mark.parametrize(("unpacked", "interpolation"), [(False, "radiance"), (True, "radiance"), (False, "network")])
+def test_lightmaps_decode_as_in_python(model, tmp_path, show, unpacked, interpolation):
     assert sorted(model.kind.tolist()) == [0, 1, 2, 3]
+    model = dataclasses.replace(model, profile=model.profile.override({"interpolation": interpolation}))
     model.save(tmp_path / "four.wlm")
     write_page(tmp_path / "page.html", [tmp_path / "four.wlm"])
     page = show(tmp_path / "page.html", unpacked=unpacked)
