@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 
 from wlm import interop
+from wlm.errors import WlmError
 from wlm.formats.checkpoint import EVERY, Checkpoint
 from wlm.formats.parts import Part
 from wlm.lightmap.data import LightmapSet
 from wlm.lightmap.model import LightmapModel, Profile, encode_scale, part_table
-from wlm.lightmap.packing import clear_unused
+from wlm.lightmap.packing import check_packable, clear_unused
 from wlm.lightmap.tiles import TILE, TileGrid, TileKind, channel_means, classify, split
 from wlm.lightmap.trainer import Targets, Trainer
 from wlm.system import Meter, OnProgress
@@ -59,7 +60,12 @@ def compress(
     meter = Meter(progress, "fit", steps * len(batches))
     for number, batch in enumerate(batches):
         parts = checkpoint.finished(number, fit.table(batch)) if checkpoint is not None else None
-        if parts is None:
+        if parts is not None:
+            try:
+                check_packable(parts, fit.profile, batch.kind == TileKind.DYNAMIC)
+            except WlmError as error:
+                raise WlmError(f"{checkpoint.path}: finished batch {number}: {error}") from error
+        else:
             targets = fit.targets(batch.rows)
             dynamic = batch.kind == TileKind.DYNAMIC
             trainer = Trainer(fit.profile, fit.model.axis, targets, dynamic, seed, device, track=progress is not None)

@@ -48,6 +48,24 @@ def clear_unused(uv: np.ndarray, used: np.ndarray) -> np.ndarray:
     return _blocks_of(ends * blocks[:, None], bits * blocks[:, None], indices * texels).reshape(uv.shape)
 
 
+def check_packable(parts: Mapping[str, np.ndarray], profile: Profile, dynamic: bool) -> None:
+    """Checks the maps and networks of some tiles before they are relied on.
+
+    Args:
+        parts: `uv`, `net` and, of dynamic tiles, `uvt`, as a trainer gives them.
+        profile: The settings.
+        dynamic: Whether the tiles are dynamic rather than static.
+
+    Raises:
+        WlmError: A block isn't of BC7 mode 6, or a network not on the levels that the settings say.
+    """
+    for name in ("uv", "uvt") if dynamic else ("uv",):
+        _parts_of(parts[name].reshape(-1, 16))
+    if profile.net_bits == 8:
+        for net in parts["net"]:
+            pack_net(net, profile.inputs(dynamic), profile.hidden)
+
+
 def pack_tiles(
     parts: Mapping[str, np.ndarray], profile: Profile, kind: np.ndarray, mask: np.ndarray
 ) -> dict[str, np.ndarray]:
