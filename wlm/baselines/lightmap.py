@@ -63,6 +63,11 @@ def _av1(title: str, quality: int, ranges: str) -> Method:
 RIVALS: dict[str, Method] = {
     "bc6h": Method("BC6H", "", encode_bc6h),
     "bc7": Method("BC7", "", encode_bc7),
+    "bc6h-rdo-1": Method("BC6H", "RDO 1", functools.partial(encode_bc6h, loss=1.0)),
+    **{
+        f"bc7-rdo-{loss:g}": Method("BC7", f"RDO {loss:g}", functools.partial(encode_bc7, loss=loss))
+        for loss in (0.5, 1.0, 2.0)
+    },
     **{
         f"astc{side}": Method("ASTC", f"{side}x{side}", functools.partial(encode_astc, block=side))
         for side in (4, 5, 6, 8, 10, 12)

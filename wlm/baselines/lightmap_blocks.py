@@ -17,6 +17,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from wlm.baselines.block_reuse import reuse_blocks
 from wlm.baselines.lightmap_levels import TileRanges, clear_unseen, prepare, seen_texels, to_codes
 from wlm.baselines.rival import EXTRA, Rival, disk_size, measure
 from wlm.errors import WlmError
@@ -26,40 +27,53 @@ from wlm.lightmap.model import TILE
 from wlm.metrics import evaluate_frame, summarise
 
 _BC_BLOCK = 4  # texels along a block's side
+_RING_WEIGHT = 0.25
 _ASTC_BLOCKS = (4, 5, 6, 8, 10, 12)
 _ASTC_PROFILES = ("best", "ldr", "hdr")
 
 
-def encode_bc6h(frame: np.ndarray, mask: np.ndarray, profile: str = "slow") -> Rival:
+def encode_bc6h(frame: np.ndarray, mask: np.ndarray, profile: str = "slow", loss: float = 0.0) -> Rival:
     """BC6H, unsigned, 8 bits a texel, with Intel's ISPC texture compressor.
 
     Args:
         frame, mask: The lightmap.
         profile: `veryfast`, `fast`, `basic`, `slow` or `veryslow`.
+        loss: Of rate-distortion optimisation (`block_reuse`), in levels of 255; 0 for none.
     """
     for package in ("ispc_texcomp", "imagecodecs"):  # the time to import them isn't the codec's
         need(package, EXTRA)
     _check_profile("bc6h", profile, hdr_blocks.BC6H_PROFILES)
+    _check_loss("bc6h", loss)
     image = prepare(frame, mask)
-    padded = _pad(clear_unseen(image, seen_texels(mask), _BC_BLOCK)).astype(np.float16)
-    rival = measure(
-        "bc6h",
-        lambda: hdr_blocks.encode_bc6h(padded, profile, EXTRA),
-        lambda data: hdr_blocks.decode_bc6h(data, *padded.shape[:2], EXTRA),
-        disk_bytes=disk_size,
-    )
-    return _cropped(rival, image)
+    seen = seen_texels(mask)
+    padded = _pad(clear_unseen(image, seen, _BC_BLOCK)).astype(np.float16)
+
+    def decode(data: bytes) -> np.ndarray:
+        return hdr_blocks.decode_bc6h(data, *padded.shape[:2], EXTRA)
+
+    def encode() -> bytes:
+        data = hdr_blocks.encode_bc6h(padded, profile, EXTRA)
+        if loss == 0.0:
+            return data
+        # Errors of codes, as shares of their tile's range.
+        codes = _pad(to_codes(image))
+        weight = _weight(mask) / np.square(_pad(TileRanges.of(to_codes(image), seen).span(*seen.shape)))
+        return reuse_blocks(data, to_codes(decode(data)), codes, weight, loss / 255.0)
+
+    return _cropped(measure(_with_loss("bc6h", loss), encode, decode, disk_bytes=disk_size), image)
 
 
-def encode_bc7(frame: np.ndarray, mask: np.ndarray, profile: str = "slow") -> Rival:
+def encode_bc7(frame: np.ndarray, mask: np.ndarray, profile: str = "slow", loss: float = 0.0) -> Rival:
     """BC7 with gamma 2.2 and the range of each tile; 8 bits a texel and 12 bytes a tile.
 
     Args:
         frame, mask: The lightmap.
         profile: `ultrafast`, `veryfast`, `fast`, `basic` or `slow`.
+        loss: Of rate-distortion optimisation (`block_reuse`), in levels of 255; 0 for none.
     """
     texcomp, codecs = need("ispc_texcomp", EXTRA), need("imagecodecs", EXTRA)
     _check_profile("bc7", profile, ("ultrafast", "veryfast", "fast", "basic", "slow"))
+    _check_loss("bc7", loss)
     image = prepare(frame, mask)
     levels, ranges = _levels(image, mask, _BC_BLOCK)
     padded = _pad(_to_bytes(levels))
@@ -67,15 +81,25 @@ def encode_bc7(frame: np.ndarray, mask: np.ndarray, profile: str = "slow") -> Ri
     opaque = np.concatenate([padded, np.full((height, width, 1), 255, np.uint8)], axis=2)
     surface = texcomp.RGBASurface(opaque.tobytes(), width, height)
     settings = texcomp.BC7EncSettings.from_profile(profile)
+
+    def decode(data: bytes) -> np.ndarray:
+        return codecs.bcn_decode(data, 7, shape=(height, width, 4))[..., :3]
+
+    def encode() -> bytes:
+        data = texcomp.compress_blocks_bc7(surface, settings)
+        if loss == 0.0:
+            return data
+        return reuse_blocks(data, decode(data) / np.float32(255.0), _pad(levels), _weight(mask), loss / 255.0)
+
     rival = measure(
-        "bc7",
-        lambda: texcomp.compress_blocks_bc7(surface, settings),
-        lambda data: codecs.bcn_decode(data, 7, shape=(height, width, 4)),
+        _with_loss("bc7", loss),
+        encode,
+        decode,
         bytes=lambda data: len(data) + len(ranges.tobytes()),
         disk_bytes=lambda data: disk_size(data + ranges.tobytes()),
     )
     rival = _cropped(rival, image)
-    return replace(rival, decoded=ranges.radiance(rival.decoded[..., :3] / np.float32(255.0)))
+    return replace(rival, decoded=ranges.radiance(rival.decoded / np.float32(255.0)))
 
 
 def encode_astc(
@@ -147,6 +171,24 @@ def _astc(image: np.ndarray, mask: np.ndarray, block: int, quality: float, profi
 def _check_profile(codec: str, profile: str, names: Sequence[str]) -> None:
     if profile not in names:
         raise WlmError(f"{codec}: unknown profile {profile!r}, expected one of {', '.join(names)}")
+
+
+def _check_loss(codec: str, loss: float) -> None:
+    if not 0.0 <= loss <= 255.0:
+        raise WlmError(f"{codec}: expected a loss from 0 to 255, got {loss:g}")
+
+
+def _with_loss(name: str, loss: float) -> str:
+    return f"{name}-rdo-{loss:g}" if loss else name
+
+
+def _weight(mask: np.ndarray) -> np.ndarray:
+    """What a squared error counts, float32 [H, W, 3] padded to blocks: some bilinear reads reach the ring."""
+    valid = np.asarray(mask).astype(bool)
+    weight = np.where(valid, 1.0, np.where(seen_texels(valid, ring=1), _RING_WEIGHT, 0.0)).astype(np.float32)
+    height, width = valid.shape
+    padded = np.pad(weight, ((0, -height % _BC_BLOCK), (0, -width % _BC_BLOCK)))
+    return np.repeat(padded[..., None], 3, axis=2)
 
 
 def _levels(image: np.ndarray, mask: np.ndarray, block: int) -> tuple[np.ndarray, TileRanges]:

@@ -107,9 +107,13 @@ class TileRanges:
 
     def levels(self, codes: np.ndarray) -> np.ndarray:
         """Codes [..., H, W, 3] to levels in [0, 1]; 0 where a range is."""
-        low, high = self._spread(*codes.shape[-3:-1])
-        span = high - low
-        return np.clip((codes - low) / np.where(span > 0.0, span, np.float32(1.0)), 0.0, 1.0)
+        low, _ = self._spread(*codes.shape[-3:-1])
+        return np.clip((codes - low) / self.span(*codes.shape[-3:-1]), 0.0, 1.0)
+
+    def span(self, height: int, width: int) -> np.ndarray:
+        """The greatest less the least over their texels, float32 [..., H, W, 3]; 1 where they are equal."""
+        low, high = self._spread(height, width)
+        return np.where(high > low, high - low, np.float32(1.0))
 
     def radiance(self, levels: np.ndarray) -> np.ndarray:
         """Levels [..., H, W, 3], clipped to [0, 1], to radiance, float32."""
