@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from builders.contest_sets import write_contest
 from builders.running import call, check_a_stop_is_resumed, fails
 from builders.small_sets import HOURS, moving_light, tiny_profile
 from PIL import Image
@@ -163,6 +164,21 @@ def test_evaluate_prints_and_writes_the_report(fitted, folder, tmp_path):
     assert not any(title in scores for title in ("ring", "border", "views"))
     assert "on disk" not in call(*words)
     assert "baselines" not in json.loads((tmp_path / "r.json").read_text())
+
+
+def test_evaluate_adds_a_contests_score_of_a_contests_map(profile, tmp_path):
+    contest = write_contest(tmp_path)
+    out, report = tmp_path / "17.wlm", tmp_path / "r.json"
+    assert "1 (6x4), 17 (20x300)" in fails("lightmap", "compress", contest, "-o", out, "--profile", profile)
+    call("lightmap", "compress", contest, "--map", 17, "-o", out, "--profile", profile)
+    words = ["lightmap", "evaluate", out, contest, "--map", 17, "--json", report]
+    text = call(*words, "--score", "hprc")
+    score = json.loads(report.read_text())["hprc"]
+    assert score["device"] == "cpu" and score["times"] == 3 and score["most"] == 60.0
+    assert score["total"] == pytest.approx(sum(score["points"].values()))
+    assert f"{score['total']:.2f}" in text.split("hprc")[1]
+    assert "LPIPS (10)" in call.stderr and "on cpu" in call.stderr
+    assert "hprc" not in call(*words) and "hprc" not in json.loads(report.read_text())
 
 
 def test_info_says_what_is_in_the_file(fitted):

@@ -271,8 +271,24 @@ def _scene_figures(scene: Scene) -> None:
     assert 1 <= scene.steps, f"accepted with {scene.steps} steps a frame"
 
 
+def _contest() -> Sequence[bytes]:
+    light, masks = ({"0": f"{name}.bin_0", "590": f"{name}.bin_0"} for name in ("light", "mask"))
+    size = {"width": 3, "height": 2}
+    return (
+        json.dumps({"lightmap_list": [{"id": 1, "resolution": size, "lightmaps": light, "masks": masks}]}).encode(),
+    )
+
+
 _ALL = (
     *models.READERS,
+    Reader(
+        "lightmap-contest",
+        "config.json",
+        _contest,
+        _json,
+        _lightmap_set,
+        lambda: {"light.bin_0": np.arange(18, dtype="<f4").tobytes(), "mask.bin_0": b"\x7f\xff" * 3},
+    ),
     Reader("exr", "a.exr", corpus("zip.exr", "piz.exr", "b44.exr", "dwaa.exr", "tiled.exr"), vary_exr, _exr),
     Reader(
         "exr-six-way",

@@ -3,7 +3,7 @@
 import math
 import time as clock
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -36,15 +36,19 @@ from wlm.cli.options import (
 if TYPE_CHECKING:
     from wlm.baselines.lightmap import Score
     from wlm.lightmap import LightmapSet, Report
+    from wlm.metrics.contest import ContestScore
 
 app = typer.Typer(help="Lightmaps over time: BC7 feature maps and a tiny network for each 128² tile.")
 
-_Set = Annotated[Path, typer.Argument(metavar="SET", help="A set.json, or a folder of EXR files.")]
+_Set = Annotated[Path, typer.Argument(metavar="SET", help="A set.json, or a folder of EXR files or of a contest.")]
 _Times = Annotated[
     str | None, typer.Option(help="Times of the lightmaps in order: numbers and start:stop:step, by commas.")
 ]
 _Mask = Annotated[str | None, typer.Option(help='Valid texels: a PNG, "alpha" or "all"; default as the set says.')]
 _Period = Annotated[float | None, typer.Option(help="Length of the day; default as the set says.")]
+_Map = Annotated[
+    str | None, typer.Option("--map", metavar="ID", help="Which lightmap of a contest's folder: ID or LEVEL/ID.")
+]
 
 
 @app.command()
@@ -63,6 +67,7 @@ def compress(
     times: _Times = None,
     mask: _Mask = None,
     period: _Period = None,
+    map_id: _Map = None,
     trust: Trust = False,
 ) -> None:
     """Compress a lightmap set into one file.
@@ -80,7 +85,7 @@ def compress(
 
     settings = Profile.load(profile).override({"steps": steps, "samples": samples}, "--")
     device = check_device(device)
-    lightmaps = _load(set_path, times, mask, period, trust)
+    lightmaps = _load(set_path, times, mask, period, trust, map_id)
     numbers = None if tiles is None else parse_tiles(tiles, TileGrid.of(*lightmaps.mask.shape).count)
     options = {"tiles": numbers, "seed": seed, "device": device}
     checkpoint = open_checkpoint(output, lightmaps, settings, resume=resume, every=checkpoint_every, **options)
@@ -149,10 +154,14 @@ def evaluate(
     views: Annotated[
         int, typer.Option(min=0, help="Views of the set's mesh, if it names one, that are scored; 0 for none.")
     ] = 50,
+    score: Annotated[
+        Literal["hprc"] | None, typer.Option(help="Add the score of a contest, as far as its rules are public.")
+    ] = None,
     device: Device = "cpu",
     times: _Times = None,
     mask: _Mask = None,
     period: _Period = None,
+    map_id: _Map = None,
     trust: Trust = False,
 ) -> None:
     """Compare a file with its input: PSNR, SSIM and FLIP by tile and by time, bits per texel, and what is seen of it.
@@ -166,12 +175,12 @@ def evaluate(
         check_output(html_path, ".html")
     quiet_warp()
     from wlm.interop import check_device
-    from wlm.lightmap.evaluation import evaluate
-    from wlm.system import load
+    from wlm.lightmap.evaluation import contest_score, evaluate
+    from wlm.system import load, plain
 
     device = check_device(device)
     model = load(file, "lightmap")
-    lightmaps = _load(set_path, times, mask, period, trust)
+    lightmaps = _load(set_path, times, mask, period, trust, map_id)
     with running("score") as progress:
         size = file.stat().st_size
         report = evaluate(model, lightmaps, views=views, device=device, progress=progress, file_bytes=size)
@@ -187,9 +196,16 @@ def evaluate(
             rivals = evaluate_rivals(model, lightmaps, views=views, progress=progress)
         extra = {"baselines": [rival.to_json() | score.to_json() for rival, score in rivals]}
         scores = {RIVALS[rival.name].label: score for rival, score in rivals}
+    contest = None
+    if score is not None:
+        with running("contest") as progress:
+            contest = contest_score(model, lightmaps, device=device, progress=progress)
+        extra[score] = plain(contest)
     if json_path is not None:
         write_json(json_path, report.to_json() | extra)
     _show_report(file, report, scores)
+    if contest is not None:
+        _show_contest(contest)
 
 
 @app.command()
@@ -265,12 +281,14 @@ def export(
     show(rows)
 
 
-def _load(path: Path, times: str | None, mask: str | None, period: float | None, trust: bool) -> "LightmapSet":
+def _load(
+    path: Path, times: str | None, mask: str | None, period: float | None, trust: bool, map_id: str | None
+) -> "LightmapSet":
     """Reads a set and prints what was repaired in it."""
     from wlm.lightmap.data import load, parse_times
 
     stamps = None if times is None else parse_times(times)
-    lightmaps = load(path, times=stamps, mask=mask, period=period, trust=trust)
+    lightmaps = load(path, times=stamps, mask=mask, period=period, trust=trust, map_id=map_id)
     for warning in lightmaps.warnings:
         note(f"warning: {warning}")
     return lightmaps
@@ -355,3 +373,18 @@ def _show_seen(named: "list[tuple[str, Report | Score]]") -> None:
         for name, *cells in zip((name for name, _ in named), *found.values(), strict=True):
             rows.add_row(name, *cells)
         show(rows)
+
+
+def _show_contest(score: "ContestScore") -> None:
+    from wlm.metrics.contest import BOUNDS, WEIGHTS
+
+    rows = table("hprc", ["", "value", "no points", "all points", "points", "of"])
+    for name, (worst, best) in BOUNDS.items():
+        value = number(getattr(score, name), ".4f")
+        rows.add_row(name, value, f"{worst:g}", f"{best:g}", number(score.points[name], ".2f"), f"{WEIGHTS[name]:g}")
+    rows.add_section()
+    rows.add_row("together", "", "", "", f"{score.total:.2f}", f"{score.most:g}")
+    show(rows)
+    each = 1000.0 * score.seconds / score.times
+    note(f"hprc: decoded in {score.seconds:.4f} s on {score.device}, {each:.3f} ms a lightmap; its bounds are unknown")
+    note("hprc: without points of 100: decode time (30), LPIPS (10), which needs a trained network")

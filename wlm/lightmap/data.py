@@ -30,7 +30,7 @@ a NaN or infinite time                error
 frames, mask or `set.json` that     error that names both files
 disagree in size
 a file missing or damaged, a          error that names the file, and the field
-malformed `set.json`
+malformed `set.json` or `config.json`
 ====================================  ================================================================
 
 Layout of a set and its evaluation: neural-dynamic-gi, section 10.1.
@@ -51,6 +51,7 @@ from wlm.errors import WlmError
 from wlm.formats.exr import read_exr
 from wlm.formats.limits import FRAMES, PICTURE_GROWTH, TIMES, check_growth
 from wlm.formats.mask import read_mask
+from wlm.lightmap.contest import CONFIG_FILE, is_contest, list_contest, read_coverage, read_light
 from wlm.lightmap.listing import SET_FILE, Listing, list_folder, parse_set
 from wlm.texels import repair
 
@@ -97,8 +98,9 @@ def load(
     mask: str | os.PathLike[str] | None = None,
     period: float | None = None,
     trust: bool = False,
+    map_id: str | None = None,
 ) -> LightmapSet:
-    """Reads a lightmap set: a `set.json`, a folder that holds one, or a plain folder of EXR files.
+    """Reads a lightmap set: a `set.json`, a folder that holds one, a plain folder of EXR files, or one of a contest.
 
     `set.json` is an object with `width`, `height` and `lightmaps` (a list of `{"time_hours", "file"}`), and
     may have `name`, `period_hours`, `mask` (a PNG's name, or "alpha"; absent means that all texels are valid) and
@@ -110,6 +112,8 @@ def load(
     digits after the second separator being decimals, not minutes. A `mask.png` among them is the mask unless
     `mask` says otherwise.
 
+    A folder with a `config.json` and no EXR file is read as `wlm.lightmap.contest` says.
+
     Args:
         path: The `set.json` or the folder.
         times: One time for each lightmap in the order of the list or the names; replaces those of `set.json`.
@@ -118,6 +122,7 @@ def load(
         period: Length of the day in the unit of the times; None takes the set's `period_hours`, if any.
         trust: Whether a `set.json` may name files outside its folder, and small files may hold large frames
             (`wlm.formats.limits`).
+        map_id: Which lightmap of a contest's folder, `ID` or `LEVEL/ID`; None where it has but one.
 
     Returns:
         The set, repaired as the module's table says.
@@ -128,7 +133,11 @@ def load(
     path = Path(path)
     if path.is_dir() and (path / SET_FILE).is_file():
         path = path / SET_FILE
-    if path.is_dir():
+    if path.is_dir() and is_contest(path):
+        listing = list_contest(path, map_id, times, trust)
+    elif map_id is not None:
+        raise WlmError(f"{path}: expected a contest's folder with a {CONFIG_FILE} to choose map {map_id} of")
+    elif path.is_dir():
         listing = list_folder(path, times)
     elif path.is_file():
         if path.suffix.lower() != ".json":
@@ -144,10 +153,14 @@ def load(
     _check_times(str(path), labels, stamps, period)
     mask_source = str(mask) if mask is not None else listing.mask
     need_alpha = mask_source == "alpha"
+    if need_alpha and listing.raw is not None:
+        raise WlmError(f"{path}: expected EXR files for a mask from alpha, found raw lightmaps without it")
     frames, covered, warnings = _read_frames(listing, need_alpha, trust)
     height, width = frames.shape[1:3]
     if need_alpha:
         valid = covered
+    elif mask is None and listing.coverage is not None:
+        valid = read_coverage(listing.coverage, (height, width))
     elif mask_source == "all":
         valid = np.ones((height, width), bool)
     else:
@@ -246,7 +259,7 @@ def _read_frames(
     listing: Listing, need_alpha: bool, trust: bool
 ) -> tuple[np.ndarray, np.ndarray | None, tuple[str, ...]]:
     """Reads all files into one array [T, H, W, 3]; if asked for, also where alphas are above 0 [T, H, W]; warnings."""
-    first, alpha = _read_rgb(listing.files[0], need_alpha)
+    first, alpha = _read_rgb(listing, 0, need_alpha)
     size = first.shape[:2]
     if listing.size is not None and size != listing.size:
         raise WlmError(f"{listing.files[0]}: is {_size(size)}, but {listing.stated_by} states {_size(listing.size)}")
@@ -262,7 +275,7 @@ def _read_frames(
     covered, warnings = np.zeros(frames.shape[:3], bool) if need_alpha else None, []
 
     def read(index: int) -> np.ndarray | None:
-        rgb, alpha = _read_rgb(listing.files[index], need_alpha)
+        rgb, alpha = _read_rgb(listing, index, need_alpha)
         if rgb.shape[:2] != size:
             raise WlmError(
                 f"{listing.files[index]}: is {_size(rgb.shape)}, but {listing.files[0]} is {_size(size)}; "
@@ -286,8 +299,11 @@ def _read_frames(
     return frames, covered, tuple(warnings)
 
 
-def _read_rgb(path: Path, need_alpha: bool) -> tuple[np.ndarray, np.ndarray | None]:
-    """Reads one file: colour [H, W, 3] and, if asked for, its alpha [H, W]."""
+def _read_rgb(listing: Listing, index: int, need_alpha: bool) -> tuple[np.ndarray, np.ndarray | None]:
+    """Reads one lightmap: colour [H, W, 3] and, if asked for, its alpha [H, W]."""
+    if listing.raw is not None:
+        return read_light(listing.raw[index], listing.size), None
+    path = listing.files[index]
     pixels, names = read_exr(path)
     if need_alpha and "A" not in names:
         raise WlmError(f"{path}: expected a channel A, which the mask is to come from, found {', '.join(names)}")

@@ -18,6 +18,7 @@ from wlm.lightmap.seen import SeenScore, Tally
 from wlm.lightmap.tiles import TileGrid, TileKind
 from wlm.lightmap.views import VIEWS, views_of
 from wlm.metrics import METRICS, FrameMetrics, LostLight, Summary, evaluate_frame, summarise
+from wlm.metrics.contest import HOURS, ContestScore, block_scores, contest_points
 from wlm.system import Meter, OnProgress
 
 SCORES = (*METRICS, "seen")
@@ -168,6 +169,43 @@ def psnr_of(model: LightmapModel, lightmaps: LightmapSet, number: int, decoded: 
     """
     mask, name = lightmaps.mask & _held(model), f"{model.name} at {lightmaps.times[number]:g}"
     return float(summarise([evaluate_frame(lightmaps.frames[number], decoded, mask, TILE, ("psnr",), name=name)]).psnr)
+
+
+def contest_score(
+    model: LightmapModel, lightmaps: LightmapSet, *, device: str = "cpu", progress: OnProgress | None = None
+) -> ContestScore:
+    """Scores a model as the contest of `wlm.metrics.contest` does.
+
+    The clock runs while `Decoder.frame` makes a lightmap of float32 from the stored bytes, with the copy to the host,
+    after a first decode that isn't timed. The ratio is that of the bytes in memory, since the contest allows no packed
+    files, to `HOURS` lightmaps at most.
+
+    Args:
+        model: The model.
+        lightmaps: The input.
+        device: Where it is decoded.
+        progress: Called about twice a second.
+
+    Raises:
+        WlmError: As `evaluate`.
+    """
+    device = interop.check_device(device)
+    mask, decoder, times = scored_mask(model, lightmaps), Decoder(model, device), len(model.times)
+    meter, seconds, psnrs, ssims = Meter(progress, "contest", times), 0.0, [], []
+    decoder.frame(model.times[0])
+    for i, stamp in enumerate(model.times):
+        start = time.perf_counter()
+        decoded = decoder.frame(stamp)
+        seconds += time.perf_counter() - start
+        blocks = block_scores(lightmaps.frames[i], decoded, mask & lightmaps.valid(i))
+        psnrs += blocks[0]
+        ssims += [value for value in blocks[1] if np.isfinite(value)]
+        if meter.due(i + 1):
+            meter.report(i + 1)
+    bpp = bits_per_texel(model, lightmaps.mask, memory_bytes(model))
+    ratio = bpp * times / (min(times, HOURS) * 3 * 32)
+    means = (float(np.mean(values)) if values else float("nan") for values in (psnrs, ssims))
+    return contest_points(ratio, *means, seconds, times, device)
 
 
 def lost_light(model: LightmapModel, lightmaps: LightmapSet, device: str = "cpu") -> list[str]:

@@ -26,14 +26,16 @@ class Listing:
 
     Attributes:
         name: The set's name.
-        files: The EXR files, as ordered by the list or by name.
+        files: The EXR files, as ordered by the list or by name; of raw lightmaps the first of each.
         times: One for each file, not yet checked.
-        mask: "all", "alpha" or the path of a PNG.
+        mask: "all", "alpha", the path of a PNG, or "coverage": that of the files of `coverage`.
         period: Length of the day in the unit of the times, or None.
         size: Height and width in texels where the set states them, else None.
         stated_by: The file that states the size, or the folder.
         warn_order: Whether times that are out of order deserve a warning.
         mesh: The mesh that the lightmaps belong to, which need not be there, or None.
+        raw: For each lightmap the raw files that it is made of, see `wlm.lightmap.contest`; None for EXR files.
+        coverage: Likewise the raw masks: one, or one for each lightmap.
     """
 
     name: str
@@ -45,6 +47,8 @@ class Listing:
     stated_by: Path
     warn_order: bool
     mesh: Path | None = None
+    raw: list[list[Path]] | None = None
+    coverage: list[list[Path]] | None = None
 
 
 def list_folder(folder: Path, times: Sequence[float] | None) -> Listing:
