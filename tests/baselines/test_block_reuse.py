@@ -50,6 +50,13 @@ def test_texels_without_weight_do_not_count():
     assert reused(target, target, 0.04, weight) == [0, 1]
 
 
+def test_of_equal_ones_the_nearest_is_taken():
+    target = strip(0.5, 0.5, 0.9, 0.7)
+    weight = np.ones_like(target)
+    weight[:, 12:] = 0.0  # nobody sees the last
+    assert reused(target, target, 0.0, weight) == [0, 0, 2, 2]
+
+
 def test_blocks_go_row_by_row_and_one_is_kept():
     target = np.concatenate([strip(0.0, 1.0), strip(0.5, 1.0)])
     assert reused(target, target, 0.01) == [0, 1, 2, 1]

@@ -2,7 +2,8 @@
 
 A block codec's bytes hardly compress, for no two blocks are alike. Here a block takes the bytes of one before it that
 fits its texels nearly as well: zstd then stores a match in place of 16 bytes. The least of all errors within a window
-is taken, if it is not more than a given amount above the block's own. Memory and decoding stay as they are.
+is taken, of equal ones the nearest, if it is not more than a given amount above the block's own. Memory and decoding
+stay as they are.
 """
 
 import numpy as np
@@ -33,9 +34,9 @@ def reuse_blocks(
     for i in range(1, len(blocks)):
         first = max(0, i - _WINDOW)
         errors = np.square(held[first:i] - wanted[i]) @ weights[i]
-        best = int(errors.argmin())
-        if errors[best] <= bound[i]:
-            held[i], blocks[i] = held[first + best], blocks[first + best]
+        best = i - 1 - int(errors[::-1].argmin())
+        if errors[best - first] <= bound[i]:
+            held[i], blocks[i] = held[best], blocks[best]
     return blocks.tobytes()
 
 
