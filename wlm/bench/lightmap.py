@@ -77,6 +77,7 @@ def run(
     quick: bool,
     device: str,
     set_path: str | os.PathLike[str] | None = None,
+    rivals: bool = True,
     progress: Note | None = None,
 ) -> list[Row]:
     """Measures the lightmap system on one set.
@@ -86,6 +87,7 @@ def run(
             set has them): five minutes on two CPU cores for 16 tiles. Its errors are those of unfinished fits.
         device: "cpu" or "cuda:0", for fits and decodes.
         set_path: A lightmap set; None: the checkout's `demos/data/city`, two tiles of the city.
+        rivals: With the rivals, which take minutes on the CPU and no GPU: `run_rivals` measures them elsewhere.
         progress: Called with a line before each part of the work.
 
     Returns:
@@ -94,7 +96,7 @@ def run(
     Raises:
         WlmError: The set or the device isn't there, or a fit diverged.
     """
-    lightmaps = load(demo_data("city", "--set PATH") if set_path is None else set_path)
+    lightmaps = _load(set_path)
     profiles = [Profile.load(name) for name in (QUICK_PROFILES if quick else PROFILES)]
     chosen = np.arange(len(lightmaps.times))
     if quick:
@@ -104,8 +106,28 @@ def run(
             for profile in profiles
         ]
         chosen = _quick_times(lightmaps.times)
-    rivals = FEW if quick else tuple(RIVALS)
-    return run_rows(lightmaps, profiles, device=device, chosen=chosen, rivals=rivals, progress=progress)
+    names = _names(quick) if rivals else ()
+    return run_rows(lightmaps, profiles, device=device, chosen=chosen, rivals=names, progress=progress)
+
+
+def run_rivals(
+    *, quick: bool = False, set_path: str | os.PathLike[str] | None = None, progress: Note | None = None
+) -> list[Row]:
+    """Measures the rivals alone, on the CPU.
+
+    Args:
+        quick, set_path, progress: As for `run`.
+
+    Returns:
+        Their rows.
+
+    Raises:
+        WlmError: The set isn't there.
+    """
+    lightmaps = _load(set_path)
+    chosen = _quick_times(lightmaps.times) if quick else np.arange(len(lightmaps.times))
+    bench = _LightmapBench(lightmaps, chosen, "cpu", progress, None)
+    return [bench.rival_row(name) for name in _names(quick)]
 
 
 def run_rows(
@@ -144,6 +166,14 @@ def run_rows(
     rows += [bench.fit_row(fit) for fit in fits]
     whole = bench.device != "cpu" and len(chosen) == len(lightmaps.times)
     return rows + bench.plain_rows(best, whole=whole)
+
+
+def _load(set_path: str | os.PathLike[str] | None) -> LightmapSet:
+    return load(demo_data("city", "--set PATH") if set_path is None else set_path)
+
+
+def _names(quick: bool) -> tuple[str, ...]:
+    return FEW if quick else tuple(RIVALS)
 
 
 def _quick_times(times: np.ndarray) -> np.ndarray:

@@ -52,16 +52,26 @@ def lightmap(
     set_path: Annotated[
         Path | None, typer.Option("--set", metavar="SET", help="A lightmap set; default the demo's.")
     ] = None,
+    rivals: _Rivals = True,
+    rivals_only: Annotated[bool, typer.Option("--rivals-only", help="The rivals alone, which need no GPU.")] = False,
     json_path: _RowsFile = None,
     plot_path: _PlotFile = None,
     baseline: _Baseline = None,
 ) -> None:
-    """Lightmaps over time: PSNR, bits a texel and decode time of the profiles and of block codecs."""
+    """Lightmaps over time: PSNR, bits a texel and decode time of the profiles, block codecs, PCA and a video codec."""
     device = _prepare(device, json_path, plot_path, baseline)
-    from wlm.bench.lightmap import PANELS, run
+    from wlm.bench.lightmap import PANELS, run, run_rivals
 
-    rows = run(quick=quick, device=device, set_path=set_path, progress=note)
-    command = _command("lightmap", quick=quick, device=device, set=set_path and rows[0].scene)
+    common = {"quick": quick, "set_path": set_path, "progress": note}
+    if rivals_only:
+        if not rivals or device != "cpu":
+            raise WlmError("--rivals-only: expected without --no-rivals and --device: the rivals need no GPU")
+        rows = run_rivals(**common)
+        options = {"rivals_only": True}
+    else:
+        rows = run(device=device, rivals=rivals, **common)
+        options = {"no_rivals": not rivals, "device": device}
+    command = _command("lightmap", quick=quick, **options, set=set_path and rows[0].scene)
     _finish(rows, command, device, json_path, plot_path, PANELS, baseline=baseline)
 
 
