@@ -40,7 +40,7 @@ from wlm.lightmap.decode import Decoder
 from wlm.lightmap.evaluation import bits_per_texel, count_kinds, memory_bytes
 from wlm.lightmap.exact import bound64, colour_tile64, decode_tile64
 from wlm.lightmap.fit import compress, dynamic_targets
-from wlm.lightmap.model import TILE, LightmapModel, Profile, TimeAxis, encode_time
+from wlm.lightmap.model import TILE, LightmapModel, Profile, TimeAxis
 from wlm.lightmap.runtime import ExactDecoder, MatrixDecoder, StripDecoder, fast_decoder
 from wlm.lightmap.seen import Tally
 from wlm.lightmap.tiles import TileGrid, TileKind, assemble
@@ -287,26 +287,15 @@ class _LightmapBench(Bench):
 
     def plain_rows(self, fit: Fit, whole: bool) -> list[Row]:
         """The same fit in plain torch, all of its steps or a few; none where no tile is dynamic."""
-        profile = fit.model.profile.model_copy(update={"metric_weight": 0.0})
+        # What a file would hold is left out: the loss is the plain square, and the maps stay continuous.
+        plain = {"metric_weight": 0.0, "quantise_from": 1.0, "freeze_from": 1.0}
+        profile = fit.model.profile.model_copy(update=plain)
         targets = dynamic_targets(self.lightmaps, profile)
         if targets is None:
             return []
         self.note(f"{fit.option}: the fit in plain torch")
-        tau, encoding = encode_time(TimeAxis(self.lightmaps.times, self.lightmaps.period, profile.time_axis))
-        sizes = ("hidden", "uvt_resolution", "uvt_slices", "plane_columns", "plane_rows")
-        rates = ("samples", "steps", "map_rate", "net_rate", "final_rate")
-        peer = PlainFit(
-            tau=tau,
-            encoding=encoding,
-            colour=targets.colour,
-            texels=targets.texels,
-            count=targets.count,
-            weight=targets.weight,
-            sizes=tuple(getattr(profile, name) for name in sizes),
-            rates=tuple(getattr(profile, name) for name in rates),
-            seed=0,
-            device=self.device,
-        )
+        axis = TimeAxis(self.lightmaps.times, self.lightmaps.period, profile.time_axis)
+        peer = PlainFit(profile, axis, targets, device=self.device)
         peer.step().item()
         steps = profile.steps if whole else min(profile.steps, _PLAIN_STEPS)
         start = time.perf_counter()
