@@ -8,8 +8,8 @@ Four kinds of rows:
   "matrix" (the fast path on matrix units), of profile M:
   the 8-bit output against the input, and its largest error against the float64 path as a share of 255. Half a level of
   8 bits, 0.00196, is the rounding itself.
-- the rivals of `wlm.baselines.lightmap`, on the same lightmaps: block codecs, temporal PCA and a video codec; between
-  stored times their light is mixed.
+- the rivals of `wlm.baselines.lightmap`, on the same lightmaps: block codecs, temporal PCA, a neural texture codec and
+  a video codec; between stored times their light is mixed.
 - method "fit", one row for each profile: the speed of the fit alone; and the same fit in plain torch, all of it on CUDA
   in a full run, else a few steps.
 
@@ -29,7 +29,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from wlm.baselines.lightmap import FEW, RIVALS, encode_set
+from wlm.baselines.lightmap import FEW, RIVALS, encode_set, few
 from wlm.baselines.lightmap_torch import PlainFit
 from wlm.bench.plot import Panel
 from wlm.bench.rows import Row
@@ -104,7 +104,7 @@ def run(
             for profile in profiles
         ]
         chosen = _quick_times(lightmaps.times)
-    rivals = FEW if quick else tuple(RIVALS)
+    rivals = few(device) if quick else tuple(RIVALS)
     return run_rows(lightmaps, profiles, device=device, chosen=chosen, rivals=rivals, progress=progress)
 
 
@@ -255,12 +255,13 @@ class _LightmapBench(Bench):
         try:
             tally = self._tally(name)
             score = functools.partial(self._frame, name, tally)
-            rival, frames = encode_set(name, self.lightmaps, score, self.chosen)
+            rival, frames = encode_set(name, self.lightmaps, score, self.chosen, device=self.device)
         except WlmError as error:
             return self.missing_row(method.title, method.option, error)
         count = len(self.lightmaps.times)
         bits = 8 / (self.lightmaps.mask.size * count)
-        notes = [self.scored_at + "size and encode time of all times, on one CPU thread", rival.option]
+        where = "" if method.fitted else ", on one CPU thread"
+        notes = [f"{self.scored_at}size and encode time of all times{where}", rival.option]
         figures = {"disk_bytes": rival.disk_bytes, "disk_bpp": rival.disk_bytes * bits}
         if method.random_access:
             figures |= {"bytes": rival.bytes, "bpp": rival.bytes * bits}
