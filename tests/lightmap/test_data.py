@@ -354,7 +354,7 @@ def test_set_that_is_no_json_object_names_the_file(tmp_path, text):
 
 def test_path_that_does_not_exist(tmp_path):
     assert "nowhere" in error_of(load, tmp_path / "nowhere")
-    assert "expected a set.json or EXR files" in error_of(load, tmp_path)
+    assert "expected a set.json or lightmaps (.exr, .hdr, .ktx2, .dds), found neither" in error_of(load, tmp_path)
 
 
 def test_plain_folder_takes_files_in_natural_order(tmp_path):
@@ -392,7 +392,7 @@ def test_plain_folder_with_a_name_that_tells_no_hour(tmp_path, odd):
     for name in ("m_05_00h", odd):
         write_exr(tmp_path / f"{name}.exr", _frames()[0])
     message = error_of(load, tmp_path)
-    assert "2 EXR files" in message and "--times" in message and odd in message
+    assert "2 lightmaps and no set.json" in message and "--times" in message and odd in message
 
 
 def test_from_arrays_checks_shapes():
