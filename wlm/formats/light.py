@@ -51,7 +51,11 @@ def read_light(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...
     with open_file(path, "the lightmap") as file:
         first = file.read(_FIRST)
     for magic, read in _READERS.items():
-        if first.startswith(magic):
+        if not first.startswith(magic):
+            continue
+        try:
             return read(path)
+        except MemoryError as error:
+            raise WlmError(f"{path}: the lightmap is too large for the memory: {error}") from error
     found = next((name for magic, name in _OTHERS.items() if first.startswith(magic)), "other content")
     raise WlmError(f"{path}: expected a lightmap, {EXPECTED}, found {found}")
