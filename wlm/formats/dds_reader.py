@@ -93,7 +93,7 @@ def read_dds(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]]
             name, layout = _of_dx10(path, file.read(_DX10.size))
         else:
             name, layout = _of_code(path, pixel_flags, code)
-        check_picture(path, held, width, height, layout.channels)
+        check_picture(path, held, width, height, layout.unpacked)
         expected = layout.bytes_of(width, height)
         start = file.tell()
         if start + expected > held:

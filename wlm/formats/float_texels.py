@@ -45,20 +45,26 @@ class Layout:
         """The channels' names."""
         return tuple("RGBA"[: self.channels])
 
+    @property
+    def unpacked(self) -> int:
+        """Bytes of a texel as half floats, or as they are stored where that is more."""
+        across, down = self.block
+        return max(_HALF_BYTES * self.channels, self.size // (across * down))
+
     def bytes_of(self, width: int, height: int) -> int:
         """Bytes of a picture."""
         across, down = self.block
         return -(-width // across) * -(-height // down) * self.size
 
 
-def check_picture(path: str | os.PathLike[str], held: int, width: int, height: int, channels: int) -> None:
+def check_picture(path: str | os.PathLike[str], held: int, width: int, height: int, texel: int) -> None:
     """Checks the size that a picture claims, before room is made for it.
 
     Args:
         path: The file, for messages.
         held: Its bytes.
         width, height: Texels.
-        channels: Of a texel.
+        texel: Bytes of one once it is unpacked.
 
     Raises:
         WlmError: It has no texels or too many, or more than so many bytes may become.
@@ -66,7 +72,7 @@ def check_picture(path: str | os.PathLike[str], held: int, width: int, height: i
     if not (width and height):
         raise WlmError(f"{path}: expected at least one texel, found {width} x {height}")
     check_sides(str(path), width, height)
-    check_growth(str(path), held, width * height * channels * _HALF_BYTES, PICTURE_GROWTH, PICTURE_BYTES)
+    check_growth(str(path), held, width * height * texel, PICTURE_GROWTH, PICTURE_BYTES)
 
 
 def decode_texels(

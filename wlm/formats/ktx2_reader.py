@@ -116,7 +116,7 @@ def read_ktx2(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]
         ):
             if not fits:
                 raise WlmError(f"{path}: {field}: expected {expected}, found {found}")
-        check_picture(path, held, width, height, layout.channels)
+        check_picture(path, held, width, height, layout.unpacked)
         expected = layout.bytes_of(width, height)
         for field, found in (("byteLength", stored), ("uncompressedByteLength", size))[scheme != _NONE :]:
             if found != expected:

@@ -22,6 +22,7 @@ _FORMAT = "32-bit_rle_rgbe"
 _SIZE = re.compile(rb"([+-])([XY]) +([0-9]{1,9}) +([+-])([XY]) +([0-9]{1,9})")
 _LEAST, _MOST = 8, 0x7FFF  # texels of a row that the newer run-length code is for
 _TEXEL = 4  # bytes: red, green, blue, exponent
+_UNPACKED = 6  # the same as half floats
 _SCALE = np.ldexp(np.float32(1), np.arange(256) - 136)
 _SCALE[0] = 0.0  # black, whatever the mantissas
 
@@ -53,7 +54,7 @@ def read_radiance(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, 
         factor = _factor(path, lines)
         rows, columns = int(axes[3]), int(axes[6])  # of the file: a row may be a column of the picture
         upright = axes[2] == b"Y"
-        check_picture(path, held, *((columns, rows) if upright else (rows, columns)), 3)
+        check_picture(path, held, *((columns, rows) if upright else (rows, columns)), _UNPACKED)
         file.seek(start)
         # The worst code has two bytes for each of a texel's, and four for a row. What follows is not of the picture.
         data = file.read(rows * (2 * _TEXEL * columns + _TEXEL))
