@@ -10,8 +10,10 @@ import texture2ddecoder
 from builders.checks import error_of
 from builders.textures import make_dds, make_ktx2
 
+from wlm.formats.dds import write_dds
 from wlm.formats.exr import write_exr
 from wlm.formats.hdr_blocks import ASTC_BLOCKS, ASTC_MEDIUM, astc, encode_bc6h
+from wlm.formats.ktx2 import write_ktx2
 from wlm.formats.light import read_light
 
 RGB, RGBA = ("R", "G", "B"), ("R", "G", "B", "A")
@@ -131,6 +133,18 @@ def test_astc_of_high_dynamic_range(tmp_path, block):
     pixels, names = _read(tmp_path / "a", make_ktx2(number, 50, 31, [blocks]))
     assert names == RGB and pixels.shape == (31, 50, 3)
     assert abs(pixels - light).mean() < 60 and abs(pixels - light).max() < 900
+
+
+def test_what_the_atlas_exports_is_read(tmp_path):
+    light = _light(8, 8, 4)
+    write_ktx2(tmp_path / "a", light[..., :3].tobytes(), 8, 8, "R16G16B16_SFLOAT")
+    np.testing.assert_array_equal(read_light(tmp_path / "a")[0], light[..., :3])
+    write_dds(tmp_path / "a", light.tobytes(), 8, 8, fmt="R16G16B16A16_FLOAT")
+    np.testing.assert_array_equal(read_light(tmp_path / "a")[0], light)
+    blocks = encode_bc6h(light[..., :3], "fast", "test")
+    write_ktx2(tmp_path / "a", blocks, 8, 8, "BC6H_UFLOAT_BLOCK")
+    write_dds(tmp_path / "b", blocks, 8, 8, fmt="BC6H_UF16")
+    np.testing.assert_array_equal(read_light(tmp_path / "a")[0], read_light(tmp_path / "b")[0])
 
 
 def test_a_picture_of_several_bands_is_one(tmp_path, monkeypatch):

@@ -29,6 +29,8 @@ a time outside [0, period)            error: 24 h is 0 h, and wrapping would hid
 a NaN or infinite time                error
 frames, mask or `set.json` that     error that names both files
 disagree in size
+PNG, integers, arrays, cubes, XYZ,    error that says what was found; what is read: docs/formats.md
+and what else is no linear light
 a file missing or damaged, a          error that names the file, and the field
 malformed `set.json` or `config.json`
 ====================================  ================================================================
