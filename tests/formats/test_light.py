@@ -231,6 +231,8 @@ def test_a_wrong_field_of_ktx2_is_named(tmp_path, at, value, words):
     ],
 )
 def test_other_orders_are_refused(tmp_path, pairs, words):
+    content = make_ktx2(90, 5, 3, [_light(3, 5).tobytes()], pairs={"KTXorientation": "rd", "KTXswizzle": "rgb1"})
+    np.testing.assert_array_equal(_read(tmp_path / "a", content)[0], _light(3, 5))
     (tmp_path / "a.ktx2").write_bytes(make_ktx2(90, 5, 3, [_light(3, 5).tobytes()], pairs=pairs))
     assert words in error_of(read_light, tmp_path / "a.ktx2")
 

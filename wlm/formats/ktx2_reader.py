@@ -126,7 +126,8 @@ def read_ktx2(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]
         if stored > 2 * expected + 1024:  # no packer makes it longer than that
             raise WlmError(f"{path}: byteLength of level 0: expected at most {2 * expected + 1024}, found {stored}")
         _check_descriptor(path, _part(path, file, held, *descriptor, "the data format descriptor", _DESCRIPTOR_BYTES))
-        right, down = _orientation(path, _part(path, file, held, *pairs, "the key/value data", _PAIRS_BYTES))
+        words = _part(path, file, held, *pairs, "the key/value data", _PAIRS_BYTES)
+        right, down = _orientation(path, words, layout.channels)
         data = _part(path, file, held, start, stored, "level 0", stored)
     if scheme == _ZSTD:
         data = unpack_zstd(path, data, expected)
@@ -160,7 +161,7 @@ def _check_descriptor(path: str | os.PathLike[str], data: bytes) -> None:
         raise WlmError(f"{path}: the data format descriptor: expected linear light (transfer 1), found {transfer}")
 
 
-def _orientation(path: str | os.PathLike[str], data: bytes) -> tuple[bool, bool]:
+def _orientation(path: str | os.PathLike[str], data: bytes, channels: int) -> tuple[bool, bool]:
     """Whether columns go to the right and rows down, as they do without a word; checks the order of channels."""
     found = {b"KTXorientation": b"rd", b"KTXswizzle": b"rgba"}
     at = 0
@@ -175,7 +176,7 @@ def _orientation(path: str | os.PathLike[str], data: bytes) -> tuple[bool, bool]
     orientation, swizzle = found.values()
     if orientation not in (b"rd", b"ru", b"ld", b"lu"):
         raise WlmError(f"{path}: KTXorientation: expected rd, ru, ld or lu, found {orientation[:20]}")
-    if swizzle[:3] != b"rgb":
+    if swizzle[:channels] != b"rgba"[:channels]:
         raise WlmError(f"{path}: KTXswizzle: expected rgba, found {swizzle[:20]}")
     return orientation[:1] == b"r", orientation[1:] == b"d"
 
