@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from builders.small_sets import moving_light
 
-from wlm.baselines.lightmap import FEW, RIVALS, encode_set, evaluate_rivals, few
+from wlm.baselines.lightmap import FEW, RIVALS, encode_set, evaluate_rivals, usual
 from wlm.baselines.lightmap_ntc import LADDER, Latents, encode_ntc
 from wlm.errors import WlmError
 from wlm.lightmap.data import from_arrays
@@ -116,7 +116,8 @@ def test_it_is_a_method_that_takes_a_device(monkeypatch):
     moving = moving_light(24, 24)
     names = [name for name, method in RIVALS.items() if method.fitted]
     assert names == [f"ntc-{name}" for name in LADDER]
-    assert few("cpu") == FEW and few("cuda:0") == (*FEW, "ntc-medium")
+    assert usual("cpu", quick=True) == FEW and usual("cuda:0", quick=True) == (*FEW, "ntc-medium")
+    assert set(usual("cuda:0")) - set(usual("cpu")) == set(names) and usual("cuda:0") == tuple(RIVALS)
     calls = []
 
     def fake(frames, mask, **options):
