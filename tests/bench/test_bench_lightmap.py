@@ -8,8 +8,7 @@ from builders.bench_rows import check_command, check_outputs, keys
 from typer.testing import CliRunner
 
 import wlm.bench.lightmap as bench
-from wlm.baselines.lightmap import FEW
-from wlm.baselines.lightmap import RIVALS as ALL
+from wlm.baselines.lightmap import FEW, usual
 from wlm.bench import read_json
 from wlm.bench.lightmap import PANELS, _quick_times, run, run_rivals, run_rows
 from wlm.cli.bench import app
@@ -138,12 +137,12 @@ def test_a_quick_run_has_few_rivals_and_a_full_one_all(monkeypatch):
     for quick in (True, False):
         run(quick=quick, device="cpu", set_path="set")
     run(quick=False, device="cpu", set_path="set", rivals=False)
-    assert calls == [FEW, tuple(ALL), ()]
+    assert calls == [FEW, usual("cpu"), ()]
 
 
 def test_the_rivals_alone(rows, lightmaps, monkeypatch, tmp_path):
     monkeypatch.setattr(bench, "load", lambda path: lightmaps)
-    monkeypatch.setattr(bench, "few", lambda device: ("bc7", "av1-75"))
+    monkeypatch.setattr(bench, "usual", lambda device, quick: ("bc7", "av1-75"))
     lines = []
     alone = run_rivals(quick=True, set_path="set", progress=lines.append)
     assert keys(alone) == [("BC7", ""), ("AV1", "75")] and len(lines) == 2
@@ -154,7 +153,7 @@ def test_the_rivals_alone(rows, lightmaps, monkeypatch, tmp_path):
     words = ["lightmap", "--rivals-only", "--json", str(tmp_path / "rivals.json")]
     result = CliRunner().invoke(app, words)
     assert result.exit_code == 0 and "AV1" in result.output
-    assert read_json(tmp_path / "rivals.json")[1]["command"] == "wlm bench lightmap --rivals-only"
+    assert read_json(tmp_path / "rivals.json")[1]["command"] == "wlm bench lightmap --rivals-only --device cpu"
     # One rival replaces its row alone.
     replaced = alone[0].with_figures(psnr=1.0)
     monkeypatch.setattr(bench, "run_rivals", lambda **options: [replaced])

@@ -99,13 +99,18 @@ RIVALS: dict[str, Method] = {
 FEW = ("bc6h", "bc7", "astc6", "astc8", "astc12", "8bit", "pca-bc4-4", "av1-75", "av1-92")
 """Those of a quick look, which need no GPU."""
 
-FITTED = ("ntc-medium",)
-"""Those that a quick look on a GPU adds."""
+_FEW_FITTED = ("ntc-medium",)
 
 
-def few(device: str) -> tuple[str, ...]:
-    """The methods of a quick look on a device."""
-    return FEW if device == "cpu" else FEW + FITTED
+def usual(device: str, quick: bool = False) -> tuple[str, ...]:
+    """The methods of a run that names none: on a CPU without those that are fitted, which takes hours there.
+
+    Args:
+        device: "cpu", "cuda" or "cuda:N".
+        quick: A third of them.
+    """
+    names = FEW + _FEW_FITTED if quick else tuple(RIVALS)
+    return tuple(name for name in names if device != "cpu" or not RIVALS[name].fitted)
 
 
 @dataclass(frozen=True)
@@ -198,7 +203,7 @@ def evaluate_rivals(
     Args:
         model: The model to compare with: it says which tiles are scored.
         lightmaps: The input.
-        names: Keys of `RIVALS`; None: `few` of the device.
+        names: Keys of `RIVALS`; None: a third of them, see `usual`.
         metrics, views: As for `wlm.lightmap.evaluate`.
         device: As for `encode_set`.
         progress: Called about twice a second.
@@ -210,7 +215,7 @@ def evaluate_rivals(
         WlmError: As `wlm.lightmap.evaluate`, an unknown name, or the extra `baselines` is missing.
     """
     device = check_device(device)
-    names = few(device) if names is None else names
+    names = usual(device, quick=True) if names is None else names
     mask, count = scored_mask(model, lightmaps), len(lightmaps.frames)
     plain, seen = [metric for metric in metrics if metric != "seen"], "seen" in metrics
     meter = Meter(progress, "baselines", len(names) * count)

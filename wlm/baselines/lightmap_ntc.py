@@ -40,6 +40,7 @@ _TURNS = (1, 2)  # of the place in a cell
 _CENTRE = math.sqrt(12.0)  # latents that are uniform in [0, 1] have mean 0 and variance 1 as inputs
 _FREEZE_FROM = 0.95  # of the steps
 _LATENT_RATE, _NETWORK_RATE = 5e-2, 2e-2  # Adam's first
+_BETAS = (0.9, 0.99)  # of Adam; a latent is sampled every few steps alone, and its gradient shrinks during a fit
 _TUNE_RATE = 1e-3  # of the network when latents are frozen; falls to a hundredth
 _LAST = 0.02  # of the network's rate before that, as a share of the first
 _RING_WEIGHT = 0.25  # of the squared error of texels that only filtered reads take in
@@ -247,7 +248,7 @@ class _Fit:
         """Fits latents and network, then the network to rounded latents."""
         freeze = math.ceil(_FREEZE_FROM * steps)
         groups = [{"params": self._latents}, {"params": self._network}]
-        adam = torch.optim.Adam(groups, fused=True, eps=1e-10)
+        adam = torch.optim.Adam(groups, fused=True, eps=1e-10, betas=_BETAS)
         for step in range(freeze):
             share = 0.5 * (1.0 + math.cos(math.pi * step / steps))
             adam.param_groups[0]["lr"] = _LATENT_RATE * share
@@ -259,7 +260,7 @@ class _Fit:
         with torch.no_grad():
             for values, top in zip(self._latents, _TOPS, strict=True):
                 values.mul_(top).round_().div_(top)
-        adam = torch.optim.Adam(self._network, fused=True, eps=1e-10)
+        adam = torch.optim.Adam(self._network, fused=True, eps=1e-10, betas=_BETAS)
         for step in range(freeze, steps):
             adam.param_groups[0]["lr"] = _TUNE_RATE * ((steps - step) / (steps - freeze) + 0.01)
             self._descend(adam, noise=False)

@@ -15,13 +15,15 @@ from torch.nn import functional
 
 from wlm.baselines.rival import EXTRA
 from wlm.formats.hdr_blocks import need
-from wlm.lightmap.model import TILE, Profile, TimeAxis, encode_time
-from wlm.lightmap.trainer import Targets
+from wlm.lightmap.model import Profile, TimeAxis, encode_time
+from wlm.lightmap.targets import Targets
+from wlm.lightmap.tiles import TILE
 from wlm.ops import plain
 
 _BLOCK = 4  # texels along a BC7 block's side
 _ENCODED = 4  # numbers of gamma(t)
 _CENTRE = math.sqrt(12.0)
+_MOMENTUM = 0.9  # Adam's decay of gradients
 _LEAST = 0.02  # of a colour over its scale, where errors are weighted by it: keeps black texels in the fit
 
 
@@ -131,7 +133,8 @@ class PlainFit:
         self.parameters = maps + net
         self.tile_bytes = f.bytes + 2 * sum(value[0].numel() for value in net) + 4 * times + 12
         groups = [{"params": maps, "lr": profile.map_rate}, {"params": net, "lr": profile.net_rate}]
-        self._adam = torch.optim.Adam(groups, fused=True, eps=profile.adam_epsilon)
+        betas = (_MOMENTUM, profile.adam_decay)
+        self._adam = torch.optim.Adam(groups, fused=True, eps=profile.adam_epsilon, betas=betas)
         final, last = profile.final_rate, max(profile.steps - 1, 1)
         self._schedule = torch.optim.lr_scheduler.LambdaLR(
             self._adam, lambda s: final + (1 - final) * 0.5 * (1 + math.cos(math.pi * min(s / last, 1)))

@@ -28,7 +28,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from wlm.baselines.lightmap import RIVALS, check_rival, encode_set, few
+from wlm.baselines.lightmap import RIVALS, check_rival, encode_set, usual
 from wlm.baselines.lightmap_torch import PlainFit
 from wlm.bench.plot import Panel
 from wlm.bench.rows import Row
@@ -107,37 +107,38 @@ def run(
             for profile in profiles
         ]
         chosen = _quick_times(lightmaps.times)
-    names = _names(quick, device) if rivals else ()
+    names = usual(device, quick) if rivals else ()
     return run_rows(lightmaps, profiles, device=device, chosen=chosen, rivals=names, progress=progress)
 
 
 def run_rivals(
     *,
     quick: bool = False,
-    set_path: str | os.PathLike[str] | None = None,
     device: str = "cpu",
+    set_path: str | os.PathLike[str] | None = None,
     names: Sequence[str] | None = None,
     progress: Note | None = None,
 ) -> list[Row]:
-    """Measures the rivals alone: on the CPU, but for those that are fitted.
+    """Measures the rivals alone.
 
     Args:
         quick, set_path, progress: As for `run`.
-        device: Of the rivals that are fitted.
-        names: Keys of `wlm.baselines.lightmap.RIVALS`; None: all, or with `quick` a third of them.
+        device: "cpu" or "cuda:0", for the rivals that are fitted; the others run on the CPU.
+        names: Keys of `wlm.baselines.lightmap.RIVALS`; None: all, or with `quick` a third of them, and on the CPU
+            without those that are fitted.
 
     Returns:
         Their rows.
 
     Raises:
-        WlmError: The set isn't there, or a name is unknown.
+        WlmError: The set or the device isn't there, or a name is unknown.
     """
     for name in names or ():
         check_rival(name)
     lightmaps = _load(set_path)
     chosen = _quick_times(lightmaps.times) if quick else np.arange(len(lightmaps.times))
     bench = _LightmapBench(lightmaps, chosen, device, progress, None)
-    return [bench.rival_row(name) for name in names or _names(quick, device)]
+    return [bench.rival_row(name) for name in names or usual(bench.device, quick)]
 
 
 def run_rows(
@@ -179,10 +180,6 @@ def run_rows(
 
 def _load(set_path: str | os.PathLike[str] | None) -> LightmapSet:
     return load(demo_data("city", "--set PATH") if set_path is None else set_path)
-
-
-def _names(quick: bool, device: str) -> tuple[str, ...]:
-    return few(device) if quick else tuple(RIVALS)
 
 
 def _quick_times(times: np.ndarray) -> np.ndarray:

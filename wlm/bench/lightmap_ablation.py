@@ -29,8 +29,8 @@ from wlm.lightmap.data import LightmapSet, load
 from wlm.lightmap.decode import Decoder
 from wlm.lightmap.evaluation import memory_bytes
 from wlm.lightmap.fit import compress, dynamic_targets
-from wlm.lightmap.model import TILE, Profile, TimeAxis
-from wlm.lightmap.tiles import TileGrid, assemble
+from wlm.lightmap.model import Profile, TimeAxis
+from wlm.lightmap.tiles import TILE, TileGrid, assemble
 from wlm.metrics import evaluate_frame, summarise
 
 METHOD = "ablation"
