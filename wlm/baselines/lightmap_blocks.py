@@ -17,11 +17,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from wlm.formats.block_reuse import reuse_blocks
 from wlm.baselines.lightmap_levels import TileRanges, clear_unseen, prepare, seen_texels, to_codes
 from wlm.baselines.rival import EXTRA, Rival, disk_size, measure
 from wlm.errors import WlmError
 from wlm.formats import bc7_modes, hdr_blocks
+from wlm.formats.block_reuse import reuse_blocks
 from wlm.formats.hdr_blocks import ASTC_THOROUGH, need
 from wlm.lightmap.model import TILE
 from wlm.metrics import evaluate_frame, summarise
