@@ -20,10 +20,11 @@ from wlm.lightmap.evaluation import count_kinds, memory_bytes, part_bytes
 from wlm.lightmap.exact import bound64, colour_tile64, decode_tile64
 from wlm.lightmap.fit import compress, open_checkpoint
 from wlm.lightmap.frame_packing import needed_blocks
-from wlm.lightmap.frames import round_half
+from wlm.lightmap.frames import choose_frames, round_half
 from wlm.lightmap.gaps import Gaps
 from wlm.lightmap.model import Profile
 from wlm.lightmap.runtime import FrameDecoder
+from wlm.lightmap.tiles import TileKind, classify, split
 from wlm.metrics import evaluate_frame, summarise
 
 DEMO = Path(__file__).resolve().parents[2] / "demos" / "data" / "city"
@@ -174,11 +175,22 @@ def test_rate_distortion_trades_bytes_for_quality(two_hours):
     ids=["two", "three", "large maps", "one", "static", "never", "always"],
 )
 def test_a_tile_is_frames_where_that_takes_no_more(lightmaps, settings, kind):
-    model = compress(lightmaps, "M", steps=10, samples=128, **settings)
-    assert count_kinds(model)[kind] == 1
-    network = model.profile.tile_bytes(kind != "static")
-    frames = model.profile.frames_bytes(len(lightmaps.times), 1.0)
-    assert settings.get("frames") or (kind == "frames") == (frames <= network)
+    profile, count = Profile.load("M").override(settings), len(lightmaps.times)
+    kinds = classify(split(lightmaps, profile.gamma), profile.gamma)
+    chosen = choose_frames(kinds, [0], lightmaps.mask, count, profile)
+    assert ("frames" if chosen[0] else TileKind(kinds[0]).name.lower()) == kind
+    assert "frames" in settings or chosen[0] == (count * 16384 < profile.tile_bytes(kinds[0] == TileKind.DYNAMIC))
+
+
+def test_blocks_that_nothing_needs_count_for_neither():
+    profile, count = Profile.load("M"), 12
+    for width, chosen in ((12, True), (40, False)):
+        mask = np.zeros((128, 128), bool)
+        mask[:, :width] = True
+        needed = -(-(width + 2) // 4) / 32
+        assert (profile.frames_bytes(count, needed) < profile.tile_bytes(True) - (1 - needed) * 16384) == chosen
+        assert choose_frames(np.array([TileKind.DYNAMIC]), [0], mask, count, profile)[0] == chosen
+        assert not choose_frames(np.array([TileKind.CONSTANT]), [0], mask, count, profile)[0]
 
 
 def test_without_the_encoder_a_network_is_fitted_and_that_is_said(monkeypatch, tmp_path):

@@ -23,9 +23,9 @@ class Decoder:
     """Holds a model's stored bytes on a device and decodes from them.
 
     Between two stored times light is the mix of their radiance (eq. 2), or what the network makes of features that are
-    interpolated, see `Profile.interpolation`; frames are always mixed; times outside the day wrap round, or stop at the first and last where
-    the set isn't periodic. Texels of the gaps within two of a chart have the light of the nearest valid texel, so that
-    a map can be filtered.
+    interpolated, see `Profile.interpolation`; frames are always mixed. Times outside the day wrap round, or stop at the
+    first and last where the set isn't periodic. Texels of the gaps within two of a chart have the light of the nearest
+    valid texel, so that a map can be filtered.
     """
 
     def __init__(self, model: LightmapModel, device: str = "cpu", gelu: str | None = None) -> None:

@@ -59,10 +59,10 @@ def export(model: LightmapModel, directory: str | os.PathLike[str], *, device: s
 
     For tile N of the grid, with four digits: `tile_N_uv.dds`, F_uv in BC7, and of a dynamic tile also
     `tile_N_uvt.dds`, F_uvt as a BC7 volume whose depth is time, and `tile_N_ut.dds` and `tile_N_vt.dds`,
-    F_ut and F_vt in R8G8_UNORM with time down the rows (neural-dynamic-gi, Table 1). The blocks are the model's
-    own bytes. A tile of frames has `tile_N_frame_I.dds`, BC7, for each stored time I. `decode.glsl` is the decoder; `valid.png` is white inside charts, for the pass that fills the gaps;
-    `frame.exr` is the map at the first stored time, as the shader should show it; `weights.json` explains itself under
-    "about".
+    F_ut and F_vt in R8G8_UNORM with time down the rows (neural-dynamic-gi, Table 1); of a tile of frames
+    `tile_N_frame_I.dds` in BC7 for each stored time I. The blocks are the model's own bytes. `decode.glsl` is the
+    decoder; `valid.png` is white inside charts, for the pass that fills the gaps; `frame.exr` is the map at the first
+    stored time, as the shader should show it; `weights.json` explains itself under "about".
 
     The files are written beside the folder and moved in together, `weights.json` last. An earlier export is replaced,
     and textures of tiles that are no longer there are removed; other files stay.

@@ -2,8 +2,8 @@
 
 `wlm.lightmap.Decoder` returns arrays on the host; these are for a renderer's loop. Each holds the tiles of one kind: a
 whole map is a `StripDecoder`, or on CUDA a `MatrixDecoder` where networks are wide, an `ExactDecoder` of the static
-tiles and a `FrameDecoder` of those of frames if there are any, and `Decoder.tiles_8bit` for the constant tiles, one colour each, which need no launch. Gaps
-take the light of charts in tiles of the same decoder.
+tiles and a `FrameDecoder` of those that are frames, if there are any, and `Decoder.tiles_8bit` for the constant tiles,
+one colour each, which need no launch. Gaps take the light of charts in tiles of the same decoder.
 """
 
 import numpy as np
