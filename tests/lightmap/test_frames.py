@@ -1,17 +1,20 @@
 """Tiles stored as frames: when they are chosen, what they decode to, and what their bytes may be."""
 
 import dataclasses
+import json
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 from builders.checks import assert_same, error_of
-from builders.small_sets import moving_light, static_light, tiny_profile
+from builders.small_sets import moving_light, static_light, tiny_profile, write_set
 from builders.synthetic import any_blocks, random_model
+from typer.testing import CliRunner
 
 import wlm
 from wlm.baselines.lightmap import encode_set
+from wlm.cli.app import app
 from wlm.errors import WlmError
 from wlm.formats.artifact import read_artifact, write_artifact
 from wlm.lightmap.data import from_arrays
@@ -28,6 +31,7 @@ from wlm.lightmap.tiles import TileKind, classify, split
 from wlm.metrics import evaluate_frame, summarise
 
 DEMO = Path(__file__).resolve().parents[2] / "demos" / "data" / "city"
+FILES = Path(__file__).resolve().parents[1] / "files"
 KINDS = (4, 3, 1, 4)
 TIMES = (7.5, 10.0, 23.0)
 
@@ -184,7 +188,7 @@ def test_a_tile_is_frames_where_that_takes_no_more(lightmaps, settings, kind):
 
 def test_blocks_that_nothing_needs_count_for_neither():
     profile, count = Profile.load("M"), 12
-    for width, chosen in ((12, True), (40, False)):
+    for width, chosen in ((6, True), (12, False)):
         mask = np.zeros((128, 128), bool)
         mask[:, :width] = True
         needed = -(-(width + 2) // 4) / 32
@@ -211,6 +215,19 @@ def test_without_the_encoder_a_network_is_fitted_and_that_is_said(monkeypatch, t
     random_model((4, 0)).decoder().frame(3.0)  # reading needs no encoder
 
 
+def test_the_command_says_that_the_encoder_is_missing(monkeypatch, tmp_path):
+    write_set(tmp_path / "set", moving_light(24, 40, hours=(6.0,)))
+    profile = tiny_profile(frames="auto", steps=10).model_dump(mode="json")
+    (tmp_path / "tiny.yaml").write_text(json.dumps(profile))
+    command = ["lightmap", "compress", str(tmp_path / "set"), "--profile", str(tmp_path / "tiny.yaml")]
+    for missing, kind in ((False, "frames"), (True, "static")):
+        if missing:
+            monkeypatch.setitem(sys.modules, "ispc_texcomp", None)
+        done = CliRunner().invoke(app, [*command, "-o", str(tmp_path / "a.wlm")])
+        assert done.exit_code == 0 and ("needs the extra: pip install 'wlm[frames]'" in done.output) == missing
+        assert count_kinds(wlm.load(tmp_path / "a.wlm"))[kind] == 1
+
+
 def test_a_file_without_the_setting_was_made_without_frames(tmp_path):
     random_model((3, 0)).save(tmp_path / "a.wlm")
     artifact = read_artifact(tmp_path / "a.wlm")
@@ -232,3 +249,10 @@ def test_any_block_may_lie_beside_any(device):
         one = np.broadcast_to(frames[:, :, y // 4, x // 4][:, :, None, None], frames.shape)
         alone = Decoder(dataclasses.replace(model, frames=np.ascontiguousarray(one)), device).tiles([0], 0.0)[0]
         assert np.array_equal(alone[y % 4, x % 4], light[y, x])
+
+
+def test_a_kept_file_decodes_as_when_it_was_written(device):
+    """Two hours of one tile with gaps, blocks of all modes."""
+    model = wlm.load(FILES / "lightmap-frames.wlm")
+    with np.load(FILES / "lightmap-frames.npz") as stored:
+        np.testing.assert_allclose(model.decoder(device).frame(8.25), stored["frame"], rtol=1e-5)
