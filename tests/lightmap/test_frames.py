@@ -162,7 +162,7 @@ def test_two_states_are_as_good_as_bc7_in_fewer_bytes(two_hours, tmp_path):
 def test_rate_distortion_trades_bytes_for_quality(two_hours):
     models = [compress(two_hours, "frames", frames_loss=loss) for loss in (0.0, 1.0)]
     scores = [wlm.lightmap.evaluate(model, two_hours, metrics=("psnr",)) for model in models]
-    assert scores[1].bytes < 0.8 * scores[0].bytes and scores[0].psnr - 1.0 < scores[1].psnr < scores[0].psnr
+    assert scores[1].bytes < 0.9 * scores[0].bytes and scores[0].psnr - 1.0 < scores[1].psnr < scores[0].psnr
 
 
 @pytest.mark.parametrize(

@@ -16,8 +16,9 @@ from wlm.lightmap.frame_packing import needed_blocks
 from wlm.lightmap.frames import choose_frames, encode_frames, missing_encoder
 from wlm.lightmap.model import LightmapModel, Profile, encode_scale, part_table
 from wlm.lightmap.packing import check_packable, clear_unused
+from wlm.lightmap.targets import Targets
 from wlm.lightmap.tiles import TILE, TileGrid, TileKind, channel_means, classify, split
-from wlm.lightmap.trainer import Targets, Trainer
+from wlm.lightmap.trainer import Trainer
 from wlm.system import Meter, OnProgress
 
 BATCH_TEXELS = 64 * 26 * TILE * TILE  # texels times times in a batch: 64 tiles of 26 times, 330 MB of targets

@@ -72,7 +72,8 @@ def encode_frames(
         colour: float32 [T, 128, 128, 3], in gamma space, gaps filled.
         valid: bool [128, 128].
         needed: bool [32, 32], from `needed_blocks`.
-        loss: Of rate-distortion optimisation (`wlm.formats.block_reuse`), in levels of 255; 0 for none.
+        loss: Of rate-distortion optimisation (`wlm.formats.block_reuse`): what the root mean square error of a block's
+            seen texels may grow by, in squares, in levels of 255; 0 for none.
 
     Returns:
         Blocks uint8 [T, 32, 32, 16], and ranges half [T, 2, 3], least and greatest.
@@ -92,8 +93,9 @@ def encode_frames(
         weight = np.tile(np.repeat(weight[..., None], 3, axis=2), (len(colour), 1, 1))
         decoded = blocks_image(decode_blocks(blocks))[..., :3] / np.float32(255.0)
         kept = np.tile(needed, (len(colour), 1))
-        values = (by_block(image)[kept.ravel()] for image in (decoded, levels, weight))
-        blocks[kept] = reuse_in_order(blocks[kept], *values, loss / 255.0, _WINDOW)
+        images = decoded, levels, weight, weight * np.float32(loss / 255.0) ** 2
+        values = (by_block(image)[kept.ravel()] for image in images)
+        blocks[kept] = reuse_in_order(blocks[kept], *values, _WINDOW)
     return clear_unneeded(blocks.reshape(len(colour), BLOCKS, BLOCKS, -1), needed), ranges
 
 
