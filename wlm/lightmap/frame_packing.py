@@ -46,7 +46,7 @@ def needed_blocks(mask: np.ndarray, number: int) -> np.ndarray:
     part = mask[max(y - REACH, 0) : y + TILE + REACH, max(x - REACH, 0) : x + TILE + REACH]
     top, left = REACH - min(y, REACH), REACH - min(x, REACH)
     near[top : top + part.shape[0], left : left + part.shape[1]] = part
-    for axis in (0, 1):
+    for axis in () if part.all() or not part.any() else (0, 1):
         shifted = [np.roll(near, step, axis) for step in range(-REACH, REACH + 1)]
         near = np.logical_or.reduce(shifted)
     near = near[REACH:-REACH, REACH:-REACH]
