@@ -13,7 +13,7 @@ import wlm
 from wlm.errors import WlmError
 from wlm.formats.artifact import read_artifact, write_artifact
 
-MODELS = ("lightmap", "probe", "atlas-tiles", "atlas-cascade", "atlas-bc6h", "smoke")
+MODELS = ("lightmap", "lightmap-frames", "probe", "atlas-tiles", "atlas-cascade", "atlas-bc6h", "smoke")
 MOST = 10  # parts of a file that are tried: a network's weights are all alike
 
 WEIRD = {
@@ -182,6 +182,15 @@ def test_a_few_bytes_that_claim_a_large_lightmap(path):
     refused(kept, path, "size: expected at least 1x1 texels, at most 65536 along a side and 268435456 in all")
     rewrite(path, {"size": [16384, 16384]}, {"kind": np.zeros(16384, np.uint8)})
     assert wlm.load(path).width == 16384
+
+
+def test_a_few_bytes_that_claim_many_frames(path):
+    kept = written(path, "lightmap-frames")
+    kind, times = np.full(16384, 4, np.uint8), np.arange(8, dtype=np.float64)
+    ranges, sizes = np.zeros((16384, 8, 2, 3), np.float16), np.zeros(16384, np.uint32)
+    parts = {"kind": kind, "times": times, "mask": GONE, "ranges": ranges, "frame_sizes": sizes}
+    rewrite(path, {"size": [16384, 16384]}, parts | {"frames": np.zeros(0, np.uint8)})
+    refused(kept, path, "part frames: expected at most 256 times its 0 bytes")
 
 
 def test_a_few_bytes_that_claim_a_large_atlas(path):

@@ -44,8 +44,15 @@ def _written(write: Callable[[Path], Any]) -> bytes:
 def _lightmap() -> Kept:
     from builders.synthetic import random_model
 
-    ranges = {"kind": (2, 4), "times": (3, 24.5), "constant": (0, -1.0), "scale_static": (0, -0.5), "affine": (0, -1.0)}
+    ranges = {"kind": (2, 5), "times": (3, 24.5), "constant": (0, -1.0), "scale_static": (0, -0.5), "affine": (0, -1.0)}
     return Kept(_written(random_model(uvt_slices=1).save), wlm.load, {}, ranges)
+
+
+def _frames() -> Kept:
+    from builders.synthetic import random_model
+
+    ranges = {"kind": (1, 5), "ranges": ((0, 0, 0), 3.0)}
+    return Kept(_written(random_model((4, 0), times=(0.0, 7.5)).save), wlm.load, {}, ranges)
 
 
 def _probe() -> Kept:
@@ -196,6 +203,7 @@ KEPT: dict[str, Callable[[], Kept]] = {
     name: functools.cache(make)
     for name, make in {
         "lightmap": _lightmap,
+        "lightmap-frames": _frames,
         "probe": _probe,
         "atlas-tiles": lambda: _atlas("tiles", "half"),
         "atlas-cascade": lambda: _atlas("cascade", "half"),

@@ -13,9 +13,9 @@ HOURS = (0.0, 5.0, 11.0, 13.5, 20.0)
 
 
 def tiny_profile(**settings) -> Profile:
-    """Sizes that all these tests share, so that each kernel is compiled once."""
+    """Networks of sizes that all these tests share, so that each kernel is compiled once; no tile is frames."""
     sizes = {"hidden": 16, "uvt_resolution": 8, "uvt_slices": 4, "plane_columns": 16, "plane_rows": 8}
-    return Profile(name="tiny", **sizes | {"steps": 20, "samples": 128} | settings)
+    return Profile(name="tiny", **sizes | {"steps": 20, "samples": 128, "frames": "never"} | settings)
 
 
 def moving_light(height=128, width=128, hours=HOURS, period=24.0, mask=None, seed=0, gain=1.0) -> LightmapSet:

@@ -3,6 +3,7 @@
 import numpy as np
 
 from wlm.formats.bc7 import pack_mode6
+from wlm.lightmap.frame_packing import clear_unneeded, needed_blocks
 from wlm.lightmap.model import LightmapModel, Profile
 from wlm.lightmap.tiles import TileGrid, TileKind
 from wlm_kernels import mlp
@@ -23,7 +24,7 @@ def random_model(
     mapped, r = dynamic + static, profile.uvt_resolution // 4
     # The map ends inside its last row and column of tiles.
     height, width = rows * 128 - 20, columns * 128 - 9
-    assert TileGrid.of(height, width).count == len(kind) and max(kinds) <= TileKind.DYNAMIC
+    assert TileGrid.of(height, width).count == len(kind) and max(kinds) <= max(TileKind)
 
     def blocks(*shape):
         lowest = rng.integers(0, 2, (*shape, 2, 1))
@@ -39,6 +40,12 @@ def random_model(
     # A channel's code 0 is black at that time; the bound, 255, is far above every mean.
     scale = rng.integers(86, 161, (dynamic, len(times), 3), np.uint8)
     scale[:1, -1, 2] = 0
+    mask = np.ones((height, width), bool) if mask is None else mask
+    framed = np.flatnonzero(kind == TileKind.FRAMES)
+    frames = any_blocks(len(framed), len(times), 32, 32, seed=seed)
+    for i, number in enumerate(framed.tolist()):
+        frames[i] = clear_unneeded(frames[i], needed_blocks(mask, number))
+    ranges = np.sort(rng.uniform(0.0, 1.5, (len(framed), len(times), 2, 3)), axis=2)
     return LightmapModel(
         name="random",
         width=width,
@@ -47,7 +54,7 @@ def random_model(
         period=period,
         source="0123456789abcdef",
         profile=profile,
-        mask=np.ones((height, width), bool) if mask is None else mask,
+        mask=mask,
         kind=kind,
         uv=blocks(mapped, 32, 32),
         uvt=blocks(dynamic, profile.uvt_slices, r, r),
@@ -60,4 +67,14 @@ def random_model(
         peak=rng.integers(161, 191, (mapped, len(times)), np.uint8),
         affine=affine.astype(np.float16),
         constant=rng.uniform(0.0, 3.0, (constant, len(times), 3)).astype(np.float16),
+        frames=frames,
+        ranges=ranges.astype(np.float16),
     )
+
+
+def any_blocks(*shape, seed=0) -> np.ndarray:
+    """Random BC7 blocks uint8 [*shape, 16], as many of each mode: any bits are a block once the mode's are set."""
+    blocks = np.random.default_rng(seed).integers(0, 256, (*shape, 16), np.uint8)
+    mode = (np.arange(blocks[..., 0].size) % 8).reshape(shape)
+    blocks[..., 0] = (blocks[..., 0] & ~((2 << mode) - 1) & 255) | 1 << mode
+    return blocks

@@ -248,7 +248,13 @@ class _diverging:
 
 
 READERS = (
-    Reader("lightmap", "a.wlm", stored("lightmap.wlm", "lightmap-packed.wlm"), vary_artifact, _lightmap),
+    Reader(
+        "lightmap",
+        "a.wlm",
+        stored("lightmap.wlm", "lightmap-packed.wlm", "lightmap-frames.wlm"),
+        vary_artifact,
+        _lightmap,
+    ),
     Reader("probe", "a.wlm", stored("probe.wlm"), vary_artifact, _probe),
     Reader(
         "atlas",

@@ -31,6 +31,7 @@ MODULES = (
     "interpolate",
     "lightmap.blocks",
     "lightmap.decode",
+    "lightmap.frames",
     "lightmap.gather",
     "lightmap.matrix_decode",
     "lightmap.output",

@@ -15,6 +15,7 @@ from scipy.special import erf
 
 from wlm.errors import WlmError
 from wlm.formats.bc7 import decode_image
+from wlm.formats.bc7_modes import blocks_image, decode_blocks
 from wlm.formats.exr import read_exr
 from wlm.lightmap.decode import Decoder
 from wlm.lightmap.exact import colour_tile64, decode_tile64
@@ -29,6 +30,8 @@ AXES = [
     {"time_axis": "paper", "gelu": "tanh"},
     {"interpolation": "network"},
     {"time_axis": "paper", "period": None, "times": (2.0, 7.5, 20.0), "interpolation": "network"},
+    {"kinds": (4, 3, 4, 4)},
+    {"kinds": (4, 2, 1, 4), "interpolation": "network", "period": None},
 ]
 
 
@@ -90,6 +93,13 @@ def features(folder, number, dynamic, tau, repeats):
     return np.concatenate(parts, axis=2)
 
 
+def frame_light(folder, tile, i, gamma):
+    """Radiance of a tile of frames at stored time i."""
+    level = read_texture(folder / f"tile_{tile['number']:04d}_frame_{i:04d}.dds")[0, ..., :3]
+    least, greatest = (np.array(tile[name][i]) for name in ("least", "greatest"))
+    return (least + level * (greatest - least)) ** gamma
+
+
 def frame_from_files(folder, t):
     """The whole map in float64 from the exported files alone."""
     document = json.loads((folder / "weights.json").read_text())
@@ -111,6 +121,8 @@ def frame_from_files(folder, t):
     for tile in document["tiles"]:
         if tile["kind"] == "constant":
             radiance = mixed(tile["radiance"])
+        elif tile["kind"] == "frames":
+            radiance = mixed({i: frame_light(folder, tile, i, document["gamma"]) for i in {before, after}})
         else:
             x = features(folder, tile["number"], tile["kind"] == "dynamic", tau, document["time_axis"]["repeats"])
             for layer in "12":
@@ -136,16 +148,20 @@ def test_the_files_alone_give_the_decoders_light(settings, tmp_path):
 
 
 def test_other_decoders_read_the_textures(tmp_path):
-    model = random_model((3, 2, 0, 3))
+    model = random_model((3, 2, 4, 3), times=(0.0, 7.5))
     paths = export(model, tmp_path)
     names = [path.name for path in paths]
     assert sorted(names) == sorted(path.name for path in tmp_path.iterdir())
     parts = ["uv", "uvt", "ut", "vt"]
     stems = [f"tile_0000_{p}" for p in parts] + ["tile_0001_uv"] + [f"tile_0003_{p}" for p in parts]
+    stems += ["tile_0002_frame_0000", "tile_0002_frame_0001"]
     assert names == [f"{stem}.dds" for stem in stems] + ["decode.glsl", "frame.exr", "valid.png", "weights.json"]
     for place, number in enumerate((0, 1, 3)):
         with Image.open(tmp_path / f"tile_{number:04d}_uv.dds") as image:
             assert np.array_equal(np.asarray(image), decode_image(model.uv[place]))
+    for i in range(2):
+        frame = read_texture(tmp_path / f"tile_0002_frame_{i:04d}.dds")[0]
+        assert np.array_equal(np.rint(frame * 255.0), blocks_image(decode_blocks(model.frames[0, i])))
     for row, number in enumerate((0, 3)):
         volume = read_texture(tmp_path / f"tile_{number:04d}_uvt.dds")
         expected = np.stack([decode_image(blocks) for blocks in model.uvt[row]])
@@ -194,7 +210,7 @@ void main()
     ivec2 texel = ivec2(gl_GlobalInvocationID.xy);
     vec3 one = vec3(1.0);
     vec3 a = wlm_decode_dynamic(uv, uvt, ut, vt, texel, 0.25, 0, one, one, one);
-    vec3 b = wlm_decode_static(uv, texel, 600, one, one, one);
+    vec3 b = wlm_decode_static(uv, texel, 600, one, one, one) + wlm_decode_frame(uv, texel, one, a);
     imageStore(result, texel, vec4(wlm_radiance(a + b), 1.0));
 }
 """
@@ -273,10 +289,10 @@ int main()
     net.resize(floats);
     if (fread(net.data(), 8, floats, stdin) != size_t(floats)) return 1;
     uv.read();
-    if (dynamic) { uvt.read(); ut.read(); vt.read(); }
+    if (dynamic == 1) { uvt.read(); ut.read(); vt.read(); }
     vec3 scale(c[0], c[1], c[2]), shift(c[3], c[4], c[5]), spread(c[6], c[7], c[8]);
     for (int y = 0; y < 128; ++y) for (int x = 0; x < 128; ++x) {
-        vec3 colour = dynamic
+        vec3 colour = dynamic > 1 ? wlm_decode_frame(uv, ivec2{x, y}, scale, shift) : dynamic
             ? wlm_decode_dynamic(uv, uvt, ut, vt, ivec2{x, y}, tau, offset, scale, shift, spread)
             : wlm_decode_static(uv, ivec2{x, y}, offset, scale, shift, spread);
         vec3 radiance = wlm_radiance(colour);
@@ -318,6 +334,11 @@ def run_shader(program, folder, number, time):
     keys = ("W1", "b1", "W2", "b2", "W3", "b3")
     networks = [np.ravel(each[key]) for each in document["tiles"] if "W1" in each for key in keys]
     networks = np.concatenate(networks)
+    if tile["kind"] == "frames":
+        data = struct.pack("<3i10d", 2, 0, 0, 0.0, *tile["least"][before], *tile["greatest"][before], *[0.0] * 3)
+        texture = read_texture(folder / f"tile_{number:04d}_frame_{before:04d}.dds")
+        data += struct.pack("<5i", 0, *texture.shape[2::-1], texture.shape[3]) + texture.tobytes()
+        return run_program(program, data)
     scale = (1.0 - share) * np.array(tile["scale"][before]) + share * np.array(tile["scale"][after])
     dynamic = tile["kind"] == "dynamic"
     data = struct.pack("<3i", dynamic, document["time_axis"]["repeats"], tile["network_offset"])
@@ -326,6 +347,10 @@ def run_shader(program, folder, number, time):
     for part in ("uv", "uvt", "ut", "vt") if dynamic else ("uv",):
         texture = read_texture(folder / f"tile_{number:04d}_{part}.dds")
         data += struct.pack("<4i", *texture.shape[2::-1], texture.shape[3]) + texture.tobytes()
+    return run_program(program, data)
+
+
+def run_program(program, data):
     out = subprocess.run([program], input=data, capture_output=True, check=True).stdout
     out = np.frombuffer(out).reshape(128, 128, 6)
     return out[..., :3], out[..., 3:]
@@ -334,10 +359,10 @@ def run_shader(program, folder, number, time):
 @pytest.mark.skipif(shutil.which("g++") is None, reason="no C++ compiler is installed")
 @pytest.mark.parametrize("settings", [{"gelu": "exact"}, {"gelu": "tanh", "period": None}], ids=str)
 def test_the_shaders_arithmetic(settings, tmp_path):
-    model = random_model((2, 3, 1, 3), interpolation="network", **settings)
+    model = random_model((2, 3, 4, 3), interpolation="network", **settings)
     export(model, tmp_path / "export")
     program, folder = compile_shader(tmp_path / "export", DECODE), tmp_path / "export"
-    for number, time in ((0, 3.3), (1, 7.5), (3, 21.7)):
+    for number, time in ((0, 3.3), (1, 7.5), (2, 13.0), (3, 21.7)):
         colour, radiance = run_shader(program, folder, number, time)
         # The constants' 8 digits, the file's 9, and in the exact form erf's 1.5e-7: 1e-7 measured.
         np.testing.assert_allclose(colour, colour_tile64(model, number, time), rtol=0, atol=2e-6)

@@ -84,3 +84,10 @@ def test_what_cannot_be_chosen(light, wanted, message):
 def test_nothing_to_choose():
     grey = from_arrays(np.ones((2, 128, 128, 3)), (0.0, 12.0))
     assert "no tile changes over time" in error_of(choose, grey, tiny_profile(), max_bpp=8.0)
+
+
+def test_frames_have_no_size_to_choose(light):
+    line = error_of(choose, light, tiny_profile(frames="always"), max_bpp=1.0)
+    assert line == "rate: expected a profile of networks, got tiny, whose tiles are frames"
+    one = moving_light(hours=(6.0,))
+    assert "no tile changes over time" in error_of(choose, one, tiny_profile(frames="auto"), max_bpp=1.0)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from builders import atlas_meshes, atlas_models, probe_models, rooms, small_sets
+from builders.synthetic import random_model
 from PIL import Image
 
 import wlm
@@ -96,6 +97,20 @@ def test_lightmaps_decode_as_in_python(model, tmp_path, show, unpacked, interpol
         bound = expected.max() ** (1 / gamma)
         apart = np.abs(np.maximum(seen, 0.0) ** (1 / gamma) - expected ** (1 / gamma)) / bound
         assert apart.max() < 2 / 255
+
+
+@pytest.mark.parametrize(("unpacked", "interpolation"), [(False, "radiance"), (True, "radiance"), (True, "network")])
+def test_frames_of_all_modes_decode_as_in_python(tmp_path, show, unpacked, interpolation):
+    model = random_model((4, 1, 2, 4), times=(0.0, 7.5, 19.0), interpolation=interpolation)
+    model.save(tmp_path / "frames.wlm")
+    write_page(tmp_path / "page.html", [tmp_path / "frames.wlm"])
+    page = show(tmp_path / "page.html", unpacked=unpacked)
+    decoder = model.decoder()
+    for time in (7.5, 21.0):
+        expected = decoder.frame(time)
+        seen = numbers(page, f"kind.read({time})").reshape(*expected.shape[:2], 4)[..., :3]
+        # The map is of half floats.
+        assert np.abs(seen - expected).max() < 2**-10 * expected.max()
 
 
 def test_the_hour_and_the_exposure_change_the_picture(model, tmp_path, show):

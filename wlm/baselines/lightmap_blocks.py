@@ -17,11 +17,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from wlm.baselines.block_reuse import reuse_blocks
 from wlm.baselines.lightmap_levels import TileRanges, clear_unseen, prepare, seen_texels, to_codes
 from wlm.baselines.rival import EXTRA, Rival, disk_size, measure
 from wlm.errors import WlmError
-from wlm.formats import hdr_blocks
+from wlm.formats import bc7_modes, hdr_blocks
+from wlm.formats.block_reuse import reuse_blocks
 from wlm.formats.hdr_blocks import ASTC_THOROUGH, need
 from wlm.lightmap.model import TILE
 from wlm.metrics import evaluate_frame, summarise
@@ -74,22 +74,19 @@ def encode_bc7(frame: np.ndarray, mask: np.ndarray, profile: str = "slow", loss:
         loss: Of rate-distortion optimisation (`block_reuse`): what the root mean square error of a block's seen texels
             may grow by, in squares, in levels of 255; 0 for none.
     """
-    texcomp, codecs = need("ispc_texcomp", EXTRA), need("imagecodecs", EXTRA)
-    _check_profile("bc7", profile, ("ultrafast", "veryfast", "fast", "basic", "slow"))
+    for package in ("ispc_texcomp", "imagecodecs"):  # the time to import them isn't the codec's
+        need(package, EXTRA)
+    _check_profile("bc7", profile, bc7_modes.ENCODERS)
     _check_loss("bc7", loss)
     image = prepare(frame, mask)
     levels, ranges = _levels(image, mask, _BC_BLOCK)
     padded = _pad(_to_bytes(levels))
-    height, width = padded.shape[:2]
-    opaque = np.concatenate([padded, np.full((height, width, 1), 255, np.uint8)], axis=2)
-    surface = texcomp.RGBASurface(opaque.tobytes(), width, height)
-    settings = texcomp.BC7EncSettings.from_profile(profile)
 
     def decode(data: bytes) -> np.ndarray:
-        return codecs.bcn_decode(data, 7, shape=(height, width, 4))[..., :3]
+        return need("imagecodecs", EXTRA).bcn_decode(data, 7, shape=(*padded.shape[:2], 4))[..., :3]
 
     def encode() -> bytes:
-        data = texcomp.compress_blocks_bc7(surface, settings)
+        data = bc7_modes.encode_image(padded, EXTRA, profile).tobytes()
         if loss == 0.0:
             return data
         weight = _weight(mask)

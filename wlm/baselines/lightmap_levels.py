@@ -16,6 +16,7 @@ from scipy.ndimage import binary_dilation
 
 from wlm.errors import WlmError
 from wlm.formats.exr import HALF_MAX
+from wlm.lightmap.frames import round_half
 from wlm.lightmap.model import TILE
 from wlm.texels import fill_gaps
 
@@ -91,8 +92,8 @@ class TileRanges:
             if inside.any():
                 texels = codes[(..., *area, slice(None))][..., inside, :]
                 axes = -2 if by_channel else (-2, -1)
-                low[..., row, column, :] = _rounded(texels.min(axes, keepdims=True), -np.inf)[..., 0, :]
-                high[..., row, column, :] = _rounded(texels.max(axes, keepdims=True), np.inf)[..., 0, :]
+                low[..., row, column, :] = round_half(texels.min(axes, keepdims=True), -np.inf)[..., 0, :]
+                high[..., row, column, :] = round_half(texels.max(axes, keepdims=True), np.inf)[..., 0, :]
         return cls(low, high)
 
     @classmethod
@@ -129,13 +130,6 @@ class TileRanges:
 def to_codes(image: np.ndarray) -> np.ndarray:
     """Radiance to codes, float32."""
     return np.power(image, np.float32(1.0 / GAMMA), dtype=np.float32)
-
-
-def _rounded(values: np.ndarray, toward: float) -> np.ndarray:
-    """Rounds to half floats that are not past the values on the wrong side."""
-    nearest = values.astype(np.float16)
-    wrong = nearest > values if toward < 0 else nearest < values
-    return np.where(wrong, np.nextafter(nearest, np.float16(toward)), nearest)
 
 
 def _over_texels(values: np.ndarray, side: int, height: int, width: int) -> np.ndarray:

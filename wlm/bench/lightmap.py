@@ -40,7 +40,7 @@ from wlm.lightmap.evaluation import bits_per_texel, count_kinds, memory_bytes
 from wlm.lightmap.exact import bound64, colour_tile64, decode_tile64
 from wlm.lightmap.fit import compress, dynamic_targets
 from wlm.lightmap.model import TILE, LightmapModel, Profile, TimeAxis
-from wlm.lightmap.runtime import ExactDecoder, MatrixDecoder, StripDecoder, fast_decoder
+from wlm.lightmap.runtime import ExactDecoder, FrameDecoder, MatrixDecoder, StripDecoder, fast_decoder
 from wlm.lightmap.seen import Tally
 from wlm.lightmap.tiles import TileGrid, TileKind, assemble
 from wlm.lightmap.views import VIEWS, views_of
@@ -65,7 +65,7 @@ _ERROR_TIMES = 3  # the float64 path takes 30 ms for one tile at one time
 
 _SEEN = ("seen", "ring", "between", "border", "view_psnr", "view_flip")  # scores that are figures by their names
 
-_Runtime = StripDecoder | MatrixDecoder | ExactDecoder
+_Runtime = StripDecoder | MatrixDecoder | ExactDecoder | FrameDecoder
 
 # GELU by its gate, which is shorter to read in a plot.
 _GELUS = {"exact": "erf", "tanh": "tanh", "fast": "fast tanh"}
@@ -166,7 +166,7 @@ def run_rows(
     fits = [bench.fit_profile(profile) for profile in profiles]
     peers = [bench.profile_row(fit) for fit in fits]
     best = next((fit for fit in fits if fit.option == "M"), fits[0])
-    if (best.model.kind >= TileKind.STATIC).any():
+    if len(best.model.mapped):
         # On the CPU "fast" is "tanh".
         gelus = [gelu for gelu in _GELUS if bench.device != "cpu" or gelu != "fast"]
         peers += [bench.option_row(best, path, gelu) for path in ("exact", "strip") for gelu in gelus]
@@ -405,6 +405,8 @@ class _LightmapBench(Bench):
             decoders.append(make(model, self.device, gelu))
         if (model.kind == TileKind.STATIC).any():
             decoders.append(ExactDecoder(model, self.device, gelu, TileKind.STATIC))
+        if len(model.frames):
+            decoders.append(FrameDecoder(model, self.device))
         for decoder in decoders:
             decoder.set_time(self.times[0])
         return decoders

@@ -62,7 +62,7 @@ _Map = Annotated[
 def compress(
     set_path: _Set,
     output: Annotated[Path, output_option("OUT.wlm", "The file to write.")],
-    profile: Annotated[str, typer.Option(help="L, M, H, ..., or a YAML file of settings.")] = "M",
+    profile: Annotated[str, typer.Option(help="L, M, H, ..., frames, or a YAML file of settings.")] = "M",
     tiles: Annotated[str | None, typer.Option(help="Only these tiles, such as 0-3,7; default all.")] = None,
     steps: Annotated[int | None, typer.Option(help="Steps of the fit; default as the profile says.")] = None,
     samples: Annotated[int | None, typer.Option(help="Samples of each tile in a step; a multiple of 128.")] = None,
@@ -120,7 +120,7 @@ def compress(
     bpp = bits_per_texel(model, lightmaps.mask, size) if model.kind.any() else None
     rows.add_row(escape(str(output)), f"{size:,}", number(bpp, ".3f"), kinds, f"{seconds:.1f}")
     show(rows)
-    for warning in lost_light(model, lightmaps, device) if model.kind.any() else ():
+    for warning in (*model.warnings, *(lost_light(model, lightmaps, device) if model.kind.any() else ())):
         note(f"warning: {warning}")
 
 

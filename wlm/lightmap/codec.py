@@ -12,6 +12,7 @@ from pydantic import Field
 from wlm.config import check_settings
 from wlm.formats.artifact import Artifact
 from wlm.formats.parts import Part, check_part, check_parts
+from wlm.lightmap.frame_packing import FRAME_SIZES, FRAMES, pack_frames, unpack_frames
 from wlm.lightmap.model import LightmapModel, Profile, part_table
 from wlm.lightmap.packing import PACKED, SIZES, TILES, pack_tiles, unpack_tiles
 from wlm.lightmap.tiles import TileGrid, TileKind
@@ -21,7 +22,7 @@ _ROUNDING = 2e-7  # relative, of stored times
 _TIMES = Part((np.float32, np.float64), (None,))
 _MASK = Part(np.uint8, (None,))
 # What files that don't state it were made with, and a setting of the fit that is no more.
-_OLD_PROFILE = {"interpolation": "network"}
+_OLD_PROFILE = {"interpolation": "network", "frames": "never"}
 _OLD_SETTINGS = ("between",)
 
 
@@ -42,10 +43,12 @@ def encode(model: LightmapModel) -> tuple[dict[str, Any], dict[str, np.ndarray],
         "period": model.period,
         "profile": _dated(model.profile),
     }
-    plain = {name: value for name, value in model.parts.items() if name not in PACKED}
+    plain = {name: value for name, value in model.parts.items() if name not in (*PACKED, "frames")}
     parts = {name: value for name, value in plain.items() if value.size}
     if len(model.mapped):
         parts |= pack_tiles(model.parts, model.profile, model.kind, model.mask)
+    if len(model.frames):
+        parts |= pack_frames(model.frames, model.kind, model.mask)
     if not model.mask.all():
         parts["mask"] = np.frombuffer(zlib.compress(np.packbits(model.mask).tobytes(), 9), np.uint8)
     return settings, parts | {"times": _shortened(model.times)}, model.source
@@ -78,6 +81,13 @@ def decode(artifact: Artifact) -> LightmapModel:
         packed = check_part(others, "tiles", TILES), check_part(others, "sizes", SIZES)
         others = {name: part for name, part in others.items() if name not in ("tiles", "sizes")}
         others |= unpack_tiles(*packed, table, header.profile, kind, mask)
+    if "frames" in others or "frame_sizes" in others:
+        packed = check_part(others, "frames", FRAMES), check_part(others, "frame_sizes", FRAME_SIZES)
+        others = {name: part for name, part in others.items() if name != "frame_sizes"}
+        others["frames"] = unpack_frames(*packed, table, kind, mask)
+    parts = check_parts(others, table)
+    if (parts["ranges"][:, :, 0] > parts["ranges"][:, :, 1]).any():
+        raise ValueError("part ranges: expected no least above its greatest")
     return LightmapModel(
         name=header.name,
         width=width,
@@ -88,25 +98,24 @@ def decode(artifact: Artifact) -> LightmapModel:
         mask=mask,
         kind=kind,
         times=times,
-        **check_parts(others, table),
+        **parts,
     )
 
 
 def _dated(profile: Profile) -> dict[str, Any]:
-    """Settings for a file: those that differ from the defaults, and `interpolation`, whose default was "network"."""
-    changes = profile.changes()
-    if changes.pop("interpolation", None) is None:
-        changes["interpolation"] = profile.interpolation
-    return changes
+    """Settings for a file: those that differ from the defaults, and those whose default was another."""
+    return profile.changes() | {name: getattr(profile, name) for name in _OLD_PROFILE}
 
 
 def _renewed(settings: dict[str, Any]) -> dict[str, Any]:
     """Settings of a file as today's names have them."""
     profile = settings.get("profile")
-    if not isinstance(profile, dict) or "interpolation" in profile:
+    if not isinstance(profile, dict) or profile.keys() >= _OLD_PROFILE.keys():
         return settings
-    kept = {name: value for name, value in profile.items() if name not in _OLD_SETTINGS}
-    return settings | {"profile": kept | _OLD_PROFILE}
+    # A file with either of them has none of the settings that are no more.
+    dropped = () if profile.keys() & _OLD_PROFILE.keys() else _OLD_SETTINGS
+    kept = {name: value for name, value in profile.items() if name not in dropped}
+    return settings | {"profile": _OLD_PROFILE | kept}
 
 
 def _mask(tensors: Mapping[str, np.ndarray], height: int, width: int) -> np.ndarray:

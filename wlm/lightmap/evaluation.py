@@ -61,7 +61,7 @@ class Report(SeenScore):
         format_limited: `time`, `tile` of the scored ones that span only a few steps of half float.
         parts: Bytes of the file by part, see `part_bytes`.
         profile: Name of the settings.
-        kinds: Tiles of the grid by kind: `empty`, `constant`, `static`, `dynamic`.
+        kinds: Tiles of the grid by kind: `empty`, `constant`, `static`, `dynamic`, `frames`.
         warnings: Tiles that were not scored, another input than the file's, or light that was lost and that the means
             hide.
     """
@@ -277,7 +277,7 @@ def memory_bytes(model: LightmapModel) -> int:
 
 
 def count_kinds(model: LightmapModel) -> dict[str, int]:
-    """Number of tiles of the grid by kind: empty (or not compressed), constant, static, dynamic."""
+    """Number of tiles of the grid by kind: empty (or not compressed), constant, static, dynamic, frames."""
     return {kind.name.lower(): int((model.kind == kind).sum()) for kind in TileKind}
 
 
@@ -290,7 +290,7 @@ def part_bytes(model: LightmapModel, file_bytes: int) -> dict[str, int]:
         ValueError: `file_bytes` is less than the parts take.
     """
     stored = encode(model)[1]
-    parts = {name: value.nbytes for name, value in stored.items() if name not in ("tiles", "sizes")}
+    parts = {name: value.nbytes for name, value in stored.items() if name not in ("tiles", "sizes", "frame_sizes")}
     if "sizes" in stored:
         parts |= zip(STREAMS, stored["sizes"].sum(0, dtype=int).tolist(), strict=True)
     parts["header"] = file_bytes - sum(parts.values())

@@ -7,6 +7,7 @@ from scipy.special import erf
 
 from wlm.errors import WlmError
 from wlm.formats.bc7 import decode_image
+from wlm.formats.bc7_modes import blocks_image, decode_blocks
 from wlm.lightmap.model import TILE, LightmapModel, decode_scale
 from wlm.lightmap.tiles import TileGrid, TileKind
 
@@ -31,6 +32,10 @@ def decode_tile64(model: LightmapModel, number: int, time: float) -> np.ndarray:
     _check(model, number, time)
     if model.kind[number] == TileKind.CONSTANT:
         return _filled(_constant(model, number, time))
+    if model.kind[number] == TileKind.FRAMES:
+        before, after, share = model.axis.neighbours(time)
+        early, late = (_frame(model, number, at) ** model.profile.gamma for at in (before, after))
+        return (1.0 - share) * early + share * late
     return sum(share * _colour(model, number, at) ** model.profile.gamma for at, share in model.axis.reads(time))
 
 
@@ -43,7 +48,9 @@ def colour_tile64(model: LightmapModel, number: int, time: float) -> np.ndarray:
     if kind == TileKind.CONSTANT:
         return _filled(_constant(model, number, time) ** (1.0 / model.profile.gamma))
     reads = model.axis.reads(time)
-    if len(reads) == 1:
+    if kind == TileKind.FRAMES and model.axis.neighbours(time)[2] == 0:
+        return _frame(model, number, model.axis.neighbours(time)[0])
+    if kind != TileKind.FRAMES and len(reads) == 1:
         return _colour(model, number, reads[0][0])
     return decode_tile64(model, number, time) ** (1.0 / model.profile.gamma)
 
@@ -78,7 +85,10 @@ def bound64(model: LightmapModel, number: int, time: float) -> float:
     if model.kind[number] == TileKind.CONSTANT:
         return float(_constant(model, number, time).max() ** (1.0 / model.profile.gamma))
     before, after, share = model.axis.neighbours(time)
-    peak = decode_scale(model.peak[_place(model, number)], model.profile.gamma)
+    if model.kind[number] == TileKind.FRAMES:
+        peak = model.ranges[_row(model, number), :, 1].max(1)
+    else:
+        peak = decode_scale(model.peak[_place(model, number)], model.profile.gamma)
     return float(peak[before] if share == 0 else max(peak[before], peak[after]))
 
 
@@ -90,13 +100,26 @@ def _check(model: LightmapModel, number: int, time: float) -> None:
 
 def _place(model: LightmapModel, number: int) -> int:
     """The tile's place among those that have maps."""
-    return int((model.kind[:number] >= TileKind.STATIC).sum())
+    return int((model.mapped < number).sum())
+
+
+def _row(model: LightmapModel, number: int) -> int:
+    """The tile's place among those of its kind."""
+    return int((model.kind[:number] == model.kind[number]).sum())
+
+
+def _frame(model: LightmapModel, number: int, at: int) -> np.ndarray:
+    """A frame of a tile in gamma space [128, 128, 3]."""
+    row = _row(model, number)
+    levels = blocks_image(decode_blocks(model.frames[row, at]))[..., :3] / 255.0
+    least, greatest = model.ranges[row, at].astype(np.float64)
+    return least + levels * (greatest - least)
 
 
 def _constant(model: LightmapModel, number: int, time: float) -> np.ndarray:
     """Radiance of a constant tile [3]."""
     before, after, share = model.axis.neighbours(time)
-    rows = model.constant[int((model.kind[:number] == TileKind.CONSTANT).sum())].astype(np.float64)
+    rows = model.constant[_row(model, number)].astype(np.float64)
     return (1.0 - share) * rows[before] + share * rows[after]
 
 
@@ -108,7 +131,7 @@ def _network_output(model: LightmapModel, number: int, place: int, time: float) 
     """The network's output y [128, 128, 3]."""
     profile = model.profile
     dynamic = model.kind[number] == TileKind.DYNAMIC
-    row = int((model.kind[:number] == model.kind[number]).sum())  # among the tiles of its kind
+    row = _row(model, number)
     maps = [decode_image(model.uv[place]) / 255.0]
     if dynamic:
         periodic = model.axis.periodic

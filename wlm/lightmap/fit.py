@@ -12,6 +12,8 @@ from wlm.errors import WlmError
 from wlm.formats.checkpoint import EVERY, Checkpoint
 from wlm.formats.parts import Part
 from wlm.lightmap.data import LightmapSet
+from wlm.lightmap.frame_packing import needed_blocks
+from wlm.lightmap.frames import choose_frames, encode_frames, missing_encoder
 from wlm.lightmap.model import LightmapModel, Profile, encode_scale, part_table
 from wlm.lightmap.packing import check_packable, clear_unused
 from wlm.lightmap.targets import Targets
@@ -49,14 +51,16 @@ def compress(
         overrides: Settings in place of the profile's: `steps=500`.
 
     Returns:
-        The model.
+        The model; its `warnings` say what could not be done as the settings ask.
 
     Raises:
-        WlmError: No such profile, setting, device or tile; a checkpoint that isn't of this fit; or the fit diverged.
+        WlmError: No such profile, setting, device or tile; a checkpoint that isn't of this fit; the fit diverged; or
+            the settings ask for frames and the extra `frames` is missing.
         KeyboardInterrupt: Raised by `progress`, after the checkpoint, if there is one, has been written.
     """
     device = interop.check_device(device)
     fit = _Fit(lightmaps, Profile.load(profile).override(overrides), tiles)
+    fit.store_frames(progress)
     steps, batches = fit.profile.steps, fit.batches()
     meter = Meter(progress, "fit", steps * len(batches))
     for number, batch in enumerate(batches):
@@ -107,11 +111,14 @@ def open_checkpoint(
     Raises:
         WlmError: With `resume`: the file is damaged, or of another fit; the line names what differs.
     """
+    profile = Profile.load(profile).override(overrides)
+    if profile.frames == "auto" and missing_encoder(0):
+        profile = profile.override({"frames": "never"})
     fit = {
         "input": lightmaps.source,
         # Not in the input's hash, and yet the time axis wraps by it.
         "period": lightmaps.period,
-        "profile": Profile.load(profile).override(overrides).model_dump(mode="json"),
+        "profile": profile.model_dump(mode="json"),
         "tiles": None if tiles is None else sorted(int(tile) for tile in tiles),
         "seed": int(seed),
         "device": "cpu" if device == "cpu" else "cuda",
@@ -156,6 +163,11 @@ class _Fit:
         self.data = split(lightmaps, profile.gamma, None if tiles is None else sorted(tiles))
         self.kinds = classify(self.data, profile.gamma, profile.static_budget_db)
         grid = TileGrid.of(*lightmaps.mask.shape)
+        framed = choose_frames(self.kinds, self.data.index, lightmaps.mask, len(lightmaps.times), profile)
+        warnings = ()
+        if profile.frames == "auto" and framed.any() and (warning := missing_encoder(int(framed.sum()))):
+            warnings, framed[:] = (f"{lightmaps.name}: {warning}",), False
+        self.kinds[framed] = TileKind.FRAMES
         kind = np.zeros(grid.count, np.uint8)
         kind[self.data.index] = self.kinds
         table = part_table(profile, kind, len(lightmaps.times))
@@ -170,9 +182,10 @@ class _Fit:
             mask=lightmaps.mask,
             kind=kind,
             constant=self._constants(len(lightmaps.times)),
+            warnings=warnings,
             **{name: np.zeros(part.shape, part.dtype) for name, part in table.items() if name != "constant"},
         )
-        self._mapped = np.flatnonzero(self.kinds >= TileKind.STATIC)
+        self._mapped = np.flatnonzero(np.isin(self.kinds, (TileKind.STATIC, TileKind.DYNAMIC)))
         self._set_scales()
         self._scale = self.model.scales
 
@@ -208,6 +221,17 @@ class _Fit:
                 shift, spread = (chosen.mean(), chosen.std()) if chosen.size else (0.0, 1.0)
                 # Half floats end at 6e-8; a channel that is the same everywhere has nothing left to spread.
                 model.affine[i, :, c] = shift, max(spread, 1e-4)
+
+    def store_frames(self, progress: OnProgress | None) -> None:
+        """Encodes the tiles that are stored as frames, and puts them into the model."""
+        rows = np.flatnonzero(self.kinds == TileKind.FRAMES)
+        meter = Meter(progress, "frames", len(rows))
+        for i, row in enumerate(rows):
+            needed = needed_blocks(self.model.mask, int(self.data.index[row]))
+            tile = encode_frames(self.data.colour[row], self.data.mask[row], needed, self.profile.frames_loss)
+            self.model.frames[i], self.model.ranges[i] = tile
+            if meter.due(i + 1):
+                meter.report(i + 1)
 
     def batches(self) -> list[_Batch]:
         """Batches of `BATCH_TEXELS`, dynamic tiles first."""

@@ -26,6 +26,8 @@ from wlm.system import Model, Settings
 from wlm_kernels import mlp
 from wlm_kernels.lightmap.features import STATIC_INPUTS, TEMPORAL_INPUTS
 
+_RANGE_BYTES = 2 * 3 * 2
+
 SCALE_SPAN = (-21.0, 16.0)  # log2 of radiance: from half float's small numbers to its largest
 
 
@@ -60,6 +62,10 @@ class Profile(Settings):
         quantise_from: Fraction of the steps after which the maps are quantised to the exact levels of the file.
         freeze_from: Fraction of the steps after which the maps are frozen and the network alone is trained.
         static_budget_db: See `wlm.lightmap.tiles.classify`.
+        frames: Which tiles that are neither empty nor constant hold the lightmap of each time as BC7 rather than maps
+            and a network: "auto", where that takes no more bytes, "never" or "always".
+        frames_loss: Of these frames' rate-distortion optimisation: what the root mean square error of a block's texels
+            may grow by, in squares, in levels of 255, to make the file smaller; 0 for none.
     """
 
     FILES: ClassVar[str] = "lightmap"
@@ -85,6 +91,8 @@ class Profile(Settings):
     quantise_from: float = Field(0.5, ge=0.0, le=1.0)
     freeze_from: float = Field(0.95, ge=0.0, le=1.0)
     static_budget_db: float = Field(60.0, gt=0.0)
+    frames: Literal["auto", "never", "always"] = "auto"
+    frames_loss: float = Field(0.0, ge=0.0, le=255.0)
 
     @model_validator(mode="after")
     def _stages_in_order(self) -> "Profile":
@@ -104,6 +112,10 @@ class Profile(Settings):
         if temporal:
             size += self.uvt_slices * self.uvt_resolution**2 + 2 * 2 * self.plane_rows * self.plane_columns
         return size
+
+    def frames_bytes(self, times: int, share: float) -> float:
+        """Bytes of one tile's frames before they are packed, where a share of its blocks is in use."""
+        return times * (share * TILE * TILE + _RANGE_BYTES)
 
 
 @dataclass(frozen=True)
@@ -206,16 +218,16 @@ def decode_scale(codes: np.ndarray, gamma: float) -> np.ndarray:
 def part_table(profile: Profile, kind: np.ndarray, times: int) -> dict[str, Part]:
     """The arrays of a model, in the order of its file.
 
-    N_m tiles have maps (STATIC and DYNAMIC, by number), N_d of them temporal ones; N_c tiles are constant.
+    N_m tiles have maps (STATIC and DYNAMIC, by number), N_d of them temporal ones; N_c tiles are constant, and N_f
+    are frames.
 
     Args:
         profile: The settings.
         kind: uint8 [tiles], as in `LightmapModel`.
         times: T.
     """
-    dynamic, static, constant = (
-        int((kind == value).sum()) for value in (TileKind.DYNAMIC, TileKind.STATIC, TileKind.CONSTANT)
-    )
+    counted = TileKind.DYNAMIC, TileKind.STATIC, TileKind.CONSTANT, TileKind.FRAMES
+    dynamic, static, constant, framed = (int((kind == value).sum()) for value in counted)
     mapped, r = dynamic + static, profile.uvt_resolution // 4
     plane = Part(np.uint8, (dynamic, profile.plane_rows, profile.plane_columns, 2))
     parameters, static_parameters = (mlp.parameter_count(profile.inputs(t), profile.hidden) for t in (True, False))
@@ -231,6 +243,8 @@ def part_table(profile: Profile, kind: np.ndarray, times: int) -> dict[str, Part
         "peak": Part(np.uint8, (mapped, times)),
         "affine": Part(np.float16, (mapped, 2, 3), least=0.0),
         "constant": Part((np.float16, np.float32), (constant, times, 3), least=0.0, most=HALF_MAX),
+        "frames": Part(np.uint8, (framed, times, TILE // 4, TILE // 4, 16)),
+        "ranges": Part(np.float16, (framed, times, 2, 3), least=0.0),
     }
 
 
@@ -254,6 +268,9 @@ class LightmapModel(Model):
         peak: Codes of an upper bound of the tile at each time, in gamma space: 255 of the 8-bit output.
         affine: Shift and spread.
         constant: Radiance of constant tiles: half floats, or float32 where one would be more than 1% off.
+        frames: BC7 blocks of the tiles that are stored as frames, of any mode; black where no read reaches.
+        ranges: Their least and greatest colour, in gamma space.
+        warnings: What the fit fell back on, one line each; not in the file.
     """
 
     SYSTEM: ClassVar[str] = "lightmap"
@@ -278,6 +295,9 @@ class LightmapModel(Model):
     peak: np.ndarray
     affine: np.ndarray
     constant: np.ndarray
+    frames: np.ndarray
+    ranges: np.ndarray
+    warnings: tuple[str, ...] = ()
 
     @property
     def parts(self) -> dict[str, np.ndarray]:
@@ -292,7 +312,7 @@ class LightmapModel(Model):
     @property
     def mapped(self) -> np.ndarray:
         """int [N_m], numbers of the tiles that have maps; `uv`, `peak` and `affine` have their rows."""
-        return np.flatnonzero(self.kind >= TileKind.STATIC)
+        return np.flatnonzero(np.isin(self.kind, (TileKind.STATIC, TileKind.DYNAMIC)))
 
     @property
     def scales(self) -> np.ndarray:

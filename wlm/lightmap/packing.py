@@ -162,7 +162,7 @@ def unpack_tiles(
 
 def _mapped(kind: np.ndarray) -> list[tuple[int, int, int]]:
     """Of each tile with maps its place among these, its number, and its place among those of its kind."""
-    numbers = np.flatnonzero(kind >= TileKind.STATIC)
+    numbers = np.flatnonzero(np.isin(kind, (TileKind.STATIC, TileKind.DYNAMIC)))
     rows = [int((kind[:number] == kind[number]).sum()) for number in numbers]
     return [(place, int(number), row) for place, (number, row) in enumerate(zip(numbers, rows, strict=True))]
 

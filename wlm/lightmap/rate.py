@@ -64,20 +64,23 @@ def choose(
 
     Args:
         lightmaps: The set.
-        profile: All other settings.
+        profile: All other settings. No tile is stored as frames, whose size doesn't follow from maps.
         target_psnr: The PSNR to reach, dB, by the tiled protocol.
         max_bpp: The most bits per texel and time that the file may have. With both, the size comes first.
         seed, device, progress: As for `compress`.
 
     Raises:
-        WlmError: Neither is given or one isn't above 0, no tile changes over time, or no resolution is small enough
-            or, without a largest size, large enough.
+        WlmError: Neither is given or one isn't above 0, the profile asks for frames, no tile changes over time, or no
+            resolution is small enough or, without a largest size, large enough.
     """
     if target_psnr is None and max_bpp is None:
         raise WlmError("rate: expected a PSNR or a size, got neither")
     for name, value in (("--target-psnr", target_psnr), ("--max-bpp", max_bpp)):
         if value is not None and not (math.isfinite(value) and value > 0):
             raise WlmError(f"{name}: expected a finite number above 0, got {value:g}")
+    if profile.frames == "always":
+        raise WlmError(f"rate: expected a profile of networks, got {profile.name}, whose tiles are frames")
+    profile = profile.override({"frames": "never"})
     search = _Search(lightmaps, profile, seed, device, progress)
     allowed = [r for r in RESOLUTIONS if max_bpp is None or search.bpp(r) <= _ROOM * max_bpp]
     if not allowed:

@@ -2,8 +2,8 @@
 
 `wlm.lightmap.Decoder` returns arrays on the host; these are for a renderer's loop. Each holds the tiles of one kind: a
 whole map is a `StripDecoder`, or on CUDA a `MatrixDecoder` where networks are wide, an `ExactDecoder` of the static
-tiles if there are any, and `Decoder.tiles_8bit` for the constant tiles, one colour each, which need no launch. Gaps
-take the light of charts in tiles of the same decoder.
+tiles and a `FrameDecoder` of those that are frames, if there are any, and `Decoder.tiles_8bit` for the constant tiles,
+one colour each, which need no launch. Gaps take the light of charts in tiles of the same decoder.
 """
 
 import numpy as np
@@ -12,6 +12,7 @@ import warp as wp
 from wlm import interop
 from wlm.errors import WlmError
 from wlm.lightmap.decode import StoredTiles, TimeTable, gelu_of, rgba
+from wlm.lightmap.frame_decode import FrameTiles
 from wlm.lightmap.gaps import Gaps
 from wlm.lightmap.model import TILE, LightmapModel
 from wlm.lightmap.tiles import TileKind
@@ -31,26 +32,11 @@ class _TileDecoder:
         self.out, self._early, self._late = (self._empty() for _ in range(3))
         self._states = [None, None]
         self._limits = wp.empty(len(self.numbers), dtype=float, device=self.device)
-        self._filled = self._gaps()
+        self._filled = _gap_places(model, self.numbers, self.device)
         self.set_time(float(model.times[0]))
 
     def _empty(self) -> wp.array:
         return wp.zeros((len(self.numbers), TILE, TILE), dtype=wp.uint32, device=self.device)
-
-    def _gaps(self) -> tuple[wp.array, wp.array]:
-        """Places in `out` of the texels that are filled, and of those whose light they take."""
-        gaps, columns = Gaps.of(self.model.mask), self.model.tile_columns
-        row = np.full(len(self.model.kind), -1)
-        row[self.numbers] = np.arange(len(self.numbers))
-
-        def place(at: np.ndarray) -> np.ndarray:
-            tile = row[at[:, 0] // TILE * columns + at[:, 1] // TILE]
-            return np.where(tile < 0, -1, (tile * TILE + at[:, 0] % TILE) * TILE + at[:, 1] % TILE)
-
-        places = np.stack([place(gaps.target), place(gaps.source)])
-        held = places[:, (places >= 0).all(0)].astype(np.int32)
-        target, source = (wp.array(values, dtype=int, device=self.device) for values in held)
-        return target, source
 
     def set_time(self, time: float) -> None:
         """Sets the time of the decodes that follow.
@@ -199,6 +185,81 @@ class ExactDecoder(_TileDecoder):
             outputs=[out],
             device=self.device,
         )
+
+
+class FrameDecoder:
+    """The tiles that are stored as frames: one thread reads one texel of one or two blocks.
+
+    Attributes:
+        numbers: int [n], numbers of these tiles in the grid, in the order of `out`.
+        out: `wp.array` uint32 [n, 128, 128], RGBA from the lowest byte, alpha 255; written by `decode`.
+    """
+
+    def __init__(self, model: LightmapModel, device: str = "cpu") -> None:
+        """Uploads the model's frames and allocates all buffers; the time is the first stored one.
+
+        Args:
+            model: The model.
+            device: "cpu", "cuda" or "cuda:N".
+
+        Raises:
+            WlmError: No such device, or a model without frames.
+        """
+        self.model, self.device = model, interop.check_device(device)
+        self._tiles = FrameTiles(model, self.device)
+        self.numbers = self._tiles.numbers
+        count = len(self.numbers)
+        self._rows = wp.array(np.arange(count, dtype=np.int32), dtype=int, device=self.device)
+        self.out = wp.zeros((count, TILE, TILE), dtype=wp.uint32, device=self.device)
+        self._limits, self._inverse = (wp.empty(count, dtype=float, device=self.device) for _ in range(2))
+        self._filled = _gap_places(model, self.numbers, self.device)
+        self.set_time(float(model.times[0]))
+
+    def set_time(self, time: float) -> None:
+        """Sets the time of the decodes that follow; a graph captured before is out of date, as of `StripDecoder`.
+
+        Args:
+            time: In the unit of the set's times, stored or between: there the radiance of both is mixed.
+
+        Raises:
+            WlmError: It isn't finite.
+        """
+        if not np.isfinite(time):
+            raise WlmError(f"time: expected a finite number, got {time}")
+        self._time, self._bounds = time, self._tiles.bounds(time)
+        self._limits.assign(self._bounds)
+        self._inverse.assign(self._tiles.inverse(self._bounds))
+
+    def decode(self) -> None:
+        """Decodes all tiles into `out`: launches alone, no allocation, no wait; can be captured."""
+        self._tiles.decode(self._time, self._rows, self.out, self._inverse)
+        if len(self._filled[0]):
+            output.fill(*self._filled, self._limits, self.out.flatten())
+
+    def numpy(self) -> np.ndarray:
+        """The last decode on the host, uint8 [n, 128, 128, 4]."""
+        return rgba(self.out)
+
+    @property
+    def bounds(self) -> np.ndarray:
+        """What 255 stands for in gamma space, float32 [n]: radiance = (byte / 255 * bound) ** gamma."""
+        return self._bounds.copy()
+
+
+def _gap_places(model: LightmapModel, numbers: np.ndarray, device: str) -> tuple[wp.array, wp.array]:
+    """Places in the decoded tiles [n, 128, 128] of the texels that are filled, and of those whose light they take."""
+    gaps, columns = Gaps.of(model.mask), model.tile_columns
+    row = np.full(len(model.kind), -1)
+    row[numbers] = np.arange(len(numbers))
+
+    def place(at: np.ndarray) -> np.ndarray:
+        tile = row[at[:, 0] // TILE * columns + at[:, 1] // TILE]
+        return np.where(tile < 0, -1, (tile * TILE + at[:, 0] % TILE) * TILE + at[:, 1] % TILE)
+
+    places = np.stack([place(gaps.target), place(gaps.source)])
+    held = places[:, (places >= 0).all(0)].astype(np.int32)
+    target, source = (wp.array(values, dtype=int, device=device) for values in held)
+    return target, source
 
 
 def fast_decoder(model: LightmapModel, device: str = "cpu") -> StripDecoder | MatrixDecoder:

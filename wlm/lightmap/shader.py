@@ -45,6 +45,7 @@ _TEMPLATE = """\
 //   f_uvt  tile_NNNN_uvt.dds   BC7 volume, {resolution} x {resolution} x {slices}
 //   f_ut   tile_NNNN_ut.dds    RG8, {columns} x {rows}
 //   f_vt   tile_NNNN_vt.dds    RG8, {columns} x {rows}
+//   f_frame  tile_NNNN_frame_TTTT.dds  BC7, 128 x 128, of a tile of frames at stored time TTTT
 //
 // Networks. One float array holds those of all tiles: for each tile of weights.json in turn W1, b1, W2, b2, W3 and b3,
 // row by row; a tile's begins at its "network_offset". It is the storage buffer below, unless WLM_NET(i) is defined
@@ -144,6 +145,13 @@ vec3 wlm_decode_static(sampler2D f_uv, ivec2 texel, int offset, vec3 scale, vec3
     return wlm_finish(wlm_network(f, WLM_STATIC_INPUTS, offset), scale, shift, spread);
 }}
 
+// The same of a tile of "frames" at a stored time, whose "least" and "greatest" these are.
+vec3 wlm_decode_frame(sampler2D f_frame, ivec2 texel, vec3 least, vec3 greatest)
+{{
+    vec4 level = texelFetch(f_frame, texel, 0);
+    return vec3(1.0 - level.x, 1.0 - level.y, 1.0 - level.z) * least + vec3(level.x, level.y, level.z) * greatest;
+}}
+
 // The texel whose light a texel of the map shows: itself inside a chart; in a gap the nearest inside within {reach}
 // texels, in reading order of several as near; beyond that itself.
 ivec2 wlm_source(sampler2D f_valid, ivec2 texel)
@@ -181,7 +189,7 @@ _FRAME = {
 """,
     "network": """\
 //   tau      from "tau", which belongs to "times": linear between the stored times around t;
-//   scale    of each tile, from its "scale": linear likewise;
+//   scale    of each tile, from its "scale": linear likewise; the radiance of frames is mixed likewise;
 //   bound    of each tile, from its "peak": the larger of the two, if colour is to be kept in 8 bits.
 """,
 }

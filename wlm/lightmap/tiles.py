@@ -106,6 +106,8 @@ class TileKind(IntEnum):
     """One colour per time and one pattern for all times."""
     DYNAMIC = 3
     """The full model."""
+    FRAMES = 4
+    """The lightmap of each time as BC7, see `wlm.lightmap.frames`."""
 
 
 def split(lightmaps: LightmapSet, gamma: float, tiles: Sequence[int] | None = None) -> TileData:

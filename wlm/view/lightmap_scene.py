@@ -20,8 +20,15 @@ _COLOURS = {
     TileKind.CONSTANT: (0.25, 0.5, 1.0),
     TileKind.STATIC: (0.2, 0.8, 0.35),
     TileKind.DYNAMIC: (1.0, 0.45, 0.1),
+    TileKind.FRAMES: (0.65, 0.35, 0.9),
 }
-_NAMED = {TileKind.EMPTY: "grey", TileKind.CONSTANT: "blue", TileKind.STATIC: "green", TileKind.DYNAMIC: "orange"}
+_NAMED = {
+    TileKind.EMPTY: "grey",
+    TileKind.CONSTANT: "blue",
+    TileKind.STATIC: "green",
+    TileKind.DYNAMIC: "orange",
+    TileKind.FRAMES: "violet",
+}
 
 
 def lightmap_scene(

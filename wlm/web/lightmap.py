@@ -59,6 +59,8 @@ def lightmap_page(
         if number in dynamic:
             row = dynamic.index(number)
             arrays |= {f"{number}_{name}": getattr(model, name)[row] for name in ("uvt", "ut", "vt")}
+    for row, number in enumerate(np.flatnonzero(model.kind == TileKind.FRAMES).tolist()):
+        arrays[f"{number}_frames"] = model.frames[row]
     profile, times = model.profile, model.times
     time = float(times[len(times) // 2])
     reference: dict[str, Any] | None = None

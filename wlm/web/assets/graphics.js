@@ -85,7 +85,7 @@ class Graphics {
     return {...result, width, height};
   }
 
-  // Blocks of BC7 mode 6, uploaded as they are where the browser takes them.
+  // Blocks of BC7, uploaded as they are where the browser takes them.
   blocks(width, height, depth, bytes, filter, wraps) {
     const {gl} = this, volume = depth > 1, target = volume ? gl.TEXTURE_3D : gl.TEXTURE_2D;
     const result = this.#texture(target, filter, wraps);

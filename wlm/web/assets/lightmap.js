@@ -25,6 +25,20 @@ void main()
     ivec2 texel = ivec2(gl_FragCoord.xy) - u_origin;
     radiance = vec4(wlm_radiance(wlm_decode_static(u_uv, texel, u_offset, u_scale, u_shift, u_spread)), 1.0);
 }`;
+// Of the two stored times around the one that is decoded: their light is mixed, whatever networks do.
+const MAIN_FRAMES = `
+uniform sampler2D u_early, u_late;
+uniform ivec2 u_origin;
+uniform vec3 u_early_least, u_early_greatest, u_late_least, u_late_greatest;
+uniform float u_share;
+out vec4 radiance;
+void main()
+{
+    ivec2 texel = ivec2(gl_FragCoord.xy) - u_origin;
+    vec3 early = wlm_radiance(wlm_decode_frame(u_early, texel, u_early_least, u_early_greatest));
+    vec3 late = wlm_radiance(wlm_decode_frame(u_late, texel, u_late_least, u_late_greatest));
+    radiance = vec4(mix(early, late, u_share), 1.0);
+}`;
 const MAIN_FILL = `
 uniform sampler2D u_map, u_valid;
 out vec4 radiance;
@@ -71,6 +85,7 @@ class LightmapPage {
     this.programs = {
       dynamic: kinds.has('dynamic') && shader(MAIN_DYNAMIC),
       static: kinds.has('static') && shader(MAIN_STATIC),
+      frames: kinds.has('frames') && shader(MAIN_FRAMES),
       fill: shader(MAIN_FILL),
     };
     this.valid = this.#mask(page.array('valid', Uint8Array));
@@ -130,14 +145,21 @@ class LightmapPage {
     const {graphics, page, lightmap} = this, {gl} = graphics, {resolution, slices, columns, rows} = lightmap.maps;
     const bytes = (map) => page.array(`${tile.number}_${map}`, Uint8Array), repeats = lightmap.time_axis.repeats;
     const textures = {};
-    if (tile.kind !== 'constant') textures.u_uv = graphics.blocks(128, 128, 1, bytes('uv'), gl.NEAREST);
+    if (tile.kind === 'dynamic' || tile.kind === 'static') textures.u_uv = graphics.blocks(128, 128, 1, bytes('uv'), gl.NEAREST);
     if (tile.kind === 'dynamic') {
       const two = [gl.RG8, gl.RG, gl.UNSIGNED_BYTE], wrap = {T: repeats};
       textures.u_uvt = graphics.blocks(resolution, resolution, slices, bytes('uvt'), gl.LINEAR, {R: repeats});
       textures.u_ut = graphics.plain(columns, rows, two, bytes('ut'), gl.LINEAR, wrap);
       textures.u_vt = graphics.plain(columns, rows, two, bytes('vt'), gl.LINEAR, wrap);
     }
-    return {...tile, textures};
+    // Frames by their hour, uploaded when they are first seen.
+    return {...tile, textures, frames: []};
+  }
+
+  #frame(tile, hour) {
+    const {graphics, page} = this, size = 128 * 128;
+    const bytes = () => page.array(`${tile.number}_frames`, Uint8Array).subarray(size * hour, size * (hour + 1));
+    return tile.frames[hour] ??= graphics.blocks(128, 128, 1, bytes(), graphics.gl.NEAREST);
   }
 
   // Valid texels from one bit each, the first the highest of its byte.
@@ -159,6 +181,16 @@ class LightmapPage {
       gl.clearColor(...between(tile.radiance), 1);
       gl.clear(gl.COLOR_BUFFER_BIT);
       gl.disable(gl.SCISSOR_TEST);
+      return;
+    }
+    if (tile.kind === 'frames') {
+      const {before, after, share} = now;
+      graphics.use(this.programs.frames, {
+        u_origin: origin, u_share: share, u_early: this.#frame(tile, before), u_late: this.#frame(tile, after),
+        u_early_least: tile.least[before], u_early_greatest: tile.greatest[before],
+        u_late_least: tile.least[after], u_late_greatest: tile.greatest[after],
+      });
+      graphics.draw(3);
       return;
     }
     graphics.use(this.programs[tile.kind], {

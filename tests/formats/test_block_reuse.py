@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from wlm.baselines.block_reuse import reuse_blocks
+from wlm.formats.block_reuse import reuse_blocks
 
 
 def strip(*values: float) -> np.ndarray:

@@ -1,0 +1,76 @@
+"""Tiles that are stored as frames, on a device."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import warp as wp
+
+from wlm.errors import WlmError
+from wlm.formats import bc7_modes
+from wlm.lightmap.model import TILE, LightmapModel
+from wlm.lightmap.tiles import TileKind
+from wlm_kernels.lightmap import frames
+
+
+class FrameTiles:
+    """The frames of a model on a device.
+
+    Attributes:
+        numbers: int [n], numbers of their tiles in the grid.
+        device_bytes: Memory that they take up on the device, bytes.
+    """
+
+    def __init__(self, model: LightmapModel, device: str) -> None:
+        """Uploads the frames.
+
+        Raises:
+            WlmError: The model has none.
+        """
+        self.numbers = np.flatnonzero(model.kind == TileKind.FRAMES)
+        if not len(self.numbers):
+            raise WlmError(f"{model.name}: expected at least one tile of frames, found none")
+        self._axis, self._device = model.axis, device
+        self._greatest = model.ranges[:, :, 1].astype(np.float32).max(2)  # [n, T]
+        ends = model.ranges.astype(np.float32).reshape(-1, 2, 3)
+        words = np.ascontiguousarray(model.frames).view("<u8").reshape(-1, TILE // 4, TILE // 4, 2)
+        stored = frames.StoredFrames()
+        stored.blocks = wp.array(words, dtype=wp.uint64, device=device)
+        stored.least = wp.array(np.ascontiguousarray(ends[:, 0]), dtype=wp.vec3, device=device)
+        stored.span = wp.array(np.ascontiguousarray(ends[:, 1] - ends[:, 0]), dtype=wp.vec3, device=device)
+        stored.times, stored.gamma = len(model.times), model.profile.gamma
+        tables = frames.Tables()
+        tables.modes = wp.array(bc7_modes.MODES, dtype=int, device=device)
+        tables.partitions = wp.array(bc7_modes.PARTITIONS, dtype=wp.uint32, device=device)
+        tables.anchors = wp.array(bc7_modes.ANCHORS, dtype=int, device=device)
+        tables.shares = wp.array(bc7_modes.SHARES, dtype=int, device=device)
+        self._arguments = stored, tables
+        self.device_bytes = sum(array.capacity for array in (stored.blocks, stored.least, stored.span))
+        self._row_of = {int(number): i for i, number in enumerate(self.numbers)}
+
+    def among(self, numbers: Sequence[int]) -> list[tuple[int, int]]:
+        """Those of `numbers` that are here: their places in `numbers` and in `self.numbers`."""
+        return [(i, self._row_of[number]) for i, number in enumerate(numbers) if number in self._row_of]
+
+    def bounds(self, time: float) -> np.ndarray:
+        """Bound of each tile, float32 [n]; between two times the larger."""
+        before, after, share = self._axis.neighbours(time)
+        return self._greatest[:, before] if share == 0 else self._greatest[:, [before, after]].max(1)
+
+    def decode(self, time: float, rows: wp.array, out: wp.array, inverse_peak: wp.array | None = None) -> None:
+        """Decodes tiles: one launch, which can be captured.
+
+        Args:
+            time: Stored or between; there the radiance of both is mixed (eq. 2), whatever the model's networks do.
+            rows: int [k], places in `numbers`.
+            out: vec3 [k, 128, 128], radiance; with `inverse_peak` uint32, as of `wlm_kernels.lightmap.frames`.
+            inverse_peak: float [n], 1 / the bound of each tile.
+        """
+        arguments = *self._arguments, *self._axis.neighbours(time), rows
+        if inverse_peak is None:
+            frames.decode_radiance(*arguments, out)
+        else:
+            frames.decode_bytes(*arguments, inverse_peak, out)
+
+    def inverse(self, bounds: np.ndarray) -> np.ndarray:
+        """What `decode` takes as `inverse_peak` for some bounds, float32 [n]."""
+        return np.divide(1.0, bounds, out=np.zeros_like(bounds), where=bounds > 0)
