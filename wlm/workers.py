@@ -1,8 +1,8 @@
 """Objects that work elsewhere: in this process, in other processes of this machine, or on a cluster of Ray.
 
 Work is handed out as calls of their methods, one at a time to each object, and answers are taken as they come.
-Processes of this machine are started by the standard library alone: Ray takes seconds to start, brings 250 MB and leaves
-its logs behind, all in vain for one machine.
+Processes of this machine are started by the standard library alone: Ray takes seconds to start, brings 250 MB and
+leaves its logs behind, all in vain for one machine.
 """
 
 import importlib

@@ -95,11 +95,11 @@ def lightmap_fit() -> tuple[Any, Any]:
     """A fit of one dynamic tile, and a trainer of it after three steps."""
     from builders.small_sets import moving_light, tiny_profile
 
-    from wlm.lightmap.fit import CPU_BATCH, _Fit
+    from wlm.lightmap.fit import _Fit
     from wlm.lightmap.trainer import Trainer
 
     fit = _Fit(moving_light(40, 24), tiny_profile())
-    (batch,) = fit.batches(CPU_BATCH)
+    (batch,) = fit.batches()
     trainer = Trainer(fit.profile, fit.model.axis, fit.piece(batch.rows).targets(), True, 0, "cpu")
     trainer.run(3)
     return fit, trainer
@@ -123,10 +123,8 @@ def _lightmap_running() -> Kept:
 
 
 def _lightmap_finished() -> Kept:
-    from wlm.lightmap.fit import CPU_BATCH
-
     fit, trainer = lightmap_fit()
-    (batch,) = fit.batches(CPU_BATCH)
+    (batch,) = fit.batches()
     content = _written(lambda path: Checkpoint(path, "lightmap", {}, "0f").add_finished(0, trainer.quantised()))
     return Kept(content, lambda path: _opened(path, "lightmap").finished(0, fit.table(batch)), {}, {})
 

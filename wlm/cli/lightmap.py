@@ -62,6 +62,22 @@ def compress(
     samples: Annotated[int | None, typer.Option(help="Samples of each tile in a step; a multiple of 128.")] = None,
     seed: Seed = 0,
     device: Device = "cpu",
+    workers: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            metavar="N",
+            help="Processes that fit tiles side by side; the file is the same. Default: one for two cores, one on a "
+            "GPU, what a cluster has room for; with cuda N are spread over the GPUs.",
+        ),
+    ] = None,
+    cluster: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ADDRESS",
+            help='Fit on a cluster of Ray (extra `cluster`): ray://HOST:10001, or "auto" on one of its machines.',
+        ),
+    ] = None,
     resume: Resume = False,
     checkpoint_every: CheckpointEvery = 30.0,
     times: _Times = None,
@@ -84,7 +100,8 @@ def compress(
     from wlm.lightmap.tiles import TileGrid, parse_tiles
 
     settings = Profile.load(profile).override({"steps": steps, "samples": samples}, "--")
-    device = check_device(device)
+    # The device of a cluster is none of this machine's.
+    own_device = "cpu" if cluster is not None else check_device(device)
     lightmaps = _load(set_path, times, mask, period, trust, map_id)
     numbers = None if tiles is None else parse_tiles(tiles, TileGrid.of(*lightmaps.mask.shape).count)
     options = {"tiles": numbers, "seed": seed, "device": device}
@@ -93,7 +110,8 @@ def compress(
         note(f"{checkpoint.path}: there is nothing to resume; starting at step 0")
     start = clock.perf_counter()
     with running("fit", checkpoint.path) as progress:
-        model = compress(lightmaps, settings, progress=progress, checkpoint=checkpoint, **options)
+        places = {"workers": workers, "cluster": cluster}
+        model = compress(lightmaps, settings, progress=progress, checkpoint=checkpoint, **places, **options)
         seconds = clock.perf_counter() - start
         size = model.save(output)
         checkpoint.remove()
@@ -103,7 +121,7 @@ def compress(
     bpp = bits_per_texel(model, lightmaps.mask, size) if model.kind.any() else None
     rows.add_row(escape(str(output)), f"{size:,}", number(bpp, ".3f"), kinds, f"{seconds:.1f}")
     show(rows)
-    for warning in lost_light(model, lightmaps, device) if model.kind.any() else ():
+    for warning in lost_light(model, lightmaps, own_device) if model.kind.any() else ():
         note(f"warning: {warning}")
 
 

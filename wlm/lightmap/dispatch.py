@@ -19,7 +19,7 @@ from wlm.workers import Lost, Workers
 
 _SLICE = 0.5  # seconds of work between two answers of another process
 _POLL = 0.2  # seconds: how long a signal waits at most to be heard
-_DEATHS = 3  # of the workers of one batch; then the batch is to blame
+_DEATHS = 3  # of workers of one batch from the same state; then the batch is to blame
 _STOPPING = 30.0  # seconds that workers get to give their state before a stop
 
 Parts = dict[str, np.ndarray]
@@ -49,7 +49,7 @@ class _Job:
     Attributes:
         batch: The batch.
         step: Steps done; None until the worker has begun.
-        deaths: Workers that died of it.
+        deaths: Workers that it has lost since its state was last kept.
         saving: Whether its state is asked for before it goes on.
     """
 
@@ -160,7 +160,7 @@ class Dispatch:
                 self._look_up(moved=True)
         else:
             self._states[job.batch.number] = said
-            job.saving = False
+            job.saving, job.deaths = False, 0
         if finished is not None:
             return finished
         if job.saving:

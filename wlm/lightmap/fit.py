@@ -32,8 +32,9 @@ from wlm.lightmap.worker import Fitter, Piece
 from wlm.system import Meter, OnProgress
 from wlm.workers import Actors, Here, Processes, Workers, cores
 
-CUDA_BATCH = 64 * 26 * TILE * TILE  # texels times times in a batch: 64 tiles of 26 times, 330 MB of targets
-CPU_BATCH = 4 * 26 * TILE * TILE  # a core gains nothing from more, and many cores want many batches
+BATCH_TEXELS = 64 * 26 * TILE * TILE  # texels times times in a batch: 64 tiles of 26 times, 330 MB of targets
+CPU_TILES = 4  # in a batch on a CPU, at most: two cores gain nothing from more, and many want many batches
+
 _WORTHWHILE = 20_000_000  # samples that two cores take some 20 s for: a process takes 3 s to start
 
 _CONSTANT_ERROR = 0.01  # of a constant tile's radiance: half floats near their end, 6e-8, are further off
@@ -80,7 +81,7 @@ def compress(
     """
     _devices(device, workers, cluster, 0)  # checked before the set is looked at
     fit = _Fit(lightmaps, Profile.load(profile).override(overrides), tiles)
-    batches = fit.batches(CPU_BATCH if device == "cpu" else CUDA_BATCH)
+    batches = fit.batches(CPU_TILES if device == "cpu" else None)
     waiting = []
     for batch in batches:
         parts = checkpoint.finished(batch.number, fit.table(batch)) if checkpoint is not None else None
@@ -280,9 +281,10 @@ class _Fit:
         peak = encode_scale(colour.max((1, 2)).astype(np.float64), gamma, up=True)
         return _Facts(kind, scale=stored, peak=peak, affine=affine)
 
-    def batches(self, texels: int) -> list[Batch]:
-        """Batches of so many texels times times, dynamic tiles first; at least one tile in each."""
-        size = max(1, texels // (len(self.model.times) * TILE * TILE))
+    def batches(self, most: int | None = None) -> list[Batch]:
+        """Batches of `BATCH_TEXELS`, of so many tiles at most and at least one; dynamic tiles first."""
+        size = max(1, BATCH_TEXELS // (len(self.model.times) * TILE * TILE))
+        size = size if most is None else min(size, most)
         result = []
         for kind in (TileKind.DYNAMIC, TileKind.STATIC):
             rows = np.flatnonzero(self.kinds == kind)
