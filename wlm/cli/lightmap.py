@@ -89,7 +89,7 @@ def compress(
     """Compress a lightmap set into one file.
 
     The fit is kept in OUT.wlm.partial from time to time, and by Ctrl-C and SIGTERM; the same command with --resume goes
-    on exactly.
+    on exactly. Lightmaps beyond 1 GiB lie in a temporary file (TMPDIR) while it runs.
     """
     check_output(output, ".wlm")
     quiet_warp()

@@ -35,6 +35,7 @@ from wlm.workers import Actors, Here, Processes, Workers, cores
 BATCH_TEXELS = 64 * 26 * TILE * TILE  # texels times times in a batch: 64 tiles of 26 times, 330 MB of targets
 CPU_TILES = 4  # in a batch on a CPU, at most: two cores gain nothing from more, and many want many batches
 
+_LOOK = 32  # tiles that are looked at between two looks at the clock: some seconds
 _WORTHWHILE = 20_000_000  # samples that two cores take some 20 s for: a process takes 3 s to start
 
 _CONSTANT_ERROR = 0.01  # of a constant tile's radiance: half floats near their end, 6e-8, are further off
@@ -66,8 +67,8 @@ def compress(
             would end soon after they have started; 1 on a GPU; on a cluster as many as it has room for.
         cluster: Address of a cluster of Ray whose machines fit the tiles, as `ray.init` takes it ("auto",
             "ray://host:10001"); each worker takes two CPUs, or a GPU where the device is "cuda". None: this machine.
-        progress: Called about twice a second; its figures are the loss and "PSNR dB", of the latest samples, by the
-            tiled protocol.
+        progress: Called about twice a second; of the stage "fit" the figures are the loss and "PSNR dB", of the latest
+            samples, by the tiled protocol. A large set has a stage "tiles" before it.
         checkpoint: From `open_checkpoint`: where a running fit is kept, and an interrupted one resumed.
         overrides: Settings in place of the profile's: `steps=500`.
 
@@ -80,7 +81,7 @@ def compress(
         KeyboardInterrupt: Raised by `progress`, after the checkpoint, if there is one, has been written.
     """
     _devices(device, workers, cluster, 0)  # checked before the set is looked at
-    fit = _Fit(lightmaps, Profile.load(profile).override(overrides), tiles)
+    fit = _Fit(lightmaps, Profile.load(profile).override(overrides), tiles, progress)
     batches = fit.batches(CPU_TILES if device == "cpu" else None)
     waiting = []
     for batch in batches:
@@ -218,12 +219,22 @@ class _Fit:
         model: Complete but for the maps and networks of the batches that have not been stored.
     """
 
-    def __init__(self, lightmaps: LightmapSet, profile: Profile, tiles: Sequence[int] | None = None) -> None:
+    def __init__(
+        self,
+        lightmaps: LightmapSet,
+        profile: Profile,
+        tiles: Sequence[int] | None = None,
+        progress: OnProgress | None = None,
+    ) -> None:
         self.profile, self._lightmaps = profile, lightmaps
         grid = TileGrid.of(*lightmaps.mask.shape)
         self.index = np.arange(grid.count) if tiles is None else np.array(sorted(tiles), np.int64)
         check_index(self.index, grid)
-        facts = [self._facts(int(number)) for number in self.index]
+        meter, facts = Meter(progress, "tiles", len(self.index)), []
+        for number in self.index.tolist():
+            facts.append(self._facts(number))
+            if len(facts) % _LOOK == 0 and meter.due(len(facts)):
+                meter.report(len(facts))
         self.kinds = np.array([tile.kind for tile in facts])
         kind = np.zeros(grid.count, np.uint8)
         kind[self.index] = self.kinds
