@@ -110,14 +110,21 @@ class Processes(Workers):
         Args:
             make: The class of the objects, of a module that can be imported.
             arguments: Of each object.
+
+        Raises:
+            WlmError: The system has no room for so many.
         """
         self.count = len(arguments)
         self._make, self._arguments = make, arguments
         self._answers: queue.SimpleQueue[tuple[int, Any]] = queue.SimpleQueue()
         self._processes: dict[int, subprocess.Popen[bytes]] = {}
         self._errors: dict[int, IO[bytes]] = {}
-        for number in range(self.count):
-            self._start(number)
+        try:
+            for number in range(self.count):
+                self._start(number)
+        except WlmError:
+            self.close()
+            raise
 
     def call(self, number: int, method: str, *arguments: Any) -> None:
         # Of a process that is gone the answer tells.
@@ -138,7 +145,7 @@ class Processes(Workers):
         for process in self._processes.values():
             with suppress(OSError):
                 process.stdin.close()
-        for number in range(self.count):
+        for number in list(self._processes):
             self._end(number, _PATIENCE)
 
     def kill(self, number: int) -> None:
@@ -146,18 +153,16 @@ class Processes(Workers):
         self._processes[number].kill()
 
     def _start(self, number: int) -> None:
-        errors = tempfile.TemporaryFile()
         environment = os.environ | {"PYTHONPATH": os.pathsep.join(path or os.getcwd() for path in sys.path)}
         # Ctrl-C in a terminal goes to a group of processes: they are asked for their state after it.
         group = {"process_group": 0} if os.name == "posix" else {}
-        process = subprocess.Popen(
-            [sys.executable, "-P", "-c", f"from {__name__} import serve; serve()"],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=errors,
-            env=environment,
-            **group,
-        )
+        command = [sys.executable, "-P", "-c", f"from {__name__} import serve; serve()"]
+        pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+        try:
+            errors = tempfile.TemporaryFile()
+            process = subprocess.Popen(command, stderr=errors, env=environment, **pipes, **group)
+        except OSError as error:
+            raise WlmError(f"workers: cannot start process {number}: {error.strerror or error}") from error
         self._processes[number], self._errors[number] = process, errors
         threading.Thread(target=self._listen, args=(number, process, errors), daemon=True).start()
         with suppress(OSError):
