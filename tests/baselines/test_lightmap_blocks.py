@@ -129,8 +129,9 @@ def test_gaps_are_filled_before_encoding(name):
     a, b = BLOCKS[name](zeros, mask), BLOCKS[name](garbage, mask)
     np.testing.assert_array_equal(a.decoded, b.decoded)
     assert psnr(image, a.decoded, mask) > FLOOR[name] - 12.0
-    # The two rows below the edge, away from the corners.
-    np.testing.assert_allclose(a.decoded[7:9, 21:32], np.stack([image[6, 21:32]] * 2), atol=0.25)
+    # The rows below the edge, away from the corners; one where blocks are repeated.
+    rows = 1 if "rdo" in name else 2
+    np.testing.assert_allclose(a.decoded[7 : 7 + rows, 21:32], np.stack([image[6, 21:32]] * rows), atol=0.25)
 
 
 @pytest.mark.parametrize("name", BLOCKS)

@@ -5,11 +5,14 @@ import sys
 import numpy as np
 import pytest
 from builders.bench_rows import check_command, check_outputs, keys
+from typer.testing import CliRunner
 
 import wlm.bench.lightmap as bench
 from wlm.baselines.lightmap import FEW
 from wlm.baselines.lightmap import RIVALS as ALL
-from wlm.bench.lightmap import PANELS, _quick_times, run, run_rows
+from wlm.bench import read_json
+from wlm.bench.lightmap import PANELS, _quick_times, run, run_rivals, run_rows
+from wlm.cli.bench import app
 from wlm.errors import WlmError
 from wlm.lightmap.data import from_arrays
 from wlm.lightmap.model import Profile
@@ -134,7 +137,26 @@ def test_a_quick_run_has_few_rivals_and_a_full_one_all(monkeypatch):
     monkeypatch.setattr(bench, "run_rows", lambda *args, **options: calls.append(options["rivals"]))
     for quick in (True, False):
         run(quick=quick, device="cpu", set_path="set")
-    assert calls == [FEW, tuple(ALL)]
+    run(quick=False, device="cpu", set_path="set", rivals=False)
+    assert calls == [FEW, tuple(ALL), ()]
+
+
+def test_the_rivals_alone(rows, lightmaps, monkeypatch, tmp_path):
+    monkeypatch.setattr(bench, "load", lambda path: lightmaps)
+    monkeypatch.setattr(bench, "FEW", ("bc7", "av1-75"))
+    lines = []
+    alone = run_rivals(quick=True, set_path="set", progress=lines.append)
+    assert keys(alone) == [("BC7", ""), ("AV1", "75")] and len(lines) == 2
+    beside = {(row.method, row.option): row for row in rows}
+    for row in alone:  # 9, 12 and 21 h, as in the rows above
+        assert row["psnr"] == beside[row.method, row.option]["psnr"] and row["times_scored"] == 3
+    monkeypatch.setattr(bench, "run_rivals", lambda **options: alone)
+    words = ["lightmap", "--rivals-only", "--json", str(tmp_path / "rivals.json")]
+    result = CliRunner().invoke(app, words)
+    assert result.exit_code == 0 and "AV1" in result.output
+    assert read_json(tmp_path / "rivals.json")[1]["command"] == "wlm bench lightmap --rivals-only"
+    result = CliRunner().invoke(app, [*words, "--no-rivals"])
+    assert result.exit_code != 0 and "--rivals-only: expected without" in str(result.exception)
 
 
 def test_quick_times():

@@ -60,6 +60,11 @@ def test_a_run_keeps_what_other_systems_and_scenes_left(tmp_path):
     assert read_runs(path) == [Run({"date": "2"}, [BARE]), Run({"date": "3"}, [OURS.with_figures(psnr=50.0)])]
     write_json(path, [OURS, BARE], {"date": "4"})
     assert read_runs(path) == [Run({"date": "4"}, [OURS, BARE])]
+    # A run of some rows replaces those alone.
+    better = replace(OURS, option="H").with_figures(psnr=50.0)
+    write_json(path, [better], {"date": "5"}, partial=True)
+    assert read_runs(path) == [Run({"date": "4"}, [OURS, BARE]), Run({"date": "5"}, [better])]
+    write_json(path, [OURS, BARE], {"date": "4"})
     # Of a run of both, the other system's rows stay with its environment.
     write_json(path, [BARE.with_figures(psnr=1.0)], {"date": "5"})
     assert read_runs(path) == [Run({"date": "4"}, [OURS]), Run({"date": "5"}, [BARE.with_figures(psnr=1.0)])]

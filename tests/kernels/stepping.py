@@ -9,7 +9,8 @@ from reference import temporal as reference
 
 from wlm import interop
 from wlm.lightmap.model import Profile, TimeAxis, encode_time
-from wlm.lightmap.trainer import Targets, Trainer
+from wlm.lightmap.targets import Targets
+from wlm.lightmap.trainer import Trainer
 from wlm.ops import plain
 
 TILE = 128

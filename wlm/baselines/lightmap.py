@@ -114,6 +114,12 @@ class Score(SeenScore):
     disk_bytes: int
 
 
+def check_rival(name: str) -> None:
+    """Raises a `WlmError` where `RIVALS` has no method of this name."""
+    if name not in RIVALS:
+        raise WlmError(f"baselines: unknown method {name!r}, expected one of {', '.join(RIVALS)}")
+
+
 def encode_set(
     name: str,
     lightmaps: LightmapSet,
@@ -135,8 +141,7 @@ def encode_set(
     Raises:
         WlmError: An unknown name, or a package is missing.
     """
-    if name not in RIVALS:
-        raise WlmError(f"baselines: unknown method {name!r}, expected one of {', '.join(RIVALS)}")
+    check_rival(name)
     method, count = RIVALS[name], len(lightmaps.frames)
     chosen = range(count) if chosen is None else [int(i) for i in chosen]
     # The whole map's mask: an engine would encode all of it, whatever we score.

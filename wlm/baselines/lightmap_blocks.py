@@ -38,7 +38,8 @@ def encode_bc6h(frame: np.ndarray, mask: np.ndarray, profile: str = "slow", loss
     Args:
         frame, mask: The lightmap.
         profile: `veryfast`, `fast`, `basic`, `slow` or `veryslow`.
-        loss: Of rate-distortion optimisation (`block_reuse`), in levels of 255; 0 for none.
+        loss: Of rate-distortion optimisation (`block_reuse`): what the root mean square error of a block's seen texels
+            may grow by, in squares, in levels of 255; 0 for none.
     """
     for package in ("ispc_texcomp", "imagecodecs"):  # the time to import them isn't the codec's
         need(package, EXTRA)
@@ -57,8 +58,9 @@ def encode_bc6h(frame: np.ndarray, mask: np.ndarray, profile: str = "slow", loss
             return data
         # Errors of codes, as shares of their tile's range.
         codes = _pad(to_codes(image))
-        weight = _weight(mask) / np.square(_pad(TileRanges.of(to_codes(image), seen).span(*seen.shape)))
-        return reuse_blocks(data, to_codes(decode(data)), codes, weight, loss / 255.0)
+        span = _pad(TileRanges.of(to_codes(image), seen).span(*seen.shape))
+        weight = _weight(mask)
+        return reuse_blocks(data, to_codes(decode(data)), codes, weight / np.square(span), weight * (loss / 255.0) ** 2)
 
     return _cropped(measure(_with_loss("bc6h", loss), encode, decode, disk_bytes=disk_size), image)
 
@@ -69,7 +71,8 @@ def encode_bc7(frame: np.ndarray, mask: np.ndarray, profile: str = "slow", loss:
     Args:
         frame, mask: The lightmap.
         profile: `ultrafast`, `veryfast`, `fast`, `basic` or `slow`.
-        loss: Of rate-distortion optimisation (`block_reuse`), in levels of 255; 0 for none.
+        loss: Of rate-distortion optimisation (`block_reuse`): what the root mean square error of a block's seen texels
+            may grow by, in squares, in levels of 255; 0 for none.
     """
     texcomp, codecs = need("ispc_texcomp", EXTRA), need("imagecodecs", EXTRA)
     _check_profile("bc7", profile, ("ultrafast", "veryfast", "fast", "basic", "slow"))
@@ -89,7 +92,8 @@ def encode_bc7(frame: np.ndarray, mask: np.ndarray, profile: str = "slow", loss:
         data = texcomp.compress_blocks_bc7(surface, settings)
         if loss == 0.0:
             return data
-        return reuse_blocks(data, decode(data) / np.float32(255.0), _pad(levels), _weight(mask), loss / 255.0)
+        weight = _weight(mask)
+        return reuse_blocks(data, decode(data) / np.float32(255.0), _pad(levels), weight, weight * (loss / 255.0) ** 2)
 
     rival = measure(
         _with_loss("bc7", loss),

@@ -10,8 +10,7 @@ Four kinds of rows:
   8 bits, 0.00196, is the rounding itself.
 - the rivals of `wlm.baselines.lightmap`, on the same lightmaps: block codecs, temporal PCA and a video codec; between
   stored times their light is mixed.
-- method "fit", one row for each profile: the speed of the fit alone; and the same fit in plain torch, all of it on CUDA
-  in a full run, else a few steps.
+- method "fit", one row for each profile: the speed of the fit alone; and some steps of the same fit in plain torch.
 
 Profiles and rivals have the scores of `wlm.lightmap.seen` too: those between stored times where both are scored, those
 of views in a full run.
@@ -29,7 +28,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from wlm.baselines.lightmap import FEW, RIVALS, encode_set
+from wlm.baselines.lightmap import FEW, RIVALS, check_rival, encode_set
 from wlm.baselines.lightmap_torch import PlainFit
 from wlm.bench.plot import Panel
 from wlm.bench.rows import Row
@@ -61,7 +60,7 @@ _QUICK_TILE_STEPS = 8_000
 _QUICK_SAMPLES = 2048
 _QUICK_HOURS = (9.0, 12.0, 21.0)  # morning, noon and lamps
 _FULL_TILES = 64  # of 1024 x 1024
-_PLAIN_STEPS = 10  # of the fit in plain torch, where it isn't run to its end
+_PLAIN_STEPS = {"cpu": 10, "cuda": 1000}  # of the fit in plain torch: enough for its time
 _ERROR_TIMES = 3  # the float64 path takes 30 ms for one tile at one time
 
 _SEEN = ("seen", "ring", "between", "border", "view_psnr", "view_flip")  # scores that are figures by their names
@@ -77,6 +76,8 @@ def run(
     quick: bool,
     device: str,
     set_path: str | os.PathLike[str] | None = None,
+    names: Sequence[str] | None = None,
+    rivals: bool = True,
     progress: Note | None = None,
 ) -> list[Row]:
     """Measures the lightmap system on one set.
@@ -86,6 +87,8 @@ def run(
             set has them): five minutes on two CPU cores for 16 tiles. Its errors are those of unfinished fits.
         device: "cpu" or "cuda:0", for fits and decodes.
         set_path: A lightmap set; None: the checkout's `demos/data/city`, two tiles of the city.
+        names: Profiles, by name or file; None: `QUICK_PROFILES` or `PROFILES`.
+        rivals: With the rivals, which take minutes on the CPU and no GPU: `run_rivals` measures them elsewhere.
         progress: Called with a line before each part of the work.
 
     Returns:
@@ -94,8 +97,8 @@ def run(
     Raises:
         WlmError: The set or the device isn't there, or a fit diverged.
     """
-    lightmaps = load(demo_data("city", "--set PATH") if set_path is None else set_path)
-    profiles = [Profile.load(name) for name in (QUICK_PROFILES if quick else PROFILES)]
+    lightmaps = _load(set_path)
+    profiles = [Profile.load(name) for name in names or (QUICK_PROFILES if quick else PROFILES)]
     chosen = np.arange(len(lightmaps.times))
     if quick:
         steps = max(200, _QUICK_TILE_STEPS // TileGrid.of(*lightmaps.mask.shape).count)
@@ -104,8 +107,35 @@ def run(
             for profile in profiles
         ]
         chosen = _quick_times(lightmaps.times)
-    rivals = FEW if quick else tuple(RIVALS)
-    return run_rows(lightmaps, profiles, device=device, chosen=chosen, rivals=rivals, progress=progress)
+    names = _names(quick) if rivals else ()
+    return run_rows(lightmaps, profiles, device=device, chosen=chosen, rivals=names, progress=progress)
+
+
+def run_rivals(
+    *,
+    quick: bool = False,
+    set_path: str | os.PathLike[str] | None = None,
+    names: Sequence[str] | None = None,
+    progress: Note | None = None,
+) -> list[Row]:
+    """Measures the rivals alone, on the CPU.
+
+    Args:
+        quick, set_path, progress: As for `run`.
+        names: Keys of `wlm.baselines.lightmap.RIVALS`; None: all, or with `quick` a third of them.
+
+    Returns:
+        Their rows.
+
+    Raises:
+        WlmError: The set isn't there, or a name is unknown.
+    """
+    for name in names or ():
+        check_rival(name)
+    lightmaps = _load(set_path)
+    chosen = _quick_times(lightmaps.times) if quick else np.arange(len(lightmaps.times))
+    bench = _LightmapBench(lightmaps, chosen, "cpu", progress, None)
+    return [bench.rival_row(name) for name in names or _names(quick)]
 
 
 def run_rows(
@@ -142,8 +172,15 @@ def run_rows(
     rows = bench.time_rows(peers)
     rows += [bench.rival_row(name) for name in rivals]
     rows += [bench.fit_row(fit) for fit in fits]
-    whole = bench.device != "cpu" and len(chosen) == len(lightmaps.times)
-    return rows + bench.plain_rows(best, whole=whole)
+    return rows + bench.plain_rows(best)
+
+
+def _load(set_path: str | os.PathLike[str] | None) -> LightmapSet:
+    return load(demo_data("city", "--set PATH") if set_path is None else set_path)
+
+
+def _names(quick: bool) -> tuple[str, ...]:
+    return FEW if quick else tuple(RIVALS)
 
 
 def _quick_times(times: np.ndarray) -> np.ndarray:
@@ -285,8 +322,8 @@ class _LightmapBench(Bench):
             **self._tiles(fit.model),
         )
 
-    def plain_rows(self, fit: Fit, whole: bool) -> list[Row]:
-        """The same fit in plain torch, all of its steps or a few; none where no tile is dynamic."""
+    def plain_rows(self, fit: Fit) -> list[Row]:
+        """Some steps of the same fit in plain torch; none where no tile is dynamic."""
         profile = fit.model.profile.model_copy(update={"metric_weight": 0.0})
         targets = dynamic_targets(self.lightmaps, profile)
         if targets is None:
@@ -308,7 +345,7 @@ class _LightmapBench(Bench):
             device=self.device,
         )
         peer.step().item()
-        steps = profile.steps if whole else min(profile.steps, _PLAIN_STEPS)
+        steps = min(profile.steps, _PLAIN_STEPS["cpu" if self.device == "cpu" else "cuda"])
         start = time.perf_counter()
         for _ in range(steps):
             loss = peer.step()

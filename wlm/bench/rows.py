@@ -140,7 +140,9 @@ def describe_environment(device: str, command: str) -> dict[str, object]:
     }
 
 
-def write_json(path: str | Path, rows: Sequence[Row], environment: Mapping[str, object]) -> None:
+def write_json(
+    path: str | Path, rows: Sequence[Row], environment: Mapping[str, object], *, partial: bool = False
+) -> None:
     """Writes a run to a result file, atomically: a reader sees the old file or the whole new one.
 
     What the file holds of other systems and scenes stays; what it holds of a system's scene is replaced.
@@ -149,15 +151,20 @@ def write_json(path: str | Path, rows: Sequence[Row], environment: Mapping[str, 
         path: File to write; its folder must exist.
         rows: The results.
         environment: As `describe_environment` gives it.
+        partial: Replace only the rows of the same method and option.
 
     Raises:
         WlmError: The environment does not fit JSON, the file can't be written, or what is there is no result file.
     """
     path = Path(path)
-    measured = {(row.system, row.scene) for row in rows}
+
+    def key(row: Row) -> tuple[str, ...]:
+        return (row.system, row.scene, row.method, row.option) if partial else (row.system, row.scene)
+
+    measured = set(map(key, rows))
     runs = []
     for run in read_runs(path) if path.exists() else []:
-        others = [row for row in run.rows if (row.system, row.scene) not in measured]
+        others = [row for row in run.rows if key(row) not in measured]
         if others:
             runs.append(Run(run.environment, others))
     runs.append(Run(dict(environment), list(rows)))

@@ -36,6 +36,9 @@ _Baseline = Annotated[
         help="Fail where rows of this result file were better: by more than 0.05 dB, or by 5% of time on this machine.",
     ),
 ]
+_Profiles = Annotated[
+    list[str] | None, typer.Option("--profile", metavar="NAME", help="Profiles; default all. Several times.")
+]
 _Rivals = Annotated[bool, typer.Option("--rivals/--no-rivals", help="With the rivals, which take minutes on the CPU.")]
 _RivalsAt = Annotated[
     Path | None,
@@ -52,17 +55,32 @@ def lightmap(
     set_path: Annotated[
         Path | None, typer.Option("--set", metavar="SET", help="A lightmap set; default the demo's.")
     ] = None,
+    profiles: _Profiles = None,
+    rivals: _Rivals = True,
+    rivals_only: Annotated[bool, typer.Option("--rivals-only", help="The rivals alone, which need no GPU.")] = False,
+    rival_names: Annotated[
+        list[str] | None, typer.Option("--rival", metavar="NAME", help="Only this rival, such as bc7. Several times.")
+    ] = None,
     json_path: _RowsFile = None,
     plot_path: _PlotFile = None,
     baseline: _Baseline = None,
 ) -> None:
-    """Lightmaps over time: PSNR, bits a texel and decode time of the profiles and of block codecs."""
+    """Lightmaps over time: PSNR, bits a texel and decode time of the profiles, block codecs, PCA and a video codec."""
     device = _prepare(device, json_path, plot_path, baseline)
-    from wlm.bench.lightmap import PANELS, run
+    from wlm.bench.lightmap import PANELS, run, run_rivals
 
-    rows = run(quick=quick, device=device, set_path=set_path, progress=note)
-    command = _command("lightmap", quick=quick, device=device, set=set_path and rows[0].scene)
-    _finish(rows, command, device, json_path, plot_path, PANELS, baseline=baseline)
+    common = {"quick": quick, "set_path": set_path, "progress": note}
+    if rivals_only or rival_names:
+        if not rivals or profiles or device != "cpu":
+            raise WlmError("--rivals-only: expected without --no-rivals, --profile and --device: rivals need no GPU")
+        rows = run_rivals(names=rival_names, **common)
+        options = {"rivals_only": rivals_only, "rival": rival_names}
+    else:
+        rows = run(device=device, names=profiles, rivals=rivals, **common)
+        options = {"profile": profiles, "no_rivals": not rivals, "device": device}
+    command = _command("lightmap", quick=quick, **options, set=set_path and rows[0].scene)
+    partial = bool(profiles or rival_names)
+    _finish(rows, command, device, json_path, plot_path, PANELS, baseline=baseline, partial=partial)
 
 
 @app.command()
@@ -120,9 +138,7 @@ def atlas(
         typer.Option("--lightmap", metavar="FILE.exr", help="A lightmap of it; may be given several times."),
     ] = None,
     mask_path: Annotated[Path | None, typer.Option("--mask", metavar="FILE.png", help="Their mask.")] = None,
-    profiles: Annotated[
-        list[str] | None, typer.Option("--profile", metavar="NAME", help="Profiles; default all. Several times.")
-    ] = None,
+    profiles: _Profiles = None,
     rivals: _Rivals = True,
     rivals_at: _RivalsAt = None,
     json_path: _RowsFile = None,
@@ -308,12 +324,13 @@ def _finish(
     panels: "Sequence[Panel]" = (),
     plotted: "Sequence[Row] | None" = None,
     baseline: Path | None = None,
+    partial: bool = False,
 ) -> None:
     """Writes the result file and the plot, of all rows unless told which, prints the tables, and compares."""
     from wlm.bench import describe_environment, plot, tables, write_json
 
     if json_path is not None:
-        write_json(json_path, rows, describe_environment(device, command))
+        write_json(json_path, rows, describe_environment(device, command), partial=partial)
     if plot_path is not None:
         plot(rows if plotted is None else plotted, plot_path, panels)
     show_text(tables(rows))

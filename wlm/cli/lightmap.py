@@ -32,10 +32,11 @@ from wlm.cli.options import (
     Trust,
     output_option,
 )
+from wlm.errors import WlmError
 
 if TYPE_CHECKING:
     from wlm.baselines.lightmap import Score
-    from wlm.lightmap import LightmapSet, Report
+    from wlm.lightmap import LightmapSet, Profile, Report
     from wlm.metrics.contest import ContestScore
 
 app = typer.Typer(help="Lightmaps over time: BC7 feature maps and a tiny network for each 128² tile.")
@@ -60,6 +61,13 @@ def compress(
     tiles: Annotated[str | None, typer.Option(help="Only these tiles, such as 0-3,7; default all.")] = None,
     steps: Annotated[int | None, typer.Option(help="Steps of the fit; default as the profile says.")] = None,
     samples: Annotated[int | None, typer.Option(help="Samples of each tile in a step; a multiple of 128.")] = None,
+    target_psnr: Annotated[
+        float | None, typer.Option(metavar="DB", help="Choose the maps' size for this PSNR; takes a third longer.")
+    ] = None,
+    max_bpp: Annotated[
+        float | None,
+        typer.Option(metavar="BITS", help="Choose the maps' size for a file of at most so many bits a texel and time."),
+    ] = None,
     seed: Seed = 0,
     device: Device = "cpu",
     workers: Annotated[
@@ -104,13 +112,18 @@ def compress(
     own_device = "cpu" if cluster is not None else check_device(device)
     lightmaps = _load(set_path, times, mask, period, trust, map_id)
     numbers = None if tiles is None else parse_tiles(tiles, TileGrid.of(*lightmaps.mask.shape).count)
+    places = {"workers": workers, "cluster": cluster}
+    if target_psnr is not None or max_bpp is not None:
+        if numbers is not None:
+            raise WlmError("--tiles: expected without --target-psnr and --max-bpp, which choose for a whole set")
+        wanted = {"target_psnr": target_psnr, "max_bpp": max_bpp}
+        settings = _chosen(lightmaps, settings, wanted, {"seed": seed, "device": device} | places)
     options = {"tiles": numbers, "seed": seed, "device": device}
     checkpoint = open_checkpoint(output, lightmaps, settings, resume=resume, every=checkpoint_every, **options)
     if resume and not checkpoint.resumed:
         note(f"{checkpoint.path}: there is nothing to resume; starting at step 0")
     start = clock.perf_counter()
     with running("fit", checkpoint.path) as progress:
-        places = {"workers": workers, "cluster": cluster}
         model = compress(lightmaps, settings, progress=progress, checkpoint=checkpoint, **places, **options)
         seconds = clock.perf_counter() - start
         size = model.save(output)
@@ -297,6 +310,26 @@ def export(
     for path in export(load(file, "lightmap"), output, device=device):
         rows.add_row(escape(path.name), f"{path.stat().st_size:,}")
     show(rows)
+
+
+def _chosen(
+    lightmaps: "LightmapSet",
+    settings: "Profile",
+    wanted: dict[str, float | None],
+    options: dict[str, Any],
+) -> "Profile":
+    """Chooses the size of the maps, and says what it was and why."""
+    from wlm.lightmap.rate import choose
+
+    with running("choose") as progress:
+        choice = choose(lightmaps, settings, **wanted, **options, progress=progress)
+    resolution = choice.profile.uvt_resolution
+    psnr = "" if choice.psnr is None else f", {choice.psnr:.1f} dB"
+    note(f"F_uvt of {resolution}x{resolution}: about {choice.bpp:.3f} bits a texel and time{psnr}")
+    if choice.limited:
+        psnr, bpp = wanted["target_psnr"], wanted["max_bpp"]
+        note(f"warning: --max-bpp {bpp:g} holds the PSNR below the {psnr:g} dB of --target-psnr")
+    return choice.profile
 
 
 def _load(

@@ -16,6 +16,7 @@ from wlm.lightmap.data import LightmapSet
 from wlm.lightmap.dispatch import Batch, Dispatch
 from wlm.lightmap.model import LightmapModel, Profile, decode_scale, encode_scale, part_table
 from wlm.lightmap.packing import check_packable, clear_unused
+from wlm.lightmap.targets import Targets
 from wlm.lightmap.tiles import (
     TILE,
     TileGrid,
@@ -27,7 +28,7 @@ from wlm.lightmap.tiles import (
     split,
     valid_texels,
 )
-from wlm.lightmap.trainer import CPU_LANES, Targets
+from wlm.lightmap.trainer import CPU_LANES
 from wlm.lightmap.worker import Fitter, Piece
 from wlm.system import Meter, OnProgress
 from wlm.workers import Actors, Here, Processes, Workers, cores

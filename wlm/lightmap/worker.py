@@ -8,8 +8,9 @@ import warp as wp
 
 from wlm import interop
 from wlm.lightmap.model import Profile, TimeAxis
+from wlm.lightmap.targets import Targets
 from wlm.lightmap.tiles import TileCut
-from wlm.lightmap.trainer import Targets, Trainer
+from wlm.lightmap.trainer import Trainer
 from wlm_kernels.lightmap import blocks
 
 _CHUNK = {"cpu": 5, "cuda": 200}  # steps after which the clock is looked at

@@ -1,0 +1,86 @@
+"""The size of the maps, chosen for a PSNR or for a size of the file."""
+
+import math
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.builders.checks import error_of
+from tests.builders.small_sets import moving_light, tiny_profile
+from wlm.lightmap import rate
+from wlm.lightmap.data import from_arrays
+from wlm.lightmap.evaluation import bits_per_texel
+from wlm.lightmap.fit import compress
+from wlm.lightmap.rate import RESOLUTIONS, choose
+
+SIZES = (4, 8, 16)
+
+
+@pytest.fixture(autouse=True)
+def few_sizes(monkeypatch):
+    monkeypatch.setattr(rate, "RESOLUTIONS", SIZES)
+
+
+@pytest.fixture(scope="module")
+def light():
+    return moving_light()
+
+
+def bpp_of(lightmaps, resolution):
+    model = compress(lightmaps, tiny_profile(uvt_resolution=resolution))
+    return bits_per_texel(model, lightmaps.mask, model.file_bytes())
+
+
+def test_the_largest_maps_that_a_size_allows(light):
+    sizes = [bpp_of(light, resolution) for resolution in SIZES]
+    for i, resolution in enumerate(SIZES):
+        choice = choose(light, tiny_profile(), max_bpp=1.02 * sizes[i])
+        assert choice.profile == tiny_profile(uvt_resolution=resolution)
+        assert choice.bpp == pytest.approx(sizes[i], rel=0.01)
+        assert choice.psnr is None and not choice.limited
+
+
+def test_the_curve_goes_through_what_fits_reach(light, monkeypatch):
+    # 3 dB for twice the bytes, whatever the texels are.
+    real, bytes_of = rate.evaluate, {}
+
+    def scored(model, *arguments, **options):
+        report = real(model, *arguments, **options)
+        bytes_of[model.profile.uvt_resolution] = size = model.file_bytes()
+        level = 50.0 + 3.0 * math.log2(size / 30_000)
+        return replace(report, psnr_by_tile=0.0 * report.psnr_by_tile + level)
+
+    monkeypatch.setattr(rate, "evaluate", scored)
+    monkeypatch.setattr(rate, "RESOLUTIONS", RESOLUTIONS[:16])
+    choice = choose(light, tiny_profile(), target_psnr=49.0)
+    chosen = choice.profile.uvt_resolution
+    assert chosen not in (8, RESOLUTIONS[0], RESOLUTIONS[15]) and not choice.limited
+    compressed = compress(light, choice.profile).file_bytes()
+    assert choice.psnr == pytest.approx(50.0 + 3.0 * math.log2(compressed / 30_000), abs=0.1)
+    assert choice.psnr == pytest.approx(49.0, abs=0.4)
+
+
+def test_a_size_comes_before_a_psnr(light):
+    choice = choose(light, tiny_profile(), target_psnr=150.0, max_bpp=1.02 * bpp_of(light, 8))
+    assert choice.profile.uvt_resolution == 8 and choice.limited and choice.psnr < 100.0
+
+
+@pytest.mark.parametrize(
+    ("wanted", "message"),
+    [
+        ({}, "rate: expected a PSNR or a size, got neither"),
+        ({"target_psnr": math.nan}, "--target-psnr: expected a finite number above 0, got nan"),
+        ({"max_bpp": 0.0}, "--max-bpp: expected a finite number above 0, got 0"),
+        ({"max_bpp": 0.01}, "--max-bpp: expected at least .* for profile tiny, got 0.01"),
+        ({"target_psnr": 150.0}, "--target-psnr: expected at most .* for profile tiny, got 150"),
+    ],
+)
+def test_what_cannot_be_chosen(light, wanted, message):
+    assert re.fullmatch(message, error_of(choose, light, tiny_profile(), **wanted))
+
+
+def test_nothing_to_choose():
+    grey = from_arrays(np.ones((2, 128, 128, 3)), (0.0, 12.0))
+    assert "no tile changes over time" in error_of(choose, grey, tiny_profile(), max_bpp=8.0)

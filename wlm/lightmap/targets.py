@@ -1,0 +1,67 @@
+"""What a batch of tiles is fitted to: normalised colour and its weights."""
+
+import numpy as np
+
+from wlm.lightmap.tiles import TILE
+
+
+class Targets:
+    """The training data of N tiles, on the host.
+
+    Attributes:
+        number: int [N], numbers of the tiles in their grid.
+        colour: float32 [N, T, 128 * 128, 3], (colour / scale - shift) / spread.
+        texels: int32 [N, K], flat indices of valid texels, padded.
+        count: int32 [N], number of valid texels.
+        weight, emphasis: float32 [N, T, 3] and a number, see `wlm_kernels.lightmap.features.Batch`.
+        shift, spread: float32 [N, 3].
+        scale: float32 [N, T, 3].
+        range: float32 [N, T], of radiance.
+    """
+
+    def __init__(
+        self,
+        number: np.ndarray,
+        colour: np.ndarray,
+        mask: np.ndarray,
+        scale: np.ndarray,
+        affine: np.ndarray,
+        gamma: float,
+        metric_weight: float,
+    ):
+        """Normalises and weights colour.
+
+        Args:
+            number: int [N].
+            colour: float32 [N, T, 128, 128, 3], in gamma space.
+            mask: bool [N, 128, 128], valid texels.
+            scale: float32 [N, T, 3], as rounded for the file.
+            affine: float32 [N, 2, 3], shift and spread, as rounded for the file.
+            gamma, metric_weight: Of the `Profile`.
+        """
+        n, times = colour.shape[:2]
+        self.number = number.astype(np.int32)
+        self.scale = scale
+        self.shift = affine[:, 0].astype(np.float32)
+        self.spread = affine[:, 1].astype(np.float32)
+        factor = np.divide(1.0, scale, out=np.zeros_like(scale), where=scale > 0)
+        flat = colour.reshape(n, times, TILE * TILE, 3)
+        self.colour = (flat * factor[:, :, None] - self.shift[:, None, None]) / self.spread[:, None, None]
+        valid = mask.reshape(n, -1)
+        self.count = valid.sum(1).astype(np.int32)
+        self.texels = np.zeros((n, max(int(self.count.max()), 1)), np.int32)
+        self.weight = np.ones((n, times, 3), np.float32)
+        self.range = np.zeros((n, times), np.float32)
+        for i in range(n):
+            self.texels[i, : self.count[i]] = np.flatnonzero(valid[i])
+            values = flat[i][:, valid[i]]
+            span = values.max((1, 2)) ** gamma - values.min((1, 2)) ** gamma  # [T] of linear radiance
+            self.range[i] = span
+            if metric_weight > 0:
+                # d radiance / d y = gamma (colour / scale)^(gamma - 1) scale^gamma spread; the middle factor is
+                # the texel's emphasis. A tile without range is not scored, so it has no weight.
+                slope = gamma * scale[i] ** gamma * self.spread[i] / np.where(span > 0, span, 1.0)[:, None]
+                self.weight[i] = np.where(span[:, None] > 0, slope, 0.0) ** (2.0 * metric_weight)
+        # A black channel has scale 0: whatever the network's output, it decodes to 0.
+        self.weight *= scale > 0
+        self.emphasis = 2.0 * (gamma - 1.0) * metric_weight
