@@ -10,6 +10,7 @@ import os
 import pickle
 import queue
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
@@ -23,6 +24,7 @@ from wlm.errors import WlmError
 
 _PROTOCOL = 5  # large arrays aren't copied
 _PATIENCE = 2.0  # seconds that a process without work gets to end by itself
+_ANSWER = 10.0  # seconds that a cluster gets to take a connection
 _TOLD = 2000  # bytes of what a dead process wrote that are looked at
 
 
@@ -264,6 +266,13 @@ class Actors(Workers):
 
 def _connect(ray: Any, address: str) -> None:
     """Connects to a cluster; signals do what they did before."""
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if host and port.isdigit():
+        # Ray tries for minutes.
+        try:
+            socket.create_connection((host, int(port)), _ANSWER).close()
+        except (OSError, OverflowError) as error:
+            raise WlmError(f"cluster {address}: cannot connect: {error}") from error
     main = threading.current_thread() is threading.main_thread()
     before = signal.getsignal(signal.SIGTERM)
     try:
