@@ -249,7 +249,9 @@ class Actors(Workers):
         except self._ray.exceptions.RayTaskError as error:
             return number, error.cause
         except self._ray.exceptions.RayError as error:
-            return number, Lost(str(error).splitlines()[0])
+            lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+            # Of an object that couldn't be made the last line says why.
+            return number, Lost(lines[-1 if "creation task" in lines[0] else 0])
 
     def renew(self, number: int) -> None:
         self._actors[number] = self._make.remote(*self._arguments)
