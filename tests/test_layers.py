@@ -5,7 +5,10 @@ from graphlib import TopologicalSorter
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-GROUND = "wlm_kernels wlm wlm._facade wlm.errors wlm.formats wlm.metrics wlm.config wlm.interop wlm.texels wlm.system"
+GROUND = (
+    "wlm_kernels wlm wlm._facade wlm.errors wlm.formats wlm.metrics wlm.config wlm.interop wlm.texels wlm.system "
+    "wlm.workers"
+)
 FLOORS = (
     GROUND.split(),
     ["wlm.ops", "wlm.fluid"],

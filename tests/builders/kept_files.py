@@ -107,7 +107,7 @@ def lightmap_fit() -> tuple[Any, Any]:
 
     fit = _Fit(moving_light(40, 24), tiny_profile())
     (batch,) = fit.batches()
-    trainer = Trainer(fit.profile, fit.model.axis, fit.targets(batch.rows), True, 0, "cpu")
+    trainer = Trainer(fit.profile, fit.model.axis, fit.piece(batch.rows).targets(), True, 0, "cpu")
     trainer.run(3)
     return fit, trainer
 

@@ -75,6 +75,22 @@ def compress(
     ] = None,
     seed: Seed = 0,
     device: Device = "cpu",
+    workers: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            metavar="N",
+            help="Processes that fit tiles side by side; the file is the same. Default: one for two cores, one on a "
+            "GPU, what a cluster has room for; with cuda N are spread over the GPUs.",
+        ),
+    ] = None,
+    cluster: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ADDRESS",
+            help='Fit on a cluster of Ray (extra `cluster`): ray://HOST:10001, or "auto" on one of its machines.',
+        ),
+    ] = None,
     resume: Resume = False,
     checkpoint_every: CheckpointEvery = 30.0,
     times: _Times = None,
@@ -86,7 +102,7 @@ def compress(
     """Compress a lightmap set into one file.
 
     The fit is kept in OUT.wlm.partial from time to time, and by Ctrl-C and SIGTERM; the same command with --resume goes
-    on exactly.
+    on exactly. Lightmaps beyond 1 GiB lie in a temporary file (TMPDIR) while it runs.
     """
     check_output(output, ".wlm")
     quiet_warp()
@@ -97,20 +113,23 @@ def compress(
     from wlm.lightmap.tiles import TileGrid, parse_tiles
 
     settings = Profile.load(profile).override({"steps": steps, "samples": samples}, "--")
-    device = check_device(device)
+    # The device of a cluster is none of this machine's.
+    own_device = "cpu" if cluster is not None else check_device(device)
     lightmaps = _load(set_path, times, mask, period, trust, map_id)
     numbers = None if tiles is None else parse_tiles(tiles, TileGrid.of(*lightmaps.mask.shape).count)
+    places = {"workers": workers, "cluster": cluster}
     if target_psnr is not None or max_bpp is not None:
         if numbers is not None:
             raise WlmError("--tiles: expected without --target-psnr and --max-bpp, which choose for a whole set")
-        settings = _chosen(lightmaps, settings, target_psnr, max_bpp, seed, device)
+        wanted = {"target_psnr": target_psnr, "max_bpp": max_bpp}
+        settings = _chosen(lightmaps, settings, wanted, {"seed": seed, "device": device} | places)
     options = {"tiles": numbers, "seed": seed, "device": device}
     checkpoint = open_checkpoint(output, lightmaps, settings, resume=resume, every=checkpoint_every, **options)
     if resume and not checkpoint.resumed:
         note(f"{checkpoint.path}: there is nothing to resume; starting at step 0")
     start = clock.perf_counter()
     with running("fit", checkpoint.path) as progress:
-        model = compress(lightmaps, settings, progress=progress, checkpoint=checkpoint, **options)
+        model = compress(lightmaps, settings, progress=progress, checkpoint=checkpoint, **places, **options)
         seconds = clock.perf_counter() - start
         size = model.save(output)
         checkpoint.remove()
@@ -120,7 +139,7 @@ def compress(
     bpp = bits_per_texel(model, lightmaps.mask, size) if model.kind.any() else None
     rows.add_row(escape(str(output)), f"{size:,}", number(bpp, ".3f"), kinds, f"{seconds:.1f}")
     show(rows)
-    for warning in (*model.warnings, *(lost_light(model, lightmaps, device) if model.kind.any() else ())):
+    for warning in (*model.warnings, *(lost_light(model, lightmaps, own_device) if model.kind.any() else ())):
         note(f"warning: {warning}")
 
 
@@ -305,22 +324,20 @@ def export(
 def _chosen(
     lightmaps: "LightmapSet",
     settings: "Profile",
-    target_psnr: float | None,
-    max_bpp: float | None,
-    seed: int,
-    device: str,
+    wanted: dict[str, float | None],
+    options: dict[str, Any],
 ) -> "Profile":
     """Chooses the size of the maps, and says what it was and why."""
     from wlm.lightmap.rate import choose
 
-    wanted = {"target_psnr": target_psnr, "max_bpp": max_bpp}
     with running("choose") as progress:
-        choice = choose(lightmaps, settings, **wanted, seed=seed, device=device, progress=progress)
+        choice = choose(lightmaps, settings, **wanted, **options, progress=progress)
     resolution = choice.profile.uvt_resolution
     psnr = "" if choice.psnr is None else f", {choice.psnr:.1f} dB"
     note(f"F_uvt of {resolution}x{resolution}: about {choice.bpp:.3f} bits a texel and time{psnr}")
     if choice.limited:
-        note(f"warning: --max-bpp {max_bpp:g} holds the PSNR below the {target_psnr:g} dB of --target-psnr")
+        psnr, bpp = wanted["target_psnr"], wanted["max_bpp"]
+        note(f"warning: --max-bpp {bpp:g} holds the PSNR below the {psnr:g} dB of --target-psnr")
     return choice.profile
 
 

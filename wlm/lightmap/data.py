@@ -25,6 +25,8 @@ files, mask or mesh outside the       error, unless the set is trusted
 folder of their `set.json`
 frames beyond 1 GiB that small files  error, unless the set is trusted
 only claim
+frames beyond 1 GiB                   in a file without a name in the folder for temporary files
+                                      (TMPDIR); without that much space there: error
 a time outside [0, period)            error: 24 h is 0 h, and wrapping would hide a mistake in the list
 a NaN or infinite time                error
 frames, mask or `set.json` that     error that names both files
@@ -53,6 +55,7 @@ from wlm.errors import WlmError
 from wlm.formats.light import EXPECTED, read_light
 from wlm.formats.limits import FRAMES, PICTURE_GROWTH, TIMES, check_growth
 from wlm.formats.mask import read_mask
+from wlm.formats.scratch import room
 from wlm.lightmap.contest import CONFIG_FILE, is_contest, list_contest, read_coverage, read_raw
 from wlm.lightmap.listing import SET_FILE, Listing, list_folder, parse_set
 from wlm.texels import repair
@@ -67,7 +70,8 @@ class LightmapSet:
     Attributes:
         name: The set's name.
         times: `[T]` float64, strictly increasing, in hours or any other unit.
-        frames: `[T, H, W, 3]` float32, linear RGB irradiance, finite, in [0, 65504]. Row 0 is v = 0.
+        frames: `[T, H, W, 3]` float32, linear RGB irradiance, finite, in [0, 65504]. Row 0 is v = 0. More than 1 GiB
+            of them are mapped from a file, see `wlm.formats.scratch`.
         mask: `[H, W]` bool, true where a texel belongs to a chart; at least one is.
         period: Length of the day in the unit of `times`, all of which are then in [0, period); None where the
             set is not periodic and times outside its ends are clamped.
@@ -161,7 +165,8 @@ def load(
     need_alpha = mask_source == "alpha"
     if need_alpha and listing.raw is not None:
         raise WlmError(f"{path}: expected files of RGBA for a mask from alpha, found raw lightmaps without it")
-    frames, covered, warnings = _read_frames(listing, need_alpha, trust)
+    order = np.argsort(stamps, kind="stable")
+    frames, covered, warnings = _read_frames(listing, order, need_alpha, trust)
     height, width = frames.shape[1:3]
     if need_alpha:
         valid = covered
@@ -175,6 +180,7 @@ def load(
         listing.name,
         labels,
         stamps,
+        order,
         frames,
         valid,
         period,
@@ -219,9 +225,13 @@ def from_arrays(
         raise WlmError(f"{name}: expected a mask of {frames.shape[1:3]}, got {valid.shape}")
     labels = [f"frame {i} (time {time:g})" for i, time in enumerate(stamps)]
     _check_times(name, labels, stamps, period)
+    order = np.argsort(stamps, kind="stable")
+    copied = room(frames.shape, np.float32, name)
     with np.errstate(over="ignore"):  # float64 beyond float32 becomes Inf and is repaired as Inf
-        copied = np.array(frames, dtype=np.float32, order="C")
-    return _check(name, labels, stamps, copied, valid.copy(), period, where=name, mask_from="the mask")
+        for frame, index in zip(copied, order, strict=True):
+            frame[...] = frames[index]
+    valid = valid[order] if valid.ndim == 3 else valid.copy()
+    return _check(name, labels, stamps, order, copied, valid, period, where=name, mask_from="the mask")
 
 
 def parse_times(text: str) -> list[float]:
@@ -262,9 +272,13 @@ def parse_times(text: str) -> list[float]:
 
 
 def _read_frames(
-    listing: Listing, need_alpha: bool, trust: bool
+    listing: Listing, order: np.ndarray, need_alpha: bool, trust: bool
 ) -> tuple[np.ndarray, np.ndarray | None, tuple[str, ...]]:
-    """Reads all files into one array [T, H, W, 3]; if asked for, also where alphas are above 0 [T, H, W]; warnings."""
+    """Reads all files into one array [T, H, W, 3], in an order; if asked for, also where alphas are above 0 [T, H, W].
+
+    Returns:
+        Both, and warnings.
+    """
     first, alpha = _read_rgb(listing, 0, need_alpha)
     size = first.shape[:2]
     if listing.size is not None and size != listing.size:
@@ -273,11 +287,10 @@ def _read_frames(
         held = sum(os.path.getsize(file) for file in set(listing.files) if os.path.exists(file))
         check_growth(f"{listing.stated_by}: lightmaps", held, len(listing.files) * first.nbytes, PICTURE_GROWTH, FRAMES)
     # One array from the start: a list of frames stacked at the end would need twice the memory.
-    try:
-        frames = np.empty((len(listing.files), *first.shape), np.float32)
-    except MemoryError as error:
-        raise WlmError(f"{listing.stated_by}: {len(listing.files)} lightmaps of {_size(size)}: {error}") from error
-    frames[0] = first
+    where = f"{listing.stated_by}: {len(listing.files)} lightmaps of {_size(size)}"
+    frames = room((len(listing.files), *first.shape), np.float32, where)
+    place = np.argsort(order)
+    frames[place[0]] = first
     covered, warnings = np.zeros(frames.shape[:3], bool) if need_alpha else None, []
 
     def read(index: int) -> np.ndarray | None:
@@ -287,7 +300,7 @@ def _read_frames(
                 f"{listing.files[index]}: is {_size(rgb.shape)}, but {listing.files[0]} is {_size(size)}; "
                 "expected one size"
             )
-        frames[index] = rgb
+        frames[place[index]] = rgb
         return alpha
 
     pool = ThreadPoolExecutor(_READERS)
@@ -297,7 +310,7 @@ def _read_frames(
         for i, (file, alpha) in enumerate(zip(listing.files, alphas, strict=True)):
             if covered is None:
                 continue
-            covered[i] = np.isfinite(alpha) & (alpha > 0)
+            covered[place[i]] = np.isfinite(alpha) & (alpha > 0)
             if broken := np.count_nonzero(~np.isfinite(alpha)):
                 warnings.append(f"{file.name}: {broken} texels with an alpha NaN or infinite: not valid")
     finally:
@@ -340,8 +353,9 @@ def _check(
     name: str,
     labels: Sequence[str],
     times: np.ndarray,  # [T]
-    frames: np.ndarray,  # [T, H, W, 3], repaired in place
-    mask: np.ndarray,  # [H, W] or [T, H, W]
+    order: np.ndarray,  # [T], that of the times
+    frames: np.ndarray,  # [T, H, W, 3] in that order, repaired in place
+    mask: np.ndarray,  # [H, W], or [T, H, W] in that order
     period: float | None,
     *,
     where: str,
@@ -353,13 +367,10 @@ def _check(
     if not mask.any():
         raise WlmError(f"{where}: the mask is empty: no texel is valid ({mask_from})")
     warnings = list(warnings)
-    order = np.argsort(times, kind="stable")
-    if (np.diff(order) < 0).any():
-        if warn_order:
-            warnings.append(f"{where}: the times were not in order: sorted, with their frames")
-        times, frames, labels = times[order], frames[order], [labels[i] for i in order]
-        mask = mask[order] if mask.ndim == 3 else mask
-    covered = mask if mask.ndim == 3 and (mask != mask[0]).any() else None
+    if (np.diff(order) < 0).any() and warn_order:
+        warnings.append(f"{where}: the times were not in order: sorted, with their frames")
+    times, labels = times[order], [labels[i] for i in order]
+    covered = mask if mask.ndim == 3 and any((valid != mask[0]).any() for valid in mask) else None
     mask = mask.any(0) if mask.ndim == 3 else mask
     for i, (label, frame) in enumerate(zip(labels, frames, strict=True)):
         inside = mask if covered is None else covered[i]

@@ -227,8 +227,9 @@ def lost_light(model: LightmapModel, lightmaps: LightmapSet, device: str = "cpu"
     mask, lost = scored_mask(model, lightmaps), LostLight()
     decoder = None
     for i, (frame, stamp) in enumerate(zip(lightmaps.frames, model.times, strict=True)):
+        inside = mask & lightmaps.valid(i)
         for tile, window in _windows(model):
-            valid, texels = (mask & lightmaps.valid(i))[window], frame[window]
+            valid, texels = inside[window], frame[window]
             light = texels.max(2, where=valid[..., None], initial=0.0)
             if not 0 < np.count_nonzero(2.0 * light >= light.max()) <= _FEW_TEXELS < np.count_nonzero(valid):
                 continue

@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,16 +13,33 @@ from wlm.errors import WlmError
 from wlm.formats.checkpoint import EVERY, Checkpoint
 from wlm.formats.parts import Part
 from wlm.lightmap.data import LightmapSet
+from wlm.lightmap.dispatch import Batch, Dispatch
 from wlm.lightmap.frame_packing import needed_blocks
 from wlm.lightmap.frames import choose_frames, encode_frames, missing_encoder
-from wlm.lightmap.model import LightmapModel, Profile, encode_scale, part_table
+from wlm.lightmap.model import LightmapModel, Profile, decode_scale, encode_scale, part_table
 from wlm.lightmap.packing import check_packable, clear_unused
 from wlm.lightmap.targets import Targets
-from wlm.lightmap.tiles import TILE, TileGrid, TileKind, channel_means, classify, split
-from wlm.lightmap.trainer import Trainer
+from wlm.lightmap.tiles import (
+    TILE,
+    TileGrid,
+    TileKind,
+    channel_means,
+    check_index,
+    classify,
+    cut,
+    split,
+    valid_texels,
+)
+from wlm.lightmap.trainer import CPU_LANES
+from wlm.lightmap.worker import Fitter, Piece
 from wlm.system import Meter, OnProgress
+from wlm.workers import Actors, Here, Processes, Workers, cores
 
 BATCH_TEXELS = 64 * 26 * TILE * TILE  # texels times times in a batch: 64 tiles of 26 times, 330 MB of targets
+CPU_TILES = 4  # in a batch on a CPU, at most: two cores gain nothing from more, and many want many batches
+
+_LOOK = 32  # tiles that are looked at between two looks at the clock: some seconds
+_WORTHWHILE = 20_000_000  # samples that two cores take some 20 s for: a process takes 3 s to start
 
 _CONSTANT_ERROR = 0.01  # of a constant tile's radiance: half floats near their end, 6e-8, are further off
 
@@ -33,6 +51,8 @@ def compress(
     tiles: Sequence[int] | None = None,
     seed: int = 0,
     device: str = "cpu",
+    workers: int | None = None,
+    cluster: str | None = None,
     progress: OnProgress | None = None,
     checkpoint: Checkpoint | None = None,
     **overrides: Any,
@@ -44,9 +64,14 @@ def compress(
         profile: The settings: a name, the path of a YAML file, or a `Profile`.
         tiles: Numbers of the tiles to compress; None: all. The others are stored as empty.
         seed: One seed gives one result on one device.
-        device: "cpu", "cuda" or "cuda:N".
-        progress: Called about twice a second; its figures are the loss and "PSNR dB", of the samples since the last
-            report, by the tiled protocol.
+        device: "cpu", "cuda" or "cuda:N". Several workers on "cuda" are spread over the GPUs.
+        workers: Processes that fit batches of tiles side by side; the result doesn't depend on it. 1: this process
+            alone. None: on the CPU one for every two of its cores, since a batch keeps two busy, but fewer where they
+            would end soon after they have started; 1 on a GPU; on a cluster as many as it has room for.
+        cluster: Address of a cluster of Ray whose machines fit the tiles, as `ray.init` takes it ("auto",
+            "ray://host:10001"); each worker takes two CPUs, or a GPU where the device is "cuda". None: this machine.
+        progress: Called about twice a second; of the stage "fit" the figures are the loss and "PSNR dB", of the latest
+            samples, by the tiled protocol. A large set has a stage "tiles" before it.
         checkpoint: From `open_checkpoint`: where a running fit is kept, and an interrupted one resumed.
         overrides: Settings in place of the profile's: `steps=500`.
 
@@ -54,36 +79,73 @@ def compress(
         The model; its `warnings` say what could not be done as the settings ask.
 
     Raises:
-        WlmError: No such profile, setting, device or tile; a checkpoint that isn't of this fit; the fit diverged; or
-            the settings ask for frames and the extra `frames` is missing.
+        WlmError: No such profile, setting, device, tile or cluster; a checkpoint that isn't of this fit; the fit
+            diverged; workers died again and again; or the settings ask for frames and the extra `frames` is missing.
         KeyboardInterrupt: Raised by `progress`, after the checkpoint, if there is one, has been written.
     """
-    device = interop.check_device(device)
-    fit = _Fit(lightmaps, Profile.load(profile).override(overrides), tiles)
+    _devices(device, workers, cluster, 0)  # checked before the set is looked at
+    fit = _Fit(lightmaps, Profile.load(profile).override(overrides), tiles, progress)
     fit.store_frames(progress)
-    steps, batches = fit.profile.steps, fit.batches()
-    meter = Meter(progress, "fit", steps * len(batches))
-    for number, batch in enumerate(batches):
-        parts = checkpoint.finished(number, fit.table(batch)) if checkpoint is not None else None
-        if parts is not None:
-            try:
-                check_packable(parts, fit.profile, batch.kind == TileKind.DYNAMIC)
-            except WlmError as error:
-                raise WlmError(f"{checkpoint.path}: finished batch {number}: {error}") from error
-        else:
-            targets = fit.targets(batch.rows)
-            dynamic = batch.kind == TileKind.DYNAMIC
-            trainer = Trainer(fit.profile, fit.model.axis, targets, dynamic, seed, device, track=progress is not None)
-            del targets
-            try:
-                _run(trainer, number, meter, checkpoint)
-                parts = trainer.quantised()
-            finally:
-                trainer.close()
-            if checkpoint is not None:
-                checkpoint.add_finished(number, parts)
+    batches = fit.batches(CPU_TILES if device == "cpu" else None)
+    waiting = []
+    for batch in batches:
+        parts = checkpoint.finished(batch.number, fit.table(batch)) if checkpoint is not None else None
+        if parts is None:
+            waiting.append(batch)
+            continue
+        try:
+            check_packable(parts, fit.profile, batch.kind == TileKind.DYNAMIC)
+        except WlmError as error:
+            raise WlmError(f"{checkpoint.path}: finished batch {batch.number}: {error}") from error
         fit.store(batch, parts)
+    if not waiting:
+        return fit.model
+    steps = fit.profile.steps
+    meter = Meter(progress, "fit", steps * len(batches))
+    samples = steps * fit.profile.samples * sum(len(batch.rows) for batch in waiting)
+    devices = _devices(device, workers, cluster, samples)[: len(waiting)]
+    shared = (fit.profile, fit.model.axis, seed), progress is not None
+    try:
+        with closing(_workers(*shared, devices, workers, cluster, len(waiting))) as at:
+            dispatch = Dispatch(at, fit.piece, steps, len(batches) - len(waiting), meter, checkpoint)
+            for batch, parts in dispatch.run(waiting):
+                fit.store(batch, parts)
+    except (WlmError, KeyboardInterrupt):
+        if checkpoint is not None:
+            checkpoint.flush()
+        raise
     return fit.model
+
+
+def _devices(device: str, workers: int | None, cluster: str | None, samples: int) -> list[str]:
+    """The device of each worker, of a fit that takes so many samples.
+
+    Raises:
+        WlmError: No such device, or a number of workers that is none.
+    """
+    if workers is not None and workers < 1:
+        raise WlmError(f"workers: expected at least 1, got {workers}")
+    if cluster is not None:
+        if device not in ("cpu", "cuda"):
+            raise WlmError(f"device '{device}': expected cpu or cuda, whichever the machines of a cluster have")
+        return [device]
+    checked = interop.check_device(device)
+    if device == "cpu":
+        return ["cpu"] * (workers or max(1, min(cores() // CPU_LANES, samples // _WORTHWHILE)))
+    gpus = interop.available_devices()[1:] if device == "cuda" else [checked]
+    return [gpus[i % len(gpus)] for i in range(workers or 1)]
+
+
+def _workers(
+    shared: tuple[Any, ...], track: bool, devices: list[str], workers: int | None, cluster: str | None, batches: int
+) -> Workers:
+    """What fits the batches, see `compress`."""
+    if cluster is not None:
+        share = {"CPU": float(CPU_LANES)} if devices[0] == "cpu" else {"GPU": 1.0}
+        return Actors(Fitter, (*shared, devices[0], track), workers, batches, cluster, share)
+    if len(devices) == 1:
+        return Here(Fitter(*shared, devices[0], track))
+    return Processes(Fitter, [(*shared, device, track) for device in devices])
 
 
 def open_checkpoint(
@@ -130,46 +192,64 @@ def dynamic_targets(lightmaps: LightmapSet, profile: Profile) -> Targets | None:
     """What the dynamic tiles of a set are fitted to, for peers of the trainer; None where there are none."""
     fit = _Fit(lightmaps, profile)
     rows = np.flatnonzero(fit.kinds == TileKind.DYNAMIC)
-    return fit.targets(rows) if len(rows) else None
+    return fit.piece(rows).targets() if len(rows) else None
 
 
 @dataclass(frozen=True, eq=False)
-class _Batch:
-    """Tiles of one kind that are fitted together.
+class _Facts:
+    """What is stored of a tile beside its maps and network, rounded as in the file (section 4).
 
     Attributes:
-        kind: STATIC or DYNAMIC.
-        rows: int [n], their places among the fit's tiles.
-        first: Number of tiles of that kind in earlier batches.
+        kind: Its kind.
+        scale: [T, 3], of tiles that have maps: codes, of a static one half floats.
+        peak: uint8 [T], of these, codes of the largest colour.
+        affine: [2, 3], of these, shift and spread.
+        constant: float64 [T, 3], radiance of a constant tile.
     """
 
     kind: TileKind
-    rows: np.ndarray
-    first: int
+    scale: np.ndarray | None = None
+    peak: np.ndarray | None = None
+    affine: np.ndarray | None = None
+    constant: np.ndarray | None = None
 
 
 class _Fit:
     """The tiles of a set, and the model that a fit fills with them.
 
+    Tiles are cut out of the set as they are needed, some at a time: all of a large set don't fit in memory.
+
     Attributes:
         profile: The settings.
-        data: The N tiles, by number.
+        index: int [N], numbers of the tiles in their grid, rising.
         kinds: int [N], `TileKind` of each.
         model: Complete but for the maps and networks of the batches that have not been stored.
     """
 
-    def __init__(self, lightmaps: LightmapSet, profile: Profile, tiles: Sequence[int] | None = None) -> None:
-        self.profile = profile
-        self.data = split(lightmaps, profile.gamma, None if tiles is None else sorted(tiles))
-        self.kinds = classify(self.data, profile.gamma, profile.static_budget_db)
+    def __init__(
+        self,
+        lightmaps: LightmapSet,
+        profile: Profile,
+        tiles: Sequence[int] | None = None,
+        progress: OnProgress | None = None,
+    ) -> None:
+        self.profile, self._lightmaps = profile, lightmaps
         grid = TileGrid.of(*lightmaps.mask.shape)
-        framed = choose_frames(self.kinds, self.data.index, lightmaps.mask, len(lightmaps.times), profile)
+        self.index = np.arange(grid.count) if tiles is None else np.array(sorted(tiles), np.int64)
+        check_index(self.index, grid)
+        meter, facts = Meter(progress, "tiles", len(self.index)), []
+        for number in self.index.tolist():
+            facts.append(self._facts(number))
+            if len(facts) % _LOOK == 0 and meter.due(len(facts)):
+                meter.report(len(facts))
+        self.kinds = np.array([tile.kind for tile in facts])
+        framed = choose_frames(self.kinds, self.index, lightmaps.mask, len(lightmaps.times), profile)
         warnings = ()
         if profile.frames == "auto" and framed.any() and (warning := missing_encoder(int(framed.sum()))):
             warnings, framed[:] = (f"{lightmaps.name}: {warning}",), False
         self.kinds[framed] = TileKind.FRAMES
         kind = np.zeros(grid.count, np.uint8)
-        kind[self.data.index] = self.kinds
+        kind[self.index] = self.kinds
         table = part_table(profile, kind, len(lightmaps.times))
         self.model = LightmapModel(
             name=lightmaps.name,
@@ -181,81 +261,85 @@ class _Fit:
             profile=profile,
             mask=lightmaps.mask,
             kind=kind,
-            constant=self._constants(len(lightmaps.times)),
+            constant=_constants(facts, len(lightmaps.times)),
             warnings=warnings,
             **{name: np.zeros(part.shape, part.dtype) for name, part in table.items() if name != "constant"},
         )
         self._mapped = np.flatnonzero(np.isin(self.kinds, (TileKind.STATIC, TileKind.DYNAMIC)))
-        self._set_scales()
+        for name, kind in (("scale", TileKind.DYNAMIC), ("scale_static", TileKind.STATIC)):
+            stored = [facts[row].scale for row in np.flatnonzero(self.kinds == kind)]
+            if stored:
+                getattr(self.model, name)[:] = stored
+        for i, row in enumerate(self._mapped):
+            self.model.peak[i], self.model.affine[i] = facts[row].peak, facts[row].affine
         self._scale = self.model.scales
 
-    def _valid(self, row: int) -> np.ndarray:
-        """Colour of a tile's K valid texels, [T, K, 3] in gamma space."""
-        return self.data.colour[row][:, self.data.mask[row]]
-
-    def _constants(self, times: int) -> np.ndarray:
-        """Radiance of the constant tiles, [N_c, T, 3]: half floats, or float32 where one would be over 1% off."""
-        rows = np.flatnonzero(self.kinds == TileKind.CONSTANT)
-        values = np.zeros((len(rows), times, 3))
-        for i, row in enumerate(rows):
-            radiance = self._valid(row).astype(np.float64) ** self.profile.gamma
+    def _facts(self, number: int) -> "_Facts":
+        """What is stored of a tile beside its maps and network."""
+        gamma = self.profile.gamma
+        tile = split(self._lightmaps, gamma, [number])
+        kind = TileKind(int(classify(tile, gamma, self.profile.static_budget_db)[0]))
+        if kind == TileKind.EMPTY:
+            return _Facts(kind)
+        colour = tile.colour[0][:, tile.mask[0]]  # [T, K, 3], of the valid texels
+        if kind == TileKind.CONSTANT:
+            radiance = colour.astype(np.float64) ** gamma
             # The middle of the range: at most half a step of half float off.
-            values[i] = 0.5 * (radiance.min(1) + radiance.max(1))
-        half = values.astype(np.float16)
-        return half if (np.abs(half - values) <= _CONSTANT_ERROR * values).all() else values.astype(np.float32)
-
-    def _set_scales(self) -> None:
-        """Sets scale, bound, shift and spread of the tiles that have maps (section 4), rounded as in the file."""
-        model, gamma = self.model, self.profile.gamma
-        means = channel_means(self.data.colour, self.data.mask)[self._mapped]
-        dynamic = self.kinds[self._mapped] == TileKind.DYNAMIC
-        model.scale[:] = encode_scale(means[dynamic], gamma)
-        model.scale_static[:] = means[~dynamic]
-        for i, (row, scale) in enumerate(zip(self._mapped, model.scales, strict=True)):
-            colour = self._valid(row)
-            model.peak[i] = encode_scale(colour.max((1, 2)).astype(np.float64), gamma, up=True)
-            lit = scale > 0
-            values = colour * np.divide(1.0, scale, out=np.zeros_like(scale), where=lit)[:, None]
-            for c in range(3):
-                chosen = values[lit[:, c], :, c]
-                shift, spread = (chosen.mean(), chosen.std()) if chosen.size else (0.0, 1.0)
-                # Half floats end at 6e-8; a channel that is the same everywhere has nothing left to spread.
-                model.affine[i, :, c] = shift, max(spread, 1e-4)
+            return _Facts(kind, constant=0.5 * (radiance.min(1) + radiance.max(1)))
+        means = channel_means(tile.colour, tile.mask)[0]
+        if kind == TileKind.DYNAMIC:
+            stored = encode_scale(means, gamma)
+            scale = decode_scale(stored, gamma)
+        else:
+            stored = means.astype(np.float16)
+            scale = stored.astype(np.float32)
+        # Shift and spread, of values as the fit will see them (section 4).
+        lit = scale > 0
+        values = colour * np.divide(1.0, scale, out=np.zeros_like(scale), where=lit)[:, None]
+        affine = np.empty((2, 3))
+        for c in range(3):
+            chosen = values[lit[:, c], :, c]
+            shift, spread = (chosen.mean(), chosen.std()) if chosen.size else (0.0, 1.0)
+            # Half floats end at 6e-8; a channel that is the same everywhere has nothing left to spread.
+            affine[:, c] = shift, max(spread, 1e-4)
+        peak = encode_scale(colour.max((1, 2)).astype(np.float64), gamma, up=True)
+        return _Facts(kind, scale=stored, peak=peak, affine=affine)
 
     def store_frames(self, progress: OnProgress | None) -> None:
         """Encodes the tiles that are stored as frames, and puts them into the model."""
         rows = np.flatnonzero(self.kinds == TileKind.FRAMES)
         meter = Meter(progress, "frames", len(rows))
         for i, row in enumerate(rows):
-            needed = needed_blocks(self.model.mask, int(self.data.index[row]))
-            tile = encode_frames(self.data.colour[row], self.data.mask[row], needed, self.profile.frames_loss)
-            self.model.frames[i], self.model.ranges[i] = tile
+            number = int(self.index[row])
+            tile, needed = split(self._lightmaps, self.profile.gamma, [number]), needed_blocks(self.model.mask, number)
+            parts = encode_frames(tile.colour[0], tile.mask[0], needed, self.profile.frames_loss)
+            self.model.frames[i], self.model.ranges[i] = parts
             if meter.due(i + 1):
                 meter.report(i + 1)
 
-    def batches(self) -> list[_Batch]:
-        """Batches of `BATCH_TEXELS`, dynamic tiles first."""
+    def batches(self, most: int | None = None) -> list[Batch]:
+        """Batches of `BATCH_TEXELS`, of so many tiles at most and at least one; dynamic tiles first."""
         size = max(1, BATCH_TEXELS // (len(self.model.times) * TILE * TILE))
+        size = size if most is None else min(size, most)
         result = []
         for kind in (TileKind.DYNAMIC, TileKind.STATIC):
             rows = np.flatnonzero(self.kinds == kind)
-            result += [_Batch(kind, rows[i : i + size], i) for i in range(0, len(rows), size)]
+            for first in range(0, len(rows), size):
+                result.append(Batch(len(result), kind, rows[first : first + size], first))
         return result
 
-    def targets(self, rows: np.ndarray) -> Targets:
-        """What some tiles are fitted to."""
+    def piece(self, rows: np.ndarray) -> Piece:
+        """Some tiles as they are sent to a worker."""
         slots = np.searchsorted(self._mapped, rows)
-        return Targets(
-            self.data.index[rows],
-            self.data.colour[rows],
-            self.data.mask[rows],
+        return Piece(
+            cut(self._lightmaps, self.index[rows]),
             self._scale[slots],
             self.model.affine[slots].astype(np.float32),
             self.profile.gamma,
             self.profile.metric_weight,
         )
 
-    def table(self, batch: _Batch) -> dict[str, Part]:
+    def table(self, batch: Batch) -> dict[str, Part]:
         """The parts of a batch that is finished, as the trainer gives them."""
         kind = np.full(len(batch.rows), batch.kind, np.uint8)
         table = part_table(self.profile, kind, len(self.model.times))
@@ -263,35 +347,18 @@ class _Fit:
             return {"net": table["net_static"], "uv": table["uv"]}
         return {name: table[name] for name in ("net", "uv", "uvt", "ut", "vt")}
 
-    def store(self, batch: _Batch, parts: dict[str, np.ndarray]) -> None:
+    def store(self, batch: Batch, parts: dict[str, np.ndarray]) -> None:
         """Puts the maps and networks of a batch into the model."""
         for row, blocks in zip(batch.rows, parts["uv"], strict=True):
-            self.model.uv[np.searchsorted(self._mapped, row)] = clear_unused(blocks, self.data.mask[row])
+            used = valid_texels(self.model.mask, int(self.index[row]))
+            self.model.uv[np.searchsorted(self._mapped, row)] = clear_unused(blocks, used)
         for name in parts.keys() - {"uv"}:
             target = "net_static" if batch.kind == TileKind.STATIC else name
             getattr(self.model, target)[batch.first : batch.first + len(batch.rows)] = parts[name]
 
 
-def _run(trainer: Trainer, number: int, meter: Meter, checkpoint: Checkpoint | None) -> None:
-    """Trains batch `number` to its end, from its checkpoint if it has one."""
-    steps = trainer.profile.steps
-    if checkpoint is not None:
-        checkpoint.restore(number, trainer.load)
-    chunk = 200 if trainer.device != "cpu" else 5
-    step = trainer.step
-    while step < steps:
-        count = min(chunk, steps - step)
-        trainer.run(count)
-        step += count
-        done = number * steps + step
-        if meter.due(done):
-            try:
-                meter.report(done, loss=float(trainer.losses().mean()), PSNR_dB=trainer.psnr())
-            except KeyboardInterrupt:
-                # Between two steps the state is whole; anywhere else an interrupt keeps nothing.
-                if checkpoint is not None:
-                    checkpoint.save_running(number, trainer.state())
-                raise
-        if checkpoint is not None and checkpoint.due():
-            checkpoint.save_running(number, trainer.state())
-    trainer.check()
+def _constants(facts: Sequence[_Facts], times: int) -> np.ndarray:
+    """Radiance of the constant tiles, [N_c, T, 3]: half floats, or float32 where one would be over 1% off."""
+    values = np.array([tile.constant for tile in facts if tile.kind == TileKind.CONSTANT]).reshape(-1, times, 3)
+    half = values.astype(np.float16)
+    return half if (np.abs(half - values) <= _CONSTANT_ERROR * values).all() else values.astype(np.float32)

@@ -16,7 +16,7 @@ import numpy as np
 from wlm.errors import WlmError
 from wlm.formats.parts import Part
 from wlm.lightmap.model import Profile
-from wlm.lightmap.tiles import TILE, TileGrid, TileKind
+from wlm.lightmap.tiles import TILE, TileKind, valid_texels
 from wlm.lightmap.weights import pack_net, packed_bytes, unpack_net
 
 STREAMS = ("uv ends", "uv indices", "uvt ends", "uvt indices", "ut", "vt", "net")
@@ -86,7 +86,7 @@ def pack_tiles(
     streams, sizes = [], []
     for place, number, row in _mapped(kind):
         raw = dict.fromkeys(STREAMS, _NONE)
-        raw["uv ends"], raw["uv indices"] = _packed_blocks(parts["uv"][place], _used(mask, number))
+        raw["uv ends"], raw["uv indices"] = _packed_blocks(parts["uv"][place], valid_texels(mask, number))
         if kind[number] == TileKind.DYNAMIC:
             raw["uvt ends"], raw["uvt indices"] = _packed_blocks(parts["uvt"][row])
             raw |= {name: np.moveaxis(parts[name][row], 2, 0) for name in ("ut", "vt")}
@@ -143,7 +143,9 @@ def unpack_tiles(
         def read(name: str, count: int, of: dict[str, np.ndarray] = streams, at: int = number) -> np.ndarray:
             return _inflated(of[name], count, f"part tiles: tile {at}: {name}")
 
-        parts["uv"][place] = _unpacked_blocks(read, "uv", TILE * TILE // 16, _used(mask, number)).reshape(32, 32, 16)
+        parts["uv"][place] = _unpacked_blocks(read, "uv", TILE * TILE // 16, valid_texels(mask, number)).reshape(
+            32, 32, 16
+        )
         net = "net" if dynamic else "net_static"
         if dynamic:
             shape = parts["uvt"].shape[1:]
@@ -165,15 +167,6 @@ def _mapped(kind: np.ndarray) -> list[tuple[int, int, int]]:
     numbers = np.flatnonzero(np.isin(kind, (TileKind.STATIC, TileKind.DYNAMIC)))
     rows = [int((kind[:number] == kind[number]).sum()) for number in numbers]
     return [(place, int(number), row) for place, (number, row) in enumerate(zip(numbers, rows, strict=True))]
-
-
-def _used(mask: np.ndarray, number: int) -> np.ndarray:
-    """The valid texels of a tile, bool [128, 128]."""
-    y, x = TileGrid.of(*mask.shape).origin(number)
-    part = mask[y : y + TILE, x : x + TILE]
-    used = np.zeros((TILE, TILE), bool)
-    used[: part.shape[0], : part.shape[1]] = part
-    return used
 
 
 def _by_block(used: np.ndarray) -> np.ndarray:

@@ -8,6 +8,7 @@ at equal PSNR, since a mean of decibels gains as much from doubling the bytes of
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -58,6 +59,8 @@ def choose(
     max_bpp: float | None = None,
     seed: int = 0,
     device: str = "cpu",
+    workers: int | None = None,
+    cluster: str | None = None,
     progress: OnProgress | None = None,
 ) -> Choice:
     """Chooses the resolution of F_uvt, in a quarter to a third of the time of the fit that follows.
@@ -67,7 +70,7 @@ def choose(
         profile: All other settings. No tile is stored as frames, whose size doesn't follow from maps.
         target_psnr: The PSNR to reach, dB, by the tiled protocol.
         max_bpp: The most bits per texel and time that the file may have. With both, the size comes first.
-        seed, device, progress: As for `compress`.
+        seed, device, workers, cluster, progress: As for `compress`.
 
     Raises:
         WlmError: Neither is given or one isn't above 0, the profile asks for frames, no tile changes over time, or no
@@ -81,7 +84,8 @@ def choose(
     if profile.frames == "always":
         raise WlmError(f"rate: expected a profile of networks, got {profile.name}, whose tiles are frames")
     profile = profile.override({"frames": "never"})
-    search = _Search(lightmaps, profile, seed, device, progress)
+    options = {"seed": seed, "device": device, "workers": workers, "cluster": cluster, "progress": _renamed(progress)}
+    search = _Search(lightmaps, profile, options)
     allowed = [r for r in RESOLUTIONS if max_bpp is None or search.bpp(r) <= _ROOM * max_bpp]
     if not allowed:
         least = search.bpp(RESOLUTIONS[0]) / _ROOM
@@ -116,11 +120,10 @@ class _Curve:
 class _Search:
     """Two fits at the profile's resolution, a short one of all tiles and a full one of a part, and what follows."""
 
-    def __init__(
-        self, lightmaps: LightmapSet, profile: Profile, seed: int, device: str, progress: OnProgress | None
-    ) -> None:
-        self._lightmaps, self._profile = lightmaps, profile
-        self._options = {"seed": seed, "device": device, "progress": _renamed(progress)}
+    def __init__(self, lightmaps: LightmapSet, profile: Profile, options: dict[str, Any]) -> None:
+        self._lightmaps, self._profile, self._options = lightmaps, profile, options
+        # The device of a cluster is none of this machine's.
+        self._device = options["device"] if options["cluster"] is None else "cpu"
         self._first = profile.uvt_resolution
         model = self._fit(self._first, None, max(10, round(_SHORT * profile.steps)))
         dynamic = np.flatnonzero(model.kind == TileKind.DYNAMIC)
@@ -168,7 +171,7 @@ class _Search:
 
     def _psnr(self, model: LightmapModel) -> np.ndarray:
         """PSNR of each tile of the grid, NaN without a score."""
-        report = evaluate(model, self._lightmaps, device=self._options["device"], metrics=("psnr",), views=0)
+        report = evaluate(model, self._lightmaps, device=self._device, metrics=("psnr",), views=0)
         return report.psnr_by_tile.ravel()
 
 

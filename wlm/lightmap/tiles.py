@@ -95,6 +95,35 @@ class TileData:
     mask: np.ndarray
 
 
+@dataclass(frozen=True, eq=False)
+class TileCut:
+    """N tiles of a set as they are in it.
+
+    Attributes:
+        index: `[N]` int64, number of each tile in its grid, row-major.
+        light: Of each tile `[T, h, w, 3]` float32, irradiance; h and w are 128, or less at the map's end.
+        mask: Of each `[h, w]` bool, true where a texel is valid.
+    """
+
+    index: np.ndarray
+    light: list[np.ndarray]
+    mask: list[np.ndarray]
+
+    def encoded(self, gamma: float) -> TileData:
+        """The tiles ready for fitting; they take N * T * 192 KiB of memory."""
+        colour = np.zeros((len(self.index), len(self.light[0]), TILE, TILE, 3), np.float32)
+        for light, valid, out in zip(self.light, self.mask, colour, strict=True):
+            if not valid.any():
+                continue
+            rows, columns = valid.shape
+            out[:, :rows, :columns] = fill_gaps(light, valid)
+            out[:, :rows, columns:] = out[:, :rows, columns - 1 : columns]
+            out[:, rows:] = out[:, rows - 1 : rows]
+            if gamma != 1.0:
+                np.power(out, np.float32(1.0 / gamma), out=out)
+        return TileData(self.index, colour, np.stack([_whole(valid) for valid in self.mask]))
+
+
 class TileKind(IntEnum):
     """The least model that a tile needs; the numbers are those in files."""
 
@@ -125,27 +154,38 @@ def split(lightmaps: LightmapSet, gamma: float, tiles: Sequence[int] | None = No
         WlmError: A number is outside the grid or given twice, there is none, or gamma is not above 0.
     """
     _check_gamma(gamma)
-    times, height, width = lightmaps.frames.shape[:3]
-    grid = TileGrid.of(height, width)
-    index = np.arange(grid.count) if tiles is None else np.asarray(list(tiles), np.int64)
-    _check_index(index, grid)
-    colour = np.zeros((len(index), times, TILE, TILE, 3), np.float32)
-    mask = np.zeros((len(index), TILE, TILE), bool)
-    for n, tile in enumerate(index):
+    grid = TileGrid.of(*lightmaps.mask.shape)
+    return cut(lightmaps, np.arange(grid.count) if tiles is None else np.array(list(tiles), np.int64)).encoded(gamma)
+
+
+def cut(lightmaps: LightmapSet, index: np.ndarray) -> TileCut:
+    """Cuts tiles out of a set, without a copy.
+
+    Args:
+        lightmaps: The set, `[T, H, W, 3]`.
+        index: `[N]` int64, numbers of the tiles.
+
+    Raises:
+        WlmError: A number is outside the grid or given twice, or there is none.
+    """
+    grid = TileGrid.of(*lightmaps.mask.shape)
+    check_index(index, grid)
+    windows = []
+    for tile in index:
         y, x = grid.origin(tile)
-        inside = (slice(y, min(y + TILE, height)), slice(x, min(x + TILE, width)))
-        valid = lightmaps.mask[inside]
-        if not valid.any():
-            continue
-        rows, columns = valid.shape
-        mask[n, :rows, :columns] = valid
-        out = colour[n]
-        out[:, :rows, :columns] = fill_gaps(lightmaps.frames[:, *inside], valid)
-        out[:, :rows, columns:] = out[:, :rows, columns - 1 : columns]
-        out[:, rows:] = out[:, rows - 1 : rows]
-        if gamma != 1.0:
-            np.power(out, np.float32(1.0 / gamma), out=out)
-    return TileData(index=index, colour=colour, mask=mask)
+        windows.append((slice(y, min(y + TILE, grid.height)), slice(x, min(x + TILE, grid.width))))
+    return TileCut(index, [lightmaps.frames[:, *at] for at in windows], [lightmaps.mask[at] for at in windows])
+
+
+def valid_texels(mask: np.ndarray, number: int) -> np.ndarray:
+    """The valid texels of a tile, bool [128, 128]; none past the map's end.
+
+    Args:
+        mask: bool [H, W], true where a texel is valid.
+        number: Of the tile in the grid.
+    """
+    y, x = TileGrid.of(*mask.shape).origin(number)
+    return _whole(mask[y : y + TILE, x : x + TILE])
 
 
 def channel_means(colour: np.ndarray, mask: np.ndarray) -> np.ndarray:
@@ -232,6 +272,21 @@ def classify(tiles: TileData, gamma: float, static_budget_db: float = 60.0) -> n
     return kinds
 
 
+def check_index(index: np.ndarray, grid: TileGrid) -> None:
+    """Checks numbers of tiles, `[N]`.
+
+    Raises:
+        WlmError: There is none, one is outside the grid, or one is given twice.
+    """
+    if not index.size:
+        raise WlmError("tiles: expected at least one tile, got none")
+    for tile in (index.min(), index.max()):
+        grid.origin(tile)
+    numbers, counts = np.unique(index, return_counts=True)
+    if (counts > 1).any():
+        raise WlmError(f"tiles: tile {numbers[counts > 1][0]} is given twice")
+
+
 def parse_tiles(text: str, count: int) -> list[int]:
     """Reads a list of tiles: numbers and closed ranges, separated by commas.
 
@@ -286,7 +341,7 @@ def assemble(tiles: np.ndarray, index: np.ndarray, grid: TileGrid, fill: float =
         raise WlmError(
             f"tiles: expected tiles [N, {TILE}, {TILE}, C] and N numbers, got {tiles.shape} and {index.shape}"
         )
-    _check_index(index, grid)
+    check_index(index, grid)
     image = np.full((grid.height, grid.width, tiles.shape[3]), fill, tiles.dtype)
     place(image, tiles, index, grid)
     return image
@@ -307,20 +362,16 @@ def place(image: np.ndarray, tiles: np.ndarray, index: np.ndarray, grid: TileGri
         part[...] = tile[: part.shape[0], : part.shape[1]]
 
 
+def _whole(valid: np.ndarray) -> np.ndarray:
+    """The valid texels of a tile [h, w] as [128, 128]."""
+    mask = np.zeros((TILE, TILE), bool)
+    mask[: valid.shape[0], : valid.shape[1]] = valid
+    return mask
+
+
 def _check_gamma(gamma: float) -> None:
     if not (math.isfinite(gamma) and gamma > 0):
         raise WlmError(f"tiles: expected a finite gamma above 0, got {gamma}")
-
-
-def _check_index(index: np.ndarray, grid: TileGrid) -> None:
-    """Raises where there is no tile, a tile outside the grid or one twice."""
-    if not index.size:
-        raise WlmError("tiles: expected at least one tile, got none")
-    for tile in (index.min(), index.max()):
-        grid.origin(tile)
-    numbers, counts = np.unique(index, return_counts=True)
-    if (counts > 1).any():
-        raise WlmError(f"tiles: tile {numbers[counts > 1][0]} is given twice")
 
 
 def _half_step(value: np.ndarray) -> np.ndarray:

@@ -1,0 +1,270 @@
+"""Fits by several workers: whatever happens to them, the file is that of one process; and sets beyond memory."""
+
+import functools
+import os
+import random
+import signal
+import subprocess
+import sys
+import tracemalloc
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+from builders.running import report_always
+from builders.small_sets import moving_light, static_light, tiny_profile, write_set
+
+import wlm
+from wlm.errors import WlmError
+from wlm.formats import scratch
+from wlm.lightmap import fit
+from wlm.lightmap.data import from_arrays, load
+from wlm.lightmap.worker import Fitter
+from wlm.workers import Here, Lost, Processes, Workers
+
+PROFILE = tiny_profile(steps=40)
+
+
+class Several(Workers):
+    """Fitters in this process: any may answer next, and those of the answers of some numbers are lost."""
+
+    remote = False
+
+    def __init__(self, shared, track, devices, *_, seed=0, lose=()):
+        self.count, self._make = len(devices), lambda: Here(Fitter(*shared, devices[0], track))
+        self._random, self._lose = random.Random(seed), lose
+        self._workers = [self._make() for _ in devices]
+        self._called, self._answers = [], 0
+
+    def call(self, number, method, *arguments):
+        self._workers[number].call(number, method, *arguments)
+        self._called.append(number)
+
+    def wait(self, seconds):
+        number = self._called.pop(self._random.randrange(len(self._called)))
+        self._answers += 1
+        if self._answers in self._lose:
+            return number, Lost("it was unlucky")
+        return number, self._workers[number].wait(seconds)[1]
+
+    def renew(self, number):
+        self._workers[number].close()
+        self._workers[number] = self._make()
+
+    def close(self):
+        for worker in self._workers:
+            worker.close()
+
+
+@pytest.fixture
+def lightmaps(monkeypatch):
+    """Two static tiles beside four dynamic ones, each a batch of its own."""
+    monkeypatch.setattr(fit, "CPU_TILES", 1)
+    static, moving = static_light(256, 128), moving_light(256, 256)
+    return from_arrays(np.concatenate([static.frames, moving.frames], axis=2), moving.times, period=24.0)
+
+
+def bytes_of(model, folder):
+    model.save(folder / "bytes.wlm")
+    return (folder / "bytes.wlm").read_bytes()
+
+
+def stop_after(step):
+    def report(progress):
+        if progress.done >= step:
+            raise KeyboardInterrupt
+
+    return report
+
+
+def test_the_order_of_answers_and_lost_workers_change_nothing(lightmaps, tmp_path, monkeypatch):
+    profile = tiny_profile(steps=20)
+    whole = bytes_of(fit.compress(lightmaps, profile), tmp_path)
+    checkpoint = fit.open_checkpoint(tmp_path / "a.wlm", lightmaps, profile, every=0)
+    for seed, lose, kept in ((1, (), None), (2, (1, 9, 20, 21), checkpoint)):
+        monkeypatch.setattr(fit, "_workers", functools.partial(Several, seed=seed, lose=lose))
+        assert bytes_of(fit.compress(lightmaps, profile, workers=3, checkpoint=kept), tmp_path) == whole
+
+
+def test_what_several_workers_were_at_is_resumed_by_another_number(lightmaps, tmp_path, monkeypatch):
+    report_always(monkeypatch)
+    whole = bytes_of(fit.compress(lightmaps, PROFILE), tmp_path)
+    with monkeypatch.context() as patched:
+        patched.setattr(fit, "_workers", Several)
+        checkpoint = fit.open_checkpoint(tmp_path / "a.wlm", lightmaps, PROFILE)
+        with pytest.raises(KeyboardInterrupt):
+            fit.compress(lightmaps, PROFILE, workers=3, progress=stop_after(100), checkpoint=checkpoint)
+    checkpoint = fit.open_checkpoint(tmp_path / "a.wlm", lightmaps, PROFILE, resume=True)
+    assert sum(checkpoint.running(number) is not None for number in range(6)) > 1
+    steps = []
+    model = fit.compress(lightmaps, PROFILE, progress=lambda now: steps.append(now.done), checkpoint=checkpoint)
+    # Steps that waiting batches were at count once their batch begins.
+    assert bytes_of(model, tmp_path) == whole and steps[-1] == 240 and len(steps) <= (240 - 100) / 5
+
+
+def test_a_batch_that_no_worker_survives_is_named(lightmaps, monkeypatch):
+    monkeypatch.setattr(fit, "_workers", functools.partial(Several, lose=range(100)))
+    with pytest.raises(WlmError, match="^fit: batch 0 has lost 3 workers: it was unlucky$"):
+        fit.compress(lightmaps, PROFILE, workers=2)
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"workers": 0}, "workers: expected at least 1, got 0"),
+        ({"cluster": "auto", "device": "cuda:1"}, "expected cpu or cuda"),
+    ],
+)
+def test_wrong_places_are_told_at_once(options, says):
+    with pytest.raises(WlmError, match=says):
+        fit.compress(None, PROFILE, **options)
+
+
+def test_workers_follow_the_cores_and_the_work(monkeypatch):
+    monkeypatch.setattr(fit, "cores", lambda: 64)
+    counts = [len(fit._devices("cpu", None, None, samples)) for samples in (0, 10**6, 10**8, 10**12)]
+    assert counts == [1, 1, 5, 32]
+    assert len(fit._devices("cpu", 3, None, 0)) == 3
+
+
+def processes_of(parent):
+    """Processes that another one has started."""
+    found = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            if int(stat.read_text().rpartition(")")[2].split()[1]) == parent:
+                found.append(int(stat.parent.name))
+        except OSError:
+            continue
+    return found
+
+
+@pytest.mark.slow
+def test_a_killed_process_changes_nothing(lightmaps, tmp_path, monkeypatch):
+    profile = tiny_profile(steps=400)
+    whole = bytes_of(fit.compress(lightmaps, profile), tmp_path)
+    killed = []
+
+    def kill(progress):
+        # One of two that are at work: both have batches by then.
+        if progress.done > 500 and not killed:
+            killed.extend(processes_of(os.getpid())[:1])
+            os.kill(killed[0], signal.SIGKILL)
+
+    report_always(monkeypatch)
+    checkpoint = fit.open_checkpoint(tmp_path / "a.wlm", lightmaps, profile, every=0.1)
+    model = fit.compress(lightmaps, profile, workers=2, progress=kill, checkpoint=checkpoint)
+    assert bytes_of(model, tmp_path) == whole
+    assert killed and processes_of(os.getpid()) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+def test_a_stopped_command_leaves_no_process_behind(number, lightmaps, tmp_path):
+    folder, out = tmp_path / "set", tmp_path / "out" / "a.wlm"
+    write_set(folder, lightmaps)
+    out.parent.mkdir()
+    words = ["lightmap", "compress", folder, "-o", out, "--steps", 10_000, "--samples", 128, "--workers", 2]
+    code = "from wlm.cli import main\nfrom wlm.cli import console\nconsole._PLAIN_REPORTS = 10**7\nmain()"
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).resolve().parents[2]), "TMPDIR": str(tmp_path)}
+    command = [sys.executable, "-c", code, *map(str, words), "--checkpoint-every", "0.1"]
+    with subprocess.Popen(
+        command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, env=environment
+    ) as run:
+        for line in run.stderr:
+            if line.startswith("fit: ") and int(line.split()[1]) > 100 and Path(f"{out}.partial").exists():
+                break
+        workers = processes_of(run.pid)
+        run.send_signal(number)
+        errors = run.stderr.read()
+    assert len(workers) == 2
+    if number != signal.SIGKILL:
+        assert run.returncode == 128 + number and "--resume goes on from" in errors and "Traceback" not in errors
+    # An orphan ends once it has answered.
+    for pid in workers:
+        for _ in range(100):
+            if not Path(f"/proc/{pid}").exists() or Path(f"/proc/{pid}/stat").read_text().split()[2] == "Z":
+                break
+            subprocess.run(["sleep", "0.1"], check=True)
+        else:
+            raise AssertionError("a worker outlives the command")
+    settings = {"steps": 10_000, "samples": 128}
+    assert fit.open_checkpoint(out, load(folder), "M", resume=True, **settings).resumed
+    # Torch keeps a folder of its own among the temporary files.
+    left = {path.name for path in tmp_path.iterdir() if not path.name.startswith("torch")}
+    assert left == {"set", "out"}
+    if number != signal.SIGKILL:
+        assert [path.name for path in out.parent.iterdir()] == ["a.wlm.partial"]
+
+
+def test_a_process_answers_or_says_why_not():
+    workers = Processes(Fraction, [(22, 7), ("wrong",)])
+    try:
+        workers.call(0, "limit_denominator", 3)
+        workers.call(1, "limit_denominator", 3)
+        answers = dict(workers.wait(60.0) for _ in range(2))
+        assert answers[0] == 3 and isinstance(answers[1], ValueError)
+        assert workers.wait(0.0) is None
+        workers.kill(0)
+        assert "ended by signal 9" in str(workers.wait(60.0)[1])
+        workers.renew(0)
+        workers.call(0, "limit_denominator", 7)
+        assert workers.wait(60.0) == (0, Fraction(22, 7))
+    finally:
+        workers.close()
+    assert processes_of(os.getpid()) == []
+
+
+@pytest.mark.slow
+def test_a_cluster_gives_the_same_bytes(lightmaps, tmp_path, monkeypatch):
+    ray = pytest.importorskip("ray")
+    whole = bytes_of(fit.compress(lightmaps, PROFILE), tmp_path)
+    ray.init(num_cpus=4, include_dashboard=False, log_to_driver=False)
+    try:
+        made = []
+        begin = fit.Actors.__init__
+
+        def remember(self, *arguments):
+            begin(self, *arguments)
+            made.append(self)
+
+        monkeypatch.setattr(fit.Actors, "__init__", remember)
+        report_always(monkeypatch)
+        killed = []
+
+        def kill(progress):
+            if progress.done >= 60 and not killed:
+                killed.append(made[0]._actors[0])
+                ray.kill(killed[0])
+
+        assert bytes_of(fit.compress(lightmaps, PROFILE, cluster="auto", progress=kill), tmp_path) == whole
+        assert made[0].count == 2 and killed
+        with pytest.raises(WlmError, match="cluster auto: expected 1 GPU for a worker"):
+            fit.compress(lightmaps, PROFILE, cluster="auto", device="cuda")
+    finally:
+        ray.shutdown()
+
+
+def test_a_mapped_set_is_the_same_set(tmp_path, monkeypatch):
+    lightmaps = moving_light(40, 24)
+    order = [3, 0, 4, 1, 2]
+    write_set(tmp_path / "set", lightmaps)
+    monkeypatch.setattr(scratch, "IN_MEMORY", 1000)
+    times = lightmaps.times
+    mapped = [load(tmp_path / "set", period=24.0), from_arrays(lightmaps.frames[order], times[order], period=24.0)]
+    for each in mapped:
+        assert each.source == lightmaps.source
+        assert each.frames.base is not None and type(each.frames) is np.ndarray
+    assert wlm.lightmap.compress(mapped[1], PROFILE).file_bytes() == fit.compress(lightmaps, PROFILE).file_bytes()
+
+
+def test_a_fit_never_holds_all_tiles():
+    lightmaps = moving_light(512, 512, hours=(0.0, 8.0, 16.0, 20.0))
+    tracemalloc.start()
+    try:
+        fit._Fit(lightmaps, PROFILE)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak < lightmaps.frames.nbytes / 2

@@ -1,0 +1,337 @@
+"""Objects that work elsewhere: in this process, in other processes of this machine, or on a cluster of Ray.
+
+Work is handed out as calls of their methods, one at a time to each object, and answers are taken as they come.
+Processes of this machine are started by the standard library alone: Ray takes seconds to start, brings 250 MB and
+leaves its logs behind, all in vain for one machine.
+"""
+
+import importlib
+import os
+import pickle
+import queue
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import traceback
+from abc import ABC, abstractmethod
+from contextlib import suppress
+from typing import IO, Any
+
+from wlm.errors import WlmError
+
+_PROTOCOL = 5  # large arrays aren't copied
+_PATIENCE = 2.0  # seconds that a process without work gets to end by itself
+_ANSWER = 10.0  # seconds that a cluster gets to take a connection
+_TOLD = 2000  # bytes of what a dead process wrote that are looked at
+
+
+class Lost(Exception):
+    """The object is gone, and with it its answer; the text says why."""
+
+
+def cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+class Workers(ABC):
+    """Objects made alike, numbered from 0.
+
+    Attributes:
+        count: How many there are.
+        remote: Whether they work while this process does something else.
+    """
+
+    count: int
+    remote = True
+
+    @abstractmethod
+    def call(self, number: int, method: str, *arguments: Any) -> None:
+        """Calls a method of an object that has answered all earlier calls."""
+
+    @abstractmethod
+    def wait(self, seconds: float) -> tuple[int, Any] | None:
+        """Takes an answer.
+
+        Args:
+            seconds: To wait for it at most.
+
+        Returns:
+            The object's number and what the method returned, an exception where it raised one, `Lost` where the
+            object is gone; None where there was no answer in that time.
+        """
+
+    @abstractmethod
+    def renew(self, number: int) -> None:
+        """Makes an object again that is lost."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Ends all of them, whatever they are doing."""
+
+
+class Here(Workers):
+    """An object in this process, which works while its answer is waited for."""
+
+    count = 1
+    remote = False
+
+    def __init__(self, worker: Any) -> None:
+        """Takes the object, which has a method `close`."""
+        self._worker, self._call = worker, ("", ())
+
+    def call(self, number: int, method: str, *arguments: Any) -> None:
+        self._call = method, arguments
+
+    def wait(self, seconds: float) -> tuple[int, Any]:
+        (method, arguments), self._call = self._call, ("", ())
+        try:
+            return 0, getattr(self._worker, method)(*arguments)
+        except Exception as error:
+            return 0, error
+
+    def renew(self, number: int) -> None:
+        raise AssertionError("this process is not lost")
+
+    def close(self) -> None:
+        self._worker.close()
+
+
+class Processes(Workers):
+    """Objects in processes of their own on this machine.
+
+    A process ends with the one that started it, by whatever that one was ended: at the latest once it has answered.
+    """
+
+    def __init__(self, make: type, arguments: list[tuple[Any, ...]]) -> None:
+        """Starts the processes.
+
+        Args:
+            make: The class of the objects, of a module that can be imported.
+            arguments: Of each object.
+
+        Raises:
+            WlmError: The system has no room for so many.
+        """
+        self.count = len(arguments)
+        self._make, self._arguments = make, arguments
+        self._answers: queue.SimpleQueue[tuple[int, Any]] = queue.SimpleQueue()
+        self._processes: dict[int, subprocess.Popen[bytes]] = {}
+        self._errors: dict[int, IO[bytes]] = {}
+        try:
+            for number in range(self.count):
+                self._start(number)
+        except WlmError:
+            self.close()
+            raise
+
+    def call(self, number: int, method: str, *arguments: Any) -> None:
+        # Of a process that is gone the answer tells.
+        with suppress(OSError):
+            _send(self._processes[number].stdin, (method, arguments))
+
+    def wait(self, seconds: float) -> tuple[int, Any] | None:
+        try:
+            return self._answers.get(timeout=seconds)
+        except queue.Empty:
+            return None
+
+    def renew(self, number: int) -> None:
+        self._end(number)
+        self._start(number)
+
+    def close(self) -> None:
+        for process in self._processes.values():
+            with suppress(OSError):
+                process.stdin.close()
+        for number in list(self._processes):
+            self._end(number, _PATIENCE)
+
+    def kill(self, number: int) -> None:
+        """Ends one process at once, as a machine without memory does."""
+        self._processes[number].kill()
+
+    def _start(self, number: int) -> None:
+        environment = os.environ | {"PYTHONPATH": os.pathsep.join(path or os.getcwd() for path in sys.path)}
+        # Ctrl-C in a terminal goes to a group of processes: they are asked for their state after it.
+        group = {"process_group": 0} if os.name == "posix" else {}
+        command = [sys.executable, "-P", "-c", f"from {__name__} import serve; serve()"]
+        pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+        try:
+            errors = tempfile.TemporaryFile()
+            process = subprocess.Popen(command, stderr=errors, env=environment, **pipes, **group)
+        except OSError as error:
+            raise WlmError(f"workers: cannot start process {number}: {error.strerror or error}") from error
+        self._processes[number], self._errors[number] = process, errors
+        threading.Thread(target=self._listen, args=(number, process, errors), daemon=True).start()
+        with suppress(OSError):
+            _send(process.stdin, (self._make.__module__, self._make.__qualname__, self._arguments[number]))
+
+    def _listen(self, number: int, process: subprocess.Popen[bytes], errors: IO[bytes]) -> None:
+        """Takes a process's answers, to its end."""
+        try:
+            while True:
+                self._answers.put((number, pickle.load(process.stdout)))
+        except (EOFError, OSError, ValueError, pickle.UnpicklingError):
+            code = process.wait()
+            # Of a process that has been replaced or closed nobody waits for an answer.
+            if self._processes.get(number) is process:
+                self._answers.put((number, Lost(_reason(code, errors))))
+
+    def _end(self, number: int, patience: float = 0.0) -> None:
+        process = self._processes.pop(number)
+        try:
+            process.wait(patience)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+        with suppress(OSError):
+            process.stdin.close()
+        self._errors.pop(number).close()
+
+
+class Actors(Workers):
+    """Objects on a cluster of Ray, each with its share of the machines."""
+
+    def __init__(
+        self,
+        make: type,
+        arguments: tuple[Any, ...],
+        count: int | None,
+        most: int,
+        address: str,
+        share: dict[str, float],
+    ) -> None:
+        """Connects to the cluster and asks for the objects; those for which it has no room come as it has.
+
+        Args:
+            make: Their class, of a module that every machine of the cluster can import.
+            arguments: Of each object.
+            count: Objects; None: as many as the cluster has room for.
+            most: Objects at most.
+            address: Of the cluster, as `ray.init` takes it.
+            share: What an object takes: `{"CPU": 2}`, or `{"GPU": 1}`.
+
+        Raises:
+            WlmError: There is no Ray, or no cluster at that address, or it has no room.
+        """
+        try:
+            import ray
+        except ImportError as error:
+            raise WlmError('cluster: expected Ray, of the extra "cluster" (pip install "wlm[cluster]")') from error
+        self._ray, self._mine = ray, not ray.is_initialized()
+        if self._mine:
+            _connect(ray, address)
+        ((resource, each),) = share.items()
+        room = int(ray.cluster_resources().get(resource, 0.0) // each)
+        if not room:
+            self._leave()
+            raise WlmError(f"cluster {address}: expected {each:g} {resource} for a worker, found less")
+        self.count = min(most, count or room)
+        options = {"num_gpus": share.get("GPU", 0), "num_cpus": share.get("CPU", 1)}
+        self._make, self._arguments = ray.remote(make).options(**options), arguments
+        self._actors = {number: self._make.remote(*arguments) for number in range(self.count)}
+        self._calls: dict[Any, int] = {}
+
+    def call(self, number: int, method: str, *arguments: Any) -> None:
+        self._calls[getattr(self._actors[number], method).remote(*arguments)] = number
+
+    def wait(self, seconds: float) -> tuple[int, Any] | None:
+        done, _ = self._ray.wait(list(self._calls), num_returns=1, timeout=seconds)
+        if not done:
+            return None
+        number = self._calls.pop(done[0])
+        try:
+            return number, self._ray.get(done[0])
+        except self._ray.exceptions.RayTaskError as error:
+            return number, error.cause
+        except self._ray.exceptions.RayError as error:
+            lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+            # Of an object that couldn't be made the last line says why.
+            return number, Lost(lines[-1 if "creation task" in lines[0] else 0])
+
+    def renew(self, number: int) -> None:
+        self._actors[number] = self._make.remote(*self._arguments)
+
+    def close(self) -> None:
+        for actor in self._actors.values():
+            self._ray.kill(actor)
+        self._leave()
+
+    def _leave(self) -> None:
+        if self._mine:
+            self._ray.shutdown()
+
+
+def _connect(ray: Any, address: str) -> None:
+    """Connects to a cluster; signals do what they did before."""
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if host and port.isdigit():
+        # Ray tries for minutes.
+        try:
+            socket.create_connection((host, int(port)), _ANSWER).close()
+        except (OSError, OverflowError) as error:
+            raise WlmError(f"cluster {address}: cannot connect: {error}") from error
+    main = threading.current_thread() is threading.main_thread()
+    before = signal.getsignal(signal.SIGTERM)
+    try:
+        ray.init(address=address, log_to_driver=False, logging_level="ERROR")
+    except (ConnectionError, RuntimeError, ValueError, TimeoutError) as error:
+        reason = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
+        raise WlmError(f"cluster {address}: {reason}") from error
+    finally:
+        if main:
+            signal.signal(signal.SIGTERM, before)
+
+
+def serve() -> None:
+    """Makes an object and answers its calls, which come on stdin, until that ends: what each of `Processes` runs."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
+    answers = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)  # what libraries print is no answer
+    with suppress(EOFError, BrokenPipeError):
+        module, name, arguments = pickle.load(sys.stdin.buffer)
+        worker, answer = None, None
+        try:
+            worker = getattr(importlib.import_module(module), name)(*arguments)
+        except Exception as error:
+            answer = _sendable(error)
+        while True:
+            method, arguments = pickle.load(sys.stdin.buffer)
+            if worker is not None:
+                try:
+                    answer = getattr(worker, method)(*arguments)
+                except Exception as error:
+                    answer = _sendable(error)
+            _send(answers, answer)
+
+
+def _send(stream: IO[bytes], message: Any) -> None:
+    pickle.dump(message, stream, _PROTOCOL)
+    stream.flush()
+
+
+def _sendable(error: Exception) -> Exception:
+    """An exception that can be sent, with the place where it was raised."""
+    if not isinstance(error, WlmError):
+        error.add_note("".join(traceback.format_exception(error)))
+    try:
+        pickle.loads(pickle.dumps(error))
+    except Exception:
+        return RuntimeError("".join(traceback.format_exception(error)))
+    return error
+
+
+def _reason(code: int, errors: IO[bytes]) -> str:
+    """Why a process ended, in a line."""
+    with suppress(OSError, ValueError):
+        size = errors.seek(0, os.SEEK_END)
+        errors.seek(max(0, size - _TOLD))
+        lines = errors.read().decode(errors="replace").splitlines()
+        last = f": {lines[-1]}" if lines else ""
+        return (f"it was ended by signal {-code}" if code < 0 else f"it ended with code {code}") + last
+    return f"it ended with code {code}"
