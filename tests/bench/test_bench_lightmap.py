@@ -143,7 +143,7 @@ def test_a_quick_run_has_few_rivals_and_a_full_one_all(monkeypatch):
 
 def test_the_rivals_alone(rows, lightmaps, monkeypatch, tmp_path):
     monkeypatch.setattr(bench, "load", lambda path: lightmaps)
-    monkeypatch.setattr(bench, "FEW", ("bc7", "av1-75"))
+    monkeypatch.setattr(bench, "few", lambda device: ("bc7", "av1-75"))
     lines = []
     alone = run_rivals(quick=True, set_path="set", progress=lines.append)
     assert keys(alone) == [("BC7", ""), ("AV1", "75")] and len(lines) == 2
@@ -155,6 +155,11 @@ def test_the_rivals_alone(rows, lightmaps, monkeypatch, tmp_path):
     result = CliRunner().invoke(app, words)
     assert result.exit_code == 0 and "AV1" in result.output
     assert read_json(tmp_path / "rivals.json")[1]["command"] == "wlm bench lightmap --rivals-only"
+    # One rival replaces its row alone.
+    replaced = alone[0].with_figures(psnr=1.0)
+    monkeypatch.setattr(bench, "run_rivals", lambda **options: [replaced])
+    assert CliRunner().invoke(app, [*words[:1], "--rival", "bc7", *words[2:]]).exit_code == 0
+    assert read_json(tmp_path / "rivals.json")[0] == [alone[1], replaced]
     result = CliRunner().invoke(app, [*words, "--no-rivals"])
     assert result.exit_code != 0 and "--rivals-only: expected without" in str(result.exception)
 

@@ -1,9 +1,9 @@
 """What compressed lightmaps over time are compared with, each tuned as well as ours is.
 
 `RIVALS` has them by name: block codecs that engines ship (`lightmap_blocks`), principal components over the hours
-(`lightmap_pca`), and a video codec (`lightmap_video`). `bytes` are those in a GPU's memory, with all that a decoder
-needs; `disk_bytes` the same under lossless compression, each lightmap of a block codec on its own. A video has only the
-latter, and no random access.
+(`lightmap_pca`), neural texture compression (`lightmap_ntc`), and a video codec (`lightmap_video`). `bytes` are those
+in a GPU's memory, with all that a decoder needs; `disk_bytes` the same under lossless compression, each lightmap of a
+block codec on its own. A video has only the latter, and no random access.
 """
 
 import functools
@@ -14,10 +14,12 @@ from typing import TypeVar
 import numpy as np
 
 from wlm.baselines.lightmap_blocks import encode_8bit, encode_astc, encode_bc6h, encode_bc7
+from wlm.baselines.lightmap_ntc import LADDER, encode_ntc
 from wlm.baselines.lightmap_pca import encode_pca, encode_pca_bc4
 from wlm.baselines.lightmap_video import encode_av1
 from wlm.baselines.rival import Rival
 from wlm.errors import WlmError
+from wlm.interop import check_device
 from wlm.lightmap.data import LightmapSet
 from wlm.lightmap.evaluation import SCORES, scored_mask
 from wlm.lightmap.model import TILE, LightmapModel
@@ -37,13 +39,15 @@ class Method:
         title, option: What a table calls it.
         encode: Makes a `Rival` of lightmaps and their mask [H, W].
         alone: Whether it takes one lightmap [H, W, 3] at a time; else all, [T, H, W, 3].
+        fitted: Whether `encode` takes the `device` on which it fits and decodes; the others need none.
         random_access: Whether a GPU reads a texel at an hour from what it holds.
     """
 
     title: str
     option: str
-    encode: Callable[[np.ndarray, np.ndarray], Rival]
+    encode: Callable[..., Rival]
     alone: bool = True
+    fitted: bool = False
     random_access: bool = True
 
     @property
@@ -83,13 +87,25 @@ RIVALS: dict[str, Method] = {
         f"pca-{step:g}": Method("PCA", f"step {step:g}", functools.partial(encode_pca, step=step), alone=False)
         for step in (0.16, 0.08, 0.04, 0.02)
     },
+    **{
+        f"ntc-{name}": Method("NTC", name, functools.partial(encode_ntc, latents=name), alone=False, fitted=True)
+        for name in LADDER
+    },
     **{f"av1-{quality}": _av1("AV1", quality, "day") for quality in _AV1_QUALITIES},
     **{f"av1-{quality}-hour": _av1("AV1 by hour", quality, "hour") for quality in _AV1_QUALITIES},
 }
 """All methods by name."""
 
 FEW = ("bc6h", "bc7", "astc6", "astc8", "astc12", "8bit", "pca-bc4-4", "av1-75", "av1-92")
-"""Those of a quick look."""
+"""Those of a quick look, which need no GPU."""
+
+FITTED = ("ntc-medium",)
+"""Those that a quick look on a GPU adds."""
+
+
+def few(device: str) -> tuple[str, ...]:
+    """The methods of a quick look on a device."""
+    return FEW if device == "cpu" else FEW + FITTED
 
 
 @dataclass(frozen=True)
@@ -125,6 +141,8 @@ def encode_set(
     lightmaps: LightmapSet,
     visit: Callable[[int, np.ndarray], _Scored],
     chosen: Sequence[int] | np.ndarray | None = None,
+    *,
+    device: str = "cpu",
 ) -> tuple[Rival, list[_Scored]]:
     """Puts a set through a method.
 
@@ -134,19 +152,21 @@ def encode_set(
         visit: Called with the index of a time and its decoded lightmap, float32 [H, W, 3], in the order of `chosen`.
         chosen: Indices of the times to visit, at least one; None for all. A method that takes one lightmap at a time
             encodes these alone; the sizes and the seconds of all times are then estimated from them.
+        device: "cpu", "cuda" or "cuda:N", for methods that are fitted.
 
     Returns:
         The rival, with bytes and seconds of all times and without what was decoded, and what the visits returned.
 
     Raises:
-        WlmError: An unknown name, or a package is missing.
+        WlmError: An unknown name, a package is missing, or there is no such device.
     """
     check_rival(name)
     method, count = RIVALS[name], len(lightmaps.frames)
     chosen = range(count) if chosen is None else [int(i) for i in chosen]
     # The whole map's mask: an engine would encode all of it, whatever we score.
     if not method.alone:
-        rival = method.encode(lightmaps.frames, lightmaps.mask)
+        options = {"device": device} if method.fitted else {}
+        rival = method.encode(lightmaps.frames, lightmaps.mask, **options)
         return replace(rival, decoded=None), [visit(i, rival.decoded[i]) for i in chosen]
     rivals, visits = [], []
     for i in chosen:
@@ -166,10 +186,11 @@ def encode_set(
 def evaluate_rivals(
     model: LightmapModel,
     lightmaps: LightmapSet,
-    names: Sequence[str] = FEW,
+    names: Sequence[str] | None = None,
     *,
     metrics: Sequence[str] = SCORES,
     views: int = VIEWS,
+    device: str = "cpu",
     progress: OnProgress | None = None,
 ) -> list[tuple[Rival, Score]]:
     """Puts a set through rivals and scores the texels that `evaluate` scores.
@@ -177,8 +198,9 @@ def evaluate_rivals(
     Args:
         model: The model to compare with: it says which tiles are scored.
         lightmaps: The input.
-        names: Keys of `RIVALS`.
+        names: Keys of `RIVALS`; None: `few` of the device.
         metrics, views: As for `wlm.lightmap.evaluate`.
+        device: As for `encode_set`.
         progress: Called about twice a second.
 
     Returns:
@@ -187,6 +209,8 @@ def evaluate_rivals(
     Raises:
         WlmError: As `wlm.lightmap.evaluate`, an unknown name, or the extra `baselines` is missing.
     """
+    device = check_device(device)
+    names = few(device) if names is None else names
     mask, count = scored_mask(model, lightmaps), len(lightmaps.frames)
     plain, seen = [metric for metric in metrics if metric != "seen"], "seen" in metrics
     meter = Meter(progress, "baselines", len(names) * count)
@@ -203,10 +227,10 @@ def evaluate_rivals(
                 meter.report(k * count + i + 1)
             return frame
 
-        rival, frames = encode_set(name, lightmaps, score)
+        rival, frames = encode_set(name, lightmaps, score, device=device)
         summary, texels = summarise(frames), lightmaps.mask.size * count
         scores = {"psnr": summary.psnr, "ssim": summary.ssim, "flip": summary.flip, **vars(tally.score())}
         sizes = rival.bytes * 8 / texels, rival.bytes, rival.disk_bytes * 8 / texels, rival.disk_bytes
-        names = ("bpp", "bytes", "disk_bpp", "disk_bytes")
-        results.append((rival, Score(**scores, **dict(zip(names, sizes, strict=True)))))
+        keys = ("bpp", "bytes", "disk_bpp", "disk_bytes")
+        results.append((rival, Score(**scores, **dict(zip(keys, sizes, strict=True)))))
     return results

@@ -22,8 +22,8 @@ class Rival:
     Attributes:
         name: The method, a key of its module's `RIVALS`.
         bytes: Size of everything that a decoder needs.
-        encode_seconds: Wall-clock time on the CPU from the input to these bytes.
-        decode_seconds: Wall-clock time on the CPU from these bytes to `decoded`; None where it isn't measured. A GPU
+        encode_seconds: Wall-clock time from the input to these bytes, on the CPU unless the method is given a device.
+        decode_seconds: Wall-clock time from these bytes to `decoded`, likewise; None where it isn't measured. A GPU
             decodes block formats in its texture unit: this says nothing of what they cost there.
         decoded: What the system's evaluation scores: a lightmap float32 [H, W, 3], an atlas' `Sampler`, probes
             float32 [N, D].

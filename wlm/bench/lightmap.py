@@ -8,8 +8,8 @@ Four kinds of rows:
   "matrix" (the fast path on matrix units), of profile M:
   the 8-bit output against the input, and its largest error against the float64 path as a share of 255. Half a level of
   8 bits, 0.00196, is the rounding itself.
-- the rivals of `wlm.baselines.lightmap`, on the same lightmaps: block codecs, temporal PCA and a video codec; between
-  stored times their light is mixed.
+- the rivals of `wlm.baselines.lightmap`, on the same lightmaps: block codecs, temporal PCA, a neural texture codec and
+  a video codec; between stored times their light is mixed.
 - method "fit", one row for each profile: the speed of the fit alone; and some steps of the same fit in plain torch.
 
 Profiles and rivals have the scores of `wlm.lightmap.seen` too: those between stored times where both are scored, those
@@ -28,7 +28,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from wlm.baselines.lightmap import FEW, RIVALS, check_rival, encode_set
+from wlm.baselines.lightmap import RIVALS, check_rival, encode_set, few
 from wlm.baselines.lightmap_torch import PlainFit
 from wlm.bench.plot import Panel
 from wlm.bench.rows import Row
@@ -39,7 +39,7 @@ from wlm.lightmap.decode import Decoder
 from wlm.lightmap.evaluation import bits_per_texel, count_kinds, memory_bytes
 from wlm.lightmap.exact import bound64, colour_tile64, decode_tile64
 from wlm.lightmap.fit import compress, dynamic_targets
-from wlm.lightmap.model import TILE, LightmapModel, Profile, TimeAxis, encode_time
+from wlm.lightmap.model import TILE, LightmapModel, Profile, TimeAxis
 from wlm.lightmap.runtime import ExactDecoder, MatrixDecoder, StripDecoder, fast_decoder
 from wlm.lightmap.seen import Tally
 from wlm.lightmap.tiles import TileGrid, TileKind, assemble
@@ -107,7 +107,7 @@ def run(
             for profile in profiles
         ]
         chosen = _quick_times(lightmaps.times)
-    names = _names(quick) if rivals else ()
+    names = _names(quick, device) if rivals else ()
     return run_rows(lightmaps, profiles, device=device, chosen=chosen, rivals=names, progress=progress)
 
 
@@ -115,13 +115,15 @@ def run_rivals(
     *,
     quick: bool = False,
     set_path: str | os.PathLike[str] | None = None,
+    device: str = "cpu",
     names: Sequence[str] | None = None,
     progress: Note | None = None,
 ) -> list[Row]:
-    """Measures the rivals alone, on the CPU.
+    """Measures the rivals alone: on the CPU, but for those that are fitted.
 
     Args:
         quick, set_path, progress: As for `run`.
+        device: Of the rivals that are fitted.
         names: Keys of `wlm.baselines.lightmap.RIVALS`; None: all, or with `quick` a third of them.
 
     Returns:
@@ -134,8 +136,8 @@ def run_rivals(
         check_rival(name)
     lightmaps = _load(set_path)
     chosen = _quick_times(lightmaps.times) if quick else np.arange(len(lightmaps.times))
-    bench = _LightmapBench(lightmaps, chosen, "cpu", progress, None)
-    return [bench.rival_row(name) for name in names or _names(quick)]
+    bench = _LightmapBench(lightmaps, chosen, device, progress, None)
+    return [bench.rival_row(name) for name in names or _names(quick, device)]
 
 
 def run_rows(
@@ -144,7 +146,7 @@ def run_rows(
     *,
     device: str,
     chosen: Sequence[int] | np.ndarray,
-    rivals: Sequence[str] = FEW,
+    rivals: Sequence[str] = (),
     repeats: int | None = None,
     progress: Note | None = None,
 ) -> list[Row]:
@@ -179,8 +181,8 @@ def _load(set_path: str | os.PathLike[str] | None) -> LightmapSet:
     return load(demo_data("city", "--set PATH") if set_path is None else set_path)
 
 
-def _names(quick: bool) -> tuple[str, ...]:
-    return FEW if quick else tuple(RIVALS)
+def _names(quick: bool, device: str) -> tuple[str, ...]:
+    return few(device) if quick else tuple(RIVALS)
 
 
 def _quick_times(times: np.ndarray) -> np.ndarray:
@@ -292,12 +294,13 @@ class _LightmapBench(Bench):
         try:
             tally = self._tally(name)
             score = functools.partial(self._frame, name, tally)
-            rival, frames = encode_set(name, self.lightmaps, score, self.chosen)
+            rival, frames = encode_set(name, self.lightmaps, score, self.chosen, device=self.device)
         except WlmError as error:
             return self.missing_row(method.title, method.option, error)
         count = len(self.lightmaps.times)
         bits = 8 / (self.lightmaps.mask.size * count)
-        notes = [self.scored_at + "size and encode time of all times, on one CPU thread", rival.option]
+        where = "" if method.fitted else ", on one CPU thread"
+        notes = [f"{self.scored_at}size and encode time of all times{where}", rival.option]
         figures = {"disk_bytes": rival.disk_bytes, "disk_bpp": rival.disk_bytes * bits}
         if method.random_access:
             figures |= {"bytes": rival.bytes, "bpp": rival.bytes * bits}
@@ -324,26 +327,15 @@ class _LightmapBench(Bench):
 
     def plain_rows(self, fit: Fit) -> list[Row]:
         """Some steps of the same fit in plain torch; none where no tile is dynamic."""
-        profile = fit.model.profile.model_copy(update={"metric_weight": 0.0})
+        # What a file would hold is left out: the loss is the plain square, and the maps stay continuous.
+        plain = {"metric_weight": 0.0, "quantise_from": 1.0, "freeze_from": 1.0}
+        profile = fit.model.profile.model_copy(update=plain)
         targets = dynamic_targets(self.lightmaps, profile)
         if targets is None:
             return []
         self.note(f"{fit.option}: the fit in plain torch")
-        tau, encoding = encode_time(TimeAxis(self.lightmaps.times, self.lightmaps.period, profile.time_axis))
-        sizes = ("hidden", "uvt_resolution", "uvt_slices", "plane_columns", "plane_rows")
-        rates = ("samples", "steps", "map_rate", "net_rate", "final_rate")
-        peer = PlainFit(
-            tau=tau,
-            encoding=encoding,
-            colour=targets.colour,
-            texels=targets.texels,
-            count=targets.count,
-            weight=targets.weight,
-            sizes=tuple(getattr(profile, name) for name in sizes),
-            rates=tuple(getattr(profile, name) for name in rates),
-            seed=0,
-            device=self.device,
-        )
+        axis = TimeAxis(self.lightmaps.times, self.lightmaps.period, profile.time_axis)
+        peer = PlainFit(profile, axis, targets, device=self.device)
         peer.step().item()
         steps = min(profile.steps, _PLAIN_STEPS["cpu" if self.device == "cpu" else "cuda"])
         start = time.perf_counter()

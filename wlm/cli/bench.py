@@ -11,7 +11,7 @@ from wlm.cli.options import Device, output_option
 from wlm.errors import WlmError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from wlm.bench import Panel, Row
 
@@ -57,7 +57,9 @@ def lightmap(
     ] = None,
     profiles: _Profiles = None,
     rivals: _Rivals = True,
-    rivals_only: Annotated[bool, typer.Option("--rivals-only", help="The rivals alone, which need no GPU.")] = False,
+    rivals_only: Annotated[
+        bool, typer.Option("--rivals-only", help="The rivals alone; but for NTC none needs a GPU.")
+    ] = False,
     rival_names: Annotated[
         list[str] | None, typer.Option("--rival", metavar="NAME", help="Only this rival, such as bc7. Several times.")
     ] = None,
@@ -71,16 +73,42 @@ def lightmap(
 
     common = {"quick": quick, "set_path": set_path, "progress": note}
     if rivals_only or rival_names:
-        if not rivals or profiles or device != "cpu":
-            raise WlmError("--rivals-only: expected without --no-rivals, --profile and --device: rivals need no GPU")
-        rows = run_rivals(names=rival_names, **common)
-        options = {"rivals_only": rivals_only, "rival": rival_names}
+        if not rivals or profiles:
+            raise WlmError("--rivals-only: expected without --no-rivals and --profile")
+        rows = run_rivals(device=device, names=rival_names, **common)
+        options = {"rivals_only": rivals_only, "rival": rival_names, "device": None if device == "cpu" else device}
     else:
         rows = run(device=device, names=profiles, rivals=rivals, **common)
         options = {"profile": profiles, "no_rivals": not rivals, "device": device}
     command = _command("lightmap", quick=quick, **options, set=set_path and rows[0].scene)
     partial = bool(profiles or rival_names)
     _finish(rows, command, device, json_path, plot_path, PANELS, baseline=baseline, partial=partial)
+
+
+@app.command("lightmap-ablation")
+def lightmap_ablation(
+    quick: Annotated[bool, typer.Option("--quick", help="Few steps, for a minute on a CPU; else for a GPU.")] = False,
+    device: Device = "cpu",
+    set_path: Annotated[
+        Path | None, typer.Option("--set", metavar="SET", help="A lightmap set; default the demo's.")
+    ] = None,
+    steps: Annotated[int | None, typer.Option(min=10, help="Of each fit; default the profile's.")] = None,
+    only: Annotated[
+        list[str] | None, typer.Option("--only", metavar="ROW", help="A row by its name; default all. Several times.")
+    ] = None,
+    json_path: _RowsFile = None,
+    baseline: _Baseline = None,
+) -> None:
+    """Lightmaps over time: fits of other feature maps at the same bytes, and without the simulation of blocks."""
+    device = _prepare(device, json_path, None, baseline)
+    from wlm.bench.lightmap_ablation import run
+
+    command = _command(
+        "lightmap-ablation", quick=quick, device=device, set=set_path and set_path.name, steps=steps, only=only
+    )
+    write = _writer(device, command, json_path)
+    rows = run(only or (), quick=quick, device=device, set_path=set_path, steps=steps, progress=note, done=write)
+    _finish(rows, command, device, None, None, baseline=baseline)
 
 
 @app.command()
@@ -236,17 +264,11 @@ def smoke_ablation(
 ) -> None:
     """Neural six-way lightmaps: short trainings of a profile with one thing changed at a time, beside each other."""
     device = _prepare(device, json_path, None, baseline)
-    from wlm.bench import describe_environment, write_json
     from wlm.bench.smoke_ablation import run
 
     lengths = {"rounds": rounds, "steps": steps}
     command = _command("smoke-ablation", quick=quick, profile=Path(profile).name, device=device, **lengths, only=only)
-
-    def write(rows: "Sequence[Row]") -> None:
-        # Rows take minutes each: those that are done outlive a stop.
-        if json_path is not None:
-            write_json(json_path, rows, describe_environment(device, command))
-
+    write = _writer(device, command, json_path)
     rows = run(profile, only or (), quick=quick, device=device, **lengths, progress=note, done=write)
     _finish(rows, command, device, None, None, baseline=baseline)
 
@@ -305,6 +327,17 @@ def _command(name: str, **options: object) -> str:
                 if item is not True:
                     words.append(shlex.quote(item.name if isinstance(item, Path) else str(item)))
     return " ".join(words)
+
+
+def _writer(device: str, command: str, json_path: Path | None) -> "Callable[[Sequence[Row]], None]":
+    """Writes the rows so far, which take minutes each: those that are done outlive a stop."""
+    from wlm.bench import describe_environment, write_json
+
+    def write(rows: "Sequence[Row]") -> None:
+        if json_path is not None:
+            write_json(json_path, rows, describe_environment(device, command))
+
+    return write
 
 
 def _measured(results: Path, rows: "Sequence[Row]") -> "list[Row]":

@@ -41,7 +41,12 @@ if TYPE_CHECKING:
 
 app = typer.Typer(help="Lightmaps over time: BC7 feature maps and a tiny network for each 128² tile.")
 
-_Set = Annotated[Path, typer.Argument(metavar="SET", help="A set.json, or a folder of EXR files or of a contest.")]
+_Set = Annotated[
+    Path,
+    typer.Argument(
+        metavar="SET", help="A set.json, or a folder of lightmaps (.exr, .hdr, .ktx2, .dds) or of a contest."
+    ),
+]
 _Times = Annotated[
     str | None, typer.Option(help="Times of the lightmaps in order: numbers and start:stop:step, by commas.")
 ]
@@ -180,7 +185,11 @@ def evaluate(
     json_path: ReportFile = None,
     html_path: PageFile = None,
     baselines: Annotated[
-        bool, typer.Option("--baselines", help="Add block codecs, temporal PCA and a video codec (extra `baselines`).")
+        bool,
+        typer.Option(
+            "--baselines",
+            help="Add block codecs, temporal PCA and a video codec (extra `baselines`), on CUDA a neural codec too.",
+        ),
     ] = False,
     views: Annotated[
         int, typer.Option(min=0, help="Views of the set's mesh, if it names one, that are scored; 0 for none.")
@@ -224,7 +233,7 @@ def evaluate(
         from wlm.baselines.lightmap import RIVALS, evaluate_rivals
 
         with running("baselines") as progress:
-            rivals = evaluate_rivals(model, lightmaps, views=views, progress=progress)
+            rivals = evaluate_rivals(model, lightmaps, views=views, device=device, progress=progress)
         extra = {"baselines": [rival.to_json() | score.to_json() for rival, score in rivals]}
         scores = {RIVALS[rival.name].label: score for rival, score in rivals}
     contest = None
