@@ -3,9 +3,11 @@
 import json
 from pathlib import Path
 
+import imagecodecs
 import numpy as np
 import pytest
 from builders.checks import error_of
+from builders.textures import make_dds, make_ktx2
 from PIL import Image
 
 from wlm.atlas.coverage import covered_texels, touched_texels
@@ -67,6 +69,21 @@ def test_a_mesh_from_files_and_arrays(tmp_path, kind):
     assert mesh.active.all() and [mesh.position.dtype, mesh.uv.dtype] == [np.float64] * 2
     assert [mesh.triangle.dtype, mesh.lightmap.dtype, mesh.mask.dtype] == [np.int32, np.float32, bool]
     assert mesh.source == from_arrays(POSITION, TRIANGLE, UV, _lightmap()).source
+
+
+def test_a_lightmap_of_any_format(tmp_path):
+    glb, light = _files(tmp_path)
+    texels = _lightmap()
+    texels[5] = np.inf  # outside the chart
+    (tmp_path / "a.ktx2").write_bytes(make_ktx2(106, WIDTH, HEIGHT, [texels.tobytes()], scheme=3))
+    (tmp_path / "a.dds").write_bytes(make_dds(6, WIDTH, HEIGHT, texels.tobytes()))
+    (tmp_path / "a.hdr").write_bytes(imagecodecs.rgbe_encode(_lightmap(), header=True))
+    expected = load(glb, light)
+    for name in ("a.ktx2", "a.dds"):
+        mesh = load(glb, tmp_path / name)
+        assert mesh.warnings == ()
+        np.testing.assert_array_equal(mesh.filled, expected.filled)
+    np.testing.assert_allclose(load(glb, tmp_path / "a.hdr").lightmap, _lightmap(), rtol=2**-7)
 
 
 def test_source_names_all_that_counts():

@@ -153,7 +153,12 @@ def test_the_rivals_alone(rows, lightmaps, monkeypatch, tmp_path):
     words = ["lightmap", "--rivals-only", "--json", str(tmp_path / "rivals.json")]
     result = CliRunner().invoke(app, words)
     assert result.exit_code == 0 and "AV1" in result.output
-    assert read_json(tmp_path / "rivals.json")[1]["command"] == "wlm bench lightmap --rivals-only --device cpu"
+    assert read_json(tmp_path / "rivals.json")[1]["command"] == "wlm bench lightmap --rivals-only"
+    # One rival replaces its row alone.
+    replaced = alone[0].with_figures(psnr=1.0)
+    monkeypatch.setattr(bench, "run_rivals", lambda **options: [replaced])
+    assert CliRunner().invoke(app, [*words[:1], "--rival", "bc7", *words[2:]]).exit_code == 0
+    assert read_json(tmp_path / "rivals.json")[0] == [alone[1], replaced]
     result = CliRunner().invoke(app, [*words, "--no-rivals"])
     assert result.exit_code != 0 and "--rivals-only: expected without" in str(result.exception)
 

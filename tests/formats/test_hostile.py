@@ -363,9 +363,12 @@ def test_a_set_names_files_of_its_folder(tmp_path):
         ({"mask": "x" * 5000}, "mask: expected a name of at most 1024 characters, found 5000"),
         ({"mask": "x" * 1000}, "cannot read the mask"),
         ({"mask": "\ud800"}, "mask: expected the name of a PNG"),
-        ({"entries": [{"time_hours": 0, "file": "\ud800"}]}, "lightmaps[0].file: expected the name of an EXR"),
-        ({"entries": [{"time_hours": 0, "file": "x" * 1000}]}, "cannot read the EXR file"),
-        ({"entries": [{"time_hours": 0, "file": "set.json"}]}, "expected an EXR file"),
+        ({"entries": [{"time_hours": 0, "file": "\ud800"}]}, "lightmaps[0].file: expected the name of a lightmap"),
+        ({"entries": [{"time_hours": 0, "file": "x" * 1000}]}, "cannot read the lightmap"),
+        (
+            {"entries": [{"time_hours": 0, "file": "set.json"}]},
+            "expected a lightmap, EXR, Radiance (.hdr), KTX2 or DDS, found other",
+        ),
     ],
 )
 def test_set_fields(tmp_path, changes, expected):

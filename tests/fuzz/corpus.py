@@ -5,12 +5,14 @@ import gzip
 import json
 from pathlib import Path
 
+import imagecodecs
 import numpy as np
 import OpenEXR
 import torch
 import warp as wp
 from builders import atlas_meshes, bench_rows, probe_sets, smoke_plumes
 from builders.godot_bakes import Writer, bake, probes
+from builders.textures import make_dds, make_ktx2
 from PIL import Image
 
 from wlm.bench import Row, write_json
@@ -30,7 +32,7 @@ _HEIGHT, _WIDTH = 12, 10  # of every picture
 def write_corpus(folder: Path) -> None:
     """Writes all files; the bytes of some depend on the versions of the libraries that pack them."""
     folder.mkdir(exist_ok=True)
-    for write in (_exrs, _pictures, _meshes, _probe_files, _volumes, _smoke, _settings):
+    for write in (_exrs, _pictures, _textures, _meshes, _probe_files, _volumes, _smoke, _settings):
         write(folder)
 
 
@@ -65,6 +67,29 @@ def _pictures(folder: Path) -> None:
     image.convert("P").save(folder / "mask-palette.png")
     image.save(folder / "flipbook.png")
     image.save(folder / "flipbook.tga", compression="tga_rle")
+
+
+def _textures(folder: Path) -> None:
+    size = _WIDTH, _HEIGHT
+    flat = np.where(_pixels(3) > 0.5, 1.0, 0.25).astype(np.float32)
+    (folder / "runs.hdr").write_bytes(imagecodecs.rgbe_encode(flat, header=True))
+    # Rows of a texel, a repeat of 4, another texel and a repeat of 4.
+    row = bytes([200, 100, 50, 128, 1, 1, 1, 4, 50, 150, 250, 129, 1, 1, 1, 4])
+    head = b"#?RADIANCE\nEXPOSURE=2\nCOLORCORR=1 2 1\nFORMAT=32-bit_rle_rgbe\n\n"
+    (folder / "repeats.hdr").write_bytes(head + b"+X 12 +Y 10\n" + 12 * row)
+    words = np.random.default_rng(1).integers(0, 1 << 32, (4, _HEIGHT, _WIDTH), np.uint32)
+    blocks = words.tobytes()[: 9 * 16]
+    half = [_pixels(4)[:: 1 << i, :: 1 << i].astype("<f2").tobytes() for i in range(2)]
+    for name, content in {
+        "packed-zstd.ktx2": make_ktx2(122, *size, [words[0].tobytes()], 2, {"KTXwriter": "wlm"}),
+        "bc6h-zlib.ktx2": make_ktx2(143, *size, [blocks], 3, {"KTXorientation": "ru", "KTXswizzle": "rgba"}),
+        "half-mips.ktx2": make_ktx2(97, *size, half),
+        "astc.ktx2": make_ktx2(1000066000, *size, [blocks]),
+        "shared.dds": make_dds(67, *size, words[0].tobytes()),
+        "bc6h.dds": make_dds(96, *size, blocks),
+        "float-legacy.dds": make_dds(0, *size, _pixels(4).tobytes(), b"\x74\0\0\0"),
+    }.items():
+        (folder / name).write_bytes(content)
 
 
 def _meshes(folder: Path) -> None:

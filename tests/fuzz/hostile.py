@@ -15,6 +15,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import imagecodecs
 import numpy as np
 
 from wlm.formats.exr import write_exr
@@ -111,6 +112,31 @@ def _fifo_beside(path: Path) -> None:
 
 
 # Archives, sets and YAML.
+
+
+def _sparse(head: bytes, size: int = 1 << 40) -> Write:
+    """A file that begins so and has zeros up to a size, which take no room on the disk."""
+
+    def write(path: Path) -> None:
+        path.write_bytes(head)
+        os.truncate(path, size)
+
+    return write
+
+
+def _wide_dds() -> bytes:
+    content = bytearray(corpus("shared.dds")()[0])
+    struct.pack_into("<2I", content, 12, 1 << 16, 1 << 16)
+    return content
+
+
+def _ktx2(side: int, texels: bytes, stored: int | None = None) -> Write:
+    """A square of 11-11-10 under zstd, of other texels than its header states."""
+    content = bytearray(corpus("packed-zstd.ktx2")()[0])
+    packed = imagecodecs.zstd_encode(texels)
+    struct.pack_into("<2I", content, 20, side, side)
+    struct.pack_into("<3Q", content, 80, len(content), stored or len(packed), 4 * side * side)
+    return _sparse(content + packed, len(content) + (stored or len(packed)))
 
 
 def _zip_bomb(name: str, header: str, size: int, **others: np.ndarray) -> Write:
@@ -221,6 +247,12 @@ HOSTILE: dict[str, tuple[Sequence[str], Write]] = {
         ["volume-nvdb"],
         lambda path: path.write_bytes(gzip.decompress((_FILES / "bbox-700.nvdb.gz").read_bytes())),
     ),
+    "wide.ktx2": (["ktx2"], _ktx2(16384, b"\0" * 16)),
+    "more.ktx2": (["ktx2"], _ktx2(64, bytes(64 << 20))),
+    "sparse.ktx2": (["ktx2"], _ktx2(4096, b"", 1 << 40)),
+    "wide.hdr": (["radiance"], _text("#?RADIANCE\n\n-Y 16384 +X 16384\n" + "abcd\1\1\1\x7f\1\1\1\x7f" * 16384)),
+    "header.hdr": (["radiance"], _sparse(b"#?RADIANCE\n")),
+    "wide.dds": (["dds"], _sparse(_wide_dds())),
     "many/set.json": (["lightmap-set"], _same_again),
     "above/set.json": (["lightmap-set"], _set(_file("../b.exr"))),
     "device/set.json": (["lightmap-set"], _set(_file("/dev/zero"))),
@@ -242,6 +274,9 @@ HOSTILE: dict[str, tuple[Sequence[str], Write]] = {
             (".partial", "probe-checkpoint"),
             (".safetensors", "smoke-pool"),
             (".exr", "exr"),
+            (".hdr", "radiance"),
+            (".ktx2", "ktx2"),
+            (".dds", "dds"),
             (".gltf", "gltf"),
             (".obj", "obj"),
             (".npz", "volume-npz"),

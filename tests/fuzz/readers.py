@@ -23,6 +23,7 @@ from wlm.fluid.volume import load_volume
 from wlm.formats.exr import read_exr
 from wlm.formats.gltf import read_gltf
 from wlm.formats.gltf_writer import write_glb
+from wlm.formats.light import read_light
 from wlm.formats.mask import read_mask
 from wlm.formats.obj import read_obj
 from wlm.probe.data import load_positions
@@ -35,6 +36,7 @@ from . import models
 from .containers import vary_exr, vary_glb, vary_gltf, vary_npz, vary_png
 from .mutate import corrupt, vary_json, vary_numbers, vary_text
 from .reader import Reader, check_finite, corpus, stored
+from .textures import vary_dds, vary_ktx2, vary_radiance
 
 _PROFILES = Path(__file__).resolve().parents[2] / "configs"
 
@@ -54,6 +56,12 @@ def _json(draw: Random, data: bytes) -> bytes:
 def _exr(path: Path) -> None:
     pixels, names = read_exr(path)
     assert pixels.dtype == np.float32 and pixels.shape[2] == len(names), f"accepted as {pixels.dtype} {pixels.shape}"
+
+
+def _light_file(path: Path) -> None:
+    pixels, names = read_light(path)
+    assert pixels.dtype == np.float32 and pixels.shape[2] == len(names), f"accepted as {pixels.dtype} {pixels.shape}"
+    assert pixels.size, "accepted without a texel"
 
 
 def _six_way(path: Path) -> None:
@@ -290,6 +298,15 @@ _ALL = (
         lambda: {"light.bin_0": np.arange(18, dtype="<f4").tobytes(), "mask.bin_0": b"\x7f\xff" * 3},
     ),
     Reader("exr", "a.exr", corpus("zip.exr", "piz.exr", "b44.exr", "dwaa.exr", "tiled.exr"), vary_exr, _exr),
+    Reader("radiance", "a.hdr", corpus("runs.hdr", "repeats.hdr"), vary_radiance, _light_file),
+    Reader(
+        "ktx2",
+        "a.ktx2",
+        corpus("packed-zstd.ktx2", "bc6h-zlib.ktx2", "half-mips.ktx2", "astc.ktx2"),
+        vary_ktx2,
+        _light_file,
+    ),
+    Reader("dds", "a.dds", corpus("shared.dds", "bc6h.dds", "float-legacy.dds"), vary_dds, _light_file),
     Reader(
         "exr-six-way",
         "a.exr",

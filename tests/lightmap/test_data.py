@@ -4,12 +4,15 @@ import json
 import shutil
 from pathlib import Path
 
+import imagecodecs
 import numpy as np
 import pytest
 from builders.checks import error_of
+from builders.textures import make_dds, make_ktx2
 from PIL import Image
 
 from wlm.formats.exr import write_exr
+from wlm.formats.light import read_light
 from wlm.lightmap.data import from_arrays, load, parse_times
 
 HEIGHT, WIDTH = 5, 7
@@ -354,7 +357,7 @@ def test_set_that_is_no_json_object_names_the_file(tmp_path, text):
 
 def test_path_that_does_not_exist(tmp_path):
     assert "nowhere" in error_of(load, tmp_path / "nowhere")
-    assert "expected a set.json or EXR files" in error_of(load, tmp_path)
+    assert "expected a set.json or lightmaps (.exr, .hdr, .ktx2, .dds), found neither" in error_of(load, tmp_path)
 
 
 def test_plain_folder_takes_files_in_natural_order(tmp_path):
@@ -366,6 +369,28 @@ def test_plain_folder_takes_files_in_natural_order(tmp_path):
     np.testing.assert_array_equal(lightmaps.frames, frames[::-1])
     assert (lightmaps.name, lightmaps.period, lightmaps.warnings) == (tmp_path.name, None, ())
     assert "2 times for 3 lightmaps" in error_of(load, tmp_path, times=[1, 2])
+
+
+def test_plain_folder_may_mix_formats(tmp_path):
+    frames = _frames(4)
+    alpha = np.ones((HEIGHT, WIDTH, 1), np.float16)
+    alpha[2, 3] = 0
+    write_exr(tmp_path / "m_1h.exr", np.concatenate([frames[0], alpha], -1))
+    (tmp_path / "m_2h.hdr").write_bytes(imagecodecs.rgbe_encode(frames[1], header=True))
+    texels = np.concatenate([frames[2], alpha], -1, dtype=np.float16)
+    (tmp_path / "m_3h.ktx2").write_bytes(make_ktx2(97, WIDTH, HEIGHT, [texels.tobytes()], scheme=2))
+    (tmp_path / "m_4h.DDS").write_bytes(make_dds(6, WIDTH, HEIGHT, frames[3].astype("<f4").tobytes()))
+    lightmaps = load(tmp_path)
+    expected = frames.copy()
+    expected[1] = read_light(tmp_path / "m_2h.hdr")[0]
+    np.testing.assert_array_equal(lightmaps.frames, expected)
+    np.testing.assert_allclose(lightmaps.frames, frames, rtol=2**-7)
+    assert lightmaps.source == from_arrays(expected, [1, 2, 3, 4]).source
+    message = error_of(load, tmp_path, mask="alpha")
+    assert "m_2h.hdr: expected a channel A, which the mask is to come from, found R, G, B" in message
+    (tmp_path / "m_2h.hdr").unlink()
+    (tmp_path / "m_4h.DDS").unlink()
+    np.testing.assert_array_equal(load(tmp_path, mask="alpha").mask, alpha[..., 0] > 0)
 
 
 def test_plain_folder_uses_its_mask(tmp_path):
@@ -392,7 +417,7 @@ def test_plain_folder_with_a_name_that_tells_no_hour(tmp_path, odd):
     for name in ("m_05_00h", odd):
         write_exr(tmp_path / f"{name}.exr", _frames()[0])
     message = error_of(load, tmp_path)
-    assert "2 EXR files" in message and "--times" in message and odd in message
+    assert "2 lightmaps and no set.json" in message and "--times" in message and odd in message
 
 
 def test_from_arrays_checks_shapes():

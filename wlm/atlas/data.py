@@ -42,9 +42,9 @@ import numpy as np
 
 from wlm.atlas.coverage import covered_texels, touched_texels
 from wlm.errors import WlmError
-from wlm.formats.exr import read_exr
 from wlm.formats.gltf import GltfDocument, GltfPrimitive, document_from_arrays, read_gltf
 from wlm.formats.gltf_writer import Replacement, write_glb
+from wlm.formats.light import read_light
 from wlm.formats.mask import read_mask
 from wlm.formats.obj import read_obj
 from wlm.texels import fill_gaps, repair
@@ -114,7 +114,7 @@ def load(
     uv_set: int | None = None,
     trust: bool = False,
 ) -> LightmappedMesh:
-    """Reads a mesh (`.glb`, `.gltf`, `.obj`) and its lightmap (EXR).
+    """Reads a mesh (`.glb`, `.gltf`, `.obj`) and its lightmap (EXR, Radiance, KTX2, DDS: see `wlm.formats.light`).
 
     Args:
         mesh_path: The mesh. All primitives that its scene draws and that have the UV set make one mesh.
@@ -147,7 +147,7 @@ def load(
         primitives = [primitive]
     else:
         document, primitives = read_gltf(path, trust)
-    lightmap, _ = read_exr(lightmap_path)
+    lightmap, _ = read_light(lightmap_path)
     lightmap = np.array(lightmap[..., :3], np.float32, order="C")
     mask = None if mask_path is None else read_mask(Path(mask_path), lightmap_path, lightmap.shape[:2])
     return _check(

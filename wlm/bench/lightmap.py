@@ -28,7 +28,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from wlm.baselines.lightmap import FEW, RIVALS, check_rival, encode_set, usual
+from wlm.baselines.lightmap import RIVALS, check_rival, encode_set, usual
 from wlm.baselines.lightmap_torch import PlainFit
 from wlm.bench.plot import Panel
 from wlm.bench.rows import Row
@@ -114,31 +114,31 @@ def run(
 def run_rivals(
     *,
     quick: bool = False,
-    device: str = "cpu",
     set_path: str | os.PathLike[str] | None = None,
+    device: str = "cpu",
     names: Sequence[str] | None = None,
     progress: Note | None = None,
 ) -> list[Row]:
-    """Measures the rivals alone.
+    """Measures the rivals alone: on the CPU, but for those that are fitted.
 
     Args:
         quick, set_path, progress: As for `run`.
-        device: "cpu" or "cuda:0", for the rivals that are fitted; the others run on the CPU.
-        names: Keys of `wlm.baselines.lightmap.RIVALS`; None: all, or with `quick` a third of them, and on the CPU
-            without those that are fitted.
+        device: Of the rivals that are fitted.
+        names: Keys of `wlm.baselines.lightmap.RIVALS`; None: all, or with `quick` a third of them; on the CPU without
+            those that are fitted.
 
     Returns:
         Their rows.
 
     Raises:
-        WlmError: The set or the device isn't there, or a name is unknown.
+        WlmError: The set isn't there, or a name is unknown.
     """
     for name in names or ():
         check_rival(name)
     lightmaps = _load(set_path)
     chosen = _quick_times(lightmaps.times) if quick else np.arange(len(lightmaps.times))
     bench = _LightmapBench(lightmaps, chosen, device, progress, None)
-    return [bench.rival_row(name) for name in names or usual(bench.device, quick)]
+    return [bench.rival_row(name) for name in names or usual(device, quick)]
 
 
 def run_rows(
@@ -147,7 +147,7 @@ def run_rows(
     *,
     device: str,
     chosen: Sequence[int] | np.ndarray,
-    rivals: Sequence[str] = FEW,
+    rivals: Sequence[str] = (),
     repeats: int | None = None,
     progress: Note | None = None,
 ) -> list[Row]:

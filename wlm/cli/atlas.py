@@ -31,7 +31,9 @@ _VIEWS, _RESOLUTION = 50, 512  # as in `wlm.atlas.evaluation`, which takes long 
 @exclusive
 def compress(
     mesh_path: Annotated[Path, typer.Argument(metavar="MESH", help="A .glb, .gltf or .obj file.")],
-    lightmap_path: Annotated[Path, typer.Argument(metavar="LIGHTMAP", help="Its lightmap, an EXR.")],
+    lightmap_path: Annotated[
+        Path, typer.Argument(metavar="LIGHTMAP", help="Its lightmap: EXR, Radiance .hdr, KTX2 or DDS.")
+    ],
     output: Annotated[Path, output_option("DIR", "The folder to write to.")],
     mask: Annotated[
         Path | None, typer.Option(metavar="PNG", help="Which texels belong to a chart; default by the triangles.")

@@ -57,7 +57,9 @@ def lightmap(
     ] = None,
     profiles: _Profiles = None,
     rivals: _Rivals = True,
-    rivals_only: Annotated[bool, typer.Option("--rivals-only", help="The rivals alone.")] = False,
+    rivals_only: Annotated[
+        bool, typer.Option("--rivals-only", help="The rivals alone; but for NTC none needs a GPU.")
+    ] = False,
     rival_names: Annotated[
         list[str] | None, typer.Option("--rival", metavar="NAME", help="Only this rival, such as bc7. Several times.")
     ] = None,
@@ -69,14 +71,14 @@ def lightmap(
     device = _prepare(device, json_path, plot_path, baseline)
     from wlm.bench.lightmap import PANELS, run, run_rivals
 
-    common = {"quick": quick, "device": device, "set_path": set_path, "progress": note}
+    common = {"quick": quick, "set_path": set_path, "progress": note}
     if rivals_only or rival_names:
         if not rivals or profiles:
             raise WlmError("--rivals-only: expected without --no-rivals and --profile")
-        rows = run_rivals(names=rival_names, **common)
-        options = {"rivals_only": rivals_only, "rival": rival_names, "device": device}
+        rows = run_rivals(device=device, names=rival_names, **common)
+        options = {"rivals_only": rivals_only, "rival": rival_names, "device": None if device == "cpu" else device}
     else:
-        rows = run(names=profiles, rivals=rivals, **common)
+        rows = run(device=device, names=profiles, rivals=rivals, **common)
         options = {"profile": profiles, "no_rivals": not rivals, "device": device}
     command = _command("lightmap", quick=quick, **options, set=set_path and rows[0].scene)
     partial = bool(profiles or rival_names)

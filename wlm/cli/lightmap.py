@@ -41,7 +41,12 @@ if TYPE_CHECKING:
 
 app = typer.Typer(help="Lightmaps over time: BC7 feature maps and a tiny network for each 128² tile.")
 
-_Set = Annotated[Path, typer.Argument(metavar="SET", help="A set.json, or a folder of EXR files or of a contest.")]
+_Set = Annotated[
+    Path,
+    typer.Argument(
+        metavar="SET", help="A set.json, or a folder of lightmaps (.exr, .hdr, .ktx2, .dds) or of a contest."
+    ),
+]
 _Times = Annotated[
     str | None, typer.Option(help="Times of the lightmaps in order: numbers and start:stop:step, by commas.")
 ]

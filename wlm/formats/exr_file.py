@@ -14,10 +14,12 @@ import OpenEXR
 
 from wlm.errors import WlmError, one_line
 from wlm.formats.atomic import atomic_path
-from wlm.formats.limits import PICTURE_BYTES, PICTURE_GROWTH, PICTURE_SIDE, PICTURE_TEXELS, check_growth
+from wlm.formats.limits import PICTURE_BYTES, PICTURE_GROWTH, check_growth, check_sides
 from wlm.formats.reading import open_file
 
-_MAGIC = b"\x76\x2f\x31\x01"
+MAGIC = b"\x76\x2f\x31\x01"
+"""The first bytes of an EXR file."""
+
 _SAMPLE_BYTES = 2  # of a half: the header as the library gives it doesn't tell halves from floats
 _STDERR = 2
 _STDERR_LOCK = threading.Lock()
@@ -82,8 +84,8 @@ def write_part(
 def _check_magic(path: str | os.PathLike[str]) -> int:
     """Checks that it is an EXR file; gives its size in bytes."""
     with open_file(path, "the EXR file") as file:
-        magic, size = file.read(len(_MAGIC)), os.fstat(file.fileno()).st_size
-    if magic != _MAGIC:
+        magic, size = file.read(len(MAGIC)), os.fstat(file.fileno()).st_size
+    if magic != MAGIC:
         raise WlmError(f"{path}: expected an EXR file, found other content")
     return size
 
@@ -94,11 +96,7 @@ def _check_size(path: str | os.PathLike[str], held: int, parts: list[OpenEXR.Par
     for part in parts:
         first, last = (np.asarray(corner).tolist() for corner in part.header["dataWindow"])
         width, height = (end - begin + 1 for begin, end in zip(first, last, strict=True))
-        if max(width, height) > PICTURE_SIDE or width * height > PICTURE_TEXELS:
-            raise WlmError(
-                f"{path}: expected at most {PICTURE_TEXELS} texels, {PICTURE_SIDE} along a side, "
-                f"found {width} x {height}"
-            )
+        check_sides(str(path), width, height)
         total += width * height * _SAMPLE_BYTES * len(part.header["channels"])
     check_growth(str(path), held, total, PICTURE_GROWTH, PICTURE_BYTES)
 

@@ -54,13 +54,13 @@ def encode_bc6h(texels: np.ndarray, profile: str, extra: str) -> bytes:
     return texcomp.compress_blocks_bc6h(surface, texcomp.BC6HEncSettings.from_profile(profile))
 
 
-def decode_bc6h(blocks: bytes, height: int, width: int, extra: str) -> np.ndarray:
-    """Decodes unsigned BC6H to half [H, W, 3], multiples of 4; reserved modes are black.
+def decode_bc6h(blocks: bytes, height: int, width: int, extra: str, signed: bool = False) -> np.ndarray:
+    """Decodes BC6H, unsigned or signed, to half [H, W, 3], multiples of 4; reserved modes are black.
 
     Raises:
         WlmError: The package is missing.
     """
-    return need("imagecodecs", extra).bcn_decode(blocks, 6, shape=(height, width, 3))
+    return need("imagecodecs", extra).bcn_decode(blocks, -6 if signed else 6, shape=(height, width, 3))
 
 
 class Astc:

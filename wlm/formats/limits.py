@@ -48,16 +48,16 @@ CORNERS = 1 << 28
 """The same of any file."""
 
 PICTURE_SIDE = 65_536
-"""Texels along a side of an EXR."""
+"""Texels along a side of a lightmap's file: EXR, Radiance, KTX2, DDS."""
 
 PICTURE_TEXELS = 1 << 28
-"""Texels of an EXR: 16384 x 16384, the largest texture of most GPUs."""
+"""Texels of one: 16384 x 16384, the largest texture of most GPUs."""
 
 PICTURE_GROWTH = 2048
-"""Bytes of pixels that a byte of an EXR may become. Black ones become 950 under ZIP."""
+"""Bytes of pixels, as half floats, that a byte of one may become. Black ones become 950 under ZIP."""
 
 PICTURE_BYTES = 256 << 20
-"""Bytes of pixels that an EXR may have however small it is: 6000 x 6000 black texels under any compression."""
+"""The same of one however small it is: 6000 x 6000 black texels under any compression."""
 
 IMAGE_BYTES = 2 << 30
 """Of a PNG or TGA: 16384 x 16384 texels of 8 bytes."""
@@ -85,6 +85,18 @@ PROBES = 1 << 24
 
 NUMBERS = 4096
 """Numbers of a probe: colours of spherical harmonics up to the 36th order. Kernels are compiled for their number."""
+
+
+def check_sides(where: str, width: int, height: int) -> None:
+    """Checks the size that a picture claims.
+
+    Raises:
+        WlmError: It has more than `PICTURE_TEXELS`, or more than `PICTURE_SIDE` along a side.
+    """
+    if max(width, height) > PICTURE_SIDE or width * height > PICTURE_TEXELS:
+        raise WlmError(
+            f"{where}: expected at most {PICTURE_TEXELS} texels, {PICTURE_SIDE} along a side, found {width} x {height}"
+        )
 
 
 def check_growth(where: str, small: int, large: int, growth: int = GROWTH, sure: int = SURE_BYTES) -> None:

@@ -22,6 +22,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from wlm.config import check_settings
 from wlm.errors import WlmError
+from wlm.formats.light import SUFFIXES
 from wlm.formats.limits import PICTURE_SIDE, PICTURE_TEXELS, TIMES
 from wlm.formats.reading import named_file, read_file, read_json_file
 from wlm.lightmap.listing import SET_FILE, Listing
@@ -63,7 +64,7 @@ class _Map(BaseModel):
 
 
 def is_contest(folder: Path) -> bool:
-    """Whether a folder has the contest's config, and no `set.json` and no EXR file beside it.
+    """Whether a folder has the contest's config, and no `set.json` and no lightmap beside it.
 
     Raises:
         WlmError: It can't be listed.
@@ -71,7 +72,7 @@ def is_contest(folder: Path) -> bool:
     if not (folder / CONFIG_FILE).is_file() or (folder / SET_FILE).is_file():
         return False
     try:
-        return not any(file.suffix.lower() == ".exr" for file in folder.iterdir())
+        return not any(file.suffix.lower() in SUFFIXES for file in folder.iterdir())
     except OSError as error:
         raise WlmError(f"{folder}: cannot read: {error.strerror or error}") from error
 
@@ -165,7 +166,7 @@ def _files(config: Path, chosen: _Map, kind: str, stated: dict[str, str] | None)
     return found
 
 
-def read_light(parts: Sequence[Path], size: tuple[int, int]) -> np.ndarray:
+def read_raw(parts: Sequence[Path], size: tuple[int, int]) -> np.ndarray:
     """Reads a lightmap, float32 [H, W, 3].
 
     Raises:
@@ -178,7 +179,7 @@ def read_coverage(masks: Sequence[Sequence[Path]], size: tuple[int, int]) -> np.
     """Reads the valid texels, bool [H, W] of one mask, [T, H, W] of several.
 
     Raises:
-        WlmError: As `read_light`.
+        WlmError: As `read_raw`.
     """
     valid = [_read(parts, size, np.dtype("i1"), "the coverage") >= _VALID for parts in masks]
     return valid[0] if len(valid) == 1 else np.stack(valid)

@@ -1,4 +1,4 @@
-"""What comes in: a set of lightmaps over time, read from EXR files or arrays and checked.
+"""What comes in: a set of lightmaps over time, read from files or arrays and checked.
 
 The stated behaviours. "Inside" is inside the mask. Repairs are counted in texels, whichever channels they touch, and
 listed in `LightmapSet.warnings`, one line per file and kind.
@@ -29,6 +29,8 @@ a time outside [0, period)            error: 24 h is 0 h, and wrapping would hid
 a NaN or infinite time                error
 frames, mask or `set.json` that     error that names both files
 disagree in size
+PNG, integers, arrays, cubes, XYZ,    error that says what was found; what is read: docs/formats.md
+and what else is no linear light
 a file missing or damaged, a          error that names the file, and the field
 malformed `set.json` or `config.json`
 ====================================  ================================================================
@@ -48,10 +50,10 @@ from pathlib import Path
 import numpy as np
 
 from wlm.errors import WlmError
-from wlm.formats.exr import read_exr
+from wlm.formats.light import EXPECTED, read_light
 from wlm.formats.limits import FRAMES, PICTURE_GROWTH, TIMES, check_growth
 from wlm.formats.mask import read_mask
-from wlm.lightmap.contest import CONFIG_FILE, is_contest, list_contest, read_coverage, read_light
+from wlm.lightmap.contest import CONFIG_FILE, is_contest, list_contest, read_coverage, read_raw
 from wlm.lightmap.listing import SET_FILE, Listing, list_folder, parse_set
 from wlm.texels import repair
 
@@ -100,19 +102,21 @@ def load(
     trust: bool = False,
     map_id: str | None = None,
 ) -> LightmapSet:
-    """Reads a lightmap set: a `set.json`, a folder that holds one, a plain folder of EXR files, or one of a contest.
+    """Reads a lightmap set: a `set.json`, a folder that holds one, a plain folder of lightmaps, or one of a contest.
+
+    A lightmap is an EXR, Radiance (`.hdr`), KTX2 or DDS file of light (`wlm.formats.light`); a set may mix them.
 
     `set.json` is an object with `width`, `height` and `lightmaps` (a list of `{"time_hours", "file"}`), and
     may have `name`, `period_hours`, `mask` (a PNG's name, or "alpha"; absent means that all texels are valid) and
     `mesh` (a glTF or OBJ file's name, read by `evaluate` alone). Other keys are ignored. Names of files are relative
     to it.
 
-    The files of a plain folder are taken in natural order of their names ("2" before "10"). Without `times`,
-    the hours are read from the names if every one ends like `_18_55h`, `_18.55h`, `_18h` or `_18.55`, the
-    digits after the second separator being decimals, not minutes. A `mask.png` among them is the mask unless
-    `mask` says otherwise.
+    The files of a plain folder that end in `.exr`, `.hdr`, `.ktx2` or `.dds` are taken in natural order of their names
+    ("2" before "10"). Without `times`, the hours are read from the names if every one ends like `_18_55h`, `_18.55h`,
+    `_18h` or `_18.55`, the digits after the second separator being decimals, not minutes. A `mask.png` among them is
+    the mask unless `mask` says otherwise.
 
-    A folder with a `config.json` and no EXR file is read as `wlm.lightmap.contest` says.
+    A folder with a `config.json` and no lightmap of these is read as `wlm.lightmap.contest` says.
 
     Args:
         path: The `set.json` or the folder.
@@ -141,10 +145,12 @@ def load(
         listing = list_folder(path, times)
     elif path.is_file():
         if path.suffix.lower() != ".json":
-            raise WlmError(f"{path}: expected a {SET_FILE} or a folder of EXR files, found a file of another kind")
+            raise WlmError(
+                f"{path}: expected a {SET_FILE} or a folder of lightmaps ({EXPECTED}), found a file of another kind"
+            )
         listing = parse_set(path, times, trust)
     else:
-        raise WlmError(f"{path}: no such file or folder; expected a {SET_FILE} or a folder of EXR files")
+        raise WlmError(f"{path}: no such file or folder; expected a {SET_FILE} or a folder of lightmaps ({EXPECTED})")
 
     labels = [file.name for file in listing.files]
     stamps = np.asarray(listing.times, np.float64)
@@ -154,7 +160,7 @@ def load(
     mask_source = str(mask) if mask is not None else listing.mask
     need_alpha = mask_source == "alpha"
     if need_alpha and listing.raw is not None:
-        raise WlmError(f"{path}: expected EXR files for a mask from alpha, found raw lightmaps without it")
+        raise WlmError(f"{path}: expected files of RGBA for a mask from alpha, found raw lightmaps without it")
     frames, covered, warnings = _read_frames(listing, need_alpha, trust)
     height, width = frames.shape[1:3]
     if need_alpha:
@@ -302,9 +308,9 @@ def _read_frames(
 def _read_rgb(listing: Listing, index: int, need_alpha: bool) -> tuple[np.ndarray, np.ndarray | None]:
     """Reads one lightmap: colour [H, W, 3] and, if asked for, its alpha [H, W]."""
     if listing.raw is not None:
-        return read_light(listing.raw[index], listing.size), None
+        return read_raw(listing.raw[index], listing.size), None
     path = listing.files[index]
-    pixels, names = read_exr(path)
+    pixels, names = read_light(path)
     if need_alpha and "A" not in names:
         raise WlmError(f"{path}: expected a channel A, which the mask is to come from, found {', '.join(names)}")
     return pixels[..., :3], pixels[..., 3] if need_alpha else None

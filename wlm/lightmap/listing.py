@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from wlm.errors import WlmError
+from wlm.formats.light import SUFFIXES
 from wlm.formats.limits import TIMES
 from wlm.formats.reading import named_file, read_json_file
 
@@ -26,7 +27,7 @@ class Listing:
 
     Attributes:
         name: The set's name.
-        files: The EXR files, as ordered by the list or by name; of raw lightmaps the first of each.
+        files: The lightmaps, as ordered by the list or by name; of raw lightmaps the first of each.
         times: One for each file, not yet checked.
         mask: "all", "alpha", the path of a PNG, or "coverage": that of the files of `coverage`.
         period: Length of the day in the unit of the times, or None.
@@ -34,7 +35,7 @@ class Listing:
         stated_by: The file that states the size, or the folder.
         warn_order: Whether times that are out of order deserve a warning.
         mesh: The mesh that the lightmaps belong to, which need not be there, or None.
-        raw: For each lightmap the raw files that it is made of, see `wlm.lightmap.contest`; None for EXR files.
+        raw: For each lightmap the raw files that it is made of, see `wlm.lightmap.contest`; None for pictures.
         coverage: Likewise the raw masks: one, or one for each lightmap.
     """
 
@@ -52,7 +53,7 @@ class Listing:
 
 
 def list_folder(folder: Path, times: Sequence[float] | None) -> Listing:
-    """Lists a folder of EXR files without a `set.json`, as `wlm.lightmap.load` states.
+    """Lists a folder of lightmaps without a `set.json`, as `wlm.lightmap.load` states.
 
     Args:
         folder: The folder.
@@ -62,24 +63,24 @@ def list_folder(folder: Path, times: Sequence[float] | None) -> Listing:
         The listing; "mask.png" of the folder is its mask, else all texels are valid.
 
     Raises:
-        WlmError: There is no EXR file, their number is not that of the times, a name tells no hour, or the
+        WlmError: There is no lightmap, their number is not that of the times, a name tells no hour, or the
             folder cannot be read.
     """
     try:
-        files = [f for f in folder.iterdir() if f.suffix.lower() == ".exr" and f.is_file()]
+        files = [f for f in folder.iterdir() if f.suffix.lower() in SUFFIXES and f.is_file()]
     except OSError as error:
         raise WlmError(f"{folder}: cannot read: {error.strerror or error}") from error
     # A hidden name is another program's: macOS writes one beside every file on a foreign disk.
     files = sorted((f for f in files if f.name[0] != "."), key=lambda f: (_natural(f.name), f.name))
     if not files:
-        raise WlmError(f"{folder}: expected a {SET_FILE} or EXR files, found neither")
+        raise WlmError(f"{folder}: expected a {SET_FILE} or lightmaps ({', '.join(SUFFIXES)}), found neither")
     # Names need not sort by their hours ("_5.5h" before "_5.45h"): only times that the caller gave have an order.
     warn_order = times is not None
     if times is None:
         times = [_time_of_name(f.stem) for f in files]
         if None in times:
             raise WlmError(
-                f"{folder}: {_count(files, 'EXR file')} and no {SET_FILE}: give {_count(files, 'time')} with "
+                f"{folder}: {_count(files, 'lightmap')} and no {SET_FILE}: give {_count(files, 'time')} with "
                 f"--times ({files[times.index(None)].name} does not end in an hour such as _18_55h)"
             )
     _check_count(folder, files, times)
@@ -164,7 +165,7 @@ def parse_set(path: Path, times: Sequence[float] | None, trust: bool = False) ->
         place = f"lightmaps[{i}]"
         if not isinstance(entry, dict):
             raise WlmError(f"{path}: {place}: expected an object (time_hours, file), got {_kind(entry)}")
-        file = field(entry, "file", f"{place}.", _is_text, "the name of an EXR file")
+        file = field(entry, "file", f"{place}.", _is_text, "the name of a lightmap")
         if file not in found:  # links are followed once
             found[file] = named_file(path, file, f"{path}: {place}.file", trust)
         files.append(found[file])

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Literal
 
 from wlm.atlas.exporter import REPORT_FILE
 from wlm.errors import WlmError
-from wlm.formats.exr import read_exr
 from wlm.formats.geometry import read_geometry
+from wlm.formats.light import SUFFIXES, read_light
 from wlm.formats.npz import read_npz
 from wlm.lightmap.listing import SET_FILE
 from wlm.smoke.data import SCENE_FILE, is_six_way, six_way_files
@@ -71,7 +71,7 @@ def open_scene(
     suffix = path.suffix.lower()
     if suffix == ".wlm":
         return request.model()
-    if suffix == ".exr":
+    if suffix in SUFFIXES:
         return request.lightmap()
     if suffix == ".nvdb" or (suffix == ".npz" and "density" in _names(path)):
         return request.volume(path)
@@ -81,9 +81,8 @@ def open_scene(
         return request.probes()
     if suffix in (".glb", ".gltf", ".obj"):
         raise WlmError(f"{path}: a mesh has no light of its own; expected the light, with this as --mesh")
-    raise WlmError(
-        f"{path}: expected a folder or .wlm, .exr, .npz, .nvdb, .json or .lmbake, found {path.suffix or 'none'}"
-    )
+    known = ", ".join((".wlm", *SUFFIXES, ".npz", ".nvdb", ".json"))
+    raise WlmError(f"{path}: expected a folder or {known} or .lmbake, found {path.suffix or 'none'}")
 
 
 @dataclass(frozen=True)
@@ -142,7 +141,9 @@ class _Request:
         if self.mesh is None:
             from wlm.lightmap.data import from_arrays
 
-            return self._lightmaps(None, from_arrays(read_exr(self.path)[0][None, ..., :3], [0.0], name=self.path.name))
+            return self._lightmaps(
+                None, from_arrays(read_light(self.path)[0][None, ..., :3], [0.0], name=self.path.name)
+            )
         from wlm.atlas.data import load as load_mesh
         from wlm.view.atlas_scene import input_scene
 
@@ -155,7 +156,7 @@ class _Request:
         self._refuse("mesh", "key", "walk", "scale", "extinction")
         output, light = read_folder(self.path), None
         if self.original is not None:
-            light = read_exr(self.original)[0]
+            light = read_light(self.original)[0]
             self._check_size(light.shape[:2], (output.model.height, output.model.width))
         return atlas_scene(output, light, title=self.path.name, flat=self.flat, up=self._up)
 

@@ -11,8 +11,8 @@ from wlm.atlas.exporter import geometry, read_folder
 from wlm.atlas.model import SIDE_BITS
 from wlm.atlas.shader import atlas_glsl
 from wlm.errors import WlmError
-from wlm.formats.exr import read_exr
 from wlm.formats.geometry import Geometry
+from wlm.formats.light import read_light
 from wlm.texels import exposure, fill_gaps
 from wlm.web.page import Page, pack_rgb9e5, pack_triangles
 
@@ -61,7 +61,7 @@ def folder_page(
         **box,
     }
     if original is not None:
-        lightmap = read_exr(original)[0][..., :3]
+        lightmap = read_light(original)[0][..., :3]
         if lightmap.shape[:2] != (model.height, model.width):
             raise WlmError(
                 f"{original}: expected a lightmap of {model.width}x{model.height}, found {lightmap.shape[1]}x"

@@ -1,0 +1,138 @@
+"""Radiance pictures: every code, both run-length codes, orientations and exposures, and what is refused."""
+
+from itertools import product
+
+import imagecodecs
+import numpy as np
+import pytest
+from builders.checks import error_of
+
+from wlm.formats.radiance import read_radiance
+
+HEAD = b"#?RADIANCE\n# made by hand\nFORMAT=32-bit_rle_rgbe\n"
+
+
+def _file(path, texels, head=HEAD, size=None):
+    """Writes texels, uint8 [H, W, 4] or the bytes that stand for them."""
+    if size is None:
+        size = "-Y {} +X {}".format(*texels.shape)
+    path.write_bytes(head + b"\n" + size.encode() + b"\n" + (texels if isinstance(texels, bytes) else texels.tobytes()))
+    return path
+
+
+def _noise(height, width, seed=0):
+    """Texels that no run-length code takes for its own: red is above 127."""
+    texels = np.random.default_rng(seed).integers(0, 256, (height, width, 4), np.uint8)
+    texels[..., 0] |= 128
+    return texels
+
+
+def _values(texels):
+    exponent = texels[..., 3:].astype(np.float64)
+    return np.where(exponent > 0, texels[..., :3] * 2.0 ** (exponent - 136), 0)
+
+
+def test_every_code(tmp_path):
+    exponent, mantissa = np.mgrid[:256, :256]
+    texels = np.stack([np.full_like(mantissa, 200), mantissa, 255 - mantissa, exponent], -1).astype(np.uint8)
+    pixels, names = read_radiance(_file(tmp_path / "a.hdr", texels))
+    assert (names, pixels.dtype, pixels.shape) == (("R", "G", "B"), np.float32, (256, 256, 3))
+    # Exact: the largest is 1.7e38, the smallest a denormal float.
+    np.testing.assert_array_equal(pixels, _values(texels))
+    assert pixels[1, 1, 1] == 2.0**-135 and not pixels[0].any()
+
+
+@pytest.mark.parametrize("shape", [(3, 7), (5, 8), (4, 300), (2, 1000)])
+def test_runs_are_read_as_another_reader_has_them(tmp_path, shape):
+    draw = np.random.default_rng(1)
+    light = np.repeat(draw.random((*shape, 3)) ** 8 * 65504, draw.integers(1, 9, shape[1]), axis=1)[:, : shape[1]]
+    light[0, :3] = 0
+    content = imagecodecs.rgbe_encode(light.astype(np.float32), header=True)
+    (tmp_path / "a.hdr").write_bytes(content)
+    pixels = read_radiance(tmp_path / "a.hdr")[0]
+    np.testing.assert_array_equal(pixels, imagecodecs.rgbe_decode(content))
+    assert (abs(pixels - light) <= light.max(-1, keepdims=True) / 128).all()
+
+
+def test_the_newer_code_by_hand(tmp_path):
+    row = b"\x02\x02\x00\x09" + b"\x89\xc8" + b"\x02\x01\x02\x87\x03" + b"\x84\x04\x85\x05" + b"\x88\x80\x01\x81"
+    plain = _noise(1, 9)
+    pixels = read_radiance(_file(tmp_path / "a.hdr", row + plain.tobytes() + row, size="-Y 3 +X 9"))[0]
+    green, blue, exponent = [1, 2] + 7 * [3], 4 * [4] + 5 * [5], 8 * [128] + [129]
+    expected = _values(np.array([9 * [200], green, blue, exponent]).T)
+    np.testing.assert_array_equal(pixels, [expected, _values(plain[0]), expected])
+
+
+def test_the_older_code_by_hand(tmp_path):
+    a, b = _noise(1, 2)[0]
+    # 1 and 2 repeats; then 3 + 256 of them.
+    rows = [(a, (1, 1, 1, 1), b, (1, 1, 1, 2)), (b, (1, 1, 1, 0), a, (1, 1, 1, 3))]
+    data = b"".join(bytes(texel) for row in rows for texel in row)
+    pixels = read_radiance(_file(tmp_path / "a.hdr", data, size="-Y 2 +X 5"))[0]
+    np.testing.assert_array_equal(pixels, _values(np.array([[a, a, b, b, b], [b, a, a, a, a]])))
+    data = bytes(a) + b"\1\1\1\3" + b"\1\1\1\1" + bytes(b)
+    pixels = read_radiance(_file(tmp_path / "a.hdr", data, size="-Y 1 +X 261"))[0]
+    np.testing.assert_array_equal(pixels, _values(np.array([260 * [a] + [b]])))
+
+
+@pytest.mark.parametrize(("down", "right", "upright"), [*product("+-", "+-", (True, False))])
+def test_orientations(tmp_path, down, right, upright):
+    texels = _noise(3, 2)
+    stored = texels[:: 1 if down == "-" else -1, :: 1 if right == "+" else -1]
+    axes = [f"{down}Y 3", f"{right}X 2"]
+    if not upright:
+        stored, axes = stored.swapaxes(0, 1), axes[::-1]
+    pixels = read_radiance(_file(tmp_path / "a.hdr", stored, size=" ".join(axes)))[0]
+    assert pixels.flags.c_contiguous
+    np.testing.assert_array_equal(pixels, _values(texels))
+
+
+def test_exposures_and_colours_multiply(tmp_path):
+    texels = _noise(2, 2)
+    texels[..., 3] = 128
+    head = HEAD + b"EXPOSURE=2\nVIEW= -vf x\nEXPOSURE= 4.0\nCOLORCORR= 1 .5 2\nGAMMA=1.0\nPRIMARIES=1 2\n"
+    pixels = read_radiance(_file(tmp_path / "a.hdr", texels, head))[0]
+    np.testing.assert_array_equal(pixels, _values(texels) / [8, 4, 16])
+    texels[..., 3] = 255
+    assert np.isinf(read_radiance(_file(tmp_path / "a.hdr", texels, HEAD + b"EXPOSURE=1e-30\n"))[0]).any()
+
+
+@pytest.mark.parametrize(
+    ("head", "size", "data", "words"),
+    [
+        (HEAD + b"FORMAT=32-bit_rle_xyze\n", "-Y 1 +X 1", b"", "FORMAT: expected 32-bit_rle_rgbe, found 32-bit_rle_x"),
+        (HEAD + b"GAMMA=2.2\n", "-Y 1 +X 1", b"abcd", "GAMMA: expected linear light, 1, found 2.2"),
+        (HEAD + b"EXPOSURE=0\n", "-Y 1 +X 1", b"abcd", "EXPOSURE: expected finite numbers above 0, 1 of them, found 0"),
+        (HEAD + b"EXPOSURE=nan\n", "-Y 1 +X 1", b"abcd", "EXPOSURE: expected finite numbers"),
+        (HEAD + 2 * b"EXPOSURE=1e200\n", "-Y 1 +X 1", b"abcd", "expected finite products above 0"),
+        (HEAD + b"COLORCORR=1 2\n", "-Y 1 +X 1", b"abcd", "COLORCORR: expected finite numbers above 0, 3 of them"),
+        (HEAD, "-Y 1 -Y 1", b"abcd", "expected a size like -Y 512 +X 512"),
+        (HEAD, "1 1", b"abcd", "expected a size like -Y 512 +X 512"),
+        (HEAD, "-Y 0 +X 1", b"abcd", "expected at least one texel, found 1 x 0"),
+        (HEAD, "-Y 65537 +X 1", b"abcd", "65536 along a side, found 1 x 65537"),
+        (HEAD, "-Y 16384 +X 16384", b"abcd", "expected at most 2048 times its"),
+        (HEAD, "-Y 2 +X 1", b"abcd", "row 1 of 2: the file is cut short"),
+        (HEAD, "-Y 1 +X 8", b"\2\2\0\7" + b"\x87\1" * 4, "expected a row of 8 texels, found another length"),
+        (HEAD, "-Y 1 +X 8", b"\2\2\0\x08" + b"\x89\1" * 4, "the run-length code is damaged: a run of 9 texels"),
+        (HEAD, "-Y 1 +X 8", b"\2\2\0\x08" + b"\x00\1" * 4, "the run-length code is damaged: a run of 0 texels"),
+        (HEAD, "-Y 1 +X 8", b"\2\2\0\x08" + b"\x88\1" * 3 + b"\x08\1\1", "row 0 of 1: the file is cut short"),
+        (HEAD, "-Y 1 +X 2", b"\1\1\1\1abcd", "damaged: a repeat before the row's first texel or past its last"),
+        (HEAD, "-Y 1 +X 2", b"abcd\1\1\1\2", "damaged: a repeat before the row's first texel or past its last"),
+        (HEAD, "-Y 1 +X 3", b"abcd\1\1\1\1", "row 0 of 1: the file is cut short"),
+    ],
+)  # fmt: skip
+def test_what_is_refused(tmp_path, head, size, data, words):
+    path = _file(tmp_path / "a.hdr", data, head, size)
+    message = error_of(read_radiance, path)
+    assert message.startswith(f"{path}: ") and words in message
+
+
+def test_a_shorter_file_is_refused(tmp_path):
+    light = np.random.default_rng(0).random((3, 20, 3)).astype(np.float32).round(1)
+    path = tmp_path / "a.hdr"
+    for whole in (imagecodecs.rgbe_encode(light, header=True), _file(path, _noise(3, 20)).read_bytes()):
+        for length in range(0, len(whole), 3):
+            path.write_bytes(whole[:length])
+            assert error_of(read_radiance, path).startswith(f"{path}: ")
+        path.write_bytes(whole + b"more")
+        assert read_radiance(path)[0].shape == (3, 20, 3)

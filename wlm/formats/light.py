@@ -1,0 +1,61 @@
+"""Pictures of light, as bakers and engines hand them over: EXR, Radiance, KTX2 and DDS, told apart by their content."""
+
+import os
+
+import numpy as np
+
+from wlm.errors import WlmError
+from wlm.formats import dds_reader, ktx2_reader, radiance
+from wlm.formats.exr import read_exr
+from wlm.formats.exr_file import MAGIC as EXR_MAGIC
+from wlm.formats.reading import open_file
+
+SUFFIXES = (".exr", ".hdr", ".ktx2", ".dds")
+"""The usual ends of their names, by which they are found in a folder."""
+
+EXPECTED = "EXR, Radiance (.hdr), KTX2 or DDS"
+"""What they are, for messages."""
+
+_READERS = {
+    EXR_MAGIC: read_exr,
+    radiance.MAGIC: radiance.read_radiance,
+    ktx2_reader.MAGIC: ktx2_reader.read_ktx2,
+    dds_reader.MAGIC: dds_reader.read_dds,
+}
+# Of others that are taken for light, for the message.
+_OTHERS = {
+    b"\x89PNG": "a PNG: its 8 or 16 bits don't say what light they stand for",
+    b"\xff\xd8\xff": "a JPEG: its 8 bits don't say what light they stand for",
+    b"\xabKTX 11": "a KTX file of version 1",
+    b"II*\0": "a TIFF",
+    b"MM\0*": "a TIFF",
+}
+_FIRST = 12  # bytes that tell
+
+
+def read_light(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Reads a picture of linear light, whatever its name ends in.
+
+    Values come as they are in the file, NaN, Inf and negative ones too: the caller checks what it can't use.
+
+    Args:
+        path: The file.
+
+    Returns:
+        The pixels, float32 [H, W, 3 or 4], the top row first, and the channels' names, ("R", "G", "B") or
+        ("R", "G", "B", "A").
+
+    Raises:
+        WlmError: The file is missing, of another kind, cut short or damaged, as the reader of its kind says.
+    """
+    with open_file(path, "the lightmap") as file:
+        first = file.read(_FIRST)
+    for magic, read in _READERS.items():
+        if not first.startswith(magic):
+            continue
+        try:
+            return read(path)
+        except MemoryError as error:
+            raise WlmError(f"{path}: the lightmap is too large for the memory: {error}") from error
+    found = next((name for magic, name in _OTHERS.items() if first.startswith(magic)), "other content")
+    raise WlmError(f"{path}: expected a lightmap, {EXPECTED}, found {found}")
