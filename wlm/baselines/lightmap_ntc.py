@@ -76,7 +76,7 @@ class Latents:
 LADDER = {
     "low": Latents(2, 4, 4, 6),
     "medium": Latents(2, 8, 4, 8),
-    "high": Latents(2, 16, 4, 16),
+    "high": Latents(1, 4, 4, 16),
     "highest": Latents(1, 12, 4, 16),
 }
 """Sizes by name: 7 to 56 bits of latents a texel."""
