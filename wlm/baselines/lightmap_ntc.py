@@ -76,10 +76,10 @@ class Latents:
 LADDER = {
     "low": Latents(2, 4, 4, 6),
     "medium": Latents(2, 8, 4, 8),
-    "high": Latents(2, 16, 4, 16),
-    "highest": Latents(2, 32, 4, 32),
+    "high": Latents(1, 4, 4, 16),
+    "highest": Latents(1, 12, 4, 16),
 }
-"""Sizes by name: 7 to 48 bits of latents a texel."""
+"""Sizes by name: 7 to 56 bits of latents a texel."""
 
 
 @dataclass(frozen=True, eq=False)
