@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from builders.checks import error_of
+from builders.small_sets import moving_light, tiny_profile
 
-from tests.builders.checks import error_of
-from tests.builders.small_sets import moving_light, tiny_profile
 from wlm.lightmap import rate
 from wlm.lightmap.data import from_arrays
 from wlm.lightmap.evaluation import bits_per_texel
