@@ -174,7 +174,7 @@ def run_rows(
             peers.append(bench.option_row(best, "matrix", "fast"))
     rows = bench.time_rows(peers)
     rows += [bench.rival_row(name) for name in rivals]
-    rows += [bench.fit_row(fit) for fit in fits]
+    rows += [bench.fit_row(fit) for fit in fits if len(fit.model.mapped)]
     return rows + bench.plain_rows(best)
 
 
@@ -252,7 +252,7 @@ class _LightmapBench(Bench):
             disk_bpp=bits_per_texel(model, self.lightmaps.mask, fit.bytes),
             encode_seconds=fit.seconds,
             max_error=error,
-            steps=model.profile.steps,
+            steps=model.profile.steps if len(model.mapped) else None,
             **self._score(frames.values(), fit.option, decode=decoder.frame),
             **self._tiles(model),
         )

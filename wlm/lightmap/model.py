@@ -92,7 +92,7 @@ class Profile(Settings):
     freeze_from: float = Field(0.95, ge=0.0, le=1.0)
     static_budget_db: float = Field(60.0, gt=0.0)
     frames: Literal["auto", "never", "always"] = "auto"
-    frames_loss: float = Field(0.0, ge=0.0, le=255.0)
+    frames_loss: float = Field(0.2, ge=0.0, le=255.0)
 
     @model_validator(mode="after")
     def _stages_in_order(self) -> "Profile":
