@@ -12,6 +12,14 @@ MOST_SIDE = 65536
 MOST_TEXELS = 1 << 28
 """Texels of a lightmap, at most: 16,384 x 16,384, of which one decoded frame takes 3 GiB."""
 
+REACH = 2
+"""Texels from a chart, along rows and columns, that a filter takes in: a bilinear read one, its half-size mip two."""
+
+_OFFSETS = sorted(
+    ((y, x) for y in range(-REACH, REACH + 1) for x in range(-REACH, REACH + 1) if (y, x) != (0, 0)),
+    key=lambda at: (at[0] ** 2 + at[1] ** 2, at),
+)  # to a texel's neighbours in the order in which they are asked: the nearest first, then by row
+
 _WHITE, _PERCENTILE = 0.8, 99.0  # where that share of the light is on the screen
 _FILMIC_WHITE = 4.0
 
@@ -77,8 +85,34 @@ def fill_gaps(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
     return image[..., rows, columns, :]
 
 
+def near_gaps(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Finds the texels within `REACH` of a valid one, and the nearest valid one of each.
+
+    Of several as near it is the first in reading order: every decoder, on the host, in a shader or in a page, takes the
+    same.
+
+    Args:
+        mask: bool [H, W], true where a texel is valid.
+
+    Returns:
+        Row and column of each such texel, int [G, 2], in reading order, and those of the valid texel.
+    """
+    height, width = mask.shape
+    found = np.zeros(mask.shape, np.int8)  # 1 + the place in `_OFFSETS`
+    if not mask.all():
+        padded = np.pad(mask, REACH)
+        for i, (y, x) in enumerate(_OFFSETS):
+            valid = padded[REACH + y : REACH + y + height, REACH + x : REACH + x + width]
+            found[valid & ~mask & (found == 0)] = i + 1
+    target = np.argwhere(found)
+    offsets = np.array(_OFFSETS)[found[found > 0].astype(int) - 1]
+    return target, target + offsets.reshape(-1, 2)
+
+
 def nearest_valid(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Finds the valid texel that is nearest to each texel of a lightmap (Euclidean distance), itself where it is valid.
+
+    Within `REACH` it is that of `near_gaps`; further off any of several as near.
 
     Args:
         mask: bool [H, W], true where a texel is valid; at least one is.
@@ -87,6 +121,8 @@ def nearest_valid(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         Its row and its column, int32 [H, W] each: `image[rows, columns]` is the image with its gaps filled.
     """
     rows, columns = distance_transform_edt(~mask, return_distances=False, return_indices=True)
+    target, source = near_gaps(mask)
+    rows[tuple(target.T)], columns[tuple(target.T)] = source.T
     return rows, columns
 
 

@@ -15,8 +15,8 @@ from wlm.formats.bc7 import BLOCK_BYTES
 from wlm.formats.bc7_modes import RESERVED, block_modes
 from wlm.formats.limits import check_growth
 from wlm.formats.parts import Part
-from wlm.lightmap.gaps import REACH
 from wlm.lightmap.tiles import TILE, TileGrid, TileKind
+from wlm.texels import REACH
 
 FRAMES = Part(np.uint8, (None,))
 FRAME_SIZES = Part(np.uint32, (None,))

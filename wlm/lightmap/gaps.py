@@ -10,14 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-REACH = 2
-"""Texels from a chart, along rows and columns, that are filled: a bilinear read needs one, its half-size mip two."""
-
-OFFSETS = sorted(
-    ((y, x) for y in range(-REACH, REACH + 1) for x in range(-REACH, REACH + 1) if (y, x) != (0, 0)),
-    key=lambda at: (at[0] ** 2 + at[1] ** 2, at),
-)
-"""Rows and columns to a texel's neighbours in the order in which they are asked: the nearest first, then by row."""
+from wlm.texels import near_gaps
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,21 +27,12 @@ class Gaps:
 
     @classmethod
     def of(cls, mask: np.ndarray) -> Gaps:
-        """Finds the texels within `REACH` of a valid one, and the nearest valid one of each.
+        """Finds those within `wlm.texels.REACH` of a valid one.
 
         Args:
             mask: bool [H, W], true where a texel is valid.
         """
-        height, width = mask.shape
-        found = np.zeros(mask.shape, np.int8)  # 1 + the place in `OFFSETS`
-        if not mask.all():
-            padded = np.pad(mask, REACH)
-            for i, (y, x) in enumerate(OFFSETS):
-                valid = padded[REACH + y : REACH + y + height, REACH + x : REACH + x + width]
-                found[valid & ~mask & (found == 0)] = i + 1
-        target = np.argwhere(found)
-        offsets = np.array(OFFSETS)[found[found > 0].astype(int) - 1]
-        return cls(target, target + offsets.reshape(-1, 2))
+        return cls(*near_gaps(mask))
 
     def fill(self, image: np.ndarray) -> None:
         """Fills a decoded map [H, W, C] in place."""

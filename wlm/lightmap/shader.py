@@ -1,7 +1,7 @@
 """The GLSL that decodes an exported lightmap; `wlm.lightmap.exporter` writes it beside the textures."""
 
-from wlm.lightmap.gaps import REACH
 from wlm.lightmap.model import LightmapModel
+from wlm.texels import REACH
 from wlm_kernels.lightmap.features import STATIC_INPUTS, TEMPORAL_INPUTS
 
 _GELU = {
