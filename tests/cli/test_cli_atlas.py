@@ -225,9 +225,9 @@ def test_decode_a_view(kind, request, tmp_path):
     assert picture.shape == (48, 48, 3)
     hit = light.any(axis=2)
     assert 0.02 < hit.mean() < 0.9 and (picture[~hit] == 128).all()
-    # Brighter light is a brighter pixel.
+    # Brighter light is a brighter pixel, up to a level: the EXR's halves are rounded, the picture's light isn't.
     order = np.argsort(light[hit][:, 0])
-    assert (np.diff(picture[hit][order, 0].astype(int)) >= 0).all()
+    assert (np.diff(picture[hit][order, 0].astype(int)) >= -1).all()
 
 
 def test_wrong_words_of_decode(tiles, tmp_path):
