@@ -11,6 +11,7 @@ from pydantic import Field
 
 from wlm.config import check_settings
 from wlm.formats.artifact import Artifact
+from wlm.formats.deflate import inflate
 from wlm.formats.parts import Part, check_part, check_parts
 from wlm.lightmap.frame_packing import FRAME_SIZES, FRAMES, pack_frames, unpack_frames
 from wlm.lightmap.model import LightmapModel, Profile, part_table
@@ -123,13 +124,8 @@ def _mask(tensors: Mapping[str, np.ndarray], height: int, width: int) -> np.ndar
     if "mask" not in tensors:
         return np.ones((height, width), bool)
     size = -(-height * width // 8)
-    reader = zlib.decompressobj()
-    try:
-        bits = reader.decompress(check_part(tensors, "mask", _MASK).tobytes(), size + 1)
-    except zlib.error as error:
-        raise ValueError(f"part mask: {error}") from error
-    if len(bits) != size or not reader.eof or reader.unused_data:
-        raise ValueError(f"part mask: expected {size} bytes, compressed, found others")
+    stored = check_part(tensors, "mask", _MASK).tobytes()
+    bits = inflate(stored, size, "part mask", f"{size} bytes, compressed, found others")
     return np.unpackbits(np.frombuffer(bits, np.uint8), count=height * width).reshape(height, width).astype(bool)
 
 

@@ -14,6 +14,8 @@ from typing import Any
 import numpy as np
 
 from wlm.errors import WlmError
+from wlm.formats.bc7 import pack_mode6, unpack_mode6
+from wlm.formats.deflate import inflate
 from wlm.formats.parts import Part
 from wlm.lightmap.model import Profile
 from wlm.lightmap.tiles import TILE, TileKind, valid_texels
@@ -29,9 +31,6 @@ TILES = Part(np.uint8, (None,))
 SIZES = Part(np.uint32, (None, len(STREAMS)))
 
 _STATIC = ("uv ends", "uv indices", "net")
-_MODE_6 = 1 << 6
-_END_SHIFTS = (7 + 7 * np.arange(8)).astype(np.uint64)
-_INDEX_SHIFTS = np.maximum(4 * np.arange(16), 1).astype(np.uint64)
 _NONE = np.empty(0, np.uint8)
 
 
@@ -176,21 +175,16 @@ def _by_block(used: np.ndarray) -> np.ndarray:
 
 def _parts_of(blocks: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Blocks [n, 16] as endpoints of 7 bits [n, 8], their lowest bits [n, 2] and indices [n, 16]."""
-    low, high = np.ascontiguousarray(blocks).view("<u8").T
-    if (low & np.uint64(127) != _MODE_6).any():
-        raise WlmError("maps: expected blocks of BC7 mode 6, found others")
-    ends = (low[:, None] >> _END_SHIFTS & np.uint64(127)).astype(np.uint8)
-    bits = np.stack([low >> np.uint64(63), high & np.uint64(1)], 1).astype(np.uint8)
-    indices = high[:, None] >> _INDEX_SHIFTS & np.array([7] + [15] * 15, np.uint64)
-    return ends, bits, indices.astype(np.uint8)
+    try:
+        endpoints, indices = unpack_mode6(blocks)
+    except WlmError as error:
+        raise WlmError("maps: expected blocks of BC7 mode 6, found others") from error
+    return (endpoints >> 1).swapaxes(1, 2).reshape(-1, 8), endpoints[..., 0] & 1, indices
 
 
 def _blocks_of(ends: np.ndarray, bits: np.ndarray, indices: np.ndarray) -> np.ndarray:
     """The inverse of `_parts_of`."""
-    low = np.bitwise_or.reduce(ends.astype(np.uint64) << _END_SHIFTS, 1, initial=np.uint64(_MODE_6))
-    low |= bits[:, 0].astype(np.uint64) << np.uint64(63)
-    high = np.bitwise_or.reduce(indices.astype(np.uint64) << _INDEX_SHIFTS, 1) | bits[:, 1]
-    return np.stack([low, high], 1).astype("<u8").view(np.uint8)
+    return pack_mode6(ends.reshape(-1, 4, 2).swapaxes(1, 2) << 1 | bits[..., None], indices)
 
 
 def _orders(count: int, used: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
@@ -228,11 +222,5 @@ def _unpacked_blocks(read: Any, name: str, count: int, used: np.ndarray | None =
 
 def _inflated(stream: np.ndarray, count: int, where: str) -> np.ndarray:
     """The bytes of a zlib stream, which must be `count`."""
-    reader = zlib.decompressobj()
-    try:
-        data = reader.decompress(stream.tobytes(), count + 1)
-    except zlib.error as error:
-        raise ValueError(f"{where}: {error}") from error
-    if len(data) != count or not reader.eof or reader.unused_data:
-        raise ValueError(f"{where}: expected {count} bytes, deflated, found others")
+    data = inflate(stream.tobytes(), count, where, f"{count} bytes, deflated, found others")
     return np.frombuffer(data, np.uint8)

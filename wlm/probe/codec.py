@@ -14,6 +14,7 @@ from pydantic import Field
 from wlm.config import check_settings
 from wlm.formats.artifact import Artifact
 from wlm.formats.bits import pack_bits, unpack_bits
+from wlm.formats.deflate import inflate
 from wlm.formats.limits import NUMBERS, PROBES
 from wlm.formats.parts import Part, check_parts
 from wlm.probe.model import LATENT, SCALE, ProbeModel, Profile, layer_shapes
@@ -146,11 +147,5 @@ def _unpack_dead(packed: np.ndarray, probes: int) -> np.ndarray:
     if not packed.size:
         return np.zeros(0, bool)
     size = -(-probes // 8)
-    inflater = zlib.decompressobj()
-    try:
-        bits = inflater.decompress(packed.tobytes(), size + 1)
-    except zlib.error as error:
-        raise ValueError(f"part dead: {error}") from error
-    if len(bits) != size or not inflater.eof or inflater.unused_data:
-        raise ValueError(f"part dead: expected a bit for each of {probes} probes")
+    bits = inflate(packed.tobytes(), size, "part dead", f"a bit for each of {probes} probes")
     return np.unpackbits(np.frombuffer(bits, np.uint8), count=probes).astype(bool)
