@@ -9,8 +9,8 @@ import texture2ddecoder
 from builders.synthetic import any_blocks
 
 from wlm.errors import WlmError
-from wlm.formats.bc7 import decode_image
-from wlm.formats.bc7_modes import RESERVED, block_modes, blocks_image, decode_blocks, encode_image
+from wlm.formats.bc7 import blocks_image, decode_image
+from wlm.formats.bc7_modes import RESERVED, block_modes, decode_blocks, encode_image
 
 ROWS, COLUMNS = 64, 96
 

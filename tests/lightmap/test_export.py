@@ -14,8 +14,8 @@ from PIL import Image
 from scipy.special import erf
 
 from wlm.errors import WlmError
-from wlm.formats.bc7 import decode_image
-from wlm.formats.bc7_modes import blocks_image, decode_blocks
+from wlm.formats.bc7 import blocks_image, decode_image
+from wlm.formats.bc7_modes import decode_blocks
 from wlm.formats.exr import read_exr
 from wlm.lightmap.decode import Decoder
 from wlm.lightmap.exact import colour_tile64, decode_tile64

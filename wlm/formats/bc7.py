@@ -124,9 +124,14 @@ def decode_image(blocks: np.ndarray) -> np.ndarray:
     """
     if blocks.ndim != 3:
         raise ValueError(f"expected blocks [H/4, W/4, 16], got {blocks.shape}")
-    rows, columns = blocks.shape[:2]
-    texels = decode_mode6(blocks).reshape(rows, columns, 4, 4, 4)
-    return texels.transpose(0, 2, 1, 3, 4).reshape(4 * rows, 4 * columns, 4)
+    return blocks_image(decode_mode6(blocks))
+
+
+def blocks_image(texels: np.ndarray) -> np.ndarray:
+    """Texels of blocks [..., H/4, W/4, 16, C] as pictures [..., H, W, C]."""
+    *rest, rows, columns, _, channels = texels.shape
+    image = texels.reshape(*rest, rows, columns, 4, 4, channels).swapaxes(-4, -3)
+    return image.reshape(*rest, 4 * rows, 4 * columns, channels)
 
 
 def _words(endpoints: np.ndarray, indices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

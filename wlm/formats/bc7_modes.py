@@ -153,13 +153,6 @@ def decode_blocks(blocks: np.ndarray) -> np.ndarray:
     return texels.reshape(*blocks.shape[:-1], 16, 4)
 
 
-def blocks_image(texels: np.ndarray) -> np.ndarray:
-    """Texels of blocks [..., H/4, W/4, 16, C] as pictures [..., H, W, C]."""
-    *rest, rows, columns, _, channels = texels.shape
-    image = texels.reshape(*rest, rows, columns, 4, 4, channels).swapaxes(-4, -3)
-    return image.reshape(*rest, 4 * rows, 4 * columns, channels)
-
-
 def _texels(bits: np.ndarray, mode: int) -> np.ndarray:
     """The texels [n, 16, 4] of blocks of one mode, given as bits [n, 128]."""
     is_of = dict(zip(FIELDS, MODES[mode].tolist(), strict=True))

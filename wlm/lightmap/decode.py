@@ -9,7 +9,7 @@ import warp as wp
 
 from wlm import interop
 from wlm.errors import WlmError
-from wlm.lightmap.frame_decode import FrameTiles
+from wlm.lightmap.frame_decode import FrameTiles, HeldTiles, inverse_of
 from wlm.lightmap.gaps import Gaps
 from wlm.lightmap.model import TILE, LightmapModel, decode_scale
 from wlm.lightmap.tiles import TileGrid, TileKind, place
@@ -143,7 +143,7 @@ class Decoder:
             self._decode(numbers, time, out, as_bytes=True)
             self._decode_frames(numbers, time, out, as_bytes=True)
         else:
-            factor = np.divide(1.0, peak, out=np.zeros_like(peak), where=peak > 0)[:, None, None, None]
+            factor = inverse_of(peak)[:, None, None, None]
             out[..., :3] = np.clip(self.tiles(numbers, time) ** exponent * factor, 0.0, 1.0) * 255.0 + 0.5
         for i, radiance in constant:
             out[i, ..., :3] = np.floor(radiance**exponent / (peak[i] or 1.0) * 255.0 + 0.5)
@@ -219,7 +219,7 @@ class Decoder:
         decoded = wp.empty((len(rows), TILE, TILE), dtype=wp.uint32 if as_bytes else wp.vec3, device=self.device)
         inverse = None
         if as_bytes:
-            inverse = wp.array(self._frames.inverse(self._frames.bounds(time)), dtype=float, device=self.device)
+            inverse = wp.array(inverse_of(self._frames.bounds(time)), dtype=float, device=self.device)
         self._frames.decode(time, wp.array(rows, device=self.device), decoded, inverse)
         out[places] = rgba(decoded) if as_bytes else decoded.numpy()
 
@@ -292,12 +292,12 @@ class TimeTable:
             state.inverse_peak = wp.empty(len(bounds), dtype=float, device=self._shift.device)
         scale = (1.0 - share) * self._scale[:, before] + share * self._scale[:, after]
         state.scale.assign(scale.astype(np.float32))
-        state.inverse_peak.assign(np.divide(1.0, bounds, out=np.zeros_like(bounds), where=bounds > 0))
+        state.inverse_peak.assign(inverse_of(bounds))
         state.tau, state.encoding = self._axis.place(time), wp.vec4(*self._axis.encode(time))
         return state
 
 
-class StoredTiles:
+class StoredTiles(HeldTiles):
     """The stored tiles of one kind on a device.
 
     Attributes:
@@ -318,7 +318,7 @@ class StoredTiles:
         self.rows = np.flatnonzero(model.kind[model.mapped] == kind)
         if not len(self.rows):
             raise WlmError(f"{model.name}: expected at least one {kind.name.lower()} tile, found none")
-        self.numbers = model.mapped[self.rows]
+        super().__init__(model.mapped[self.rows])
         self.places = wp.array(self.rows.astype(np.int32), dtype=int, device=device)
 
         def blocks(values: np.ndarray) -> wp.array:
@@ -342,8 +342,3 @@ class StoredTiles:
         output = wp.array(output, dtype=wp.vec3, device=device)
         self.arguments = (stored, hidden, output)
         self.device_bytes = sum(array.capacity for array in (*maps.values(), hidden, output))
-        self._row_of = {int(number): i for i, number in enumerate(self.numbers)}
-
-    def among(self, numbers: Sequence[int]) -> list[tuple[int, int]]:
-        """Those of `numbers` that are here: their places in `numbers` and in `self.numbers`."""
-        return [(i, self._row_of[number]) for i, number in enumerate(numbers) if number in self._row_of]

@@ -6,8 +6,8 @@ import numpy as np
 from scipy.special import erf
 
 from wlm.errors import WlmError
-from wlm.formats.bc7 import decode_image
-from wlm.formats.bc7_modes import blocks_image, decode_blocks
+from wlm.formats.bc7 import blocks_image, decode_image
+from wlm.formats.bc7_modes import decode_blocks
 from wlm.lightmap.model import TILE, LightmapModel, decode_scale
 from wlm.lightmap.tiles import TileGrid, TileKind
 

@@ -12,7 +12,28 @@ from wlm.lightmap.tiles import TileKind
 from wlm_kernels.lightmap import frames
 
 
-class FrameTiles:
+def inverse_of(bounds: np.ndarray) -> np.ndarray:
+    """1 / each bound, float32; 0 for that of a black tile."""
+    return np.divide(1.0, bounds, out=np.zeros_like(bounds), where=bounds > 0)
+
+
+class HeldTiles:
+    """Some tiles of a grid.
+
+    Attributes:
+        numbers: int [n], their numbers in the grid.
+    """
+
+    def __init__(self, numbers: np.ndarray) -> None:
+        self.numbers = numbers
+        self._row_of = {int(number): i for i, number in enumerate(numbers)}
+
+    def among(self, numbers: Sequence[int]) -> list[tuple[int, int]]:
+        """Those of `numbers` that are here: their places in `numbers` and in `self.numbers`."""
+        return [(i, self._row_of[number]) for i, number in enumerate(numbers) if number in self._row_of]
+
+
+class FrameTiles(HeldTiles):
     """The frames of a model on a device.
 
     Attributes:
@@ -26,7 +47,7 @@ class FrameTiles:
         Raises:
             WlmError: The model has none.
         """
-        self.numbers = np.flatnonzero(model.kind == TileKind.FRAMES)
+        super().__init__(np.flatnonzero(model.kind == TileKind.FRAMES))
         if not len(self.numbers):
             raise WlmError(f"{model.name}: expected at least one tile of frames, found none")
         self._axis, self._device = model.axis, device
@@ -45,11 +66,6 @@ class FrameTiles:
         tables.shares = wp.array(bc7_modes.SHARES, dtype=int, device=device)
         self._arguments = stored, tables
         self.device_bytes = sum(array.capacity for array in (stored.blocks, stored.least, stored.span))
-        self._row_of = {int(number): i for i, number in enumerate(self.numbers)}
-
-    def among(self, numbers: Sequence[int]) -> list[tuple[int, int]]:
-        """Those of `numbers` that are here: their places in `numbers` and in `self.numbers`."""
-        return [(i, self._row_of[number]) for i, number in enumerate(numbers) if number in self._row_of]
 
     def bounds(self, time: float) -> np.ndarray:
         """Bound of each tile, float32 [n]; between two times the larger."""
@@ -70,7 +86,3 @@ class FrameTiles:
             frames.decode_radiance(*arguments, out)
         else:
             frames.decode_bytes(*arguments, inverse_peak, out)
-
-    def inverse(self, bounds: np.ndarray) -> np.ndarray:
-        """What `decode` takes as `inverse_peak` for some bounds, float32 [n]."""
-        return np.divide(1.0, bounds, out=np.zeros_like(bounds), where=bounds > 0)

@@ -14,7 +14,8 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.ndimage import binary_dilation
 
-from wlm.formats.bc7_modes import blocks_image, decode_blocks, encode_image
+from wlm.formats.bc7 import blocks_image
+from wlm.formats.bc7_modes import decode_blocks, encode_image
 from wlm.formats.block_reuse import by_block, reuse_in_order
 from wlm.lightmap.frame_packing import BLOCKS, clear_unneeded, needed_blocks
 from wlm.lightmap.model import Profile

@@ -12,7 +12,7 @@ import warp as wp
 from wlm import interop
 from wlm.errors import WlmError
 from wlm.lightmap.decode import StoredTiles, TimeTable, gelu_of, rgba
-from wlm.lightmap.frame_decode import FrameTiles
+from wlm.lightmap.frame_decode import FrameTiles, inverse_of
 from wlm.lightmap.gaps import Gaps
 from wlm.lightmap.model import TILE, LightmapModel
 from wlm.lightmap.tiles import TileKind
@@ -228,7 +228,7 @@ class FrameDecoder:
             raise WlmError(f"time: expected a finite number, got {time}")
         self._time, self._bounds = time, self._tiles.bounds(time)
         self._limits.assign(self._bounds)
-        self._inverse.assign(self._tiles.inverse(self._bounds))
+        self._inverse.assign(inverse_of(self._bounds))
 
     def decode(self) -> None:
         """Decodes all tiles into `out`: launches alone, no allocation, no wait; can be captured."""
