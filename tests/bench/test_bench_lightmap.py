@@ -47,7 +47,7 @@ def test_every_row_has_its_figures(rows):
     blocks = [("BC6H", ""), ("BC7", ""), ("ASTC", "12x12"), ("8 bits", "")]
     rivals = [*blocks, ("PCA in BC4", "2"), ("PCA", "step 0.04"), ("AV1", "75")]
     fits = [("fit", "M 60 steps"), ("fit in plain torch", "M 10 steps")]
-    assert keys(rows) == [("ours", "M"), *ways, *rivals, *fits]
+    assert keys(rows) == [("ours", "M"), ("texture", "M"), *ways, *rivals, *fits]
     scored, weighed, timed = {"psnr", "ssim", "flip"}, {"disk_bytes", "disk_bpp", "encode_seconds"}, {"decode_ms"}
     held = {"bytes", "bpp"}
     for row in rows:
@@ -60,7 +60,7 @@ def test_every_row_has_its_figures(rows):
         assert (row["times"], row["times_scored"]) == (4, 3)
         if (row.method, row.option) not in rivals:
             assert row["decode_ms_spread"] >= 0.0
-        if row.method in ("exact", "strip"):
+        if row.method in ("exact", "strip", "texture"):
             assert measured == {"psnr", "decode_ms"}
             continue
         streamed = row.method == "AV1"
@@ -76,6 +76,13 @@ def test_every_row_has_its_figures(rows):
             assert row["bpp"] == pytest.approx(row["bytes"] * 8 / (104 * 384 * 4))
             assert row["disk_bytes"] <= row["bytes"]
     assert "; LDR" in next(row.notes for row in rows if row.method == "ASTC")
+
+
+def test_the_texture_is_as_good_as_the_decode(rows):
+    ours, texture = (next(row for row in rows if row.method == method) for method in ("ours", "texture"))
+    assert "one RGB9E5 texture with 8 mips" in texture.notes
+    for name in ("psnr", "seen", "between"):
+        assert abs(texture[name] - ours[name]) < 0.1, "8 bits lose little at such errors"
 
 
 def test_errors_against_the_float64_path(rows):

@@ -65,17 +65,9 @@ def test_gaps_are_filled_as_everywhere(device):
     mask = np.zeros((236, 247), bool)
     mask[20:60, 30:128] = mask[100:180, 60:90] = True
     model = random_model((4, 4, 4, 3), mask=mask)
-    decoder, runtime = Decoder(model, device), FrameDecoder(model, device)
+    decoder = Decoder(model, device)
     frame, gaps = decoder.frame(9.0), Gaps.of(mask)
     assert np.array_equal(frame[tuple(gaps.target.T)], frame[tuple(gaps.source.T)])
-    runtime.set_time(9.0)
-    runtime.decode()
-    image, _ = decoder.frame_8bit(9.0)
-    for row, (y, x) in enumerate(((0, 0), (0, 128), (128, 0))):
-        part = image[y : y + 128, x : x + 128].astype(int)
-        off = np.abs(runtime.numpy()[row, : part.shape[0], : part.shape[1]] - part)[part[..., 3] == 255]
-        off = off[: part[..., 3].sum()]
-        assert np.quantile(off, 0.99) <= 1 and off.shape[0] > 0
 
 
 def test_the_blocks_that_a_read_reaches():

@@ -65,23 +65,6 @@ def test_matrix_units_are_close(hidden, device):
         assert off.max() <= 3 and off.mean() < 0.2, "half floats: some thousandths of an activation"
 
 
-def test_gaps_take_the_light_of_charts(device):
-    mask = np.zeros((236, 247), bool)
-    mask[20:60, 30:128] = mask[100:180, 60:90] = True  # across tiles, and near the edge of one
-    model = random_model((3, 3, 3, 2), mask=mask, hidden=16)
-    decoder, runtime = Decoder(model, device), StripDecoder(model, device)
-    for time in (7.5, 9.0):
-        runtime.set_time(time)
-        runtime.decode()
-        image, bounds = decoder.frame_8bit(time)
-        np.testing.assert_allclose(runtime.bounds, bounds[:3], rtol=1e-6)
-        for row, number in enumerate((0, 1, 2)):
-            y, x = number // 2 * 128, number % 2 * 128
-            part = image[y : y + 128, x : x + 128].astype(int)
-            off = np.abs(runtime.numpy()[row, : part.shape[0], : part.shape[1]] - part)
-            assert off.max() <= 3, "what is rounded for another tile's bound may be off by one more"
-
-
 def test_a_captured_decode_repeats(device):
     model = random_model((3, 3))
     strip = StripDecoder(model, device)

@@ -16,10 +16,11 @@ import wlm
 from wlm.cli.app import app
 from wlm.errors import WlmError
 from wlm.formats.exr import write_exr
+from wlm.formats.shared_exponent import pack_rgb9e5
 from wlm.smoke.camera import Camera
 from wlm.smoke.data import write_six_way
 from wlm.smoke.lightmaps import SixWay
-from wlm.web.page import Page, pack_rgb9e5
+from wlm.web.page import Page
 from wlm.web.pages import make_page, write_page
 
 

@@ -1,6 +1,6 @@
 """The lightmap system against itself and against block codecs: size, speed and error in one run.
 
-Four kinds of rows:
+Five kinds of rows:
 
 - method "ours", one row for each profile: the file, the fit, the errors of the float decode against the input, and the
   decode time of the whole map to 8 bits on the fast path. The largest error is in radiance, against the float64 path.
@@ -8,6 +8,8 @@ Four kinds of rows:
   "matrix" (the fast path on matrix units), of profile M:
   the 8-bit output against the input, and its largest error against the float64 path as a share of 255. Half a level of
   8 bits, 0.00196, is the rounding itself.
+- method "texture", one row for each profile: the map as a renderer samples it, one RGB9E5 texture with all mips
+  (`wlm.lightmap.page`), its errors and how long it takes from the stored bytes.
 - the rivals of `wlm.baselines.lightmap`, on the same lightmaps: block codecs, temporal PCA, a neural texture codec and
   a video codec; between stored times their light is mixed.
 - method "fit", one row for each profile: the speed of the fit alone; and some steps of the same fit in plain torch.
@@ -40,6 +42,7 @@ from wlm.lightmap.evaluation import bits_per_texel, count_kinds, memory_bytes
 from wlm.lightmap.exact import bound64, colour_tile64, decode_tile64
 from wlm.lightmap.fit import compress, dynamic_targets
 from wlm.lightmap.model import TILE, LightmapModel, Profile, TimeAxis
+from wlm.lightmap.page import MapDecoder
 from wlm.lightmap.runtime import ExactDecoder, FrameDecoder, MatrixDecoder, StripDecoder, fast_decoder
 from wlm.lightmap.seen import Tally
 from wlm.lightmap.tiles import TileGrid, TileKind, assemble
@@ -164,7 +167,7 @@ def run_rows(
         raise ValueError("expected at least one profile and one time")
     bench = _LightmapBench(lightmaps, np.asarray(chosen), device, progress, repeats)
     fits = [bench.fit_profile(profile) for profile in profiles]
-    peers = [bench.profile_row(fit) for fit in fits]
+    peers = [row(fit) for fit in fits for row in (bench.profile_row, bench.texture_row)]
     best = next((fit for fit in fits if fit.option == "M"), fits[0])
     if len(best.model.mapped):
         # On the CPU "fast" is "tanh".
@@ -257,6 +260,25 @@ class _LightmapBench(Bench):
             **self._tiles(model),
         )
         return row, self._decode(self._decoders(model, "fast", None))
+
+    def texture_row(self, fit: Fit) -> tuple[Row, Callable[[], object]]:
+        """What a renderer samples of a profile: one texture of the map, with mips."""
+        self.note(f"{fit.option}: texture")
+        decoder = MapDecoder(fit.model, self.device)
+
+        def frame(t: float) -> np.ndarray:
+            decoder.set_time(t)
+            decoder.decode()
+            return decoder.numpy()
+
+        row = self.row(
+            "texture",
+            fit.option,
+            f"{self.scored_at}one RGB9E5 texture with {len(decoder.levels) - 1} mips; time of all of it, {self.mode}",
+            **self._score((frame(t) for t in self.times), fit.option, ("psnr",), frame, views=0),
+        )
+        decoder.set_time(self.times[0])
+        return row, self.replay(decoder.decode)
 
     def option_row(self, fit: Fit, path: str, gelu: str) -> tuple[Row, Callable[[], object]]:
         """One way to decode a profile to 8 bits."""
@@ -365,17 +387,18 @@ class _LightmapBench(Bench):
         name: str,
         metrics: Sequence[str] = METRICS,
         decode: Callable[[float], np.ndarray] | None = None,
+        views: int = VIEWS,
     ) -> dict[str, float]:
         """The figures of lightmaps at the chosen times and, with a decoder of any time, of how they are seen."""
-        tally = None if decode is None else self._tally(name, decode)
+        tally = None if decode is None else self._tally(name, decode, views)
         pairs = zip(self.chosen.tolist(), frames, strict=True)
         return self._figures([self._frame(name, tally, i, frame, metrics) for i, frame in pairs], tally)
 
-    def _tally(self, name: str, decode: Callable[[float], np.ndarray] | None = None) -> Tally:
+    def _tally(self, name: str, decode: Callable[[float], np.ndarray] | None = None, views: int = VIEWS) -> Tally:
         """The scores of `wlm.lightmap.seen`, to be filled."""
         whole = len(self.chosen) == len(self.lightmaps.times)
-        views, _ = views_of(self.lightmaps, VIEWS if whole else 0, device=self.device)
-        return Tally(self.lightmaps, self.lightmaps.mask, decode, views, name)
+        seen_from, _ = views_of(self.lightmaps, views if whole else 0, device=self.device)
+        return Tally(self.lightmaps, self.lightmaps.mask, decode, seen_from, name)
 
     def _frame(
         self, name: str, tally: Tally | None, i: int, decoded: np.ndarray, metrics: Sequence[str] = METRICS

@@ -156,22 +156,34 @@ def decode(
             "and the bound of each tile in the PNG's text.",
         ),
     ] = None,
+    texture: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="MAP.dds",
+            help="Also write what a renderer samples: one texture of RGB9E5 texels, 32 bits each, with mips.",
+        ),
+    ] = None,
     device: Device = "cpu",
 ) -> None:
     """Decode the whole map at one time."""
     check_output(output, ".exr")
+    if texture is not None:
+        check_output(texture, ".dds")
     if eight_bit is not None:
         check_output(eight_bit, ".png")
     quiet_warp()
     from wlm.formats.exr import write_exr
-    from wlm.lightmap.exporter import write_8bit
+    from wlm.lightmap.exporter import write_8bit, write_texture
     from wlm.system import load
 
-    decoder = load(file, "lightmap").decoder(device)
+    model = load(file, "lightmap")
+    decoder = model.decoder(device)
     frame = decoder.frame(time)
     write_exr(output, frame)
     if eight_bit is not None:
         write_8bit(eight_bit, decoder, time)
+    if texture is not None:
+        write_texture(texture, model, time, device)
     rows = table(str(file), ["time", "size", "mean", "largest", "file"])
     size, mean, largest = f"{frame.shape[1]}x{frame.shape[0]}", f"{frame.mean():.4g}", f"{frame.max():.4g}"
     rows.add_row(f"{time:g}", size, mean, largest, escape(str(output)))

@@ -1,7 +1,7 @@
 """DDS files of block-compressed textures and of a few uncompressed formats, with the DX10 header: a 2D texture or
-a volume, one mip level.
+a volume, the former with mips if need be.
 
-A volume's slices follow each other, each a 2D grid of blocks (or of texels, row by row without padding).
+A volume's slices follow each other, each a 2D grid of blocks (or of texels, row by row without padding); so do mips.
 """
 
 import os
@@ -15,6 +15,7 @@ DXGI_FORMATS = {
     "R16G16_UNORM": 35,
     "R16G16_UINT": 36,
     "R8G8_UNORM": 49,
+    "R9G9B9E5_SHAREDEXP": 67,
     "BC6H_UF16": 95,
     "BC6H_SF16": 96,
     "BC7_UNORM": 98,
@@ -31,8 +32,10 @@ _TEXEL_BYTES = {
     "R16G16_UNORM": 4,
     "R16G16_UINT": 4,
     "R8G8_UNORM": 2,
+    "R9G9B9E5_SHAREDEXP": 4,
 }
-_MAX_SIDE = 16384  # texels; the limit of a 2D texture in Direct3D 11 and 12
+MOST_SIDE = 16384
+"""Texels along a side: the limit of a 2D texture in Direct3D 11 and 12."""
 _MAX_DEPTH = 2048
 
 _MAGIC = b"DDS "
@@ -46,7 +49,8 @@ _CAPS, _HEIGHT, _WIDTH, _PIXEL_FORMAT, _DEPTH = 0x1, 0x2, 0x4, 0x1000, 0x800000
 _PITCH, _LINEAR_SIZE = 0x8, 0x80000  # which of the two the size field holds: bytes of a row, or of a slice
 _REQUIRED = _CAPS | _HEIGHT | _WIDTH | _PIXEL_FORMAT
 _FOUR_CC = 0x4
-_CAPS_COMPLEX, _CAPS_TEXTURE = 0x8, 0x1000
+_CAPS_COMPLEX, _CAPS_TEXTURE, _CAPS_MIPS = 0x8, 0x1000, 0x400000
+_MIPS = 0x20000
 _CAPS2_VOLUME = 0x200000
 _DIMENSION_2D, _DIMENSION_3D = 3, 4
 
@@ -59,6 +63,7 @@ def write_dds(
     depth: int = 1,
     fmt: str = "BC7_UNORM",
     volume: bool | None = None,
+    mips: int = 0,
 ) -> None:
     """Writes blocks or texels as a DDS file, whole or not at all.
 
@@ -72,20 +77,27 @@ def write_dds(
         fmt: A key of `DXGI_FORMATS`.
         volume: Whether it is a volume, which a shader reads through another sampler; None: if `depth` is
             above 1.
+        mips: Levels after the first of a 2D texture, of half the size each, rounded down; `blocks` holds them one
+            after another.
 
     Raises:
-        ValueError: An unknown format, a size out of range, several slices of what is no volume, or blocks
-            that don't fill the texture.
+        ValueError: An unknown format, a size or a number of mips out of range, several slices of what is no volume,
+            mips of a volume, or blocks that don't fill the texture.
         WlmError: The file can't be written; what was there before stays.
     """
     if fmt not in DXGI_FORMATS:
         raise ValueError(f"fmt: expected one of {', '.join(DXGI_FORMATS)}, got {fmt}")
-    if not (1 <= width <= _MAX_SIDE and 1 <= height <= _MAX_SIDE and 1 <= depth <= _MAX_DEPTH):
-        raise ValueError(f"expected sides of 1 to {_MAX_SIDE} and a depth of 1 to {_MAX_DEPTH} texels")
-    slice_bytes = _slice_bytes(fmt, width, height)
-    if len(blocks) != depth * slice_bytes:
-        raise ValueError(f"blocks: expected {depth * slice_bytes} bytes, got {len(blocks)}")
+    if not (1 <= width <= MOST_SIDE and 1 <= height <= MOST_SIDE and 1 <= depth <= _MAX_DEPTH):
+        raise ValueError(f"expected sides of 1 to {MOST_SIDE} and a depth of 1 to {_MAX_DEPTH} texels")
     volume = depth > 1 if volume is None else volume
+    most = 0 if volume else max(width, height).bit_length() - 1
+    if not 0 <= mips <= most:
+        raise ValueError(f"mips: expected 0 to {most}, got {mips}")
+    slice_bytes = _slice_bytes(fmt, width, height)
+    levels = (_slice_bytes(fmt, max(width >> level, 1), max(height >> level, 1)) for level in range(1, mips + 1))
+    whole = depth * slice_bytes + sum(levels)
+    if len(blocks) != whole:
+        raise ValueError(f"blocks: expected {whole} bytes, got {len(blocks)}")
     if depth > 1 and not volume:
         raise ValueError(f"depth: expected 1 of a 2D texture, got {depth}")
     size_flag, size = _LINEAR_SIZE, slice_bytes
@@ -94,17 +106,17 @@ def write_dds(
     header = _HEADER.pack(
         _MAGIC,
         _HEADER_SIZE,
-        _REQUIRED | size_flag | (_DEPTH if volume else 0),
+        _REQUIRED | size_flag | (_DEPTH if volume else 0) | (_MIPS if mips else 0),
         height,
         width,
         size,
         depth if volume else 0,
-        1,
+        1 + mips,
         _PIXEL_FORMAT_SIZE,
         _FOUR_CC,
         b"DX10",
         *(0, 0, 0, 0, 0),
-        _CAPS_TEXTURE | (_CAPS_COMPLEX if volume else 0),
+        _CAPS_TEXTURE | (_CAPS_COMPLEX if volume or mips else 0) | (_CAPS_MIPS if mips else 0),
         _CAPS2_VOLUME if volume else 0,
         *(0, 0),
         DXGI_FORMATS[fmt],

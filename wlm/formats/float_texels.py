@@ -15,6 +15,7 @@ import numpy as np
 from wlm.errors import WlmError
 from wlm.formats.hdr_blocks import ASTC_BLOCKS, ASTC_MEDIUM, astc, decode_bc6h, need
 from wlm.formats.limits import PICTURE_BYTES, PICTURE_GROWTH, check_growth, check_sides
+from wlm.formats.shared_exponent import unpack_rgb9e5
 
 EXTRA = "atlas"
 """The extra with the packages that decode blocks and zstd."""
@@ -124,13 +125,8 @@ def _packed(data: memoryview, rows: int, columns: int) -> np.ndarray:
 
 
 # 2^(e - 15 - 9): nine bits of mantissa, whose leading bit is not implied.
-_SHARED_SCALE = np.ldexp(np.float32(1), np.arange(32) - 24)
-
-
 def _shared(data: memoryview, rows: int, columns: int) -> np.ndarray:
-    words = np.frombuffer(data, "<u4").reshape(rows, columns, 1)
-    mantissas = words >> np.array([0, 9, 18], np.uint32) & 0x1FF
-    return mantissas.astype(np.float32) * _SHARED_SCALE[words >> 27]
+    return unpack_rgb9e5(np.frombuffer(data, "<u4").reshape(rows, columns))
 
 
 def _bc6h(data: memoryview, rows: int, columns: int, *, signed: bool) -> np.ndarray:

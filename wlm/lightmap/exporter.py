@@ -12,12 +12,13 @@ from PIL.PngImagePlugin import PngInfo
 
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_path
-from wlm.formats.dds import write_dds
+from wlm.formats.dds import MOST_SIDE, write_dds
 from wlm.formats.exr import write_exr
 from wlm.formats.folder import compact_json, make_parents, rounded, staged
 from wlm.lightmap.decode import Decoder
 from wlm.lightmap.exact import SQRT_12
 from wlm.lightmap.model import TILE, LightmapModel, decode_scale, encode_time
+from wlm.lightmap.page import MapDecoder
 from wlm.lightmap.shader import decode_glsl
 from wlm.lightmap.tiles import TileKind
 
@@ -121,6 +122,30 @@ def write_8bit(path: str | os.PathLike[str], decoder: Decoder, time: float) -> N
     text.add_text("wlm", json.dumps({"gamma": decoder.model.profile.gamma, "bounds": bounds.tolist()}))
     with atomic_path(path) as temporary:
         Image.fromarray(pixels).save(temporary, "PNG", pnginfo=text)
+
+
+def write_texture(path: str | os.PathLike[str], model: LightmapModel, time: float, device: str = "cpu") -> None:
+    """Writes the map at one time as a renderer samples it: a DDS of RGB9E5 texels with all mips.
+
+    Args:
+        path: The DDS.
+        model: The model.
+        time: In the unit of the set's times.
+        device: Where it is decoded.
+
+    Raises:
+        WlmError: No such device, the time isn't finite, the map is larger than a DDS may be, or the file can't be
+            written.
+    """
+    if max(model.height, model.width) > MOST_SIDE:
+        size = f"{model.width}x{model.height}"
+        raise WlmError(f"{model.name}: expected at most {MOST_SIDE} texels along a side for a DDS, found {size}")
+    decoder = MapDecoder(model, device)
+    decoder.set_time(time)
+    decoder.decode()
+    texels = b"".join(level.numpy().astype("<u4").tobytes() for level in decoder.levels)
+    mips = len(decoder.levels) - 1
+    write_dds(path, texels, model.width, model.height, fmt="R9G9B9E5_SHAREDEXP", mips=mips)
 
 
 def _write_maps(folder: Path, number: int, model: LightmapModel, place: int, row: int | None) -> list[Path]:

@@ -55,7 +55,8 @@ class Profile(Settings):
         final_rate: Final learning rate of both as a fraction of the initial one; the schedule is half a cosine.
         adam_epsilon: Adam's epsilon; the loss is a mean over a tile's samples and channels.
         adam_decay: Adam's decay of squared gradients, beta 2. A texel is sampled every few steps alone and its gradient
-            shrinks by orders of magnitude during a fit: 0.99 follows that, and is worth 0.1 to 0.8 dB over 0.999.
+            shrinks by orders of magnitude during a fit: 0.99 follows that, and is worth 0.1 to 0.8 dB over 0.999 in
+            short fits, nothing in long ones.
         metric_weight: 0: the squared error in normalised gamma space, as the paper; 1: each texel, channel and time
             weighted so that the loss is the squared error of linear radiance over the tile's range at that time,
             which is what PSNR measures; between: the geometric mean.

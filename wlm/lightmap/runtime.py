@@ -1,9 +1,8 @@
 """Decoding to 8 bits at runtime: everything stays on the device, and a decode is launches alone.
 
-`wlm.lightmap.Decoder` returns arrays on the host; these are for a renderer's loop. Each holds the tiles of one kind: a
-whole map is a `StripDecoder`, or on CUDA a `MatrixDecoder` where networks are wide, an `ExactDecoder` of the static
-tiles and a `FrameDecoder` of those that are frames, if there are any, and `Decoder.tiles_8bit` for the constant tiles,
-one colour each, which need no launch. Gaps take the light of charts in tiles of the same decoder.
+`wlm.lightmap.Decoder` returns arrays on the host; these are for a renderer's loop. Each holds the tiles of one kind,
+gaps unfilled: a `StripDecoder`, or on CUDA a `MatrixDecoder` where networks are wide, an `ExactDecoder` of the static
+tiles and a `FrameDecoder` of those that are frames. `wlm.lightmap.page` puts them together to a texture of the map.
 """
 
 import numpy as np
@@ -13,7 +12,6 @@ from wlm import interop
 from wlm.errors import WlmError
 from wlm.lightmap.decode import StoredTiles, TimeTable, gelu_of, rgba
 from wlm.lightmap.frame_decode import FrameTiles, inverse_of
-from wlm.lightmap.gaps import Gaps
 from wlm.lightmap.model import TILE, LightmapModel
 from wlm.lightmap.tiles import TileKind
 from wlm_kernels.lightmap import decode as lightmap_decode
@@ -31,8 +29,6 @@ class _TileDecoder:
         self._times = TimeTable(model, self.device)
         self.out, self._early, self._late = (self._empty() for _ in range(3))
         self._states = [None, None]
-        self._limits = wp.empty(len(self.numbers), dtype=float, device=self.device)
-        self._filled = _gap_places(model, self.numbers, self.device)
         self.set_time(float(model.times[0]))
 
     def _empty(self) -> wp.array:
@@ -55,7 +51,6 @@ class _TileDecoder:
         for i, (stamp, _) in enumerate(self._reads):
             self._states[i] = self._times.at(stamp, self._states[i])
         self._bounds = self._times.bounds(time)[self._stored.rows]
-        self._limits.assign(self._bounds)
 
     def decode(self) -> None:
         """Decodes all tiles into `out`: launches alone, no allocation, no wait; can be captured."""
@@ -69,8 +64,6 @@ class _TileDecoder:
             inverse = early.inverse_peak, late.inverse_peak
             share, gamma = self._reads[1][1], self.model.profile.gamma
             output.blend(*words[:2], *inverse, self._stored.places, share, gamma, words[2])
-        if len(self._filled[0]):
-            output.fill(*self._filled, self._limits, self.out.flatten())
 
     def numpy(self) -> np.ndarray:
         """The last decode on the host, uint8 [n, 128, 128, 4]."""
@@ -211,8 +204,7 @@ class FrameDecoder:
         count = len(self.numbers)
         self._rows = wp.array(np.arange(count, dtype=np.int32), dtype=int, device=self.device)
         self.out = wp.zeros((count, TILE, TILE), dtype=wp.uint32, device=self.device)
-        self._limits, self._inverse = (wp.empty(count, dtype=float, device=self.device) for _ in range(2))
-        self._filled = _gap_places(model, self.numbers, self.device)
+        self._inverse = wp.empty(count, dtype=float, device=self.device)
         self.set_time(float(model.times[0]))
 
     def set_time(self, time: float) -> None:
@@ -227,14 +219,11 @@ class FrameDecoder:
         if not np.isfinite(time):
             raise WlmError(f"time: expected a finite number, got {time}")
         self._time, self._bounds = time, self._tiles.bounds(time)
-        self._limits.assign(self._bounds)
         self._inverse.assign(inverse_of(self._bounds))
 
     def decode(self) -> None:
         """Decodes all tiles into `out`: launches alone, no allocation, no wait; can be captured."""
         self._tiles.decode(self._time, self._rows, self.out, self._inverse)
-        if len(self._filled[0]):
-            output.fill(*self._filled, self._limits, self.out.flatten())
 
     def numpy(self) -> np.ndarray:
         """The last decode on the host, uint8 [n, 128, 128, 4]."""
@@ -244,22 +233,6 @@ class FrameDecoder:
     def bounds(self) -> np.ndarray:
         """What 255 stands for in gamma space, float32 [n]: radiance = (byte / 255 * bound) ** gamma."""
         return self._bounds.copy()
-
-
-def _gap_places(model: LightmapModel, numbers: np.ndarray, device: str) -> tuple[wp.array, wp.array]:
-    """Places in the decoded tiles [n, 128, 128] of the texels that are filled, and of those whose light they take."""
-    gaps, columns = Gaps.of(model.mask), model.tile_columns
-    row = np.full(len(model.kind), -1)
-    row[numbers] = np.arange(len(numbers))
-
-    def place(at: np.ndarray) -> np.ndarray:
-        tile = row[at[:, 0] // TILE * columns + at[:, 1] // TILE]
-        return np.where(tile < 0, -1, (tile * TILE + at[:, 0] % TILE) * TILE + at[:, 1] % TILE)
-
-    places = np.stack([place(gaps.target), place(gaps.source)])
-    held = places[:, (places >= 0).all(0)].astype(np.int32)
-    target, source = (wp.array(values, dtype=int, device=device) for values in held)
-    return target, source
 
 
 def fast_decoder(model: LightmapModel, device: str = "cpu") -> StripDecoder | MatrixDecoder:

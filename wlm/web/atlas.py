@@ -13,8 +13,9 @@ from wlm.atlas.shader import atlas_glsl
 from wlm.errors import WlmError
 from wlm.formats.geometry import Geometry
 from wlm.formats.light import read_light
+from wlm.formats.shared_exponent import pack_rgb9e5
 from wlm.texels import exposure, fill_gaps
-from wlm.web.page import Page, pack_rgb9e5, pack_triangles
+from wlm.web.page import Page, pack_triangles
 
 _FORMATS = {"half": "half floats", "bc6h": "BC6H", "astc": "ASTC"}
 

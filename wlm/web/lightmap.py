@@ -10,6 +10,7 @@ import numpy as np
 
 from wlm.errors import WlmError
 from wlm.formats.geometry import read_geometry
+from wlm.formats.shared_exponent import pack_rgb9e5
 from wlm.lightmap.data import load
 from wlm.lightmap.decode import Decoder
 from wlm.lightmap.evaluation import count_kinds, psnr_of
@@ -19,7 +20,7 @@ from wlm.lightmap.shader import decode_glsl
 from wlm.lightmap.tiles import TileKind
 from wlm.system import Meter, OnProgress
 from wlm.texels import exposure, fill_gaps
-from wlm.web.page import Page, pack_rgb9e5, pack_triangles
+from wlm.web.page import Page, pack_triangles
 
 _TIMES = ("times", "period", "interpolation", "time_axis", "tau", "tiles")
 _LAYERS = ("W1", "b1", "W2", "b2", "W3", "b3")

@@ -92,23 +92,5 @@ def pack_triangles(geometry: Geometry, up: Literal["y", "z"]) -> tuple[dict[str,
     return {name: values for name, values in parts.items() if values is not None}, box
 
 
-def pack_rgb9e5(light: np.ndarray) -> np.ndarray:
-    """Packs light as WebGL's RGB9_E5: nine bits a channel and one exponent.
-
-    Args:
-        light: [..., 3], finite; below 0 counts as 0, above 65408 as that.
-
-    Returns:
-        uint32 [...], within 1/512 of a texel's largest channel.
-    """
-    light = np.clip(np.asarray(light, np.float64), 0.0, 65408.0)
-    largest = light.max(-1)
-    # A mantissa of 9 bits without a hidden one: largest / 2 ** (exponent - 24) below 512.
-    exponent = np.clip(np.floor(np.log2(np.maximum(largest, 2.0**-20))) + 16, 0, 31).astype(np.int64)
-    exponent += np.round(largest / 2.0 ** (exponent - 24)) >= 512
-    codes = np.round(light / 2.0 ** (exponent - 24)[..., None]).astype(np.uint32)
-    return codes[..., 0] | codes[..., 1] << 9 | codes[..., 2] << 18 | exponent.astype(np.uint32) << 27
-
-
 def _asset(name: str) -> str:
     return (resources.files("wlm.web") / "assets" / name).read_text(encoding="utf-8").rstrip("\n")

@@ -1,9 +1,9 @@
-"""What follows a decode to 8 bits: two stored times are mixed in radiance, and gaps take the light of charts.
+"""What follows a decode to 8 bits between two stored times: both are mixed in radiance.
 
 Tiles are uint32 [n, 128 * 128], RGBA from the lowest byte, each with a bound of its own: radiance is
 (byte / 255 * bound) ** gamma.
 
-Read first: `wlm.lightmap.decode.Decoder.tiles_8bit` and `frame_8bit`, the same on the host.
+Read first: `wlm.lightmap.decode.Decoder.tiles_8bit`, the same on the host.
 """
 
 import warp as wp
@@ -56,29 +56,6 @@ def _blend(
     out[i, j] = word
 
 
-@wp.kernel
-def _fill(
-    # in:
-    target: wp.array1d[int],
-    source: wp.array1d[int],
-    bounds: wp.array1d[float],
-    # in and out:
-    out: wp.array1d[wp.uint32],
-):
-    g = wp.tid()
-    to = target[g]
-    come = source[g]
-    word = out[come]
-    a = bounds[come // 16384]
-    b = bounds[to // 16384]
-    if a != b and b > 0.0:
-        filled = wp.lshift(wp.uint32(255), wp.uint32(24))
-        for c in range(3):
-            filled = with_byte(filled, c, byte_at(word, c) / 255.0 * a / b)
-        word = filled
-    out[to] = word
-
-
 def blend(early, late, early_inverse, late_inverse, places, share: float, gamma: float, out) -> None:
     """Mixes two decodes in radiance (neural-dynamic-gi, eq. 2).
 
@@ -92,15 +69,3 @@ def blend(early, late, early_inverse, late_inverse, places, share: float, gamma:
     """
     inputs = [early, late, early_inverse, late_inverse, places, share, gamma]
     wp.launch(_blend, out.shape, inputs=inputs, outputs=[out], device=out.device)
-
-
-def fill(target, source, bounds, out) -> None:
-    """Gives texels in gaps the light of others.
-
-    Args:
-        target: int [G], places in `out` of the texels that are filled.
-        source: int [G], those whose light they take; none is a target.
-        bounds: float [n], of each tile: where two differ, light beyond the target's is cut off.
-        out: uint32 [n * 128 * 128], changed.
-    """
-    wp.launch(_fill, target.shape, inputs=[target, source, bounds], outputs=[out], device=out.device)

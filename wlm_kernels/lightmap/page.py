@@ -1,0 +1,138 @@
+"""A map as one texture of RGB9E5 texels with mips, from tiles that were decoded to 8 bits.
+
+Tiles are uint32 [n, 128 * 128], RGBA from the lowest byte, each with a bound of its own: radiance is
+(byte / 255 * bound) ** gamma. The texture has one scale throughout, so that a filter may cross tiles.
+
+Read first: `wlm.lightmap.page.MapDecoder`.
+"""
+
+import warp as wp
+
+from wlm_kernels.lightmap.output import byte_at
+from wlm_kernels.shared_exponent import pack_rgb9e5, unpack_rgb9e5
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def _place(
+    # in:
+    tiles: wp.array3d[wp.uint32],
+    bounds: wp.array1d[float],
+    gamma: float,
+    corners: wp.array1d[wp.vec2i],
+    # out:
+    page: wp.array2d[wp.uint32],
+):
+    n, i, j = wp.tid()
+    y = corners[n][0] + i
+    x = corners[n][1] + j
+    if y < page.shape[0] and x < page.shape[1]:
+        word = tiles[n, i, j]
+        scale = bounds[n] / 255.0
+        page[y, x] = pack_rgb9e5(
+            wp.vec3(
+                wp.pow(byte_at(word, 0) * scale, gamma),
+                wp.pow(byte_at(word, 1) * scale, gamma),
+                wp.pow(byte_at(word, 2) * scale, gamma),
+            )
+        )
+
+
+@wp.kernel
+def _paint(
+    # in:
+    colours: wp.array1d[wp.vec3],
+    corners: wp.array1d[wp.vec2i],
+    # out:
+    page: wp.array2d[wp.uint32],
+):
+    n, i, j = wp.tid()
+    y = corners[n][0] + i
+    x = corners[n][1] + j
+    if y < page.shape[0] and x < page.shape[1]:
+        page[y, x] = pack_rgb9e5(colours[n])
+
+
+@wp.kernel
+def _halve(
+    # in:
+    fine: wp.array2d[wp.uint32],
+    weight: wp.array2d[float],
+    # out:
+    coarse: wp.array2d[wp.uint32],
+):
+    y, x = wp.tid()
+    # The last texel of an odd side takes three.
+    bottom = wp.where(y == coarse.shape[0] - 1, fine.shape[0], 2 * y + 2)
+    right = wp.where(x == coarse.shape[1] - 1, fine.shape[1], 2 * x + 2)
+    light = wp.vec3()
+    total = float(0.0)
+    for i in range(2 * y, bottom):
+        for j in range(2 * x, right):
+            w = weight[i, j]
+            light += w * unpack_rgb9e5(fine[i, j])
+            total += w
+    if total > 0.0:
+        light = light / total
+    coarse[y, x] = pack_rgb9e5(light)
+
+
+@wp.kernel
+def _fill(
+    # in:
+    target: wp.array1d[wp.vec2i],
+    source: wp.array1d[wp.vec2i],
+    # in and out:
+    page: wp.array2d[wp.uint32],
+):
+    g = wp.tid()
+    page[target[g][0], target[g][1]] = page[source[g][0], source[g][1]]
+
+
+def place(tiles, bounds, gamma: float, corners, page) -> None:
+    """Puts decoded tiles into the texture.
+
+    Args:
+        tiles: uint32 [n, 128, 128], RGBA.
+        bounds: float [n], what 255 stands for in gamma space.
+        gamma: Of the colours.
+        corners: vec2i [n], row and column of each tile's first texel; what lies outside the map is left out.
+        page: uint32 [H, W], changed.
+    """
+    wp.launch(_place, tiles.shape, inputs=[tiles, bounds, gamma, corners], outputs=[page], device=page.device)
+
+
+def paint(colours, corners, side: int, page) -> None:
+    """Puts tiles of one colour each into the texture.
+
+    Args:
+        colours: vec3 [n], radiance.
+        corners: vec2i [n], as of `place`.
+        side: Texels along a tile's side.
+        page: uint32 [H, W], changed.
+    """
+    dim = (len(colours), side, side)
+    wp.launch(_paint, dim, inputs=[colours, corners], outputs=[page], device=page.device)
+
+
+def halve(fine, weight, coarse) -> None:
+    """Makes the next smaller mip: means of two by two texels, by weight.
+
+    Args:
+        fine: uint32 [h, w].
+        weight: float [h, w], of each texel: 0 in gaps.
+        coarse: uint32 [max(h // 2, 1), max(w // 2, 1)], written; 0 where nothing has a weight.
+    """
+    wp.launch(_halve, coarse.shape, inputs=[fine, weight], outputs=[coarse], device=coarse.device)
+
+
+def fill(target, source, page) -> None:
+    """Gives texels in gaps the light of others.
+
+    Args:
+        target: vec2i [G], row and column of the texels that are filled.
+        source: vec2i [G], of those whose light they take; none is a target.
+        page: uint32 [H, W], changed.
+    """
+    wp.launch(_fill, target.shape, inputs=[target, source], outputs=[page], device=page.device)
