@@ -13,6 +13,7 @@ from wlm.formats.dds import DXGI_FORMATS, write_dds
 FLAGS, HEIGHT, WIDTH, PITCH, DEPTH, MIPS = 8, 12, 16, 20, 24, 28
 PIXEL_FLAGS, FOUR_CC, CAPS, CAPS2 = 80, 84, 108, 112
 FORMAT, DIMENSION, MISC, ARRAY, ALPHA = 128, 132, 136, 140, 144
+FOUR_BYTES = "R16G16_FLOAT", "R16G16_UNORM", "R16G16_UINT", "R9G9B9E5_SHAREDEXP"
 
 
 def _blocks(count: int) -> bytes:
@@ -42,6 +43,15 @@ def test_the_header_of_a_picture(tmp_path):
     assert values == [124, 0x81007, 13, 22, 384, 0, 1, 32, 4]
     assert [_field(data, at) for at in (CAPS, CAPS2)] == [0x1000, 0]
     assert [_field(data, at) for at in (FORMAT, DIMENSION, MISC, ARRAY, ALPHA)] == [99, 3, 0, 1, 0]
+
+
+def test_the_header_of_mips(tmp_path):
+    path = tmp_path / "a.dds"
+    texels = np.arange(15 + 3 + 1, dtype="<u4").tobytes()  # 5x3, 2x1, 1x1
+    write_dds(path, texels, width=5, height=3, fmt="R9G9B9E5_SHAREDEXP", mips=2)
+    data = path.read_bytes()
+    assert [_field(data, at) for at in (FLAGS, PITCH, MIPS, CAPS, FORMAT)] == [0x2100F, 20, 3, 0x401008, 67]
+    assert data[148:] == texels
 
 
 def test_the_header_of_a_volume(tmp_path):
@@ -77,7 +87,8 @@ def test_two_bytes_a_texel(tmp_path):
 @pytest.mark.parametrize("depth", [1, 3])
 def test_every_format(tmp_path, fmt, depth):
     path = tmp_path / "a.dds"
-    texel = {"R16G16B16A16_FLOAT": 8, "R16G16_FLOAT": 4, "R16G16_UNORM": 4, "R16G16_UINT": 4, "R8G8_UNORM": 2}.get(fmt)
+    texel = {"R16G16B16A16_FLOAT": 8, "R8G8_UNORM": 2} | dict.fromkeys(FOUR_BYTES, 4)
+    texel = texel.get(fmt)
     blocks = _blocks(10 * depth)[: (5 * 4 * texel if texel else 2 * 16) * depth]
     write_dds(path, blocks, width=5, height=4, depth=depth, fmt=fmt)
     data = path.read_bytes()
