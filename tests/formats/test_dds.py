@@ -47,7 +47,7 @@ def test_the_header_of_a_picture(tmp_path):
 
 def test_the_header_of_mips(tmp_path):
     path = tmp_path / "a.dds"
-    texels = np.arange(15 + 3 + 1, dtype="<u4").tobytes()  # 5x3, 2x1, 1x1
+    texels = np.arange(15 + 2 + 1, dtype="<u4").tobytes()  # 5x3, 2x1, 1x1
     write_dds(path, texels, width=5, height=3, fmt="R9G9B9E5_SHAREDEXP", mips=2)
     data = path.read_bytes()
     assert [_field(data, at) for at in (FLAGS, PITCH, MIPS, CAPS, FORMAT)] == [0x2100F, 20, 3, 0x401008, 67]
