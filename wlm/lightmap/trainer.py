@@ -16,7 +16,7 @@ from wlm.lightmap.model import Profile, TimeAxis, encode_time
 from wlm.lightmap.targets import Targets
 from wlm.lightmap.tiles import TILE
 from wlm.lightmap.weights import put_on_levels
-from wlm_kernels.lightmap import blocks, features, gather
+from wlm_kernels.lightmap import blocks, features, gather, levels
 from wlm_kernels.lightmap import step as lightmap_step
 from wlm_kernels.lightmap.gather import gather_maps, gather_net
 
@@ -178,10 +178,10 @@ class Trainer:
             else (wrap(self._partial, vec), wrap(self._partial_out, wp.vec3), wrap(self._loss_parts))
         )
         # What the kernels read: the networks, or their levels.
-        self._used = self.hidden.detach(), self.output.detach()
-        if self.profile.net_bits == 8:
-            self._used = tuple(torch.empty_like(values) for values in self._used)
-        self._launch_args = (wrap(self._used[0], vec), wrap(self._used[1], wp.vec3))
+        nets = self.hidden.detach(), self.output.detach()
+        on_levels = tuple(torch.empty_like(values) for values in nets)
+        self._nets = [(wrap(values[0], vec), wrap(values[1], wp.vec3)) for values in (nets, on_levels)]
+        self._levels_args = tuple(wrap(values) for values in (*nets, *on_levels))
         self._launch_sums = (wrap(self._acc), *shaped)
         self._maps_sums = (wrap(self._acc), wrap(self.maps), wrap(self.maps_grad))
         self._net_sums = (
@@ -292,17 +292,12 @@ class Trainer:
         finally:
             torch.set_num_threads(threads)
 
-    def _levels(self, quantised: bool) -> tuple[torch.Tensor, torch.Tensor]:
-        """The networks as they are evaluated."""
-        nets = self.hidden.detach(), self.output.detach()
-        return put_on_levels(*nets, self.inputs) if quantised and self.profile.net_bits == 8 else nets
-
     def _step(self, quantised: bool, move_maps: bool) -> None:
         self.batch.quantised = int(quantised)
-        if self.profile.net_bits == 8:
-            for used, values in zip(self._used, self._levels(quantised), strict=True):
-                used.copy_(values)
-        hidden, output = self._launch_args
+        on_levels = quantised and self.profile.net_bits == 8
+        if on_levels:
+            levels.put_on_levels(*self._levels_args)
+        hidden, output = self._nets[on_levels]
         args = (
             self._maps,
             self._offsets,
@@ -354,7 +349,10 @@ class Trainer:
             `net` and `uv`, of dynamic tiles also `uvt`, `ut` and `vt`, as `LightmapModel` has them; `net`
             is `net_static` of static tiles.
         """
-        net = torch.cat([values.flatten(1) for values in self._levels(True)], 1)
+        nets = self.hidden.detach(), self.output.detach()
+        if self.profile.net_bits == 8:
+            nets = put_on_levels(*nets, self.inputs)
+        net = torch.cat([values.flatten(1) for values in nets], 1)
         result = {"net": net.cpu().numpy().astype(np.float16), "uv": self._blocks("uv")}
         if self.temporal:
             uvt = self._blocks("uvt")
