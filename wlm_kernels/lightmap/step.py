@@ -37,7 +37,7 @@ from wlm_kernels.lightmap.matrix_step import fits_matrix_units, matrix_network
 from wlm_kernels.lightmap.reduce import BLOCK, block_reduction, reload
 
 LAUNCH_BOUNDS = (BLOCK, 2)  # two blocks per multiprocessor leave 255 registers per thread: no spills at width 16
-MATRIX_LAUNCH_BOUNDS = (BLOCK, 3)  # as many as shared memory has room for at width 64
+MATRIX_LAUNCH_BOUNDS = (BLOCK, 4)  # as many as shared memory has room for at width 64
 NOISE = wp.constant(1.0 / 256.0)  # alpha of eq. 6: one step of 8 bits
 
 

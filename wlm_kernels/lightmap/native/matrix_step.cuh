@@ -41,6 +41,12 @@ unsigned short *left = both, *right = both + T * STRIDE, *w1 = right;  // w1 whe
 const int t = threadIdx.x, lane = t & 31, warp = t >> 5, first = t & ~31, g = lane >> 2, q = lane & 3;
 // The rows and groups of which a lane gives the address: pieces down and then across, or across and then down.
 const int down = lane & 15, across = lane >> 4, down_after = (lane & 7) + (lane >> 4) * 8, across_first = lane >> 3 & 1;
+// A copy of a number that the compiler doesn't know: what is computed of it, mostly addresses, isn't kept in registers
+// from one use to the next, of which there are too few here.
+const auto fresh = [](int number) {
+    asm volatile("" : "+r"(number));
+    return number;
+};
 const float* w = reinterpret_cast<const float*>(hidden.data) + size_t(n) * (I + H + 2) * H;
 const float* o = reinterpret_cast<const float*>(output.data) + size_t(n) * (H + 1) * 3;
 
@@ -76,6 +82,7 @@ for (int layer = 0; layer < 2; ++layer) {
     unsigned short* to = layer == 0 ? left : right;
     #pragma unroll
     for (int p = 0; p < KT; ++p) {
+        const int at = fresh(lane), g = at >> 2, q = at & 3, down = at & 15, across = at >> 4;
         float s[2][2][4];
         #pragma unroll
         for (int j = 0; j < 2; ++j) {
@@ -125,6 +132,7 @@ for (int layer = 0; layer < 2; ++layer) {
     for (int k = 0; k < KT; ++k) {
         const float* from = o + (16 * k + 2 * q) * 3 + min(g, 2);
         const unsigned low = Units::pack(from[0], from[3]), high = Units::pack(from[24], from[27]);
+        const int at = fresh(lane), down = at & 15, across = at >> 4;
         unsigned a[4];
         #pragma unroll
         for (int m = 0; m < 2; ++m) {
@@ -227,6 +235,7 @@ for (int m = 0; m < 2; ++m)
     }
 #pragma unroll
 for (int p = 0; p < KT; ++p) {
+    const int at = fresh(lane), g = at >> 2, q = at & 3;
     float s[2][2][4] = {};
     #pragma unroll
     for (int j = 0; j < 2; ++j) {
@@ -255,6 +264,7 @@ for (int p = 0; p < KT; ++p) {
 // d1.
 #pragma unroll
 for (int p = 0; p < KT; ++p) {
+    const int at = fresh(lane), down_after = (at & 7) + (at >> 4) * 8, across_first = at >> 3 & 1;
     float s[2][2][4] = {};
     #pragma unroll
     for (int k = 0; k < KT; ++k) {
@@ -320,7 +330,8 @@ for (int layer = 1; layer >= 0; --layer) {
     if (layer == 0) continue;
     load_weights(w1, w, 16, I);
     #pragma unroll
-    for (int p = 0; p < KT; ++p)
+    for (int p = 0; p < KT; ++p) {
+        const int at = fresh(lane), g = at >> 2, q = at & 3;
         #pragma unroll
         for (int m = 0; m < 2; ++m)
             #pragma unroll
@@ -330,6 +341,7 @@ for (int layer = 1; layer >= 0; --layer) {
                     unsigned* d = reinterpret_cast<unsigned*>(left + Place::at(first + 16 * m + 8 * r + g, 2 * p + j));
                     d[q] = Units::scale(d1[m][p][2 * j + r], ratios[m][r]);
                 }
+    }
     __syncthreads();
     #pragma unroll
     for (int p = 0; p < KT; ++p) {
