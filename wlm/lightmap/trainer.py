@@ -15,7 +15,6 @@ from wlm.formats.parts import Part, check_part, check_parts
 from wlm.lightmap.model import Profile, TimeAxis, encode_time
 from wlm.lightmap.targets import Targets
 from wlm.lightmap.tiles import TILE
-from wlm.lightmap.weights import put_on_levels
 from wlm_kernels.lightmap import blocks, features, gather, levels
 from wlm_kernels.lightmap import step as lightmap_step
 from wlm_kernels.lightmap.gather import gather_maps, gather_net, update_maps, update_net
@@ -180,9 +179,9 @@ class Trainer:
         )
         # What the kernels read: the networks, or their levels.
         nets = self.hidden.detach(), self.output.detach()
-        on_levels = tuple(torch.empty_like(values) for values in nets)
-        self._nets = [(wrap(values[0], vec), wrap(values[1], wp.vec3)) for values in (nets, on_levels)]
-        self._levels_args = tuple(wrap(values) for values in (*nets, *on_levels))
+        self._on_levels = tuple(torch.empty_like(values) for values in nets)
+        self._nets = [(wrap(values[0], vec), wrap(values[1], wp.vec3)) for values in (nets, self._on_levels)]
+        self._levels_args = tuple(wrap(values) for values in (*nets, *self._on_levels))
         self._launch_sums = (wrap(self._acc), *shaped)
         net_sums = (
             wrap(self._partial.view(parts, -1)),
@@ -365,7 +364,9 @@ class Trainer:
         """
         nets = self.hidden.detach(), self.output.detach()
         if self.profile.net_bits == 8:
-            nets = put_on_levels(*nets, self.inputs)
+            nets = self._on_levels
+            with interop.stream(self.device):
+                levels.put_on_levels(*self._levels_args)
         net = torch.cat([values.flatten(1) for values in nets], 1)
         result = {"net": net.cpu().numpy().astype(np.float16), "uv": self._blocks("uv")}
         if self.temporal:

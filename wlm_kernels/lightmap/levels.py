@@ -1,9 +1,13 @@
-"""Networks on 8-bit levels in one launch: a step on a GPU would spend as long on forty small ones as on its samples.
+"""Networks on 8-bit levels in one launch: as forty small ones it would be a good part of a step on a GPU.
 
-Read first: `wlm.lightmap.weights`, `put_on_levels`, the same in torch, bit for bit.
+Read first: `tests/reference/levels.py`, the same in torch, bit for bit.
 """
 
 import warp as wp
+
+LEVELS = 127
+
+_MOST = wp.constant(float(LEVELS))
 
 
 @wp.func
@@ -17,11 +21,11 @@ def _column_on_levels(values: wp.array3d[float], n: int, first: int, rows: int, 
     most = float(0.0)
     for i in range(rows):
         most = wp.max(most, wp.abs(values[n, first + i, j]))
-    level = _half(most) / 127.0
+    level = _half(most) / _MOST
     for i in range(rows):
         whole = float(0.0)
         if level > 0.0:
-            whole = wp.clamp(wp.rint(values[n, first + i, j] / level), -127.0, 127.0)
+            whole = wp.clamp(wp.rint(values[n, first + i, j] / level), -_MOST, _MOST)
         out[n, first + i, j] = _half(whole * level)
     out[n, first + rows, j] = values[n, first + rows, j]
 
