@@ -16,3 +16,13 @@ def native_source(package: str, name: str, **constants: int) -> str:
     """
     declarations = (f"constexpr int {key} = {value};\n" for key, value in constants.items())
     return "".join(declarations) + (resources.files(package) / "native" / f"{name}.cuh").read_text(encoding="utf-8")
+
+
+def on_cuda(code: str, otherwise: str) -> str:
+    """A body whose code only a GPU's compiler takes, and another one for the CPU's.
+
+    Args:
+        code: From `native_source`.
+        otherwise: A statement.
+    """
+    return f"#if defined(__CUDA_ARCH__)\n{code}#else\n{otherwise}\n#endif\n"

@@ -8,6 +8,7 @@ import torch
 from builders import small_sets
 from builders.checks import assert_same, error_of
 from builders.synthetic import random_model
+from reference.levels import put_on_levels
 
 import wlm
 from wlm.formats.artifact import read_artifact, write_artifact
@@ -15,7 +16,6 @@ from wlm.formats.bc7 import decode_image
 from wlm.lightmap.decode import Decoder
 from wlm.lightmap.evaluation import part_bytes
 from wlm.lightmap.packing import STREAMS, clear_unused
-from wlm.lightmap.weights import put_on_levels
 
 
 def _mask(seed: int = 0) -> np.ndarray:

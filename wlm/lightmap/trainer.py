@@ -15,12 +15,11 @@ from wlm.formats.parts import Part, check_part, check_parts
 from wlm.lightmap.model import Profile, TimeAxis, encode_time
 from wlm.lightmap.targets import Targets
 from wlm.lightmap.tiles import TILE
-from wlm.lightmap.weights import put_on_levels
-from wlm_kernels.lightmap import blocks, features, gather
+from wlm_kernels.lightmap import blocks, features, gather, levels
 from wlm_kernels.lightmap import step as lightmap_step
-from wlm_kernels.lightmap.gather import gather_maps, gather_net
+from wlm_kernels.lightmap.gather import gather_maps, gather_net, update_maps, update_net
 
-# What a checkpoint keeps: attributes of a trainer, and of each of Adam's parameters.
+# What a checkpoint keeps: attributes of a trainer, and of each of torch's Adam's parameters.
 _STATE = ("maps", "hidden", "output", "loss", "control")
 _ADAM_STATE = ("step", "exp_avg", "exp_avg_sq")
 
@@ -158,14 +157,15 @@ class Trainer:
         self.loss = zeros(n)
         self.control = zeros(1, dtype=torch.int32)
         self._tracked = zeros(lanes if self._track else 0, n, len(self.axis.times), 2)
-        rates = zeros(2)
-        self._rates = rates
-        betas = (_MOMENTUM, self.profile.adam_decay)
-        fused = {"betas": betas, "eps": self.profile.adam_epsilon, "fused": True, "capturable": self._cuda}
-        self._adam_maps = torch.optim.Adam(self._pieces(), lr=rates[0] if self._cuda else 1.0, **fused)
-        self._adam_net = torch.optim.Adam([stored_hidden, stored_output], lr=rates[1] if self._cuda else 1.0, **fused)
-
+        rates = zeros(4)
+        self._rates = rates[:2]
         wrap = interop.to_warp
+        self._moments, self._adams = {}, {}
+        if self._cuda:
+            adams = [self._moments_of(*named) for named in (("maps", self.maps), *self._named_nets())]
+        else:
+            self._adams = self._torch_adams([stored_hidden, stored_output])
+
         vec = self._kernels.net.vec_hidden
         # CUDA stores whole tiles of scalars; the CPU adds whole columns.
         shaped = (
@@ -178,38 +178,49 @@ class Trainer:
             else (wrap(self._partial, vec), wrap(self._partial_out, wp.vec3), wrap(self._loss_parts))
         )
         # What the kernels read: the networks, or their levels.
-        self._used = self.hidden.detach(), self.output.detach()
-        if self.profile.net_bits == 8:
-            self._used = tuple(torch.empty_like(values) for values in self._used)
-        self._launch_args = (wrap(self._used[0], vec), wrap(self._used[1], wp.vec3))
+        nets = self.hidden.detach(), self.output.detach()
+        self._on_levels = tuple(torch.empty_like(values) for values in nets)
+        self._nets = [(wrap(values[0], vec), wrap(values[1], wp.vec3)) for values in (nets, self._on_levels)]
+        self._levels_args = tuple(wrap(values) for values in (*nets, *self._on_levels))
         self._launch_sums = (wrap(self._acc), *shaped)
-        self._maps_sums = (wrap(self._acc), wrap(self.maps), wrap(self.maps_grad))
-        self._net_sums = (
+        net_sums = (
             wrap(self._partial.view(parts, -1)),
             wrap(self._partial_out.view(parts, -1)),
             wrap(self._loss_parts),
         )
-        self._net_outs = (
-            wrap(self.hidden.grad.view(-1)),
-            wrap(self.output.grad.view(-1)),
-            wrap(self.loss),
-            wrap(rates),
-        )
+        net_grads = wrap(self.hidden.grad.view(-1)), wrap(self.output.grad.view(-1))
+        maps = wrap(self.maps), wrap(self.maps_grad)
+        if self._cuda:
+            # What `update_maps` and `update_net` take, to their last arguments.
+            self._maps_update = (wrap(self._acc), adams[0], *maps, wrap(rates))
+            flat = (wrap(values.view(-1)) for values in nets)
+            moved = *adams[1:], *flat, wrap(self.loss), wrap(self.control)
+            self._net_update = (*net_sums, wrap(rates), *moved, *net_grads)
+        else:
+            self._maps_sums = (wrap(self._acc), *maps)
+            self._net_sums, self._net_outs = net_sums, (*net_grads, wrap(self.loss), wrap(self._rates))
 
-    def _pieces(self) -> list[torch.Tensor]:
-        """The maps in pieces, as the optimiser's parameters.
+    def _named_nets(self) -> tuple[tuple[str, torch.Tensor], ...]:
+        return ("hidden", self.hidden), ("output", self.output)
 
-        A fused Adam gives each block of threads 65,536 numbers of one tensor: a single long tensor would leave most of
-        a GPU idle. 36 is as many tensors as one of its launches takes.
-        """
-        pieces = 36 if self._cuda else 1
-        size = -(-self.maps.numel() // pieces)
-        result = []
-        for values, grad in zip(self.maps.split(size), self.maps_grad.split(size), strict=True):
-            piece = values.detach().requires_grad_()
-            piece.grad = grad
-            result.append(piece)
-        return result
+    def _moments_of(self, name: str, values: torch.Tensor) -> gather.Adam:
+        """Adam on a GPU for one array of parameters, with moments of 0."""
+        adam = gather.Adam()
+        adam.decay = wp.vec2(_MOMENTUM, self.profile.adam_decay)
+        adam.epsilon = self.profile.adam_epsilon
+        for key, field in (("exp_avg", "first"), ("exp_avg_sq", "second")):
+            moments = torch.zeros(values.numel(), device=self.device)
+            self._moments[f"adam_{name}.{key}"] = moments
+            setattr(adam, field, interop.to_warp(moments))
+        return adam
+
+    def _torch_adams(self, nets: list[torch.Tensor]) -> dict[str, torch.optim.Adam]:
+        """Adam on the CPU: torch's."""
+        maps = self.maps.detach().requires_grad_()
+        maps.grad = self.maps_grad
+        betas = (_MOMENTUM, self.profile.adam_decay)
+        options = {"lr": 1.0, "betas": betas, "eps": self.profile.adam_epsilon, "fused": True}
+        return {"adam_maps": torch.optim.Adam([maps], **options), "adam_net": torch.optim.Adam(nets, **options)}
 
     def _upload(self, targets: Targets, seed: int) -> None:
         tau, encoding = encode_time(self.axis)
@@ -243,10 +254,13 @@ class Trainer:
         self.batch = batch
 
     def _rates_over_steps(self) -> wp.array:
+        """The schedule as `gather.update_maps` takes it."""
         p = self.profile
         share = np.linspace(0.0, 1.0, p.steps)
         values = p.final_rate + (1.0 - p.final_rate) * 0.5 * (1.0 + np.cos(np.pi * share))
-        return wp.array(values.astype(np.float32), dtype=float, device=self.device)
+        done = np.arange(1, p.steps + 1)
+        corrections = 1.0 - _MOMENTUM**done, np.sqrt(1.0 - p.adam_decay**done)
+        return wp.array(np.stack([values, *corrections], 1).astype(np.float32), dtype=wp.vec3, device=self.device)
 
     def _draw(self, seed: int) -> None:
         """Draws the initial parameters; each tile has its own generator, so that it is the same in any batch."""
@@ -292,17 +306,12 @@ class Trainer:
         finally:
             torch.set_num_threads(threads)
 
-    def _levels(self, quantised: bool) -> tuple[torch.Tensor, torch.Tensor]:
-        """The networks as they are evaluated."""
-        nets = self.hidden.detach(), self.output.detach()
-        return put_on_levels(*nets, self.inputs) if quantised and self.profile.net_bits == 8 else nets
-
     def _step(self, quantised: bool, move_maps: bool) -> None:
         self.batch.quantised = int(quantised)
-        if self.profile.net_bits == 8:
-            for used, values in zip(self._used, self._levels(quantised), strict=True):
-                used.copy_(values)
-        hidden, output = self._launch_args
+        on_levels = quantised and self.profile.net_bits == 8
+        if on_levels:
+            levels.put_on_levels(*self._levels_args)
+        hidden, output = self._nets[on_levels]
         args = (
             self._maps,
             self._offsets,
@@ -312,23 +321,22 @@ class Trainer:
             self.profile.samples,
             *self._launch_sums,
         )
+        rates = (self.profile.map_rate, self.profile.net_rate)
         if self._cuda:
             self._kernels.launch(*args)
-            gather_maps(*self._maps_sums)
-        else:
-            span = self.profile.samples // CPU_LANES
-            self._share(lambda lane: self._kernels.launch(*args, lane * span, span))
-            part = -(-self.maps.numel() // CPU_LANES)
-            counts = [min(part, self.maps.numel() - lane * part) for lane in range(CPU_LANES)]
-            self._share(lambda lane: gather_maps(*self._maps_sums, lane * part, counts[lane]))
-        rates = (self.profile.map_rate, self.profile.net_rate)
+            update_maps(self._schedule, rates, self.batch.control, move_maps, *self._maps_update)
+            update_net(*self._net_update)
+            return
+        span = self.profile.samples // CPU_LANES
+        self._share(lambda lane: self._kernels.launch(*args, lane * span, span))
+        part = -(-self.maps.numel() // CPU_LANES)
+        counts = [min(part, self.maps.numel() - lane * part) for lane in range(CPU_LANES)]
+        self._share(lambda lane: gather_maps(*self._maps_sums, lane * part, counts[lane]))
         gather_net(*self._net_sums, self._schedule, rates, self.batch.control, *self._net_outs)
-        if not self._cuda:
-            self._adam_maps.param_groups[0]["lr"] = float(self._rates[0])
-            self._adam_net.param_groups[0]["lr"] = float(self._rates[1])
-        if move_maps:
-            self._adam_maps.step()
-        self._adam_net.step()
+        for (name, adam), rate in zip(self._adams.items(), self._rates, strict=True):
+            adam.param_groups[0]["lr"] = float(rate)
+            if move_maps or name != "adam_maps":
+                adam.step()
 
     def _share(self, work: Callable[[int], None]) -> None:
         """Runs `work(lane)` for each lane on the CPU's threads; a launch releases the interpreter's lock."""
@@ -354,7 +362,12 @@ class Trainer:
             `net` and `uv`, of dynamic tiles also `uvt`, `ut` and `vt`, as `LightmapModel` has them; `net`
             is `net_static` of static tiles.
         """
-        net = torch.cat([values.flatten(1) for values in self._levels(True)], 1)
+        nets = self.hidden.detach(), self.output.detach()
+        if self.profile.net_bits == 8:
+            nets = self._on_levels
+            with interop.stream(self.device):
+                levels.put_on_levels(*self._levels_args)
+        net = torch.cat([values.flatten(1) for values in nets], 1)
         result = {"net": net.cpu().numpy().astype(np.float16), "uv": self._blocks("uv")}
         if self.temporal:
             uvt = self._blocks("uvt")
@@ -375,9 +388,6 @@ class Trainer:
         # Texels [S, H, W] -> blocks [S, H/4, W/4, 16], row-major in the block.
         index = index.numpy().reshape(s, h // 4, 4, w // 4, 4).swapaxes(2, 3).reshape(s, h // 4, w // 4, 16)
         return pack_mode6(levels.numpy(), index)
-
-    def _adams(self) -> tuple[tuple[str, torch.optim.Adam], ...]:
-        return ("adam_maps", self._adam_maps), ("adam_net", self._adam_net)
 
     def check(self) -> None:
         """Holds that the fit is sound.
@@ -401,8 +411,8 @@ class Trainer:
             WlmError: As `check`.
         """
         self.check()
-        result = {key: getattr(self, key) for key in _STATE}
-        for name, adam in self._adams():
+        result = {key: getattr(self, key) for key in _STATE} | self._moments
+        for name, adam in self._adams.items():
             for i, values in enumerate(adam.state.values()):
                 result |= {f"{name}.{i}.{key}": values[key] for key in _ADAM_STATE}
         # Copies, and numbers stay without a dimension.
@@ -412,7 +422,9 @@ class Trainer:
         """The parts of a `state` after so many steps."""
         table = {key: Part(np.float32, tuple(getattr(self, key).shape)) for key in _STATE}
         table["control"] = Part(np.int32, (1,), least=step, most=step)
-        for name, adam in self._adams():
+        for key, values in self._moments.items():
+            table[key] = Part(np.float32, tuple(values.shape), least=0.0 if key.endswith("_sq") else None)
+        for name, adam in self._adams.items():
             # Maps that are frozen from the start have no optimiser.
             if step == 0 or (name == "adam_maps" and self.stage(0) == 2):
                 continue
@@ -437,7 +449,9 @@ class Trainer:
         with interop.stream(self.device), torch.no_grad():
             for key in _STATE:
                 getattr(self, key).copy_(values[key])
-            for name, adam in self._adams():
+            for key, moments in self._moments.items():
+                moments.copy_(values[key])
+            for name, adam in self._adams.items():
                 for i, parameter in enumerate(adam.param_groups[0]["params"]):
                     if f"{name}.{i}.step" in values:
                         adam.state[parameter] = {key: values[f"{name}.{i}.{key}"] for key in _ADAM_STATE}

@@ -24,9 +24,87 @@ def corner_weights(first: int, second: int, f: float, block: int) -> wp.vec2:
     return wp.vec2(a, b)
 
 
+_Spread = wp.types.vector(8, float)
+
+# A warp's lanes add their samples' numbers together, so that neighbours in memory are added at once: 8 lanes the
+# endpoints of one sample's block, then of the next one's. One lane for each sample would take as many requests to
+# memory as numbers, and those were most of a step.
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    const int own = threadIdx.x & 31;
+    wp::vec_t<8, float> mine;
+    #pragma unroll
+    for (int r = 0; r < 8; ++r) {
+        float of[4];
+        #pragma unroll
+        for (int c = 0; c < 4; ++c) of[c] = __shfl_sync(0xffffffffu, g.c[c], 4 * r + (own >> 3));
+        mine.c[r] = own & 2 ? (own & 1 ? of[3] : of[2]) : (own & 1 ? of[1] : of[0]);
+    }
+    return mine;
+#else
+    return wp::vec_t<8, float>();
+#endif
+""")
+def _spread_texels(g: wp.vec4) -> _Spread:
+    """Channel l % 4 of the samples of lanes 4 r + l / 8, for lane l."""
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    const int own = threadIdx.x & 31;
+    const unsigned any = __ballot_sync(0xffffffffu, at >= 0);
+    #pragma unroll
+    for (int r = 0; r < 8; ++r) {
+        if ((any >> (4 * r) & 15u) == 0u) continue;
+        const int from = 4 * r + (own >> 3), to = __shfl_sync(0xffffffffu, at, from);
+        const float first = __shfl_sync(0xffffffffu, a, from), second = __shfl_sync(0xffffffffu, b, from);
+        const long long steps = static_cast<long long>((own & 4 ? second : first) * g.c[r] * 1099511627776.0f);
+        if (to >= 0)
+            atomicAdd(reinterpret_cast<unsigned long long*>(acc.data + to + (own & 7)),
+                      static_cast<unsigned long long>(steps));
+    }
+#endif
+""")
+def _add_endpoints(acc: wp.array2d[wp.int64], lane: int, at: int, a: float, b: float, g: _Spread):
+    """Adds a g to 4 sums from `at` on and b g to the next 4, if `at` isn't negative; all lanes of a warp call it."""
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    const int own = threadIdx.x & 31;
+    #pragma unroll
+    for (int r = 0; r < 4; ++r) {
+        const int from = 8 * r + (own >> 2);
+        float of[4];
+        #pragma unroll
+        for (int c = 0; c < 4; ++c) of[c] = __shfl_sync(0xffffffffu, v.c[c], from);
+        const float mine = own & 2 ? (own & 1 ? of[3] : of[2]) : (own & 1 ? of[1] : of[0]);
+        #pragma unroll
+        for (int k = 0; k < 2; ++k) {
+            const int low = __shfl_sync(0xffffffffu, k == 0 ? early.c[0] : late.c[0], from);
+            const int high = __shfl_sync(0xffffffffu, k == 0 ? early.c[1] : late.c[1], from);
+            const float share = __shfl_sync(0xffffffffu, k == 0 ? 1.0f - ft : ft, from);
+            const long long steps = static_cast<long long>(share * mine * 1099511627776.0f);
+            atomicAdd(reinterpret_cast<unsigned long long*>(acc.data + (own & 2 ? high : low) + (own & 1)),
+                      static_cast<unsigned long long>(steps));
+        }
+    }
+#endif
+""")
+def _add_cells(acc: wp.array2d[wp.int64], early: wp.vec2i, late: wp.vec2i, ft: float, v: wp.vec4):
+    """Adds two numbers to each of two cells of a row and two of the next; all lanes of a warp call it."""
+
+
+@wp.func
+def _spread_none(g: wp.vec4) -> wp.vec4:
+    return g
+
+
 @functools.cache
-def _adders(device_kind: str) -> tuple[Any, Any]:
-    """The function that adds a number to a sum, and the sum's type."""
+def _adders(device_kind: str) -> tuple[Any, ...]:
+    """How numbers are added to sums: one number, the sums' type, a block's endpoints, and what these take for g."""
     if device_kind == "cuda":
         # Fixed point with steps of 2^-40, about 1e-12; a sum beyond 8e6 would overflow.
 
@@ -34,13 +112,20 @@ def _adders(device_kind: str) -> tuple[Any, Any]:
         def add(acc: wp.array2d[wp.int64], lane: int, i: int, value: float):
             wp.atomic_add(acc, lane, i, wp.int64(value * 1099511627776.0))
 
-        return add, wp.int64
+        return add, wp.int64, _add_endpoints, _spread_texels
 
     @wp.func
     def add(acc: wp.array2d[float], lane: int, i: int, value: float):
         acc[lane, i] += value
 
-    return add, float
+    @wp.func
+    def add_endpoints(acc: wp.array2d[float], lane: int, at: int, a: float, b: float, g: wp.vec4):
+        if at >= 0:
+            for c in range(4):
+                add(acc, lane, at + c, a * g[c])
+                add(acc, lane, at + 4 + c, b * g[c])
+
+    return add, float, add_endpoints, _spread_none
 
 
 @functools.cache
@@ -53,13 +138,7 @@ def scatters(device_kind: str) -> tuple[Any, Any, Any, Any]:
     Returns:
         Three `wp.func`s and the scalar type of the sums that they add to.
     """
-    add, scalar = _adders(device_kind)
-
-    @wp.func
-    def add_endpoints(acc: wp.array2d[scalar], lane: int, at: int, a: float, b: float, g: wp.vec4):
-        for c in range(4):
-            add(acc, lane, at + c, a * g[c])
-            add(acc, lane, at + 4 + c, b * g[c])
+    add, scalar, add_endpoints, spread = _adders(device_kind)
 
     @wp.func
     def scatter_texel(
@@ -80,7 +159,7 @@ def scatters(device_kind: str) -> tuple[Any, Any, Any, Any]:
         w = ste_weight(maps.uv_weights[n, y, x], quantised)
         add(acc, lane, offsets.uv_weights + (n * height + y) * width + x, wp.dot(e1 - e0, g))
         block = (n * (height // 4) + y // 4) * (width // 4) + x // 4
-        add_endpoints(acc, lane, offsets.uv_endpoints + block * 8, 1.0 - w, w, g)
+        add_endpoints(acc, lane, offsets.uv_endpoints + block * 8, 1.0 - w, w, spread(g))
 
     @wp.func
     def scatter_volume(
@@ -109,6 +188,7 @@ def scatters(device_kind: str) -> tuple[Any, Any, Any, Any]:
         xb = axis_index(x + 1, width, 0)
         ya = axis_index(y, height, 0)
         yb = axis_index(y + 1, height, 0)
+        parts = spread(g)
         two = int(2)  # rolled, as in volume_at
         four = int(4)
         for k in range(two):
@@ -117,60 +197,82 @@ def scatters(device_kind: str) -> tuple[Any, Any, Any, Any]:
             # The four corners of a slice lie in one to four blocks: endpoints get one sum per block, not per corner.
             for j in range(two):
                 by = wp.where(j == 0, ya // 4, yb // 4)
-                if j == 0 or by != ya // 4:
-                    cy = corner_weights(ya, yb, fy, by) * ct
-                    for i in range(two):
-                        bx = wp.where(i == 0, xa // 4, xb // 4)
-                        if i == 0 or bx != xa // 4:
-                            cx = corner_weights(xa, xb, fx, bx)
-                            e0 = ste_endpoint(maps.uvt_endpoints[s, by, bx, 0], quantised)
-                            e1 = ste_endpoint(maps.uvt_endpoints[s, by, bx, 1], quantised)
-                            along = wp.dot(e1 - e0, g)
-                            first = float(0.0)
-                            second = float(0.0)
-                            for q in range(four):
-                                c = cy[q // 2] * cx[q % 2]
-                                if c != 0.0:
-                                    yy = wp.where(q // 2 == 0, ya, yb)
-                                    xx = wp.where(q % 2 == 0, xa, xb)
-                                    w = ste_weight(maps.uvt_weights[s, yy, xx], quantised)
-                                    first += c * (1.0 - w)
-                                    second += c * w
-                                    add(
-                                        acc,
-                                        lane,
-                                        offsets.uvt_weights + (s * height + yy) * width + xx,
-                                        c * along,
-                                    )
-                            block = (s * (height // 4) + by) * (width // 4) + bx
-                            add_endpoints(acc, lane, offsets.uvt_endpoints + block * 8, first, second, g)
+                for i in range(two):
+                    bx = wp.where(i == 0, xa // 4, xb // 4)
+                    at = int(-1)
+                    first = float(0.0)
+                    second = float(0.0)
+                    if (j == 0 or by != ya // 4) and (i == 0 or bx != xa // 4):
+                        cy = corner_weights(ya, yb, fy, by) * ct
+                        cx = corner_weights(xa, xb, fx, bx)
+                        e0 = ste_endpoint(maps.uvt_endpoints[s, by, bx, 0], quantised)
+                        e1 = ste_endpoint(maps.uvt_endpoints[s, by, bx, 1], quantised)
+                        along = wp.dot(e1 - e0, g)
+                        for q in range(four):
+                            c = cy[q // 2] * cx[q % 2]
+                            if c != 0.0:
+                                yy = wp.where(q // 2 == 0, ya, yb)
+                                xx = wp.where(q % 2 == 0, xa, xb)
+                                w = ste_weight(maps.uvt_weights[s, yy, xx], quantised)
+                                first += c * (1.0 - w)
+                                second += c * w
+                                add(acc, lane, offsets.uvt_weights + (s * height + yy) * width + xx, c * along)
+                        at = offsets.uvt_endpoints + ((s * (height // 4) + by) * (width // 4) + bx) * 8
+                    add_endpoints(acc, lane, at, first, second, parts)
 
-    @wp.func
-    def scatter_plane(
-        acc: wp.array2d[scalar],
-        lane: int,
-        offset: int,
-        rows: int,
-        columns: int,
-        n: int,
-        p: float,
-        tau: float,
-        periodic: int,
-        g: wp.vec2,
-    ):
-        x = cell(p, columns)
-        t = cell(tau, rows)
-        fx = fraction(p, columns)
-        ft = fraction(tau, rows)
-        two = int(2)
-        for k in range(two):
-            tt = axis_index(t + k, rows, periodic)
-            ct = wp.where(k == 0, 1.0 - ft, ft)
-            for i in range(two):
-                xx = axis_index(x + i, columns, 0)
-                c = ct * wp.where(i == 0, 1.0 - fx, fx)
-                at = offset + ((n * rows + tt) * columns + xx) * 2
-                add(acc, lane, at, c * g[0])
-                add(acc, lane, at + 1, c * g[1])
+    if device_kind == "cuda":
+
+        @wp.func
+        def scatter_plane(
+            acc: wp.array2d[scalar],
+            lane: int,
+            offset: int,
+            rows: int,
+            columns: int,
+            n: int,
+            p: float,
+            tau: float,
+            periodic: int,
+            g: wp.vec2,
+        ):
+            x = cell(p, columns)
+            t = cell(tau, rows)
+            fx = fraction(p, columns)
+            cells = wp.vec2i(axis_index(x, columns, 0), axis_index(x + 1, columns, 0))
+            at = wp.vec2i(offset) + 2 * cells
+            early = wp.vec2i((n * rows + axis_index(t, rows, periodic)) * columns * 2)
+            late = wp.vec2i((n * rows + axis_index(t + 1, rows, periodic)) * columns * 2)
+            v = wp.vec4((1.0 - fx) * g[0], (1.0 - fx) * g[1], fx * g[0], fx * g[1])
+            _add_cells(acc, at + early, at + late, fraction(tau, rows), v)
+
+    else:
+
+        @wp.func
+        def scatter_plane(
+            acc: wp.array2d[scalar],
+            lane: int,
+            offset: int,
+            rows: int,
+            columns: int,
+            n: int,
+            p: float,
+            tau: float,
+            periodic: int,
+            g: wp.vec2,
+        ):
+            x = cell(p, columns)
+            t = cell(tau, rows)
+            fx = fraction(p, columns)
+            ft = fraction(tau, rows)
+            two = int(2)
+            for k in range(two):
+                tt = axis_index(t + k, rows, periodic)
+                ct = wp.where(k == 0, 1.0 - ft, ft)
+                for i in range(two):
+                    xx = axis_index(x + i, columns, 0)
+                    c = ct * wp.where(i == 0, 1.0 - fx, fx)
+                    at = offset + ((n * rows + tt) * columns + xx) * 2
+                    add(acc, lane, at, c * g[0])
+                    add(acc, lane, at + 1, c * g[1])
 
     return scatter_texel, scatter_volume, scatter_plane, scalar

@@ -1,4 +1,7 @@
-"""Turns the sums of `step` into gradients, and advances the schedule.
+"""Turns the sums of `step` into gradients, and advances the schedule; on a GPU it also moves the parameters.
+
+There Adam is ours, in the launches that sum the gradients: torch's fused one reads and writes them once more, and gives
+each block of threads 65,536 numbers, with which a network would keep one multiprocessor busy.
 
 Read first: `kernels/stepping.py` in the tests, which reads these gradients and holds them to autograd's.
 """
@@ -31,18 +34,95 @@ def _gather_maps_cpu(
     parameters[i] = wp.clamp(parameters[i], 0.0, 1.0)
 
 
+@wp.struct
+class Adam:
+    """Adam's settings and moments of one array of parameters."""
+
+    decay: wp.vec2  # of the gradients and of their squares
+    epsilon: float
+    first: wp.array1d[float]
+    second: wp.array1d[float]
+
+
+@wp.func
+def moved(adam: Adam, i: int, value: float, grad: float, rate: float, corrections: wp.vec2) -> float:
+    """A parameter after a step. `corrections`: 1 - decay^t of the gradients, and its root of their squares."""
+    first = adam.decay[0] * adam.first[i] + (1.0 - adam.decay[0]) * grad
+    second = adam.decay[1] * adam.second[i] + (1.0 - adam.decay[1]) * grad * grad
+    adam.first[i] = first
+    adam.second[i] = second
+    return value - rate / corrections[0] * first / (wp.sqrt(second) / corrections[1] + adam.epsilon)
+
+
 @wp.kernel(enable_backward=False)
-def _gather_maps_cuda(
+def _update_maps(
+    # in:
+    schedule: wp.array1d[wp.vec3],
+    first_rates: wp.vec2,
+    control: wp.array1d[int],
+    move: int,
     # in and out:
     acc: wp.array2d[wp.int64],
+    adam: Adam,
     parameters: wp.array1d[float],
     # out:
     grad: wp.array1d[float],
+    rates: wp.array1d[float],
 ):
     i = wp.tid()
-    grad[i] = float(acc[0, i]) * 9.094947017729282e-13  # steps of 2^-40, as `adjoint` adds them
+    now = schedule[wp.min(control[0], schedule.shape[0] - 1)]
+    g = float(acc[0, i]) * 9.094947017729282e-13  # steps of 2^-40, as `adjoint` adds them
     acc[0, i] = wp.int64(0)
-    parameters[i] = wp.clamp(parameters[i], 0.0, 1.0)
+    grad[i] = g
+    value = wp.clamp(parameters[i], 0.0, 1.0)
+    if move != 0:
+        value = moved(adam, i, value, g, now[0] * first_rates[0], wp.vec2(now[1], now[2]))
+    parameters[i] = value
+    if i == 0:
+        rates[0] = now[0] * first_rates[0]
+        rates[1] = now[0] * first_rates[1]
+        rates[2] = now[1]
+        rates[3] = now[2]
+
+
+@wp.func
+def toward(mean: float, value: float) -> float:
+    """A running mean over about 50 steps."""
+    return mean + (value - mean) * 0.02
+
+
+@wp.kernel(enable_backward=False)
+def _update_net(
+    # in:
+    partial: wp.array2d[float],
+    partial_out: wp.array2d[float],
+    loss: wp.array2d[float],
+    rates: wp.array1d[float],
+    # in and out:
+    adam: Adam,
+    adam_out: Adam,
+    hidden: wp.array1d[float],
+    output: wp.array1d[float],
+    mean_loss: wp.array1d[float],
+    control: wp.array1d[int],
+    # out:
+    grad: wp.array1d[float],
+    grad_out: wp.array1d[float],
+):
+    i = wp.tid()
+    corrections = wp.vec2(rates[2], rates[3])
+    if i < grad.shape[0]:
+        g = drain(partial, i, 0)
+        grad[i] = g
+        hidden[i] = moved(adam, i, hidden[i], g, rates[1], corrections)
+    if i < grad_out.shape[0]:
+        g_out = drain(partial_out, i, 0)
+        grad_out[i] = g_out
+        output[i] = moved(adam_out, i, output[i], g_out, rates[1], corrections)
+    if i < mean_loss.shape[0]:
+        mean_loss[i] = toward(mean_loss[i], drain(loss, i, 0))
+    if i == 0:
+        control[0] = control[0] + 1
 
 
 @wp.kernel(enable_backward=False)
@@ -51,8 +131,7 @@ def _gather_net(
     partial: wp.array2d[float],
     partial_out: wp.array2d[float],
     loss: wp.array2d[float],
-    clear: int,
-    schedule: wp.array1d[float],
+    schedule: wp.array1d[wp.vec3],
     first_rates: wp.vec2,
     control: wp.array1d[int],
     # out:
@@ -63,34 +142,29 @@ def _gather_net(
 ):
     i = wp.tid()
     if i < grad.shape[0]:
-        grad[i] = drain(partial, i, clear)
+        grad[i] = drain(partial, i, 1)
     if i < grad_out.shape[0]:
-        grad_out[i] = drain(partial_out, i, clear)
+        grad_out[i] = drain(partial_out, i, 1)
     if i < mean_loss.shape[0]:
-        s = drain(loss, i, clear)
-        mean_loss[i] = mean_loss[i] + (s - mean_loss[i]) * 0.02  # a running mean over about 50 steps
+        mean_loss[i] = toward(mean_loss[i], drain(loss, i, 1))
     if i == 0:
-        share = schedule[wp.min(control[0], schedule.shape[0] - 1)]
+        share = schedule[wp.min(control[0], schedule.shape[0] - 1)][0]
         rates[0] = share * first_rates[0]
         rates[1] = share * first_rates[1]
         control[0] = control[0] + 1
 
 
 def gather_maps(acc: wp.array, parameters: wp.array, grad: wp.array, base: int = 0, count: int | None = None) -> None:
-    """Turns the maps' sums that `StepKernels.launch` left into gradients, and clears them.
+    """Turns the maps' sums that `StepKernels.launch` left on the CPU into gradients, and clears them.
 
     Args:
-        acc: [lanes, M], the sums; cleared.
+        acc: float [lanes, M], the sums; cleared.
         parameters: float [M], the maps; clamped to [0, 1].
         grad: float [M], written.
-        base, count: On the CPU, the range that this launch takes; default all.
+        base, count: The range that this launch takes; default all.
     """
-    device = parameters.device
-    if device.is_cpu:
-        dim = parameters.shape[0] - base if count is None else count
-        wp.launch(_gather_maps_cpu, dim, inputs=[acc, parameters, base], outputs=[grad], device=device)
-    else:
-        wp.launch(_gather_maps_cuda, parameters.shape, inputs=[acc, parameters], outputs=[grad], device=device)
+    dim = parameters.shape[0] - base if count is None else count
+    wp.launch(_gather_maps_cpu, dim, inputs=[acc, parameters, base], outputs=[grad], device=parameters.device)
 
 
 def gather_net(
@@ -105,22 +179,88 @@ def gather_net(
     mean_loss: wp.array,
     rates: wp.array,
 ) -> None:
-    """Turns the networks' sums into gradients, and advances the schedule by one step.
+    """Turns the networks' sums on the CPU into gradients, and advances the schedule by one step.
 
     Args:
-        partial, partial_out, loss: The networks' sums as float [P, ...]; cleared on the CPU.
-        schedule: float [steps], fraction of the initial learning rates at each step.
+        partial, partial_out, loss: The networks' sums as float [P, ...]; cleared.
+        schedule: vec3 [steps], of which the first is the fraction of the initial learning rates at each step.
         first_rates: The initial learning rates of the maps and of the networks.
         control: int [1], the step; increased.
         grad, grad_out: float, the networks' gradients, written.
         mean_loss: float [N], running mean of each tile's loss, updated.
         rates: float [2], the learning rates of this step, written.
     """
-    device = partial.device
     wp.launch(
         _gather_net,
         max(grad.shape[0], grad_out.shape[0], mean_loss.shape[0]),
-        inputs=[partial, partial_out, loss, int(device.is_cpu), schedule, wp.vec2(*first_rates), control],
+        inputs=[partial, partial_out, loss, schedule, wp.vec2(*first_rates), control],
         outputs=[grad, grad_out, mean_loss, rates],
-        device=device,
+        device=partial.device,
+    )
+
+
+def update_maps(
+    schedule: wp.array,
+    first_rates: tuple[float, float],
+    control: wp.array,
+    move: bool,
+    acc: wp.array,
+    adam: Adam,
+    parameters: wp.array,
+    grad: wp.array,
+    rates: wp.array,
+) -> None:
+    """Turns the maps' integer sums into gradients, clears them and moves the maps; begins a step's update.
+
+    Args:
+        schedule: vec3 [steps]: the fraction of the initial learning rates, and Adam's corrections, see `moved`.
+        first_rates: The initial learning rates of the maps and of the networks.
+        control: int [1], the step.
+        move: Whether the maps move; they are clamped in any case.
+        acc: int64 [1, M], the sums; cleared.
+        adam: Updated.
+        parameters: float [M], the maps; clamped to [0, 1], then moved.
+        grad: float [M], written.
+        rates: float [4], the learning rates and the corrections of this step, written.
+    """
+    wp.launch(
+        _update_maps,
+        parameters.shape,
+        inputs=[schedule, wp.vec2(*first_rates), control, int(move), acc, adam, parameters],
+        outputs=[grad, rates],
+        device=parameters.device,
+    )
+
+
+def update_net(
+    partial: wp.array,
+    partial_out: wp.array,
+    loss: wp.array,
+    rates: wp.array,
+    adam: Adam,
+    adam_out: Adam,
+    hidden: wp.array,
+    output: wp.array,
+    mean_loss: wp.array,
+    control: wp.array,
+    grad: wp.array,
+    grad_out: wp.array,
+) -> None:
+    """Turns the networks' sums into gradients and moves the networks; ends a step's update.
+
+    Args:
+        partial, partial_out, loss: The networks' sums as float [P, ...].
+        rates: As `update_maps` wrote them.
+        adam, adam_out: Updated.
+        hidden, output: float, the networks, moved.
+        mean_loss: float [N], running mean of each tile's loss, updated.
+        control: int [1], the step; increased.
+        grad, grad_out: float, the networks' gradients, written.
+    """
+    wp.launch(
+        _update_net,
+        max(grad.shape[0], grad_out.shape[0], mean_loss.shape[0]),
+        inputs=[partial, partial_out, loss, rates, adam, adam_out, hidden, output, mean_loss, control],
+        outputs=[grad, grad_out],
+        device=partial.device,
     )

@@ -23,7 +23,7 @@ from wlm_kernels.lightmap.decode import (
     stored_plane_at,
 )
 from wlm_kernels.lightmap.features import CENTRE, TEMPORAL_INPUTS
-from wlm_kernels.native import native_source
+from wlm_kernels.native import native_source, on_cuda
 
 ROWS = 8
 """Texels that a thread decodes."""
@@ -109,7 +109,9 @@ def matrix_kernels(hidden: int) -> MatrixKernels:
     vec_in, vec_hidden = wp.types.vector(TEMPORAL_INPUTS, float), wp.types.vector(hidden, float)
     constants = {"H": hidden, "NT": hidden // 8, "KT": hidden // _STEP}
 
-    @wp.func_native(native_source(__package__, "matrix_forward", **constants))
+    code = native_source(__package__, "matrix_units") + native_source(__package__, "matrix_forward", **constants)
+
+    @wp.func_native(on_cuda(code, "return wp::vec_t<3, float>();"))
     def forward(
         hidden: wp.array2d[vec_hidden], output: wp.array2d[wp.vec3], n: int, fresh: int, f: vec_in
     ) -> wp.vec3: ...

@@ -33,9 +33,11 @@ from wlm_kernels.lightmap.features import (
     track_error,
     volume_at,
 )
+from wlm_kernels.lightmap.matrix_step import fits_matrix_units, matrix_network
 from wlm_kernels.lightmap.reduce import BLOCK, block_reduction, reload
 
 LAUNCH_BOUNDS = (BLOCK, 2)  # two blocks per multiprocessor leave 255 registers per thread: no spills at width 16
+MATRIX_LAUNCH_BOUNDS = (BLOCK, 4)  # as many as shared memory has room for at width 64
 NOISE = wp.constant(1.0 / 256.0)  # alpha of eq. 6: one step of 8 bits
 
 
@@ -291,6 +293,41 @@ def step_kernels(temporal: bool, hidden: int, gelu: str, device_kind: str) -> St
             partial[lane, n, wp.static(columns_2 + units)] += p.d2
             partial_out[lane, n, wp.static(units)] += p.d3
             scatter(acc, lane, offsets, maps, batch, n, sample, back_input(hidden, n, p.d1))
+
+    elif fits_matrix_units(inputs, hidden):
+        network = matrix_network(inputs, hidden, gelu)
+
+        @wp.kernel(module="unique", module_options=options, launch_bounds=MATRIX_LAUNCH_BOUNDS)
+        def step(
+            # in:
+            maps: Maps,
+            offsets: Offsets,
+            hidden: wp.array2d[vec_hidden],
+            output: wp.array2d[wp.vec3],
+            batch: Batch,
+            samples: int,
+            base: int,
+            # out:
+            acc: wp.array2d[scalar],
+            partial: wp.array2d[float],
+            partial_out: wp.array2d[float],
+            loss: wp.array1d[float],
+        ):
+            n, b = wp.tid()
+            sample = draw_sample(batch, n, b, samples)
+            k = sample.k
+            f = features(maps, batch, n, sample.flat // 128, sample.flat % 128, k, sample.state)
+            target = batch.targets[n, k, sample.flat]
+            weight = texel_weight(batch, n, k, target)
+            row = (b // wp.static(BLOCK)) * hidden.shape[0] + n
+            share = 1.0 / (3.0 * float(samples))
+            r = network(hidden, output, n, f, target, weight, share, row, partial, partial_out, loss)
+            error = wp.vec3(r[wp.static(inputs)], r[wp.static(inputs + 1)], r[wp.static(inputs + 2)])
+            track_error(batch, 0, n, k, target, error)
+            g = vec_in()
+            for c in range(wp.static(inputs)):
+                g[c] = r[c]
+            scatter(acc, 0, offsets, maps, batch, n, sample, g)
 
     else:
         reduce = block_reduction(net)

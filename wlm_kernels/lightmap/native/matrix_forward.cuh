@@ -4,27 +4,17 @@
 // Native, since Warp's tiles go through shared memory between layers: here the sums of one layer are, rounded to halves,
 // the operand of the next one as they lie in the registers (mma.m16n8k16, PTX ISA, "matrix fragments").
 //
-// The body of the function `forward` of wlm_kernels/lightmap/matrix_decode.py, which defines its arguments and:
+// The body of the function `forward` of wlm_kernels/lightmap/matrix_decode.py, behind `matrix_units.cuh`. The function
+// defines its arguments, and:
 //   H          hidden width, a multiple of 16
 //   NT, KT     columns of 8 units, and steps of 16, in a layer
 // A block has 128 threads, all of one network; `fresh` is not 0 in its first call, which loads the weights.
 
-#if defined(__CUDA_ARCH__)
-struct Half2 {
-    static __device__ unsigned pack(float low, float high) {
-        unsigned word;
-        asm("cvt.rn.f16x2.f32 %0, %1, %2;" : "=r"(word) : "f"(high), "f"(low));
-        return word;
-    }
-    static __device__ float gelu(float x) {
+struct Gelu {
+    static __device__ float of(float x) {
         float y;
         asm("tanh.approx.f32 %0, %1;" : "=f"(y) : "f"(x * (0.7978845608f + 0.0356774081f * x * x)));
         return x * (0.5f + 0.5f * y);
-    }
-    static __device__ void multiply(float* c, const unsigned* a, uint2 b) {
-        asm("mma.sync.aligned.m16n8k16.row.col.f32.f16.f16.f32 {%0,%1,%2,%3}, {%4,%5,%6,%7}, {%8,%9}, {%0,%1,%2,%3};"
-            : "+f"(c[0]), "+f"(c[1]), "+f"(c[2]), "+f"(c[3])
-            : "r"(a[0]), "r"(a[1]), "r"(a[2]), "r"(a[3]), "r"(b.x), "r"(b.y));
     }
 };
 constexpr int I = 16, WORDS = 12;  // words between two texels' inputs: an odd multiple of 4 keeps banks apart
@@ -40,13 +30,13 @@ if (fresh) {
         const int l = i >> 1 & 31, column = (i >> 6) % NT * 8 + (l >> 2), step = (i >> 6) / NT;
         const int row = 2 * (l & 3) + 8 * (i & 1);
         const float* from = w + (step == 0 ? row : I + 1 + (step - 1) * 16 + row) * H + column;
-        const unsigned word = Half2::pack(from[0], from[H]);
+        const unsigned word = Units::pack(from[0], from[H]);
         if (step == 0) w1[i] = word;
         else w2[i - NT * 64] = word;
     }
     for (int i = t; i < KT * 64; i += 128) {
         const int l = i >> 1 & 31, column = l >> 2, row = (i >> 6) * 16 + 2 * (l & 3) + 8 * (i & 1);
-        w3[i] = column < 3 ? Half2::pack(o[row * 3 + column], o[row * 3 + 3 + column]) : 0u;
+        w3[i] = column < 3 ? Units::pack(o[row * 3 + column], o[row * 3 + 3 + column]) : 0u;
     }
     for (int i = t; i < H; i += 128) {
         b1[i] = w[I * H + i];
@@ -56,7 +46,7 @@ if (fresh) {
     __syncthreads();
 }
 #pragma unroll
-for (int c = 0; c < I / 2; ++c) staged[t * WORDS + c] = Half2::pack(f.c[2 * c], f.c[2 * c + 1]);
+for (int c = 0; c < I / 2; ++c) staged[t * WORDS + c] = Units::pack(f.c[2 * c], f.c[2 * c + 1]);
 __syncwarp();
 // Two groups of 16 texels, so that a weight that is read serves both.
 unsigned a[2][KT][4];
@@ -83,23 +73,25 @@ for (int layer = 0; layer < 2; ++layer) {
             const unsigned* from = layer == 0 ? w1 : w2 + k * NT * 64;
             const uint2 b = *reinterpret_cast<const uint2*>(from + (i * 32 + lane) * 2);
             #pragma unroll
-            for (int m = 0; m < 2; ++m) Half2::multiply(s[m][i], a[m][k], b);
+            for (int m = 0; m < 2; ++m) Units::multiply(s[m][i], a[m][k], b.x, b.y);
         }
     }
     #pragma unroll
     for (int m = 0; m < 2; ++m)
         #pragma unroll
         for (int i = 0; i < NT; ++i) {
-            a[m][i / 2][2 * (i & 1)] = Half2::pack(Half2::gelu(s[m][i][0]), Half2::gelu(s[m][i][1]));
-            a[m][i / 2][2 * (i & 1) + 1] = Half2::pack(Half2::gelu(s[m][i][2]), Half2::gelu(s[m][i][3]));
+            a[m][i / 2][2 * (i & 1)] = Units::pack(Gelu::of(s[m][i][0]), Gelu::of(s[m][i][1]));
+            a[m][i / 2][2 * (i & 1) + 1] = Units::pack(Gelu::of(s[m][i][2]), Gelu::of(s[m][i][3]));
         }
 }
 #pragma unroll
 for (int m = 0; m < 2; ++m) {
     float y[4] = {b3[2 * q], b3[2 * q + 1], b3[2 * q], b3[2 * q + 1]};
     #pragma unroll
-    for (int k = 0; k < KT; ++k)
-        Half2::multiply(y, a[m][k], *reinterpret_cast<const uint2*>(w3 + (k * 32 + lane) * 2));
+    for (int k = 0; k < KT; ++k) {
+        const uint2 b = *reinterpret_cast<const uint2*>(w3 + (k * 32 + lane) * 2);
+        Units::multiply(y, a[m][k], b.x, b.y);
+    }
     if (q < 2) {
         float* to = answers + (first + 16 * m + g) * 4 + 2 * q;
         to[0] = y[0];
@@ -113,6 +105,3 @@ const float* answer = answers + t * 4;
 const wp::vec_t<3, float> result(answer[0], answer[1], answer[2]);
 __syncwarp();
 return result;
-#else
-return wp::vec_t<3, float>();
-#endif

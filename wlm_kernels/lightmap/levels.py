@@ -1,0 +1,69 @@
+"""Networks on 8-bit levels in one launch: as forty small ones it would be a good part of a step on a GPU.
+
+Read first: `tests/reference/levels.py`, the same in torch, bit for bit.
+"""
+
+import warp as wp
+
+LEVELS = 127
+
+_MOST = wp.constant(float(LEVELS))
+
+
+@wp.func
+def _half(value: float) -> float:
+    return float(wp.float16(value))
+
+
+@wp.func
+def _column_on_levels(values: wp.array3d[float], n: int, first: int, rows: int, j: int, out: wp.array3d[float]):
+    """The weights into one unit, and the bias behind them."""
+    most = float(0.0)
+    for i in range(rows):
+        most = wp.max(most, wp.abs(values[n, first + i, j]))
+    level = _half(most) / _MOST
+    for i in range(rows):
+        whole = float(0.0)
+        if level > 0.0:
+            whole = wp.clamp(wp.rint(values[n, first + i, j] / level), -_MOST, _MOST)
+        out[n, first + i, j] = _half(whole * level)
+    out[n, first + rows, j] = values[n, first + rows, j]
+
+
+@wp.kernel(enable_backward=False)
+def _put_on_levels(
+    # in:
+    hidden: wp.array3d[float],
+    output: wp.array3d[float],
+    # out:
+    hidden_out: wp.array3d[float],
+    output_out: wp.array3d[float],
+):
+    n, unit = wp.tid()
+    width = hidden.shape[2]
+    inputs = hidden.shape[1] - width - 2
+    if unit < width:
+        _column_on_levels(hidden, n, 0, inputs, unit, hidden_out)
+    elif unit < 2 * width:
+        _column_on_levels(hidden, n, inputs + 1, width, unit - width, hidden_out)
+    else:
+        _column_on_levels(output, n, 0, width, unit - 2 * width, output_out)
+
+
+def put_on_levels(hidden: wp.array, output: wp.array, hidden_out: wp.array, output_out: wp.array) -> None:
+    """Networks with their weights on levels and their biases as they are.
+
+    Args:
+        hidden: float [N, I + H + 2, H], see `wlm_kernels.mlp`.
+        output: float [N, H + 1, 3].
+        hidden_out, output_out: Like these, written.
+    """
+    shape = (hidden.shape[0], 2 * hidden.shape[2] + 3)
+    wp.launch(
+        _put_on_levels,
+        shape,
+        inputs=[hidden, output],
+        outputs=[hidden_out, output_out],
+        device=hidden.device,
+        block_dim=64,
+    )

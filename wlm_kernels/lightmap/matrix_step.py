@@ -1,0 +1,60 @@
+"""The network of a training step on a GPU's matrix units: `native/matrix_step.cuh` as a function for kernels.
+
+Read first: `wlm_kernels/mlp.py`, the same network in float32, and `tests/reference/temporal.py`, `losses`.
+"""
+
+import functools
+from typing import Any
+
+import warp as wp
+
+from wlm_kernels.lightmap.reduce import BLOCK
+from wlm_kernels.native import native_source, on_cuda
+
+_STEP = 16  # of a matrix product: the hidden width is a multiple of it
+_WIDEST = 64  # a block's activations and weights then fill its 48 KiB of shared memory
+
+
+def fits_matrix_units(inputs: int, hidden: int) -> bool:
+    """Whether `matrix_network` has a network's shape."""
+    return inputs <= _STEP and hidden % _STEP == 0 and hidden <= _WIDEST
+
+
+@functools.cache
+def matrix_network(inputs: int, hidden: int, gelu: str) -> Any:
+    """Builds (once) the `wp.func` that takes a block of `BLOCK` samples of one tile through its network and back.
+
+    Its arguments are the networks `hidden` [N, I + H + 2] and `output` [N, H + 1], see `wlm_kernels.mlp`, and `n`, the
+    block's; of each sample the inputs `f`, the `target` and the channels' `weight`; `share`, which every squared error
+    is multiplied by; `row`, the row of the outputs that the block fills; and the outputs, written: `partial`
+    [rows * (I + H + 2), H], `partial_out` [rows * (H + 1), 3] and `loss` [rows].
+
+    It gives, of each sample, the gradient of the inputs and behind it the error of the answer.
+
+    Args:
+        inputs, hidden: I and H, as `fits_matrix_units` allows.
+        gelu: "exact" or "tanh".
+    """
+    vec_in, vec_hidden = wp.types.vector(inputs, float), wp.types.vector(hidden, float)
+    vec_result = wp.types.vector(inputs + 3, float)
+    # Rows of 64 halves are all banks: permuting their groups of 8 keeps a column's apart, padding the others does.
+    rows = {"STRIDE": hidden, "MASK": 7} if hidden == _WIDEST else {"STRIDE": hidden + 8, "MASK": 0}
+    constants = {"I": inputs, "H": hidden, "T": BLOCK, "EXACT": int(gelu == "exact"), **rows}
+    code = native_source(__package__, "matrix_units") + native_source(__package__, "matrix_step", **constants)
+
+    @wp.func_native(on_cuda(code, f"return wp::vec_t<{inputs + 3}, float>();"))
+    def network(
+        hidden: wp.array2d[vec_hidden],
+        output: wp.array2d[wp.vec3],
+        n: int,
+        f: vec_in,
+        target: wp.vec3,
+        weight: wp.vec3,
+        share: float,
+        row: int,
+        partial: wp.array2d[float],
+        partial_out: wp.array2d[float],
+        loss: wp.array1d[float],
+    ) -> vec_result: ...
+
+    return network
