@@ -33,6 +33,7 @@ MODULES = (
     "lightmap.decode",
     "lightmap.frames",
     "lightmap.gather",
+    "lightmap.levels",
     "lightmap.matrix_decode",
     "lightmap.output",
     "probe.cubes",

@@ -5,9 +5,12 @@ import math
 import numpy as np
 import pytest
 import torch
+import warp as wp
+from reference.levels import put_on_levels
 
-from kernels.compare import close
+from kernels.compare import array, close
 from kernels.stepping import Case, draw, fused_step, trainer
+from wlm_kernels.lightmap import gather, levels
 
 RATES = {"map_rate": 0.02, "net_rate": 0.005, "final_rate": 0.1}
 
@@ -53,20 +56,10 @@ def test_loss_is_a_running_mean(device: str):
     fit.close()
 
 
-@pytest.mark.parametrize("split", [False, True], ids=["as-is", "36-pieces"])
-def test_adam_over_pieces_is_adam_over_the_whole(device: str, split: bool, monkeypatch: pytest.MonkeyPatch):
-    """Twenty steps against torch's Adam in float64 over whole tensors, fed with the same gradients."""
+def test_adam_is_torchs(device: str):
+    """Twenty steps against torch's Adam in float64, fed with the same gradients."""
     settings = RATES | {"steps": 20}
     fit = trainer(Case(settings=settings, samples=1024), device)
-    if split:
-        # The CPU keeps one piece; what a GPU does must be right wherever it is tested.
-        with monkeypatch.context() as patch:
-            patch.setattr(fit, "_cuda", True)
-            pieces = fit._pieces()
-        assert 30 <= len(pieces) <= 36 and sum(p.numel() for p in pieces) == fit.maps.numel()
-        options = {key: fit._adam_maps.defaults[key] for key in ("betas", "eps", "fused", "capturable")}
-        rate = fit._adam_maps.param_groups[0]["lr"]
-        fit._adam_maps = torch.optim.Adam(pieces, lr=rate, **options)
     named = [fit.maps, fit.hidden, fit.output]
     whole = [value.detach().cpu().double().clone().requires_grad_() for value in named]
     groups = [{"params": whole[:1], "lr": 1.0}, {"params": whole[1:], "lr": 1.0}]
@@ -84,6 +77,66 @@ def test_adam_over_pieces_is_adam_over_the_whole(device: str, split: bool, monke
     for name, value, mine in zip(("maps", "hidden", "output"), whole, named, strict=True):
         close(mine.detach(), value, 2e-5, name)
     fit.close()
+
+
+def test_a_gpus_update_is_torchs_adam(device: str):
+    """The launches that move the parameters on a GPU, wherever they run: sums to gradients, Adam, rates and counts."""
+    random, steps, parts = np.random.default_rng(0), 6, 3
+    shapes = {"maps": 48, "hidden": 31, "output": 7}
+    values = {key: random.uniform(-0.2, 1.2, count).astype(np.float32) for key, count in shapes.items()}
+    twins = {key: torch.tensor(value, dtype=torch.float64).requires_grad_() for key, value in values.items()}
+    adams = {key: torch.optim.Adam([twin], betas=(0.9, 0.99), eps=1e-8) for key, twin in twins.items()}
+    mine = {key: array(value, float, device) for key, value in values.items()}
+    grads = {key: array(np.zeros_like(value), float, device) for key, value in values.items()}
+    moments = {}
+    for key, value in values.items():
+        moments[key] = gather.Adam()
+        moments[key].decay, moments[key].epsilon = wp.vec2(0.9, 0.99), 1e-8
+        moments[key].first, moments[key].second = (array(np.zeros_like(value), float, device) for _ in range(2))
+    done = np.arange(1, steps + 1)
+    share = np.linspace(1.0, 0.5, steps)
+    schedule = array(np.stack([share, 1 - 0.9**done, np.sqrt(1 - 0.99**done)], 1).astype(np.float32), wp.vec3, device)
+    control, rates = array(np.zeros(1, np.int32), int, device), array(np.zeros(4, np.float32), float, device)
+    mean_loss = array(np.zeros(2, np.float32), float, device)
+    for step in range(steps):
+        move = step < 4
+        sums = {key: random.normal(size=(parts, count)).astype(np.float32) for key, count in shapes.items()}
+        acc = array(np.round(sums["maps"].sum(0) * 2.0**40).astype(np.int64)[None], wp.int64, device)
+        loss = array(np.full((parts, 2), 0.5, np.float32), float, device)
+        net = [array(sums[key], float, device) for key in ("hidden", "output")]
+        gather.update_maps(
+            schedule, (0.02, 0.01), control, move, acc, moments["maps"], mine["maps"], grads["maps"], rates
+        )
+        gather.update_net(
+            *net, loss, rates, moments["hidden"], moments["output"], mine["hidden"], mine["output"], mean_loss, control,
+            grads["hidden"], grads["output"],
+        )  # fmt: skip
+        assert not acc.numpy().any() and control.numpy()[0] == step + 1
+        np.testing.assert_allclose(rates.numpy()[:2], np.array([0.02, 0.01]) * share[step], rtol=1e-6)
+        np.testing.assert_allclose(mean_loss.numpy(), 1.5 * (1 - 0.98 ** (step + 1)), rtol=1e-5)
+        with torch.no_grad():
+            twins["maps"].clamp_(0.0, 1.0)
+        for key, adam in adams.items():
+            close(grads[key], sums[key].sum(0), 1e-6, f"gradient of {key}")
+            twins[key].grad = torch.tensor(sums[key].sum(0), dtype=torch.float64)
+            adam.param_groups[0]["lr"] = (0.02 if key == "maps" else 0.01) * share[step]
+            if move or key != "maps":
+                adam.step()
+            close(mine[key], twins[key], 2e-6, f"{key} after {step}")
+
+
+@pytest.mark.parametrize("factor", [1.0, 1e-6, 1e3])
+def test_levels_are_torchs(device: str, factor: float):
+    """Networks on 8-bit levels, bit for bit; a unit without weights, and biases as they are."""
+    random = np.random.default_rng(1)
+    hidden = (random.normal(size=(3, 4 + 17 + 2, 17)) * factor).astype(np.float32)
+    output = (random.normal(size=(3, 18, 3)) * factor).astype(np.float32)
+    hidden[1, :4, 5] = 0.0
+    nets = [array(values, float, device) for values in (hidden, output)]
+    made = [wp.empty_like(values) for values in nets]
+    levels.put_on_levels(*nets, *made)
+    for got, want in zip(made, put_on_levels(torch.tensor(hidden), torch.tensor(output), 4), strict=True):
+        np.testing.assert_array_equal(got.numpy(), want.numpy())
 
 
 def test_stages_and_repetition(device: str):

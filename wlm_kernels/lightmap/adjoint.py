@@ -27,8 +27,8 @@ def corner_weights(first: int, second: int, f: float, block: int) -> wp.vec2:
 _Spread = wp.types.vector(8, float)
 
 # A warp's lanes add their samples' numbers together, so that neighbours in memory are added at once: 8 lanes the
-# endpoints of one sample's block, then of the next one's. One lane for each sample would take as many requests to
-# memory as numbers, and those were most of a step.
+# endpoints of one sample's block, then of the next one's. With a lane for each sample there would be as many requests
+# to memory as numbers, rather than one for four.
 
 
 @wp.func_native("""

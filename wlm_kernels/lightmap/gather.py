@@ -1,7 +1,7 @@
 """Turns the sums of `step` into gradients, and advances the schedule; on a GPU it also moves the parameters.
 
 There Adam is ours, in the launches that sum the gradients: torch's fused one reads and writes them once more, and gives
-each block of threads 65,536 numbers, with which a network would keep one multiprocessor busy.
+each block of threads 65,536 numbers, with which the networks of 64 tiles would keep one to six multiprocessors busy.
 
 Read first: `kernels/stepping.py` in the tests, which reads these gradients and holds them to autograd's.
 """

@@ -1,4 +1,4 @@
-"""Networks on 8-bit levels in one launch: as forty small ones it would be a good part of a step on a GPU.
+"""Networks on 8-bit levels in one launch: of torch's operations it takes some forty, each a launch.
 
 Read first: `tests/reference/levels.py`, the same in torch, bit for bit.
 """

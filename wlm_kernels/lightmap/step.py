@@ -4,6 +4,9 @@ It handles B random samples of each of N tiles (neural-dynamic-gi, section 3.3, 
 time, samples F_uv, F_uvt, F_ut and F_vt, adds the uniform noise of eq. 6, centres the features, runs the network,
 computes the weighted squared error and sums the gradients. `gather` turns the sums into gradient arrays.
 
+On CUDA networks of up to 64 units, in steps of 16, run on the matrix units in half floats (`matrix_step`), the others
+in float32 as on the CPU.
+
 The sums are in a fixed order or of integers, so that one seed gives one result on one device. A tile's samples depend
 on the seed, the step and its number alone, so that a tile fits to the same result in any batch.
 
