@@ -35,6 +35,7 @@ MODULES = (
     "lightmap.gather",
     "lightmap.matrix_decode",
     "lightmap.output",
+    "lightmap.video",
     "probe.cubes",
     "probe.gaussian_sum",
     "probe.step",
