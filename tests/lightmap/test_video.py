@@ -23,12 +23,15 @@ from wlm.lightmap.evaluation import count_kinds, memory_bytes, part_bytes
 from wlm.lightmap.exact import bound64, colour_tile64, decode_tile64
 from wlm.lightmap.fit import compress
 from wlm.lightmap.gaps import Gaps
+from wlm.lightmap.model import Profile
+from wlm.lightmap.rate import choose
 from wlm.lightmap.runtime import FrameDecoder
 from wlm.lightmap.tiles import TileKind
 from wlm.lightmap.video import encode_levels
 from wlm.lightmap.video_packing import decode_levels, levels_of, pages, unpack_video
 
 DEMO = Path(__file__).resolve().parents[2] / "demos" / "data" / "city"
+FILES = Path(__file__).resolve().parents[1] / "files"
 KINDS = (5, 4, 1, 5)
 TIMES = (7.5, 10.0, 23.0)
 
@@ -223,3 +226,35 @@ def test_without_the_package_a_line_names_the_extra(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "imagecodecs", None)
     for call, argument in ((wlm.load, tmp_path / "a.wlm"), (lambda x: compress(x, "video"), moving_light())):
         assert "video: imagecodecs is missing; needs the extra: pip install 'wlm[video]'" in error_of(call, argument)
+
+
+def test_a_kept_file_decodes_as_when_it_was_written(device):
+    """Three hours of one tile with gaps."""
+    model = wlm.load(FILES / "lightmap-video.wlm")
+    with np.load(FILES / "lightmap-video.npz") as stored:
+        np.testing.assert_array_equal(model.video_levels[0, :, ::8, ::8], stored["levels"])
+        np.testing.assert_allclose(model.decoder(device).frame(8.25)[::4, ::4], stored["frame"], rtol=1e-5)
+
+
+def test_the_quality_is_chosen(few_hours):
+    light = from_arrays(few_hours.frames[:2, :128], few_hours.times[:2], few_hours.mask[:128])
+    settings = Profile.load("video").override({"video_speed": 9})
+
+    def measured(profile):
+        model = compress(light, profile)
+        return wlm.lightmap.evaluate(model, light, metrics=("psnr",))
+
+    choice = choose(light, settings, target_psnr=45.0)
+    quality = choice.profile.video_quality
+    assert choice.profile == settings.override({"video_quality": quality}) and not choice.limited
+    found, below = (measured(settings.override({"video_quality": q})) for q in (quality, quality - 1))
+    assert choice.psnr == found.psnr >= 45.0 > below.psnr and choice.bpp == found.bpp
+    small = choose(light, settings, max_bpp=1.02 * choice.bpp)
+    assert small.psnr is None and small.profile.video_quality >= quality
+    assert measured(small.profile).bpp <= 1.02 * choice.bpp
+    both = choose(light, settings, max_bpp=0.8 * choice.bpp, target_psnr=45.0)
+    assert both.limited and both.psnr < 45.0 and both.bpp <= 0.8 * choice.bpp
+    assert "--max-bpp: expected at least 0." in error_of(choose, light, settings, max_bpp=1e-3)
+    assert "--target-psnr: expected at most " in error_of(choose, light, settings, target_psnr=110.0)
+    constant = from_arrays(np.ones((1, 8, 8, 3), np.float32), [0.0])
+    assert "no tile is more than a colour" in error_of(choose, constant, settings, max_bpp=1.0)
