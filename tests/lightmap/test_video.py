@@ -258,3 +258,13 @@ def test_the_quality_is_chosen(few_hours):
     assert "--target-psnr: expected at most " in error_of(choose, light, settings, target_psnr=110.0)
     constant = from_arrays(np.ones((1, 8, 8, 3), np.float32), [0.0])
     assert "no tile is more than a colour" in error_of(choose, constant, settings, max_bpp=1.0)
+
+
+def test_the_number_of_threads_changes_nothing(monkeypatch):
+    rng = np.random.default_rng(0)
+    pictures = np.cumsum(rng.integers(-4, 5, (3, 256, 384, 3)), 2).astype(np.int64) % 1024
+    streams = []
+    for count in (1, 2, 5):
+        monkeypatch.setattr(av1, "cores", lambda count=count: count)
+        streams.append(av1.encode_av1(pictures.astype(np.uint16), 80, 8, "video"))
+    assert streams[0] == streams[1] == streams[2]

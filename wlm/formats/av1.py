@@ -15,6 +15,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from wlm.formats.hdr_blocks import need
+from wlm.workers import cores
 
 BITS = 10
 """Of a sample."""
@@ -50,7 +51,7 @@ def encode_av1(pictures: np.ndarray, quality: int, speed: int, extra: str) -> by
         pixelformat="yuv444",
         matrix=_IDENTITY,
         codec="aom",
-        numthreads=1,
+        numthreads=max(2, cores()),  # the stream is the same for any number but 1
     )
     at = 0
     while data[at + 4 : at + 8] != b"mdat":

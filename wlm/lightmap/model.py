@@ -97,8 +97,8 @@ class Profile(Settings):
     static_budget_db: float = Field(60.0, gt=0.0)
     frames: Literal["auto", "never", "always", "video"] = "auto"
     frames_loss: float = Field(0.2, ge=0.0, le=255.0)
-    video_quality: int = Field(95, ge=0, le=100)
-    video_speed: int = Field(4, ge=0, le=10)
+    video_quality: int = Field(96, ge=0, le=100)
+    video_speed: int = Field(3, ge=0, le=10)
 
     @model_validator(mode="after")
     def _stages_in_order(self) -> "Profile":
