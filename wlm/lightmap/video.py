@@ -26,7 +26,7 @@ from wlm.metrics import evaluate_frame
 from wlm.texels import fill_smoothly
 
 _TRIAL_SPEED = 6  # beyond it libaom is of another kind, which takes a quality for another
-_PER_OCTAVE = 3.8  # dB for twice the bytes, in the city and in a game's lightmaps alike
+_STEP = 4  # of the quality, for another point on the curve of PSNR over size
 
 
 def encode_levels(levels: np.ndarray, quality: int, speed: int, extra: str = EXTRA) -> bytes:
@@ -54,7 +54,8 @@ def encode_page(
     """Encodes a page, with the ranges that yield more for their bytes: those of each time, or those of all times.
 
     Where hours are alike, levels that are relative to one range follow from each other; where they differ much, dark
-    ones lose their levels to bright ones. Which is better a quick encoding of either says.
+    ones lose their levels to bright ones. Which is better quick encodings say: one of either, and one more of another
+    quality, which says what PSNR the smaller would have at the size of the larger.
 
     Args:
         page: The page.
@@ -74,16 +75,21 @@ def encode_page(
     count = by_time.shape[1]
     if count == 1:
         return _encoded(page, colour, valid, by_time, quality, speed), by_time
-    trial, best = max(speed, _TRIAL_SPEED), -np.inf
-    for ranges in (by_time, over_all):
+    trial = max(speed, _TRIAL_SPEED)
+
+    def tried(ranges: np.ndarray, quality: int) -> tuple[float, float, bytes]:
+        """Octaves of the size, PSNR and stream of a trial."""
         stream = _encoded(page, colour, valid, ranges, quality, trial)
-        psnr = _psnr(page, colour, valid, ranges, decode_levels(stream, count, *page.shape), gamma)
-        worth = psnr - _PER_OCTAVE * np.log2(len(stream))
-        if worth > best:
-            best, chosen = worth, (stream, ranges)
-    if trial == speed:
-        return chosen
-    return _encoded(page, colour, valid, chosen[1], quality, speed), chosen[1]
+        levels = decode_levels(stream, count, *page.shape)
+        return float(np.log2(len(stream))), _psnr(page, colour, valid, ranges, levels, gamma), stream
+
+    both = [(*tried(ranges, quality), ranges) for ranges in (by_time, over_all)]
+    small, large = sorted(both, key=lambda result: result[0])
+    other = tried(small[3], quality + (_STEP if quality + _STEP <= 100 else -_STEP))
+    octaves = other[0] - small[0]
+    slope = (other[1] - small[1]) / octaves if octaves else 0.0
+    _, _, stream, ranges = small if small[1] + slope * (large[0] - small[0]) > large[1] else large
+    return stream if trial == speed else _encoded(page, colour, valid, ranges, quality, speed), ranges
 
 
 def _range_of(texels: np.ndarray) -> np.ndarray:
