@@ -13,7 +13,16 @@ import wlm
 from wlm.errors import WlmError
 from wlm.formats.artifact import read_artifact, write_artifact
 
-MODELS = ("lightmap", "lightmap-frames", "probe", "atlas-tiles", "atlas-cascade", "atlas-bc6h", "smoke")
+MODELS = (
+    "lightmap",
+    "lightmap-frames",
+    "lightmap-video",
+    "probe",
+    "atlas-tiles",
+    "atlas-cascade",
+    "atlas-bc6h",
+    "smoke",
+)
 MOST = 10  # parts of a file that are tried: a network's weights are all alike
 
 WEIRD = {

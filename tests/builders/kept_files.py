@@ -44,15 +44,22 @@ def _written(write: Callable[[Path], Any]) -> bytes:
 def _lightmap() -> Kept:
     from builders.synthetic import random_model
 
-    ranges = {"kind": (2, 5), "times": (3, 24.5), "constant": (0, -1.0), "scale_static": (0, -0.5), "affine": (0, -1.0)}
+    ranges = {"kind": (2, 6), "times": (3, 24.5), "constant": (0, -1.0), "scale_static": (0, -0.5), "affine": (0, -1.0)}
     return Kept(_written(random_model(uvt_slices=1).save), wlm.load, {}, ranges)
 
 
 def _frames() -> Kept:
     from builders.synthetic import random_model
 
-    ranges = {"kind": (1, 5), "ranges": ((0, 0, 0), 3.0)}
+    ranges = {"kind": (1, 6), "ranges": ((0, 0, 0), 3.0)}
     return Kept(_written(random_model((4, 0), times=(0.0, 7.5)).save), wlm.load, {}, ranges)
+
+
+def _video() -> Kept:
+    from builders.synthetic import random_model
+
+    ranges = {"kind": (1, 6), "video_ranges": ((0, 0, 0), 3.0)}
+    return Kept(_written(random_model((5, 0), times=(0.0, 7.5)).save), wlm.load, {}, ranges)
 
 
 def _probe() -> Kept:
@@ -204,6 +211,7 @@ KEPT: dict[str, Callable[[], Kept]] = {
     for name, make in {
         "lightmap": _lightmap,
         "lightmap-frames": _frames,
+        "lightmap-video": _video,
         "probe": _probe,
         "atlas-tiles": lambda: _atlas("tiles", "half"),
         "atlas-cascade": lambda: _atlas("cascade", "half"),

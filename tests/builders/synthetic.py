@@ -6,6 +6,8 @@ from wlm.formats.bc7 import pack_mode6
 from wlm.lightmap.frame_packing import clear_unneeded, needed_blocks
 from wlm.lightmap.model import LightmapModel, Profile
 from wlm.lightmap.tiles import TileGrid, TileKind
+from wlm.lightmap.video import encode_levels
+from wlm.lightmap.video_packing import pages
 from wlm_kernels import mlp
 
 
@@ -46,6 +48,11 @@ def random_model(
     for i, number in enumerate(framed.tolist()):
         frames[i] = clear_unneeded(frames[i], needed_blocks(mask, number))
     ranges = np.sort(rng.uniform(0.0, 1.5, (len(framed), len(times), 2, 3)), axis=2)
+    streams = []
+    for page in pages(kind, columns, len(times)):
+        levels = rng.random((len(times), *(side // 16 for side in page.shape), 3)).repeat(16, 1).repeat(16, 2)
+        streams.append(np.frombuffer(encode_levels(levels.astype(np.float32), 60, 10), np.uint8))
+    video_ranges = np.sort(rng.uniform(0.0, 1.5, (int((kind == TileKind.VIDEO).sum()), len(times), 2)), axis=2)
     return LightmapModel(
         name="random",
         width=width,
@@ -69,6 +76,9 @@ def random_model(
         constant=rng.uniform(0.0, 3.0, (constant, len(times), 3)).astype(np.float16),
         frames=frames,
         ranges=ranges.astype(np.float16),
+        video=np.concatenate(streams) if streams else np.zeros(0, np.uint8),
+        video_sizes=np.array([len(stream) for stream in streams], np.uint32),
+        video_ranges=video_ranges.astype(np.float16),
     )
 
 

@@ -251,7 +251,7 @@ READERS = (
     Reader(
         "lightmap",
         "a.wlm",
-        stored("lightmap.wlm", "lightmap-packed.wlm", "lightmap-frames.wlm"),
+        stored("lightmap.wlm", "lightmap-packed.wlm", "lightmap-frames.wlm", "lightmap-video.wlm"),
         vary_artifact,
         _lightmap,
     ),

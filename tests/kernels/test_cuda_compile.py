@@ -36,6 +36,7 @@ MODULES = (
     "lightmap.levels",
     "lightmap.matrix_decode",
     "lightmap.output",
+    "lightmap.video",
     "probe.cubes",
     "probe.gaussian_sum",
     "probe.step",

@@ -32,6 +32,7 @@ AXES = [
     {"time_axis": "paper", "period": None, "times": (2.0, 7.5, 20.0), "interpolation": "network"},
     {"kinds": (4, 3, 4, 4)},
     {"kinds": (4, 2, 1, 4), "interpolation": "network", "period": None},
+    {"kinds": (5, 4, 1, 5)},
 ]
 
 
@@ -43,6 +44,9 @@ def read_texture(path):
     depth, payload = max(depth, 1), data[148:]
     if fmt == 49:
         return np.frombuffer(payload, np.uint8).reshape(depth, height, width, 2) / 255.0
+    if fmt == 24:
+        words = np.frombuffer(payload, "<u4").reshape(depth, height, width, 1)
+        return np.concatenate([words >> shift & 1023 for shift in (0, 10, 20)], 3) / 1023.0
     assert fmt == 98
     size = len(payload) // depth
     slices = [texture2ddecoder.decode_bc7(payload[i * size : (i + 1) * size], width, height) for i in range(depth)]
@@ -94,7 +98,7 @@ def features(folder, number, dynamic, tau, repeats):
 
 
 def frame_light(folder, tile, i, gamma):
-    """Radiance of a tile of frames at stored time i."""
+    """Radiance of a tile of frames or video at stored time i."""
     level = read_texture(folder / f"tile_{tile['number']:04d}_frame_{i:04d}.dds")[0, ..., :3]
     least, greatest = (np.array(tile[name][i]) for name in ("least", "greatest"))
     return (least + level * (greatest - least)) ** gamma
@@ -121,7 +125,7 @@ def frame_from_files(folder, t):
     for tile in document["tiles"]:
         if tile["kind"] == "constant":
             radiance = mixed(tile["radiance"])
-        elif tile["kind"] == "frames":
+        elif tile["kind"] in ("frames", "video"):
             radiance = mixed({i: frame_light(folder, tile, i, document["gamma"]) for i in {before, after}})
         else:
             x = features(folder, tile["number"], tile["kind"] == "dynamic", tau, document["time_axis"]["repeats"])

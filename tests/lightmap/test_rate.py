@@ -88,6 +88,6 @@ def test_nothing_to_choose():
 
 def test_frames_have_no_size_to_choose(light):
     line = error_of(choose, light, tiny_profile(frames="always"), max_bpp=1.0)
-    assert line == "rate: expected a profile of networks, got tiny, whose tiles are frames"
+    assert line == "rate: expected a profile of networks or video, got tiny, whose tiles are frames"
     one = moving_light(hours=(6.0,))
     assert "no tile changes over time" in error_of(choose, one, tiny_profile(frames="auto"), max_bpp=1.0)

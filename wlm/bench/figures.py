@@ -152,6 +152,7 @@ TABLES: dict[str, dict[str, Figure]] = {
         "static_tiles": Figure("static tiles", form=_WHOLE),
         "dynamic_tiles": Figure("dynamic tiles", form=_WHOLE),
         "frames_tiles": Figure("tiles of frames", form=_WHOLE),
+        "video_tiles": Figure("tiles of video", form=_WHOLE),
         "tiles_timed": Figure("tiles timed", form=_WHOLE),
         "lightmaps": Figure("lightmaps", form=_WHOLE),
         "resolution": Figure("resolution", "pixels", _WHOLE),

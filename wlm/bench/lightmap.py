@@ -230,6 +230,9 @@ class _LightmapBench(Bench):
 
     def fit_profile(self, profile: Profile) -> Fit:
         """Fits and writes a profile; compiling its kernels is no part of either time."""
+        if profile.frames in ("always", "video"):  # no kernel is compiled
+            self.note(f"{profile.name}: encoding {self.grid.count} tiles")
+            return self.fit(profile.name, lambda: compress(self.lightmaps, profile, device=self.device))
         self.note(f"{profile.name}: fitting {self.grid.count} tiles, {profile.steps:,} steps")
         compress(self.lightmaps, profile.model_copy(update={"steps": 10}), device=self.device)
         return self.fit(profile.name, lambda: compress(self.lightmaps, profile, device=self.device))
@@ -428,8 +431,9 @@ class _LightmapBench(Bench):
             decoders.append(make(model, self.device, gelu))
         if (model.kind == TileKind.STATIC).any():
             decoders.append(ExactDecoder(model, self.device, gelu, TileKind.STATIC))
-        if len(model.frames):
-            decoders.append(FrameDecoder(model, self.device))
+        for kind in (TileKind.FRAMES, TileKind.VIDEO):
+            if (model.kind == kind).any():
+                decoders.append(FrameDecoder(model, self.device, kind))
         for decoder in decoders:
             decoder.set_time(self.times[0])
         return decoders

@@ -62,16 +62,17 @@ _Map = Annotated[
 def compress(
     set_path: _Set,
     output: Annotated[Path, output_option("OUT.wlm", "The file to write.")],
-    profile: Annotated[str, typer.Option(help="L, M, H, ..., frames, or a YAML file of settings.")] = "M",
+    profile: Annotated[str, typer.Option(help="L, M, H, ..., frames, video, or a YAML file of settings.")] = "M",
     tiles: Annotated[str | None, typer.Option(help="Only these tiles, such as 0-3,7; default all.")] = None,
     steps: Annotated[int | None, typer.Option(help="Steps of the fit; default as the profile says.")] = None,
     samples: Annotated[int | None, typer.Option(help="Samples of each tile in a step; a multiple of 128.")] = None,
     target_psnr: Annotated[
-        float | None, typer.Option(metavar="DB", help="Choose the maps' size for this PSNR; takes a third longer.")
+        float | None,
+        typer.Option(metavar="DB", help="Choose the maps' size, or a video's quality, for it; takes longer."),
     ] = None,
     max_bpp: Annotated[
         float | None,
-        typer.Option(metavar="BITS", help="Choose the maps' size for a file of at most so many bits a texel and time."),
+        typer.Option(metavar="BITS", help="Choose the same for a file of at most so many bits a texel and time."),
     ] = None,
     seed: Seed = 0,
     device: Device = "cpu",
@@ -339,14 +340,15 @@ def _chosen(
     wanted: dict[str, float | None],
     options: dict[str, Any],
 ) -> "Profile":
-    """Chooses the size of the maps, and says what it was and why."""
+    """Chooses the size of the maps, or the quality of video, and says what it was and why."""
     from wlm.lightmap.rate import choose
 
     with running("choose") as progress:
         choice = choose(lightmaps, settings, **wanted, **options, progress=progress)
-    resolution = choice.profile.uvt_resolution
+    resolution, quality = choice.profile.uvt_resolution, choice.profile.video_quality
+    chosen = f"F_uvt of {resolution}x{resolution}" if settings.frames != "video" else f"video of quality {quality}"
     psnr = "" if choice.psnr is None else f", {choice.psnr:.1f} dB"
-    note(f"F_uvt of {resolution}x{resolution}: about {choice.bpp:.3f} bits a texel and time{psnr}")
+    note(f"{chosen}: about {choice.bpp:.3f} bits a texel and time{psnr}")
     if choice.limited:
         psnr, bpp = wanted["target_psnr"], wanted["max_bpp"]
         note(f"warning: --max-bpp {bpp:g} holds the PSNR below the {psnr:g} dB of --target-psnr")

@@ -11,6 +11,7 @@ from wlm.formats.atomic import atomic_write
 
 DXGI_FORMATS = {
     "R16G16B16A16_FLOAT": 10,
+    "R10G10B10A2_UNORM": 24,
     "R16G16_FLOAT": 34,
     "R16G16_UNORM": 35,
     "R16G16_UINT": 36,
@@ -22,12 +23,13 @@ DXGI_FORMATS = {
     "BC7_UNORM_SRGB": 99,
 }
 """The formats that can be written and their DXGI numbers: those of BC with 16 bytes a block of 4 x 4 texels, the
-others with a texel's channels one after another, little-endian."""
+others with a texel's channels one after another, little-endian; those of 10 bits in a word, the first in its lowest."""
 
 _BLOCK_BYTES = 16
 # Of the formats without blocks.
 _TEXEL_BYTES = {
     "R16G16B16A16_FLOAT": 8,
+    "R10G10B10A2_UNORM": 4,
     "R16G16_FLOAT": 4,
     "R16G16_UNORM": 4,
     "R16G16_UINT": 4,

@@ -87,9 +87,10 @@ def decode(artifact: Artifact) -> LightmapModel:
         others = {name: part for name, part in others.items() if name != "frame_sizes"}
         others["frames"] = unpack_frames(*packed, table, kind, mask)
     parts = check_parts(others, table)
-    if (parts["ranges"][:, :, 0] > parts["ranges"][:, :, 1]).any():
-        raise ValueError("part ranges: expected no least above its greatest")
-    return LightmapModel(
+    for name in ("ranges", "video_ranges"):
+        if (parts[name][:, :, 0] > parts[name][:, :, 1]).any():
+            raise ValueError(f"part {name}: expected no least above its greatest")
+    model = LightmapModel(
         name=header.name,
         width=width,
         height=height,
@@ -101,6 +102,9 @@ def decode(artifact: Artifact) -> LightmapModel:
         times=times,
         **parts,
     )
+    if len(model.video_ranges):
+        _ = model.video_levels  # whatever is wrong with a stream is wrong with the file
+    return model
 
 
 def _dated(profile: Profile) -> dict[str, Any]:

@@ -9,7 +9,7 @@ import warp as wp
 
 from wlm import interop
 from wlm.errors import WlmError
-from wlm.lightmap.frame_decode import FrameTiles, HeldTiles, inverse_of
+from wlm.lightmap.frame_decode import HeldTiles, image_tiles, inverse_of
 from wlm.lightmap.gaps import Gaps
 from wlm.lightmap.model import TILE, LightmapModel, decode_scale
 from wlm.lightmap.tiles import TileGrid, TileKind, place
@@ -23,9 +23,9 @@ class Decoder:
     """Holds a model's stored bytes on a device and decodes from them.
 
     Between two stored times light is the mix of their radiance (eq. 2), or what the network makes of features that are
-    interpolated, see `Profile.interpolation`; frames are always mixed. Times outside the day wrap round, or stop at the
-    first and last where the set isn't periodic. Texels of the gaps within two of a chart have the light of the nearest
-    valid texel, so that a map can be filtered.
+    interpolated, see `Profile.interpolation`; frames and video are always mixed. Times outside the day wrap round, or
+    stop at the first and last where the set isn't periodic. Texels of the gaps within two of a chart have the light of
+    the nearest valid texel, so that a map can be filtered.
     """
 
     def __init__(self, model: LightmapModel, device: str = "cpu", gelu: str | None = None) -> None:
@@ -48,15 +48,14 @@ class Decoder:
                 tiles = StoredTiles(model, kind, self.device)
                 kernels = lightmap_decode.exact_kernels(kind == TileKind.DYNAMIC, model.profile.hidden, self.gelu)
                 self._groups.append((tiles, kernels))
-        self._frames = FrameTiles(model, self.device) if len(model.frames) else None
+        self._images = image_tiles(model, self.device)
         self._constants = {int(tile): i for i, tile in enumerate(np.flatnonzero(model.kind == TileKind.CONSTANT))}
         self._gaps = Gaps.of(model.mask)
 
     @property
     def device_bytes(self) -> int:
-        """Memory that the maps, networks and frames take up on the device, in bytes: what a runtime keeps resident."""
-        held = [tiles for tiles, _ in self._groups] + ([self._frames] if self._frames else [])
-        return sum(tiles.device_bytes for tiles in held)
+        """Memory that the maps, networks and images take up on the device, in bytes: what a runtime keeps resident."""
+        return sum(tiles.device_bytes for tiles in [*(tiles for tiles, _ in self._groups), *self._images])
 
     def tile(self, number: int, time: float, border: int = 0) -> np.ndarray:
         """Decodes one tile.
@@ -110,7 +109,7 @@ class Decoder:
             self._decode(numbers, stamp, light, as_bytes=False)
             if share < 1.0:
                 out += np.float32(share) * light
-        self._decode_frames(numbers, time, out, as_bytes=False)
+        self._decode_images(numbers, time, out, as_bytes=False)
         return out
 
     def tiles_8bit(self, numbers: Sequence[int], time: float) -> tuple[np.ndarray, np.ndarray]:
@@ -134,14 +133,14 @@ class Decoder:
             for i, row in tiles.among(numbers):
                 peak[i] = bounds[tiles.rows[row]]
                 out[i, ..., 3] = 255
-        if self._frames:
-            highest = self._frames.bounds(time)
-            for i, row in self._frames.among(numbers):
+        for tiles in self._images:
+            highest = tiles.bounds(time)
+            for i, row in tiles.among(numbers):
                 peak[i] = highest[row]
                 out[i, ..., 3] = 255
         if len(self._times.reads(time)) == 1:
             self._decode(numbers, time, out, as_bytes=True)
-            self._decode_frames(numbers, time, out, as_bytes=True)
+            self._decode_images(numbers, time, out, as_bytes=True)
         else:
             factor = inverse_of(peak)[:, None, None, None]
             out[..., :3] = np.clip(self.tiles(numbers, time) ** exponent * factor, 0.0, 1.0) * 255.0 + 0.5
@@ -211,17 +210,18 @@ class Decoder:
             )
             out[places] = rgba(decoded) if as_bytes else decoded.numpy()
 
-    def _decode_frames(self, numbers: Sequence[int], time: float, out: np.ndarray, as_bytes: bool) -> None:
-        chosen = self._frames.among(numbers) if self._frames else []
-        if not chosen:
-            return
-        places, rows = (np.array(values, np.int32) for values in zip(*chosen, strict=True))
-        decoded = wp.empty((len(rows), TILE, TILE), dtype=wp.uint32 if as_bytes else wp.vec3, device=self.device)
-        inverse = None
-        if as_bytes:
-            inverse = wp.array(inverse_of(self._frames.bounds(time)), dtype=float, device=self.device)
-        self._frames.decode(time, wp.array(rows, device=self.device), decoded, inverse)
-        out[places] = rgba(decoded) if as_bytes else decoded.numpy()
+    def _decode_images(self, numbers: Sequence[int], time: float, out: np.ndarray, as_bytes: bool) -> None:
+        for tiles in self._images:
+            chosen = tiles.among(numbers)
+            if not chosen:
+                continue
+            places, rows = (np.array(values, np.int32) for values in zip(*chosen, strict=True))
+            decoded = wp.empty((len(rows), TILE, TILE), dtype=wp.uint32 if as_bytes else wp.vec3, device=self.device)
+            inverse = None
+            if as_bytes:
+                inverse = wp.array(inverse_of(tiles.bounds(time)), dtype=float, device=self.device)
+            tiles.decode(time, wp.array(rows, device=self.device), decoded, inverse)
+            out[places] = rgba(decoded) if as_bytes else decoded.numpy()
 
 
 def rgba(words: wp.array) -> np.ndarray:

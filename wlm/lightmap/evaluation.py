@@ -61,7 +61,7 @@ class Report(SeenScore):
         format_limited: `time`, `tile` of the scored ones that span only a few steps of half float.
         parts: Bytes of the file by part, see `part_bytes`.
         profile: Name of the settings.
-        kinds: Tiles of the grid by kind: `empty`, `constant`, `static`, `dynamic`, `frames`.
+        kinds: Tiles of the grid by kind: `empty`, `constant`, `static`, `dynamic`, `frames`, `video`.
         warnings: Tiles that were not scored, another input than the file's, or light that was lost and that the means
             hide.
     """
@@ -273,12 +273,18 @@ def bits_per_texel(model: LightmapModel, mask: np.ndarray, file_bytes: int) -> f
 
 
 def memory_bytes(model: LightmapModel) -> int:
-    """Bytes of a model's maps, networks and scales as a GPU holds them: blocks as they are, networks in half floats."""
-    return sum(value.nbytes for value in model.parts.values())
+    """Bytes of a model's maps, networks and scales as a GPU holds them.
+
+    Blocks are as they are, networks in half floats, video is unpacked.
+    """
+    held = [value for name, value in model.parts.items() if name not in ("video", "video_sizes")]
+    if len(model.video_ranges):
+        held.append(model.video_levels)
+    return sum(value.nbytes for value in held)
 
 
 def count_kinds(model: LightmapModel) -> dict[str, int]:
-    """Number of tiles of the grid by kind: empty (or not compressed), constant, static, dynamic, frames."""
+    """Number of tiles of the grid by kind: empty (or not compressed), constant, static, dynamic, frames, video."""
     return {kind.name.lower(): int((model.kind == kind).sum()) for kind in TileKind}
 
 
@@ -290,8 +296,8 @@ def part_bytes(model: LightmapModel, file_bytes: int) -> dict[str, int]:
     Raises:
         ValueError: `file_bytes` is less than the parts take.
     """
-    stored = encode(model)[1]
-    parts = {name: value.nbytes for name, value in stored.items() if name not in ("tiles", "sizes", "frame_sizes")}
+    stored, unnamed = encode(model)[1], ("tiles", "sizes", "frame_sizes", "video_sizes")
+    parts = {name: value.nbytes for name, value in stored.items() if name not in unnamed}
     if "sizes" in stored:
         parts |= zip(STREAMS, stored["sizes"].sum(0, dtype=int).tolist(), strict=True)
     parts["header"] = file_bytes - sum(parts.values())

@@ -10,9 +10,12 @@ from wlm.formats.bc7 import blocks_image, decode_image
 from wlm.formats.bc7_modes import decode_blocks
 from wlm.lightmap.model import TILE, LightmapModel, decode_scale
 from wlm.lightmap.tiles import TileGrid, TileKind
+from wlm.lightmap.video_packing import WHITE, levels_of
 
 SQRT_12 = math.sqrt(12.0)
 """Features in [0, 1] are fed to the network as (f - 1/2) sqrt(12): mean 0 and deviation 1 if they are uniform."""
+
+_IMAGES = (TileKind.FRAMES, TileKind.VIDEO)
 
 
 def decode_tile64(model: LightmapModel, number: int, time: float) -> np.ndarray:
@@ -32,7 +35,7 @@ def decode_tile64(model: LightmapModel, number: int, time: float) -> np.ndarray:
     _check(model, number, time)
     if model.kind[number] == TileKind.CONSTANT:
         return _filled(_constant(model, number, time))
-    if model.kind[number] == TileKind.FRAMES:
+    if model.kind[number] in _IMAGES:
         before, after, share = model.axis.neighbours(time)
         early, late = (_frame(model, number, at) ** model.profile.gamma for at in (before, after))
         return (1.0 - share) * early + share * late
@@ -48,9 +51,9 @@ def colour_tile64(model: LightmapModel, number: int, time: float) -> np.ndarray:
     if kind == TileKind.CONSTANT:
         return _filled(_constant(model, number, time) ** (1.0 / model.profile.gamma))
     reads = model.axis.reads(time)
-    if kind == TileKind.FRAMES and model.axis.neighbours(time)[2] == 0:
+    if kind in _IMAGES and model.axis.neighbours(time)[2] == 0:
         return _frame(model, number, model.axis.neighbours(time)[0])
-    if kind != TileKind.FRAMES and len(reads) == 1:
+    if kind not in _IMAGES and len(reads) == 1:
         return _colour(model, number, reads[0][0])
     return decode_tile64(model, number, time) ** (1.0 / model.profile.gamma)
 
@@ -87,6 +90,8 @@ def bound64(model: LightmapModel, number: int, time: float) -> float:
     before, after, share = model.axis.neighbours(time)
     if model.kind[number] == TileKind.FRAMES:
         peak = model.ranges[_row(model, number), :, 1].max(1)
+    elif model.kind[number] == TileKind.VIDEO:
+        peak = model.video_peaks[_row(model, number)]
     else:
         peak = decode_scale(model.peak[_place(model, number)], model.profile.gamma)
     return float(peak[before] if share == 0 else max(peak[before], peak[after]))
@@ -111,6 +116,9 @@ def _row(model: LightmapModel, number: int) -> int:
 def _frame(model: LightmapModel, number: int, at: int) -> np.ndarray:
     """A frame of a tile in gamma space [128, 128, 3]."""
     row = _row(model, number)
+    if model.kind[number] == TileKind.VIDEO:
+        least, greatest = model.video_ranges[row, at].astype(np.float64)
+        return least + levels_of(model.video_levels[row, at]) / WHITE * (greatest - least)
     levels = blocks_image(decode_blocks(model.frames[row, at]))[..., :3] / 255.0
     least, greatest = model.ranges[row, at].astype(np.float64)
     return least + levels * (greatest - least)

@@ -49,8 +49,8 @@ _ABOUT = {
     "uvt[4], ut[2], vt[2] as sampled, in [0, 1], then the encoded time[4]; of a static tile uv[4] alone. "
     "network_offset counts floats in the array of all networks, W1 b1 W2 b2 W3 b3 of each tile in this order.",
     "radiance": "Of a constant tile, linear RGB at each stored time, interpolated linearly.",
-    "frames": "A tile of frames has a texture of each stored time i, tile_N_frame_i.dds, and no network: colour is "
-    "least[i] + level * (greatest[i] - least[i]). Between two stored times their radiance is mixed, whatever "
+    "frames": "A tile of frames or video has a texture of each stored time i, tile_N_frame_i.dds, and no network: "
+    "colour is least[i] + level * (greatest[i] - least[i]). Between two stored times their radiance is mixed, whatever "
     "interpolation says.",
 }
 
@@ -61,9 +61,10 @@ def export(model: LightmapModel, directory: str | os.PathLike[str], *, device: s
     For tile N of the grid, with four digits: `tile_N_uv.dds`, F_uv in BC7, and of a dynamic tile also
     `tile_N_uvt.dds`, F_uvt as a BC7 volume whose depth is time, and `tile_N_ut.dds` and `tile_N_vt.dds`,
     F_ut and F_vt in R8G8_UNORM with time down the rows (neural-dynamic-gi, Table 1); of a tile of frames
-    `tile_N_frame_I.dds` in BC7 for each stored time I. The blocks are the model's own bytes. `decode.glsl` is the
-    decoder; `valid.png` is white inside charts, for the pass that fills the gaps; `frame.exr` is the map at the first
-    stored time, as the shader should show it; `weights.json` explains itself under "about".
+    `tile_N_frame_I.dds` in BC7 for each stored time I, of a tile of video the same in R10G10B10A2_UNORM, unpacked. The
+    blocks are the model's own bytes. `decode.glsl` is the decoder; `valid.png` is white inside charts, for the pass
+    that fills the gaps; `frame.exr` is the map at the first stored time, as the shader should show it; `weights.json`
+    explains itself under "about".
 
     The files are written beside the folder and moved in together, `weights.json` last. An earlier export is replaced,
     and textures of tiles that are no longer there are removed; other files stay.
@@ -97,6 +98,11 @@ def export(model: LightmapModel, directory: str | os.PathLike[str], *, device: s
             for i, blocks in enumerate(model.frames[row]):
                 path = staging / f"tile_{number:04d}_frame_{i:04d}.dds"
                 write_dds(path, np.ascontiguousarray(blocks).tobytes(), TILE, TILE)
+                written.append(path)
+        for row, number in enumerate(np.flatnonzero(model.kind == TileKind.VIDEO).tolist()):
+            for i, words in enumerate(model.video_levels[row]):
+                path = staging / f"tile_{number:04d}_frame_{i:04d}.dds"
+                write_dds(path, words.astype("<u4").tobytes(), TILE, TILE, fmt="R10G10B10A2_UNORM")
                 written.append(path)
         (staging / SHADER_FILE).write_bytes(decode_glsl(model).encode())
         write_exr(staging / FRAME_FILE, frame, half=False)
@@ -201,6 +207,10 @@ def _tiles(model: LightmapModel) -> tuple[list[dict[str, Any]], int]:
         elif kind == TileKind.FRAMES:
             least, greatest = model.ranges[row].swapaxes(0, 1)
             tile |= {"least": rounded(least), "greatest": rounded(greatest), "peak": rounded(greatest.max(1))}
+        elif kind == TileKind.VIDEO:
+            least, greatest = model.video_ranges[row].repeat(3, 1).reshape(-1, 2, 3).swapaxes(0, 1)
+            peak = rounded(model.video_peaks[row])
+            tile |= {"least": rounded(least), "greatest": rounded(greatest), "peak": peak}
         else:
             temporal = kind == TileKind.DYNAMIC
             net = (model.net if temporal else model.net_static)[row]

@@ -31,6 +31,8 @@ from wlm.lightmap.tiles import (
     valid_texels,
 )
 from wlm.lightmap.trainer import CPU_LANES
+from wlm.lightmap.video import encode_page
+from wlm.lightmap.video_packing import pages
 from wlm.lightmap.worker import Fitter, Piece
 from wlm.system import Meter, OnProgress
 from wlm.workers import Actors, Here, Processes, Workers, cores
@@ -80,12 +82,14 @@ def compress(
 
     Raises:
         WlmError: No such profile, setting, device, tile or cluster; a checkpoint that isn't of this fit; the fit
-            diverged; workers died again and again; or the settings ask for frames and the extra `frames` is missing.
+            diverged; workers died again and again; or the settings ask for frames or video and the extra for it is
+            missing.
         KeyboardInterrupt: Raised by `progress`, after the checkpoint, if there is one, has been written.
     """
     _devices(device, workers, cluster, 0)  # checked before the set is looked at
     fit = _Fit(lightmaps, Profile.load(profile).override(overrides), tiles, progress)
     fit.store_frames(progress)
+    fit.store_video(progress)
     batches = fit.batches(CPU_TILES if device == "cpu" else None)
     waiting = []
     for batch in batches:
@@ -247,7 +251,7 @@ class _Fit:
         warnings = ()
         if profile.frames == "auto" and framed.any() and (warning := missing_encoder(int(framed.sum()))):
             warnings, framed[:] = (f"{lightmaps.name}: {warning}",), False
-        self.kinds[framed] = TileKind.FRAMES
+        self.kinds[framed] = TileKind.VIDEO if profile.frames == "video" else TileKind.FRAMES
         kind = np.zeros(grid.count, np.uint8)
         kind[self.index] = self.kinds
         table = part_table(profile, kind, len(lightmaps.times))
@@ -263,7 +267,12 @@ class _Fit:
             kind=kind,
             constant=_constants(facts, len(lightmaps.times)),
             warnings=warnings,
-            **{name: np.zeros(part.shape, part.dtype) for name, part in table.items() if name != "constant"},
+            **{
+                # Those of any size are known when they are made.
+                name: np.zeros([size or 0 for size in part.shape], part.dtype)
+                for name, part in table.items()
+                if name != "constant"
+            },
         )
         self._mapped = np.flatnonzero(np.isin(self.kinds, (TileKind.STATIC, TileKind.DYNAMIC)))
         for name, kind in (("scale", TileKind.DYNAMIC), ("scale_static", TileKind.STATIC)):
@@ -316,6 +325,25 @@ class _Fit:
             self.model.frames[i], self.model.ranges[i] = parts
             if meter.due(i + 1):
                 meter.report(i + 1)
+
+    def store_video(self, progress: OnProgress | None) -> None:
+        """Encodes the tiles that are stored as video, and puts them into the model."""
+        model, profile, streams = self.model, self.profile, []
+        numbers = np.flatnonzero(model.kind == TileKind.VIDEO)
+        meter = Meter(progress, "video", len(numbers))
+        done = 0
+        for page in pages(model.kind, model.tile_columns, len(model.times)):
+            tiles = split(self._lightmaps, profile.gamma, page.numbers)
+            settings = profile.gamma, profile.video_quality, profile.video_speed
+            stream, ranges = encode_page(page, tiles.colour, tiles.mask, *settings)
+            model.video_ranges[np.searchsorted(numbers, page.numbers)] = ranges
+            streams.append(np.frombuffer(stream, np.uint8))
+            done += len(page.numbers)
+            if meter.due(done):
+                meter.report(done)
+        if streams:
+            model.video = np.concatenate(streams)
+            model.video_sizes = np.array([len(stream) for stream in streams], np.uint32)
 
     def batches(self, most: int | None = None) -> list[Batch]:
         """Batches of `BATCH_TEXELS`, of so many tiles at most and at least one; dynamic tiles first."""

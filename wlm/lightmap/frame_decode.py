@@ -1,6 +1,7 @@
-"""Tiles that are stored as frames, on a device."""
+"""Tiles that are stored as images, frames or video, on a device."""
 
 from collections.abc import Sequence
+from types import ModuleType
 
 import numpy as np
 import warp as wp
@@ -9,7 +10,7 @@ from wlm.errors import WlmError
 from wlm.formats import bc7_modes
 from wlm.lightmap.model import TILE, LightmapModel
 from wlm.lightmap.tiles import TileKind
-from wlm_kernels.lightmap import frames
+from wlm_kernels.lightmap import frames, video
 
 
 def inverse_of(bounds: np.ndarray) -> np.ndarray:
@@ -33,39 +34,32 @@ class HeldTiles:
         return [(i, self._row_of[number]) for i, number in enumerate(numbers) if number in self._row_of]
 
 
-class FrameTiles(HeldTiles):
-    """The frames of a model on a device.
+class ImageTiles(HeldTiles):
+    """Tiles with an image at each time.
 
     Attributes:
-        numbers: int [n], numbers of their tiles in the grid.
+        numbers: int [n], numbers of the tiles in the grid.
         device_bytes: Memory that they take up on the device, bytes.
     """
 
-    def __init__(self, model: LightmapModel, device: str) -> None:
-        """Uploads the frames.
+    def __init__(self, model: LightmapModel, kind: TileKind, greatest: np.ndarray, kernels: ModuleType) -> None:
+        """Finds the tiles of a kind.
+
+        Args:
+            model: The model.
+            kind: FRAMES or VIDEO.
+            greatest: float32 [n, T], their greatest colour.
+            kernels: The module that decodes them.
 
         Raises:
             WlmError: The model has none.
         """
-        super().__init__(np.flatnonzero(model.kind == TileKind.FRAMES))
+        super().__init__(np.flatnonzero(model.kind == kind))
         if not len(self.numbers):
-            raise WlmError(f"{model.name}: expected at least one tile of frames, found none")
-        self._axis, self._device = model.axis, device
-        self._greatest = model.ranges[:, :, 1].astype(np.float32).max(2)  # [n, T]
-        ends = model.ranges.astype(np.float32).reshape(-1, 2, 3)
-        words = np.ascontiguousarray(model.frames).view("<u8").reshape(-1, TILE // 4, TILE // 4, 2)
-        stored = frames.StoredFrames()
-        stored.blocks = wp.array(words, dtype=wp.uint64, device=device)
-        stored.least = wp.array(np.ascontiguousarray(ends[:, 0]), dtype=wp.vec3, device=device)
-        stored.span = wp.array(np.ascontiguousarray(ends[:, 1] - ends[:, 0]), dtype=wp.vec3, device=device)
-        stored.times, stored.gamma = len(model.times), model.profile.gamma
-        tables = frames.Tables()
-        tables.modes = wp.array(bc7_modes.MODES, dtype=int, device=device)
-        tables.partitions = wp.array(bc7_modes.PARTITIONS, dtype=wp.uint32, device=device)
-        tables.anchors = wp.array(bc7_modes.ANCHORS, dtype=int, device=device)
-        tables.shares = wp.array(bc7_modes.SHARES, dtype=int, device=device)
-        self._arguments = stored, tables
-        self.device_bytes = sum(array.capacity for array in (stored.blocks, stored.least, stored.span))
+            raise WlmError(f"{model.name}: expected at least one tile of {kind.name.lower()}, found none")
+        self._axis, self._greatest, self._kernels = model.axis, greatest, kernels
+        self._arguments: tuple[object, ...] = ()
+        self.device_bytes = 0
 
     def bounds(self, time: float) -> np.ndarray:
         """Bound of each tile, float32 [n]; between two times the larger."""
@@ -83,6 +77,58 @@ class FrameTiles(HeldTiles):
         """
         arguments = *self._arguments, *self._axis.neighbours(time), rows
         if inverse_peak is None:
-            frames.decode_radiance(*arguments, out)
+            self._kernels.decode_radiance(*arguments, out)
         else:
-            frames.decode_bytes(*arguments, inverse_peak, out)
+            self._kernels.decode_bytes(*arguments, inverse_peak, out)
+
+
+class FrameTiles(ImageTiles):
+    """The frames of a model on a device."""
+
+    def __init__(self, model: LightmapModel, device: str) -> None:
+        """Uploads the frames.
+
+        Raises:
+            WlmError: The model has none.
+        """
+        super().__init__(model, TileKind.FRAMES, model.ranges[:, :, 1].astype(np.float32).max(2), frames)
+        ends = model.ranges.astype(np.float32).reshape(-1, 2, 3)
+        words = np.ascontiguousarray(model.frames).view("<u8").reshape(-1, TILE // 4, TILE // 4, 2)
+        stored = frames.StoredFrames()
+        stored.blocks = wp.array(words, dtype=wp.uint64, device=device)
+        stored.least = wp.array(np.ascontiguousarray(ends[:, 0]), dtype=wp.vec3, device=device)
+        stored.span = wp.array(np.ascontiguousarray(ends[:, 1] - ends[:, 0]), dtype=wp.vec3, device=device)
+        stored.times, stored.gamma = len(model.times), model.profile.gamma
+        tables = frames.Tables()
+        tables.modes = wp.array(bc7_modes.MODES, dtype=int, device=device)
+        tables.partitions = wp.array(bc7_modes.PARTITIONS, dtype=wp.uint32, device=device)
+        tables.anchors = wp.array(bc7_modes.ANCHORS, dtype=int, device=device)
+        tables.shares = wp.array(bc7_modes.SHARES, dtype=int, device=device)
+        self._arguments = stored, tables
+        self.device_bytes = sum(array.capacity for array in (stored.blocks, stored.least, stored.span))
+
+
+class VideoTiles(ImageTiles):
+    """The unpacked video of a model on a device."""
+
+    def __init__(self, model: LightmapModel, device: str) -> None:
+        """Uploads the levels.
+
+        Raises:
+            WlmError: The model has none.
+        """
+        super().__init__(model, TileKind.VIDEO, model.video_peaks, video)
+        least, greatest = np.moveaxis(model.video_ranges.astype(np.float32), 2, 0).reshape(2, -1)
+        stored = video.StoredVideo()
+        stored.levels = wp.array(model.video_levels.reshape(-1, TILE, TILE), dtype=wp.uint32, device=device)
+        stored.least = wp.array(least, dtype=float, device=device)
+        stored.span = wp.array(greatest - least, dtype=float, device=device)
+        stored.times, stored.gamma = len(model.times), model.profile.gamma
+        self._arguments = (stored,)
+        self.device_bytes = sum(array.capacity for array in (stored.levels, stored.least, stored.span))
+
+
+def image_tiles(model: LightmapModel, device: str) -> list[ImageTiles]:
+    """The tiles of a model that are images, by kind; without those that it has none of."""
+    kinds = (TileKind.FRAMES, FrameTiles), (TileKind.VIDEO, VideoTiles)
+    return [make(model, device) for kind, make in kinds if (model.kind == kind).any()]

@@ -13,6 +13,7 @@ divides by the rounded values, so that rounding them costs nothing.
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -20,7 +21,8 @@ from pydantic import Field, model_validator
 
 from wlm.formats.exr import HALF_MAX
 from wlm.formats.parts import Part
-from wlm.lightmap.tiles import TILE, TileKind
+from wlm.lightmap.tiles import TILE, TileKind, valid_texels
+from wlm.lightmap.video_packing import WHITE, levels_of, unpack_video
 from wlm.lightmap.weights import packed_bytes
 from wlm.system import Model, Settings
 from wlm_kernels import mlp
@@ -64,9 +66,11 @@ class Profile(Settings):
         freeze_from: Fraction of the steps after which the maps are frozen and the network alone is trained.
         static_budget_db: See `wlm.lightmap.tiles.classify`.
         frames: Which tiles that are neither empty nor constant hold the lightmap of each time as BC7 rather than maps
-            and a network: "auto", where that takes no more bytes, "never" or "always".
+            and a network: "auto", where that takes no more bytes, "never" or "always". "video": all are an AV1 stream.
         frames_loss: Of these frames' rate-distortion optimisation: what the root mean square error of a block's texels
             may grow by, in squares, in levels of 255, to make the file smaller; 0 for none.
+        video_quality: Of video, 0 to 100; of 100 levels are as exact as 10 bits and the change of colours allow.
+        video_speed: Of its encoder, 0 (the smallest file, very slow) to 10.
     """
 
     FILES: ClassVar[str] = "lightmap"
@@ -92,8 +96,10 @@ class Profile(Settings):
     quantise_from: float = Field(0.5, ge=0.0, le=1.0)
     freeze_from: float = Field(0.95, ge=0.0, le=1.0)
     static_budget_db: float = Field(60.0, gt=0.0)
-    frames: Literal["auto", "never", "always"] = "auto"
+    frames: Literal["auto", "never", "always", "video"] = "auto"
     frames_loss: float = Field(0.2, ge=0.0, le=255.0)
+    video_quality: int = Field(96, ge=0, le=100)
+    video_speed: int = Field(3, ge=0, le=10)
 
     @model_validator(mode="after")
     def _stages_in_order(self) -> "Profile":
@@ -219,16 +225,17 @@ def decode_scale(codes: np.ndarray, gamma: float) -> np.ndarray:
 def part_table(profile: Profile, kind: np.ndarray, times: int) -> dict[str, Part]:
     """The arrays of a model, in the order of its file.
 
-    N_m tiles have maps (STATIC and DYNAMIC, by number), N_d of them temporal ones; N_c tiles are constant, and N_f
-    are frames.
+    N_m tiles have maps (STATIC and DYNAMIC, by number), N_d of them temporal ones; N_c tiles are constant, N_f are
+    frames and N_v video.
 
     Args:
         profile: The settings.
         kind: uint8 [tiles], as in `LightmapModel`.
         times: T.
     """
-    counted = TileKind.DYNAMIC, TileKind.STATIC, TileKind.CONSTANT, TileKind.FRAMES
-    dynamic, static, constant, framed = (int((kind == value).sum()) for value in counted)
+    counted = TileKind.DYNAMIC, TileKind.STATIC, TileKind.CONSTANT, TileKind.FRAMES, TileKind.VIDEO
+    dynamic, static, constant, framed, filmed = (int((kind == value).sum()) for value in counted)
+    streamed = None if filmed else 0  # of any size, where there are any
     mapped, r = dynamic + static, profile.uvt_resolution // 4
     plane = Part(np.uint8, (dynamic, profile.plane_rows, profile.plane_columns, 2))
     parameters, static_parameters = (mlp.parameter_count(profile.inputs(t), profile.hidden) for t in (True, False))
@@ -246,6 +253,9 @@ def part_table(profile: Profile, kind: np.ndarray, times: int) -> dict[str, Part
         "constant": Part((np.float16, np.float32), (constant, times, 3), least=0.0, most=HALF_MAX),
         "frames": Part(np.uint8, (framed, times, TILE // 4, TILE // 4, 16)),
         "ranges": Part(np.float16, (framed, times, 2, 3), least=0.0),
+        "video": Part(np.uint8, (streamed,)),
+        "video_sizes": Part(np.uint32, (streamed,)),
+        "video_ranges": Part(np.float16, (filmed, times, 2), least=0.0),
     }
 
 
@@ -271,6 +281,9 @@ class LightmapModel(Model):
         constant: Radiance of constant tiles: half floats, or float32 where one would be more than 1% off.
         frames: BC7 blocks of the tiles that are stored as frames, of any mode; black where no read reaches.
         ranges: Their least and greatest colour, in gamma space.
+        video: The streams of the tiles that are stored as video, see `wlm.lightmap.video`.
+        video_sizes: Bytes of each stream.
+        video_ranges: Colour of the tiles' levels 0 and 1, in gamma space.
         warnings: What the fit fell back on, one line each; not in the file.
     """
 
@@ -298,6 +311,9 @@ class LightmapModel(Model):
     constant: np.ndarray
     frames: np.ndarray
     ranges: np.ndarray
+    video: np.ndarray
+    video_sizes: np.ndarray
+    video_ranges: np.ndarray
     warnings: tuple[str, ...] = ()
 
     @property
@@ -323,6 +339,26 @@ class LightmapModel(Model):
         result[kinds == TileKind.DYNAMIC] = decode_scale(self.scale, self.profile.gamma)
         result[kinds == TileKind.STATIC] = self.scale_static
         return result
+
+    @cached_property
+    def video_levels(self) -> np.ndarray:
+        """The levels of the tiles of video, uint32 [N_v, T, 128, 128] as of `unpack_video`, decoded once.
+
+        Raises:
+            ValueError, WlmError: As `unpack_video`.
+        """
+        return unpack_video(self.video, self.video_sizes, self.kind, self.tile_columns, len(self.times))
+
+    @cached_property
+    def video_peaks(self) -> np.ndarray:
+        """The greatest colour of their valid texels, in gamma space, float32 [N_v, T]."""
+        peaks = np.zeros(self.video_ranges.shape[:2], np.float32)
+        for row, number in enumerate(np.flatnonzero(self.kind == TileKind.VIDEO).tolist()):
+            inside = valid_texels(self.mask, number)
+            if inside.any():
+                peaks[row] = levels_of(self.video_levels[row][:, inside]).max((1, 2))
+        least, greatest = np.moveaxis(self.video_ranges.astype(np.float32), 2, 0)
+        return least + peaks / np.float32(WHITE) * (greatest - least)
 
     @property
     def tile_columns(self) -> int:

@@ -7,7 +7,9 @@ at equal PSNR, since a mean of decibels gains as much from doubling the bytes of
 """
 
 import math
+from bisect import bisect_left
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -32,6 +34,8 @@ _PER_OCTAVE = 2.3  # dB for twice the bytes: 2.1 in the living room, 2.1 to 3 in
 _OCTAVES = 0.15  # between two sizes whose PSNR gives the figure of this scene
 _LEAST_PER_OCTAVE, _MOST_PER_OCTAVE = 1.0, 4.0
 _ROOM = 0.99  # of the largest size
+_QUALITIES = range(101)  # of video
+_VIDEO_SPEED = 6  # of its trials: 5% larger than at 4
 
 
 @dataclass(frozen=True)
@@ -39,7 +43,7 @@ class Choice:
     """What was chosen for a set.
 
     Attributes:
-        profile: The settings, with the resolution that was chosen.
+        profile: The settings, with the resolution that was chosen, or the quality of video.
         bpp: Expected, see `Report.bpp`.
         psnr: Expected, dB, see `Report.psnr`; None where no PSNR was asked for.
         limited: Whether the largest size holds it below the wanted PSNR.
@@ -65,6 +69,9 @@ def choose(
 ) -> Choice:
     """Chooses the resolution of F_uvt, in a quarter to a third of the time of the fit that follows.
 
+    Of video it chooses the quality, by bisection: the least that reaches the PSNR, the greatest that fits the size,
+    from up to seven encodings of the set, with both up to fourteen.
+
     Args:
         lightmaps: The set.
         profile: All other settings. No tile is stored as frames, whose size doesn't follow from maps.
@@ -82,9 +89,11 @@ def choose(
         if value is not None and not (math.isfinite(value) and value > 0):
             raise WlmError(f"{name}: expected a finite number above 0, got {value:g}")
     if profile.frames == "always":
-        raise WlmError(f"rate: expected a profile of networks, got {profile.name}, whose tiles are frames")
-    profile = profile.override({"frames": "never"})
+        raise WlmError(f"rate: expected a profile of networks or video, got {profile.name}, whose tiles are frames")
     options = {"seed": seed, "device": device, "workers": workers, "cluster": cluster, "progress": _renamed(progress)}
+    if profile.frames == "video":
+        return _choose_quality(lightmaps, profile, target_psnr, max_bpp, options)
+    profile = profile.override({"frames": "never"})
     search = _Search(lightmaps, profile, options)
     allowed = [r for r in RESOLUTIONS if max_bpp is None or search.bpp(r) <= _ROOM * max_bpp]
     if not allowed:
@@ -99,6 +108,40 @@ def choose(
     if short and max_bpp is None:
         raise WlmError(f"--target-psnr: expected at most {psnr:.1f} for profile {profile.name}, got {target_psnr:g}")
     return Choice(profile.override({"uvt_resolution": chosen}), search.bpp(chosen), psnr, short)
+
+
+def _choose_quality(
+    lightmaps: LightmapSet, profile: Profile, target_psnr: float | None, max_bpp: float | None, options: dict[str, Any]
+) -> Choice:
+    """Chooses the quality of video, see `choose`."""
+    device = options["device"] if options["cluster"] is None else "cpu"
+
+    @cache
+    def trial(quality: int) -> tuple[float, float]:
+        """Bits per texel and time, and PSNR, where it is asked for."""
+        changes = {"video_quality": quality, "video_speed": max(profile.video_speed, _VIDEO_SPEED)}
+        model = compress(lightmaps, profile.override(changes), **options)
+        if not len(model.video_ranges):
+            raise WlmError(f"{lightmaps.name}: no tile is more than a colour, so there is no size to choose")
+        bpp = bits_per_texel(model, lightmaps.mask, model.file_bytes())
+        if target_psnr is None:
+            return bpp, math.nan
+        return bpp, evaluate(model, lightmaps, device=device, metrics=("psnr",), views=0).psnr
+
+    fitting = len(_QUALITIES)
+    if max_bpp is not None:
+        fitting = bisect_left(_QUALITIES, True, key=lambda quality: trial(quality)[0] > _ROOM * max_bpp)
+        if fitting == 0:
+            least = trial(0)[0] / _ROOM
+            raise WlmError(f"--max-bpp: expected at least {least:.3f} for profile {profile.name}, got {max_bpp:g}")
+    best = fitting - 1
+    if target_psnr is None:
+        return Choice(profile.override({"video_quality": best}), trial(best)[0])
+    chosen = min(bisect_left(_QUALITIES[:fitting], True, key=lambda quality: trial(quality)[1] >= target_psnr), best)
+    bpp, psnr = trial(chosen)
+    if psnr < target_psnr and max_bpp is None:
+        raise WlmError(f"--target-psnr: expected at most {psnr:.1f} for profile {profile.name}, got {target_psnr:g}")
+    return Choice(profile.override({"video_quality": chosen}), bpp, psnr, psnr < target_psnr)
 
 
 @dataclass(frozen=True)

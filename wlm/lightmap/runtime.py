@@ -2,7 +2,8 @@
 
 `wlm.lightmap.Decoder` returns arrays on the host; these are for a renderer's loop. Each holds the tiles of one kind,
 gaps unfilled: a `StripDecoder`, or on CUDA a `MatrixDecoder` where networks are wide, an `ExactDecoder` of the static
-tiles and a `FrameDecoder` of those that are frames. `wlm.lightmap.page` puts them together to a texture of the map.
+tiles and a `FrameDecoder` each of those that are frames and video. `wlm.lightmap.page` puts them together to a texture
+of the map.
 """
 
 import numpy as np
@@ -11,7 +12,7 @@ import warp as wp
 from wlm import interop
 from wlm.errors import WlmError
 from wlm.lightmap.decode import StoredTiles, TimeTable, gelu_of, rgba
-from wlm.lightmap.frame_decode import FrameTiles, inverse_of
+from wlm.lightmap.frame_decode import FrameTiles, VideoTiles, inverse_of
 from wlm.lightmap.model import TILE, LightmapModel
 from wlm.lightmap.tiles import TileKind
 from wlm_kernels.lightmap import decode as lightmap_decode
@@ -181,25 +182,26 @@ class ExactDecoder(_TileDecoder):
 
 
 class FrameDecoder:
-    """The tiles that are stored as frames: one thread reads one texel of one or two blocks.
+    """The tiles that are stored as frames, or as video: one thread reads one texel of one or two images.
 
     Attributes:
         numbers: int [n], numbers of these tiles in the grid, in the order of `out`.
         out: `wp.array` uint32 [n, 128, 128], RGBA from the lowest byte, alpha 255; written by `decode`.
     """
 
-    def __init__(self, model: LightmapModel, device: str = "cpu") -> None:
-        """Uploads the model's frames and allocates all buffers; the time is the first stored one.
+    def __init__(self, model: LightmapModel, device: str = "cpu", kind: TileKind = TileKind.FRAMES) -> None:
+        """Uploads the images, video unpacked, and allocates all buffers; the time is the first stored one.
 
         Args:
             model: The model.
             device: "cpu", "cuda" or "cuda:N".
+            kind: FRAMES or VIDEO.
 
         Raises:
-            WlmError: No such device, or a model without frames.
+            WlmError: No such device, or a model without such tiles.
         """
         self.model, self.device = model, interop.check_device(device)
-        self._tiles = FrameTiles(model, self.device)
+        self._tiles = (VideoTiles if kind == TileKind.VIDEO else FrameTiles)(model, self.device)
         self.numbers = self._tiles.numbers
         count = len(self.numbers)
         self._rows = wp.array(np.arange(count, dtype=np.int32), dtype=int, device=self.device)

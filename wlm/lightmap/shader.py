@@ -45,7 +45,7 @@ _TEMPLATE = """\
 //   f_uvt  tile_NNNN_uvt.dds   BC7 volume, {resolution} x {resolution} x {slices}
 //   f_ut   tile_NNNN_ut.dds    RG8, {columns} x {rows}
 //   f_vt   tile_NNNN_vt.dds    RG8, {columns} x {rows}
-//   f_frame  tile_NNNN_frame_TTTT.dds  BC7, 128 x 128, of a tile of frames at stored time TTTT
+//   f_frame  tile_NNNN_frame_TTTT.dds  128 x 128, BC7 of a tile of frames, RGB10A2 of one of video, at stored time TTTT
 //
 // Networks. One float array holds those of all tiles: for each tile of weights.json in turn W1, b1, W2, b2, W3 and b3,
 // row by row; a tile's begins at its "network_offset". It is the storage buffer below, unless WLM_NET(i) is defined
@@ -145,7 +145,7 @@ vec3 wlm_decode_static(sampler2D f_uv, ivec2 texel, int offset, vec3 scale, vec3
     return wlm_finish(wlm_network(f, WLM_STATIC_INPUTS, offset), scale, shift, spread);
 }}
 
-// The same of a tile of "frames" at a stored time, whose "least" and "greatest" these are.
+// The same of a tile of "frames" or "video" at a stored time, whose "least" and "greatest" these are.
 vec3 wlm_decode_frame(sampler2D f_frame, ivec2 texel, vec3 least, vec3 greatest)
 {{
     vec4 level = texelFetch(f_frame, texel, 0);

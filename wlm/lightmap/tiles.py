@@ -137,6 +137,8 @@ class TileKind(IntEnum):
     """The full model."""
     FRAMES = 4
     """The lightmap of each time as BC7, see `wlm.lightmap.frames`."""
+    VIDEO = 5
+    """The lightmaps of all times as a part of an AV1 stream, see `wlm.lightmap.video`."""
 
 
 def split(lightmaps: LightmapSet, gamma: float, tiles: Sequence[int] | None = None) -> TileData:

@@ -21,6 +21,7 @@ _COLOURS = {
     TileKind.STATIC: (0.2, 0.8, 0.35),
     TileKind.DYNAMIC: (1.0, 0.45, 0.1),
     TileKind.FRAMES: (0.65, 0.35, 0.9),
+    TileKind.VIDEO: (0.95, 0.85, 0.2),
 }
 _NAMED = {
     TileKind.EMPTY: "grey",
@@ -28,6 +29,7 @@ _NAMED = {
     TileKind.STATIC: "green",
     TileKind.DYNAMIC: "orange",
     TileKind.FRAMES: "violet",
+    TileKind.VIDEO: "yellow",
 }
 
 

@@ -17,7 +17,7 @@ from wlm.lightmap.evaluation import count_kinds, psnr_of
 from wlm.lightmap.exporter import document
 from wlm.lightmap.model import LightmapModel
 from wlm.lightmap.shader import decode_glsl
-from wlm.lightmap.tiles import TileKind
+from wlm.lightmap.tiles import TileKind, valid_texels
 from wlm.system import Meter, OnProgress
 from wlm.texels import exposure, fill_gaps
 from wlm.web.page import Page, pack_triangles
@@ -62,6 +62,9 @@ def lightmap_page(
             arrays |= {f"{number}_{name}": getattr(model, name)[row] for name in ("uvt", "ut", "vt")}
     for row, number in enumerate(np.flatnonzero(model.kind == TileKind.FRAMES).tolist()):
         arrays[f"{number}_frames"] = model.frames[row]
+    for row, number in enumerate(np.flatnonzero(model.kind == TileKind.VIDEO).tolist()):
+        # The gaps' light is that of charts: what lies there packs better as nothing.
+        arrays[f"{number}_video"] = model.video_levels[row] * valid_texels(model.mask, number)
     profile, times = model.profile, model.times
     time = float(times[len(times) // 2])
     reference: dict[str, Any] | None = None

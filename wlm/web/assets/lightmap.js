@@ -85,7 +85,7 @@ class LightmapPage {
     this.programs = {
       dynamic: kinds.has('dynamic') && shader(MAIN_DYNAMIC),
       static: kinds.has('static') && shader(MAIN_STATIC),
-      frames: kinds.has('frames') && shader(MAIN_FRAMES),
+      images: (kinds.has('frames') || kinds.has('video')) && shader(MAIN_FRAMES),
       fill: shader(MAIN_FILL),
     };
     this.valid = this.#mask(page.array('valid', Uint8Array));
@@ -152,14 +152,19 @@ class LightmapPage {
       textures.u_ut = graphics.plain(columns, rows, two, bytes('ut'), gl.LINEAR, wrap);
       textures.u_vt = graphics.plain(columns, rows, two, bytes('vt'), gl.LINEAR, wrap);
     }
-    // Frames by their hour, uploaded when they are first seen.
+    // Images by their hour, uploaded when they are first seen.
     return {...tile, textures, frames: []};
   }
 
   #frame(tile, hour) {
-    const {graphics, page} = this, size = 128 * 128;
+    const {graphics, page} = this, {gl} = graphics, size = 128 * 128;
+    if (tile.kind === 'video') {
+      const words = () => page.array(`${tile.number}_video`, Uint32Array).subarray(size * hour, size * (hour + 1));
+      const form = [gl.RGB10_A2, gl.RGBA, gl.UNSIGNED_INT_2_10_10_10_REV];
+      return tile.frames[hour] ??= graphics.plain(128, 128, form, words(), gl.NEAREST);
+    }
     const bytes = () => page.array(`${tile.number}_frames`, Uint8Array).subarray(size * hour, size * (hour + 1));
-    return tile.frames[hour] ??= graphics.blocks(128, 128, 1, bytes(), graphics.gl.NEAREST);
+    return tile.frames[hour] ??= graphics.blocks(128, 128, 1, bytes(), gl.NEAREST);
   }
 
   // Valid texels from one bit each, the first the highest of its byte.
@@ -183,9 +188,9 @@ class LightmapPage {
       gl.disable(gl.SCISSOR_TEST);
       return;
     }
-    if (tile.kind === 'frames') {
+    if (tile.kind === 'frames' || tile.kind === 'video') {
       const {before, after, share} = now;
-      graphics.use(this.programs.frames, {
+      graphics.use(this.programs.images, {
         u_origin: origin, u_share: share, u_early: this.#frame(tile, before), u_late: this.#frame(tile, after),
         u_early_least: tile.least[before], u_early_greatest: tile.greatest[before],
         u_late_least: tile.least[after], u_late_greatest: tile.greatest[after],

@@ -1,0 +1,140 @@
+"""Tiles stored as video: the lightmaps of all times as one AV1 stream, the smallest on disk, unpacked when it is read.
+
+As in frames a texel is a level between the least and the greatest colour of its tile at its time, in gamma space:
+
+    colour = least + level (greatest - least),     radiance = colour ** gamma
+
+All three channels share the two, so that grey stays grey, and levels have 10 bits, as GPUs read them (R10G10B10A2). A
+texel can't be read without decoding its picture and those that it follows from: there is no random access, and what
+a GPU holds is the unpacked levels, 32 bits for a texel and time.
+
+A picture is a page of the map, up to 8 x 8 tiles: a stream for each tile would take 19% to 60% more. What lies beside
+the valid texels is filled smoothly, which costs next to nothing; decoders fill the gaps with charts' light anyway. The
+planes that are coded are luma, a green and an orange difference, in our own arithmetic: libavif's, in floats, loses 0.2
+to 0.4 dB, and is no part of AV1's standard, which is exact to the bit.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from wlm.formats.av1 import encode_av1
+from wlm.lightmap.frames import round_half
+from wlm.lightmap.tiles import TILE
+from wlm.lightmap.video_packing import EXTRA, MIDDLE, WHITE, Page, decode_levels
+from wlm.metrics import evaluate_frame
+from wlm.texels import fill_smoothly
+
+_TRIAL_SPEED = 6  # beyond it libaom is of another kind, which takes a quality for another
+_STEP = 4  # of the quality, for another point on the curve of PSNR over size
+
+
+def encode_levels(levels: np.ndarray, quality: int, speed: int, extra: str = EXTRA) -> bytes:
+    """Encodes levels as one stream.
+
+    Args:
+        levels: float32 [T, H, W, 3] in [0, 1].
+        quality, speed, extra: As for `wlm.formats.av1.encode_av1`.
+
+    Raises:
+        WlmError: The encoder is missing.
+    """
+    planes = np.empty(levels.shape, np.uint16)
+    for picture, out in zip(levels, planes, strict=True):
+        red, green, blue = np.moveaxis(picture * np.float32(WHITE), 2, 0)
+        luma = 0.25 * (red + blue) + 0.5 * green
+        for i, plane in enumerate((luma, green - luma + MIDDLE, 0.5 * (red - blue) + MIDDLE)):
+            out[..., i] = np.clip(plane + np.float32(0.5), 0, WHITE)
+    return encode_av1(planes, quality, speed, extra)
+
+
+def encode_page(
+    page: Page, colour: Sequence[np.ndarray], valid: Sequence[np.ndarray], gamma: float, quality: int, speed: int
+) -> tuple[bytes, np.ndarray]:
+    """Encodes a page, with the ranges that yield more for their bytes: those of each time, or those of all times.
+
+    Where hours are alike, levels that are relative to one range follow from each other; where they differ much, dark
+    ones lose their levels to bright ones. Which is better quick encodings say: one of either, and one more of another
+    quality, which says what PSNR the smaller would have at the size of the larger.
+
+    Args:
+        page: The page.
+        colour: Of its tiles float32 [T, 128, 128, 3], in gamma space.
+        valid: Of each bool [128, 128].
+        gamma: Of that space.
+        quality, speed: As for `encode_levels`.
+
+    Returns:
+        The stream, and the ranges of the tiles, half [n, T, 2], least and greatest.
+
+    Raises:
+        WlmError: The encoder is missing.
+    """
+    by_time = np.stack([_range_of(tile[:, inside]) for tile, inside in zip(colour, valid, strict=True)])
+    over_all = np.broadcast_to(np.stack([by_time[..., 0].min(1), by_time[..., 1].max(1)], 1)[:, None], by_time.shape)
+    count = by_time.shape[1]
+    if count == 1:
+        return _encoded(page, colour, valid, by_time, quality, speed), by_time
+    trial = max(speed, _TRIAL_SPEED)
+
+    def tried(ranges: np.ndarray, quality: int) -> tuple[float, float, bytes]:
+        """Octaves of the size, PSNR and stream of a trial."""
+        stream = _encoded(page, colour, valid, ranges, quality, trial)
+        levels = decode_levels(stream, count, *page.shape)
+        return float(np.log2(len(stream))), _psnr(page, colour, valid, ranges, levels, gamma), stream
+
+    both = [(*tried(ranges, quality), ranges) for ranges in (by_time, over_all)]
+    small, large = sorted(both, key=lambda result: result[0])
+    other = tried(small[3], quality + (_STEP if quality + _STEP <= 100 else -_STEP))
+    octaves = other[0] - small[0]
+    slope = (other[1] - small[1]) / octaves if octaves else 0.0
+    _, _, stream, ranges = small if small[1] + slope * (large[0] - small[0]) > large[1] else large
+    return stream if trial == speed else _encoded(page, colour, valid, ranges, quality, speed), ranges
+
+
+def _range_of(texels: np.ndarray) -> np.ndarray:
+    """Least and greatest of texels [T, K, 3] at each time, half [T, 2]."""
+    least, greatest = texels.min((1, 2)), texels.max((1, 2))
+    return np.stack([round_half(least, -np.inf), round_half(greatest, np.inf)], 1)
+
+
+def _encoded(
+    page: Page,
+    colour: Sequence[np.ndarray],
+    valid: Sequence[np.ndarray],
+    ranges: np.ndarray,
+    quality: int,
+    speed: int,
+) -> bytes:
+    """The stream of a page, relative to ranges [n, T, 2]."""
+    levels = np.zeros((ranges.shape[1], *page.shape, 3), np.float32)
+    inside = np.zeros(page.shape, bool)
+    for tile, mask, (low, high), window in zip(
+        colour, valid, ranges.astype(np.float32).transpose(0, 2, 1), page.windows(), strict=True
+    ):
+        span = np.where(high > low, high - low, np.float32(1.0))
+        inside[window] = mask
+        levels[:, *window] = np.clip((tile - low[:, None, None, None]) / span[:, None, None, None], 0.0, 1.0)
+    for picture in levels:
+        picture[...] = fill_smoothly(picture, inside)
+    return encode_levels(levels, quality, speed)
+
+
+def _psnr(
+    page: Page,
+    colour: Sequence[np.ndarray],
+    valid: Sequence[np.ndarray],
+    ranges: np.ndarray,
+    levels: np.ndarray,
+    gamma: float,
+) -> float:
+    """PSNR of a decoded page by the tiled protocol, dB; 0 where no tile has a score."""
+    scores = []
+    for tile, mask, (low, high), window in zip(
+        colour, valid, ranges.astype(np.float32).transpose(0, 2, 1), page.windows(), strict=True
+    ):
+        for t, original in enumerate(tile):
+            decoded = low[t] + levels[t, *window] * ((high[t] - low[t]) / np.float32(WHITE))
+            score = evaluate_frame(original**gamma, decoded**gamma, mask, TILE, ("psnr",)).psnr[0, 0]
+            scores.append(score)
+    return float(np.nanmean(scores)) if np.isfinite(scores).any() else 0.0
