@@ -101,16 +101,18 @@ def test_exact_decode(dynamic: bool, hidden: int, tmp_path: Path):
     _compile_all(lightmap_decode.exact_kernels(dynamic, hidden, "tanh"), tmp_path)
 
 
+@pytest.mark.parametrize("shared", [False, True])
 @pytest.mark.parametrize("hidden", _slow_but(16, WIDTHS))
-def test_strip_decode(hidden: int, tmp_path: Path):
+def test_strip_decode(hidden: int, shared: bool, tmp_path: Path):
     """Decoding four texels a thread."""
-    _compile_all(vars(lightmap_decode.strip_kernels(hidden, "fast")).values(), tmp_path)
+    _compile_all(vars(lightmap_decode.strip_kernels(hidden, "fast", shared)).values(), tmp_path)
 
 
+@pytest.mark.parametrize("shared", [False, True])
 @pytest.mark.parametrize("hidden", _slow_but(64, [16, 32, 48]))
-def test_matrix_decode(hidden: int, tmp_path: Path):
+def test_matrix_decode(hidden: int, shared: bool, tmp_path: Path):
     """Decoding on matrix units, which a GPU alone has."""
-    _compile_all(vars(matrix_decode.matrix_kernels(hidden)).values(), tmp_path)
+    _compile_all(vars(matrix_decode.matrix_kernels(hidden, shared)).values(), tmp_path)
 
 
 @pytest.mark.parametrize("latent", _slow_but(9, [1, 12, 32]))

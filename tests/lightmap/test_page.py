@@ -18,7 +18,7 @@ from wlm.texels import near_gaps
 from wlm_kernels.shared_exponent import pack_rgb9e5 as pack
 from wlm_kernels.shared_exponent import unpack_rgb9e5 as unpack
 
-KINDS = (3, 4, 2, 1, 0, 3)
+KINDS = (3, 4, 2, 1, 5, 3)
 
 
 @wp.kernel
@@ -54,15 +54,10 @@ def test_the_map_is_that_of_the_host(time, device):
     decoder = MapDecoder(model, device)
     decoder.set_time(time)
     decoder.decode()
-    expected, bounds = Decoder(model, device).frame(time), Decoder(model, device).frame_8bit(time)[1]
-    peak = np.repeat(np.repeat(bounds.reshape(2, 3), 128, 0), 128, 1)[: mask.shape[0], : mask.shape[1], None]
-    # What a gap holds comes from another tile at times.
-    peak = np.where(mask[..., None], peak, bounds.max())
-    gamma, share = model.profile.gamma, np.maximum(expected, 0) ** (1 / model.profile.gamma)
-    most = (
-        (share + (1.6 if time == 9.0 else 1.1) * peak / 255) ** gamma - expected + expected.max(2, keepdims=True) / 256
-    )
-    assert (np.abs(decoder.numpy() - expected) <= most).all()
+    expected = Decoder(model, device).frame(time)
+    step = expected.max(2, keepdims=True) / 256
+    # Half a step of each of both times and of their mixture.
+    assert (np.abs(decoder.numpy() - expected) <= (1.5 if time == 9.0 else 0.5) * step + 1e-6).all()
 
 
 def test_mips_hold_charts_alone(device):

@@ -72,14 +72,17 @@ class ImageTiles(HeldTiles):
         Args:
             time: Stored or between; there the radiance of both is mixed (eq. 2), whatever the model's networks do.
             rows: int [k], places in `numbers`.
-            out: vec3 [k, 128, 128], radiance; with `inverse_peak` uint32, as of `wlm_kernels.lightmap.frames`.
+            out: [k, 128, 128], radiance, vec3 or uint32 of RGB9E5; with `inverse_peak` uint32 of 8 bits, as of
+                `wlm_kernels.lightmap.frames`.
             inverse_peak: float [n], 1 / the bound of each tile.
         """
         arguments = *self._arguments, *self._axis.neighbours(time), rows
-        if inverse_peak is None:
-            self._kernels.decode_radiance(*arguments, out)
-        else:
+        if inverse_peak is not None:
             self._kernels.decode_bytes(*arguments, inverse_peak, out)
+        elif out.dtype == wp.uint32:
+            self._kernels.decode_shared(*arguments, out)
+        else:
+            self._kernels.decode_radiance(*arguments, out)
 
 
 class FrameTiles(ImageTiles):

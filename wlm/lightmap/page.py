@@ -1,7 +1,7 @@
 """A whole map at runtime as one texture that a renderer samples: RGB9E5 with mips, on the device.
 
-Tiles that were decoded to 8 bits have a bound each, so that a filter may not cross from one to the next. Here they lie
-in one texture of the same 32 bits a texel, with gaps filled over the whole map and mips of what is inside charts.
+Tiles of 8 bits have a bound each, so that a filter may not cross from one to the next. Here they lie in one texture of
+the same 32 bits a texel, with gaps filled over the whole map and mips of what is inside charts.
 """
 
 import numpy as np
@@ -45,13 +45,13 @@ class MapDecoder:
             raise WlmError(f"mips: expected 0 to {most} for a map of {model.width}x{model.height}, got {mips}")
         self.decoders: list[StripDecoder | MatrixDecoder | ExactDecoder | FrameDecoder] = []
         if (model.kind == TileKind.DYNAMIC).any():
-            self.decoders.append(fast_decoder(model, self.device))
+            self.decoders.append(fast_decoder(model, self.device, shared=True))
         if (model.kind == TileKind.STATIC).any():
-            self.decoders.append(ExactDecoder(model, self.device, kind=TileKind.STATIC))
-        if (model.kind == TileKind.FRAMES).any():
-            self.decoders.append(FrameDecoder(model, self.device))
+            self.decoders.append(ExactDecoder(model, self.device, kind=TileKind.STATIC, shared=True))
+        for kind in (TileKind.FRAMES, TileKind.VIDEO):
+            if (model.kind == kind).any():
+                self.decoders.append(FrameDecoder(model, self.device, kind, shared=True))
         self._corners = [self._places(decoder.numbers) for decoder in self.decoders]
-        self._bounds = [wp.empty(len(decoder.numbers), dtype=float, device=self.device) for decoder in self.decoders]
         self._times = TimeTable(model, self.device)
         self._constant = self._places(np.flatnonzero(model.kind == TileKind.CONSTANT))
         self._colours = wp.empty(len(self._constant), dtype=wp.vec3, device=self.device)
@@ -85,18 +85,17 @@ class MapDecoder:
             WlmError: It isn't finite.
         """
         before, after, share = self._times.neighbours(time)
-        for decoder, bounds in zip(self.decoders, self._bounds, strict=True):
+        for decoder in self.decoders:
             decoder.set_time(time)
-            bounds.assign(decoder.bounds)
         colours = self.model.constant.astype(np.float32)
         self._colours.assign((1.0 - share) * colours[:, before] + share * colours[:, after])
 
     def decode(self) -> None:
         """Decodes the map into `levels`: launches alone, no allocation, no wait; can be captured."""
         whole = self.levels[0]
-        for decoder, bounds, corners in zip(self.decoders, self._bounds, self._corners, strict=True):
+        for decoder, corners in zip(self.decoders, self._corners, strict=True):
             decoder.decode()
-            page.place(decoder.out, bounds, self.model.profile.gamma, corners, whole)
+            page.place(decoder.out, corners, whole)
         if len(self._constant):
             page.paint(self._colours, self._constant, TILE, whole)
         for i, (level, (target, source)) in enumerate(zip(self.levels, self._gaps, strict=True)):

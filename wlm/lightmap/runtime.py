@@ -1,4 +1,4 @@
-"""Decoding to 8 bits at runtime: everything stays on the device, and a decode is launches alone.
+"""Decoding to 32 bits a texel at runtime: everything stays on the device, and a decode is launches alone.
 
 `wlm.lightmap.Decoder` returns arrays on the host; these are for a renderer's loop. Each holds the tiles of one kind,
 gaps unfilled: a `StripDecoder`, or on CUDA a `MatrixDecoder` where networks are wide, an `ExactDecoder` of the static
@@ -11,6 +11,7 @@ import warp as wp
 
 from wlm import interop
 from wlm.errors import WlmError
+from wlm.formats.shared_exponent import unpack_rgb9e5
 from wlm.lightmap.decode import StoredTiles, TimeTable, gelu_of, rgba
 from wlm.lightmap.frame_decode import FrameTiles, VideoTiles, inverse_of
 from wlm.lightmap.model import TILE, LightmapModel
@@ -22,7 +23,8 @@ from wlm_kernels.lightmap import matrix_decode, output
 class _TileDecoder:
     """The tiles of one kind on a device, and the time at which they are decoded."""
 
-    def __init__(self, model: LightmapModel, device: str, gelu: str | None, kind: TileKind) -> None:
+    def __init__(self, model: LightmapModel, device: str, gelu: str | None, kind: TileKind, shared: bool) -> None:
+        self.shared = shared
         self.model, self.device, self.gelu = model, interop.check_device(device), gelu_of(model, gelu)
         self._stored = StoredTiles(model, kind, self.device)
         self.numbers = self._stored.numbers
@@ -62,17 +64,21 @@ class _TileDecoder:
             self._launch(early, self._early)
             self._launch(late, self._late)
             words = [array.reshape((len(self.numbers), -1)) for array in (self._early, self._late, self.out)]
+            if self.shared:
+                output.blend_shared(*(word.flatten() for word in words[:2]), self._reads[1][1], words[2].flatten())
+                return
             inverse = early.inverse_peak, late.inverse_peak
             share, gamma = self._reads[1][1], self.model.profile.gamma
             output.blend(*words[:2], *inverse, self._stored.places, share, gamma, words[2])
 
     def numpy(self) -> np.ndarray:
-        """The last decode on the host, uint8 [n, 128, 128, 4]."""
-        return rgba(self.out)
+        """The last decode on the host, uint8 [n, 128, 128, 4]; of RGB9E5 linear radiance, float32 [n, 128, 128, 3]."""
+        return unpack_rgb9e5(self.out.numpy()) if self.shared else rgba(self.out)
 
     @property
     def bounds(self) -> np.ndarray:
-        """What 255 stands for in gamma space, float32 [n]: radiance = (byte / 255 * bound) ** gamma."""
+        """What 255 stands for in gamma space where texels have 8 bits, float32 [n]: radiance = (byte / 255 * bound) **
+        gamma."""
         return self._bounds.copy()
 
 
@@ -81,24 +87,27 @@ class StripDecoder(_TileDecoder):
 
     Attributes:
         numbers: int [n], numbers of the dynamic tiles in the grid, in the order of `out`.
-        out: `wp.array` uint32 [n, 128, 128], RGBA from the lowest byte, alpha 255; written by `decode`.
+        out: `wp.array` uint32 [n, 128, 128], RGBA from the lowest byte, alpha 255, or RGB9E5; written by `decode`.
         gelu: The GELU in use.
     """
 
-    def __init__(self, model: LightmapModel, device: str = "cpu", gelu: str | None = None) -> None:
+    def __init__(
+        self, model: LightmapModel, device: str = "cpu", gelu: str | None = None, shared: bool = False
+    ) -> None:
         """Uploads the model's dynamic tiles and allocates all buffers; the time is the first stored one.
 
         Args:
             model: The model.
             device: "cpu", "cuda" or "cuda:N".
             gelu: Another GELU than the model's, see `wlm_kernels.mlp`; None: the model's.
+            shared: Texels are linear radiance with a shared exponent (RGB9E5) rather than 8 bits over a bound.
 
         Raises:
             WlmError: No such device or GELU, or a model without dynamic tiles.
         """
-        super().__init__(model, device, gelu, TileKind.DYNAMIC)
+        super().__init__(model, device, gelu, TileKind.DYNAMIC, shared)
         n, resolution = len(self.numbers), model.profile.uvt_resolution
-        self._kernels = lightmap_decode.strip_kernels(model.profile.hidden, self.gelu)
+        self._kernels = lightmap_decode.strip_kernels(model.profile.hidden, self.gelu, shared)
         self._scratch = (
             wp.empty((n, resolution, resolution), dtype=wp.vec4, device=self.device),
             wp.empty((n, model.profile.hidden, TILE), dtype=float, device=self.device),
@@ -118,12 +127,13 @@ class MatrixDecoder(_TileDecoder):
         gelu: "fast".
     """
 
-    def __init__(self, model: LightmapModel, device: str = "cuda") -> None:
+    def __init__(self, model: LightmapModel, device: str = "cuda", shared: bool = False) -> None:
         """Uploads the model's dynamic tiles and allocates all buffers; the time is the first stored one.
 
         Args:
             model: The model, of a hidden width that is a multiple of 16.
             device: "cuda" or "cuda:N".
+            shared: As of `StripDecoder`.
 
         Raises:
             WlmError: No such device, another width, or a model without dynamic tiles.
@@ -133,9 +143,9 @@ class MatrixDecoder(_TileDecoder):
             raise WlmError("device: expected cuda for the matrix path, got cpu")
         if hidden % 16:
             raise WlmError(f"hidden: expected a multiple of 16 for the matrix path, got {hidden}")
-        super().__init__(model, name, "fast", TileKind.DYNAMIC)
+        super().__init__(model, name, "fast", TileKind.DYNAMIC, shared)
         n, resolution = len(self.numbers), model.profile.uvt_resolution
-        self._kernels = matrix_decode.matrix_kernels(hidden)
+        self._kernels = matrix_decode.matrix_kernels(hidden, shared)
         self._scratch = (
             wp.empty((n, resolution, resolution), dtype=wp.vec4, device=self.device),
             *(wp.empty((n, TILE), dtype=wp.vec2, device=self.device) for _ in range(2)),
@@ -151,7 +161,7 @@ class ExactDecoder(_TileDecoder):
 
     Attributes:
         numbers: int [n], numbers of the tiles of that kind in the grid, in the order of `out`.
-        out: `wp.array` uint32 [n, 128, 128], RGBA from the lowest byte, alpha 255; written by `decode`.
+        out: `wp.array` uint32 [n, 128, 128], RGBA from the lowest byte, alpha 255, or RGB9E5; written by `decode`.
         gelu: The GELU in use.
     """
 
@@ -161,14 +171,16 @@ class ExactDecoder(_TileDecoder):
         device: str = "cpu",
         gelu: str | None = None,
         kind: TileKind = TileKind.DYNAMIC,
+        shared: bool = False,
     ) -> None:
         """Uploads the model's tiles of one kind; the other arguments and errors are those of `StripDecoder`.
 
         Args:
             kind: STATIC or DYNAMIC.
         """
-        super().__init__(model, device, gelu, kind)
-        self._kernel = lightmap_decode.exact_kernels(kind == TileKind.DYNAMIC, model.profile.hidden, self.gelu)[1]
+        super().__init__(model, device, gelu, kind, shared)
+        kernels = lightmap_decode.exact_kernels(kind == TileKind.DYNAMIC, model.profile.hidden, self.gelu)
+        self._kernel = kernels[1 + shared]
 
     def _launch(self, state: lightmap_decode.TimeState, out: wp.array) -> None:
         stored = self._stored
@@ -186,21 +198,24 @@ class FrameDecoder:
 
     Attributes:
         numbers: int [n], numbers of these tiles in the grid, in the order of `out`.
-        out: `wp.array` uint32 [n, 128, 128], RGBA from the lowest byte, alpha 255; written by `decode`.
+        out: `wp.array` uint32 [n, 128, 128], RGBA from the lowest byte, alpha 255, or RGB9E5; written by `decode`.
     """
 
-    def __init__(self, model: LightmapModel, device: str = "cpu", kind: TileKind = TileKind.FRAMES) -> None:
+    def __init__(
+        self, model: LightmapModel, device: str = "cpu", kind: TileKind = TileKind.FRAMES, shared: bool = False
+    ) -> None:
         """Uploads the images, video unpacked, and allocates all buffers; the time is the first stored one.
 
         Args:
             model: The model.
             device: "cpu", "cuda" or "cuda:N".
             kind: FRAMES or VIDEO.
+            shared: As of `StripDecoder`.
 
         Raises:
             WlmError: No such device, or a model without such tiles.
         """
-        self.model, self.device = model, interop.check_device(device)
+        self.model, self.device, self.shared = model, interop.check_device(device), shared
         self._tiles = (VideoTiles if kind == TileKind.VIDEO else FrameTiles)(model, self.device)
         self.numbers = self._tiles.numbers
         count = len(self.numbers)
@@ -225,20 +240,24 @@ class FrameDecoder:
 
     def decode(self) -> None:
         """Decodes all tiles into `out`: launches alone, no allocation, no wait; can be captured."""
-        self._tiles.decode(self._time, self._rows, self.out, self._inverse)
+        self._tiles.decode(self._time, self._rows, self.out, None if self.shared else self._inverse)
 
     def numpy(self) -> np.ndarray:
-        """The last decode on the host, uint8 [n, 128, 128, 4]."""
-        return rgba(self.out)
+        """The last decode on the host, uint8 [n, 128, 128, 4]; of RGB9E5 linear radiance, float32 [n, 128, 128, 3]."""
+        return unpack_rgb9e5(self.out.numpy()) if self.shared else rgba(self.out)
 
     @property
     def bounds(self) -> np.ndarray:
-        """What 255 stands for in gamma space, float32 [n]: radiance = (byte / 255 * bound) ** gamma."""
+        """What 255 stands for in gamma space where texels have 8 bits, float32 [n]: radiance = (byte / 255 * bound) **
+        gamma."""
         return self._bounds.copy()
 
 
-def fast_decoder(model: LightmapModel, device: str = "cpu") -> StripDecoder | MatrixDecoder:
+def fast_decoder(model: LightmapModel, device: str = "cpu", shared: bool = False) -> StripDecoder | MatrixDecoder:
     """The fastest decoder of a model's dynamic tiles: on CUDA a `MatrixDecoder`, where its width and GELU allow it.
+
+    Args:
+        model, device, shared: As of `StripDecoder`.
 
     Raises:
         WlmError: As `StripDecoder`.
@@ -246,5 +265,5 @@ def fast_decoder(model: LightmapModel, device: str = "cpu") -> StripDecoder | Ma
     device = interop.check_device(device)
     tanh = device != "cpu" and model.profile.gelu == "tanh"
     if tanh and model.profile.hidden % 16 == 0:
-        return MatrixDecoder(model, device)
-    return StripDecoder(model, device, "fast" if tanh else None)
+        return MatrixDecoder(model, device, shared)
+    return StripDecoder(model, device, "fast" if tanh else None, shared)

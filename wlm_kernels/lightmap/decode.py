@@ -18,6 +18,7 @@ from wlm_kernels import mlp
 from wlm_kernels.interpolate import axis_index, cell, fraction
 from wlm_kernels.lightmap.blocks import bits7, byte_mix, index_level, stored_texel
 from wlm_kernels.lightmap.features import CENTRE, STATIC_INPUTS, TEMPORAL_INPUTS
+from wlm_kernels.shared_exponent import pack_rgb9e5
 
 
 @wp.struct
@@ -128,8 +129,19 @@ def finish_bytes(time: TimeState, n: int, y: wp.vec3) -> wp.uint32:
     return pack(wp.vec4ub(finish_byte(c[0], p), finish_byte(c[1], p), finish_byte(c[2], p), wp.uint8(255)))
 
 
+@wp.func
+def finish_shared(time: TimeState, n: int, y: wp.vec3) -> wp.uint32:
+    """Linear radiance as RGB9E5."""
+    return pack_rgb9e5(finish_radiance(time, n, y))
+
+
+def finish_words(shared: bool) -> Any:
+    """What makes words of a network's output: RGB9E5, or 8 bits over a bound."""
+    return finish_shared if shared else finish_bytes
+
+
 @functools.cache
-def exact_kernels(temporal: bool, hidden: int, gelu: str) -> tuple[Any, Any]:
+def exact_kernels(temporal: bool, hidden: int, gelu: str) -> tuple[Any, Any, Any]:
     """Builds (once) the kernels that decode whole tiles, one texel per thread.
 
     Args:
@@ -140,7 +152,8 @@ def exact_kernels(temporal: bool, hidden: int, gelu: str) -> tuple[Any, Any]:
     Returns:
         Two kernels over (tiles, 128, 128). Their inputs are `Stored`, hidden vecH [N, I + H + 2], output vec3
         [N, H + 1], `TimeState`, places int [N] (of each tile in `TimeState`) and tiles int [n]. Their output is
-        [n, 128, 128]: linear radiance as vec3, or 8-bit colour as uint32, RGBA from the lowest byte.
+        [n, 128, 128]: linear radiance as vec3; 8-bit colour as uint32, RGBA from the lowest byte; or linear radiance as
+        uint32, RGB9E5.
     """
     inputs = TEMPORAL_INPUTS if temporal else STATIC_INPUTS
     centred = 12 if temporal else 4
@@ -197,7 +210,8 @@ def exact_kernels(temporal: bool, hidden: int, gelu: str) -> tuple[Any, Any]:
 
         return decode
 
-    return decode_kernel(wp.vec3, finish_radiance), decode_kernel(wp.uint32, finish_bytes)
+    words = (decode_kernel(wp.uint32, finish_words(shared)) for shared in (False, True))
+    return decode_kernel(wp.vec3, finish_radiance), *words
 
 
 @wp.kernel(enable_backward=False)
@@ -245,7 +259,7 @@ class StripKernels:
         tiles: wp.array,
         out: wp.array,
     ) -> None:
-        """Decodes tiles to 8-bit colour at one time.
+        """Decodes tiles to words at one time.
 
         Args:
             stored: Dynamic tiles.
@@ -257,7 +271,7 @@ class StripKernels:
             rows: vec2 [N, 128], scratch.
             places: int [N], each tile's place in `time`.
             tiles: int [n], the tiles to decode. The scratch of all N is filled.
-            out: uint32 [n, 128, 128], RGBA from the lowest byte.
+            out: uint32 [n, 128, 128]: colour in 8 bits, RGBA from the lowest byte, or radiance as RGB9E5.
         """
         device = out.device
         wp.launch(frame_volume, volume.shape, inputs=[stored, time.tau], outputs=[volume], device=device)
@@ -311,14 +325,16 @@ STRIP_BOUNDS = (128, 3)  # threads of a block, blocks of a multiprocessor: 168 r
 
 
 @functools.cache
-def strip_kernels(hidden: int, gelu: str) -> StripKernels:
+def strip_kernels(hidden: int, gelu: str, shared: bool = False) -> StripKernels:
     """Builds (once) the runtime path for dynamic tiles of a hidden width.
 
     Args:
         hidden: H, width of the hidden layers.
         gelu: One of `mlp.GELUS`.
+        shared: Whether they write RGB9E5 rather than 8 bits.
     """
     net = mlp.kernels(TEMPORAL_INPUTS, hidden, gelu)
+    finish = finish_words(shared)
     units, vec_hidden, act = net.hidden, net.vec_hidden, net.act
     options = {"enable_backward": False}
 
@@ -437,9 +453,9 @@ def strip_kernels(hidden: int, gelu: str) -> StripKernels:
             y1 += colour * k1[c]
             y2 += colour * k2[c]
             y3 += colour * k3[c]
-        out[i, y, x] = finish_bytes(time, place, y0)
-        out[i, y + 1, x] = finish_bytes(time, place, y1)
-        out[i, y + 2, x] = finish_bytes(time, place, y2)
-        out[i, y + 3, x] = finish_bytes(time, place, y3)
+        out[i, y, x] = finish(time, place, y0)
+        out[i, y + 1, x] = finish(time, place, y1)
+        out[i, y + 2, x] = finish(time, place, y2)
+        out[i, y + 3, x] = finish(time, place, y3)
 
     return StripKernels(hidden, vec_hidden, frame_lines, decode)

@@ -7,6 +7,7 @@ little-endian bytes. The format's tables are arrays (`wlm.formats.bc7_modes` has
 import warp as wp
 
 from wlm_kernels.lightmap.decode import finish_byte, pack
+from wlm_kernels.shared_exponent import pack_rgb9e5
 
 wp.set_module_options({"enable_backward": False})
 
@@ -209,6 +210,22 @@ def _decode_bytes(
     )
 
 
+@wp.kernel
+def _decode_shared(
+    # in:
+    stored: StoredFrames,
+    tables: Tables,
+    early: int,
+    late: int,
+    share: float,
+    tiles: wp.array1d[int],
+    # out:
+    out: wp.array3d[wp.uint32],
+):
+    i, y, x = wp.tid()
+    out[i, y, x] = pack_rgb9e5(frame_radiance(stored, tables, early, late, share, tiles[i], y, x))
+
+
 def decode_radiance(stored, tables, early: int, late: int, share: float, tiles, out) -> None:
     """Decodes tiles to linear radiance.
 
@@ -233,3 +250,14 @@ def decode_bytes(stored, tables, early: int, late: int, share: float, tiles, inv
     """
     inputs = [stored, tables, early, late, share, tiles, inverse_peak]
     wp.launch(_decode_bytes, out.shape, inputs=inputs, outputs=[out], device=out.device)
+
+
+def decode_shared(stored, tables, early: int, late: int, share: float, tiles, out) -> None:
+    """Decodes tiles to linear radiance as RGB9E5.
+
+    Args:
+        stored, tables, early, late, share, tiles: As for `decode_radiance`.
+        out: uint32 [n, 128, 128], written.
+    """
+    inputs = [stored, tables, early, late, share, tiles]
+    wp.launch(_decode_shared, out.shape, inputs=inputs, outputs=[out], device=out.device)

@@ -17,7 +17,7 @@ from wlm_kernels.lightmap.decode import (
     Stored,
     TimeState,
     centred_texel,
-    finish_bytes,
+    finish_words,
     frame_volume,
     frame_volume_at,
     stored_plane_at,
@@ -68,7 +68,7 @@ class MatrixKernels:
         tiles: wp.array,
         out: wp.array,
     ) -> None:
-        """Decodes tiles to 8-bit colour at one time, on CUDA.
+        """Decodes tiles to words at one time, on CUDA.
 
         Args:
             stored: Dynamic tiles.
@@ -79,7 +79,7 @@ class MatrixKernels:
             ut, vt: vec2 [N, 128], scratch.
             places: int [N], each tile's place in `time`.
             tiles: int [n], the tiles to decode. The scratch of all N is filled.
-            out: uint32 [n, 128, 128], RGBA from the lowest byte.
+            out: uint32 [n, 128, 128]: colour in 8 bits, RGBA from the lowest byte, or radiance as RGB9E5.
         """
         device = out.device
         wp.launch(frame_volume, volume.shape, inputs=[stored, time.tau], outputs=[volume], device=device)
@@ -95,11 +95,12 @@ class MatrixKernels:
 
 
 @functools.cache
-def matrix_kernels(hidden: int) -> MatrixKernels:
+def matrix_kernels(hidden: int, shared: bool = False) -> MatrixKernels:
     """Builds (once) the path of a hidden width.
 
     Args:
         hidden: H, a multiple of 16.
+        shared: Whether they write RGB9E5 rather than 8 bits.
 
     Raises:
         ValueError: Another width.
@@ -107,6 +108,7 @@ def matrix_kernels(hidden: int) -> MatrixKernels:
     if hidden % _STEP or hidden < _STEP:
         raise ValueError(f"hidden: expected a multiple of {_STEP}, got {hidden}")
     vec_in, vec_hidden = wp.types.vector(TEMPORAL_INPUTS, float), wp.types.vector(hidden, float)
+    finish = finish_words(shared)
     constants = {"H": hidden, "NT": hidden // 8, "KT": hidden // _STEP}
 
     code = native_source(__package__, "matrix_units") + native_source(__package__, "matrix_forward", **constants)
@@ -155,6 +157,6 @@ def matrix_kernels(hidden: int) -> MatrixKernels:
             for c in range(2):
                 f[8 + c] = across[c]
                 f[10 + c] = down[c]
-            out[i, y, x] = finish_bytes(time, place, forward(hidden, output, n, wp.where(r == 0, 1, 0), f))
+            out[i, y, x] = finish(time, place, forward(hidden, output, n, wp.where(r == 0, 1, 0), f))
 
     return MatrixKernels(hidden, decode)

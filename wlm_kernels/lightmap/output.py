@@ -8,6 +8,8 @@ Read first: `wlm.lightmap.decode.Decoder.tiles_8bit`, the same on the host.
 
 import warp as wp
 
+from wlm_kernels.shared_exponent import pack_rgb9e5, unpack_rgb9e5
+
 wp.set_module_options({"enable_backward": False})
 
 
@@ -56,6 +58,19 @@ def _blend(
     out[i, j] = word
 
 
+@wp.kernel
+def _blend_shared(
+    # in:
+    early: wp.array1d[wp.uint32],
+    late: wp.array1d[wp.uint32],
+    share: float,
+    # out:
+    out: wp.array1d[wp.uint32],
+):
+    i = wp.tid()
+    out[i] = pack_rgb9e5((1.0 - share) * unpack_rgb9e5(early[i]) + share * unpack_rgb9e5(late[i]))
+
+
 def blend(early, late, early_inverse, late_inverse, places, share: float, gamma: float, out) -> None:
     """Mixes two decodes in radiance (neural-dynamic-gi, eq. 2).
 
@@ -69,3 +84,14 @@ def blend(early, late, early_inverse, late_inverse, places, share: float, gamma:
     """
     inputs = [early, late, early_inverse, late_inverse, places, share, gamma]
     wp.launch(_blend, out.shape, inputs=inputs, outputs=[out], device=out.device)
+
+
+def blend_shared(early, late, share: float, out) -> None:
+    """Mixes two decodes to RGB9E5 in radiance (neural-dynamic-gi, eq. 2).
+
+    Args:
+        early, late: uint32 [n], texels at two stored times.
+        share: Of the later time, 0 to 1.
+        out: uint32 [n], written.
+    """
+    wp.launch(_blend_shared, out.shape, inputs=[early, late, share], outputs=[out], device=out.device)

@@ -1,14 +1,10 @@
-"""A map as one texture of RGB9E5 texels with mips, from tiles that were decoded to 8 bits.
-
-Tiles are uint32 [n, 128 * 128], RGBA from the lowest byte, each with a bound of its own: radiance is
-(byte / 255 * bound) ** gamma. The texture has one scale throughout, so that a filter may cross tiles.
+"""A map as one texture of RGB9E5 texels with mips, from decoded tiles.
 
 Read first: `wlm.lightmap.page.MapDecoder`.
 """
 
 import warp as wp
 
-from wlm_kernels.lightmap.output import byte_at
 from wlm_kernels.shared_exponent import pack_rgb9e5, unpack_rgb9e5
 
 wp.set_module_options({"enable_backward": False})
@@ -18,8 +14,6 @@ wp.set_module_options({"enable_backward": False})
 def _place(
     # in:
     tiles: wp.array3d[wp.uint32],
-    bounds: wp.array1d[float],
-    gamma: float,
     corners: wp.array1d[wp.vec2i],
     # out:
     page: wp.array2d[wp.uint32],
@@ -28,15 +22,7 @@ def _place(
     y = corners[n][0] + i
     x = corners[n][1] + j
     if y < page.shape[0] and x < page.shape[1]:
-        word = tiles[n, i, j]
-        scale = bounds[n] / 255.0
-        page[y, x] = pack_rgb9e5(
-            wp.vec3(
-                wp.pow(byte_at(word, 0) * scale, gamma),
-                wp.pow(byte_at(word, 1) * scale, gamma),
-                wp.pow(byte_at(word, 2) * scale, gamma),
-            )
-        )
+        page[y, x] = tiles[n, i, j]
 
 
 @wp.kernel
@@ -90,17 +76,15 @@ def _fill(
     page[target[g][0], target[g][1]] = page[source[g][0], source[g][1]]
 
 
-def place(tiles, bounds, gamma: float, corners, page) -> None:
+def place(tiles, corners, page) -> None:
     """Puts decoded tiles into the texture.
 
     Args:
-        tiles: uint32 [n, 128, 128], RGBA.
-        bounds: float [n], what 255 stands for in gamma space.
-        gamma: Of the colours.
+        tiles: uint32 [n, 128, 128], RGB9E5.
         corners: vec2i [n], row and column of each tile's first texel; what lies outside the map is left out.
         page: uint32 [H, W], changed.
     """
-    wp.launch(_place, tiles.shape, inputs=[tiles, bounds, gamma, corners], outputs=[page], device=page.device)
+    wp.launch(_place, tiles.shape, inputs=[tiles, corners], outputs=[page], device=page.device)
 
 
 def paint(colours, corners, side: int, page) -> None:

@@ -8,6 +8,7 @@ import warp as wp
 
 from wlm_kernels.lightmap.decode import finish_byte, pack
 from wlm_kernels.lightmap.frames import power
+from wlm_kernels.shared_exponent import pack_rgb9e5
 
 wp.set_module_options({"enable_backward": False})
 
@@ -86,6 +87,21 @@ def _decode_bytes(
     )
 
 
+@wp.kernel
+def _decode_shared(
+    # in:
+    stored: StoredVideo,
+    early: int,
+    late: int,
+    share: float,
+    tiles: wp.array1d[int],
+    # out:
+    out: wp.array3d[wp.uint32],
+):
+    i, y, x = wp.tid()
+    out[i, y, x] = pack_rgb9e5(video_radiance(stored, early, late, share, tiles[i], y, x))
+
+
 def decode_radiance(stored, early: int, late: int, share: float, tiles, out) -> None:
     """Decodes tiles to linear radiance.
 
@@ -109,3 +125,14 @@ def decode_bytes(stored, early: int, late: int, share: float, tiles, inverse_pea
     """
     inputs = [stored, early, late, share, tiles, inverse_peak]
     wp.launch(_decode_bytes, out.shape, inputs=inputs, outputs=[out], device=out.device)
+
+
+def decode_shared(stored, early: int, late: int, share: float, tiles, out) -> None:
+    """Decodes tiles to linear radiance as RGB9E5.
+
+    Args:
+        stored, early, late, share, tiles: As for `decode_radiance`.
+        out: uint32 [n, 128, 128], written.
+    """
+    inputs = [stored, early, late, share, tiles]
+    wp.launch(_decode_shared, out.shape, inputs=inputs, outputs=[out], device=out.device)
