@@ -107,6 +107,7 @@ def evaluate(
     views: int = VIEWS,
     progress: OnProgress | None = None,
     file_bytes: int | None = None,
+    peak: float | None = None,
 ) -> Report:
     """Decodes every stored time, and times between them, from the stored bytes and compares them with the input.
 
@@ -120,6 +121,8 @@ def evaluate(
         views: Views of the set's mesh, of "seen"; 0 for none. Without a mesh there are none.
         progress: Called about twice a second.
         file_bytes: Size of the model's file; None: that of the file that it would be saved to.
+        peak: What errors are relative to where the set isn't light, see `wlm.metrics.evaluate_frame`; then no light is
+            looked for that was lost. None: the range of each tile at each time.
 
     Returns:
         The report.
@@ -136,15 +139,15 @@ def evaluate(
     meter = Meter(progress, "score", len(model.times))
     plain = [metric for metric in metrics if metric != "seen"]
     drawn, warnings = views_of(lightmaps, views if "seen" in metrics else 0, device=device)
-    tally = Tally(lightmaps, mask, decoder.frame, drawn, model.name)
+    tally = Tally(lightmaps, mask, decoder.frame, drawn, model.name, peak)
     frames, lost = [], LostLight()
     for i, stamp in enumerate(model.times):
         name, decoded = f"{model.name} at {stamp:g}", decoder.frame(stamp)
         inside = mask & lightmaps.valid(i)
-        frames.append(evaluate_frame(lightmaps.frames[i], decoded, inside, TILE, plain, name=name))
+        frames.append(evaluate_frame(lightmaps.frames[i], decoded, inside, TILE, plain, name=name, peak=peak))
         if "seen" in metrics:
             tally.add(i, decoded, frames[i])
-        for tile, window in _windows(model):
+        for tile, window in _windows(model) if peak is None else ():
             valid = inside[window]
             lost.add(lightmaps.frames[i][window][valid], decoded[window][valid], _place(tile, stamp))
         if meter.due(i + 1):

@@ -10,7 +10,7 @@ import numpy as np
 
 from wlm import interop
 from wlm.errors import WlmError
-from wlm.formats.checkpoint import EVERY, Checkpoint
+from wlm.formats.checkpoint import EVERY, Checkpoint, CheckpointRange
 from wlm.formats.parts import Part
 from wlm.lightmap.data import LightmapSet
 from wlm.lightmap.dispatch import Batch, Dispatch
@@ -54,7 +54,7 @@ def compress(
     workers: int | None = None,
     cluster: str | None = None,
     progress: OnProgress | None = None,
-    checkpoint: Checkpoint | None = None,
+    checkpoint: Checkpoint | CheckpointRange | None = None,
     **overrides: Any,
 ) -> LightmapModel:
     """Compresses a lightmap set.
