@@ -107,9 +107,10 @@ def evaluate(
     views: int = VIEWS,
     progress: OnProgress | None = None,
     file_bytes: int | None = None,
-    peak: float | None = None,
 ) -> Report:
     """Decodes every stored time, and times between them, from the stored bytes and compares them with the input.
+
+    Where the profile has a `peak`, errors are relative to that, and no light is looked for that was lost.
 
     Only what the model holds is scored: where it was made of some tiles, the texels of the others are masked out.
 
@@ -121,8 +122,6 @@ def evaluate(
         views: Views of the set's mesh, of "seen"; 0 for none. Without a mesh there are none.
         progress: Called about twice a second.
         file_bytes: Size of the model's file; None: that of the file that it would be saved to.
-        peak: What errors are relative to where the set isn't light, see `wlm.metrics.evaluate_frame`; then no light is
-            looked for that was lost. None: the range of each tile at each time.
 
     Returns:
         The report.
@@ -137,6 +136,7 @@ def evaluate(
     mask = scored_mask(model, lightmaps)
     decoder = Decoder(model, device)
     meter = Meter(progress, "score", len(model.times))
+    peak = model.profile.peak
     plain = [metric for metric in metrics if metric != "seen"]
     drawn, warnings = views_of(lightmaps, views if "seen" in metrics else 0, device=device)
     tally = Tally(lightmaps, mask, decoder.frame, drawn, model.name, peak)
@@ -171,7 +171,8 @@ def psnr_of(model: LightmapModel, lightmaps: LightmapSet, number: int, decoded: 
         The mean over the tiles; NaN where none has a score.
     """
     mask, name = lightmaps.mask & _held(model), f"{model.name} at {lightmaps.times[number]:g}"
-    return float(summarise([evaluate_frame(lightmaps.frames[number], decoded, mask, TILE, ("psnr",), name=name)]).psnr)
+    options = {"name": name, "peak": model.profile.peak}
+    return float(summarise([evaluate_frame(lightmaps.frames[number], decoded, mask, TILE, ("psnr",), **options)]).psnr)
 
 
 def contest_score(

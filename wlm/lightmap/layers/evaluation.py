@@ -90,7 +90,6 @@ def evaluate(
             metrics=[metric for metric in metrics if not (sheet.linear and metric == "flip")],
             views=0 if sheet.linear else views,
             progress=progress,
-            peak=1.0 if sheet.linear else None,
         )
         size, span = own_bytes[sheet], sheet.span
         parts = {name: count for name, count in part_bytes(own, report.bytes).items() if name not in _SHARED}

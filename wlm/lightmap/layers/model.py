@@ -10,7 +10,7 @@ from wlm.lightmap.layers.sheet import Sheet
 from wlm.lightmap.model import LightmapModel, Profile
 from wlm.system import Model
 
-_LINEAR = {"gamma": 1.0, "metric_weight": 0.0}
+_LINEAR = {"gamma": 1.0, "peak": 1.0}
 
 
 @dataclass
