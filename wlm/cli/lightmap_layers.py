@@ -3,12 +3,12 @@
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from wlm.cli.console import escape, note, number, show, show_json, table
 from wlm.errors import WlmError
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from wlm.lightmap import LayeredModel, LayeredReport, LayeredSet, LightmapModel
     from wlm.lightmap.layers.decode import Decoder
 
@@ -114,12 +114,14 @@ def show_layered_info(file: Path, model: "LayeredModel", decoder: "Decoder", as_
 
 def write_layer(
     decoder: "Decoder", time: float, layer: str | None, atlas: str | None, output: Path, eight_bit: Path | None
-) -> np.ndarray:
+) -> "np.ndarray":
     """Decodes a layer of an atlas and writes it as an EXR with its channels' names, and as 8 bits; gives the values.
 
     Raises:
         WlmError: There is no such layer, or it has more than three channels and shall be 8 bits.
     """
+    import numpy as np
+
     from wlm.formats.channels import read_channels
     from wlm.formats.exr import HALF_MAX
     from wlm.formats.exr_file import write_part
@@ -128,7 +130,7 @@ def write_layer(
 
     sheets = decoder.model.layer(layer, atlas)
     if eight_bit is not None and len(sheets) > 1:
-        raise WlmError(f"--8bit: expected a layer of at most three channels, found {sheets[0].layer} of more")
+        raise WlmError(f"--eight-bit: expected a layer of at most three channels, found {sheets[0].layer} of more")
     names = [name for sheet in sheets for name in sheet.channels]
     frame = decoder.layer(time, sheets[0].layer, sheets[0].atlas)
     planes = np.moveaxis(np.clip(frame, -HALF_MAX, HALF_MAX).astype(np.float16), 2, 0)

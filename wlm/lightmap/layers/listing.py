@@ -161,14 +161,15 @@ def _list_states(folder: Path, times: Sequence[float] | None, chosen: Sequence[s
     for state in states:
         files: dict[tuple[str, str], dict[str, Path]] = {}
         for key, path in _unity_files(state):
-            if chosen is None or key[1] in chosen:
-                files.setdefault(key, {})[path.suffix.lower()] = path
+            files.setdefault(key, {})[path.suffix.lower()] = path
         found.append(files)
     everywhere = sorted({key for files in found for key in files}, key=lambda key: (natural(key[0]), key))
     atlases = list(dict.fromkeys(atlas for atlas, _ in everywhere))
     layers = [name for name in _UNITY_ENCODING if any(key[1] == name for key in everywhere)]
     sources: list[dict[tuple[str, str], Source]] = [{} for _ in states]
-    for key in ((atlas, layer) for atlas in atlases for layer in layers):
+    keys = [(atlas, layer) for layer in layers if chosen is None or layer in chosen for atlas in atlases]
+    # What a state lacks that another has is told first.
+    for key in sorted(keys, key=lambda key: key not in everywhere):
         suffixes = [suffix for suffix in _SUFFIXES if all(suffix in files.get(key, ()) for files in found)]
         if not suffixes:
             _refuse(folder, key, states, found)
