@@ -1,5 +1,7 @@
 """Reading layered sets: every stated behaviour of `wlm.lightmap.layers.data`."""
 
+import tempfile
+
 import numpy as np
 import pytest
 from builders.checks import error_of
@@ -7,6 +9,7 @@ from builders.layered_sets import write_set_json, write_unity
 from PIL import Image
 
 import wlm
+from wlm.formats import scratch
 from wlm.formats.channels import read_channels
 from wlm.formats.exr import read_exr, write_exr
 from wlm.formats.exr_file import write_part
@@ -160,3 +163,13 @@ def test_twelve_channels_and_no_more():
     assert len(from_layers([*layers, other], [0.0]).sheets) == 5
     wrong = LayerArrays(np.zeros((1, 5, 4, 1)), "c")
     assert "0/c R is 4x5, but atlas 0 is 4x4" in error_of(from_layers, [*layers, wrong], [0.0])
+
+
+def test_sheets_that_are_large_together_lie_in_a_file(tmp_path, monkeypatch):
+    write_unity(tmp_path / "scene", atlases=1)
+    whole = wlm.lightmap.load(tmp_path / "scene")
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setattr(scratch, "IN_MEMORY", 2 * whole.sheets[next(iter(whole.sheets))].frames.nbytes)
+    mapped = wlm.lightmap.load(tmp_path / "scene")
+    assert [own.frames.base is not None for own in mapped.sheets.values()] == [False, False, True]
+    assert mapped.source == whole.source

@@ -101,6 +101,7 @@ def show_layered_info(file: Path, model: "LayeredModel", decoder: "Decoder", as_
         "times": f"{len(times)}, {times[0]:g} to {times[-1]:g}",
         "period": number(model.period, "g"),
         "source": escape(model.source),
+        "profile": escape(next(iter(model.sheets.values())).profile.name),
         f"bytes on {decoder.device}": f"{decoder.device_bytes:,}",
     }.items():
         rows.add_row(name, value)

@@ -189,12 +189,13 @@ def from_layers(
     labels = [f"frame {i} (time {time:g})" for i, time in enumerate(stamps)]
     check_times(name, labels, stamps, period)
     order = np.argsort(stamps, kind="stable")
-    sheets = {}
+    sheets, made = {}, 0
     for sheet, (frames, chosen) in sources.items():
         valid = np.asarray((masks or {}).get(sheet.atlas, np.ones(sizes[sheet], bool))).astype(bool)
         if valid.shape not in (frames.shape[1:3], frames.shape[:3]):
             raise WlmError(f"{name}: expected a mask of {frames.shape[1:3]}, got {valid.shape}")
-        copied = room((*frames.shape[:3], 3), np.float32, name)
+        copied = room((*frames.shape[:3], 3), np.float32, name, made)
+        made += copied.nbytes
         with np.errstate(over="ignore"):
             for frame, index in zip(copied, order, strict=True):
                 frame[...] = sheet.levels(frames[index][..., chosen])
@@ -222,6 +223,7 @@ class _Reader:
     def __init__(self, listing: LayeredListing, order: np.ndarray, trust: bool) -> None:
         self._listing, self._order, self._trust = listing, order, trust
         self._sizes: dict[Sheet, tuple[int, int]] = {}
+        self._made = 0  # bytes of the sheets that room was made for
         self._held = {source.path for state in listing.states for source in state.values()}
 
     def read(self, atlas: Atlas, layer: Layer, need_alpha: bool) -> _Stack:
@@ -274,7 +276,10 @@ class _Reader:
             total = sum(math.prod(at) for at in self._sizes.values()) * 3 * 4 * count
             check_growth(f"{self._listing.where}: lightmaps", held, total, PICTURE_GROWTH, FRAMES)
         where = f"{self._listing.where}: {count} pictures of {_size(size)}"
-        frames = {sheet: room((count, *size, 3), np.float32, where) for sheet in sheets}
+        frames = {}
+        for sheet in sheets:
+            frames[sheet] = room((count, *size, 3), np.float32, where, self._made)
+            self._made += frames[sheet].nbytes
         alpha = room((count, *size), np.float32, where) if need_alpha and _ALPHA in names else None
         return _Stack(frames, alpha)
 
