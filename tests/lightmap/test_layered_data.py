@@ -150,7 +150,7 @@ def test_values_beyond_their_range_are_clamped_and_told():
     np.testing.assert_array_equal(values[:2], [[-1.0, 0.0, 1.0], [-1.0, 0.5, 1.0]])
     assert values[2:].tolist() == [[-1.0, 0.5, 1.0]] * 2, "the nearest finite texel's"
     first, second = lightmaps.warnings
-    assert "0/dir RGB: 1 texels beyond -1 to 1" in first and "2 texels NaN or infinite" in second
+    assert "0/dir RGB: 1 texel beyond -1 to 1" in first and "2 texels NaN or infinite" in second
 
 
 def test_twelve_channels_and_no_more():

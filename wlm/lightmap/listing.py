@@ -109,14 +109,14 @@ def count_of(items: Sequence[object], noun: str) -> str:
     return f"{len(items)} {noun}{'' if len(items) == 1 else 's'}"
 
 
-def check_count(where: Path, files: Sequence[object], times: Sequence[float]) -> None:
+def check_count(where: Path, files: Sequence[object], times: Sequence[float], noun: str = "lightmap") -> None:
     """Checks that there is a time for each lightmap, or state.
 
     Raises:
         WlmError: There are more or fewer.
     """
     if len(times) != len(files):
-        raise WlmError(f"{where}: {count_of(times, 'time')} for {count_of(files, 'lightmap')}; expected one each")
+        raise WlmError(f"{where}: {count_of(times, 'time')} for {count_of(files, noun)}; expected one each")
 
 
 def parse_set(path: Path, times: Sequence[float] | None, trust: bool = False) -> Listing:

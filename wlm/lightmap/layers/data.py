@@ -353,7 +353,8 @@ def _clamped(
         with np.errstate(invalid="ignore"):
             beyond = np.count_nonzero(((frame < 0.0) | (frame > 1.0)).any(axis=2) & inside)
         if beyond:
-            yield f"{labels[order[i]]}: {sheet.label}: {beyond} texels beyond {least:g} to {greatest:g}: clamped to it"
+            texels = f"{beyond} {'texel' if beyond == 1 else 'texels'}"
+            yield f"{labels[order[i]]}: {sheet.label}: {texels} beyond {least:g} to {greatest:g}: clamped to it"
         np.clip(frame, 0.0, 1.0, out=frame)
 
 

@@ -184,7 +184,7 @@ def _list_states(folder: Path, times: Sequence[float] | None, chosen: Sequence[s
                 f"{folder}: {count_of(states, 'state')} of light and no {SET_FILE}: give {count_of(states, 'time')} "
                 f"with --times, in the order {names}"
             )
-    check_count(folder, states, times)
+    check_count(folder, states, times, "state")
     return LayeredListing(
         folder.resolve().name,
         folder,
@@ -245,7 +245,7 @@ def _parse(path: Path, times: Sequence[float] | None, trust: bool) -> LayeredLis
         if times is None:
             stamps.append(float(field(path, entry, "time_hours", f"{place}.", is_number, "a finite number")))
     if times is not None:
-        check_count(path, states, times)
+        check_count(path, states, times, "state")
     labels = [f"lightmaps[{i}]" for i in range(len(states))]
     period = period_of(path, content)
     return LayeredListing(
