@@ -13,6 +13,7 @@ from wlm.formats import scratch
 from wlm.formats.channels import read_channels
 from wlm.formats.exr import read_exr, write_exr
 from wlm.formats.exr_file import write_part
+from wlm.lightmap.data import LightmapSet
 from wlm.lightmap.layers.data import LayerArrays, LayeredSet, from_layers
 
 RGB = ("R", "G", "B")
@@ -44,6 +45,14 @@ def test_unitys_folders_are_states_of_atlases(tmp_path):
     one = wlm.lightmap.load(tmp_path / "scene" / "day_12h", mask="all", layers=["dir"])
     assert one.times.tolist() == [0.0] and {sheet.layer for sheet in one.sheets} == {"dir"}
     assert all(own.mask.all() for own in one.sheets.values())
+
+
+def test_a_plain_folder_stays_one_whatever_lies_beside_it(tmp_path):
+    write_unity(tmp_path / "scene")
+    write_exr(tmp_path / "scene" / "light_03h.exr", np.full((4, 5, 3), 0.5))
+    lightmaps = wlm.lightmap.load(tmp_path / "scene")
+    assert isinstance(lightmaps, LightmapSet) and lightmaps.times.tolist() == [3.0]
+    assert "expected a set with layers" in error_of(wlm.lightmap.load, tmp_path / "scene", layers=["light"])
 
 
 def test_states_that_differ_are_one_line(tmp_path):

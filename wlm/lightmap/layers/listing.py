@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from wlm.errors import WlmError
+from wlm.formats.light import SUFFIXES
 from wlm.formats.limits import TIMES
 from wlm.formats.reading import named_file
 from wlm.lightmap.fields import field, is_list, is_number, is_size, is_text, kind, name_of, period_of, read_set
@@ -134,10 +135,17 @@ def list_layers(path: Path, times: Sequence[float] | None, chosen: Sequence[str]
 
 
 def _state_folders(folder: Path) -> list[Path]:
-    """The folder itself, or those in it that have light as Unity names it, in natural order."""
+    """The folder itself, or those in it that have light as Unity names it, in natural order.
+
+    A folder with lightmaps of other names is a set of its own, whatever lies in folders in it.
+    """
     try:
-        inside = sorted((path for path in folder.iterdir() if path.is_dir()), key=lambda path: natural(path.name))
-        return [path for path in (folder, *inside) if _has_light(path)]
+        if _has_light(folder):
+            return [folder]
+        inside = sorted(folder.iterdir(), key=lambda path: natural(path.name))
+        if any(path.suffix.lower() in SUFFIXES and path.is_file() for path in inside):
+            return []
+        return [path for path in inside if path.is_dir() and _has_light(path)]
     except OSError as error:
         raise WlmError(f"{folder}: cannot read: {error.strerror or error}") from error
 
@@ -155,8 +163,6 @@ def _unity_files(folder: Path) -> list[tuple[tuple[str, str], Path]]:
 def _list_states(folder: Path, times: Sequence[float] | None, chosen: Sequence[str] | None) -> LayeredListing:
     """Lists a folder with a state of light as Unity bakes it, or with a folder of each state."""
     states = _state_folders(folder)
-    if states[0] == folder:
-        states = states[:1]
     found: list[dict[tuple[str, str], dict[str, Path]]] = []
     for state in states:
         files: dict[tuple[str, str], dict[str, Path]] = {}
