@@ -68,6 +68,11 @@ def test_states_that_differ_are_one_line(tmp_path):
     write_exr(late / "Lightmap-0_comp_light.exr", np.ones((4, 12, 4)))
     assert "is 12x4 of R, G, B, A, but" in error_of(wlm.lightmap.load, folder)
     write_unity(tmp_path / "other", hours=(3.0, 9.0))
+    dark = tmp_path / "other" / "day_9h"
+    light = read_exr(dark / "Lightmap-1_comp_light.exr")[0]
+    write_exr(dark / "Lightmap-1_comp_light.exr", np.concatenate([light[..., :3], 0 * light[..., :1]], 2))
+    text = error_of(wlm.lightmap.load, dark)
+    assert "no texel is valid (the alpha of the light; --mask all takes all)" in text
     for name in ("day_3h", "day_9h"):
         (tmp_path / "other" / name).rename(tmp_path / "other" / name[:-1])
     text = error_of(wlm.lightmap.load, tmp_path / "other")

@@ -128,7 +128,7 @@ def load(
     reader = _Reader(listing, order, trust)
     sheets: dict[Sheet, LightmapSet] = {}
     for atlas in listing.atlases:
-        valid = None
+        valid = mask_from = None
         chosen = str(mask) if mask is not None else atlas.mask
         # Light first: its alpha is the atlas' mask.
         for layer in sorted(listing.layers, key=lambda layer: layer.encoding != "radiance"):
@@ -136,11 +136,11 @@ def load(
             stack = reader.read(atlas, layer, by_alpha)
             if valid is None:
                 valid = _valid(listing, atlas, layer, stack, chosen)
+                mask_from = "the alpha of the light; --mask all takes all" if stack.alpha is not None else chosen
             labels = [_name_of(state[atlas.name, layer.name].path) for state in listing.states]
             for sheet, frames in stack.frames.items():
-                sheets[sheet] = _checked(
-                    sheet, listing.name, labels, stamps, order, frames, valid, period, str(path), listing.warn_order
-                )
+                told = str(path), str(mask_from), listing.warn_order
+                sheets[sheet] = _checked(sheet, listing.name, labels, stamps, order, frames, valid, period, *told)
     order_of = {layer.name: i for i, layer in enumerate(listing.layers)}
     atlas_of = {atlas.name: i for i, atlas in enumerate(listing.atlases)}
     placed = sorted(sheets, key=lambda sheet: (atlas_of[sheet.atlas], order_of[sheet.layer]))
@@ -200,7 +200,7 @@ def from_layers(
             for frame, index in zip(copied, order, strict=True):
                 frame[...] = sheet.levels(frames[index][..., chosen])
         valid = valid[order] if valid.ndim == 3 else valid
-        sheets[sheet] = _checked(sheet, name, labels, stamps, order, copied, valid, period, name, True)
+        sheets[sheet] = _checked(sheet, name, labels, stamps, order, copied, valid, period, name, "the mask", True)
     return LayeredSet(name, sheets)
 
 
@@ -323,6 +323,7 @@ def _checked(
     mask: np.ndarray,
     period: float | None,
     where: str,
+    mask_from: str,
     warn_order: bool,
 ) -> LightmapSet:
     """Clamps levels and applies the table of `wlm.lightmap.data`."""
@@ -336,7 +337,7 @@ def _checked(
         mask,
         period,
         where=where,
-        mask_from="the mask",
+        mask_from=mask_from,
         warn_order=warn_order,
         warnings=warnings,
     )
