@@ -31,6 +31,7 @@ from wlm.formats.artifact import FORMAT_VERSION, Artifact, encode_artifact, read
 # Which package reads which system's files.
 _PACKAGES = {
     "lightmap": "wlm.lightmap",
+    "lightmap-layers": "wlm.lightmap.layers",
     "atlas": "wlm.atlas",
     "probe": "wlm.probe",
     "smoke-network": "wlm.smoke",

@@ -62,6 +62,18 @@ def _lightmap() -> Subject:
     )
 
 
+def _layers() -> Subject:
+    def decode(model: Any) -> dict[str, np.ndarray]:
+        frame = model.decoder().frame(18.5)
+        return {
+            f"{atlas}_{layer}": values[:24:2, :24:2]
+            for atlas, layers in frame.items()
+            for layer, values in layers.items()
+        }
+
+    return Subject("lightmap-layers", FILES / "lightmap-layers.wlm", decode, FILES / "lightmap-layers.npz")
+
+
 def _probe() -> Subject:
     profile = wlm.probe.Profile(name="tiny", ratio=0.1, steps=60, hidden=16, latent=3)
 
@@ -122,6 +134,7 @@ def _smoke() -> Subject:
 
 SUBJECTS: dict[str, Callable[[], Subject]] = {
     "lightmap": _lightmap,
+    "lightmap-layers": _layers,
     "probe": _probe,
     **{f"atlas-{kind}": lambda kind=kind: _atlas(kind) for kind in ("tiles", "cascade", "bc6h", "plain")},
     "smoke": _smoke,

@@ -62,6 +62,13 @@ def _video() -> Kept:
     return Kept(_written(random_model((5, 0), times=(0.0, 7.5)).save), wlm.load, {}, ranges)
 
 
+def _layers() -> Kept:
+    from builders.layered_sets import random_layers
+
+    ranges = {"0.kind": (0, 5), "times": (3, 24.5), "2.constant": (0, -1.0), "1.ranges": ((0, 0, 0), 3.0)}
+    return Kept(_written(random_layers(uvt_slices=1).save), wlm.load, {"0.mask": "missing"}, ranges)
+
+
 def _probe() -> Kept:
     from builders.probe_models import random_model
 
@@ -212,6 +219,7 @@ KEPT: dict[str, Callable[[], Kept]] = {
         "lightmap": _lightmap,
         "lightmap-frames": _frames,
         "lightmap-video": _video,
+        "lightmap-layers": _layers,
         "probe": _probe,
         "atlas-tiles": lambda: _atlas("tiles", "half"),
         "atlas-cascade": lambda: _atlas("cascade", "half"),

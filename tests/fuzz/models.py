@@ -31,6 +31,17 @@ def _lightmap(path: Path) -> None:
     assert frame.shape == (model.height, model.width, 3) and (frame >= 0).all(), "decodes to another size, or below 0"
 
 
+def _layers(path: Path) -> None:
+    model = wlm.load(path, "lightmap-layers")
+    check_digest(path)
+    for own in model.sheets.values():
+        check_finite(**own.parts, times=own.times)
+    for sheet in model.sheets:
+        values = model.decoder().layer(float(model.times.mean()), sheet.layer, sheet.atlas)
+        check_finite(values=values)
+        assert values.shape[:2] == model.atlases[sheet.atlas], "decodes to another size"
+
+
 def _probe(path: Path) -> None:
     model = wlm.load(path, "probe")
     check_digest(path)
@@ -255,6 +266,7 @@ READERS = (
         vary_artifact,
         _lightmap,
     ),
+    Reader("lightmap-layers", "a.wlm", stored("lightmap-layers.wlm"), vary_artifact, _layers),
     Reader("probe", "a.wlm", stored("probe.wlm"), vary_artifact, _probe),
     Reader(
         "atlas",

@@ -201,6 +201,30 @@ def _lightmap_set(path: Path) -> None:
     assert (lightmaps.frames >= 0).all() and (np.diff(lightmaps.times) > 0).all(), "negative, or times out of order"
 
 
+def _layers() -> Sequence[bytes]:
+    """Light of two atlases, directions in a PNG, and a layer of an EXR's rows."""
+    files = {
+        "0": {"light": "a.exr", "dir": "c.png", "L1": {"file": "a.exr", "slice": 0, "slices": 1}},
+        "1": {"light": {"file": "b.exr", "slice": 1, "slices": 2}, "dir": "c.png", "L1": "b.exr"},
+    }
+    layers = {"light": "radiance", "dir": {"encoding": "signed", "channels": ["G", "R", "A"]}, "L1": "unit"}
+    lightmaps = [{"time_hours": 2.5 * i, "files": {"0": files["0"]}} for i in range(2)]
+    one = {"name": "day", "layers": layers, "period_hours": 24, "lightmaps": lightmaps}
+    two = {"layers": {"light": "radiance"}, "lightmaps": [{"time_hours": 0.0, "files": files}]}
+    atlas = {"width": 10, "height": 12, "mask": "mask.png"}
+    return tuple(
+        json.dumps(content).encode()
+        for content in (one | {"atlases": {"0": atlas}}, two | {"atlases": {"0": {"mask": "all"}, "1": {}}})
+    )
+
+
+def _layered_set(path: Path) -> None:
+    lightmaps = wlm.lightmap.load(path.parent)
+    for sheet, own in lightmaps.sheets.items():
+        check_finite(frames=own.frames, times=own.times)
+        assert (own.frames >= 0).all() and (not sheet.linear or (own.frames <= 1).all()), "levels beyond their range"
+
+
 def _frames(path: Path) -> None:
     _scene_figures(load_frames(path.parent).scene)
 
@@ -335,6 +359,19 @@ _ALL = (
         lambda draw, data: vary_numbers(draw, data, _grid_fields(data)),
         _volume,
         cost=2,
+    ),
+    Reader(
+        "lightmap-layers-set",
+        "set.json",
+        _layers,
+        _json,
+        _layered_set,
+        lambda: {
+            "a.exr": corpus("light.exr")()[0],
+            "b.exr": corpus("zip.exr")()[0],
+            "c.png": corpus("mask-rgba.png")()[0],
+            "mask.png": corpus("mask-grey.png")()[0],
+        },
     ),
     Reader(
         "lightmap-set",

@@ -1,6 +1,5 @@
 """`wlm lightmap`: compress a set of lightmaps over time, decode it, score it, look into it, export it."""
 
-import math
 import time as clock
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -20,6 +19,8 @@ from wlm.cli.console import (
     table,
     write_json,
 )
+from wlm.cli.lightmap_layers import refuse_layers, show_layered, show_layered_info, show_layered_report, write_layer
+from wlm.cli.lightmap_tables import show_contest, show_report
 from wlm.cli.options import (
     AsJson,
     CheckpointEvery,
@@ -35,16 +36,17 @@ from wlm.cli.options import (
 from wlm.errors import WlmError
 
 if TYPE_CHECKING:
-    from wlm.baselines.lightmap import Score
-    from wlm.lightmap import LightmapSet, Profile, Report
-    from wlm.metrics.contest import ContestScore
+    from wlm.lightmap import LayeredModel, LayeredSet, LightmapModel, LightmapSet, Profile
+
+_LAYERED = "lightmap-layers"
 
 app = typer.Typer(help="Lightmaps over time: BC7 feature maps and a tiny network for each 128² tile.")
 
 _Set = Annotated[
     Path,
     typer.Argument(
-        metavar="SET", help="A set.json, or a folder of lightmaps (.exr, .hdr, .ktx2, .dds) or of a contest."
+        metavar="SET",
+        help="A set.json, or a folder of lightmaps (.exr, .hdr, .ktx2, .dds), of Unity's states or of a contest.",
     ),
 ]
 _Times = Annotated[
@@ -52,6 +54,9 @@ _Times = Annotated[
 ]
 _Mask = Annotated[str | None, typer.Option(help='Valid texels: a PNG, "alpha" or "all"; default as the set says.')]
 _Period = Annotated[float | None, typer.Option(help="Length of the day; default as the set says.")]
+_Layers = Annotated[
+    str | None, typer.Option(metavar="NAMES", help="Of a set with layers: which to read, by commas; default all.")
+]
 _Map = Annotated[
     str | None, typer.Option("--map", metavar="ID", help="Which lightmap of a contest's folder: ID or LEVEL/ID.")
 ]
@@ -98,6 +103,7 @@ def compress(
     mask: _Mask = None,
     period: _Period = None,
     map_id: _Map = None,
+    layers: _Layers = None,
     trust: Trust = False,
 ) -> None:
     """Compress a lightmap set into one file.
@@ -109,14 +115,18 @@ def compress(
     quiet_warp()
     from wlm.interop import check_device
     from wlm.lightmap.evaluation import bits_per_texel, count_kinds, lost_light
-    from wlm.lightmap.fit import compress, open_checkpoint
+    from wlm.lightmap.front import compress, open_checkpoint
+    from wlm.lightmap.layers.data import LayeredSet
     from wlm.lightmap.model import Profile
     from wlm.lightmap.tiles import TileGrid, parse_tiles
 
     settings = Profile.load(profile).override({"steps": steps, "samples": samples}, "--")
     # The device of a cluster is none of this machine's.
     own_device = "cpu" if cluster is not None else check_device(device)
-    lightmaps = _load(set_path, times, mask, period, trust, map_id)
+    lightmaps = _load(set_path, times, mask, period, trust, map_id, layers)
+    layered = isinstance(lightmaps, LayeredSet)
+    if layered:
+        refuse_layers(**{"tiles": tiles, "target-psnr": target_psnr, "max-bpp": max_bpp})
     numbers = None if tiles is None else parse_tiles(tiles, TileGrid.of(*lightmaps.mask.shape).count)
     places = {"workers": workers, "cluster": cluster}
     if target_psnr is not None or max_bpp is not None:
@@ -124,7 +134,7 @@ def compress(
             raise WlmError("--tiles: expected without --target-psnr and --max-bpp, which choose for a whole set")
         wanted = {"target_psnr": target_psnr, "max_bpp": max_bpp}
         settings = _chosen(lightmaps, settings, wanted, {"seed": seed, "device": device} | places)
-    options = {"tiles": numbers, "seed": seed, "device": device}
+    options = {"seed": seed, "device": device} | ({} if layered else {"tiles": numbers})
     checkpoint = open_checkpoint(output, lightmaps, settings, resume=resume, every=checkpoint_every, **options)
     if resume and not checkpoint.resumed:
         note(f"{checkpoint.path}: there is nothing to resume; starting at step 0")
@@ -134,6 +144,9 @@ def compress(
         seconds = clock.perf_counter() - start
         size = model.save(output)
         checkpoint.remove()
+    if layered:
+        show_layered(output, model, lightmaps, size, seconds, own_device)
+        return
     kinds = ", ".join(f"{count} {kind}" for kind, count in count_kinds(model).items() if count)
     rows = table(model.name, ["file", "bytes", "bpp", "tiles", "seconds"], text=["tiles"])
     # Tiles without a valid texel leave nothing to count.
@@ -164,6 +177,10 @@ def decode(
             help="Also write what a renderer samples: one texture of RGB9E5 texels, 32 bits each, with mips.",
         ),
     ] = None,
+    layer: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Of a file with layers: which; default the first of light.")
+    ] = None,
+    atlas: Annotated[str | None, typer.Option(metavar="NAME", help="Of such a file: which; default the first.")] = None,
     device: Device = "cpu",
 ) -> None:
     """Decode the whole map at one time."""
@@ -175,16 +192,22 @@ def decode(
     quiet_warp()
     from wlm.formats.exr import write_exr
     from wlm.lightmap.exporter import write_8bit, write_texture
-    from wlm.system import load
 
-    model = load(file, "lightmap")
+    model = _model(file)
     decoder = model.decoder(device)
-    frame = decoder.frame(time)
-    write_exr(output, frame)
-    if eight_bit is not None:
-        write_8bit(eight_bit, decoder, time)
-    if texture is not None:
-        write_texture(texture, model, time, device)
+    if model.SYSTEM == _LAYERED:
+        refuse_layers(texture=texture)
+        frame = write_layer(decoder, time, layer, atlas, output, eight_bit)
+    else:
+        for name, value in {"layer": layer, "atlas": atlas}.items():
+            if value is not None:
+                raise WlmError(f"{file}: --{name} means nothing to a file without layers")
+        frame = decoder.frame(time)
+        write_exr(output, frame)
+        if eight_bit is not None:
+            write_8bit(eight_bit, decoder, time)
+        if texture is not None:
+            write_texture(texture, model, time, device)
     rows = table(str(file), ["time", "size", "mean", "largest", "file"])
     size, mean, largest = f"{frame.shape[1]}x{frame.shape[0]}", f"{frame.mean():.4g}", f"{frame.max():.4g}"
     rows.add_row(f"{time:g}", size, mean, largest, escape(str(output)))
@@ -215,6 +238,7 @@ def evaluate(
     mask: _Mask = None,
     period: _Period = None,
     map_id: _Map = None,
+    layers: _Layers = None,
     trust: Trust = False,
 ) -> None:
     """Compare a file with its input: PSNR, SSIM and FLIP by tile and by time, bits per texel, and what is seen of it.
@@ -228,15 +252,23 @@ def evaluate(
         check_output(html_path, ".html")
     quiet_warp()
     from wlm.interop import check_device
-    from wlm.lightmap.evaluation import contest_score, evaluate
-    from wlm.system import load, plain
+    from wlm.lightmap.evaluation import contest_score
+    from wlm.lightmap.front import evaluate
+    from wlm.system import plain
 
     device = check_device(device)
-    model = load(file, "lightmap")
-    lightmaps = _load(set_path, times, mask, period, trust, map_id)
+    model = _model(file)
+    if model.SYSTEM == _LAYERED:
+        refuse_layers(html=html_path, baselines=baselines or None, score=score)
+    lightmaps = _load(set_path, times, mask, period, trust, map_id, layers)
     with running("score") as progress:
         size = file.stat().st_size
         report = evaluate(model, lightmaps, views=views, device=device, progress=progress, file_bytes=size)
+    if model.SYSTEM == _LAYERED:
+        if json_path is not None:
+            write_json(json_path, report.to_json())
+        show_layered_report(file, report)
+        return
     if html_path is not None:
         from wlm.view.reports import lightmap_report
 
@@ -256,9 +288,9 @@ def evaluate(
         extra[score] = plain(contest)
     if json_path is not None:
         write_json(json_path, report.to_json() | extra)
-    _show_report(file, report, scores)
+    show_report(file, report, scores)
     if contest is not None:
-        _show_contest(contest)
+        show_contest(contest)
 
 
 @app.command()
@@ -270,9 +302,11 @@ def info(
     """Say what a file holds, without decoding it."""
     quiet_warp()
     from wlm.lightmap.evaluation import count_kinds, part_bytes
-    from wlm.system import load
 
-    model = load(file, "lightmap")
+    model = _model(file)
+    if model.SYSTEM == _LAYERED:
+        show_layered_info(file, model, model.decoder(device), as_json)
+        return
     decoder = model.decoder(device)
     size = file.stat().st_size
     facts: dict[str, Any] = {
@@ -322,16 +356,26 @@ def export(
 ) -> None:
     """Write the maps as textures and the rest as plain files, for an engine.
 
-    frame.exr is the map at the first stored time: what the shader should show.
+    frame.exr is the map at the first stored time: what the shader should show. Of a file with layers each sheet of
+    three channels has a folder of its own; sheets.json names them.
     """
     quiet_warp()
-    from wlm.lightmap.exporter import export
-    from wlm.system import load
+    from wlm.lightmap.front import export
 
     rows = table(str(output), ["file", "bytes"])
-    for path in export(load(file, "lightmap"), output, device=device):
-        rows.add_row(escape(path.name), f"{path.stat().st_size:,}")
+    for path in export(_model(file), output, device=device):
+        rows.add_row(escape(str(path.relative_to(output))), f"{path.stat().st_size:,}")
     show(rows)
+
+
+def _model(file: Path) -> "LightmapModel | LayeredModel":
+    """Reads a file of lightmaps, with layers or without."""
+    from wlm.system import load
+
+    model = load(file)
+    if model.SYSTEM not in ("lightmap", _LAYERED):
+        raise WlmError(f"{file}: expected an artifact of lightmap, found one of {model.SYSTEM}")
+    return model
 
 
 def _chosen(
@@ -356,109 +400,21 @@ def _chosen(
 
 
 def _load(
-    path: Path, times: str | None, mask: str | None, period: float | None, trust: bool, map_id: str | None
-) -> "LightmapSet":
+    path: Path,
+    times: str | None,
+    mask: str | None,
+    period: float | None,
+    trust: bool,
+    map_id: str | None,
+    layers: str | None,
+) -> "LightmapSet | LayeredSet":
     """Reads a set and prints what was repaired in it."""
-    from wlm.lightmap.data import load, parse_times
+    from wlm.lightmap.data import parse_times
+    from wlm.lightmap.front import load
 
     stamps = None if times is None else parse_times(times)
-    lightmaps = load(path, times=stamps, mask=mask, period=period, trust=trust, map_id=map_id)
+    names = None if layers is None else [name.strip() for name in layers.split(",")]
+    lightmaps = load(path, times=stamps, mask=mask, period=period, trust=trust, map_id=map_id, layers=names)
     for warning in lightmaps.warnings:
         note(f"warning: {warning}")
     return lightmaps
-
-
-def _show_report(file: Path, report: "Report", rivals: "dict[str, Score]") -> None:
-    sizes = ["bytes on disk", "bpp on disk", "bpp in memory"] if rivals else ["bytes", "bpp"]
-    rows = table(str(file), ["", "PSNR dB", "SSIM", "FLIP", *sizes])
-
-    def add(name: str, psnr: float, ssim: float, flip: float, *sizes: str) -> None:
-        rows.add_row(name, number(psnr, ".2f"), number(ssim, ".4f"), number(flip, ".4f"), *sizes)
-
-    own = f"wlm {escape(report.profile)}"
-    named: list[tuple[str, Report | Score]] = [(own, report), *rivals.items()]
-    for label, score in named:
-        ours = score is report
-        kept, bits, held = (
-            (score.bytes, score.bpp, score.memory_bpp) if ours else (score.disk_bytes, score.disk_bpp, score.bpp)
-        )
-        memory = [f"{held:.3f}"] if rivals else []
-        add(label, score.psnr, score.ssim, score.flip, f"{kept:,}", f"{bits:.3f}", *memory)
-    rows.add_section()
-    scores = (report.psnr_by_time, report.ssim_by_time, report.flip_by_time)
-    for stamp, *values in zip(report.time_values, *scores, strict=True):
-        add(f"time {stamp:g}", *values)
-    rows.add_section()
-    grids = (report.psnr_by_tile, report.ssim_by_tile, report.flip_by_tile)
-    for tile, values in enumerate(zip(*(grid.ravel() for grid in grids), strict=True)):
-        # Tiles that are empty or not in the file have no score.
-        if any(value == value for value in values):
-            add(f"tile {tile}", *values)
-    show(rows)
-    _show_seen(named)
-    if report.worst_tile is not None:
-        worst = report.worst_tile
-        note(f"worst: {report.worst_psnr:.2f} dB, tile {worst['tile']} at {worst['time']:g}")
-    for what, worst in (("seen", report.worst_seen), ("between times", report.worst_between)):
-        if worst is not None:
-            note(f"worst {what}: {worst['psnr']:.2f} dB, tile {worst['tile']} at {worst['time']:g}")
-    if report.worst_seen_time is not None:
-        worst = report.worst_seen_time
-        note(f"worst time, mean of its tiles seen: {worst['psnr']:.2f} dB at {worst['time']:g}")
-    if report.worst_seen_tile is not None:
-        worst = report.worst_seen_tile
-        note(f"worst tile, mean of its times seen: {worst['psnr']:.2f} dB, tile {worst['tile']}")
-    if report.worst_view is not None:
-        worst = report.worst_view
-        note(
-            f"worst view: {worst['psnr']:.2f} dB, FLIP {worst['flip']:.4f}, camera {worst['view']} at {worst['time']:g}"
-        )
-    left_out = ", ".join(f"{count} {reason}" for reason, count in report.not_scored.items() if count)
-    if left_out:
-        note(f"without a score, tiles times times: {left_out}")
-    if report.format_limited:
-        note(
-            f"{len(report.format_limited)} scored ones span only a few steps of half float; without them PSNR is "
-            f"{number(report.psnr_unlimited, '.2f')} dB"
-        )
-    for warning in report.warnings:
-        note(f"warning: {warning}")
-
-
-def _show_seen(named: "list[tuple[str, Report | Score]]") -> None:
-    """Shows the scores of `wlm.lightmap.seen`; columns without any number are left out."""
-    columns = {
-        "texels dB": ("psnr", ".2f", 1.0),
-        "seen dB": ("seen", ".2f", 1.0),
-        "ring dB": ("ring", ".2f", 1.0),
-        "between dB": ("between", ".2f", 1.0),
-        "border ×": ("border", ".2f", 1.0),
-        "flicker %": ("flicker", ".3f", 100.0),
-        "views dB": ("view_psnr", ".2f", 1.0),
-        "views FLIP": ("view_flip", ".4f", 1.0),
-    }
-    found = {
-        title: [number(scale * getattr(score, name), form) for _, score in named]
-        for title, (name, form, scale) in columns.items()
-        if any(math.isfinite(getattr(score, name)) for _, score in named)
-    }
-    if len(found) > 1:
-        rows = table("as it is seen", ["", *found])
-        for name, *cells in zip((name for name, _ in named), *found.values(), strict=True):
-            rows.add_row(name, *cells)
-        show(rows)
-
-
-def _show_contest(score: "ContestScore") -> None:
-    from wlm.metrics.contest import BOUNDS, WEIGHTS
-
-    rows = table("hprc", ["", "value", "no points", "all points", "points", "of"])
-    for name, (worst, best) in BOUNDS.items():
-        value = number(getattr(score, name), ".4f")
-        rows.add_row(name, value, f"{worst:g}", f"{best:g}", number(score.points[name], ".2f"), f"{WEIGHTS[name]:g}")
-    rows.add_section()
-    rows.add_row("together", "", "", "", f"{score.total:.2f}", f"{score.most:g}")
-    show(rows)
-    each = 1000.0 * score.seconds / score.times
-    note(f"hprc: decoded in {score.seconds:.4f} s on {score.device}, {each:.3f} ms a lightmap; its bounds are unknown")
-    note("hprc: without points of 100: decode time (30), LPIPS (10), which needs a trained network")

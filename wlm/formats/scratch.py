@@ -15,7 +15,7 @@ IN_MEMORY = 1 << 30
 _PIECE = 1 << 24
 
 
-def room(shape: tuple[int, ...], dtype: type[np.generic], where: str) -> np.ndarray:
+def room(shape: tuple[int, ...], dtype: type[np.generic], where: str, beside: int = 0) -> np.ndarray:
     """Makes an array of zeros, in memory or in a file that is mapped.
 
     The system writes parts of a mapped array to the disk and drops them from memory when that is short. The file has no
@@ -26,6 +26,7 @@ def room(shape: tuple[int, ...], dtype: type[np.generic], where: str) -> np.ndar
         shape: Of the array.
         dtype: Of its values.
         where: What it is for, for messages.
+        beside: Bytes of other arrays that are needed with it: they count too.
 
     Returns:
         A plain array of that shape, written and read as any other.
@@ -35,7 +36,7 @@ def room(shape: tuple[int, ...], dtype: type[np.generic], where: str) -> np.ndar
     """
     size = math.prod(shape) * np.dtype(dtype).itemsize
     try:
-        if size <= IN_MEMORY:
+        if size + beside <= IN_MEMORY:
             return np.zeros(shape, dtype)
         with tempfile.TemporaryFile() as file:
             _fill(file.fileno(), size)

@@ -4,16 +4,21 @@ from wlm._facade import facade
 
 _PLACES = {
     "Decoder": "wlm.lightmap.decode",
+    "LayerArrays": "wlm.lightmap.layers.data",
+    "LayeredModel": "wlm.lightmap.layers.model",
+    "LayeredReport": "wlm.lightmap.layers.evaluation",
+    "LayeredSet": "wlm.lightmap.layers.data",
     "LightmapModel": "wlm.lightmap.model",
     "LightmapSet": "wlm.lightmap.data",
     "Profile": "wlm.lightmap.model",
     "Report": "wlm.lightmap.evaluation",
-    "compress": "wlm.lightmap.fit",
-    "evaluate": "wlm.lightmap.evaluation",
-    "export": "wlm.lightmap.exporter",
+    "compress": "wlm.lightmap.front",
+    "evaluate": "wlm.lightmap.front",
+    "export": "wlm.lightmap.front",
     "from_arrays": "wlm.lightmap.data",
-    "load": "wlm.lightmap.data",
-    "open_checkpoint": "wlm.lightmap.fit",
+    "from_layers": "wlm.lightmap.layers.data",
+    "load": "wlm.lightmap.front",
+    "open_checkpoint": "wlm.lightmap.front",
 }
 
 __all__ = sorted(_PLACES)

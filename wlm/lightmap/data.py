@@ -160,7 +160,7 @@ def load(
     stamps = np.asarray(listing.times, np.float64)
     period = listing.period if period is None else period
     # Before the files are read: of a bad list that would be in vain.
-    _check_times(str(path), labels, stamps, period)
+    check_times(str(path), labels, stamps, period)
     mask_source = str(mask) if mask is not None else listing.mask
     need_alpha = mask_source == "alpha"
     if need_alpha and listing.raw is not None:
@@ -176,7 +176,7 @@ def load(
         valid = np.ones((height, width), bool)
     else:
         valid = read_mask(Path(mask_source), listing.files[0], (height, width), ', "alpha" or "all"')
-    lightmaps = _check(
+    lightmaps = checked_set(
         listing.name,
         labels,
         stamps,
@@ -224,14 +224,14 @@ def from_arrays(
     if valid.shape not in (frames.shape[1:3], frames.shape[:3]):
         raise WlmError(f"{name}: expected a mask of {frames.shape[1:3]}, got {valid.shape}")
     labels = [f"frame {i} (time {time:g})" for i, time in enumerate(stamps)]
-    _check_times(name, labels, stamps, period)
+    check_times(name, labels, stamps, period)
     order = np.argsort(stamps, kind="stable")
     copied = room(frames.shape, np.float32, name)
     with np.errstate(over="ignore"):  # float64 beyond float32 becomes Inf and is repaired as Inf
         for frame, index in zip(copied, order, strict=True):
             frame[...] = frames[index]
     valid = valid[order] if valid.ndim == 3 else valid.copy()
-    return _check(name, labels, stamps, order, copied, valid, period, where=name, mask_from="the mask")
+    return checked_set(name, labels, stamps, order, copied, valid, period, where=name, mask_from="the mask")
 
 
 def parse_times(text: str) -> list[float]:
@@ -334,7 +334,7 @@ def _size(shape: Sequence[int]) -> str:
     return f"{shape[1]}x{shape[0]}"
 
 
-def _check_times(where: str, labels: Sequence[str], times: np.ndarray, period: float | None) -> None:
+def check_times(where: str, labels: Sequence[str], times: np.ndarray, period: float | None) -> None:
     """Applies the module's table to the times [T] of the frames of these labels."""
     if period is not None and not (math.isfinite(period) and period > 0):
         raise WlmError(f"{where}: expected a finite period above 0, got {period:g}")
@@ -349,7 +349,7 @@ def _check_times(where: str, labels: Sequence[str], times: np.ndarray, period: f
             raise WlmError(f"{where}: {labels[i]} and {labels[j]} have the same time, {times[i]:g}")
 
 
-def _check(
+def checked_set(
     name: str,
     labels: Sequence[str],
     times: np.ndarray,  # [T]

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from wlm.errors import WlmError
-from wlm.formats.checkpoint import Checkpoint
+from wlm.formats.checkpoint import Checkpoint, CheckpointRange
 from wlm.lightmap.tiles import TileKind
 from wlm.lightmap.worker import Advance, Piece
 from wlm.metrics.tiled import nanmean
@@ -69,7 +69,7 @@ class Dispatch:
         steps: int,
         done: int,
         meter: Meter,
-        checkpoint: Checkpoint | None,
+        checkpoint: Checkpoint | CheckpointRange | None,
     ) -> None:
         """Takes what all batches share.
 

@@ -110,6 +110,8 @@ def evaluate(
 ) -> Report:
     """Decodes every stored time, and times between them, from the stored bytes and compares them with the input.
 
+    Where the profile has a `peak`, errors are relative to that, and no light is looked for that was lost.
+
     Only what the model holds is scored: where it was made of some tiles, the texels of the others are masked out.
 
     Args:
@@ -134,17 +136,18 @@ def evaluate(
     mask = scored_mask(model, lightmaps)
     decoder = Decoder(model, device)
     meter = Meter(progress, "score", len(model.times))
+    peak = model.profile.peak
     plain = [metric for metric in metrics if metric != "seen"]
     drawn, warnings = views_of(lightmaps, views if "seen" in metrics else 0, device=device)
-    tally = Tally(lightmaps, mask, decoder.frame, drawn, model.name)
+    tally = Tally(lightmaps, mask, decoder.frame, drawn, model.name, peak)
     frames, lost = [], LostLight()
     for i, stamp in enumerate(model.times):
         name, decoded = f"{model.name} at {stamp:g}", decoder.frame(stamp)
         inside = mask & lightmaps.valid(i)
-        frames.append(evaluate_frame(lightmaps.frames[i], decoded, inside, TILE, plain, name=name))
+        frames.append(evaluate_frame(lightmaps.frames[i], decoded, inside, TILE, plain, name=name, peak=peak))
         if "seen" in metrics:
             tally.add(i, decoded, frames[i])
-        for tile, window in _windows(model):
+        for tile, window in _windows(model) if peak is None else ():
             valid = inside[window]
             lost.add(lightmaps.frames[i][window][valid], decoded[window][valid], _place(tile, stamp))
         if meter.due(i + 1):
@@ -168,7 +171,8 @@ def psnr_of(model: LightmapModel, lightmaps: LightmapSet, number: int, decoded: 
         The mean over the tiles; NaN where none has a score.
     """
     mask, name = lightmaps.mask & _held(model), f"{model.name} at {lightmaps.times[number]:g}"
-    return float(summarise([evaluate_frame(lightmaps.frames[number], decoded, mask, TILE, ("psnr",), name=name)]).psnr)
+    options = {"name": name, "peak": model.profile.peak}
+    return float(summarise([evaluate_frame(lightmaps.frames[number], decoded, mask, TILE, ("psnr",), **options)]).psnr)
 
 
 def contest_score(

@@ -54,8 +54,19 @@ _ABOUT = {
     "interpolation says.",
 }
 
+_VALUES = (
+    "What the colours 0 and 1 stand for: these are values, not light. Where radiance is said above, read values[0] + "
+    "colour * (values[1] - values[0]); gamma is 1."
+)
 
-def export(model: LightmapModel, directory: str | os.PathLike[str], *, device: str = "cpu") -> list[Path]:
+
+def export(
+    model: LightmapModel,
+    directory: str | os.PathLike[str],
+    *,
+    device: str = "cpu",
+    values: tuple[float, float] | None = None,
+) -> list[Path]:
     """Writes a model as textures, weights and a shader, and a frame to compare with.
 
     For tile N of the grid, with four digits: `tile_N_uv.dds`, F_uv in BC7, and of a dynamic tile also
@@ -73,6 +84,8 @@ def export(model: LightmapModel, directory: str | os.PathLike[str], *, device: s
         model: The model.
         directory: The folder; made if it isn't there.
         device: Where the frame is decoded.
+        values: What the levels 0 and 1 of a model without gamma stand for: `frame.exr` and the shader have values, and
+            `weights.json` says so. None: the model is of radiance.
 
     Returns:
         The files written.
@@ -83,8 +96,12 @@ def export(model: LightmapModel, directory: str | os.PathLike[str], *, device: s
     """
     folder = Path(directory)
     frame = Decoder(model, device).frame(float(model.times[0]))
+    content = document(model)
+    if values is not None:
+        frame = np.float32(values[0]) + np.float32(values[1] - values[0]) * frame
+        content |= {"values": list(values), "about": _ABOUT | {"values": _VALUES}}
     try:
-        text = compact_json(document(model))
+        text = compact_json(content)
     except ValueError as error:
         raise WlmError(f"{model.name}: cannot export: a weight is NaN or infinite") from error
     make_parents(folder)
@@ -104,7 +121,7 @@ def export(model: LightmapModel, directory: str | os.PathLike[str], *, device: s
                 path = staging / f"tile_{number:04d}_frame_{i:04d}.dds"
                 write_dds(path, words.astype("<u4").tobytes(), TILE, TILE, fmt="R10G10B10A2_UNORM")
                 written.append(path)
-        (staging / SHADER_FILE).write_bytes(decode_glsl(model).encode())
+        (staging / SHADER_FILE).write_bytes(decode_glsl(model, values).encode())
         write_exr(staging / FRAME_FILE, frame, half=False)
         Image.fromarray(model.mask).save(staging / VALID_FILE)
         (staging / WEIGHTS_FILE).write_bytes(text.encode())
@@ -112,20 +129,29 @@ def export(model: LightmapModel, directory: str | os.PathLike[str], *, device: s
     return [folder / path.name for path in written]
 
 
-def write_8bit(path: str | os.PathLike[str], decoder: Decoder, time: float) -> None:
+def is_exported(name: str) -> bool:
+    """Whether a file's name is one that an export may have."""
+    return name in (WEIGHTS_FILE, SHADER_FILE, FRAME_FILE, VALID_FILE) or bool(_TEXTURE.fullmatch(name))
+
+
+def write_8bit(
+    path: str | os.PathLike[str], decoder: Decoder, time: float, values: tuple[float, float] | None = None
+) -> None:
     """Writes a frame as a texture cache holds it: a PNG of 8 bits, with gamma and each tile's bound in its text "wlm".
 
     Args:
         path: The PNG.
         decoder: The decoder.
         time: In the unit of the set's times.
+        values: As for `export`; the text has them too.
 
     Raises:
         WlmError: The time isn't finite, or the file can't be written.
     """
     pixels, bounds = decoder.frame_8bit(time)
     text = PngInfo()
-    text.add_text("wlm", json.dumps({"gamma": decoder.model.profile.gamma, "bounds": bounds.tolist()}))
+    facts = {"gamma": decoder.model.profile.gamma, "bounds": bounds.tolist()}
+    text.add_text("wlm", json.dumps(facts if values is None else facts | {"values": list(values)}))
     with atomic_path(path) as temporary:
         Image.fromarray(pixels).save(temporary, "PNG", pnginfo=text)
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from wlm import interop
 from wlm.errors import WlmError
-from wlm.formats.checkpoint import EVERY, Checkpoint
+from wlm.formats.checkpoint import EVERY, Checkpoint, CheckpointRange
 from wlm.formats.parts import Part
 from wlm.lightmap.data import LightmapSet
 from wlm.lightmap.dispatch import Batch, Dispatch
@@ -56,7 +56,7 @@ def compress(
     workers: int | None = None,
     cluster: str | None = None,
     progress: OnProgress | None = None,
-    checkpoint: Checkpoint | None = None,
+    checkpoint: Checkpoint | CheckpointRange | None = None,
     **overrides: Any,
 ) -> LightmapModel:
     """Compresses a lightmap set.
@@ -287,14 +287,16 @@ class _Fit:
         """What is stored of a tile beside its maps and network."""
         gamma = self.profile.gamma
         tile = split(self._lightmaps, gamma, [number])
-        kind = TileKind(int(classify(tile, gamma, self.profile.static_budget_db)[0]))
+        peak = self.profile.peak
+        kind = TileKind(int(classify(tile, gamma, self.profile.static_budget_db, peak)[0]))
         if kind == TileKind.EMPTY:
             return _Facts(kind)
         colour = tile.colour[0][:, tile.mask[0]]  # [T, K, 3], of the valid texels
         if kind == TileKind.CONSTANT:
             radiance = colour.astype(np.float64) ** gamma
             # The middle of the range: at most half a step of half float off.
-            return _Facts(kind, constant=0.5 * (radiance.min(1) + radiance.max(1)))
+            middle = 0.5 * (radiance.min(1) + radiance.max(1)) if peak is None else radiance.mean(1)
+            return _Facts(kind, constant=middle)
         means = channel_means(tile.colour, tile.mask)[0]
         if kind == TileKind.DYNAMIC:
             stored = encode_scale(means, gamma)
@@ -365,6 +367,7 @@ class _Fit:
             self.model.affine[slots].astype(np.float32),
             self.profile.gamma,
             self.profile.metric_weight,
+            self.profile.peak,
         )
 
     def table(self, batch: Batch) -> dict[str, Part]:

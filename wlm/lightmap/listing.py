@@ -3,16 +3,16 @@
 No pixels are read here. The layout follows the scene configuration of neural-dynamic-gi, section 10.1.
 """
 
-import json
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from wlm.errors import WlmError
 from wlm.formats.light import SUFFIXES
 from wlm.formats.limits import TIMES
-from wlm.formats.reading import named_file, read_json_file
+from wlm.formats.reading import named_file
+from wlm.lightmap.fields import field, is_list, is_number, is_size, is_text, kind, name_of, period_of, read_set
 
 SET_FILE = "set.json"
 
@@ -71,31 +71,31 @@ def list_folder(folder: Path, times: Sequence[float] | None) -> Listing:
     except OSError as error:
         raise WlmError(f"{folder}: cannot read: {error.strerror or error}") from error
     # A hidden name is another program's: macOS writes one beside every file on a foreign disk.
-    files = sorted((f for f in files if f.name[0] != "."), key=lambda f: (_natural(f.name), f.name))
+    files = sorted((f for f in files if f.name[0] != "."), key=lambda f: (natural(f.name), f.name))
     if not files:
         raise WlmError(f"{folder}: expected a {SET_FILE} or lightmaps ({', '.join(SUFFIXES)}), found neither")
     # Names need not sort by their hours ("_5.5h" before "_5.45h"): only times that the caller gave have an order.
     warn_order = times is not None
     if times is None:
-        times = [_time_of_name(f.stem) for f in files]
+        times = [time_of_name(f.stem) for f in files]
         if None in times:
             raise WlmError(
-                f"{folder}: {_count(files, 'lightmap')} and no {SET_FILE}: give {_count(files, 'time')} with "
+                f"{folder}: {count_of(files, 'lightmap')} and no {SET_FILE}: give {count_of(files, 'time')} with "
                 f"--times ({files[times.index(None)].name} does not end in an hour such as _18_55h)"
             )
-    _check_count(folder, files, times)
+    check_count(folder, files, times)
     mask = folder / "mask.png"
     return Listing(
         folder.resolve().name, files, times, str(mask) if mask.is_file() else "all", None, None, folder, warn_order
     )
 
 
-def _natural(name: str) -> list[str | int]:
+def natural(name: str) -> list[str | int]:
     """Sort key with digits split from text: "2" before "10"."""
     return [int(part) if i % 2 else part.lower() for i, part in enumerate(re.split(r"([0-9]+)", name))]
 
 
-def _time_of_name(stem: str) -> float | None:
+def time_of_name(stem: str) -> float | None:
     """Returns the hour that a file's name ends in, or None."""
     match = _NAME_TIME.search(stem)
     if not match:
@@ -104,13 +104,19 @@ def _time_of_name(stem: str) -> float | None:
     return float(bare or f"{whole}.{decimals or 0}")
 
 
-def _count(items: Sequence[object], noun: str) -> str:
+def count_of(items: Sequence[object], noun: str) -> str:
+    """Counts items in words: "1 time", "2 times"."""
     return f"{len(items)} {noun}{'' if len(items) == 1 else 's'}"
 
 
-def _check_count(where: Path, files: Sequence[Path], times: Sequence[float]) -> None:
+def check_count(where: Path, files: Sequence[object], times: Sequence[float], noun: str = "lightmap") -> None:
+    """Checks that there is a time for each lightmap, or state.
+
+    Raises:
+        WlmError: There are more or fewer.
+    """
     if len(times) != len(files):
-        raise WlmError(f"{where}: {_count(times, 'time')} for {_count(files, 'lightmap')}; expected one each")
+        raise WlmError(f"{where}: {count_of(times, 'time')} for {count_of(files, noun)}; expected one each")
 
 
 def parse_set(path: Path, times: Sequence[float] | None, trust: bool = False) -> Listing:
@@ -128,35 +134,22 @@ def parse_set(path: Path, times: Sequence[float] | None, trust: bool = False) ->
         WlmError: The file cannot be read, is not JSON, a field is missing or of a wrong kind, a file lies outside the
             folder, or there are too many; the message names the file and the field.
     """
-    content = read_json_file(path, "the set")
-    if not isinstance(content, dict):
-        raise WlmError(f"{path}: expected a JSON object, got {_kind(content)}")
-
-    def field(holder: dict, key: str, place: str, ok: Callable[[object], bool], expected: str) -> object:
-        if key not in holder:
-            raise WlmError(f"{path}: {place}{key} is missing; expected {expected}")
-        if not ok(holder[key]):
-            raise WlmError(f"{path}: {place}{key}: expected {expected}, got {_kind(holder[key])}")
-        return holder[key]
-
-    width = field(content, "width", "", _is_size, "a whole number of texels above 0")
-    height = field(content, "height", "", _is_size, "a whole number of texels above 0")
-    entries = field(content, "lightmaps", "", _is_list, "a list of lightmaps")
-    name = path.resolve().parent.name
-    if content.get("name") is not None:
-        name = field(content, "name", "", _is_text, "a name")
-    period = None
-    if content.get("period_hours") is not None:
-        period = float(field(content, "period_hours", "", _is_positive, "a number above 0"))
+    content = read_set(path)
+    if "layers" in content:
+        raise WlmError(f"{path}: expected a set of one lightmap a time, found one with layers")
+    width = field(path, content, "width", "", is_size, "a whole number of texels above 0")
+    height = field(path, content, "height", "", is_size, "a whole number of texels above 0")
+    entries = field(path, content, "lightmaps", "", is_list, "a list of lightmaps")
+    name, period = name_of(path, content), period_of(path, content)
     mask = "all"
     if content.get("mask") is not None:
-        mask = field(content, "mask", "", _is_text, 'the name of a PNG, "alpha" or "all"')
+        mask = field(path, content, "mask", "", is_text, 'the name of a PNG, "alpha" or "all"')
         if mask not in ("all", "alpha"):
             mask = str(named_file(path, mask, f"{path}: mask", trust))
 
     mesh = None
     if content.get("mesh") is not None:
-        mesh = named_file(path, field(content, "mesh", "", _is_text, "the name of a mesh"), f"{path}: mesh", trust)
+        mesh = named_file(path, field(path, content, "mesh", "", is_text, "the name of a mesh"), f"{path}: mesh", trust)
 
     if len(entries) > TIMES:
         raise WlmError(f"{path}: lightmaps: expected at most {TIMES:,}, got {len(entries):,}")
@@ -164,50 +157,14 @@ def parse_set(path: Path, times: Sequence[float] | None, trust: bool = False) ->
     for i, entry in enumerate(entries):
         place = f"lightmaps[{i}]"
         if not isinstance(entry, dict):
-            raise WlmError(f"{path}: {place}: expected an object (time_hours, file), got {_kind(entry)}")
-        file = field(entry, "file", f"{place}.", _is_text, "the name of a lightmap")
+            raise WlmError(f"{path}: {place}: expected an object (time_hours, file), got {kind(entry)}")
+        file = field(path, entry, "file", f"{place}.", is_text, "the name of a lightmap")
         if file not in found:  # links are followed once
             found[file] = named_file(path, file, f"{path}: {place}.file", trust)
         files.append(found[file])
         if times is None:
-            stamps.append(float(field(entry, "time_hours", f"{place}.", _is_number, "a finite number")))
+            stamps.append(float(field(path, entry, "time_hours", f"{place}.", is_number, "a finite number")))
     if times is not None:
-        _check_count(path, files, times)
+        check_count(path, files, times)
         stamps = times
     return Listing(name, files, stamps, mask, period, (height, width), path, True, mesh)
-
-
-def _is_text(value: object) -> bool:
-    # No file can have a NUL or half a character in its name.
-    if not isinstance(value, str) or not value.strip() or "\0" in value:
-        return False
-    return not any("\ud800" <= character <= "\udfff" for character in value)
-
-
-def _is_number(value: object) -> bool:
-    # True is an int to Python, and JSON as Python reads it has NaN, Infinity and integers of any length.
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return False
-    return abs(value) <= 1e300
-
-
-def _is_positive(value: object) -> bool:
-    return _is_number(value) and value > 0
-
-
-def _is_list(value: object) -> bool:
-    return isinstance(value, list) and bool(value)
-
-
-def _is_size(value: object) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and value > 0
-
-
-def _kind(value: object) -> str:
-    """Describes a JSON value in a message: itself, or its kind where it is long."""
-    if isinstance(value, dict):
-        return "an object"
-    if isinstance(value, list):
-        return f"a list of {len(value)}" if value else "an empty list"
-    text = json.dumps(value) if not isinstance(value, int) or abs(value) < 1e300 else "a very large number"
-    return text if len(text) <= 60 else text[:57] + "..."

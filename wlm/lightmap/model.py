@@ -60,10 +60,12 @@ class Profile(Settings):
             shrinks by orders of magnitude during a fit: 0.99 follows that, and is worth 0.1 to 0.8 dB over 0.999 in
             short fits, nothing in long ones.
         metric_weight: 0: the squared error in normalised gamma space, as the paper; 1: each texel, channel and time
-            weighted so that the loss is the squared error of linear radiance over the tile's range at that time,
-            which is what PSNR measures; between: the geometric mean.
+            weighted so that the loss is the squared error of linear radiance over the tile's range at that time, or
+            over `peak`, which is what PSNR measures; between: the geometric mean.
         quantise_from: Fraction of the steps after which the maps are quantised to the exact levels of the file.
         freeze_from: Fraction of the steps after which the maps are frozen and the network alone is trained.
+        peak: What an error is relative to, in all tiles at all times, of values that have a range of their own and
+            aren't light; None: the range of the tile at that time, which the paper's protocol divides by.
         static_budget_db: See `wlm.lightmap.tiles.classify`.
         frames: Which tiles that are neither empty nor constant hold the lightmap of each time as BC7 rather than maps
             and a network: "auto", where that takes no more bytes, "never" or "always". "video": all are an AV1 stream.
@@ -95,6 +97,7 @@ class Profile(Settings):
     metric_weight: float = Field(0.5, ge=0.0, le=1.0)
     quantise_from: float = Field(0.5, ge=0.0, le=1.0)
     freeze_from: float = Field(0.95, ge=0.0, le=1.0)
+    peak: float | None = Field(None, gt=0.0)
     static_budget_db: float = Field(60.0, gt=0.0)
     frames: Literal["auto", "never", "always", "video"] = "auto"
     frames_loss: float = Field(0.2, ge=0.0, le=255.0)

@@ -93,6 +93,7 @@ class Tally:
         decode: Callable[[float], np.ndarray] | None = None,
         views: Views | None = None,
         name: str = "lightmap",
+        peak: float | None = None,
     ) -> None:
         """Prepares the reads.
 
@@ -104,8 +105,10 @@ class Tally:
                 stored times is the mix of the two lightmaps that were added (eq. 2).
             views: Of the set's mesh; None for none.
             name: What to call the decoder in a message.
+            peak: As for `wlm.metrics.evaluate_frame`.
         """
         self._lightmaps, self._mask, self._decode, self._views, self._name = lightmaps, mask, decode, views, name
+        self._peak = peak
         self._grid = grid = TileGrid.of(*mask.shape)
         self._count = count = len(lightmaps.times)
         # Lengths of the intervals between stored times, that from the last to the first among them.
@@ -234,7 +237,7 @@ class Tally:
         else:
             light = self._decode(middle)
         name = f"{self._name} at {middle:g}"
-        metrics = evaluate_frame(0.5 * (first + second), light, self._mask, TILE, ("psnr",), name=name)
+        metrics = evaluate_frame(0.5 * (first + second), light, self._mask, TILE, ("psnr",), name=name, peak=self._peak)
         self._between[index] = metrics.psnr
         if index not in self._moving:
             return

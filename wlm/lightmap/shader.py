@@ -173,10 +173,21 @@ ivec2 wlm_source(sampler2D f_valid, ivec2 texel)
     return found;
 }}
 
+{last}"""
+
+_RADIANCE = """\
 // Linear radiance of a colour in gamma space.
 vec3 wlm_radiance(vec3 colour)
-{{
+{
     return pow(colour, vec3(WLM_GAMMA, WLM_GAMMA, WLM_GAMMA));
+}
+"""
+
+_VALUES = """\
+// The values of a colour, which has no gamma here: levels from 0 to 1. They mix as radiance does.
+vec3 wlm_value(vec3 colour)
+{{
+    return vec3({least}, {least}, {least}) + {span} * colour;
 }}
 """
 
@@ -195,17 +206,19 @@ _FRAME = {
 }
 
 
-def decode_glsl(model: LightmapModel) -> str:
+def decode_glsl(model: LightmapModel, values: tuple[float, float] | None = None) -> str:
     """The shader text for a model: functions alone, to be included below `#version`.
 
     Args:
         model: Its settings choose the constants, the GELU and what the time axis does at its ends.
+        values: What the levels 0 and 1 of a model without gamma stand for; None: the model is of radiance.
 
     Returns:
         GLSL 4.30, which Vulkan's dialect takes too.
     """
     profile = model.profile
     periodic = model.axis.periodic
+    last = _RADIANCE if values is None else _VALUES.format(least=repr(values[0]), span=repr(values[1] - values[0]))
     # repr gives the shortest decimals that are the number again, and always a point or an exponent.
     return _TEMPLATE.format(
         frame=_FRAME[profile.interpolation],
@@ -225,4 +238,5 @@ def decode_glsl(model: LightmapModel) -> str:
         turn_note="2 pi: the axis is a circle, midnight is no jump" if periodic else "pi, as in eq. 4",
         gamma=repr(float(profile.gamma)),
         gelu=_GELU["exact" if profile.gelu == "exact" else "tanh"],
+        last=last,
     )

@@ -16,7 +16,7 @@ class Targets:
         weight, emphasis: float32 [N, T, 3] and a number, see `wlm_kernels.lightmap.features.Batch`.
         shift, spread: float32 [N, 3].
         scale: float32 [N, T, 3].
-        range: float32 [N, T], of radiance.
+        range: float32 [N, T], of radiance, or the peak.
     """
 
     def __init__(
@@ -28,6 +28,7 @@ class Targets:
         affine: np.ndarray,
         gamma: float,
         metric_weight: float,
+        peak: float | None = None,
     ):
         """Normalises and weights colour.
 
@@ -37,7 +38,7 @@ class Targets:
             mask: bool [N, 128, 128], valid texels.
             scale: float32 [N, T, 3], as rounded for the file.
             affine: float32 [N, 2, 3], shift and spread, as rounded for the file.
-            gamma, metric_weight: Of the `Profile`.
+            gamma, metric_weight, peak: Of the `Profile`.
         """
         n, times = colour.shape[:2]
         self.number = number.astype(np.int32)
@@ -56,6 +57,8 @@ class Targets:
             self.texels[i, : self.count[i]] = np.flatnonzero(valid[i])
             values = flat[i][:, valid[i]]
             span = values.max((1, 2)) ** gamma - values.min((1, 2)) ** gamma  # [T] of linear radiance
+            if peak is not None:
+                span = np.full_like(span, peak)
             self.range[i] = span
             if metric_weight > 0:
                 # d radiance / d y = gamma (colour / scale)^(gamma - 1) scale^gamma spread; the middle factor is

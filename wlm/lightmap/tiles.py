@@ -23,6 +23,8 @@ TILE = 128  # texels a side: the paper's tile (Table 1)
 # A colour that was encoded and decoded again in float32 is off by a few parts in 10^6; a half float's step is at
 # least 488 such parts, so one step with this slack is never mistaken for two.
 _STEP_SLACK = 1.01
+_FLAT_DB = 50.0  # between half and one level of 8 bits
+_OUTLIER = 4.0  # a single texel of another value is within the budget of most tiles, and not what it means
 _HALF_MIN_EXPONENT = -14  # below 2**-14 half floats are subnormal and their step no longer shrinks
 _HALF_MANTISSA_BITS = 10
 
@@ -230,7 +232,7 @@ def static_pattern(colour: np.ndarray, means: np.ndarray) -> np.ndarray:
     return pattern
 
 
-def classify(tiles: TileData, gamma: float, static_budget_db: float = 60.0) -> np.ndarray:
+def classify(tiles: TileData, gamma: float, static_budget_db: float = 60.0, peak: float | None = None) -> np.ndarray:
     """Finds the least model that each tile needs, from a stated error budget.
 
     In linear space, over the valid texels:
@@ -244,11 +246,16 @@ def classify(tiles: TileData, gamma: float, static_budget_db: float = 60.0) -> n
       that the PSNR would measure the half float. A set of one time is such a product exactly.
     - `DYNAMIC`: the rest.
 
+    With a peak, of values that aren't light, the PSNR's peak is that one, and a tile is constant as well where at every
+    time its channels' means have a PSNR of `_FLAT_DB` and no texel is off by more than `_OUTLIER` times the error that
+    this allows: sources of 8 bits are never flat.
+
     Args:
         tiles: From `split`.
         gamma: The one given to `split`.
         static_budget_db: The lowest PSNR in decibels that makes a tile static; infinite admits only what is within a
             step of half float.
+        peak: Of `wlm.lightmap.model.Profile`.
 
     Returns:
         `[N]` int64 of `TileKind`.
@@ -265,9 +272,9 @@ def classify(tiles: TileData, gamma: float, static_budget_db: float = 60.0) -> n
         colour = tiles.colour[n]
         if not valid.any():
             kinds[n] = TileKind.EMPTY
-        elif _is_constant(colour, valid, gamma):
+        elif _is_constant(colour, valid, gamma) or (peak and _is_flat(colour, valid, gamma, peak)):
             kinds[n] = TileKind.CONSTANT
-        elif _is_static(colour, valid, means[n], gamma, static_budget_db):
+        elif _is_static(colour, valid, means[n], gamma, static_budget_db, peak):
             kinds[n] = TileKind.STATIC
         else:
             kinds[n] = TileKind.DYNAMIC
@@ -392,12 +399,21 @@ def _is_constant(colour: np.ndarray, valid: np.ndarray, gamma: float) -> bool:
     return bool((high - low <= _STEP_SLACK * _half_step(low)).all())
 
 
+def _is_flat(colour: np.ndarray, valid: np.ndarray, gamma: float, peak: float) -> bool:
+    """Whether the channels' means are near all texels of [T, 128, 128, 3] at every time, see `classify`."""
+    linear = colour[:, valid].astype(np.float64) ** gamma
+    error = np.abs(linear - linear.mean(axis=1, keepdims=True))
+    allowed = peak * 10.0 ** (-_FLAT_DB / 20.0)
+    return bool((np.square(error).mean((1, 2)) <= allowed**2).all() and error.max() <= _OUTLIER * allowed)
+
+
 def _is_static(
     colour: np.ndarray,  # [T, 128, 128, 3]
     valid: np.ndarray,  # [128, 128]
     means: np.ndarray,  # [T, 3]
     gamma: float,
     budget_db: float,
+    set_peak: float | None,
 ) -> bool:
     """Whether one colour per time, multiplied by one pattern, meets the budget at every time."""
     pattern = static_pattern(colour[None], means[None])[0][valid] ** gamma  # [K, 3]
@@ -406,7 +422,7 @@ def _is_static(
         error = np.abs(mean**gamma * pattern - linear)
         if (error <= _STEP_SLACK * _half_step(linear)).all():
             continue
-        peak = np.ptp(linear)
+        peak = np.ptp(linear) if set_peak is None else set_peak
         # A range of zero is one grey in all channels; the error above is then more than a step of half float.
         if peak == 0.0 or 10.0 * math.log10(peak * peak / np.mean(np.square(error))) < budget_db:
             return False

@@ -22,7 +22,7 @@ class Piece:
 
     Attributes:
         tiles: As they are in their set.
-        scale, affine, gamma, metric_weight: As `Targets` takes them.
+        scale, affine, gamma, metric_weight, peak: As `Targets` takes them.
     """
 
     tiles: TileCut
@@ -30,11 +30,13 @@ class Piece:
     affine: np.ndarray
     gamma: float
     metric_weight: float
+    peak: float | None
 
     def targets(self) -> Targets:
         """What the tiles are fitted to."""
         tiles = self.tiles.encoded(self.gamma)
-        return Targets(tiles.index, tiles.colour, tiles.mask, self.scale, self.affine, self.gamma, self.metric_weight)
+        weights = self.metric_weight, self.peak
+        return Targets(tiles.index, tiles.colour, tiles.mask, self.scale, self.affine, self.gamma, *weights)
 
 
 @dataclass(frozen=True, eq=False)

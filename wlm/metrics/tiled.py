@@ -41,7 +41,7 @@ class FrameMetrics:
         flip: Mean FLIP error in [0, 1]; NaN likewise.
         max_abs_error: Largest absolute error in the images' units, for every tile with a valid texel, scored
             or not; NaN without one.
-        range: Dynamic range in the images' units; NaN without a valid texel.
+        range: Dynamic range in the images' units, or the peak that was given; NaN without a valid texel.
         half_step: Half float's step at the tile's largest magnitude, in the images' units; NaN without a
             valid texel.
         valid: Number of valid texels.
@@ -121,6 +121,7 @@ def evaluate_frame(
     metrics: Sequence[str] = METRICS,
     flip_exposure_count: int = 2,
     name: str = "lightmap",
+    peak: float | None = None,
 ) -> FrameMetrics:
     """Scores one lightmap tile by tile (neural-dynamic-gi, section 10.2, as this module settles it).
 
@@ -133,6 +134,8 @@ def evaluate_frame(
         metrics: Any of `METRICS`. FLIP takes most of the time.
         flip_exposure_count: Exposures for HDR-FLIP, at least 2.
         name: What to call this lightmap in a message.
+        peak: The scale of every tile, above 0, where values have a range of their own and aren't light; None: the
+            tile's own range.
 
     Returns:
         Scores for each tile.
@@ -170,7 +173,7 @@ def evaluate_frame(
         if count == 0:
             continue
         a, b = ref[area][inside], test[area][inside]
-        span = float(np.ptp(a))
+        span = float(np.ptp(a)) if peak is None else peak
         result.range[index] = span
         result.half_step[index] = half_ulp(np.abs(a).max())
         result.max_abs_error[index] = np.abs(a - b).max()

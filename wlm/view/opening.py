@@ -111,14 +111,15 @@ class _Request:
 
     def model(self) -> Scene:
         model = load(self.path)
-        if model.SYSTEM == "lightmap":
-            from wlm.lightmap.data import load as load_set
+        if model.SYSTEM in ("lightmap", "lightmap-layers"):
+            from wlm.lightmap.front import load_light
 
             self._refuse("key", "walk", "scale", "extinction")
-            given = None if self.original is None else load_set(self.original)
+            sheet, model = model.shown() if model.SYSTEM == "lightmap-layers" else (None, model)
+            given = None if self.original is None else load_light(self.original, sheet)
             if given is not None:
                 self._check_size(given.mask.shape, (model.height, model.width))
-            return self._lightmaps(model, given)
+            return self._lightmaps(model, given, "" if sheet is None else f": {sheet.label}")
         if model.SYSTEM == "probe":
             from wlm.probe.places import probes_of
             from wlm.view.probe_scene import Probes
@@ -131,10 +132,10 @@ class _Request:
         raise WlmError(f"{self.path}: a network has no picture of its own; expected the lightmaps that it predicts")
 
     def lightmap_set(self) -> Scene:
-        from wlm.lightmap.data import load as load_set
+        from wlm.lightmap.front import load_light
 
         self._refuse("original", "key", "walk", "scale", "extinction")
-        return self._lightmaps(None, load_set(self.path))
+        return self._lightmaps(None, load_light(self.path))
 
     def lightmap(self) -> Scene:
         self._refuse("original", "key", "walk", "scale", "extinction")
@@ -195,13 +196,13 @@ class _Request:
                 f"{self.original}: expected a lightmap of {expected[1]}x{expected[0]}, found {found[1]}x{found[0]}"
             )
 
-    def _lightmaps(self, model: LightmapModel | None, lightmaps: LightmapSet | None) -> Scene:
+    def _lightmaps(self, model: LightmapModel | None, lightmaps: LightmapSet | None, which: str = "") -> Scene:
         from wlm.view.lightmap_scene import lightmap_scene
 
         geometry = None if self.mesh is None else read_geometry(self.mesh)
         if self.flat:
             geometry = None
-        return lightmap_scene(model, lightmaps, title=self.path.name, geometry=geometry, up=self._up)
+        return lightmap_scene(model, lightmaps, title=self.path.name + which, geometry=geometry, up=self._up)
 
     def _probes(self, probes: Probes) -> Scene:
         from wlm.probe.data import load_positions

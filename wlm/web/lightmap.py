@@ -11,10 +11,12 @@ import numpy as np
 from wlm.errors import WlmError
 from wlm.formats.geometry import read_geometry
 from wlm.formats.shared_exponent import pack_rgb9e5
-from wlm.lightmap.data import load
+from wlm.lightmap.data import LightmapSet
 from wlm.lightmap.decode import Decoder
 from wlm.lightmap.evaluation import count_kinds, psnr_of
 from wlm.lightmap.exporter import document
+from wlm.lightmap.front import load_light
+from wlm.lightmap.layers.sheet import Sheet
 from wlm.lightmap.model import LightmapModel
 from wlm.lightmap.shader import decode_glsl
 from wlm.lightmap.tiles import TileKind, valid_texels
@@ -35,13 +37,17 @@ def lightmap_page(
     hours: int = 6,
     up: Literal["y", "z"] = "y",
     progress: OnProgress | None = None,
+    sheet: Sheet | None = None,
+    others: int = 0,
 ) -> Page:
     """Makes the page of a lightmap model.
 
     Args:
         model: The model.
-        file_bytes: Size of its file.
+        file_bytes: Size of its file, or of its part of a layered one.
         mesh, original, hours, up, progress: As for `wlm.web.pages.make_page`.
+        sheet: Which sheet of a layered file it is; None: of none.
+        others: How many sheets more that file has.
 
     Raises:
         WlmError: The mesh or the set can't be read, or the set is of another size.
@@ -69,7 +75,7 @@ def lightmap_page(
     time = float(times[len(times) // 2])
     reference: dict[str, Any] | None = None
     if original is not None:
-        reference, originals = _originals(model, original, hours, progress)
+        reference, originals = _originals(model, load_light(original, sheet), original, hours, progress)
         arrays |= originals
         # A page begins where its original is.
         time = min(reference["times"], key=lambda stored: abs(stored - time))
@@ -103,16 +109,22 @@ def lightmap_page(
     ]
     if reference is not None:
         manifest["reference"] = reference
-    return Page("lightmap", model.name, "Lightmaps over the day, decoded on this GPU.", figures, manifest, arrays)
+    note = "Lightmaps over the day, decoded on this GPU."
+    if sheet is not None:
+        note += f" Shown is {sheet.label}, without the file's {others} other sheets."
+    return Page("lightmap", model.name, note, figures, manifest, arrays)
 
 
 def _originals(
-    model: LightmapModel, path: str | os.PathLike[str], hours: int, progress: OnProgress | None
+    model: LightmapModel,
+    lightmaps: LightmapSet,
+    path: str | os.PathLike[str],
+    hours: int,
+    progress: OnProgress | None,
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Some frames of the set, spread evenly, their gaps filled: what a filter would read there; with their scores."""
     if hours < 1:
         raise WlmError(f"--hours: expected at least 1, got {hours}")
-    lightmaps = load(path)
     size = lightmaps.mask.shape
     if size != (model.height, model.width):
         raise WlmError(f"{path}: expected lightmaps of {model.width}x{model.height}, found {size[1]}x{size[0]}")

@@ -45,8 +45,8 @@ def make_page(
     """Makes the page of a file.
 
     Args:
-        files: One `.wlm` of lightmaps or of probes; or the folder that `wlm atlas compress` wrote; or six-way lightmaps
-            of smoke, one EXR a frame, or their folder.
+        files: One `.wlm` of lightmaps (of layered ones the first light is shown) or of probes; or the folder that
+            `wlm atlas compress` wrote; or six-way lightmaps of smoke, one EXR a frame, or their folder.
         mesh: The scene: `.glb`, `.gltf` or `.obj`; of lightmaps with their UVs, of probes any.
         original: What was compressed, to compare with: a lightmap set, an atlas' lightmap, a probe file.
         key: Of a probe file with several arrays, the one that was compressed.
@@ -90,6 +90,15 @@ def make_page(
         return lightmap_page(
             model, path.stat().st_size, mesh=mesh, original=original, hours=hours, up=up, progress=progress
         )
+    if model.SYSTEM == "lightmap-layers":
+        from wlm.lightmap.layers.codec import sheet_bytes
+        from wlm.web.lightmap import lightmap_page
+
+        _refuse(path, key=key)
+        sheet, own = model.shown()
+        size = sheet_bytes(model)[sheet]
+        options = {"mesh": mesh, "original": original, "hours": hours, "up": up, "progress": progress}
+        return lightmap_page(own, size, sheet=sheet, others=len(model.sheets) - 1, **options)
     if model.SYSTEM == "probe":
         from wlm.web.probe import probe_page
 
