@@ -10,9 +10,10 @@ from builders.lightmaps import smooth_light
 
 from wlm.baselines.lightmap import RIVALS
 from wlm.baselines.lightmap_pca import encode_pca, encode_pca_bc4
-from wlm.baselines.lightmap_video import encode_av1, fill_smoothly
+from wlm.baselines.lightmap_video import encode_av1
 from wlm.errors import WlmError
 from wlm.metrics import psnr_from_mse
+from wlm.texels import fill_smoothly
 
 # One of each kind; the rest differ in a number.
 KINDS = ("pca-bc4-4", "pca-0.04", "av1-85", "av1-85-hour")

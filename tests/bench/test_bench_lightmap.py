@@ -128,10 +128,11 @@ def test_a_codec_without_its_package_says_so(lightmaps, monkeypatch):
     assert eight["psnr"] > 40.0
 
 
-def test_frames_have_nothing_to_fit(lightmaps):
-    rows = run_rows(lightmaps, [Profile.load("frames")], device="cpu", chosen=[0], repeats=1)
-    assert keys(rows) == [("ours", "frames"), ("texture", "frames")]
-    assert [rows[0].get(name) for name in ("frames_tiles", "constant_tiles", "steps")] == [2, 1, None]
+@pytest.mark.parametrize(("name", "changes"), [("frames", {}), ("video", {"video_speed": 8})])
+def test_frames_and_video_have_nothing_to_fit(lightmaps, name, changes):
+    rows = run_rows(lightmaps, [Profile.load(name).override(changes)], device="cpu", chosen=[0], repeats=1)
+    assert keys(rows) == [("ours", name), ("texture", name)]
+    assert [rows[0].get(figure) for figure in (f"{name}_tiles", "constant_tiles", "steps")] == [2, 1, None]
     assert rows[0]["psnr"] > 45.0 and rows[0]["decode_ms"] > 0.0
 
 

@@ -65,7 +65,7 @@ def _video() -> Kept:
 def _layers() -> Kept:
     from builders.layered_sets import random_layers
 
-    ranges = {"0.kind": (0, 5), "times": (3, 24.5), "2.constant": (0, -1.0), "1.ranges": ((0, 0, 0), 3.0)}
+    ranges = {"0.kind": (0, 6), "times": (3, 24.5), "2.constant": (0, -1.0), "1.ranges": ((0, 0, 0), 3.0)}
     return Kept(_written(random_layers(uvt_slices=1).save), wlm.load, {"0.mask": "missing"}, ranges)
 
 

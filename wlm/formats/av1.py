@@ -30,7 +30,7 @@ _KNOWN = {_SEQUENCE_HEADER, _DELIMITER, 3, 4, 5, 6, 7, 15}
 
 
 def encode_av1(pictures: np.ndarray, quality: int, speed: int, extra: str) -> bytes:
-    """Encodes pictures as one stream; the result depends on nothing else.
+    """Encodes pictures as one stream, the same on any machine with the same version of the encoder.
 
     Args:
         pictures: uint16 [T, H, W, 3], planes Y, U and V, below 1024.

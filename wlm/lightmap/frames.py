@@ -43,7 +43,7 @@ def missing_encoder(count: int) -> str | None:
 def choose_frames(
     kinds: np.ndarray, numbers: Sequence[int] | np.ndarray, mask: np.ndarray, times: int, profile: Profile
 ) -> np.ndarray:
-    """Says which tiles are stored as frames, see `Profile.frames`.
+    """Says which tiles are stored as frames or video, see `Profile.frames`.
 
     Args:
         kinds: int [N], from `wlm.lightmap.tiles.classify`.

@@ -10,7 +10,7 @@ a GPU holds is the unpacked levels, 32 bits for a texel and time.
 
 A picture is a page of the map, up to 8 x 8 tiles: a stream for each tile would take 19% to 60% more. What lies beside
 the valid texels is filled smoothly, which costs next to nothing; decoders fill the gaps with charts' light anyway. The
-planes that are coded are luma, a green and an orange difference, in our own arithmetic: libavif's, in floats, loses 0.2
+planes that are coded are luma, a green and an orange difference, in our own arithmetic: libavif's, in floats, loses 0.1
 to 0.4 dB, and is no part of AV1's standard, which is exact to the bit.
 """
 

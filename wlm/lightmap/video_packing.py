@@ -66,7 +66,7 @@ def pages(kind: np.ndarray, columns: int, times: int) -> list[Page]:
 
 
 def decode_levels(stream: bytes, count: int, height: int, width: int, extra: str = EXTRA) -> np.ndarray:
-    """Decodes them to whole numbers, uint16 [count, H, W, 3], up to `WHITE`.
+    """Decodes a stream of levels to whole numbers, uint16 [count, H, W, 3], up to `WHITE`.
 
     Raises:
         ValueError, WlmError: As `wlm.formats.av1.decode_av1`.
