@@ -44,7 +44,7 @@ def test_every_row_has_its_figures(rows):
     ways = ["none", "sphere", "sphere lists", "box", "exact", "exact, given order", "cut 2.5", "cut 2"]
     fits = [("fit", f"standard {STEPS} steps"), ("dense torch", f"standard {STEPS} steps")]
     rivals = [(name, size) for size in ("same bytes", "3x bytes") for name in RIVALS] + [("Unreal packing", "")]
-    volume = [("volume", "walk of 4 frames"), ("volume", "teleport")]
+    volume = [("volume", f"{light}, walk of 4 frames") for light in ("lossless", "ours")]
     for scene, speed in (("room", fits), ("hall", [])):
         assert keys(row for row in rows if row.scene == scene) == [
             *ours,
@@ -62,7 +62,8 @@ def test_every_row_has_its_figures(rows):
             assert row["bpp"] == pytest.approx(row["bytes"] * 8 / 300) and row["encode_seconds"] > 0.0
             assert row["probes"] == 270 and row["share_of_float32"] == pytest.approx(row["bpp"] / (27 * 32))
         if row.method == "volume":
-            assert 0.0 <= row["coverage"] <= 1.0 and row["frames"] >= 1
+            assert 0.0 <= row["coverage"] <= 1.0 and row["frames"] == 4
+            assert row["psnr"] < row["light_psnr"] + 1.0 and (row["light_psnr"] == 120.0) == ("lossless" in row.option)
 
 
 def test_rivals_keep_to_the_bytes(rows):

@@ -39,6 +39,8 @@ MODULES = (
     "probe.gaussian_sum",
     "probe.step",
     "probe.volume",
+    "probe.volume_frame",
+    "probe.volume_weights",
     "raster.gradient",
     "raster.rasterize",
     "raster.texture",

@@ -12,9 +12,11 @@ For each set these kinds of rows, but where another is named:
   in plain torch, all of them on CUDA, else a few.
 - the rivals of `wlm.baselines.probe` at the bytes of the first profile's file and at three times as many, and
   Unreal's packing, which has one size. The list of dead probes is counted for them too.
-- method "volume": a walk with the cascaded volume over the decoder, whose figures are means and 95th percentiles of a
-  frame, and a teleport into an empty volume: its first frame, and the frame after which nothing waits. The light's RMS
-  is that of the direct decode, which the volume's RMSE is against.
+- method "volume": a walk with the cascaded volume, over the probes as they were ("lossless") and over the decoder
+  ("ours"), whose figures are means and 95th percentiles of a frame. Its PSNR is that of what is read at probes near the
+  viewer against the input, beside it that of the same probes as they were decoded, and of what is read farther away.
+  It starts with an empty volume: what its first frame takes, and the frames until nothing waits. The light's RMS is
+  that of the probes that the volume was made from, which the volume's RMSE is against.
 
 A largest error is that against the float64 decode of the same model, at its own cut, in the probes' unit. A decode on
 CUDA is timed as the replay of a graph, so that gaps between launches do not count; the rivals decode on the CPU alone.
@@ -41,9 +43,10 @@ from wlm.probe.decode import Decoder, Points
 from wlm.probe.evaluation import Report, score
 from wlm.probe.exact import decode64
 from wlm.probe.fit import compress
+from wlm.probe.light import DecodedLight, StoredLight
 from wlm.probe.model import ProbeModel, Profile
-from wlm.probe.volume import SIZES, Volume
-from wlm.probe.walk import EYE_HEIGHT, camera_path, summary, walk
+from wlm.probe.volume import Volume
+from wlm.probe.walk import STEP, camera_path, loop_frames, settle, summary, walk
 
 PROFILES = ("standard", "compact", "paper")
 """Profiles of a run; the first is the one that the other rows are about."""
@@ -55,7 +58,6 @@ _DEMO_KEYS = ("12.00", "21.00")  # noon and night
 # A quick fit is worth this many steps of one probe, however many probes there are: some seconds on two CPU cores.
 _QUICK_PROBE_STEPS = 600_000
 _QUICK_FRAMES = 60
-_FRAMES = 240
 _DENSE_STEPS = 10  # of the fit in plain torch, where it isn't run to its end
 _CUTS = (2.5, 2.0)
 _RIVALS: dict[str, tuple[str, Sequence[int | None]]] = {
@@ -69,8 +71,6 @@ _RIVALS: dict[str, tuple[str, Sequence[int | None]]] = {
     "moving basis": ("moving_basis", WEIGHT_BITS),
 }
 _SIZES = {1: "same bytes", 3: "3x bytes"}  # of the first profile's file
-# The scene is scaled to this length for the volume, whose blocks are metres: the finest window covers a quarter of it.
-_VILLAGE = 128.0
 
 PANELS = (Panel("bpp", "psnr", ("ours", *_RIVALS)), Panel("decode_ms", "max_error", ("decode",)))
 """What a plot of the rows shows: quality against size, and a decode's error against its time."""
@@ -115,7 +115,7 @@ def run(
         device=device,
         ratios=() if quick else RATIOS,
         sizes=() if not rivals else (1,) if quick else tuple(_SIZES),
-        frames=_QUICK_FRAMES if quick else _FRAMES,
+        frames=_QUICK_FRAMES if quick else None,
         progress=progress,
     )
 
@@ -164,7 +164,7 @@ def run_rows(
     device: str,
     ratios: Sequence[float],
     sizes: Sequence[int],
-    frames: int,
+    frames: int | None,
     repeats: int | None = None,
     progress: Note | None = None,
 ) -> list[Row]:
@@ -175,7 +175,7 @@ def run_rows(
         profiles: At least one; all but the rows "ours" are about the first.
         ratios: Further ratios of the first profile; the profile's ratio is left out.
         sizes: Of the rivals, in bytes of the first profile's file: 1, 3; none: no rivals.
-        frames: Frames of the walk, at least one.
+        frames: Frames of the walk, at least one; None: as many as a tenth of a block each takes.
         repeats: As for `Bench`.
     """
     if not sets or not profiles:
@@ -334,56 +334,39 @@ class _ProbeBench(Bench):
             **_size_and_psnr(report),
         )
 
-    def volume_rows(self, model: ProbeModel, frames: int) -> list[Row]:
-        """A walk, and a teleport into an empty volume."""
-        self.note(f"the volume, {frames} frames")
-        extent = float(np.ptp(self.position, axis=0).max())
-        scale = extent / _VILLAGE if extent > 0 else 1.0
-        path = camera_path(self.position, frames, EYE_HEIGHT * scale)
-        decoder = Decoder(model, self.device)
-        volume = Volume(
-            self.probes.position,
-            decoder.decode,
-            model.outputs,
-            live=self.probes.live,
-            scale=scale,
-            device=self.device,
-        )
-        start = walk(volume, path[:1])
-        left, count = start[0].stats.left, 1
-        while left:
-            left, count = volume.update(path[0]).left, count + 1
-        first, settled = summary(start), summary(walk(volume, path[:1]))
-        walked = summary(walk(volume, path))
-        blocks = ", ".join(f"{size:g}" for size in SIZES)
-        spread = {
-            "update_ms": walked["update_ms"],
-            "update_decode_ms": walked["decode_ms"],
-            "blocks": walked["updated"],
-            "probes_decoded": walked["probes"],
-        }
-        figures = {name: value["mean"] for name, value in spread.items()}
-        figures |= {f"{name}_p95": value["p95"] for name, value in spread.items()}
-        return [
-            self.row(
-                "volume",
-                f"walk of {frames} frames",
-                f"blocks of {blocks} m, the scene as {_VILLAGE:g} m",
-                frames=frames,
-                memory=volume.memory_bytes / 2**20,
-                **_light(walked),
-                **figures,
-            ),
-            self.row(
-                "volume",
-                "teleport",
-                "into an empty volume",
-                frames=count,
-                first_ms=first["update_ms"]["max"],
-                **_light(settled),
-                **{f"first_{name}": value for name, value in _light(first).items()},
-            ),
-        ]
+    def volume_rows(self, model: ProbeModel, frames: int | None) -> list[Row]:
+        """A walk with the probes as they were and one with the model's, and a teleport into an empty volume."""
+        decoder, live, position = Decoder(model, self.device), self.probes.live, self.probes.position
+        rows = []
+        lights = {"lossless": StoredLight(self.probes.values, self.device), "ours": DecodedLight(decoder, position)}
+        for name, light in lights.items():
+            volume = Volume(position, light, live=live)
+            count = frames or loop_frames(self.position, STEP * volume.sizes[0])
+            path = camera_path(self.position, count)
+            self.note(f"the volume, {name}, {count} frames")
+            peak = float(np.ptp(self.probes.values))
+            start = walk(volume, path[:1], original=self.probes.values)
+            first = 1 + (settle(volume, path[0]) if start[0].stats.left else 0)
+            walked = summary(walk(volume, path, original=self.probes.values), peak)
+            spread = {"update_ms": walked["update_ms"], "blocks": walked["updated"], "probes_decoded": walked["probes"]}
+            rows.append(
+                self.row(
+                    "volume",
+                    f"{name}, walk of {count} frames",
+                    f"the finest blocks are {volume.sizes[0]:.3g} units wide",
+                    frames=count,
+                    first_ms=summary(start)["update_ms"]["max"],
+                    frames_first=first,
+                    memory=volume.memory_bytes / 2**20,
+                    psnr=walked["psnr"],
+                    light_psnr=walked["light_psnr"],
+                    far_psnr=walked["far_psnr"],
+                    **_light(walked),
+                    **{key: value["mean"] for key, value in spread.items()},
+                    **{f"{key}_p95": value["p95"] for key, value in spread.items()},
+                )
+            )
+        return rows
 
     def _decode(
         self, decoder: Decoder, points: Points, exact: np.ndarray, size: int

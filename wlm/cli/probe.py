@@ -30,7 +30,7 @@ from wlm.cli.options import (
     Seed,
     output_option,
 )
-from wlm.errors import WlmError
+from wlm.cli.probe_volume import register
 
 if TYPE_CHECKING:
     import numpy as np
@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from wlm.probe import ProbeModel, ProbeSet, Report
 
 app = typer.Typer(help="Light probes: quantised 3D Gaussians and a small network, read through a cascaded volume.")
+register(app)
 
 _Probes = Annotated[Path, typer.Argument(metavar="PROBES", help="A .npz, .json or .lmbake file of probes.")]
 _Key = Annotated[str | None, typer.Option(help="Name of the values in PROBES; default the only ones.")]
@@ -46,7 +47,6 @@ _Convention = Annotated[
     str | None, typer.Option(help="Of the numbers: threejs, godot, unreal or unity; default as PROBES says.")
 ]
 
-_AXES = ("x", "y", "z")
 _NAMES = {
     "global_pca": "PCA",
     "block_pca": "block PCA",
@@ -271,64 +271,6 @@ def export(
     show(rows)
 
 
-@app.command()
-def walk(
-    file: ModelFile,
-    probes_path: Annotated[
-        Path | None, typer.Argument(metavar="PROBES", help="The probes' positions; default those in FILE.wlm.")
-    ] = None,
-    frames: Annotated[int, typer.Option(help="Frames of a loop through the scene.")] = 600,
-    path: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Viewpoints: a JSON list of x, y, z, or `position` of a .npz.")
-    ] = None,
-    scale: Annotated[float, typer.Option(help="Of the volume's blocks and the eye's height: units in a metre.")] = 1.0,
-    up: Annotated[str, typer.Option(help="The axis that points up: x, y or z.")] = "y",
-    budget: Annotated[int | None, typer.Option(help="Blocks decoded in a frame; default 64.")] = None,
-    json_path: ReportFile = None,
-    device: Device = "cpu",
-) -> None:
-    """Walk through the scene with a cascaded lighting volume: what a frame costs, covers and gets wrong."""
-    if json_path is not None:
-        check_output(json_path, ".json")
-    if up not in _AXES:
-        raise WlmError(f"--up: expected x, y or z, got {up}")
-    quiet_warp()
-    from wlm.probe import load_positions
-    from wlm.probe.volume import BUDGET, Volume
-    from wlm.probe.walk import EYE_HEIGHT, camera_path, summary, walk
-    from wlm.system import load
-
-    model = load(file, "probe")
-    decoder = model.decoder(device)
-    position, at_probes = _positions(model, probes_path)
-    if not at_probes:
-        raise WlmError(f"{probes_path}: expected the {model.probes} probes that {file} was made of, in their order")
-    volume = Volume(
-        position,
-        decoder.decode,
-        model.outputs,
-        live=~model.dead if len(model.dead) else None,
-        scale=scale,
-        budget=BUDGET if budget is None else budget,
-        device=decoder.device,
-    )
-    if path is None:
-        viewpoints = camera_path(volume.position, frames, EYE_HEIGHT * scale, _AXES.index(up))
-    else:
-        viewpoints = load_positions(path)
-    with running("walk") as progress:
-        figures = summary(walk(volume, viewpoints, progress=progress))
-    memory = {
-        "volume_bytes": volume.memory_bytes,
-        "model_bytes": decoder.device_bytes,
-        "host_bytes": volume.host_bytes,
-    }
-    if json_path is not None:
-        settings = {"device": decoder.device, "sizes": list(volume.sizes), "side": volume.side, "budget": volume.budget}
-        write_json(json_path, {"name": model.name} | settings | memory | figures)
-    _show_walk(file, figures, memory)
-
-
 def _load(path: Path, key: str | None, convention: str | None) -> "ProbeSet":
     """Reads a set and notes what was repaired in it."""
     from wlm.probe.data import load
@@ -368,25 +310,3 @@ def _show_report(file: Path, profile: str, report: "Report", rivals: "list[tuple
         note(f"worst: {number(worst['psnr'], '.2f')} dB, probe {worst['probe']} at ({place})")
     for warning in report.warnings:
         note(f"warning: {warning}")
-
-
-def _show_walk(file: Path, figures: dict[str, Any], memory: dict[str, int]) -> None:
-    rows = table(f"{file}: {figures['frames']} frames", ["per frame", "mean", "95%", "worst"])
-    counts = {
-        "blocks decoded": "updated",
-        "blocks from the cache": "cached",
-        "blocks waiting": "left",
-        "probes": "probes",
-    }
-    times = {f"{name} ms": f"{name}_ms" for name in ("update", "find", "decode", "upload", "read")}
-    for names, form in ((counts, ".1f"), (times, ".3f"), ({"error": "rmse", "light": "rms"}, ".4g")):
-        for name, key in names.items():
-            values = figures[key] or {}
-            rows.add_row(name, *(number(values.get(part), form) for part in ("mean", "p95", "max")))
-        rows.add_section()
-    coverage = figures["coverage"] or {}
-    rows.add_row("covered", *(number(coverage.get(part), ".2%") for part in ("mean", "p5", "min")))
-    rows.add_section()
-    for name, count in memory.items():
-        rows.add_row(name.replace("_bytes", ", bytes"), f"{count:,}")
-    show(rows)

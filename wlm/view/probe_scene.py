@@ -12,11 +12,12 @@ from wlm.errors import WlmError
 from wlm.formats.geometry import Geometry
 from wlm.probe.data import ProbeSet
 from wlm.probe.decode import Decoder
+from wlm.probe.light import DecodedLight, Light, StoredLight
 from wlm.probe.model import CENTRE, ROTATION, SCALE, ProbeModel
 from wlm.probe.places import ball_exposure, ball_radius
 from wlm.probe.sphere import basis, coefficient_bands, cosine_factor, irradiance, sh_count
-from wlm.probe.volume import SIDE, SIZES, Volume
-from wlm.probe.walk import EYE_HEIGHT, camera_path
+from wlm.probe.volume import Volume
+from wlm.probe.walk import camera_path, settle
 from wlm.view.canvas import Canvas, Hit
 from wlm.view.rendering import import_pyvista
 from wlm.view.scene import Scene, Slider, State, frame_slider
@@ -45,6 +46,7 @@ class Probes:
         coefficients: C.
         values: By "decoded" and "original", as there are, float32 [N, C, 3].
         decode: Light float32 [M, 3 C] at points [M, 3].
+        light: That of the probes, for a volume.
         model: The model; None: the input alone.
         note: For the caption.
     """
@@ -54,6 +56,7 @@ class Probes:
     coefficients: int
     values: dict[str, np.ndarray]
     decode: Callable[[np.ndarray], np.ndarray]
+    light: Light
     model: ProbeModel | None
     note: str
 
@@ -72,7 +75,8 @@ class Probes:
         if original is not None:
             values["original"] = original[live].reshape(-1, count, 3)
         note = f"{model.name}, {len(places):,} probes, {model.count:,} Gaussians, profile {model.profile.name}"
-        return cls(places, np.flatnonzero(live), count, values, decoder.decode, model, note)
+        light = DecodedLight(decoder, places)
+        return cls(places, np.flatnonzero(live), count, values, decoder.decode, light, model, note)
 
     @classmethod
     def of_set(cls, probes: ProbeSet, title: str) -> Self:
@@ -90,7 +94,7 @@ class Probes:
 
         shown = {"original": values.reshape(-1, count, 3)}
         note = f"{probes.name}, {len(places):,} live probes, {probes.key}"
-        return cls(places, np.flatnonzero(probes.live), count, shown, nearest, None, note)
+        return cls(places, np.flatnonzero(probes.live), count, shown, nearest, StoredLight(values), None, note)
 
 
 def probe_scene(
@@ -99,7 +103,7 @@ def probe_scene(
     title: str,
     geometry: Geometry | None = None,
     walk: np.ndarray | None = None,
-    scale: float | None = None,
+    block: float | None = None,
     up: int = 1,
 ) -> Scene:
     """Makes the scene of probes.
@@ -109,18 +113,14 @@ def probe_scene(
         title: Of the window.
         geometry: The scene's mesh, lit at its vertices; None: none.
         walk: [F, 3], viewpoints of the cascaded volume; None: a loop through the scene.
-        scale: Of the volume's blocks: units in a metre. None: 1, or less where the finest window would span more than
-            half of the scene.
+        block: Side of the volume's finest blocks; None: from the probes' spacing.
         up: The axis that points up.
 
     Raises:
-        WlmError: The scale isn't above 0.
+        WlmError: The side isn't above 0.
     """
-    if scale is None:
-        longest = float(np.ptp(probes.position, axis=0).max())
-        scale = min(1.0, longest / (2.0 * SIDE * SIZES[0])) if longest > 0 else 1.0
-    volume = Volume(probes.position, probes.decode, 3 * probes.coefficients, scale=scale)
-    path = walk if walk is not None else camera_path(volume.position, _LOOP, EYE_HEIGHT * scale, up)
+    volume = Volume(probes.position, probes.light, block=block)
+    path = walk if walk is not None else camera_path(volume.position, _LOOP, up=up)
     views = ("balls", "gaussians", "volume") if probes.model is not None else ("balls", "volume")
     sliders = frame_slider(len(path), ("volume",)) + (_SIGMAS,) * (probes.model is not None)
     return _ProbeScene(
@@ -230,9 +230,9 @@ class _ProbeScene(Scene):
         frame = state.frame
         if frame != self._frame:
             # A jump is waited for; the next frame shows what a frame's budget fills.
+            if self._frame is None or frame != self._frame + 1:
+                settle(self.volume, self.path[frame])
             self._stats = self.volume.update(self.path[frame])
-            while self._stats.left and (self._frame is None or frame != self._frame + 1):
-                self._stats = self.volume.update(self.path[frame])
             self._frame = frame
         values, valid = self.volume.unscroll()
         centres, sides, light = [], [], []

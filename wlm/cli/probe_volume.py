@@ -1,0 +1,112 @@
+"""`wlm probe walk`: the light of probes as a viewer gets it, through the cascaded volume."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from wlm.cli.console import check_output, number, quiet_warp, running, show, table, write_json
+from wlm.cli.options import Device, ModelFile, ReportFile
+from wlm.errors import WlmError
+
+_AXES = ("x", "y", "z")
+
+
+def register(app: typer.Typer) -> None:
+    """Adds the commands of the volume to those of probes."""
+    app.command()(walk)
+
+
+def walk(
+    file: ModelFile,
+    probes_path: Annotated[
+        Path | None,
+        typer.Argument(metavar="PROBES", help="What was compressed, to compare with; default the places in FILE.wlm."),
+    ] = None,
+    frames: Annotated[
+        int | None, typer.Option(help="Frames of a loop through the scene; default a tenth of a block each.")
+    ] = None,
+    path: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Viewpoints: a JSON list of x, y, z, or `position` of a .npz.")
+    ] = None,
+    block: Annotated[
+        float | None, typer.Option(help="Side of the finest blocks; default from the probes' spacing.")
+    ] = None,
+    eye: Annotated[
+        float | None, typer.Option(help="Height of the eyes above the ground; default an 80th of the scene's length.")
+    ] = None,
+    up: Annotated[str, typer.Option(help="The axis that points up: x, y or z.")] = "y",
+    budget: Annotated[int | None, typer.Option(help="Blocks decoded in a frame; default 64.")] = None,
+    key: Annotated[str | None, typer.Option(help="Name of the values in PROBES; default the only ones.")] = None,
+    json_path: ReportFile = None,
+    device: Device = "cpu",
+) -> None:
+    """Walk through the scene with a cascaded lighting volume: what a frame costs, covers and gets wrong.
+
+    With PROBES the light that is read is scored against theirs.
+    """
+    if json_path is not None:
+        check_output(json_path, ".json")
+    if up not in _AXES:
+        raise WlmError(f"--up: expected x, y or z, got {up}")
+    quiet_warp()
+    from wlm.probe import load_positions
+    from wlm.probe.light import DecodedLight
+    from wlm.probe.places import probes_of
+    from wlm.probe.volume import BUDGET, Volume
+    from wlm.probe.walk import STEP, camera_path, loop_frames, settle, summary, walk
+    from wlm.system import load
+
+    model = load(file, "probe")
+    decoder = model.decoder(device)
+    if probes_path is None:
+        position, original, live = model.stored_positions(), None, ~model.dead if len(model.dead) else None
+    else:
+        position, original, live = probes_of(model, probes_path, key)
+    if not model.has_probes_at(position):
+        raise WlmError(f"{probes_path}: expected the {model.probes} probes that {file} was made of, in their order")
+    budget = BUDGET if budget is None else budget
+    volume = Volume(position, DecodedLight(decoder, position), live=live, block=block, budget=budget)
+    if path is None:
+        axis, lit = _AXES.index(up), position[volume.numbers]
+        if frames is None:
+            frames = loop_frames(lit, STEP * volume.sizes[0], axis)
+        viewpoints = camera_path(lit, frames, eye, axis)
+    else:
+        viewpoints = load_positions(path)
+    first = settle(volume, viewpoints[0])
+    peak = None if original is None else float(original.max()) - float(original.min())
+    with running("walk") as progress:
+        figures = summary(walk(volume, viewpoints, original=original, progress=progress), peak)
+    figures |= {"first_frames": first, "volume_bytes": volume.memory_bytes, "model_bytes": decoder.device_bytes}
+    if json_path is not None:
+        settings = {"device": decoder.device, "sizes": list(volume.sizes), "side": volume.side, "budget": volume.budget}
+        write_json(json_path, {"name": model.name} | settings | figures)
+    _show_walk(file, figures)
+
+
+def _show_walk(file: Path, figures: dict[str, Any]) -> None:
+    rows = table(f"{file}: {figures['frames']} frames", ["per frame", "mean", "95%", "worst"])
+    counts = {
+        "blocks decoded": "updated",
+        "blocks from the pool": "cached",
+        "blocks waiting": "left",
+        "probes": "probes",
+    }
+    times = {"update ms": "update_ms", "read ms": "read_ms"}
+    for names, form in ((counts, ".1f"), (times, ".3f"), ({"error": "rmse", "light": "rms"}, ".4g")):
+        for name, key in names.items():
+            values = figures[key] or {}
+            rows.add_row(name, *(number(values.get(part), form) for part in ("mean", "p95", "max")))
+        rows.add_section()
+    coverage = figures["coverage"] or {}
+    rows.add_row("covered", *(number(coverage.get(part), ".2%") for part in ("mean", "p5", "min")))
+    rows.add_section()
+    names = {"read near, dB": "psnr", "decoded there, dB": "light_psnr", "read farther away, dB": "far_psnr"}
+    for name, key in names.items():
+        if key in figures:
+            rows.add_row(name, number(figures[key], ".2f"))
+    rows.add_row("frames until all is there", str(figures["first_frames"]))
+    rows.add_row("volume, bytes", f"{figures['volume_bytes']:,}")
+    rows.add_row("model, bytes", f"{figures['model_bytes']:,}")
+    show(rows)
