@@ -10,6 +10,7 @@ from wlm.bench.probe import PANELS, run, run_rivals, run_rows
 from wlm.errors import WlmError
 from wlm.probe.data import from_arrays
 from wlm.probe.model import Profile
+from wlm.probe.seen import KINDS
 
 STEPS = 120
 PROFILES = [
@@ -45,6 +46,7 @@ def test_every_row_has_its_figures(rows):
     fits = [("fit", f"standard {STEPS} steps"), ("dense torch", f"standard {STEPS} steps")]
     rivals = [(name, size) for size in ("same bytes", "3x bytes") for name in RIVALS] + [("Unreal packing", "")]
     volume = [("volume", f"{light}, walk of 4 frames") for light in ("lossless", "ours")]
+    views = [("views", f"balls, {light}") for light in KINDS]
     for scene, speed in (("room", fits), ("hall", [])):
         assert keys(row for row in rows if row.scene == scene) == [
             *ours,
@@ -52,6 +54,7 @@ def test_every_row_has_its_figures(rows):
             *speed,
             *rivals,
             *volume,
+            *views,
         ]
     for row in rows:
         assert row.system == "probe" and row.notes

@@ -17,6 +17,7 @@ For each set these kinds of rows, but where another is named:
   viewer against the input, beside it that of the same probes as they were decoded, and of what is read farther away.
   It starts with an empty volume: what its first frame takes, and the frames until nothing waits. The light's RMS is
   that of the probes that the volume was made from, which the volume's RMSE is against.
+- method "views": pictures of balls at the probes, compared as they are shown, see `wlm.probe.seen`.
 
 A largest error is that against the float64 decode of the same model, at its own cut, in the probes' unit. A decode on
 CUDA is timed as the replay of a graph, so that gaps between launches do not count; the rivals decode on the CPU alone.
@@ -45,6 +46,7 @@ from wlm.probe.exact import decode64
 from wlm.probe.fit import compress
 from wlm.probe.light import DecodedLight, StoredLight
 from wlm.probe.model import ProbeModel, Profile
+from wlm.probe.seen import VIEWS, score_views
 from wlm.probe.volume import Volume
 from wlm.probe.walk import STEP, camera_path, loop_frames, settle, summary, walk
 
@@ -195,6 +197,7 @@ def run_rows(
         if sizes:
             rows += bench.rival_rows(first.bytes, sizes)
         rows += bench.volume_rows(first.model, frames)
+        rows += bench.view_rows(first.model, VIEWS if frames is None else min(frames, VIEWS))
     return rows
 
 
@@ -367,6 +370,26 @@ class _ProbeBench(Bench):
                 )
             )
         return rows
+
+    def view_rows(self, model: ProbeModel, views: int) -> list[Row]:
+        """Pictures of balls under the light, for each way to read it."""
+        self.note(f"{views} views of balls")
+        decoded = Decoder(model, self.device).decode_probes(self.probes.position)
+        try:
+            scores = score_views(self.probes, decoded, views=views, device=self.device)
+        except WlmError as error:  # no spherical harmonics
+            return [self.missing_row("views", "balls", error)]
+        return [
+            self.row(
+                "views",
+                f"{score.drawn}, {score.light}",
+                f"{score.views} views under the probes as they were and under these",
+                psnr=score.psnr,
+                ssim=score.ssim,
+                flip=score.flip,
+            )
+            for score in scores
+        ]
 
     def _decode(
         self, decoder: Decoder, points: Points, exact: np.ndarray, size: int

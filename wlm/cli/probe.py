@@ -30,7 +30,7 @@ from wlm.cli.options import (
     Seed,
     output_option,
 )
-from wlm.cli.probe_volume import register
+from wlm.cli.probe_volume import register, score_seen, show_seen
 
 if TYPE_CHECKING:
     import numpy as np
@@ -164,6 +164,10 @@ def evaluate(
     baselines: Annotated[
         bool, typer.Option("--baselines", help="Add the PCA family, a moving basis and 8 bits, at equal bytes.")
     ] = False,
+    views: Annotated[int, typer.Option(help="Score so many pictures of balls and of --mesh under the light.")] = 0,
+    mesh: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="The scene, .glb, .gltf or .obj, for the pictures.")
+    ] = None,
     device: Device = "cpu",
     key: _Key = None,
     convention: _Convention = None,
@@ -192,10 +196,13 @@ def evaluate(
 
         with running("baselines") as progress:
             rivals = evaluate_rivals(probes, report.bytes, progress=progress, skipped=lambda error: note(str(error)))
+    seen = score_seen(model, probes, views, mesh, device) if views or mesh is not None else []
     if json_path is not None:
         scores = [{"method": rival.name} | rival.to_json() | score.to_json() for rival, score in rivals]
-        write_json(json_path, report.to_json() | ({"baselines": scores} if baselines else {}))
+        content = report.to_json() | ({"baselines": scores} if baselines else {})
+        write_json(json_path, content | ({"views": [score.to_json() for score in seen]} if seen else {}))
     _show_report(file, model.profile.name, report, rivals)
+    show_seen(seen)
 
 
 @app.command()

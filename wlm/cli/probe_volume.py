@@ -1,13 +1,17 @@
 """`wlm probe walk`: the light of probes as a viewer gets it, through the cascaded volume."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from wlm.cli.console import check_output, number, quiet_warp, running, show, table, write_json
 from wlm.cli.options import Device, ModelFile, ReportFile
 from wlm.errors import WlmError
+
+if TYPE_CHECKING:
+    from wlm.probe import ProbeModel, ProbeSet
+    from wlm.probe.seen import SeenScore
 
 _AXES = ("x", "y", "z")
 
@@ -83,6 +87,30 @@ def walk(
         settings = {"device": decoder.device, "sizes": list(volume.sizes), "side": volume.side, "budget": volume.budget}
         write_json(json_path, {"name": model.name} | settings | figures)
     _show_walk(file, figures)
+
+
+def score_seen(
+    model: "ProbeModel", probes: "ProbeSet", views: int, mesh: Path | None, device: str
+) -> "list[SeenScore]":
+    """Scores pictures under the decoded light, 50 of them where no number is given."""
+    from wlm.formats.geometry import read_geometry
+    from wlm.probe.seen import VIEWS, score_views
+
+    geometry = None if mesh is None else read_geometry(mesh, with_uv=False)
+    decoded = model.decoder(device).decode_probes(probes.position)
+    with running("views") as progress:
+        return score_views(probes, decoded, geometry, views=views or VIEWS, device=device, progress=progress)
+
+
+def show_seen(scores: "list[SeenScore]") -> None:
+    """Shows the scores of pictures; nothing without any."""
+    if not scores:
+        return
+    rows = table("pictures under the light", ["", "light", "views", "MSE", "PSNR dB", "SSIM", "FLIP"])
+    for score in scores:
+        figures = (number(score.mse, ".3g"), number(score.psnr, ".2f"), number(score.ssim, ".4f"))
+        rows.add_row(score.drawn, score.light, str(score.views), *figures, number(score.flip, ".4f"))
+    show(rows)
 
 
 def _show_walk(file: Path, figures: dict[str, Any]) -> None:

@@ -18,6 +18,7 @@ _PLACES = {
     "open_checkpoint": "wlm.probe.fit",
     "save_probes": "wlm.probe.data",
     "score": "wlm.probe.evaluation",
+    "score_views": "wlm.probe.seen",
 }
 
 __all__ = sorted(_PLACES)
