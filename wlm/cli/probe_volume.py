@@ -1,24 +1,29 @@
-"""`wlm probe walk`: the light of probes as a viewer gets it, through the cascaded volume."""
+"""`wlm probe walk` and `volume`: the light of probes as a viewer gets it, through the cascaded volume."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from wlm.cli.console import check_output, number, quiet_warp, running, show, table, write_json
-from wlm.cli.options import Device, ModelFile, ReportFile
+from wlm.cli.console import check_output, escape, number, quiet_warp, running, show, table, write_json
+from wlm.cli.options import Device, ModelFile, ReportFile, output_option
 from wlm.errors import WlmError
 
 if TYPE_CHECKING:
-    from wlm.probe import ProbeModel, ProbeSet
+    import numpy as np
+
+    from wlm.probe import Decoder, ProbeModel, ProbeSet, Volume
     from wlm.probe.seen import SeenScore
 
+_Block = Annotated[float | None, typer.Option(help="Side of the finest blocks; default from the probes' spacing.")]
+_Key = Annotated[str | None, typer.Option(help="Name of the values in PROBES; default the only ones.")]
 _AXES = ("x", "y", "z")
 
 
 def register(app: typer.Typer) -> None:
     """Adds the commands of the volume to those of probes."""
     app.command()(walk)
+    app.command()(volume)
 
 
 def walk(
@@ -33,15 +38,13 @@ def walk(
     path: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Viewpoints: a JSON list of x, y, z, or `position` of a .npz.")
     ] = None,
-    block: Annotated[
-        float | None, typer.Option(help="Side of the finest blocks; default from the probes' spacing.")
-    ] = None,
+    block: _Block = None,
     eye: Annotated[
         float | None, typer.Option(help="Height of the eyes above the ground; default an 80th of the scene's length.")
     ] = None,
     up: Annotated[str, typer.Option(help="The axis that points up: x, y or z.")] = "y",
     budget: Annotated[int | None, typer.Option(help="Blocks decoded in a frame; default 64.")] = None,
-    key: Annotated[str | None, typer.Option(help="Name of the values in PROBES; default the only ones.")] = None,
+    key: _Key = None,
     json_path: ReportFile = None,
     device: Device = "cpu",
 ) -> None:
@@ -55,22 +58,13 @@ def walk(
         raise WlmError(f"--up: expected x, y or z, got {up}")
     quiet_warp()
     from wlm.probe import load_positions
-    from wlm.probe.light import DecodedLight
-    from wlm.probe.places import probes_of
-    from wlm.probe.volume import BUDGET, Volume
     from wlm.probe.walk import STEP, camera_path, loop_frames, settle, summary, walk
     from wlm.system import load
 
     model = load(file, "probe")
     decoder = model.decoder(device)
-    if probes_path is None:
-        position, original, live = model.stored_positions(), None, ~model.dead if len(model.dead) else None
-    else:
-        position, original, live = probes_of(model, probes_path, key)
-    if not model.has_probes_at(position):
-        raise WlmError(f"{probes_path}: expected the {model.probes} probes that {file} was made of, in their order")
-    budget = BUDGET if budget is None else budget
-    volume = Volume(position, DecodedLight(decoder, position), live=live, block=block, budget=budget)
+    volume, original = _volume(file, model, decoder, probes_path, key, block, budget)
+    position = volume.position
     if path is None:
         axis, lit = _AXES.index(up), position[volume.numbers]
         if frames is None:
@@ -87,6 +81,71 @@ def walk(
         settings = {"device": decoder.device, "sizes": list(volume.sizes), "side": volume.side, "budget": volume.budget}
         write_json(json_path, {"name": model.name} | settings | figures)
     _show_walk(file, figures)
+
+
+def volume(
+    file: ModelFile,
+    output: Annotated[Path, output_option("DIR", "The folder to write to.")],
+    probes_path: Annotated[
+        Path | None, typer.Argument(metavar="PROBES", help="What was compressed; default the places in FILE.wlm.")
+    ] = None,
+    at: Annotated[
+        str | None, typer.Option(metavar="X,Y,Z", help="Where the viewer stands; default the middle of the probes.")
+    ] = None,
+    block: _Block = None,
+    key: _Key = None,
+    device: Device = "cpu",
+) -> None:
+    """Write the cascaded volume round a viewer as buffers and a page table, with shaders that read them."""
+    quiet_warp()
+    from wlm.probe.volume_export import export_volume
+    from wlm.probe.walk import settle
+    from wlm.system import load
+
+    model = load(file, "probe")
+    made, _ = _volume(file, model, model.decoder(device), probes_path, key, block, None)
+    lit = made.position[made.numbers]
+    settle(made, (lit.min(0) + lit.max(0)) / 2 if at is None else _point(at))
+    rows = table(str(output), ["file", "bytes"])
+    for path in export_volume(made, output):
+        rows.add_row(escape(path.name), f"{path.stat().st_size:,}")
+    show(rows)
+
+
+def _point(text: str) -> "np.ndarray":
+    import numpy as np
+
+    try:
+        point = np.array([float(word) for word in text.split(",")])
+    except ValueError:
+        point = np.zeros(0)
+    if point.shape != (3,) or not np.isfinite(point).all():
+        raise WlmError(f"--at: expected three numbers as x,y,z, got {text}")
+    return point
+
+
+def _volume(
+    file: Path,
+    model: "ProbeModel",
+    decoder: "Decoder",
+    probes_path: Path | None,
+    key: str | None,
+    block: float | None,
+    budget: int | None,
+) -> "tuple[Volume, np.ndarray | None]":
+    """A volume of a model's probes, and the light that was compressed, where it is given."""
+    from wlm.probe.light import DecodedLight
+    from wlm.probe.places import probes_of
+    from wlm.probe.volume import BUDGET, Volume
+
+    if probes_path is None:
+        position, original, live = model.stored_positions(), None, ~model.dead if len(model.dead) else None
+    else:
+        position, original, live = probes_of(model, probes_path, key)
+    if not model.has_probes_at(position):
+        raise WlmError(f"{probes_path}: expected the {model.probes} probes that {file} was made of, in their order")
+    budget = BUDGET if budget is None else budget
+    return Volume(position, DecodedLight(decoder, position), live=live, block=block, budget=budget), original
 
 
 def score_seen(

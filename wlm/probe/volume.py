@@ -90,6 +90,23 @@ class Reading:
     weight: np.ndarray
 
 
+@dataclass(frozen=True, eq=False)
+class State:
+    """What lies on the device, as `wlm_kernels.probe.volume` has it.
+
+    Attributes:
+        pool: float32 [R, D], blocks.
+        pages: int32 [L * side^3], the row of each slot's block, or -1.
+        bases: int32 [L, 3], first block of each window, from `BlockIndex.start`.
+        views: float32 [L, 4], where the viewer lies in each window, and 1 / side of a block.
+    """
+
+    pool: np.ndarray
+    pages: np.ndarray
+    bases: np.ndarray
+    views: np.ndarray
+
+
 class Volume:
     """A cascaded lighting volume on a device. Call `update` once a frame, then `read`.
 
@@ -206,6 +223,17 @@ class Volume:
         return sum(array.capacity for array in self._arrays)
 
     @property
+    def viewpoint(self) -> np.ndarray:
+        """float64 [3], of the last update.
+
+        Raises:
+            ValueError: There was none.
+        """
+        if self._viewpoint is None:
+            raise ValueError("viewpoint: expected one update at least")
+        return self._viewpoint.copy()
+
+    @property
     def base(self) -> np.ndarray:
         """int64 [L, 3], coordinates of the first block of each window; block b spans [b, b + 1) times its side."""
         return self._base + self.index.start.astype(np.int64)
@@ -311,6 +339,12 @@ class Volume:
         """
         windows = self._windows
         kernels.read(self._pool, windows.pages, windows.bases, windows.views, self.side, points, values, level, weight)
+
+    def state(self) -> State:
+        """Copies what a shader would read to the host."""
+        windows = self._windows
+        with interop.stream(self.device):
+            return State(*(part.numpy() for part in (self._pool, windows.pages, windows.bases, windows.views)))
 
     def unscroll(self) -> tuple[np.ndarray, np.ndarray]:
         """The windows in the order of space, as a texture for each level (the last step of section 3.4).
