@@ -321,6 +321,11 @@ def test_volume_writes_what_a_viewer_has_round(fitted, carrying, room, tmp_path)
     assert "--at: expected three numbers" in fails("probe", "volume", carrying, "-o", tmp_path / "no", "--at", "1,2")
 
 
+def test_grid_for_three(fitted, tmp_path):
+    text = call("probe", "grid", fitted, "-o", tmp_path / "out", "--cells", 5)
+    assert max(json.loads((tmp_path / "out" / "grid.json").read_text())["resolution"]) == 5 and "grid.ktx2" in text
+
+
 def test_evaluate_scores_pictures(fitted, room, tmp_path):
     text = call("probe", "evaluate", fitted, room, "--views", 2, "--json", tmp_path / "r.json")
     views = json.loads((tmp_path / "r.json").read_text())["views"]

@@ -1,4 +1,4 @@
-"""`wlm probe walk` and `volume`: the light of probes as a viewer gets it, through the cascaded volume."""
+"""`wlm probe walk`, `volume` and `grid`: the light of probes as a viewer gets it."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -24,6 +24,7 @@ def register(app: typer.Typer) -> None:
     """Adds the commands of the volume to those of probes."""
     app.command()(walk)
     app.command()(volume)
+    app.command()(grid)
 
 
 def walk(
@@ -108,6 +109,23 @@ def volume(
     settle(made, (lit.min(0) + lit.max(0)) / 2 if at is None else _point(at))
     rows = table(str(output), ["file", "bytes"])
     for path in export_volume(made, output):
+        rows.add_row(escape(path.name), f"{path.stat().st_size:,}")
+    show(rows)
+
+
+def grid(
+    file: ModelFile,
+    output: Annotated[Path, output_option("DIR", "The folder to write to.")],
+    cells: Annotated[int | None, typer.Option(help="Along the longest side of the probes' box; default 24.")] = None,
+    device: Device = "cpu",
+) -> None:
+    """Write the light as a grid for three.js: a texture, and a module that loads it into a LightProbeGrid."""
+    quiet_warp()
+    from wlm.probe.three_grid import CELLS, export_grid
+    from wlm.system import load
+
+    rows = table(str(output), ["file", "bytes"])
+    for path in export_grid(load(file, "probe"), output, cells=CELLS if cells is None else cells, device=device):
         rows.add_row(escape(path.name), f"{path.stat().st_size:,}")
     show(rows)
 

@@ -12,6 +12,7 @@ _PLACES = {
     "compress": "wlm.probe.fit",
     "evaluate": "wlm.probe.evaluation",
     "export": "wlm.probe.exporter",
+    "export_grid": "wlm.probe.three_grid",
     "export_volume": "wlm.probe.volume_export",
     "from_arrays": "wlm.probe.data",
     "load": "wlm.probe.data",
