@@ -33,7 +33,7 @@ LEAST_PSNR = 41.0
 LEAST_IRRADIANCE_PSNR = 36.0
 LEAST_RATIO = 21.5  # of float32
 LEAST_COVERAGE = 0.99  # of the probes near the viewer, on the mean over the frames
-LEAST_VOLUME_PSNR = 39.0  # of what is read there
+LEAST_VOLUME_PSNR = 38.0  # of what is read there
 
 
 def run(out: Path, device: str) -> dict[str, float]:
