@@ -56,7 +56,8 @@ class Grid:
         weight = wp.empty(len(points), dtype=float, device=self.device)
         where = array((points - origin).astype(np.float32), wp.vec3, self.device)
         views = array(views, wp.vec4, self.device)
-        volume.read(pool, pages, bases, views, self.side, where, out, level, weight)
+        ahead = wp.empty(0, dtype=wp.vec3, device=self.device)
+        volume.read(pool, pages, bases, views, self.side, where, ahead, out, level, weight)
         return out.numpy(), level.numpy(), weight.numpy()
 
     def unscroll(self) -> tuple[np.ndarray, np.ndarray]:

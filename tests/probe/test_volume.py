@@ -142,6 +142,27 @@ def test_read_at_a_probe_is_that_probes_light(device: str):
         assert near.sum() > 100 and np.sqrt((error**2).mean()) < most
 
 
+def test_normals_keep_light_from_leaking(device: str):
+    """A bright room and a dark one, with a wall between that is thinner than a block."""
+    random = np.random.default_rng(4)
+    along = np.stack(np.meshgrid(np.arange(-3.0, 3.1, 0.3), np.arange(0.0, 3.1, 0.3)), -1).reshape(-1, 2)
+    along = np.concatenate([along, along]) + random.uniform(-0.1, 0.1, (2 * len(along), 2))
+    bright = np.arange(len(along)) < len(along) / 2
+    side = np.where(bright, -1.0, 1.0)
+    position, normal = np.column_stack([0.05 * side, along]), side[:, None] * [7.0, 0.0, 0.0]
+    light = StoredLight(bright[:, None].astype(float), device)
+    leaks = []
+    for known in (None, normal):
+        volume = Volume(position, light, normal=known, block=1.0, ratios=(1,), side=16, budget=1024)
+        settle(volume, np.zeros(3))
+        inner = ~bright & (np.abs(along[:, 0]) < 2.5) & (np.abs(along[:, 1] - 1.5) < 1.0)
+        reading = volume.read(position[inner], known if known is None else normal[inner])
+        leaks.append(float(np.sqrt((reading.values**2).mean())))
+    assert leaks[0] > 0.3 and leaks[1] < 0.4 * leaks[0]
+    with pytest.raises(ValueError, match="normal"):
+        Volume(position, light, normal=normal[1:])
+
+
 def test_any_way_leads_to_the_same_volume(device: str):
     """After a walk with jumps, once settled, it equals one that starts there, bit for bit."""
     position = _surface()

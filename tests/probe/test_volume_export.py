@@ -67,10 +67,14 @@ int main()
     float p[6];
     while (std::fread(p, 4, 6, stdin) == 6) {
         float values[27];
-        float weight = wlm_volume_read(vec3(p[0], p[1], p[2]), values);
+        float weight = wlm_volume_read(vec3(p[0], p[1], p[2]), vec3(0, 0, 0), values);
         std::fwrite(&weight, 4, 1, stdout);
         std::fwrite(values, 4, 27, stdout);
-        vec3 light = wlm_volume_diffuse(vec3(p[0], p[1], p[2]), vec3(p[3], p[4], p[5]));
+        vec3 n(p[3], p[4], p[5]);
+        float ahead[27];
+        wlm_volume_read(vec3(p[0], p[1], p[2]), n, ahead);
+        std::fwrite(ahead, 4, 27, stdout);
+        vec3 light = wlm_volume_diffuse(vec3(p[0], p[1], p[2]), n);
         std::fwrite(&light, 4, 3, stdout);
     }
 }
@@ -92,13 +96,16 @@ def test_shaders_read_what_the_volume_has(volume, tmp_path):
         (tmp_path / "run.cpp").write_text(_PRELUDE + (tmp_path / name).read_text() + _MAIN)
         subprocess.run(["g++", "-O1", "-std=c++14", "-o", "run", "run.cpp"], cwd=tmp_path, check=True)
         out = subprocess.run([tmp_path / "run"], cwd=tmp_path, input=sent, capture_output=True, check=True).stdout
-        got = np.frombuffer(out, "<f4").reshape(-1, 31)
+        got = np.frombuffer(out, "<f4").reshape(-1, 58)
         np.testing.assert_allclose(got[:, 0], weight, atol=1e-5)
         # Divided by a small weight, a rounding of the place counts for more.
         want = np.array(reference["values"])
         np.testing.assert_allclose(got[:, 1:28] * weight[:, None], want * weight[:, None], atol=2e-5)
-        shown = np.stack([irradiance(v.reshape(9, 3), n[None])[0] for v, n in zip(got[:, 1:28], normals, strict=True)])
-        np.testing.assert_allclose(got[:, 28:], shown / np.pi, atol=2e-5)
+        ahead = volume.read(points, normals)
+        far = ahead.weight[:, None]
+        np.testing.assert_allclose(got[:, 28:55] * far, ahead.values * far, atol=2e-5)
+        shown = np.stack([irradiance(v.reshape(9, 3), n[None])[0] for v, n in zip(got[:, 28:55], normals, strict=True)])
+        np.testing.assert_allclose(got[:, 55:], shown / np.pi, atol=2e-5)
 
 
 @pytest.mark.skipif(shutil.which("glslangValidator") is None, reason="glslangValidator is not installed")
@@ -108,10 +115,10 @@ def test_the_shaders_compile(language, outputs, tmp_path):
     if language == "hlsl":
         call = "RWStructuredBuffer<float> o : register(u0);\n[numthreads(1, 1, 1)] void main()\n"
         text, options = volume_hlsl(outputs) + call, ["-D", "-V", "-e", "main"]
-        body = f"{{ float v[{outputs}]; o[0] = wlm_volume_read(float3(1.0, 2.0, 3.0), v) + v[0]; }}\n"
+        body = f"{{ float v[{outputs}]; float3 p = float3(1.0, 2.0, 3.0); o[0] = wlm_volume_read(p, p, v) + v[0]; }}\n"
     else:
         body = "layout(std430, binding = 7) buffer O { float o[]; };\n"
-        body += f"void main() {{ float v[{outputs}]; o[0] = wlm_volume_read(vec3(1.0, 2.0, 3.0), v) + v[0]; }}\n"
+        body += f"void main() {{ float v[{outputs}]; vec3 p = vec3(1.0); o[0] = wlm_volume_read(p, p, v) + v[0]; }}\n"
         text, options = "#version 450\nlayout(local_size_x = 1) in;\n" + volume_glsl(outputs), []
         options = ["-V"] if language == "vulkan" else []
     (tmp_path / "shader.comp").write_text(text + body)

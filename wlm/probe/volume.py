@@ -128,6 +128,7 @@ class Volume:
         light: Light,
         *,
         live: np.ndarray | None = None,
+        normal: np.ndarray | None = None,
         block: float | None = None,
         ratios: Sequence[int] = RATIOS,
         side: int = SIDE,
@@ -140,6 +141,8 @@ class Volume:
             position: [N, 3], of all probes.
             light: Of as many probes.
             live: bool [N], false for probes to leave out; None: all are live.
+            normal: [N, 3], of the surface that each probe lies on, of any length; 0 where it lies on none. Blocks then
+                take less from probes whose surface they lie behind. None: none is known.
             block: Side of the finest blocks, in the unit of the positions; None: from the probes' spacing.
             ratios: Sides of the levels' blocks over the finest, rising powers of two from 1, 8 of them at most.
             side: Blocks along an axis of a window, even, 2 to 64.
@@ -174,10 +177,10 @@ class Volume:
         self._viewpoint: np.ndarray | None = None
         self._base = np.zeros((len(ratios), 3), np.int64)
         self._frame = 0
-        self._make(rows)
+        self._make(rows, _unit(normal, position.shape)[self.numbers])
         self._step = interop.StepGraph(self._work, self.device)
 
-    def _make(self, rows: int) -> None:
+    def _make(self, rows: int, normal: np.ndarray) -> None:
         """Puts all on the device."""
         device, levels, budget = self.device, len(self.sizes), self.budget
         slots = levels * self.side**3
@@ -196,6 +199,7 @@ class Volume:
         index, host = frame_kernels.Index(), self.index
         index.key, index.number = put(host.key, wp.int64), put(self.numbers[host.number].astype(np.int32), int)
         index.cell, index.place = put(host.cell, wp.vec3i), put(host.place, wp.vec3)
+        index.normal = put(normal[host.number], wp.vec3)
         index.block, index.level_start = put(host.block, wp.int64), put(host.level_start, int)
         index.ratios = put(np.array(host.ratios, np.int32), int)
         windows = frame_kernels.Windows()
@@ -215,6 +219,7 @@ class Volume:
         work.count = full((budget, frame_kernels.HALVES), int, 0)
         work.numbers, work.weights = reader.numbers, full((budget, frame_kernels.PROBES), float, 0.0)
         self._index, self._windows, self._pool_rows, self._reader, self._frame_work = index, windows, pool, reader, work
+        self._nowhere = full(0, wp.vec3, wp.vec3())
         self._pool = full((rows, self.channels), float, 0.0)
 
     @property
@@ -302,11 +307,13 @@ class Volume:
         self._reader.run()
         frame_kernels.combine(work, self._reader.values, self._pool)
 
-    def read(self, points: np.ndarray) -> Reading:
+    def read(self, points: np.ndarray, normals: np.ndarray | None = None) -> Reading:
         """Reads the light at points, as `wlm_kernels.probe.volume.read` says; at float32's precision near the viewer.
 
         Args:
             points: [M, 3], in the unit of the positions. One that is NaN or infinite is covered by nothing.
+            normals: [M, 3], of surfaces that they lie on, of any length: the light is read half a block ahead. None: at
+                the points.
 
         Returns:
             The light there.
@@ -325,10 +332,15 @@ class Volume:
             values = wp.empty((len(points), self.channels), dtype=float, device=self.device)
             level = wp.empty(len(points), dtype=int, device=self.device)
             weight = wp.empty(len(points), dtype=float, device=self.device)
-            self.read_into(on_device, values, level, weight)
+            ahead = None
+            if normals is not None:
+                ahead = wp.array(_unit(normals, points.shape), dtype=wp.vec3, device=self.device)
+            self.read_into(on_device, values, level, weight, ahead)
             return Reading(values.numpy(), level.numpy(), weight.numpy())
 
-    def read_into(self, points: wp.array, values: wp.array, level: wp.array, weight: wp.array) -> None:
+    def read_into(
+        self, points: wp.array, values: wp.array, level: wp.array, weight: wp.array, normals: wp.array | None = None
+    ) -> None:
         """Reads the light at points that lie on the device, without a copy: the path of a renderer.
 
         Args:
@@ -336,9 +348,11 @@ class Volume:
             values: float [M, D], written; this and the next two as in `Reading`.
             level: int [M], written.
             weight: float [M], written.
+            normals: vec3 [M], of unit length, as for `read`.
         """
         windows = self._windows
-        kernels.read(self._pool, windows.pages, windows.bases, windows.views, self.side, points, values, level, weight)
+        place = (windows.pages, windows.bases, windows.views, self.side, points)
+        kernels.read(self._pool, *place, self._nowhere if normals is None else normals, values, level, weight)
 
     def state(self) -> State:
         """Copies what a shader would read to the host."""
@@ -359,6 +373,21 @@ class Volume:
             valid = wp.empty(math.prod(shape), dtype=wp.uint8, device=self.device)
             kernels.unscroll(self._pool, self._windows.pages, self._windows.bases, self.side, out, valid)
             return out.numpy().reshape(*shape, self.channels), valid.numpy().astype(bool).reshape(shape)
+
+
+def _unit(normal: np.ndarray | None, shape: tuple[int, ...]) -> np.ndarray:
+    """Normals of length 1, float32; 0 where there is none.
+
+    Raises:
+        ValueError: Another shape, or a number isn't finite.
+    """
+    if normal is None:
+        return np.zeros(shape, np.float32)
+    normal = np.asarray(normal, np.float64)
+    if normal.shape != shape or not np.isfinite(normal).all():
+        raise ValueError(f"normal: expected finite numbers {list(shape)}, got {list(normal.shape)}")
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    return (normal / np.where(length > 0, length, 1.0)).astype(np.float32)
 
 
 def _check(block: float | None, ratios: Sequence[int], side: int, budget: int, rows: int) -> None:

@@ -28,10 +28,11 @@ int wlm_volume_wrap(int i, int side)
     return r < 0 ? r + side : r;
 }}
 
-// The light at a point, from the viewer: scene position less viewpoint. The finest level that has all eight blocks
-// round the point answers; the weight of those that are missing passes on to the next. Returns how much of the weight
-// was found, 0 to 1; where that is 0 so are the values.
-float wlm_volume_read({vec3} p, out float values[{outputs}])
+// The light at a point, from the viewer: scene position less viewpoint. With the normal of the surface that it lies on,
+// of unit length, it is read half a block ahead, so that a wall's far side has less part in it; with 0 at the point.
+// The finest level that has all eight blocks round it answers; the weight of those that are missing passes on to the
+// next. Returns how much of the weight was found, 0 to 1; where that is 0 so are the values.
+float wlm_volume_read({vec3} p, {vec3} normal, out float values[{outputs}])
 {{
     int levels = int(WLM_VOLUME_HEAD(0));
     int side = int(WLM_VOLUME_HEAD(1));
@@ -43,9 +44,9 @@ float wlm_volume_read({vec3} p, out float values[{outputs}])
     for (int level = 0; level < levels && left > 0.0; ++level) {{
         int at = {head} + {level_words} * level;
         float scale = {as_float}(WLM_VOLUME_HEAD(at + 3));
-        float x = p.x * scale + {as_float}(WLM_VOLUME_HEAD(at));
-        float y = p.y * scale + {as_float}(WLM_VOLUME_HEAD(at + 1));
-        float z = p.z * scale + {as_float}(WLM_VOLUME_HEAD(at + 2));
+        float x = p.x * scale + {as_float}(WLM_VOLUME_HEAD(at)) + 0.5 * normal.x;
+        float y = p.y * scale + {as_float}(WLM_VOLUME_HEAD(at + 1)) + 0.5 * normal.y;
+        float z = p.z * scale + {as_float}(WLM_VOLUME_HEAD(at + 2)) + 0.5 * normal.z;
         if (min(x, min(y, z)) >= -edge - 1.0 && max(x, max(y, z)) < edge) {{
             float fx = x - floor(x);
             float fy = y - floor(y);
@@ -89,12 +90,12 @@ float wlm_volume_read({vec3} p, out float values[{outputs}])
 """
 
 _IRRADIANCE = """
-// What a white diffuse surface of normal n, of unit length, shows at a point: irradiance over pi, RGB. Orthonormal real
-// basis in the order 1; y, z, x; xy, yz, 3z2-1, xz, x2-y2, all signs plus.
+// What a white diffuse surface of normal n, of unit length, shows at a point: irradiance over pi, RGB, read ahead.
+// Orthonormal real basis in the order 1; y, z, x; xy, yz, 3z2-1, xz, x2-y2, all signs plus.
 {vec3} wlm_volume_diffuse({vec3} p, {vec3} n)
 {{
     float values[{outputs}];
-    wlm_volume_read(p, values);
+    wlm_volume_read(p, n, values);
     float weight[9];
     weight[0] = 0.282094792;
     weight[1] = 0.325735008 * n.y;

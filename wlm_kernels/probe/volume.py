@@ -16,6 +16,7 @@ import warp as wp
 
 NOTHING = -(2**31)  # each coordinate of the block of a slot that no window has had yet
 
+_AHEAD = wp.constant(0.5)  # sides: how far in front of a surface its light is read
 _CHUNK = 4  # numbers that a GPU's thread reads: 16 bytes of a row, and 7 threads for a point of 27
 
 vec8 = wp.types.vector(length=8, dtype=float)
@@ -66,6 +67,7 @@ def _read(
     views: wp.array1d[wp.vec4],
     side: int,
     points: wp.array1d[wp.vec3],
+    normals: wp.array1d[wp.vec3],
     chunk: int,
     # out:
     out: wp.array2d[float],
@@ -74,6 +76,9 @@ def _read(
 ):
     i, part = wp.tid()
     p = points[i]
+    ahead = wp.vec3()
+    if normals.shape[0] > 0:
+        ahead = _AHEAD * normals[i]
     start = part * chunk
     stop = wp.min(start + chunk, out.shape[1])
     for c in range(start, stop):
@@ -85,9 +90,9 @@ def _read(
     edge = 0.5 * float(side)
     for level in range(bases.shape[0]):
         view = views[level]
-        x = p[0] * view[3] + view[0]
-        y = p[1] * view[3] + view[1]
-        z = p[2] * view[3] + view[2]
+        x = p[0] * view[3] + view[0] + ahead[0]
+        y = p[1] * view[3] + view[1] + ahead[1]
+        z = p[2] * view[3] + view[2] + ahead[2]
         # Beyond it no corner is in the window; NaN compares false too, and no float out of range becomes an int.
         near = x >= -edge - 1.0 and y >= -edge - 1.0 and z >= -edge - 1.0 and x < edge and y < edge and z < edge
         if near and left > 0.0:
@@ -154,7 +159,7 @@ def unscroll(pool, pages, bases, side: int, out, valid) -> None:
     wp.launch(_unscroll, out.shape, inputs=[pool, pages, bases, side], outputs=[out, valid], device=pool.device)
 
 
-def read(pool, pages, bases, views, side: int, points, out, answered, weight) -> None:
+def read(pool, pages, bases, views, side: int, points, normals, out, answered, weight) -> None:
     """Reads the light at points, from the finest level that has it.
 
     At each level, from the finest, the 8 blocks whose centres surround a point have trilinear weights. Those that are
@@ -170,6 +175,8 @@ def read(pool, pages, bases, views, side: int, points, out, answered, weight) ->
         views: vec4 [L].
         side: Blocks along an axis of a window, even.
         points: vec3 [M], relative to the origin of `views`. One that is NaN or far out is covered by nothing.
+        normals: vec3 [M], of unit length: each point is read half a block's side ahead along its own, so that a wall's
+            far side has less part in it; or [0]: where they are.
         out: float [M, D]; 0 where nothing covers the point.
         answered: int [M], the level with the largest share, -1 where none has any.
         weight: float [M], how much of the light was found at any level, 0 to 1.
@@ -180,7 +187,7 @@ def read(pool, pages, bases, views, side: int, points, out, answered, weight) ->
     wp.launch(
         _read,
         (len(points), -(-channels // chunk)),
-        inputs=[pool, pages, bases, views, side, points, chunk],
+        inputs=[pool, pages, bases, views, side, points, normals, chunk],
         outputs=[out, answered, weight],
         device=pool.device,
     )

@@ -55,6 +55,7 @@ class Index:
         number: [N].
         cell: [N].
         place: [N].
+        normal: [N], of the surface that each lies on, of unit length; 0: it lies on none, or none is known.
         block: [W], rising within a level.
         level_start: [L + 1].
         ratios: [L], sides of the levels over the finest.
@@ -64,6 +65,7 @@ class Index:
     number: wp.array1d[int]
     cell: wp.array1d[wp.vec3i]
     place: wp.array1d[wp.vec3]
+    normal: wp.array1d[wp.vec3]
     block: wp.array1d[wp.int64]
     level_start: wp.array1d[int]
     ratios: wp.array1d[int]
