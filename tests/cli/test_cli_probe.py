@@ -326,8 +326,11 @@ def test_grid_for_three(fitted, tmp_path):
     assert max(json.loads((tmp_path / "out" / "grid.json").read_text())["resolution"]) == 5 and "grid.ktx2" in text
 
 
-def test_evaluate_scores_pictures(fitted, room, tmp_path):
-    text = call("probe", "evaluate", fitted, room, "--views", 2, "--json", tmp_path / "r.json")
-    views = json.loads((tmp_path / "r.json").read_text())["views"]
+def test_evaluate_scores_walks_and_pictures(fitted, room, tmp_path):
+    text = call("probe", "evaluate", fitted, room, "--views", 2, "--volume", "--json", tmp_path / "r.json")
+    report = json.loads((tmp_path / "r.json").read_text())
+    views, walked = report["views"], report["volume"]
+    assert walked["lossless"]["light_psnr"] == 120.0 > walked["lossless"]["psnr"] > walked["decoded"]["psnr"]
+    assert f"{walked['decoded']['psnr']:.2f}" in text and "through the volume" in text
     assert [score["light"] for score in views] == ["decoded", "lossless, volume", "decoded, volume"]
     assert all(f"{score['psnr']:.2f}" in text for score in views)

@@ -47,8 +47,7 @@ from wlm.probe.fit import compress
 from wlm.probe.light import DecodedLight, StoredLight
 from wlm.probe.model import ProbeModel, Profile
 from wlm.probe.seen import VIEWS, score_views
-from wlm.probe.volume import Volume
-from wlm.probe.walk import STEP, camera_path, loop_frames, settle, summary, walk
+from wlm.probe.walk import score_volume
 
 PROFILES = ("standard", "compact", "paper")
 """Profiles of a run; the first is the one that the other rows are about."""
@@ -338,29 +337,25 @@ class _ProbeBench(Bench):
         )
 
     def volume_rows(self, model: ProbeModel, frames: int | None) -> list[Row]:
-        """A walk with the probes as they were and one with the model's, and a teleport into an empty volume."""
-        decoder, live, position = Decoder(model, self.device), self.probes.live, self.probes.position
+        """A walk with the probes as they were and one with the model's, each from an empty volume."""
         rows = []
-        lights = {"lossless": StoredLight(self.probes.values, self.device), "ours": DecodedLight(decoder, position)}
+        lights = {
+            "lossless": StoredLight(self.probes.values, self.device),
+            "ours": DecodedLight(Decoder(model, self.device), self.probes.position),
+        }
         for name, light in lights.items():
-            volume = Volume(position, light, live=live)
-            count = frames or loop_frames(self.position, STEP * volume.sizes[0])
-            path = camera_path(self.position, count)
-            self.note(f"the volume, {name}, {count} frames")
-            peak = float(np.ptp(self.probes.values))
-            start = walk(volume, path[:1], original=self.probes.values)
-            first = 1 + (settle(volume, path[0]) if start[0].stats.left else 0)
-            walked = summary(walk(volume, path, original=self.probes.values), peak)
+            self.note(f"the volume, {name}")
+            walked = score_volume(self.probes, light, frames=frames)
             spread = {"update_ms": walked["update_ms"], "blocks": walked["updated"], "probes_decoded": walked["probes"]}
             rows.append(
                 self.row(
                     "volume",
-                    f"{name}, walk of {count} frames",
-                    f"the finest blocks are {volume.sizes[0]:.3g} units wide",
-                    frames=count,
-                    first_ms=summary(start)["update_ms"]["max"],
-                    frames_first=first,
-                    memory=volume.memory_bytes / 2**20,
+                    f"{name}, walk of {walked['frames']} frames",
+                    f"the finest blocks are {walked['block']:.3g} units wide",
+                    frames=walked["frames"],
+                    first_ms=walked["first_ms"],
+                    frames_first=walked["first_frames"],
+                    memory=walked["memory_bytes"] / 2**20,
                     psnr=walked["psnr"],
                     light_psnr=walked["light_psnr"],
                     far_psnr=walked["far_psnr"],

@@ -30,7 +30,7 @@ from wlm.cli.options import (
     Seed,
     output_option,
 )
-from wlm.cli.probe_volume import register, score_seen, show_seen
+from wlm.cli.probe_volume import register, score_seen, show_seen, show_walk_scores, walk_scores
 
 if TYPE_CHECKING:
     import numpy as np
@@ -164,6 +164,9 @@ def evaluate(
     baselines: Annotated[
         bool, typer.Option("--baselines", help="Add the PCA family, a moving basis and 8 bits, at equal bytes.")
     ] = False,
+    volume: Annotated[
+        bool, typer.Option("--volume", help="Score what is read through the cascaded volume along a walk.")
+    ] = False,
     views: Annotated[int, typer.Option(help="Score so many pictures of balls and of --mesh under the light.")] = 0,
     mesh: Annotated[
         Path | None, typer.Option(metavar="FILE", help="The scene, .glb, .gltf or .obj, for the pictures.")
@@ -197,11 +200,14 @@ def evaluate(
         with running("baselines") as progress:
             rivals = evaluate_rivals(probes, report.bytes, progress=progress, skipped=lambda error: note(str(error)))
     seen = score_seen(model, probes, views, mesh, device) if views or mesh is not None else []
+    walked = walk_scores(model, probes, device) if volume else {}
     if json_path is not None:
         scores = [{"method": rival.name} | rival.to_json() | score.to_json() for rival, score in rivals]
         content = report.to_json() | ({"baselines": scores} if baselines else {})
+        content |= {"volume": walked} if walked else {}
         write_json(json_path, content | ({"views": [score.to_json() for score in seen]} if seen else {}))
     _show_report(file, model.profile.name, report, rivals)
+    show_walk_scores(walked)
     show_seen(seen)
 
 

@@ -166,6 +166,32 @@ def _volume(
     return Volume(position, DecodedLight(decoder, position), live=live, block=block, budget=budget), original
 
 
+def walk_scores(model: "ProbeModel", probes: "ProbeSet", device: str) -> dict[str, dict[str, Any]]:
+    """What is read along a walk, from the probes as they were and from the model's."""
+    from wlm.probe.light import DecodedLight, StoredLight
+    from wlm.probe.walk import score_volume
+
+    decoder = model.decoder(device)
+    lights = {
+        "lossless": StoredLight(probes.values, decoder.device),
+        "decoded": DecodedLight(decoder, probes.position),
+    }
+    with running("walk") as progress:
+        return {name: score_volume(probes, light, progress=progress) for name, light in lights.items()}
+
+
+def show_walk_scores(walked: dict[str, dict[str, Any]]) -> None:
+    """Shows the scores of walks; nothing without any."""
+    if not walked:
+        return
+    columns = ["light", "read near, dB", "decoded there, dB", "read farther away, dB", "blocks a frame"]
+    rows = table("through the volume", columns)
+    for name, figures in walked.items():
+        decibels = (number(figures[key], ".2f") for key in ("psnr", "light_psnr", "far_psnr"))
+        rows.add_row(name, *decibels, number(figures["updated"]["mean"], ".1f"))
+    show(rows)
+
+
 def score_seen(
     model: "ProbeModel", probes: "ProbeSet", views: int, mesh: Path | None, device: str
 ) -> "list[SeenScore]":

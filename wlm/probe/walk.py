@@ -10,7 +10,8 @@ from scipy.spatial import cKDTree
 
 from wlm.errors import WlmError
 from wlm.metrics import psnr_from_mse
-from wlm.probe.light import at_probes
+from wlm.probe.data import ProbeSet
+from wlm.probe.light import Light, at_probes
 from wlm.probe.volume import FrameStats, Volume
 from wlm.system import Meter, OnProgress
 
@@ -153,6 +154,37 @@ def settle(volume: Volume, viewpoint: np.ndarray) -> int:
         left, frames = stats.left, frames + 1
         idle = 0 if stats.updated else idle + 1
     return frames
+
+
+def score_volume(
+    probes: ProbeSet, light: Light, *, frames: int | None = None, up: int = 1, progress: OnProgress | None = None
+) -> dict[str, object]:
+    """Walks round a scene with a volume that starts empty, and scores what is read against the probes as they were.
+
+    Args:
+        probes: As they were.
+        light: Of all of them: theirs, or as a model has them.
+        frames: Of the loop; None: a tenth of a block each.
+        up: The axis that points up.
+        progress: As for `walk`.
+
+    Returns:
+        The `summary`, and `block`, the side of the finest blocks; `first_ms` and `first_frames`, what the first frame
+        takes and how many pass until nothing waits; `memory_bytes`.
+    """
+    volume = Volume(probes.position, light, live=probes.live)
+    lit = probes.position[probes.live]
+    path = camera_path(lit, frames or loop_frames(lit, STEP * volume.sizes[0], up), up=up)
+    first = volume.update(path[0])
+    count = 1 + (settle(volume, path[0]) if first.left else 0)
+    peak = float(probes.values.max()) - float(probes.values.min())
+    figures = summary(walk(volume, path, original=probes.values, progress=progress), peak)
+    return figures | {
+        "block": volume.sizes[0],
+        "first_ms": 1e3 * first.seconds,
+        "first_frames": count,
+        "memory_bytes": volume.memory_bytes,
+    }
 
 
 def _draw(numbers: np.ndarray, most: int, random: np.random.Generator) -> np.ndarray:
