@@ -206,7 +206,7 @@ class Volume:
         windows.bases, windows.views = full(levels, wp.vec3i, wp.vec3i()), full(levels, wp.vec4, wp.vec4())
         windows.held = full(slots, wp.vec3i, wp.vec3i(kernels.NOTHING))
         windows.wanted, windows.pages = full(slots, int, -1), full(slots, int, -1)
-        windows.away = full(slots, float, -1.0)
+        windows.away, windows.forward = full(slots, float, -1.0), full(1, wp.vec3, wp.vec3())
         pool = frame_kernels.Pool()
         pool.stamp, pool.owner = full(rows, int, -1), full(rows, int, -1)
         pool.rows = full(len(host.block), int, -1)
@@ -243,30 +243,33 @@ class Volume:
         """int64 [L, 3], coordinates of the first block of each window; block b spans [b, b + 1) times its side."""
         return self._base + self.index.start.astype(np.int64)
 
-    def update(self, viewpoint: np.ndarray) -> FrameStats:
+    def update(self, viewpoint: np.ndarray, forward: np.ndarray | None = None) -> FrameStats:
         """Moves the windows to a viewpoint, fills up to `budget` of the blocks that are missing, and waits for it.
 
         Args:
             viewpoint: [3], in the unit of the positions.
+            forward: [3], where the viewer looks, of any length: blocks behind wait as if they were twice as far. None:
+                all directions are alike.
 
         Returns:
             What was done.
 
         Raises:
-            WlmError: The viewpoint isn't three finite numbers, or so far out that a block has no number.
+            WlmError: The viewpoint or the direction isn't three finite numbers, or so far out that a block has no
+                number.
         """
         start = time.perf_counter()
-        entered = self.advance(viewpoint)
+        entered = self.advance(viewpoint, forward)
         counters = self._frame_work.counters.numpy()
         seconds = time.perf_counter() - start
         queued, dropped, cached, left, updated, probes = counters[: frame_kernels.GATHERED].tolist()
         return FrameStats(entered, queued, dropped, updated, cached, left, probes, seconds)
 
-    def advance(self, viewpoint: np.ndarray) -> int:
+    def advance(self, viewpoint: np.ndarray, forward: np.ndarray | None = None) -> int:
         """As `update`, but on CUDA the frame is queued, not awaited: the path of a renderer.
 
         Args:
-            viewpoint: [3], in the unit of the positions.
+            viewpoint, forward: As for `update`.
 
         Returns:
             How many blocks came into a window.
@@ -277,6 +280,10 @@ class Volume:
         viewpoint = np.array(viewpoint, np.float64)
         if viewpoint.shape != (3,) or not np.isfinite(viewpoint).all():
             raise WlmError(f"viewpoint: expected three finite numbers, got {viewpoint.tolist()}")
+        ahead = np.zeros(3) if forward is None else np.array(forward, np.float64)
+        if ahead.shape != (3,) or not np.isfinite(ahead).all():
+            raise WlmError(f"forward: expected three finite numbers, got {ahead.tolist()}")
+        ahead = _unit(ahead[None], (1, 3))[0]
         at = viewpoint / self._size[:, None] - self.index.start
         if np.abs(at).max() > _FARTHEST:
             limit = _FARTHEST * self.sizes[0]
@@ -290,7 +297,7 @@ class Volume:
             middle = [p - (b + self.side // 2) - 0.5 for p, b in zip(place, first, strict=True)]
             bases[level], views[level] = wp.vec3i(*first), wp.vec4(*middle, 1.0 / self.sizes[level])
         with interop.stream(self.device):
-            frame_kernels.look(bases, views, self._frame, self._windows, self._frame_work)
+            frame_kernels.look(bases, views, wp.vec3(*ahead.tolist()), self._frame, self._windows, self._frame_work)
             self._step()
         return len(self.sizes) * self.side**3 - int(kept)
 

@@ -5,7 +5,8 @@ The launches of a frame, whose sizes never change, so that a graph can hold them
 1. `look` takes the new windows; `scroll` finds for each slot the block that it now stands for, whether a probe is near
    that block, and whether the pool still has it. What it hasn't waits, and is counted by its distance to the viewer.
 2. `choose` finds the distance within which enough blocks wait, gathers those and ranks them: the nearest are decoded,
-   in sides of their own, of two as near the finer one, then the one of the lower slot.
+   in sides of their own and with what is behind the viewer as if it were twice as far; of two as near the finer one,
+   then the one of the lower slot.
 3. `allocate` gives each a row of the pool: the least recently used one of a group of rows that no other takes from.
    Groups take turns. A row whose block is in a window is never given away.
 4. `search` finds the probes in a block's reach, 64 ranges of the sorted cells; `volume_weights` weighs up to 16.
@@ -81,7 +82,8 @@ class Windows:
         held: [S], the block that a slot stands for.
         wanted: [S], its number among the index's blocks, -1 where no probe is near.
         pages: [S], its row of the pool, or -1.
-        away: [S], squared distance to the viewer in sides, of blocks that wait; else -1.
+        away: [S], how far blocks that wait are, see `_rank_of`; else -1.
+        forward: [1], where the viewer looks, of unit length, or 0.
     """
 
     bases: wp.array1d[wp.vec3i]
@@ -90,6 +92,7 @@ class Windows:
     wanted: wp.array1d[int]
     pages: wp.array1d[int]
     away: wp.array1d[float]
+    forward: wp.array1d[wp.vec3]
 
 
 @wp.struct
@@ -182,19 +185,30 @@ def _find(index: Index, level: int, block: wp.vec3i) -> int:
 
 
 @wp.func
-def _bin(away: float, side: int) -> int:
+def _rank_of(away: wp.vec3, forward: wp.vec3) -> float:
+    """The squared distance in sides; of what lies behind the viewer as if it were twice as far."""
+    squared = wp.length_sq(away)
+    if squared > 0.0:
+        squared += 1.5 * squared * (wp.length(forward) - wp.dot(away, forward) / wp.sqrt(squared))
+    return squared
+
+
+@wp.func
+def _bin(away: float, side: int, forward: wp.vec3) -> int:
     half = 0.5 * float(side) + 1.0
-    return wp.min(int(away * float(_BINS) / (3.0 * half * half)), _BINS - 1)
+    most = 3.0 * half * half * (1.0 + 3.0 * wp.length(forward))
+    return wp.min(int(away * float(_BINS) / most), _BINS - 1)
 
 
 @wp.kernel(enable_backward=False)
-def _look(bases: Bases, views: Views, frame: int, windows: Windows, work: Work):
+def _look(bases: Bases, views: Views, forward: wp.vec3, frame: int, windows: Windows, work: Work):
     i = wp.tid()
     if i < windows.bases.shape[0]:
         windows.bases[i] = wp.vec3i(bases[i, 0], bases[i, 1], bases[i, 2])
         windows.views[i] = wp.vec4(views[i, 0], views[i, 1], views[i, 2], views[i, 3])
     if i == 0:
         work.clock[0] = frame
+        windows.forward[0] = forward
     if i < work.counters.shape[0]:
         work.counters[i] = 0
     if i < work.chosen.shape[0]:
@@ -235,8 +249,8 @@ def _scroll(index: Index, windows: Windows, pool: Pool, side: int, work: Work):
                 float(local[1] - side // 2) - view[1],
                 float(local[2] - side // 2) - view[2],
             )
-            away = wp.length_sq(d)
-            bin = _bin(away, side)
+            away = _rank_of(d, windows.forward[0])
+            bin = _bin(away, side, windows.forward[0])
             wp.atomic_add(work.histogram, bin, 1)
             wp.atomic_add(work.histogram, _BINS + bin // 16, 1)
             wp.atomic_add(work.histogram, _SIXTEENS + bin // 256, 1)
@@ -281,7 +295,7 @@ def _gather(windows: Windows, side: int, work: Work):
     s = wp.tid()
     away = windows.away[s]
     if away >= 0.0:
-        if _bin(away, side) <= work.limit[0]:
+        if _bin(away, side, windows.forward[0]) <= work.limit[0]:
             i = wp.atomic_add(work.counters, _GATHERED, 1)
             if i < work.gathered.shape[0]:
                 work.gathered[i] = s
@@ -387,17 +401,18 @@ def _take_points(points: wp.array1d[wp.vec3], numbers: wp.array1d[int], out: wp.
     out[i] = points[numbers[i]]
 
 
-def look(bases: Bases, views: Views, frame: int, windows: Windows, work: Work) -> None:
+def look(bases: Bases, views: Views, forward, frame: int, windows: Windows, work: Work) -> None:
     """Takes a frame's windows and number; what changes from frame to frame is in the arguments of this launch alone.
 
     Args:
         bases: First block of each window, in the index's numbers.
         views: See `Windows`.
+        forward: vec3, where the viewer looks, of unit length; 0: nowhere.
         frame: The frame's number, rising.
         windows, work: Written.
     """
     count = max(LEVELS, work.counters.shape[0], work.chosen.shape[0])
-    wp.launch(_look, count, inputs=[bases, views, frame, windows, work], device=work.clock.device)
+    wp.launch(_look, count, inputs=[bases, views, forward, frame, windows, work], device=work.clock.device)
 
 
 def scroll(index: Index, windows: Windows, pool: Pool, side: int, work: Work) -> None:
