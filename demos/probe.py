@@ -19,7 +19,7 @@ from wlm.cli.console import quiet_warp, show_figures
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_write
 from wlm.interop import check_device
-from wlm.probe.light import DecodedLight
+from wlm.probe.light import light_of
 from wlm.probe.walk import camera_path, settle, summary, walk
 from wlm.view.spheres import render_probes
 
@@ -59,7 +59,7 @@ def run(out: Path, device: str) -> dict[str, float]:
     report = wlm.probe.score(decoded, probes, size)
     lap("evaluate")
     live = probes.live
-    volume = wlm.probe.Volume(probes.position, DecodedLight(decoder, probes.position), live=live)
+    volume = wlm.probe.Volume(probes.position, light_of(decoder, probes.position), live=live)
     path = camera_path(probes.position[live], FRAMES)
     settle(volume, path[0])
     figures = summary(walk(volume, path, original=probes.values), report.peak)

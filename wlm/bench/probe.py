@@ -44,7 +44,7 @@ from wlm.probe.decode import Decoder, Points
 from wlm.probe.evaluation import Report, score
 from wlm.probe.exact import decode64
 from wlm.probe.fit import compress
-from wlm.probe.light import DecodedLight, StoredLight
+from wlm.probe.light import StoredLight, light_of
 from wlm.probe.model import ProbeModel, Profile
 from wlm.probe.seen import VIEWS, score_views
 from wlm.probe.walk import score_volume
@@ -341,7 +341,7 @@ class _ProbeBench(Bench):
         rows = []
         lights = {
             "lossless": StoredLight(self.probes.values, self.device),
-            "ours": DecodedLight(Decoder(model, self.device), self.probes.position),
+            "ours": light_of(model.decoder(self.device), self.probes.position),
         }
         for name, light in lights.items():
             self.note(f"the volume, {name}")
@@ -369,7 +369,7 @@ class _ProbeBench(Bench):
     def view_rows(self, model: ProbeModel, views: int) -> list[Row]:
         """Pictures of balls under the light, for each way to read it."""
         self.note(f"{views} views of balls")
-        decoded = Decoder(model, self.device).decode_probes(self.probes.position)
+        decoded = model.decoder(self.device).decode_probes(self.probes.position)
         try:
             scores = score_views(self.probes, decoded, views=views, device=self.device)
         except WlmError as error:  # no spherical harmonics

@@ -152,7 +152,7 @@ def _volume(
     budget: int | None,
 ) -> "tuple[Volume, np.ndarray | None]":
     """A volume of a model's probes, and the light that was compressed, where it is given."""
-    from wlm.probe.light import DecodedLight
+    from wlm.probe.light import light_of
     from wlm.probe.places import probes_of
     from wlm.probe.volume import BUDGET, Volume
 
@@ -163,18 +163,18 @@ def _volume(
     if not model.has_probes_at(position):
         raise WlmError(f"{probes_path}: expected the {model.probes} probes that {file} was made of, in their order")
     budget = BUDGET if budget is None else budget
-    return Volume(position, DecodedLight(decoder, position), live=live, block=block, budget=budget), original
+    return Volume(position, light_of(decoder, position), live=live, block=block, budget=budget), original
 
 
 def walk_scores(model: "ProbeModel", probes: "ProbeSet", device: str) -> dict[str, dict[str, Any]]:
     """What is read along a walk, from the probes as they were and from the model's."""
-    from wlm.probe.light import DecodedLight, StoredLight
+    from wlm.probe.light import StoredLight, light_of
     from wlm.probe.walk import score_volume
 
     decoder = model.decoder(device)
     lights = {
         "lossless": StoredLight(probes.values, decoder.device),
-        "decoded": DecodedLight(decoder, probes.position),
+        "decoded": light_of(decoder, probes.position),
     }
     with running("walk") as progress:
         return {name: score_volume(probes, light, progress=progress) for name, light in lights.items()}

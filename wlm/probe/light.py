@@ -43,6 +43,19 @@ class Light(Protocol):
         """Makes a reader of so many probes at a time."""
 
 
+class ProbeDecoder(Protocol):
+    """Any model of probes on a device.
+
+    Attributes:
+        device: "cpu" or "cuda:N".
+    """
+
+    device: str
+
+    def decode_probes(self, position: np.ndarray) -> np.ndarray:
+        """The light of the model's own probes, float32 [N, D]."""
+
+
 class StoredLight:
     """Probes as an array: the light before a model, or an engine's own."""
 
@@ -122,6 +135,21 @@ class _DecodedReader:
     def run(self) -> None:
         kernels.take_points(self._x, self.numbers, self._points.x)
         self._decoder.run(self._points)
+
+
+def light_of(decoder: ProbeDecoder, position: np.ndarray) -> Light:
+    """The light of a model's own probes: decoded on demand from Gaussians, else unpacked now.
+
+    Args:
+        decoder: Of the model, on the device where the light is wanted.
+        position: [N, 3], of all its probes, in the order of the fit.
+
+    Raises:
+        WlmError: The probes aren't as many as the model's, or a position isn't finite.
+    """
+    if isinstance(decoder, Decoder):
+        return DecodedLight(decoder, position)
+    return StoredLight(decoder.decode_probes(position), decoder.device)
 
 
 def at_probes(light: Light, numbers: np.ndarray) -> np.ndarray:

@@ -12,7 +12,7 @@ from wlm.errors import WlmError
 from wlm.formats.geometry import Geometry
 from wlm.probe.data import ProbeSet
 from wlm.probe.decode import Decoder
-from wlm.probe.light import DecodedLight, Light, StoredLight
+from wlm.probe.light import Light, StoredLight, light_of
 from wlm.probe.model import CENTRE, ROTATION, SCALE, ProbeModel
 from wlm.probe.places import ball_exposure, ball_radius
 from wlm.probe.sphere import basis, coefficient_bands, cosine_factor, irradiance, sh_count
@@ -75,7 +75,7 @@ class Probes:
         if original is not None:
             values["original"] = original[live].reshape(-1, count, 3)
         note = f"{model.name}, {len(places):,} probes, {model.count:,} Gaussians, profile {model.profile.name}"
-        light = DecodedLight(decoder, places)
+        light = light_of(decoder, places)
         return cls(places, np.flatnonzero(live), count, values, decoder.decode, light, model, note)
 
     @classmethod
