@@ -29,6 +29,8 @@ _MOST_LOG = 40.0
 
 
 _LIGHT = "light"
+# Numbers that a transform may unpack to: those of a set without any light have next to no bytes.
+_SURE_NUMBERS, _NUMBERS_A_BYTE = 1 << 23, 4096
 
 
 class _TransformHeader(Header):
@@ -155,6 +157,10 @@ def _decode_transform(artifact: Artifact) -> TransformModel:
     end = len(light) - header.dead
     if end < 0:
         raise ValueError(f"part light: expected at least {header.dead} bytes, found {len(light)}")
+    most = _SURE_NUMBERS + _NUMBERS_A_BYTE * end
+    if header.probes * header.outputs > most:
+        numbers = f"{header.probes} probes of {header.outputs} numbers"
+        raise ValueError(f"part light: expected at most {most} numbers of {end} bytes, found {numbers}")
     places = None
     if parts["places"].size:
         size = 6 * header.probes
