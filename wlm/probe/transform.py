@@ -163,6 +163,13 @@ class TransformModel(Model):
         """Whether positions, float64 [M, 3], are those of the model's own probes, in their order."""
         return len(position) == self.probes and Places.of(position).check == self.head.check
 
+    @cached_property
+    def stored_values(self) -> np.ndarray:
+        """The numbers of all probes at the places that are stored, read-only; errors as of `values`."""
+        values = self.values(self.places)
+        values.flags.writeable = False
+        return values
+
     def values(self, places: Places) -> np.ndarray:
         """The numbers of all probes, float32 [N, D], zero where one is dead.
 

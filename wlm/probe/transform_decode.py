@@ -54,7 +54,7 @@ class TransformDecoder:
         if position is not None:
             self._place(position)
         elif model.places is not None:
-            self._unpack(model.places, model.places.position())
+            self._hold(model.stored_values, model.places.position())
 
     @property
     def device_bytes(self) -> int:
@@ -115,11 +115,10 @@ class TransformDecoder:
 
     def _place(self, position: np.ndarray) -> None:
         position = np.asarray(position, np.float64)
-        self._unpack(Places.of(position), position)
+        self._hold(self.model.values(Places.of(position)), position)
 
-    def _unpack(self, places: Places, position: np.ndarray) -> None:
+    def _hold(self, values: np.ndarray, position: np.ndarray) -> None:
         model = self.model
-        values = model.values(places)
         live = ~model.dead if len(model.dead) and not model.dead.all() else np.ones(model.probes, bool)
         self._low, self._high = position[live].min(0), position[live].max(0)
         self._kriging = Kriging(position[live] - self._low)

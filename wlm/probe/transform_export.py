@@ -1,13 +1,12 @@
 """A transform's probes for engines: places, light and lists of neighbours in one buffer, and a shader that reads it.
 
 What is exported is unpacked: the light of each live probe as half floats, which a GPU reads at random. Between probes
-the shader does what `wlm.probe.kriging` does, with the neighbours found in the list of the cell that a point lies in.
+the shader does what `wlm.probe.kriging` does, with the neighbours found in the cells of a grid round a point.
 """
 
 from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from wlm.errors import WlmError
 from wlm.probe.conventions import CANONICAL
@@ -27,8 +26,7 @@ ABOUT = {
     "t_i + l, sum of w = 1, with t_i = |x - x_i| / r, r the distance of the nearest one left out, e_i = taper t_i^4 / "
     "(1 - t_i^2). Values are the sum of w_i times those of probe i. x is moved to the nearest point of the live "
     "probes' box before.",
-    "cells": "The box from low, in cubes of one side. The list of a cube holds all probes that are among the nearest "
-    "of any point in it.",
+    "cells": "The box from low, in cubes of one side. The list of a cube holds the probes in it.",
     "values": "Of a probe, outputs numbers. Spherical harmonics: coefficient after coefficient, of each red, green and "
     "blue; orthonormal real basis in the order 1; y, z, x; xy, yz, 3z2-1, xz, x2-y2; all signs plus, of radiance.",
     "dead": "Probes that are zero, by number from 0 in the order of compression: engines leave them inside walls.",
@@ -81,24 +79,11 @@ float wlm_probe_apart(vec3 a, vec3 b)
     return sqrt(dot(d, d));
 }}
 
-int wlm_probe_cell(float x, float side, int axis)
+// Puts the probes of a cell among the nearest.
+void wlm_probe_look(int cell, vec3 x, inout int probe[WLM_PROBE_ASKED], inout float away[WLM_PROBE_ASKED])
 {{
-    return min(int(x / side), int(WLM_PROBE_LIGHT(7 + axis)) - 1);
-}}
-
-// The nearest probes of a point x of the box, from low, and their distances.
-void wlm_probe_nearest(vec3 x, out int probe[WLM_PROBE_ASKED], out float away[WLM_PROBE_ASKED])
-{{
-    float side = wlm_probe_float(6);
-    int across = int(WLM_PROBE_LIGHT(7));
-    int row = wlm_probe_cell(x.z, side, 2) * int(WLM_PROBE_LIGHT(8)) + wlm_probe_cell(x.y, side, 1);
-    int cell = int(WLM_PROBE_LIGHT(13)) + row * across + wlm_probe_cell(x.x, side, 0);
-    int first = int(WLM_PROBE_LIGHT(cell));
-    int last = int(WLM_PROBE_LIGHT(cell + 1));
-    for (int k = 0; k < WLM_PROBE_ASKED; ++k) {{
-        probe[k] = 0;
-        away[k] = 3.0e38;
-    }}
+    int first = int(WLM_PROBE_LIGHT(int(WLM_PROBE_LIGHT(13)) + cell));
+    int last = int(WLM_PROBE_LIGHT(int(WLM_PROBE_LIGHT(13)) + cell + 1));
     for (int i = first; i < last; ++i) {{
         int candidate = int(WLM_PROBE_LIGHT(int(WLM_PROBE_LIGHT(14)) + i));
         float d = wlm_probe_apart(x, wlm_probe_vec3({head} + 3 * candidate));
@@ -113,6 +98,33 @@ void wlm_probe_nearest(vec3 x, out int probe[WLM_PROBE_ASKED], out float away[WL
             probe[k] = candidate;
         }}
     }}
+}}
+
+// The nearest probes of a point x of the box, from low, and their distances: shell by shell of cells, until none left
+// can have a nearer probe.
+void wlm_probe_nearest(vec3 x, out int probe[WLM_PROBE_ASKED], out float away[WLM_PROBE_ASKED])
+{{
+    for (int k = 0; k < WLM_PROBE_ASKED; ++k) {{
+        probe[k] = 0;
+        away[k] = 3.0e38;
+    }}
+    float side = wlm_probe_float(6);
+    int nx = int(WLM_PROBE_LIGHT(7));
+    int ny = int(WLM_PROBE_LIGHT(8));
+    int nz = int(WLM_PROBE_LIGHT(9));
+    int cx = min(int(x.x / side), nx - 1);
+    int cy = min(int(x.y / side), ny - 1);
+    int cz = min(int(x.z / side), nz - 1);
+    for (int r = 0; r < nx + ny + nz && away[WLM_PROBE_ASKED - 1] > float(r - 1) * side; ++r)
+        for (int k = -r; k <= r; ++k)
+            for (int j = -r; j <= r; ++j) {{
+                bool within = k > -r && k < r && j > -r && j < r;
+                for (int i = -r; i <= r; i += within ? 2 * r : 1) {{
+                    int cell = ((cz + k) * ny + cy + j) * nx + cx + i;
+                    if (cx + i >= 0 && cx + i < nx && cy + j >= 0 && cy + j < ny && cz + k >= 0 && cz + k < nz)
+                        wlm_probe_look(cell, x, probe, away);
+                }}
+            }}
 }}
 
 // How much of each of the nearest probes the light at x takes: a Cholesky factor and two right sides.
@@ -241,7 +253,7 @@ def light_bytes(model: TransformModel, place: np.ndarray, values: np.ndarray) ->
         head = np.array([*low, *size], np.float32)
     if not np.isfinite(head).all() or (size.max() > 0 and not head[3:].max() > 1e-30):
         raise WlmError(f"{model.name}: cannot export: the probes' box is too large or too small for floats")
-    side, cells, start, item = _lists(inside, size)
+    side, cells, start, item = _cells(inside, size)
     gain = float(np.abs(values).max()) or 1.0
     halves = np.zeros((len(place), 2 * _words(model.outputs)), "<f2")
     halves[:, : model.outputs] = values / gain
@@ -288,24 +300,17 @@ def _words(outputs: int) -> int:
     return -(-outputs // 2)
 
 
-def _lists(inside: np.ndarray, size: np.ndarray) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
-    """Side of the cells, their counts [3], where each one's list begins, and the lists."""
+def _cells(inside: np.ndarray, size: np.ndarray) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
+    """Side of the cells, their counts [3], where each one's probes begin, and the probes cell by cell."""
     longest = float(size.max()) or 1.0
-    count = max(1, round(len(inside) / _PROBES_A_CELL))
-    # As many cells as that, in a box that is `size` but at least a cell thick.
+    most = max(1, round(len(inside) / _PROBES_A_CELL))
     along = 1
-    while along < _MOST_CELLS and np.maximum(np.ceil(size / longest * (along + 1)), 1).prod() <= count:
+    while along < _MOST_CELLS and np.maximum(np.ceil(size / longest * (along + 1)), 1).prod() <= most:
         along += 1
     # A little more than the box: the last cell ends behind it.
     side = longest / along * (1.0 + 1e-6)
     cells = np.maximum(np.ceil(size / side), 1).astype(int)
-    z, y, x = np.meshgrid(*(np.arange(n) for n in cells[::-1]), indexing="ij")
-    middle = (np.stack([x, y, z], 3).reshape(-1, 3) + 0.5) * side
-    tree = cKDTree(inside)
-    asked = min(NEIGHBOURS + 1, len(inside))
-    nearest = tree.query(middle, k=asked)[0].reshape(len(middle), asked)[:, -1]
-    # Whoever is among the nearest of a point of the cell is no farther from its middle.
-    reach = (nearest + np.sqrt(3.0) * side) * (1.0 + 1e-5)
-    lists = tree.query_ball_point(middle, reach, return_sorted=True)
-    start = np.cumsum([0, *(len(each) for each in lists)])
-    return side, cells, start, np.concatenate([np.asarray(each, np.int64) for each in lists])
+    x, y, z = np.minimum((inside / side).astype(int), cells - 1).T
+    number = (z * cells[1] + y) * cells[0] + x
+    start = np.concatenate([[0], np.cumsum(np.bincount(number, minlength=cells.prod()))])
+    return side, cells, start, np.argsort(number, kind="stable")

@@ -23,7 +23,7 @@ from wlm.system import Meter, OnProgress
 
 _PRICE = 0.25  # of a number that isn't zero, in steps
 _ROUND = 0.4  # what is added before rounding down: below half, a smaller number is cheaper
-_SPARSE, _AGAIN = 25, 15  # rounds with the price, and for another step
+_SPARSE, _AGAIN = 25, 20  # rounds with the price, and for another step
 _FREE, _MOVES = 15, 3  # rounds without the price, and of moving rounded numbers
 _BIT = 0.1155  # squared steps that a bit is worth at fine steps: 2 ln 2 / 12
 _COUNTS = (1, 2, 4, 8, 16)  # of stored directions that are tried, and all
@@ -208,8 +208,9 @@ class _Search:
         def shrunk(number: np.ndarray) -> np.ndarray:
             return np.copysign(np.maximum(np.abs(number) - price, 0.0), number)
 
-        # Another step begins where the last one ended.
-        start, rounds = (self._exact(), _SPARSE) if self._warm is None else (self._warm, _AGAIN)
+        # Of many probes another step begins where the last one ended.
+        again = self._warm is not None and len(target) > _FEW
+        start, rounds = (self._warm, _AGAIN) if again else (self._exact(), _SPARSE)
         number = self._warm = _accelerated(start, lambda x: shrunk(downhill(x)), rounds)
         kept = number != 0.0
         number = _accelerated(number, lambda x: downhill(x) * kept, _FREE)
