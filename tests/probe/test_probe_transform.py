@@ -82,7 +82,7 @@ def test_kriging_is_exact_at_places_even_and_without_jumps():
         index, weight = kriging.weights(point)
         return (light[index] * weight[..., None]).sum(1)
 
-    np.testing.assert_allclose(at(place), light, atol=2e-3)
+    np.testing.assert_array_equal(at(place), light)
     path = np.linspace([0.1, 0.2, 0.3], [0.9, 0.7, 0.8], 20001)
     np.testing.assert_allclose(at(path)[:, 0], 1.0, atol=1e-9)
     # The K nearest change some fifty times on the way: the largest step is no more than a steep slope's.
@@ -145,9 +145,9 @@ def test_a_file_comes_back_and_knows_its_places(positions, tmp_path):
             back.decoder().decode_probes(other)
     values = decoder.decode_probes(probes.position.astype(np.float32))
     np.testing.assert_array_equal(values, model.decoder().decode_probes(probes.position))
-    live = probes.live
-    between = decoder.decode(probes.position[live])
-    np.testing.assert_allclose(between, values[live], atol=2e-3 * np.abs(values).max())
+    # A place as the file has it is a 65535th of the box from the probe at most.
+    between, slack = decoder.decode(probes.position[probes.live]), 1e-3 if positions else 0.0
+    np.testing.assert_allclose(between, values[probes.live], rtol=0, atol=slack * np.abs(values).max())
 
 
 HARD = {

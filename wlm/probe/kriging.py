@@ -66,4 +66,6 @@ class Kriging:
         matrix[:, diagonal, diagonal] += TAPER * near**4 / np.maximum(1.0 - near**2, SLIGHT) + SLIGHT
         sides = np.stack([SILL - near, np.ones_like(near)], 2)
         light, one = np.moveaxis(np.linalg.solve(matrix, sides), 2, 0)
-        return index, light + one * ((1.0 - light.sum(1)) / one.sum(1))[:, None]
+        weight = light + one * ((1.0 - light.sum(1)) / one.sum(1))[:, None]
+        weight[distance[:, 0] == 0.0] = diagonal == 0
+        return index, weight

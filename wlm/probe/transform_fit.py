@@ -77,7 +77,7 @@ class _Search:
         self._fineness = FINENESS[0]
         self._largest = float(np.abs(self._exact()).max())
         self._warm: np.ndarray | None = None
-        self._meter = Meter(progress, "fit", _TRIES)
+        self._meter = Meter(progress, "fit", 0)
         self._tried = 0
 
     def chosen(self) -> _Coded:
@@ -144,7 +144,8 @@ class _Search:
             coded = encode(2.0**x)
             found = excess(coded)
             self._tried += 1
-            self._meter.report(min(self._tried, _TRIES), PSNR_dB=self._psnr(coded), bytes=self._bytes(coded))
+            if self._meter.due(self._tried):
+                self._meter.report(self._tried, PSNR_dB=self._psnr(coded), bytes=self._bytes(coded))
             enough = found >= 0
             if enough not in ends or (abs(found) < abs(ends[enough][1])):
                 ends[enough] = x, found, coded

@@ -19,7 +19,9 @@ def _mix(
     point, number = wp.tid()
     total = float(0.0)
     for i in range(index.shape[1]):
-        total += weight[point, i] * rows[index[point, i], number]
+        # At a stored row all weights but one are zero.
+        if weight[point, i] != 0.0:
+            total += weight[point, i] * rows[index[point, i], number]
     out[point, number] = total
 
 
