@@ -3,10 +3,10 @@
 Numbers q [N, K] are coded level by level (`wlm.probe.tree`), in a level one column after the other. What a number is
 expected to be in size, its class of odds, follows from the sizes of its parents' numbers in the same column and of its
 own in the two columns before. A magnitude below 8 is a symbol; a larger one is one of two symbols for each power of
-two, and the bits that the symbol leaves open. Signs and those bits have even odds. The odds of a class begin as those
-of a geometric distribution and follow the counts. All of it is whole numbers, sums, products and quotients of IEEE
-doubles, so that every machine has the same odds. The coder is that of constriction (Bamler, Understanding Entropy
-Coding With Asymmetric Numeral Systems, 2022).
+two, and the bits that the symbol leaves open, whose odds are even. The odds of a class begin as those of a geometric
+distribution and follow the counts; those of a column's signs begin even. All of it is whole numbers, sums, products and
+quotients of IEEE doubles, so that every machine has the same odds. The coder is that of constriction (Bamler,
+Understanding Entropy Coding With Asymmetric Numeral Systems, 2022).
 """
 
 from collections.abc import Iterator, Sequence
@@ -19,14 +19,14 @@ LARGEST = (1 << 24) - 1
 
 _DIRECT = 8  # magnitudes that are symbols of their own
 _SYMBOLS = _DIRECT + 2 * 21  # up to LARGEST
-_CLASSES = 26
+_CLASSES = 43
 _PRIOR = 6.0  # numbers that the first odds of a class are worth
+_EVEN = 8.0  # the same of a sign
 _HALVED = 4096.0  # a class's numbers at which its counts are halved: columns and levels differ
 _FEWEST, _MOST = 8, 2048  # rows that are coded with the same odds
 _CHUNK = 12  # bits that are coded at once
 
 models, AnsCoder = constriction.stream.model, constriction.stream.stack.AnsCoder
-_SIGNS = models.Uniform(2)
 
 
 def pack(q: np.ndarray, levels: Sequence[np.ndarray], parents: Sequence[np.ndarray]) -> bytes:
@@ -42,7 +42,7 @@ def pack(q: np.ndarray, levels: Sequence[np.ndarray], parents: Sequence[np.ndarr
     """
     size = np.abs(q)
     steps: list[tuple[np.ndarray, object]] = []
-    odds = _Odds()
+    odds = _Odds(size.shape[1])
     for rows, column, classes in _batches(size, levels, parents):
         symbol, extra, bits = _split(size[rows, column])
         for kind in np.unique(classes):
@@ -51,7 +51,8 @@ def pack(q: np.ndarray, levels: Sequence[np.ndarray], parents: Sequence[np.ndarr
             odds.count(kind, chosen)
         sign = q[rows, column][size[rows, column] > 0] < 0
         if len(sign):
-            steps.append((sign.astype(np.int64), _SIGNS))
+            steps.append((sign.astype(np.int64), odds.sign_model(column)))
+            odds.count_signs(column, sign)
         for width in np.unique(bits[bits > 0]):
             left = extra[bits == width]
             for low in range(0, int(width), _CHUNK):
@@ -74,7 +75,7 @@ def unpack(data: bytes, columns: int, levels: Sequence[np.ndarray], parents: Seq
     coder = AnsCoder(np.frombuffer(data, "<u4").astype(np.uint32))
     count = sum(len(level) for level in levels)
     q, size = np.zeros((count, columns), np.int64), np.zeros((count, columns), np.int64)
-    odds = _Odds()
+    odds = _Odds(columns)
     for rows, column, classes in _batches(size, levels, parents):
         symbol = np.empty(len(rows), np.int64)
         for kind in np.unique(classes):
@@ -84,7 +85,8 @@ def unpack(data: bytes, columns: int, levels: Sequence[np.ndarray], parents: Seq
         nonzero = symbol > 0
         sign = np.zeros(len(rows), np.int64)
         if nonzero.any():
-            sign[nonzero] = coder.decode(_SIGNS, int(nonzero.sum()))
+            sign[nonzero] = coder.decode(odds.sign_model(column), int(nonzero.sum()))
+            odds.count_signs(column, sign[nonzero] > 0)
         low, bits = _START[symbol], _BITS[symbol]
         for width in np.unique(bits[bits > 0]):
             chosen = np.flatnonzero(bits == width)
@@ -137,14 +139,15 @@ def _split(size: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 _START = np.array([*range(_DIRECT), *((2 + half) << (power - 1) for power in range(3, 24) for half in (0, 1))])
 _BITS = np.array([0] * _DIRECT + [power - 1 for power in range(3, 24) for half in (0, 1)])
 # Classes of odds, by what is expected in 1/32: two for each power of two.
-_EDGES = np.array([1, 2, 4, 6, *((2 + half) << power for power in range(2, 13) for half in (0, 1))])[: _CLASSES - 1]
+_EDGES = np.array([1, 2, 4, 6, *((2 + half) << power for power in range(2, 22) for half in (0, 1))])[: _CLASSES - 1]
 
 
 class _Odds:
-    """Counts of the symbols of each class."""
+    """Counts of the symbols of each class, and of the signs of each column."""
 
-    def __init__(self) -> None:
+    def __init__(self, columns: int) -> None:
         self._count = _first_odds() * _PRIOR
+        self._signs = np.full((columns, 2), _EVEN)
 
     def model(self, kind: int) -> models.Categorical:
         count = self._count[kind]
@@ -154,6 +157,13 @@ class _Odds:
         self._count[kind] += np.bincount(symbols, minlength=_SYMBOLS)
         if self._count[kind].sum() > _HALVED:
             self._count[kind] = 0.5 * self._count[kind]
+
+    def sign_model(self, column: int) -> models.Categorical:
+        count = self._signs[column]
+        return models.Categorical(count / count.sum(), perfect=False)
+
+    def count_signs(self, column: int, negative: np.ndarray) -> None:
+        self._signs[column] += np.bincount(negative.astype(np.int64), minlength=2)
 
 
 def _first_odds() -> np.ndarray:

@@ -2,7 +2,8 @@
 
 With F the fixed colours and Q the basis, coefficients of probe i are c_i = q_i step / reach_i, over the levels of
 `wlm.probe.tree`, and its numbers are (values of the tree's transform of c) Q^T F^T. Q's first columns are stored: the
-directions in which probes differ most from what coarser ones predict. The others follow from these.
+directions in which probes differ most from what coarser ones predict. The others follow from these. Where no probe is
+predicted there is no tree, and its numbers are q_i step F^T, or q_i step.
 """
 
 import struct
@@ -29,6 +30,7 @@ FINENESS = (8, 16, 64)
 """Of the directions' numbers, which are whole ones in 1/8, 1/16 or 1/64."""
 
 _HEAD = struct.Struct("<fIHBB")
+_RAW = 8
 _ZERO = 1e-9
 _COLOURS = np.array([[1.0, 1.0, 1.0], [1.0, 0.0, -1.0], [1.0, -2.0, 1.0]])
 
@@ -41,7 +43,8 @@ class Head(NamedTuple):
         check: `Places.check`.
         words: Of 32 bits, in which the directions are coded.
         vectors: How many of them there are.
-        flags: 1 where probes are predicted from coarser ones; twice the place in `FINENESS` of the directions'.
+        flags: 1 where probes are predicted from coarser ones; twice the place in `FINENESS` of the directions'; 8 where
+            numbers are not turned at all.
     """
 
     step: float
@@ -56,7 +59,11 @@ class Head(NamedTuple):
 
     @property
     def fineness(self) -> int:
-        return FINENESS[self.flags >> 1]
+        return FINENESS[self.flags >> 1 & 3]
+
+    @property
+    def raw(self) -> bool:
+        return bool(self.flags & _RAW)
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,8 +152,8 @@ class TransformModel(Model):
             raise ValueError(f"part light: expected a positive step, found {head.step:g}")
         if head.vectors > min(VECTORS, self.outputs) or _HEAD.size + 4 * head.words > len(self.stream):
             raise ValueError("part light: expected fewer directions, or more bytes")
-        if head.flags > 5:
-            raise ValueError(f"part light: expected flags of at most 5, found {head.flags}")
+        if head.flags not in (0, 1, 3, 5, _RAW):
+            raise ValueError(f"part light: expected flags 0, 1, 3, 5 or {_RAW}, found {head.flags}")
         return head
 
     def stored_positions(self) -> np.ndarray:
@@ -199,30 +206,48 @@ class TransformModel(Model):
             turned = tree.values(turned / tree.reach[:, None])
         result = np.zeros((self.probes, self.outputs), np.float32)
         with np.errstate(over="ignore", invalid="ignore"):
-            result[live] = turned @ basis(self.outputs, vectors).T
+            result[live] = turned if head.raw else turned @ basis(self.outputs, vectors).T
         if not np.isfinite(result).all():
             raise WlmError(f"{self.name}: part light: expected values that float32 holds")
         return result
 
 
-def make_stream(
-    step: float, check: int, vectors: np.ndarray | None, fineness: int, q: np.ndarray, tree: Tree | None
-) -> np.ndarray:
+@dataclass(frozen=True, eq=False)
+class Coding:
+    """What probes are turned into before they are rounded.
+
+    Attributes:
+        tree: Of the live probes; None: none is predicted.
+        vectors: float64 [V, D], the directions, whole numbers over the fineness; None: none is stored.
+        fineness: One of `FINENESS`.
+        raw: Whether numbers are not turned at all; without a tree and directions.
+    """
+
+    tree: Tree | None
+    vectors: np.ndarray | None = None
+    fineness: int = FINENESS[0]
+    raw: bool = False
+
+    def basis(self, outputs: int) -> np.ndarray:
+        """What numbers are multiplied with, float64 [D, D]."""
+        return np.eye(outputs) if self.raw else basis(outputs, self.vectors)
+
+
+def make_stream(step: float, check: int, coding: Coding, q: np.ndarray) -> np.ndarray:
     """The part `light` of a model, uint8 [B].
 
     Args:
         step: Of the whole numbers, as float32 holds it.
         check: Of all places.
-        vectors: float64 [V, D], whole numbers over the fineness, or None.
-        fineness: One of `FINENESS`.
+        coding: What they are numbers of.
         q: int64 [L, D], the live probes' numbers.
-        tree: Of the live probes; None: none is predicted.
     """
-    code, count = b"", 0
-    if vectors is not None:
-        code, count = pack(np.rint(vectors * fineness).astype(np.int64), flat(len(vectors)), []), len(vectors)
+    code, count, tree = b"", 0, coding.tree
+    if coding.vectors is not None:
+        vectors = np.rint(coding.vectors * coding.fineness).astype(np.int64)
+        code, count = pack(vectors, flat(len(vectors)), []), len(vectors)
     levels, parents = (tree.levels, tree.parents) if tree else (flat(len(q)), [])
-    flags = (tree is not None) | FINENESS.index(fineness) << 1
+    flags = (tree is not None) | FINENESS.index(coding.fineness) << 1 | _RAW * coding.raw
     head = _HEAD.pack(step, check, len(code) // 4, count, flags)
     return np.frombuffer(head + code + pack(q, levels, parents), np.uint8)
 

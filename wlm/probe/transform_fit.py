@@ -17,7 +17,7 @@ from wlm.metrics import psnr_from_mse
 from wlm.probe.data import ProbeSet
 from wlm.probe.entropy import LARGEST
 from wlm.probe.model import Profile
-from wlm.probe.transform import FINENESS, VECTORS, Places, TransformModel, basis, colours, make_stream
+from wlm.probe.transform import FINENESS, VECTORS, Coding, Places, TransformModel, colours, make_stream
 from wlm.probe.tree import Tree
 from wlm.system import Meter, OnProgress
 
@@ -72,9 +72,8 @@ class _Search:
         peak = float(probes.values.max()) - float(probes.values.min())
         # Probes that are all alike have no range; they have a size.
         self._peak = peak or float(np.abs(probes.values).max())
-        self._tree: Tree | None = Tree(self._places.code[probes.live])
-        self._vectors: np.ndarray | None = None
-        self._fineness = FINENESS[0]
+        self._tree = Tree(self._places.code[probes.live])
+        self._coding = Coding(self._tree)
         self._largest = float(np.abs(self._exact()).max())
         self._warm: np.ndarray | None = None
         self._meter = Meter(progress, "fit", 0)
@@ -168,11 +167,8 @@ class _Search:
 
     def _choose_basis(self, step: float) -> None:
         """Takes the directions, or none, and the prediction, or none, that are worth most at a step."""
-        outputs, tree = self._probes.outputs, self._tree or Tree(self._places.code[self._probes.live])
-        options: list[tuple[Tree | None, np.ndarray | None, int]] = [
-            (None, None, FINENESS[0]),
-            (tree, None, FINENESS[0]),
-        ]
+        outputs, tree = self._probes.outputs, self._tree
+        options = [Coding(None, raw=True), Coding(None), Coding(tree)]
         if len(tree.levels) > 1 and 1 < outputs <= _WIDEST:
             inner = np.concatenate(tree.levels[1:])
             change = (tree.coefficients(self._values) @ colours(outputs))[inner]
@@ -181,13 +177,13 @@ class _Search:
             few = len(inner) <= _FEW
             counts = [count for count in _COUNTS if few and count < len(vectors)] + [len(vectors)]
             for fineness in FINENESS if few else FINENESS[-1:]:
-                options += [(tree, np.rint(vectors[:count] * fineness) / fineness, fineness) for count in counts]
+                options += [Coding(tree, np.rint(vectors[:n] * fineness) / fineness, fineness) for n in counts]
         self._warm = None
         costs = []
-        for self._tree, self._vectors, self._fineness in options:
+        for self._coding in options:
             coded = self._plain(step)
             costs.append(coded.error + _BIT * coded.step**2 * 8 * len(coded.stream))
-        self._tree, self._vectors, self._fineness = options[int(np.argmin(costs))]
+        self._coding = options[int(np.argmin(costs))]
 
     def _plain(self, step: float) -> _Coded:
         """Each number rounded for itself."""
@@ -195,7 +191,7 @@ class _Search:
 
     def _fitted(self, step: float) -> _Coded:
         """Numbers that are worth their bits together."""
-        tree, step = self._tree, _held(step)
+        tree, step = self._coding.tree, _held(step)
         if tree is None:
             return self._plain(step)
         target, reach = self._turned(), tree.reach[:, None]
@@ -222,12 +218,13 @@ class _Search:
         return self._coded(step, q)
 
     def _turned(self) -> np.ndarray:
-        return self._values @ basis(self._probes.outputs, self._vectors)
+        return self._values @ self._coding.basis(self._probes.outputs)
 
     def _exact(self) -> np.ndarray:
         """The numbers before rounding, in units of the values."""
         turned = self._turned()
-        return turned if self._tree is None else self._tree.coefficients(turned) * self._tree.reach[:, None]
+        tree = self._coding.tree
+        return turned if tree is None else tree.coefficients(turned) * tree.reach[:, None]
 
     def _rounded(self, number: np.ndarray) -> np.ndarray:
         size = np.minimum(np.floor(np.abs(number) + _ROUND), LARGEST)
@@ -235,10 +232,10 @@ class _Search:
 
     def _coded(self, step: float, q: np.ndarray) -> _Coded:
         step = _held(step)
-        stream = make_stream(step, self._places.check, self._vectors, self._fineness, q, self._tree)
+        stream = make_stream(step, self._places.check, self._coding, q)
         decoded = q * step
-        if self._tree is not None:
-            decoded = self._tree.values(decoded / self._tree.reach[:, None])
+        if (tree := self._coding.tree) is not None:
+            decoded = tree.values(decoded / tree.reach[:, None])
         return _Coded(step, stream, float(np.square(decoded - self._turned()).sum()))
 
     def _psnr(self, coded: _Coded) -> float:
