@@ -37,6 +37,7 @@ MODULES = (
     "lightmap.output",
     "probe.cubes",
     "probe.gaussian_sum",
+    "probe.mixture",
     "probe.step",
     "probe.volume",
     "probe.volume_frame",

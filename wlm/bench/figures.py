@@ -54,6 +54,10 @@ TABLES: dict[str, dict[str, Figure]] = {
         "psnr_worst": Figure("worst view", "dB", ".2f"),
         "texel_psnr": Figure("texels", "dB", ".2f"),
         "irradiance_psnr": Figure("irradiance", "dB", ".2f"),
+        "nearest_psnr": Figure("nearest", "dB", ".2f"),  # of uncompressed probes, as the next two
+        "distance_psnr": Figure("by distance", "dB", ".2f"),
+        "kriging_psnr": Figure("kriging", "dB", ".2f"),
+        "half_way_psnr": Figure("half-way", "dB", ".2f"),
         "coarse_psnr": Figure("coarse march", "dB", ".2f"),
         "network_psnr": Figure("network", "dB", ".2f"),
         "right_psnr": Figure("right", "dB", ".2f"),

@@ -31,12 +31,13 @@ from wlm.cli.options import (
     output_option,
 )
 from wlm.cli.probe_volume import register, score_seen, show_seen, show_walk_scores, walk_scores
+from wlm.errors import WlmError
 
 if TYPE_CHECKING:
     import numpy as np
 
     from wlm.baselines.rival import Rival
-    from wlm.probe import ProbeModel, ProbeSet, Report
+    from wlm.probe import ProbeModel, ProbeSet, Report, TransformModel
 
 app = typer.Typer(help="Light probes: quantised 3D Gaussians and a small network, read through a cascaded volume.")
 register(app)
@@ -45,6 +46,11 @@ _Probes = Annotated[Path, typer.Argument(metavar="PROBES", help="A .npz, .json o
 _Key = Annotated[str | None, typer.Option(help="Name of the values in PROBES; default the only ones.")]
 _Convention = Annotated[
     str | None, typer.Option(help="Of the numbers: threejs, godot, unreal or unity; default as PROBES says.")
+]
+
+_Original = Annotated[
+    Path | None,
+    typer.Option(metavar="PROBES", help="The probes that were compressed, where a transform's file has no positions."),
 ]
 
 _NAMES = {
@@ -64,8 +70,14 @@ def compress(
     probes_path: _Probes,
     output: Annotated[Path, output_option("OUT.wlm", "The file to write.")],
     profile: Annotated[
-        str, typer.Option(help="standard, compact, small, paper, or a YAML file of settings.")
-    ] = "standard",
+        str, typer.Option(help="transform, standard, compact, small, paper, or a YAML file of settings.")
+    ] = "transform",
+    target_psnr: Annotated[
+        float | None, typer.Option(metavar="DB", help="Of a transform: the PSNR to reach; default 50.")
+    ] = None,
+    max_bytes: Annotated[
+        int | None, typer.Option(metavar="BYTES", help="Of a transform: the most bytes that the file may have.")
+    ] = None,
     ratio: Annotated[float | None, typer.Option(help="Gaussians as a share of the live probes.")] = None,
     bits: Annotated[int | None, typer.Option(help="Bits of a Gaussian's scale, rotation and latent.")] = None,
     latent: Annotated[int | None, typer.Option(help="Numbers in a Gaussian's latent.")] = None,
@@ -89,9 +101,12 @@ def compress(
     quiet_warp()
     from wlm.interop import check_device
     from wlm.probe import Profile, compress, open_checkpoint
+    from wlm.probe.fit import check_method
 
-    overrides = {"ratio": ratio, "bits": bits, "latent": latent, "steps": steps}
+    overrides = {"target_psnr": target_psnr, "max_bytes": max_bytes}
+    overrides |= {"ratio": ratio, "bits": bits, "latent": latent, "steps": steps}
     settings = Profile.load(profile).override(overrides, "--")
+    check_method(settings, overrides, "--")
     device = check_device(device)
     probes = _load(probes_path, key, convention)
     options = {"seed": seed, "device": device}
@@ -104,16 +119,17 @@ def compress(
         seconds = time.perf_counter() - start
         size = model.save(output)
         checkpoint.remove()
-    rows = table(model.name, ["file", "bytes", "of float32", "bits per probe", "Gaussians", "dropped", "seconds"])
-    rows.add_row(
-        escape(str(output)),
-        f"{size:,}",
-        f"{size / probes.float_bytes:.2%}",
-        f"{size * 8 / probes.probes:.2f}",
-        f"{model.count:,}",
-        f"{model.dropped:,}",
-        f"{seconds:.1f}",
-    )
+    cells = {
+        "file": escape(str(output)),
+        "bytes": f"{size:,}",
+        "of float32": f"{size / probes.float_bytes:.2%}",
+        "bits per probe": f"{size * 8 / probes.probes:.2f}",
+    }
+    if settings.method == "gaussians":
+        cells |= {"Gaussians": f"{model.count:,}", "dropped": f"{model.dropped:,}"}
+    cells["seconds"] = f"{seconds:.1f}"
+    rows = table(model.name, list(cells))
+    rows.add_row(*cells.values())
     show(rows)
 
 
@@ -126,6 +142,7 @@ def decode(
         typer.Option(metavar="PROBES", help="Where: a .npz, .json or .lmbake file, of which `position` is taken."),
     ] = None,
     convention: Annotated[str, typer.Option(help="Of the numbers: threejs, godot, unreal or unity.")] = "threejs",
+    original: _Original = None,
     device: Device = "cpu",
 ) -> None:
     """Decode the light at the stored positions, or at any others.
@@ -139,8 +156,8 @@ def decode(
     from wlm.system import load
 
     model = load(file, "probe")
-    decoder = model.decoder(device)
     position, at_probes = _positions(model, positions)
+    decoder = _decoder(model, device, original, position if at_probes else None)
     values = decoder.decode_probes(position) if at_probes else decoder.decode(position)
     save_probes(output, position, values, convention=convention)
     rows = table(str(file), ["file", "positions", "of", "zero", "mean", "largest"], text=["of"])
@@ -171,6 +188,9 @@ def evaluate(
     mesh: Annotated[
         Path | None, typer.Option(metavar="FILE", help="The scene, .glb, .gltf or .obj, for the pictures.")
     ] = None,
+    hold_out: Annotated[
+        bool, typer.Option("--hold-out", help="Fit four fifths of the probes again, and score the light at the others.")
+    ] = False,
     device: Device = "cpu",
     key: _Key = None,
     convention: _Convention = None,
@@ -186,7 +206,9 @@ def evaluate(
 
     model = load(file, "probe")
     probes = _load(probes_path, key, convention)
-    report = evaluate(model, probes, device=device, file_bytes=file.stat().st_size)
+    with running("evaluate") as progress:
+        size = file.stat().st_size
+        report = evaluate(model, probes, device=device, progress=progress, file_bytes=size, hold_out=hold_out)
     if probes.source != model.source:
         note(f"warning: {probes_path}: not what {file} was made of; another key, convention or file?")
     if html_path is not None:
@@ -222,37 +244,49 @@ def info(file: ModelFile, as_json: AsJson = False, device: Device = "cpu") -> No
     artifact = read_artifact(file, "probe")
     model = system.decode(file, artifact, codec.decode)
     decoder = model.decoder(device)
+    transform = model.profile.method == "transform"
     facts: dict[str, Any] = {
         "name": model.name,
+        "method": model.profile.method,
         "bytes": artifact.file_bytes,
         "probes": model.probes,
         "dead": int(model.dead.sum()),
         "outputs": model.outputs,
-        "gaussians": model.count,
-        "dropped": model.dropped,
-        "gaussian_bits": int(model.profile.code_bits().sum()),
         "bits_per_probe": artifact.file_bytes * 8 / model.probes,
-        "origin": model.origin.tolist(),
-        "size": (model.extent * model.size).tolist(),
-        "positions": bool(len(model.positions)),
+        "positions": model.has_positions,
         "source": model.source,
         "parts": {"header": artifact.header_bytes} | artifact.parts,
         "device": decoder.device,
         "device_bytes": decoder.device_bytes,
         "profile": model.profile.model_dump(mode="json"),
     }
+    if transform:
+        facts |= {"step": model.head.step, "directions": model.head.vectors, "predicted": model.head.predicted}
+    else:
+        facts |= {
+            "gaussians": model.count,
+            "dropped": model.dropped,
+            "gaussian_bits": int(model.profile.code_bits().sum()),
+            "origin": model.origin.tolist(),
+            "size": (model.extent * model.size).tolist(),
+        }
     if as_json:
         show_json(facts)
         return
     rows = table(str(file), ["", "value"])
     rows.add_row("name", escape(model.name))
+    rows.add_row("method", model.profile.method)
     rows.add_row("bytes", f"{artifact.file_bytes:,}")
     rows.add_row("probes", f"{model.probes:,}, {facts['dead']:,} of them dead")
     rows.add_row("numbers of a probe", str(model.outputs))
     rows.add_row("bits per probe", f"{facts['bits_per_probe']:.2f}")
-    rows.add_row("Gaussians", f"{model.count:,}, {model.dropped:,} dropped")
-    rows.add_row("bits per Gaussian", str(facts["gaussian_bits"]))
-    rows.add_row("box", " x ".join(f"{side:.4g}" for side in facts["size"]))
+    if transform:
+        rows.add_row("step", f"{model.head.step:.4g}")
+        rows.add_row("directions", str(model.head.vectors))
+    else:
+        rows.add_row("Gaussians", f"{model.count:,}, {model.dropped:,} dropped")
+        rows.add_row("bits per Gaussian", str(facts["gaussian_bits"]))
+        rows.add_row("box", " x ".join(f"{side:.4g}" for side in facts["size"]))
     rows.add_row("positions", "stored" if facts["positions"] else "not stored")
     rows.add_row("source", escape(model.source))
     rows.add_row("profile", escape(model.profile.name))
@@ -268,9 +302,10 @@ def info(file: ModelFile, as_json: AsJson = False, device: Device = "cpu") -> No
 def export(
     file: ModelFile,
     output: Annotated[Path, output_option("DIR", "The folder to write to.")],
+    original: _Original = None,
     device: Device = "cpu",
 ) -> None:
-    """Write the Gaussians and the network as buffers, with a shader that reads them, for an engine.
+    """Write what the file holds as buffers, with a shader that reads them, for an engine.
 
     reference.json is the light at some positions: what the shader should make of the rest.
     """
@@ -278,8 +313,9 @@ def export(
     from wlm.probe import export
     from wlm.system import load
 
+    model = load(file, "probe")
     rows = table(str(output), ["file", "bytes"])
-    for path in export(load(file, "probe"), output, device=device):
+    for path in export(model, output, device=device, position=_given(model, original)):
         rows.add_row(escape(path.name), f"{path.stat().st_size:,}")
     show(rows)
 
@@ -294,7 +330,7 @@ def _load(path: Path, key: str | None, convention: str | None) -> "ProbeSet":
     return probes
 
 
-def _positions(model: "ProbeModel", path: Path | None) -> "tuple[np.ndarray, bool]":
+def _positions(model: "ProbeModel | TransformModel", path: Path | None) -> "tuple[np.ndarray, bool]":
     """The positions to decode at, float64 [M, 3], and whether they are those of the model's own probes."""
     from wlm.probe import load_positions
 
@@ -302,6 +338,30 @@ def _positions(model: "ProbeModel", path: Path | None) -> "tuple[np.ndarray, boo
         return model.stored_positions(), True
     position = load_positions(path)
     return position, model.has_probes_at(position)
+
+
+def _given(model: "ProbeModel | TransformModel", original: Path | None) -> "np.ndarray | None":
+    """The positions of the model's own probes in another file, if there is one; only a transform needs them."""
+    from wlm.probe import load_positions
+
+    if original is None:
+        return None
+    position = load_positions(original)
+    if model.profile.method != "transform":
+        raise WlmError(f"--original: means nothing to {model.name}, which is decoded without its probes' positions")
+    if not model.has_probes_at(position):
+        raise WlmError(f"{original}: expected the {model.probes} probes of {model.name}, in their order")
+    return position
+
+
+def _decoder(
+    model: "ProbeModel | TransformModel", device: str, original: Path | None, position: "np.ndarray | None" = None
+) -> "Any":
+    """A decoder, of a transform at the places of `original` or at `position`, the model's own probes."""
+    given = _given(model, original)
+    if given is None and model.profile.method == "transform":
+        given = position
+    return model.decoder(device) if given is None else model.decoder(device, position=given)
 
 
 def _show_report(file: Path, profile: str, report: "Report", rivals: "list[tuple[Rival, Report]]") -> None:
@@ -316,6 +376,14 @@ def _show_report(file: Path, profile: str, report: "Report", rivals: "list[tuple
         rows.add_section()
         for band, psnr in enumerate(report.psnr_by_band):
             rows.add_row(f"band {band}", number(psnr, ".2f"))
+    if report.between_psnr is not None:
+        rows.add_section()
+        rows.add_row("half-way between probes", number(report.between_psnr, ".2f"))
+    if report.held_out is not None:
+        held = report.held_out
+        rows.add_row(f"{held.probes:,} probes held out", number(held.psnr, ".2f"), "", "", f"{held.bytes:,}")
+        rows.add_row("  by the nearest uncompressed", number(held.nearest, ".2f"))
+        rows.add_row("  by distance, of 8 uncompressed", number(held.distance, ".2f"))
     show(rows)
     if report.worst_probe is not None:
         worst = report.worst_probe

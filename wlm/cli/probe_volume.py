@@ -116,16 +116,23 @@ def volume(
 def grid(
     file: ModelFile,
     output: Annotated[Path, output_option("DIR", "The folder to write to.")],
+    probes_path: Annotated[
+        Path | None, typer.Argument(metavar="PROBES", help="What was compressed, where FILE.wlm has no places.")
+    ] = None,
     cells: Annotated[int | None, typer.Option(help="Along the longest side of the probes' box; default 24.")] = None,
     device: Device = "cpu",
 ) -> None:
     """Write the light as a grid for three.js: a texture, and a module that loads it into a LightProbeGrid."""
     quiet_warp()
+    from wlm.probe import load_positions
     from wlm.probe.three_grid import CELLS, export_grid
     from wlm.system import load
 
+    cells = CELLS if cells is None else cells
+    position = None if probes_path is None else load_positions(probes_path)
+
     rows = table(str(output), ["file", "bytes"])
-    for path in export_grid(load(file, "probe"), output, cells=CELLS if cells is None else cells, device=device):
+    for path in export_grid(load(file, "probe"), output, cells=cells, position=position, device=device):
         rows.add_row(escape(path.name), f"{path.stat().st_size:,}")
     show(rows)
 

@@ -8,6 +8,8 @@ _PLACES = {
     "ProbeSet": "wlm.probe.data",
     "Profile": "wlm.probe.model",
     "Report": "wlm.probe.evaluation",
+    "TransformDecoder": "wlm.probe.transform_decode",
+    "TransformModel": "wlm.probe.transform",
     "Volume": "wlm.probe.volume",
     "compress": "wlm.probe.fit",
     "evaluate": "wlm.probe.evaluation",

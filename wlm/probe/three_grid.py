@@ -21,6 +21,8 @@ from wlm.formats.reading import named_file
 from wlm.probe.conventions import THREE_GRID as FORMAT
 from wlm.probe.decode import Decoder
 from wlm.probe.model import ProbeModel
+from wlm.probe.transform import TransformModel
+from wlm.probe.transform_decode import TransformDecoder
 
 _VERSION = 1
 INFO_FILE = "grid.json"
@@ -70,7 +72,12 @@ export async function loadLightProbeGrid(url, renderer, THREE, KTX2Loader, Grid)
 
 
 def export_grid(
-    model: ProbeModel, directory: str | os.PathLike[str], *, cells: int = CELLS, device: str = "cpu"
+    model: ProbeModel | TransformModel,
+    directory: str | os.PathLike[str],
+    *,
+    cells: int = CELLS,
+    position: np.ndarray | None = None,
+    device: str = "cpu",
 ) -> list[Path]:
     """Writes a model's light as a grid for three.js: `grid.ktx2`, `grid.json`, and `grid.js`, which loads them.
 
@@ -81,6 +88,7 @@ def export_grid(
         model: Of L2 in RGB.
         directory: The folder; made if it isn't there. A new export replaces an earlier one.
         cells: Along the longest side of the box, 1 to 256.
+        position: [N, 3], of the model's own probes, for a transform whose file has none.
         device: Where it is decoded.
 
     Returns:
@@ -94,13 +102,17 @@ def export_grid(
         raise WlmError(f"{model.name}: expected L2 in RGB, 27 numbers a probe, got {model.outputs}")
     if not 1 <= cells <= _MOST_CELLS:
         raise WlmError(f"cells: expected 1 to {_MOST_CELLS} along the longest side, got {cells}")
-    span = model.extent * model.size
+    if isinstance(model, TransformModel):
+        position = model.stored_positions() if position is None else position
+        decoder: Decoder | TransformDecoder = TransformDecoder(model, device, position=position)
+        corner, span = position.min(0), np.ptp(position, axis=0)
+    else:
+        decoder, corner, span = Decoder(model, device), model.origin, model.extent * model.size
     size = float(span.max()) / cells or 1.0  # all probes in one place: one cell
     count = np.clip(np.ceil(span / size - 1e-6), 1, cells).astype(int)
-    low = model.origin + span / 2 - count * size / 2
+    low = corner + span / 2 - count * size / 2
     box = np.stack([low, low + count * size])
     places = grid_places(box, count)
-    decoder = Decoder(model, device)
     values = np.concatenate([decoder.decode(places[i : i + _ROWS]) for i in range(0, len(places), _ROWS)])
     if not np.abs(values).max() <= np.finfo(np.float16).max:
         raise WlmError(f"{model.name}: expected light within half floats, got {np.abs(values).max():.3g}")

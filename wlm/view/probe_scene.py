@@ -11,11 +11,11 @@ from scipy.spatial import cKDTree
 from wlm.errors import WlmError
 from wlm.formats.geometry import Geometry
 from wlm.probe.data import ProbeSet
-from wlm.probe.decode import Decoder
-from wlm.probe.light import Light, StoredLight, light_of
+from wlm.probe.light import Light, StoredLight
 from wlm.probe.model import CENTRE, ROTATION, SCALE, ProbeModel
 from wlm.probe.places import ball_exposure, ball_radius
 from wlm.probe.sphere import basis, coefficient_bands, cosine_factor, irradiance, sh_count
+from wlm.probe.transform import TransformModel
 from wlm.probe.volume import Volume
 from wlm.probe.walk import camera_path, settle
 from wlm.view.canvas import Canvas, Hit
@@ -47,7 +47,7 @@ class Probes:
         values: By "decoded" and "original", as there are, float32 [N, C, 3].
         decode: Light float32 [M, 3 C] at points [M, 3].
         light: That of the probes, for a volume.
-        model: The model; None: the input alone.
+        model: The Gaussians; None: there are none.
         note: For the caption.
     """
 
@@ -62,7 +62,12 @@ class Probes:
 
     @classmethod
     def of_model(
-        cls, model: ProbeModel, position: np.ndarray, original: np.ndarray | None, live: np.ndarray, title: str
+        cls,
+        model: ProbeModel | TransformModel,
+        position: np.ndarray,
+        original: np.ndarray | None,
+        live: np.ndarray,
+        title: str,
     ) -> Self:
         """Takes what `wlm.probe.places.probes_of` found of a model.
 
@@ -70,13 +75,15 @@ class Probes:
             WlmError: A probe's numbers are no spherical harmonics.
         """
         count = _coefficients(model.outputs, title)
-        decoder, places = Decoder(model), position[live]
-        values = {"decoded": decoder.decode(places).reshape(-1, count, 3)}
+        decoder, places = model.decoder(), position[live]
+        values = {"decoded": decoder.decode_probes(position)[live].reshape(-1, count, 3)}
         if original is not None:
             values["original"] = original[live].reshape(-1, count, 3)
-        note = f"{model.name}, {len(places):,} probes, {model.count:,} Gaussians, profile {model.profile.name}"
-        light = light_of(decoder, places)
-        return cls(places, np.flatnonzero(live), count, values, decoder.decode, light, model, note)
+        shapes = model if isinstance(model, ProbeModel) else None
+        gaussians = "" if shapes is None else f"{shapes.count:,} Gaussians, "
+        note = f"{model.name}, {len(places):,} probes, {gaussians}profile {model.profile.name}"
+        light = StoredLight(values["decoded"])
+        return cls(places, np.flatnonzero(live), count, values, decoder.decode, light, shapes, note)
 
     @classmethod
     def of_set(cls, probes: ProbeSet, title: str) -> Self:
