@@ -55,17 +55,18 @@ class Kriging:
         count, asked = self.count, min(self.count + 1, len(self.place))
         distance, index = self._tree.query(point, k=asked)
         distance, index = distance.reshape(len(point), asked), index.reshape(len(point), asked)
-        reach = distance[:, -1:] * (1.0 if asked > count else FEW)
-        reach = np.where(reach > 0.0, reach, 1.0)
-        index, near = index[:, :count], distance[:, :count] / reach
-        place = self.place[index]
-        apart = np.sqrt(np.square(place[:, :, None] - place[:, None]).sum(-1)) / reach[:, :, None]
+        weight = np.zeros((len(point), count))
+        weight[:, 0] = 1.0  # where a place is itself
+        between = distance[:, 0] > 0.0
+        reach = distance[between, -1] * (1.0 if asked > count else FEW)
+        near = distance[between, :count] / reach[:, None]
+        place = self.place[index[between, :count]]
+        apart = np.sqrt(np.square(place[:, :, None] - place[:, None]).sum(-1)) / reach[:, None, None]
         matrix = SILL - apart
-        # The farthest taken may be as far as the first left out.
         diagonal = np.arange(count)
+        # The farthest taken may be as far as the first left out.
         matrix[:, diagonal, diagonal] += TAPER * near**4 / np.maximum(1.0 - near**2, SLIGHT) + SLIGHT
         sides = np.stack([SILL - near, np.ones_like(near)], 2)
         light, one = np.moveaxis(np.linalg.solve(matrix, sides), 2, 0)
-        weight = light + one * ((1.0 - light.sum(1)) / one.sum(1))[:, None]
-        weight[distance[:, 0] == 0.0] = diagonal == 0
-        return index, weight
+        weight[between] = light + one * ((1.0 - light.sum(1)) / one.sum(1))[:, None]
+        return index[:, :count], weight

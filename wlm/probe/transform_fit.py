@@ -76,6 +76,8 @@ class _Search:
         self._coding = Coding(self._tree)
         self._largest = float(np.abs(self._exact()).max())
         self._warm: np.ndarray | None = None
+        # A fitted step is finer than a plain one of the same size: directions are chosen again where that is quick.
+        self._rounds = 2 if len(self._values) <= _FEW else 1
         self._meter = Meter(progress, "fit", 0)
         self._tried = 0
 
@@ -83,14 +85,30 @@ class _Search:
         """What has the wanted size, or the wanted PSNR."""
         psnr, limit = self._profile.target_psnr, self._profile.max_bytes
         if psnr is not None or limit is None:
-            wanted = _PSNR if psnr is None else psnr
-            self._choose_basis(self._for_psnr(wanted, self._plain, 0.5).step)
-            coded = self._for_psnr(wanted, self._fitted, _CLOSE)
+            coded = self._smallest(_PSNR if psnr is None else psnr)
             if limit is None or self._bytes(coded) <= limit:
                 return coded
-        step = self._for_bytes(limit, self._plain, 0.9).step
-        self._choose_basis(step)
-        return self._for_bytes(limit, self._fitted, _FULL, step)
+        return self._best(limit)
+
+    def _smallest(self, psnr: float) -> _Coded:
+        """What reaches a PSNR in the fewest bytes."""
+        found = [self._for_psnr(psnr, self._plain, 0.5)]
+        for _ in range(self._rounds):
+            self._choose_basis(found[-1].step)
+            found.append(self._for_psnr(psnr, self._fitted, _CLOSE))
+        return min(found[1:], key=lambda coded: len(coded.stream))
+
+    def _best(self, limit: int) -> _Coded:
+        """What has the least error in a size."""
+        self._coding = Coding(self._tree)
+        found = [self._for_bytes(limit, self._plain, 0.9)]
+        for _ in range(self._rounds):
+            self._choose_basis(found[-1].step)
+            if self._bytes(self._plain(8.0 * self._largest)) > limit:
+                # No room for anything beside the directions.
+                self._coding = Coding(self._tree)
+            found.append(self._for_bytes(limit, self._fitted, _FULL, found[-1].step))
+        return min(found, key=lambda coded: coded.error)
 
     def model(self, coded: _Coded) -> TransformModel:
         """The model of what was chosen."""
@@ -107,7 +125,9 @@ class _Search:
 
     def _for_psnr(self, target: float, encode: Callable[[float], _Coded], close: float) -> _Coded:
         start = self._peak * 10.0 ** (-target / 20.0) * 4.0
-        coded, excess = self._solve(encode, lambda coded: self._psnr(coded) - target, -5.0, close, start)
+        coded, excess = self._solve(
+            encode, lambda coded: self._psnr(coded) - target, -5.0, close, start, lambda coded: len(coded.stream)
+        )
         if excess < 0:
             name, most = self._probes.name, self._psnr(coded)
             raise WlmError(f"--target-psnr: expected at most {most:.1f} for {name}, got {target:g}")
@@ -118,7 +138,7 @@ class _Search:
             return math.log2(limit / self._bytes(coded))
 
         start = start or self._peak * 0.02
-        coded, excess = self._solve(encode, room, 0.7, -math.log2(full), start)
+        coded, excess = self._solve(encode, room, 0.7, -math.log2(full), start, lambda coded: coded.error)
         if excess < 0:
             raise WlmError(f"--max-bytes: expected at least {self._bytes(coded)} for {self._probes.name}, got {limit}")
         return coded
@@ -130,11 +150,13 @@ class _Search:
         slope: float,
         close: float,
         start: float,
+        cost: Callable[[_Coded], float],
     ) -> tuple[_Coded, float]:
-        """What has the least excess that isn't negative, with it; else what comes nearest.
+        """What costs least of all tried whose excess isn't negative, with its excess; else what comes nearest.
 
         `slope` is about what the excess gains where the step doubles. An excess up to `close` is small enough.
         """
+        good: list[tuple[_Coded, float]] = []
         # From numbers that still have room to a step at which all are 0, whatever the directions.
         low, high = math.log2(4.0 * self._largest / LARGEST), math.log2(8.0 * self._largest)
         x = min(max(math.log2(start), low), high)
@@ -146,6 +168,8 @@ class _Search:
             if self._meter.due(self._tried):
                 self._meter.report(self._tried, PSNR_dB=self._psnr(coded), bytes=self._bytes(coded))
             enough = found >= 0
+            if enough:
+                good.append((coded, found))
             if enough not in ends or (abs(found) < abs(ends[enough][1])):
                 ends[enough] = x, found, coded
             if enough and found <= close:
@@ -162,7 +186,9 @@ class _Search:
                 if further == x:
                     break
                 x = further
-        _, found, coded = ends[True] if True in ends else ends[False]
+        if good:
+            return min(good, key=lambda pair: cost(pair[0]))
+        _, found, coded = ends[False]
         return coded, found
 
     def _choose_basis(self, step: float) -> None:
