@@ -195,9 +195,11 @@ class Model:
 
     Attributes:
         SYSTEM: The system's name in files.
+        DECODER: Module and class of the decoder, in the system's package.
     """
 
     SYSTEM: ClassVar[str]
+    DECODER: ClassVar[tuple[str, str]] = ("decode", "Decoder")
 
     def save(self, path: str | os.PathLike[str]) -> int:
         """Writes the model to one file, whole or not at all.
@@ -234,7 +236,8 @@ class Model:
         Raises:
             WlmError: No such device.
         """
-        return _room(self.SYSTEM, "decode").Decoder(self, device, **options)
+        room, name = self.DECODER
+        return getattr(_room(self.SYSTEM, room), name)(self, device, **options)
 
     def _encoded(self) -> tuple[dict[str, Any], dict[str, np.ndarray], str]:
         """Settings, parts and source of the file."""

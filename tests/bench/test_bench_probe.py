@@ -10,6 +10,7 @@ from wlm.bench.probe import PANELS, run, run_rivals, run_rows
 from wlm.errors import WlmError
 from wlm.probe.data import from_arrays
 from wlm.probe.model import Profile
+from wlm.probe.seen import KINDS
 
 STEPS = 120
 PROFILES = [
@@ -36,22 +37,26 @@ def sets():
 
 @pytest.fixture(scope="module")
 def rows(sets):
-    return run_rows(sets, PROFILES, device="cpu", ratios=(0.1, 0.2), sizes=(1, 3), frames=4, repeats=1)
+    return run_rows(sets, PROFILES, device="cpu", ratios=(0.1, 0.2), shares=(5, 10), frames=4, repeats=1)
 
 
 def test_every_row_has_its_figures(rows):
-    ours = [("ours", "standard"), ("ours", "other"), ("ours", "ratio 0.20")]
+    ours = [("ours", "standard"), ("ours", "other"), ("ours", "ratio 0.20"), ("transform", "5%"), ("transform", "10%")]
     ways = ["none", "sphere", "sphere lists", "box", "exact", "exact, given order", "cut 2.5", "cut 2"]
     fits = [("fit", f"standard {STEPS} steps"), ("dense torch", f"standard {STEPS} steps")]
-    rivals = [(name, size) for size in ("same bytes", "3x bytes") for name in RIVALS] + [("Unreal packing", "")]
-    volume = [("volume", "walk of 4 frames"), ("volume", "teleport")]
+    rivals = [(name, size) for size in ("5%", "10%") for name in RIVALS] + [("Unreal packing", "")]
+    held = [("held out", "standard"), ("held out", "5%")]
+    volume = [("volume", f"{light}, walk of 4 frames") for light in ("lossless", "ours")]
+    views = [("views", f"balls, {light}") for light in KINDS]
     for scene, speed in (("room", fits), ("hall", [])):
         assert keys(row for row in rows if row.scene == scene) == [
             *ours,
             *(("decode", way) for way in ways),
             *speed,
             *rivals,
+            *held,
             *volume,
+            *views,
         ]
     for row in rows:
         assert row.system == "probe" and row.notes
@@ -62,15 +67,19 @@ def test_every_row_has_its_figures(rows):
             assert row["bpp"] == pytest.approx(row["bytes"] * 8 / 300) and row["encode_seconds"] > 0.0
             assert row["probes"] == 270 and row["share_of_float32"] == pytest.approx(row["bpp"] / (27 * 32))
         if row.method == "volume":
-            assert 0.0 <= row["coverage"] <= 1.0 and row["frames"] >= 1
+            assert 0.0 <= row["coverage"] <= 1.0 and row["frames"] == 4
+            assert row["psnr"] < row["light_psnr"] + 1.0 and (row["light_psnr"] == 120.0) == ("lossless" in row.option)
 
 
 def test_rivals_keep_to_the_bytes(rows):
-    ours = {row.scene: row for row in rows if (row.method, row.option) == ("ours", "standard")}
+    ours = {(row.scene, row.option): row for row in rows if row.method == "transform"}
     for row in rows:
         if row.method in RIVALS and row.figures:
-            times = 3 if row.option == "3x bytes" else 1
-            assert row["bytes"] <= times * ours[row.scene]["bytes"] and row["psnr"] > 5.0
+            transform = ours[row.scene, row.option]
+            assert row["bytes"] <= transform["bytes"] <= 0.1 * 300 * 27 * 4 and 5.0 < row["psnr"] < transform["psnr"]
+        if row.method == "held out":
+            assert row["distance_psnr"] < row["kriging_psnr"] and row["half_way_psnr"] > 10.0
+            assert row.option == "standard" or row["distance_psnr"] < row["psnr"] < row["kriging_psnr"] + 0.5
 
 
 def test_rivals_alone_are_the_same(sets, rows, tmp_path, monkeypatch):
@@ -82,7 +91,7 @@ def test_rivals_alone_are_the_same(sets, rows, tmp_path, monkeypatch):
     for name in ("bytes", "psnr"):
         assert [row.get(name) for row in alone] == [row.get(name) for row in beside]
     write_json(tmp_path / "hall.json", [row for row in rows if row.scene == "hall"], {})
-    with pytest.raises(WlmError, match="expected a row of profile standard of room"):
+    with pytest.raises(WlmError, match="expected rows of transforms of room"):
         run_rivals(tmp_path / "hall.json", probes_path="room.npz")
 
 
@@ -101,6 +110,6 @@ def test_what_is_refused(sets, tmp_path):
     with pytest.raises(WlmError, match="No such file"):
         run(quick=True, device="cpu", probes_path=tmp_path / "absent.npz")
     with pytest.raises(WlmError, match="device 'tpu'"):
-        run_rows(sets, PROFILES, device="tpu", ratios=(), sizes=(), frames=1)
+        run_rows(sets, PROFILES, device="tpu", ratios=(), shares=(), frames=1)
     with pytest.raises(ValueError, match="at least one set and one profile"):
-        run_rows(sets, [], device="cpu", ratios=(), sizes=(), frames=1)
+        run_rows(sets, [], device="cpu", ratios=(), shares=(), frames=1)

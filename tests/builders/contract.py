@@ -95,6 +95,19 @@ def _probe() -> Subject:
     )
 
 
+def _probe_transform() -> Subject:
+    return Subject(
+        "probe",
+        FILES / "probe-transform.wlm",
+        lambda model: {"values": model.decoder().decode_probes()},
+        FILES / "probe-transform.npz",
+        lambda: probe_sets.synthetic(300, dead=5),
+        lambda data, **options: wlm.probe.compress(data, positions=True, target_psnr=40.0, **options),
+        lambda model, data: wlm.probe.evaluate(model, data),
+        lambda model, data, folder: wlm.probe.export(model, folder),
+    )
+
+
 def _atlas(kind: str) -> Subject:
     settings = {"method": "cascade", "steps": 40, "resolution": 32, "fallback": False} if kind == "cascade" else {}
     profile = wlm.atlas.Profile(name="tiny", views=0, **settings)
@@ -136,6 +149,7 @@ SUBJECTS: dict[str, Callable[[], Subject]] = {
     "lightmap": _lightmap,
     "lightmap-layers": _layers,
     "probe": _probe,
+    "probe-transform": _probe_transform,
     **{f"atlas-{kind}": lambda kind=kind: _atlas(kind) for kind in ("tiles", "cascade", "bc6h", "plain")},
     "smoke": _smoke,
 }

@@ -201,14 +201,15 @@ def test_export_lists_what_it_wrote(fitted, tmp_path):
 
 
 def test_walk_prints_and_writes_the_report(fitted, carrying, room, tmp_path):
-    words = ["--frames", 20, "--scale", 0.1, "--budget", 5, "--json", tmp_path / "r.json"]
+    words = ["--frames", 20, "--block", 0.25, "--budget", 5, "--json", tmp_path / "r.json"]
     text = call("probe", "walk", fitted, room, *words)
     report = json.loads((tmp_path / "r.json").read_text())
     assert report["frames"] == 20 and report["budget"] == 5 and report["updated"]["max"] == 5
-    np.testing.assert_allclose(report["sizes"], [0.2, 0.4, 0.8, 3.2])
-    # Blocks of D floats and their places.
-    assert report["volume_bytes"] >= 4 * 16**3 * (27 + 3) * 4
-    for word in ("20 frames", f"{report['coverage']['mean']:.2%}", f"{report['volume_bytes']:,}", "update ms"):
+    np.testing.assert_allclose(report["sizes"], [0.25, 0.5, 1.0, 4.0])
+    assert report["volume_bytes"] >= 32768 * 27 * 4 and report["first_frames"] > 1
+    assert 0 < report["psnr"] <= report["light_psnr"] + 1.0  # no better than the probes as decoded, or hardly
+    words_there = ["20 frames", f"{report['coverage']['mean']:.2%}", f"{report['volume_bytes']:,}", "update ms"]
+    for word in (*words_there, f"{report['psnr']:.2f}", f"{report['light_psnr']:.2f}"):
         assert word in text
     assert "walk: 20 of 20" in call.stderr
     call("probe", "walk", carrying, *words)
@@ -231,9 +232,10 @@ def test_walk_with_another_axis_up(carrying, monkeypatch):
         return position[:2]
 
     monkeypatch.setattr("wlm.probe.walk.camera_path", path)
-    call("probe", "walk", carrying, "--up", "z", "--scale", 0.5, "--frames", 7)
-    # Live probes alone, and eyes as high as the scale says.
-    assert asked == [(PROBES - DEAD, 7, 0.8, 2)]
+    call("probe", "walk", carrying, "--up", "z", "--eye", 0.8, "--frames", 7)
+    call("probe", "walk", carrying, "--block", 0.7)
+    # Live probes alone, and as many frames as it takes to go round.
+    assert asked[0] == (PROBES - DEAD, 7, 0.8, 2) and asked[1][1] > 20 and asked[1][2:] == (None, 1)
 
 
 def test_names_that_look_like_markup_are_shown_as_they_are(fitted, tmp_path):
@@ -277,7 +279,7 @@ def test_names_that_look_like_markup_are_shown_as_they_are(fitted, tmp_path):
         (["walk", "{fit}", "{other}"], "expected the 160 probes that"),
         (["walk", "{fit}", "{set}", "--up", "w"], "--up: expected x, y or z"),
         (["walk", "{fit}", "{set}", "--frames", "0"], "camera path: expected at least 1 frame"),
-        (["walk", "{fit}", "{set}", "--scale", "-1"], "volume sizes"),
+        (["walk", "{fit}", "{set}", "--block", "-1"], "volume block"),
         (["walk", "{fit}", "{set}", "--budget", "0"], "volume budget"),
         (["walk", "{fit}", "{set}", "--path", "absent.json"], "absent.json"),
         (["frobnicate"], "frobnicate"),
@@ -306,3 +308,29 @@ def test_an_unknown_exception_is_a_bug_and_shows(room, profile, monkeypatch, tmp
     monkeypatch.setattr(data, "load", broken)
     with pytest.raises(ZeroDivisionError):
         call("probe", "compress", room, "-o", tmp_path / "a.wlm", "--profile", profile)
+
+
+def test_volume_writes_what_a_viewer_has_round(fitted, carrying, room, tmp_path):
+    text = call("probe", "volume", fitted, room, "-o", tmp_path / "out", "--at", "1,2.5,-3")
+    files = list((tmp_path / "out").iterdir())
+    assert len(files) == 7 and all(file.name in text and f"{file.stat().st_size:,}" in text for file in files)
+    document = json.loads((tmp_path / "out" / "volume.json").read_text())
+    assert document["viewpoint"] == [1.0, 2.5, -3.0]
+    call("probe", "volume", carrying, "-o", tmp_path / "out", "--block", 0.5)
+    assert json.loads((tmp_path / "out" / "volume.json").read_text())["levels"][0]["block"] == 0.5
+    assert "--at: expected three numbers" in fails("probe", "volume", carrying, "-o", tmp_path / "no", "--at", "1,2")
+
+
+def test_grid_for_three(fitted, tmp_path):
+    text = call("probe", "grid", fitted, "-o", tmp_path / "out", "--cells", 5)
+    assert max(json.loads((tmp_path / "out" / "grid.json").read_text())["resolution"]) == 5 and "grid.ktx2" in text
+
+
+def test_evaluate_scores_walks_and_pictures(fitted, room, tmp_path):
+    text = call("probe", "evaluate", fitted, room, "--views", 2, "--volume", "--json", tmp_path / "r.json")
+    report = json.loads((tmp_path / "r.json").read_text())
+    views, walked = report["views"], report["volume"]
+    assert walked["lossless"]["light_psnr"] == 120.0 > walked["lossless"]["psnr"] > walked["decoded"]["psnr"]
+    assert f"{walked['decoded']['psnr']:.2f}" in text and "through the volume" in text
+    assert [score["light"] for score in views] == ["decoded", "lossless, volume", "decoded, volume"]
+    assert all(f"{score['psnr']:.2f}" in text for score in views)

@@ -3,6 +3,7 @@
 import base64
 import gzip
 import json
+import tempfile
 from pathlib import Path
 
 import imagecodecs
@@ -10,7 +11,7 @@ import numpy as np
 import OpenEXR
 import torch
 import warp as wp
-from builders import atlas_meshes, bench_rows, probe_sets, smoke_plumes
+from builders import atlas_meshes, bench_rows, probe_models, probe_sets, smoke_plumes
 from builders.godot_bakes import Writer, bake, probes
 from builders.textures import make_dds, make_ktx2
 from PIL import Image
@@ -20,6 +21,7 @@ from wlm.fluid.volume import from_array, save_volume
 from wlm.formats.exr import write_exr
 from wlm.formats.gltf_writer import write_glb
 from wlm.probe.data import save_probes
+from wlm.probe.three_grid import export_grid
 from wlm.smoke.baking import bake as bake_smoke
 from wlm.smoke.data import open_frames, write_six_way
 from wlm.smoke.learn.pool import Pool, save_pool
@@ -164,6 +166,10 @@ def _probe_files(folder: Path) -> None:
     (folder / "probes-list.json").write_text(json.dumps({"convention": "godot", "probes": each}))
     writer = Writer()
     (folder / "probes.lmbake").write_bytes(writer.file(bake(writer, points, sh)))
+    with tempfile.TemporaryDirectory() as grid:
+        export_grid(probe_models.random_model(count=3), Path(grid) / "out", cells=2)
+        for name in ("grid.json", "grid.ktx2"):
+            (folder / name).write_bytes((Path(grid) / "out" / name).read_bytes())
     np.savez(folder / "positions.npz", position=room.position)
     (folder / "positions.json").write_text(json.dumps(room.position.round(3).tolist()))
 

@@ -15,6 +15,7 @@ import wlm
 from wlm.errors import WlmError
 from wlm.lightmap import fit as lightmap_fit
 from wlm.probe import fit as probe_fit
+from wlm.probe.transform import TransformModel
 from wlm.smoke.learn.pool import load_pool
 from wlm.system import Meter
 
@@ -45,6 +46,12 @@ def _layers(path: Path) -> None:
 def _probe(path: Path) -> None:
     model = wlm.load(path, "probe")
     check_digest(path)
+    if isinstance(model, TransformModel):
+        if model.has_positions:
+            values = model.decoder().decode_probes()
+            check_finite(values=values, position=model.stored_positions())
+            assert values.shape == (model.probes, model.outputs), "decodes to another size"
+        return
     check_finite(bounds=model.bounds, net=model.net, origin=model.origin, extent=model.extent, gain=model.gain)
     places = np.linspace(0.0, 1.0, 8)[:, None]
     with np.errstate(over="ignore"):
@@ -267,7 +274,7 @@ READERS = (
         _lightmap,
     ),
     Reader("lightmap-layers", "a.wlm", stored("lightmap-layers.wlm"), vary_artifact, _layers),
-    Reader("probe", "a.wlm", stored("probe.wlm"), vary_artifact, _probe),
+    Reader("probe", "a.wlm", stored("probe.wlm", "probe-transform.wlm"), vary_artifact, _probe),
     Reader(
         "atlas",
         "a.wlm",

@@ -131,6 +131,10 @@ def _probes(path: Path) -> None:
     assert probes.values.shape[0] == len(probes.position) > 0, "accepted without probes"
 
 
+def _texture() -> dict[str, bytes]:
+    return {"grid.ktx2": corpus("grid.ktx2")()[0]}
+
+
 def _positions(path: Path) -> None:
     position = load_positions(path)
     check_finite(position=position)
@@ -349,6 +353,15 @@ _ALL = (
     Reader("probes-npz", "a.npz", corpus("probes.npz"), vary_npz, _probes),
     Reader("probes-json", "a.json", corpus("probes.json", "probes-list.json"), _json, _probes),
     Reader("probes-lmbake", "a.lmbake", corpus("probes.lmbake"), _godot, _probes),
+    Reader("probes-grid", "grid.json", corpus("grid.json"), _json, _probes, _texture),
+    Reader(
+        "probes-texture",
+        "grid.ktx2",
+        corpus("grid.ktx2"),
+        vary_ktx2,
+        lambda path: _probes(path.with_name("grid.json")),
+        lambda: {"grid.json": corpus("grid.json")()[0]},
+    ),
     Reader("positions-npz", "a.npz", corpus("positions.npz"), vary_npz, _positions),
     Reader("positions-json", "a.json", corpus("positions.json"), _json, _positions),
     Reader("volume-npz", "a.npz", corpus("volume.npz"), vary_npz, _volume),

@@ -1,4 +1,4 @@
-"""Blocks in slots: writing them, putting them in order, and reading the light at any point."""
+"""Blocks behind a page table: putting them in order, and reading the light at any point."""
 
 import itertools
 
@@ -23,9 +23,9 @@ class Grid:
         self.bases, self.sizes, self.side, self.device = bases, np.array(sizes), side, device
         self.blocks: dict[tuple[int, int, int, int], np.ndarray] = {}
         slots = len(sizes) * side**3
-        # What no block was written to must not matter.
-        self.values = array(np.full((slots, channels), np.nan), float, device)
-        self.held = wp.full(slots, wp.vec3i(volume.NOTHING), dtype=wp.vec3i, device=device)
+        # Rows that no page names must not matter.
+        self.pool = np.full((slots, channels), np.nan, np.float32)
+        self.pages = np.full(slots, -1, np.int32)
 
     def window(self, level: int) -> list[tuple[int, int, int, int]]:
         ranges = [range(first, first + self.side) for first in self.bases[level]]
@@ -35,45 +35,48 @@ class Grid:
         return ((level * self.side + x % self.side) * self.side + y % self.side) * self.side + z % self.side
 
     def write(self, blocks: dict[tuple[int, int, int, int], np.ndarray]) -> None:
+        """In rows of no order; a slot stands for the block of its level's window."""
         self.blocks.update(blocks)
-        volume.scatter(
-            array(np.array([self.slot(*name) for name in blocks], np.int32), int, self.device),
-            array(np.array([name[1:] for name in blocks], np.int32), wp.vec3i, self.device),
-            array(np.array(list(blocks.values()), np.float32), float, self.device),
-            self.values,
-            self.held,
-        )
+        rows = np.random.default_rng(0).permutation(len(self.pool))
+        for name, values in blocks.items():
+            slot = self.slot(*name)
+            self.pool[rows[slot]], self.pages[slot] = values, rows[slot]
+
+    def _arrays(self) -> tuple[wp.array, wp.array, wp.array]:
+        pool, pages = array(self.pool, float, self.device), array(self.pages, int, self.device)
+        return pool, pages, array(self.bases, wp.vec3i, self.device)
 
     def read(self, points: np.ndarray, origin: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """At points in float64."""
         place = origin / self.sizes[:, None] - (self.bases + self.side // 2) - 0.5
         views = np.concatenate([place, 1.0 / self.sizes[:, None]], 1).astype(np.float32)
-        out = array(np.full((len(points), self.values.shape[1]), np.nan), float, self.device)
+        pool, pages, bases = self._arrays()
+        out = array(np.full((len(points), self.pool.shape[1]), np.nan), float, self.device)
         level = wp.empty(len(points), dtype=int, device=self.device)
         weight = wp.empty(len(points), dtype=float, device=self.device)
         where = array((points - origin).astype(np.float32), wp.vec3, self.device)
-        bases = array(self.bases, wp.vec3i, self.device)
         views = array(views, wp.vec4, self.device)
-        volume.read(self.values, self.held, bases, views, self.side, where, out, level, weight)
+        ahead = wp.empty(0, dtype=wp.vec3, device=self.device)
+        volume.read(pool, pages, bases, views, self.side, where, ahead, out, level, weight)
         return out.numpy(), level.numpy(), weight.numpy()
 
     def unscroll(self) -> tuple[np.ndarray, np.ndarray]:
-        out = array(np.full(self.values.shape, np.nan), float, self.device)
-        valid = wp.empty(len(self.held), dtype=wp.uint8, device=self.device)
-        volume.unscroll(self.values, self.held, array(self.bases, wp.vec3i, self.device), self.side, out, valid)
+        pool, pages, bases = self._arrays()
+        out = array(np.full(self.pool.shape, np.nan), float, self.device)
+        valid = wp.empty(len(self.pages), dtype=wp.uint8, device=self.device)
+        volume.unscroll(pool, pages, bases, self.side, out, valid)
         return out.numpy(), valid.numpy()
 
 
 def _filled(channels: int, device: str, share: float = 0.6, bases: np.ndarray = BASES) -> Grid:
-    """A grid with a random share of its blocks; the other slots hold NaN, for blocks that lie one window further on."""
+    """A grid with a random share of its blocks."""
     random = np.random.default_rng(channels)
     grid = Grid(bases, SIZES, SIDE, channels, device)
     blocks = {}
     for level in range(len(SIZES)):
         for name in grid.window(level):
-            stale = (level, name[1] + SIDE * int(random.choice([-1, 1])), *name[2:])
-            there = random.random() < share
-            blocks[name if there else stale] = random.normal(size=channels) if there else np.full(channels, np.nan)
+            if random.random() < share:
+                blocks[name] = random.normal(size=channels)
     grid.write(blocks)
     return grid
 
@@ -156,22 +159,8 @@ def test_continuous_across_missing_blocks(device: str):
     assert np.abs(np.diff(values, axis=0)).max() < bound < 0.1 * np.ptp(values)
 
 
-def test_scatter_changes_its_slots_alone(device: str):
-    grid = _filled(3, device)
-    before, held = grid.values.numpy(), grid.held.numpy()
-    name = (1, -6, 3, 2)
-    grid.write({name: np.array([7.0, 8.0, 9.0])})
-    slot = grid.slot(*name)
-    after, held_after = grid.values.numpy(), grid.held.numpy()
-    np.testing.assert_array_equal(after[slot], [7.0, 8.0, 9.0])
-    np.testing.assert_array_equal(held_after[slot], name[1:])
-    others = np.arange(len(after)) != slot
-    np.testing.assert_array_equal(after[others], before[others])
-    np.testing.assert_array_equal(held_after[others], held[others])
-
-
 def test_unscroll(device: str):
-    """In the order of space; blocks of another window, and none at all, are invalid and 0."""
+    """In the order of space; blocks that are not there are invalid and 0."""
     grid = _filled(3, device)
     values, valid = grid.unscroll()
     names = [name for level in range(len(SIZES)) for name in grid.window(level)]

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from wlm.errors import WlmError
+from wlm.probe.light import StoredLight
 from wlm.probe.volume import Volume
-from wlm.probe.walk import camera_path, summary, walk
+from wlm.probe.walk import camera_path, loop_frames, settle, summary, walk
 
 
 def _hills(count: int = 900) -> np.ndarray:
@@ -24,6 +25,10 @@ def _ground(x: np.ndarray, z: np.ndarray) -> np.ndarray:
 
 def _light(position: np.ndarray) -> np.ndarray:
     return np.stack([np.sin(position[:, 0] / 3), np.cos(position[:, 2] / 4)], 1).astype(np.float32)
+
+
+def _volume(position: np.ndarray, device: str = "cpu", **settings: object) -> Volume:
+    return Volume(position, StoredLight(_light(position), device), **({"block": 2.0, "side": 16} | settings))
 
 
 def _line(frames: int, step: float) -> np.ndarray:
@@ -50,9 +55,9 @@ def test_camera_path_follows_the_ground():
 def test_camera_path_of_little():
     """One probe, coincident probes, one frame, and no room in plan."""
     place = np.array([[3.0, 4.0, 5.0]])
-    np.testing.assert_allclose(camera_path(place, 3), [[3.0, 5.6, 5.0]] * 3)
+    np.testing.assert_allclose(camera_path(place, 3, 1.6), [[3.0, 5.6, 5.0]] * 3)
     np.testing.assert_allclose(camera_path(np.repeat(place, 40, 0), 20, 0.0), np.repeat(place, 20, 0))
-    assert camera_path(_hills(), 1).shape == (1, 3)
+    np.testing.assert_allclose(camera_path(_hills(), 1), camera_path(_hills(), 1, np.ptp(_hills(), axis=0).max() / 80))
     tower = np.stack([np.zeros(5), np.arange(5.0), np.zeros(5)], 1)
     np.testing.assert_allclose(camera_path(tower, 2, 1.0), [[0.0, 3.0, 0.0]] * 2)
     for position, frames in [(np.zeros((0, 3)), 5), (place, 0)]:
@@ -63,58 +68,77 @@ def test_camera_path_of_little():
             camera_path(position, 5, up=up)
 
 
+def test_loop_at_a_pace():
+    """So many frames that each goes as far as it should, uphill apart."""
+    position = _hills() * [1.0, 0.01, 1.0]
+    for up, order in ((1, [0, 1, 2]), (2, [0, 2, 1])):
+        turned = position[:, order]
+        path = camera_path(turned, loop_frames(turned, 0.7, up), up=up)
+        steps = np.linalg.norm(np.diff(path, axis=0, append=path[:1]), axis=1)
+        assert steps.mean() == pytest.approx(0.7, rel=0.01)
+    assert loop_frames(position, 1e9) == 1 and loop_frames(position, 1e-9) == 100_000
+
+
 def test_figures_of_each_frame(device: str):
-    """A slow walk through a whole scene: what the figures say is what the volume and the decoder do."""
+    """A slow walk through a whole scene: what the figures say is what the volume, the light and the original are."""
     position = _hills()
-    volume = Volume(position, _light, 2, budget=40, device=device)
+    live = np.arange(len(position)) % 9 > 0
+    original = _light(position) + np.random.default_rng(1).normal(size=(len(position), 2)).astype(np.float32) / 10
+    volume = _volume(position, device, live=live, budget=40)
     reports = []
     path = _line(12, 1.0)
-    figures = walk(volume, path, samples=100, progress=reports.append)
+    figures = walk(volume, path, samples=60, original=original, progress=reports.append)
     assert (reports[-1].done, reports[-1].total, len(figures)) == (12, 12, 12)
     for figure, viewpoint in zip(figures, path, strict=True):
-        assert figure.viewpoint == tuple(viewpoint) and figure.samples == 100
+        assert figure.viewpoint == tuple(viewpoint) and figure.samples == figure.far == 60
         assert figure.coverage == pytest.approx(sum(figure.by_level)) and 0.0 < figure.coverage <= 1.0
         assert 0.0 < figure.rmse < 1.5 * figure.rms < 1.5
-        assert min(figure.read_seconds, figure.stats.find_seconds, figure.stats.upload_seconds) > 0.0
-    assert figures[0].stats.updated == 40 and figures[0].stats.decode_seconds > 0.0
-    # The last frame again, with all probes in reach as samples.
-    last = walk(volume, path[-1:], samples=10**6)[0]
-    near = position[(np.abs(position - path[-1]) <= 32.0).all(1)]
-    reading = volume.read(near)
-    assert last.samples == len(near) and last.stats.entered == 0
-    error = (reading.values - _light(near)).astype(np.float64)
-    assert last.rmse == pytest.approx(np.sqrt((error**2).mean()))
-    assert last.rms == pytest.approx(np.sqrt((_light(near).astype(np.float64) ** 2).mean()))
+        assert min(figure.read_seconds, figure.stats.seconds) > 0.0
+    assert figures[0].stats.updated == 40
+    # The last frame again, with all probes in reach as samples, dead ones apart.
+    last = walk(volume, path[-1:], samples=10**6, original=original)[0]
+    inside = (np.abs(position - path[-1]) < 16.0).all(1)
+    near, far = np.flatnonzero(live & inside), np.flatnonzero(live & ~inside)
+    reading, light = volume.read(position[near]), _light(position[near])
+    assert (last.samples, last.far, last.stats.entered) == (len(near), len(far), 0)
+
+    def rms(values: np.ndarray) -> object:
+        return pytest.approx(np.sqrt((values.astype(np.float64) ** 2).mean()))
+
+    assert last.rmse == rms(reading.values - light) and last.rms == rms(light)
+    assert last.original_rmse == rms(reading.values - original[near])
+    assert last.light_rmse == rms(light - original[near])
+    assert last.far_rmse == rms(volume.read(position[far]).values - original[far])
     assert last.coverage == pytest.approx((reading.level >= 0).mean())
     assert last.by_level == pytest.approx([(reading.level == level).mean() for level in range(4)])
 
 
 def test_finer_blocks_err_less():
-    """The error means something: it falls with the side of the blocks, and a constant light has none."""
+    """The error means something: it falls with the side of the blocks."""
     position = _hills(3000)
     errors = []
-    for size in (1.0, 4.0, 16.0):
-        volume = Volume(position, _light, 2, sizes=(size,), side=int(64 / size), budget=10**6)
+    for block in (1.0, 4.0, 16.0):
+        volume = _volume(position, block=block, ratios=(1,), side=int(64 / block), budget=1024)
+        settle(volume, _line(1, 0.0)[0])
         figure = walk(volume, _line(1, 0.0), samples=500, radius=20.0)[0]
         assert figure.coverage == 1.0
         errors.append(figure.rmse)
     assert errors[0] < 0.5 * errors[1] < 0.25 * errors[2]
-    flat = Volume(position, lambda p: np.full((len(p), 3), 2.5, np.float32), 3)
-    figure = walk(flat, _line(1, 0.0))[0]
-    assert figure.rmse < 1e-6 and figure.rms == 2.5
 
 
 def test_what_nothing_covers_counts_as_black():
-    volume = Volume(_hills(), lambda p: np.full((len(p), 1), 2.0, np.float32), 1, sizes=(2.0,), budget=1)
+    position = _hills()
+    light = StoredLight(np.full((len(position), 1), 2.0))
+    volume = Volume(position, light, block=2.0, ratios=(1,), side=16, budget=1)
     figure = walk(volume, _line(1, 0.0), samples=10**6)[0]
-    assert 0.0 < figure.coverage < 0.1
+    assert 0.0 < figure.coverage < 0.2
     assert figure.rmse == pytest.approx(2.0 * math.sqrt(1.0 - figure.coverage), rel=1e-5)
 
 
 def test_second_lap_costs_no_decode():
     position = _hills()
-    path = camera_path(position, 60)
-    volume = Volume(position, _light, 2, budget=10**6)
+    path = camera_path(position, 30)
+    volume = _volume(position, budget=1024)
     first = walk(volume, path)
     second = walk(volume, path)
     assert sum(f.stats.updated for f in first) > 0 and sum(f.stats.updated for f in second) == 0
@@ -124,17 +148,18 @@ def test_second_lap_costs_no_decode():
 
 
 def test_summary():
-    volume = Volume(_hills(), _light, 2, budget=30)
-    frames = walk(volume, _line(20, 2.0))
-    figures = summary(frames)
+    volume = _volume(_hills(), budget=30)
+    frames = walk(volume, _line(20, 2.0), original=_light(_hills()) + 0.1)
+    figures = summary(frames, 2.0)
     assert json.loads(json.dumps(figures, allow_nan=False)) == figures
     updated = [f.stats.updated for f in frames]
     expected = {"mean": np.mean(updated), "p95": np.percentile(updated, 95), "max": max(updated)}
     assert figures["frames"] == 20 and figures["updated"] == pytest.approx(expected)
-    stages = figures["find_ms"]["mean"] + figures["decode_ms"]["mean"] + figures["upload_ms"]["mean"]
-    assert figures["update_ms"]["mean"] == pytest.approx(stages)
-    slowest = max(f.stats.find_seconds + f.stats.decode_seconds + f.stats.upload_seconds for f in frames)
-    assert figures["update_ms"]["max"] == pytest.approx(1e3 * slowest)
+    assert figures["update_ms"]["max"] == pytest.approx(1e3 * max(f.stats.seconds for f in frames))
+    squares = np.concatenate([[f.far_rmse**2] * f.far for f in frames])
+    assert figures["far_psnr"] == pytest.approx(10 * np.log10(4.0 / squares.mean()))
+    assert figures["light_psnr"] == pytest.approx(20 * np.log10(2.0 / 0.1), abs=1e-4)
+    assert "psnr" not in summary(frames)
     assert figures["coverage"]["min"] == min(f.coverage for f in frames)
     assert figures["settled"] == np.mean([f.stats.left == 0 for f in frames])
     assert figures["by_level"] == pytest.approx(np.mean([f.by_level for f in frames], 0))
@@ -144,21 +169,23 @@ def test_summary():
 
 def test_a_walk_outside_of_the_scene():
     """Frames without a sample have no coverage and no error, and don't count in their means."""
-    volume = Volume(_hills(), _light, 2, budget=10**6)
+    volume = _volume(_hills(), budget=1024)
     away = walk(volume, _line(2, 1.0) + 1e6)
     assert all(f.samples == 0 and math.isnan(f.coverage) and math.isnan(f.rmse) for f in away)
-    figures = summary(away)
+    figures = summary(away, 1.0)
     assert json.loads(json.dumps(figures, allow_nan=False)) == figures
-    assert all(figures[key] is None for key in ("coverage", "by_level", "rmse", "rms", "from_cache"))
+    assert all(figures[key] is None for key in ("coverage", "by_level", "rmse", "rms", "from_cache", "psnr"))
     there = walk(volume, _line(1, 0.0))
     assert summary(away + there)["rmse"]["mean"] == there[0].rmse
     assert walk(volume, np.zeros((0, 3))) == []
 
 
 def test_walk_refuses():
-    volume = Volume(_hills(50), _light, 2)
+    volume = _volume(_hills(50))
     for path, options in [(np.zeros(3), {}), (_line(1, 0.0), {"samples": 0}), (_line(1, 0.0), {"radius": 0.0})]:
         with pytest.raises(ValueError, match="path|samples"):
             walk(volume, path, **options)
+    with pytest.raises(ValueError, match="original"):
+        walk(volume, _line(1, 0.0), original=np.zeros((49, 2)))
     with pytest.raises(WlmError, match="viewpoint"):
         walk(volume, np.array([[0.0, np.nan, 0.0]]))

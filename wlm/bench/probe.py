@@ -10,18 +10,25 @@ For each set these kinds of rows, but where another is named:
   ellipsoids of the first fit by their spheres. The cuts below the profile's are those of the decode alone.
 - method "fit", the first profile on the first set alone: the speed of the fit, and method "dense torch": as many steps
   in plain torch, all of them on CUDA, else a few.
-- the rivals of `wlm.baselines.probe` at the bytes of the first profile's file and at three times as many, and
-  Unreal's packing, which has one size. The list of dead probes is counted for them too.
-- method "volume": a walk with the cascaded volume over the decoder, whose figures are means and 95th percentiles of a
-  frame, and a teleport into an empty volume: its first frame, and the frame after which nothing waits. The light's RMS
-  is that of the direct decode, which the volume's RMSE is against.
+- method "transform", one row for each size, a share of the probes as float32: as "ours". A size in which there is no
+  room for the file is left out.
+- the rivals of `wlm.baselines.probe` at the bytes of each of these files, and Unreal's packing, which has one size. The
+  list of dead probes is counted for them too; positions are for nobody.
+- method "held out", the first profile and the transform of 5%: the light at every fifth probe, of a file of the others,
+  beside that of the uncompressed others by plain rules, and the light half-way between probes.
+- method "volume": a walk with the cascaded volume, over the probes as they were ("lossless") and as the first profile
+  has them ("ours"), whose figures are means and 95th percentiles of a frame. Its PSNR is that of what is read at probes
+  near the viewer against the input, beside it that of the same probes as they were decoded, and of what is read
+  farther away. It starts with an empty volume: what its first frame takes, and the frames until nothing waits. The
+  light's RMS is that of the probes that the volume was made from, which the volume's RMSE is against.
+- method "views": pictures of balls at the probes, compared as they are shown, see `wlm.probe.seen`.
 
 A largest error is that against the float64 decode of the same model, at its own cut, in the probes' unit. A decode on
 CUDA is timed as the replay of a graph, so that gaps between launches do not count; the rivals decode on the CPU alone.
 """
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -35,18 +42,23 @@ from wlm.bench.plot import Panel
 from wlm.bench.rows import Row, read_json
 from wlm.bench.runner import Bench, Fit, Note, demo_data, exact_errors
 from wlm.errors import WlmError
+from wlm.probe.between import between_psnr, held_out
 from wlm.probe.codec import pack_dead
 from wlm.probe.data import ProbeSet, load
 from wlm.probe.decode import Decoder, Points
 from wlm.probe.evaluation import Report, score
 from wlm.probe.exact import decode64
 from wlm.probe.fit import compress
+from wlm.probe.light import StoredLight, light_of
 from wlm.probe.model import ProbeModel, Profile
-from wlm.probe.volume import SIZES, Volume
-from wlm.probe.walk import EYE_HEIGHT, camera_path, summary, walk
+from wlm.probe.seen import VIEWS, score_views
+from wlm.probe.walk import score_volume
 
 PROFILES = ("standard", "compact", "paper")
 """Profiles of a run; the first is the one that the other rows are about."""
+
+SHARES = (1, 2, 3, 5, 7, 10)
+"""Sizes of transforms, per cent of float32, in a full run."""
 
 RATIOS = (0.02, 0.05, 0.10, 0.15, 0.20)
 """Gaussians as a share of the live probes, in a full run: the paper's tables 2 and 3."""
@@ -55,7 +67,6 @@ _DEMO_KEYS = ("12.00", "21.00")  # noon and night
 # A quick fit is worth this many steps of one probe, however many probes there are: some seconds on two CPU cores.
 _QUICK_PROBE_STEPS = 600_000
 _QUICK_FRAMES = 60
-_FRAMES = 240
 _DENSE_STEPS = 10  # of the fit in plain torch, where it isn't run to its end
 _CUTS = (2.5, 2.0)
 _RIVALS: dict[str, tuple[str, Sequence[int | None]]] = {
@@ -68,11 +79,10 @@ _RIVALS: dict[str, tuple[str, Sequence[int | None]]] = {
     "CPCA by signal": ("clustered_pca_signal", WEIGHT_BITS),
     "moving basis": ("moving_basis", WEIGHT_BITS),
 }
-_SIZES = {1: "same bytes", 3: "3x bytes"}  # of the first profile's file
-# The scene is scaled to this length for the volume, whose blocks are metres: the finest window covers a quarter of it.
-_VILLAGE = 128.0
+_TRANSFORM = "transform"
+_HELD_OUT = 5  # per cent, of the transform that is scored between probes too
 
-PANELS = (Panel("bpp", "psnr", ("ours", *_RIVALS)), Panel("decode_ms", "max_error", ("decode",)))
+PANELS = (Panel("bpp", "psnr", ("transform", "ours", *_RIVALS)), Panel("decode_ms", "max_error", ("decode",)))
 """What a plot of the rows shows: quality against size, and a decode's error against its time."""
 
 
@@ -88,8 +98,8 @@ def run(
     """Measures the probe system on one file.
 
     Args:
-        quick: Short fits, no other ratios than the profiles', rivals of one size, a short walk, and of the demo noon
-            alone: under two minutes on two CPU cores. Its errors are those of unfinished fits.
+        quick: Short fits, no other ratios than the profiles', transform and rivals of one size, a short walk, and of
+            the demo noon alone: under two minutes on two CPU cores. Its errors are those of unfinished fits.
         device: "cpu" or "cuda:0", for fits, decodes and the volume.
         probes_path: A file as `wlm.probe.load` reads it; None: the checkout's
             `demos/data/probes/street.npz`.
@@ -114,8 +124,9 @@ def run(
         profiles,
         device=device,
         ratios=() if quick else RATIOS,
-        sizes=() if not rivals else (1,) if quick else tuple(_SIZES),
-        frames=_QUICK_FRAMES if quick else _FRAMES,
+        shares=(_HELD_OUT,) if quick else SHARES,
+        rivals=rivals,
+        frames=_QUICK_FRAMES if quick else None,
         progress=progress,
     )
 
@@ -127,7 +138,7 @@ def run_rivals(
     keys: Sequence[str] = (),
     progress: Note | None = None,
 ) -> list[Row]:
-    """Measures the rivals alone, at the bytes that our first profile took on another machine.
+    """Measures the rivals alone, at the bytes that our transforms took in a former run.
 
     Args:
         results: What a former run wrote, maybe without rivals.
@@ -139,16 +150,21 @@ def run_rivals(
         The rows of the rivals, computed on the CPU.
 
     Raises:
-        WlmError: As `run`, or `results` lacks the first profile of a set.
+        WlmError: As `run`, or `results` lacks the transforms of a set.
     """
     rows = read_json(results)[0]
-    ours = {row.scene: row.get("bytes") for row in rows if (row.method, row.option) == ("ours", PROFILES[0])}
     sets = _load(probes_path, keys or (_DEMO_KEYS if probes_path is None else ()))
     benches = [_ProbeBench(probes, "cpu", progress) for probes in sets]
-    missing = [bench.scene for bench in benches if not ours.get(bench.scene)]
+    sizes = {bench.scene: _sizes(row for row in rows if row.scene == bench.scene) for bench in benches}
+    missing = [scene for scene, ours in sizes.items() if not ours]
     if missing:
-        raise WlmError(f"{results}: expected a row of profile {PROFILES[0]} of {missing[0]}")
-    return [row for bench in benches for row in bench.rival_rows(ours[bench.scene], tuple(_SIZES))]
+        raise WlmError(f"{results}: expected rows of transforms of {missing[0]}")
+    return [row for bench in benches for row in bench.rival_rows(sizes[bench.scene])]
+
+
+def _sizes(rows: Iterable[Row]) -> dict[str, int]:
+    """Bytes of the transforms' files, by their option."""
+    return {row.option: int(row["bytes"]) for row in rows if row.method == _TRANSFORM and row.get("bytes")}
 
 
 def _load(path: str | os.PathLike[str] | None, keys: Sequence[str]) -> list[ProbeSet]:
@@ -163,8 +179,9 @@ def run_rows(
     *,
     device: str,
     ratios: Sequence[float],
-    sizes: Sequence[int],
-    frames: int,
+    shares: Sequence[int],
+    frames: int | None,
+    rivals: bool = True,
     repeats: int | None = None,
     progress: Note | None = None,
 ) -> list[Row]:
@@ -174,8 +191,9 @@ def run_rows(
         sets: At least one.
         profiles: At least one; all but the rows "ours" are about the first.
         ratios: Further ratios of the first profile; the profile's ratio is left out.
-        sizes: Of the rivals, in bytes of the first profile's file: 1, 3; none: no rivals.
-        frames: Frames of the walk, at least one.
+        shares: Sizes of transforms, per cent of float32.
+        frames: Frames of the walk, at least one; None: as many as a tenth of a block each takes.
+        rivals: With the rivals, at the transforms' bytes.
         repeats: As for `Bench`.
     """
     if not sets or not profiles:
@@ -188,13 +206,17 @@ def run_rows(
             if ratio != profiles[0].ratio:
                 changed = profiles[0].model_copy(update={"ratio": ratio})
                 others.append(bench.fit_profile(changed, f"ratio {ratio:.2f}"))
+        transforms = bench.transforms(shares)
         peers = [bench.profile_row(fit) for fit in (first, *others)]
+        peers += [bench.transform_row(fit) for fit in transforms.values()]
         rows += bench.time_rows(peers + bench.decode_rows(first))
         if probes is sets[0]:
             rows += bench.fit_rows(first)
-        if sizes:
-            rows += bench.rival_rows(first.bytes, sizes)
+        if rivals:
+            rows += bench.rival_rows({fit.option: fit.bytes for fit in transforms.values()})
+        rows += [bench.held_out_row(fit) for fit in (first, transforms.get(_HELD_OUT)) if fit is not None]
         rows += bench.volume_rows(first.model, frames)
+        rows += bench.view_rows(first.model, VIEWS if frames is None else min(frames, VIEWS))
     return rows
 
 
@@ -232,6 +254,54 @@ class _ProbeBench(Bench):
             **errors,
         )
         return row, self.replay(lambda: decoder.run(points))
+
+    def transforms(self, shares: Sequence[int]) -> dict[int, Fit]:
+        """Transforms by their share of float32, those that there is room for."""
+        fits = {}
+        for share in shares:
+            self.note(f"transform, {share}%")
+            limit = share * self.probes.float_bytes // 100
+            try:
+                fits[share] = self.fit(f"{share}%", lambda limit=limit: compress(self.probes, max_bytes=limit))
+            except WlmError as error:
+                self.note(str(error))
+        return fits
+
+    def transform_row(self, fit: Fit) -> tuple[Row, Callable[[], object]]:
+        """What a transform costs and yields; and its decode once it is unpacked, to be timed."""
+        decoder = fit.model.decoder(self.device, position=self.probes.position)
+        report = score(decoder.decode_probes(), self.probes, fit.bytes)
+        points = decoder.points(self.position)
+        row = self.row(
+            _TRANSFORM,
+            fit.option,
+            f"time of all live probes once they are unpacked, {self.mode}; made on the CPU",
+            encode_seconds=fit.seconds,
+            probes=report.live,
+            irradiance_psnr=report.irradiance_psnr,
+            memory=decoder.device_bytes / 2**20,
+            **_size_and_psnr(report),
+        )
+        return row, self.replay(lambda: decoder.run(points))
+
+    def held_out_row(self, fit: Fit) -> Row:
+        """The light where no probe was compressed."""
+        self.note(f"{fit.option}: fitting four fifths of the probes")
+        held = held_out(fit.model, self.probes, device=self.device)
+        decoder = fit.model.decoder(self.device)
+        decoder.decode_probes(self.probes.position)
+        return self.row(
+            "held out",
+            fit.option,
+            "PSNR at every fifth probe of a file of the others; beside it that of the uncompressed others",
+            bytes=held.bytes,
+            probes=held.probes,
+            psnr=held.psnr,
+            nearest_psnr=held.nearest,
+            distance_psnr=held.distance,
+            kriging_psnr=held.kriging,
+            half_way_psnr=between_psnr(decoder, self.probes),
+        )
 
     def decode_rows(self, fit: Fit) -> list[tuple[Row, Callable[[], object]]]:
         """The ways to decode a model."""
@@ -309,14 +379,14 @@ class _ProbeBench(Bench):
         )
         return [ours, dense]
 
-    def rival_rows(self, size: int, sizes: Sequence[int]) -> list[Row]:
-        """The rivals at some times the size of a file, and Unreal's packing at its own."""
+    def rival_rows(self, sizes: Mapping[str, int]) -> list[Row]:
+        """The rivals at the bytes of some files, by their option, and Unreal's packing at its own."""
         rows = []
-        for times in sizes:
+        for option, size in sizes.items():
             for name, (baseline, bits) in _RIVALS.items():
-                self.note(f"{name}, {_SIZES[times]}")
-                encode = partial(at_bytes, baseline, budget_bytes=times * size - self._dead_bytes(), bits=bits)
-                rows.append(self._rival_row(name, _SIZES[times], encode))
+                self.note(f"{name}, {option}")
+                encode = partial(at_bytes, baseline, budget_bytes=size - self._dead_bytes(), bits=bits)
+                rows.append(self._rival_row(name, option, encode))
         return [*rows, self._rival_row("Unreal packing", "", unreal_packing)]
 
     def _rival_row(self, method: str, option: str, encode: Callable[..., Rival]) -> Row:
@@ -334,55 +404,54 @@ class _ProbeBench(Bench):
             **_size_and_psnr(report),
         )
 
-    def volume_rows(self, model: ProbeModel, frames: int) -> list[Row]:
-        """A walk, and a teleport into an empty volume."""
-        self.note(f"the volume, {frames} frames")
-        extent = float(np.ptp(self.position, axis=0).max())
-        scale = extent / _VILLAGE if extent > 0 else 1.0
-        path = camera_path(self.position, frames, EYE_HEIGHT * scale)
-        decoder = Decoder(model, self.device)
-        volume = Volume(
-            self.probes.position,
-            decoder.decode,
-            model.outputs,
-            live=self.probes.live,
-            scale=scale,
-            device=self.device,
-        )
-        start = walk(volume, path[:1])
-        left, count = start[0].stats.left, 1
-        while left:
-            left, count = volume.update(path[0]).left, count + 1
-        first, settled = summary(start), summary(walk(volume, path[:1]))
-        walked = summary(walk(volume, path))
-        blocks = ", ".join(f"{size:g}" for size in SIZES)
-        spread = {
-            "update_ms": walked["update_ms"],
-            "update_decode_ms": walked["decode_ms"],
-            "blocks": walked["updated"],
-            "probes_decoded": walked["probes"],
+    def volume_rows(self, model: ProbeModel, frames: int | None) -> list[Row]:
+        """A walk with the probes as they were and one with the model's, each from an empty volume."""
+        rows = []
+        lights = {
+            "lossless": StoredLight(self.probes.values, self.device),
+            "ours": light_of(model.decoder(self.device), self.probes.position),
         }
-        figures = {name: value["mean"] for name, value in spread.items()}
-        figures |= {f"{name}_p95": value["p95"] for name, value in spread.items()}
+        for name, light in lights.items():
+            self.note(f"the volume, {name}")
+            walked = score_volume(self.probes, light, frames=frames)
+            spread = {"update_ms": walked["update_ms"], "blocks": walked["updated"], "probes_decoded": walked["probes"]}
+            rows.append(
+                self.row(
+                    "volume",
+                    f"{name}, walk of {walked['frames']} frames",
+                    f"the finest blocks are {walked['block']:.3g} units wide",
+                    frames=walked["frames"],
+                    first_ms=walked["first_ms"],
+                    frames_first=walked["first_frames"],
+                    memory=walked["memory_bytes"] / 2**20,
+                    psnr=walked["psnr"],
+                    light_psnr=walked["light_psnr"],
+                    far_psnr=walked["far_psnr"],
+                    **_light(walked),
+                    **{key: value["mean"] for key, value in spread.items()},
+                    **{f"{key}_p95": value["p95"] for key, value in spread.items()},
+                )
+            )
+        return rows
+
+    def view_rows(self, model: ProbeModel, views: int) -> list[Row]:
+        """Pictures of balls under the light, for each way to read it."""
+        self.note(f"{views} views of balls")
+        decoded = model.decoder(self.device).decode_probes(self.probes.position)
+        try:
+            scores = score_views(self.probes, decoded, views=views, device=self.device)
+        except WlmError as error:  # no spherical harmonics
+            return [self.missing_row("views", "balls", error)]
         return [
             self.row(
-                "volume",
-                f"walk of {frames} frames",
-                f"blocks of {blocks} m, the scene as {_VILLAGE:g} m",
-                frames=frames,
-                memory=volume.memory_bytes / 2**20,
-                **_light(walked),
-                **figures,
-            ),
-            self.row(
-                "volume",
-                "teleport",
-                "into an empty volume",
-                frames=count,
-                first_ms=first["update_ms"]["max"],
-                **_light(settled),
-                **{f"first_{name}": value for name, value in _light(first).items()},
-            ),
+                "views",
+                f"{score.drawn}, {score.light}",
+                f"{score.views} views under the probes as they were and under these",
+                psnr=score.psnr,
+                ssim=score.ssim,
+                flip=score.flip,
+            )
+            for score in scores
         ]
 
     def _decode(

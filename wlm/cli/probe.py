@@ -30,15 +30,17 @@ from wlm.cli.options import (
     Seed,
     output_option,
 )
+from wlm.cli.probe_volume import register, score_seen, show_seen, show_walk_scores, walk_scores
 from wlm.errors import WlmError
 
 if TYPE_CHECKING:
     import numpy as np
 
     from wlm.baselines.rival import Rival
-    from wlm.probe import ProbeModel, ProbeSet, Report
+    from wlm.probe import ProbeModel, ProbeSet, Report, TransformModel
 
 app = typer.Typer(help="Light probes: quantised 3D Gaussians and a small network, read through a cascaded volume.")
+register(app)
 
 _Probes = Annotated[Path, typer.Argument(metavar="PROBES", help="A .npz, .json or .lmbake file of probes.")]
 _Key = Annotated[str | None, typer.Option(help="Name of the values in PROBES; default the only ones.")]
@@ -46,7 +48,11 @@ _Convention = Annotated[
     str | None, typer.Option(help="Of the numbers: threejs, godot, unreal or unity; default as PROBES says.")
 ]
 
-_AXES = ("x", "y", "z")
+_Original = Annotated[
+    Path | None,
+    typer.Option(metavar="PROBES", help="The probes that were compressed, where a transform's file has no positions."),
+]
+
 _NAMES = {
     "global_pca": "PCA",
     "block_pca": "block PCA",
@@ -64,8 +70,14 @@ def compress(
     probes_path: _Probes,
     output: Annotated[Path, output_option("OUT.wlm", "The file to write.")],
     profile: Annotated[
-        str, typer.Option(help="standard, compact, small, paper, or a YAML file of settings.")
-    ] = "standard",
+        str, typer.Option(help="transform, standard, compact, small, paper, or a YAML file of settings.")
+    ] = "transform",
+    target_psnr: Annotated[
+        float | None, typer.Option(metavar="DB", help="Of a transform: the PSNR to reach; default 50.")
+    ] = None,
+    max_bytes: Annotated[
+        int | None, typer.Option(metavar="BYTES", help="Of a transform: the most bytes that the file may have.")
+    ] = None,
     ratio: Annotated[float | None, typer.Option(help="Gaussians as a share of the live probes.")] = None,
     bits: Annotated[int | None, typer.Option(help="Bits of a Gaussian's scale, rotation and latent.")] = None,
     latent: Annotated[int | None, typer.Option(help="Numbers in a Gaussian's latent.")] = None,
@@ -89,9 +101,12 @@ def compress(
     quiet_warp()
     from wlm.interop import check_device
     from wlm.probe import Profile, compress, open_checkpoint
+    from wlm.probe.fit import check_method
 
-    overrides = {"ratio": ratio, "bits": bits, "latent": latent, "steps": steps}
+    overrides = {"target_psnr": target_psnr, "max_bytes": max_bytes}
+    overrides |= {"ratio": ratio, "bits": bits, "latent": latent, "steps": steps}
     settings = Profile.load(profile).override(overrides, "--")
+    check_method(settings, overrides, "--")
     device = check_device(device)
     probes = _load(probes_path, key, convention)
     options = {"seed": seed, "device": device}
@@ -104,16 +119,17 @@ def compress(
         seconds = time.perf_counter() - start
         size = model.save(output)
         checkpoint.remove()
-    rows = table(model.name, ["file", "bytes", "of float32", "bits per probe", "Gaussians", "dropped", "seconds"])
-    rows.add_row(
-        escape(str(output)),
-        f"{size:,}",
-        f"{size / probes.float_bytes:.2%}",
-        f"{size * 8 / probes.probes:.2f}",
-        f"{model.count:,}",
-        f"{model.dropped:,}",
-        f"{seconds:.1f}",
-    )
+    cells = {
+        "file": escape(str(output)),
+        "bytes": f"{size:,}",
+        "of float32": f"{size / probes.float_bytes:.2%}",
+        "bits per probe": f"{size * 8 / probes.probes:.2f}",
+    }
+    if settings.method == "gaussians":
+        cells |= {"Gaussians": f"{model.count:,}", "dropped": f"{model.dropped:,}"}
+    cells["seconds"] = f"{seconds:.1f}"
+    rows = table(model.name, list(cells))
+    rows.add_row(*cells.values())
     show(rows)
 
 
@@ -126,6 +142,7 @@ def decode(
         typer.Option(metavar="PROBES", help="Where: a .npz, .json or .lmbake file, of which `position` is taken."),
     ] = None,
     convention: Annotated[str, typer.Option(help="Of the numbers: threejs, godot, unreal or unity.")] = "threejs",
+    original: _Original = None,
     device: Device = "cpu",
 ) -> None:
     """Decode the light at the stored positions, or at any others.
@@ -139,8 +156,8 @@ def decode(
     from wlm.system import load
 
     model = load(file, "probe")
-    decoder = model.decoder(device)
     position, at_probes = _positions(model, positions)
+    decoder = _decoder(model, device, original, position if at_probes else None)
     values = decoder.decode_probes(position) if at_probes else decoder.decode(position)
     save_probes(output, position, values, convention=convention)
     rows = table(str(file), ["file", "positions", "of", "zero", "mean", "largest"], text=["of"])
@@ -164,6 +181,16 @@ def evaluate(
     baselines: Annotated[
         bool, typer.Option("--baselines", help="Add the PCA family, a moving basis and 8 bits, at equal bytes.")
     ] = False,
+    volume: Annotated[
+        bool, typer.Option("--volume", help="Score what is read through the cascaded volume along a walk.")
+    ] = False,
+    views: Annotated[int, typer.Option(help="Score so many pictures of balls and of --mesh under the light.")] = 0,
+    mesh: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="The scene, .glb, .gltf or .obj, for the pictures.")
+    ] = None,
+    hold_out: Annotated[
+        bool, typer.Option("--hold-out", help="Fit four fifths of the probes again, and score the light at the others.")
+    ] = False,
     device: Device = "cpu",
     key: _Key = None,
     convention: _Convention = None,
@@ -179,7 +206,9 @@ def evaluate(
 
     model = load(file, "probe")
     probes = _load(probes_path, key, convention)
-    report = evaluate(model, probes, device=device, file_bytes=file.stat().st_size)
+    with running("evaluate") as progress:
+        size = file.stat().st_size
+        report = evaluate(model, probes, device=device, progress=progress, file_bytes=size, hold_out=hold_out)
     if probes.source != model.source:
         note(f"warning: {probes_path}: not what {file} was made of; another key, convention or file?")
     if html_path is not None:
@@ -192,10 +221,16 @@ def evaluate(
 
         with running("baselines") as progress:
             rivals = evaluate_rivals(probes, report.bytes, progress=progress, skipped=lambda error: note(str(error)))
+    seen = score_seen(model, probes, views, mesh, device) if views or mesh is not None else []
+    walked = walk_scores(model, probes, device) if volume else {}
     if json_path is not None:
         scores = [{"method": rival.name} | rival.to_json() | score.to_json() for rival, score in rivals]
-        write_json(json_path, report.to_json() | ({"baselines": scores} if baselines else {}))
+        content = report.to_json() | ({"baselines": scores} if baselines else {})
+        content |= {"volume": walked} if walked else {}
+        write_json(json_path, content | ({"views": [score.to_json() for score in seen]} if seen else {}))
     _show_report(file, model.profile.name, report, rivals)
+    show_walk_scores(walked)
+    show_seen(seen)
 
 
 @app.command()
@@ -209,37 +244,49 @@ def info(file: ModelFile, as_json: AsJson = False, device: Device = "cpu") -> No
     artifact = read_artifact(file, "probe")
     model = system.decode(file, artifact, codec.decode)
     decoder = model.decoder(device)
+    transform = model.profile.method == "transform"
     facts: dict[str, Any] = {
         "name": model.name,
+        "method": model.profile.method,
         "bytes": artifact.file_bytes,
         "probes": model.probes,
         "dead": int(model.dead.sum()),
         "outputs": model.outputs,
-        "gaussians": model.count,
-        "dropped": model.dropped,
-        "gaussian_bits": int(model.profile.code_bits().sum()),
         "bits_per_probe": artifact.file_bytes * 8 / model.probes,
-        "origin": model.origin.tolist(),
-        "size": (model.extent * model.size).tolist(),
-        "positions": bool(len(model.positions)),
+        "positions": model.has_positions,
         "source": model.source,
         "parts": {"header": artifact.header_bytes} | artifact.parts,
         "device": decoder.device,
         "device_bytes": decoder.device_bytes,
         "profile": model.profile.model_dump(mode="json"),
     }
+    if transform:
+        facts |= {"step": model.head.step, "directions": model.head.vectors, "predicted": model.head.predicted}
+    else:
+        facts |= {
+            "gaussians": model.count,
+            "dropped": model.dropped,
+            "gaussian_bits": int(model.profile.code_bits().sum()),
+            "origin": model.origin.tolist(),
+            "size": (model.extent * model.size).tolist(),
+        }
     if as_json:
         show_json(facts)
         return
     rows = table(str(file), ["", "value"])
     rows.add_row("name", escape(model.name))
+    rows.add_row("method", model.profile.method)
     rows.add_row("bytes", f"{artifact.file_bytes:,}")
     rows.add_row("probes", f"{model.probes:,}, {facts['dead']:,} of them dead")
     rows.add_row("numbers of a probe", str(model.outputs))
     rows.add_row("bits per probe", f"{facts['bits_per_probe']:.2f}")
-    rows.add_row("Gaussians", f"{model.count:,}, {model.dropped:,} dropped")
-    rows.add_row("bits per Gaussian", str(facts["gaussian_bits"]))
-    rows.add_row("box", " x ".join(f"{side:.4g}" for side in facts["size"]))
+    if transform:
+        rows.add_row("step", f"{model.head.step:.4g}")
+        rows.add_row("directions", str(model.head.vectors))
+    else:
+        rows.add_row("Gaussians", f"{model.count:,}, {model.dropped:,} dropped")
+        rows.add_row("bits per Gaussian", str(facts["gaussian_bits"]))
+        rows.add_row("box", " x ".join(f"{side:.4g}" for side in facts["size"]))
     rows.add_row("positions", "stored" if facts["positions"] else "not stored")
     rows.add_row("source", escape(model.source))
     rows.add_row("profile", escape(model.profile.name))
@@ -255,9 +302,10 @@ def info(file: ModelFile, as_json: AsJson = False, device: Device = "cpu") -> No
 def export(
     file: ModelFile,
     output: Annotated[Path, output_option("DIR", "The folder to write to.")],
+    original: _Original = None,
     device: Device = "cpu",
 ) -> None:
-    """Write the Gaussians and the network as buffers, with a shader that reads them, for an engine.
+    """Write what the file holds as buffers, with a shader that reads them, for an engine.
 
     reference.json is the light at some positions: what the shader should make of the rest.
     """
@@ -265,68 +313,11 @@ def export(
     from wlm.probe import export
     from wlm.system import load
 
+    model = load(file, "probe")
     rows = table(str(output), ["file", "bytes"])
-    for path in export(load(file, "probe"), output, device=device):
+    for path in export(model, output, device=device, position=_given(model, original)):
         rows.add_row(escape(path.name), f"{path.stat().st_size:,}")
     show(rows)
-
-
-@app.command()
-def walk(
-    file: ModelFile,
-    probes_path: Annotated[
-        Path | None, typer.Argument(metavar="PROBES", help="The probes' positions; default those in FILE.wlm.")
-    ] = None,
-    frames: Annotated[int, typer.Option(help="Frames of a loop through the scene.")] = 600,
-    path: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Viewpoints: a JSON list of x, y, z, or `position` of a .npz.")
-    ] = None,
-    scale: Annotated[float, typer.Option(help="Of the volume's blocks and the eye's height: units in a metre.")] = 1.0,
-    up: Annotated[str, typer.Option(help="The axis that points up: x, y or z.")] = "y",
-    budget: Annotated[int | None, typer.Option(help="Blocks decoded in a frame; default 64.")] = None,
-    json_path: ReportFile = None,
-    device: Device = "cpu",
-) -> None:
-    """Walk through the scene with a cascaded lighting volume: what a frame costs, covers and gets wrong."""
-    if json_path is not None:
-        check_output(json_path, ".json")
-    if up not in _AXES:
-        raise WlmError(f"--up: expected x, y or z, got {up}")
-    quiet_warp()
-    from wlm.probe import load_positions
-    from wlm.probe.volume import BUDGET, Volume
-    from wlm.probe.walk import EYE_HEIGHT, camera_path, summary, walk
-    from wlm.system import load
-
-    model = load(file, "probe")
-    decoder = model.decoder(device)
-    position, at_probes = _positions(model, probes_path)
-    if not at_probes:
-        raise WlmError(f"{probes_path}: expected the {model.probes} probes that {file} was made of, in their order")
-    volume = Volume(
-        position,
-        decoder.decode,
-        model.outputs,
-        live=~model.dead if len(model.dead) else None,
-        scale=scale,
-        budget=BUDGET if budget is None else budget,
-        device=decoder.device,
-    )
-    if path is None:
-        viewpoints = camera_path(volume.position, frames, EYE_HEIGHT * scale, _AXES.index(up))
-    else:
-        viewpoints = load_positions(path)
-    with running("walk") as progress:
-        figures = summary(walk(volume, viewpoints, progress=progress))
-    memory = {
-        "volume_bytes": volume.memory_bytes,
-        "model_bytes": decoder.device_bytes,
-        "host_bytes": volume.host_bytes,
-    }
-    if json_path is not None:
-        settings = {"device": decoder.device, "sizes": list(volume.sizes), "side": volume.side, "budget": volume.budget}
-        write_json(json_path, {"name": model.name} | settings | memory | figures)
-    _show_walk(file, figures, memory)
 
 
 def _load(path: Path, key: str | None, convention: str | None) -> "ProbeSet":
@@ -339,7 +330,7 @@ def _load(path: Path, key: str | None, convention: str | None) -> "ProbeSet":
     return probes
 
 
-def _positions(model: "ProbeModel", path: Path | None) -> "tuple[np.ndarray, bool]":
+def _positions(model: "ProbeModel | TransformModel", path: Path | None) -> "tuple[np.ndarray, bool]":
     """The positions to decode at, float64 [M, 3], and whether they are those of the model's own probes."""
     from wlm.probe import load_positions
 
@@ -347,6 +338,30 @@ def _positions(model: "ProbeModel", path: Path | None) -> "tuple[np.ndarray, boo
         return model.stored_positions(), True
     position = load_positions(path)
     return position, model.has_probes_at(position)
+
+
+def _given(model: "ProbeModel | TransformModel", original: Path | None) -> "np.ndarray | None":
+    """The positions of the model's own probes in another file, if there is one; only a transform needs them."""
+    from wlm.probe import load_positions
+
+    if original is None:
+        return None
+    position = load_positions(original)
+    if model.profile.method != "transform":
+        raise WlmError(f"--original: means nothing to {model.name}, which is decoded without its probes' positions")
+    if not model.has_probes_at(position):
+        raise WlmError(f"{original}: expected the {model.probes} probes of {model.name}, in their order")
+    return position
+
+
+def _decoder(
+    model: "ProbeModel | TransformModel", device: str, original: Path | None, position: "np.ndarray | None" = None
+) -> "Any":
+    """A decoder, of a transform at the places of `original` or at `position`, the model's own probes."""
+    given = _given(model, original)
+    if given is None and model.profile.method == "transform":
+        given = position
+    return model.decoder(device) if given is None else model.decoder(device, position=given)
 
 
 def _show_report(file: Path, profile: str, report: "Report", rivals: "list[tuple[Rival, Report]]") -> None:
@@ -361,6 +376,14 @@ def _show_report(file: Path, profile: str, report: "Report", rivals: "list[tuple
         rows.add_section()
         for band, psnr in enumerate(report.psnr_by_band):
             rows.add_row(f"band {band}", number(psnr, ".2f"))
+    if report.between_psnr is not None:
+        rows.add_section()
+        rows.add_row("half-way between probes", number(report.between_psnr, ".2f"))
+    if report.held_out is not None:
+        held = report.held_out
+        rows.add_row(f"{held.probes:,} probes held out", number(held.psnr, ".2f"), "", "", f"{held.bytes:,}")
+        rows.add_row("  by the nearest uncompressed", number(held.nearest, ".2f"))
+        rows.add_row("  by distance, of 8 uncompressed", number(held.distance, ".2f"))
     show(rows)
     if report.worst_probe is not None:
         worst = report.worst_probe
@@ -368,25 +391,3 @@ def _show_report(file: Path, profile: str, report: "Report", rivals: "list[tuple
         note(f"worst: {number(worst['psnr'], '.2f')} dB, probe {worst['probe']} at ({place})")
     for warning in report.warnings:
         note(f"warning: {warning}")
-
-
-def _show_walk(file: Path, figures: dict[str, Any], memory: dict[str, int]) -> None:
-    rows = table(f"{file}: {figures['frames']} frames", ["per frame", "mean", "95%", "worst"])
-    counts = {
-        "blocks decoded": "updated",
-        "blocks from the cache": "cached",
-        "blocks waiting": "left",
-        "probes": "probes",
-    }
-    times = {f"{name} ms": f"{name}_ms" for name in ("update", "find", "decode", "upload", "read")}
-    for names, form in ((counts, ".1f"), (times, ".3f"), ({"error": "rmse", "light": "rms"}, ".4g")):
-        for name, key in names.items():
-            values = figures[key] or {}
-            rows.add_row(name, *(number(values.get(part), form) for part in ("mean", "p95", "max")))
-        rows.add_section()
-    coverage = figures["coverage"] or {}
-    rows.add_row("covered", *(number(coverage.get(part), ".2%") for part in ("mean", "p5", "min")))
-    rows.add_section()
-    for name, count in memory.items():
-        rows.add_row(name.replace("_bytes", ", bytes"), f"{count:,}")
-    show(rows)

@@ -39,8 +39,8 @@ def view(
     walk: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Viewpoints of the volume, as wlm probe walk --path takes.")
     ] = None,
-    scale: Annotated[
-        float | None, typer.Option(help="Of the volume's blocks: units in a metre; default 1, less in a small scene.")
+    block: Annotated[
+        float | None, typer.Option(help="Side of the volume's finest blocks; default from the probes' spacing.")
     ] = None,
     extinction: Annotated[float | None, typer.Option(help="Of a volume of smoke, at density 1.")] = None,
     up: Up = "y",
@@ -77,7 +77,7 @@ def view(
             original=original,
             key=key,
             walk=walk,
-            scale=scale,
+            block=block,
             extinction=extinction,
             flat=flat,
             up=up,

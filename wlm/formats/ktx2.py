@@ -1,4 +1,4 @@
-"""KTX2 files of the textures that the atlas is exported to: 2D, one mip level, not supercompressed.
+"""KTX2 files of the textures that we export: 2D, or 3D for grids of probes, one mip level, not supercompressed.
 
 Layout: the KTX file format specification 2.0; the data format descriptor: Khronos Data Format specification 1.3, the
 basic descriptor block.
@@ -8,7 +8,11 @@ import math
 import os
 import struct
 
+import numpy as np
+
+from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_write
+from wlm.formats.reading import read_file
 
 VK_FORMATS = {
     "R16G16_UNORM": 77,
@@ -28,6 +32,9 @@ _IDENTIFIER = b"\xabKTX 20\xbb\r\n\x1a\n"
 _HEADER = struct.Struct("<12s 9I 4I 2Q 3Q")
 _BLOCK_BYTES = 16
 _MAX_SIDE = 16384  # texels; the limit of desktop GPUs
+_MAX_DEPTH = 2048  # slices, likewise
+_MOST_TEXELS = 2**22  # that are read: 600,000 probes
+_MOST_PAIRS = 4096  # bytes of the descriptor and the key/value data
 
 _CHANNELS = {
     "R16G16_UNORM": 2,
@@ -42,7 +49,7 @@ _VERSION, _BT709, _LINEAR = 2, 1, 1
 _FLOAT, _SIGNED = 0x80, 0x40  # a sample's qualifiers
 
 
-def write_ktx2(path: str | os.PathLike[str], data: bytes, width: int, height: int, fmt: str) -> int:
+def write_ktx2(path: str | os.PathLike[str], data: bytes, width: int, height: int, fmt: str, depth: int = 0) -> int:
     """Writes texels or blocks as a KTX2 file, whole or not at all.
 
     Args:
@@ -52,6 +59,7 @@ def write_ktx2(path: str | os.PathLike[str], data: bytes, width: int, height: in
         width: Texels, 1 to 16384.
         height: Texels, 1 to 16384.
         fmt: A key of `VK_FORMATS`.
+        depth: Slices of a 3D texture of texels, 1 to 2048, each with its rows in `data`; 0: a 2D texture.
 
     Returns:
         The number of bytes written.
@@ -64,11 +72,14 @@ def write_ktx2(path: str | os.PathLike[str], data: bytes, width: int, height: in
         raise ValueError(f"fmt: expected one of {', '.join(VK_FORMATS)}, got {fmt}")
     if not (1 <= width <= _MAX_SIDE and 1 <= height <= _MAX_SIDE):
         raise ValueError(f"expected sides of 1 to {_MAX_SIDE} texels, got {width}x{height}")
-    if len(data) != _size(fmt, width, height):
-        raise ValueError(f"data: expected {_size(fmt, width, height)} bytes, got {len(data)}")
+    if not 0 <= depth <= _MAX_DEPTH or (depth and fmt not in _CHANNELS):
+        raise ValueError(f"depth: expected 0 to {_MAX_DEPTH} slices of texels, got {depth} of {fmt}")
+    size = _size(fmt, width, height) * max(depth, 1)
+    if len(data) != size:
+        raise ValueError(f"data: expected {size} bytes, got {len(data)}")
     descriptor = _descriptor(fmt)
-    # In the order of their keys; r and d: to the right and down.
-    pairs = _pair("KTXorientation", "rd") + _pair("KTXwriter", "wlm")
+    # In the order of their keys; r, d and i: to the right, down and inwards.
+    pairs = _pair("KTXorientation", "rdi" if depth else "rd") + _pair("KTXwriter", "wlm")
     end = _HEADER.size + len(descriptor) + len(pairs)
     # A level begins at a multiple of both 4 and the bytes of a texel or block.
     start = end + -end % math.lcm(4, _texel_bytes(fmt))
@@ -78,7 +89,7 @@ def write_ktx2(path: str | os.PathLike[str], data: bytes, width: int, height: in
         2 if fmt in _CHANNELS else 1,
         width,
         height,
-        *(0, 0, 1, 1, 0),
+        *(depth, 0, 1, 1, 0),
         _HEADER.size,
         len(descriptor),
         _HEADER.size + len(descriptor),
@@ -87,6 +98,32 @@ def write_ktx2(path: str | os.PathLike[str], data: bytes, width: int, height: in
         *(start, len(data), len(data)),
     )
     return atomic_write(path, [header, descriptor, pairs, bytes(start - end), data])
+
+
+def read_half_volume(path: str | os.PathLike[str]) -> np.ndarray:
+    """Reads a 3D texture of half floats in RGBA as `write_ktx2` writes it.
+
+    Args:
+        path: The file.
+
+    Returns:
+        float16 [D, H, W, 4].
+
+    Raises:
+        WlmError: The file can't be read, is another kind of texture, or is cut short.
+    """
+    largest = _HEADER.size + _MOST_TEXELS * 8 + _MOST_PAIRS
+    data = read_file(path, largest, "the texture")
+    if len(data) < _HEADER.size or data[: len(_IDENTIFIER)] != _IDENTIFIER:
+        raise WlmError(f"{path}: expected a KTX2 texture")
+    fields = _HEADER.unpack_from(data)
+    fmt, _, width, height, depth, layers, faces, levels, packing = fields[1:10]
+    start, length = fields[-3:-1]
+    if (fmt, layers, faces, levels, packing) != (VK_FORMATS["R16G16B16A16_SFLOAT"], 0, 1, 1, 0) or not depth:
+        raise WlmError(f"{path}: expected one 3D texture of half floats in RGBA, not packed, found format {fmt}")
+    if length != 8 * width * height * depth or start + length > len(data):
+        raise WlmError(f"{path}: expected {width} x {height} x {depth} texels, found {length} bytes of them")
+    return np.frombuffer(data, "<f2", 4 * width * height * depth, start).reshape(depth, height, width, 4)
 
 
 def _texel_bytes(fmt: str) -> int:

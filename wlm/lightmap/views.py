@@ -21,7 +21,7 @@ from wlm.errors import WlmError
 from wlm.formats.geometry import Geometry, read_geometry
 from wlm.interop import check_device
 from wlm.lightmap.data import LightmapSet
-from wlm.metrics import flip_display, psnr_from_mse
+from wlm.metrics import Pictures
 from wlm.ops import raster
 from wlm.ops.views import sphere_views, visible_points
 from wlm.texels import exposure, filmic, to_srgb
@@ -84,7 +84,7 @@ class Views:
             self._cameras[times[number % len(times)]].append(number)
         self._views = sphere_views(count)
         self._rows: list[dict[str, float | int]] = []
-        self._squared, self._flip, self._pixels = 0.0, 0.0, 0
+        self._pictures = Pictures()
 
     def add(self, index: int, original: np.ndarray, decoded: np.ndarray) -> None:
         """Draws the views of a time.
@@ -103,30 +103,20 @@ class Views:
         drawn = visible_points(mesh.position, mesh.triangle, mesh.uv, cameras, RESOLUTION, self._device, cull=True)
         for number, (visible, _, uv) in zip(numbers, drawn, strict=True):
             hit = (visible >= 0).cpu().numpy()
-            count = int(np.count_nonzero(hit))
-            if not count:
-                continue
             pictures = []
             for image in images:
                 light = raster.texture(image, uv).cpu().numpy() * gain
                 pictures.append(to_srgb(filmic(np.maximum(light, 0.0))) * hit[..., None])
-            # FLIP takes its time for empty pixels too.
-            window = tuple(slice(at.min(), at.max() + 1) for at in np.nonzero(hit))
-            first, second = (picture[window] for picture in pictures)
-            shown = hit[window]
-            flip = float(flip_display(first, second)[shown].sum())
-            squared = float(np.square(first - second, dtype=np.float64)[shown].sum())
-            psnr, time = psnr_from_mse(squared / (3 * count), 1.0), float(self._lightmaps.times[index])
-            self._rows.append({"view": number, "time": time, "psnr": psnr, "flip": flip / count})
-            self._squared, self._flip, self._pixels = self._squared + squared, self._flip + flip, self._pixels + count
+            figures = self._pictures.add(*pictures, hit)
+            if figures is not None:
+                self._rows.append({"view": number, "time": float(self._lightmaps.times[index])} | figures)
 
     def score(self) -> ViewScore:
         """The score of what was added."""
         if not self._rows:
             return NO_VIEWS
-        psnr = psnr_from_mse(self._squared / (3 * self._pixels), 1.0)
         worst = min(self._rows, key=lambda row: row["psnr"])
-        return ViewScore(len(self._rows), psnr, self._flip / self._pixels, worst)
+        return ViewScore(len(self._rows), self._pictures.psnr, self._pictures.flip, worst)
 
 
 def views_of(

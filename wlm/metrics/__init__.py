@@ -3,6 +3,7 @@
 from wlm.metrics.error import PSNR_CAP_DB, dynamic_range, half_ulp, max_abs_error, mse, psnr, psnr_from_mse
 from wlm.metrics.flip import flip_display, flip_exposures, flip_map
 from wlm.metrics.lost import LostLight
+from wlm.metrics.pictures import Pictures
 from wlm.metrics.structural import SSIM_WINDOW, ssim, ssim_map
 from wlm.metrics.tiled import (
     FORMAT_LIMITED_ULPS,
@@ -22,6 +23,7 @@ __all__ = [
     "SSIM_WINDOW",
     "FrameMetrics",
     "LostLight",
+    "Pictures",
     "Summary",
     "dynamic_range",
     "evaluate_frame",

@@ -121,6 +121,30 @@ def clip_positions(position: np.ndarray, view: View) -> np.ndarray:
     return np.stack([ZOOM * x, ZOOM * y, z, w], axis=1).astype(np.float32)
 
 
+def clip_from(position: np.ndarray, eye: np.ndarray, forward: np.ndarray, up: int = 1) -> np.ndarray:
+    """The vertices in the clip space of a viewer who stands in the scene, 90 degrees wide and high.
+
+    Args:
+        position: [V, 3], in any unit.
+        eye: [3], where the viewer is.
+        forward: [3], where they look, of any length but 0, and not along `up`.
+        up: The axis that points up, 0 to 2.
+
+    Returns:
+        float32 [V, 4]: x, y, z, w, as `clip_positions`; z / w rises from -infinity at the eye to 1 far away.
+    """
+    forward = np.asarray(forward, np.float64) / np.linalg.norm(forward)
+    right = np.cross(forward, np.eye(3)[up])
+    right /= np.linalg.norm(right)
+    offset = np.asarray(position, np.float64) - eye
+    # Written out, as there.
+    x, y, w = (
+        offset[:, 0] * a + offset[:, 1] * b + offset[:, 2] * c for a, b, c in (right, np.cross(right, forward), forward)
+    )
+    near = 1e-3 * float(np.abs(offset).max(initial=0.0))
+    return np.stack([x, y, w - 2.0 * near, w], axis=1).astype(np.float32)
+
+
 def visible_points(
     position: np.ndarray,
     triangle: np.ndarray,

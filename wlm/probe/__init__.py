@@ -8,16 +8,21 @@ _PLACES = {
     "ProbeSet": "wlm.probe.data",
     "Profile": "wlm.probe.model",
     "Report": "wlm.probe.evaluation",
+    "TransformDecoder": "wlm.probe.transform_decode",
+    "TransformModel": "wlm.probe.transform",
     "Volume": "wlm.probe.volume",
     "compress": "wlm.probe.fit",
     "evaluate": "wlm.probe.evaluation",
     "export": "wlm.probe.exporter",
+    "export_grid": "wlm.probe.three_grid",
+    "export_volume": "wlm.probe.volume_export",
     "from_arrays": "wlm.probe.data",
     "load": "wlm.probe.data",
     "load_positions": "wlm.probe.data",
     "open_checkpoint": "wlm.probe.fit",
     "save_probes": "wlm.probe.data",
     "score": "wlm.probe.evaluation",
+    "score_views": "wlm.probe.seen",
 }
 
 __all__ = sorted(_PLACES)

@@ -39,6 +39,9 @@ from wlm.probe.sphere import coefficient_bands, cosine_factor, sh_count
 CANONICAL = "threejs"
 CONVENTIONS = (CANONICAL, "godot", "unreal", "unity")
 
+THREE_GRID = "wlm-light-probe-grid"
+"""What a `.json` says its format is that is a grid for three.js, see `wlm.probe.three_grid`."""
+
 _LAST_BAND = {"unreal": 2, "unity": 2}
 
 # Constants in front of the basis' polynomials, and the clamped cosine's factors over pi; bands 0 to 2.

@@ -50,7 +50,7 @@ from wlm.formats.godot import read_lmbake
 from wlm.formats.limits import JSON_BYTES, NUMBERS, PROBES
 from wlm.formats.npz import read_npz
 from wlm.formats.reading import read_json_file
-from wlm.probe.conventions import CANONICAL, CONVENTIONS, from_canonical, to_canonical
+from wlm.probe.conventions import CANONICAL, CONVENTIONS, THREE_GRID, from_canonical, to_canonical
 from wlm.probe.sphere import sh_count
 
 LARGEST = float(np.sqrt(np.finfo(np.float32).max))
@@ -113,6 +113,7 @@ def load(path: str | os.PathLike[str], *, key: str | None = None, convention: st
 
     - `.npz`: arrays `position` (N, 3) and `sh...` (N, C, 3) or (N, D), and a string `convention` if they aren't
       canonical.
+    - `grid.json` beside `grid.ktx2`: what `wlm.probe.export_grid` writes for three.js.
     - `.json`: `{"position": [[x, y, z], ...], "sh": [[[r, g, b], ...], ...]}`, or
       `{"probes": [{"position": [x, y, z], "sh": [[r, g, b], ...]}, ...]}`, and `"convention"` likewise.
     - `.lmbake`: a lightmap bake of Godot 4.
@@ -259,6 +260,11 @@ def _read_npz(path: Path, key: str | None) -> _Raw:
 
 def _read_json(path: Path, key: str | None) -> _Raw:
     content = _json(path)
+    if isinstance(content, dict) and content.get("format") == THREE_GRID:
+        from wlm.probe.three_grid import read_grid
+
+        position, values = read_grid(path, content)
+        return _Raw(position, values, _choose(path, (_POSITION, _SH), key), CANONICAL)
     names, read = _fields(path, content)
     name = _choose(path, names, key)
     return _Raw(read(_POSITION), read(name), name, _text(path, content.get(_CONVENTION, CANONICAL)))

@@ -27,10 +27,11 @@ import numpy as np
 
 from wlm.errors import WlmError
 from wlm.metrics import LostLight, psnr_from_mse
+from wlm.probe.between import HeldOut, between_psnr, held_out
 from wlm.probe.data import ProbeSet
-from wlm.probe.decode import Decoder
 from wlm.probe.model import ProbeModel
 from wlm.probe.sphere import coefficient_bands, fibonacci_sphere, irradiance, sh_count
+from wlm.probe.transform import TransformModel
 from wlm.system import Meter, OnProgress
 from wlm.system import Report as BaseReport
 
@@ -63,6 +64,8 @@ class Report(BaseReport):
         irradiance_psnr: dB, over `NORMALS` fixed normals of every live probe in RGB; its peak is the range of the
             input's irradiance there. None as `psnr_by_band`.
         warnings: Light that was lost and that the means hide.
+        between_psnr: dB, half-way between probes, see `wlm.probe.between`; None where that isn't asked.
+        held_out: The score where nothing was compressed; None where that isn't asked.
     """
 
     name: str
@@ -83,15 +86,18 @@ class Report(BaseReport):
     psnr_by_coefficient: np.ndarray
     irradiance_psnr: float | None
     warnings: list[str] = field(default_factory=list)
+    between_psnr: float | None = None
+    held_out: HeldOut | None = None
 
 
 def evaluate(
-    model: ProbeModel,
+    model: ProbeModel | TransformModel,
     probes: ProbeSet,
     *,
     device: str = "cpu",
     progress: OnProgress | None = None,
     file_bytes: int | None = None,
+    hold_out: bool = False,
 ) -> Report:
     """Decodes a model at its probes and compares them with the input.
 
@@ -101,6 +107,7 @@ def evaluate(
         device: Where it is decoded.
         progress: Called after the decode and at the end.
         file_bytes: Size of the model's file; None: of the one that `model.save` writes.
+        hold_out: Whether four fifths of the probes are fitted once more, to score the light at the others' places.
 
     Returns:
         The report.
@@ -109,12 +116,18 @@ def evaluate(
         WlmError: No such device, or as `score`.
     """
     meter = Meter(progress, "evaluate", 2)
-    decoded = Decoder(model, device).decode_probes(probes.position)
+    decoder = model.decoder(device)
+    decoded = decoder.decode_probes(probes.position)
     meter.report(1)
     report = score(decoded, probes, model.file_bytes() if file_bytes is None else file_bytes)
     lost = LostLight()
     lost.add(probes.values, decoded)
-    report = replace(report, warnings=lost.warnings(probes.name, "probe", "the set"))
+    report = replace(
+        report,
+        warnings=lost.warnings(probes.name, "probe", "the set"),
+        between_psnr=between_psnr(decoder, probes),
+        held_out=held_out(model, probes, device=device, progress=progress) if hold_out else None,
+    )
     meter.report(2, PSNR_dB=report.psnr)
     return report
 

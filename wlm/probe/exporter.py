@@ -19,6 +19,8 @@ from wlm.probe.decode import Decoder
 from wlm.probe.model import CENTRE, SCALE, ProbeModel
 from wlm.probe.shader import HEAD_WORDS, gaussian_words, probe_glsl
 from wlm.probe.sphere import sh_count
+from wlm.probe.transform import TransformModel
+from wlm.probe.transform_export import LIGHT_FILE, light_bytes, transform_document, transform_glsl
 
 FORMAT = "wlm-probe-export"
 _VERSION = 1
@@ -29,7 +31,7 @@ POSITIONS_FILE = "positions.bin"
 SHADER_FILE = "probe.glsl"
 REFERENCE_FILE = "reference.json"
 
-_FILES = {INFO_FILE, GAUSSIANS_FILE, NETWORK_FILE, POSITIONS_FILE, SHADER_FILE, REFERENCE_FILE}
+_FILES = {INFO_FILE, LIGHT_FILE, GAUSSIANS_FILE, NETWORK_FILE, POSITIONS_FILE, SHADER_FILE, REFERENCE_FILE}
 _REFERENCES = 64  # positions in reference.json, and one outside the box
 _FOUR = 4
 
@@ -58,12 +60,18 @@ _ABOUT = {
 }
 
 
-def export(model: ProbeModel, directory: str | os.PathLike[str], *, device: str = "cpu") -> list[Path]:
+def export(
+    model: ProbeModel | TransformModel,
+    directory: str | os.PathLike[str],
+    *,
+    device: str = "cpu",
+    position: np.ndarray | None = None,
+) -> list[Path]:
     """Writes a model as buffers, numbers and a shader.
 
-    `gaussians.bin` and `network.bin` are laid out as `probe.glsl` says at its head, `positions.bin` is written
-    if the model has positions, `reference.json` has the light at some places to compare with, and `probe.json`
-    explains itself under "about".
+    `gaussians.bin` and `network.bin`, or `light.bin` of a transform, are laid out as `probe.glsl` says at its head,
+    `positions.bin` is written if a model of Gaussians has positions, `reference.json` has the light at some places to
+    compare with, and `probe.json` explains itself under "about".
 
     All files are made beside the folder and moved in together, `probe.json` last. A new export replaces an earlier
     one in its folder; other files there stay.
@@ -72,6 +80,7 @@ def export(model: ProbeModel, directory: str | os.PathLike[str], *, device: str 
         model: The model.
         directory: The folder; made if it isn't there.
         device: Where the reference is decoded.
+        position: [N, 3], of a transform's own probes; None: those that are stored with it.
 
     Returns:
         The files written, `probe.json` last.
@@ -81,6 +90,8 @@ def export(model: ProbeModel, directory: str | os.PathLike[str], *, device: str 
             number of the model isn't finite.
     """
     folder = Path(directory)
+    if isinstance(model, TransformModel):
+        return _export_transform(model, folder, device, position)
     for part in (model.net, model.bounds, model.origin, model.size, np.array([model.extent, model.gain])):
         if not np.isfinite(part).all():
             raise WlmError(f"{model.name}: cannot export: a number is NaN or infinite")
@@ -95,7 +106,29 @@ def export(model: ProbeModel, directory: str | os.PathLike[str], *, device: str 
     }
     if len(model.positions):
         files[POSITIONS_FILE] = np.ascontiguousarray(model.positions, "<u2").tobytes()
-    document = _document(model, {name: len(content) for name, content in files.items()})
+    return _write(folder, files, _document(model), position, values)
+
+
+def _export_transform(model: TransformModel, folder: Path, device: str, position: np.ndarray | None) -> list[Path]:
+    own = model.stored_positions() if position is None else np.asarray(position, np.float64)
+    decoder = model.decoder(device, position=None if position is None else own)
+    live = ~model.dead if len(model.dead) else np.ones(model.probes, bool)
+    place = own[live]
+    content, numbers = light_bytes(model, place, decoder.decode_probes()[live])
+    # Half-way between probes that are neighbours in the file, and outside.
+    chosen = np.unique(np.linspace(0, len(place) - 1, min(len(place), _REFERENCES)).astype(int))
+    between = 0.5 * (place[chosen] + place[np.minimum(chosen + 1, len(place) - 1)])
+    points = np.concatenate([between, place.max(0)[None] + 0.25 * np.ptp(place, axis=0).max() + 0.25])
+    files = {LIGHT_FILE: content, SHADER_FILE: transform_glsl(len(place), model.outputs).encode()}
+    return _write(folder, files, transform_document(model, len(place), numbers), points, decoder.decode(points))
+
+
+def _write(
+    folder: Path, files: dict[str, bytes], document: dict[str, Any], position: np.ndarray, values: np.ndarray
+) -> list[Path]:
+    """Writes the files, the reference and the document, which lists them."""
+    sizes = {name: len(content) for name, content in files.items()}
+    document = {"format": FORMAT, "version": _VERSION} | document | {"bytes": sizes}
     make_parents(folder)
     with staged(folder, INFO_FILE, FORMAT, _FILES.__contains__) as temporary:
         for name, content in files.items():
@@ -147,16 +180,13 @@ def _reference_positions(model: ProbeModel) -> np.ndarray:
     return model.origin + model.extent * np.concatenate([inside, model.size[None] + 0.25])
 
 
-def _document(model: ProbeModel, sizes: dict[str, int]) -> dict[str, Any]:
+def _document(model: ProbeModel) -> dict[str, Any]:
     profile = model.profile
     scale = np.exp(model.rows()[:, SCALE]).astype(np.float64)
     return {
-        "format": FORMAT,
-        "version": _VERSION,
         "about": _ABOUT,
         "name": model.name,
         "source": model.source,
-        "bytes": sizes,
         "probes": model.probes,
         "outputs": model.outputs,
         "coefficients": sh_count(model.outputs),

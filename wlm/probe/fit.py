@@ -1,7 +1,11 @@
-"""Fitting a probe set: from checked input to a compressed model (gaussian-probe-compression, section 3.2 and 3.3)."""
+"""Fitting a probe set: from checked input to a compressed model (gaussian-probe-compression, section 3.2 and 3.3).
+
+A profile of the method "transform" is fitted in `wlm.probe.transform_fit`, within seconds.
+"""
 
 import math
 import os
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -13,15 +17,18 @@ from wlm.metrics import psnr_from_mse
 from wlm.probe.data import ProbeSet
 from wlm.probe.model import ProbeModel, Profile, check_outputs
 from wlm.probe.trainer import Trainer
+from wlm.probe.transform import TransformModel
+from wlm.probe.transform_fit import compress_transform
 from wlm.system import Meter, OnProgress
 
+_OF_TRANSFORMS = ("target_psnr", "max_bytes")
 _CHUNK = {"cpu": 5, "cuda": 500}  # steps between two looks at the clock
 
 
 def open_checkpoint(
     output: str | os.PathLike[str],
     probes: ProbeSet,
-    profile: str | os.PathLike[str] | Profile = "standard",
+    profile: str | os.PathLike[str] | Profile = "transform",
     *,
     seed: int = 0,
     device: str = "cpu",
@@ -51,7 +58,7 @@ def open_checkpoint(
 
 def compress(
     probes: ProbeSet,
-    profile: str | os.PathLike[str] | Profile = "standard",
+    profile: str | os.PathLike[str] | Profile = "transform",
     *,
     seed: int = 0,
     device: str = "cpu",
@@ -59,7 +66,7 @@ def compress(
     checkpoint: Checkpoint | None = None,
     positions: bool = False,
     **overrides: Any,
-) -> ProbeModel:
+) -> ProbeModel | TransformModel:
     """Compresses a probe set.
 
     Dead probes take no part: the model has a bit for each, if there are any.
@@ -67,13 +74,14 @@ def compress(
     Args:
         probes: The set.
         profile: The settings: a name, a YAML file, or a `Profile`.
-        seed: One seed gives one result on one device.
-        device: "cpu" or "cuda:0".
+        seed: One seed gives one result on one device; a transform has nothing random.
+        device: "cpu" or "cuda:0"; a transform is made on the CPU.
         progress: Called about twice a second, with the PSNR of all numbers of all probes.
         checkpoint: From `open_checkpoint` for the same settings, or None: where a running fit is kept, and an
-            interrupted one resumed.
+            interrupted one resumed. A transform is made anew.
         positions: Whether the model carries the probes' positions, 16 bits an axis; an engine has them anyway.
-        overrides: Settings that replace the profile's: `steps=500`.
+        overrides: Settings that replace the profile's: `steps=500`, or of a transform `target_psnr=45` and
+            `max_bytes=20000`.
 
     Returns:
         The model.
@@ -84,7 +92,10 @@ def compress(
         KeyboardInterrupt: Raised by `progress`, after the checkpoint, if there is one, has been written.
     """
     profile = Profile.load(profile).override(overrides)
+    check_method(profile, overrides)
     device = interop.check_device(device)
+    if profile.method == "transform":
+        return compress_transform(probes, profile, positions=positions, progress=progress)
     check_outputs(probes.name, profile, probes.outputs, device)
     origin, extent, size = _frame(probes.position)
     x = ((probes.position - origin) / extent).astype(np.float32)
@@ -118,6 +129,25 @@ def compress(
         dropped=int((~trainer.needed).sum()),
         **parts,
     )
+
+
+def check_method(profile: Profile, overrides: Mapping[str, Any], prefix: str = "") -> None:
+    """Checks that settings which replace a profile's mean something to its method.
+
+    Args:
+        profile: The profile.
+        overrides: By name; None leaves a setting as it is.
+        prefix: As for `Profile.override`.
+
+    Raises:
+        WlmError: One doesn't.
+    """
+    transform = profile.method == "transform"
+    for name, value in overrides.items():
+        if value is not None and name not in ("name", "method") and (name in _OF_TRANSFORMS) != transform:
+            method = "gaussians" if transform else "transform"
+            shown = prefix + (name.replace("_", "-") if prefix else name)
+            raise WlmError(f"{shown}: expected a profile of the method {method}, found {profile.name}")
 
 
 def _frame(position: np.ndarray) -> tuple[np.ndarray, float, np.ndarray]:

@@ -9,6 +9,7 @@ from wlm.errors import WlmError
 from wlm.probe.data import load
 from wlm.probe.model import ProbeModel
 from wlm.probe.sphere import fibonacci_sphere, irradiance
+from wlm.probe.transform import TransformModel
 from wlm.texels import exposure
 
 _NORMALS = 32
@@ -16,7 +17,7 @@ _SHARE = 0.45  # of the median distance between neighbours: balls don't touch
 
 
 def probes_of(
-    model: ProbeModel, original: str | os.PathLike[str] | None, key: str | None = None
+    model: ProbeModel | TransformModel, original: str | os.PathLike[str] | None, key: str | None = None
 ) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
     """The places of a model's probes, with the file that was compressed their numbers, and which of them are live.
 
@@ -40,7 +41,7 @@ def probes_of(
                 f"{len(probes.position)} of {probes.values.shape[1]}"
             )
         return probes.position, probes.values, live
-    if not len(model.positions):
+    if not model.has_positions:
         raise WlmError(f"{model.name}: the file has no positions; expected --original, the file that was compressed")
     return model.stored_positions(), None, live
 

@@ -1,29 +1,32 @@
 """The cascaded lighting volume: nested grids of blocks round the viewer, filled from the probes as it moves.
 
-Follows gaussian-probe-compression, section 3.4, with the settings of section 5. What the paper leaves open:
+Follows gaussian-probe-compression, section 3.4: levels whose blocks are 1, 2, 4 and 16 times as wide, as the paper's of
+2, 4, 8 and 32 m, and at most 64 blocks decoded in a frame. What the paper leaves open, or is done otherwise:
 
-- A level's window is the 16 blocks along each axis whose middle lies nearest to the viewpoint, so the window depends
-  on the viewpoint alone.
-- A block's light is the mean of its probes, weighted by 1 / (d^2 + e^2), d being the distance to the block's centre
-  and e a quarter of the block's side; the paper names no weights. From e = 0.1 to 1 side the error of what is read
-  changes by less than 2%.
-- Of a block with many probes, 64 decide, every n-th along the Morton order, which spreads them evenly: a block of 32 m
-  may hold half of a scene, and a frame must not cost as much. On three scenes of 1,237 to 14,900 probes that changes
-  the error of what is read by less than 0.2% and the most probes in a frame from up to 13,810 to 2,395.
-- A block without a probe is empty: it is never queued, takes up no budget, and is not there for a read.
-- The budget counts blocks that are decoded. One that comes from the cache costs an upload alone, and is back in the
-  frame in which it comes into its window.
+- The finest block is 1.25 times as wide as probes are apart (`wlm.probe.index.finest_side`), whatever the unit. Its
+  windows have 32 blocks along an axis for the paper's 16, since most are empty and those take up no memory.
+- A level's window is the blocks along each axis whose middle lies nearest to the viewpoint, so the window depends on
+  the viewpoint alone.
+- A block's light is that of up to 16 probes within one side of its centre along each axis, spread evenly over these,
+  weighed so that what is read at a probe is nearly that probe's light (`wlm_kernels.probe.volume_weights`). The paper
+  takes the probes inside of the block and names no weights; a mean of those, weighted by distance, blurs what the
+  probes tell apart.
+- A block without a probe so near is empty: it is never queued, takes up no budget, and is not there for a read.
+- Blocks lie in a pool, whose rows are the cache too: a block that left its window stays until its row is needed. One
+  that is still there is back in the frame in which it comes into its window, and costs nothing.
 - Blocks wait in the order of their distance to the viewpoint in sides of their own, so that all levels grow outwards
   together: after a teleport the first frame already covers what is near, if coarsely, where the finest level first
   would leave the rest of the scene black until that level was done.
 - Which level answers a point follows from the windows and from the blocks that are there: the finest that has it, as
   `wlm_kernels.probe.volume.read` says. With every block there that is the paper's choice by the distance to the
   viewer.
+
+Everything but the windows' places is done on the device, in launches of fixed sizes: on CUDA a frame is one graph.
 """
 
+import math
 import time
-from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,17 +34,18 @@ import warp as wp
 
 from wlm import interop
 from wlm.errors import WlmError
-from wlm.probe.index import ProbeIndex
+from wlm.probe.index import BlockIndex, finest_side
+from wlm.probe.light import Light
 from wlm_kernels.probe import volume as kernels
+from wlm_kernels.probe import volume_frame as frame_kernels
+from wlm_kernels.probe import volume_weights
 
-SIZES = (2.0, 4.0, 8.0, 32.0)  # sides of a block, in metres
-SIDE = 16  # blocks along an axis of a window
+RATIOS = (1, 2, 4, 16)  # sides of the levels' blocks over the finest
+SIDE = 32  # blocks along an axis of a window
 BUDGET = 64  # blocks decoded in a frame
-PROBES = 64  # decoded for a block
-CACHE = 16384  # blocks: as many as the windows have, so that one teleport back finds all it left
+ROWS = 32768  # of the pool
 
-_SOFTENING = 0.25  # e over the block's side: a probe at the centre doesn't drown out the rest
-_LONGEST = 128  # side of a window: 2 million blocks a level
+_LONGEST = 64  # side of a window: 262,144 blocks a level
 _SMALLEST = 1e-30  # side of a block, so that float32 holds it and its inverse
 _FARTHEST = 2**30  # coordinate of a block: int32 on the device, with room for a window
 
@@ -55,12 +59,10 @@ class FrameStats:
         queued: Of those, the ones that now wait for their turn.
         dropped: Blocks that left their window while they waited.
         updated: Blocks decoded and written, at most the budget.
-        cached: Blocks written from the cache.
+        cached: Blocks that came into a window and were still in the pool.
         left: Blocks that still wait.
-        probes: Probes decoded; one that lies in blocks of several levels counts once.
-        find_seconds: Finding what changed, what is cached, and the probes of the blocks.
-        decode_seconds: Decoding the probes and weighting them.
-        upload_seconds: Writing to the device, until it is done.
+        probes: Probes decoded; one that decides several blocks counts for each.
+        seconds: Of the frame, until the device has done it.
     """
 
     entered: int
@@ -70,9 +72,7 @@ class FrameStats:
     cached: int
     left: int
     probes: int
-    find_seconds: float
-    decode_seconds: float
-    upload_seconds: float
+    seconds: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,13 +90,32 @@ class Reading:
     weight: np.ndarray
 
 
+@dataclass(frozen=True, eq=False)
+class State:
+    """What lies on the device, as `wlm_kernels.probe.volume` has it.
+
+    Attributes:
+        pool: float32 [R, D], blocks.
+        pages: int32 [L * side^3], the row of each slot's block, or -1.
+        bases: int32 [L, 3], first block of each window, from `BlockIndex.start`.
+        views: float32 [L, 4], where the viewer lies in each window, and 1 / side of a block.
+    """
+
+    pool: np.ndarray
+    pages: np.ndarray
+    bases: np.ndarray
+    views: np.ndarray
+
+
 class Volume:
     """A cascaded lighting volume on a device. Call `update` once a frame, then `read`.
 
     Attributes:
-        index: The live probes by place.
-        position: float64 [N, 3], of the live probes.
-        sizes: Sides of a block at each level, scaled.
+        index: The live probes by cell, and the blocks near them.
+        light: What the probes are read from.
+        position: float64 [N, 3], of all probes.
+        numbers: int64 [V], which of them are live.
+        sizes: Sides of a block at each level.
         side: Blocks along an axis of a window.
         budget: Blocks decoded in a frame.
         channels: D.
@@ -106,152 +125,202 @@ class Volume:
     def __init__(
         self,
         position: np.ndarray,
-        decode: Callable[[np.ndarray], np.ndarray],
-        channels: int,
+        light: Light,
         *,
         live: np.ndarray | None = None,
-        sizes: Sequence[float] = SIZES,
-        scale: float = 1.0,
+        normal: np.ndarray | None = None,
+        block: float | None = None,
+        ratios: Sequence[int] = RATIOS,
         side: int = SIDE,
         budget: int = BUDGET,
-        probes: int | None = PROBES,
-        cache: int = CACHE,
-        device: str = "cpu",
+        rows: int = ROWS,
     ):
-        """Makes an empty volume.
+        """Makes an empty volume on the device of the light.
 
         Args:
-            position: [N, 3], of all probes, in the unit of `sizes`.
-            decode: From positions float64 [M, 3] to the probes' numbers, float32 [M, D].
-            channels: D, 27 for L2 in RGB.
+            position: [N, 3], of all probes.
+            light: Of as many probes.
             live: bool [N], false for probes to leave out; None: all are live.
-            sizes: Side of a block at each level, from the finest; the paper's are metres.
-            scale: Factor on all sizes, for scenes in another unit or of another size.
-            side: Blocks along an axis of a window, even, 2 to 128.
-            budget: Most blocks to decode in a frame.
-            probes: Most probes to decode for a block; None: all of them.
-            cache: Most blocks to keep for their return, the least recently used ones giving way; 0: none.
-            device: Where the volume lies.
+            normal: [N, 3], of the surface that each probe lies on, of any length; 0 where it lies on none. Blocks then
+                take less from probes whose surface they lie behind. None: none is known.
+            block: Side of the finest blocks, in the unit of the positions; None: from the probes' spacing.
+            ratios: Sides of the levels' blocks over the finest, rising powers of two from 1, 8 of them at most.
+            side: Blocks along an axis of a window, even, 2 to 64.
+            budget: Most blocks to decode in a frame, 1 to 1024.
+            rows: Blocks that the pool holds, at least the budget. Where the windows have more near probes, the
+                farthest ones wait in vain.
 
         Raises:
-            WlmError: A setting is out of its range, or the device isn't there.
-            ValueError: `position` or `live` has a wrong shape, or a position isn't finite.
+            WlmError: A setting is out of its range.
+            ValueError: `position`, `light` or `live` has a wrong shape, or a position isn't finite.
         """
-        self.sizes = tuple(float(size) * float(scale) for size in sizes)
-        rising = all(a < b for a, b in zip(self.sizes, self.sizes[1:], strict=False))
-        if not self.sizes or not rising or not _SMALLEST <= self.sizes[0] or not self.sizes[-1] <= 1.0 / _SMALLEST:
-            limits = f"{_SMALLEST:g} to {1.0 / _SMALLEST:g}"
-            raise WlmError(f"volume sizes: expected rising numbers from {limits}, got {list(sizes)} times {scale:g}")
-        if not 2 <= side <= _LONGEST or side % 2:
-            raise WlmError(f"volume side: expected an even number of blocks from 2 to {_LONGEST}, got {side}")
-        if budget < 1:
-            raise WlmError(f"volume budget: expected at least 1 block a frame, got {budget}")
-        if probes is not None and probes < 1:
-            raise WlmError(f"volume probes: expected at least 1 probe a block, got {probes}")
-        if cache < 0:
-            raise WlmError(f"volume cache: expected 0 blocks or more, got {cache}")
-        if channels < 1:
-            raise ValueError(f"channels: expected at least 1, got {channels}")
         position = np.asarray(position, np.float64)
+        if position.shape != (light.count, 3):
+            raise ValueError(f"position: expected [{light.count}, 3] for the light's probes, got {position.shape}")
+        self.numbers = np.arange(len(position))
         if live is not None:
             live = np.asarray(live)
             if live.shape != position.shape[:1] or live.dtype != bool:
                 raise ValueError(f"live: expected bool {list(position.shape[:1])}, got {live.dtype} {list(live.shape)}")
-            position = position[live]
-        self.index = ProbeIndex(position, self.sizes[0])
-        self.position = position
-        self.side, self.budget, self.channels = side, budget, channels
-        self.device = interop.check_device(device)
-        self._decode = decode
-        self._probes = probes
-        self._cache = _BlockCache(cache, channels)
-        levels, slots = len(self.sizes), len(self.sizes) * side**3
+            self.numbers = np.flatnonzero(live)
+        _check(block, ratios, side, budget, rows)
+        lit = position[self.numbers]
+        self.index = BlockIndex(lit, finest_side(lit) if block is None else block, ratios)
+        self.sizes = self.index.sizes
+        if not _SMALLEST <= self.sizes[0] <= self.sizes[-1] <= 1.0 / _SMALLEST:
+            limits = f"{_SMALLEST:g} to {1.0 / _SMALLEST:g}"
+            raise WlmError(f"volume block: expected sides from {limits}, got {list(self.sizes)}")
+        self.position, self.light = position, light
+        self.side, self.budget, self.channels = side, budget, light.channels
+        self.device = light.device
         self._size = np.array(self.sizes)
-        self._level = np.repeat(np.arange(levels), side**3)
-        # Of each slot within its level's grid, along each axis.
-        self._place = np.tile(np.indices((side,) * 3).reshape(3, -1).T, (levels, 1))
-        self._viewpoint = None
-        self._base = np.zeros((levels, 3), np.int64)
-        self._block = np.full((slots, 3), kernels.NOTHING, np.int64)  # that the window wants in each slot
-        self._held = self._block.copy()  # that each slot holds, as on the device
-        self._waiting = np.zeros(slots, bool)
-        self._values = wp.zeros((slots, channels), dtype=float, device=self.device)
-        self._held_device = wp.full(slots, wp.vec3i(kernels.NOTHING), dtype=wp.vec3i, device=self.device)
-        self._bases = wp.zeros(levels, dtype=wp.vec3i, device=self.device)
-        self._views = wp.zeros(levels, dtype=wp.vec4, device=self.device)
-        wp.load_module(kernels, device=self.device)  # compiled now, not in the first frame
+        self._viewpoint: np.ndarray | None = None
+        self._base = np.zeros((len(ratios), 3), np.int64)
+        self._frame = 0
+        self._make(rows, _unit(normal, position.shape)[self.numbers])
+        self._step = interop.StepGraph(self._work, self.device)
+
+    def _make(self, rows: int, normal: np.ndarray) -> None:
+        """Puts all on the device."""
+        device, levels, budget = self.device, len(self.sizes), self.budget
+        slots = levels * self.side**3
+
+        reader = self.light.reader(budget * frame_kernels.PROBES)
+        self._arrays = [reader.numbers, reader.values]
+
+        def full(shape: int | tuple[int, ...], dtype: type, value: object) -> wp.array:
+            self._arrays.append(wp.full(shape, value, dtype=dtype, device=device))
+            return self._arrays[-1]
+
+        def put(array: np.ndarray, dtype: type) -> wp.array:
+            self._arrays.append(wp.array(array, dtype=dtype, device=device))
+            return self._arrays[-1]
+
+        index, host = frame_kernels.Index(), self.index
+        index.key, index.number = put(host.key, wp.int64), put(self.numbers[host.number].astype(np.int32), int)
+        index.cell, index.place = put(host.cell, wp.vec3i), put(host.place, wp.vec3)
+        index.normal = put(normal[host.number], wp.vec3)
+        index.block, index.level_start = put(host.block, wp.int64), put(host.level_start, int)
+        index.ratios = put(np.array(host.ratios, np.int32), int)
+        windows = frame_kernels.Windows()
+        windows.bases, windows.views = full(levels, wp.vec3i, wp.vec3i()), full(levels, wp.vec4, wp.vec4())
+        windows.held = full(slots, wp.vec3i, wp.vec3i(kernels.NOTHING))
+        windows.wanted, windows.pages = full(slots, int, -1), full(slots, int, -1)
+        windows.away, windows.forward = full(slots, float, -1.0), full(1, wp.vec3, wp.vec3())
+        pool = frame_kernels.Pool()
+        pool.stamp, pool.owner = full(rows, int, -1), full(rows, int, -1)
+        pool.rows = full(len(host.block), int, -1)
+        work = frame_kernels.Work()
+        work.clock, work.counters, work.limit = full(1, int, 0), full(7, int, 0), full(1, int, 0)
+        work.histogram = full(frame_kernels.TOTALS, int, 0)
+        work.gathered, work.distance = full(frame_kernels.MOST, int, 0), full(frame_kernels.MOST, float, 0.0)
+        work.chosen, work.taken = full(budget, int, -1), full(budget, int, -1)
+        work.begin = full((budget, frame_kernels.HALVES), int, 0)
+        work.count = full((budget, frame_kernels.HALVES), int, 0)
+        work.numbers, work.weights = reader.numbers, full((budget, frame_kernels.PROBES), float, 0.0)
+        self._index, self._windows, self._pool_rows, self._reader, self._frame_work = index, windows, pool, reader, work
+        self._nowhere = full(0, wp.vec3, wp.vec3())
+        self._pool = full((rows, self.channels), float, 0.0)
 
     @property
     def memory_bytes(self) -> int:
-        """Memory of the volume on its device, in bytes; constant."""
-        return sum(array.capacity for array in (self._values, self._held_device, self._bases, self._views))
+        """Memory of the volume and of its index on the device, in bytes, without the light's; constant."""
+        return sum(array.capacity for array in self._arrays)
 
     @property
-    def host_bytes(self) -> int:
-        """Host memory of the index, the cache and the slot tables, in bytes."""
-        tables = (self._level, self._place, self._block, self._held, self._waiting)
-        return sum(array.nbytes for array in tables) + self.index.memory_bytes + self._cache.memory_bytes
+    def viewpoint(self) -> np.ndarray:
+        """float64 [3], of the last update.
 
-    def update(self, viewpoint: np.ndarray) -> FrameStats:
-        """Moves the windows to a viewpoint and fills up to `budget` of the blocks that are missing.
+        Raises:
+            ValueError: There was none.
+        """
+        if self._viewpoint is None:
+            raise ValueError("viewpoint: expected one update at least")
+        return self._viewpoint.copy()
 
-        Blocks wait in the order of the distance of their centre to the viewpoint over their side; of two alike, the
-        finer goes first, then the one of the lower slot. Those that leave their window are dropped.
+    @property
+    def base(self) -> np.ndarray:
+        """int64 [L, 3], coordinates of the first block of each window; block b spans [b, b + 1) times its side."""
+        return self._base + self.index.start.astype(np.int64)
+
+    def update(self, viewpoint: np.ndarray, forward: np.ndarray | None = None) -> FrameStats:
+        """Moves the windows to a viewpoint, fills up to `budget` of the blocks that are missing, and waits for it.
 
         Args:
             viewpoint: [3], in the unit of the positions.
+            forward: [3], where the viewer looks, of any length: blocks behind wait as if they were twice as far. None:
+                all directions are alike.
 
         Returns:
             What was done.
 
         Raises:
-            WlmError: The viewpoint isn't three finite numbers, or so far out that a block has no number.
-            ValueError: `decode` gave another shape than [M, D], or a number that isn't finite.
+            WlmError: The viewpoint or the direction isn't three finite numbers, or so far out that a block has no
+                number.
         """
-        clock = _Clock()
+        start = time.perf_counter()
+        entered = self.advance(viewpoint, forward)
+        counters = self._frame_work.counters.numpy()
+        seconds = time.perf_counter() - start
+        queued, dropped, cached, left, updated, probes = counters[: frame_kernels.GATHERED].tolist()
+        return FrameStats(entered, queued, dropped, updated, cached, left, probes, seconds)
+
+    def advance(self, viewpoint: np.ndarray, forward: np.ndarray | None = None) -> int:
+        """As `update`, but on CUDA the frame is queued, not awaited: the path of a renderer.
+
+        Args:
+            viewpoint, forward: As for `update`.
+
+        Returns:
+            How many blocks came into a window.
+
+        Raises:
+            WlmError: As `update`.
+        """
         viewpoint = np.array(viewpoint, np.float64)
         if viewpoint.shape != (3,) or not np.isfinite(viewpoint).all():
             raise WlmError(f"viewpoint: expected three finite numbers, got {viewpoint.tolist()}")
-        if np.abs(viewpoint).max() > _FARTHEST * self.sizes[0]:
+        ahead = np.zeros(3) if forward is None else np.array(forward, np.float64)
+        if ahead.shape != (3,) or not np.isfinite(ahead).all():
+            raise WlmError(f"forward: expected three finite numbers, got {ahead.tolist()}")
+        ahead = _unit(ahead[None], (1, 3))[0]
+        at = viewpoint / self._size[:, None] - self.index.start
+        if np.abs(at).max() > _FARTHEST:
             limit = _FARTHEST * self.sizes[0]
-            raise WlmError(f"viewpoint: expected at most {limit:g} from the origin, got {viewpoint.tolist()}")
-        entered, dropped = self._move(viewpoint)
-        arrived = entered[self._waiting[entered]]
-        hit, rows = self._cache.find(self._keys(arrived))
-        cached = arrived[hit]
-        clock.lap("find")
-        self._views.assign(self._view(viewpoint))
-        self._write(cached, rows)
-        clock.lap("upload")
+            raise WlmError(f"viewpoint: expected at most {limit:g} from the probes, got {viewpoint.tolist()}")
+        base = np.floor(at + 0.5).astype(np.int64) - self.side // 2
+        kept = np.maximum(self.side - np.abs(base - self._base), 0).prod(1).sum() if self._viewpoint is not None else 0
+        self._viewpoint, self._base = viewpoint, base
+        self._frame += 1
+        bases, views = frame_kernels.Bases(), frame_kernels.Views()
+        for level, (first, place) in enumerate(zip(base.tolist(), at.tolist(), strict=True)):
+            middle = [p - (b + self.side // 2) - 0.5 for p, b in zip(place, first, strict=True)]
+            bases[level], views[level] = wp.vec3i(*first), wp.vec4(*middle, 1.0 / self.sizes[level])
+        with interop.stream(self.device):
+            frame_kernels.look(bases, views, wp.vec3(*ahead.tolist()), self._frame, self._windows, self._frame_work)
+            self._step()
+        return len(self.sizes) * self.side**3 - int(kept)
 
-        chosen = self._next()
-        probes, offsets = _thin(*self._find(chosen), self._probes)
-        unique, which = np.unique(probes, return_inverse=True)
-        clock.lap("find")
-        decoded = self.decode(self.position[unique])
-        values = self._combine(chosen, probes, offsets, decoded[which])
-        clock.lap("decode")
-        self._cache.put(self._keys(chosen), values)
-        self._write(chosen, values)
-        clock.lap("upload")
-        return FrameStats(
-            entered=len(entered),
-            queued=len(arrived) - len(cached),
-            dropped=dropped,
-            updated=len(chosen),
-            cached=len(cached),
-            left=int(np.count_nonzero(self._waiting)),
-            probes=len(unique),
-            find_seconds=clock.seconds["find"],
-            decode_seconds=clock.seconds["decode"],
-            upload_seconds=clock.seconds["upload"],
-        )
+    def _work(self) -> None:
+        """All of a frame that a graph holds."""
+        work, windows = self._frame_work, self._windows
+        frame_kernels.scroll(self._index, windows, self._pool_rows, self.side, work)
+        frame_kernels.choose(windows, self.side, work)
+        frame_kernels.allocate(windows, self._pool_rows, work)
+        if self.index.count == 0 or (self.device == "cpu" and not (work.taken.numpy() >= 0).any()):
+            return
+        frame_kernels.search(self._index, windows, self.side, work)
+        volume_weights.weigh(self._index, windows, self.side, work)
+        self._reader.run()
+        frame_kernels.combine(work, self._reader.values, self._pool)
 
-    def read(self, points: np.ndarray) -> Reading:
+    def read(self, points: np.ndarray, normals: np.ndarray | None = None) -> Reading:
         """Reads the light at points, as `wlm_kernels.probe.volume.read` says; at float32's precision near the viewer.
 
         Args:
             points: [M, 3], in the unit of the positions. One that is NaN or infinite is covered by nothing.
+            normals: [M, 3], of surfaces that they lie on, of any length: the light is read half a block ahead. None: at
+                the points.
 
         Returns:
             The light there.
@@ -265,14 +334,20 @@ class Volume:
         # Taken from the viewpoint in float64, so that a viewer far from the origin loses nothing.
         with np.errstate(over="ignore"):
             relative = (points - self._viewpoint).astype(np.float32)
-        on_device = wp.array(relative, dtype=wp.vec3, device=self.device)
-        values = wp.empty((len(points), self.channels), dtype=float, device=self.device)
-        level = wp.empty(len(points), dtype=int, device=self.device)
-        weight = wp.empty(len(points), dtype=float, device=self.device)
-        self.read_into(on_device, values, level, weight)
-        return Reading(values.numpy(), level.numpy(), weight.numpy())
+        with interop.stream(self.device):
+            on_device = wp.array(relative, dtype=wp.vec3, device=self.device)
+            values = wp.empty((len(points), self.channels), dtype=float, device=self.device)
+            level = wp.empty(len(points), dtype=int, device=self.device)
+            weight = wp.empty(len(points), dtype=float, device=self.device)
+            ahead = None
+            if normals is not None:
+                ahead = wp.array(_unit(normals, points.shape), dtype=wp.vec3, device=self.device)
+            self.read_into(on_device, values, level, weight, ahead)
+            return Reading(values.numpy(), level.numpy(), weight.numpy())
 
-    def read_into(self, points: wp.array, values: wp.array, level: wp.array, weight: wp.array) -> None:
+    def read_into(
+        self, points: wp.array, values: wp.array, level: wp.array, weight: wp.array, normals: wp.array | None = None
+    ) -> None:
         """Reads the light at points that lie on the device, without a copy: the path of a renderer.
 
         Args:
@@ -280,10 +355,17 @@ class Volume:
             values: float [M, D], written; this and the next two as in `Reading`.
             level: int [M], written.
             weight: float [M], written.
+            normals: vec3 [M], of unit length, as for `read`.
         """
-        kernels.read(
-            self._values, self._held_device, self._bases, self._views, self.side, points, values, level, weight
-        )
+        windows = self._windows
+        place = (windows.pages, windows.bases, windows.views, self.side, points)
+        kernels.read(self._pool, *place, self._nowhere if normals is None else normals, values, level, weight)
+
+    def state(self) -> State:
+        """Copies what a shader would read to the host."""
+        windows = self._windows
+        with interop.stream(self.device):
+            return State(*(part.numpy() for part in (self._pool, windows.pages, windows.bases, windows.views)))
 
     def unscroll(self) -> tuple[np.ndarray, np.ndarray]:
         """The windows in the order of space, as a texture for each level (the last step of section 3.4).
@@ -292,167 +374,39 @@ class Volume:
             float32 [L, side, side, side, D], by level, x, y and z, 0 where a block isn't there; and bool
             [L, side, side, side], true where it is. The first block of each level is that of `base`.
         """
-        out = wp.empty(self._values.shape, dtype=float, device=self.device)
-        valid = wp.empty(len(self._held_device), dtype=wp.uint8, device=self.device)
-        kernels.unscroll(self._values, self._held_device, self._bases, self.side, out, valid)
         shape = (len(self.sizes), self.side, self.side, self.side)
-        return out.numpy().reshape(*shape, self.channels), valid.numpy().astype(bool).reshape(shape)
-
-    def decode(self, position: np.ndarray) -> np.ndarray:
-        """The light at probes themselves, float32 [M, D], by the function that the volume was given.
-
-        Args:
-            position: float64 [M, 3].
-
-        Raises:
-            ValueError: It gave another shape, or a number that isn't finite.
-        """
-        if len(position) == 0:
-            return np.zeros((0, self.channels), np.float32)
-        values = np.asarray(self._decode(position), np.float32)
-        if values.shape != (len(position), self.channels):
-            raise ValueError(f"decode: expected {(len(position), self.channels)}, got {values.shape}")
-        if not np.isfinite(values).all():
-            raise ValueError("decode: expected finite numbers, got NaN or infinity")
-        return values
-
-    @property
-    def base(self) -> np.ndarray:
-        """int64 [L, 3], coordinates of the first block of each window; block b spans [b, b + 1) times its side."""
-        return self._base.copy()
-
-    def _move(self, viewpoint: np.ndarray) -> tuple[np.ndarray, int]:
-        """Moves the windows; returns the slots whose block changed, and how many of them dropped one that waited."""
-        base = np.floor(viewpoint / self._size[:, None] + 0.5).astype(np.int64) - self.side // 2
-        moved = np.flatnonzero((base != self._base).any(1) | (self._viewpoint is None))
-        self._viewpoint = viewpoint
-        if len(moved) == 0:
-            return moved, 0
-        self._base = base
-        self._bases.assign(base.astype(np.int32))
-        count = self.side**3
-        slots = (moved[:, None] * count + np.arange(count)).ravel()
-        at = base[self._level[slots]]
-        block = at + (self._place[slots] - at) % self.side
-        new = (block != self._block[slots]).any(1)
-        entered = slots[new]
-        dropped = int(np.count_nonzero(self._waiting[entered]))
-        # A block was in use as long as it was in its window, not only when it was decoded.
-        self._cache.touch(self._keys(entered[(self._held[entered] == self._block[entered]).all(1)]))
-        self._block[entered] = block[new]
-        self._waiting[entered] = False
-        absent = entered[(self._held[entered] != self._block[entered]).any(1)]
-        _, offsets = self._find(absent)
-        self._waiting[absent[np.diff(offsets) > 0]] = True
-        return entered, dropped
-
-    def _view(self, viewpoint: np.ndarray) -> np.ndarray:
-        """float32 [L, 4], the kernels' views."""
-        place = viewpoint / self._size[:, None] - (self._base + self.side // 2) - 0.5
-        return np.concatenate([place, 1.0 / self._size[:, None]], 1).astype(np.float32)
-
-    def _next(self) -> np.ndarray:
-        """The slots to fill in this frame."""
-        waiting = np.flatnonzero(self._waiting)
-        level = self._level[waiting]
-        away = self._block[waiting] + 0.5 - self._viewpoint / self._size[level, None]
-        return waiting[np.argsort((away**2).sum(1), kind="stable")[: self.budget]]
-
-    def _find(self, slots: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The probes in the blocks of slots, as `ProbeIndex.query` gives them."""
-        size = self._size[self._level[slots], None]
-        # The upper corner as the next block computes its lower one: a probe lies in one of the two, rounding or not.
-        return self.index.query(self._block[slots] * size, (self._block[slots] + 1) * size)
-
-    def _combine(self, slots: np.ndarray, probes: np.ndarray, offsets: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """float32 [B, D], the light at the blocks' centres, of the values [M, D] of their probes."""
-        if len(slots) == 0:
-            return np.zeros((0, self.channels), np.float32)
-        owner = np.repeat(np.arange(len(slots)), np.diff(offsets))
-        # In sides of the block.
-        away = self.position[probes] / self._size[self._level[slots], None][owner] - (self._block[slots][owner] + 0.5)
-        weight = 1.0 / ((away**2).sum(1) + _SOFTENING**2)
-        weight /= np.add.reduceat(weight, offsets[:-1])[owner]
-        return np.add.reduceat(weight[:, None] * values, offsets[:-1]).astype(np.float32)
-
-    def _write(self, slots: np.ndarray, values: np.ndarray) -> None:
-        """Writes the blocks of slots to the device; they wait no longer."""
-        if len(slots) == 0:
-            return
-        block = self._block[slots]
-        kernels.scatter(
-            wp.array(slots.astype(np.int32), dtype=int, device=self.device),
-            wp.array(block.astype(np.int32), dtype=wp.vec3i, device=self.device),
-            wp.array(values, dtype=float, device=self.device),
-            self._values,
-            self._held_device,
-        )
-        wp.synchronize_device(self.device)  # so that the clock shows what it costs
-        self._held[slots] = block
-        self._waiting[slots] = False
-
-    def _keys(self, slots: np.ndarray) -> list[tuple[int, ...]]:
-        """(level, x, y, z) of the blocks that the windows want in slots."""
-        return list(map(tuple, np.column_stack([self._level[slots], self._block[slots]]).tolist()))
+        with interop.stream(self.device):
+            out = wp.empty((math.prod(shape), self.channels), dtype=float, device=self.device)
+            valid = wp.empty(math.prod(shape), dtype=wp.uint8, device=self.device)
+            kernels.unscroll(self._pool, self._windows.pages, self._windows.bases, self.side, out, valid)
+            return out.numpy().reshape(*shape, self.channels), valid.numpy().astype(bool).reshape(shape)
 
 
-def _thin(probes: np.ndarray, offsets: np.ndarray, most: int | None) -> tuple[np.ndarray, np.ndarray]:
-    """Keeps at most so many probes of each block of `ProbeIndex.query`, evenly spaced in their order."""
-    count = np.diff(offsets)
-    if most is None or (count <= most).all():
-        return probes, offsets
-    owner = np.repeat(np.arange(len(count)), count)
-    number, total = np.arange(len(probes)) - offsets[owner], count[owner]
-    chosen = (total <= most) | (number * most // total != (number - 1) * most // total)
-    return probes[chosen], np.concatenate([[0], np.cumsum(np.minimum(count, most))])
+def _unit(normal: np.ndarray | None, shape: tuple[int, ...]) -> np.ndarray:
+    """Normals of length 1, float32; 0 where there is none.
+
+    Raises:
+        ValueError: Another shape, or a number isn't finite.
+    """
+    if normal is None:
+        return np.zeros(shape, np.float32)
+    normal = np.asarray(normal, np.float64)
+    if normal.shape != shape or not np.isfinite(normal).all():
+        raise ValueError(f"normal: expected finite numbers {list(shape)}, got {list(normal.shape)}")
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    return (normal / np.where(length > 0, length, 1.0)).astype(np.float32)
 
 
-class _BlockCache:
-    """Finished blocks by (level, x, y, z); the least recently used ones give way."""
-
-    def __init__(self, capacity: int, channels: int):
-        self._values = np.empty((capacity, channels), np.float32)  # takes up memory as it is filled
-        self._row: OrderedDict[tuple[int, ...], int] = OrderedDict()  # the least recently used first
-
-    @property
-    def memory_bytes(self) -> int:
-        """Bytes of the cached values."""
-        return len(self._row) * self._values.itemsize * self._values.shape[1]
-
-    def touch(self, keys: list[tuple[int, ...]]) -> None:
-        """Marks blocks as used now; those that aren't there don't matter."""
-        for key in keys:
-            if key in self._row:
-                self._row.move_to_end(key)
-
-    def find(self, keys: list[tuple[int, ...]]) -> tuple[np.ndarray, np.ndarray]:
-        """bool [B], which blocks are there; and their numbers, float32 [hits, D]. They are used now."""
-        self.touch(keys)
-        rows = np.array([self._row.get(key, -1) for key in keys], np.int64)
-        return rows >= 0, self._values[rows[rows >= 0]]
-
-    def put(self, keys: list[tuple[int, ...]], values: np.ndarray) -> None:
-        """Keeps blocks [B, D]."""
-        for key, value in zip(keys, values, strict=True):
-            row = self._row.pop(key, None)
-            if row is None:
-                if len(self._values) == 0:
-                    return
-                full = len(self._row) == len(self._values)
-                row = self._row.popitem(last=False)[1] if full else len(self._row)
-            self._row[key] = row
-            self._values[row] = value
-
-
-class _Clock:
-    """Seconds by stage."""
-
-    def __init__(self):
-        self.seconds = {"find": 0.0, "decode": 0.0, "upload": 0.0}
-        self._last = time.perf_counter()
-
-    def lap(self, stage: str) -> None:
-        """Counts the time since the last lap towards a stage."""
-        now = time.perf_counter()
-        self.seconds[stage] += now - self._last
-        self._last = now
+def _check(block: float | None, ratios: Sequence[int], side: int, budget: int, rows: int) -> None:
+    """Refuses settings out of their range."""
+    if block is not None and not _SMALLEST <= block <= 1.0 / _SMALLEST:
+        raise WlmError(f"volume block: expected a side from {_SMALLEST:g} to {1.0 / _SMALLEST:g}, got {block:g}")
+    rising = list(ratios[:1]) == [1] and all(a < b for a, b in zip(ratios, ratios[1:], strict=False))
+    if not rising or len(ratios) > frame_kernels.LEVELS or any(r & (r - 1) or r > 1024 for r in ratios):
+        raise WlmError(f"volume ratios: expected up to 8 rising powers of two from 1 to 1024, got {list(ratios)}")
+    if not 2 <= side <= _LONGEST or side % 2:
+        raise WlmError(f"volume side: expected an even number of blocks from 2 to {_LONGEST}, got {side}")
+    if not 1 <= budget <= 1024:
+        raise WlmError(f"volume budget: expected 1 to 1024 blocks a frame, got {budget}")
+    if rows < budget:
+        raise WlmError(f"volume rows: expected at least the budget of {budget}, got {rows}")

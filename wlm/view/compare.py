@@ -202,7 +202,7 @@ def _probes(
         names = {"PSNR dB": "psnr", "PSNR of irradiance, dB": "irradiance_psnr", "largest error": "max_abs_error"}
         scores = {title: tuple(getattr(report, name) for report in reports) for title, name in names.items()}
         position = probes.position
-    elif len(models[0].positions):
+    elif models[0].has_positions:
         position = models[0].stored_positions()
     else:
         raise WlmError(f"{paths[0]}: the file has no positions; expected --original, the file that was compressed")

@@ -31,7 +31,7 @@ def open_scene(
     original: str | os.PathLike[str] | None = None,
     key: str | None = None,
     walk: str | os.PathLike[str] | None = None,
-    scale: float | None = None,
+    block: float | None = None,
     extinction: float | None = None,
     flat: bool = False,
     up: Literal["y", "z"] = "y",
@@ -46,7 +46,7 @@ def open_scene(
         original: What was compressed, to compare with: a lightmap set, an atlas' lightmap, a probe file.
         key: Of a probe file with several arrays, the one to show.
         walk: Viewpoints of the cascaded volume, as `wlm probe walk --path` takes.
-        scale: Of the cascaded volume's blocks: units in a metre; None: 1, or less in a small scene.
+        block: Side of the cascaded volume's finest blocks; None: from the probes' spacing.
         extinction: Of a volume of smoke, per unit of length at density 1.
         flat: Whether a lightmap is shown unwrapped though its mesh is there.
         up: The axis that points up.
@@ -59,7 +59,7 @@ def open_scene(
     if not paths:
         raise WlmError("expected a file to show, found none")
     path = paths[0]
-    request = _Request(path, mesh, original, key, walk, scale, extinction, flat, up, progress)
+    request = _Request(path, mesh, original, key, walk, block, extinction, flat, up, progress)
     if not path.exists():
         raise WlmError(f"{path}: no such file or folder")
     if is_six_way(path):
@@ -94,7 +94,7 @@ class _Request:
     original: str | os.PathLike[str] | None
     key: str | None
     walk: str | os.PathLike[str] | None
-    scale: float | None
+    block: float | None
     extinction: float | None
     flat: bool
     up: Literal["y", "z"]
@@ -114,7 +114,7 @@ class _Request:
         if model.SYSTEM in ("lightmap", "lightmap-layers"):
             from wlm.lightmap.front import load_light
 
-            self._refuse("key", "walk", "scale", "extinction")
+            self._refuse("key", "walk", "block", "extinction")
             sheet, model = model.shown() if model.SYSTEM == "lightmap-layers" else (None, model)
             given = None if self.original is None else load_light(self.original, sheet)
             if given is not None:
@@ -134,11 +134,11 @@ class _Request:
     def lightmap_set(self) -> Scene:
         from wlm.lightmap.front import load_light
 
-        self._refuse("original", "key", "walk", "scale", "extinction")
+        self._refuse("original", "key", "walk", "block", "extinction")
         return self._lightmaps(None, load_light(self.path))
 
     def lightmap(self) -> Scene:
-        self._refuse("original", "key", "walk", "scale", "extinction")
+        self._refuse("original", "key", "walk", "block", "extinction")
         if self.mesh is None:
             from wlm.lightmap.data import from_arrays
 
@@ -154,7 +154,7 @@ class _Request:
         from wlm.atlas.exporter import read_folder
         from wlm.view.atlas_scene import atlas_scene
 
-        self._refuse("mesh", "key", "walk", "scale", "extinction")
+        self._refuse("mesh", "key", "walk", "block", "extinction")
         output, light = read_folder(self.path), None
         if self.original is not None:
             light = read_light(self.original)[0]
@@ -172,13 +172,13 @@ class _Request:
         from wlm.smoke.data import load_frames
         from wlm.view.smoke_scene import volume_scene
 
-        self._refuse("mesh", "original", "key", "walk", "scale", "flat")
+        self._refuse("mesh", "original", "key", "walk", "block", "flat")
         return volume_scene(load_frames(path, extinction=self.extinction), title=path.name, up=self._up)
 
     def six_way(self, paths: Sequence[Path]) -> Scene:
         from wlm.view.smoke_scene import six_way_scene
 
-        self._refuse("mesh", "original", "key", "walk", "scale", "extinction", "flat")
+        self._refuse("mesh", "original", "key", "walk", "block", "extinction", "flat")
         return six_way_scene(paths, title=self.path.name, progress=self.progress)
 
     @property
@@ -210,7 +210,7 @@ class _Request:
 
         geometry = None if self.mesh is None else read_geometry(self.mesh, with_uv=False)
         walk = None if self.walk is None else load_positions(self.walk)
-        return probe_scene(probes, title=self.path.name, geometry=geometry, walk=walk, scale=self.scale, up=self._up)
+        return probe_scene(probes, title=self.path.name, geometry=geometry, walk=walk, block=self.block, up=self._up)
 
 
 def _names(path: Path) -> list[str]:

@@ -11,12 +11,13 @@ from scipy.spatial import cKDTree
 from wlm.errors import WlmError
 from wlm.formats.geometry import Geometry
 from wlm.probe.data import ProbeSet
-from wlm.probe.decode import Decoder
+from wlm.probe.light import Light, StoredLight
 from wlm.probe.model import CENTRE, ROTATION, SCALE, ProbeModel
 from wlm.probe.places import ball_exposure, ball_radius
 from wlm.probe.sphere import basis, coefficient_bands, cosine_factor, irradiance, sh_count
-from wlm.probe.volume import SIDE, SIZES, Volume
-from wlm.probe.walk import EYE_HEIGHT, camera_path
+from wlm.probe.transform import TransformModel
+from wlm.probe.volume import Volume
+from wlm.probe.walk import camera_path, settle
 from wlm.view.canvas import Canvas, Hit
 from wlm.view.rendering import import_pyvista
 from wlm.view.scene import Scene, Slider, State, frame_slider
@@ -45,7 +46,8 @@ class Probes:
         coefficients: C.
         values: By "decoded" and "original", as there are, float32 [N, C, 3].
         decode: Light float32 [M, 3 C] at points [M, 3].
-        model: The model; None: the input alone.
+        light: That of the probes, for a volume.
+        model: The Gaussians; None: there are none.
         note: For the caption.
     """
 
@@ -54,12 +56,18 @@ class Probes:
     coefficients: int
     values: dict[str, np.ndarray]
     decode: Callable[[np.ndarray], np.ndarray]
+    light: Light
     model: ProbeModel | None
     note: str
 
     @classmethod
     def of_model(
-        cls, model: ProbeModel, position: np.ndarray, original: np.ndarray | None, live: np.ndarray, title: str
+        cls,
+        model: ProbeModel | TransformModel,
+        position: np.ndarray,
+        original: np.ndarray | None,
+        live: np.ndarray,
+        title: str,
     ) -> Self:
         """Takes what `wlm.probe.places.probes_of` found of a model.
 
@@ -67,12 +75,15 @@ class Probes:
             WlmError: A probe's numbers are no spherical harmonics.
         """
         count = _coefficients(model.outputs, title)
-        decoder, places = Decoder(model), position[live]
-        values = {"decoded": decoder.decode(places).reshape(-1, count, 3)}
+        decoder, places = model.decoder(), position[live]
+        values = {"decoded": decoder.decode_probes(position)[live].reshape(-1, count, 3)}
         if original is not None:
             values["original"] = original[live].reshape(-1, count, 3)
-        note = f"{model.name}, {len(places):,} probes, {model.count:,} Gaussians, profile {model.profile.name}"
-        return cls(places, np.flatnonzero(live), count, values, decoder.decode, model, note)
+        shapes = model if isinstance(model, ProbeModel) else None
+        gaussians = "" if shapes is None else f"{shapes.count:,} Gaussians, "
+        note = f"{model.name}, {len(places):,} probes, {gaussians}profile {model.profile.name}"
+        light = StoredLight(values["decoded"])
+        return cls(places, np.flatnonzero(live), count, values, decoder.decode, light, shapes, note)
 
     @classmethod
     def of_set(cls, probes: ProbeSet, title: str) -> Self:
@@ -90,7 +101,7 @@ class Probes:
 
         shown = {"original": values.reshape(-1, count, 3)}
         note = f"{probes.name}, {len(places):,} live probes, {probes.key}"
-        return cls(places, np.flatnonzero(probes.live), count, shown, nearest, None, note)
+        return cls(places, np.flatnonzero(probes.live), count, shown, nearest, StoredLight(values), None, note)
 
 
 def probe_scene(
@@ -99,7 +110,7 @@ def probe_scene(
     title: str,
     geometry: Geometry | None = None,
     walk: np.ndarray | None = None,
-    scale: float | None = None,
+    block: float | None = None,
     up: int = 1,
 ) -> Scene:
     """Makes the scene of probes.
@@ -109,18 +120,14 @@ def probe_scene(
         title: Of the window.
         geometry: The scene's mesh, lit at its vertices; None: none.
         walk: [F, 3], viewpoints of the cascaded volume; None: a loop through the scene.
-        scale: Of the volume's blocks: units in a metre. None: 1, or less where the finest window would span more than
-            half of the scene.
+        block: Side of the volume's finest blocks; None: from the probes' spacing.
         up: The axis that points up.
 
     Raises:
-        WlmError: The scale isn't above 0.
+        WlmError: The side isn't above 0.
     """
-    if scale is None:
-        longest = float(np.ptp(probes.position, axis=0).max())
-        scale = min(1.0, longest / (2.0 * SIDE * SIZES[0])) if longest > 0 else 1.0
-    volume = Volume(probes.position, probes.decode, 3 * probes.coefficients, scale=scale)
-    path = walk if walk is not None else camera_path(volume.position, _LOOP, EYE_HEIGHT * scale, up)
+    volume = Volume(probes.position, probes.light, block=block)
+    path = walk if walk is not None else camera_path(volume.position, _LOOP, up=up)
     views = ("balls", "gaussians", "volume") if probes.model is not None else ("balls", "volume")
     sliders = frame_slider(len(path), ("volume",)) + (_SIGMAS,) * (probes.model is not None)
     return _ProbeScene(
@@ -230,9 +237,9 @@ class _ProbeScene(Scene):
         frame = state.frame
         if frame != self._frame:
             # A jump is waited for; the next frame shows what a frame's budget fills.
+            if self._frame is None or frame != self._frame + 1:
+                settle(self.volume, self.path[frame])
             self._stats = self.volume.update(self.path[frame])
-            while self._stats.left and (self._frame is None or frame != self._frame + 1):
-                self._stats = self.volume.update(self.path[frame])
             self._frame = frame
         values, valid = self.volume.unscroll()
         centres, sides, light = [], [], []

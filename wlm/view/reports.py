@@ -19,9 +19,9 @@ from wlm.lightmap.tiles import TileGrid
 from wlm.metrics.error import psnr_from_mse
 from wlm.ops.views import sphere_views
 from wlm.probe.data import ProbeSet
-from wlm.probe.decode import Decoder as ProbeDecoder
 from wlm.probe.evaluation import Report as ProbeReport
 from wlm.probe.model import ProbeModel
+from wlm.probe.transform import TransformModel
 from wlm.smoke.camera import Camera
 from wlm.smoke.evaluation import NETWORK, REFERENCE, Comparison, Example
 from wlm.smoke.model import SmokeModel, parameter_count
@@ -158,7 +158,9 @@ def atlas_report(
     return page.write(path)
 
 
-def probe_report(path: str | os.PathLike[str], model: ProbeModel, probes: ProbeSet, report: ProbeReport) -> int:
+def probe_report(
+    path: str | os.PathLike[str], model: ProbeModel | TransformModel, probes: ProbeSet, report: ProbeReport
+) -> int:
     """Writes a probe report: the summary, errors by band and by probe, and the worst probes.
 
     Args:
@@ -184,9 +186,9 @@ def probe_report(path: str | os.PathLike[str], model: ProbeModel, probes: ProbeS
     if report.psnr_by_band is not None:
         bands = np.asarray(report.psnr_by_band, np.float64)
         page.table("PSNR by band", ("band", "dB"), [(str(i), _number(value, ".2f")) for i, value in enumerate(bands)])
-    decoded = ProbeDecoder(model).decode_probes(probes.position)
+    decoded = model.decoder().decode_probes(probes.position)
     mse = np.square(probes.values.astype(np.float64) - decoded).mean(1)
-    live = ~model.dead
+    live = probes.live
     with np.errstate(divide="ignore"):
         psnr = 10.0 * np.log10(report.peak**2 / mse)
     page.histogram("PSNR of the probes", "dB", psnr[live])

@@ -18,13 +18,14 @@ from wlm.probe.model import ProbeModel
 from wlm.probe.places import ball_exposure, ball_radius, probes_of
 from wlm.probe.shader import probe_glsl
 from wlm.probe.sphere import sh_count
+from wlm.probe.transform import TransformModel
 from wlm.web.page import Page, pack_triangles
 
 _BANDS = 9  # coefficients that diffuse light needs
 
 
 def probe_page(
-    model: ProbeModel,
+    model: ProbeModel | TransformModel,
     file_bytes: int,
     *,
     mesh: str | os.PathLike[str] | None = None,
@@ -43,6 +44,8 @@ def probe_page(
         WlmError: A probe's numbers are no spherical harmonics; the positions are not known; the mesh or the original
             can't be read, or is of other probes.
     """
+    if not isinstance(model, ProbeModel):
+        raise WlmError(f"{model.name}: expected Gaussians, which a page decodes, found a file of profile transform")
     coefficients = sh_count(model.outputs)
     if coefficients is None:
         raise WlmError(f"{model.name}: expected spherical harmonics, found {model.outputs} numbers a probe")

@@ -1,0 +1,216 @@
+"""A transform's file: what is coded comes back, has the wanted size or error, and refuses what isn't its own."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from builders.probe_sets import synthetic
+
+import wlm
+from wlm.errors import WlmError
+from wlm.formats.artifact import read_artifact, write_artifact
+from wlm.probe import entropy
+from wlm.probe.data import from_arrays
+from wlm.probe.kriging import Kriging
+from wlm.probe.transform import Places, TransformModel, basis
+from wlm.probe.tree import Tree, flat
+
+RANDOM = np.random.default_rng(0)
+
+
+@pytest.fixture(autouse=True)
+def _same_numbers(monkeypatch):
+    monkeypatch.setitem(globals(), "RANDOM", np.random.default_rng(0))
+
+
+def lattice(side=6, outputs=12):
+    """A lattice with smooth light, [side³] probes, every 50th of them dead."""
+    place = np.stack(np.meshgrid(*[np.arange(side) * 0.5] * 3, indexing="ij"), -1).reshape(-1, 3)
+    wave = np.sin(place @ RANDOM.normal(size=(3, outputs)) + RANDOM.normal(size=outputs))
+    values = (wave + RANDOM.normal(size=wave.shape) * 0.01).astype(np.float32)
+    values[::50] = 0.0
+    return from_arrays(place, values, name="lattice")
+
+
+@pytest.mark.parametrize("kind", ["zeros", "small", "large", "one"])
+def test_whole_numbers_come_back(kind):
+    place = RANDOM.integers(0, 65536, (1 if kind == "one" else 300, 3))
+    tree = Tree(place)
+    size = {"zeros": 0, "small": 2, "large": 2.0**22, "one": 9}[kind]
+    q = np.rint(RANDOM.laplace(size=(len(place), 5)) * size / 12).astype(np.int64)
+    q[-1, -1] = entropy.LARGEST if kind == "large" else 0
+    data = entropy.pack(q, tree.levels, tree.parents)
+    np.testing.assert_array_equal(entropy.unpack(data, 5, tree.levels, tree.parents), q)
+    if kind == "zeros":
+        assert len(data) < 24
+    with pytest.raises(ValueError):
+        entropy.unpack(data + b"\x01\0\0\0", 5, tree.levels, tree.parents)
+
+
+def test_odds_follow_what_is_known():
+    # Laplacian numbers of one scale take their entropy; where it is a row's own, less than if nothing were known of it.
+    for spread, most in ((0.0, 1.02), (1.5, 0.97)):
+        scale = np.exp(RANDOM.normal(size=(4000, 1)) * spread)
+        q = np.rint(RANDOM.laplace(size=(4000, 5)) * scale).astype(np.int64)
+        share = np.unique(q, return_counts=True)[1] / q.size
+        alone = -q.size * (share * np.log2(share)).sum()
+        assert 8 * len(entropy.pack(q, flat(4000), [])) < most * alone
+
+
+@pytest.mark.parametrize("shape", ["scattered", "lattice", "line", "coincident"])
+def test_a_tree_is_undone_and_transposed(shape):
+    place = RANDOM.integers(0, 65536, (200, 3))
+    if shape == "lattice":
+        place = np.stack(np.meshgrid(*[np.arange(6) * 13107] * 3, indexing="ij"), -1).reshape(-1, 3)
+    if shape == "line":
+        place[:, :2] = 7
+    if shape == "coincident":
+        place[50:] = place[:1]
+    tree = Tree(place)
+    assert sorted(np.concatenate(tree.levels)) == list(range(len(place)))
+    a, b = RANDOM.normal(size=(2, len(place), 4))
+    np.testing.assert_allclose(tree.values(tree.coefficients(a)), a, atol=1e-9)
+    assert np.vdot(tree.values(a), b) == pytest.approx(np.vdot(a, tree.adjoint(b)))
+
+
+def test_kriging_is_exact_at_places_even_and_without_jumps():
+    place = RANDOM.random((100, 3))
+    kriging = Kriging(place)
+    light = np.stack([np.ones(100), place @ [1.0, -2.0, 3.0], RANDOM.normal(size=100)], 1)
+
+    def at(point):
+        index, weight = kriging.weights(point)
+        return (light[index] * weight[..., None]).sum(1)
+
+    np.testing.assert_array_equal(at(place), light)
+    path = np.linspace([0.1, 0.2, 0.3], [0.9, 0.7, 0.8], 20001)
+    np.testing.assert_allclose(at(path)[:, 0], 1.0, atol=1e-9)
+    # The K nearest change some fifty times on the way: the largest step is no more than a steep slope's.
+    assert np.abs(np.diff(at(path)[:, 2])).max() < 5e-3
+
+
+def test_the_basis_is_orthonormal_and_begins_with_the_directions():
+    vectors = np.linalg.qr(RANDOM.normal(size=(27, 27)))[0][:5]
+    rounded = np.rint(vectors * 64) / 64
+    found = basis(27, rounded)
+    np.testing.assert_allclose(found.T @ found, np.eye(27), atol=1e-12)
+    along = np.abs(np.einsum("vd,dv->v", rounded @ basis(27, None).T, found[:, :5]))
+    assert (along > 0.97).all()
+
+
+@pytest.mark.parametrize("asked", [{"target_psnr": 30.0}, {"target_psnr": 60.0}, {"max_bytes": 600}])
+def test_the_file_is_as_asked(asked, tmp_path):
+    probes = lattice()
+    model = wlm.probe.compress(probes, positions="max_bytes" in asked, **asked)
+    size = model.save(tmp_path / "a.wlm")
+    report = wlm.probe.evaluate(wlm.load(tmp_path / "a.wlm"), probes)
+    if "target_psnr" in asked:
+        assert asked["target_psnr"] <= report.psnr < asked["target_psnr"] + 1.0
+    else:
+        assert 0.9 * 600 < size <= 600
+    assert not model.decoder().decode_probes(probes.position)[~probes.live].any()
+
+
+def test_what_cannot_be_had_is_one_line():
+    probes = lattice()
+    with pytest.raises(WlmError, match="--max-bytes: expected at least .* for lattice, got 100"):
+        wlm.probe.compress(probes, max_bytes=100)
+    with pytest.raises(WlmError, match="ratio: expected a profile of the method gaussians, found transform"):
+        wlm.probe.compress(probes, ratio=0.1)
+    with pytest.raises(WlmError, match="max_bytes: expected a profile of the method transform, found standard"):
+        wlm.probe.compress(probes, "standard", max_bytes=1000)
+
+
+@pytest.mark.parametrize("positions", [False, True])
+def test_a_file_comes_back_and_knows_its_places(positions, tmp_path):
+    probes = lattice()
+    model = wlm.probe.compress(probes, positions=positions)
+    size = model.save(tmp_path / "a.wlm")
+    back = wlm.load(tmp_path / "a.wlm")
+    assert isinstance(back, TransformModel) and size == model.file_bytes()
+    back.save(tmp_path / "b.wlm")
+    assert (tmp_path / "a.wlm").read_bytes() == (tmp_path / "b.wlm").read_bytes()
+    decoder = back.decoder()
+    if positions:
+        # A lattice's places are worth little more than the line of the header that names them.
+        assert size < wlm.probe.compress(probes).file_bytes() + 300
+        np.testing.assert_allclose(back.stored_positions(), probes.position, atol=2.5 / 65535)
+    else:
+        with pytest.raises(WlmError, match="lattice: the file has no positions"):
+            decoder.decode(probes.position)
+        with pytest.raises(WlmError, match="lattice: holds no positions"):
+            decoder.decode_probes()
+    for other in (probes.position[::-1], probes.position + [[0.1, 0, 0]] * (np.arange(216) == 5)[:, None]):
+        with pytest.raises(WlmError, match="lattice: expected the positions of its own 216 probes"):
+            back.decoder().decode_probes(other)
+    values = decoder.decode_probes(probes.position.astype(np.float32))
+    np.testing.assert_array_equal(values, model.decoder().decode_probes(probes.position))
+    # A place as the file has it is a 65535th of the box from the probe at most.
+    between, slack = decoder.decode(probes.position[probes.live]), 1e-3 if positions else 0.0
+    np.testing.assert_allclose(between, values[probes.live], rtol=0, atol=slack * np.abs(values).max())
+
+
+HARD = {
+    "one probe": (1, 3),
+    "two": (2, 27),
+    "coincident": (30, 5),
+    "constant": (30, 12),
+    "one number": (30, 1),
+    "far": (30, 27),
+    "huge": (30, 27),
+    "tiny": (30, 27),
+}
+
+
+@pytest.mark.parametrize("kind", HARD)
+def test_hard_sets(kind, tmp_path):
+    count, outputs = HARD[kind]
+    place, values = RANDOM.random((count, 3)) * 4, RANDOM.normal(size=(count, outputs)).astype(np.float32)
+    place = np.repeat(place[:1], count, 0) if kind == "coincident" else place + 1e9 * (kind == "far")
+    if kind == "constant":
+        values[:] = 0.25
+    values = values * np.float32({"huge": 1e17, "tiny": 1e-20}.get(kind, 1.0))
+    probes = from_arrays(place, values)
+    wlm.probe.compress(probes, positions=True).save(tmp_path / "a.wlm")
+    decoder = wlm.load(tmp_path / "a.wlm").decoder()
+    decoded = decoder.decode_probes()
+    error = np.sqrt(np.square(decoded.astype(np.float64) - values).mean())
+    assert error <= 0.01 * np.abs(values).max()
+    assert np.isfinite(decoder.decode(place + 0.3)).all()
+
+
+@pytest.mark.parametrize("part", ["light", "places"])
+@pytest.mark.parametrize("change", ["cut", "noise", "gone"])
+def test_damage_that_is_signed_is_one_line(part, change, tmp_path):
+    probes = lattice()
+    wlm.probe.compress(probes, positions=True).save(tmp_path / "a.wlm")
+    artifact = read_artifact(tmp_path / "a.wlm")
+    tensors = dict(artifact.tensors)
+    if change == "gone":
+        del tensors[part]
+    else:
+        data = tensors[part].copy()
+        tensors[part] = data[:-9] if change == "cut" else RANDOM.integers(0, 256, len(data)).astype(np.uint8)
+    write_artifact(tmp_path / "a.wlm", "probe", artifact.settings, tensors, artifact.source)
+    with pytest.raises(WlmError) as error:
+        wlm.load(tmp_path / "a.wlm").decoder().decode_probes()
+    assert "\n" not in str(error.value)
+
+
+def test_light_between_probes_is_better_than_by_distance():
+    probes = synthetic(400)
+    held = np.arange(400) % 5 == 4
+    known = from_arrays(probes.position[~held], probes.values[~held])
+    decoder = wlm.probe.compress(known, target_psnr=50.0).decoder(position=known.position)
+    error = np.square(decoder.decode(probes.position[held]) - probes.values[held]).mean()
+    index, distance = (Kriging(known.position)._tree.query(probes.position[held], k=8)[i] for i in (1, 0))
+    weight = distance**-2.0
+    plain = (known.values[index] * (weight / weight.sum(1, keepdims=True))[..., None]).sum(1)
+    assert error < np.square(plain - probes.values[held]).mean()
+
+
+def test_places_are_the_same_from_floats():
+    place = RANDOM.random((50, 3)) * 30 - 10
+    one, two = Places.of(place), Places.of(place.astype(np.float32).astype(np.float64))
+    np.testing.assert_array_equal(one.code, two.code)
+    assert one.check == two.check != dataclasses.replace(one, code=one.code[::-1]).check

@@ -1,0 +1,90 @@
+"""Grids for three.js: the layout, number by number, and what is refused."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+from builders.probe_models import random_model
+
+from wlm.errors import WlmError
+from wlm.probe import export_grid, load
+from wlm.probe.three_grid import grid_places
+
+
+@pytest.fixture(scope="module")
+def grid(tmp_path_factory):
+    """A model and its grid: 6 x 3 x 5 cells of a box of 8 x 3 x 6."""
+    model = random_model()
+    folder = tmp_path_factory.mktemp("grid") / "out"
+    export_grid(model, folder, cells=6)
+    return model, folder
+
+
+def test_texture_as_three_lays_it_out(grid):
+    model, folder = grid
+    info = json.loads((folder / "grid.json").read_text())
+    nx, ny, nz = info["resolution"]
+    assert (nx, ny, nz) == (6, 3, 5)
+    box = np.array(info["box"])
+    np.testing.assert_allclose(box.mean(0), model.origin + model.extent * model.size / 2)
+    np.testing.assert_allclose(np.array(info["corners"]) - box, [[2 / 3] * 3, [-2 / 3] * 3])
+    texels = np.frombuffer((folder / "grid.ktx2").read_bytes()[-nx * ny * 7 * (nz + 2) * 8 :], "<f2")
+    texels = texels.reshape(7, nz + 2, ny, nx, 4)
+    decoder = model.decoder()
+    for x, y, z in [(0, 0, 0), (5, 2, 4), (3, 1, 2)]:
+        place = box[0] + (np.array([x, y, z]) + 0.5) * 4 / 3
+        got = texels[:, 1 + z, y, x].reshape(-1)
+        np.testing.assert_allclose(got[:27], decoder.decode(place[None])[0], rtol=1e-3, atol=1e-6)
+        assert got[27] == 0.0
+    np.testing.assert_array_equal(texels[:, 0], texels[:, 1])
+    np.testing.assert_array_equal(texels[:, -1], texels[:, -2])
+
+
+def test_a_grid_is_read_as_probes(grid):
+    model, folder = grid
+    probes = load(folder / "grid.json")
+    info = json.loads((folder / "grid.json").read_text())
+    np.testing.assert_array_equal(probes.position, grid_places(np.array(info["box"]), np.array(info["resolution"])))
+    np.testing.assert_allclose(probes.values, model.decoder().decode(probes.position), rtol=1e-3, atol=1e-6)
+    with pytest.raises(WlmError, match="noon"):
+        load(folder / "grid.json", key="noon")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"box": None}, "box: expected two corners"),
+        ({"box": [[0, 0, 0], [1, "a", 1]]}, "box, resolution: expected numbers"),
+        ({"box": [[0, 0, 0], [1, 0, 1]]}, "the lower first"),
+        ({"resolution": [6, 3, 300]}, "resolution: expected three numbers"),
+        ({"resolution": [6, 3, 4]}, "expected .* slices"),
+        ({"texture": 7}, "texture: expected the name"),
+        ({"texture": "../x.ktx2"}, "texture"),
+        ({"texture": "grid.json"}, "expected a KTX2"),
+        ({"texture": "short.ktx2"}, "expected 6 x 3 x 49 texels"),
+        ({"texture": "flat.ktx2"}, "expected one 3D texture"),
+    ],
+)
+def test_a_damaged_grid_is_one_line(grid, tmp_path, change, message):
+    shutil.copytree(grid[1], tmp_path / "out")
+    data = bytearray((tmp_path / "out" / "grid.ktx2").read_bytes())
+    (tmp_path / "out" / "short.ktx2").write_bytes(data[:-1])
+    data[28:32] = bytes(4)  # the depth
+    (tmp_path / "out" / "flat.ktx2").write_bytes(data)
+    path = tmp_path / "out" / "grid.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | change))
+    with pytest.raises(WlmError, match=message) as caught:
+        load(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_export_refuses(tmp_path):
+    for model, settings, message in [
+        (random_model(outputs=12), {}, "expected L2 in RGB"),
+        (random_model(), {"cells": 0}, "cells: expected"),
+        (random_model(), {"cells": 257}, "cells: expected"),
+    ]:
+        with pytest.raises(WlmError, match=message):
+            export_grid(model, tmp_path / "out", **settings)
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,182 @@
+"""Whole numbers of probes as bytes: asymmetric numeral systems, with odds that follow from what is decoded already.
+
+Numbers q [N, K] are coded level by level (`wlm.probe.tree`), in a level one column after the other. What a number is
+expected to be in size, its class of odds, follows from the sizes of its parents' numbers in the same column and of its
+own in the two columns before. A magnitude below 8 is a symbol; a larger one is one of two symbols for each power of
+two, and the bits that the symbol leaves open, whose odds are even. The odds of a class begin as those of a geometric
+distribution and follow the counts; those of a column's signs begin even. All of it is whole numbers, sums, products and
+quotients of IEEE doubles, so that every machine has the same odds. The coder is that of constriction (Bamler,
+Understanding Entropy Coding With Asymmetric Numeral Systems, 2022).
+"""
+
+from collections.abc import Iterator, Sequence
+
+import constriction
+import numpy as np
+
+LARGEST = (1 << 24) - 1
+"""The largest magnitude."""
+
+_DIRECT = 8  # magnitudes that are symbols of their own
+_SYMBOLS = _DIRECT + 2 * 21  # up to LARGEST
+_CLASSES = 43
+_PRIOR = 6.0  # numbers that the first odds of a class are worth
+_EVEN = 8.0  # the same of a sign
+_HALVED = 4096.0  # a class's numbers at which its counts are halved: columns and levels differ
+_FEWEST, _MOST = 8, 2048  # rows that are coded with the same odds
+_CHUNK = 12  # bits that are coded at once
+
+models, AnsCoder = constriction.stream.model, constriction.stream.stack.AnsCoder
+
+
+def pack(q: np.ndarray, levels: Sequence[np.ndarray], parents: Sequence[np.ndarray]) -> bytes:
+    """Codes numbers.
+
+    Args:
+        q: int64 [N, K], magnitudes up to `LARGEST`.
+        levels: int64 [n] each, the rows in their order of coding.
+        parents: int64 [n, P] each, of the levels but the first: rows of earlier ones.
+
+    Returns:
+        The bytes, a multiple of four of them.
+    """
+    size = np.abs(q)
+    steps: list[tuple[np.ndarray, object]] = []
+    odds = _Odds(size.shape[1])
+    for rows, column, classes in _batches(size, levels, parents):
+        symbol, extra, bits = _split(size[rows, column])
+        for kind in np.unique(classes):
+            chosen = symbol[classes == kind]
+            steps.append((chosen, odds.model(kind)))
+            odds.count(kind, chosen)
+        sign = q[rows, column][size[rows, column] > 0] < 0
+        if len(sign):
+            steps.append((sign.astype(np.int64), odds.sign_model(column)))
+            odds.count_signs(column, sign)
+        for width in np.unique(bits[bits > 0]):
+            left = extra[bits == width]
+            for low in range(0, int(width), _CHUNK):
+                part = min(_CHUNK, int(width) - low)
+                steps.append(((left >> low) & ((1 << part) - 1), models.Uniform(1 << part)))
+    coder = AnsCoder()
+    for symbols, model in reversed(steps):
+        coder.encode_reverse(np.ascontiguousarray(symbols, np.int32), model)
+    return coder.get_compressed().astype("<u4").tobytes()
+
+
+def unpack(data: bytes, columns: int, levels: Sequence[np.ndarray], parents: Sequence[np.ndarray]) -> np.ndarray:
+    """Undoes `pack`, int64 [N, K].
+
+    Raises:
+        ValueError: The bytes are none that `pack` makes of so many rows and columns.
+    """
+    if len(data) % 4:
+        raise ValueError(f"expected whole words, found {len(data)} bytes")
+    coder = AnsCoder(np.frombuffer(data, "<u4").astype(np.uint32))
+    count = sum(len(level) for level in levels)
+    q, size = np.zeros((count, columns), np.int64), np.zeros((count, columns), np.int64)
+    odds = _Odds(columns)
+    for rows, column, classes in _batches(size, levels, parents):
+        symbol = np.empty(len(rows), np.int64)
+        for kind in np.unique(classes):
+            chosen = classes == kind
+            symbol[chosen] = decoded = coder.decode(odds.model(kind), int(chosen.sum()))
+            odds.count(kind, decoded)
+        nonzero = symbol > 0
+        sign = np.zeros(len(rows), np.int64)
+        if nonzero.any():
+            sign[nonzero] = coder.decode(odds.sign_model(column), int(nonzero.sum()))
+            odds.count_signs(column, sign[nonzero] > 0)
+        low, bits = _START[symbol], _BITS[symbol]
+        for width in np.unique(bits[bits > 0]):
+            chosen = np.flatnonzero(bits == width)
+            for first in range(0, int(width), _CHUNK):
+                part = min(_CHUNK, int(width) - first)
+                low[chosen] += coder.decode(models.Uniform(1 << part), len(chosen)).astype(np.int64) << first
+        size[rows, column] = low
+        q[rows, column] = np.where(sign > 0, -low, low)
+    if not coder.is_empty():
+        raise ValueError("found more than the numbers of its probes")
+    return q
+
+
+def _batches(
+    size: np.ndarray, levels: Sequence[np.ndarray], parents: Sequence[np.ndarray]
+) -> Iterator[tuple[np.ndarray, int, np.ndarray]]:
+    """Rows, a column, and the class of odds of each row there; `size` is read up to the batch before."""
+    for rows, above in _pieces(levels, parents):
+        for column in range(size.shape[1]):
+            expected = np.zeros(len(rows), np.int64)
+            if above is not None:
+                expected += 32 * size[above, column].sum(1) // above.shape[1]
+            for back, share in ((1, 22), (2, 16)):
+                if column >= back:
+                    expected += share * size[rows, column - back]
+            yield rows, column, np.searchsorted(_EDGES, expected, side="right")
+
+
+def _pieces(
+    levels: Sequence[np.ndarray], parents: Sequence[np.ndarray]
+) -> Iterator[tuple[np.ndarray, np.ndarray | None]]:
+    """Rows of a level, and their parents: as many as there were before, within limits, so that the odds keep up."""
+    seen = 0
+    for number, rows in enumerate(levels):
+        start = 0
+        while start < len(rows):
+            piece = slice(start, start + min(max(seen, _FEWEST), _MOST))
+            yield rows[piece], parents[number - 1][piece] if number else None
+            seen += len(rows[piece])
+            start = piece.stop
+
+
+def _split(size: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Symbols of magnitudes, and the bits that they leave open with their number."""
+    symbol = np.searchsorted(_START, size, side="right") - 1
+    return symbol, size - _START[symbol], _BITS[symbol]
+
+
+# The first magnitude of each symbol, and how many bits tell its magnitudes apart.
+_START = np.array([*range(_DIRECT), *((2 + half) << (power - 1) for power in range(3, 24) for half in (0, 1))])
+_BITS = np.array([0] * _DIRECT + [power - 1 for power in range(3, 24) for half in (0, 1)])
+# Classes of odds, by what is expected in 1/32: two for each power of two.
+_EDGES = np.array([1, 2, 4, 6, *((2 + half) << power for power in range(2, 22) for half in (0, 1))])[: _CLASSES - 1]
+
+
+class _Odds:
+    """Counts of the symbols of each class, and of the signs of each column."""
+
+    def __init__(self, columns: int) -> None:
+        self._count = _first_odds() * _PRIOR
+        self._signs = np.full((columns, 2), _EVEN)
+
+    def model(self, kind: int) -> models.Categorical:
+        count = self._count[kind]
+        return models.Categorical(count / count.sum(), perfect=False)
+
+    def count(self, kind: int, symbols: np.ndarray) -> None:
+        self._count[kind] += np.bincount(symbols, minlength=_SYMBOLS)
+        if self._count[kind].sum() > _HALVED:
+            self._count[kind] = 0.5 * self._count[kind]
+
+    def sign_model(self, column: int) -> models.Categorical:
+        count = self._signs[column]
+        return models.Categorical(count / count.sum(), perfect=False)
+
+    def count_signs(self, column: int, negative: np.ndarray) -> None:
+        self._signs[column] += np.bincount(negative.astype(np.int64), minlength=2)
+
+
+def _first_odds() -> np.ndarray:
+    """Geometric distributions, one for each class; products alone, whose rounding is the same everywhere."""
+    middle = np.concatenate([[0.5], 0.5 * (_EDGES[1:] + _EDGES[:-1]), [1.5 * _EDGES[-1]]]) / 32.0
+    mean = 0.01 + 0.55 * middle
+    powers = [mean / (1.0 + mean)]  # of the ratio: to 1, 2, 4, 8 ...
+    for _ in range(24):
+        powers.append(powers[-1] * powers[-1])
+    survive = np.ones((len(mean), _SYMBOLS + 1))
+    for symbol, start in enumerate([*_START.tolist(), LARGEST + 1]):
+        for bit in range(25):
+            if start >> bit & 1:
+                survive[:, symbol] *= powers[bit]
+    odds = survive[:, :-1] - survive[:, 1:]
+    return odds + 3e-5

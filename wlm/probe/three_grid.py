@@ -1,0 +1,196 @@
+"""Grids of probes as three.js has them: `LightProbeGrid`, a texture of spherical harmonics over a box.
+
+Layout, from its source (examples/jsm/lighting/LightProbeGridWebGL.js of r187): one 3D texture in RGBA of nx x ny x
+7 (nz + 2) texels. A probe's 27 numbers, coefficient after coefficient, of each red, green and blue, and one 0, are cut
+into 7 texels; volume t of them has slices t (nz + 2) to (t + 1) (nz + 2) - 1, of which the first and the last are
+copies of their neighbours. The coefficients are ours: radiance on the orthonormal real basis, all signs plus. Since
+r187 a probe stands at the centre of its cell of the box; up to r186 the outermost ones stood on its faces. The export
+has both boxes, and its loader takes that of the three.js that it runs in.
+"""
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from wlm.errors import WlmError
+from wlm.formats.folder import make_parents, staged, write_index
+from wlm.formats.ktx2 import read_half_volume, write_ktx2
+from wlm.formats.reading import named_file
+from wlm.probe.conventions import THREE_GRID as FORMAT
+from wlm.probe.decode import Decoder
+from wlm.probe.model import ProbeModel
+from wlm.probe.transform import TransformModel
+from wlm.probe.transform_decode import TransformDecoder
+
+_VERSION = 1
+INFO_FILE = "grid.json"
+TEXTURE_FILE = "grid.ktx2"
+LOADER_FILE = "grid.js"
+CELLS = 24
+"""Cells along the longest side of the box, where no number is given."""
+
+_FILES = {INFO_FILE, TEXTURE_FILE, LOADER_FILE}
+_PARTS, _NUMBERS = 7, 27
+_MOST_CELLS = 256
+_FARTHEST = 1e100
+_ROWS = 65536  # of points decoded at a time
+_ABOUT = (
+    "Light for three.js: grid.js loads grid.ktx2 with its KTX2Loader into its LightProbeGrid. box is that of the "
+    "cells, with a probe at the centre of each (r187 and later), corners that of the probes themselves (up to r186). "
+    "Positions are the scene's own."
+)
+
+_LOADER = """\
+// Loads the light beside this file into a LightProbeGrid, for scene.add().
+//
+//     import { KTX2Loader } from 'three/addons/loaders/KTX2Loader.js';
+//     import { LightProbeGridWebGL } from 'three/addons/lighting/LightProbeGridWebGL.js';
+//     scene.add(await loadLightProbeGrid(new URL('grid.json', import.meta.url), renderer, THREE, KTX2Loader,
+//                                        LightProbeGridWebGL));
+//
+// With WebGPURenderer, and up to r185, the class is LightProbeGrid.
+export async function loadLightProbeGrid(url, renderer, THREE, KTX2Loader, Grid)
+{
+    const info = await (await fetch(url)).json();
+    const loader = new KTX2Loader().detectSupport(renderer);
+    const texture = await loader.loadAsync(new URL(info.texture, new URL(url, document.baseURI)).href);
+    loader.dispose();
+    texture.minFilter = texture.magFilter = THREE.LinearFilter;
+    texture.generateMipmaps = false;
+    texture.colorSpace = THREE.NoColorSpace;
+    texture.needsUpdate = true;
+    const [low, high] = parseInt(THREE.REVISION) >= 187 ? info.box : info.corners;
+    const grid = new Grid(high[0] - low[0], high[1] - low[1], high[2] - low[2], ...info.resolution);
+    grid.position.set((low[0] + high[0]) / 2, (low[1] + high[1]) / 2, (low[2] + high[2]) / 2);
+    grid.texture = texture;
+    grid.updateBoundingBox();
+    return grid;
+}
+"""
+
+
+def export_grid(
+    model: ProbeModel | TransformModel,
+    directory: str | os.PathLike[str],
+    *,
+    cells: int = CELLS,
+    position: np.ndarray | None = None,
+    device: str = "cpu",
+) -> list[Path]:
+    """Writes a model's light as a grid for three.js: `grid.ktx2`, `grid.json`, and `grid.js`, which loads them.
+
+    The probes stand at the centres of cubic cells that fill the probes' box, and have what `Decoder.decode` gives
+    there, in half floats.
+
+    Args:
+        model: Of L2 in RGB.
+        directory: The folder; made if it isn't there. A new export replaces an earlier one.
+        cells: Along the longest side of the box, 1 to 256.
+        position: [N, 3], of the model's own probes, for a transform whose file has none.
+        device: Where it is decoded.
+
+    Returns:
+        The files written, `grid.json` last.
+
+    Raises:
+        WlmError: Another number of coefficients, cells out of range, light beyond half floats, no such device, or the
+            folder can't be written.
+    """
+    if model.outputs != _NUMBERS:
+        raise WlmError(f"{model.name}: expected L2 in RGB, 27 numbers a probe, got {model.outputs}")
+    if not 1 <= cells <= _MOST_CELLS:
+        raise WlmError(f"cells: expected 1 to {_MOST_CELLS} along the longest side, got {cells}")
+    if isinstance(model, TransformModel):
+        position = model.stored_positions() if position is None else position
+        decoder: Decoder | TransformDecoder = TransformDecoder(model, device, position=position)
+        corner, span = position.min(0), np.ptp(position, axis=0)
+    else:
+        decoder, corner, span = Decoder(model, device), model.origin, model.extent * model.size
+    size = float(span.max()) / cells or 1.0  # all probes in one place: one cell
+    count = np.clip(np.ceil(span / size - 1e-6), 1, cells).astype(int)
+    low = corner + span / 2 - count * size / 2
+    box = np.stack([low, low + count * size])
+    places = grid_places(box, count)
+    values = np.concatenate([decoder.decode(places[i : i + _ROWS]) for i in range(0, len(places), _ROWS)])
+    if not np.abs(values).max() <= np.finfo(np.float16).max:
+        raise WlmError(f"{model.name}: expected light within half floats, got {np.abs(values).max():.3g}")
+    texels = pack(values, count)
+    document = {
+        "format": FORMAT,
+        "version": _VERSION,
+        "about": _ABOUT,
+        "name": model.name,
+        "texture": TEXTURE_FILE,
+        "resolution": count.tolist(),
+        "box": box.tolist(),
+        "corners": [(box[0] + size / 2).tolist(), (box[1] - size / 2).tolist()],
+    }
+    folder = Path(directory)
+    make_parents(folder)
+    with staged(folder, INFO_FILE, FORMAT, _FILES.__contains__) as temporary:
+        depth, height, width, _ = texels.shape
+        write_ktx2(temporary / TEXTURE_FILE, texels.tobytes(), width, height, "R16G16B16A16_SFLOAT", depth)
+        (temporary / LOADER_FILE).write_text(_LOADER, encoding="utf-8")
+        write_index(temporary / INFO_FILE, document)
+    return [folder / name for name in (TEXTURE_FILE, LOADER_FILE, INFO_FILE)]
+
+
+def read_grid(path: Path, document: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+    """Reads what `export_grid` wrote, and any grid in that form.
+
+    Args:
+        path: `grid.json`.
+        document: What it says.
+
+    Returns:
+        float64 [N, 3], places; float32 [N, 9, 3].
+
+    Raises:
+        WlmError: A field is missing or wrong, or the texture can't be read or has another size.
+    """
+    box, count, name = (document.get(field) for field in ("box", "resolution", "texture"))
+    try:
+        corners, cells = np.array(box, np.float64), np.array(count)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise WlmError(f"{path}: box, resolution: expected numbers, got others") from error
+    if corners.shape != (2, 3) or not (np.abs(corners) < _FARTHEST).all() or not (corners[1] > corners[0]).all():
+        raise WlmError(f"{path}: box: expected two corners, the lower first")
+    if cells.shape != (3,) or cells.dtype.kind != "i" or not ((cells >= 1) & (cells <= _MOST_CELLS)).all():
+        raise WlmError(f"{path}: resolution: expected three numbers of 1 to {_MOST_CELLS}")
+    if not isinstance(name, str):
+        raise WlmError(f"{path}: texture: expected the name of a file")
+    texels = read_half_volume(named_file(path, name, f"{path}: texture"))
+    expected = (_PARTS * (int(cells[2]) + 2), int(cells[1]), int(cells[0]))
+    if texels.shape[:3] != expected:
+        raise WlmError(f"{path}: texture: expected {expected} slices, rows and texels, got {texels.shape[:3]}")
+    return grid_places(corners, cells), unpack(texels).reshape(-1, 9, 3)
+
+
+def grid_places(box: np.ndarray, count: np.ndarray) -> np.ndarray:
+    """Centres of the cells, float64 [nz * ny * nx, 3], x fastest.
+
+    Args:
+        box: [2, 3], lowest and highest corner.
+        count: [3], cells along x, y and z.
+    """
+    axes = [low + (high - low) * (np.arange(n) + 0.5) / n for low, high, n in zip(*box, count, strict=True)]
+    z, y, x = np.meshgrid(*axes[::-1], indexing="ij")
+    return np.stack([x, y, z], -1).reshape(-1, 3)
+
+
+def pack(values: np.ndarray, count: np.ndarray) -> np.ndarray:
+    """The texture of probes [nz * ny * nx, 27] in the order of `grid_places`: float16 [7 (nz + 2), ny, nx, 4]."""
+    nx, ny, nz = (int(n) for n in count)
+    padded = np.zeros((nz, ny, nx, 4 * _PARTS), "<f2")
+    padded[..., :_NUMBERS] = np.asarray(values).reshape(nz, ny, nx, _NUMBERS)
+    parts = np.moveaxis(padded.reshape(nz, ny, nx, _PARTS, 4), 3, 0)
+    return np.concatenate([parts[:, :1], parts, parts[:, -1:]], 1).reshape(-1, ny, nx, 4)
+
+
+def unpack(texels: np.ndarray) -> np.ndarray:
+    """The probes, float32 [nz * ny * nx, 27], of a texture of `pack`."""
+    _, ny, nx, _ = texels.shape
+    parts = texels.reshape(_PARTS, -1, ny, nx, 4)[:, 1:-1]
+    return np.moveaxis(parts, 0, 3).reshape(-1, 4 * _PARTS)[:, :_NUMBERS].astype(np.float32)

@@ -1,0 +1,108 @@
+"""Probes from coarse to fine, each but the first predicted from coarser ones: a transform over free positions.
+
+A level has one probe for each cube of a grid that no coarser level has a probe in, the next level's cubes have half the
+side. A probe's value is the kriging of the nearest eight of the coarser levels plus its own coefficient (the predicting
+transform of point clouds, Mammou, Tourapis, Kim, Robinet, Valentin and Su, Lifting Scheme for Lossy Attribute Encoding,
+MPEG m42640, 2018):
+
+    value[i] = sum_j w_ij value[parent_ij] + coefficient[i]
+
+A coefficient of a coarse probe reaches many values: `reach` is about the length of what one unit of it changes.
+"""
+
+import numpy as np
+from scipy import sparse
+
+from wlm.probe.kriging import Kriging
+
+PARENTS = 8
+_FINEST = 18  # halvings: positions have 16 bits an axis
+
+
+class Tree:
+    """The levels of some places.
+
+    Attributes:
+        levels: int64 [n] each, probes of a level in their order, the coarsest first.
+        parents: int64 [n, K] each, of the levels but the first.
+        reach: float64 [N], at least 1.
+    """
+
+    def __init__(self, code: np.ndarray):
+        """Makes the levels.
+
+        Args:
+            code: int [N, 3], positions in whole numbers below 2^16: all that follows depends on these alone.
+        """
+        place = code.astype(np.float64)
+        self.levels = _levels(code.astype(np.int64))
+        self.parents: list[np.ndarray] = []
+        self.reach = np.ones(len(code))
+        self._down: list[sparse.csr_matrix] = []
+        known = self.levels[0]
+        weights = []
+        for level in self.levels[1:]:
+            index, weight = Kriging(place[known], PARENTS).weights(place[level])
+            self.parents.append(known[index])
+            weights.append(weight)
+            self._down.append(_matrix(self.parents[-1], weight, len(code)))
+            known = np.concatenate([known, level])
+        for level, parents, weight in zip(self.levels[:0:-1], self.parents[::-1], weights[::-1], strict=True):
+            np.add.at(self.reach, parents, np.square(weight) * self.reach[level][:, None])
+        self.reach = np.sqrt(self.reach)
+        self._up = [matrix.T.tocsr() for matrix in self._down]
+
+    def values(self, coefficient: np.ndarray) -> np.ndarray:
+        """Values [N, D] of coefficients [N, D]."""
+        value = coefficient.copy()
+        for level, matrix in zip(self.levels[1:], self._down, strict=True):
+            value[level] += matrix @ value
+        return value
+
+    def coefficients(self, value: np.ndarray) -> np.ndarray:
+        """Coefficients [N, D] of values [N, D]: undoes `values`."""
+        result = value.copy()
+        for level, matrix in zip(self.levels[1:], self._down, strict=True):
+            result[level] -= matrix @ value
+        return result
+
+    def adjoint(self, value: np.ndarray) -> np.ndarray:
+        """The transpose of `values`, [N, D] to [N, D]."""
+        result = value.copy()
+        for level, matrix in zip(self.levels[:0:-1], self._up[::-1], strict=True):
+            result += matrix @ result[level]
+        return result
+
+
+def flat(count: int) -> list[np.ndarray]:
+    """The one level of probes that predict nothing."""
+    return [np.arange(count)]
+
+
+def _matrix(parents: np.ndarray, weight: np.ndarray, count: int) -> sparse.csr_matrix:
+    start = np.arange(len(parents) + 1) * parents.shape[1]
+    return sparse.csr_matrix((weight.ravel(), parents.ravel(), start), shape=(len(parents), count))
+
+
+def _levels(code: np.ndarray) -> list[np.ndarray]:
+    chosen = np.zeros(len(code), bool)
+    levels = []
+    for halving in range(_FINEST):
+        # Sides are powers of two, whole cubes of 2^16: their numbers are exact.
+        cell = code >> max(16 - halving, 0)
+        key = (cell[:, 0] << 42) | (cell[:, 1] << 21) | cell[:, 2]
+        free = np.flatnonzero(~chosen & ~np.isin(key, key[chosen]))
+        if halving == _FINEST - 1:
+            # The last are where another probe is.
+            free = np.flatnonzero(~chosen)
+        elif len(free):
+            middle = (2 * cell[free] + 1 << max(16 - halving, 0)) - 2 * code[free]
+            order = np.lexsort((np.square(middle).sum(1), key[free]))
+            first = np.diff(key[free][order], prepend=-1) != 0
+            free = np.sort(free[order[first]])
+        if len(free):
+            chosen[free] = True
+            levels.append(free)
+        if chosen.all():
+            break
+    return levels

@@ -1,0 +1,462 @@
+"""A frame of the cascaded volume on its device: which blocks are new, what fills them, and where they are kept.
+
+The launches of a frame, whose sizes never change, so that a graph can hold them:
+
+1. `look` takes the new windows; `scroll` finds for each slot the block that it now stands for, whether a probe is near
+   that block, and whether the pool still has it. What it hasn't waits, and is counted by its distance to the viewer.
+2. `choose` finds the distance within which enough blocks wait, gathers those and ranks them: the nearest are decoded,
+   in sides of their own and with what is behind the viewer as if it were twice as far; of two as near the finer one,
+   then the one of the lower slot.
+3. `allocate` gives each a row of the pool: the least recently used one of a group of rows that no other takes from.
+   Groups take turns. A row whose block is in a window is never given away.
+4. `search` finds the probes in a block's reach, 64 ranges of the sorted cells; `volume_weights` weighs up to 16.
+5. `combine` makes the block's light of theirs, at most half of their range beyond them.
+"""
+
+import warp as wp
+
+from wlm_kernels.probe.volume import wrap
+
+PROBES = 16  # that decide a block
+HALVES = 64  # of a block's reach: four half sides along each axis
+BINS = 4096  # of the distance, a cube of 16
+TOTALS = BINS + BINS // 16 + BINS // 256  # with the sums over 16 of them, and over 256
+GROUP = 64  # rows of the pool, of which one is chosen
+MOST = 4096  # blocks that are ranked
+QUEUED, DROPPED, CACHED, LEFT, UPDATED, DECODED, GATHERED = range(7)
+"""Counters of a frame; the last is that of `choose`."""
+
+_PROBES = wp.constant(PROBES)
+_QUEUED, _DROPPED, _CACHED, _LEFT, _UPDATED, _GATHERED = (
+    wp.constant(i) for i in (QUEUED, DROPPED, CACHED, LEFT, UPDATED, GATHERED)
+)
+_BINS = wp.constant(BINS)
+_SIXTEENS = wp.constant(BINS + BINS // 16)
+_BEYOND = wp.constant(0.5)
+_LIMIT = wp.constant(1 << 20)  # blocks along an axis of the finest level
+# Morton keys: steps that spread 21 bits out to every third one.
+_M0, _M1, _M2, _M3, _M4 = (
+    wp.constant(wp.int64(mask))
+    for mask in (0x001F00000000FFFF, 0x001F0000FF0000FF, 0x100F00F00F00F00F, 0x10C30C30C30C30C3, 0x1249249249249249)
+)
+
+vec16i = wp.types.vector(length=16, dtype=int)
+
+LEVELS = 8
+Bases = wp.types.matrix(shape=(LEVELS, 3), dtype=int)
+Views = wp.types.matrix(shape=(LEVELS, 4), dtype=float)
+
+
+@wp.struct
+class Index:
+    """Probes by cell, and the blocks that have one near; see `wlm.probe.index`.
+
+    Attributes:
+        key: [N], rising.
+        number: [N].
+        cell: [N].
+        place: [N].
+        normal: [N], of the surface that each lies on, of unit length; 0: it lies on none, or none is known.
+        block: [W], rising within a level.
+        level_start: [L + 1].
+        ratios: [L], sides of the levels over the finest.
+    """
+
+    key: wp.array1d[wp.int64]
+    number: wp.array1d[int]
+    cell: wp.array1d[wp.vec3i]
+    place: wp.array1d[wp.vec3]
+    normal: wp.array1d[wp.vec3]
+    block: wp.array1d[wp.int64]
+    level_start: wp.array1d[int]
+    ratios: wp.array1d[int]
+
+
+@wp.struct
+class Windows:
+    """What each level's window holds; S slots.
+
+    Attributes:
+        bases: [L].
+        views: [L], see `wlm_kernels.probe.volume`.
+        held: [S], the block that a slot stands for.
+        wanted: [S], its number among the index's blocks, -1 where no probe is near.
+        pages: [S], its row of the pool, or -1.
+        away: [S], how far blocks that wait are, see `_rank_of`; else -1.
+        forward: [1], where the viewer looks, of unit length, or 0.
+    """
+
+    bases: wp.array1d[wp.vec3i]
+    views: wp.array1d[wp.vec4]
+    held: wp.array1d[wp.vec3i]
+    wanted: wp.array1d[int]
+    pages: wp.array1d[int]
+    away: wp.array1d[float]
+    forward: wp.array1d[wp.vec3]
+
+
+@wp.struct
+class Pool:
+    """The rows in which blocks lie, R of them, in use or kept for their return.
+
+    Attributes:
+        stamp: [R], the last frame in which the row's block was in a window; -1 for a row without one.
+        owner: [R], its block's number in the index, or -1.
+        rows: [W], the row of each block of the index, or -1.
+    """
+
+    stamp: wp.array1d[int]
+    owner: wp.array1d[int]
+    rows: wp.array1d[int]
+
+
+@wp.struct
+class Work:
+    """What one launch of a frame leaves for the next; B blocks are decoded at most.
+
+    Attributes:
+        clock: [1], the frame's number.
+        counters: [7].
+        histogram: [TOTALS], blocks that wait by distance.
+        limit: [1], the last bin that is gathered.
+        gathered: [MOST], slots.
+        distance: [MOST], how far away each is.
+        chosen: [B], slots, or -1.
+        taken: [B], rows of the pool, or -1.
+        begin, count: [B, 64], ranges of the index.
+        numbers: [B * 16], probes.
+        weights: [B, 16].
+    """
+
+    clock: wp.array1d[int]
+    counters: wp.array1d[int]
+    histogram: wp.array1d[int]
+    limit: wp.array1d[int]
+    gathered: wp.array1d[int]
+    distance: wp.array1d[float]
+    chosen: wp.array1d[int]
+    taken: wp.array1d[int]
+    begin: wp.array2d[int]
+    count: wp.array2d[int]
+    numbers: wp.array1d[int]
+    weights: wp.array2d[float]
+
+
+@wp.func
+def _spread(i: int) -> wp.int64:
+    b = wp.int64(i)
+    b = (b | b << wp.int64(32)) & _M0
+    b = (b | b << wp.int64(16)) & _M1
+    b = (b | b << wp.int64(8)) & _M2
+    b = (b | b << wp.int64(4)) & _M3
+    return (b | b << wp.int64(2)) & _M4
+
+
+@wp.func
+def morton(cell: wp.vec3i) -> wp.int64:
+    return _spread(cell[0]) | _spread(cell[1]) << wp.int64(1) | _spread(cell[2]) << wp.int64(2)
+
+
+@wp.func
+def _lower(keys: wp.array1d[wp.int64], first: int, last: int, key: wp.int64) -> int:
+    """The first of keys[first:last], which rise, that is no less than a key; `last` where none is."""
+    low = first
+    high = last
+    while low < high:
+        middle = (low + high) // 2
+        if keys[middle] < key:
+            low = middle + 1
+        else:
+            high = middle
+    return low
+
+
+@wp.func
+def _find(index: Index, level: int, block: wp.vec3i) -> int:
+    if wp.min(wp.min(block[0], block[1]), block[2]) < 0 or wp.max(wp.max(block[0], block[1]), block[2]) >= _LIMIT:
+        return -1
+    last = index.level_start[level + 1]
+    key = morton(block)
+    i = _lower(index.block, index.level_start[level], last, key)
+    if i < last:
+        if index.block[i] == key:
+            return i
+    return -1
+
+
+@wp.func
+def _rank_of(away: wp.vec3, forward: wp.vec3) -> float:
+    """The squared distance in sides; of what lies behind the viewer as if it were twice as far."""
+    squared = wp.length_sq(away)
+    if squared > 0.0:
+        squared += 1.5 * squared * (wp.length(forward) - wp.dot(away, forward) / wp.sqrt(squared))
+    return squared
+
+
+@wp.func
+def _bin(away: float, side: int, forward: wp.vec3) -> int:
+    half = 0.5 * float(side) + 1.0
+    most = 3.0 * half * half * (1.0 + 3.0 * wp.length(forward))
+    return wp.min(int(away * float(_BINS) / most), _BINS - 1)
+
+
+@wp.kernel(enable_backward=False)
+def _look(bases: Bases, views: Views, forward: wp.vec3, frame: int, windows: Windows, work: Work):
+    i = wp.tid()
+    if i < windows.bases.shape[0]:
+        windows.bases[i] = wp.vec3i(bases[i, 0], bases[i, 1], bases[i, 2])
+        windows.views[i] = wp.vec4(views[i, 0], views[i, 1], views[i, 2], views[i, 3])
+    if i == 0:
+        work.clock[0] = frame
+        windows.forward[0] = forward
+    if i < work.counters.shape[0]:
+        work.counters[i] = 0
+    if i < work.chosen.shape[0]:
+        work.chosen[i] = -1
+
+
+@wp.kernel(enable_backward=False)
+def _scroll(index: Index, windows: Windows, pool: Pool, side: int, work: Work):
+    s = wp.tid()
+    plane = side * side
+    level = s // (plane * side)
+    base = windows.bases[level]
+    local = wp.vec3i(
+        wrap(s // plane % side - base[0], side), wrap(s // side % side - base[1], side), wrap(s % side - base[2], side)
+    )
+    block = base + local
+    held = windows.held[s]
+    wanted = windows.wanted[s]
+    if block[0] != held[0] or block[1] != held[1] or block[2] != held[2]:
+        if wanted >= 0 and windows.pages[s] < 0:
+            wp.atomic_add(work.counters, _DROPPED, 1)
+        windows.held[s] = block
+        wanted = _find(index, level, block)
+        windows.wanted[s] = wanted
+        if wanted >= 0:
+            wp.atomic_add(work.counters, wp.where(pool.rows[wanted] >= 0, _CACHED, _QUEUED), 1)
+    row = int(-1)
+    away = float(-1.0)
+    if wanted >= 0:
+        row = pool.rows[wanted]
+        if row >= 0:
+            pool.stamp[row] = work.clock[0]
+        else:
+            view = windows.views[level]
+            # From the viewer, whom the view puts at -(x, y, z) of the window's middle.
+            d = wp.vec3(
+                float(local[0] - side // 2) - view[0],
+                float(local[1] - side // 2) - view[1],
+                float(local[2] - side // 2) - view[2],
+            )
+            away = _rank_of(d, windows.forward[0])
+            bin = _bin(away, side, windows.forward[0])
+            wp.atomic_add(work.histogram, bin, 1)
+            wp.atomic_add(work.histogram, _BINS + bin // 16, 1)
+            wp.atomic_add(work.histogram, _SIXTEENS + bin // 256, 1)
+    windows.pages[s] = row
+    windows.away[s] = away
+
+
+@wp.func
+def _descend(histogram: wp.array1d[int], first: int, budget: int, before: int):
+    """Of 16 counts the first with which a sum reaches the budget, or the last; and the sum before it."""
+    counts = vec16i()
+    for i in range(16):  # unrolled, so that all are under way at once
+        counts[i] = histogram[first + i]
+    at = int(15)
+    sum_before = before
+    found = int(0)
+    for i in range(16):
+        if found == 0:
+            if before + counts[i] >= budget or i == 15:
+                at = i
+                sum_before = before
+                found = 1
+            before += counts[i]
+    return at, sum_before
+
+
+@wp.kernel(enable_backward=False)
+def _find_limit(work: Work):
+    budget = work.chosen.shape[0]
+    total = int(0)
+    for i in range(16):
+        total += work.histogram[_SIXTEENS + i]
+    group, before = _descend(work.histogram, _SIXTEENS, budget, 0)
+    sixteen, before_sixteen = _descend(work.histogram, _BINS + 16 * group, budget, before)
+    bin, _before = _descend(work.histogram, 16 * (16 * group + sixteen), budget, before_sixteen)
+    work.limit[0] = 16 * (16 * group + sixteen) + bin
+    work.counters[_LEFT] = total
+
+
+@wp.kernel(enable_backward=False)
+def _gather(windows: Windows, side: int, work: Work):
+    s = wp.tid()
+    away = windows.away[s]
+    if away >= 0.0:
+        if _bin(away, side, windows.forward[0]) <= work.limit[0]:
+            i = wp.atomic_add(work.counters, _GATHERED, 1)
+            if i < work.gathered.shape[0]:
+                work.gathered[i] = s
+                work.distance[i] = away
+
+
+@wp.kernel(enable_backward=False)
+def _rank(work: Work):
+    i = wp.tid()
+    if i < work.histogram.shape[0]:
+        work.histogram[i] = 0
+    count = wp.min(work.counters[_GATHERED], work.gathered.shape[0])
+    if i < count:
+        slot = work.gathered[i]
+        away = work.distance[i]
+        nearer = int(0)
+        for j in range(count):
+            d = work.distance[j]
+            if d < away or (d == away and work.gathered[j] < slot):
+                nearer += 1
+        if nearer < work.chosen.shape[0]:
+            work.chosen[nearer] = slot
+
+
+@wp.kernel(enable_backward=False)
+def _allocate(windows: Windows, pool: Pool, size: int, work: Work):
+    k = wp.tid()
+    taken = int(-1)
+    slot = work.chosen[k]
+    if slot >= 0:
+        frame = work.clock[0]
+        groups = pool.stamp.shape[0] // size
+        # Of one frame no two blocks look in one group: there are as many groups as blocks, or more.
+        first = (frame % groups * work.chosen.shape[0] + k) % groups * size
+        oldest = frame
+        for i in range(size):
+            stamp = pool.stamp[first + i]
+            if stamp < oldest:
+                oldest = stamp
+                taken = first + i
+        if taken >= 0:
+            before = pool.owner[taken]
+            if before >= 0:
+                pool.rows[before] = -1
+            wanted = windows.wanted[slot]
+            pool.owner[taken] = wanted
+            pool.rows[wanted] = taken
+            pool.stamp[taken] = frame
+            windows.pages[slot] = taken
+            wp.atomic_add(work.counters, _UPDATED, 1)
+            wp.atomic_sub(work.counters, _LEFT, 1)
+    work.taken[k] = taken
+
+
+@wp.kernel(enable_backward=False)
+def _find_ranges(index: Index, windows: Windows, side: int, work: Work):
+    k, j = wp.tid()
+    count = int(0)
+    if work.taken[k] >= 0:
+        slot = work.chosen[k]
+        ratio = index.ratios[slot // (side * side * side)]
+        # In half sides of the block, each of which is `ratio` cells wide and a cell of the octree.
+        half = 2 * windows.held[slot] + wp.vec3i(j // 16 - 1, j // 4 % 4 - 1, j % 4 - 1)
+        if wp.min(wp.min(half[0], half[1]), half[2]) >= 0:
+            last = index.key.shape[0]
+            begin = _lower(index.key, 0, last, morton(ratio * half))
+            # Of the last cell in it; the cells of one half are neighbours in the list.
+            end = _lower(index.key, begin, last, morton(ratio * half + wp.vec3i(ratio - 1)) + wp.int64(1))
+            work.begin[k, j] = begin
+            count = end - begin
+    work.count[k, j] = count
+
+
+@wp.kernel(enable_backward=False)
+def _combine(work: Work, light: wp.array2d[float], pool: wp.array2d[float]):
+    k, c = wp.tid()
+    row = work.taken[k]
+    if row >= 0:
+        s = float(0.0)
+        low = float(wp.inf)
+        high = -float(wp.inf)
+        for i in range(_PROBES):
+            w = work.weights[k, i]
+            if w != 0.0:
+                value = light[k * _PROBES + i, c]
+                s += w * value
+                low = wp.min(low, value)
+                high = wp.max(high, value)
+        # What a block guesses beyond its probes ends at half of their range.
+        room = _BEYOND * (high - low)
+        pool[row, c] = wp.clamp(s, low - room, high + room)
+
+
+@wp.kernel(enable_backward=False)
+def _take_rows(values: wp.array2d[float], numbers: wp.array1d[int], out: wp.array2d[float]):
+    i, c = wp.tid()
+    out[i, c] = values[numbers[i], c]
+
+
+@wp.kernel(enable_backward=False)
+def _take_points(points: wp.array1d[wp.vec3], numbers: wp.array1d[int], out: wp.array1d[wp.vec3]):
+    i = wp.tid()
+    out[i] = points[numbers[i]]
+
+
+def look(bases: Bases, views: Views, forward, frame: int, windows: Windows, work: Work) -> None:
+    """Takes a frame's windows and number; what changes from frame to frame is in the arguments of this launch alone.
+
+    Args:
+        bases: First block of each window, in the index's numbers.
+        views: See `Windows`.
+        forward: vec3, where the viewer looks, of unit length; 0: nowhere.
+        frame: The frame's number, rising.
+        windows, work: Written.
+    """
+    count = max(LEVELS, work.counters.shape[0], work.chosen.shape[0])
+    wp.launch(_look, count, inputs=[bases, views, forward, frame, windows, work], device=work.clock.device)
+
+
+def scroll(index: Index, windows: Windows, pool: Pool, side: int, work: Work) -> None:
+    """Finds what each slot stands for, and what waits."""
+    inputs = [index, windows, pool, side, work]
+    wp.launch(_scroll, windows.held.shape, inputs=inputs, device=work.clock.device)
+
+
+def choose(windows: Windows, side: int, work: Work) -> None:
+    """Chooses the blocks to decode in this frame."""
+    device = work.clock.device
+    wp.launch(_find_limit, 1, inputs=[work], device=device)
+    wp.launch(_gather, windows.held.shape, inputs=[windows, side, work], device=device)
+    wp.launch(_rank, max(MOST, work.histogram.shape[0]), inputs=[work], device=device)
+
+
+def allocate(windows: Windows, pool: Pool, work: Work) -> None:
+    """Gives the chosen blocks their rows; one that gets none, where its group is all in use, goes on waiting."""
+    size = max(1, min(GROUP, pool.stamp.shape[0] // work.chosen.shape[0]))
+    wp.launch(_allocate, work.chosen.shape, inputs=[windows, pool, size, work], device=work.clock.device)
+
+
+def search(index: Index, windows: Windows, side: int, work: Work) -> None:
+    """Finds the probes of the chosen blocks, as ranges of the index."""
+    inputs = [index, windows, side, work]
+    wp.launch(_find_ranges, work.count.shape, inputs=inputs, device=work.clock.device)
+
+
+def combine(work: Work, light: wp.array, pool: wp.array) -> None:
+    """Writes the blocks' light.
+
+    Args:
+        work: With the weights.
+        light: float [B * 16, D], of the probes `work.numbers`.
+        pool: float [R, D], written.
+    """
+    wp.launch(_combine, (work.chosen.shape[0], pool.shape[1]), inputs=[work, light, pool], device=pool.device)
+
+
+def take_rows(values: wp.array, numbers: wp.array, out: wp.array) -> None:
+    """Rows [M, D] of an array [N, D] by their numbers [M]."""
+    wp.launch(_take_rows, out.shape, inputs=[values, numbers, out], device=out.device)
+
+
+def take_points(points: wp.array, numbers: wp.array, out: wp.array) -> None:
+    """Points [M] of an array [N] by their numbers [M]."""
+    wp.launch(_take_points, out.shape, inputs=[points, numbers, out], device=out.device)
