@@ -183,6 +183,8 @@ def from_layers(
                 f"channels, got {layer.encoding!r} and {len(channels)}"
             )
         for sheet in sheets_of(layer.atlas, layer.name, channels, layer.encoding):
+            if sheet in sizes:
+                raise WlmError(f"{name}: {layer.atlas}/{layer.name}: expected each channel of a layer once")
             sizes[sheet] = frames.shape[1:3]
             sources[sheet] = frames, [channels.index(channel) for channel in sheet.channels]
     check_sheets(name, sizes)

@@ -286,8 +286,9 @@ def _layer(path: Path, name: str, value: Any) -> Layer:
     if options.get("channels") is None:
         return Layer(name, encoding)
     channels = field(path, options, "channels", f"{place}.", is_list, f"a list of 1 to {MOST_CHANNELS} channels")
-    if len(channels) > MOST_CHANNELS or not all(_is_channel(channel) for channel in channels):
-        raise WlmError(f"{path}: {place}.channels: expected 1 to {MOST_CHANNELS} names of channels")
+    named = len(channels) <= MOST_CHANNELS and all(_is_channel(channel) for channel in channels)
+    if not named or len(set(channels)) < len(channels):
+        raise WlmError(f"{path}: {place}.channels: expected 1 to {MOST_CHANNELS} names, each channel of a layer once")
     return Layer(name, encoding, tuple(channels))
 
 
