@@ -242,3 +242,7 @@ def test_a_page_shows_the_first_light_and_says_so(tmp_path):
     page = make_page([tmp_path / "a.wlm"])
     assert "a/light RGB" in page.note and "3 other sheets" in page.note
     assert (page.manifest["width"], page.manifest["height"]) == (119, 108)
+    model = random_layers()
+    model.sheets = {sheet: model.sheets[sheet] for sheet in SHEETS[:1]}
+    model.save(tmp_path / "b.wlm")
+    assert make_page([tmp_path / "b.wlm"]).note.endswith("Shown is a/light RGB.")
