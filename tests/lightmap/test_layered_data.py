@@ -184,6 +184,17 @@ def test_twelve_channels_and_no_more():
     assert "0/b: expected each channel of a layer once" in error_of(from_layers, [*layers, layers[1]], [0.0])
 
 
+def test_names_of_arrays_are_those_that_a_file_can_have():
+    frames = np.ones((1, 4, 4, 3))
+    for options in ({"name": ""}, {"atlas": "a" * 129}, {"channels": ["R", "G", "\n"]}):
+        assert "1 to 128 printable characters" in error_of(from_layers, [LayerArrays(frames, **options)], [0.0])
+    assert next(iter(from_layers([LayerArrays(frames, channels=["x", "y", "z"])], [0.0]).sheets)).channels == tuple(
+        "xyz"
+    )
+    masks = {"b": np.ones((4, 4), bool)}
+    assert "masks: expected those of atlases" in error_of(from_layers, [LayerArrays(frames)], [0.0], masks)
+
+
 def test_sheets_that_are_large_together_lie_in_a_file(tmp_path, monkeypatch):
     write_unity(tmp_path / "scene", atlases=1)
     whole = wlm.lightmap.load(tmp_path / "scene")
