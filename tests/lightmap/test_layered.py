@@ -9,12 +9,17 @@ from builders.layered_sets import SHEETS, random_layers, small_layers, turning_d
 from builders.resigned import GONE, rewrite
 from builders.running import report_always
 from builders.small_sets import HOURS, tiny_profile
+from builders.synthetic import random_model
 from test_export import read_texture
 
 import wlm
 from wlm.formats.artifact import read_artifact
+from wlm.formats.checkpoint import Pace
 from wlm.formats.exr import read_exr
+from wlm.lightmap import fit
+from wlm.lightmap.layers import codec
 from wlm.lightmap.layers.data import LayerArrays, from_layers
+from wlm.lightmap.layers.model import LayeredModel
 from wlm.lightmap.tiles import TileKind
 from wlm.web.pages import make_page
 
@@ -74,6 +79,16 @@ def test_files_that_claim_too_much_are_one_line(tmp_path):
     refused({}, {"1.mask": stored.tensors["0.mask"]}, "part 1.mask: expected it with sheet 0")
     refused({}, {"00.kind": stored.tensors["0.kind"]}, "part 00.kind is none of the file's")
     refused({}, {"0.times": stored.tensors["times"], "times": GONE}, "times")
+
+
+def test_video_of_all_sheets_together_is_bounded(tmp_path, monkeypatch):
+    model = LayeredModel("video", "0123456789abcdef", {SHEETS[i]: random_model((5,), 1, seed=i) for i in (0, 3)})
+    model.save(tmp_path / "a.wlm")
+    assert len(wlm.load(tmp_path / "a.wlm").sheets) == 2
+    monkeypatch.setattr(codec, "VIDEO_GROWTH", 1)
+    monkeypatch.setattr(codec, "VIDEO_BYTES", 300_000)
+    text = error_of(wlm.load, tmp_path / "a.wlm")
+    assert "the file's video: expected at most" in text and "found a size of 524288" in text, "of either 262,144"
 
 
 def test_signed_values_keep_their_sign(fitted):
@@ -157,15 +172,19 @@ def test_a_layer_of_light_alone_is_fitted_as_without_layers(tmp_path):
         np.testing.assert_array_equal(own.parts[name], part)
 
 
-def test_a_stopped_fit_goes_on_in_its_sheet_to_the_same_bytes(tmp_path, monkeypatch):
+@pytest.mark.parametrize("stage", ["sheet 2 of 3, tiles", "sheet 2 of 3"])
+def test_a_stopped_fit_goes_on_in_its_sheet_to_the_same_bytes(stage, tmp_path, monkeypatch):
     report_always(monkeypatch)
+    monkeypatch.setattr(fit, "_LOOK", 1)
+    # Nothing is written before the fit is stopped.
+    monkeypatch.setattr(Pace, "affordable", lambda self: False)
     data, profile, output = small_layers(40, 24), tiny_profile(steps=20), tmp_path / "part.wlm"
     stages = []
     wlm.lightmap.compress(data, profile, progress=lambda done: stages.append(done.stage)).save(tmp_path / "whole.wlm")
     assert {"sheet 1 of 3", "sheet 2 of 3", "sheet 3 of 3"} <= set(stages)
 
     def stop(progress):
-        if progress.stage == "sheet 2 of 3" and progress.done:
+        if progress.stage == stage and progress.done:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -223,3 +242,7 @@ def test_a_page_shows_the_first_light_and_says_so(tmp_path):
     page = make_page([tmp_path / "a.wlm"])
     assert "a/light RGB" in page.note and "3 other sheets" in page.note
     assert (page.manifest["width"], page.manifest["height"]) == (119, 108)
+    model = random_layers()
+    model.sheets = {sheet: model.sheets[sheet] for sheet in SHEETS[:1]}
+    model.save(tmp_path / "b.wlm")
+    assert make_page([tmp_path / "b.wlm"]).note.endswith("Shown is a/light RGB.")

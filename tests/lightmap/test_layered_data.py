@@ -109,6 +109,8 @@ def test_a_set_names_layers_channels_and_slices(tmp_path):
     np.testing.assert_array_equal(values_of(chosen, "small", "L0")[0], small)
     assert values_of(chosen, "small", "L1").shape == (1, 3, 5, 1)
     assert [own.mask.sum() for own in chosen.sheets.values()] == [40, 40, 15, 15]
+    write_part(tmp_path / "order.exr", {name: planes["R"] for name in ("A", "B", "BA", "G", "R")}, read_channels)
+    assert read_channels(tmp_path / "order.exr")[1] == ("R", "G", "B", "A", "BA")
     layers["dir"]["channels"] = ["G", "R"]
     both = write_set_json(
         tmp_path,
@@ -146,6 +148,7 @@ def test_a_set_names_layers_channels_and_slices(tmp_path):
             "expected 3 slices of one height, found 2 rows",
         ),
         ({"layers": {"light": {"encoding": "unit", "channels": ["R"] * 2}}}, "each channel of a layer once"),
+        ({"layers": {"light": {"encoding": "unit", "channels": ["R", "G", "B"] * 2}}}, "each channel of a layer once"),
     ],
 )
 def test_a_wrong_set_is_one_line(tmp_path, changes, words):
@@ -177,6 +180,19 @@ def test_twelve_channels_and_no_more():
     assert len(from_layers([*layers, other], [0.0]).sheets) == 5
     wrong = LayerArrays(np.zeros((1, 5, 4, 1)), "c")
     assert "0/c R is 4x5, but atlas 0 is 4x4" in error_of(from_layers, [*layers, wrong], [0.0])
+    # Not the second in place of the first.
+    assert "0/b: expected each channel of a layer once" in error_of(from_layers, [*layers, layers[1]], [0.0])
+
+
+def test_names_of_arrays_are_those_that_a_file_can_have():
+    frames = np.ones((1, 4, 4, 3))
+    for options in ({"name": ""}, {"atlas": "a" * 129}, {"channels": ["R", "G", "\n"]}):
+        assert "1 to 128 printable characters" in error_of(from_layers, [LayerArrays(frames, **options)], [0.0])
+    assert next(iter(from_layers([LayerArrays(frames, channels=["x", "y", "z"])], [0.0]).sheets)).channels == tuple(
+        "xyz"
+    )
+    masks = {"b": np.ones((4, 4), bool)}
+    assert "masks: expected those of atlases" in error_of(from_layers, [LayerArrays(frames)], [0.0], masks)
 
 
 def test_sheets_that_are_large_together_lie_in_a_file(tmp_path, monkeypatch):

@@ -87,6 +87,16 @@ def test_mips_hold_charts_alone(device):
         MapDecoder(model, device, mips=8)
 
 
+def test_mips_leave_out_tiles_that_the_file_lacks(device):
+    decoder = MapDecoder(random_model((3, 0, 1, 3), hidden=16), device)
+    decoder.decode()
+    light, whole = decoder.numpy().astype(np.float64), len(decoder.levels) - 1
+    held = np.ones(light.shape[:2], bool)
+    held[:128, 128:] = False
+    # The mean is rounded at each level.
+    np.testing.assert_allclose(decoder.numpy(whole)[0, 0], light[held].mean(0), rtol=0.03)
+
+
 def test_a_captured_map_repeats(device):
     decoder = MapDecoder(random_model(KINDS), device)
     decoder.decode()

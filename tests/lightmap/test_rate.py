@@ -7,13 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from builders.checks import error_of
-from builders.small_sets import moving_light, tiny_profile
+from builders.running import call
+from builders.small_sets import moving_light, tiny_profile, write_set
 
 from wlm.lightmap import rate
 from wlm.lightmap.data import from_arrays
 from wlm.lightmap.evaluation import bits_per_texel
 from wlm.lightmap.fit import compress
-from wlm.lightmap.rate import RESOLUTIONS, choose
+from wlm.lightmap.rate import RESOLUTIONS, Choice, choose
 
 SIZES = (4, 8, 16)
 
@@ -91,3 +92,14 @@ def test_frames_have_no_size_to_choose(light):
     assert line == "rate: expected a profile of networks or video, got tiny, whose tiles are frames"
     one = moving_light(hours=(6.0,))
     assert "no tile changes over time" in error_of(choose, one, tiny_profile(frames="auto"), max_bpp=1.0)
+
+
+def test_a_file_beyond_the_wanted_size_is_told(tmp_path, monkeypatch):
+    write_set(tmp_path / "set", moving_light(24, 40, (3.0, 9.0)))
+    monkeypatch.setattr(rate, "choose", lambda lightmaps, profile, **_: Choice(profile, 0.5))
+    words = "lightmap", "compress", tmp_path / "set", "-o", tmp_path / "a.wlm", "--profile", "video"
+    call(*words, "--max-bpp=0.5")
+    bits = 8 * (tmp_path / "a.wlm").stat().st_size / (24 * 40 * 2)
+    assert f"warning: --max-bpp 0.5: the trials were smaller than the file, which has {bits:.3f}" in call.stderr
+    call(*words, "--max-bpp=500")
+    assert "--max-bpp" not in call.stderr

@@ -153,6 +153,8 @@ def compress(
     bpp = bits_per_texel(model, lightmaps.mask, size) if model.kind.any() else None
     rows.add_row(escape(str(output)), f"{size:,}", number(bpp, ".3f"), kinds, f"{seconds:.1f}")
     show(rows)
+    if bpp is not None and max_bpp is not None and bpp > max_bpp:
+        note(f"warning: --max-bpp {max_bpp:g}: the trials were smaller than the file, which has {bpp:.3f}")
     for warning in (*model.warnings, *(lost_light(model, lightmaps, own_device) if model.kind.any() else ())):
         note(f"warning: {warning}")
 

@@ -15,7 +15,7 @@ from wlm.formats.mask import DAMAGED_PICTURE
 from wlm.formats.reading import open_file, read_file
 
 _PNG_MAGIC = b"\x89PNG"
-_FIRST = "RGBA"  # in this order, before others in that of their names
+_FIRST = ("R", "G", "B", "A")  # in this order, before others in that of their names
 
 
 def read_channels(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...], bool]:
@@ -40,7 +40,7 @@ def read_channels(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, 
 
 def _read_exr(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]]:
     channels = read_part(path).channels
-    names = tuple(sorted(channels, key=lambda name: (name not in _FIRST, _FIRST.find(name), name)))
+    names = tuple(sorted(channels, key=lambda name: (_FIRST.index(name) if name in _FIRST else len(_FIRST), name)))
     planes = [channels[name].pixels for name in names]
     for name, plane in zip(names, planes, strict=True):
         if plane is None or plane.dtype not in (np.float16, np.float32):

@@ -124,7 +124,6 @@ def _packed(data: memoryview, rows: int, columns: int) -> np.ndarray:
     return bits.astype(np.uint16).view(np.float16)
 
 
-# 2^(e - 15 - 9): nine bits of mantissa, whose leading bit is not implied.
 def _shared(data: memoryview, rows: int, columns: int) -> np.ndarray:
     return unpack_rgb9e5(np.frombuffer(data, "<u4").reshape(rows, columns))
 

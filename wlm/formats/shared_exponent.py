@@ -8,6 +8,7 @@ import numpy as np
 LARGEST = 65408.0
 """The largest number that it holds."""
 
+# 2^(e - 15 - 9): nine bits of mantissa, whose leading bit is not implied.
 _SCALE = np.ldexp(np.float32(1), np.arange(32) - 24)
 
 

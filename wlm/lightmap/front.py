@@ -123,9 +123,8 @@ def evaluate(
     """
     layered = isinstance(model, LayeredModel)
     if layered != isinstance(lightmaps, LayeredSet):
-        kinds = "has layers", "has none"
-        first, second = kinds if layered else kinds[::-1]
-        raise WlmError(f"{lightmaps.name}: the file {model.name} {first}, but this set {second}")
+        found = "has layers, but this set has none" if layered else "has no layers, but this set has some"
+        raise WlmError(f"{lightmaps.name}: the file {model.name} {found}")
     return (layers_evaluation if layered else evaluation).evaluate(model, lightmaps, **options)
 
 

@@ -23,8 +23,8 @@ class MapDecoder:
 
     Attributes:
         levels: `wp.array` uint32 [h, w] each, RGB9E5: the map, then mips of half the size, rounded down; written by
-            `decode`. A mip's texel is the mean of the valid texels that it covers; gaps within `wlm.texels.REACH` of
-            those hold the nearest one of their own level.
+            `decode`. A mip's texel is the mean of the valid texels of the file's tiles that it covers; gaps within
+            `wlm.texels.REACH` of those hold the nearest one of their own level.
         decoders: The tiles by kind.
     """
 
@@ -61,6 +61,11 @@ class MapDecoder:
     def _allocate(self, mips: int) -> None:
         self.levels, self._weights, self._gaps = [], [], []
         weight = self.model.mask.astype(np.float32)
+        # Valid texels that the file doesn't hold would darken mips.
+        grid = TileGrid.of(self.model.height, self.model.width)
+        for number in np.flatnonzero(self.model.kind == TileKind.EMPTY).tolist():
+            y, x = grid.origin(number)
+            weight[y : y + TILE, x : x + TILE] = 0.0
         for level in range(mips + 1):
             if level:
                 weight = _halved(weight)

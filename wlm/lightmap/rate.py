@@ -22,6 +22,7 @@ from wlm.lightmap.fit import compress
 from wlm.lightmap.model import LightmapModel, Profile
 from wlm.lightmap.packing import STREAMS
 from wlm.lightmap.tiles import TileKind
+from wlm.lightmap.video import TRIAL_SPEED
 from wlm.system import OnProgress, Progress
 
 RESOLUTIONS = tuple(range(4, 129, 4))
@@ -35,7 +36,6 @@ _OCTAVES = 0.15  # between two sizes whose PSNR gives the figure of this scene
 _LEAST_PER_OCTAVE, _MOST_PER_OCTAVE = 1.0, 4.0
 _ROOM = 0.99  # of the largest size
 _QUALITIES = range(101)  # of video
-_VIDEO_SPEED = 6  # of its trials: 5% larger than at 4
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ def _choose_quality(
     @cache
     def trial(quality: int) -> tuple[float, float]:
         """Bits per texel and time, and PSNR, where it is asked for."""
-        changes = {"video_quality": quality, "video_speed": max(profile.video_speed, _VIDEO_SPEED)}
+        changes = {"video_quality": quality, "video_speed": max(profile.video_speed, TRIAL_SPEED)}
         model = compress(lightmaps, profile.override(changes), **options)
         if not len(model.video_ranges):
             raise WlmError(f"{lightmaps.name}: no tile is more than a colour, so there is no size to choose")

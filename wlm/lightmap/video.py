@@ -25,7 +25,9 @@ from wlm.lightmap.video_packing import EXTRA, MIDDLE, WHITE, Page, decode_levels
 from wlm.metrics import evaluate_frame
 from wlm.texels import fill_smoothly
 
-_TRIAL_SPEED = 6  # beyond it libaom is of another kind, which takes a quality for another
+TRIAL_SPEED = 6
+"""Of encodings that only choose: beyond it libaom is of another kind, which takes a quality for another."""
+
 _STEP = 4  # of the quality, for another point on the curve of PSNR over size
 
 
@@ -75,7 +77,7 @@ def encode_page(
     count = by_time.shape[1]
     if count == 1:
         return _encoded(page, colour, valid, by_time, quality, speed), by_time
-    trial = max(speed, _TRIAL_SPEED)
+    trial = max(speed, TRIAL_SPEED)
 
     def tried(ranges: np.ndarray, quality: int) -> tuple[float, float, bytes]:
         """Octaves of the size, PSNR and stream of a trial."""

@@ -111,7 +111,8 @@ def lightmap_page(
         manifest["reference"] = reference
     note = "Lightmaps over the day, decoded on this GPU."
     if sheet is not None:
-        note += f" Shown is {sheet.label}, without the file's {others} other sheets."
+        rest = f", without the file's {others} other sheet{'' if others == 1 else 's'}" if others else ""
+        note += f" Shown is {sheet.label}{rest}."
     return Page("lightmap", model.name, note, figures, manifest, arrays)
 
 

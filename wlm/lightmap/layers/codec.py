@@ -14,7 +14,7 @@ from pydantic import Field
 from wlm.config import check_settings
 from wlm.errors import WlmError, one_line
 from wlm.formats.artifact import Artifact
-from wlm.formats.limits import check_growth
+from wlm.formats.limits import VIDEO_BYTES, VIDEO_GROWTH, check_growth
 from wlm.lightmap import codec
 from wlm.lightmap.layers.listing import MOST_NAME
 from wlm.lightmap.layers.model import LayeredModel
@@ -94,7 +94,7 @@ def decode(artifact: Artifact) -> LayeredModel:
     stored = sum(value.nbytes for value in artifact.tensors.values())
     first: dict[str, int] = {}  # sheets of each atlas
     models: dict[Sheet, LightmapModel] = {}
-    unpacked = 0
+    unpacked = filmed = 0
     for number, (sheet, item) in enumerate(zip(sheets, header.sheets, strict=True)):
         own = parts[number] | {name: artifact.tensors[name] for name in artifact.tensors.keys() & {_TIMES}}
         if (holder := first.setdefault(sheet.atlas, number)) != number:
@@ -109,6 +109,9 @@ def decode(artifact: Artifact) -> LayeredModel:
             model.mask = models[sheets[holder]].mask
         unpacked += sum(value.nbytes for value in model.parts.values())
         check_growth("the file", stored, unpacked)
+        if len(model.video_ranges):
+            filmed += model.video_levels.nbytes
+            check_growth("the file's video", stored, filmed, VIDEO_GROWTH, VIDEO_BYTES)
         models[sheet] = model
     if len({model.period for model in models.values()}) > 1:
         raise ValueError("setting sheets: expected one period")

@@ -33,7 +33,7 @@ from wlm.formats.limits import FRAMES, PICTURE_GROWTH, check_growth
 from wlm.formats.mask import read_mask
 from wlm.formats.scratch import room
 from wlm.lightmap.data import LightmapSet, check_times, checked_set
-from wlm.lightmap.layers.listing import Atlas, Layer, LayeredListing, Source, list_layers
+from wlm.lightmap.layers.listing import MOST_NAME, Atlas, Layer, LayeredListing, Source, is_name, list_layers
 from wlm.lightmap.layers.sheet import ENCODINGS, Sheet, check_sheets, sheets_of
 
 _LIGHT = ("R", "G", "B")
@@ -176,16 +176,24 @@ def from_layers(
             where = f"{name}: {layer.atlas}/{layer.name}"
             raise WlmError(f"{where}: expected frames [{stamps.size}, H, W, C], none of them 0, got {frames.shape}")
         count = frames.shape[3]
-        channels = layer.channels or (tuple("RGBA"[:count]) if count <= 4 else tuple(map(str, range(count))))
+        channels = tuple(layer.channels or ("RGBA"[:count] if count <= 4 else map(str, range(count))))
+        if not all(is_name(value) for value in (layer.atlas, layer.name, *channels)):
+            raise WlmError(
+                f"{name}: atlases, layers, channels: expected names of 1 to {MOST_NAME} printable characters"
+            )
         if layer.encoding not in ENCODINGS or len(channels) != count:
             raise WlmError(
                 f"{name}: {layer.atlas}/{layer.name}: expected an encoding of {', '.join(ENCODINGS)} and {count} "
                 f"channels, got {layer.encoding!r} and {len(channels)}"
             )
         for sheet in sheets_of(layer.atlas, layer.name, channels, layer.encoding):
+            if sheet in sizes:
+                raise WlmError(f"{name}: {layer.atlas}/{layer.name}: expected each channel of a layer once")
             sizes[sheet] = frames.shape[1:3]
             sources[sheet] = frames, [channels.index(channel) for channel in sheet.channels]
     check_sheets(name, sizes)
+    if unknown := (masks or {}).keys() - {sheet.atlas for sheet in sizes}:
+        raise WlmError(f"{name}: masks: expected those of atlases that layers are of, found {sorted(unknown)[0]!r}")
     labels = [f"frame {i} (time {time:g})" for i, time in enumerate(stamps)]
     check_times(name, labels, stamps, period)
     order = np.argsort(stamps, kind="stable")

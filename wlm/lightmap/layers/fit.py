@@ -4,6 +4,7 @@ import os
 from dataclasses import replace
 from typing import Any
 
+from wlm.errors import WlmError
 from wlm.formats.checkpoint import EVERY, Checkpoint, CheckpointRange
 from wlm.lightmap import fit
 from wlm.lightmap.layers.data import LayeredSet
@@ -44,16 +45,22 @@ def compress(
     profile = Profile.load(profile).override(overrides)
     models = {}
     for number, (sheet, own) in enumerate(lightmaps.sheets.items()):
-        models[sheet] = fit.compress(
-            own,
-            sheet_profile(profile, sheet),
-            seed=seed,
-            device=device,
-            workers=workers,
-            cluster=cluster,
-            progress=_named(progress, f"sheet {number + 1} of {len(lightmaps.sheets)}"),
-            checkpoint=None if checkpoint is None else CheckpointRange(checkpoint, number * _BATCHES),
-        )
+        try:
+            models[sheet] = fit.compress(
+                own,
+                sheet_profile(profile, sheet),
+                seed=seed,
+                device=device,
+                workers=workers,
+                cluster=cluster,
+                progress=_named(progress, f"sheet {number + 1} of {len(lightmaps.sheets)}"),
+                checkpoint=None if checkpoint is None else CheckpointRange(checkpoint, number * _BATCHES),
+            )
+        except (WlmError, KeyboardInterrupt):
+            # A sheet that is stopped before its first step writes nothing, and earlier ones may have left something.
+            if checkpoint is not None:
+                checkpoint.flush()
+            raise
         # Read from files each has a mask of its own.
         shared = next(model.mask for other, model in models.items() if other.atlas == sheet.atlas)
         models[sheet].mask = shared

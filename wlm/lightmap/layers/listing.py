@@ -98,6 +98,11 @@ class LayeredListing:
     warn_order: bool
 
 
+def is_name(value: object) -> bool:
+    """Whether a value can name a layer, an atlas or a channel."""
+    return is_text(value) and len(value) <= MOST_NAME and value.isprintable()
+
+
 def is_layered(path: Path) -> bool:
     """Whether a set is layered: a `set.json` with `layers`, or a folder with one, or with Unity's files."""
     if path.is_dir():
@@ -271,7 +276,7 @@ def _named(path: Path, content: Mapping[str, Any], key: str, expected: str) -> d
     """An object of named things, not empty."""
     values = field(path, content, key, "", lambda value: _is_object(value) and bool(value), expected)
     for name in values:
-        if not is_text(name) or len(name) > MOST_NAME or not name.isprintable():
+        if not is_name(name):
             raise WlmError(f"{path}: {key}: expected names of 1 to {MOST_NAME} printable characters")
     return values
 
@@ -286,13 +291,10 @@ def _layer(path: Path, name: str, value: Any) -> Layer:
     if options.get("channels") is None:
         return Layer(name, encoding)
     channels = field(path, options, "channels", f"{place}.", is_list, f"a list of 1 to {MOST_CHANNELS} channels")
-    if len(channels) > MOST_CHANNELS or not all(_is_channel(channel) for channel in channels):
-        raise WlmError(f"{path}: {place}.channels: expected 1 to {MOST_CHANNELS} names of channels")
+    named = len(channels) <= MOST_CHANNELS and all(is_name(channel) for channel in channels)
+    if not named or len(set(channels)) < len(channels):
+        raise WlmError(f"{path}: {place}.channels: expected 1 to {MOST_CHANNELS} names, each channel of a layer once")
     return Layer(name, encoding, tuple(channels))
-
-
-def _is_channel(value: object) -> bool:
-    return is_text(value) and len(value) <= MOST_NAME and value.isprintable()
 
 
 def _atlas(path: Path, name: str, value: Any, trust: bool) -> Atlas:
