@@ -7,6 +7,7 @@ import pytest
 from builders.probe_sets import synthetic
 from builders.running import call, fails
 
+from wlm.cli.console import progress_bar
 from wlm.probe import load, save_probes
 
 PROBES, DEAD = 160, 5
@@ -76,3 +77,11 @@ def test_options_of_the_other_method_are_refused(folder, tmp_path):
         *words, "--profile", "small", "--max-bytes", 9
     )
     assert not list(tmp_path.iterdir())
+
+
+def test_progress_of_unknown_length_tells_no_time_left(capsys):
+    for done, total, text in ((3, 0, "PSNR 48 dB"), (4, 5, "")):
+        with progress_bar("fit") as report:
+            report(done, total, text)
+    first, second = capsys.readouterr().err.splitlines()
+    assert first == "fit: 3, PSNR 48 dB" and second.startswith("fit: 4 of 5, 0:0")

@@ -1,6 +1,7 @@
 """A transform's file: what is coded comes back, has the wanted size or error, and refuses what isn't its own."""
 
 import dataclasses
+import zlib
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import wlm
 from wlm.errors import WlmError
 from wlm.formats.artifact import read_artifact, write_artifact
 from wlm.probe import entropy
+from wlm.probe.between import held_out
 from wlm.probe.data import from_arrays
 from wlm.probe.kriging import Kriging
 from wlm.probe.transform import Places, TransformModel, basis
@@ -71,6 +73,38 @@ def test_a_tree_is_undone_and_transposed(shape):
     a, b = RANDOM.normal(size=(2, len(place), 4))
     np.testing.assert_allclose(tree.values(tree.coefficients(a)), a, atol=1e-9)
     assert np.vdot(tree.values(a), b) == pytest.approx(np.vdot(a, tree.adjoint(b)))
+
+
+def test_parents_are_the_first_of_those_that_are_as_far():
+    side = np.arange(6) * 8192 + 4096
+    place = np.stack(np.meshgrid(side, side, side, indexing="ij"), -1).reshape(-1, 3)
+    place = np.concatenate([place, place[:40]])[RANDOM.permutation(256)]
+    # A middle that comes last, with 30 as far from it.
+    ring = np.unique(
+        np.concatenate([np.array([[3, 4, 0], [5, 0, 0]])[:, axes] for axes in [[0, 1, 2], [1, 2, 0]]]), axis=0
+    )
+    signs = np.stack(np.meshgrid(*[[-1, 1]] * 3), -1).reshape(-1, 1, 3)
+    ring = np.unique((ring * signs).reshape(-1, 3), axis=0)
+    for code in (
+        place,
+        np.concatenate([[[0, 0, 0]], 30000 + 2000 * RANDOM.permutation(ring), [[30001, 30000, 30000]]]),
+    ):
+        tree = Tree(code)
+        known = tree.levels[0]
+        for level, parents in zip(tree.levels[1:], tree.parents, strict=True):
+            far = np.square(code[level][:, None] - code[known]).sum(-1)
+            first = np.lexsort((np.broadcast_to(np.arange(len(known)), far.shape), far), axis=-1)[:, : parents.shape[1]]
+            np.testing.assert_array_equal(np.sort(parents, 1), np.sort(known[first], 1))
+            known = np.concatenate([known, level])
+
+
+def test_odds_are_the_same_in_any_order_of_summing():
+    odds = entropy._Odds(1)
+    for _ in range(40):
+        odds.count(7, RANDOM.integers(0, 50, 999))
+    odds = odds._count[7] / entropy._UNIT
+    sums = {np.cumsum(RANDOM.permutation(odds))[-1] for _ in range(50)}
+    assert len(sums) == 1 and odds.min() > 0
 
 
 def test_kriging_is_exact_at_places_even_and_without_jumps():
@@ -159,6 +193,7 @@ HARD = {
     "far": (30, 27),
     "huge": (30, 27),
     "tiny": (30, 27),
+    "wide": (30, 27),
 }
 
 
@@ -167,6 +202,7 @@ def test_hard_sets(kind, tmp_path):
     count, outputs = HARD[kind]
     place, values = RANDOM.random((count, 3)) * 4, RANDOM.normal(size=(count, outputs)).astype(np.float32)
     place = np.repeat(place[:1], count, 0) if kind == "coincident" else place + 1e9 * (kind == "far")
+    place = place * 1e60 if kind == "wide" else place
     if kind == "constant":
         values[:] = 0.25
     values = values * np.float32({"huge": 1e17, "tiny": 1e-20}.get(kind, 1.0))
@@ -177,6 +213,29 @@ def test_hard_sets(kind, tmp_path):
     error = np.sqrt(np.square(decoded.astype(np.float64) - values).mean())
     assert error <= 0.01 * np.abs(values).max()
     assert np.isfinite(decoder.decode(place + 0.3)).all()
+
+
+def test_a_file_without_a_live_probe_is_one_line(tmp_path):
+    model = wlm.probe.compress(lattice(), positions=True)
+    with pytest.raises(WlmError, match="expected 1 to .* live probes .* found 0"):
+        dataclasses.replace(model, dead=np.ones(216, bool)).save(tmp_path / "a.wlm")
+
+
+def test_more_probes_than_the_bytes_can_tell_are_refused_before_they_are_placed(tmp_path):
+    wlm.probe.compress(lattice(), positions=True).save(tmp_path / "a.wlm")
+    artifact = read_artifact(tmp_path / "a.wlm")
+    tensors = dict(artifact.tensors) | {"places": np.frombuffer(zlib.compress(bytes(6 << 20)), np.uint8)}
+    settings = artifact.settings | {"probes": 1 << 20, "outputs": 1, "dead": 0}
+    write_artifact(tmp_path / "a.wlm", "probe", settings, tensors, artifact.source)
+    with pytest.raises(WlmError, match="live probes of .* bytes, found 1048576"):
+        wlm.load(tmp_path / "a.wlm")
+
+
+def test_held_out_probes_of_a_file_with_places_get_no_bytes_for_them():
+    probes = synthetic(200)
+    plain, placed = (wlm.probe.compress(probes, positions=positions) for positions in (False, True))
+    assert placed.file_bytes() > plain.file_bytes() + 500
+    assert held_out(placed, probes) == held_out(plain, probes)
 
 
 @pytest.mark.parametrize("part", ["light", "places"])

@@ -212,7 +212,8 @@ def progress_bar(what: str) -> Iterator[Callable[[int, int, str], None]]:
                 note(what)
             if (part := done * _PLAIN_REPORTS // max(total, 1)) > reported:
                 reported = part
-                note(f"{what}: {done} of {total}{text and ', '}{text}, {_left(start, done, total)}")
+                count = f"{done} of {total}" if total else f"{done}"
+                note(", ".join(filter(None, (f"{what}: {count}", text, _left(start, done, total)))))
 
         yield line
         return
@@ -227,7 +228,7 @@ def progress_bar(what: str) -> Iterator[Callable[[int, int, str], None]]:
 
         def update(done: int, total: int, text: str) -> None:
             fields = ", ".join(filter(None, (text, _left(start, done, total))))
-            bar.update(task, completed=done, total=total, note=fields)
+            bar.update(task, completed=done, total=total or None, note=fields)
 
         yield update
 
@@ -288,8 +289,8 @@ def _named_figure(name: str, value: float) -> str:
 
 
 def _left(start: float, done: int, total: int) -> str:
-    """Writes the time left, if the rest goes as the work so far did."""
-    if done <= 0:
+    """Writes the time left, if the rest goes as the work so far did; nothing where the total is unknown."""
+    if done <= 0 or not total:
         return ""
     seconds = round((time.perf_counter() - start) * (total - done) / done)
     minutes, seconds = divmod(seconds, 60)

@@ -6,7 +6,7 @@ uncompressed others give there by the plain rules of engines is beside it. And h
 the decoded light is compared with what the uncompressed probes give there by kriging.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -76,8 +76,12 @@ def held_out(
     others = from_arrays(probes.position[known], probes.values[known], name=probes.name)
     settings: dict[str, Any] = {}
     if isinstance(model, TransformModel):
-        settings["max_bytes"] = int(model.file_bytes() * (EVERY - 1) / EVERY)
-    fitted = compress(others, model.profile, seed=seed, device=device, progress=progress, **settings)
+        # The others' file has no positions.
+        settings["max_bytes"] = replace(model, places=None).file_bytes() * (EVERY - 1) // EVERY
+    try:
+        fitted = compress(others, model.profile, seed=seed, device=device, progress=progress, **settings)
+    except WlmError as error:
+        raise WlmError(f"{probes.name}: cannot fit {len(known)} probes to hold out {len(asked)}: {error}") from error
     decoder = fitted.decoder(device)
     decoder.decode_probes(others.position)
     position, expected = probes.position[asked], probes.values[asked].astype(np.float64)

@@ -29,8 +29,11 @@ _MOST_LOG = 40.0
 
 
 _LIGHT = "light"
+_L2 = 27  # numbers of a probe that a transform's file doesn't state
 # Numbers that a transform may unpack to: those of a set without any light have next to no bytes.
 _SURE_NUMBERS, _NUMBERS_A_BYTE = 1 << 23, 4096
+# Live probes of it: each takes some 20 microseconds and 500 bytes to place among the others.
+_SURE_PROBES, _PROBES_A_BYTE = 1 << 17, 16
 
 
 class _TransformHeader(Header):
@@ -38,7 +41,7 @@ class _TransformHeader(Header):
 
     name: Name
     probes: int = Field(ge=1, le=PROBES)
-    outputs: int = Field(ge=1, le=NUMBERS)
+    outputs: int = Field(_L2, ge=1, le=NUMBERS)
     dead: int = Field(0, ge=0, le=2 * PROBES)
 
 
@@ -135,7 +138,9 @@ def decode(artifact: Artifact) -> ProbeModel | TransformModel:
 
 
 def _encode_transform(model: TransformModel) -> tuple[dict[str, Any], dict[str, np.ndarray], str]:
-    settings = {"name": model.name, "probes": model.probes, "outputs": model.outputs}
+    settings: dict[str, Any] = {"name": model.name, "probes": model.probes}
+    if model.outputs != _L2:
+        settings["outputs"] = model.outputs
     # A part of its own would cost a line of the header, half of what a small set has.
     dead = pack_dead(model.dead)
     if len(dead):
@@ -161,6 +166,10 @@ def _decode_transform(artifact: Artifact) -> TransformModel:
     if header.probes * header.outputs > most:
         numbers = f"{header.probes} probes of {header.outputs} numbers"
         raise ValueError(f"part light: expected at most {most} numbers of {end} bytes, found {numbers}")
+    dead = _unpack_dead(light[end:], header.probes)
+    live, most = header.probes - int(dead.sum()), _SURE_PROBES + _PROBES_A_BYTE * end
+    if not 1 <= live <= most:
+        raise ValueError(f"part light: expected 1 to {most} live probes of {end} bytes, found {live}")
     places = None
     if parts["places"].size:
         size = 6 * header.probes
@@ -178,7 +187,7 @@ def _decode_transform(artifact: Artifact) -> TransformModel:
         source=artifact.source,
         probes=header.probes,
         outputs=header.outputs,
-        dead=_unpack_dead(light[end:], header.probes),
+        dead=dead,
         stream=light[:end],
         places=places,
     )

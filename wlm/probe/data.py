@@ -7,10 +7,9 @@ input                                 behaviour
 ====================================  ================================================================
 a position NaN or infinite            error that names the probe
 positions far from the origin         kept in float64
-positions that span more than         error
-float64 holds
+positions that span more than 1e150   error
 coincident positions                  fine; one warning with the count of those that repeat an earlier one:
-                                      they decode to one value, whatever they held
+                                      Gaussians decode them to one value, whatever they held
 NaN, Inf in a probe                   the probe is not live and all its numbers become 0; warning with
                                       the count and the first
 a probe that is all zero              not live, no warning: engines leave probes inside walls so
@@ -56,6 +55,7 @@ from wlm.probe.sphere import sh_count
 LARGEST = float(np.sqrt(np.finfo(np.float32).max))
 """The largest number whose square float32 still holds."""
 
+_FARTHEST = 1e150  # the squares of distances are float64's too
 _POSITION, _CONVENTION, _PROBES, _SH = "position", "convention", "probes", "sh"
 
 
@@ -425,7 +425,7 @@ def _check(
         )
     repeated = _repeated(position)
     if repeated:
-        warnings.append(f"{name}: {_probes(repeated)} at the position of another: they decode to the same values")
+        warnings.append(f"{name}: {_probes(repeated)} at the position of another: Gaussians decode them to one value")
     return ProbeSet(name, position, checked, key, live, _hash(position, checked, live), tuple(warnings))
 
 
@@ -447,8 +447,8 @@ def _check_positions(where: str, position: np.ndarray) -> np.ndarray:
         raise WlmError(f"{where}: {_POSITION}[{bad[0]}]: expected finite numbers, got ({text})")
     with np.errstate(over="ignore"):
         extent = np.ptp(position, axis=0).max()
-    if not np.isfinite(extent):
-        raise WlmError(f"{where}: {_POSITION}: the positions lie further apart than float64 can tell")
+    if not extent <= _FARTHEST:
+        raise WlmError(f"{where}: {_POSITION}: expected positions within {_FARTHEST:g} of each other, got {extent:.3g}")
     return position
 
 

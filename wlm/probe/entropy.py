@@ -4,9 +4,9 @@ Numbers q [N, K] are coded level by level (`wlm.probe.tree`), in a level one col
 expected to be in size, its class of odds, follows from the sizes of its parents' numbers in the same column and of its
 own in the two columns before. A magnitude below 8 is a symbol; a larger one is one of two symbols for each power of
 two, and the bits that the symbol leaves open, whose odds are even. The odds of a class begin as those of a geometric
-distribution and follow the counts; those of a column's signs begin even. All of it is whole numbers, sums, products and
-quotients of IEEE doubles, so that every machine has the same odds. The coder is that of constriction (Bamler,
-Understanding Entropy Coding With Asymmetric Numeral Systems, 2022).
+distribution and follow the counts; those of a column's signs begin even. Counts are whole numbers, which have one sum
+in any order, and odds their quotients in IEEE doubles, so that every machine has the same. The coder is that of
+constriction (Bamler, Understanding Entropy Coding With Asymmetric Numeral Systems, 2022).
 """
 
 from collections.abc import Iterator, Sequence
@@ -22,7 +22,8 @@ _SYMBOLS = _DIRECT + 2 * 21  # up to LARGEST
 _CLASSES = 43
 _PRIOR = 6.0  # numbers that the first odds of a class are worth
 _EVEN = 8.0  # the same of a sign
-_HALVED = 4096.0  # a class's numbers at which its counts are halved: columns and levels differ
+_HALVED = 4096  # a class's numbers at which its counts are halved: columns and levels differ
+_UNIT = 1 << 20  # of the counts of a class: what one number counts
 _FEWEST, _MOST = 8, 2048  # rows that are coded with the same odds
 _CHUNK = 12  # bits that are coded at once
 
@@ -146,7 +147,7 @@ class _Odds:
     """Counts of the symbols of each class, and of the signs of each column."""
 
     def __init__(self, columns: int) -> None:
-        self._count = _first_odds() * _PRIOR
+        self._count = np.rint(_first_odds() * _PRIOR * _UNIT).astype(np.int64)
         self._signs = np.full((columns, 2), _EVEN)
 
     def model(self, kind: int) -> models.Categorical:
@@ -154,9 +155,9 @@ class _Odds:
         return models.Categorical(count / count.sum(), perfect=False)
 
     def count(self, kind: int, symbols: np.ndarray) -> None:
-        self._count[kind] += np.bincount(symbols, minlength=_SYMBOLS)
-        if self._count[kind].sum() > _HALVED:
-            self._count[kind] = 0.5 * self._count[kind]
+        self._count[kind] += _UNIT * np.bincount(symbols, minlength=_SYMBOLS)
+        if self._count[kind].sum() > _HALVED * _UNIT:
+            self._count[kind] = (self._count[kind] + 1) // 2
 
     def sign_model(self, column: int) -> models.Categorical:
         count = self._signs[column]

@@ -51,10 +51,14 @@ class Kriging:
             index[piece], weight[piece] = self._weights(point[piece])
         return index, weight
 
+    def nearest(self, point: np.ndarray, asked: int) -> tuple[np.ndarray, np.ndarray]:
+        """Distances and numbers of the nearest places, float64 and int64 [M, asked], the nearest first."""
+        distance, index = self._tree.query(point, k=asked)
+        return distance.reshape(len(point), asked), index.reshape(len(point), asked)
+
     def _weights(self, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         count, asked = self.count, min(self.count + 1, len(self.place))
-        distance, index = self._tree.query(point, k=asked)
-        distance, index = distance.reshape(len(point), asked), index.reshape(len(point), asked)
+        distance, index = self.nearest(point, asked)
         weight = np.zeros((len(point), count))
         weight[:, 0] = 1.0  # where a place is itself
         between = distance[:, 0] > 0.0

@@ -83,11 +83,12 @@ class Places:
     @classmethod
     def of(cls, position: np.ndarray) -> "Places":
         """Rounds positions, float64 [N, 3]; those that float32 has held give the same, unless far from the origin."""
-        with np.errstate(over="ignore"):
+        # Beyond float32 the spacing is NaN, and nothing is rounded.
+        with np.errstate(over="ignore", invalid="ignore"):
             rounded = position.astype(np.float32).astype(np.float64)
-        coarse = np.spacing(np.float32(np.abs(rounded).max())) * 4.0 * CODES
-        if coarse < np.ptp(rounded, axis=0).max():
-            position = rounded
+            coarse = np.spacing(np.float32(np.abs(rounded).max())) * 4.0 * CODES
+            if coarse < np.ptp(rounded, axis=0).max():
+                position = rounded
         origin = position.min(0)
         extent = float((position.max(0) - origin).max())
         if not extent > 0:
@@ -196,7 +197,7 @@ class TransformModel(Model):
         try:
             if head.vectors:
                 vectors = unpack(data[_HEAD.size : start], self.outputs, flat(head.vectors), []) / head.fineness
-            tree = Tree(places.code[live]) if head.predicted and count else None
+            tree = Tree(places.code[live]) if head.predicted else None
             levels, parents = (tree.levels, tree.parents) if tree else (flat(count), [])
             q = unpack(data[start:], self.outputs, levels, parents)
         except ValueError as error:

@@ -119,7 +119,7 @@ class TransformDecoder:
 
     def _hold(self, values: np.ndarray, position: np.ndarray) -> None:
         model = self.model
-        live = ~model.dead if len(model.dead) and not model.dead.all() else np.ones(model.probes, bool)
+        live = ~model.dead if len(model.dead) else np.ones(model.probes, bool)
         self._low, self._high = position[live].min(0), position[live].max(0)
         self._kriging = Kriging(position[live] - self._low)
         self._rows = wp.array(values[live], dtype=float, device=self.device)

@@ -30,6 +30,7 @@ _COUNTS = (1, 2, 4, 8, 16)  # of stored directions that are tried, and all
 _FEW = 4096  # probes up to which it matters how many directions are stored, and how finely
 _WIDEST = 64  # numbers of a probe up to which directions are looked for
 _TRIES = 14
+_LEAST = -149.0  # of the step's logarithm: float32 has no less
 _PSNR = 50.0  # that is wanted where nothing is said
 _CLOSE = 0.03  # dB above the wanted PSNR that is near enough
 _FULL = 0.985  # of the largest size that is near enough
@@ -158,7 +159,7 @@ class _Search:
         """
         good: list[tuple[_Coded, float]] = []
         # From numbers that still have room to a step at which all are 0, whatever the directions.
-        low, high = math.log2(4.0 * self._largest / LARGEST), math.log2(8.0 * self._largest)
+        low, high = max(math.log2(4.0 * self._largest / LARGEST), _LEAST), math.log2(8.0 * self._largest)
         x = min(max(math.log2(start), low), high)
         ends: dict[bool, tuple[float, float, _Coded]] = {}  # by whether it is enough: step, excess
         for _ in range(_TRIES):

@@ -17,6 +17,7 @@ from wlm.probe.kriging import Kriging
 
 PARENTS = 8
 _FINEST = 18  # halvings: positions have 16 bits an axis
+_AT_ONCE = 1 << 21  # distances, where many places are as far
 
 
 class Tree:
@@ -42,7 +43,7 @@ class Tree:
         known = self.levels[0]
         weights = []
         for level in self.levels[1:]:
-            index, weight = Kriging(place[known], PARENTS).weights(place[level])
+            index, weight = _FirstOfTies(place[known], PARENTS).weights(place[level])
             self.parents.append(known[index])
             weights.append(weight)
             self._down.append(_matrix(self.parents[-1], weight, len(code)))
@@ -72,6 +73,35 @@ class Tree:
         for level, matrix in zip(self.levels[:0:-1], self._up[::-1], strict=True):
             result += matrix @ result[level]
         return result
+
+
+class _FirstOfTies(Kriging):
+    """Kriging of places in whole numbers, no two alike, whose choice among those that are as far is the first.
+
+    Which of them a search tree finds differs between machines, and the odds of numbers follow from the parents.
+    """
+
+    def nearest(self, point: np.ndarray, asked: int) -> tuple[np.ndarray, np.ndarray]:
+        distance, index = super().nearest(point, asked)
+        self._settle(point, distance, index, 2 * asked)
+        return distance, index
+
+    def _settle(self, point: np.ndarray, distance: np.ndarray, index: np.ndarray, looked: int) -> None:
+        """Puts the first of all that are as far into `index`, with so many places looked at."""
+        looked, asked = min(looked, len(self.place)), distance.shape[1]
+        # The last one is left out, unless all are taken.
+        tied = np.flatnonzero(distance[:, -1] == distance[:, self.count - 1]) if self.count < asked else []
+        for start in range(0, len(tied), max(1, _AT_ONCE // looked)):
+            rows = tied[start : start + max(1, _AT_ONCE // looked)]
+            far, number = super().nearest(point[rows], looked)
+            order = np.lexsort((number, far), axis=-1)
+            whole = far[:, -1] > distance[rows, -1] if looked < len(self.place) else np.ones(len(rows), bool)
+            index[rows[whole]] = np.take_along_axis(number, order, 1)[whole, :asked]
+            if not whole.all():
+                more = rows[~whole]
+                part = index[more]
+                self._settle(point[more], distance[more], part, 2 * looked)
+                index[more] = part
 
 
 def flat(count: int) -> list[np.ndarray]:
