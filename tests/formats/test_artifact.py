@@ -140,9 +140,7 @@ def test_the_header_is_small(tmp_path):
     found = read_artifact(tmp_path / "a.wlm")
     # safetensors itself takes 48 bytes a tensor before its name and numbers; the settings cost no escapes.
     assert found.header_bytes <= len(text) + 660
-    # Bytes need no padding.
-    with open(tmp_path / "a.wlm", "rb") as file:
-        assert file.read(found.header_bytes).endswith(b"}")
+    assert found.header_bytes % 8 == 0
 
 
 def test_a_mapped_artifact_outlives_its_replacement(artifact):

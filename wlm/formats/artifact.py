@@ -31,6 +31,7 @@ FORMAT_VERSION = 1
 _LENGTH = struct.Struct("<Q")
 _NO_DIGEST = "0" * 32
 _EXCHANGED_QUOTES = str.maketrans({'"': "'", "'": '"'})
+_ALIGNMENT = 8  # of the first tensor, in bytes: that of the widest type
 _HEADER_LIMIT = 100_000_000  # bytes; the safetensors library refuses a longer header too
 
 _MOST_AXES, _MOST_NUMBERS = 8, 1 << 48  # of a part
@@ -153,8 +154,7 @@ def encode_artifact(
         }
         offset = end
     encoded = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
-    # The first tensor begins at a multiple of its item's size.
-    encoded += b" " * (-(_LENGTH.size + len(encoded)) % max((array.itemsize for array in arrays.values()), default=1))
+    encoded += b" " * (-len(encoded) % _ALIGNMENT)
     head = _LENGTH.pack(len(encoded)) + encoded
     digest = hashlib.blake2b(head, digest_size=16)
     for array in arrays.values():
