@@ -63,13 +63,14 @@ class _TileDecoder:
             early, late = self._states
             self._launch(early, self._early)
             self._launch(late, self._late)
-            words = [array.reshape((len(self.numbers), -1)) for array in (self._early, self._late, self.out)]
+            share, arrays = self._reads[1][1], (self._early, self._late, self.out)
             if self.shared:
-                output.blend_shared(*(word.flatten() for word in words[:2]), self._reads[1][1], words[2].flatten())
-                return
-            inverse = early.inverse_peak, late.inverse_peak
-            share, gamma = self._reads[1][1], self.model.profile.gamma
-            output.blend(*words[:2], *inverse, self._stored.places, share, gamma, words[2])
+                *both, out = (array.flatten() for array in arrays)
+                output.blend_shared(*both, share, out)
+            else:
+                *both, out = (array.reshape((len(self.numbers), -1)) for array in arrays)
+                inverse = early.inverse_peak, late.inverse_peak
+                output.blend(*both, *inverse, self._stored.places, share, self.model.profile.gamma, out)
 
     def numpy(self) -> np.ndarray:
         """The last decode on the host, uint8 [n, 128, 128, 4]; of RGB9E5 linear radiance, float32 [n, 128, 128, 3]."""

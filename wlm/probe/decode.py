@@ -7,7 +7,7 @@ import warp as wp
 
 from wlm import interop
 from wlm.errors import WlmError
-from wlm.probe.model import ProbeModel, check_outputs
+from wlm.probe.model import ProbeModel, check_outputs, check_points
 from wlm.probe.start import morton_order
 from wlm_kernels.probe import cubes as probe_cubes
 from wlm_kernels.probe import gaussian_sum
@@ -116,13 +116,7 @@ class Decoder:
             WlmError: A position that isn't finite.
             ValueError: Another shape.
         """
-        position = np.asarray(position, np.float64)
-        if position.ndim != 2 or position.shape[1] != 3:
-            raise ValueError(f"position: expected [M, 3], got {position.shape}")
-        bad = np.flatnonzero(~np.isfinite(position).all(1))
-        if len(bad):
-            raise WlmError(f"position {bad[0]}: expected finite numbers, got {position[bad[0]].tolist()}")
-        return Points(position, self.model, self.device)
+        return Points(check_points(position), self.model, self.device)
 
     def run(self, points: Points) -> None:
         """Decodes points where they lie; on CUDA it is queued, not awaited."""

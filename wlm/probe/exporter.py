@@ -16,7 +16,7 @@ from wlm.formats.folder import make_parents, rounded, staged, write_index
 from wlm.probe.conventions import CANONICAL
 from wlm.probe.data import save_probes
 from wlm.probe.decode import Decoder
-from wlm.probe.model import CENTRE, SCALE, ProbeModel
+from wlm.probe.model import CENTRE, SCALE, ProbeModel, live_probes
 from wlm.probe.shader import HEAD_WORDS, gaussian_words, probe_glsl
 from wlm.probe.sphere import sh_count
 from wlm.probe.transform import TransformModel
@@ -112,7 +112,7 @@ def export(
 def _export_transform(model: TransformModel, folder: Path, device: str, position: np.ndarray | None) -> list[Path]:
     own = model.stored_positions() if position is None else np.asarray(position, np.float64)
     decoder = model.decoder(device, position=None if position is None else own)
-    live = ~model.dead if len(model.dead) else np.ones(model.probes, bool)
+    live = live_probes(model.dead, model.probes)
     place = own[live]
     content, numbers = light_bytes(model, place, decoder.decode_probes()[live])
     # Half-way between probes that are neighbours in the file, and outside.

@@ -8,6 +8,7 @@ import warp as wp
 from wlm import interop
 from wlm.errors import WlmError
 from wlm.probe.decode import Decoder
+from wlm.probe.model import check_points
 from wlm_kernels.probe import volume_frame as kernels
 
 
@@ -112,12 +113,7 @@ class DecodedLight:
         """
         self._decoder = decoder
         self.device, self.channels = decoder.device, decoder.model.outputs
-        position = np.asarray(position, np.float64)
-        if position.ndim != 2 or position.shape[1] != 3:
-            raise ValueError(f"position: expected [N, 3], got {position.shape}")
-        bad = np.flatnonzero(~np.isfinite(position).all(1))
-        if len(bad):
-            raise WlmError(f"position {bad[0]}: expected finite numbers, got {position[bad[0]].tolist()}")
+        position = check_points(position, "N")
         self._x = wp.array(decoder.model.normalise(position), dtype=wp.vec3, device=self.device)
         self.count = len(position)
 

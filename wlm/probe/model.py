@@ -221,3 +221,31 @@ class ProbeModel(Model):
         # An engine may have rounded them to float32.
         slack = 1e-6 * self.extent + np.finfo(np.float32).eps * np.abs(box).max()
         return bool((np.abs(np.stack([position.min(0), position.max(0)]) - box) <= slack).all())
+
+
+def live_probes(dead: np.ndarray, count: int) -> np.ndarray:
+    """Which of `count` probes have light, bool [N]; `dead` is bool [N], or empty where none is."""
+    return ~dead if len(dead) else np.ones(count, bool)
+
+
+def check_points(position: np.ndarray, letter: str = "M") -> np.ndarray:
+    """Checks points in space.
+
+    Args:
+        position: [M, 3].
+        letter: What an error calls their number.
+
+    Returns:
+        float64 [M, 3].
+
+    Raises:
+        WlmError: A position that isn't finite.
+        ValueError: Another shape.
+    """
+    position = np.asarray(position, np.float64)
+    if position.ndim != 2 or position.shape[1] != 3:
+        raise ValueError(f"position: expected [{letter}, 3], got {position.shape}")
+    bad = np.flatnonzero(~np.isfinite(position).all(1))
+    if len(bad):
+        raise WlmError(f"position {bad[0]}: expected finite numbers, got {position[bad[0]].tolist()}")
+    return position

@@ -7,7 +7,7 @@ from scipy.spatial import cKDTree
 
 from wlm.errors import WlmError
 from wlm.probe.data import load
-from wlm.probe.model import ProbeModel
+from wlm.probe.model import ProbeModel, live_probes
 from wlm.probe.sphere import fibonacci_sphere, irradiance
 from wlm.probe.transform import TransformModel
 from wlm.texels import exposure
@@ -32,7 +32,7 @@ def probes_of(
     Raises:
         WlmError: No positions are known, or the file can't be read or is of other probes.
     """
-    live = ~model.dead if len(model.dead) else np.ones(model.probes, bool)
+    live = live_probes(model.dead, model.probes)
     if original is not None:
         probes = load(original, key=key)
         if len(probes.position) != model.probes or probes.values.shape[1] != model.outputs:

@@ -16,7 +16,7 @@ import numpy as np
 
 from wlm.errors import WlmError
 from wlm.probe.entropy import pack, unpack
-from wlm.probe.model import Profile
+from wlm.probe.model import Profile, live_probes
 from wlm.probe.tree import Tree, flat
 from wlm.system import Model
 
@@ -190,7 +190,7 @@ class TransformModel(Model):
         head = self.head
         if len(places.code) != self.probes or places.check != head.check:
             raise WlmError(f"{self.name}: expected the positions of its own {self.probes} probes, in their order")
-        live = ~self.dead if len(self.dead) else np.ones(self.probes, bool)
+        live = live_probes(self.dead, self.probes)
         count, data = int(live.sum()), self.stream.tobytes()
         start = _HEAD.size + 4 * head.words
         vectors = None

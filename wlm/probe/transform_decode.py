@@ -6,6 +6,7 @@ import warp as wp
 from wlm import interop
 from wlm.errors import WlmError
 from wlm.probe.kriging import Kriging
+from wlm.probe.model import check_points, live_probes
 from wlm.probe.transform import Places, TransformModel
 from wlm_kernels.probe.mixture import mix
 
@@ -72,12 +73,7 @@ class TransformDecoder:
             WlmError: A position that isn't finite, or the model's own places are not known yet.
             ValueError: Another shape.
         """
-        position = np.asarray(position, np.float64)
-        if position.ndim != 2 or position.shape[1] != 3:
-            raise ValueError(f"position: expected [M, 3], got {position.shape}")
-        bad = np.flatnonzero(~np.isfinite(position).all(1))
-        if len(bad):
-            raise WlmError(f"position {bad[0]}: expected finite numbers, got {position[bad[0]].tolist()}")
+        position = check_points(position)
         if self._values is None:
             raise WlmError(f"{self.model.name}: the file has no positions; expected those of its probes first")
         inside = np.clip(position, self._low, self._high) - self._low
@@ -119,7 +115,7 @@ class TransformDecoder:
 
     def _hold(self, values: np.ndarray, position: np.ndarray) -> None:
         model = self.model
-        live = ~model.dead if len(model.dead) else np.ones(model.probes, bool)
+        live = live_probes(model.dead, model.probes)
         self._low, self._high = position[live].min(0), position[live].max(0)
         self._kriging = Kriging(position[live] - self._low)
         self._rows = wp.array(values[live], dtype=float, device=self.device)

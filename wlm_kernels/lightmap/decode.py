@@ -122,11 +122,18 @@ def finish_byte(c: float, inverse_peak: float) -> wp.uint8:
 
 
 @wp.func
+def bytes_over(colour: wp.vec3, inverse_bound: float) -> wp.uint32:
+    """A colour in 8 bits over a bound; alpha is 255."""
+    r = finish_byte(colour[0], inverse_bound)
+    g = finish_byte(colour[1], inverse_bound)
+    b = finish_byte(colour[2], inverse_bound)
+    return pack(wp.vec4ub(r, g, b, wp.uint8(255)))
+
+
+@wp.func
 def finish_bytes(time: TimeState, n: int, y: wp.vec3) -> wp.uint32:
     """The 8-bit output: gamma-space colour over the tile's bound at this time; alpha is 255."""
-    c = finish_colour(time, n, y)
-    p = time.inverse_peak[n]
-    return pack(wp.vec4ub(finish_byte(c[0], p), finish_byte(c[1], p), finish_byte(c[2], p), wp.uint8(255)))
+    return bytes_over(finish_colour(time, n, y), time.inverse_peak[n])
 
 
 @wp.func

@@ -6,7 +6,7 @@ bit.
 
 import warp as wp
 
-from wlm_kernels.lightmap.decode import finish_byte, pack
+from wlm_kernels.lightmap.decode import bytes_over
 from wlm_kernels.lightmap.frames import power
 from wlm_kernels.shared_exponent import pack_rgb9e5
 
@@ -81,10 +81,7 @@ def _decode_bytes(
         colour = power(video_radiance(stored, early, late, share, n, y, x), 1.0 / stored.gamma)
     else:
         colour = video_colour(stored, n * stored.times + early, y, x)
-    p = inverse_peak[n]
-    out[i, y, x] = pack(
-        wp.vec4ub(finish_byte(colour[0], p), finish_byte(colour[1], p), finish_byte(colour[2], p), wp.uint8(255))
-    )
+    out[i, y, x] = bytes_over(colour, inverse_peak[n])
 
 
 @wp.kernel
