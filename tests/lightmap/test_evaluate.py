@@ -12,7 +12,7 @@ import wlm
 from wlm.errors import WlmError
 from wlm.lightmap.data import from_arrays
 from wlm.lightmap.decode import Decoder
-from wlm.lightmap.evaluation import bits_per_texel, evaluate, lost_light, part_bytes
+from wlm.lightmap.evaluation import bits_per_texel, evaluate, lost_light, part_bytes, psnr_of_tiles
 from wlm.lightmap.fit import compress
 from wlm.metrics import evaluate_frame, summarise
 
@@ -65,6 +65,13 @@ def test_the_scores_are_those_of_the_protocol(fitted, report):
         "row": row,
         "column": column,
     }
+
+
+def test_the_psnr_of_some_tiles_is_that_of_the_report(fitted, report):
+    lightmaps, model, _ = fitted
+    some = psnr_of_tiles(model, lightmaps, [1, 3, 0], range(5))
+    np.testing.assert_allclose(some, report.psnr_by_tile.ravel()[[1, 3, 0]], rtol=1e-12)
+    assert psnr_of_tiles(model, lightmaps, [0], [2])[0] != some[2]
 
 
 def test_what_is_held_and_left_out_is_counted(fitted, report):

@@ -35,7 +35,7 @@ from wlm.lightmap.video import encode_page
 from wlm.lightmap.video_packing import pages
 from wlm.lightmap.worker import Fitter, Piece
 from wlm.system import Meter, OnProgress
-from wlm.workers import Actors, Here, Processes, Workers, cores
+from wlm.workers import Actors, Here, Processes, Workers, cores, each
 
 BATCH_TEXELS = 64 * 26 * TILE * TILE  # texels times times in a batch: 64 tiles of 26 times, 330 MB of targets
 CPU_TILES = 4  # in a batch on a CPU, at most: two cores gain nothing from more, and many want many batches
@@ -242,8 +242,8 @@ class _Fit:
         self.index = np.arange(grid.count) if tiles is None else np.array(sorted(tiles), np.int64)
         check_index(self.index, grid)
         meter, facts = Meter(progress, "tiles", len(self.index)), []
-        for number in self.index.tolist():
-            facts.append(self._facts(number))
+        for fact in each(self._facts, self.index.tolist()):
+            facts.append(fact)
             if len(facts) % _LOOK == 0 and meter.due(len(facts)):
                 meter.report(len(facts))
         self.kinds = np.array([tile.kind for tile in facts])

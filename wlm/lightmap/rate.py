@@ -17,7 +17,7 @@ import numpy as np
 from wlm.errors import WlmError
 from wlm.lightmap.codec import encode
 from wlm.lightmap.data import LightmapSet
-from wlm.lightmap.evaluation import bits_per_texel, evaluate
+from wlm.lightmap.evaluation import bits_per_texel, evaluate, psnr_of_tiles
 from wlm.lightmap.fit import compress
 from wlm.lightmap.model import LightmapModel, Profile
 from wlm.lightmap.packing import STREAMS
@@ -34,6 +34,7 @@ _FEWEST = 4  # tiles: fewer don't stand for a set
 _PER_OCTAVE = 2.3  # dB for twice the bytes: 2.1 in the living room, 2.1 to 3 in the city
 _OCTAVES = 0.15  # between two sizes whose PSNR gives the figure of this scene
 _LEAST_PER_OCTAVE, _MOST_PER_OCTAVE = 1.0, 4.0
+_TIMES = 6  # that say how much easier a part of the tiles is
 _ROOM = 0.99  # of the largest size
 _QUALITIES = range(101)  # of video
 
@@ -175,8 +176,12 @@ class _Search:
         count = max(math.ceil(_PART * len(dynamic)), min(_FEWEST, len(dynamic)))
         self._part = dynamic[np.linspace(0, len(dynamic) - 1, count).round().astype(int)].tolist()
         # A short fit says what each tile is beside the others, a part of them what all steps make of it.
-        scores, part = self._psnr(model), self._fit(self._first, self._part, profile.steps)
-        self._easier = np.nanmean(scores[self._part]) - np.nanmean(scores)
+        some = np.unique(np.linspace(0, len(model.times) - 1, _TIMES).round().astype(int)).tolist()
+        scores, part = (
+            psnr_of_tiles(model, lightmaps, dynamic, some, self._device),
+            self._fit(self._first, self._part, profile.steps),
+        )
+        self._easier = np.nanmean(scores[np.isin(dynamic, self._part)]) - np.nanmean(scores)
         self._first_level = self._level(part)
         short, full = _stream_bytes(model), _stream_bytes(part)
         grown = full.sum(0) / short[np.searchsorted(model.mapped, self._part)].sum(0)
@@ -206,16 +211,12 @@ class _Search:
 
     def _level(self, part: LightmapModel) -> float:
         """PSNR of the set, from a fit of the part: less what that is easier, as the short fit says."""
-        return float(np.nanmean(self._psnr(part)[self._part]) - self._easier)
+        every = range(len(part.times))
+        return float(np.nanmean(psnr_of_tiles(part, self._lightmaps, self._part, every, self._device)) - self._easier)
 
     def _fit(self, resolution: int, tiles: list[int] | None, steps: int) -> LightmapModel:
         changes = {"uvt_resolution": resolution, "steps": steps}
         return compress(self._lightmaps, self._profile.override(changes), tiles=tiles, **self._options)
-
-    def _psnr(self, model: LightmapModel) -> np.ndarray:
-        """PSNR of each tile of the grid, NaN without a score."""
-        report = evaluate(model, self._lightmaps, device=self._device, metrics=("psnr",), views=0)
-        return report.psnr_by_tile.ravel()
 
 
 def _stream_bytes(model: LightmapModel) -> np.ndarray:

@@ -3,6 +3,7 @@
 import numpy as np
 
 from wlm.lightmap.tiles import TILE
+from wlm.workers import each
 
 
 class Targets:
@@ -47,13 +48,17 @@ class Targets:
         self.spread = affine[:, 1].astype(np.float32)
         factor = np.divide(1.0, scale, out=np.zeros_like(scale), where=scale > 0)
         flat = colour.reshape(n, times, TILE * TILE, 3)
-        self.colour = (flat * factor[:, :, None] - self.shift[:, None, None]) / self.spread[:, None, None]
         valid = mask.reshape(n, -1)
+        self.colour = np.empty_like(flat)
         self.count = valid.sum(1).astype(np.int32)
         self.texels = np.zeros((n, max(int(self.count.max()), 1)), np.int32)
         self.weight = np.ones((n, times, 3), np.float32)
         self.range = np.zeros((n, times), np.float32)
-        for i in range(n):
+
+        def fill(i: int) -> None:
+            np.multiply(flat[i], factor[i, :, None], out=self.colour[i])
+            self.colour[i] -= self.shift[i]
+            self.colour[i] /= self.spread[i]
             self.texels[i, : self.count[i]] = np.flatnonzero(valid[i])
             values = flat[i][:, valid[i]]
             span = values.max((1, 2)) ** gamma - values.min((1, 2)) ** gamma  # [T] of linear radiance
@@ -65,6 +70,8 @@ class Targets:
                 # the texel's emphasis. A tile without range is not scored, so it has no weight.
                 slope = gamma * scale[i] ** gamma * self.spread[i] / np.where(span > 0, span, 1.0)[:, None]
                 self.weight[i] = np.where(span[:, None] > 0, slope, 0.0) ** (2.0 * metric_weight)
+
+        list(each(fill, range(n)))
         # A black channel has scale 0: whatever the network's output, it decodes to 0.
         self.weight *= scale > 0
         self.emphasis = 2.0 * (gamma - 1.0) * metric_weight

@@ -17,6 +17,7 @@ import numpy as np
 from wlm.errors import WlmError
 from wlm.lightmap.data import LightmapSet
 from wlm.texels import check_size, fill_gaps
+from wlm.workers import each
 
 TILE = 128  # texels a side: the paper's tile (Table 1)
 
@@ -114,15 +115,19 @@ class TileCut:
     def encoded(self, gamma: float) -> TileData:
         """The tiles ready for fitting; they take N * T * 192 KiB of memory."""
         colour = np.zeros((len(self.index), len(self.light[0]), TILE, TILE, 3), np.float32)
-        for light, valid, out in zip(self.light, self.mask, colour, strict=True):
+
+        def encode(i: int) -> None:
+            valid, out = self.mask[i], colour[i]
             if not valid.any():
-                continue
+                return
             rows, columns = valid.shape
-            out[:, :rows, :columns] = fill_gaps(light, valid)
+            out[:, :rows, :columns] = fill_gaps(self.light[i], valid)
             out[:, :rows, columns:] = out[:, :rows, columns - 1 : columns]
             out[:, rows:] = out[:, rows - 1 : rows]
             if gamma != 1.0:
                 np.power(out, np.float32(1.0 / gamma), out=out)
+
+        list(each(encode, range(len(self.index))))
         return TileData(self.index, colour, np.stack([_whole(valid) for valid in self.mask]))
 
 
