@@ -12,6 +12,8 @@ from wlm_kernels.fluid import advection, advection_sources, lattice, lattice_fie
 from wlm_kernels.lightmap import decode as lightmap_decode
 from wlm_kernels.lightmap import matrix_decode
 from wlm_kernels.lightmap import step as lightmap_step
+from wlm_kernels.lightmap.frames import FRAMES
+from wlm_kernels.lightmap.video import VIDEO
 from wlm_kernels.probe import decode as probe_decode
 from wlm_kernels.probe import gaussian_sum, optimiser
 from wlm_kernels.probe import network as probe_network
@@ -31,12 +33,10 @@ MODULES = (
     "interpolate",
     "lightmap.blocks",
     "lightmap.decode",
-    "lightmap.frames",
     "lightmap.gather",
     "lightmap.levels",
     "lightmap.matrix_decode",
     "lightmap.output",
-    "lightmap.video",
     "probe.cubes",
     "probe.gaussian_sum",
     "probe.mixture",
@@ -116,6 +116,12 @@ def test_strip_decode(hidden: int, shared: bool, tmp_path: Path):
 def test_matrix_decode(hidden: int, shared: bool, tmp_path: Path):
     """Decoding on matrix units, which a GPU alone has."""
     _compile_all(vars(matrix_decode.matrix_kernels(hidden, shared)).values(), tmp_path)
+
+
+@pytest.mark.parametrize("kernels", [FRAMES, VIDEO], ids=["frames", "video"])
+def test_images(kernels: object, tmp_path: Path):
+    """Decoding what is stored as an image at each time."""
+    _compile_all(vars(kernels).values(), tmp_path)
 
 
 @pytest.mark.parametrize("latent", _slow_but(9, [1, 12, 32]))

@@ -1,7 +1,7 @@
 """Tiles that are stored as images, frames or video, on a device."""
 
 from collections.abc import Sequence
-from types import ModuleType
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -10,7 +10,9 @@ from wlm.errors import WlmError
 from wlm.formats import bc7_modes
 from wlm.lightmap.model import TILE, LightmapModel
 from wlm.lightmap.tiles import TileKind
-from wlm_kernels.lightmap import frames, video
+from wlm_kernels.lightmap.frames import FRAMES, StoredFrames, Tables
+from wlm_kernels.lightmap.images import ImageKernels
+from wlm_kernels.lightmap.video import VIDEO, StoredVideo
 
 
 def inverse_of(bounds: np.ndarray) -> np.ndarray:
@@ -42,14 +44,14 @@ class ImageTiles(HeldTiles):
         device_bytes: Memory that they take up on the device, bytes.
     """
 
-    def __init__(self, model: LightmapModel, kind: TileKind, greatest: np.ndarray, kernels: ModuleType) -> None:
+    def __init__(self, model: LightmapModel, kind: TileKind, greatest: np.ndarray, kernels: ImageKernels) -> None:
         """Finds the tiles of a kind.
 
         Args:
             model: The model.
             kind: FRAMES or VIDEO.
             greatest: float32 [n, T], their greatest colour.
-            kernels: The module that decodes them.
+            kernels: Those of its images.
 
         Raises:
             WlmError: The model has none.
@@ -58,7 +60,7 @@ class ImageTiles(HeldTiles):
         if not len(self.numbers):
             raise WlmError(f"{model.name}: expected at least one tile of {kind.name.lower()}, found none")
         self._axis, self._greatest, self._kernels = model.axis, greatest, kernels
-        self._arguments: tuple[object, ...] = ()
+        self._stored: Any = None
         self.device_bytes = 0
 
     def bounds(self, time: float) -> np.ndarray:
@@ -73,10 +75,10 @@ class ImageTiles(HeldTiles):
             time: Stored or between; there the radiance of both is mixed (eq. 2), whatever the model's networks do.
             rows: int [k], places in `numbers`.
             out: [k, 128, 128], radiance, vec3 or uint32 of RGB9E5; with `inverse_peak` uint32 of 8 bits, as of
-                `wlm_kernels.lightmap.frames`.
+                `wlm_kernels.lightmap.images`.
             inverse_peak: float [n], 1 / the bound of each tile.
         """
-        arguments = *self._arguments, *self._axis.neighbours(time), rows
+        arguments = self._stored, *self._axis.neighbours(time), rows
         if inverse_peak is not None:
             self._kernels.decode_bytes(*arguments, inverse_peak, out)
         elif out.dtype == wp.uint32:
@@ -94,20 +96,21 @@ class FrameTiles(ImageTiles):
         Raises:
             WlmError: The model has none.
         """
-        super().__init__(model, TileKind.FRAMES, model.ranges[:, :, 1].astype(np.float32).max(2), frames)
+        super().__init__(model, TileKind.FRAMES, model.ranges[:, :, 1].astype(np.float32).max(2), FRAMES)
         ends = model.ranges.astype(np.float32).reshape(-1, 2, 3)
         words = np.ascontiguousarray(model.frames).view("<u8").reshape(-1, TILE // 4, TILE // 4, 2)
-        stored = frames.StoredFrames()
+        stored = StoredFrames()
         stored.blocks = wp.array(words, dtype=wp.uint64, device=device)
         stored.least = wp.array(np.ascontiguousarray(ends[:, 0]), dtype=wp.vec3, device=device)
         stored.span = wp.array(np.ascontiguousarray(ends[:, 1] - ends[:, 0]), dtype=wp.vec3, device=device)
         stored.times, stored.gamma = len(model.times), model.profile.gamma
-        tables = frames.Tables()
+        tables = Tables()
         tables.modes = wp.array(bc7_modes.MODES, dtype=int, device=device)
         tables.partitions = wp.array(bc7_modes.PARTITIONS, dtype=wp.uint32, device=device)
         tables.anchors = wp.array(bc7_modes.ANCHORS, dtype=int, device=device)
         tables.shares = wp.array(bc7_modes.SHARES, dtype=int, device=device)
-        self._arguments = stored, tables
+        stored.tables = tables
+        self._stored = stored
         self.device_bytes = sum(array.capacity for array in (stored.blocks, stored.least, stored.span))
 
 
@@ -120,14 +123,14 @@ class VideoTiles(ImageTiles):
         Raises:
             WlmError: The model has none.
         """
-        super().__init__(model, TileKind.VIDEO, model.video_peaks, video)
+        super().__init__(model, TileKind.VIDEO, model.video_peaks, VIDEO)
         least, greatest = np.moveaxis(model.video_ranges.astype(np.float32), 2, 0).reshape(2, -1)
-        stored = video.StoredVideo()
+        stored = StoredVideo()
         stored.levels = wp.array(model.video_levels.reshape(-1, TILE, TILE), dtype=wp.uint32, device=device)
         stored.least = wp.array(least, dtype=float, device=device)
         stored.span = wp.array(greatest - least, dtype=float, device=device)
         stored.times, stored.gamma = len(model.times), model.profile.gamma
-        self._arguments = (stored,)
+        self._stored = stored
         self.device_bytes = sum(array.capacity for array in (stored.levels, stored.least, stored.span))
 
 

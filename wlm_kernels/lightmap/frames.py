@@ -6,8 +6,7 @@ little-endian bytes. The format's tables are arrays (`wlm.formats.bc7_modes` has
 
 import warp as wp
 
-from wlm_kernels.lightmap.decode import bytes_over
-from wlm_kernels.shared_exponent import pack_rgb9e5
+from wlm_kernels.lightmap.images import image_kernels
 
 wp.set_module_options({"enable_backward": False})
 
@@ -29,6 +28,7 @@ class StoredFrames:
     blocks: wp.array4d[wp.uint64]  # [N T, 32, 32, 2]
     least: wp.array1d[wp.vec3]  # [N T], colour of level 0
     span: wp.array1d[wp.vec3]  # [N T], that of level 1 less it
+    tables: Tables
     times: int
     gamma: float
 
@@ -144,117 +144,13 @@ def block_texel(low: wp.uint64, high: wp.uint64, tables: Tables, texel: int) -> 
 
 
 @wp.func
-def frame_colour(stored: StoredFrames, tables: Tables, frame: int, y: int, x: int) -> wp.vec3:
+def frame_colour(stored: StoredFrames, frame: int, y: int, x: int) -> wp.vec3:
     """The colour in gamma space of a texel of a frame."""
     low = stored.blocks[frame, y // 4, x // 4, 0]
     high = stored.blocks[frame, y // 4, x // 4, 1]
-    level = block_texel(low, high, tables, 4 * (y % 4) + x % 4) / 255.0
+    level = block_texel(low, high, stored.tables, 4 * (y % 4) + x % 4) / 255.0
     return stored.least[frame] + wp.cw_mul(level, stored.span[frame])
 
 
-@wp.func
-def power(colour: wp.vec3, exponent: float) -> wp.vec3:
-    return wp.vec3(wp.pow(colour[0], exponent), wp.pow(colour[1], exponent), wp.pow(colour[2], exponent))
-
-
-@wp.func
-def frame_radiance(
-    stored: StoredFrames, tables: Tables, early: int, late: int, share: float, n: int, y: int, x: int
-) -> wp.vec3:
-    """Radiance between two frames (eq. 2)."""
-    light = power(frame_colour(stored, tables, n * stored.times + early, y, x), stored.gamma)
-    if share > 0.0:
-        other = power(frame_colour(stored, tables, n * stored.times + late, y, x), stored.gamma)
-        light = (1.0 - share) * light + share * other
-    return light
-
-
-@wp.kernel
-def _decode_radiance(
-    # in:
-    stored: StoredFrames,
-    tables: Tables,
-    early: int,
-    late: int,
-    share: float,
-    tiles: wp.array1d[int],
-    # out:
-    out: wp.array3d[wp.vec3],
-):
-    i, y, x = wp.tid()
-    out[i, y, x] = frame_radiance(stored, tables, early, late, share, tiles[i], y, x)
-
-
-@wp.kernel
-def _decode_bytes(
-    # in:
-    stored: StoredFrames,
-    tables: Tables,
-    early: int,
-    late: int,
-    share: float,
-    tiles: wp.array1d[int],
-    inverse_peak: wp.array1d[float],
-    # out:
-    out: wp.array3d[wp.uint32],
-):
-    i, y, x = wp.tid()
-    n = tiles[i]
-    if share > 0.0:
-        colour = power(frame_radiance(stored, tables, early, late, share, n, y, x), 1.0 / stored.gamma)
-    else:
-        colour = frame_colour(stored, tables, n * stored.times + early, y, x)
-    out[i, y, x] = bytes_over(colour, inverse_peak[n])
-
-
-@wp.kernel
-def _decode_shared(
-    # in:
-    stored: StoredFrames,
-    tables: Tables,
-    early: int,
-    late: int,
-    share: float,
-    tiles: wp.array1d[int],
-    # out:
-    out: wp.array3d[wp.uint32],
-):
-    i, y, x = wp.tid()
-    out[i, y, x] = pack_rgb9e5(frame_radiance(stored, tables, early, late, share, tiles[i], y, x))
-
-
-def decode_radiance(stored, tables, early: int, late: int, share: float, tiles, out) -> None:
-    """Decodes tiles to linear radiance.
-
-    Args:
-        stored: `StoredFrames`.
-        tables: `Tables`.
-        early, late, share: The two frames around the time, and the share of the second in [0, 1).
-        tiles: int [n], the tiles to decode.
-        out: vec3 [n, 128, 128], written.
-    """
-    inputs = [stored, tables, early, late, share, tiles]
-    wp.launch(_decode_radiance, out.shape, inputs=inputs, outputs=[out], device=out.device)
-
-
-def decode_bytes(stored, tables, early: int, late: int, share: float, tiles, inverse_peak, out) -> None:
-    """Decodes tiles to 8-bit colour in gamma space over a bound.
-
-    Args:
-        stored, tables, early, late, share, tiles: As for `decode_radiance`.
-        inverse_peak: float [N], 1 / the bound of each tile; 0 for a black one.
-        out: uint32 [n, 128, 128], RGBA from the lowest byte, alpha 255, written.
-    """
-    inputs = [stored, tables, early, late, share, tiles, inverse_peak]
-    wp.launch(_decode_bytes, out.shape, inputs=inputs, outputs=[out], device=out.device)
-
-
-def decode_shared(stored, tables, early: int, late: int, share: float, tiles, out) -> None:
-    """Decodes tiles to linear radiance as RGB9E5.
-
-    Args:
-        stored, tables, early, late, share, tiles: As for `decode_radiance`.
-        out: uint32 [n, 128, 128], written.
-    """
-    inputs = [stored, tables, early, late, share, tiles]
-    wp.launch(_decode_shared, out.shape, inputs=inputs, outputs=[out], device=out.device)
+FRAMES = image_kernels(StoredFrames, frame_colour)
+"""Decodes frames."""
