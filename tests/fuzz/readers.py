@@ -26,6 +26,7 @@ from wlm.formats.gltf_writer import write_glb
 from wlm.formats.light import read_light
 from wlm.formats.mask import read_mask
 from wlm.formats.obj import read_obj
+from wlm.inspection import inspect
 from wlm.probe.data import load_positions
 from wlm.smoke.data import load_frames, read_six_way
 from wlm.smoke.exporter import read_flipbook
@@ -56,6 +57,10 @@ def _json(draw: Random, data: bytes) -> bytes:
 def _exr(path: Path) -> None:
     pixels, names = read_exr(path)
     assert pixels.dtype == np.float32 and pixels.shape[2] == len(names), f"accepted as {pixels.dtype} {pixels.shape}"
+
+
+def _inspect(path: Path) -> None:
+    assert all("\n" not in line for each in inspect(path.parent) for line in (each.what, *each.problems))
 
 
 def _light_file(path: Path) -> None:
@@ -334,6 +339,7 @@ _ALL = (
         vary_ktx2,
         _light_file,
     ),
+    Reader("inspect", "a.json", corpus("set.json", "probes.json", "positions.json"), _json, _inspect),
     Reader("dds", "a.dds", corpus("shared.dds", "bc6h.dds", "float-legacy.dds"), vary_dds, _light_file),
     Reader(
         "exr-six-way",

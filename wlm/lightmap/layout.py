@@ -10,7 +10,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-_PICTURES = 8  # of a set, that are compared
+PICTURES = 8
+"""Of a set, that are compared."""
+
 _LEAST_BORDER = 0.005  # of the lit texels: with less there is nothing to tell by
 _MOST_BORDER = 0.6  # beyond it light ends everywhere, in noise
 _LEAST_SHARED = 0.2  # of the smaller picture, lit in both
@@ -27,15 +29,20 @@ def odd_layout(count: int, lit: Callable[[int], np.ndarray]) -> tuple[int, int] 
     Returns:
         The numbers of both; None where all may be of one atlas, or too little is dark to tell.
     """
-    chosen = np.unique(np.linspace(0, count - 1, min(count, _PICTURES)).astype(int))
-    pictures = [lit(int(i)) for i in chosen]
+    chosen = spread(count, PICTURES)
+    pictures = [lit(i) for i in chosen]
     borders = [_border(picture) for picture in pictures]
     most = int(np.argmax([np.count_nonzero(picture) for picture in pictures]))
     for i in range(len(chosen)):
         if i != most and _differ(pictures[i], borders[i], pictures[most], borders[most]):
-            first, second = sorted((int(chosen[i]), int(chosen[most])))
+            first, second = sorted((chosen[i], chosen[most]))
             return first, second
     return None
+
+
+def spread(count: int, most: int) -> list[int]:
+    """At most so many of the numbers from 0 to count - 1, spread evenly."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).astype(int)).tolist()
 
 
 def _differ(a: np.ndarray, border_a: np.ndarray, b: np.ndarray, border_b: np.ndarray) -> bool:

@@ -1,0 +1,267 @@
+"""What a folder holds as a whole, and the files in it that belong to nothing else."""
+
+import os
+from collections.abc import Iterator, Sequence
+from itertools import islice
+from pathlib import Path
+
+from wlm.errors import WlmError
+from wlm.formats.light import SUFFIXES
+from wlm.inspection.files import document_of, inspect_file
+from wlm.inspection.finding import Finding
+from wlm.inspection.pictures import Picture, picture_of, read_lit, said
+from wlm.lightmap.contest import CONFIG_FILE, is_contest, list_contest
+from wlm.lightmap.layers.listing import is_layered, list_layers, state_folders
+from wlm.lightmap.layout import PICTURES, odd_layout, spread
+from wlm.lightmap.listing import SET_FILE, Listing, count_of, natural, parse_set, time_of_name
+from wlm.smoke.camera import DIRECTIONS
+
+MOST = 256
+"""Findings that are told, and folders that are looked into."""
+
+_DEEPEST = 4
+_ENTRIES = 20_000  # of one folder
+_SILENT = {".md", ".txt", ".meta", ".import", ".uid", ".html", ".pdf", ".py", ".js", ".cs", ".glsl", ".hlsl", ".bin"}
+_SILENT_NAMES = ("license", "licence", "readme", "copying")
+
+
+def inspect(path: str | os.PathLike[str]) -> list[Finding]:
+    """Says what a file holds, or a folder and those in it, in 256 lines at most.
+
+    Args:
+        path: The file or the folder.
+
+    Raises:
+        WlmError: There is none, or a folder can't be read.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise WlmError(f"{path}: no such file or folder")
+    if not path.is_dir():
+        return [inspect_file(path)]
+    found = list(islice(_folder(path, 0), MOST))
+    return found or [Finding(path, "nothing that is known here")]
+
+
+def _folder(folder: Path, depth: int) -> Iterator[Finding]:
+    entries = _entries(folder)
+    files = [entry for entry in entries if entry.is_file()]
+    taken: set[Path] = set()
+    for whole in (_documents, _unity, _contest, _pictures):
+        try:
+            found = whole(folder, [file for file in files if file not in taken])
+        except WlmError as error:
+            found = [(Finding(folder, "can't be read", problems=(said(error, folder),)), set())]
+        for finding, its in found:
+            taken |= its
+            yield finding
+    for file in files:
+        if file not in taken and not _is_silent(file):
+            yield inspect_file(file)
+    if depth < _DEEPEST:
+        for entry in entries:
+            if entry not in taken and entry.is_dir() and not entry.is_symlink():
+                yield from _folder(entry, depth + 1)
+
+
+def _entries(folder: Path) -> list[Path]:
+    try:
+        found = [Path(entry.path) for entry in islice(os.scandir(folder), _ENTRIES) if entry.name[0] != "."]
+    except OSError as error:
+        raise WlmError(f"{folder}: cannot read: {error.strerror or error}") from error
+    return sorted(found, key=lambda path: (natural(path.name), path.name))
+
+
+def _is_silent(file: Path) -> bool:
+    return file.suffix.lower() in _SILENT or file.name.lower().startswith(_SILENT_NAMES)
+
+
+_Found = list[tuple[Finding, set[Path]]]
+
+
+def _documents(folder: Path, files: Sequence[Path]) -> _Found:
+    """What a JSON of ours says that the folder is; a `set.json`."""
+    for file in files:
+        if file.suffix.lower() != ".json":
+            continue
+        if file.name == SET_FILE:
+            finding = inspect_set(file)
+            listed = set() if finding.what == _UNREADABLE else {file, *_named(file, files)}
+            return [(finding, listed | {file})]
+        stated = document_of(file)
+        if stated is not None:
+            # All of it is that output's.
+            return [(Finding(folder, stated, _next(folder, stated)), set(files) | set(_entries(folder)))]
+    return []
+
+
+def _next(folder: Path, stated: str) -> str:
+    if "mesh" in stated:
+        return f"wlm web {folder} -o PAGE.html"
+    return f"wlm smoke bake {folder} -o DIR" if "frames of smoke" in stated else ""
+
+
+_UNREADABLE = "a lightmap set that can't be read"
+
+
+def inspect_set(path: Path) -> Finding:
+    """Says what a `set.json` lists, and whether it is there."""
+    try:
+        if is_layered(path):
+            listing = list_layers(path, None, None, False)
+            sheets = f"{count_of(listing.atlases, 'atlas')} with {', '.join(layer.name for layer in listing.layers)}"
+            problems = sorted(
+                {f"{s.path.name} is missing" for one in listing.states for s in one.values() if not s.path.is_file()}
+            )
+            what = f"a layered set of lightmaps at {count_of(listing.states, 'time')}: {sheets}"
+            return Finding(path.parent, what, f"wlm lightmap compress {path.parent} -o OUT.wlm", tuple(problems[:4]))
+        return _checked(path.parent, parse_set(path, None))
+    except WlmError as error:
+        return Finding(path.parent, _UNREADABLE, problems=(said(error, path),))
+
+
+def _named(path: Path, files: Sequence[Path]) -> set[Path]:
+    """The files beside a `set.json` that it names."""
+    try:
+        if is_layered(path):
+            return {source.path for one in list_layers(path, None, None, False).states for source in one.values()}
+        listing = parse_set(path, None)
+    except WlmError:
+        return set()
+    return {*listing.files, Path(listing.mask)} & set(files)
+
+
+def _checked(folder: Path, listing: Listing) -> Finding:
+    """A set of lightmaps over time, with what may be wrong with it."""
+    missing = [file.name for file in listing.files if not file.is_file()]
+    problems = (
+        [f"{missing[0]} and {len(missing) - 1} more are missing" if missing[1:] else f"{missing[0]} is missing"]
+        if missing
+        else []
+    )
+    files = list(dict.fromkeys(file for file in listing.files if file.is_file()))
+    heads = [picture_of(file) for file in files]
+    size = next((head.size for head in heads if head is not None and head.width), "an unknown size")
+    problems += _of_files(files, heads)
+    what = f"a set of lightmaps at {count_of(listing.files, 'time')}, {size}"
+    return Finding(folder, what, f"wlm lightmap compress {folder} -o OUT.wlm", tuple(problems))
+
+
+def _of_files(files: Sequence[Path], heads: Sequence[Picture | None]) -> list[str]:
+    """What may be wrong with pictures of one atlas: kinds, sizes, layouts, numbers."""
+    problems = []
+    for file, head in zip(files, heads, strict=True):
+        if head is None or head.kind == "PNG":
+            return [f"{file.name} is no picture of light"]
+    sized = [(file, head) for file, head in zip(files, heads, strict=True) if head.width]
+    for file, head in sized[1:]:
+        if head.size != sized[0][1].size:
+            return [f"{file.name} is {head.size}, {sized[0][0].name} is {sized[0][1].size}"]
+    chosen = [files[i] for i in spread(len(files), PICTURES)]
+    lit = []
+    for file in chosen:
+        try:
+            one, said_of = read_lit(file)
+        except WlmError as error:
+            return [f"{file.name}: {said(error, file)}"]
+        lit.append(one)
+        problems += [f"{file.name}: {text}" for text in said_of]
+    odd = odd_layout(len(lit), lit.__getitem__) if len({one.shape for one in lit}) == 1 else None
+    if odd is not None:
+        problems.append(f"{chosen[odd[0]].name} and {chosen[odd[1]].name} don't look like one atlas at two times")
+    return problems
+
+
+def _unity(folder: Path, files: Sequence[Path]) -> _Found:
+    """States of light as Unity bakes them, the folder's own or those of folders in it."""
+    states = state_folders(folder)
+    if not states or (folder / SET_FILE).is_file():
+        return []
+    held = {state: [entry for entry in _entries(state) if "_comp_" in entry.name.lower()] for state in states}
+    times = [time_of_name(state.name) for state in states]
+    problems, option = [], ""
+    if len(states) > 1 and None in times:
+        option = f" --times {','.join(str(i) for i in range(len(states)))}"
+        problems.append(f"the hours of {', '.join(state.name for state in states[:8])} aren't known: say them")
+    stated: list[float] = [float(i) for i in range(len(states))]
+    layers = ""
+    try:
+        listing = list_layers(folder, stated, None, False)
+    except WlmError as error:
+        problems.append(said(error, folder))
+        shared = ["light", *(name for name in ("dir", "shadowmask") if _lists(folder, stated, ["light", name]))]
+        layers, listing = f" --layers {','.join(shared)}", list_layers(folder, stated, shared, False)
+    sizes = []
+    for atlas in listing.atlases:
+        paths = [one[atlas.name, "light"].path for one in listing.states]
+        heads = [picture_of(path) for path in paths]
+        sizes += sorted({head.size for head in heads if head is not None})
+        problems += [f"{atlas.name}: {text}" for text in _of_files(paths, heads)]
+    names = ", ".join(layer.name for layer in listing.layers)
+    size = " and ".join(dict.fromkeys(sizes))
+    maps = f"{count_of(listing.atlases, 'map')} of {size}, with {names}"
+    what = f"{count_of(states, 'state')} of Unity's light, {maps}"
+    finding = Finding(folder, what, f"wlm lightmap compress {folder}{option}{layers} -o OUT.wlm", tuple(problems))
+    its = {path for paths in held.values() for path in paths}
+    if states == [folder]:
+        return [(finding, its)]
+    # What else lies in the states' folders is told here: they aren't looked into again.
+    rest = [
+        entry
+        for state in states
+        for entry in _entries(state)
+        if entry not in its and entry.is_file() and not _is_silent(entry)
+    ]
+    return [(finding, set(states)), *((inspect_file(entry), set()) for entry in rest)]
+
+
+def _lists(folder: Path, times: list[float], layers: list[str]) -> bool:
+    try:
+        list_layers(folder, times, layers, False)
+    except WlmError:
+        return False
+    return True
+
+
+def _contest(folder: Path, files: Sequence[Path]) -> _Found:
+    if not is_contest(folder):
+        return []
+    problems: tuple[str, ...] = ()
+    try:
+        what = f"a contest's raw lightmaps at {count_of(list_contest(folder, None, None).files, 'time')}"
+    except WlmError as error:
+        what, problems = "a contest's raw lightmaps", (said(error, folder / CONFIG_FILE),)
+    return [(Finding(folder, what, f"wlm lightmap compress {folder} -o OUT.wlm", problems), set(_entries(folder)))]
+
+
+def _pictures(folder: Path, files: Sequence[Path]) -> _Found:
+    """Two or more pictures of light: times of one atlas, frames of smoke, or lightmaps of several meshes."""
+    heads = {}
+    for file in files:
+        if file.suffix.lower() in SUFFIXES:
+            try:
+                heads[file] = picture_of(file)
+            except WlmError:
+                continue  # told by itself
+    heads = {file: head for file, head in heads.items() if head is not None and not head.is_cube and head.kind != "PNG"}
+    smoke = [file for file, head in heads.items() if set(DIRECTIONS) <= set(head.channels)]
+    if smoke:
+        what = f"six-way lightmaps of smoke, {count_of(smoke, 'frame')} of {heads[smoke[0]].size}"
+        return [(Finding(folder, what, f"wlm smoke flipbook {folder} -o OUT.png"), set(smoke))]
+    pictures = [file for file in heads if "_comp_" not in file.name.lower()]
+    if len(pictures) < 2:
+        return []
+    problems = _of_files(pictures, [heads[file] for file in pictures])
+    unlike = any("one atlas" in text or " is " in text and "x" in text.rsplit(" ", 1)[-1] for text in problems)
+    if unlike:
+        what = f"{count_of(pictures, 'lightmap')} of different atlases: no times of one"
+        command = "wlm atlas compress MESH.glb LIGHTMAP -o DIR, of each with its mesh"
+        return [(Finding(folder, what, command, tuple(problems)), set(pictures))]
+    option = ""
+    if any(time_of_name(file.stem) is None for file in pictures):
+        option = " --times ..."
+        problems.append("no hours in the names: are they one atlas at several times? then say them")
+    what = f"{count_of(pictures, 'lightmap')} of {heads[pictures[0]].size}"
+    mask = folder / "mask.png"
+    taken = {*pictures, mask} & set(files)
+    return [(Finding(folder, what, f"wlm lightmap compress {folder}{option} -o OUT.wlm", tuple(problems)), taken)]
