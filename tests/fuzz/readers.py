@@ -19,6 +19,7 @@ import wlm
 from wlm.atlas.exporter import geometry, read_folder
 from wlm.bench.rows import read_json
 from wlm.config import load_settings
+from wlm.errors import WlmError
 from wlm.fluid.volume import load_volume
 from wlm.formats.exr import read_exr
 from wlm.formats.gltf import read_gltf
@@ -60,7 +61,10 @@ def _exr(path: Path) -> None:
 
 
 def _inspect(path: Path) -> None:
-    assert all("\n" not in line for each in inspect(path.parent) for line in (each.what, *each.problems))
+    for each in inspect(path.parent):
+        assert not any("\n" in line for line in (each.what, *each.problems))
+        if each.what.endswith("can't be read"):
+            raise WlmError(each.problems[0])
 
 
 def _light_file(path: Path) -> None:

@@ -50,5 +50,5 @@ def test_little_to_tell_by_is_no_reason():
     random, atlas, full = np.random.default_rng(0), charts(0), np.ones((256, 256), bool)
     noise = [random.random((256, 256)) > 0.4 for _ in range(2)]
     halves = [(atlas >= 0) & (np.arange(256)[:, None] // 128 == side) for side in range(2)]
-    for pictures in (noise, halves, [full, atlas >= 0], [~full, atlas >= 0], [full]):
+    for pictures in (noise, halves, [full, atlas >= 0], [~full, atlas >= 0], [full], []):
         assert odd_layout(len(pictures), pictures.__getitem__) is None

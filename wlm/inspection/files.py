@@ -15,6 +15,7 @@ from wlm.formats.npz import read_npz
 from wlm.formats.reading import open_file, read_json_file
 from wlm.inspection.finding import Finding
 from wlm.inspection.pictures import inspect_picture, picture_of, said
+from wlm.inspection.sets import inspect_set
 from wlm.system import load
 
 _MAGIC = 16
@@ -162,8 +163,6 @@ def _json(path: Path) -> Finding:
     if stated is not None:
         return Finding(path, stated)
     if isinstance(content, dict) and "lightmaps" in content:
-        from wlm.inspection.folders import inspect_set
-
         return inspect_set(path)
     if isinstance(content, dict) and ("probes" in content or "position" in content):
         return _probes(path)

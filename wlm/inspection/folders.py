@@ -9,11 +9,11 @@ from wlm.errors import WlmError
 from wlm.formats.light import SUFFIXES
 from wlm.inspection.files import document_of, inspect_file
 from wlm.inspection.finding import Finding
-from wlm.inspection.pictures import Picture, picture_of, read_lit, said
+from wlm.inspection.pictures import picture_of, said
+from wlm.inspection.sets import UNREADABLE, inspect_set, named, together
 from wlm.lightmap.contest import CONFIG_FILE, is_contest, list_contest
-from wlm.lightmap.layers.listing import is_layered, list_layers, state_folders
-from wlm.lightmap.layout import PICTURES, odd_layout, spread
-from wlm.lightmap.listing import SET_FILE, Listing, count_of, natural, parse_set, time_of_name
+from wlm.lightmap.layers.listing import list_layers, state_folders
+from wlm.lightmap.listing import SET_FILE, count_of, natural, time_of_name
 from wlm.smoke.camera import DIRECTIONS
 
 MOST = 256
@@ -86,7 +86,7 @@ def _documents(folder: Path, files: Sequence[Path]) -> _Found:
             continue
         if file.name == SET_FILE:
             finding = inspect_set(file)
-            listed = set() if finding.what == _UNREADABLE else {file, *_named(file, files)}
+            listed = set() if finding.what == UNREADABLE else {file, *named(file, files)}
             return [(finding, listed | {file})]
         stated = document_of(file)
         if stated is not None:
@@ -99,77 +99,6 @@ def _next(folder: Path, stated: str) -> str:
     if "mesh" in stated:
         return f"wlm web {folder} -o PAGE.html"
     return f"wlm smoke bake {folder} -o DIR" if "frames of smoke" in stated else ""
-
-
-_UNREADABLE = "a lightmap set that can't be read"
-
-
-def inspect_set(path: Path) -> Finding:
-    """Says what a `set.json` lists, and whether it is there."""
-    try:
-        if is_layered(path):
-            listing = list_layers(path, None, None, False)
-            sheets = f"{count_of(listing.atlases, 'atlas')} with {', '.join(layer.name for layer in listing.layers)}"
-            problems = sorted(
-                {f"{s.path.name} is missing" for one in listing.states for s in one.values() if not s.path.is_file()}
-            )
-            what = f"a layered set of lightmaps at {count_of(listing.states, 'time')}: {sheets}"
-            return Finding(path.parent, what, f"wlm lightmap compress {path.parent} -o OUT.wlm", tuple(problems[:4]))
-        return _checked(path.parent, parse_set(path, None))
-    except WlmError as error:
-        return Finding(path.parent, _UNREADABLE, problems=(said(error, path),))
-
-
-def _named(path: Path, files: Sequence[Path]) -> set[Path]:
-    """The files beside a `set.json` that it names."""
-    try:
-        if is_layered(path):
-            return {source.path for one in list_layers(path, None, None, False).states for source in one.values()}
-        listing = parse_set(path, None)
-    except WlmError:
-        return set()
-    return {*listing.files, Path(listing.mask)} & set(files)
-
-
-def _checked(folder: Path, listing: Listing) -> Finding:
-    """A set of lightmaps over time, with what may be wrong with it."""
-    missing = [file.name for file in listing.files if not file.is_file()]
-    problems = (
-        [f"{missing[0]} and {len(missing) - 1} more are missing" if missing[1:] else f"{missing[0]} is missing"]
-        if missing
-        else []
-    )
-    files = list(dict.fromkeys(file for file in listing.files if file.is_file()))
-    heads = [picture_of(file) for file in files]
-    size = next((head.size for head in heads if head is not None and head.width), "an unknown size")
-    problems += _of_files(files, heads)
-    what = f"a set of lightmaps at {count_of(listing.files, 'time')}, {size}"
-    return Finding(folder, what, f"wlm lightmap compress {folder} -o OUT.wlm", tuple(problems))
-
-
-def _of_files(files: Sequence[Path], heads: Sequence[Picture | None]) -> list[str]:
-    """What may be wrong with pictures of one atlas: kinds, sizes, layouts, numbers."""
-    problems = []
-    for file, head in zip(files, heads, strict=True):
-        if head is None or head.kind == "PNG":
-            return [f"{file.name} is no picture of light"]
-    sized = [(file, head) for file, head in zip(files, heads, strict=True) if head.width]
-    for file, head in sized[1:]:
-        if head.size != sized[0][1].size:
-            return [f"{file.name} is {head.size}, {sized[0][0].name} is {sized[0][1].size}"]
-    chosen = [files[i] for i in spread(len(files), PICTURES)]
-    lit = []
-    for file in chosen:
-        try:
-            one, said_of = read_lit(file)
-        except WlmError as error:
-            return [f"{file.name}: {said(error, file)}"]
-        lit.append(one)
-        problems += [f"{file.name}: {text}" for text in said_of]
-    odd = odd_layout(len(lit), lit.__getitem__) if len({one.shape for one in lit}) == 1 else None
-    if odd is not None:
-        problems.append(f"{chosen[odd[0]].name} and {chosen[odd[1]].name} don't look like one atlas at two times")
-    return problems
 
 
 def _unity(folder: Path, files: Sequence[Path]) -> _Found:
@@ -196,7 +125,7 @@ def _unity(folder: Path, files: Sequence[Path]) -> _Found:
         paths = [one[atlas.name, "light"].path for one in listing.states]
         heads = [picture_of(path) for path in paths]
         sizes += sorted({head.size for head in heads if head is not None})
-        problems += [f"{atlas.name}: {text}" for text in _of_files(paths, heads)]
+        problems += [f"{atlas.name}: {text}" for text in together(paths, heads).problems]
     names = ", ".join(layer.name for layer in listing.layers)
     size = " and ".join(dict.fromkeys(sizes))
     maps = f"{count_of(listing.atlases, 'map')} of {size}, with {names}"
@@ -251,9 +180,8 @@ def _pictures(folder: Path, files: Sequence[Path]) -> _Found:
     pictures = [file for file in heads if "_comp_" not in file.name.lower()]
     if len(pictures) < 2:
         return []
-    problems = _of_files(pictures, [heads[file] for file in pictures])
-    unlike = any("one atlas" in text or " is " in text and "x" in text.rsplit(" ", 1)[-1] for text in problems)
-    if unlike:
+    problems, alike = together(pictures, [heads[file] for file in pictures])
+    if not alike:
         what = f"{count_of(pictures, 'lightmap')} of different atlases: no times of one"
         command = "wlm atlas compress MESH.glb LIGHTMAP -o DIR, of each with its mesh"
         return [(Finding(folder, what, command, tuple(problems)), set(pictures))]

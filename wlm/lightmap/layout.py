@@ -31,6 +31,8 @@ def odd_layout(count: int, lit: Callable[[int], np.ndarray]) -> tuple[int, int] 
     """
     chosen = spread(count, PICTURES)
     pictures = [lit(i) for i in chosen]
+    if not pictures:
+        return None
     borders = [_border(picture) for picture in pictures]
     most = int(np.argmax([np.count_nonzero(picture) for picture in pictures]))
     for i in range(len(chosen)):
