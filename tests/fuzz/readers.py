@@ -64,7 +64,7 @@ def _inspect(path: Path) -> None:
     for each in inspect(path.parent):
         assert not any("\n" in line for line in (each.what, *each.problems))
         if each.what.endswith("can't be read"):
-            raise WlmError(each.problems[0])
+            raise WlmError(f"{path}: {each.problems[0]}")
 
 
 def _light_file(path: Path) -> None:
