@@ -1,6 +1,7 @@
 """What a folder holds as a whole, and the files in it that belong to nothing else."""
 
 import os
+import re
 from collections.abc import Iterator, Sequence
 from itertools import islice
 from pathlib import Path
@@ -22,6 +23,8 @@ MOST = 256
 _DEEPEST = 4
 _ENTRIES = 20_000  # of one folder
 _SILENT = {".md", ".txt", ".meta", ".import", ".uid", ".html", ".pdf", ".py", ".js", ".cs", ".glsl", ".hlsl", ".bin"}
+# The channels of the two textures, as their names have them.
+_BOOKS = (("rlt", "bbf", "o3de"), ("tlr", "bbf", "embergen"), ("rtb", "lbf", "unity"), ("tlrb", "fb", "o3de-tlrb"))
 _SILENT_NAMES = ("license", "licence", "readme", "copying")
 
 
@@ -47,7 +50,7 @@ def _folder(folder: Path, depth: int) -> Iterator[Finding]:
     entries = _entries(folder)
     files = [entry for entry in entries if entry.is_file()]
     taken: set[Path] = set()
-    for whole in (_documents, _unity, _contest, _pictures):
+    for whole in (_documents, _unity, _contest, _flip_books, _pictures):
         try:
             found = whole(folder, [file for file in files if file not in taken])
         except WlmError as error:
@@ -161,6 +164,26 @@ def _contest(folder: Path, files: Sequence[Path]) -> _Found:
     except WlmError as error:
         what, problems = "a contest's raw lightmaps", (said(error, folder / CONFIG_FILE),)
     return [(Finding(folder, what, f"wlm lightmap compress {folder} -o OUT.wlm", problems), set(_entries(folder)))]
+
+
+def _flip_books(folder: Path, files: Sequence[Path]) -> _Found:
+    """Pairs of textures of six-way lightmaps, as engines name them."""
+    found: _Found = []
+    for file in files:
+        for first, second, layout in _BOOKS:
+            match = re.search(rf"(^|[_.-]){first}([_.-]|$)", file.name, re.IGNORECASE)
+            if match is None or file.suffix.lower() not in (".png", ".tga", ".exr"):
+                continue
+            name = file.name[: match.start()] + match[1] + second + match[2] + file.name[match.end() :]
+            other = next((each for each in files if each.name.lower() == name.lower()), None)
+            if other is None:
+                continue
+            stated = re.search(r"(\d+)x(\d+)", file.stem)
+            cells = "ROWSxCOLUMNS" if stated is None else f"{stated[2]}x{stated[1]}"
+            options = f"--with {other.name} --from {layout} --cells {cells}"
+            what = f"a flip book of six-way lightmaps of smoke, with {other.name}"
+            found.append((Finding(file, what, f"wlm smoke shade {file} {options} -o DIR"), {file, other}))
+    return found
 
 
 def _pictures(folder: Path, files: Sequence[Path]) -> _Found:
