@@ -95,7 +95,7 @@ def test_straight_light_with_a_texture_of_opacity(frames, straight, tmp_path):
     corner = light_of(tmp_path / "out" / "shade_0001.png")[0, 0]
     np.testing.assert_allclose(corner, [0, 0, 1], atol=1e-6)
     found = next(each for each in inspect(tmp_path) if each.path == first)
-    assert found.command.endswith("--with puff_BBF_2x2.png --from o3de --cells 2x2 -o DIR")
+    assert found.command.endswith(f"--with {second} --from o3de --cells 2x2 -o DIR")
 
 
 def test_what_is_refused(straight, tmp_path):

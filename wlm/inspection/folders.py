@@ -180,7 +180,7 @@ def _flip_books(folder: Path, files: Sequence[Path]) -> _Found:
                 continue
             stated = re.search(r"(\d+)x(\d+)", file.stem)
             cells = "ROWSxCOLUMNS" if stated is None else f"{stated[2]}x{stated[1]}"
-            options = f"--with {other.name} --from {layout} --cells {cells}"
+            options = f"--with {other} --from {layout} --cells {cells}"
             what = f"a flip book of six-way lightmaps of smoke, with {other.name}"
             found.append((Finding(file, what, f"wlm smoke shade {file} {options} -o DIR"), {file, other}))
     return found
