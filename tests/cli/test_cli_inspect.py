@@ -16,6 +16,7 @@ import wlm
 from wlm.cli.app import app
 from wlm.formats.exr import write_exr
 from wlm.inspection import inspect
+from wlm.inspection.folders import MOST
 
 
 def chart(width: int, seed: int = 0, height: int = 64, alpha: bool = False) -> np.ndarray:
@@ -127,14 +128,23 @@ def test_what_is_damaged_is_said_and_nothing_stops(tmp_path):
     assert told(tmp_path / "empty") == ".: nothing that is known here -> "
 
 
+def test_no_more_is_told_than_can_be_read(tmp_path):
+    for number in range(300):
+        (tmp_path / f"{number}.vdb").write_bytes(b" BDV\0\0\0\0")
+        (tmp_path / "deep" / str(number)).mkdir(parents=True)
+    assert len(inspect(tmp_path)) == MOST and len(inspect(tmp_path / "deep")) == 1
+
+
 def test_the_command(tmp_path):
-    path = tmp_path / "a.npz"
+    path = tmp_path / "a volume.npz"
     np.savez(path, density=np.ones((2, 2, 2), np.float32))
     run = CliRunner().invoke
     assert run(app, ["inspect", str(path)]).output.startswith(
         f"{path}: a volume of smoke, 2x2x2 voxels of 1 -> wlm smoke"
     )
     (found,) = json.loads(run(app, ["inspect", str(path), "--json"]).output)
-    assert found["path"] == str(path) and found["problems"] == [] and found["command"].startswith("wlm smoke bake")
+    assert (
+        found["path"] == str(path) and found["problems"] == [] and found["command"] == f"wlm smoke bake '{path}' -o DIR"
+    )
     result = run(app, ["inspect", str(tmp_path / "absent")])
     assert result.exit_code == 2 and "no such file or folder" in result.output

@@ -13,7 +13,7 @@ from wlm.formats.light import SUFFIXES
 from wlm.formats.limits import JSON_BYTES
 from wlm.formats.npz import read_npz
 from wlm.formats.reading import open_file, read_json_file
-from wlm.inspection.finding import Finding
+from wlm.inspection.finding import Finding, quoted
 from wlm.inspection.pictures import inspect_picture, picture_of, said
 from wlm.inspection.sets import inspect_set
 from wlm.system import load
@@ -100,7 +100,7 @@ def _probes(path: Path, keys: Sequence[str] = ()) -> Finding:
         rest = np.abs(probes.values[probes.live][:, 3:]).reshape(len(mean), -1, 3)
         if rest.size and (wrong := int(np.count_nonzero((rest > 2.3 * np.abs(mean)[:, None]).any((1, 2))))):
             problems.append(f"{wrong} have a coefficient beyond what light can: another order, or convention?")
-    return Finding(path, what, f"wlm probe compress {path}{option} -o OUT.wlm", tuple(problems))
+    return Finding(path, what, f"wlm probe compress {quoted(path)}{option} -o OUT.wlm", tuple(problems))
 
 
 def _volume(path: Path) -> Finding:
@@ -113,7 +113,7 @@ def _volume(path: Path) -> Finding:
     problems = list(volume.warnings)
     if not bool((volume.density > 0).any()):
         problems.append("no smoke in it")
-    return Finding(path, what, f"wlm smoke bake {path} -o DIR", tuple(problems))
+    return Finding(path, what, f"wlm smoke bake {quoted(path)} -o DIR", tuple(problems))
 
 
 def _mesh(path: Path) -> Finding:
@@ -144,7 +144,7 @@ def _mesh(path: Path) -> Finding:
         elif area > 1.0:
             cause = "each mesh may have a lightmap of its own" if parts > 1 else "not of a lightmap?"
             problems.append(f"its triangles have {area:.1f} times the UVs' square: they overlap; {cause}")
-    command = f"wlm atlas compress {path} LIGHTMAP -o DIR" if uvs and not problems else ""
+    command = f"wlm atlas compress {quoted(path)} LIGHTMAP -o DIR" if uvs and not problems else ""
     return Finding(path, what, command, tuple(problems))
 
 
@@ -154,7 +154,7 @@ def _model(path: Path) -> Finding:
     kind = {"lightmap": "lightmaps over time", "atlas": "a mesh's lightmap", "probe": "light probes"}.get(system)
     name = "a network that predicts six-way lightmaps" if kind is None else f"compressed {kind}: {model.name}"
     verb = "web" if system in ("lightmap", "probe") else f"{system} {'info' if kind else 'predict'}"
-    return Finding(path, name, f"wlm {verb} {path}" + (" -o PAGE.html" if verb == "web" else ""))
+    return Finding(path, name, f"wlm {verb} {quoted(path)}" + (" -o PAGE.html" if verb == "web" else ""))
 
 
 def _json(path: Path) -> Finding:

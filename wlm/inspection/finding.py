@@ -1,5 +1,6 @@
 """What is said of a file or a folder."""
 
+import shlex
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -24,3 +25,8 @@ class Finding:
     def to_json(self) -> dict[str, Any]:
         """The finding as JSON values."""
         return asdict(self) | {"path": str(self.path), "problems": list(self.problems)}
+
+
+def quoted(path: Path) -> str:
+    """A path as a shell takes it."""
+    return shlex.quote(str(path))

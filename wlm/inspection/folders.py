@@ -2,26 +2,26 @@
 
 import os
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from itertools import islice
 from pathlib import Path
 
 from wlm.errors import WlmError
 from wlm.formats.light import SUFFIXES
 from wlm.inspection.files import document_of, inspect_file
-from wlm.inspection.finding import Finding
+from wlm.inspection.finding import Finding, quoted
 from wlm.inspection.pictures import picture_of, said
 from wlm.inspection.sets import UNREADABLE, inspect_set, named, together
 from wlm.lightmap.contest import CONFIG_FILE, is_contest, list_contest
 from wlm.lightmap.layers.listing import list_layers, state_folders
 from wlm.lightmap.listing import SET_FILE, count_of, natural, time_of_name
-from wlm.smoke.camera import DIRECTIONS
 
 MOST = 256
 """Findings that are told, and folders that are looked into."""
 
 _DEEPEST = 4
 _ENTRIES = 20_000  # of one folder
+_DOCUMENTS = 64  # of one folder, that are read to see whether they are of all that is in it
 _SILENT = {".md", ".txt", ".meta", ".import", ".uid", ".html", ".pdf", ".py", ".js", ".cs", ".glsl", ".hlsl", ".bin"}
 # The channels of the two textures, as their names have them.
 _BOOKS = (("rlt", "bbf", "o3de"), ("tlr", "bbf", "embergen"), ("rtb", "lbf", "unity"), ("tlrb", "fb", "o3de-tlrb"))
@@ -42,29 +42,37 @@ def inspect(path: str | os.PathLike[str]) -> list[Finding]:
         raise WlmError(f"{path}: no such file or folder")
     if not path.is_dir():
         return [inspect_file(path)]
-    found = list(islice(_folder(path, 0), MOST))
+    _entries(path)
+    found: list[Finding] = []
+    waiting = [(path, 0)]
+    for _ in range(MOST):
+        if not waiting or len(found) >= MOST:
+            break
+        folder, depth = waiting.pop()
+        findings, inside = _folder(folder, MOST - len(found))
+        found += findings
+        if depth < _DEEPEST:
+            waiting += [(each, depth + 1) for each in reversed(inside)]
     return found or [Finding(path, "nothing that is known here")]
 
 
-def _folder(folder: Path, depth: int) -> Iterator[Finding]:
-    entries = _entries(folder)
-    files = [entry for entry in entries if entry.is_file()]
+def _folder(folder: Path, most: int) -> tuple[list[Finding], list[Path]]:
+    """What is in a folder itself, so many findings at most, and the folders in it that belong to none of them."""
+    findings: list[Finding] = []
     taken: set[Path] = set()
-    for whole in (_documents, _unity, _contest, _flip_books, _pictures):
-        try:
-            found = whole(folder, [file for file in files if file not in taken])
-        except WlmError as error:
-            found = [(Finding(folder, "can't be read", problems=(said(error, folder),)), set())]
-        for finding, its in found:
-            taken |= its
-            yield finding
-    for file in files:
-        if file not in taken and not _is_silent(file):
-            yield inspect_file(file)
-    if depth < _DEEPEST:
-        for entry in entries:
-            if entry not in taken and entry.is_dir() and not entry.is_symlink():
-                yield from _folder(entry, depth + 1)
+    try:
+        entries = _entries(folder)
+        files = [entry for entry in entries if entry.is_file()]
+        for whole in (_documents, _unity, _contest, _flip_books, _pictures):
+            for finding, its in whole(folder, [file for file in files if file not in taken]):
+                findings.append(finding)
+                taken |= its
+    except WlmError as error:
+        return [Finding(folder, "can't be read", problems=(said(error, folder),))], []
+    rest = (file for file in files if file not in taken and not _is_silent(file))
+    findings += map(inspect_file, islice(rest, max(most - len(findings), 0)))
+    inside = [entry for entry in entries if entry not in taken and entry.is_dir() and not entry.is_symlink()]
+    return findings[:most], inside
 
 
 def _entries(folder: Path) -> list[Path]:
@@ -84,9 +92,8 @@ _Found = list[tuple[Finding, set[Path]]]
 
 def _documents(folder: Path, files: Sequence[Path]) -> _Found:
     """What a JSON of ours says that the folder is; a `set.json`."""
-    for file in files:
-        if file.suffix.lower() != ".json":
-            continue
+    documents = [file for file in files if file.suffix.lower() == ".json"]
+    for file in sorted(documents, key=lambda file: file.name != SET_FILE)[:_DOCUMENTS]:
         if file.name == SET_FILE:
             finding = inspect_set(file)
             listed = set() if finding.what == UNREADABLE else {file, *named(file, files)}
@@ -100,8 +107,8 @@ def _documents(folder: Path, files: Sequence[Path]) -> _Found:
 
 def _next(folder: Path, stated: str) -> str:
     if "mesh" in stated:
-        return f"wlm web {folder} -o PAGE.html"
-    return f"wlm smoke bake {folder} -o DIR" if "frames of smoke" in stated else ""
+        return f"wlm web {quoted(folder)} -o PAGE.html"
+    return f"wlm smoke bake {quoted(folder)} -o DIR" if "frames of smoke" in stated else ""
 
 
 def _unity(folder: Path, files: Sequence[Path]) -> _Found:
@@ -133,7 +140,9 @@ def _unity(folder: Path, files: Sequence[Path]) -> _Found:
     size = " and ".join(dict.fromkeys(sizes))
     maps = f"{count_of(listing.atlases, 'map')} of {size}, with {names}"
     what = f"{count_of(states, 'state')} of Unity's light, {maps}"
-    finding = Finding(folder, what, f"wlm lightmap compress {folder}{option}{layers} -o OUT.wlm", tuple(problems))
+    finding = Finding(
+        folder, what, f"wlm lightmap compress {quoted(folder)}{option}{layers} -o OUT.wlm", tuple(problems)
+    )
     its = {path for paths in held.values() for path in paths}
     if states == [folder]:
         return [(finding, its)]
@@ -163,7 +172,9 @@ def _contest(folder: Path, files: Sequence[Path]) -> _Found:
         what = f"a contest's raw lightmaps at {count_of(list_contest(folder, None, None).files, 'time')}"
     except WlmError as error:
         what, problems = "a contest's raw lightmaps", (said(error, folder / CONFIG_FILE),)
-    return [(Finding(folder, what, f"wlm lightmap compress {folder} -o OUT.wlm", problems), set(_entries(folder)))]
+    return [
+        (Finding(folder, what, f"wlm lightmap compress {quoted(folder)} -o OUT.wlm", problems), set(_entries(folder)))
+    ]
 
 
 def _flip_books(folder: Path, files: Sequence[Path]) -> _Found:
@@ -180,9 +191,9 @@ def _flip_books(folder: Path, files: Sequence[Path]) -> _Found:
                 continue
             stated = re.search(r"(\d+)x(\d+)", file.stem)
             cells = "ROWSxCOLUMNS" if stated is None else f"{stated[2]}x{stated[1]}"
-            options = f"--with {other} --from {layout} --cells {cells}"
+            options = f"--with {quoted(other)} --from {layout} --cells {cells}"
             what = f"a flip book of six-way lightmaps of smoke, with {other.name}"
-            found.append((Finding(file, what, f"wlm smoke shade {file} {options} -o DIR"), {file, other}))
+            found.append((Finding(file, what, f"wlm smoke shade {quoted(file)} {options} -o DIR"), {file, other}))
     return found
 
 
@@ -196,10 +207,10 @@ def _pictures(folder: Path, files: Sequence[Path]) -> _Found:
             except WlmError:
                 continue  # told by itself
     heads = {file: head for file, head in heads.items() if head is not None and not head.is_cube and head.kind != "PNG"}
-    smoke = [file for file, head in heads.items() if set(DIRECTIONS) <= set(head.channels)]
+    smoke = [file for file, head in heads.items() if head.is_six_way]
     if smoke:
         what = f"six-way lightmaps of smoke, {count_of(smoke, 'frame')} of {heads[smoke[0]].size}"
-        return [(Finding(folder, what, f"wlm smoke flipbook {folder} -o OUT.png"), set(smoke))]
+        return [(Finding(folder, what, f"wlm smoke flipbook {quoted(folder)} -o OUT.png"), set(smoke))]
     pictures = [file for file in heads if "_comp_" not in file.name.lower()]
     if len(pictures) < 2:
         return []
@@ -215,4 +226,6 @@ def _pictures(folder: Path, files: Sequence[Path]) -> _Found:
     what = f"{count_of(pictures, 'lightmap')} of {heads[pictures[0]].size}"
     mask = folder / "mask.png"
     taken = {*pictures, mask} & set(files)
-    return [(Finding(folder, what, f"wlm lightmap compress {folder}{option} -o OUT.wlm", tuple(problems)), taken)]
+    return [
+        (Finding(folder, what, f"wlm lightmap compress {quoted(folder)}{option} -o OUT.wlm", tuple(problems)), taken)
+    ]

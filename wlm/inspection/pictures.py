@@ -15,8 +15,7 @@ from wlm.formats.exr_file import read_header
 from wlm.formats.light import read_light
 from wlm.formats.limits import check_sides
 from wlm.formats.reading import open_file
-from wlm.inspection.finding import Finding
-from wlm.smoke.camera import DIRECTIONS
+from wlm.inspection.finding import Finding, quoted
 
 PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 _FIRST = 80  # bytes, the sizes of all but EXR and Radiance among them
@@ -53,6 +52,16 @@ class Picture:
         short, long = sorted((self.width, self.height))
         return short > 0 and long == _FACES * short
 
+    @property
+    def is_six_way(self) -> bool:
+        """Whether it has a channel for the light from each direction."""
+        if len(self.channels) < _FACES:
+            return False
+        # It brings torch, which takes seconds.
+        from wlm.smoke.camera import DIRECTIONS
+
+        return set(DIRECTIONS) <= set(self.channels)
+
 
 def picture_of(path: Path) -> Picture | None:
     """Reads the head of a picture; None where it is none.
@@ -87,11 +96,13 @@ def inspect_picture(path: Path, picture: Picture) -> Finding:
         WlmError: It can't be read.
     """
     name = path.name.lower()
-    if set(DIRECTIONS) <= set(picture.channels):
+    if picture.is_six_way:
         what = f"six-way lightmaps of smoke, {picture.size}"
-        return Finding(path, what, f"wlm smoke flipbook {path} -o OUT.png")
+        return Finding(path, what, f"wlm smoke flipbook {quoted(path)} -o OUT.png")
     if _GUIDE <= set(picture.channels):
-        return Finding(path, f"a guiding map of smoke, {picture.size}", f"wlm smoke predict NETWORK.wlm {path} -o DIR")
+        return Finding(
+            path, f"a guiding map of smoke, {picture.size}", f"wlm smoke predict NETWORK.wlm {quoted(path)} -o DIR"
+        )
     if picture.is_cube:
         return Finding(path, f"a cube's six faces, {picture.size}: a reflection probe; nothing here takes it")
     if "_comp_dir" in name or "_comp_shadowmask" in name:
@@ -103,7 +114,7 @@ def inspect_picture(path: Path, picture: Picture) -> Finding:
     pixels, names = read_light(path)
     height, width = pixels.shape[:2]
     what = f"a picture of light, {picture.kind}, {width}x{height}, {''.join(names)}"
-    return Finding(path, what, f"wlm atlas compress MESH.glb {path} -o DIR", problems_of(pixels))
+    return Finding(path, what, f"wlm atlas compress MESH.glb {quoted(path)} -o DIR", problems_of(pixels))
 
 
 def problems_of(pixels: np.ndarray) -> tuple[str, ...]:

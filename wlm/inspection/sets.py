@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from wlm.errors import WlmError
-from wlm.inspection.finding import Finding
+from wlm.inspection.finding import Finding, quoted
 from wlm.inspection.pictures import Picture, picture_of, read_lit, said
 from wlm.lightmap.layers.listing import is_layered, list_layers
 from wlm.lightmap.layout import PICTURES, odd_layout, spread
@@ -24,7 +24,9 @@ def inspect_set(path: Path) -> Finding:
                 {f"{s.path.name} is missing" for one in listing.states for s in one.values() if not s.path.is_file()}
             )
             what = f"a layered set of lightmaps at {count_of(listing.states, 'time')}: {sheets}"
-            return Finding(path.parent, what, f"wlm lightmap compress {path.parent} -o OUT.wlm", tuple(problems[:4]))
+            return Finding(
+                path.parent, what, f"wlm lightmap compress {quoted(path.parent)} -o OUT.wlm", tuple(problems[:4])
+            )
         return _checked(path.parent, parse_set(path, None))
     except WlmError as error:
         return Finding(path.parent, UNREADABLE, problems=(said(error, path),))
@@ -50,7 +52,7 @@ def _checked(folder: Path, listing: Listing) -> Finding:
     size = next((head.size for head in heads if head is not None and head.width), "an unknown size")
     problems += together(files, heads).problems
     what = f"a set of lightmaps at {count_of(listing.files, 'time')}, {size}"
-    return Finding(folder, what, f"wlm lightmap compress {folder} -o OUT.wlm", tuple(problems))
+    return Finding(folder, what, f"wlm lightmap compress {quoted(folder)} -o OUT.wlm", tuple(problems))
 
 
 class Together(NamedTuple):
