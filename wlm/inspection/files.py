@@ -150,11 +150,14 @@ def _mesh(path: Path) -> Finding:
 
 def _model(path: Path) -> Finding:
     model = load(path)
-    system = model.SYSTEM.removesuffix("-layers")
-    kind = {"lightmap": "lightmaps over time", "atlas": "a mesh's lightmap", "probe": "light probes"}.get(system)
-    name = "a network that predicts six-way lightmaps" if kind is None else f"compressed {kind}: {model.name}"
-    verb = "web" if system in ("lightmap", "probe") else f"{system} {'info' if kind else 'predict'}"
-    return Finding(path, name, f"wlm {verb} {quoted(path)}" + (" -o PAGE.html" if verb == "web" else ""))
+    kind = {"lightmap": "lightmaps over time", "atlas": "a mesh's lightmap", "probe": "light probes"}.get(
+        model.SYSTEM.removesuffix("-layers")
+    )
+    if kind is None:
+        what = "a network that predicts six-way lightmaps"
+        return Finding(path, what, f"wlm smoke predict SMOKE --network {quoted(path)} -o OUT.exr")
+    command = "" if model.SYSTEM == "atlas" else f"wlm web {quoted(path)} -o PAGE.html"
+    return Finding(path, f"compressed {kind}: {model.name}", command)
 
 
 def _json(path: Path) -> Finding:

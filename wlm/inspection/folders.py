@@ -11,7 +11,7 @@ from wlm.formats.light import SUFFIXES
 from wlm.inspection.files import document_of, inspect_file
 from wlm.inspection.finding import Finding, quoted
 from wlm.inspection.pictures import picture_of, said
-from wlm.inspection.sets import UNREADABLE, inspect_set, named, together
+from wlm.inspection.sets import UNREADABLE, compress_command, inspect_set, named, together
 from wlm.lightmap.contest import CONFIG_FILE, is_contest, list_contest
 from wlm.lightmap.layers.listing import list_layers, state_folders
 from wlm.lightmap.listing import SET_FILE, count_of, natural, time_of_name
@@ -140,9 +140,7 @@ def _unity(folder: Path, files: Sequence[Path]) -> _Found:
     size = " and ".join(dict.fromkeys(sizes))
     maps = f"{count_of(listing.atlases, 'map')} of {size}, with {names}"
     what = f"{count_of(states, 'state')} of Unity's light, {maps}"
-    finding = Finding(
-        folder, what, f"wlm lightmap compress {quoted(folder)}{option}{layers} -o OUT.wlm", tuple(problems)
-    )
+    finding = Finding(folder, what, compress_command(folder, option + layers), tuple(problems))
     its = {path for paths in held.values() for path in paths}
     if states == [folder]:
         return [(finding, its)]
@@ -172,9 +170,7 @@ def _contest(folder: Path, files: Sequence[Path]) -> _Found:
         what = f"a contest's raw lightmaps at {count_of(list_contest(folder, None, None).files, 'time')}"
     except WlmError as error:
         what, problems = "a contest's raw lightmaps", (said(error, folder / CONFIG_FILE),)
-    return [
-        (Finding(folder, what, f"wlm lightmap compress {quoted(folder)} -o OUT.wlm", problems), set(_entries(folder)))
-    ]
+    return [(Finding(folder, what, compress_command(folder), problems), set(_entries(folder)))]
 
 
 def _flip_books(folder: Path, files: Sequence[Path]) -> _Found:
@@ -226,6 +222,4 @@ def _pictures(folder: Path, files: Sequence[Path]) -> _Found:
     what = f"{count_of(pictures, 'lightmap')} of {heads[pictures[0]].size}"
     mask = folder / "mask.png"
     taken = {*pictures, mask} & set(files)
-    return [
-        (Finding(folder, what, f"wlm lightmap compress {quoted(folder)}{option} -o OUT.wlm", tuple(problems)), taken)
-    ]
+    return [(Finding(folder, what, compress_command(folder, option), tuple(problems)), taken)]

@@ -14,6 +14,11 @@ from wlm.lightmap.listing import Listing, count_of, parse_set
 UNREADABLE = "a lightmap set that can't be read"
 
 
+def compress_command(folder: Path, options: str = "") -> str:
+    """What takes lightmaps in a folder."""
+    return f"wlm lightmap compress {quoted(folder)}{options} -o OUT.wlm"
+
+
 def inspect_set(path: Path) -> Finding:
     """Says what a `set.json` lists, and whether it is there."""
     try:
@@ -24,9 +29,7 @@ def inspect_set(path: Path) -> Finding:
                 {f"{s.path.name} is missing" for one in listing.states for s in one.values() if not s.path.is_file()}
             )
             what = f"a layered set of lightmaps at {count_of(listing.states, 'time')}: {sheets}"
-            return Finding(
-                path.parent, what, f"wlm lightmap compress {quoted(path.parent)} -o OUT.wlm", tuple(problems[:4])
-            )
+            return Finding(path.parent, what, compress_command(path.parent), tuple(problems[:4]))
         return _checked(path.parent, parse_set(path, None))
     except WlmError as error:
         return Finding(path.parent, UNREADABLE, problems=(said(error, path),))
@@ -52,7 +55,7 @@ def _checked(folder: Path, listing: Listing) -> Finding:
     size = next((head.size for head in heads if head is not None and head.width), "an unknown size")
     problems += together(files, heads).problems
     what = f"a set of lightmaps at {count_of(listing.files, 'time')}, {size}"
-    return Finding(folder, what, f"wlm lightmap compress {quoted(folder)} -o OUT.wlm", tuple(problems))
+    return Finding(folder, what, compress_command(folder), tuple(problems))
 
 
 class Together(NamedTuple):
