@@ -77,7 +77,7 @@ def test_a_project_is_told_piece_by_piece(tmp_path):
         "two.npz: 9 light probes of 9 RGB coefficients, 9 of them lit, under the keys sh_9, sh_12 -> "
         "wlm probe compress HERE/other/two.npz --key 9 -o OUT.wlm",
         "smoke.vdb: an OpenVDB volume",
-        "map.wlm: compressed lightmaps over time",
+        "map.wlm: lightmaps over time, compressed",
         "atlas: a compressed lightmap of a mesh -> wlm web HERE/atlas -o PAGE.html",
     ):
         assert said in text, said

@@ -157,7 +157,7 @@ def _model(path: Path) -> Finding:
         what = "a network that predicts six-way lightmaps"
         return Finding(path, what, f"wlm smoke predict SMOKE --network {quoted(path)} -o OUT.exr")
     command = "" if model.SYSTEM == "atlas" else f"wlm web {quoted(path)} -o PAGE.html"
-    return Finding(path, f"compressed {kind}: {model.name}", command)
+    return Finding(path, f"{kind}, compressed: {model.name}", command)
 
 
 def _json(path: Path) -> Finding:
