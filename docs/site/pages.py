@@ -12,7 +12,17 @@ if TYPE_CHECKING:
     from mkdocs.structure.files import Files
 
 ROOT = Path(__file__).resolve().parents[2]
-PACKAGES = ("wlm", "wlm.lightmap", "wlm.atlas", "wlm.probe", "wlm.smoke", "wlm.fluid", "wlm.ops", "wlm.web")
+PACKAGES = (
+    "wlm",
+    "wlm.lightmap",
+    "wlm.atlas",
+    "wlm.probe",
+    "wlm.smoke",
+    "wlm.fluid",
+    "wlm.ops",
+    "wlm.inspection",
+    "wlm.web",
+)
 _OUTSIDE = re.compile(
     r"\[([^\]]+)\]\((?:\.\./)*(?:wlm|wlm_kernels|benchmarks|demos|tests|configs|LICENSE|README\.md)(?:[/#][^)]*)?\)"
 )

@@ -322,7 +322,7 @@ def test_volume_writes_what_a_viewer_has_round(fitted, carrying, room, tmp_path)
 
 
 def test_grid_for_three(fitted, tmp_path):
-    text = call("probe", "grid", fitted, "-o", tmp_path / "out", "--cells", 5)
+    text = call("probe", "export", fitted, "--engine", "three", "-o", tmp_path / "out", "--cells", 5)
     assert max(json.loads((tmp_path / "out" / "grid.json").read_text())["resolution"]) == 5 and "grid.ktx2" in text
 
 

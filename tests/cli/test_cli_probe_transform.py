@@ -62,8 +62,9 @@ def test_probes_and_points_are_decoded(folder, tmp_path):
 def test_walks_and_exports_have_the_places(folder, tmp_path):
     call("probe", "walk", folder / "a.wlm", folder / "room.npz", "--frames", 2)
     call("probe", "volume", folder / "b.wlm", "-o", tmp_path / "volume")
-    call("probe", "grid", folder / "a.wlm", folder / "room.npz", "-o", tmp_path / "grid", "--cells", 3)
-    assert "holds no positions" in fails("probe", "grid", folder / "a.wlm", "-o", tmp_path / "none")
+    three = ["probe", "export", folder / "a.wlm", "--engine", "three"]
+    call(*three, "--original", folder / "room.npz", "-o", tmp_path / "grid", "--cells", 3)
+    assert "holds no positions" in fails(*three, "-o", tmp_path / "none")
     call("probe", "export", folder / "b.wlm", "-o", tmp_path / "b")
     call("probe", "export", folder / "a.wlm", "-o", tmp_path / "a", "--original", folder / "room.npz")
     assert {path.name for path in (tmp_path / "a").iterdir()} >= {"light.bin", "probe.glsl", "probe.json"}

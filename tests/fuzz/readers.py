@@ -19,6 +19,7 @@ import wlm
 from wlm.atlas.exporter import geometry, read_folder
 from wlm.bench.rows import read_json
 from wlm.config import load_settings
+from wlm.errors import WlmError
 from wlm.fluid.volume import load_volume
 from wlm.formats.exr import read_exr
 from wlm.formats.gltf import read_gltf
@@ -26,6 +27,7 @@ from wlm.formats.gltf_writer import write_glb
 from wlm.formats.light import read_light
 from wlm.formats.mask import read_mask
 from wlm.formats.obj import read_obj
+from wlm.inspection import inspect
 from wlm.probe.data import load_positions
 from wlm.smoke.data import load_frames, read_six_way
 from wlm.smoke.exporter import read_flipbook
@@ -56,6 +58,13 @@ def _json(draw: Random, data: bytes) -> bytes:
 def _exr(path: Path) -> None:
     pixels, names = read_exr(path)
     assert pixels.dtype == np.float32 and pixels.shape[2] == len(names), f"accepted as {pixels.dtype} {pixels.shape}"
+
+
+def _inspect(path: Path) -> None:
+    for each in inspect(path.parent):
+        assert not any("\n" in line for line in (each.what, *each.problems))
+        if each.what.endswith("can't be read"):
+            raise WlmError(f"{path}: {each.problems[0]}")
 
 
 def _light_file(path: Path) -> None:
@@ -334,6 +343,7 @@ _ALL = (
         vary_ktx2,
         _light_file,
     ),
+    Reader("inspect", "a.json", corpus("set.json", "probes.json", "positions.json"), _json, _inspect),
     Reader("dds", "a.dds", corpus("shared.dds", "bc6h.dds", "float-legacy.dds"), vary_dds, _light_file),
     Reader(
         "exr-six-way",

@@ -8,7 +8,7 @@ import re
 import numpy as np
 import pytest
 import torch
-from builders import atlas_meshes, atlas_models, probe_models, rooms, small_sets
+from builders import atlas_meshes, atlas_models, probe_models, probe_sets, rooms, small_sets
 from builders.synthetic import random_model
 from PIL import Image
 
@@ -378,6 +378,26 @@ def test_probes_decode_as_in_python(outputs, tmp_path, show):
     expected = model.decoder().decode(model.stored_positions()[live])[:, :27]
     seen = numbers(page, "kind.read()").reshape(-1, 27)[:, : expected.shape[1]]
     assert np.abs(seen - expected).max() < 3 / 255 * np.abs(expected).max()
+    assert picture(page).max() > 100
+
+
+def test_probes_of_a_transform_and_light_between_them_decode_as_in_python(tmp_path, show):
+    probes = probe_sets.synthetic(60, dead=5)
+    model = wlm.probe.compress(probes)
+    model.save(tmp_path / "probe.wlm")
+    wlm.probe.save_probes(tmp_path / "probes.npz", probes.position, probes.values)
+    corners = probes.position[probes.live][:3]
+    corners[2] += 0.3
+    document, _ = document_from_arrays(corners, np.array([[0, 1, 2]]), np.zeros((3, 2)), "triangle")
+    write_glb(tmp_path / "triangle.glb", document, [], 0)
+    files = {"mesh": tmp_path / "triangle.glb", "original": tmp_path / "probes.npz"}
+    write_page(tmp_path / "page.html", [tmp_path / "probe.wlm"], **files)
+    page = show(tmp_path / "page.html")
+    decoder = model.decoder(position=probes.position)
+    for group, expected in enumerate([decoder.decode_probes()[probes.live], decoder.decode(corners)]):
+        seen = numbers(page, f"kind.read({group})").reshape(-1, 27)
+        # The page has half floats of them.
+        assert np.abs(seen - expected).max() < 2**-10 * np.abs(expected).max()
     assert picture(page).max() > 100
 
 

@@ -2,7 +2,7 @@
 
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -302,20 +302,58 @@ def info(file: ModelFile, as_json: AsJson = False, device: Device = "cpu") -> No
 def export(
     file: ModelFile,
     output: Annotated[Path, output_option("DIR", "The folder to write to.")],
-    original: _Original = None,
+    engine: Annotated[
+        Literal["any", "three", "godot", "unity"],
+        typer.Option(
+            help="For three.js and Godot light on a lattice, for Godot and Unity the probes themselves too; for any "
+            "engine buffers and a shader that reads them."
+        ),
+    ] = "any",
+    original: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="PROBES",
+            help="The probes that were compressed, where FILE.wlm has no positions; for Godot their bake, to keep the "
+            "rest of it.",
+        ),
+    ] = None,
+    cells: Annotated[
+        int | None, typer.Option(help="Of a lattice, along the longest side of the probes' box; default 24.")
+    ] = None,
+    mirror: Annotated[
+        Literal["x", "y", "z"] | None,
+        typer.Option(help="For Unity, which is left-handed: the axis to turn round; default none."),
+    ] = None,
     device: Device = "cpu",
 ) -> None:
-    """Write what the file holds as buffers, with a shader that reads them, for an engine.
+    """Write the light for an engine, as files that it takes as they are.
 
-    reference.json is the light at some positions: what the shader should make of the rest.
+    For any engine, reference.json is the light at some positions: what the shader should make of the rest.
     """
+    if cells is not None and engine not in ("three", "godot"):
+        raise WlmError("--cells: means nothing without --engine three or godot")
+    if mirror is not None and engine != "unity":
+        raise WlmError("--mirror: means nothing without --engine unity")
     quiet_warp()
-    from wlm.probe import export
+    from wlm import probe
+    from wlm.probe.three_grid import CELLS
     from wlm.system import load
 
     model = load(file, "probe")
+    if engine == "any":
+        paths = probe.export(model, output, device=device, position=_given(model, original))
+    elif engine == "three":
+        given, size = _given(model, original), CELLS if cells is None else cells
+        paths = probe.export_grid(model, output, cells=size, position=given, device=device)
+    elif engine == "godot":
+        bake = original if original is not None and original.suffix.lower() == ".lmbake" else None
+        given = None if bake is not None else _given(model, original)
+        paths = probe.export_godot(model, output, bake=bake, cells=cells, position=given, device=device)
+    else:
+        given = None if original is None else _places(model, original)
+        paths = probe.export_unity(model, output, mirror=mirror, position=given, device=device)
     rows = table(str(output), ["file", "bytes"])
-    for path in export(model, output, device=device, position=_given(model, original)):
+    for path in paths:
         rows.add_row(escape(path.name), f"{path.stat().st_size:,}")
     show(rows)
 
@@ -342,13 +380,19 @@ def _positions(model: "ProbeModel | TransformModel", path: Path | None) -> "tupl
 
 def _given(model: "ProbeModel | TransformModel", original: Path | None) -> "np.ndarray | None":
     """The positions of the model's own probes in another file, if there is one; only a transform needs them."""
-    from wlm.probe import load_positions
-
     if original is None:
         return None
-    position = load_positions(original)
+    position = _places(model, original)
     if model.profile.method != "transform":
         raise WlmError(f"--original: means nothing to {model.name}, which is decoded without its probes' positions")
+    return position
+
+
+def _places(model: "ProbeModel | TransformModel", original: Path) -> "np.ndarray":
+    """The positions of the model's own probes in another file."""
+    from wlm.probe import load_positions
+
+    position = load_positions(original)
     if not model.has_probes_at(position):
         raise WlmError(f"{original}: expected the {model.probes} probes of {model.name}, in their order")
     return position

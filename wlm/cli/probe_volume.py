@@ -1,4 +1,4 @@
-"""`wlm probe walk`, `volume` and `grid`: the light of probes as a viewer gets it."""
+"""`wlm probe walk` and `volume`: the light of probes as a viewer gets it."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -24,7 +24,6 @@ def register(app: typer.Typer) -> None:
     """Adds the commands of the volume to those of probes."""
     app.command()(walk)
     app.command()(volume)
-    app.command()(grid)
 
 
 def walk(
@@ -109,30 +108,6 @@ def volume(
     settle(made, (lit.min(0) + lit.max(0)) / 2 if at is None else _point(at))
     rows = table(str(output), ["file", "bytes"])
     for path in export_volume(made, output):
-        rows.add_row(escape(path.name), f"{path.stat().st_size:,}")
-    show(rows)
-
-
-def grid(
-    file: ModelFile,
-    output: Annotated[Path, output_option("DIR", "The folder to write to.")],
-    probes_path: Annotated[
-        Path | None, typer.Argument(metavar="PROBES", help="What was compressed, where FILE.wlm has no places.")
-    ] = None,
-    cells: Annotated[int | None, typer.Option(help="Along the longest side of the probes' box; default 24.")] = None,
-    device: Device = "cpu",
-) -> None:
-    """Write the light as a grid for three.js: a texture, and a module that loads it into a LightProbeGrid."""
-    quiet_warp()
-    from wlm.probe import load_positions
-    from wlm.probe.three_grid import CELLS, export_grid
-    from wlm.system import load
-
-    cells = CELLS if cells is None else cells
-    position = None if probes_path is None else load_positions(probes_path)
-
-    rows = table(str(output), ["file", "bytes"])
-    for path in export_grid(load(file, "probe"), output, cells=cells, position=position, device=device):
         rows.add_row(escape(path.name), f"{path.stat().st_size:,}")
     show(rows)
 

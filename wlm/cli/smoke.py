@@ -1,6 +1,6 @@
 """`wlm smoke`: simulate smoke, render guiding maps, bake six-way lightmaps, light them, pack them for an engine."""
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -40,15 +40,28 @@ if TYPE_CHECKING:
     from wlm.fluid.volume import DensityVolume
     from wlm.smoke.camera import Camera
     from wlm.smoke.shading import Light
-    from wlm.smoke.shots import BakedFiles, FramesToBake, Shot
+    from wlm.smoke.shots import BakedFiles, FlipBook, FramesToBake, Shot
     from wlm.system import OnProgress
 
 app = typer.Typer(help="Smoke: simulated, and rendered through six-way lightmaps.")
 
 _Baked = Annotated[
     Path,
-    typer.Argument(metavar="SMOKE", help="A .npz or .nvdb volume, a folder of simulate, bake or predict, or an EXR."),
+    typer.Argument(
+        metavar="SMOKE",
+        help="A .npz or .nvdb volume, a folder of simulate, bake or predict, an EXR, or a flip book's first texture.",
+    ),
 ]
+_With = Annotated[
+    list[Path] | None,
+    typer.Option("--with", metavar="TEXTURE", help="A flip book's second texture; again: one of its opacity."),
+]
+_Cells = Annotated[str | None, typer.Option(metavar="ROWSxCOLUMNS", help="Of a flip book, such as 8x8.")]
+_From = Annotated[
+    str | None,
+    typer.Option("--from", metavar="LAYOUT", help="Of a flip book: unity, the default, o3de, o3de-tlrb or embergen."),
+]
+_Straight = Annotated[bool, typer.Option("--straight", help="A flip book's light isn't multiplied by its opacity yet.")]
 _Output = Annotated[Path, output_option("OUT", "A .exr, or for frames a folder.")]
 # Baked smoke has both already.
 _BakeStep = Annotated[
@@ -205,6 +218,10 @@ def shade(
     background: Annotated[str | None, typer.Option(metavar="R,G,B", help="Linear colour behind the smoke.")] = None,
     white: Annotated[float, typer.Option(help="The light that becomes white.")] = 1.0,
     rule: Annotated[str, typer.Option(help="Weights of the lightmaps: squared, absolute or normalised.")] = "squared",
+    textures: _With = None,
+    cells: _Cells = None,
+    source_layout: _From = None,
+    straight: _Straight = False,
     step: _BakeStep = None,
     supersample: _BakeSupersample = None,
 ) -> None:
@@ -225,7 +242,8 @@ def shade(
     from wlm.view.atlas import save_png
     from wlm.view.smoke import contact_sheet, picture, to_bytes
 
-    source = _source(smoke, options, step, supersample, 1.0)
+    book = _book(smoke, textures, cells, source_layout, straight)
+    source = _source(smoke, options, step, supersample, 1.0, book)
     if not lights:
         lights = [settings.light() for settings in source.scene.lights] if source.scene else [_light("1,1,1")]
     if behind is None:
@@ -235,6 +253,8 @@ def shade(
     pictures = []
     with running("shade") as progress:
         for shot in _shots(source, progress):
+            if shot.six.transparency is None:
+                raise WlmError(f"{smoke}: has no opacity: expected an alpha, or a third texture by a second --with")
             extra = {"ramp": shot.ramp, "obstacles": shot.obstacles, "time": shot.time}
             shaded = picture(shot.six, lights, background=behind, rule=rule, **extra)
             pictures.append(to_bytes(shaded, white))
@@ -262,6 +282,10 @@ def flipbook(
         float | None,
         typer.Option(help="Factor on the light; default 1 in an EXR, else the greatest without clipping."),
     ] = None,
+    textures: _With = None,
+    cells: _Cells = None,
+    source_layout: _From = None,
+    straight: _Straight = False,
     step: _BakeStep = None,
     supersample: _BakeSupersample = None,
 ) -> None:
@@ -274,14 +298,16 @@ def flipbook(
     if gain is not None and not 0 < gain < float("inf"):
         raise WlmError(f"--gain: expected a number above 0, got {gain}")
     quiet_warp()
-    from wlm.smoke.exporter import brightest_gain, cells, channels, write_flipbook
+    from wlm.smoke.exporter import brightest_gain, channels, write_flipbook
+    from wlm.smoke.exporter import cells as cells_for
 
-    source = _source(smoke, options, step, supersample, 0.5)
+    book = _book(smoke, textures, cells, source_layout, straight)
+    source = _source(smoke, options, step, supersample, 0.5, book)
     with running("flipbook") as progress:
         frames = [shot.six for shot in _shots(source, progress, count)]
     if any(frame.lightmaps.shape != frames[0].lightmaps.shape for frame in frames):
         raise WlmError(f"{smoke}: expected lightmaps of one size")
-    rows_of_cells, columns = cells(len(frames), columns)
+    rows_of_cells, columns = cells_for(len(frames), columns)
     if gain is None:
         gain = 1.0 if output.suffix.lower() == ".exr" else brightest_gain(frames)
     paths = tuple(output.with_name(f"{output.stem}_{i}{output.suffix}") for i in (1, 2))
@@ -308,14 +334,44 @@ def _light(text: str) -> "Light":
     return check_settings(LightSettings, values, "--light: ").light()
 
 
+def _book(
+    smoke: Path, textures: list[Path] | None, cells: str | None, layout: str | None, straight: bool
+) -> "FlipBook | None":
+    """The flip book that the options tell; None where they tell none."""
+    from wlm.smoke.camera import LAYOUTS
+    from wlm.smoke.shots import FlipBook
+
+    if not textures:
+        for option, given in (("cells", cells), ("from", layout), ("straight", straight)):
+            if given:
+                raise WlmError(f"--{option}: means nothing without --with, a flip book's second texture")
+        return None
+    if len(textures) > 2:
+        raise WlmError(f"--with: expected a second texture and maybe one of opacity, got {len(textures)}")
+    layout = "unity" if layout is None else layout
+    if layout not in LAYOUTS:
+        raise WlmError(f"--from: expected one of {', '.join(LAYOUTS)}, got {layout!r}")
+    rows, cross, columns = (cells or "").partition("x")
+    if not (cross and rows.isdecimal() and columns.isdecimal() and 0 < int(rows) <= 64 and 0 < int(columns) <= 64):
+        raise WlmError(f"--cells: expected rows and columns of 1 to 64, such as 8x8, got {cells}")
+    return FlipBook((smoke, *textures), layout, int(rows), int(columns), straight)
+
+
 def _source(
-    smoke: Path, options: SmokeOptions, step: float | None, supersample: int | None, default_step: float
-) -> "BakedFiles | FramesToBake":
-    """The lightmaps to shade or pack: those that bake or predict wrote, else of smoke that is baked now."""
+    smoke: Path,
+    options: SmokeOptions,
+    step: float | None,
+    supersample: int | None,
+    default_step: float,
+    book: "FlipBook | None",
+) -> "BakedFiles | FlipBook | FramesToBake":
+    """The lightmaps to shade or pack: a flip book's, those of bake or predict, else of smoke that is baked now."""
     from wlm.interop import check_device
     from wlm.smoke.shots import FramesToBake, baked_files
 
-    if baked := baked_files(smoke, check_device(options.device)):
+    device = check_device(options.device)
+    baked = baked_files(smoke, device) if book is None else replace(book, device=device)
+    if baked is not None:
         changes = options.given() | {"step": step, "supersample": supersample}
         if option := next((name for name, value in changes.items() if value is not None), None):
             raise WlmError(f"{smoke}: was baked: --{option} has to be given to bake")
@@ -324,7 +380,9 @@ def _source(
     return FramesToBake(frames, options.camera(frames), step or default_step, supersample or 1)
 
 
-def _shots(source: "BakedFiles | FramesToBake", progress: "OnProgress", count: int | None = None) -> "Iterator[Shot]":
+def _shots(
+    source: "BakedFiles | FlipBook | FramesToBake", progress: "OnProgress", count: int | None = None
+) -> "Iterator[Shot]":
     """The source's shots; notes repairs of their volumes."""
     for shot in source.shots(count, progress):
         for warning in shot.warnings:

@@ -46,6 +46,25 @@ def read_part(path: str | os.PathLike[str]) -> OpenEXR.Part:
     return parts[0]
 
 
+def read_header(path: str | os.PathLike[str]) -> tuple[int, int, tuple[str, ...]]:
+    """Reads what an EXR file says of its first part: width, height and the channels' names; no pixels.
+
+    Raises:
+        WlmError: The file is missing, not an EXR, or its header is damaged, or claims more than a picture may have.
+    """
+    size = _check_magic(path)
+    with _captured_chatter() as chatter:
+        try:
+            parts = OpenEXR.File(str(path), separate_channels=True, header_only=True).parts
+            _check_size(path, size, parts)
+            first, last = (np.asarray(corner).tolist() for corner in parts[0].header["dataWindow"])
+            names = tuple(channel.name for channel in parts[0].header["channels"])
+        except (RuntimeError, ValueError, LookupError, MemoryError) as error:
+            found = chatter.text or one_line(error)
+            raise WlmError(f"{path}: the EXR file is cut short or damaged: {found}") from error
+    return last[0] - first[0] + 1, last[1] - first[1] + 1, names
+
+
 def write_part(
     path: str | os.PathLike[str],
     channels: Mapping[str, np.ndarray],

@@ -1,4 +1,4 @@
-"""Reading the light probes of a Godot 4 lightmap bake (`.lmbake`).
+"""Reading the light probes of a Godot 4 lightmap bake (`.lmbake`), and replacing them.
 
 The file is Godot's binary resource (`RSRC`, or `RSCC` where it was saved compressed) of the type `LightmapGIData`.
 Its property `probe_data` is a dictionary with `points` and, for each of them, nine colours `sh`; everything else (the
@@ -99,6 +99,37 @@ def read_lmbake(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray]:
         WlmError: The file is missing, not a Godot resource, of another version or type, cut short or damaged, has no
             probes, or is compressed and imagecodecs is not installed.
     """
+    points, colours, _, _ = _read(path)
+    return points, colours.reshape(len(points), COEFFICIENTS, 4)[..., :3].copy()
+
+
+def relit(path: str | os.PathLike[str], sh: np.ndarray) -> bytes:
+    """A bake with other light at its probes: textures, meshes and all else stay as they are.
+
+    Args:
+        path: The `.lmbake`, not compressed.
+        sh: [N, 9, 3], for each of its N probes, as the file has them.
+
+    Returns:
+        The file's new content.
+
+    Raises:
+        WlmError: As for `read_lmbake`, or the bake is compressed.
+        ValueError: Another shape.
+    """
+    points, colours, reader, at = _read(path)
+    if bytes(reader.data[:4]) != b"RSRC":
+        raise WlmError(f"{path}: is compressed: expected a bake that was saved without, to replace its light")
+    if sh.shape != (len(points), COEFFICIENTS, 3):
+        raise ValueError(f"expected ({len(points)}, {COEFFICIENTS}, 3), got {sh.shape}")
+    changed = colours.reshape(len(points), COEFFICIENTS, 4)
+    changed[..., :3] = sh
+    light = changed.astype(f"{reader.order}f4").tobytes()
+    return bytes(reader.data[:at]) + light + bytes(reader.data[at + len(light) :])
+
+
+def _read(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray, _Reader, int]:
+    """Points [N, 3], colours [9 N, 4], the bytes they are from, and where in these the colours begin."""
     data = read_file(path, BAKE_BYTES, "the bake")
     magic = data[:4]
     if magic == b"RSCC":
@@ -110,6 +141,7 @@ def read_lmbake(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray]:
         raise WlmError(f"{path}: expected a Godot binary resource (RSRC or RSCC), found {magic!r} at its start")
     names = _open(reader)
     points = colours = None
+    at = 0
     for _ in range(reader.u32()):
         if reader.name(names) != _PROPERTY:
             reader.skip()
@@ -121,6 +153,7 @@ def read_lmbake(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray]:
                 points = reader.vectors()
             elif key == "sh":
                 colours = reader.colours()
+                at = reader.position - 16 * len(colours)
             else:
                 reader.skip()
     if points is None or colours is None or len(points) == 0:
@@ -130,7 +163,7 @@ def read_lmbake(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray]:
             f"{path}: {_PROPERTY}.sh: expected {COEFFICIENTS} colours for each of {len(points)} points, "
             f"found {len(colours)}"
         )
-    return points, colours.reshape(len(points), COEFFICIENTS, 4)[..., :3].copy()
+    return points, colours, reader, at
 
 
 def _open(reader: _Reader) -> list[str]:

@@ -19,6 +19,7 @@ times out of order                    sorted, with their frames; warning
 two equal times                       error that names both files
 more than 100,000 times               error
 an alpha NaN or infinite              the texel is outside a mask from alpha; warning
+frames of unlike atlases              warning, where light or an alpha ends at the charts' borders
 texels that some frames alone have    kept: fitted at the other times to the frame nearest in time
                                       that has them, and scored at their own; warning
 files, mask or mesh outside the       error, unless the set is trusted
@@ -57,6 +58,7 @@ from wlm.formats.limits import FRAMES, PICTURE_GROWTH, TIMES, check_growth
 from wlm.formats.mask import read_mask
 from wlm.formats.scratch import room
 from wlm.lightmap.contest import CONFIG_FILE, is_contest, list_contest, read_coverage, read_raw
+from wlm.lightmap.layout import odd_layout
 from wlm.lightmap.listing import SET_FILE, Listing, list_folder, parse_set
 from wlm.texels import repair
 
@@ -375,6 +377,12 @@ def checked_set(
     for i, (label, frame) in enumerate(zip(labels, frames, strict=True)):
         inside = mask if covered is None else covered[i]
         warnings += [f"{label}: {text}" for text in repair(frame, inside, f"{where}: {label}")]
+    odd = odd_layout(len(frames), lambda i: frames[i].any(-1) if covered is None else covered[i])
+    if odd is not None:
+        warnings.append(
+            f"{where}: {labels[odd[0]]} and {labels[odd[1]]} don't look like one atlas at two times: their charts "
+            "end in other texels"
+        )
     if covered is not None:
         covered = covered & mask
         _fill_in_time(frames, covered, times, period)

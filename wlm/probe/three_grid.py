@@ -19,23 +19,18 @@ from wlm.formats.folder import make_parents, staged, write_index
 from wlm.formats.ktx2 import read_half_volume, write_ktx2
 from wlm.formats.reading import named_file
 from wlm.probe.conventions import THREE_GRID as FORMAT
-from wlm.probe.decode import Decoder
+from wlm.probe.lattice import CELLS, NUMBERS, lattice_of
 from wlm.probe.model import ProbeModel
 from wlm.probe.transform import TransformModel
-from wlm.probe.transform_decode import TransformDecoder
 
 _VERSION = 1
 INFO_FILE = "grid.json"
 TEXTURE_FILE = "grid.ktx2"
 LOADER_FILE = "grid.js"
-CELLS = 24
-"""Cells along the longest side of the box, where no number is given."""
-
 _FILES = {INFO_FILE, TEXTURE_FILE, LOADER_FILE}
-_PARTS, _NUMBERS = 7, 27
+_PARTS = 7
 _MOST_CELLS = 256
 _FARTHEST = 1e100
-_ROWS = 65536  # of points decoded at a time
 _ABOUT = (
     "Light for three.js: grid.js loads grid.ktx2 with its KTX2Loader into its LightProbeGrid. box is that of the "
     "cells, with a probe at the centre of each (r187 and later), corners that of the probes themselves (up to r186). "
@@ -98,22 +93,10 @@ def export_grid(
         WlmError: Another number of coefficients, cells out of range, light beyond half floats, no such device, or the
             folder can't be written.
     """
-    if model.outputs != _NUMBERS:
-        raise WlmError(f"{model.name}: expected L2 in RGB, 27 numbers a probe, got {model.outputs}")
-    if not 1 <= cells <= _MOST_CELLS:
-        raise WlmError(f"cells: expected 1 to {_MOST_CELLS} along the longest side, got {cells}")
-    if isinstance(model, TransformModel):
-        position = model.stored_positions() if position is None else position
-        decoder: Decoder | TransformDecoder = TransformDecoder(model, device, position=position)
-        corner, span = position.min(0), np.ptp(position, axis=0)
-    else:
-        decoder, corner, span = Decoder(model, device), model.origin, model.extent * model.size
-    size = float(span.max()) / cells or 1.0  # all probes in one place: one cell
-    count = np.clip(np.ceil(span / size - 1e-6), 1, cells).astype(int)
-    low = corner + span / 2 - count * size / 2
+    lattice = lattice_of(model, cells, _MOST_CELLS, position, device)
+    low, size, count = lattice.low, lattice.size, lattice.count
     box = np.stack([low, low + count * size])
-    places = grid_places(box, count)
-    values = np.concatenate([decoder.decode(places[i : i + _ROWS]) for i in range(0, len(places), _ROWS)])
+    values = lattice.light(lattice.centres())
     if not np.abs(values).max() <= np.finfo(np.float16).max:
         raise WlmError(f"{model.name}: expected light within half floats, got {np.abs(values).max():.3g}")
     texels = pack(values, count)
@@ -184,7 +167,7 @@ def pack(values: np.ndarray, count: np.ndarray) -> np.ndarray:
     """The texture of probes [nz * ny * nx, 27] in the order of `grid_places`: float16 [7 (nz + 2), ny, nx, 4]."""
     nx, ny, nz = (int(n) for n in count)
     padded = np.zeros((nz, ny, nx, 4 * _PARTS), "<f2")
-    padded[..., :_NUMBERS] = np.asarray(values).reshape(nz, ny, nx, _NUMBERS)
+    padded[..., :NUMBERS] = np.asarray(values).reshape(nz, ny, nx, NUMBERS)
     parts = np.moveaxis(padded.reshape(nz, ny, nx, _PARTS, 4), 3, 0)
     return np.concatenate([parts[:, :1], parts, parts[:, -1:]], 1).reshape(-1, ny, nx, 4)
 
@@ -193,4 +176,4 @@ def unpack(texels: np.ndarray) -> np.ndarray:
     """The probes, float32 [nz * ny * nx, 27], of a texture of `pack`."""
     _, ny, nx, _ = texels.shape
     parts = texels.reshape(_PARTS, -1, ny, nx, 4)[:, 1:-1]
-    return np.moveaxis(parts, 0, 3).reshape(-1, 4 * _PARTS)[:, :_NUMBERS].astype(np.float32)
+    return np.moveaxis(parts, 0, 3).reshape(-1, 4 * _PARTS)[:, :NUMBERS].astype(np.float32)

@@ -9,6 +9,7 @@ import io
 import math
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +26,8 @@ from wlm.smoke.camera import ALPHA, DIRECTIONS, EMISSION, LAYOUTS
 from wlm.smoke.lightmaps import SixWay
 
 _SUFFIXES = (".exr", ".png", ".tga")
-_MODES = ("RGB", "RGBA")
+_MODES, _GREY = ("RGB", "RGBA"), ("L", "LA")
+_BARE, _LIT = 0.999, 0.05  # transparency without smoke; light that is none there
 
 
 def cells(count: int, columns: int | None = None) -> tuple[int, int]:
@@ -171,35 +173,69 @@ def write_flipbook(
 
 
 def read_flipbook(
-    paths: tuple[str | os.PathLike[str], str | os.PathLike[str]],
+    paths: Sequence[str | os.PathLike[str]],
     layout: str = "unity",
     *,
     rows: int,
     columns: int,
     count: int | None = None,
     gain: float = 1.0,
+    straight: bool = False,
 ) -> list[SixWay]:
-    """Reads frames from two textures.
+    """Reads frames from two textures, or three.
 
     Args:
-        paths: The two files, .exr, .png or .tga (8 bits a channel, linear).
+        paths: The files, .exr, .png or .tga (8 bits a channel, linear): those of the layout, and maybe one of opacity,
+            its alpha or else its first channel.
         layout, rows, columns, count, gain: As for `unpack`.
+        straight: Whether the light isn't multiplied by the opacity yet; it is here.
 
     Returns:
         As `unpack`.
 
     Raises:
         WlmError: A file is missing, damaged, of another kind or size, holds numbers that aren't finite, or lacks a
-            channel of the layout.
+            channel of the layout; or the light is straight, and there is no opacity.
+        ValueError: Not two or three paths.
     """
-    pages = [_read(path) for path in paths]
+    if len(paths) not in (2, 3):
+        raise ValueError(f"expected two or three textures, got {len(paths)}")
+    where = ", ".join(map(str, paths))
+    pages = [_read(path) for path in paths[:2]]
     try:
-        return unpack(pages[0], pages[1], layout, rows=rows, columns=columns, count=count, gain=gain)
+        frames = unpack(pages[0], pages[1], layout, rows=rows, columns=columns, count=count, gain=gain)
+        if len(paths) == 3:
+            opacity = _read(paths[2], grey=True)
+            opacity = opacity[..., -1] if opacity.shape[2] in (2, 4) else opacity[..., 0]
+            if opacity.shape != pages[0].shape[:2]:
+                raise ValueError(f"expected textures of one size, got {pages[0].shape[:2]} and {opacity.shape}")
+            cell = opacity.reshape(rows, opacity.shape[0] // rows, columns, -1).swapaxes(1, 2)
+            cell = cell.reshape(rows * columns, *cell.shape[2:])
+            frames = [replace(frame, transparency=torch.from_numpy(1.0 - cell[i])) for i, frame in enumerate(frames)]
     except ValueError as error:
-        raise WlmError(f"{paths[0]}, {paths[1]}: {error}") from error
+        raise WlmError(f"{where}: {error}") from error
+    if not straight:
+        return frames
+    if any(frame.transparency is None for frame in frames):
+        raise WlmError(f"{where}: expected opacity, in an alpha or a third texture, for light without it")
+    return [_covered(frame) for frame in frames]
 
 
-def _read(path: str | os.PathLike[str]) -> np.ndarray:
+def is_straight(frames: Sequence[SixWay]) -> bool:
+    """Whether there is light where there is no smoke: it isn't multiplied by the opacity then. False without one."""
+    bare = [frame.lightmaps.amax(0)[frame.transparency > _BARE] for frame in frames if frame.transparency is not None]
+    light = torch.cat(bare) if bare else torch.zeros(0)
+    return len(light) > 0 and float(light.mean()) > _LIT
+
+
+def _covered(frame: SixWay) -> SixWay:
+    """A frame with its light multiplied by its opacity."""
+    opacity = 1.0 - frame.transparency
+    emission = None if frame.emission is None else frame.emission * opacity
+    return replace(frame, lightmaps=frame.lightmaps * opacity, emission=emission)
+
+
+def _read(path: str | os.PathLike[str], *, grey: bool = False) -> np.ndarray:
     if _suffix(path) == ".exr":
         page = read_exr(path)[0]
         if not np.isfinite(page).all():
@@ -209,11 +245,13 @@ def _read(path: str | os.PathLike[str]) -> np.ndarray:
     try:
         # From memory: of a file on disk Pillow would make room for as many bytes as a chunk claims to have.
         with Image.open(io.BytesIO(data), formats=[_suffix(path)[1:].upper()]) as image:
-            if image.mode not in _MODES:
-                raise WlmError(f"{path}: expected RGB or RGBA of 8 bits, found {image.mode}")
-            floats = 4 * image.width * image.height * len(image.mode)
+            modes = (*_MODES, *_GREY) if grey else _MODES
+            if image.mode not in modes:
+                raise WlmError(f"{path}: expected {' or '.join(modes)} of 8 bits, found {image.mode}")
+            floats = 4 * image.width * image.height * len(image.getbands())
             check_growth(str(path), len(data), floats, PICTURE_GROWTH)
-            return np.asarray(image).astype(np.float32) / np.float32(255.0)
+            pixels = np.asarray(image).astype(np.float32) / np.float32(255.0)
+            return pixels.reshape(*pixels.shape[:2], -1)
     except DAMAGED_PICTURE as error:
         raise WlmError(f"{path}: cannot read the picture: {str(error) or type(error).__name__}") from error
 

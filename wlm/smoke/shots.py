@@ -7,7 +7,9 @@ from pathlib import Path
 
 from wlm.errors import WlmError
 from wlm.smoke.baking import bake
+from wlm.smoke.camera import Camera
 from wlm.smoke.data import SCENE_FILE, Frames, numbered, read_six_way, spread
+from wlm.smoke.exporter import is_straight, read_flipbook
 from wlm.smoke.guiding import guide
 from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.scene import CameraSettings, ObstacleSettings, Scene, make_camera
@@ -110,6 +112,50 @@ class BakedFiles:
         meter = Meter(progress, "read", len(numbers))
         for done, number in enumerate(numbers, 1):
             yield Shot(number, read_six_way(self.files[number], self.device))
+            meter.report(done)
+
+
+@dataclass(frozen=True)
+class FlipBook:
+    """Lightmaps in an engine's textures, seen from the front: the camera isn't known.
+
+    Attributes:
+        files: The two textures, and maybe one of opacity.
+        layout, rows, columns, straight: As for `wlm.smoke.exporter.read_flipbook`.
+        device: Where the lightmaps go.
+    """
+
+    files: tuple[Path, ...]
+    layout: str
+    rows: int
+    columns: int
+    straight: bool = False
+    device: str = "cpu"
+    scene: None = None
+
+    @property
+    def single(self) -> bool:
+        """Whether it has one frame."""
+        return self.rows * self.columns == 1
+
+    def shots(self, count: int | None = None, progress: OnProgress | None = None) -> Iterator[Shot]:
+        """Reads the textures, then gives one cell after the other; arguments as for `FramesToBake.shots`.
+
+        Raises:
+            WlmError: A file is damaged, of another size, or lacks a channel.
+        """
+        frames = read_flipbook(self.files, self.layout, rows=self.rows, columns=self.columns, straight=self.straight)
+        warnings: tuple[str, ...] = ()
+        if not self.straight and is_straight(frames):
+            warnings = (f"{self.files[0]}: light where there is no smoke: is it straight (--straight)?",)
+        height, width = frames[0].lightmaps.shape[1:]
+        camera = Camera.look_at((0.0, 0.0, 1.0), (0.0, 0.0, 0.0), extent=1.0, height=height, width=width)
+        numbers = spread(range(1, len(frames) + 1), count)
+        meter = Meter(progress, "read", len(numbers))
+        for done, number in enumerate(numbers, 1):
+            six, planes = frames[number - 1], ("lightmaps", "transparency", "emission")
+            moved = {name: plane.to(self.device) for name in planes if (plane := getattr(six, name)) is not None}
+            yield Shot(number, replace(six, **moved, camera=camera), warnings=warnings if done == 1 else ())
             meter.report(done)
 
 

@@ -19,6 +19,7 @@ from wlm.probe.places import ball_exposure, ball_radius, probes_of
 from wlm.probe.shader import probe_glsl
 from wlm.probe.sphere import sh_count
 from wlm.probe.transform import TransformModel
+from wlm.probe.transform_export import light_bytes, transform_glsl
 from wlm.web.page import Page, pack_triangles
 
 _BANDS = 9  # coefficients that diffuse light needs
@@ -40,26 +41,31 @@ def probe_page(
         file_bytes: Size of its file.
         mesh, original, key, up: As for `wlm.web.pages.make_page`.
 
+    Of Gaussians the page carries codes and network as they are, of a transform the unpacked light of its probes.
+
     Raises:
         WlmError: A probe's numbers are no spherical harmonics; the positions are not known; the mesh or the original
             can't be read, or is of other probes.
     """
-    if not isinstance(model, ProbeModel):
-        raise WlmError(f"{model.name}: expected Gaussians, which a page decodes, found a file of profile transform")
     coefficients = sh_count(model.outputs)
     if coefficients is None:
         raise WlmError(f"{model.name}: expected spherical harmonics, found {model.outputs} numbers a probe")
     position, values, live = probes_of(model, original, key)
     places = position[live].astype(np.float32)
-    arrays = {
-        "gaussians": np.frombuffer(_whole(gaussian_bytes(model)), "<u4"),
-        "network": np.frombuffer(_whole(network_bytes(model)), "<u4"),
-        "places": places,
-    }
+    if isinstance(model, TransformModel):
+        decoded = model.decoder(position=None if original is None else position).decode_probes()[live]
+        content = {"light": light_bytes(model, position[live], decoded)[0]}
+        shader, fact = transform_glsl(len(places), model.outputs), ("step", f"{model.head.step:.3g}")
+    else:
+        decoded = Decoder(model).decode(position[live])
+        content = {"gaussians": gaussian_bytes(model), "network": network_bytes(model)}
+        shader, fact = probe_glsl(model), ("Gaussians", f"{model.count:,}")
+    arrays = {name: np.frombuffer(_whole(part), "<u4") for name, part in content.items()}
+    arrays["places"] = places
     radius = ball_radius(places)
-    light = Decoder(model).decode(position[live]) if values is None else values[live]
+    light = decoded if values is None else values[live]
     manifest: dict[str, Any] = {
-        "shader": probe_glsl(model),
+        "shader": shader,
         "exposure": ball_exposure(light.reshape(len(places), coefficients, 3)),
         "low": (places.min(0) - radius).tolist(),
         "high": (places.max(0) + radius).tolist(),
@@ -83,7 +89,7 @@ def probe_page(
         ("bits per probe", f"{file_bytes * 8 / model.probes:.1f}"),
         ("size", f"{100 * file_bytes / (4 * model.outputs * model.probes):.2f}% of float32"),
         ("live probes", f"{len(places):,} of {model.probes:,}"),
-        ("Gaussians", f"{model.count:,}"),
+        fact,
         ("profile", model.profile.name),
     ]
     if original is not None:

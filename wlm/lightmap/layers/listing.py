@@ -107,7 +107,7 @@ def is_layered(path: Path) -> bool:
     """Whether a set is layered: a `set.json` with `layers`, or a folder with one, or with Unity's files."""
     if path.is_dir():
         if not (path / SET_FILE).is_file():
-            return bool(_state_folders(path))
+            return bool(state_folders(path))
         path = path / SET_FILE
     # One that can't be read is an error of whoever reads it.
     return path.is_file() and path.suffix.lower() == ".json" and "layers" in read_set(path)
@@ -139,7 +139,7 @@ def list_layers(path: Path, times: Sequence[float] | None, chosen: Sequence[str]
     return LayeredListing(**vars(listing) | {"layers": layers})
 
 
-def _state_folders(folder: Path) -> list[Path]:
+def state_folders(folder: Path) -> list[Path]:
     """The folder itself, or those in it that have light as Unity names it, in natural order.
 
     A folder with lightmaps of other names is a set of its own, whatever lies in folders in it.
@@ -167,7 +167,7 @@ def _unity_files(folder: Path) -> list[tuple[tuple[str, str], Path]]:
 
 def _list_states(folder: Path, times: Sequence[float] | None, chosen: Sequence[str] | None) -> LayeredListing:
     """Lists a folder with a state of light as Unity bakes it, or with a folder of each state."""
-    states = _state_folders(folder)
+    states = state_folders(folder)
     found: list[dict[tuple[str, str], dict[str, Path]]] = []
     for state in states:
         files: dict[tuple[str, str], dict[str, Path]] = {}

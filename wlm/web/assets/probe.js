@@ -3,10 +3,11 @@
 const WIDTH = 256;  // places a row of the table of coefficients
 const ROW = 32;     // places that are decoded before the browser is asked whether it has time
 
-const DECODE = `
-uniform highp usampler2D u_gaussians, u_network;
-#define WLM_PROBE_GAUSSIANS(i) texelFetch(u_gaussians, ivec2((i) & 1023, (i) >> 10), 0).r
-#define WLM_PROBE_NETWORK(i) texelFetch(u_network, ivec2((i) & 1023, (i) >> 10), 0).r
+// Arrays that the exported shaders read: of Gaussians two, of a transform's probes one.
+const BUFFERS = ['gaussians', 'network', 'light'];
+const declare = (name) => `
+uniform highp usampler2D u_${name};
+#define WLM_PROBE_${name.toUpperCase()}(i) texelFetch(u_${name}, ivec2((i) & 1023, (i) >> 10), 0).r
 `;
 const STORE = `
 uniform sampler2D u_places;
@@ -105,12 +106,10 @@ class ProbePage {
   constructor(graphics, page, panel, changed) {
     const {manifest} = page, {gl} = graphics;
     Object.assign(this, {graphics, manifest, panel});
-    this.buffers = {
-      u_gaussians: graphics.numbers(page.array('gaussians', Uint32Array)),
-      u_network: graphics.numbers(page.array('network', Uint32Array)),
-    };
-    const count = manifest.probe.coefficients;
-    this.decoder = graphics.program(WHOLE, HEAD + DECODE + manifest.shader + STORE.replaceAll('COUNT', String(count)));
+    const held = BUFFERS.filter(page.has), store = STORE.replaceAll('COUNT', String(manifest.probe.coefficients));
+    this.buffers = Object.fromEntries(held.map((name) =>
+      [`u_${name}`, graphics.numbers(page.array(name, Uint32Array))]));
+    this.decoder = graphics.program(WHOLE, HEAD + held.map(declare).join('') + manifest.shader + store);
     this.drawer = graphics.program(LIT, `${HEAD}
 in vec3 v_decoded;
 in vec3 v_original;
@@ -211,9 +210,9 @@ void main() { colour = vec4(wlm_shown(v_decoded, v_original), 1.0); }`);
     }
   }
 
-  // For scripts: the 27 numbers of every probe, by probes.
-  async read() {
-    const {places} = this.groups[0], {gl} = this.graphics, {width, height} = places.texture;
+  // For scripts: the 27 numbers of every probe, by probes; of group 1 those of the mesh's vertices.
+  async read(group = 0) {
+    const {places} = this.groups[group], {gl} = this.graphics, {width, height} = places.texture;
     while (places.done < places.count) await new Promise(requestAnimationFrame);
     const numbers = new Float32Array(27 * places.count), values = new Float32Array(4 * width * height);
     gl.bindFramebuffer(gl.FRAMEBUFFER, places.buffer);

@@ -1,0 +1,150 @@
+"""`wlm inspect`: what lies in a folder is named, with the command that takes it and what is wrong with it."""
+
+import json
+import os
+import shutil
+
+import numpy as np
+import pytest
+from builders import atlas_meshes, small_sets
+from builders.contract import FILES
+from builders.godot_bakes import Writer, bake, probes
+from PIL import Image
+from typer.testing import CliRunner
+
+import wlm
+from wlm.cli.app import app
+from wlm.formats.exr import write_exr
+from wlm.inspection import inspect
+from wlm.inspection.folders import MOST
+
+
+def chart(width: int, seed: int = 0, height: int = 64, alpha: bool = False) -> np.ndarray:
+    """Light on stripes of a width with gaps of two texels between them."""
+    light = np.random.default_rng(seed).random((height, 64, 3)).astype(np.float32) + 0.1
+    lit = np.broadcast_to((np.arange(64) % width < width - 2)[None, :], (height, 64))
+    light *= lit[..., None]
+    return np.concatenate([light, lit[..., None].astype(np.float32)], 2) if alpha else light
+
+
+def write_set(folder) -> None:
+    """A set of five hours with its `set.json`."""
+    small_sets.write_set(folder, small_sets.moving_light())
+    names = sorted(path.name for path in folder.glob("*.exr"))
+    entries = [{"time_hours": i, "file": name} for i, name in enumerate(names)]
+    (folder / "set.json").write_text(json.dumps({"width": 128, "height": 128, "lightmaps": entries}))
+
+
+def told(path) -> str:
+    """All that is said, a line each, with names relative to the folder."""
+    lines = []
+    for finding in inspect(path):
+        lines.append(f"{finding.path.relative_to(path)}: {finding.what} -> {finding.command}")
+        lines += finding.problems
+    assert all("\n" not in line for line in lines)
+    return "\n".join(lines).replace(str(path), "HERE")
+
+
+def test_a_project_is_told_piece_by_piece(tmp_path):
+    for state, seed in (("night", 1), ("day", 2)):
+        (tmp_path / "unity" / state).mkdir(parents=True)
+        write_exr(tmp_path / "unity" / state / "Lightmap-0_comp_light.exr", chart(16, seed, alpha=True))
+        Image.new("RGBA", (64, 64)).save(tmp_path / "unity" / state / "Lightmap-0_comp_dir.png")
+    Image.new("RGBA", (64, 64)).save(tmp_path / "unity" / "day" / "Lightmap-0_comp_shadowmask.png")
+    write_exr(tmp_path / "unity" / "day" / "ReflectionProbe-0.exr", np.ones((8, 48, 3), np.float32))
+    write_set(tmp_path / "set")
+    (tmp_path / "set" / "LICENSE").write_text("none")
+    (tmp_path / "other").mkdir()
+    position, sh = probes(9)
+    writer = Writer()
+    (tmp_path / "other" / "room.lmbake").write_bytes(writer.file(bake(writer, position, np.abs(sh) * 0.1 + 1.0)))
+    np.savez(tmp_path / "other" / "smoke.npz", density=np.ones((4, 5, 6), np.float32))
+    np.savez(tmp_path / "other" / "two.npz", position=position, sh_9=sh, sh_12=sh)
+    (tmp_path / "other" / "smoke.vdb").write_bytes(b" BDV\0\0\0\0")
+    shutil.copy(FILES / "lightmap.wlm", tmp_path / "other" / "map.wlm")
+    mesh = atlas_meshes.sheet()
+    wlm.atlas.export(wlm.atlas.compress(mesh, wlm.atlas.Profile(name="tiny", views=0)), tmp_path / "atlas", mesh)
+    text = told(tmp_path)
+    for said in (
+        "unity: 2 states of Unity's light, 1 map of 64x64, with light, dir -> "
+        "wlm lightmap compress HERE/unity --times 0,1 --layers light,dir -o OUT.wlm",
+        "the hours of day, night aren't known",
+        "night has no Lightmap-0_comp_shadowmask",
+        "unity/day/ReflectionProbe-0.exr: a cube's six faces, 48x8",
+        "set: a set of lightmaps at 5 times, 128x128 -> wlm lightmap compress HERE/set -o OUT.wlm",
+        "room.lmbake: 9 light probes of 9 RGB coefficients, 9 of them lit -> wlm probe compress",
+        "smoke.npz: a volume of smoke, 4x5x6 voxels of 1 -> wlm smoke bake",
+        "two.npz: 9 light probes of 9 RGB coefficients, 9 of them lit, under the keys sh_9, sh_12 -> "
+        "wlm probe compress HERE/other/two.npz --key 9 -o OUT.wlm",
+        "smoke.vdb: an OpenVDB volume",
+        "map.wlm: lightmaps over time, compressed",
+        "atlas: a compressed lightmap of a mesh -> wlm web HERE/atlas -o PAGE.html",
+    ):
+        assert said in text, said
+    assert "LICENSE" not in text and text.count("set") < 20
+
+
+def test_pictures_of_several_atlases_are_no_times(tmp_path):
+    for hour, width in ((6, 16), (12, 16), (18, 16)):
+        write_exr(tmp_path / f"map_{hour}h.exr", chart(width, hour))
+    assert told(tmp_path) == ".: 3 lightmaps of 64x64 -> wlm lightmap compress HERE -o OUT.wlm"
+    write_exr(tmp_path / "map_18h.exr", chart(11, 18))
+    text = told(tmp_path)
+    assert "3 lightmaps of different atlases" in text and "wlm atlas compress MESH.glb" in text
+    assert "map_6h.exr and map_18h.exr don't look like one atlas" in text
+    write_exr(tmp_path / "map_18h.exr", chart(16, 18, height=32))
+    assert "map_18h.exr is 64x32, map_6h.exr is 64x64" in told(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda light: light * 1e5, "half of it above"),
+        (lambda light: np.minimum(light, 0.5) * 2.0, "cut at 1"),
+        (lambda light: np.rint(light / 1.2 * 255.0) / 255.0, "in 256 levels"),
+        (lambda light: -light, "no light at all"),
+        (lambda light: np.where(light > 1.05, np.nan, light), "texels NaN or infinite"),
+        (lambda light: light, None),
+    ],
+)
+def test_light_that_looks_wrong(tmp_path, change, said):
+    write_exr(tmp_path / "a.exr", change(chart(16)).astype(np.float32), half=False)
+    problems = inspect(tmp_path / "a.exr")[0].problems
+    assert any(said in problem for problem in problems) if said else problems == ()
+
+
+def test_what_is_damaged_is_said_and_nothing_stops(tmp_path):
+    write_set(tmp_path / "set")
+    data = sorted((tmp_path / "set").glob("*.exr"))[0].read_bytes()
+    sorted((tmp_path / "set").glob("*.exr"))[1].unlink()
+    for suffix in ("exr", "ktx2", "dds", "hdr", "npz", "glb", "lmbake", "wlm", "nvdb", "json", "png"):
+        (tmp_path / f"empty.{suffix}").write_bytes(b"")
+    (tmp_path / "cut.exr").write_bytes(data[: len(data) // 2])
+    (tmp_path / "link").symlink_to(tmp_path)
+    os.mkfifo(tmp_path / "pipe.exr")
+    text = told(tmp_path)
+    assert text.count("can't be read") == 12 and "is missing" in text and "pipe" not in text and "link" not in text
+    (tmp_path / "empty").mkdir()
+    assert told(tmp_path / "empty") == ".: nothing that is known here -> "
+
+
+def test_no_more_is_told_than_can_be_read(tmp_path):
+    for number in range(300):
+        (tmp_path / f"{number}.vdb").write_bytes(b" BDV\0\0\0\0")
+        (tmp_path / "deep" / str(number)).mkdir(parents=True)
+    assert len(inspect(tmp_path)) == MOST and len(inspect(tmp_path / "deep")) == 1
+
+
+def test_the_command(tmp_path):
+    path = tmp_path / "a volume.npz"
+    np.savez(path, density=np.ones((2, 2, 2), np.float32))
+    run = CliRunner().invoke
+    assert run(app, ["inspect", str(path)]).output.startswith(
+        f"{path}: a volume of smoke, 2x2x2 voxels of 1 -> wlm smoke"
+    )
+    (found,) = json.loads(run(app, ["inspect", str(path), "--json"]).output)
+    assert (
+        found["path"] == str(path) and found["problems"] == [] and found["command"] == f"wlm smoke bake '{path}' -o DIR"
+    )
+    result = run(app, ["inspect", str(tmp_path / "absent")])
+    assert result.exit_code == 2 and "no such file or folder" in result.output
