@@ -286,6 +286,7 @@ def _fly(
         t = border
         if t < end:
             cell = _onward(cell, leave, d)
+    f.glow = glow
     f.random = random
     return f
 
