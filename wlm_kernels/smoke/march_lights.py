@@ -44,7 +44,7 @@ PLANES = ("transparency", "emission", "depth")
 
 _LEAST_SPACING = 0.25  # voxels between nodes
 _MOST_NODES = 2**28
-
+_MOST_MARCHING = 2**24  # of a point light, each of which marches by itself
 _ROUNDING = 1e-6
 
 
@@ -267,10 +267,10 @@ def light_kernels(dtype: Any) -> _Kernels:
     return _Kernels(measure, reach, gather, seen)
 
 
-def _parts(extents: Sequence[float], spacing: float) -> list[int]:
+def _parts(extents: Sequence[float], spacing: float, most: int) -> list[int]:
     """Gaps along each axis, no longer than a spacing, or than makes the nodes too many."""
     spacing = max(spacing, _LEAST_SPACING)
-    while math.prod(parts := [max(math.ceil(e / spacing - _ROUNDING), 1) for e in extents]) > _MOST_NODES:
+    while math.prod(parts := [max(math.ceil(e / spacing - _ROUNDING), 1) for e in extents]) > most:
         spacing *= 1.1
     return parts
 
@@ -289,10 +289,7 @@ def _lattice(shape: Sequence[int], place: Sequence[float], radius: float | None,
     axes = _axes(place) if radius is None else [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)]
     low = [sum(min(-0.5 * a, (n + 0.5) * a) for n, a in zip(shape, axis, strict=True)) for axis in axes]
     extents = [sum((n + 1) * abs(a) for n, a in zip(shape, axis, strict=True)) for axis in axes]
-    parts = _parts(extents, spacing)
-    if radius is not None:
-        # Each node marches by itself: of closer ones the time would grow with the fourth power.
-        parts = _parts(extents, max(spacing, 1.0))
+    parts = _parts(extents, spacing, _MOST_NODES if radius is None else _MOST_MARCHING)
     lattice = Lattice()
     lattice.axes = wp.mat33(*(value for axis in axes for value in axis))
     lattice.low = wp.vec3(*low)
@@ -301,7 +298,9 @@ def _lattice(shape: Sequence[int], place: Sequence[float], radius: float | None,
     return lattice, tuple(n + 1 for n in parts)
 
 
-def light(medium: Medium, view: View, place: Sequence[float], radius: float | None, march: March, out: wp.array) -> None:
+def light(
+    medium: Medium, view: View, place: Sequence[float], radius: float | None, march: March, out: wp.array
+) -> None:
     """Smoke of albedo 1 under a light and under the opposite one, or under a point light.
 
     Args:
@@ -310,7 +309,7 @@ def light(medium: Medium, view: View, place: Sequence[float], radius: float | No
         place: The direction to a light infinitely far off, of length 1, or the position of a point light, in voxels.
         radius: Of a point light, in voxels: at smaller distances its irradiance is as at this one. None: infinitely
             far off.
-        march: As for `march_coarse`; nodes of a point light are a voxel apart at least.
+        march: As for `march_coarse`; nodes of a point light are 2^24 at most.
         out: float [2, H, W], written: light scattered once, of irradiance 4 pi from the place and from the opposite
             one. Of a point light [1, H, W]: its irradiance is 4 pi at a distance of one voxel.
     """

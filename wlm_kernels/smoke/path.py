@@ -290,6 +290,7 @@ def _fly(
     f.random = random
     return f
 
+
 @wp.func
 def _passed(
     density: wp.array3d[Any],

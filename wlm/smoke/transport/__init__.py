@@ -4,8 +4,10 @@ from wlm._facade import facade
 
 _PLACES = {
     "Environment": "wlm.smoke.transport.lights",
+    "LitSmoke": "wlm.smoke.transport.lighting",
     "PointLight": "wlm.smoke.transport.lights",
     "Transport": "wlm.smoke.transport.tracing",
+    "light_smoke": "wlm.smoke.transport.lighting",
     "trace": "wlm.smoke.transport.tracing",
 }
 

@@ -89,6 +89,18 @@ def checked_colour(name: str, colour: Sequence[float]) -> np.ndarray:
     return values
 
 
+def checked_albedo(albedo: Sequence[float]) -> np.ndarray:
+    """Three numbers of 0 to 1, float64 [3].
+
+    Raises:
+        ValueError: They aren't.
+    """
+    colour = checked_colour("albedo", albedo)
+    if not (colour <= 1).all():
+        raise ValueError(f"albedo: expected three numbers of 0 to 1, got {tuple(albedo)}")
+    return colour
+
+
 def in_voxels(light: AnyLight, volume: DensityVolume) -> tuple[np.ndarray, np.ndarray, float | None]:
     """A light in a volume's voxels: direction or position, irradiance over 4 pi, and a point light's radius, or None.
 

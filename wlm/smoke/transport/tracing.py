@@ -15,7 +15,7 @@ from wlm.errors import WlmError
 from wlm.fluid.volume import DensityVolume
 from wlm.interop import device_name, stream, to_warp, torch_memory
 from wlm.smoke.camera import Camera
-from wlm.smoke.transport.lights import AnyLight, Environment, checked_colour, in_voxels
+from wlm.smoke.transport.lights import AnyLight, Environment, checked_albedo, in_voxels
 from wlm.system import Meter, OnProgress
 from wlm_kernels.smoke import path
 from wlm_kernels.smoke.march import Medium
@@ -83,7 +83,7 @@ class Transport:
         Raises:
             ValueError: Not an albedo; or one of 0 was traced.
         """
-        wanted = _albedo(albedo)
+        wanted = checked_albedo(albedo)
         if min(self.albedo) <= 0.0:
             raise ValueError("albedo: expected paths of an albedo above 0")
         ratio = torch.tensor(wanted / np.asarray(self.albedo)).to(self.planes)
@@ -135,10 +135,15 @@ def trace(
     """
     if not -1 < g < 1:
         raise ValueError(f"g: expected a number within -1 and 1, got {g}")
-    for name, value, least in (("samples", samples, 2), ("orders", orders, 0), ("highest", highest, 0), ("seed", seed, 0)):
+    for name, value, least in (
+        ("samples", samples, 2),
+        ("orders", orders, 0),
+        ("highest", highest, 0),
+        ("seed", seed, 0),
+    ):
         if value < least:
             raise ValueError(f"{name}: expected at least {least}, got {value}")
-    colour = _albedo(albedo)
+    colour = checked_albedo(albedo)
     device = device_name(volume.device)
     with stream(device):
         density, temperature = volume.arrays()
@@ -180,13 +185,6 @@ def trace(
     picked = torch.tensor(there, dtype=torch.long, device=volume.device)
     chosen = tuple(names[n] for n in there)
     return Transport(total[picked], chosen, noise[picked], error, tuple(map(float, colour)), camera, samples)
-
-
-def _albedo(albedo: Sequence[float]) -> np.ndarray:
-    colour = checked_colour("albedo", albedo)
-    if not (colour <= 1).all():
-        raise ValueError(f"albedo: expected three numbers of 0 to 1, got {tuple(albedo)}")
-    return colour
 
 
 def _noise(means: torch.Tensor, samples: int) -> tuple[torch.Tensor, float]:
