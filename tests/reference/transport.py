@@ -1,6 +1,7 @@
 """Light scattered twice in a density grid, by quadrature in float64 NumPy; `marching.py` has light scattered once."""
 
 import numpy as np
+
 from reference.marching import Scene, depth_to, phase, span, trilinear
 
 

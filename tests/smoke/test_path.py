@@ -169,7 +169,7 @@ def test_obstacles_block(device: str):
 
 
 def test_hard_smoke(device: str):
-    """Empty, black, thick smoke, and a camera and a light within it, are light and no error; one seed gives one image."""
+    """Empty, black and thick smoke, a camera and a light within it are no error; one seed gives one image."""
     camera = facing(ball(), size=6)
     empty = trace(from_array(np.zeros((4, 4, 4)), device=device), camera, [Light(WAY)], samples=2)
     assert not empty.total.any() and empty.error == 0.0

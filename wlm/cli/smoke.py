@@ -20,6 +20,7 @@ from wlm.cli.console import (
     table,
 )
 from wlm.cli.options import CheckpointEvery, Device, Resume, output_option
+from wlm.cli.smoke_light import register as register_light
 from wlm.cli.smoke_network import register
 from wlm.cli.smoke_options import (
     SHEET,
@@ -333,3 +334,4 @@ def _shots(source: "BakedFiles | FramesToBake", progress: "OnProgress", count: i
 
 
 register(app)
+register_light(app)

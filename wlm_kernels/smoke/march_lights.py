@@ -192,6 +192,7 @@ def light_kernels(dtype: Any) -> _Kernels:
         view: View,
         lattice: Lattice,
         march: MarchParameters,
+        shadow: float,
         # out:
         out: wp.array3d[float],
     ):
@@ -210,7 +211,7 @@ def light_kernels(dtype: Any) -> _Kernels:
                 p = r.origin + (r.first + (float(n) + offset) * r.length) * r.direction
                 x = extinction * _look(density, bricks, p) * r.length
                 if x > 0.0:
-                    depths = _between(nodes, wp.cw_mul(lattice.axes * p - lattice.low, inverse))
+                    depths = shadow * _between(nodes, wp.cw_mul(lattice.axes * p - lattice.low, inverse))
                     share = wp.exp(-tau) * absorbed(x)
                     if lattice.point == 0:
                         light += share * wp.vec2(forth * wp.exp(-depths[0]), back * wp.exp(-depths[1]))
@@ -299,7 +300,7 @@ def _lattice(shape: Sequence[int], place: Sequence[float], radius: float | None,
 
 
 def light(
-    medium: Medium, view: View, place: Sequence[float], radius: float | None, march: March, out: wp.array
+    medium: Medium, view: View, place: Sequence[float], radius: float | None, march: March, shadow: float, out: wp.array
 ) -> None:
     """Smoke of albedo 1 under a light and under the opposite one, or under a point light.
 
@@ -310,6 +311,7 @@ def light(
         radius: Of a point light, in voxels: at smaller distances its irradiance is as at this one. None: infinitely
             far off.
         march: As for `march_coarse`; nodes of a point light are 2^24 at most.
+        shadow: Extinction on the ways to the light over that along the camera's rays; 1 is smoke as it is.
         out: float [2, H, W], written: light scattered once, of irradiance 4 pi from the place and from the opposite
             one. Of a point light [1, H, W]: its irradiance is 4 pi at a distance of one voxel.
     """
@@ -328,7 +330,7 @@ def light(
         wp.launch(_add_up, counts[:2], [gaps], [nodes], device=device)
     else:
         wp.launch(kernels.reach, counts, [density, bricks, extinction, lattice, step], [nodes], device=device)
-    inputs = [density, bricks, nodes, extinction, view, lattice, parameters(march)]
+    inputs = [density, bricks, nodes, extinction, view, lattice, parameters(march), shadow]
     wp.launch(kernels.gather, out.shape[1:], inputs=inputs, outputs=[out], device=device)
 
 

@@ -2,12 +2,12 @@
 
 Free paths are sampled by delta tracking, transmittances by ratio tracking (Novak et al. 2018, "Monte Carlo methods for
 volumetric light transport simulation", sections 5.1 and 5.2), both with a majorant per brick. At each scattering every
-light is tried (next event estimation); the environment is reached by such a try and by the path's own escape, weighed by
-the balance heuristic. Emission is gathered along the free paths: each tentative collision counts for e / majorant.
+light is tried (next event estimation); the environment is reached by such a try and by the path's own escape, weighed
+by the balance heuristic. Emission is gathered along the free paths: each tentative collision counts for e / majorant.
 
-Units and sampling of the density are those of `march`; densities between voxels are exactly those of `density_at`. Light
-of order n has been scattered n times. Random numbers are a pixel's own: the result depends on the seed alone.
-Read first: `transmitted` and `scattered_twice` of `tests/reference/transport.py`, low orders by quadrature.
+Units are those of `march`; densities between voxels are exactly those of `density_at`. Light of order n has been
+scattered n times. Random numbers are a pixel's own: the result depends on the seed alone.
+Read first: `scattered_twice` of `tests/reference/transport.py`, the second order by quadrature.
 """
 
 import functools
@@ -19,13 +19,13 @@ from typing import Any
 import warp as wp
 
 from wlm_kernels.smoke.march import BRICK, Medium, View, clip, density_at, phase, ray, size_of
+from wlm_kernels.smoke.path_ways import Sky, chance_of, following, scatter, stir, texel, toward_sky, uniform
 
 _OPTIONS = {"enable_backward": False}
 _NEVER = wp.constant(1.0e30)
 _GLOW = 1.0 / BRICK  # least majorant where smoke glows: about one place a brick at which its light is gathered
 _SLACK = 1.0001  # of a majorant over rounding of interpolated densities
 _FAINT = wp.constant(0.1)  # what is below this is carried on by fewer paths
-_TWO_PI = wp.constant(2.0 * math.pi)
 _FOUR_PI = wp.constant(4.0 * math.pi)
 
 
@@ -42,20 +42,6 @@ class PathLight:
     colour: wp.vec3
     point: int
     radius: float
-
-
-@wp.struct
-class Sky:
-    """Light from infinitely far off, a map of texels of one radiance each.
-
-    Row 0 is around +y; column 0 begins at +x and columns go on towards +z. `rows` and `columns` are running sums of the
-    chances of a row, and of a column within its row. `total` is the integral of the mean radiance over the sphere.
-    """
-
-    radiance: wp.array2d[wp.vec3]
-    rows: wp.array1d[float]
-    columns: wp.array2d[float]
-    total: float
 
 
 @wp.struct
@@ -86,38 +72,6 @@ class _Passed:
 
     share: float
     random: wp.uint64
-
-
-@wp.struct
-class _Way:
-    """A direction, its chance per solid angle, and the random state after it."""
-
-    direction: wp.vec3
-    chance: float
-    random: wp.uint64
-
-
-@wp.func
-def _stir(x: wp.uint64) -> wp.uint64:
-    x = x ^ (x >> wp.uint64(31))
-    x = x * wp.uint64(6364136223846793005)
-    x = x ^ (x >> wp.uint64(29))
-    x = x * wp.uint64(3935559000370003845)
-    return x ^ (x >> wp.uint64(32))
-
-
-@wp.func
-def _next(random: wp.uint64) -> wp.uint64:
-    return random * wp.uint64(6364136223846793005) + wp.uint64(1442695040888963407)
-
-
-@wp.func
-def _uniform(random: wp.uint64) -> float:
-    """A number of at least 0 and below 1 (PCG-XSH-RR, O'Neill 2014), of 24 bits."""
-    x = wp.uint32(((random >> wp.uint64(18)) ^ random) >> wp.uint64(27))
-    turn = wp.uint32(random >> wp.uint64(59))
-    x = (x >> turn) | (x << ((wp.uint32(32) - turn) & wp.uint32(31)))
-    return float(x >> wp.uint32(8)) * (1.0 / 16777216.0)
 
 
 @wp.func
@@ -161,83 +115,6 @@ def _onward(cell: wp.vec3i, leave: wp.vec3, d: wp.vec3) -> wp.vec3i:
 
 
 @wp.func
-def _scatter(g: float, d: wp.vec3, u: float, v: float) -> wp.vec3:
-    """A direction by the Henyey-Greenstein phase function of a path that goes along d."""
-    cosine = 1.0 - 2.0 * u
-    if wp.abs(g) > 1.0e-3:
-        share = (1.0 - g * g) / (1.0 - g + 2.0 * g * u)
-        cosine = (1.0 + g * g - share * share) / (2.0 * g)
-    cosine = wp.clamp(cosine, -1.0, 1.0)
-    sine = wp.sqrt(wp.max(1.0 - cosine * cosine, 0.0))
-    # Two directions across d without a division by nearly 0 (Duff et al. 2017).
-    sign = wp.where(d[2] >= 0.0, 1.0, -1.0)
-    a = -1.0 / (sign + d[2])
-    b = d[0] * d[1] * a
-    across = wp.vec3(1.0 + sign * d[0] * d[0] * a, sign * b, -sign * d[0])
-    beside = wp.vec3(b, sign + d[1] * d[1] * a, -d[1])
-    angle = _TWO_PI * v
-    return wp.normalize(cosine * d + sine * (wp.cos(angle) * across + wp.sin(angle) * beside))
-
-
-@wp.func
-def _texel(sky: Sky, d: wp.vec3) -> wp.vec3:
-    """The sky's radiance in a direction."""
-    rows = sky.radiance.shape[0]
-    columns = sky.radiance.shape[1]
-    row = int(wp.acos(wp.clamp(d[1], -1.0, 1.0)) / (0.5 * _TWO_PI) * float(rows))
-    turn = wp.atan2(d[2], d[0])
-    if turn < 0.0:
-        turn += _TWO_PI
-    column = int(turn / _TWO_PI * float(columns))
-    return sky.radiance[wp.clamp(row, 0, rows - 1), wp.clamp(column, 0, columns - 1)]
-
-
-@wp.func
-def _chance(sky: Sky, radiance: wp.vec3) -> float:
-    """Chance per solid angle of a direction in a texel."""
-    return (radiance[0] + radiance[1] + radiance[2]) / (3.0 * sky.total)
-
-
-@wp.func
-def _toward_sky(sky: Sky, random: wp.uint64) -> _Way:
-    """A direction by the sky's brightness."""
-    way = _Way()
-    rows = sky.radiance.shape[0]
-    columns = sky.radiance.shape[1]
-    random = _next(random)
-    u = _uniform(random)
-    row = int(0)
-    past = rows - 1
-    while row < past:
-        middle = (row + past) // 2
-        if sky.rows[middle] > u:
-            past = middle
-        else:
-            row = middle + 1
-    random = _next(random)
-    u = _uniform(random)
-    column = int(0)
-    past = columns - 1
-    while column < past:
-        middle = (column + past) // 2
-        if sky.columns[row, middle] > u:
-            past = middle
-        else:
-            column = middle + 1
-    top = wp.cos(0.5 * _TWO_PI * float(row) / float(rows))
-    bottom = wp.cos(0.5 * _TWO_PI * float(row + 1) / float(rows))
-    random = _next(random)
-    height = wp.lerp(top, bottom, _uniform(random))
-    random = _next(random)
-    turn = _TWO_PI * (float(column) + _uniform(random)) / float(columns)
-    across = wp.sqrt(wp.max(1.0 - height * height, 0.0))
-    way.direction = wp.vec3(across * wp.cos(turn), height, across * wp.sin(turn))
-    way.chance = _chance(sky, sky.radiance[row, column])
-    way.random = random
-    return way
-
-
-@wp.func
 def _blocked(mesh: wp.uint64, p: wp.vec3, d: wp.vec3, within: float) -> float:
     """Distance to the first obstacle along a ray, or never."""
     if mesh == wp.uint64(0):
@@ -271,14 +148,14 @@ def _fly(
         most = bounds[cell[0], cell[1], cell[2]]
         if most > 0.0:
             while t < border:
-                random = _next(random)
-                t -= wp.log(1.0 - _uniform(random)) / most
+                random = following(random)
+                t -= wp.log(1.0 - uniform(random)) / most
                 if t < border:
                     at = p + t * d
                     if emission > 0.0:
                         glow += emission * density_at(temperature, at) / most
-                    random = _next(random)
-                    if _uniform(random) * most < extinction * density_at(density, at):
+                    random = following(random)
+                    if uniform(random) * most < extinction * density_at(density, at):
                         f.hit = 1
                         f.t = t
                         end = -1.0
@@ -314,13 +191,13 @@ def _passed(
         most = bounds[cell[0], cell[1], cell[2]]
         if most > 0.0:
             while t < border:
-                random = _next(random)
-                t -= wp.log(1.0 - _uniform(random)) / most
+                random = following(random)
+                t -= wp.log(1.0 - uniform(random)) / most
                 if t < border:
                     share = share * (1.0 - extinction * density_at(density, p + t * d) / most)
                     if share < _FAINT:
-                        random = _next(random)
-                        if _uniform(random) * _FAINT < share:
+                        random = following(random)
+                        if uniform(random) * _FAINT < share:
                             share = _FAINT
                         else:
                             share = 0.0
@@ -400,7 +277,7 @@ def path_kernels(dtype: Any) -> _Kernels:
             samples += 1
         weight = 1.0 / float(settings.samples)
         pixel = wp.uint64(row) * wp.uint64(view.width) + wp.uint64(column)
-        random = _stir(settings.key + _stir(pixel * wp.uint64(1048576) + wp.uint64(first + part)))
+        random = stir(settings.key + stir(pixel * wp.uint64(1048576) + wp.uint64(first + part)))
         start = ray(view, row, column)
         for _sample in range(samples):
             p = start.origin
@@ -424,10 +301,10 @@ def path_kernels(dtype: Any) -> _Kernels:
                     out[at, row, column] = out[at, row, column] + flight.glow * through
                 if flight.hit == 0:
                     if sky.total > 0.0 and limit >= 0.5 * _NEVER:
-                        light = _texel(sky, d)
+                        light = texel(sky, d)
                         share = float(1.0)
                         if chance > 0.0:
-                            share = chance / (chance + _chance(sky, light))
+                            share = chance / (chance + chance_of(sky, light))
                         at = (part * sources + count) * planes + plane
                         out[at, row, column] = out[at, row, column] + share * wp.cw_mul(through, light)
                     alive = 0
@@ -437,8 +314,8 @@ def path_kernels(dtype: Any) -> _Kernels:
                     through = wp.cw_mul(through, settings.albedo)
                     most = wp.max(through[0], wp.max(through[1], through[2])) / weight
                     if most < _FAINT:
-                        random = _next(random)
-                        if _uniform(random) * _FAINT < most:
+                        random = following(random)
+                        if uniform(random) * _FAINT < most:
                             through = through * (_FAINT / most)
                         else:
                             alive = 0
@@ -464,7 +341,7 @@ def path_kernels(dtype: Any) -> _Kernels:
                             light = strength * wp.cw_mul(through, lights[n].colour)
                             out[at, row, column] = out[at, row, column] + light
                     if sky.total > 0.0:
-                        far = _toward_sky(sky, random)
+                        far = toward_sky(sky, random)
                         random = far.random
                         if _blocked(mesh, p, far.direction, _NEVER) >= _NEVER:
                             got = _passed(density, bounds, extinction, p, far.direction, _NEVER, random)
@@ -472,13 +349,13 @@ def path_kernels(dtype: Any) -> _Kernels:
                             own = phase(settings.g, wp.dot(d, far.direction)) / _FOUR_PI
                             strength = got.share * own / (own + far.chance)
                             at = (part * sources + count) * planes + plane
-                            light = strength * wp.cw_mul(through, _texel(sky, far.direction))
+                            light = strength * wp.cw_mul(through, texel(sky, far.direction))
                             out[at, row, column] = out[at, row, column] + light
-                    random = _next(random)
-                    u = _uniform(random)
-                    random = _next(random)
+                    random = following(random)
+                    u = uniform(random)
+                    random = following(random)
                     before = d
-                    d = _scatter(settings.g, d, u, _uniform(random))
+                    d = scatter(settings.g, d, u, uniform(random))
                     chance = phase(settings.g, wp.dot(before, d)) / _FOUR_PI
 
     return _Kernels(majorants, trace)
@@ -501,7 +378,7 @@ def make_lights(lights: Sequence[tuple[Sequence[float], Sequence[float], float |
 
 
 def bounds(medium: Medium) -> wp.array:
-    """The greatest extinction per voxel that a sample in each brick can find, float [X / 8, Y / 8, Z / 8], rounded up."""
+    """The greatest extinction per voxel that a sample in each brick can find, [X / 8, Y / 8, Z / 8], rounded up."""
     density, (temperature, emission) = medium.density, medium.glow
     out = medium.buffer(tuple(-(-n // BRICK) for n in density.shape), float)
     inputs = [density, temperature, medium.extinction, emission, _GLOW, _SLACK]

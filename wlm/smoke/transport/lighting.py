@@ -1,8 +1,8 @@
 """Smoke under its actual lights: one march to each light's own direction or point, instead of six ways weighed.
 
 Six lightmaps, weighed, are 30% off for lights between their axes. The march that they are made by, with its lattice
-turned towards a light, costs as much for this light and the opposite one as for two of the six, and has the error of its
-step alone. `wlm.smoke.transport.filtering` makes light of all orders from such planes.
+turned towards a light, costs as much for this light and the opposite one as for two of the six, and has the error of
+its step alone. `wlm.smoke.transport.filtering` makes light of all orders from such planes.
 """
 
 import math
@@ -109,7 +109,12 @@ def fine_march(volume: DensityVolume, g: float = 0.0) -> March:
 
 
 def light_smoke(
-    volume: DensityVolume, camera: Camera, lights: Sequence[AnyLight], march: March | None = None
+    volume: DensityVolume,
+    camera: Camera,
+    lights: Sequence[AnyLight],
+    march: March | None = None,
+    *,
+    shadow: float = 1.0,
 ) -> LitSmoke:
     """Marches through smoke to each of its lights.
 
@@ -118,6 +123,8 @@ def light_smoke(
         camera: Any, outside the smoke or inside.
         lights: Any number.
         march: Its steps, the distance between the lattice's nodes, its phase function. None: `fine_march`.
+        shadow: Extinction on the ways to the lights over that along the camera's rays; 1 is smoke as it is, less an
+            octave of light that was scattered more often.
 
     Returns:
         The light on the smoke's device.
@@ -131,9 +138,9 @@ def light_smoke(
     for n, light in enumerate(lights):
         place, _, radius = in_voxels(light, volume)
         if radius is None:
-            planes[n], opposite[n] = run(march_lights.light, volume, camera, (2,), place, None, march)
+            planes[n], opposite[n] = run(march_lights.light, volume, camera, (2,), place, None, march, shadow)
         else:
-            one = run(march_lights.light, volume, camera, (1,), place, radius, march)[0]
+            one = run(march_lights.light, volume, camera, (1,), place, radius, march, shadow)[0]
             planes[n] = one / volume.voxel**2
     transparency, emission, depth = run(march_lights.seen, volume, camera, (len(march_lights.PLANES),), march)
     hot = emission if volume.temperature is not None else None

@@ -11,7 +11,7 @@ from wlm.smoke.learn.synthetic import make_plume
 from wlm.smoke.shading import Light
 from wlm.smoke.transport.tracing import trace
 
-ALBEDOS = (0.8, 0.9, 0.95, 1.0)
+ALBEDOS = (0.5, 0.8, 0.9, 0.95, 1.0)
 """Albedos that light is known at; between them it is a smooth function of the albedo."""
 
 _ORDERS = 40
@@ -67,10 +67,14 @@ def make_sample(
         samples: Paths a pixel.
         device: "cpu" or "cuda:N".
     """
-    volume, camera, lamps = draw_view(seed, number, pixels=pixels, lights=lights)
+    return traced(draw_view(seed, number, pixels=pixels, lights=lights), samples=samples, seed=number, device=device)
+
+
+def traced(view: tuple[DensityVolume, Camera, tuple], *, samples: int, seed: int, device: str = "cpu") -> Sample:
+    """A view of `draw_view` with its light; arguments as for `make_sample`."""
+    volume, camera, lamps = view
     volume = replace(volume, density=volume.density.to(device))
-    traced = trace(volume, camera, lamps, samples=samples, orders=_ORDERS, seed=number)
-    grey = traced.planes[..., 0]
+    grey = trace(volume, camera, lamps, samples=samples, orders=_ORDERS, seed=seed).planes[..., 0]
     powers = torch.tensor(ALBEDOS, device=grey.device)[:, None] ** torch.arange(_ORDERS + 2, device=grey.device)
     light = torch.einsum("ak,lkhw->lahw", powers, grey)
     return Sample(volume, camera, lamps, light)
