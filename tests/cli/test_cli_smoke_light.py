@@ -36,18 +36,18 @@ def camera_of(volume) -> Camera:
 
 def test_light_and_trace_show_the_same(volume, tmp_path):
     """All orders are brighter than one, and near what is traced; an albedo of 0 is black where no fire is."""
-    lamp = ("--light", "1,0.5,0.6:9", "--emission", 0)
+    lamp = ("--light", "1,0.5,0.6:9", "--extinction", 8, "--emission", 0)
     for name, words in (
         ("all", ("light", "--albedo", "0.95")),
         ("single", ("light", "--orders", "single", "--albedo", "0.95")),
-        ("black", ("light", "--albedo", "0", *lamp[2:])),
-        ("traced", ("trace", "--albedo", "0.95", "--samples", 1024)),
+        ("black", ("light", "--albedo", "0", *lamp[4:])),
+        ("traced", ("trace", "--albedo", "0.95", "--samples", 512)),
     ):
         call("smoke", words[0], volume, "-o", tmp_path / f"{name}.png", *SMALL, *words[1:], *lamp)
     seen = {name: png(tmp_path / f"{name}.png").astype(float) for name in ("all", "single", "black", "traced")}
     assert not seen["black"].any()
     off = {name: np.abs(seen[name] - seen["traced"]).mean() for name in ("all", "single")}
-    assert off["all"] < 0.4 * off["single"] and seen["all"].mean() > 1.1 * seen["single"].mean()
+    assert off["all"] < 0.5 * off["single"] and seen["all"].mean() > 1.1 * seen["single"].mean()
 
 
 def test_trace_writes_orders_and_noise(volume, tmp_path):

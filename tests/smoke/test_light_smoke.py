@@ -17,7 +17,7 @@ from wlm.smoke.transport.lights import PointLight
 from wlm.smoke.transport.tracing import trace
 from wlm_kernels.smoke.settings import March
 
-WAYS = [(1.0, 0.7, 0.8), (-0.3, -0.9, 0.5), (0.6, 0.2, -1.0), (0.0, 1.0, 0.0), (0.0, 0.0, -1.0)]
+WAYS = [(1.0, 0.7, 0.8), (-0.3, -0.9, 0.5), (0.0, 0.0, -1.0)]
 
 
 def rms(a: torch.Tensor, b: torch.Tensor) -> float:
@@ -29,8 +29,8 @@ def rms(a: torch.Tensor, b: torch.Tensor) -> float:
 @pytest.mark.parametrize("perspective", [False, True])
 def test_each_light_has_its_own_march(device: str, g: float, perspective: bool):
     """Lights from anywhere within 0.5% of a march from each sample, and the opposite ones as well."""
-    volume = make_plume(40, hot=False, extinction=14.0, device=device)
-    camera = Camera.around(volume, toward=(0.4, 0.2, 1.0), pixels=20, perspective=perspective)
+    volume = make_plume(28, hot=False, extinction=10.0, device=device)
+    camera = Camera.around(volume, toward=(0.4, 0.2, 1.0), pixels=16, perspective=perspective)
     made = light_smoke(volume, camera, [Light(way) for way in WAYS], fine_march(volume, g))
     for n, way in enumerate(WAYS):
         for plane, sign in ((made.planes[n], 1.0), (made.opposite[n], -1.0)):
@@ -41,10 +41,10 @@ def test_each_light_has_its_own_march(device: str, g: float, perspective: bool):
 
 @pytest.mark.parametrize("inside", [False, True])
 def test_point_lights_against_the_tracer(device: str, inside: bool):
-    volume = make_plume(24, hot=False, extinction=14.0, device=device)
+    volume = make_plume(20, hot=False, extinction=8.0, device=device)
     camera = facing(volume, size=10)
     lamp = PointLight((0.55, 0.6, 0.5) if inside else (1.4, 1.2, 1.1), (3.0, 2.0, 0.0), radius=0.15)
-    made = light_smoke(volume, camera, [lamp], March(step=0.25, jitter=0.0, g=0.3)).shade(albedo=(1.0, 0.5, 1.0))
+    made = light_smoke(volume, camera, [lamp], March(step=0.35, jitter=0.0, g=0.3)).shade(albedo=(1.0, 0.5, 1.0))
     traced = trace(volume, camera, [lamp], albedo=(1.0, 0.5, 1.0), g=0.3, samples=8192, highest=1)
     assert abs(float(made.mean() / traced.total.mean()) - 1) < 0.01
     assert rms(made, traced.total) < 0.04
@@ -53,8 +53,8 @@ def test_point_lights_against_the_tracer(device: str, inside: bool):
 
 def test_the_whole_picture_is_the_tracers(device: str):
     """Two lights in colour, albedo in colour, emission and background: as the first order that is traced."""
-    volume = make_plume(32, hot=True, extinction=10.0, device=device)
-    camera = facing(volume, (0.2, 0.1, 1.0), size=16)
+    volume = make_plume(28, hot=True, extinction=8.0, device=device)
+    camera = facing(volume, (0.2, 0.1, 1.0), size=12)
     lights = [Light((1.0, 0.7, 0.8), (6.0, 3.0, 1.0)), Light((-1.0, 0.1, 0.2), (0.0, 4.0, 8.0))]
     made = light_smoke(volume, camera, lights).shade(albedo=(0.9, 0.6, 0.3), background=(0.2, 0.2, 0.5))
     traced = trace(volume, camera, lights, albedo=(0.9, 0.6, 0.3), samples=4096, highest=1)
@@ -71,7 +71,9 @@ def test_six_ways_are_far_off_and_this_is_not(device: str):
     camera = facing(volume, size=20)
     light = Light((1.0, 0.7, 0.8))
     expected = lit(volume, camera, light.toward, step=0.25)[..., None].expand(-1, -1, 3)
-    six = bake(volume, camera, step=0.5, estimate=False).shade([light])
+    maps = bake(volume, camera, step=0.5, estimate=False)
+    six = maps.shade([light])
+    assert torch.allclose(maps.shade([light], albedo=(0.5, 0.0, 1.0)), six * torch.tensor([0.5, 0.0, 1.0]).to(six))
     coarse = light_smoke(volume, camera, [light], March(step=1.0, seed=1)).shade()
     assert rms(six, expected) > 0.15 > 0.08 > rms(coarse, expected)
 

@@ -183,6 +183,11 @@ def test_hard_smoke(device: str):
     again, other = (trace(ball(device=device), within, [Light(WAY)], samples=40, seed=seed) for seed in (5, 6))
     first = trace(ball(device=device), within, [Light(WAY)], samples=40, seed=5)
     assert torch.equal(first.planes, again.planes) and not torch.equal(first.planes, other.planes)
+
+
+@pytest.mark.slow
+def test_half_floats_are_traced_as_floats(device: str):
+    camera = facing(ball(), size=6)
     half = ball(device=device)
     half = DensityVolume(half.density.half(), half.extinction, half.voxel)
     whole = DensityVolume(half.density.float(), half.extinction, half.voxel)
