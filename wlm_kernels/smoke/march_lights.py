@@ -104,18 +104,18 @@ def _add_up(
     # out:
     nodes: wp.array3d[wp.vec2],
 ):
-    """Depths from each node to either end of its line, which runs along the last axis; the light is at its end."""
-    i, j = wp.tid()
-    last = nodes.shape[2] - 1
+    """Depths from each node to either end of its line, which runs along the first axis; the light is at its end."""
+    j, k = wp.tid()
+    last = nodes.shape[0] - 1
     ahead = float(0.0)
     behind = float(0.0)
-    nodes[i, j, last][0] = 0.0
-    nodes[i, j, 0][1] = 0.0
+    nodes[last, j, k][0] = 0.0
+    nodes[0, j, k][1] = 0.0
     for n in range(last):
-        behind += gaps[i, j, n]
-        ahead += gaps[i, j, last - 1 - n]
-        nodes[i, j, n + 1][1] = behind
-        nodes[i, j, last - 1 - n][0] = ahead
+        behind += gaps[n, j, k]
+        ahead += gaps[last - 1 - n, j, k]
+        nodes[n + 1, j, k][1] = behind
+        nodes[last - 1 - n, j, k][0] = ahead
 
 
 @dataclass(frozen=True)
@@ -146,10 +146,10 @@ def light_kernels(dtype: Any) -> _Kernels:
         """Optical depth of the gap from a node to the next one of its line."""
         i, j, k = wp.tid()
         tau = float(0.0)
-        if k < gaps.shape[2] - 1:
+        if i < gaps.shape[0] - 1:
             p = _node(lattice, i, j, k)
-            along = wp.vec3(lattice.axes[2, 0], lattice.axes[2, 1], lattice.axes[2, 2])
-            d = lattice.gap[2] / float(parts)
+            along = wp.vec3(lattice.axes[0, 0], lattice.axes[0, 1], lattice.axes[0, 2])
+            d = lattice.gap[0] / float(parts)
             for n in range(parts):
                 tau += d * _look(density, bricks, p + (float(n) + 0.5) * d * along)
         gaps[i, j, k] = extinction * tau
@@ -202,7 +202,7 @@ def light_kernels(dtype: Any) -> _Kernels:
         tau = float(0.0)
         if r.count > 0:
             offset = 0.5 + march.jitter * (noise(row, column, march.seed) - 0.5)
-            along = wp.vec3(lattice.axes[2, 0], lattice.axes[2, 1], lattice.axes[2, 2])
+            along = wp.vec3(lattice.axes[0, 0], lattice.axes[0, 1], lattice.axes[0, 2])
             cosine = wp.dot(along, r.direction)
             forth = phase(march.g, cosine)
             back = phase(march.g, -cosine)
@@ -277,12 +277,12 @@ def _parts(extents: Sequence[float], spacing: float, most: int) -> list[int]:
 
 
 def _axes(toward: Sequence[float]) -> list[tuple[float, float, float]]:
-    """Two directions across a light's, and it itself last."""
+    """A light's direction, and two across it."""
     x, y, z = toward
     sign = 1.0 if z >= 0.0 else -1.0
     a = -1.0 / (sign + z)
     b = x * y * a
-    return [(1.0 + sign * x * x * a, sign * b, -sign * x), (b, sign + y * y * a, -y), (x, y, z)]
+    return [(x, y, z), (1.0 + sign * x * x * a, sign * b, -sign * x), (b, sign + y * y * a, -y)]
 
 
 def _lattice(shape: Sequence[int], place: Sequence[float], radius: float | None, spacing: float) -> tuple[Lattice, Any]:
@@ -325,9 +325,9 @@ def light(
     nodes = medium.buffer(counts, wp.vec2)
     if radius is None:
         gaps = medium.buffer(counts, float)
-        parts = max(math.ceil(lattice.gap[2] / step - _ROUNDING), 1)
+        parts = max(math.ceil(lattice.gap[0] / step - _ROUNDING), 1)
         wp.launch(kernels.measure, counts, [density, bricks, extinction, lattice, parts], [gaps], device=device)
-        wp.launch(_add_up, counts[:2], [gaps], [nodes], device=device)
+        wp.launch(_add_up, counts[1:], [gaps], [nodes], device=device)
     else:
         wp.launch(kernels.reach, counts, [density, bricks, extinction, lattice, step], [nodes], device=device)
     inputs = [density, bricks, nodes, extinction, view, lattice, parameters(march), shadow]
