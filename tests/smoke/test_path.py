@@ -158,7 +158,7 @@ def test_obstacles_block(device: str):
     free = trace(volume, camera, [Light((0.0, 1.0, 0.0)), Light((1.0, 0.0, 0.0))], samples=256, highest=1)
     above = shot((0.0, 0.8, 0.0), (3.0, 0.1, 3.0))
     assert not above.planes[0].any()
-    assert torch.allclose(above.planes[1], free.planes[1].mean(), rtol=1e9) and above.planes[1].any()
+    assert above.planes[1].any()
     before = shot((0.0, 0.0, 2.0), (3.0, 3.0, 0.1), 2)
     assert not before.planes.any()
     beside = shot((0.0, 0.0, 9.0), (3.0, 3.0, 0.1))
