@@ -17,9 +17,10 @@ from wlm.lightmap import fit as lightmap_fit
 from wlm.probe import fit as probe_fit
 from wlm.probe.transform import TransformModel
 from wlm.smoke.learn.pool import load_pool
+from wlm.smoke.transport.filtering import load_orders
 from wlm.system import Meter
 
-from .containers import vary_artifact
+from .containers import vary_artifact, vary_npz
 from .reader import Reader, check_digest, check_finite, corpus, stored
 
 
@@ -78,6 +79,17 @@ def _network(path: Path) -> None:
     if model.settings.guide == "paper":
         planes = model.decoder(height=16, width=16)(guide)
         assert planes.shape == (8, 16, 16), f"decodes to {tuple(planes.shape)}"
+
+
+@functools.cache
+def _shipped_orders() -> Sequence[bytes]:
+    return ((Path(wlm.__file__).parent / "data" / "smoke-orders.npz").read_bytes(),)
+
+
+def _orders(path: Path) -> None:
+    model = load_orders(path)
+    check_finite(**model.arrays)
+    assert (model.arrays["spread"] > 0).all(), "accepted a spread of 0"
 
 
 def _pool(path: Path) -> None:
@@ -283,6 +295,7 @@ READERS = (
         _atlas,
     ),
     Reader("smoke-network", "a.wlm", stored("smoke.wlm"), vary_artifact, _network),
+    Reader("smoke-orders", "a.npz", _shipped_orders, vary_npz, _orders),
     Reader("smoke-pool", "pool.safetensors", corpus("pool.safetensors"), vary_artifact, _pool),
     Reader("lightmap-checkpoint", "a.partial", _lightmap_states, vary_artifact, _lightmap_checkpoint, cost=8),
     Reader("probe-checkpoint", "a.partial", _probe_states, vary_artifact, _probe_checkpoint, cost=4),

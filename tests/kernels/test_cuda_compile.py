@@ -19,7 +19,7 @@ from wlm_kernels.probe import gaussian_sum, optimiser
 from wlm_kernels.probe import network as probe_network
 from wlm_kernels.probe import step as probe_step
 from wlm_kernels.smoke import march as smoke_march
-from wlm_kernels.smoke import march_coarse, march_guide, march_motion, march_six
+from wlm_kernels.smoke import march_coarse, march_guide, march_lights, march_motion, march_six, path
 
 ARCHITECTURE = 90
 MODULES = (
@@ -159,6 +159,13 @@ def test_marching(dtype: type, tmp_path: Path):
 def test_coarse_marching(dtype: type, hot: bool, tmp_path: Path):
     """The march of all six lights in large steps, with emission and without."""
     _compile_all(march_coarse.coarse_kernels(dtype, hot), tmp_path)
+
+
+@pytest.mark.parametrize("dtype", _slow_but(wp.float16, [wp.float32]))
+def test_lights_and_paths(dtype: type, tmp_path: Path):
+    """The march to lights, and the path tracer."""
+    _compile_all(vars(march_lights.light_kernels(dtype)).values(), tmp_path / "lights")
+    _compile_all(vars(path.path_kernels(dtype)).values(), tmp_path / "path")
 
 
 LATTICE_STEPS = (

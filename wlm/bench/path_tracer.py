@@ -1,4 +1,4 @@
-"""Six-way lightmaps by Mitsuba's volumetric path tracer at one bounce, and Open Image Denoise: the extra `bake`.
+"""Six-way lightmaps by Mitsuba's volumetric path tracer, of one bounce or more, and Open Image Denoise: extra `bake`.
 
 An independent estimate of the same integral: with many samples it checks the march, with few it shows the quality that
 a path tracer has in the time of a frame. Mitsuba traces on the CPU, or on a GPU whose driver has OptiX, which drivers
@@ -105,13 +105,25 @@ class PathTracer:
         variant: Mitsuba's.
     """
 
-    def __init__(self, volume: DensityVolume, camera: Camera, *, variant: str | None = None) -> None:
+    def __init__(
+        self,
+        volume: DensityVolume,
+        camera: Camera,
+        *,
+        variant: str | None = None,
+        albedo: float = 1.0,
+        g: float = 0.0,
+        order: int = 1,
+    ) -> None:
         """Loads smoke and camera into Mitsuba.
 
         Args:
             volume: The smoke, on any device.
             camera: Orthographic.
             variant: As `choose_variant` gives it; None: the fastest on the CPU.
+            albedo: The share of light that a scattering leaves.
+            g: Mean cosine of the Henyey-Greenstein phase function.
+            order: Scatterings after which a path ends.
 
         Raises:
             ValueError: The camera is in perspective.
@@ -125,8 +137,8 @@ class PathTracer:
 
         self.variant = variant or choose_variant()[0]
         mitsuba.set_variant(self.variant)
-        self._mitsuba, self._camera = mitsuba, camera
-        self._smoke = self._load_smoke(volume)
+        self._mitsuba, self._camera, self._order = mitsuba, camera, order
+        self._smoke = self._load_smoke(volume, albedo, g)
         self._sensor = self._load_sensor(volume)
 
     def __call__(self, samples: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -150,12 +162,12 @@ class PathTracer:
             "direction": [float(-w) for w in self._camera.axes.T @ direction],
             "irradiance": {"type": "rgb", "value": 4 * math.pi},
         }
-        integrator = {"type": "volpath", "max_depth": 2, "rr_depth": _NEVER, "hide_emitters": True}
+        integrator = {"type": "volpath", "max_depth": self._order + 1, "rr_depth": _NEVER, "hide_emitters": True}
         parts = {"integrator": integrator, "sensor": self._sensor, "light": light, "smoke": self._smoke}
         scene = self._mitsuba.load_dict({"type": "scene", **parts})
         return np.array(self._mitsuba.render(scene, spp=samples, seed=seed))
 
-    def _load_smoke(self, volume: DensityVolume) -> Any:
+    def _load_smoke(self, volume: DensityVolume, albedo: float, g: float) -> Any:
         """The smoke, in voxels; a border of empty voxels makes Mitsuba's clamped grid end as ours does."""
         transform = self._mitsuba.ScalarTransform4f
         size = np.array(volume.shape, np.float64)
@@ -164,10 +176,10 @@ class PathTracer:
         values = self._mitsuba.VolumeGrid(np.ascontiguousarray(grid))
         medium = {
             "type": "heterogeneous",
-            "albedo": 1.0,
+            "albedo": albedo,
             "scale": volume.extinction * volume.voxel,
             "sigma_t": {"type": "gridvolume", "grid": values, "to_world": box},
-            "phase": {"type": "isotropic"},
+            "phase": {"type": "hg", "g": g} if g else {"type": "isotropic"},
         }
         centre = [float(c) for c in size / 2]
         return self._mitsuba.load_dict(

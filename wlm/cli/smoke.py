@@ -20,6 +20,7 @@ from wlm.cli.console import (
     table,
 )
 from wlm.cli.options import CheckpointEvery, Device, Resume, output_option
+from wlm.cli.smoke_light import register as register_light
 from wlm.cli.smoke_network import register
 from wlm.cli.smoke_options import (
     SHEET,
@@ -391,3 +392,4 @@ def _shots(
 
 
 register(app)
+register_light(app)

@@ -14,6 +14,7 @@ import torch
 
 from wlm.smoke.camera import DIRECTIONS, Camera, weights
 from wlm.smoke.shading import Light, Ramp
+from wlm.smoke.transport.lights import checked_albedo
 
 
 @dataclass(frozen=True)
@@ -77,6 +78,7 @@ class SixWay:
         background: torch.Tensor | Sequence[float] | None = None,
         rule: str = "squared",
         ramp: Ramp | None = None,
+        albedo: Sequence[float] = (1.0, 1.0, 1.0),
     ) -> torch.Tensor:
         """Lights the smoke: a light of irradiance E counts for E / (4 pi) of each lightmap's weight (eq. 4 and 5).
 
@@ -86,17 +88,19 @@ class SixWay:
                 added to what is behind times the transparency.
             rule: How a light's direction weighs the lightmaps, one of `wlm.smoke.camera.RULES`.
             ramp: Colour of the emission; None: grey, as it is.
+            albedo: R, G, B, the share of light that a scattering leaves, 0 to 1.
 
         Returns:
             float32 [H, W, 3], linear.
 
         Raises:
             ValueError: The camera is needed and not known, or the transparency for a background; a light has no
-                direction, a negative irradiance or a visibility of another shape.
+                direction, a negative irradiance or a visibility of another shape; not an albedo.
         """
         if self.camera is None and lights:
             raise ValueError("camera: expected that of the lightmaps, found none; give it by dataclasses.replace")
         height, width = self.lightmaps.shape[1:]
+        scattered = checked_albedo(albedo) / (4 * math.pi)
         image = torch.zeros((height, width, 3), dtype=torch.float32, device=self.lightmaps.device)
         for light in lights:
             irradiance = np.asarray(light.irradiance, np.float64)
@@ -108,7 +112,7 @@ class SixWay:
                 if light.visibility.shape != grey.shape:
                     raise ValueError(f"visibility: expected {tuple(grey.shape)}, got {tuple(light.visibility.shape)}")
                 grey = grey * light.visibility
-            image += grey[..., None] * torch.tensor(irradiance / (4 * math.pi)).to(image)
+            image += grey[..., None] * torch.tensor(irradiance * scattered).to(image)
         if self.emission is not None:
             image += self.emission[..., None] if ramp is None else ramp(self.emission)
         if background is None:

@@ -68,7 +68,7 @@ def _sample(density: wp.array3d[Any], bricks: wp.array3d[wp.uint8], p: wp.vec3) 
 
 
 @wp.func
-def _noise(row: int, column: int, seed: int) -> float:
+def noise(row: int, column: int, seed: int) -> float:
     """Interleaved gradient noise, at least 0 and below 1."""
     pattern = float(seed & (_PATTERNS - 1))
     x = float(column) + 5.588238 * pattern
@@ -180,7 +180,7 @@ def coarse_kernels(dtype: Any, hot: bool):
         depth = float(0.0)
         if r.count > 0:
             dt = r.length
-            offset = 0.5 + march.jitter * (_noise(row, column, march.seed) - 0.5)
+            offset = 0.5 + march.jitter * (noise(row, column, march.seed) - 0.5)
             # The ray's place in the lattice, which all of its samples share.
             x = (wp.dot(r.origin - view.origin, view.right) - lattice.low[0]) / lattice.gap[0]
             y = (wp.dot(r.origin - view.origin, view.up) - lattice.low[1]) / lattice.gap[1]

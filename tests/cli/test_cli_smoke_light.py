@@ -1,0 +1,111 @@
+"""Smoke under its own lights, and path traced, from the command line."""
+
+import numpy as np
+import pytest
+from builders.running import call, fails
+from builders.smoke_plumes import SPHERE, plume, write_frames
+from PIL import Image
+
+from wlm.fluid.volume import load_volume, save_volume
+from wlm.formats.exr_planes import read_planes
+from wlm.smoke.camera import Camera
+from wlm.smoke.scene import CameraSettings, make_camera
+from wlm.smoke.shading import Light
+from wlm.smoke.transport.lights import PointLight
+from wlm.smoke.transport.tracing import trace
+
+SMALL = ("--resolution", 16)
+
+
+@pytest.fixture(scope="session")
+def volume(tmp_path_factory):
+    path = tmp_path_factory.mktemp("lit") / "plume.npz"
+    save_volume(path, plume(hot=True))
+    return path
+
+
+def png(path):
+    with Image.open(path) as image:
+        return np.asarray(image)
+
+
+def camera_of(volume) -> Camera:
+    size = volume.voxel * np.array(volume.shape)
+    return make_camera(CameraSettings(resolution=16), volume.origin, size)
+
+
+def test_light_and_trace_show_the_same(volume, tmp_path):
+    """All orders are brighter than one, and near what is traced; an albedo of 0 is black where no fire is."""
+    lamp = ("--light", "1,0.5,0.6:9", "--extinction", 8, "--emission", 0)
+    for name, words in (
+        ("all", ("light", "--albedo", "0.95")),
+        ("single", ("light", "--orders", "single", "--albedo", "0.95")),
+        ("black", ("light", "--albedo", "0", *lamp[4:])),
+        ("traced", ("trace", "--albedo", "0.95", "--samples", 512)),
+    ):
+        call("smoke", words[0], volume, "-o", tmp_path / f"{name}.png", *SMALL, *words[1:], *lamp)
+    seen = {name: png(tmp_path / f"{name}.png").astype(float) for name in ("all", "single", "black", "traced")}
+    assert not seen["black"].any()
+    off = {name: np.abs(seen[name] - seen["traced"]).mean() for name in ("all", "single")}
+    assert off["all"] < 0.5 * off["single"] and seen["all"].mean() > 1.1 * seen["single"].mean()
+
+
+def test_trace_writes_orders_and_noise(volume, tmp_path):
+    path = tmp_path / "a.exr"
+    words = (
+        "--light",
+        "1,1,0:3,2,1",
+        "--point",
+        "0.3,0.5,0.6:1",
+        "--samples",
+        8,
+        "--orders",
+        2,
+        "--albedo",
+        "1,0.5,0.2",
+    )
+    out = call("smoke", "trace", volume, "-o", path, *SMALL, *words, "--seed", 4)
+    smoke = load_volume(volume)
+    lights = [Light((1, 1, 0), (3, 2, 1)), PointLight((0.3, 0.5, 0.6))]
+    wanted = trace(smoke, camera_of(smoke), lights, albedo=(1.0, 0.5, 0.2), samples=8, orders=2, seed=4)
+    planes, note = read_planes(path)
+    names = {f"{letter}{suffix}" for letter in "RGB" for suffix in ("", ".0", ".1", ".2", ".noise")}
+    assert set(planes) == names and note["samples"] == 8 and note["sources"] == ["light 1", "light 2", "emission"]
+    np.testing.assert_allclose(planes["G"], wanted.total[..., 1].numpy(), rtol=1e-5)
+    np.testing.assert_allclose(planes["B.2"], wanted.planes.sum(0)[2, ..., 2].numpy(), rtol=1e-5)
+    assert f"{wanted.error:.2%}" in out
+
+
+def test_frames_keep_their_obstacles_and_lights(tmp_path):
+    folder = write_frames(tmp_path / "a", obstacles=[SPHERE], frames=2).path
+    call("smoke", "light", folder, "-o", tmp_path / "lit", "--resolution", 24)
+    call("smoke", "trace", folder, "-o", tmp_path / "traced", "--resolution", 24, "--samples", 4, "--sky", "1,1,1")
+    for name, stem in (("lit", "light"), ("traced", "trace")):
+        pictures = [png(tmp_path / name / f"{stem}_000{n}.png") for n in (1, 2)]
+        assert not np.array_equal(*pictures)
+    # Before an even sky the sphere is black, and the corner isn't.
+    assert (
+        not png(tmp_path / "traced" / "trace_0002.png").all()
+        and png(tmp_path / "traced" / "trace_0002.png")[0, 0].all()
+    )
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("light", "--orders", "two"), "--orders"),
+        (("light", "--orders", "single", "--model", "a.npz"), "--model"),
+        (("light", "--model", "absent.npz"), "absent.npz"),
+        (("light", "--albedo", "1.5"), "--albedo"),
+        (("light", "--light", "0,0,0"), "--light"),
+        (("light", "--point", "0,0,0:-1"), "--point"),
+        (("trace", "--light", "1,0,0:1,1"), "--light"),
+        (("trace", "--sky", "1,-1,1"), "--sky"),
+        (("trace", "--white", "0"), "--white"),
+        (("trace", "--extinction", "1e9"), "optical depth"),
+    ],
+)
+def test_wrong_options_are_one_line(volume, tmp_path, words, message):
+    output = tmp_path / "out.png"
+    assert message in fails("smoke", words[0], volume, "-o", output, *SMALL, *words[1:])
+    assert not output.exists()

@@ -1,0 +1,99 @@
+"""The march to a scene's own lights: against the march that shares nothing, the path tracer, and six ways."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from builders.smoke_plumes import facing
+
+from wlm.fluid.volume import from_array
+from wlm.smoke.baking import bake, lit
+from wlm.smoke.camera import Camera
+from wlm.smoke.learn.synthetic import make_plume
+from wlm.smoke.shading import Light
+from wlm.smoke.transport.lighting import fine_march, light_smoke
+from wlm.smoke.transport.lights import PointLight
+from wlm.smoke.transport.tracing import trace
+from wlm_kernels.smoke.settings import March
+
+WAYS = [(1.0, 0.7, 0.8), (-0.3, -0.9, 0.5), (0.0, 0.0, -1.0)]
+
+
+def rms(a: torch.Tensor, b: torch.Tensor) -> float:
+    """Root of the mean square of the difference over that of `b`."""
+    return float(((a - b).double().square().mean() / b.double().square().mean()).sqrt())
+
+
+@pytest.mark.parametrize("g", [0.0, 0.6])
+@pytest.mark.parametrize("perspective", [False, True])
+def test_each_light_has_its_own_march(device: str, g: float, perspective: bool):
+    """Lights from anywhere within 0.5% of a march from each sample, and the opposite ones as well."""
+    volume = make_plume(28, hot=False, extinction=10.0, device=device)
+    camera = Camera.around(volume, toward=(0.4, 0.2, 1.0), pixels=16, perspective=perspective)
+    made = light_smoke(volume, camera, [Light(way) for way in WAYS], fine_march(volume, g))
+    for n, way in enumerate(WAYS):
+        for plane, sign in ((made.planes[n], 1.0), (made.opposite[n], -1.0)):
+            expected = lit(volume, camera, sign * np.array(way), step=0.25, g=g)
+            assert abs(float(plane.mean() / expected.mean()) - 1) < 0.005
+            assert rms(plane, expected) < 0.01
+
+
+@pytest.mark.parametrize("inside", [False, True])
+def test_point_lights_against_the_tracer(device: str, inside: bool):
+    volume = make_plume(20, hot=False, extinction=8.0, device=device)
+    camera = facing(volume, size=10)
+    lamp = PointLight((0.55, 0.6, 0.5) if inside else (1.4, 1.2, 1.1), (3.0, 2.0, 0.0), radius=0.15)
+    made = light_smoke(volume, camera, [lamp], March(step=0.35, jitter=0.0, g=0.3)).shade(albedo=(1.0, 0.5, 1.0))
+    traced = trace(volume, camera, [lamp], albedo=(1.0, 0.5, 1.0), g=0.3, samples=8192, highest=1)
+    assert abs(float(made.mean() / traced.total.mean()) - 1) < 0.01
+    assert rms(made, traced.total) < 0.04
+    assert not made[..., 2].any()
+
+
+def test_the_whole_picture_is_the_tracers(device: str):
+    """Two lights in colour, albedo in colour, emission and background: as the first order that is traced."""
+    volume = make_plume(28, hot=True, extinction=8.0, device=device)
+    camera = facing(volume, (0.2, 0.1, 1.0), size=12)
+    lights = [Light((1.0, 0.7, 0.8), (6.0, 3.0, 1.0)), Light((-1.0, 0.1, 0.2), (0.0, 4.0, 8.0))]
+    made = light_smoke(volume, camera, lights).shade(albedo=(0.9, 0.6, 0.3), background=(0.2, 0.2, 0.5))
+    traced = trace(volume, camera, lights, albedo=(0.9, 0.6, 0.3), samples=4096, highest=1)
+    # Emission that is scattered isn't in the march.
+    wanted = traced.planes[:2].sum((0, 1)) + traced.planes[2, 0]
+    wanted = wanted + bake(volume, camera, step=0.25).transparency[..., None] * torch.tensor([0.2, 0.2, 0.5])
+    assert abs(float(made.mean() / wanted.mean()) - 1) < 0.005
+    assert rms(made, wanted) < 0.02
+
+
+def test_six_ways_are_far_off_and_this_is_not(device: str):
+    """What the lights' own march is for: oblique lights, where weighed lightmaps are wrong by a quarter."""
+    volume = make_plume(40, hot=False, extinction=25.0, device=device)
+    camera = facing(volume, size=20)
+    light = Light((1.0, 0.7, 0.8))
+    expected = lit(volume, camera, light.toward, step=0.25)[..., None].expand(-1, -1, 3)
+    maps = bake(volume, camera, step=0.5, estimate=False)
+    six = maps.shade([light])
+    assert torch.allclose(maps.shade([light], albedo=(0.5, 0.0, 1.0)), six * torch.tensor([0.5, 0.0, 1.0]).to(six))
+    coarse = light_smoke(volume, camera, [light], March(step=1.0, seed=1)).shade()
+    assert rms(six, expected) > 0.15 > 0.08 > rms(coarse, expected)
+
+
+def test_hard_smoke(device: str):
+    """No smoke, thick smoke, no light, a camera and a light within, one voxel."""
+    volume = make_plume(16, extinction=10.0, device=device)
+    none = light_smoke(volume, facing(volume, size=6), [])
+    assert none.planes.shape == (0, 6, 6) and none.emission.any() and none.shade().any()
+    empty = light_smoke(from_array(np.zeros((1, 1, 1)), device=device), facing(volume, size=6), [Light((1, 1, 1))])
+    assert not empty.shade().any() and (empty.transparency == 1).all() and empty.emission is None
+    thick = from_array(np.full((8, 8, 8), 1e6), device=device)
+    made = light_smoke(thick, facing(thick, size=6), [Light((0, 0, 1)), PointLight((4.0, 4.0, 4.0))])
+    assert torch.isfinite(made.shade()).all() and (made.transparency[2:4, 2:4] == 0).all()
+    within = Camera.look_at((0.5, 0.5, 0.5), (0.5, 0.9, 0.5), extent=1.0, height=6, width=6, perspective=True)
+    seen = light_smoke(volume, within, [PointLight((0.5, 0.5, 0.4)), Light((0, 1, 0))])
+    assert torch.isfinite(seen.shade()).all() and seen.planes.any()
+    made = light_smoke(volume, facing(volume, size=6), [Light((1, 1, 1), (4 * math.pi,) * 3)])
+    with pytest.raises(ValueError, match="albedo"):
+        made.shade(albedo=(2.0, 1.0, 1.0))
+    wrong = Light((1, 1, 1), visibility=torch.ones(3, 3, device=device))
+    with pytest.raises(ValueError, match="visibility"):
+        light_smoke(volume, facing(volume, size=6), [wrong]).shade()

@@ -1,0 +1,192 @@
+"""Light of all orders by the filter and its network: against path tracing, on its own smoke and on a simulation's."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from builders.smoke_plumes import plume
+
+from wlm.errors import WlmError
+from wlm.fluid.volume import from_array
+from wlm.smoke.camera import Camera
+from wlm.smoke.shading import Light
+from wlm.smoke.transport.filtering import COARSE, OrdersModel, blur, load_orders, make_inputs, scatter, shift
+from wlm.smoke.transport.learning import Lesson, fit_filter, make_lessons, psnr, train_network, with_gates
+from wlm.smoke.transport.lights import PointLight
+from wlm.smoke.transport.samples import ALBEDOS, Sample, draw_view, make_sample
+from wlm.smoke.transport.scoring import best_gain, compare
+from wlm.smoke.transport.tracing import trace
+from wlm_kernels.smoke.settings import March
+
+
+@pytest.fixture(scope="module")
+def unseen() -> list[Sample]:
+    """Two views that no training has, with little noise."""
+    return [make_sample(90_000, number, samples=256, pixels=32, lights=2) for number in (0, 1)]
+
+
+@pytest.fixture(scope="module")
+def lessons(unseen) -> list[Lesson]:
+    return [lesson for sample in unseen for lesson in make_lessons(sample)]
+
+
+def test_every_method_is_worse_than_the_filter(unseen, lessons):
+    """By shaded pictures: single scattering, its best gain, which is fitted to these very pictures, and octaves."""
+    gains = {albedo: best_gain(lessons, albedo) for albedo in (0.9, 1.0)}
+    scores = compare(unseen, load_orders(), gains, lights=2)
+    mean = {name: np.mean(score.psnr) for name, score in scores.items()}
+    flip = {name: np.mean(score.flip) for name, score in scores.items()}
+    assert mean["filter"] > 30.0 and min(scores["filter"].psnr) > 26.0
+    for rival in ("single", "gain", "octaves"):
+        assert mean["filter"] > mean[rival] + 3.0 and flip["filter"] < flip[rival]
+    assert mean["single"] < 24.0
+
+
+def test_the_network_is_worth_its_name_and_never_worse(lessons):
+    """Better than the filter alone, on no light worse; a network that wasn't trained fails here."""
+    model = load_orders()
+
+    def gains(model: OrdersModel) -> list[float]:
+        found = []
+        for lesson in lessons:
+            for albedo in (0.8, 1.0):
+                both = (model.light(lesson.inputs, (albedo,) * 3, network=n)[..., 0] for n in (True, False))
+                with_it, without = (psnr(light, lesson.light[ALBEDOS.index(albedo)]) for light in both)
+                found.append(with_it - without)
+        return found
+
+    def holds(model: OrdersModel) -> bool:
+        found = gains(model)
+        return min(found) > -0.02 and np.mean(found) > 0.1
+
+    assert holds(model)
+    random = torch.Generator().manual_seed(1)
+    last = 0.3 * torch.randn(model.arrays["last"].shape, generator=random)
+    untrained = OrdersModel(model.arrays | {"last": last, "gates": torch.ones(len(ALBEDOS))})
+    assert not holds(untrained)
+    # The gates shut it out, and a network that adds nothing adds nothing.
+    shut = with_gates(untrained, lessons)
+    assert not shut.arrays["gates"].any() and not holds(shut) and max(map(abs, gains(shut))) == 0.0
+
+
+def test_far_from_what_it_was_trained_on_the_network_is_left_out(lessons):
+    model = load_orders()
+    inputs = lessons[0].inputs
+    high = float(model.arrays["range"][1])
+    beyond = replace(inputs, depth=high + 1.0)
+    assert model.trust(replace(inputs, depth=high)) == 1.0 and 0 < model.trust(replace(inputs, depth=high + 0.2)) < 1
+    assert torch.equal(model.multiple(beyond), model.filtered(beyond))
+
+
+@pytest.mark.parametrize("kind", ["directional", "point", "perspective"])
+def test_other_smoke_other_lights_other_cameras(device: str, kind: str):
+    """A plume of another maker, in a box that isn't a cube: 6 dB nearer to all light than single scattering."""
+    volume = plume(device=device)
+    camera = Camera.around(volume, toward=(0.5, 0.2, 1.0), pixels=24, perspective=kind == "perspective")
+    light = Light((1.0, 0.5, 0.6)) if kind != "point" else PointLight((1.0, 1.4, 1.2), (4 * math.pi,) * 3)
+    wanted = trace(volume, camera, [light], albedo=(1.0, 0.95, 0.9), samples=192)
+    made = scatter(volume, camera, [light], (1.0, 0.95, 0.9))
+    scale = 1.0 / float(wanted.total.max())
+    once = made.lit.shade(albedo=(1.0, 0.95, 0.9))
+    assert psnr(scale * made.shade(), scale * wanted.total) > psnr(scale * once, scale * wanted.total) + 6.0
+
+
+@pytest.mark.slow
+def test_a_filter_is_fitted_and_a_network_trained(unseen, lessons):
+    """From noisy references alone: the fit helps at once, training lowers the error, one seed gives one model."""
+    noisy = make_sample(5, 1, samples=32, pixels=32, lights=2)
+    known = [*make_lessons(noisy), *make_lessons(make_sample(5, 2, samples=32, pixels=32, lights=2))]
+    model = fit_filter(known, pixels=400)
+    errors: list[float] = []
+    steps = {"steps": 120, "pixels": 256, "report": lambda step, error: errors.append(error)}
+    trained = train_network(model, known, known, **steps)
+    again = train_network(model, known, known, **steps)
+    assert all(torch.equal(trained.arrays[name], again.arrays[name]) for name in trained.arrays)
+    assert errors[1] < 0.9 * errors[0] and not torch.equal(trained.arrays["last"], model.arrays["last"])
+    mean = np.mean([psnr(trained.light(x.inputs, (1.0,) * 3)[..., 0], x.light[-1]) for x in known])
+    single = np.mean([psnr(x.inputs.single, x.light[-1]) for x in known])
+    assert mean > single + 6.0
+
+
+def test_views_are_of_their_numbers():
+    (a, b, c), (d, e, f) = draw_view(3, 5), draw_view(3, 5)
+    assert torch.equal(a.density, d.density) and b == e
+    assert [light.toward for light in c] == [light.toward for light in f]
+    assert not torch.equal(a.density, draw_view(3, 6)[0].density[: a.shape[0], : a.shape[1], : a.shape[2]])
+
+
+@pytest.mark.parametrize("sigma", [0.7, 2.0, 5.0, 11.0])
+def test_a_blur_keeps_light_and_spreads_it(sigma: float):
+    """Of a point: its sum, its middle, and its spread within 6%."""
+    plane = torch.zeros(1, 97, 93, dtype=torch.float64)
+    plane[0, 48, 44] = 1.0
+    made = blur(plane, sigma)[0]
+    rows = torch.arange(97.0).double()
+    along = made.sum(1)
+    middle = (along * rows).sum() / along.sum()
+    assert float(made.sum()) == pytest.approx(1.0, rel=0.01) and float(middle) == pytest.approx(48, abs=0.25 * sigma)
+    assert float(((along * (rows - middle) ** 2).sum() / along.sum()).sqrt()) == pytest.approx(sigma, rel=0.06)
+    assert torch.equal(shift(plane, 3.0, -2.0)[0] > 0.5, torch.roll(plane[0] > 0.5, (2, -3), (0, 1)))
+
+
+def test_hard_smoke(device: str):
+    """No smoke, albedo 0 and in colour, smoke ten times as thick as any that was learned, and half floats."""
+    camera = Camera.around(plume(), pixels=12)
+    empty = scatter(from_array(np.zeros((4, 4, 4)), device=device), camera, [Light((1, 1, 1))])
+    assert not empty.shade().any()
+    assert not scatter(plume(device=device), camera, [Light((1, 1, 1))], (0.0, 0.0, 0.0)).shade().any()
+    tinted = scatter(plume(device=device), camera, [Light((1, 1, 1))], (1.0, 0.9, 0.3)).planes
+    assert (tinted[..., 0] >= tinted[..., 1]).all() and (tinted[..., 1] >= tinted[..., 2]).all()
+    thick = replace(plume(device=device), extinction=1000.0)
+    made = scatter(thick, camera, [Light((1, 1, 1))]).shade()
+    assert torch.isfinite(made).all() and 0.1 < float(made.max()) <= 6.0
+    half = replace(plume(device=device), density=plume(device=device).density.half())
+    assert torch.isfinite(scatter(half, camera, [Light((1, 1, 1))]).shade()).all()
+    with pytest.raises(ValueError, match="g: expected 0"):
+        scatter(plume(), camera, [Light((1, 1, 1))], march=March(g=0.5))
+    with pytest.raises(ValueError, match="albedo"):
+        scatter(plume(), camera, [Light((1, 1, 1))], (1.0, 2.0, 0.0))
+
+
+def test_files_of_models(tmp_path):
+    """A model comes back as it went; every wrong one is a line that names the part."""
+    model = load_orders()
+    model.save(tmp_path / "a.npz")
+    again = load_orders(tmp_path / "a.npz")
+    assert all(torch.equal(model.arrays[name], again.arrays[name]) for name in model.arrays)
+    with pytest.raises(WlmError, match="npz"):
+        model.save(tmp_path / "a.bin")
+    wrong = {
+        "weights": torch.zeros(3, 3),
+        "spread": torch.zeros_like(model.arrays["spread"]),
+        "gates": torch.full((len(ALBEDOS),), 2.0),
+        "first": model.arrays["first"] * math.inf,
+    }
+    for name, array in wrong.items():
+        OrdersModel(model.arrays | {name: array}).save(tmp_path / "b.npz")
+        with pytest.raises(WlmError, match=rf"b.npz: {name}: expected"):
+            load_orders(tmp_path / "b.npz")
+    missing = {name: array for name, array in model.arrays.items() if name != "last"}
+    OrdersModel(missing).save(tmp_path / "b.npz")
+    with pytest.raises(WlmError, match="last is missing"):
+        load_orders(tmp_path / "b.npz")
+    with pytest.raises(WlmError, match="absent.npz"):
+        load_orders(tmp_path / "absent.npz")
+
+
+def test_inputs_hold_for_any_image(device: str):
+    """At twice the pixels the filter says the same: its scales are the smoke's and not the image's."""
+    from wlm.smoke.transport.filtering import ambient
+    from wlm.smoke.transport.lighting import light_smoke
+
+    volume, model = plume(device=device), load_orders().to(device)
+    made = []
+    for pixels in (24, 48, 96):
+        camera = Camera.around(volume, pixels=pixels)
+        lit = light_smoke(volume, camera, [Light((1.0, 0.5, 0.6))], COARSE)
+        inputs = make_inputs(volume, lit, ambient(volume, camera))[0]
+        made.append(torch.nn.functional.avg_pool2d(model.filtered(inputs), pixels // 24))
+    for finer in made[1:]:
+        assert float((made[0] - finer).square().mean().sqrt() / finer.square().mean().sqrt()) < 0.12

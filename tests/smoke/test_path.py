@@ -1,0 +1,248 @@
+"""The path tracer: each order against quadrature and Mitsuba, energy, lights of each kind, obstacles, hard cases."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from builders.smoke_plumes import facing, unit_grid
+from reference.marching import Scene
+from reference.transport import scattered_twice
+
+from wlm.bench.path_tracer import PathTracer
+from wlm.errors import WlmError
+from wlm.fluid.shapes import box
+from wlm.fluid.volume import DensityVolume, from_array
+from wlm.smoke.baking import bake, lit
+from wlm.smoke.camera import Camera
+from wlm.smoke.learn.synthetic import make_plume
+from wlm.smoke.shading import Light
+from wlm.smoke.transport.lights import Environment, PointLight
+from wlm.smoke.transport.tracing import Transport, trace
+
+WAY = (1.0, 0.7, 0.8)
+
+
+def ball(n: int = 12, depth: float = 4.0, device: str = "cpu") -> DensityVolume:
+    """A soft ball of an optical depth through its middle, in a box of edge 1."""
+    x, y, z = unit_grid(n)
+    density = np.clip(1.5 - 1.5 * np.sqrt(x**2 + y**2 + z**2), 0, 1).astype(np.float32)
+    return from_array(density, extinction=depth, voxel=1.0 / n, device=device)
+
+
+def close(traced: torch.Tensor, noise: torch.Tensor, expected: torch.Tensor, share: float) -> None:
+    """Holds the mean to a share and the pixels to the noise that is stated."""
+    assert noise.square().sum().sqrt() / noise.numel() < 0.6 * share * expected.mean()  # or nothing is shown
+    assert abs(float(traced.mean() / expected.mean()) - 1.0) < share
+    assert 0.6 < float((traced - expected).square().mean() / noise.square().mean()) < 1.6
+
+
+@pytest.mark.parametrize("g", [-0.3, 0.0, 0.6])
+def test_the_first_order_is_single_scattering(device: str, g: float):
+    """Against the march that shares nothing, of the mean within 0.5%, of pixels as the noise estimate says."""
+    volume = make_plume(24, hot=False, extinction=14.0, device=device)
+    camera = facing(volume, (0.3, 0.2, 1.0), size=20)
+    lights = [Light(WAY), Light((0.0, 0.3, -1.0))]
+    traced = trace(volume, camera, lights, g=g, samples=2048, highest=1, seed=3)
+    for n, light in enumerate(lights):
+        expected = lit(volume, camera, light.toward, step=0.25, g=g)
+        close(traced.planes[n, 1, ..., 1], traced.noise[n, ..., 1], expected, 0.005)
+    assert not traced.planes[:, [0, 2]].any()
+
+
+def test_the_second_order_is_that_of_quadrature(device: str):
+    volume = ball(4, depth=2.5, device=device)
+    camera = facing(volume, (0.2, -0.1, 1.0), size=2)
+    toward = np.array(WAY) / np.linalg.norm(WAY)
+    position = np.array(camera.position) / volume.voxel
+    axes = [np.array(axis) for axis in (camera.right, camera.up, camera.toward)]
+    density, extinction = volume.density.cpu().numpy(), volume.extinction * volume.voxel
+    scene = Scene(density, extinction, position, *axes, camera.pitch / volume.voxel, 2, 2)
+    expected = scattered_twice(scene, toward, 0.3, 0.5, 6, 12)
+    traced = trace(volume, camera, [Light(WAY)], g=0.3, samples=400_000, orders=2, highest=2)
+    got = traced.planes[0, 2, ..., 0].cpu().numpy()
+    assert abs(got.mean() / expected.mean() - 1) < 0.01
+    assert np.abs(got / expected - 1).max() < 0.02
+
+
+@pytest.mark.parametrize(("g", "share"), [(0.0, 0.003), (0.6, 0.003)])
+def test_a_white_furnace_stays_white(device: str, g: float, share: float):
+    """Smoke of albedo 1 in an even environment can't be seen; half of what is tried goes by the map's own chances."""
+    volume = make_plume(24, hot=False, extinction=30.0, device=device)
+    sky = Environment(np.ones((5, 7, 3)))
+    traced = trace(volume, facing(volume, size=16), environment=sky, g=g, samples=512, orders=2)
+    assert abs(float(traced.total.mean()) - 1.0) < share and traced.error < 0.03
+    assert 0.05 < float(traced.planes[0, 3].mean())
+    # Of an albedo of 1/2 it takes light away.
+    dim = trace(volume, facing(volume, size=16), environment=sky, g=g, albedo=(0.5,) * 3, samples=32)
+    assert float(dim.total.mean()) < 0.9
+
+
+def test_an_environment_is_the_lights_that_it_is_made_of(device: str):
+    """Two bright texels among dark ones are lit like two directional lights from there."""
+    volume, radiance = ball(device=device), np.zeros((64, 128, 3))
+    radiance[20, 5], radiance[40, 70] = 900.0, (300.0, 0.0, 0.0)
+    rows = np.cos(np.pi * np.arange(65) / 64)
+    lights = []
+    for row, column in ((20, 5), (40, 70)):
+        height, turn = 0.5 * (rows[row] + rows[row + 1]), 2 * np.pi * (column + 0.5) / 128
+        across = math.sqrt(1 - height**2)
+        solid = (rows[row] - rows[row + 1]) * 2 * np.pi / 128
+        way = (across * math.cos(turn), height, across * math.sin(turn))
+        lights.append(Light(way, tuple(float(c) for c in radiance[row, column] * solid)))
+    camera = facing(volume, size=12)
+    # The camera itself sees neither.
+    some = trace(volume, camera, environment=Environment(radiance), samples=1024, g=0.3)
+    same = trace(volume, camera, lights, samples=1024, g=0.3)
+    for channel in (0, 1):
+        assert abs(float(some.total[..., channel].mean() / same.total[..., channel].mean()) - 1) < 0.01
+
+
+def test_orders_and_albedo(device: str):
+    """An order n has the albedo's n-th power, whether traced or scaled; the orders add up to the whole."""
+    volume, camera = ball(device=device), facing(ball(), size=8)
+    white = trace(volume, camera, [Light(WAY)], samples=64, orders=4)
+    tinted = trace(volume, camera, [Light(WAY)], samples=64, orders=4, albedo=(1.0, 0.8, 0.0))
+    for n in range(5):
+        ratio = torch.tensor([1.0, 0.8**n, float(n == 0)], device=volume.device)
+        assert torch.allclose(tinted.planes[:, n], white.planes[:, n] * ratio, rtol=1e-4, atol=1e-7)
+    scaled = white.with_albedo((1.0, 0.8, 0.0))
+    assert torch.allclose(scaled.planes[:, :5], tinted.planes[:, :5], rtol=1e-4, atol=1e-7)
+    assert not scaled.planes[:, 5].any() and white.planes[:, 5].any()
+    assert torch.allclose(white.up_to(4)[0] + white.planes[0, 5], white.total, rtol=1e-5)
+    # Fewer paths carry what is left of the light on, which changes no mean.
+    dark = trace(volume, camera, [Light(WAY)], samples=4096, orders=3, albedo=(0.3,) * 3)
+    wanted = trace(volume, camera, [Light(WAY)], samples=4096, orders=3, seed=1).with_albedo((0.3,) * 3)
+    assert abs(float(dark.planes[:, 3].mean() / wanted.planes[:, 3].mean()) - 1) < 0.03
+
+
+def test_point_lights(device: str):
+    """From far off as a directional light; by the inverse square; in the smoke as much light as a march finds."""
+    volume = ball(device=device)
+    camera = facing(volume, size=8)
+    toward = np.array(WAY) / np.linalg.norm(WAY)
+    far = PointLight(tuple(volume.centre + 500.0 * toward), (4 * math.pi * 500.0**2,) * 3)
+    one, other = (trace(volume, camera, [lamp], samples=256).total for lamp in (far, Light(WAY)))
+    assert abs(float(one.mean() / other.mean()) - 1) < 0.01
+    inside = PointLight(tuple(volume.centre), radius=0.05)
+    traced = trace(volume, camera, [inside], samples=512, highest=1)
+    assert torch.isfinite(traced.total).all() and traced.error < 0.2
+    assert traced.total.max() == traced.total[2:6, 2:6].max()
+
+
+def test_emission_is_seen_and_scattered(device: str):
+    """Unscattered it is what bake finds; smoke of albedo 1 scatters as much as it takes away, in all directions."""
+    volume = make_plume(20, extinction=8.0, device=device)
+    camera = facing(volume, size=16)
+    traced = trace(volume, camera, samples=1024, albedo=(1.0, 0.5, 0.0), orders=1)
+    assert traced.sources == ("emission",)
+    close(traced.planes[0, 0, ..., 2], traced.noise[0, ..., 2], bake(volume, camera, step=0.25).emission, 0.02)
+    assert not traced.planes[0, 1:, ..., 2].any() and traced.planes[0, 1, ..., 0].any()
+    # Cold smoke has no such source, and fire without smoke shines as well.
+    bare = from_array(np.zeros((8, 8, 8)), temperature=np.ones((8, 8, 8)), emission=0.5, device=device)
+    seen = trace(bare, facing(bare, size=8), samples=1024)
+    assert abs(float(seen.total[3:5, 3:5].mean()) - 4.0) < 0.1
+
+
+def test_obstacles_block(device: str):
+    """A plate between smoke and light keeps its light off, one before the camera hides all; beside them nothing."""
+    volume = ball(device=device)
+    camera = facing(volume, size=8)
+    corners, triangles = box()
+
+    def shot(place: tuple, half: tuple, samples: int = 256) -> Transport:
+        plate = (corners * np.array(half) + volume.centre + np.array(place), triangles)
+        lights, sky = [Light((0.0, 1.0, 0.0)), Light((1.0, 0.0, 0.0))], Environment.even()
+        return trace(volume, camera, lights, environment=sky, samples=samples, highest=1, obstacles=plate)
+
+    free = trace(volume, camera, [Light((0.0, 1.0, 0.0)), Light((1.0, 0.0, 0.0))], samples=256, highest=1)
+    above = shot((0.0, 0.8, 0.0), (3.0, 0.1, 3.0))
+    assert not above.planes[0].any()
+    assert above.planes[1].any()
+    before = shot((0.0, 0.0, 2.0), (3.0, 3.0, 0.1), 2)
+    assert not before.planes.any()
+    beside = shot((0.0, 0.0, 9.0), (3.0, 3.0, 0.1))
+    assert abs(float(beside.planes[:2].mean() / free.planes.mean()) - 1) < 0.03
+    # The background behind the smoke is seen where no obstacle stands before it.
+    behind = shot((0.5, 0.0, -2.0), (0.5, 3.0, 0.1))
+    assert behind.planes[2, 0, :, :3].mean() > 0.3 and not behind.planes[2, 0, :, 5:].any()
+
+
+def test_hard_smoke(device: str):
+    """Empty, black and thick smoke, a camera and a light within it are no error; one seed gives one image."""
+    camera = facing(ball(), size=6)
+    empty = trace(from_array(np.zeros((4, 4, 4)), device=device), camera, [Light(WAY)], samples=2)
+    assert not empty.total.any() and empty.error == 0.0
+    black = trace(ball(device=device), camera, [Light(WAY)], albedo=(0.0, 0.0, 0.0), samples=8)
+    assert not black.total.any()
+    thick = trace(ball(depth=80.0, device=device), camera, [Light(WAY)], samples=16, environment=Environment.even())
+    assert torch.isfinite(thick.total).all() and 0.7 < float(thick.planes[1].sum(0).mean()) < 1.3
+    within = Camera.look_at((0.5, 0.5, 0.5), (0.5, 0.5, 0.0), extent=1.0, height=6, width=6, perspective=True)
+    inside = trace(ball(device=device), within, [PointLight((0.5, 0.5, 0.4), radius=0.1)], samples=64)
+    assert torch.isfinite(inside.total).all() and (inside.total > 0).all()
+    again, other = (trace(ball(device=device), within, [Light(WAY)], samples=40, seed=seed) for seed in (5, 6))
+    first = trace(ball(device=device), within, [Light(WAY)], samples=40, seed=5)
+    assert torch.equal(first.planes, again.planes) and not torch.equal(first.planes, other.planes)
+
+
+@pytest.mark.slow
+def test_half_floats_are_traced_as_floats(device: str):
+    camera = facing(ball(), size=6)
+    half = ball(device=device)
+    half = DensityVolume(half.density.half(), half.extinction, half.voxel)
+    whole = DensityVolume(half.density.float(), half.extinction, half.voxel)
+    a, b = (trace(smoke, camera, [Light(WAY)], samples=16).total for smoke in (half, whole))
+    assert torch.allclose(a, b, rtol=1e-3)
+
+
+def test_wrong_settings_are_named():
+    volume, camera = ball(), facing(ball(), size=4)
+    wrong = {"g": 1.0, "samples": 1, "orders": -1, "highest": -1, "seed": -1, "albedo": (1.0, 1.2, 0.0)}
+    for name, value in wrong.items():
+        with pytest.raises(ValueError, match=f"{name}: expected"):
+            trace(volume, camera, [Light(WAY)], **{name: value})
+    with pytest.raises(WlmError, match="optical depth of at most"):
+        trace(ball(depth=1e7), camera, samples=2)
+    with pytest.raises(ValueError, match="obstacles: expected triangles"):
+        trace(volume, camera, obstacles=(np.zeros((3, 3)), np.array([[0, 1, 7]])))
+    for build, message in (
+        (lambda: PointLight((0, 0, math.nan)), "position"),
+        (lambda: PointLight((0, 0, 0), radius=-1.0), "radius"),
+        (lambda: PointLight((0, 0, 0), (1, -1, 0)), "intensity"),
+        (lambda: Environment(np.ones((2, 2))), "radiance"),
+        (lambda: Environment(np.full((1, 1, 3), -1.0)), "radiance"),
+        (lambda: trace(volume, camera, samples=2).up_to(2), "order"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            build()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("albedo", [0.8, 0.95, 1.0])
+@pytest.mark.parametrize("g", [-0.3, 0.0, 0.6])
+@pytest.mark.parametrize("name", ["cube", "ball", "plume", "thick"])
+def test_against_mitsuba(name: str, g: float, albedo: float):
+    """Each order of Mitsuba's `volpath` within 1% above the noise of the two."""
+    pytest.importorskip("mitsuba")
+    volume = {
+        "cube": lambda: from_array(np.ones((8, 8, 8)), extinction=0.25, voxel=1.0),
+        "ball": ball,
+        "plume": lambda: make_plume(16, hot=False, extinction=14.0),
+        "thick": lambda: make_plume(16, seed=3, hot=False, extinction=40.0),
+    }[name]()
+    camera, rays, most = facing(volume, size=8), 4, 4
+    way = np.array(WAY) / np.linalg.norm(WAY)
+    ours = []
+    for seed in range(4):
+        options = {"albedo": (albedo,) * 3, "g": g, "samples": 256, "orders": most, "highest": most, "seed": seed}
+        planes = trace(volume, camera.finer(rays), [Light(camera.axes.T @ way)], **options).planes[0, 1:-1, ..., 0]
+        ours.append(torch.nn.functional.avg_pool2d(planes, rays).double().numpy())
+    sums = np.zeros((4, most + 1, camera.height, camera.width))
+    for order in range(1, most + 1):
+        tracer = PathTracer(volume, camera, variant="scalar_rgb", albedo=albedo, g=g, order=order)
+        sums[:, order] = [tracer.trace(way, 2048, 10 * order + seed)[..., 0] for seed in range(4)]
+    theirs = np.diff(sums, axis=1)
+    for order in range(most):
+        a, b = np.stack([run[order] for run in ours]), theirs[:, order]
+        noise = math.hypot(*(runs.mean((1, 2)).std(ddof=1) / 2 for runs in (a, b)))
+        assert abs(a.mean() - b.mean()) < 0.01 * b.mean() + 3.0 * noise, f"order {order + 1}: {a.mean()} {b.mean()}"

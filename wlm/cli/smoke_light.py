@@ -1,0 +1,259 @@
+"""`wlm smoke`: light smoke by its own lights, with light of all orders of scattering, and trace the truth."""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from wlm.cli.console import check_output, escape, exclusive, note, number, quiet_warp, running, show, table
+from wlm.cli.options import Seed, output_option
+from wlm.cli.smoke_options import SHEET, Input, SmokeOptions, outputs, vector, with_smoke
+from wlm.errors import WlmError
+
+if TYPE_CHECKING:
+    from wlm.fluid.volume import DensityVolume
+    from wlm.smoke.data import Frames
+    from wlm.smoke.scene import Scene
+    from wlm.smoke.transport.lights import AnyLight
+    from wlm.smoke.transport.tracing import Transport
+
+_Lights = Annotated[
+    list[str] | None,
+    typer.Option("--light", metavar="X,Y,Z[:R,G,B]", help="Direction to a light and its irradiance; repeat for more."),
+]
+_Points = Annotated[
+    list[str] | None,
+    typer.Option("--point", metavar="X,Y,Z[:R,G,B]", help="A light's place and its intensity; repeat for more."),
+]
+_Albedo = Annotated[
+    str, typer.Option(metavar="R,G,B", help="Share of light that a scattering leaves, one number or three.")
+]
+_White = Annotated[float, typer.Option(help="The light that becomes white.")]
+
+
+def register(app: typer.Typer) -> None:
+    """Adds the commands to `wlm smoke`."""
+    for command in (light, trace):
+        app.command()(command)
+
+
+@with_smoke
+@exclusive
+def light(
+    smoke: Input,
+    output: Annotated[Path, output_option("OUT", "A .png, or for frames a folder.")],
+    options: SmokeOptions,
+    lights: _Lights = None,
+    points: _Points = None,
+    albedo: _Albedo = "1",
+    orders: Annotated[str, typer.Option(help="all: light that is scattered again too; single: once alone.")] = "all",
+    model: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Of all orders; default the one that comes with wlm.")
+    ] = None,
+    step: Annotated[float, typer.Option(min=0.01, max=1000.0, help="In voxels.")] = 1.0,
+    perspective: Annotated[bool, typer.Option("--perspective", help="Rays meet in the eye.")] = False,
+    background: Annotated[str | None, typer.Option(metavar="R,G,B", help="Linear colour behind the smoke.")] = None,
+    white: _White = 1.0,
+) -> None:
+    """Light the smoke into PNGs by a march to each light itself, and predict light that is scattered more than once.
+
+    Without --light and --point the lights are the scene's, or one from 1,1,1. Obstacles of a scene are drawn and cast
+    their shadows.
+    """
+    if orders not in ("all", "single"):
+        raise WlmError(f"--orders: expected all or single, got {orders!r}")
+    if model is not None and orders == "single":
+        raise WlmError("--model: expected --orders all beside it")
+    colour = _albedo(albedo)
+    behind = None if background is None else vector("--background", background)
+    _check_white(white)
+    own = _lights(lights, points)
+    quiet_warp()
+    from wlm.smoke.scene import make_camera
+    from wlm.smoke.transport.filtering import load_orders, scatter
+    from wlm.smoke.transport.lighting import light_smoke
+    from wlm.view.atlas import save_png
+    from wlm.view.smoke import contact_sheet, to_bytes
+    from wlm.view.smoke_light import light_picture
+    from wlm_kernels.smoke.settings import March
+
+    frames = options.open(smoke)
+    camera = options.camera(frames, orthographic=False, perspective=perspective)
+    scene, march = frames.scene, March(step=step, jitter=0.0)
+    lamps = own or _scene_lights(scene)
+    if behind is None:
+        behind = scene.background if scene else (0.0, 0.0, 0.0)
+    extra = {"ramp": scene.smoke.ramp, "obstacles": scene.obstacles} if scene else {}
+    network = load_orders(model) if orders == "all" else None
+    file = outputs(smoke, scene is None, output, "light", ".png")
+    rows = table(str(smoke), ["file", "covered", "mean", "largest", "clipped"])
+    pictures = []
+    with running("light") as progress:
+        for frame, volume in frames.volumes(progress=progress):
+            for warning in volume.warnings:
+                note(f"warning: {warning}")
+            view = make_camera(camera, volume.origin, [volume.voxel * n for n in volume.shape])
+            if network is None:
+                made = light_smoke(volume, view, lamps, march)
+            else:
+                made = scatter(volume, view, lamps, colour, march=march, model=network)
+            time = frames.time(frame)
+            shaded = light_picture(made, albedo=colour, background=behind, time=time, **extra)
+            pictures.append(to_bytes(shaded, white))
+            path = file(frame)
+            save_png(path, pictures[-1])
+            transparency = (made if network is None else made.lit).transparency
+            covered, clipped = (float(part.float().mean()) for part in (transparency < 0.99, (shaded > white).any(-1)))
+            rows.add_row(
+                escape(path.name), f"{covered:.1%}", f"{shaded.mean():.4g}", f"{shaded.max():.4g}", f"{clipped:.1%}"
+            )
+    if scene is not None:
+        contact_sheet(output / SHEET, {"": pictures})
+    show(rows)
+
+
+@with_smoke
+@exclusive
+def trace(
+    smoke: Input,
+    output: Annotated[Path, output_option("OUT", "A .png or .exr, or for frames a folder of PNGs.")],
+    options: SmokeOptions,
+    lights: _Lights = None,
+    points: _Points = None,
+    sky: Annotated[str | None, typer.Option(metavar="R,G,B", help="Light from all around, seen too.")] = None,
+    albedo: _Albedo = "1",
+    g: Annotated[
+        float, typer.Option(min=-0.99, max=0.99, help="Mean cosine of the Henyey-Greenstein phase function.")
+    ] = 0.0,
+    samples: Annotated[int, typer.Option(min=2, max=2**20, help="Paths a pixel.")] = 64,
+    orders: Annotated[
+        int, typer.Option(min=0, max=1000, help="Orders of scattering with channels of their own in an EXR.")
+    ] = 1,
+    highest: Annotated[int | None, typer.Option(min=0, help="Scatterings after which paths end; default none.")] = None,
+    perspective: Annotated[bool, typer.Option("--perspective", help="Rays meet in the eye.")] = False,
+    white: _White = 1.0,
+    seed: Seed = 0,
+) -> None:
+    """Trace paths through the smoke: light of every order without bias, with noise, and how much noise there is.
+
+    Hot smoke is lit by its own fire as well. Obstacles of a scene absorb all light. An EXR has R, G and B, R.1, G.1 and
+    B.1 of light scattered once, and so on, and R.noise, G.noise and B.noise.
+    """
+    colour, around = _albedo(albedo), None if sky is None else vector("--sky", sky)
+    _check_white(white)
+    own = _lights(lights, points)
+    quiet_warp()
+    from wlm.smoke.scene import make_camera, obstacle_mesh
+    from wlm.smoke.transport.lights import Environment
+    from wlm.smoke.transport.tracing import HIGHEST, trace
+    from wlm.view.atlas import save_png
+    from wlm.view.smoke import to_bytes
+
+    environment = None
+    if around is not None:
+        environment = _checked("--sky", lambda: Environment.even(around))
+    frames = options.open(smoke)
+    camera = options.camera(frames, orthographic=False, perspective=perspective)
+    scene = frames.scene
+    lamps = own or ([] if environment is not None else _scene_lights(scene))
+    if scene is None:
+        check_output(output, ".png", ".exr")
+        as_exr = output.suffix.lower() == ".exr"
+    else:
+        as_exr = False
+    file = (lambda frame: output) if scene is None else outputs(smoke, False, output, "trace", ".png")
+    settings = {"albedo": colour, "g": g, "samples": samples, "orders": orders, "seed": seed}
+    rows = table(str(smoke), ["file", "mean", "largest", "scattered again", "noise"])
+    with running("trace") as progress:
+        for frame, volume in _each(frames):
+            view = make_camera(camera, volume.origin, [volume.voxel * n for n in volume.shape])
+            solid = None
+            if scene is not None and scene.obstacles:
+                solid = obstacle_mesh(scene.obstacles, frames.time(frame))[:2]
+            extra = {"environment": environment, "obstacles": solid, "highest": HIGHEST if highest is None else highest}
+            made = trace(volume, view, lamps, **settings, **extra, progress=progress)
+            path, image = file(frame), made.total
+            if as_exr:
+                _write_exr(path, made)
+            else:
+                save_png(path, to_bytes(image, white))
+            more = float(made.planes[:, 2:].sum() / made.planes[:, 1:].sum().clamp(min=1e-30))
+            rows.add_row(
+                escape(path.name),
+                number(float(image.mean()), ".4g"),
+                number(float(image.max()), ".4g"),
+                "" if orders != 1 else f"{more:.1%}",
+                f"{made.error:.2%}",
+            )
+    show(rows)
+
+
+def _each(frames: "Frames") -> "Iterator[tuple[int, DensityVolume]]":
+    """The volumes of frames; notes their repairs."""
+    for frame, volume in frames.volumes():
+        for warning in volume.warnings:
+            note(f"warning: {warning}")
+        yield frame, volume
+
+
+def _write_exr(path: Path, made: "Transport") -> None:
+    from wlm.formats.exr_planes import write_planes
+
+    orders = made.planes.sum(0).cpu().numpy()
+    noise = made.noise.square().sum(0).sqrt().cpu().numpy()
+    planes = {}
+    for channel, letter in enumerate("RGB"):
+        planes[letter] = orders[..., channel].sum(0)
+        for order in range(made.orders + 1):
+            planes[f"{letter}.{order}"] = orders[order, ..., channel]
+        planes[f"{letter}.noise"] = noise[..., channel]
+    note = {"albedo": made.albedo, "samples": made.samples, "sources": made.sources, "noise": made.error}
+    write_planes(path, planes, note, whole=tuple(planes))
+
+
+def _check_white(white: float) -> None:
+    if not 0 < white < float("inf"):
+        raise WlmError(f"--white: expected a number above 0, got {white}")
+
+
+def _albedo(text: str) -> tuple[float, float, float]:
+    values = vector("--albedo", text if "," in text else ",".join([text] * 3))
+    if not all(0 <= value <= 1 for value in values):
+        raise WlmError(f"--albedo: expected numbers of 0 to 1, got {text!r}")
+    return values
+
+
+def _checked(option: str, make: Callable[[], Any]) -> Any:
+    """What is made of an option's values, or one line that names the option."""
+    try:
+        return make()
+    except ValueError as error:
+        raise WlmError(f"{option}: {error}") from error
+
+
+def _lights(directions: list[str] | None, places: list[str] | None) -> "list[AnyLight]":
+    """Lights of `X,Y,Z[:R,G,B]` or `X,Y,Z[:E]`, white ones."""
+    from wlm.smoke.camera import unit
+    from wlm.smoke.shading import Light
+    from wlm.smoke.transport.lights import PointLight, checked_colour
+
+    made: list[AnyLight] = []
+    for option, texts in (("--light", directions), ("--point", places)):
+        for text in texts or ():
+            place, colon, colour = text.partition(":")
+            values = [vector(option, place)]
+            if colon:
+                values.append(vector(option, colour if "," in colour else ",".join([colour] * 3)))
+                _checked(option, lambda values=values: checked_colour("colour", values[1]))
+            if option == "--light":
+                _checked(option, lambda values=values: unit(values[0], "direction"))
+            kind = Light if option == "--light" else PointLight
+            made.append(_checked(option, lambda kind=kind, values=values: kind(*values)))
+    return made
+
+
+def _scene_lights(scene: "Scene | None") -> "list[AnyLight]":
+    from wlm.smoke.shading import Light
+
+    return [Light((1.0, 1.0, 1.0))] if scene is None else [settings.light() for settings in scene.lights]

@@ -1,0 +1,21 @@
+"""Light in smoke beyond six ways: path-traced references, a scene's own lights, light scattered more than once."""
+
+from wlm._facade import facade
+
+_PLACES = {
+    "Environment": "wlm.smoke.transport.lights",
+    "LitSmoke": "wlm.smoke.transport.lighting",
+    "OrdersModel": "wlm.smoke.transport.filtering",
+    "PointLight": "wlm.smoke.transport.lights",
+    "ScatteredSmoke": "wlm.smoke.transport.filtering",
+    "Transport": "wlm.smoke.transport.tracing",
+    "fine_march": "wlm.smoke.transport.lighting",
+    "light_smoke": "wlm.smoke.transport.lighting",
+    "load_orders": "wlm.smoke.transport.filtering",
+    "scatter": "wlm.smoke.transport.filtering",
+    "trace": "wlm.smoke.transport.tracing",
+}
+
+__all__ = sorted(_PLACES)
+
+__getattr__, __dir__ = facade(__name__, _PLACES)

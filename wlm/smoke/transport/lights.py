@@ -1,0 +1,116 @@
+"""Lights beside the directional ones of `wlm.smoke.shading`: points, and an environment, checked."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from wlm.fluid.volume import DensityVolume
+from wlm.smoke.camera import unit
+from wlm.smoke.shading import Light
+
+_BRIGHTEST = 1e12  # of which float32 holds products with any phase function
+
+
+@dataclass(frozen=True)
+class PointLight:
+    """A light at a point, inside the smoke or out of it.
+
+    Attributes:
+        position: In the world.
+        intensity: R, G, B per solid angle; the irradiance at a distance r is intensity / r^2.
+        radius: In the world's unit; at smaller distances the irradiance is as at this one. 0: no such bound, and no
+            bound on the noise of a path tracer with the light inside the smoke.
+    """
+
+    position: tuple[float, float, float]
+    intensity: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    radius: float = 0.0
+
+    def __post_init__(self) -> None:
+        if np.shape(self.position) != (3,) or not np.isfinite(self.position).all():
+            raise ValueError(f"position: expected three finite numbers, got {self.position}")
+        if not 0 <= self.radius < math.inf:
+            raise ValueError(f"radius: expected at least 0, got {self.radius}")
+        checked_colour("intensity", self.intensity)
+
+
+AnyLight = Light | PointLight
+"""A light that smoke is lit by: infinitely far off, or at a point."""
+
+
+@dataclass(frozen=True, eq=False)
+class Environment:
+    """Light from all around, a map of texels of one radiance each.
+
+    Attributes:
+        radiance: [rows, columns, 3], linear, not negative. Row 0 is around the world's +y; column 0 begins at +x, and
+            columns go on towards +z.
+    """
+
+    radiance: np.ndarray
+
+    def __post_init__(self) -> None:
+        values = np.asarray(self.radiance, np.float64)
+        if values.ndim != 3 or values.shape[2] != 3 or 0 in values.shape:
+            raise ValueError(f"radiance: expected [rows, columns, 3], got {values.shape}")
+        if not ((values >= 0) & (values <= _BRIGHTEST)).all():
+            raise ValueError(f"radiance: expected numbers of 0 to {_BRIGHTEST:g}")
+
+    @staticmethod
+    def even(colour: Sequence[float] = (1.0, 1.0, 1.0)) -> "Environment":
+        """The same radiance from everywhere."""
+        return Environment(np.asarray(colour, np.float64).reshape(1, 1, 3))
+
+    def chances(self) -> tuple[np.ndarray, np.ndarray, float]:
+        """Running sums of the chances of rows [R] and of columns within their rows [R, C], and the mean's integral."""
+        mean = np.asarray(self.radiance, np.float64).mean(-1)
+        edges = np.cos(np.pi * np.arange(len(mean) + 1) / len(mean))
+        solid = (edges[:-1] - edges[1:]) * 2.0 * np.pi / mean.shape[1]
+        power = mean * solid[:, None]
+        total = power.sum()
+        if total == 0.0:
+            return np.ones(len(mean)), np.ones(mean.shape), 0.0
+        row = power.sum(1)
+        along = np.cumsum(power, 1) / np.where(row > 0, row, 1.0)[:, None]
+        return np.cumsum(row) / total, along, float(total)
+
+
+def checked_colour(name: str, colour: Sequence[float]) -> np.ndarray:
+    """Three numbers that aren't negative, float64 [3].
+
+    Raises:
+        ValueError: They aren't.
+    """
+    values = np.asarray(colour, np.float64)
+    if values.shape != (3,) or not ((values >= 0) & (values <= _BRIGHTEST)).all():
+        raise ValueError(f"{name}: expected three numbers of 0 to {_BRIGHTEST:g}, got {colour}")
+    return values
+
+
+def checked_albedo(albedo: Sequence[float]) -> np.ndarray:
+    """Three numbers of 0 to 1, float64 [3].
+
+    Raises:
+        ValueError: They aren't.
+    """
+    colour = checked_colour("albedo", albedo)
+    if not (colour <= 1).all():
+        raise ValueError(f"albedo: expected three numbers of 0 to 1, got {tuple(albedo)}")
+    return colour
+
+
+def in_voxels(light: AnyLight, volume: DensityVolume) -> tuple[np.ndarray, np.ndarray, float | None]:
+    """A light in a volume's voxels: direction or position, irradiance over 4 pi, and a point light's radius, or None.
+
+    The irradiance of a point light is that at a distance of one voxel.
+
+    Raises:
+        ValueError: A direction without length, or a colour that isn't one.
+    """
+    if isinstance(light, Light):
+        return unit(light.toward), checked_colour("irradiance", light.irradiance) / (4.0 * math.pi), None
+    place = (np.asarray(light.position, np.float64) - np.asarray(volume.origin, np.float64)) / volume.voxel
+    colour = checked_colour("intensity", light.intensity) / (4.0 * math.pi * volume.voxel**2)
+    return place, colour, light.radius / volume.voxel

@@ -1,0 +1,80 @@
+"""Smoke, cameras and lights drawn at random, with all light that reaches the camera: what a filter of planes learns."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from wlm.fluid.volume import DensityVolume
+from wlm.smoke.camera import Camera
+from wlm.smoke.learn.synthetic import make_plume
+from wlm.smoke.shading import Light
+from wlm.smoke.transport.tracing import trace
+
+ALBEDOS = (0.5, 0.8, 0.9, 0.95, 1.0)
+"""Albedos that light is known at; between them it is a smooth function of the albedo."""
+
+_ORDERS = 40
+_THIN, _THICK = 5.0, 60.0  # extinction over the box's edge
+_SIZES = (40, 48, 56, 64)
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """One volume from one side under some lights.
+
+    Attributes:
+        volume: The smoke.
+        camera: Orthographic.
+        lights: Directional, of irradiance 4 pi.
+        light: float32 tensor [L, A, H, W], light of all orders of each light, at each of `ALBEDOS`; with noise.
+    """
+
+    volume: DensityVolume
+    camera: Camera
+    lights: tuple[Light, ...]
+    light: torch.Tensor
+
+
+def draw_view(seed: int, number: int, *, pixels: int = 64, lights: int = 6) -> tuple[DensityVolume, Camera, tuple]:
+    """Draws smoke, a camera and lights; each is of the seed and the number alone.
+
+    Args:
+        seed, number: At least 0.
+        pixels: H and W.
+        lights: How many.
+    """
+    random = np.random.default_rng([seed, number])
+    extinction = float(np.exp(random.uniform(np.log(_THIN), np.log(_THICK))))
+    n = int(random.choice(_SIZES))
+    volume = make_plume(n, seed=int(random.integers(2**31)), hot=False, extinction=extinction)
+    density = volume.density ** float(random.uniform(0.5, 2.0))
+    density = density.permute(tuple(int(i) for i in random.permutation(3)))
+    density = density.flip([axis for axis in range(3) if random.random() < 0.5]).contiguous()
+    volume = replace(volume, density=density)
+    ways = random.normal(size=(lights + 1, 3))
+    camera = Camera.around(volume, toward=ways[0], pixels=pixels)
+    return volume, camera, tuple(Light(tuple(map(float, way))) for way in ways[1:])
+
+
+def make_sample(
+    seed: int, number: int, *, samples: int = 64, pixels: int = 64, lights: int = 6, device: str = "cpu"
+) -> Sample:
+    """Draws a view and traces it.
+
+    Args:
+        seed, number, pixels, lights: As for `draw_view`.
+        samples: Paths a pixel.
+        device: "cpu" or "cuda:N".
+    """
+    return traced(draw_view(seed, number, pixels=pixels, lights=lights), samples=samples, seed=number, device=device)
+
+
+def traced(view: tuple[DensityVolume, Camera, tuple], *, samples: int, seed: int, device: str = "cpu") -> Sample:
+    """A view of `draw_view` with its light; arguments as for `make_sample`."""
+    volume, camera, lamps = view
+    volume = replace(volume, density=volume.density.to(device))
+    grey = trace(volume, camera, lamps, samples=samples, orders=_ORDERS, seed=seed).planes[..., 0]
+    powers = torch.tensor(ALBEDOS, device=grey.device)[:, None] ** torch.arange(_ORDERS + 2, device=grey.device)
+    light = torch.einsum("ak,lkhw->lahw", powers, grey)
+    return Sample(volume, camera, lamps, light)

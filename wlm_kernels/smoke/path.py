@@ -1,0 +1,422 @@
+"""A path tracer of volumes: light of every order of scattering in a density grid, without bias.
+
+Free paths are sampled by delta tracking, transmittances by ratio tracking (Novak et al. 2018, "Monte Carlo methods for
+volumetric light transport simulation", sections 5.1 and 5.2), both with a majorant per brick. At each scattering every
+light is tried (next event estimation); the environment is reached by such a try and by the path's own escape, weighed
+by the balance heuristic. Emission is gathered along the free paths: each tentative collision counts for e / majorant.
+
+Units are those of `march`; densities between voxels are exactly those of `density_at`. Light of order n has been
+scattered n times. Random numbers are a pixel's own: the result depends on the seed alone.
+Read first: `scattered_twice` of `tests/reference/transport.py`, the second order by quadrature.
+"""
+
+import functools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import warp as wp
+
+from wlm_kernels.smoke.march import BRICK, Medium, View, clip, density_at, phase, ray, size_of
+from wlm_kernels.smoke.path_ways import Sky, chance_of, following, scatter, stir, texel, toward_sky, uniform
+
+_OPTIONS = {"enable_backward": False}
+_NEVER = wp.constant(1.0e30)
+_GLOW = 1.0 / BRICK  # least majorant where smoke glows: about one place a brick at which its light is gathered
+_SLACK = 1.0001  # of a majorant over rounding of interpolated densities
+_FAINT = wp.constant(0.1)  # what is below this is carried on by fewer paths
+_FOUR_PI = wp.constant(4.0 * math.pi)
+
+
+@wp.struct
+class PathLight:
+    """A light, in voxels.
+
+    `place` is the direction to a light infinitely far off, of length 1, or a point light's position. `colour` is the
+    irradiance over 4 pi, of a point light that at a distance of one voxel. Within `radius` of a point light its
+    irradiance no longer grows.
+    """
+
+    place: wp.vec3
+    colour: wp.vec3
+    point: int
+    radius: float
+
+
+@wp.struct
+class PathSettings:
+    """`albedo` by colour; paths end after `highest` scatterings; `kept` of them have planes of their own."""
+
+    albedo: wp.vec3
+    g: float
+    highest: int
+    kept: int
+    samples: int
+    key: wp.uint64
+
+
+@wp.struct
+class _Flight:
+    """Where a free path ends, the light gathered on its way, and the random state after it."""
+
+    t: float
+    hit: int
+    glow: float
+    random: wp.uint64
+
+
+@wp.struct
+class _Passed:
+    """The share of light that passes, and the random state after it."""
+
+    share: float
+    random: wp.uint64
+
+
+@wp.func
+def _brick(majorants: wp.array3d[float], p: wp.vec3) -> wp.vec3i:
+    edge = 1.0 / float(BRICK)
+    return wp.vec3i(
+        wp.clamp(int(wp.floor(p[0] * edge)), 0, majorants.shape[0] - 1),
+        wp.clamp(int(wp.floor(p[1] * edge)), 0, majorants.shape[1] - 1),
+        wp.clamp(int(wp.floor(p[2] * edge)), 0, majorants.shape[2] - 1),
+    )
+
+
+@wp.func
+def _border(cell: int, count: int, p: float, d: float) -> float:
+    """Distance at which a ray leaves a brick along one axis; the outermost bricks have no outer border."""
+    if d > 1.0e-9 and cell < count - 1:
+        return (float((cell + 1) * BRICK) - p) / d
+    if d < -1.0e-9 and cell > 0:
+        return (float(cell * BRICK) - p) / d
+    return _NEVER
+
+
+@wp.func
+def _leave(majorants: wp.array3d[float], cell: wp.vec3i, p: wp.vec3, d: wp.vec3) -> wp.vec3:
+    """Distances at which a ray leaves a brick along each axis."""
+    return wp.vec3(
+        _border(cell[0], majorants.shape[0], p[0], d[0]),
+        _border(cell[1], majorants.shape[1], p[1], d[1]),
+        _border(cell[2], majorants.shape[2], p[2], d[2]),
+    )
+
+
+@wp.func
+def _onward(cell: wp.vec3i, leave: wp.vec3, d: wp.vec3) -> wp.vec3i:
+    """The next brick along a ray."""
+    if leave[0] <= leave[1] and leave[0] <= leave[2]:
+        return wp.vec3i(cell[0] + wp.where(d[0] > 0.0, 1, -1), cell[1], cell[2])
+    if leave[1] <= leave[2]:
+        return wp.vec3i(cell[0], cell[1] + wp.where(d[1] > 0.0, 1, -1), cell[2])
+    return wp.vec3i(cell[0], cell[1], cell[2] + wp.where(d[2] > 0.0, 1, -1))
+
+
+@wp.func
+def _blocked(mesh: wp.uint64, p: wp.vec3, d: wp.vec3, within: float) -> float:
+    """Distance to the first obstacle along a ray, or never."""
+    if mesh == wp.uint64(0):
+        return _NEVER
+    found = wp.mesh_query_ray(mesh, p, d, within)
+    return wp.where(found.result, found.t, _NEVER)
+
+
+@wp.func
+def _fly(
+    density: wp.array3d[Any],
+    temperature: wp.array3d[Any],
+    bounds: wp.array3d[float],
+    extinction: float,
+    emission: float,
+    p: wp.vec3,
+    d: wp.vec3,
+    limit: float,
+    random: wp.uint64,
+) -> _Flight:
+    """A free path by delta tracking, up to a limit."""
+    f = _Flight()
+    glow = float(0.0)
+    span = clip(size_of(density), p, d)
+    t = wp.max(span[0], 0.0)
+    end = wp.min(span[1], limit)
+    cell = _brick(bounds, p + t * d)
+    while t < end:
+        leave = _leave(bounds, cell, p, d)
+        border = wp.min(wp.min(leave[0], wp.min(leave[1], leave[2])), end)
+        most = bounds[cell[0], cell[1], cell[2]]
+        if most > 0.0:
+            while t < border:
+                random = following(random)
+                t -= wp.log(1.0 - uniform(random)) / most
+                if t < border:
+                    at = p + t * d
+                    if emission > 0.0:
+                        glow += emission * density_at(temperature, at) / most
+                    random = following(random)
+                    if uniform(random) * most < extinction * density_at(density, at):
+                        f.hit = 1
+                        f.t = t
+                        end = -1.0
+                        border = -1.0
+        t = border
+        if t < end:
+            cell = _onward(cell, leave, d)
+    f.glow = glow
+    f.random = random
+    return f
+
+
+@wp.func
+def _passed(
+    density: wp.array3d[Any],
+    bounds: wp.array3d[float],
+    extinction: float,
+    p: wp.vec3,
+    d: wp.vec3,
+    limit: float,
+    random: wp.uint64,
+) -> _Passed:
+    """The share of light that passes along a ray up to a limit, by ratio tracking."""
+    f = _Passed()
+    span = clip(size_of(density), p, d)
+    t = wp.max(span[0], 0.0)
+    end = wp.min(span[1], limit)
+    share = float(1.0)
+    cell = _brick(bounds, p + t * d)
+    while t < end:
+        leave = _leave(bounds, cell, p, d)
+        border = wp.min(wp.min(leave[0], wp.min(leave[1], leave[2])), end)
+        most = bounds[cell[0], cell[1], cell[2]]
+        if most > 0.0:
+            while t < border:
+                random = following(random)
+                t -= wp.log(1.0 - uniform(random)) / most
+                if t < border:
+                    share = share * (1.0 - extinction * density_at(density, p + t * d) / most)
+                    if share < _FAINT:
+                        random = following(random)
+                        if uniform(random) * _FAINT < share:
+                            share = _FAINT
+                        else:
+                            share = 0.0
+                            end = -1.0
+                            border = -1.0
+        t = border
+        if t < end:
+            cell = _onward(cell, leave, d)
+    f.share = share
+    f.random = random
+    return f
+
+
+@dataclass(frozen=True)
+class _Kernels:
+    """Of one type of density."""
+
+    majorants: wp.Kernel
+    trace: wp.Kernel
+
+
+@functools.cache
+def path_kernels(dtype: Any) -> _Kernels:
+    """Builds (once) the kernels for densities of a type, `wp.float32` or `wp.float16`."""
+
+    @wp.kernel(module="unique", module_options=_OPTIONS)
+    def majorants(
+        # in:
+        density: wp.array3d[dtype],
+        temperature: wp.array3d[dtype],
+        extinction: float,
+        emission: float,
+        least: float,
+        slack: float,
+        # out:
+        out: wp.array3d[float],
+    ):
+        a, b, c = wp.tid()
+        most = float(0.0)
+        hot = float(0.0)
+        # A point in a brick reads half a voxel beyond it too.
+        for i in range(wp.max(a * BRICK - 1, 0), wp.min((a + 1) * BRICK + 1, density.shape[0])):
+            for j in range(wp.max(b * BRICK - 1, 0), wp.min((b + 1) * BRICK + 1, density.shape[1])):
+                for k in range(wp.max(c * BRICK - 1, 0), wp.min((c + 1) * BRICK + 1, density.shape[2])):
+                    most = wp.max(most, float(density[i, j, k]))
+                    hot = wp.max(hot, float(temperature[i, j, k]))
+        most = most * extinction * slack
+        if emission > 0.0 and hot > 0.0:
+            most = wp.max(most, least)
+        out[a, b, c] = most
+
+    @wp.kernel(module="unique", module_options=_OPTIONS)
+    def trace(
+        # in:
+        density: wp.array3d[dtype],
+        temperature: wp.array3d[dtype],
+        bounds: wp.array3d[float],
+        extinction: float,
+        emission: float,
+        view: View,
+        lights: wp.array1d[PathLight],
+        sky: Sky,
+        mesh: wp.uint64,
+        settings: PathSettings,
+        first: int,
+        parts: int,
+        # out:
+        out: wp.array3d[wp.vec3],
+    ):
+        part, row, column = wp.tid()
+        count = lights.shape[0]
+        planes = settings.kept + 2
+        sources = count + 2
+        # Some parts have one sample more than others.
+        samples = settings.samples // parts
+        if first + part < settings.samples % parts:
+            samples += 1
+        weight = 1.0 / float(settings.samples)
+        pixel = wp.uint64(row) * wp.uint64(view.width) + wp.uint64(column)
+        random = stir(settings.key + stir(pixel * wp.uint64(1048576) + wp.uint64(first + part)))
+        start = ray(view, row, column)
+        for _sample in range(samples):
+            p = start.origin
+            d = start.direction
+            chance = float(0.0)  # of the direction per solid angle; 0: the camera's, which no light was tried for
+            through = wp.vec3(weight)
+            order = int(0)
+            alive = int(1)
+            while alive == 1:
+                limit = float(0.0)
+                if order == 0:
+                    # An orthographic ray starts where the smoke does; what lies before that blocks as well.
+                    limit = _blocked(mesh, p - view.moved * d, d, _NEVER) - view.moved
+                else:
+                    limit = _blocked(mesh, p, d, _NEVER)
+                flight = _fly(density, temperature, bounds, extinction, emission, p, d, limit, random)
+                random = flight.random
+                plane = wp.min(order, planes - 1)
+                if flight.glow > 0.0:
+                    at = (part * sources + count + 1) * planes + plane
+                    out[at, row, column] = out[at, row, column] + flight.glow * through
+                if flight.hit == 0:
+                    if sky.total > 0.0 and limit >= 0.5 * _NEVER:
+                        light = texel(sky, d)
+                        share = float(1.0)
+                        if chance > 0.0:
+                            share = chance / (chance + chance_of(sky, light))
+                        at = (part * sources + count) * planes + plane
+                        out[at, row, column] = out[at, row, column] + share * wp.cw_mul(through, light)
+                    alive = 0
+                else:
+                    p = p + flight.t * d
+                    order += 1
+                    through = wp.cw_mul(through, settings.albedo)
+                    most = wp.max(through[0], wp.max(through[1], through[2])) / weight
+                    if most < _FAINT:
+                        random = following(random)
+                        if uniform(random) * _FAINT < most:
+                            through = through * (_FAINT / most)
+                        else:
+                            alive = 0
+                    if order > settings.highest:
+                        alive = 0
+                if alive == 1:
+                    plane = wp.min(order, planes - 1)
+                    for n in range(count):
+                        way = lights[n].place
+                        reach = float(_NEVER)
+                        strength = float(1.0)
+                        if lights[n].point != 0:
+                            way = way - p
+                            reach = wp.length(way)
+                            away = wp.max(reach, lights[n].radius)
+                            strength = 1.0 / wp.max(away * away, 1.0e-12)
+                            way = wp.normalize(way)
+                        if _blocked(mesh, p, way, reach) >= reach:
+                            got = _passed(density, bounds, extinction, p, way, reach, random)
+                            random = got.random
+                            strength = strength * got.share * phase(settings.g, wp.dot(d, way))
+                            at = (part * sources + n) * planes + plane
+                            light = strength * wp.cw_mul(through, lights[n].colour)
+                            out[at, row, column] = out[at, row, column] + light
+                    if sky.total > 0.0:
+                        far = toward_sky(sky, random)
+                        random = far.random
+                        if _blocked(mesh, p, far.direction, _NEVER) >= _NEVER:
+                            got = _passed(density, bounds, extinction, p, far.direction, _NEVER, random)
+                            random = got.random
+                            own = phase(settings.g, wp.dot(d, far.direction)) / _FOUR_PI
+                            strength = got.share * own / (own + far.chance)
+                            at = (part * sources + count) * planes + plane
+                            light = strength * wp.cw_mul(through, texel(sky, far.direction))
+                            out[at, row, column] = out[at, row, column] + light
+                    random = following(random)
+                    u = uniform(random)
+                    random = following(random)
+                    before = d
+                    d = scatter(settings.g, d, u, uniform(random))
+                    chance = phase(settings.g, wp.dot(before, d)) / _FOUR_PI
+
+    return _Kernels(majorants, trace)
+
+
+def make_lights(lights: Sequence[tuple[Sequence[float], Sequence[float], float | None]]) -> list[PathLight]:
+    """Makes lights for `trace`.
+
+    Args:
+        lights: Of each a direction of length 1 or a position, the colour, and the radius of a point light, or None: it
+            is infinitely far off. All in voxels, as `PathLight` has them.
+    """
+    made = []
+    for place, colour, radius in lights:
+        light = PathLight()
+        light.place, light.colour = wp.vec3(*map(float, place)), wp.vec3(*map(float, colour))
+        light.point, light.radius = int(radius is not None), float(radius or 0.0)
+        made.append(light)
+    return made
+
+
+def bounds(medium: Medium) -> wp.array:
+    """The greatest extinction per voxel that a sample in each brick can find, [X / 8, Y / 8, Z / 8], rounded up."""
+    density, (temperature, emission) = medium.density, medium.glow
+    out = medium.buffer(tuple(-(-n // BRICK) for n in density.shape), float)
+    inputs = [density, temperature, medium.extinction, emission, _GLOW, _SLACK]
+    wp.launch(path_kernels(density.dtype).majorants, out.shape, inputs=inputs, outputs=[out], device=density.device)
+    return out
+
+
+def trace(
+    medium: Medium,
+    view: View,
+    majorants: wp.array,
+    lights: wp.array,
+    sky: Sky,
+    mesh: wp.uint64,
+    settings: PathSettings,
+    first: int,
+    parts: int,
+    out: wp.array,
+) -> None:
+    """Traces some of the parts that the samples are divided into.
+
+    Args:
+        medium: The smoke.
+        view: The camera, [H, W] pixels; paths go through pixel centres.
+        majorants: From `bounds`.
+        lights: `PathLight` [L]; L may be 0.
+        sky: Of total 0: none.
+        mesh: Of obstacles, in voxels, which absorb all light; 0: none.
+        settings: The paths.
+        first: The first part to trace.
+        parts: Parts in all.
+        out: vec3 [P * (L + 2) * (settings.kept + 2), H, W], added to: of P parts each light, the sky and the emission;
+            of each of these the light of order 0, 1 and so on, and last that of all orders above `settings.kept`. The
+            parts add up to the mean over all samples.
+    """
+    density, (temperature, emission) = medium.density, medium.glow
+    planes = (lights.shape[0] + 2) * (settings.kept + 2)
+    size = (out.shape[0] // planes, view.height, view.width)
+    inputs = [density, temperature, majorants, medium.extinction, emission, view, lights, sky, mesh, settings]
+    kernel = path_kernels(density.dtype).trace
+    wp.launch(kernel, size, inputs=[*inputs, first, parts], outputs=[out], device=density.device)
