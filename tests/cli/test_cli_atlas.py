@@ -55,7 +55,8 @@ def test_compress_prints_one_table(inputs, tmp_path):
         assert f"{ratio:.2%}" in text
     assert "compress: weights" in call.stderr and os.listdir(tmp_path) == ["out"]
     report = json.loads((out / "report.json").read_text())
-    assert report["inputs"] == {"mesh": str(inputs[0]), "lightmap": str(inputs[1]), "mask": None}
+    files = {"mesh": str(inputs[0]), "lightmap": str(inputs[1]), "mask": None}
+    assert report["inputs"] == files | {"node": None, "encoding": None, "flip": False}
     assert (report["seed"], report["device"]) == (0, "cpu") and report["seconds"]["weights"] > 0
 
 
