@@ -49,9 +49,7 @@ def test_nobody_stands_in_or_on_a_thing():
     thing = box((0, 0, 0), (1, 1, 1))
     for metres in (False, True):
         assert not len(indoors(*thing[:2], metres=metres).eye)
+        assert not len(indoors(thing[0] * 50, thing[1], metres=metres).eye)
     assert indoors(*thing[:2], metres=True).views(5) == []
     flat = np.array([[0, 0, 0], [1, 0, 0], [0, 0, 1]], float)
     assert not len(indoors(flat, np.array([[0, 2, 1]]), metres=True).eye)
-    # A room that is modelled with its fronts outside, high enough to stand in.
-    outward = box((0, 0, 0), (6, 3, 5))
-    assert len(indoors(*outward[:2], metres=True).eye) > 100 and not len(indoors(*outward[:2], metres=False).eye)

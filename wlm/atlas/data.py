@@ -179,7 +179,7 @@ def load(
     lightmap = read_light(lightmap_path)[0] if encoding is None else read_encoded(lightmap_path, encoding)
     lightmap = np.array(lightmap[:: -1 if flip else 1, :, :3], np.float32, order="C")
     mask = None if mask_path is None else read_mask(Path(mask_path), lightmap_path, lightmap.shape[:2])
-    return _check(
+    return checked_mesh(
         str(path),
         path.stem,
         document,
@@ -226,7 +226,7 @@ def from_arrays(
     document, primitive = _document(name, name, np.asarray(position), np.asarray(triangle), np.asarray(uv))
     with np.errstate(over="ignore"):  # float64 beyond float32 becomes Inf and is repaired as Inf
         copied = np.array(lightmap, np.float32, order="C")
-    return _check(name, name, document, [primitive], 0, copied, valid, f"{name}: lightmap", f"{name}: mask")
+    return checked_mesh(name, name, document, [primitive], 0, copied, valid, f"{name}: lightmap", f"{name}: mask")
 
 
 def write_mesh(
@@ -289,7 +289,7 @@ def _document(
         return document_from_arrays(position[used], corner.reshape(-1, 3), uv[used], name)
 
 
-def _check(
+def checked_mesh(
     where: str,
     name: str,
     document: GltfDocument,
@@ -300,12 +300,25 @@ def _check(
     lightmap_name: str,
     mask_name: str,
     metres: bool = False,
+    choose: bool = True,
 ) -> LightmappedMesh:
-    """Applies the module's table to the content of the files."""
+    """Applies the module's table to the content of the files.
+
+    Args:
+        where, name: The file and the mesh, for messages.
+        document, primitives: As read.
+        uv_set: As for `load`.
+        lightmap: float32 [H, W, 3], repaired in place.
+        mask: bool [H, W]; None: derived.
+        lightmap_name, mask_name: For messages.
+        metres: As in `LightmappedMesh`.
+        choose: Whether of meshes that lie on each other in UV space one is chosen.
+    """
     warnings: list[str] = []
     primitives, uv_set = _select(where, primitives, uv_set, warnings)
-    primitives, left_out = choose_mesh(where, name, primitives, uv_set, lightmap)
-    warnings += left_out
+    if choose:
+        primitives, left_out = choose_mesh(where, name, primitives, uv_set, lightmap)
+        warnings += left_out
     parts, vertices, triangles = [], 0, 0
     for primitive in primitives:
         _check_finite(where, primitive, uv_set)

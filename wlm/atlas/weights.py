@@ -61,10 +61,26 @@ def weights(grid: FineGrid, profile: Profile, seed: int) -> np.ndarray:
         visible = _areas(mesh, height, width, seed)
     else:
         visible = _seen(grid, profile.views, seed)
+    return spread(grid, visible, profile)
+
+
+def spread(grid: FineGrid, visible: np.ndarray, profile: Profile, mean: float | None = None) -> np.ndarray:
+    """Weights by counts of pixels: those, a little where there are none, and more at borders of charts.
+
+    Args:
+        grid: The grid.
+        visible: [2 H, 2 W], pixels that show each cell.
+        profile: `unseen` and `border`.
+        mean: Of the pixels of a cell, of which what isn't seen has a fraction; None: this lightmap's.
+
+    Returns:
+        As `weights`.
+    """
     used = grid.covered | (visible > 0)
     if not used.any():  # the mesh is smaller than a cell, and no pixel shows it
-        used = np.repeat(np.repeat(mesh.mask, 2, 0), 2, 1)
-    mean = visible[used].mean() or 1.0
+        used = np.repeat(np.repeat(grid.mesh.mask, 2, 0), 2, 1)
+    if mean is None:
+        mean = visible[used].mean() or 1.0
     result = np.where(used, visible + profile.unseen * mean, 0.0)
     return np.where(grid.border, profile.border * result, result)
 

@@ -8,8 +8,7 @@ A floor is a triangle that faces up, at most 45 degrees steep. A viewer stands o
 - three quarters of those end on a triangle's front: not in a wall or in a solid thing;
 - and none within a fifth of the height of their eyes.
 
-Rooms are also modelled with their fronts outside and drawn from both sides. Where no viewer stands by these rules, a
-scene in metres, 2 m high or more, is tried once more with all triangles turned over.
+A room whose fronts are outside can't be told from a thing, and nobody stands in it.
 
 Eyes are 1 m above the floor; 0.35 of the scene's height where that is less, where the unit isn't known, or where the
 scene is higher than 200 m, which says that its unit isn't the metre.
@@ -28,7 +27,7 @@ from wlm_kernels.raster.rays import first_hit
 EYES, EYES_SHARE = 1.0, 0.35
 """Metres above the floor; or this share of the scene's height."""
 
-_TALLEST, _ROOM = 200.0, 2.0  # metres
+_TALLEST = 200.0  # metres
 _STEEPEST = math.sqrt(0.5)  # of a floor: the least y of its normal
 _CANDIDATES, _RAYS = 1024, 96
 _FEWEST = 16  # places among the candidates: fewer are a crack in a thing
@@ -96,16 +95,11 @@ def indoors(position: np.ndarray, triangle: np.ndarray, *, metres: bool, device:
     points = wp.array(scaled.reshape(-1, 3).astype(np.float32), dtype=wp.vec3, device=device)
     mesh = wp.Mesh(points, wp.array(np.arange(3 * len(corner), dtype=np.int32), dtype=int, device=device))
     normal = np.cross(scaled[:, 1] - scaled[:, 0], scaled[:, 2] - scaled[:, 0])
-    for side in (1.0, -1.0) if known and tall >= _ROOM else (1.0,):
-        eye = _standing(mesh, scaled, side * normal, height * scale, side, device)
-        if len(eye) >= _FEWEST:
-            return Indoors(eye / scale + low, height)
-    return none
+    eye = _standing(mesh, scaled, normal, height * scale, device)
+    return Indoors(eye / scale + low, height) if len(eye) >= _FEWEST else none
 
 
-def _standing(
-    mesh: wp.Mesh, corner: np.ndarray, normal: np.ndarray, height: float, side: float, device: str
-) -> np.ndarray:
+def _standing(mesh: wp.Mesh, corner: np.ndarray, normal: np.ndarray, height: float, device: str) -> np.ndarray:
     """Eyes above the floors by the module's rules, float64 [P, 3]."""
     area = np.linalg.norm(normal, axis=1)
     ends = np.cumsum(np.where(normal[:, 1] >= _STEEPEST * area, area, 0.0))
@@ -126,7 +120,7 @@ def _standing(
     distance, front = distance[:, :-1], front[:, :-1]
     hit = front != 0
     enclosed = hit.mean(1) >= _ENCLOSED
-    outside = (front == side).sum(1) >= _FRONTS * hit.sum(1)
+    outside = (front == 1).sum(1) >= _FRONTS * hit.sum(1)
     return eye[free & enclosed & outside & (distance.min(1) >= _NEAREST * height)]
 
 
