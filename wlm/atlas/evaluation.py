@@ -26,8 +26,7 @@ NaN or Inf in decoded colours         error that names the decoder
 """
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -40,6 +39,7 @@ from wlm.atlas.charts import charts, welded
 from wlm.atlas.data import LightmappedMesh
 from wlm.atlas.decode import Decoder
 from wlm.atlas.model import AtlasModel, disk_ratio
+from wlm.atlas.stages import one_thread
 from wlm.atlas.views import corner_weights, mesh_charts, mesh_views, texel_triangles, visible_uv
 from wlm.errors import WlmError
 from wlm.interop import check_device
@@ -213,7 +213,7 @@ def compare(
     # Corners at one place in space have one number.
     place = torch.tensor(welded(mesh.position, np.zeros_like(mesh.uv), mesh.triangle), device=device)
     meter = Meter(progress, "evaluate", len(cameras))
-    with torch.no_grad(), _one_thread(device):
+    with torch.no_grad(), one_thread(device):
         peak, brightest = _peak(mesh, image, cameras, resolution)
         tallies = {name: _Tally() for name in decoders}
         for number, (visible, barycentric, uv) in enumerate(visible_uv(mesh, cameras, resolution, device)):
@@ -245,19 +245,6 @@ def _chart_labels(model: AtlasModel, mesh: LightmappedMesh, device: str) -> Samp
     corner = welded(mesh.position[mesh.triangle].reshape(-1, 3), model.uv.reshape(-1, 2), corner)
     number = torch.from_numpy(charts(corner)).to(device)
     return lambda uv, triangle, barycentric: number[triangle.long()]
-
-
-@contextmanager
-def _one_thread(device: str) -> Iterator[None]:
-    """Keeps torch to one thread on the CPU: its calls are short, and on a busy machine a second thread makes an
-    evaluation ten times slower, while on a free machine it gains little."""
-    threads = torch.get_num_threads()
-    try:
-        if device == "cpu":
-            torch.set_num_threads(1)
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 def _peak(

@@ -31,10 +31,15 @@ _VIEWS, _RESOLUTION = 50, 512  # as in `wlm.atlas.evaluation`, which takes long 
 @exclusive
 def compress(
     mesh_path: Annotated[Path, typer.Argument(metavar="MESH", help="A .glb, .gltf or .obj file.")],
-    lightmap_path: Annotated[
-        Path, typer.Argument(metavar="LIGHTMAP", help="Its lightmap: EXR, Radiance .hdr, KTX2, DDS, or PNG.")
-    ],
     output: Annotated[Path, output_option("DIR", "The folder to write to.")],
+    lightmap_path: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="LIGHTMAP",
+            help="Its lightmap: EXR, Radiance .hdr, KTX2, DDS, or PNG. Of a scene a .json that lists all; none: the "
+            "materials' own.",
+        ),
+    ] = None,
     mask: Annotated[
         Path | None, typer.Option(metavar="PNG", help="Which texels belong to a chart; default by the triangles.")
     ] = None,
@@ -71,6 +76,18 @@ def compress(
     """
     from wlm.atlas.model import Profile
 
+    if lightmap_path is None or lightmap_path.suffix.lower() == ".json":
+        lone = {"mask": mask, "node": node, "encoding": encoding, "flip": flip, "colour": colour, "resume": resume}
+        for name, value in lone.items():
+            if value:
+                raise WlmError(f"--{name}: expected with one lightmap alone; of a scene its list says it")
+        quiet_warp()
+        from wlm.cli.atlas_scene import compress_scene
+
+        changes = {"budget": budget, "views": views}
+        options = {"seed": seed, "device": device, "trust": trust}
+        compress_scene(mesh_path, lightmap_path, output, uv_set=uv_set, profile=profile, overrides=changes, **options)
+        return
     settings = Profile.load(profile).override({"budget": budget, "colour": colour, "views": views}, "--")
     quiet_warp()
     from wlm.atlas.data import load
@@ -128,6 +145,17 @@ def evaluate(
     if html_path is not None:
         check_output(html_path, ".html")
     quiet_warp()
+    from wlm.atlas.scene.exporter import is_scene
+
+    if is_scene(folder):
+        given = {"html": html_path, "mesh": mesh, "lightmap": lightmap, "mask": mask}
+        for name, value in given.items():
+            if value is not None:
+                raise WlmError(f"--{name}: expected with one lightmap alone, not with a scene")
+        from wlm.cli.atlas_scene import evaluate_scene
+
+        evaluate_scene(folder, views, resolution, json_path, device, trust)
+        return
     from wlm.atlas.evaluation import evaluate
     from wlm.atlas.exporter import read_folder, read_inputs
     from wlm.baselines.atlas import evaluate_rivals, share_of

@@ -1,7 +1,7 @@
 """Reads light of a scene: one entry of the table that all sheets share, then a bilinear read of each component.
 
-As `wlm_kernels.atlas.decode`, but that a sheet's tiles begin at a place of their own in the table, that texels are packed
-as RGB9E5, and that light is a sum of components, each a layer of the texture, by the state's factors.
+As `wlm_kernels.atlas.decode`, but that a sheet's tiles begin at a place of their own in the table, that texels are
+packed as RGB9E5, and that light is a sum of components, each a layer of the texture, by the state's factors.
 
 Read `wlm/atlas/scene/exact.py` first: the same in float64 NumPy.
 """
@@ -49,6 +49,12 @@ def _axis(entry: wp.uint16, place: float) -> _Axis:
     return axis
 
 
+@wp.func
+def _mixed(texels: wp.array3d[wp.uint32], layer: int, row: int, x: _Axis) -> wp.vec3:
+    """The light of a row between two texels."""
+    return wp.lerp(unpack_rgb9e5(texels[layer, row, x.low]), unpack_rgb9e5(texels[layer, row, x.high]), x.share)
+
+
 @wp.kernel
 def _read(
     # in:
@@ -76,11 +82,9 @@ def _read(
     count = factor.shape[0]
     for k in range(count):
         layer = sheets[s, 6] * count + k
-        top = wp.lerp(unpack_rgb9e5(texels[layer, y.low, x.low]), unpack_rgb9e5(texels[layer, y.low, x.high]), x.share)
-        low = wp.lerp(
-            unpack_rgb9e5(texels[layer, y.high, x.low]), unpack_rgb9e5(texels[layer, y.high, x.high]), x.share
-        )
-        total += wp.cw_mul(factor[k], wp.lerp(top, low, y.share))
+        top = _mixed(texels, layer, y.low, x)
+        bottom = _mixed(texels, layer, y.high, x)
+        total += wp.cw_mul(factor[k], wp.lerp(top, bottom, y.share))
     out[i] = total
 
 

@@ -222,9 +222,8 @@ def _from_set(path: str, content: dict[str, Any]) -> Description:
     """A `set.json`: one sheet."""
     entries = content["lightmaps"]
     fields = ("time_hours", "file")
-    if not isinstance(entries, list) or not all(
-        isinstance(each, dict) and set(fields) <= set(each) for each in entries
-    ):
+    entries = entries if isinstance(entries, list) else [None]
+    if not all(isinstance(each, dict) and set(fields) <= set(each) for each in entries):
         raise WlmError(f"{path}: lightmaps: expected a list of objects with time_hours and file")
     states = [f"{float(each['time_hours']):g} h" for each in entries if isinstance(each["time_hours"], int | float)]
     mask, files = content.get("mask"), [each["file"] for each in entries]

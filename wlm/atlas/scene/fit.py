@@ -12,7 +12,7 @@ as much in every object. The number of components is the one that leaves the lea
 
 import math
 import os
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -24,7 +24,7 @@ from wlm.atlas.scene.data import LightmappedScene
 from wlm.atlas.scene.mixture import components, factorise
 from wlm.atlas.scene.model import FACTOR_BITS, TEXEL_BITS, SceneModel, SceneProfile, SheetPlace
 from wlm.atlas.scene.seen import scene_weights
-from wlm.atlas.stages import Stages
+from wlm.atlas.stages import Stages, one_thread
 from wlm.atlas.tiles import Tiles, allocate, cut, errors, place, solve, solved
 from wlm.errors import WlmError
 from wlm.formats.shared_exponent import pack_rgb9e5
@@ -38,7 +38,25 @@ _AT_ONCE = 8192  # tiles
 _PERCENTILE = 99.9  # of a state's light: its peak
 _BRIGHT = 1024.0  # what a component's largest texel becomes: RGB9E5 has as many octaves below it as above
 _LEAST_GAIN = 2.0**-24
+_NO_ROOM = "budget: {:g} is less than the smallest tiles and their table take: expected more"
 _WIDTHS = np.linspace(0.7, 1.5, 9)  # of a page, over the square root of its number of samples
+
+
+@dataclass(frozen=True, eq=False)
+class _SceneTiles:
+    """The tiles of all sheets that have a weight.
+
+    Attributes:
+        component: For each component its light; they share index and weight. `index` counts within a sheet.
+        sheet: int [T], their sheets, ascending.
+    """
+
+    component: list[Tiles]
+    sheet: np.ndarray
+
+    def every(self, step: int) -> "_SceneTiles":
+        """Every n-th tile."""
+        return _SceneTiles([_part(each, slice(None, None, step)) for each in self.component], self.sheet[::step])
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +103,12 @@ def compress_scene(
     """
     device = interop.check_device(device)
     profile = SceneProfile.load(profile).override(overrides)
-    stages = Stages(device, progress)
+    with one_thread(device):
+        return _compressed(scene, profile, seed, Stages(device, progress))
+
+
+def _compressed(scene: LightmappedScene, profile: SceneProfile, seed: int, stages: Stages) -> SceneModel:
+    device = stages.device
     with stages("weights"):
         weights = scene_weights(scene, profile, seed, device)
     layout = _laid_out(scene, profile.tile)
@@ -95,31 +118,27 @@ def compress_scene(
         chosen, tried = _choose(scene, weights, peak, light, weight, layout, profile, stages)
         factor = factorise(np.sqrt(weight)[:, None] * light, chosen)
     with stages("tiles"):
-        parts, total = _parts(scene, factor, peak), sum(float(each.sum()) for each in weights)
-        tiles = [
-            _tiles(part, weight, profile.tile, float(weight.sum()) / total, device)
-            for part, weight in zip(parts, weights, strict=True)
-        ]
+        tiles = _tiles(_parts(scene, factor, peak), weights, profile.tile, device)
     with stages("curves"):
         sizes = _sizes(profile)
         error = _curves(tiles, sizes, factor, stages)
     with stages("allocate"):
         room = _room(scene, profile, layout, chosen)
-        sheet_of = np.repeat(np.arange(len(tiles)), [len(each[0].index) for each in tiles])
+        sheet_of = tiles.sheet
         size, first, page, shape = _placed(error, np.array(sizes), room, sheet_of, profile)
     with stages("solve"):
         texels, scale = _texels(tiles, size, first, page[sheet_of], shape, int(page.max()) + 1)
-    lut = _table(tiles, layout, size, first, sheet_of)
+    lut = _table(tiles, layout, size, first)
     sheets = tuple(
         SheetPlace(sheet.name, *sheet.mesh.mask.shape, row, column, *grid, int(number))
         for sheet, row, column, grid, number in zip(
             scene.sheets, layout.row, layout.column, layout.grid, page, strict=True
         )
     )
-    samples = np.bincount(sheet_of, size.prod(1), len(tiles)).astype(int)
+    samples, counts = (np.bincount(sheet_of, each, len(sheets)).astype(int) for each in (size.prod(1), None))
     report = {
         "components": chosen,
-        "tiles": [len(each[0].index) for each in tiles],
+        "tiles": counts.tolist(),
         "samples": samples.tolist(),
         "pages": int(page.max()) + 1,
         "error by components": tried,
@@ -191,35 +210,26 @@ def _choose(
         counts = [min(profile.components, states)]
     counts = [count for count in counts if _fits(scene, profile, layout, weights, count)]
     if not counts:
-        raise WlmError(
-            f"budget: {profile.budget:g} is less than the smallest tiles and their table take: expected more"
-        )
+        raise WlmError(_NO_ROOM.format(profile.budget))
     if len(counts) == 1:
         return counts[0], {}
-    total = sum(float(each.sum()) for each in weights)
-    tried: dict[str, float] = {}
+    sizes, tried = _sizes(profile), {}
     best, least = counts[0], math.inf
     for count in counts:
         factor = factorise(np.sqrt(weight)[:, None] * light, count)
         rest = np.einsum("mkc,knc->mnc", factor, components(light, factor)) - light
         lost = float(np.square(rest).mean(axis=(0, 2)) @ weight) / len(weight)
-        tiles, share = [], 0.0
-        for part, each in zip(_parts(scene, factor, peak), weights, strict=True):
-            whole = _tiles(part, each, profile.tile, float(each.sum()) / total, stages.device)
-            every = max(1, sum(math.prod(grid) for grid in layout.grid) // _TRIED)
-            rows = torch.arange(0, len(whole[0].index), every, device=stages.device)
-            share += len(rows) / max(1, len(whole[0].index)) * float(each.sum()) / total
-            tiles.append([Tiles(t.index[rows], t.light[rows], t.weight[rows], t.size) for t in whole])
-        sizes = _sizes(profile)
-        error = _curves(tiles, sizes, factor, Stages(stages.device))
-        all_tiles = sum(int((_tile_weight(each, profile.tile) > 0).sum()) for each in weights)
-        room = _room(scene, profile, layout, count) * error.shape[1] / all_tiles
+        tiles = _tiles(_parts(scene, factor, peak), weights, profile.tile, stages.device)
+        few = tiles.every(max(1, len(tiles.sheet) // _TRIED))
+        error = _curves(few, sizes, factor, Stages(stages.device))
+        room = _room(scene, profile, layout, count) * len(few.sheet) / len(tiles.sheet)
         number = allocate(error, np.array(sizes).prod(1).astype(float), room, 0.0)
-        left = float(error[number, np.arange(error.shape[1])].sum()) / max(share, 1e-9)
-        tried[str(count)] = lost + left
-        if lost + left < least:
-            best, least = count, lost + left
-        elif lost + left > 2.0 * least:
+        share = float(few.component[0].weight.double().sum() / tiles.component[0].weight.double().sum())
+        left = lost + float(error[number, np.arange(len(number))].sum()) / max(share, 1e-9)
+        tried[str(count)] = left
+        if left < least:
+            best, least = count, left
+        elif left > 1.5 * least:
             break
     return best, tried
 
@@ -254,11 +264,23 @@ def _parts(scene: LightmappedScene, factor: np.ndarray, peak: np.ndarray) -> lis
     return parts
 
 
-def _tiles(part: np.ndarray, weight: np.ndarray, tile: int, share: float, device: str) -> list[Tiles]:
-    """The tiles of a sheet's components; their weights add up to the sheet's share."""
-    cuts = [cut(each, weight, tile, device) for each in part]
-    weights = cuts[0].weight * share
-    return [replace(each, weight=weights) for each in cuts]
+def _tiles(parts: list[np.ndarray], weights: list[np.ndarray], tile: int, device: str) -> _SceneTiles:
+    """Cuts the components of all sheets into tiles, whose weights add up to 1."""
+    total = sum(float(each.sum()) for each in weights)
+    cuts = [
+        [cut(each, weight, tile, device) for each in part] if weight.any() else []
+        for part, weight in zip(parts, weights, strict=True)
+    ]
+    sheet = np.repeat(np.arange(len(cuts)), [len(each[0].index) if each else 0 for each in cuts])
+    shares = [float(weight.sum()) / total for weight in weights]
+    index = torch.cat([each[0].index for each in cuts if each])
+    weight = torch.cat([each[0].weight * share for each, share in zip(cuts, shares, strict=True) if each])
+    light = [torch.cat([each[k].light for each in cuts if each]) for k in range(len(parts[0]))]
+    return _SceneTiles([Tiles(index, each, weight, tile) for each in light], sheet)
+
+
+def _part(tiles: Tiles, rows: slice) -> Tiles:
+    return Tiles(tiles.index[rows], tiles.light[rows], tiles.weight[rows], tiles.size)
 
 
 def _sizes(profile: SceneProfile) -> list[tuple[int, int]]:
@@ -266,31 +288,26 @@ def _sizes(profile: SceneProfile) -> list[tuple[int, int]]:
     return [(nx, ny) for ny in sides for nx in sides]
 
 
-def _curves(tiles: list[list[Tiles]], sizes: list[tuple[int, int]], factor: np.ndarray, stages: Stages) -> np.ndarray:
+def _curves(tiles: _SceneTiles, sizes: list[tuple[int, int]], factor: np.ndarray, stages: Stages) -> np.ndarray:
     """The error of every tile at every size, mean over the states, float64 [sizes, T]."""
-    states = len(factor)
-    roots = [np.linalg.cholesky(_gram(factor[:, :, channel]) / states) for channel in range(3)]
+    roots = [np.linalg.cholesky(_gram(factor[:, :, channel]) / len(factor)) for channel in range(3)]
     root = torch.from_numpy(np.stack(roots, axis=2)).float().to(stages.device)  # [K, K, 3]
-    mixed = []
-    for sheet in tiles:
-        light = torch.stack([each.light for each in sheet])  # [K, T, 3, P]
-        for j in range(root.shape[1]):
-            values = (light * root[:, j, None, :, None]).sum(0)
-            mixed.append(Tiles(sheet[0].index, values, sheet[0].weight, sheet[0].size))
-    counts = [len(sheet[0].index) for sheet in tiles]
-    first = np.cumsum([0, *counts])
-    sheet_of = [number for number, sheet in enumerate(tiles) for _ in sheet]
-    result = np.zeros((len(sizes), first[-1]))
-    meter = Meter(stages.progress, "curves", len(sizes))
+    count, each = len(tiles.component), tiles.component[0]
+    result, meter = np.zeros((len(sizes), len(tiles.sheet))), Meter(stages.progress, "curves", len(sizes))
+    # Every mixture of every tile at once, a bounded number of them.
+    step = max(1, _AT_ONCE // count)
+    pieces = []
+    for at in range(0, len(tiles.sheet), step):
+        light = torch.stack([component.light[at : at + step] for component in tiles.component])  # [K, T, 3, P]
+        mixed = torch.einsum("ktcp,kjc->jtcp", light, root).reshape(-1, *light.shape[2:])
+        index, weight = (values[at : at + step] for values in (each.index, each.weight))
+        pieces.append((at, Tiles(index.repeat(count), mixed, weight.repeat(count, 1), each.size)))
     for i, (nx, ny) in enumerate(sizes):
         if meter.due(i):
             meter.report(i)
-        for number, each in zip(sheet_of, mixed, strict=True):
-            for at in range(0, counts[number], _AT_ONCE):
-                rows = slice(at, min(at + _AT_ONCE, counts[number]))
-                piece = Tiles(each.index[rows], each.light[rows], each.weight[rows], each.size)
-                value = errors(piece, solve(piece, nx, ny, _ROUGH)).cpu().numpy()
-                result[i, first[number] + rows.start : first[number] + rows.stop] += value
+        for at, piece in pieces:
+            error = errors(piece, solve(piece, nx, ny, _ROUGH)).reshape(count, -1).sum(0)
+            result[i, at : at + len(error)] = error.cpu().numpy()
     return result
 
 
@@ -323,9 +340,7 @@ def _placed(
         if shape[0] * shape[1] * pages <= room:
             return chosen, first, page, shape
         if chosen.prod(1).sum() <= error.shape[1]:
-            raise WlmError(
-                f"budget: {profile.budget:g} is less than the smallest tiles and their table take: expected more"
-            )
+            raise WlmError(_NO_ROOM.format(profile.budget))
         budget = min(budget, float(chosen.prod(1).sum())) * min(0.999 * room / (shape[0] * shape[1] * pages), 0.99)
 
 
@@ -356,31 +371,24 @@ def _packed(size: np.ndarray, page: np.ndarray) -> tuple[np.ndarray, tuple[int, 
 
 
 def _texels(
-    tiles: list[list[Tiles]], size: np.ndarray, first: np.ndarray, page: np.ndarray, shape: tuple[int, int], pages: int
+    tiles: _SceneTiles, size: np.ndarray, first: np.ndarray, page: np.ndarray, shape: tuple[int, int], pages: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """T_p, uint32 [pages K, Hp, Wp], and what each component was multiplied by, float64 [K, 3]."""
-    count = len(tiles[0])
-    light = np.zeros((pages, count, *shape, 3), np.float32)
-    start = 0
-    for sheet in tiles:
-        stop = start + len(sheet[0].index)
-        for k, each in enumerate(sheet):
-            at = zip(solved(each, size[start:stop]), first[start:stop], size[start:stop], page[start:stop], strict=True)
-            for values, (x, y), (nx, ny), number in at:
-                light[number, k, y : y + ny, x : x + nx] = values
-        start = stop
+    light = np.zeros((pages, len(tiles.component), *shape, 3), np.float32)
+    for k, each in enumerate(tiles.component):
+        for values, (x, y), (nx, ny), number in zip(solved(each, size), first, size, page, strict=True):
+            light[number, k, y : y + ny, x : x + nx] = values
     largest = light.max(axis=(0, 2, 3)).astype(np.float64)
     scale = np.divide(_BRIGHT, largest, out=np.ones_like(largest), where=largest > 0)
     return pack_rgb9e5(light * scale[None, :, None, None].astype(np.float32)).reshape(-1, *shape), scale
 
 
-def _table(
-    tiles: list[list[Tiles]], layout: _Layout, size: np.ndarray, first: np.ndarray, sheet_of: np.ndarray
-) -> np.ndarray:
+def _table(tiles: _SceneTiles, layout: _Layout, size: np.ndarray, first: np.ndarray) -> np.ndarray:
     """T_c, uint16 [Hc, Wc, 2]. Tiles without a weight show the page's first texel."""
     corner, texels = np.zeros((*layout.shape, 2), int), np.ones((*layout.shape, 2), int)
-    for number, sheet in enumerate(tiles):
-        row, column = np.divmod(sheet[0].index.cpu().numpy(), layout.grid[number][1])
-        at = row + layout.row[number], column + layout.column[number]
-        corner[at], texels[at] = first[sheet_of == number], size[sheet_of == number]
+    index = tiles.component[0].index.cpu().numpy()
+    columns = np.array([each[1] for each in layout.grid])[tiles.sheet]
+    row = index // columns + np.array(layout.row)[tiles.sheet]
+    column = index % columns + np.array(layout.column)[tiles.sheet]
+    corner[row, column], texels[row, column] = first, size
     return pack_entries(corner, texels)
