@@ -30,7 +30,7 @@ from wlm.errors import WlmError
 from wlm.formats.shared_exponent import pack_rgb9e5
 from wlm.system import Meter, OnProgress
 
-_SAMPLES = 30_000  # texels that factors are fitted to
+_SAMPLES = 8_000  # texels that factors are fitted to
 _TRIED = 256  # tiles that a number of components is tried on
 _COUNTS = (1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 20, 24, 32, 48, 64)
 _ROUGH = 3  # rounds of conjugate gradients of a curve

@@ -7,7 +7,7 @@ squares, Cichocki and Phan 2009). None is negative, so that textures of unsigned
 
 import numpy as np
 
-_ROUNDS = 200
+_ROUNDS = 100
 _LAST_ROUNDS = 60  # of the components alone, from a good start
 _TINY = 1e-12
 
