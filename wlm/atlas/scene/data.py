@@ -256,7 +256,10 @@ def _read_frames(description: Description, files: SheetFiles, trust: bool) -> tu
     for name in files.files:
         path = description.file(name, trust)
         light = read_light(path)[0] if files.encoding is None else read_encoded(path, files.encoding)
-        light = light[:: -1 if files.flip else 1, :, :3].astype(np.float32) * np.float32(files.intensity)
+        light = np.array(light[:: -1 if files.flip else 1, :, :3], np.float32)
+        if files.intensity != 1.0:
+            with np.errstate(invalid="ignore", over="ignore"):  # repaired as infinity, as it may be in the file
+                light *= np.float32(files.intensity)
         if frames and light.shape != frames[0].shape:
             size, first = ("x".join(map(str, each.shape[1::-1])) for each in (light, frames[0]))
             raise WlmError(f"{path}: expected {first} texels as the sheet's other lightmaps, found {size}")
@@ -286,6 +289,7 @@ def _sheet(
     mesh = checked_mesh(
         where, label, document, primitives, uv_set, first, mask, label, label, metres=True, choose=False
     )
+    frames[0] = first
     triangle = mesh.triangle[mesh.active]
     covered = _covered(mesh.uv, triangle, height, width)
     if mask is None:
@@ -301,9 +305,8 @@ def _repaired(frames: np.ndarray, mask: np.ndarray, covered: np.ndarray, label: 
     """Repairs lightmaps in place and fills their gaps; what was done."""
     warnings = []
     for frame in frames:
-        specks = replace_strays(frame, mask, covered)
-        if specks:
-            warnings.append(f"{label}: texels in specks far above all other light: replaced")
+        if specks := replace_strays(frame, mask, covered):
+            warnings.append(f"{label}: {specks} texels in specks far above all other light: replaced")
         warnings += [f"{label}: {text}" for text in repair(frame, mask, label)]
     return fill_gaps(frames, mask), warnings
 
