@@ -11,10 +11,9 @@ from builders.atlas_models import random_model
 from builders.lit_cube import DIRECTIONS, HEIGHT, WIDTH, lit_cube, waves
 
 from wlm import metrics
-from wlm.atlas.charts import mesh_charts
 from wlm.atlas.data import from_arrays
 from wlm.atlas.evaluation import compare, evaluate
-from wlm.atlas.views import visible_uv
+from wlm.atlas.views import mesh_charts, visible_uv
 from wlm.errors import WlmError
 from wlm.ops import raster
 from wlm.ops.views import View, sphere_views

@@ -21,7 +21,8 @@ def corners(parts: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         position = np.empty((len(s), 3))
         position[:, axis], position[:, axis - 1], position[:, axis - 2] = direction[axis], s, t
         positions.append(position)
-        triangles.append(square.reshape(-1, 3) + number * len(s))
+        outward = square.reshape(-1, 3)[:, :: int(direction[axis])]
+        triangles.append(outward + number * len(s))
         place = 0.5 + 0.45 * np.stack([s, t], 1)
         uvs.append((place + [number % 3, number // 3]) / [3.0, 2.0])
     return np.concatenate(positions), np.concatenate(triangles), np.concatenate(uvs)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import yaml
 from builders.atlas_meshes import charts, sheet, write_files
+from builders.gltf_scene import Thing, box, write_scene
 from builders.running import call, fails
 from PIL import Image
 
@@ -55,7 +56,8 @@ def test_compress_prints_one_table(inputs, tmp_path):
         assert f"{ratio:.2%}" in text
     assert "compress: weights" in call.stderr and os.listdir(tmp_path) == ["out"]
     report = json.loads((out / "report.json").read_text())
-    assert report["inputs"] == {"mesh": str(inputs[0]), "lightmap": str(inputs[1]), "mask": None}
+    files = {"mesh": str(inputs[0]), "lightmap": str(inputs[1]), "mask": None}
+    assert report["inputs"] == files | {"node": None, "encoding": None, "flip": False}
     assert (report["seed"], report["device"]) == (0, "cpu") and report["seconds"]["weights"] > 0
 
 
@@ -279,3 +281,21 @@ def test_info_of_a_plain_model(inputs, tmp_path):
     assert re.search(r"│ table +│ +none │", text) and re.search(r"│ method +│ +plain │", text)
     call("atlas", "evaluate", tmp_path / "out", "--views", 1, "--resolution", 32)
     assert "gone.wlm" in fails("atlas", "info", tmp_path / "gone.wlm")
+
+
+def test_a_scene_is_one_command(tmp_path):
+    """The lightmaps of all its nodes and states become one output, which is then scored."""
+    position, triangle, uv = box((0, 0, 0), (6, 3, 5), inward=True)
+    path = write_scene(tmp_path / "room.gltf", [Thing("room", position, triangle, [uv])])
+    row, column = np.mgrid[:32, :32] / 32
+    for name, share in (("day", 1.0), ("night", 0.2)):
+        write_exr(tmp_path / f"{name}.exr", (share * (1 + row * column) + (1 - share) * row)[..., None] * [1, 0.9, 0.8])
+    (tmp_path / "lights.json").write_text(json.dumps({"sheets": [{"files": ["day.exr", "night.exr"]}]}))
+    out = tmp_path / "out"
+    text = call("atlas", "compress", path, tmp_path / "lights.json", "-o", out, "--budget", "0.3", "--views", "1")
+    assert "scene.glb" in text and "colour_0.dds" in text and wlm.load(out / "scene.wlm").states == ("0", "1")
+    text = call("atlas", "evaluate", out, "--views", "2", "--resolution", "32", "--json", tmp_path / "r.json")
+    report = json.loads((tmp_path / "r.json").read_text())
+    assert report["inside_views"] == 2 and report["psnr"] > 35.0 and "PSNR dB, from inside" in text
+    words = ("atlas", "compress", path, tmp_path / "lights.json", "-o", out, "--flip")
+    assert "--flip: expected with one lightmap alone" in fails(*words)

@@ -71,6 +71,16 @@ def _atlas(path: Path) -> None:
     assert (light >= 0).all(), "decodes to negative light"
 
 
+def _atlas_scene(path: Path) -> None:
+    model = wlm.load(path, "atlas-scene")
+    check_digest(path)
+    check_finite(factor=model.factor)
+    generator = torch.Generator().manual_seed(0)
+    sheet = torch.randint(0, len(model.sheets), (64,), generator=generator)
+    light = model.decoder().read(torch.rand(64, 2, generator=generator), sheet, 0)
+    assert (light >= 0).all(), "decodes to negative light"
+
+
 def _network(path: Path) -> None:
     model = wlm.load(path, "smoke-network")
     check_digest(path)
@@ -294,6 +304,7 @@ READERS = (
         vary_artifact,
         _atlas,
     ),
+    Reader("atlas-scene", "a.wlm", stored("atlas-scene.wlm"), vary_artifact, _atlas_scene),
     Reader("smoke-network", "a.wlm", stored("smoke.wlm"), vary_artifact, _network),
     Reader("smoke-orders", "a.npz", _shipped_orders, vary_npz, _orders),
     Reader("smoke-pool", "pool.safetensors", corpus("pool.safetensors"), vary_artifact, _pool),

@@ -17,6 +17,7 @@ import numpy as np
 
 import wlm
 from wlm.atlas.exporter import geometry, read_folder
+from wlm.atlas.scene.description import read_description
 from wlm.bench.rows import read_json
 from wlm.config import load_settings
 from wlm.errors import WlmError
@@ -77,6 +78,20 @@ def _six_way(path: Path) -> None:
     six = read_six_way(path)
     check_finite(lightmaps=six.lightmaps, transparency=six.transparency, axes=six.camera.axes)
     assert six.lightmaps.shape[1:] == (six.camera.height, six.camera.width), "accepted with another size"
+
+
+def _light_lists() -> Sequence[bytes]:
+    """Lists of a scene's lightmaps, in each convention."""
+    sheets = [{"files": ["day.exr", "night.exr"], "name": "wall", "flip": True}]
+    rectangle = {"x": 0.5, "y": 0.5, "z": 0.0, "w": 0.5}
+    objects = {
+        "gltf": {"node": "a", "sheet": 0, "scale_offset": [0.5, 0.5, 0.0, 0.5]},
+        "unity": {"node": "a", "lightmapIndex": 0, "lightmapScaleOffset": rectangle},
+        "godot": {"path": "Level/a", "slice_index": 0, "uv_scale": [0.0, 0.5, 0.5, 0.5]},
+    }
+    head = {"states": ["day", "night"], "sheets": sheets, "uv_set": 1}
+    lists = [head | {"convention": name, "objects": [each]} for name, each in objects.items()]
+    return [json.dumps(each).encode() for each in (*lists, {"lightmaps": [{"time_hours": 6.5, "file": "a.exr"}]})]
 
 
 def _mask(path: Path) -> None:
@@ -360,6 +375,7 @@ _ALL = (
     Reader(
         "obj", "a.obj", corpus("mesh.obj"), lambda draw, data: vary_text(draw, data.decode(), ("f", "v")), _obj, _light
     ),
+    Reader("atlas-lights", "lights.json", _light_lists, _json, read_description),
     Reader("probes-npz", "a.npz", corpus("probes.npz"), vary_npz, _probes),
     Reader("probes-json", "a.json", corpus("probes.json", "probes-list.json"), _json, _probes),
     Reader("probes-lmbake", "a.lmbake", corpus("probes.lmbake"), _godot, _probes),

@@ -4,8 +4,6 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from wlm.atlas.data import LightmappedMesh
-
 
 def welded(position: np.ndarray, uv: np.ndarray, triangle: np.ndarray) -> np.ndarray:
     """Numbers the corners so that those with equal position and UV have one number.
@@ -53,16 +51,3 @@ def charts(corner: np.ndarray, active: np.ndarray | None = None) -> np.ndarray:
     _, first, number = np.unique(label, return_index=True, return_inverse=True)
     out[triangle] = np.argsort(np.argsort(first))[number]
     return out
-
-
-def mesh_charts(mesh: LightmappedMesh) -> np.ndarray:
-    """Numbers the charts of the lightmap's UVs.
-
-    Args:
-        mesh: The mesh.
-
-    Returns:
-        int32 [F]: active triangles connected by edges whose ends coincide in space and in UV space are one chart; -1
-        where a triangle isn't active.
-    """
-    return charts(welded(mesh.position, mesh.uv, mesh.triangle), mesh.active)

@@ -7,6 +7,10 @@ The stated behaviours. "Inside" means inside the mask. Each kind of repair or od
 input                                 behaviour
 ====================================  ================================================================
 no triangle, no UVs                   error
+several meshes that lie on each       the one that the lightmap fits best (`belonging`), the others left out; warning.
+other in UV space                     Error where none fits clearly better: `node` says which
+a lightmap that fits its charts       warning: `flip` turns it
+better upside down
 a primitive without the UV set        left out, and unchanged in what is written; warning
 a position or UV NaN or infinite,     error that names the primitive and the vertex
 a position beyond float32
@@ -17,6 +21,12 @@ no triangle with area                 error
 UVs of less than a texel in all       warning
 overlapping UVs, a mesh drawn twice   fine: what shares texels is lit alike; warning
 NaN, Inf inside                       the texel takes the value of the nearest finite one inside; warning
+a speck inside, less than 3 texels    the same
+wide, above 16 times the light's
+99.5th percentile
+NaN, Inf or above 4 times the light   the same, without a warning
+beside it, in a texel that a triangle
+touches, its centre outside
 no finite texel inside                error
 negative inside                       the channel is clamped to 0; warning
 above 65,504 inside (half's maximum)  the channel is clamped to 65,504; warning
@@ -40,13 +50,16 @@ from pathlib import Path
 
 import numpy as np
 
+from wlm.atlas.belonging import chart_map, choose_mesh, fits_flipped, named, replace_strays
 from wlm.atlas.coverage import covered_texels, touched_texels
 from wlm.errors import WlmError
+from wlm.formats.encoded import read_encoded
 from wlm.formats.gltf import GltfDocument, GltfPrimitive, document_from_arrays, read_gltf
 from wlm.formats.gltf_writer import Replacement, write_glb
 from wlm.formats.light import read_light
 from wlm.formats.mask import read_mask
 from wlm.formats.obj import read_obj
+from wlm.ops.indoors import Indoors, indoors
 from wlm.texels import fill_gaps, repair
 
 _FLAT = 1e-12  # ratio of area to longest side squared below which float64 can't tell a triangle from one without area
@@ -85,6 +98,7 @@ class LightmappedMesh:
         warnings: Repairs and oddities, one line each.
         document: The file that the mesh came from, or one made for it.
         parts: The primitives that make up the mesh, in order.
+        metres: Whether the unit is known to be the metre, as it is in glTF.
     """
 
     name: str
@@ -99,11 +113,17 @@ class LightmappedMesh:
     warnings: tuple[str, ...]
     document: GltfDocument
     parts: tuple[Part, ...]
+    metres: bool
 
     @cached_property
     def filled(self) -> np.ndarray:
         """The lightmap with charts dilated into the gaps between them, float32 [H, W, 3]; not to be written to."""
         return fill_gaps(self.lightmap, self.mask)
+
+    @cached_property
+    def indoors(self) -> Indoors:
+        """Where viewers can stand in it, see `wlm.ops.indoors`."""
+        return indoors(self.position, self.triangle, metres=self.metres)
 
 
 def load(
@@ -112,17 +132,24 @@ def load(
     *,
     mask_path: str | os.PathLike[str] | None = None,
     uv_set: int | None = None,
+    node: str | None = None,
+    encoding: str | None = None,
+    flip: bool = False,
     trust: bool = False,
 ) -> LightmappedMesh:
-    """Reads a mesh (`.glb`, `.gltf`, `.obj`) and its lightmap (EXR, Radiance, KTX2, DDS: see `wlm.formats.light`).
+    """Reads a mesh (`.glb`, `.gltf`, `.obj`) and its lightmap (EXR, Radiance, KTX2, DDS: see `wlm.formats.light`; PNG).
 
     Args:
-        mesh_path: The mesh. All primitives that its scene draws and that have the UV set make one mesh.
+        mesh_path: The mesh. All primitives that its scene draws and that have the UV set make one mesh, but where
+            they lie on each other in UV space, see the module's table.
         lightmap_path: Linear RGB; row 0 is v = 0 of glTF, v = 1 of an `.obj`.
         mask_path: A PNG of the lightmap's size; a texel belongs to a chart where any colour channel is above 0. None
             derives it from the triangles.
         uv_set: n of `TEXCOORD_n`, the lightmap's UVs. None takes 1, where engines and viewers look for them, if any
             primitive has it, else 0. An `.obj` has only 0.
+        node: The node that the lightmap belongs to, by its name, its mesh's name or its number; None: see above.
+        encoding: What the bytes of a PNG stand for, one of `wlm.formats.encoded.ENCODINGS`; None: it is no PNG.
+        flip: Whether the lightmap is upside down, its top row v = 1 of glTF.
         trust: Whether a glTF file may name files outside its folder, and draw more than its bytes account for
             (`wlm.formats.limits`).
 
@@ -147,11 +174,22 @@ def load(
         primitives = [primitive]
     else:
         document, primitives = read_gltf(path, trust)
-    lightmap, _ = read_light(lightmap_path)
-    lightmap = np.array(lightmap[..., :3], np.float32, order="C")
+    if node is not None:
+        primitives = named(str(path), primitives, node)
+    lightmap = read_light(lightmap_path)[0] if encoding is None else read_encoded(lightmap_path, encoding)
+    lightmap = np.array(lightmap[:: -1 if flip else 1, :, :3], np.float32, order="C")
     mask = None if mask_path is None else read_mask(Path(mask_path), lightmap_path, lightmap.shape[:2])
-    return _check(
-        str(path), path.stem, document, primitives, uv_set, lightmap, mask, str(lightmap_path), str(mask_path)
+    return checked_mesh(
+        str(path),
+        path.stem,
+        document,
+        primitives,
+        uv_set,
+        lightmap,
+        mask,
+        str(lightmap_path),
+        str(mask_path),
+        metres=suffix != ".obj",
     )
 
 
@@ -188,7 +226,7 @@ def from_arrays(
     document, primitive = _document(name, name, np.asarray(position), np.asarray(triangle), np.asarray(uv))
     with np.errstate(over="ignore"):  # float64 beyond float32 becomes Inf and is repaired as Inf
         copied = np.array(lightmap, np.float32, order="C")
-    return _check(name, name, document, [primitive], 0, copied, valid, f"{name}: lightmap", f"{name}: mask")
+    return checked_mesh(name, name, document, [primitive], 0, copied, valid, f"{name}: lightmap", f"{name}: mask")
 
 
 def write_mesh(
@@ -251,7 +289,7 @@ def _document(
         return document_from_arrays(position[used], corner.reshape(-1, 3), uv[used], name)
 
 
-def _check(
+def checked_mesh(
     where: str,
     name: str,
     document: GltfDocument,
@@ -261,10 +299,26 @@ def _check(
     mask: np.ndarray | None,  # [H, W]
     lightmap_name: str,
     mask_name: str,
+    metres: bool = False,
+    choose: bool = True,
 ) -> LightmappedMesh:
-    """Applies the module's table to the content of the files."""
+    """Applies the module's table to the content of the files.
+
+    Args:
+        where, name: The file and the mesh, for messages.
+        document, primitives: As read.
+        uv_set: As for `load`.
+        lightmap: float32 [H, W, 3], repaired in place.
+        mask: bool [H, W]; None: derived.
+        lightmap_name, mask_name: For messages.
+        metres: As in `LightmappedMesh`.
+        choose: Whether of meshes that lie on each other in UV space one is chosen.
+    """
     warnings: list[str] = []
     primitives, uv_set = _select(where, primitives, uv_set, warnings)
+    if choose:
+        primitives, left_out = choose_mesh(where, name, primitives, uv_set, lightmap)
+        warnings += left_out
     parts, vertices, triangles = [], 0, 0
     for primitive in primitives:
         _check_finite(where, primitive, uv_set)
@@ -315,10 +369,27 @@ def _check(
                 f"{name}: {_count(missed, 'texel')} of {covered} that triangles cover are outside the mask: "
                 f"is it of another UV set than TEXCOORD_{uv_set}, or upside down?"
             )
+    if fits_flipped(lightmap, chart_map(position, uv, triangle[active], height, width)):
+        warnings.append(f"{lightmap_name}: fits the mesh's charts better upside down: see flip (--flip)")
+    specks = replace_strays(lightmap, mask, coverage > 0)
+    if specks:
+        warnings.append(f"{lightmap_name}: {_count(specks, 'texel')} in specks far above all other light: replaced")
     warnings += [f"{lightmap_name}: {text}" for text in repair(lightmap, mask, lightmap_name)]
     source = _hash(position, triangle, uv, lightmap, mask)
     return LightmappedMesh(
-        name, position, triangle, uv, active, lightmap, mask, uv_set, source, tuple(warnings), document, tuple(parts)
+        name,
+        position,
+        triangle,
+        uv,
+        active,
+        lightmap,
+        mask,
+        uv_set,
+        source,
+        tuple(warnings),
+        document,
+        tuple(parts),
+        metres,
     )
 
 

@@ -1,11 +1,13 @@
 """Error of a decoded lightmap in views of the mesh (lightmap-uv-clustering-cascade, section 4.1.4).
 
-The mesh is drawn from cameras around it, `wlm.ops.views`. A pixel is the lightmap's linear RGB at its surface
+The mesh is drawn from cameras around it, `wlm.ops.views`, and as often by viewers who stand in it, where they can,
+`wlm.ops.indoors`. A pixel is the lightmap's linear RGB at its surface
 point, without any shading. The reference is the original lightmap read bilinearly, clamped, its gaps filled from the
 nearest texel of a chart. Only covered pixels count; a view without any is left out.
 
 The peak of every PSNR and the range of SSIM are one number: maximum less minimum of the reference's covered pixels of
-all views. (The paper doesn't name its peak; one per view would change with the cameras.)
+all views. (The paper doesn't name its peak; one per view would change with the cameras.) A maximum above twice the
+99.9th percentile counts as that: one bright texel must not make every error small.
 
 The stated behaviours:
 
@@ -24,26 +26,27 @@ NaN or Inf in decoded colours         error that names the decoder
 """
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import torch
 from scipy.ndimage import distance_transform_edt
 
 from wlm import system
-from wlm.atlas.charts import charts, mesh_charts, welded
+from wlm.atlas.charts import charts, welded
 from wlm.atlas.data import LightmappedMesh
 from wlm.atlas.decode import Decoder
 from wlm.atlas.model import AtlasModel, disk_ratio
-from wlm.atlas.views import corner_weights, texel_triangles, visible_uv
+from wlm.atlas.stages import one_thread
+from wlm.atlas.views import corner_weights, mesh_charts, mesh_views, texel_triangles, visible_uv
 from wlm.errors import WlmError
 from wlm.interop import check_device
 from wlm.metrics import SSIM_WINDOW
 from wlm.metrics.error import psnr_from_mse
 from wlm.ops import raster
-from wlm.ops.views import View, sphere_views
+from wlm.ops.views import View, Viewpoint
 from wlm.system import Meter, OnProgress
 
 Sampler = Callable[[torch.Tensor, torch.Tensor, torch.Tensor], torch.Tensor]
@@ -52,6 +55,9 @@ linear RGB float [N, 3] or, for labels, to int [N]; all on one device."""
 
 VIEWS, RESOLUTION = 50, 512
 """Cameras of a score, as many as in section 4.1.4, and pixels along a side of a view, which the paper doesn't state."""
+
+_PERCENTILE, _ABOVE = 0.999, 2.0  # of the peak
+_BINS, _OCTAVES = 8192, (-32.0, 32.0)  # of a histogram of light
 
 # Wang et al. 2004, as in `wlm.metrics.structural`.
 _SIGMA, _C1, _C2 = 1.5, 0.01, 0.03
@@ -68,8 +74,12 @@ class Score(system.Report):
         name: The mesh's name.
         views: Number of views that show the mesh.
         pixels: Covered pixels in all of them.
-        peak: Range of the reference there, of the PSNRs and SSIM.
+        peak: Range of the reference there, of the PSNRs and SSIM, see the module.
+        brightest: Maximum of the reference there.
         psnr: dB, the mean over views of each view's.
+        around_psnr, inside_psnr: The same of the views from around the mesh and of those from inside it.
+        inside_views: Number of views from inside that show the mesh.
+        eye_height: Of the viewers inside, above their floor, in the scene's unit; NaN where nobody can stand.
         psnr_worst: dB, of the worst view.
         worst_view: Its number among the cameras; -1: no view, or no peak.
         one_minus_ssim: 1 less the mean SSIM of each view's covered pixels, averaged over the views: a Gaussian window
@@ -85,7 +95,12 @@ class Score(system.Report):
     views: int
     pixels: int
     peak: float
+    brightest: float
     psnr: float
+    around_psnr: float
+    inside_psnr: float
+    inside_views: int
+    eye_height: float
     psnr_worst: float
     worst_view: int
     one_minus_ssim: float
@@ -118,7 +133,7 @@ def evaluate(
     model: AtlasModel,
     mesh: LightmappedMesh,
     *,
-    views: int | Sequence[View] = VIEWS,
+    views: int | Sequence[View | Viewpoint] = VIEWS,
     resolution: int = RESOLUTION,
     device: str = "cpu",
     progress: OnProgress | None = None,
@@ -156,7 +171,7 @@ def compare(
     mesh: LightmappedMesh,
     decoders: Mapping[str, Sampler],
     *,
-    views: int | Sequence[View] = VIEWS,
+    views: int | Sequence[View | Viewpoint] = VIEWS,
     resolution: int = RESOLUTION,
     device: str = "cpu",
     labels: Mapping[str, Sampler] | None = None,
@@ -169,7 +184,7 @@ def compare(
     Args:
         mesh: The mesh with its original lightmap.
         decoders: By name; see `Sampler`.
-        views: Number of cameras, spread evenly on the sphere; or the cameras.
+        views: Number of cameras, spread evenly on the sphere, and of views from inside; or the cameras.
         resolution: Pixels along a side of a view, 1 to 16,384.
         device: "cpu" or "cuda:N", where the decoders are called.
         labels: For some of the decoders, numbers of their own charts or tiles: their seams are where these change.
@@ -191,14 +206,15 @@ def compare(
     unknown = sorted(labels.keys() - decoders.keys())
     if unknown:
         raise ValueError(f"labels: expected names of decoders, got {', '.join(unknown)}")
-    cameras = sphere_views(views) if isinstance(views, int) else list(views)
+    cameras = mesh_views(mesh, views) if isinstance(views, int) else list(views)
+    inside = [isinstance(camera, Viewpoint) for camera in cameras]
     image = torch.tensor(mesh.filled, device=device)
     chart = torch.tensor(mesh_charts(mesh), device=device)
     # Corners at one place in space have one number.
     place = torch.tensor(welded(mesh.position, np.zeros_like(mesh.uv), mesh.triangle), device=device)
     meter = Meter(progress, "evaluate", len(cameras))
-    with torch.no_grad(), _one_thread(device):
-        peak = _peak(mesh, image, cameras, resolution)
+    with torch.no_grad(), one_thread(device):
+        peak, brightest = _peak(mesh, image, cameras, resolution)
         tallies = {name: _Tally() for name in decoders}
         for number, (visible, barycentric, uv) in enumerate(visible_uv(mesh, cameras, resolution, device)):
             hit = visible >= 0
@@ -218,7 +234,9 @@ def compare(
             if meter.due(number + 1):
                 meter.report(number + 1)
         texel_errors = _texel_errors(mesh, image, decoders)
-    return {name: tally.score(mesh.name, peak, texel_errors[name]) for name, tally in tallies.items()}
+    height = mesh.indoors.height if any(inside) else math.nan
+    facts = {"name": mesh.name, "peak": peak, "brightest": brightest, "eye_height": height}
+    return {name: tally.score(facts, texel_errors[name], inside) for name, tally in tallies.items()}
 
 
 def _chart_labels(model: AtlasModel, mesh: LightmappedMesh, device: str) -> Sampler:
@@ -229,29 +247,28 @@ def _chart_labels(model: AtlasModel, mesh: LightmappedMesh, device: str) -> Samp
     return lambda uv, triangle, barycentric: number[triangle.long()]
 
 
-@contextmanager
-def _one_thread(device: str) -> Iterator[None]:
-    """Keeps torch to one thread on the CPU: its calls are short, and on a busy machine a second thread makes an
-    evaluation ten times slower, while on a free machine it gains little."""
-    threads = torch.get_num_threads()
-    try:
-        if device == "cpu":
-            torch.set_num_threads(1)
-        yield
-    finally:
-        torch.set_num_threads(threads)
+def _peak(
+    mesh: LightmappedMesh, image: torch.Tensor, cameras: Sequence[View | Viewpoint], resolution: int
+) -> tuple[float, float]:
+    """The range of the reference in all views, see the module, and its maximum.
 
-
-def _peak(mesh: LightmappedMesh, image: torch.Tensor, cameras: Sequence[View], resolution: int) -> float:
-    """Maximum less minimum of the reference in all views. Drawing twice is cheaper than storing all views."""
+    Drawing twice is cheaper than storing all views.
+    """
     low, high = math.inf, -math.inf
+    count = torch.zeros(_BINS, dtype=torch.float64)
     for visible, _, uv in visible_uv(mesh, cameras, resolution, str(image.device)):
         colour = raster.texture(image, uv[visible >= 0])
         if len(colour):
             low, high = min(low, float(colour.min())), max(high, float(colour.max()))
+            octave = colour.clamp(min=2.0 ** _OCTAVES[0]).log2().float().cpu()
+            count += torch.histc(octave, _BINS, *_OCTAVES)
     if high < low:
-        return math.nan
-    return high - low if high - low > _ROUNDING * high else 0.0
+        return math.nan, math.nan
+    share = count.cumsum(0) / count.sum()
+    top = int(torch.searchsorted(share, _PERCENTILE)) + 1
+    top = 2.0 ** (_OCTAVES[0] + (_OCTAVES[1] - _OCTAVES[0]) * top / _BINS)
+    peak = min(high, max(_ABOVE * top, low)) - low
+    return (peak if peak > _ROUNDING * high else 0.0), high
 
 
 _Points = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
@@ -299,17 +316,23 @@ class _Tally:
         self.rest += float(absolute[~border].sum())
         self.seam_pixels += int(border.sum())
 
-    def score(self, name: str, peak: float, texel_mse: float) -> Score:
+    def score(self, facts: dict[str, Any], texel_mse: float, inside: Sequence[bool]) -> Score:
+        peak = facts["peak"]
         psnr = [psnr_from_mse(mse, peak) for mse in self.mse]
+        kinds: tuple[list[float], list[float]] = [], []  # around the mesh, inside
+        for each, number in zip(psnr, self.view, strict=True):
+            kinds[inside[number]].append(each)
         ssim = [value for value in self.ssim if not math.isnan(value)]
         seam, rest = _ratio(self.seam, self.seam_pixels), _ratio(self.rest, self.pixels - self.seam_pixels)
         measured = bool(psnr) and peak > 0.0
         return Score(
-            name=name,
+            **facts,
             views=len(psnr),
             pixels=self.pixels,
-            peak=peak,
             psnr=_ratio(sum(psnr), len(psnr)),
+            around_psnr=_ratio(sum(kinds[0]), len(kinds[0])),
+            inside_psnr=_ratio(sum(kinds[1]), len(kinds[1])),
+            inside_views=len(kinds[1]),
             psnr_worst=min(psnr, default=math.nan),
             worst_view=self.view[int(np.argmin(psnr))] if measured else -1,
             one_minus_ssim=1.0 - _ratio(sum(ssim), len(ssim)),

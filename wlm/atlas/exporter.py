@@ -43,6 +43,8 @@ MASK_FILE = "mask.png"
 SHADER_FILE = "atlas.glsl"
 REPORT_FILE = "report.json"
 _TEXTURES = tuple(name + suffix for name in ("lut", "colour") for suffix in (".exr", ".ktx2", ".dds"))
+READING = {"node": str, "encoding": str, "flip": bool}
+"""Options of `load` that the report keeps among the inputs."""
 _FILES = (MODEL_FILE, MESH_FILE, MASK_FILE, *_TEXTURES, SHADER_FILE, REPORT_FILE)
 _MOST_SIDE = 16384  # texels of a texture on GPUs
 _LUT_FORMATS = {"tiles": "R16G16_UINT", "cascade": "R16G16_UNORM"}
@@ -82,7 +84,7 @@ def export(
         directory: The folder; made if it isn't there.
         mesh: The mesh that was compressed.
         facts: More entries of `report.json`, plain JSON values. "inputs", a mapping with the paths "mesh",
-            "lightmap" and "mask" (None: none), is what `read_inputs` reads.
+            "lightmap" and "mask" (None: none) and the options of `READING`, is what `read_inputs` reads.
 
     Returns:
         The files written, `report.json` last.
@@ -165,7 +167,11 @@ def geometry(output: Output) -> LightmappedMesh:
     if type(number) is not int:
         raise WlmError(f"{output.folder / REPORT_FILE}: uv_set: expected a whole number, found {one_line(number, 60)}")
     _, primitives = read_gltf(path)
+    # A report of an earlier version names no parts: they are all that have the set.
+    of_mesh = output.report.get("parts")
     parts = [each for each in primitives if number in each.uv]
+    if isinstance(of_mesh, list):
+        parts = [each for each in parts if [each.node, each.primitive] in of_mesh]
     triangles, expected = sum(len(each.triangle) for each in parts), output.report.get("triangles")
     if triangles != expected or not triangles:
         raise WlmError(f"{path}: expected {expected} triangles with TEXCOORD_{number}, found {triangles}")
@@ -182,7 +188,7 @@ def geometry(output: Output) -> LightmappedMesh:
         mask,
         name=str(path),
     )
-    return dataclasses.replace(mesh, source=model.source)
+    return dataclasses.replace(mesh, source=model.source, metres=output.report.get("metres") is True)
 
 
 def read_inputs(
@@ -212,7 +218,14 @@ def read_inputs(
             raise WlmError(f"{output.folder / REPORT_FILE}: inputs.{name}: expected a path, found none; give --{name}")
         if not paths[name].is_file():
             raise WlmError(f"{paths[name]}: no such {name}; if it has moved, give --{name}")
-    options = {"mask_path": paths.get("mask"), "uv_set": output.report.get("uv_set"), "trust": trust}
+    reading = {name: stored[name] for name in READING if stored.get(name) is not None}
+    for name, value in reading.items():
+        if type(value) is not READING[name]:
+            raise WlmError(
+                f"{output.folder / REPORT_FILE}: inputs.{name}: expected {READING[name].__name__}, found "
+                f"{one_line(value, 60)}"
+            )
+    options = {"mask_path": paths.get("mask"), "uv_set": output.report.get("uv_set"), "trust": trust} | reading
     mesh = load(paths["mesh"], paths["lightmap"], **options)
     if mesh.source != output.model.source:
         names = ", ".join(map(str, paths.values()))
@@ -285,7 +298,9 @@ def _report(model: AtlasModel, mesh: LightmappedMesh, new_set: int | None, model
         "colour_size": [model.texels.shape[1], model.texels.shape[0]],
         "lut_size": [model.lut.shape[1], model.lut.shape[0]],
         "triangles": len(mesh.triangle),
+        "parts": [[each.primitive.node, each.primitive.primitive] for each in mesh.parts],
         "uv_set": mesh.uv_set,
+        "metres": mesh.metres,
         "new_uv_set": new_set,
         "cr": model.compression_ratio,
         "cr_disk": disk_ratio(model_bytes, mesh.mask.shape),

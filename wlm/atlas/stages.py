@@ -34,3 +34,16 @@ class Stages:
         if self.device != "cpu":
             torch.cuda.synchronize(self.device)
         self.seconds[name] = meter.seconds
+
+
+@contextmanager
+def one_thread(device: str) -> Iterator[None]:
+    """Keeps torch to one thread on the CPU: its calls are short, and on a busy machine a second thread makes an
+    evaluation ten times slower, while on a free machine it gains little."""
+    threads = torch.get_num_threads()
+    try:
+        if device == "cpu":
+            torch.set_num_threads(1)
+        yield
+    finally:
+        torch.set_num_threads(threads)

@@ -1,7 +1,7 @@
 """A mesh and its lightmap, seen: the surface point at each pixel of a view, and at each texel.
 
-The cameras are those of `wlm.ops.views`. A triangle that isn't `active` hides what is behind it, but its pixels count
-as uncovered.
+The cameras are those of `wlm.ops.views`, and viewers who stand in the mesh, `wlm.ops.indoors`. A triangle that isn't
+`active` hides what is behind it, but its pixels count as uncovered.
 """
 
 from collections.abc import Iterator, Sequence
@@ -9,14 +9,26 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 import torch
 
+from wlm.atlas.charts import charts, welded
 from wlm.atlas.data import LightmappedMesh
 from wlm.interop import check_device
 from wlm.ops import raster as ops_raster
-from wlm.ops.views import View, visible_points
+from wlm.ops.views import View, Viewpoint, sphere_views, visible_points
+
+
+def mesh_views(mesh: LightmappedMesh, count: int, seed: int | None = None) -> list[View | Viewpoint]:
+    """Makes the views of a mesh: cameras around it and, where viewers can stand in it, as many views from inside.
+
+    Args:
+        mesh: The mesh.
+        count: Number of cameras around it, at least 0.
+        seed: None spreads them evenly; else they are random. Views from inside follow it too.
+    """
+    return [*sphere_views(count, seed), *mesh.indoors.views(count, 0 if seed is None else seed)]
 
 
 def visible_uv(
-    mesh: LightmappedMesh, views: Sequence[View], resolution: int, device: str
+    mesh: LightmappedMesh, views: Sequence[View | Viewpoint], resolution: int, device: str
 ) -> Iterator[tuple[torch.Tensor, torch.Tensor, torch.Tensor]]:
     """Draws the mesh from each camera.
 
@@ -50,7 +62,7 @@ def corner_weights(barycentric: torch.Tensor) -> torch.Tensor:
 
 
 def visibility(
-    mesh: LightmappedMesh, views: Sequence[View], resolution: int, height: int, width: int, device: str
+    mesh: LightmappedMesh, views: Sequence[View | Viewpoint], resolution: int, height: int, width: int, device: str
 ) -> np.ndarray:
     """Counts the pixels that show each part of UV space.
 
@@ -118,3 +130,16 @@ def surface_points(mesh: LightmappedMesh, count: int, random: np.random.Generato
     triangle = np.searchsorted(ends, random.random(count) * ends[-1], side="right").clip(max=len(ends) - 1)
     root, share = np.sqrt(random.random(count)), random.random(count)
     return triangle, np.stack([1.0 - root, root * (1.0 - share), root * share], 1)
+
+
+def mesh_charts(mesh: LightmappedMesh) -> np.ndarray:
+    """Numbers the charts of the lightmap's UVs.
+
+    Args:
+        mesh: The mesh.
+
+    Returns:
+        int32 [F]: active triangles connected by edges whose ends coincide in space and in UV space are one chart; -1
+        where a triangle isn't active.
+    """
+    return charts(welded(mesh.position, mesh.uv, mesh.triangle), mesh.active)

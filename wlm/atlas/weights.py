@@ -6,12 +6,10 @@ import numpy as np
 import torch
 from scipy.ndimage import maximum_filter, minimum_filter
 
-from wlm.atlas.charts import mesh_charts
 from wlm.atlas.coverage import covered_texels
 from wlm.atlas.data import LightmappedMesh
 from wlm.atlas.model import Profile
-from wlm.atlas.views import surface_points, texel_triangles, visibility
-from wlm.ops.views import sphere_views
+from wlm.atlas.views import mesh_charts, mesh_views, surface_points, texel_triangles, visibility
 
 _BORDER = 2  # cells of the fine grid: one texel
 _RESOLUTION = 768  # pixels along a side of a view that visibility is counted in
@@ -62,14 +60,41 @@ def weights(grid: FineGrid, profile: Profile, seed: int) -> np.ndarray:
     if not profile.views:
         visible = _areas(mesh, height, width, seed)
     else:
-        views = sphere_views(profile.views, seed)
-        visible = visibility(mesh, views, _RESOLUTION, height, width, grid.device)
+        visible = _seen(grid, profile.views, seed)
+    return spread(grid, visible, profile)
+
+
+def spread(grid: FineGrid, visible: np.ndarray, profile: Profile, mean: float | None = None) -> np.ndarray:
+    """Weights by counts of pixels: those, a little where there are none, and more at borders of charts.
+
+    Args:
+        grid: The grid.
+        visible: [2 H, 2 W], pixels that show each cell.
+        profile: `unseen` and `border`.
+        mean: Of the pixels of a cell, of which what isn't seen has a fraction; None: this lightmap's.
+
+    Returns:
+        As `weights`.
+    """
     used = grid.covered | (visible > 0)
     if not used.any():  # the mesh is smaller than a cell, and no pixel shows it
-        used = np.repeat(np.repeat(mesh.mask, 2, 0), 2, 1)
-    mean = visible[used].mean() or 1.0
+        used = np.repeat(np.repeat(grid.mesh.mask, 2, 0), 2, 1)
+    if mean is None:
+        mean = visible[used].mean() or 1.0
     result = np.where(used, visible + profile.unseen * mean, 0.0)
     return np.where(grid.border, profile.border * result, result)
+
+
+def _seen(grid: FineGrid, count: int, seed: int) -> np.ndarray:
+    """Pixels of random views that show each cell, float64 [2 H, 2 W]; views from inside count as much as the others."""
+    views = mesh_views(grid.mesh, count, seed)
+    around, inside = (
+        visibility(grid.mesh, each, _RESOLUTION, grid.height, grid.width, grid.device)
+        for each in (views[:count], views[count:])
+    )
+    if around.any() and inside.any():
+        inside *= around.sum() / inside.sum()
+    return around + inside
 
 
 def _areas(mesh: LightmappedMesh, height: int, width: int, seed: int) -> np.ndarray:

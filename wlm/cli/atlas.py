@@ -31,16 +31,28 @@ _VIEWS, _RESOLUTION = 50, 512  # as in `wlm.atlas.evaluation`, which takes long 
 @exclusive
 def compress(
     mesh_path: Annotated[Path, typer.Argument(metavar="MESH", help="A .glb, .gltf or .obj file.")],
-    lightmap_path: Annotated[
-        Path, typer.Argument(metavar="LIGHTMAP", help="Its lightmap: EXR, Radiance .hdr, KTX2 or DDS.")
-    ],
     output: Annotated[Path, output_option("DIR", "The folder to write to.")],
+    lightmap_path: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="LIGHTMAP",
+            help="Its lightmap: EXR, Radiance .hdr, KTX2, DDS, or PNG. Of a scene a .json that lists all; none: the "
+            "materials' own.",
+        ),
+    ] = None,
     mask: Annotated[
         Path | None, typer.Option(metavar="PNG", help="Which texels belong to a chart; default by the triangles.")
     ] = None,
     uv_set: Annotated[
         int | None, typer.Option("--uv-set", min=0, help="n of TEXCOORD_n, the lightmap's UVs; default 1, else 0.")
     ] = None,
+    node: Annotated[
+        str | None, typer.Option(help="The node that the lightmap belongs to; default the one that it fits best.")
+    ] = None,
+    encoding: Annotated[
+        str | None, typer.Option(help="What a PNG's bytes stand for: linear, srgb, rgbm, dldr or rgbe.")
+    ] = None,
+    flip: Annotated[bool, typer.Option("--flip", help="The lightmap is upside down: its top row is v = 1.")] = False,
     profile: Annotated[
         str, typer.Option(help="standard, bc6h, astc, compact, cascade, paper, or a YAML file.")
     ] = "standard",
@@ -64,6 +76,18 @@ def compress(
     """
     from wlm.atlas.model import Profile
 
+    if lightmap_path is None or lightmap_path.suffix.lower() == ".json":
+        lone = {"mask": mask, "node": node, "encoding": encoding, "flip": flip, "colour": colour, "resume": resume}
+        for name, value in lone.items():
+            if value:
+                raise WlmError(f"--{name}: expected with one lightmap alone; of a scene its list says it")
+        quiet_warp()
+        from wlm.cli.atlas_scene import compress_scene
+
+        changes = {"budget": budget, "views": views}
+        options = {"seed": seed, "device": device, "trust": trust}
+        compress_scene(mesh_path, lightmap_path, output, uv_set=uv_set, profile=profile, overrides=changes, **options)
+        return
     settings = Profile.load(profile).override({"budget": budget, "colour": colour, "views": views}, "--")
     quiet_warp()
     from wlm.atlas.data import load
@@ -75,7 +99,8 @@ def compress(
 
     device = check_device(device)
     claim(output, REPORT_FILE, FORMAT)
-    mesh = load(mesh_path, lightmap_path, mask_path=mask, uv_set=uv_set, trust=trust)
+    reading = {"node": node, "encoding": encoding, "flip": flip}
+    mesh = load(mesh_path, lightmap_path, mask_path=mask, uv_set=uv_set, trust=trust, **reading)
     for warning in mesh.warnings:
         note(f"warning: {warning}")
     options = {"seed": seed, "device": device}
@@ -83,7 +108,7 @@ def compress(
     if resume and not checkpoint.resumed:
         note(f"{checkpoint.path}: there is nothing to resume; starting at the first stage")
     inputs = {"mesh": mesh_path, "lightmap": lightmap_path, "mask": mask}
-    facts = {"inputs": {name: None if path is None else str(path.resolve()) for name, path in inputs.items()}}
+    facts = {"inputs": {name: path and str(path.resolve()) for name, path in inputs.items()} | reading}
     with running("compress", checkpoint.path) as progress:
         model = compress(mesh, settings, progress=progress, checkpoint=checkpoint, **options)
         files = export(model, output, mesh, facts | options)
@@ -104,7 +129,7 @@ def compress(
 @app.command()
 def evaluate(
     folder: _Folder,
-    views: Annotated[int, typer.Option(min=1, max=4096, help="Cameras, spread evenly on a sphere.")] = _VIEWS,
+    views: Annotated[int, typer.Option(min=1, max=4096, help="Cameras around the mesh; as many inside.")] = _VIEWS,
     resolution: Annotated[int, typer.Option(min=16, max=16384, help="Pixels along a side of a view.")] = _RESOLUTION,
     json_path: ReportFile = None,
     html_path: PageFile = None,
@@ -120,6 +145,17 @@ def evaluate(
     if html_path is not None:
         check_output(html_path, ".html")
     quiet_warp()
+    from wlm.atlas.scene.exporter import is_scene
+
+    if is_scene(folder):
+        given = {"html": html_path, "mesh": mesh, "lightmap": lightmap, "mask": mask}
+        for name, value in given.items():
+            if value is not None:
+                raise WlmError(f"--{name}: expected with one lightmap alone, not with a scene")
+        from wlm.cli.atlas_scene import evaluate_scene
+
+        evaluate_scene(folder, views, resolution, json_path, device, trust)
+        return
     from wlm.atlas.evaluation import evaluate
     from wlm.atlas.exporter import read_folder, read_inputs
     from wlm.baselines.atlas import evaluate_rivals, share_of
@@ -132,6 +168,10 @@ def evaluate(
     with running("evaluate") as progress:
         report = evaluate(output.model, original, **options, progress=progress, file_bytes=output.model_bytes)
         ((rival, score),) = evaluate_rivals(output.model, original, **options)
+    if not report.views:
+        raise WlmError(
+            f"{folder}: cannot be scored: neither a camera around the mesh nor a viewer inside sees its charts"
+        )
     if html_path is not None:
         from wlm.view.reports import atlas_report
 
@@ -152,6 +192,10 @@ def evaluate(
 # Label in the table, attribute of a report, format.
 _ROWS = (
     ("PSNR dB", "psnr", ".2f"),
+    ("peak", "peak", ".4g"),
+    ("brightest", "brightest", ".4g"),
+    ("PSNR dB, from around", "around_psnr", ".2f"),
+    ("PSNR dB, from inside", "inside_psnr", ".2f"),
     ("PSNR dB, worst view", "psnr_worst", ".2f"),
     ("worst view", "worst_view", "d"),
     ("1 - SSIM", "one_minus_ssim", ".5f"),
@@ -165,7 +209,8 @@ def decode(
     folder: _Folder,
     output: Annotated[Path, output_option("OUT", "A .exr; of a view also a .png.")],
     view: Annotated[
-        int | None, typer.Option(min=0, help="Draw the mesh from this camera of evaluate, instead of the lightmap.")
+        int | None,
+        typer.Option(min=0, help="Draw the mesh from this camera of evaluate instead; those inside come last."),
     ] = None,
     views: Annotated[
         int | None, typer.Option(min=1, max=4096, help="Of a --view: cameras that evaluate has; default 50.")
@@ -185,8 +230,6 @@ def decode(
                 raise WlmError(f"--{option}: expected with --view alone: a lightmap has its own size")
     views = _VIEWS if views is None else views
     resolution = _RESOLUTION if resolution is None else resolution
-    if view is not None and view >= views:
-        raise WlmError(f"--view: expected 0 to {views - 1}, got {view}")
     quiet_warp()
     from wlm.atlas.exporter import geometry, read_folder
     from wlm.formats.exr import write_exr
@@ -198,11 +241,14 @@ def decode(
         picture, covered = decoder.lightmap(mesh), mesh.mask
         write_exr(output, picture)
     else:
-        from wlm.ops.views import sphere_views
+        from wlm.atlas.views import mesh_views
         from wlm.view.atlas import draw, encode, save_png
         from wlm.view.display import white_of
 
-        pictures, covered = draw(mesh, {"ours": decoder}, sphere_views(views)[view], resolution, decoder.device)
+        cameras = mesh_views(mesh, views)
+        if view >= len(cameras):
+            raise WlmError(f"--view: expected 0 to {len(cameras) - 1}, got {view}")
+        pictures, covered = draw(mesh, {"ours": decoder}, cameras[view], resolution, decoder.device)
         picture = pictures["ours"]
         if output.suffix.lower() == ".png":
             save_png(output, encode(picture, covered, white_of(picture[covered])))

@@ -36,7 +36,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from wlm.errors import WlmError
+from wlm.errors import WlmError, one_line
 from wlm.formats.gltf_container import MAGIC, load_buffers, split_glb
 from wlm.formats.limits import CORNERS, CORNERS_A_BYTE, JSON_BYTES, MESH_BYTES, SURE_CORNERS
 from wlm.formats.reading import read_file
@@ -49,6 +49,7 @@ COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 512
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 _MATRIX_SIDES = {"MAT2": 2, "MAT3": 3, "MAT4": 4}
 _LONGEST_STRIDE = 252  # bytes
+_LABEL = 60  # letters of a name
 _OVERHEAD = 256  # corners that take about as long as a primitive without any
 _UV_NAME = re.compile(r"TEXCOORD_(0|[1-9]\d{0,3})")
 _REFUSED = {
@@ -102,6 +103,8 @@ class GltfPrimitive:
         triangle: int32 [F, 3].
         uv: For each set n that the file has as `TEXCOORD_n`, float32 [V, 2]; u right, v down.
         row: int64 [V], where each vertex is in the primitive's accessors.
+        label, mesh_label: The names of the node and of its mesh; "node 3", "mesh 2" where they have none.
+        material: Number of its material; None: none.
     """
 
     node: int
@@ -112,6 +115,9 @@ class GltfPrimitive:
     triangle: np.ndarray
     uv: dict[int, np.ndarray]
     row: np.ndarray
+    label: str
+    mesh_label: str
+    material: int | None
 
 
 def read_gltf(path: str | os.PathLike[str], trust: bool = False) -> tuple[GltfDocument, list[GltfPrimitive]]:
@@ -190,7 +196,10 @@ def document_from_arrays(
     document = GltfDocument(name, content, (points.tobytes() + places.tobytes() + corners.tobytes(),))
     row = np.arange(len(points))
     corners = corners.astype(np.int32)
-    return document, GltfPrimitive(0, 0, 0, name, points.astype(np.float64), corners, {0: places}, row)
+    label = one_line(name, _LABEL)
+    return document, GltfPrimitive(
+        0, 0, 0, name, points.astype(np.float64), corners, {0: places}, row, label, label, None
+    )
 
 
 def elements(document: GltfDocument, number: int) -> np.ndarray:
@@ -356,9 +365,24 @@ def _read_primitives(document: GltfDocument) -> list[GltfPrimitive]:
                     triangle=triangle.reshape(-1, 3).astype(np.int32),
                     uv=uv,
                     row=row,
+                    label=_label(document.content["nodes"][node], f"node {node}"),
+                    mesh_label=_label(mesh, f"mesh {mesh_number}"),
+                    material=_material(where, primitive),
                 )
             )
     return primitives
+
+
+def _label(item: dict, other: str) -> str:
+    name = item.get("name")
+    return one_line(name, _LABEL) if isinstance(name, str) and name else other
+
+
+def _material(where: str, primitive: dict) -> int | None:
+    number = primitive.get("material")
+    if number is not None and (not isinstance(number, int) or isinstance(number, bool)):
+        raise WlmError(f"{where}.material: expected a whole number, found {one_line(number, _LABEL)}")
+    return number
 
 
 def _count(document: GltfDocument, number: int) -> int:

@@ -4,6 +4,8 @@ The mesh is scaled into [-1, 1]³: the longest side of its box is 2 long, the bo
 a distance of 3 and look at the origin (lightmap-uv-clustering-cascade, section 4.1.4). Their field of view just holds
 the sphere around that cube, of radius sqrt 3: 2 asin(sqrt 3 / 3), 70.5 degrees both ways, so that nothing is ever cut
 off. Pictures are square; row 0 is their top.
+
+A `Viewpoint` is a viewer who stands in the scene instead.
 """
 
 import math
@@ -60,6 +62,19 @@ class View:
         right = np.cross([0.0, 1.0, 0.0] if abs(back[1]) <= _STEEP else [0.0, 0.0, 1.0], back)
         right = right / np.linalg.norm(right)
         return cls(np.stack([right, np.cross(back, right), back]))
+
+
+@dataclass(frozen=True, eq=False)
+class Viewpoint:
+    """A viewer in the scene, who sees 90 degrees both ways.
+
+    Attributes:
+        eye: float64 [3], where they are, in the mesh's space and unit.
+        forward: float64 [3], where they look; not straight up or down.
+    """
+
+    eye: np.ndarray
+    forward: np.ndarray
 
 
 def sphere_views(count: int, seed: int | np.random.Generator | None = None) -> list[View]:
@@ -149,7 +164,7 @@ def visible_points(
     position: np.ndarray,
     triangle: np.ndarray,
     uv: np.ndarray,
-    views: Sequence[View],
+    views: Sequence[View | Viewpoint],
     resolution: int,
     device: str,
     *,
@@ -181,7 +196,9 @@ def visible_points(
     coordinate = torch.tensor(uv, dtype=torch.float32, device=device)
     for view in views:
         with torch.no_grad():
-            clip = torch.tensor(clip_positions(scaled, view), device=device)
+            inside = isinstance(view, Viewpoint)
+            clip = clip_from(position, view.eye, view.forward) if inside else clip_positions(scaled, view)
+            clip = torch.tensor(clip, device=device)
             raster = ops_raster.rasterize(clip, corner, resolution, resolution, cull=cull)
             seen = ops_raster.interpolate(coordinate, corner, raster)
         yield raster.triangle, raster.barycentric, seen

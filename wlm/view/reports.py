@@ -11,13 +11,13 @@ import torch
 from wlm.atlas.data import LightmappedMesh
 from wlm.atlas.evaluation import Report as AtlasReport
 from wlm.atlas.model import AtlasModel
+from wlm.atlas.views import mesh_views
 from wlm.lightmap.data import LightmapSet
 from wlm.lightmap.decode import Decoder as LightmapDecoder
 from wlm.lightmap.evaluation import Report as LightmapReport
 from wlm.lightmap.model import TILE, LightmapModel
 from wlm.lightmap.tiles import TileGrid
 from wlm.metrics.error import psnr_from_mse
-from wlm.ops.views import sphere_views
 from wlm.probe.data import ProbeSet
 from wlm.probe.evaluation import Report as ProbeReport
 from wlm.probe.model import ProbeModel
@@ -135,9 +135,12 @@ def atlas_report(
     Raises:
         WlmError: The file can't be written.
     """
-    unseen = "No camera outside the mesh sees its front: the scores of views are missing."
+    unseen = "No camera around the mesh and no viewer inside sees it: the scores of views are missing."
     rows = [
         ("PSNR in views", _number(report.psnr, ".2f", "dB")),
+        ("PSNR in views from around it", _number(report.around_psnr, ".2f", "dB")),
+        ("PSNR in views from inside", _number(report.inside_psnr, ".2f", "dB")),
+        ("peak of PSNR", _number(report.peak, ".4g")),
         ("PSNR of the worst view", _number(report.psnr_worst, ".2f", "dB")),
         ("1 - SSIM", _number(report.one_minus_ssim, ".5f")),
         ("error at seams / elsewhere", _number(report.seam_ratio, ".2f")),
@@ -150,7 +153,7 @@ def atlas_report(
     page = _begin(model.name, model.profile.name, warnings, rows)
     decoder = model.decoder()
     if report.worst_view >= 0:
-        view = sphere_views(views)[report.worst_view]
+        view = mesh_views(mesh, views)[report.worst_view]
         drawn, hit = draw(mesh, {"original": original(mesh), "decoded": decoder}, view)
         then = drawn.pop("original")
         _beside(page, f"The worst view, camera {report.worst_view}", "original", then, drawn, hit)

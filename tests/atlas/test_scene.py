@@ -1,0 +1,214 @@
+"""Scenes: many meshes, several states, one table and one texture."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+import torch
+from builders.checks import assert_same, error_of
+from builders.gltf_scene import Thing, box, write_scene
+
+import wlm
+from wlm.atlas.data import from_arrays
+from wlm.atlas.scene.data import load_scene, scene_of
+from wlm.atlas.scene.decode import Decoder
+from wlm.atlas.scene.description import read_description
+from wlm.atlas.scene.evaluation import compare_scene, evaluate_scene
+from wlm.atlas.scene.exact import decode64
+from wlm.atlas.scene.exporter import export_scene, read_scene
+from wlm.atlas.scene.fit import compress_scene
+from wlm.atlas.scene.mixture import components, factorise
+from wlm.atlas.scene.model import SceneProfile
+from wlm.atlas.scene.seen import scene_weights
+from wlm.formats.exr import write_exr
+
+SIDE = 48
+QUICK = {"views": 2, "budget": 0.15}
+
+
+def lights(shift: float, states: int = 3) -> np.ndarray:
+    """A sky that brightens and a lamp that goes out, float32 [M, H, W, 3]."""
+    row, column = np.mgrid[:SIDE, :SIDE] / SIDE
+    sky = (1.2 + np.sin(5 * column + shift) * np.cos(4 * row))[..., None] * [0.6, 0.8, 1.0]
+    lamp = np.exp(-20 * ((row - 0.3) ** 2 + (column - 0.6) ** 2))[..., None] * [2.0, 1.2, 0.5]
+    share = np.linspace(0.1, 1.0, states)
+    return np.stack([s * sky + (1 - s) * lamp for s in share]).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """A room with two crates, three states."""
+    parts = [box((0, 0, 0), (6, 3, 5), inward=True), box((1, 0, 1), (2, 1, 2)), box((4, 0, 3), (4.2, 0.2, 3.2))]
+    meshes = [from_arrays(*part, lights(i)[0], name=f"part {i}") for i, part in enumerate(parts)]
+    return scene_of(meshes, [lights(i) for i in range(3)], name="room")
+
+
+@pytest.fixture(scope="module")
+def model(scene):
+    return compress_scene(scene, **QUICK)
+
+
+def test_light_of_two_sources_has_two_components():
+    light = lights(0.0, 6).reshape(6, -1, 3).astype(np.float64)
+    factor = factorise(light, 2)
+    assert factor.min() >= 0.0
+    rest = np.einsum("mkc,knc->mnc", factor, components(light, factor)) - light
+    assert np.sqrt(np.mean(rest**2)) < 1e-3
+    np.testing.assert_array_equal(components(light, factorise(light, 6)), light.astype(np.float32))
+
+
+def test_one_table_and_one_texture_for_all(scene, model):
+    assert model.report["components"] == model.factor.shape[1] == 2 and len(model.states) == 3
+    assert 0.85 <= model.compression_ratio < 0.9 and model.lut.shape[0] * model.lut.shape[1] < 3 * 8 * 8
+    report = evaluate_scene(model, scene, views=3, resolution=48)
+    assert report.views == 6 and report.inside_views == 3 and report.eye_height == pytest.approx(0.35 * 3)
+    assert report.psnr > 35.0 and report.around_psnr > 35.0 and report.inside_psnr > 35.0
+    assert len(report.psnr_by_state) == len(report.peaks) == 3 and min(report.peaks) > 0.5
+    # Bits go to what is seen large: the small crate has far fewer samples a tile than the room.
+    samples = np.array(model.report["samples"]) / np.array(model.report["tiles"])
+    assert samples[2] < 0.5 * samples[0]
+
+
+def test_the_kernel_reads_what_the_reference_does(scene, model, device):
+    random = np.random.default_rng(0)
+    uv = random.random((500, 2)).astype(np.float32)
+    uv[:4] = [[0, 0], [1, 1], [1, 0], [0.5, 2.0]]
+    sheet = random.integers(0, 3, 500)
+    decoder = Decoder(model, device)
+    for state in range(3):
+        points = torch.from_numpy(uv).to(device), torch.from_numpy(sheet).to(device)
+        light = decoder.read(*points, state).cpu().numpy()
+        np.testing.assert_allclose(light, decode64(model, uv, sheet, state), rtol=1e-3, atol=1e-3)
+    middle = 0.5 * (decoder.lightmap(1, 0) + decoder.lightmap(1, 1))
+    np.testing.assert_allclose(decoder.lightmap(1, 0.5), middle, rtol=1e-4, atol=1e-5)
+
+
+def test_a_file_holds_all(tmp_path, scene, model):
+    model.save(tmp_path / "a.wlm")
+    again = wlm.load(tmp_path / "a.wlm")
+    assert_same(dataclasses.replace(again, report={}), dataclasses.replace(model, report={}))
+
+
+def test_views_of_the_scene_decide(scene):
+    """A crate in a closed room is hidden from around, and is seen from inside."""
+    room, crate, small = scene_weights(scene, SceneProfile(name="", views=3), 0, "cpu")
+    assert min(crate.sum(), small.sum()) > 0
+    per_cell = [each[each > 0].mean() for each in (room, crate, small)]
+    assert per_cell[2] < per_cell[1]
+
+
+def files(folder, states=("day", "night")):
+    position, triangle, uv = box((0, 0, 0), (2, 2, 2))
+    half = uv * [0.5, 1.0]
+    things = [
+        Thing("left", position, triangle, [uv, uv]),
+        Thing("right", like=0, translation=(4, 0, 0)),
+        Thing("rock", position + [0, 0, 4], triangle, [uv]),
+    ]
+    path = write_scene(folder / "scene.gltf", things)
+    for i, state in enumerate(states):
+        write_exr(folder / f"{state}.exr", lights(i)[0])
+    return path, half
+
+
+CONVENTIONS = {
+    "gltf": lambda n, x: {"node": n, "sheet": 0, "scale_offset": [0.5, 0.75, x, 0.0]},
+    "unity": lambda n, x: {
+        "node": n,
+        "lightmapIndex": 0,
+        "lightmapScaleOffset": {"x": 0.5, "y": 0.75, "z": x, "w": 0.25},
+    },
+    "godot": lambda n, x: {"path": f"Level/{n}", "slice_index": 0, "uv_scale": [x, 0.0, 0.5, 0.75]},
+}
+
+
+@pytest.mark.parametrize("convention", CONVENTIONS)
+def test_instances_with_a_rectangle_each(tmp_path, convention):
+    path, _ = files(tmp_path)
+    objects = [CONVENTIONS[convention](name, x) for name, x in (("left", 0.0), ("right", 0.5))]
+    content = {"states": ["day", "night"], "sheets": [{"files": ["day.exr", "night.exr"]}], "objects": objects}
+    (tmp_path / "lights.json").write_text(json.dumps(content | {"convention": convention}))
+    scene = load_scene(path, tmp_path / "lights.json")
+    (sheet,) = scene.sheets
+    assert scene.states == ("day", "night") and scene.uv_set == 1 and sheet.frames.shape == (2, SIDE, SIDE, 3)
+    assert [(each.label, each.scale_offset[2:]) for each in scene.objects] == [("left", (0, 0)), ("right", (0.5, 0))]
+    uv = box((0, 0, 0), (2, 2, 2))[2] * [0.5, 0.75]
+    np.testing.assert_allclose(np.sort(sheet.mesh.uv, 0), np.sort(np.concatenate([uv, uv + [0.5, 0]]), 0), atol=1e-6)
+    assert len(scene.blocker) == 12  # the rock has no lightmap
+    model = compress_scene(scene, views=1, budget=0.3)
+    paths = export_scene(model, tmp_path / "out", scene)
+    assert {each.name for each in paths} >= {"scene.wlm", "scene.glb", "scene.glsl", "lut.dds", "colour_0.dds"}
+    again, report = read_scene(tmp_path / "out")
+    assert again.source == scene.source and report["objects"][1]["scale_offset"][2] == 0.5
+    from wlm.formats.gltf import read_gltf
+
+    document, _ = read_gltf(tmp_path / "out" / "scene.glb")
+    assert document.content["nodes"][1]["extras"]["wlm"]["scale_offset"] == [0.5, 0.75, 0.5, 0.0]
+
+
+def test_materials_own_lightmaps(tmp_path):
+    position, triangle, uv = box((0, 0, 0), (2, 2, 2))
+
+    def material(**more):
+        return {"extensions": {"MOZ_lightmap": {"index": 0, "texCoord": 0, "intensity": 2.0} | more}}
+
+    shift = {"extensions": {"KHR_texture_transform": {"scale": [0.5, 0.5], "offset": [0.5, 0.5]}}}
+    things = [
+        Thing("a", position, triangle, [uv * 0.5], material=material()),
+        Thing("b", position + 3, triangle, [uv], material=material(**shift)),
+    ]
+    images = {"textures": [{"source": 0}], "images": [{"uri": "day.exr", "name": "baked"}]}
+    path = write_scene(tmp_path / "scene.gltf", things, images)
+    write_exr(tmp_path / "day.exr", lights(0)[0])
+    scene = load_scene(path)
+    assert [each.scale_offset for each in scene.objects] == [(1, 1, 0, 0), (0.5, 0.5, 0.5, 0.5)]
+    assert scene.sheets[0].name == "baked" and scene.states == ("light",)
+    inside = scene.sheets[0].mesh.mask
+    np.testing.assert_allclose(scene.sheets[0].frames[0][inside], 2 * lights(0)[0][inside], rtol=1e-3)
+
+
+def test_what_a_list_of_lightmaps_says_wrong(tmp_path):
+    path, _ = files(tmp_path)
+    lists = tmp_path / "lights.json"
+
+    def told(**content):
+        lists.write_text(json.dumps({"sheets": [{"files": ["day.exr"]}]} | content))
+        return error_of(load_scene, path, lists)
+
+    assert "no material has a lightmap (MOZ_lightmap)" in error_of(load_scene, path)
+    assert "sheets: expected 2 files each, one a state, found [1]" in told(states=["a", "b"])
+    assert "objects[0].sheet: expected below 1, found 3" in told(objects=[{"node": "left", "sheet": 3}])
+    assert "node: expected one of left, right, found 'top'" in told(objects=[{"node": "top", "sheet": 0}])
+    twice = [{"node": "left", "sheet": 0}, {"node": "left", "sheet": 0, "scale_offset": [1, 1, 0.5, 0]}]
+    assert "left is given two lightmaps" in told(objects=twice)
+    assert "sheets[0]: no triangle reads it" in told(objects=[])
+    godot = {"convention": "godot", "objects": [{"path": "a", "uv_scale": [1, 2]}]}
+    assert "objects[0].uv_scale: expected 4 numbers, found [1, 2]" in told(**godot)
+    lists.write_text(json.dumps({"lightmaps": [{"time_hours": 6, "file": "day.exr"}], "mesh": "scene.glb"}))
+    assert read_description(lists).states == ("6 h",)
+    write_exr(tmp_path / "small.exr", lights(0)[0][:20])
+    assert "small.exr: expected 48x48 texels as the sheet's other lightmaps, found 48x20" in told(
+        sheets=[{"files": ["day.exr", "small.exr"]}]
+    )
+
+
+def test_hard_cases_of_a_scene(tmp_path):
+    """Overlapping charts, charts without area, one of one texel, and light that is black."""
+    position, triangle, uv = box((0, 0, 0), (1, 1, 1))
+    tiny = uv.copy()
+    tiny[:4] = [0.5, 0.5]  # without area
+    tiny[4:8] = 0.25 + 0.2 / SIDE * (tiny[4:8] - tiny[4:8].min(0)) * [3, 2]  # within a texel
+    meshes = [
+        from_arrays(position, triangle, each, lights(0)[0], name=name)
+        for name, each in (("overlap", 0.3 + 0.4 * (uv % [1 / 3, 0.5])), ("tiny", tiny), ("black", uv))
+    ]
+    black = np.zeros((3, SIDE, SIDE, 3))
+    scene = scene_of(meshes, [lights(0), lights(1), black])
+    model = compress_scene(scene, views=1, budget=0.3, components=2)
+    decoder = Decoder(model)
+    assert not decoder.lightmap(2, 1).any()
+    score = compare_scene(scene, {"it": decoder.read}, views=2, resolution=32)["it"]
+    assert score.psnr > 35.0
+    dark = compress_scene(scene_of(meshes, [black] * 3), views=1, budget=0.3, components=1)
+    assert not Decoder(dark).lightmap(0, 2).any()

@@ -1,0 +1,185 @@
+"""Whether a lightmap is a mesh's own: of which node, which way up, and which of its texels are stray.
+
+All of it is read from the light itself. Within a chart light is smooth but for the edges of shadows; gaps, other charts
+and what a baker leaves between them are not. So the mean step between neighbouring texels of one chart is least under
+the UVs that the lightmap was baked for.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from scipy.ndimage import binary_opening, maximum_filter
+
+from wlm.atlas.charts import charts, welded
+from wlm.atlas.coverage import covered_texels
+from wlm.errors import WlmError
+from wlm.formats.gltf import GltfPrimitive
+from wlm.ops.raster import rasterize_uv
+from wlm.texels import fill_gaps
+
+_STEP = 3.0  # octaves: a larger step counts as this, as does one to NaN or infinity
+_DARK = 0.02  # of the median light, added before a step is measured: darkness has no steps
+# Measured on 15 lightmaps, both ways up: the right one has at most 0.82 of the other's roughness.
+_BETTER = 0.85
+_LEAST, _FEWEST = 0.005, 1024  # octaves; texels in charts, of which the mean says something
+_SHARED = 0.02  # of the texels under several meshes: fewer are the rounding of neighbours in one atlas
+_BRIGHT, _PERCENTILE = 16.0, 99.5  # times this percentile of a chart's light, and in a speck: no light
+_WIDEST = 3  # texels along a side of what is no speck
+_FRINGE, _REACH = 4.0, 5  # times the brightest texel of a chart in a window of so many texels
+
+
+def choose_mesh(
+    where: str, name: str, primitives: list[GltfPrimitive], uv_set: int, lightmap: np.ndarray
+) -> tuple[list[GltfPrimitive], list[str]]:
+    """Chooses the meshes of a scene that a lightmap belongs to.
+
+    Meshes that lie side by side in UV space share it. Where they lie on each other it is of one of them, the one whose
+    charts it is smoothest in; a mesh that several nodes draw counts once.
+
+    Args:
+        where, name: The file and the mesh, for messages.
+        primitives: With the UV set.
+        uv_set: n of `TEXCOORD_n`.
+        lightmap: float [H, W, 3].
+
+    Returns:
+        The primitives, and lines that say what was left out.
+
+    Raises:
+        WlmError: No mesh fits clearly better than the next.
+    """
+    numbers = sorted({each.mesh for each in primitives})
+    if len(numbers) == 1:
+        return primitives, []
+    height, width = lightmap.shape[:2]
+    groups = [[each for each in primitives if each.mesh == number] for number in numbers]
+    covered = np.zeros((height, width), np.int32)
+    for group in groups:
+        _, uv, triangle = _joined(group, uv_set)
+        if not np.isfinite(uv).all():  # told where the primitives are checked
+            return primitives, []
+        covered += covered_texels(uv.clip(0.0, 1.0), triangle, height, width) > 0
+    if np.count_nonzero(covered > 1) <= _SHARED * np.count_nonzero(covered):
+        return primitives, []
+    charted = [chart_map(*_joined(group, uv_set), height, width) for group in groups]
+    rough = [min(roughness(light, chart) for light in (lightmap, lightmap[::-1])) for chart in charted]
+    order = np.argsort(rough)
+    best, second = order[:2]
+    if not rough[best] < _BETTER * rough[second]:
+        names = ", ".join(group[0].label for group in groups[:8]) + (", ..." if len(groups) > 8 else "")
+        raise WlmError(
+            f"{where}: {len(groups)} meshes lie on each other in TEXCOORD_{uv_set}, and the lightmap fits none clearly "
+            f"better: expected the name of one as the node (--node): {names}"
+        )
+    line = (
+        f"{name}: {len(groups)} meshes lie on each other in TEXCOORD_{uv_set}: the lightmap fits "
+        f"{groups[best][0].label} best; the others are left out"
+    )
+    return groups[best], [line]
+
+
+def named(where: str, primitives: list[GltfPrimitive], node: str) -> list[GltfPrimitive]:
+    """The primitives of one node, by its name, its mesh's name or its number.
+
+    Raises:
+        WlmError: There is none; the line names those that there are.
+    """
+    found = [each for each in primitives if node in (each.label, each.mesh_label, str(each.node))]
+    if not found:
+        labels = list(dict.fromkeys(each.label for each in primitives))
+        names = ", ".join(labels[:8]) + (", ..." if len(labels) > 8 else "")
+        raise WlmError(f"{where}: node: expected one of {names}, found {node!r}")
+    return found
+
+
+def chart_map(position: np.ndarray, uv: np.ndarray, triangle: np.ndarray, height: int, width: int) -> np.ndarray:
+    """The number of the chart that holds each texel's centre, int32 [height, width], -1 for none."""
+    uv = np.asarray(uv, np.float64).clip(0.0, 1.0)
+    number = charts(welded(position, uv, triangle))
+    corners = torch.from_numpy(np.ascontiguousarray(triangle, np.int32))
+    seen = rasterize_uv(torch.tensor(uv, dtype=torch.float32), corners, height, width).triangle.numpy()
+    return np.where(seen < 0, -1, number[seen.clip(0)])
+
+
+def roughness(lightmap: np.ndarray, chart: np.ndarray) -> float:
+    """The mean step, in octaves, between neighbouring texels of one chart; infinite where there are none.
+
+    Args:
+        lightmap: float [H, W, 3]; NaN and infinity are steps.
+        chart: int [H, W], `chart_map`.
+    """
+    with np.errstate(invalid="ignore"):
+        light = lightmap.astype(np.float64).mean(axis=2)
+    finite = np.isfinite(light)
+    lit = light[finite & (light > 0)]
+    if not lit.size:
+        return float("inf")
+    octave = np.log2(np.where(finite, light.clip(0.0), 0.0) + _DARK * np.median(lit))
+    total, count = 0.0, 0
+    for axis in (0, 1):
+        (a, b), (c, d), (e, f) = (_neighbours(values, axis) for values in (octave, chart, finite))
+        inside = (c == d) & (c >= 0)
+        step = np.where(e & f, np.minimum(np.abs(a - b), _STEP), _STEP)
+        total, count = total + float(step[inside].sum()), count + int(inside.sum())
+    return total / count if count else float("inf")
+
+
+def fits_flipped(lightmap: np.ndarray, chart: np.ndarray) -> bool:
+    """Whether a lightmap fits its charts clearly better upside down.
+
+    Args:
+        lightmap: float [H, W, 3].
+        chart: int [H, W], `chart_map`.
+    """
+    if np.count_nonzero(chart >= 0) < _FEWEST:
+        return False
+    flipped, rough = roughness(lightmap[::-1], chart), roughness(lightmap, chart)
+    return flipped < min(_BETTER * rough, rough - _LEAST)
+
+
+def replace_strays(lightmap: np.ndarray, mask: np.ndarray, covered: np.ndarray) -> int:
+    """Gives texels that are no light the value of the nearest that is, in place.
+
+    No light is, of texels without their centre in a triangle, NaN, infinity and what is brighter than 4 times the
+    brightest texel near it that has: bakers and denoisers leave such in gutters. Of the others it is a speck, less than
+    3 texels wide, brighter than 16 times the 99.5th percentile of them all.
+
+    Args:
+        lightmap: float32 [H, W, 3].
+        mask: bool [H, W], the texels that count.
+        covered: bool [H, W], those with their centre in a triangle.
+
+    Returns:
+        How many specks there were.
+    """
+    brightest = lightmap.max(axis=2)
+    finite = np.isfinite(lightmap).all(axis=2)
+    inside = mask & covered
+    light = brightest[inside & finite & (brightest > 0)]
+    if not light.size:
+        return 0
+    high = inside & finite & (brightest > _BRIGHT * np.percentile(light, _PERCENTILE))
+    # What lies beside a bright area and is bright too is that area's end.
+    speck = high & ~binary_opening(high, np.ones((_WIDEST, _WIDEST)))
+    known = np.where(inside & finite & ~speck, brightest, 0.0)
+    near = maximum_filter(known, _REACH)
+    fringe = mask & ~covered & (~finite | (brightest > _FRINGE * near) & (near > 0))
+    stray = fringe | speck
+    good = mask & finite & ~stray
+    if stray.any() and good.any():
+        lightmap[stray] = fill_gaps(lightmap, good)[stray]
+    return int(speck.sum())
+
+
+def _joined(primitives: Sequence[GltfPrimitive], uv_set: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Positions, UVs and triangles of some primitives as one mesh."""
+    first = np.cumsum([0, *(len(each.position) for each in primitives)])
+    triangle = [each.triangle + start for each, start in zip(primitives, first[:-1], strict=True)]
+    uv = np.concatenate([each.uv[uv_set] for each in primitives]).astype(np.float64)
+    return np.concatenate([each.position for each in primitives]), uv, np.concatenate(triangle)
+
+
+def _neighbours(values: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
+    """Each but the last along an axis, and each but the first."""
+    return values.take(range(values.shape[axis] - 1), axis), values.take(range(1, values.shape[axis]), axis)

@@ -1,0 +1,75 @@
+"""The runtime path: light from a scene's compressed lightmaps."""
+
+import numpy as np
+import torch
+import warp as wp
+
+from wlm import interop
+from wlm.atlas.scene.model import SceneModel
+from wlm_kernels.atlas import scene as kernels
+
+
+class Decoder:
+    """A model on a device.
+
+    Attributes:
+        model: The model.
+        device: "cpu" or "cuda:N".
+    """
+
+    def __init__(self, model: SceneModel, device: str = "cpu") -> None:
+        """Loads a model.
+
+        Args:
+            model: The model.
+            device: "cpu", "cuda" or "cuda:N".
+
+        Raises:
+            WlmError: No such device.
+        """
+        self.model, self.device = model, interop.check_device(device)
+        self._texels = wp.array(np.ascontiguousarray(model.texels), dtype=wp.uint32, device=self.device)
+        self._lut = wp.array(np.ascontiguousarray(model.lut), dtype=wp.uint16, device=self.device)
+        self._sheets = wp.array(model.table(), dtype=int, device=self.device)
+
+    def factors(self, state: float) -> np.ndarray:
+        """The factors of a state, float32 [K, 3]; between two states, 0.5 for example, they are mixed.
+
+        Raises:
+            ValueError: It is below 0 or above the last.
+        """
+        last = len(self.model.states) - 1
+        if not 0 <= state <= last:
+            raise ValueError(f"state: expected 0 to {last}, got {state}")
+        low = min(int(state), max(last - 1, 0))
+        near, far = self.model.factor[low], self.model.factor[min(low + 1, last)]
+        return (near + np.float32(state - low) * (far - near)).astype(np.float32)
+
+    def read(self, uv: torch.Tensor, sheet: torch.Tensor, state: float) -> torch.Tensor:
+        """Reads light at points, as a shader does.
+
+        Args:
+            uv: float32 [N, 2] on the decoder's device, in the sheets.
+            sheet: int [N], 0 to S - 1.
+            state: As for `factors`.
+
+        Returns:
+            float32 [N, 3].
+        """
+        uv, sheet = uv.contiguous(), sheet.int().contiguous()
+        out = torch.empty((len(uv), 3), dtype=torch.float32, device=uv.device)
+        if len(uv):
+            factor = wp.array(self.factors(state), dtype=wp.vec3, device=self.device)
+            points = interop.to_warp(uv, wp.vec2), interop.to_warp(sheet)
+            tile, result = self.model.profile.tile, interop.to_warp(out, wp.vec3)
+            kernels.read(*points, self._sheets, tile, factor, self._lut, self._texels, result)
+        return out
+
+    def lightmap(self, sheet: int, state: float) -> np.ndarray:
+        """Decodes a lightmap in its own layout, float32 [H, W, 3]; in the gaps between charts it is anything."""
+        place = self.model.sheets[sheet]
+        row, column = torch.meshgrid(torch.arange(place.height), torch.arange(place.width), indexing="ij")
+        uv = torch.stack([(column + 0.5) / place.width, (row + 0.5) / place.height], 2).reshape(-1, 2)
+        number = torch.full((len(uv),), sheet, dtype=torch.int32, device=self.device)
+        light = self.read(uv.float().to(self.device), number, state)
+        return light.reshape(place.height, place.width, 3).cpu().numpy()

@@ -1,0 +1,101 @@
+"""What of a scene's lightmaps is seen: the sheet and the place in it at each pixel of views of the whole scene."""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+import torch
+
+from wlm.atlas.model import Profile
+from wlm.atlas.scene.data import LightmappedScene
+from wlm.atlas.scene.model import SceneProfile
+from wlm.atlas.weights import FineGrid, spread
+from wlm.interop import check_device
+from wlm.ops.views import View, Viewpoint, sphere_views, visible_points
+
+_RESOLUTION = 768  # pixels along a side of a view that visibility is counted in
+
+
+def scene_views(scene: LightmappedScene, count: int, seed: int | None = None) -> list[View | Viewpoint]:
+    """Makes views of a scene: cameras around it and, where viewers can stand in it, as many from inside.
+
+    Args:
+        scene: The scene.
+        count: Number of cameras around it, at least 0.
+        seed: None spreads them evenly; else they are random.
+    """
+    return [*sphere_views(count, seed), *scene.indoors().views(count, 0 if seed is None else seed)]
+
+
+def seen_points(
+    scene: LightmappedScene, views: Sequence[View | Viewpoint], resolution: int, device: str
+) -> Iterator[tuple[torch.Tensor, torch.Tensor, torch.Tensor]]:
+    """Draws a scene from each camera.
+
+    Args:
+        scene: The scene.
+        views: The cameras.
+        resolution: Pixels along a side, 1 to 16,384.
+        device: "cpu" or "cuda:N".
+
+    Yields:
+        For each camera, on the device: bool [h, w], the pixels that show a sheet; and of these, row by row, the sheet,
+        int32 [N], and the UVs in it, float32 [N, 2].
+
+    Raises:
+        WlmError: There is no such device.
+        ValueError: The resolution is out of range.
+    """
+    position, triangle, uv, owner = scene.geometry()
+    sheet_of = torch.from_numpy(owner).to(check_device(device))
+    for visible, _, place in visible_points(position, triangle, uv, views, resolution, device):
+        sheet = torch.where(visible >= 0, sheet_of[visible.clamp(min=0).long()], -1)
+        hit = sheet >= 0
+        yield hit, sheet[hit], place[hit]
+
+
+def scene_weights(scene: LightmappedScene, profile: SceneProfile, seed: int, device: str) -> list[np.ndarray]:
+    """How much each quarter of a texel counts: the pixels of random views of the scene that show it, and a little.
+
+    Objects that are seen large so get more than those that are small, far away or hidden; views from inside count as
+    much as those from around.
+
+    Args:
+        scene: The scene.
+        profile: `views`, `unseen` and `border`.
+        seed: Of the views.
+        device: "cpu" or "cuda:N".
+
+    Returns:
+        For each sheet float64 [2 H, 2 W], 0 where there is no triangle.
+
+    Raises:
+        WlmError: There is no such device.
+    """
+    views = scene_views(scene, profile.views, seed)
+    grids = [FineGrid(sheet.mesh, device) for sheet in scene.sheets]
+    around, inside = (_counts(scene, grids, part, device) for part in (views[: profile.views], views[profile.views :]))
+    totals = [sum(float(each.sum()) for each in counts) for counts in (around, inside)]
+    scale = totals[0] / totals[1] if min(totals) > 0 else 1.0
+    visible = [a + scale * b for a, b in zip(around, inside, strict=True)]
+    used = [grid.covered | (count > 0) for grid, count in zip(grids, visible, strict=True)]
+    cells = sum(int(each.sum()) for each in used)
+    mean = sum(float(count[each].sum()) for count, each in zip(visible, used, strict=True)) / max(cells, 1)
+    settings = Profile(name="", unseen=profile.unseen, border=profile.border)
+    return [spread(grid, count, settings, mean or 1.0) for grid, count in zip(grids, visible, strict=True)]
+
+
+def _counts(
+    scene: LightmappedScene, grids: Sequence[FineGrid], views: Sequence[View | Viewpoint], device: str
+) -> list[np.ndarray]:
+    """Pixels that show each cell of each sheet."""
+    sizes = [(grid.height, grid.width) for grid in grids]
+    first = np.cumsum([0, *(height * width for height, width in sizes)])
+    place = torch.tensor(np.array([(*size, start) for size, start in zip(sizes, first, strict=False)]), device=device)
+    count = torch.zeros(int(first[-1]), dtype=torch.int64, device=device)
+    for _, sheet, uv in seen_points(scene, views, _RESOLUTION, device):
+        height, width, start = place[sheet.long()].T
+        column = torch.minimum((uv[:, 0].double() * width).long().clamp(min=0), width - 1)
+        row = torch.minimum((uv[:, 1].double() * height).long().clamp(min=0), height - 1)
+        count += torch.bincount(start + row * width + column, minlength=len(count))
+    flat = count.double().cpu().numpy()
+    return [flat[a:b].reshape(size) for a, b, size in zip(first, first[1:], sizes, strict=False)]

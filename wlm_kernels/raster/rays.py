@@ -1,0 +1,46 @@
+"""The first triangle along rays."""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+_FARTHEST = wp.constant(1.0e30)
+
+
+@wp.kernel
+def _first_hit(
+    # in:
+    mesh: wp.uint64,
+    origin: wp.array[wp.vec3],  # [P]
+    direction: wp.array[wp.vec3],  # [D], of unit length
+    # out:
+    distance: wp.array2d[float],  # [P, D]
+    front: wp.array2d[wp.int8],  # [P, D]
+):
+    point, ray = wp.tid()
+    hit = wp.mesh_query_ray(mesh, origin[point], direction[ray], _FARTHEST)
+    if hit.result:
+        distance[point, ray] = hit.t
+        front[point, ray] = wp.where(hit.sign > 0.0, wp.int8(1), wp.int8(-1))
+    else:
+        distance[point, ray] = wp.inf
+        front[point, ray] = wp.int8(0)
+
+
+def first_hit(mesh: wp.Mesh, origin: wp.array, direction: wp.array, distance: wp.array, front: wp.array) -> None:
+    """Sends rays from points in directions.
+
+    Args:
+        mesh: The triangles.
+        origin: vec3 [P].
+        direction: vec3 [D], of unit length, the same for all points.
+        distance: float [P, D], written: to the first triangle; infinite for none.
+        front: int8 [P, D], written: 1 where its corners run counter-clockwise as seen, -1 clockwise, 0 for none.
+    """
+    wp.launch(
+        _first_hit,
+        dim=distance.shape,
+        inputs=[mesh.id, origin, direction],
+        outputs=[distance, front],
+        device=distance.device,
+    )
