@@ -256,7 +256,9 @@ def test_wrong_words_are_one_line(volume, frames, baked, tmp_path):
     assert "device 'tpu'" in fails(*made, "--device", "tpu")
     assert "ends in .exr" in fails("smoke", "bake", volume, "-o", tmp_path / "a.png")
     assert "gone.npz: cannot read the arrays: No such file" in fails("smoke", "bake", tmp_path / "gone.npz", "-o", out)
-    assert "expected a name that ends in .npz or .nvdb" in fails("smoke", "bake", tmp_path / "a.vdb", "-o", out)
+    assert "expected a name that ends in .npz, .nvdb, .vdb" in fails("smoke", "bake", tmp_path / "a.abc", "-o", out)
+    assert "--up: expected one of x, y, z, got 'w'" in fails(*made, "--up", "w")
+    assert "expected no up for the frames of a scene" in fails("smoke", "bake", frames, "-o", out, "--up", "z")
     shaded = ("smoke", "shade", volume, "-o", tmp_path / "a.png")
     assert "--light: expected three numbers" in fails(*shaded, "--light", "up")
     assert "--light: toward: expected a direction" in fails(*shaded, "--light", "0,0,0")
@@ -269,7 +271,7 @@ def test_wrong_words_are_one_line(volume, frames, baked, tmp_path):
         for command in ("shade", "flipbook"):
             line = fails("smoke", command, one, "-o", tmp_path / "a.png", f"--{option}", value)
             assert f"was baked: --{option} has to be given to bake" in line
-    assert "expected a folder that simulate or bake wrote" in fails("smoke", "shade", tmp_path, "-o", tmp_path / "x")
+    assert "expected a folder of simulate, or one sequence" in fails("smoke", "shade", tmp_path, "-o", tmp_path / "x")
     packed = ("smoke", "flipbook", baked, "-o", tmp_path / "a.png")
     assert "--layout: expected one of unity" in fails(*packed, "--layout", "godot")
     assert "--gain: expected a number above 0" in fails(*packed, "--gain", 0)

@@ -112,10 +112,23 @@ def test_nvdb_of_two_grids(tmp_path: Path):
     volume = load_volume(tmp_path / "both.nvdb")
     np.testing.assert_array_equal(volume.density, density)
     np.testing.assert_array_equal(volume.temperature, hot)
-    _nvdb(tmp_path / "t.nvdb", hot, voxel=0.25)
-    _joined(tmp_path / "both.nvdb", {"temperature": tmp_path / "t.nvdb", "density": tmp_path / "d.nvdb"})
-    with pytest.raises(WlmError, match="both.nvdb: temperature: expected the voxels of density"):
-        load_volume(tmp_path / "both.nvdb")
+    by_name = load_volume(tmp_path / "both.nvdb", density="temperature")
+    np.testing.assert_array_equal(by_name.density, hot)
+    assert by_name.temperature is None
+    with pytest.raises(WlmError, match="both.nvdb: heat is missing; found temperature, density"):
+        load_volume(tmp_path / "both.nvdb", temperature="heat")
+    # Each in a segment of its own, as converters append them; and the temperature in finer voxels, further on.
+    _nvdb(tmp_path / "t.nvdb", np.ones_like(hot), voxel=0.25, at=(2.875, 2.0, 3.0))
+    parts = []
+    for name, letter in (("density", "d"), ("temperature", "t")):
+        _joined(tmp_path / "one.nvdb", {name: tmp_path / f"{letter}.nvdb"})
+        parts.append((tmp_path / "one.nvdb").read_bytes())
+    (tmp_path / "both.nvdb").write_bytes(b"".join(parts))
+    volume = load_volume(tmp_path / "both.nvdb")
+    np.testing.assert_array_equal(volume.density[:8], density)
+    assert volume.origin == (0.75, 1.75, 2.75) and volume.shape == (9, 8, 8) and not volume.density[8].any()
+    # Voxel 4's centre is at 3, the first of the temperature's at 2.875; its last at 4.625.
+    np.testing.assert_allclose(volume.temperature[:, 1, 1], [0, 0, 0, 0, 1, 1, 1, 1, 0.0], atol=1e-5)
 
 
 def test_damaged_nvdb(tmp_path: Path):
@@ -133,13 +146,16 @@ def test_damaged_nvdb(tmp_path: Path):
 
 
 def test_unsupported_nvdb(tmp_path: Path):
-    """Grids of vectors and of stretched voxels are refused."""
+    """Grids of vectors are refused, and those whose voxels have no volume."""
     path = tmp_path / "a.nvdb"
     _nvdb(path, np.ones((8, 8, 8, 3), np.float32))
     with pytest.raises(WlmError, match="expected a grid of floats"):
         load_volume(path)
-    _nvdb(path, np.ones((8, 8, 8), np.float32), voxel=(1.0, 2.0, 1.0))
-    with pytest.raises(WlmError, match="expected a grid of cubic voxels"):
+    _nvdb(path, np.ones((8, 8, 8), np.float32))
+    data = bytearray(path.read_bytes())
+    struct.pack_into("<d", data, _HEADER + _METADATA + 1 + 384, 0.0)  # the first number of the map
+    path.write_bytes(data)
+    with pytest.raises(WlmError, match="expected a map to the world that keeps a volume"):
         load_volume(path)
 
 
@@ -168,7 +184,7 @@ def test_wrong_files(tmp_path: Path):
     np.save(tmp_path / "c.npy", np.ones(3))
     (tmp_path / "c.npy").rename(tmp_path / "c.npz")
     for name, message in (
-        ("a.vdb", "expected a name that ends in .npz or .nvdb, found .vdb"),
+        ("a.abc", "expected a name that ends in .npz, .nvdb, .vdb, found .abc"),
         ("a.npz", "No such file"),
         ("b.npz", "cannot read the arrays"),
         ("c.npz", "expected a .npz file of several arrays"),

@@ -14,6 +14,7 @@ from random import Random
 from typing import Any
 
 import numpy as np
+from builders.vdb_files import ACTIVE_MASK, ZIP, scaled, tree, vdb_file
 
 import wlm
 from wlm.atlas.exporter import geometry, read_folder
@@ -150,6 +151,16 @@ def _volume(path: Path) -> None:
 @functools.cache
 def _grids() -> Sequence[bytes]:
     return tuple(gzip.decompress(data) for data in corpus("cloud.nvdb.gz")())
+
+
+@functools.cache
+def _vdbs() -> Sequence[bytes]:
+    """One packed by zlib, and one of several grids by Blosc, of OpenVDB's own."""
+    random = np.random.default_rng(0)
+    values = (random.random((16, 8, 24)) * (random.random((16, 8, 24)) < 0.5)).astype(np.float32)
+    nodes = tree(values, values > 0, ZIP | ACTIVE_MASK)
+    made = gzip.decompress((Path(__file__).resolve().parents[1] / "files" / "openvdb.vdb.gz").read_bytes())
+    return vdb_file({"density": (scaled(0.5, 0.5, 0.6), nodes, ZIP | ACTIVE_MASK, False)}), made
 
 
 @functools.cache
@@ -369,6 +380,14 @@ _ALL = (
         "volume-nvdb",
         "a.nvdb",
         _grids,
+        lambda draw, data: vary_numbers(draw, data, _grid_fields(data)),
+        _volume,
+        cost=2,
+    ),
+    Reader(
+        "volume-vdb",
+        "a.vdb",
+        _vdbs,
         lambda draw, data: vary_numbers(draw, data, _grid_fields(data)),
         _volume,
         cost=2,

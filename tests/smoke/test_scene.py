@@ -248,7 +248,10 @@ def test_folders_that_are_none(tmp_path):
         open_frames(tmp_path / "a", scene)
     with pytest.raises(WlmError, match="cannot write: the folder .* does not exist"):
         open_frames(tmp_path / "none" / "b", scene)
-    with pytest.raises(WlmError, match=r"expected a folder that simulate wrote, found no scene.json"):
+    with pytest.raises(
+        WlmError,
+        match=r"expected a folder of simulate, or one sequence of volumes .*, found neither scene.json nor any",
+    ):
         load_frames(tmp_path / "a")
     for content, said in (
         ("{", "found other content"),

@@ -47,7 +47,7 @@ app = typer.Typer(help="Smoke: simulated, and rendered through six-way lightmaps
 
 _Baked = Annotated[
     Path,
-    typer.Argument(metavar="SMOKE", help="A .npz or .nvdb volume, a folder of simulate, bake or predict, or an EXR."),
+    typer.Argument(metavar="SMOKE", help="A .npz, .nvdb or .vdb volume, a folder of frames, or what bake wrote."),
 ]
 _Output = Annotated[Path, output_option("OUT", "A .exr, or for frames a folder.")]
 # Baked smoke has both already.

@@ -5,12 +5,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from wlm.errors import WlmError
 from wlm.smoke.baking import bake
 from wlm.smoke.data import SCENE_FILE, Frames, numbered, read_six_way, spread
 from wlm.smoke.guiding import guide
 from wlm.smoke.lightmaps import SixWay
-from wlm.smoke.scene import CameraSettings, ObstacleSettings, Scene, make_camera
+from wlm.smoke.scene import CameraSettings, ObstacleSettings, Scene
 from wlm.smoke.shading import Ramp
 from wlm.system import Meter, OnProgress
 from wlm_kernels.smoke.settings import March
@@ -62,7 +61,7 @@ class FramesToBake:
     @property
     def single(self) -> bool:
         """Whether it is one file and not a folder."""
-        return self.frames.scene is None
+        return self.frames.single
 
     def shots(self, count: int | None = None, progress: OnProgress | None = None) -> Iterator[Shot]:
         """Bakes one frame after the other.
@@ -75,7 +74,7 @@ class FramesToBake:
             WlmError: A frame is missing or damaged.
         """
         for number, volume in self.frames.volumes(spread(self.frames.numbers, count), progress):
-            camera = make_camera(self.camera, volume.origin, [volume.voxel * n for n in volume.shape])
+            camera = self.frames.view(self.camera, volume)
             six = bake(volume, camera, step=self.step, supersample=self.supersample, estimate=False)
             shot = Shot(number, six, time=self.frames.time(number), warnings=volume.warnings)
             if self.scene is not None:
@@ -117,10 +116,7 @@ def baked_files(path: str | os.PathLike[str], device: str = "cpu") -> BakedFiles
     """Finds what `bake` or `predict` wrote: the file itself, or those of a folder.
 
     Returns:
-        None where the path is a volume or a folder of a simulation.
-
-    Raises:
-        WlmError: A folder of neither kind.
+        None where the path is another file or folder.
     """
     path = Path(path)
     if path.suffix.lower() == ".exr":
@@ -128,6 +124,4 @@ def baked_files(path: str | os.PathLike[str], device: str = "cpu") -> BakedFiles
     if not path.is_dir() or (path / SCENE_FILE).exists():
         return None
     files = numbered(path, "six", ".exr")
-    if not files:
-        raise WlmError(f"{path}: expected a folder that simulate or bake wrote")
-    return BakedFiles(files, False, device)
+    return BakedFiles(files, False, device) if files else None
