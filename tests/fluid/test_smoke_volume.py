@@ -9,7 +9,7 @@ import torch
 import warp as wp
 
 from wlm.errors import WlmError
-from wlm.fluid.volume import from_array, from_grid, load_volume
+from wlm.fluid.volume import from_array, from_grid, load_volume, save_volume
 
 _GRID_INDEX, _GRID_NAME, _HEADER, _METADATA = 24, 40, 16, 176
 
@@ -47,6 +47,39 @@ def test_npz(tmp_path: Path, device: str):
     assert volume.warnings == () and volume.device.type == device[:4].rstrip(":")
     scaled = load_volume(path, voxel=1.0)
     assert scaled.voxel == 1.0 and scaled.origin == (4.0, 8.0, 12.0)
+
+
+def test_bricks(tmp_path: Path, device: str):
+    """What is empty is left out; all else comes back, of any shape, in its type."""
+    values = np.zeros((13, 24, 9), np.float16)
+    values[3:5, 9:12, 8], heat = 0.3, np.zeros_like(values)
+    heat[12, 23, 0] = 7
+    made = from_array(values, temperature=heat, voxel=0.25, origin=(1.0, 2.0, 3.0), device=device)
+    save_volume(tmp_path / "a.npz", made, bricks=True)
+    with np.load(tmp_path / "a.npz") as arrays:
+        assert arrays["bricks"].tolist() == [3, 10] and arrays["shape"].tolist() == [13, 24, 9]
+        parts = dict(arrays)
+    back = load_volume(tmp_path / "a.npz", device=device)
+    assert back.density.dtype == torch.float16 and (back.voxel, back.origin) == (0.25, (1.0, 2.0, 3.0))
+    np.testing.assert_array_equal(back.density.cpu(), values)
+    np.testing.assert_array_equal(back.temperature.cpu(), heat)
+    for name, value, message in (
+        ("bricks", [3, 3], "bricks: expected numbers int32 that rise"),
+        ("bricks", [3, 12], "bricks: expected numbers from 0 to 11"),
+        ("bricks", [-1, 3], "bricks: expected numbers from 0 to 11"),
+        ("bricks", [3, 4, 5], "density_bricks: expected 3 bricks of floats"),
+        ("shape", [13, 0, 9], "shape: expected 3 whole numbers from 1"),
+        ("shape", [1024, 1024, 1024], "shape: expected at most 256 times its"),
+        ("shape", [4096, 4096, 4096], "shape: expected at most 1073741824 voxels"),
+    ):
+        kind = parts[name].dtype
+        np.savez(tmp_path / "b.npz", **parts | {name: np.array(value, kind)})
+        with pytest.raises(WlmError, match=f"b.npz: {message}"):
+            load_volume(tmp_path / "b.npz")
+    del parts["density_bricks"]
+    np.savez(tmp_path / "b.npz", **parts)
+    with pytest.raises(WlmError, match="b.npz: density is missing; found voxel, origin, temperature"):
+        load_volume(tmp_path / "b.npz")
 
 
 def test_types():

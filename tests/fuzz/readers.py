@@ -28,7 +28,7 @@ from wlm.formats.light import read_light
 from wlm.formats.mask import read_mask
 from wlm.formats.obj import read_obj
 from wlm.probe.data import load_positions
-from wlm.smoke.data import load_frames, read_six_way
+from wlm.smoke.data import load_frames, read_shaded
 from wlm.smoke.exporter import read_flipbook
 from wlm.smoke.learn.settings import DatasetSettings
 from wlm.smoke.scene import Scene
@@ -66,7 +66,8 @@ def _light_file(path: Path) -> None:
 
 
 def _six_way(path: Path) -> None:
-    six = read_six_way(path)
+    six, looks = read_shaded(path)
+    assert looks is None or looks.ramp is None or len(looks.ramp.stops) > 1, "accepted with a glow of one colour"
     check_finite(lightmaps=six.lightmaps, transparency=six.transparency, axes=six.camera.axes)
     assert six.lightmaps.shape[1:] == (six.camera.height, six.camera.width), "accepted with another size"
 
@@ -375,7 +376,7 @@ _ALL = (
     ),
     Reader("positions-npz", "a.npz", corpus("positions.npz"), vary_npz, _positions),
     Reader("positions-json", "a.json", corpus("positions.json"), _json, _positions),
-    Reader("volume-npz", "a.npz", corpus("volume.npz"), vary_npz, _volume),
+    Reader("volume-npz", "a.npz", corpus("volume.npz", "volume-bricks.npz"), vary_npz, _volume),
     Reader(
         "volume-nvdb",
         "a.nvdb",

@@ -147,7 +147,7 @@ def guide(
     camera = options.camera(frames, orthographic=False, perspective=perspective)
     rows = table(str(smoke), ["file", "covered", "mean light", "nearest", "farthest"])
 
-    def make(file: "Callable[[], Path]", volume: "DensityVolume", view: "Camera") -> None:
+    def make(frame: int, file: "Callable[[], Path]", volume: "DensityVolume", view: "Camera") -> None:
         maps = guide(volume, view, march)
         path = file()
         write_guide(path, maps)
@@ -222,21 +222,21 @@ def shade(
     lights = [_light(text) for text in light or ()]
     behind = None if background is None else vector("--background", background)
     quiet_warp()
+    from wlm.smoke.scene import LightSettings, Looks
     from wlm.view.atlas import save_png
     from wlm.view.smoke import contact_sheet, picture, to_bytes
 
     source = _source(smoke, options, step, supersample, 1.0)
-    if not lights:
-        lights = [settings.light() for settings in source.scene.lights] if source.scene else [_light("1,1,1")]
-    if behind is None:
-        behind = source.scene.background if source.scene else (0.0, 0.0, 0.0)
+    plain = Looks(lights=[LightSettings(toward=(1, 1, 1))])
     file = outputs(smoke, source.single, output, "shade", ".png")
     rows = table(str(smoke), ["file", "covered", "mean", "largest", "clipped"])
     pictures = []
     with running("shade") as progress:
         for shot in _shots(source, progress):
-            extra = {"ramp": shot.ramp, "obstacles": shot.obstacles, "time": shot.time}
-            shaded = picture(shot.six, lights, background=behind, rule=rule, **extra)
+            looks = shot.looks or plain
+            given = lights or [settings.light() for settings in looks.lights]
+            extra = {"ramp": looks.ramp, "obstacles": looks.obstacles, "time": looks.time, "rule": rule}
+            shaded = picture(shot.six, given, background=looks.background if behind is None else behind, **extra)
             pictures.append(to_bytes(shaded, white))
             path = file(shot.number)
             save_png(path, pictures[-1])

@@ -150,7 +150,7 @@ def march_frames(
     camera: "CameraSettings",
     output: Path,
     stem: str,
-    make: "Callable[[Callable[[], Path], DensityVolume, Camera], None]",
+    make: "Callable[[int, Callable[[], Path], DensityVolume, Camera], None]",
     settings: dict[str, Any],
     *,
     resume: bool,
@@ -162,7 +162,8 @@ def march_frames(
         camera: Before each frame.
         output: A file, or for frames a folder.
         stem: Of the folder's files.
-        make: Makes one, of a volume and a camera; it gets the path from a function when there is something to write.
+        make: Makes one, of a frame's number, a volume and a camera; it gets the path from a function when there is
+            something to write.
         settings: What results depend on beside smoke and camera, as JSON values.
         resume: Whether to leave out the frames that an interrupted run of the same settings has made.
     """
@@ -187,7 +188,7 @@ def march_frames(
         for frame, volume in frames.volumes(numbers, progress):
             for warning in volume.warnings:
                 note(f"warning: {warning}")
-            make(functools.partial(file, frame), volume, frames.view(camera, volume))
+            make(frame, functools.partial(file, frame), volume, frames.view(camera, volume))
     if partial is not None:
         files.finish()
 
@@ -214,13 +215,15 @@ def write_lightmaps(
     """
     from wlm.smoke.camera import axis_faults
     from wlm.smoke.data import write_six_way
+    from wlm.smoke.shots import with_surface
 
     rows = table(str(frames.path), ["file", "covered", "mean light", *(["largest error", "RMS error"] * errors)])
 
-    def write(file: Callable[[], Path], volume: "DensityVolume", view: "Camera") -> None:
-        six = make(volume, view)
+    def write(frame: int, file: Callable[[], Path], volume: "DensityVolume", view: "Camera") -> None:
+        looks = frames.looks(frame)
+        six = with_surface(make(volume, view), volume, looks)
         path = file()
-        write_six_way(path, six)
+        write_six_way(path, six, looks)
         covered = six.transparency < 0.99
         for fault in axis_faults(six.lightmaps.cpu().numpy()) if covered.any() else ():
             note(f"{path}: note: {fault}")

@@ -30,6 +30,7 @@ a file missing or damaged             error that names the file, and the field
 A grid's density has no unit of its own: the extinction per length is `extinction` times it.
 """
 
+import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -41,17 +42,18 @@ import torch
 import warp as wp
 
 from wlm.errors import WlmError
+from wlm.fluid.bricks import EDGE, gather, scatter
 from wlm.fluid.grids import UPS, Grid, on_one_lattice
 from wlm.fluid.nanovdb import BAD_GRID, dense, entries
 from wlm.formats.atomic import atomic_path
 from wlm.formats.exr import HALF_MAX
-from wlm.formats.limits import RESAMPLED, SURE_BOX, SURE_VOXELS, VOLUME_BYTES, VOXELS, VOXELS_A_BYTE
+from wlm.formats.limits import RESAMPLED, SURE_BOX, SURE_VOXELS, VOLUME_BYTES, VOXELS, VOXELS_A_BYTE, check_growth
 from wlm.formats.npz import read_npz
 from wlm.formats.reading import read_file
 from wlm.formats.vdb import VdbFile
 from wlm.interop import check_device, device_name, to_warp
 
-_DENSITY, _TEMPERATURE = "density", "temperature"
+_DENSITY, _TEMPERATURE, _BRICKS = "density", "temperature", "bricks"
 _LARGEST = 2**31 - 1  # voxels that a kernel can index
 _TINY, _HUGE = float(np.finfo(np.float32).tiny), float(np.finfo(np.float32).max)
 
@@ -177,7 +179,7 @@ def load_volume(
     """Reads a volume from a file.
 
     - `.npz`: an array `density` [X, Y, Z], and optionally `temperature` of the same shape and the numbers
-      `voxel` and `origin` [3].
+      `voxel` and `origin` [3]; or their bricks, as `save_volume` writes them.
     - `.nvdb` and `.vdb`: grids of floats, over the box of their active voxels. Their maps to the world give the size
       and the position of the voxels; voxels that aren't cubes along the axes are resampled (`wlm.fluid.grids`).
 
@@ -206,7 +208,7 @@ def load_volume(
     names, device = (density, temperature), check_device(device)
     factors = {"extinction": extinction, "emission": emission, "name": str(path)}
     if path.suffix.lower() == ".npz":
-        volume = from_array(**_read_npz(path, names, trust), **factors, device=device)
+        volume = from_array(**_read_npz(path, names, device, trust), **factors, device=device)
         volume = _turned(volume, up) if up != "y" else volume
     else:
         # It becomes dense on the CPU: the file's tree is in host memory anyway.
@@ -233,23 +235,31 @@ def _turned(volume: DensityVolume, up: str) -> DensityVolume:
     return replace(volume, density=values[0], temperature=heat, origin=lattice.origin)
 
 
-def save_volume(path: str | os.PathLike[str], volume: DensityVolume) -> None:
+def save_volume(path: str | os.PathLike[str], volume: DensityVolume, *, bricks: bool = False) -> None:
     """Writes a volume as `.npz`, atomically, such that `load_volume` reads it back.
+
+    Args:
+        path: The file.
+        volume: The smoke.
+        bricks: Whether to leave out what is empty instead of packing all by deflate: far quicker, for a larger file
+            that other programs don't know.
 
     Raises:
         WlmError: Another suffix, or the file can't be written.
     """
     if Path(path).suffix.lower() != ".npz":
         raise WlmError(f"{path}: expected a name that ends in .npz")
-    arrays = {
-        _DENSITY: volume.density.cpu().numpy(),
-        "voxel": np.float64(volume.voxel),
-        "origin": np.asarray(volume.origin, np.float64),
-    }
+    fields = {_DENSITY: volume.density}
     if volume.temperature is not None:
-        arrays[_TEMPERATURE] = volume.temperature.cpu().numpy()
+        fields[_TEMPERATURE] = volume.temperature
+    arrays = {"voxel": np.float64(volume.voxel), "origin": np.asarray(volume.origin, np.float64)}
+    if bricks:
+        numbers, cut = gather(list(fields.values()))
+        fields = {f"{name}_bricks": part for name, part in zip(fields, cut, strict=True)}
+        arrays |= {_BRICKS: numbers.cpu().numpy(), "shape": np.asarray(volume.shape, np.int64)}
+    arrays |= {name: values.cpu().numpy() for name, values in fields.items()}
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        np.savez_compressed(file, **arrays)
+        (np.savez if bricks else np.savez_compressed)(file, **arrays)
 
 
 def _check(
@@ -305,16 +315,22 @@ def _dimmed(name: str, heat: torch.Tensor, emission: float, voxel: float, warnin
     return heat
 
 
-def _read_npz(path: Path, names: tuple[str | None, str | None], trust: bool) -> dict[str, Any]:
+def _read_npz(path: Path, names: tuple[str | None, str | None], device: str, trust: bool) -> dict[str, Any]:
     density, temperature = (name or default for name, default in zip(names, (_DENSITY, _TEMPERATURE), strict=True))
     wanted = {density: _DENSITY, temperature: _TEMPERATURE, "voxel": "voxel", "origin": "origin"}
     needed = [density] if names[1] is None else [density, temperature]
-    arrays = read_npz(
-        path,
-        lambda found: [*needed, *(name for name in wanted if name in found and name not in needed)],
-        numbers=_LARGEST if trust else VOXELS,
-        sure=VOLUME_BYTES if trust else 4 * SURE_VOXELS,
-    )
+
+    def choose(found: Sequence[str]) -> list[str]:
+        if _BRICKS in found and density not in found:
+            return [name for name in found if name.removesuffix("_bricks") in (*wanted, _BRICKS, "shape")]
+        return [*needed, *(name for name in wanted if name in found and name not in needed)]
+
+    most = _LARGEST if trust else VOXELS
+    arrays = read_npz(path, choose, numbers=most, sure=VOLUME_BYTES if trust else 4 * SURE_VOXELS)
+    if _BRICKS in arrays:
+        arrays = _in_place(path, arrays, most, device, trust)
+        if missing := next((name for name in needed if name not in arrays), None):
+            raise WlmError(f"{path}: {missing} is missing; found {', '.join(arrays) or 'nothing'}")
     arrays = {wanted[name]: array for name, array in arrays.items()}
     for field, size in (("voxel", 1), ("origin", 3)):
         value = arrays.get(field)
@@ -324,7 +340,7 @@ def _read_npz(path: Path, names: tuple[str | None, str | None], trust: bool) -> 
             raise WlmError(f"{path}: {field}: expected {size} finite numbers, found {value.dtype} {value.shape}")
         arrays[field] = float(value.item()) if size == 1 else tuple(map(float, value.ravel()))
     for field in (_DENSITY, _TEMPERATURE):
-        if field in arrays and arrays[field].dtype in (np.float16, np.float32):
+        if isinstance(arrays.get(field), np.ndarray) and arrays[field].dtype in (np.float16, np.float32):
             # A tensor, which `from_array` need not copy.
             arrays[field] = torch.from_numpy(arrays[field])
     return arrays
@@ -366,6 +382,31 @@ def from_grid(
         most = _LARGEST if trust else min(VOXELS, max(SURE_BOX, VOXELS_A_BYTE * stored))
         parts.append(dense(grid, f"{name}: {grid.get_grid_info().name or field}", most))
     return _from_parts(parts, up, trust, extinction=extinction, emission=emission, name=name)
+
+
+def _in_place(path: Path, arrays: dict[str, Any], most: int, device: str, trust: bool) -> dict[str, Any]:
+    """Arrays of bricks as what they are of, on a device, and the others as they are."""
+    shape, numbers = arrays.pop("shape", np.zeros(0)), arrays.pop(_BRICKS)
+    if shape.shape != (3,) or shape.dtype.kind not in "iu" or not (1 <= shape.min() and shape.max() <= most):
+        raise WlmError(f"{path}: shape: expected 3 whole numbers from 1 to {most}, found {shape.dtype} {shape.shape}")
+    sides = shape.tolist()
+    counts = [-(-n // EDGE) for n in sides]
+    if math.prod(sides) > most:
+        raise WlmError(f"{path}: shape: expected at most {most} voxels, found {sides}")
+    if not trust:
+        stored = sum(array.nbytes for array in arrays.values())
+        check_growth(f"{path}: shape", stored, 4 * math.prod(counts) * EDGE**3, sure=4 * SURE_VOXELS)
+    if numbers.ndim != 1 or numbers.dtype != np.int32 or (np.diff(numbers.astype(np.int64)) < 1).any():
+        raise WlmError(f"{path}: {_BRICKS}: expected numbers int32 that rise, found {numbers.dtype} {numbers.shape}")
+    if len(numbers) and not (numbers[0] >= 0 and numbers[-1] < math.prod(counts)):
+        raise WlmError(f"{path}: {_BRICKS}: expected numbers from 0 to {math.prod(counts) - 1}, found others")
+    places = torch.from_numpy(numbers).to(device)
+    for name in [name for name in arrays if name.endswith("_bricks")]:
+        cut = arrays.pop(name)
+        if cut.shape != (len(numbers), EDGE, EDGE, EDGE) or cut.dtype not in (np.float16, np.float32):
+            raise WlmError(f"{path}: {name}: expected {len(numbers)} bricks of floats, found {cut.dtype} {cut.shape}")
+        arrays[name.removesuffix("_bricks")] = scatter(places, torch.from_numpy(cut).to(device), sides)
+    return arrays
 
 
 def _from_parts(parts: Sequence[Grid], up: str, trust: bool, **factors: Any) -> DensityVolume:

@@ -30,7 +30,7 @@ from wlm.formats.lock import is_passing
 from wlm.smoke.camera import DIRECTIONS, EMISSION, Camera
 from wlm.smoke.guiding import Guide
 from wlm.smoke.lightmaps import SixWay
-from wlm.smoke.scene import CameraSettings, Scene, make_camera
+from wlm.smoke.scene import CameraSettings, Looks, Scene, make_camera
 from wlm.system import Meter, OnProgress
 
 SCENE_FILE = "scene.json"
@@ -43,7 +43,8 @@ load = load_volume
 _FORMAT, _VERSION = "wlm-smoke-frames", 1
 _NUMBERED = re.compile(r"(.*?)(\d{1,9})(\.[^.\d]+)")  # what is before the last number, it, and the suffix
 _TRANSPARENCY = "transparency"
-_GUIDE = ("light", _TRANSPARENCY, "depth")
+_DEPTH = "depth"
+_GUIDE = ("light", _TRANSPARENCY, _DEPTH)
 
 
 @dataclass(frozen=True)
@@ -109,8 +110,12 @@ class Frames:
         return self.files.get(number, self.path / f"frame_{number:04d}.npz")
 
     def time(self, number: int) -> float:
-        """The time of a frame in seconds; 0 of a single volume."""
+        """The time of a frame in seconds; 0 without a scene."""
         return 0.0 if self.scene is None else self.scene.time(number)
+
+    def looks(self, number: int) -> Looks | None:
+        """What a picture of a frame shows; None without a scene."""
+        return None if self.scene is None else self.scene.looks(number)
 
     def load(self, number: int) -> DensityVolume:
         """Reads a frame.
@@ -333,9 +338,9 @@ def write_guide(path: str | os.PathLike[str], guide: Guide) -> None:
     write_planes(path, planes, {"camera": asdict(guide.camera)}, whole=_GUIDE)
 
 
-def write_six_way(path: str | os.PathLike[str], six: SixWay) -> None:
-    """Writes lightmaps as an EXR of half floats: a channel for each direction, `transparency` and, of hot smoke,
-    `emission`; the camera is in its header.
+def write_six_way(path: str | os.PathLike[str], six: SixWay, looks: Looks | None = None) -> None:
+    """Writes lightmaps as an EXR of half floats: a channel for each direction, `transparency`, of hot smoke `emission`,
+    and where it is known the surface's `depth`, a float; the camera and the looks are in its header.
 
     Raises:
         ValueError: The camera isn't known.
@@ -344,10 +349,11 @@ def write_six_way(path: str | os.PathLike[str], six: SixWay) -> None:
     if six.camera is None:
         raise ValueError("camera: expected that of the lightmaps, found none")
     planes = dict(zip(DIRECTIONS, six.lightmaps.cpu().numpy(), strict=True))
-    for name, plane in ((_TRANSPARENCY, six.transparency), (EMISSION, six.emission)):
+    for name, plane in ((_TRANSPARENCY, six.transparency), (EMISSION, six.emission), (_DEPTH, six.depth)):
         if plane is not None:
             planes[name] = plane.cpu().numpy()
-    write_planes(path, planes, {"camera": asdict(six.camera)})
+    note = {"camera": asdict(six.camera)} | ({} if looks is None else {"looks": looks.model_dump(mode="json")})
+    write_planes(path, planes, note, whole=(_DEPTH,))
 
 
 def is_six_way(path: Path) -> bool:
@@ -372,10 +378,19 @@ def six_way_files(folder: Path) -> list[Path]:
 
 
 def read_six_way(path: str | os.PathLike[str], device: str = "cpu") -> SixWay:
-    """Reads what `write_six_way` wrote.
+    """Reads the lightmaps of a file of `write_six_way`.
 
     Raises:
         WlmError: The file is missing or damaged, lacks a channel or its camera, or holds a number that isn't finite.
+    """
+    return read_shaded(path, device)[0]
+
+
+def read_shaded(path: str | os.PathLike[str], device: str = "cpu") -> tuple[SixWay, Looks | None]:
+    """Reads what `write_six_way` wrote: the lightmaps, and the looks that were given with them.
+
+    Raises:
+        WlmError: As `read_six_way`, or the looks are wrong.
     """
     planes, note = read_planes(path)
     for name in (*DIRECTIONS, _TRANSPARENCY):
@@ -395,7 +410,10 @@ def read_six_way(path: str | os.PathLike[str], device: str = "cpu") -> SixWay:
         raise WlmError(f"{path}: expected the camera's {camera.height} x {camera.width} pixels, found {size}")
     tensors = {name: torch.from_numpy(plane).to(device) for name, plane in planes.items()}
     lightmaps = torch.stack([tensors[name] for name in DIRECTIONS])
-    return SixWay(lightmaps, tensors[_TRANSPARENCY], tensors.get(EMISSION), camera)
+    six = SixWay(lightmaps, tensors[_TRANSPARENCY], tensors.get(EMISSION), camera, tensors.get(_DEPTH))
+    if "looks" not in note:
+        return six, None
+    return six, check_settings(Looks, note["looks"], f"{path}: header attribute wlm: looks.")
 
 
 @contextmanager

@@ -143,7 +143,7 @@ def _simulate(
                 solver.check()
                 volume = volume_of(scene, solver)
                 # Before the state: one whose frame is missing would be resumed past it.
-                save_volume(frames.file(frame), volume)
+                save_volume(frames.file(frame), volume, bricks=True)
             if pace.due():
                 with pace.saving():
                     solver.save(checkpoint)
