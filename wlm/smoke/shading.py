@@ -9,9 +9,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+import warp as wp
 
-from wlm.ops.raster import rasterize
+from wlm.interop import device_name, stream, to_warp, torch_memory
 from wlm.smoke.camera import Camera, unit
+from wlm_kernels.smoke import shadow
 
 _SMALLEST_MAP = 8  # texels along an edge, of which four are the empty border
 
@@ -80,7 +82,8 @@ def obstacle_visibility(
         vertices: float32 [V, 3], the obstacles' corners in the world.
         triangles: int32 or int64 [F, 3], rows of the vertices.
         resolution: Texels along an edge of the shadow map, at least 8.
-        bias: How much nearer to the light, in the world's unit, an obstacle must be to keep it off; None: 1.5 texels.
+        bias: How much nearer to the light, in the world's unit, an obstacle must be to keep it off, at least 0; None:
+            1.5 texels.
 
     Returns:
         float32 [H, W] in [0, 1], mixed between the four texels around a point; 1 where there is no smoke.
@@ -95,35 +98,16 @@ def obstacle_visibility(
     lit = torch.ones(size, dtype=torch.float32, device=depth.device)
     if resolution < _SMALLEST_MAP:
         raise ValueError(f"resolution: expected at least {_SMALLEST_MAP}, got {resolution}")
+    if bias is not None and not bias >= 0:
+        raise ValueError(f"bias: expected at least 0, got {bias}")
     if not len(triangles):
         return lit
     # Any turn about the light's direction will do.
-    from_light = Camera.look_at(direction, np.zeros(3), extent=1.0, height=1, width=1)
-    axes = torch.tensor(from_light.axes, dtype=torch.float64, device=depth.device)
-    corners = vertices.double() @ axes.T
-    low, high = corners[triangles.reshape(-1)].aminmax(dim=0)
-    middle = 0.5 * (low + high)
-    # Square, and two texels wider than the obstacles on each side, so that the border is empty.
-    half = max(float((high - low)[:2].max()) * 0.5 * resolution / (resolution - 4), 1e-9)
-    texel = 2.0 * half / resolution
-    behind = max(float((high - low)[2]), 1e-9)
-    flat = (corners - middle) / half
-    # z grows away from the light.
-    clip = torch.stack([flat[:, 0], flat[:, 1], (middle[2] - corners[:, 2]) / behind, torch.ones_like(flat[:, 0])], 1)
-    drawn = rasterize(clip.float(), triangles, resolution, resolution)
-    nearest = torch.where(drawn.triangle >= 0, middle[2] - drawn.depth.double() * behind, -math.inf)
-
-    origin, direction = camera.rays(depth.device)
-    at = (origin + depth.double()[..., None] * direction) @ axes.T
-    column = ((at[..., 0] - middle[0]) / half + 1.0) * 0.5 * resolution - 0.5
-    row = (1.0 - (at[..., 1] - middle[1]) / half) * 0.5 * resolution - 0.5
-    offset = 1.5 * texel if bias is None else bias
-    hidden = torch.zeros_like(depth, dtype=torch.float64)
-    for down in (0, 1):
-        for across in (0, 1):
-            r, c = row.floor() + down, column.floor() + across
-            weight = (1.0 - (row - r).abs()) * (1.0 - (column - c).abs())
-            # The border's texels are empty: what lies outside is lit.
-            occluder = nearest[r.clamp(0, resolution - 1).long(), c.clamp(0, resolution - 1).long()]
-            hidden += torch.where(occluder > at[..., 2] + offset, weight, 0.0)
-    return torch.where(depth > 0, (1.0 - hidden).clamp(0, 1).float(), lit)
+    axes = Camera.look_at(direction, np.zeros(3), extent=1.0, height=1, width=1).axes
+    with stream(device_name(depth.device)):
+        arrays = to_warp(vertices.float().contiguous(), wp.vec3), to_warp(triangles.int().contiguous())
+        surface = to_warp(depth.float().contiguous())
+        arrays += axes.ravel().tolist(), camera.in_world(), surface, to_warp(lit)
+        options = {"resolution": resolution, "bias": -1.0 if bias is None else bias}
+        shadow.visibility(*arrays, **options, empty=torch_memory(depth.device))
+    return lit

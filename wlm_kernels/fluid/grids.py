@@ -4,10 +4,10 @@ import warp as wp
 
 from wlm_kernels.smoke.march import density_at, size_of
 
-_OPTIONS = {"enable_backward": False}
+wp.set_module_options({"enable_backward": False})
 
 
-@wp.kernel(module="unique", module_options=_OPTIONS)
+@wp.kernel
 def dense(
     # in:
     grid: wp.uint64,
@@ -20,7 +20,7 @@ def dense(
     out[i, j, k] = wp.volume_lookup_f(grid, low[0] + i, low[1] + j, low[2] + k)
 
 
-@wp.kernel(module="unique", module_options=_OPTIONS)
+@wp.kernel
 def resample(
     # in:
     values: wp.array3d[float],
