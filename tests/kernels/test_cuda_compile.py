@@ -48,6 +48,7 @@ MODULES = (
     "raster.gradient",
     "raster.rasterize",
     "raster.texture",
+    "smoke.picture",
     "smoke.shadow",
     "smoke.single_scatter",
 )

@@ -14,6 +14,10 @@ import warp as wp
 from wlm.interop import device_name, stream, to_warp, torch_memory
 from wlm.smoke.camera import Camera, unit
 from wlm_kernels.smoke import shadow
+from wlm_kernels.smoke.march import View
+
+SHADOW_MAP = 512
+"""Texels along an edge of a shadow map."""
 
 _SMALLEST_MAP = 8  # texels along an edge, of which four are the empty border
 
@@ -67,7 +71,7 @@ def obstacle_visibility(
     vertices: torch.Tensor,
     triangles: torch.Tensor,
     *,
-    resolution: int = 512,
+    resolution: int = SHADOW_MAP,
     bias: float | None = None,
 ) -> torch.Tensor:
     """The share of a light that obstacles leave to the smoke's surface, by a shadow map (section 4.5).
@@ -102,12 +106,37 @@ def obstacle_visibility(
         raise ValueError(f"bias: expected at least 0, got {bias}")
     if not len(triangles):
         return lit
-    # Any turn about the light's direction will do.
-    axes = Camera.look_at(direction, np.zeros(3), extent=1.0, height=1, width=1).axes
     with stream(device_name(depth.device)):
         arrays = to_warp(vertices.float().contiguous(), wp.vec3), to_warp(triangles.int().contiguous())
         surface = to_warp(depth.float().contiguous())
-        arrays += axes.ravel().tolist(), camera.in_world(), surface, to_warp(lit)
-        options = {"resolution": resolution, "bias": -1.0 if bias is None else bias}
-        shadow.visibility(*arrays, **options, empty=torch_memory(depth.device))
+        cast_shadow(*arrays, light_axes(direction), camera.in_world(), surface, to_warp(lit), resolution, bias)
     return lit
+
+
+def light_axes(toward: Sequence[float] | np.ndarray) -> list[float]:
+    """Rows of axes of which the third points to a light, 9 numbers: any turn about its direction will do."""
+    return Camera.look_at(toward, np.zeros(3), extent=1.0, height=1, width=1).axes.ravel().tolist()
+
+
+def cast_shadow(
+    points: wp.array,
+    triangles: wp.array,
+    axes: Sequence[float],
+    view: View,
+    depth: wp.array,
+    out: wp.array,
+    resolution: int = SHADOW_MAP,
+    bias: float | None = None,
+) -> None:
+    """`obstacle_visibility` of arrays that stay in place, unchecked; a graph may capture it.
+
+    Args:
+        points, triangles: vec3 [V] and int32 [F, 3], at least one.
+        axes: From `light_axes`.
+        view: From `Camera.in_world`.
+        depth, out: float [H, W].
+        resolution, bias: As for `obstacle_visibility`.
+    """
+    options = {"resolution": resolution, "bias": -1.0 if bias is None else bias}
+    memory = torch_memory(wp.device_to_torch(depth.device))
+    shadow.visibility(points, triangles, axes, view, depth, out, **options, empty=memory)

@@ -1,7 +1,7 @@
 """Shadows of obstacles on the surface of smoke, by a shadow map (section 4.5): bounds, map and look-up, four launches.
 
-The map is square, seen from the light, over the obstacles and two texels more on each side: its border is empty. Nothing
-is read back, so that all of it can be captured in a graph. Lengths are the world's, measured from the first corner of
+The map is square, seen from the light, over the obstacles and two texels more on each side: its border is empty. None
+of it is read back, so that a graph can capture all. Lengths are the world's, measured from the first corner of the
 the first triangle, so that float32 holds them wherever the scene lies.
 """
 
