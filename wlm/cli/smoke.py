@@ -31,6 +31,7 @@ from wlm.cli.smoke_options import (
     with_smoke,
     write_lightmaps,
 )
+from wlm.cli.smoke_run import register as register_run
 from wlm.errors import WlmError
 from wlm_kernels.smoke.settings import March
 
@@ -333,3 +334,4 @@ def _shots(source: "BakedFiles | FramesToBake", progress: "OnProgress", count: i
 
 
 register(app)
+register_run(app)

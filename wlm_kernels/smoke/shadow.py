@@ -2,7 +2,7 @@
 
 The map is square, seen from the light, over the obstacles and two texels more on each side: its border is empty. None
 of it is read back, so that a graph can capture all. Lengths are the world's, measured from the first corner of the
-the first triangle, so that float32 holds them wherever the scene lies.
+first triangle, so that float32 holds them wherever the scene lies.
 """
 
 from collections.abc import Sequence
