@@ -11,6 +11,7 @@ from builders.smoke_plumes import SCENE, SPHERE
 from PIL import Image
 
 from wlm.formats.film import film
+from wlm.smoke.codec import shipped
 
 HOT = {"extinction": 8.0, "emission": 3.0, "glow": [[0, 0, 0, 0], [0.5, 2, 0.5, 0]]}
 
@@ -45,6 +46,8 @@ def test_run_is_what_its_stages_are_one_by_one(scene, tmp_path):
         # Half floats; and at a few pixels the surface's depth, in jittered steps, on another side of an obstacle.
         error = np.abs(made - staged)
         assert (error > 2).mean() < 0.02, number
+    call("smoke", "run", scene, "-o", tmp_path / "net", "--network", shipped(), "--frames", 1)
+    assert np.abs(png(tmp_path / "net" / "run_0001.png") - png(tmp_path / "run" / "run_0001.png")).mean() < 6
     call("smoke", "run", scene, "-o", tmp_path / "one", "--frames", 1, "--resolution", 10, "--scale", 2)
     assert png(tmp_path / "one" / "run_0001.png").shape == (10, 12, 3)
 

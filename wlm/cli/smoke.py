@@ -63,7 +63,9 @@ _G = Annotated[float, typer.Option(min=-0.99, max=0.99, help="Mean cosine of the
 @app.command()
 @exclusive
 def simulate(
-    scene_name: Annotated[str, typer.Argument(metavar="SCENE", help="jet-sphere, jet-moving, explosion, or a YAML.")],
+    scene_name: Annotated[
+        str, typer.Argument(metavar="SCENE", help="jet-sphere, jet-moving, explosion, chimney, or a YAML.")
+    ],
     output: Annotated[Path, output_option("DIR", "The folder of frames to write.")],
     frames: Annotated[int | None, typer.Option(min=1, max=9999, help="How many; default the scene's.")] = None,
     scale: Annotated[

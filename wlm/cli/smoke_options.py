@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 
 SHEET = "sheet.png"
 
+SceneName = Annotated[
+    str, typer.Argument(metavar="SCENE", help="jet-sphere, jet-moving, explosion, chimney, or a YAML.")
+]
 Input = Annotated[Path, typer.Argument(metavar="SMOKE", help="A .npz, .nvdb or .vdb volume, or a folder of frames.")]
 
 

@@ -8,6 +8,7 @@ import typer
 
 from wlm.cli.console import check_output, exclusive, number, quiet_warp, running, show, table
 from wlm.cli.options import Device, Seed, output_option
+from wlm.cli.smoke_options import SceneName
 from wlm.errors import WlmError
 
 _WARM = 2  # frames at the beginning that compile and fill caches, and don't count where there are others
@@ -20,7 +21,7 @@ def register(app: typer.Typer) -> None:
 
 @exclusive
 def run(
-    scene_name: Annotated[str, typer.Argument(metavar="SCENE", help="One of ours, or a YAML.")],
+    scene_name: SceneName,
     output: Annotated[Path, output_option("OUT", "A folder of PNGs, or an .mp4.")],
     frames: Annotated[int | None, typer.Option(min=1, max=9999, help="How many; default the scene's.")] = None,
     scale: Annotated[
