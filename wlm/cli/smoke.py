@@ -265,6 +265,8 @@ def flipbook(
         float | None,
         typer.Option(help="Factor on the light; default 1 in an EXR, else the greatest without clipping."),
     ] = None,
+    padding: Annotated[int, typer.Option(min=0, max=64, help="Pixels around each cell that repeat its border.")] = 0,
+    shader: Annotated[bool, typer.Option("--shader", help="Write OUT.glsl and OUT.hlsl too.")] = False,
     step: _BakeStep = None,
     supersample: _BakeSupersample = None,
 ) -> None:
@@ -277,7 +279,9 @@ def flipbook(
     if gain is not None and not 0 < gain < float("inf"):
         raise WlmError(f"--gain: expected a number above 0, got {gain}")
     quiet_warp()
+    from wlm.formats.atomic import atomic_write
     from wlm.smoke.exporter import brightest_gain, cells, channels, write_flipbook
+    from wlm.smoke.shader import LANGUAGES, smoke_shader
 
     source = _source(smoke, options, step, supersample, 0.5)
     with running("flipbook") as progress:
@@ -288,13 +292,20 @@ def flipbook(
     if gain is None:
         gain = 1.0 if output.suffix.lower() == ".exr" else brightest_gain(frames)
     paths = tuple(output.with_name(f"{output.stem}_{i}{output.suffix}") for i in (1, 2))
-    clipped = write_flipbook(paths, frames, layout, rows=rows_of_cells, columns=columns, gain=gain)
+    placed = {"rows": rows_of_cells, "columns": columns, "gain": gain, "padding": padding}
+    clipped = write_flipbook(paths, frames, layout, **placed)
     height, width = frames[0].lightmaps.shape[1:]
+    if shader:
+        hot = any(frame.emission is not None for frame in frames)
+        for language in LANGUAGES:
+            text = smoke_shader(language, layout, **placed, count=len(frames), size=(height, width), hot=hot)
+            atomic_write(output.with_suffix(f".{language}"), text.encode())
     rows = table(str(smoke), ["file", "bytes", "channels"], text=["channels"])
     for path, names in zip(paths, channels(frames, layout), strict=True):
         rows.add_row(escape(str(path)), f"{path.stat().st_size:,}", " ".join(names))
     rows.add_section()
-    rows.add_row("frames", f"{len(frames):,}", f"{rows_of_cells} x {columns} cells of {width} x {height}")
+    around = f", {padding} around each" if padding else ""
+    rows.add_row("frames", f"{len(frames):,}", f"{rows_of_cells} x {columns} cells of {width} x {height}{around}")
     rows.add_row("gain", f"{gain:.4g}", f"{clipped:,} numbers clipped")
     show(rows)
 
