@@ -103,7 +103,7 @@ def run(
     looks = scene.looks(1)
     parts = {"background": looks.background, "ramp": looks.ramp, "obstacles": looks.obstacles}
     drawing = Drawing(camera, [light.light() for light in looks.lights], **parts, device=device)
-    graph = _Graph(lighting, camera, drawing, device) if lighting.network is None and device != "cpu" else None
+    graph = FrameGraph(lighting, camera, drawing, device) if lighting.network is None and device != "cpu" else None
     meter = Meter(progress, "run", scene.frames)
     for number in range(1, scene.frames + 1):
         clock = _Clock(device)
@@ -143,15 +143,29 @@ class _Clock:
         return time.perf_counter()
 
 
-class _Graph:
-    """Lightmaps and picture of a volume in one graph, which reads a copy of the smoke: that of a solver moves."""
+class FrameGraph:
+    """Lightmaps and picture of frames in one graph: captured at the second call on CUDA, and replayed from then on.
+
+    It reads a copy of the smoke, since that of a solver moves.
+    """
 
     def __init__(self, lighting: Lighting, camera: Camera, drawing: Drawing, device: str) -> None:
+        """Makes it.
+
+        Args:
+            lighting: By a march.
+            camera: Orthographic; that of the drawing.
+            drawing: Whose `image` each call fills.
+            device: As `wlm.interop.check_device` returns it; its kernels should have run once.
+        """
         self._lighting, self._camera, self._drawing = lighting, camera, drawing
         self._volume: DensityVolume | None = None
-        self._device, self._step = device, StepGraph(self._work, device)
+        self._device = device
+        # Frames before have loaded the kernels.
+        self._step = StepGraph(self._work, device, warmup=1)
 
     def __call__(self, volume: DensityVolume) -> None:
+        """Draws a frame of smoke, of the first one's shape, place and factors."""
         with stream(self._device):
             if self._volume is None:
                 heat = None if volume.temperature is None else torch.empty_like(volume.temperature)
