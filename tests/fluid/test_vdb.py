@@ -147,6 +147,12 @@ def test_damage(tmp_path: Path):
     path.write_bytes(whole.replace(b"Tree_float_5_4_3", b"Tree_vec3s_5_4_3"))
     with pytest.raises(WlmError, match=r"a.vdb: expected a grid of floats, found density \(Tree_vec3s_5_4_3\)"):
         load_volume(path)
+    nodes = tree(*smoke(), 0)
+    both = vdb_file({name: (scaled(1, 1, 1), nodes, 0, False) for name in ("density", "heat")})
+    path.write_bytes(both.replace(b"Tree_float_5_4_3", b"Tree_vec3s_5_4_3", 1))
+    with pytest.raises(WlmError, match=r"a.vdb: expected a grid of floats for the density, found density \(Tree_vec3s"):
+        load_volume(path)
+    assert load_volume(path, density="heat").shape == (24, 16, 32)
     write(path, placed=scaled(1, 1, 1e-7))
     with pytest.raises(WlmError, match="a.vdb: density: expected at most 134217728 cubic voxels"):
         load_volume(path)

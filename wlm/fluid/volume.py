@@ -442,6 +442,8 @@ def _read_vdb(path: Path, names: tuple[str | None, str | None], trust: bool) -> 
     file = VdbFile(data, str(path))
     if not file.names:
         raise WlmError(f"{path}: expected a grid of floats, found {', '.join(file.others) or 'no grid'}")
+    if names[0] is None and (other := next((o for o in file.others if o.startswith(f"{_DENSITY} (")), None)):
+        raise WlmError(f"{path}: expected a grid of floats for the density, found {other}; name another")
     most = _LARGEST if trust else min(VOXELS, max(SURE_BOX, VOXELS_A_BYTE * len(data)))
     grids = []
     for name in _choose(path, file.names, names):
