@@ -81,7 +81,7 @@ def jet(out: Path, name: str, device: str) -> dict[str, float]:
     drawn, maps, coverage = [], [], []
     for shot in FramesToBake(frames, scene.camera).shots():
         _check_lightmaps(f"{name}, frame {shot.number}", shot.six)
-        options = {"background": scene.background, "obstacles": shot.obstacles, "time": shot.time}
+        options = {"background": scene.background, "obstacles": scene.obstacles, "time": shot.looks.time}
         drawn.append(to_bytes(picture(shot.six, lights, **options)))
         pictures = six_pictures(shot.six)
         maps.append({key: pictures[key] for key in ("right", "top", "front")})

@@ -105,7 +105,7 @@ def light(
         depth = guide(volume, camera, March(1.0, jitter=0.0)).depth if scene.obstacles else None
         lightmaps = render(volume, camera, model, predictor, number)
         for method, six in lightmaps.items():
-            image = picture(replace(six, depth=depth), lights, ramp=scene.smoke.ramp, **options)
+            image = picture(replace(six, depth=depth), lights, ramp=scene.looks(number).ramp, **options)
             rows.setdefault(method, []).append(to_bytes(image))
             if method != "reference":
                 for what, value in psnr(six, lightmaps["reference"]).items():

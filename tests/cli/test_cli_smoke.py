@@ -17,13 +17,14 @@ from wlm.fluid.volume import from_array, load_volume, save_volume
 from wlm.formats.exr_planes import read_planes
 from wlm.smoke.baking import bake
 from wlm.smoke.camera import axis_faults
-from wlm.smoke.data import read_six_way
+from wlm.smoke.data import load_frames, read_shaded, read_six_way
 from wlm.smoke.exporter import read_flipbook
 from wlm.smoke.guiding import guide
 from wlm.smoke.scene import CameraSettings, LightSettings, make_camera
 from wlm.view.smoke import picture, to_bytes
 from wlm_kernels.smoke.settings import March
 
+LIGHT = LightSettings(toward=(1, 1, 1)).light()
 SMALL = ("--resolution", 20, "--step", 1)
 
 
@@ -170,17 +171,44 @@ def test_shade(volume, frames, baked, tmp_path):
     # Baked lightmaps know their camera.
     call("smoke", "shade", baked / "six_0002.exr", "-o", out, "--light", "1,1,0", "--rule", "absolute")
     light = LightSettings(toward=(1, 1, 0)).light()
-    expected = picture(read_six_way(baked / "six_0002.exr"), [light], rule="absolute")
+    six, looks = read_shaded(baked / "six_0002.exr")
+    expected = picture(six, [light], rule="absolute", obstacles=looks.obstacles, time=looks.time)
     np.testing.assert_array_equal(png(out), to_bytes(expected))
     # Frames have a scene: its obstacle is in the picture, and moves.
     text = call("smoke", "shade", frames, "-o", tmp_path / "s", *SMALL)
     names = [f"shade_{i:04d}.png" for i in (1, 2, 3)]
     assert sorted(os.listdir(tmp_path / "s")) == [*names, "sheet.png"] and all(name in text for name in names)
-    call("smoke", "shade", baked, "-o", tmp_path / "t")
-    differ = [png(tmp_path / "s" / name) != png(tmp_path / "t" / name) for name in names]
+    without = [to_bytes(read_six_way(baked / f"six_{i:04d}.exr").shade([LIGHT])) for i in (1, 2, 3)]
+    differ = [np.abs(png(tmp_path / "s" / names[i]) - np.int32(plain)) > 2 for i, plain in enumerate(without)]
     columns = [np.flatnonzero(each.any((0, 2))).mean() for each in differ]
     assert columns[0] < columns[1] < columns[2]
     assert png(tmp_path / "s" / "sheet.png").shape[1] > 3 * 20
+
+
+def test_every_route_keeps_the_scene(tmp_path):
+    """Lights, background, glow, obstacles and their shadows are those of the scene, whoever made the lightmaps."""
+    lights = [{"toward": [1, 0, 1], "irradiance": [20, 2, 2]}, {"toward": [-1, 1, 0], "irradiance": [0, 0, 30]}]
+    looks = {"lights": lights, "background": [0.0, 0.2, 0.0], "obstacles": [SPHERE | {"colour": [0.5, 0.5, 0.1]}]}
+    smoke = {"extinction": 8.0, "emission": 2.0, "glow": [[0, 0, 0, 0], [1, 3, 1, 0]]}
+    folder = write_frames(tmp_path / "a", smoke=smoke, frames=2, **looks).path
+    for number in (1, 2):
+        save_volume(folder / f"frame_{number:04d}.npz", plume(number + 1, hot=True))
+    call("smoke", "shade", folder, "-o", tmp_path / "s", *SMALL)
+    for name, words in {"bake": ["bake", "--step", 1], "coarse": ["predict", "--coarse", "--step", 1]}.items():
+        call("smoke", *words, folder, "-o", tmp_path / name, "--resolution", 20)
+        call("smoke", "shade", tmp_path / name, "-o", tmp_path / f"{name}_s")
+        for number in (1, 2):
+            file = f"shade_{number:04d}.png"
+            expected, got = (np.int32(png(tmp_path / at / file)) for at in ("s", f"{name}_s"))
+            # Half floats, and of the march of `--coarse` its steps.
+            error = np.abs(got - expected)
+            assert error.max() <= 1 if name == "bake" else (error.mean() < 2 and error.max() < 40), name
+    # One file has them too.
+    call("smoke", "shade", tmp_path / "bake" / "six_0002.exr", "-o", tmp_path / "one.png")
+    np.testing.assert_array_equal(png(tmp_path / "one.png"), png(tmp_path / "bake_s" / "shade_0002.png"))
+    call("smoke", "predict", folder, "-o", tmp_path / "network", "--resolution", 20)
+    six, kept = read_shaded(tmp_path / "network" / "six_0002.exr")
+    assert kept == load_frames(folder).scene.looks(2) and bool((six.depth > 0).any())
 
 
 def test_a_scenes_glow(tmp_path):
@@ -205,6 +233,15 @@ def test_flipbook(layout, baked, volume, tmp_path):
         torch.testing.assert_close(frame.lightmaps, six.lightmaps)
         torch.testing.assert_close(frame.transparency, six.transparency, rtol=0, atol=1e-3)
     assert ("emission" in text) == (layout == "o3de-tlrb"), "the last channel is left out where nothing glows"
+
+
+def test_a_padded_flipbook_and_its_shaders(baked, tmp_path):
+    text = call("smoke", "flipbook", baked, "-o", tmp_path / "f.exr", "--padding", 3, "--shader")
+    assert sorted(os.listdir(tmp_path)) == ["f.glsl", "f.hlsl", "f_1.exr", "f_2.exr"] and "3 around each" in text
+    result = read_flipbook((tmp_path / "f_1.exr", tmp_path / "f_2.exr"), rows=2, columns=2, count=3, padding=3)
+    torch.testing.assert_close(result[1].lightmaps, read_six_way(baked / "six_0002.exr").lightmaps)
+    assert "of 3 frames, in 2 x 2 cells" in (tmp_path / "f.hlsl").read_text()
+    assert f"place.x * {20 / 26:.9g}" in (tmp_path / "f.glsl").read_text()
 
 
 def test_flipbook_of_volumes(volume, frames, tmp_path):
@@ -256,7 +293,9 @@ def test_wrong_words_are_one_line(volume, frames, baked, tmp_path):
     assert "device 'tpu'" in fails(*made, "--device", "tpu")
     assert "ends in .exr" in fails("smoke", "bake", volume, "-o", tmp_path / "a.png")
     assert "gone.npz: cannot read the arrays: No such file" in fails("smoke", "bake", tmp_path / "gone.npz", "-o", out)
-    assert "expected a name that ends in .npz or .nvdb" in fails("smoke", "bake", tmp_path / "a.vdb", "-o", out)
+    assert "expected a name that ends in .npz, .nvdb, .vdb" in fails("smoke", "bake", tmp_path / "a.abc", "-o", out)
+    assert "--up: expected one of x, y, z, got 'w'" in fails(*made, "--up", "w")
+    assert "expected no up for the frames of a scene" in fails("smoke", "bake", frames, "-o", out, "--up", "z")
     shaded = ("smoke", "shade", volume, "-o", tmp_path / "a.png")
     assert "--light: expected three numbers" in fails(*shaded, "--light", "up")
     assert "--light: toward: expected a direction" in fails(*shaded, "--light", "0,0,0")
@@ -269,7 +308,7 @@ def test_wrong_words_are_one_line(volume, frames, baked, tmp_path):
         for command in ("shade", "flipbook"):
             line = fails("smoke", command, one, "-o", tmp_path / "a.png", f"--{option}", value)
             assert f"was baked: --{option} has to be given to bake" in line
-    assert "expected a folder that simulate or bake wrote" in fails("smoke", "shade", tmp_path, "-o", tmp_path / "x")
+    assert "expected a folder of simulate, or one sequence" in fails("smoke", "shade", tmp_path, "-o", tmp_path / "x")
     packed = ("smoke", "flipbook", baked, "-o", tmp_path / "a.png")
     assert "--layout: expected one of unity" in fails(*packed, "--layout", "godot")
     assert "--gain: expected a number above 0" in fails(*packed, "--gain", 0)

@@ -148,10 +148,10 @@ def test_a_frame_that_cannot_be_written_is_not_resumed_past(tmp_path, monkeypatc
     """A state is kept after its frame: where the frame isn't there, it is simulated again."""
     scene, out, save = Scene.model_validate(JET), tmp_path / "out", save_volume
 
-    def full(path, volume):
+    def full(path, volume, **options):
         if path.name == "frame_0003.npz":
             raise WlmError(f"{path}: cannot write: no space left")
-        save(path, volume)
+        save(path, volume, **options)
 
     monkeypatch.setattr(simulation, "save_volume", full)
     with pytest.raises(WlmError, match="no space left"):

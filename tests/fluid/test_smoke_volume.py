@@ -9,7 +9,7 @@ import torch
 import warp as wp
 
 from wlm.errors import WlmError
-from wlm.fluid.volume import from_array, from_grid, load_volume
+from wlm.fluid.volume import from_array, from_grid, load_volume, save_volume
 
 _GRID_INDEX, _GRID_NAME, _HEADER, _METADATA = 24, 40, 16, 176
 
@@ -47,6 +47,39 @@ def test_npz(tmp_path: Path, device: str):
     assert volume.warnings == () and volume.device.type == device[:4].rstrip(":")
     scaled = load_volume(path, voxel=1.0)
     assert scaled.voxel == 1.0 and scaled.origin == (4.0, 8.0, 12.0)
+
+
+def test_bricks(tmp_path: Path, device: str):
+    """What is empty is left out; all else comes back, of any shape, in its type."""
+    values = np.zeros((13, 24, 9), np.float16)
+    values[3:5, 9:12, 8], heat = 0.3, np.zeros_like(values)
+    heat[12, 23, 0] = 7
+    made = from_array(values, temperature=heat, voxel=0.25, origin=(1.0, 2.0, 3.0), device=device)
+    save_volume(tmp_path / "a.npz", made, bricks=True)
+    with np.load(tmp_path / "a.npz") as arrays:
+        assert arrays["bricks"].tolist() == [3, 10] and arrays["shape"].tolist() == [13, 24, 9]
+        parts = dict(arrays)
+    back = load_volume(tmp_path / "a.npz", device=device)
+    assert back.density.dtype == torch.float16 and (back.voxel, back.origin) == (0.25, (1.0, 2.0, 3.0))
+    np.testing.assert_array_equal(back.density.cpu(), values)
+    np.testing.assert_array_equal(back.temperature.cpu(), heat)
+    for name, value, message in (
+        ("bricks", [3, 3], "bricks: expected numbers int32 that rise"),
+        ("bricks", [3, 12], "bricks: expected numbers from 0 to 11"),
+        ("bricks", [-1, 3], "bricks: expected numbers from 0 to 11"),
+        ("bricks", [3, 4, 5], "density_bricks: expected 3 bricks of floats"),
+        ("shape", [13, 0, 9], "shape: expected 3 whole numbers from 1"),
+        ("shape", [1024, 1024, 1024], "shape: expected at most 256 times its"),
+        ("shape", [4096, 4096, 4096], "shape: expected at most 1073741824 voxels"),
+    ):
+        kind = parts[name].dtype
+        np.savez(tmp_path / "b.npz", **parts | {name: np.array(value, kind)})
+        with pytest.raises(WlmError, match=f"b.npz: {message}"):
+            load_volume(tmp_path / "b.npz")
+    del parts["density_bricks"]
+    np.savez(tmp_path / "b.npz", **parts)
+    with pytest.raises(WlmError, match="b.npz: density is missing; found voxel, origin, temperature"):
+        load_volume(tmp_path / "b.npz")
 
 
 def test_types():
@@ -112,10 +145,23 @@ def test_nvdb_of_two_grids(tmp_path: Path):
     volume = load_volume(tmp_path / "both.nvdb")
     np.testing.assert_array_equal(volume.density, density)
     np.testing.assert_array_equal(volume.temperature, hot)
-    _nvdb(tmp_path / "t.nvdb", hot, voxel=0.25)
-    _joined(tmp_path / "both.nvdb", {"temperature": tmp_path / "t.nvdb", "density": tmp_path / "d.nvdb"})
-    with pytest.raises(WlmError, match="both.nvdb: temperature: expected the voxels of density"):
-        load_volume(tmp_path / "both.nvdb")
+    by_name = load_volume(tmp_path / "both.nvdb", density="temperature")
+    np.testing.assert_array_equal(by_name.density, hot)
+    assert by_name.temperature is None
+    with pytest.raises(WlmError, match="both.nvdb: heat is missing; found temperature, density"):
+        load_volume(tmp_path / "both.nvdb", temperature="heat")
+    # Each in a segment of its own, as converters append them; and the temperature in finer voxels, further on.
+    _nvdb(tmp_path / "t.nvdb", np.ones_like(hot), voxel=0.25, at=(2.875, 2.0, 3.0))
+    parts = []
+    for name, letter in (("density", "d"), ("temperature", "t")):
+        _joined(tmp_path / "one.nvdb", {name: tmp_path / f"{letter}.nvdb"})
+        parts.append((tmp_path / "one.nvdb").read_bytes())
+    (tmp_path / "both.nvdb").write_bytes(b"".join(parts))
+    volume = load_volume(tmp_path / "both.nvdb")
+    np.testing.assert_array_equal(volume.density[:8], density)
+    assert volume.origin == (0.75, 1.75, 2.75) and volume.shape == (9, 8, 8) and not volume.density[8].any()
+    # Voxel 4's centre is at 3, the first of the temperature's at 2.875; its last at 4.625.
+    np.testing.assert_allclose(volume.temperature[:, 1, 1], [0, 0, 0, 0, 1, 1, 1, 1, 0.0], atol=1e-5)
 
 
 def test_damaged_nvdb(tmp_path: Path):
@@ -133,13 +179,16 @@ def test_damaged_nvdb(tmp_path: Path):
 
 
 def test_unsupported_nvdb(tmp_path: Path):
-    """Grids of vectors and of stretched voxels are refused."""
+    """Grids of vectors are refused, and those whose voxels have no volume."""
     path = tmp_path / "a.nvdb"
     _nvdb(path, np.ones((8, 8, 8, 3), np.float32))
     with pytest.raises(WlmError, match="expected a grid of floats"):
         load_volume(path)
-    _nvdb(path, np.ones((8, 8, 8), np.float32), voxel=(1.0, 2.0, 1.0))
-    with pytest.raises(WlmError, match="expected a grid of cubic voxels"):
+    _nvdb(path, np.ones((8, 8, 8), np.float32))
+    data = bytearray(path.read_bytes())
+    struct.pack_into("<d", data, _HEADER + _METADATA + 1 + 384, 0.0)  # the first number of the map
+    path.write_bytes(data)
+    with pytest.raises(WlmError, match="expected a map to the world that keeps a volume"):
         load_volume(path)
 
 
@@ -168,7 +217,7 @@ def test_wrong_files(tmp_path: Path):
     np.save(tmp_path / "c.npy", np.ones(3))
     (tmp_path / "c.npy").rename(tmp_path / "c.npz")
     for name, message in (
-        ("a.vdb", "expected a name that ends in .npz or .nvdb, found .vdb"),
+        ("a.abc", "expected a name that ends in .npz, .nvdb, .vdb, found .abc"),
         ("a.npz", "No such file"),
         ("b.npz", "cannot read the arrays"),
         ("c.npz", "expected a .npz file of several arrays"),

@@ -92,6 +92,7 @@ def write(path: Path, content: object) -> Path:
         (load_positions, ".json"),
         (load_volume, ".npz"),
         (load_volume, ".nvdb"),
+        (load_volume, ".vdb"),
         (lambda path: read_mask(path, "a.exr", (4, 4)), ".png"),
     ],
 )
@@ -486,7 +487,8 @@ def test_a_compressed_grid_that_unpacks_to_far_more(tmp_path):
     body = struct.pack("<Q", len(packed)) + packed
     header = struct.pack("<QIHH", 0x304244566F6E614E, 32 << 21, 1, 1)
     grid = bytearray(176)
-    struct.pack_into("<Q", grid, 8, 200 * len(body))
-    path = write(tmp_path / "a.nvdb", header + grid + 200 * body)
+    struct.pack_into("<2Q", grid, 0, 200 << 20, 200 * len(body))
+    struct.pack_into("<I", grid, 136, 1)  # of the name, which is empty
+    path = write(tmp_path / "a.nvdb", header + grid + b"\0" + 200 * body)
     with little_memory():
         assert "expected at most 256 times its" in refused(load_volume, path)

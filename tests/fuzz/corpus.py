@@ -27,6 +27,7 @@ from wlm.smoke.data import open_frames, write_six_way
 from wlm.smoke.learn.pool import Pool, save_pool
 from wlm.smoke.learn.settings import DatasetSettings
 from wlm.smoke.scene import Scene
+from wlm.smoke.shots import with_surface
 
 _HEIGHT, _WIDTH = 12, 10  # of every picture
 
@@ -178,6 +179,7 @@ def _volumes(folder: Path) -> None:
     density = np.random.default_rng(0).random((6, 5, 7)).astype(np.float16)
     volume = from_array(density, voxel=0.25, origin=(1.0, 2.0, 3.0), temperature=density**2)
     save_volume(folder / "volume.npz", volume)
+    save_volume(folder / "volume-bricks.npz", volume, bricks=True)
     grid = wp.Volume.load_from_numpy(density.astype(np.float32), (1.0, 2.0, 3.0), 0.5, 0.0, device="cpu")
     grid.save_to_nvdb(folder / "cloud.nvdb")
     # A node near the root has room for thousands of children: almost all of the file is zeros.
@@ -187,7 +189,9 @@ def _volumes(folder: Path) -> None:
 
 def _smoke(folder: Path) -> None:
     plume = smoke_plumes.plume(hot=True)
-    write_six_way(folder / "six-way.exr", bake_smoke(plume, smoke_plumes.facing(plume, size=12), estimate=False))
+    six = bake_smoke(plume, smoke_plumes.facing(plume, size=12), estimate=False)
+    looks = Scene.model_validate(smoke_plumes.SCENE | {"obstacles": [smoke_plumes.SPHERE]}).looks(1)
+    write_six_way(folder / "six-way.exr", with_surface(six, plume, looks), looks)
     guides, targets = (torch.linspace(0, 1, 2 * planes * 16).reshape(1, 2, planes, 4, 4).half() for planes in (3, 8))
     pool = Pool(guides, targets, torch.zeros(1, 2, 4, 4).half(), torch.zeros(1, dtype=torch.int64))
     save_pool(folder / "pool.safetensors", pool, DatasetSettings(), "seed-0")

@@ -283,6 +283,7 @@ HOSTILE: dict[str, tuple[Sequence[str], Write]] = {
             (".json", "probes-json"),
             (".lmbake", "probes-lmbake"),
             (".nvdb", "volume-nvdb"),
+            (".vdb", "volume-vdb"),
             (".png", "png-mask"),
             (".tga", "tga-flipbook"),
             (".yaml", "yaml-scene"),

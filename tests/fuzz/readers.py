@@ -14,6 +14,7 @@ from random import Random
 from typing import Any
 
 import numpy as np
+from builders.vdb_files import ACTIVE_MASK, ZIP, scaled, tree, vdb_file
 
 import wlm
 from wlm.atlas.exporter import geometry, read_folder
@@ -30,7 +31,7 @@ from wlm.formats.mask import read_mask
 from wlm.formats.obj import read_obj
 from wlm.inspection import inspect
 from wlm.probe.data import load_positions
-from wlm.smoke.data import load_frames, read_six_way
+from wlm.smoke.data import load_frames, read_shaded
 from wlm.smoke.exporter import read_flipbook
 from wlm.smoke.learn.settings import DatasetSettings
 from wlm.smoke.scene import Scene
@@ -75,7 +76,8 @@ def _light_file(path: Path) -> None:
 
 
 def _six_way(path: Path) -> None:
-    six = read_six_way(path)
+    six, looks = read_shaded(path)
+    assert looks is None or looks.ramp is None or len(looks.ramp.stops) > 1, "accepted with a glow of one colour"
     check_finite(lightmaps=six.lightmaps, transparency=six.transparency, axes=six.camera.axes)
     assert six.lightmaps.shape[1:] == (six.camera.height, six.camera.width), "accepted with another size"
 
@@ -174,6 +176,16 @@ def _volume(path: Path) -> None:
 @functools.cache
 def _grids() -> Sequence[bytes]:
     return tuple(gzip.decompress(data) for data in corpus("cloud.nvdb.gz")())
+
+
+@functools.cache
+def _vdbs() -> Sequence[bytes]:
+    """One packed by zlib, and one of several grids by Blosc, of OpenVDB's own."""
+    random = np.random.default_rng(0)
+    values = (random.random((16, 8, 24)) * (random.random((16, 8, 24)) < 0.5)).astype(np.float32)
+    nodes = tree(values, values > 0, ZIP | ACTIVE_MASK)
+    made = gzip.decompress((Path(__file__).resolve().parents[1] / "files" / "openvdb.vdb.gz").read_bytes())
+    return vdb_file({"density": (scaled(0.5, 0.5, 0.6), nodes, ZIP | ACTIVE_MASK, False)}), made
 
 
 @functools.cache
@@ -390,11 +402,19 @@ _ALL = (
     ),
     Reader("positions-npz", "a.npz", corpus("positions.npz"), vary_npz, _positions),
     Reader("positions-json", "a.json", corpus("positions.json"), _json, _positions),
-    Reader("volume-npz", "a.npz", corpus("volume.npz"), vary_npz, _volume),
+    Reader("volume-npz", "a.npz", corpus("volume.npz", "volume-bricks.npz"), vary_npz, _volume),
     Reader(
         "volume-nvdb",
         "a.nvdb",
         _grids,
+        lambda draw, data: vary_numbers(draw, data, _grid_fields(data)),
+        _volume,
+        cost=2,
+    ),
+    Reader(
+        "volume-vdb",
+        "a.vdb",
+        _vdbs,
         lambda draw, data: vary_numbers(draw, data, _grid_fields(data)),
         _volume,
         cost=2,

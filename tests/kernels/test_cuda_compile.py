@@ -28,6 +28,7 @@ MODULES = (
     "atlas.patch_graph",
     "atlas.patches",
     "fluid.advection_places",
+    "fluid.grids",
     "fluid.lattice_links",
     "fluid.lattice_solids",
     "interpolate",
@@ -47,6 +48,8 @@ MODULES = (
     "raster.gradient",
     "raster.rasterize",
     "raster.texture",
+    "smoke.picture",
+    "smoke.shadow",
     "smoke.single_scatter",
 )
 WIDTHS = (8, 17, 32, 64)

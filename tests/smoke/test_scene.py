@@ -33,6 +33,7 @@ from wlm.smoke.guiding import guide
 from wlm.smoke.scene import (
     CameraSettings,
     LightSettings,
+    Looks,
     ObstacleSettings,
     Scene,
     Smoke,
@@ -60,19 +61,27 @@ def test_a_scene_from_a_file(tmp_path):
     assert _scene(tmp_path, inlets=[]).fastest == 1.0
 
 
-@pytest.mark.parametrize("name", ["jet-sphere", "jet-moving", "explosion"])
-def test_the_scenes_that_there_are(name):
+@pytest.mark.parametrize(
+    ("name", "cells"),
+    [
+        ("jet-sphere", (100, 100, 100)),
+        ("jet-moving", (100, 100, 100)),
+        ("explosion", (100, 100, 100)),
+        ("chimney", (140, 100, 60)),
+    ],
+)
+def test_the_scenes_that_there_are(name, cells):
     scene = load_scene(name)
     assert name in profile_names("smoke")
-    # Nothing begins inside of an obstacle or out of the box, and the paper's grids are meant.
-    assert scene.grid.cells == (100, 100, 100) and scene.grid.shape == (400, 400, 400)
+    # Nothing begins out of the box, and the paper's grids are meant.
+    assert scene.grid.cells == cells and scene.grid.shape == tuple(4 * n for n in cells)
     box = scene.grid.origin + scene.grid.size
     for time in np.linspace(0, scene.time(scene.frames), 9):
         for obstacle in scene.obstacles:
-            assert (np.abs(obstacle.centre(time) - 0.5 * box) + obstacle.radius < 0.5 * box).all()
+            assert (np.abs(obstacle.centre(time) - 0.5 * box) + obstacle.radius <= 0.5 * box).all()
     assert scene.inlets or scene.sources
-    small = scene.scaled(0.16)
-    assert small.grid.cells == (16, 16, 16)
+    small = scene.scaled(0.2)
+    assert small.grid.cells == tuple(n // 5 for n in cells)
     np.testing.assert_allclose(small.grid.size, scene.grid.size)
     assert small.steps * 5 < scene.steps * 2
 
@@ -100,7 +109,7 @@ def test_scaling_keeps_one_cell(tmp_path):
         ({"grid": {"cells": [4, 4, 4], "cell": 1, "faces": {"up": "wall"}}}, "grid.faces.up"),
         ({"grid": {"cells": [4, 4, 4], "cell": 1, "faces": {"-x": "periodic"}}}, "both faces of an axis"),
         ({"smoke": {"extinction": 0}}, "smoke.extinction: expected greater than 0"),
-        ({"smoke": {"glow": [[0, 1, 1, 1]]}}, "smoke: expected no stops of glow, or at least two that rise"),
+        ({"smoke": {"glow": [[0, 1, 1, 1]]}}, "smoke.glow: expected no stops of glow, or at least two that rise"),
         ({"air": {"viscosity": math.nan}}, "air.viscosity: expected a finite number, got nan"),
         ({"sources": [{"centre": [0, 0, 0], "radius": 1, "start": 2, "stop": 1}]}, "expected to stop after it starts"),
         ({"obstacles": [SPHERE | {"path": []}]}, "obstacles.0.path"),
@@ -202,9 +211,11 @@ def test_a_camera_as_it_is_told():
 def test_lights_and_glow():
     light = LightSettings(toward=(0, 3, 0)).light()
     assert light.toward == (0, 3, 0) and light.irradiance == pytest.approx((4 * math.pi,) * 3)
-    assert Smoke().ramp is None and not Smoke().hot and Smoke(emission=1.0).hot
-    ramp = Smoke(glow=((0, 0, 0, 0), (2, 4, 2, 0))).ramp
-    np.testing.assert_allclose(ramp(torch.tensor([1.0])), [[2, 1, 0]])
+    assert Looks(lights=()).ramp is None and not Smoke().hot and Smoke(emission=1.0).hot
+    scene = Scene.model_validate(SCENE | {"smoke": {"glow": ((0, 0, 0, 0), (2, 4, 2, 0))}, "obstacles": [SPHERE]})
+    looks = scene.looks(2)
+    np.testing.assert_allclose(looks.ramp(torch.tensor([1.0])), [[2, 1, 0]])
+    assert (looks.time, looks.lights, looks.obstacles) == (pytest.approx(0.2), scene.lights, scene.obstacles)
 
 
 def test_a_folder_of_frames(tmp_path):
@@ -248,7 +259,10 @@ def test_folders_that_are_none(tmp_path):
         open_frames(tmp_path / "a", scene)
     with pytest.raises(WlmError, match="cannot write: the folder .* does not exist"):
         open_frames(tmp_path / "none" / "b", scene)
-    with pytest.raises(WlmError, match=r"expected a folder that simulate wrote, found no scene.json"):
+    with pytest.raises(
+        WlmError,
+        match=r"or one sequence of volumes .*, found neither scene.json nor any",
+    ):
         load_frames(tmp_path / "a")
     for content, said in (
         ("{", "found other content"),

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from wlm.fluid.shapes import sphere
 from wlm.smoke.camera import VECTORS, Camera
 from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.shading import Light, Ramp, obstacle_visibility
@@ -135,6 +136,21 @@ def test_shadow_falls_behind_only(device: str):
     assert (obstacle_visibility(depths, camera, (0, 0, 1), box[0], none) == 1).all()
 
 
+@pytest.mark.parametrize("far", [0.0, 1000.0])
+def test_shadow_of_a_sphere(device: str, far: float):
+    """Its edge is mixed over a texel, so that the shadow's area is a circle's; a thousand radii off too."""
+    points, triangles = sphere()
+    corners = torch.from_numpy((points + [far, 0, far]).astype(np.float32)).to(device)
+    camera = Camera.look_at((far, 8, far), (far, 0, far), extent=4.0, height=100, width=100, world_up=(0, 0, 1))
+    depths = torch.full((100, 100), 12.0, device=device)
+    light = obstacle_visibility(depths, camera, (0, 1, 0), corners, torch.from_numpy(triangles).to(device))
+    area = float((1 - light).sum()) * (4.0 / 100) ** 2
+    # The sphere has 48 sides.
+    assert area == pytest.approx(24 * np.sin(np.pi / 24), rel=5e-3)
+    centre = (1 - light.cpu().numpy()).sum(0) @ (np.arange(100) + 0.5) / float((1 - light).sum())
+    assert centre == pytest.approx(50.0, abs=0.1)
+
+
 def test_wrong_settings():
     six = _six("cpu")
     with pytest.raises(ValueError, match="irradiance"):
@@ -157,5 +173,7 @@ def test_wrong_settings():
         obstacle_visibility(torch.ones(2, 2), camera, (0, 0, 1), *box)
     with pytest.raises(ValueError, match="toward"):
         obstacle_visibility(torch.ones(8, 8), camera, (0, 0, 0), *box)
+    with pytest.raises(ValueError, match="bias: expected at least 0, got -1"):
+        obstacle_visibility(torch.ones(8, 8), camera, (0, 0, 1), *box, bias=-1)
     with pytest.raises(ValueError, match="resolution: expected at least 8"):
         obstacle_visibility(torch.ones(8, 8), camera, (0, 0, 1), *box, resolution=4)

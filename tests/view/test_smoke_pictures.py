@@ -127,6 +127,21 @@ def test_without_obstacles_it_is_smoke_over_a_colour(device):
     light = Light((0.0, 0.0, 3.0), (4 * math.pi, 0.0, 0.0))
     found = picture(six, [light], background=(0.2, 0.4, 0.6), ramp=ramp)
     torch.testing.assert_close(found[3, 4].cpu(), torch.tensor([0.25 + 1.0 + 0.1, 0.5 + 0.2, 0.3]))
+    # The same as in torch, lights without number, with their shares of the smoke, and a glow of three stops.
+    seen = torch.linspace(0, 1, 64, device=device).reshape(8, 8)
+    six = replace(six, emission=torch.linspace(-1, 4, 64, device=device).reshape(8, 8))
+    ramp = Ramp((0.0, 0.5, 2.0), ((0, 0, 0.3), (2.0, 1.0, 0.0), (1, 5, 1)))
+    lights = [light, Light((1.0, 2.0, -1.0), (3.0, 4.0, 5.0), seen)]
+    for given in (lights, lights[:1], []):
+        for colours in (ramp, None):
+            for rule in ("squared", "absolute"):
+                expected = six.shade(given, background=(0.2, 0.4, 0.6), ramp=colours, rule=rule)
+                found = picture(six, given, background=(0.2, 0.4, 0.6), ramp=colours, rule=rule)
+                torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6)
+    with pytest.raises(ValueError, match="irradiance"):
+        picture(six, [Light((0, 0, 1), (-1, 0, 0))])
+    with pytest.raises(ValueError, match="visibility"):
+        picture(six, [Light((0, 0, 1), visibility=seen[:4])])
     with pytest.raises(ValueError, match="transparency"):
         picture(replace(six, transparency=None), [light])
     with pytest.raises(ValueError, match="depth"):

@@ -32,6 +32,7 @@ from wlm.cli.smoke_options import (
     with_smoke,
     write_lightmaps,
 )
+from wlm.cli.smoke_run import register as register_run
 from wlm.errors import WlmError
 from wlm_kernels.smoke.settings import March
 
@@ -50,7 +51,7 @@ _Baked = Annotated[
     Path,
     typer.Argument(
         metavar="SMOKE",
-        help="A .npz or .nvdb volume, a folder of simulate, bake or predict, an EXR, or a flip book's first texture.",
+        help="A .npz, .nvdb or .vdb volume, a folder of frames, what bake wrote, or a flip book's first texture.",
     ),
 ]
 _With = Annotated[
@@ -76,7 +77,9 @@ _G = Annotated[float, typer.Option(min=-0.99, max=0.99, help="Mean cosine of the
 @app.command()
 @exclusive
 def simulate(
-    scene_name: Annotated[str, typer.Argument(metavar="SCENE", help="jet-sphere, jet-moving, explosion, or a YAML.")],
+    scene_name: Annotated[
+        str, typer.Argument(metavar="SCENE", help="jet-sphere, jet-moving, explosion, chimney, or a YAML.")
+    ],
     output: Annotated[Path, output_option("DIR", "The folder of frames to write.")],
     frames: Annotated[int | None, typer.Option(min=1, max=9999, help="How many; default the scene's.")] = None,
     scale: Annotated[
@@ -161,7 +164,7 @@ def guide(
     camera = options.camera(frames, orthographic=False, perspective=perspective)
     rows = table(str(smoke), ["file", "covered", "mean light", "nearest", "farthest"])
 
-    def make(file: "Callable[[], Path]", volume: "DensityVolume", view: "Camera") -> None:
+    def make(frame: int, file: "Callable[[], Path]", volume: "DensityVolume", view: "Camera") -> None:
         maps = guide(volume, view, march)
         path = file()
         write_guide(path, maps)
@@ -240,15 +243,13 @@ def shade(
     lights = [_light(text) for text in light or ()]
     behind = None if background is None else vector("--background", background)
     quiet_warp()
+    from wlm.smoke.scene import LightSettings, Looks
     from wlm.view.atlas import save_png
     from wlm.view.smoke import contact_sheet, picture, to_bytes
 
     book = _book(smoke, textures, cells, source_layout, straight)
     source = _source(smoke, options, step, supersample, 1.0, book)
-    if not lights:
-        lights = [settings.light() for settings in source.scene.lights] if source.scene else [_light("1,1,1")]
-    if behind is None:
-        behind = source.scene.background if source.scene else (0.0, 0.0, 0.0)
+    plain = Looks(lights=[LightSettings(toward=(1, 1, 1))])
     file = outputs(smoke, source.single, output, "shade", ".png")
     rows = table(str(smoke), ["file", "covered", "mean", "largest", "clipped"])
     pictures = []
@@ -256,8 +257,10 @@ def shade(
         for shot in _shots(source, progress):
             if shot.six.transparency is None:
                 raise WlmError(f"{smoke}: has no opacity: expected an alpha, or a third texture by a second --with")
-            extra = {"ramp": shot.ramp, "obstacles": shot.obstacles, "time": shot.time}
-            shaded = picture(shot.six, lights, background=behind, rule=rule, **extra)
+            looks = shot.looks or plain
+            given = lights or [settings.light() for settings in looks.lights]
+            extra = {"ramp": looks.ramp, "obstacles": looks.obstacles, "time": looks.time, "rule": rule}
+            shaded = picture(shot.six, given, background=looks.background if behind is None else behind, **extra)
             pictures.append(to_bytes(shaded, white))
             path = file(shot.number)
             save_png(path, pictures[-1])
@@ -287,6 +290,8 @@ def flipbook(
     cells: _Cells = None,
     source_layout: _From = None,
     straight: _Straight = False,
+    padding: Annotated[int, typer.Option(min=0, max=64, help="Pixels around each cell that repeat its border.")] = 0,
+    shader: Annotated[bool, typer.Option("--shader", help="Write OUT.glsl and OUT.hlsl too.")] = False,
     step: _BakeStep = None,
     supersample: _BakeSupersample = None,
 ) -> None:
@@ -299,8 +304,10 @@ def flipbook(
     if gain is not None and not 0 < gain < float("inf"):
         raise WlmError(f"--gain: expected a number above 0, got {gain}")
     quiet_warp()
+    from wlm.formats.atomic import atomic_write
     from wlm.smoke.exporter import brightest_gain, channels, write_flipbook
     from wlm.smoke.exporter import cells as cells_for
+    from wlm.smoke.shader import LANGUAGES, smoke_shader
 
     book = _book(smoke, textures, cells, source_layout, straight)
     source = _source(smoke, options, step, supersample, 0.5, book)
@@ -312,13 +319,20 @@ def flipbook(
     if gain is None:
         gain = 1.0 if output.suffix.lower() == ".exr" else brightest_gain(frames)
     paths = tuple(output.with_name(f"{output.stem}_{i}{output.suffix}") for i in (1, 2))
-    clipped = write_flipbook(paths, frames, layout, rows=rows_of_cells, columns=columns, gain=gain)
+    placed = {"rows": rows_of_cells, "columns": columns, "gain": gain, "padding": padding}
+    clipped = write_flipbook(paths, frames, layout, **placed)
     height, width = frames[0].lightmaps.shape[1:]
+    if shader:
+        hot = any(frame.emission is not None for frame in frames)
+        for language in LANGUAGES:
+            text = smoke_shader(language, layout, **placed, count=len(frames), size=(height, width), hot=hot)
+            atomic_write(output.with_suffix(f".{language}"), text.encode())
     rows = table(str(smoke), ["file", "bytes", "channels"], text=["channels"])
     for path, names in zip(paths, channels(frames, layout), strict=True):
         rows.add_row(escape(str(path)), f"{path.stat().st_size:,}", " ".join(names))
     rows.add_section()
-    rows.add_row("frames", f"{len(frames):,}", f"{rows_of_cells} x {columns} cells of {width} x {height}")
+    around = f", {padding} around each" if padding else ""
+    rows.add_row("frames", f"{len(frames):,}", f"{rows_of_cells} x {columns} cells of {width} x {height}{around}")
     rows.add_row("gain", f"{gain:.4g}", f"{clipped:,} numbers clipped")
     show(rows)
 
@@ -393,3 +407,4 @@ def _shots(
 
 register(app)
 register_light(app)
+register_run(app)

@@ -140,7 +140,8 @@ def predict(
 def evaluate(
     network: _Network = None,
     smoke: Annotated[
-        list[Path] | None, typer.Option(metavar="FILE", help="A .npz or .nvdb volume to score too; repeat for more.")
+        list[Path] | None,
+        typer.Option(metavar="FILE", help="A .npz, .nvdb or .vdb volume to score; repeat for more."),
     ] = None,
     resolution: Annotated[int, typer.Option(min=8, max=4096, help="Pixels along an image's edges.")] = 512,
     cells: Annotated[

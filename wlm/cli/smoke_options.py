@@ -22,7 +22,10 @@ if TYPE_CHECKING:
 
 SHEET = "sheet.png"
 
-Input = Annotated[Path, typer.Argument(metavar="SMOKE", help="A .npz or .nvdb volume, or a folder of simulate.")]
+SceneName = Annotated[
+    str, typer.Argument(metavar="SCENE", help="jet-sphere, jet-moving, explosion, chimney, or a YAML.")
+]
+Input = Annotated[Path, typer.Argument(metavar="SMOKE", help="A .npz, .nvdb or .vdb volume, or a folder of frames.")]
 
 
 @dataclass(frozen=True)
@@ -46,6 +49,15 @@ class SmokeOptions:
     emission: Annotated[float | None, typer.Option(help="Per length of temperature 1; default the scene's, or 1.")] = (
         None
     )
+    up: Annotated[
+        str | None, typer.Option(metavar="AXIS", help="x, y or z: upwards in the file, +y here; default y.")
+    ] = None
+    density: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Of the grid of density; default density, else the first.")
+    ] = None
+    temperature: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Of the grid of temperature; default temperature, if any.")
+    ] = None
     trust: Trust = False
     device: Device = "cpu"
 
@@ -57,12 +69,16 @@ class SmokeOptions:
 
     def open(self, smoke: Path) -> "Frames":
         """Opens a volume or a folder of frames, on a device that there is."""
+        from wlm.fluid.grids import UPS
         from wlm.interop import check_device
         from wlm.smoke.data import load_frames
 
         device = check_device(self.device)
-        options = {"extinction": self.extinction, "emission": self.emission, "trust": self.trust}
-        return load_frames(smoke, **options, device=device)
+        names = {"up": self.up, "density": self.density, "temperature": self.temperature}
+        factors = {"extinction": self.extinction, "emission": self.emission}
+        if self.up is not None and self.up not in UPS:
+            raise WlmError(f"--up: expected one of {', '.join(UPS)}, got {self.up!r}")
+        return load_frames(smoke, **factors, **names, trust=self.trust or None, device=device)
 
     def camera(self, frames: "Frames", *, orthographic: bool = True, perspective: bool = False) -> "CameraSettings":
         """The scene's camera, or the default one, changed by the options.
@@ -137,7 +153,7 @@ def march_frames(
     camera: "CameraSettings",
     output: Path,
     stem: str,
-    make: "Callable[[Callable[[], Path], DensityVolume, Camera], None]",
+    make: "Callable[[int, Callable[[], Path], DensityVolume, Camera], None]",
     settings: dict[str, Any],
     *,
     resume: bool,
@@ -149,14 +165,14 @@ def march_frames(
         camera: Before each frame.
         output: A file, or for frames a folder.
         stem: Of the folder's files.
-        make: Makes one, of a volume and a camera; it gets the path from a function when there is something to write.
+        make: Makes one, of a frame's number, a volume and a camera; it gets the path from a function when there is
+            something to write.
         settings: What results depend on beside smoke and camera, as JSON values.
         resume: Whether to leave out the frames that an interrupted run of the same settings has made.
     """
     from wlm.smoke.data import NumberedFiles
-    from wlm.smoke.scene import make_camera
 
-    if frames.scene is None:
+    if frames.single:
         if resume:
             raise WlmError(f"--resume: expected a folder of frames, {frames.path} is one volume")
         check_output(output, ".exr")
@@ -164,7 +180,8 @@ def march_frames(
     else:
         _check_folder(frames.path, output)
         smoke = {"extinction": frames.extinction, "emission": frames.emission, "device": frames.device[:4]}
-        views = {"scene": frames.scene.model_dump(mode="json"), "camera": camera.model_dump(mode="json")}
+        scene = dict(frames.options) if frames.scene is None else frames.scene.model_dump(mode="json")
+        views = {"scene": scene, "camera": camera.model_dump(mode="json")}
         files = NumberedFiles(output, stem, ".exr", SHEET, run=settings | smoke | views, resume=resume)
         file, numbers, partial = files.file, [each for each in frames.numbers if each not in files.done], files.partial
         if resume:
@@ -174,8 +191,7 @@ def march_frames(
         for frame, volume in frames.volumes(numbers, progress):
             for warning in volume.warnings:
                 note(f"warning: {warning}")
-            view = make_camera(camera, volume.origin, [volume.voxel * n for n in volume.shape])
-            make(functools.partial(file, frame), volume, view)
+            make(frame, functools.partial(file, frame), volume, frames.view(camera, volume))
     if partial is not None:
         files.finish()
 
@@ -202,13 +218,15 @@ def write_lightmaps(
     """
     from wlm.smoke.camera import axis_faults
     from wlm.smoke.data import write_six_way
+    from wlm.smoke.shots import with_surface
 
     rows = table(str(frames.path), ["file", "covered", "mean light", *(["largest error", "RMS error"] * errors)])
 
-    def write(file: Callable[[], Path], volume: "DensityVolume", view: "Camera") -> None:
-        six = make(volume, view)
+    def write(frame: int, file: Callable[[], Path], volume: "DensityVolume", view: "Camera") -> None:
+        looks = frames.looks(frame)
+        six = with_surface(make(volume, view), volume, looks)
         path = file()
-        write_six_way(path, six)
+        write_six_way(path, six, looks)
         covered = six.transparency < 0.99
         for fault in axis_faults(six.lightmaps.cpu().numpy()) if covered.any() else ():
             note(f"{path}: note: {fault}")

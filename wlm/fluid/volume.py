@@ -1,4 +1,4 @@
-"""Density volumes of smoke, checked, from arrays, `.npz` or NanoVDB (`.nvdb`) files; and writing `.npz`.
+"""Density volumes of smoke, checked, from arrays, `.npz`, NanoVDB (`.nvdb`) or OpenVDB (`.vdb`); and writing `.npz`.
 
 Stated behaviours. Repairs are listed in `DensityVolume.warnings`, one line for each kind.
 
@@ -21,9 +21,9 @@ gives off more than 65,504 (half's
 maximum)
 a length, extinction or emission      error
 beyond float32
-transform of a `.nvdb` that turns,  error
-shears or stretches
-a `.nvdb` of points, vectors, ints  error
+voxels of a `.nvdb` or `.vdb` that    resampled to cubic ones (`wlm.fluid.grids`)
+aren't cubes along the axes
+grids of points, vectors, ints        passed over in a `.vdb`; of a `.nvdb`, an error if it is chosen
 a file missing or damaged             error that names the file, and the field
 ====================================  ================================================================
 
@@ -32,42 +32,33 @@ A grid's density has no unit of its own: the extinction per length is `extinctio
 
 import math
 import os
-import struct
-import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 import warp as wp
 
 from wlm.errors import WlmError
+from wlm.fluid.bricks import EDGE, gather, scatter
+from wlm.fluid.grids import UPS, Grid, on_one_lattice
+from wlm.fluid.nanovdb import BAD_GRID, dense, entries
 from wlm.formats.atomic import atomic_path
 from wlm.formats.exr import HALF_MAX
-from wlm.formats.limits import (
-    GROWTH,
-    SURE_BOX,
-    SURE_BYTES,
-    SURE_VOXELS,
-    VOLUME_BYTES,
-    VOXELS,
-    VOXELS_A_BYTE,
-    check_growth,
-)
+from wlm.formats.limits import RESAMPLED, SURE_BOX, SURE_VOXELS, VOLUME_BYTES, VOXELS, VOXELS_A_BYTE, check_growth
 from wlm.formats.npz import read_npz
 from wlm.formats.reading import read_file
-from wlm.interop import check_device, to_warp
+from wlm.formats.vdb import VdbFile
+from wlm.interop import check_device, device_name, to_warp
 
-_DENSITY, _TEMPERATURE = "density", "temperature"
-# What Warp raises on a NanoVDB file that is none, is cut short, or lies about its sizes.
-_BAD_GRID = (RuntimeError, TypeError, ValueError, LookupError, OverflowError, MemoryError, struct.error, zlib.error)
+_DENSITY, _TEMPERATURE, _BRICKS = "density", "temperature", "bricks"
 _LARGEST = 2**31 - 1  # voxels that a kernel can index
 _TINY, _HUGE = float(np.finfo(np.float32).tiny), float(np.finfo(np.float32).max)
 
-# Of the NanoVDB format: bytes of a file's header and of a grid's, and in the latter the place of its name's length.
-_FILE_HEADER, _GRID_HEADER, _NAME_LENGTH = 16, 176, 120
-_BLOSC = 2  # of its two compressions
-_PIECE = 1 << 20  # bytes unpacked at once
+SUFFIXES = (".npz", ".nvdb", ".vdb")
+"""Of the files that `load_volume` reads."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,9 +96,14 @@ class DensityVolume:
         return self.density.device
 
     @property
+    def size(self) -> np.ndarray:
+        """The box's edges in the world, float64 [3]."""
+        return self.voxel * np.asarray(self.shape, np.float64)
+
+    @property
     def centre(self) -> np.ndarray:
         """The box's centre in the world, float64 [3]."""
-        return np.asarray(self.origin) + 0.5 * self.voxel * np.asarray(self.shape)
+        return np.asarray(self.origin) + 0.5 * self.size
 
     def arrays(self) -> tuple[wp.array, wp.array | None]:
         """Density and temperature as Warp arrays that share the tensors' memory."""
@@ -176,13 +172,16 @@ def load_volume(
     voxel: float | None = None,
     device: str = "cpu",
     trust: bool = False,
+    up: str = "y",
+    density: str | None = None,
+    temperature: str | None = None,
 ) -> DensityVolume:
     """Reads a volume from a file.
 
     - `.npz`: an array `density` [X, Y, Z], and optionally `temperature` of the same shape and the numbers
-      `voxel` and `origin` [3].
-    - `.nvdb`: a float grid named `density`, else the first one, over the box of its active voxels; and a grid named
-      `temperature`, over the same box. Its transform gives the size and the position of the voxels.
+      `voxel` and `origin` [3]; or their bricks, as `save_volume` writes them.
+    - `.nvdb` and `.vdb`: grids of floats, over the box of their active voxels. Their maps to the world give the size
+      and the position of the voxels; voxels that aren't cubes along the axes are resampled (`wlm.fluid.grids`).
 
     Args:
         path: The file; its suffix tells the format.
@@ -191,6 +190,9 @@ def load_volume(
         voxel: Edge of a voxel, in the world's unit; None: the file's, or 1.
         device: "cpu" or "cuda:N".
         trust: Whether the file is believed to hold as many voxels as it says (`wlm.formats.limits`).
+        up: "x", "y" or "z", the axis of the file's world that becomes +y.
+        density: Name of the array or grid; None: `density`, else of a VDB file the first grid of floats.
+        temperature: The same of the temperature; None: `temperature`, if there is one.
 
     Returns:
         The volume, repaired as in the module's table.
@@ -199,17 +201,21 @@ def load_volume(
         WlmError: One line that names the file and the field, for each error of the module's table.
     """
     path = Path(path)
-    if path.suffix.lower() not in (".npz", ".nvdb"):
-        raise WlmError(f"{path}: expected a name that ends in .npz or .nvdb, found {path.suffix or 'none'}")
+    if path.suffix.lower() not in SUFFIXES:
+        raise WlmError(f"{path}: expected a name that ends in {', '.join(SUFFIXES)}, found {path.suffix or 'none'}")
+    if up not in UPS:
+        raise ValueError(f"up: expected one of {', '.join(UPS)}, got {up!r}")
+    names, device = (density, temperature), check_device(device)
     factors = {"extinction": extinction, "emission": emission, "name": str(path)}
     if path.suffix.lower() == ".npz":
-        volume = from_array(**_read_npz(path, trust), **factors, device=device)
+        volume = from_array(**_read_npz(path, names, device, trust), **factors, device=device)
+        volume = _turned(volume, up) if up != "y" else volume
     else:
         # It becomes dense on the CPU: the file's tree is in host memory anyway.
-        dense = from_grid(*_read_nvdb(path, trust), **factors, trust=trust)
-        device = check_device(device)
-        heat = None if dense.temperature is None else dense.temperature.to(device)
-        volume = replace(dense, density=dense.density.to(device), temperature=heat)
+        read = _read_nvdb if path.suffix.lower() == ".nvdb" else _read_vdb
+        volume = _from_parts(read(path, names, trust), up, trust, **factors)
+        heat = None if volume.temperature is None else volume.temperature.to(device)
+        volume = replace(volume, density=volume.density.to(device), temperature=heat)
     if voxel is None:
         return volume
     if not _TINY <= voxel <= _HUGE:
@@ -217,23 +223,43 @@ def load_volume(
     return replace(volume, voxel=voxel, origin=tuple(voxel / volume.voxel * o for o in volume.origin))
 
 
-def save_volume(path: str | os.PathLike[str], volume: DensityVolume) -> None:
+def _turned(volume: DensityVolume, up: str) -> DensityVolume:
+    """The same smoke in a world whose axis `up` has become +y."""
+    matrix = np.diag([volume.voxel] * 3 + [1.0])
+    matrix[:3, 3] = np.asarray(volume.origin) + 0.5 * volume.voxel
+    parts = [Grid(_DENSITY, volume.density, matrix)]
+    if volume.temperature is not None:
+        parts.append(Grid(_TEMPERATURE, volume.temperature, matrix))
+    lattice, values = on_one_lattice(parts, _LARGEST, up)
+    heat = values[1] if len(values) > 1 else None
+    return replace(volume, density=values[0], temperature=heat, origin=lattice.origin)
+
+
+def save_volume(path: str | os.PathLike[str], volume: DensityVolume, *, bricks: bool = False) -> None:
     """Writes a volume as `.npz`, atomically, such that `load_volume` reads it back.
+
+    Args:
+        path: The file.
+        volume: The smoke.
+        bricks: Whether to leave out what is empty instead of packing all by deflate: far quicker, for a larger file
+            that other programs don't know.
 
     Raises:
         WlmError: Another suffix, or the file can't be written.
     """
     if Path(path).suffix.lower() != ".npz":
         raise WlmError(f"{path}: expected a name that ends in .npz")
-    arrays = {
-        _DENSITY: volume.density.cpu().numpy(),
-        "voxel": np.float64(volume.voxel),
-        "origin": np.asarray(volume.origin, np.float64),
-    }
+    fields = {_DENSITY: volume.density}
     if volume.temperature is not None:
-        arrays[_TEMPERATURE] = volume.temperature.cpu().numpy()
+        fields[_TEMPERATURE] = volume.temperature
+    arrays = {"voxel": np.float64(volume.voxel), "origin": np.asarray(volume.origin, np.float64)}
+    if bricks:
+        numbers, cut = gather(list(fields.values()))
+        fields = {f"{name}_bricks": part for name, part in zip(fields, cut, strict=True)}
+        arrays |= {_BRICKS: numbers.cpu().numpy(), "shape": np.asarray(volume.shape, np.int64)}
+    arrays |= {name: values.cpu().numpy() for name, values in fields.items()}
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        np.savez_compressed(file, **arrays)
+        (np.savez if bricks else np.savez_compressed)(file, **arrays)
 
 
 def _check(
@@ -289,14 +315,23 @@ def _dimmed(name: str, heat: torch.Tensor, emission: float, voxel: float, warnin
     return heat
 
 
-def _read_npz(path: Path, trust: bool) -> dict:
-    wanted = (_DENSITY, _TEMPERATURE, "voxel", "origin")
-    arrays = read_npz(
-        path,
-        lambda names: [_DENSITY, *(name for name in wanted[1:] if name in names)],
-        numbers=_LARGEST if trust else VOXELS,
-        sure=VOLUME_BYTES if trust else 4 * SURE_VOXELS,
-    )
+def _read_npz(path: Path, names: tuple[str | None, str | None], device: str, trust: bool) -> dict[str, Any]:
+    density, temperature = (name or default for name, default in zip(names, (_DENSITY, _TEMPERATURE), strict=True))
+    wanted = {density: _DENSITY, temperature: _TEMPERATURE, "voxel": "voxel", "origin": "origin"}
+    needed = [density] if names[1] is None else [density, temperature]
+
+    def choose(found: Sequence[str]) -> list[str]:
+        if _BRICKS in found and density not in found:
+            return [name for name in found if name.removesuffix("_bricks") in (*wanted, _BRICKS, "shape")]
+        return [*needed, *(name for name in wanted if name in found and name not in needed)]
+
+    most = _LARGEST if trust else VOXELS
+    arrays = read_npz(path, choose, numbers=most, sure=VOLUME_BYTES if trust else 4 * SURE_VOXELS)
+    if _BRICKS in arrays:
+        arrays = _in_place(path, arrays, most, device, trust)
+        if missing := next((name for name in needed if name not in arrays), None):
+            raise WlmError(f"{path}: {missing} is missing; found {', '.join(arrays) or 'nothing'}")
+    arrays = {wanted[name]: array for name, array in arrays.items()}
     for field, size in (("voxel", 1), ("origin", 3)):
         value = arrays.get(field)
         if value is None:
@@ -305,22 +340,10 @@ def _read_npz(path: Path, trust: bool) -> dict:
             raise WlmError(f"{path}: {field}: expected {size} finite numbers, found {value.dtype} {value.shape}")
         arrays[field] = float(value.item()) if size == 1 else tuple(map(float, value.ravel()))
     for field in (_DENSITY, _TEMPERATURE):
-        if field in arrays and arrays[field].dtype in (np.float16, np.float32):
+        if isinstance(arrays.get(field), np.ndarray) and arrays[field].dtype in (np.float16, np.float32):
             # A tensor, which `from_array` need not copy.
             arrays[field] = torch.from_numpy(arrays[field])
     return arrays
-
-
-@wp.kernel(enable_backward=False)
-def _dense(
-    # in:
-    grid: wp.uint64,
-    low: wp.vec3i,
-    # out:
-    out: wp.array3d[float],
-):
-    i, j, k = wp.tid()
-    out[i, j, k] = wp.volume_lookup_f(grid, low[0] + i, low[1] + j, low[2] + k)
 
 
 def from_grid(
@@ -331,6 +354,7 @@ def from_grid(
     emission: float = 1.0,
     name: str = "grid",
     trust: bool = True,
+    up: str = "y",
 ) -> DensityVolume:
     """Makes a checked volume from a NanoVDB grid, on the grid's device, over the box of its active voxels.
 
@@ -338,11 +362,12 @@ def from_grid(
 
     Args:
         density: A grid of floats.
-        temperature: Another grid with the same transform, or None.
+        temperature: Another grid, or None.
         extinction: Per unit of length at density 1.
         emission: Light given off per unit of length at temperature 1.
         name: By which messages name it.
         trust: Whether its box is believed, however few voxels the grid stores; false for a stranger's.
+        up: "x", "y" or "z", the axis of the grid's world that becomes +y.
 
     Returns:
         The volume, repaired as in the module's table.
@@ -350,95 +375,93 @@ def from_grid(
     Raises:
         WlmError: An error of the module's table.
     """
-    info = density.get_grid_info()
-    matrix = np.array(info.transform_matrix, np.float64).reshape(3, 3)
-    voxel = abs(matrix[0, 0])
-    if not (voxel > 0 and np.allclose(matrix, voxel * np.eye(3), atol=1e-5 * voxel)):
-        raise WlmError(f"{name}: {info.name}: expected a grid of cubic voxels along the axes, found {matrix.tolist()}")
-    low, high = _box(name, density, trust)
-    heat = None
-    if temperature is not None:
-        heat_info = temperature.get_grid_info()
-        same = np.allclose(np.array(heat_info.transform_matrix).reshape(3, 3), matrix, atol=1e-5 * voxel)
-        if not (same and np.allclose(heat_info.translation, info.translation, atol=1e-4 * voxel)):
-            raise WlmError(f"{name}: {_TEMPERATURE}: expected the voxels of {info.name}")
-        heat = _read_dense(name, temperature, low, high)
-    return from_array(
-        _read_dense(name, density, low, high),
-        extinction=extinction,
-        voxel=float(voxel),
-        # NanoVDB's coordinates are those of voxel centres.
-        origin=tuple(float(t + voxel * (i - 0.5)) for t, i in zip(info.translation, low, strict=True)),
-        temperature=heat,
-        emission=emission,
-        device=str(density.device),
-        name=name,
+    grids = {_DENSITY: density} | ({} if temperature is None else {_TEMPERATURE: temperature})
+    parts = []
+    for field, grid in grids.items():
+        stored = grid.array().size
+        most = _LARGEST if trust else min(VOXELS, max(SURE_BOX, VOXELS_A_BYTE * stored))
+        parts.append(dense(grid, f"{name}: {grid.get_grid_info().name or field}", most))
+    return _from_parts(parts, up, trust, extinction=extinction, emission=emission, name=name)
+
+
+def _in_place(path: Path, arrays: dict[str, Any], most: int, device: str, trust: bool) -> dict[str, Any]:
+    """Arrays of bricks as what they are of, on a device, and the others as they are."""
+    shape, numbers = arrays.pop("shape", np.zeros(0)), arrays.pop(_BRICKS)
+    if shape.shape != (3,) or shape.dtype.kind not in "iu" or not (1 <= shape.min() and shape.max() <= most):
+        raise WlmError(f"{path}: shape: expected 3 whole numbers from 1 to {most}, found {shape.dtype} {shape.shape}")
+    sides = shape.tolist()
+    counts = [-(-n // EDGE) for n in sides]
+    if math.prod(sides) > most:
+        raise WlmError(f"{path}: shape: expected at most {most} voxels, found {sides}")
+    if not trust:
+        stored = sum(array.nbytes for array in arrays.values())
+        check_growth(f"{path}: shape", stored, 4 * math.prod(counts) * EDGE**3, sure=4 * SURE_VOXELS)
+    if numbers.ndim != 1 or numbers.dtype != np.int32 or (np.diff(numbers.astype(np.int64)) < 1).any():
+        raise WlmError(f"{path}: {_BRICKS}: expected numbers int32 that rise, found {numbers.dtype} {numbers.shape}")
+    if len(numbers) and not (numbers[0] >= 0 and numbers[-1] < math.prod(counts)):
+        raise WlmError(f"{path}: {_BRICKS}: expected numbers from 0 to {math.prod(counts) - 1}, found others")
+    places = torch.from_numpy(numbers).to(device)
+    for name in [name for name in arrays if name.endswith("_bricks")]:
+        cut = arrays.pop(name)
+        if cut.shape != (len(numbers), EDGE, EDGE, EDGE) or cut.dtype not in (np.float16, np.float32):
+            raise WlmError(f"{path}: {name}: expected {len(numbers)} bricks of floats, found {cut.dtype} {cut.shape}")
+        arrays[name.removesuffix("_bricks")] = scatter(places, torch.from_numpy(cut).to(device), sides)
+    return arrays
+
+
+def _from_parts(parts: Sequence[Grid], up: str, trust: bool, **factors: Any) -> DensityVolume:
+    """A volume of dense grids: of the density and, if there are two, of the temperature."""
+    voxels = sum(part.values.numel() for part in parts)
+    lattice, values = on_one_lattice(
+        parts, _LARGEST if trust else min(VOXELS, max(SURE_VOXELS, RESAMPLED * voxels)), up
     )
+    place = {"voxel": lattice.voxel, "origin": lattice.origin, "device": device_name(values[0].device)}
+    heat = values[1] if len(values) > 1 else None
+    return from_array(values[0], temperature=heat, **place, **factors)
 
 
-def _read_nvdb(path: Path, trust: bool) -> tuple[wp.Volume, wp.Volume | None]:
-    """The grids named density, or the first, and temperature, if there is one."""
+def _read_nvdb(path: Path, names: tuple[str | None, str | None], trust: bool) -> list[Grid]:
+    """The dense grids of density and, if there is one, temperature."""
     data = read_file(path, VOLUME_BYTES, "the NanoVDB file")
     try:
-        if not trust:
-            check_growth(str(path), len(data), _unpacked_size(data, max(SURE_BYTES, GROWTH * len(data))))
-        volume = wp.Volume.load_from_nvdb(data, device="cpu")
-        grids = []
-        while volume is not None:
-            grids.append(volume)
-            volume = volume.load_next_grid()
-    except _BAD_GRID as error:
+        found = {entry.name: entry for entry in reversed(list(entries(data)))}
+        chosen = _choose(path, list(reversed(found)), names)
+        volumes = {name: found[name].load(str(path), trust) for name in chosen}
+    except BAD_GRID as error:
         raise WlmError(f"{path}: cannot read the NanoVDB file: {str(error) or type(error).__name__}") from error
-    names = [grid.get_grid_info().name for grid in grids]
-    density = grids[names.index(_DENSITY)] if _DENSITY in names else grids[0]
-    return density, grids[names.index(_TEMPERATURE)] if _TEMPERATURE in names else None
+    grids = []
+    for name, volume in volumes.items():
+        most = _LARGEST if trust else min(VOXELS, max(SURE_BOX, VOXELS_A_BYTE * volume.array().size))
+        grids.append(dense(volume, f"{path}: {name or 'grid 0'}", most))
+    return grids
 
 
-def _unpacked_size(data: bytes, most: int) -> int:
-    """Bytes of the grids of a compressed file, which Warp would unpack whatever they become; stops beyond `most`."""
-    grids, codec = struct.unpack_from("<2H", data, _FILE_HEADER - 4)
-    at, packed = _FILE_HEADER, 0
-    for _ in range(grids):
-        packed += struct.unpack_from("<Q", data, at + 8)[0]
-        at += _GRID_HEADER + struct.unpack_from("<I", data, at + _NAME_LENGTH)[0]
-    end, size = at + packed, 0
-    while codec and at < end and size <= most:
-        length = struct.unpack_from("<Q", data, at)[0]
-        piece = data[at + 8 : at + 8 + length]
-        if codec == _BLOSC:  # which states the size itself
-            size += struct.unpack_from("<I", piece, 4)[0]
-        else:
-            unpacker = zlib.decompressobj()
-            while piece and size <= most:
-                size += len(unpacker.decompress(piece, _PIECE))
-                piece = unpacker.unconsumed_tail
-        at += 8 + length
-    return size
+def _read_vdb(path: Path, names: tuple[str | None, str | None], trust: bool) -> list[Grid]:
+    """The same of OpenVDB's file."""
+    data = read_file(path, VOLUME_BYTES, "the OpenVDB file")
+    file = VdbFile(data, str(path))
+    if not file.names:
+        raise WlmError(f"{path}: expected a grid of floats, found {', '.join(file.others) or 'no grid'}")
+    if names[0] is None and (other := next((o for o in file.others if o.startswith(f"{_DENSITY} (")), None)):
+        raise WlmError(f"{path}: expected a grid of floats for the density, found {other}; name another")
+    most = _LARGEST if trust else min(VOXELS, max(SURE_BOX, VOXELS_A_BYTE * len(data)))
+    grids = []
+    for name in _choose(path, file.names, names):
+        grid = file.read(name, most)
+        matrix = grid.matrix.copy()
+        matrix[:3, 3] += matrix[:3, :3] @ grid.low
+        grids.append(Grid(f"{path}: {name or 'grid 0'}", torch.from_numpy(np.ascontiguousarray(grid.values)), matrix))
+    return grids
 
 
-def _box(where: str, volume: wp.Volume, trust: bool) -> tuple[np.ndarray, np.ndarray]:
-    """First and last active voxel, tiles too, from the header of the tree's root, which Warp doesn't expose."""
-    data = volume.array().numpy()
-    grid_header, root_offset = 672, 24
-    root = grid_header + struct.unpack_from("<q", data, grid_header + root_offset)[0]
-    corners = np.array(struct.unpack_from("<6i", data, root)).reshape(2, 3)
-    name = volume.get_grid_info().name or "grid 0"
-    if (corners[1] < corners[0]).any():
-        raise WlmError(f"{where}: {name}: expected active voxels, found none")
-    most = _LARGEST if trust else min(VOXELS, max(SURE_BOX, VOXELS_A_BYTE * data.nbytes))
-    if math.prod(corners[1].astype(object) - corners[0] + 1) > most:
-        raise WlmError(
-            f"{where}: {name}: expected a box of at most {most} voxels from a grid of {data.nbytes} bytes, "
-            f"found {corners.tolist()}"
-        )
-    return corners[0], corners[1]
-
-
-def _read_dense(where: str, volume: wp.Volume, low: np.ndarray, high: np.ndarray) -> torch.Tensor:
-    info = volume.get_grid_info()
-    if volume.dtype is not wp.float32:
-        raise WlmError(f"{where}: {info.name or 'grid 0'}: expected a grid of floats, found {info.type_str}")
-    out = wp.empty(tuple(int(n) for n in high - low + 1), dtype=float, device=volume.device)
-    inputs = [volume.id, wp.vec3i(*map(int, low))]
-    wp.launch(_dense, out.shape, inputs=inputs, outputs=[out], device=volume.device)
-    return wp.to_torch(out)
+def _choose(path: Path, names: Sequence[str], wanted: tuple[str | None, str | None]) -> list[str]:
+    """The names of the density's grid and, if there is one, the temperature's."""
+    density, temperature = wanted
+    for name in (density, temperature):
+        if name is not None and name not in names:
+            raise WlmError(f"{path}: {name} is missing; found {', '.join(names)}")
+    if density is None:
+        density = _DENSITY if _DENSITY in names else names[0]
+    if temperature is None and _TEMPERATURE in names and density != _TEMPERATURE:
+        temperature = _TEMPERATURE
+    return [density] if temperature is None else [density, temperature]

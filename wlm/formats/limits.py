@@ -30,7 +30,7 @@ MESH_BYTES = (4 << 30) - 1
 """Of a `.glb`, whose format allows no more, and of a buffer or an image beside a glTF file."""
 
 VOLUME_BYTES = 16 << 30
-"""Of a `.npz` or `.nvdb`: 1024^3 voxels in float64 have 8.6 GB, twice that with their temperatures."""
+"""Of a `.npz`, `.nvdb` or `.vdb`: 1024^3 voxels in float64 have 8.6 GB, twice that with their temperatures."""
 
 GROWTH = 256
 """Bytes that a compressed byte may become. Zeros become 1,032 under deflate, honest arrays some ten."""
@@ -82,10 +82,14 @@ SURE_VOXELS = 1 << 27
 """Voxels that a volume may have however small its file is: 512^3, for a simulation's frames without smoke."""
 
 SURE_BOX = 1 << 24
-"""Voxels that the box of a NanoVDB grid may have however small the grid is: 256^3."""
+"""Voxels that the box of a VDB grid may have however small the grid is: 256^3."""
 
 VOXELS_A_BYTE = 64
-"""Voxels in the box of a NanoVDB grid for a byte of the grid: 1 of 256 may be stored."""
+"""Voxels in the box of a NanoVDB grid for a byte of the grid, or of a `.vdb` for one of the file: 1 of 256 may be
+stored."""
+
+RESAMPLED = 8
+"""Cubic voxels that a voxel of another shape may become."""
 
 PROBES = 1 << 24
 """Probes of a set."""

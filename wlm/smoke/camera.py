@@ -263,6 +263,11 @@ class Camera:
             return position.expand_as(across), torch.nn.functional.normalize(across - toward, dim=-1)
         return across + position, (-toward).expand_as(across)
 
+    def in_world(self) -> View:
+        """The camera in the world, as kernels take it."""
+        right, up, toward = self.axes
+        return make_view(self.position, right, up, -toward, self.pitch, self.width, self.height, self.perspective)
+
     def view(self, volume: DensityVolume) -> View:
         """The camera in a volume's voxels, as kernels take it.
 

@@ -1,15 +1,17 @@
 """Smoke in files: one volume or a folder of a scene's frames, guiding maps and lightmaps as EXR, numbered results.
 
-A folder of frames holds `scene.json` and `frame_0001.npz`, `frame_0002.npz` and so on, each a volume as
-`wlm.smoke.load` reads it. `simulate` writes it, and can be stopped and resumed.
+A folder of a scene's frames holds `scene.json` and `frame_0001.npz`, `frame_0002.npz` and so on, each a volume as
+`wlm.smoke.load` reads it. `simulate` writes it, and can be stopped and resumed. A folder of another program's frames
+holds volumes whose names are alike but for a number before their suffix.
 """
 
+import functools
 import json
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +21,7 @@ import torch
 from wlm import __version__
 from wlm.config import check_settings
 from wlm.errors import WlmError
-from wlm.fluid.volume import DensityVolume, load_volume
+from wlm.fluid.volume import SUFFIXES, DensityVolume, load_volume
 from wlm.formats.atomic import atomic_write
 from wlm.formats.exr_file import read_part
 from wlm.formats.exr_planes import read_planes, write_planes
@@ -28,7 +30,7 @@ from wlm.formats.lock import is_passing
 from wlm.smoke.camera import DIRECTIONS, EMISSION, Camera
 from wlm.smoke.guiding import Guide
 from wlm.smoke.lightmaps import SixWay
-from wlm.smoke.scene import CameraSettings, Scene
+from wlm.smoke.scene import CameraSettings, Looks, Scene, make_camera
 from wlm.system import Meter, OnProgress
 
 SCENE_FILE = "scene.json"
@@ -39,43 +41,81 @@ CHECKPOINT = "simulation.partial"
 load = load_volume
 
 _FORMAT, _VERSION = "wlm-smoke-frames", 1
+_NUMBERED = re.compile(r"(.*?)(\d{1,9})(\.[^.\d]+)")  # what is before the last number, it, and the suffix
 _TRANSPARENCY = "transparency"
-_GUIDE = ("light", _TRANSPARENCY, "depth")
+_DEPTH = "depth"
+_GUIDE = ("light", _TRANSPARENCY, _DEPTH)
 
 
 @dataclass(frozen=True)
 class Frames:
-    """Smoke over time, one volume in memory at a time: the file of a single volume, or a folder of a scene's frames.
+    """Smoke over time, one volume in memory at a time: the file of a single volume, or a folder of frames.
 
     Attributes:
         path: The file or the folder.
-        scene: Of a folder; None: a single volume.
-        numbers: Of the frames that are there, rising; (1,) of a single volume.
+        scene: Of a folder that `simulate` wrote; None: a single volume, or another program's frames.
+        files: Those that are there, by their rising number; that of a single volume is 1.
         device: Where volumes go.
         extinction, emission: In place of the scene's, or of 1; None: those.
-        trust: As for `load`.
+        options: Of `load` for files of other programs: trust, up, density, temperature.
     """
 
     path: Path
     scene: Scene | None
-    numbers: tuple[int, ...]
+    files: Mapping[int, Path]
     device: str = "cpu"
     extinction: float | None = None
     emission: float | None = None
-    trust: bool = False
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def single(self) -> bool:
+        """Whether it is one file and not a folder."""
+        return self.files.get(1) == self.path
+
+    @property
+    def numbers(self) -> tuple[int, ...]:
+        """Of the frames that are there, rising."""
+        return tuple(self.files)
 
     @property
     def camera(self) -> CameraSettings:
         """The scene's camera, or the default one."""
         return CameraSettings() if self.scene is None else self.scene.camera
 
+    def view(self, settings: CameraSettings, volume: DensityVolume) -> Camera:
+        """Places a camera before a frame: that of a sequence stays where it is, before the boxes of all frames.
+
+        Raises:
+            WlmError: A frame is missing or damaged.
+        """
+        box = (volume.origin, volume.size) if self.scene is not None or self.single else self._box
+        return make_camera(settings, *box)
+
+    @functools.cached_property
+    def _box(self) -> tuple[np.ndarray, np.ndarray]:
+        """The corner and the edges of the boxes of all frames together, which are read for it."""
+        boxes = []
+        for number in self.files:
+            volume = replace(self, device="cpu").load(number)
+            begin = np.asarray(volume.origin)
+            boxes.append((bool(volume.density.any()), begin, begin + volume.size))
+        # A frame without smoke may have its box anywhere.
+        smoky = [box for box in boxes if box[0]] or boxes
+        low = np.min([box[1] for box in smoky], axis=0)
+        return low, np.max([box[2] for box in smoky], axis=0) - low
+
     def file(self, number: int) -> Path:
-        """The file of a frame."""
-        return self.path if self.scene is None else self.path / f"frame_{number:04d}.npz"
+        """The file of a frame, which `simulate` may yet have to write."""
+        return self.files.get(number, self.path / f"frame_{number:04d}.npz")
 
     def time(self, number: int) -> float:
-        """The time of a frame in seconds; 0 of a single volume."""
+        """The time of a frame in seconds; 0 without a scene."""
         return 0.0 if self.scene is None else self.scene.time(number)
+
+    def looks(self, number: int) -> Looks | None:
+        """What a picture of a frame shows; None without a scene."""
+        return None if self.scene is None else self.scene.looks(number)
 
     def load(self, number: int) -> DensityVolume:
         """Reads a frame.
@@ -88,7 +128,7 @@ class Frames:
         for name in ("extinction", "emission"):
             override = getattr(self, name)
             factors[name] = override if override is not None else getattr(smoke, name, 1.0)
-        return load_volume(self.file(number), **factors, device=self.device, trust=self.trust)
+        return load_volume(self.file(number), **factors, device=self.device, **self.options)
 
     def volumes(
         self, numbers: Sequence[int] | None = None, progress: OnProgress | None = None
@@ -111,26 +151,57 @@ def load_frames(
     extinction: float | None = None,
     emission: float | None = None,
     device: str = "cpu",
-    trust: bool = False,
+    **options: Any,
 ) -> Frames:
-    """Opens a volume, `.npz` or `.nvdb`, or a folder that `simulate` wrote.
+    """Opens a volume, or a folder of frames: of `simulate`, or of volumes that another program numbered.
 
     Args:
         path: The file or the folder.
-        extinction, emission, device, trust: As in `Frames`.
+        extinction, emission, device: As in `Frames`.
+        options: As in `Frames`; those that are None aren't given.
 
     Raises:
-        WlmError: A folder without frames or a damaged `scene.json`.
+        WlmError: A folder without frames, of several sequences, or with a damaged `scene.json`; frames of `simulate`
+            need no option but trust.
     """
     path = Path(path)
+    options = {name: value for name, value in options.items() if value is not None}
+    given = (device, extinction, emission, options)
     if not path.is_dir():
-        return Frames(path, None, (1,), device, extinction, emission, trust)
+        return Frames(path, None, {1: path}, *given)
     if not (path / SCENE_FILE).is_file():
-        raise WlmError(f"{path}: expected a folder that simulate wrote, found no {SCENE_FILE}")
-    frames = Frames(path, _read_scene(path), _numbers(path), device, extinction, emission, trust)
-    if not frames.numbers:
+        return Frames(path, None, _sequence(path), *given)
+    if (name := next((name for name in options if name != "trust"), None)) is not None:
+        raise WlmError(f"{path}: expected no {name} for the frames of a scene")
+    frames = Frames(path, _read_scene(path), numbered(path, "frame", ".npz"), *given)
+    if not frames.files:
         raise WlmError(f"{path}: expected frames such as {frames.file(1).name}, found none")
     return frames
+
+
+def _sequence(folder: Path) -> dict[int, Path]:
+    """The volumes of a folder by the last number in their names, which are alike but for it.
+
+    Raises:
+        WlmError: It has none, those of several sequences, or two of one number.
+    """
+    found: dict[tuple[str, str], dict[int, Path]] = {}
+    for path in sorted(folder.iterdir()):
+        match = _NUMBERED.fullmatch(path.name)
+        if match and match[3].lower() in SUFFIXES and path.is_file():
+            files = found.setdefault((match[1], match[3]), {})
+            number = int(match[2])
+            if number in files:
+                raise WlmError(
+                    f"{folder}: expected frames of different numbers, found {files[number].name}, {path.name}"
+                )
+            files[number] = path
+    if len(found) != 1:
+        kinds = ", ".join(f"{stem}*{suffix}" for stem, suffix in found) or f"neither {SCENE_FILE} nor any"
+        raise WlmError(
+            f"{folder}: expected a folder of simulate, or one sequence of volumes such as smoke_0001.vdb, found {kinds}"
+        )
+    return dict(sorted(next(iter(found.values())).items()))
 
 
 def open_frames(folder: str | os.PathLike[str], scene: Scene, *, resume: bool = False) -> Frames:
@@ -160,7 +231,7 @@ def open_frames(folder: str | os.PathLike[str], scene: Scene, *, resume: bool = 
                 path.unlink(missing_ok=True)
     content = {"format": _FORMAT, "version": _VERSION, "scene": scene.model_dump(mode="json")}
     atomic_write(folder / SCENE_FILE, (json.dumps(content, indent=1, allow_nan=False) + "\n").encode())
-    return Frames(folder, scene, _numbers(folder))
+    return Frames(folder, scene, numbered(folder, "frame", ".npz"))
 
 
 def numbered(folder: Path, stem: str, suffix: str) -> dict[int, Path]:
@@ -267,9 +338,9 @@ def write_guide(path: str | os.PathLike[str], guide: Guide) -> None:
     write_planes(path, planes, {"camera": asdict(guide.camera)}, whole=_GUIDE)
 
 
-def write_six_way(path: str | os.PathLike[str], six: SixWay) -> None:
-    """Writes lightmaps as an EXR of half floats: a channel for each direction, `transparency` and, of hot smoke,
-    `emission`; the camera is in its header.
+def write_six_way(path: str | os.PathLike[str], six: SixWay, looks: Looks | None = None) -> None:
+    """Writes lightmaps as an EXR of half floats: a channel for each direction, `transparency`, of hot smoke `emission`,
+    and where it is known the surface's `depth`, a float; the camera and the looks are in its header.
 
     Raises:
         ValueError: The camera isn't known.
@@ -278,10 +349,11 @@ def write_six_way(path: str | os.PathLike[str], six: SixWay) -> None:
     if six.camera is None:
         raise ValueError("camera: expected that of the lightmaps, found none")
     planes = dict(zip(DIRECTIONS, six.lightmaps.cpu().numpy(), strict=True))
-    for name, plane in ((_TRANSPARENCY, six.transparency), (EMISSION, six.emission)):
+    for name, plane in ((_TRANSPARENCY, six.transparency), (EMISSION, six.emission), (_DEPTH, six.depth)):
         if plane is not None:
             planes[name] = plane.cpu().numpy()
-    write_planes(path, planes, {"camera": asdict(six.camera)})
+    note = {"camera": asdict(six.camera)} | ({} if looks is None else {"looks": looks.model_dump(mode="json")})
+    write_planes(path, planes, note, whole=(_DEPTH,))
 
 
 def is_six_way(path: Path) -> bool:
@@ -306,10 +378,19 @@ def six_way_files(folder: Path) -> list[Path]:
 
 
 def read_six_way(path: str | os.PathLike[str], device: str = "cpu") -> SixWay:
-    """Reads what `write_six_way` wrote.
+    """Reads the lightmaps of a file of `write_six_way`.
 
     Raises:
         WlmError: The file is missing or damaged, lacks a channel or its camera, or holds a number that isn't finite.
+    """
+    return read_shaded(path, device)[0]
+
+
+def read_shaded(path: str | os.PathLike[str], device: str = "cpu") -> tuple[SixWay, Looks | None]:
+    """Reads what `write_six_way` wrote: the lightmaps, and the looks that were given with them.
+
+    Raises:
+        WlmError: As `read_six_way`, or the looks are wrong.
     """
     planes, note = read_planes(path)
     for name in (*DIRECTIONS, _TRANSPARENCY):
@@ -329,7 +410,10 @@ def read_six_way(path: str | os.PathLike[str], device: str = "cpu") -> SixWay:
         raise WlmError(f"{path}: expected the camera's {camera.height} x {camera.width} pixels, found {size}")
     tensors = {name: torch.from_numpy(plane).to(device) for name, plane in planes.items()}
     lightmaps = torch.stack([tensors[name] for name in DIRECTIONS])
-    return SixWay(lightmaps, tensors[_TRANSPARENCY], tensors.get(EMISSION), camera)
+    six = SixWay(lightmaps, tensors[_TRANSPARENCY], tensors.get(EMISSION), camera, tensors.get(_DEPTH))
+    if "looks" not in note:
+        return six, None
+    return six, check_settings(Looks, note["looks"], f"{path}: header attribute wlm: looks.")
 
 
 @contextmanager
@@ -339,10 +423,6 @@ def _writing(folder: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise WlmError(f"{folder}: cannot write there: {error.strerror or error}") from error
-
-
-def _numbers(folder: Path) -> tuple[int, ...]:
-    return tuple(numbered(folder, "frame", ".npz"))
 
 
 def _read_scene(folder: Path) -> Scene:

@@ -51,7 +51,7 @@ def channels(frames: Sequence[SixWay], layout: str) -> tuple[tuple[str, ...], ..
 
 
 def pack(
-    frames: Sequence[SixWay], layout: str = "unity", *, rows: int, columns: int, gain: float = 1.0
+    frames: Sequence[SixWay], layout: str = "unity", *, rows: int, columns: int, gain: float = 1.0, padding: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:
     """Lays frames out in two textures.
 
@@ -62,26 +62,29 @@ def pack(
         layout: One of `LAYOUTS`.
         rows, columns: Of cells.
         gain: Factor on the lightmaps and the emission, to use the range of 8 bits.
+        padding: Pixels around each frame that repeat its border, so that neighbours don't show in filtered or smaller
+            textures.
 
     Returns:
-        Two arrays float32 [rows * H, columns * W, 3 or 4].
+        Two arrays float32 [rows * (H + 2 padding), columns * (W + 2 padding), 3 or 4].
 
     Raises:
         ValueError: The frames don't fit, no such layout, or a gain that isn't above 0.
     """
-    _check_cells(layout, rows, columns, gain)
+    _check_cells(layout, rows, columns, gain, padding)
     if not 1 <= len(frames) <= rows * columns:
         raise ValueError(f"expected 1 to {rows * columns} frames, got {len(frames)}")
     height, width = frames[0].lightmaps.shape[1:]
     pages = []
     for names in channels(frames, layout):
-        page = np.zeros((rows, height, columns, width, len(names)), np.float32)
+        page = np.zeros((rows, height + 2 * padding, columns, width + 2 * padding, len(names)), np.float32)
         for i, frame in enumerate(frames):
             if tuple(frame.lightmaps.shape[1:]) != (height, width):
                 raise ValueError(f"frame {i}: expected {height} x {width}, got {tuple(frame.lightmaps.shape[1:])}")
             for c, name in enumerate(names):
-                page[i // columns, :, i % columns, :, c] = _plane(frame, name, gain)
-        pages.append(page.reshape(rows * height, columns * width, len(names)))
+                plane = np.broadcast_to(_plane(frame, name, gain), (height, width))
+                page[i // columns, :, i % columns, :, c] = np.pad(plane, padding, mode="edge")
+        pages.append(page.reshape(rows * page.shape[1], columns * page.shape[3], len(names)))
     return pages[0], pages[1]
 
 
@@ -94,15 +97,17 @@ def unpack(
     columns: int,
     count: int | None = None,
     gain: float = 1.0,
+    padding: int = 0,
 ) -> list[SixWay]:
     """Cuts two textures into frames, the inverse of `pack`.
 
     Args:
-        first, second: [rows * H, columns * W, 3 or 4].
+        first, second: [rows * (H + 2 padding), columns * (W + 2 padding), 3 or 4].
         layout: One of `LAYOUTS`.
         rows, columns: Of cells.
         count: Frames; None: all cells.
         gain: The factor on the light.
+        padding: Pixels around each frame.
 
     Returns:
         The frames, float32 on the CPU, without a camera; None for a plane without a channel.
@@ -110,7 +115,7 @@ def unpack(
     Raises:
         ValueError: The shapes don't fit each other, the cells or the layout.
     """
-    _check_cells(layout, rows, columns, gain)
+    _check_cells(layout, rows, columns, gain, padding)
     count = rows * columns if count is None else count
     if not 1 <= count <= rows * columns:
         raise ValueError(f"count: expected 1 to {rows * columns} frames, got {count}")
@@ -118,11 +123,14 @@ def unpack(
         raise ValueError(f"expected two textures of one size, got {first.shape[:2]} and {second.shape[:2]}")
     if first.shape[0] % rows or first.shape[1] % columns or 0 in first.shape:
         raise ValueError(f"expected {rows} x {columns} cells of whole pixels, got {first.shape[0]} x {first.shape[1]}")
+    if min(first.shape[0] // rows, first.shape[1] // columns) <= 2 * padding:
+        raise ValueError(f"padding: expected cells of more than twice {padding} pixels, got {first.shape[:2]} in all")
     planes: dict[str, np.ndarray] = {}
     for page, names in zip((first, second), LAYOUTS[layout], strict=True):
         height, width = page.shape[0] // rows, page.shape[1] // columns
         cells = page.reshape(rows, height, columns, width, -1).transpose(0, 2, 4, 1, 3)
         cells = cells.reshape(rows * columns, -1, height, width)[:count].astype(np.float32)
+        cells = cells[:, :, padding : height - padding, padding : width - padding]
         planes |= {name: cells[:, c] for c, name in enumerate(names[: page.shape[2]])}
     missing = [name for name in DIRECTIONS if name not in planes]
     if missing:
@@ -141,12 +149,13 @@ def write_flipbook(
     rows: int,
     columns: int,
     gain: float = 1.0,
+    padding: int = 0,
 ) -> int:
     """Writes frames as two textures, each whole or not at all.
 
     Args:
         paths: The two files, .exr, .png or .tga; their folders must exist.
-        frames, layout, rows, columns, gain: As for `pack`.
+        frames, layout, rows, columns, gain, padding: As for `pack`.
 
     Returns:
         How many numbers were above their file's range and became its greatest.
@@ -158,7 +167,8 @@ def write_flipbook(
     for path in paths:
         _suffix(path)
     clipped = 0
-    for path, page in zip(paths, pack(frames, layout, rows=rows, columns=columns, gain=gain), strict=True):
+    pages = pack(frames, layout, rows=rows, columns=columns, gain=gain, padding=padding)
+    for path, page in zip(paths, pages, strict=True):
         if not np.isfinite(page).all():
             raise WlmError(f"{path}: cannot write: expected finite light, found NaN or infinity")
         if _suffix(path) == ".exr":
@@ -181,13 +191,14 @@ def read_flipbook(
     count: int | None = None,
     gain: float = 1.0,
     straight: bool = False,
+    padding: int = 0,
 ) -> list[SixWay]:
     """Reads frames from two textures, or three.
 
     Args:
         paths: The files, .exr, .png or .tga (8 bits a channel, linear): those of the layout, and maybe one of opacity,
             its alpha or else its first channel.
-        layout, rows, columns, count, gain: As for `unpack`.
+        layout, rows, columns, count, gain, padding: As for `unpack`.
         straight: Whether the light isn't multiplied by the opacity yet; it is here.
 
     Returns:
@@ -203,7 +214,8 @@ def read_flipbook(
     where = ", ".join(map(str, paths))
     pages = [_read(path) for path in paths[:2]]
     try:
-        frames = unpack(pages[0], pages[1], layout, rows=rows, columns=columns, count=count, gain=gain)
+        options = {"rows": rows, "columns": columns, "count": count, "gain": gain, "padding": padding}
+        frames = unpack(pages[0], pages[1], layout, **options)
         if len(paths) == 3:
             opacity = _read(paths[2], grey=True)
             opacity = opacity[..., -1] if opacity.shape[2] in (2, 4) else opacity[..., 0]
@@ -211,6 +223,8 @@ def read_flipbook(
                 raise ValueError(f"expected textures of one size, got {pages[0].shape[:2]} and {opacity.shape}")
             cell = opacity.reshape(rows, opacity.shape[0] // rows, columns, -1).swapaxes(1, 2)
             cell = cell.reshape(rows * columns, *cell.shape[2:])
+            height, width = cell.shape[1:]
+            cell = cell[:, padding : height - padding, padding : width - padding].copy()
             frames = [replace(frame, transparency=torch.from_numpy(1.0 - cell[i])) for i, frame in enumerate(frames)]
     except ValueError as error:
         raise WlmError(f"{where}: {error}") from error
@@ -272,10 +286,12 @@ def _suffix(path: str | os.PathLike[str]) -> str:
     return suffix
 
 
-def _check_cells(layout: str, rows: int, columns: int, gain: float) -> None:
+def _check_cells(layout: str, rows: int, columns: int, gain: float, padding: int) -> None:
     if layout not in LAYOUTS:
         raise ValueError(f"layout: expected one of {', '.join(LAYOUTS)}, got {layout!r}")
     if rows < 1 or columns < 1:
         raise ValueError(f"expected at least one row and column, got {rows} x {columns}")
     if not 0 < gain < np.inf:
         raise ValueError(f"gain: expected a number above 0, got {gain}")
+    if padding < 0:
+        raise ValueError(f"padding: expected at least 0, got {padding}")

@@ -65,6 +65,19 @@ _Count = Annotated[int, Field(ge=1, le=4096)]
 _Face = Literal["-x", "+x", "-y", "+y", "-z", "+z"]
 
 
+def _stops(glow: tuple[tuple[float, float, float, float], ...]) -> tuple[tuple[float, float, float, float], ...]:
+    if len(glow) == 1 or any(b[0] <= a[0] for a, b in zip(glow, glow[1:], strict=False)):
+        raise PydanticCustomError("glow", "expected no stops of glow, or at least two that rise")
+    return glow
+
+
+_Glow = Annotated[tuple[tuple[_Number, _NotNegative, _NotNegative, _NotNegative], ...], AfterValidator(_stops)]
+
+
+def _ramp(glow: tuple[tuple[float, float, float, float], ...]) -> Ramp | None:
+    return Ramp(tuple(stop[0] for stop in glow), tuple(stop[1:] for stop in glow)) if glow else None
+
+
 class _Settings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -159,25 +172,12 @@ class Smoke(_Settings):
     storage: Literal["float32", "float16"] = "float32"
     bricks: bool = False
     substeps: int = Field(2, ge=1, le=16)
-    glow: tuple[tuple[_Number, _NotNegative, _NotNegative, _NotNegative], ...] = ()
-
-    @model_validator(mode="after")
-    def _stops(self) -> Smoke:
-        if len(self.glow) == 1 or any(b[0] <= a[0] for a, b in zip(self.glow, self.glow[1:], strict=False)):
-            raise PydanticCustomError("glow", "expected no stops of glow, or at least two that rise")
-        return self
+    glow: _Glow = ()
 
     @property
     def hot(self) -> bool:
         """Whether temperature has any effect."""
         return self.emission > 0.0 or self.buoyancy > 0.0
-
-    @property
-    def ramp(self) -> Ramp | None:
-        """The glow's colours; None: grey."""
-        if not self.glow:
-            return None
-        return Ramp(tuple(stop[0] for stop in self.glow), tuple(stop[1:] for stop in self.glow))
 
 
 class _Timed(_Settings):
@@ -317,6 +317,28 @@ class LightSettings(_Settings):
         return Light(self.toward, self.irradiance)
 
 
+class Looks(_Settings):
+    """What a picture of a frame shows beside its smoke, and by which light.
+
+    Attributes:
+        lights, background: As of a scene.
+        glow: As of a scene's smoke.
+        obstacles: As of a scene.
+        time: Of the obstacles, seconds.
+    """
+
+    lights: tuple[LightSettings, ...]
+    background: _Colour = (0.0, 0.0, 0.0)
+    glow: _Glow = ()
+    obstacles: tuple[ObstacleSettings, ...] = Field((), max_length=255)
+    time: _Number = 0.0
+
+    @property
+    def ramp(self) -> Ramp | None:
+        """The glow's colours; None: grey."""
+        return _ramp(self.glow)
+
+
 class Scene(_Settings):
     """A scene.
 
@@ -360,6 +382,11 @@ class Scene(_Settings):
     def time(self, frame: int) -> float:
         """The time of a frame in seconds; frames count from 1."""
         return frame / self.rate
+
+    def looks(self, frame: int) -> Looks:
+        """What a picture of a frame shows."""
+        parts = {"lights": self.lights, "background": self.background, "obstacles": self.obstacles}
+        return Looks(**parts, glow=self.smoke.glow, time=self.time(frame))
 
     def scaled(self, factor: float) -> Scene:
         """The same scene on a grid of a multiple of its cells along each axis, rounded; no axis gets fewer than one.

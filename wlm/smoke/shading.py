@@ -9,9 +9,15 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+import warp as wp
 
-from wlm.ops.raster import rasterize
+from wlm.interop import device_name, stream, to_warp, torch_memory
 from wlm.smoke.camera import Camera, unit
+from wlm_kernels.smoke import shadow
+from wlm_kernels.smoke.march import View
+
+SHADOW_MAP = 512
+"""Texels along an edge of a shadow map."""
 
 _SMALLEST_MAP = 8  # texels along an edge, of which four are the empty border
 
@@ -65,7 +71,7 @@ def obstacle_visibility(
     vertices: torch.Tensor,
     triangles: torch.Tensor,
     *,
-    resolution: int = 512,
+    resolution: int = SHADOW_MAP,
     bias: float | None = None,
 ) -> torch.Tensor:
     """The share of a light that obstacles leave to the smoke's surface, by a shadow map (section 4.5).
@@ -80,7 +86,8 @@ def obstacle_visibility(
         vertices: float32 [V, 3], the obstacles' corners in the world.
         triangles: int32 or int64 [F, 3], rows of the vertices.
         resolution: Texels along an edge of the shadow map, at least 8.
-        bias: How much nearer to the light, in the world's unit, an obstacle must be to keep it off; None: 1.5 texels.
+        bias: How much nearer to the light, in the world's unit, an obstacle must be to keep it off, at least 0; None:
+            1.5 texels.
 
     Returns:
         float32 [H, W] in [0, 1], mixed between the four texels around a point; 1 where there is no smoke.
@@ -95,35 +102,42 @@ def obstacle_visibility(
     lit = torch.ones(size, dtype=torch.float32, device=depth.device)
     if resolution < _SMALLEST_MAP:
         raise ValueError(f"resolution: expected at least {_SMALLEST_MAP}, got {resolution}")
+    if bias is not None and not bias >= 0:
+        raise ValueError(f"bias: expected at least 0, got {bias}")
     if not len(triangles):
         return lit
-    # Any turn about the light's direction will do.
-    from_light = Camera.look_at(direction, np.zeros(3), extent=1.0, height=1, width=1)
-    axes = torch.tensor(from_light.axes, dtype=torch.float64, device=depth.device)
-    corners = vertices.double() @ axes.T
-    low, high = corners[triangles.reshape(-1)].aminmax(dim=0)
-    middle = 0.5 * (low + high)
-    # Square, and two texels wider than the obstacles on each side, so that the border is empty.
-    half = max(float((high - low)[:2].max()) * 0.5 * resolution / (resolution - 4), 1e-9)
-    texel = 2.0 * half / resolution
-    behind = max(float((high - low)[2]), 1e-9)
-    flat = (corners - middle) / half
-    # z grows away from the light.
-    clip = torch.stack([flat[:, 0], flat[:, 1], (middle[2] - corners[:, 2]) / behind, torch.ones_like(flat[:, 0])], 1)
-    drawn = rasterize(clip.float(), triangles, resolution, resolution)
-    nearest = torch.where(drawn.triangle >= 0, middle[2] - drawn.depth.double() * behind, -math.inf)
+    wp.init()  # which wrapping a tensor doesn't do
+    with stream(device_name(depth.device)):
+        arrays = to_warp(vertices.float().contiguous(), wp.vec3), to_warp(triangles.int().contiguous())
+        surface = to_warp(depth.float().contiguous())
+        cast_shadow(*arrays, light_axes(direction), camera.in_world(), surface, to_warp(lit), resolution, bias)
+    return lit
 
-    origin, direction = camera.rays(depth.device)
-    at = (origin + depth.double()[..., None] * direction) @ axes.T
-    column = ((at[..., 0] - middle[0]) / half + 1.0) * 0.5 * resolution - 0.5
-    row = (1.0 - (at[..., 1] - middle[1]) / half) * 0.5 * resolution - 0.5
-    offset = 1.5 * texel if bias is None else bias
-    hidden = torch.zeros_like(depth, dtype=torch.float64)
-    for down in (0, 1):
-        for across in (0, 1):
-            r, c = row.floor() + down, column.floor() + across
-            weight = (1.0 - (row - r).abs()) * (1.0 - (column - c).abs())
-            # The border's texels are empty: what lies outside is lit.
-            occluder = nearest[r.clamp(0, resolution - 1).long(), c.clamp(0, resolution - 1).long()]
-            hidden += torch.where(occluder > at[..., 2] + offset, weight, 0.0)
-    return torch.where(depth > 0, (1.0 - hidden).clamp(0, 1).float(), lit)
+
+def light_axes(toward: Sequence[float] | np.ndarray) -> list[float]:
+    """Rows of axes of which the third points to a light, 9 numbers: any turn about its direction will do."""
+    return Camera.look_at(toward, np.zeros(3), extent=1.0, height=1, width=1).axes.ravel().tolist()
+
+
+def cast_shadow(
+    points: wp.array,
+    triangles: wp.array,
+    axes: Sequence[float],
+    view: View,
+    depth: wp.array,
+    out: wp.array,
+    resolution: int = SHADOW_MAP,
+    bias: float | None = None,
+) -> None:
+    """`obstacle_visibility` of arrays that stay in place, unchecked; a graph may capture it.
+
+    Args:
+        points, triangles: vec3 [V] and int32 [F, 3], at least one.
+        axes: From `light_axes`.
+        view: From `Camera.in_world`.
+        depth, out: float [H, W].
+        resolution, bias: As for `obstacle_visibility`.
+    """
+    options = {"resolution": resolution, "bias": -1.0 if bias is None else bias}
+    memory = torch_memory(wp.device_to_torch(depth.device))
+    shadow.visibility(points, triangles, axes, view, depth, out, **options, empty=memory)

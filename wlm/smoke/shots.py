@@ -5,15 +5,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from wlm.errors import WlmError
+from wlm.fluid.volume import DensityVolume
 from wlm.smoke.baking import bake
 from wlm.smoke.camera import Camera
-from wlm.smoke.data import SCENE_FILE, Frames, numbered, read_six_way, spread
+from wlm.smoke.data import SCENE_FILE, Frames, numbered, read_shaded, spread
 from wlm.smoke.exporter import is_straight, read_flipbook
 from wlm.smoke.guiding import guide
 from wlm.smoke.lightmaps import SixWay
-from wlm.smoke.scene import CameraSettings, ObstacleSettings, Scene, make_camera
-from wlm.smoke.shading import Ramp
+from wlm.smoke.scene import CameraSettings, Looks
 from wlm.system import Meter, OnProgress
 from wlm_kernels.smoke.settings import March
 
@@ -27,18 +26,24 @@ class Shot:
     Attributes:
         number: Of the frame.
         six: Lightmaps with their camera; with obstacles, with their depth too.
-        ramp: The scene's colours of the emission.
-        obstacles: The scene's.
-        time: Of the obstacles, seconds.
+        looks: Lights, colours and obstacles of the scene; None: there is none.
         warnings: The volume's repairs, one line each.
     """
 
     number: int
     six: SixWay
-    ramp: Ramp | None = None
-    obstacles: tuple[ObstacleSettings, ...] = ()
-    time: float = 0.0
+    looks: Looks | None = None
     warnings: tuple[str, ...] = ()
+
+
+def with_surface(six: SixWay, volume: DensityVolume, looks: Looks | None) -> SixWay:
+    """The lightmaps with the depth at which obstacles and their shadows are drawn, if the looks have any.
+
+    Whichever way the lightmaps were made, it is that of a march in steps of a voxel.
+    """
+    if looks is None or not looks.obstacles:
+        return replace(six, depth=None)
+    return replace(six, depth=guide(volume, six.camera, _SURFACE).depth)
 
 
 @dataclass(frozen=True)
@@ -57,14 +62,9 @@ class FramesToBake:
     supersample: int = 1
 
     @property
-    def scene(self) -> Scene | None:
-        """Of the frames; None: a single volume."""
-        return self.frames.scene
-
-    @property
     def single(self) -> bool:
         """Whether it is one file and not a folder."""
-        return self.frames.scene is None
+        return self.frames.single
 
     def shots(self, count: int | None = None, progress: OnProgress | None = None) -> Iterator[Shot]:
         """Bakes one frame after the other.
@@ -77,14 +77,10 @@ class FramesToBake:
             WlmError: A frame is missing or damaged.
         """
         for number, volume in self.frames.volumes(spread(self.frames.numbers, count), progress):
-            camera = make_camera(self.camera, volume.origin, [volume.voxel * n for n in volume.shape])
+            camera = self.frames.view(self.camera, volume)
             six = bake(volume, camera, step=self.step, supersample=self.supersample, estimate=False)
-            shot = Shot(number, six, time=self.frames.time(number), warnings=volume.warnings)
-            if self.scene is not None:
-                if self.scene.obstacles:
-                    shot = replace(shot, six=replace(six, depth=guide(volume, camera, _SURFACE).depth))
-                shot = replace(shot, ramp=self.scene.smoke.ramp, obstacles=self.scene.obstacles)
-            yield shot
+            looks = self.frames.looks(number)
+            yield Shot(number, with_surface(six, volume, looks), looks, volume.warnings)
 
 
 @dataclass(frozen=True)
@@ -100,7 +96,6 @@ class BakedFiles:
     files: dict[int, Path]
     single: bool
     device: str = "cpu"
-    scene: None = None
 
     def shots(self, count: int | None = None, progress: OnProgress | None = None) -> Iterator[Shot]:
         """Reads one frame after the other; arguments as for `FramesToBake.shots`.
@@ -111,7 +106,7 @@ class BakedFiles:
         numbers = spread(tuple(self.files), count)
         meter = Meter(progress, "read", len(numbers))
         for done, number in enumerate(numbers, 1):
-            yield Shot(number, read_six_way(self.files[number], self.device))
+            yield Shot(number, *read_shaded(self.files[number], self.device))
             meter.report(done)
 
 
@@ -131,7 +126,6 @@ class FlipBook:
     columns: int
     straight: bool = False
     device: str = "cpu"
-    scene: None = None
 
     @property
     def single(self) -> bool:
@@ -163,10 +157,7 @@ def baked_files(path: str | os.PathLike[str], device: str = "cpu") -> BakedFiles
     """Finds what `bake` or `predict` wrote: the file itself, or those of a folder.
 
     Returns:
-        None where the path is a volume or a folder of a simulation.
-
-    Raises:
-        WlmError: A folder of neither kind.
+        None where the path is another file or folder.
     """
     path = Path(path)
     if path.suffix.lower() == ".exr":
@@ -174,6 +165,4 @@ def baked_files(path: str | os.PathLike[str], device: str = "cpu") -> BakedFiles
     if not path.is_dir() or (path / SCENE_FILE).exists():
         return None
     files = numbered(path, "six", ".exr")
-    if not files:
-        raise WlmError(f"{path}: expected a folder that simulate or bake wrote")
-    return BakedFiles(files, False, device)
+    return BakedFiles(files, False, device) if files else None

@@ -20,6 +20,7 @@ from wlm.smoke.data import CHECKPOINT, Frames
 from wlm.smoke.scene import Inlet, Scene, SourceSettings
 from wlm.system import Meter, OnProgress
 
+_Timed = tuple[fluid.Source, Callable[[float], bool]]
 # Cells by which smoke at an inlet reaches into the box, so that the air carries on smoke of full density.
 _INLET_DEPTH = 1.0
 # Steps in which inlets open, per cell of the longest axis: a sudden start is a sound wave.
@@ -135,15 +136,13 @@ def _simulate(
     for frame in range(done + 1, scene.frames + 1):
         begin = time.perf_counter()
         for step in range(solver.steps % per_frame, per_frame):
-            now = (frame - 1 + step / per_frame) / scene.rate
-            solver.sources = tuple(source for source, active in sources if active(now))
-            solver.step()
+            _step(scene, solver, sources, frame - 1 + step / per_frame)
             last = step + 1 == per_frame
             if last:
                 solver.check()
                 volume = volume_of(scene, solver)
                 # Before the state: one whose frame is missing would be resumed past it.
-                save_volume(frames.file(frame), volume)
+                save_volume(frames.file(frame), volume, bricks=True)
             if pace.due():
                 with pace.saving():
                     solver.save(checkpoint)
@@ -159,6 +158,23 @@ def _simulate(
     if begun <= scene.frames * per_frame:
         checkpoint.unlink(missing_ok=True)
     return min(done, scene.frames) + 1
+
+
+def advance(scene: Scene, solver: fluid.Solver, frame: int) -> None:
+    """Takes a solver from the end of the frame before to that of a frame; frames count from 1.
+
+    Raises:
+        WlmError: An obstacle is too fast.
+    """
+    per_frame, sources = scene.steps // scene.smoke.substeps, _sources(scene)
+    for step in range(per_frame):
+        _step(scene, solver, sources, frame - 1 + step / per_frame)
+
+
+def _step(scene: Scene, solver: fluid.Solver, sources: list[_Timed], frames: float) -> None:
+    """One step of the smoke, which begins after some frames, with the sources that are on then."""
+    solver.sources = tuple(source for source, active in sources if active(frames / scene.rate))
+    solver.step()
 
 
 def _require_memory(scene: Scene, device: str) -> None:
@@ -235,9 +251,9 @@ def _set_inlets(lattice: Lattice, scene: Scene, domain: Domain, name: str, inlet
     lattice.set_inlet(name, velocity, opened)
 
 
-def _sources(scene: Scene) -> list[tuple[fluid.Source, Callable[[float], bool]]]:
+def _sources(scene: Scene) -> list[_Timed]:
     """The solver's sources, in cells, at inlets and within the box; and whether each is on at a time."""
-    sources: list[tuple[fluid.Source, Callable[[float], bool]]] = []
+    sources: list[_Timed] = []
 
     def add(
         shape: str,

@@ -73,7 +73,7 @@ def open_scene(
         return request.model()
     if suffix in SUFFIXES:
         return request.lightmap()
-    if suffix == ".nvdb" or (suffix == ".npz" and "density" in _names(path)):
+    if suffix in (".nvdb", ".vdb") or (suffix == ".npz" and "density" in _names(path)):
         return request.volume(path)
     if path.name == SET_FILE:
         return request.lightmap_set()
@@ -81,7 +81,7 @@ def open_scene(
         return request.probes()
     if suffix in (".glb", ".gltf", ".obj"):
         raise WlmError(f"{path}: a mesh has no light of its own; expected the light, with this as --mesh")
-    known = ", ".join((".wlm", *SUFFIXES, ".npz", ".nvdb", ".json"))
+    known = ", ".join((".wlm", *SUFFIXES, ".npz", ".nvdb", ".vdb", ".json"))
     raise WlmError(f"{path}: expected a folder or {known} or .lmbake, found {path.suffix or 'none'}")
 
 

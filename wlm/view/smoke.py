@@ -3,7 +3,6 @@
 import math
 import os
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,20 +10,20 @@ import torch
 from PIL import Image, ImageDraw, ImageFont
 
 from wlm.errors import WlmError
-from wlm.ops.raster import rasterize
+from wlm.interop import device_name
 from wlm.smoke.camera import DIRECTIONS, Camera
 from wlm.smoke.guiding import Guide
 from wlm.smoke.lightmaps import SixWay
-from wlm.smoke.scene import ObstacleSettings, obstacle_mesh
-from wlm.smoke.shading import Light, Ramp, obstacle_visibility
+from wlm.smoke.scene import ObstacleSettings
+from wlm.smoke.shading import Light, Ramp
 from wlm.view.atlas import encode, save_png
+from wlm.view.smoke_drawing import Drawing
 
 MOST_COLUMNS = 8
 """Pictures in a row of a contact sheet."""
 
 _GREY = 96  # of a sheet: neither smoke nor shadow
 _MARGIN, _FONT = 4, 14  # pixels
-_AMBIENT = 0.2  # of an obstacle's colour, so that its dark side stands out from a black background
 
 
 def to_bytes(light: torch.Tensor | np.ndarray, white: float = 1.0) -> np.ndarray:
@@ -63,40 +62,10 @@ def draw_obstacles(
     Returns:
         Light float32 [H, W, 3], and the distance along the ray float32 [H, W], infinite where there is no obstacle.
     """
-    points, triangles, owner = (torch.from_numpy(a).to(device) for a in obstacle_mesh(obstacles, time))
-    light = torch.zeros((camera.height, camera.width, 3), dtype=torch.float32, device=device)
-    depth = torch.full(light.shape[:2], math.inf, device=device)
-    axes = torch.tensor(camera.axes, dtype=torch.float32, device=device)
-    local = (points - torch.tensor(camera.position, dtype=torch.float32, device=device)) @ axes.T
-    away = -local[:, 2]
-    # With parallel rays the rasteriser doesn't cut off what is behind the camera.
-    ahead = (away[triangles.long()] > 0).all(1) if not camera.perspective else torch.ones_like(owner, dtype=torch.bool)
-    triangles, owner = triangles[ahead].contiguous(), owner[ahead]
-    if not len(triangles):
-        return light, depth
-    half = 0.5 * camera.extent
-    flat = [local[:, 0] / (half * camera.width / camera.height), local[:, 1] / half]
-    far = float(away.abs().max())
-    ends = [away - 1.0, away] if camera.perspective else [away / far, torch.ones_like(away)]
-    drawn = rasterize(torch.stack(flat + ends, 1), triangles, camera.height, camera.width)
-    hit = drawn.triangle >= 0
-    number = drawn.triangle[hit].long()
-    corners = points[triangles[number].long()]
-    weight = torch.cat([drawn.barycentric[hit], 1.0 - drawn.barycentric[hit].sum(1, keepdim=True)], 1)
-    at = (corners * weight[..., None]).sum(1)
-    origin, direction = (part.float() for part in camera.rays(device))
-    depth[hit] = ((at - origin[hit]) * direction[hit]).sum(1)
-    normal = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normal = torch.nn.functional.normalize(normal, dim=1)
-    normal = torch.where((normal * direction[hit]).sum(1, keepdim=True) > 0, -normal, normal)
-    colour = torch.tensor([o.colour for o in obstacles], dtype=torch.float32, device=device)[owner[number].long()]
-    total = torch.full_like(colour, _AMBIENT)
-    for lamp in lights:
-        toward = torch.tensor(lamp.toward, dtype=torch.float32, device=device)
-        facing = (normal @ (toward / toward.norm())).clamp(min=0)[:, None]
-        total = total + facing * torch.tensor(lamp.irradiance, dtype=torch.float32, device=device) / math.pi
-    light[hit] = colour * total
-    return light, depth
+    drawing = Drawing(camera, lights, obstacles=obstacles, device=device)
+    drawing.move(time)
+    drawing.draw_obstacles()
+    return drawing.solid_light, drawing.solid_depth
 
 
 def picture(
@@ -129,21 +98,12 @@ def picture(
     Raises:
         ValueError: The lightmaps lack their camera, transparency or, with obstacles, depth.
     """
-    if not len(obstacles):
-        return six.shade(lights, background=background, ramp=ramp, rule=rule)
-    if six.camera is None or six.depth is None:
-        raise ValueError("six: expected lightmaps with their camera and depth, for the obstacles")
-    device = str(six.lightmaps.device)
-    points, triangles, _ = (torch.from_numpy(a).to(device) for a in obstacle_mesh(obstacles, time))
-    shadowed = [
-        replace(light, visibility=obstacle_visibility(six.depth, six.camera, light.toward, points, triangles))
-        for light in lights
-    ]
-    drawn, away = draw_obstacles(obstacles, time, six.camera, lights, device)
-    plain = torch.tensor(background, dtype=torch.float32, device=device)
-    behind = torch.where(torch.isfinite(away)[..., None], drawn, plain)
-    smoky = six.shade(shadowed, background=behind, ramp=ramp, rule=rule)
-    return torch.where((away < six.depth)[..., None], drawn, smoky)
+    if six.camera is None:
+        raise ValueError("six: expected lightmaps with their camera")
+    options = {"background": background, "ramp": ramp, "obstacles": obstacles, "rule": rule}
+    drawing = Drawing(six.camera, lights, **options, device=device_name(six.lightmaps.device))
+    drawing.move(time)
+    return drawing(six)
 
 
 def six_pictures(six: SixWay, white: float = 1.0) -> dict[str, np.ndarray]:

@@ -110,7 +110,7 @@ def pool_of_volume(
     """Makes samples of any volume, one from each fixed view: a test on smoke from elsewhere.
 
     Args:
-        path: A `.npz` or `.nvdb` volume, as `load_volume` reads it.
+        path: A `.npz`, `.nvdb` or `.vdb` volume, as `load_volume` reads it.
         settings: Views and march; the volume's longest edge counts as the box's.
         device: "cpu", "cuda" or "cuda:N".
         extinction: Extinction of density 1, per unit of length; None: such that its dense smoke is as opaque as a

@@ -1,0 +1,160 @@
+"""Grids of a file, each with a map from its voxels to the world, on one lattice of cubic voxels along the axes.
+
+A grid whose voxels are cubic and lie along the axes, in any order and direction, stays as it is, but for the order of
+its axes. Any other map, of voxels that are longer along one axis, turned or sheared, is resampled: linearly between the
+centres of the grid's voxels, at voxels as long as its shortest edge. Its box then grows by the voxels which the smoke
+between two centres reaches into.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import warp as wp
+
+from wlm.errors import WlmError
+from wlm.interop import device_name, to_warp
+from wlm_kernels.fluid import grids as kernels
+
+UPS = {
+    "x": np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
+    "y": np.eye(3),
+    "z": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),
+}
+"""Turns of a world in which x, y or z is up to one in which +y is, by that axis."""
+
+_CUBIC = 1e-5  # of an edge, by which it may differ from that of a cube along the axes
+_FLAT = 1e-9  # volume of a parallelepiped of edges of length 1
+_FARTHEST = 1 << 30  # of voxels from the world's origin: beyond, rounding would move them
+_APART = 1e-4  # of a voxel, by which two grids' voxels may differ and still be the same
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """A grid over the box of its active voxels.
+
+    Attributes:
+        name: As messages name it.
+        values: float32 tensor [X, Y, Z].
+        matrix: float64 [4, 4], from the indices of voxel centres, 0 the first of the box, to the world.
+    """
+
+    name: str
+    values: torch.Tensor
+    matrix: np.ndarray
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """Cubic voxels along the axes.
+
+    Attributes:
+        voxel: Edge of a voxel, in the world's unit.
+        origin: The corner of voxel (0, 0, 0) in the world, [3].
+        shape: Voxels along each axis.
+    """
+
+    voxel: float
+    origin: tuple[float, float, float]
+    shape: tuple[int, int, int]
+
+
+def on_one_lattice(grids: Sequence[Grid], most: int, up: str = "y") -> tuple[Lattice, list[torch.Tensor]]:
+    """Puts grids on one lattice, that of the first, over the box of all.
+
+    Args:
+        grids: At least one.
+        most: Voxels that the lattice may have.
+        up: "x", "y" or "z", the axis of the grids' world that becomes +y.
+
+    Returns:
+        The lattice, and each grid's values on it, float32 [X, Y, Z]; 0 where a grid has none.
+
+    Raises:
+        WlmError: A map without volume, or the lattice has too many voxels.
+    """
+    turned = [(grid, _turned(grid, up)) for grid in grids]
+    first, matrix = turned[0]
+    voxel = float(np.linalg.norm(matrix[:3, :3], axis=0).min())
+    # A lattice through the first grid's corner: its own voxels, if they are cubes along the axes.
+    corner = _ends(first, matrix, 0.0)[0]
+    kept = [_is_kept(_between(voxel, corner, matrix)) for _, matrix in turned]
+    ends = [_ends(grid, matrix, 0.0 if same else 0.5) for (grid, matrix), same in zip(turned, kept, strict=True)]
+    farthest = float(np.abs(ends).max()) / voxel
+    if not farthest <= _FARTHEST:
+        raise WlmError(f"{first.name}: expected a box within {_FARTHEST} voxels of the origin, found {farthest:.4g}")
+    low = np.floor(np.min([(begin - corner) / voxel for begin, _ in ends], axis=0) + _APART)
+    high = np.ceil(np.max([(end - corner) / voxel for _, end in ends], axis=0) - _APART)
+    size = [max(int(n), 1) for n in high - low]
+    if math.prod(size) > most:
+        raise WlmError(
+            f"{first.name}: expected at most {most} cubic voxels of the grid's shortest edge, {voxel:.4g}, "
+            f"found {' x '.join(map(str, size))}"
+        )
+    lattice = Lattice(voxel, tuple(map(float, corner + low * voxel)), tuple(size))
+    return lattice, [_on(lattice, grid, matrix) for grid, matrix in turned]
+
+
+def _turned(grid: Grid, up: str) -> np.ndarray:
+    """The map of the corners of a grid's voxels, rather than their centres, to the turned world, [4, 4]."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = UPS[up]
+    matrix = matrix @ grid.matrix
+    matrix[:3, 3] -= 0.5 * matrix[:3, :3].sum(1)
+    edges = np.linalg.norm(matrix[:3, :3], axis=0)
+    # Of unit edges, so that small voxels have a volume too.
+    if not (np.isfinite(edges).all() and edges.all() and abs(np.linalg.det(matrix[:3, :3] / edges)) > _FLAT):
+        raise WlmError(f"{grid.name}: expected a map to the world that keeps a volume, found {grid.matrix.tolist()}")
+    return matrix
+
+
+def _ends(grid: Grid, matrix: np.ndarray, margin: float) -> tuple[np.ndarray, np.ndarray]:
+    """The ends of a grid's box in the world, which is `margin` voxels larger on each side, two of [3]."""
+    box = np.stack(np.meshgrid(*[(-margin, n + margin) for n in grid.values.shape], indexing="ij"), -1).reshape(8, 3)
+    corners = box @ matrix[:3, :3].T + matrix[:3, 3]
+    return corners.min(0), corners.max(0)
+
+
+def _between(voxel: float, origin: np.ndarray, matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The map from a lattice's voxels to a grid's, of corners: its linear part [3, 3] and its shift [3]."""
+    turn = np.linalg.inv(matrix[:3, :3])
+    return turn * voxel, turn @ (origin - matrix[:3, 3])
+
+
+def _is_kept(between: tuple[np.ndarray, np.ndarray]) -> bool:
+    """Whether each voxel of the lattice is one of the grid."""
+    turn, shift = between
+    axes = np.abs(turn).round()
+    straight = np.abs(np.abs(turn) - axes).max() <= _CUBIC and (axes.sum(0) == 1).all() and (axes.sum(1) == 1).all()
+    return bool(straight and np.abs(shift - shift.round()).max() <= _APART)
+
+
+def _on(lattice: Lattice, grid: Grid, matrix: np.ndarray) -> torch.Tensor:
+    """A grid's values on the lattice."""
+    turn, shift = _between(lattice.voxel, np.asarray(lattice.origin), matrix)
+    if not _is_kept((turn, shift)):
+        return _resampled(lattice, grid.values, turn, shift)
+    signs = turn.round().astype(int)
+    order = np.abs(signs).argmax(0).tolist()  # for each axis of the lattice that of the grid
+    begin = (shift + 0.5 * signs.sum(1) - 0.5).round().astype(int)  # the grid's voxel at the lattice's first
+    backwards = [axis for axis in range(3) if signs[order[axis], axis] < 0]
+    values = grid.values.permute(order).flip(backwards)
+    first = [
+        begin[order[axis]] + 1 - values.shape[axis] if axis in backwards else -begin[order[axis]] for axis in range(3)
+    ]
+    if not any(first) and tuple(values.shape) == lattice.shape:
+        return values.contiguous()
+    out = torch.zeros(lattice.shape, dtype=torch.float32, device=values.device)
+    out[tuple(slice(int(a), int(a) + n) for a, n in zip(first, values.shape, strict=True))] = values
+    return out
+
+
+def _resampled(lattice: Lattice, values: torch.Tensor, turn: np.ndarray, shift: np.ndarray) -> torch.Tensor:
+    wp.init()  # which wrapping a tensor doesn't do
+    out = torch.empty(lattice.shape, dtype=torch.float32, device=values.device)
+    inputs = [to_warp(values.contiguous()), wp.mat33(*turn.ravel().tolist()), wp.vec3(*shift.tolist())]
+    device = device_name(values.device)
+    wp.launch(kernels.resample, lattice.shape, inputs, [to_warp(out)], device=device)
+    return out

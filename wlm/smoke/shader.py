@@ -1,0 +1,109 @@
+"""The shader of a six-way flip book, in GLSL or HLSL: where a frame lies, and its light from a direction."""
+
+import re
+
+from wlm.smoke.camera import ALPHA, EMISSION, LAYOUTS
+
+LANGUAGES = ("glsl", "hlsl")
+
+_TEXT = """\
+// Six-way smoke of {count} frames, in {rows} x {columns} cells, in the channels of "{layout}".
+// (Neural Six-way Lightmaps for Real-time Smoke Rendering, eq. 4; lights weigh by squares, as in engines.)
+// For {language}. Both textures are linear, not sRGB; sample both at wlm_smoke_uv, clamped to their edge.
+//
+//     light = sum over lights of irradiance / (4 pi) * wlm_smoke_light(first, second, toward)
+//     pixel = light + colour * wlm_smoke_emission(first, second) + behind * (1 - wlm_smoke_alpha(first, second))
+
+// The texture's coordinates of a frame, from 0 on, at a place on the billboard: (0, 0) its top left, (1, 1) its bottom
+// right.
+float2 wlm_smoke_uv(float2 place, float frame)
+{{
+    float cell = clamp(floor(frame), 0.0, {last:.1f});
+    float row = floor((cell + 0.5) / {columns:.1f});
+    float column = cell - {columns:.1f} * row;
+    float x = column + {inset_x} + place.x * {share_x};
+    float y = row + {inset_y} + place.y * {share_y};
+    return float2(x / {columns:.1f}, y / {rows:.1f});
+}}
+
+// The light of irradiance 4 pi from a direction, of length 1, from the smoke to the light: x to the billboard's right,
+// y up, z to the viewer.
+float wlm_smoke_light(float4 first, float4 second, float3 toward)
+{{
+    float x = toward.x > 0.0 ? {right} : {left};
+    float y = toward.y > 0.0 ? {top} : {bottom};
+    float z = toward.z > 0.0 ? {front} : {back};
+    return (toward.x * toward.x * x + toward.y * toward.y * y + toward.z * toward.z * z) * {factor};
+}}
+
+float wlm_smoke_alpha(float4 first, float4 second)
+{{
+    return {alpha};
+}}
+
+float wlm_smoke_emission(float4 first, float4 second)
+{{
+    return {emission};
+}}
+"""
+
+
+def smoke_shader(
+    language: str,
+    layout: str,
+    *,
+    rows: int,
+    columns: int,
+    count: int,
+    size: tuple[int, int],
+    padding: int = 0,
+    gain: float = 1.0,
+    hot: bool = True,
+) -> str:
+    """Writes the shader of a flip book.
+
+    Args:
+        language: One of `LANGUAGES`: GLSL 3.30, GLSL ES 3.00, or HLSL of any shader model.
+        layout: One of `wlm.smoke.camera.LAYOUTS`.
+        rows, columns, count: Of cells, and of frames in them.
+        size: Height and width of a frame in pixels, without padding.
+        padding: Pixels around it.
+        gain: The factor on the light in the textures.
+        hot: Whether they have a channel of emission.
+
+    Raises:
+        ValueError: No such language or layout.
+    """
+    if language not in LANGUAGES or layout not in LAYOUTS:
+        known = f"{', '.join(LANGUAGES)} and of {', '.join(LAYOUTS)}"
+        raise ValueError(f"expected one of {known}, got {language!r} and {layout!r}")
+    places = {
+        name: f"{texture}.{letter}"
+        for texture, names in zip(("first", "second"), LAYOUTS[layout], strict=True)
+        for name, letter in zip(names, "rgba", strict=True)
+    }
+    height, width = (n + 2 * padding for n in size)
+    alpha, emission = places.pop(ALPHA), places.pop(EMISSION)
+    text = _TEXT.format(
+        language="GLSL" if language == "glsl" else "HLSL",
+        layout=layout,
+        rows=rows,
+        columns=columns,
+        count=count,
+        last=count - 1,
+        inset_x=_literal(padding / width),
+        inset_y=_literal(padding / height),
+        share_x=_literal(size[1] / width),
+        share_y=_literal(size[0] / height),
+        factor=_literal(1.0 / gain),
+        alpha=alpha,
+        emission=f"{emission} * {_literal(1.0 / gain)}" if hot else "0.0",
+        **places,
+    )
+    return text if language == "hlsl" else re.sub(r"\bfloat([234])\b", r"vec\1", text)
+
+
+def _literal(number: float) -> str:
+    """A number that GLSL ES too takes for a float."""
+    text = f"{number:.9g}"
+    return text if "." in text or "e" in text else f"{text}.0"

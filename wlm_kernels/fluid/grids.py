@@ -1,0 +1,46 @@
+"""Sparse grids made dense, and voxels of any shape resampled to cubic ones."""
+
+import warp as wp
+
+from wlm_kernels.smoke.march import density_at, size_of
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def dense(
+    # in:
+    grid: wp.uint64,
+    low: wp.vec3i,
+    # out:
+    out: wp.array3d[float],
+):
+    """Reads a NanoVDB grid of floats over a box whose first voxel is `low`."""
+    i, j, k = wp.tid()
+    out[i, j, k] = wp.volume_lookup_f(grid, low[0] + i, low[1] + j, low[2] + k)
+
+
+@wp.kernel
+def resample(
+    # in:
+    values: wp.array3d[float],
+    turn: wp.mat33,
+    shift: wp.vec3,
+    # out:
+    out: wp.array3d[float],
+):
+    """Reads values, trilinear between the centres of their voxels and zero outside, at the centres of others.
+
+    The point p, in the voxels of `out`, is the point turn p + shift in those of `values`.
+    """
+    i, j, k = wp.tid()
+    p = turn * wp.vec3(float(i) + 0.5, float(j) + 0.5, float(k) + 0.5) + shift
+    size = size_of(values)
+    result = float(0.0)
+    inside = int(1)
+    for axis in range(3):
+        if p[axis] < -0.5 or p[axis] > size[axis] + 0.5:
+            inside = int(0)
+    if inside != 0:
+        result = density_at(values, p)
+    out[i, j, k] = result

@@ -1,0 +1,222 @@
+"""Pictures of smoke from its lightmaps: solid obstacles, and the smoke's light over them. Nothing is read back.
+
+All light is linear. `wlm.smoke.lightmaps.SixWay.shade` is the same in torch, without obstacles.
+"""
+
+from dataclasses import dataclass
+
+import warp as wp
+
+from wlm_kernels.smoke.march import View, ray
+
+wp.set_module_options({"enable_backward": False})
+
+
+@dataclass(frozen=True)
+class Solids:
+    """Obstacles on a device.
+
+    Attributes:
+        points: vec3 [V], corners in the world.
+        triangles: int32 [F, 3].
+        owner: int32 [F], whose each triangle is.
+        colours: vec3, each obstacle's albedo.
+    """
+
+    points: wp.array
+    triangles: wp.array
+    owner: wp.array
+    colours: wp.array
+
+
+@dataclass(frozen=True)
+class Lamps:
+    """Directional lights on a device, at least one array's worth of room even where there is none.
+
+    Attributes:
+        count: Of the lights.
+        toward: vec3 [L], directions to them in the world, of length 1.
+        irradiance: vec3 [L].
+        weights: float [L, 6], of the lightmaps.
+        visibility: float [L, H, W], the share of each that reaches the smoke.
+    """
+
+    count: int
+    toward: wp.array
+    irradiance: wp.array
+    weights: wp.array
+    visibility: wp.array
+
+
+@wp.kernel
+def _clip(
+    # in:
+    points: wp.array(dtype=wp.vec3),
+    view: View,
+    # out:
+    clip: wp.array(dtype=wp.vec4),
+):
+    n = wp.tid()
+    p = points[n] - view.origin
+    away = wp.dot(p, view.forward)
+    half = 0.5 * view.pitch * float(view.height)
+    x = wp.dot(p, view.right) / (half * float(view.width) / float(view.height))
+    y = wp.dot(p, view.up) / half
+    if view.perspective != 0:
+        clip[n] = wp.vec4(x, y, away - 1.0, away)
+    elif away > 0.0:
+        clip[n] = wp.vec4(x, y, away, 1.0)
+    else:
+        # With parallel rays the rasteriser doesn't cut off what is behind the camera; what isn't finite it leaves out.
+        clip[n] = wp.vec4(wp.nan, wp.nan, wp.nan, wp.nan)
+
+
+@wp.kernel
+def _light_solids(
+    # in:
+    points: wp.array(dtype=wp.vec3),
+    triangles: wp.array2d(dtype=wp.int32),
+    owner: wp.array(dtype=wp.int32),
+    colours: wp.array(dtype=wp.vec3),
+    lights: int,
+    toward: wp.array(dtype=wp.vec3),
+    irradiance: wp.array(dtype=wp.vec3),
+    ambient: float,
+    view: View,
+    drawn: wp.array2d(dtype=wp.int32),
+    barycentric: wp.array2d(dtype=wp.vec2),
+    # out:
+    light: wp.array2d(dtype=wp.vec3),
+    depth: wp.array2d(dtype=float),
+):
+    i, j = wp.tid()
+    n = drawn[i, j]
+    if n < 0:
+        light[i, j] = wp.vec3(0.0, 0.0, 0.0)
+        depth[i, j] = wp.inf
+        return
+    a = points[triangles[n, 0]]
+    b = points[triangles[n, 1]]
+    c = points[triangles[n, 2]]
+    share = barycentric[i, j]
+    r = ray(view, i, j)
+    at = share[0] * (a - r.origin) + share[1] * (b - r.origin) + (1.0 - share[0] - share[1]) * (c - r.origin)
+    depth[i, j] = wp.dot(at, r.direction)
+    normal = wp.normalize(wp.cross(b - a, c - a))
+    if wp.dot(normal, r.direction) > 0.0:
+        normal = -normal
+    total = wp.vec3(ambient, ambient, ambient)
+    for lamp in range(lights):
+        total += wp.max(wp.dot(normal, toward[lamp]), 0.0) / wp.pi * irradiance[lamp]
+    light[i, j] = wp.cw_mul(colours[owner[n]], total)
+
+
+@wp.func
+def _glow(stops: wp.array(dtype=float), colours: wp.array(dtype=wp.vec3), count: int, emission: float) -> wp.vec3:
+    """Linear between the stops, the end stops' colours beyond them; without stops grey, as it is."""
+    if count == 0:
+        return wp.vec3(emission, emission, emission)
+    colour = colours[0]
+    for n in range(1, count):
+        share = wp.clamp((emission - stops[n - 1]) / (stops[n] - stops[n - 1]), 0.0, 1.0)
+        if emission > stops[n - 1]:
+            colour = (1.0 - share) * colours[n - 1] + share * colours[n]
+    return colour
+
+
+@wp.kernel
+def _compose(
+    # in:
+    lightmaps: wp.array3d(dtype=float),
+    transparency: wp.array2d(dtype=float),
+    emission: wp.array2d(dtype=float),
+    hot: int,
+    stops: wp.array(dtype=float),
+    glow: wp.array(dtype=wp.vec3),
+    lights: int,
+    irradiance: wp.array(dtype=wp.vec3),
+    weights: wp.array2d(dtype=float),
+    visibility: wp.array3d(dtype=float),
+    background: wp.vec3,
+    solids: int,
+    surface: wp.array2d(dtype=float),
+    solid_light: wp.array2d(dtype=wp.vec3),
+    solid_depth: wp.array2d(dtype=float),
+    # out:
+    image: wp.array2d(dtype=wp.vec3),
+):
+    i, j = wp.tid()
+    behind = background
+    if solids != 0 and solid_depth[i, j] < wp.inf:
+        behind = solid_light[i, j]
+        if solid_depth[i, j] < surface[i, j]:
+            image[i, j] = behind
+            return
+    total = transparency[i, j] * behind
+    for lamp in range(lights):
+        grey = float(0.0)
+        for way in range(6):
+            grey += weights[lamp, way] * lightmaps[way, i, j]
+        total += (grey * visibility[lamp, i, j] / (4.0 * wp.pi)) * irradiance[lamp]
+    if hot != 0:
+        total += _glow(stops, glow, wp.where(hot > 1, stops.shape[0], 0), emission[i, j])
+    image[i, j] = total
+
+
+def clip_points(solids: Solids, view: View, clip: wp.array) -> None:
+    """Brings corners to the clip space of a camera in the world, vec4 [V]; those that mustn't be drawn become NaN."""
+    wp.launch(_clip, solids.points.shape, [solids.points, view], [clip], device=clip.device)
+
+
+def light_solids(
+    solids: Solids,
+    lamps: Lamps,
+    ambient: float,
+    view: View,
+    drawn: wp.array,
+    barycentric: wp.array,
+    light: wp.array,
+    depth: wp.array,
+) -> None:
+    """Lights the obstacles that pixels see; they cast no shadows on each other.
+
+    Args:
+        solids: The obstacles.
+        lamps: The lights.
+        ambient: Light on all sides.
+        view: The camera in the world.
+        drawn, barycentric: int32 [H, W] and vec2 [H, W], as the rasteriser gives them.
+        light: vec3 [H, W], 0 where there is none.
+        depth: float [H, W], along the rays, infinite where there is none.
+    """
+    inputs = [*vars(solids).values(), lamps.count, lamps.toward, lamps.irradiance, ambient, view, drawn, barycentric]
+    wp.launch(_light_solids, depth.shape, inputs, [light, depth], device=depth.device)
+
+
+def compose(
+    planes: tuple[wp.array, wp.array, wp.array | None],
+    glow: tuple[wp.array, wp.array] | None,
+    lamps: Lamps,
+    background: tuple[float, float, float],
+    solids: tuple[wp.array, wp.array, wp.array] | None,
+    image: wp.array,
+) -> None:
+    """Puts the smoke's light over obstacles and a background.
+
+    Args:
+        planes: Lightmaps float [6, H, W], transparency [H, W], and of hot smoke its emission [H, W].
+        glow: Stops float [S] and their colours vec3 [S]; None: grey.
+        lamps: The lights.
+        background: A colour.
+        solids: The smoke's surface float [H, W], and the obstacles' light and depth of `light_solids`; None: there are
+            none.
+        image: vec3 [H, W].
+    """
+    lightmaps, transparency, emission = planes
+    hot = 0 if emission is None else 1 if glow is None else 2
+    # In place of what there isn't, arrays that aren't read.
+    stops, colours = glow or (transparency.flatten(), lamps.irradiance)
+    surface, light, depth = solids or (transparency, image, transparency)
+    inputs = [lightmaps, transparency, transparency if emission is None else emission, hot, stops, colours, lamps.count]
+    inputs += [lamps.irradiance, lamps.weights, lamps.visibility, wp.vec3(*background), int(solids is not None)]
+    wp.launch(_compose, image.shape, [*inputs, surface, light, depth], [image], device=image.device)
