@@ -42,12 +42,14 @@ def compress(
         int | None, typer.Option("--uv-set", min=0, help="n of TEXCOORD_n, the lightmap's UVs; default 1, else 0.")
     ] = None,
     profile: Annotated[
-        str, typer.Option(help="standard, bc6h, astc, compact, cascade, paper, or a YAML file.")
+        str, typer.Option(help="standard, half, bc6h, astc, compact, cascade, paper, or a YAML file.")
     ] = "standard",
     budget: Annotated[
         float | None, typer.Option(help="Bits of both textures as a fraction of the lightmap's at 48 per texel.")
     ] = None,
-    colour: Annotated[str | None, typer.Option(help="How the colour texture is stored: half, bc6h or astc.")] = None,
+    colour: Annotated[
+        str | None, typer.Option(help="How the colour texture is stored: half, rgb9e5, bc6h, astc or mixed.")
+    ] = None,
     views: Annotated[
         int | None, typer.Option(help="Random views; a texel counts by the pixels that show it. 0: by its area.")
     ] = None,

@@ -99,10 +99,7 @@ it; -1 for bits of the mode's number and of indices. Field 4 c + e is channel c 
 y, z)."""
 
 MODES = np.array(
-    [
-        [number, 2 if number < 2 else 5, number not in (0x03, 0x1E), bits, *others]
-        for number, bits, others, _ in _MODES
-    ],
+    [[number, 2 if number < 2 else 5, number not in (0x03, 0x1E), bits, *others] for number, bits, others, _ in _MODES],
     np.int32,
 )
 """int32 [14, 7]: the mode's number, bits of it, whether x, y and z are differences, bits of w, and bits of the others'
