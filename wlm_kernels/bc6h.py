@@ -21,7 +21,9 @@ _STRETCH = wp.constant(64.0 / 31.0)  # from a half float's bits to BC6H's 16
 _POWER_ROUNDS = wp.constant(4)
 _AXIS_ROUNDS = wp.constant(8)
 _REFINED = wp.constant(2)  # times that a line is fitted to its texels' levels
+_REFITTED = wp.constant(2)  # times that a block's ends are fitted to the indices that it took
 _TRIED = wp.constant(2)  # partitions
+_LEAST_WEIGHT = wp.constant(1.0e-4)  # of the heaviest texel's
 _HUGE = wp.constant(3.4e38)
 
 _Colours = wp.types.matrix(shape=(16, 3), dtype=float)
@@ -80,12 +82,16 @@ class _Texels:
         weight: Of each texel's squared error.
         place: The light in BC6H's space of 16 bits, not rounded.
         pull: Weight of each channel's squared error there.
+        middle: Mean of the places.
+        metric: What a channel's distance from it is scaled by: the root of the mean pull.
     """
 
     light: _Colours
     weight: _Numbers
     place: _Colours
     pull: _Colours
+    middle: wp.vec3
+    metric: wp.vec3
 
 
 @wp.func
@@ -136,46 +142,73 @@ def _spread(m: _Moments) -> float:
 
 
 @wp.func
-def _moments(point: wp.vec3, weight: float) -> _Moments:
-    """Weight, weighted sum and the six weighted products of a point's channels."""
-    x, y, z = point[0], point[1], point[2]
-    return weight * _Moments(1.0, x, y, z, x * x, x * y, x * z, y * y, y * z, z * z)
+def _scaled(texels: _Texels, texel: int) -> wp.vec3:
+    """A texel's place about the middle, in the metric."""
+    return wp.cw_mul(texels.place[texel] - texels.middle, texels.metric)
 
 
 @wp.func
-def _fitted(texels: _Texels, mask: int, ends: _Ends, line: int, axis: wp.vec3, metric: wp.vec3, steps: int) -> _Ends:
-    """The ends of a line through some texels: the outermost along an axis, then twice by least squares.
+def _moments(texels: _Texels, mask: int) -> _Moments:
+    """Weight, weighted sum and the six weighted products of the channels of some texels' scaled places."""
+    total = _Moments()
+    square = wp.cw_mul(texels.metric, texels.metric)
+    for i in range(_TEXELS):
+        if _in(mask, i):
+            point = _scaled(texels, i)
+            x, y, z = point[0], point[1], point[2]
+            weight = wp.dot(wp.cw_div(texels.pull[i], square), wp.vec3(1.0 / 3.0))
+            total += weight * _Moments(1.0, x, y, z, x * x, x * y, x * z, y * y, y * z, z * z)
+    return total
+
+
+@wp.func
+def _fitted(texels: _Texels, mask: int, ends: _Ends, line: int, moments: _Moments, steps: int) -> _Ends:
+    """The ends of a line through some texels: the outermost along their principal axis, then twice by least squares.
 
     Args:
         texels: The block.
         mask: The texels.
         ends: Where the result is put, at rows 2 `line` and 2 `line` + 1.
-        axis: In places scaled by `metric`.
+        moments: Of these texels.
         steps: The index of the line's far end.
     """
+    principal = _axis_of(moments, _AXIS_ROUNDS)
+    axis = wp.vec3(principal[0], principal[1], principal[2])
     low = float(_HUGE)
     high = float(-_HUGE)
     for i in range(_TEXELS):
         if _in(mask, i):
-            t = wp.dot(wp.cw_mul(texels.place[i], metric), axis)
+            t = wp.dot(_scaled(texels, i), axis)
             low = wp.min(low, t)
             high = wp.max(high, t)
-    middle = wp.vec3(0.0)
-    total = wp.vec3(1.0e-30)
-    for i in range(_TEXELS):
-        if _in(mask, i):
-            middle += wp.cw_mul(texels.pull[i], texels.place[i])
-            total += texels.pull[i]
-    middle = wp.cw_div(middle, total)
-    centre = wp.dot(wp.cw_mul(middle, metric), axis)
-    slope = wp.cw_div(axis, metric)
-    a = middle + slope * (low - centre)
-    b = middle + slope * (high - centre)
+    mean = wp.vec3(moments[1], moments[2], moments[3]) / wp.max(moments[0], 1.0e-30)
+    centre = wp.dot(mean, axis)
+    a = texels.middle + wp.cw_div(mean + axis * (low - centre), texels.metric)
+    b = texels.middle + wp.cw_div(mean + axis * (high - centre), texels.metric)
     for _round in range(_REFINED):
         a, b = _regressed(texels, mask, a, b, steps)
     ends[2 * line] = a
     ends[2 * line + 1] = b
     return ends
+
+
+@wp.func
+def _solved(products: wp.vec3, right: wp.vec2, before: wp.vec2) -> wp.vec2:
+    """Both ends of a channel by least squares, within the format's range; those of before where texels tell but one."""
+    aa, ab, bb = products[0], products[1], products[2]
+    determinant = aa * bb - ab * ab
+    if not (determinant > 1.0e-5 * aa * bb and determinant > 0.0):
+        return wp.vec2(wp.clamp(before[0], 0.0, _TOP), wp.clamp(before[1], 0.0, _TOP))
+    a = (right[0] * bb - right[1] * ab) / determinant
+    b = (right[1] * aa - right[0] * ab) / determinant
+    # Where one end is held at the range's, the other is the best beside it.
+    if a < 0.0 or a > _TOP:
+        a = wp.clamp(a, 0.0, _TOP)
+        b = (right[1] - ab * a) / wp.max(bb, 1.0e-30)
+    elif b < 0.0 or b > _TOP:
+        b = wp.clamp(b, 0.0, _TOP)
+        a = (right[0] - ab * b) / wp.max(aa, 1.0e-30)
+    return wp.vec2(wp.clamp(a, 0.0, _TOP), wp.clamp(b, 0.0, _TOP))
 
 
 @wp.func
@@ -204,13 +237,9 @@ def _regressed(texels: _Texels, mask: int, a: wp.vec3, b: wp.vec3, steps: int):
             ay += weighted * s
             by += weighted * t
     for c in range(3):
-        determinant = aa[c] * bb[c] - ab[c] * ab[c]
-        if determinant > 1.0e-5 * aa[c] * bb[c] and determinant > 0.0:
-            a[c] = wp.clamp((ay[c] * bb[c] - by[c] * ab[c]) / determinant, 0.0, _TOP)
-            b[c] = wp.clamp((by[c] * aa[c] - ay[c] * ab[c]) / determinant, 0.0, _TOP)
-        else:
-            a[c] = wp.clamp(a[c], 0.0, _TOP)
-            b[c] = wp.clamp(b[c], 0.0, _TOP)
+        pair = _solved(wp.vec3(aa[c], ab[c], bb[c]), wp.vec2(ay[c], by[c]), wp.vec2(a[c], b[c]))
+        a[c] = pair[0]
+        b[c] = pair[1]
     return a, b
 
 
@@ -349,11 +378,38 @@ def _refitted(texels: _Texels, block: _Block, mask: int, ends: _Ends, line: int,
             ay += weighted * s
             by += weighted * t
     for c in range(3):
-        determinant = aa[c] * bb[c] - ab[c] * ab[c]
-        if determinant > 1.0e-5 * aa[c] * bb[c] and determinant > 0.0:
-            ends[2 * line, c] = wp.clamp((ay[c] * bb[c] - by[c] * ab[c]) / determinant, 0.0, _TOP)
-            ends[2 * line + 1, c] = wp.clamp((by[c] * aa[c] - ay[c] * ab[c]) / determinant, 0.0, _TOP)
+        before = wp.vec2(ends[2 * line, c], ends[2 * line + 1, c])
+        pair = _solved(wp.vec3(aa[c], ab[c], bb[c]), wp.vec2(ay[c], by[c]), before)
+        ends[2 * line, c] = pair[0]
+        ends[2 * line + 1, c] = pair[1]
     return ends
+
+
+@wp.func
+def _gathered(light: wp.array2d[wp.vec3], weight: wp.array2d[float], number: int) -> _Texels:
+    """The texels of a block."""
+    texels = _Texels()
+    heaviest = float(0.0)
+    for i in range(_TEXELS):
+        heaviest = wp.max(heaviest, weight[number, i])
+    metric = wp.vec3(0.0)
+    for i in range(_TEXELS):
+        # A texel without weight counts for very little, and not for nothing: it is read next to others.
+        w = float(1.0)
+        if heaviest > 0.0:
+            w = wp.max(weight[number, i] / heaviest, _LEAST_WEIGHT)
+        texels.weight[i] = w
+        for c in range(3):
+            value = wp.clamp(light[number, i][c], 0.0, _LARGEST)
+            place = _place_of(value)
+            texels.light[i, c] = value
+            texels.place[i, c] = place[0]
+            texels.pull[i, c] = w * place[1] * place[1]
+        texels.middle += texels.place[i] / float(_TEXELS)
+        metric += texels.pull[i] / float(_TEXELS)
+    for c in range(3):
+        texels.metric[c] = wp.sqrt(wp.max(metric[c], 1.0e-6 * wp.max(metric)))
+    return texels
 
 
 @wp.kernel
@@ -368,63 +424,25 @@ def _encode(
 ):
     """One block per thread."""
     number = wp.tid()
-    texels = _Texels()
-    metric = wp.vec3(0.0)
-    heaviest = float(0.0)
-    for i in range(_TEXELS):
-        heaviest = wp.max(heaviest, weight[number, i])
-    for i in range(_TEXELS):
-        # A texel without weight counts for very little, and not for nothing: it is read next to others.
-        w = float(1.0)
-        if heaviest > 0.0:
-            w = wp.max(weight[number, i] / heaviest, 1.0e-4)
-        texels.weight[i] = w
-        for c in range(3):
-            value = wp.clamp(light[number, i][c], 0.0, _LARGEST)
-            texels.light[i, c] = value
-            place = _place_of(value)
-            texels.place[i, c] = place[0]
-            texels.pull[i, c] = w * place[1] * place[1]
-            metric[c] += texels.pull[i, c]
-    largest = wp.max(metric)
-    texels_in_all = float(_TEXELS)
-    for c in range(3):
-        metric[c] = wp.sqrt(wp.max(metric[c], 1.0e-6 * largest) / texels_in_all)
-        if metric[c] <= 0.0:
-            metric[c] = 1.0
-    # The scatter of all texels and, by partition, of those on either line.
-    whole = _Moments()
-    middle = wp.vec3(0.0)
-    for i in range(_TEXELS):
-        middle += texels.place[i] / texels_in_all
-    for i in range(_TEXELS):
-        point = wp.cw_mul(texels.place[i] - middle, metric)
-        pull = wp.dot(wp.cw_div(texels.pull[i], wp.cw_mul(metric, metric)), wp.vec3(1.0 / 3.0))
-        whole += _moments(point, pull)
-    axis = _axis_of(whole, _AXIS_ROUNDS)
-    ends = _fitted(texels, _ALL, _Ends(), 0, wp.vec3(axis[0], axis[1], axis[2]), metric, 15)
-    ends = _turned(texels, ends, 0, 0)
+    texels = _gathered(light, weight, number)
+    whole = _moments(texels, _ALL)
+    ends = _turned(texels, _fitted(texels, _ALL, _Ends(), 0, whole, 15), 0, 0)
     best = _encoded(texels, tables, ends, _finest(tables, ends, 10, 14, 2), 0)
-    again = _refitted(texels, best, _ALL, ends, 0, 15)
-    again = _turned(texels, again, 0, 0)
-    other = _encoded(texels, tables, again, _finest(tables, again, 10, 14, 2), 0)
-    if other.error < best.error:
-        best = other
-    one = _spread(whole) - axis[3]
+    for _round in range(_REFITTED):
+        ends = _turned(texels, _refitted(texels, best, _ALL, ends, 0, 15), 0, 0)
+        other = _encoded(texels, tables, ends, _finest(tables, ends, 10, 14, 2), 0)
+        if other.error < best.error:
+            best = other
+    # Of a line's scatter, an index of four bits leaves 1/225 and one of three 1/49.
+    spread = _axis_of(whole, _AXIS_ROUNDS)[3]
+    alone = _spread(whole) - spread * (224.0 / 225.0)
     tried = int(0)  # a bit a partition
     for _attempt in range(_TRIED):
-        # A line's share of the scatter that three bits of index leave is 1/49.
         least = float(_HUGE)
-        partition = int(-1)
+        partition = int(0)
         for p in range(32):
             if ((tried >> p) & 1) == 0:
-                mask = tables.masks[p]
-                second = _Moments()
-                for i in range(_TEXELS):
-                    if _in(mask, i):
-                        point = wp.cw_mul(texels.place[i] - middle, metric)
-                        pull = wp.dot(wp.cw_div(texels.pull[i], wp.cw_mul(metric, metric)), wp.vec3(1.0 / 3.0))
-                        second += _moments(point, pull)
+                second = _moments(texels, tables.masks[p])
                 first = whole - second
                 along = _axis_of(first, _POWER_ROUNDS)[3] + _axis_of(second, _POWER_ROUNDS)[3]
                 left = _spread(first) + _spread(second) - along * (48.0 / 49.0)
@@ -432,30 +450,22 @@ def _encode(
                     least = left
                     partition = p
         tried = tried | (1 << partition)
-        if least < one + axis[3] / 225.0:
-            mask = tables.masks[partition]
-            second = _Moments()
-            for i in range(_TEXELS):
-                if _in(mask, i):
-                    point = wp.cw_mul(texels.place[i] - middle, metric)
-                    pull = wp.dot(wp.cw_div(texels.pull[i], wp.cw_mul(metric, metric)), wp.vec3(1.0 / 3.0))
-                    second += _moments(point, pull)
-            near = _axis_of(whole - second, _AXIS_ROUNDS)
-            far = _axis_of(second, _AXIS_ROUNDS)
-            ends = _fitted(texels, _ALL ^ mask, _Ends(), 0, wp.vec3(near[0], near[1], near[2]), metric, 7)
-            ends = _fitted(texels, mask, ends, 1, wp.vec3(far[0], far[1], far[2]), metric, 7)
-            ends = _turned(texels, ends, 0, 0)
-            ends = _turned(texels, ends, 1, tables.anchors[partition])
+        if least < alone:
+            mask, anchor = tables.masks[partition], tables.anchors[partition]
+            second = _moments(texels, mask)
+            ends = _fitted(texels, _ALL ^ mask, _Ends(), 0, whole - second, 7)
+            ends = _fitted(texels, mask, ends, 1, second, 7)
+            ends = _turned(texels, _turned(texels, ends, 0, 0), 1, anchor)
             other = _encoded(texels, tables, ends, _finest(tables, ends, 0, 10, 4), partition)
             if other.error < best.error:
                 best = other
-            ends = _refitted(texels, other, _ALL ^ mask, ends, 0, 7)
-            ends = _refitted(texels, other, mask, ends, 1, 7)
-            ends = _turned(texels, ends, 0, 0)
-            ends = _turned(texels, ends, 1, tables.anchors[partition])
-            other = _encoded(texels, tables, ends, _finest(tables, ends, 0, 10, 4), partition)
-            if other.error < best.error:
-                best = other
+            for _round in range(_REFITTED):
+                ends = _refitted(texels, other, _ALL ^ mask, ends, 0, 7)
+                ends = _refitted(texels, other, mask, ends, 1, 7)
+                ends = _turned(texels, _turned(texels, ends, 0, 0), 1, anchor)
+                other = _encoded(texels, tables, ends, _finest(tables, ends, 0, 10, 4), partition)
+                if other.error < best.error:
+                    best = other
     for i in range(_TEXELS):
         decoded[number, i] = best.light[i]
     _write(number, best, tables, blocks)

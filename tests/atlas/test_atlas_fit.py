@@ -44,13 +44,16 @@ def downsampled(mesh, share: float) -> float:
 def checked(model, mesh) -> np.ndarray:
     """Checks invariants of any model; returns the lightmap that it decodes to."""
     rows, columns = model.texels.shape[:2]
-    bits = rows * columns * 48 if model.colour == "half" else -(-rows // 4) * -(-columns // 4) * 128
+    texel_bits = {"half": 64, "rgb9e5": 32, "mixed": 32}
+    bits = rows * columns * texel_bits.get(model.colour, 0) or -(-rows // 4) * -(-columns // 4) * 128
+    bits += len(model.blocks) * 128 * (model.colour == "mixed")
     share = (bits + model.lut.size * 16) / (mesh.mask.size * 48)
     assert share == pytest.approx(1.0 - model.compression_ratio) and share <= model.profile.budget
     assert model.texels.dtype == np.float16 and np.isfinite(model.texels).all() and (model.texels >= 0).all()
     if model.method == "tiles":
-        first, size = unpack_entries(model.lut)
-        assert (first + size <= model.texels.shape[1::-1]).all()
+        first, size, blocks = unpack_entries(model.lut, model.colour)
+        last = np.where(blocks, model.block_texels.shape[1::-1], model.texels.shape[1::-1])
+        assert (first + size <= last).all()
         assert model.lut.shape[:2] == tile_counts(*mesh.mask.shape, model.profile.tile)
     else:
         assert not model.lut.size and not model.uv.size
@@ -297,7 +300,7 @@ def test_tiles_of_blocks(name: str):
     decoded = colour.decode(model.blocks, *model.texels.shape[:2], name)
     np.testing.assert_array_equal(model.texels, decoded.astype(np.float16))
     assert psnr(model, mesh) > 30.0
-    first, size = unpack_entries(model.lut)
+    first, size, _ = unpack_entries(model.lut, model.colour)
     assert not (first % 4).any() and not (size % 4).any()
     rows, columns = -(-model.texels.shape[0] // 4), -(-model.texels.shape[1] // 4)
     assert model.blocks.shape == (rows * columns, 16)
