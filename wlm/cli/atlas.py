@@ -95,7 +95,7 @@ def compress(
         rows.add_row(escape(path.name), f"{path.stat().st_size:,}")
     rows.add_section()
     rows.add_row("method", model.method)
-    rows.add_row("CR of both textures", f"{model.compression_ratio:.2%}")
+    rows.add_row("CR of the textures", f"{model.compression_ratio:.2%}")
     rows.add_row(f"CR of {MODEL_FILE}", f"{disk_ratio((output / MODEL_FILE).stat().st_size, mesh.mask.shape):.2%}")
     rows.add_row("seconds", f"{sum(model.report['seconds'].values()):.1f}")
     show(rows)
@@ -159,6 +159,8 @@ _ROWS = (
     ("1 - SSIM", "one_minus_ssim", ".5f"),
     ("error at seams / elsewhere", "seam_ratio", ".2f"),
     ("PSNR dB of texels", "texel_psnr", ".2f"),
+    ("PSNR dB, tone mapped", "tone_psnr", ".2f"),
+    ("FLIP", "flip", ".4f"),
 )
 
 
@@ -239,11 +241,12 @@ def info(
     rows.add_row("name", escape(facts["name"]))
     rows.add_row("method", facts["method"])
     rows.add_row("bytes", f"{facts['bytes']:,}")
-    for label, key in (("lightmap", "size"), ("colour texture", "colour_size"), ("table", "lut_size")):
+    sizes = {"lightmap": "size", "colour texture": "colour_size", "its blocks": "block_size", "table": "lut_size"}
+    for label, key in sizes.items():
         rows.add_row(label, "x".join(map(str, facts[key])) if facts[key][0] else "none")
     rows.add_row("colour stored as", facts["colour"])
     rows.add_row("UVs", f"new, of {facts['new_uvs']:,} triangles" if facts["new_uvs"] else "the mesh's own")
-    rows.add_row("CR of both textures", f"{facts['cr']:.2%}")
+    rows.add_row("CR of the textures", f"{facts['cr']:.2%}")
     rows.add_row("CR on disk", f"{facts['cr_disk']:.2%}")
     rows.add_row("source", escape(facts["source"]))
     rows.add_row("profile", escape(facts["profile"]["name"]))
