@@ -182,7 +182,7 @@ def run_rows(
         bench = _AtlasBench(lightmap, device, progress, points, repeats)
         entries = bench.ours(profiles, whole)
         named = {profile.name for profile in profiles} | {_smaller_name(profiles[0], cr) for cr in _SMALLER}
-        shares = {entry.row.option: _share(entry.row) for entry in entries if entry.row.option in named}
+        shares = {entry.row.option: _share(entry.row) for entry in entries if entry.model and entry.row.option in named}
         if lightmap is lightmaps[0]:
             entries += bench.tuned(entries)
         entries.append(bench.original(entries[0].model))
@@ -236,14 +236,15 @@ class _AtlasBench(Bench):
     def ours(self, profiles: Sequence[Profile], whole: bool) -> list[_Entry]:
         """Our profiles, the first of them smaller, and at the bits of the first cascade."""
         entries = [self.entry(profile, profile.name) for profile in profiles]
-        for cr in _SMALLER if whole and profiles[0].method == "tiles" else ():
-            smaller = profiles[0].model_copy(update={"budget": 1.0 - cr})
-            entries.append(self.entry(smaller, _smaller_name(profiles[0], cr)))
+        if not whole or profiles[0].method != "tiles":
+            return entries
+        budgets = {_smaller_name(profiles[0], cr): 1.0 - cr for cr in _SMALLER}
         cascade = next((entry for entry in entries if entry.model.profile.method == "cascade"), None)
-        if whole and cascade is not None and profiles[0].method == "tiles":
-            option = f"{profiles[0].name}, bits of {cascade.row.option}"
+        if cascade is not None:
+            budgets[f"{profiles[0].name}, bits of {cascade.row.option}"] = _share(cascade.row)
+        for option, budget in budgets.items():
             try:
-                entries.append(self.entry(profiles[0].model_copy(update={"budget": _share(cascade.row)}), option))
+                entries.append(self.entry(profiles[0].model_copy(update={"budget": budget}), option))
             except WlmError as error:  # no room for a table
                 entries.append(_Entry(self.missing_row("ours", option, error)))
         return entries
