@@ -10,6 +10,8 @@ The tables are those of `wlm.formats.bc6h`, whose decoder is the reference.
 
 import warp as wp
 
+from wlm_kernels.bc6h_block import Block, Colours, Tables, write_block
+
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 
 _TEXELS = wp.constant(16)
@@ -26,51 +28,9 @@ _TRIED = wp.constant(2)  # partitions
 _LEAST_WEIGHT = wp.constant(1.0e-4)  # of the heaviest texel's
 _HUGE = wp.constant(3.4e38)
 
-_Colours = wp.types.matrix(shape=(16, 3), dtype=float)
 _Numbers = wp.types.vector(length=16, dtype=float)
-_Indices = wp.types.vector(length=16, dtype=int)
 _Ends = wp.types.matrix(shape=(4, 3), dtype=float)
-_Codes = wp.types.matrix(shape=(4, 3), dtype=int)
 _Moments = wp.types.vector(length=10, dtype=float)
-
-
-@wp.struct
-class Tables:
-    """The format, from `wlm.formats.bc6h`.
-
-    Attributes:
-        modes: int [14, 7], `MODES`.
-        layout: int [14, 82], `LAYOUT`.
-        masks: int [32], `MASKS`.
-        anchors: int [32], `SECOND_ANCHORS`.
-        halves: float [31,744], the half float of each number of bits.
-    """
-
-    modes: wp.array2d[int]
-    layout: wp.array2d[int]
-    masks: wp.array1d[int]
-    anchors: wp.array1d[int]
-    halves: wp.array1d[float]
-
-
-@wp.struct
-class _Block:
-    """A block in one mode.
-
-    Attributes:
-        error: Of its texels, weighted.
-        mode, partition: Their rows.
-        code: The endpoints w, x, y and z as the mode stores them, without differences.
-        index: Of each texel.
-        light: What it decodes to.
-    """
-
-    error: float
-    mode: int
-    partition: int
-    code: _Codes
-    index: _Indices
-    light: _Colours
 
 
 @wp.struct
@@ -86,10 +46,10 @@ class _Texels:
         metric: What a channel's distance from it is scaled by: the root of the mean pull.
     """
 
-    light: _Colours
+    light: Colours
     weight: _Numbers
-    place: _Colours
-    pull: _Colours
+    place: Colours
+    pull: Colours
     middle: wp.vec3
     metric: wp.vec3
 
@@ -297,9 +257,9 @@ def _finest(tables: Tables, ends: _Ends, first: int, last: int, count: int) -> i
 
 
 @wp.func
-def _encoded(texels: _Texels, tables: Tables, ends: _Ends, mode: int, partition: int) -> _Block:
+def _encoded(texels: _Texels, tables: Tables, ends: _Ends, mode: int, partition: int) -> Block:
     """A block in a mode: rounded ends, and the best index of each texel."""
-    block = _Block()
+    block = Block()
     block.mode = mode
     block.partition = partition
     bits = tables.modes[mode, 3]
@@ -312,7 +272,7 @@ def _encoded(texels: _Texels, tables: Tables, ends: _Ends, mode: int, partition:
         mask = tables.masks[partition]
         anchor = tables.anchors[partition]
         steps = 7
-    palette = _Colours()
+    palette = Colours()
     for line in range(lines):
         for c in range(3):
             block.code[2 * line, c] = _coded(ends[2 * line][c], bits)
@@ -359,7 +319,7 @@ def _turned(texels: _Texels, ends: _Ends, line: int, anchor: int) -> _Ends:
 
 
 @wp.func
-def _refitted(texels: _Texels, block: _Block, mask: int, ends: _Ends, line: int, steps: int) -> _Ends:
+def _refitted(texels: _Texels, block: Block, mask: int, ends: _Ends, line: int, steps: int) -> _Ends:
     """Ends by least squares of the levels that the texels of a line took."""
     aa = wp.vec3(0.0)
     ab = wp.vec3(0.0)
@@ -468,46 +428,7 @@ def _encode(
                     best = other
     for i in range(_TEXELS):
         decoded[number, i] = best.light[i]
-    _write(number, best, tables, blocks)
-
-
-@wp.func
-def _write(number: int, block: _Block, tables: Tables, blocks: wp.array2d[wp.uint32]):
-    """Packs a block."""
-    mode = block.mode
-    word = wp.vec4ui()
-    word[0] = wp.uint32(tables.modes[mode, 0])
-    begin = tables.modes[mode, 1]
-    for place in range(begin, 82):
-        code = tables.layout[mode, place]
-        if code >= 0:
-            field = code >> 4
-            value = block.partition
-            if field < 12:
-                channel, end = field >> 2, field & 3
-                value = block.code[end, channel]
-                if end > 0 and tables.modes[mode, 2] == 1:
-                    value = value - block.code[0, channel]
-            bit = wp.uint32((value >> (code & 15)) & 1)
-            word[place >> 5] = word[place >> 5] | (bit << wp.uint32(place & 31))
-    anchor = int(0)
-    width = int(4)
-    if mode < 10:
-        anchor = tables.anchors[block.partition]
-        width = 3
-    place = int(65)
-    if mode < 10:
-        place = 82
-    for i in range(_TEXELS):
-        own = width
-        if i == 0 or i == anchor:
-            own = width - 1
-        for b in range(own):
-            bit = wp.uint32((block.index[i] >> b) & 1)
-            word[place >> 5] = word[place >> 5] | (bit << wp.uint32(place & 31))
-            place += 1
-    for k in range(4):
-        blocks[number, k] = word[k]
+    write_block(number, best, tables, blocks)
 
 
 def encode(light, weight, tables: Tables, blocks, decoded) -> None:
