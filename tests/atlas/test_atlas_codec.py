@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 from builders.atlas_meshes import charts, sheet, triangle
-from builders.atlas_models import KINDS, random_model
+from builders.atlas_models import KINDS, MIXED, random_model
 from builders.checks import assert_same
 from builders.resigned import GONE, put, rewrite
 
@@ -14,9 +14,10 @@ from wlm.atlas import codec, colour
 from wlm.atlas.model import MOST_SIZE, pack_entries
 from wlm.errors import WlmError
 
+STORED = [(kind, stored) for kind in KINDS for stored in ("half", "rgb9e5", "bc6h", "astc")] + [(MIXED, "mixed")]
 
-@pytest.mark.parametrize("stored", ["half", "bc6h", "astc"])
-@pytest.mark.parametrize("kind", KINDS)
+
+@pytest.mark.parametrize(("kind", "stored"), STORED)
 def test_a_model_comes_back(kind, stored, tmp_path, monkeypatch):
     """So do the facts of `describe`, which decodes nothing; and the size is the bits of the textures and a header."""
     mesh, path = sheet(), tmp_path / "a.wlm"
@@ -37,12 +38,15 @@ def test_a_model_comes_back(kind, stored, tmp_path, monkeypatch):
     assert (facts["size"], facts["colour_size"], facts["lut_size"]) == ([48, 40], [23, 18], [*model.lut.shape[1::-1]])
     assert facts["new_uvs"] == len(model.uv) and facts["bytes"] == size == sum(facts["parts"].values())
 
-    colour_bytes = 18 * 23 * 6 if stored == "half" else 5 * 6 * 16
-    expected = {"colour": colour_bytes, "lut": model.lut.size * 2, "uv": len(model.uv) * 24}
+    texel_bytes = {"half": 6, "rgb9e5": 4, "mixed": 4}
+    colour_bytes = 18 * 23 * texel_bytes[stored] if stored in texel_bytes else 5 * 6 * 16
+    block_bytes = 16 * 20 if stored == "mixed" else 0
+    expected = {"colour": colour_bytes, "blocks": block_bytes, "lut": model.lut.size * 2, "uv": len(model.uv) * 24}
     header = facts["parts"].pop("header")
     assert facts["parts"] == {name: count for name, count in expected.items() if count} and header < 700
-    # Eq. 9 counts both textures, whole blocks of them, and no UVs.
-    bits = 8 * colour_bytes + model.lut.shape[0] * model.lut.shape[1] * 32
+    # Eq. 9 counts the textures, whole blocks of them, and no UVs; half floats as a GPU holds them, of four channels.
+    padding = 18 * 23 * 16 if stored == "half" else 0
+    bits = 8 * (colour_bytes + block_bytes) + padding + model.lut.shape[0] * model.lut.shape[1] * 32
     assert model.compression_ratio == pytest.approx(1.0 - bits / (mesh.mask.size * 48), abs=1e-12)
 
 
@@ -125,6 +129,10 @@ def test_settings_that_do_not_fit_are_refused(change, words, tmp_path):
 
 
 def test_blocks_that_are_none_of_the_format(tmp_path):
+    both = {"lut": put((0, 0), np.array([15, 3]))}
+    _refused(tmp_path, MIXED, "lut: a tile is of both textures", tensors=both)
+    beyond = {"lut": put((0, 0), pack_entries(np.array([16, 4]), np.array([8, 4]), True))}
+    _refused(tmp_path, MIXED, "beyond the colour texture", tensors=beyond)
     blocks = {"colour": lambda v: np.zeros((29, 16), np.uint8)}
     _refused(tmp_path, "plain", "colour is uint8 .29, 16., expected uint8 .30, 16.", tensors=blocks, stored="astc")
     model = random_model(sheet(), "plain", "astc")

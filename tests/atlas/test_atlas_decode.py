@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from builders.atlas_meshes import charts, sheet, write_files
-from builders.atlas_models import KINDS
+from builders.atlas_models import KINDS, MIXED
 
 from wlm.atlas.decode import Decoder
 from wlm.atlas.exact import decode64
@@ -32,7 +32,8 @@ def models(make_mesh) -> dict[str, AtlasModel]:
     uv = (1.0 - mesh.uv[mesh.triangle])[..., ::-1].astype(np.float32)
     lut = random.integers(0, 65536, (9, 13, 2)).astype(np.uint16)
     return {
-        "tiles": compress(mesh, "standard", **FEW),
+        "tiles": compress(mesh, "half", **FEW),
+        MIXED: compress(mesh, "standard", **FEW),
         "cascade": model_of(mesh, "cascade", texels, lut=lut, uv=uv),
         "plain": model_of(mesh, "plain", texels),
         "plain with uv": model_of(mesh, "plain", mesh.lightmap[::-1, ::-1].transpose(1, 0, 2), uv=uv),
@@ -49,12 +50,12 @@ def points(mesh, count: int = 500) -> tuple[torch.Tensor, torch.Tensor, torch.Te
                  ((uv, torch.float32), (triangle, torch.int32), (weight, torch.float32)))  # fmt: skip
 
 
-@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize("name", [*KINDS, MIXED])
 def test_against_float64(device: str, name: str):
     mesh, model = sheet(), models(sheet)[name]
     random = np.random.default_rng(2)
     uv = random.uniform(-0.1, 1.1, (2000, 2)).astype(np.float32)
-    if name == "tiles":
+    if model.method == "tiles":
         # A point on a border of tiles may be read from either.
         place = (uv * [mesh.mask.shape[1], mesh.mask.shape[0]] - 0.5) / model.profile.tile
         uv = uv[np.abs(place - np.rint(place)).min(1) > 1e-4]

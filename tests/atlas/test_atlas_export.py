@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from builders.atlas_meshes import charts, sheet
-from builders.atlas_models import KINDS, random_model
+from builders.atlas_models import KINDS, MIXED, random_model
 from builders.textures import open_dds, open_ktx2
 
 import wlm
@@ -22,6 +22,8 @@ from wlm.atlas.shader import atlas_glsl
 from wlm.errors import WlmError
 from wlm.formats.exr import read_exr
 from wlm.formats.gltf import read_gltf
+from wlm.formats.light import read_light
+from wlm.formats.shared_exponent import unpack_rgb9e5
 
 ALWAYS = {"atlas.wlm", "mesh.glb", "colour.exr", "colour.ktx2", "atlas.glsl", "report.json"}
 LUT = {"lut.exr", "lut.ktx2", "lut.dds"}
@@ -33,11 +35,14 @@ def written(folder, kind, stored="half", mesh=None, **facts):
     return model, mesh, exporter.export(model, folder, mesh, facts)
 
 
-@pytest.mark.parametrize("stored", ["half", "bc6h", "astc"])
-@pytest.mark.parametrize("kind", KINDS)
+STORED = [(kind, stored) for kind in KINDS for stored in ("half", "rgb9e5", "bc6h", "astc")] + [(MIXED, "mixed")]
+
+
+@pytest.mark.parametrize(("kind", "stored"), STORED)
 def test_what_is_written(kind, stored, tmp_path):
     model, mesh, paths = written(tmp_path / "out", kind, stored, seed=3)
     expected = ALWAYS | (set() if model.method == "plain" else LUT) | (set() if stored == "astc" else {"colour.dds"})
+    expected |= {"blocks.exr", "blocks.ktx2", "blocks.dds"} if stored == "mixed" else set()
     assert {path.name for path in paths} == expected == set(os.listdir(tmp_path / "out"))
     assert paths[-1].name == "report.json" and os.listdir(tmp_path) == ["out"]
     report = json.loads(paths[-1].read_text())
@@ -64,7 +69,16 @@ def test_the_table_is_exact_in_every_format(kind, tmp_path):
     assert not exr[..., 2].any()
 
 
-@pytest.mark.parametrize("stored", ["half", "bc6h", "astc"])
+def test_both_textures_are_exact_in_every_format(tmp_path):
+    model, _, _ = written(tmp_path, MIXED)
+    for name, texels in (("colour", model.texels), ("blocks", model.block_texels)):
+        assert texels.any()
+        for suffix in ("exr", "ktx2", "dds"):
+            light, _ = read_light(tmp_path / f"{name}.{suffix}")
+            np.testing.assert_array_equal(light[..., :3], texels.astype(np.float32))
+
+
+@pytest.mark.parametrize("stored", ["half", "rgb9e5", "bc6h", "astc"])
 def test_the_colours_are_exact_in_every_format(stored, tmp_path):
     model, _, _ = written(tmp_path, "plain", stored)
     np.testing.assert_array_equal(read_exr(tmp_path / "colour.exr")[0], model.texels.astype(np.float32))
@@ -77,6 +91,11 @@ def test_the_colours_are_exact_in_every_format(stored, tmp_path):
         whole = np.frombuffer(dds.data, "<f2").reshape(18, 23, 4)
         np.testing.assert_array_equal(whole[..., :3], model.texels)
         assert (whole[..., 3] == 1).all()
+        return
+    if stored == "rgb9e5":
+        assert (ktx2.fmt, dds.fmt) == ("E5B9G9R9_UFLOAT_PACK32", "R9G9B9E5_SHAREDEXP") and ktx2.data == dds.data
+        words = np.frombuffer(ktx2.data, "<u4").reshape(18, 23)
+        np.testing.assert_array_equal(unpack_rgb9e5(words), model.texels.astype(np.float32))
         return
     assert ktx2.fmt == {"bc6h": "BC6H_UFLOAT_BLOCK", "astc": "ASTC_4x4_SFLOAT_BLOCK"}[stored]
     blocks = np.frombuffer(ktx2.data, np.uint8).reshape(-1, 16)
@@ -226,6 +245,10 @@ ivec2 operator+(ivec2 a, ivec2 b) { return ivec2(a.x + b.x, a.y + b.y); }
 ivec2 operator-(ivec2 a, ivec2 b) { return ivec2(a.x - b.x, a.y - b.y); }
 ivec2 min(ivec2 a, ivec2 b) { return ivec2(std::min(a.x, b.x), std::min(a.y, b.y)); }
 uvec2 operator>>(uvec2 a, uint b) { return uvec2(a.x >> b, a.y >> b); }
+uvec2 operator-(uvec2 a, uvec2 b) { return uvec2(a.x - b.x, a.y - b.y); }
+uvec2 operator+(uvec2 a, uvec2 b) { return uvec2(a.x + b.x, a.y + b.y); }
+uvec2 operator*(uvec2 a, uint b) { return uvec2(a.x * b, a.y * b); }
+uvec2& operator*=(uvec2& a, uint b) { return a = a * b; }
 uvec2 operator&(uvec2 a, uvec2 b) { return uvec2(a.x & b.x, a.y & b.y); }
 vec2 operator+(vec2 a, vec2 b) { return vec2(a.x + b.x, a.y + b.y); }
 vec2 operator-(vec2 a, vec2 b) { return vec2(a.x - b.x, a.y - b.y); }
@@ -250,13 +273,14 @@ vec4 textureLod(const sampler2D& s, vec2 at, float)
     vec4 top = mix(texelFetch(s, ivec2(i, j), 0), texelFetch(s, ivec2(k, j), 0), x - i);
     return mix(top, mix(texelFetch(s, ivec2(i, l), 0), texelFetch(s, ivec2(k, l), 0), x - i), y - j);
 }
-sampler2D colour;
+sampler2D colour, blocks;
 #ifdef TILES
 usampler2D lut;
 #else
 sampler2D lut;
 #endif
 #define WLM_ATLAS_COLOUR colour
+#define WLM_ATLAS_BLOCKS blocks
 #define WLM_ATLAS_LUT lut
 #include "shader.h"
 template <class S> void read(S& s, const char* path)
@@ -269,7 +293,7 @@ template <class S> void read(S& s, const char* path)
 }
 int main()
 {
-    read(colour, "colour.bin"), read(lut, "lut.bin");
+    read(colour, "colour.bin"), read(blocks, "blocks.bin"), read(lut, "lut.bin");
     float at[2];
     while (fread(at, 4, 2, stdin) == 2) {
         vec3 light = wlm_atlas(vec2(at[0], at[1]));
@@ -289,7 +313,7 @@ def _texture(path, values, kind):
 
 @pytest.mark.skipif(shutil.which("g++") is None, reason="no C++ compiler is installed")
 @pytest.mark.parametrize("exact", [True, False])
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", [*KINDS, MIXED])
 def test_the_shaders_arithmetic(kind, exact, tmp_path):
     model = random_model(charts(), kind)
     tiles = model.method == "tiles"
@@ -302,6 +326,8 @@ def test_the_shaders_arithmetic(kind, exact, tmp_path):
     done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     _texture(tmp_path / "colour.bin", model.texels.astype(np.float32), np.float32)
+    blocks = model.block_texels if model.block_texels.size else np.zeros((1, 1, 3))
+    _texture(tmp_path / "blocks.bin", blocks.astype(np.float32), np.float32)
     lut = model.lut if model.lut.size else np.zeros((1, 1, 2))
     _texture(tmp_path / "lut.bin", lut if tiles else lut / 65535, np.uint32 if tiles else np.float32)
     uv = np.random.default_rng(0).uniform(-0.1, 1.1, (4000, 2)).astype(np.float32)

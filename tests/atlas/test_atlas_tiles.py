@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 import torch
 
+from wlm.atlas import layout as allocation
 from wlm.atlas import tiles as grid
+from wlm.atlas.colour import quantise, stored
 from wlm.atlas.decode import Decoder
+from wlm.atlas.layout import Size
 from wlm.atlas.model import AtlasModel, Profile, pack_entries, tile_counts, unpack_entries
 
 RANDOM = np.random.default_rng(11)
@@ -218,20 +221,40 @@ def test_curves_and_solved():
     """A curve is the error at each size; each tile is solved at its own; no sample is negative."""
     tiles = _tiles(9, 5)
     tiles.light[:2] = (tiles.light[:2] - 2.0).clamp(min=0.0)  # a black tile with some light in it
-    sizes = [(1, 1), (3, 2), (6, 6)]
+    sizes = [Size(*sides, "half") for sides in ((1, 1), (3, 2), (6, 6))]
     error = grid.curves(tiles, sizes)
     assert error.shape == (3, 9) and error.dtype == np.float64
-    chosen = np.array([sizes[i % 3] for i in range(9)])
-    samples = grid.solved(tiles, chosen)
-    for i, values in enumerate(samples):
-        assert values.shape == (chosen[i, 1], chosen[i, 0], 3) and (values >= 0).all()
+    chosen = np.arange(9) % 3
+    samples = grid.solved(tiles, sizes, chosen)
+    for i, (values, weight) in enumerate(samples):
+        size = sizes[chosen[i]]
+        assert values.shape == (size.ny, size.nx, 3) and (values >= 0).all()
+        interpolation = _kron(size.nx, size.ny, 2 * tiles.size)
+        np.testing.assert_allclose(weight.ravel(), tiles.weight[i].numpy() @ interpolation**2, rtol=1e-4)
         tile = grid.Tiles(*(part[i : i + 1] for part in (tiles.index, tiles.light, tiles.weight)), tiles.size)
         # A curve takes fewer rounds.
         exact = float(grid.errors(tile, torch.from_numpy(values)[None])[0])
         assert exact <= error[i % 3, i] * 1.01 + 1e-12 and exact >= error[i % 3, i] * 0.9 - 1e-9
-    dark = grid.curves(tiles, sizes, torch.zeros_like)  # the file holds nothing
-    expected = (tiles.light.double() ** 2).mean(1) * tiles.weight
-    np.testing.assert_allclose(dark, np.broadcast_to(expected.sum(1).numpy(), (3, 9)), rtol=1e-5)
+    # A curve is of what the file holds.
+    coarse = grid.curves(tiles, [Size(4, 4, "bc6h"), Size(4, 4, "rgb9e5"), Size(4, 4, "half")])
+    samples = grid.solve(tiles, 4, 4, grid._MEDIUM).clamp(min=0.0)
+    weight = torch.from_numpy(np.stack([grid._Grid(tiles, 4, 4).weights(tiles.weight).numpy()])[0])
+    of_blocks = grid.errors(tiles, stored(samples, weight, "bc6h")).numpy()
+    np.testing.assert_allclose(coarse[0], of_blocks, rtol=1e-6)
+    lit = coarse[2] > 0
+    assert lit.sum() >= 7 and (coarse[0, lit] > coarse[1, lit]).all() and (coarse[1, lit] > 0.99 * coarse[2, lit]).all()
+
+
+def test_what_is_stored_is_what_the_texture_holds():
+    """Tile by tile on the device, as in the file."""
+    random = np.random.default_rng(3)
+    samples = random.random((5, 8, 4, 3)).astype(np.float32) * 10.0 ** random.uniform(-8, 5, (5, 1, 1, 1))
+    samples = samples.astype(np.float32)
+    weight = random.random((5, 8, 4)).astype(np.float32)
+    for colour in ("rgb9e5", "bc6h"):
+        decoded = stored(torch.from_numpy(samples), torch.from_numpy(weight), colour).numpy()
+        texture = quantise(samples.reshape(40, 4, 3), colour, weight.reshape(40, 4))["texels"]
+        np.testing.assert_array_equal(decoded.reshape(40, 4, 3), texture.astype(np.float32))
 
 
 def _brute(error: np.ndarray, cost: np.ndarray, budget: float) -> float:
@@ -249,7 +272,7 @@ def test_allocate_is_optimal_for_what_it_spends(seed: int):
     error = np.sort(random.random((5, 6)), 0)[::-1] * random.random(6) ** 3
     spent = []
     for budget in (6.0, 9.0, 14.0, 25.0, 40.0, 54.0):
-        chosen = grid.allocate(error, cost, budget, 0.0)
+        chosen = allocation.allocate(error, cost, budget, 0.0)
         spent.append(cost[chosen].sum())
         assert spent[-1] <= budget
         assert error[chosen, np.arange(6)].sum() == pytest.approx(_brute(error, cost, spent[-1]), rel=1e-12)
@@ -261,17 +284,17 @@ def test_allocate_is_optimal_for_what_it_spends(seed: int):
 def test_allocate_buys_no_sample_below_the_least_gain():
     cost = np.array([1.0, 2.0, 3.0])
     error = np.array([[10.0, 10.0, 0.0], [9.0, 5.0, 0.0], [8.5, 4.9, 0.0]])
-    assert grid.allocate(error, cost, 100.0, 0.0).tolist() == [2, 2, 0]
-    assert grid.allocate(error, cost, 100.0, 0.6).tolist() == [1, 1, 0]
-    assert grid.allocate(error, cost, 100.0, 2.0).tolist() == [0, 1, 0]
-    assert grid.allocate(error, cost, 4.0, 0.0).tolist() == [0, 1, 0]
+    assert allocation.allocate(error, cost, 100.0, 0.0).tolist() == [2, 2, 0]
+    assert allocation.allocate(error, cost, 100.0, 0.6).tolist() == [1, 1, 0]
+    assert allocation.allocate(error, cost, 100.0, 2.0).tolist() == [0, 1, 0]
+    assert allocation.allocate(error, cost, 4.0, 0.0).tolist() == [0, 1, 0]
 
 
 def test_allocate_gives_the_cheapest_where_nothing_fits():
     error = np.array([[3.0, 2.0], [1.0, 1.0]])
-    assert grid.allocate(error, np.array([1.0, 2.0]), 0.5, 0.0).tolist() == [0, 0]
+    assert allocation.allocate(error, np.array([1.0, 2.0]), 0.5, 0.0).tolist() == [0, 0]
     flat = np.zeros((2, 4))
-    assert grid.allocate(flat, np.array([1.0, 2.0]), 4.0, 0.0).tolist() == [0] * 4
+    assert allocation.allocate(flat, np.array([1.0, 2.0]), 4.0, 0.0).tolist() == [0] * 4
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -281,7 +304,7 @@ def test_place(seed: int):
     count = int(random.integers(1, 300))
     sizes = random.integers(1, 17, (count, 2))
     width = int(sizes[:, 0].max() + random.integers(0, 100))
-    first, height = grid.place(sizes, width)
+    first, height = allocation.place(sizes, width)
     used = np.zeros((height, width), int)
     for (x, y), (w, h) in zip(first, sizes, strict=True):
         assert x >= 0 and y >= 0 and x + w <= width and y + h <= height
@@ -296,7 +319,41 @@ def test_entries():
     first, size = np.array([[0, 4095], [17, 1]]), np.array([[1, 16], [16, 3]])
     entries = pack_entries(first, size)
     assert entries.dtype == np.uint16
-    np.testing.assert_array_equal(np.stack(unpack_entries(entries)), np.stack([first, size]))
+    np.testing.assert_array_equal(np.stack(unpack_entries(entries, "half")[:2]), np.stack([first, size]))
     for wrong in ((first - 1, size), (first + 1, size), (first, size - 1), (first, size + 1)):
         with pytest.raises(ValueError, match="an entry beyond a texture of 4096 texels or a tile of 16"):
             pack_entries(*wrong)
+
+
+def test_entries_of_two_textures():
+    """Of blocks places reach four times further; what isn't of whole blocks, or has a size of blocks, is refused."""
+    first, size = np.array([[0, 4095], [16380, 8], [17, 1]]), np.array([[1, 12], [16, 4], [12, 3]])
+    blocks = np.array([False, True, False])
+    entries = pack_entries(first, size, blocks)
+    for found, expected in zip(unpack_entries(entries, "mixed"), (first, size, blocks[:, None]), strict=True):
+        np.testing.assert_array_equal(found, np.broadcast_to(expected, (3, 2)))
+    for wrong in ((first + 1, size), (first, size + 1), (first, np.where(blocks[:, None], size, 13))):
+        with pytest.raises(ValueError, match="an entry"):
+            pack_entries(*wrong, blocks)
+
+
+def test_layout_of_two_textures():
+    """Rectangles lie apart in textures of their own, blocks on whole ones, and all bits are within the room."""
+    random = np.random.default_rng(1)
+    sizes = allocation.sizes_of(Profile(name="a", colour="mixed", tile=11))
+    bits = np.array([size.bits for size in sizes])
+    assert bits.min() == 32 and max(size.nx for size in sizes) == 12
+    error = random.random((len(sizes), 60)) ** 4 / bits[:, None]
+    room = 60 * 700.0
+    packed = allocation.layout(error, sizes, room, 0.0)
+    chosen = [sizes[number] for number in packed.chosen]
+    assert {size.second for size in chosen} == {False, True}
+    used = [np.zeros(shape, int) for shape in packed.shapes]
+    for size, (x, y) in zip(chosen, packed.first, strict=True):
+        assert not size.second or (x % 4 == 0 and y % 4 == 0)
+        used[size.second][y : y + size.ny, x : x + size.nx] += 1
+    assert [image.max() for image in used] == [1, 1] and [image.sum() for image in used] == [
+        sum(size.nx * size.ny for size in chosen if size.second == second) for second in (False, True)
+    ]
+    assert room * 0.85 < 32 * used[0].size + 8 * used[1].size <= room
+    assert allocation.layout(error, sizes, 60 * 31.0, 0.0) is None

@@ -90,8 +90,7 @@ def test_a_block_that_breaks_the_format():
     assert not decode(np.full((1, 16), 0b10011, np.uint8), 4, 4, "bc6h").any()
 
 
-@pytest.mark.parametrize(("codec", "package"), [("bc6h", "ispc_texcomp"), ("astc", "astc_encoder")])
-def test_a_missing_package_names_the_extra(codec, package, monkeypatch):
-    monkeypatch.setitem(sys.modules, package, None)  # makes the import fail
-    with pytest.raises(WlmError, match=rf"{package} is missing.*wlm\[atlas\]"):
-        encode(_smooth(8, 8), codec)
+def test_a_missing_package_names_the_extra(monkeypatch):
+    monkeypatch.setitem(sys.modules, "astc_encoder", None)  # makes the import fail
+    with pytest.raises(WlmError, match=r"astc_encoder is missing.*wlm\[atlas\]"):
+        encode(_smooth(8, 8), "astc")

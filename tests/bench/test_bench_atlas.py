@@ -22,7 +22,8 @@ PROFILES = [
     Profile(name="bc6h", colour="bc6h", budget=0.3, fallback=False, **FEW),
     Profile(name="paper", method="cascade", steps=6, resolution=32, fallback=False, colour_scale=0.6),
 ]
-RIVALS = ["downsampling", "downsampling bilinear", "BC6H", "ASTC", "single colour"]
+RIVALS = ["downsampling", "downsampling bilinear", "BC6H", "BC6H, our encoder", "ASTC", "single colour"]
+SMALLER = ["standard, CR 92.5%", "standard, CR 95%"]
 MEAN = "mean over 2 lightmaps"
 
 
@@ -37,7 +38,7 @@ def rows(lightmaps):
 
 
 def test_every_row_has_its_figures(rows):
-    ours = [("ours", name) for name in ("standard", "bc6h", "paper", "standard, bits of paper")]
+    ours = [("ours", name) for name in ("standard", "bc6h", "paper", *SMALLER, "standard, bits of paper")]
     tuned = [("fit", "paper, space views"), ("fit", "paper, space uv")]
     for scene, extra in (("sheet day", tuned), ("cube night", [])):
         measured = keys(row for row in rows if row.scene == scene)
@@ -45,10 +46,17 @@ def test_every_row_has_its_figures(rows):
         assert measured[: len(before)] == before
         rest = measured[len(before) :]
         for method in ("downsampling", "ASTC"):
-            assert [option for name, option in rest if name == method] == ["bits of bc6h", "bits of paper"]
+            options = [option for name, option in rest if name == method]
+            # One that has the whole lightmap in the bits of standard isn't measured in more.
+            assert options[-3:] == [f"bits of {option}" for option in ("paper", *SMALLER)]
+            assert options[:-3] in ([], ["bits of bc6h"])
         assert {name for name, _ in rest} == set(RIVALS)
     means = keys(row for row in rows if row.scene == MEAN)
-    assert means[:10] == [*ours, ("lightmap", "half floats"), *((name, "bits of standard") for name in RIVALS)]
+    assert means[: len(ours) + 1 + len(RIVALS)] == [
+        *ours,
+        ("lightmap", "half floats"),
+        *((name, "bits of standard") for name in RIVALS),
+    ]
     for row in rows:
         assert row.system == "atlas" and "not measured" not in row.notes
         assert (row.method == "lightmap") == (row.get("psnr") is None)
@@ -57,8 +65,8 @@ def test_every_row_has_its_figures(rows):
         if row.method != "lightmap":
             assert row["psnr"] > 8.0 and row["one_minus_ssim"] >= 0.0 and row["encode_seconds"] > 0.0
         if row.method == "ours":
-            # The file has a header besides.
-            assert row["bytes"] > row["bpp"] * 64 * 48 / 8
+            # The file has a header besides, and half floats of three channels where a GPU has four.
+            assert row["bytes"] > row["bpp"] * 64 * 48 / 8 * 0.75
 
 
 def test_rows_are_of_what_they_name(lightmaps, rows):
@@ -69,7 +77,7 @@ def test_rows_are_of_what_they_name(lightmaps, rows):
     assert row["bpp"] == pytest.approx(48 * (1 - model.compression_ratio))
     assert row["compression_ratio"] == model.compression_ratio
     report = compare(mesh, {"a": bench.Decoder(model)}, views=3, resolution=64)["a"]
-    for name in ("psnr", "psnr_worst", "texel_psnr", "one_minus_ssim"):
+    for name in ("psnr", "psnr_worst", "texel_psnr", "one_minus_ssim", "tone_psnr", "flip"):
         assert row[name] == pytest.approx(getattr(report, name)), name
     assert "seam_ratio" not in row.figures  # a sheet has no seam
 
@@ -77,7 +85,7 @@ def test_rows_are_of_what_they_name(lightmaps, rows):
 def test_rivals_keep_to_the_bits(rows):
     bpp = {(row.scene, f"bits of {row.option}"): row["bpp"] for row in rows if row.method == "ours"}
     rivals = [row for row in rows if row.method in RIVALS and row.scene != MEAN]
-    assert len(rivals) >= 2 * (5 + 2)
+    assert len(rivals) >= 2 * (len(RIVALS) + 2)
     for row in rivals:
         assert row["bpp"] <= bpp[row.scene, row.option] * (1 + 1e-9)
         assert row["bytes"] == pytest.approx(row["bpp"] / 8 * (64 * 64 if row.scene == "sheet day" else 48 * 64), abs=1)
@@ -88,7 +96,17 @@ def test_means(rows):
         if row.scene == MEAN:
             both = [r for r in rows if (r.method, r.option) == (row.method, row.option) and r is not row]
             assert len(both) == row["lightmaps"] == 2
-            for name in ("bpp", "psnr", "one_minus_ssim", "seam_ratio", "decode_ms", "encode_seconds"):
+            for name in (
+                "bpp",
+                "psnr",
+                "texel_psnr",
+                "tone_psnr",
+                "flip",
+                "one_minus_ssim",
+                "seam_ratio",
+                "decode_ms",
+                "encode_seconds",
+            ):
                 values = [r[name] for r in both if name in r.figures]
                 assert row.get(name) == (pytest.approx(np.mean(values)) if values else None), name
             if row.get("psnr"):
@@ -195,7 +213,7 @@ def test_the_rivals_alone(lightmaps, rows, tmp_path, monkeypatch):
     write_json(tmp_path / "rows.json", rows, {})
     alone = run_rivals(tmp_path / "rows.json", lightmaps[:1])
     beside = [row for row in rows if row.scene == "sheet day" and row.method in RIVALS]
-    beside = [row for row in beside if row.option == "bits of standard"]
+    beside = [row for row in beside if row.option in {f"bits of {option}" for option in ("standard", *SMALLER)}]
     assert keys(alone) == keys(beside)
     for name in ("bytes", "psnr"):
         assert [row[name] for row in alone] == [row[name] for row in beside]

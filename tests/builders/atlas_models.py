@@ -10,26 +10,38 @@ from wlm.atlas.data import LightmappedMesh
 from wlm.atlas.model import AtlasModel, Profile, pack_entries, tile_counts
 
 KINDS = ("tiles", "cascade", "plain", "plain with uv")
+MIXED = "tiles mixed"
+"""Tiles in two textures; it has no other colour."""
 
 
 def random_model(mesh: LightmappedMesh, kind: str, colour: str = "half", seed: int = 0, tile: int = 7) -> AtlasModel:
-    """Makes a model of one of `KINDS` for a mesh."""
+    """Makes a model of one of `KINDS`, or `MIXED`, for a mesh."""
     random = np.random.default_rng(seed)
     height, width = mesh.mask.shape
-    method = kind.split()[0]
+    method, colour = kind.split()[0], "mixed" if kind == MIXED else colour
     profile = Profile(name="random", method="tiles" if method == "tiles" else "cascade", tile=tile, colour=colour)
     texels, lut = random.random((18, 23, 3)) * 3.0, np.empty((0, 0, 2), np.uint16)
+    second = {}
     if method == "tiles":
         counts = tile_counts(height, width, tile)
         size = random.integers(1, tile + 2, (*counts, 2))
-        lut = pack_entries(random.integers(0, np.array([23, 18]) - size + 1), size)
+        first, blocks = random.integers(0, np.array([23, 18]) - size + 1), False
+        if colour == "mixed":
+            encoded = quantise(random.random((16, 20, 3)) * 3.0, "bc6h")
+            second = {"blocks": encoded["blocks"], "block_texels": encoded["texels"]}
+            blocks = random.random(counts) < 0.5
+            whole = random.integers(1, 4, (*counts, 2))
+            size = np.where(blocks[..., None], 4 * whole, size)
+            first = np.where(blocks[..., None], 4 * random.integers(0, np.array([5, 4]) - whole + 1), first)
+        lut = pack_entries(first, size, blocks)
     elif method == "cascade":
         lut = random.integers(0, 65536, (9, 13, 2)).astype(np.uint16)
     triangles = len(mesh.triangle) if method == "cascade" or kind.endswith("uv") else 0
     uv = random.random((triangles, 3, 2)).astype(np.float32)
     settings = (mesh.name, mesh.source, profile, method, colour, height, width)
     report = {"seconds": {"fit": 1.5}, "tiles": 4}
-    return AtlasModel(*settings, **quantise(texels, colour), lut=lut, uv=uv, report=report)
+    textures = quantise(texels, "rgb9e5" if colour == "mixed" else colour) | second
+    return AtlasModel(*settings, **textures, lut=lut, uv=uv, report=report)
 
 
 def grouped(representative: Sequence[int], order: Sequence[int] | None = None) -> Clusters:

@@ -17,6 +17,7 @@ TEXEL = {
     "R16G16_SFLOAT": 4,
     "R16G16B16_SFLOAT": 6,
     "R16G16B16A16_SFLOAT": 8,
+    "E5B9G9R9_UFLOAT_PACK32": 4,
 }
 ONE, MINUS_ONE = 0x3F800000, 0xBF800000
 
@@ -37,7 +38,7 @@ def test_the_header(tmp_path, fmt):
     data = path.read_bytes()
     assert data[:12] == bytes([0xAB, 0x4B, 0x54, 0x58, 0x20, 0x32, 0x30, 0xBB, 0x0D, 0x0A, 0x1A, 0x0A])
     found = [_word(data, at) for at in (FORMAT, TYPE_SIZE, WIDTH, HEIGHT, DEPTH, LAYERS, FACES, LEVELS, SCHEME)]
-    assert found == [VK_FORMATS[fmt], 2 if fmt in TEXEL else 1, 5, 3, 0, 0, 1, 1, 0]
+    assert found == [VK_FORMATS[fmt], (4 if fmt[0] == "E" else 2) if fmt in TEXEL else 1, 5, 3, 0, 0, 1, 1, 0]
     assert struct.unpack_from("<2Q", data, 64) == (0, 0)
     start, length, plain = struct.unpack_from("<3Q", data, LEVEL)
     assert length == plain == len(_data(fmt)) and data[start:] == _data(fmt)
@@ -58,10 +59,14 @@ def test_the_header(tmp_path, fmt):
         ("R16G16_SFLOAT", 1, 0, 4, [(0, 15, 0xC0, MINUS_ONE, ONE), (16, 15, 0xC1, MINUS_ONE, ONE)]),
         ("R16G16B16_SFLOAT", 1, 0, 6, [(16 * i, 15, 0xC0 + i, MINUS_ONE, ONE) for i in range(3)]),
         ("R16G16B16A16_SFLOAT", 1, 0, 8, [(16 * i, 15, 0xC0 + (i, 15)[i == 3], MINUS_ONE, ONE) for i in range(4)]),
+        (
+            "E5B9G9R9_UFLOAT_PACK32", 1, 0, 4,
+            [pair for i in range(3) for pair in ((9 * i, 8, i, 0, 8448), (27, 4, 0x20 + i, 15, 31))],
+        ),
         ("BC6H_UFLOAT_BLOCK", 133, 0x303, 16, [(0, 127, 0x80, 0, ONE)]),
         ("ASTC_4x4_SFLOAT_BLOCK", 162, 0x303, 16, [(0, 127, 0xC0, MINUS_ONE, ONE)]),
     ],
-)
+)  # fmt: skip
 def test_the_data_format_descriptor(tmp_path, fmt, model, sides, plane, samples):
     path = tmp_path / "a.ktx2"
     write_ktx2(path, _data(fmt), 5, 3, fmt)

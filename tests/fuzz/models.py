@@ -300,7 +300,7 @@ READERS = (
     Reader(
         "atlas",
         "a.wlm",
-        stored("atlas-tiles.wlm", "atlas-cascade.wlm", "atlas-bc6h.wlm", "atlas-plain.wlm"),
+        stored("atlas-tiles.wlm", "atlas-mixed.wlm", "atlas-cascade.wlm", "atlas-bc6h.wlm", "atlas-plain.wlm"),
         vary_artifact,
         _atlas,
     ),

@@ -229,9 +229,8 @@ def test_a_texel_of_an_atlas(kind, tmp_path, show):
         assert np.abs(light_of(text, "original") - original).max() <= original.max() / 400
         if kind == "tiles":
             wide, high, left, top = map(int, re.search(r"(\d+) × (\d+) texels at (\d+), (\d+)", text).groups())
-            first, size = unpack_entries(
-                model.lut[min(row // 7, len(model.lut) - 1), min(column // 7, len(model.lut[0]) - 1)]
-            )
+            entry = model.lut[min(row // 7, len(model.lut) - 1), min(column // 7, len(model.lut[0]) - 1)]
+            first, size, _ = unpack_entries(entry, model.colour)
             assert [left, top] == first.tolist() and [wide, high] == size.tolist()
         assert ("tile" in text) == (kind == "tiles")
     assert len(seen) == 3 and (1, 2) not in seen, "three sides of the cube, and nothing of what is inside"

@@ -1,7 +1,8 @@
 """The artifact of an atlas model: both textures in one file.
 
-Parts: `colour` (half [Hp, Wp, 3], or uint8 [B, 16] where T_p is stored as blocks) and, where the model has them,
-`lut` (uint16 [Hc, Wc, 2]) and `uv` (float32 [F, 3, 2]).
+Parts: `colour` (half [Hp, Wp, 3], uint32 [Hp, Wp] of RGB9E5, or uint8 [B, 16] where T_p is stored as blocks) and, where
+the model has them, `blocks` (uint8 [B, 16], the second texture of "mixed"), `lut` (uint16 [Hc, Wc, 2]) and `uv`
+(float32 [F, 3, 2]).
 """
 
 import math
@@ -14,6 +15,8 @@ from pydantic import Field, JsonValue
 from wlm import system
 from wlm.atlas import colour
 from wlm.atlas.model import (
+    BLOCK_SIDE,
+    BLOCKS,
     MOST_SIZE,
     AtlasModel,
     Profile,
@@ -26,6 +29,7 @@ from wlm.atlas.model import (
 from wlm.config import check_settings
 from wlm.formats.artifact import Artifact, read_artifact
 from wlm.formats.parts import Part, check_parts
+from wlm.formats.shared_exponent import pack_rgb9e5, unpack_rgb9e5
 from wlm.system import Header, Name
 from wlm.texels import MOST_SIDE
 
@@ -43,7 +47,14 @@ def encode(model: AtlasModel) -> tuple[dict[str, Any], dict[str, np.ndarray], st
         "profile": model.profile.changes(),
         "report": {name: value for name, value in model.report.items() if name != "seconds"},
     }
-    parts = {"colour": model.texels if model.colour == "half" else model.blocks, "lut": model.lut, "uv": model.uv}
+    parts = {"colour": model.texels, "lut": model.lut, "uv": model.uv}
+    if model.colour in colour.BLOCK_CODECS:
+        parts["colour"] = model.blocks
+    elif model.colour != "half":
+        parts["colour"] = pack_rgb9e5(model.texels)
+    if model.colour == "mixed":
+        settings["block_texels"] = list(model.block_texels.shape[:2])
+        parts["blocks"] = model.blocks
     return settings, {name: part for name, part in parts.items() if part.size}, model.source
 
 
@@ -54,11 +65,16 @@ def decode(artifact: Artifact) -> AtlasModel:
         WlmError: A setting is wrong, a block isn't one of its format, or a package that decodes blocks is missing.
         ValueError: The parts don't fit the settings; so with LookupError, TypeError and AttributeError.
     """
-    fields, size, parts = _checked(artifact)
-    textures = {"texels": parts.pop("colour")}
-    if fields["colour"] != "half":
-        blocks = textures["texels"]
-        textures = {"texels": colour.decode(blocks, *size, fields["colour"]).astype(np.float16), "blocks": blocks}
+    fields, size, second, parts = _checked(artifact)
+    stored, blocks = parts.pop("colour"), parts.pop("blocks")
+    textures = {"texels": stored}
+    if fields["colour"] in colour.BLOCK_CODECS:
+        textures = {"texels": colour.decode(stored, *size, fields["colour"]).astype(np.float16), "blocks": stored}
+    elif fields["colour"] != "half":
+        textures = {"texels": unpack_rgb9e5(stored).astype(np.float16)}
+    if fields["colour"] == "mixed":
+        decoded = colour.decode(blocks, *second, BLOCKS).astype(np.float16)
+        textures |= {"blocks": blocks, "block_texels": decoded}
     return AtlasModel(**fields, **textures, **parts)
 
 
@@ -73,7 +89,7 @@ def describe(path: str | os.PathLike[str]) -> dict[str, Any]:
         WlmError: As `wlm.load`, but for the blocks.
     """
     artifact = read_artifact(path, AtlasModel.SYSTEM)
-    fields, texels, parts = system.decode(path, artifact, _checked)
+    fields, texels, second, parts = system.decode(path, artifact, _checked)
     size, lut = (fields["height"], fields["width"]), parts["lut"].shape[:2]
     return {
         "name": fields["name"],
@@ -82,9 +98,10 @@ def describe(path: str | os.PathLike[str]) -> dict[str, Any]:
         "bytes": artifact.file_bytes,
         "size": list(size[::-1]),
         "colour_size": list(texels[::-1]),
+        "block_size": list(second[::-1]),
         "lut_size": list(lut[::-1]),
         "new_uvs": len(parts["uv"]),
-        "cr": compression_ratio(texels, lut, size, fields["colour"]),
+        "cr": compression_ratio(texels, lut, size, fields["colour"], second),
         "cr_disk": disk_ratio(artifact.file_bytes, size),
         "source": artifact.source,
         "parts": {"header": artifact.header_bytes} | artifact.parts,
@@ -94,29 +111,46 @@ def describe(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 
 class _Header(Header):
-    """The settings of a file; `size` and `texels` are rows and columns of the lightmap and of T_p."""
+    """The settings of a file.
+
+    `size`, `texels` and `block_texels` are rows and columns of the lightmap, of T_p and of its second texture.
+    """
 
     name: Name
     method: Literal["tiles", "cascade", "plain"]
-    colour: Literal["half", "bc6h", "astc"]
+    colour: Literal["half", "rgb9e5", "bc6h", "astc", "mixed"]
     size: _Size
     texels: _Size
+    block_texels: _Size | None = None
     profile: Profile
     report: dict[str, JsonValue]
 
 
-def _checked(artifact: Artifact) -> tuple[dict[str, Any], tuple[int, int], dict[str, np.ndarray]]:
+def _checked(
+    artifact: Artifact,
+) -> tuple[dict[str, Any], tuple[int, int], tuple[int, int], dict[str, np.ndarray]]:
     """Checks the settings and the parts, but not what blocks decode to.
 
     Returns:
-        The fields of `AtlasModel` but for its arrays; rows and columns of T_p; and the parts.
+        The fields of `AtlasModel` but for its arrays; rows and columns of T_p and of the second texture of "mixed",
+        else (0, 0); and the parts.
     """
     header = check_settings(_Header, artifact.settings, "setting ")
     (height, width), texels = header.size, tuple(header.texels)
     blocks = math.prod(colour.block_grid(*texels))
-    half = header.colour == "half"
+    mixed, second = header.colour == "mixed", tuple(header.block_texels or (0, 0))
+    if mixed != (header.block_texels is not None) or any(side % BLOCK_SIDE for side in second):
+        raise ValueError("setting block_texels: expected multiples of 4 of colour mixed alone")
+    if mixed and header.method != "tiles":
+        raise ValueError(f"setting colour: expected one texture for method {header.method}, found mixed")
+    colours = {
+        "half": Part(np.float16, (*texels, 3), least=0.0),
+        "bc6h": Part(np.uint8, (blocks, 16)),
+        "astc": Part(np.uint8, (blocks, 16)),
+    }
     table = {
-        "colour": Part(np.float16, (*texels, 3), least=0.0) if half else Part(np.uint8, (blocks, 16)),
+        "colour": colours.get(header.colour, Part(np.uint32, texels)),
+        "blocks": Part(np.uint8, (math.prod(second) // BLOCK_SIDE**2, 16), optional=not mixed),
         "lut": {
             "tiles": Part(np.uint16, (*tile_counts(height, width, header.profile.tile), 2)),
             "cascade": Part(np.uint16, (None, None, 2)),
@@ -129,10 +163,12 @@ def _checked(artifact: Artifact) -> tuple[dict[str, Any], tuple[int, int], dict[
     if header.method == "cascade" and not lut.size:
         raise ValueError("part lut is empty")
     if header.method == "tiles":
-        first, size = unpack_entries(lut)
-        if max(texels) > MOST_SIZE or ((first + size) > texels[::-1]).any():
+        first, size, of_blocks = unpack_entries(lut, header.colour)
+        if (of_blocks[..., 0] != of_blocks[..., 1]).any():
+            raise ValueError("part lut: a tile is of both textures")
+        if max(texels) > MOST_SIZE or ((first + size) > np.where(of_blocks, second[::-1], texels[::-1])).any():
             raise ValueError("part lut: a tile reaches beyond the colour texture")
-    check_area((height, width), texels, lut.shape[:2])
+    check_area((height, width), (1, math.prod(texels) + math.prod(second)), lut.shape[:2])
     fields = {
         "name": header.name,
         "source": artifact.source,
@@ -143,4 +179,4 @@ def _checked(artifact: Artifact) -> tuple[dict[str, Any], tuple[int, int], dict[
         "width": width,
         "report": header.report,
     }
-    return fields, texels, parts
+    return fields, texels, second, parts

@@ -1,22 +1,30 @@
-"""The colour texture as stored: half floats, or blocks that GPUs decode, BC6H or ASTC HDR 4x4.
+"""The colour texture as stored: half floats, RGB9E5, or blocks that GPUs decode, BC6H or ASTC HDR 4x4.
 
-Both block formats take 16 bytes for 4x4 texels, 8 bits per texel. lightmap-uv-clustering-cascade, section 4.4, counts 6
-for ASTC 4x4, which the format doesn't have; we count 8. Both need the extra `atlas`.
+RGB9E5 takes 32 bits a texel, and all GPUs filter it; half floats take 64 on desktop GPUs, which have them of four
+channels and not of three. Both block formats take 16 bytes for 4x4 texels, 8 bits per texel.
+lightmap-uv-clustering-cascade, section 4.4, counts 6 for ASTC 4x4, which the format doesn't have; we count 8. ASTC
+needs the extra `atlas`.
+
+Half floats hold exactly what each of them decodes to.
 """
 
 import math
 
 import numpy as np
+import torch
 
 from wlm.atlas.model import BLOCK_SIDE
 from wlm.errors import WlmError
-from wlm.formats import hdr_blocks
+from wlm.formats import bc6h, hdr_blocks
 from wlm.formats.exr import HALF_MAX
+from wlm.formats.shared_exponent import LARGEST, pack_rgb9e5, unpack_rgb9e5
+from wlm.ops.bc6h import bc6h_blocks
 
 BLOCK_CODECS = ("bc6h", "astc")
 _EXTRA = "atlas"
-# A third of the time of "slow" for 0.2 dB less, and every size of every tile is encoded once to measure its error.
-_BC6H = "basic"
+_MANTISSA = 512  # of RGB9E5, and its least exponent, of a largest channel below 2 ** -15
+_LEAST_EXPONENT = -15
+_FRACTION = 24
 
 
 def block_grid(height: int, width: int) -> tuple[int, int]:
@@ -24,12 +32,16 @@ def block_grid(height: int, width: int) -> tuple[int, int]:
     return math.ceil(height / BLOCK_SIDE), math.ceil(width / BLOCK_SIDE)
 
 
-def quantise(texels: np.ndarray, colour: str) -> dict[str, np.ndarray]:
+def quantise(
+    texels: np.ndarray, colour: str, weight: np.ndarray | None = None, device: str = "cpu"
+) -> dict[str, np.ndarray]:
     """Encodes T_p as it is stored.
 
     Args:
         texels: numbers [H, W, 3], linear.
-        colour: "half", "bc6h" or "astc".
+        colour: "half", "rgb9e5", "bc6h" or "astc".
+        weight: numbers [H, W], for "bc6h": of each texel's squared error; None: all alike.
+        device: Where BC6H is encoded.
 
     Returns:
         `texels` and, of a block format, `blocks` of `AtlasModel`.
@@ -39,17 +51,68 @@ def quantise(texels: np.ndarray, colour: str) -> dict[str, np.ndarray]:
     """
     if colour == "half":
         return {"texels": texels.clip(0.0, HALF_MAX).astype(np.float16)}
-    blocks, decoded = encode(texels, colour)
+    if colour == "rgb9e5":
+        return {"texels": unpack_rgb9e5(pack_rgb9e5(texels)).astype(np.float16)}
+    blocks, decoded = encode(texels, colour, weight, device)
     return {"texels": decoded.astype(np.float16), "blocks": blocks}
 
 
-def encode(texels: np.ndarray, codec: str) -> tuple[np.ndarray, np.ndarray]:
+def stored(samples: torch.Tensor, weight: torch.Tensor, colour: str) -> torch.Tensor:
+    """What tiles decode to, once stored.
+
+    Args:
+        samples: float32 [T, ny, nx, 3], finite, not negative; of blocks ny and nx are multiples of 4.
+        weight: float32 [T, ny, nx], of each sample's squared error.
+        colour: As for `quantise`.
+
+    Returns:
+        float32 [T, ny, nx, 3]. Half floats round by too little to matter.
+
+    Raises:
+        WlmError: A package is missing; the line names the extra.
+    """
+    if colour == "half":
+        return samples
+    if colour == "rgb9e5":
+        return _rounded(samples)
+    if colour == "bc6h":
+        count, ny, nx, _ = samples.shape
+        _, decoded = bc6h_blocks(_by_block(samples), _by_block(weight[..., None])[..., 0])
+        cells = decoded.view(count, ny // BLOCK_SIDE, nx // BLOCK_SIDE, BLOCK_SIDE, BLOCK_SIDE, 3)
+        return cells.transpose(2, 3).reshape(count, ny, nx, 3)
+    count, ny, nx, _ = samples.shape
+    _, decoded = encode(samples.cpu().numpy().reshape(count * ny, nx, 3), colour)
+    return torch.from_numpy(decoded.reshape(count, ny, nx, 3)).to(samples)
+
+
+def _rounded(samples: torch.Tensor) -> torch.Tensor:
+    """What RGB9E5 decodes to: `wlm.formats.shared_exponent` for tensors."""
+    samples = samples.clamp(0.0, LARGEST)
+    largest = samples.amax(-1, keepdim=True)
+    # The exponent of a number from 1/2 to 1 times a power of two.
+    exponent = torch.frexp(largest)[1].clamp(min=_LEAST_EXPONENT) - _LEAST_EXPONENT
+    scale = torch.ldexp(torch.ones_like(largest), exponent - _FRACTION)
+    scale = torch.where((largest / scale).round() >= _MANTISSA, 2.0 * scale, scale)
+    return (samples / scale).round() * scale
+
+
+def _by_block(texels: torch.Tensor) -> torch.Tensor:
+    """Blocks [N, 16, C] of tiles [T, ny, nx, C], tile by tile and row by row."""
+    count, ny, nx, channels = texels.shape
+    cells = texels.reshape(count, ny // BLOCK_SIDE, BLOCK_SIDE, nx // BLOCK_SIDE, BLOCK_SIDE, channels)
+    return cells.transpose(2, 3).reshape(-1, BLOCK_SIDE * BLOCK_SIDE, channels)
+
+
+def encode(
+    texels: np.ndarray, codec: str, weight: np.ndarray | None = None, device: str = "cpu"
+) -> tuple[np.ndarray, np.ndarray]:
     """Encodes a texture.
 
     Args:
         texels: numbers [H, W, 3], linear; clamped to [0, 65504], infinities too. Where H or W is no multiple of 4 the
             last row or column is repeated.
         codec: "bc6h" or "astc".
+        weight, device: As for `quantise`.
 
     Returns:
         Blocks, uint8 [B, 16], row by row; and their decoded texels, float32 [H, W, 3].
@@ -66,13 +129,16 @@ def encode(texels: np.ndarray, codec: str) -> tuple[np.ndarray, np.ndarray]:
     if np.isnan(texels).any():
         raise ValueError(f"texels: {np.count_nonzero(np.isnan(texels).any(axis=2))} are NaN")
     height, width = texels.shape[:2]
-    padded = np.pad(texels, ((0, -height % BLOCK_SIDE), (0, -width % BLOCK_SIDE), (0, 0)), mode="edge")
-    half = np.clip(padded, 0.0, HALF_MAX).astype(np.float16)
+    margin = (0, -height % BLOCK_SIDE), (0, -width % BLOCK_SIDE)
+    light = np.pad(texels.clip(0.0, HALF_MAX), (*margin, (0, 0)), mode="edge").astype(np.float32)
     if codec == "bc6h":
-        data = hdr_blocks.encode_bc6h(half, _BC6H, _EXTRA)
+        weight = np.ones((height, width)) if weight is None else weight
+        padded = torch.from_numpy(np.pad(weight, margin).astype(np.float32))[None, ..., None]
+        cells = _by_block(torch.from_numpy(light)[None])
+        blocks, _ = bc6h_blocks(cells.to(device), _by_block(padded)[..., 0].to(device))
+        blocks = blocks.cpu().numpy()
     else:
-        data = _astc().encode(half)
-    blocks = np.frombuffer(data, np.uint8).reshape(-1, 16).copy()
+        blocks = np.frombuffer(_astc().encode(light.astype(np.float16)), np.uint8).reshape(-1, 16).copy()
     return blocks, decode(blocks, height, width, codec)
 
 
@@ -99,7 +165,8 @@ def decode(blocks: np.ndarray, height: int, width: int, codec: str) -> np.ndarra
         raise ValueError(f"blocks: expected uint8 [{rows * columns}, 16], got {blocks.dtype} {blocks.shape}")
     size = (rows * BLOCK_SIDE, columns * BLOCK_SIDE)
     if codec == "bc6h":
-        texels = hdr_blocks.decode_bc6h(blocks.tobytes(), *size, _EXTRA)
+        cells = bc6h.decode_bc6h(blocks).reshape(rows, columns, BLOCK_SIDE, BLOCK_SIDE, 3)
+        texels = cells.transpose(0, 2, 1, 3, 4).reshape(*size, 3)
     else:
         texels = _astc().decode(blocks.tobytes(), *size)
     texels = texels[:height, :width].astype(np.float32)

@@ -6,7 +6,7 @@ import warp as wp
 
 from wlm import interop
 from wlm.atlas.data import LightmappedMesh
-from wlm.atlas.model import LUT_STEPS, AtlasModel
+from wlm.atlas.model import FIRST_BLOCK_CODE, LUT_STEPS, AtlasModel
 from wlm.atlas.views import corner_weights, texel_triangles
 from wlm.errors import WlmError
 from wlm.texels import fill_gaps
@@ -37,6 +37,10 @@ class Decoder:
             # As stored: two bytes per number.
             self._texels = wp.array(np.ascontiguousarray(model.texels), dtype=wp.vec3h, device=self.device)
             self._lut = wp.array(np.ascontiguousarray(lut), dtype=wp.uint16, device=self.device)
+            self._second = {}
+            if model.colour == "mixed":
+                blocks = wp.array(np.ascontiguousarray(model.block_texels), dtype=wp.vec3h, device=self.device)
+                self._second = {"blocks": blocks, "first_block_code": FIRST_BLOCK_CODE}
         else:
             self._texels = wp.array(model.texels.astype(np.float32), dtype=float, device=self.device)
             self._lut = wp.array((lut / np.float32(LUT_STEPS)).astype(np.float32), dtype=float, device=self.device)
@@ -74,6 +78,7 @@ class Decoder:
                 self._lut,
                 self._texels,
                 interop.to_warp(out, wp.vec3),
+                **self._second,
             )
         else:
             cascade.sample(self._texels, self._lut, uv, interop.to_warp(out))

@@ -21,6 +21,7 @@ a millionth                           range to measure against
 nothing covered in any view           the same, and the errors are NaN too
 no seam on any screen                 `seam_error` and `seam_ratio` are NaN
 an error at seams alone               `seam_ratio` is infinite, null in JSON
+FLIP of no covered view               NaN, null in JSON: it is taken of some of the views alone
 NaN or Inf in decoded colours         error that names the decoder
 ====================================  ================================================================
 """
@@ -38,6 +39,7 @@ from wlm import system
 from wlm.atlas.charts import charts, welded
 from wlm.atlas.data import LightmappedMesh
 from wlm.atlas.decode import Decoder
+from wlm.atlas.display import FLIP_VIEWS, Screen, ScreenTally, screen_exposure
 from wlm.atlas.model import AtlasModel, disk_ratio
 from wlm.atlas.stages import one_thread
 from wlm.atlas.views import corner_weights, mesh_charts, mesh_views, texel_triangles, visible_uv
@@ -89,6 +91,8 @@ class Score(system.Report):
         rest_error: Mean absolute error of all others.
         seam_ratio: `seam_error` over `rest_error`: 1 where seams don't stand out.
         texel_psnr: dB, over the lightmap's texels that are in the mask and have their centre in a triangle.
+        tone_psnr: dB, the mean over views of each view's as a screen shows it, `wlm.atlas.display`.
+        flip: Mean FLIP of some of the views as a screen shows them, 0 to 1.
     """
 
     name: str
@@ -108,6 +112,8 @@ class Score(system.Report):
     rest_error: float
     seam_ratio: float
     texel_psnr: float
+    tone_psnr: float
+    flip: float
 
 
 @dataclass(frozen=True)
@@ -179,7 +185,7 @@ def compare(
 ) -> dict[str, Score]:
     """Compares any decoders with the original lightmap. Each view is drawn once for all of them.
 
-    On the CPU torch has one thread until it returns: 50 views of 512² take 2 to 5 s.
+    On the CPU torch has one thread until it returns: 50 views of 512² take some seconds, FLIP about as much a decoder.
 
     Args:
         mesh: The mesh with its original lightmap.
@@ -212,6 +218,7 @@ def compare(
     chart = torch.tensor(mesh_charts(mesh), device=device)
     # Corners at one place in space have one number.
     place = torch.tensor(welded(mesh.position, np.zeros_like(mesh.uv), mesh.triangle), device=device)
+    factor, stride = screen_exposure(mesh), max(1, len(cameras) // FLIP_VIEWS)
     meter = Meter(progress, "evaluate", len(cameras))
     with torch.no_grad(), one_thread(device):
         peak, brightest = _peak(mesh, image, cameras, resolution)
@@ -222,6 +229,7 @@ def compare(
             if len(points[0]):
                 target = raster.texture(image, points[0]).double()
                 similarity = _Similarity(hit, target, peak)
+                screen = Screen(factor, hit, target, number % stride == 0)
                 chart_border = _near_border(visible, chart[visible.clamp(min=0).long()], place)[hit]
                 for name, decoder in decoders.items():
                     error = _colours(decoder, points, mesh, name) - target
@@ -231,6 +239,7 @@ def compare(
                         label[hit] = _labels(labels[name], points, name)
                         border = _near_border(visible, label, place)[hit]
                     tallies[name].add(number, error, border, similarity.mean(target + error))
+                    tallies[name].screen.add(*screen.errors(target + error))
             if meter.due(number + 1):
                 meter.report(number + 1)
         texel_errors = _texel_errors(mesh, image, decoders)
@@ -305,6 +314,7 @@ class _Tally:
     seam: float = 0.0
     seam_pixels: int = 0
     rest: float = 0.0
+    screen: ScreenTally = field(default_factory=ScreenTally)
 
     def add(self, view: int, error: torch.Tensor, border: torch.Tensor, ssim: float) -> None:
         absolute = error.abs().mean(dim=1)
@@ -340,6 +350,7 @@ class _Tally:
             rest_error=rest,
             seam_ratio=math.inf if rest == 0.0 and seam > 0.0 else _ratio(seam, rest),
             texel_psnr=psnr_from_mse(texel_mse, peak),
+            **self.screen.figures(),
         )
 
 

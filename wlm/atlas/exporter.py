@@ -5,6 +5,7 @@ mesh.glb                        the mesh, with its new UVs as one more set if it
 mask.png                        the texels that belong to charts, unless those are all that triangles touch
 lut.exr, .ktx2, .dds            T_c, unless the model is "plain"
 colour.exr, .ktx2, .dds         T_p; blocks of ASTC have no DDS
+blocks.exr, .ktx2, .dds         the second texture of colour "mixed", BC6H
 atlas.glsl                      a function that reads them
 report.json                     settings, sizes, times, warnings, and where the inputs were
 """
@@ -23,7 +24,7 @@ from wlm import system
 from wlm.atlas import codec
 from wlm.atlas.coverage import touched_texels
 from wlm.atlas.data import LightmappedMesh, from_arrays, load, write_mesh
-from wlm.atlas.model import LUT_STEPS, AtlasModel, disk_ratio
+from wlm.atlas.model import BLOCKS, LUT_STEPS, TEXELS, AtlasModel, disk_ratio
 from wlm.atlas.shader import atlas_glsl
 from wlm.errors import WlmError, one_line
 from wlm.formats.atomic import atomic_write
@@ -34,6 +35,7 @@ from wlm.formats.gltf import read_gltf
 from wlm.formats.gltf_writer import write_glb
 from wlm.formats.ktx2 import write_ktx2
 from wlm.formats.mask import read_mask, write_mask
+from wlm.formats.shared_exponent import pack_rgb9e5
 
 FORMAT = "wlm-atlas"
 _VERSION = 1
@@ -42,7 +44,7 @@ MESH_FILE = "mesh.glb"
 MASK_FILE = "mask.png"
 SHADER_FILE = "atlas.glsl"
 REPORT_FILE = "report.json"
-_TEXTURES = tuple(name + suffix for name in ("lut", "colour") for suffix in (".exr", ".ktx2", ".dds"))
+_TEXTURES = tuple(name + suffix for name in ("lut", "colour", "blocks") for suffix in (".exr", ".ktx2", ".dds"))
 READING = {"node": str, "encoding": str, "flip": bool}
 """Options of `load` that the report keeps among the inputs."""
 _FILES = (MODEL_FILE, MESH_FILE, MASK_FILE, *_TEXTURES, SHADER_FILE, REPORT_FILE)
@@ -96,7 +98,7 @@ def export(
     """
     if model.source != mesh.source:
         raise ValueError(f"model of {model.source}, mesh of {mesh.source}: expected the mesh that was compressed")
-    for name, texture in (("T_p", model.texels), ("T_c", model.lut)):
+    for name, texture in (("T_p", model.texels), ("T_p's blocks", model.block_texels), ("T_c", model.lut)):
         side = max(texture.shape[:2])
         if side > _MOST_SIDE:
             raise WlmError(f"{model.name}: {name}: expected at most {_MOST_SIDE} texels along a side, found {side}")
@@ -267,23 +269,37 @@ def _write_lut(folder: Path, model: AtlasModel) -> None:
 
 
 def _write_colour(folder: Path, model: AtlasModel) -> None:
-    """T_p. The EXR has what blocks decode to."""
-    height, width = model.texels.shape[:2]
-    write_exr(folder / "colour.exr", model.texels)
-    ktx2, dds = folder / "colour.ktx2", folder / "colour.dds"
-    if model.colour == "half":
-        texels = np.ascontiguousarray(model.texels, "<f2")
+    """T_p, of "mixed" both its textures."""
+    if model.colour == "mixed":
+        _write_texture(folder, "colour", TEXELS, model.texels)
+        _write_texture(folder, "blocks", BLOCKS, model.block_texels, model.blocks)
+    else:
+        _write_texture(folder, "colour", model.colour, model.texels, model.blocks)
+
+
+def _write_texture(folder: Path, name: str, colour: str, decoded: np.ndarray, blocks: np.ndarray | None = None) -> None:
+    """A texture as engines load it, and as an EXR of what it decodes to."""
+    height, width = decoded.shape[:2]
+    write_exr(folder / f"{name}.exr", decoded)
+    ktx2, dds = folder / f"{name}.ktx2", folder / f"{name}.dds"
+    if colour == "half":
+        texels = np.ascontiguousarray(decoded, "<f2")
         write_ktx2(ktx2, texels.tobytes(), width, height, "R16G16B16_SFLOAT")
         # DXGI has no half floats of three channels.
         whole = np.concatenate([texels, np.ones((height, width, 1), "<f2")], 2)
         write_dds(dds, whole.tobytes(), width, height, fmt="R16G16B16A16_FLOAT")
         return
-    blocks = np.ascontiguousarray(model.blocks).tobytes()
-    if model.colour == "bc6h":
-        write_ktx2(ktx2, blocks, width, height, "BC6H_UFLOAT_BLOCK")
-        write_dds(dds, blocks, width, height, fmt="BC6H_UF16")
+    if colour == "rgb9e5":
+        words = pack_rgb9e5(decoded).astype("<u4").tobytes()
+        write_ktx2(ktx2, words, width, height, "E5B9G9R9_UFLOAT_PACK32")
+        write_dds(dds, words, width, height, fmt="R9G9B9E5_SHAREDEXP")
+        return
+    data = np.ascontiguousarray(blocks).tobytes()
+    if colour == "bc6h":
+        write_ktx2(ktx2, data, width, height, "BC6H_UFLOAT_BLOCK")
+        write_dds(dds, data, width, height, fmt="BC6H_UF16")
     else:
-        write_ktx2(ktx2, blocks, width, height, "ASTC_4x4_SFLOAT_BLOCK")
+        write_ktx2(ktx2, data, width, height, "ASTC_4x4_SFLOAT_BLOCK")
 
 
 def _report(model: AtlasModel, mesh: LightmappedMesh, new_set: int | None, model_bytes: int) -> dict[str, Any]:
@@ -296,6 +312,7 @@ def _report(model: AtlasModel, mesh: LightmappedMesh, new_set: int | None, model
         "colour": model.colour,
         "size": [model.width, model.height],
         "colour_size": [model.texels.shape[1], model.texels.shape[0]],
+        "block_size": [model.block_texels.shape[1], model.block_texels.shape[0]],
         "lut_size": [model.lut.shape[1], model.lut.shape[0]],
         "triangles": len(mesh.triangle),
         "parts": [[each.primitive.node, each.primitive.primitive] for each in mesh.parts],

@@ -16,7 +16,7 @@ from wlm.atlas import colour
 from wlm.atlas.cascade import fit_cascade, group_triangles
 from wlm.atlas.data import LightmappedMesh
 from wlm.atlas.decode import Decoder
-from wlm.atlas.model import BLOCK_SIDE, COLOUR_BITS, SOURCE_BITS, AtlasModel, Profile, check_area
+from wlm.atlas.model import BLOCK_SIDE, BLOCKS, COLOUR_BITS, SOURCE_BITS, AtlasModel, Profile, check_area
 from wlm.atlas.resize import fitting_size, resize
 from wlm.atlas.stages import Stages
 from wlm.atlas.tiles import fit_tiles
@@ -129,15 +129,16 @@ def _better(grid: FineGrid, model: AtlasModel | None, profile: Profile, seed: in
     mesh, device = grid.mesh, grid.device
     height, width = mesh.mask.shape
     share = profile.budget if model is None else 1.0 - model.compression_ratio
-    block = 1 if profile.colour == "half" else BLOCK_SIDE
-    bits = COLOUR_BITS[profile.colour]
+    format = BLOCKS if profile.colour == "mixed" else profile.colour
+    block = BLOCK_SIDE if format in colour.BLOCK_CODECS else 1
+    bits = COLOUR_BITS[format]
     size = fitting_size(height, width, share * height * width * SOURCE_BITS, (block, block), bits)
     if size is None:
         if model is not None:
             return model
         size = 1, 1
-    textures = colour.quantise(resize(mesh.lightmap, mesh.mask, *size), profile.colour)
-    plain = AtlasModel(mesh.name, mesh.source, profile, "plain", profile.colour, height, width, **textures)
+    textures = colour.quantise(resize(mesh.lightmap, mesh.mask, *size), format, device=device)
+    plain = AtlasModel(mesh.name, mesh.source, profile, "plain", format, height, width, **textures)
     if model is None:
         return replace(plain, report={"why plain": "tiles do not fit the budget"})
     # Other views than those of the fit, in which its error is less than elsewhere.

@@ -25,8 +25,12 @@ from wlm.texels import check_size
 SOURCE_BITS = 48
 """Bits per texel of the lightmap: three half floats (eq. 9)."""
 
-COLOUR_BITS = {"half": 48, "bc6h": 8, "astc": 8}
-"""Bits per texel of T_p, by how it is stored: half floats, BC6H or ASTC 4x4."""
+COLOUR_BITS = {"half": 64, "rgb9e5": 32, "bc6h": 8, "astc": 8}
+"""Bits per texel of a texture on a GPU, by how it is stored: half floats, which desktop GPUs have of four channels and
+not of three; RGB9E5; BC6H; ASTC 4x4."""
+
+TEXELS, BLOCKS = "rgb9e5", "bc6h"
+"""The formats of the two textures of colour "mixed"."""
 
 BLOCK_SIDE = 4
 """Texels along a block of BC6H or ASTC."""
@@ -40,7 +44,10 @@ LUT_STEPS = 65535.0
 # An entry of a tile has one number per axis: the rectangle's first texel, and its number of texels less one.
 SIDE_BITS = 4
 MOST_SIZE = 1 << (16 - SIDE_BITS)
-"""Most texels of T_p along an axis for method "tiles"."""
+"""Most texels of T_p along an axis for method "tiles"; of the blocks of colour "mixed", most blocks."""
+
+FIRST_BLOCK_CODE = 12
+"""Of colour "mixed": the size's code from which on an entry names blocks, 1 to 4 along an axis, and not texels."""
 
 
 class Profile(Settings):
@@ -49,13 +56,15 @@ class Profile(Settings):
     Attributes:
         name: Shown in reports.
         method: "tiles" or "cascade", see the module.
-        colour: How T_p is stored: "half" floats, "bc6h" or "astc" (4x4).
+        colour: How T_p is stored: "half" floats, "rgb9e5", "bc6h" or "astc" (4x4); or, for "tiles", "mixed": two
+            textures, RGB9E5 and BC6H, and each tile in one of them.
         budget: For "tiles": bits of T_p and T_c as a fraction of the lightmap's at 48 bits per texel, 1 - CR of eq. 9.
         tile: For "tiles": texels of the lightmap along a tile, 3 to 15. A tile has up to one sample more per axis, and
             with these it keeps every texel.
         views: Random views of the unit sphere; a texel counts by the pixels that show it. 0: by its area on the mesh.
         unseen: Weight of what no view shows, as a fraction of the mean weight.
         border: Factor on the weight within a texel of a chart's border: an error there is a seam.
+        relative: How much of the weight is of the relative error, 0 to 1; the rest is of the error in linear light.
         fallback: Whether a plain smaller lightmap of as many bits replaces the result if its error is no larger.
         threshold: lambda of eq. 4; 0 shares no triangles.
         colour_threshold: lambda_h of section 3.2.1.
@@ -75,12 +84,13 @@ class Profile(Settings):
     FILES: ClassVar[str] = "atlas"
 
     method: Literal["tiles", "cascade"] = "tiles"
-    colour: Literal["half", "bc6h", "astc"] = "half"
+    colour: Literal["half", "rgb9e5", "bc6h", "astc", "mixed"] = "half"
     budget: float = Field(0.17, gt=0.0, le=2.0)
     tile: int = Field(7, ge=3, le=15)
     views: int = Field(64, ge=0, le=4096)
     unseen: float = Field(0.05, gt=0.0, le=1.0)
     border: float = Field(16.0, gt=0.0, le=100.0)
+    relative: float = Field(0.0, ge=0.0, le=1.0)
     fallback: bool = True
     threshold: float = Field(0.03, ge=0.0, le=1.0)
     colour_threshold: float = Field(0.09, ge=0.0, le=2.0)
@@ -100,12 +110,15 @@ class Profile(Settings):
         """Replaces some settings, as `wlm.system.Settings.override`.
 
         Raises:
-            WlmError: Unknown or out of range; or a budget for the cascade, which has none.
+            WlmError: Unknown or out of range; or a budget or two textures for the cascade, which has neither.
         """
-        if values.get("budget") is not None and (values.get("method") or self.method) == "cascade":
-            raise WlmError(
-                f"{prefix}budget: profiles of the cascade have sizes of their own; expected one of tiles, or none"
-            )
+        if (values.get("method") or self.method) == "cascade":
+            if values.get("budget") is not None:
+                raise WlmError(
+                    f"{prefix}budget: profiles of the cascade have sizes of their own; expected one of tiles, or none"
+                )
+            if (values.get("colour") or self.colour) == "mixed":
+                raise WlmError(f"{prefix}colour: expected half, rgb9e5, bc6h or astc for a cascade, found mixed")
         return super().override(values, prefix)
 
 
@@ -122,10 +135,12 @@ class AtlasModel(Model):
         source: `LightmappedMesh.source`.
         profile: The settings of the compression.
         method: "tiles", "cascade" or "plain"; "plain" also where the profile's method does not pay.
-        colour: How T_p is stored, as in `Profile`.
+        colour: How T_p is stored, as in `Profile`; "plain" is never "mixed".
         height, width: Texels of the lightmap.
-        texels: half [Hp, Wp, 3], T_p, finite, not negative; what `blocks` decode to where there are any.
-        blocks: uint8 [B, 16], the blocks of T_p, row by row; [0, 16] for half floats.
+        texels: half [Hp, Wp, 3], T_p, finite, not negative; what is stored decodes to just that. Of "mixed" the
+            texture in RGB9E5.
+        blocks: uint8 [B, 16], the blocks of T_p, row by row; of "mixed" those of its second texture; [0, 16] for none.
+        block_texels: half [Hb, Wb, 3], multiples of 4, the second texture of "mixed"; [0, 0, 3] for none.
         lut: uint16 [Hc, Wc, 2], T_c: for "tiles" `pack_entries`' [ty, tx, 2]; for "cascade" coordinates in units of
             1 / `LUT_STEPS`; [0, 0, 2] for "plain".
         uv: float32 [F, 3, 2] in [0, 1], the corners' new UVs; [0, 3, 2] where the mesh keeps its own.
@@ -144,6 +159,7 @@ class AtlasModel(Model):
     width: int
     texels: np.ndarray
     blocks: np.ndarray = field(default_factory=lambda: np.empty((0, 16), np.uint8))
+    block_texels: np.ndarray = field(default_factory=lambda: np.empty((0, 0, 3), np.float16))
     lut: np.ndarray = field(default_factory=lambda: np.empty((0, 0, 2), np.uint16))
     uv: np.ndarray = field(default_factory=lambda: np.empty((0, 3, 2), np.float32))
     report: dict[str, Any] = field(default_factory=dict)
@@ -151,7 +167,8 @@ class AtlasModel(Model):
     @property
     def compression_ratio(self) -> float:
         """CR of eq. 9."""
-        return compression_ratio(self.texels.shape[:2], self.lut.shape[:2], (self.height, self.width), self.colour)
+        textures = (self.texels.shape[:2], self.lut.shape[:2], (self.height, self.width), self.colour)
+        return compression_ratio(*textures, self.block_texels.shape[:2])
 
 
 def check_area(size: tuple[int, int], texels: tuple[int, int], lut: tuple[int, int]) -> None:
@@ -175,18 +192,27 @@ def check_area(size: tuple[int, int], texels: tuple[int, int], lut: tuple[int, i
         )
 
 
-def compression_ratio(texels: tuple[int, int], lut: tuple[int, int], size: tuple[int, int], colour: str) -> float:
-    """CR of eq. 9: 1 less the bits of both textures over the lightmap's.
+def compression_ratio(
+    texels: tuple[int, int],
+    lut: tuple[int, int],
+    size: tuple[int, int],
+    colour: str,
+    block_texels: tuple[int, int] = (0, 0),
+) -> float:
+    """CR of eq. 9: 1 less the bits of the textures on a GPU over the lightmap's at 48 a texel.
 
     Args:
         texels: Rows and columns of T_p. Blocks count whole.
         lut: Rows and columns of T_c, (0, 0) for none.
         size: Rows and columns of the lightmap.
         colour: How T_p is stored, as in `Profile`.
+        block_texels: Rows and columns of the second texture of "mixed".
     """
-    side = 1 if colour == "half" else BLOCK_SIDE
+    first = TEXELS if colour == "mixed" else colour
+    side = BLOCK_SIDE if first in ("bc6h", "astc") else 1
     rows, columns = (-(-count // side) * side for count in texels)
-    bits = rows * columns * COLOUR_BITS[colour] + lut[0] * lut[1] * LUT_BITS
+    bits = rows * columns * COLOUR_BITS[first] + lut[0] * lut[1] * LUT_BITS
+    bits += math.prod(block_texels) * COLOUR_BITS[BLOCKS]
     return 1.0 - bits / (size[0] * size[1] * SOURCE_BITS)
 
 
@@ -208,26 +234,54 @@ def tile_counts(height: int, width: int, tile: int) -> tuple[int, int]:
     return max(1, -(-(height - 1) // tile)), max(1, -(-(width - 1) // tile))
 
 
-def pack_entries(first: np.ndarray, size: np.ndarray) -> np.ndarray:
+def pack_entries(first: np.ndarray, size: np.ndarray, blocks: np.ndarray | bool = False) -> np.ndarray:
     """Encodes entries of T_c for tiles.
 
     Args:
-        first: int [..., 2], x and y of the rectangle's first texel, below `MOST_SIZE`.
+        first: int [..., 2], x and y of the rectangle's first texel, below `MOST_SIZE`, of blocks below four times that.
         size: int [..., 2], the rectangle's texels along x and y, 1 to 16.
+        blocks: bool [...], where an entry is of the second texture of "mixed": first texel and size are multiples of 4,
+            and sizes of the first texture are at most `FIRST_BLOCK_CODE`.
 
     Returns:
-        uint16 [..., 2]: `first` shifted left by 4, plus `size` - 1.
+        uint16 [..., 2]: the first texel shifted left by 4, plus the size less 1. Of blocks, their numbers in place of
+        texels', and the code is `FIRST_BLOCK_CODE` more.
 
     Raises:
         ValueError: A number is out of range.
     """
-    first, size = np.asarray(first), np.asarray(size)
+    first, size, blocks = np.asarray(first), np.asarray(size), np.asarray(blocks)[..., None]
+    if (np.where(blocks, first | size, 0) % BLOCK_SIDE).any() or (blocks.any() and (size > _most(blocks)).any()):
+        raise ValueError("an entry that isn't of whole blocks, or beyond the sizes beside them")
+    code = np.where(blocks, FIRST_BLOCK_CODE + size // BLOCK_SIDE, size) - 1
+    first = np.where(blocks, first // BLOCK_SIDE, first)
     if (first < 0).any() or (first >= MOST_SIZE).any() or (size < 1).any() or (size > 1 << SIDE_BITS).any():
         raise ValueError(f"an entry beyond a texture of {MOST_SIZE} texels or a tile of {1 << SIDE_BITS}")
-    return ((first << SIDE_BITS) + size - 1).astype(np.uint16)
+    return ((first << SIDE_BITS) + code).astype(np.uint16)
 
 
-def unpack_entries(lut: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Decodes `pack_entries`: first texels and sizes, int64 [..., 2] each."""
+def unpack_entries(lut: np.ndarray, colour: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Decodes `pack_entries`.
+
+    Args:
+        lut: uint16 [..., 2].
+        colour: How T_p is stored, as in `Profile`.
+
+    Returns:
+        First texels and sizes, int64 [..., 2] each, and whether they are of the second texture of "mixed", bool
+        [..., 2]: the same along both axes.
+    """
     lut = np.asarray(lut).astype(np.int64)
-    return lut >> SIDE_BITS, (lut & ((1 << SIDE_BITS) - 1)) + 1
+    first, size = lut >> SIDE_BITS, (lut & ((1 << SIDE_BITS) - 1)) + 1
+    if colour != "mixed":
+        return first, size, np.zeros(lut.shape, bool)
+    blocks = size > FIRST_BLOCK_CODE
+    return (
+        np.where(blocks, first * BLOCK_SIDE, first),
+        np.where(blocks, (size - FIRST_BLOCK_CODE) * BLOCK_SIDE, size),
+        blocks,
+    )
+
+
+def _most(blocks: np.ndarray) -> np.ndarray:
+    return np.where(blocks, 1 << SIDE_BITS, FIRST_BLOCK_CODE)

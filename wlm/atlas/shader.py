@@ -1,6 +1,6 @@
 """The GLSL that reads an exported atlas (lightmap-uv-clustering-cascade, eq. 7); `wlm.atlas.exporter` writes it."""
 
-from wlm.atlas.model import SIDE_BITS, AtlasModel
+from wlm.atlas.model import BLOCK_SIDE, FIRST_BLOCK_CODE, SIDE_BITS, AtlasModel
 
 _HEAD = """\
 // Light from a compressed lightmap: {what}
@@ -32,12 +32,20 @@ _LUT = """\
 #endif
 """
 
+_SECOND = """\
+#ifndef WLM_ATLAS_BLOCKS
+{block_sampler}
+#define WLM_ATLAS_BLOCKS wlm_atlas_blocks
+#endif
+"""
+
 _TEXTURES = {
     "plain": "// colour: the small texture, sampler2D, filter linear, clamped to its edge.",
     "tiles": "// lut: the table of tiles, usampler2D, two unsigned integers an entry, filter nearest.",
+    "mixed": "// blocks: the small texture's blocks, sampler2D, filter linear, clamped to its edge.",
     "cascade": "// lut: the table of coordinates, sampler2D, filter linear, clamped to its edge.",
 }
-"""Textures of each method; all have that of "plain"."""
+"""Textures of each method, and of colour "mixed"; all have that of "plain"."""
 
 # Coordinates are in texels, so that arithmetic within a tile stays exact.
 _READ = """
@@ -71,10 +79,19 @@ vec3 wlm_atlas(vec2 uv)
     ivec2 tile = min(ivec2(floor(x)), textureSize(WLM_ATLAS_LUT, 0) - ivec2(1, 1));
     uvec2 entry = texelFetch(WLM_ATLAS_LUT, tile, 0).xy;
     // An entry is the first texel of the tile's rectangle, and in the low bits its texels less one.
-    vec2 first = vec2(entry >> {bits}u);
-    vec2 steps = vec2(entry & uvec2({mask}u, {mask}u));
-    return wlm_atlas_colour_at(first + (x - vec2(tile)) * steps + vec2(0.5, 0.5));
+    uvec2 first = entry >> {bits}u;
+    uvec2 steps = entry & uvec2({mask}u, {mask}u);
+{blocks}    return wlm_atlas_colour_at(vec2(first) + (x - vec2(tile)) * vec2(steps) + vec2(0.5, 0.5));
 }}
+"""
+
+_BLOCKS = """\
+    if (steps.x >= {code}u) {{
+        // Its first block, and from {code} on its blocks less one, of {side} texels a side.
+        first *= {side}u;
+        steps = (steps - uvec2({code}u, {code}u)) * {side}u + uvec2({last}u, {last}u);
+        return wlm_atlas_blocks_at(vec2(first) + (x - vec2(tile)) * vec2(steps) + vec2(0.5, 0.5));
+    }}
 """
 
 _CASCADE = """
@@ -109,24 +126,31 @@ def atlas_glsl(model: AtlasModel) -> str:
     Returns:
         GLSL 3.30, which Vulkan's dialect takes too where the bindings are defined.
     """
-    tiles, cascade = model.method == "tiles", model.method == "cascade"
+    tiles, cascade, mixed = model.method == "tiles", model.method == "cascade", model.colour == "mixed"
+    textures = (_TEXTURES["plain"], *([_TEXTURES["mixed"]] if mixed else []), _TEXTURES[model.method])
     text = _HEAD.format(
         what=_WHAT[model.method],
         coordinate="the new UVs of mesh.glb" if len(model.uv) else "the mesh's own lightmap UVs",
-        textures="\n".join(dict.fromkeys((_TEXTURES["plain"], _TEXTURES[model.method]))),
+        textures="\n".join(dict.fromkeys(textures)),
         colour_sampler=_SAMPLER.format(upper="COLOUR", lower="colour", kind="sampler2D"),
     )
     if tiles or cascade:
         kind = "usampler2D" if tiles else "sampler2D"
         text += _LUT.format(lut_sampler=_SAMPLER.format(upper="LUT", lower="lut", kind=kind))
+    if mixed:
+        text += _SECOND.format(block_sampler=_SAMPLER.format(upper="BLOCKS", lower="blocks", kind="sampler2D"))
     text += _READ.format(type="vec3", name="colour", image="WLM_ATLAS_COLOUR", channels="rgb")
+    if mixed:
+        text += _READ.format(type="vec3", name="blocks", image="WLM_ATLAS_BLOCKS", channels="rgb")
     if tiles:
+        blocks = _BLOCKS.format(code=FIRST_BLOCK_CODE, side=BLOCK_SIDE, last=BLOCK_SIDE - 1) if mixed else ""
         return text + _TILES.format(
             width=model.width,
             height=model.height,
             tile=model.profile.tile,
             bits=SIDE_BITS,
             mask=(1 << SIDE_BITS) - 1,
+            blocks=blocks,
         )
     if cascade:
         return text + _READ.format(type="vec2", name="lut", image="WLM_ATLAS_LUT", channels="xy") + _CASCADE

@@ -2,39 +2,25 @@
 
 The lightmap is cut into tiles of B x B texels whose borders lie on texel centres. A tile becomes nx x ny samples, 1 to
 B + 1 per axis, the outermost on its borders, and light is bilinear between them: with B + 1 it is the lightmap itself.
-Tiles share no sample, so each is a small weighted least squares problem of its own, solved for every size. The sizes
-are then allocated within a budget of samples: each tile has a curve of error against samples, and at the optimum one
-more sample gains as much in every tile. That gain, a Lagrange multiplier, is found by bisection.
+Tiles share no sample, so each is a small weighted least squares problem of its own, solved for every size, and its
+error is that of the samples as they are stored. The sizes are then allocated within a budget, `wlm.atlas.layout`.
 
 This replaces sections 3.1 to 3.3 of lightmap-uv-clustering-cascade: sharp shadows get samples and evenly lit walls next
 to none, within a triangle too, which that paper names as its limit (section 5.1).
 """
 
-import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 
 from wlm.atlas import colour
-from wlm.atlas.model import (
-    BLOCK_SIDE,
-    COLOUR_BITS,
-    LUT_BITS,
-    MOST_SIZE,
-    SIDE_BITS,
-    SOURCE_BITS,
-    AtlasModel,
-    Profile,
-    pack_entries,
-    tile_counts,
-)
+from wlm.atlas.layout import Size, composed, layout, sizes_of
+from wlm.atlas.model import BLOCKS, LUT_BITS, SOURCE_BITS, TEXELS, AtlasModel, Profile, tile_counts
 from wlm.atlas.stages import Stages
 from wlm.atlas.weights import FineGrid, weights
-from wlm.errors import WlmError
 from wlm.formats.checkpoint import Checkpoint
-from wlm.formats.exr import HALF_MAX
 from wlm.formats.parts import Part, check_parts
 from wlm.system import Meter, OnProgress
 
@@ -42,13 +28,12 @@ SUPERSAMPLING = 2
 """Points per texel and axis that a tile is fitted to."""
 
 _AT_ONCE = 8192  # tiles
-_ROUGH, _FINE = 3, 40  # rounds of conjugate gradients, from the unweighted solution
+# Rounds of conjugate gradients, from the unweighted solution: of curves, of those of blocks, and of what is stored.
+_ROUGH, _MEDIUM, _FINE = 3, 10, 40
 # A sample that reaches no point with a weight stays near the unweighted solution.
 _RIDGE = 1e-4
-_BISECTIONS = 60
-# A sample must save this fraction of the squared range, of one texel of the lightmap: half float's rounding there.
-_LEAST_GAIN = 2.0**-24
-_WIDTHS = np.linspace(0.7, 1.5, 17)  # of T_p, over the square root of its number of samples
+# A bit must save this fraction of the squared range, of one texel of the lightmap: half float's rounding there.
+_LEAST_GAIN = 2.0**-24 / 48
 
 
 @dataclass(frozen=True)
@@ -89,114 +74,38 @@ def fit_tiles(grid: FineGrid, profile: Profile, seed: int, stages: Stages) -> At
     height, width = mesh.mask.shape
     rows, columns = tile_counts(height, width, profile.tile)
     bits = profile.budget * height * width * SOURCE_BITS
-    room = (bits - rows * columns * LUT_BITS) / COLOUR_BITS[profile.colour]
-    sizes = _sizes(profile)
-    if room < len(tiles.index) * min(nx * ny for nx, ny in sizes):
+    room = bits - rows * columns * LUT_BITS
+    sizes = sizes_of(profile)
+    if room < len(tiles.index) * min(size.bits for size in sizes):
         return None
     with stages("curves"):
-        stored = None if profile.colour == "half" else _round_trip(profile.colour)
-        error = curves(tiles, sizes, stored, stages.progress, stages.checkpoint)
+        error = curves(tiles, sizes, stages.progress, stages.checkpoint)
     with stages("allocate"):
         peak = float(np.ptp(mesh.filled[mesh.mask]))
         least = peak**2 * _LEAST_GAIN / (height * width)
-        packed = layout(error, np.array(sizes), room, least, profile.colour != "half")
+        packed = layout(error, sizes, room, least)
         if packed is None:
             return None
-        chosen, first, shape = packed
     with stages("solve"):
-        samples = solved(tiles, chosen)
+        samples = solved(tiles, sizes, packed.chosen)
     with stages("write"):
-        texels, lut = _composed(samples, tiles.index.cpu().numpy(), chosen, first, shape, (rows, columns))
-        textures = colour.quantise(texels, profile.colour)
+        (first, *second), lut = composed(samples, sizes, packed, tiles.index.cpu().numpy(), (rows, columns))
+        mixed = profile.colour == "mixed"
+        textures = colour.quantise(first[0], TEXELS if mixed else profile.colour, first[1], grid.device)
+        if mixed:
+            blocks = colour.quantise(second[0][0], BLOCKS, second[0][1], grid.device)
+            textures |= {"blocks": blocks["blocks"], "block_texels": blocks["texels"]}
+    chosen = [sizes[number] for number in packed.chosen]
     report = {
         "tiles": len(tiles.index),
         "of tiles": rows * columns,
-        "samples": int(chosen.prod(1).sum()),
-        "constant tiles": int((chosen.prod(1) == 1).sum()),
+        "samples": sum(size.nx * size.ny for size in chosen),
+        "constant tiles": sum(size.nx * size.ny == 1 for size in chosen),
     }
+    if mixed:
+        report["tiles of blocks"] = sum(size.second for size in chosen)
     settings = (mesh.name, mesh.source, profile, "tiles", profile.colour, height, width)
     return AtlasModel(*settings, **textures, lut=lut, report=report)
-
-
-def _sizes(profile: Profile) -> list[tuple[int, int]]:
-    """The sizes that a tile may have; where T_p is made of blocks, whole ones, so that no block has two tiles."""
-    if profile.colour == "half":
-        sides = range(1, profile.tile + 2)
-    else:
-        sides = range(BLOCK_SIDE, profile.tile + 1 + BLOCK_SIDE, BLOCK_SIDE)
-        sides = [side for side in sides if side <= 1 << SIDE_BITS]
-    return [(nx, ny) for ny in sides for nx in sides]
-
-
-def _round_trip(codec: str) -> Callable[[torch.Tensor], torch.Tensor]:
-    """Encoding and decoding of tiles [T, ny, nx, 3] whose sides are whole blocks."""
-
-    def stored(samples: torch.Tensor) -> torch.Tensor:
-        count, ny, nx, _ = samples.shape
-        _, decoded = colour.encode(samples.cpu().numpy().reshape(count * ny, nx, 3), codec)
-        return torch.from_numpy(decoded.reshape(count, ny, nx, 3)).to(samples)
-
-    return stored
-
-
-def layout(
-    error: np.ndarray, sizes: np.ndarray, room: float, least: float, blocks: bool
-) -> tuple[np.ndarray, np.ndarray, tuple[int, int]] | None:
-    """Allocates sizes whose rectangles fit in a T_p of a given number of texels, and places them.
-
-    Args:
-        error: float64 [sizes, T], `curves`.
-        sizes: int [sizes, 2], nx and ny.
-        room: Most texels of T_p.
-        least: As for `allocate`.
-        blocks: Whether T_p is made of blocks.
-
-    Returns:
-        The tiles' sizes, int [T, 2]; their first texels, int64 [T, 2]; rows and columns of T_p. None where not even
-        the smallest sizes fit.
-
-    Raises:
-        WlmError: T_p has more texels along a side than an entry of T_c can name.
-    """
-    cost, budget = sizes.prod(1).astype(np.float64), room
-    step, fewest = BLOCK_SIDE if blocks else 1, error.shape[1] * cost.min()
-    while True:
-        chosen = sizes[allocate(error, cost, budget, least)]
-        total = chosen.prod(1).sum()
-        best = None
-        for share in _WIDTHS:
-            width = max(int(chosen[:, 0].max()), -(-round(share * math.sqrt(total)) // step) * step)
-            first, height = place(chosen, width)
-            # No shelf may reach as far as the width allows.
-            width = int((first[:, 0] + chosen[:, 0]).max())
-            if best is None or width * height < best[0]:
-                best = width * height, first, (height, width)
-        area, first, shape = best
-        if max(shape) > MOST_SIZE:
-            raise WlmError(f"budget: T_p would have {max(shape)} texels along a side; tiles allow {MOST_SIZE}")
-        if area <= room:
-            return chosen, first, shape
-        if total <= fewest:
-            return None
-        # The area lost between shelves is about the same next time.
-        budget = min(budget, total) * min(0.999 * room / area, 0.99)
-
-
-def _composed(
-    samples: list[np.ndarray],
-    index: np.ndarray,
-    sizes: np.ndarray,
-    first: np.ndarray,
-    shape: tuple[int, int],
-    counts: tuple[int, int],
-) -> tuple[np.ndarray, np.ndarray]:
-    """T_p, float32, and T_c. Tiles without a weight show the texture's first texel."""
-    texels = np.zeros((*shape, 3), np.float32)
-    for values, (x, y), (nx, ny) in zip(samples, first.tolist(), sizes.tolist(), strict=True):
-        texels[y : y + ny, x : x + nx] = values
-    entry_first, entry_size = np.zeros((counts[0] * counts[1], 2), int), np.ones((counts[0] * counts[1], 2), int)
-    entry_first[index], entry_size[index] = first, sizes
-    return texels.clip(max=HALF_MAX), pack_entries(entry_first, entry_size).reshape(*counts, 2)
 
 
 def cut(image: np.ndarray, weight: np.ndarray, size: int, device: str) -> Tiles:
@@ -284,34 +193,59 @@ def solve(tiles: Tiles, nx: int, ny: int, rounds: int = _FINE) -> torch.Tensor:
     Returns:
         float [T, ny, nx, 3].
     """
-    light, weight = tiles.light, tiles.weight[:, None]
-    device, points = str(light.device), _side(tiles)
-    ax, ay = (linear(n, points, device) for n in (nx, ny))
-    # One large product of matrices is faster than two small ones per tile.
-    both = torch.kron(ay, ax)
-    start = light @ torch.kron(torch.linalg.pinv(ay), torch.linalg.pinv(ax)).T
-    weight = weight / weight.mean(2, keepdim=True)
-    ridge = _RIDGE * points**2 / (nx * ny)
-    diagonal = weight @ both + ridge
+    grid, weight = _Grid(tiles, nx, ny), tiles.weight[:, None] / tiles.weight.mean(1)[:, None, None]
+    weight, light = grid.turned(weight), grid.turned(tiles.light)
+    ridge = _RIDGE * weight.shape[-1] ** 2 / (nx * ny)
+    diagonal = grid.gathered(weight) + ridge
+    start = grid.gathered(light, inverse=True)
     # In terms of the difference to the start, towards which the ridge pulls.
     change = torch.zeros_like(start)
-    residual = ((light - start @ both.T) * weight) @ both
+    residual = grid.gathered((light - grid.spread(start)) * weight)
     preconditioned = residual / diagonal
-    direction, energy = preconditioned, (residual * preconditioned).sum(2, keepdim=True)
+    direction, energy = preconditioned, (residual * preconditioned).sum((2, 3), keepdim=True)
     for _ in range(rounds):
-        image = ((direction @ both.T) * weight) @ both + ridge * direction
-        step = energy / (direction * image).sum(2, keepdim=True).clamp(min=1e-30)
+        image = grid.gathered(grid.spread(direction) * weight) + ridge * direction
+        step = energy / (direction * image).sum((2, 3), keepdim=True).clamp(min=1e-30)
         change = change + step * direction
         residual = residual - step * image
         preconditioned = residual / diagonal
-        before, energy = energy, (residual * preconditioned).sum(2, keepdim=True)
+        before, energy = energy, (residual * preconditioned).sum((2, 3), keepdim=True)
         direction = preconditioned + energy / before.clamp(min=1e-30) * direction
-    return (start + change).view(-1, 3, ny, nx).permute(0, 2, 3, 1)
+    return (start + change).permute(0, 2, 3, 1)
 
 
-def _side(tiles: Tiles) -> int:
-    """Points along a tile."""
-    return SUPERSAMPLING * tiles.size
+class _Grid:
+    """Interpolation from nx x ny samples to the points of tiles, axis by axis; images of points are turned: x, then y.
+
+    Args:
+        tiles: T of them.
+        nx, ny: Samples along x and y.
+    """
+
+    def __init__(self, tiles: Tiles, nx: int, ny: int) -> None:
+        self.points = SUPERSAMPLING * tiles.size
+        device = str(tiles.light.device)
+        self.across, self.down = (linear(samples, self.points, device) for samples in (nx, ny))
+
+    def turned(self, values: torch.Tensor) -> torch.Tensor:
+        """Values [T, C, m * m], row by row, as [T, C, m, m], column by column."""
+        return values.unflatten(2, (self.points, self.points)).transpose(2, 3).contiguous()
+
+    def spread(self, samples: torch.Tensor) -> torch.Tensor:
+        """Samples [T, C, ny, nx] at the points."""
+        return (samples @ self.across.T).transpose(2, 3) @ self.down.T
+
+    def gathered(self, values: torch.Tensor, inverse: bool = False) -> torch.Tensor:
+        """Values at the points, taken back to the samples [T, C, ny, nx] by the transpose, or the pseudoinverse."""
+        across, down = self.across, self.down
+        if inverse:
+            across, down = torch.linalg.pinv(across).T, torch.linalg.pinv(down).T
+        return (values @ down).transpose(2, 3) @ across
+
+    def weights(self, weight: torch.Tensor) -> torch.Tensor:
+        """How much each sample's own squared error counts [T, ny, nx], of the points' weights [T, m * m]."""
+        values = self.turned(weight[:, None])
+        return ((values @ self.down.square()).transpose(2, 3) @ self.across.square())[:, 0]
 
 
 def errors(tiles: Tiles, samples: torch.Tensor) -> torch.Tensor:
@@ -321,18 +255,15 @@ def errors(tiles: Tiles, samples: torch.Tensor) -> torch.Tensor:
         tiles: T of them.
         samples: float [T, ny, nx, 3].
     """
-    count, ny, nx, _ = samples.shape
-    device, points = str(samples.device), _side(tiles)
-    both = torch.kron(linear(ny, points, device), linear(nx, points, device))
-    interpolated = samples.permute(0, 3, 1, 2).reshape(count, 3, ny * nx) @ both.T
-    squared = ((interpolated - tiles.light) ** 2).mean(1) * tiles.weight
-    return squared.double().sum(1)
+    grid = _Grid(tiles, samples.shape[2], samples.shape[1])
+    interpolated = grid.spread(samples.permute(0, 3, 1, 2))
+    squared = (interpolated - grid.turned(tiles.light)).square().mean(1, keepdim=True)
+    return (squared * grid.turned(tiles.weight[:, None])).double().sum((1, 2, 3))
 
 
 def curves(
     tiles: Tiles,
-    sizes: list[tuple[int, int]],
-    stored: Callable[[torch.Tensor], torch.Tensor] | None = None,
+    sizes: list[Size],
     progress: OnProgress | None = None,
     checkpoint: Checkpoint | None = None,
 ) -> np.ndarray:
@@ -340,12 +271,10 @@ def curves(
 
     Args:
         tiles: T of them.
-        sizes: nx and ny.
-        stored: Maps samples [T, ny, nx, 3] to their values in the file; None: they stay.
+        sizes: The sizes; an error is that of the samples as the size's format stores them.
         progress: Called with the sizes done.
         checkpoint: Where the errors of the sizes done are kept, as batch 0.
     """
-    rounds = _ROUGH if stored is None else _FINE  # a codec's error deserves an exact solution
     result, meter = np.empty((len(sizes), len(tiles.index))), Meter(progress, "curves", len(sizes))
     begin = 0
 
@@ -357,7 +286,7 @@ def curves(
 
     if checkpoint is not None:
         checkpoint.restore(0, load)
-    for i, (nx, ny) in enumerate(sizes[begin:], begin):
+    for i, size in enumerate(sizes[begin:], begin):
         if meter.due(i):
             try:
                 meter.report(i)
@@ -365,32 +294,36 @@ def curves(
                 if checkpoint is not None:
                     checkpoint.save_running(0, {"error": result[:i]})
                 raise
+        rounds = _ROUGH if size.step == 1 else _MEDIUM
         for part, piece in _pieces(tiles):
-            samples = solve(piece, nx, ny, rounds).clamp(min=0.0)
-            result[i, part] = errors(piece, samples if stored is None else stored(samples)).cpu().numpy()
+            samples = solve(piece, size.nx, size.ny, rounds).clamp(min=0.0)
+            weight = _Grid(piece, size.nx, size.ny).weights(piece.weight)
+            result[i, part] = errors(piece, colour.stored(samples, weight, size.format)).cpu().numpy()
         if checkpoint is not None and checkpoint.due():
             checkpoint.save_running(0, {"error": result[: i + 1]})
     return result
 
 
-def solved(tiles: Tiles, sizes: np.ndarray) -> list[np.ndarray]:
+def solved(tiles: Tiles, sizes: list[Size], chosen: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
     """Solves for the samples of every tile at its own size.
 
     Args:
         tiles: T of them.
-        sizes: int [T, 2], nx and ny.
+        sizes: The sizes.
+        chosen: int [T], each tile's number in them.
 
     Returns:
-        For each tile float32 [ny, nx, 3], not negative.
+        For each tile float32 [ny, nx, 3], not negative, and the weights of the samples' squared errors [ny, nx].
     """
-    result: list[np.ndarray] = [np.empty(0)] * len(sizes)
-    for nx, ny in np.unique(sizes, axis=0).tolist():
-        chosen = np.flatnonzero((sizes == (nx, ny)).all(1))
-        rows = torch.from_numpy(chosen).to(tiles.index.device)
+    result: list[tuple[np.ndarray, np.ndarray]] = [(np.empty(0), np.empty(0))] * len(chosen)
+    for number in np.unique(chosen).tolist():
+        size, members = sizes[number], np.flatnonzero(chosen == number)
+        rows = torch.from_numpy(members).to(tiles.index.device)
         group = Tiles(tiles.index[rows], tiles.light[rows], tiles.weight[rows], tiles.size)
         for part, piece in _pieces(group):
-            values = solve(piece, nx, ny).clamp(min=0.0).cpu().numpy()
-            for row, samples in zip(chosen[part], values, strict=True):
+            values = solve(piece, size.nx, size.ny).clamp(min=0.0).cpu().numpy()
+            weight = _Grid(piece, size.nx, size.ny).weights(piece.weight).cpu().numpy()
+            for row, samples in zip(members[part], zip(values, weight, strict=True), strict=True):
                 result[row] = samples
     return result
 
@@ -399,54 +332,3 @@ def _pieces(tiles: Tiles) -> Iterator[tuple[slice, Tiles]]:
     for first in range(0, len(tiles.index), _AT_ONCE):
         part = slice(first, first + _AT_ONCE)
         yield part, Tiles(tiles.index[part], tiles.light[part], tiles.weight[part], tiles.size)
-
-
-def allocate(error: np.ndarray, cost: np.ndarray, budget: float, least: float) -> np.ndarray:
-    """Chooses the size of each tile for the least total error within a budget.
-
-    Args:
-        error: [sizes, T].
-        cost: [sizes], samples of each size.
-        budget: Samples of all tiles.
-        least: Error that a sample must save to be allocated.
-
-    Returns:
-        int [T], numbers of sizes. The cheapest of all where even they are over the budget.
-    """
-
-    def best(gain: float) -> np.ndarray:
-        return (error + gain * cost[:, None]).argmin(0)
-
-    chosen = best(least)
-    if cost[chosen].sum() <= budget:
-        return chosen
-    low, high = least, max(least, error.max() + 1e-30)  # at the high end no sample pays
-    for _ in range(_BISECTIONS):
-        middle = np.sqrt(low * high) if low > 0 else high * 1e-6
-        if cost[best(middle)].sum() > budget:
-            low = middle
-        else:
-            high = middle
-    return best(high)
-
-
-def place(sizes: np.ndarray, width: int) -> tuple[np.ndarray, int]:
-    """Packs rectangles on shelves of one width, the highest first; each shelf is as high as its first rectangle.
-
-    Args:
-        sizes: int [R, 2], width and height of each.
-        width: Of the shelves, at least that of the widest.
-
-    Returns:
-        int64 [R, 2], x and y of each; and the height of all shelves.
-    """
-    first = np.zeros((len(sizes), 2), np.int64)
-    x = y = height = 0
-    order = np.lexsort((-sizes[:, 0], -sizes[:, 1]))
-    for i, (w, h) in zip(order.tolist(), sizes[order].tolist(), strict=True):
-        if x + w > width:
-            x, y, height = 0, y + height, 0
-        height = height or h
-        first[i] = x, y
-        x += w
-    return first, y + height

@@ -15,6 +15,9 @@ _BORDER = 2  # cells of the fine grid: one texel
 _RESOLUTION = 768  # pixels along a side of a view that visibility is counted in
 _POINTS = 4  # random points of the surface per cell, where there are no views
 _POINTS_AT_ONCE = 1 << 20
+# Relative error is that over the light and this share of what all but a hundredth of the texels stay below: darker
+# light is black on a screen that shows the brighter.
+_DARK, _BRIGHT = 0.05, 99.0
 
 
 class FineGrid:
@@ -49,6 +52,21 @@ class FineGrid:
         window = 2 * _BORDER + 1
         return maximum_filter(chart, window) != minimum_filter(chart, window)
 
+    @cached_property
+    def texels(self) -> np.ndarray:
+        """bool [2 H, 2 W], the quarters of the texels of the mask whose own centres a triangle holds."""
+        mesh = self.mesh
+        inside = covered_texels(mesh.uv, mesh.triangle[mesh.active], *mesh.mask.shape) > 0
+        return np.repeat(np.repeat(inside & mesh.mask, 2, 0), 2, 1)
+
+    @cached_property
+    def relative(self) -> np.ndarray:
+        """float64 [2 H, 2 W], what a squared error of linear light counts as one of relative light, up to a factor."""
+        light = self.mesh.filled.mean(2, dtype=np.float64)
+        dark = _DARK * float(np.percentile(light[self.mesh.mask], _BRIGHT))
+        weight = 1.0 / np.square(light + (dark or 1.0))
+        return np.repeat(np.repeat(weight, 2, 0), 2, 1)
+
 
 def weights(grid: FineGrid, profile: Profile, seed: int) -> np.ndarray:
     """How much each cell counts: the pixels that show it in random views, and a little for those that none shows.
@@ -76,13 +94,18 @@ def spread(grid: FineGrid, visible: np.ndarray, profile: Profile, mean: float | 
     Returns:
         As `weights`.
     """
-    used = grid.covered | (visible > 0)
+    # A texel is read at its centre too, of which a small triangle may hold no quarter's.
+    used = grid.covered | grid.texels | (visible > 0)
     if not used.any():  # the mesh is smaller than a cell, and no pixel shows it
         used = np.repeat(np.repeat(grid.mesh.mask, 2, 0), 2, 1)
     if mean is None:
         mean = visible[used].mean() or 1.0
     result = np.where(used, visible + profile.unseen * mean, 0.0)
-    return np.where(grid.border, profile.border * result, result)
+    result = np.where(grid.border, profile.border * result, result)
+    if profile.relative:
+        share = profile.relative * result.sum() / (result * grid.relative).sum()
+        result = result * (1.0 - profile.relative + share * grid.relative)
+    return result
 
 
 def _seen(grid: FineGrid, count: int, seed: int) -> np.ndarray:

@@ -4,7 +4,7 @@ For each lightmap of each mesh these kinds of rows:
 
 - method "ours", one row for each profile: the file, the compression with the writing, the error as the mesh is seen
   from around, and the time to read a million random points of its surface. In a full run also the first profile at the
-  bits that the paper's method came to.
+  bits that the paper's method came to, and at CRs of 92.5% and 95%.
 - method "lightmap": the time to read the same points from the lightmap itself, in half floats.
 - the rivals of `wlm.baselines.atlas` at the bits of the first profile; in a full run also at those of the others.
   Bits are those of eq. 9 of lightmap-uv-clustering-cascade, which leave out UVs and headers; a rival's bytes are these
@@ -45,17 +45,19 @@ from wlm.bench.runner import Bench, Note, exact_errors
 from wlm.errors import WlmError
 from wlm.texels import fill_gaps
 
-PROFILES = ("standard", "bc6h", "astc", "compact", "cascade", "paper")
+PROFILES = ("standard", "half", "bc6h", "astc", "compact", "cascade", "paper")
 """Profiles of a run; the first has the bits of the first cascade too."""
 
 _RIVALS = {
     "downsampling": "downsampling",
     "downsampling bilinear": "downsampling bilinear",
     "BC6H": "bc6h",
+    "BC6H, our encoder": "bc6h own",
     "ASTC": "astc",
     "single colour": "single colour",
 }
-_HELD_TO = ("standard", "astc", "compact")  # profiles whose bits rivals get when they run alone
+_SMALLER = (0.925, 0.95)  # CRs that the first profile is measured at too
+_HELD_TO = ("standard", "standard, CR 92.5%", "standard, CR 95%", "astc")  # whose bits rivals get when they run alone
 _FIRST = "downsampling"  # what everything is compared with
 _VIEWS, _RESOLUTION = 50, 512  # section 4.1.4; the paper doesn't say at which resolution it scores
 _QUICK_VIEWS, _QUICK_RESOLUTION = 8, 256
@@ -63,8 +65,9 @@ _QUICK_CASCADE = {"steps": 30, "resolution": 256}
 _POINTS = 1_000_000
 _CHECKED = 1 << 17  # of them, against float64
 _SAME = 0.01  # shares of bits that differ by less are equal
-_AVERAGED = ("bytes", "bpp", "compression_ratio", "encode_seconds", "decode_ms", "psnr", "one_minus_ssim", "seam_ratio")
-_RANGED = ("psnr", "one_minus_ssim", "seam_ratio")  # with their least and most
+_SCORES = ("psnr", "psnr_worst", "texel_psnr", "tone_psnr", "one_minus_ssim", "flip", "seam_ratio")
+_RANGED = ("psnr", "texel_psnr", "tone_psnr", "one_minus_ssim", "flip", "seam_ratio")  # with their least and most
+_AVERAGED = ("bytes", "bpp", "compression_ratio", "encode_seconds", "decode_ms", *_RANGED)
 
 PANELS = (Panel("bpp", "psnr", ("ours", _FIRST, "BC6H", "ASTC")), Panel("decode_ms", "max_error", ("ours", "lightmap")))
 """What a plot of the rows shows: quality against size, of all but the weakest rivals, whose names would hide the rest;
@@ -163,7 +166,8 @@ def run_rows(
         lightmaps: At least one.
         profiles: At least one; the rivals have the bits of the first.
         views, resolution: Cameras of the scores, and their pixels along a side.
-        whole: With the first profile at the bits of a cascade, and rivals at the bits of all profiles.
+        whole: With the first profile at the bits of a cascade and at the CRs of `_SMALLER`, and rivals at the bits of
+            all profiles.
         methods: The rivals.
         points: Read by a timed decode.
         repeats: As for `Bench`.
@@ -177,7 +181,8 @@ def run_rows(
     for lightmap in lightmaps:
         bench = _AtlasBench(lightmap, device, progress, points, repeats)
         entries = bench.ours(profiles, whole)
-        shares = {entry.row.option: _share(entry.row) for entry in entries[: len(profiles)]}
+        named = {profile.name for profile in profiles} | {_smaller_name(profiles[0], cr) for cr in _SMALLER}
+        shares = {entry.row.option: _share(entry.row) for entry in entries if entry.model and entry.row.option in named}
         if lightmap is lightmaps[0]:
             entries += bench.tuned(entries)
         entries.append(bench.original(entries[0].model))
@@ -190,6 +195,10 @@ def run_rows(
 def plotted(rows: Sequence[Row]) -> list[Row]:
     """The rows that a plot shows: the means, or all where there are none."""
     return [row for row in rows if row.scene.startswith(MEAN)] or list(rows)
+
+
+def _smaller_name(profile: Profile, cr: float) -> str:
+    return f"{profile.name}, CR {100 * cr:g}%"
 
 
 def _share(row: Row) -> float:
@@ -225,13 +234,17 @@ class _AtlasBench(Bench):
         self.triangle, self.weight = surface_points(self.mesh, points, np.random.default_rng(0))
 
     def ours(self, profiles: Sequence[Profile], whole: bool) -> list[_Entry]:
-        """Our profiles, and the first of them at the bits of the first cascade."""
+        """Our profiles, the first of them smaller, and at the bits of the first cascade."""
         entries = [self.entry(profile, profile.name) for profile in profiles]
+        if not whole or profiles[0].method != "tiles":
+            return entries
+        budgets = {_smaller_name(profiles[0], cr): 1.0 - cr for cr in _SMALLER}
         cascade = next((entry for entry in entries if entry.model.profile.method == "cascade"), None)
-        if whole and cascade is not None and profiles[0].method == "tiles":
-            option = f"{profiles[0].name}, bits of {cascade.row.option}"
+        if cascade is not None:
+            budgets[f"{profiles[0].name}, bits of {cascade.row.option}"] = _share(cascade.row)
+        for option, budget in budgets.items():
             try:
-                entries.append(self.entry(profiles[0].model_copy(update={"budget": _share(cascade.row)}), option))
+                entries.append(self.entry(profiles[0].model_copy(update={"budget": budget}), option))
             except WlmError as error:  # no room for a table
                 entries.append(_Entry(self.missing_row("ours", option, error)))
         return entries
@@ -292,6 +305,7 @@ class _AtlasBench(Bench):
             colour="half",
             texels=fill_gaps(self.mesh.lightmap, self.mesh.mask).astype(np.float16),
             blocks=np.empty((0, 16), np.uint8),
+            block_texels=np.empty((0, 0, 3), np.float16),
             lut=np.empty((0, 0, 2), np.uint16),
             uv=np.empty((0, 3, 2), np.float32),
         )
@@ -357,8 +371,7 @@ class _AtlasBench(Bench):
         reports = compare(self.mesh, decoders, views=views, resolution=resolution, device=self.device)
         rows = [entry.row for entry in entries]
         for i, report in reports.items():
-            names = ("psnr", "psnr_worst", "texel_psnr", "one_minus_ssim", "seam_ratio")
-            rows[int(i)] = rows[int(i)].with_figures(**{name: getattr(report, name) for name in names})
+            rows[int(i)] = rows[int(i)].with_figures(**{name: getattr(report, name) for name in _SCORES})
         return rows
 
     def _decode(self, model: AtlasModel) -> tuple[Callable[[], object], dict[str, float]]:

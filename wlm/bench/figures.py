@@ -53,6 +53,11 @@ TABLES: dict[str, dict[str, Figure]] = {
         "psnr_max": Figure("most", "dB", ".2f"),
         "psnr_worst": Figure("worst view", "dB", ".2f"),
         "texel_psnr": Figure("texels", "dB", ".2f"),
+        "texel_psnr_min": Figure("least", "dB", ".2f"),
+        "texel_psnr_max": Figure("most", "dB", ".2f"),
+        "tone_psnr": Figure("tone mapped", "dB", ".2f"),  # as a screen shows it, `wlm.atlas.display`
+        "tone_psnr_min": Figure("least", "dB", ".2f"),
+        "tone_psnr_max": Figure("most", "dB", ".2f"),
         "irradiance_psnr": Figure("irradiance", "dB", ".2f"),
         "nearest_psnr": Figure("nearest", "dB", ".2f"),  # of uncompressed probes, as the next two
         "distance_psnr": Figure("by distance", "dB", ".2f"),
@@ -78,6 +83,8 @@ TABLES: dict[str, dict[str, Figure]] = {
         "one_minus_ssim_min": Figure("least", form=".2g"),
         "one_minus_ssim_max": Figure("most", form=".2g"),
         "flip": Figure("FLIP", form=".4f"),
+        "flip_min": Figure("least", form=".4f"),
+        "flip_max": Figure("most", form=".4f"),
         "seam_ratio": Figure("seams", form=".2f"),  # error at charts' borders over that elsewhere
         "seam_ratio_min": Figure("least", form=".2f"),
         "seam_ratio_max": Figure("most", form=".2f"),

@@ -54,12 +54,14 @@ def compress(
     ] = None,
     flip: Annotated[bool, typer.Option("--flip", help="The lightmap is upside down: its top row is v = 1.")] = False,
     profile: Annotated[
-        str, typer.Option(help="standard, bc6h, astc, compact, cascade, paper, or a YAML file.")
+        str, typer.Option(help="standard, half, bc6h, astc, compact, cascade, paper, or a YAML file.")
     ] = "standard",
     budget: Annotated[
         float | None, typer.Option(help="Bits of both textures as a fraction of the lightmap's at 48 per texel.")
     ] = None,
-    colour: Annotated[str | None, typer.Option(help="How the colour texture is stored: half, bc6h or astc.")] = None,
+    colour: Annotated[
+        str | None, typer.Option(help="How the colour texture is stored: half, rgb9e5, bc6h, astc or mixed.")
+    ] = None,
     views: Annotated[
         int | None, typer.Option(help="Random views; a texel counts by the pixels that show it. 0: by its area.")
     ] = None,
@@ -118,7 +120,7 @@ def compress(
         rows.add_row(escape(path.name), f"{path.stat().st_size:,}")
     rows.add_section()
     rows.add_row("method", model.method)
-    rows.add_row("CR of both textures", f"{model.compression_ratio:.2%}")
+    rows.add_row("CR of the textures", f"{model.compression_ratio:.2%}")
     rows.add_row(f"CR of {MODEL_FILE}", f"{disk_ratio((output / MODEL_FILE).stat().st_size, mesh.mask.shape):.2%}")
     rows.add_row("seconds", f"{sum(model.report['seconds'].values()):.1f}")
     show(rows)
@@ -201,6 +203,8 @@ _ROWS = (
     ("1 - SSIM", "one_minus_ssim", ".5f"),
     ("error at seams / elsewhere", "seam_ratio", ".2f"),
     ("PSNR dB of texels", "texel_psnr", ".2f"),
+    ("PSNR dB, tone mapped", "tone_psnr", ".2f"),
+    ("FLIP", "flip", ".4f"),
 )
 
 
@@ -283,11 +287,12 @@ def info(
     rows.add_row("name", escape(facts["name"]))
     rows.add_row("method", facts["method"])
     rows.add_row("bytes", f"{facts['bytes']:,}")
-    for label, key in (("lightmap", "size"), ("colour texture", "colour_size"), ("table", "lut_size")):
+    sizes = {"lightmap": "size", "colour texture": "colour_size", "its blocks": "block_size", "table": "lut_size"}
+    for label, key in sizes.items():
         rows.add_row(label, "x".join(map(str, facts[key])) if facts[key][0] else "none")
     rows.add_row("colour stored as", facts["colour"])
     rows.add_row("UVs", f"new, of {facts['new_uvs']:,} triangles" if facts["new_uvs"] else "the mesh's own")
-    rows.add_row("CR of both textures", f"{facts['cr']:.2%}")
+    rows.add_row("CR of the textures", f"{facts['cr']:.2%}")
     rows.add_row("CR on disk", f"{facts['cr_disk']:.2%}")
     rows.add_row("source", escape(facts["source"]))
     rows.add_row("profile", escape(facts["profile"]["name"]))

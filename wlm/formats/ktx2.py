@@ -20,10 +20,11 @@ VK_FORMATS = {
     "R16G16_SFLOAT": 83,
     "R16G16B16_SFLOAT": 90,
     "R16G16B16A16_SFLOAT": 97,
+    "E5B9G9R9_UFLOAT_PACK32": 123,
     "BC6H_UFLOAT_BLOCK": 143,
     "ASTC_4x4_SFLOAT_BLOCK": 1000066000,
 }
-"""The formats that can be written and their Vulkan numbers: 16 bits a channel, or 16 bytes a block of 4 x 4 texels."""
+"""The formats that can be written and their Vulkan numbers: 16 bits a channel, RGB9E5, or 16 bytes a block of 4 x 4."""
 
 _IDENTIFIER = b"\xabKTX 20\xbb\r\n\x1a\n"
 # Identifier; format, bytes of a channel, width, height, depth, layers, faces, levels, supercompression; offset and
@@ -46,7 +47,10 @@ _CHANNELS = {
 _RGBSDA, _BC6H, _ASTC = 1, 133, 162  # colour models
 _CHANNEL_IDS = (0, 1, 2, 15)  # red, green, blue, alpha
 _VERSION, _BT709, _LINEAR = 2, 1, 1
-_FLOAT, _SIGNED = 0x80, 0x40  # a sample's qualifiers
+_FLOAT, _SIGNED, _EXPONENT = 0x80, 0x40, 0x20  # a sample's qualifiers
+_SHARED = "E5B9G9R9_UFLOAT_PACK32"
+# Its mantissa that stands for 1 at the exponent's middle, and the exponent's middle and most (section 5.21).
+_SHARED_UNITY, _SHARED_MIDDLE, _SHARED_MOST = 8448, 15, 31
 
 
 def write_ktx2(path: str | os.PathLike[str], data: bytes, width: int, height: int, fmt: str, depth: int = 0) -> int:
@@ -55,7 +59,7 @@ def write_ktx2(path: str | os.PathLike[str], data: bytes, width: int, height: in
     Args:
         path: The file to write; its folder must exist.
         data: Rows from the top: texels of 16-bit channels, little-endian, or ceil(width / 4) * ceil(height / 4)
-            blocks of 16 bytes.
+            blocks of 16 bytes; of RGB9E5 one word of 32 bits a texel.
         width: Texels, 1 to 16384.
         height: Texels, 1 to 16384.
         fmt: A key of `VK_FORMATS`.
@@ -86,7 +90,7 @@ def write_ktx2(path: str | os.PathLike[str], data: bytes, width: int, height: in
     header = _HEADER.pack(
         _IDENTIFIER,
         VK_FORMATS[fmt],
-        2 if fmt in _CHANNELS else 1,
+        4 if fmt == _SHARED else 2 if fmt in _CHANNELS else 1,
         width,
         height,
         *(depth, 0, 1, 1, 0),
@@ -127,11 +131,13 @@ def read_half_volume(path: str | os.PathLike[str]) -> np.ndarray:
 
 
 def _texel_bytes(fmt: str) -> int:
+    if fmt == _SHARED:
+        return 4
     return 2 * _CHANNELS[fmt] if fmt in _CHANNELS else _BLOCK_BYTES
 
 
 def _size(fmt: str, width: int, height: int) -> int:
-    if fmt in _CHANNELS:
+    if fmt in _CHANNELS or fmt == _SHARED:
         return width * height * _texel_bytes(fmt)
     return -(-width // 4) * -(-height // 4) * _BLOCK_BYTES
 
@@ -144,6 +150,13 @@ def _pair(key: str, value: str) -> bytes:
 
 def _descriptor(fmt: str) -> bytes:
     """The data format descriptor: its total length and one basic descriptor block."""
+    if fmt == _SHARED:
+        # The exponent is named once for each channel.
+        samples = []
+        for i, channel in enumerate(_CHANNEL_IDS[:3]):
+            samples.append(struct.pack("<H2B4x2I", 9 * i, 8, channel, 0, _SHARED_UNITY))
+            samples.append(struct.pack("<H2B4x2I", 27, 4, channel | _EXPONENT, _SHARED_MIDDLE, _SHARED_MOST))
+        return _basic_block(_RGBSDA, 0, 4, samples)
     if fmt in _CHANNELS:
         model, side = _RGBSDA, 0
         samples = [(16 * i, 16, channel) for i, channel in enumerate(_CHANNEL_IDS[: _CHANNELS[fmt]])]
@@ -157,10 +170,16 @@ def _descriptor(fmt: str) -> bytes:
         unsigned = "UFLOAT" in fmt
         qualifiers = _FLOAT if unsigned else _FLOAT | _SIGNED
         lowest, highest = struct.pack("<f", 0.0 if unsigned else -1.0), struct.pack("<f", 1.0)
+    packed = [
+        struct.pack("<H2B4x", offset, bits - 1, channel | qualifiers) + lowest + highest
+        for offset, bits, channel in samples
+    ]
+    return _basic_block(model, side, _texel_bytes(fmt), packed)
+
+
+def _basic_block(model: int, side: int, texel_bytes: int, samples: list[bytes]) -> bytes:
     size = 24 + 16 * len(samples)
     # Vendor and type; version and size; model, primaries, transfer and flags; the block's sides; bytes of a plane.
-    head = (0, _VERSION, size, model, _BT709, _LINEAR, 0, side, side, 0, 0, _texel_bytes(fmt))
-    block = struct.pack("<I 2H 4B 4B B7x", *head)
-    for offset, bits, channel in samples:
-        block += struct.pack("<H2B4x", offset, bits - 1, channel | qualifiers) + lowest + highest
+    head = (0, _VERSION, size, model, _BT709, _LINEAR, 0, side, side, 0, 0, texel_bytes)
+    block = struct.pack("<I 2H 4B 4B B7x", *head) + b"".join(samples)
     return struct.pack("<I", 4 + size) + block

@@ -84,7 +84,7 @@ class _AtlasScene(SurfaceScene):
         return self.light
 
     def tile_colours(self) -> np.ndarray:
-        first, size = unpack_entries(self.model.lut)
+        _, size, _ = unpack_entries(self.model.lut, self.model.colour)
         side = self.model.profile.tile
         share = size.prod(-1) / (side + 1) ** 2
         rows, columns = (
@@ -103,8 +103,10 @@ class _AtlasScene(SurfaceScene):
         y, x = (
             min(place // side, count - 1) for place, count in zip((row, column), self.model.lut.shape, strict=False)
         )
-        (left, top), (wide, high) = (part[y, x] for part in unpack_entries(self.model.lut))
-        return f"tile {x}, {y}: {wide} × {high} texels at {left}, {top}" + f"   {outside}" * bool(outside)
+        entries = unpack_entries(self.model.lut, self.model.colour)
+        (left, top), (wide, high), (blocks, _) = (part[y, x] for part in entries)
+        text = f"tile {x}, {y}: {wide} × {high} texels{' of blocks' * bool(blocks)} at {left}, {top}"
+        return text + f"   {outside}" * bool(outside)
 
     def caption(self, state: State) -> str:
         text = f"{self.width} × {self.height}, {self.note}"

@@ -228,7 +228,13 @@ def _atlases(paths: Sequence[Path], original: _Path | None, device: str, progres
             atlas.evaluate(each.model, mesh, **options, progress=_stage(progress, name))
             for each, mesh, name in zip(outputs, inputs, "AB", strict=True)
         ]
-        names = {"PSNR of views, dB": "psnr", "PSNR of texels, dB": "texel_psnr", "1 - SSIM": "one_minus_ssim"}
+        names = {
+            "PSNR of views, dB": "psnr",
+            "PSNR of texels, dB": "texel_psnr",
+            "PSNR tone mapped, dB": "tone_psnr",
+            "1 - SSIM": "one_minus_ssim",
+            "FLIP": "flip",
+        }
         scores = {title: tuple(getattr(report, name) for report in reports) for title, name in names.items()}
         pictures["original"] = inputs[0].lightmap * meshes[0].mask[..., None]
     facts = _facts([output.folder / MODEL_FILE for output in outputs], [output.model for output in outputs])

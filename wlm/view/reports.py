@@ -145,6 +145,8 @@ def atlas_report(
         ("1 - SSIM", _number(report.one_minus_ssim, ".5f")),
         ("error at seams / elsewhere", _number(report.seam_ratio, ".2f")),
         ("PSNR of texels", _number(report.texel_psnr, ".2f", "dB")),
+        ("PSNR in views, tone mapped", _number(report.tone_psnr, ".2f", "dB")),
+        ("FLIP", _number(report.flip, ".4f")),
         ("saved (eq. 9)", _number(100 * report.cr, ".2f", "%")),
         ("saved on disk", _number(100 * report.cr_disk, ".2f", "%")),
         ("views that see the mesh", f"{report.views}"),

@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 
 from wlm.atlas.exporter import geometry, read_folder
-from wlm.atlas.model import SIDE_BITS
+from wlm.atlas.model import BLOCK_SIDE, FIRST_BLOCK_CODE, SIDE_BITS, AtlasModel
 from wlm.atlas.shader import atlas_glsl
 from wlm.errors import WlmError
 from wlm.formats.geometry import Geometry
@@ -17,7 +17,7 @@ from wlm.formats.shared_exponent import pack_rgb9e5
 from wlm.texels import exposure, fill_gaps
 from wlm.web.page import Page, pack_triangles
 
-_FORMATS = {"half": "half floats", "bc6h": "BC6H", "astc": "ASTC"}
+_FORMATS = {"half": "half floats", "rgb9e5": "RGB9E5", "bc6h": "BC6H", "astc": "ASTC", "mixed": "RGB9E5"}
 
 
 def folder_page(
@@ -43,6 +43,8 @@ def folder_page(
     texels = np.ascontiguousarray(model.texels, np.float16)
     arrays, box = pack_triangles(drawn, up)
     arrays["colour"] = texels
+    if model.colour == "mixed":
+        arrays["blocks"] = np.ascontiguousarray(model.block_texels, np.float16)
     if len(model.uv):
         arrays["coordinate"] = model.uv[mesh.active].reshape(-1, 2).astype(np.float32)
     if model.method != "plain":
@@ -51,13 +53,16 @@ def folder_page(
         "width": model.width,
         "height": model.height,
         "shader": atlas_glsl(model),
-        "exposure": exposure(texels.astype(np.float32)),
+        "exposure": exposure(_all_texels(model)),
         "atlas": {
             "method": model.method,
             "colour": texels.shape[1::-1],
+            "blocks": model.block_texels.shape[1::-1],
             "lut": model.lut.shape[1::-1],
             "tile": model.profile.tile,
             "size_bits": SIDE_BITS,
+            "block_side": BLOCK_SIDE,
+            "first_block_code": FIRST_BLOCK_CODE if model.colour == "mixed" else 1 << SIDE_BITS,
         },
         **box,
     }
@@ -81,4 +86,12 @@ def folder_page(
         ("triangles", f"{len(triangles):,}"),
         ("profile", model.profile.name),
     ]
+    if model.colour == "mixed":
+        height, width = model.block_texels.shape[:2]
+        figures.insert(4, ("its blocks", f"{width} × {height}, BC6H"))
     return Page("atlas", model.name, "A lightmap read through a table, on this GPU.", figures, manifest, arrays)
+
+
+def _all_texels(model: AtlasModel) -> np.ndarray:
+    """The texels of T_p, of "mixed" those of both its textures, float32 [1, N, 3]."""
+    return np.concatenate([model.texels.reshape(1, -1, 3), model.block_texels.reshape(1, -1, 3)], 1).astype(np.float32)

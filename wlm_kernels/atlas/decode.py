@@ -1,7 +1,8 @@
 """Reads a lightmap from tiles: one entry of a table, then one bilinear read of a small texture.
 
 Tile (i, j) of size B spans the lightmap's texel centres i B to (i + 1) B along x, and j B to (j + 1) B along y; its
-entry names the rectangle of the texture that holds it. The rectangle's outermost samples lie on the tile's borders.
+entry names the rectangle of the texture that holds it, or of a second texture, made of blocks. The rectangle's
+outermost samples lie on the tile's borders.
 
 Read `wlm/atlas/exact.py` first: the same in float64 NumPy.
 """
@@ -10,6 +11,7 @@ import warp as wp
 
 SIDE_BITS = wp.constant(4)
 _SIDE_MASK = wp.constant(15)
+_BLOCK = wp.constant(4)
 
 
 @wp.struct
@@ -32,10 +34,13 @@ def _tile_place(u: float, texels: int, size: int, tiles: int) -> wp.vec2:
 
 
 @wp.func
-def _axis(entry: wp.uint16, place: float) -> _Axis:
+def _axis(entry: wp.uint16, place: float, first_block_code: int) -> _Axis:
     """The two texels that a place in a tile lies between."""
     first = int(entry) >> SIDE_BITS
     last = int(entry) & _SIDE_MASK
+    if last >= first_block_code:
+        first = _BLOCK * first
+        last = _BLOCK * (last - first_block_code) + _BLOCK - 1
     x = place * float(last)
     axis = _Axis()
     below = wp.max(wp.min(int(x), last - 1), 0)
@@ -43,6 +48,13 @@ def _axis(entry: wp.uint16, place: float) -> _Axis:
     axis.high = first + wp.min(below + 1, last)
     axis.share = x - float(below)
     return axis
+
+
+@wp.func
+def _bilinear(texels: wp.array2d[wp.vec3h], x: _Axis, y: _Axis) -> wp.vec3:
+    top = wp.lerp(wp.vec3(texels[y.low, x.low]), wp.vec3(texels[y.low, x.high]), x.share)
+    bottom = wp.lerp(wp.vec3(texels[y.high, x.low]), wp.vec3(texels[y.high, x.high]), x.share)
+    return wp.lerp(top, bottom, y.share)
 
 
 @wp.kernel(enable_backward=False)
@@ -54,6 +66,8 @@ def _decode(
     size: int,
     lut: wp.array3d[wp.uint16],
     texels: wp.array2d[wp.vec3h],
+    blocks: wp.array2d[wp.vec3h],
+    first_block_code: int,
     # out:
     out: wp.array1d[wp.vec3],
 ):
@@ -63,14 +77,16 @@ def _decode(
     across = _tile_place(u[0], width, size, lut.shape[1])
     down = _tile_place(u[1], height, size, lut.shape[0])
     row, column = int(down[0]), int(across[0])
-    x = _axis(lut[row, column, 0], across[1])
-    y = _axis(lut[row, column, 1], down[1])
-    top = wp.lerp(wp.vec3(texels[y.low, x.low]), wp.vec3(texels[y.low, x.high]), x.share)
-    bottom = wp.lerp(wp.vec3(texels[y.high, x.low]), wp.vec3(texels[y.high, x.high]), x.share)
-    out[i] = wp.lerp(top, bottom, y.share)
+    entry = lut[row, column, 0]
+    x = _axis(entry, across[1], first_block_code)
+    y = _axis(lut[row, column, 1], down[1], first_block_code)
+    if (int(entry) & _SIDE_MASK) < first_block_code:
+        out[i] = _bilinear(texels, x, y)
+    else:
+        out[i] = _bilinear(blocks, x, y)
 
 
-def decode(uv, height: int, width: int, size: int, lut, texels, out) -> None:
+def decode(uv, height: int, width: int, size: int, lut, texels, out, blocks=None, first_block_code=16) -> None:
     """Reads light at points.
 
     Args:
@@ -80,5 +96,9 @@ def decode(uv, height: int, width: int, size: int, lut, texels, out) -> None:
         lut: uint16 [ty, tx, 2], for x and y: first texel of the rectangle << 4 | number of its texels - 1.
         texels: vec3h [Hp, Wp].
         out: vec3 [N], written.
+        blocks: vec3h [Hb, Wb], multiples of 4: the second texture; None: there is none.
+        first_block_code: The least number in the low bits of an entry that means the second texture, in blocks: the
+            first block << 4 | `first_block_code` + number of blocks - 1.
     """
-    wp.launch(_decode, uv.shape, inputs=[uv, height, width, size, lut, texels], outputs=[out], device=uv.device)
+    inputs = [uv, height, width, size, lut, texels, texels if blocks is None else blocks, first_block_code]
+    wp.launch(_decode, uv.shape, inputs=inputs, outputs=[out], device=uv.device)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from pydantic import JsonValue
 
-from wlm.atlas.model import MOST_SIZE, check_area, tile_counts, unpack_entries
+from wlm.atlas.model import MOST_SIZE, TEXELS, check_area, tile_counts, unpack_entries
 from wlm.atlas.scene.model import SceneModel, SceneProfile, SheetPlace
 from wlm.config import check_settings
 from wlm.formats.artifact import Artifact
@@ -62,7 +62,7 @@ def decode(artifact: Artifact) -> SceneModel:
     pages, rest = divmod(len(texels), count)
     if count > _MOST_COMPONENTS or rest or max(texels.shape[1:]) > MOST_SIZE:
         raise ValueError(f"part colour: expected pages of {count} layers, found {texels.shape}")
-    first, size = unpack_entries(lut)
+    first, size, _ = unpack_entries(lut, TEXELS)
     if ((first + size) > texels.shape[:0:-1]).any():
         raise ValueError("part lut: a tile reaches beyond the colour texture")
     places = []

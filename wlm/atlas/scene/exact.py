@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from wlm.atlas.model import unpack_entries
+from wlm.atlas.model import TEXELS, unpack_entries
 from wlm.atlas.scene.model import SceneModel
 from wlm.formats.shared_exponent import unpack_rgb9e5
 
@@ -23,7 +23,7 @@ def decode64(model: SceneModel, uv: np.ndarray, sheet: np.ndarray, state: int) -
     size, origin, tiles, page = table[:, 1::-1], table[:, 3:1:-1], table[:, 5:3:-1], table[:, 6]
     x = (np.asarray(uv, np.float64).clip(0.0, 1.0) * size - 0.5).clip(0, size - 1) / model.profile.tile
     tile = np.minimum(np.floor(x), tiles - 1).astype(np.int64)
-    first, count = unpack_entries(model.lut[tile[:, 1] + origin[:, 1], tile[:, 0] + origin[:, 0]])
+    first, count, _ = unpack_entries(model.lut[tile[:, 1] + origin[:, 1], tile[:, 0] + origin[:, 0]], TEXELS)
     place = first + (x - tile) * (count - 1)
     low = np.clip(np.floor(place).astype(np.int64), first, first + count - 1)
     high = np.minimum(low + 1, first + count - 1)

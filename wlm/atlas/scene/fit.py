@@ -19,13 +19,14 @@ import numpy as np
 import torch
 
 from wlm import interop
-from wlm.atlas.model import LUT_BITS, MOST_SIZE, pack_entries, tile_counts
+from wlm.atlas.layout import Size, allocate, place
+from wlm.atlas.model import LUT_BITS, MOST_SIZE, TEXELS, pack_entries, tile_counts
 from wlm.atlas.scene.data import LightmappedScene
 from wlm.atlas.scene.mixture import components, factorise
 from wlm.atlas.scene.model import FACTOR_BITS, TEXEL_BITS, SceneModel, SceneProfile, SheetPlace
 from wlm.atlas.scene.seen import scene_weights
 from wlm.atlas.stages import Stages, one_thread
-from wlm.atlas.tiles import Tiles, allocate, cut, errors, place, solve, solved
+from wlm.atlas.tiles import Tiles, cut, errors, solve, solved
 from wlm.errors import WlmError
 from wlm.formats.shared_exponent import pack_rgb9e5
 from wlm.system import Meter, OnProgress
@@ -375,8 +376,11 @@ def _texels(
 ) -> tuple[np.ndarray, np.ndarray]:
     """T_p, uint32 [pages K, Hp, Wp], and what each component was multiplied by, float64 [K, 3]."""
     light = np.zeros((pages, len(tiles.component), *shape, 3), np.float32)
+    sides, chosen = np.unique(size, axis=0, return_inverse=True)
+    sizes = [Size(nx, ny, TEXELS) for nx, ny in sides.tolist()]
     for k, each in enumerate(tiles.component):
-        for values, (x, y), (nx, ny), number in zip(solved(each, size), first, size, page, strict=True):
+        samples = solved(each, sizes, chosen.ravel())
+        for (values, _), (x, y), (nx, ny), number in zip(samples, first, size, page, strict=True):
             light[number, k, y : y + ny, x : x + nx] = values
     largest = light.max(axis=(0, 2, 3)).astype(np.float64)
     scale = np.divide(_BRIGHT, largest, out=np.ones_like(largest), where=largest > 0)

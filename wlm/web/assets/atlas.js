@@ -9,6 +9,10 @@ class AtlasPage {
     this.textures = {
       wlm_atlas_colour: graphics.plain(width, height, half, page.array('colour', Uint16Array), gl.LINEAR),
     };
+    if (page.has('blocks')) {
+      const size = manifest.atlas.blocks;
+      this.textures.wlm_atlas_blocks = graphics.plain(...size, half, page.array('blocks', Uint16Array), gl.LINEAR);
+    }
     if (page.has('lut')) {
       const [across, down] = manifest.atlas.lut, tiles = manifest.atlas.method === 'tiles';
       const lut = this.lut = page.array('lut', Uint16Array);
@@ -41,12 +45,14 @@ class AtlasPage {
   }
 
   #tile(column, row) {
-    const {lut: [across, down], tile, size_bits: bits} = this.manifest.atlas;
+    const {lut: [across, down], tile, size_bits: bits, block_side: side, first_block_code: code} = this.manifest.atlas;
     const x = Math.min(Math.floor(column / tile), across - 1), y = Math.min(Math.floor(row / tile), down - 1);
     const entry = [0, 1].map((i) => this.lut[2 * (y * across + x) + i]);
-    const [wide, high] = entry.map((code) => (code & ((1 << bits) - 1)) + 1);
-    const [left, top] = entry.map((code) => code >> bits);
-    return `tile ${x}, ${y}: ${wide} × ${high} texels at ${left}, ${top}`;
+    const sizes = entry.map((number) => number & ((1 << bits) - 1)), places = entry.map((number) => number >> bits);
+    const blocks = sizes[0] >= code;
+    const [wide, high] = sizes.map((size) => (blocks ? side * (size - code + 1) : size + 1));
+    const [left, top] = places.map((place) => (blocks ? side * place : place));
+    return `tile ${x}, ${y}: ${wide} × ${high} texels${blocks ? ' of blocks' : ''} at ${left}, ${top}`;
   }
 
   // For scripts: light at coordinates [N, 2], RGBA.

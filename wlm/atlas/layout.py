@@ -1,0 +1,230 @@
+"""Sizes of tiles: which a tile may have, which it gets within a budget of bits, and where it lies in the texture.
+
+Each tile has a curve of error against bits. At the optimum one more bit gains as much in every tile. That gain, a
+Lagrange multiplier, is found by bisection. Of colour "mixed" a tile's sizes are of two formats, each with a texture of
+its own: blocks for what they follow well, single texels for what they don't, and for tiles of few samples.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from wlm.atlas.model import (
+    BLOCK_SIDE,
+    BLOCKS,
+    COLOUR_BITS,
+    FIRST_BLOCK_CODE,
+    MOST_SIZE,
+    SIDE_BITS,
+    TEXELS,
+    Profile,
+    pack_entries,
+)
+from wlm.errors import WlmError
+from wlm.formats.exr import HALF_MAX
+
+_BISECTIONS = 60
+_WIDTHS = np.linspace(0.7, 1.5, 17)  # of T_p, over the square root of its number of samples
+# Of "mixed", sides in texels: between 6 and the largest every other one is enough.
+_MIXED_SIDES = (1, 2, 3, 4, 5, 6, 8, 10, 12)
+
+
+@dataclass(frozen=True)
+class Size:
+    """What a tile may become.
+
+    Attributes:
+        nx, ny: Samples along x and y.
+        format: How they are stored, of `COLOUR_BITS`.
+        second: Whether they are in the second texture of "mixed".
+    """
+
+    nx: int
+    ny: int
+    format: str
+    second: bool = False
+
+    @property
+    def bits(self) -> int:
+        """On a GPU."""
+        return self.nx * self.ny * COLOUR_BITS[self.format]
+
+    @property
+    def step(self) -> int:
+        """What its sides are multiples of."""
+        return BLOCK_SIDE if self.format in ("bc6h", "astc") else 1
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The sizes of all tiles and their places.
+
+    Attributes:
+        chosen: int [T], numbers of sizes.
+        first: int64 [T, 2], x and y of each tile's first texel.
+        shapes: Rows and columns of T_p, and of the second texture of "mixed".
+    """
+
+    chosen: np.ndarray
+    first: np.ndarray
+    shapes: tuple[tuple[int, int], ...]
+
+
+def sizes_of(profile: Profile) -> list[Size]:
+    """The sizes that a tile may have; of blocks whole ones, so that no block has two tiles."""
+    most = profile.tile + 1
+
+    def of_blocks(format: str, second: bool) -> list[Size]:
+        sides = range(BLOCK_SIDE, min(most + BLOCK_SIDE - 1, 1 << SIDE_BITS) + 1, BLOCK_SIDE)
+        return [Size(nx, ny, format, second) for ny in sides for nx in sides]
+
+    if profile.colour in ("bc6h", "astc"):
+        return of_blocks(profile.colour, False)
+    if profile.colour != "mixed":
+        sides = range(1, most + 1)
+        return [Size(nx, ny, profile.colour) for ny in sides for nx in sides]
+    sides = [side for side in _MIXED_SIDES if side <= min(most, FIRST_BLOCK_CODE)]
+    return [Size(nx, ny, TEXELS) for ny in sides for nx in sides] + of_blocks(BLOCKS, True)
+
+
+def layout(error: np.ndarray, sizes: list[Size], room: float, least: float) -> Layout | None:
+    """Allocates sizes whose rectangles fit in textures of a given number of bits, and places them.
+
+    Args:
+        error: float64 [sizes, T], `curves`.
+        sizes: The sizes.
+        room: Most bits of T_p.
+        least: Error that a bit must save to be allocated.
+
+    Returns:
+        The layout; None where not even the smallest sizes fit.
+
+    Raises:
+        WlmError: A texture has more texels along a side than an entry of T_c can name.
+    """
+    cost = np.array([size.bits for size in sizes], np.float64)
+    sides = np.array([(size.nx, size.ny) for size in sizes])
+    second = np.array([size.second for size in sizes])
+    textures = [next(size for size in sizes if size.second == each) for each in sorted(set(second.tolist()))]
+    budget, fewest = room, error.shape[1] * cost.min()
+    while True:
+        chosen = allocate(error, cost, budget, least)
+        first, shapes, bits = np.zeros((len(chosen), 2), np.int64), [], 0
+        for texture in textures:
+            members = np.flatnonzero(second[chosen] == texture.second)
+            if len(members):
+                first[members], shape = _packed(sides[chosen[members]], texture.step)
+            else:
+                shape = texture.step, texture.step
+            shapes.append(shape)
+            most = MOST_SIZE * BLOCK_SIDE if texture.second else MOST_SIZE
+            if max(shape) > most:
+                raise WlmError(f"budget: T_p would have {max(shape)} texels along a side; tiles allow {most}")
+            bits += math.prod(shape) * COLOUR_BITS[texture.format]
+        if bits <= room:
+            return Layout(chosen, first, tuple(shapes))
+        total = cost[chosen].sum()
+        if total <= fewest:
+            return None
+        # The area lost between shelves is about the same next time.
+        budget = min(budget, total) * min(0.999 * room / bits, 0.99)
+
+
+def _packed(sides: np.ndarray, step: int) -> tuple[np.ndarray, tuple[int, int]]:
+    """Packs rectangles into the smallest of some textures: their first texels, and its rows and columns."""
+    total = sides.prod(1).sum()
+    best = None
+    for share in _WIDTHS:
+        width = max(int(sides[:, 0].max()), -(-round(share * math.sqrt(total)) // step) * step)
+        first, height = place(sides, width)
+        # No shelf may reach as far as the width allows.
+        width = int((first[:, 0] + sides[:, 0]).max())
+        if best is None or width * height < best[0]:
+            best = width * height, first, (height, width)
+    return best[1:]
+
+
+def composed(
+    samples: list[tuple[np.ndarray, np.ndarray]],
+    sizes: list[Size],
+    layout: Layout,
+    index: np.ndarray,
+    counts: tuple[int, int],
+) -> tuple[list[tuple[np.ndarray, np.ndarray]], np.ndarray]:
+    """The textures and the table.
+
+    Args:
+        samples: Of each tile float32 [ny, nx, 3], and the weights of their squared errors [ny, nx].
+        sizes: The sizes.
+        layout: Of the tiles.
+        index: int64 [T], the tiles' numbers in the grid.
+        counts: Rows and columns of the grid. Tiles that aren't in `index` show the first texel.
+
+    Returns:
+        Of each texture the texels, float32 [H, W, 3], and their weights [H, W]; and T_c.
+    """
+    textures = [(np.zeros((*shape, 3), np.float32), np.zeros(shape, np.float32)) for shape in layout.shapes]
+    for (values, weight), number, (x, y) in zip(samples, layout.chosen, layout.first.tolist(), strict=True):
+        size = sizes[number]
+        texels, weights = textures[size.second]
+        texels[y : y + size.ny, x : x + size.nx] = values
+        weights[y : y + size.ny, x : x + size.nx] = weight
+    total = counts[0] * counts[1]
+    first, side, second = np.zeros((total, 2), int), np.ones((total, 2), int), np.zeros(total, bool)
+    first[index] = layout.first
+    side[index] = np.array([(size.nx, size.ny) for size in sizes])[layout.chosen]
+    second[index] = np.array([size.second for size in sizes])[layout.chosen]
+    lut = pack_entries(first, side, second).reshape(*counts, 2)
+    return [(texels.clip(max=HALF_MAX), weights) for texels, weights in textures], lut
+
+
+def allocate(error: np.ndarray, cost: np.ndarray, budget: float, least: float) -> np.ndarray:
+    """Chooses the size of each tile for the least total error within a budget.
+
+    Args:
+        error: [sizes, T].
+        cost: [sizes], bits of each size.
+        budget: Bits of all tiles.
+        least: Error that a bit must save to be allocated.
+
+    Returns:
+        int [T], numbers of sizes. The cheapest of all where even they are over the budget.
+    """
+
+    def best(gain: float) -> np.ndarray:
+        return (error + gain * cost[:, None]).argmin(0)
+
+    chosen = best(least)
+    if cost[chosen].sum() <= budget:
+        return chosen
+    low, high = least, max(least, error.max() + 1e-30)  # at the high end no bit pays
+    for _ in range(_BISECTIONS):
+        middle = np.sqrt(low * high) if low > 0 else high * 1e-6
+        if cost[best(middle)].sum() > budget:
+            low = middle
+        else:
+            high = middle
+    return best(high)
+
+
+def place(sizes: np.ndarray, width: int) -> tuple[np.ndarray, int]:
+    """Packs rectangles on shelves of one width, the highest first; each shelf is as high as its first rectangle.
+
+    Args:
+        sizes: int [R, 2], width and height of each.
+        width: Of the shelves, at least that of the widest.
+
+    Returns:
+        int64 [R, 2], x and y of each; and the height of all shelves.
+    """
+    first = np.zeros((len(sizes), 2), np.int64)
+    x = y = height = 0
+    order = np.lexsort((-sizes[:, 0], -sizes[:, 1]))
+    for i, (w, h) in zip(order.tolist(), sizes[order].tolist(), strict=True):
+        if x + w > width:
+            x, y, height = 0, y + height, 0
+        height = height or h
+        first[i] = x, y
+        x += w
+    return first, y + height

@@ -1,0 +1,193 @@
+"""BC6H blocks, unsigned, of all fourteen modes: their layout, and an exact decoder.
+
+A block of 128 bits holds 4 x 4 texels of RGB half floats: one line in colour, or two and the number of the partition
+that says which texels are on which. From the lowest bit: the mode's number; the endpoints w and x of the first line, y
+and z of the second, their bits in an order of each mode's own; the partition's number; the indices. Most modes store x,
+y and z as differences to w. A line's anchor texel, the first of them texel 0, has an index of one bit less.
+
+The format is that of Khronos' Data Format Specification 1.3, chapter 20.2 ("BC6H").
+"""
+
+import numpy as np
+
+from wlm.formats.bc7_modes import ANCHORS, PARTITIONS, SHARES
+
+BLOCK_BYTES = 16
+SIDE = 4
+"""Texels along a block."""
+
+# Of each mode, from the format's mode 1 to its mode 14: its number; bits of w; of the others' red, green and blue; and
+# the fields behind the number, from the lowest bit. "rw0-9" is bits 0 to 9 of w's red, "rw15-10" is bits 15 down to 10.
+_WX = "rw0-9 gw0-9 bw0-9"
+_MODES = (
+    (0x00, 10, (5, 5, 5), f"gy4 by4 bz4 {_WX} rx0-4 gz4 gy0-3 gx0-4 bz0 gz0-3 bx0-4 bz1 by0-3 ry0-4 bz2 rz0-4 bz3"),
+    (
+        0x01, 7, (6, 6, 6),
+        "gy5 gz4 gz5 rw0-6 bz0 bz1 by4 gw0-6 by5 bz2 gy4 bw0-6 bz3 bz5 bz4 rx0-5 gy0-3 gx0-5 gz0-3 bx0-5 by0-3 ry0-5 "
+        "rz0-5",
+    ),
+    (0x02, 11, (5, 4, 4), f"{_WX} rx0-4 rw10 gy0-3 gx0-3 gw10 bz0 gz0-3 bx0-3 bw10 bz1 by0-3 ry0-4 bz2 rz0-4 bz3"),
+    (
+        0x06, 11, (4, 5, 4),
+        f"{_WX} rx0-3 rw10 gz4 gy0-3 gx0-4 gw10 gz0-3 bx0-3 bw10 bz1 by0-3 ry0-3 bz0 bz2 rz0-3 gy4 bz3",
+    ),
+    (
+        0x0A, 11, (4, 4, 5),
+        f"{_WX} rx0-3 rw10 by4 gy0-3 gx0-3 gw10 bz0 gz0-3 bx0-4 bw10 by0-3 ry0-3 bz1 bz2 rz0-3 bz4 bz3",
+    ),
+    (
+        0x0E, 9, (5, 5, 5),
+        "rw0-8 by4 gw0-8 gy4 bw0-8 bz4 rx0-4 gz4 gy0-3 gx0-4 bz0 gz0-3 bx0-4 bz1 by0-3 ry0-4 bz2 rz0-4 bz3",
+    ),
+    (
+        0x12, 8, (6, 5, 5),
+        "rw0-7 gz4 by4 gw0-7 bz2 gy4 bw0-7 bz3 bz4 rx0-5 gy0-3 gx0-4 bz0 gz0-3 bx0-4 bz1 by0-3 ry0-5 rz0-5",
+    ),
+    (
+        0x16, 8, (5, 6, 5),
+        "rw0-7 bz0 by4 gw0-7 gy5 gy4 bw0-7 gz5 bz4 rx0-4 gz4 gy0-3 gx0-5 gz0-3 bx0-4 bz1 by0-3 ry0-4 bz2 rz0-4 bz3",
+    ),
+    (
+        0x1A, 8, (5, 5, 6),
+        "rw0-7 bz1 by4 gw0-7 by5 gy4 bw0-7 bz5 bz4 rx0-4 gz4 gy0-3 gx0-4 bz0 gz0-3 bx0-5 by0-3 ry0-4 bz2 rz0-4 bz3",
+    ),
+    (
+        0x1E, 6, (6, 6, 6),
+        "rw0-5 gz4 bz0 bz1 by4 gw0-5 gy5 by5 bz2 gy4 bw0-5 gz5 bz3 bz5 bz4 rx0-5 gy0-3 gx0-5 gz0-3 bx0-5 by0-3 ry0-5 "
+        "rz0-5",
+    ),
+    (0x03, 10, (10, 10, 10), f"{_WX} rx0-9 gx0-9 bx0-9"),
+    (0x07, 11, (9, 9, 9), f"{_WX} rx0-8 rw10 gx0-8 gw10 bx0-8 bw10"),
+    (0x0B, 12, (8, 8, 8), f"{_WX} rx0-7 rw11-10 gx0-7 gw11-10 bx0-7 bw11-10"),
+    (0x0F, 16, (4, 4, 4), f"{_WX} rx0-3 rw15-10 gx0-3 gw15-10 bx0-3 bw15-10"),
+)  # fmt: skip
+
+TWO_LINES = 10
+"""Modes before this row of `MODES` have two lines."""
+
+PARTITION = 12
+"""The number of the field that holds the partition, in `LAYOUT`."""
+_PARTITION_BITS = 5
+
+
+def _fields(text: str) -> list[int]:
+    """The code of `LAYOUT` of every bit that a mode's line names."""
+    codes = []
+    for token in text.split():
+        field = 4 * "rgb".index(token[0]) + "wxyz".index(token[1])
+        first, _, last = token[2:].partition("-")
+        first, last = int(first), int(last or first)
+        step = 1 if last >= first else -1
+        codes += [field << 4 | bit for bit in range(first, last + step, step)]
+    return codes
+
+
+def _layout() -> np.ndarray:
+    layout = np.full((len(_MODES), 82), -1, np.int32)
+    for row, (number, _, _, text) in enumerate(_MODES):
+        codes = _fields(text)
+        if row < TWO_LINES:
+            codes += [PARTITION << 4 | bit for bit in range(_PARTITION_BITS)]
+        begin = 2 if number < 2 else 5
+        layout[row, begin : begin + len(codes)] = codes
+    return layout
+
+
+LAYOUT = _layout()
+"""int32 [14, 82]: by the row of `MODES`, what each bit of a block is: 16 times the number of the field, plus the bit of
+it; -1 for bits of the mode's number and of indices. Field 4 c + e is channel c (red, green, blue) of endpoint e (w, x,
+y, z)."""
+
+MODES = np.array(
+    [[number, 2 if number < 2 else 5, number not in (0x03, 0x1E), bits, *others] for number, bits, others, _ in _MODES],
+    np.int32,
+)
+"""int32 [14, 7]: the mode's number, bits of it, whether x, y and z are differences, bits of w, and bits of the others'
+red, green and blue."""
+
+MASKS = np.array([sum((int(word) >> 2 * i & 1) << i for i in range(16)) for word in PARTITIONS[1, :32]], np.int32)
+"""int32 [32]: the texels on the second line of each partition, a bit each."""
+
+SECOND_ANCHORS = np.ascontiguousarray(ANCHORS[1, :32, 0])
+"""int32 [32]: the anchor texel of the second line."""
+
+_PIECE = 1 << 15  # blocks at once
+_RESERVED = -1
+
+
+def _rows() -> np.ndarray:
+    """By the lowest five bits of a block, the row of `MODES`; `_RESERVED` of four numbers."""
+    rows = np.full(32, _RESERVED, np.int64)
+    for row, (number, bits) in enumerate(MODES[:, :2]):
+        rows[np.arange(number, 32, 1 << bits)] = row
+    return rows
+
+
+_ROWS = _rows()
+
+
+def decode_bc6h(blocks: np.ndarray) -> np.ndarray:
+    """Decodes unsigned BC6H, to the bit.
+
+    Args:
+        blocks: uint8 [B, 16].
+
+    Returns:
+        half [B, 16, 3], texels row by row; blocks of a reserved mode are black.
+
+    Raises:
+        ValueError: Wrong shape or type.
+    """
+    if blocks.dtype != np.uint8 or blocks.ndim != 2 or blocks.shape[1] != BLOCK_BYTES:
+        raise ValueError(f"blocks: expected uint8 [B, 16], got {blocks.dtype} {blocks.shape}")
+    texels = np.zeros((len(blocks), SIDE * SIDE, 3), np.float16)
+    row = _ROWS[blocks[:, 0] & 31]
+    for mode in range(len(MODES)):
+        members = np.flatnonzero(row == mode)
+        for first in range(0, len(members), _PIECE):
+            part = members[first : first + _PIECE]
+            texels[part] = _decode_mode(blocks[part], mode)
+    return texels
+
+
+def _decode_mode(blocks: np.ndarray, mode: int) -> np.ndarray:
+    """Decodes blocks of one mode, half [B, 16, 3]."""
+    bits = np.unpackbits(blocks, axis=1, bitorder="little").astype(np.int32)
+    fields = np.zeros((PARTITION + 1, len(blocks)), np.int32)
+    for place in np.flatnonzero(LAYOUT[mode] >= 0):
+        code = LAYOUT[mode, place]
+        fields[code >> 4] |= bits[:, place] << (code & 15)
+    count = 4 if mode < TWO_LINES else 2
+    # [channel, endpoint, block]
+    endpoint = fields[:PARTITION].reshape(3, 4, -1)[:, :count]
+    _, _, differences, width, *others = MODES[mode].tolist()
+    if differences:
+        sign = 1 << (np.array(others, np.int32) - 1)[:, None, None]
+        signed = (endpoint[:, 1:] ^ sign) - sign
+        endpoint[:, 1:] = (signed + endpoint[:, :1]) & ((1 << width) - 1)
+    if width < 15:
+        whole = ((endpoint << 16) + 0x8000) >> width
+        whole = np.where(endpoint == 0, 0, np.where(endpoint == (1 << width) - 1, 0xFFFF, whole))
+    else:
+        whole = endpoint
+    texel = np.arange(SIDE * SIDE)
+    if mode < TWO_LINES:
+        partition = fields[PARTITION]
+        line = MASKS[partition][:, None] >> texel & 1
+        anchor = (texel == 0) | (texel == SECOND_ANCHORS[partition][:, None])
+        index_bits = 3
+    else:
+        line = np.zeros((len(blocks), texel.size), np.int32)
+        anchor = np.broadcast_to(texel == 0, line.shape)
+        index_bits = 4
+    own = index_bits - anchor
+    last = np.cumsum(own, axis=1)
+    place = 128 - last[:, -1:] + last - own
+    block = np.arange(len(blocks))[:, None]
+    index = np.zeros_like(line)
+    for bit in range(index_bits):
+        index |= np.where(bit < own, bits[block, np.minimum(place + bit, 127)] << bit, 0)
+    share = SHARES[index_bits - 2][index]
+    low, high = (whole[:, 2 * line + end, block] for end in (0, 1))
+    mixed = ((64 - share) * low + share * high + 32) >> 6
+    return np.moveaxis(((mixed * 31) >> 6).astype(np.uint16).view(np.float16), 0, -1)

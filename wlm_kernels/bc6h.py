@@ -1,0 +1,444 @@
+"""Encodes blocks of 4 x 4 texels as unsigned BC6H: the least weighted squared error in linear light.
+
+BC6H interpolates between two colours in a space that is about the logarithm of light. A block is fitted there by
+weighted least squares, each texel with the square of the slope of light as a further weight, and the levels that its
+texels take are then chosen by their error in light itself. The finest mode that holds the line is used, once with one
+line for all texels and once each with the two best of the 32 partitions into two lines; the best of all is kept.
+
+The tables are those of `wlm.formats.bc6h`, whose decoder is the reference.
+"""
+
+import warp as wp
+
+from wlm_kernels.bc6h_block import Block, Colours, Tables, write_block
+
+wp.set_module_options({"enable_backward": False, "max_unroll": 1})
+
+_TEXELS = wp.constant(16)
+_ALL = wp.constant(0xFFFF)
+_LARGEST = wp.constant(65504.0)
+_TOP = wp.constant(65535.0)
+_LEAST_NORMAL = wp.constant(6.103515625e-05)  # 2 ** -14
+_STRETCH = wp.constant(64.0 / 31.0)  # from a half float's bits to BC6H's 16
+_POWER_ROUNDS = wp.constant(4)
+_AXIS_ROUNDS = wp.constant(8)
+_REFINED = wp.constant(2)  # times that a line is fitted to its texels' levels
+_REFITTED = wp.constant(2)  # times that a block's ends are fitted to the indices that it took
+_TRIED = wp.constant(2)  # partitions
+_LEAST_WEIGHT = wp.constant(1.0e-4)  # of the heaviest texel's
+_HUGE = wp.constant(3.4e38)
+
+_Numbers = wp.types.vector(length=16, dtype=float)
+_Ends = wp.types.matrix(shape=(4, 3), dtype=float)
+_Moments = wp.types.vector(length=10, dtype=float)
+
+
+@wp.struct
+class _Texels:
+    """What a block is fitted to.
+
+    Attributes:
+        light: Of each texel.
+        weight: Of each texel's squared error.
+        place: The light in BC6H's space of 16 bits, not rounded.
+        pull: Weight of each channel's squared error there.
+        middle: Mean of the places.
+        metric: What a channel's distance from it is scaled by: the root of the mean pull.
+    """
+
+    light: Colours
+    weight: _Numbers
+    place: Colours
+    pull: Colours
+    middle: wp.vec3
+    metric: wp.vec3
+
+
+@wp.func
+def _place_of(light: float) -> wp.vec2:
+    """Light in BC6H's space, and the slope of light there."""
+    if light < _LEAST_NORMAL:
+        return wp.vec2(light * 16777216.0 * _STRETCH, 1.0 / (16777216.0 * _STRETCH))
+    exponent = wp.floor(wp.log2(light))
+    scale = wp.pow(2.0, exponent)
+    # The logarithm may round to the next whole number: the curve has a bend there, and no step.
+    bits = 1024.0 * (exponent + 14.0 + light / scale)
+    return wp.vec2(wp.min(bits * _STRETCH, _TOP), scale / (1024.0 * _STRETCH))
+
+
+@wp.func
+def _in(mask: int, texel: int) -> bool:
+    return ((mask >> texel) & 1) == 1
+
+
+@wp.func
+def _axis_of(m: _Moments, rounds: int) -> wp.vec4:
+    """Principal axis of moments, and the variance along it times the weight; moments are those of `_moments`."""
+    inverse = 1.0 / wp.max(m[0], 1.0e-30)
+    xx, xy, xz = m[4] - m[1] * m[1] * inverse, m[5] - m[1] * m[2] * inverse, m[6] - m[1] * m[3] * inverse
+    yy, yz, zz = m[7] - m[2] * m[2] * inverse, m[8] - m[2] * m[3] * inverse, m[9] - m[3] * m[3] * inverse
+    a = wp.mat33(xx, xy, xz, xy, yy, yz, xz, yz, zz)
+    axis = a[0]
+    if yy > xx and yy > zz:
+        axis = a[1]
+    elif zz > xx:
+        axis = a[2]
+    for _round in range(rounds):
+        length = wp.length(axis)
+        if length > 0.0:
+            axis = a * (axis / length)
+    length = wp.length(axis)
+    if length > 0.0:
+        axis = axis / length
+    value = wp.dot(axis, a * axis)
+    return wp.vec4(axis[0], axis[1], axis[2], wp.max(value, 0.0))
+
+
+@wp.func
+def _spread(m: _Moments) -> float:
+    """Trace of the scatter about the mean."""
+    inverse = 1.0 / wp.max(m[0], 1.0e-30)
+    return wp.max(m[4] + m[7] + m[9] - (m[1] * m[1] + m[2] * m[2] + m[3] * m[3]) * inverse, 0.0)
+
+
+@wp.func
+def _scaled(texels: _Texels, texel: int) -> wp.vec3:
+    """A texel's place about the middle, in the metric."""
+    return wp.cw_mul(texels.place[texel] - texels.middle, texels.metric)
+
+
+@wp.func
+def _moments(texels: _Texels, mask: int) -> _Moments:
+    """Weight, weighted sum and the six weighted products of the channels of some texels' scaled places."""
+    total = _Moments()
+    square = wp.cw_mul(texels.metric, texels.metric)
+    for i in range(_TEXELS):
+        if _in(mask, i):
+            point = _scaled(texels, i)
+            x, y, z = point[0], point[1], point[2]
+            weight = wp.dot(wp.cw_div(texels.pull[i], square), wp.vec3(1.0 / 3.0))
+            total += weight * _Moments(1.0, x, y, z, x * x, x * y, x * z, y * y, y * z, z * z)
+    return total
+
+
+@wp.func
+def _fitted(texels: _Texels, mask: int, ends: _Ends, line: int, moments: _Moments, steps: int) -> _Ends:
+    """The ends of a line through some texels: the outermost along their principal axis, then twice by least squares.
+
+    Args:
+        texels: The block.
+        mask: The texels.
+        ends: Where the result is put, at rows 2 `line` and 2 `line` + 1.
+        moments: Of these texels.
+        steps: The index of the line's far end.
+    """
+    principal = _axis_of(moments, _AXIS_ROUNDS)
+    axis = wp.vec3(principal[0], principal[1], principal[2])
+    low = float(_HUGE)
+    high = float(-_HUGE)
+    for i in range(_TEXELS):
+        if _in(mask, i):
+            t = wp.dot(_scaled(texels, i), axis)
+            low = wp.min(low, t)
+            high = wp.max(high, t)
+    mean = wp.vec3(moments[1], moments[2], moments[3]) / wp.max(moments[0], 1.0e-30)
+    centre = wp.dot(mean, axis)
+    a = texels.middle + wp.cw_div(mean + axis * (low - centre), texels.metric)
+    b = texels.middle + wp.cw_div(mean + axis * (high - centre), texels.metric)
+    for _round in range(_REFINED):
+        a, b = _regressed(texels, mask, a, b, steps)
+    ends[2 * line] = a
+    ends[2 * line + 1] = b
+    return ends
+
+
+@wp.func
+def _solved(products: wp.vec3, right: wp.vec2, before: wp.vec2) -> wp.vec2:
+    """Both ends of a channel by least squares, within the format's range; those of before where texels tell but one."""
+    aa, ab, bb = products[0], products[1], products[2]
+    determinant = aa * bb - ab * ab
+    if not (determinant > 1.0e-5 * aa * bb and determinant > 0.0):
+        return wp.vec2(wp.clamp(before[0], 0.0, _TOP), wp.clamp(before[1], 0.0, _TOP))
+    a = (right[0] * bb - right[1] * ab) / determinant
+    b = (right[1] * aa - right[0] * ab) / determinant
+    # Where one end is held at the range's, the other is the best beside it.
+    if a < 0.0 or a > _TOP:
+        a = wp.clamp(a, 0.0, _TOP)
+        b = (right[1] - ab * a) / wp.max(bb, 1.0e-30)
+    elif b < 0.0 or b > _TOP:
+        b = wp.clamp(b, 0.0, _TOP)
+        a = (right[0] - ab * b) / wp.max(aa, 1.0e-30)
+    return wp.vec2(wp.clamp(a, 0.0, _TOP), wp.clamp(b, 0.0, _TOP))
+
+
+@wp.func
+def _regressed(texels: _Texels, mask: int, a: wp.vec3, b: wp.vec3, steps: int):
+    """A line's ends by least squares, its texels at the nearest of the levels between the ends they had."""
+    along = b - a
+    aa = wp.vec3(0.0)
+    ab = wp.vec3(0.0)
+    bb = wp.vec3(0.0)
+    ay = wp.vec3(0.0)
+    by = wp.vec3(0.0)
+    for i in range(_TEXELS):
+        if _in(mask, i):
+            pull = texels.pull[i]
+            scaled = wp.cw_mul(pull, along)
+            square = wp.dot(scaled, along)
+            t = float(0.0)
+            if square > 0.0:
+                t = wp.dot(scaled, texels.place[i] - a) / square
+            t = wp.clamp(wp.floor(t * float(steps) + 0.5), 0.0, float(steps)) / float(steps)
+            s = 1.0 - t
+            aa += pull * (s * s)
+            ab += pull * (s * t)
+            bb += pull * (t * t)
+            weighted = wp.cw_mul(pull, texels.place[i])
+            ay += weighted * s
+            by += weighted * t
+    for c in range(3):
+        pair = _solved(wp.vec3(aa[c], ab[c], bb[c]), wp.vec2(ay[c], by[c]), wp.vec2(a[c], b[c]))
+        a[c] = pair[0]
+        b[c] = pair[1]
+    return a, b
+
+
+@wp.func
+def _whole(code: int, bits: int) -> int:
+    """An endpoint's channel in 16 bits."""
+    if bits == 16 or code == 0:
+        return code
+    if code == (1 << bits) - 1:
+        return 65535
+    return ((code << 16) + 32768) >> bits
+
+
+@wp.func
+def _coded(place: float, bits: int) -> int:
+    """The code of `bits` bits whose 16 bits are nearest to a place."""
+    top = (1 << bits) - 1
+    if bits == 16:
+        return wp.clamp(int(place + 0.5), 0, top)
+    code = wp.clamp(int(place / float(1 << (16 - bits))), 0, top)
+    best = code
+    for other in range(wp.max(code - 1, 0), wp.min(code + 2, top + 1)):
+        if wp.abs(float(_whole(other, bits)) - place) < wp.abs(float(_whole(best, bits)) - place):
+            best = other
+    return best
+
+
+@wp.func
+def _share(index: int, steps: int) -> int:
+    """The far end's share at an index, in 64ths; 3 and 4 bits round alike."""
+    return (index * 64 + steps // 2) // steps
+
+
+@wp.func
+def _finest(tables: Tables, ends: _Ends, first: int, last: int, count: int) -> int:
+    """The mode of most bits in `first`..`last` whose differences hold the ends, -1 for none.
+
+    Args:
+        ends: `count` of them.
+    """
+    best = int(-1)
+    for mode in range(first, last):
+        bits = tables.modes[mode, 3]
+        fits = bool(True)
+        if tables.modes[mode, 2] == 1:
+            for c in range(3):
+                most = (1 << (tables.modes[mode, 4 + c] - 1)) - 1
+                base = _coded(ends[0][c], bits)
+                for e in range(1, count):
+                    if wp.abs(_coded(ends[e][c], bits) - base) > most:
+                        fits = False
+        if fits and (best < 0 or bits > tables.modes[best, 3]):
+            best = mode
+    return best
+
+
+@wp.func
+def _encoded(texels: _Texels, tables: Tables, ends: _Ends, mode: int, partition: int) -> Block:
+    """A block in a mode: rounded ends, and the best index of each texel."""
+    block = Block()
+    block.mode = mode
+    block.partition = partition
+    bits = tables.modes[mode, 3]
+    lines = int(1)
+    mask = int(0)
+    anchor = int(0)
+    steps = int(15)
+    if mode < 10:
+        lines = 2
+        mask = tables.masks[partition]
+        anchor = tables.anchors[partition]
+        steps = 7
+    palette = Colours()
+    for line in range(lines):
+        for c in range(3):
+            block.code[2 * line, c] = _coded(ends[2 * line][c], bits)
+            block.code[2 * line + 1, c] = _coded(ends[2 * line + 1][c], bits)
+            low = _whole(block.code[2 * line, c], bits)
+            high = _whole(block.code[2 * line + 1, c], bits)
+            for k in range(steps + 1):
+                share = _share(k, steps)
+                mixed = ((64 - share) * low + share * high + 32) >> 6
+                palette[8 * line + k, c] = tables.halves[(mixed * 31) >> 6]
+    error = float(0.0)
+    for i in range(_TEXELS):
+        start = int(0)
+        if _in(mask, i):
+            start = 8
+        last = steps
+        if i == 0 or (lines == 2 and i == anchor):
+            last = steps // 2
+        best = float(_HUGE)
+        index = int(0)
+        for k in range(last + 1):
+            away = palette[start + k] - texels.light[i]
+            square = wp.dot(away, away)
+            if square < best:
+                best = square
+                index = k
+        block.index[i] = index
+        block.light[i] = palette[start + index]
+        error += texels.weight[i] * best
+    block.error = error
+    return block
+
+
+@wp.func
+def _turned(texels: _Texels, ends: _Ends, line: int, anchor: int) -> _Ends:
+    """Ends of which the first is the nearer to the line's anchor texel, whose index has a bit less."""
+    a, b = ends[2 * line], ends[2 * line + 1]
+    pull = texels.pull[anchor]
+    along = wp.cw_mul(pull, b - a)
+    if wp.dot(along, texels.place[anchor] - 0.5 * (a + b)) > 0.0:
+        ends[2 * line] = b
+        ends[2 * line + 1] = a
+    return ends
+
+
+@wp.func
+def _refitted(texels: _Texels, block: Block, mask: int, ends: _Ends, line: int, steps: int) -> _Ends:
+    """Ends by least squares of the levels that the texels of a line took."""
+    aa = wp.vec3(0.0)
+    ab = wp.vec3(0.0)
+    bb = wp.vec3(0.0)
+    ay = wp.vec3(0.0)
+    by = wp.vec3(0.0)
+    for i in range(_TEXELS):
+        if _in(mask, i):
+            pull = texels.pull[i]
+            t = float(_share(block.index[i], steps)) / 64.0
+            s = 1.0 - t
+            aa += pull * (s * s)
+            ab += pull * (s * t)
+            bb += pull * (t * t)
+            weighted = wp.cw_mul(pull, texels.place[i])
+            ay += weighted * s
+            by += weighted * t
+    for c in range(3):
+        before = wp.vec2(ends[2 * line, c], ends[2 * line + 1, c])
+        pair = _solved(wp.vec3(aa[c], ab[c], bb[c]), wp.vec2(ay[c], by[c]), before)
+        ends[2 * line, c] = pair[0]
+        ends[2 * line + 1, c] = pair[1]
+    return ends
+
+
+@wp.func
+def _gathered(light: wp.array2d[wp.vec3], weight: wp.array2d[float], number: int) -> _Texels:
+    """The texels of a block."""
+    texels = _Texels()
+    heaviest = float(0.0)
+    for i in range(_TEXELS):
+        heaviest = wp.max(heaviest, weight[number, i])
+    metric = wp.vec3(0.0)
+    for i in range(_TEXELS):
+        # A texel without weight counts for very little, and not for nothing: it is read next to others.
+        w = float(1.0)
+        if heaviest > 0.0:
+            w = wp.max(weight[number, i] / heaviest, _LEAST_WEIGHT)
+        texels.weight[i] = w
+        for c in range(3):
+            value = wp.clamp(light[number, i][c], 0.0, _LARGEST)
+            place = _place_of(value)
+            texels.light[i, c] = value
+            texels.place[i, c] = place[0]
+            texels.pull[i, c] = w * place[1] * place[1]
+        texels.middle += texels.place[i] / float(_TEXELS)
+        metric += texels.pull[i] / float(_TEXELS)
+    for c in range(3):
+        texels.metric[c] = wp.sqrt(wp.max(metric[c], 1.0e-6 * wp.max(metric)))
+    return texels
+
+
+@wp.kernel
+def _encode(
+    # in:
+    light: wp.array2d[wp.vec3],
+    weight: wp.array2d[float],
+    tables: Tables,
+    # out:
+    blocks: wp.array2d[wp.uint32],
+    decoded: wp.array2d[wp.vec3],
+):
+    """One block per thread."""
+    number = wp.tid()
+    texels = _gathered(light, weight, number)
+    whole = _moments(texels, _ALL)
+    ends = _turned(texels, _fitted(texels, _ALL, _Ends(), 0, whole, 15), 0, 0)
+    best = _encoded(texels, tables, ends, _finest(tables, ends, 10, 14, 2), 0)
+    for _round in range(_REFITTED):
+        ends = _turned(texels, _refitted(texels, best, _ALL, ends, 0, 15), 0, 0)
+        other = _encoded(texels, tables, ends, _finest(tables, ends, 10, 14, 2), 0)
+        if other.error < best.error:
+            best = other
+    # Of a line's scatter, an index of four bits leaves 1/225 and one of three 1/49.
+    spread = _axis_of(whole, _AXIS_ROUNDS)[3]
+    alone = _spread(whole) - spread * (224.0 / 225.0)
+    tried = int(0)  # a bit a partition
+    for _attempt in range(_TRIED):
+        least = float(_HUGE)
+        partition = int(0)
+        for p in range(32):
+            if ((tried >> p) & 1) == 0:
+                second = _moments(texels, tables.masks[p])
+                first = whole - second
+                along = _axis_of(first, _POWER_ROUNDS)[3] + _axis_of(second, _POWER_ROUNDS)[3]
+                left = _spread(first) + _spread(second) - along * (48.0 / 49.0)
+                if left < least:
+                    least = left
+                    partition = p
+        tried = tried | (1 << partition)
+        if least < alone:
+            mask, anchor = tables.masks[partition], tables.anchors[partition]
+            second = _moments(texels, mask)
+            ends = _fitted(texels, _ALL ^ mask, _Ends(), 0, whole - second, 7)
+            ends = _fitted(texels, mask, ends, 1, second, 7)
+            ends = _turned(texels, _turned(texels, ends, 0, 0), 1, anchor)
+            other = _encoded(texels, tables, ends, _finest(tables, ends, 0, 10, 4), partition)
+            if other.error < best.error:
+                best = other
+            for _round in range(_REFITTED):
+                ends = _refitted(texels, other, _ALL ^ mask, ends, 0, 7)
+                ends = _refitted(texels, other, mask, ends, 1, 7)
+                ends = _turned(texels, _turned(texels, ends, 0, 0), 1, anchor)
+                other = _encoded(texels, tables, ends, _finest(tables, ends, 0, 10, 4), partition)
+                if other.error < best.error:
+                    best = other
+    for i in range(_TEXELS):
+        decoded[number, i] = best.light[i]
+    write_block(number, best, tables, blocks)
+
+
+def encode(light, weight, tables: Tables, blocks, decoded) -> None:
+    """Encodes blocks.
+
+    Args:
+        light: vec3 [N, 16], texels row by row, finite; clamped to [0, 65504].
+        weight: float [N, 16], of each texel's squared error, 0 or more.
+        tables: On the same device.
+        blocks: uint32 [N, 4], written: 16 bytes a block, the lowest first.
+        decoded: vec3 [N, 16], written: what the blocks decode to.
+    """
+    wp.launch(_encode, len(light), inputs=[light, weight, tables], outputs=[blocks, decoded], device=light.device)

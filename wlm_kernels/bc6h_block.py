@@ -1,0 +1,88 @@
+"""A BC6H block as an encoder makes it, and its 128 bits."""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False, "max_unroll": 1})
+
+_TEXELS = wp.constant(16)
+Colours = wp.types.matrix(shape=(16, 3), dtype=float)
+Indices = wp.types.vector(length=16, dtype=int)
+Codes = wp.types.matrix(shape=(4, 3), dtype=int)
+
+
+@wp.struct
+class Tables:
+    """The format, from `wlm.formats.bc6h`.
+
+    Attributes:
+        modes: int [14, 7], `MODES`.
+        layout: int [14, 82], `LAYOUT`.
+        masks: int [32], `MASKS`.
+        anchors: int [32], `SECOND_ANCHORS`.
+        halves: float [31,744], the half float of each number of bits.
+    """
+
+    modes: wp.array2d[int]
+    layout: wp.array2d[int]
+    masks: wp.array1d[int]
+    anchors: wp.array1d[int]
+    halves: wp.array1d[float]
+
+
+@wp.struct
+class Block:
+    """A block in one mode.
+
+    Attributes:
+        error: Of its texels, weighted.
+        mode, partition: Their rows.
+        code: The endpoints w, x, y and z as the mode stores them, without differences.
+        index: Of each texel.
+        light: What it decodes to.
+    """
+
+    error: float
+    mode: int
+    partition: int
+    code: Codes
+    index: Indices
+    light: Colours
+
+
+@wp.func
+def write_block(number: int, block: Block, tables: Tables, blocks: wp.array2d[wp.uint32]):
+    """Packs a block."""
+    mode = block.mode
+    word = wp.vec4ui()
+    word[0] = wp.uint32(tables.modes[mode, 0])
+    begin = tables.modes[mode, 1]
+    for place in range(begin, 82):
+        code = tables.layout[mode, place]
+        if code >= 0:
+            field = code >> 4
+            value = block.partition
+            if field < 12:
+                channel, end = field >> 2, field & 3
+                value = block.code[end, channel]
+                if end > 0 and tables.modes[mode, 2] == 1:
+                    value = value - block.code[0, channel]
+            bit = wp.uint32((value >> (code & 15)) & 1)
+            word[place >> 5] = word[place >> 5] | (bit << wp.uint32(place & 31))
+    anchor = int(0)
+    width = int(4)
+    if mode < 10:
+        anchor = tables.anchors[block.partition]
+        width = 3
+    place = int(65)
+    if mode < 10:
+        place = 82
+    for i in range(_TEXELS):
+        own = width
+        if i == 0 or i == anchor:
+            own = width - 1
+        for b in range(own):
+            bit = wp.uint32((block.index[i] >> b) & 1)
+            word[place >> 5] = word[place >> 5] | (bit << wp.uint32(place & 31))
+            place += 1
+    for k in range(4):
+        blocks[number, k] = word[k]
