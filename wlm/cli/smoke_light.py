@@ -70,7 +70,6 @@ def light(
     _check_white(white)
     own = _lights(lights, points)
     quiet_warp()
-    from wlm.smoke.scene import make_camera
     from wlm.smoke.transport.filtering import load_orders, scatter
     from wlm.smoke.transport.lighting import light_smoke
     from wlm.view.atlas import save_png
@@ -80,26 +79,26 @@ def light(
 
     frames = options.open(smoke)
     camera = options.camera(frames, orthographic=False, perspective=perspective)
-    scene, march = frames.scene, March(step=step, jitter=0.0)
-    lamps = own or _scene_lights(scene)
-    if behind is None:
-        behind = scene.background if scene else (0.0, 0.0, 0.0)
-    extra = {"ramp": scene.smoke.ramp, "obstacles": scene.obstacles} if scene else {}
+    march, lamps = March(step=step, jitter=0.0), own or _scene_lights(frames.scene)
     network = load_orders(model) if orders == "all" else None
-    file = outputs(smoke, scene is None, output, "light", ".png")
+    file = outputs(smoke, frames.single, output, "light", ".png")
     rows = table(str(smoke), ["file", "covered", "mean", "largest", "clipped"])
     pictures = []
     with running("light") as progress:
         for frame, volume in frames.volumes(progress=progress):
             for warning in volume.warnings:
                 note(f"warning: {warning}")
-            view = make_camera(camera, volume.origin, [volume.voxel * n for n in volume.shape])
+            view = frames.view(camera, volume)
             if network is None:
                 made = light_smoke(volume, view, lamps, march)
             else:
                 made = scatter(volume, view, lamps, colour, march=march, model=network)
-            time = frames.time(frame)
-            shaded = light_picture(made, albedo=colour, background=behind, time=time, **extra)
+            extra, background = {}, (0.0, 0.0, 0.0)
+            if (looks := frames.looks(frame)) is not None:
+                extra = {"ramp": looks.ramp, "obstacles": looks.obstacles, "time": looks.time}
+                background = looks.background
+            background = background if behind is None else behind
+            shaded = light_picture(made, albedo=colour, background=background, **extra)
             pictures.append(to_bytes(shaded, white))
             path = file(frame)
             save_png(path, pictures[-1])
@@ -108,7 +107,7 @@ def light(
             rows.add_row(
                 escape(path.name), f"{covered:.1%}", f"{shaded.mean():.4g}", f"{shaded.max():.4g}", f"{clipped:.1%}"
             )
-    if scene is not None:
+    if not frames.single:
         contact_sheet(output / SHEET, {"": pictures})
     show(rows)
 
@@ -144,7 +143,7 @@ def trace(
     _check_white(white)
     own = _lights(lights, points)
     quiet_warp()
-    from wlm.smoke.scene import make_camera, obstacle_mesh
+    from wlm.smoke.scene import obstacle_mesh
     from wlm.smoke.transport.lights import Environment
     from wlm.smoke.transport.tracing import HIGHEST, trace
     from wlm.view.atlas import save_png
@@ -157,17 +156,15 @@ def trace(
     camera = options.camera(frames, orthographic=False, perspective=perspective)
     scene = frames.scene
     lamps = own or ([] if environment is not None else _scene_lights(scene))
-    if scene is None:
+    if frames.single:
         check_output(output, ".png", ".exr")
-        as_exr = output.suffix.lower() == ".exr"
-    else:
-        as_exr = False
-    file = (lambda frame: output) if scene is None else outputs(smoke, False, output, "trace", ".png")
+    as_exr = frames.single and output.suffix.lower() == ".exr"
+    file = (lambda frame: output) if frames.single else outputs(smoke, False, output, "trace", ".png")
     settings = {"albedo": colour, "g": g, "samples": samples, "orders": orders, "seed": seed}
     rows = table(str(smoke), ["file", "mean", "largest", "scattered again", "noise"])
     with running("trace") as progress:
         for frame, volume in _each(frames):
-            view = make_camera(camera, volume.origin, [volume.voxel * n for n in volume.shape])
+            view = frames.view(camera, volume)
             solid = None
             if scene is not None and scene.obstacles:
                 solid = obstacle_mesh(scene.obstacles, frames.time(frame))[:2]
