@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from wlm.baselines.rival import Rival
-    from wlm.probe import ProbeModel, ProbeSet, Report, TransformModel
+    from wlm.probe import ProbeModel, ProbeSet, Report, Transform
 
 app = typer.Typer(help="Light probes: quantised 3D Gaussians and a small network, read through a cascaded volume.")
 register(app)
@@ -330,7 +330,7 @@ def _load(path: Path, key: str | None, convention: str | None) -> "ProbeSet":
     return probes
 
 
-def _positions(model: "ProbeModel | TransformModel", path: Path | None) -> "tuple[np.ndarray, bool]":
+def _positions(model: "ProbeModel | Transform", path: Path | None) -> "tuple[np.ndarray, bool]":
     """The positions to decode at, float64 [M, 3], and whether they are those of the model's own probes."""
     from wlm.probe import load_positions
 
@@ -340,7 +340,7 @@ def _positions(model: "ProbeModel | TransformModel", path: Path | None) -> "tupl
     return position, model.has_probes_at(position)
 
 
-def _given(model: "ProbeModel | TransformModel", original: Path | None) -> "np.ndarray | None":
+def _given(model: "ProbeModel | Transform", original: Path | None) -> "np.ndarray | None":
     """The positions of the model's own probes in another file, if there is one; only a transform needs them."""
     from wlm.probe import load_positions
 
@@ -355,7 +355,7 @@ def _given(model: "ProbeModel | TransformModel", original: Path | None) -> "np.n
 
 
 def _decoder(
-    model: "ProbeModel | TransformModel", device: str, original: Path | None, position: "np.ndarray | None" = None
+    model: "ProbeModel | Transform", device: str, original: Path | None, position: "np.ndarray | None" = None
 ) -> "Any":
     """A decoder, of a transform at the places of `original` or at `position`, the model's own probes."""
     given = _given(model, original)

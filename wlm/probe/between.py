@@ -6,7 +6,7 @@ uncompressed others give there by the plain rules of engines is beside it. And h
 the decoded light is compared with what the uncompressed probes give there by kriging.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,7 @@ from wlm.probe.data import ProbeSet, from_arrays
 from wlm.probe.fit import compress
 from wlm.probe.kriging import Kriging
 from wlm.probe.model import ProbeModel
-from wlm.probe.transform import TransformModel
+from wlm.probe.transform import Transform
 from wlm.system import OnProgress
 
 EVERY = 5
@@ -51,7 +51,7 @@ class HeldOut:
 
 
 def held_out(
-    model: ProbeModel | TransformModel,
+    model: ProbeModel | Transform,
     probes: ProbeSet,
     *,
     seed: int = 0,
@@ -75,9 +75,9 @@ def held_out(
     known, asked = live[~out], live[out]
     others = from_arrays(probes.position[known], probes.values[known], name=probes.name)
     settings: dict[str, Any] = {}
-    if isinstance(model, TransformModel):
+    if isinstance(model, Transform):
         # The others' file has no positions.
-        settings["max_bytes"] = replace(model, places=None).file_bytes() * (EVERY - 1) // EVERY
+        settings["max_bytes"] = model.without_places().file_bytes() * (EVERY - 1) // EVERY
     try:
         fitted = compress(others, model.profile, seed=seed, device=device, progress=progress, **settings)
     except WlmError as error:

@@ -21,7 +21,7 @@ from wlm.formats.reading import named_file
 from wlm.probe.conventions import THREE_GRID as FORMAT
 from wlm.probe.decode import Decoder
 from wlm.probe.model import ProbeModel
-from wlm.probe.transform import TransformModel
+from wlm.probe.transform import Transform
 from wlm.probe.transform_decode import TransformDecoder
 
 _VERSION = 1
@@ -72,7 +72,7 @@ export async function loadLightProbeGrid(url, renderer, THREE, KTX2Loader, Grid)
 
 
 def export_grid(
-    model: ProbeModel | TransformModel,
+    model: ProbeModel | Transform,
     directory: str | os.PathLike[str],
     *,
     cells: int = CELLS,
@@ -102,7 +102,7 @@ def export_grid(
         raise WlmError(f"{model.name}: expected L2 in RGB, 27 numbers a probe, got {model.outputs}")
     if not 1 <= cells <= _MOST_CELLS:
         raise WlmError(f"cells: expected 1 to {_MOST_CELLS} along the longest side, got {cells}")
-    if isinstance(model, TransformModel):
+    if isinstance(model, Transform):
         position = model.stored_positions() if position is None else position
         decoder: Decoder | TransformDecoder = TransformDecoder(model, device, position=position)
         corner, span = position.min(0), np.ptp(position, axis=0)

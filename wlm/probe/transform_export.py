@@ -12,7 +12,7 @@ from wlm.errors import WlmError
 from wlm.probe.conventions import CANONICAL
 from wlm.probe.kriging import FEW, NEIGHBOURS, SILL, SLIGHT, TAPER
 from wlm.probe.sphere import sh_count
-from wlm.probe.transform import TransformModel
+from wlm.probe.transform import Transform
 
 LIGHT_FILE = "light.bin"
 HEAD_WORDS = 15
@@ -235,7 +235,7 @@ def transform_glsl(live: int, outputs: int) -> str:
     return text if coefficients is None else text + _SH.format(coefficients=coefficients)
 
 
-def light_bytes(model: TransformModel, place: np.ndarray, values: np.ndarray) -> tuple[bytes, dict[str, Any]]:
+def light_bytes(model: Transform, place: np.ndarray, values: np.ndarray) -> tuple[bytes, dict[str, Any]]:
     """What `light.bin` holds, and its numbers for `probe.json`.
 
     Args:
@@ -276,7 +276,7 @@ def light_bytes(model: TransformModel, place: np.ndarray, values: np.ndarray) ->
     return content, numbers
 
 
-def transform_document(model: TransformModel, live: int, numbers: dict[str, Any]) -> dict[str, Any]:
+def transform_document(model: Transform, live: int, numbers: dict[str, Any]) -> dict[str, Any]:
     """What `probe.json` says of a transform, but for its kind and version."""
     return {
         "about": ABOUT,

@@ -18,14 +18,14 @@ from wlm.probe.model import ProbeModel
 from wlm.probe.places import ball_exposure, ball_radius, probes_of
 from wlm.probe.shader import probe_glsl
 from wlm.probe.sphere import sh_count
-from wlm.probe.transform import TransformModel
+from wlm.probe.transform import Transform
 from wlm.web.page import Page, pack_triangles
 
 _BANDS = 9  # coefficients that diffuse light needs
 
 
 def probe_page(
-    model: ProbeModel | TransformModel,
+    model: ProbeModel | Transform,
     file_bytes: int,
     *,
     mesh: str | os.PathLike[str] | None = None,
