@@ -15,11 +15,11 @@ import wlm
 from wlm.errors import WlmError
 from wlm.lightmap import fit as lightmap_fit
 from wlm.probe import fit as probe_fit
-from wlm.probe.transform import TransformModel
+from wlm.probe.transform import Transform
 from wlm.smoke.learn.pool import load_pool
 from wlm.system import Meter
 
-from .containers import vary_artifact
+from .containers import vary_artifact, vary_compact
 from .reader import Reader, check_digest, check_finite, corpus, stored
 
 
@@ -46,7 +46,7 @@ def _layers(path: Path) -> None:
 def _probe(path: Path) -> None:
     model = wlm.load(path, "probe")
     check_digest(path)
-    if isinstance(model, TransformModel):
+    if isinstance(model, Transform):
         if model.has_positions:
             values = model.decoder().decode_probes()
             check_finite(values=values, position=model.stored_positions())
@@ -275,6 +275,7 @@ READERS = (
     ),
     Reader("lightmap-layers", "a.wlm", stored("lightmap-layers.wlm"), vary_artifact, _layers),
     Reader("probe", "a.wlm", stored("probe.wlm", "probe-transform.wlm"), vary_artifact, _probe),
+    Reader("probe-compact", "a.wlm", stored("probe-compact.wlm", "probe-regions.wlm"), vary_compact, _probe),
     Reader(
         "atlas",
         "a.wlm",

@@ -156,12 +156,12 @@ class RegionModel(Transform):
         piece, name = self.pieces[number], f"{self.name}, region {number}"
         _check_digest(name, piece.data, piece.digest)
         try:
-            own, places, check, stream = parse_piece(piece.data, piece.probes, self.outputs, dead)
+            own, places, check, grid, stream = parse_piece(piece.data, piece.probes, self.outputs, dead)
         except ValueError as error:
             raise WlmError(f"{name}: {error}") from error
         if self.has_positions != (places is not None):
             raise WlmError(f"{name}: expected places in all regions or in none")
-        head = self.head._replace(check=check)
+        head = self.head._replace(check=check, grid=grid)
         return TransformModel(name, self.source, piece.probes, self.outputs, own, head, stream, places, self.directions)
 
     def boxes(self) -> np.ndarray:
@@ -218,7 +218,7 @@ class RegionModel(Transform):
         pieces = []
         for number, piece in enumerate(self.pieces):
             model = self.region(number)
-            data = pack_piece(model.dead, None, model.head.check, model.stream)
+            data = pack_piece(model.dead, None, model.head.check, model.head.grid, model.stream)
             pieces.append(piece._replace(data=np.frombuffer(data, np.uint8), digest=digest(data)))
         order = pack_dead(self.dead)
         return replace(self, has_positions=False, order=order, order_digest=digest(order), pieces=tuple(pieces))

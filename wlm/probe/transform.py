@@ -49,6 +49,7 @@ class Head(NamedTuple):
         vectors: Stored directions.
         flags: 1 where probes are predicted from coarser ones; twice the place in `FINENESS` of the directions'; 8 where
             numbers are not turned at all.
+        grid: Of the tree of places.
         words: Of 32 bits, in which the directions are coded by themselves, as earlier files have them; None: they are
             coded in front of the numbers.
     """
@@ -57,6 +58,7 @@ class Head(NamedTuple):
     check: int
     vectors: int
     flags: int
+    grid: int = 0
     words: int | None = None
 
     @property
@@ -213,7 +215,7 @@ class TransformModel(Transform):
         if len(places.code) != self.probes or places.check != head.check:
             raise WlmError(f"{self.name}: expected the positions of its own {self.probes} probes, in their order")
         live = live_probes(self.dead, self.probes)
-        tree = Tree(places.code[live]) if head.predicted else None
+        tree = Tree(places.code[live], head.grid) if head.predicted else None
         try:
             vectors, q = self._numbers(tree, int(live.sum()))
         except ValueError as error:

@@ -7,7 +7,8 @@ last byte:
 field           content
 ==============  =======================================================================================================
 flags           U16: stored directions; 64 times `Head.flags`; 1024 where D follows, which else is 27; 2048 where there
-                are dead probes; 4096 where their bits are deflated; 8192 where places are stored
+                are dead probes; 4096 where their bits are deflated; 8192 where places are stored; 16384 times
+                the tree's place in `RADII`
 N, D            numbers of any size; D if it isn't 27
 source          the first 8 digits of the input's hash, as 4 bytes
 dead            a bit for each probe, the first in the highest bit of the first byte; or a length and these deflated
@@ -37,6 +38,7 @@ from wlm.formats.deflate import inflate
 from wlm.formats.limits import NUMBERS, PROBES
 from wlm.formats.parts import Part, check_part, check_parts
 from wlm.probe.transform import SOURCE, Head, Places, TransformModel, step_of
+from wlm.probe.tree import RADII
 from wlm.system import Header, Name
 
 _LIGHT, _PLACES, _FRAME = "light", "places", "frame"
@@ -46,8 +48,9 @@ CORNERS = struct.Struct("<4d")
 _CHECK = struct.Struct("<I")
 SHORT = struct.Struct("<H")
 DIRECTIONS, KIND = 63, 15  # masks
-HEAD_SHIFT = 6
+HEAD_SHIFT, _GRID_SHIFT = 6, 14
 OUTPUTS, _DEAD, _DEFLATED, PLACED = (1 << bit for bit in range(10, 14))
+_GRIDLESS = (1 << _GRID_SHIFT) - 1
 _LONGEST = 5  # bytes of a whole number
 FARTHEST = 1e150
 # Numbers that a transform may unpack to: those of a set without any light have next to no bytes.
@@ -112,7 +115,7 @@ def name_of(artifact: Artifact) -> str:
 def encode_body(model: TransformModel) -> bytes:
     """The bytes of the module's table."""
     head = model.head
-    flags = head.vectors | head.flags << HEAD_SHIFT
+    flags = head.vectors | head.flags << HEAD_SHIFT | head.grid << _GRID_SHIFT
     pieces = [number_bytes(model.probes)]
     if model.outputs != L2:
         flags |= OUTPUTS
@@ -135,7 +138,7 @@ def decode_body(name: str, body: np.ndarray) -> TransformModel:
     """
     reader = Fields(body)
     flags = reader.fields(SHORT)[0]
-    if flags >= 2 * PLACED or flags & (_DEAD | _DEFLATED) == _DEFLATED:
+    if flags & (_DEAD | _DEFLATED) == _DEFLATED:
         raise ValueError(f"part {BODY}: expected known flags, found {flags}")
     probes = reader.number("probes", PROBES)
     outputs = reader.number("numbers of a probe", NUMBERS) if flags & OUTPUTS else L2
@@ -144,28 +147,29 @@ def decode_body(name: str, body: np.ndarray) -> TransformModel:
     step = step_of(reader.fields(SHORT)[0])
     check = reader.fields(_CHECK)[0] if places is None else places.check
     stream = reader.rest()
-    head = Head(step, check, flags & DIRECTIONS, flags >> HEAD_SHIFT & KIND).checked(outputs, len(stream))
+    kind, grid = flags >> HEAD_SHIFT & KIND, flags >> _GRID_SHIFT
+    head = Head(step, check, flags & DIRECTIONS, kind, grid).checked(outputs, len(stream))
     check_counts(probes, outputs, dead, len(stream))
     return TransformModel(name, source, probes, outputs, dead, head, stream, places)
 
 
-def pack_piece(dead: np.ndarray, places: Places | None, check: int, stream: np.ndarray) -> bytes:
+def pack_piece(dead: np.ndarray, places: Places | None, check: int, grid: int, stream: np.ndarray) -> bytes:
     """The bytes of a region: flags U8, those of the table's from 2048 on, over 2048; then dead, places, check, stream.
 
     Args:
         dead: bool [n], of the region's probes, empty if there are none; nothing is stored of it without places.
         places: Of the region, where they are stored.
-        check: Of the region's places.
+        check, grid: Of the region's places.
         stream: The numbers.
     """
     flags, own = _pack_own(dead, places) if places is not None else (0, _CHECK.pack(check))
-    return bytes([flags // _DEAD]) + own + stream.tobytes()
+    return bytes([(flags | grid << _GRID_SHIFT) // _DEAD]) + own + stream.tobytes()
 
 
 def parse_piece(
     data: np.ndarray, probes: int, outputs: int, dead: np.ndarray | None
-) -> tuple[np.ndarray, Places | None, int, np.ndarray]:
-    """Undoes `pack_piece`: dead probes, places, check and stream.
+) -> tuple[np.ndarray, Places | None, int, int, np.ndarray]:
+    """Undoes `pack_piece`: dead probes, places, check, grid and stream.
 
     Args:
         data: uint8 [B].
@@ -177,7 +181,8 @@ def parse_piece(
     """
     reader = Fields(data)
     flags = int(reader.take(1)[0]) * _DEAD
-    if flags not in (0, PLACED, PLACED | _DEAD, PLACED | _DEAD | _DEFLATED):
+    grid = flags >> _GRID_SHIFT
+    if grid >= len(RADII) or flags & _GRIDLESS not in (0, PLACED, PLACED | _DEAD, PLACED | _DEAD | _DEFLATED):
         raise ValueError(f"expected known flags, found {flags // _DEAD}")
     own, places = reader.own(flags, probes)
     check = places.check if places is not None else reader.fields(_CHECK)[0]
@@ -185,7 +190,7 @@ def parse_piece(
         own = dead
     stream = reader.rest()
     check_counts(probes, outputs, own, len(stream))
-    return own, places, check, stream
+    return own, places, check, grid, stream
 
 
 def pack_labels(labels: np.ndarray) -> np.ndarray:
@@ -338,7 +343,7 @@ def _decode_earlier(artifact: Artifact) -> TransformModel:
         raise ValueError(f"part light: expected at least {expected} bytes, found {len(light)}")
     step, check, words, vectors, flags = _EARLIER.unpack(light[: _EARLIER.size].tobytes())
     stream = light[_EARLIER.size : end]
-    head = Head(step, check, vectors, flags, words).checked(header.outputs, len(stream))
+    head = Head(step, check, vectors, flags, 0, words).checked(header.outputs, len(stream))
     dead = unpack_dead(light[end:], header.probes)
     check_counts(header.probes, header.outputs, dead, len(stream))
     places = None

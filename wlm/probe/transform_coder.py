@@ -15,10 +15,13 @@ import numpy as np
 
 from wlm.probe.entropy import LARGEST
 from wlm.probe.transform import Coding, Places, colours, make_stream, stored_step
-from wlm.probe.tree import Tree
+from wlm.probe.tree import RADII, Tree
 
 MANY = 4096
 """Probes above which a fit at another step begins where the last one ended."""
+
+BIT = 0.1155
+"""Squared steps that a bit is worth at fine steps: 2 ln 2 / 12."""
 
 _PRICE = 0.25  # of a number that isn't zero, in steps
 _ROUND = 0.4  # what is added before rounding down: below half, a smaller number is cheaper
@@ -43,10 +46,21 @@ class Measured:
 
 @dataclass(frozen=True)
 class Coded:
-    """A region's numbers at a step: the stream, uint8 [B], and the sum of squared errors."""
+    """A region's numbers at a step.
+
+    Attributes:
+        stream: uint8 [B].
+        error: The sum of squares.
+        grid: Of the tree.
+    """
 
     stream: np.ndarray
     error: float
+    grid: int
+
+    def cost(self, step: float) -> float:
+        """The error, with what the bytes are worth at a step."""
+        return self.error + BIT * step**2 * 8 * len(self.stream)
 
 
 class Coder:
@@ -61,10 +75,10 @@ class Coder:
             live: bool [N], one at least is.
         """
         self._values = values[live].astype(np.float64)
-        self._tree = Tree(Places.of(position).code[live])
-        self._coding = Coding(self._tree)
-        self._bound = 1.05 * _largest_eigenvalue(self._tree)
+        self._code = Places.of(position).code[live]
+        self._coding = Coding(True)
         self._turned = self._warm = None
+        self._take(Tree(self._code, 1))
 
     def measure(self) -> Measured:
         tree = self._tree
@@ -77,6 +91,22 @@ class Coder:
     def choose(self, coding: Coding) -> None:
         """Takes a way to code; a tree in it stands for the region's own."""
         self._coding, self._turned, self._warm = coding, None, None
+
+    def settle(self, step: float) -> None:
+        """Takes the grid of the tree that costs least at a step."""
+        if not self._coding.predicted or len(self._tree.levels) < 2:
+            return
+        # Of many probes the other distances cost more time than they are worth bytes.
+        others = range(len(RADII)) if len(self._code) <= MANY else (0, 1)
+        trees = [self._tree] + [Tree(self._code, grid) for grid in others if grid != self._tree.grid]
+        costs = []
+        for self._tree in trees:
+            costs.append(self.plain(step).cost(stored_step(step)))
+        self._take(trees[int(np.argmin(costs))])
+
+    def _take(self, tree: Tree) -> None:
+        self._tree, self._warm = tree, None
+        self._bound = 1.05 * _largest_eigenvalue(tree)
 
     def plain(self, step: float) -> Coded:
         """Each number rounded for itself."""
@@ -125,7 +155,7 @@ class Coder:
             decoded = self._tree.values(decoded / self._tree.reach[:, None])
         tree = self._tree if self._coding.predicted else None
         error = float(np.square(decoded - self._target()).sum())
-        return Coded(make_stream(self._coding, tree, q), error)
+        return Coded(make_stream(self._coding, tree, q), error, self._tree.grid)
 
 
 class Coders:

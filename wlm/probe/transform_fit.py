@@ -21,11 +21,10 @@ from wlm.probe.model import Profile
 from wlm.probe.regions import Piece, RegionModel, Split, members
 from wlm.probe.transform import FINENESS, SOURCE, VECTORS, Coding, Places, Transform, TransformModel, stored_step
 from wlm.probe.transform_codec import pack_dead, pack_labels, pack_piece
-from wlm.probe.transform_coder import MANY, Coded, Coders, Measured
+from wlm.probe.transform_coder import BIT, MANY, Coded, Coders, Measured
 from wlm.system import Meter, OnProgress
 from wlm.workers import Here, Processes, Workers, cores
 
-_BIT = 0.1155  # squared steps that a bit is worth at fine steps: 2 ln 2 / 12
 _COUNTS = (1, 2, 4, 8, 16)  # of stored directions that are tried, and all
 _WIDEST = 64  # numbers of a probe up to which directions are looked for
 _TINY = 16  # live probes up to which every way to code is fitted: each byte counts
@@ -45,6 +44,7 @@ class _Tried:
     step: float
     coding: Coding
     streams: tuple[np.ndarray, ...]
+    grids: tuple[int, ...]
     error: float
 
     @property
@@ -99,11 +99,13 @@ class _Frame:
         if self.split.regions == 1:
             stored = self._places if self._positions else None
             shape = (probes.probes, probes.outputs)
+            head = head._replace(grid=tried.grids[0])
             return TransformModel(probes.name, source, *shape, self._dead, head, tried.streams[0], stored)
         pieces = []
-        for (places, check, box), part, stream in zip(self._pieces, self.members, tried.streams, strict=True):
+        parts = zip(self._pieces, self.members, tried.grids, tried.streams, strict=True)
+        for (places, check, box), part, grid, stream in parts:
             dead = self._dead[part] if self._dead.size else self._dead
-            data = pack_piece(dead, places if self._positions else None, check, stream)
+            data = pack_piece(dead, places if self._positions else None, check, grid, stream)
             pieces.append(Piece(np.frombuffer(data, np.uint8), digest(data), len(part), box))
         order = pack_labels(self._labels) if self._positions else pack_dead(self._dead)
         return RegionModel(
@@ -344,8 +346,9 @@ class _Search:
         for coding in options:
             self._choose(coding)
             tried = self._plain(step)
-            costs.append(tried.error + _BIT * tried.step**2 * 8 * self._frame.file_bytes(tried))
+            costs.append(tried.error + BIT * tried.step**2 * 8 * self._frame.file_bytes(tried))
         self._choose(options[int(np.argmin(costs))])
+        self._team.run("settle", step)
 
     def _choose(self, coding: Coding) -> None:
         self._coding = coding
@@ -360,7 +363,8 @@ class _Search:
     def _all(self, method: str, step: float) -> _Tried:
         coded: list[Coded] = self._team.run(method, step)
         error = sum(each.error for each in coded)
-        return _Tried(stored_step(step), self._coding, tuple(each.stream for each in coded), error)
+        streams, grids = tuple(each.stream for each in coded), tuple(each.grid for each in coded)
+        return _Tried(stored_step(step), self._coding, streams, grids, error)
 
     def _psnr(self, tried: _Tried) -> float:
         return psnr_from_mse(tried.error / self._probes.values.size, self._peak)
