@@ -78,6 +78,9 @@ def compress(
     max_bytes: Annotated[
         int | None, typer.Option(metavar="BYTES", help="Of a transform: the most bytes that the file may have.")
     ] = None,
+    region: Annotated[
+        int | None, typer.Option(metavar="PROBES", help="Of a transform: live probes up to which a set is one region.")
+    ] = None,
     ratio: Annotated[float | None, typer.Option(help="Gaussians as a share of the live probes.")] = None,
     bits: Annotated[int | None, typer.Option(help="Bits of a Gaussian's scale, rotation and latent.")] = None,
     latent: Annotated[int | None, typer.Option(help="Numbers in a Gaussian's latent.")] = None,
@@ -103,7 +106,7 @@ def compress(
     from wlm.probe import Profile, compress, open_checkpoint
     from wlm.probe.fit import check_method
 
-    overrides = {"target_psnr": target_psnr, "max_bytes": max_bytes}
+    overrides = {"target_psnr": target_psnr, "max_bytes": max_bytes, "region": region}
     overrides |= {"ratio": ratio, "bits": bits, "latent": latent, "steps": steps}
     settings = Profile.load(profile).override(overrides, "--")
     check_method(settings, overrides, "--")
@@ -143,6 +146,9 @@ def decode(
     ] = None,
     convention: Annotated[str, typer.Option(help="Of the numbers: threejs, godot, unreal or unity.")] = "threejs",
     original: _Original = None,
+    region: Annotated[
+        int | None, typer.Option(metavar="NUMBER", help="Of a file of many regions: the live probes of one, from 0.")
+    ] = None,
     device: Device = "cpu",
 ) -> None:
     """Decode the light at the stored positions, or at any others.
@@ -156,15 +162,19 @@ def decode(
     from wlm.system import load
 
     model = load(file, "probe")
-    position, at_probes = _positions(model, positions)
-    decoder = _decoder(model, device, original, position if at_probes else None)
-    values = decoder.decode_probes(position) if at_probes else decoder.decode(position)
+    if region is None:
+        position, at_probes = _positions(model, positions)
+        decoder = _decoder(model, device, original, position if at_probes else None)
+        values = decoder.decode_probes(position) if at_probes else decoder.decode(position)
+    else:
+        position, values = _region(file, model, region, positions, original, device)
+        at_probes = False
     save_probes(output, position, values, convention=convention)
     rows = table(str(file), ["file", "positions", "of", "zero", "mean", "largest"], text=["of"])
     rows.add_row(
         escape(str(output)),
         f"{len(position):,}",
-        "its probes" if at_probes else "other points",
+        "its probes" if at_probes else "other points" if region is None else f"region {region}",
         f"{int(model.dead.sum()) if at_probes else 0:,}",
         f"{values.mean():.4g}",
         f"{values.max():.4g}",
@@ -209,7 +219,7 @@ def evaluate(
     with running("evaluate") as progress:
         size = file.stat().st_size
         report = evaluate(model, probes, device=device, progress=progress, file_bytes=size, hold_out=hold_out)
-    if probes.source != model.source:
+    if not model.source or not probes.source.startswith(model.source):
         note(f"warning: {probes_path}: not what {file} was made of; another key, convention or file?")
     if html_path is not None:
         from wlm.view.reports import probe_report
@@ -239,7 +249,7 @@ def info(file: ModelFile, as_json: AsJson = False, device: Device = "cpu") -> No
     quiet_warp()
     from wlm import system
     from wlm.formats.artifact import read_artifact
-    from wlm.probe import codec
+    from wlm.probe import RegionModel, codec
 
     artifact = read_artifact(file, "probe")
     model = system.decode(file, artifact, codec.decode)
@@ -262,6 +272,7 @@ def info(file: ModelFile, as_json: AsJson = False, device: Device = "cpu") -> No
     }
     if transform:
         facts |= {"step": model.head.step, "directions": model.head.vectors, "predicted": model.head.predicted}
+        facts["regions"] = model.split.regions if isinstance(model, RegionModel) else 1
     else:
         facts |= {
             "gaussians": model.count,
@@ -283,6 +294,7 @@ def info(file: ModelFile, as_json: AsJson = False, device: Device = "cpu") -> No
     if transform:
         rows.add_row("step", f"{model.head.step:.4g}")
         rows.add_row("directions", str(model.head.vectors))
+        rows.add_row("regions", str(facts["regions"]))
     else:
         rows.add_row("Gaussians", f"{model.count:,}, {model.dropped:,} dropped")
         rows.add_row("bits per Gaussian", str(facts["gaussian_bits"]))
@@ -328,6 +340,21 @@ def _load(path: Path, key: str | None, convention: str | None) -> "ProbeSet":
     for warning in probes.warnings:
         note(f"warning: {warning}")
     return probes
+
+
+def _region(
+    file: Path, model: "Any", number: int, positions: Path | None, original: Path | None, device: str
+) -> "tuple[np.ndarray, np.ndarray]":
+    """Positions and numbers of the live probes of one region; nothing of the others is read."""
+    from wlm.probe import RegionModel
+
+    if not isinstance(model, RegionModel) or not 0 <= number < model.split.regions:
+        regions = model.split.regions if isinstance(model, RegionModel) else 0
+        raise WlmError(f"--region: expected one of {file}'s {regions} regions, counted from 0, found {number}")
+    if positions is not None:
+        raise WlmError("--region: expected no --positions: they are those of the region's probes")
+    given = _given(model, original)
+    return model.decoder(device, position=given).region(number)
 
 
 def _positions(model: "ProbeModel | Transform", path: Path | None) -> "tuple[np.ndarray, bool]":

@@ -69,7 +69,8 @@ class ProbeSet:
         name: The set's name.
         position: float64 [N, 3], in the input's unit and axes.
         values: float32 [N, D], finite; zero where a probe is not live; above 1 GiB in a file without a name. For
-            spherical harmonics D = 3 C, and `values.reshape(N, C, 3)` are canonical coefficients of radiance (`wlm.probe.conventions`), RGB last.
+            spherical harmonics D = 3 C, and `values.reshape(N, C, 3)` are canonical coefficients of radiance
+            (`wlm.probe.conventions`), RGB last.
         key: Name of the array that was read.
         live: bool [N], false where the probe takes no part in the fit and decodes to zero; at least one is true.
         source: 16 hexadecimal digits of BLAKE2b over the positions, the values and which are live.

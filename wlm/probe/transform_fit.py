@@ -89,7 +89,7 @@ class _Frame:
         self._pieces: list[tuple[Places, int, np.ndarray]] = []
         if self.split.regions > 1:
             self._pieces = [self._piece(part) for part in self.members]
-        self._beside: dict[int, int] = {}
+        self._beside: dict[Coding, int] = {}
 
     def model(self, tried: _Tried) -> Transform:
         """The model of what was chosen."""
@@ -126,10 +126,9 @@ class _Frame:
 
     def file_bytes(self, tried: _Tried) -> int:
         """Size of the file; what isn't a stream is laid out once for each coding."""
-        key = id(tried.coding)
-        if key not in self._beside:
-            self._beside[key] = self.model(tried).file_bytes() - tried.size
-        return self._beside[key] + tried.size
+        if tried.coding not in self._beside:
+            self._beside[tried.coding] = self.model(tried).file_bytes() - tried.size
+        return self._beside[tried.coding] + tried.size
 
     def _piece(self, part: np.ndarray) -> tuple[Places, int, np.ndarray]:
         places = Places.of(self.probes.position[part])
