@@ -4,13 +4,15 @@
 lowest bit first; `frame` is origin, extent, size of the box and gain; `dead` is a bit for each probe, deflated.
 
 A transform has `light`, its stream and the dead probes' bits, in place of Gaussians, bounds and network; `places` are
-differences of 16 bits from probe to probe, deflated, and `frame` is then origin and extent alone.
+differences of 16 bits from probe to probe, deflated, and `frame` is then origin and extent alone. Several hours are in
+the part `hours` (`wlm.probe.day`) in place of `light`.
 """
 
 import zlib
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+from itertools import pairwise
+from typing import Annotated, Any
 
 import numpy as np
 from pydantic import Field
@@ -21,14 +23,15 @@ from wlm.formats.bits import pack_bits, unpack_bits
 from wlm.formats.deflate import inflate
 from wlm.formats.limits import NUMBERS, PROBES
 from wlm.formats.parts import Part, check_part, check_parts
+from wlm.probe.day import PERIOD, TIMES, DayModel, pack_hours, unpack_hours
 from wlm.probe.model import LATENT, SCALE, ProbeModel, Profile, layer_shapes
-from wlm.probe.transform import Places, TransformModel
+from wlm.probe.transform import Places, TransformModel, read_head
 from wlm.system import Header, Name
 
 _MOST_LOG = 40.0
 
 
-_LIGHT = "light"
+_LIGHT, _HOURS = "light", "hours"
 _L2 = 27  # numbers of a probe that a transform's file doesn't state
 # Numbers that a transform may unpack to: those of a set without any light have next to no bytes.
 _SURE_NUMBERS, _NUMBERS_A_BYTE = 1 << 23, 4096
@@ -43,6 +46,15 @@ class _TransformHeader(Header):
     probes: int = Field(ge=1, le=PROBES)
     outputs: int = Field(_L2, ge=1, le=NUMBERS)
     dead: int = Field(0, ge=0, le=2 * PROBES)
+
+
+class _DayHeader(Header):
+    """The settings of a file of several hours."""
+
+    name: Name
+    probes: int = Field(ge=1, le=PROBES)
+    outputs: int = Field(_L2, ge=1, le=NUMBERS)
+    times: list[Annotated[float, Field(ge=0.0, lt=PERIOD)]] = Field(min_length=1, max_length=TIMES)
 
 
 class _Header(Header):
@@ -63,6 +75,9 @@ _TRANSFORM_PARTS = {
 }
 
 
+_DAY_PARTS = {_HOURS: _TRANSFORM_PARTS[_LIGHT]} | {name: _TRANSFORM_PARTS[name] for name in ("places", "frame")}
+
+
 def _parts(header: _Header) -> dict[str, Part]:
     """The table of parts."""
     profile = header.profile
@@ -81,6 +96,8 @@ def _parts(header: _Header) -> dict[str, Part]:
 
 def encode(model: ProbeModel | TransformModel) -> tuple[dict[str, Any], dict[str, np.ndarray], str]:
     """Settings, parts and source of a model's file."""
+    if isinstance(model, DayModel):
+        return _encode_day(model)
     if isinstance(model, TransformModel):
         return _encode_transform(model)
     settings = {
@@ -110,6 +127,8 @@ def decode(artifact: Artifact) -> ProbeModel | TransformModel:
     """
     if _LIGHT in artifact.tensors:
         return _decode_transform(artifact)
+    if _HOURS in artifact.tensors:
+        return _decode_day(artifact)
     header = check_settings(_Header, artifact.settings, "setting ")
     parts = check_parts(artifact.tensors, _parts(header))
     _check_frame(parts["frame"])
@@ -146,13 +165,28 @@ def _encode_transform(model: TransformModel) -> tuple[dict[str, Any], dict[str, 
     if len(dead):
         settings["dead"] = len(dead)
     parts = {_LIGHT: np.concatenate([model.stream, dead])}
-    if model.places is not None:
-        change = np.diff(model.places.code.astype(np.uint16), axis=0, prepend=np.zeros((1, 3), np.uint16))
-        # Axis by axis, low bytes and then high ones: those of a lattice repeat.
-        planes = np.ascontiguousarray(change.T.astype("<u2")).view(np.uint8).reshape(3, -1, 2).transpose(0, 2, 1)
-        parts["places"] = np.frombuffer(zlib.compress(planes.tobytes(), 9), np.uint8)
-        parts["frame"] = np.array([*model.places.origin, model.places.extent], np.float64)
+    parts |= _encode_places(model.places)
     return settings, {name: part for name, part in parts.items() if part.size}, model.source
+
+
+def _encode_day(model: DayModel) -> tuple[dict[str, Any], dict[str, np.ndarray], str]:
+    settings: dict[str, Any] = {"name": model.name, "probes": model.probes, "times": list(model.times)}
+    if model.outputs != _L2:
+        settings["outputs"] = model.outputs
+    return settings, {_HOURS: pack_hours(model.hours, model.probes)} | _encode_places(model.places), model.source
+
+
+def _encode_places(places: Places | None) -> dict[str, np.ndarray]:
+    """The parts of places that are stored."""
+    if places is None:
+        return {}
+    change = np.diff(places.code.astype(np.uint16), axis=0, prepend=np.zeros((1, 3), np.uint16))
+    # Axis by axis, low bytes and then high ones: those of a lattice repeat.
+    planes = np.ascontiguousarray(change.T.astype("<u2")).view(np.uint8).reshape(3, -1, 2).transpose(0, 2, 1)
+    return {
+        "places": np.frombuffer(zlib.compress(planes.tobytes(), 9), np.uint8),
+        "frame": np.array([*places.origin, places.extent], np.float64),
+    }
 
 
 def _decode_transform(artifact: Artifact) -> TransformModel:
@@ -162,26 +196,10 @@ def _decode_transform(artifact: Artifact) -> TransformModel:
     end = len(light) - header.dead
     if end < 0:
         raise ValueError(f"part light: expected at least {header.dead} bytes, found {len(light)}")
-    most = _SURE_NUMBERS + _NUMBERS_A_BYTE * end
-    if header.probes * header.outputs > most:
-        numbers = f"{header.probes} probes of {header.outputs} numbers"
-        raise ValueError(f"part light: expected at most {most} numbers of {end} bytes, found {numbers}")
+    _check_numbers(header.probes, header.outputs, end)
     dead = _unpack_dead(light[end:], header.probes)
-    live, most = header.probes - int(dead.sum()), _SURE_PROBES + _PROBES_A_BYTE * end
-    if not 1 <= live <= most:
-        raise ValueError(f"part light: expected 1 to {most} live probes of {end} bytes, found {live}")
-    places = None
-    if parts["places"].size:
-        size = 6 * header.probes
-        data = inflate(parts["places"].tobytes(), size, "part places", f"the places of {header.probes} probes")
-        planes = np.frombuffer(data, np.uint8).reshape(3, 2, header.probes).transpose(0, 2, 1)
-        change = np.ascontiguousarray(planes).view("<u2")[..., 0].T
-        frame = check_part(artifact.tensors, "frame", replace(_TRANSFORM_PARTS["frame"], optional=False))
-        if not frame[3] > 0:
-            raise ValueError(f"part frame: expected a positive extent, found {frame[3]:g}")
-        places = Places(frame[:3].copy(), float(frame[3]), np.cumsum(change, axis=0, dtype=np.uint16))
-    elif parts["frame"].size:
-        raise ValueError("part frame: expected none without places")
+    _check_live([header.probes - int(dead.sum())], end)
+    places = _decode_places(artifact, parts, header.probes)
     model = TransformModel(
         name=header.name,
         source=artifact.source,
@@ -196,6 +214,56 @@ def _decode_transform(artifact: Artifact) -> TransformModel:
         # What can be unpacked here is, so that whatever is wrong with it is said of the file.
         _ = model.stored_values
     return model
+
+
+def _decode_day(artifact: Artifact) -> DayModel:
+    header = check_settings(_DayHeader, artifact.settings, "setting ")
+    parts = check_parts(artifact.tensors, _DAY_PARTS)
+    times, data = tuple(header.times), parts[_HOURS]
+    if any(a >= b for a, b in pairwise(times)):
+        raise ValueError("setting times: expected increasing hours")
+    _check_numbers(header.probes, header.outputs * len(times), len(data))
+    hours = unpack_hours(data, len(times), header.probes, header.outputs)
+    _check_live([header.probes - int(hour.dead.sum()) for hour in hours], len(data))
+    places = _decode_places(artifact, parts, header.probes)
+    model = DayModel.of(header.name, artifact.source, header.probes, header.outputs, times, hours, places)
+    checks = {read_head(hour.stream, header.outputs).check for hour in hours}
+    if len(checks) > 1:
+        raise ValueError("part hours: expected hours of the same places")
+    if places is not None:
+        for time in times:
+            model.at(time).values(places)
+    return model
+
+
+def _check_numbers(probes: int, outputs: int, size: int) -> None:
+    most = _SURE_NUMBERS + _NUMBERS_A_BYTE * size
+    if probes * outputs > most:
+        numbers = f"{probes} probes of {outputs} numbers"
+        raise ValueError(f"part light: expected at most {most} numbers of {size} bytes, found {numbers}")
+
+
+def _check_live(live: list[int], size: int) -> None:
+    """Checks that every hour has light, and how many probes all of them have together."""
+    most = _SURE_PROBES + _PROBES_A_BYTE * size
+    if min(live) < 1 or sum(live) > most:
+        found = sum(live) if min(live) else 0
+        raise ValueError(f"part light: expected 1 to {most} live probes of {size} bytes, found {found}")
+
+
+def _decode_places(artifact: Artifact, parts: Mapping[str, np.ndarray], probes: int) -> Places | None:
+    """The places that are stored, if they are."""
+    if not parts["places"].size:
+        if parts["frame"].size:
+            raise ValueError("part frame: expected none without places")
+        return None
+    data = inflate(parts["places"].tobytes(), 6 * probes, "part places", f"the places of {probes} probes")
+    planes = np.frombuffer(data, np.uint8).reshape(3, 2, probes).transpose(0, 2, 1)
+    change = np.ascontiguousarray(planes).view("<u2")[..., 0].T
+    frame = check_part(artifact.tensors, "frame", replace(_TRANSFORM_PARTS["frame"], optional=False))
+    if not frame[3] > 0:
+        raise ValueError(f"part frame: expected a positive extent, found {frame[3]:g}")
+    return Places(frame[:3].copy(), float(frame[3]), np.cumsum(change, axis=0, dtype=np.uint16))
 
 
 def _check_frame(frame: np.ndarray) -> None:

@@ -146,16 +146,7 @@ class TransformModel(Model):
         Raises:
             ValueError: They can't be.
         """
-        if len(self.stream) < _HEAD.size:
-            raise ValueError(f"part light: expected at least {_HEAD.size} bytes, found {len(self.stream)}")
-        head = Head(*_HEAD.unpack_from(self.stream[: _HEAD.size].tobytes()))
-        if not (head.step > 0 and np.isfinite(head.step)):
-            raise ValueError(f"part light: expected a positive step, found {head.step:g}")
-        if head.vectors > min(VECTORS, self.outputs) or _HEAD.size + 4 * head.words > len(self.stream):
-            raise ValueError("part light: expected fewer directions, or more bytes")
-        if head.flags not in (0, 1, 3, 5, _RAW):
-            raise ValueError(f"part light: expected flags 0, 1, 3, 5 or {_RAW}, found {head.flags}")
-        return head
+        return read_head(self.stream, self.outputs)
 
     def stored_positions(self) -> np.ndarray:
         """The positions stored with the model, float64 [N, 3], to 1/65535 of the box.
@@ -187,30 +178,26 @@ class TransformModel(Model):
         Raises:
             WlmError: They are other places, or the stream is none of theirs.
         """
-        head = self.head
-        if len(places.code) != self.probes or places.check != head.check:
-            raise WlmError(f"{self.name}: expected the positions of its own {self.probes} probes, in their order")
+        self.check_places(places)
         live = live_probes(self.dead, self.probes)
-        count, data = int(live.sum()), self.stream.tobytes()
-        start = _HEAD.size + 4 * head.words
-        vectors = None
-        try:
-            if head.vectors:
-                vectors = unpack(data[_HEAD.size : start], self.outputs, flat(head.vectors), []) / head.fineness
-            tree = Tree(places.code[live]) if head.predicted else None
-            levels, parents = (tree.levels, tree.parents) if tree else (flat(count), [])
-            q = unpack(data[start:], self.outputs, levels, parents)
-        except ValueError as error:
-            raise WlmError(f"{self.name}: part light: {error}") from error
-        turned = q * head.step
-        if tree:
-            turned = tree.values(turned / tree.reach[:, None])
         result = np.zeros((self.probes, self.outputs), np.float32)
         with np.errstate(over="ignore", invalid="ignore"):
-            result[live] = turned if head.raw else turned @ basis(self.outputs, vectors).T
+            try:
+                result[live] = read_values(self.stream, self.outputs, places.code[live])
+            except ValueError as error:
+                raise WlmError(f"{self.name}: {error}") from error
         if not np.isfinite(result).all():
             raise WlmError(f"{self.name}: part light: expected values that float32 holds")
         return result
+
+    def check_places(self, places: Places) -> None:
+        """Checks that places are those of the model's own probes.
+
+        Raises:
+            WlmError: They aren't.
+        """
+        if len(places.code) != self.probes or places.check != self.head.check:
+            raise WlmError(f"{self.name}: expected the positions of its own {self.probes} probes, in their order")
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,6 +238,53 @@ def make_stream(step: float, check: int, coding: Coding, q: np.ndarray) -> np.nd
     flags = (tree is not None) | FINENESS.index(coding.fineness) << 1 | _RAW * coding.raw
     head = _HEAD.pack(step, check, len(code) // 4, count, flags)
     return np.frombuffer(head + code + pack(q, levels, parents), np.uint8)
+
+
+def read_head(stream: np.ndarray, outputs: int) -> Head:
+    """What a stream of probes of so many numbers begins with.
+
+    Raises:
+        ValueError: It can't be one.
+    """
+    if len(stream) < _HEAD.size:
+        raise ValueError(f"part light: expected at least {_HEAD.size} bytes, found {len(stream)}")
+    head = Head(*_HEAD.unpack_from(stream[: _HEAD.size].tobytes()))
+    if not (head.step > 0 and np.isfinite(head.step)):
+        raise ValueError(f"part light: expected a positive step, found {head.step:g}")
+    if head.vectors > min(VECTORS, outputs) or _HEAD.size + 4 * head.words > len(stream):
+        raise ValueError("part light: expected fewer directions, or more bytes")
+    if head.flags not in (0, 1, 3, 5, _RAW):
+        raise ValueError(f"part light: expected flags 0, 1, 3, 5 or {_RAW}, found {head.flags}")
+    return head
+
+
+def read_values(stream: np.ndarray, outputs: int, code: np.ndarray, tree: Tree | None = None) -> np.ndarray:
+    """The numbers of live probes, float64 [L, D]: undoes `make_stream`.
+
+    Args:
+        stream: uint8 [B].
+        outputs: D.
+        code: uint16 [L, 3], their places.
+        tree: Of these places, where it is known already.
+
+    Raises:
+        ValueError: The stream is none of so many probes.
+    """
+    head, data = read_head(stream, outputs), stream.tobytes()
+    start = _HEAD.size + 4 * head.words
+    vectors = None
+    try:
+        if head.vectors:
+            vectors = unpack(data[_HEAD.size : start], outputs, flat(head.vectors), []) / head.fineness
+        tree = (tree or Tree(code)) if head.predicted else None
+        levels, parents = (tree.levels, tree.parents) if tree else (flat(len(code)), [])
+        q = unpack(data[start:], outputs, levels, parents)
+    except ValueError as error:
+        raise ValueError(f"part light: {error}") from error
+    turned = q * head.step
+    if tree:
+        turned = tree.values(turned / tree.reach[:, None])
+    return turned if head.raw else turned @ basis(outputs, vectors).T
 
 
 def colours(outputs: int) -> np.ndarray:

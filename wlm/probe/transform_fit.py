@@ -17,7 +17,7 @@ from wlm.metrics import psnr_from_mse
 from wlm.probe.data import ProbeSet
 from wlm.probe.entropy import LARGEST
 from wlm.probe.model import Profile
-from wlm.probe.transform import FINENESS, VECTORS, Coding, Places, TransformModel, colours, make_stream
+from wlm.probe.transform import FINENESS, VECTORS, Coding, Places, TransformModel, colours, make_stream, read_values
 from wlm.probe.tree import Tree
 from wlm.system import Meter, OnProgress
 
@@ -30,14 +30,20 @@ _COUNTS = (1, 2, 4, 8, 16)  # of stored directions that are tried, and all
 _FEW = 4096  # probes up to which it matters how many directions are stored, and how finely
 _WIDEST = 64  # numbers of a probe up to which directions are looked for
 _TRIES = 14
+_FAR = 0.25  # octaves of a step that comes nowhere by smaller ones
 _LEAST = -149.0  # of the step's logarithm: float32 has no less
-_PSNR = 50.0  # that is wanted where nothing is said
+PSNR = 50.0
+"""That is wanted where nothing is said."""
+
 _CLOSE = 0.03  # dB above the wanted PSNR that is near enough
-_FULL = 0.985  # of the largest size that is near enough
+FULL = 0.985
+"""Of the largest size that is near enough."""
 
 
 @dataclass(frozen=True, eq=False)
-class _Coded:
+class Coded:
+    """Numbers at a step, as a stream."""
+
     step: float
     stream: np.ndarray
     error: float  # sum of squares
@@ -57,41 +63,56 @@ def compress_transform(
     Raises:
         WlmError: A size that nothing fits, or a PSNR that can't be reached.
     """
-    search = _Search(probes, profile, positions, progress)
+    search = Search(probes, profile, positions, progress)
     return search.model(search.chosen())
 
 
-class _Search:
+class Search:
     """The size and the error of a set at a step, and the step that is wanted."""
 
-    def __init__(self, probes: ProbeSet, profile: Profile, positions: bool, progress: OnProgress | None) -> None:
+    def __init__(
+        self,
+        probes: ProbeSet,
+        profile: Profile,
+        positions: bool,
+        progress: OnProgress | None,
+        *,
+        tree: Tree | None = None,
+        peak: float | None = None,
+    ) -> None:
+        """Prepares a set.
+
+        Args:
+            probes, profile, positions, progress: As for `compress_transform`.
+            tree: Of the live probes, where it is known already.
+            peak: What PSNR is of, the range of the numbers unless it is given.
+        """
         self._probes, self._profile = probes, profile
         self._places = Places.of(probes.position)
         self._stored = self._places if positions else None
         self._dead = np.zeros(0, bool) if probes.live.all() else ~probes.live
         self._values = probes.values[probes.live].astype(np.float64)
-        peak = float(probes.values.max()) - float(probes.values.min())
-        # Probes that are all alike have no range; they have a size.
-        self._peak = peak or float(np.abs(probes.values).max())
-        self._tree = Tree(self._places.code[probes.live])
+        self._peak = peak_of(probes) if peak is None else peak
+        self._tree = Tree(self._places.code[probes.live]) if tree is None else tree
         self._coding = Coding(self._tree)
-        self._largest = float(np.abs(self._exact()).max())
+        # What is left of probes that are predicted exactly is zero.
+        self._largest = float(np.abs(self._exact()).max()) or self._peak
         self._warm: np.ndarray | None = None
         # A fitted step is finer than a plain one of the same size: directions are chosen again where that is quick.
         self._rounds = 2 if len(self._values) <= _FEW else 1
         self._meter = Meter(progress, "fit", 0)
         self._tried = 0
 
-    def chosen(self) -> _Coded:
+    def chosen(self) -> Coded:
         """What has the wanted size, or the wanted PSNR."""
         psnr, limit = self._profile.target_psnr, self._profile.max_bytes
         if psnr is not None or limit is None:
-            coded = self._smallest(_PSNR if psnr is None else psnr)
+            coded = self.smallest(PSNR if psnr is None else psnr)
             if limit is None or self._bytes(coded) <= limit:
                 return coded
         return self._best(limit)
 
-    def _smallest(self, psnr: float) -> _Coded:
+    def smallest(self, psnr: float) -> Coded:
         """What reaches a PSNR in the fewest bytes."""
         found = [self._for_psnr(psnr, self._plain, 0.5)]
         for _ in range(self._rounds):
@@ -99,7 +120,7 @@ class _Search:
             found.append(self._for_psnr(psnr, self._fitted, _CLOSE))
         return min(found[1:], key=lambda coded: len(coded.stream))
 
-    def _best(self, limit: int) -> _Coded:
+    def _best(self, limit: int) -> Coded:
         """What has the least error in a size."""
         self._coding = Coding(self._tree)
         found = [self._for_bytes(limit, self._plain, 0.9)]
@@ -108,10 +129,23 @@ class _Search:
             if self._bytes(self._plain(8.0 * self._largest)) > limit:
                 # No room for anything beside the directions.
                 self._coding = Coding(self._tree)
-            found.append(self._for_bytes(limit, self._fitted, _FULL, found[-1].step))
+            found.append(self._for_bytes(limit, self._fitted, FULL, found[-1].step))
         return min(found, key=lambda coded: coded.error)
 
-    def model(self, coded: _Coded) -> TransformModel:
+    def at_step(self, step: float) -> Coded:
+        """What is worth most at a step."""
+        self._choose_basis(step)
+        return self._fitted(step)
+
+    def cost(self, step: float, more: int) -> float:
+        """The squared error at a step, with so many bytes more than the stream's at what bytes are worth."""
+        return self._choose_basis(step) + _BIT * _held(step) ** 2 * 8 * more
+
+    def decoded(self, coded: Coded) -> np.ndarray:
+        """The live probes' numbers, float64 [L, D]."""
+        return read_values(coded.stream, self._probes.outputs, self._places.code[self._probes.live], self._tree)
+
+    def model(self, coded: Coded) -> TransformModel:
         """The model of what was chosen."""
         probes = self._probes
         return TransformModel(
@@ -124,7 +158,7 @@ class _Search:
             places=self._stored,
         )
 
-    def _for_psnr(self, target: float, encode: Callable[[float], _Coded], close: float) -> _Coded:
+    def _for_psnr(self, target: float, encode: Callable[[float], Coded], close: float) -> Coded:
         start = self._peak * 10.0 ** (-target / 20.0) * 4.0
         coded, excess = self._solve(
             encode, lambda coded: self._psnr(coded) - target, -5.0, close, start, lambda coded: len(coded.stream)
@@ -134,8 +168,8 @@ class _Search:
             raise WlmError(f"--target-psnr: expected at most {most:.1f} for {name}, got {target:g}")
         return coded
 
-    def _for_bytes(self, limit: int, encode: Callable[[float], _Coded], full: float, start: float = 0.0) -> _Coded:
-        def room(coded: _Coded) -> float:
+    def _for_bytes(self, limit: int, encode: Callable[[float], Coded], full: float, start: float = 0.0) -> Coded:
+        def room(coded: Coded) -> float:
             return math.log2(limit / self._bytes(coded))
 
         start = start or self._peak * 0.02
@@ -146,23 +180,25 @@ class _Search:
 
     def _solve(
         self,
-        encode: Callable[[float], _Coded],
-        excess: Callable[[_Coded], float],
+        encode: Callable[[float], Coded],
+        excess: Callable[[Coded], float],
         slope: float,
         close: float,
         start: float,
-        cost: Callable[[_Coded], float],
-    ) -> tuple[_Coded, float]:
+        cost: Callable[[Coded], float],
+    ) -> tuple[Coded, float]:
         """What costs least of all tried whose excess isn't negative, with its excess; else what comes nearest.
 
         `slope` is about what the excess gains where the step doubles. An excess up to `close` is small enough.
         """
-        good: list[tuple[_Coded, float]] = []
+        good: list[tuple[Coded, float]] = []
         # From numbers that still have room to a step at which all are 0, whatever the directions.
         low, high = max(math.log2(4.0 * self._largest / LARGEST), _LEAST), math.log2(8.0 * self._largest)
         x = min(max(math.log2(start), low), high)
-        ends: dict[bool, tuple[float, float, _Coded]] = {}  # by whether it is enough: step, excess
-        for _ in range(_TRIES):
+        ends: dict[bool, tuple[float, float, Coded]] = {}  # by whether it is enough: step, excess
+        for trial in range(2 * _TRIES):
+            if trial == _TRIES and good:
+                break
             coded = encode(2.0**x)
             found = excess(coded)
             self._tried += 1
@@ -183,6 +219,9 @@ class _Search:
                     break
             else:
                 further = min(max(x + (0.5 * close - found) / slope, x - 6.0), x + 6.0)
+                if trial >= _TRIES:
+                    # What comes nearer and nearer, and never there.
+                    further = x + math.copysign(_FAR, slope)
                 further = min(max(further, low), high)
                 if further == x:
                     break
@@ -192,8 +231,12 @@ class _Search:
         _, found, coded = ends[False]
         return coded, found
 
-    def _choose_basis(self, step: float) -> None:
-        """Takes the directions, or none, and the prediction, or none, that are worth most at a step."""
+    def _choose_basis(self, step: float) -> float:
+        """Takes the directions, or none, and the prediction, or none, that are worth most at a step.
+
+        Returns:
+            The squared error, and the stream's bytes at what they are worth.
+        """
         outputs, tree = self._probes.outputs, self._tree
         options = [Coding(None, raw=True), Coding(None), Coding(tree)]
         if len(tree.levels) > 1 and 1 < outputs <= _WIDEST:
@@ -211,12 +254,13 @@ class _Search:
             coded = self._plain(step)
             costs.append(coded.error + _BIT * coded.step**2 * 8 * len(coded.stream))
         self._coding = options[int(np.argmin(costs))]
+        return min(costs)
 
-    def _plain(self, step: float) -> _Coded:
+    def _plain(self, step: float) -> Coded:
         """Each number rounded for itself."""
         return self._coded(step, self._rounded(self._exact() / _held(step)))
 
-    def _fitted(self, step: float) -> _Coded:
+    def _fitted(self, step: float) -> Coded:
         """Numbers that are worth their bits together."""
         tree, step = self._coding.tree, _held(step)
         if tree is None:
@@ -257,19 +301,24 @@ class _Search:
         size = np.minimum(np.floor(np.abs(number) + _ROUND), LARGEST)
         return np.copysign(size, number).astype(np.int64)
 
-    def _coded(self, step: float, q: np.ndarray) -> _Coded:
+    def _coded(self, step: float, q: np.ndarray) -> Coded:
         step = _held(step)
         stream = make_stream(step, self._places.check, self._coding, q)
         decoded = q * step
         if (tree := self._coding.tree) is not None:
             decoded = tree.values(decoded / tree.reach[:, None])
-        return _Coded(step, stream, float(np.square(decoded - self._turned()).sum()))
+        return Coded(step, stream, float(np.square(decoded - self._turned()).sum()))
 
-    def _psnr(self, coded: _Coded) -> float:
+    def _psnr(self, coded: Coded) -> float:
         return psnr_from_mse(coded.error / self._probes.values.size, self._peak)
 
-    def _bytes(self, coded: _Coded) -> int:
+    def _bytes(self, coded: Coded) -> int:
         return self.model(coded).file_bytes()
+
+
+def peak_of(probes: ProbeSet) -> float:
+    """What the PSNR of a set is of: the range of its numbers, or the largest of those that are all alike."""
+    return float(probes.values.max()) - float(probes.values.min()) or float(np.abs(probes.values).max())
 
 
 def _held(step: float) -> float:

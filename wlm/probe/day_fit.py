@@ -1,0 +1,250 @@
+"""Fitting several hours of one scene: in which order, from what each is predicted, and at which step.
+
+Which hours tell much of each other is estimated from the hours as they were; the matrices are then fitted to the
+decoded ones, so that what is lost of an hour is made up for in the next.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+
+from wlm.errors import WlmError
+from wlm.probe.data import ProbeSet, joint_source
+from wlm.probe.day import FINENESS, PERIOD, REFERENCES, TIMES, WIDEST, DayModel, Hour, pack_matrix, predicted, tree_of
+from wlm.probe.model import Profile
+from wlm.probe.transform import Places
+from wlm.probe.transform_fit import FULL, PSNR, Search, peak_of
+from wlm.probe.tree import Tree
+from wlm.system import Meter, OnProgress
+
+_ROWS = 2048  # probes by which hours are put in order
+_TRIES = 10
+_SLIGHT = 1e-6  # of the mean square of what is predicted from
+_MOST = 1 << 12  # whole numbers of a matrix
+
+
+def compress_day(
+    sets: Sequence[ProbeSet],
+    times: Sequence[float],
+    profile: str | Profile = "transform",
+    *,
+    positions: bool = False,
+    progress: OnProgress | None = None,
+    **overrides: float | int | None,
+) -> DayModel:
+    """Compresses several hours of one set of probes into one model.
+
+    Args:
+        sets: One for each hour, of the same positions and numbers of a probe.
+        times: Their hours of the day, in [0, 24), in any order.
+        profile: Of the method "transform". `target_psnr` is what each hour reaches, over its own range; with
+            `max_bytes` all hours have one step relative to their ranges, which is what has the least error.
+        positions: Whether the model carries the probes' places.
+        progress: Called after each hour that is coded.
+        overrides: Settings that replace the profile's.
+
+    Raises:
+        WlmError: Times or sets that don't fit each other, another method, a size that nothing fits, or a PSNR that
+            can't be reached.
+    """
+    profile = Profile.load(profile).override(overrides)
+    if profile.method != "transform":
+        raise WlmError(f"times: expected a profile of the method transform, found {profile.name}")
+    check_hours(sets, times)
+    order = np.argsort(times)
+    fit = _Fit([sets[i] for i in order], tuple(float(times[i]) for i in order), profile, positions, progress)
+    return fit.chosen()
+
+
+def check_hours(sets: Sequence[ProbeSet], times: Sequence[float]) -> None:
+    """Checks that sets are hours of one set of probes.
+
+    Raises:
+        WlmError: They aren't.
+    """
+    if not 1 <= len(times) <= TIMES:
+        raise WlmError(f"times: expected 1 to {TIMES} hours, got {len(times)}")
+    if len(sets) != len(times):
+        raise WlmError(f"times: expected as many as sets of probes, {len(sets)}, got {len(times)}")
+    for time in times:
+        if not 0.0 <= time < PERIOD:
+            raise WlmError(f"times: expected hours of the day, from 0 to below {PERIOD:g}, got {time:g}")
+    for a, b in pairwise(sorted(times)):
+        if a == b:
+            raise WlmError(f"times: expected each hour once, got {a:g} twice")
+    first = sets[0]
+    for other, time in zip(sets, times, strict=True):
+        if other.outputs != first.outputs:
+            raise WlmError(f"{other.name}, {time:g} h: expected {first.outputs} numbers a probe, found {other.outputs}")
+        if not np.array_equal(other.position, first.position):
+            raise WlmError(f"{other.name}, {time:g} h: expected the positions of {first.name}, in their order")
+
+
+class _Fit:
+    """The hours of a set, and what they are coded as."""
+
+    def __init__(
+        self,
+        sets: Sequence[ProbeSet],
+        times: tuple[float, ...],
+        profile: Profile,
+        positions: bool,
+        progress: OnProgress | None,
+    ) -> None:
+        self._sets, self._times, self._profile = sets, times, profile
+        self._places = Places.of(sets[0].position)
+        self._stored = self._places if positions else None
+        # As the file holds them.
+        self._gains = {i: max(float(np.float32(peak_of(probes))), 1e-38) for i, probes in enumerate(sets)}
+        self._trees: dict[bytes, Tree] = {}
+        self._meter = Meter(progress, "fit", 0)
+        self._coded = 0
+        self._order = self._ordered()
+        self._references: dict[int, tuple[int, ...]] = {}
+
+    def chosen(self) -> DayModel:
+        """The model of the wanted PSNR, or the wanted size."""
+        psnr, limit = self._profile.target_psnr, self._profile.max_bytes
+        if psnr is not None or limit is None:
+            wanted = PSNR if psnr is None else psnr
+            model, _ = self._day(4.0 * 10.0 ** (-wanted / 20.0), lambda search, _: search.smallest(wanted))
+            if limit is None or model.file_bytes() <= limit:
+                return model
+        return self._best(limit)
+
+    def _best(self, limit: int) -> DayModel:
+        """What has the least error in a size: one step for all hours, relative to their ranges."""
+        x, ends, good = math.log2(0.02), {}, []
+        smallest = math.inf
+        for _ in range(_TRIES):
+            step = 2.0**x
+            model, error = self._day(step, lambda search, gain, step=step: search.at_step(step * gain))
+            size = model.file_bytes()
+            smallest = min(smallest, size)
+            enough = size <= limit
+            if enough:
+                good.append((error, x, model))
+                if size >= FULL * limit:
+                    break
+            room = math.log2(limit / size)
+            if enough not in ends or abs(room) < abs(ends[enough][1]):
+                ends[enough] = x, room
+            if len(ends) == 2:
+                (a, at_a), (b, at_b) = ends[False], ends[True]
+                share = (-0.5 * math.log2(FULL) - at_a) / (at_b - at_a)
+                x = a + min(max(share, 0.1), 0.9) * (b - a)
+            else:
+                x -= min(max((room + 0.5 * math.log2(FULL)) / 0.7, -3.0), 6.0)
+        if not good:
+            raise WlmError(f"--max-bytes: expected at least {smallest} for {self._sets[0].name}, got {limit}")
+        return min(good, key=lambda found: found[:2])[2]
+
+    def _day(self, step: float, encode: Callable[[Search, float], object]) -> tuple[DayModel, float]:
+        """All hours, each from what is decoded of those before it, and the sum of their errors over their gains.
+
+        Args:
+            step: About what it will be, over an hour's gain.
+            encode: From what is left of an hour and its gain to what it is coded as.
+        """
+        decoded: dict[int, np.ndarray] = {}
+        hours, total = [], 0.0
+        for number in self._order:
+            probes, gain = self._sets[number], self._gains[number]
+            if number not in self._references:
+                self._references[number] = self._choose(number, decoded, step)
+            hour, search = self._left(number, self._references[number], decoded, step)
+            coded = encode(search, gain)
+            hour = hour._replace(stream=coded.stream)
+            hours.append(hour)
+            result = np.zeros_like(probes.values)
+            result[probes.live] = predicted(hour, decoded, self._gains, probes.live) + search.decoded(coded)
+            decoded[number] = result
+            error = float(np.square(result.astype(np.float64) - probes.values).mean()) / gain**2
+            total += error
+            self._coded += 1
+            if self._meter.due(self._coded):
+                self._meter.report(self._coded, PSNR_dB=-10.0 * math.log10(max(error, 1e-12)))
+        first = self._sets[0]
+        source = joint_source(self._sets, self._times)
+        made = DayModel.of(first.name, source, first.probes, first.outputs, self._times, hours, self._stored)
+        return made, total
+
+    def _ordered(self) -> list[int]:
+        """Hours such that each is told much by those before it: the middle one first, then the nearest to any."""
+        count = len(self._sets)
+        light = [probes.values / self._gains[i] for i, probes in enumerate(self._sets)]
+        rows = np.linspace(0, len(light[0]) - 1, min(len(light[0]), _ROWS)).astype(int)
+        light = [values[rows].astype(np.float64) for values in light]
+        centred = np.stack([(values - values.mean(0)).ravel() for values in light])
+        square = centred @ centred.T
+        power = np.maximum(np.diag(square), np.finfo(float).tiny)
+        like = np.square(square) / np.outer(power, power)  # how much of one is a multiple of the other
+        order = [int(np.argmax(like.sum(1)))]
+        while len(order) < count:
+            rest = [i for i in range(count) if i not in order]
+            order.append(max(rest, key=lambda i: like[i, order].max()))
+        return order
+
+    def _choose(self, number: int, decoded: dict[int, np.ndarray], step: float) -> tuple[int, ...]:
+        """The hours, of those that are decoded, that one is predicted from: what takes the fewest bytes at a step."""
+        if self._sets[number].outputs > WIDEST:
+            return ()
+        chosen: tuple[int, ...] = ()
+        least = self._cost(number, (), decoded, step)
+        for _ in range(REFERENCES):
+            rest = [i for i in decoded if i not in chosen]
+            if not rest:
+                break
+            remains = [self._remains(number, (*chosen, i), decoded, step) for i in rest]
+            best = rest[int(np.argmin(remains))]
+            cost = self._cost(number, (*chosen, best), decoded, step)
+            if cost >= least:
+                break
+            chosen, least = (*chosen, best), cost
+        return chosen
+
+    def _cost(self, number: int, references: tuple[int, ...], decoded: dict[int, np.ndarray], step: float) -> float:
+        hour, search = self._left(number, references, decoded, step)
+        return search.cost(step * self._gains[number], len(pack_matrix(hour)) + len(references))
+
+    def _remains(self, number: int, references: tuple[int, ...], decoded: dict[int, np.ndarray], step: float) -> float:
+        """About the bits of what is left of an hour."""
+        hour = self._hour(number, references, decoded)
+        probes = self._sets[number]
+        left = probes.values[probes.live] - predicted(hour, decoded, self._gains, probes.live)
+        tree = tree_of(probes.live, self._places, self._trees)
+        size = tree.coefficients(left) * tree.reach[:, None] / (step * self._gains[number])
+        return float(np.log2(1.0 + np.square(size)).sum())
+
+    def _left(
+        self, number: int, references: tuple[int, ...], decoded: dict[int, np.ndarray], step: float
+    ) -> tuple[Hour, Search]:
+        """An hour without its stream, and the search for what is left of it."""
+        hour, probes = self._hour(number, references, decoded), self._sets[number]
+        values = probes.values.copy()
+        values[probes.live] -= predicted(hour, decoded, self._gains, probes.live).astype(np.float32)
+        tree = tree_of(probes.live, self._places, self._trees)
+        left = replace(probes, values=values)
+        return hour, Search(left, self._profile, False, None, tree=tree, peak=self._gains[number])
+
+    def _hour(self, number: int, references: tuple[int, ...], decoded: dict[int, np.ndarray]) -> Hour:
+        """An hour without its stream, with the matrix that leaves least of it."""
+        probes, outputs = self._sets[number], self._sets[number].outputs
+        matrix = np.zeros((0, outputs), np.int64)
+        if references:
+            tree = tree_of(probes.live, self._places, self._trees)
+
+            def detail(values: np.ndarray, gain: float) -> np.ndarray:
+                return tree.coefficients(values[probes.live].astype(np.float64) / gain) * tree.reach[:, None]
+
+            known = np.concatenate([detail(decoded[i], self._gains[i]) for i in references], 1)
+            square = known.T @ known
+            square[np.diag_indices_from(square)] += _SLIGHT * max(np.trace(square) / len(square), 1e-300)
+            side = known.T @ detail(probes.values, self._gains[number])
+            matrix = np.rint(np.linalg.solve(square, side) * FINENESS)
+            matrix = np.clip(matrix, -_MOST, _MOST).astype(np.int64)
+        dead = np.zeros(0, bool) if probes.live.all() else ~probes.live
+        return Hour(number, references, self._gains[number], matrix, dead, np.zeros(0, np.uint8))
