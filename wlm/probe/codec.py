@@ -23,7 +23,8 @@ from wlm.formats.bits import pack_bits, unpack_bits
 from wlm.formats.deflate import inflate
 from wlm.formats.limits import NUMBERS, PROBES
 from wlm.formats.parts import Part, check_part, check_parts
-from wlm.probe.day import PERIOD, TIMES, DayModel, pack_hours, unpack_hours
+from wlm.probe.day import DayModel, pack_hours, unpack_hours
+from wlm.probe.hours import PERIOD, TIMES
 from wlm.probe.model import LATENT, SCALE, ProbeModel, Profile, layer_shapes
 from wlm.probe.transform import Places, TransformModel, read_head
 from wlm.system import Header, Name

@@ -462,14 +462,6 @@ def _probes(count: int) -> str:
     return f"{count} {'probe' if count == 1 else 'probes'}"
 
 
-def joint_source(sets: Sequence[ProbeSet], times: Sequence[float]) -> str:
-    """Names several hours of one set of probes, as `ProbeSet.source` one: 16 hexadecimal digits."""
-    digest = hashlib.blake2b(digest_size=8)
-    for probes, time in zip(sets, times, strict=True):
-        digest.update(f"{time!r} {probes.source}\n".encode())
-    return digest.hexdigest()
-
-
 def _hash(position: np.ndarray, values: np.ndarray, live: np.ndarray) -> str:
     """Names the input by 16 hexadecimal digits, the same on every machine."""
     digest = hashlib.blake2b(digest_size=8)

@@ -22,15 +22,10 @@ import numpy as np
 from wlm.errors import WlmError
 from wlm.formats.deflate import inflate
 from wlm.probe.entropy import pack, unpack
+from wlm.probe.hours import PERIOD
 from wlm.probe.model import live_probes
 from wlm.probe.transform import Places, TransformModel, read_head, read_values
 from wlm.probe.tree import Tree, flat
-
-PERIOD = 24.0
-"""Hours of a day."""
-
-TIMES = 255
-"""Hours that a file holds, at most."""
 
 REFERENCES = 2
 """Hours that one is predicted from, at most."""
@@ -62,6 +57,11 @@ class Hour(NamedTuple):
     matrix: np.ndarray
     dead: np.ndarray
     stream: np.ndarray
+
+    @property
+    def bytes(self) -> int:
+        """Of the stream and the matrices, in a file."""
+        return len(self.stream) + len(pack_matrix(self))
 
 
 @dataclass(frozen=True, eq=False)

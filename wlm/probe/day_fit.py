@@ -7,13 +7,13 @@ decoded ones, so that what is lost of an hour is made up for in the next.
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 
 from wlm.errors import WlmError
-from wlm.probe.data import ProbeSet, joint_source
-from wlm.probe.day import FINENESS, PERIOD, REFERENCES, TIMES, WIDEST, DayModel, Hour, pack_matrix, predicted, tree_of
+from wlm.probe.data import ProbeSet
+from wlm.probe.day import FINENESS, REFERENCES, WIDEST, DayModel, Hour, predicted, tree_of
+from wlm.probe.hours import check_hours, joint_source
 from wlm.probe.model import Profile
 from wlm.probe.transform import Places
 from wlm.probe.transform_fit import FULL, PSNR, Search, peak_of
@@ -57,30 +57,6 @@ def compress_day(
     order = np.argsort(times)
     fit = _Fit([sets[i] for i in order], tuple(float(times[i]) for i in order), profile, positions, progress)
     return fit.chosen()
-
-
-def check_hours(sets: Sequence[ProbeSet], times: Sequence[float]) -> None:
-    """Checks that sets are hours of one set of probes.
-
-    Raises:
-        WlmError: They aren't.
-    """
-    if not 1 <= len(times) <= TIMES:
-        raise WlmError(f"times: expected 1 to {TIMES} hours, got {len(times)}")
-    if len(sets) != len(times):
-        raise WlmError(f"times: expected as many as sets of probes, {len(sets)}, got {len(times)}")
-    for time in times:
-        if not 0.0 <= time < PERIOD:
-            raise WlmError(f"times: expected hours of the day, from 0 to below {PERIOD:g}, got {time:g}")
-    for a, b in pairwise(sorted(times)):
-        if a == b:
-            raise WlmError(f"times: expected each hour once, got {a:g} twice")
-    first = sets[0]
-    for other, time in zip(sets, times, strict=True):
-        if other.outputs != first.outputs:
-            raise WlmError(f"{other.name}, {time:g} h: expected {first.outputs} numbers a probe, found {other.outputs}")
-        if not np.array_equal(other.position, first.position):
-            raise WlmError(f"{other.name}, {time:g} h: expected the positions of {first.name}, in their order")
 
 
 class _Fit:
@@ -208,7 +184,7 @@ class _Fit:
 
     def _cost(self, number: int, references: tuple[int, ...], decoded: dict[int, np.ndarray], step: float) -> float:
         hour, search = self._left(number, references, decoded, step)
-        return search.cost(step * self._gains[number], len(pack_matrix(hour)) + len(references))
+        return search.cost(step * self._gains[number], hour.bytes)
 
     def _remains(self, number: int, references: tuple[int, ...], decoded: dict[int, np.ndarray], step: float) -> float:
         """About the bits of what is left of an hour."""

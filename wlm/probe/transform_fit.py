@@ -139,7 +139,7 @@ class Search:
 
     def cost(self, step: float, more: int) -> float:
         """The squared error at a step, with so many bytes more than the stream's at what bytes are worth."""
-        return self._choose_basis(step) + _BIT * _held(step) ** 2 * 8 * more
+        return self._choose_basis(step, quick=True) + _BIT * _held(step) ** 2 * 8 * more
 
     def decoded(self, coded: Coded) -> np.ndarray:
         """The live probes' numbers, float64 [L, D]."""
@@ -231,8 +231,12 @@ class Search:
         _, found, coded = ends[False]
         return coded, found
 
-    def _choose_basis(self, step: float) -> float:
+    def _choose_basis(self, step: float, *, quick: bool = False) -> float:
         """Takes the directions, or none, and the prediction, or none, that are worth most at a step.
+
+        Args:
+            step: Of the numbers.
+            quick: Whether all directions or none will do.
 
         Returns:
             The squared error, and the stream's bytes at what they are worth.
@@ -248,6 +252,8 @@ class Search:
             counts = [count for count in _COUNTS if few and count < len(vectors)] + [len(vectors)]
             for fineness in FINENESS if few else FINENESS[-1:]:
                 options += [Coding(tree, np.rint(vectors[:n] * fineness) / fineness, fineness) for n in counts]
+        if quick:
+            options = [options[2], options[-1]]
         self._warm = None
         costs = []
         for self._coding in options:
