@@ -4,9 +4,11 @@ Which hours tell much of each other is estimated from the hours as they were; th
 decoded ones, so that what is lost of an hour is made up for in the next.
 """
 
+import functools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,13 +17,16 @@ from wlm.probe.data import ProbeSet
 from wlm.probe.day import FINENESS, REFERENCES, WIDEST, DayModel, Hour, predicted, tree_of
 from wlm.probe.hours import check_hours, joint_source
 from wlm.probe.model import Profile
-from wlm.probe.transform import Places
-from wlm.probe.transform_fit import FULL, PSNR, Search, peak_of
+from wlm.probe.transform import Coding, Places
+from wlm.probe.transform_fit import FULL, PSNR, Coded, Search, peak_of
 from wlm.probe.tree import Tree
 from wlm.system import Meter, OnProgress
 
+_DARK = 1e-150  # power of an hour that is all alike
 _ROWS = 2048  # probes by which hours are put in order
 _TRIES = 10
+_CLOSE, _NEAR = 0.15, 0.5  # octaves of bytes: for a rough step, and at which hours are told by the same
+_SLOPE = 0.7  # about the octaves of bytes that an octave of the step is worth
 _SLIGHT = 1e-6  # of the mean square of what is predicted from
 _MOST = 1 << 12  # whole numbers of a matrix
 
@@ -59,6 +64,13 @@ def compress_day(
     return fit.chosen()
 
 
+class _Told(NamedTuple):
+    """Which hours one is predicted from, and whether by fitted matrices or as they are."""
+
+    references: tuple[int, ...]
+    fitted: bool
+
+
 class _Fit:
     """The hours of a set, and what they are coded as."""
 
@@ -79,7 +91,8 @@ class _Fit:
         self._meter = Meter(progress, "fit", 0)
         self._coded = 0
         self._order = self._ordered()
-        self._references: dict[int, tuple[int, ...]] = {}
+        self._told: dict[int, _Told] = {}
+        self._codings: dict[int, Coding] = {}
 
     def chosen(self) -> DayModel:
         """The model of the wanted PSNR, or the wanted size."""
@@ -93,46 +106,62 @@ class _Fit:
 
     def _best(self, limit: int) -> DayModel:
         """What has the least error in a size: one step for all hours, relative to their ranges."""
-        x, ends, good = math.log2(0.02), {}, []
-        smallest = math.inf
+        x, good, smallest = self._rough(limit), [], math.inf
+        # From one that is too large to one that isn't: the step's logarithm and what room there is.
+        ends: dict[bool, tuple[float, float]] = {}
         for _ in range(_TRIES):
-            step = 2.0**x
-            model, error = self._day(step, lambda search, gain, step=step: search.at_step(step * gain))
+            model, error = self._day(2.0**x, functools.partial(self._at_step, 2.0**x))
             size = model.file_bytes()
-            smallest = min(smallest, size)
-            enough = size <= limit
-            if enough:
+            smallest, room = min(smallest, size), math.log2(limit / size)
+            if room >= 0.0:
                 good.append((error, x, model))
                 if size >= FULL * limit:
                     break
-            room = math.log2(limit / size)
-            if enough not in ends or abs(room) < abs(ends[enough][1]):
-                ends[enough] = x, room
-            if len(ends) == 2:
-                (a, at_a), (b, at_b) = ends[False], ends[True]
-                share = (-0.5 * math.log2(FULL) - at_a) / (at_b - at_a)
-                x = a + min(max(share, 0.1), 0.9) * (b - a)
-            else:
-                x -= min(max((room + 0.5 * math.log2(FULL)) / 0.7, -3.0), 6.0)
+            if abs(room) > _NEAR:
+                # At another step other hours and directions are worth it.
+                self._told, self._codings, ends = {}, {}, {}
+            ends[room >= 0.0] = x, room
+            x = _next(x, room, ends)
         if not good:
             raise WlmError(f"--max-bytes: expected at least {smallest} for {self._sets[0].name}, got {limit}")
         return min(good, key=lambda found: found[:2])[2]
 
-    def _day(self, step: float, encode: Callable[[Search, float], object]) -> tuple[DayModel, float]:
+    def _rough(self, limit: int) -> float:
+        """The logarithm of about the step at which the hours fit into a size, each coded for itself."""
+        searches = [self._left(number, _Told((), False), {})[1] for number in self._order]
+        x, ends = math.log2(0.02), {}
+        for _ in range(_TRIES):
+            step = 2.0**x
+            size = sum(
+                search.rough_bytes(step * self._gains[i]) for i, search in zip(self._order, searches, strict=True)
+            )
+            room = math.log2(limit / size)
+            if abs(room) < _CLOSE:
+                break
+            ends[room >= 0.0] = x, room
+            x = _next(x, room, ends)
+        return x
+
+    def _at_step(self, step: float, search: Search, number: int) -> Coded:
+        coded = search.at_step(step * self._gains[number], self._codings.get(number))
+        self._codings[number] = search.coding
+        return coded
+
+    def _day(self, step: float, encode: Callable[[Search, int], Coded]) -> tuple[DayModel, float]:
         """All hours, each from what is decoded of those before it, and the sum of their errors over their gains.
 
         Args:
             step: About what it will be, over an hour's gain.
-            encode: From what is left of an hour and its gain to what it is coded as.
+            encode: From what is left of an hour and its number to what it is coded as.
         """
         decoded: dict[int, np.ndarray] = {}
         hours, total = [], 0.0
         for number in self._order:
             probes, gain = self._sets[number], self._gains[number]
-            if number not in self._references:
-                self._references[number] = self._choose(number, decoded, step)
-            hour, search = self._left(number, self._references[number], decoded, step)
-            coded = encode(search, gain)
+            if number not in self._told:
+                self._told[number] = self._choose(number, decoded, step)
+            hour, search = self._left(number, self._told[number], decoded)
+            coded = encode(search, number)
             hour = hour._replace(stream=coded.stream)
             hours.append(hour)
             result = np.zeros_like(probes.values)
@@ -156,7 +185,7 @@ class _Fit:
         light = [values[rows].astype(np.float64) for values in light]
         centred = np.stack([(values - values.mean(0)).ravel() for values in light])
         square = centred @ centred.T
-        power = np.maximum(np.diag(square), np.finfo(float).tiny)
+        power = np.maximum(np.diag(square), _DARK)
         like = np.square(square) / np.outer(power, power)  # how much of one is a multiple of the other
         order = [int(np.argmax(like.sum(1)))]
         while len(order) < count:
@@ -164,53 +193,55 @@ class _Fit:
             order.append(max(rest, key=lambda i: like[i, order].max()))
         return order
 
-    def _choose(self, number: int, decoded: dict[int, np.ndarray], step: float) -> tuple[int, ...]:
-        """The hours, of those that are decoded, that one is predicted from: what takes the fewest bytes at a step."""
+    def _choose(self, number: int, decoded: dict[int, np.ndarray], step: float) -> _Told:
+        """What an hour is told by those that are decoded: what takes the fewest bytes at a step."""
+        chosen = _Told((), False)
         if self._sets[number].outputs > WIDEST:
-            return ()
-        chosen: tuple[int, ...] = ()
-        least = self._cost(number, (), decoded, step)
-        for _ in range(REFERENCES):
-            rest = [i for i in decoded if i not in chosen]
-            if not rest:
+            return chosen
+        least = self._cost(number, chosen, decoded, step)
+        for count in range(1, REFERENCES + 1):
+            rest = [i for i in decoded if i not in chosen.references]
+            if len(chosen.references) < count - 1 or not rest:
                 break
-            remains = [self._remains(number, (*chosen, i), decoded, step) for i in rest]
-            best = rest[int(np.argmin(remains))]
-            cost = self._cost(number, (*chosen, best), decoded, step)
-            if cost >= least:
-                break
-            chosen, least = (*chosen, best), cost
+            options = [_Told((*chosen.references, i), True) for i in rest]
+            best = options[int(np.argmin([self._remains(number, told, decoded, step) for told in options]))]
+            # The light of the other hour as it is takes next to no bytes for the matrix.
+            for told in (best, best._replace(fitted=False))[: 3 - count]:
+                cost = self._cost(number, told, decoded, step)
+                if cost < least:
+                    chosen, least = told, cost
         return chosen
 
-    def _cost(self, number: int, references: tuple[int, ...], decoded: dict[int, np.ndarray], step: float) -> float:
-        hour, search = self._left(number, references, decoded, step)
+    def _cost(self, number: int, told: _Told, decoded: dict[int, np.ndarray], step: float) -> float:
+        hour, search = self._left(number, told, decoded)
         return search.cost(step * self._gains[number], hour.bytes)
 
-    def _remains(self, number: int, references: tuple[int, ...], decoded: dict[int, np.ndarray], step: float) -> float:
+    def _remains(self, number: int, told: _Told, decoded: dict[int, np.ndarray], step: float) -> float:
         """About the bits of what is left of an hour."""
-        hour = self._hour(number, references, decoded)
+        hour = self._hour(number, told, decoded)
         probes = self._sets[number]
         left = probes.values[probes.live] - predicted(hour, decoded, self._gains, probes.live)
         tree = tree_of(probes.live, self._places, self._trees)
         size = tree.coefficients(left) * tree.reach[:, None] / (step * self._gains[number])
         return float(np.log2(1.0 + np.square(size)).sum())
 
-    def _left(
-        self, number: int, references: tuple[int, ...], decoded: dict[int, np.ndarray], step: float
-    ) -> tuple[Hour, Search]:
+    def _left(self, number: int, told: _Told, decoded: dict[int, np.ndarray]) -> tuple[Hour, Search]:
         """An hour without its stream, and the search for what is left of it."""
-        hour, probes = self._hour(number, references, decoded), self._sets[number]
+        hour, probes = self._hour(number, told, decoded), self._sets[number]
         values = probes.values.copy()
         values[probes.live] -= predicted(hour, decoded, self._gains, probes.live).astype(np.float32)
         tree = tree_of(probes.live, self._places, self._trees)
         left = replace(probes, values=values)
         return hour, Search(left, self._profile, False, None, tree=tree, peak=self._gains[number])
 
-    def _hour(self, number: int, references: tuple[int, ...], decoded: dict[int, np.ndarray]) -> Hour:
+    def _hour(self, number: int, told: _Told, decoded: dict[int, np.ndarray]) -> Hour:
         """An hour without its stream, with the matrix that leaves least of it."""
         probes, outputs = self._sets[number], self._sets[number].outputs
         matrix = np.zeros((0, outputs), np.int64)
-        if references:
+        references = told.references
+        if references and not told.fitted:
+            matrix = FINENESS * np.eye(outputs, dtype=np.int64)
+        elif references:
             tree = tree_of(probes.live, self._places, self._trees)
 
             def detail(values: np.ndarray, gain: float) -> np.ndarray:
@@ -224,3 +255,13 @@ class _Fit:
             matrix = np.clip(matrix, -_MOST, _MOST).astype(np.int64)
         dead = np.zeros(0, bool) if probes.live.all() else ~probes.live
         return Hour(number, references, self._gains[number], matrix, dead, np.zeros(0, np.uint8))
+
+
+def _next(x: float, room: float, ends: dict[bool, tuple[float, float]]) -> float:
+    """The next step's logarithm to try, from the last one's and what room it left, in octaves of bytes."""
+    wanted = -0.5 * math.log2(FULL)
+    if len(ends) < 2:
+        return x - min(max((room - wanted) / _SLOPE, -6.0), 3.0)
+    (a, at_a), (b, at_b) = ends[False], ends[True]
+    share = (wanted - at_a) / (at_b - at_a)
+    return a + min(max(share, 0.1), 0.9) * (b - a)

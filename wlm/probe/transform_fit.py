@@ -22,6 +22,7 @@ from wlm.probe.tree import Tree
 from wlm.system import Meter, OnProgress
 
 _PRICE = 0.25  # of a number that isn't zero, in steps
+_ABOVE = 1.05  # the largest eigenvalue of the transform: what a step downhill is divided by
 _ROUND = 0.4  # what is added before rounding down: below half, a smaller number is cheaper
 _SPARSE, _AGAIN = 25, 20  # rounds with the price, and for another step
 _FREE, _MOVES = 15, 3  # rounds without the price, and of moving rounded numbers
@@ -68,7 +69,11 @@ def compress_transform(
 
 
 class Search:
-    """The size and the error of a set at a step, and the step that is wanted."""
+    """The size and the error of a set at a step, and the step that is wanted.
+
+    Attributes:
+        coding: What the set is turned into before it is rounded.
+    """
 
     def __init__(
         self,
@@ -94,7 +99,7 @@ class Search:
         self._values = probes.values[probes.live].astype(np.float64)
         self._peak = peak_of(probes) if peak is None else peak
         self._tree = Tree(self._places.code[probes.live]) if tree is None else tree
-        self._coding = Coding(self._tree)
+        self.coding = Coding(self._tree)
         # What is left of probes that are predicted exactly is zero.
         self._largest = float(np.abs(self._exact()).max()) or self._peak
         self._warm: np.ndarray | None = None
@@ -122,20 +127,27 @@ class Search:
 
     def _best(self, limit: int) -> Coded:
         """What has the least error in a size."""
-        self._coding = Coding(self._tree)
+        self.coding = Coding(self._tree)
         found = [self._for_bytes(limit, self._plain, 0.9)]
         for _ in range(self._rounds):
             self._choose_basis(found[-1].step)
             if self._bytes(self._plain(8.0 * self._largest)) > limit:
                 # No room for anything beside the directions.
-                self._coding = Coding(self._tree)
+                self.coding = Coding(self._tree)
             found.append(self._for_bytes(limit, self._fitted, FULL, found[-1].step))
         return min(found, key=lambda coded: coded.error)
 
-    def at_step(self, step: float) -> Coded:
-        """What is worth most at a step."""
-        self._choose_basis(step)
+    def at_step(self, step: float, coding: Coding | None = None) -> Coded:
+        """What is worth most at a step, in a coding that is left in `coding`; None: the one that is worth most."""
+        if coding is None:
+            self._choose_basis(step)
+        else:
+            self.coding = coding
         return self._fitted(step)
+
+    def rough_bytes(self, step: float) -> int:
+        """About the bytes of the stream at a step."""
+        return len(self._plain(step).stream)
 
     def cost(self, step: float, more: int) -> float:
         """The squared error at a step, with so many bytes more than the stream's at what bytes are worth."""
@@ -256,10 +268,10 @@ class Search:
             options = [options[2], options[-1]]
         self._warm = None
         costs = []
-        for self._coding in options:
+        for self.coding in options:
             coded = self._plain(step)
             costs.append(coded.error + _BIT * coded.step**2 * 8 * len(coded.stream))
-        self._coding = options[int(np.argmin(costs))]
+        self.coding = options[int(np.argmin(costs))]
         return min(costs)
 
     def _plain(self, step: float) -> Coded:
@@ -268,11 +280,11 @@ class Search:
 
     def _fitted(self, step: float) -> Coded:
         """Numbers that are worth their bits together."""
-        tree, step = self._coding.tree, _held(step)
+        tree, step = self.coding.tree, _held(step)
         if tree is None:
             return self._plain(step)
         target, reach = self._turned(), tree.reach[:, None]
-        bound = 1.05 * _largest_eigenvalue(tree)
+        bound = _ABOVE * tree.eigenvalue
 
         def downhill(number: np.ndarray) -> np.ndarray:
             return number - tree.adjoint(tree.values(number / reach) - target) / reach / bound
@@ -295,12 +307,12 @@ class Search:
         return self._coded(step, q)
 
     def _turned(self) -> np.ndarray:
-        return self._values @ self._coding.basis(self._probes.outputs)
+        return self._values @ self.coding.basis(self._probes.outputs)
 
     def _exact(self) -> np.ndarray:
         """The numbers before rounding, in units of the values."""
         turned = self._turned()
-        tree = self._coding.tree
+        tree = self.coding.tree
         return turned if tree is None else tree.coefficients(turned) * tree.reach[:, None]
 
     def _rounded(self, number: np.ndarray) -> np.ndarray:
@@ -309,9 +321,9 @@ class Search:
 
     def _coded(self, step: float, q: np.ndarray) -> Coded:
         step = _held(step)
-        stream = make_stream(step, self._places.check, self._coding, q)
+        stream = make_stream(step, self._places.check, self.coding, q)
         decoded = q * step
-        if (tree := self._coding.tree) is not None:
+        if (tree := self.coding.tree) is not None:
             decoded = tree.values(decoded / tree.reach[:, None])
         return Coded(step, stream, float(np.square(decoded - self._turned()).sum()))
 
@@ -341,14 +353,3 @@ def _accelerated(first: np.ndarray, step: Callable[[np.ndarray], np.ndarray], ro
         ahead = current + (weight - 1.0) / following * (current - before)
         weight = following
     return current
-
-
-def _largest_eigenvalue(tree: Tree) -> float:
-    """Of the transform, with its numbers divided by their reach, times its transpose; by the power method."""
-    reach = tree.reach[:, None]
-    vector, size = np.random.default_rng(0).standard_normal((len(reach), 1)), 1.0
-    for _ in range(15):
-        vector = tree.adjoint(tree.values(vector / reach)) / reach
-        size = float(np.linalg.norm(vector))
-        vector /= size
-    return size

@@ -10,6 +10,8 @@ MPEG m42640, 2018):
 A coefficient of a coarse probe reaches many values: `reach` is about the length of what one unit of it changes.
 """
 
+from functools import cached_property
+
 import numpy as np
 from scipy import sparse
 
@@ -17,6 +19,8 @@ from wlm.probe.kriging import Kriging
 
 PARENTS = 8
 _FINEST = 18  # halvings: positions have 16 bits an axis
+_FEW_TURNS, _TURNS = 15, 90  # of the power method
+_GROWN = 1.03
 _AT_ONCE = 1 << 21  # distances, where many places are as far
 
 
@@ -73,6 +77,19 @@ class Tree:
         for level, matrix in zip(self.levels[:0:-1], self._up[::-1], strict=True):
             result += matrix @ result[level]
         return result
+
+    @cached_property
+    def eigenvalue(self) -> float:
+        """About the largest one of the transform, its numbers divided by their reach, times its transpose."""
+        vector, first, size = np.random.default_rng(0).standard_normal((len(self.reach), 1)), 1.0, 1.0
+        for turn in range(_TURNS):
+            vector = self.adjoint(self.values(vector / self.reach[:, None])) / self.reach[:, None]
+            size = float(np.linalg.norm(vector))
+            vector /= size
+            if turn == _FEW_TURNS - 1:
+                first = size
+        # Few turns will do unless they end far below: one probe of few may change most, and its part grows late.
+        return size if size > _GROWN * first else first
 
 
 class _FirstOfTies(Kriging):
