@@ -16,7 +16,10 @@ from wlm.probe.between import held_out
 from wlm.probe.data import from_arrays
 from wlm.probe.kriging import Kriging
 from wlm.probe.transform import Places, TransformModel, basis
+from wlm.probe.transform_coder import Coders
+from wlm.probe.transform_fit import Frame, Search, Team
 from wlm.probe.tree import RADII, Tree, flat
+from wlm.workers import Here
 
 RANDOM = np.random.default_rng(0)
 
@@ -33,6 +36,12 @@ def lattice(side=6, outputs=12):
     values = (wave + RANDOM.normal(size=wave.shape) * 0.01).astype(np.float32)
     values[::50] = 0.0
     return from_arrays(place, values, name="lattice")
+
+
+def searched(probes):
+    """The search of a set for the usual PSNR."""
+    frame, team = Frame(probes, False, probes.probes), Team(Here(Coders()), 1)
+    return Search(probes, wlm.probe.Profile.load("transform"), frame, team, None)
 
 
 @pytest.mark.parametrize("kind", ["zeros", "small", "large", "one"])
@@ -305,3 +314,25 @@ def test_places_are_the_same_from_floats():
     one, two = Places.of(place), Places.of(place.astype(np.float32).astype(np.float64))
     np.testing.assert_array_equal(one.code, two.code)
     assert one.check == two.check != dataclasses.replace(one, code=one.code[::-1]).check
+
+
+def test_a_fit_of_few_probes_does_not_diverge():
+    # Late in the power method one probe's part outgrows the others.
+    probes = synthetic(100, coefficients=4, dead=3)
+    lit = np.flatnonzero(probes.live)
+    few = from_arrays(*(part[lit[np.arange(len(lit)) % 5 != 4]] for part in (probes.position, probes.values)))
+    tree = Tree(Places.of(few.position).code)
+    matrix = tree.values(np.eye(few.probes) / tree.reach[:, None])
+    assert tree.eigenvalue == pytest.approx(np.linalg.eigvalsh(matrix.T @ matrix)[-1], rel=1e-3)
+    search = searched(few)
+    fitted, rough = search.at_step(0.1), search.rough_bytes(0.1)
+    assert fitted.size < rough and fitted.error < 2.0 * 0.1**2 * few.values.size
+
+
+def test_a_psnr_that_comes_nearer_and_nearer_is_reached(monkeypatch):
+    probes = synthetic(40, coefficients=1)
+    search = searched(probes)
+    # An octave of the step gains an eighth of what is expected.
+    monkeypatch.setattr(search, "_psnr", lambda coded: 40.0 - 0.6 * np.log2(coded.step))
+    coded = search.smallest(45.0)
+    assert 45.0 <= search._psnr(coded) < 45.2

@@ -30,6 +30,17 @@ from wlm.cli.options import (
     Seed,
     output_option,
 )
+from wlm.cli.probe_day import (
+    Time,
+    at_time,
+    evaluate_hours,
+    is_source,
+    joined,
+    only_path,
+    read_hours,
+    read_times,
+    stored_time,
+)
 from wlm.cli.probe_volume import register, score_seen, show_seen, show_walk_scores, walk_scores
 from wlm.errors import WlmError
 
@@ -37,15 +48,19 @@ if TYPE_CHECKING:
     import numpy as np
 
     from wlm.baselines.rival import Rival
-    from wlm.probe import ProbeModel, ProbeSet, Report, Transform
+    from wlm.probe import DayModel, ProbeModel, ProbeSet, Report, Transform
 
 app = typer.Typer(help="Light probes: quantised 3D Gaussians and a small network, read through a cascaded volume.")
 register(app)
 
-_Probes = Annotated[Path, typer.Argument(metavar="PROBES", help="A .npz, .json or .lmbake file of probes.")]
 _Key = Annotated[str | None, typer.Option(help="Name of the values in PROBES; default the only ones.")]
 _Convention = Annotated[
     str | None, typer.Option(help="Of the numbers: threejs, godot, unreal or unity; default as PROBES says.")
+]
+
+_Hours = Annotated[
+    list[Path],
+    typer.Argument(metavar="PROBES...", help="A .npz, .json or .lmbake file of probes; of several hours one or more."),
 ]
 
 _Original = Annotated[
@@ -67,7 +82,7 @@ _NAMES = {
 @app.command()
 @exclusive
 def compress(
-    probes_path: _Probes,
+    probes_paths: _Hours,
     output: Annotated[Path, output_option("OUT.wlm", "The file to write.")],
     profile: Annotated[
         str, typer.Option(help="transform, standard, compact, small, paper, or a YAML file of settings.")
@@ -92,10 +107,15 @@ def compress(
     positions: Annotated[
         bool, typer.Option("--positions", help="Store the probes' positions too, 16 bits per axis.")
     ] = False,
+    times: Annotated[
+        str | None, typer.Option(metavar="9,12,21", help="Store several hours: of a file each, or of arrays of one.")
+    ] = None,
     key: _Key = None,
     convention: _Convention = None,
 ) -> None:
     """Compress a probe set into one file.
+
+    With --times it holds several hours of the set: PROBES are a file for each, or one with arrays sh_09.00, sh_12.00.
 
     The fit is kept in OUT.wlm.partial from time to time, and by Ctrl-C and SIGTERM; the same command with --resume goes
     on exactly.
@@ -103,7 +123,7 @@ def compress(
     check_output(output, ".wlm")
     quiet_warp()
     from wlm.interop import check_device
-    from wlm.probe import Profile, compress, open_checkpoint
+    from wlm.probe import Profile, compress, compress_day, open_checkpoint
     from wlm.probe.fit import check_method
 
     overrides = {"target_psnr": target_psnr, "max_bytes": max_bytes, "region": region}
@@ -111,23 +131,34 @@ def compress(
     settings = Profile.load(profile).override(overrides, "--")
     check_method(settings, overrides, "--")
     device = check_device(device)
-    probes = _load(probes_path, key, convention)
+    sets, hours = [], None if times is None else read_times(times)
+    if hours is None:
+        probes = _load(only_path(probes_paths), key, convention)
+    else:
+        sets = read_hours(probes_paths, hours, key, convention)
+        probes = joined(sets, hours)
     options = {"seed": seed, "device": device}
     checkpoint = open_checkpoint(output, probes, settings, resume=resume, every=checkpoint_every, **options)
     if resume and not checkpoint.resumed:
         note(f"{checkpoint.path}: there is nothing to resume; starting at step 0")
     start = time.perf_counter()
     with running("fit", checkpoint.path) as progress:
-        model = compress(probes, settings, progress=progress, checkpoint=checkpoint, positions=positions, **options)
+        if hours is None:
+            model = compress(probes, settings, progress=progress, checkpoint=checkpoint, positions=positions, **options)
+        else:
+            model = compress_day(sets, hours, settings, progress=progress, positions=positions)
         seconds = time.perf_counter() - start
         size = model.save(output)
         checkpoint.remove()
+    count = len(sets) or 1
     cells = {
         "file": escape(str(output)),
         "bytes": f"{size:,}",
-        "of float32": f"{size / probes.float_bytes:.2%}",
-        "bits per probe": f"{size * 8 / probes.probes:.2f}",
+        "of float32": f"{size / probes.float_bytes / count:.2%}",
+        "bits per probe": f"{size * 8 / probes.probes / count:.2f}",
     }
+    if hours is not None:
+        cells["hours"] = str(count)
     if settings.method == "gaussians":
         cells |= {"Gaussians": f"{model.count:,}", "dropped": f"{model.dropped:,}"}
     cells["seconds"] = f"{seconds:.1f}"
@@ -149,6 +180,7 @@ def decode(
     region: Annotated[
         int | None, typer.Option(metavar="NUMBER", help="Of a file of many regions: the live probes of one, from 0.")
     ] = None,
+    time: Time = None,
     device: Device = "cpu",
 ) -> None:
     """Decode the light at the stored positions, or at any others.
@@ -161,7 +193,7 @@ def decode(
     from wlm.probe import save_probes
     from wlm.system import load
 
-    model = load(file, "probe")
+    model = at_time(load(file, "probe"), time)
     if region is None:
         position, at_probes = _positions(model, positions)
         decoder = _decoder(model, device, original, position if at_probes else None)
@@ -185,7 +217,7 @@ def decode(
 @app.command()
 def evaluate(
     file: ModelFile,
-    probes_path: _Probes,
+    probes_paths: _Hours,
     json_path: ReportFile = None,
     html_path: PageFile = None,
     baselines: Annotated[
@@ -201,26 +233,44 @@ def evaluate(
     hold_out: Annotated[
         bool, typer.Option("--hold-out", help="Fit four fifths of the probes again, and score the light at the others.")
     ] = False,
+    time: Time = None,
     device: Device = "cpu",
     key: _Key = None,
     convention: _Convention = None,
 ) -> None:
-    """Compare the decoded probes with the input: PSNR of coefficients and of irradiance, and bits per probe."""
+    """Compare the decoded probes with the input: PSNR of coefficients and of irradiance, and bits per probe.
+
+    Of a file of several hours PROBES are as for compress: all hours are scored, or with --time one of them.
+    """
     if json_path is not None:
         check_output(json_path, ".json")
     if html_path is not None:
         check_output(html_path, ".html")
     quiet_warp()
-    from wlm.probe import evaluate
+    from wlm.probe import DayModel, evaluate
+    from wlm.probe.hours import joint_source
     from wlm.system import load
 
     model = load(file, "probe")
-    probes = _load(probes_path, key, convention)
+    if isinstance(model, DayModel):
+        sets = read_hours(probes_paths, model.times, key, convention)
+        if time is None:
+            if baselines or volume or views or mesh is not None or html_path is not None:
+                raise WlmError("--time: expected with --baselines, --volume, --views, --mesh and --html")
+            evaluate_hours(file, model, sets, json_path, hold_out, device)
+            return
+        stored_time(model, time)
+        probes = sets[model.times.index(time)]
+        source, shared = joint_source(sets, model.times), len(sets)
+    else:
+        probes = _load(only_path(probes_paths), key, convention)
+        source, shared = probes.source, 1
+    model = at_time(model, time)
     with running("evaluate") as progress:
-        size = file.stat().st_size
+        size = max(1, file.stat().st_size // shared)
         report = evaluate(model, probes, device=device, progress=progress, file_bytes=size, hold_out=hold_out)
-    if not model.source or not probes.source.startswith(model.source):
-        note(f"warning: {probes_path}: not what {file} was made of; another key, convention or file?")
+    if not is_source(model, source):
+        note(f"warning: {probes_paths[0]}: not what {file} was made of; another key, convention or file?")
     if html_path is not None:
         from wlm.view.reports import probe_report
 
@@ -249,7 +299,7 @@ def info(file: ModelFile, as_json: AsJson = False, device: Device = "cpu") -> No
     quiet_warp()
     from wlm import system
     from wlm.formats.artifact import read_artifact
-    from wlm.probe import RegionModel, codec
+    from wlm.probe import DayModel, RegionModel, codec
 
     artifact = read_artifact(file, "probe")
     model = system.decode(file, artifact, codec.decode)
@@ -270,7 +320,10 @@ def info(file: ModelFile, as_json: AsJson = False, device: Device = "cpu") -> No
         "device_bytes": decoder.device_bytes,
         "profile": model.profile.model_dump(mode="json"),
     }
-    if transform:
+    day = isinstance(model, DayModel)
+    if day:
+        facts |= {"times": list(model.times), "hours": _hour_facts(model)}
+    elif transform:
         facts |= {"step": model.head.step, "directions": model.head.vectors, "predicted": model.head.predicted}
         facts["regions"] = model.split.regions if isinstance(model, RegionModel) else 1
     else:
@@ -291,7 +344,11 @@ def info(file: ModelFile, as_json: AsJson = False, device: Device = "cpu") -> No
     rows.add_row("probes", f"{model.probes:,}, {facts['dead']:,} of them dead")
     rows.add_row("numbers of a probe", str(model.outputs))
     rows.add_row("bits per probe", f"{facts['bits_per_probe']:.2f}")
-    if transform:
+    if day:
+        for hour in facts["hours"]:
+            told = " and ".join(f"{time:g}" for time in hour["from"])
+            rows.add_row(f"bytes of {hour['time']:g} h", f"{hour['bytes']:,}" + (f", told by {told}" if told else ""))
+    elif transform:
         rows.add_row("step", f"{model.head.step:.4g}")
         rows.add_row("directions", str(model.head.vectors))
         rows.add_row("regions", str(facts["regions"]))
@@ -315,6 +372,7 @@ def export(
     file: ModelFile,
     output: Annotated[Path, output_option("DIR", "The folder to write to.")],
     original: _Original = None,
+    time: Time = None,
     device: Device = "cpu",
 ) -> None:
     """Write what the file holds as buffers, with a shader that reads them, for an engine.
@@ -325,11 +383,24 @@ def export(
     from wlm.probe import export
     from wlm.system import load
 
-    model = load(file, "probe")
+    model = at_time(load(file, "probe"), time)
     rows = table(str(output), ["file", "bytes"])
     for path in export(model, output, device=device, position=_given(model, original)):
         rows.add_row(escape(path.name), f"{path.stat().st_size:,}")
     show(rows)
+
+
+def _hour_facts(model: "DayModel") -> list[dict[str, Any]]:
+    """What a file says of each of its hours, in its own order."""
+    return [
+        {
+            "time": model.times[hour.number],
+            "bytes": hour.bytes,
+            "from": [model.times[i] for i in hour.told.references],
+            "dead": int(hour.dead.sum()),
+        }
+        for hour in model.hours
+    ]
 
 
 def _load(path: Path, key: str | None, convention: str | None) -> "ProbeSet":

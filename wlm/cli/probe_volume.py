@@ -7,6 +7,7 @@ import typer
 
 from wlm.cli.console import check_output, escape, number, quiet_warp, running, show, table, write_json
 from wlm.cli.options import Device, ModelFile, ReportFile, output_option
+from wlm.cli.probe_day import Time, at_time
 from wlm.errors import WlmError
 
 if TYPE_CHECKING:
@@ -47,6 +48,7 @@ def walk(
     budget: Annotated[int | None, typer.Option(help="Blocks decoded in a frame; default 64.")] = None,
     key: _Key = None,
     json_path: ReportFile = None,
+    time: Time = None,
     device: Device = "cpu",
 ) -> None:
     """Walk through the scene with a cascaded lighting volume: what a frame costs, covers and gets wrong.
@@ -62,7 +64,7 @@ def walk(
     from wlm.probe.walk import STEP, camera_path, loop_frames, settle, summary, walk
     from wlm.system import load
 
-    model = load(file, "probe")
+    model = at_time(load(file, "probe"), time)
     decoder = model.decoder(device)
     volume, original = _volume(file, model, decoder, probes_path, key, block, budget)
     position = volume.position
@@ -95,6 +97,7 @@ def volume(
     ] = None,
     block: _Block = None,
     key: _Key = None,
+    time: Time = None,
     device: Device = "cpu",
 ) -> None:
     """Write the cascaded volume round a viewer as buffers and a page table, with shaders that read them."""
@@ -103,7 +106,7 @@ def volume(
     from wlm.probe.walk import settle
     from wlm.system import load
 
-    model = load(file, "probe")
+    model = at_time(load(file, "probe"), time)
     made, _ = _volume(file, model, model.decoder(device), probes_path, key, block, None)
     lit = made.position[made.numbers]
     settle(made, (lit.min(0) + lit.max(0)) / 2 if at is None else _point(at))
@@ -120,6 +123,7 @@ def grid(
         Path | None, typer.Argument(metavar="PROBES", help="What was compressed, where FILE.wlm has no places.")
     ] = None,
     cells: Annotated[int | None, typer.Option(help="Along the longest side of the probes' box; default 24.")] = None,
+    time: Time = None,
     device: Device = "cpu",
 ) -> None:
     """Write the light as a grid for three.js: a texture, and a module that loads it into a LightProbeGrid."""
@@ -132,7 +136,7 @@ def grid(
     position = None if probes_path is None else load_positions(probes_path)
 
     rows = table(str(output), ["file", "bytes"])
-    for path in export_grid(load(file, "probe"), output, cells=cells, position=position, device=device):
+    for path in export_grid(at_time(load(file, "probe"), time), output, cells=cells, position=position, device=device):
         rows.add_row(escape(path.name), f"{path.stat().st_size:,}")
     show(rows)
 

@@ -3,6 +3,7 @@
 from wlm._facade import facade
 
 _PLACES = {
+    "DayModel": "wlm.probe.day",
     "Decoder": "wlm.probe.decode",
     "ProbeModel": "wlm.probe.model",
     "ProbeSet": "wlm.probe.data",
@@ -15,12 +16,15 @@ _PLACES = {
     "TransformModel": "wlm.probe.transform",
     "Volume": "wlm.probe.volume",
     "compress": "wlm.probe.fit",
+    "compress_day": "wlm.probe.day_fit",
     "evaluate": "wlm.probe.evaluation",
+    "evaluate_day": "wlm.probe.day_evaluation",
     "export": "wlm.probe.exporter",
     "export_grid": "wlm.probe.three_grid",
     "export_volume": "wlm.probe.volume_export",
     "from_arrays": "wlm.probe.data",
     "load": "wlm.probe.data",
+    "load_hours": "wlm.probe.hours",
     "load_positions": "wlm.probe.data",
     "open_checkpoint": "wlm.probe.fit",
     "save_probes": "wlm.probe.data",

@@ -16,6 +16,8 @@ from wlm.formats.bits import pack_bits, unpack_bits
 from wlm.formats.compact import HEAD
 from wlm.formats.limits import NUMBERS, PROBES
 from wlm.formats.parts import Part, check_parts
+from wlm.probe.day import DayModel
+from wlm.probe.day_codec import decode_day, encode_day, is_day
 from wlm.probe.model import LATENT, SCALE, ProbeModel, Profile, layer_shapes
 from wlm.probe.region_codec import decode_regions, encode_regions
 from wlm.probe.regions import RegionModel
@@ -57,6 +59,8 @@ def encode(model: ProbeModel | Transform) -> tuple[dict[str, Any], dict[str, np.
     """Settings, parts and source of a model's file."""
     if isinstance(model, RegionModel):
         return encode_regions(model)
+    if isinstance(model, DayModel):
+        return encode_day(model)
     if isinstance(model, TransformModel):
         return encode_transform(model)
     settings = {
@@ -86,6 +90,8 @@ def decode(artifact: Artifact) -> ProbeModel | Transform:
     """
     if HEAD in artifact.tensors:
         return decode_regions(artifact)
+    if is_day(artifact):
+        return decode_day(artifact)
     if is_transform(artifact):
         return decode_transform(artifact)
     header = check_settings(_Header, artifact.settings, "setting ")

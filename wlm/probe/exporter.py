@@ -15,6 +15,7 @@ from wlm.errors import WlmError
 from wlm.formats.folder import make_parents, rounded, staged, write_index
 from wlm.probe.conventions import CANONICAL
 from wlm.probe.data import save_probes
+from wlm.probe.day import DayModel
 from wlm.probe.decode import Decoder
 from wlm.probe.model import CENTRE, SCALE, ProbeModel, live_probes
 from wlm.probe.shader import HEAD_WORDS, gaussian_words, probe_glsl
@@ -120,7 +121,10 @@ def _export_transform(model: Transform, folder: Path, device: str, position: np.
     between = 0.5 * (place[chosen] + place[np.minimum(chosen + 1, len(place) - 1)])
     points = np.concatenate([between, place.max(0)[None] + 0.25 * np.ptp(place, axis=0).max() + 0.25])
     files = {LIGHT_FILE: content, SHADER_FILE: transform_glsl(len(place), model.outputs).encode()}
-    return _write(folder, files, transform_document(model, len(place), numbers), points, decoder.decode(points))
+    document = transform_document(model, len(place), numbers)
+    if isinstance(model, DayModel):
+        document |= {"time": model.time, "times": list(model.times)}
+    return _write(folder, files, document, points, decoder.decode(points))
 
 
 def _write(

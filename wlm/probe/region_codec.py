@@ -29,24 +29,27 @@ import numpy as np
 
 from wlm.formats.artifact import Artifact
 from wlm.formats.compact import DATA, HEAD
-from wlm.formats.limits import NUMBERS, PROBES
+from wlm.formats.limits import NUMBERS
 from wlm.probe.entropy import Shape, pack, unpack
 from wlm.probe.regions import Piece, RegionModel, Split
-from wlm.probe.transform import SOURCE, Head, step_of
+from wlm.probe.transform import step_of
 from wlm.probe.transform_codec import (
     CORNERS,
     DIRECTIONS,
     FARTHEST,
     HEAD_SHIFT,
     KIND,
-    L2,
     OUTPUTS,
     PLACED,
     SHORT,
     Fields,
+    begin_bytes,
     check_counts,
+    head_flags,
+    head_of,
     name_of,
     number_bytes,
+    step_bytes,
 )
 from wlm.probe.tree import flat
 
@@ -58,13 +61,8 @@ _PIECE = struct.Struct("<I4sI6H")
 def encode_regions(model: RegionModel) -> tuple[dict[str, Any], dict[str, np.ndarray], str]:
     """Settings, parts and source of a model's file."""
     head = model.head
-    flags = head.vectors | head.flags << HEAD_SHIFT | PLACED * model.has_positions
-    flags |= OUTPUTS * (model.outputs != L2)
-    pieces = [SHORT.pack(flags), number_bytes(model.probes)]
-    if model.outputs != L2:
-        pieces.append(number_bytes(model.outputs))
-    pieces += [bytes.fromhex(model.source), CORNERS.pack(*model.origin, model.extent)]
-    pieces.append(SHORT.pack(int(np.array(head.step, np.float32).view(np.uint32)) >> 16))
+    pieces = [begin_bytes(head_flags(head) | PLACED * model.has_positions, model)]
+    pieces += [CORNERS.pack(*model.origin, model.extent), step_bytes(head.step)]
     if model.directions is not None:
         vectors = np.rint(model.directions * head.fineness).astype(np.int64)
         code = pack((vectors, Shape(model.outputs, flat(len(vectors)))))
@@ -84,17 +82,13 @@ def decode_regions(artifact: Artifact) -> RegionModel:
         ValueError: The head is damaged, or doesn't fit the data.
     """
     reader, data = Fields(artifact.tensors[HEAD]), artifact.tensors[DATA]
-    flags = reader.fields(SHORT)[0]
+    flags, probes, outputs, source = reader.begin()
     if flags & ~(DIRECTIONS | KIND << HEAD_SHIFT | OUTPUTS | PLACED):
         raise ValueError(f"part {HEAD}: expected known flags, found {flags}")
-    probes = reader.number("probes", PROBES)
-    outputs = reader.number("numbers of a probe", NUMBERS) if flags & OUTPUTS else L2
-    source = reader.take(SOURCE // 2).tobytes().hex()
     frame = np.array(reader.fields(CORNERS))
     if not ((np.abs(frame) <= FARTHEST).all() and frame[3] > 0):
         raise ValueError(f"part {HEAD}: expected an origin and a positive extent within {FARTHEST:g}")
-    head = Head(step_of(reader.fields(SHORT)[0]), 0, flags & DIRECTIONS, flags >> HEAD_SHIFT & KIND)
-    head = head.checked(outputs, len(data))
+    head = head_of(flags, step_of(reader.fields(SHORT)[0]), 0).checked(outputs, len(data))
     directions = None
     if head.vectors:
         code = reader.take(reader.number("bytes", 16 * NUMBERS * NUMBERS)).tobytes()
@@ -114,7 +108,7 @@ def decode_regions(artifact: Artifact) -> RegionModel:
         raise ValueError(f"part {DATA}: expected {end} bytes, found {len(data)}")
     if sum(piece.probes for piece in pieces) != probes:
         raise ValueError(f"part {HEAD}: expected regions of {probes} probes in all")
-    check_counts(probes, outputs, np.zeros(0, bool), len(data))
+    check_counts(probes, outputs, [np.zeros(0, bool)], len(data))
     return RegionModel(
         name=name_of(artifact),
         source=source,

@@ -7,9 +7,11 @@ predicted there is no tree, and its numbers are q_i step F^T, or q_i step.
 """
 
 import zlib
+from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
 
@@ -129,7 +131,7 @@ class Places:
 
 
 class Transform(Model):
-    """Base of models that are read at the places of their own probes: of one region or of many.
+    """Base of models that are read at the places of their own probes: of one region or of many, of one hour or more.
 
     Attributes:
         profile: The method alone.
@@ -140,33 +142,22 @@ class Transform(Model):
     profile: ClassVar[Profile] = Profile(name="transform", method="transform")
 
 
-@dataclass(frozen=True, eq=False)
-class TransformModel(Transform):
-    """A compressed probe set of N probes of D numbers, read at the places of the set.
+class Placed(Transform, ABC):
+    """Base of transforms whose probes are one region.
 
     Attributes:
         name: The set's name.
-        source: The first digits of the hash of the input, all of them in earlier files.
         probes: N.
-        outputs: D, 27 for L2 in RGB.
-        dead: bool [N], probes that decode to zero; empty if there are none.
-        head: What the stream's numbers are.
-        stream: uint8 [B], the coded numbers, see `docs/formats.md`.
         places: Of all probes, where they are stored with the model; else None.
-        directions: float64 [V, D], where the stream lacks them: those of a set of many regions.
+        check: `Places.check` of the model's own probes.
     """
 
     DECODER: ClassVar[tuple[str, str]] = ("transform_decode", "TransformDecoder")
 
     name: str
-    source: str
     probes: int
-    outputs: int
-    dead: np.ndarray
-    head: Head
-    stream: np.ndarray
     places: Places | None
-    directions: np.ndarray | None = None
+    check: int
 
     @property
     def has_positions(self) -> bool:
@@ -183,13 +174,13 @@ class TransformModel(Transform):
             raise WlmError(NO_POSITIONS.format(self.name))
         return self.places.position()
 
-    def without_places(self) -> "TransformModel":
+    def without_places(self) -> Self:
         """The model as its file would be without the positions."""
         return replace(self, places=None)
 
     def has_probes_at(self, position: np.ndarray) -> bool:
         """Whether positions, float64 [M, 3], are those of the model's own probes, in their order."""
-        return len(position) == self.probes and Places.of(position).check == self.head.check
+        return len(position) == self.probes and Places.of(position).check == self.check
 
     def values_at(self, position: np.ndarray) -> np.ndarray:
         """The numbers of all probes at their own positions, float64 [N, 3]; as `values`."""
@@ -209,39 +200,60 @@ class TransformModel(Transform):
             places: Of the model's own probes.
 
         Raises:
-            WlmError: They are other places, or the stream is none of theirs.
+            WlmError: They are other places, or the model is none of theirs.
         """
-        head = self.head
-        if len(places.code) != self.probes or places.check != head.check:
+        if len(places.code) != self.probes or places.check != self.check:
             raise WlmError(f"{self.name}: expected the positions of its own {self.probes} probes, in their order")
+        return self._values(places)
+
+    @abstractmethod
+    def _values(self, places: Places) -> np.ndarray:
+        """`values` at places that are the model's own."""
+
+
+@dataclass(frozen=True, eq=False)
+class TransformModel(Placed):
+    """A compressed probe set of N probes of D numbers, read at the places of the set.
+
+    Attributes:
+        name: The set's name.
+        source: The first digits of the hash of the input, all of them in earlier files.
+        probes: N.
+        outputs: D, 27 for L2 in RGB.
+        dead: bool [N], probes that decode to zero; empty if there are none.
+        head: What the stream's numbers are.
+        stream: uint8 [B], the coded numbers, see `docs/formats.md`.
+        places: Of all probes, where they are stored with the model; else None.
+        directions: float64 [V, D], where the stream lacks them: those of a set of many regions.
+    """
+
+    name: str
+    source: str
+    probes: int
+    outputs: int
+    dead: np.ndarray
+    head: Head
+    stream: np.ndarray
+    places: Places | None
+    directions: np.ndarray | None = None
+
+    @property
+    def check(self) -> int:
+        return self.head.check
+
+    def _values(self, places: Places) -> np.ndarray:
         live = live_probes(self.dead, self.probes)
-        tree = Tree(places.code[live], head.grid) if head.predicted else None
+        result = np.zeros((self.probes, self.outputs), np.float32)
         try:
-            vectors, q = self._numbers(tree, int(live.sum()))
+            with np.errstate(over="ignore", invalid="ignore"):
+                result[live] = read_values(
+                    self.head, self.stream, self.outputs, places.code[live], directions=self.directions
+                )
         except ValueError as error:
             raise WlmError(f"{self.name}: part light: {error}") from error
-        turned = q * head.step
-        if tree:
-            turned = tree.values(turned / tree.reach[:, None])
-        result = np.zeros((self.probes, self.outputs), np.float32)
-        with np.errstate(over="ignore", invalid="ignore"):
-            result[live] = turned if head.raw else turned @ basis(self.outputs, vectors).T
         if not np.isfinite(result).all():
             raise WlmError(f"{self.name}: part light: expected values that float32 holds")
         return result
-
-    def _numbers(self, tree: Tree | None, count: int) -> tuple[np.ndarray | None, np.ndarray]:
-        """The directions, float64 [V, D], or None; and the numbers of so many live probes, int64 [L, D]."""
-        head, data, shape = self.head, self.stream.tobytes(), numbers_shape(tree, count, self.outputs)
-        if self.directions is not None or not head.vectors:
-            return self.directions, unpack(data, shape)[0]
-        directions = Shape(self.outputs, flat(head.vectors))
-        if head.words is None:
-            vectors, q = unpack(data, directions, shape)
-        else:
-            end = 4 * head.words
-            (vectors,), (q,) = unpack(data[:end], directions), unpack(data[end:], shape)
-        return vectors / head.fineness, q
 
 
 @dataclass(frozen=True, eq=False)
@@ -294,6 +306,46 @@ def make_stream(coding: Coding, tree: Tree | None, q: np.ndarray) -> np.ndarray:
     if coding.vectors is not None and not coding.apart:
         blocks.insert(0, coding.block())
     return np.frombuffer(pack(*blocks), np.uint8)
+
+
+def read_values(
+    head: Head,
+    stream: np.ndarray,
+    outputs: int,
+    code: np.ndarray,
+    trees: Callable[[np.ndarray, int], Tree] = Tree,
+    *,
+    directions: np.ndarray | None = None,
+) -> np.ndarray:
+    """The numbers of live probes, float64 [L, D]: undoes `make_stream`.
+
+    Args:
+        head: What the stream's numbers are.
+        stream: uint8 [B].
+        outputs: D.
+        code: uint16 [L, 3], the probes' places.
+        trees: What makes a tree of these.
+        directions: float64 [V, D], where the stream lacks them.
+
+    Raises:
+        ValueError: The stream is none of so many probes.
+    """
+    tree = trees(code, head.grid) if head.predicted else None
+    shape, data = numbers_shape(tree, len(code), outputs), stream.tobytes()
+    if directions is not None or not head.vectors:
+        (q,) = unpack(data, shape)
+    else:
+        front = Shape(outputs, flat(head.vectors))
+        if head.words is None:
+            vectors, q = unpack(data, front, shape)
+        else:
+            end = 4 * head.words
+            (vectors,), (q,) = unpack(data[:end], front), unpack(data[end:], shape)
+        directions = vectors / head.fineness
+    turned = q * head.step
+    if tree:
+        turned = tree.values(turned / tree.reach[:, None])
+    return turned if head.raw else turned @ basis(outputs, directions).T
 
 
 def stored_step(step: float) -> float:

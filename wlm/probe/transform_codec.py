@@ -6,9 +6,9 @@ last byte:
 ==============  =======================================================================================================
 field           content
 ==============  =======================================================================================================
-flags           U16: stored directions; 64 times `Head.flags`; 1024 where D follows, which else is 27; 2048 where there
-                are dead probes; 4096 where their bits are deflated; 8192 where places are stored; 16384 times
-                the tree's place in `RADII`
+flags           U16: stored directions; 64 times `Head.flags`, or `HOURS` (`wlm.probe.day_codec`); 1024 where D follows,
+                which else is 27; 2048 where there are dead probes; 4096 where their bits are deflated; 8192 where
+                places are stored; 16384 times the tree's place in `RADII`
 N, D            numbers of any size; D if it isn't 27
 source          the first 8 digits of the input's hash, as 4 bytes
 dead            a bit for each probe, the first in the highest bit of the first byte; or a length and these deflated
@@ -25,6 +25,7 @@ directions, the numbers, and in the last `dead` bytes the dead probes' bits, def
 
 import struct
 import zlib
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -37,7 +38,7 @@ from wlm.formats.compact import BODY
 from wlm.formats.deflate import inflate
 from wlm.formats.limits import NUMBERS, PROBES
 from wlm.formats.parts import Part, check_part, check_parts
-from wlm.probe.transform import SOURCE, Head, Places, TransformModel, step_of
+from wlm.probe.transform import SOURCE, Head, Places, Transform, TransformModel, step_of
 from wlm.probe.tree import RADII
 from wlm.system import Header, Name
 
@@ -45,11 +46,12 @@ _LIGHT, _PLACES, _FRAME = "light", "places", "frame"
 L2 = 27  # numbers of a probe that a file doesn't state
 _EARLIER = struct.Struct("<fIHBB")
 CORNERS = struct.Struct("<4d")
-_CHECK = struct.Struct("<I")
+CHECK = struct.Struct("<I")
 SHORT = struct.Struct("<H")
+HOURS = 15  # in place of a kind
 DIRECTIONS, KIND = 63, 15  # masks
 HEAD_SHIFT, _GRID_SHIFT = 6, 14
-OUTPUTS, _DEAD, _DEFLATED, PLACED = (1 << bit for bit in range(10, 14))
+OUTPUTS, DEAD, DEFLATED, PLACED = (1 << bit for bit in range(10, 14))
 _GRIDLESS = (1 << _GRID_SHIFT) - 1
 _LONGEST = 5  # bytes of a whole number
 FARTHEST = 1e150
@@ -115,19 +117,11 @@ def name_of(artifact: Artifact) -> str:
 def encode_body(model: TransformModel) -> bytes:
     """The bytes of the module's table."""
     head = model.head
-    flags = head.vectors | head.flags << HEAD_SHIFT | head.grid << _GRID_SHIFT
-    pieces = [number_bytes(model.probes)]
-    if model.outputs != L2:
-        flags |= OUTPUTS
-        pieces.append(number_bytes(model.outputs))
-    pieces.append(bytes.fromhex(model.source))
-    kind, own = _pack_own(model.dead, model.places)
-    flags |= kind
-    pieces.append(own)
-    pieces.append(SHORT.pack(int(np.array(head.step, np.float32).view(np.uint32)) >> 16))
+    flags, own = pack_own(model.dead, model.places)
+    pieces = [begin_bytes(head_flags(head) | flags, model), own, step_bytes(head.step)]
     if model.places is None:
-        pieces.append(_CHECK.pack(head.check))
-    return b"".join([SHORT.pack(flags), *pieces, model.stream.tobytes()])
+        pieces.append(CHECK.pack(head.check))
+    return b"".join([*pieces, model.stream.tobytes()])
 
 
 def decode_body(name: str, body: np.ndarray) -> TransformModel:
@@ -137,19 +131,14 @@ def decode_body(name: str, body: np.ndarray) -> TransformModel:
         ValueError: It is damaged.
     """
     reader = Fields(body)
-    flags = reader.fields(SHORT)[0]
-    if flags & (_DEAD | _DEFLATED) == _DEFLATED:
-        raise ValueError(f"part {BODY}: expected known flags, found {flags}")
-    probes = reader.number("probes", PROBES)
-    outputs = reader.number("numbers of a probe", NUMBERS) if flags & OUTPUTS else L2
-    source = reader.take(SOURCE // 2).tobytes().hex()
+    flags, probes, outputs, source = reader.begin()
+    check_flags(flags & (DEAD | DEFLATED) != DEFLATED, flags)
     dead, places = reader.own(flags, probes)
     step = step_of(reader.fields(SHORT)[0])
-    check = reader.fields(_CHECK)[0] if places is None else places.check
+    check = reader.check(places)
     stream = reader.rest()
-    kind, grid = flags >> HEAD_SHIFT & KIND, flags >> _GRID_SHIFT
-    head = Head(step, check, flags & DIRECTIONS, kind, grid).checked(outputs, len(stream))
-    check_counts(probes, outputs, dead, len(stream))
+    head = head_of(flags, step, check).checked(outputs, len(stream))
+    check_counts(probes, outputs, [dead], len(stream))
     return TransformModel(name, source, probes, outputs, dead, head, stream, places)
 
 
@@ -162,8 +151,8 @@ def pack_piece(dead: np.ndarray, places: Places | None, check: int, grid: int, s
         check, grid: Of the region's places.
         stream: The numbers.
     """
-    flags, own = _pack_own(dead, places) if places is not None else (0, _CHECK.pack(check))
-    return bytes([(flags | grid << _GRID_SHIFT) // _DEAD]) + own + stream.tobytes()
+    flags, own = pack_own(dead, places) if places is not None else (0, CHECK.pack(check))
+    return bytes([(flags | grid << _GRID_SHIFT) // DEAD]) + own + stream.tobytes()
 
 
 def parse_piece(
@@ -180,16 +169,16 @@ def parse_piece(
         ValueError: It is damaged.
     """
     reader = Fields(data)
-    flags = int(reader.take(1)[0]) * _DEAD
+    flags = int(reader.take(1)[0]) * DEAD
     grid = flags >> _GRID_SHIFT
-    if grid >= len(RADII) or flags & _GRIDLESS not in (0, PLACED, PLACED | _DEAD, PLACED | _DEAD | _DEFLATED):
-        raise ValueError(f"expected known flags, found {flags // _DEAD}")
+    if grid >= len(RADII) or flags & _GRIDLESS not in (0, PLACED, PLACED | DEAD, PLACED | DEAD | DEFLATED):
+        raise ValueError(f"expected known flags, found {flags // DEAD}")
     own, places = reader.own(flags, probes)
-    check = places.check if places is not None else reader.fields(_CHECK)[0]
+    check = reader.check(places)
     if places is None and dead is not None:
         own = dead
     stream = reader.rest()
-    check_counts(probes, outputs, own, len(stream))
+    check_counts(probes, outputs, [own], len(stream))
     return own, places, check, grid, stream
 
 
@@ -239,12 +228,27 @@ class Fields:
     def fields(self, layout: struct.Struct) -> tuple:
         return layout.unpack(self.take(layout.size).tobytes())
 
+    def begin(self) -> tuple[int, int, int, str]:
+        """Flags, N, D and source."""
+        flags = self.fields(SHORT)[0]
+        probes = self.number("probes", PROBES)
+        outputs = self.number("numbers of a probe", NUMBERS) if flags & OUTPUTS else L2
+        return flags, probes, outputs, self.take(SOURCE // 2).tobytes().hex()
+
+    def block(self) -> np.ndarray:
+        """A length, and so many bytes."""
+        return self.take(self.number("bytes", len(self._body), 0))
+
+    def check(self, places: Places | None) -> int:
+        """That of places, which is here where they aren't."""
+        return self.fields(CHECK)[0] if places is None else places.check
+
     def own(self, flags: int, probes: int) -> tuple[np.ndarray, Places | None]:
         """Dead probes and places."""
         dead = np.zeros(0, bool)
-        if flags & _DEFLATED:
+        if flags & DEFLATED:
             dead = unpack_dead(self.take(self.number("bytes", 2 * PROBES)), probes)
-        elif flags & _DEAD:
+        elif flags & DEAD:
             dead = np.unpackbits(self.take(-(-probes // 8)), count=probes).astype(bool)
         if not flags & PLACED:
             return dead, None
@@ -253,26 +257,55 @@ class Fields:
             raise ValueError(f"part places: expected an origin and an extent within {FARTHEST:g}")
         return dead, _unpack_places(corner, self.take(self.number("bytes", 8 * PROBES)), probes)
 
-    def number(self, what: str, most: int) -> int:
+    def number(self, what: str, most: int, least: int = 1) -> int:
         value = 0
         for place in range(_LONGEST):
             byte = int(self.take(1)[0])
             value |= (byte & 127) << 7 * place
             if byte < 128:
                 break
-        if not 1 <= value <= most or byte >= 128 or (byte == 0 and place):
-            raise ValueError(f"part {BODY}: expected 1 to {most} {what}, found {value}")
+        if not least <= value <= most or byte >= 128 or (byte == 0 and place):
+            raise ValueError(f"part {BODY}: expected {least} to {most} {what}, found {value}")
         return value
 
 
-def _pack_own(dead: np.ndarray, places: Places | None) -> tuple[int, bytes]:
+def begin_bytes(flags: int, model: Transform) -> bytes:
+    """Flags, to which that of D is added, N, D and source."""
+    pieces = [SHORT.pack(flags | OUTPUTS * (model.outputs != L2)), number_bytes(model.probes)]
+    if model.outputs != L2:
+        pieces.append(number_bytes(model.outputs))
+    return b"".join([*pieces, bytes.fromhex(model.source)])
+
+
+def head_flags(head: Head) -> int:
+    """What flags say of a head."""
+    return head.vectors | head.flags << HEAD_SHIFT | head.grid << _GRID_SHIFT
+
+
+def head_of(flags: int, step: float, check: int) -> Head:
+    """Undoes `head_flags`."""
+    return Head(step, check, flags & DIRECTIONS, flags >> HEAD_SHIFT & KIND, flags >> _GRID_SHIFT)
+
+
+def check_flags(known: bool, flags: int) -> None:
+    """Refuses flags that aren't known."""
+    if not known:
+        raise ValueError(f"part {BODY}: expected known flags, found {flags}")
+
+
+def step_bytes(step: float) -> bytes:
+    """A step as files hold it."""
+    return SHORT.pack(int(np.array(step, np.float32).view(np.uint32)) >> 16)
+
+
+def pack_own(dead: np.ndarray, places: Places | None) -> tuple[int, bytes]:
     """Flags and bytes of dead probes and places."""
     flags, result = 0, b""
     if dead.any():
-        flags |= _DEAD
+        flags |= DEAD
         bits, deflated = np.packbits(dead).tobytes(), pack_dead(dead).tobytes()
         if len(bits) > len(deflated) + len(number_bytes(len(deflated))):
-            flags |= _DEFLATED
+            flags |= DEFLATED
             bits = number_bytes(len(deflated)) + deflated
         result += bits
     if places is not None:
@@ -306,15 +339,21 @@ def _unpack_places(frame: np.ndarray, packed: np.ndarray, probes: int) -> Places
     return Places(frame[:3].copy(), float(frame[3]), np.cumsum(change, axis=0, dtype=np.uint16))
 
 
-def check_counts(probes: int, outputs: int, dead: np.ndarray, size: int) -> None:
-    """Checks that so many bytes may be so many probes."""
+def check_numbers(probes: int, outputs: int, size: int) -> None:
+    """Checks that so many bytes may be so many probes of so many numbers, of all hours."""
     most = _SURE_NUMBERS + _NUMBERS_A_BYTE * size
     if probes * outputs > most:
         numbers = f"{probes} probes of {outputs} numbers"
         raise ValueError(f"part light: expected at most {most} numbers of {size} bytes, found {numbers}")
-    live, most = probes - int(dead.sum()), _SURE_PROBES + _PROBES_A_BYTE * size
-    if not 1 <= live <= most:
-        raise ValueError(f"part light: expected 1 to {most} live probes of {size} bytes, found {live}")
+
+
+def check_counts(probes: int, outputs: int, dead: Sequence[np.ndarray], size: int) -> None:
+    """Checks that so many bytes may be so many probes, of which each hour's dead ones are given."""
+    check_numbers(probes, outputs * len(dead), size)
+    live, most = [probes - int(each.sum()) for each in dead], _SURE_PROBES + _PROBES_A_BYTE * size
+    if min(live) < 1 or sum(live) > most:
+        found = sum(live) if min(live) else 0
+        raise ValueError(f"part light: expected 1 to {most} live probes of {size} bytes, found {found}")
 
 
 def _encode_earlier(model: TransformModel) -> tuple[dict[str, Any], dict[str, np.ndarray], str]:
@@ -345,7 +384,7 @@ def _decode_earlier(artifact: Artifact) -> TransformModel:
     stream = light[_EARLIER.size : end]
     head = Head(step, check, vectors, flags, 0, words).checked(header.outputs, len(stream))
     dead = unpack_dead(light[end:], header.probes)
-    check_counts(header.probes, header.outputs, dead, len(stream))
+    check_counts(header.probes, header.outputs, [dead], len(stream))
     places = None
     if parts[_PLACES].size:
         frame = check_part(artifact.tensors, _FRAME, replace(_EARLIER_PARTS[_FRAME], optional=False))

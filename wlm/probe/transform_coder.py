@@ -15,7 +15,7 @@ import numpy as np
 
 from wlm.probe.entropy import LARGEST
 from wlm.probe.transform import Coding, Places, colours, make_stream, stored_step
-from wlm.probe.tree import RADII, Tree
+from wlm.probe.tree import FIRST, RADII, Tree
 
 MANY = 4096
 """Probes above which a fit at another step begins where the last one ended."""
@@ -23,6 +23,7 @@ MANY = 4096
 BIT = 0.1155
 """Squared steps that a bit is worth at fine steps: 2 ln 2 / 12."""
 
+_ABOVE = 1.05  # the largest eigenvalue of the transform: what a step downhill is divided by
 _PRICE = 0.25  # of a number that isn't zero, in steps
 _ROUND = 0.4  # what is added before rounding down: below half, a smaller number is cheaper
 _SPARSE, _AGAIN = 25, 20  # rounds with the price, and for another step
@@ -66,19 +67,27 @@ class Coded:
 class Coder:
     """The probes of a region."""
 
-    def __init__(self, position: np.ndarray, values: np.ndarray, live: np.ndarray):
+    def __init__(
+        self,
+        position: np.ndarray,
+        values: np.ndarray,
+        live: np.ndarray,
+        trees: Callable[[np.ndarray, int], Tree] = Tree,
+    ):
         """Makes the tree.
 
         Args:
             position: float64 [N, 3].
             values: float32 [N, D].
             live: bool [N], one at least is.
+            trees: What makes a tree of places.
         """
+        self._trees = trees
         self._values = values[live].astype(np.float64)
         self._code = Places.of(position).code[live]
         self._coding = Coding(True)
         self._turned = self._warm = None
-        self._take(Tree(self._code, 1))
+        self.plant(FIRST)
 
     def measure(self) -> Measured:
         tree = self._tree
@@ -89,7 +98,7 @@ class Coder:
         return Measured(largest, len(inner), change.T @ change)
 
     def choose(self, coding: Coding) -> None:
-        """Takes a way to code; a tree in it stands for the region's own."""
+        """Takes a way to code."""
         self._coding, self._turned, self._warm = coding, None, None
 
     def settle(self, step: float) -> None:
@@ -98,15 +107,18 @@ class Coder:
             return
         # Of many probes the other distances cost more time than they are worth bytes.
         others = range(len(RADII)) if len(self._code) <= MANY else (0, 1)
-        trees = [self._tree] + [Tree(self._code, grid) for grid in others if grid != self._tree.grid]
+        trees = [self._tree] + [self._trees(self._code, grid) for grid in others if grid != self._tree.grid]
         costs = []
         for self._tree in trees:
             costs.append(self.plain(step).cost(stored_step(step)))
         self._take(trees[int(np.argmin(costs))])
 
+    def plant(self, grid: int) -> None:
+        """Takes the tree of a grid."""
+        self._take(self._trees(self._code, grid))
+
     def _take(self, tree: Tree) -> None:
         self._tree, self._warm = tree, None
-        self._bound = 1.05 * _largest_eigenvalue(tree)
 
     def plain(self, step: float) -> Coded:
         """Each number rounded for itself."""
@@ -117,7 +129,7 @@ class Coder:
         tree, step = self._tree, stored_step(step)
         if not self._coding.predicted:
             return self.plain(step)
-        target, reach, bound = self._target(), tree.reach[:, None], self._bound
+        target, reach, bound = self._target(), tree.reach[:, None], _ABOVE * tree.eigenvalue
 
         def downhill(number: np.ndarray) -> np.ndarray:
             return number - tree.adjoint(tree.values(number / reach) - target) / reach / bound
@@ -161,11 +173,12 @@ class Coder:
 class Coders:
     """The coders of some regions, by their numbers: what a process of a fit holds."""
 
-    def __init__(self) -> None:
+    def __init__(self, trees: Callable[[np.ndarray, int], Tree] = Tree) -> None:
+        self._trees = trees
         self._coders: dict[int, Coder] = {}
 
     def add(self, number: int, position: np.ndarray, values: np.ndarray, live: np.ndarray) -> Measured:
-        self._coders[number] = Coder(position, values, live)
+        self._coders[number] = Coder(position, values, live, self._trees)
         return self._coders[number].measure()
 
     def run(self, method: str, *arguments: Any) -> dict[int, Any]:
@@ -189,14 +202,3 @@ def _accelerated(first: np.ndarray, step: Callable[[np.ndarray], np.ndarray], ro
         ahead = current + (weight - 1.0) / following * (current - before)
         weight = following
     return current
-
-
-def _largest_eigenvalue(tree: Tree) -> float:
-    """Of the transform, with its numbers divided by their reach, times its transpose; by the power method."""
-    reach = tree.reach[:, None]
-    vector, size = np.random.default_rng(0).standard_normal((len(reach), 1)), 1.0
-    for _ in range(15):
-        vector = tree.adjoint(tree.values(vector / reach)) / reach
-        size = float(np.linalg.norm(vector))
-        vector /= size
-    return size

@@ -5,7 +5,7 @@ their own where there are many probes.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -30,16 +30,29 @@ _WIDEST = 64  # numbers of a probe up to which directions are looked for
 _TINY = 16  # live probes up to which every way to code is fitted: each byte counts
 _AROUND = np.arange(-8, 9) / 16  # steps round the best that are tried of these, in powers of two
 _TRIES = 14
+_FAR = 0.25  # octaves of a step that comes nowhere by smaller ones
 _LEAST = -133.0  # of the step's logarithm: a file has no less
-_PSNR = 50.0  # that is wanted where nothing is said
+PSNR = 50.0
+"""That is wanted where nothing is said."""
+
 _CLOSE = 0.03  # dB above the wanted PSNR that is near enough
-_FULL = 0.985  # of the largest size that is near enough
+FULL = 0.985
+"""Of the largest size that is near enough."""
+
 _ALONE = 1 << 16  # numbers that a process is worth starting for: a second of work
 
 
 @dataclass(frozen=True, eq=False)
-class _Tried:
-    """All regions at a step."""
+class Tried:
+    """All regions at a step.
+
+    Attributes:
+        step: As the file holds it.
+        coding: Of all regions.
+        streams: uint8 [B], of each.
+        grids: Of their trees.
+        error: The sum of squares.
+    """
 
     step: float
     coding: Coding
@@ -69,13 +82,13 @@ def compress_transform(
     Raises:
         WlmError: A size that nothing fits, or a PSNR that can't be reached.
     """
-    frame = _Frame(probes, positions, profile.region)
+    frame = Frame(probes, positions, profile.region)
     with _team(frame) as team:
-        search = _Search(probes, profile, frame, team, progress)
-        return frame.model(search.chosen())
+        search = Search(probes, profile, frame, team, progress)
+        return search.model(search.chosen())
 
 
-class _Frame:
+class Frame:
     """What a set's file holds beside its streams."""
 
     def __init__(self, probes: ProbeSet, positions: bool, most: int) -> None:
@@ -91,7 +104,7 @@ class _Frame:
             self._pieces = [self._piece(part) for part in self.members]
         self._beside: dict[Coding, int] = {}
 
-    def model(self, tried: _Tried) -> Transform:
+    def model(self, tried: Tried) -> Transform:
         """The model of what was chosen."""
         probes = self.probes
         head = tried.coding.head(tried.step, self._places.check)
@@ -124,7 +137,7 @@ class _Frame:
             pieces=tuple(pieces),
         )
 
-    def file_bytes(self, tried: _Tried) -> int:
+    def file_bytes(self, tried: Tried) -> int:
         """Size of the file; what isn't a stream is laid out once for each coding."""
         if tried.coding not in self._beside:
             self._beside[tried.coding] = self.model(tried).file_bytes() - tried.size
@@ -136,13 +149,13 @@ class _Frame:
         return places, places.check, np.stack([live.min(0), live.max(0)])
 
 
-class _Team:
+class Team:
     """The coders of all regions, wherever they are."""
 
     def __init__(self, workers: Workers, regions: int) -> None:
         self._workers, self._regions = workers, regions
 
-    def add(self, frame: _Frame) -> list[Measured]:
+    def add(self, frame: Frame) -> list[Measured]:
         """Gives each region to one of the workers; as they have time for it, for regions differ."""
         probes, waiting = frame.probes, list(range(self._regions))
         found: dict[int, Measured] = {}
@@ -183,30 +196,45 @@ class _Team:
 
 
 @contextmanager
-def _team(frame: _Frame):
+def _team(frame: Frame):
     """Coders in this process, or in as many as there is work for."""
     regions = frame.split.regions
     numbers = int(frame.probes.live.sum()) * frame.probes.outputs
     count = min(cores(), regions, numbers // _ALONE)
     workers = Processes(Coders, [()] * count) if count > 1 else Here(Coders())
     try:
-        yield _Team(workers, regions)
+        yield Team(workers, regions)
     finally:
         workers.close()
 
 
-class _Search:
+class Search:
     """The size and the error of a set at a step, and the step that is wanted."""
 
     def __init__(
-        self, probes: ProbeSet, profile: Profile, frame: _Frame, team: _Team, progress: OnProgress | None
+        self,
+        probes: ProbeSet,
+        profile: Profile,
+        frame: Frame,
+        team: Team,
+        progress: OnProgress | None,
+        *,
+        peak: float | None = None,
     ) -> None:
+        """Gives a set to its coders.
+
+        Args:
+            probes: The set.
+            profile: What is wanted of it.
+            frame, team: Of the set.
+            progress: Called after each step size that is tried.
+            peak: What PSNR is of; None: that of the set.
+        """
         self._probes, self._profile, self._frame, self._team = probes, profile, frame, team
-        peak = float(probes.values.max()) - float(probes.values.min())
-        # Probes that are all alike have no range; they have a size.
-        self._peak = peak or float(np.abs(probes.values).max())
+        self._peak = peak_of(probes) if peak is None else peak
         measured = team.add(frame)
-        self._largest = max(each.largest for each in measured)
+        # What is left of probes that are predicted exactly is zero.
+        self._largest = max(each.largest for each in measured) or self._peak
         self._inner = sum(each.inner for each in measured)
         self._change = np.sum([each.change for each in measured], axis=0)
         self._live = int(probes.live.sum())
@@ -216,16 +244,44 @@ class _Search:
         self._meter = Meter(progress, "fit", 0)
         self._tried = 0
 
-    def chosen(self) -> _Tried:
+    def chosen(self) -> Tried:
         """What has the wanted size, or the wanted PSNR."""
         psnr, limit = self._profile.target_psnr, self._profile.max_bytes
         if psnr is not None or limit is None:
-            tried = self._smallest(_PSNR if psnr is None else psnr)
+            tried = self.smallest(PSNR if psnr is None else psnr)
             if limit is None or self._frame.file_bytes(tried) <= limit:
                 return tried
         return self._best(limit)
 
-    def _smallest(self, psnr: float) -> _Tried:
+    def model(self, tried: Tried) -> Transform:
+        """The model of what was tried."""
+        return self._frame.model(tried)
+
+    def at_step(self, step: float, like: Tried | None = None) -> Tried:
+        """What is worth most at a step, for a set of one region.
+
+        Args:
+            step: The step.
+            like: What was tried at another step, to be coded the same way; None: the way that is worth most.
+        """
+        if like is None:
+            self._choose_basis(step)
+        else:
+            self._choose(like.coding)
+            self._team.run("plant", like.grids[0])
+        return self._fitted(step)
+
+    def rough_bytes(self, step: float) -> int:
+        """About the bytes of the streams at a step."""
+        return self._plain(step).size
+
+    def cost(self, step: float, more: int) -> float:
+        """About the squared error at a step, and what the file is worth with so many bytes more."""
+        # All directions, or none.
+        options = self._codings()[2:]
+        return min(self._costs([options[0], options[-1]], step, more).values())
+
+    def smallest(self, psnr: float) -> Tried:
         """What reaches a PSNR in the fewest bytes."""
         found = [self._for_psnr(psnr, self._plain, 0.5)]
         for _ in range(self._rounds):
@@ -233,7 +289,7 @@ class _Search:
             found.append(self._for_psnr(psnr, self._fitted, _CLOSE))
         return min(found[1:], key=lambda tried: tried.size)
 
-    def _best(self, limit: int) -> _Tried:
+    def _best(self, limit: int) -> Tried:
         """What has the least error in a size."""
         self._choose(Coding(True))
         found = [self._for_bytes(limit, self._plain, 0.9)]
@@ -242,12 +298,12 @@ class _Search:
             if self._frame.file_bytes(self._plain(8.0 * self._largest)) > limit:
                 # No room for anything beside the directions.
                 self._choose(Coding(True))
-            found.append(self._for_bytes(limit, self._fitted, _FULL, found[-1].step))
+            found.append(self._for_bytes(limit, self._fitted, FULL, found[-1].step))
         if self._live <= _TINY:
             found += self._everything(limit, found[-1].step)
         return min(found, key=lambda tried: tried.error)
 
-    def _everything(self, limit: int, step: float) -> list[_Tried]:
+    def _everything(self, limit: int, step: float) -> list[Tried]:
         """What fits into a size of all ways to code, each at many steps."""
         found = []
         for coding in self._codings():
@@ -256,7 +312,7 @@ class _Search:
             found += [tried for tried in tries if self._frame.file_bytes(tried) <= limit]
         return found
 
-    def _for_psnr(self, target: float, encode: Callable[[float], _Tried], close: float) -> _Tried:
+    def _for_psnr(self, target: float, encode: Callable[[float], Tried], close: float) -> Tried:
         start = self._peak * 10.0 ** (-target / 20.0) * 4.0
         tried, excess = self._solve(
             encode, lambda tried: self._psnr(tried) - target, -5.0, close, start, lambda tried: tried.size
@@ -266,8 +322,8 @@ class _Search:
             raise WlmError(f"--target-psnr: expected at most {most:.1f} for {name}, got {target:g}")
         return tried
 
-    def _for_bytes(self, limit: int, encode: Callable[[float], _Tried], full: float, start: float = 0.0) -> _Tried:
-        def room(tried: _Tried) -> float:
+    def _for_bytes(self, limit: int, encode: Callable[[float], Tried], full: float, start: float = 0.0) -> Tried:
+        def room(tried: Tried) -> float:
             return math.log2(limit / self._frame.file_bytes(tried))
 
         start = start or self._peak * 0.02
@@ -279,23 +335,25 @@ class _Search:
 
     def _solve(
         self,
-        encode: Callable[[float], _Tried],
-        excess: Callable[[_Tried], float],
+        encode: Callable[[float], Tried],
+        excess: Callable[[Tried], float],
         slope: float,
         close: float,
         start: float,
-        cost: Callable[[_Tried], float],
-    ) -> tuple[_Tried, float]:
+        cost: Callable[[Tried], float],
+    ) -> tuple[Tried, float]:
         """What costs least of all tried whose excess isn't negative, with its excess; else what comes nearest.
 
         `slope` is about what the excess gains where the step doubles. An excess up to `close` is small enough.
         """
-        good: list[tuple[_Tried, float]] = []
+        good: list[tuple[Tried, float]] = []
         # From numbers that still have room to a step at which all are 0, whatever the directions.
         low, high = max(math.log2(4.0 * self._largest / LARGEST), _LEAST), math.log2(8.0 * self._largest)
         x = min(max(math.log2(start), low), high)
-        ends: dict[bool, tuple[float, float, _Tried]] = {}  # by whether it is enough: step, excess
-        for _ in range(_TRIES):
+        ends: dict[bool, tuple[float, float, Tried]] = {}  # by whether it is enough: step, excess
+        for trial in range(2 * _TRIES):
+            if trial == _TRIES and good:
+                break
             tried = encode(2.0**x)
             found = excess(tried)
             self._tried += 1
@@ -316,6 +374,9 @@ class _Search:
                     break
             else:
                 further = min(max(x + (0.5 * close - found) / slope, x - 6.0), x + 6.0)
+                if trial >= _TRIES:
+                    # What comes nearer and nearer, and never there.
+                    further = x + math.copysign(_FAR, slope)
                 further = min(max(further, low), high)
                 if further == x:
                     break
@@ -339,31 +400,45 @@ class _Search:
                 options += [Coding(True, rounded[:count], fineness, apart=apart) for count in counts]
         return options
 
-    def _choose_basis(self, step: float) -> None:
-        """Takes the directions, or none, and the prediction, or none, that are worth most at a step."""
-        options, costs = self._codings(), []
+    def _ranked(self, step: float) -> list[Coding]:
+        """All ways to code, the one that is worth most at a step first."""
+        costs = self._costs(self._codings(), step)
+        return sorted(costs, key=costs.get)
+
+    def _costs(self, options: Sequence[Coding], step: float, more: int = 0) -> dict[Coding, float]:
+        """The squared error of ways to code, with what the file is worth, of so many bytes more."""
+        costs = {}
         for coding in options:
             self._choose(coding)
             tried = self._plain(step)
-            costs.append(tried.error + BIT * tried.step**2 * 8 * self._frame.file_bytes(tried))
-        self._choose(options[int(np.argmin(costs))])
+            costs[coding] = tried.error + BIT * tried.step**2 * 8 * (self._frame.file_bytes(tried) + more)
+        return costs
+
+    def _choose_basis(self, step: float) -> None:
+        """Takes the directions, or none, and the prediction, or none, that are worth most at a step."""
+        self._choose(self._ranked(step)[0])
         self._team.run("settle", step)
 
     def _choose(self, coding: Coding) -> None:
         self._coding = coding
         self._team.run("choose", coding)
 
-    def _plain(self, step: float) -> _Tried:
+    def _plain(self, step: float) -> Tried:
         return self._all("plain", step)
 
-    def _fitted(self, step: float) -> _Tried:
+    def _fitted(self, step: float) -> Tried:
         return self._all("fitted", step)
 
-    def _all(self, method: str, step: float) -> _Tried:
+    def _all(self, method: str, step: float) -> Tried:
         coded: list[Coded] = self._team.run(method, step)
         error = sum(each.error for each in coded)
         streams, grids = tuple(each.stream for each in coded), tuple(each.grid for each in coded)
-        return _Tried(stored_step(step), self._coding, streams, grids, error)
+        return Tried(stored_step(step), self._coding, streams, grids, error)
 
-    def _psnr(self, tried: _Tried) -> float:
+    def _psnr(self, tried: Tried) -> float:
         return psnr_from_mse(tried.error / self._probes.values.size, self._peak)
+
+
+def peak_of(probes: ProbeSet) -> float:
+    """What the PSNR of a set is of: the range of its numbers, or the largest of those that are all alike."""
+    return float(probes.values.max()) - float(probes.values.min()) or float(np.abs(probes.values).max())

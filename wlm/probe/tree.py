@@ -12,6 +12,7 @@ A coefficient of a coarse probe reaches many values: `reach` is about the length
 """
 
 import math
+from functools import cached_property
 
 import numpy as np
 from scipy import sparse
@@ -23,10 +24,15 @@ PARENTS = 8
 RADII = (0, 45875, 39322, 55706)
 """First distances of the spread levels, in codes; with 0 levels are by cubes, as in all earlier files."""
 
+FIRST = 1
+"""The place of that which a fit begins with."""
+
 _FINEST = 18  # halvings: positions have 16 bits an axis
 _LEAST = 64  # of a squared distance: all that are left are the last level
 _BATCH = 64  # probes that are looked at together at least
 _MIX = 2654435761  # odd, 2^32 over the golden ratio: an order without any in space
+_FEW_TURNS, _TURNS = 15, 90  # of the power method
+_GROWN = 1.03
 _AT_ONCE = 1 << 21  # distances, where many places are as far
 
 
@@ -87,6 +93,32 @@ class Tree:
         for level, matrix in zip(self.levels[:0:-1], self._up[::-1], strict=True):
             result += matrix @ result[level]
         return result
+
+    @cached_property
+    def eigenvalue(self) -> float:
+        """About the largest one of the transform, its numbers divided by their reach, times its transpose."""
+        vector, first, size = np.random.default_rng(0).standard_normal((len(self.reach), 1)), 1.0, 1.0
+        for turn in range(_TURNS):
+            vector = self.adjoint(self.values(vector / self.reach[:, None])) / self.reach[:, None]
+            size = float(np.linalg.norm(vector))
+            vector /= size
+            if turn == _FEW_TURNS - 1:
+                first = size
+        # Few turns will do unless they end far below: one probe of few may change most, and its part grows late.
+        return size if size > _GROWN * first else first
+
+
+class Trees:
+    """Trees that are made when they are asked for and kept, for sets of the same places; called as `Tree` is."""
+
+    def __init__(self) -> None:
+        self._made: dict[tuple[bytes, int], Tree] = {}
+
+    def __call__(self, code: np.ndarray, grid: int = 0) -> Tree:
+        key = code.tobytes(), grid
+        if key not in self._made:
+            self._made[key] = Tree(code, grid)
+        return self._made[key]
 
 
 class _FirstOfTies(Kriging):
