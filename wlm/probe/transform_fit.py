@@ -27,8 +27,9 @@ from wlm.workers import Here, Processes, Workers, cores
 
 _COUNTS = (1, 2, 4, 8, 16)  # of stored directions that are tried, and all
 _WIDEST = 64  # numbers of a probe up to which directions are looked for
-_TINY = 16  # live probes up to which every way to code is fitted: each byte counts
-_AROUND = np.arange(-8, 9) / 16  # steps round the best that are tried of these, in powers of two
+_TINY = 16  # live probes up to which several ways to code are fitted: each byte counts
+_WAYS = 5  # so many
+_AROUND = np.arange(-6, 7) / 12  # steps round the best that are tried of these, in powers of two
 _TRIES = 14
 _LEAST = -133.0  # of the step's logarithm: a file has no less
 _PSNR = 50.0  # that is wanted where nothing is said
@@ -244,14 +245,15 @@ class _Search:
                 self._choose(Coding(True))
             found.append(self._for_bytes(limit, self._fitted, _FULL, found[-1].step))
         if self._live <= _TINY:
-            found += self._everything(limit, found[-1].step)
+            found += self._several(limit, found[-1].step)
         return min(found, key=lambda tried: tried.error)
 
-    def _everything(self, limit: int, step: float) -> list[_Tried]:
-        """What fits into a size of all ways to code, each at many steps."""
+    def _several(self, limit: int, step: float) -> list[_Tried]:
+        """What fits into a size of the ways to code that cost least at a step, each at many steps round it."""
         found = []
-        for coding in self._codings():
+        for coding in self._ranked(step)[:_WAYS]:
             self._choose(coding)
+            self._team.run("settle", step)
             tries = [encode(step * 2.0**x) for x in _AROUND for encode in (self._plain, self._fitted)]
             found += [tried for tried in tries if self._frame.file_bytes(tried) <= limit]
         return found
@@ -339,14 +341,18 @@ class _Search:
                 options += [Coding(True, rounded[:count], fineness, apart=apart) for count in counts]
         return options
 
-    def _choose_basis(self, step: float) -> None:
-        """Takes the directions, or none, and the prediction, or none, that are worth most at a step."""
-        options, costs = self._codings(), []
-        for coding in options:
+    def _ranked(self, step: float) -> list[Coding]:
+        """All ways to code, the one that is worth most at a step first."""
+        costs = {}
+        for coding in self._codings():
             self._choose(coding)
             tried = self._plain(step)
-            costs.append(tried.error + BIT * tried.step**2 * 8 * self._frame.file_bytes(tried))
-        self._choose(options[int(np.argmin(costs))])
+            costs[coding] = tried.error + BIT * tried.step**2 * 8 * self._frame.file_bytes(tried)
+        return sorted(costs, key=costs.get)
+
+    def _choose_basis(self, step: float) -> None:
+        """Takes the directions, or none, and the prediction, or none, that are worth most at a step."""
+        self._choose(self._ranked(step)[0])
         self._team.run("settle", step)
 
     def _choose(self, coding: Coding) -> None:
