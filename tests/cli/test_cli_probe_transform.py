@@ -30,7 +30,7 @@ def test_size_and_psnr_are_as_asked(folder):
     report = json.loads((folder / "a.json").read_text())
     assert 42.0 <= report["psnr"] < 43.0 and report["between_psnr"] > 30.0
     held = report["held_out"]
-    assert held["probes"] == (PROBES - DEAD) // 5 and held["psnr"] > held["distance"] > 0.0
+    assert held["probes"] == (PROBES - DEAD) // 5 and held["psnr"] > held["nearest"] > 0.0
     assert held["bytes"] <= 0.8 * report["bytes"]
     facts = json.loads(call("probe", "info", folder / "a.wlm", "--json"))
     assert facts["method"] == "transform" and not facts["positions"] and facts["dead"] == DEAD

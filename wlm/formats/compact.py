@@ -1,4 +1,4 @@
-"""Compact artifacts: a head of nine bytes at most, for files so small that a JSON header would be most of them.
+"""Compact artifacts: eight or sixteen bytes before what the system says, for files that a JSON header would be most of.
 
 Byte 3 is 16 times the system's number, its place in `SYSTEMS`, plus the version:
 

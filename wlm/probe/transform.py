@@ -30,7 +30,7 @@ VECTORS = 32
 FINENESS = (8, 16, 64)
 """Of the directions' numbers, which are whole ones in 1/8, 1/16 or 1/64."""
 
-SOURCE = 8
+SOURCE = 4
 """Digits of the input's hash that a file has."""
 
 NO_POSITIONS = "{}: holds no positions; expected those of its probes, or a fit that stores them"

@@ -10,7 +10,7 @@ flags           U16: stored directions; 64 times `Head.flags`, or `HOURS` (`wlm.
                 which else is 27; 2048 where there are dead probes; 4096 where their bits are deflated; 8192 where
                 places are stored; 16384 times the tree's place in `RADII`
 N, D            numbers of any size; D if it isn't 27
-source          the first 8 digits of the input's hash, as 4 bytes
+source          the first 4 digits of the input's hash, as 2 bytes
 dead            a bit for each probe, the first in the highest bit of the first byte; or a length and these deflated
 places          origin and extent, F64 x 4; a length and along each axis in turn the differences of codes from probe to
                 probe modulo 2^16, all low bytes and then all high ones, deflated

@@ -27,8 +27,9 @@ from wlm.workers import Here, Processes, Workers, cores
 
 _COUNTS = (1, 2, 4, 8, 16)  # of stored directions that are tried, and all
 _WIDEST = 64  # numbers of a probe up to which directions are looked for
-_TINY = 16  # live probes up to which every way to code is fitted: each byte counts
-_AROUND = np.arange(-8, 9) / 16  # steps round the best that are tried of these, in powers of two
+_TINY = 16  # live probes up to which several ways to code are fitted: each byte counts
+_WAYS = 5  # so many
+_AROUND = np.arange(-6, 7) / 12  # steps round the best that are tried of these, in powers of two
 _TRIES = 14
 _FAR = 0.25  # octaves of a step that comes nowhere by smaller ones
 _LEAST = -133.0  # of the step's logarithm: a file has no less
@@ -300,14 +301,15 @@ class Search:
                 self._choose(Coding(True))
             found.append(self._for_bytes(limit, self._fitted, FULL, found[-1].step))
         if self._live <= _TINY:
-            found += self._everything(limit, found[-1].step)
+            found += self._several(limit, found[-1].step)
         return min(found, key=lambda tried: tried.error)
 
-    def _everything(self, limit: int, step: float) -> list[Tried]:
-        """What fits into a size of all ways to code, each at many steps."""
+    def _several(self, limit: int, step: float) -> list[Tried]:
+        """What fits into a size of the ways to code that cost least at a step, each at many steps round it."""
         found = []
-        for coding in self._codings():
+        for coding in self._ranked(step)[:_WAYS]:
             self._choose(coding)
+            self._team.run("settle", step)
             tries = [encode(step * 2.0**x) for x in _AROUND for encode in (self._plain, self._fitted)]
             found += [tried for tried in tries if self._frame.file_bytes(tried) <= limit]
         return found
