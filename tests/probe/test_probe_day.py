@@ -1,6 +1,7 @@
 """Several hours of probes in one file: what each hour comes back as, what lies between, and what is refused."""
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -179,3 +180,13 @@ def test_a_damaged_part_is_refused(model, tmp_path):
     gain = part.copy()
     gain[4:8] = np.frombuffer(np.array([-1.0], "<f4").tobytes(), np.uint8)
     refused("positive gain", hours=gain)
+
+
+def test_a_file_of_before_reads_as_it_did():
+    files = Path(__file__).resolve().parents[1] / "files"
+    model = wlm.load(files / "probe-day.wlm")
+    with np.load(files / "probe-day.npz") as before:
+        assert len(before.files) == 4
+        for name in before.files:
+            values = model.at(float(name.removeprefix("sh_"))).stored_values
+            np.testing.assert_allclose(values, before[name], atol=1e-5)

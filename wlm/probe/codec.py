@@ -38,6 +38,7 @@ _L2 = 27  # numbers of a probe that a transform's file doesn't state
 _SURE_NUMBERS, _NUMBERS_A_BYTE = 1 << 23, 4096
 # Live probes of it: each takes some 20 microseconds and 500 bytes to place among the others.
 _SURE_PROBES, _PROBES_A_BYTE = 1 << 17, 16
+_STATES = 1 << 27  # probes times hours: a byte each tells who is dead
 
 
 class _TransformHeader(Header):
@@ -223,6 +224,8 @@ def _decode_day(artifact: Artifact) -> DayModel:
     times, data = tuple(header.times), parts[_HOURS]
     if any(a >= b for a, b in pairwise(times)):
         raise ValueError("setting times: expected increasing hours")
+    if header.probes * len(times) > _STATES:
+        raise ValueError(f"setting times: expected at most {_STATES // header.probes} of {header.probes} probes")
     _check_numbers(header.probes, header.outputs * len(times), len(data))
     hours = unpack_hours(data, len(times), header.probes, header.outputs)
     _check_live([header.probes - int(hour.dead.sum()) for hour in hours], len(data))
