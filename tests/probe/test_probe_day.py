@@ -16,7 +16,7 @@ from wlm.probe.day import DayModel
 from wlm.probe.transform import Places
 
 TIMES = (9.0, 12.0, 21.0)
-PROBES = 100
+PROBES = 70
 
 
 def scene(coefficients=4, probes=PROBES):
@@ -85,8 +85,8 @@ def test_hours_stand_in_any_order(sets, model):
 
 
 def test_a_size_is_kept(sets):
-    made = compress_day(sets, TIMES, max_bytes=1800)
-    assert 1650 < made.file_bytes() <= 1800
+    made = compress_day(sets, TIMES, max_bytes=1400)
+    assert 1270 < made.file_bytes() <= 1400
     # All hours have one step, so about one error.
     scores = [psnr(made, time, probes) for time, probes in zip(TIMES, sets, strict=True)]
     assert max(scores) - min(scores) < 4.0
@@ -99,13 +99,22 @@ def test_hours_are_scored_and_held_out(sets, model):
     assert all(report.psnr >= 44.9 for report in reports)
     assert sum(report.bytes for report in reports) == pytest.approx(model.file_bytes(), abs=3)
     first, _, night = (report.held_out for report in reports)
-    assert first.probes == 18 and first.psnr > first.kriging - 2.0 and night.psnr < 25.0
+    assert first.probes == 12 and first.psnr > first.kriging - 2.0 and night.psnr < 25.0
     assert first.bytes <= 0.8 * dataclasses.replace(model, places=None).file_bytes()
     with pytest.raises(WlmError, match="expected one hour"):
         wlm.probe.evaluate(model, sets[0], hold_out=True)
 
 
-@pytest.mark.parametrize("case", ["one hour", "one probe", "bright", "nan", "all alike", "wide"])
+@pytest.mark.parametrize(
+    "case",
+    [
+        "one hour",
+        "one probe",
+        "bright",
+        "nan",
+        *(pytest.param(x, marks=pytest.mark.slow) for x in ("all alike", "wide")),
+    ],
+)
 def test_hard_cases(case):
     sets, times = scene(25 if case == "wide" else 4, 24), TIMES
     if case == "one hour":
