@@ -89,8 +89,8 @@ def test_progress_of_unknown_length_tells_no_time_left(capsys):
 
 def test_several_hours_in_one_file(folder, tmp_path):
     room = load(folder / "room.npz")
-    hours = {"sh_06.00": room.values, "sh_18.50": room.values[:, ::-1]}
-    np.savez(tmp_path / "day.npz", position=room.position, **hours)
+    hours = {"sh_06.00": room.values[:30], "sh_18.50": room.values[:30, ::-1]}
+    np.savez(tmp_path / "day.npz", position=room.position[:30], **hours)
     file, day = tmp_path / "day.wlm", tmp_path / "day.npz"
     call("probe", "compress", day, "--times", "18.5,6", "-o", file, "--target-psnr", 40, "--positions")
     facts = json.loads(call("probe", "info", file, "--json"))
@@ -107,7 +107,6 @@ def test_several_hours_in_one_file(folder, tmp_path):
     np.testing.assert_allclose(at[9], 0.76 * at[6] + 0.24 * at[18.5], atol=1e-6)
     call("probe", "export", file, "--time", 9, "-o", tmp_path / "engine")
     assert json.loads((tmp_path / "engine" / "probe.json").read_text())["time"] == 9.0
-    call("probe", "walk", file, "--time", 9, "--frames", 2)
     for words, line in (
         (["decode", file, "-o", tmp_path / "x.npz"], "expected --time, the file holds 6, 18.5"),
         (["decode", folder / "b.wlm", "--time", 9, "-o", tmp_path / "x.npz"], "expected a file of several hours"),

@@ -15,6 +15,7 @@ import wlm
 from wlm.errors import WlmError
 from wlm.lightmap import fit as lightmap_fit
 from wlm.probe import fit as probe_fit
+from wlm.probe.day import DayModel
 from wlm.probe.regions import RegionModel
 from wlm.probe.transform import Transform
 from wlm.smoke.learn.pool import load_pool
@@ -57,6 +58,8 @@ def _probe(path: Path) -> None:
             values = model.decoder().decode_probes()
             check_finite(values=values, position=model.stored_positions())
             assert values.shape == (model.probes, model.outputs), "decodes to another size"
+            if isinstance(model, DayModel):
+                check_finite(**{f"hour{time}": model.at(time + 0.5).stored_values for time in model.times})
         return
     check_finite(bounds=model.bounds, net=model.net, origin=model.origin, extent=model.extent, gain=model.gain)
     places = np.linspace(0.0, 1.0, 8)[:, None]
@@ -281,7 +284,13 @@ READERS = (
     ),
     Reader("lightmap-layers", "a.wlm", stored("lightmap-layers.wlm"), vary_artifact, _layers),
     Reader("probe", "a.wlm", stored("probe.wlm", "probe-transform.wlm"), vary_artifact, _probe),
-    Reader("probe-compact", "a.wlm", stored("probe-compact.wlm", "probe-regions.wlm"), vary_compact, _probe),
+    Reader(
+        "probe-compact",
+        "a.wlm",
+        stored("probe-compact.wlm", "probe-regions.wlm", "probe-day.wlm"),
+        vary_compact,
+        _probe,
+    ),
     Reader(
         "atlas",
         "a.wlm",

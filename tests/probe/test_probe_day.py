@@ -1,5 +1,7 @@
 """Several hours of probes in one file: what each hour comes back as, what lies between, and what is refused."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from builders.probe_sets import synthetic
@@ -15,7 +17,7 @@ from wlm.probe.transform import SOURCE, Places
 from wlm.probe.transform_codec import pack_own
 
 TIMES = (9.0, 12.0, 21.0)
-PROBES = 100
+PROBES = 70
 
 
 def scene(coefficients=4, probes=PROBES):
@@ -86,8 +88,8 @@ def test_hours_stand_in_any_order(sets, model):
 
 
 def test_a_size_is_kept(sets):
-    made = compress_day(sets, TIMES, max_bytes=1800)
-    assert 1650 < made.file_bytes() <= 1800
+    made = compress_day(sets, TIMES, max_bytes=1400)
+    assert 1270 < made.file_bytes() <= 1400
     # All hours have one step, so about one error.
     scores = [psnr(made, time, probes) for time, probes in zip(TIMES, sets, strict=True)]
     assert max(scores) - min(scores) < 4.0
@@ -100,13 +102,22 @@ def test_hours_are_scored_and_held_out(sets, model):
     assert all(report.psnr >= 44.9 for report in reports)
     assert sum(report.bytes for report in reports) == pytest.approx(model.file_bytes(), abs=3)
     first, _, night = (report.held_out for report in reports)
-    assert first.probes == 18 and first.psnr > first.kriging - 2.0 and night.psnr < 25.0
+    assert first.probes == 12 and first.psnr > first.kriging - 2.0 and night.psnr < 25.0
     assert first.bytes <= 0.8 * model.without_places().file_bytes()
     with pytest.raises(WlmError, match="expected one hour"):
         wlm.probe.evaluate(model, sets[0], hold_out=True)
 
 
-@pytest.mark.parametrize("case", ["one hour", "one probe", "bright", "nan", "all alike", "wide"])
+@pytest.mark.parametrize(
+    "case",
+    [
+        "one hour",
+        "one probe",
+        "bright",
+        "nan",
+        *(pytest.param(x, marks=pytest.mark.slow) for x in ("all alike", "wide")),
+    ],
+)
 def test_hard_cases(case):
     sets, times = scene(25 if case == "wide" else 4, 24), TIMES
     if case == "one hour":
@@ -190,3 +201,13 @@ def test_more_probes_than_a_region_are_refused():
     live = max(int(probes.live.sum()) for probes in scene(4, 300))
     with pytest.raises(WlmError, match=f"--region: expected at least {live}: several hours are one region, got 256"):
         compress_day(scene(4, 300), TIMES, region=256)
+
+
+def test_a_file_of_before_reads_as_it_did():
+    files = Path(__file__).resolve().parents[1] / "files"
+    model = wlm.load(files / "probe-day.wlm")
+    with np.load(files / "probe-day.npz") as before:
+        assert len(before.files) == 4
+        for name in before.files:
+            values = model.at(float(name.removeprefix("sh_"))).stored_values
+            np.testing.assert_allclose(values, before[name], atol=1e-5)

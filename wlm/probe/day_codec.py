@@ -63,6 +63,7 @@ from wlm.probe.transform_codec import (
     step_bytes,
 )
 
+_STATES = 1 << 27  # probes times hours: a byte each tells who is dead
 _GAIN = struct.Struct("<f")
 
 
@@ -103,6 +104,8 @@ def decode_day(artifact: Artifact) -> DayModel:
     flags, probes, outputs, source = reader.begin()
     check_flags(not flags & ~(HOURS << HEAD_SHIFT | OUTPUTS | PLACED), flags)
     count = reader.number("hours", TIMES)
+    if probes * count > _STATES:
+        raise ValueError(f"part {BODY}: expected at most {_STATES // probes} hours of {probes} probes, found {count}")
     check_numbers(probes, outputs * count, len(body))
     times = tuple(np.frombuffer(reader.take(8 * count).tobytes(), "<f8").tolist())
     if not all(0.0 <= time < PERIOD for time in times) or any(a >= b for a, b in pairwise(times)):

@@ -12,7 +12,7 @@ from wlm.errors import WlmError
 from wlm.probe.conventions import CANONICAL
 from wlm.probe.kriging import FEW, NEIGHBOURS, SILL, SLIGHT, TAPER
 from wlm.probe.sphere import sh_count
-from wlm.probe.transform import Transform
+from wlm.probe.transform import TransformModel
 
 LIGHT_FILE = "light.bin"
 HEAD_WORDS = 15
@@ -30,8 +30,8 @@ ABOUT = {
     "values": "Of a probe, outputs numbers. Spherical harmonics: coefficient after coefficient, of each red, green and "
     "blue; orthonormal real basis in the order 1; y, z, x; xy, yz, 3z2-1, xz, x2-y2; all signs plus, of radiance.",
     "dead": "Probes that are zero, by number from 0 in the order of compression: engines leave them inside walls.",
-    "time": "Of a file of several hours: the time of day of this export, and the hours that the file holds. Between "
-    "two hours their light is mixed linearly, after the last comes the first.",
+    "time": "Of a file of several hours: the time of this export, and the hours that the file holds. Between two "
+    "hours their light is mixed linearly, after the last comes the first.",
     "reference": "reference.json has positions of the scene, the last one outside the box, and the values there.",
 }
 
@@ -237,7 +237,7 @@ def transform_glsl(live: int, outputs: int) -> str:
     return text if coefficients is None else text + _SH.format(coefficients=coefficients)
 
 
-def light_bytes(model: Transform, place: np.ndarray, values: np.ndarray) -> tuple[bytes, dict[str, Any]]:
+def light_bytes(model: TransformModel, place: np.ndarray, values: np.ndarray) -> tuple[bytes, dict[str, Any]]:
     """What `light.bin` holds, and its numbers for `probe.json`.
 
     Args:
@@ -278,7 +278,7 @@ def light_bytes(model: Transform, place: np.ndarray, values: np.ndarray) -> tupl
     return content, numbers
 
 
-def transform_document(model: Transform, live: int, numbers: dict[str, Any]) -> dict[str, Any]:
+def transform_document(model: TransformModel, live: int, numbers: dict[str, Any]) -> dict[str, Any]:
     """What `probe.json` says of a transform, but for its kind and version."""
     return {
         "about": ABOUT,
