@@ -95,6 +95,15 @@ def _probe() -> Subject:
     )
 
 
+def _probe_compact() -> Subject:
+    return Subject(
+        "probe",
+        FILES / "probe-compact.wlm",
+        lambda model: {"values": model.decoder().decode_probes()},
+        FILES / "probe-compact.npz",
+    )
+
+
 def _probe_transform() -> Subject:
     return Subject(
         "probe",
@@ -149,6 +158,7 @@ SUBJECTS: dict[str, Callable[[], Subject]] = {
     "lightmap": _lightmap,
     "lightmap-layers": _layers,
     "probe": _probe,
+    "probe-compact": _probe_compact,
     "probe-transform": _probe_transform,
     **{f"atlas-{kind}": lambda kind=kind: _atlas(kind) for kind in ("tiles", "cascade", "bc6h", "plain")},
     "smoke": _smoke,

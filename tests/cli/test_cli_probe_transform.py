@@ -30,7 +30,7 @@ def test_size_and_psnr_are_as_asked(folder):
     report = json.loads((folder / "a.json").read_text())
     assert 42.0 <= report["psnr"] < 43.0 and report["between_psnr"] > 30.0
     held = report["held_out"]
-    assert held["probes"] == (PROBES - DEAD) // 5 and held["psnr"] > held["distance"] > 0.0
+    assert held["probes"] == (PROBES - DEAD) // 5 and held["psnr"] > held["nearest"] > 0.0
     assert held["bytes"] <= 0.8 * report["bytes"]
     facts = json.loads(call("probe", "info", folder / "a.wlm", "--json"))
     assert facts["method"] == "transform" and not facts["positions"] and facts["dead"] == DEAD
@@ -86,3 +86,34 @@ def test_progress_of_unknown_length_tells_no_time_left(capsys):
             report(done, total, text)
     first, second = capsys.readouterr().err.splitlines()
     assert first == "fit: 3, PSNR 48 dB" and second.startswith("fit: 4 of 5, 0:0")
+
+
+def test_several_hours_in_one_file(folder, tmp_path):
+    room = load(folder / "room.npz")
+    hours = {"sh_06.00": room.values[:30], "sh_18.50": room.values[:30, ::-1]}
+    np.savez(tmp_path / "day.npz", position=room.position[:30], **hours)
+    file, day = tmp_path / "day.wlm", tmp_path / "day.npz"
+    call("probe", "compress", day, "--times", "18.5,6", "-o", file, "--target-psnr", 40, "--positions")
+    facts = json.loads(call("probe", "info", file, "--json"))
+    assert facts["times"] == [6.0, 18.5] and {hour["time"] for hour in facts["hours"]} == {6.0, 18.5}
+    assert "bytes of 18.5 h" in call("probe", "info", file)
+    call("probe", "evaluate", file, day, "--json", tmp_path / "all.json")
+    report = json.loads((tmp_path / "all.json").read_text())
+    assert report["times"] == [6.0, 18.5] and all(hour["psnr"] >= 39.99 for hour in report["hours"])
+    call("probe", "evaluate", file, day, "--time", "18.5", "--json", tmp_path / "one.json")
+    assert json.loads((tmp_path / "one.json").read_text())["psnr"] == report["hours"][1]["psnr"]
+    for time in (6, 9, 18.5):
+        call("probe", "decode", file, "--time", time, "-o", tmp_path / f"{time}.npz")
+    at = {time: load(tmp_path / f"{time}.npz").values for time in (6, 9, 18.5)}
+    np.testing.assert_allclose(at[9], 0.76 * at[6] + 0.24 * at[18.5], atol=1e-6)
+    call("probe", "export", file, "--time", 9, "-o", tmp_path / "engine")
+    assert json.loads((tmp_path / "engine" / "probe.json").read_text())["time"] == 9.0
+    for words, line in (
+        (["decode", file, "-o", tmp_path / "x.npz"], "expected --time, the file holds 6, 18.5"),
+        (["decode", folder / "b.wlm", "--time", 9, "-o", tmp_path / "x.npz"], "expected a file of several hours"),
+        (["evaluate", file, day, "--time", 9], "expected one of the file's hours to compare with, 6, 18.5, got 9"),
+        (["evaluate", file, day, "--volume"], "--time: expected with --baselines"),
+        (["compress", day, "--times", "6,x", "-o", tmp_path / "x.wlm"], "--times: expected hours as 9,12,21.5"),
+        (["compress", day, day, "-o", tmp_path / "x.wlm"], "expected one file of probes"),
+    ):
+        assert line in fails("probe", *words)

@@ -108,6 +108,29 @@ def _pack_artifact(words: str, settings: Any, parts: dict[str, np.ndarray]) -> b
     return _sign(header, body)
 
 
+# Compact artifacts.
+
+
+def vary_compact(draw: Random, data: bytes) -> bytes:
+    """Changes bytes behind the digest, those of a head more often than not, and signs the whole again."""
+    size = 4 if data[3] & 15 == 2 else 8
+    body = data[4 + size :]
+    if size == 8 and draw.random() < 0.5:
+        # The head alone, so that the data is where it was.
+        end = 4 + int.from_bytes(body[:4], "little")
+        body = body[:4] + corrupt(draw, body[4:end])[: end - 4].ljust(end - 4, b"\0") + body[end:]
+    else:
+        body = corrupt(draw, body)
+    return data[:4] + compact_digest(data[:4], body) + body
+
+
+def compact_digest(begin: bytes, body: bytes) -> bytes:
+    """The digest of a compact artifact: of all of it, or of all up to the end of its head."""
+    if begin[3] & 15 == 2:
+        return hashlib.blake2b(begin + body, digest_size=4).digest()
+    return hashlib.blake2b(begin + body[: 4 + int.from_bytes(body[:4], "little")], digest_size=8).digest()
+
+
 # NumPy archives.
 
 _WRONG_HEADERS = (

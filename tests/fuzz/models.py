@@ -15,12 +15,14 @@ import wlm
 from wlm.errors import WlmError
 from wlm.lightmap import fit as lightmap_fit
 from wlm.probe import fit as probe_fit
-from wlm.probe.transform import TransformModel
+from wlm.probe.day import DayModel
+from wlm.probe.regions import RegionModel
+from wlm.probe.transform import Transform
 from wlm.smoke.learn.pool import load_pool
 from wlm.smoke.transport.filtering import load_orders
 from wlm.system import Meter
 
-from .containers import vary_artifact, vary_npz
+from .containers import vary_artifact, vary_compact, vary_npz
 from .reader import Reader, check_digest, check_finite, corpus, stored
 
 
@@ -47,11 +49,18 @@ def _layers(path: Path) -> None:
 def _probe(path: Path) -> None:
     model = wlm.load(path, "probe")
     check_digest(path)
-    if isinstance(model, TransformModel):
+    if isinstance(model, RegionModel):
+        # Its pieces are looked at when they are asked for, and errors have the name alone.
+        with suppress(WlmError):
+            check_finite(values=model.decoder().decode_probes())
+        return
+    if isinstance(model, Transform):
         if model.has_positions:
             values = model.decoder().decode_probes()
             check_finite(values=values, position=model.stored_positions())
             assert values.shape == (model.probes, model.outputs), "decodes to another size"
+            if isinstance(model, DayModel):
+                check_finite(**{f"hour{time}": model.at(time + 0.5).stored_values for time in model.times})
         return
     check_finite(bounds=model.bounds, net=model.net, origin=model.origin, extent=model.extent, gain=model.gain)
     places = np.linspace(0.0, 1.0, 8)[:, None]
@@ -297,6 +306,13 @@ READERS = (
     ),
     Reader("lightmap-layers", "a.wlm", stored("lightmap-layers.wlm"), vary_artifact, _layers),
     Reader("probe", "a.wlm", stored("probe.wlm", "probe-transform.wlm"), vary_artifact, _probe),
+    Reader(
+        "probe-compact",
+        "a.wlm",
+        stored("probe-compact.wlm", "probe-regions.wlm", "probe-day.wlm"),
+        vary_compact,
+        _probe,
+    ),
     Reader(
         "atlas",
         "a.wlm",

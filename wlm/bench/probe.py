@@ -43,7 +43,6 @@ from wlm.bench.rows import Row, read_json
 from wlm.bench.runner import Bench, Fit, Note, demo_data, exact_errors
 from wlm.errors import WlmError
 from wlm.probe.between import between_psnr, held_out
-from wlm.probe.codec import pack_dead
 from wlm.probe.data import ProbeSet, load
 from wlm.probe.decode import Decoder, Points
 from wlm.probe.evaluation import Report, score
@@ -52,6 +51,7 @@ from wlm.probe.fit import compress
 from wlm.probe.light import StoredLight, light_of
 from wlm.probe.model import ProbeModel, Profile
 from wlm.probe.seen import VIEWS, score_views
+from wlm.probe.transform_codec import pack_dead
 from wlm.probe.walk import score_volume
 
 PROFILES = ("standard", "compact", "paper")

@@ -2,7 +2,7 @@
 
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -30,6 +30,19 @@ from wlm.cli.options import (
     Seed,
     output_option,
 )
+from wlm.cli.probe_day import (
+    Time,
+    at_time,
+    evaluate_hours,
+    is_source,
+    joined,
+    only_path,
+    read_hours,
+    read_times,
+    stored_time,
+)
+from wlm.cli.probe_export import given_positions
+from wlm.cli.probe_export import register as register_export
 from wlm.cli.probe_volume import register, score_seen, show_seen, show_walk_scores, walk_scores
 from wlm.errors import WlmError
 
@@ -37,15 +50,19 @@ if TYPE_CHECKING:
     import numpy as np
 
     from wlm.baselines.rival import Rival
-    from wlm.probe import ProbeModel, ProbeSet, Report, TransformModel
+    from wlm.probe import DayModel, ProbeModel, ProbeSet, Report, Transform
 
 app = typer.Typer(help="Light probes: quantised 3D Gaussians and a small network, read through a cascaded volume.")
 register(app)
 
-_Probes = Annotated[Path, typer.Argument(metavar="PROBES", help="A .npz, .json or .lmbake file of probes.")]
 _Key = Annotated[str | None, typer.Option(help="Name of the values in PROBES; default the only ones.")]
 _Convention = Annotated[
     str | None, typer.Option(help="Of the numbers: threejs, godot, unreal or unity; default as PROBES says.")
+]
+
+_Hours = Annotated[
+    list[Path],
+    typer.Argument(metavar="PROBES...", help="A .npz, .json or .lmbake file of probes; of several hours one or more."),
 ]
 
 _Original = Annotated[
@@ -67,7 +84,7 @@ _NAMES = {
 @app.command()
 @exclusive
 def compress(
-    probes_path: _Probes,
+    probes_paths: _Hours,
     output: Annotated[Path, output_option("OUT.wlm", "The file to write.")],
     profile: Annotated[
         str, typer.Option(help="transform, standard, compact, small, paper, or a YAML file of settings.")
@@ -77,6 +94,9 @@ def compress(
     ] = None,
     max_bytes: Annotated[
         int | None, typer.Option(metavar="BYTES", help="Of a transform: the most bytes that the file may have.")
+    ] = None,
+    region: Annotated[
+        int | None, typer.Option(metavar="PROBES", help="Of a transform: live probes up to which a set is one region.")
     ] = None,
     ratio: Annotated[float | None, typer.Option(help="Gaussians as a share of the live probes.")] = None,
     bits: Annotated[int | None, typer.Option(help="Bits of a Gaussian's scale, rotation and latent.")] = None,
@@ -89,10 +109,15 @@ def compress(
     positions: Annotated[
         bool, typer.Option("--positions", help="Store the probes' positions too, 16 bits per axis.")
     ] = False,
+    times: Annotated[
+        str | None, typer.Option(metavar="9,12,21", help="Store several hours: of a file each, or of arrays of one.")
+    ] = None,
     key: _Key = None,
     convention: _Convention = None,
 ) -> None:
     """Compress a probe set into one file.
+
+    With --times it holds several hours of the set: PROBES are a file for each, or one with arrays sh_09.00, sh_12.00.
 
     The fit is kept in OUT.wlm.partial from time to time, and by Ctrl-C and SIGTERM; the same command with --resume goes
     on exactly.
@@ -100,31 +125,42 @@ def compress(
     check_output(output, ".wlm")
     quiet_warp()
     from wlm.interop import check_device
-    from wlm.probe import Profile, compress, open_checkpoint
+    from wlm.probe import Profile, compress, compress_day, open_checkpoint
     from wlm.probe.fit import check_method
 
-    overrides = {"target_psnr": target_psnr, "max_bytes": max_bytes}
+    overrides = {"target_psnr": target_psnr, "max_bytes": max_bytes, "region": region}
     overrides |= {"ratio": ratio, "bits": bits, "latent": latent, "steps": steps}
     settings = Profile.load(profile).override(overrides, "--")
     check_method(settings, overrides, "--")
     device = check_device(device)
-    probes = _load(probes_path, key, convention)
+    sets, hours = [], None if times is None else read_times(times)
+    if hours is None:
+        probes = _load(only_path(probes_paths), key, convention)
+    else:
+        sets = read_hours(probes_paths, hours, key, convention)
+        probes = joined(sets, hours)
     options = {"seed": seed, "device": device}
     checkpoint = open_checkpoint(output, probes, settings, resume=resume, every=checkpoint_every, **options)
     if resume and not checkpoint.resumed:
         note(f"{checkpoint.path}: there is nothing to resume; starting at step 0")
     start = time.perf_counter()
     with running("fit", checkpoint.path) as progress:
-        model = compress(probes, settings, progress=progress, checkpoint=checkpoint, positions=positions, **options)
+        if hours is None:
+            model = compress(probes, settings, progress=progress, checkpoint=checkpoint, positions=positions, **options)
+        else:
+            model = compress_day(sets, hours, settings, progress=progress, positions=positions)
         seconds = time.perf_counter() - start
         size = model.save(output)
         checkpoint.remove()
+    count = len(sets) or 1
     cells = {
         "file": escape(str(output)),
         "bytes": f"{size:,}",
-        "of float32": f"{size / probes.float_bytes:.2%}",
-        "bits per probe": f"{size * 8 / probes.probes:.2f}",
+        "of float32": f"{size / probes.float_bytes / count:.2%}",
+        "bits per probe": f"{size * 8 / probes.probes / count:.2f}",
     }
+    if hours is not None:
+        cells["hours"] = str(count)
     if settings.method == "gaussians":
         cells |= {"Gaussians": f"{model.count:,}", "dropped": f"{model.dropped:,}"}
     cells["seconds"] = f"{seconds:.1f}"
@@ -143,6 +179,10 @@ def decode(
     ] = None,
     convention: Annotated[str, typer.Option(help="Of the numbers: threejs, godot, unreal or unity.")] = "threejs",
     original: _Original = None,
+    region: Annotated[
+        int | None, typer.Option(metavar="NUMBER", help="Of a file of many regions: the live probes of one, from 0.")
+    ] = None,
+    time: Time = None,
     device: Device = "cpu",
 ) -> None:
     """Decode the light at the stored positions, or at any others.
@@ -155,16 +195,20 @@ def decode(
     from wlm.probe import save_probes
     from wlm.system import load
 
-    model = load(file, "probe")
-    position, at_probes = _positions(model, positions)
-    decoder = _decoder(model, device, original, position if at_probes else None)
-    values = decoder.decode_probes(position) if at_probes else decoder.decode(position)
+    model = at_time(load(file, "probe"), time)
+    if region is None:
+        position, at_probes = _positions(model, positions)
+        decoder = _decoder(model, device, original, position if at_probes else None)
+        values = decoder.decode_probes(position) if at_probes else decoder.decode(position)
+    else:
+        position, values = _region(file, model, region, positions, original, device)
+        at_probes = False
     save_probes(output, position, values, convention=convention)
     rows = table(str(file), ["file", "positions", "of", "zero", "mean", "largest"], text=["of"])
     rows.add_row(
         escape(str(output)),
         f"{len(position):,}",
-        "its probes" if at_probes else "other points",
+        "its probes" if at_probes else "other points" if region is None else f"region {region}",
         f"{int(model.dead.sum()) if at_probes else 0:,}",
         f"{values.mean():.4g}",
         f"{values.max():.4g}",
@@ -175,7 +219,7 @@ def decode(
 @app.command()
 def evaluate(
     file: ModelFile,
-    probes_path: _Probes,
+    probes_paths: _Hours,
     json_path: ReportFile = None,
     html_path: PageFile = None,
     baselines: Annotated[
@@ -191,26 +235,44 @@ def evaluate(
     hold_out: Annotated[
         bool, typer.Option("--hold-out", help="Fit four fifths of the probes again, and score the light at the others.")
     ] = False,
+    time: Time = None,
     device: Device = "cpu",
     key: _Key = None,
     convention: _Convention = None,
 ) -> None:
-    """Compare the decoded probes with the input: PSNR of coefficients and of irradiance, and bits per probe."""
+    """Compare the decoded probes with the input: PSNR of coefficients and of irradiance, and bits per probe.
+
+    Of a file of several hours PROBES are as for compress: all hours are scored, or with --time one of them.
+    """
     if json_path is not None:
         check_output(json_path, ".json")
     if html_path is not None:
         check_output(html_path, ".html")
     quiet_warp()
-    from wlm.probe import evaluate
+    from wlm.probe import DayModel, evaluate
+    from wlm.probe.hours import joint_source
     from wlm.system import load
 
     model = load(file, "probe")
-    probes = _load(probes_path, key, convention)
+    if isinstance(model, DayModel):
+        sets = read_hours(probes_paths, model.times, key, convention)
+        if time is None:
+            if baselines or volume or views or mesh is not None or html_path is not None:
+                raise WlmError("--time: expected with --baselines, --volume, --views, --mesh and --html")
+            evaluate_hours(file, model, sets, json_path, hold_out, device)
+            return
+        stored_time(model, time)
+        probes = sets[model.times.index(time)]
+        source, shared = joint_source(sets, model.times), len(sets)
+    else:
+        probes = _load(only_path(probes_paths), key, convention)
+        source, shared = probes.source, 1
+    model = at_time(model, time)
     with running("evaluate") as progress:
-        size = file.stat().st_size
+        size = max(1, file.stat().st_size // shared)
         report = evaluate(model, probes, device=device, progress=progress, file_bytes=size, hold_out=hold_out)
-    if probes.source != model.source:
-        note(f"warning: {probes_path}: not what {file} was made of; another key, convention or file?")
+    if not is_source(model, source):
+        note(f"warning: {probes_paths[0]}: not what {file} was made of; another key, convention or file?")
     if html_path is not None:
         from wlm.view.reports import probe_report
 
@@ -239,7 +301,7 @@ def info(file: ModelFile, as_json: AsJson = False, device: Device = "cpu") -> No
     quiet_warp()
     from wlm import system
     from wlm.formats.artifact import read_artifact
-    from wlm.probe import codec
+    from wlm.probe import DayModel, RegionModel, codec
 
     artifact = read_artifact(file, "probe")
     model = system.decode(file, artifact, codec.decode)
@@ -260,8 +322,12 @@ def info(file: ModelFile, as_json: AsJson = False, device: Device = "cpu") -> No
         "device_bytes": decoder.device_bytes,
         "profile": model.profile.model_dump(mode="json"),
     }
-    if transform:
+    day = isinstance(model, DayModel)
+    if day:
+        facts |= {"times": list(model.times), "hours": _hour_facts(model)}
+    elif transform:
         facts |= {"step": model.head.step, "directions": model.head.vectors, "predicted": model.head.predicted}
+        facts["regions"] = model.split.regions if isinstance(model, RegionModel) else 1
     else:
         facts |= {
             "gaussians": model.count,
@@ -280,9 +346,14 @@ def info(file: ModelFile, as_json: AsJson = False, device: Device = "cpu") -> No
     rows.add_row("probes", f"{model.probes:,}, {facts['dead']:,} of them dead")
     rows.add_row("numbers of a probe", str(model.outputs))
     rows.add_row("bits per probe", f"{facts['bits_per_probe']:.2f}")
-    if transform:
+    if day:
+        for hour in facts["hours"]:
+            told = " and ".join(f"{time:g}" for time in hour["from"])
+            rows.add_row(f"bytes of {hour['time']:g} h", f"{hour['bytes']:,}" + (f", told by {told}" if told else ""))
+    elif transform:
         rows.add_row("step", f"{model.head.step:.4g}")
         rows.add_row("directions", str(model.head.vectors))
+        rows.add_row("regions", str(facts["regions"]))
     else:
         rows.add_row("Gaussians", f"{model.count:,}, {model.dropped:,} dropped")
         rows.add_row("bits per Gaussian", str(facts["gaussian_bits"]))
@@ -298,64 +369,17 @@ def info(file: ModelFile, as_json: AsJson = False, device: Device = "cpu") -> No
     show(rows)
 
 
-@app.command()
-def export(
-    file: ModelFile,
-    output: Annotated[Path, output_option("DIR", "The folder to write to.")],
-    engine: Annotated[
-        Literal["any", "three", "godot", "unity"],
-        typer.Option(
-            help="For three.js and Godot light on a lattice, for Godot and Unity the probes themselves too; for any "
-            "engine buffers and a shader that reads them."
-        ),
-    ] = "any",
-    original: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="PROBES",
-            help="The probes that were compressed, where FILE.wlm has no positions; for Godot their bake, to keep the "
-            "rest of it.",
-        ),
-    ] = None,
-    cells: Annotated[
-        int | None, typer.Option(help="Of a lattice, along the longest side of the probes' box; default 24.")
-    ] = None,
-    mirror: Annotated[
-        Literal["x", "y", "z"] | None,
-        typer.Option(help="For Unity, which is left-handed: the axis to turn round; default none."),
-    ] = None,
-    device: Device = "cpu",
-) -> None:
-    """Write the light for an engine, as files that it takes as they are.
-
-    For any engine, reference.json is the light at some positions: what the shader should make of the rest.
-    """
-    if cells is not None and engine not in ("three", "godot"):
-        raise WlmError("--cells: means nothing without --engine three or godot")
-    if mirror is not None and engine != "unity":
-        raise WlmError("--mirror: means nothing without --engine unity")
-    quiet_warp()
-    from wlm import probe
-    from wlm.probe.three_grid import CELLS
-    from wlm.system import load
-
-    model = load(file, "probe")
-    if engine == "any":
-        paths = probe.export(model, output, device=device, position=_given(model, original))
-    elif engine == "three":
-        given, size = _given(model, original), CELLS if cells is None else cells
-        paths = probe.export_grid(model, output, cells=size, position=given, device=device)
-    elif engine == "godot":
-        bake = original if original is not None and original.suffix.lower() == ".lmbake" else None
-        given = None if bake is not None else _given(model, original)
-        paths = probe.export_godot(model, output, bake=bake, cells=cells, position=given, device=device)
-    else:
-        given = None if original is None else _places(model, original)
-        paths = probe.export_unity(model, output, mirror=mirror, position=given, device=device)
-    rows = table(str(output), ["file", "bytes"])
-    for path in paths:
-        rows.add_row(escape(path.name), f"{path.stat().st_size:,}")
-    show(rows)
+def _hour_facts(model: "DayModel") -> list[dict[str, Any]]:
+    """What a file says of each of its hours, in its own order."""
+    return [
+        {
+            "time": model.times[hour.number],
+            "bytes": hour.bytes,
+            "from": [model.times[i] for i in hour.told.references],
+            "dead": int(hour.dead.sum()),
+        }
+        for hour in model.hours
+    ]
 
 
 def _load(path: Path, key: str | None, convention: str | None) -> "ProbeSet":
@@ -368,7 +392,22 @@ def _load(path: Path, key: str | None, convention: str | None) -> "ProbeSet":
     return probes
 
 
-def _positions(model: "ProbeModel | TransformModel", path: Path | None) -> "tuple[np.ndarray, bool]":
+def _region(
+    file: Path, model: "Any", number: int, positions: Path | None, original: Path | None, device: str
+) -> "tuple[np.ndarray, np.ndarray]":
+    """Positions and numbers of the live probes of one region; nothing of the others is read."""
+    from wlm.probe import RegionModel
+
+    if not isinstance(model, RegionModel) or not 0 <= number < model.split.regions:
+        regions = model.split.regions if isinstance(model, RegionModel) else 0
+        raise WlmError(f"--region: expected one of {file}'s {regions} regions, counted from 0, found {number}")
+    if positions is not None:
+        raise WlmError("--region: expected no --positions: they are those of the region's probes")
+    given = given_positions(model, original)
+    return model.decoder(device, position=given).region(number)
+
+
+def _positions(model: "ProbeModel | Transform", path: Path | None) -> "tuple[np.ndarray, bool]":
     """The positions to decode at, float64 [M, 3], and whether they are those of the model's own probes."""
     from wlm.probe import load_positions
 
@@ -378,31 +417,11 @@ def _positions(model: "ProbeModel | TransformModel", path: Path | None) -> "tupl
     return position, model.has_probes_at(position)
 
 
-def _given(model: "ProbeModel | TransformModel", original: Path | None) -> "np.ndarray | None":
-    """The positions of the model's own probes in another file, if there is one; only a transform needs them."""
-    if original is None:
-        return None
-    position = _places(model, original)
-    if model.profile.method != "transform":
-        raise WlmError(f"--original: means nothing to {model.name}, which is decoded without its probes' positions")
-    return position
-
-
-def _places(model: "ProbeModel | TransformModel", original: Path) -> "np.ndarray":
-    """The positions of the model's own probes in another file."""
-    from wlm.probe import load_positions
-
-    position = load_positions(original)
-    if not model.has_probes_at(position):
-        raise WlmError(f"{original}: expected the {model.probes} probes of {model.name}, in their order")
-    return position
-
-
 def _decoder(
-    model: "ProbeModel | TransformModel", device: str, original: Path | None, position: "np.ndarray | None" = None
+    model: "ProbeModel | Transform", device: str, original: Path | None, position: "np.ndarray | None" = None
 ) -> "Any":
     """A decoder, of a transform at the places of `original` or at `position`, the model's own probes."""
-    given = _given(model, original)
+    given = given_positions(model, original)
     if given is None and model.profile.method == "transform":
         given = position
     return model.decoder(device) if given is None else model.decoder(device, position=given)
@@ -435,3 +454,6 @@ def _show_report(file: Path, profile: str, report: "Report", rivals: "list[tuple
         note(f"worst: {number(worst['psnr'], '.2f')} dB, probe {worst['probe']} at ({place})")
     for warning in report.warnings:
         note(f"warning: {warning}")
+
+
+register_export(app)

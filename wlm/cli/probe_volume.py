@@ -7,6 +7,7 @@ import typer
 
 from wlm.cli.console import check_output, escape, number, quiet_warp, running, show, table, write_json
 from wlm.cli.options import Device, ModelFile, ReportFile, output_option
+from wlm.cli.probe_day import Time, at_time
 from wlm.errors import WlmError
 
 if TYPE_CHECKING:
@@ -46,6 +47,7 @@ def walk(
     budget: Annotated[int | None, typer.Option(help="Blocks decoded in a frame; default 64.")] = None,
     key: _Key = None,
     json_path: ReportFile = None,
+    time: Time = None,
     device: Device = "cpu",
 ) -> None:
     """Walk through the scene with a cascaded lighting volume: what a frame costs, covers and gets wrong.
@@ -61,7 +63,7 @@ def walk(
     from wlm.probe.walk import STEP, camera_path, loop_frames, settle, summary, walk
     from wlm.system import load
 
-    model = load(file, "probe")
+    model = at_time(load(file, "probe"), time)
     decoder = model.decoder(device)
     volume, original = _volume(file, model, decoder, probes_path, key, block, budget)
     position = volume.position
@@ -94,6 +96,7 @@ def volume(
     ] = None,
     block: _Block = None,
     key: _Key = None,
+    time: Time = None,
     device: Device = "cpu",
 ) -> None:
     """Write the cascaded volume round a viewer as buffers and a page table, with shaders that read them."""
@@ -102,7 +105,7 @@ def volume(
     from wlm.probe.walk import settle
     from wlm.system import load
 
-    model = load(file, "probe")
+    model = at_time(load(file, "probe"), time)
     made, _ = _volume(file, model, model.decoder(device), probes_path, key, block, None)
     lit = made.position[made.numbers]
     settle(made, (lit.min(0) + lit.max(0)) / 2 if at is None else _point(at))

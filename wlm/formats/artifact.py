@@ -8,6 +8,8 @@ The file is a valid safetensors file: an 8-byte length, a JSON header, the tenso
 - `settings`: JSON, with `"` and `'` exchanged, because each `"` inside a JSON string would cost an escape.
 
 A part is a tensor; its byte count is what its type and shape say, and its offsets must say the same.
+
+An artifact without a source is a compact one (`wlm.formats.compact`).
 """
 
 import hashlib
@@ -18,12 +20,14 @@ import os
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from wlm.errors import WlmError, one_line
 from wlm.formats.atomic import atomic_write
+from wlm.formats.compact import encode_compact, is_compact, parse_compact
 from wlm.formats.reading import open_file
 
 FORMAT_VERSION = 1
@@ -70,8 +74,8 @@ class Artifact:
     Attributes:
         system: The system that wrote it, "lightmap" for example.
         version: The format's version.
-        settings: What it was made with.
-        source: A hash of what it was made from, as the writer gave it.
+        settings: What it was made with; of a compact one `name`, that of the file, alone.
+        source: A hash of what it was made from, as the writer gave it; empty of a compact one.
         tensors: The parts by name: read-only views of the mapped file.
         parts: The parts' sizes by name, bytes.
         file_bytes: The size on disk: the header and all parts.
@@ -120,7 +124,8 @@ def encode_artifact(
         system: The system's name, without spaces.
         settings: Plain JSON values; NaN and Inf are none.
         tensors: The parts by name: any shape; a bool, an integer of 8 to 64 bits or a float of 16 to 64.
-        source: A hash of the input, without spaces, not empty.
+        source: A hash of the input, without spaces. Empty: the artifact is compact, its parts are those of
+            `wlm.formats.compact`, and it has no settings.
 
     Returns:
         The file's content as consecutive buffers: the header, then the tensors.
@@ -128,6 +133,10 @@ def encode_artifact(
     Raises:
         ValueError: A name, a setting or a type that the format can't hold.
     """
+    if not source:
+        if settings:
+            raise ValueError("settings: expected none in a compact artifact")
+        return encode_compact(system, tensors)
     for what, word in (("system", system), ("source", source)):
         if not word or not word.isascii() or not word.isprintable() or " " in word:
             raise ValueError(f"{what}: expected one ASCII word, got {word!r}")
@@ -165,7 +174,7 @@ def encode_artifact(
 
 
 def read_artifact(path: str | os.PathLike[str], system: str | None = None) -> Artifact:
-    """Maps an artifact and checks every byte of it against its digest.
+    """Maps an artifact and checks every byte of it against its digest, but for what is read piece by piece.
 
     Args:
         path: The file.
@@ -180,6 +189,8 @@ def read_artifact(path: str | os.PathLike[str], system: str | None = None) -> Ar
     """
     mapped = _map(path)
     size = len(mapped)
+    if is_compact(mapped[: _LENGTH.size]):
+        return _compact(path, mapped, system)
     if size < _LENGTH.size:
         raise WlmError(f"{path}: expected an artifact (safetensors), found a file of {size} bytes")
     (length,) = _LENGTH.unpack_from(mapped)
@@ -200,8 +211,7 @@ def read_artifact(path: str | os.PathLike[str], system: str | None = None) -> Ar
     entries = {name: _entry(path, name, entry) for name, entry in header.items() if name != "__metadata__"}
     _check_extents(path, entries, size - start)
     _check_digest(path, mapped, encoded, digest)
-    if system is not None and found_system != system:
-        raise WlmError(f"{path}: expected an artifact of {system}, found one of {found_system}")
+    _check_system(path, found_system, system)
     settings = _parse_json(path, settings_text.translate(_EXCHANGED_QUOTES), "settings")
     tensors = {name: _view(mapped, start, *entry) for name, entry in entries.items()}
     return Artifact(
@@ -214,6 +224,20 @@ def read_artifact(path: str | os.PathLike[str], system: str | None = None) -> Ar
         file_bytes=size,
         header_bytes=start,
     )
+
+
+def _compact(path: str | os.PathLike[str], mapped: mmap.mmap | bytes, system: str | None) -> Artifact:
+    found_system, version, tensors, start = parse_compact(path, mapped)
+    _check_system(path, found_system, system)
+    parts = {name: array.nbytes for name, array in tensors.items()}
+    # It has no name of its own.
+    settings = {"name": Path(path).stem}
+    return Artifact(found_system, version, settings, "", tensors, parts, len(mapped), start)
+
+
+def _check_system(path: str | os.PathLike[str], found: str, expected: str | None) -> None:
+    if expected is not None and found != expected:
+        raise WlmError(f"{path}: expected an artifact of {expected}, found one of {found}")
 
 
 def _little_endian(name: str, array: np.ndarray) -> np.ndarray:

@@ -1,4 +1,7 @@
-"""Reading `.npz` files: named arrays in a ZIP file. What each claims to be is looked at before it is inflated."""
+"""Reading `.npz` files: named arrays in a ZIP file. What each claims to be is looked at before it is inflated.
+
+Arrays above `wlm.formats.scratch.IN_MEMORY` lie in a file without a name.
+"""
 
 import io
 import math
@@ -12,6 +15,7 @@ import numpy as np
 from wlm.errors import WlmError
 from wlm.formats.limits import SURE_BYTES, VOLUME_BYTES, check_growth
 from wlm.formats.reading import open_file
+from wlm.formats.scratch import room
 
 _SUFFIX = ".npy"
 _PIECE = 1 << 20  # bytes inflated at once
@@ -72,7 +76,7 @@ def _read(where: str, archive: zipfile.ZipFile, info: zipfile.ZipInfo, numbers: 
         if stated != size:
             raise WlmError(f"{where}: expected {size} bytes of numbers, found {stated}")
         check_growth(where, info.compress_size, size, sure=sure)
-        flat = np.empty(count, dtype)
+        flat = room((count,), dtype, where)
         unfilled = memoryview(flat.view(np.uint8)) if size else memoryview(b"")
         piece = begin.read()
         while piece and len(piece) <= len(unfilled):

@@ -15,7 +15,7 @@ IN_MEMORY = 1 << 30
 _PIECE = 1 << 24
 
 
-def room(shape: tuple[int, ...], dtype: type[np.generic], where: str, beside: int = 0) -> np.ndarray:
+def room(shape: tuple[int, ...], dtype: type[np.generic] | np.dtype, where: str, beside: int = 0) -> np.ndarray:
     """Makes an array of zeros, in memory or in a file that is mapped.
 
     The system writes parts of a mapped array to the disk and drops them from memory when that is short. The file has no

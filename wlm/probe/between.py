@@ -6,7 +6,7 @@ uncompressed others give there by the plain rules of engines is beside it. And h
 the decoded light is compared with what the uncompressed probes give there by kriging.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,10 +15,11 @@ from scipy.spatial import cKDTree
 from wlm.errors import WlmError
 from wlm.metrics import psnr_from_mse
 from wlm.probe.data import ProbeSet, from_arrays
+from wlm.probe.day import DayModel
 from wlm.probe.fit import compress
 from wlm.probe.kriging import Kriging
 from wlm.probe.model import ProbeModel
-from wlm.probe.transform import TransformModel
+from wlm.probe.transform import Transform
 from wlm.system import OnProgress
 
 EVERY = 5
@@ -51,7 +52,7 @@ class HeldOut:
 
 
 def held_out(
-    model: ProbeModel | TransformModel,
+    model: ProbeModel | Transform,
     probes: ProbeSet,
     *,
     seed: int = 0,
@@ -68,6 +69,8 @@ def held_out(
     Raises:
         WlmError: Fewer than two live probes, no such device, or a fit that failed.
     """
+    if isinstance(model, DayModel):
+        raise WlmError(f"{model.name}: expected one hour to hold probes out of, found a file of {len(model.times)}")
     live = np.flatnonzero(probes.live)
     if len(live) < 2:
         raise WlmError(f"{probes.name}: expected at least 2 live probes to hold one out, found {len(live)}")
@@ -75,24 +78,37 @@ def held_out(
     known, asked = live[~out], live[out]
     others = from_arrays(probes.position[known], probes.values[known], name=probes.name)
     settings: dict[str, Any] = {}
-    if isinstance(model, TransformModel):
+    if isinstance(model, Transform):
         # The others' file has no positions.
-        settings["max_bytes"] = replace(model, places=None).file_bytes() * (EVERY - 1) // EVERY
+        settings["max_bytes"] = model.without_places().file_bytes() * (EVERY - 1) // EVERY
     try:
         fitted = compress(others, model.profile, seed=seed, device=device, progress=progress, **settings)
     except WlmError as error:
         raise WlmError(f"{probes.name}: cannot fit {len(known)} probes to hold out {len(asked)}: {error}") from error
     decoder = fitted.decoder(device)
     decoder.decode_probes(others.position)
+    return score_held(decoder, others, probes, asked, fitted.file_bytes())
+
+
+def score_held(decoder: Any, others: ProbeSet, probes: ProbeSet, asked: np.ndarray, size: int) -> HeldOut:
+    """Scores the light where probes were left out of a fit.
+
+    Args:
+        decoder: Of the fit, which knows its places.
+        others: What was fitted.
+        probes: The whole set.
+        asked: int [M], which of them were left out and are live.
+        size: Bytes of the fit's file.
+    """
     position, expected = probes.position[asked], probes.values[asked].astype(np.float64)
-    peak = float(np.ptp(probes.values[live]))
+    peak = float(np.ptp(probes.values[probes.live]))
 
     def score(values: np.ndarray) -> float:
         return psnr_from_mse(float(np.square(values - expected).mean()), peak)
 
     return HeldOut(
         probes=len(asked),
-        bytes=fitted.file_bytes(),
+        bytes=size,
         psnr=score(decoder.decode(position)),
         nearest=score(by_distance(others, position, 1)),
         distance=score(by_distance(others, position, _NEAREST)),

@@ -1,15 +1,10 @@
-"""Probe models in files: packed Gaussians and a half-float network, or the stream of a transform.
+"""Probe models in files: packed Gaussians and a half-float network; transforms as `wlm.probe.transform_codec` has them.
 
 `gaussians` holds for every Gaussian three centres of 16 bits and 7 + L codes of b bits, packed without a gap, the
 lowest bit first; `frame` is origin, extent, size of the box and gain; `dead` is a bit for each probe, deflated.
-
-A transform has `light`, its stream and the dead probes' bits, in place of Gaussians, bounds and network; `places` are
-differences of 16 bits from probe to probe, deflated, and `frame` is then origin and extent alone.
 """
 
-import zlib
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,31 +13,19 @@ from pydantic import Field
 from wlm.config import check_settings
 from wlm.formats.artifact import Artifact
 from wlm.formats.bits import pack_bits, unpack_bits
-from wlm.formats.deflate import inflate
+from wlm.formats.compact import HEAD
 from wlm.formats.limits import NUMBERS, PROBES
-from wlm.formats.parts import Part, check_part, check_parts
+from wlm.formats.parts import Part, check_parts
+from wlm.probe.day import DayModel
+from wlm.probe.day_codec import decode_day, encode_day, is_day
 from wlm.probe.model import LATENT, SCALE, ProbeModel, Profile, layer_shapes
-from wlm.probe.transform import Places, TransformModel
+from wlm.probe.region_codec import decode_regions, encode_regions
+from wlm.probe.regions import RegionModel
+from wlm.probe.transform import Transform, TransformModel
+from wlm.probe.transform_codec import decode_transform, encode_transform, is_transform, pack_dead, unpack_dead
 from wlm.system import Header, Name
 
 _MOST_LOG = 40.0
-
-
-_LIGHT = "light"
-_L2 = 27  # numbers of a probe that a transform's file doesn't state
-# Numbers that a transform may unpack to: those of a set without any light have next to no bytes.
-_SURE_NUMBERS, _NUMBERS_A_BYTE = 1 << 23, 4096
-# Live probes of it: each takes some 20 microseconds and 500 bytes to place among the others.
-_SURE_PROBES, _PROBES_A_BYTE = 1 << 17, 16
-
-
-class _TransformHeader(Header):
-    """The settings of a transform's file."""
-
-    name: Name
-    probes: int = Field(ge=1, le=PROBES)
-    outputs: int = Field(_L2, ge=1, le=NUMBERS)
-    dead: int = Field(0, ge=0, le=2 * PROBES)
 
 
 class _Header(Header):
@@ -54,13 +37,6 @@ class _Header(Header):
     profile: Profile
     gaussians: int = Field(ge=1, le=PROBES)
     dropped: int = Field(ge=0, le=PROBES)
-
-
-_TRANSFORM_PARTS = {
-    _LIGHT: Part(np.uint8, (None,)),
-    "places": Part(np.uint8, (None,), optional=True),
-    "frame": Part(np.float64, (4,), optional=True, least=-1e150, most=1e150),
-}
 
 
 def _parts(header: _Header) -> dict[str, Part]:
@@ -79,10 +55,14 @@ def _parts(header: _Header) -> dict[str, Part]:
     }
 
 
-def encode(model: ProbeModel | TransformModel) -> tuple[dict[str, Any], dict[str, np.ndarray], str]:
+def encode(model: ProbeModel | Transform) -> tuple[dict[str, Any], dict[str, np.ndarray], str]:
     """Settings, parts and source of a model's file."""
+    if isinstance(model, RegionModel):
+        return encode_regions(model)
+    if isinstance(model, DayModel):
+        return encode_day(model)
     if isinstance(model, TransformModel):
-        return _encode_transform(model)
+        return encode_transform(model)
     settings = {
         "name": model.name,
         "probes": model.probes,
@@ -102,14 +82,18 @@ def encode(model: ProbeModel | TransformModel) -> tuple[dict[str, Any], dict[str
     return settings, {name: part for name, part in parts.items() if part.size}, model.source
 
 
-def decode(artifact: Artifact) -> ProbeModel | TransformModel:
+def decode(artifact: Artifact) -> ProbeModel | Transform:
     """Makes the model of a file; what `encode` gave comes back bit for bit.
 
     Raises:
         WlmError, ValueError: A setting or a part is missing or wrong, or they don't fit each other.
     """
-    if _LIGHT in artifact.tensors:
-        return _decode_transform(artifact)
+    if HEAD in artifact.tensors:
+        return decode_regions(artifact)
+    if is_day(artifact):
+        return decode_day(artifact)
+    if is_transform(artifact):
+        return decode_transform(artifact)
     header = check_settings(_Header, artifact.settings, "setting ")
     parts = check_parts(artifact.tensors, _parts(header))
     _check_frame(parts["frame"])
@@ -131,71 +115,10 @@ def decode(artifact: Artifact) -> ProbeModel | TransformModel:
         code=codes[:, 3:],
         bounds=parts["bounds"],
         net=parts["net"],
-        dead=_unpack_dead(parts["dead"], header.probes),
+        dead=unpack_dead(parts["dead"], header.probes),
         positions=parts["positions"],
         dropped=header.dropped,
     )
-
-
-def _encode_transform(model: TransformModel) -> tuple[dict[str, Any], dict[str, np.ndarray], str]:
-    settings: dict[str, Any] = {"name": model.name, "probes": model.probes}
-    if model.outputs != _L2:
-        settings["outputs"] = model.outputs
-    # A part of its own would cost a line of the header, half of what a small set has.
-    dead = pack_dead(model.dead)
-    if len(dead):
-        settings["dead"] = len(dead)
-    parts = {_LIGHT: np.concatenate([model.stream, dead])}
-    if model.places is not None:
-        change = np.diff(model.places.code.astype(np.uint16), axis=0, prepend=np.zeros((1, 3), np.uint16))
-        # Axis by axis, low bytes and then high ones: those of a lattice repeat.
-        planes = np.ascontiguousarray(change.T.astype("<u2")).view(np.uint8).reshape(3, -1, 2).transpose(0, 2, 1)
-        parts["places"] = np.frombuffer(zlib.compress(planes.tobytes(), 9), np.uint8)
-        parts["frame"] = np.array([*model.places.origin, model.places.extent], np.float64)
-    return settings, {name: part for name, part in parts.items() if part.size}, model.source
-
-
-def _decode_transform(artifact: Artifact) -> TransformModel:
-    header = check_settings(_TransformHeader, artifact.settings, "setting ")
-    parts = check_parts(artifact.tensors, _TRANSFORM_PARTS)
-    light = parts[_LIGHT]
-    end = len(light) - header.dead
-    if end < 0:
-        raise ValueError(f"part light: expected at least {header.dead} bytes, found {len(light)}")
-    most = _SURE_NUMBERS + _NUMBERS_A_BYTE * end
-    if header.probes * header.outputs > most:
-        numbers = f"{header.probes} probes of {header.outputs} numbers"
-        raise ValueError(f"part light: expected at most {most} numbers of {end} bytes, found {numbers}")
-    dead = _unpack_dead(light[end:], header.probes)
-    live, most = header.probes - int(dead.sum()), _SURE_PROBES + _PROBES_A_BYTE * end
-    if not 1 <= live <= most:
-        raise ValueError(f"part light: expected 1 to {most} live probes of {end} bytes, found {live}")
-    places = None
-    if parts["places"].size:
-        size = 6 * header.probes
-        data = inflate(parts["places"].tobytes(), size, "part places", f"the places of {header.probes} probes")
-        planes = np.frombuffer(data, np.uint8).reshape(3, 2, header.probes).transpose(0, 2, 1)
-        change = np.ascontiguousarray(planes).view("<u2")[..., 0].T
-        frame = check_part(artifact.tensors, "frame", replace(_TRANSFORM_PARTS["frame"], optional=False))
-        if not frame[3] > 0:
-            raise ValueError(f"part frame: expected a positive extent, found {frame[3]:g}")
-        places = Places(frame[:3].copy(), float(frame[3]), np.cumsum(change, axis=0, dtype=np.uint16))
-    elif parts["frame"].size:
-        raise ValueError("part frame: expected none without places")
-    model = TransformModel(
-        name=header.name,
-        source=artifact.source,
-        probes=header.probes,
-        outputs=header.outputs,
-        dead=dead,
-        stream=light[:end],
-        places=places,
-    )
-    _ = model.head
-    if places is not None:
-        # What can be unpacked here is, so that whatever is wrong with it is said of the file.
-        _ = model.stored_values
-    return model
 
 
 def _check_frame(frame: np.ndarray) -> None:
@@ -228,18 +151,3 @@ def _check_values(header: _Header, parts: Mapping[str, np.ndarray]) -> None:
     most = max(first.sum(0).max(), parts["frame"][7] * layers[2].sum(0).max())
     if not most <= np.finfo(np.float32).max:
         raise ValueError("parts net, bounds and frame: expected values that float32 holds")
-
-
-def pack_dead(dead: np.ndarray) -> np.ndarray:
-    """A bit for each probe, bool [N], deflated; uint8, empty where none is dead."""
-    packed = zlib.compress(np.packbits(dead).tobytes(), 9) if dead.any() else b""
-    return np.frombuffer(packed, np.uint8)
-
-
-def _unpack_dead(packed: np.ndarray, probes: int) -> np.ndarray:
-    """bool [N], or empty where none is dead."""
-    if not packed.size:
-        return np.zeros(0, bool)
-    size = -(-probes // 8)
-    bits = inflate(packed.tobytes(), size, "part dead", f"a bit for each of {probes} probes")
-    return np.unpackbits(np.frombuffer(bits, np.uint8), count=probes).astype(bool)

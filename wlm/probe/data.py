@@ -49,12 +49,14 @@ from wlm.formats.godot import read_lmbake
 from wlm.formats.limits import JSON_BYTES, NUMBERS, PROBES
 from wlm.formats.npz import read_npz
 from wlm.formats.reading import read_json_file
+from wlm.formats.scratch import room
 from wlm.probe.conventions import CANONICAL, CONVENTIONS, THREE_GRID, from_canonical, to_canonical
 from wlm.probe.sphere import sh_count
 
 LARGEST = float(np.sqrt(np.finfo(np.float32).max))
 """The largest number whose square float32 still holds."""
 
+_ROWS = 1 << 16  # probes at once, so that float64 copies stay at some tens of MB
 _FARTHEST = 1e150  # the squares of distances are float64's too
 _POSITION, _CONVENTION, _PROBES, _SH = "position", "convention", "probes", "sh"
 
@@ -66,8 +68,9 @@ class ProbeSet:
     Attributes:
         name: The set's name.
         position: float64 [N, 3], in the input's unit and axes.
-        values: float32 [N, D], finite; zero where a probe is not live. For spherical harmonics D = 3 C, and
-            `values.reshape(N, C, 3)` are canonical coefficients of radiance (`wlm.probe.conventions`), RGB last.
+        values: float32 [N, D], finite; zero where a probe is not live; above 1 GiB in a file without a name. For
+            spherical harmonics D = 3 C, and `values.reshape(N, C, 3)` are canonical coefficients of radiance
+            (`wlm.probe.conventions`), RGB last.
         key: Name of the array that was read.
         live: bool [N], false where the probe takes no part in the fit and decodes to zero; at least one is true.
         source: 16 hexadecimal digits of BLAKE2b over the positions, the values and which are live.
@@ -402,16 +405,22 @@ def _check(
     if values.size > NUMBERS * count:
         raise WlmError(f"{where}: {key}: expected at most {NUMBERS} numbers a probe, got {values.size // count}")
 
-    # float64, so that what doesn't fit float32 is told from Inf; integers have no NaN to look for.
-    wide = values.astype(np.float64)
-    finite = np.isfinite(wide).all(axis=tuple(range(1, wide.ndim)))
-    wide = _convert(where, wide, convention, to_canonical).reshape(count, -1)
-    beyond = np.flatnonzero(finite & (np.abs(wide).max(axis=1) > LARGEST))
-    if len(beyond):
-        worst = np.abs(wide[beyond[0]]).max()
-        raise WlmError(f"{where}: {key}[{beyond[0]}]: expected numbers within {LARGEST:.2g}, got {worst:.3g}")
-    wide[~finite] = 0.0
-    checked = wide.astype(np.float32)
+    checked = room((count, values.size // count), np.float32, where)
+    finite = np.empty(count, bool)
+    for start in range(0, count, _ROWS):
+        rows = slice(start, start + _ROWS)
+        # float64, so that what doesn't fit float32 is told from Inf; integers have no NaN to look for.
+        wide = values[rows].astype(np.float64)
+        finite[rows] = np.isfinite(wide).all(axis=tuple(range(1, wide.ndim)))
+        wide = _convert(where, wide, convention, to_canonical).reshape(len(wide), -1)
+        beyond = np.flatnonzero(finite[rows] & (np.abs(wide).max(axis=1) > LARGEST))
+        if len(beyond):
+            worst = np.abs(wide[beyond[0]]).max()
+            raise WlmError(
+                f"{where}: {key}[{start + beyond[0]}]: expected numbers within {LARGEST:.2g}, got {worst:.3g}"
+            )
+        wide[~finite[rows]] = 0.0
+        checked[rows] = wide
     live = (checked != 0.0).any(axis=1)
     if not live.any():
         raise WlmError(f"{where}: {key}: every probe is zero or not finite: there is nothing to fit")

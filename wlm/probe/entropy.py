@@ -10,6 +10,7 @@ constriction (Bamler, Understanding Entropy Coding With Asymmetric Numeral Syste
 """
 
 from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 import constriction
 import numpy as np
@@ -30,54 +31,77 @@ _CHUNK = 12  # bits that are coded at once
 models, AnsCoder = constriction.stream.model, constriction.stream.stack.AnsCoder
 
 
-def pack(q: np.ndarray, levels: Sequence[np.ndarray], parents: Sequence[np.ndarray]) -> bytes:
+class Shape(NamedTuple):
+    """Of some coded numbers.
+
+    Attributes:
+        columns: K.
+        levels: int64 [n] each, the rows in their order of coding.
+        parents: int64 [n, P] each, of the levels but the first: rows of earlier ones.
+    """
+
+    columns: int
+    levels: Sequence[np.ndarray]
+    parents: Sequence[np.ndarray] = ()
+
+
+def pack(*blocks: tuple[np.ndarray, Shape]) -> bytes:
     """Codes numbers.
 
     Args:
-        q: int64 [N, K], magnitudes up to `LARGEST`.
-        levels: int64 [n] each, the rows in their order of coding.
-        parents: int64 [n, P] each, of the levels but the first: rows of earlier ones.
+        blocks: Numbers, int64 [N, K] with magnitudes up to `LARGEST`, each with their shape; one follows the other.
 
     Returns:
-        The bytes, a multiple of four of them.
+        The bytes, without the zeros at their end.
     """
+    steps = [step for q, shape in blocks for step in _steps(q, shape)]
+    coder = AnsCoder()
+    for symbols, model in reversed(steps):
+        coder.encode_reverse(np.ascontiguousarray(symbols, np.int32), model)
+    return coder.get_compressed().astype("<u4").tobytes().rstrip(b"\0")
+
+
+def _steps(q: np.ndarray, shape: Shape) -> Iterator[tuple[np.ndarray, object]]:
+    """Symbols, and the model that they are coded with."""
     size = np.abs(q)
-    steps: list[tuple[np.ndarray, object]] = []
-    odds = _Odds(size.shape[1])
-    for rows, column, classes in _batches(size, levels, parents):
+    odds = _Odds(shape.columns)
+    for rows, column, classes in _batches(size, shape):
         symbol, extra, bits = _split(size[rows, column])
         for kind in np.unique(classes):
             chosen = symbol[classes == kind]
-            steps.append((chosen, odds.model(kind)))
+            yield chosen, odds.model(kind)
             odds.count(kind, chosen)
         sign = q[rows, column][size[rows, column] > 0] < 0
         if len(sign):
-            steps.append((sign.astype(np.int64), odds.sign_model(column)))
+            yield sign.astype(np.int64), odds.sign_model(column)
             odds.count_signs(column, sign)
         for width in np.unique(bits[bits > 0]):
             left = extra[bits == width]
             for low in range(0, int(width), _CHUNK):
                 part = min(_CHUNK, int(width) - low)
-                steps.append(((left >> low) & ((1 << part) - 1), models.Uniform(1 << part)))
-    coder = AnsCoder()
-    for symbols, model in reversed(steps):
-        coder.encode_reverse(np.ascontiguousarray(symbols, np.int32), model)
-    return coder.get_compressed().astype("<u4").tobytes()
+                yield (left >> low) & ((1 << part) - 1), models.Uniform(1 << part)
 
 
-def unpack(data: bytes, columns: int, levels: Sequence[np.ndarray], parents: Sequence[np.ndarray]) -> np.ndarray:
-    """Undoes `pack`, int64 [N, K].
+def unpack(data: bytes, *shapes: Shape) -> list[np.ndarray]:
+    """Undoes `pack`, int64 [N, K] for each shape.
 
     Raises:
         ValueError: The bytes are none that `pack` makes of so many rows and columns.
     """
-    if len(data) % 4:
-        raise ValueError(f"expected whole words, found {len(data)} bytes")
-    coder = AnsCoder(np.frombuffer(data, "<u4").astype(np.uint32))
-    count = sum(len(level) for level in levels)
+    words = data + bytes(-len(data) % 4)
+    coder = AnsCoder(np.frombuffer(words, "<u4").astype(np.uint32))
+    blocks = [_unpack(coder, shape) for shape in shapes]
+    if not coder.is_empty():
+        raise ValueError("found more than the numbers of its probes")
+    return blocks
+
+
+def _unpack(coder: AnsCoder, shape: Shape) -> np.ndarray:
+    """int64 [N, K]."""
+    count, columns = sum(len(level) for level in shape.levels), shape.columns
     q, size = np.zeros((count, columns), np.int64), np.zeros((count, columns), np.int64)
     odds = _Odds(columns)
-    for rows, column, classes in _batches(size, levels, parents):
+    for rows, column, classes in _batches(size, shape):
         symbol = np.empty(len(rows), np.int64)
         for kind in np.unique(classes):
             chosen = classes == kind
@@ -96,16 +120,12 @@ def unpack(data: bytes, columns: int, levels: Sequence[np.ndarray], parents: Seq
                 low[chosen] += coder.decode(models.Uniform(1 << part), len(chosen)).astype(np.int64) << first
         size[rows, column] = low
         q[rows, column] = np.where(sign > 0, -low, low)
-    if not coder.is_empty():
-        raise ValueError("found more than the numbers of its probes")
     return q
 
 
-def _batches(
-    size: np.ndarray, levels: Sequence[np.ndarray], parents: Sequence[np.ndarray]
-) -> Iterator[tuple[np.ndarray, int, np.ndarray]]:
+def _batches(size: np.ndarray, shape: Shape) -> Iterator[tuple[np.ndarray, int, np.ndarray]]:
     """Rows, a column, and the class of odds of each row there; `size` is read up to the batch before."""
-    for rows, above in _pieces(levels, parents):
+    for rows, above in _pieces(shape):
         for column in range(size.shape[1]):
             expected = np.zeros(len(rows), np.int64)
             if above is not None:
@@ -116,16 +136,14 @@ def _batches(
             yield rows, column, np.searchsorted(_EDGES, expected, side="right")
 
 
-def _pieces(
-    levels: Sequence[np.ndarray], parents: Sequence[np.ndarray]
-) -> Iterator[tuple[np.ndarray, np.ndarray | None]]:
+def _pieces(shape: Shape) -> Iterator[tuple[np.ndarray, np.ndarray | None]]:
     """Rows of a level, and their parents: as many as there were before, within limits, so that the odds keep up."""
     seen = 0
-    for number, rows in enumerate(levels):
+    for number, rows in enumerate(shape.levels):
         start = 0
         while start < len(rows):
             piece = slice(start, start + min(max(seen, _FEWEST), _MOST))
-            yield rows[piece], parents[number - 1][piece] if number else None
+            yield rows[piece], shape.parents[number - 1][piece] if number else None
             seen += len(rows[piece])
             start = piece.stop
 

@@ -31,7 +31,7 @@ from wlm.probe.between import HeldOut, between_psnr, held_out
 from wlm.probe.data import ProbeSet
 from wlm.probe.model import ProbeModel
 from wlm.probe.sphere import coefficient_bands, fibonacci_sphere, irradiance, sh_count
-from wlm.probe.transform import TransformModel
+from wlm.probe.transform import Transform
 from wlm.system import Meter, OnProgress
 from wlm.system import Report as BaseReport
 
@@ -91,7 +91,7 @@ class Report(BaseReport):
 
 
 def evaluate(
-    model: ProbeModel | TransformModel,
+    model: ProbeModel | Transform,
     probes: ProbeSet,
     *,
     device: str = "cpu",

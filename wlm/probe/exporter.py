@@ -15,11 +15,12 @@ from wlm.errors import WlmError
 from wlm.formats.folder import make_parents, rounded, staged, write_index
 from wlm.probe.conventions import CANONICAL
 from wlm.probe.data import save_probes
+from wlm.probe.day import DayModel
 from wlm.probe.decode import Decoder
 from wlm.probe.model import CENTRE, SCALE, ProbeModel, live_probes
 from wlm.probe.shader import HEAD_WORDS, gaussian_words, probe_glsl
 from wlm.probe.sphere import sh_count
-from wlm.probe.transform import TransformModel
+from wlm.probe.transform import Transform
 from wlm.probe.transform_export import LIGHT_FILE, light_bytes, transform_document, transform_glsl
 
 FORMAT = "wlm-probe-export"
@@ -61,7 +62,7 @@ _ABOUT = {
 
 
 def export(
-    model: ProbeModel | TransformModel,
+    model: ProbeModel | Transform,
     directory: str | os.PathLike[str],
     *,
     device: str = "cpu",
@@ -90,7 +91,7 @@ def export(
             number of the model isn't finite.
     """
     folder = Path(directory)
-    if isinstance(model, TransformModel):
+    if isinstance(model, Transform):
         return _export_transform(model, folder, device, position)
     for part in (model.net, model.bounds, model.origin, model.size, np.array([model.extent, model.gain])):
         if not np.isfinite(part).all():
@@ -109,7 +110,7 @@ def export(
     return _write(folder, files, _document(model), position, values)
 
 
-def _export_transform(model: TransformModel, folder: Path, device: str, position: np.ndarray | None) -> list[Path]:
+def _export_transform(model: Transform, folder: Path, device: str, position: np.ndarray | None) -> list[Path]:
     own = model.stored_positions() if position is None else np.asarray(position, np.float64)
     decoder = model.decoder(device, position=None if position is None else own)
     live = live_probes(model.dead, model.probes)
@@ -120,7 +121,10 @@ def _export_transform(model: TransformModel, folder: Path, device: str, position
     between = 0.5 * (place[chosen] + place[np.minimum(chosen + 1, len(place) - 1)])
     points = np.concatenate([between, place.max(0)[None] + 0.25 * np.ptp(place, axis=0).max() + 0.25])
     files = {LIGHT_FILE: content, SHADER_FILE: transform_glsl(len(place), model.outputs).encode()}
-    return _write(folder, files, transform_document(model, len(place), numbers), points, decoder.decode(points))
+    document = transform_document(model, len(place), numbers)
+    if isinstance(model, DayModel):
+        document |= {"time": model.time, "times": list(model.times)}
+    return _write(folder, files, document, points, decoder.decode(points))
 
 
 def _write(

@@ -17,11 +17,11 @@ from wlm.metrics import psnr_from_mse
 from wlm.probe.data import ProbeSet
 from wlm.probe.model import ProbeModel, Profile, check_outputs
 from wlm.probe.trainer import Trainer
-from wlm.probe.transform import TransformModel
+from wlm.probe.transform import Transform
 from wlm.probe.transform_fit import compress_transform
 from wlm.system import Meter, OnProgress
 
-_OF_TRANSFORMS = ("target_psnr", "max_bytes")
+_OF_TRANSFORMS = ("target_psnr", "max_bytes", "region")
 _CHUNK = {"cpu": 5, "cuda": 500}  # steps between two looks at the clock
 
 
@@ -66,7 +66,7 @@ def compress(
     checkpoint: Checkpoint | None = None,
     positions: bool = False,
     **overrides: Any,
-) -> ProbeModel | TransformModel:
+) -> ProbeModel | Transform:
     """Compresses a probe set.
 
     Dead probes take no part: the model has a bit for each, if there are any.
@@ -80,8 +80,8 @@ def compress(
         checkpoint: From `open_checkpoint` for the same settings, or None: where a running fit is kept, and an
             interrupted one resumed. A transform is made anew.
         positions: Whether the model carries the probes' positions, 16 bits an axis; an engine has them anyway.
-        overrides: Settings that replace the profile's: `steps=500`, or of a transform `target_psnr=45` and
-            `max_bytes=20000`.
+        overrides: Settings that replace the profile's: `steps=500`, or of a transform `target_psnr=45`,
+            `max_bytes=20000` and `region=65536`.
 
     Returns:
         The model.

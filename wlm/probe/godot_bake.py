@@ -21,7 +21,7 @@ from wlm.probe.conventions import from_canonical
 from wlm.probe.data import load_positions
 from wlm.probe.lattice import CELLS, NUMBERS, lattice_of
 from wlm.probe.model import ProbeModel
-from wlm.probe.transform import TransformModel
+from wlm.probe.transform import Transform
 
 FORMAT = "wlm-godot-light"
 _VERSION = 1
@@ -44,7 +44,7 @@ _NEXT = ((1, 3), (-1, 2), (-2, -3), (-4, 4), (-5, -6))
 
 
 def export_godot(
-    model: ProbeModel | TransformModel,
+    model: ProbeModel | Transform,
     directory: str | os.PathLike[str],
     *,
     bake: str | os.PathLike[str] | None = None,

@@ -7,7 +7,7 @@ import numpy as np
 from wlm.errors import WlmError
 from wlm.probe.decode import Decoder
 from wlm.probe.model import ProbeModel
-from wlm.probe.transform import TransformModel
+from wlm.probe.transform import Transform
 from wlm.probe.transform_decode import TransformDecoder
 
 CELLS = 24
@@ -53,7 +53,7 @@ class Lattice:
 
 
 def lattice_of(
-    model: ProbeModel | TransformModel, cells: int, most: int, position: np.ndarray | None, device: str
+    model: ProbeModel | Transform, cells: int, most: int, position: np.ndarray | None, device: str
 ) -> Lattice:
     """Fills the box of a model's probes with cells, in its middle where they don't fit.
 
@@ -71,9 +71,9 @@ def lattice_of(
         raise WlmError(f"{model.name}: expected L2 in RGB, {NUMBERS} numbers a probe, got {model.outputs}")
     if not 1 <= cells <= most:
         raise WlmError(f"cells: expected 1 to {most} along the longest side, got {cells}")
-    if isinstance(model, TransformModel):
+    if isinstance(model, Transform):
         position = model.stored_positions() if position is None else position
-        decoder: Decoder | TransformDecoder = TransformDecoder(model, device, position=position)
+        decoder: Decoder | TransformDecoder = model.decoder(device, position=position)
         corner, span = position.min(0), np.ptp(position, axis=0)
     else:
         decoder, corner, span = Decoder(model, device), model.origin, model.extent * model.size

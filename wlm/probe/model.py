@@ -31,10 +31,11 @@ class Profile(Settings):
 
     Attributes:
         name: Shown in reports.
-        method: "gaussians", which all settings but the next two are about, or "transform".
+        method: "gaussians", which all settings but the next three are about, or "transform".
         target_psnr: Of a transform, dB over all numbers of all probes: what to reach, with as few bytes as that takes.
             None: 50, or as many as `max_bytes` allows.
         max_bytes: Of a transform, the most that its file may have, which comes before the PSNR; None: any.
+        region: Of a transform, live probes up to which a set is one region; more are divided.
         ratio: Gaussians as a share of the live probes.
         bits: Bits of each number of a Gaussian's scale, rotation and latent.
         latent: Numbers in a Gaussian's latent.
@@ -62,6 +63,7 @@ class Profile(Settings):
     method: Literal["gaussians", "transform"] = "gaussians"
     target_psnr: float | None = Field(None, gt=0.0, le=120.0)
     max_bytes: int | None = Field(None, ge=1)
+    region: int = Field(32768, ge=256)
     ratio: float = Field(0.05, gt=0.0, le=1.0)
     bits: int = Field(10, ge=4, le=16)
     latent: int = Field(9, ge=1, le=32)

@@ -9,7 +9,7 @@ from wlm.errors import WlmError
 from wlm.probe.data import load
 from wlm.probe.model import ProbeModel, live_probes
 from wlm.probe.sphere import fibonacci_sphere, irradiance
-from wlm.probe.transform import TransformModel
+from wlm.probe.transform import Transform
 from wlm.texels import exposure
 
 _NORMALS = 32
@@ -17,7 +17,7 @@ _SHARE = 0.45  # of the median distance between neighbours: balls don't touch
 
 
 def probes_of(
-    model: ProbeModel | TransformModel, original: str | os.PathLike[str] | None, key: str | None = None
+    model: ProbeModel | Transform, original: str | os.PathLike[str] | None, key: str | None = None
 ) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
     """The places of a model's probes, with the file that was compressed their numbers, and which of them are live.
 

@@ -21,7 +21,7 @@ from wlm.formats.reading import named_file
 from wlm.probe.conventions import THREE_GRID as FORMAT
 from wlm.probe.lattice import CELLS, NUMBERS, lattice_of
 from wlm.probe.model import ProbeModel
-from wlm.probe.transform import TransformModel
+from wlm.probe.transform import Transform
 
 _VERSION = 1
 INFO_FILE = "grid.json"
@@ -67,7 +67,7 @@ export async function loadLightProbeGrid(url, renderer, THREE, KTX2Loader, Grid)
 
 
 def export_grid(
-    model: ProbeModel | TransformModel,
+    model: ProbeModel | Transform,
     directory: str | os.PathLike[str],
     *,
     cells: int = CELLS,

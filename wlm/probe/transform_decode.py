@@ -7,7 +7,7 @@ from wlm import interop
 from wlm.errors import WlmError
 from wlm.probe.kriging import Kriging
 from wlm.probe.model import check_points, live_probes
-from wlm.probe.transform import Places, TransformModel
+from wlm.probe.transform import Transform
 from wlm_kernels.probe.mixture import mix
 
 
@@ -39,13 +39,16 @@ class TransformDecoder:
         model, device: The arguments.
     """
 
-    def __init__(self, model: TransformModel, device: str = "cpu", *, position: np.ndarray | None = None):
+    def __init__(
+        self, model: Transform, device: str = "cpu", *, position: np.ndarray | None = None, lazily: bool = False
+    ):
         """Loads a model.
 
         Args:
             model: The model.
             device: "cpu" or "cuda:0".
             position: [N, 3], of the model's own probes; None: those stored with it, if there are.
+            lazily: Whether stored positions wait until they are asked for.
 
         Raises:
             WlmError: No such device, or other positions.
@@ -54,8 +57,8 @@ class TransformDecoder:
         self._values: np.ndarray | None = None
         if position is not None:
             self._place(position)
-        elif model.places is not None:
-            self._hold(model.stored_values, model.places.position())
+        elif model.has_positions and not lazily:
+            self._hold(model.stored_values, model.stored_positions())
 
     @property
     def device_bytes(self) -> int:
@@ -111,7 +114,7 @@ class TransformDecoder:
 
     def _place(self, position: np.ndarray) -> None:
         position = np.asarray(position, np.float64)
-        self._hold(self.model.values(Places.of(position)), position)
+        self._hold(self.model.values_at(position), position)
 
     def _hold(self, values: np.ndarray, position: np.ndarray) -> None:
         model = self.model

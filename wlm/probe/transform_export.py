@@ -30,6 +30,8 @@ ABOUT = {
     "values": "Of a probe, outputs numbers. Spherical harmonics: coefficient after coefficient, of each red, green and "
     "blue; orthonormal real basis in the order 1; y, z, x; xy, yz, 3z2-1, xz, x2-y2; all signs plus, of radiance.",
     "dead": "Probes that are zero, by number from 0 in the order of compression: engines leave them inside walls.",
+    "time": "Of a file of several hours: the time of this export, and the hours that the file holds. Between two "
+    "hours their light is mixed linearly, after the last comes the first.",
     "reference": "reference.json has positions of the scene, the last one outside the box, and the values there.",
 }
 

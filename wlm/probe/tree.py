@@ -1,22 +1,38 @@
 """Probes from coarse to fine, each but the first predicted from coarser ones: a transform over free positions.
 
-A level has one probe for each cube of a grid that no coarser level has a probe in, the next level's cubes have half the
-side. A probe's value is the kriging of the nearest eight of the coarser levels plus its own coefficient (the predicting
-transform of point clouds, Mammou, Tourapis, Kim, Robinet, Valentin and Su, Lifting Scheme for Lossy Attribute Encoding,
-MPEG m42640, 2018):
+A level has the probes that are a distance from all of the coarser levels and from each other, as many as there is room
+for; the next level's distance is half of that. Or it has one probe for each cube of a grid that no coarser level has a
+probe in, which costs some 8% more bytes, for walls lie across cubes as it happens. A probe's value is the kriging of
+the nearest eight of the coarser levels plus its own coefficient (the predicting transform of point clouds, Mammou,
+Tourapis, Kim, Robinet, Valentin and Su, Lifting Scheme for Lossy Attribute Encoding, MPEG m42640, 2018):
 
     value[i] = sum_j w_ij value[parent_ij] + coefficient[i]
 
 A coefficient of a coarse probe reaches many values: `reach` is about the length of what one unit of it changes.
 """
 
+import math
+from functools import cached_property
+
 import numpy as np
 from scipy import sparse
+from scipy.spatial import cKDTree
 
 from wlm.probe.kriging import Kriging
 
 PARENTS = 8
+RADII = (0, 45875, 39322, 55706)
+"""First distances of the spread levels, in codes; with 0 levels are by cubes, as in all earlier files."""
+
+FIRST = 1
+"""The place of that which a fit begins with."""
+
 _FINEST = 18  # halvings: positions have 16 bits an axis
+_LEAST = 64  # of a squared distance: all that are left are the last level
+_BATCH = 64  # probes that are looked at together at least
+_MIX = 2654435761  # odd, 2^32 over the golden ratio: an order without any in space
+_FEW_TURNS, _TURNS = 15, 90  # of the power method
+_GROWN = 1.03
 _AT_ONCE = 1 << 21  # distances, where many places are as far
 
 
@@ -24,19 +40,23 @@ class Tree:
     """The levels of some places.
 
     Attributes:
+        grid: The argument.
         levels: int64 [n] each, probes of a level in their order, the coarsest first.
         parents: int64 [n, K] each, of the levels but the first.
         reach: float64 [N], at least 1.
     """
 
-    def __init__(self, code: np.ndarray):
+    def __init__(self, code: np.ndarray, grid: int = 0):
         """Makes the levels.
 
         Args:
             code: int [N, 3], positions in whole numbers below 2^16: all that follows depends on these alone.
+            grid: The place of the first distance in `RADII`.
         """
         place = code.astype(np.float64)
-        self.levels = _levels(code.astype(np.int64))
+        self.grid = grid
+        whole = code.astype(np.int64)
+        self.levels = _spread(whole, RADII[grid] ** 2) if grid else _levels(whole)
         self.parents: list[np.ndarray] = []
         self.reach = np.ones(len(code))
         self._down: list[sparse.csr_matrix] = []
@@ -73,6 +93,32 @@ class Tree:
         for level, matrix in zip(self.levels[:0:-1], self._up[::-1], strict=True):
             result += matrix @ result[level]
         return result
+
+    @cached_property
+    def eigenvalue(self) -> float:
+        """About the largest one of the transform, its numbers divided by their reach, times its transpose."""
+        vector, first, size = np.random.default_rng(0).standard_normal((len(self.reach), 1)), 1.0, 1.0
+        for turn in range(_TURNS):
+            vector = self.adjoint(self.values(vector / self.reach[:, None])) / self.reach[:, None]
+            size = float(np.linalg.norm(vector))
+            vector /= size
+            if turn == _FEW_TURNS - 1:
+                first = size
+        # Few turns will do unless they end far below: one probe of few may change most, and its part grows late.
+        return size if size > _GROWN * first else first
+
+
+class Trees:
+    """Trees that are made when they are asked for and kept, for sets of the same places; called as `Tree` is."""
+
+    def __init__(self) -> None:
+        self._made: dict[tuple[bytes, int], Tree] = {}
+
+    def __call__(self, code: np.ndarray, grid: int = 0) -> Tree:
+        key = code.tobytes(), grid
+        if key not in self._made:
+            self._made[key] = Tree(code, grid)
+        return self._made[key]
 
 
 class _FirstOfTies(Kriging):
@@ -136,3 +182,59 @@ def _levels(code: np.ndarray) -> list[np.ndarray]:
         if chosen.all():
             break
     return levels
+
+
+def _spread(code: np.ndarray, square: int) -> list[np.ndarray]:
+    """Levels of probes that are apart, the first by a squared distance; all of it in whole numbers.
+
+    Squares are sums below 2^34 of whole numbers: as floats they are exact, and a root's square rounds back to them.
+    """
+    count = len(code)
+    order = np.argsort(np.arange(count, dtype=np.uint64) * np.uint64(_MIX) & np.uint64(0xFFFFFFFF), kind="stable")
+    away = np.full(count, np.inf)  # squared distance to what is chosen, where that is near
+    left, levels = np.ones(count, bool), []
+    while left.any():
+        if square < _LEAST:
+            levels.append(np.flatnonzero(left))
+            break
+        chosen = _apart(code, order[left[order] & (away[order] >= square)], square)
+        if len(chosen):
+            levels.append(np.sort(chosen))
+            left[chosen] = False
+            square >>= 2
+            rest = np.flatnonzero(left)
+            away[rest] = np.minimum(away[rest], _squares(code[chosen], code[rest], square))
+        else:
+            square >>= 2
+    return levels
+
+
+def _apart(code: np.ndarray, waiting: np.ndarray, square: int) -> np.ndarray:
+    """Of probes in their order each that isn't nearer than a squared distance to one before it that was taken."""
+    taken: list[np.ndarray] = []
+    count = 0
+    while len(waiting):
+        first = waiting[: max(_BATCH, 4 * count)]
+        pairs = cKDTree(code[first]).query_pairs(math.sqrt(square) + 1.0, output_type="ndarray")
+        near = np.square(code[first[pairs[:, 0]]] - code[first[pairs[:, 1]]]).sum(1) < square
+        pairs = pairs[near]
+        alive, chosen = np.ones(len(first), bool), np.zeros(len(first), bool)
+        while alive.any():
+            # Those that no one before them can rule out any more.
+            sure = alive.copy()
+            sure[pairs[:, 1]] = False
+            chosen |= sure
+            alive &= ~sure
+            alive[pairs[sure[pairs[:, 0]], 1]] = False
+            pairs = pairs[alive[pairs].all(1)]
+        taken.append(first[chosen])
+        count += len(taken[-1])
+        waiting = waiting[len(first) :]
+        waiting = waiting[_squares(code[taken[-1]], code[waiting], square) >= square]
+    return np.concatenate(taken) if taken else np.zeros(0, np.int64)
+
+
+def _squares(place: np.ndarray, point: np.ndarray, square: int) -> np.ndarray:
+    """Squared distances of points to the nearest place, where they are below a square; else infinity, or more."""
+    distance = cKDTree(place).query(point, distance_upper_bound=math.sqrt(square) + 1.0)[0]
+    return np.rint(np.square(distance))

@@ -15,7 +15,7 @@ from wlm.formats.folder import compact_json, make_parents, rounded, staged
 from wlm.probe.conventions import from_canonical
 from wlm.probe.model import ProbeModel
 from wlm.probe.sphere import sh_count
-from wlm.probe.transform import TransformModel
+from wlm.probe.transform import Transform
 
 FORMAT = "wlm-unity-probes"
 _VERSION = 1
@@ -165,7 +165,7 @@ public class WlmLightProbes : MonoBehaviour
 
 
 def export_unity(
-    model: ProbeModel | TransformModel,
+    model: ProbeModel | Transform,
     directory: str | os.PathLike[str],
     *,
     mirror: str | None = None,

@@ -15,7 +15,7 @@ from wlm.probe.light import Light, StoredLight
 from wlm.probe.model import CENTRE, ROTATION, SCALE, ProbeModel
 from wlm.probe.places import ball_exposure, ball_radius
 from wlm.probe.sphere import basis, coefficient_bands, cosine_factor, irradiance, sh_count
-from wlm.probe.transform import TransformModel
+from wlm.probe.transform import Transform
 from wlm.probe.volume import Volume
 from wlm.probe.walk import camera_path, settle
 from wlm.view.canvas import Canvas, Hit
@@ -63,7 +63,7 @@ class Probes:
     @classmethod
     def of_model(
         cls,
-        model: ProbeModel | TransformModel,
+        model: ProbeModel | Transform,
         position: np.ndarray,
         original: np.ndarray | None,
         live: np.ndarray,

@@ -18,7 +18,7 @@ from wlm.probe.model import ProbeModel
 from wlm.probe.places import ball_exposure, ball_radius, probes_of
 from wlm.probe.shader import probe_glsl
 from wlm.probe.sphere import sh_count
-from wlm.probe.transform import TransformModel
+from wlm.probe.transform import Transform
 from wlm.probe.transform_export import light_bytes, transform_glsl
 from wlm.web.page import Page, pack_triangles
 
@@ -26,7 +26,7 @@ _BANDS = 9  # coefficients that diffuse light needs
 
 
 def probe_page(
-    model: ProbeModel | TransformModel,
+    model: ProbeModel | Transform,
     file_bytes: int,
     *,
     mesh: str | os.PathLike[str] | None = None,
@@ -52,7 +52,7 @@ def probe_page(
         raise WlmError(f"{model.name}: expected spherical harmonics, found {model.outputs} numbers a probe")
     position, values, live = probes_of(model, original, key)
     places = position[live].astype(np.float32)
-    if isinstance(model, TransformModel):
+    if isinstance(model, Transform):
         decoded = model.decoder(position=None if original is None else position).decode_probes()[live]
         content = {"light": light_bytes(model, position[live], decoded)[0]}
         shader, fact = transform_glsl(len(places), model.outputs), ("step", f"{model.head.step:.3g}")
