@@ -23,7 +23,7 @@ from wlm.smoke.data import CHECKPOINT
 
 KILLS = {
     "lightmap compress": 16,
-    "probe compress": 16,
+    "probe compress": 9,
     "atlas compress": 10,
     "atlas compress cascade": 10,
     "smoke simulate": 14,
@@ -108,7 +108,7 @@ def command(request, tmp_path_factory):
         case "probe compress":
             probes = probe_sets.synthetic(300, dead=5)
             save_probes(place / "room.npz", probes.position, probes.values)
-            profile = settings({"name": "tiny", "ratio": 0.1, "hidden": 16, "latent": 4, "steps": 400})
+            profile = settings({"name": "tiny", "ratio": 0.1, "hidden": 16, "latent": 4, "steps": 800})
             words += (place / "room.npz", "--profile", profile, *EVERY)
             return Command(words, "a.wlm", older("probe.wlm"), file_bytes, kept_or_whole, beside)
         case "atlas compress" | "atlas compress cascade":
