@@ -11,7 +11,6 @@ from builders.checks import error_of
 from builders.probe_sets import synthetic
 
 from wlm.errors import WlmError
-from wlm.formats import scratch
 from wlm.probe import data
 from wlm.probe.conventions import CONVENTIONS, from_canonical
 from wlm.probe.data import LARGEST, ProbeSet, from_arrays, load, load_positions, save_probes
@@ -490,15 +489,3 @@ def test_the_demo_set(key):
     assert loaded.warnings == () and loaded.outputs == 27 and 1500 < loaded.probes < 2500
     assert 0.5 * loaded.probes < loaded.live.sum() < loaded.probes
     assert DEMO.stat().st_size < 300_000
-
-
-def test_a_set_that_lies_on_the_disk_is_the_same(tmp_path, monkeypatch):
-    values = np.random.default_rng(0).random((300, 9, 3)).astype(np.float32)
-    values[5], values[7, 2] = 0.0, np.nan
-    np.savez_compressed(tmp_path / "a.npz", position=np.random.default_rng(1).random((300, 3)), sh=values)
-    whole = load(tmp_path / "a.npz")
-    monkeypatch.setattr(scratch, "IN_MEMORY", 1 << 10)
-    monkeypatch.setattr(data, "_ROWS", 64)
-    pieces = load(tmp_path / "a.npz")
-    assert (pieces.source, pieces.warnings) == (whole.source, whole.warnings)
-    np.testing.assert_array_equal(pieces.values, whole.values)

@@ -9,9 +9,10 @@ from builders.probe_sets import synthetic
 
 import wlm
 from wlm.errors import WlmError
+from wlm.formats import scratch
 from wlm.formats.artifact import read_artifact, write_artifact
 from wlm.formats.compact import DATA, HEAD
-from wlm.probe import transform_fit
+from wlm.probe import data, transform_fit
 from wlm.probe.data import from_arrays
 from wlm.probe.regions import RegionModel, Split, members
 
@@ -128,3 +129,15 @@ def test_a_head_that_is_signed_but_wrong_is_one_line(stored, tmp_path):
                 refused += 1
                 assert "\n" not in str(error)
     assert refused > len(head) // 3
+
+
+def test_a_set_that_lies_on_the_disk_is_the_same(tmp_path, monkeypatch):
+    values = np.random.default_rng(0).random((300, 9, 3)).astype(np.float32)
+    values[5], values[7, 2] = 0.0, np.nan
+    np.savez_compressed(tmp_path / "a.npz", position=np.random.default_rng(1).random((300, 3)), sh=values)
+    whole = wlm.probe.load(tmp_path / "a.npz")
+    monkeypatch.setattr(scratch, "IN_MEMORY", 1 << 10)
+    monkeypatch.setattr(data, "_ROWS", 64)
+    pieces = wlm.probe.load(tmp_path / "a.npz")
+    assert (pieces.source, pieces.warnings) == (whole.source, whole.warnings)
+    np.testing.assert_array_equal(pieces.values, whole.values)
