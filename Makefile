@@ -11,6 +11,7 @@ demo: $(STAMP)
 	$(BIN)/python demos/atlas.py
 	$(BIN)/python demos/probe.py
 	$(BIN)/python demos/smoke.py
+	$(BIN)/python demos/smoke_light.py
 	$(BIN)/python demos/smoke_network.py
 	$(BIN)/python demos/ops_march.py
 	$(BIN)/python demos/ops_bc7.py
