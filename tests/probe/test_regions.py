@@ -14,6 +14,7 @@ from wlm.formats.compact import DATA, HEAD
 from wlm.probe import transform_fit
 from wlm.probe.data import from_arrays
 from wlm.probe.regions import RegionModel, Split, members
+from wlm.probe.transform import Places
 
 ASKED = {"region": 256, "target_psnr": 40.0}
 
@@ -64,6 +65,10 @@ def test_a_file_comes_back_in_the_order_of_the_probes(stored, probes, tmp_path):
     np.testing.assert_array_equal(values, model.decoder().decode_probes(probes.position.astype(np.float32)))
     if model.has_positions:
         np.testing.assert_allclose(model.stored_positions(), probes.position, atol=1e-4)
+        # Of these some are on the other side of a plane.
+        assert (model.labels_of(None) != model.split.labels(Places.of(model.stored_positions()).code)).any()
+        assert model.has_probes_at(model.stored_positions()) and model.has_probes_at(probes.position)
+        np.testing.assert_array_equal(model.decoder(position=model.stored_positions()).decode_probes(), values)
         plain = model.without_places()
         assert plain.file_bytes() < model.file_bytes() - 900
         np.testing.assert_array_equal(plain.decoder().decode_probes(probes.position), values)
