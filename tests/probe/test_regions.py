@@ -90,6 +90,14 @@ def test_stored_positions_next_to_a_plane_are_the_models_own(tmp_path):
     np.testing.assert_array_equal(model.decoder().decode_probes(position), values)
 
 
+def test_damage_is_not_taken_for_other_probes(stored, probes):
+    model = wlm.load(stored)
+    piece = model.pieces[1]
+    model = dataclasses.replace(model, pieces=(model.pieces[0], piece._replace(data=piece.data ^ 1), *model.pieces[2:]))
+    with pytest.raises(WlmError, match="a, region 1: damaged"):
+        model.has_probes_at(probes.position)
+
+
 def test_no_border_is_seen_between_regions(stored, probes):
     model = wlm.load(stored)
     given = None if model.has_positions else probes.position

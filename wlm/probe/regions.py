@@ -226,11 +226,18 @@ class RegionModel(Transform):
         return replace(self, has_positions=False, order=order, order_digest=digest(order), pieces=tuple(pieces))
 
     def has_probes_at(self, position: np.ndarray) -> bool:
-        """Whether positions, float64 [M, 3], are those of the model's own probes, in their order."""
-        try:
-            return all(model.has_probes_at(position[part]) for _, part, model in self._regions(position))
-        except WlmError:
+        """Whether positions, float64 [M, 3], are those of the model's own probes, in their order.
+
+        Raises:
+            WlmError: A region is damaged.
+        """
+        if len(position) != self.probes:
             return False
+        if not self.has_positions:
+            counts = np.bincount(self.split.labels(Places.of(position).code), minlength=self.split.regions)
+            if counts.tolist() != [piece.probes for piece in self.pieces]:
+                return False
+        return all(model.has_probes_at(position[part]) for _, part, model in self._regions(position))
 
     @property
     def stored_values(self) -> np.ndarray:
