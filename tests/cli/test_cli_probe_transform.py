@@ -106,6 +106,8 @@ def test_several_hours_in_one_file(folder, tmp_path):
         call("probe", "decode", file, "--time", time, "-o", tmp_path / f"{time}.npz")
     at = {time: load(tmp_path / f"{time}.npz").values for time in (6, 9, 18.5)}
     np.testing.assert_allclose(at[9], 0.76 * at[6] + 0.24 * at[18.5], atol=1e-6)
+    call("web", file, "-o", tmp_path / "day.html")
+    assert "6, of 6, 18.5" in (tmp_path / "day.html").read_text()
     call("probe", "export", file, "--time", 9, "-o", tmp_path / "engine")
     assert json.loads((tmp_path / "engine" / "probe.json").read_text())["time"] == 9.0
     for words, line in (
@@ -113,6 +115,7 @@ def test_several_hours_in_one_file(folder, tmp_path):
         (["decode", folder / "b.wlm", "--time", 9, "-o", tmp_path / "x.npz"], "expected a file of several hours"),
         (["evaluate", file, day, "--time", 9], "expected one of the file's hours to compare with, 6, 18.5, got 9"),
         (["evaluate", file, day, "--volume"], "--time: expected with --baselines"),
+        (["evaluate", file, day, "--time", 6, "--hold-out"], "--hold-out: expected no --time"),
         (["compress", day, "--times", "6,x", "-o", tmp_path / "x.wlm"], "--times: expected hours as 9,12,21.5"),
         (["compress", day, day, "-o", tmp_path / "x.wlm"], "expected one file of probes"),
     ):

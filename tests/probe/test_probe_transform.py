@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import warp as wp
 from builders.probe_sets import synthetic
 
 import wlm
@@ -20,6 +21,7 @@ from wlm.probe.transform_coder import Coders
 from wlm.probe.transform_fit import Frame, Search, Team
 from wlm.probe.tree import RADII, Tree, flat
 from wlm.workers import Here
+from wlm_kernels.probe.mixture import mix
 
 RANDOM = np.random.default_rng(0)
 
@@ -152,6 +154,17 @@ def test_kriging_is_exact_at_places_even_and_without_jumps():
     np.testing.assert_allclose(at(path)[:, 0], 1.0, atol=1e-9)
     # The K nearest change some fifty times on the way: the largest step is no more than a steep slope's.
     assert np.abs(np.diff(at(path)[:, 2])).max() < 5e-3
+
+
+@pytest.mark.parametrize("outputs", [3, 9, 12, 27])
+def test_rows_are_mixed_in_threads_of_one_number_or_nine(outputs):
+    random = np.random.default_rng(outputs)
+    rows, weight = random.normal(size=(30, outputs)), random.normal(size=(50, 12)) * (random.random((50, 12)) < 0.7)
+    index = random.integers(0, 30, (50, 12))
+    inputs = wp.array(rows, dtype=float), wp.array(index, dtype=int), wp.array(weight, dtype=float)
+    out = wp.full((50, outputs), np.nan, dtype=float)
+    mix(*inputs, out)
+    np.testing.assert_allclose(out.numpy(), (weight[:, :, None] * rows[index]).sum(1), atol=1e-5)
 
 
 def test_the_basis_is_orthonormal_and_begins_with_the_directions():

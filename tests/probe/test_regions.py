@@ -15,6 +15,7 @@ from wlm.formats.compact import DATA, HEAD
 from wlm.probe import data, transform_fit
 from wlm.probe.data import from_arrays
 from wlm.probe.regions import RegionModel, Split, members
+from wlm.probe.transform import Places
 
 ASKED = {"region": 256, "target_psnr": 40.0}
 
@@ -65,11 +66,37 @@ def test_a_file_comes_back_in_the_order_of_the_probes(stored, probes, tmp_path):
     np.testing.assert_array_equal(values, model.decoder().decode_probes(probes.position.astype(np.float32)))
     if model.has_positions:
         np.testing.assert_allclose(model.stored_positions(), probes.position, atol=1e-4)
+        assert model.has_probes_at(model.stored_positions()) and model.has_probes_at(probes.position)
+        np.testing.assert_array_equal(model.decoder(position=model.stored_positions()).decode_probes(), values)
         plain = model.without_places()
         assert plain.file_bytes() < model.file_bytes() - 900
         np.testing.assert_array_equal(plain.decoder().decode_probes(probes.position), values)
     with pytest.raises(WlmError, match="expected the positions of its own 900 probes"):
         model.decoder().decode_probes(probes.position[::-1])
+
+
+def test_stored_positions_next_to_a_plane_are_the_models_own(tmp_path):
+    random = np.random.default_rng(0)
+    position = random.random((300, 3)) * [8.0, 3.0, 6.0]
+    # Within some codes of the plane, whichever probe it goes through.
+    position[:200, 0] = 4.0 + random.random(200) * 1e-3
+    probes = from_arrays(position, random.random((300, 3)).astype(np.float32) + 1.0, name="next to a plane")
+    wlm.probe.compress(probes, positions=True, region=256, target_psnr=20.0).save(tmp_path / "a.wlm")
+    model = wlm.load(tmp_path / "a.wlm")
+    stored = model.stored_positions()
+    assert (model.split.labels(Places.of(stored).code) != model.labels_of(None)).any()
+    assert model.has_probes_at(stored) and model.has_probes_at(position) and not model.has_probes_at(stored[:-1])
+    values = model.decoder().decode_probes()
+    np.testing.assert_array_equal(model.decoder(position=stored).decode_probes(stored), values)
+    np.testing.assert_array_equal(model.decoder().decode_probes(position), values)
+
+
+def test_damage_is_not_taken_for_other_probes(stored, probes):
+    model = wlm.load(stored)
+    piece = model.pieces[1]
+    model = dataclasses.replace(model, pieces=(model.pieces[0], piece._replace(data=piece.data ^ 1), *model.pieces[2:]))
+    with pytest.raises(WlmError, match="a, region 1: damaged"):
+        model.has_probes_at(probes.position)
 
 
 def test_no_border_is_seen_between_regions(stored, probes):

@@ -261,6 +261,8 @@ def evaluate(
                 raise WlmError("--time: expected with --baselines, --volume, --views, --mesh and --html")
             evaluate_hours(file, model, sets, json_path, hold_out, device)
             return
+        if hold_out:
+            raise WlmError("--hold-out: expected no --time: all hours of a file are fitted at once")
         stored_time(model, time)
         probes = sets[model.times.index(time)]
         source, shared = joint_source(sets, model.times), len(sets)

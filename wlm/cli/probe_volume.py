@@ -145,7 +145,7 @@ def _volume(
         position, original, live = model.stored_positions(), None, ~model.dead if len(model.dead) else None
     else:
         position, original, live = probes_of(model, probes_path, key)
-    if not model.has_probes_at(position):
+    if probes_path is not None and not model.has_probes_at(position):
         raise WlmError(f"{probes_path}: expected the {model.probes} probes that {file} was made of, in their order")
     budget = BUDGET if budget is None else budget
     return Volume(position, light_of(decoder, position), live=live, block=block, budget=budget), original

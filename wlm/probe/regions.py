@@ -173,19 +173,21 @@ class RegionModel(Transform):
         """The region of each of the model's own probes, int64 [N].
 
         Args:
-            position: float64 [N, 3]; None: as the file states it.
+            position: float64 [N, 3], which count where the file doesn't state the regions; None: it must.
 
         Raises:
             WlmError: None are stored, the file is damaged, or these are others than the model's.
         """
-        if position is None:
-            if not self.has_positions:
-                raise WlmError(NO_POSITIONS.format(self.name))
+        if self.has_positions:
+            # A stored position next to a plane may be rounded to its other side.
             labels = self._labels
+        elif position is None:
+            raise WlmError(NO_POSITIONS.format(self.name))
         else:
             labels = self.split.labels(Places.of(position).code)
+        given = self.probes if position is None else len(position)
         counts = np.bincount(labels, minlength=self.split.regions)
-        if len(labels) != self.probes or counts.tolist() != [piece.probes for piece in self.pieces]:
+        if not given == len(labels) == self.probes or counts.tolist() != [piece.probes for piece in self.pieces]:
             raise WlmError(f"{self.name}: expected the positions of its own {self.probes} probes, in their order")
         return labels
 
@@ -224,11 +226,18 @@ class RegionModel(Transform):
         return replace(self, has_positions=False, order=order, order_digest=digest(order), pieces=tuple(pieces))
 
     def has_probes_at(self, position: np.ndarray) -> bool:
-        """Whether positions, float64 [M, 3], are those of the model's own probes, in their order."""
-        try:
-            return all(model.has_probes_at(position[part]) for _, part, model in self._regions(position))
-        except WlmError:
+        """Whether positions, float64 [M, 3], are those of the model's own probes, in their order.
+
+        Raises:
+            WlmError: A region is damaged.
+        """
+        if len(position) != self.probes:
             return False
+        if not self.has_positions:
+            counts = np.bincount(self.split.labels(Places.of(position).code), minlength=self.split.regions)
+            if counts.tolist() != [piece.probes for piece in self.pieces]:
+                return False
+        return all(model.has_probes_at(position[part]) for _, part, model in self._regions(position))
 
     @property
     def stored_values(self) -> np.ndarray:

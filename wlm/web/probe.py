@@ -11,6 +11,7 @@ import numpy as np
 from wlm.errors import WlmError
 from wlm.formats.geometry import read_geometry
 from wlm.probe.data import load
+from wlm.probe.day import DayModel
 from wlm.probe.decode import Decoder
 from wlm.probe.evaluation import evaluate
 from wlm.probe.exporter import gaussian_bytes, network_bytes
@@ -55,7 +56,7 @@ def probe_page(
     if isinstance(model, Transform):
         decoded = model.decoder(position=None if original is None else position).decode_probes()[live]
         content = {"light": light_bytes(model, position[live], decoded)[0]}
-        shader, fact = transform_glsl(len(places), model.outputs), ("step", f"{model.head.step:.3g}")
+        shader, fact = transform_glsl(len(places), model.outputs), _fact(model)
     else:
         decoded = Decoder(model).decode(position[live])
         content = {"gaussians": gaussian_bytes(model), "network": network_bytes(model)}
@@ -96,6 +97,13 @@ def probe_page(
         score = evaluate(model, load(original, key=key), file_bytes=file_bytes).psnr
         figures.append(("PSNR of coefficients", "–" if math.isnan(score) else f"{score:.2f} dB"))
     return Page("probe", model.name, "Light probes, decoded on this GPU.", figures, manifest, arrays)
+
+
+def _fact(model: Transform) -> tuple[str, str]:
+    """What is said of a transform: its step, or which of its hours it shows."""
+    if isinstance(model, DayModel):
+        return "hour", f"{model.time:g}, of {', '.join(f'{time:g}' for time in model.times)}"
+    return "step", f"{model.head.step:.3g}"
 
 
 def _whole(content: bytes) -> bytes:

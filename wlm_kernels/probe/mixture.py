@@ -1,10 +1,12 @@
-"""Light at points as weighted sums of stored rows: a thread for each number of a point.
+"""Light at points as weighted sums of stored rows: a thread for each number of a point, or for nine of them.
 
 The twin to read first: `wlm.probe.kriging`, whose weights these are. All sums are
 `(weight[:, :, None] * rows[index]).sum(1)`.
 """
 
 import warp as wp
+
+_GROUP = 9  # numbers of a thread: index and weight are read once for all, and L2 in RGB has three groups
 
 
 @wp.kernel(enable_backward=False)
@@ -25,6 +27,27 @@ def _mix(
     out[point, number] = total
 
 
+@wp.kernel(enable_backward=False)
+def _mix_groups(
+    # in:
+    rows: wp.array2d[float],
+    index: wp.array2d[int],
+    weight: wp.array2d[float],
+    # out:
+    out: wp.array2d[float],
+):
+    point, group = wp.tid()
+    total = wp.vector(dtype=float, length=_GROUP)
+    for i in range(index.shape[1]):
+        share = weight[point, i]
+        if share != 0.0:
+            row = index[point, i]
+            for j in range(_GROUP):
+                total[j] += share * rows[row, _GROUP * group + j]
+    for j in range(_GROUP):
+        out[point, _GROUP * group + j] = total[j]
+
+
 def mix(rows: wp.array, index: wp.array, weight: wp.array, out: wp.array) -> None:
     """Sums rows.
 
@@ -34,4 +57,6 @@ def mix(rows: wp.array, index: wp.array, weight: wp.array, out: wp.array) -> Non
         weight: float [M, K].
         out: float [M, D], written.
     """
-    wp.launch(_mix, out.shape, inputs=[rows, index, weight], outputs=[out], device=out.device)
+    points, numbers = out.shape
+    kernel, threads = (_mix, numbers) if numbers % _GROUP else (_mix_groups, numbers // _GROUP)
+    wp.launch(kernel, (points, threads), inputs=[rows, index, weight], outputs=[out], device=out.device)
