@@ -372,6 +372,30 @@ def _gathered(light: wp.array2d[wp.vec3], weight: wp.array2d[float], number: int
     return texels
 
 
+@wp.func
+def _split(texels: _Texels, tables: Tables, whole: _Moments, tried: int) -> wp.vec2:
+    """The partition of the least scatter off its two lines, among those whose bit isn't set in `tried`; and that."""
+    least = float(_HUGE)
+    partition = int(0)
+    for p in range(32):
+        if ((tried >> p) & 1) == 0:
+            second = _moments(texels, tables.masks[p])
+            left = float(0.0)
+            along = float(0.0)
+            for line in range(2):
+                part = second
+                if line == 0:
+                    part = whole - second
+                left += _spread(part)
+                along += _axis_of(part, _POWER_ROUNDS)[3]
+            # Of a line's scatter, an index of three bits leaves 1/49.
+            left = left - along * (48.0 / 49.0)
+            if left < least:
+                least = left
+                partition = p
+    return wp.vec2(float(partition), least)
+
+
 @wp.kernel
 def _encode(
     # in:
@@ -382,50 +406,63 @@ def _encode(
     blocks: wp.array2d[wp.uint32],
     decoded: wp.array2d[wp.vec3],
 ):
-    """One block per thread."""
+    """One block per thread.
+
+    Every function is called at one place, in loops over ways, lines and rounds: compilers inline each call, and ten
+    copies of the same took CUDA's half a minute.
+    """
     number = wp.tid()
     texels = _gathered(light, weight, number)
     whole = _moments(texels, _ALL)
-    ends = _turned(texels, _fitted(texels, _ALL, _Ends(), 0, whole, 15), 0, 0)
-    best = _encoded(texels, tables, ends, _finest(tables, ends, 10, 14, 2), 0)
-    for _round in range(_REFITTED):
-        ends = _turned(texels, _refitted(texels, best, _ALL, ends, 0, 15), 0, 0)
-        other = _encoded(texels, tables, ends, _finest(tables, ends, 10, 14, 2), 0)
-        if other.error < best.error:
-            best = other
-    # Of a line's scatter, an index of four bits leaves 1/225 and one of three 1/49.
-    spread = _axis_of(whole, _AXIS_ROUNDS)[3]
-    alone = _spread(whole) - spread * (224.0 / 225.0)
+    # Of a line's scatter, an index of four bits leaves 1/225.
+    alone = _spread(whole) - _axis_of(whole, _AXIS_ROUNDS)[3] * (224.0 / 225.0)
+    best = Block()
+    best.error = _HUGE
     tried = int(0)  # a bit a partition
-    for _attempt in range(_TRIED):
-        least = float(_HUGE)
+    for attempt in range(1 + _TRIED):  # one line, then two
+        lines = int(1)
+        steps = int(15)
         partition = int(0)
-        for p in range(32):
-            if ((tried >> p) & 1) == 0:
-                second = _moments(texels, tables.masks[p])
-                first = whole - second
-                along = _axis_of(first, _POWER_ROUNDS)[3] + _axis_of(second, _POWER_ROUNDS)[3]
-                left = _spread(first) + _spread(second) - along * (48.0 / 49.0)
-                if left < least:
-                    least = left
-                    partition = p
-        tried = tried | (1 << partition)
-        if least < alone:
-            mask, anchor = tables.masks[partition], tables.anchors[partition]
+        mask = int(0)
+        anchor = int(0)
+        first_mode = int(10)
+        last_mode = int(14)
+        promising = bool(True)
+        if attempt > 0:
+            split = _split(texels, tables, whole, tried)
+            partition = int(split[0])
+            tried = tried | (1 << partition)
+            promising = split[1] < alone
+            lines = 2
+            steps = 7
+            mask = tables.masks[partition]
+            anchor = tables.anchors[partition]
+            first_mode = 0
+            last_mode = 10
+        if promising:
             second = _moments(texels, mask)
-            ends = _fitted(texels, _ALL ^ mask, _Ends(), 0, whole - second, 7)
-            ends = _fitted(texels, mask, ends, 1, second, 7)
-            ends = _turned(texels, _turned(texels, ends, 0, 0), 1, anchor)
-            other = _encoded(texels, tables, ends, _finest(tables, ends, 0, 10, 4), partition)
-            if other.error < best.error:
-                best = other
-            for _round in range(_REFITTED):
-                ends = _refitted(texels, other, _ALL ^ mask, ends, 0, 7)
-                ends = _refitted(texels, other, mask, ends, 1, 7)
-                ends = _turned(texels, _turned(texels, ends, 0, 0), 1, anchor)
-                other = _encoded(texels, tables, ends, _finest(tables, ends, 0, 10, 4), partition)
-                if other.error < best.error:
-                    best = other
+            ends = _Ends()
+            block = Block()
+            for round in range(1 + _REFITTED):
+                for line in range(lines):
+                    own = _ALL ^ mask
+                    part = whole - second
+                    start = int(0)
+                    if line == 1:
+                        own = mask
+                        part = second
+                        start = anchor
+                    if round == 0:
+                        ends = _fitted(texels, own, ends, line, part, steps)
+                    else:
+                        ends = _refitted(texels, block, own, ends, line, steps)
+                    ends = _turned(texels, ends, line, start)
+                mode = _finest(tables, ends, first_mode, last_mode, 2 * lines)
+                block = _encoded(texels, tables, ends, mode, partition)
+                if block.error < best.error:
+                    best = block
+                if lines == 1:
+                    block = best
     for i in range(_TEXELS):
         decoded[number, i] = best.light[i]
     write_block(number, best, tables, blocks)

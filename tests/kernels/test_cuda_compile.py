@@ -27,6 +27,8 @@ MODULES = (
     "atlas.decode",
     "atlas.patch_graph",
     "atlas.patches",
+    "atlas.scene",
+    pytest.param("bc6h", marks=pytest.mark.slow),  # several seconds
     "fluid.advection_places",
     "fluid.grids",
     "fluid.lattice_links",
@@ -47,6 +49,7 @@ MODULES = (
     "probe.volume_weights",
     "raster.gradient",
     "raster.rasterize",
+    "raster.rays",
     "raster.texture",
     "smoke.picture",
     "smoke.shadow",
