@@ -29,7 +29,7 @@ SUPERSAMPLING = 2
 
 _AT_ONCE = 8192  # tiles
 # Rounds of conjugate gradients, from the unweighted solution: of curves, of those of blocks, and of what is stored.
-_ROUGH, _MEDIUM, _FINE = 3, 10, 40
+_ROUGH, _MEDIUM, _FINE = 3, 10, 24
 # A sample that reaches no point with a weight stays near the unweighted solution.
 _RIDGE = 1e-4
 # A bit must save this fraction of the squared range, of one texel of the lightmap: half float's rounding there.
@@ -188,7 +188,7 @@ def solve(tiles: Tiles, nx: int, ny: int, rounds: int = _FINE) -> torch.Tensor:
     Args:
         tiles: T of them.
         nx, ny: Samples along x and y.
-        rounds: Of conjugate gradients.
+        rounds: Of conjugate gradients, at most.
 
     Returns:
         float [T, ny, nx, 3].
@@ -203,7 +203,8 @@ def solve(tiles: Tiles, nx: int, ny: int, rounds: int = _FINE) -> torch.Tensor:
     residual = grid.gathered((light - grid.spread(start)) * weight)
     preconditioned = residual / diagonal
     direction, energy = preconditioned, (residual * preconditioned).sum((2, 3), keepdim=True)
-    for _ in range(rounds):
+    # In exact arithmetic as many rounds as samples are enough.
+    for _ in range(min(rounds, 2 * nx * ny)):
         image = grid.gathered(grid.spread(direction) * weight) + ridge * direction
         step = energy / (direction * image).sum((2, 3), keepdim=True).clamp(min=1e-30)
         change = change + step * direction
