@@ -186,7 +186,7 @@ def test_hard_smoke(device: str):
 
 
 def test_the_noise_of_all_lights_counts_what_they_share(device: str):
-    """Lights that nearly coincide share their paths; the spread between seeds is what is stated, at other albedos too."""
+    """Lights that nearly coincide share their paths; the spread between seeds is as stated, at other albedos too."""
     volume = ball(8, depth=8.0, device=device)
     lights = [Light((0.1 * n, 1.0, 0.2)) for n in range(4)]
     made = [trace(volume, facing(volume, size=8), lights, samples=32, orders=6, seed=seed) for seed in range(16)]

@@ -136,9 +136,9 @@ def trace(
 ) -> None:
     """Trace paths through the smoke: light of every order without bias, with noise, and how much noise there is.
 
-    Without --light, --point and --sky the lights are the scene's, or one from 1,1,1. Hot smoke is lit by its own fire as
-    well, which is grey. Obstacles of a scene absorb all light, and its background isn't drawn. An EXR has R, G and B, R.1, G.1 and
-    B.1 of light scattered once, and so on, and R.noise, G.noise and B.noise.
+    Without --light, --point and --sky the lights are the scene's, or one from 1,1,1. Hot smoke is lit by its own fire
+    as well, which is grey. Obstacles of a scene absorb all light, and its background isn't drawn. An EXR has R, G and
+    B, R.1, G.1 and B.1 of light scattered once, and so on, and R.noise, G.noise and B.noise.
     """
     colour, around = _albedo(albedo), None if sky is None else vector("--sky", sky)
     _check_white(white)

@@ -202,13 +202,13 @@ def trace(
 
 def _require(planes: int, sources: int, view: View, parts: int, at_once: int, device: str) -> None:
     """Checks that what is made of an image fits into the memory before a path is traced."""
-    # The parts that are traced, their sum, what is picked of it and what is added up of that; the means and their spread.
+    # The parts that are traced, their sum, what is picked of it and added up of that; the means and their spread.
     needed = 12 * view.height * view.width * (planes * (at_once + 3) + 3 * sources * parts)
     free = free_memory(wp.get_device(device))
     if needed > free:
         raise WlmError(
-            f"orders: {planes} planes of {view.height} x {view.width} pixels need {needed / 2**30:.1f} GiB on {device}: "
-            f"expected at most the {free / 2**30:.1f} GiB that are free: use fewer orders or pixels"
+            f"orders: {planes} planes of {view.height} x {view.width} pixels need {needed / 2**30:.1f} GiB on {device}:"
+            f" expected at most the {free / 2**30:.1f} GiB that are free: use fewer orders or pixels"
         )
 
 
