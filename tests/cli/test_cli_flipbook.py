@@ -109,7 +109,7 @@ def test_what_is_refused(straight, tmp_path):
     assert "--from: expected one of" in fails(*words[:-1], "unreal", "--cells", "2x2", *out)
     assert "got 3" in fails(*words, *["--with", opacity] * 2, "--cells", "2x2", *out)
     assert "--straight: means nothing without --with" in fails("shade", first, "--straight", *out)
-    assert "--resolution has to be given" in fails(*words, "--cells", "2x2", "--resolution", 8, *out)
+    assert "book: --resolution means nothing" in fails(*words, "--cells", "2x2", "--resolution", 8, *out)
     Image.new("L", (8, 8)).save(tmp_path / "small.png")
     assert "of one size" in fails(*words, "--with", tmp_path / "small.png", "--cells", "2x2", *out)
     assert not list((tmp_path / "out").glob("*"))

@@ -76,6 +76,11 @@ def test_trace_writes_orders_and_noise(volume, tmp_path):
     assert f"{wanted.error:.2%}" in out
 
 
+def test_smoke_too_dense_to_trace_is_named(volume, tmp_path):
+    line = fails("smoke", "trace", volume, "-o", tmp_path / "a.png", *SMALL, "--extinction", 1e9)
+    assert str(volume) in line and "optical depth" in line
+
+
 def test_frames_keep_their_obstacles_and_lights(tmp_path):
     folder = write_frames(tmp_path / "a", obstacles=[SPHERE], frames=2).path
     call("smoke", "light", folder, "-o", tmp_path / "lit", "--resolution", 24)

@@ -51,6 +51,14 @@ def test_point_lights_against_the_tracer(device: str, inside: bool):
     assert not made[..., 2].any()
 
 
+@pytest.mark.parametrize("z", [4.0, 4.5])
+def test_a_point_light_at_a_sample_is_no_brighter_than_beside_it(device: str, z: float):
+    volume = from_array(np.ones((9, 9, 9), np.float32), extinction=0.05, device=device)
+    camera = Camera.around(volume, toward=(0, 0, 1), pixels=9)
+    made = light_smoke(volume, camera, [PointLight((4.5, 4.5, z))], March(step=1.0, jitter=0.0)).planes
+    assert 0.05 < float(made.max()) < 2.0
+
+
 def test_the_whole_picture_is_the_tracers(device: str):
     """Two lights in colour, albedo in colour, emission and background: as the first order that is traced."""
     volume = make_plume(28, hot=True, extinction=8.0, device=device)

@@ -131,6 +131,13 @@ def test_a_blur_keeps_light_and_spreads_it(sigma: float):
     assert torch.equal(shift(plane, 3.0, -2.0)[0] > 0.5, torch.roll(plane[0] > 0.5, (2, -3), (0, 1)))
 
 
+@pytest.mark.parametrize("sigma", [30.0, 1e3, 1e7])
+def test_a_blur_wider_than_the_image(sigma: float):
+    """An image of ones, outside of which there is nothing: in its middle what the Gaussian has over it."""
+    made = blur(torch.ones(1, 16, 16), sigma)
+    assert float(made[0, 8, 8]) == pytest.approx(math.erf(8 / (sigma * math.sqrt(2))) ** 2, rel=0.1)
+
+
 def test_hard_smoke(device: str):
     """No smoke, albedo 0 and in colour, smoke ten times as thick as any that was learned, and half floats."""
     camera = Camera.around(plume(), pixels=12)

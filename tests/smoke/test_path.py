@@ -185,6 +185,24 @@ def test_hard_smoke(device: str):
     assert torch.equal(first.planes, again.planes) and not torch.equal(first.planes, other.planes)
 
 
+def test_the_noise_of_all_lights_counts_what_they_share(device: str):
+    """Lights that nearly coincide share their paths; the spread between seeds is as stated, at other albedos too."""
+    volume = ball(8, depth=8.0, device=device)
+    lights = [Light((0.1 * n, 1.0, 0.2)) for n in range(4)]
+    made = [trace(volume, facing(volume, size=8), lights, samples=32, orders=6, seed=seed) for seed in range(16)]
+    spread = torch.stack([each.total for each in made]).var(0).mean()
+    stated = torch.stack([each.total_noise.square() for each in made]).mean()
+    assert 0.7 < float(stated / spread) < 1.4
+    darker = made[0].with_albedo((0.1, 0.1, 0.1))
+    assert darker.error == pytest.approx(float(darker.total_noise.norm() / darker.total.norm()), rel=1e-4)
+
+
+def test_planes_beyond_the_memory_are_refused_before_they_are_made():
+    volume = ball(4)
+    with pytest.raises(WlmError, match=r"orders: .* planes of 16384 x 16384 pixels need .* fewer orders or pixels"):
+        trace(volume, facing(volume, size=16384), [Light(WAY)], samples=2, orders=1000)
+
+
 @pytest.mark.slow
 def test_half_floats_are_traced_as_floats(device: str):
     camera = facing(ball(), size=6)

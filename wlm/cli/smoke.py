@@ -389,7 +389,9 @@ def _source(
     if baked is not None:
         changes = options.given() | {"step": step, "supersample": supersample}
         if option := next((name for name, value in changes.items() if value is not None), None):
-            raise WlmError(f"{smoke}: was baked: --{option} has to be given to bake")
+            kind = "was baked" if book is None else "is a flip book"
+            remedy = "has to be given to bake" if book is None else "means nothing for it"
+            raise WlmError(f"{smoke}: {kind}: --{option} {remedy}")
         return baked
     frames = options.open(smoke)
     return FramesToBake(frames, options.camera(frames), step or default_step, supersample or 1)

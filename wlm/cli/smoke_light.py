@@ -136,8 +136,9 @@ def trace(
 ) -> None:
     """Trace paths through the smoke: light of every order without bias, with noise, and how much noise there is.
 
-    Hot smoke is lit by its own fire as well. Obstacles of a scene absorb all light. An EXR has R, G and B, R.1, G.1 and
-    B.1 of light scattered once, and so on, and R.noise, G.noise and B.noise.
+    Without --light, --point and --sky the lights are the scene's, or one from 1,1,1. Hot smoke is lit by its own fire
+    as well, which is grey. Obstacles of a scene absorb all light, and its background isn't drawn. An EXR has R, G and
+    B, R.1, G.1 and B.1 of light scattered once, and so on, and R.noise, G.noise and B.noise.
     """
     colour, around = _albedo(albedo), None if sky is None else vector("--sky", sky)
     _check_white(white)
@@ -169,7 +170,10 @@ def trace(
             if scene is not None and scene.obstacles:
                 solid = obstacle_mesh(scene.obstacles, frames.time(frame))[:2]
             extra = {"environment": environment, "obstacles": solid, "highest": HIGHEST if highest is None else highest}
-            made = trace(volume, view, lamps, **settings, **extra, progress=progress)
+            try:
+                made = trace(volume, view, lamps, **settings, **extra, progress=progress)
+            except WlmError as error:
+                raise WlmError(f"{frames.file(frame)}: {error}") from error
             path, image = file(frame), made.total
             if as_exr:
                 _write_exr(path, made)
@@ -180,7 +184,7 @@ def trace(
                 escape(path.name),
                 number(float(image.mean()), ".4g"),
                 number(float(image.max()), ".4g"),
-                "" if orders != 1 else f"{more:.1%}",
+                "" if orders < 1 else f"{more:.1%}",
                 f"{made.error:.2%}",
             )
     show(rows)
@@ -198,7 +202,7 @@ def _write_exr(path: Path, made: "Transport") -> None:
     from wlm.formats.exr_planes import write_planes
 
     orders = made.planes.sum(0).cpu().numpy()
-    noise = made.noise.square().sum(0).sqrt().cpu().numpy()
+    noise = made.total_noise.cpu().numpy()
     planes = {}
     for channel, letter in enumerate("RGB"):
         planes[letter] = orders[..., channel].sum(0)

@@ -217,9 +217,10 @@ def light_kernels(dtype: Any) -> _Kernels:
                         light += share * wp.vec2(forth * wp.exp(-depths[0]), back * wp.exp(-depths[1]))
                     else:
                         way = lattice.place - p
-                        away = wp.max(wp.length(way), lattice.radius)
+                        # Closer than half a step the sample would stand for far more light than its step has.
+                        away = wp.max(wp.length(way), wp.max(lattice.radius, 0.5 * r.length))
                         share = share * phase(march.g, wp.dot(wp.normalize(way), r.direction))
-                        light += wp.vec2(share * wp.exp(-depths[0]) / wp.max(away * away, 1.0e-12), 0.0)
+                        light += wp.vec2(share * wp.exp(-depths[0]) / (away * away), 0.0)
                     tau += x
                     if wp.exp(-tau) < march.cutoff:
                         break

@@ -71,14 +71,18 @@ def blur(planes: torch.Tensor, sigma: float) -> torch.Tensor:
         return planes
     height, width = planes.shape[-2:]
     # A wide one at a lower resolution.
-    factor = 1 << max(int(math.log2(sigma)) - 1, 0)
+    most = max(planes.shape[-2:])
+    factor = 1 << min(max(int(math.log2(sigma)) - 1, 0), most.bit_length())
     small = planes[None]
     if factor > 1:
         small = F.avg_pool2d(F.pad(small, (0, -width % factor, 0, -height % factor)), factor)
         sigma = math.sqrt(max(sigma**2 - (factor**2 - 1) / 12.0, 0.0)) / factor
     reach = max(math.ceil(3.0 * sigma), 1)
-    kernel = torch.exp(-0.5 * (torch.arange(-reach, reach + 1, device=planes.device) / sigma) ** 2)
-    kernel = (kernel / kernel.sum()).to(planes)
+    # Of a blur far wider than the image only the middle of the kernel meets it.
+    near = min(reach, max(small.shape[-2:]))
+    kernel = torch.exp(-0.5 * (torch.arange(-near, near + 1, device=planes.device) / sigma) ** 2)
+    kernel = (kernel / (kernel.sum() if near == reach else sigma * math.sqrt(2.0 * math.pi))).to(planes)
+    reach = near
     small = F.conv2d(small.transpose(0, 1), kernel.reshape(1, 1, 1, -1), padding=(0, reach))
     small = F.conv2d(small, kernel.reshape(1, 1, -1, 1), padding=(reach, 0)).transpose(0, 1)
     if factor > 1:

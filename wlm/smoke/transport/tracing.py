@@ -13,12 +13,12 @@ import warp as wp
 
 from wlm.errors import WlmError
 from wlm.fluid.volume import DensityVolume
-from wlm.interop import device_name, stream, to_warp, torch_memory
+from wlm.interop import device_name, free_memory, stream, to_warp, torch_memory
 from wlm.smoke.camera import Camera
 from wlm.smoke.transport.lights import AnyLight, Environment, checked_albedo, in_voxels
 from wlm.system import Meter, OnProgress
 from wlm_kernels.smoke import path
-from wlm_kernels.smoke.march import Medium
+from wlm_kernels.smoke.march import Medium, View
 
 HIGHEST = 100_000
 """Scatterings after which a path ends whatever is left of its light."""
@@ -38,7 +38,8 @@ class Transport:
             once, twice and so on, and last all that was scattered more than `orders` times.
         sources: The lights by number, "light 1" and so on, "environment" and "emission".
         noise: float32 tensor [S, H, W, 3], the standard error of each source's sum over its planes.
-        error: Root of the mean square of the standard error of `total`, over that of `total`; 0 of a black picture.
+        total_noise: float32 tensor [H, W, 3], the standard error of `total`; sources share their paths, so that it is
+            more than the root of the sum of the squares of theirs.
         albedo: R, G, B.
         camera: The view.
         samples: Paths a pixel.
@@ -47,7 +48,7 @@ class Transport:
     planes: torch.Tensor
     sources: tuple[str, ...]
     noise: torch.Tensor
-    error: float
+    total_noise: torch.Tensor
     albedo: tuple[float, float, float]
     camera: Camera
     samples: int
@@ -61,6 +62,12 @@ class Transport:
     def total(self) -> torch.Tensor:
         """All light of all sources, [H, W, 3]."""
         return self.planes.sum((0, 1))
+
+    @property
+    def error(self) -> float:
+        """Root of the mean square of the standard error of `total`, over that of `total`; 0 of a black picture."""
+        power = float(self.total.double().square().mean())
+        return math.sqrt(float(self.total_noise.double().square().mean()) / power) if power > 0 else 0.0
 
     def up_to(self, order: int) -> torch.Tensor:
         """Light scattered at most so often, of each source, [S, H, W, 3].
@@ -90,9 +97,13 @@ class Transport:
         powers = ratio ** torch.arange(self.orders + 1, device=ratio.device, dtype=ratio.dtype)[:, None]
         planes = torch.zeros_like(self.planes)
         planes[:, :-1] = self.planes[:, :-1] * powers[:, None, None]
-        before = self.planes.sum(1)
-        noise = self.noise * torch.where(before > 0, planes.sum(1) / before.clamp(min=1e-30), 0.0)
-        return replace(self, planes=planes, noise=noise, albedo=tuple(map(float, wanted)))
+
+        def scaled(noise: torch.Tensor, before: torch.Tensor, after: torch.Tensor) -> torch.Tensor:
+            return noise * torch.where(before > 0, after / before.clamp(min=1e-30), 0.0)
+
+        noise = scaled(self.noise, self.planes.sum(1), planes.sum(1))
+        total_noise = scaled(self.total_noise, self.total, planes.sum((0, 1)))
+        return replace(self, planes=planes, noise=noise, total_noise=total_noise, albedo=tuple(map(float, wanted)))
 
 
 def trace(
@@ -131,7 +142,7 @@ def trace(
 
     Raises:
         ValueError: A setting is out of its range.
-        WlmError: The smoke is so dense that paths would hardly end.
+        WlmError: The smoke is so dense that paths would hardly end, or the planes don't fit into the memory.
     """
     if not -1 < g < 1:
         raise ValueError(f"g: expected a number within -1 and 1, got {g}")
@@ -165,6 +176,7 @@ def trace(
         sources, kept = len(lights) + 2, orders + 2
         planes = sources * kept
         at_once = 1 if device == "cpu" else max(1, min(parts, _BYTES // (12 * planes * view.height * view.width)))
+        _require(planes, sources, view, parts, at_once, device)
         total = torch.zeros((sources, kept, view.height, view.width, 3), device=volume.device)
         means = []
         meter = Meter(progress, "trace", parts)
@@ -178,29 +190,35 @@ def trace(
             total += each.sum(0)
             means.append(each.sum(2))
             meter.report(first + count)
-        noise, error = _noise(torch.cat(means), samples)
+        means = torch.cat(means)
+        noise, total_noise = _noise(means, samples), _noise(means.sum(1), samples)
     names = [f"light {n + 1}" for n in range(len(lights))] + ["environment", "emission"]
     there = [*range(len(lights)), *([len(lights)] * (environment is not None))]
     there += [len(lights) + 1] * (volume.temperature is not None)
     picked = torch.tensor(there, dtype=torch.long, device=volume.device)
     chosen = tuple(names[n] for n in there)
-    return Transport(total[picked], chosen, noise[picked], error, tuple(map(float, colour)), camera, samples)
+    return Transport(total[picked], chosen, noise[picked], total_noise, tuple(map(float, colour)), camera, samples)
 
 
-def _noise(means: torch.Tensor, samples: int) -> tuple[torch.Tensor, float]:
-    """Standard errors [S, H, W, 3] of the sum over parts [P, S, H, W, 3], and the relative one of the whole picture."""
+def _require(planes: int, sources: int, view: View, parts: int, at_once: int, device: str) -> None:
+    """Checks that what is made of an image fits into the memory before a path is traced."""
+    # The parts that are traced, their sum, what is picked of it and added up of that; the means and their spread.
+    needed = 12 * view.height * view.width * (planes * (at_once + 3) + 3 * sources * parts)
+    free = free_memory(wp.get_device(device))
+    if needed > free:
+        raise WlmError(
+            f"orders: {planes} planes of {view.height} x {view.width} pixels need {needed / 2**30:.1f} GiB on {device}:"
+            f" expected at most the {free / 2**30:.1f} GiB that are free: use fewer orders or pixels"
+        )
+
+
+def _noise(means: torch.Tensor, samples: int) -> torch.Tensor:
+    """Standard errors [...] of the sum over parts [P, ...]."""
     parts = len(means)
     counts = torch.tensor([samples // parts + (n < samples % parts) for n in range(parts)])
-    share = (counts.double() / samples).to(means).reshape(-1, 1, 1, 1)
-
-    def error(each: torch.Tensor) -> torch.Tensor:
-        weight = share.reshape(-1, *[1] * (each.ndim - 1))
-        off = each - weight * each.sum(0)
-        return (off.square().sum(0) * (parts / (parts - 1))).sqrt()
-
-    whole = means.sum(1)
-    power = float(whole.sum(0).double().square().mean())
-    return error(means), math.sqrt(float(error(whole).double().square().mean()) / power) if power > 0 else 0.0
+    weight = (counts.double() / samples).to(means).reshape(-1, *[1] * (means.ndim - 1))
+    off = means - weight * means.sum(0)
+    return (off.square().sum(0) * (parts / (parts - 1))).sqrt()
 
 
 def _mesh(obstacles: tuple[np.ndarray, np.ndarray], volume: DensityVolume, device: str) -> wp.Mesh:
