@@ -13,9 +13,10 @@ from wlm.config import check_settings
 from wlm.formats.artifact import Artifact
 from wlm.formats.deflate import inflate
 from wlm.formats.parts import Part, check_part, check_parts
+from wlm.lightmap.deflated import SIZES, TILES, inflate_tiles
 from wlm.lightmap.frame_packing import FRAME_SIZES, FRAMES, pack_frames, unpack_frames
-from wlm.lightmap.model import LightmapModel, Profile, part_table
-from wlm.lightmap.packing import PACKED, SIZES, TILES, pack_tiles, unpack_tiles
+from wlm.lightmap.model import LightmapModel, Profile, TimeAxis, part_table
+from wlm.lightmap.packing import PACKED, STREAM_SIZES, TILE_STREAMS, pack_tiles, unpack_tiles
 from wlm.lightmap.tiles import TileGrid, TileKind
 from wlm.system import Header, Name
 
@@ -47,7 +48,7 @@ def encode(model: LightmapModel) -> tuple[dict[str, Any], dict[str, np.ndarray],
     plain = {name: value for name, value in model.parts.items() if name not in (*PACKED, "frames")}
     parts = {name: value for name, value in plain.items() if value.size}
     if len(model.mapped):
-        parts |= pack_tiles(model.parts, model.profile, model.kind, model.mask)
+        parts |= pack_tiles(model.parts, model.profile, model.kind, model.mask, model.axis)
     if len(model.frames):
         parts |= pack_frames(model.frames, model.kind, model.mask)
     if not model.mask.all():
@@ -81,7 +82,12 @@ def decode(artifact: Artifact) -> LightmapModel:
     if "tiles" in others or "sizes" in others:
         packed = check_part(others, "tiles", TILES), check_part(others, "sizes", SIZES)
         others = {name: part for name, part in others.items() if name not in ("tiles", "sizes")}
-        others |= unpack_tiles(*packed, table, header.profile, kind, mask)
+        others |= inflate_tiles(*packed, table, header.profile, kind, mask)
+    if "streams" in others or "stream_sizes" in others:
+        packed = check_part(others, "streams", TILE_STREAMS), check_part(others, "stream_sizes", STREAM_SIZES)
+        others = {name: part for name, part in others.items() if name not in ("streams", "stream_sizes")}
+        axis = TimeAxis(times, header.period, header.profile.time_axis, header.profile.interpolation)
+        others |= unpack_tiles(*packed, table, header.profile, kind, mask, axis)
     if "frames" in others or "frame_sizes" in others:
         packed = check_part(others, "frames", FRAMES), check_part(others, "frame_sizes", FRAME_SIZES)
         others = {name: part for name, part in others.items() if name != "frame_sizes"}

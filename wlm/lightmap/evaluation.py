@@ -330,10 +330,10 @@ def part_bytes(model: LightmapModel, file_bytes: int) -> dict[str, int]:
     Raises:
         ValueError: `file_bytes` is less than the parts take.
     """
-    stored, unnamed = encode(model)[1], ("tiles", "sizes", "frame_sizes", "video_sizes")
+    stored, unnamed = encode(model)[1], ("streams", "stream_sizes", "frame_sizes", "video_sizes")
     parts = {name: value.nbytes for name, value in stored.items() if name not in unnamed}
-    if "sizes" in stored:
-        parts |= zip(STREAMS, stored["sizes"].sum(0, dtype=int).tolist(), strict=True)
+    if "stream_sizes" in stored:
+        parts |= zip(STREAMS, stored["stream_sizes"].sum(0, dtype=int).tolist(), strict=True)
     parts["header"] = file_bytes - sum(parts.values())
     if parts["header"] < 0:
         raise ValueError(f"file_bytes: expected at least {file_bytes - parts['header']}, got {file_bytes}")

@@ -17,7 +17,8 @@ from wlm.lightmap.dispatch import Batch, Dispatch
 from wlm.lightmap.frame_packing import needed_blocks
 from wlm.lightmap.frames import choose_frames, encode_frames, missing_encoder
 from wlm.lightmap.model import LightmapModel, Profile, decode_scale, encode_scale, part_table
-from wlm.lightmap.packing import check_packable, clear_unused
+from wlm.lightmap.packing import check_packable, clear_unread
+from wlm.lightmap.reads import Reads
 from wlm.lightmap.targets import Targets
 from wlm.lightmap.tiles import (
     TILE,
@@ -380,12 +381,17 @@ class _Fit:
 
     def store(self, batch: Batch, parts: dict[str, np.ndarray]) -> None:
         """Puts the maps and networks of a batch into the model."""
-        for row, blocks in zip(batch.rows, parts["uv"], strict=True):
+        dynamic = batch.kind == TileKind.DYNAMIC
+        maps = ("uv", "uvt", "ut", "vt") if dynamic else ("uv",)
+        for i, row in enumerate(batch.rows):
             used = valid_texels(self.model.mask, int(self.index[row]))
-            self.model.uv[np.searchsorted(self._mapped, row)] = clear_unused(blocks, used)
-        for name in parts.keys() - {"uv"}:
-            target = "net_static" if batch.kind == TileKind.STATIC else name
-            getattr(self.model, target)[batch.first : batch.first + len(batch.rows)] = parts[name]
+            reads = Reads.of(used, self.profile, self.model.axis) if dynamic else None
+            cleared = clear_unread({name: parts[name][i] for name in maps}, used, reads)
+            self.model.uv[np.searchsorted(self._mapped, row)] = cleared.pop("uv")
+            for name, values in cleared.items():
+                getattr(self.model, name)[batch.first + i] = values
+        nets = self.model.net if dynamic else self.model.net_static
+        nets[batch.first : batch.first + len(batch.rows)] = parts["net"]
 
 
 def _constants(facts: Sequence[_Facts], times: int) -> np.ndarray:

@@ -1,13 +1,12 @@
-"""Each tile's maps and network as deflated streams, one after another: a tile is read, and streamed, alone.
+"""Each tile's maps and network as streams, one after another: a tile is read, and streamed, alone.
 
-A block of BC7 mode 6 is a picture of 16 indices in 4 bits and ten numbers of 7 bits and 1 bit, which have nothing in
-common: they are taken apart, the same number of all blocks side by side. Blocks that hold no valid texel, and indices
-of texels that aren't valid, come last; a fit leaves these at zero, so that they take up next to nothing.
+A stream is a byte and what an adaptive arithmetic coder (`wlm.lightmap.streams`) makes of the rest: F_uv and F_uvt block
+by block, F_ut, F_vt, and the bytes of the network. It leaves out what no valid texel reads at a time that is evaluated,
+which a fit sets to zero; where one of these isn't zero it holds everything.
 
-The streams of a tile, those that it has, are in the order of `STREAMS`; each is a zlib stream.
+The streams of a tile, those that it has, are in the order of `STREAMS`.
 """
 
-import zlib
 from collections.abc import Mapping
 from typing import Any
 
@@ -15,36 +14,47 @@ import numpy as np
 
 from wlm.errors import WlmError
 from wlm.formats.bc7 import pack_mode6, unpack_mode6
-from wlm.formats.deflate import inflate
 from wlm.formats.parts import Part
-from wlm.lightmap.model import Profile
+from wlm.lightmap.model import Profile, TimeAxis
+from wlm.lightmap.reads import Reads
+from wlm.lightmap.streams import BlockGrid, code_blocks, code_bytes, code_plane, read_blocks, read_bytes, read_plane
 from wlm.lightmap.tiles import TILE, TileKind, valid_texels
 from wlm.lightmap.weights import pack_net, packed_bytes, unpack_net
+from wlm.workers import each
 
-STREAMS = ("uv ends", "uv indices", "uvt ends", "uvt indices", "ut", "vt", "net")
-"""The streams of a tile; a static one has the first two and the last."""
+STREAMS = ("uv", "uvt", "ut", "vt", "net")
+"""The streams of a tile; a static one has the first and the last."""
 
 PACKED = ("uv", "uvt", "ut", "vt", "net", "net_static")
 """The parts of a model that are packed."""
 
-TILES = Part(np.uint8, (None,))
-SIZES = Part(np.uint32, (None, len(STREAMS)))
+TILE_STREAMS = Part(np.uint8, (None,))
+STREAM_SIZES = Part(np.uint32, (None, len(STREAMS)))
 
-_STATIC = ("uv ends", "uv indices", "net")
-_NONE = np.empty(0, np.uint8)
+_STATIC = ("uv", "net")
 
 
-def clear_unused(uv: np.ndarray, used: np.ndarray) -> np.ndarray:
-    """Sets what decodes to no valid texel to zero: the blocks without one, and the other texels' indices.
+def clear_unread(parts: Mapping[str, np.ndarray], used: np.ndarray, reads: Reads | None) -> dict[str, np.ndarray]:
+    """Sets what decodes to no valid texel to zero, and the ends of a block in an order that is cheap to code.
 
     Args:
-        uv: Blocks of F_uv, uint8 [32, 32, 16].
+        parts: `uv`, uint8 [32, 32, 16], and of a dynamic tile `uvt`, `ut` and `vt`.
         used: bool [128, 128], the tile's valid texels.
+        reads: What a dynamic tile reads; None: the tile is static.
+
+    Returns:
+        The same parts, which decode to the same light.
     """
-    ends, bits, indices = _parts_of(uv.reshape(-1, 16))
-    texels = _by_block(used)
-    blocks = texels.any(1)
-    return _blocks_of(ends * blocks[:, None], bits * blocks[:, None], indices * texels).reshape(uv.shape)
+    result = dict(parts)
+    result["uv"] = _cleared(parts["uv"].reshape(-1, 16), by_block(used)).reshape(parts["uv"].shape)
+    if reads is None:
+        return result
+    blocks = by_block(reads.texels)
+    texels = (reads.slices[:, None, None] & blocks).reshape(-1, 16)
+    result["uvt"] = _cleared(parts["uvt"].reshape(-1, 16), texels).reshape(parts["uvt"].shape)
+    for name, columns in zip(("ut", "vt"), reads.columns, strict=True):
+        result[name] = parts[name] * (reads.rows[:, None] & columns)[..., None]
+    return result
 
 
 def check_packable(parts: Mapping[str, np.ndarray], profile: Profile, dynamic: bool) -> None:
@@ -59,14 +69,14 @@ def check_packable(parts: Mapping[str, np.ndarray], profile: Profile, dynamic: b
         WlmError: A block isn't of BC7 mode 6, or a network not on the levels that the settings say.
     """
     for name in ("uv", "uvt") if dynamic else ("uv",):
-        _parts_of(parts[name].reshape(-1, 16))
+        _unpacked(parts[name].reshape(-1, 16))
     if profile.net_bits == 8:
         for net in parts["net"]:
             pack_net(net, profile.inputs(dynamic), profile.hidden)
 
 
 def pack_tiles(
-    parts: Mapping[str, np.ndarray], profile: Profile, kind: np.ndarray, mask: np.ndarray
+    parts: Mapping[str, np.ndarray], profile: Profile, kind: np.ndarray, mask: np.ndarray, axis: TimeAxis
 ) -> dict[str, np.ndarray]:
     """Packs the maps and networks of all tiles.
 
@@ -75,51 +85,58 @@ def pack_tiles(
         profile: The settings.
         kind: uint8 [tiles], `TileKind` of each tile of the grid.
         mask: bool [H, W], true where a texel is valid.
+        axis: The time axis.
 
     Returns:
-        `tiles`, uint8 [bytes], and `sizes`, uint32 [N_m, 7], the bytes of each stream, 0 of those that a tile lacks.
+        `streams`, uint8 [bytes], and `stream_sizes`, uint32 [N_m, 5], the bytes of each stream, 0 of those that a tile
+        lacks.
 
     Raises:
         WlmError: A block isn't of BC7 mode 6, or a network not on the levels that the settings say.
     """
-    streams, sizes = [], []
-    for place, number, row in _mapped(kind):
-        raw = dict.fromkeys(STREAMS, _NONE)
-        raw["uv ends"], raw["uv indices"] = _packed_blocks(parts["uv"][place], valid_texels(mask, number))
-        if kind[number] == TileKind.DYNAMIC:
-            raw["uvt ends"], raw["uvt indices"] = _packed_blocks(parts["uvt"][row])
-            raw |= {name: np.moveaxis(parts[name][row], 2, 0) for name in ("ut", "vt")}
-        dynamic = bool(kind[number] == TileKind.DYNAMIC)
+
+    def packed(tile: tuple[int, int, int]) -> list[bytes]:
+        place, number, row = tile
+        dynamic, used = bool(kind[number] == TileKind.DYNAMIC), valid_texels(mask, number)
+        streams = dict.fromkeys(STREAMS, b"")
+        streams["uv"] = code_blocks(*_unpacked(parts["uv"][place].reshape(-1, 16)), _grid(used))
+        if dynamic:
+            reads = Reads.of(used, profile, axis)
+            streams["uvt"] = code_blocks(*_unpacked(parts["uvt"][row].reshape(-1, 16)), _grid(reads.texels, reads.slices))
+            for name, columns in zip(("ut", "vt"), reads.columns, strict=True):
+                streams[name] = code_plane(parts[name][row], reads.rows, columns)
         net = parts["net" if dynamic else "net_static"][row]
         if profile.net_bits == 8:
-            raw["net"] = pack_net(net, profile.inputs(dynamic), profile.hidden)
-        else:  # the high bytes of half floats are alike, the low ones noise
-            raw["net"] = net.view(np.uint8).reshape(-1, 2).T
-        packed = [
-            zlib.compress(np.ascontiguousarray(values).tobytes(), 9) if values.size else b"" for values in raw.values()
-        ]
-        streams += packed
-        sizes.append([len(stream) for stream in packed])
+            values = pack_net(net, profile.inputs(dynamic), profile.hidden)
+        else:
+            values = net.view(np.uint8).reshape(-1, 2).T.ravel()
+        streams["net"] = code_bytes(values, _classes(profile, dynamic))
+        return [streams[name] for name in STREAMS]
+
+    tiles = list(each(packed, mapped_tiles(kind)))
     return {
-        "tiles": np.frombuffer(b"".join(streams), np.uint8),
-        "sizes": np.array(sizes, np.uint32).reshape(-1, len(STREAMS)),
+        "streams": np.frombuffer(b"".join(stream for tile in tiles for stream in tile), np.uint8),
+        "stream_sizes": np.array([[len(stream) for stream in tile] for tile in tiles], np.uint32).reshape(
+            -1, len(STREAMS)
+        ),
     }
 
 
 def unpack_tiles(
-    tiles: np.ndarray,
+    streams: np.ndarray,
     sizes: np.ndarray,
     table: Mapping[str, Part],
     profile: Profile,
     kind: np.ndarray,
     mask: np.ndarray,
+    axis: TimeAxis,
 ) -> dict[str, np.ndarray]:
     """Reads what `pack_tiles` wrote.
 
     Args:
-        tiles, sizes: Its result.
+        streams, sizes: Its result.
         table: The parts, with the sizes that they must have.
-        profile, kind, mask: As for `pack_tiles`.
+        profile, kind, mask, axis: As for `pack_tiles`.
 
     Returns:
         `uv`, `uvt`, `ut`, `vt`, `net` and `net_static`.
@@ -127,100 +144,97 @@ def unpack_tiles(
     Raises:
         ValueError: The streams aren't those of these tiles.
     """
-    mapped = _mapped(kind)
-    if len(sizes) != len(mapped) or int(sizes.sum(dtype=np.uint64)) != len(tiles):
-        raise ValueError(f"part sizes: expected those of {len(mapped)} tiles and {len(tiles)} bytes, found others")
+    mapped = mapped_tiles(kind)
+    if len(sizes) != len(mapped) or int(sizes.sum(dtype=np.uint64)) != len(streams):
+        raise ValueError(
+            f"part stream_sizes: expected those of {len(mapped)} tiles and {len(streams)} bytes, found others"
+        )
     parts = {name: np.empty(table[name].shape, table[name].dtype) for name in PACKED}
     ends = np.cumsum(sizes.astype(np.int64).ravel()).reshape(sizes.shape)
-    for (place, number, row), last, size in zip(mapped, ends, sizes.astype(np.int64), strict=True):
-        streams = {name: tiles[b - n : b] for name, b, n in zip(STREAMS, last, size, strict=True)}
-        dynamic = kind[number] == TileKind.DYNAMIC
+
+    def unpack(job: tuple[tuple[int, int, int], np.ndarray, np.ndarray]) -> None:
+        (place, number, row), last, size = job
+        dynamic, used = bool(kind[number] == TileKind.DYNAMIC), valid_texels(mask, number)
+        own = {name: streams[b - n : b] for name, b, n in zip(STREAMS, last, size, strict=True)}
         for name in STREAMS:
-            if len(streams[name]) and not dynamic and name not in _STATIC:
-                raise ValueError(f"part tiles: tile {number} is static, and has the stream {name}")
+            if (len(own[name]) > 0) != (dynamic or name in _STATIC):
+                found = "has none" if dynamic or name in _STATIC else "is static, and has one"
+                raise ValueError(f"part streams: tile {number}: {name}: {found}")
 
-        def read(name: str, count: int, of: dict[str, np.ndarray] = streams, at: int = number) -> np.ndarray:
-            return _inflated(of[name], count, f"part tiles: tile {at}: {name}")
+        def read(name: str, call: Any, *arguments: Any) -> Any:
+            try:
+                return call(own[name], *arguments)
+            except ValueError as error:
+                raise ValueError(f"part streams: tile {number}: {name}: {error}") from error
 
-        parts["uv"][place] = _unpacked_blocks(read, "uv", TILE * TILE // 16, valid_texels(mask, number)).reshape(
-            32, 32, 16
-        )
+        parts["uv"][place] = pack_mode6(*read("uv", read_blocks, _grid(used))).reshape(32, 32, 16)
         net = "net" if dynamic else "net_static"
         if dynamic:
-            shape = parts["uvt"].shape[1:]
-            parts["uvt"][row] = _unpacked_blocks(read, "uvt", int(np.prod(shape[:-1]))).reshape(shape)
-            for name in ("ut", "vt"):
-                rows, columns = parts[name].shape[1:3]
-                parts[name][row] = np.moveaxis(read(name, rows * columns * 2).reshape(2, rows, columns), 0, 2)
+            reads = Reads.of(used, profile, axis)
+            blocks = read("uvt", read_blocks, _grid(reads.texels, reads.slices))
+            parts["uvt"][row] = pack_mode6(*blocks).reshape(parts["uvt"].shape[1:])
+            for name, columns in zip(("ut", "vt"), reads.columns, strict=True):
+                parts[name][row] = read(name, read_plane, reads.rows, columns)
+        classes = _classes(profile, dynamic)
+        values = read("net", read_bytes, classes)
         if profile.net_bits == 8:
-            shape = profile.inputs(bool(dynamic)), profile.hidden
-            parts[net][row] = unpack_net(read("net", packed_bytes(*shape)), *shape)
-            continue
-        count = parts[net].shape[1]
-        parts[net][row] = np.ascontiguousarray(read("net", 2 * count).reshape(2, count).T).view("<f2").ravel()
+            parts[net][row] = unpack_net(values, profile.inputs(dynamic), profile.hidden)
+        else:
+            parts[net][row] = np.ascontiguousarray(values.reshape(2, -1).T).view("<f2").ravel()
+
+    for _ in each(unpack, zip(mapped, ends, sizes.astype(np.int64), strict=True)):
+        continue
     return parts
 
 
-def _mapped(kind: np.ndarray) -> list[tuple[int, int, int]]:
+def mapped_tiles(kind: np.ndarray) -> list[tuple[int, int, int]]:
     """Of each tile with maps its place among these, its number, and its place among those of its kind."""
     numbers = np.flatnonzero(np.isin(kind, (TileKind.STATIC, TileKind.DYNAMIC)))
     rows = [int((kind[:number] == kind[number]).sum()) for number in numbers]
     return [(place, int(number), row) for place, (number, row) in enumerate(zip(numbers, rows, strict=True))]
 
 
-def _by_block(used: np.ndarray) -> np.ndarray:
-    """Texels [128, 128] block by block, [1024, 16]."""
-    return used.reshape(TILE // 4, 4, TILE // 4, 4).swapaxes(1, 2).reshape(-1, 16)
+def by_block(texels: np.ndarray) -> np.ndarray:
+    """Texels [4 h, 4 w] block by block, [h w, 16]."""
+    h, w = texels.shape
+    return texels.reshape(h // 4, 4, w // 4, 4).swapaxes(1, 2).reshape(-1, 16)
 
 
-def _parts_of(blocks: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Blocks [n, 16] as endpoints of 7 bits [n, 8], their lowest bits [n, 2] and indices [n, 16]."""
-    try:
-        endpoints, indices = unpack_mode6(blocks)
-    except WlmError as error:
-        raise WlmError("maps: expected blocks of BC7 mode 6, found others") from error
-    return (endpoints >> 1).swapaxes(1, 2).reshape(-1, 8), endpoints[..., 0] & 1, indices
-
-
-def _blocks_of(ends: np.ndarray, bits: np.ndarray, indices: np.ndarray) -> np.ndarray:
-    """The inverse of `_parts_of`."""
+def blocks_of(ends: np.ndarray, bits: np.ndarray, indices: np.ndarray) -> np.ndarray:
+    """Blocks [n, 16] of endpoints of 7 bits [n, 8], channel by channel, their lowest bits [n, 2] and indices [n, 16]."""
     return pack_mode6(ends.reshape(-1, 4, 2).swapaxes(1, 2) << 1 | bits[..., None], indices)
 
 
-def _orders(count: int, used: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-    """The order of blocks and that of texels: those in use first."""
-    if used is None:
-        return np.arange(count), np.arange(16 * count)
-    texels = _by_block(used)
-    return np.argsort(~texels.any(1), kind="stable"), np.argsort(~texels.ravel(), kind="stable")
+def _unpacked(blocks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Blocks [n, 16] as ends, uint8 [n, 2, 4], and indices [n, 16]."""
+    try:
+        return unpack_mode6(blocks)
+    except WlmError as error:
+        raise WlmError("maps: expected blocks of BC7 mode 6, found others") from error
 
 
-def _packed_blocks(blocks: np.ndarray, used: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """The streams of a map: endpoints, one after another, with their lowest bits; and indices, two a byte."""
-    ends, bits, indices = _parts_of(blocks.reshape(-1, 16))
-    order, texels = _orders(len(ends), used)
-    nibbles = indices.ravel()[texels]
-    plain = np.concatenate([ends[order].T.ravel(), np.packbits(bits[order].T)])
-    return plain, nibbles[::2] | nibbles[1::2] << 4
+def _grid(texels: np.ndarray, slices: np.ndarray | None = None) -> BlockGrid:
+    """The blocks of a map's slices whose valid, or read, texels are given."""
+    side = texels.shape[0] // 4
+    return BlockGrid(side, by_block(texels), np.ones(1, bool) if slices is None else slices)
 
 
-def _unpacked_blocks(read: Any, name: str, count: int, used: np.ndarray | None = None) -> np.ndarray:
-    """The blocks of a map, [count, 16], whose streams `read(name, bytes)` gives."""
-    order, texels = _orders(count, used)
-    plain = read(f"{name} ends", 8 * count + -(-2 * count // 8))
-    ends, bits = np.empty((count, 8), np.uint8), np.empty((count, 2), np.uint8)
-    ends[order] = plain[: 8 * count].reshape(8, count).T
-    bits[order] = np.unpackbits(plain[8 * count :], count=2 * count).reshape(2, count).T
-    pairs = read(f"{name} indices", 8 * count)
-    indices = np.empty(16 * count, np.uint8)
-    indices[texels] = np.stack([pairs & 15, pairs >> 4], 1).ravel()
-    indices = indices.reshape(count, 16)
-    if (ends > 127).any() or (indices[:, 0] > 7).any():
-        raise ValueError(f"part tiles: {name}: expected endpoints of 7 bits and a first index of 3")
-    return _blocks_of(ends, bits, indices)
+def _cleared(blocks: np.ndarray, used: np.ndarray) -> np.ndarray:
+    """Blocks [n, 16] without what isn't used, bool [n, 16]."""
+    ends, indices = _unpacked(blocks)
+    ends, indices = ends * used.any(1)[:, None, None], indices * used
+    # A block's first index is below 8, which fixes the order of its ends; where it isn't used, they are in order.
+    swapped = ~used[:, 0] & (ends[:, 0].sum(1, dtype=int) > ends[:, 1].sum(1, dtype=int))
+    ends[swapped] = ends[swapped][:, ::-1]
+    indices[swapped] = (15 - indices[swapped]) * used[swapped]
+    return pack_mode6(ends, indices)
 
 
-def _inflated(stream: np.ndarray, count: int, where: str) -> np.ndarray:
-    """The bytes of a zlib stream, which must be `count`."""
-    data = inflate(stream.tobytes(), count, where, f"{count} bytes, deflated, found others")
-    return np.frombuffer(data, np.uint8)
+def _classes(profile: Profile, dynamic: bool) -> np.ndarray:
+    """The class of each of a network's bytes: weights by layer, and high and low bytes of half floats."""
+    inputs, hidden = profile.inputs(dynamic), profile.hidden
+    if profile.net_bits == 16:
+        count = (inputs + hidden + 2) * hidden + 3 * (hidden + 1)
+        return np.repeat([3, 4], count)
+    halves = (packed_bytes(inputs, hidden) - (inputs + hidden + 3) * hidden) // 2
+    return np.repeat(np.arange(5), [inputs * hidden, hidden * hidden, 3 * hidden, halves, halves])

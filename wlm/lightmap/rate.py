@@ -221,8 +221,8 @@ class _Search:
 
 def _stream_bytes(model: LightmapModel) -> np.ndarray:
     """Bytes of F_uvt and of the rest of each tile with maps, float64 [N_m, 2]."""
-    sizes = encode(model)[1]["sizes"].astype(np.float64)
-    volume = np.array([name.startswith("uvt") for name in STREAMS])
+    sizes = encode(model)[1]["stream_sizes"].astype(np.float64)
+    volume = np.array([name == "uvt" for name in STREAMS])
     return np.stack([sizes[:, volume].sum(1), sizes[:, ~volume].sum(1)], 1)
 
 

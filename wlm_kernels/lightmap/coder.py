@@ -21,6 +21,9 @@ INPUTS = PREDICTIONS + 1
 """What is mixed: the predictions and the counts."""
 
 LIMIT = 60  # of counts
+MET = 2  # each count at first
+PREDICTION_WEIGHT, COUNT_WEIGHT = 9175, 19661  # in a mixture at first, in 65536ths
+AHEAD = 3  # bytes that a reader is ahead of what its numbers needed
 HALF = 2048  # entries of the sigmoid's table on each side of 0, 256 to one
 
 ENDS, LOWEST, INDICES = 0, 48, 49
@@ -91,8 +94,8 @@ def finish(c: Coder):
 
 @wp.func
 def ended(c: Coder) -> bool:
-    """Whether a reader is past its stream: it is ahead by 3 bytes, which are zeros at the end."""
-    return c.encode == 0 and c.place[0] > c.data.shape[0] + 3
+    """Whether a reader is past its stream: it is `AHEAD` of its numbers, with zeros at the end."""
+    return c.encode == 0 and c.place[0] > c.data.shape[0] + AHEAD
 
 
 @wp.func
@@ -116,15 +119,6 @@ def _bit(c: Coder, chance: int, bit: int) -> int:
         high = wp.lshift(high, wp.uint32(8)) | wp.uint32(255)
     c.range[0] = low
     c.range[1] = high
-    return result
-
-
-@wp.func
-def plain(c: Coder, value: int, bits: int) -> int:
-    """Codes a number whose bits are as likely as not."""
-    result = int(0)
-    for b in range(bits):
-        result = 2 * result + _bit(c, 32768, wp.rshift(value, bits - 1 - b) & 1)
     return result
 
 

@@ -18,7 +18,6 @@ from wlm_kernels.lightmap.coder import (
     ended,
     finish,
     number,
-    plain,
 )
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 4})
@@ -229,10 +228,9 @@ def _code_indices(
 def code_blocks(
     c: Coder,
     slices: int,
-    rows: int,
-    columns: int,
-    coarse: int,
-    # in: [rows * columns, 16] whether a texel is coded, in all slices alike
+    columns: int,  # and rows, of blocks
+    coarse: int,  # lowest bits that are 0: of 7, beside the lowest of 8
+    # in: [columns * columns, 16] whether a texel is coded, in all slices alike
     used: wp.array2d[int],
     # in, out:
     ends: wp.array2d[int],
@@ -241,8 +239,7 @@ def code_blocks(
     texels: wp.array3d[int],
 ):
     begin(c)
-    shift = plain(c, coarse, 3)
-    area = rows * columns
+    area = columns * columns
     for b in range(slices * area):
         if ended(c):
             return
@@ -280,7 +277,7 @@ def code_blocks(
                         top = -1
                     else:
                         corner = -1
-        _code_ends(c, shift, ends, texels, used, b, place, valid, left, top, early, columns)
+        _code_ends(c, coarse, ends, texels, used, b, place, valid, left, top, early, columns)
         _code_indices(c, ends, indices, texels, used, b, place, left, top, corner, early, columns)
     finish(c)
 
@@ -288,13 +285,12 @@ def code_blocks(
 @wp.kernel
 def code_planes(
     c: Coder,
-    coarse: int,
+    coarse: int,  # lowest bits that are 0
     # in, out: [channels, rows, columns]
     values: wp.array3d[int],
 ):
     begin(c)
-    shift = plain(c, coarse, 3)
-    most = 16 * (wp.rshift(256, shift) - 1)
+    most = 16 * (wp.rshift(256, coarse) - 1)
     for channel in range(values.shape[0]):
         rows = Row()
         for k in range(PREDICTIONS):
@@ -308,15 +304,15 @@ def code_planes(
                 corner = wp.where(x > 0 and y > 0, values[channel, wp.max(y - 1, 0), wp.max(x - 1, 0)], 127)
                 other = values[0, y, x]
                 predicted = Row(
-                    wp.rshift(16 * left, shift),
-                    wp.rshift(16 * top, shift),
-                    wp.rshift(8 * (left + top), shift),
-                    wp.clamp(wp.rshift(16 * (left + top - corner), shift), 0, most),
-                    wp.rshift(16 * wp.where(channel > 0, other, 127), shift),
+                    wp.rshift(16 * left, coarse),
+                    wp.rshift(16 * top, coarse),
+                    wp.rshift(8 * (left + top), coarse),
+                    wp.clamp(wp.rshift(16 * (left + top - corner), coarse), 0, most),
+                    wp.rshift(16 * wp.where(channel > 0, other, 127), coarse),
                 )
-                value = wp.rshift(values[channel, y, x], shift)
-                value = number(c, value, 8 - shift, PREDICTIONS, predicted, rows, channel, channel)
-                values[channel, y, x] = wp.lshift(value, shift)
+                value = wp.rshift(values[channel, y, x], coarse)
+                value = number(c, value, 8 - coarse, PREDICTIONS, predicted, rows, channel, channel)
+                values[channel, y, x] = wp.lshift(value, coarse)
     finish(c)
 
 
