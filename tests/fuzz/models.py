@@ -300,7 +300,9 @@ READERS = (
     Reader(
         "lightmap",
         "a.wlm",
-        stored("lightmap.wlm", "lightmap-packed.wlm", "lightmap-frames.wlm", "lightmap-video.wlm"),
+        stored(
+            "lightmap.wlm", "lightmap-packed.wlm", "lightmap-coded.wlm", "lightmap-frames.wlm", "lightmap-video.wlm"
+        ),
         vary_artifact,
         _lightmap,
     ),

@@ -43,6 +43,8 @@ class Profile(Settings):
         uvt_slices: Slices of F_uvt along time.
         plane_columns, plane_rows: Size of F_ut and F_vt: along u or v, and along time.
         net_bits: Bits of a network's weight in the file: 16, half floats, or 8, see `wlm.lightmap.weights`.
+        map_bits: Bits of the numbers in F_ut and F_vt and of the ends of blocks: 8, all levels of BC7 mode 6; fewer,
+            multiples of 2 ** (8 - bits) alone, which decode as fast and take less of the file.
         gelu: "exact", or its "tanh" form, for which GPUs have an instruction.
         gamma: The maps hold radiance ** (1 / gamma).
         time_axis: "paper": the features' time axis is the hour over the period, clamped at its ends. "frames": every
@@ -83,6 +85,7 @@ class Profile(Settings):
     plane_columns: int = Field(64, ge=1, le=128)
     plane_rows: int = Field(24, ge=1, le=64)
     net_bits: Literal[8, 16] = 16
+    map_bits: int = Field(8, ge=4, le=8)
     gelu: Literal["exact", "tanh"] = "tanh"
     gamma: float = Field(2.2, ge=1.0, le=4.0)
     time_axis: Literal["paper", "frames"] = "frames"
@@ -109,6 +112,11 @@ class Profile(Settings):
         if self.quantise_from > self.freeze_from:
             raise ValueError("quantise_from must not be later than freeze_from")
         return self
+
+    @property
+    def map_step(self) -> int:
+        """What the numbers of maps are multiples of."""
+        return 1 << (8 - self.map_bits)
 
     def inputs(self, temporal: bool) -> int:
         """Inputs of the network of a tile with or without temporal maps."""

@@ -307,7 +307,7 @@ class Trainer:
             torch.set_num_threads(threads)
 
     def _step(self, quantised: bool, move_maps: bool) -> None:
-        self.batch.quantised = int(quantised)
+        self.batch.quantised = self.profile.map_step if quantised else 0
         on_levels = quantised and self.profile.net_bits == 8
         if on_levels:
             levels.put_on_levels(*self._levels_args)
@@ -373,8 +373,9 @@ class Trainer:
             uvt = self._blocks("uvt")
             result["uvt"] = uvt.reshape(self.tiles, -1, *uvt.shape[1:])
             for key in ("ut", "vt"):
-                plane = np.clip(self.views[key].cpu().numpy(), 0.0, 1.0)
-                result[key] = np.floor(plane * np.float32(255.0) + np.float32(0.5)).astype(np.uint8)
+                plane, step = np.clip(self.views[key].cpu().numpy(), 0.0, 1.0), np.float32(self.profile.map_step)
+                level = np.floor(plane * np.float32(255.0) / step + np.float32(0.5))
+                result[key] = (np.minimum(level, 256 / step - 1) * step).astype(np.uint8)
         return result
 
     def _blocks(self, name: str) -> np.ndarray:
@@ -383,7 +384,7 @@ class Trainer:
         with interop.stream(self.device):
             levels = wp.empty(endpoints.shape, dtype=wp.vec4ub, device=self.device)
             index = wp.empty(weights.shape, dtype=wp.uint8, device=self.device)
-            blocks.quantise(endpoints, weights, levels, index)
+            blocks.quantise(endpoints, weights, levels, index, self.profile.map_step)
         s, h, w = index.shape
         # Texels [S, H, W] -> blocks [S, H/4, W/4, 16], row-major in the block.
         index = index.numpy().reshape(s, h // 4, 4, w // 4, 4).swapaxes(2, 3).reshape(s, h // 4, w // 4, 16)
