@@ -17,7 +17,16 @@ from wlm.formats.bc7 import pack_mode6, unpack_mode6
 from wlm.formats.parts import Part
 from wlm.lightmap.model import Profile, TimeAxis
 from wlm.lightmap.reads import Reads
-from wlm.lightmap.streams import BlockGrid, code_blocks, code_bytes, code_plane, read_blocks, read_bytes, read_plane
+from wlm.lightmap.streams import (
+    BlockGrid,
+    code_blocks,
+    code_bytes,
+    code_plane,
+    read_blocks,
+    read_bytes,
+    read_plane,
+    tables,
+)
 from wlm.lightmap.tiles import TILE, TileKind, valid_texels
 from wlm.lightmap.weights import pack_net, packed_bytes, unpack_net
 from wlm.workers import each
@@ -102,7 +111,9 @@ def pack_tiles(
         streams["uv"] = code_blocks(*_unpacked(parts["uv"][place].reshape(-1, 16)), _grid(used))
         if dynamic:
             reads = Reads.of(used, profile, axis)
-            streams["uvt"] = code_blocks(*_unpacked(parts["uvt"][row].reshape(-1, 16)), _grid(reads.texels, reads.slices))
+            streams["uvt"] = code_blocks(
+                *_unpacked(parts["uvt"][row].reshape(-1, 16)), _grid(reads.texels, reads.slices)
+            )
             for name, columns in zip(("ut", "vt"), reads.columns, strict=True):
                 streams[name] = code_plane(parts[name][row], reads.rows, columns)
         net = parts["net" if dynamic else "net_static"][row]
@@ -113,6 +124,7 @@ def pack_tiles(
         streams["net"] = code_bytes(values, _classes(profile, dynamic))
         return [streams[name] for name in STREAMS]
 
+    tables()
     tiles = list(each(packed, mapped_tiles(kind)))
     return {
         "streams": np.frombuffer(b"".join(stream for tile in tiles for stream in tile), np.uint8),
@@ -182,6 +194,7 @@ def unpack_tiles(
         else:
             parts[net][row] = np.ascontiguousarray(values.reshape(2, -1).T).view("<f2").ravel()
 
+    tables()
     for _ in each(unpack, zip(mapped, ends, sizes.astype(np.int64), strict=True)):
         continue
     return parts

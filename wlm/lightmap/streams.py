@@ -8,7 +8,6 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
-from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,6 @@ from wlm_kernels.lightmap import coder, tile_coder
 
 _ROOM = 2.0  # of a stream, beside what its numbers take uncoded
 _WHOLE = 8
-_LOADING = Lock()  # of the kernels and tables, which the first of some threads makes
 _WIDTHS = {"blocks": 12, "numbers": 25}  # of predictions, at first
 
 
@@ -35,6 +33,17 @@ class BlockGrid:
     side: int
     used: np.ndarray
     slices: np.ndarray
+
+
+@cache
+def tables() -> tuple[wp.array, wp.array, wp.array]:
+    """Logarithm, sigmoid and rate, see `coder.Coder`; to be made, with the kernels, before threads need them."""
+    wp.load_module(tile_coder, "cpu")
+    logarithm = [0] + [round(256 * math.log(i)) for i in range(1, 65538)]
+    half = coder.HALF
+    sigmoid = [round(65536 / (1 + math.exp((half - i) / 256))) for i in range(2 * half)]
+    rate = [131072 // (2 * n + 3) for n in range(coder.LIMIT + 1)]
+    return _array(logarithm), _array(sigmoid), _array(rate)
 
 
 def code_blocks(ends: np.ndarray, indices: np.ndarray, grid: BlockGrid) -> bytes:
@@ -204,22 +213,10 @@ def _read(stream: np.ndarray, widths: str, launch: Callable[[coder.Coder], None]
         raise ValueError(f"expected another length than {len(stream)} bytes")
 
 
-@cache
-def _tables() -> tuple[wp.array, wp.array, wp.array]:
-    """Logarithm, sigmoid and rate, see `coder.Coder`."""
-    wp.load_module(tile_coder, "cpu")
-    logarithm = [0] + [round(256 * math.log(i)) for i in range(1, 65538)]
-    half = coder.HALF
-    sigmoid = [round(65536 / (1 + math.exp((half - i) / 256))) for i in range(2 * half)]
-    rate = [131072 // (2 * n + 3) for n in range(coder.LIMIT + 1)]
-    return _array(logarithm), _array(sigmoid), _array(rate)
-
-
 def _coder(data: np.ndarray, encode: bool, widths: str) -> coder.Coder:
     """A coder before its first number."""
     c = coder.Coder()
-    with _LOADING:
-        c.logarithm, c.sigmoid, c.rate = _tables()
+    c.logarithm, c.sigmoid, c.rate = tables()
     c.encode = int(encode)
     c.data = wp.array(np.ascontiguousarray(data), dtype=wp.uint8, device="cpu")
     c.range = wp.zeros(3, dtype=wp.uint32, device="cpu")
