@@ -1,8 +1,8 @@
 """Files of before the arithmetic coder: each tile's maps and network as deflated streams, one after another.
 
-A block of BC7 mode 6 is a picture of 16 indices in 4 bits and ten numbers of 7 bits and 1 bit: they are taken apart, the
-same number of all blocks side by side. Blocks that hold no valid texel, and indices of texels that aren't valid, come
-last. The streams of a tile, those that it has, are in the order of `DEFLATED`; each is a zlib stream.
+A block of BC7 mode 6 is a picture of 16 indices in 4 bits and ten numbers of 7 bits and 1 bit: they are taken apart,
+the same number of all blocks side by side. Blocks that hold no valid texel, and indices of texels that aren't valid,
+come last. The streams of a tile, those that it has, are in the order of `DEFLATED`; each is a zlib stream.
 """
 
 from collections.abc import Mapping
@@ -10,10 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from wlm.formats.bc7 import pack_mode6
 from wlm.formats.deflate import inflate
 from wlm.formats.parts import Part
 from wlm.lightmap.model import Profile
-from wlm.lightmap.packing import PACKED, blocks_of, by_block, mapped_tiles
+from wlm.lightmap.packing import PACKED, by_block, mapped_tiles
 from wlm.lightmap.tiles import TILE, TileKind, valid_texels
 from wlm.lightmap.weights import packed_bytes, unpack_net
 
@@ -105,7 +106,7 @@ def _unpacked_blocks(read: Any, name: str, count: int, used: np.ndarray | None =
     indices = indices.reshape(count, 16)
     if (ends > 127).any() or (indices[:, 0] > 7).any():
         raise ValueError(f"part tiles: {name}: expected endpoints of 7 bits and a first index of 3")
-    return blocks_of(ends, bits, indices)
+    return pack_mode6(ends.reshape(-1, 4, 2).swapaxes(1, 2) << 1 | bits[..., None], indices)
 
 
 def _inflated(stream: np.ndarray, count: int, where: str) -> np.ndarray:

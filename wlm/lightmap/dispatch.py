@@ -91,11 +91,11 @@ class Dispatch:
         self._stop: KeyboardInterrupt | None = None
         self._patience = math.inf
 
-    def run(self, batches: Sequence[Batch]) -> Iterator[tuple[Batch, Parts]]:
+    def run(self, batches: Sequence[Batch]) -> Iterator[tuple[Batch, Parts, float]]:
         """Fits batches.
 
         Yields:
-            Each with its parts, as they get done.
+            Each with its parts and its PSNR, see `Advance`, as they get done.
 
         Raises:
             WlmError: A fit diverged, a kept state is wrong, or the workers of a batch died again and again.
@@ -143,7 +143,7 @@ class Dispatch:
             raise WlmError(f"fit: batch {job.batch.number} has lost {_DEATHS} workers: {why}")
         self._begin(number, job)
 
-    def _take(self, number: int, said: Any) -> tuple[Batch, Parts] | None:
+    def _take(self, number: int, said: Any) -> tuple[Batch, Parts, float] | None:
         """Takes a worker's answer and has it go on; returns a batch that is done."""
         job = self._jobs[number]
         if isinstance(said, BaseException):
@@ -152,7 +152,7 @@ class Dispatch:
         if isinstance(said, Advance):
             begun, job.step = job.step is None, said.step
             if said.parts is not None:
-                finished = job.batch, said.parts
+                finished = job.batch, said.parts, said.psnr
                 self._finish(number, said.parts)
             if not begun:
                 self._warm.add(job.batch.kind)

@@ -15,7 +15,7 @@ from wlm.lightmap.decode import Decoder
 from wlm.lightmap.model import TILE, LightmapModel
 from wlm.lightmap.packing import STREAMS
 from wlm.lightmap.seen import SeenScore, Tally
-from wlm.lightmap.tiles import TileGrid, TileKind, valid_texels
+from wlm.lightmap.tiles import TileGrid, TileKind
 from wlm.lightmap.views import VIEWS, views_of
 from wlm.metrics import METRICS, FrameMetrics, LostLight, Summary, evaluate_frame, summarise
 from wlm.metrics.contest import HOURS, ContestScore, block_scores, contest_points
@@ -173,36 +173,6 @@ def psnr_of(model: LightmapModel, lightmaps: LightmapSet, number: int, decoded: 
     mask, name = lightmaps.mask & _held(model), f"{model.name} at {lightmaps.times[number]:g}"
     options = {"name": name, "peak": model.profile.peak}
     return float(summarise([evaluate_frame(lightmaps.frames[number], decoded, mask, TILE, ("psnr",), **options)]).psnr)
-
-
-def psnr_of_tiles(
-    model: LightmapModel, lightmaps: LightmapSet, numbers: Sequence[int], times: Sequence[int], device: str = "cpu"
-) -> np.ndarray:
-    """PSNR of some tiles, dB: `Report.psnr_by_tile` of them, in a fraction of its time.
-
-    Args:
-        model: The model, of at least these tiles.
-        lightmaps: The input, of the model's size.
-        numbers: Of the tiles in their grid.
-        times: Indices of the stored times.
-        device: Where they are decoded.
-
-    Returns:
-        float64 [n], means over the times; NaN without a score.
-    """
-    decoder, grid, scores = Decoder(model, device), TileGrid.of(*model.mask.shape), []
-    options = {"name": model.name, "peak": model.profile.peak}
-    for i in times:
-        # The tiles in a row, as one lightmap.
-        valid = np.hstack([valid_texels(lightmaps.valid(i), int(number)) for number in numbers])
-        light = np.zeros((*valid.shape, 3), np.float32)
-        for place, number in enumerate(numbers):
-            y, x = grid.origin(int(number))
-            tile = lightmaps.frames[i, y : y + TILE, x : x + TILE]
-            light[: tile.shape[0], place * TILE : place * TILE + tile.shape[1]] = tile
-        decoded = np.hstack(decoder.tiles(numbers, float(model.times[i])))
-        scores.append(evaluate_frame(light, decoded, valid, TILE, ("psnr",), **options))
-    return summarise(scores).psnr_by_tile[0]
 
 
 def contest_score(

@@ -1,5 +1,6 @@
 """Fitting a lightmap set: from checked input to a compressed model (neural-dynamic-gi, sections 3.4 and 4)."""
 
+import math
 import os
 from collections.abc import Sequence
 from contextlib import closing
@@ -91,6 +92,61 @@ def compress(
     fit = _Fit(lightmaps, Profile.load(profile).override(overrides), tiles, progress)
     fit.store_frames(progress)
     fit.store_video(progress)
+    _run(fit, seed, device, workers, cluster, progress, checkpoint)
+    return fit.model
+
+
+class Trials:
+    """Fits of one set with maps of several sizes, or of several lengths."""
+
+    def __init__(
+        self,
+        lightmaps: LightmapSet,
+        profile: Profile,
+        *,
+        seed: int,
+        device: str,
+        workers: int | None,
+        cluster: str | None,
+        progress: OnProgress | None,
+    ) -> None:
+        """Looks at the set, once for all fits.
+
+        Args:
+            lightmaps: The set.
+            profile: The settings; no tile is stored as frames.
+            seed, device, workers, cluster, progress: As for `compress`.
+        """
+        _devices(device, workers, cluster, 0)
+        self._lightmaps, self._profile, self._progress = lightmaps, profile.override({"frames": "never"}), progress
+        self._options = seed, device, workers, cluster
+        self._facts = _Fit(lightmaps, self._profile, None, progress).facts
+
+    def fit(self, **changes: Any) -> tuple[LightmapModel, float]:
+        """Compresses the set.
+
+        Args:
+            changes: Settings in place of the profile's, of the maps' sizes and of the training.
+
+        Returns:
+            The model, and the PSNR of its dynamic tiles by the tiled protocol in the fit's last samples; NaN without
+            such a tile.
+        """
+        fit = _Fit(self._lightmaps, self._profile.override(changes), None, None, self._facts)
+        return fit.model, _run(fit, *self._options, self._progress, None, track=True)
+
+
+def _run(
+    fit: "_Fit",
+    seed: int,
+    device: str,
+    workers: int | None,
+    cluster: str | None,
+    progress: OnProgress | None,
+    checkpoint: Checkpoint | CheckpointRange | None,
+    track: bool = False,
+) -> float:
+    """Fits the tiles that have maps, and puts them into the model; returns the PSNR of dynamic ones, where tracked."""
     batches = fit.batches(CPU_TILES if device == "cpu" else None)
     waiting = []
     for batch in batches:
@@ -104,22 +160,26 @@ def compress(
             raise WlmError(f"{checkpoint.path}: finished batch {batch.number}: {error}") from error
         fit.store(batch, parts)
     if not waiting:
-        return fit.model
+        return math.nan
     steps = fit.profile.steps
     meter = Meter(progress, "fit", steps * len(batches))
     samples = steps * fit.profile.samples * sum(len(batch.rows) for batch in waiting)
     devices = _devices(device, workers, cluster, samples)[: len(waiting)]
-    shared = (fit.profile, fit.model.axis, seed), progress is not None
+    shared = (fit.profile, fit.model.axis, seed), track or progress is not None
+    scores = []
     try:
         with closing(_workers(*shared, devices, workers, cluster, len(waiting))) as at:
             dispatch = Dispatch(at, fit.piece, steps, len(batches) - len(waiting), meter, checkpoint)
-            for batch, parts in dispatch.run(waiting):
+            for batch, parts, psnr in dispatch.run(waiting):
                 fit.store(batch, parts)
+                if batch.kind == TileKind.DYNAMIC and not math.isnan(psnr):
+                    scores.append((psnr, len(batch.rows)))
     except (WlmError, KeyboardInterrupt):
         if checkpoint is not None:
             checkpoint.flush()
         raise
-    return fit.model
+    psnr, tiles = np.array(scores).reshape(-1, 2).T
+    return float(np.average(psnr, weights=tiles)) if scores else math.nan
 
 
 def _devices(device: str, workers: int | None, cluster: str | None, samples: int) -> list[str]:
@@ -227,6 +287,7 @@ class _Fit:
     Attributes:
         profile: The settings.
         index: int [N], numbers of the tiles in their grid, rising.
+        facts: What is stored of each beside its maps.
         kinds: int [N], `TileKind` of each.
         model: Complete but for the maps and networks of the batches that have not been stored.
     """
@@ -237,16 +298,13 @@ class _Fit:
         profile: Profile,
         tiles: Sequence[int] | None = None,
         progress: OnProgress | None = None,
+        facts: "list[_Facts] | None" = None,
     ) -> None:
         self.profile, self._lightmaps = profile, lightmaps
         grid = TileGrid.of(*lightmaps.mask.shape)
         self.index = np.arange(grid.count) if tiles is None else np.array(sorted(tiles), np.int64)
         check_index(self.index, grid)
-        meter, facts = Meter(progress, "tiles", len(self.index)), []
-        for fact in each(self._facts, self.index.tolist()):
-            facts.append(fact)
-            if len(facts) % _LOOK == 0 and meter.due(len(facts)):
-                meter.report(len(facts))
+        self.facts = facts = self._look(progress) if facts is None else facts
         self.kinds = np.array([tile.kind for tile in facts])
         framed = choose_frames(self.kinds, self.index, lightmaps.mask, len(lightmaps.times), profile)
         warnings = ()
@@ -283,6 +341,15 @@ class _Fit:
         for i, row in enumerate(self._mapped):
             self.model.peak[i], self.model.affine[i] = facts[row].peak, facts[row].affine
         self._scale = self.model.scales
+
+    def _look(self, progress: OnProgress | None) -> "list[_Facts]":
+        """Looks at all tiles."""
+        meter, facts = Meter(progress, "tiles", len(self.index)), []
+        for fact in each(self._facts, self.index.tolist()):
+            facts.append(fact)
+            if len(facts) % _LOOK == 0 and meter.due(len(facts)):
+                meter.report(len(facts))
+        return facts
 
     def _facts(self, number: int) -> "_Facts":
         """What is stored of a tile beside its maps and network."""

@@ -1,8 +1,8 @@
 """Each tile's maps and network as streams, one after another: a tile is read, and streamed, alone.
 
-A stream is a byte and what an adaptive arithmetic coder (`wlm.lightmap.streams`) makes of the rest: F_uv and F_uvt block
-by block, F_ut, F_vt, and the bytes of the network. It leaves out what no valid texel reads at a time that is evaluated,
-which a fit sets to zero; where one of these isn't zero it holds everything.
+A stream is a byte and what an adaptive arithmetic coder (`wlm.lightmap.streams`) makes of the rest: F_uv and F_uvt
+block by block, F_ut, F_vt, and the bytes of the network. It leaves out what no valid texel reads at a time that is
+evaluated, which a fit sets to zero; where one of these isn't zero it holds everything.
 
 The streams of a tile, those that it has, are in the order of `STREAMS`.
 """
@@ -27,7 +27,7 @@ from wlm.lightmap.streams import (
     read_plane,
     tables,
 )
-from wlm.lightmap.tiles import TILE, TileKind, valid_texels
+from wlm.lightmap.tiles import TileKind, valid_texels
 from wlm.lightmap.weights import pack_net, packed_bytes, unpack_net
 from wlm.workers import each
 
@@ -211,11 +211,6 @@ def by_block(texels: np.ndarray) -> np.ndarray:
     """Texels [4 h, 4 w] block by block, [h w, 16]."""
     h, w = texels.shape
     return texels.reshape(h // 4, 4, w // 4, 4).swapaxes(1, 2).reshape(-1, 16)
-
-
-def blocks_of(ends: np.ndarray, bits: np.ndarray, indices: np.ndarray) -> np.ndarray:
-    """Blocks [n, 16] of endpoints of 7 bits [n, 8], channel by channel, their lowest bits [n, 2] and indices [n, 16]."""
-    return pack_mode6(ends.reshape(-1, 4, 2).swapaxes(1, 2) << 1 | bits[..., None], indices)
 
 
 def _unpacked(blocks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -290,7 +290,12 @@ class Trainer:
     def stage(self, step: int) -> int:
         """Stage of a step: 0, continuous maps with noise; 1, maps on their exact levels; 2, maps frozen."""
         p = self.profile
-        return int(step >= round(p.quantise_from * p.steps)) + int(step >= round(p.freeze_from * p.steps))
+        return int(step >= round(p.quantise_from * p.steps)) + int(step >= self.frozen)
+
+    @property
+    def frozen(self) -> int:
+        """The first step at which the network alone is trained."""
+        return round(self.profile.freeze_from * self.profile.steps)
 
     def run(self, steps: int) -> None:
         """Queues the next steps."""

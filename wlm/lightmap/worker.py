@@ -13,7 +13,7 @@ from wlm.lightmap.tiles import TileCut
 from wlm.lightmap.trainer import Trainer
 from wlm_kernels.lightmap import blocks
 
-_CHUNK = {"cpu": 5, "cuda": 200}  # steps after which the clock is looked at
+_CHUNK = {"cpu": 5, "cuda": 50}  # steps after which the clock is looked at
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +45,8 @@ class Advance:
 
     Attributes:
         step: Steps done.
-        loss, psnr: Mean over its tiles, see `Trainer`; NaN where nothing was asked or done.
+        loss, psnr: Mean over its tiles, see `Trainer`, of the latest samples; NaN where nothing was asked or done. Once
+            it is done these were taken with its maps as the file holds them.
         parts: Its maps and networks as the file holds them, once it is done.
     """
 
@@ -102,7 +103,7 @@ class Fitter:
             WlmError: The fit diverged.
         """
         trainer, steps = self._trainer, self._profile.steps
-        chunk = _CHUNK["cpu" if self._device == "cpu" else "cuda"]
+        chunk, frozen = _CHUNK["cpu" if self._device == "cpu" else "cuda"], trainer.frozen
         step, end = trainer.step, time.monotonic() + seconds
         while step < steps:
             count = min(chunk, steps - step)
@@ -110,6 +111,8 @@ class Fitter:
             step += count
             if time.monotonic() >= end:
                 break
+            if self._track and step - count < frozen <= step < steps:
+                trainer.psnr()  # what was sampled until now isn't of the result
         figures = (float(trainer.losses().mean()), trainer.psnr()) if self._track else ()
         if step < steps:
             return Advance(step, *figures)

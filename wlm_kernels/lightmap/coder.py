@@ -1,7 +1,7 @@
 """An adaptive binary arithmetic coder of a tile's maps and network, in whole numbers: the same bits everywhere.
 
-Each number is coded bit by bit, from its highest. The probability of a bit is a mixture, in the logistic domain, of what
-a few predictions of the number say and of how often the bit was met after the same higher bits (the mixing of PAQ:
+Each number is coded bit by bit, from its highest. The probability of a bit is a mixture, in the logistic domain, of
+what a few predictions of the number say and of how often the bit was met after the same higher bits (the mixing of PAQ:
 Mahoney, "Adaptive weighing of context models for lossless data compression", 2005). A prediction is a logistic
 distribution round a value made of neighbours; its width follows its errors so far. Weights, widths and counts are those
 of one stream, which is therefore read alone.
