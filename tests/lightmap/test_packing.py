@@ -14,7 +14,7 @@ from reference.levels import put_on_levels
 
 import wlm
 from wlm.formats.artifact import read_artifact, write_artifact
-from wlm.formats.bc7 import decode_image
+from wlm.formats.bc7 import decode_image, unpack_mode6
 from wlm.lightmap.decode import Decoder
 from wlm.lightmap.evaluation import part_bytes
 from wlm.lightmap.packing import STREAMS, clear_unread
@@ -213,3 +213,15 @@ def test_a_fit_on_levels_is_what_its_file_decodes_to(tmp_path):
     scores = [wlm.lightmap.evaluate(each, lightmaps, metrics=["psnr"]).psnr for each in (model, plain)]
     assert abs(scores[0] - scores[1]) < 2.0
     assert not np.array_equal(model.net, plain.net)
+
+
+def test_a_fit_on_fewer_levels_is_what_its_file_decodes_to(tmp_path):
+    lightmaps = small_sets.moving_light()
+    models = [wlm.lightmap.compress(lightmaps, small_sets.tiny_profile(steps=60, map_bits=bits)) for bits in (6, 8)]
+    for model, step in zip(models, (4, 1), strict=True):
+        ends = np.concatenate([unpack_mode6(blocks.reshape(-1, 16))[0] for blocks in (model.uv, model.uvt)])
+        assert np.gcd.reduce(ends, axis=None) == np.gcd.reduce(model.ut, axis=None) == step
+        assert_same(wlm.load(model.save(tmp_path / "a.wlm") and tmp_path / "a.wlm"), model)
+    assert models[0].file_bytes() < 0.9 * models[1].file_bytes()
+    scores = [wlm.lightmap.evaluate(each, lightmaps, metrics=["psnr"]).psnr for each in models]
+    assert abs(scores[0] - scores[1]) < 1.0
