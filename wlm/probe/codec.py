@@ -18,11 +18,12 @@ from wlm.formats.limits import NUMBERS, PROBES
 from wlm.formats.parts import Part, check_parts
 from wlm.probe.day import DayModel
 from wlm.probe.day_codec import decode_day, encode_day, is_day
+from wlm.probe.fields import pack_dead, unpack_dead
 from wlm.probe.model import LATENT, SCALE, ProbeModel, Profile, layer_shapes
 from wlm.probe.region_codec import decode_regions, encode_regions
 from wlm.probe.regions import RegionModel
 from wlm.probe.transform import Transform, TransformModel
-from wlm.probe.transform_codec import decode_transform, encode_transform, is_transform, pack_dead, unpack_dead
+from wlm.probe.transform_codec import decode_transform, encode_transform, is_transform
 from wlm.system import Header, Name
 
 _MOST_LOG = 40.0

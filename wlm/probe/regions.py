@@ -14,8 +14,9 @@ import numpy as np
 
 from wlm.errors import WlmError
 from wlm.formats.compact import digest
+from wlm.probe.fields import pack_dead, unpack_dead
 from wlm.probe.transform import CODES, NO_POSITIONS, Head, Places, Transform, TransformModel
-from wlm.probe.transform_codec import pack_dead, pack_piece, parse_piece, unpack_dead, unpack_labels
+from wlm.probe.transform_codec import pack_piece, parse_piece, unpack_labels
 
 LEAF = 3
 """In place of an axis: a region."""

@@ -17,10 +17,11 @@ from wlm.formats.compact import digest
 from wlm.metrics import psnr_from_mse
 from wlm.probe.data import ProbeSet
 from wlm.probe.entropy import LARGEST
+from wlm.probe.fields import pack_dead
 from wlm.probe.model import Profile
 from wlm.probe.regions import Piece, RegionModel, Split, members
 from wlm.probe.transform import FINENESS, SOURCE, VECTORS, Coding, Places, Transform, TransformModel, stored_step
-from wlm.probe.transform_codec import pack_dead, pack_labels, pack_piece
+from wlm.probe.transform_codec import pack_labels, pack_piece
 from wlm.probe.transform_coder import BIT, MANY, Coded, Coders, Measured
 from wlm.system import Meter, OnProgress
 from wlm.workers import Here, Processes, Workers, cores
