@@ -47,15 +47,6 @@ _STATES = 1 << 27  # probes times hours: a byte each tells who is dead
 _GAIN = struct.Struct("<f")
 
 
-def is_day(artifact: Artifact) -> bool:
-    """Whether a probe file is one of several hours."""
-    begin = artifact.tensors.get(BODY, np.zeros(0, np.uint8))[: fields.SHORT.size]
-    return (
-        len(begin) == fields.SHORT.size
-        and fields.SHORT.unpack(begin.tobytes())[0] >> fields.HEAD_SHIFT & fields.HOURS == fields.HOURS
-    )
-
-
 def encode_day(model: DayModel) -> tuple[dict[str, Any], dict[str, np.ndarray], str]:
     """Settings, parts and source of a model's file."""
     flags, places = fields.pack_own(np.zeros(0, bool), model.places)

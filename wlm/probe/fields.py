@@ -38,7 +38,7 @@ L2 = 27  # numbers of a probe that a file doesn't state
 CORNERS = struct.Struct("<4d")
 CHECK = struct.Struct("<I")
 SHORT = struct.Struct("<H")
-HOURS = 15  # in place of a kind
+HOURS, GAUSSIANS = 15, 14  # in place of a kind
 DIRECTIONS, KIND = 63, 15  # masks
 HEAD_SHIFT, GRID_SHIFT = 6, 14
 OUTPUTS, DEAD, DEFLATED, PLACED = (1 << bit for bit in range(10, 14))
@@ -53,6 +53,12 @@ _SURE_PROBES, _PROBES_A_BYTE = 1 << 17, 16
 
 class _NameHeader(Header):
     name: Name = ""
+
+
+def is_of(artifact: Artifact, kind: int) -> bool:
+    """Whether a probe file has a body of a kind, `HOURS` or `GAUSSIANS`."""
+    begin = artifact.tensors.get(BODY, np.zeros(0, np.uint8))[: SHORT.size]
+    return len(begin) == SHORT.size and SHORT.unpack(begin.tobytes())[0] >> HEAD_SHIFT & KIND == kind
 
 
 def name_of(artifact: Artifact) -> str:
