@@ -67,7 +67,7 @@ def test_the_options_of_compress_reach_the_fit(room, profile, tmp_path):
     model = wlm.load(out)
     settings = model.profile
     assert (settings.ratio, settings.bits, settings.latent, settings.steps) == (0.2, 8, 3, 12)
-    assert model.source == data.load(room).source
+    assert model.source == data.load(room).source[:4]
     slack = model.extent * model.size.max() / 65535
     np.testing.assert_allclose(model.stored_positions(), data.load(room).position, rtol=0, atol=slack)
     # The seed of the command is the seed of the fit.
@@ -76,7 +76,7 @@ def test_the_options_of_compress_reach_the_fit(room, profile, tmp_path):
         assert (other.read_bytes() == out.read_bytes()) is same
     # Another convention is other light.
     call("probe", "compress", room, "-o", other, *options, "--convention", "godot")
-    assert wlm.load(other).source == data.load(room, convention="godot").source != model.source
+    assert wlm.load(other).source == data.load(room, convention="godot").source[:4] != model.source
 
 
 def test_warnings_of_the_set_are_shown(profile, tmp_path):

@@ -20,6 +20,8 @@ LATENT = slice(9, None)
 MOST = 65535
 """The largest code that a model has for a number of a Gaussian."""
 
+# What is beyond this is refused of a file, whatever it is.
+_FARTHEST = 3e38
 _SHORTEST = 1e-12  # of a quaternion that has a direction
 _SAME = 1e-12  # between angles that rounding alone tells apart
 
@@ -76,7 +78,7 @@ class Packed:
         return {
             "centre": codes[:, PLACE],
             "code": codes[:, PLACE.stop :],
-            "bounds": bounds.astype(np.float32),
+            "bounds": np.clip(bounds, -_FARTHEST, _FARTHEST).astype(np.float32),
             "net": net,
         }
 

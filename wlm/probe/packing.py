@@ -35,9 +35,9 @@ _FAINT = 1e-10  # of the squared range: an error that is floats'
 # Of the natural steps of each group, where a bit is worth as much in all: within a third for `livingroom` and `city`.
 _SHARES = np.array([0.033, 0.0141, 0.0105, 0.0226, 0.0151, 0.06, 0.168, 0.037])
 _NEAR = 0.95  # of the allowed growth that is near enough
-_TRIES = 6
+_TRIES = 8
 _LESS = 0.7
-_OF_LATENTS, _OF_LAYERS = 1e-4, 1e-6  # how much stays as it was, of the mean square of what is weighted
+_OF_LATENTS, _OF_LAYERS = 1e-4, 1e-5  # how much stays as it was, of the mean square of what is weighted
 
 
 def pack_model(model: ProbeModel, position: np.ndarray, values: np.ndarray, device: str) -> ProbeModel:
@@ -135,12 +135,12 @@ class _Search:
     def within(self, growth: float) -> Packed | None:
         """The coarsest numbers found with which the error grows by at most this share; None: there are none."""
         best, natural, most = None, self._natural(), (1.0 + growth) * self._base
-        times, tried = 1.0, []
+        least, times, tried = 0.0, 1.0, []
         for _ in range(_TRIES):
             packed, error = self._rounded(_Steps(*(natural * times)))
             tried.append((times**2, error))
-            if error <= most:
-                best = packed
+            if error <= most and times > least:
+                best, least = packed, times
                 if error >= most - (1.0 - _NEAR) * growth * self._base:
                     break
             # The error is about that of numbers without steps, and a share of the square of the steps.
