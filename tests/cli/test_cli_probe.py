@@ -180,7 +180,7 @@ def test_info_says_what_is_in_the_file(fitted, carrying):
     model = wlm.load(fitted)
     assert facts["bytes"] == fitted.stat().st_size == sum(facts["parts"].values())
     assert (facts["probes"], facts["dead"], facts["outputs"], facts["positions"]) == (PROBES, DEAD, 27, False)
-    assert facts["gaussians"] == model.count and facts["gaussian_bits"] == 48 + 11 * 10
+    assert facts["gaussians"] == model.count and facts["packed"] and facts["gaussian_bits"] is None
     assert facts["bits_per_probe"] == facts["bytes"] * 8 / PROBES
     np.testing.assert_allclose(facts["size"], np.ptp(synthetic(PROBES).position, axis=0))
     assert facts["profile"]["name"] == "tiny"

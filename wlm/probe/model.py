@@ -34,7 +34,7 @@ class Profile(Settings):
         name: Shown in reports.
         method: "gaussians", which all settings but the next three are about, or "transform".
         target_psnr: Of a transform, dB over all numbers of all probes: what to reach, with as few bytes as that takes.
-            None: 50, or as many as `max_bytes` allows.
+            None: 50, or fewer where the set's own noise is more, or as many as `max_bytes` allows.
         max_bytes: Of a transform, the most that its file may have, which comes before the PSNR; None: any.
         region: Of a transform, live probes up to which a set is one region; more are divided.
         ratio: Gaussians as a share of the live probes.

@@ -34,7 +34,7 @@ _PIECE = 1 << 21  # probes times Gaussians at once
 _FAINT = 1e-10  # of the squared range: an error that is floats'
 # Of the natural steps of each group, where a bit is worth as much in all: within a third for `livingroom` and `city`.
 _SHARES = np.array([0.033, 0.0141, 0.0105, 0.0226, 0.0151, 0.06, 0.168, 0.037])
-_NEAR = 0.95  # of the allowed growth that is near enough
+_NEAR = 0.85  # of the allowed growth that is near enough
 _TRIES = 8
 _LESS = 0.7
 _OF_LATENTS, _OF_LAYERS = 1e-4, 1e-5  # how much stays as it was, of the mean square of what is weighted

@@ -165,6 +165,16 @@ class RegionModel(Transform):
         head = self.head._replace(check=check, grid=grid)
         return TransformModel(name, self.source, piece.probes, self.outputs, own, head, stream, places, self.directions)
 
+    def check_pieces(self) -> None:
+        """Compares all bytes with their digests.
+
+        Raises:
+            WlmError: Some are damaged.
+        """
+        _check_digest(self.name, self.order, self.order_digest)
+        for number, piece in enumerate(self.pieces):
+            _check_digest(f"{self.name}, region {number}", piece.data, piece.digest)
+
     def boxes(self) -> np.ndarray:
         """float64 [R, 2, 3], round the live probes of each region, in the unit of the positions."""
         codes = np.array([piece.box for piece in self.pieces], np.float64) + np.array([[-1.0], [1.0]])

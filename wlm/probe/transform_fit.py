@@ -19,8 +19,20 @@ from wlm.probe.data import ProbeSet
 from wlm.probe.entropy import LARGEST
 from wlm.probe.fields import pack_dead
 from wlm.probe.model import Profile
+from wlm.probe.noise import noise_psnr
 from wlm.probe.regions import Piece, RegionModel, Split, members
-from wlm.probe.transform import FINENESS, SOURCE, VECTORS, Coding, Places, Transform, TransformModel, stored_step
+from wlm.probe.transform import (
+    FINENESS,
+    SOURCE,
+    VECTORS,
+    Coding,
+    Places,
+    Transform,
+    TransformModel,
+    step_bits,
+    step_of,
+    stored_step,
+)
 from wlm.probe.transform_codec import pack_labels, pack_piece
 from wlm.probe.transform_coder import BIT, MANY, Coded, Coders, Measured
 from wlm.system import Meter, OnProgress
@@ -34,8 +46,8 @@ _AROUND = np.arange(-6, 7) / 12  # steps round the best that are tried of these,
 _TRIES = 14
 _FAR = 0.25  # octaves of a step that comes nowhere by smaller ones
 _LEAST = -133.0  # of the step's logarithm: a file has no less
-PSNR = 50.0
-"""That is wanted where nothing is said."""
+PSNR, LEAST_PSNR = 50.0, 40.0
+"""That is wanted where nothing is said, and at least that where the input is noise."""
 
 _CLOSE = 0.03  # dB above the wanted PSNR that is near enough
 FULL = 0.985
@@ -250,7 +262,7 @@ class Search:
         """What has the wanted size, or the wanted PSNR."""
         psnr, limit = self._profile.target_psnr, self._profile.max_bytes
         if psnr is not None or limit is None:
-            tried = self.smallest(PSNR if psnr is None else psnr)
+            tried = self.smallest(usual_psnr(self._probes) if psnr is None else psnr)
             if limit is None or self._frame.file_bytes(tried) <= limit:
                 return tried
         return self._best(limit)
@@ -354,9 +366,11 @@ class Search:
         low, high = max(math.log2(4.0 * self._largest / LARGEST), _LEAST), math.log2(8.0 * self._largest)
         x = min(max(math.log2(start), low), high)
         ends: dict[bool, tuple[float, float, Tried]] = {}  # by whether it is enough: step, excess
+        seen: set[int] = set()
         for trial in range(2 * _TRIES):
             if trial == _TRIES and good:
                 break
+            seen.add(_bits(x))
             tried = encode(2.0**x)
             found = excess(tried)
             self._tried += 1
@@ -373,8 +387,11 @@ class Search:
                 (a, at_a, _), (b, at_b, _) = ends[False], ends[True]
                 share = (0.5 * close - at_a) / (at_b - at_a)
                 x = a + min(max(share, 0.1), 0.9) * (b - a)
-                if abs(a - b) < 1e-3:
+                between = range(min(map(_bits, (a, b))) + 1, max(map(_bits, (a, b))))
+                if not between:
                     break
+                if _bits(x) not in between:
+                    x = math.log2(step_of(between[len(between) // 2]))
             else:
                 further = min(max(x + (0.5 * close - found) / slope, x - 6.0), x + 6.0)
                 if trial >= _TRIES:
@@ -383,6 +400,9 @@ class Search:
                 further = min(max(further, low), high)
                 if further == x:
                     break
+                if _bits(further) in seen:
+                    # The file has no step so near: the next one that it has.
+                    further = math.log2(step_of(max(_bits(x) + (1 if further > x else -1), 1)))
                 x = further
         if good:
             return min(good, key=lambda pair: cost(pair[0]))
@@ -440,6 +460,17 @@ class Search:
 
     def _psnr(self, tried: Tried) -> float:
         return psnr_from_mse(tried.error / self._probes.values.size, self._peak)
+
+
+def _bits(x: float) -> int:
+    """What a file holds of a step of so many octaves."""
+    return step_bits(2.0**x)
+
+
+def usual_psnr(probes: ProbeSet) -> float:
+    """What is wanted of a set where nothing is said: no more than tells its light from its noise."""
+    noise = noise_psnr(probes)
+    return PSNR if noise is None else min(max(noise, LEAST_PSNR), PSNR)
 
 
 def peak_of(probes: ProbeSet) -> float:
