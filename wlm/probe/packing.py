@@ -13,6 +13,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+import torch
 from scipy import linalg
 from scipy.spatial.transform import Rotation
 from scipy.special import expit
@@ -30,7 +31,7 @@ DROP = 0.05
 
 _MANY = 32768  # probes that numbers are fitted to: fewer would be fitted better, and the others worse
 _TOGETHER = 2048  # Gaussians up to which latents are fitted together: their matrix has as many rows and columns
-_PIECE = 1 << 21  # probes times Gaussians at once
+_PIECE = 1 << 22  # probes times Gaussians at once
 _FAINT = 1e-10  # of the squared range: an error that is floats'
 # Of the natural steps of each group, where a bit is worth as much in all: within a third for `livingroom` and `city`.
 _SHARES = np.array([0.033, 0.0141, 0.0105, 0.0226, 0.0151, 0.06, 0.168, 0.037])
@@ -51,7 +52,7 @@ def pack_model(model: ProbeModel, position: np.ndarray, values: np.ndarray, devi
     """
     many = slice(None, None, -(-len(position) // _MANY))
     faint = _FAINT * max(float(np.ptp(values)), float(np.abs(values).max())) ** 2
-    search = _Search(model, position[many], values[many], faint)
+    search = _Search(model, position[many], values[many], faint, device)
     growth = 10.0 ** (DROP / 10.0) - 1.0
     most = (1.0 + growth) * (_error(model, position, values, device) + faint)
     for _ in range(_TRIES):
@@ -96,13 +97,13 @@ class _Sums(NamedTuple):
 
     Attributes:
         rows: float64 [K, 9], the Gaussians.
-        weight: float64 [N, K], None where there are too many of them.
+        weight: float64 [N, K] on the device, None where there are too many of them.
         square: weight^T weight, None as this.
         feed: Its `_feed`, None as this.
     """
 
     rows: np.ndarray
-    weight: np.ndarray | None
+    weight: torch.Tensor | None
     square: np.ndarray | None
     feed: np.ndarray | None
 
@@ -110,9 +111,10 @@ class _Sums(NamedTuple):
 class _Search:
     """Whole numbers of a model at some steps, and the error that they leave."""
 
-    def __init__(self, model: ProbeModel, position: np.ndarray, values: np.ndarray, faint: float) -> None:
+    def __init__(self, model: ProbeModel, position: np.ndarray, values: np.ndarray, faint: float, device: str) -> None:
         self._gain, self._cut, self._sphere = model.gain, model.profile.cut, model.profile.support == "sphere"
         self._x = model.normalise(position).astype(np.float64)
+        self._on_device = torch.from_numpy(self._x).to(device)
         self._wanted = values.astype(np.float64) / self._gain
         rows = least_turned(model.rows())
         order = np.argsort(morton_keys(np.rint((rows[:, PLACE] - rows[:, PLACE].min(0)) * MOST / 4).astype(np.int64)))
@@ -177,7 +179,7 @@ class _Search:
         latent = rows[:, LATENT]
         if sums.square is not None:
             ridge = _ridge(sums.square, _OF_LATENTS)
-            right = sums.weight.T @ self._latent + ridge * latent
+            right = (sums.weight.T @ self._put(self._latent)).cpu().numpy() + ridge * latent
             latent = linalg.solve(sums.square + ridge * np.eye(len(rows)), right, assume_a="pos")
         latent = _fed(latent, np.tile(step[LATENT], (len(rows), 1)), sums.feed)
         net_step = [steps.first * each for each in self._of_first] + [steps.near] * 4 + [steps.second, steps.third]
@@ -210,30 +212,30 @@ class _Search:
     def _sums(self, rows: np.ndarray) -> _Sums:
         if len(rows) > _TOGETHER:
             return _Sums(rows, None, None, None)
-        weight = np.concatenate([piece for _, piece in self._weights(rows)])
-        square = weight.T @ weight
+        weight = torch.cat(list(self._weights(rows)))
+        square = (weight.T @ weight).cpu().numpy()
         return _Sums(rows, weight, square, _feed(square, _OF_LATENTS))
 
-    def _weights(self, rows: np.ndarray) -> Iterator[tuple[slice, np.ndarray]]:
-        """Weights of Gaussians [K, 9] at some of the probes, float64 [n, K]."""
+    def _weights(self, rows: np.ndarray) -> Iterator[torch.Tensor]:
+        """Weights of Gaussians [K, 9] at the probes, float64 [n, K] of some after the others."""
         scale = np.exp(rows[:, SIZE])
         bent = Rotation.from_mrp(rows[:, TURN]).as_matrix().transpose(0, 2, 1) / scale[:, :, None]  # S^-1 R^T
-        flat, middle = bent.reshape(-1, 3).T, np.einsum("kij,kj->ki", bent, rows[:, PLACE])
-        at_once = max(1, _PIECE // len(rows))
-        for start in range(0, len(self._x), at_once):
-            piece = slice(start, start + at_once)
-            square = np.square((self._x[piece] @ flat).reshape(-1, len(rows), 3) - middle).sum(2)
-            reached = square < self._cut**2
-            if self._sphere:
-                away = self._x[piece, None] - rows[:, PLACE]
-                reached = np.square(away).sum(2) < np.square(self._cut * scale.max(1))
-            yield piece, np.where(reached, np.exp(-0.5 * square), 0.0)
+        middle = self._put(np.einsum("kij,kj->ki", bent, rows[:, PLACE]))
+        flat, place = self._put(bent.reshape(-1, 3).T), self._put(rows[:, PLACE])
+        reach = self._put(np.square(self._cut * scale.max(1)))
+        for x in self._on_device.split(max(1, _PIECE // len(rows))):
+            square = ((x @ flat).reshape(-1, len(rows), 3) - middle).square_().sum(2)
+            reached = (x[:, None] - place).square_().sum(2) < reach if self._sphere else square < self._cut**2
+            yield square.mul_(-0.5).exp_().mul_(reached)
 
     def _latents(self, sums: _Sums, latent: np.ndarray) -> np.ndarray:
         """The sum of latents at the probes, float64 [N, L]."""
-        if sums.weight is not None:
-            return sums.weight @ latent
-        return np.concatenate([weight @ latent for _, weight in self._weights(sums.rows)])
+        latents = self._put(latent)
+        pieces = self._weights(sums.rows) if sums.weight is None else [sums.weight]
+        return torch.cat([weight @ latents for weight in pieces]).cpu().numpy()
+
+    def _put(self, numbers: np.ndarray) -> torch.Tensor:
+        return torch.from_numpy(np.ascontiguousarray(numbers)).to(self._on_device.device)
 
     def _inputs(self, latent: np.ndarray) -> np.ndarray:
         return _with_one(np.concatenate([latent, self._x], 1))
