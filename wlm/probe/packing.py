@@ -29,7 +29,7 @@ from wlm.probe.transform import SOURCE, stored_step
 DROP = 0.05
 """dB that packing may cost at the probes."""
 
-_MANY = 32768  # probes that numbers are fitted to: fewer would be fitted better, and the others worse
+_MANY = 20_000  # probes that numbers are fitted to: fewer would be fitted better, and the others worse
 _TOGETHER = 2048  # Gaussians up to which latents are fitted together: their matrix has as many rows and columns
 _PIECE = 1 << 22  # probes times Gaussians at once
 _FAINT = 1e-10  # of the squared range: an error that is floats'
@@ -37,7 +37,7 @@ _FAINT = 1e-10  # of the squared range: an error that is floats'
 _SHARES = np.array([0.033, 0.0141, 0.0105, 0.0226, 0.0151, 0.06, 0.168, 0.037])
 _NEAR = 0.85  # of the allowed growth that is near enough
 _TRIES = 8
-_LESS = 0.7
+_AGAIN, _LESS = 3, 0.7  # times, and with what share of the room, where the other probes have lost more
 _OF_LATENTS, _OF_LAYERS = 1e-4, 1e-5  # how much stays as it was, of the mean square of what is weighted
 
 
@@ -55,7 +55,7 @@ def pack_model(model: ProbeModel, position: np.ndarray, values: np.ndarray, devi
     search = _Search(model, position[many], values[many], faint, device)
     growth = 10.0 ** (DROP / 10.0) - 1.0
     most = (1.0 + growth) * (_error(model, position, values, device) + faint)
-    for _ in range(_TRIES):
+    for _ in range(_AGAIN):
         packed = search.within(growth)
         if packed is None:
             break
@@ -132,7 +132,6 @@ class _Search:
         first = self._layers[0][: self._latent.shape[1]]
         self._of_latent = 1.0 / _positive(np.linalg.norm(first, axis=1))
         self._of_first = 1.0 / _positive(np.sqrt(np.square(self._latent).mean(0)))
-        self._last: tuple[bytes, _Sums] | None = None
 
     def within(self, growth: float) -> Packed | None:
         """The coarsest numbers found with which the error grows by at most this share; None: there are none."""
@@ -167,21 +166,19 @@ class _Search:
         rows, latents = self._rows, self._latent.shape[1]
         step = np.concatenate([np.repeat(steps[:3], 3), steps.latent * self._of_latent])
         least = np.ptp(rows, axis=0) * (1.01 / MOST)
-        least[TURN] = 0.0
+        least[TURN] = 1.0 / MOST
         step = np.array([stored_step(each) for each in np.maximum(step, least)])
         whole = np.rint(rows[:, : LATENT.start] / step[: LATENT.start])
         turn = whole[:, TURN] * step[TURN]
         # Steps that large are none that come into question, but a file has half a turn at most.
-        whole[:, TURN] = np.where(
-            np.square(turn).sum(1, keepdims=True) <= 1.0, whole[:, TURN], np.trunc(whole[:, TURN])
-        )
-        sums = self._kept(whole, step)
+        whole[np.square(turn).sum(1) > 1.0, TURN] = 0.0
+        sums = self._sums(whole * step[: LATENT.start])
         latent = rows[:, LATENT]
         if sums.square is not None:
             ridge = _ridge(sums.square, _OF_LATENTS)
             right = (sums.weight.T @ self._put(self._latent)).cpu().numpy() + ridge * latent
             latent = linalg.solve(sums.square + ridge * np.eye(len(rows)), right, assume_a="pos")
-        latent = _fed(latent, np.tile(step[LATENT], (len(rows), 1)), sums.feed)
+        latent = _fed(latent, np.tile(step[LATENT], (len(rows), 1)), sums.feed, MOST // 2)
         net_step = [steps.first * each for each in self._of_first] + [steps.near] * 4 + [steps.second, steps.third]
         net_step = np.array([stored_step(each) for each in net_step])
         inputs = self._inputs(self._latents(sums, latent * step[LATENT]))
@@ -193,7 +190,7 @@ class _Search:
             ridge = _ridge(square, _OF_LAYERS)
             right = inputs.T @ wanted[number] + ridge * layer
             fitted = linalg.solve(square + ridge * np.eye(len(layer)), right, assume_a="pos")
-            net.append(_fed(fitted, np.repeat(own[:, None], layer.shape[1], 1), _feed(square, _OF_LAYERS)))
+            net.append(_fed(fitted, np.repeat(own[:, None], layer.shape[1], 1), _feed(square, _OF_LAYERS), LARGEST))
             result = inputs @ (net[-1] * own[:, None])
             inputs = _with_one(expit(result))
         numbers = np.concatenate([whole, latent], 1).astype(np.int64)
@@ -201,13 +198,6 @@ class _Search:
         numbers = numbers[np.argsort(morton_keys(place), kind="stable")]
         packed = Packed(numbers, step, tuple(layer.astype(np.int64) for layer in net), net_step)
         return packed, float(np.square(result - self._wanted).mean()) + self._faint
-
-    def _kept(self, whole: np.ndarray, step: np.ndarray) -> _Sums:
-        key = step[: LATENT.start].tobytes()
-        if self._last is None or self._last[0] != key:
-            self._last = None  # before the next one takes as much memory
-            self._last = key, self._sums(whole * step[: LATENT.start])
-        return self._last[1]
 
     def _sums(self, rows: np.ndarray) -> _Sums:
         if len(rows) > _TOGETHER:
@@ -247,11 +237,11 @@ def _feed(square: np.ndarray, share: float) -> np.ndarray:
     return linalg.cholesky(0.5 * (inverse + inverse.T))
 
 
-def _fed(numbers: np.ndarray, step: np.ndarray, feed: np.ndarray | None) -> np.ndarray:
-    """Numbers [I, O] rounded row by row, each making up for those before it; whole numbers as float64."""
+def _fed(numbers: np.ndarray, step: np.ndarray, feed: np.ndarray | None, most: int) -> np.ndarray:
+    """Numbers [I, O] rounded row by row, each making up for those before it; whole ones up to `most`, as float64."""
     numbers, whole = numbers.copy(), np.empty_like(numbers)
     for row in range(len(numbers)):
-        whole[row] = np.clip(np.rint(numbers[row] / step[row]), -LARGEST, LARGEST)
+        whole[row] = np.clip(np.rint(numbers[row] / step[row]), -most, most)
         if feed is not None:
             over = (numbers[row] - whole[row] * step[row]) / feed[row, row]
             numbers[row + 1 :] -= np.outer(feed[row, row + 1 :], over)

@@ -297,7 +297,8 @@ class Search:
 
     def smallest(self, psnr: float) -> Tried:
         """What reaches a PSNR in the fewest bytes."""
-        found = [self._for_psnr(psnr, self._plain, 0.5)]
+        # Of the first search the step alone is of use.
+        found = [self._for_psnr(psnr, self._uncoded, 0.5)]
         for _ in range(self._rounds):
             self._choose_basis(found[-1].step)
             found.append(self._for_psnr(psnr, self._fitted, _CLOSE))
@@ -330,7 +331,12 @@ class Search:
     def _for_psnr(self, target: float, encode: Callable[[float], Tried], close: float) -> Tried:
         start = self._peak * 10.0 ** (-target / 20.0) * 4.0
         tried, excess = self._solve(
-            encode, lambda tried: self._psnr(tried) - target, -5.0, close, start, lambda tried: tried.size
+            encode,
+            lambda tried: self._psnr(tried) - target,
+            -5.0,
+            close,
+            start,
+            lambda tried: (tried.size, -tried.step),
         )
         if excess < 0:
             name, most = self._probes.name, self._psnr(tried)
@@ -355,7 +361,7 @@ class Search:
         slope: float,
         close: float,
         start: float,
-        cost: Callable[[Tried], float],
+        cost: Callable[[Tried], Any],
     ) -> tuple[Tried, float]:
         """What costs least of all tried whose excess isn't negative, with its excess; else what comes nearest.
 
@@ -375,7 +381,8 @@ class Search:
             found = excess(tried)
             self._tried += 1
             if self._meter.due(self._tried):
-                self._meter.report(self._tried, PSNR_dB=self._psnr(tried), bytes=self._frame.file_bytes(tried))
+                size = {"bytes": self._frame.file_bytes(tried)} if tried.size else {}
+                self._meter.report(self._tried, PSNR_dB=self._psnr(tried), **size)
             enough = found >= 0
             if enough:
                 good.append((tried, found))
@@ -448,6 +455,9 @@ class Search:
 
     def _plain(self, step: float) -> Tried:
         return self._all("plain", step)
+
+    def _uncoded(self, step: float) -> Tried:
+        return self._all("uncoded", step)
 
     def _fitted(self, step: float) -> Tried:
         return self._all("fitted", step)
