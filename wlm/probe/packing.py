@@ -30,7 +30,7 @@ DROP = 0.05
 """dB that packing may cost at the probes."""
 
 _MANY = 20_000  # probes that numbers are fitted to: fewer would be fitted better, and the others worse
-_TOGETHER = 2048  # Gaussians up to which latents are fitted together: their matrix has as many rows and columns
+_TOGETHER = 1024  # Gaussians up to which latents are fitted together: their matrix has as many rows and columns
 _PIECE = 1 << 22  # probes times Gaussians at once
 _FAINT = 1e-10  # of the squared range: an error that is floats'
 # Of the natural steps of each group, where a bit is worth as much in all: within a third for `livingroom` and `city`.
