@@ -175,6 +175,8 @@ class Processes(Workers):
 
     def _start(self, number: int) -> None:
         environment = os.environ | {"PYTHONPATH": os.pathsep.join(path or os.getcwd() for path in sys.path)}
+        # NumPy would start a thread for every core, in each process.
+        environment.setdefault("OPENBLAS_NUM_THREADS", str(max(1, cores() // self.count)))
         # Ctrl-C in a terminal goes to a group of processes: they are asked for their state after it.
         group = {"process_group": 0} if os.name == "posix" else {}
         command = [sys.executable, "-P", "-c", f"from {__name__} import serve; serve()"]

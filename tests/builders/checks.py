@@ -23,14 +23,22 @@ def assert_same(a: Any, b: Any) -> None:
     """Compares two models field by field; of a report all but the times, which aren't saved."""
     assert type(a) is type(b)
     for field in dataclasses.fields(a):
-        x, y = getattr(a, field.name), getattr(b, field.name)
-        if isinstance(x, np.ndarray):
-            assert x.shape == y.shape and x.dtype == y.dtype, field.name
-            np.testing.assert_array_equal(x, y, err_msg=field.name)
-        elif field.name == "report":
-            assert x == {key: value for key, value in y.items() if key != "seconds"}
-        else:
-            assert x == y, field.name
+        _assert_same(getattr(a, field.name), getattr(b, field.name), field.name)
+
+
+def _assert_same(x: Any, y: Any, name: str) -> None:
+    if isinstance(x, np.ndarray):
+        assert x.shape == y.shape and x.dtype == y.dtype, name
+        np.testing.assert_array_equal(x, y, err_msg=name)
+    elif name == "report":
+        assert x == {key: value for key, value in y.items() if key != "seconds"}
+    elif dataclasses.is_dataclass(x) and type(x).__eq__ is object.__eq__:
+        assert_same(x, y)
+    elif isinstance(x, tuple) and any(isinstance(part, np.ndarray) for part in x):
+        for mine, other in zip(x, y, strict=True):
+            _assert_same(mine, other, name)
+    else:
+        assert x == y, name
 
 
 def put(index: Any, value: Any) -> Callable[[np.ndarray], np.ndarray]:

@@ -104,6 +104,15 @@ def _probe_compact() -> Subject:
     )
 
 
+def _probe_packed() -> Subject:
+    return Subject(
+        "probe",
+        FILES / "probe-packed.wlm",
+        lambda model: {"values": model.decoder().decode_probes()},
+        FILES / "probe-packed.npz",
+    )
+
+
 def _probe_transform() -> Subject:
     return Subject(
         "probe",
@@ -159,6 +168,7 @@ SUBJECTS: dict[str, Callable[[], Subject]] = {
     "lightmap-layers": _layers,
     "probe": _probe,
     "probe-compact": _probe_compact,
+    "probe-packed": _probe_packed,
     "probe-transform": _probe_transform,
     **{f"atlas-{kind}": lambda kind=kind: _atlas(kind) for kind in ("tiles", "cascade", "bc6h", "plain")},
     "smoke": _smoke,

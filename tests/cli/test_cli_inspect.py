@@ -128,6 +128,16 @@ def test_what_is_damaged_is_said_and_nothing_stops(tmp_path):
     assert told(tmp_path / "empty") == ".: nothing that is known here -> "
 
 
+def test_a_damaged_region_of_probes_is_said(tmp_path):
+    data = bytearray((FILES / "probe-regions.wlm").read_bytes())
+    (tmp_path / "whole.wlm").write_bytes(data)
+    assert inspect(tmp_path / "whole.wlm")[0].problems == ()
+    data[-10] ^= 0xFF
+    (tmp_path / "a.wlm").write_bytes(data)
+    (problem,) = inspect(tmp_path / "a.wlm")[0].problems
+    assert "damaged" in problem and "region" in problem
+
+
 def test_no_more_is_told_than_can_be_read(tmp_path):
     for number in range(300):
         (tmp_path / f"{number}.vdb").write_bytes(b" BDV\0\0\0\0")

@@ -67,7 +67,7 @@ def test_the_options_of_compress_reach_the_fit(room, profile, tmp_path):
     model = wlm.load(out)
     settings = model.profile
     assert (settings.ratio, settings.bits, settings.latent, settings.steps) == (0.2, 8, 3, 12)
-    assert model.source == data.load(room).source
+    assert model.source == data.load(room).source[:4]
     slack = model.extent * model.size.max() / 65535
     np.testing.assert_allclose(model.stored_positions(), data.load(room).position, rtol=0, atol=slack)
     # The seed of the command is the seed of the fit.
@@ -76,7 +76,7 @@ def test_the_options_of_compress_reach_the_fit(room, profile, tmp_path):
         assert (other.read_bytes() == out.read_bytes()) is same
     # Another convention is other light.
     call("probe", "compress", room, "-o", other, *options, "--convention", "godot")
-    assert wlm.load(other).source == data.load(room, convention="godot").source != model.source
+    assert wlm.load(other).source == data.load(room, convention="godot").source[:4] != model.source
 
 
 def test_warnings_of_the_set_are_shown(profile, tmp_path):
@@ -180,7 +180,7 @@ def test_info_says_what_is_in_the_file(fitted, carrying):
     model = wlm.load(fitted)
     assert facts["bytes"] == fitted.stat().st_size == sum(facts["parts"].values())
     assert (facts["probes"], facts["dead"], facts["outputs"], facts["positions"]) == (PROBES, DEAD, 27, False)
-    assert facts["gaussians"] == model.count and facts["gaussian_bits"] == 48 + 11 * 10
+    assert facts["gaussians"] == model.count and facts["packed"] and facts["gaussian_bits"] is None
     assert facts["bits_per_probe"] == facts["bytes"] * 8 / PROBES
     np.testing.assert_allclose(facts["size"], np.ptp(synthetic(PROBES).position, axis=0))
     assert facts["profile"]["name"] == "tiny"

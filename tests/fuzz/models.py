@@ -311,7 +311,7 @@ READERS = (
     Reader(
         "probe-compact",
         "a.wlm",
-        stored("probe-compact.wlm", "probe-regions.wlm", "probe-day.wlm"),
+        stored("probe-compact.wlm", "probe-regions.wlm", "probe-day.wlm", "probe-packed.wlm"),
         vary_compact,
         _probe,
     ),

@@ -13,8 +13,8 @@ from wlm.formats.compact import BODY
 from wlm.probe import compress_day, evaluate_day, load_hours, save_probes
 from wlm.probe.data import from_arrays
 from wlm.probe.day import DayModel
+from wlm.probe.fields import pack_own
 from wlm.probe.transform import SOURCE, Places
-from wlm.probe.transform_codec import pack_own
 
 TIMES = (9.0, 12.0, 21.0)
 PROBES = 70

@@ -47,11 +47,11 @@ from wlm.probe.data import ProbeSet, load
 from wlm.probe.decode import Decoder, Points
 from wlm.probe.evaluation import Report, score
 from wlm.probe.exact import decode64
+from wlm.probe.fields import pack_dead
 from wlm.probe.fit import compress
 from wlm.probe.light import StoredLight, light_of
 from wlm.probe.model import ProbeModel, Profile
 from wlm.probe.seen import VIEWS, score_views
-from wlm.probe.transform_codec import pack_dead
 from wlm.probe.walk import score_volume
 
 PROFILES = ("standard", "compact", "paper")

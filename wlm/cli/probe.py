@@ -334,7 +334,8 @@ def info(file: ModelFile, as_json: AsJson = False, device: Device = "cpu") -> No
         facts |= {
             "gaussians": model.count,
             "dropped": model.dropped,
-            "gaussian_bits": int(model.profile.code_bits().sum()),
+            "packed": model.packed is not None,
+            "gaussian_bits": int(model.profile.code_bits().sum()) if model.packed is None else None,
             "origin": model.origin.tolist(),
             "size": (model.extent * model.size).tolist(),
         }
@@ -358,7 +359,7 @@ def info(file: ModelFile, as_json: AsJson = False, device: Device = "cpu") -> No
         rows.add_row("regions", str(facts["regions"]))
     else:
         rows.add_row("Gaussians", f"{model.count:,}, {model.dropped:,} dropped")
-        rows.add_row("bits per Gaussian", str(facts["gaussian_bits"]))
+        rows.add_row("bits per Gaussian", str(facts["gaussian_bits"] or "packed"))
         rows.add_row("box", " x ".join(f"{side:.4g}" for side in facts["size"]))
     rows.add_row("positions", "stored" if facts["positions"] else "not stored")
     rows.add_row("source", escape(model.source))
@@ -444,6 +445,8 @@ def _show_report(file: Path, profile: str, report: "Report", rivals: "list[tuple
     if report.between_psnr is not None:
         rows.add_section()
         rows.add_row("half-way between probes", number(report.between_psnr, ".2f"))
+    if report.noise_psnr is not None:
+        rows.add_row("of the input's own noise", number(report.noise_psnr, ".2f"))
     if report.held_out is not None:
         held = report.held_out
         rows.add_row(f"{held.probes:,} probes held out", number(held.psnr, ".2f"), "", "", f"{held.bytes:,}")

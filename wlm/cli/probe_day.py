@@ -113,11 +113,11 @@ def _listed(model: "DayModel") -> str:
 def _show(file: Path, model: "DayModel", reports: "Sequence[Report]", size: int) -> None:
     share = size / sum(report.probes * report.outputs * 4 for report in reports)
     title = f"{file}: {size:,} bytes, {share:.2%} of float32, {size * 8 / reports[0].probes / len(reports):.2f} bits"
-    columns = ["hour", "PSNR dB", "live dB", "irradiance dB", "between dB"]
+    columns = ["hour", "PSNR dB", "live dB", "irradiance dB", "between dB", "noise dB"]
     held = reports[0].held_out is not None
     rows = table(f"{escape(title)} a probe and hour", [*columns, *(["held out dB", "lossless there"] if held else [])])
     for time, report in zip(model.times, reports, strict=True):
-        figures = [report.psnr, report.psnr_live, report.irradiance_psnr, report.between_psnr]
+        figures = [report.psnr, report.psnr_live, report.irradiance_psnr, report.between_psnr, report.noise_psnr]
         if report.held_out is not None:
             figures += [report.held_out.psnr, report.held_out.kriging]
         rows.add_row(f"{time:g}", *(number(figure, ".2f") for figure in figures))

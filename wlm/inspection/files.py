@@ -150,6 +150,12 @@ def _mesh(path: Path) -> Finding:
 
 def _model(path: Path) -> Finding:
     model = load(path)
+    if model.SYSTEM == "probe":
+        from wlm.probe.regions import RegionModel
+
+        if isinstance(model, RegionModel):
+            # It is read piece by piece; here all of it is asked for.
+            model.check_pieces()
     kind = {"lightmap": "lightmaps over time", "atlas": "a mesh's lightmap", "probe": "light probes"}.get(
         model.SYSTEM.removesuffix("-layers")
     )

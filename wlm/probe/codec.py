@@ -1,10 +1,10 @@
-"""Probe models in files: packed Gaussians and a half-float network; transforms as `wlm.probe.transform_codec` has them.
+"""Probe models in files. Packed Gaussians are as `wlm.probe.gaussian_codec` has them, transforms as
+`wlm.probe.transform_codec`; here are those of Gaussians that are not packed, as in earlier files.
 
 `gaussians` holds for every Gaussian three centres of 16 bits and 7 + L codes of b bits, packed without a gap, the
 lowest bit first; `frame` is origin, extent, size of the box and gain; `dead` is a bit for each probe, deflated.
 """
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -17,15 +17,17 @@ from wlm.formats.compact import HEAD
 from wlm.formats.limits import NUMBERS, PROBES
 from wlm.formats.parts import Part, check_parts
 from wlm.probe.day import DayModel
-from wlm.probe.day_codec import decode_day, encode_day, is_day
+from wlm.probe.day_codec import decode_day, encode_day
+from wlm.probe.fields import GAUSSIANS, HOURS, is_of, pack_dead, unpack_dead
+from wlm.probe.gaussian_codec import decode_gaussians, encode_gaussians
 from wlm.probe.model import LATENT, SCALE, ProbeModel, Profile, layer_shapes
 from wlm.probe.region_codec import decode_regions, encode_regions
 from wlm.probe.regions import RegionModel
 from wlm.probe.transform import Transform, TransformModel
-from wlm.probe.transform_codec import decode_transform, encode_transform, is_transform, pack_dead, unpack_dead
+from wlm.probe.transform_codec import decode_transform, encode_transform, is_transform
 from wlm.system import Header, Name
 
-_MOST_LOG = 40.0
+_MOST, _MOST_LOG = 1e38, 40.0
 
 
 class _Header(Header):
@@ -46,8 +48,7 @@ def _parts(header: _Header) -> dict[str, Part]:
     bits = header.gaussians * int(profile.code_bits().sum())
     return {
         "gaussians": Part(np.uint8, (-(-bits // 8),)),
-        # The difference of any two is finite.
-        "bounds": Part(np.float32, (2, LATENT.start + profile.latent), least=-1e38, most=1e38),
+        "bounds": Part(np.float32, (2, LATENT.start + profile.latent), least=-_MOST, most=_MOST),
         "net": Part(np.float16, (sum(rows * columns for rows, columns in layers),)),
         "frame": Part(np.float64, (8,)),
         "dead": Part(np.uint8, (None,), optional=True),
@@ -63,6 +64,8 @@ def encode(model: ProbeModel | Transform) -> tuple[dict[str, Any], dict[str, np.
         return encode_day(model)
     if isinstance(model, TransformModel):
         return encode_transform(model)
+    if model.packed is not None:
+        return encode_gaussians(model)
     settings = {
         "name": model.name,
         "probes": model.probes,
@@ -90,18 +93,17 @@ def decode(artifact: Artifact) -> ProbeModel | Transform:
     """
     if HEAD in artifact.tensors:
         return decode_regions(artifact)
-    if is_day(artifact):
+    if is_of(artifact, HOURS):
         return decode_day(artifact)
+    if is_of(artifact, GAUSSIANS):
+        return _checked(decode_gaussians(artifact))
     if is_transform(artifact):
         return decode_transform(artifact)
     header = check_settings(_Header, artifact.settings, "setting ")
     parts = check_parts(artifact.tensors, _parts(header))
-    _check_frame(parts["frame"])
-    _check_bounds(parts["bounds"])
-    _check_values(header, parts)
     frame = parts["frame"]
     codes = unpack_bits(parts["gaussians"], header.profile.code_bits(), header.gaussians)
-    return ProbeModel(
+    model = ProbeModel(
         name=header.name,
         source=artifact.source,
         profile=header.profile,
@@ -119,10 +121,22 @@ def decode(artifact: Artifact) -> ProbeModel | Transform:
         positions=parts["positions"],
         dropped=header.dropped,
     )
+    return _checked(model)
 
 
-def _check_frame(frame: np.ndarray) -> None:
-    origin, extent, size, gain = frame[:3], frame[3], frame[4:7], frame[7]
+def _checked(model: ProbeModel) -> ProbeModel:
+    """The model, if all of its numbers can be used.
+
+    Raises:
+        ValueError: They can't.
+    """
+    _check_frame(model.origin, model.extent, model.size, model.gain)
+    _check_bounds(model.bounds)
+    _check_values(model)
+    return model
+
+
+def _check_frame(origin: np.ndarray, extent: float, size: np.ndarray, gain: float) -> None:
     with np.errstate(over="ignore"):
         reaches = np.isfinite(origin + extent * size).all()
     if not (extent > 0 and reaches and (size >= 0).all() and (size <= 1).all()):
@@ -132,6 +146,9 @@ def _check_frame(frame: np.ndarray) -> None:
 
 
 def _check_bounds(bounds: np.ndarray) -> None:
+    # The difference of any two is finite.
+    if not np.abs(bounds).max() <= _MOST:
+        raise ValueError(f"part bounds: expected numbers of at most {_MOST:g} either way")
     if (bounds[0] > bounds[1]).any():
         raise ValueError("part bounds: expected no lowest value above its highest")
     # Scales are logarithms: their squares, and the squares' inverses, must be float32.
@@ -139,15 +156,12 @@ def _check_bounds(bounds: np.ndarray) -> None:
         raise ValueError(f"part bounds: expected logs of scales of at most {_MOST_LOG:g} either way")
 
 
-def _check_values(header: _Header, parts: Mapping[str, np.ndarray]) -> None:
+def _check_values(model: ProbeModel) -> None:
     """Checks that no number on the way to a probe's values is beyond float32, wherever it is decoded."""
-    layers, begin = [], 0
-    for rows, columns in layer_shapes(header.profile.latent, header.profile.hidden, header.outputs):
-        # The sum of what each output may become, of inputs in [-1, 1].
-        layers.append(np.abs(parts["net"][begin : begin + rows * columns].reshape(rows, columns).astype(np.float64)))
-        begin += rows * columns
-    sums = header.gaussians * np.abs(parts["bounds"][:, LATENT].astype(np.float64)).max(0)
-    first = layers[0] * np.concatenate([np.maximum(sums, 1.0), np.ones(4)])[:, None]
-    most = max(first.sum(0).max(), parts["frame"][7] * layers[2].sum(0).max())
+    # The sum of what each output may become, of inputs in [-1, 1].
+    first, _, third = (np.abs(layer.astype(np.float64)) for layer in model.layers())
+    sums = model.count * np.abs(model.bounds[:, LATENT].astype(np.float64)).max(0)
+    first *= np.concatenate([np.maximum(sums, 1.0), np.ones(4)])[:, None]
+    most = max(first.sum(0).max(), model.gain * third.sum(0).max())
     if not most <= np.finfo(np.float32).max:
         raise ValueError("parts net, bounds and frame: expected values that float32 holds")

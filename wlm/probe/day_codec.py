@@ -1,6 +1,6 @@
 """Several hours of probes in files: a compact artifact whose body is the places, and then hour after hour.
 
-The body, with fields as in `wlm.probe.transform_codec`:
+The body, with fields as in `wlm.probe.fields`:
 
 ==========  ===========================================================================================================
 field       content
@@ -36,60 +36,37 @@ import numpy as np
 
 from wlm.formats.artifact import Artifact
 from wlm.formats.compact import BODY
+from wlm.probe import fields
 from wlm.probe.day import REFERENCES, WIDEST, DayModel, Hour, Told, matrix_shape
 from wlm.probe.entropy import unpack
 from wlm.probe.hours import PERIOD, TIMES
 from wlm.probe.model import live_probes
 from wlm.probe.transform import step_of
-from wlm.probe.transform_codec import (
-    CHECK,
-    DEAD,
-    DEFLATED,
-    HEAD_SHIFT,
-    HOURS,
-    OUTPUTS,
-    PLACED,
-    SHORT,
-    Fields,
-    begin_bytes,
-    check_counts,
-    check_flags,
-    check_numbers,
-    head_flags,
-    head_of,
-    name_of,
-    number_bytes,
-    pack_own,
-    step_bytes,
-)
 
 _STATES = 1 << 27  # probes times hours: a byte each tells who is dead
 _GAIN = struct.Struct("<f")
 
 
-def is_day(artifact: Artifact) -> bool:
-    """Whether a probe file is one of several hours."""
-    begin = artifact.tensors.get(BODY, np.zeros(0, np.uint8))[: SHORT.size]
-    return len(begin) == SHORT.size and SHORT.unpack(begin.tobytes())[0] >> HEAD_SHIFT & HOURS == HOURS
-
-
 def encode_day(model: DayModel) -> tuple[dict[str, Any], dict[str, np.ndarray], str]:
     """Settings, parts and source of a model's file."""
-    flags, places = pack_own(np.zeros(0, bool), model.places)
-    content = [begin_bytes(flags | HOURS << HEAD_SHIFT, model), number_bytes(len(model.times))]
+    flags, places = fields.pack_own(np.zeros(0, bool), model.places)
+    content = [
+        fields.begin_bytes(flags | fields.HOURS << fields.HEAD_SHIFT, model),
+        fields.number_bytes(len(model.times)),
+    ]
     content += [np.array(model.times, "<f8").tobytes(), places]
     if model.places is None:
-        content.append(CHECK.pack(model.check))
+        content.append(fields.CHECK.pack(model.check))
     before = np.zeros(model.probes, bool)
     for hour in model.hours:
         dead = ~live_probes(hour.dead, model.probes)
-        flags, change = pack_own(dead ^ before, None)
+        flags, change = fields.pack_own(dead ^ before, None)
         before = dead
         content += [bytes([hour.number, len(hour.told.references), *hour.told.references]), _GAIN.pack(hour.told.gain)]
-        content += [SHORT.pack(head_flags(hour.head) | flags), change, step_bytes(hour.head.step)]
+        content += [fields.SHORT.pack(fields.head_flags(hour.head) | flags), change, fields.step_bytes(hour.head.step)]
         blocks = [hour.told.packed()] if hour.told.references else []
         for block in (*blocks, hour.stream.tobytes()):
-            content += [number_bytes(len(block)), block]
+            content += [fields.number_bytes(len(block)), block]
     return {}, {BODY: np.frombuffer(b"".join(content), np.uint8)}, ""
 
 
@@ -100,13 +77,13 @@ def decode_day(artifact: Artifact) -> DayModel:
         WlmError, ValueError: The body is damaged.
     """
     body = artifact.tensors[BODY]
-    reader = Fields(body)
+    reader = fields.Fields(body)
     flags, probes, outputs, source = reader.begin()
-    check_flags(not flags & ~(HOURS << HEAD_SHIFT | OUTPUTS | PLACED), flags)
+    fields.check_flags(not flags & ~(fields.HOURS << fields.HEAD_SHIFT | fields.OUTPUTS | fields.PLACED), flags)
     count = reader.number("hours", TIMES)
     if probes * count > _STATES:
         raise ValueError(f"part {BODY}: expected at most {_STATES // probes} hours of {probes} probes, found {count}")
-    check_numbers(probes, outputs * count, len(body))
+    fields.check_numbers(probes, outputs * count, len(body))
     times = tuple(np.frombuffer(reader.take(8 * count).tobytes(), "<f8").tolist())
     if not all(0.0 <= time < PERIOD for time in times) or any(a >= b for a, b in pairwise(times)):
         raise ValueError(f"part hours: expected increasing times of day, from 0 to below {PERIOD:g}")
@@ -117,8 +94,8 @@ def decode_day(artifact: Artifact) -> DayModel:
         hours.append(_read_hour(reader, hours, count, probes, outputs, check))
     if len(rest := reader.rest()):
         raise ValueError(f"part hours: expected {len(body) - len(rest)} bytes, found {len(body)}")
-    check_counts(probes, outputs, [hour.dead for hour in hours], len(body))
-    model = DayModel(name_of(artifact), source, probes, outputs, places, times, tuple(hours), times[0])
+    fields.check_counts(probes, outputs, [hour.dead for hour in hours], len(body))
+    model = DayModel(fields.name_of(artifact), source, probes, outputs, places, times, tuple(hours), times[0])
     if places is not None:
         # What can be unpacked here is, so that whatever is wrong with it is said of the file.
         for time in times:
@@ -126,7 +103,7 @@ def decode_day(artifact: Artifact) -> DayModel:
     return model
 
 
-def _read_hour(reader: Fields, hours: list[Hour], count: int, probes: int, outputs: int, check: int) -> Hour:
+def _read_hour(reader: fields.Fields, hours: list[Hour], count: int, probes: int, outputs: int, check: int) -> Hour:
     """The hour that follows those that are read, of so many."""
     number, told = reader.take(2).tolist()
     references = tuple(reader.take(told).tolist())
@@ -138,14 +115,17 @@ def _read_hour(reader: Fields, hours: list[Hour], count: int, probes: int, outpu
     gain = reader.fields(_GAIN)[0]
     if not 0.0 < gain < np.inf:
         raise ValueError(f"part hours: expected a positive gain, found {gain:g}")
-    flags = reader.fields(SHORT)[0]
-    check_flags(not flags & (OUTPUTS | PLACED) and flags & (DEAD | DEFLATED) != DEFLATED, flags)
+    flags = reader.fields(fields.SHORT)[0]
+    fields.check_flags(
+        not flags & (fields.OUTPUTS | fields.PLACED) and flags & (fields.DEAD | fields.DEFLATED) != fields.DEFLATED,
+        flags,
+    )
     change, _ = reader.own(flags, probes)
     dead = hours[-1].dead if hours else np.zeros(0, bool)
     if change.size:
         dead = change ^ dead if dead.size else change
         dead = dead if dead.any() else np.zeros(0, bool)
-    head = head_of(flags, step_of(reader.fields(SHORT)[0]), check)
+    head = fields.head_of(flags, step_of(reader.fields(fields.SHORT)[0]), check)
     matrix = np.zeros((0, outputs), np.int64)
     if told:
         try:

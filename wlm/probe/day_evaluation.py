@@ -13,6 +13,7 @@ from wlm.probe.day import DayModel
 from wlm.probe.day_fit import compress_day
 from wlm.probe.evaluation import Report, score
 from wlm.probe.hours import check_hours
+from wlm.probe.noise import noise_psnr
 from wlm.system import Meter, OnProgress
 
 
@@ -53,7 +54,9 @@ def evaluate_day(
         lost.add(probes.values, decoded)
         warnings = lost.warnings(f"{probes.name}, {time:g} h", "probe", "the set")
         report = score(decoded, probes, share)
-        reports.append(replace(report, warnings=warnings, between_psnr=between_psnr(decoder, probes), held_out=held[i]))
+        between = between_psnr(decoder, probes)
+        more = {"between_psnr": between, "held_out": held[i], "noise_psnr": noise_psnr(probes)}
+        reports.append(replace(report, warnings=warnings, **more))
         meter.report(i + 1, PSNR_dB=report.psnr)
     return reports
 

@@ -19,7 +19,7 @@ from wlm.probe.hours import check_hours, joint_source
 from wlm.probe.model import Profile
 from wlm.probe.transform import SOURCE, Places
 from wlm.probe.transform_coder import Coders
-from wlm.probe.transform_fit import FULL, PSNR, Frame, Search, Team, Tried, peak_of
+from wlm.probe.transform_fit import FULL, Frame, Search, Team, Tried, peak_of, usual_psnr
 from wlm.probe.tree import FIRST, Tree, Trees
 from wlm.system import Meter, OnProgress
 from wlm.workers import Here
@@ -103,7 +103,7 @@ class _Fit:
         """The model of the wanted PSNR, or the wanted size."""
         psnr, limit = self._profile.target_psnr, self._profile.max_bytes
         if psnr is not None or limit is None:
-            wanted = PSNR if psnr is None else psnr
+            wanted = max(map(usual_psnr, self._sets)) if psnr is None else psnr
             model, _ = self._day(4.0 * 10.0 ** (-wanted / 20.0), lambda search, _: search.smallest(wanted))
             if limit is None or model.file_bytes() <= limit:
                 return model

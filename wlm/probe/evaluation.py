@@ -30,6 +30,7 @@ from wlm.metrics import LostLight, psnr_from_mse
 from wlm.probe.between import HeldOut, between_psnr, held_out
 from wlm.probe.data import ProbeSet
 from wlm.probe.model import ProbeModel
+from wlm.probe.noise import noise_psnr
 from wlm.probe.sphere import coefficient_bands, fibonacci_sphere, irradiance, sh_count
 from wlm.probe.transform import Transform
 from wlm.system import Meter, OnProgress
@@ -66,6 +67,8 @@ class Report(BaseReport):
         warnings: Light that was lost and that the means hide.
         between_psnr: dB, half-way between probes, see `wlm.probe.between`; None where that isn't asked.
         held_out: The score where nothing was compressed; None where that isn't asked.
+        noise_psnr: dB, of the input's own noise, see `wlm.probe.noise`: a `psnr` above it is spent on noise. None where
+            it can't be told, or isn't asked.
     """
 
     name: str
@@ -88,6 +91,7 @@ class Report(BaseReport):
     warnings: list[str] = field(default_factory=list)
     between_psnr: float | None = None
     held_out: HeldOut | None = None
+    noise_psnr: float | None = None
 
 
 def evaluate(
@@ -127,6 +131,7 @@ def evaluate(
         warnings=lost.warnings(probes.name, "probe", "the set"),
         between_psnr=between_psnr(decoder, probes),
         held_out=held_out(model, probes, device=device, progress=progress) if hold_out else None,
+        noise_psnr=noise_psnr(probes),
     )
     meter.report(2, PSNR_dB=report.psnr)
     return report

@@ -51,4 +51,4 @@ def decode64(model: ProbeModel, position: np.ndarray) -> np.ndarray:
 def _rows(model: ProbeModel) -> np.ndarray:
     """Eq. 14, float64 [K, 10 + L]."""
     low, high = model.bounds.astype(np.float64)
-    return low + model.codes * ((high - low) / (2.0 ** model.profile.code_bits() - 1.0))
+    return low + model.codes * ((high - low) / np.maximum(model.levels, 1))

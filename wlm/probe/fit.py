@@ -16,6 +16,7 @@ from wlm.formats.checkpoint import EVERY, Checkpoint
 from wlm.metrics import psnr_from_mse
 from wlm.probe.data import ProbeSet
 from wlm.probe.model import ProbeModel, Profile, check_outputs
+from wlm.probe.packing import pack_model
 from wlm.probe.trainer import Trainer
 from wlm.probe.transform import Transform
 from wlm.probe.transform_fit import compress_transform
@@ -115,7 +116,7 @@ def compress(
     if positions:
         stored = np.rint((probes.position - origin) / extent / np.where(size > 0, size, 1.0) * 65535.0)
         stored = np.clip(stored, 0, 65535).astype(np.uint16)
-    return ProbeModel(
+    model = ProbeModel(
         name=probes.name,
         source=probes.source,
         profile=profile,
@@ -129,6 +130,7 @@ def compress(
         dropped=int((~trainer.needed).sum()),
         **parts,
     )
+    return pack_model(model, probes.position[probes.live], probes.values[probes.live], device)
 
 
 def check_method(profile: Profile, overrides: Mapping[str, Any], prefix: str = "") -> None:

@@ -15,6 +15,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from wlm.errors import WlmError
+from wlm.probe.packed import Packed
 from wlm.system import Model, Settings
 from wlm_kernels.probe.network import most_outputs
 
@@ -33,7 +34,7 @@ class Profile(Settings):
         name: Shown in reports.
         method: "gaussians", which all settings but the next three are about, or "transform".
         target_psnr: Of a transform, dB over all numbers of all probes: what to reach, with as few bytes as that takes.
-            None: 50, or as many as `max_bytes` allows.
+            None: 50, or fewer where the set's own noise is more, or as many as `max_bytes` allows.
         max_bytes: Of a transform, the most that its file may have, which comes before the PSNR; None: any.
         region: Of a transform, live probes up to which a set is one region; more are divided.
         ratio: Gaussians as a share of the live probes.
@@ -131,13 +132,14 @@ class ProbeModel(Model):
         size: float64 [3], of the box of the probes, normalised: each in [0, 1].
         gain: Factor behind the network.
         centre: uint16 [K, 3].
-        code: uint16 [K, 7 + L], below 2 ** bits: log of the scale, rotation, latent.
+        code: uint16 [K, 7 + L], up to `levels`: log of the scale, rotation, latent.
         bounds: float32 [2, 10 + L], lowest and highest value of each channel.
         net: float16 [P], the network: for each layer a row of weights for every input, then the biases.
         dead: bool [N], probes that decode to zero: all their numbers were zero, or one was not finite. Empty if there
             are none.
         positions: uint16 [N, 3] over the box, where they are stored with the model; else empty.
         dropped: Gaussians that no probe felt and that are not stored.
+        packed: The whole numbers that `centre`, `code`, `bounds` and `net` follow from, of a packed file; else None.
     """
 
     SYSTEM: ClassVar[str] = "probe"
@@ -158,6 +160,7 @@ class ProbeModel(Model):
     dead: np.ndarray
     positions: np.ndarray
     dropped: int
+    packed: Packed | None = None
 
     @property
     def count(self) -> int:
@@ -175,10 +178,15 @@ class ProbeModel(Model):
         return np.concatenate([self.centre, self.code], 1)
 
     @property
+    def levels(self) -> np.ndarray:
+        """The largest code of each channel, int64 [10 + L]."""
+        return 2 ** self.profile.code_bits() - 1 if self.packed is None else self.packed.levels()
+
+    @property
     def steps(self) -> np.ndarray:
         """What one unit of each code is worth, float32 [10 + L]."""
         low, high = self.bounds
-        return (high - low) / (2 ** self.profile.code_bits() - 1).astype(np.float32)
+        return (high - low) / np.maximum(self.levels, 1).astype(np.float32)
 
     def rows(self) -> np.ndarray:
         """The Gaussians' numbers restored from their codes (eq. 14), float32 [K, 10 + L].

@@ -1,6 +1,6 @@
 """Probe sets of many regions in files: a compact artifact read piece by piece.
 
-The head, with fields as in `wlm.probe.transform_codec`:
+The head, with fields as in `wlm.probe.fields`:
 
 ===========  ==========================================================================================================
 field        content
@@ -30,27 +30,10 @@ import numpy as np
 from wlm.formats.artifact import Artifact
 from wlm.formats.compact import DATA, HEAD
 from wlm.formats.limits import NUMBERS
+from wlm.probe import fields
 from wlm.probe.entropy import Shape, pack, unpack
 from wlm.probe.regions import Piece, RegionModel, Split
 from wlm.probe.transform import step_of
-from wlm.probe.transform_codec import (
-    CORNERS,
-    DIRECTIONS,
-    FARTHEST,
-    HEAD_SHIFT,
-    KIND,
-    OUTPUTS,
-    PLACED,
-    SHORT,
-    Fields,
-    begin_bytes,
-    check_counts,
-    head_flags,
-    head_of,
-    name_of,
-    number_bytes,
-    step_bytes,
-)
 from wlm.probe.tree import flat
 
 _REGIONS = 1 << 16
@@ -61,13 +44,17 @@ _PIECE = struct.Struct("<I4sI6H")
 def encode_regions(model: RegionModel) -> tuple[dict[str, Any], dict[str, np.ndarray], str]:
     """Settings, parts and source of a model's file."""
     head = model.head
-    pieces = [begin_bytes(head_flags(head) | PLACED * model.has_positions, model)]
-    pieces += [CORNERS.pack(*model.origin, model.extent), step_bytes(head.step)]
+    pieces = [fields.begin_bytes(fields.head_flags(head) | fields.PLACED * model.has_positions, model)]
+    pieces += [fields.CORNERS.pack(*model.origin, model.extent), fields.step_bytes(head.step)]
     if model.directions is not None:
         vectors = np.rint(model.directions * head.fineness).astype(np.int64)
         code = pack((vectors, Shape(model.outputs, flat(len(vectors)))))
-        pieces += [number_bytes(len(code)), code]
-    pieces += [number_bytes(model.split.regions), model.split.axis.tobytes(), model.split.plane.astype("<u2").tobytes()]
+        pieces += [fields.number_bytes(len(code)), code]
+    pieces += [
+        fields.number_bytes(model.split.regions),
+        model.split.axis.tobytes(),
+        model.split.plane.astype("<u2").tobytes(),
+    ]
     pieces.append(_ORDER.pack(len(model.order), model.order_digest))
     for piece in model.pieces:
         pieces.append(_PIECE.pack(len(piece.data), piece.digest, piece.probes, *piece.box.ravel().tolist()))
@@ -81,14 +68,14 @@ def decode_regions(artifact: Artifact) -> RegionModel:
     Raises:
         ValueError: The head is damaged, or doesn't fit the data.
     """
-    reader, data = Fields(artifact.tensors[HEAD]), artifact.tensors[DATA]
+    reader, data = fields.Fields(artifact.tensors[HEAD]), artifact.tensors[DATA]
     flags, probes, outputs, source = reader.begin()
-    if flags & ~(DIRECTIONS | KIND << HEAD_SHIFT | OUTPUTS | PLACED):
+    if flags & ~(fields.DIRECTIONS | fields.KIND << fields.HEAD_SHIFT | fields.OUTPUTS | fields.PLACED):
         raise ValueError(f"part {HEAD}: expected known flags, found {flags}")
-    frame = np.array(reader.fields(CORNERS))
-    if not ((np.abs(frame) <= FARTHEST).all() and frame[3] > 0):
-        raise ValueError(f"part {HEAD}: expected an origin and a positive extent within {FARTHEST:g}")
-    head = head_of(flags, step_of(reader.fields(SHORT)[0]), 0).checked(outputs, len(data))
+    frame = np.array(reader.fields(fields.CORNERS))
+    if not ((np.abs(frame) <= fields.FARTHEST).all() and frame[3] > 0):
+        raise ValueError(f"part {HEAD}: expected an origin and a positive extent within {fields.FARTHEST:g}")
+    head = fields.head_of(flags, step_of(reader.fields(fields.SHORT)[0]), 0).checked(outputs, len(data))
     directions = None
     if head.vectors:
         code = reader.take(reader.number("bytes", 16 * NUMBERS * NUMBERS)).tobytes()
@@ -108,13 +95,13 @@ def decode_regions(artifact: Artifact) -> RegionModel:
         raise ValueError(f"part {DATA}: expected {end} bytes, found {len(data)}")
     if sum(piece.probes for piece in pieces) != probes:
         raise ValueError(f"part {HEAD}: expected regions of {probes} probes in all")
-    check_counts(probes, outputs, [np.zeros(0, bool)], len(data))
+    fields.check_counts(probes, outputs, [np.zeros(0, bool)], len(data))
     return RegionModel(
-        name=name_of(artifact),
+        name=fields.name_of(artifact),
         source=source,
         probes=probes,
         outputs=outputs,
-        has_positions=bool(flags & PLACED),
+        has_positions=bool(flags & fields.PLACED),
         origin=frame[:3].copy(),
         extent=float(frame[3]),
         split=split,

@@ -14,8 +14,9 @@ import numpy as np
 
 from wlm.errors import WlmError
 from wlm.formats.compact import digest
+from wlm.probe.fields import pack_dead, unpack_dead
 from wlm.probe.transform import CODES, NO_POSITIONS, Head, Places, Transform, TransformModel
-from wlm.probe.transform_codec import pack_dead, pack_piece, parse_piece, unpack_dead, unpack_labels
+from wlm.probe.transform_codec import pack_piece, parse_piece, unpack_labels
 
 LEAF = 3
 """In place of an axis: a region."""
@@ -163,6 +164,16 @@ class RegionModel(Transform):
             raise WlmError(f"{name}: expected places in all regions or in none")
         head = self.head._replace(check=check, grid=grid)
         return TransformModel(name, self.source, piece.probes, self.outputs, own, head, stream, places, self.directions)
+
+    def check_pieces(self) -> None:
+        """Compares all bytes with their digests.
+
+        Raises:
+            WlmError: Some are damaged.
+        """
+        _check_digest(self.name, self.order, self.order_digest)
+        for number, piece in enumerate(self.pieces):
+            _check_digest(f"{self.name}, region {number}", piece.data, piece.digest)
 
     def boxes(self) -> np.ndarray:
         """float64 [R, 2, 3], round the live probes of each region, in the unit of the positions."""

@@ -203,7 +203,7 @@ void wlm_probe_values_listed(vec3 x, int first, int count, out float values[WLM_
 #endif
 """
 
-_SH = """
+SH = """
 // Spherical harmonics of the light at a position of the scene: {coefficients} coefficients, RGB.
 void wlm_probe_sh(vec3 position, out vec3 sh[{coefficients}])
 {{
@@ -212,7 +212,10 @@ void wlm_probe_sh(vec3 position, out vec3 sh[{coefficients}])
     for (int c = 0; c < {coefficients}; ++c)
         sh[c] = vec3(values[3 * c], values[3 * c + 1], values[3 * c + 2]);
 }}
+"""
+"""What ends the text where the numbers are spherical harmonics."""
 
+_SH_LISTED = """
 #ifdef WLM_PROBE_LIST
 void wlm_probe_sh_listed(vec3 position, int first, int count, out vec3 sh[{coefficients}])
 {{
@@ -258,4 +261,4 @@ def probe_glsl(model: ProbeModel) -> str:
         reached=_REACHED[profile.support],
     )
     coefficients = sh_count(model.outputs)
-    return text if coefficients is None else text + _SH.format(coefficients=coefficients)
+    return text if coefficients is None else text + (SH + _SH_LISTED).format(coefficients=coefficients)

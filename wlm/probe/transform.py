@@ -348,10 +348,14 @@ def read_values(
     return turned if head.raw else turned @ basis(outputs, directions).T
 
 
+def step_bits(step: float) -> int:
+    """The 16 bits of the nearest step that a file holds, the upper half of a float32; they grow with the step."""
+    return max(int(np.array(step, np.float32).view(np.uint32)) + 0x8000 >> 16, 1)
+
+
 def stored_step(step: float) -> float:
-    """The nearest step that a file holds: the upper half of a float32."""
-    bits = int(np.array(step, np.float32).view(np.uint32)) + 0x8000 >> 16
-    return step_of(max(bits, 1))
+    """The nearest step that a file holds."""
+    return step_of(step_bits(step))
 
 
 def step_of(bits: int) -> float:

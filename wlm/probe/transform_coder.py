@@ -124,6 +124,11 @@ class Coder:
         """Each number rounded for itself."""
         return self._coded(step, _rounded(self._exact() / stored_step(step)))
 
+    def uncoded(self, step: float) -> Coded:
+        """As `plain`, without the bytes."""
+        step = stored_step(step)
+        return Coded(np.zeros(0, np.uint8), self._error(step, _rounded(self._exact() / step)), self._tree.grid)
+
     def fitted(self, step: float) -> Coded:
         """Numbers that are worth their bits together."""
         tree, step = self._tree, stored_step(step)
@@ -162,12 +167,14 @@ class Coder:
         return self._tree.coefficients(turned) * self._tree.reach[:, None] if self._coding.predicted else turned
 
     def _coded(self, step: float, q: np.ndarray) -> Coded:
-        decoded = q * stored_step(step)
+        tree = self._tree if self._coding.predicted else None
+        return Coded(make_stream(self._coding, tree, q), self._error(stored_step(step), q), self._tree.grid)
+
+    def _error(self, step: float, q: np.ndarray) -> float:
+        decoded = q * step
         if self._coding.predicted:
             decoded = self._tree.values(decoded / self._tree.reach[:, None])
-        tree = self._tree if self._coding.predicted else None
-        error = float(np.square(decoded - self._target()).sum())
-        return Coded(make_stream(self._coding, tree, q), error, self._tree.grid)
+        return float(np.square(decoded - self._target()).sum())
 
 
 class Coders:

@@ -11,6 +11,7 @@ import numpy as np
 from wlm.errors import WlmError
 from wlm.probe.conventions import CANONICAL
 from wlm.probe.kriging import FEW, NEIGHBOURS, SILL, SLIGHT, TAPER
+from wlm.probe.shader import SH
 from wlm.probe.sphere import sh_count
 from wlm.probe.transform import TransformModel
 
@@ -207,17 +208,6 @@ void wlm_probe_values(vec3 x, out float values[WLM_PROBE_OUTPUTS])
 }}
 """
 
-_SH = """
-// Spherical harmonics of the light at a position of the scene: {coefficients} coefficients, RGB.
-void wlm_probe_sh(vec3 position, out vec3 sh[{coefficients}])
-{{
-    float values[WLM_PROBE_OUTPUTS];
-    wlm_probe_values(wlm_probe_place(position), values);
-    for (int c = 0; c < {coefficients}; ++c)
-        sh[c] = vec3(values[3 * c], values[3 * c + 1], values[3 * c + 2]);
-}}
-"""
-
 
 def transform_glsl(live: int, outputs: int) -> str:
     """The shader text for so many live probes (its text is the same from 13 on) of so many numbers."""
@@ -234,7 +224,7 @@ def transform_glsl(live: int, outputs: int) -> str:
         slight=f"{SLIGHT:.8f}",
     )
     coefficients = sh_count(outputs)
-    return text if coefficients is None else text + _SH.format(coefficients=coefficients)
+    return text if coefficients is None else text + SH.format(coefficients=coefficients)
 
 
 def light_bytes(model: TransformModel, place: np.ndarray, values: np.ndarray) -> tuple[bytes, dict[str, Any]]:

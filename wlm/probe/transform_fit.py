@@ -17,10 +17,23 @@ from wlm.formats.compact import digest
 from wlm.metrics import psnr_from_mse
 from wlm.probe.data import ProbeSet
 from wlm.probe.entropy import LARGEST
+from wlm.probe.fields import pack_dead
 from wlm.probe.model import Profile
+from wlm.probe.noise import noise_psnr
 from wlm.probe.regions import Piece, RegionModel, Split, members
-from wlm.probe.transform import FINENESS, SOURCE, VECTORS, Coding, Places, Transform, TransformModel, stored_step
-from wlm.probe.transform_codec import pack_dead, pack_labels, pack_piece
+from wlm.probe.transform import (
+    FINENESS,
+    SOURCE,
+    VECTORS,
+    Coding,
+    Places,
+    Transform,
+    TransformModel,
+    step_bits,
+    step_of,
+    stored_step,
+)
+from wlm.probe.transform_codec import pack_labels, pack_piece
 from wlm.probe.transform_coder import BIT, MANY, Coded, Coders, Measured
 from wlm.system import Meter, OnProgress
 from wlm.workers import Here, Processes, Workers, cores
@@ -33,8 +46,8 @@ _AROUND = np.arange(-6, 7) / 12  # steps round the best that are tried of these,
 _TRIES = 14
 _FAR = 0.25  # octaves of a step that comes nowhere by smaller ones
 _LEAST = -133.0  # of the step's logarithm: a file has no less
-PSNR = 50.0
-"""That is wanted where nothing is said."""
+PSNR, LEAST_PSNR = 50.0, 40.0
+"""That is wanted where nothing is said, and at least that where the input is noise."""
 
 _CLOSE = 0.03  # dB above the wanted PSNR that is near enough
 FULL = 0.985
@@ -249,7 +262,7 @@ class Search:
         """What has the wanted size, or the wanted PSNR."""
         psnr, limit = self._profile.target_psnr, self._profile.max_bytes
         if psnr is not None or limit is None:
-            tried = self.smallest(PSNR if psnr is None else psnr)
+            tried = self.smallest(usual_psnr(self._probes) if psnr is None else psnr)
             if limit is None or self._frame.file_bytes(tried) <= limit:
                 return tried
         return self._best(limit)
@@ -284,7 +297,8 @@ class Search:
 
     def smallest(self, psnr: float) -> Tried:
         """What reaches a PSNR in the fewest bytes."""
-        found = [self._for_psnr(psnr, self._plain, 0.5)]
+        # Of the first search the step alone is of use.
+        found = [self._for_psnr(psnr, self._uncoded, 0.5)]
         for _ in range(self._rounds):
             self._choose_basis(found[-1].step)
             found.append(self._for_psnr(psnr, self._fitted, _CLOSE))
@@ -317,7 +331,12 @@ class Search:
     def _for_psnr(self, target: float, encode: Callable[[float], Tried], close: float) -> Tried:
         start = self._peak * 10.0 ** (-target / 20.0) * 4.0
         tried, excess = self._solve(
-            encode, lambda tried: self._psnr(tried) - target, -5.0, close, start, lambda tried: tried.size
+            encode,
+            lambda tried: self._psnr(tried) - target,
+            -5.0,
+            close,
+            start,
+            lambda tried: (tried.size, -tried.step),
         )
         if excess < 0:
             name, most = self._probes.name, self._psnr(tried)
@@ -342,7 +361,7 @@ class Search:
         slope: float,
         close: float,
         start: float,
-        cost: Callable[[Tried], float],
+        cost: Callable[[Tried], Any],
     ) -> tuple[Tried, float]:
         """What costs least of all tried whose excess isn't negative, with its excess; else what comes nearest.
 
@@ -353,14 +372,17 @@ class Search:
         low, high = max(math.log2(4.0 * self._largest / LARGEST), _LEAST), math.log2(8.0 * self._largest)
         x = min(max(math.log2(start), low), high)
         ends: dict[bool, tuple[float, float, Tried]] = {}  # by whether it is enough: step, excess
+        seen: set[int] = set()
         for trial in range(2 * _TRIES):
             if trial == _TRIES and good:
                 break
+            seen.add(_bits(x))
             tried = encode(2.0**x)
             found = excess(tried)
             self._tried += 1
             if self._meter.due(self._tried):
-                self._meter.report(self._tried, PSNR_dB=self._psnr(tried), bytes=self._frame.file_bytes(tried))
+                size = {"bytes": self._frame.file_bytes(tried)} if tried.size else {}
+                self._meter.report(self._tried, PSNR_dB=self._psnr(tried), **size)
             enough = found >= 0
             if enough:
                 good.append((tried, found))
@@ -372,8 +394,11 @@ class Search:
                 (a, at_a, _), (b, at_b, _) = ends[False], ends[True]
                 share = (0.5 * close - at_a) / (at_b - at_a)
                 x = a + min(max(share, 0.1), 0.9) * (b - a)
-                if abs(a - b) < 1e-3:
+                between = range(min(map(_bits, (a, b))) + 1, max(map(_bits, (a, b))))
+                if not between:
                     break
+                if _bits(x) not in between:
+                    x = math.log2(step_of(between[len(between) // 2]))
             else:
                 further = min(max(x + (0.5 * close - found) / slope, x - 6.0), x + 6.0)
                 if trial >= _TRIES:
@@ -382,6 +407,9 @@ class Search:
                 further = min(max(further, low), high)
                 if further == x:
                     break
+                if _bits(further) in seen:
+                    # The file has no step so near: the next one that it has.
+                    further = math.log2(step_of(max(_bits(x) + (1 if further > x else -1), 1)))
                 x = further
         if good:
             return min(good, key=lambda pair: cost(pair[0]))
@@ -428,6 +456,9 @@ class Search:
     def _plain(self, step: float) -> Tried:
         return self._all("plain", step)
 
+    def _uncoded(self, step: float) -> Tried:
+        return self._all("uncoded", step)
+
     def _fitted(self, step: float) -> Tried:
         return self._all("fitted", step)
 
@@ -439,6 +470,17 @@ class Search:
 
     def _psnr(self, tried: Tried) -> float:
         return psnr_from_mse(tried.error / self._probes.values.size, self._peak)
+
+
+def _bits(x: float) -> int:
+    """What a file holds of a step of so many octaves."""
+    return step_bits(2.0**x)
+
+
+def usual_psnr(probes: ProbeSet) -> float:
+    """What is wanted of a set where nothing is said: no more than tells its light from its noise."""
+    noise = noise_psnr(probes)
+    return PSNR if noise is None else min(max(noise, LEAST_PSNR), PSNR)
 
 
 def peak_of(probes: ProbeSet) -> float:
