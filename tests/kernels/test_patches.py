@@ -38,7 +38,7 @@ def _triangles(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
 def _sampled(image: np.ndarray, corners: np.ndarray, level: np.ndarray, device: str):
     fixed = np.rint(corners * 65536).astype(np.int64)
     samples, patches, bright = kernels.sample(_texels(image), fixed, level, device)
-    kernels.dominant(samples, patches, level)
+    kernels.dominant(samples, patches)
     return samples, patches, bright
 
 
@@ -112,11 +112,8 @@ def _ints(values: np.ndarray, device: str) -> wp.array:
 
 def _graph(samples, patches, threshold: float, colour_threshold: float, device: str):
     """The graph, and the number that each of its nodes had."""
-    patch = patches.numpy()
-    order = np.argsort(kernels.bin_numbers(patch["colour"]), kind="stable")
-    nodes = wp.array(patch[order], dtype=kernels.Patch, device=device)
-    bounds = graphs.bounds(samples, nodes, int(patch["level"].max()) + 1)
-    return graphs.graph(samples, nodes, bounds, graphs.rule(threshold, colour_threshold, device)), order
+    bounds = graphs.bounds(samples, patches, int(patches.numpy()["level"].max()) + 1)
+    return graphs.graph(samples, patches, bounds, graphs.rule(threshold, colour_threshold, device))
 
 
 @pytest.mark.parametrize("contrast", [0.02, 0.2, 1.0])
@@ -178,15 +175,6 @@ def test_the_threshold_itself_is_not_alike(device: str, step: int, alike: bool, 
     degree = wp.zeros(2, dtype=int, device=device)
     graphs.count_neighbours(graph, 0, 2, degree, wp.zeros(2, dtype=wp.int64, device=device))
     assert degree.numpy().tolist() == [int(alike)] * 2
-
-
-def test_dominant_colours_in_parts(device: str, monkeypatch: pytest.MonkeyPatch):
-    """The same however few samples are sorted at once, also where one patch alone has more."""
-    image, (corners, level) = _image(), _triangles(40)
-    _, whole, _ = _sampled(image, corners, level, device)
-    monkeypatch.setattr(kernels, "_AT_ONCE", 20)
-    _, parts, _ = _sampled(image, corners, level, device)
-    np.testing.assert_array_equal(whole.numpy()["colour"], parts.numpy()["colour"])
 
 
 def test_too_many_samples():

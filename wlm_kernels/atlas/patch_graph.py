@@ -1,7 +1,8 @@
 """The graph of patches that are alike (lightmap-uv-clustering-cascade, section 3.2), without storing its edges.
 
 Few pairs need all their samples compared. Bounds of the distance from below and from above (`Bounds`) settle most;
-they are in float32, with a margin larger than its rounding, and so never change a result.
+they are in float32, with a margin larger than its rounding, and so never change a result. Patches are sorted by their
+mean level, which differs by less than lambda where two are alike: those beyond aren't looked at.
 
 Read `tests/reference/patches.py` first (`distances`, `adjacency`, `greedy`): the same with the whole matrix.
 """
@@ -17,7 +18,6 @@ from wlm_kernels.atlas.patches import (
     BINS,
     SIZES,
     Patch,
-    bin_numbers,
     channel,
     distance_sum,
     samples_of,
@@ -206,14 +206,54 @@ def _alike(
 
 
 @wp.kernel(enable_backward=False)
+def _spans(
+    # in:
+    patches: wp.array1d[Patch],
+    bounds: wp.array2d[Bounds],
+    # out:
+    low: wp.array1d[float],
+    high: wp.array1d[float],
+):
+    """One patch per thread: its mean level, summed over the channels, on its own lattice and all larger ones."""
+    i = wp.tid()
+    least = float(wp.inf)
+    most = float(-wp.inf)
+    for level in range(patches[i].level, bounds.shape[1]):
+        moment = bounds[i, level].moment
+        sum = moment[0] + moment[1] + moment[2]
+        mean = sum[0] + sum[1] + sum[2]
+        least = wp.min(least, mean)
+        most = wp.max(most, mean)
+    low[i] = least
+    high[i] = most
+
+
+@wp.kernel(enable_backward=False)
+def _take(
+    # in:
+    patches: wp.array1d[Patch],
+    bounds: wp.array2d[Bounds],
+    index: wp.array1d[int],
+    # out:
+    taken: wp.array1d[Patch],
+    taken_bounds: wp.array2d[Bounds],
+):
+    """One patch per thread."""
+    i = wp.tid()
+    taken[i] = patches[index[i]]
+    for level in range(bounds.shape[1]):
+        taken_bounds[i, level] = bounds[index[i], level]
+
+
+@wp.kernel(enable_backward=False)
 def _count(
     # in:
     samples: wp.array1d[int],
     patches: wp.array1d[Patch],
     bounds: wp.array2d[Bounds],
     rule: Rule,
-    cell: wp.array1d[int],
-    first: wp.array1d[int],
+    low: wp.array1d[float],
+    high: wp.array1d[float],
     offset: int,
     # out:
     degree: wp.array1d[int],
@@ -221,21 +261,52 @@ def _count(
 ):
     """One patch per thread; each pair once, counted for both by the thread of the first."""
     a = offset + wp.tid()
-    colour = patches[a].colour
+    last = high[a] + rule.level + _MARGIN
     neighbours = int(0)
     count = wp.int64(0)
-    for c in range(cell[a], first.shape[0] - 1):
-        if not _near(rule, colour, patches[first[c]].colour):
-            continue
-        for b in range(wp.max(first[c], a + 1), first[c + 1]):
-            alike = _alike(samples, patches, bounds, rule, a, b)
-            if alike > 1:
-                count += wp.int64(1)
-            if (alike & 1) == 1:
-                neighbours += 1
-                wp.atomic_add(degree, b, 1)
+    for b in range(a + 1, low.shape[0]):
+        if low[b] > last:
+            break
+        alike = _alike(samples, patches, bounds, rule, a, b)
+        if alike > 1:
+            count += wp.int64(1)
+        if (alike & 1) == 1:
+            neighbours += 1
+            wp.atomic_add(degree, b, 1)
     wp.atomic_add(degree, a, neighbours)
     compared[a] = count
+
+
+@wp.kernel(enable_backward=False)
+def _join(
+    # in:
+    samples: wp.array1d[int],
+    patches: wp.array1d[Patch],
+    bounds: wp.array2d[Bounds],
+    rule: Rule,
+    low: wp.array1d[float],
+    high: wp.array1d[float],
+    reach: float,
+    nodes: wp.array1d[int],
+    offset: int,
+    heads: wp.array1d[int],
+    head_low: wp.array1d[float],
+    rank: wp.array1d[int],
+    # out:
+    joined: wp.array1d[int],
+):
+    """One node per thread."""
+    i = offset + wp.tid()
+    a = nodes[i]
+    margin = rule.level + _MARGIN
+    best = int(rank.shape[0])
+    for k in range(wp.lower_bound(head_low, low[a] - margin - reach), heads.shape[0]):
+        if head_low[k] > high[a] + margin:
+            break
+        if rank[k] < best:
+            if (_alike(samples, patches, bounds, rule, heads[k], a) & 1) == 1:
+                best = rank[k]
+    joined[i] = best
 
 
 @wp.kernel(enable_backward=False)
@@ -319,32 +390,63 @@ class Graph:
 
     Attributes:
         samples: int, samples of all patches.
-        patches: Patch [M], by rising bin of the dominant colour.
+        patches: Patch [M], by rising `low`.
         bounds: Bounds [M, levels].
         rule: Rule.
-        cell: int [M], number of the bin among those that occur.
-        first: int [cells + 1], the first patch of each bin.
+        low, high: float [M], least and largest mean level on any lattice; of two that are alike on any lattice the
+            means differ by less than lambda.
+        means: float32 [M], `low` on the host.
+        reach: The largest difference of the two in any patch.
     """
 
     samples: wp.array
     patches: wp.array
     bounds: wp.array
     rule: Rule
-    cell: wp.array
-    first: wp.array
+    low: wp.array
+    high: wp.array
+    means: np.ndarray
+    reach: float
 
     def _inputs(self) -> list:
         return [self.samples, self.patches, self.bounds, self.rule]
 
+    def window(self, nodes: np.ndarray) -> tuple[float, float]:
+        """The least and the largest of the `means` that neighbours of some nodes may have."""
+        margin = self.rule.level + self.reach + 1.0
+        return float(self.means[nodes[0]]) - margin, float(self.means[nodes[-1]]) + margin
 
-def graph(samples, patches, bounds, rule: Rule) -> Graph:
-    """Makes the graph of patches that are sorted by `bin_numbers`."""
-    bins = bin_numbers(patches.numpy()["colour"])
-    _, first, cell = np.unique(bins, return_index=True, return_inverse=True)
-    first = np.append(first, len(bins))
-    device = samples.device
-    cells = [wp.array(values.astype(np.int32), dtype=int, device=device) for values in (cell, first)]
-    return Graph(samples, patches, bounds, rule, *cells)
+
+def graph(samples, patches, bounds, rule: Rule) -> tuple[Graph, np.ndarray]:
+    """Makes the graph of some patches.
+
+    Returns:
+        The graph, and the number of each of its nodes among the patches, int64 [M].
+    """
+    count, device = patches.shape[0], samples.device
+    low, high = (wp.empty(count, dtype=float, device=device) for _ in range(2))
+    wp.launch(_spans, count, inputs=[patches, bounds], outputs=[low, high], device=device)
+    least, most = low.numpy(), high.numpy()
+    order = np.argsort(least, kind="stable")
+    spans = [wp.array(values[order], dtype=float, device=device) for values in (least, most)]
+    reach = float((most - least).max(initial=0.0))
+    return Graph(samples, *_taken(patches, bounds, order), rule, *spans, least[order], reach), order
+
+
+def part(whole: Graph, nodes: np.ndarray) -> Graph:
+    """The graph of some of its nodes, int [N], ascending."""
+    spans = [wp.array(values.numpy()[nodes], dtype=float, device=values.device) for values in (whole.low, whole.high)]
+    taken = _taken(whole.patches, whole.bounds, nodes)
+    return Graph(whole.samples, *taken, whole.rule, *spans, whole.means[nodes], whole.reach)
+
+
+def _taken(patches, bounds, nodes: np.ndarray) -> tuple[wp.array, wp.array]:
+    device = patches.device
+    out = wp.empty(len(nodes), dtype=Patch, device=device)
+    out_bounds = wp.empty((len(nodes), bounds.shape[1]), dtype=Bounds, device=device)
+    index = wp.array(nodes.astype(np.int32), dtype=int, device=device)
+    wp.launch(_take, len(nodes), inputs=[patches, bounds, index], outputs=[out, out_bounds], device=device)
+    return out, out_bounds
 
 
 def count_neighbours(graph: Graph, begin: int, end: int, degree, compared) -> None:
@@ -356,8 +458,24 @@ def count_neighbours(graph: Graph, begin: int, end: int, degree, compared) -> No
         degree: int [M], added to.
         compared: int64 [M], written in the range: pairs that the bounds did not settle.
     """
-    inputs = [*graph._inputs(), graph.cell, graph.first, begin]
+    inputs = [*graph._inputs(), graph.low, graph.high, begin]
     wp.launch(_count, end - begin, inputs=inputs, outputs=[degree, compared], device=degree.device)
+
+
+def join(graph: Graph, nodes, begin: int, end: int, heads, head_low, rank, joined) -> None:
+    """Finds for some nodes the first of the heads that they are like.
+
+    Args:
+        graph: The graph.
+        nodes: int [N].
+        begin, end: The range of them.
+        heads: int [H], nodes, ascending.
+        head_low: float [H], their `low`.
+        rank: int [H], the order in which they are asked.
+        joined: int [N], written in the range: the rank of the head, H for none.
+    """
+    inputs = [*graph._inputs(), graph.low, graph.high, graph.reach, nodes, begin, heads, head_low, rank]
+    wp.launch(_join, end - begin, inputs=inputs, outputs=[joined], device=joined.device)
 
 
 def mark_neighbours(graph: Graph, nodes, node: int, marked) -> None:
