@@ -102,10 +102,10 @@ def test_against_naive(device: str, threshold: float, colour_threshold: float):
 
 def test_many_triangles_are_grouped_by_samples(device: str, monkeypatch: pytest.MonkeyPatch):
     """Each is like its representative, no two representatives are alike, and there are few more of them."""
-    count = 400
+    count = 200
     (uv, triangle), lightmap = _mesh(count), _lightmap()
     exact = cluster(uv, triangle, lightmap, largest=65, device=device)
-    monkeypatch.setattr(clustering, "SAMPLE", 60)
+    monkeypatch.setattr(clustering, "SAMPLE", 40)
     reports = []
     clusters = cluster(uv, triangle, lightmap, largest=65, device=device, progress=reports.append)
     _sound(clusters, count)

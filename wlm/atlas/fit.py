@@ -137,7 +137,7 @@ def _better(grid: FineGrid, model: AtlasModel | None, profile: Profile, seed: in
         if model is not None:
             return model
         size = 1, 1
-    textures = colour.quantise(resize(mesh.lightmap, mesh.mask, *size), format, device=device)
+    textures = colour.quantise(resize(mesh.lightmap, mesh.mask, *size, device=device), format, device=device)
     plain = AtlasModel(mesh.name, mesh.source, profile, "plain", format, height, width, **textures)
     if model is None:
         return replace(plain, report={"why plain": "tiles do not fit the budget"})
@@ -155,7 +155,7 @@ def _better(grid: FineGrid, model: AtlasModel | None, profile: Profile, seed: in
 
 
 def _cell_centres(
-    grid: FineGrid, weight: np.ndarray
+    grid: FineGrid, weight: torch.Tensor
 ) -> tuple[tuple[torch.Tensor, torch.Tensor, torch.Tensor], torch.Tensor]:
     """Centres of cells that are in a triangle, as a decoder takes them, and their weights.
 
@@ -163,7 +163,6 @@ def _cell_centres(
     """
     triangle, barycentric = grid.triangle
     hit = triangle >= 0
-    weight = torch.from_numpy(weight).to(grid.device)
     if not bool(hit.any()):
         hit = weight > 0
     row, column = torch.nonzero(hit, as_tuple=True)

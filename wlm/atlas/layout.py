@@ -9,6 +9,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 
 from wlm.atlas.model import (
     BLOCK_SIDE,
@@ -24,7 +25,8 @@ from wlm.atlas.model import (
 from wlm.errors import WlmError
 from wlm.formats.exr import HALF_MAX
 
-_BISECTIONS = 60
+_BISECTIONS, _CLOSE = 60, 1e-6
+_TILES_AT_ONCE = 1 << 16
 _WIDTHS = np.linspace(0.7, 1.5, 17)  # of T_p, over the square root of its number of samples
 # Of "mixed", sides in texels: between 6 and the largest every other one is enough.
 _MIXED_SIDES = (1, 2, 3, 4, 5, 6, 8, 10, 12)
@@ -88,11 +90,11 @@ def sizes_of(profile: Profile) -> list[Size]:
     return [Size(nx, ny, TEXELS) for ny in sides for nx in sides] + of_blocks(BLOCKS, True)
 
 
-def layout(error: np.ndarray, sizes: list[Size], room: float, least: float) -> Layout | None:
+def layout(error: torch.Tensor | np.ndarray, sizes: list[Size], room: float, least: float) -> Layout | None:
     """Allocates sizes whose rectangles fit in textures of a given number of bits, and places them.
 
     Args:
-        error: float64 [sizes, T], `curves`.
+        error: float64 [sizes, T], `curves`, on any device.
         sizes: The sizes.
         room: Most bits of T_p.
         least: Error that a bit must save to be allocated.
@@ -146,7 +148,7 @@ def _packed(sides: np.ndarray, step: int) -> tuple[np.ndarray, tuple[int, int]]:
 
 
 def composed(
-    samples: list[tuple[np.ndarray, np.ndarray]],
+    samples: list[tuple[np.ndarray, np.ndarray, np.ndarray]],
     sizes: list[Size],
     layout: Layout,
     index: np.ndarray,
@@ -155,7 +157,8 @@ def composed(
     """The textures and the table.
 
     Args:
-        samples: Of each tile float32 [ny, nx, 3], and the weights of their squared errors [ny, nx].
+        samples: Of some tiles of one size each: their rows in `layout`, int [n], float32 [n, ny, nx, 3], and the
+            weights of their squared errors [n, ny, nx].
         sizes: The sizes.
         layout: Of the tiles.
         index: int64 [T], the tiles' numbers in the grid.
@@ -165,11 +168,11 @@ def composed(
         Of each texture the texels, float32 [H, W, 3], and their weights [H, W]; and T_c.
     """
     textures = [(np.zeros((*shape, 3), np.float32), np.zeros(shape, np.float32)) for shape in layout.shapes]
-    for (values, weight), number, (x, y) in zip(samples, layout.chosen, layout.first.tolist(), strict=True):
-        size = sizes[number]
+    for members, values, weight in samples:
+        size = sizes[layout.chosen[members[0]]]
+        at = texels_of(layout.first[members], size.nx, size.ny)
         texels, weights = textures[size.second]
-        texels[y : y + size.ny, x : x + size.nx] = values
-        weights[y : y + size.ny, x : x + size.nx] = weight
+        texels[at], weights[at] = values, weight
     total = counts[0] * counts[1]
     first, side, second = np.zeros((total, 2), int), np.ones((total, 2), int), np.zeros(total, bool)
     first[index] = layout.first
@@ -179,11 +182,17 @@ def composed(
     return [(texels.clip(max=HALF_MAX), weights) for texels, weights in textures], lut
 
 
-def allocate(error: np.ndarray, cost: np.ndarray, budget: float, least: float) -> np.ndarray:
+def texels_of(first: np.ndarray, nx: int, ny: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rows [n, ny, 1] and columns [n, 1, nx] of the texels of rectangles with first texels (x, y) [n, 2]."""
+    row = first[:, 1, None, None] + np.arange(ny)[:, None]
+    return row, first[:, 0, None, None] + np.arange(nx)
+
+
+def allocate(error: torch.Tensor | np.ndarray, cost: np.ndarray, budget: float, least: float) -> np.ndarray:
     """Chooses the size of each tile for the least total error within a budget.
 
     Args:
-        error: [sizes, T].
+        error: float64 [sizes, T].
         cost: [sizes], bits of each size.
         budget: Bits of all tiles.
         least: Error that a bit must save to be allocated.
@@ -191,21 +200,26 @@ def allocate(error: np.ndarray, cost: np.ndarray, budget: float, least: float) -
     Returns:
         int [T], numbers of sizes. The cheapest of all where even they are over the budget.
     """
+    error = torch.as_tensor(error)
+    bits = torch.from_numpy(np.asarray(cost, np.float64)).to(error.device)
 
-    def best(gain: float) -> np.ndarray:
-        return (error + gain * cost[:, None]).argmin(0)
+    def best(gain: float) -> torch.Tensor:
+        parts = [(each + gain * bits[:, None]).argmin(0) for each in error.split(_TILES_AT_ONCE, 1)]
+        return torch.cat(parts)
 
     chosen = best(least)
-    if cost[chosen].sum() <= budget:
-        return chosen
-    low, high = least, max(least, error.max() + 1e-30)  # at the high end no bit pays
+    if float(bits[chosen].sum()) <= budget:
+        return chosen.cpu().numpy()
+    low, high = least, max(least, float(error.max()) + 1e-30)  # at the high end no bit pays
     for _ in range(_BISECTIONS):
-        middle = np.sqrt(low * high) if low > 0 else high * 1e-6
-        if cost[best(middle)].sum() > budget:
+        middle = math.sqrt(low * high) if low > 0 else high * 1e-6
+        if float(bits[best(middle)].sum()) > budget:
             low = middle
         else:
             high = middle
-    return best(high)
+        if high <= low * (1.0 + _CLOSE):
+            break
+    return best(high).cpu().numpy()
 
 
 def place(sizes: np.ndarray, width: int) -> tuple[np.ndarray, int]:
@@ -221,10 +235,18 @@ def place(sizes: np.ndarray, width: int) -> tuple[np.ndarray, int]:
     first = np.zeros((len(sizes), 2), np.int64)
     x = y = height = 0
     order = np.lexsort((-sizes[:, 0], -sizes[:, 1]))
-    for i, (w, h) in zip(order.tolist(), sizes[order].tolist(), strict=True):
-        if x + w > width:
-            x, y, height = 0, y + height, 0
-        height = height or h
-        first[i] = x, y
-        x += w
+    kinds, begin = np.unique(-sizes[order][:, ::-1], axis=0, return_index=True)
+    for (h, w), members in zip((-kinds).tolist(), np.split(order, begin[1:]), strict=True):
+        # Of one size: those that fit beside the last, then whole shelves of them.
+        beside = min((width - x) // w, len(members)) if height else 0
+        first[members[:beside], 0] = x + w * np.arange(beside)
+        first[members[:beside], 1] = y
+        x += w * beside
+        if rest := len(members) - beside:
+            each = width // w
+            shelf, place = np.divmod(np.arange(rest), each)
+            first[members[beside:], 0] = w * place
+            first[members[beside:], 1] = y + height + h * shelf
+            y += height + h * int(shelf[-1])
+            x, height = w * (int(place[-1]) + 1), h
     return first, y + height
