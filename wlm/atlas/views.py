@@ -74,7 +74,8 @@ def visibility(
         device: "cpu" or "cuda:N".
 
     Returns:
-        float64 [height, width] on the device, pixels of all views whose UVs lie in each cell; a UV of 1 lies in the last one.
+        float64 [height, width] on the device, pixels of all views whose UVs lie in each cell; a UV of 1 lies in the
+        last one.
 
     Raises:
         WlmError: There is no such device.
