@@ -10,8 +10,8 @@ first representative that they are like, and so on with those that are left: the
 groups, each triangle is like its representative, and no two representatives are alike, as before. On 41,472 triangles
 of a synthetic lightmap there are 1% more groups, in an eighth of the time.
 
-Edges are never stored but recomputed from the patches, so that memory grows with the triangles and the texels that
-they cover alone: at most `samples_of(largest)` words per triangle.
+Edges are stored within a sample alone, so that memory grows with the triangles and the texels that they cover: at most
+`samples_of(largest)` words per triangle.
 
 Where the paper is silent or we differ:
 
@@ -54,7 +54,7 @@ _FARTHEST = 65536.0
 SAMPLE = 8192
 """Triangles among which groups are formed at once."""
 
-_PAIRS_AT_ONCE = 1 << 26  # between two looks at the clock
+_PAIRS_AT_ONCE = 1 << 24  # between two looks at the clock
 
 
 @dataclass(frozen=True)
@@ -230,9 +230,9 @@ def _groups(
     while True:
         sample = left if len(left) <= SAMPLE else np.sort(left[np.argsort(drawn[left])[:SAMPLE]])
         part = graph if len(sample) == count else graphs.part(graph, sample)
-        degree, stats = _degrees(part, comparing, count - len(left))
+        edge, stats = _edges(part, comparing, count - len(left))
         compared, edges = compared + stats.compared, edges + stats.edges
-        formed = [(int(sample[node]), sample[members]) for node, members in _greedy(part, number[sample], degree)]
+        formed = [(int(sample[node]), sample[members]) for node, members in _greedy(edge, number[sample])]
         if len(sample) == len(left):
             groups += formed
             clustering.report(count)
@@ -271,56 +271,40 @@ def _joined(graph: graphs.Graph, nodes: np.ndarray, heads: np.ndarray, meter: Me
     return joined.numpy()
 
 
-def _degrees(graph: graphs.Graph, meter: Meter, done: int) -> tuple[wp.array, Stats]:
-    """The number of neighbours of each node, int [M]; `done` triangles are in groups already."""
+def _edges(graph: graphs.Graph, meter: Meter, done: int) -> tuple[np.ndarray, Stats]:
+    """The edges, uint8 [M, M]; `done` triangles are in groups already."""
     count, device = graph.patches.shape[0], graph.patches.device
-    degree = wp.zeros(count, dtype=int, device=device)
+    edge = wp.zeros((count, count), dtype=wp.uint8, device=device)
     compared = wp.zeros(count, dtype=wp.int64, device=device)
     piece = max(_PAIRS_AT_ONCE // max(count, 1), 1)
     for begin in range(0, count, piece):
         end = min(begin + piece, count)
-        graphs.count_neighbours(graph, begin, end, degree, compared)
+        graphs.find_edges(graph, begin, end, edge, compared)
         wp.synchronize_device(device)
         if meter.due(done + end):
             meter.report(done + end)
-    edges = int(degree.numpy().sum(dtype=np.int64)) // 2
-    return degree, Stats(int(compared.numpy().sum()), edges)
+    edges = edge.numpy()
+    return edges, Stats(int(compared.numpy().sum()), int(np.count_nonzero(edges)) // 2)
 
 
-def _greedy(graph: graphs.Graph, number: np.ndarray, degree: wp.array) -> Iterator[tuple[int, np.ndarray]]:
+def _greedy(edge: np.ndarray, number: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
     """Forms groups and removes them from the graph (section 3.2.2).
 
     Args:
-        graph: The graph, of M nodes.
+        edge: uint8 [M, M], 1 where two nodes are alike.
         number: int [M], the triangle of each node, which settles ties.
-        degree: int [M], reduced to those among the nodes that remain.
 
     Yields:
         The node that represents a group, and the nodes of the group; groups of one are left out.
     """
-
-    def on_device(nodes: np.ndarray) -> wp.array:
-        return wp.array(nodes, dtype=int, device=degree.device)
-
-    def near(nodes: np.ndarray) -> tuple[int, int]:
-        """The range of `remaining` that neighbours of some nodes are in."""
-        low, high = graph.window(nodes)
-        means = graph.means[remaining]
-        return int(np.searchsorted(means, low)), int(np.searchsorted(means, high, "right"))
-
-    remaining = np.flatnonzero(degree.numpy() > 0).astype(np.int32)
-    while len(remaining):
-        degrees = degree.numpy()[remaining]
-        top = remaining[degrees == degrees.max()]
-        node = int(top[number[top].argmin()])
-        first, stop = near(np.array([node]))
-        marked = wp.empty(stop - first, dtype=wp.uint8, device=degree.device)
-        graphs.mark_neighbours(graph, on_device(remaining[first:stop]), node, marked)
-        group = remaining[first:stop][marked.numpy() != 0]
-        remaining = np.setdiff1d(remaining, group, assume_unique=True)
-        yield node, group
-        first, stop = near(group)
-        if first < stop:
-            graphs.remove_neighbours(graph, on_device(remaining[first:stop]), on_device(group), degree)
-        if len(remaining):
-            remaining = remaining[degree.numpy()[remaining] > 0]
+    degree = edge.sum(1, dtype=np.int64)
+    remains = np.ones(len(number), bool)
+    # Of equals the lowest number is first.
+    order = np.argsort(number, kind="stable")
+    while len(order) and degree[node := order[degree[order].argmax()]] > 0:
+        members = np.flatnonzero(remains & (edge[node] != 0))
+        members = np.sort(np.append(members, node))
+        yield int(node), members
+        remains[members] = False
+        degree -= edge[members].sum(0, dtype=np.int64)
+        degree[members] = 0

@@ -1,4 +1,4 @@
-"""The graph of patches that are alike (lightmap-uv-clustering-cascade, section 3.2), without storing its edges.
+"""The graph of patches that are alike (lightmap-uv-clustering-cascade, section 3.2).
 
 Few pairs need all their samples compared. Bounds of the distance from below and from above (`Bounds`) settle most;
 they are in float32, with a margin larger than its rounding, and so never change a result. Patches are sorted by their
@@ -246,7 +246,7 @@ def _take(
 
 
 @wp.kernel(enable_backward=False)
-def _count(
+def _edges(
     # in:
     samples: wp.array1d[int],
     patches: wp.array1d[Patch],
@@ -256,13 +256,12 @@ def _count(
     high: wp.array1d[float],
     offset: int,
     # out:
-    degree: wp.array1d[int],
+    edge: wp.array2d[wp.uint8],
     compared: wp.array1d[wp.int64],
 ):
-    """One patch per thread; each pair once, counted for both by the thread of the first."""
+    """One patch per thread; each pair once, by the thread of the first."""
     a = offset + wp.tid()
     last = high[a] + rule.level + _MARGIN
-    neighbours = int(0)
     count = wp.int64(0)
     for b in range(a + 1, low.shape[0]):
         if low[b] > last:
@@ -271,9 +270,8 @@ def _count(
         if alike > 1:
             count += wp.int64(1)
         if (alike & 1) == 1:
-            neighbours += 1
-            wp.atomic_add(degree, b, 1)
-    wp.atomic_add(degree, a, neighbours)
+            edge[a, b] = wp.uint8(1)
+            edge[b, a] = wp.uint8(1)
     compared[a] = count
 
 
@@ -307,49 +305,6 @@ def _join(
             if (_alike(samples, patches, bounds, rule, heads[k], a) & 1) == 1:
                 best = rank[k]
     joined[i] = best
-
-
-@wp.kernel(enable_backward=False)
-def _mark(
-    # in:
-    samples: wp.array1d[int],
-    patches: wp.array1d[Patch],
-    bounds: wp.array2d[Bounds],
-    rule: Rule,
-    nodes: wp.array1d[int],
-    node: int,
-    # out:
-    marked: wp.array1d[wp.uint8],
-):
-    """One node per thread."""
-    i = wp.tid()
-    a = nodes[i]
-    alike = int(1)  # the node itself is marked too
-    if a != node:
-        alike = _alike(samples, patches, bounds, rule, node, a)
-    marked[i] = wp.uint8(alike & 1)
-
-
-@wp.kernel(enable_backward=False)
-def _remove(
-    # in:
-    samples: wp.array1d[int],
-    patches: wp.array1d[Patch],
-    bounds: wp.array2d[Bounds],
-    rule: Rule,
-    nodes: wp.array1d[int],
-    removed: wp.array1d[int],
-    # out:
-    degree: wp.array1d[int],
-):
-    """One remaining node per thread."""
-    a = nodes[wp.tid()]
-    count = int(0)
-    for i in range(removed.shape[0]):
-        b = removed[i]
-        if (_alike(samples, patches, bounds, rule, a, b) & 1) == 1:
-            count += 1
-    degree[a] -= count
 
 
 def rule(threshold: float, colour_threshold: float, device) -> Rule:
@@ -386,7 +341,7 @@ def bounds(samples, patches, levels: int):
 
 @dataclass(frozen=True)
 class Graph:
-    """The similarity graph (eq. 5). No edge is stored: each is computed from the patches when it is needed.
+    """The similarity graph (eq. 5). Its edges are computed from the patches when they are needed.
 
     Attributes:
         samples: int, samples of all patches.
@@ -410,11 +365,6 @@ class Graph:
 
     def _inputs(self) -> list:
         return [self.samples, self.patches, self.bounds, self.rule]
-
-    def window(self, nodes: np.ndarray) -> tuple[float, float]:
-        """The least and the largest of the `means` that neighbours of some nodes may have."""
-        margin = self.rule.level + self.reach + 1.0
-        return float(self.means[nodes[0]]) - margin, float(self.means[nodes[-1]]) + margin
 
 
 def graph(samples, patches, bounds, rule: Rule) -> tuple[Graph, np.ndarray]:
@@ -449,17 +399,17 @@ def _taken(patches, bounds, nodes: np.ndarray) -> tuple[wp.array, wp.array]:
     return out, out_bounds
 
 
-def count_neighbours(graph: Graph, begin: int, end: int, degree, compared) -> None:
-    """Adds the edges between patches `begin` to `end` - 1 and any later one to the degrees of both.
+def find_edges(graph: Graph, begin: int, end: int, edge, compared) -> None:
+    """Finds the edges between patches `begin` to `end` - 1 and any later one.
 
     Args:
         graph: The graph.
         begin, end: The range.
-        degree: int [M], added to.
+        edge: uint8 [M, M], 0; set to 1 in both places of an edge.
         compared: int64 [M], written in the range: pairs that the bounds did not settle.
     """
     inputs = [*graph._inputs(), graph.low, graph.high, begin]
-    wp.launch(_count, end - begin, inputs=inputs, outputs=[degree, compared], device=degree.device)
+    wp.launch(_edges, end - begin, inputs=inputs, outputs=[edge, compared], device=edge.device)
 
 
 def join(graph: Graph, nodes, begin: int, end: int, heads, head_low, rank, joined) -> None:
@@ -476,29 +426,3 @@ def join(graph: Graph, nodes, begin: int, end: int, heads, head_low, rank, joine
     """
     inputs = [*graph._inputs(), graph.low, graph.high, graph.reach, nodes, begin, heads, head_low, rank]
     wp.launch(_join, end - begin, inputs=inputs, outputs=[joined], device=joined.device)
-
-
-def mark_neighbours(graph: Graph, nodes, node: int, marked) -> None:
-    """Marks a patch and its neighbours.
-
-    Args:
-        graph: The graph.
-        nodes: int [L], the patches to look at.
-        node: The patch.
-        marked: uint8 [L], written: 1 for `node` and its neighbours, else 0.
-    """
-    inputs = [*graph._inputs(), nodes, node]
-    wp.launch(_mark, nodes.shape, inputs=inputs, outputs=[marked], device=nodes.device)
-
-
-def remove_neighbours(graph: Graph, nodes, removed, degree) -> None:
-    """Subtracts the edges to removed patches from the degrees of the remaining ones.
-
-    Args:
-        graph: The graph.
-        nodes: int [L], the remaining patches.
-        removed: int [G], the removed ones.
-        degree: int [M], subtracted from.
-    """
-    inputs = [*graph._inputs(), nodes, removed]
-    wp.launch(_remove, nodes.shape, inputs=inputs, outputs=[degree], device=nodes.device)
