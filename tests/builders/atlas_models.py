@@ -6,6 +6,7 @@ import numpy as np
 
 from wlm.atlas.cluster import Clusters, Stats
 from wlm.atlas.colour import quantise
+from wlm.atlas.corners import snapped
 from wlm.atlas.data import LightmappedMesh
 from wlm.atlas.model import AtlasModel, Profile, pack_entries, tile_counts
 
@@ -37,7 +38,7 @@ def random_model(mesh: LightmappedMesh, kind: str, colour: str = "half", seed: i
     elif method == "cascade":
         lut = random.integers(0, 65536, (9, 13, 2)).astype(np.uint16)
     triangles = len(mesh.triangle) if method == "cascade" or kind.endswith("uv") else 0
-    uv = random.random((triangles, 3, 2)).astype(np.float32)
+    uv = snapped(random.random((triangles, 3, 2)))
     settings = (mesh.name, mesh.source, profile, method, colour, height, width)
     report = {"seconds": {"fit": 1.5}, "tiles": 4}
     textures = quantise(texels, "rgb9e5" if colour == "mixed" else colour) | second

@@ -65,7 +65,7 @@ def resize(
         return filled
     weights = _WEIGHTS["box" if filter == "fit" else filter]
     light = torch.from_numpy(filled).to(device)
-    small = _along(weights(height, mask.shape[0]), _along(weights(width, mask.shape[1]), light.transpose(0, 1)))
+    small = _along(weights(width, mask.shape[1]), _along(weights(height, mask.shape[0]), light))
     if filter == "fit":
         small = _fit(light, torch.from_numpy(mask).to(device), small)
     return small.clamp(0.0, HALF_MAX).cpu().numpy()
