@@ -112,19 +112,21 @@ def layout(error: torch.Tensor | np.ndarray, sizes: list[Size], room: float, lea
     budget, fewest = room, error.shape[1] * cost.min()
     while True:
         chosen = allocate(error, cost, budget, least)
-        first, shapes, bits = np.zeros((len(chosen), 2), np.int64), [], 0
+        counts, widths, shapes, bits = np.bincount(chosen, minlength=len(sizes)), [], [], 0
         for texture in textures:
-            members = np.flatnonzero(second[chosen] == texture.second)
-            if len(members):
-                first[members], shape = _packed(sides[chosen[members]], texture.step)
-            else:
-                shape = texture.step, texture.step
+            members = (second == texture.second) & (counts > 0)
+            width, shape = _narrowest(_Kinds.of(sides[members], counts[members]), texture.step)
+            widths.append(width)
             shapes.append(shape)
             most = MOST_SIZE * BLOCK_SIDE if texture.second else MOST_SIZE
             if max(shape) > most:
                 raise WlmError(f"budget: T_p would have {max(shape)} texels along a side; tiles allow {most}")
             bits += math.prod(shape) * COLOUR_BITS[texture.format]
         if bits <= room:
+            first = np.zeros((len(chosen), 2), np.int64)
+            for texture, width in zip(textures, widths, strict=True):
+                members = np.flatnonzero(second[chosen] == texture.second)
+                first[members] = place(sides[chosen[members]], width)[0]
             return Layout(chosen, first, tuple(shapes))
         total = cost[chosen].sum()
         if total <= fewest:
@@ -133,17 +135,19 @@ def layout(error: torch.Tensor | np.ndarray, sizes: list[Size], room: float, lea
         budget = min(budget, total) * min(0.999 * room / bits, 0.99)
 
 
-def _packed(sides: np.ndarray, step: int) -> tuple[np.ndarray, tuple[int, int]]:
-    """Packs rectangles into the smallest of some textures: their first texels, and its rows and columns."""
-    total = sides.prod(1).sum()
+def _narrowest(kinds: "_Kinds", step: int) -> tuple[int, tuple[int, int]]:
+    """Of some widths of shelves the one whose texture is smallest; and the texture's rows and columns."""
+    if not len(kinds.size):
+        return step, (step, step)
+    total = float(kinds.size.prod(1) @ kinds.count)
     best = None
     for share in _WIDTHS:
-        width = max(int(sides[:, 0].max()), -(-round(share * math.sqrt(total)) // step) * step)
-        first, height = place(sides, width)
+        width = max(int(kinds.size[:, 0].max()), -(-round(share * math.sqrt(total)) // step) * step)
+        runs, height = kinds.shelves(width)
         # No shelf may reach as far as the width allows.
-        width = int((first[:, 0] + sides[:, 0]).max())
-        if best is None or width * height < best[0]:
-            best = width * height, first, (height, width)
+        widest = max(run.widest for run in runs)
+        if best is None or widest * height < best[0]:
+            best = widest * height, width, (height, widest)
     return best[1:]
 
 
@@ -222,6 +226,56 @@ def allocate(error: torch.Tensor | np.ndarray, cost: np.ndarray, budget: float, 
     return best(high).cpu().numpy()
 
 
+@dataclass(frozen=True)
+class _Run:
+    """Where the rectangles of one size are: some beside the last of another size, then whole shelves of them.
+
+    Attributes:
+        beside: How many are beside others, from (x, y) on.
+        x, y: Of the first of these.
+        each: How many are on a shelf of their own, of which the first is at `below`.
+        below: Its y.
+        widest: Where the rightmost ends.
+    """
+
+    beside: int
+    x: int
+    y: int
+    each: int
+    below: int
+    widest: int
+
+
+@dataclass(frozen=True)
+class _Kinds:
+    """The sizes of rectangles, the highest first, and of these the widest; and how many there are of each."""
+
+    size: np.ndarray
+    count: np.ndarray
+
+    @classmethod
+    def of(cls, size: np.ndarray, count: np.ndarray) -> "_Kinds":
+        """Sorts sizes, int [K, 2], all different."""
+        order = np.lexsort((-size[:, 0], -size[:, 1]))
+        return cls(size[order], count[order])
+
+    def shelves(self, width: int) -> tuple[list[_Run], int]:
+        """Where each size goes on shelves of a width, and the height of all."""
+        runs, x, y, height = [], 0, 0, 0
+        for (w, h), count in zip(self.size.tolist(), self.count.tolist(), strict=True):
+            each = width // w
+            beside = min((width - x) // w, count) if height else 0
+            run = _Run(
+                beside, x, y, each, y + height, max(x + w * beside if beside else 0, w * min(each, count - beside))
+            )
+            runs.append(run)
+            x += w * beside
+            if rest := count - beside:
+                y, height = run.below + h * ((rest - 1) // each), h
+                x = w * ((rest - 1) % each + 1)
+        return runs, y + height
+
+
 def place(sizes: np.ndarray, width: int) -> tuple[np.ndarray, int]:
     """Packs rectangles on shelves of one width, the highest first; each shelf is as high as its first rectangle.
 
@@ -233,20 +287,18 @@ def place(sizes: np.ndarray, width: int) -> tuple[np.ndarray, int]:
         int64 [R, 2], x and y of each; and the height of all shelves.
     """
     first = np.zeros((len(sizes), 2), np.int64)
-    x = y = height = 0
+    if not len(sizes):
+        return first, 0
     order = np.lexsort((-sizes[:, 0], -sizes[:, 1]))
-    kinds, begin = np.unique(-sizes[order][:, ::-1], axis=0, return_index=True)
-    for (h, w), members in zip((-kinds).tolist(), np.split(order, begin[1:]), strict=True):
-        # Of one size: those that fit beside the last, then whole shelves of them.
-        beside = min((width - x) // w, len(members)) if height else 0
-        first[members[:beside], 0] = x + w * np.arange(beside)
-        first[members[:beside], 1] = y
-        x += w * beside
-        if rest := len(members) - beside:
-            each = width // w
-            shelf, place = np.divmod(np.arange(rest), each)
-            first[members[beside:], 0] = w * place
-            first[members[beside:], 1] = y + height + h * shelf
-            y += height + h * int(shelf[-1])
-            x, height = w * (int(place[-1]) + 1), h
-    return first, y + height
+    ordered = sizes[order]
+    starts = np.flatnonzero(np.append(True, (ordered[1:] != ordered[:-1]).any(1)))
+    kinds = _Kinds(ordered[starts], np.diff(np.append(starts, len(sizes))))
+    runs, height = kinds.shelves(width)
+    for run, (w, h), members in zip(runs, kinds.size.tolist(), np.split(order, starts[1:]), strict=True):
+        beside, below = members[: run.beside], members[run.beside :]
+        first[beside, 0] = run.x + w * np.arange(len(beside))
+        first[beside, 1] = run.y
+        shelf, column = np.divmod(np.arange(len(below)), run.each)
+        first[below, 0] = w * column
+        first[below, 1] = run.below + h * shelf
+    return first, height
