@@ -1,8 +1,9 @@
 """The artifact of an atlas model: both textures in one file.
 
 Parts: `colour` (half [Hp, Wp, 3], uint32 [Hp, Wp] of RGB9E5, or uint8 [B, 16] where T_p is stored as blocks) and, where
-the model has them, `blocks` (uint8 [B, 16], the second texture of "mixed"), `lut` (uint16 [Hc, Wc, 2]) and those of
-`corners`, or in earlier files `uv` (float32 [F, 3, 2]). Each is a zlib stream where that is smaller, `streams`.
+the model has them, `blocks` (uint8 [B, 16], the second texture of "mixed"), `tail` (uint8 [B, 16], the mips), `lut`
+(uint16 [Hc, Wc, 2]) and those of `corners`, or in earlier files `uv` (float32 [F, 3, 2]). Each is a zlib stream where
+that is smaller, `streams`.
 """
 
 import math
@@ -24,6 +25,8 @@ from wlm.atlas.model import (
     check_area,
     compression_ratio,
     disk_ratio,
+    tail_blocks,
+    tail_shapes,
     tile_counts,
     unpack_entries,
 )
@@ -51,7 +54,7 @@ def encode(model: AtlasModel) -> tuple[dict[str, Any], dict[str, np.ndarray], st
         "profile": model.profile.changes(),
         "report": {name: value for name, value in model.report.items() if name != "seconds"},
     }
-    parts = {"colour": model.texels, "lut": model.lut} | encode_corners(model.uv)
+    parts = {"colour": model.texels, "lut": model.lut, "tail": model.tail} | encode_corners(model.uv)
     if model.colour in colour.BLOCK_CODECS:
         parts["colour"] = model.blocks
     elif model.colour != "half":
@@ -106,7 +109,7 @@ def describe(path: str | os.PathLike[str]) -> dict[str, Any]:
         "block_size": list(second[::-1]),
         "lut_size": list(lut[::-1]),
         "new_uvs": len(parts["uv"]),
-        "cr": compression_ratio(texels, lut, size, fields["colour"], second),
+        "cr": compression_ratio(texels, lut, size, fields["colour"], second, len(parts["tail"])),
         "cr_disk": disk_ratio(artifact.file_bytes, size),
         "source": artifact.source,
         "parts": {"header": artifact.header_bytes} | artifact.parts,
@@ -162,6 +165,7 @@ def _checked(
             "cascade": Part(np.uint16, (None, None, 2)),
             "plain": Part(np.uint16, (0, 0, 2)),
         }[header.method],
+        "tail": Part(np.uint8, (sum(tail_blocks(*shape) for shape in tail_shapes(height, width)), 16), optional=True),
         "uv": Part(np.float32, (None, 3, 2), optional=True, least=0.0, most=1.0),
         **PARTS,
     }

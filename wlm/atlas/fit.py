@@ -16,7 +16,8 @@ from wlm.atlas import colour
 from wlm.atlas.cascade import fit_cascade, group_triangles
 from wlm.atlas.data import LightmappedMesh
 from wlm.atlas.decode import Decoder
-from wlm.atlas.model import BLOCK_SIDE, BLOCKS, COLOUR_BITS, SOURCE_BITS, AtlasModel, Profile, check_area
+from wlm.atlas.mips import make_tail
+from wlm.atlas.model import BLOCK_SIDE, BLOCKS, COLOUR_BITS, SOURCE_BITS, AtlasModel, Profile, check_area, tail_bits
 from wlm.atlas.resize import fitting_size, resize
 from wlm.atlas.stages import Stages
 from wlm.atlas.tiles import fit_tiles
@@ -67,6 +68,8 @@ def compress(
     device = interop.check_device(device)
     profile = Profile.load(profile).override(overrides)
     check_size(*mesh.mask.shape)
+    if profile.mips and tail_bits(*mesh.mask.shape) >= profile.budget * mesh.mask.size * SOURCE_BITS:
+        raise WlmError(f"budget: {profile.budget:g} is less than mips take: expected more, or no mips")
     stages, grid = Stages(device, progress, checkpoint), FineGrid(mesh, device)
     if profile.method == "cascade":
         model = fit_cascade(mesh, group_triangles(mesh, profile, stages), profile, seed, stages)
@@ -77,6 +80,9 @@ def compress(
             model = _better(grid, model, profile, seed)
     elif model is None:
         raise WlmError(_NO_ROOM.format(profile.budget, *mesh.mask.shape[::-1]))
+    if profile.mips:
+        with stages("mips"):
+            model = replace(model, tail=make_tail(mesh, device))
     check_area(mesh.mask.shape, model.texels.shape[:2], model.lut.shape[:2])
     lost = LostLight()
     lost.add(mesh.lightmap[mesh.mask], Decoder(model, device).lightmap(mesh)[mesh.mask])
@@ -128,7 +134,9 @@ def _better(grid: FineGrid, model: AtlasModel | None, profile: Profile, seed: in
     """
     mesh, device = grid.mesh, grid.device
     height, width = mesh.mask.shape
-    share = profile.budget if model is None else 1.0 - model.compression_ratio
+    # The model has no mips yet.
+    mips = tail_bits(height, width) / (height * width * SOURCE_BITS) if profile.mips else 0.0
+    share = profile.budget - mips if model is None else 1.0 - model.compression_ratio
     format = BLOCKS if profile.colour == "mixed" else profile.colour
     block = BLOCK_SIDE if format in colour.BLOCK_CODECS else 1
     bits = COLOUR_BITS[format]

@@ -71,8 +71,13 @@ def resize(
     return small.clamp(0.0, HALF_MAX).cpu().numpy()
 
 
+def box(image: torch.Tensor, height: int, width: int) -> torch.Tensor:
+    """Means of an image [H, W, C], float64, over the squares of fewer texels: [height, width, C]."""
+    return _along(_box(width, image.shape[1]), _along(_box(height, image.shape[0]), image))
+
+
 def _along(matrix: sparse.csr_matrix, image: torch.Tensor) -> torch.Tensor:
-    """A matrix [new, old] along the first axis of an image [old, N, 3], the result turned: [N, new, 3]."""
+    """A matrix [new, old] along the first axis of an image [old, N, C], the result turned: [N, new, C]."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # that sparse tensors may change
         parts = (torch.from_numpy(values) for values in (matrix.indptr, matrix.indices, matrix.data))

@@ -18,7 +18,7 @@ import torch
 
 from wlm.atlas import colour
 from wlm.atlas.layout import Size, composed, layout, sizes_of
-from wlm.atlas.model import BLOCKS, LUT_BITS, SOURCE_BITS, TEXELS, AtlasModel, Profile, tile_counts
+from wlm.atlas.model import BLOCKS, LUT_BITS, SOURCE_BITS, TEXELS, AtlasModel, Profile, tail_bits, tile_counts
 from wlm.atlas.stages import Stages
 from wlm.atlas.weights import FineGrid, weights
 from wlm.formats.checkpoint import Checkpoint
@@ -76,6 +76,8 @@ def fit_tiles(grid: FineGrid, profile: Profile, seed: int, stages: Stages) -> At
     height, width = mesh.mask.shape
     rows, columns = tile_counts(height, width, profile.tile)
     bits = profile.budget * height * width * SOURCE_BITS
+    if profile.mips:
+        bits -= tail_bits(height, width)
     room = bits - rows * columns * LUT_BITS
     sizes = sizes_of(profile)
     if room < len(tiles.index) * min(size.bits for size in sizes):
