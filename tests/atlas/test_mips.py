@@ -57,7 +57,7 @@ def test_there_is_no_step(pair, device):
     decoder, uv = model.decoder(device), torch.tensor([[0.31, 0.42]], device=device)
     lods = torch.linspace(0.0, 6.0, 601, device=device)
     light = decoder.read(uv.expand(601, 2), lods)
-    assert float(light.diff(dim=0).abs().max()) < 0.02 * float(light.max())
+    assert float(light.diff(dim=0).abs().max()) < 0.03 * float(light.max())
     assert torch.equal(light[0], decoder.read(uv)[0])
 
 

@@ -65,7 +65,7 @@ class Decoder:
             if self._tail is None:
                 raise ValueError("lod: expected a model with mips")
             near, far = self.read(uv), self._tail.read(uv, lod)
-            return near + (lod / TAIL_OCTAVES).clamp(0.0, 1.0)[:, None] * (far - near)
+            return near + (lod - TAIL_OCTAVES + 1).clamp(0.0, 1.0)[:, None] * (far - near)
         uv = uv.contiguous()
         out = torch.empty((len(uv), 3), dtype=torch.float32, device=uv.device)
         if len(uv):

@@ -4,9 +4,10 @@ Tiles that are neighbours in the lightmap aren't in T_p, so that its own mips wo
 place of them the tail is the lightmap at a quarter of its resolution with all smaller levels, one texture of BC6H under
 the mesh's own UVs. With `lod` the octaves of the lightmap's texels along a pixel, light is
 
-    mix(tiles, tail, clamp(lod / 2, 0, 1)),    the tail read at its own level lod - 2,
+    mix(tiles, tail, clamp(lod - 1, 0, 1)),    the tail read at its own level lod - 2,
 
-which has no step: at 0 it is the tiles', from 2 on the tail's. The tail takes 1.4% of the lightmap's bits.
+which has no step: up to 1, where a bilinear read still meets all texels, it is the tiles', from 2 on the tail's. The tail
+takes 1.4% of the lightmap's bits.
 """
 
 import numpy as np

@@ -51,7 +51,8 @@ vec3 wlm_atlas_grad(vec2 uv, vec2 dx, vec2 dy)
 {{
     vec2 size = {scale}.0 * vec2(textureSize(WLM_ATLAS_TAIL, 0)); // of the lightmap, in texels
     float texels = max(length(dx * size), length(dy * size)); // along the pixel
-    float share = log2(max(texels, 1.0)) / {octaves}.0;
+    // A bilinear read still meets all texels where a pixel is two of them.
+    float share = log2(max(texels, 1.0)) - {octaves}.0;
     if (share <= 0.0)
         return wlm_atlas(uv);
     vec3 far = textureGrad(WLM_ATLAS_TAIL, uv, dx, dy).rgb;
@@ -181,5 +182,5 @@ def atlas_glsl(model: AtlasModel) -> str:
     elif cascade:
         body = _READ.format(type="vec2", name="lut", image="WLM_ATLAS_LUT", channels="xy") + _CASCADE
     if len(model.tail):
-        body += _GRAD.format(scale=1 << TAIL_OCTAVES, octaves=TAIL_OCTAVES)
+        body += _GRAD.format(scale=1 << TAIL_OCTAVES, octaves=TAIL_OCTAVES - 1)
     return text + body
