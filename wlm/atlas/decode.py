@@ -13,6 +13,8 @@ from wlm.errors import WlmError
 from wlm.texels import fill_gaps
 from wlm_kernels.atlas import cascade, decode
 
+_TEXELS_AT_ONCE = 1 << 24
+
 
 class Decoder:
     """A model on a device. It is a `wlm.atlas.evaluation.Sampler`.
@@ -127,9 +129,12 @@ class Decoder:
             raise WlmError(f"{mesh.name}: expected the mesh and lightmap that the model was made of")
         result = np.zeros((height, width, 3), np.float32)
         if not len(self._corner):
-            row, column = np.nonzero(mesh.mask)
-            uv = np.stack([(column + 0.5) / width, (row + 0.5) / height], 1).astype(np.float32)
-            result[mesh.mask] = self.read(torch.from_numpy(uv).to(self.device)).cpu().numpy()
+            step = max(1, _TEXELS_AT_ONCE // width)
+            for first in range(0, height, step):
+                inside = mesh.mask[first : first + step]
+                row, column = torch.nonzero(torch.from_numpy(inside).to(self.device), as_tuple=True)
+                uv = torch.stack([(column.double() + 0.5) / width, (row.double() + first + 0.5) / height], 1)
+                result[first : first + step][inside] = self.read(uv.float()).cpu().numpy()
             return result
         triangle, barycentric = texel_triangles(mesh, height, width, self.device)
         hit = triangle >= 0

@@ -5,6 +5,7 @@ where that has no larger error.
 """
 
 import os
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -18,7 +19,7 @@ from wlm.atlas.data import LightmappedMesh
 from wlm.atlas.decode import Decoder
 from wlm.atlas.mips import make_tail
 from wlm.atlas.model import BLOCK_SIDE, BLOCKS, COLOUR_BITS, SOURCE_BITS, AtlasModel, Profile, check_area, tail_bits
-from wlm.atlas.resize import fitting_size, resize
+from wlm.atlas.resize import fitting_size, resized
 from wlm.atlas.stages import Stages
 from wlm.atlas.tiles import fit_tiles
 from wlm.atlas.views import corner_weights
@@ -30,6 +31,7 @@ from wlm.ops.raster import texture
 from wlm.system import OnProgress
 from wlm.texels import check_size
 
+_CELLS_AT_ONCE = 1 << 24
 _NO_ROOM = "budget: {:g} of {}x{} texels is less than the smallest tiles and their table take: expected more"
 
 
@@ -145,17 +147,18 @@ def _better(grid: FineGrid, model: AtlasModel | None, profile: Profile, seed: in
         if model is not None:
             return model
         size = 1, 1
-    textures = colour.quantise(resize(mesh.lightmap, mesh.mask, *size, device=device), format, device=device)
+    textures = colour.quantise(resized(mesh.filled, mesh.mask, *size, device=device), format, device=device)
     plain = AtlasModel(mesh.name, mesh.source, profile, "plain", format, height, width, **textures)
     if model is None:
         return replace(plain, report={"why plain": "tiles do not fit the budget"})
     # Other views than those of the fit, in which its error is less than elsewhere.
-    points, weight = _cell_centres(grid, weights(grid, profile, seed + 1))
-    target = texture(torch.from_numpy(mesh.filled).to(device), points[0])
-    error, plain_error = (
-        float(((Decoder(each, device)(*points) - target).double().square().sum(1) * weight).sum())
-        for each in (model, plain)
-    )
+    image, decoders = torch.from_numpy(mesh.filled).to(device), [Decoder(each, device) for each in (model, plain)]
+    errors = torch.zeros(2, dtype=torch.float64)
+    for points, weight in _cell_centres(grid, weights(grid, profile, seed + 1)):
+        target = texture(image, points[0])
+        for i, decoder in enumerate(decoders):
+            errors[i] += float(((decoder(*points) - target).double().square().sum(1) * weight).sum())
+    error, plain_error = errors.tolist()
     ratio = {"error against a plain lightmap of as many bits": error / plain_error if plain_error else None}
     if error < plain_error:
         return replace(model, report=model.report | ratio)
@@ -164,17 +167,17 @@ def _better(grid: FineGrid, model: AtlasModel | None, profile: Profile, seed: in
 
 def _cell_centres(
     grid: FineGrid, weight: torch.Tensor
-) -> tuple[tuple[torch.Tensor, torch.Tensor, torch.Tensor], torch.Tensor]:
-    """Centres of cells that are in a triangle, as a decoder takes them, and their weights.
+) -> Iterator[tuple[tuple[torch.Tensor, torch.Tensor, torch.Tensor], torch.Tensor]]:
+    """Centres of cells that are in a triangle, as a decoder takes them, and their weights; some rows at a time.
 
     Where no triangle holds a centre, being too small, the cells with a weight stand for their triangles.
     """
-    triangle, barycentric = grid.triangle
-    hit = triangle >= 0
-    if not bool(hit.any()):
-        hit = weight > 0
-    row, column = torch.nonzero(hit, as_tuple=True)
-    uv = torch.stack([(column + 0.5) / grid.width, (row + 0.5) / grid.height], 1).float()
-    barycentric, triangle = barycentric[hit], triangle[hit]
-    triangle = torch.where(triangle < 0, int(np.flatnonzero(grid.mesh.active)[0]), triangle)
-    return (uv, triangle, corner_weights(barycentric)), weight[hit]
+    held = bool((grid.triangle[0] >= 0).any())
+    rows = max(1, _CELLS_AT_ONCE // grid.width)
+    pieces = (values.split(rows) for values in (*grid.triangle, weight))
+    for number, (triangle, barycentric, share) in enumerate(zip(*pieces, strict=True)):
+        hit = triangle >= 0 if held else share > 0
+        row, column = torch.nonzero(hit, as_tuple=True)
+        uv = torch.stack([(column + 0.5) / grid.width, (row + number * rows + 0.5) / grid.height], 1).float()
+        triangle = torch.where(triangle < 0, int(np.flatnonzero(grid.mesh.active)[0]), triangle)
+        yield (uv, triangle[hit], corner_weights(barycentric[hit])), share[hit]

@@ -6,8 +6,8 @@ the mesh's own UVs. With `lod` the octaves of the lightmap's texels along a pixe
 
     mix(tiles, tail, clamp(lod - 1, 0, 1)),    the tail read at its own level lod - 2,
 
-which has no step: up to 1, where a bilinear read still meets all texels, it is the tiles', from 2 on the tail's. The tail
-takes 1.4% of the lightmap's bits.
+which has no step: up to 1, where a bilinear read still meets all texels, it is the tiles', from 2 on the tail's. The
+tail takes 1.4% of the lightmap's bits.
 """
 
 import numpy as np

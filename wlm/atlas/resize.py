@@ -60,7 +60,14 @@ def resize(
         raise ValueError(f"filter: expected one of {', '.join(FILTERS)}, got {filter!r}")
     if not (1 <= height <= lightmap.shape[0] and 1 <= width <= lightmap.shape[1]):
         raise ValueError(f"size: expected up to {lightmap.shape[:2]}, got {(height, width)}")
-    filled = fill_gaps(lightmap, mask).astype(np.float64)
+    return resized(fill_gaps(lightmap, mask), mask, height, width, filter, device)
+
+
+def resized(
+    filled: np.ndarray, mask: np.ndarray, height: int, width: int, filter: str = "fit", device: str = "cpu"
+) -> np.ndarray:
+    """As `resize`, of a lightmap whose gaps are filled, at an allowed size."""
+    filled = filled.astype(np.float64)
     if (height, width) == mask.shape:
         return filled
     weights = _WEIGHTS["box" if filter == "fit" else filter]
