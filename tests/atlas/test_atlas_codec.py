@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 from builders.atlas_meshes import charts, sheet, triangle
-from builders.atlas_models import KINDS, MIXED, random_model
+from builders.atlas_models import KINDS, MIXED, random_model, save_plainly
 from builders.checks import assert_same
 from builders.resigned import GONE, put, rewrite
 
@@ -75,21 +75,12 @@ def test_the_smallest_and_the_largest_numbers(tmp_path):
     assert_same(wlm.load(tmp_path / "a.wlm"), model)
 
 
-def _save_plainly(model, path) -> None:
-    """As earlier versions did: no part is a stream, and corners are floats."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(codec, "deflated", lambda parts: (parts, {}))
-        patch.setattr(codec, "encode_corners", lambda uv: {"uv": uv})
-        model.save(path)
-    rewrite(path, {"parts": GONE})
-
-
 def test_earlier_files_are_read(tmp_path):
     for kind, stored in STORED:
         model = random_model(sheet(), kind, stored)
         corners = np.nextafter(model.uv, np.float32(0.5))  # beside the places of 16 bits
         model = dataclasses.replace(model, uv=corners)
-        _save_plainly(model, tmp_path / "a.wlm")
+        save_plainly(model, tmp_path / "a.wlm")
         back = wlm.load(tmp_path / "a.wlm")
         assert_same(back, model)
         back.save(tmp_path / "b.wlm")
@@ -149,7 +140,7 @@ def test_corners_take_few_bytes():
 def _refused(tmp_path, kind: str, words: str, settings=None, tensors=None, stored: str = "half") -> None:
     """Saves a model with other settings or tensors; reading and describing it are one line."""
     path = tmp_path / "a.wlm"
-    _save_plainly(random_model(sheet(), kind, stored), path)
+    save_plainly(random_model(sheet(), kind, stored), path)
     rewrite(path, settings, tensors)
     for read in (wlm.load, codec.describe):
         with pytest.raises(WlmError, match=words) as error:
@@ -213,7 +204,7 @@ def test_blocks_that_are_none_of_the_format(tmp_path):
     blocks = {"colour": lambda v: np.zeros((29, 16), np.uint8)}
     _refused(tmp_path, "plain", "colour is uint8 .29, 16., expected uint8 .30, 16.", tensors=blocks, stored="astc")
     model = random_model(sheet(), "plain", "astc")
-    _save_plainly(model, tmp_path / "a.wlm")
+    save_plainly(model, tmp_path / "a.wlm")
     rewrite(tmp_path / "a.wlm", tensors={"colour": put(7, 0)})  # a reserved mode
     with pytest.raises(WlmError, match="a.wlm: astc: expected blocks of the format"):
         wlm.load(tmp_path / "a.wlm")
@@ -225,7 +216,7 @@ def test_a_texture_beyond_what_entries_reach(tmp_path):
     with pytest.raises(WlmError, match="a.wlm: not written: .*beyond the colour texture"):
         wide.save(tmp_path / "a.wlm")
     assert not (tmp_path / "a.wlm").exists()
-    _save_plainly(model, tmp_path / "a.wlm")
+    save_plainly(model, tmp_path / "a.wlm")
     rewrite(tmp_path / "a.wlm", {"texels": [18, MOST_SIZE + 1]}, {"colour": wide.texels})
     with pytest.raises(WlmError, match="beyond the colour texture"):
         wlm.load(tmp_path / "a.wlm")
