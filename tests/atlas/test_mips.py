@@ -1,11 +1,14 @@
 """Mips: each level against means of the lightmap, no step between them, and what a file and a shader have of them."""
 
 import dataclasses
+import shutil
+import subprocess
 
 import numpy as np
 import pytest
 import torch
 from builders.atlas_meshes import charts, sheet
+from builders.atlas_models import MIXED, random_model
 
 import wlm
 from wlm.atlas.fit import compress
@@ -87,6 +90,16 @@ def test_the_bits_are_counted_and_the_file_keeps_them(pair, tmp_path):
         assert ("vec3 wlm_atlas_grad(vec2 uv, vec2 dx, vec2 dy)" in text) == ("wlm_atlas_tail" in text) == there
     with pytest.raises(ValueError, match="lod: expected a model with mips"):
         bare.decoder().read(torch.zeros(1, 2), torch.zeros(1))
+
+
+@pytest.mark.skipif(shutil.which("glslangValidator") is None, reason="glslangValidator is not installed")
+@pytest.mark.parametrize("kind", ["tiles", MIXED, "plain"])
+def test_the_shader_compiles(kind, tmp_path):
+    model = dataclasses.replace(random_model(sheet(), kind), tail=np.zeros((1, 16), np.uint8))
+    main = "in vec2 uv;\nout vec4 light;\nvoid main() { light = vec4(wlm_atlas_grad(uv, dFdx(uv), dFdy(uv)), 1.0); }\n"
+    (tmp_path / "shader.frag").write_text(f"#version 330\n{atlas_glsl(model)}{main}")
+    done = subprocess.run(["glslangValidator", "shader.frag"], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0 and "WARNING" not in done.stdout, done.stdout
 
 
 def test_where_there_are_none():

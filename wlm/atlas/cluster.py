@@ -8,7 +8,7 @@ left (eq. 6).
 That is quadratic. Of more than `SAMPLE` triangles groups are formed among that many at random, all others join the
 first representative that they are like, and so on with those that are left: the time grows with the triangles and the
 groups, each triangle is like its representative, and no two representatives are alike, as before. On 41,472 triangles
-of a synthetic lightmap there are 1% more groups, in an eighth of the time.
+of a synthetic lightmap there are 1.6% more groups, in a sixth of the time; 991,232 triangles take 8 s on one core.
 
 Edges are stored within a sample alone, so that memory grows with the triangles and the texels that they cover: at most
 `samples_of(largest)` words per triangle.
