@@ -65,7 +65,7 @@ def test_every_row_has_its_figures(rows):
         if row.method != "lightmap":
             assert row["psnr"] > 8.0 and row["one_minus_ssim"] >= 0.0 and row["encode_seconds"] > 0.0
         if row.method == "ours":
-            # The file has a header besides, streams of its parts, and half floats of three channels where a GPU has four.
+            # The file has a header besides, streams, and half floats of three channels where a GPU has four.
             assert row["bytes"] > row["bpp"] * 64 * 48 / 8 * 0.4
 
 
