@@ -54,6 +54,22 @@ class _Texels:
     metric: wp.vec3
 
 
+@wp.struct
+class _Sums:
+    """The normal equations of a line's two ends, by channel.
+
+    Attributes:
+        aa, ab, bb: Weighted products of the texels' shares of the first and of the second end.
+        ay, by: Weighted sums of their places, by these shares.
+    """
+
+    aa: wp.vec3
+    ab: wp.vec3
+    bb: wp.vec3
+    ay: wp.vec3
+    by: wp.vec3
+
+
 @wp.func
 def _place_of(light: float) -> wp.vec2:
     """Light in BC6H's space, and the slope of light there."""
@@ -172,14 +188,34 @@ def _solved(products: wp.vec3, right: wp.vec2, before: wp.vec2) -> wp.vec2:
 
 
 @wp.func
+def _added(sums: _Sums, pull: wp.vec3, place: wp.vec3, t: float) -> _Sums:
+    """The normal equations with one more texel, at share `t` of the way from the first end to the second."""
+    s = 1.0 - t
+    sums.aa += pull * (s * s)
+    sums.ab += pull * (s * t)
+    sums.bb += pull * (t * t)
+    weighted = wp.cw_mul(pull, place)
+    sums.ay += weighted * s
+    sums.by += weighted * t
+    return sums
+
+
+@wp.func
+def _ends_of(sums: _Sums, a: wp.vec3, b: wp.vec3):
+    """The ends that solve the normal equations; `a` and `b` are those before."""
+    for c in range(3):
+        products = wp.vec3(sums.aa[c], sums.ab[c], sums.bb[c])
+        pair = _solved(products, wp.vec2(sums.ay[c], sums.by[c]), wp.vec2(a[c], b[c]))
+        a[c] = pair[0]
+        b[c] = pair[1]
+    return a, b
+
+
+@wp.func
 def _regressed(texels: _Texels, mask: int, a: wp.vec3, b: wp.vec3, steps: int):
     """A line's ends by least squares, its texels at the nearest of the levels between the ends they had."""
     along = b - a
-    aa = wp.vec3(0.0)
-    ab = wp.vec3(0.0)
-    bb = wp.vec3(0.0)
-    ay = wp.vec3(0.0)
-    by = wp.vec3(0.0)
+    sums = _Sums()
     for i in range(_TEXELS):
         if _in(mask, i):
             pull = texels.pull[i]
@@ -189,17 +225,8 @@ def _regressed(texels: _Texels, mask: int, a: wp.vec3, b: wp.vec3, steps: int):
             if square > 0.0:
                 t = wp.dot(scaled, texels.place[i] - a) / square
             t = wp.clamp(wp.floor(t * float(steps) + 0.5), 0.0, float(steps)) / float(steps)
-            s = 1.0 - t
-            aa += pull * (s * s)
-            ab += pull * (s * t)
-            bb += pull * (t * t)
-            weighted = wp.cw_mul(pull, texels.place[i])
-            ay += weighted * s
-            by += weighted * t
-    for c in range(3):
-        pair = _solved(wp.vec3(aa[c], ab[c], bb[c]), wp.vec2(ay[c], by[c]), wp.vec2(a[c], b[c]))
-        a[c] = pair[0]
-        b[c] = pair[1]
+            sums = _added(sums, pull, texels.place[i], t)
+    a, b = _ends_of(sums, a, b)
     return a, b
 
 
@@ -321,27 +348,14 @@ def _turned(texels: _Texels, ends: _Ends, line: int, anchor: int) -> _Ends:
 @wp.func
 def _refitted(texels: _Texels, block: Block, mask: int, ends: _Ends, line: int, steps: int) -> _Ends:
     """Ends by least squares of the levels that the texels of a line took."""
-    aa = wp.vec3(0.0)
-    ab = wp.vec3(0.0)
-    bb = wp.vec3(0.0)
-    ay = wp.vec3(0.0)
-    by = wp.vec3(0.0)
+    sums = _Sums()
     for i in range(_TEXELS):
         if _in(mask, i):
-            pull = texels.pull[i]
             t = float(_share(block.index[i], steps)) / 64.0
-            s = 1.0 - t
-            aa += pull * (s * s)
-            ab += pull * (s * t)
-            bb += pull * (t * t)
-            weighted = wp.cw_mul(pull, texels.place[i])
-            ay += weighted * s
-            by += weighted * t
-    for c in range(3):
-        before = wp.vec2(ends[2 * line, c], ends[2 * line + 1, c])
-        pair = _solved(wp.vec3(aa[c], ab[c], bb[c]), wp.vec2(ay[c], by[c]), before)
-        ends[2 * line, c] = pair[0]
-        ends[2 * line + 1, c] = pair[1]
+            sums = _added(sums, texels.pull[i], texels.place[i], t)
+    a, b = _ends_of(sums, ends[2 * line], ends[2 * line + 1])
+    ends[2 * line] = a
+    ends[2 * line + 1] = b
     return ends
 
 

@@ -5,14 +5,17 @@ import dataclasses
 import numpy as np
 import pytest
 from builders.atlas_meshes import charts, sheet, triangle
-from builders.atlas_models import KINDS, MIXED, random_model
+from builders.atlas_models import KINDS, MIXED, random_model, save_plainly
 from builders.checks import assert_same
 from builders.resigned import GONE, put, rewrite
 
 import wlm
 from wlm.atlas import codec, colour
+from wlm.atlas.corners import PARTS, decode_corners, encode_corners, snapped
 from wlm.atlas.model import MOST_SIZE, pack_entries
+from wlm.atlas.streams import deflated
 from wlm.errors import WlmError
+from wlm.formats.artifact import read_artifact
 
 STORED = [(kind, stored) for kind in KINDS for stored in ("half", "rgb9e5", "bc6h", "astc")] + [(MIXED, "mixed")]
 
@@ -41,9 +44,12 @@ def test_a_model_comes_back(kind, stored, tmp_path, monkeypatch):
     texel_bytes = {"half": 6, "rgb9e5": 4, "mixed": 4}
     colour_bytes = 18 * 23 * texel_bytes[stored] if stored in texel_bytes else 5 * 6 * 16
     block_bytes = 16 * 20 if stored == "mixed" else 0
-    expected = {"colour": colour_bytes, "blocks": block_bytes, "lut": model.lut.size * 2, "uv": len(model.uv) * 24}
+    expected = {"colour": colour_bytes, "blocks": block_bytes, "lut": model.lut.size * 2}
     header = facts["parts"].pop("header")
-    assert facts["parts"] == {name: count for name, count in expected.items() if count} and header < 700
+    uv = sum(facts["parts"].pop(name, 0) for name in PARTS)
+    assert header < 900 and (0 < uv < 32 * len(model.uv) if len(model.uv) else uv == 0)
+    assert facts["parts"].keys() == {name for name, count in expected.items() if count}
+    assert all(0.7 * expected[name] < count <= expected[name] for name, count in facts["parts"].items())  # random
     # Eq. 9 counts the textures, whole blocks of them, and no UVs; half floats as a GPU holds them, of four channels.
     padding = 18 * 23 * 16 if stored == "half" else 0
     bits = 8 * (colour_bytes + block_bytes) + padding + model.lut.shape[0] * model.lut.shape[1] * 32
@@ -69,10 +75,72 @@ def test_the_smallest_and_the_largest_numbers(tmp_path):
     assert_same(wlm.load(tmp_path / "a.wlm"), model)
 
 
+def test_earlier_files_are_read(tmp_path):
+    for kind, stored in STORED:
+        model = random_model(sheet(), kind, stored)
+        corners = np.nextafter(model.uv, np.float32(0.5))  # beside the places of 16 bits
+        model = dataclasses.replace(model, uv=corners)
+        save_plainly(model, tmp_path / "a.wlm")
+        back = wlm.load(tmp_path / "a.wlm")
+        assert_same(back, model)
+        back.save(tmp_path / "b.wlm")
+        assert_same(wlm.load(tmp_path / "b.wlm"), model)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"parts": {"lut": [9, 9, 10**9]}}, "part lut: .*: expected what .* bytes can hold"),
+        ({"parts": {"lut": [10**6, 0, 2]}}, "part lut: expected 0 bytes"),
+        ({"parts": {"dial": [1]}}, "setting parts: dial is none of the file's"),
+        ({"parts": {"lut": [4, 4, 2]}}, "part lut: expected 64 bytes"),
+        ({"parts": {}}, "part .* is uint8"),
+    ],
+)
+def test_streams_that_do_not_fit_are_refused(change, words, tmp_path):
+    path = tmp_path / "a.wlm"
+    random_model(sheet(), "tiles").save(path)
+    assert read_artifact(path).settings["parts"]["lut"] == [6, 7, 2]
+    rewrite(path, change)
+    with pytest.raises(WlmError, match=f"a.wlm: .*{words}"):
+        wlm.load(path)
+
+
+@pytest.mark.parametrize(
+    ("part", "change", "words"),
+    [
+        ("uv_place", lambda v: v[..., :3], "uv_triangle: expected numbers below 3"),
+        ("uv_index", lambda v: v[..., :-1], "uv_order: expected a number for each"),
+        ("uv_triangle", lambda v: v[..., :1], "uv_index: expected numbers below 1"),
+        ("uv_order", lambda v: v * 0 + 6, "uv_order: expected numbers of at most 5"),
+        ("uv_index", GONE, "uv_index is missing"),
+    ],
+)
+def test_corners_that_do_not_fit_are_refused(part, change, words, tmp_path, monkeypatch):
+    path = tmp_path / "a.wlm"
+    monkeypatch.setattr(codec, "deflated", lambda parts: (parts, {}))
+    random_model(sheet(), "cascade").save(path)
+    rewrite(path, tensors={part: change if change is GONE else lambda v: np.ascontiguousarray(change(v))})
+    with pytest.raises(WlmError, match=words):
+        wlm.load(path)
+
+
+def test_corners_take_few_bytes():
+    """Triangles that share texels, and those that share corners, name what is there: exact, and in 2 bytes each."""
+    random = np.random.default_rng(0)
+    row, column = np.mgrid[:40, :40].reshape(2, -1, 1)
+    quad = np.stack([column, row], 2) + [[0, 0], [1, 0], [0, 1]]
+    uv = snapped(quad / 40)[random.permutation(1600).repeat(4)]
+    uv = np.take_along_axis(uv, random.permuted(np.tile(np.arange(3), (6400, 1)), axis=1)[:, :, None], 1)
+    parts = encode_corners(uv)
+    np.testing.assert_array_equal(decode_corners({name: parts[name] for name in PARTS}), uv)
+    assert sum(part.size for part in deflated(parts)[0].values()) < 4 * len(uv) < uv.nbytes / 5
+
+
 def _refused(tmp_path, kind: str, words: str, settings=None, tensors=None, stored: str = "half") -> None:
     """Saves a model with other settings or tensors; reading and describing it are one line."""
     path = tmp_path / "a.wlm"
-    random_model(sheet(), kind, stored).save(path)
+    save_plainly(random_model(sheet(), kind, stored), path)
     rewrite(path, settings, tensors)
     for read in (wlm.load, codec.describe):
         with pytest.raises(WlmError, match=words) as error:
@@ -136,7 +204,7 @@ def test_blocks_that_are_none_of_the_format(tmp_path):
     blocks = {"colour": lambda v: np.zeros((29, 16), np.uint8)}
     _refused(tmp_path, "plain", "colour is uint8 .29, 16., expected uint8 .30, 16.", tensors=blocks, stored="astc")
     model = random_model(sheet(), "plain", "astc")
-    model.save(tmp_path / "a.wlm")
+    save_plainly(model, tmp_path / "a.wlm")
     rewrite(tmp_path / "a.wlm", tensors={"colour": put(7, 0)})  # a reserved mode
     with pytest.raises(WlmError, match="a.wlm: astc: expected blocks of the format"):
         wlm.load(tmp_path / "a.wlm")
@@ -148,7 +216,7 @@ def test_a_texture_beyond_what_entries_reach(tmp_path):
     with pytest.raises(WlmError, match="a.wlm: not written: .*beyond the colour texture"):
         wide.save(tmp_path / "a.wlm")
     assert not (tmp_path / "a.wlm").exists()
-    model.save(tmp_path / "a.wlm")
+    save_plainly(model, tmp_path / "a.wlm")
     rewrite(tmp_path / "a.wlm", {"texels": [18, MOST_SIZE + 1]}, {"colour": wide.texels})
     with pytest.raises(WlmError, match="beyond the colour texture"):
         wlm.load(tmp_path / "a.wlm")

@@ -177,7 +177,7 @@ def test_parts_that_no_view_shows_stay_in_range(views: int):
     """One view shows three sides at most, and none the chart within the cube."""
     mesh = charts(height=96, width=128)
     profile = HALF.override({"views": views})
-    weight = weights(FineGrid(mesh, "cpu"), profile, 0)
+    weight = weights(FineGrid(mesh, "cpu"), profile, 0).numpy()
     decoded = checked(compress(mesh, profile), mesh)
     low, high = mesh.lightmap[mesh.mask].min(), mesh.lightmap[mesh.mask].max()
     assert decoded[mesh.mask].min() >= low - 0.3 * (high - low) and decoded.max() <= high + 0.3 * (high - low)
@@ -200,7 +200,7 @@ def test_weights_follow_the_views_and_the_borders():
     """A border of a chart counts more, what has no triangle not at all."""
     mesh = charts(height=48, width=64)
     grid = FineGrid(mesh, "cpu")
-    plain, bordered = (weights(grid, HALF.override({"border": border}), 0) for border in (1.0, 5.0))
+    plain, bordered = (weights(grid, HALF.override({"border": border}), 0).numpy() for border in (1.0, 5.0))
     assert plain.shape == (96, 128) and (plain >= 0).all()
     ratio = bordered[plain > 0] / plain[plain > 0]
     assert set(np.unique(np.round(ratio, 6))) == {1.0, 5.0}

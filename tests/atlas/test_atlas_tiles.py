@@ -225,8 +225,13 @@ def test_curves_and_solved():
     error = grid.curves(tiles, sizes)
     assert error.shape == (3, 9) and error.dtype == np.float64
     chosen = np.arange(9) % 3
-    samples = grid.solved(tiles, sizes, chosen)
-    for i, (values, weight) in enumerate(samples):
+    samples = {
+        i: pair
+        for members, *parts in grid.solved(tiles, sizes, chosen)
+        for i, *pair in zip(members.tolist(), *parts, strict=True)
+    }
+    assert sorted(samples) == list(range(9))
+    for i, (values, weight) in samples.items():
         size = sizes[chosen[i]]
         assert values.shape == (size.ny, size.nx, 3) and (values >= 0).all()
         interpolation = _kron(size.nx, size.ny, 2 * tiles.size)

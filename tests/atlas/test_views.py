@@ -124,17 +124,17 @@ def test_inactive_triangles_hide_and_are_not_seen():
 def test_visibility_counts_every_covered_pixel_once(device):
     mesh, views = lit_cube(2), sphere_views(9, seed=1)
     pixels = sum(int((visible >= 0).sum()) for visible, _, _ in visible_uv(mesh, views, 64, device))
-    count = visibility(mesh, views, 64, HEIGHT, WIDTH, device)
+    count = visibility(mesh, views, 64, HEIGHT, WIDTH, device).cpu().numpy()
     assert count.dtype == np.float64 and count.shape == (HEIGHT, WIDTH) and count.sum() == pixels > 5000
-    np.testing.assert_array_equal(count, visibility(mesh, views, 64, HEIGHT, WIDTH, device))
-    fine = visibility(mesh, views, 64, 2 * HEIGHT, 2 * WIDTH, device)
+    np.testing.assert_array_equal(count, visibility(mesh, views, 64, HEIGHT, WIDTH, device).cpu())
+    fine = visibility(mesh, views, 64, 2 * HEIGHT, 2 * WIDTH, device).cpu().numpy()
     np.testing.assert_array_equal(fine.reshape(HEIGHT, 2, WIDTH, 2).sum(axis=(1, 3)), count)
     assert (count[mesh.mask] > 0).mean() > 0.7 and not count[~mesh.mask].any()
 
 
 def test_visibility_of_one_side_and_of_none():
     mesh = lit_cube(1)
-    count = visibility(mesh, [View.of(DIRECTIONS[4])], 64, HEIGHT, WIDTH, "cpu")
+    count = visibility(mesh, [View.of(DIRECTIONS[4])], 64, HEIGHT, WIDTH, "cpu").numpy()
     chart = np.zeros((HEIGHT, WIDTH), bool)
     chart[HEIGHT // 2 :, WIDTH // 3 : 2 * WIDTH // 3] = True
     assert count[chart].sum() > 500 and not count[~chart].any()
@@ -144,7 +144,7 @@ def test_visibility_of_one_side_and_of_none():
 def test_a_uv_at_the_end_is_in_the_last_cell():
     position = np.array([[-1, -1, 0], [1, -1, 0], [-1, 1, 0]], np.float64)
     mesh = from_arrays(position, np.array([[0, 1, 2]]), np.array([[1 - 1e-7, 1], [1, 1], [1, 1 - 1e-7]]), waves())
-    count = visibility(mesh, [View.of([0, 0, 1])], 32, 8, 8, "cpu")
+    count = visibility(mesh, [View.of([0, 0, 1])], 32, 8, 8, "cpu").numpy()
     assert count[7, 7] == count.sum() > 50
 
 

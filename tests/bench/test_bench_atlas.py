@@ -65,8 +65,8 @@ def test_every_row_has_its_figures(rows):
         if row.method != "lightmap":
             assert row["psnr"] > 8.0 and row["one_minus_ssim"] >= 0.0 and row["encode_seconds"] > 0.0
         if row.method == "ours":
-            # The file has a header besides, and half floats of three channels where a GPU has four.
-            assert row["bytes"] > row["bpp"] * 64 * 48 / 8 * 0.75
+            # The file has a header besides, streams, and half floats of three channels where a GPU has four.
+            assert row["bytes"] > row["bpp"] * 64 * 48 / 8 * 0.4
 
 
 def test_rows_are_of_what_they_name(lightmaps, rows):

@@ -1,11 +1,16 @@
 """Atlas models of random numbers, for tests of what only writes or reads them; and groups of triangles."""
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
+import pytest
+from builders.resigned import GONE, rewrite
 
+from wlm.atlas import codec
 from wlm.atlas.cluster import Clusters, Stats
 from wlm.atlas.colour import quantise
+from wlm.atlas.corners import snapped
 from wlm.atlas.data import LightmappedMesh
 from wlm.atlas.model import AtlasModel, Profile, pack_entries, tile_counts
 
@@ -37,11 +42,20 @@ def random_model(mesh: LightmappedMesh, kind: str, colour: str = "half", seed: i
     elif method == "cascade":
         lut = random.integers(0, 65536, (9, 13, 2)).astype(np.uint16)
     triangles = len(mesh.triangle) if method == "cascade" or kind.endswith("uv") else 0
-    uv = random.random((triangles, 3, 2)).astype(np.float32)
+    uv = snapped(random.random((triangles, 3, 2)))
     settings = (mesh.name, mesh.source, profile, method, colour, height, width)
     report = {"seconds": {"fit": 1.5}, "tiles": 4}
     textures = quantise(texels, "rgb9e5" if colour == "mixed" else colour) | second
     return AtlasModel(*settings, **textures, lut=lut, uv=uv, report=report)
+
+
+def save_plainly(model: AtlasModel, path: Path) -> None:
+    """As earlier versions did: no part is a stream, and corners are floats."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(codec, "deflated", lambda parts: (parts, {}))
+        patch.setattr(codec, "encode_corners", lambda uv: {"uv": uv})
+        model.save(path)
+    rewrite(path, {"parts": GONE})
 
 
 def grouped(representative: Sequence[int], order: Sequence[int] | None = None) -> Clusters:

@@ -38,7 +38,7 @@ def _triangles(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
 def _sampled(image: np.ndarray, corners: np.ndarray, level: np.ndarray, device: str):
     fixed = np.rint(corners * 65536).astype(np.int64)
     samples, patches, bright = kernels.sample(_texels(image), fixed, level, device)
-    kernels.dominant(samples, patches, level)
+    kernels.dominant(samples, patches)
     return samples, patches, bright
 
 
@@ -112,11 +112,8 @@ def _ints(values: np.ndarray, device: str) -> wp.array:
 
 def _graph(samples, patches, threshold: float, colour_threshold: float, device: str):
     """The graph, and the number that each of its nodes had."""
-    patch = patches.numpy()
-    order = np.argsort(kernels.bin_numbers(patch["colour"]), kind="stable")
-    nodes = wp.array(patch[order], dtype=kernels.Patch, device=device)
-    bounds = graphs.bounds(samples, nodes, int(patch["level"].max()) + 1)
-    return graphs.graph(samples, nodes, bounds, graphs.rule(threshold, colour_threshold, device)), order
+    bounds = graphs.bounds(samples, patches, int(patches.numpy()["level"].max()) + 1)
+    return graphs.graph(samples, patches, bounds, graphs.rule(threshold, colour_threshold, device))
 
 
 @pytest.mark.parametrize("contrast", [0.02, 0.2, 1.0])
@@ -130,19 +127,23 @@ def test_neighbours(device: str, threshold: float, contrast: float):
     split = [_smallest(patch) for patch in _unpacked(samples, level)]
     want = reference.adjacency([split[t] for t in number], threshold, 0.09)
 
-    degree = wp.zeros(count, dtype=int, device=device)
+    edge = wp.zeros((count, count), dtype=wp.uint8, device=device)
     compared = wp.zeros(count, dtype=wp.int64, device=device)
     for begin in range(0, count, 32):
-        graphs.count_neighbours(graph, begin, min(begin + 32, count), degree, compared)
-    np.testing.assert_array_equal(degree.numpy(), want.sum(1))
+        graphs.find_edges(graph, begin, min(begin + 32, count), edge, compared)
+    np.testing.assert_array_equal(edge.numpy() != 0, want)
+    few = np.arange(5, count, 3)
+    part, edge = graphs.part(graph, few), wp.zeros((len(few), len(few)), dtype=wp.uint8, device=device)
+    graphs.find_edges(part, 0, len(few), edge, compared)
+    np.testing.assert_array_equal(edge.numpy() != 0, want[np.ix_(few, few)])
 
-    left = np.arange(5, count)
-    marked = wp.empty(len(left), dtype=wp.uint8, device=device)
-    for chosen in (5, 40):
-        graphs.mark_neighbours(graph, _ints(left, device), chosen, marked)
-        np.testing.assert_array_equal(marked.numpy(), want[chosen, left] | (left == chosen))
-    graphs.remove_neighbours(graph, _ints(left, device), _ints(np.arange(5), device), degree)
-    np.testing.assert_array_equal(degree.numpy()[left], want[np.ix_(left, left)].sum(1))
+    heads = np.array([5, 40])
+    joined = wp.empty(count, dtype=int, device=device)
+    low = wp.array(graph.means[heads], dtype=float, device=device)
+    nodes = _ints(np.arange(count), device)
+    graphs.join(graph, nodes, 0, count, _ints(heads, device), low, _ints(np.array([1, 0]), device), joined)
+    like = want[heads] | (heads[:, None] == np.arange(count))
+    np.testing.assert_array_equal(joined.numpy(), np.where(like[1], 0, np.where(like[0], 1, 2)))
 
 
 def test_bounds_settle_most_pairs(device: str):
@@ -152,10 +153,10 @@ def test_bounds_settle_most_pairs(device: str):
     image = np.repeat((0.3 + 0.3 * x + 0.2 * y)[..., None], 3, -1)
     samples, patches, _ = _sampled(image, *_triangles(count), device)
     graph, _ = _graph(samples, patches, 0.03, 2.0, device)
-    degree = wp.zeros(count, dtype=int, device=device)
+    edge = wp.zeros((count, count), dtype=wp.uint8, device=device)
     compared = wp.zeros(count, dtype=wp.int64, device=device)
-    graphs.count_neighbours(graph, 0, count, degree, compared)
-    edges, pairs = degree.numpy().sum() // 2, count * (count - 1) // 2
+    graphs.find_edges(graph, 0, count, edge, compared)
+    edges, pairs = edge.numpy().sum(dtype=int) // 2, count * (count - 1) // 2
     assert 0.1 * pairs < edges < 0.9 * pairs
     assert compared.numpy().sum() < 0.2 * pairs
 
@@ -175,18 +176,9 @@ def test_the_threshold_itself_is_not_alike(device: str, step: int, alike: bool, 
         patch[name][1] = patch[name][0] + step * 0x010101
     samples = wp.array(grey, dtype=int, device=device)
     graph, _ = _graph(samples, wp.array(patch, dtype=kernels.Patch, device=device), 0.2, 2.0, device)
-    degree = wp.zeros(2, dtype=int, device=device)
-    graphs.count_neighbours(graph, 0, 2, degree, wp.zeros(2, dtype=wp.int64, device=device))
-    assert degree.numpy().tolist() == [int(alike)] * 2
-
-
-def test_dominant_colours_in_parts(device: str, monkeypatch: pytest.MonkeyPatch):
-    """The same however few samples are sorted at once, also where one patch alone has more."""
-    image, (corners, level) = _image(), _triangles(40)
-    _, whole, _ = _sampled(image, corners, level, device)
-    monkeypatch.setattr(kernels, "_AT_ONCE", 20)
-    _, parts, _ = _sampled(image, corners, level, device)
-    np.testing.assert_array_equal(whole.numpy()["colour"], parts.numpy()["colour"])
+    edge = wp.zeros((2, 2), dtype=wp.uint8, device=device)
+    graphs.find_edges(graph, 0, 2, edge, wp.zeros(2, dtype=wp.int64, device=device))
+    assert edge.numpy().tolist() == [[0, int(alike)], [int(alike), 0]]
 
 
 def test_too_many_samples():

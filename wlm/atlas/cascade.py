@@ -23,7 +23,7 @@ On CUDA gradients are added in any order: two fits with one seed differ in the l
 """
 
 import math
-from dataclasses import astuple, dataclass, fields
+from dataclasses import astuple, dataclass, fields, replace
 
 import numpy as np
 import torch
@@ -32,6 +32,7 @@ import warp as wp
 from wlm import interop
 from wlm.atlas.cluster import Clusters, Stats, cluster
 from wlm.atlas.colour import quantise
+from wlm.atlas.corners import snapped
 from wlm.atlas.data import LightmappedMesh
 from wlm.atlas.model import LUT_STEPS, AtlasModel, Profile
 from wlm.atlas.pack import pack, regenerate
@@ -124,6 +125,7 @@ def fit_cascade(
     """
     with stages("pack"):
         packed = pack(mesh, clusters, profile.scale)
+        packed = replace(packed, uv=snapped(packed.uv))  # what the file holds is what is tuned
     with stages("regenerate"):
         start = initial(*regenerate(mesh, packed, stages.device), profile)
     with stages("fit"):

@@ -5,8 +5,13 @@ lambda in one of the six orders of the vertices. The node with most edges (the l
 group: itself and its neighbours. The group is removed and the edges of the rest are counted again, until no edge is
 left (eq. 6).
 
-Edges are never stored but recomputed from the patches, so that memory grows with the triangles and the texels that
-they cover alone: at most `samples_of(largest)` words per triangle.
+That is quadratic. Of more than `SAMPLE` triangles groups are formed among that many at random, all others join the
+first representative that they are like, and so on with those that are left: the time grows with the triangles and the
+groups, each triangle is like its representative, and no two representatives are alike, as before. On 41,472 triangles
+of a synthetic lightmap there are 1.6% more groups, in a sixth of the time; 991,232 triangles take 8 s on one core.
+
+Edges are stored within a sample alone, so that memory grows with the triangles and the texels that they cover: at most
+`samples_of(largest)` words per triangle.
 
 Where the paper is silent or we differ:
 
@@ -45,7 +50,11 @@ from wlm_kernels.atlas.patches import SIZES
 # fast; edges within 1%; groups within a seventh, or within one group where there are ten or fewer.
 LARGEST = 17
 _FARTHEST = 65536.0
-_PAIRS_AT_ONCE = 1 << 26  # between two looks at the clock
+
+SAMPLE = 8192
+"""Triangles among which groups are formed at once."""
+
+_PAIRS_AT_ONCE = 1 << 24  # between two looks at the clock
 
 
 @dataclass(frozen=True)
@@ -55,7 +64,7 @@ class Stats:
     Attributes:
         compared: Pairs whose samples had to be compared, bounds having settled the others; rounding may make it differ
             from device to device.
-        edges: Pairs that are alike.
+        edges: Pairs that are alike; of more than `SAMPLE` triangles both are of pairs within samples.
     """
 
     compared: int
@@ -112,7 +121,7 @@ def cluster(
         largest: The largest size of a patch, one of `wlm_kernels.atlas.patches.SIZES`.
         device: "cpu" or "cuda:N"; the result is the same on all.
         progress: Called with the triangles done, in stage "compare patches" while edges are counted, then in stage
-            "cluster" while groups are formed.
+            "cluster" while groups are formed; of more than `SAMPLE` triangles in turns.
 
     Returns:
         The groups.
@@ -130,23 +139,19 @@ def cluster(
     corner = _corners(uv, triangle, lightmap.shape)
     level = _levels(corner, largest)
     samples, patches, bright = kernels.sample(_texels(lightmap, max_radiance), corner, level, device)
-    kernels.dominant(samples, patches, level)
+    kernels.dominant(samples, patches)
     excluded |= bright.numpy() != 0
 
     included = np.flatnonzero(~excluded)
-    patch = patches.numpy()
-    bins = kernels.bin_numbers(patch["colour"][included])
-    number = included[np.argsort(bins, kind="stable")]  # the triangle of each node
-    nodes = wp.array(patch[number], dtype=kernels.Patch, device=device)
+    nodes = wp.array(patches.numpy()[included], dtype=kernels.Patch, device=device)
     bounds = graphs.bounds(samples, nodes, int(level.max(initial=0)) + 1)
-    graph = graphs.graph(samples, nodes, bounds, graphs.rule(threshold, colour_threshold, device))
-
-    degree, stats = _degrees(graph, progress)
+    graph, order = graphs.graph(samples, nodes, bounds, graphs.rule(threshold, colour_threshold, device))
+    number = included[order]  # the triangle of each node
+    groups, stats = _groups(graph, number, progress)
     head = np.arange(count, dtype=np.int32)  # the representative of each triangle
-    heads: list[int] = []
-    for node, members in _greedy(graph, number, degree, progress):
+    heads = [number[node] for node, _ in groups]
+    for node, members in groups:
         head[number[members]] = number[node]
-        heads.append(number[node])
     single = head == np.arange(count)
     single[heads] = False
     representative = np.concatenate([np.array(heads, np.int64), np.flatnonzero(single)]).astype(np.int32)
@@ -203,55 +208,103 @@ def _levels(corner: np.ndarray, largest: int) -> np.ndarray:
     return np.searchsorted(SIZES, np.minimum(np.ceil(longest), largest)).astype(np.int32)
 
 
-def _degrees(graph: graphs.Graph, progress: OnProgress | None) -> tuple[wp.array, Stats]:
-    """The number of neighbours of each node, int [M]."""
-    count, device = graph.patches.shape[0], graph.patches.device
-    degree = wp.zeros(count, dtype=int, device=device)
-    compared = wp.zeros(count, dtype=wp.int64, device=device)
-    meter, piece = Meter(progress, "compare patches", count), max(_PAIRS_AT_ONCE // max(count, 1), 1)
-    for begin in range(0, count, piece):
-        end = min(begin + piece, count)
-        graphs.count_neighbours(graph, begin, end, degree, compared)
-        if progress is not None:
-            wp.synchronize_device(device)
-            if meter.due(end):
-                meter.report(end)
-    edges = int(degree.numpy().sum(dtype=np.int64)) // 2
-    return degree, Stats(int(compared.numpy().sum()), edges)
-
-
-def _greedy(
-    graph: graphs.Graph, number: np.ndarray, degree: wp.array, progress: OnProgress | None
-) -> Iterator[tuple[int, np.ndarray]]:
-    """Forms groups and removes them from the graph (section 3.2.2).
+def _groups(
+    graph: graphs.Graph, number: np.ndarray, progress: OnProgress | None
+) -> tuple[list[tuple[int, np.ndarray]], Stats]:
+    """Forms groups.
 
     Args:
         graph: The graph, of M nodes.
         number: int [M], the triangle of each node, which settles ties.
-        degree: int [M], reduced to those among the nodes that remain.
         progress: As for `cluster`.
+
+    Returns:
+        The node that represents each group and the nodes of the group, those of one left out, in the order in which
+        they were formed; and figures of the graph.
+    """
+    count, compared, edges = len(number), 0, 0
+    left = np.arange(count)
+    drawn = np.random.default_rng(0).permutation(count)  # the order in which nodes get into samples
+    groups: list[tuple[int, np.ndarray]] = []
+    comparing, clustering = Meter(progress, "compare patches", count), Meter(progress, "cluster", count)
+    while True:
+        sample = left if len(left) <= SAMPLE else np.sort(left[np.argsort(drawn[left])[:SAMPLE]])
+        part = graph if len(sample) == count else graphs.part(graph, sample)
+        edge, stats = _edges(part, comparing, count - len(left))
+        compared, edges = compared + stats.compared, edges + stats.edges
+        formed = [(int(sample[node]), sample[members]) for node, members in _greedy(edge, number[sample])]
+        if len(sample) == len(left):
+            groups += formed
+            clustering.report(count)
+            return groups, Stats(compared, edges)
+        # Those that are like no other of the sample may be like one outside of it.
+        alone = np.setdiff1d(sample, np.concatenate([np.empty(0, np.int64), *(members for _, members in formed)]))
+        heads = np.concatenate([np.array([node for node, _ in formed], np.int64), alone])
+        rest = np.setdiff1d(left, sample, assume_unique=True)
+        joined = _joined(graph, rest, heads, clustering, count - len(left))
+        order = np.argsort(joined, kind="stable")
+        ends = np.searchsorted(joined[order], np.arange(len(heads) + 1))
+        members = [members for _, members in formed] + [np.array([node]) for node in alone]
+        for rank, node in enumerate(heads.tolist()):
+            found = rest[order[ends[rank] : ends[rank + 1]]]
+            if len(found) or rank < len(formed):
+                groups.append((node, np.concatenate([members[rank], found])))
+        left = rest[joined == len(heads)]
+
+
+def _joined(graph: graphs.Graph, nodes: np.ndarray, heads: np.ndarray, meter: Meter, done: int) -> np.ndarray:
+    """The first of the heads that each node is like, int [N]; their number where there is none."""
+    device, by_mean = graph.patches.device, np.argsort(heads, kind="stable")
+
+    def on_device(values: np.ndarray) -> wp.array:
+        return wp.array(values.astype(np.int32), dtype=int, device=device)
+
+    low = wp.array(graph.means[heads[by_mean]], dtype=float, device=device)
+    inputs = on_device(heads[by_mean]), low, on_device(by_mean)
+    each, joined = on_device(nodes), wp.empty(len(nodes), dtype=int, device=device)
+    piece = max(_PAIRS_AT_ONCE // len(heads), 1)
+    for begin in range(0, len(nodes), piece):
+        graphs.join(graph, each, begin, min(begin + piece, len(nodes)), *inputs, joined)
+        wp.synchronize_device(device)
+        if meter.due(done):
+            meter.report(done)
+    return joined.numpy()
+
+
+def _edges(graph: graphs.Graph, meter: Meter, done: int) -> tuple[np.ndarray, Stats]:
+    """The edges, uint8 [M, M]; `done` triangles are in groups already."""
+    count, device = graph.patches.shape[0], graph.patches.device
+    edge = wp.zeros((count, count), dtype=wp.uint8, device=device)
+    compared = wp.zeros(count, dtype=wp.int64, device=device)
+    piece = max(_PAIRS_AT_ONCE // max(count, 1), 1)
+    for begin in range(0, count, piece):
+        end = min(begin + piece, count)
+        graphs.find_edges(graph, begin, end, edge, compared)
+        wp.synchronize_device(device)
+        if meter.due(done + end):
+            meter.report(done + end)
+    edges = edge.numpy()
+    return edges, Stats(int(compared.numpy().sum()), int(np.count_nonzero(edges)) // 2)
+
+
+def _greedy(edge: np.ndarray, number: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
+    """Forms groups and removes them from the graph (section 3.2.2).
+
+    Args:
+        edge: uint8 [M, M], 1 where two nodes are alike.
+        number: int [M], the triangle of each node, which settles ties.
 
     Yields:
         The node that represents a group, and the nodes of the group; groups of one are left out.
     """
-    meter = Meter(progress, "cluster", len(number))
-
-    def on_device(nodes: np.ndarray) -> wp.array:
-        return wp.array(nodes, dtype=int, device=degree.device)
-
-    remaining = np.flatnonzero(degree.numpy() > 0).astype(np.int32)
-    while len(remaining):
-        if meter.due(len(number) - len(remaining)):
-            meter.report(len(number) - len(remaining))
-        degrees = degree.numpy()[remaining]
-        top = remaining[degrees == degrees.max()]
-        node = int(top[number[top].argmin()])
-        marked = wp.empty(len(remaining), dtype=wp.uint8, device=degree.device)
-        graphs.mark_neighbours(graph, on_device(remaining), node, marked)
-        members = marked.numpy() != 0
-        group, remaining = remaining[members], remaining[~members]
-        yield node, group
-        if len(remaining):
-            graphs.remove_neighbours(graph, on_device(remaining), on_device(group), degree)
-            remaining = remaining[degree.numpy()[remaining] > 0]
-    meter.report(len(number))
+    degree = edge.sum(1, dtype=np.int64)
+    remains = np.ones(len(number), bool)
+    # Of equals the lowest number is first.
+    order = np.argsort(number, kind="stable")
+    while len(order) and degree[node := order[degree[order].argmax()]] > 0:
+        members = np.flatnonzero(remains & (edge[node] != 0))
+        members = np.sort(np.append(members, node))
+        yield int(node), members
+        remains[members] = False
+        degree -= edge[members].sum(0, dtype=np.int64)
+        degree[members] = 0

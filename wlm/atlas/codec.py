@@ -1,8 +1,9 @@
 """The artifact of an atlas model: both textures in one file.
 
 Parts: `colour` (half [Hp, Wp, 3], uint32 [Hp, Wp] of RGB9E5, or uint8 [B, 16] where T_p is stored as blocks) and, where
-the model has them, `blocks` (uint8 [B, 16], the second texture of "mixed"), `lut` (uint16 [Hc, Wc, 2]) and `uv`
-(float32 [F, 3, 2]).
+the model has them, `blocks` (uint8 [B, 16], the second texture of "mixed"), `tail` (uint8 [B, 16], the mips), `lut`
+(uint16 [Hc, Wc, 2]) and those of `corners`, or in earlier files `uv` (float32 [F, 3, 2]). Each is a zlib stream where
+that is smaller, `streams`.
 """
 
 import math
@@ -14,6 +15,7 @@ from pydantic import Field, JsonValue
 
 from wlm import system
 from wlm.atlas import colour
+from wlm.atlas.corners import PARTS, decode_corners, encode_corners
 from wlm.atlas.model import (
     BLOCK_SIDE,
     BLOCKS,
@@ -23,15 +25,20 @@ from wlm.atlas.model import (
     check_area,
     compression_ratio,
     disk_ratio,
+    tail_blocks,
+    tail_shapes,
     tile_counts,
     unpack_entries,
 )
+from wlm.atlas.streams import deflated, inflated
 from wlm.config import check_settings
 from wlm.formats.artifact import Artifact, read_artifact
 from wlm.formats.parts import Part, check_parts
 from wlm.formats.shared_exponent import pack_rgb9e5, unpack_rgb9e5
 from wlm.system import Header, Name
 from wlm.texels import MOST_SIDE
+
+_MOST_NUMBERS = 1 << 31  # along an axis of a part
 
 _Size = Annotated[list[Annotated[int, Field(ge=1, le=MOST_SIDE)]], Field(min_length=2, max_length=2)]
 
@@ -47,7 +54,7 @@ def encode(model: AtlasModel) -> tuple[dict[str, Any], dict[str, np.ndarray], st
         "profile": model.profile.changes(),
         "report": {name: value for name, value in model.report.items() if name != "seconds"},
     }
-    parts = {"colour": model.texels, "lut": model.lut, "uv": model.uv}
+    parts = {"colour": model.texels, "lut": model.lut, "tail": model.tail} | encode_corners(model.uv)
     if model.colour in colour.BLOCK_CODECS:
         parts["colour"] = model.blocks
     elif model.colour != "half":
@@ -55,7 +62,8 @@ def encode(model: AtlasModel) -> tuple[dict[str, Any], dict[str, np.ndarray], st
     if model.colour == "mixed":
         settings["block_texels"] = list(model.block_texels.shape[:2])
         parts["blocks"] = model.blocks
-    return settings, {name: part for name, part in parts.items() if part.size}, model.source
+    streams, settings["parts"] = deflated({name: part for name, part in parts.items() if part.size})
+    return settings, streams, model.source
 
 
 def decode(artifact: Artifact) -> AtlasModel:
@@ -101,7 +109,7 @@ def describe(path: str | os.PathLike[str]) -> dict[str, Any]:
         "block_size": list(second[::-1]),
         "lut_size": list(lut[::-1]),
         "new_uvs": len(parts["uv"]),
-        "cr": compression_ratio(texels, lut, size, fields["colour"], second),
+        "cr": compression_ratio(texels, lut, size, fields["colour"], second, len(parts["tail"])),
         "cr_disk": disk_ratio(artifact.file_bytes, size),
         "source": artifact.source,
         "parts": {"header": artifact.header_bytes} | artifact.parts,
@@ -124,6 +132,7 @@ class _Header(Header):
     block_texels: _Size | None = None
     profile: Profile
     report: dict[str, JsonValue]
+    parts: dict[str, list[Annotated[int, Field(ge=0, le=_MOST_NUMBERS)]]] = {}
 
 
 def _checked(
@@ -156,10 +165,16 @@ def _checked(
             "cascade": Part(np.uint16, (None, None, 2)),
             "plain": Part(np.uint16, (0, 0, 2)),
         }[header.method],
+        "tail": Part(np.uint8, (sum(tail_blocks(*shape) for shape in tail_shapes(height, width)), 16), optional=True),
         "uv": Part(np.float32, (None, 3, 2), optional=True, least=0.0, most=1.0),
+        **PARTS,
     }
-    parts = check_parts(artifact.tensors, table)
-    lut = parts["lut"]
+    parts = check_parts(inflated(artifact.tensors, header.parts, table), table)
+    lut, corners = parts["lut"], decode_corners({name: parts.pop(name) for name in PARTS})
+    if len(corners):
+        if len(parts["uv"]):
+            raise ValueError("part uv: expected corners in one way, found two")
+        parts["uv"] = corners
     if header.method == "cascade" and not lut.size:
         raise ValueError("part lut is empty")
     if header.method == "tiles":

@@ -78,8 +78,7 @@ def stored(samples: torch.Tensor, weight: torch.Tensor, colour: str) -> torch.Te
     if colour == "bc6h":
         count, ny, nx, _ = samples.shape
         _, decoded = bc6h_blocks(_by_block(samples), _by_block(weight[..., None])[..., 0])
-        cells = decoded.view(count, ny // BLOCK_SIDE, nx // BLOCK_SIDE, BLOCK_SIDE, BLOCK_SIDE, 3)
-        return cells.transpose(2, 3).reshape(count, ny, nx, 3)
+        return _of_blocks(decoded, count, ny, nx)
     count, ny, nx, _ = samples.shape
     _, decoded = encode(samples.cpu().numpy().reshape(count * ny, nx, 3), colour)
     return torch.from_numpy(decoded.reshape(count, ny, nx, 3)).to(samples)
@@ -101,6 +100,12 @@ def _by_block(texels: torch.Tensor) -> torch.Tensor:
     count, ny, nx, channels = texels.shape
     cells = texels.reshape(count, ny // BLOCK_SIDE, BLOCK_SIDE, nx // BLOCK_SIDE, BLOCK_SIDE, channels)
     return cells.transpose(2, 3).reshape(-1, BLOCK_SIDE * BLOCK_SIDE, channels)
+
+
+def _of_blocks(texels: torch.Tensor, count: int, ny: int, nx: int) -> torch.Tensor:
+    """Tiles [T, ny, nx, 3] of blocks [N, 16, 3], `_by_block` turned round."""
+    cells = texels.view(count, ny // BLOCK_SIDE, nx // BLOCK_SIDE, BLOCK_SIDE, BLOCK_SIDE, 3)
+    return cells.transpose(2, 3).reshape(count, ny, nx, 3)
 
 
 def encode(
@@ -135,10 +140,10 @@ def encode(
         weight = np.ones((height, width)) if weight is None else weight
         padded = torch.from_numpy(np.pad(weight, margin).astype(np.float32))[None, ..., None]
         cells = _by_block(torch.from_numpy(light)[None])
-        blocks, _ = bc6h_blocks(cells.to(device), _by_block(padded)[..., 0].to(device))
-        blocks = blocks.cpu().numpy()
-    else:
-        blocks = np.frombuffer(_astc().encode(light.astype(np.float16)), np.uint8).reshape(-1, 16).copy()
+        blocks, decoded = bc6h_blocks(cells.to(device), _by_block(padded)[..., 0].to(device))
+        whole = _of_blocks(decoded, 1, *light.shape[:2])[0, :height, :width]
+        return blocks.cpu().numpy(), whole.cpu().numpy()
+    blocks = np.frombuffer(_astc().encode(light.astype(np.float16)), np.uint8).reshape(-1, 16).copy()
     return blocks, decode(blocks, height, width, codec)
 
 

@@ -108,5 +108,5 @@ def _crossing(start: np.ndarray, end: np.ndarray, y: np.ndarray) -> np.ndarray:
 def _add_spans(change: np.ndarray, row: np.ndarray, first: np.ndarray, stop: np.ndarray) -> None:
     """Adds 1 to the texels first <= column < stop of each row, as differences along the row."""
     flat, stride = change.reshape(-1), change.shape[1]
-    flat += np.bincount(row * stride + first, minlength=flat.size).astype(np.int32)
-    flat -= np.bincount(row * stride + stop, minlength=flat.size).astype(np.int32)
+    np.add.at(flat, row * stride + first, 1)
+    np.subtract.at(flat, row * stride + stop, 1)

@@ -6,11 +6,14 @@ import warp as wp
 
 from wlm import interop
 from wlm.atlas.data import LightmappedMesh
-from wlm.atlas.model import FIRST_BLOCK_CODE, LUT_STEPS, AtlasModel
+from wlm.atlas.mips import Tail
+from wlm.atlas.model import FIRST_BLOCK_CODE, LUT_STEPS, TAIL_OCTAVES, AtlasModel
 from wlm.atlas.views import corner_weights, texel_triangles
 from wlm.errors import WlmError
 from wlm.texels import fill_gaps
 from wlm_kernels.atlas import cascade, decode
+
+_TEXELS_AT_ONCE = 1 << 24
 
 
 class Decoder:
@@ -45,16 +48,26 @@ class Decoder:
             self._texels = wp.array(model.texels.astype(np.float32), dtype=float, device=self.device)
             self._lut = wp.array((lut / np.float32(LUT_STEPS)).astype(np.float32), dtype=float, device=self.device)
         self._corner = torch.tensor(model.uv, device=self.device)
+        self._tail = Tail(model.tail, model.height, model.width, self.device) if len(model.tail) else None
 
-    def read(self, uv: torch.Tensor) -> torch.Tensor:
+    def read(self, uv: torch.Tensor, lod: torch.Tensor | None = None) -> torch.Tensor:
         """Reads light at coordinates, as a shader does.
 
         Args:
             uv: float32 [N, 2] on the decoder's device: the model's new UVs where it has any, else the lightmap's.
+            lod: float32 [N], octaves of the lightmap's texels along a pixel, of a model with mips; None: up close.
 
         Returns:
             float32 [N, 3].
+
+        Raises:
+            ValueError: The model has no mips.
         """
+        if lod is not None:
+            if self._tail is None:
+                raise ValueError("lod: expected a model with mips")
+            near, far = self.read(uv), self._tail.read(uv, lod)
+            return near + (lod - TAIL_OCTAVES + 1).clamp(0.0, 1.0)[:, None] * (far - near)
         uv = uv.contiguous()
         out = torch.empty((len(uv), 3), dtype=torch.float32, device=uv.device)
         if len(uv):
@@ -116,9 +129,12 @@ class Decoder:
             raise WlmError(f"{mesh.name}: expected the mesh and lightmap that the model was made of")
         result = np.zeros((height, width, 3), np.float32)
         if not len(self._corner):
-            row, column = np.nonzero(mesh.mask)
-            uv = np.stack([(column + 0.5) / width, (row + 0.5) / height], 1).astype(np.float32)
-            result[mesh.mask] = self.read(torch.from_numpy(uv).to(self.device)).cpu().numpy()
+            step = max(1, _TEXELS_AT_ONCE // width)
+            for first in range(0, height, step):
+                inside = mesh.mask[first : first + step]
+                row, column = torch.nonzero(torch.from_numpy(inside).to(self.device), as_tuple=True)
+                uv = torch.stack([(column.double() + 0.5) / width, (row.double() + first + 0.5) / height], 1)
+                result[first : first + step][inside] = self.read(uv.float()).cpu().numpy()
             return result
         triangle, barycentric = texel_triangles(mesh, height, width, self.device)
         hit = triangle >= 0

@@ -5,6 +5,7 @@ where that has no larger error.
 """
 
 import os
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -16,8 +17,9 @@ from wlm.atlas import colour
 from wlm.atlas.cascade import fit_cascade, group_triangles
 from wlm.atlas.data import LightmappedMesh
 from wlm.atlas.decode import Decoder
-from wlm.atlas.model import BLOCK_SIDE, BLOCKS, COLOUR_BITS, SOURCE_BITS, AtlasModel, Profile, check_area
-from wlm.atlas.resize import fitting_size, resize
+from wlm.atlas.mips import make_tail
+from wlm.atlas.model import BLOCK_SIDE, BLOCKS, COLOUR_BITS, SOURCE_BITS, AtlasModel, Profile, check_area, tail_bits
+from wlm.atlas.resize import fitting_size, resized
 from wlm.atlas.stages import Stages
 from wlm.atlas.tiles import fit_tiles
 from wlm.atlas.views import corner_weights
@@ -29,6 +31,7 @@ from wlm.ops.raster import texture
 from wlm.system import OnProgress
 from wlm.texels import check_size
 
+_CELLS_AT_ONCE = 1 << 24
 _NO_ROOM = "budget: {:g} of {}x{} texels is less than the smallest tiles and their table take: expected more"
 
 
@@ -67,6 +70,8 @@ def compress(
     device = interop.check_device(device)
     profile = Profile.load(profile).override(overrides)
     check_size(*mesh.mask.shape)
+    if profile.mips and tail_bits(*mesh.mask.shape) >= profile.budget * mesh.mask.size * SOURCE_BITS:
+        raise WlmError(f"budget: {profile.budget:g} is less than mips take: expected more, or no mips")
     stages, grid = Stages(device, progress, checkpoint), FineGrid(mesh, device)
     if profile.method == "cascade":
         model = fit_cascade(mesh, group_triangles(mesh, profile, stages), profile, seed, stages)
@@ -77,6 +82,9 @@ def compress(
             model = _better(grid, model, profile, seed)
     elif model is None:
         raise WlmError(_NO_ROOM.format(profile.budget, *mesh.mask.shape[::-1]))
+    if profile.mips:
+        with stages("mips"):
+            model = replace(model, tail=make_tail(mesh, device))
     check_area(mesh.mask.shape, model.texels.shape[:2], model.lut.shape[:2])
     lost = LostLight()
     lost.add(mesh.lightmap[mesh.mask], Decoder(model, device).lightmap(mesh)[mesh.mask])
@@ -128,7 +136,9 @@ def _better(grid: FineGrid, model: AtlasModel | None, profile: Profile, seed: in
     """
     mesh, device = grid.mesh, grid.device
     height, width = mesh.mask.shape
-    share = profile.budget if model is None else 1.0 - model.compression_ratio
+    # The model has no mips yet.
+    mips = tail_bits(height, width) / (height * width * SOURCE_BITS) if profile.mips else 0.0
+    share = profile.budget - mips if model is None else 1.0 - model.compression_ratio
     format = BLOCKS if profile.colour == "mixed" else profile.colour
     block = BLOCK_SIDE if format in colour.BLOCK_CODECS else 1
     bits = COLOUR_BITS[format]
@@ -137,17 +147,18 @@ def _better(grid: FineGrid, model: AtlasModel | None, profile: Profile, seed: in
         if model is not None:
             return model
         size = 1, 1
-    textures = colour.quantise(resize(mesh.lightmap, mesh.mask, *size), format, device=device)
+    textures = colour.quantise(resized(mesh.filled, mesh.mask, *size, device=device), format, device=device)
     plain = AtlasModel(mesh.name, mesh.source, profile, "plain", format, height, width, **textures)
     if model is None:
         return replace(plain, report={"why plain": "tiles do not fit the budget"})
     # Other views than those of the fit, in which its error is less than elsewhere.
-    points, weight = _cell_centres(grid, weights(grid, profile, seed + 1))
-    target = texture(torch.from_numpy(mesh.filled).to(device), points[0])
-    error, plain_error = (
-        float(((Decoder(each, device)(*points) - target).double().square().sum(1) * weight).sum())
-        for each in (model, plain)
-    )
+    image, decoders = torch.from_numpy(mesh.filled).to(device), [Decoder(each, device) for each in (model, plain)]
+    errors = torch.zeros(2, dtype=torch.float64)
+    for points, weight in _cell_centres(grid, weights(grid, profile, seed + 1)):
+        target = texture(image, points[0])
+        for i, decoder in enumerate(decoders):
+            errors[i] += float(((decoder(*points) - target).double().square().sum(1) * weight).sum())
+    error, plain_error = errors.tolist()
     ratio = {"error against a plain lightmap of as many bits": error / plain_error if plain_error else None}
     if error < plain_error:
         return replace(model, report=model.report | ratio)
@@ -155,19 +166,18 @@ def _better(grid: FineGrid, model: AtlasModel | None, profile: Profile, seed: in
 
 
 def _cell_centres(
-    grid: FineGrid, weight: np.ndarray
-) -> tuple[tuple[torch.Tensor, torch.Tensor, torch.Tensor], torch.Tensor]:
-    """Centres of cells that are in a triangle, as a decoder takes them, and their weights.
+    grid: FineGrid, weight: torch.Tensor
+) -> Iterator[tuple[tuple[torch.Tensor, torch.Tensor, torch.Tensor], torch.Tensor]]:
+    """Centres of cells that are in a triangle, as a decoder takes them, and their weights; some rows at a time.
 
     Where no triangle holds a centre, being too small, the cells with a weight stand for their triangles.
     """
-    triangle, barycentric = grid.triangle
-    hit = triangle >= 0
-    weight = torch.from_numpy(weight).to(grid.device)
-    if not bool(hit.any()):
-        hit = weight > 0
-    row, column = torch.nonzero(hit, as_tuple=True)
-    uv = torch.stack([(column + 0.5) / grid.width, (row + 0.5) / grid.height], 1).float()
-    barycentric, triangle = barycentric[hit], triangle[hit]
-    triangle = torch.where(triangle < 0, int(np.flatnonzero(grid.mesh.active)[0]), triangle)
-    return (uv, triangle, corner_weights(barycentric)), weight[hit]
+    held = bool((grid.triangle[0] >= 0).any())
+    rows = max(1, _CELLS_AT_ONCE // grid.width)
+    pieces = (values.split(rows) for values in (*grid.triangle, weight))
+    for number, (triangle, barycentric, share) in enumerate(zip(*pieces, strict=True)):
+        hit = triangle >= 0 if held else share > 0
+        row, column = torch.nonzero(hit, as_tuple=True)
+        uv = torch.stack([(column + 0.5) / grid.width, (row + number * rows + 0.5) / grid.height], 1).float()
+        triangle = torch.where(triangle < 0, int(np.flatnonzero(grid.mesh.active)[0]), triangle)
+        yield (uv, triangle[hit], corner_weights(barycentric[hit])), share[hit]

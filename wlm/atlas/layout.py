@@ -9,6 +9,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 
 from wlm.atlas.model import (
     BLOCK_SIDE,
@@ -24,7 +25,8 @@ from wlm.atlas.model import (
 from wlm.errors import WlmError
 from wlm.formats.exr import HALF_MAX
 
-_BISECTIONS = 60
+_BISECTIONS, _CLOSE = 60, 1e-6
+_TILES_AT_ONCE = 1 << 16
 _WIDTHS = np.linspace(0.7, 1.5, 17)  # of T_p, over the square root of its number of samples
 # Of "mixed", sides in texels: between 6 and the largest every other one is enough.
 _MIXED_SIDES = (1, 2, 3, 4, 5, 6, 8, 10, 12)
@@ -88,11 +90,11 @@ def sizes_of(profile: Profile) -> list[Size]:
     return [Size(nx, ny, TEXELS) for ny in sides for nx in sides] + of_blocks(BLOCKS, True)
 
 
-def layout(error: np.ndarray, sizes: list[Size], room: float, least: float) -> Layout | None:
+def layout(error: torch.Tensor | np.ndarray, sizes: list[Size], room: float, least: float) -> Layout | None:
     """Allocates sizes whose rectangles fit in textures of a given number of bits, and places them.
 
     Args:
-        error: float64 [sizes, T], `curves`.
+        error: float64 [sizes, T], `curves`, on any device.
         sizes: The sizes.
         room: Most bits of T_p.
         least: Error that a bit must save to be allocated.
@@ -110,19 +112,21 @@ def layout(error: np.ndarray, sizes: list[Size], room: float, least: float) -> L
     budget, fewest = room, error.shape[1] * cost.min()
     while True:
         chosen = allocate(error, cost, budget, least)
-        first, shapes, bits = np.zeros((len(chosen), 2), np.int64), [], 0
+        counts, widths, shapes, bits = np.bincount(chosen, minlength=len(sizes)), [], [], 0
         for texture in textures:
-            members = np.flatnonzero(second[chosen] == texture.second)
-            if len(members):
-                first[members], shape = _packed(sides[chosen[members]], texture.step)
-            else:
-                shape = texture.step, texture.step
+            members = (second == texture.second) & (counts > 0)
+            width, shape = _narrowest(_Kinds.of(sides[members], counts[members]), texture.step)
+            widths.append(width)
             shapes.append(shape)
             most = MOST_SIZE * BLOCK_SIDE if texture.second else MOST_SIZE
             if max(shape) > most:
                 raise WlmError(f"budget: T_p would have {max(shape)} texels along a side; tiles allow {most}")
             bits += math.prod(shape) * COLOUR_BITS[texture.format]
         if bits <= room:
+            first = np.zeros((len(chosen), 2), np.int64)
+            for texture, width in zip(textures, widths, strict=True):
+                members = np.flatnonzero(second[chosen] == texture.second)
+                first[members] = place(sides[chosen[members]], width)[0]
             return Layout(chosen, first, tuple(shapes))
         total = cost[chosen].sum()
         if total <= fewest:
@@ -131,22 +135,24 @@ def layout(error: np.ndarray, sizes: list[Size], room: float, least: float) -> L
         budget = min(budget, total) * min(0.999 * room / bits, 0.99)
 
 
-def _packed(sides: np.ndarray, step: int) -> tuple[np.ndarray, tuple[int, int]]:
-    """Packs rectangles into the smallest of some textures: their first texels, and its rows and columns."""
-    total = sides.prod(1).sum()
+def _narrowest(kinds: "_Kinds", step: int) -> tuple[int, tuple[int, int]]:
+    """Of some widths of shelves the one whose texture is smallest; and the texture's rows and columns."""
+    if not len(kinds.size):
+        return step, (step, step)
+    total = float(kinds.size.prod(1) @ kinds.count)
     best = None
     for share in _WIDTHS:
-        width = max(int(sides[:, 0].max()), -(-round(share * math.sqrt(total)) // step) * step)
-        first, height = place(sides, width)
+        width = max(int(kinds.size[:, 0].max()), -(-round(share * math.sqrt(total)) // step) * step)
+        runs, height = kinds.shelves(width)
         # No shelf may reach as far as the width allows.
-        width = int((first[:, 0] + sides[:, 0]).max())
-        if best is None or width * height < best[0]:
-            best = width * height, first, (height, width)
+        widest = max(run.widest for run in runs)
+        if best is None or widest * height < best[0]:
+            best = widest * height, width, (height, widest)
     return best[1:]
 
 
 def composed(
-    samples: list[tuple[np.ndarray, np.ndarray]],
+    samples: list[tuple[np.ndarray, np.ndarray, np.ndarray]],
     sizes: list[Size],
     layout: Layout,
     index: np.ndarray,
@@ -155,7 +161,8 @@ def composed(
     """The textures and the table.
 
     Args:
-        samples: Of each tile float32 [ny, nx, 3], and the weights of their squared errors [ny, nx].
+        samples: Of some tiles of one size each: their rows in `layout`, int [n], float32 [n, ny, nx, 3], and the
+            weights of their squared errors [n, ny, nx].
         sizes: The sizes.
         layout: Of the tiles.
         index: int64 [T], the tiles' numbers in the grid.
@@ -165,11 +172,11 @@ def composed(
         Of each texture the texels, float32 [H, W, 3], and their weights [H, W]; and T_c.
     """
     textures = [(np.zeros((*shape, 3), np.float32), np.zeros(shape, np.float32)) for shape in layout.shapes]
-    for (values, weight), number, (x, y) in zip(samples, layout.chosen, layout.first.tolist(), strict=True):
-        size = sizes[number]
+    for members, values, weight in samples:
+        size = sizes[layout.chosen[members[0]]]
+        at = texels_of(layout.first[members], size.nx, size.ny)
         texels, weights = textures[size.second]
-        texels[y : y + size.ny, x : x + size.nx] = values
-        weights[y : y + size.ny, x : x + size.nx] = weight
+        texels[at], weights[at] = values, weight
     total = counts[0] * counts[1]
     first, side, second = np.zeros((total, 2), int), np.ones((total, 2), int), np.zeros(total, bool)
     first[index] = layout.first
@@ -179,11 +186,17 @@ def composed(
     return [(texels.clip(max=HALF_MAX), weights) for texels, weights in textures], lut
 
 
-def allocate(error: np.ndarray, cost: np.ndarray, budget: float, least: float) -> np.ndarray:
+def texels_of(first: np.ndarray, nx: int, ny: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rows [n, ny, 1] and columns [n, 1, nx] of the texels of rectangles with first texels (x, y) [n, 2]."""
+    row = first[:, 1, None, None] + np.arange(ny)[:, None]
+    return row, first[:, 0, None, None] + np.arange(nx)
+
+
+def allocate(error: torch.Tensor | np.ndarray, cost: np.ndarray, budget: float, least: float) -> np.ndarray:
     """Chooses the size of each tile for the least total error within a budget.
 
     Args:
-        error: [sizes, T].
+        error: float64 [sizes, T].
         cost: [sizes], bits of each size.
         budget: Bits of all tiles.
         least: Error that a bit must save to be allocated.
@@ -191,21 +204,76 @@ def allocate(error: np.ndarray, cost: np.ndarray, budget: float, least: float) -
     Returns:
         int [T], numbers of sizes. The cheapest of all where even they are over the budget.
     """
+    error = torch.as_tensor(error)
+    bits = torch.from_numpy(np.asarray(cost, np.float64)).to(error.device)
 
-    def best(gain: float) -> np.ndarray:
-        return (error + gain * cost[:, None]).argmin(0)
+    def best(gain: float) -> torch.Tensor:
+        parts = [(each + gain * bits[:, None]).argmin(0) for each in error.split(_TILES_AT_ONCE, 1)]
+        return torch.cat(parts)
 
     chosen = best(least)
-    if cost[chosen].sum() <= budget:
-        return chosen
-    low, high = least, max(least, error.max() + 1e-30)  # at the high end no bit pays
+    if float(bits[chosen].sum()) <= budget:
+        return chosen.cpu().numpy()
+    low, high = least, max(least, float(error.max()) + 1e-30)  # at the high end no bit pays
     for _ in range(_BISECTIONS):
-        middle = np.sqrt(low * high) if low > 0 else high * 1e-6
-        if cost[best(middle)].sum() > budget:
+        middle = math.sqrt(low * high) if low > 0 else high * 1e-6
+        if float(bits[best(middle)].sum()) > budget:
             low = middle
         else:
             high = middle
-    return best(high)
+        if high <= low * (1.0 + _CLOSE):
+            break
+    return best(high).cpu().numpy()
+
+
+@dataclass(frozen=True)
+class _Run:
+    """Where the rectangles of one size are: some beside the last of another size, then whole shelves of them.
+
+    Attributes:
+        beside: How many are beside others, from (x, y) on.
+        x, y: Of the first of these.
+        each: How many are on a shelf of their own, of which the first is at `below`.
+        below: Its y.
+        widest: Where the rightmost ends.
+    """
+
+    beside: int
+    x: int
+    y: int
+    each: int
+    below: int
+    widest: int
+
+
+@dataclass(frozen=True)
+class _Kinds:
+    """The sizes of rectangles, the highest first, and of these the widest; and how many there are of each."""
+
+    size: np.ndarray
+    count: np.ndarray
+
+    @classmethod
+    def of(cls, size: np.ndarray, count: np.ndarray) -> "_Kinds":
+        """Sorts sizes, int [K, 2], all different."""
+        order = np.lexsort((-size[:, 0], -size[:, 1]))
+        return cls(size[order], count[order])
+
+    def shelves(self, width: int) -> tuple[list[_Run], int]:
+        """Where each size goes on shelves of a width, and the height of all."""
+        runs, x, y, height = [], 0, 0, 0
+        for (w, h), count in zip(self.size.tolist(), self.count.tolist(), strict=True):
+            each = width // w
+            beside = min((width - x) // w, count) if height else 0
+            run = _Run(
+                beside, x, y, each, y + height, max(x + w * beside if beside else 0, w * min(each, count - beside))
+            )
+            runs.append(run)
+            x += w * beside
+            if rest := count - beside:
+                y, height = run.below + h * ((rest - 1) // each), h
+                x = w * ((rest - 1) % each + 1)
+        return runs, y + height
 
 
 def place(sizes: np.ndarray, width: int) -> tuple[np.ndarray, int]:
@@ -219,12 +287,18 @@ def place(sizes: np.ndarray, width: int) -> tuple[np.ndarray, int]:
         int64 [R, 2], x and y of each; and the height of all shelves.
     """
     first = np.zeros((len(sizes), 2), np.int64)
-    x = y = height = 0
+    if not len(sizes):
+        return first, 0
     order = np.lexsort((-sizes[:, 0], -sizes[:, 1]))
-    for i, (w, h) in zip(order.tolist(), sizes[order].tolist(), strict=True):
-        if x + w > width:
-            x, y, height = 0, y + height, 0
-        height = height or h
-        first[i] = x, y
-        x += w
-    return first, y + height
+    ordered = sizes[order]
+    starts = np.flatnonzero(np.append(True, (ordered[1:] != ordered[:-1]).any(1)))
+    kinds = _Kinds(ordered[starts], np.diff(np.append(starts, len(sizes))))
+    runs, height = kinds.shelves(width)
+    for run, (w, h), members in zip(runs, kinds.size.tolist(), np.split(order, starts[1:]), strict=True):
+        beside, below = members[: run.beside], members[run.beside :]
+        first[beside, 0] = run.x + w * np.arange(len(beside))
+        first[beside, 1] = run.y
+        shelf, column = np.divmod(np.arange(len(below)), run.each)
+        first[below, 0] = w * column
+        first[below, 1] = run.below + h * shelf
+    return first, height

@@ -46,6 +46,9 @@ SIDE_BITS = 4
 MOST_SIZE = 1 << (16 - SIDE_BITS)
 """Most texels of T_p along an axis for method "tiles"; of the blocks of colour "mixed", most blocks."""
 
+TAIL_OCTAVES = 2
+"""Of mips: how much smaller than the lightmap the tail's first level is, a power of two."""
+
 FIRST_BLOCK_CODE = 12
 """Of colour "mixed": the size's code from which on an entry names blocks, 1 to 4 along an axis, and not texels."""
 
@@ -65,6 +68,7 @@ class Profile(Settings):
         unseen: Weight of what no view shows, as a fraction of the mean weight.
         border: Factor on the weight within a texel of a chart's border: an error there is a seam.
         relative: How much of the weight is of the relative error, 0 to 1; the rest is of the error in linear light.
+        mips: For "tiles": whether there is a tail of smaller levels, `wlm.atlas.mips`; its bits are part of the budget.
         fallback: Whether a plain smaller lightmap of as many bits replaces the result if its error is no larger.
         threshold: lambda of eq. 4; 0 shares no triangles.
         colour_threshold: lambda_h of section 3.2.1.
@@ -91,6 +95,7 @@ class Profile(Settings):
     unseen: float = Field(0.05, gt=0.0, le=1.0)
     border: float = Field(16.0, gt=0.0, le=100.0)
     relative: float = Field(0.0, ge=0.0, le=1.0)
+    mips: bool = False
     fallback: bool = True
     threshold: float = Field(0.03, ge=0.0, le=1.0)
     colour_threshold: float = Field(0.09, ge=0.0, le=2.0)
@@ -110,7 +115,8 @@ class Profile(Settings):
         """Replaces some settings, as `wlm.system.Settings.override`.
 
         Raises:
-            WlmError: Unknown or out of range; or a budget or two textures for the cascade, which has neither.
+            WlmError: Unknown or out of range; or a budget, two textures or mips for the cascade, which has none; or
+                mips beside ASTC.
         """
         if (values.get("method") or self.method) == "cascade":
             if values.get("budget") is not None:
@@ -119,6 +125,10 @@ class Profile(Settings):
                 )
             if (values.get("colour") or self.colour) == "mixed":
                 raise WlmError(f"{prefix}colour: expected half, rgb9e5, bc6h or astc for a cascade, found mixed")
+            if values.get("mips") or self.mips:
+                raise WlmError(f"{prefix}mips: expected a profile of tiles")
+        elif (values.get("mips") or self.mips) and (values.get("colour") or self.colour) == "astc":
+            raise WlmError(f"{prefix}mips: they are of BC6H: expected colour half, rgb9e5, bc6h or mixed, found astc")
         return super().override(values, prefix)
 
 
@@ -143,6 +153,7 @@ class AtlasModel(Model):
         block_texels: half [Hb, Wb, 3], multiples of 4, the second texture of "mixed"; [0, 0, 3] for none.
         lut: uint16 [Hc, Wc, 2], T_c: for "tiles" `pack_entries`' [ty, tx, 2]; for "cascade" coordinates in units of
             1 / `LUT_STEPS`; [0, 0, 2] for "plain".
+        tail: uint8 [B, 16], the mips' blocks of BC6H, level by level; [0, 16] for none.
         uv: float32 [F, 3, 2] in [0, 1], the corners' new UVs; [0, 3, 2] where the mesh keeps its own.
         report: Facts about the compression, for people: "seconds" by stage (not saved, since they differ from run to
             run), groups, why it is plain.
@@ -161,6 +172,7 @@ class AtlasModel(Model):
     blocks: np.ndarray = field(default_factory=lambda: np.empty((0, 16), np.uint8))
     block_texels: np.ndarray = field(default_factory=lambda: np.empty((0, 0, 3), np.float16))
     lut: np.ndarray = field(default_factory=lambda: np.empty((0, 0, 2), np.uint16))
+    tail: np.ndarray = field(default_factory=lambda: np.empty((0, 16), np.uint8))
     uv: np.ndarray = field(default_factory=lambda: np.empty((0, 3, 2), np.float32))
     report: dict[str, Any] = field(default_factory=dict)
 
@@ -168,7 +180,7 @@ class AtlasModel(Model):
     def compression_ratio(self) -> float:
         """CR of eq. 9."""
         textures = (self.texels.shape[:2], self.lut.shape[:2], (self.height, self.width), self.colour)
-        return compression_ratio(*textures, self.block_texels.shape[:2])
+        return compression_ratio(*textures, self.block_texels.shape[:2], len(self.tail))
 
 
 def check_area(size: tuple[int, int], texels: tuple[int, int], lut: tuple[int, int]) -> None:
@@ -198,6 +210,7 @@ def compression_ratio(
     size: tuple[int, int],
     colour: str,
     block_texels: tuple[int, int] = (0, 0),
+    tail: int = 0,
 ) -> float:
     """CR of eq. 9: 1 less the bits of the textures on a GPU over the lightmap's at 48 a texel.
 
@@ -207,13 +220,32 @@ def compression_ratio(
         size: Rows and columns of the lightmap.
         colour: How T_p is stored, as in `Profile`.
         block_texels: Rows and columns of the second texture of "mixed".
+        tail: Blocks of the mips.
     """
     first = TEXELS if colour == "mixed" else colour
     side = BLOCK_SIDE if first in ("bc6h", "astc") else 1
     rows, columns = (-(-count // side) * side for count in texels)
     bits = rows * columns * COLOUR_BITS[first] + lut[0] * lut[1] * LUT_BITS
-    bits += math.prod(block_texels) * COLOUR_BITS[BLOCKS]
+    bits += (math.prod(block_texels) + tail * BLOCK_SIDE**2) * COLOUR_BITS[BLOCKS]
     return 1.0 - bits / (size[0] * size[1] * SOURCE_BITS)
+
+
+def tail_shapes(height: int, width: int) -> list[tuple[int, int]]:
+    """Rows and columns of the mips of a lightmap: a quarter, rounded up, then halves, rounded down, to one texel."""
+    scale = 1 << TAIL_OCTAVES
+    height, width = -(-height // scale), -(-width // scale)
+    levels = max(height, width).bit_length()
+    return [(max(height >> level, 1), max(width >> level, 1)) for level in range(levels)]
+
+
+def tail_blocks(height: int, width: int) -> int:
+    """Blocks of a level of so many rows and columns."""
+    return -(-height // BLOCK_SIDE) * -(-width // BLOCK_SIDE)
+
+
+def tail_bits(height: int, width: int) -> int:
+    """Bits of the mips of a lightmap on a GPU."""
+    return sum(tail_blocks(*shape) for shape in tail_shapes(height, width)) * BLOCK_SIDE**2 * COLOUR_BITS[BLOCKS]
 
 
 def disk_ratio(file_bytes: int, size: tuple[int, int]) -> float:

@@ -1,7 +1,10 @@
 """Lightmaps at a lower resolution, to be read bilinearly."""
 
+import warnings
+
 import numpy as np
 import scipy.sparse as sparse
+import torch
 
 from wlm.formats.exr import HALF_MAX
 from wlm.texels import fill_gaps
@@ -34,7 +37,9 @@ def fitting_size(height: int, width: int, budget: float, block: tuple[int, int],
     return None
 
 
-def resize(lightmap: np.ndarray, mask: np.ndarray, height: int, width: int, filter: str = "fit") -> np.ndarray:
+def resize(
+    lightmap: np.ndarray, mask: np.ndarray, height: int, width: int, filter: str = "fit", device: str = "cpu"
+) -> np.ndarray:
     """Makes a smaller lightmap, to be read bilinearly.
 
     Args:
@@ -43,6 +48,7 @@ def resize(lightmap: np.ndarray, mask: np.ndarray, height: int, width: int, filt
         height, width: 1 to H and 1 to W.
         filter: "bilinear" reads the lightmap at the new texels' centres; "box" averages it over their squares;
             "lanczos" has 3 lobes; "fit" has the least squared error when it is read at the mask's texels.
+        device: "cpu" or "cuda:N".
 
     Returns:
         float64 [height, width, 3] in [0, 65504]; at the lightmap's own size it is the lightmap with its gaps filled.
@@ -54,38 +60,63 @@ def resize(lightmap: np.ndarray, mask: np.ndarray, height: int, width: int, filt
         raise ValueError(f"filter: expected one of {', '.join(FILTERS)}, got {filter!r}")
     if not (1 <= height <= lightmap.shape[0] and 1 <= width <= lightmap.shape[1]):
         raise ValueError(f"size: expected up to {lightmap.shape[:2]}, got {(height, width)}")
-    filled = fill_gaps(lightmap, mask).astype(np.float64)
+    return resized(fill_gaps(lightmap, mask), mask, height, width, filter, device)
+
+
+def resized(
+    filled: np.ndarray, mask: np.ndarray, height: int, width: int, filter: str = "fit", device: str = "cpu"
+) -> np.ndarray:
+    """As `resize`, of a lightmap whose gaps are filled, at an allowed size."""
+    filled = filled.astype(np.float64)
     if (height, width) == mask.shape:
         return filled
     weights = _WEIGHTS["box" if filter == "fit" else filter]
-    # Separable: rows, then columns, with sparse matrices.
-    rows = (weights(height, mask.shape[0]) @ filled.reshape(mask.shape[0], -1)).reshape(height, mask.shape[1], 3)
-    columns = np.ascontiguousarray(rows.swapaxes(0, 1)).reshape(mask.shape[1], -1)
-    small = (weights(width, mask.shape[1]) @ columns).reshape(width, height, 3).swapaxes(0, 1)
+    light = torch.from_numpy(filled).to(device)
+    small = _along(weights(width, mask.shape[1]), _along(weights(height, mask.shape[0]), light))
     if filter == "fit":
-        small = _fit(filled, mask, small)
-    return np.clip(small, 0.0, HALF_MAX)
+        small = _fit(light, torch.from_numpy(mask).to(device), small)
+    return small.clamp(0.0, HALF_MAX).cpu().numpy()
 
 
-def _fit(filled: np.ndarray, mask: np.ndarray, start: np.ndarray) -> np.ndarray:
+def box(image: torch.Tensor, height: int, width: int) -> torch.Tensor:
+    """Means of an image [H, W, C], float64, over the squares of fewer texels: [height, width, C]."""
+    return _along(_box(width, image.shape[1]), _along(_box(height, image.shape[0]), image))
+
+
+def _along(matrix: sparse.csr_matrix, image: torch.Tensor) -> torch.Tensor:
+    """A matrix [new, old] along the first axis of an image [old, N, C], the result turned: [N, new, C]."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # that sparse tensors may change
+        parts = (torch.from_numpy(values) for values in (matrix.indptr, matrix.indices, matrix.data))
+        on_device = torch.sparse_csr_tensor(*parts, matrix.shape, dtype=torch.float64).to(image.device)
+    product = on_device @ image.reshape(len(image), -1)
+    return product.reshape(matrix.shape[0], *image.shape[1:]).transpose(0, 1)
+
+
+def _fit(filled: torch.Tensor, mask: torch.Tensor, start: torch.Tensor) -> torch.Tensor:
     """Minimises the squared error at the mask's texels by conjugate gradients, from an initial [h, w, 3]."""
-    inside = mask.reshape(-1)
-    read = sparse.kron(*(_bilinear(old, new) for old, new in zip(mask.shape, start.shape[:2], strict=True)), "csr")
-    read = read[inside]
-    normal = (read.T @ read + _PULL * sparse.identity(read.shape[1])).tocsr()
-    change = np.zeros((read.shape[1], 3))
-    residual = read.T @ (filled.reshape(-1, 3)[inside] - read @ start.reshape(-1, 3))
-    direction, energy = residual.copy(), (residual * residual).sum(axis=0)
+    rows, columns = (_bilinear(new, old) for new, old in zip(mask.shape, start.shape[:2], strict=True))
+    turned_rows, turned_columns = rows.T.tocsr(), columns.T.tocsr()
+
+    def read(small: torch.Tensor) -> torch.Tensor:
+        return _along(columns, _along(rows, small))
+
+    def gathered(image: torch.Tensor) -> torch.Tensor:
+        return _along(turned_columns, _along(turned_rows, image * mask[..., None]))
+
+    change = torch.zeros_like(start)
+    residual = gathered(filled - read(start))
+    direction, energy = residual.clone(), residual.square().sum((0, 1))
     for _ in range(_ROUNDS):
-        image = normal @ direction
-        curvature = (direction * image).sum(axis=0)
+        image = gathered(read(direction)) + _PULL * direction
+        curvature = (direction * image).sum((0, 1))
         # A channel that is solved already has a curvature of 0.
-        step = np.divide(energy, curvature, out=np.zeros(3), where=curvature > 0.0)
+        step = torch.where(curvature > 0.0, energy / curvature, 0.0)
         change += step * direction
         residual -= step * image
-        before, energy = energy, (residual * residual).sum(axis=0)
-        direction = residual + np.divide(energy, before, out=np.zeros(3), where=before > 0.0) * direction
-    return start + change.reshape(start.shape)
+        before, energy = energy, residual.square().sum((0, 1))
+        direction = residual + torch.where(before > 0.0, energy / before, 0.0) * direction
+    return start + change
 
 
 def _bilinear(new: int, old: int) -> sparse.csr_matrix:

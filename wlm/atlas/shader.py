@@ -1,6 +1,6 @@
 """The GLSL that reads an exported atlas (lightmap-uv-clustering-cascade, eq. 7); `wlm.atlas.exporter` writes it."""
 
-from wlm.atlas.model import BLOCK_SIDE, FIRST_BLOCK_CODE, SIDE_BITS, AtlasModel
+from wlm.atlas.model import BLOCK_SIDE, FIRST_BLOCK_CODE, SIDE_BITS, TAIL_OCTAVES, AtlasModel
 
 _HEAD = """\
 // Light from a compressed lightmap: {what}
@@ -9,7 +9,7 @@ _HEAD = """\
 // {coordinate}: u to the right, v down, (0, 0) at the first row's first texel.
 //
 {textures}
-// They have one mip level. Where WLM_ATLAS_EXACT is defined four texels are fetched and mixed in floats; else the
+// {mips} have one mip level. Where WLM_ATLAS_EXACT is defined four texels are fetched and mixed in floats; else the
 // sampler does that, in one fetch, with the 8 or so bits that a GPU gives to a place between two texels.
 
 #ifndef WLM_ATLAS_COLOUR
@@ -39,13 +39,35 @@ _SECOND = """\
 #endif
 """
 
+_TAIL = """#ifndef WLM_ATLAS_TAIL
+{tail_sampler}
+#define WLM_ATLAS_TAIL wlm_atlas_tail
+#endif
+"""
+
+_GRAD = """
+// Light where a pixel is large: dx and dy are dFdx(uv) and dFdy(uv). Up close it is wlm_atlas(uv).
+vec3 wlm_atlas_grad(vec2 uv, vec2 dx, vec2 dy)
+{{
+    vec2 size = {scale}.0 * vec2(textureSize(WLM_ATLAS_TAIL, 0)); // of the lightmap, in texels
+    float texels = max(length(dx * size), length(dy * size)); // along the pixel
+    // A bilinear read still meets all texels where a pixel is two of them.
+    float share = log2(max(texels, 1.0)) - {octaves}.0;
+    if (share <= 0.0)
+        return wlm_atlas(uv);
+    vec3 far = textureGrad(WLM_ATLAS_TAIL, uv, dx, dy).rgb;
+    return share < 1.0 ? mix(wlm_atlas(uv), far, share) : far;
+}}
+"""
+
 _TEXTURES = {
     "plain": "// colour: the small texture, sampler2D, filter linear, clamped to its edge.",
     "tiles": "// lut: the table of tiles, usampler2D, two unsigned integers an entry, filter nearest.",
     "mixed": "// blocks: the small texture's blocks, sampler2D, filter linear, clamped to its edge.",
+    "tail": "// tail: smaller levels, sampler2D, filter linear, between mips too, clamped to its edge, anisotropic.",
     "cascade": "// lut: the table of coordinates, sampler2D, filter linear, clamped to its edge.",
 }
-"""Textures of each method, and of colour "mixed"; all have that of "plain"."""
+"""Textures of each method, of colour "mixed" and of mips; all have that of "plain"."""
 
 # Coordinates are in texels, so that arithmetic within a tile stays exact.
 _READ = """
@@ -127,11 +149,13 @@ def atlas_glsl(model: AtlasModel) -> str:
         GLSL 3.30, which Vulkan's dialect takes too where the bindings are defined.
     """
     tiles, cascade, mixed = model.method == "tiles", model.method == "cascade", model.colour == "mixed"
-    textures = (_TEXTURES["plain"], *([_TEXTURES["mixed"]] if mixed else []), _TEXTURES[model.method])
+    kinds = ["plain", *(["mixed"] if mixed else []), *(["tail"] if len(model.tail) else []), model.method]
+    textures = [_TEXTURES[kind] for kind in kinds]
     text = _HEAD.format(
         what=_WHAT[model.method],
         coordinate="the new UVs of mesh.glb" if len(model.uv) else "the mesh's own lightmap UVs",
         textures="\n".join(dict.fromkeys(textures)),
+        mips="All but the tail" if len(model.tail) else "They",
         colour_sampler=_SAMPLER.format(upper="COLOUR", lower="colour", kind="sampler2D"),
     )
     if tiles or cascade:
@@ -139,12 +163,15 @@ def atlas_glsl(model: AtlasModel) -> str:
         text += _LUT.format(lut_sampler=_SAMPLER.format(upper="LUT", lower="lut", kind=kind))
     if mixed:
         text += _SECOND.format(block_sampler=_SAMPLER.format(upper="BLOCKS", lower="blocks", kind="sampler2D"))
+    if len(model.tail):
+        text += _TAIL.format(tail_sampler=_SAMPLER.format(upper="TAIL", lower="tail", kind="sampler2D"))
     text += _READ.format(type="vec3", name="colour", image="WLM_ATLAS_COLOUR", channels="rgb")
     if mixed:
         text += _READ.format(type="vec3", name="blocks", image="WLM_ATLAS_BLOCKS", channels="rgb")
+    body = _PLAIN
     if tiles:
         blocks = _BLOCKS.format(code=FIRST_BLOCK_CODE, side=BLOCK_SIDE, last=BLOCK_SIDE - 1) if mixed else ""
-        return text + _TILES.format(
+        body = _TILES.format(
             width=model.width,
             height=model.height,
             tile=model.profile.tile,
@@ -152,6 +179,8 @@ def atlas_glsl(model: AtlasModel) -> str:
             mask=(1 << SIDE_BITS) - 1,
             blocks=blocks,
         )
-    if cascade:
-        return text + _READ.format(type="vec2", name="lut", image="WLM_ATLAS_LUT", channels="xy") + _CASCADE
-    return text + _PLAIN
+    elif cascade:
+        body = _READ.format(type="vec2", name="lut", image="WLM_ATLAS_LUT", channels="xy") + _CASCADE
+    if len(model.tail):
+        body += _GRAD.format(scale=1 << TAIL_OCTAVES, octaves=TAIL_OCTAVES - 1)
+    return text + body

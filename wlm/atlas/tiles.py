@@ -9,6 +9,7 @@ This replaces sections 3.1 to 3.3 of lightmap-uv-clustering-cascade: sharp shado
 to none, within a triangle too, which that paper names as its limit (section 5.1).
 """
 
+import functools
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -17,7 +18,7 @@ import torch
 
 from wlm.atlas import colour
 from wlm.atlas.layout import Size, composed, layout, sizes_of
-from wlm.atlas.model import BLOCKS, LUT_BITS, SOURCE_BITS, TEXELS, AtlasModel, Profile, tile_counts
+from wlm.atlas.model import BLOCKS, LUT_BITS, SOURCE_BITS, TEXELS, AtlasModel, Profile, tail_bits, tile_counts
 from wlm.atlas.stages import Stages
 from wlm.atlas.weights import FineGrid, weights
 from wlm.formats.checkpoint import Checkpoint
@@ -27,7 +28,8 @@ from wlm.system import Meter, OnProgress
 SUPERSAMPLING = 2
 """Points per texel and axis that a tile is fitted to."""
 
-_AT_ONCE = 8192  # tiles
+_AT_ONCE, _AT_ONCE_CUDA = 8192, 65536  # tiles
+_SHARES = tuple((k + 0.5) / SUPERSAMPLING for k in range(SUPERSAMPLING))  # of the second of two texels, at a point
 # Rounds of conjugate gradients, from the unweighted solution: of curves, of those of blocks, and of what is stored.
 _ROUGH, _MEDIUM, _FINE = 3, 10, 24
 # A sample that reaches no point with a weight stays near the unweighted solution.
@@ -74,6 +76,8 @@ def fit_tiles(grid: FineGrid, profile: Profile, seed: int, stages: Stages) -> At
     height, width = mesh.mask.shape
     rows, columns = tile_counts(height, width, profile.tile)
     bits = profile.budget * height * width * SOURCE_BITS
+    if profile.mips:
+        bits -= tail_bits(height, width)
     room = bits - rows * columns * LUT_BITS
     sizes = sizes_of(profile)
     if room < len(tiles.index) * min(size.bits for size in sizes):
@@ -83,7 +87,7 @@ def fit_tiles(grid: FineGrid, profile: Profile, seed: int, stages: Stages) -> At
     with stages("allocate"):
         peak = float(np.ptp(mesh.filled[mesh.mask]))
         least = peak**2 * _LEAST_GAIN / (height * width)
-        packed = layout(error, sizes, room, least)
+        packed = layout(torch.from_numpy(error).to(grid.device), sizes, room, least)
         if packed is None:
             return None
     with stages("solve"):
@@ -108,63 +112,69 @@ def fit_tiles(grid: FineGrid, profile: Profile, seed: int, stages: Stages) -> At
     return AtlasModel(*settings, **textures, lut=lut, report=report)
 
 
-def cut(image: np.ndarray, weight: np.ndarray, size: int, device: str) -> Tiles:
+def cut(image: np.ndarray, weight: torch.Tensor | np.ndarray, size: int, device: str) -> Tiles:
     """Cuts a lightmap into tiles.
 
     Args:
         image: float [H, W, 3], without gaps.
-        weight: float [2 H, 2 W], of each quarter of a texel; at least one is above 0.
+        weight: float64 [2 H, 2 W], of each quarter of a texel; at least one is above 0.
         size: B, texels along a tile.
         device: "cpu" or "cuda:N".
 
     Returns:
         The tiles in which some weight is above 0.
     """
-    height, width = image.shape[:2]
-    rows, columns = tile_counts(height, width, size)
-    light = _between(_between(image, rows * size, 0), columns * size, 1)
-    weight = _folded(_folded(np.asarray(weight, np.float64), rows * size, 0), columns * size, 1)
+    index, share = weighted(torch.as_tensor(weight, device=device), size)
+    columns = tile_counts(*image.shape[:2], size)[1]
+    light = torch.from_numpy(np.ascontiguousarray(image, np.float32)).to(device)
+    parts = [tile_light(patches(light, each, columns, size)) for each in index.split(_AT_ONCE)]
+    return Tiles(index, torch.cat(parts), share, size)
+
+
+def weighted(weight: torch.Tensor, size: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """The tiles that have a weight.
+
+    Args:
+        weight: float64 [2 H, 2 W], of each quarter of a texel; at least one is above 0.
+        size: B, texels along a tile.
+
+    Returns:
+        `index` and `weight` of `Tiles`.
+    """
+    rows, columns = tile_counts(*(side // 2 for side in weight.shape), size)
     m = SUPERSAMPLING * size
-
-    def tiles(values: np.ndarray) -> np.ndarray:
-        cells = values.reshape(rows, m, columns, m, -1).transpose(0, 2, 4, 1, 3)
-        return cells.reshape(rows * columns, -1, m * m)
-
-    def on_device(values: np.ndarray) -> torch.Tensor:
-        return torch.from_numpy(np.ascontiguousarray(values, np.float32)).to(device)
-
-    tile_weight = tiles(weight)[:, 0]
-    index = np.flatnonzero(tile_weight.any(1))
-    return Tiles(
-        torch.from_numpy(index).to(device),
-        on_device(tiles(light)[index]),
-        on_device(tile_weight[index] / weight.sum()),
-        size,
-    )
+    folded = _folded(_folded(weight, rows * m).T, columns * m).T
+    cells = folded.reshape(rows, m, columns, m).transpose(1, 2).reshape(rows * columns, m * m)
+    index = torch.nonzero(cells.any(1))[:, 0]
+    return index, (cells[index] / weight.sum()).float()
 
 
-def _between(image: np.ndarray, texels: int, axis: int) -> np.ndarray:
-    """Bilinear values along an axis at 1/4, 3/4, 5/4 ... texels from the first texel's centre."""
-    place = (np.arange(SUPERSAMPLING * texels) + 0.5) / SUPERSAMPLING
-    last = image.shape[axis] - 1
-    place = place.clip(0, last)
-    first = np.minimum(place.astype(np.int64), max(last - 1, 0))
-    share = np.expand_dims((place - first).astype(np.float32), tuple(i for i in range(image.ndim) if i != axis))
-    near, far = image.take(first, axis), image.take(np.minimum(first + 1, last), axis)
-    return near + share * (far - near)
+def patches(image: torch.Tensor, index: torch.Tensor, columns: int, size: int) -> torch.Tensor:
+    """The texels [T, B + 1, B + 1, ...] of tiles of an image [H, W, ...], its last texels repeated beyond it."""
+    step = torch.arange(size + 1, device=image.device)
+    row = ((index // columns)[:, None] * size + step).clamp(max=image.shape[0] - 1)
+    column = ((index % columns)[:, None] * size + step).clamp(max=image.shape[1] - 1)
+    return image[row[:, :, None], column[:, None, :]]
 
 
-def _folded(weight: np.ndarray, texels: int, axis: int) -> np.ndarray:
-    """Weights along an axis at `_between`'s points; those beyond the outermost texel centres go to these centres."""
-    weight = np.moveaxis(weight, axis, 0)
-    inner = weight[1:-1].copy()
-    if not len(inner):  # a single texel, whose quarters all lie beyond its centre
-        inner = np.zeros((1, *weight.shape[1:]))
-    inner[0] += weight[0]
-    inner[-1] += weight[-1]
-    padded = np.zeros((SUPERSAMPLING * texels, *weight.shape[1:]))
+def tile_light(patch: torch.Tensor) -> torch.Tensor:
+    """Light at the points of tiles, `Tiles.light`, of their texels [T, B + 1, B + 1, 3]."""
+    near, far = patch[:, :-1], patch[:, 1:]
+    down = torch.stack([near + share * (far - near) for share in _SHARES], 2).flatten(1, 2)
+    near, far = down[:, :, :-1], down[:, :, 1:]
+    points = torch.stack([near + share * (far - near) for share in _SHARES], 3).flatten(2, 3)
+    return points.permute(0, 3, 1, 2).flatten(2).contiguous()
+
+
+def _folded(weight: torch.Tensor, points: int) -> torch.Tensor:
+    """Weights [2 H, N] at the points of tiles along the first axis; those beyond the outermost texel centres go to
+    these centres."""
+    padded = weight.new_zeros((points, weight.shape[1]))
+    inner = weight[1:-1]
     padded[: len(inner)] = inner
-    return np.moveaxis(padded, 0, axis)
+    padded[0] += weight[0]
+    padded[max(len(inner), 1) - 1] += weight[-1]
+    return padded
 
 
 def linear(samples: int, points: int, device: str = "cpu") -> torch.Tensor:
@@ -215,6 +225,13 @@ def solve(tiles: Tiles, nx: int, ny: int, rounds: int = _FINE) -> torch.Tensor:
     return (start + change).permute(0, 2, 3, 1)
 
 
+@functools.cache
+def _maps(samples: int, points: int, device: str) -> tuple[torch.Tensor, torch.Tensor]:
+    """`linear`, and the transpose of its pseudoinverse; on GPUs that would take longer than all else."""
+    matrix = linear(samples, points)
+    return matrix.to(device), torch.linalg.pinv(matrix).T.contiguous().to(device)
+
+
 class _Grid:
     """Interpolation from nx x ny samples to the points of tiles, axis by axis; images of points are turned: x, then y.
 
@@ -226,7 +243,9 @@ class _Grid:
     def __init__(self, tiles: Tiles, nx: int, ny: int) -> None:
         self.points = SUPERSAMPLING * tiles.size
         device = str(tiles.light.device)
-        self.across, self.down = (linear(samples, self.points, device) for samples in (nx, ny))
+        (self.across, self._left), (self.down, self._right) = (
+            _maps(samples, self.points, device) for samples in (nx, ny)
+        )
 
     def turned(self, values: torch.Tensor) -> torch.Tensor:
         """Values [T, C, m * m], row by row, as [T, C, m, m], column by column."""
@@ -240,7 +259,7 @@ class _Grid:
         """Values at the points, taken back to the samples [T, C, ny, nx] by the transpose, or the pseudoinverse."""
         across, down = self.across, self.down
         if inverse:
-            across, down = torch.linalg.pinv(across).T, torch.linalg.pinv(down).T
+            across, down = self._left, self._right
         return (values @ down).transpose(2, 3) @ across
 
     def weights(self, weight: torch.Tensor) -> torch.Tensor:
@@ -305,7 +324,7 @@ def curves(
     return result
 
 
-def solved(tiles: Tiles, sizes: list[Size], chosen: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+def solved(tiles: Tiles, sizes: list[Size], chosen: np.ndarray) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Solves for the samples of every tile at its own size.
 
     Args:
@@ -314,9 +333,10 @@ def solved(tiles: Tiles, sizes: list[Size], chosen: np.ndarray) -> list[tuple[np
         chosen: int [T], each tile's number in them.
 
     Returns:
-        For each tile float32 [ny, nx, 3], not negative, and the weights of the samples' squared errors [ny, nx].
+        For some tiles of one size each: their numbers, int [n], samples, float32 [n, ny, nx, 3], not negative, and the
+        weights of the samples' squared errors [n, ny, nx]; all tiles together.
     """
-    result: list[tuple[np.ndarray, np.ndarray]] = [(np.empty(0), np.empty(0))] * len(chosen)
+    result = []
     for number in np.unique(chosen).tolist():
         size, members = sizes[number], np.flatnonzero(chosen == number)
         rows = torch.from_numpy(members).to(tiles.index.device)
@@ -324,12 +344,12 @@ def solved(tiles: Tiles, sizes: list[Size], chosen: np.ndarray) -> list[tuple[np
         for part, piece in _pieces(group):
             values = solve(piece, size.nx, size.ny).clamp(min=0.0).cpu().numpy()
             weight = _Grid(piece, size.nx, size.ny).weights(piece.weight).cpu().numpy()
-            for row, samples in zip(members[part], zip(values, weight, strict=True), strict=True):
-                result[row] = samples
+            result.append((members[part], values, weight))
     return result
 
 
 def _pieces(tiles: Tiles) -> Iterator[tuple[slice, Tiles]]:
-    for first in range(0, len(tiles.index), _AT_ONCE):
-        part = slice(first, first + _AT_ONCE)
+    step = _AT_ONCE if tiles.light.device.type == "cpu" else _AT_ONCE_CUDA
+    for first in range(0, len(tiles.index), step):
+        part = slice(first, first + step)
         yield part, Tiles(tiles.index[part], tiles.light[part], tiles.weight[part], tiles.size)

@@ -63,7 +63,7 @@ def corner_weights(barycentric: torch.Tensor) -> torch.Tensor:
 
 def visibility(
     mesh: LightmappedMesh, views: Sequence[View | Viewpoint], resolution: int, height: int, width: int, device: str
-) -> np.ndarray:
+) -> torch.Tensor:
     """Counts the pixels that show each part of UV space.
 
     Args:
@@ -74,7 +74,8 @@ def visibility(
         device: "cpu" or "cuda:N".
 
     Returns:
-        float64 [height, width], pixels of all views whose UVs lie in each cell; a UV of 1 lies in the last one.
+        float64 [height, width] on the device, pixels of all views whose UVs lie in each cell; a UV of 1 lies in the
+        last one.
 
     Raises:
         WlmError: There is no such device.
@@ -87,8 +88,9 @@ def visibility(
         u, v = uv[visible >= 0].double().T
         column = (u * width).long().clamp(0, width - 1)
         row = (v * height).long().clamp(0, height - 1)
-        count += torch.bincount(row * width + column, minlength=height * width)
-    return count.reshape(height, width).double().cpu().numpy()
+        cell = row * width + column
+        count.index_add_(0, cell, torch.ones_like(cell))
+    return count.reshape(height, width).double()
 
 
 def texel_triangles(mesh: LightmappedMesh, height: int, width: int, device: str) -> tuple[torch.Tensor, torch.Tensor]:

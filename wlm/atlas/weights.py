@@ -4,7 +4,7 @@ from functools import cached_property
 
 import numpy as np
 import torch
-from scipy.ndimage import maximum_filter, minimum_filter
+from torch.nn.functional import max_pool2d
 
 from wlm.atlas.coverage import covered_texels
 from wlm.atlas.data import LightmappedMesh
@@ -18,6 +18,7 @@ _POINTS_AT_ONCE = 1 << 20
 # Relative error is that over the light and this share of what all but a hundredth of the texels stay below: darker
 # light is black on a screen that shows the brighter.
 _DARK, _BRIGHT = 0.05, 99.0
+_SAMPLES = 1 << 22  # texels that this is found of
 
 
 class FineGrid:
@@ -39,55 +40,70 @@ class FineGrid:
         return texel_triangles(self.mesh, self.height, self.width, self.device)
 
     @cached_property
-    def covered(self) -> np.ndarray:
+    def covered(self) -> torch.Tensor:
         """bool [2 H, 2 W], whether a triangle holds the centre, exactly."""
         mesh = self.mesh
-        return covered_texels(mesh.uv, mesh.triangle[mesh.active], self.height, self.width) > 0
+        inside = covered_texels(mesh.uv, mesh.triangle[mesh.active], self.height, self.width) > 0
+        return torch.from_numpy(inside).to(self.device)
 
     @cached_property
-    def border(self) -> np.ndarray:
+    def border(self) -> torch.Tensor:
         """bool [2 H, 2 W], within a texel of a chart's border."""
-        triangle = self.triangle[0].cpu().numpy()
-        chart = np.where(triangle < 0, -1, mesh_charts(self.mesh)[triangle])
-        window = 2 * _BORDER + 1
-        return maximum_filter(chart, window) != minimum_filter(chart, window)
+        triangle = self.triangle[0]
+        chart = torch.from_numpy(mesh_charts(self.mesh)).to(self.device)
+        chart = torch.where(triangle < 0, -1, chart[triangle.clamp(min=0)])
+        # Numbers of charts are whole in float32 up to 2 ** 24.
+        return _largest(chart.float()) != -_largest(-chart.float())
 
     @cached_property
-    def texels(self) -> np.ndarray:
+    def texels(self) -> torch.Tensor:
         """bool [2 H, 2 W], the quarters of the texels of the mask whose own centres a triangle holds."""
         mesh = self.mesh
         inside = covered_texels(mesh.uv, mesh.triangle[mesh.active], *mesh.mask.shape) > 0
-        return np.repeat(np.repeat(inside & mesh.mask, 2, 0), 2, 1)
+        return _quarters(torch.from_numpy(inside & mesh.mask).to(self.device))
 
     @cached_property
-    def relative(self) -> np.ndarray:
+    def relative(self) -> torch.Tensor:
         """float64 [2 H, 2 W], what a squared error of linear light counts as one of relative light, up to a factor."""
         light = self.mesh.filled.mean(2, dtype=np.float64)
-        dark = _DARK * float(np.percentile(light[self.mesh.mask], _BRIGHT))
-        weight = 1.0 / np.square(light + (dark or 1.0))
-        return np.repeat(np.repeat(weight, 2, 0), 2, 1)
+        bright = light[self.mesh.mask]
+        dark = _DARK * float(np.percentile(bright[:: max(1, len(bright) // _SAMPLES)], _BRIGHT))
+        light = torch.from_numpy(light).to(self.device)
+        return _quarters(1.0 / (light + (dark or 1.0)).square())
 
 
-def weights(grid: FineGrid, profile: Profile, seed: int) -> np.ndarray:
+def _quarters(texels: torch.Tensor) -> torch.Tensor:
+    """Each texel as four cells."""
+    return texels.repeat_interleave(2, 0).repeat_interleave(2, 1)
+
+
+def _largest(values: torch.Tensor) -> torch.Tensor:
+    """The largest value within a texel of each cell."""
+    window = 2 * _BORDER + 1
+    across = max_pool2d(values[None, None], (1, window), 1, (0, _BORDER))
+    return max_pool2d(across, (window, 1), 1, (_BORDER, 0))[0, 0]
+
+
+def weights(grid: FineGrid, profile: Profile, seed: int) -> torch.Tensor:
     """How much each cell counts: the pixels that show it in random views, and a little for those that none shows.
 
     Returns:
-        float64 [2 H, 2 W], 0 where there is no triangle; at least one is above 0.
+        float64 [2 H, 2 W] on the grid's device, 0 where there is no triangle; at least one is above 0.
     """
     mesh, height, width = grid.mesh, grid.height, grid.width
     if not profile.views:
-        visible = _areas(mesh, height, width, seed)
+        visible = torch.from_numpy(_areas(mesh, height, width, seed)).double().to(grid.device)
     else:
         visible = _seen(grid, profile.views, seed)
     return spread(grid, visible, profile)
 
 
-def spread(grid: FineGrid, visible: np.ndarray, profile: Profile, mean: float | None = None) -> np.ndarray:
+def spread(grid: FineGrid, visible: torch.Tensor, profile: Profile, mean: float | None = None) -> torch.Tensor:
     """Weights by counts of pixels: those, a little where there are none, and more at borders of charts.
 
     Args:
         grid: The grid.
-        visible: [2 H, 2 W], pixels that show each cell.
+        visible: float64 [2 H, 2 W] on its device, pixels that show each cell.
         profile: `unseen` and `border`.
         mean: Of the pixels of a cell, of which what isn't seen has a fraction; None: this lightmap's.
 
@@ -97,18 +113,18 @@ def spread(grid: FineGrid, visible: np.ndarray, profile: Profile, mean: float | 
     # A texel is read at its centre too, of which a small triangle may hold no quarter's.
     used = grid.covered | grid.texels | (visible > 0)
     if not used.any():  # the mesh is smaller than a cell, and no pixel shows it
-        used = np.repeat(np.repeat(grid.mesh.mask, 2, 0), 2, 1)
+        used = _quarters(torch.from_numpy(grid.mesh.mask).to(grid.device))
     if mean is None:
-        mean = visible[used].mean() or 1.0
-    result = np.where(used, visible + profile.unseen * mean, 0.0)
-    result = np.where(grid.border, profile.border * result, result)
+        mean = float(visible[used].mean()) or 1.0
+    result = torch.where(used, visible + profile.unseen * mean, 0.0)
+    result = torch.where(grid.border, profile.border * result, result)
     if profile.relative:
         share = profile.relative * result.sum() / (result * grid.relative).sum()
         result = result * (1.0 - profile.relative + share * grid.relative)
     return result
 
 
-def _seen(grid: FineGrid, count: int, seed: int) -> np.ndarray:
+def _seen(grid: FineGrid, count: int, seed: int) -> torch.Tensor:
     """Pixels of random views that show each cell, float64 [2 H, 2 W]; views from inside count as much as the others."""
     views = mesh_views(grid.mesh, count, seed)
     around, inside = (

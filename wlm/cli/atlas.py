@@ -62,6 +62,9 @@ def compress(
     colour: Annotated[
         str | None, typer.Option(help="How the colour texture is stored: half, rgb9e5, bc6h, astc or mixed.")
     ] = None,
+    mips: Annotated[
+        bool, typer.Option("--mips", help="Smaller levels beside the tiles, in 1.4% of the lightmap's bits.")
+    ] = False,
     views: Annotated[
         int | None, typer.Option(help="Random views; a texel counts by the pixels that show it. 0: by its area.")
     ] = None,
@@ -79,7 +82,15 @@ def compress(
     from wlm.atlas.model import Profile
 
     if lightmap_path is None or lightmap_path.suffix.lower() == ".json":
-        lone = {"mask": mask, "node": node, "encoding": encoding, "flip": flip, "colour": colour, "resume": resume}
+        lone = {
+            "mask": mask,
+            "node": node,
+            "encoding": encoding,
+            "flip": flip,
+            "colour": colour,
+            "mips": mips,
+            "resume": resume,
+        }
         for name, value in lone.items():
             if value:
                 raise WlmError(f"--{name}: expected with one lightmap alone; of a scene its list says it")
@@ -90,7 +101,9 @@ def compress(
         options = {"seed": seed, "device": device, "trust": trust}
         compress_scene(mesh_path, lightmap_path, output, uv_set=uv_set, profile=profile, overrides=changes, **options)
         return
-    settings = Profile.load(profile).override({"budget": budget, "colour": colour, "views": views}, "--")
+    settings = Profile.load(profile).override(
+        {"budget": budget, "colour": colour, "mips": mips or None, "views": views}, "--"
+    )
     quiet_warp()
     from wlm.atlas.data import load
     from wlm.atlas.exporter import FORMAT, MODEL_FILE, REPORT_FILE, export

@@ -32,9 +32,11 @@ class LostLight:
             reference, decoded: [K, C]; a point's light is the largest magnitude of its channels.
             where: Words for the group in the warning.
         """
-        if not len(reference) or not (largest := np.abs(reference).max()) > 0:
+        if not len(reference):
             return
-        light, kept = (np.abs(values).max(1) for values in (reference, decoded))
+        light, kept = _largest(reference), _largest(decoded)
+        if not (largest := light.max()) > 0:
+            return
         lost = (light >= _BRIGHT * largest) & (kept < _KEPT * light)
         if lost.any():
             self.count += int(np.count_nonzero(lost))
@@ -43,7 +45,7 @@ class LostLight:
                 self.worst = float(light[worst]), float(kept[worst]), where
         if largest > _BRIGHTER * np.median(light):
             lit = light > 0
-            off = np.abs(decoded - reference).max(1)[lit] > _KEPT * light[lit]
+            off = _largest(decoded - reference)[lit] > _KEPT * light[lit]
             if 2 * np.count_nonzero(off) > len(off):
                 self.hidden += int(np.count_nonzero(off))
 
@@ -67,6 +69,14 @@ class LostLight:
                 "PSNR hides it, since others are over ten times as bright"
             )
         return lines
+
+
+def _largest(values: np.ndarray) -> np.ndarray:
+    """The largest magnitude of each row's channels [K]; column by column, which is faster than row by row."""
+    result = np.abs(values[:, 0])
+    for channel in range(1, values.shape[1]):
+        np.maximum(result, np.abs(values[:, channel]), out=result)
+    return result
 
 
 def _count(number: int, point: str) -> str:

@@ -15,7 +15,7 @@ _BLOCK = wp.constant(4)
 
 
 @wp.struct
-class _Axis:
+class Axis:
     """Two texels along an axis, and the weight of the second."""
 
     low: int
@@ -24,7 +24,7 @@ class _Axis:
 
 
 @wp.func
-def _tile_place(u: float, texels: int, size: int, tiles: int) -> wp.vec2:
+def tile_place(u: float, texels: int, size: int, tiles: int) -> wp.vec2:
     """Number of the tile that holds a coordinate, and the place in it from 0 to 1; for NaN tile 0 and NaN."""
     if not (u == u):
         return wp.vec2(0.0, u)
@@ -34,7 +34,7 @@ def _tile_place(u: float, texels: int, size: int, tiles: int) -> wp.vec2:
 
 
 @wp.func
-def _axis(entry: wp.uint16, place: float, first_block_code: int) -> _Axis:
+def axis_at(entry: wp.uint16, place: float, first_block_code: int) -> Axis:
     """The two texels that a place in a tile lies between."""
     first = int(entry) >> SIDE_BITS
     last = int(entry) & _SIDE_MASK
@@ -42,7 +42,7 @@ def _axis(entry: wp.uint16, place: float, first_block_code: int) -> _Axis:
         first = _BLOCK * first
         last = _BLOCK * (last - first_block_code) + _BLOCK - 1
     x = place * float(last)
-    axis = _Axis()
+    axis = Axis()
     below = wp.max(wp.min(int(x), last - 1), 0)
     axis.low = first + below
     axis.high = first + wp.min(below + 1, last)
@@ -51,7 +51,7 @@ def _axis(entry: wp.uint16, place: float, first_block_code: int) -> _Axis:
 
 
 @wp.func
-def _bilinear(texels: wp.array2d[wp.vec3h], x: _Axis, y: _Axis) -> wp.vec3:
+def _bilinear(texels: wp.array2d[wp.vec3h], x: Axis, y: Axis) -> wp.vec3:
     top = wp.lerp(wp.vec3(texels[y.low, x.low]), wp.vec3(texels[y.low, x.high]), x.share)
     bottom = wp.lerp(wp.vec3(texels[y.high, x.low]), wp.vec3(texels[y.high, x.high]), x.share)
     return wp.lerp(top, bottom, y.share)
@@ -74,12 +74,12 @@ def _decode(
     """One point per thread."""
     i = wp.tid()
     u = uv[i]
-    across = _tile_place(u[0], width, size, lut.shape[1])
-    down = _tile_place(u[1], height, size, lut.shape[0])
+    across = tile_place(u[0], width, size, lut.shape[1])
+    down = tile_place(u[1], height, size, lut.shape[0])
     row, column = int(down[0]), int(across[0])
     entry = lut[row, column, 0]
-    x = _axis(entry, across[1], first_block_code)
-    y = _axis(lut[row, column, 1], down[1], first_block_code)
+    x = axis_at(entry, across[1], first_block_code)
+    y = axis_at(lut[row, column, 1], down[1], first_block_code)
     if (int(entry) & _SIDE_MASK) < first_block_code:
         out[i] = _bilinear(texels, x, y)
     else:

@@ -1,7 +1,8 @@
-"""The graph of patches that are alike (lightmap-uv-clustering-cascade, section 3.2), without storing its edges.
+"""The graph of patches that are alike (lightmap-uv-clustering-cascade, section 3.2).
 
 Few pairs need all their samples compared. Bounds of the distance from below and from above (`Bounds`) settle most;
-they are in float32, with a margin larger than its rounding, and so never change a result.
+they are in float32, with a margin larger than its rounding, and so never change a result. Patches are sorted by their
+mean level, which differs by less than lambda where two are alike: those beyond aren't looked at.
 
 Read `tests/reference/patches.py` first (`distances`, `adjacency`, `greedy`): the same with the whole matrix.
 """
@@ -17,7 +18,6 @@ from wlm_kernels.atlas.patches import (
     BINS,
     SIZES,
     Patch,
-    bin_numbers,
     channel,
     distance_sum,
     samples_of,
@@ -206,79 +206,105 @@ def _alike(
 
 
 @wp.kernel(enable_backward=False)
-def _count(
+def _spans(
+    # in:
+    patches: wp.array1d[Patch],
+    bounds: wp.array2d[Bounds],
+    # out:
+    low: wp.array1d[float],
+    high: wp.array1d[float],
+):
+    """One patch per thread: its mean level, summed over the channels, on its own lattice and all larger ones."""
+    i = wp.tid()
+    least = float(wp.inf)
+    most = float(-wp.inf)
+    for level in range(patches[i].level, bounds.shape[1]):
+        moment = bounds[i, level].moment
+        sum = moment[0] + moment[1] + moment[2]
+        mean = sum[0] + sum[1] + sum[2]
+        least = wp.min(least, mean)
+        most = wp.max(most, mean)
+    low[i] = least
+    high[i] = most
+
+
+@wp.kernel(enable_backward=False)
+def _take(
+    # in:
+    patches: wp.array1d[Patch],
+    bounds: wp.array2d[Bounds],
+    index: wp.array1d[int],
+    # out:
+    taken: wp.array1d[Patch],
+    taken_bounds: wp.array2d[Bounds],
+):
+    """One patch per thread."""
+    i = wp.tid()
+    taken[i] = patches[index[i]]
+    for level in range(bounds.shape[1]):
+        taken_bounds[i, level] = bounds[index[i], level]
+
+
+@wp.kernel(enable_backward=False)
+def _edges(
     # in:
     samples: wp.array1d[int],
     patches: wp.array1d[Patch],
     bounds: wp.array2d[Bounds],
     rule: Rule,
-    cell: wp.array1d[int],
-    first: wp.array1d[int],
+    low: wp.array1d[float],
+    high: wp.array1d[float],
     offset: int,
     # out:
-    degree: wp.array1d[int],
+    edge: wp.array2d[wp.uint8],
     compared: wp.array1d[wp.int64],
 ):
-    """One patch per thread; each pair once, counted for both by the thread of the first."""
+    """One patch per thread; each pair once, by the thread of the first."""
     a = offset + wp.tid()
-    colour = patches[a].colour
-    neighbours = int(0)
+    last = high[a] + rule.level + _MARGIN
     count = wp.int64(0)
-    for c in range(cell[a], first.shape[0] - 1):
-        if not _near(rule, colour, patches[first[c]].colour):
-            continue
-        for b in range(wp.max(first[c], a + 1), first[c + 1]):
-            alike = _alike(samples, patches, bounds, rule, a, b)
-            if alike > 1:
-                count += wp.int64(1)
-            if (alike & 1) == 1:
-                neighbours += 1
-                wp.atomic_add(degree, b, 1)
-    wp.atomic_add(degree, a, neighbours)
+    for b in range(a + 1, low.shape[0]):
+        if low[b] > last:
+            break
+        alike = _alike(samples, patches, bounds, rule, a, b)
+        if alike > 1:
+            count += wp.int64(1)
+        if (alike & 1) == 1:
+            edge[a, b] = wp.uint8(1)
+            edge[b, a] = wp.uint8(1)
     compared[a] = count
 
 
 @wp.kernel(enable_backward=False)
-def _mark(
+def _join(
     # in:
     samples: wp.array1d[int],
     patches: wp.array1d[Patch],
     bounds: wp.array2d[Bounds],
     rule: Rule,
+    low: wp.array1d[float],
+    high: wp.array1d[float],
+    reach: float,
     nodes: wp.array1d[int],
-    node: int,
+    offset: int,
+    heads: wp.array1d[int],
+    head_low: wp.array1d[float],
+    rank: wp.array1d[int],
     # out:
-    marked: wp.array1d[wp.uint8],
+    joined: wp.array1d[int],
 ):
     """One node per thread."""
-    i = wp.tid()
+    i = offset + wp.tid()
     a = nodes[i]
-    alike = int(1)  # the node itself is marked too
-    if a != node:
-        alike = _alike(samples, patches, bounds, rule, node, a)
-    marked[i] = wp.uint8(alike & 1)
-
-
-@wp.kernel(enable_backward=False)
-def _remove(
-    # in:
-    samples: wp.array1d[int],
-    patches: wp.array1d[Patch],
-    bounds: wp.array2d[Bounds],
-    rule: Rule,
-    nodes: wp.array1d[int],
-    removed: wp.array1d[int],
-    # out:
-    degree: wp.array1d[int],
-):
-    """One remaining node per thread."""
-    a = nodes[wp.tid()]
-    count = int(0)
-    for i in range(removed.shape[0]):
-        b = removed[i]
-        if (_alike(samples, patches, bounds, rule, a, b) & 1) == 1:
-            count += 1
-    degree[a] -= count
+    margin = rule.level + _MARGIN
+    best = int(rank.shape[0])
+    for k in range(wp.lower_bound(head_low, low[a] - margin - reach), heads.shape[0]):
+        if head_low[k] > high[a] + margin:
+            break
+        if rank[k] < best:
+            if (_alike(samples, patches, bounds, rule, heads[k], a) & 1) == 1:
+                best = rank[k]
+    joined[i] = best
 
 
 def rule(threshold: float, colour_threshold: float, device) -> Rule:
@@ -315,72 +341,88 @@ def bounds(samples, patches, levels: int):
 
 @dataclass(frozen=True)
 class Graph:
-    """The similarity graph (eq. 5). No edge is stored: each is computed from the patches when it is needed.
+    """The similarity graph (eq. 5). Its edges are computed from the patches when they are needed.
 
     Attributes:
         samples: int, samples of all patches.
-        patches: Patch [M], by rising bin of the dominant colour.
+        patches: Patch [M], by rising `low`.
         bounds: Bounds [M, levels].
         rule: Rule.
-        cell: int [M], number of the bin among those that occur.
-        first: int [cells + 1], the first patch of each bin.
+        low, high: float [M], least and largest mean level on any lattice; of two that are alike on any lattice the
+            means differ by less than lambda.
+        means: float32 [M], `low` on the host.
+        reach: The largest difference of the two in any patch.
     """
 
     samples: wp.array
     patches: wp.array
     bounds: wp.array
     rule: Rule
-    cell: wp.array
-    first: wp.array
+    low: wp.array
+    high: wp.array
+    means: np.ndarray
+    reach: float
 
     def _inputs(self) -> list:
         return [self.samples, self.patches, self.bounds, self.rule]
 
 
-def graph(samples, patches, bounds, rule: Rule) -> Graph:
-    """Makes the graph of patches that are sorted by `bin_numbers`."""
-    bins = bin_numbers(patches.numpy()["colour"])
-    _, first, cell = np.unique(bins, return_index=True, return_inverse=True)
-    first = np.append(first, len(bins))
-    device = samples.device
-    cells = [wp.array(values.astype(np.int32), dtype=int, device=device) for values in (cell, first)]
-    return Graph(samples, patches, bounds, rule, *cells)
+def graph(samples, patches, bounds, rule: Rule) -> tuple[Graph, np.ndarray]:
+    """Makes the graph of some patches.
+
+    Returns:
+        The graph, and the number of each of its nodes among the patches, int64 [M].
+    """
+    count, device = patches.shape[0], samples.device
+    low, high = (wp.empty(count, dtype=float, device=device) for _ in range(2))
+    wp.launch(_spans, count, inputs=[patches, bounds], outputs=[low, high], device=device)
+    least, most = low.numpy(), high.numpy()
+    order = np.argsort(least, kind="stable")
+    spans = [wp.array(values[order], dtype=float, device=device) for values in (least, most)]
+    reach = float((most - least).max(initial=0.0))
+    return Graph(samples, *_taken(patches, bounds, order), rule, *spans, least[order], reach), order
 
 
-def count_neighbours(graph: Graph, begin: int, end: int, degree, compared) -> None:
-    """Adds the edges between patches `begin` to `end` - 1 and any later one to the degrees of both.
+def part(whole: Graph, nodes: np.ndarray) -> Graph:
+    """The graph of some of its nodes, int [N], ascending."""
+    spans = [wp.array(values.numpy()[nodes], dtype=float, device=values.device) for values in (whole.low, whole.high)]
+    taken = _taken(whole.patches, whole.bounds, nodes)
+    return Graph(whole.samples, *taken, whole.rule, *spans, whole.means[nodes], whole.reach)
+
+
+def _taken(patches, bounds, nodes: np.ndarray) -> tuple[wp.array, wp.array]:
+    device = patches.device
+    out = wp.empty(len(nodes), dtype=Patch, device=device)
+    out_bounds = wp.empty((len(nodes), bounds.shape[1]), dtype=Bounds, device=device)
+    index = wp.array(nodes.astype(np.int32), dtype=int, device=device)
+    wp.launch(_take, len(nodes), inputs=[patches, bounds, index], outputs=[out, out_bounds], device=device)
+    return out, out_bounds
+
+
+def find_edges(graph: Graph, begin: int, end: int, edge, compared) -> None:
+    """Finds the edges between patches `begin` to `end` - 1 and any later one.
 
     Args:
         graph: The graph.
         begin, end: The range.
-        degree: int [M], added to.
+        edge: uint8 [M, M], 0; set to 1 in both places of an edge.
         compared: int64 [M], written in the range: pairs that the bounds did not settle.
     """
-    inputs = [*graph._inputs(), graph.cell, graph.first, begin]
-    wp.launch(_count, end - begin, inputs=inputs, outputs=[degree, compared], device=degree.device)
+    inputs = [*graph._inputs(), graph.low, graph.high, begin]
+    wp.launch(_edges, end - begin, inputs=inputs, outputs=[edge, compared], device=edge.device)
 
 
-def mark_neighbours(graph: Graph, nodes, node: int, marked) -> None:
-    """Marks a patch and its neighbours.
-
-    Args:
-        graph: The graph.
-        nodes: int [L], the patches to look at.
-        node: The patch.
-        marked: uint8 [L], written: 1 for `node` and its neighbours, else 0.
-    """
-    inputs = [*graph._inputs(), nodes, node]
-    wp.launch(_mark, nodes.shape, inputs=inputs, outputs=[marked], device=nodes.device)
-
-
-def remove_neighbours(graph: Graph, nodes, removed, degree) -> None:
-    """Subtracts the edges to removed patches from the degrees of the remaining ones.
+def join(graph: Graph, nodes, begin: int, end: int, heads, head_low, rank, joined) -> None:
+    """Finds for some nodes the first of the heads that they are like.
 
     Args:
         graph: The graph.
-        nodes: int [L], the remaining patches.
-        removed: int [G], the removed ones.
-        degree: int [M], subtracted from.
+        nodes: int [N].
+        begin, end: The range of them.
+        heads: int [H], nodes, ascending.
+        head_low: float [H], their `low`.
+        rank: int [H], the order in which they are asked.
+        joined: int [N], written in the range: the rank of the head, H for none.
     """
-    inputs = [*graph._inputs(), nodes, removed]
-    wp.launch(_remove, nodes.shape, inputs=inputs, outputs=[degree], device=nodes.device)
+    inputs = [*graph._inputs(), graph.low, graph.high, graph.reach, nodes, begin, heads, head_low, rank]
+    wp.launch(_join, end - begin, inputs=inputs, outputs=[joined], device=joined.device)

@@ -36,10 +36,9 @@ SIZES = (2, 3, 5, 9, 17, 33, 65, 129)
 BINS = 32
 """Bins of the histogram per channel (section 3.2.1)."""
 
-_AT_ONCE = 1 << 22  # samples whose bins are sorted in one call
-
 _LEVELS = wp.constant(255)
 _BIN_SHIFT = wp.constant(3)  # 256 levels in 32 bins
+_BEYOND = wp.constant(BINS**3)
 
 # Divisor from 16 bits, under weights that add up to 256 * 256, to 8 bits.
 _TO_BYTE = wp.constant(wp.int64(65536 * 257))
@@ -160,45 +159,35 @@ def _bin(colour: int) -> int:
 
 
 @wp.kernel(enable_backward=False)
-def _bins(
+def _dominant(
     # in:
     samples: wp.array1d[int],
-    first: int,
-    # out:
-    keys: wp.array1d[int],
-    items: wp.array1d[int],
-):
-    """One sample per thread."""
-    i = wp.tid()
-    keys[i] = _bin(samples[first + i])
-    items[i] = i
-
-
-@wp.kernel(enable_backward=False)
-def _commonest(
-    # in:
-    keys: wp.array1d[int],
-    start: wp.array1d[int],
-    first: int,
     # out:
     patches: wp.array1d[Patch],
 ):
-    """One patch per thread: the bin of the longest run among its sorted bins, the lowest of equals."""
+    """One patch per thread: a pass over its samples for each of its few bins, in rising order."""
     t = wp.tid()
+    p = patches[t]
+    size = size_of(p.level)
+    stop = p.start + size * (size + 1) // 2
     best = int(0)
-    longest = int(0)
-    run = int(0)
-    before = int(-1)
-    for i in range(start[t], start[t + 1]):
-        key = keys[i]
-        run = wp.where(key == before, run + 1, 1)
-        before = key
-        if run > longest:
-            longest = run
+    most = int(0)
+    key = int(-1)  # before the first
+    while key < _BEYOND:
+        after = int(_BEYOND)
+        count = int(0)
+        for i in range(p.start, stop):
+            other = _bin(samples[i])
+            if other == key:
+                count += 1
+            elif other > key and other < after:
+                after = other
+        if count > most:
+            most = count
             best = key
-    p = patches[first + t]
+        key = after
     p.colour = (best >> 10) + (((best >> 5) & 31) << 8) + ((best & 31) << 16)
-    patches[first + t] = p
+    patches[t] = p
 
 
 @wp.func
@@ -334,11 +323,6 @@ def _compare(
     distance[t] = wp.float64(limit) / wp.float64(levels)
 
 
-def _starts(level: np.ndarray) -> np.ndarray:
-    """First sample of each patch, then the number of all samples, int64 [F + 1]."""
-    return np.concatenate([[0], np.cumsum(samples_of(np.array(SIZES, np.int64))[level])])
-
-
 def sample(lightmap: np.ndarray, corner: np.ndarray, level: np.ndarray, device) -> tuple:
     """Samples the patches of triangles (section 3.1).
 
@@ -355,7 +339,7 @@ def sample(lightmap: np.ndarray, corner: np.ndarray, level: np.ndarray, device) 
     Raises:
         ValueError: More samples than 32 bits count.
     """
-    start = _starts(level)
+    start = np.concatenate([[0], np.cumsum(samples_of(np.array(SIZES, np.int64))[level])])
     if start[-1] > np.iinfo(np.int32).max:
         raise ValueError(f"level: {start[-1]} samples, expected at most {np.iinfo(np.int32).max}")
     samples = wp.empty(int(start[-1]), dtype=int, device=device)
@@ -371,32 +355,13 @@ def sample(lightmap: np.ndarray, corner: np.ndarray, level: np.ndarray, device) 
     return samples, patches, bright
 
 
-def dominant(samples, patches, level: np.ndarray) -> None:
+def dominant(samples, patches) -> None:
     """Finds the dominant colours, the commonest of 32 x 32 x 32 bins and the lowest of equals (section 3.2.1).
-
-    A limited number of samples is sorted at once, so that sorting takes little memory.
 
     Args:
         samples, patches: As of `sample`; the latter's `colour` is written.
-        level: int32 [F], as passed to `sample`.
     """
-    device = samples.device
-    start = _starts(level)
-    begin = 0
-    while begin < len(level):
-        end = max(int(np.searchsorted(start, start[begin] + _AT_ONCE, "right")) - 1, begin + 1)
-        count = int(start[end] - start[begin])
-        keys, items = (wp.empty(2 * count, dtype=int, device=device) for _ in range(2))
-        local = wp.array((start[begin : end + 1] - start[begin]).astype(np.int32), dtype=int, device=device)
-        wp.launch(_bins, count, inputs=[samples, int(start[begin])], outputs=[keys, items], device=device)
-        wp.utils.segmented_sort_pairs(keys, items, count, local)
-        wp.launch(_commonest, end - begin, inputs=[keys, local, begin], outputs=[patches], device=device)
-        begin = end
-
-
-def bin_numbers(colour: np.ndarray) -> np.ndarray:
-    """Numbers of packed bins, the order of the graph's nodes: red in the highest bits."""
-    return ((colour & 255) << 10) | ((colour >> 8 & 255) << 5) | (colour >> 16 & 255)
+    wp.launch(_dominant, patches.shape, inputs=[samples], outputs=[patches], device=samples.device)
 
 
 def compare(samples, patches, member, representative) -> tuple[np.ndarray, np.ndarray]:

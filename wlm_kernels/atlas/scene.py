@@ -8,49 +8,16 @@ Read `wlm/atlas/scene/exact.py` first: the same in float64 NumPy.
 
 import warp as wp
 
+from wlm_kernels.atlas.decode import Axis, axis_at, tile_place
 from wlm_kernels.shared_exponent import unpack_rgb9e5
 
 wp.set_module_options({"enable_backward": False})
 
-_SIDE_BITS = wp.constant(4)
-_SIDE_MASK = wp.constant(15)
-
-
-@wp.struct
-class _Axis:
-    """Two texels along an axis, and the weight of the second."""
-
-    low: int
-    high: int
-    share: float
+_NO_BLOCKS = wp.constant(16)  # more than any size's code: no entry names blocks
 
 
 @wp.func
-def _tile_place(u: float, texels: int, size: int, tiles: int) -> wp.vec2:
-    """Number of the tile that holds a coordinate, and the place in it from 0 to 1; for NaN tile 0 and NaN."""
-    if not (u == u):
-        return wp.vec2(0.0, u)
-    x = wp.clamp(u * float(texels) - 0.5, 0.0, float(texels - 1)) / float(size)
-    tile = wp.min(wp.floor(x), float(tiles - 1))
-    return wp.vec2(tile, x - tile)
-
-
-@wp.func
-def _axis(entry: wp.uint16, place: float) -> _Axis:
-    """The two texels that a place in a tile lies between."""
-    first = int(entry) >> _SIDE_BITS
-    last = int(entry) & _SIDE_MASK
-    x = place * float(last)
-    axis = _Axis()
-    below = wp.max(wp.min(int(x), last - 1), 0)
-    axis.low = first + below
-    axis.high = first + wp.min(below + 1, last)
-    axis.share = x - float(below)
-    return axis
-
-
-@wp.func
-def _mixed(texels: wp.array3d[wp.uint32], layer: int, row: int, x: _Axis) -> wp.vec3:
+def _mixed(texels: wp.array3d[wp.uint32], layer: int, row: int, x: Axis) -> wp.vec3:
     """The light of a row between two texels."""
     return wp.lerp(unpack_rgb9e5(texels[layer, row, x.low]), unpack_rgb9e5(texels[layer, row, x.high]), x.share)
 
@@ -72,12 +39,12 @@ def _read(
     i = wp.tid()
     u = uv[i]
     s = sheet[i]
-    down = _tile_place(u[1], sheets[s, 0], size, sheets[s, 4])
-    across = _tile_place(u[0], sheets[s, 1], size, sheets[s, 5])
+    down = tile_place(u[1], sheets[s, 0], size, sheets[s, 4])
+    across = tile_place(u[0], sheets[s, 1], size, sheets[s, 5])
     row = sheets[s, 2] + int(down[0])
     column = sheets[s, 3] + int(across[0])
-    x = _axis(lut[row, column, 0], across[1])
-    y = _axis(lut[row, column, 1], down[1])
+    x = axis_at(lut[row, column, 0], across[1], _NO_BLOCKS)
+    y = axis_at(lut[row, column, 1], down[1], _NO_BLOCKS)
     total = wp.vec3(0.0, 0.0, 0.0)
     count = factor.shape[0]
     for k in range(count):

@@ -1,22 +1,24 @@
 """The artifact of a scene's model: one file.
 
 Parts: `colour` (uint32 [pages K, Hp, Wp], RGB9E5), `lut` (uint16 [Hc, Wc, 2]), `factor` (float32 [M, K, 3]) and
-`sheets` (int32 [S, 7], `SceneModel.table`).
+`sheets` (int32 [S, 7], `SceneModel.table`); each a zlib stream where that is smaller, `wlm.atlas.streams`.
 """
 
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
-from pydantic import JsonValue
+from pydantic import Field, JsonValue
 
 from wlm.atlas.model import MOST_SIZE, TEXELS, check_area, tile_counts, unpack_entries
 from wlm.atlas.scene.model import SceneModel, SceneProfile, SheetPlace
+from wlm.atlas.streams import deflated, inflated
 from wlm.config import check_settings
 from wlm.formats.artifact import Artifact
 from wlm.formats.parts import Part, check_parts
 from wlm.system import Header, Name
 
 _MOST_COMPONENTS = 64
+_MOST_NUMBERS = 1 << 31  # along an axis of a part
 
 
 def encode(model: SceneModel) -> tuple[dict[str, Any], dict[str, np.ndarray], str]:
@@ -29,7 +31,8 @@ def encode(model: SceneModel) -> tuple[dict[str, Any], dict[str, np.ndarray], st
         "report": {name: value for name, value in model.report.items() if name != "seconds"},
     }
     parts = {"colour": model.texels, "lut": model.lut, "factor": model.factor, "sheets": model.table()}
-    return settings, parts, model.source
+    streams, settings["parts"] = deflated(parts)
+    return settings, streams, model.source
 
 
 class _Header(Header):
@@ -38,6 +41,7 @@ class _Header(Header):
     sheets: list[Name]
     profile: SceneProfile
     report: dict[str, JsonValue]
+    parts: dict[str, list[Annotated[int, Field(ge=0, le=_MOST_NUMBERS)]]] = {}
 
 
 def decode(artifact: Artifact) -> SceneModel:
@@ -54,7 +58,7 @@ def decode(artifact: Artifact) -> SceneModel:
         "factor": Part(np.float32, (len(header.states), None, 3), least=0.0),
         "sheets": Part(np.int32, (len(header.sheets), 7), least=0),
     }
-    parts = check_parts(artifact.tensors, table)
+    parts = check_parts(inflated(artifact.tensors, header.parts, table), table)
     texels, lut, factor, sheets = (parts[name] for name in table)
     if not (texels.size and lut.size and factor.size and len(sheets)):
         raise ValueError("a part is empty")

@@ -136,33 +136,39 @@ def compare_scene(
     seen, inside = [], []
     for camera, (_, sheet, uv) in zip(cameras, seen_points(scene, cameras, resolution, device), strict=True):
         if len(sheet):
-            seen.append((sheet, uv, torch.stack([_read(images, sheet, uv, state) for state in states])))
+            seen.append((sheet, uv))
             inside.append(isinstance(camera, Viewpoint))
         if meter.due(len(seen)):
             meter.report(len(seen))
     if not seen:
         raise WlmError(f"{scene.name}: cannot be scored: no camera around it or inside sees a lightmap")
-    peaks = [_peak([light[state] for _, _, light in seen]) for state in states]
+    peaks, psnrs, texels = [], {name: [] for name in decoders}, {name: [] for name in decoders}
+    for state in states:  # the light of one at a time
+        lights = [_read(images, sheet, uv, state) for sheet, uv in seen]
+        peak = _peak(lights)
+        peaks.append(peak)
+        for name, decoder in decoders.items():
+            psnrs[name].append(
+                [
+                    psnr_from_mse(_mse(decoder(uv, sheet, state), light, scene.name, name), peak)
+                    for (sheet, uv), light in zip(seen, lights, strict=True)
+                ]
+            )
+            texels[name].append(psnr_from_mse(_texel_mse(scene, images, decoder, state, name), peak))
     height = scene.indoors().height if any(inside) else math.nan
     facts = {"name": scene.name, "views": len(seen), "inside_views": sum(inside), "eye_height": height}
-    result = {}
-    for name, decoder in decoders.items():
-        mse = [
-            [_mse(decoder(uv, sheet, state), light[state], scene.name, name) for state in states]
-            for sheet, uv, light in seen
-        ]
-        psnr = np.array([[psnr_from_mse(value, peak) for value, peak in zip(row, peaks, strict=True)] for row in mse])
-        kinds = np.array(inside)
-        texel = [_texel_mse(scene, images, decoder, m, name) for m in states]
+    result, kinds = {}, np.array(inside)
+    for name in decoders:
+        psnr = np.array(psnrs[name])  # [M, views]
         result[name] = SceneScore(
             **facts,
             psnr=_mean(psnr),
-            around_psnr=_mean(psnr[~kinds]),
-            inside_psnr=_mean(psnr[kinds]),
+            around_psnr=_mean(psnr[:, ~kinds]),
+            inside_psnr=_mean(psnr[:, kinds]),
             psnr_worst=float(np.nanmin(psnr)) if np.isfinite(psnr).any() else math.nan,
-            psnr_by_state=tuple(_mean(psnr[:, m]) for m in states),
+            psnr_by_state=tuple(_mean(row) for row in psnr),
             peaks=tuple(peaks),
-            texel_psnr=_mean(np.array([psnr_from_mse(t, p) for t, p in zip(texel, peaks, strict=True)])),
+            texel_psnr=_mean(np.array(texels[name])),
         )
     return result
 

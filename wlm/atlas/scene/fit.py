@@ -19,14 +19,14 @@ import numpy as np
 import torch
 
 from wlm import interop
-from wlm.atlas.layout import Size, allocate, place
+from wlm.atlas.layout import Size, allocate, place, texels_of
 from wlm.atlas.model import LUT_BITS, MOST_SIZE, TEXELS, pack_entries, tile_counts
 from wlm.atlas.scene.data import LightmappedScene
 from wlm.atlas.scene.mixture import components, factorise
 from wlm.atlas.scene.model import FACTOR_BITS, TEXEL_BITS, SceneModel, SceneProfile, SheetPlace
 from wlm.atlas.scene.seen import scene_weights
 from wlm.atlas.stages import Stages, one_thread
-from wlm.atlas.tiles import Tiles, cut, errors, solve, solved
+from wlm.atlas.tiles import Tiles, cut, errors, patches, solve, solved, tile_light, weighted
 from wlm.errors import WlmError
 from wlm.formats.shared_exponent import pack_rgb9e5
 from wlm.system import Meter, OnProgress
@@ -54,10 +54,6 @@ class _SceneTiles:
 
     component: list[Tiles]
     sheet: np.ndarray
-
-    def every(self, step: int) -> "_SceneTiles":
-        """Every n-th tile."""
-        return _SceneTiles([_part(each, slice(None, None, step)) for each in self.component], self.sheet[::step])
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,16 +212,17 @@ def _choose(
         return counts[0], {}
     sizes, tried = _sizes(profile), {}
     best, least = counts[0], math.inf
+    texels, few_weight, part = _few(scene, weights, peak, profile.tile)
+    share = float(few_weight.double().sum())
     for count in counts:
         factor = factorise(np.sqrt(weight)[:, None] * light, count)
         rest = np.einsum("mkc,knc->mnc", factor, components(light, factor)) - light
         lost = float(np.square(rest).mean(axis=(0, 2)) @ weight) / len(weight)
-        tiles = _tiles(_parts(scene, factor, peak), weights, profile.tile, stages.device)
-        few = tiles.every(max(1, len(tiles.sheet) // _TRIED))
+        patch = components(texels.reshape(states, -1, 3), factor).reshape(count, *texels.shape[1:])
+        few = _few_tiles(patch, few_weight, profile.tile, stages.device)
         error = _curves(few, sizes, factor, Stages(stages.device))
-        room = _room(scene, profile, layout, count) * len(few.sheet) / len(tiles.sheet)
+        room = _room(scene, profile, layout, count) * part
         number = allocate(error, np.array(sizes).prod(1).astype(float), room, 0.0)
-        share = float(few.component[0].weight.double().sum() / tiles.component[0].weight.double().sum())
         left = lost + float(error[number, np.arange(len(number))].sum()) / max(share, 1e-9)
         tried[str(count)] = left
         if left < least:
@@ -233,6 +230,40 @@ def _choose(
         elif left > 1.5 * least:
             break
     return best, tried
+
+
+def _few(
+    scene: LightmappedScene, weights: list[np.ndarray], peak: np.ndarray, tile: int
+) -> tuple[np.ndarray, torch.Tensor, float]:
+    """About `_TRIED` of the tiles of all sheets, evenly.
+
+    Returns:
+        The light of their texels over its peak, float32 [M, T, B + 1, B + 1, 3]; their points' weights, float [T, P],
+        as fractions of the whole scene's; and their number as a fraction of all.
+    """
+    total = sum(float(each.sum()) for each in weights)
+    cuts = [weighted(torch.from_numpy(each), tile) if each.any() else None for each in weights]
+    count = sum(len(each[0]) for each in cuts if each)
+    step, begin, texels, shares = max(1, count // _TRIED), 0, [], []
+    for sheet, weight, each in zip(scene.sheets, weights, cuts, strict=True):
+        if each is None:
+            continue
+        index, share = (values[-begin % step :: step] for values in each)
+        begin += len(each[0])
+        columns = tile_counts(*sheet.mesh.mask.shape, tile)[1]
+        # Texels first, then states.
+        frames = torch.from_numpy(sheet.frames).permute(1, 2, 0, 3)
+        texels.append(patches(frames, index, columns, tile).permute(3, 0, 1, 2, 4).numpy())
+        shares.append(share * (float(weight.sum()) / total))
+    light = np.concatenate(texels, 1) / peak[:, None, None, None, None].astype(np.float32)
+    return light, torch.cat(shares), len(light[0]) / count
+
+
+def _few_tiles(patch: np.ndarray, weight: torch.Tensor, tile: int, device: str) -> _SceneTiles:
+    """Tiles of the components' texels, float32 [K, T, B + 1, B + 1, 3]."""
+    index, weight = torch.arange(len(weight), device=device), weight.to(device)
+    light = [tile_light(torch.from_numpy(each).to(device)) for each in patch]
+    return _SceneTiles([Tiles(index, each, weight, tile) for each in light], np.zeros(len(weight), int))
 
 
 def _tile_weight(weight: np.ndarray, tile: int) -> np.ndarray:
@@ -278,10 +309,6 @@ def _tiles(parts: list[np.ndarray], weights: list[np.ndarray], tile: int, device
     weight = torch.cat([each[0].weight * share for each, share in zip(cuts, shares, strict=True) if each])
     light = [torch.cat([each[k].light for each in cuts if each]) for k in range(len(parts[0]))]
     return _SceneTiles([Tiles(index, each, weight, tile) for each in light], sheet)
-
-
-def _part(tiles: Tiles, rows: slice) -> Tiles:
-    return Tiles(tiles.index[rows], tiles.light[rows], tiles.weight[rows], tiles.size)
 
 
 def _sizes(profile: SceneProfile) -> list[tuple[int, int]]:
@@ -379,9 +406,9 @@ def _texels(
     sides, chosen = np.unique(size, axis=0, return_inverse=True)
     sizes = [Size(nx, ny, TEXELS) for nx, ny in sides.tolist()]
     for k, each in enumerate(tiles.component):
-        samples = solved(each, sizes, chosen.ravel())
-        for (values, _), (x, y), (nx, ny), number in zip(samples, first, size, page, strict=True):
-            light[number, k, y : y + ny, x : x + nx] = values
+        for members, values, _ in solved(each, sizes, chosen.ravel()):
+            row, column = texels_of(first[members], values.shape[2], values.shape[1])
+            light[page[members, None, None], k, row, column] = values
     largest = light.max(axis=(0, 2, 3)).astype(np.float64)
     scale = np.divide(_BRIGHT, largest, out=np.ones_like(largest), where=largest > 0)
     return pack_rgb9e5(light * scale[None, :, None, None].astype(np.float32)).reshape(-1, *shape), scale

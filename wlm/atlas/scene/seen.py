@@ -81,12 +81,13 @@ def scene_weights(scene: LightmappedScene, profile: SceneProfile, seed: int, dev
     cells = sum(int(each.sum()) for each in used)
     mean = sum(float(count[each].sum()) for count, each in zip(visible, used, strict=True)) / max(cells, 1)
     settings = Profile(name="", unseen=profile.unseen, border=profile.border)
-    return [spread(grid, count, settings, mean or 1.0) for grid, count in zip(grids, visible, strict=True)]
+    spreads = (spread(grid, count, settings, mean or 1.0) for grid, count in zip(grids, visible, strict=True))
+    return [each.cpu().numpy() for each in spreads]
 
 
 def _counts(
     scene: LightmappedScene, grids: Sequence[FineGrid], views: Sequence[View | Viewpoint], device: str
-) -> list[np.ndarray]:
+) -> list[torch.Tensor]:
     """Pixels that show each cell of each sheet."""
     sizes = [(grid.height, grid.width) for grid in grids]
     first = np.cumsum([0, *(height * width for height, width in sizes)])
@@ -96,6 +97,7 @@ def _counts(
         height, width, start = place[sheet.long()].T
         column = torch.minimum((uv[:, 0].double() * width).long().clamp(min=0), width - 1)
         row = torch.minimum((uv[:, 1].double() * height).long().clamp(min=0), height - 1)
-        count += torch.bincount(start + row * width + column, minlength=len(count))
-    flat = count.double().cpu().numpy()
+        cell = start + row * width + column
+        count.index_add_(0, cell, torch.ones_like(cell))
+    flat = count.double()
     return [flat[a:b].reshape(size) for a, b, size in zip(first, first[1:], sizes, strict=False)]
