@@ -28,6 +28,7 @@ from wlm.cli.smoke_options import (
     SmokeOptions,
     march_frames,
     outputs,
+    place_and_colour,
     vector,
     with_smoke,
     write_lightmaps,
@@ -338,14 +339,11 @@ def flipbook(
 
 
 def _light(text: str) -> "Light":
-    """A light of `X,Y,Z[:R,G,B]` or `X,Y,Z[:E]`, a white one."""
+    """A light of `place_and_colour`."""
     from wlm.config import check_settings
     from wlm.smoke.scene import LightSettings
 
-    toward, colon, irradiance = text.partition(":")
-    values = {"toward": vector("--light", toward)}
-    if colon:
-        values["irradiance"] = vector("--light", irradiance if "," in irradiance else ",".join([irradiance] * 3))
+    values = dict(zip(("toward", "irradiance"), place_and_colour("--light", text), strict=False))
     return check_settings(LightSettings, values, "--light: ").light()
 
 

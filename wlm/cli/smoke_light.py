@@ -8,7 +8,7 @@ import typer
 
 from wlm.cli.console import check_output, escape, exclusive, note, number, quiet_warp, running, show, table
 from wlm.cli.options import Seed, output_option
-from wlm.cli.smoke_options import SHEET, Input, SmokeOptions, outputs, vector, with_smoke
+from wlm.cli.smoke_options import SHEET, Input, SmokeOptions, outputs, place_and_colour, vector, with_smoke
 from wlm.errors import WlmError
 
 if TYPE_CHECKING:
@@ -234,7 +234,7 @@ def _checked(option: str, make: Callable[[], Any]) -> Any:
 
 
 def _lights(directions: list[str] | None, places: list[str] | None) -> "list[AnyLight]":
-    """Lights of `X,Y,Z[:R,G,B]` or `X,Y,Z[:E]`, white ones."""
+    """Lights of `place_and_colour`."""
     from wlm.smoke.camera import unit
     from wlm.smoke.shading import Light
     from wlm.smoke.transport.lights import PointLight, checked_colour
@@ -242,10 +242,8 @@ def _lights(directions: list[str] | None, places: list[str] | None) -> "list[Any
     made: list[AnyLight] = []
     for option, texts in (("--light", directions), ("--point", places)):
         for text in texts or ():
-            place, colon, colour = text.partition(":")
-            values = [vector(option, place)]
-            if colon:
-                values.append(vector(option, colour if "," in colour else ",".join([colour] * 3)))
+            values = place_and_colour(option, text)
+            if len(values) == 2:
                 _checked(option, lambda values=values: checked_colour("colour", values[1]))
             if option == "--light":
                 _checked(option, lambda values=values: unit(values[0], "direction"))

@@ -12,7 +12,6 @@ Read first: `lit` of `tests/reference/marching.py`, one such light with nothing 
 """
 
 import functools
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -31,10 +30,9 @@ from wlm_kernels.smoke.march import (
     occupied,
     parameters,
     phase,
-    sample,
     size_of,
 )
-from wlm_kernels.smoke.march_coarse import noise
+from wlm_kernels.smoke.march_coarse import MOST_NODES, by_bricks, gaps_along, noise, parts_of
 from wlm_kernels.smoke.settings import March
 
 _OPTIONS = {"enable_backward": False}
@@ -42,10 +40,7 @@ _OPTIONS = {"enable_backward": False}
 PLANES = ("transparency", "emission", "depth")
 """Planes of `seen`."""
 
-_LEAST_SPACING = 0.25  # voxels between nodes
-_MOST_NODES = 2**28
 _MOST_MARCHING = 2**24  # of a point light, each of which marches by itself
-_ROUNDING = 1e-6
 
 
 @wp.struct
@@ -62,13 +57,11 @@ class Lattice:
 
 @wp.func
 def _look(density: wp.array3d[Any], bricks: wp.array3d[wp.uint8], p: wp.vec3) -> float:
-    """The density, by bricks where there are any, and 0 far outside the grid."""
+    """`by_bricks`, and 0 far outside the grid."""
     for axis in range(3):
         if p[axis] < -0.5 or p[axis] > float(density.shape[axis]) + 0.5:
             return 0.0
-    if bricks.shape[0] > 0:
-        return sample(density, bricks, p)
-    return density_at(density, p)
+    return by_bricks(density, bricks, p)
 
 
 @wp.func
@@ -269,14 +262,6 @@ def light_kernels(dtype: Any) -> _Kernels:
     return _Kernels(measure, reach, gather, seen)
 
 
-def _parts(extents: Sequence[float], spacing: float, most: int) -> list[int]:
-    """Gaps along each axis, no longer than a spacing, or than makes the nodes too many."""
-    spacing = max(spacing, _LEAST_SPACING)
-    while math.prod(parts := [max(math.ceil(e / spacing - _ROUNDING), 1) for e in extents]) > most:
-        spacing *= 1.1
-    return parts
-
-
 def _axes(toward: Sequence[float]) -> list[tuple[float, float, float]]:
     """A light's direction, and two across it."""
     x, y, z = toward
@@ -291,13 +276,13 @@ def _lattice(shape: Sequence[int], place: Sequence[float], radius: float | None,
     axes = _axes(place) if radius is None else [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)]
     low = [sum(min(-0.5 * a, (n + 0.5) * a) for n, a in zip(shape, axis, strict=True)) for axis in axes]
     extents = [sum((n + 1) * abs(a) for n, a in zip(shape, axis, strict=True)) for axis in axes]
-    parts = _parts(extents, spacing, _MOST_NODES if radius is None else _MOST_MARCHING)
+    gaps = gaps_along(extents, spacing, MOST_NODES if radius is None else _MOST_MARCHING)
     lattice = Lattice()
     lattice.axes = wp.mat33(*(value for axis in axes for value in axis))
     lattice.low = wp.vec3(*low)
-    lattice.gap = wp.vec3(*(extent / n for extent, n in zip(extents, parts, strict=True)))
+    lattice.gap = wp.vec3(*(extent / n for extent, n in zip(extents, gaps, strict=True)))
     lattice.place, lattice.point, lattice.radius = wp.vec3(*place), int(radius is not None), float(radius or 0.0)
-    return lattice, tuple(n + 1 for n in parts)
+    return lattice, tuple(n + 1 for n in gaps)
 
 
 def light(
@@ -326,7 +311,7 @@ def light(
     nodes = medium.buffer(counts, wp.vec2)
     if radius is None:
         gaps = medium.buffer(counts, float)
-        parts = max(math.ceil(lattice.gap[0] / step - _ROUNDING), 1)
+        parts = parts_of(lattice.gap[0], step)
         wp.launch(kernels.measure, counts, [density, bricks, extinction, lattice, parts], [gaps], device=device)
         wp.launch(_add_up, counts[1:], [gaps], [nodes], device=device)
     else:

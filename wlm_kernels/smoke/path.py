@@ -57,6 +57,21 @@ class PathSettings:
 
 
 @wp.struct
+class _Walk:
+    """A ray's walk through bricks: the brick that it is in, `t` along the ray, which is before `border` and `end`.
+
+    `leave` has the distances at which it leaves the brick along each axis, of which `border` is the first.
+    """
+
+    cell: wp.vec3i
+    leave: wp.vec3
+    t: float
+    border: float
+    end: float
+    most: float
+
+
+@wp.struct
 class _Flight:
     """Where a free path ends, the light gathered on its way, and the random state after it."""
 
@@ -95,23 +110,42 @@ def _border(cell: int, count: int, p: float, d: float) -> float:
 
 
 @wp.func
-def _leave(majorants: wp.array3d[float], cell: wp.vec3i, p: wp.vec3, d: wp.vec3) -> wp.vec3:
-    """Distances at which a ray leaves a brick along each axis."""
-    return wp.vec3(
-        _border(cell[0], majorants.shape[0], p[0], d[0]),
-        _border(cell[1], majorants.shape[1], p[1], d[1]),
-        _border(cell[2], majorants.shape[2], p[2], d[2]),
-    )
+def _enter(bounds: wp.array3d[float], size: wp.vec3, p: wp.vec3, d: wp.vec3, limit: float) -> _Walk:
+    """The brick in which a ray begins; none where it misses the smoke, or up to its limit."""
+    w = _Walk()
+    span = clip(size, p, d)
+    w.t = wp.max(span[0], 0.0)
+    w.end = wp.min(span[1], limit)
+    w.cell = _brick(bounds, p + w.t * d)
+    return _within(w, bounds, p, d)
 
 
 @wp.func
-def _onward(cell: wp.vec3i, leave: wp.vec3, d: wp.vec3) -> wp.vec3i:
-    """The next brick along a ray."""
-    if leave[0] <= leave[1] and leave[0] <= leave[2]:
-        return wp.vec3i(cell[0] + wp.where(d[0] > 0.0, 1, -1), cell[1], cell[2])
-    if leave[1] <= leave[2]:
-        return wp.vec3i(cell[0], cell[1] + wp.where(d[1] > 0.0, 1, -1), cell[2])
-    return wp.vec3i(cell[0], cell[1], cell[2] + wp.where(d[2] > 0.0, 1, -1))
+def _within(w: _Walk, bounds: wp.array3d[float], p: wp.vec3, d: wp.vec3) -> _Walk:
+    """A walk with what it has to know of its brick."""
+    w.leave = wp.vec3(
+        _border(w.cell[0], bounds.shape[0], p[0], d[0]),
+        _border(w.cell[1], bounds.shape[1], p[1], d[1]),
+        _border(w.cell[2], bounds.shape[2], p[2], d[2]),
+    )
+    w.border = wp.min(wp.min(w.leave[0], wp.min(w.leave[1], w.leave[2])), w.end)
+    w.most = bounds[w.cell[0], w.cell[1], w.cell[2]]
+    return w
+
+
+@wp.func
+def _onward(w: _Walk, bounds: wp.array3d[float], p: wp.vec3, d: wp.vec3) -> _Walk:
+    """The walk in the next brick, or at its end."""
+    w.t = w.border
+    if w.t < w.end:
+        if w.leave[0] <= w.leave[1] and w.leave[0] <= w.leave[2]:
+            w.cell[0] += wp.where(d[0] > 0.0, 1, -1)
+        elif w.leave[1] <= w.leave[2]:
+            w.cell[1] += wp.where(d[1] > 0.0, 1, -1)
+        else:
+            w.cell[2] += wp.where(d[2] > 0.0, 1, -1)
+        w = _within(w, bounds, p, d)
+    return w
 
 
 @wp.func
@@ -138,31 +172,23 @@ def _fly(
     """A free path by delta tracking, up to a limit."""
     f = _Flight()
     glow = float(0.0)
-    span = clip(size_of(density), p, d)
-    t = wp.max(span[0], 0.0)
-    end = wp.min(span[1], limit)
-    cell = _brick(bounds, p + t * d)
-    while t < end:
-        leave = _leave(bounds, cell, p, d)
-        border = wp.min(wp.min(leave[0], wp.min(leave[1], leave[2])), end)
-        most = bounds[cell[0], cell[1], cell[2]]
-        if most > 0.0:
-            while t < border:
+    w = _enter(bounds, size_of(density), p, d, limit)
+    while w.t < w.end:
+        if w.most > 0.0:
+            while w.t < w.border:
                 random = following(random)
-                t -= wp.log(1.0 - uniform(random)) / most
-                if t < border:
-                    at = p + t * d
+                w.t -= wp.log(1.0 - uniform(random)) / w.most
+                if w.t < w.border:
+                    at = p + w.t * d
                     if emission > 0.0:
-                        glow += emission * density_at(temperature, at) / most
+                        glow += emission * density_at(temperature, at) / w.most
                     random = following(random)
-                    if uniform(random) * most < extinction * density_at(density, at):
+                    if uniform(random) * w.most < extinction * density_at(density, at):
                         f.hit = 1
-                        f.t = t
-                        end = -1.0
-                        border = -1.0
-        t = border
-        if t < end:
-            cell = _onward(cell, leave, d)
+                        f.t = w.t
+                        w.end = -1.0
+                        w.border = -1.0
+        w = _onward(w, bounds, p, d)
     f.glow = glow
     f.random = random
     return f
@@ -180,32 +206,24 @@ def _passed(
 ) -> _Passed:
     """The share of light that passes along a ray up to a limit, by ratio tracking."""
     f = _Passed()
-    span = clip(size_of(density), p, d)
-    t = wp.max(span[0], 0.0)
-    end = wp.min(span[1], limit)
     share = float(1.0)
-    cell = _brick(bounds, p + t * d)
-    while t < end:
-        leave = _leave(bounds, cell, p, d)
-        border = wp.min(wp.min(leave[0], wp.min(leave[1], leave[2])), end)
-        most = bounds[cell[0], cell[1], cell[2]]
-        if most > 0.0:
-            while t < border:
+    w = _enter(bounds, size_of(density), p, d, limit)
+    while w.t < w.end:
+        if w.most > 0.0:
+            while w.t < w.border:
                 random = following(random)
-                t -= wp.log(1.0 - uniform(random)) / most
-                if t < border:
-                    share = share * (1.0 - extinction * density_at(density, p + t * d) / most)
+                w.t -= wp.log(1.0 - uniform(random)) / w.most
+                if w.t < w.border:
+                    share = share * (1.0 - extinction * density_at(density, p + w.t * d) / w.most)
                     if share < _FAINT:
                         random = following(random)
                         if uniform(random) * _FAINT < share:
                             share = _FAINT
                         else:
                             share = 0.0
-                            end = -1.0
-                            border = -1.0
-        t = border
-        if t < end:
-            cell = _onward(cell, leave, d)
+                            w.end = -1.0
+                            w.border = -1.0
+        w = _onward(w, bounds, p, d)
     f.share = share
     f.random = random
     return f
