@@ -52,6 +52,7 @@ MODULES = (
     "raster.rays",
     "raster.texture",
     "smoke.picture",
+    "smoke.scales",
     "smoke.shadow",
     "smoke.single_scatter",
 )

@@ -19,7 +19,6 @@ from typing import Any
 import warp as wp
 
 from wlm_kernels.smoke.march import (
-    BRICK,
     MarchParameters,
     Medium,
     View,
@@ -27,7 +26,6 @@ from wlm_kernels.smoke.march import (
     clip,
     density_at,
     marched_ray,
-    occupied,
     parameters,
     phase,
     size_of,
@@ -286,7 +284,15 @@ def _lattice(shape: Sequence[int], place: Sequence[float], radius: float | None,
 
 
 def light(
-    medium: Medium, view: View, place: Sequence[float], radius: float | None, march: March, shadow: float, out: wp.array
+    medium: Medium,
+    view: View,
+    place: Sequence[float],
+    radius: float | None,
+    march: March,
+    shadow: float,
+    out: wp.array,
+    *,
+    bricks: wp.array,
 ) -> None:
     """Smoke of albedo 1 under a light and under the opposite one, or under a point light.
 
@@ -300,13 +306,13 @@ def light(
         shadow: Extinction on the ways to the light over that along the camera's rays; 1 is smoke as it is.
         out: float [2, H, W], written: light scattered once, of irradiance 4 pi from the place and from the opposite
             one. Of a point light [1, H, W]: its irradiance is 4 pi at a distance of one voxel.
+        bricks: Of `occupied`.
     """
     spacing = march.step if march.spacing is None else march.spacing
     step = spacing if march.light_step is None else march.light_step
     density, extinction = medium.density, medium.extinction
     device = density.device
     kernels = light_kernels(density.dtype)
-    bricks = occupied(medium) if march.step < BRICK else medium.buffer((0, 0, 0), wp.uint8)
     lattice, counts = _lattice(density.shape, place, radius, spacing)
     nodes = medium.buffer(counts, wp.vec2)
     if radius is None:
@@ -320,10 +326,9 @@ def light(
     wp.launch(kernels.gather, out.shape[1:], inputs=inputs, outputs=[out], device=device)
 
 
-def seen(medium: Medium, view: View, march: March, out: wp.array) -> None:
-    """What a camera sees of smoke without light: `PLANES`, [3, H, W], written."""
+def seen(medium: Medium, view: View, march: March, out: wp.array, *, bricks: wp.array) -> None:
+    """What a camera sees of smoke without light: `PLANES`, [3, H, W], written; arguments as for `light`."""
     density, (temperature, emission) = medium.density, medium.glow
-    bricks = occupied(medium) if march.step < BRICK else medium.buffer((0, 0, 0), wp.uint8)
     inputs = [density, temperature, bricks, medium.extinction, emission, view, parameters(march)]
     kernel = light_kernels(density.dtype).seen
     wp.launch(kernel, out.shape[1:], inputs=inputs, outputs=[out], device=density.device)
