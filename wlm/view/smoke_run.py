@@ -17,6 +17,7 @@ from wlm.smoke.coarse import march
 from wlm.smoke.guiding import guide
 from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.prediction import SmokePredictor
+from wlm.smoke.replay import VolumeGraph
 from wlm.smoke.scene import Scene, make_camera
 from wlm.smoke.simulation import advance, make_solver, volume_of
 from wlm.system import Meter, OnProgress

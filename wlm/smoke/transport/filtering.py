@@ -81,8 +81,9 @@ class OrdersModel:
 
     def filtered(self, inputs: Inputs, nodes: Sequence[int] = range(len(ALBEDOS))) -> torch.Tensor:
         """R by the filter alone, [N, H, W], at some of `ALBEDOS` by number."""
-        weights = self.arrays["weights"].reshape(len(ALBEDOS), ANGLES, FEATURES)[list(nodes)]
-        mixed = sum(inputs.cosine**n * weights[:, n] for n in range(ANGLES))
+        weights = self.arrays["weights"].reshape(len(ALBEDOS), ANGLES, FEATURES)
+        # An index in a list would be copied to the device, which a graph can't capture.
+        mixed = torch.stack([sum(inputs.cosine**n * weights[node, n] for n in range(ANGLES)) for node in nodes])
         return (mixed @ inputs.features.flatten(1)).unflatten(1, inputs.features.shape[1:]).clamp(min=0.0)
 
     def correction(self, inputs: Inputs, filtered: torch.Tensor, nodes: Sequence[int]) -> torch.Tensor:
