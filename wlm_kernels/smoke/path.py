@@ -1,11 +1,13 @@
 """A path tracer of volumes: light of every order of scattering in a density grid, without bias.
 
 Free paths are sampled by delta tracking, transmittances by ratio tracking (Novak et al. 2018, "Monte Carlo methods for
-volumetric light transport simulation", sections 5.1 and 5.2), both with a majorant per brick. At each scattering every
+volumetric light transport simulation", sections 5.1 and 5.2), both with a majorant per brick, through which an optical
+depth that is drawn once is spent. Where a density is needed, one of the eight voxels around the place is drawn by its
+weight: either tracking asks for no more than its mean, which is that of `density_at`. At each scattering every
 light is tried (next event estimation); the environment is reached by such a try and by the path's own escape, weighed
 by the balance heuristic. Emission is gathered along the free paths: each tentative collision counts for e / majorant.
 
-Units are those of `march`; densities between voxels are exactly those of `density_at`. Light of order n has been
+Units are those of `march`. Light of order n has been
 scattered n times. Random numbers are a pixel's own: the result depends on the seed alone.
 Read first: `scattered_twice` of `tests/reference/transport.py`, the second order by quadrature.
 """
@@ -19,12 +21,15 @@ from typing import Any
 import warp as wp
 
 from wlm_kernels.smoke.march import BRICK, Medium, View, clip, density_at, phase, ray, size_of
-from wlm_kernels.smoke.path_ways import Sky, chance_of, following, scatter, stir, texel, toward_sky, uniform
+from wlm_kernels.smoke.path_ways import Sky, bits, chance_of, following, scatter, stir, texel, toward_sky, uniform
 
 _OPTIONS = {"enable_backward": False}
 _NEVER = wp.constant(1.0e30)
 _GLOW = 1.0 / BRICK  # least majorant where smoke glows: about one place a brick at which its light is gathered
+_TENTH_BIT = wp.constant(1.0 / 1024.0)
 _SLACK = 1.0001  # of a majorant over rounding of interpolated densities
+_DEEP = 2.0  # optical depth through a brick, of the densest smoke, that bricks may have
+_THREADS = 2**20  # on a GPU, of which each traces several parts one after another
 _FAINT = wp.constant(0.1)  # what is below this is carried on by fewer paths
 _FOUR_PI = wp.constant(4.0 * math.pi)
 
@@ -58,13 +63,14 @@ class PathSettings:
 
 @wp.struct
 class _Walk:
-    """A ray's walk through bricks: the brick that it is in, `t` along the ray, which is before `border` and `end`.
+    """A ray's walk through bricks: the one that it is in, from `t` to `border` along the ray, which ends at `end`.
 
-    `leave` has the distances at which it leaves the brick along each axis, of which `border` is the first.
+    `leave` has the distances at which it leaves the brick along each axis, `across` those that it takes through one.
     """
 
     cell: wp.vec3i
     leave: wp.vec3
+    across: wp.vec3
     t: float
     border: float
     end: float
@@ -90,71 +96,67 @@ class _Passed:
 
 
 @wp.func
-def _brick(majorants: wp.array3d[float], p: wp.vec3) -> wp.vec3i:
-    edge = 1.0 / float(BRICK)
-    return wp.vec3i(
-        wp.clamp(int(wp.floor(p[0] * edge)), 0, majorants.shape[0] - 1),
-        wp.clamp(int(wp.floor(p[1] * edge)), 0, majorants.shape[1] - 1),
-        wp.clamp(int(wp.floor(p[2] * edge)), 0, majorants.shape[2] - 1),
-    )
-
-
-@wp.func
-def _border(cell: int, count: int, p: float, d: float) -> float:
+def _border(cell: int, count: int, edge: float, p: float, d: float) -> float:
     """Distance at which a ray leaves a brick along one axis; the outermost bricks have no outer border."""
     if d > 1.0e-9 and cell < count - 1:
-        return (float((cell + 1) * BRICK) - p) / d
+        return (float(cell + 1) * edge - p) / d
     if d < -1.0e-9 and cell > 0:
-        return (float(cell * BRICK) - p) / d
+        return (float(cell) * edge - p) / d
     return _NEVER
 
 
 @wp.func
-def _enter(bounds: wp.array3d[float], size: wp.vec3, p: wp.vec3, d: wp.vec3, limit: float) -> _Walk:
+def _enter(bounds: wp.array3d[float], edge: float, size: wp.vec3, p: wp.vec3, d: wp.vec3, limit: float) -> _Walk:
     """The brick in which a ray begins; none where it misses the smoke, or up to its limit."""
     w = _Walk()
     span = clip(size, p, d)
     w.t = wp.max(span[0], 0.0)
     w.end = wp.min(span[1], limit)
-    w.cell = _brick(bounds, p + w.t * d)
-    return _within(w, bounds, p, d)
-
-
-@wp.func
-def _within(w: _Walk, bounds: wp.array3d[float], p: wp.vec3, d: wp.vec3) -> _Walk:
-    """A walk with what it has to know of its brick."""
-    w.leave = wp.vec3(
-        _border(w.cell[0], bounds.shape[0], p[0], d[0]),
-        _border(w.cell[1], bounds.shape[1], p[1], d[1]),
-        _border(w.cell[2], bounds.shape[2], p[2], d[2]),
-    )
+    for axis in range(3):
+        at = int(wp.floor((p[axis] + w.t * d[axis]) / edge))
+        w.cell[axis] = wp.clamp(at, 0, bounds.shape[axis] - 1)
+        w.leave[axis] = _border(w.cell[axis], bounds.shape[axis], edge, p[axis], d[axis])
+        w.across[axis] = edge / wp.max(wp.abs(d[axis]), 1.0e-9)
     w.border = wp.min(wp.min(w.leave[0], wp.min(w.leave[1], w.leave[2])), w.end)
     w.most = bounds[w.cell[0], w.cell[1], w.cell[2]]
     return w
 
 
 @wp.func
-def _onward(w: _Walk, bounds: wp.array3d[float], p: wp.vec3, d: wp.vec3) -> _Walk:
+def _further(cell: int, count: int, leave: float, across: float) -> float:
+    """Distance at which a ray leaves the brick that it has come to along an axis."""
+    return wp.where(cell > 0 and cell < count - 1, leave + across, _NEVER)
+
+
+@wp.func
+def _onward(w: _Walk, bounds: wp.array3d[float], d: wp.vec3) -> _Walk:
     """The walk in the next brick, or at its end."""
     w.t = w.border
     if w.t < w.end:
         if w.leave[0] <= w.leave[1] and w.leave[0] <= w.leave[2]:
             w.cell[0] += wp.where(d[0] > 0.0, 1, -1)
+            w.leave[0] = _further(w.cell[0], bounds.shape[0], w.leave[0], w.across[0])
         elif w.leave[1] <= w.leave[2]:
             w.cell[1] += wp.where(d[1] > 0.0, 1, -1)
+            w.leave[1] = _further(w.cell[1], bounds.shape[1], w.leave[1], w.across[1])
         else:
             w.cell[2] += wp.where(d[2] > 0.0, 1, -1)
-        w = _within(w, bounds, p, d)
+            w.leave[2] = _further(w.cell[2], bounds.shape[2], w.leave[2], w.across[2])
+        w.border = wp.min(wp.min(w.leave[0], wp.min(w.leave[1], w.leave[2])), w.end)
+        w.most = bounds[w.cell[0], w.cell[1], w.cell[2]]
     return w
 
 
 @wp.func
-def _blocked(mesh: wp.uint64, p: wp.vec3, d: wp.vec3, within: float) -> float:
-    """Distance to the first obstacle along a ray, or never."""
-    if mesh == wp.uint64(0):
-        return _NEVER
-    found = wp.mesh_query_ray(mesh, p, d, within)
-    return wp.where(found.result, found.t, _NEVER)
+def _drawn(density: wp.array3d[Any], p: wp.vec3, random: wp.uint64) -> float:
+    """The density of one of the voxels around a place, whose mean is that of `density_at`."""
+    x = bits(random)
+    i = int(wp.floor(p[0] + (float(x & wp.uint32(1023)) - 511.5) * _TENTH_BIT))
+    j = int(wp.floor(p[1] + (float((x >> wp.uint32(10)) & wp.uint32(1023)) - 511.5) * _TENTH_BIT))
+    k = int(wp.floor(p[2] + (float((x >> wp.uint32(20)) & wp.uint32(1023)) - 511.5) * _TENTH_BIT))
+    if i < 0 or j < 0 or k < 0 or i >= density.shape[0] or j >= density.shape[1] or k >= density.shape[2]:
+        return 0.0
+    return float(density[i, j, k])
 
 
 @wp.func
@@ -162,6 +164,7 @@ def _fly(
     density: wp.array3d[Any],
     temperature: wp.array3d[Any],
     bounds: wp.array3d[float],
+    edge: float,
     extinction: float,
     emission: float,
     p: wp.vec3,
@@ -172,23 +175,28 @@ def _fly(
     """A free path by delta tracking, up to a limit."""
     f = _Flight()
     glow = float(0.0)
-    w = _enter(bounds, size_of(density), p, d, limit)
+    random = following(random)
+    left = -wp.log(1.0 - uniform(random))  # optical depth, of the majorants, to the next place that is looked at
+    w = _enter(bounds, edge, size_of(density), p, d, limit)
     while w.t < w.end:
-        if w.most > 0.0:
-            while w.t < w.border:
-                random = following(random)
-                w.t -= wp.log(1.0 - uniform(random)) / w.most
-                if w.t < w.border:
-                    at = p + w.t * d
-                    if emission > 0.0:
-                        glow += emission * density_at(temperature, at) / w.most
-                    random = following(random)
-                    if uniform(random) * w.most < extinction * density_at(density, at):
-                        f.hit = 1
-                        f.t = w.t
-                        w.end = -1.0
-                        w.border = -1.0
-        w = _onward(w, bounds, p, d)
+        through = w.most * (w.border - w.t)
+        if left >= through:
+            left -= through
+            w = _onward(w, bounds, d)
+        else:
+            w.t += left / w.most
+            at = p + w.t * d
+            if emission > 0.0:
+                glow += emission * density_at(temperature, at) / w.most
+            random = following(random)
+            found = extinction * _drawn(density, at, random)
+            random = following(random)
+            if uniform(random) * w.most < found:
+                f.hit = 1
+                f.t = w.t
+                w.end = -1.0
+            random = following(random)
+            left = -wp.log(1.0 - uniform(random))
     f.glow = glow
     f.random = random
     return f
@@ -198,6 +206,7 @@ def _fly(
 def _passed(
     density: wp.array3d[Any],
     bounds: wp.array3d[float],
+    edge: float,
     extinction: float,
     p: wp.vec3,
     d: wp.vec3,
@@ -207,23 +216,27 @@ def _passed(
     """The share of light that passes along a ray up to a limit, by ratio tracking."""
     f = _Passed()
     share = float(1.0)
-    w = _enter(bounds, size_of(density), p, d, limit)
+    random = following(random)
+    left = -wp.log(1.0 - uniform(random))
+    w = _enter(bounds, edge, size_of(density), p, d, limit)
     while w.t < w.end:
-        if w.most > 0.0:
-            while w.t < w.border:
+        through = w.most * (w.border - w.t)
+        if left >= through:
+            left -= through
+            w = _onward(w, bounds, d)
+        else:
+            w.t += left / w.most
+            random = following(random)
+            share = share * (1.0 - extinction * _drawn(density, p + w.t * d, random) / w.most)
+            if share < _FAINT:
                 random = following(random)
-                w.t -= wp.log(1.0 - uniform(random)) / w.most
-                if w.t < w.border:
-                    share = share * (1.0 - extinction * density_at(density, p + w.t * d) / w.most)
-                    if share < _FAINT:
-                        random = following(random)
-                        if uniform(random) * _FAINT < share:
-                            share = _FAINT
-                        else:
-                            share = 0.0
-                            w.end = -1.0
-                            w.border = -1.0
-        w = _onward(w, bounds, p, d)
+                if uniform(random) * _FAINT < share:
+                    share = _FAINT
+                else:
+                    share = 0.0
+                    w.end = -1.0
+            random = following(random)
+            left = -wp.log(1.0 - uniform(random))
     f.share = share
     f.random = random
     return f
@@ -234,12 +247,13 @@ class _Kernels:
     """Of one type of density."""
 
     majorants: wp.Kernel
+    coarser: wp.Kernel
     trace: wp.Kernel
 
 
 @functools.cache
-def path_kernels(dtype: Any) -> _Kernels:
-    """Builds (once) the kernels for densities of a type, `wp.float32` or `wp.float16`."""
+def path_kernels(dtype: Any, solid: bool) -> _Kernels:
+    """Builds (once) the kernels for densities of a type, `wp.float32` or `wp.float16`; `solid`: with obstacles."""
 
     @wp.kernel(module="unique", module_options=_OPTIONS)
     def majorants(
@@ -268,11 +282,35 @@ def path_kernels(dtype: Any) -> _Kernels:
         out[a, b, c] = most
 
     @wp.kernel(module="unique", module_options=_OPTIONS)
+    def coarser(
+        # in:
+        bounds: wp.array3d[float],
+        # out:
+        out: wp.array3d[float],
+    ):
+        a, b, c = wp.tid()
+        most = float(0.0)
+        for i in range(2 * a, wp.min(2 * a + 2, bounds.shape[0])):
+            for j in range(2 * b, wp.min(2 * b + 2, bounds.shape[1])):
+                for k in range(2 * c, wp.min(2 * c + 2, bounds.shape[2])):
+                    most = wp.max(most, bounds[i, j, k])
+        out[a, b, c] = most
+
+    @wp.func
+    def free(mesh: wp.uint64, p: wp.vec3, d: wp.vec3) -> float:
+        """Distance to the first obstacle along a ray, or never."""
+        if wp.static(solid):
+            found = wp.mesh_query_ray(mesh, p, d, _NEVER)
+            return wp.where(found.result, found.t, _NEVER)
+        return _NEVER
+
+    @wp.kernel(module="unique", module_options=_OPTIONS)
     def trace(
         # in:
         density: wp.array3d[dtype],
         temperature: wp.array3d[dtype],
         bounds: wp.array3d[float],
+        edge: float,
         extinction: float,
         emission: float,
         view: View,
@@ -281,41 +319,57 @@ def path_kernels(dtype: Any) -> _Kernels:
         mesh: wp.uint64,
         settings: PathSettings,
         first: int,
+        last: int,
         parts: int,
+        together: int,
         # out:
         out: wp.array3d[wp.vec3],
     ):
-        part, row, column = wp.tid()
+        group, row, column = wp.tid()
         count = lights.shape[0]
         planes = settings.kept + 2
         sources = count + 2
-        # Some parts have one sample more than others.
-        samples = settings.samples // parts
-        if first + part < settings.samples % parts:
-            samples += 1
         weight = 1.0 / float(settings.samples)
         pixel = wp.uint64(row) * wp.uint64(view.width) + wp.uint64(column)
-        random = stir(settings.key + stir(pixel * wp.uint64(1048576) + wp.uint64(first + part)))
         start = ray(view, row, column)
-        for _sample in range(samples):
-            p = start.origin
-            d = start.direction
-            chance = float(0.0)  # of the direction per solid angle; 0: the camera's, which no light was tried for
-            through = wp.vec3(weight)
-            order = int(0)
-            alive = int(1)
-            while alive == 1:
+        part = first + group * together - 1
+        past = wp.min(first + (group + 1) * together, last)
+        samples = int(0)
+        random = wp.uint64(0)
+        p = wp.vec3()
+        d = wp.vec3()
+        chance = float(0.0)  # of the direction per solid angle; 0: the camera's, which no light was tried for
+        through = wp.vec3()
+        order = int(0)
+        alive = int(0)
+        # One loop for all paths: a thread whose path has ended begins its next while its neighbours go on.
+        while part < past:
+            if alive == 0:
+                if samples == 0:
+                    part += 1
+                    # Some parts have one sample more than others.
+                    samples = settings.samples // parts + wp.where(part < settings.samples % parts, 1, 0)
+                    random = stir(settings.key + stir(pixel * wp.uint64(1048576) + wp.uint64(part)))
+                samples -= 1
+                p = start.origin
+                d = start.direction
+                chance = 0.0
+                through = wp.vec3(weight)
+                order = 0
+                alive = 1
+            if part < past:
+                base = (part - first) * sources
                 limit = float(0.0)
                 if order == 0:
                     # An orthographic ray starts where the smoke does; what lies before that blocks as well.
-                    limit = _blocked(mesh, p - view.moved * d, d, _NEVER) - view.moved
+                    limit = free(mesh, p - view.moved * d, d) - view.moved
                 else:
-                    limit = _blocked(mesh, p, d, _NEVER)
-                flight = _fly(density, temperature, bounds, extinction, emission, p, d, limit, random)
+                    limit = free(mesh, p, d)
+                flight = _fly(density, temperature, bounds, edge, extinction, emission, p, d, limit, random)
                 random = flight.random
                 plane = wp.min(order, planes - 1)
                 if flight.glow > 0.0:
-                    at = (part * sources + count + 1) * planes + plane
+                    at = (base + count + 1) * planes + plane
                     out[at, row, column] = out[at, row, column] + flight.glow * through
                 if flight.hit == 0:
                     if sky.total > 0.0 and limit >= 0.5 * _NEVER:
@@ -323,7 +377,7 @@ def path_kernels(dtype: Any) -> _Kernels:
                         share = float(1.0)
                         if chance > 0.0:
                             share = chance / (chance + chance_of(sky, light))
-                        at = (part * sources + count) * planes + plane
+                        at = (base + count) * planes + plane
                         out[at, row, column] = out[at, row, column] + share * wp.cw_mul(through, light)
                     alive = 0
                 else:
@@ -351,24 +405,27 @@ def path_kernels(dtype: Any) -> _Kernels:
                             away = wp.max(reach, lights[n].radius)
                             strength = 1.0 / wp.max(away * away, 1.0e-12)
                             way = wp.normalize(way)
-                        if _blocked(mesh, p, way, reach) >= reach:
-                            got = _passed(density, bounds, extinction, p, way, reach, random)
+                        if free(mesh, p, way) >= reach:
+                            got = _passed(density, bounds, edge, extinction, p, way, reach, random)
                             random = got.random
                             strength = strength * got.share * phase(settings.g, wp.dot(d, way))
-                            at = (part * sources + n) * planes + plane
+                            at = (base + n) * planes + plane
                             light = strength * wp.cw_mul(through, lights[n].colour)
                             out[at, row, column] = out[at, row, column] + light
                     if sky.total > 0.0:
                         far = toward_sky(sky, random)
                         random = far.random
-                        if _blocked(mesh, p, far.direction, _NEVER) >= _NEVER:
-                            got = _passed(density, bounds, extinction, p, far.direction, _NEVER, random)
+                        if free(mesh, p, far.direction) >= _NEVER:
+                            got = _passed(density, bounds, edge, extinction, p, far.direction, _NEVER, random)
                             random = got.random
                             own = phase(settings.g, wp.dot(d, far.direction)) / _FOUR_PI
                             strength = got.share * own / (own + far.chance)
-                            at = (part * sources + count) * planes + plane
+                            at = (base + count) * planes + plane
                             light = strength * wp.cw_mul(through, texel(sky, far.direction))
                             out[at, row, column] = out[at, row, column] + light
+                    # After its last order a path goes on to the sky and to what glows alone.
+                    if order == settings.highest and sky.total == 0.0 and emission == 0.0:
+                        alive = 0
                     random = following(random)
                     u = uniform(random)
                     random = following(random)
@@ -376,7 +433,7 @@ def path_kernels(dtype: Any) -> _Kernels:
                     d = scatter(settings.g, d, u, uniform(random))
                     chance = phase(settings.g, wp.dot(before, d)) / _FOUR_PI
 
-    return _Kernels(majorants, trace)
+    return _Kernels(majorants, coarser, trace)
 
 
 def make_lights(lights: Sequence[tuple[Sequence[float], Sequence[float], float | None]]) -> list[PathLight]:
@@ -395,19 +452,39 @@ def make_lights(lights: Sequence[tuple[Sequence[float], Sequence[float], float |
     return made
 
 
-def bounds(medium: Medium) -> wp.array:
-    """The greatest extinction per voxel that a sample in each brick can find, [X / 8, Y / 8, Z / 8], rounded up."""
+@dataclass(frozen=True)
+class Majorants:
+    """The greatest extinction per voxel that a sample in each brick can find, float [X, Y, Z] / edge, rounded up."""
+
+    most: wp.array
+    edge: int
+
+
+def bounds(medium: Medium, densest: float) -> Majorants:
+    """Finds majorants, of bricks through which the optical depth is about one where smoke is densest.
+
+    Args:
+        medium: The smoke.
+        densest: Its greatest extinction per voxel.
+    """
     density, (temperature, emission) = medium.density, medium.glow
-    out = medium.buffer(tuple(-(-n // BRICK) for n in density.shape), float)
+    kernels = path_kernels(density.dtype, False)
+    edge, device = BRICK, density.device
+    most = medium.buffer(tuple(-(-n // edge) for n in density.shape), float)
     inputs = [density, temperature, medium.extinction, emission, _GLOW, _SLACK]
-    wp.launch(path_kernels(density.dtype).majorants, out.shape, inputs=inputs, outputs=[out], device=density.device)
-    return out
+    wp.launch(kernels.majorants, most.shape, inputs=inputs, outputs=[most], device=device)
+    while 2 * edge * densest <= _DEEP and max(most.shape) > 1:
+        edge *= 2
+        wider = medium.buffer(tuple(-(-n // 2) for n in most.shape), float)
+        wp.launch(kernels.coarser, wider.shape, inputs=[most], outputs=[wider], device=device)
+        most = wider
+    return Majorants(most, edge)
 
 
 def trace(
     medium: Medium,
     view: View,
-    majorants: wp.array,
+    majorants: Majorants,
     lights: wp.array,
     sky: Sky,
     mesh: wp.uint64,
@@ -433,8 +510,11 @@ def trace(
             parts add up to the mean over all samples.
     """
     density, (temperature, emission) = medium.density, medium.glow
-    planes = (lights.shape[0] + 2) * (settings.kept + 2)
-    size = (out.shape[0] // planes, view.height, view.width)
-    inputs = [density, temperature, majorants, medium.extinction, emission, view, lights, sky, mesh, settings]
-    kernel = path_kernels(density.dtype).trace
-    wp.launch(kernel, size, inputs=[*inputs, first, parts], outputs=[out], device=density.device)
+    traced = out.shape[0] // ((lights.shape[0] + 2) * (settings.kept + 2))
+    # Fewer threads than keep a GPU busy wouldn't be faster for more paths each.
+    together = max(1, traced * view.height * view.width // _THREADS) if density.device.is_cuda else 1
+    size = (-(-traced // together), view.height, view.width)
+    inputs = [density, temperature, majorants.most, float(majorants.edge), medium.extinction, emission, view, lights]
+    inputs += [sky, mesh, settings, first, first + traced, parts, together]
+    kernel = path_kernels(density.dtype, mesh != 0).trace
+    wp.launch(kernel, size, inputs=inputs, outputs=[out], device=density.device)
