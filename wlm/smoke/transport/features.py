@@ -1,5 +1,6 @@
 """What light of all orders is predicted from: planes of marches, blurred at scales of the smoke's box and shifted."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -75,7 +76,15 @@ def ambient(volume: DensityVolume, camera: Camera, march: March = COARSE) -> tor
 
 
 def make_inputs(volume: DensityVolume, lit: LitSmoke, around: torch.Tensor) -> list[Inputs]:
-    """The filter's inputs for each light of irradiance 4 pi; of a point light that at the smoke's centre.
+    """The filter's inputs for each light; arguments as for `input_maker`."""
+    make = input_maker(volume, lit, around)
+    return [make(n) for n in range(len(lit.lights))]
+
+
+def input_maker(volume: DensityVolume, lit: LitSmoke, around: torch.Tensor) -> Callable[[int], Inputs]:
+    """Blurs planes, and makes the filter's inputs of them for one light at a time, by number.
+
+    The light has an irradiance of 4 pi; of a point light that at the smoke's centre.
 
     Args:
         volume: The smoke.
@@ -101,13 +110,15 @@ def make_inputs(volume: DensityVolume, lit: LitSmoke, around: torch.Tensor) -> l
         arrays = (to_warp(part) for part in (single, opposite, around, lit.transparency))
         bases = scales.make_bases(*arrays, _THINNEST, torch_memory(device))
         blurred = scales.make_scales(bases, [scale * edge / pitch for scale in SCALES], torch_memory(device))
-        made = []
-        for n, (toward, _) in enumerate(ways):
-            across, rise, cosine = camera.axes @ toward
+
+    def make(n: int) -> Inputs:
+        across, rise, cosine = camera.axes @ ways[n][0]
+        with stream(device_name(device)):
             features = torch.empty(FEATURES, camera.height, camera.width, device=device)
             scales.features(bases, blurred, n, across, rise, to_warp(features))
-            made.append(Inputs(single[n], features, opacity, float(cosine), depth))
-    return made
+        return Inputs(single[n], features, opacity, float(cosine), depth)
+
+    return make
 
 
 def _as_directional(

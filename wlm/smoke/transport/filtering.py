@@ -27,7 +27,7 @@ from wlm.formats.npz import read_npz
 from wlm.interop import device_name, stream
 from wlm.smoke.camera import Camera
 from wlm.smoke.shading import Ramp
-from wlm.smoke.transport.features import COARSE, FEATURES, Inputs, aim, ambient, make_inputs
+from wlm.smoke.transport.features import COARSE, FEATURES, Inputs, aim, ambient, input_maker
 from wlm.smoke.transport.lighting import LitSmoke, light_smoke
 from wlm.smoke.transport.lights import AnyLight, checked_albedo
 from wlm.smoke.transport.samples import ALBEDOS
@@ -236,8 +236,9 @@ def scatter(
     with stream(device_name(volume.device)):
         lit = light_smoke(volume, camera, lights, march)
         planes = torch.empty((*lit.planes.shape, 3), device=volume.device)
-        for n, inputs in enumerate(make_inputs(volume, lit, ambient(volume, camera, march))):
-            planes[n] = model.light(inputs, albedo, network=network)
+        make = input_maker(volume, lit, ambient(volume, camera, march))
+        for n in range(len(lights)):
+            planes[n] = model.light(make(n), albedo, network=network)
             if (factor := aim(lights[n], volume)[1]) != 1.0:
                 planes[n] /= factor
     return ScatteredSmoke(lit, planes)
