@@ -96,6 +96,18 @@ def test_other_smoke_other_lights_other_cameras(device: str, kind: str):
     assert psnr(scale * made.shade(), scale * wanted.total) > psnr(scale * once, scale * wanted.total) + 6.0
 
 
+@pytest.mark.parametrize(("g", "least"), [(-0.3, 33.0), (0.3, 31.0), (0.6, 24.0)])
+def test_light_that_is_scattered_onward_or_back(device: str, g: float, least: float):
+    """Of a phase function that the filter wasn't fitted to: 8 dB nearer than light scattered once."""
+    volume = plume(device=device)
+    camera = Camera.around(volume, toward=(0.5, 0.2, 1.0), pixels=24)
+    lights = [Light((1.0, 0.5, 0.6), (6.0, 6.0, 6.0)), Light((-0.2, 0.3, -1.0), (4.0, 4.0, 4.0))]
+    wanted = trace(volume, camera, lights, albedo=(0.95,) * 3, g=g, samples=256).total
+    made = scatter(volume, camera, lights, (0.95,) * 3, march=March(step=1.0, jitter=0.0, g=g))
+    found, once = (psnr(image, wanted) for image in (made.shade(), made.lit.shade(albedo=(0.95,) * 3)))
+    assert found > max(least, once + 8.0)
+
+
 @pytest.mark.slow
 def test_a_filter_is_fitted_and_a_network_trained(unseen, lessons):
     """From noisy references alone: the fit helps at once, training lowers the error, one seed gives one model."""
@@ -182,8 +194,6 @@ def test_hard_smoke(device: str):
     assert torch.isfinite(made).all() and 0.1 < float(made.max()) <= 6.0
     half = replace(plume(device=device), density=plume(device=device).density.half())
     assert torch.isfinite(scatter(half, camera, [Light((1, 1, 1))]).shade()).all()
-    with pytest.raises(ValueError, match="g: expected 0"):
-        scatter(plume(), camera, [Light((1, 1, 1))], march=March(g=0.5))
     with pytest.raises(ValueError, match="albedo"):
         scatter(plume(), camera, [Light((1, 1, 1))], (1.0, 2.0, 0.0))
 

@@ -83,6 +83,5 @@ def test_the_command(tmp_path):
         (("--fit", "cube"), "--fit"),
         (("--albedo", 0.9), "--albedo"),
         (("--fit", "sphere", "--supersample", 2), "--supersample"),
-        (("--fit", "sphere", "--albedo", 0.9, "--g", 0.3), "--g"),
     ):
         assert message in fails(*words, *wrong)

@@ -216,8 +216,6 @@ def bake(
         raise WlmError("--supersample: expected 1 with --fit sphere")
     if albedo is not None and fit == "axes":
         raise WlmError("--albedo: expected --fit sphere beside it: along the axes light is scattered once")
-    if albedo is not None and g != 0.0:
-        raise WlmError(f"--g: expected 0 for light of all orders, got {g}")
     frames = options.open(smoke)
     settings = {"step": step, "g": g, "supersample": supersample}
     make, made = partial(bake, **settings), {"made": "bake"} | settings

@@ -27,6 +27,7 @@ BASES, SHIFTED = 9, 3
 FEATURES = 2 * (BASES + (BASES + SHIFTED) * len(SCALES))
 
 _THINNEST = 1e-4  # transparency below which depths count the same
+_STEPS = 130  # through the box, at most, of a march for light of all orders
 _AROUND = 64  # steps through the box that light from all around is marched in, at most
 
 
@@ -47,6 +48,12 @@ class Inputs:
     opacity: torch.Tensor
     cosine: float
     depth: torch.Tensor
+
+
+def orders_march(volume: DensityVolume, g: float = 0.0) -> March:
+    """A march whose steps are a 130th of the smoke's longest edge, or a voxel where those are longer: as `COARSE`, or
+    finer than that was on the smoke of the fit."""
+    return replace(COARSE, step=max(COARSE.step, max(volume.shape) / _STEPS), g=g)
 
 
 def blur(planes: torch.Tensor, sigma: float) -> torch.Tensor:

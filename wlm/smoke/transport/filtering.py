@@ -13,7 +13,7 @@ albedos of `samples.ALBEDOS`, between which it is linear.
 import functools
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +27,7 @@ from wlm.formats.npz import read_npz
 from wlm.interop import device_name, stream
 from wlm.smoke.camera import Camera
 from wlm.smoke.shading import Ramp
-from wlm.smoke.transport.features import COARSE, FEATURES, Inputs, aim, ambient, input_maker
+from wlm.smoke.transport.features import FEATURES, Inputs, aim, ambient, input_maker, orders_march
 from wlm.smoke.transport.lighting import LitSmoke, light_smoke
 from wlm.smoke.transport.lights import AnyLight, checked_albedo
 from wlm.smoke.transport.samples import ALBEDOS
@@ -210,7 +210,7 @@ def scatter(
     lights: Sequence[AnyLight],
     albedo: Sequence[float] = (1.0, 1.0, 1.0),
     *,
-    march: March = COARSE,
+    march: March | None = None,
     model: OrdersModel | None = None,
     network: bool = True,
 ) -> ScatteredSmoke:
@@ -221,26 +221,41 @@ def scatter(
         camera: Any.
         lights: Any number. Each is predicted alone; a point light as if its rays were nearly parallel.
         albedo: R, G, B, the share of light that a scattering leaves, 0 to 1.
-        march: Of the planes; its g must be 0, of which the model was fitted.
+        march: Of the planes. With a g other than 0 light scattered once is that of its phase function, and what is
+            scattered again that of smoke which scatters alike in all directions and is thinner by the share g^2 of
+            what goes straight on (delta-Eddington: Joseph, Wiscombe and Weinman 1976); the farther g is from 0, the
+            less exact. None: `orders_march`.
         model: None: the one that comes with wlm.
         network: Whether the network corrects the filter.
 
     Raises:
-        ValueError: The march's g isn't 0, or not an albedo.
+        ValueError: Not an albedo.
         WlmError: The model that comes with wlm can't be read.
     """
-    if march.g != 0.0:
-        raise ValueError(f"g: expected 0 for light of all orders, got {march.g}")
-    checked_albedo(albedo)
+    colour = checked_albedo(albedo)
+    march = orders_march(volume) if march is None else march
     model = _shipped(volume.device) if model is None else model.to(volume.device)
     with stream(device_name(volume.device)):
         lit = light_smoke(volume, camera, lights, march)
+        even, alike, thinner = lit, volume, colour
+        if march.g != 0.0:
+            # What goes straight on is as if it hadn't been scattered.
+            straight = max(march.g, 0.0) ** 2
+            left = 1.0 - float(colour.mean()) * straight
+            alike = replace(volume, extinction=volume.extinction * left)
+            thinner = (colour * (1.0 - straight) / left).clip(0.0, 1.0)
+            march = replace(march, g=0.0)
+            even = light_smoke(alike, camera, lights, march)
         planes = torch.empty((*lit.planes.shape, 3), device=volume.device)
-        make = input_maker(volume, lit, ambient(volume, camera, march))
+        make = input_maker(alike, even, ambient(alike, camera, march))
         for n in range(len(lights)):
-            planes[n] = model.light(make(n), albedo, network=network)
+            planes[n] = model.light(make(n), thinner, network=network)
             if (factor := aim(lights[n], volume)[1]) != 1.0:
                 planes[n] /= factor
+            if even is not lit:
+                for channel in range(3):
+                    once = colour[channel] * lit.planes[n] - thinner[channel] * even.planes[n]
+                    planes[n, ..., channel] = (planes[n, ..., channel] + once).clamp(min=0.0)
     return ScatteredSmoke(lit, planes)
 
 
