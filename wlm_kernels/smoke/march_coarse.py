@@ -48,6 +48,11 @@ DEPTH = PLANES.index("depth")
 MOST_NODES = 2**28
 """Of a lattice: a long thin box seen along a diagonal has far more than it has voxels."""
 
+AT_ONCE = wp.constant(8)
+"""Nodes of a line that a thread adds up at a time."""
+
+Several = wp.types.vector(length=int(AT_ONCE), dtype=float)
+
 _LEAST_SPACING = 0.25  # voxels between nodes
 _PATTERNS = wp.constant(64)  # of the noise, a power of 2
 _ROUNDING = 1e-6  # by which parts may be longer than asked, rather than one more
@@ -105,12 +110,21 @@ def _add_up(
         last = nodes.shape[0] - 1
         nodes[last, line, k][0] = 0.0
         nodes[0, line, k][1] = 0.0
-        for n in range(last):
-            # From both ends at once: the time is that of one walk along the line.
-            left += gaps[n, line, k][0]
-            right += gaps[last - 1 - n, line, k][0]
-            nodes[n + 1, line, k][1] = left
-            nodes[last - 1 - n, line, k][0] = right
+        # From both ends at once, and several nodes at a time: loads wait for stores before them.
+        for first in range(0, last, AT_ONCE):
+            forth = Several()
+            back = Several()
+            for m in range(AT_ONCE):
+                n = wp.min(first + m, last - 1)
+                forth[m] = gaps[n, line, k][0]
+                back[m] = gaps[last - 1 - n, line, k][0]
+            for m in range(AT_ONCE):
+                n = first + m
+                if n < last:
+                    left += forth[m]
+                    right += back[m]
+                    nodes[n + 1, line, k][1] = left
+                    nodes[last - 1 - n, line, k][0] = right
     else:
         i = line - across
         top = float(0.0)
@@ -118,11 +132,20 @@ def _add_up(
         last = nodes.shape[1] - 1
         nodes[i, last, k][2] = 0.0
         nodes[i, 0, k][3] = 0.0
-        for n in range(last):
-            bottom += gaps[i, n, k][1]
-            top += gaps[i, last - 1 - n, k][1]
-            nodes[i, n + 1, k][3] = bottom
-            nodes[i, last - 1 - n, k][2] = top
+        for first in range(0, last, AT_ONCE):
+            forth = Several()
+            back = Several()
+            for m in range(AT_ONCE):
+                n = wp.min(first + m, last - 1)
+                forth[m] = gaps[i, n, k][1]
+                back[m] = gaps[i, last - 1 - n, k][1]
+            for m in range(AT_ONCE):
+                n = first + m
+                if n < last:
+                    bottom += forth[m]
+                    top += back[m]
+                    nodes[i, n + 1, k][3] = bottom
+                    nodes[i, last - 1 - n, k][2] = top
 
 
 @functools.cache

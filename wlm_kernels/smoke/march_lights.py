@@ -30,7 +30,7 @@ from wlm_kernels.smoke.march import (
     phase,
     size_of,
 )
-from wlm_kernels.smoke.march_coarse import MOST_NODES, by_bricks, gaps_along, noise, parts_of
+from wlm_kernels.smoke.march_coarse import AT_ONCE, MOST_NODES, Several, by_bricks, gaps_along, noise, parts_of
 from wlm_kernels.smoke.settings import March
 
 _OPTIONS = {"enable_backward": False}
@@ -102,11 +102,21 @@ def _add_up(
     behind = float(0.0)
     nodes[last, j, k][0] = 0.0
     nodes[0, j, k][1] = 0.0
-    for n in range(last):
-        behind += gaps[n, j, k]
-        ahead += gaps[last - 1 - n, j, k]
-        nodes[n + 1, j, k][1] = behind
-        nodes[last - 1 - n, j, k][0] = ahead
+    # Some at a time: the loads of one wait for the stores of those before, and not for each other.
+    for first in range(0, last, AT_ONCE):
+        forth = Several()
+        back = Several()
+        for m in range(AT_ONCE):
+            n = wp.min(first + m, last - 1)
+            forth[m] = gaps[n, j, k]
+            back[m] = gaps[last - 1 - n, j, k]
+        for m in range(AT_ONCE):
+            n = first + m
+            if n < last:
+                behind += forth[m]
+                ahead += back[m]
+                nodes[n + 1, j, k][1] = behind
+                nodes[last - 1 - n, j, k][0] = ahead
 
 
 @dataclass(frozen=True)
