@@ -96,7 +96,7 @@ def test_other_smoke_other_lights_other_cameras(device: str, kind: str):
     assert psnr(scale * made.shade(), scale * wanted.total) > psnr(scale * once, scale * wanted.total) + 6.0
 
 
-@pytest.mark.parametrize(("g", "least"), [(-0.3, 33.0), (0.3, 31.0), (0.6, 24.0)])
+@pytest.mark.parametrize(("g", "least"), [(-0.3, 30.0), (0.3, 30.0), (0.6, 23.0)])
 def test_light_that_is_scattered_onward_or_back(device: str, g: float, least: float):
     """Of a phase function that the filter wasn't fitted to: 8 dB nearer than light scattered once."""
     volume = plume(device=device)

@@ -69,10 +69,17 @@ class OrdersModel:
     arrays: dict[str, torch.Tensor]
 
     def to(self, device: torch.device | str) -> "OrdersModel":
-        """The same on a device."""
-        if self.arrays["weights"].device == torch.device(device):
+        """The same on a device: copied there once."""
+        device = torch.device(device)
+        if self.arrays["weights"].device == device:
             return self
-        return OrdersModel({name: array.to(device) for name, array in self.arrays.items()})
+        if device not in self._elsewhere:
+            self._elsewhere[device] = OrdersModel({name: array.to(device) for name, array in self.arrays.items()})
+        return self._elsewhere[device]
+
+    @functools.cached_property
+    def _elsewhere(self) -> dict[torch.device, "OrdersModel"]:
+        return {}
 
     @functools.cached_property
     def gates(self) -> tuple[float, ...]:
@@ -234,7 +241,7 @@ def scatter(
     """
     colour = checked_albedo(albedo)
     march = orders_march(volume) if march is None else march
-    model = _shipped(volume.device) if model is None else model.to(volume.device)
+    model = (_shipped() if model is None else model).to(volume.device)
     with stream(device_name(volume.device)):
         lit = light_smoke(volume, camera, lights, march)
         even, alike, thinner = lit, volume, colour
@@ -260,5 +267,5 @@ def scatter(
 
 
 @functools.cache
-def _shipped(device: torch.device) -> OrdersModel:
-    return load_orders().to(device)
+def _shipped() -> OrdersModel:
+    return load_orders()

@@ -96,8 +96,8 @@ class LitSmoke:
             image += self.emission[..., None] if ramp is None else ramp(self.emission)
         if background is None:
             return image
-        if isinstance(background, torch.Tensor):
-            return image + self.transparency[..., None] * background.to(image)
+        if isinstance(background, torch.Tensor) or np.ndim(background) > 1:
+            return image + self.transparency[..., None] * torch.as_tensor(background).to(image)
         return _add(image, self.transparency[..., None].expand_as(image), background)
 
 
