@@ -5,8 +5,8 @@ a sequence of PNGs, the three side by side, and a contact sheet. The network is 
 `--network`; `--train` trains a small one first, for half a minute.
 
 The coarse march is the network's guide as it is. On grids as small as these its steps are shorter than a voxel, so that
-it is nearer to the fine march than the network is, which has learned from 128 to 400 voxels and 205 to 1,024 pixels
-along an edge.
+it is nearer to the fine march than a network is that has learned from 128 to 400 voxels and 205 to 1,024 pixels along
+an edge: the gate takes little of it here, and no frame may be worse than its guide.
 
     python demos/smoke_network.py
 """
@@ -51,9 +51,8 @@ RESOLUTION, FRAMES = 128, 6
 RATES = {"jet-sphere": 1.5, "jet-moving": 1.5, "explosion": 6.0}  # frames a second
 TURNED, TURN = "jet-sphere", 90.0  # degrees by which its camera turns; its lights turn the other way
 
-# Least PSNR on each scene, dB in sRGB: of the network that comes with wlm, of the one trained here, and of any other;
-# some decibels below what the first two reach on the worst of the scenes.
-LEAST_SHIPPED, LEAST_TRAINED, LEAST_OTHER = 43.0, 42.0, 20.0
+# By how many dB a frame by the network may be worse than its guide. A network of a guide that isn't lightmaps has none.
+MOST_LOST = 0.1
 # Largest mean light of a network's lightmaps where the fine march sees no smoke.
 MOST_STRAY = 1e-3
 
@@ -88,9 +87,7 @@ def render(
     }
 
 
-def light(
-    out: Path, name: str, scene: Scene, model: SmokeModel, least: float, turn: float, device: str
-) -> dict[str, float]:
+def light(out: Path, name: str, scene: Scene, model: SmokeModel, turn: float, device: str) -> dict[str, float]:
     """Simulates a scene, lights its frames by each method, and scores these against the fine march."""
     predictor = SmokePredictor(model, device)
     simulate(open_frames(out / name, scene), device=device)
@@ -114,8 +111,13 @@ def light(
     write_sequence(out / f"{name}_frames", [np.concatenate(images, 1) for images in zip(*rows.values(), strict=True)])
     contact_sheet(out / f"{name}.png", rows, [f"{scene.time(number):.2g} s" for number in footage.numbers])
     mean = {method: sum(values) / len(values) for method, values in scores.items()}
-    if not mean["network, dB"] >= least:
-        raise WlmError(f"demo: {name}: expected the network to reach {least} dB, got {mean['network, dB']:.2f}")
+    if model.settings.guide == "six":
+        pairs = zip(footage.numbers, scores["network, dB"], scores["coarse march, dB"], strict=True)
+        for number, made, given in pairs:
+            if not made >= given - MOST_LOST:
+                raise WlmError(
+                    f"demo: {name}: frame {number}: expected {given:.2f} dB by the network, got {made:.2f} dB"
+                )
     return mean | {"network's worst frame, dB": min(scores["network, dB"])}
 
 
@@ -178,14 +180,14 @@ def main() -> None:
         args.out.mkdir(parents=True, exist_ok=True)
         device = check_device(args.device)
         if args.train:
-            model, least = train(SMALL, args.out / "network.safetensors", device=device).model, LEAST_TRAINED
+            model = train(SMALL, args.out / "network.safetensors", device=device).model
         else:
-            model, least = open_network(args.network), LEAST_OTHER if args.network else LEAST_SHIPPED
+            model = open_network(args.network)
         figures = {}
         for name in RATES:
             scene = few_frames(name, args.scale, args.refine, args.resolution)
             turn = TURN if name == TURNED else 0.0
-            figures[name] = light(args.out, name, scene, model, least, turn, device)
+            figures[name] = light(args.out, name, scene, model, turn, device)
         figures["all"] = {"seconds": time.perf_counter() - clock}
         atomic_write(args.out / "report.json", (json.dumps(figures, indent=1) + "\n").encode())
     except (WlmError, OSError) as error:

@@ -219,4 +219,13 @@ def _side_stream(device: str) -> tuple[torch.cuda.Stream, wp.Stream]:
     # Warp looks a stream's device up in a table that it makes when it starts, and this may be its first call.
     wp.init()
     side = torch.cuda.Stream(device)
-    return side, wp.stream_from_torch(side)
+    return side, warp_stream(side)
+
+
+@cache
+def warp_stream(stream: torch.cuda.Stream) -> wp.Stream:
+    """A stream of torch as Warp knows it, the same one at every use.
+
+    One for all uses: when a second wrapper of a stream is deleted, Warp forgets the stream and can't capture on it.
+    """
+    return wp.stream_from_torch(stream)

@@ -24,7 +24,7 @@ from wlm.smoke.learn.pool import load_pool
 from wlm.smoke.learn.settings import DatasetSettings
 from wlm.smoke.learn.trainer import Trainer
 from wlm.smoke.model import SmokeModel
-from wlm.smoke.planes import GUIDES, decode_lightmaps, render_guide
+from wlm.smoke.planes import GUIDES, encode_lightmaps, render_guide
 from wlm_kernels.smoke.settings import March
 
 PROFILE = {
@@ -143,9 +143,12 @@ def test_predict_marches_as_in_training(network, volume, tmp_path):
     # A tenth of the 24 voxels of the longest edge.
     march = March(2.4, seed=4, threshold=4.0 / 24)
     guide = render_guide(load_frames(volume).load(1), six.camera, "six", march)
-    expected = decode_lightmaps(wlm.load(network).decoder(height=20, width=six.camera.width)(guide))
-    for name in ("lightmaps", "transparency", "emission"):
-        torch.testing.assert_close(getattr(six, name), getattr(expected, name), rtol=1e-3, atol=1e-4)
+    planes = wlm.load(network).decoder(height=20, width=six.camera.width)(guide)
+    # What its gate leaves of it: one share of all lightmaps, of the way from the guide to the network.
+    change, made = (planes - guide[[*range(6), 7, 6]])[:6], (encode_lightmaps(six) - guide[[*range(6), 7, 6]])[:6]
+    share = float((change * made).sum() / change.square().sum().clamp(min=1e-9))
+    assert -1e-3 <= share <= 1.001
+    torch.testing.assert_close(made, share * change, rtol=1e-2, atol=1e-3)
     call("smoke", "predict", volume, "-o", out, "--network", network, "--resolution", 20, "--seed", 5)
     assert not torch.equal(read_six_way(out).lightmaps, six.lightmaps)
     # As what bake wrote.
@@ -174,17 +177,11 @@ def test_without_a_network_the_one_that_ships_is_used(network, volume, tmp_path,
     assert "8 bytes, 512 x 512 pixels" in call("smoke", "export", "-o", tmp_path / "a.onnx")
 
 
-@pytest.mark.parametrize("resolution, noted", [(20, False), (8, True), (150, True)])
-def test_predict_notes_images_unlike_those_of_training(network, volume, tmp_path, resolution, noted):
-    """A network of images of so many pixels along the box's edge."""
-    call("smoke", "predict", volume, "-o", tmp_path / "a.exr", "--network", network, "--resolution", resolution)
-    assert ("was trained with" in " ".join(call.stderr.split())) == noted
-
-
 def test_predict_frames(network, tmp_path):
     folder = write_frames(tmp_path / "frames").path
     call("smoke", "predict", folder, "-o", tmp_path / "six", "--network", network, "--resolution", 170)
-    assert " ".join(call.stderr.split()).count("was trained with") == 1
+    # One that has learned next to nothing is left out, and one line says so.
+    assert " ".join(call.stderr.split()).count("of the network is taken") == 1
     call("smoke", "predict", folder, "-o", tmp_path / "six", "--network", network, "--resolution", 17)
     assert sorted(os.listdir(tmp_path / "six")) == [f"six_{i:04d}.exr" for i in (1, 2, 3)]
     assert read_six_way(tmp_path / "six" / "six_0002.exr").lightmaps.shape == (6, 17, 17)

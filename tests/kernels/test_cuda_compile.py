@@ -52,6 +52,7 @@ MODULES = (
     "raster.rays",
     "raster.texture",
     "smoke.picture",
+    "smoke.scales",
     "smoke.shadow",
     "smoke.single_scatter",
 )
@@ -171,7 +172,8 @@ def test_coarse_marching(dtype: type, hot: bool, tmp_path: Path):
 def test_lights_and_paths(dtype: type, tmp_path: Path):
     """The march to lights, and the path tracer."""
     _compile_all(vars(march_lights.light_kernels(dtype)).values(), tmp_path / "lights")
-    _compile_all(vars(path.path_kernels(dtype)).values(), tmp_path / "path")
+    for solid in (False, True):
+        _compile_all(vars(path.path_kernels(dtype, solid)).values(), tmp_path / f"path{solid}")
 
 
 LATTICE_STEPS = (

@@ -47,8 +47,8 @@ def test_a_predictor_for_many_frames(smoke):
     again = [predictor(smoke, camera, 1) for camera in cameras]
     assert all(torch.equal(a.lightmaps, b.lightmaps) for a, b in zip(first, again, strict=True))
     assert not torch.equal(predictor(smoke, cameras[0], 2).lightmaps, first[0].lightmaps)
-    assert "the coarse march may be nearer" in predictor.warning(smoke, cameras[0])
-    assert predictor.warning(smoke, wlm.smoke.Camera.around(smoke, pixels=512)) is None
+    # Of smoke as smooth as this, on a grid as small, the march says all.
+    assert float(predictor.share) < 0.2 and "the coarse march that it reads is as near or nearer" in predictor.note()
 
 
 @pytest.mark.parametrize("options", [{}, {"perspective": True}, {"aspect": 2.0, "toward": (0, 1, 0)}])

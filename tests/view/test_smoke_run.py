@@ -1,12 +1,17 @@
 """The light of frames by a graph: on every device the picture of each."""
 
+from dataclasses import replace
+
+import pytest
 import torch
 from builders.smoke_plumes import SPHERE, plume
 
+from wlm.smoke.replay import VolumeGraph
 from wlm.smoke.scene import CameraSettings, LightSettings, ObstacleSettings, make_camera
+from wlm.smoke.transport.filtering import scatter
 from wlm.view.smoke import picture
 from wlm.view.smoke_drawing import Drawing
-from wlm.view.smoke_run import FrameGraph, Lighting
+from wlm.view.smoke_run import Lighting
 
 
 def test_a_graph_draws_each_frame(device):
@@ -16,7 +21,7 @@ def test_a_graph_draws_each_frame(device):
     lights = [LightSettings(toward=toward).light() for toward in ((1, 1, 1), (-1, 0, 1))]
     parts = {"background": (0.1, 0.2, 0.3), "obstacles": [ObstacleSettings.model_validate(SPHERE)]}
     drawing, lighting = Drawing(camera, lights, **parts, device=device), Lighting(step=1.0)
-    graph, seen = FrameGraph(lighting, camera, drawing, device), []
+    graph, seen = VolumeGraph(lambda volume: drawing(lighting(volume, camera, True)), device), []
     for number, volume in enumerate(volumes + volumes):
         drawing.move(0.1 * number)
         graph(volume)
@@ -24,3 +29,17 @@ def test_a_graph_draws_each_frame(device):
         expected = picture(lighting(volume, camera, True), lights, **parts, time=0.1 * number)
         torch.testing.assert_close(seen[-1], expected)
     assert not torch.equal(seen[0], seen[3]) and not torch.equal(seen[1], seen[2])
+
+
+def test_a_graph_scatters_all_orders(device):
+    """As without one; smoke of another size is refused."""
+    volumes = [plume(frame, device=device) for frame in (1, 2, 3, 4)]
+    camera = make_camera(CameraSettings(resolution=24), volumes[0].origin, volumes[0].size)
+    lights = [LightSettings(toward=(1, 1, 1)).light()]
+    graph = VolumeGraph(lambda volume: scatter(volume, camera, lights, (0.95, 0.9, 0.8)), device)
+    for volume in volumes:
+        made = graph(volume).shade(background=(0.1, 0.2, 0.3))
+        expected = scatter(volume, camera, lights, (0.95, 0.9, 0.8)).shade(background=(0.1, 0.2, 0.3))
+        torch.testing.assert_close(made, expected)
+    with pytest.raises(ValueError, match="volume: expected"):
+        graph(replace(volumes[0], extinction=2.0))

@@ -28,6 +28,7 @@ from wlm.cli.smoke_options import (
     SmokeOptions,
     march_frames,
     outputs,
+    place_and_colour,
     vector,
     with_smoke,
     write_lightmaps,
@@ -192,6 +193,13 @@ def bake(
     step: Annotated[float, typer.Option(min=0.01, max=1000.0, help="The longest step in voxels.")] = 0.5,
     supersample: Annotated[int, typer.Option(min=1, max=16, help="Rays along a pixel's edge.")] = 1,
     g: _G = March.g,
+    fit: Annotated[
+        str, typer.Option(help="axes: exact for lights along these; sphere: nearest to lights all round.")
+    ] = "axes",
+    albedo: Annotated[
+        float | None,
+        typer.Option(min=0.0, max=1.0, help="With --fit sphere: light of all orders; default once."),
+    ] = None,
     resume: Resume = False,
 ) -> None:
     """Make six-way lightmaps by a fine march, and say how far a step twice as long is from them.
@@ -202,10 +210,21 @@ def bake(
     quiet_warp()
     from wlm.smoke.baking import bake
 
+    if fit not in ("axes", "sphere"):
+        raise WlmError(f"--fit: expected axes or sphere, got {fit!r}")
+    if fit == "sphere" and supersample > 1:
+        raise WlmError("--supersample: expected 1 with --fit sphere")
+    if albedo is not None and fit == "axes":
+        raise WlmError("--albedo: expected --fit sphere beside it: along the axes light is scattered once")
     frames = options.open(smoke)
     settings = {"step": step, "g": g, "supersample": supersample}
     make, made = partial(bake, **settings), {"made": "bake"} | settings
-    write_lightmaps(frames, options.camera(frames), output, make, made, resume=resume, errors=True)
+    if fit == "sphere":
+        from wlm.smoke.transport.sphere import bake_sphere
+
+        make = partial(bake_sphere, march=March(step, jitter=0.0, g=g), albedo=albedo)
+        made |= {"fit": fit, "albedo": albedo}
+    write_lightmaps(frames, options.camera(frames), output, make, made, resume=resume, errors=fit == "axes")
 
 
 @app.command()
@@ -338,14 +357,11 @@ def flipbook(
 
 
 def _light(text: str) -> "Light":
-    """A light of `X,Y,Z[:R,G,B]` or `X,Y,Z[:E]`, a white one."""
+    """A light of `place_and_colour`."""
     from wlm.config import check_settings
     from wlm.smoke.scene import LightSettings
 
-    toward, colon, irradiance = text.partition(":")
-    values = {"toward": vector("--light", toward)}
-    if colon:
-        values["irradiance"] = vector("--light", irradiance if "," in irradiance else ",".join([irradiance] * 3))
+    values = dict(zip(("toward", "irradiance"), place_and_colour("--light", text), strict=False))
     return check_settings(LightSettings, values, "--light: ").light()
 
 

@@ -8,7 +8,7 @@ import typer
 
 from wlm.cli.console import check_output, escape, exclusive, note, number, quiet_warp, running, show, table
 from wlm.cli.options import Seed, output_option
-from wlm.cli.smoke_options import SHEET, Input, SmokeOptions, outputs, vector, with_smoke
+from wlm.cli.smoke_options import SHEET, Input, SmokeOptions, outputs, place_and_colour, vector, with_smoke
 from wlm.errors import WlmError
 
 if TYPE_CHECKING:
@@ -29,6 +29,7 @@ _Points = Annotated[
 _Albedo = Annotated[
     str, typer.Option(metavar="R,G,B", help="Share of light that a scattering leaves, one number or three.")
 ]
+_G = Annotated[float, typer.Option(min=-0.99, max=0.99, help="Mean cosine of the Henyey-Greenstein phase function.")]
 _White = Annotated[float, typer.Option(help="The light that becomes white.")]
 
 
@@ -47,11 +48,15 @@ def light(
     lights: _Lights = None,
     points: _Points = None,
     albedo: _Albedo = "1",
+    g: _G = 0.0,
     orders: Annotated[str, typer.Option(help="all: light that is scattered again too; single: once alone.")] = "all",
     model: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Of all orders; default the one that comes with wlm.")
     ] = None,
-    step: Annotated[float, typer.Option(min=0.01, max=1000.0, help="In voxels.")] = 1.0,
+    step: Annotated[
+        float | None,
+        typer.Option(min=0.01, max=1000.0, help="In voxels; default 1, or 1/130 of the longest edge if that is more."),
+    ] = None,
     perspective: Annotated[bool, typer.Option("--perspective", help="Rays meet in the eye.")] = False,
     background: Annotated[str | None, typer.Option(metavar="R,G,B", help="Linear colour behind the smoke.")] = None,
     white: _White = 1.0,
@@ -70,6 +75,7 @@ def light(
     _check_white(white)
     own = _lights(lights, points)
     quiet_warp()
+    from wlm.smoke.transport.features import orders_march
     from wlm.smoke.transport.filtering import load_orders, scatter
     from wlm.smoke.transport.lighting import light_smoke
     from wlm.view.atlas import save_png
@@ -79,7 +85,7 @@ def light(
 
     frames = options.open(smoke)
     camera = options.camera(frames, orthographic=False, perspective=perspective)
-    march, lamps = March(step=step, jitter=0.0), own or _scene_lights(frames.scene)
+    lamps = own or _scene_lights(frames.scene)
     network = load_orders(model) if orders == "all" else None
     file = outputs(smoke, frames.single, output, "light", ".png")
     rows = table(str(smoke), ["file", "covered", "mean", "largest", "clipped"])
@@ -89,6 +95,7 @@ def light(
             for warning in volume.warnings:
                 note(f"warning: {warning}")
             view = frames.view(camera, volume)
+            march = orders_march(volume, g) if step is None else March(step=step, jitter=0.0, g=g)
             if network is None:
                 made = light_smoke(volume, view, lamps, march)
             else:
@@ -122,9 +129,7 @@ def trace(
     points: _Points = None,
     sky: Annotated[str | None, typer.Option(metavar="R,G,B", help="Light from all around, seen too.")] = None,
     albedo: _Albedo = "1",
-    g: Annotated[
-        float, typer.Option(min=-0.99, max=0.99, help="Mean cosine of the Henyey-Greenstein phase function.")
-    ] = 0.0,
+    g: _G = 0.0,
     samples: Annotated[int, typer.Option(min=2, max=2**20, help="Paths a pixel.")] = 64,
     orders: Annotated[
         int, typer.Option(min=0, max=1000, help="Orders of scattering with channels of their own in an EXR.")
@@ -234,7 +239,7 @@ def _checked(option: str, make: Callable[[], Any]) -> Any:
 
 
 def _lights(directions: list[str] | None, places: list[str] | None) -> "list[AnyLight]":
-    """Lights of `X,Y,Z[:R,G,B]` or `X,Y,Z[:E]`, white ones."""
+    """Lights of `place_and_colour`."""
     from wlm.smoke.camera import unit
     from wlm.smoke.shading import Light
     from wlm.smoke.transport.lights import PointLight, checked_colour
@@ -242,10 +247,8 @@ def _lights(directions: list[str] | None, places: list[str] | None) -> "list[Any
     made: list[AnyLight] = []
     for option, texts in (("--light", directions), ("--point", places)):
         for text in texts or ():
-            place, colon, colour = text.partition(":")
-            values = [vector(option, place)]
-            if colon:
-                values.append(vector(option, colour if "," in colour else ",".join([colour] * 3)))
+            values = place_and_colour(option, text)
+            if len(values) == 2:
                 _checked(option, lambda values=values: checked_colour("colour", values[1]))
             if option == "--light":
                 _checked(option, lambda values=values: unit(values[0], "direction"))

@@ -278,17 +278,18 @@ def _coarse(step: float | None, seed: int) -> "Callable[[DensityVolume, Camera],
 
 
 def _predicted(model: "SmokeModel", seed: int, device: str) -> "Callable[[DensityVolume, Camera], SixWay]":
-    """Makes lightmaps by a network; notes once where it wasn't trained for the image's size."""
+    """Makes lightmaps by a network; notes once where little of it is taken."""
     from wlm.smoke.prediction import SmokePredictor
 
     predictor, first = SmokePredictor(model, device), True
 
     def make(volume: "DensityVolume", camera: "Camera") -> "SixWay":
         nonlocal first
-        if first and (warning := predictor.warning(volume, camera)):
-            note(warning)
+        six = predictor(volume, camera, seed)
+        if first and (line := predictor.note()):
+            note(line)
         first = False
-        return predictor(volume, camera, seed)
+        return six
 
     return make
 

@@ -148,6 +148,19 @@ def _check_folder(smoke: Path, output: Path) -> None:
         raise WlmError(f"{output}: expected another folder than that of the frames")
 
 
+def place_and_colour(option: str, text: str) -> list[tuple[float, float, float]]:
+    """The numbers of `X,Y,Z[:R,G,B]`, or of `X,Y,Z[:E]` for a white light: one or two triples, not checked.
+
+    Raises:
+        WlmError: They aren't numbers.
+    """
+    place, colon, colour = text.partition(":")
+    values = [vector(option, place)]
+    if colon:
+        values.append(vector(option, colour if "," in colour else ",".join([colour] * 3)))
+    return values
+
+
 def march_frames(
     frames: "Frames",
     camera: "CameraSettings",

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 import warp as wp
 
-from wlm.interop import to_warp
+from wlm.interop import to_warp, warp_stream
 
 Shape = tuple[int | None, ...]
 """Sizes of a tensor's axes; None: any."""
@@ -75,7 +75,7 @@ def on_stream(device: torch.device) -> AbstractContextManager:
     wp.init()
     if device.type == "cpu":
         return nullcontext()
-    return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device)), sync_enter=False)
+    return wp.ScopedStream(warp_stream(torch.cuda.current_stream(device)), sync_enter=False)
 
 
 def dense(tensor: torch.Tensor) -> torch.Tensor:

@@ -34,8 +34,12 @@ def run(
     with stream(device_name(volume.device)):
         size = (*planes, camera.height, camera.width)
         out = torch.empty(size, dtype=torch.float32, device=volume.device)
-        density, temperature = volume.arrays()
-        factors = (volume.extinction * volume.voxel, temperature, volume.emission * volume.voxel)
-        medium = Medium(density, *factors, empty=torch_memory(volume.device))
-        launch(medium, camera.view(volume), *arguments, to_warp(out), **options)
+        launch(medium_of(volume), camera.view(volume), *arguments, to_warp(out), **options)
     return out
+
+
+def medium_of(volume: DensityVolume) -> Medium:
+    """The smoke as marches take it, inside `wlm.interop.stream`."""
+    density, temperature = volume.arrays()
+    factors = (volume.extinction * volume.voxel, temperature, volume.emission * volume.voxel)
+    return Medium(density, *factors, empty=torch_memory(volume.device))

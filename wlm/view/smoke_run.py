@@ -9,16 +9,15 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-import torch
 import warp as wp
 
 from wlm.fluid.volume import DensityVolume
-from wlm.interop import StepGraph, stream
 from wlm.smoke.camera import Camera
 from wlm.smoke.coarse import march
 from wlm.smoke.guiding import guide
 from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.prediction import SmokePredictor
+from wlm.smoke.replay import VolumeGraph
 from wlm.smoke.scene import Scene, make_camera
 from wlm.smoke.simulation import advance, make_solver, volume_of
 from wlm.system import Meter, OnProgress
@@ -103,7 +102,10 @@ def run(
     looks = scene.looks(1)
     parts = {"background": looks.background, "ramp": looks.ramp, "obstacles": looks.obstacles}
     drawing = Drawing(camera, [light.light() for light in looks.lights], **parts, device=device)
-    graph = FrameGraph(lighting, camera, drawing, device) if lighting.network is None and device != "cpu" else None
+    graph = None
+    if lighting.network is None and device != "cpu":
+        # Frames before have loaded the kernels.
+        graph = VolumeGraph(lambda volume: drawing(lighting(volume, camera, True)), device, warmup=1)
     meter = Meter(progress, "run", scene.frames)
     for number in range(1, scene.frames + 1):
         clock = _Clock(device)
@@ -141,42 +143,6 @@ class _Clock:
     def _now(self) -> float:
         wp.synchronize_device(self._device)
         return time.perf_counter()
-
-
-class FrameGraph:
-    """Lightmaps and picture of frames in one graph: captured at the second call on CUDA, and replayed from then on.
-
-    It reads a copy of the smoke, since that of a solver moves.
-    """
-
-    def __init__(self, lighting: Lighting, camera: Camera, drawing: Drawing, device: str) -> None:
-        """Makes it.
-
-        Args:
-            lighting: By a march.
-            camera: Orthographic; that of the drawing.
-            drawing: Whose `image` each call fills.
-            device: As `wlm.interop.check_device` returns it; its kernels should have run once.
-        """
-        self._lighting, self._camera, self._drawing = lighting, camera, drawing
-        self._volume: DensityVolume | None = None
-        self._device = device
-        # Frames before have loaded the kernels.
-        self._step = StepGraph(self._work, device, warmup=1)
-
-    def __call__(self, volume: DensityVolume) -> None:
-        """Draws a frame of smoke, of the first one's shape, place and factors."""
-        with stream(self._device):
-            if self._volume is None:
-                heat = None if volume.temperature is None else torch.empty_like(volume.temperature)
-                self._volume = replace(volume, density=torch.empty_like(volume.density), temperature=heat)
-            self._volume.density.copy_(volume.density)
-            if volume.temperature is not None:
-                self._volume.temperature.copy_(volume.temperature)
-        self._step()
-
-    def _work(self) -> None:
-        self._drawing(self._lighting(self._volume, self._camera, True))
 
 
 def write_all(frames: Iterator[Frame], write: Callable[[int, np.ndarray], None]) -> dict[str, list[float]]:

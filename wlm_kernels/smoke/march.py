@@ -274,23 +274,37 @@ def occupied_kernel(dtype: Any) -> wp.Kernel:
     """Builds (once) the kernel for densities of a type, `wp.float32` or `wp.float16`."""
 
     @wp.kernel(module="unique", module_options=_OPTIONS)
-    def occupied(
+    def rows(
         # in:
         density: wp.array3d[dtype],
         # out:
-        bricks: wp.array3d[wp.uint8],
+        out: wp.array3d[wp.uint8],
     ):
-        a, b, c = wp.tid()
+        """Smoke in a row of voxels as long as a brick, and the voxel beyond either end."""
+        i, j, c = wp.tid()
         smoke = wp.uint8(0)
-        # A point in a brick reads half a voxel beyond it too.
-        for i in range(wp.max(a * BRICK - 1, 0), wp.min((a + 1) * BRICK + 1, density.shape[0])):
-            for j in range(wp.max(b * BRICK - 1, 0), wp.min((b + 1) * BRICK + 1, density.shape[1])):
-                for k in range(wp.max(c * BRICK - 1, 0), wp.min((c + 1) * BRICK + 1, density.shape[2])):
-                    if float(density[i, j, k]) > 0.0:
-                        smoke = wp.uint8(1)
-        bricks[a, b, c] = smoke
+        for k in range(wp.max(c * BRICK - 1, 0), wp.min((c + 1) * BRICK + 1, density.shape[2])):
+            if float(density[i, j, k]) > 0.0:
+                smoke = wp.uint8(1)
+        out[i, j, c] = smoke
 
-    return occupied
+    return rows
+
+
+@wp.kernel(module="unique", module_options=_OPTIONS)
+def _bricks_of_rows(
+    # in:
+    rows: wp.array3d[wp.uint8],
+    # out:
+    bricks: wp.array3d[wp.uint8],
+):
+    a, b, c = wp.tid()
+    smoke = wp.uint8(0)
+    # A point in a brick reads half a voxel beyond it too.
+    for i in range(wp.max(a * BRICK - 1, 0), wp.min((a + 1) * BRICK + 1, rows.shape[0])):
+        for j in range(wp.max(b * BRICK - 1, 0), wp.min((b + 1) * BRICK + 1, rows.shape[1])):
+            smoke = wp.max(smoke, rows[i, j, c])
+    bricks[a, b, c] = smoke
 
 
 def occupied(medium: Medium) -> wp.array:
@@ -301,8 +315,10 @@ def occupied(medium: Medium) -> wp.array:
     """
     density = medium.density
     shape = tuple(-(-n // BRICK) for n in density.shape)
-    bricks = medium.buffer(shape, wp.uint8)
-    wp.launch(occupied_kernel(density.dtype), shape, [density], [bricks], device=density.device)
+    # By rows first: neighbouring threads then read neighbouring voxels, each of them once.
+    rows, bricks = medium.buffer((*density.shape[:2], shape[2]), wp.uint8), medium.buffer(shape, wp.uint8)
+    wp.launch(occupied_kernel(density.dtype), rows.shape, [density], [rows], device=density.device)
+    wp.launch(_bricks_of_rows, shape, [rows], [bricks], device=density.device)
     return bricks
 
 

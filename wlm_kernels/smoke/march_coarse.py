@@ -45,8 +45,15 @@ PLANES = ("right", "left", "top", "bottom", "front", "back", "transparency", "em
 
 DEPTH = PLANES.index("depth")
 
+MOST_NODES = 2**28
+"""Of a lattice: a long thin box seen along a diagonal has far more than it has voxels."""
+
+AT_ONCE = wp.constant(8)
+"""Nodes of a line that a thread adds up at a time."""
+
+Several = wp.types.vector(length=int(AT_ONCE), dtype=float)
+
 _LEAST_SPACING = 0.25  # voxels between nodes
-_MOST_NODES = 2**28  # a long thin box seen along a diagonal has far more than it has voxels
 _PATTERNS = wp.constant(64)  # of the noise, a power of 2
 _ROUNDING = 1e-6  # by which parts may be longer than asked, rather than one more
 
@@ -60,7 +67,7 @@ class _Lattice:
 
 
 @wp.func
-def _sample(density: wp.array3d[Any], bricks: wp.array3d[wp.uint8], p: wp.vec3) -> float:
+def by_bricks(density: wp.array3d[Any], bricks: wp.array3d[wp.uint8], p: wp.vec3) -> float:
     """The density, by bricks where there are any: the same number."""
     if bricks.shape[0] > 0:
         return sample(density, bricks, p)
@@ -103,12 +110,21 @@ def _add_up(
         last = nodes.shape[0] - 1
         nodes[last, line, k][0] = 0.0
         nodes[0, line, k][1] = 0.0
-        for n in range(last):
-            # From both ends at once: the time is that of one walk along the line.
-            left += gaps[n, line, k][0]
-            right += gaps[last - 1 - n, line, k][0]
-            nodes[n + 1, line, k][1] = left
-            nodes[last - 1 - n, line, k][0] = right
+        # From both ends at once, and several nodes at a time: loads wait for stores before them.
+        for first in range(0, last, AT_ONCE):
+            forth = Several()
+            back = Several()
+            for m in range(AT_ONCE):
+                n = wp.min(first + m, last - 1)
+                forth[m] = gaps[n, line, k][0]
+                back[m] = gaps[last - 1 - n, line, k][0]
+            for m in range(AT_ONCE):
+                n = first + m
+                if n < last:
+                    left += forth[m]
+                    right += back[m]
+                    nodes[n + 1, line, k][1] = left
+                    nodes[last - 1 - n, line, k][0] = right
     else:
         i = line - across
         top = float(0.0)
@@ -116,11 +132,20 @@ def _add_up(
         last = nodes.shape[1] - 1
         nodes[i, last, k][2] = 0.0
         nodes[i, 0, k][3] = 0.0
-        for n in range(last):
-            bottom += gaps[i, n, k][1]
-            top += gaps[i, last - 1 - n, k][1]
-            nodes[i, n + 1, k][3] = bottom
-            nodes[i, last - 1 - n, k][2] = top
+        for first in range(0, last, AT_ONCE):
+            forth = Several()
+            back = Several()
+            for m in range(AT_ONCE):
+                n = wp.min(first + m, last - 1)
+                forth[m] = gaps[i, n, k][1]
+                back[m] = gaps[i, last - 1 - n, k][1]
+            for m in range(AT_ONCE):
+                n = first + m
+                if n < last:
+                    bottom += forth[m]
+                    top += back[m]
+                    nodes[i, n + 1, k][3] = bottom
+                    nodes[i, last - 1 - n, k][2] = top
 
 
 @functools.cache
@@ -149,11 +174,11 @@ def coarse_kernels(dtype: Any, hot: bool):
         d = lattice.gap[0] / float(parts[0])
         if i < gaps.shape[0] - 1:
             for n in range(parts[0]):
-                right += d * _sample(density, bricks, p + (float(n) + 0.5) * d * view.right)
+                right += d * by_bricks(density, bricks, p + (float(n) + 0.5) * d * view.right)
         d = lattice.gap[1] / float(parts[1])
         if j < gaps.shape[1] - 1:
             for n in range(parts[1]):
-                up += d * _sample(density, bricks, p + (float(n) + 0.5) * d * view.up)
+                up += d * by_bricks(density, bricks, p + (float(n) + 0.5) * d * view.up)
         gaps[i, j, k] = extinction * wp.vec2(right, up)
 
     @wp.kernel(module="unique", module_options=_OPTIONS)
@@ -194,7 +219,7 @@ def coarse_kernels(dtype: Any, hot: bool):
             for n in range(r.count):
                 s = r.first + (float(n) + offset) * dt
                 p = r.origin + s * r.direction
-                sigma = extinction * _sample(density, bricks, p)
+                sigma = extinction * by_bricks(density, bricks, p)
                 if wp.static(hot):
                     # The mean transparency along the step: fire without smoke shines too.
                     x = sigma * dt
@@ -232,13 +257,24 @@ def coarse_kernels(dtype: Any, hot: bool):
     return measure, _add_up, gather
 
 
+def gaps_along(extents: Sequence[float], spacing: float, most: int) -> tuple[int, ...]:
+    """Gaps of a lattice along each axis, no longer than a spacing, or than makes them more than so many in all."""
+    spacing = max(spacing, _LEAST_SPACING)
+    while math.prod(gaps := [parts_of(extent, spacing) for extent in extents]) > most:
+        spacing *= 1.1
+    return tuple(gaps)
+
+
+def parts_of(length: float, step: float) -> int:
+    """Equal parts of a length, no longer than a step, at least one."""
+    return max(math.ceil(length / step - _ROUNDING), 1)
+
+
 def _lattice(shape: Sequence[int], view: View, spacing: float) -> tuple[_Lattice, tuple[int, ...]]:
     """A lattice over all that the camera sees of the smoke's box, or would in a larger image, and its nodes."""
     axes = (view.right, view.up, view.forward)
     extents = [sum((n + 1) * abs(a) for n, a in zip(shape, axis, strict=True)) for axis in axes]
-    spacing = max(spacing, _LEAST_SPACING)
-    while math.prod(parts := [max(math.ceil(e / spacing - _ROUNDING), 1) for e in extents]) > _MOST_NODES:
-        spacing *= 1.1
+    gaps = gaps_along(extents, spacing, MOST_NODES)
     lattice = _Lattice()
     lattice.low = wp.vec3(
         *(
@@ -246,8 +282,8 @@ def _lattice(shape: Sequence[int], view: View, spacing: float) -> tuple[_Lattice
             for axis in axes
         )
     )
-    lattice.gap = wp.vec3(*(extent / n for extent, n in zip(extents, parts, strict=True)))
-    return lattice, tuple(n + 1 for n in parts)
+    lattice.gap = wp.vec3(*(extent / n for extent, n in zip(extents, gaps, strict=True)))
+    return lattice, tuple(n + 1 for n in gaps)
 
 
 def coarse_six_way(medium: Medium, view: View, march: March, out: wp.array) -> None:
@@ -276,7 +312,7 @@ def coarse_six_way(medium: Medium, view: View, march: March, out: wp.array) -> N
     bricks = occupied(medium) if march.step < BRICK else medium.buffer((0, 0, 0), wp.uint8)
     lattice, counts = _lattice(density.shape, view, spacing)
     gaps, nodes = medium.buffer(counts, wp.vec2), medium.buffer(counts, wp.vec4)
-    parts = wp.vec2i(*(max(math.ceil(lattice.gap[axis] / light_step - _ROUNDING), 1) for axis in range(2)))
+    parts = wp.vec2i(*(parts_of(lattice.gap[axis], light_step) for axis in range(2)))
     inputs = [density, bricks, extinction, view, lattice, parts]
     wp.launch(measure, counts, inputs=inputs, outputs=[gaps], device=device)
     lines = (counts[1] + counts[0], counts[2])

@@ -12,7 +12,6 @@ Read first: `lit` of `tests/reference/marching.py`, one such light with nothing 
 """
 
 import functools
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -20,7 +19,6 @@ from typing import Any
 import warp as wp
 
 from wlm_kernels.smoke.march import (
-    BRICK,
     MarchParameters,
     Medium,
     View,
@@ -28,13 +26,11 @@ from wlm_kernels.smoke.march import (
     clip,
     density_at,
     marched_ray,
-    occupied,
     parameters,
     phase,
-    sample,
     size_of,
 )
-from wlm_kernels.smoke.march_coarse import noise
+from wlm_kernels.smoke.march_coarse import AT_ONCE, MOST_NODES, Several, by_bricks, gaps_along, noise, parts_of
 from wlm_kernels.smoke.settings import March
 
 _OPTIONS = {"enable_backward": False}
@@ -42,10 +38,7 @@ _OPTIONS = {"enable_backward": False}
 PLANES = ("transparency", "emission", "depth")
 """Planes of `seen`."""
 
-_LEAST_SPACING = 0.25  # voxels between nodes
-_MOST_NODES = 2**28
 _MOST_MARCHING = 2**24  # of a point light, each of which marches by itself
-_ROUNDING = 1e-6
 
 
 @wp.struct
@@ -62,13 +55,11 @@ class Lattice:
 
 @wp.func
 def _look(density: wp.array3d[Any], bricks: wp.array3d[wp.uint8], p: wp.vec3) -> float:
-    """The density, by bricks where there are any, and 0 far outside the grid."""
+    """`by_bricks`, and 0 far outside the grid."""
     for axis in range(3):
         if p[axis] < -0.5 or p[axis] > float(density.shape[axis]) + 0.5:
             return 0.0
-    if bricks.shape[0] > 0:
-        return sample(density, bricks, p)
-    return density_at(density, p)
+    return by_bricks(density, bricks, p)
 
 
 @wp.func
@@ -111,11 +102,21 @@ def _add_up(
     behind = float(0.0)
     nodes[last, j, k][0] = 0.0
     nodes[0, j, k][1] = 0.0
-    for n in range(last):
-        behind += gaps[n, j, k]
-        ahead += gaps[last - 1 - n, j, k]
-        nodes[n + 1, j, k][1] = behind
-        nodes[last - 1 - n, j, k][0] = ahead
+    # Some at a time: the loads of one wait for the stores of those before, and not for each other.
+    for first in range(0, last, AT_ONCE):
+        forth = Several()
+        back = Several()
+        for m in range(AT_ONCE):
+            n = wp.min(first + m, last - 1)
+            forth[m] = gaps[n, j, k]
+            back[m] = gaps[last - 1 - n, j, k]
+        for m in range(AT_ONCE):
+            n = first + m
+            if n < last:
+                behind += forth[m]
+                ahead += back[m]
+                nodes[n + 1, j, k][1] = behind
+                nodes[last - 1 - n, j, k][0] = ahead
 
 
 @dataclass(frozen=True)
@@ -269,14 +270,6 @@ def light_kernels(dtype: Any) -> _Kernels:
     return _Kernels(measure, reach, gather, seen)
 
 
-def _parts(extents: Sequence[float], spacing: float, most: int) -> list[int]:
-    """Gaps along each axis, no longer than a spacing, or than makes the nodes too many."""
-    spacing = max(spacing, _LEAST_SPACING)
-    while math.prod(parts := [max(math.ceil(e / spacing - _ROUNDING), 1) for e in extents]) > most:
-        spacing *= 1.1
-    return parts
-
-
 def _axes(toward: Sequence[float]) -> list[tuple[float, float, float]]:
     """A light's direction, and two across it."""
     x, y, z = toward
@@ -291,17 +284,25 @@ def _lattice(shape: Sequence[int], place: Sequence[float], radius: float | None,
     axes = _axes(place) if radius is None else [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)]
     low = [sum(min(-0.5 * a, (n + 0.5) * a) for n, a in zip(shape, axis, strict=True)) for axis in axes]
     extents = [sum((n + 1) * abs(a) for n, a in zip(shape, axis, strict=True)) for axis in axes]
-    parts = _parts(extents, spacing, _MOST_NODES if radius is None else _MOST_MARCHING)
+    gaps = gaps_along(extents, spacing, MOST_NODES if radius is None else _MOST_MARCHING)
     lattice = Lattice()
     lattice.axes = wp.mat33(*(value for axis in axes for value in axis))
     lattice.low = wp.vec3(*low)
-    lattice.gap = wp.vec3(*(extent / n for extent, n in zip(extents, parts, strict=True)))
+    lattice.gap = wp.vec3(*(extent / n for extent, n in zip(extents, gaps, strict=True)))
     lattice.place, lattice.point, lattice.radius = wp.vec3(*place), int(radius is not None), float(radius or 0.0)
-    return lattice, tuple(n + 1 for n in parts)
+    return lattice, tuple(n + 1 for n in gaps)
 
 
 def light(
-    medium: Medium, view: View, place: Sequence[float], radius: float | None, march: March, shadow: float, out: wp.array
+    medium: Medium,
+    view: View,
+    place: Sequence[float],
+    radius: float | None,
+    march: March,
+    shadow: float,
+    out: wp.array,
+    *,
+    bricks: wp.array,
 ) -> None:
     """Smoke of albedo 1 under a light and under the opposite one, or under a point light.
 
@@ -315,18 +316,18 @@ def light(
         shadow: Extinction on the ways to the light over that along the camera's rays; 1 is smoke as it is.
         out: float [2, H, W], written: light scattered once, of irradiance 4 pi from the place and from the opposite
             one. Of a point light [1, H, W]: its irradiance is 4 pi at a distance of one voxel.
+        bricks: Of `occupied`.
     """
     spacing = march.step if march.spacing is None else march.spacing
     step = spacing if march.light_step is None else march.light_step
     density, extinction = medium.density, medium.extinction
     device = density.device
     kernels = light_kernels(density.dtype)
-    bricks = occupied(medium) if march.step < BRICK else medium.buffer((0, 0, 0), wp.uint8)
     lattice, counts = _lattice(density.shape, place, radius, spacing)
     nodes = medium.buffer(counts, wp.vec2)
     if radius is None:
         gaps = medium.buffer(counts, float)
-        parts = max(math.ceil(lattice.gap[0] / step - _ROUNDING), 1)
+        parts = parts_of(lattice.gap[0], step)
         wp.launch(kernels.measure, counts, [density, bricks, extinction, lattice, parts], [gaps], device=device)
         wp.launch(_add_up, counts[1:], [gaps], [nodes], device=device)
     else:
@@ -335,10 +336,9 @@ def light(
     wp.launch(kernels.gather, out.shape[1:], inputs=inputs, outputs=[out], device=device)
 
 
-def seen(medium: Medium, view: View, march: March, out: wp.array) -> None:
-    """What a camera sees of smoke without light: `PLANES`, [3, H, W], written."""
+def seen(medium: Medium, view: View, march: March, out: wp.array, *, bricks: wp.array) -> None:
+    """What a camera sees of smoke without light: `PLANES`, [3, H, W], written; arguments as for `light`."""
     density, (temperature, emission) = medium.density, medium.glow
-    bricks = occupied(medium) if march.step < BRICK else medium.buffer((0, 0, 0), wp.uint8)
     inputs = [density, temperature, bricks, medium.extinction, emission, view, parameters(march)]
     kernel = light_kernels(density.dtype).seen
     wp.launch(kernel, out.shape[1:], inputs=inputs, outputs=[out], device=density.device)

@@ -1,11 +1,13 @@
 """A path tracer of volumes: light of every order of scattering in a density grid, without bias.
 
 Free paths are sampled by delta tracking, transmittances by ratio tracking (Novak et al. 2018, "Monte Carlo methods for
-volumetric light transport simulation", sections 5.1 and 5.2), both with a majorant per brick. At each scattering every
+volumetric light transport simulation", sections 5.1 and 5.2), both with a majorant per brick, through which an optical
+depth that is drawn once is spent. Where a density is needed, one of the eight voxels around the place is drawn by its
+weight: either tracking asks for no more than its mean, which is that of `density_at`. At each scattering every
 light is tried (next event estimation); the environment is reached by such a try and by the path's own escape, weighed
 by the balance heuristic. Emission is gathered along the free paths: each tentative collision counts for e / majorant.
 
-Units are those of `march`; densities between voxels are exactly those of `density_at`. Light of order n has been
+Units are those of `march`. Light of order n has been
 scattered n times. Random numbers are a pixel's own: the result depends on the seed alone.
 Read first: `scattered_twice` of `tests/reference/transport.py`, the second order by quadrature.
 """
@@ -18,13 +20,16 @@ from typing import Any
 
 import warp as wp
 
-from wlm_kernels.smoke.march import BRICK, Medium, View, clip, density_at, phase, ray, size_of
+from wlm_kernels.smoke.march import BRICK, Medium, View, density_at, phase, ray, size_of
+from wlm_kernels.smoke.path_walk import drawn, enter, onward
 from wlm_kernels.smoke.path_ways import Sky, chance_of, following, scatter, stir, texel, toward_sky, uniform
 
 _OPTIONS = {"enable_backward": False}
 _NEVER = wp.constant(1.0e30)
 _GLOW = 1.0 / BRICK  # least majorant where smoke glows: about one place a brick at which its light is gathered
 _SLACK = 1.0001  # of a majorant over rounding of interpolated densities
+_DEEP = 2.0  # optical depth through a brick, of the densest smoke, that bricks may have
+_THREADS = 2**20  # on a GPU, of which each traces several parts one after another
 _FAINT = wp.constant(0.1)  # what is below this is carried on by fewer paths
 _FOUR_PI = wp.constant(4.0 * math.pi)
 
@@ -75,59 +80,11 @@ class _Passed:
 
 
 @wp.func
-def _brick(majorants: wp.array3d[float], p: wp.vec3) -> wp.vec3i:
-    edge = 1.0 / float(BRICK)
-    return wp.vec3i(
-        wp.clamp(int(wp.floor(p[0] * edge)), 0, majorants.shape[0] - 1),
-        wp.clamp(int(wp.floor(p[1] * edge)), 0, majorants.shape[1] - 1),
-        wp.clamp(int(wp.floor(p[2] * edge)), 0, majorants.shape[2] - 1),
-    )
-
-
-@wp.func
-def _border(cell: int, count: int, p: float, d: float) -> float:
-    """Distance at which a ray leaves a brick along one axis; the outermost bricks have no outer border."""
-    if d > 1.0e-9 and cell < count - 1:
-        return (float((cell + 1) * BRICK) - p) / d
-    if d < -1.0e-9 and cell > 0:
-        return (float(cell * BRICK) - p) / d
-    return _NEVER
-
-
-@wp.func
-def _leave(majorants: wp.array3d[float], cell: wp.vec3i, p: wp.vec3, d: wp.vec3) -> wp.vec3:
-    """Distances at which a ray leaves a brick along each axis."""
-    return wp.vec3(
-        _border(cell[0], majorants.shape[0], p[0], d[0]),
-        _border(cell[1], majorants.shape[1], p[1], d[1]),
-        _border(cell[2], majorants.shape[2], p[2], d[2]),
-    )
-
-
-@wp.func
-def _onward(cell: wp.vec3i, leave: wp.vec3, d: wp.vec3) -> wp.vec3i:
-    """The next brick along a ray."""
-    if leave[0] <= leave[1] and leave[0] <= leave[2]:
-        return wp.vec3i(cell[0] + wp.where(d[0] > 0.0, 1, -1), cell[1], cell[2])
-    if leave[1] <= leave[2]:
-        return wp.vec3i(cell[0], cell[1] + wp.where(d[1] > 0.0, 1, -1), cell[2])
-    return wp.vec3i(cell[0], cell[1], cell[2] + wp.where(d[2] > 0.0, 1, -1))
-
-
-@wp.func
-def _blocked(mesh: wp.uint64, p: wp.vec3, d: wp.vec3, within: float) -> float:
-    """Distance to the first obstacle along a ray, or never."""
-    if mesh == wp.uint64(0):
-        return _NEVER
-    found = wp.mesh_query_ray(mesh, p, d, within)
-    return wp.where(found.result, found.t, _NEVER)
-
-
-@wp.func
 def _fly(
     density: wp.array3d[Any],
     temperature: wp.array3d[Any],
     bounds: wp.array3d[float],
+    edge: float,
     extinction: float,
     emission: float,
     p: wp.vec3,
@@ -138,31 +95,28 @@ def _fly(
     """A free path by delta tracking, up to a limit."""
     f = _Flight()
     glow = float(0.0)
-    span = clip(size_of(density), p, d)
-    t = wp.max(span[0], 0.0)
-    end = wp.min(span[1], limit)
-    cell = _brick(bounds, p + t * d)
-    while t < end:
-        leave = _leave(bounds, cell, p, d)
-        border = wp.min(wp.min(leave[0], wp.min(leave[1], leave[2])), end)
-        most = bounds[cell[0], cell[1], cell[2]]
-        if most > 0.0:
-            while t < border:
-                random = following(random)
-                t -= wp.log(1.0 - uniform(random)) / most
-                if t < border:
-                    at = p + t * d
-                    if emission > 0.0:
-                        glow += emission * density_at(temperature, at) / most
-                    random = following(random)
-                    if uniform(random) * most < extinction * density_at(density, at):
-                        f.hit = 1
-                        f.t = t
-                        end = -1.0
-                        border = -1.0
-        t = border
-        if t < end:
-            cell = _onward(cell, leave, d)
+    random = following(random)
+    left = -wp.log(1.0 - uniform(random))  # optical depth, of the majorants, to the next place that is looked at
+    w = enter(bounds, edge, size_of(density), p, d, limit)
+    while w.t < w.end:
+        through = w.most * (w.border - w.t)
+        if left >= through:
+            left -= through
+            w = onward(w, bounds, d)
+        else:
+            w.t += left / w.most
+            at = p + w.t * d
+            if emission > 0.0:
+                glow += emission * density_at(temperature, at) / w.most
+            random = following(random)
+            found = extinction * drawn(density, at, random)
+            random = following(random)
+            if uniform(random) * w.most < found:
+                f.hit = 1
+                f.t = w.t
+                w.end = -1.0
+            random = following(random)
+            left = -wp.log(1.0 - uniform(random))
     f.glow = glow
     f.random = random
     return f
@@ -172,6 +126,7 @@ def _fly(
 def _passed(
     density: wp.array3d[Any],
     bounds: wp.array3d[float],
+    edge: float,
     extinction: float,
     p: wp.vec3,
     d: wp.vec3,
@@ -180,32 +135,28 @@ def _passed(
 ) -> _Passed:
     """The share of light that passes along a ray up to a limit, by ratio tracking."""
     f = _Passed()
-    span = clip(size_of(density), p, d)
-    t = wp.max(span[0], 0.0)
-    end = wp.min(span[1], limit)
     share = float(1.0)
-    cell = _brick(bounds, p + t * d)
-    while t < end:
-        leave = _leave(bounds, cell, p, d)
-        border = wp.min(wp.min(leave[0], wp.min(leave[1], leave[2])), end)
-        most = bounds[cell[0], cell[1], cell[2]]
-        if most > 0.0:
-            while t < border:
+    random = following(random)
+    left = -wp.log(1.0 - uniform(random))
+    w = enter(bounds, edge, size_of(density), p, d, limit)
+    while w.t < w.end:
+        through = w.most * (w.border - w.t)
+        if left >= through:
+            left -= through
+            w = onward(w, bounds, d)
+        else:
+            w.t += left / w.most
+            random = following(random)
+            share = share * (1.0 - extinction * drawn(density, p + w.t * d, random) / w.most)
+            if share < _FAINT:
                 random = following(random)
-                t -= wp.log(1.0 - uniform(random)) / most
-                if t < border:
-                    share = share * (1.0 - extinction * density_at(density, p + t * d) / most)
-                    if share < _FAINT:
-                        random = following(random)
-                        if uniform(random) * _FAINT < share:
-                            share = _FAINT
-                        else:
-                            share = 0.0
-                            end = -1.0
-                            border = -1.0
-        t = border
-        if t < end:
-            cell = _onward(cell, leave, d)
+                if uniform(random) * _FAINT < share:
+                    share = _FAINT
+                else:
+                    share = 0.0
+                    w.end = -1.0
+            random = following(random)
+            left = -wp.log(1.0 - uniform(random))
     f.share = share
     f.random = random
     return f
@@ -216,12 +167,13 @@ class _Kernels:
     """Of one type of density."""
 
     majorants: wp.Kernel
+    coarser: wp.Kernel
     trace: wp.Kernel
 
 
 @functools.cache
-def path_kernels(dtype: Any) -> _Kernels:
-    """Builds (once) the kernels for densities of a type, `wp.float32` or `wp.float16`."""
+def path_kernels(dtype: Any, solid: bool) -> _Kernels:
+    """Builds (once) the kernels for densities of a type, `wp.float32` or `wp.float16`; `solid`: with obstacles."""
 
     @wp.kernel(module="unique", module_options=_OPTIONS)
     def majorants(
@@ -250,11 +202,35 @@ def path_kernels(dtype: Any) -> _Kernels:
         out[a, b, c] = most
 
     @wp.kernel(module="unique", module_options=_OPTIONS)
+    def coarser(
+        # in:
+        bounds: wp.array3d[float],
+        # out:
+        out: wp.array3d[float],
+    ):
+        a, b, c = wp.tid()
+        most = float(0.0)
+        for i in range(2 * a, wp.min(2 * a + 2, bounds.shape[0])):
+            for j in range(2 * b, wp.min(2 * b + 2, bounds.shape[1])):
+                for k in range(2 * c, wp.min(2 * c + 2, bounds.shape[2])):
+                    most = wp.max(most, bounds[i, j, k])
+        out[a, b, c] = most
+
+    @wp.func
+    def free(mesh: wp.uint64, p: wp.vec3, d: wp.vec3) -> float:
+        """Distance to the first obstacle along a ray, or never."""
+        if wp.static(solid):
+            found = wp.mesh_query_ray(mesh, p, d, _NEVER)
+            return wp.where(found.result, found.t, _NEVER)
+        return _NEVER
+
+    @wp.kernel(module="unique", module_options=_OPTIONS)
     def trace(
         # in:
         density: wp.array3d[dtype],
         temperature: wp.array3d[dtype],
         bounds: wp.array3d[float],
+        edge: float,
         extinction: float,
         emission: float,
         view: View,
@@ -263,41 +239,57 @@ def path_kernels(dtype: Any) -> _Kernels:
         mesh: wp.uint64,
         settings: PathSettings,
         first: int,
+        last: int,
         parts: int,
+        together: int,
         # out:
         out: wp.array3d[wp.vec3],
     ):
-        part, row, column = wp.tid()
+        group, row, column = wp.tid()
         count = lights.shape[0]
         planes = settings.kept + 2
         sources = count + 2
-        # Some parts have one sample more than others.
-        samples = settings.samples // parts
-        if first + part < settings.samples % parts:
-            samples += 1
         weight = 1.0 / float(settings.samples)
         pixel = wp.uint64(row) * wp.uint64(view.width) + wp.uint64(column)
-        random = stir(settings.key + stir(pixel * wp.uint64(1048576) + wp.uint64(first + part)))
         start = ray(view, row, column)
-        for _sample in range(samples):
-            p = start.origin
-            d = start.direction
-            chance = float(0.0)  # of the direction per solid angle; 0: the camera's, which no light was tried for
-            through = wp.vec3(weight)
-            order = int(0)
-            alive = int(1)
-            while alive == 1:
+        part = first + group * together - 1
+        past = wp.min(first + (group + 1) * together, last)
+        samples = int(0)
+        random = wp.uint64(0)
+        p = wp.vec3()
+        d = wp.vec3()
+        chance = float(0.0)  # of the direction per solid angle; 0: the camera's, which no light was tried for
+        through = wp.vec3()
+        order = int(0)
+        alive = int(0)
+        # One loop for all paths: a thread whose path has ended begins its next while its neighbours go on.
+        while part < past:
+            if alive == 0:
+                if samples == 0:
+                    part += 1
+                    # Some parts have one sample more than others.
+                    samples = settings.samples // parts + wp.where(part < settings.samples % parts, 1, 0)
+                    random = stir(settings.key + stir(pixel * wp.uint64(1048576) + wp.uint64(part)))
+                samples -= 1
+                p = start.origin
+                d = start.direction
+                chance = 0.0
+                through = wp.vec3(weight)
+                order = 0
+                alive = 1
+            if part < past:
+                base = (part - first) * sources
                 limit = float(0.0)
                 if order == 0:
                     # An orthographic ray starts where the smoke does; what lies before that blocks as well.
-                    limit = _blocked(mesh, p - view.moved * d, d, _NEVER) - view.moved
+                    limit = free(mesh, p - view.moved * d, d) - view.moved
                 else:
-                    limit = _blocked(mesh, p, d, _NEVER)
-                flight = _fly(density, temperature, bounds, extinction, emission, p, d, limit, random)
+                    limit = free(mesh, p, d)
+                flight = _fly(density, temperature, bounds, edge, extinction, emission, p, d, limit, random)
                 random = flight.random
                 plane = wp.min(order, planes - 1)
                 if flight.glow > 0.0:
-                    at = (part * sources + count + 1) * planes + plane
+                    at = (base + count + 1) * planes + plane
                     out[at, row, column] = out[at, row, column] + flight.glow * through
                 if flight.hit == 0:
                     if sky.total > 0.0 and limit >= 0.5 * _NEVER:
@@ -305,7 +297,7 @@ def path_kernels(dtype: Any) -> _Kernels:
                         share = float(1.0)
                         if chance > 0.0:
                             share = chance / (chance + chance_of(sky, light))
-                        at = (part * sources + count) * planes + plane
+                        at = (base + count) * planes + plane
                         out[at, row, column] = out[at, row, column] + share * wp.cw_mul(through, light)
                     alive = 0
                 else:
@@ -333,24 +325,27 @@ def path_kernels(dtype: Any) -> _Kernels:
                             away = wp.max(reach, lights[n].radius)
                             strength = 1.0 / wp.max(away * away, 1.0e-12)
                             way = wp.normalize(way)
-                        if _blocked(mesh, p, way, reach) >= reach:
-                            got = _passed(density, bounds, extinction, p, way, reach, random)
+                        if free(mesh, p, way) >= reach:
+                            got = _passed(density, bounds, edge, extinction, p, way, reach, random)
                             random = got.random
                             strength = strength * got.share * phase(settings.g, wp.dot(d, way))
-                            at = (part * sources + n) * planes + plane
+                            at = (base + n) * planes + plane
                             light = strength * wp.cw_mul(through, lights[n].colour)
                             out[at, row, column] = out[at, row, column] + light
                     if sky.total > 0.0:
                         far = toward_sky(sky, random)
                         random = far.random
-                        if _blocked(mesh, p, far.direction, _NEVER) >= _NEVER:
-                            got = _passed(density, bounds, extinction, p, far.direction, _NEVER, random)
+                        if free(mesh, p, far.direction) >= _NEVER:
+                            got = _passed(density, bounds, edge, extinction, p, far.direction, _NEVER, random)
                             random = got.random
                             own = phase(settings.g, wp.dot(d, far.direction)) / _FOUR_PI
                             strength = got.share * own / (own + far.chance)
-                            at = (part * sources + count) * planes + plane
+                            at = (base + count) * planes + plane
                             light = strength * wp.cw_mul(through, texel(sky, far.direction))
                             out[at, row, column] = out[at, row, column] + light
+                    # After its last order a path goes on to the sky and to what glows alone.
+                    if order == settings.highest and sky.total == 0.0 and emission == 0.0:
+                        alive = 0
                     random = following(random)
                     u = uniform(random)
                     random = following(random)
@@ -358,7 +353,7 @@ def path_kernels(dtype: Any) -> _Kernels:
                     d = scatter(settings.g, d, u, uniform(random))
                     chance = phase(settings.g, wp.dot(before, d)) / _FOUR_PI
 
-    return _Kernels(majorants, trace)
+    return _Kernels(majorants, coarser, trace)
 
 
 def make_lights(lights: Sequence[tuple[Sequence[float], Sequence[float], float | None]]) -> list[PathLight]:
@@ -377,19 +372,39 @@ def make_lights(lights: Sequence[tuple[Sequence[float], Sequence[float], float |
     return made
 
 
-def bounds(medium: Medium) -> wp.array:
-    """The greatest extinction per voxel that a sample in each brick can find, [X / 8, Y / 8, Z / 8], rounded up."""
+@dataclass(frozen=True)
+class Majorants:
+    """The greatest extinction per voxel that a sample in each brick can find, float [X, Y, Z] / edge, rounded up."""
+
+    most: wp.array
+    edge: int
+
+
+def bounds(medium: Medium, densest: float) -> Majorants:
+    """Finds majorants, of bricks through which the optical depth is about one where smoke is densest.
+
+    Args:
+        medium: The smoke.
+        densest: Its greatest extinction per voxel.
+    """
     density, (temperature, emission) = medium.density, medium.glow
-    out = medium.buffer(tuple(-(-n // BRICK) for n in density.shape), float)
+    kernels = path_kernels(density.dtype, False)
+    edge, device = BRICK, density.device
+    most = medium.buffer(tuple(-(-n // edge) for n in density.shape), float)
     inputs = [density, temperature, medium.extinction, emission, _GLOW, _SLACK]
-    wp.launch(path_kernels(density.dtype).majorants, out.shape, inputs=inputs, outputs=[out], device=density.device)
-    return out
+    wp.launch(kernels.majorants, most.shape, inputs=inputs, outputs=[most], device=device)
+    while 2 * edge * densest <= _DEEP and max(most.shape) > 1:
+        edge *= 2
+        wider = medium.buffer(tuple(-(-n // 2) for n in most.shape), float)
+        wp.launch(kernels.coarser, wider.shape, inputs=[most], outputs=[wider], device=device)
+        most = wider
+    return Majorants(most, edge)
 
 
 def trace(
     medium: Medium,
     view: View,
-    majorants: wp.array,
+    majorants: Majorants,
     lights: wp.array,
     sky: Sky,
     mesh: wp.uint64,
@@ -415,8 +430,11 @@ def trace(
             parts add up to the mean over all samples.
     """
     density, (temperature, emission) = medium.density, medium.glow
-    planes = (lights.shape[0] + 2) * (settings.kept + 2)
-    size = (out.shape[0] // planes, view.height, view.width)
-    inputs = [density, temperature, majorants, medium.extinction, emission, view, lights, sky, mesh, settings]
-    kernel = path_kernels(density.dtype).trace
-    wp.launch(kernel, size, inputs=[*inputs, first, parts], outputs=[out], device=density.device)
+    traced = out.shape[0] // ((lights.shape[0] + 2) * (settings.kept + 2))
+    # Fewer threads than keep a GPU busy wouldn't be faster for more paths each.
+    together = max(1, traced * view.height * view.width // _THREADS) if density.device.is_cuda else 1
+    size = (-(-traced // together), view.height, view.width)
+    inputs = [density, temperature, majorants.most, float(majorants.edge), medium.extinction, emission, view, lights]
+    inputs += [sky, mesh, settings, first, first + traced, parts, together]
+    kernel = path_kernels(density.dtype, mesh != 0).trace
+    wp.launch(kernel, size, inputs=inputs, outputs=[out], device=density.device)

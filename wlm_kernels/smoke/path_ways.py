@@ -45,12 +45,17 @@ def following(random: wp.uint64) -> wp.uint64:
 
 
 @wp.func
-def uniform(random: wp.uint64) -> float:
-    """A number of at least 0 and below 1 (PCG-XSH-RR, O'Neill 2014), of 24 bits."""
+def bits(random: wp.uint64) -> wp.uint32:
+    """32 random bits (PCG-XSH-RR, O'Neill 2014)."""
     x = wp.uint32(((random >> wp.uint64(18)) ^ random) >> wp.uint64(27))
     turn = wp.uint32(random >> wp.uint64(59))
-    x = (x >> turn) | (x << ((wp.uint32(32) - turn) & wp.uint32(31)))
-    return float(x >> wp.uint32(8)) * (1.0 / 16777216.0)
+    return (x >> turn) | (x << ((wp.uint32(32) - turn) & wp.uint32(31)))
+
+
+@wp.func
+def uniform(random: wp.uint64) -> float:
+    """A number of at least 0 and below 1, of 24 bits."""
+    return float(bits(random) >> wp.uint32(8)) * (1.0 / 16777216.0)
 
 
 @wp.func

@@ -9,6 +9,7 @@ _PLACES = {
     "PointLight": "wlm.smoke.transport.lights",
     "ScatteredSmoke": "wlm.smoke.transport.filtering",
     "Transport": "wlm.smoke.transport.tracing",
+    "bake_sphere": "wlm.smoke.transport.sphere",
     "fine_march": "wlm.smoke.transport.lighting",
     "light_smoke": "wlm.smoke.transport.lighting",
     "load_orders": "wlm.smoke.transport.filtering",

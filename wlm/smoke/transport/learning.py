@@ -10,18 +10,13 @@ from dataclasses import dataclass
 import torch
 
 from wlm.smoke.planes import to_srgb
+from wlm.smoke.transport.features import COARSE, FEATURES, Inputs, ambient, blur, make_inputs
 from wlm.smoke.transport.filtering import (
     ANGLES,
-    COARSE,
     CONDITIONS,
     FAINT,
-    FEATURES,
     HIDDEN,
-    Inputs,
     OrdersModel,
-    ambient,
-    blur,
-    make_inputs,
 )
 from wlm.smoke.transport.lighting import light_smoke
 from wlm.smoke.transport.samples import ALBEDOS, Sample
@@ -83,7 +78,7 @@ def fit_filter(lessons: Sequence[Lesson], *, pixels: int = 1024, seed: int = 0) 
         for node in range(len(ALBEDOS)):
             left[node] += (rows * weights[node]) @ rows.T
             right[node] += rows @ (weights[node] * target[node])
-        depths.append(lesson.inputs.depth)
+        depths.append(float(lesson.inputs.depth))
     diagonal = left.diagonal(dim1=1, dim2=2)
     left += _RIDGE * torch.diag_embed(diagonal + 1e-3 * diagonal.mean(1, keepdim=True))
     spread = (moments[1] - moments[0].square()).clamp(min=1e-8).sqrt()
@@ -145,9 +140,9 @@ def train_network(
             lesson.inputs.cosine,
             lesson.inputs.depth,
         )
-        filtered = network.filtered(part)[node]
-        target, weights = (p[node].flatten()[chosen, None] for p in (lesson.multiple(), lesson.weights()))
-        off = filtered + network.correction(part, filtered, node) - target
+        filtered = network.filtered(part, [node])
+        target, weights = (p[node].flatten()[chosen].reshape(1, -1, 1) for p in (lesson.multiple(), lesson.weights()))
+        off = filtered + network.correction(part, filtered, [node]) - target
         loss = (weights * off.square()).mean()
         optimiser.zero_grad(set_to_none=True)
         loss.backward()
@@ -171,10 +166,10 @@ def with_gates(model: OrdersModel, held_out: Sequence[Lesson]) -> OrdersModel:
         best = 0.0
         errors = torch.zeros(len(_GATES), len(held_out))
         for number, lesson in enumerate(held_out):
-            filtered = model.filtered(lesson.inputs)[node]
-            correction = model.correction(lesson.inputs, filtered, node)
+            filtered = model.filtered(lesson.inputs, [node])
+            correction = model.correction(lesson.inputs, filtered, [node])
             for n, gate in enumerate(_GATES):
-                more = (filtered + gate * correction).clamp(min=0.0)
+                more = (filtered + gate * correction)[0].clamp(min=0.0)
                 light = albedo * lesson.inputs.single + albedo**2 * more
                 errors[n, number] = psnr(light, lesson.light[node])
         for n, gate in enumerate(_GATES):

@@ -6,18 +6,22 @@ its step alone. `wlm.smoke.transport.filtering` makes light of all orders from s
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
 import torch
+import warp as wp
 
 from wlm.fluid.volume import DensityVolume
+from wlm.interop import device_name, stream, to_warp
 from wlm.smoke.camera import Camera
-from wlm.smoke.marching import run
+from wlm.smoke.marching import medium_of
 from wlm.smoke.shading import Light, Ramp
 from wlm.smoke.transport.lights import AnyLight, checked_albedo, in_voxels
 from wlm_kernels.smoke import march_lights
+from wlm_kernels.smoke.march import Medium, View, occupied
 from wlm_kernels.smoke.settings import March
 
 _CLOSE, _FINEST = 0.1, 0.25  # optical depth between nodes, and voxels
@@ -68,8 +72,8 @@ class LitSmoke:
         Raises:
             ValueError: Not an albedo, or a light's visibility has another shape.
         """
-        colour = torch.tensor(checked_albedo(albedo)).to(self.planes)
-        return self.compose(self.planes[..., None] * colour, background=background, ramp=ramp)
+        planes = torch.stack([float(value) * self.planes for value in checked_albedo(albedo)], -1)
+        return self.compose(planes, background=background, ramp=ramp)
 
     def compose(
         self,
@@ -82,18 +86,26 @@ class LitSmoke:
         image = torch.zeros((*self.transparency.shape, 3), dtype=torch.float32, device=planes.device)
         for light, plane in zip(self.lights, planes, strict=True):
             colour = light.irradiance if isinstance(light, Light) else light.intensity
-            part = plane * torch.tensor(np.asarray(colour) / (4 * math.pi)).to(plane)
             visibility = light.visibility if isinstance(light, Light) else None
             if visibility is not None:
                 if visibility.shape != image.shape[:2]:
                     raise ValueError(f"visibility: expected {tuple(image.shape[:2])}, got {tuple(visibility.shape)}")
-                part = part * visibility[..., None]
-            image += part
+                plane = plane * visibility[..., None]
+            _add(image, plane, np.asarray(colour) / (4 * math.pi))
         if self.emission is not None:
             image += self.emission[..., None] if ramp is None else ramp(self.emission)
         if background is None:
             return image
-        return image + self.transparency[..., None] * torch.as_tensor(background).to(image)
+        if isinstance(background, torch.Tensor) or np.ndim(background) > 1:
+            return image + self.transparency[..., None] * torch.as_tensor(background).to(image)
+        return _add(image, self.transparency[..., None].expand_as(image), background)
+
+
+def _add(image: torch.Tensor, planes: torch.Tensor, colour: Sequence[float] | np.ndarray) -> torch.Tensor:
+    """Adds planes [H, W, 3] times a colour, without a copy to the device, which would wait for it."""
+    for channel, value in enumerate(colour):
+        image[..., channel].add_(planes[..., channel], alpha=float(value))
+    return image
 
 
 def fine_march(volume: DensityVolume, g: float = 0.0) -> March:
@@ -133,15 +145,44 @@ def light_smoke(
         ValueError: A light without direction, or of a colour that isn't one.
     """
     march = fine_march(volume) if march is None else march
-    size = (len(lights), camera.height, camera.width)
-    planes, opposite = torch.zeros(2, *size, device=volume.device)
-    for n, light in enumerate(lights):
-        place, _, radius = in_voxels(light, volume)
-        if radius is None:
-            planes[n], opposite[n] = run(march_lights.light, volume, camera, (2,), place, None, march, shadow)
-        else:
-            one = run(march_lights.light, volume, camera, (1,), place, radius, march, shadow)[0]
-            planes[n] = one / volume.voxel**2
-    transparency, emission, depth = run(march_lights.seen, volume, camera, (len(march_lights.PLANES),), march)
+    planes = torch.zeros(2, len(lights), camera.height, camera.width, device=volume.device)
+    with marching(volume, camera, march, shadow) as scene:
+        for n, light in enumerate(lights):
+            place, _, radius = in_voxels(light, volume)
+            scene.light(place, radius, planes[:, n] if radius is None else planes[:1, n])
+            if radius is not None:
+                planes[0, n] /= volume.voxel**2
+        transparency, emission, depth = scene.seen()
     hot = emission if volume.temperature is not None else None
-    return LitSmoke(tuple(lights), planes, opposite, transparency, hot, depth, camera, march)
+    return LitSmoke(tuple(lights), *planes, transparency, hot, depth, camera, march)
+
+
+@dataclass(frozen=True, eq=False)
+class Marching:
+    """A march through one volume from one side, for any number of lights: the map of its bricks is made once."""
+
+    medium: Medium
+    view: View
+    march: March
+    shadow: float
+    bricks: wp.array
+
+    def light(self, place: Sequence[float], radius: float | None, out: torch.Tensor) -> None:
+        """Light scattered once: see `march_lights.light`; `out` is float32 [2, H, W], of a point light [1, H, W]."""
+        arguments = (place, radius, self.march, self.shadow, to_warp(out))
+        march_lights.light(self.medium, self.view, *arguments, bricks=self.bricks)
+
+    def seen(self) -> torch.Tensor:
+        """Transparency, emission and depth, [3, H, W]."""
+        size = (len(march_lights.PLANES), self.view.height, self.view.width)
+        out = torch.empty(size, device=wp.device_to_torch(self.medium.density.device))
+        march_lights.seen(self.medium, self.view, self.march, to_warp(out), bricks=self.bricks)
+        return out
+
+
+@contextmanager
+def marching(volume: DensityVolume, camera: Camera, march: March, shadow: float = 1.0) -> Iterator[Marching]:
+    """Opens a march, on the smoke's device; arguments as for `light_smoke`."""
+    with stream(device_name(volume.device)):
+        medium = medium_of(volume)
+        yield Marching(medium, camera.view(volume), march, shadow, occupied(medium))

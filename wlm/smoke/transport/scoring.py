@@ -8,7 +8,8 @@ import torch
 
 from wlm.metrics.flip import flip_display
 from wlm.smoke.planes import to_srgb
-from wlm.smoke.transport.filtering import COARSE, OrdersModel
+from wlm.smoke.transport.features import COARSE
+from wlm.smoke.transport.filtering import OrdersModel
 from wlm.smoke.transport.learning import Lesson, make_lessons, psnr
 from wlm.smoke.transport.lighting import light_smoke
 from wlm.smoke.transport.samples import ALBEDOS, Sample

@@ -24,7 +24,7 @@ HIGHEST = 100_000
 """Scatterings after which a path ends whatever is left of its light."""
 
 _PARTS = 16  # that samples are divided into, whose spread tells the noise
-_BYTES = 2**28  # of the planes of the parts that are traced at once
+_BYTES = 2**31  # at most, and a fourth of the memory, of the planes of the parts that are traced at once
 _DENSEST = 1e4  # optical depth of a voxel: of more, paths would hardly end
 _KEY = 2**64
 
@@ -163,7 +163,7 @@ def trace(
         densest = float(volume.density.max()) * medium.extinction
         if not densest <= _DENSEST:
             raise WlmError(f"expected voxels of an optical depth of at most {_DENSEST:g}, found one of {densest:.4g}")
-        majorants = path.bounds(medium)
+        majorants = path.bounds(medium, densest)
         lamps = path.make_lights([in_voxels(light, volume) for light in lights])
         lamps = wp.array(lamps, dtype=path.PathLight, device=device)
         mesh = None if obstacles is None or not len(obstacles[1]) else _mesh(obstacles, volume, device)
@@ -175,7 +175,8 @@ def trace(
         view, parts = camera.view(volume), min(_PARTS, samples)
         sources, kept = len(lights) + 2, orders + 2
         planes = sources * kept
-        at_once = 1 if device == "cpu" else max(1, min(parts, _BYTES // (12 * planes * view.height * view.width)))
+        room = min(_BYTES, free_memory(wp.get_device(device)) // 4)
+        at_once = 1 if device == "cpu" else max(1, min(parts, room // (12 * planes * view.height * view.width)))
         _require(planes, sources, view, parts, at_once, device)
         total = torch.zeros((sources, kept, view.height, view.width, 3), device=volume.device)
         means = []
@@ -184,7 +185,7 @@ def trace(
             count = min(at_once, parts - first)
             size = (count * planes, view.height, view.width, 3)
             out = torch.zeros(size, device=volume.device)
-            arguments = (lamps, sky, wp.uint64(0 if mesh is None else mesh.id), settings, first, parts)
+            arguments = (lamps, sky, 0 if mesh is None else mesh.id, settings, first, parts)
             path.trace(medium, view, majorants, *arguments, to_warp(out, wp.vec3))
             each = out.reshape(count, *total.shape)
             total += each.sum(0)

@@ -1,0 +1,87 @@
+"""Six-way lightmaps by least squares over the sphere: nearer to lights from anywhere than those of the axes."""
+
+import numpy as np
+import pytest
+import torch
+from builders.running import call, fails
+from builders.smoke_plumes import facing, plume
+
+from wlm.fluid.volume import from_array, save_volume
+from wlm.smoke.baking import bake
+from wlm.smoke.camera import weights
+from wlm.smoke.data import read_six_way
+from wlm.smoke.shading import Light
+from wlm.smoke.transport.features import COARSE
+from wlm.smoke.transport.filtering import scatter
+from wlm.smoke.transport.lighting import light_smoke
+from wlm.smoke.transport.sphere import bake_sphere, half_sphere
+
+
+def lights(count: int = 12) -> list[Light]:
+    ways = np.random.default_rng(5).normal(size=(count, 3))
+    return [Light(tuple(map(float, way))) for way in ways]
+
+
+def rms(six, lamps: list[Light], exact: torch.Tensor) -> float:
+    """Of pictures of light after light."""
+    shaded = torch.stack([six.shade([lamp])[..., 0] for lamp in lamps])
+    return float(((shaded - exact).square().mean() / exact.square().mean()).sqrt())
+
+
+def test_random_lights_are_nearer_than_by_the_axes(device: str):
+    volume = plume(device=device)
+    camera, lamps = facing(volume, (0.3, 0.2, 1.0), size=20), lights()
+    exact = light_smoke(volume, camera, lamps).planes
+    made = bake_sphere(volume, camera)
+    assert rms(made, lamps, exact) < 0.92 * rms(bake(volume, camera, step=1.0, estimate=False), lamps, exact)
+    assert (made.lightmaps >= 0).all() and made.lightmaps.any()
+    # No other maps of at least 0 are nearer to the lights that they are fitted to.
+    ways = half_sphere(16)
+    weigh = torch.tensor(np.concatenate([weights(ways), weights(-ways)]), dtype=torch.float32, device=device)
+    fitted = [Light(tuple(map(float, way @ camera.axes))) for way in ways]
+    lit = light_smoke(volume, camera, fitted, COARSE)
+    planes = torch.cat([lit.planes, lit.opposite])
+
+    def error(maps: torch.Tensor) -> torch.Tensor:
+        return (torch.einsum("lp,phw->lhw", weigh, maps) - planes).square().sum()
+
+    least = error(made.lightmaps)
+    for index in range(6):
+        for change in (0.9, 1.1):
+            other = made.lightmaps.clone()
+            other[index] *= change
+            assert error(other) > least
+
+
+def test_of_all_orders(device: str):
+    volume = plume(device=device)
+    camera, lamps = facing(volume, size=16), lights(6)
+    exact = scatter(volume, camera, lamps, (0.9,) * 3).planes[..., 0]
+    made = bake_sphere(volume, camera, lights=16, albedo=0.9)
+    once = bake_sphere(volume, camera, lights=16)
+    assert rms(made, lamps, exact) < 0.35 < 0.5 < rms(once, lamps, exact)
+    assert not bake_sphere(from_array(np.zeros((4, 4, 4)), device=device), camera, lights=12).lightmaps.any()
+
+
+def test_wrong_arguments(device: str):
+    volume = plume(device=device)
+    for options, message in (({"lights": 13}, "lights"), ({"lights": 6}, "lights"), ({"albedo": 1.5}, "albedo")):
+        with pytest.raises(ValueError, match=f"{message}: expected"):
+            bake_sphere(volume, facing(volume, size=4), **options)
+    with pytest.raises(ValueError, match="camera: expected"):
+        bake_sphere(volume, facing(volume, size=4, perspective=True))
+
+
+def test_the_command(tmp_path):
+    save_volume(tmp_path / "plume.npz", plume())
+    words = ("smoke", "bake", tmp_path / "plume.npz", "-o", tmp_path / "six.exr", "--resolution", 16, "--extinction", 8)
+    call(*words, "--fit", "sphere", "--step", 1, "--albedo", 0.9)
+    made = read_six_way(tmp_path / "six.exr").lightmaps
+    call(*words, "--fit", "sphere", "--step", 1)
+    assert float(made.mean()) > 1.2 * float(read_six_way(tmp_path / "six.exr").lightmaps.mean())
+    for wrong, message in (
+        (("--fit", "cube"), "--fit"),
+        (("--albedo", 0.9), "--albedo"),
+        (("--fit", "sphere", "--supersample", 2), "--supersample"),
+    ):
+        assert message in fails(*words, *wrong)

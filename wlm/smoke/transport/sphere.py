@@ -1,0 +1,91 @@
+"""Six-way lightmaps that are nearest to lights from anywhere, rather than exact for lights along the six axes.
+
+Shaders weigh six lightmaps by the squares of a light's direction. Whatever they hold, that is wrong between the axes;
+but where it is wrong can be chosen: least squares over lights from all round makes the error of a random light as small
+as six maps can, at the price of the axes' own.
+"""
+
+import numpy as np
+import torch
+
+from wlm.fluid.volume import DensityVolume
+from wlm.interop import device_name, stream
+from wlm.smoke.camera import Camera, weights
+from wlm.smoke.lightmaps import SixWay
+from wlm.smoke.shading import Light
+from wlm.smoke.transport.filtering import scatter
+from wlm.smoke.transport.lighting import light_smoke
+from wlm_kernels.smoke.settings import March
+
+_ROUNDS = 100  # of the descent to maps that aren't negative: one is then within 1e-4 of the least squares
+
+
+def bake_sphere(
+    volume: DensityVolume,
+    camera: Camera,
+    *,
+    lights: int = 32,
+    march: March | None = None,
+    albedo: float | None = None,
+) -> SixWay:
+    """Makes the lightmaps whose pictures, weighed by squares, are nearest to those of lights spread over the sphere.
+
+    Args:
+        volume: The smoke.
+        camera: Orthographic.
+        lights: Directions that they are fitted to, an even number of at least 12.
+        march: To each light; None: in steps of a voxel, without jitter.
+        albedo: None: light scattered once, of albedo 1, as in all lightmaps. A number of 0 to 1: light of all orders at
+            this albedo, which `scatter` predicts.
+
+    Returns:
+        The lightmaps on the smoke's device, none below 0, with transparency, depth and the emission of hot smoke.
+
+    Raises:
+        ValueError: The camera is in perspective, or another argument isn't as it should be.
+    """
+    if camera.perspective:
+        raise ValueError("camera: expected an orthographic one for six-way lightmaps")
+    if lights < 12 or lights % 2:
+        raise ValueError(f"lights: expected an even number of at least 12, got {lights}")
+    march = March(step=1.0, jitter=0.0) if march is None else march
+    ways = half_sphere(lights // 2)
+    lamps = [Light(tuple(map(float, way @ camera.axes))) for way in ways]
+    both = torch.tensor(np.stack([weights(ways), weights(-ways)]), dtype=torch.float32, device=volume.device)
+    with stream(device_name(volume.device)):
+        if albedo is None:
+            lit = light_smoke(volume, camera, lamps, march)
+            sums = _sums(both[0], lit.planes) + _sums(both[1], lit.opposite)
+        else:
+            opposite = [Light(tuple(-c for c in lamp.toward)) for lamp in lamps]
+            grey = (albedo,) * 3
+            made, back = (scatter(volume, camera, each, grey, march=march) for each in (lamps, opposite))
+            lit, sums = made.lit, _sums(both[0], made.planes[..., 0]) + _sums(both[1], back.planes[..., 0])
+        maps = _not_negative(both.flatten(0, 1).T @ both.flatten(0, 1), sums)
+    return SixWay(maps, lit.transparency, lit.emission, camera, lit.depth)
+
+
+def half_sphere(count: int) -> np.ndarray:
+    """Directions on one half of the sphere that are evenly spread with their opposites, float64 [count, 3]."""
+    k = np.arange(count) + 0.5
+    height, turn = 1.0 - k / count, np.pi * (1.0 + 5.0**0.5) * k
+    across = np.sqrt(1.0 - height**2)
+    return np.stack([across * np.cos(turn), height, across * np.sin(turn)], -1)
+
+
+def _sums(weigh: torch.Tensor, planes: torch.Tensor) -> torch.Tensor:
+    """Planes [L, H, W] weighed by [L, 6], [6, H, W]."""
+    return torch.einsum("lp,lhw->phw", weigh, planes)
+
+
+def _not_negative(gram: torch.Tensor, sums: torch.Tensor) -> torch.Tensor:
+    """The least squares of normal equations [6, 6] and [6, H, W] among maps of at least 0, by accelerated descent."""
+    step = 1.0 / float(torch.linalg.eigvalsh(gram.double())[-1])
+    right = sums.flatten(1)
+    maps = torch.linalg.solve(gram, right).clamp(min=0.0)
+    ahead, momentum = maps, 1.0
+    for _ in range(_ROUNDS):
+        following = (ahead - step * (gram @ ahead - right)).clamp(min=0.0)
+        grown = 0.5 * (1.0 + (1.0 + 4.0 * momentum**2) ** 0.5)
+        ahead, maps, momentum = following + (momentum - 1.0) / grown * (following - maps), following, grown
+    return maps.reshape(sums.shape)
