@@ -2,14 +2,12 @@
 
 import json
 import shutil
-import struct
 import subprocess
 from dataclasses import replace
 
 import numpy as np
 import pytest
-import texture2ddecoder
-from builders.shader_runs import HEADS, run_glsl
+from builders.shader_runs import HEADS, lightmap_uniforms, read_dds_levels, rows_of_floats, run_glsl
 from builders.synthetic import random_model
 from PIL import Image
 from scipy.special import erf
@@ -37,30 +35,11 @@ AXES = [
 ]
 
 
-def read_texture(path):
-    """A DDS file by Microsoft's description of it and another BC7 decoder: levels [layers, H, W, C] in [0, 1]."""
-    data = path.read_bytes()
-    height, width = struct.unpack_from("<2I", data, 12)
-    fmt, dimension, _, layers = struct.unpack_from("<4I", data, 128)
-    assert dimension == 3
-    payload = data[148:]
-    if fmt == 49:
-        return np.frombuffer(payload, np.uint8).reshape(layers, height, width, 2) / 255.0
-    if fmt == 24:
-        words = np.frombuffer(payload, "<u4").reshape(layers, height, width, 1)
-        return np.concatenate([words >> shift & 1023 for shift in (0, 10, 20)], 3) / 1023.0
-    assert fmt == 98
-    size = len(payload) // layers
-    slices = [texture2ddecoder.decode_bc7(payload[i * size : (i + 1) * size], width, height) for i in range(layers)]
-    bgra = np.stack([np.frombuffer(s, np.uint8).reshape(height, width, 4) for s in slices])
-    return bgra[..., [2, 1, 0, 3]] / 255.0
-
-
 def image_of(folder, document, name, number, layer=0):
     """One image of a texture of all tiles, as "about" says."""
     info = document["textures"][name]
     (width, height), across = info["image"], info["across"]
-    texels = read_texture(folder / f"{name}.dds")
+    texels = read_dds_levels(folder / f"{name}.dds")
     assert list(texels.shape[2:0:-1]) == info["size"]
     row, column = divmod(number, across)
     return texels[layer, row * height : (row + 1) * height, column * width : (column + 1) * width]
@@ -191,7 +170,7 @@ def test_other_decoders_read_the_textures(tmp_path):
         found = image_of(tmp_path, document, "uv", images[number])
         assert np.array_equal(np.rint(found * 255.0), decode_image(model.uv[place]))
     with Image.open(tmp_path / "uv.dds") as image:
-        assert np.array_equal(np.asarray(image), np.rint(read_texture(tmp_path / "uv.dds")[0] * 255.0))
+        assert np.array_equal(np.asarray(image), np.rint(read_dds_levels(tmp_path / "uv.dds")[0] * 255.0))
     for row, number in enumerate((2, 4)):
         for i in range(2):
             frame = image_of(tmp_path, document, "frames", images[number], i)
@@ -271,28 +250,6 @@ def test_the_shader_compiles(settings, exact, tmp_path):
         assert done.returncode == 0 and "WARNING" not in done.stdout, done.stdout
 
 
-def rows_of_floats(numbers):
-    """A texture of 1,024 fours a row."""
-    fours = np.asarray(numbers, np.float32).reshape(-1, 4)
-    return np.pad(fours, ((0, -len(fours) % 1024), (0, 0))).reshape(-1, 1024, 4)
-
-
-def uniforms_of(folder):
-    """The textures of an exported folder, as an engine uploads them; `hour` gives the table of a stored one."""
-    made = {}
-    for path in folder.glob("*.dds"):
-        levels = read_texture(path)
-        bits = np.float32(levels) if path.stem == "video" else np.uint8(np.rint(levels * 255.0))
-        made[f"wlm_lightmap_{path.stem}"] = bits if path.stem in ("frames", "video") else bits[0]
-    if (folder / "networks.bin").exists():
-        made["wlm_lightmap_networks"] = rows_of_floats(np.fromfile(folder / "networks.bin", "<f4"))
-    with Image.open(folder / "valid.png") as image:
-        made["wlm_lightmap_valid"] = np.asarray(image).astype(np.uint8)[..., None] * 255
-    document = json.loads((folder / "weights.json").read_text())
-    tables = np.fromfile(folder / "hours.bin", "<f4").reshape(len(document["times"]), document["hour_fours"], 4)
-    return made, lambda i: {"wlm_lightmap_hour": rows_of_floats(tables[i])}
-
-
 LIGHT = "light = vec4(wlm_radiance(pixel), 1.0);"
 
 
@@ -301,7 +258,7 @@ LIGHT = "light = vec4(wlm_radiance(pixel), 1.0);"
 def test_the_shader_gives_the_decoders_light(settings, language, tmp_path):
     model = random_model(**settings)
     export(model, tmp_path)
-    uniforms, hour = uniforms_of(tmp_path)
+    uniforms, hour = lightmap_uniforms(tmp_path)
     text, size = (tmp_path / "decode.glsl").read_text(), (model.height, model.width)
     decoder = Decoder(model)
     for i in (1, len(model.times) - 1):
@@ -339,7 +296,7 @@ def levels_of(texture):
 def test_the_shader_of_values(tmp_path):
     model = random_model(gamma=1.0)
     export(model, tmp_path, values=(-1.0, 1.0))
-    uniforms, hour = uniforms_of(tmp_path)
+    uniforms, hour = lightmap_uniforms(tmp_path)
     text = "#define WLM_LIGHTMAP_EXACT\n" + (tmp_path / "decode.glsl").read_text()
     expected = read_exr(tmp_path / "frame.exr")[0]
     found = run_glsl(text, "light = vec4(wlm_value(pixel), 1.0);", expected.shape[:2], uniforms | hour(0))
@@ -349,7 +306,7 @@ def test_the_shader_of_values(tmp_path):
 def test_the_shader_fills_gaps(tmp_path):
     mask = np.random.default_rng(0).random((236, 247)) < 0.03
     export(random_model(mask=mask), tmp_path)
-    uniforms, hour = uniforms_of(tmp_path)
+    uniforms, hour = lightmap_uniforms(tmp_path)
     text = (tmp_path / "decode.glsl").read_text()
     main = "light = vec4(vec2(wlm_source(pixel)), 0.0, 1.0);"
     found = run_glsl(text, main, mask.shape, uniforms | hour(0))[..., 1::-1]

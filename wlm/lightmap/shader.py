@@ -44,8 +44,8 @@ _HEAD = """\
 // Where WLM_LIGHTMAP_EXACT is defined four texels are fetched and mixed in floats; else the filter unit does that, with
 // the 8 or so bits that it gives to a place between two texels.
 //
-// WLM_LIGHTMAP_NET(i) and WLM_LIGHTMAP_HOUR_AT(i) read four floats of networks and of the table; define them before
-// this file to have these in buffers.
+// WLM_LIGHTMAP_NET(i) and WLM_LIGHTMAP_HOUR_AT(i) read four floats of networks and of the table; where these are in
+// buffers define them before this file, or change the functions below that call them.
 
 {samplers}{reads}
 const int WLM_LIGHTMAP_COLUMNS = {columns}; // tiles in a row of the map
@@ -67,6 +67,11 @@ _READ = """
 #ifndef {macro}
 #define {macro}(i) texelFetch({texture}, ivec2((i) & 1023, (i) >> 10), 0)
 #endif
+
+vec4 {function}(int i)
+{{
+    return {macro}(i);
+}}
 """
 
 _NETWORK = """
@@ -79,23 +84,23 @@ vec3 wlm_lightmap_output(vec4 a[WLM_LIGHTMAP_FOURS], int start)
     vec4 b[WLM_LIGHTMAP_FOURS];
     int at = start + 4 * WLM_LIGHTMAP_FOURS * WLM_LIGHTMAP_FOURS;
     for (int j = 0; j < WLM_LIGHTMAP_FOURS; j++)
-        b[j] = WLM_LIGHTMAP_NET(at + j);
+        b[j] = wlm_lightmap_four(at + j);
     for (int i = 0; i < WLM_LIGHTMAP_FOURS; i++) {{
         vec4 x = wlm_gelu(a[i]);
         at = start + 4 * i * WLM_LIGHTMAP_FOURS;
         for (int j = 0; j < WLM_LIGHTMAP_FOURS; j++) {{
-            b[j] += x.x * WLM_LIGHTMAP_NET(at + j);
-            b[j] += x.y * WLM_LIGHTMAP_NET(at + WLM_LIGHTMAP_FOURS + j);
-            b[j] += x.z * WLM_LIGHTMAP_NET(at + 2 * WLM_LIGHTMAP_FOURS + j);
-            b[j] += x.w * WLM_LIGHTMAP_NET(at + 3 * WLM_LIGHTMAP_FOURS + j);
+            b[j] += x.x * wlm_lightmap_four(at + j);
+            b[j] += x.y * wlm_lightmap_four(at + WLM_LIGHTMAP_FOURS + j);
+            b[j] += x.z * wlm_lightmap_four(at + 2 * WLM_LIGHTMAP_FOURS + j);
+            b[j] += x.w * wlm_lightmap_four(at + 3 * WLM_LIGHTMAP_FOURS + j);
         }}
     }}
     at = start + (4 * WLM_LIGHTMAP_FOURS + 1) * WLM_LIGHTMAP_FOURS;
-    vec4 y = WLM_LIGHTMAP_NET(at + 4 * WLM_LIGHTMAP_FOURS);
+    vec4 y = wlm_lightmap_four(at + 4 * WLM_LIGHTMAP_FOURS);
     for (int i = 0; i < WLM_LIGHTMAP_FOURS; i++) {{
         vec4 x = wlm_gelu(b[i]);
-        y += x.x * WLM_LIGHTMAP_NET(at + 4 * i) + x.y * WLM_LIGHTMAP_NET(at + 4 * i + 1);
-        y += x.z * WLM_LIGHTMAP_NET(at + 4 * i + 2) + x.w * WLM_LIGHTMAP_NET(at + 4 * i + 3);
+        y += x.x * wlm_lightmap_four(at + 4 * i) + x.y * wlm_lightmap_four(at + 4 * i + 1);
+        y += x.z * wlm_lightmap_four(at + 4 * i + 2) + x.w * wlm_lightmap_four(at + 4 * i + 3);
     }}
     return y.xyz;
 }}
@@ -108,12 +113,12 @@ vec3 wlm_lightmap_mapped(vec4 tile, int record, ivec2 inner)
     ivec2 at = ivec2(row % {uv_columns}, row / {uv_columns}) * {TILE} + inner;
     vec4 a[WLM_LIGHTMAP_FOURS];
     for (int j = 0; j < WLM_LIGHTMAP_FOURS; j++)
-        a[j] = WLM_LIGHTMAP_HOUR_AT(record + 3 + j);
+        a[j] = wlm_lightmap_entry(record + 3 + j);
     vec4 x = texelFetch(WLM_LIGHTMAP_UV, at, 0);
 {sum}    int rest = start + 5 * WLM_LIGHTMAP_FOURS;
 {dynamic}    vec3 y = wlm_lightmap_output(a, rest);
-    vec3 gain = WLM_LIGHTMAP_HOUR_AT(record + 1).xyz;
-    vec3 colour = gain + WLM_LIGHTMAP_HOUR_AT(record + 2).xyz * y;
+    vec3 gain = wlm_lightmap_entry(record + 1).xyz;
+    vec3 colour = gain + wlm_lightmap_entry(record + 2).xyz * y;
     return max(colour, vec3(0.0, 0.0, 0.0));
 }}
 """
@@ -121,9 +126,9 @@ vec3 wlm_lightmap_mapped(vec4 tile, int record, ivec2 inner)
 _SUM = """\
 {indent}for (int j = 0; j < WLM_LIGHTMAP_FOURS; j++) {{
 {indent}    int w = start{skip} + j;
-{indent}    a[j] += x.x * WLM_LIGHTMAP_NET(w) + x.y * WLM_LIGHTMAP_NET(w + WLM_LIGHTMAP_FOURS);
-{indent}    a[j] += x.z * WLM_LIGHTMAP_NET(w + 2 * WLM_LIGHTMAP_FOURS);
-{indent}    a[j] += x.w * WLM_LIGHTMAP_NET(w + 3 * WLM_LIGHTMAP_FOURS);
+{indent}    a[j] += x.x * wlm_lightmap_four(w) + x.y * wlm_lightmap_four(w + WLM_LIGHTMAP_FOURS);
+{indent}    a[j] += x.z * wlm_lightmap_four(w + 2 * WLM_LIGHTMAP_FOURS);
+{indent}    a[j] += x.w * wlm_lightmap_four(w + 3 * WLM_LIGHTMAP_FOURS);
 {indent}}}
 """
 
@@ -163,7 +168,7 @@ vec4 wlm_lightmap_slice(int image, vec2 place)
 // F_uvt at the table's hour, at a place from 0 to 1.
 vec4 wlm_lightmap_volume(int row, vec2 place)
 {{
-    vec4 time = WLM_LIGHTMAP_HOUR_AT(0);
+    vec4 time = wlm_lightmap_entry(0);
     vec2 texel = place * {side}.0;
     vec4 early = wlm_lightmap_slice(row * {slices} + int(time.x), texel);
     return mix(early, wlm_lightmap_slice(row * {slices} + int(time.y), texel), time.z);
@@ -188,7 +193,7 @@ vec2 wlm_lightmap_line(int image, float place, int time)
 
 vec2 wlm_lightmap_plane(int image, float place)
 {{
-    vec4 time = WLM_LIGHTMAP_HOUR_AT(1);
+    vec4 time = wlm_lightmap_entry(1);
     vec2 early = wlm_lightmap_line(image, place, int(time.x));
     return mix(early, wlm_lightmap_line(image, place, int(time.y)), time.z);
 }}
@@ -199,10 +204,10 @@ _IMAGES = """
 vec3 wlm_lightmap_of_{name}(vec4 tile, int record, ivec2 inner)
 {{
     int row = int(tile.y);
-    vec4 least = WLM_LIGHTMAP_HOUR_AT(record);
+    vec4 least = wlm_lightmap_entry(record);
     ivec2 at = ivec2(row % {across}, row / {across}) * {TILE} + inner;
     vec3 level = texelFetch(WLM_LIGHTMAP_{upper}, ivec3(at, int(least.w)), 0).xyz;
-    return mix(least.xyz, WLM_LIGHTMAP_HOUR_AT(record + 1).xyz, level);
+    return mix(least.xyz, wlm_lightmap_entry(record + 1).xyz, level);
 }}
 """
 
@@ -213,8 +218,8 @@ vec3 wlm_colour(ivec2 texel)
     ivec2 place = texel / {TILE};
     ivec2 inner = texel - place * {TILE};
     int record = {head} + (place.y * WLM_LIGHTMAP_COLUMNS + place.x) * WLM_LIGHTMAP_RECORD;
-    vec4 tile = WLM_LIGHTMAP_HOUR_AT(record);
-{kinds}    return WLM_LIGHTMAP_HOUR_AT(record + 1).xyz;
+    vec4 tile = wlm_lightmap_entry(record);
+{kinds}    return wlm_lightmap_entry(record + 1).xyz;
 }}
 """
 
@@ -366,8 +371,11 @@ def decode_glsl(model: LightmapModel, values: tuple[float, float] | None = None)
 def _head(names: list[str], words: dict[str, object]) -> str:
     lines = [f"//   wlm_lightmap_{name}: {_TEXTURES[name][1].format(**words)}.\n" for name in names]
     reads = "".join(
-        _READ.format(macro=macro, texture=f"WLM_LIGHTMAP_{name.upper()}")
-        for macro, name in (("WLM_LIGHTMAP_HOUR_AT", "hour"), ("WLM_LIGHTMAP_NET", "networks"))
+        _READ.format(macro=macro, function=function, texture=f"WLM_LIGHTMAP_{name.upper()}")
+        for macro, function, name in (
+            ("WLM_LIGHTMAP_HOUR_AT", "wlm_lightmap_entry", "hour"),
+            ("WLM_LIGHTMAP_NET", "wlm_lightmap_four", "networks"),
+        )
         if name in names
     )
     return _HEAD.format(
