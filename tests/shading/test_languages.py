@@ -21,6 +21,7 @@ from wlm.atlas.scene.decode import Decoder as SceneDecoder
 from wlm.atlas.scene.model import SceneModel, SceneProfile, SheetPlace
 from wlm.atlas.scene.shader import scene_glsl
 from wlm.atlas.shader import atlas_glsl
+from wlm.errors import WlmError
 from wlm.formats.shared_exponent import pack_rgb9e5, unpack_rgb9e5
 from wlm.lightmap.decode import Decoder as LightmapDecoder
 from wlm.lightmap.exporter import export as export_lightmap
@@ -303,7 +304,7 @@ def test_every_shader_shows_what_python_decodes(name, language, tmp_path):
 
 
 def test_what_is_no_shader_of_ours():
-    with pytest.raises(ValueError, match="language: expected one of glsl, .* got 'cg'"):
+    with pytest.raises(WlmError, match="shader: expected one of glsl, .* got 'cg'"):
         translate("", "cg")
     for text, words in (
         ("#pragma once\n", "expected ifdef"),

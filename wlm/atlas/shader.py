@@ -3,6 +3,9 @@
 from wlm.atlas.model import BLOCK_SIDE, FIRST_BLOCK_CODE, SIDE_BITS, AtlasModel
 from wlm.shading import sampler
 
+EXACT = "WLM_ATLAS_EXACT"
+"""Macro that has texels fetched and mixed in floats."""
+
 _HEAD = """\
 // Light from a compressed lightmap: {what}
 // (Lightmap Compression with Color-Coherent UV Clustering and Cascade Texture Optimization, eq. 7).

@@ -19,8 +19,9 @@ from wlm.lightmap import packed
 from wlm.lightmap.decode import Decoder
 from wlm.lightmap.model import TILE, LightmapModel, decode_scale, encode_time
 from wlm.lightmap.page import MapDecoder
-from wlm.lightmap.shader import decode_glsl
+from wlm.lightmap.shader import EXACT, decode_glsl
 from wlm.lightmap.tiles import TileKind
+from wlm.shading import ENDINGS, check_language, translate
 
 FORMAT = "wlm-lightmap-export"
 _VERSION = 2
@@ -30,9 +31,10 @@ HOURS_FILE = "hours.bin"
 FRAME_FILE = "frame.exr"
 VALID_FILE = "valid.png"
 TEXTURES = ("uv", "uvt", "planes", "frames", "video")
-SHADER_FILE = "decode.glsl"
+SHADER_STEM = "decode"
 
-_FILES = {WEIGHTS_FILE, NETWORKS_FILE, HOURS_FILE, FRAME_FILE, VALID_FILE, SHADER_FILE}
+_FILES = {WEIGHTS_FILE, NETWORKS_FILE, HOURS_FILE, FRAME_FILE, VALID_FILE}
+_FILES |= {SHADER_STEM + ending for ending in ENDINGS.values()}
 _FILES |= {f"{name}.dds" for name in TEXTURES}
 _OF_VERSION_1 = re.compile(r"tile_\d{4,}_(uv|uvt|ut|vt|frame_\d{4,})\.dds")
 
@@ -80,6 +82,8 @@ def export(
     *,
     device: str = "cpu",
     values: tuple[float, float] | None = None,
+    shader: str = "glsl",
+    exact: bool = False,
 ) -> list[Path]:
     """Writes a model as textures, tables, a shader and a frame to compare with.
 
@@ -87,8 +91,9 @@ def export(
     (neural-dynamic-gi, Table 1), image by image; `frames.dds` (BC7) and `video.dds` (R10G10B10A2_UNORM, unpacked) are
     arrays with a layer for each stored time. Those that a model has no tiles for are left out. The blocks are the
     model's own bytes. `networks.bin` and `hours.bin` are floats, see `wlm.lightmap.packed`; `decode.glsl` is the
-    decoder; `valid.png` is white inside charts, for the pass that fills the gaps; `frame.exr` is the map at the first
-    stored time, as the shader should show it; `weights.json` explains itself under "about".
+    decoder (or `.hlsl`, `.metal`, `.wgsl`); `valid.png` is white inside charts, for the pass that fills the gaps;
+    `frame.exr` is the map at the first stored time, as the shader should show it; `weights.json` explains itself under
+    "about".
 
     The files are written beside the folder and moved in together, `weights.json` last. An earlier export is replaced;
     other files stay.
@@ -99,24 +104,28 @@ def export(
         device: Where the frame is decoded.
         values: What the levels 0 and 1 of a model without gamma stand for: `frame.exr` and the shader have values, and
             `weights.json` says so. None: the model is of radiance.
+        shader: Its language, one of `wlm.shading.LANGUAGES`.
+        exact: Texels are fetched and mixed in floats where the filter unit would do.
 
     Returns:
         The files written.
 
     Raises:
-        WlmError: The folder holds something other than an earlier export, or can't be written; no such device; a
-            number of the model isn't finite; or a texture is larger than GPUs take.
+        WlmError: The folder holds something other than an earlier export, or can't be written; no such device or
+            language; a number of the model isn't finite; or a texture is larger than GPUs take.
     """
-    folder = Path(directory)
+    check_language(shader)
+    folder, name = Path(directory), SHADER_STEM + ENDINGS[shader]
     frame = Decoder(model, device).frame(float(model.times[0]))
     if values is not None:
         frame = np.float32(values[0]) + np.float32(values[1] - values[0]) * frame
     make_parents(folder)
     with staged(folder, WEIGHTS_FILE, FORMAT, is_exported) as staging:
         write_exr(staging / FRAME_FILE, frame, half=False)
-        (staging / SHADER_FILE).write_bytes(decode_glsl(model, values).encode())
+        text = translate(decode_glsl(model, values), shader, [EXACT] if exact else [])
+        (staging / name).write_bytes(text.encode())
         names = write_parts(model, staging, values)
-    return [folder / name for name in (FRAME_FILE, SHADER_FILE, *names)]
+    return [folder / name for name in (FRAME_FILE, name, *names)]
 
 
 def write_parts(model: LightmapModel, folder: Path, values: tuple[float, float] | None = None) -> list[str]:

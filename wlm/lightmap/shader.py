@@ -6,6 +6,9 @@ from wlm.lightmap.tiles import TileKind
 from wlm.shading import sampler
 from wlm.texels import REACH
 
+EXACT = "WLM_LIGHTMAP_EXACT"
+"""Macro that has texels fetched and mixed in floats."""
+
 _GELU = {
     "exact": """\
 // x Phi(x). erf as in Abramowitz and Stegun, Handbook of Mathematical Functions, 7.1.26: within 1.5e-7, which leaves

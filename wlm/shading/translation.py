@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterable
 
+from wlm.errors import WlmError
 from wlm.shading.hlsl import HlslWriter
 from wlm.shading.metal import MetalWriter
 from wlm.shading.source import read_words
@@ -24,6 +25,16 @@ _PRECISIONS = "".join(
 _FOR_GLSL = re.compile(r"For GLSL [^;]*;\s*(//\s*)?include it below #version[^.:]*\.")
 
 
+def check_language(language: str) -> None:
+    """Checks a language's name.
+
+    Raises:
+        WlmError: It is none of `LANGUAGES`.
+    """
+    if language not in LANGUAGES:
+        raise WlmError(f"shader: expected one of {', '.join(LANGUAGES)}, got {language!r}")
+
+
 def translate(text: str, language: str, defined: Iterable[str] = ()) -> str:
     """Writes one of our shaders in another language.
 
@@ -36,10 +47,10 @@ def translate(text: str, language: str, defined: Iterable[str] = ()) -> str:
         defined: Macros that are defined, for example `WLM_ATLAS_EXACT`.
 
     Raises:
-        ValueError: No such language, or GLSL beyond what our shaders are made of.
+        WlmError: No such language.
+        ValueError: GLSL beyond what our shaders are made of.
     """
-    if language not in LANGUAGES:
-        raise ValueError(f"language: expected one of {', '.join(LANGUAGES)}, got {language!r}")
+    check_language(language)
     if not language.startswith("glsl"):
         text = _FOR_GLSL.sub(f"For {_VERSIONS[language]}.", text)
         return _WRITERS[language](read_shader(read_words(text, defined))).text()
