@@ -39,7 +39,7 @@ _HEAD = """\
 // below `precision highp` of float, int, sampler2D and sampler2DArray.
 //
 // Once for each stored hour that is wanted: bind the hour's table, draw the map into a texture of linear light with
-// wlm_radiance(texel), and draw that one into another, each texel from wlm_source(texel), which fills the gaps between
+// {last}(texel), and draw that one into another, each texel from wlm_source(texel), which fills the gaps between
 // charts that a filter reads at their edges. Materials mix two of these by the time between both hours (eq. 2).
 //
 // Textures; row 0 is v = 0. Filters are linear, without mip levels.
@@ -351,7 +351,7 @@ def decode_glsl(model: LightmapModel, values: tuple[float, float] | None = None)
             own = words | {"name": name, "upper": name.upper(), "across": across[name], "code": CODES[kind]}
             images += _IMAGES.format(**own)
             kinds += _IMAGE_KIND.format(**own)
-    text = _head(names, words)
+    text = _head(names, words | {"last": "wlm_radiance" if values is None else "wlm_value"})
     if "uvt" in names:
         text += _MAPS.format(**words)
     if mapped:

@@ -6,7 +6,8 @@ from wlm.smoke.camera import ALPHA, EMISSION, LAYOUTS
 _TEXT = """\
 // Six-way smoke of {count} frames, in {rows} x {columns} cells, in the channels of "{layout}".
 // (Neural Six-way Lightmaps for Real-time Smoke Rendering, eq. 4; lights weigh by squares, as in engines.)
-// For GLSL 3.30, GLSL ES 3.00 and later; include it below #version. Both textures are linear, not sRGB; sample both at wlm_smoke_uv, clamped to their edge.
+// For GLSL 3.30, GLSL ES 3.00 and later; include it below #version.
+// Both textures are linear, not sRGB; sample both at wlm_smoke_uv, clamped to their edge.
 //
 //     light = sum over lights of irradiance / (4 pi) * wlm_smoke_light(first, second, toward)
 //     pixel = light + colour * wlm_smoke_emission(first, second) + behind * (1 - wlm_smoke_alpha(first, second))
