@@ -16,6 +16,7 @@ DXGI_FORMATS = {
     "R16G16_UNORM": 35,
     "R16G16_UINT": 36,
     "R8G8_UNORM": 49,
+    "R8_UNORM": 61,
     "R9G9B9E5_SHAREDEXP": 67,
     "BC6H_UF16": 95,
     "BC6H_SF16": 96,
@@ -34,6 +35,7 @@ _TEXEL_BYTES = {
     "R16G16_UNORM": 4,
     "R16G16_UINT": 4,
     "R8G8_UNORM": 2,
+    "R8_UNORM": 1,
     "R9G9B9E5_SHAREDEXP": 4,
 }
 MOST_SIDE = 16384

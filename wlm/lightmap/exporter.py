@@ -129,7 +129,11 @@ def export(
 
 
 def write_parts(model: LightmapModel, folder: Path, values: tuple[float, float] | None = None) -> list[str]:
-    """Writes what every engine reads: textures, floats, the mask, and `weights.json` last; see `export`.
+    """Writes what every engine reads: textures, floats, the mask, and `weights.json` last.
+
+    Args:
+        model, values: As of `export`.
+        folder: Where; it must exist.
 
     Returns:
         The files' names.

@@ -1,0 +1,16 @@
+#[compute]
+#version 450
+// Decodes a stored hour into linear light. See README.md.
+
+@SHADER@
+
+layout(local_size_x = 8, local_size_y = 8) in;
+layout(rgba16f, set = 0, binding = 8) uniform restrict writeonly image2D wlm_target;
+
+void main()
+{
+    ivec2 texel = ivec2(gl_GlobalInvocationID.xy);
+    ivec2 size = imageSize(wlm_target);
+    if (texel.x < size.x && texel.y < size.y)
+        imageStore(wlm_target, texel, vec4(wlm_radiance(texel), 1.0));
+}
