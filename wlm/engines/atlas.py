@@ -5,11 +5,14 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
+
 from wlm.atlas.exporter import MESH_FILE, Output
-from wlm.atlas.model import AtlasModel
+from wlm.atlas.model import BLOCK_SIDE, AtlasModel
 from wlm.atlas.shader import atlas_glsl
 from wlm.engines.kit import ENGINES, README_FILE, filled, godot_uniforms
 from wlm.errors import WlmError
+from wlm.formats.dds import write_dds
 from wlm.formats.folder import make_parents, staged, write_index
 from wlm.shading import ENDINGS, check_language, translate
 
@@ -52,7 +55,10 @@ def export_atlas(
         raise WlmError(f"{folder}: expected another folder than that of the compression")
     with staged(folder, INFO_FILE, FORMAT, _is_exported) as staging:
         for name, file in files.items():
-            _copy(output.folder / (name + ending), staging / file)
+            if name == "colour" and engine != "raw" and ending == ".dds" and _odd_blocks(model):
+                _write_halves(staging / file, model.texels)
+            else:
+                _copy(output.folder / (name + ending), staging / file)
         _copy(output.folder / MESH_FILE, staging / MESH_FILE)
         for name, text in texts.items():
             (staging / name).write_bytes(text.encode())
@@ -69,6 +75,20 @@ def export_atlas(
         }
         write_index(staging / INFO_FILE, info)
     return [folder / name for name in (*texts, *files.values(), MESH_FILE, INFO_FILE)]
+
+
+def _odd_blocks(model: AtlasModel) -> bool:
+    """Whether the colours are blocks that don't fill their texture, which Direct3D and browsers refuse."""
+    return model.colour == "bc6h" and any(side % BLOCK_SIDE for side in model.texels.shape[:2])
+
+
+def _write_halves(path: Path, texels: np.ndarray) -> None:
+    height, width = texels.shape[:2]
+    whole = np.concatenate([texels.astype("<f2"), np.ones((height, width, 1), "<f2")], 2)
+    # Under another ending in Unity's folder.
+    made = path.with_suffix(".dds")
+    write_dds(made, whole.tobytes(), width, height, fmt="R16G16B16A16_FLOAT")
+    made.rename(path)
 
 
 def _copy(source: Path, target: Path) -> None:
