@@ -76,8 +76,7 @@ def _godot(model: LightmapModel) -> dict[str, str]:
     shader = bindings + decode_glsl(model)
     listed = ", ".join(f'"{name}"' for name in names)
     return {
-        "decode.glsl": filled("godot_decode.glsl", SHADER=shader),
-        "fill.glsl": filled("godot_fill.glsl", SHADER=shader),
+        "lightmap.glsl": filled("godot_lightmap.glsl", SHADER=shader),
         "wlm_lightmap.gd": filled("godot_lightmap.gd", NAMES=listed),
         "lit.gdshader": filled("godot_lit.gdshader"),
         README_FILE: filled("godot_lightmap.md", NAME=model.name),
@@ -110,7 +109,7 @@ _TEXTS: dict[str, Callable[[LightmapModel], dict[str, str]]] = {
     "unreal": _unreal,
 }
 _ENDINGS = (".hlsl", ".shader", ".cs", ".usf", ".gd", ".gdshader", ".js", ".glsl")
-_STEMS = {"lightmap", "decode", "fill", "lit", "wlm_lightmap", "WlmLightmap"}
+_STEMS = {"lightmap", "lit", "wlm_lightmap", "WlmLightmap"}
 _BYTES = {f"{name}.bytes" for name in ("uv", "uvt", "planes", "frames", "video", "networks", "hours", "valid")}
 
 

@@ -44,9 +44,9 @@ func _ready() -> void:
 			_textures[name] = _fours(FileAccess.get_file_as_bytes(folder.path_join("networks.bin")))
 		elif name != "hour":
 			_textures[name] = _read_dds(folder.path_join(name + ".dds"), name == "frames" or name == "video")
+	var file: RDShaderFile = load(folder.path_join("lightmap.glsl"))
 	for name in ["decode", "fill"]:
-		var file: RDShaderFile = load(folder.path_join(name + ".glsl"))
-		var shader := _device.shader_create_from_spirv(file.get_spirv())
+		var shader := _device.shader_create_from_spirv(file.get_spirv(name))
 		_passes[name] = [shader, _device.compute_pipeline_create(shader)]
 	_raw = _target()
 	for i in 2:
@@ -114,7 +114,7 @@ func _map_of(hour: int, other: int) -> int:
 func _run(name: String, target: RID, source: RID) -> void:
 	var bound: Array[RDUniform] = []
 	for i in NAMES.size():
-		# What fill.glsl doesn't read isn't in its layout.
+		# What a pass doesn't read isn't in its layout.
 		if name == "decode" and NAMES[i] != "valid" or name == "fill" and NAMES[i] == "valid":
 			bound.append(_uniform(RenderingDevice.UNIFORM_TYPE_SAMPLER_WITH_TEXTURE, i, [_sampler, _textures[NAMES[i]]]))
 	bound.append(_uniform(RenderingDevice.UNIFORM_TYPE_IMAGE, 8, [target]))
