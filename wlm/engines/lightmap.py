@@ -16,6 +16,7 @@ from wlm.lightmap.model import LightmapModel
 from wlm.lightmap.shader import decode_glsl, texture_names
 from wlm.shading import translate
 
+FORMAT = "wlm-lightmap-engine"
 MASK_FILE = "valid.dds"
 
 
@@ -39,8 +40,8 @@ def export_lightmap(model: LightmapModel | LayeredModel, directory: str | os.Pat
         raise WlmError(f"{model.name}: cannot export for {engine}: expected one light, found layers; export it raw")
     folder = Path(directory)
     make_parents(folder)
-    with staged(folder, exporter.WEIGHTS_FILE, exporter.FORMAT, _is_exported) as staging:
-        parts = exporter.write_parts(model, staging)
+    with staged(folder, exporter.WEIGHTS_FILE, FORMAT, _is_exported) as staging:
+        parts = exporter.write_parts(model, staging, form=FORMAT)
         (staging / exporter.VALID_FILE).unlink()
         height, width = model.mask.shape
         mask = model.mask.astype(np.uint8) * 255

@@ -128,12 +128,15 @@ def export(
     return [folder / name for name in (FRAME_FILE, name, *names)]
 
 
-def write_parts(model: LightmapModel, folder: Path, values: tuple[float, float] | None = None) -> list[str]:
+def write_parts(
+    model: LightmapModel, folder: Path, values: tuple[float, float] | None = None, form: str = FORMAT
+) -> list[str]:
     """Writes what every engine reads: textures, floats, the mask, and `weights.json` last.
 
     Args:
         model, values: As of `export`.
         folder: Where; it must exist.
+        form: `format` of `weights.json`: whose folder it is.
 
     Returns:
         The files' names.
@@ -143,7 +146,7 @@ def write_parts(model: LightmapModel, folder: Path, values: tuple[float, float] 
     """
     tables, nets = packed.hour_tables(model), packed.networks(model)
     textures = packed.textures(model)
-    content = document(model, textures, nets[1]) | {"hour_fours": tables.shape[1]}
+    content = document(model, textures, nets[1]) | {"format": form, "hour_fours": tables.shape[1]}
     if values is not None:
         content |= {"values": list(values), "about": _ABOUT | {"values": _VALUES}}
     try:

@@ -42,7 +42,7 @@ public class WlmLightmap : MonoBehaviour
         if (weights == null || shader == null)
             return;
         content = JsonUtility.FromJson<Content>(weights.text);
-        if (content.format != "wlm-lightmap-export" || content.version != 2)
+        if (content.format != "wlm-lightmap-engine" || content.version != 2)
             throw new FormatException("WlmLightmap: expected weights.json of wlm, version 2");
         material = Keep(new Material(shader));
         void Put(string name, TextAsset asset, bool array)
