@@ -30,6 +30,7 @@ template <class T, int N> struct vec {
     vec(vec<T, 2> a, vec<T, 2> b) : v{a.v[0], a.v[1], b.v[0], b.v[1]} {}
     vec(vec<T, 2> a, T z, T w) : v{a.v[0], a.v[1], z, w} {}
     vec(vec<T, 3> a, T w) : v{a.v[0], a.v[1], a.v[2], w} {}
+    T& operator[](int i) { return v[i]; }
     T& x() { return v[0]; } T& y() { return v[1]; } T& z() { return v[2]; } T& w() { return v[3]; }
     T& r() { return v[0]; } T& g() { return v[1]; } T& b() { return v[2]; } T& a() { return v[3]; }
     vec<T, 2> xy() { return vec<T, 2>(v[0], v[1]); }
