@@ -68,6 +68,7 @@ def test_what_cannot_be_exported_for_an_engine(tmp_path):
     assert "engine: expected one of raw" in error_of(export_atlas, output, tmp_path / "a", "cry")
     assert "there is no DDS of ASTC" in error_of(export_atlas, output, tmp_path / "a", "three")
     assert {path.name for path in export_atlas(output, tmp_path / "a", "godot")} > {"colour.exr"}
+    assert {path.name for path in export_atlas(output, tmp_path / "a", "raw")} > {"colour.ktx2"}
     assert "another folder" in error_of(export_atlas, output, output.folder, "godot")
     (tmp_path / "made" / "colour.exr").unlink()
     assert "colour.exr: no such file; compress again" in error_of(export_atlas, output, tmp_path / "b", "godot")

@@ -306,6 +306,7 @@ def test_every_shader_shows_what_python_decodes(name, language, tmp_path):
         np.testing.assert_allclose(found, subject.expected, rtol=0, atol=subject.filtered)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", ["lightmap", "atlas cascade", "atlas tiles mixed", "scene", "smoke unity", "volume", "probes"]
 )

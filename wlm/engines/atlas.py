@@ -44,6 +44,8 @@ def export_atlas(
         raise WlmError(f"engine: expected one of raw, {', '.join(ENGINES)}, got {engine!r}")
     check_language(shader)
     model, ending = output.model, ".exr" if engine == "godot" else ".dds"
+    if model.colour == "astc" and engine == "raw":
+        ending = ".ktx2"
     if model.colour == "astc" and ending == ".dds":
         raise WlmError(f"{output.folder}: cannot export for {engine}: there is no DDS of ASTC; compress with bc6h")
     names = ["colour", *(["lut"] if model.method != "plain" else []), *(["blocks"] if model.colour == "mixed" else [])]
@@ -141,7 +143,7 @@ _TEXTS: dict[str, Callable[[AtlasModel], dict[str, str]]] = {
     "unreal": _unreal,
 }
 _STEMS = {"atlas", "colour", "lut", "blocks", "WlmAtlas"}
-_ENDINGS = {*ENDINGS.values(), ".dds", ".exr", ".bytes", ".js", ".gdshader", ".shader", ".cs", ".usf"}
+_ENDINGS = {*ENDINGS.values(), ".dds", ".ktx2", ".exr", ".bytes", ".js", ".gdshader", ".shader", ".cs", ".usf"}
 
 
 def _is_exported(name: str) -> bool:

@@ -94,7 +94,7 @@ export async function loadLightmap(url, renderer, THREE) {
       mixing.uniforms.u_share.value = reads.length > 1 ? reads[1].weight : 0;
       draw(mixing, shown);
     },
-    // The light on a material; `channel`: n of its mesh's TEXCOORD_n.
+    // The light on a material; `channel`: n of its mesh's TEXCOORD_n, the same for all.
     apply(material, channel = 1) {
       material.lightMap = shown.texture;
       material.lightMap.channel = channel;
