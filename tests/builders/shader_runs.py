@@ -162,9 +162,9 @@ def run_hlsl(text, expression, size, bound, tmp_path):
 
 
 def _run(code, size, bound, places):
+    gpu = device()
     import wgpu
 
-    gpu = device()
     usage, kinds = wgpu.BufferUsage, wgpu.TextureUsage
     pipeline = gpu.create_compute_pipeline(
         layout="auto", compute={"module": gpu.create_shader_module(code=code), "entry_point": "main"}
