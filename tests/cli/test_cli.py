@@ -220,6 +220,7 @@ def test_export_for_an_engine_and_in_a_language(fitted, tmp_path):
     assert "textureSampleLevel" not in text and "fn wlm_radiance(texel: vec2i) -> vec3f" in text
     assert "--shader: means nothing with --engine unity" in fails(*out, "--engine", "unity", "--shader", "hlsl")
     assert "--exact: means nothing with --engine godot" in fails(*out, "--engine", "godot", "--exact")
+    assert "--device: means nothing with --engine three" in fails(*out, "--engine", "three", "--device", "cuda")
 
 
 def test_names_that_look_like_markup_are_shown_as_they_are(fitted, tmp_path):

@@ -369,6 +369,8 @@ def export(
     of three channels has a folder of its own; sheets.json names them.
     """
     language = shader_of(engine, shader, exact)
+    if engine != "raw" and device != "cpu":
+        raise WlmError(f"--device: means nothing with --engine {engine}, for which no frame is decoded")
     quiet_warp()
     from wlm.engines import export_lightmap
     from wlm.lightmap.front import export
