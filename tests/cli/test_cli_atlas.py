@@ -311,3 +311,6 @@ def test_export_for_an_engine_and_in_a_language(tiles, tmp_path):
     assert "float3 wlm_atlas(float2 uv) const" in (tmp_path / "out" / "atlas.metal").read_text()
     assert "--shader: means nothing with --engine three" in fails(*out, "--engine", "three", "--shader", "wgsl")
     assert "another folder" in fails("atlas", "export", tiles, "-o", tiles)
+    (tmp_path / "scene").mkdir()
+    (tmp_path / "scene" / "report.json").write_text('{"format": "wlm-atlas-scene"}')
+    assert "found a scene" in fails("atlas", "export", tmp_path / "scene", "-o", tmp_path / "other")

@@ -86,9 +86,11 @@ def filtered(frame):
     return out
 
 
-@pytest.mark.parametrize("kinds", [(4, 3, 2, 1), (5, 3, 5, 0)], ids=str)
-def test_three_shows_the_light_of_any_hour(kinds, tmp_path, browser, serve):
-    model = random_lightmap(kinds)
+@pytest.mark.parametrize(
+    ("kinds", "interpolation"), [((4, 3, 2, 1), "radiance"), ((5, 3, 5, 0), "radiance"), ((4, 3, 2, 1), "network")]
+)
+def test_three_shows_the_light_of_any_hour(kinds, interpolation, tmp_path, browser, serve):
+    model = random_lightmap(kinds, interpolation=interpolation)
     export_lightmap(model, tmp_path, "three")
     page, errors = opened(browser, tmp_path, serve, _LIGHTMAP)
     decoder = model.decoder()

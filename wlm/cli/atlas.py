@@ -299,8 +299,11 @@ def export(
     language = shader_of(engine, shader, exact)
     quiet_warp()
     from wlm.atlas.exporter import read_folder
+    from wlm.atlas.scene.exporter import is_scene
     from wlm.engines import export_atlas
 
+    if is_scene(folder):
+        raise WlmError(f"{folder}: expected one lightmap alone, found a scene, whose folder has scene.glsl already")
     rows = table(str(output), ["file", "bytes"])
     for path in export_atlas(read_folder(folder), output, engine, shader=language, exact=exact):
         rows.add_row(escape(path.name), f"{path.stat().st_size:,}")
