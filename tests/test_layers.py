@@ -7,13 +7,13 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 GROUND = (
     "wlm_kernels wlm wlm._facade wlm.errors wlm.formats wlm.metrics wlm.config wlm.interop wlm.texels wlm.system "
-    "wlm.workers"
+    "wlm.workers wlm.shading"
 )
 FLOORS = (
     GROUND.split(),
     ["wlm.ops", "wlm.fluid"],
     ["wlm.lightmap", "wlm.atlas", "wlm.probe", "wlm.smoke"],
-    ["wlm.baselines", "wlm.inspection", "wlm.view", "wlm.web"],
+    ["wlm.baselines", "wlm.engines", "wlm.inspection", "wlm.view", "wlm.web"],
     ["wlm.bench"],
     ["wlm.cli"],
     ["wlm.__main__"],

@@ -21,6 +21,7 @@ PACKAGES = (
     "wlm.fluid",
     "wlm.ops",
     "wlm.inspection",
+    "wlm.engines",
     "wlm.web",
 )
 _OUTSIDE = re.compile(

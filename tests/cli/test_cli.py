@@ -68,7 +68,7 @@ def test_the_version_is_quick_to_tell():
 def test_help_lists_the_commands():
     systems = {
         "lightmap": "compress decode evaluate info export",
-        "atlas": "compress decode evaluate info",
+        "atlas": "compress decode evaluate info export",
         "probe": "compress decode evaluate info export walk",
         "smoke": "simulate guide bake shade flipbook",
     }
@@ -207,6 +207,20 @@ def test_export_lists_what_it_wrote(fitted, tmp_path):
     call("lightmap", "export", fitted, "-o", tmp_path / "out", "--device", "cpu")  # over an earlier one
     assert "device 'tpu'" in fails("lightmap", "export", fitted, "-o", tmp_path / "none", "--device", "tpu")
     assert not (tmp_path / "none").exists()
+
+
+def test_export_for_an_engine_and_in_a_language(fitted, tmp_path):
+    out = ["lightmap", "export", fitted, "-o", tmp_path / "out"]
+    assert "decode.hlsl" in call(*out, "--shader", "hlsl")
+    assert "decode.wgsl" in call(*out, "--shader", "wgsl", "--exact")
+    assert not (tmp_path / "out" / "decode.hlsl").exists()
+    assert "lightmap.js" in call("lightmap", "export", fitted, "-o", tmp_path / "three", "--engine", "three")
+    assert "found other files" in fails(*out, "--engine", "three")
+    text = (tmp_path / "out" / "decode.wgsl").read_text()
+    assert "textureSampleLevel" not in text and "fn wlm_radiance(texel: vec2i) -> vec3f" in text
+    assert "--shader: means nothing with --engine unity" in fails(*out, "--engine", "unity", "--shader", "hlsl")
+    assert "--exact: means nothing with --engine godot" in fails(*out, "--engine", "godot", "--exact")
+    assert "--device: means nothing with --engine three" in fails(*out, "--engine", "three", "--device", "cuda")
 
 
 def test_names_that_look_like_markup_are_shown_as_they_are(fitted, tmp_path):

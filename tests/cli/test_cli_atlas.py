@@ -301,3 +301,16 @@ def test_a_scene_is_one_command(tmp_path):
     assert report["inside_views"] == 2 and report["psnr"] > 35.0 and "PSNR dB, from inside" in text
     words = ("atlas", "compress", path, tmp_path / "lights.json", "-o", out, "--flip")
     assert "--flip: expected with one lightmap alone" in fails(*words)
+
+
+def test_export_for_an_engine_and_in_a_language(tiles, tmp_path):
+    out = ["atlas", "export", tiles, "-o", tmp_path / "out"]
+    assert "atlas.gdshader" in call(*out, "--engine", "godot")
+    assert "atlas.metal" in call(*out, "--shader", "msl")
+    assert not (tmp_path / "out" / "atlas.gdshader").exists()
+    assert "float3 wlm_atlas(float2 uv) const" in (tmp_path / "out" / "atlas.metal").read_text()
+    assert "--shader: means nothing with --engine three" in fails(*out, "--engine", "three", "--shader", "wgsl")
+    assert "another folder" in fails("atlas", "export", tiles, "-o", tiles)
+    (tmp_path / "scene").mkdir()
+    (tmp_path / "scene" / "report.json").write_text('{"format": "wlm-atlas-scene"}')
+    assert "found a scene" in fails("atlas", "export", tmp_path / "scene", "-o", tmp_path / "other")

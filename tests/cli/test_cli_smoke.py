@@ -237,7 +237,10 @@ def test_flipbook(layout, baked, volume, tmp_path):
 
 def test_a_padded_flipbook_and_its_shaders(baked, tmp_path):
     text = call("smoke", "flipbook", baked, "-o", tmp_path / "f.exr", "--padding", 3, "--shader")
-    assert sorted(os.listdir(tmp_path)) == ["f.glsl", "f.hlsl", "f_1.exr", "f_2.exr"] and "3 around each" in text
+    assert (
+        sorted(os.listdir(tmp_path)) == ["f.glsl", "f.hlsl", "f.metal", "f.wgsl", "f_1.exr", "f_2.exr"]
+        and "3 around each" in text
+    )
     result = read_flipbook((tmp_path / "f_1.exr", tmp_path / "f_2.exr"), rows=2, columns=2, count=3, padding=3)
     torch.testing.assert_close(result[1].lightmaps, read_six_way(baked / "six_0002.exr").lightmaps)
     assert "of 3 frames, in 2 x 2 cells" in (tmp_path / "f.hlsl").read_text()

@@ -83,11 +83,20 @@ def test_two_bytes_a_texel(tmp_path):
         write_dds(path, texels, width=4, height=4, fmt="R8G8_UNORM")
 
 
+def test_an_array(tmp_path):
+    path = tmp_path / "a.dds"
+    write_dds(path, _blocks(6), width=8, height=4, layers=3)
+    data = path.read_bytes()
+    # DDSCAPS_COMPLEX, and arraySize behind the dimension and the flags.
+    assert [_field(data, at) for at in (CAPS, CAPS2, DEPTH, DIMENSION, DIMENSION + 8)] == [0x1008, 0, 0, 3, 3]
+    assert data[148:] == _blocks(6)
+
+
 @pytest.mark.parametrize("fmt", DXGI_FORMATS)
 @pytest.mark.parametrize("depth", [1, 3])
 def test_every_format(tmp_path, fmt, depth):
     path = tmp_path / "a.dds"
-    texel = {"R16G16B16A16_FLOAT": 8, "R8G8_UNORM": 2} | dict.fromkeys(FOUR_BYTES, 4)
+    texel = {"R16G16B16A16_FLOAT": 8, "R8G8_UNORM": 2, "R8_UNORM": 1} | dict.fromkeys(FOUR_BYTES, 4)
     texel = texel.get(fmt)
     blocks = _blocks(10 * depth)[: (5 * 4 * texel if texel else 2 * 16) * depth]
     write_dds(path, blocks, width=5, height=4, depth=depth, fmt=fmt)
@@ -109,6 +118,9 @@ def test_every_format(tmp_path, fmt, depth):
         {"width": 9},
         {"fmt": "R8G8_UNORM"},
         {"width": 4, "depth": 2, "volume": False},
+        {"layers": 2},
+        {"width": 4, "depth": 2, "layers": 1},
+        {"width": 4, "layers": -1},
     ],
 )
 def test_what_does_not_fit_is_a_value_error(tmp_path, change):

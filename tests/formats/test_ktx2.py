@@ -16,6 +16,7 @@ TEXEL = {
     "R16G16_UINT": 4,
     "R16G16_SFLOAT": 4,
     "R16G16B16_SFLOAT": 6,
+    "R32G32_SFLOAT": 8,
     "R16G16B16A16_SFLOAT": 8,
     "E5B9G9R9_UFLOAT_PACK32": 4,
 }
@@ -38,7 +39,17 @@ def test_the_header(tmp_path, fmt):
     data = path.read_bytes()
     assert data[:12] == bytes([0xAB, 0x4B, 0x54, 0x58, 0x20, 0x32, 0x30, 0xBB, 0x0D, 0x0A, 0x1A, 0x0A])
     found = [_word(data, at) for at in (FORMAT, TYPE_SIZE, WIDTH, HEIGHT, DEPTH, LAYERS, FACES, LEVELS, SCHEME)]
-    assert found == [VK_FORMATS[fmt], (4 if fmt[0] == "E" else 2) if fmt in TEXEL else 1, 5, 3, 0, 0, 1, 1, 0]
+    assert found == [
+        VK_FORMATS[fmt],
+        (4 if fmt.startswith(("E", "R32")) else 2) if fmt in TEXEL else 1,
+        5,
+        3,
+        0,
+        0,
+        1,
+        1,
+        0,
+    ]
     assert struct.unpack_from("<2Q", data, 64) == (0, 0)
     start, length, plain = struct.unpack_from("<3Q", data, LEVEL)
     assert length == plain == len(_data(fmt)) and data[start:] == _data(fmt)
@@ -57,6 +68,7 @@ def test_the_header(tmp_path, fmt):
         ("R16G16_UNORM", 1, 0, 4, [(0, 15, 0, 0, 0xFFFF), (16, 15, 1, 0, 0xFFFF)]),
         ("R16G16_UINT", 1, 0, 4, [(0, 15, 0, 0, 1), (16, 15, 1, 0, 1)]),
         ("R16G16_SFLOAT", 1, 0, 4, [(0, 15, 0xC0, MINUS_ONE, ONE), (16, 15, 0xC1, MINUS_ONE, ONE)]),
+        ("R32G32_SFLOAT", 1, 0, 8, [(32 * i, 31, 0xC0 + i, MINUS_ONE, ONE) for i in range(2)]),
         ("R16G16B16_SFLOAT", 1, 0, 6, [(16 * i, 15, 0xC0 + i, MINUS_ONE, ONE) for i in range(3)]),
         ("R16G16B16A16_SFLOAT", 1, 0, 8, [(16 * i, 15, 0xC0 + (i, 15)[i == 3], MINUS_ONE, ONE) for i in range(4)]),
         (

@@ -8,9 +8,9 @@ from builders.checks import assert_same, error_of
 from builders.layered_sets import SHEETS, random_layers, small_layers, turning_directions
 from builders.resigned import GONE, rewrite
 from builders.running import report_always
+from builders.shader_runs import read_dds_levels
 from builders.small_sets import HOURS, tiny_profile
 from builders.synthetic import random_model
-from test_export import read_texture
 
 import wlm
 from wlm.formats.artifact import read_artifact
@@ -213,12 +213,12 @@ def test_an_export_has_a_folder_for_each_sheet(tmp_path):
     light, directions = (folder / item["folder"] for item in index["sheets"][:2])
     assert (index["sheets"][1]["least"], index["sheets"][1]["greatest"]) == (-1.0, 1.0)
     shader = (directions / "decode.glsl").read_text()
-    assert "return vec3(-1.0, -1.0, -1.0) + 2.0 * colour;" in shader and "wlm_radiance" not in shader
+    assert "return vec3(-1.0, -1.0, -1.0) + 2.0 * wlm_colour(texel);" in shader and "wlm_radiance" not in shader
     assert "wlm_radiance" in (light / "decode.glsl").read_text()
     # By what the files say alone: a texel of the tile of frames, at the first time.
     document = json.loads((directions / "weights.json").read_text())
     (tile,) = document["tiles"]
-    level = read_texture(directions / "tile_0000_frame_0000.dds")[0, ..., :3]
+    level = read_dds_levels(directions / "frames.dds")[0, ..., :3]
     colour = tile["least"][0] + level * (np.array(tile["greatest"][0]) - tile["least"][0])
     low, high = document["values"]
     frame = read_exr(directions / "frame.exr")[0]

@@ -1,10 +1,7 @@
 """Flip books: every layout and kind of file there and back, the order of cells, what is refused."""
 
-import shutil
 import struct
-import subprocess
 import zlib
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,8 +17,6 @@ from wlm.smoke.baking import bake
 from wlm.smoke.camera import DIRECTIONS, LAYOUTS, Camera, axis_faults
 from wlm.smoke.exporter import brightest_gain, cells, channels, pack, read_flipbook, unpack, write_flipbook
 from wlm.smoke.lightmaps import SixWay
-from wlm.smoke.shader import smoke_shader
-from wlm.smoke.shading import Light
 
 KINDS = {".exr": 6e-4, ".png": 0.51 / 255, ".tga": 0.51 / 255}
 
@@ -62,84 +57,6 @@ def test_padding():
         pack(frames, rows=2, columns=3, padding=-1)
     with pytest.raises(ValueError, match="padding: expected cells of more than twice 5"):
         unpack(*pages, rows=2, columns=3, padding=5)
-
-
-def _shader(language: str, layout: str = "unity", **changed: object) -> str:
-    options = {"rows": 2, "columns": 3, "count": 5, "size": (6, 9), "padding": 2, "gain": 0.5} | changed
-    return smoke_shader(language, layout, **options)
-
-
-@pytest.mark.skipif(shutil.which("glslangValidator") is None, reason="glslangValidator is not installed")
-def test_the_shaders_compile(tmp_path: Path):
-    calls = "wlm_smoke_light(a, b, c) + wlm_smoke_alpha(a, b) + wlm_smoke_emission(a, b)"
-    glsl = (
-        "in vec4 a; in vec4 b; in vec3 c; out vec4 o;\nvoid main() { o = vec4(wlm_smoke_uv(a.xy, b.x), "
-        + calls
-        + ", 1); }"
-    )
-    hlsl = "float4 main(float4 a : A, float4 b : B, float3 c : C) : SV_Target\n{ return float4("
-    hlsl += f"wlm_smoke_uv(a.xy, b.x), {calls}, 1); }}"
-    texts = {
-        "glsl": f"#version 330\n{_shader('glsl')}{glsl}",
-        "es": f"#version 300 es\nprecision highp float;\n{_shader('glsl', 'o3de-tlrb')}{glsl}",
-        "hlsl": _shader("hlsl", "embergen", hot=False) + hlsl,
-    }
-    for name, text in texts.items():
-        (tmp_path / f"{name}.frag").write_text(text)
-        words = ["-D", "-V", "-e", "main", "-S", "frag", "-o", "out.spv"] if name == "hlsl" else []
-        made = subprocess.run(
-            ["glslangValidator", *words, f"{name}.frag"], cwd=tmp_path, capture_output=True, text=True
-        )
-        assert made.returncode == 0, made.stdout
-
-
-@pytest.mark.skipif(shutil.which("g++") is None, reason="no C++ compiler is installed")
-@pytest.mark.parametrize("layout", LAYOUTS)
-def test_the_shaders_arithmetic(tmp_path: Path, layout: str):
-    """Compiled as C++: what `shade` makes of the frames that the textures hold, and where they are."""
-    frames = _frames(5)
-    camera = Camera.look_at((0, 0, 5), (0, 0, 0), extent=6.0, height=6, width=9)
-    first, second = pack(frames, layout, rows=2, columns=3, gain=0.5, padding=2)
-    ways = [(0.6, 0.0, 0.8), (-0.6, 0.8, 0.0), (0.48, -0.6, -0.64)]
-    (tmp_path / "shader.h").write_text(_shader("hlsl", layout))
-    (tmp_path / "run.cpp").write_text(_PROGRAM)
-    subprocess.run(["g++", "-O1", "-o", "run", "run.cpp"], cwd=tmp_path, check=True)
-    asked, expected = [], []
-    for n, frame in enumerate(frames):
-        for row, column in ((0, 0), (3, 7), (5, 8)):
-            texel = n // 3 * 10 + 2 + row, n % 3 * 13 + 2 + column
-            for way in ways:
-                asked.append([(column + 0.5) / 9, (row + 0.5) / 6, n, *first[texel], *second[texel], *way])
-                light = replace(frame, camera=camera, emission=None).shade([Light(way)])[row, column, 0]
-                place = (texel[1] + 0.5) / first.shape[1], (texel[0] + 0.5) / first.shape[0]
-                expected.append([*place, light, 1 - frame.transparency[row, column], frame.emission[row, column]])
-    text = "\n".join(" ".join(f"{float(value):.9g}" for value in row) for row in asked)
-    made = subprocess.run([tmp_path / "run"], input=text, capture_output=True, text=True, check=True).stdout
-    got = np.array(made.split(), float).reshape(-1, 5)
-    np.testing.assert_allclose(got, np.array(expected, float), rtol=1e-5, atol=1e-5)
-
-
-_PROGRAM = """
-#include <algorithm>
-#include <cmath>
-#include <cstdio>
-using std::floor;
-struct float2 { float x, y; float2(float a, float b) : x(a), y(b) {} };
-struct float3 { float x, y, z; };
-struct float4 { float r, g, b, a; };
-static float clamp(float v, double low, double high) { return std::min(std::max(v, (float)low), (float)high); }
-#include "shader.h"
-int main()
-{
-    float x, y, n; float4 a, b; float3 w;
-    while (scanf("%f%f%f%f%f%f%f%f%f%f%f%f%f%f", &x, &y, &n, &a.r, &a.g, &a.b, &a.a, &b.r, &b.g, &b.b, &b.a,
-                 &w.x, &w.y, &w.z) == 14) {
-        float2 uv = wlm_smoke_uv(float2(x, y), n);
-        printf("%.9g %.9g %.9g %.9g %.9g\\n", uv.x, uv.y, wlm_smoke_light(a, b, w), wlm_smoke_alpha(a, b),
-               wlm_smoke_emission(a, b));
-    }
-}
-"""
 
 
 def test_channels_of_unity():

@@ -1,6 +1,11 @@
 """A browser for the pages, where one is installed."""
 
+import functools
+import http.server
+import os
 import shutil
+import threading
+from pathlib import Path
 
 import pytest
 
@@ -41,3 +46,32 @@ def show(browser):
     for context in contexts:
         context.close()
     assert not errors
+
+
+THREE = os.environ.get("WLM_THREE")
+"""The folder of an unpacked `three` from npm, 0.187 or later."""
+
+
+@pytest.fixture
+def serve():
+    """Serves a folder, with three.js beside it, on this machine's loopback; gives its address."""
+    if not THREE:
+        pytest.skip("WLM_THREE names no three.js: npm install three, and name its folder")
+    started = []
+
+    class Quiet(http.server.SimpleHTTPRequestHandler):
+        def log_message(self, *words: object) -> None:
+            """Says nothing."""
+
+    def start(folder: Path) -> str:
+        (folder / "three").symlink_to(Path(THREE).resolve(), target_is_directory=True)
+        server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Quiet, directory=str(folder)))
+        thread = threading.Thread(target=server.serve_forever, daemon=True)
+        thread.start()
+        started.append((server, thread))
+        return f"http://127.0.0.1:{server.server_port}"
+
+    yield start
+    for server, thread in started:
+        server.shutdown()
+        thread.join()

@@ -3,12 +3,7 @@
 three.js is no part of this package: WLM_THREE names the folder of an unpacked `three` from npm, 0.187 or later.
 """
 
-import functools
-import http.server
 import json
-import os
-import threading
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,7 +12,6 @@ from builders.probe_models import random_model
 from wlm.probe import export_grid
 from wlm.probe.sphere import irradiance
 
-_THREE = os.environ.get("WLM_THREE")
 _SIZE = 64
 _PAGE = """<!doctype html>
 <script type="importmap">{"imports": {"three": "/three/build/three.module.js", "three/addons/": "/three/examples/jsm/"}}
@@ -60,27 +54,15 @@ window.ready = true;
 
 
 @pytest.fixture
-def site(tmp_path):
-    """The grid of a model and three.js, on this machine's loopback."""
+def site(tmp_path, serve):
+    """The grid of a model and three.js."""
     model = random_model(seed=3)
     model.net[-27:-24] = 4.0  # biases of L0: light that is nowhere below 0
     export_grid(model, tmp_path, cells=8)
     (tmp_path / "index.html").write_text(_PAGE.replace("SIZE", str(_SIZE)))
-    (tmp_path / "three").symlink_to(Path(_THREE).resolve(), target_is_directory=True)
-
-    class Quiet(http.server.SimpleHTTPRequestHandler):
-        def log_message(self, *words: object) -> None:
-            """Says nothing."""
-
-    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Quiet, directory=str(tmp_path)))
-    thread = threading.Thread(target=server.serve_forever, daemon=True)
-    thread.start()
-    yield model, json.loads((tmp_path / "grid.json").read_text()), f"http://127.0.0.1:{server.server_port}/index.html"
-    server.shutdown()
-    thread.join()
+    return model, json.loads((tmp_path / "grid.json").read_text()), f"{serve(tmp_path)}/index.html"
 
 
-@pytest.mark.skipif(not _THREE, reason="WLM_THREE names no three.js")
 def test_three_shows_what_decode_gives(site, browser):
     """At the pixels of six planes: trilinear between the cells' centres, half a cell ahead along the normal."""
     model, info, url = site

@@ -270,7 +270,12 @@ def _write_lut(folder: Path, model: AtlasModel) -> None:
     picture = np.zeros((height, width, 3), np.float32)
     picture[..., :2] = model.lut if model.method == "tiles" else model.lut / LUT_STEPS
     write_exr(folder / "lut.exr", picture, half=False)
-    write_ktx2(folder / "lut.ktx2", data, width, height, fmt)
+    if model.method == "tiles":
+        write_ktx2(folder / "lut.ktx2", data, width, height, fmt)
+    else:
+        # Loaders refuse levels of 16 bits; floats hold them exactly enough, to half a step of 2^-24.
+        places = (model.lut / np.float32(LUT_STEPS)).astype("<f4")
+        write_ktx2(folder / "lut.ktx2", places.tobytes(), width, height, "R32G32_SFLOAT")
     write_dds(folder / "lut.dds", data, width, height, fmt=fmt)
 
 
@@ -289,10 +294,9 @@ def _write_texture(folder: Path, name: str, colour: str, decoded: np.ndarray, bl
     write_exr(folder / f"{name}.exr", decoded)
     ktx2, dds = folder / f"{name}.ktx2", folder / f"{name}.dds"
     if colour == "half":
-        texels = np.ascontiguousarray(decoded, "<f2")
-        write_ktx2(ktx2, texels.tobytes(), width, height, "R16G16B16_SFLOAT")
-        # DXGI has no half floats of three channels.
-        whole = np.concatenate([texels, np.ones((height, width, 1), "<f2")], 2)
+        # DXGI has no half floats of three channels, and loaders of KTX2 refuse them.
+        whole = np.concatenate([np.asarray(decoded, "<f2"), np.ones((height, width, 1), "<f2")], 2)
+        write_ktx2(ktx2, whole.tobytes(), width, height, "R16G16B16A16_SFLOAT")
         write_dds(dds, whole.tobytes(), width, height, fmt="R16G16B16A16_FLOAT")
         return
     if colour == "rgb9e5":

@@ -1,48 +1,21 @@
 """The GLSL that reads an exported atlas (lightmap-uv-clustering-cascade, eq. 7); `wlm.atlas.exporter` writes it."""
 
 from wlm.atlas.model import BLOCK_SIDE, FIRST_BLOCK_CODE, SIDE_BITS, TAIL_OCTAVES, AtlasModel
+from wlm.shading import sampler
+
+EXACT = "WLM_ATLAS_EXACT"
+"""Macro that has texels fetched and mixed in floats."""
 
 _HEAD = """\
 // Light from a compressed lightmap: {what}
 // (Lightmap Compression with Color-Coherent UV Clustering and Cascade Texture Optimization, eq. 7).
-// For GLSL 3.30 and later, with or without Vulkan; include it below #version. Call wlm_atlas with
-// {coordinate}: u to the right, v down, (0, 0) at the first row's first texel.
+// For GLSL 3.30, GLSL ES 3.00 and later, with or without Vulkan; include it below #version, in ES below the precisions
+// of what it declares. Call wlm_atlas with {coordinate}: u to the right, v down, (0, 0) at the first row's first texel.
 //
 {textures}
 // {mips} have one mip level. Where WLM_ATLAS_EXACT is defined four texels are fetched and mixed in floats; else the
 // sampler does that, in one fetch, with the 8 or so bits that a GPU gives to a place between two texels.
 
-#ifndef WLM_ATLAS_COLOUR
-{colour_sampler}
-#define WLM_ATLAS_COLOUR wlm_atlas_colour
-#endif
-"""
-
-_SAMPLER = """\
-#ifndef WLM_ATLAS_{upper}_BINDING
-uniform {kind} wlm_atlas_{lower};
-#else
-layout(binding = WLM_ATLAS_{upper}_BINDING) uniform {kind} wlm_atlas_{lower};
-#endif"""
-
-_LUT = """\
-#ifndef WLM_ATLAS_LUT
-{lut_sampler}
-#define WLM_ATLAS_LUT wlm_atlas_lut
-#endif
-"""
-
-_SECOND = """\
-#ifndef WLM_ATLAS_BLOCKS
-{block_sampler}
-#define WLM_ATLAS_BLOCKS wlm_atlas_blocks
-#endif
-"""
-
-_TAIL = """#ifndef WLM_ATLAS_TAIL
-{tail_sampler}
-#define WLM_ATLAS_TAIL wlm_atlas_tail
-#endif
 """
 
 _GRAD = """
@@ -101,7 +74,7 @@ vec3 wlm_atlas(vec2 uv)
     ivec2 tile = min(ivec2(floor(x)), textureSize(WLM_ATLAS_LUT, 0) - ivec2(1, 1));
     uvec2 entry = texelFetch(WLM_ATLAS_LUT, tile, 0).xy;
     // An entry is the first texel of the tile's rectangle, and in the low bits its texels less one.
-    uvec2 first = entry >> {bits}u;
+    uvec2 first = entry >> uvec2({bits}u, {bits}u);
     uvec2 steps = entry & uvec2({mask}u, {mask}u);
 {blocks}    return wlm_atlas_colour_at(vec2(first) + (x - vec2(tile)) * vec2(steps) + vec2(0.5, 0.5));
 }}
@@ -156,15 +129,14 @@ def atlas_glsl(model: AtlasModel) -> str:
         coordinate="the new UVs of mesh.glb" if len(model.uv) else "the mesh's own lightmap UVs",
         textures="\n".join(dict.fromkeys(textures)),
         mips="All but the tail" if len(model.tail) else "They",
-        colour_sampler=_SAMPLER.format(upper="COLOUR", lower="colour", kind="sampler2D"),
     )
+    text += sampler("wlm_atlas_colour", "sampler2D")
     if tiles or cascade:
-        kind = "usampler2D" if tiles else "sampler2D"
-        text += _LUT.format(lut_sampler=_SAMPLER.format(upper="LUT", lower="lut", kind=kind))
+        text += sampler("wlm_atlas_lut", "usampler2D" if tiles else "sampler2D")
     if mixed:
-        text += _SECOND.format(block_sampler=_SAMPLER.format(upper="BLOCKS", lower="blocks", kind="sampler2D"))
+        text += sampler("wlm_atlas_blocks", "sampler2D")
     if len(model.tail):
-        text += _TAIL.format(tail_sampler=_SAMPLER.format(upper="TAIL", lower="tail", kind="sampler2D"))
+        text += sampler("wlm_atlas_tail", "sampler2D")
     text += _READ.format(type="vec3", name="colour", image="WLM_ATLAS_COLOUR", channels="rgb")
     if mixed:
         text += _READ.format(type="vec3", name="blocks", image="WLM_ATLAS_BLOCKS", channels="rgb")

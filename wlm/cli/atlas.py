@@ -18,7 +18,21 @@ from wlm.cli.console import (
     table,
     write_json,
 )
-from wlm.cli.options import AsJson, CheckpointEvery, Device, PageFile, ReportFile, Resume, Seed, Trust, output_option
+from wlm.cli.options import (
+    AsJson,
+    CheckpointEvery,
+    Device,
+    Engine,
+    ExactShader,
+    PageFile,
+    ReportFile,
+    Resume,
+    Seed,
+    ShaderLanguage,
+    Trust,
+    output_option,
+    shader_of,
+)
 from wlm.errors import WlmError
 
 app = typer.Typer(help="The lightmap of a mesh: a small colour texture, read through a small table.")
@@ -280,6 +294,32 @@ def decode(
         number(float(inside.mean()) if inside.size else None, ".4g"),
         number(float(inside.max()) if inside.size else None, ".4g"),
     )
+    show(rows)
+
+
+@app.command()
+def export(
+    folder: _Folder,
+    output: Annotated[Path, output_option("OUT", "The folder to write to.")],
+    engine: Engine = "raw",
+    shader: ShaderLanguage = None,
+    exact: ExactShader = False,
+) -> None:
+    """Write what an engine needs of a folder that compress wrote: textures, the mesh, a material or a shader.
+
+    Of raw these are the folder's own textures, and the shader in any language.
+    """
+    language = shader_of(engine, shader, exact)
+    quiet_warp()
+    from wlm.atlas.exporter import read_folder
+    from wlm.atlas.scene.exporter import is_scene
+    from wlm.engines import export_atlas
+
+    if is_scene(folder):
+        raise WlmError(f"{folder}: expected one lightmap alone, found a scene, whose folder has scene.glsl already")
+    rows = table(str(output), ["file", "bytes"])
+    for path in export_atlas(read_folder(folder), output, engine, shader=language, exact=exact):
+        rows.add_row(escape(path.name), f"{path.stat().st_size:,}")
     show(rows)
 
 

@@ -25,13 +25,17 @@ from wlm.cli.options import (
     AsJson,
     CheckpointEvery,
     Device,
+    Engine,
+    ExactShader,
     ModelFile,
     PageFile,
     ReportFile,
     Resume,
     Seed,
+    ShaderLanguage,
     Trust,
     output_option,
+    shader_of,
 )
 from wlm.errors import WlmError
 
@@ -354,18 +358,30 @@ def info(
 def export(
     file: ModelFile,
     output: Annotated[Path, output_option("DIR", "The folder to write to.")],
-    device: Annotated[str, typer.Option(help="Where the frame to compare with is decoded.")] = "cpu",
+    engine: Engine = "raw",
+    shader: ShaderLanguage = None,
+    exact: ExactShader = False,
+    device: Annotated[str, typer.Option(help="Of raw, where the frame to compare with is decoded.")] = "cpu",
 ) -> None:
-    """Write the maps as textures and the rest as plain files, for an engine.
+    """Write the light for an engine: textures, floats, a decoder, and for an engine by name what puts them together.
 
-    frame.exr is the map at the first stored time: what the shader should show. Of a file with layers each sheet of
-    three channels has a folder of its own; sheets.json names them.
+    Of raw, frame.exr is the map at the first stored time: what the shader should show. Of a file with layers each sheet
+    of three channels has a folder of its own; sheets.json names them.
     """
+    language = shader_of(engine, shader, exact)
+    if engine != "raw" and device != "cpu":
+        raise WlmError(f"--device: means nothing with --engine {engine}, for which no frame is decoded")
     quiet_warp()
+    from wlm.engines import export_lightmap
     from wlm.lightmap.front import export
 
+    model = _model(file)
     rows = table(str(output), ["file", "bytes"])
-    for path in export(_model(file), output, device=device):
+    if engine == "raw":
+        paths = export(model, output, device=device, shader=language, exact=exact)
+    else:
+        paths = export_lightmap(model, output, engine)
+    for path in paths:
         rows.add_row(escape(str(path.relative_to(output))), f"{path.stat().st_size:,}")
     show(rows)
 

@@ -5,6 +5,8 @@ from typing import Annotated, Any, Literal
 
 import typer
 
+from wlm.errors import WlmError
+
 Device = Annotated[str, typer.Option(help='Where it computes: "cpu", "cuda" or "cuda:N".')]
 Seed = Annotated[int, typer.Option(min=0, max=2**31 - 1, help="One seed gives one result on one device.")]
 Resume = Annotated[bool, typer.Option("--resume", help="Go on with an interrupted run of the same output.")]
@@ -34,7 +36,30 @@ Trust = Annotated[
     bool,
     typer.Option("--trust", help="Trust the input's author: it may name files elsewhere, and be as large as it says."),
 ]
+Engine = Annotated[
+    Literal["raw", "three", "godot", "unity", "unreal"],
+    typer.Option(help="Whose folder: raw is textures, floats and a shader for any."),
+]
+ShaderLanguage = Annotated[
+    Literal["glsl", "glsl-es", "hlsl", "msl", "wgsl"] | None,
+    typer.Option(help="Of raw, the shader's language; default glsl."),
+]
+ExactShader = Annotated[
+    bool, typer.Option("--exact", help="Of raw, the shader mixes texels in floats rather than by the filter unit.")
+]
 ModelFile = Annotated[Path, typer.Argument(metavar="FILE.wlm", help="A file that compress wrote.")]
+
+
+def shader_of(engine: str, shader: str | None, exact: bool) -> str:
+    """The language of a raw export's shader.
+
+    Raises:
+        WlmError: One is given, or --exact, for an engine that has its own.
+    """
+    for option, given in (("shader", shader), ("exact", exact)):
+        if given and engine != "raw":
+            raise WlmError(f"--{option}: means nothing with --engine {engine}, which has its own shaders")
+    return shader or "glsl"
 
 
 def output_option(metavar: str, help_text: str) -> Any:

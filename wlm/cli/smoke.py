@@ -310,7 +310,9 @@ def flipbook(
     source_layout: _From = None,
     straight: _Straight = False,
     padding: Annotated[int, typer.Option(min=0, max=64, help="Pixels around each cell that repeat its border.")] = 0,
-    shader: Annotated[bool, typer.Option("--shader", help="Write OUT.glsl and OUT.hlsl too.")] = False,
+    shader: Annotated[
+        bool, typer.Option("--shader", help="Write OUT.glsl, OUT.hlsl, OUT.metal and OUT.wgsl too.")
+    ] = False,
     step: _BakeStep = None,
     supersample: _BakeSupersample = None,
 ) -> None:
@@ -324,9 +326,10 @@ def flipbook(
         raise WlmError(f"--gain: expected a number above 0, got {gain}")
     quiet_warp()
     from wlm.formats.atomic import atomic_write
+    from wlm.shading import ENDINGS
     from wlm.smoke.exporter import brightest_gain, channels, write_flipbook
     from wlm.smoke.exporter import cells as cells_for
-    from wlm.smoke.shader import LANGUAGES, smoke_shader
+    from wlm.smoke.shader import smoke_shader
 
     book = _book(smoke, textures, cells, source_layout, straight)
     source = _source(smoke, options, step, supersample, 0.5, book)
@@ -343,9 +346,9 @@ def flipbook(
     height, width = frames[0].lightmaps.shape[1:]
     if shader:
         hot = any(frame.emission is not None for frame in frames)
-        for language in LANGUAGES:
+        for language in ("glsl", "hlsl", "msl", "wgsl"):
             text = smoke_shader(language, layout, **placed, count=len(frames), size=(height, width), hot=hot)
-            atomic_write(output.with_suffix(f".{language}"), text.encode())
+            atomic_write(output.with_suffix(ENDINGS[language]), text.encode())
     rows = table(str(smoke), ["file", "bytes", "channels"], text=["channels"])
     for path, names in zip(paths, channels(frames, layout), strict=True):
         rows.add_row(escape(str(path)), f"{path.stat().st_size:,}", " ".join(names))

@@ -1,7 +1,7 @@
-"""DDS files of block-compressed textures and of a few uncompressed formats, with the DX10 header: a 2D texture or
-a volume, the former with mips if need be.
+"""DDS files of block-compressed textures and of a few uncompressed formats, with the DX10 header: a 2D texture, an
+array of them or a volume, the first with mips if need be.
 
-A volume's slices follow each other, each a 2D grid of blocks (or of texels, row by row without padding); so do mips.
+Slices and layers follow each other, each a 2D grid of blocks (or of texels, row by row without padding); so do mips.
 """
 
 import os
@@ -16,6 +16,7 @@ DXGI_FORMATS = {
     "R16G16_UNORM": 35,
     "R16G16_UINT": 36,
     "R8G8_UNORM": 49,
+    "R8_UNORM": 61,
     "R9G9B9E5_SHAREDEXP": 67,
     "BC6H_UF16": 95,
     "BC6H_SF16": 96,
@@ -34,6 +35,7 @@ _TEXEL_BYTES = {
     "R16G16_UNORM": 4,
     "R16G16_UINT": 4,
     "R8G8_UNORM": 2,
+    "R8_UNORM": 1,
     "R9G9B9E5_SHAREDEXP": 4,
 }
 MOST_SIDE = 16384
@@ -66,6 +68,7 @@ def write_dds(
     fmt: str = "BC7_UNORM",
     volume: bool | None = None,
     mips: int = 0,
+    layers: int = 0,
 ) -> None:
     """Writes blocks or texels as a DDS file, whole or not at all.
 
@@ -81,10 +84,11 @@ def write_dds(
             above 1.
         mips: Levels after the first of a 2D texture, of half the size each, rounded down; `blocks` holds them one
             after another.
+        layers: Of an array of 2D textures, 1 to 2048, one after another in `blocks`; 0: no array.
 
     Raises:
-        ValueError: An unknown format, a size or a number of mips out of range, several slices of what is no volume,
-            mips of a volume, or blocks that don't fill the texture.
+        ValueError: An unknown format, a size or a number of mips or layers out of range, several slices of what is no
+            volume, mips of a volume, layers of a volume or of what has mips, or blocks that don't fill the texture.
         WlmError: The file can't be written; what was there before stays.
     """
     if fmt not in DXGI_FORMATS:
@@ -95,9 +99,11 @@ def write_dds(
     most = 0 if volume else max(width, height).bit_length() - 1
     if not 0 <= mips <= most:
         raise ValueError(f"mips: expected 0 to {most}, got {mips}")
+    if not 0 <= layers <= _MAX_DEPTH or (layers and (volume or mips)):
+        raise ValueError(f"layers: expected 0 to {_MAX_DEPTH}, of a 2D texture without mips, got {layers}")
     slice_bytes = _slice_bytes(fmt, width, height)
     levels = (_slice_bytes(fmt, max(width >> level, 1), max(height >> level, 1)) for level in range(1, mips + 1))
-    whole = depth * slice_bytes + sum(levels)
+    whole = depth * max(layers, 1) * slice_bytes + sum(levels)
     if len(blocks) != whole:
         raise ValueError(f"blocks: expected {whole} bytes, got {len(blocks)}")
     if depth > 1 and not volume:
@@ -118,12 +124,12 @@ def write_dds(
         _FOUR_CC,
         b"DX10",
         *(0, 0, 0, 0, 0),
-        _CAPS_TEXTURE | (_CAPS_COMPLEX if volume or mips else 0) | (_CAPS_MIPS if mips else 0),
+        _CAPS_TEXTURE | (_CAPS_COMPLEX if volume or mips or layers else 0) | (_CAPS_MIPS if mips else 0),
         _CAPS2_VOLUME if volume else 0,
         *(0, 0),
         DXGI_FORMATS[fmt],
         _DIMENSION_3D if volume else _DIMENSION_2D,
-        *(0, 1, 0),
+        *(0, max(layers, 1), 0),
     )
     atomic_write(path, [header, blocks])
 

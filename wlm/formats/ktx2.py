@@ -20,11 +20,13 @@ VK_FORMATS = {
     "R16G16_SFLOAT": 83,
     "R16G16B16_SFLOAT": 90,
     "R16G16B16A16_SFLOAT": 97,
+    "R32G32_SFLOAT": 103,
     "E5B9G9R9_UFLOAT_PACK32": 123,
     "BC6H_UFLOAT_BLOCK": 143,
     "ASTC_4x4_SFLOAT_BLOCK": 1000066000,
 }
-"""The formats that can be written and their Vulkan numbers: 16 bits a channel, RGB9E5, or 16 bytes a block of 4 x 4."""
+"""The formats that can be written and their Vulkan numbers: 16 or 32 bits a channel, RGB9E5, or 16 bytes a block of 4 x
+4."""
 
 _IDENTIFIER = b"\xabKTX 20\xbb\r\n\x1a\n"
 # Identifier; format, bytes of a channel, width, height, depth, layers, faces, levels, supercompression; offset and
@@ -43,6 +45,7 @@ _CHANNELS = {
     "R16G16_SFLOAT": 2,
     "R16G16B16_SFLOAT": 3,
     "R16G16B16A16_SFLOAT": 4,
+    "R32G32_SFLOAT": 2,
 }
 _RGBSDA, _BC6H, _ASTC = 1, 133, 162  # colour models
 _CHANNEL_IDS = (0, 1, 2, 15)  # red, green, blue, alpha
@@ -58,7 +61,7 @@ def write_ktx2(path: str | os.PathLike[str], data: bytes, width: int, height: in
 
     Args:
         path: The file to write; its folder must exist.
-        data: Rows from the top: texels of 16-bit channels, little-endian, or ceil(width / 4) * ceil(height / 4)
+        data: Rows from the top: texels of 16- or 32-bit channels, little-endian, or ceil(width / 4) * ceil(height / 4)
             blocks of 16 bytes; of RGB9E5 one word of 32 bits a texel.
         width: Texels, 1 to 16384.
         height: Texels, 1 to 16384.
@@ -90,7 +93,7 @@ def write_ktx2(path: str | os.PathLike[str], data: bytes, width: int, height: in
     header = _HEADER.pack(
         _IDENTIFIER,
         VK_FORMATS[fmt],
-        4 if fmt == _SHARED else 2 if fmt in _CHANNELS else 1,
+        4 if fmt == _SHARED else _channel_bytes(fmt) if fmt in _CHANNELS else 1,
         width,
         height,
         *(depth, 0, 1, 1, 0),
@@ -133,7 +136,11 @@ def read_half_volume(path: str | os.PathLike[str]) -> np.ndarray:
 def _texel_bytes(fmt: str) -> int:
     if fmt == _SHARED:
         return 4
-    return 2 * _CHANNELS[fmt] if fmt in _CHANNELS else _BLOCK_BYTES
+    return _channel_bytes(fmt) * _CHANNELS[fmt] if fmt in _CHANNELS else _BLOCK_BYTES
+
+
+def _channel_bytes(fmt: str) -> int:
+    return 4 if fmt.startswith("R32") else 2
 
 
 def _size(fmt: str, width: int, height: int) -> int:
@@ -159,7 +166,8 @@ def _descriptor(fmt: str) -> bytes:
         return _basic_block(_RGBSDA, 0, 4, samples)
     if fmt in _CHANNELS:
         model, side = _RGBSDA, 0
-        samples = [(16 * i, 16, channel) for i, channel in enumerate(_CHANNEL_IDS[: _CHANNELS[fmt]])]
+        bits = 8 * _channel_bytes(fmt)
+        samples = [(bits * i, bits, channel) for i, channel in enumerate(_CHANNEL_IDS[: _CHANNELS[fmt]])]
     else:
         model, side = (_BC6H if fmt.startswith("BC6H") else _ASTC), 3  # sides are stored less one
         samples = [(0, 8 * _BLOCK_BYTES, 0)]

@@ -24,6 +24,8 @@ _VDB = b" BDV\0\0\0\0"
 _EXPORTS = {
     "wlm-atlas": "a compressed lightmap of a mesh",
     "wlm-lightmap-export": "lightmaps over time for an engine: textures, weights and a shader",
+    "wlm-lightmap-engine": "lightmaps over time for one engine: textures, weights and a component",
+    "wlm-atlas-engine": "a compressed lightmap of a mesh for one engine: textures, the mesh and a material or a shader",
     "wlm-lightmap-layers-export": "layered lightmaps for an engine: a folder for each sheet",
     "wlm-probe-export": "light probes for an engine: buffers and a shader",
     "wlm-probe-volume": "a cascaded volume of probes for an engine: buffers and shaders",

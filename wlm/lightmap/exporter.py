@@ -1,4 +1,4 @@
-"""Lightmaps for engines: DDS textures, weights in JSON and a shader, usable without this package."""
+"""Lightmaps for engines: DDS textures of all tiles, tables of floats and a shader, usable without this package."""
 
 import json
 import os
@@ -15,25 +15,34 @@ from wlm.formats.atomic import atomic_path
 from wlm.formats.dds import MOST_SIDE, write_dds
 from wlm.formats.exr import write_exr
 from wlm.formats.folder import compact_json, make_parents, rounded, staged
+from wlm.lightmap import packed
 from wlm.lightmap.decode import Decoder
-from wlm.lightmap.exact import SQRT_12
 from wlm.lightmap.model import TILE, LightmapModel, decode_scale, encode_time
 from wlm.lightmap.page import MapDecoder
-from wlm.lightmap.shader import decode_glsl
+from wlm.lightmap.shader import EXACT, decode_glsl
 from wlm.lightmap.tiles import TileKind
+from wlm.shading import ENDINGS, check_language, translate
 
 FORMAT = "wlm-lightmap-export"
-_VERSION = 1
+_VERSION = 2
 WEIGHTS_FILE = "weights.json"
-SHADER_FILE = "decode.glsl"
+NETWORKS_FILE = "networks.bin"
+HOURS_FILE = "hours.bin"
 FRAME_FILE = "frame.exr"
 VALID_FILE = "valid.png"
+TEXTURES = ("uv", "uvt", "planes", "frames", "video")
+SHADER_STEM = "decode"
 
-_TEXTURE = re.compile(r"tile_\d{4,}_(uv|uvt|ut|vt|frame_\d{4,})\.dds")
-_CENTRED_DYNAMIC, _CENTRED_STATIC = 12, 4  # inputs that come from textures; the encoded time is not centred
+_FILES = {WEIGHTS_FILE, NETWORKS_FILE, HOURS_FILE, FRAME_FILE, VALID_FILE}
+_FILES |= {SHADER_STEM + ending for ending in ENDINGS.values()}
+_FILES |= {f"{name}.dds" for name in TEXTURES}
+_OF_VERSION_1 = re.compile(r"tile_\d{4,}_(uv|uvt|ut|vt|frame_\d{4,})\.dds")
 
 _ABOUT = {
     "tiles": "Tiles of tile_size texels at (column, row) of the grid. A tile that is not listed is empty: 0.",
+    "textures": "Each has images of all its tiles from left to right, across of them in a row. uv.dds: image row of a "
+    "tile. uvt.dds: slice s of a tile is image row * slices + s. planes.dds: F_ut is image 2 * row, F_vt 2 * row + 1, "
+    "time down the rows. frames.dds and video.dds are arrays: layer i has image row of each tile at stored time i.",
     "time": "Wrap t modulo the period (without one clamp it to the stored times) and find the stored times around it; "
     "with a period the last and the first are neighbours. share is where t lies between the two, 0 to 1.",
     "interpolation": "Of light between two stored times. radiance: decode both and mix their linear radiance by share "
@@ -41,17 +50,24 @@ _ABOUT = {
     "tau": "Place on the textures' time axis: tau[i] of stored time i. Between two, tau[i] + share * (step), the step "
     "to the next one; for the rule 'frames' it is 1/T, and tau is taken modulo 1 if time_axis.repeats. For the rule "
     "'paper' with a period tau is t / period.",
+    "hours": "hours.bin has a table for each stored time, hour_fours times four floats, which the shader reads. Fours "
+    "0 and 1: of F_uvt, and of F_ut and F_vt, the slices or rows before and after tau, and the share of the later one. "
+    "Then record fours for each tile of the grid, in order: code (0 empty or constant, 1 static, 2 dynamic, 3 frames, "
+    "4 video), row, network_four, share of the later image. Code 0: colour. 1 and 2: shift * scale, spread * scale, "
+    "then b1, in which of code 2 the encoded time is: b1 + its four rows of W1 times sin, cos(turn * tau), sin, cos(2 "
+    "turn * tau). 3 and 4: least and layer, greatest, of the earlier, then of the later image. Between two stored "
+    "times, where interpolation is network, a table is computed so.",
     "colour": "(shift + spread * y) * scale, not below 0, is the colour in gamma space; y is the network's answer "
-    "(decode.glsl). radiance = colour ** gamma, linear RGB. scale is interpolated linearly between stored times.",
+    "(the shader). radiance = colour ** gamma, linear RGB. scale is interpolated linearly between stored times.",
     "peak": "A bound of the tile's colour in gamma space: what 255 stands for where colour is kept in 8 bits. Between "
     "two stored times the larger holds.",
     "network": "h1 = gelu(x W1 + b1), h2 = gelu(h1 W2 + b2), y = h2 W3 + b3, a row of W for each input. x is uv[4], "
-    "uvt[4], ut[2], vt[2] as sampled, in [0, 1], then the encoded time[4]; of a static tile uv[4] alone. "
-    "network_offset counts floats in the array of all networks, W1 b1 W2 b2 W3 b3 of each tile in this order.",
+    "uvt[4], ut[2], vt[2] as sampled, in [0, 1], then the encoded time[4]; of a static tile uv[4] alone. networks.bin "
+    "has float32 W1 b1 W2 b2 W3 b3 of each tile, the rows filled up with zeros to fours, and rows of zeros added for "
+    "those; a tile's begin at four network_four.",
     "radiance": "Of a constant tile, linear RGB at each stored time, interpolated linearly.",
-    "frames": "A tile of frames or video has a texture of each stored time i, tile_N_frame_i.dds, and no network: "
-    "colour is least[i] + level * (greatest[i] - least[i]). Between two stored times their radiance is mixed, whatever "
-    "interpolation says.",
+    "frames": "A tile of frames or video has an image of each stored time and no network: colour is least[i] + level * "
+    "(greatest[i] - least[i]). Between two stored times their radiance is mixed, whatever interpolation says.",
 }
 
 _VALUES = (
@@ -66,19 +82,21 @@ def export(
     *,
     device: str = "cpu",
     values: tuple[float, float] | None = None,
+    shader: str = "glsl",
+    exact: bool = False,
 ) -> list[Path]:
-    """Writes a model as textures, weights and a shader, and a frame to compare with.
+    """Writes a model as textures, tables, a shader and a frame to compare with.
 
-    For tile N of the grid, with four digits: `tile_N_uv.dds`, F_uv in BC7, and of a dynamic tile also
-    `tile_N_uvt.dds`, F_uvt as a BC7 volume whose depth is time, and `tile_N_ut.dds` and `tile_N_vt.dds`,
-    F_ut and F_vt in R8G8_UNORM with time down the rows (neural-dynamic-gi, Table 1); of a tile of frames
-    `tile_N_frame_I.dds` in BC7 for each stored time I, of a tile of video the same in R10G10B10A2_UNORM, unpacked. The
-    blocks are the model's own bytes. `decode.glsl` is the decoder; `valid.png` is white inside charts, for the pass
-    that fills the gaps; `frame.exr` is the map at the first stored time, as the shader should show it; `weights.json`
-    explains itself under "about".
+    `uv.dds` (BC7), `uvt.dds` (BC7) and `planes.dds` (R8G8_UNORM) are F_uv, F_uvt and F_ut beside F_vt of all tiles
+    (neural-dynamic-gi, Table 1), image by image; `frames.dds` (BC7) and `video.dds` (R10G10B10A2_UNORM, unpacked) are
+    arrays with a layer for each stored time. Those that a model has no tiles for are left out. The blocks are the
+    model's own bytes. `networks.bin` and `hours.bin` are floats, see `wlm.lightmap.packed`; `decode.glsl` is the
+    decoder (or `.hlsl`, `.metal`, `.wgsl`); `valid.png` is white inside charts, for the pass that fills the gaps;
+    `frame.exr` is the map at the first stored time, as the shader should show it; `weights.json` explains itself under
+    "about".
 
-    The files are written beside the folder and moved in together, `weights.json` last. An earlier export is replaced,
-    and textures of tiles that are no longer there are removed; other files stay.
+    The files are written beside the folder and moved in together, `weights.json` last. An earlier export is replaced;
+    other files stay.
 
     Args:
         model: The model.
@@ -86,52 +104,71 @@ def export(
         device: Where the frame is decoded.
         values: What the levels 0 and 1 of a model without gamma stand for: `frame.exr` and the shader have values, and
             `weights.json` says so. None: the model is of radiance.
+        shader: Its language, one of `wlm.shading.LANGUAGES`.
+        exact: Texels are fetched and mixed in floats where the filter unit would do.
 
     Returns:
         The files written.
 
     Raises:
-        WlmError: The folder holds something other than an earlier export, or can't be written; no such device; or a
-            number of the model isn't finite.
+        WlmError: The folder holds something other than an earlier export, or can't be written; no such device or
+            language; a number of the model isn't finite; or a texture is larger than GPUs take.
     """
-    folder = Path(directory)
+    check_language(shader)
+    folder, name = Path(directory), SHADER_STEM + ENDINGS[shader]
     frame = Decoder(model, device).frame(float(model.times[0]))
-    content = document(model)
     if values is not None:
         frame = np.float32(values[0]) + np.float32(values[1] - values[0]) * frame
+    make_parents(folder)
+    with staged(folder, WEIGHTS_FILE, FORMAT, is_exported) as staging:
+        write_exr(staging / FRAME_FILE, frame, half=False)
+        text = translate(decode_glsl(model, values), shader, [EXACT] if exact else [])
+        (staging / name).write_bytes(text.encode())
+        names = write_parts(model, staging, values)
+    return [folder / name for name in (FRAME_FILE, name, *names)]
+
+
+def write_parts(
+    model: LightmapModel, folder: Path, values: tuple[float, float] | None = None, form: str = FORMAT
+) -> list[str]:
+    """Writes what every engine reads: textures, floats, the mask, and `weights.json` last.
+
+    Args:
+        model, values: As of `export`.
+        folder: Where; it must exist.
+        form: `format` of `weights.json`: whose folder it is.
+
+    Returns:
+        The files' names.
+
+    Raises:
+        WlmError: As `export`.
+    """
+    tables, nets = packed.hour_tables(model), packed.networks(model)
+    textures = packed.textures(model)
+    content = document(model, textures, nets[1]) | {"format": form, "hour_fours": tables.shape[1]}
+    if values is not None:
         content |= {"values": list(values), "about": _ABOUT | {"values": _VALUES}}
     try:
         text = compact_json(content)
     except ValueError as error:
-        raise WlmError(f"{model.name}: cannot export: a weight is NaN or infinite") from error
-    make_parents(folder)
-    dynamic = np.flatnonzero(model.kind == TileKind.DYNAMIC).tolist()
-    with staged(folder, WEIGHTS_FILE, FORMAT, lambda name: bool(_TEXTURE.fullmatch(name))) as staging:
-        written = []
-        for place, number in enumerate(model.mapped.tolist()):
-            row = dynamic.index(number) if number in dynamic else None
-            written += _write_maps(staging, number, model, place, row)
-        for row, number in enumerate(np.flatnonzero(model.kind == TileKind.FRAMES).tolist()):
-            for i, blocks in enumerate(model.frames[row]):
-                path = staging / f"tile_{number:04d}_frame_{i:04d}.dds"
-                write_dds(path, np.ascontiguousarray(blocks).tobytes(), TILE, TILE)
-                written.append(path)
-        for row, number in enumerate(np.flatnonzero(model.kind == TileKind.VIDEO).tolist()):
-            for i, words in enumerate(model.video_levels[row]):
-                path = staging / f"tile_{number:04d}_frame_{i:04d}.dds"
-                write_dds(path, words.astype("<u4").tobytes(), TILE, TILE, fmt="R10G10B10A2_UNORM")
-                written.append(path)
-        (staging / SHADER_FILE).write_bytes(decode_glsl(model, values).encode())
-        write_exr(staging / FRAME_FILE, frame, half=False)
-        Image.fromarray(model.mask).save(staging / VALID_FILE)
-        (staging / WEIGHTS_FILE).write_bytes(text.encode())
-        written += [staging / name for name in (SHADER_FILE, FRAME_FILE, VALID_FILE, WEIGHTS_FILE)]
-    return [folder / path.name for path in written]
+        raise WlmError(f"{model.name}: cannot export: a number is NaN or infinite") from error
+    for name, texture in textures.items():
+        size = texture.width, texture.height
+        write_dds(folder / f"{name}.dds", texture.data.tobytes(), *size, fmt=texture.fmt, layers=texture.layers)
+    (folder / HOURS_FILE).write_bytes(tables.astype("<f4").tobytes())
+    names = [f"{name}.dds" for name in textures] + [HOURS_FILE]
+    if len(nets[0]):
+        (folder / NETWORKS_FILE).write_bytes(nets[0].astype("<f4").tobytes())
+        names.append(NETWORKS_FILE)
+    Image.fromarray(model.mask).save(folder / VALID_FILE)
+    (folder / WEIGHTS_FILE).write_bytes(text.encode())
+    return [*names, VALID_FILE, WEIGHTS_FILE]
 
 
 def is_exported(name: str) -> bool:
-    """Whether a file's name is one that an export may have."""
-    return name in (WEIGHTS_FILE, SHADER_FILE, FRAME_FILE, VALID_FILE) or bool(_TEXTURE.fullmatch(name))
+    """Whether a file's name is one that an export has or, of an earlier version, had."""
+    return name in _FILES or bool(_OF_VERSION_1.fullmatch(name))
 
 
 def write_8bit(
@@ -180,54 +217,19 @@ def write_texture(path: str | os.PathLike[str], model: LightmapModel, time: floa
     write_dds(path, texels, model.width, model.height, fmt="R9G9B9E5_SHAREDEXP", mips=mips)
 
 
-def _write_maps(folder: Path, number: int, model: LightmapModel, place: int, row: int | None) -> list[Path]:
-    """Writes the textures of one tile; `row` is its place among the dynamic ones, None for a static one."""
-    profile = model.profile
-
-    def put(part: str, values: np.ndarray, *size: int, **options: Any) -> Path:
-        path = folder / f"tile_{number:04d}_{part}.dds"
-        write_dds(path, np.ascontiguousarray(values).tobytes(), *size, **options)
-        return path
-
-    written = [put("uv", model.uv[place], TILE, TILE)]
-    if row is not None:
-        side, plane = profile.uvt_resolution, (profile.plane_columns, profile.plane_rows)
-        written.append(put("uvt", model.uvt[row], side, side, profile.uvt_slices, volume=True))
-        written.append(put("ut", model.ut[row], *plane, fmt="R8G8_UNORM"))
-        written.append(put("vt", model.vt[row], *plane, fmt="R8G8_UNORM"))
-    return written
-
-
-def _network(net: np.ndarray, hidden: int, temporal: bool) -> dict[str, Any]:
-    """Weights by layer, the centring of the textures' features folded into the first."""
-    centred = _CENTRED_DYNAMIC if temporal else _CENTRED_STATIC
-    count = len(net) - 3 * (hidden + 1)
-    layers, output = net[:count].astype(np.float64).reshape(-1, hidden), net[count:].reshape(-1, 3)
-    inputs = len(layers) - hidden - 2
-    first, bias = layers[:inputs].copy(), layers[inputs].copy()
-    # W (f - 1/2) sqrt(12) + b = (sqrt(12) W) f + (b - sqrt(12)/2 W 1).
-    first[:centred] *= SQRT_12
-    bias -= 0.5 * first[:centred].sum(0)
-    return {
-        "W1": rounded(first),
-        "b1": rounded(bias),
-        "W2": rounded(layers[inputs + 1 : -1]),
-        "b2": rounded(layers[-1]),
-        "W3": rounded(output[:-1]),
-        "b3": rounded(output[-1]),
-    }
-
-
-def _tiles(model: LightmapModel) -> tuple[list[dict[str, Any]], int]:
-    """Describes the tiles in the order of their numbers, and counts the floats of their networks."""
+def _tiles(model: LightmapModel, starts: np.ndarray) -> list[dict[str, Any]]:
+    """Describes the tiles in the order of their numbers."""
     scales, peaks = model.scales, decode_scale(model.peak, model.profile.gamma)
-    tiles, offset, mapped = [], 0, 0
+    places, mapped = packed.rows_of(model), {number: i for i, number in enumerate(model.mapped.tolist())}
+    tiles = []
     rows = dict.fromkeys(TileKind, 0)  # the next tile's place among those of its kind
     for number in np.flatnonzero(model.kind != TileKind.EMPTY).tolist():
         kind = TileKind(int(model.kind[number]))
         row, rows[kind] = rows[kind], rows[kind] + 1
         place = divmod(number, model.tile_columns)
         tile = {"number": number, "kind": kind.name.lower(), "column": place[1], "row": place[0]}
+        if kind != TileKind.CONSTANT:
+            tile["image"] = int(places[number])
         if kind == TileKind.CONSTANT:
             tile["radiance"] = rounded(model.constant[row])
         elif kind == TileKind.FRAMES:
@@ -238,21 +240,37 @@ def _tiles(model: LightmapModel) -> tuple[list[dict[str, Any]], int]:
             peak = rounded(model.video_peaks[row])
             tile |= {"least": rounded(least), "greatest": rounded(greatest), "peak": peak}
         else:
-            temporal = kind == TileKind.DYNAMIC
-            net = (model.net if temporal else model.net_static)[row]
-            shift, spread = model.affine[mapped]
-            tile |= {"shift": rounded(shift), "spread": rounded(spread)}
-            tile |= {"scale": rounded(scales[mapped]), "peak": rounded(peaks[mapped]), "network_offset": offset}
-            tile |= _network(net, model.profile.hidden, temporal)
-            mapped, offset = mapped + 1, offset + len(net)
+            at = mapped[number]
+            shift, spread = model.affine[at]
+            tile |= {"shift": rounded(shift), "spread": rounded(spread), "scale": rounded(scales[at])}
+            tile |= {"peak": rounded(peaks[at]), "network_four": int(starts[places[number]])}
         tiles.append(tile)
-    return tiles, offset
+    return tiles
 
 
-def document(model: LightmapModel) -> dict[str, Any]:
-    """What `weights.json` holds: networks, scales and bounds by tile, and how to read them ("about")."""
+def document(model: LightmapModel, textures: dict[str, packed.Texture], starts: np.ndarray) -> dict[str, Any]:
+    """What `weights.json` holds: textures, scales and bounds by tile, and how to read them ("about").
+
+    Args:
+        model: The model.
+        textures: What `wlm.lightmap.packed.textures` gives.
+        starts: Where each network begins, see `wlm.lightmap.packed.networks`.
+    """
     profile, axis = model.profile, model.axis
-    tiles, floats = _tiles(model)
+    sides = {
+        "uvt": (profile.uvt_resolution, profile.uvt_resolution),
+        "planes": (profile.plane_columns, profile.plane_rows),
+    }
+    described = {}
+    for name, texture in textures.items():
+        width, height = sides.get(name, (TILE, TILE))
+        described[name] = {
+            "format": texture.fmt,
+            "size": [texture.width, texture.height],
+            "layers": texture.layers,
+            "image": [width, height],
+            "across": texture.width // width,
+        }
     return {
         "format": FORMAT,
         "version": _VERSION,
@@ -266,11 +284,13 @@ def document(model: LightmapModel) -> dict[str, Any]:
         "gamma": profile.gamma,
         "hidden": profile.hidden,
         "gelu": "exact" if profile.gelu == "exact" else "tanh",
-        "network_floats": floats,
         "times": model.times.tolist(),
         "interpolation": profile.interpolation,
         "period": model.period,
-        "time_axis": {"rule": axis.kind, "repeats": axis.periodic},
+        "time_axis": {"rule": axis.kind, "repeats": axis.periodic, "turn": axis.turn},
         "tau": rounded(encode_time(axis)[0]),
-        "tiles": tiles,
+        "slices": profile.uvt_slices,
+        "record": packed.record(model),
+        "textures": described,
+        "tiles": _tiles(model, starts),
     }

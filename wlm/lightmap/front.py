@@ -129,7 +129,12 @@ def evaluate(
 
 
 def export(
-    model: LightmapModel | LayeredModel, directory: str | os.PathLike[str], *, device: str = "cpu"
+    model: LightmapModel | LayeredModel,
+    directory: str | os.PathLike[str],
+    *,
+    device: str = "cpu",
+    shader: str = "glsl",
+    exact: bool = False,
 ) -> list[Path]:
     """Writes a model as textures, weights and shaders, see `wlm.lightmap.exporter` and `wlm.lightmap.layers.exporter`.
 
@@ -137,13 +142,15 @@ def export(
         model: The model.
         directory: The folder; made if it isn't there.
         device: Where the frames to compare with are decoded.
+        shader: Its language, one of `wlm.shading.LANGUAGES`.
+        exact: The shader fetches texels and mixes them in floats, rather than to have them filtered.
 
     Returns:
         The files written.
 
     Raises:
-        WlmError: The folder holds something other than an earlier export, or can't be written; no such device; or a
-            number of the model isn't finite.
+        WlmError: The folder holds something other than an earlier export, or can't be written; no such device or
+            language; or a number of the model isn't finite.
     """
     verbs = layers_exporter if isinstance(model, LayeredModel) else exporter
-    return verbs.export(model, directory, device=device)
+    return verbs.export(model, directory, device=device, shader=shader, exact=exact)

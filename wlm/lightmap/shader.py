@@ -1,242 +1,389 @@
 """The GLSL that decodes an exported lightmap; `wlm.lightmap.exporter` writes it beside the textures."""
 
-from wlm.lightmap.model import LightmapModel
+from wlm.lightmap.model import TILE, LightmapModel
+from wlm.lightmap.packed import CODES, HEAD, columns, fours, record
+from wlm.lightmap.tiles import TileKind
+from wlm.shading import sampler
 from wlm.texels import REACH
-from wlm_kernels.lightmap.features import STATIC_INPUTS, TEMPORAL_INPUTS
+
+EXACT = "WLM_LIGHTMAP_EXACT"
+"""Macro that has texels fetched and mixed in floats."""
 
 _GELU = {
     "exact": """\
 // x Phi(x). erf as in Abramowitz and Stegun, Handbook of Mathematical Functions, 7.1.26: within 1.5e-7, which leaves
 // GELU within 2.2e-7.
-float wlm_gelu(float x)
+vec4 wlm_gelu(vec4 x)
 {
-    float z = abs(x) * 0.70710678;
-    float t = 1.0 / (1.0 + 0.3275911 * z);
-    float p = t * (0.254829592 + t * (-0.284496736 + t * (1.421413741 + t * (-1.453152027 + t * 1.061405429))));
-    float e = 1.0 - p * exp(-z * z);
-    return 0.5 * x * (1.0 + (x < 0.0 ? -e : e));
+    vec4 z = abs(x) * 0.70710678;
+    vec4 t = 1.0 / (1.0 + 0.3275911 * z);
+    vec4 p = t * (0.254829592 + t * (-0.284496736 + t * (1.421413741 + t * (-1.453152027 + t * 1.061405429))));
+    return 0.5 * x * (1.0 + sign(x) * (1.0 - p * exp(-1.0 * z * z)));
 }
 """,
     "tanh": """\
 // The tanh form of GELU, which the model was trained with; within 4.8e-4 of the exact one.
-float wlm_gelu(float x)
+vec4 wlm_gelu(vec4 x)
 {
     // Some drivers' tanh is a quotient of exponentials and overflows; beyond 9 it is 1 in a float anyway.
-    float z = clamp(x * (0.79788456 + 0.035677408 * x * x), -9.0, 9.0);
+    vec4 z = x * (0.79788456 + 0.035677408 * x * x);
+    z = clamp(z, vec4(-9.0, -9.0, -9.0, -9.0), vec4(9.0, 9.0, 9.0, 9.0));
     return 0.5 * x * (1.0 + tanh(z));
 }
 """,
 }
 
-_TEMPLATE = """\
-// Decodes a texel of a temporal lightmap: BC7 feature maps and a small network for each tile of 128 x 128 texels
-// (Neural Dynamic GI, sections 3.2 to 3.4). For GLSL 4.30 and later, with or without Vulkan; include it below #version.
+_HEAD = """\
+// Decodes a temporal lightmap: feature maps and a small network for each tile of 128 x 128 texels (Neural Dynamic GI,
+// sections 3.2 to 3.4). For GLSL 3.30, GLSL ES 3.00 and later, with or without Vulkan; include it below #version, in ES
+// below `precision highp` of float, int, sampler2D and sampler2DArray.
 //
-// weights.json has everything else; see "about" there. What the caller does once a frame, for the time t:
-{frame}//
-// Gaps. A bilinear read at a chart's edge takes in texels outside it, which are decoded to anything. Once all tiles are
-// in a texture of linear radiance, a pass over it gives each texel the light of the texel wlm_source(f_valid, texel);
-// f_valid is valid.png, R8, {width} x {height}, white inside charts.
+// Once for each stored hour that is wanted: bind the hour's table, draw the map into a texture of linear light with
+// {last}(texel), and draw that one into another, each texel from wlm_source(texel), which fills the gaps between
+// charts that a filter reads at their edges. Materials mix two of these by the time between both hours (eq. 2).
 //
-// Textures. u runs along x and v along y, row 0 is v = 0. Filters are linear, without mip levels; u and v clamp to the
-// edge; the axis of time (z of F_uvt, y of F_ut and F_vt) {wrap}. At texel centres the
-// fractions along u and v are multiples of 1/256, which the filter unit's 8 bits hold exactly; along time they round.
-//   f_uv   tile_NNNN_uv.dds    BC7, 128 x 128
-//   f_uvt  tile_NNNN_uvt.dds   BC7 volume, {resolution} x {resolution} x {slices}
-//   f_ut   tile_NNNN_ut.dds    RG8, {columns} x {rows}
-//   f_vt   tile_NNNN_vt.dds    RG8, {columns} x {rows}
-//   f_frame  tile_NNNN_frame_TTTT.dds  128 x 128, BC7 of a tile of frames, RGB10A2 of one of video, at stored time TTTT
+// Textures; row 0 is v = 0. Filters are linear, without mip levels.
+{textures}//
+// Where WLM_LIGHTMAP_EXACT is defined four texels are fetched and mixed in floats; else the filter unit does that, with
+// the 8 or so bits that it gives to a place between two texels.
 //
-// Networks. One float array holds those of all tiles: for each tile of weights.json in turn W1, b1, W2, b2, W3 and b3,
-// row by row; a tile's begins at its "network_offset". It is the storage buffer below, unless WLM_NET(i) is defined
-// before this file as another way to read its float i.
+// WLM_LIGHTMAP_NET(i) and WLM_LIGHTMAP_HOUR_AT(i) read four floats of networks and of the table; where these are in
+// buffers define them before this file, or change the functions below that call them.
 
-#ifndef WLM_NET
-#ifndef WLM_NET_BINDING
-#define WLM_NET_BINDING 0
-#endif
-layout(std430, binding = WLM_NET_BINDING) readonly buffer WlmNetworks {{ float wlm_net[]; }};
-#define WLM_NET(i) wlm_net[i]
+{samplers}{reads}
+const int WLM_LIGHTMAP_COLUMNS = {columns}; // tiles in a row of the map
+const int WLM_LIGHTMAP_RECORD = {record}; // fours of a tile in the table, after {head} of all
+"""
+
+_TEXTURES = {
+    "hour": ("sampler2D", "the hour's floats of hours.bin, RGBA32F, 1024 a row; fetched"),
+    "networks": ("sampler2D", "networks.bin, RGBA32F, 1024 a row; fetched"),
+    "uv": ("sampler2D", "uv.dds, BC7, {TILE} x {TILE} texels a tile; fetched"),
+    "uvt": ("sampler2D", "uvt.dds, BC7, {side} x {side} texels for each of {slices} slices of a tile; filtered"),
+    "planes": ("sampler2D", "planes.dds, RG8, {plane_columns} x {plane_rows} texels twice a tile; filtered"),
+    "frames": ("sampler2DArray", "frames.dds, BC7, a layer for each stored time; fetched"),
+    "video": ("sampler2DArray", "video.dds, RGB10A2, a layer for each stored time; fetched"),
+    "valid": ("sampler2D", "valid.png, R8, {width} x {height}, white inside charts; fetched"),
+}
+
+_READ = """
+#ifndef {macro}
+#define {macro}(i) texelFetch({texture}, ivec2((i) & 1023, (i) >> 10), 0)
 #endif
 
-const int WLM_HIDDEN = {hidden};
-const int WLM_TEMPORAL_INPUTS = {temporal_inputs};
-const int WLM_STATIC_INPUTS = {static_inputs};
-const float WLM_TURN = {turn}; // {turn_note}
-const float WLM_GAMMA = {gamma};
+vec4 {function}(int i)
+{{
+    return {macro}(i);
+}}
+"""
+
+_NETWORK = """
+const int WLM_LIGHTMAP_FOURS = {fours}; // of {hidden} units
 
 {gelu}
-// G of eq. 4: two hidden layers and a linear one, of the first {static_inputs} or all {temporal_inputs} features.
-// Textures are fed as they are sampled: their centring, (f - 1/2) sqrt(12), is in W1 and b1.
-vec3 wlm_network(float f[WLM_TEMPORAL_INPUTS], int inputs, int offset)
+// G of eq. 4, behind the first layer's sums: two hidden layers, and a linear one whose start this returns.
+vec3 wlm_lightmap_output(vec4 a[WLM_LIGHTMAP_FOURS], int start)
 {{
-    float a[WLM_HIDDEN];
-    float b[WLM_HIDDEN];
-    int at = offset;
-    for (int j = 0; j < WLM_HIDDEN; ++j) {{
-        float s = WLM_NET(at + inputs * WLM_HIDDEN + j);
-        for (int c = 0; c < inputs; ++c)
-            s += WLM_NET(at + c * WLM_HIDDEN + j) * f[c];
-        a[j] = wlm_gelu(s);
+    vec4 b[WLM_LIGHTMAP_FOURS];
+    int at = start + 4 * WLM_LIGHTMAP_FOURS * WLM_LIGHTMAP_FOURS;
+    for (int j = 0; j < WLM_LIGHTMAP_FOURS; j++)
+        b[j] = wlm_lightmap_four(at + j);
+    for (int i = 0; i < WLM_LIGHTMAP_FOURS; i++) {{
+        vec4 x = wlm_gelu(a[i]);
+        at = start + 4 * i * WLM_LIGHTMAP_FOURS;
+        for (int j = 0; j < WLM_LIGHTMAP_FOURS; j++) {{
+            b[j] += x.x * wlm_lightmap_four(at + j);
+            b[j] += x.y * wlm_lightmap_four(at + WLM_LIGHTMAP_FOURS + j);
+            b[j] += x.z * wlm_lightmap_four(at + 2 * WLM_LIGHTMAP_FOURS + j);
+            b[j] += x.w * wlm_lightmap_four(at + 3 * WLM_LIGHTMAP_FOURS + j);
+        }}
     }}
-    at += (inputs + 1) * WLM_HIDDEN;
-    for (int j = 0; j < WLM_HIDDEN; ++j) {{
-        float s = WLM_NET(at + WLM_HIDDEN * WLM_HIDDEN + j);
-        for (int c = 0; c < WLM_HIDDEN; ++c)
-            s += WLM_NET(at + c * WLM_HIDDEN + j) * a[c];
-        b[j] = wlm_gelu(s);
+    at = start + (4 * WLM_LIGHTMAP_FOURS + 1) * WLM_LIGHTMAP_FOURS;
+    vec4 y = wlm_lightmap_four(at + 4 * WLM_LIGHTMAP_FOURS);
+    for (int i = 0; i < WLM_LIGHTMAP_FOURS; i++) {{
+        vec4 x = wlm_gelu(b[i]);
+        y += x.x * wlm_lightmap_four(at + 4 * i) + x.y * wlm_lightmap_four(at + 4 * i + 1);
+        y += x.z * wlm_lightmap_four(at + 4 * i + 2) + x.w * wlm_lightmap_four(at + 4 * i + 3);
     }}
-    at += (WLM_HIDDEN + 1) * WLM_HIDDEN;
-    int bias = at + 3 * WLM_HIDDEN;
-    vec3 y = vec3(WLM_NET(bias), WLM_NET(bias + 1), WLM_NET(bias + 2));
-    for (int c = 0; c < WLM_HIDDEN; ++c)
-        y += b[c] * vec3(WLM_NET(at + 3 * c), WLM_NET(at + 3 * c + 1), WLM_NET(at + 3 * c + 2));
-    return y;
+    return y.xyz;
 }}
 
-// Section 4: the network answers relative to each channel's mean at this time.
-vec3 wlm_finish(vec3 y, vec3 scale, vec3 shift, vec3 spread)
+// Of a tile of maps: `record` is where its record lies, `inner` the texel in the tile.
+vec3 wlm_lightmap_mapped(vec4 tile, int record, ivec2 inner)
 {{
-    return max((shift + spread * y) * scale, vec3(0.0, 0.0, 0.0));
+    int row = int(tile.y);
+    int start = int(tile.z);
+    ivec2 at = ivec2(row % {uv_columns}, row / {uv_columns}) * {TILE} + inner;
+    vec4 a[WLM_LIGHTMAP_FOURS];
+    for (int j = 0; j < WLM_LIGHTMAP_FOURS; j++)
+        a[j] = wlm_lightmap_entry(record + 3 + j);
+    vec4 x = texelFetch(WLM_LIGHTMAP_UV, at, 0);
+{sum}    int rest = start + 5 * WLM_LIGHTMAP_FOURS;
+{dynamic}    vec3 y = wlm_lightmap_output(a, rest);
+    vec3 gain = wlm_lightmap_entry(record + 1).xyz;
+    vec3 colour = gain + wlm_lightmap_entry(record + 2).xyz * y;
+    return max(colour, vec3(0.0, 0.0, 0.0));
 }}
+"""
 
-// Colour in gamma space, at least 0, of a texel of a "dynamic" tile; for 8 bits divide it by the tile's bound.
-vec3 wlm_decode_dynamic(sampler2D f_uv, sampler3D f_uvt, sampler2D f_ut, sampler2D f_vt, ivec2 texel, float tau,
-                        int offset, vec3 scale, vec3 shift, vec3 spread)
+_SUM = """\
+{indent}for (int j = 0; j < WLM_LIGHTMAP_FOURS; j++) {{
+{indent}    int w = start{skip} + j;
+{indent}    a[j] += x.x * wlm_lightmap_four(w) + x.y * wlm_lightmap_four(w + WLM_LIGHTMAP_FOURS);
+{indent}    a[j] += x.z * wlm_lightmap_four(w + 2 * WLM_LIGHTMAP_FOURS);
+{indent}    a[j] += x.w * wlm_lightmap_four(w + 3 * WLM_LIGHTMAP_FOURS);
+{indent}}}
+"""
+
+_DYNAMIC = """\
+    if (int(tile.x) == {code}) {{
+        vec2 place = (vec2(inner) + vec2(0.5, 0.5)) / {TILE}.0;
+        x = wlm_lightmap_volume(row, place);
+{uvt_sum}        x = vec4(wlm_lightmap_plane(2 * row, place.x), wlm_lightmap_plane(2 * row + 1, place.y));
+{plane_sum}        // The encoded time is in the bias.
+        rest = start + 17 * WLM_LIGHTMAP_FOURS;
+    }}
+"""
+
+_MAPS = """
+const int WLM_LIGHTMAP_SIDE = {side}; // texels of a slice of F_uvt along a side
+
+// A slice of F_uvt at a place in its texels; texel i has its centre at i + 1/2.
+vec4 wlm_lightmap_slice(int image, vec2 place)
 {{
-    float u = (float(texel.x) + 0.5) / 128.0;
-    float v = (float(texel.y) + 0.5) / 128.0;
-    vec4 uv = texelFetch(f_uv, texel, 0);
-    vec4 uvt = textureLod(f_uvt, vec3(u, v, tau), 0.0);
-    vec4 ut = textureLod(f_ut, vec2(u, tau), 0.0);
-    vec4 vt = textureLod(f_vt, vec2(v, tau), 0.0);
-    float f[WLM_TEMPORAL_INPUTS];
-    f[0] = uv.x;
-    f[1] = uv.y;
-    f[2] = uv.z;
-    f[3] = uv.w;
-    f[4] = uvt.x;
-    f[5] = uvt.y;
-    f[6] = uvt.z;
-    f[7] = uvt.w;
-    f[8] = ut.x;
-    f[9] = ut.y;
-    f[10] = vt.x;
-    f[11] = vt.y;
-    // Encoded time, gamma(t) of eq. 4.
-    f[12] = sin(WLM_TURN * tau);
-    f[13] = cos(WLM_TURN * tau);
-    f[14] = sin(2.0 * WLM_TURN * tau);
-    f[15] = cos(2.0 * WLM_TURN * tau);
-    return wlm_finish(wlm_network(f, WLM_TEMPORAL_INPUTS, offset), scale, shift, spread);
+    ivec2 first = ivec2(image % {uvt_columns}, image / {uvt_columns}) * WLM_LIGHTMAP_SIDE;
+    vec2 inside = clamp(place, vec2(0.5, 0.5), vec2({side}.0, {side}.0) - vec2(0.5, 0.5));
+#ifdef WLM_LIGHTMAP_EXACT
+    inside = inside - vec2(0.5, 0.5);
+    ivec2 low = ivec2(floor(inside));
+    ivec2 high = min(low + ivec2(1, 1), ivec2(WLM_LIGHTMAP_SIDE - 1, WLM_LIGHTMAP_SIDE - 1));
+    vec2 share = inside - vec2(low);
+    vec4 a = texelFetch(WLM_LIGHTMAP_UVT, first + low, 0);
+    vec4 b = texelFetch(WLM_LIGHTMAP_UVT, first + ivec2(high.x, low.y), 0);
+    vec4 c = texelFetch(WLM_LIGHTMAP_UVT, first + ivec2(low.x, high.y), 0);
+    vec4 d = texelFetch(WLM_LIGHTMAP_UVT, first + high, 0);
+    return mix(mix(a, b, share.x), mix(c, d, share.x), share.y);
+#else
+    return textureLod(WLM_LIGHTMAP_UVT, (vec2(first) + inside) / vec2({uvt_width}.0, {uvt_height}.0), 0.0);
+#endif
 }}
 
-// The same of a "static" tile: one pattern for all times.
-vec3 wlm_decode_static(sampler2D f_uv, ivec2 texel, int offset, vec3 scale, vec3 shift, vec3 spread)
+// F_uvt at the table's hour, at a place from 0 to 1.
+vec4 wlm_lightmap_volume(int row, vec2 place)
 {{
-    vec4 uv = texelFetch(f_uv, texel, 0);
-    float f[WLM_TEMPORAL_INPUTS];
-    f[0] = uv.x;
-    f[1] = uv.y;
-    f[2] = uv.z;
-    f[3] = uv.w;
-    for (int c = WLM_STATIC_INPUTS; c < WLM_TEMPORAL_INPUTS; ++c)
-        f[c] = 0.0;
-    return wlm_finish(wlm_network(f, WLM_STATIC_INPUTS, offset), scale, shift, spread);
+    vec4 time = wlm_lightmap_entry(0);
+    vec2 texel = place * {side}.0;
+    vec4 early = wlm_lightmap_slice(row * {slices} + int(time.x), texel);
+    return mix(early, wlm_lightmap_slice(row * {slices} + int(time.y), texel), time.z);
 }}
 
-// The same of a tile of "frames" or "video" at a stored time, whose "least" and "greatest" these are.
-vec3 wlm_decode_frame(sampler2D f_frame, ivec2 texel, vec3 least, vec3 greatest)
+// F_ut (an even image) or F_vt (an odd one) at a row of time.
+vec2 wlm_lightmap_line(int image, float place, int time)
 {{
-    vec4 level = texelFetch(f_frame, texel, 0);
-    return vec3(1.0 - level.x, 1.0 - level.y, 1.0 - level.z) * least + vec3(level.x, level.y, level.z) * greatest;
+    ivec2 first = ivec2(image % {plane_across} * {plane_columns}, image / {plane_across} * {plane_rows} + time);
+    float inside = clamp(place * {plane_columns}.0, 0.5, {plane_columns}.0 - 0.5);
+#ifdef WLM_LIGHTMAP_EXACT
+    inside = inside - 0.5;
+    int low = int(floor(inside));
+    vec4 a = texelFetch(WLM_LIGHTMAP_PLANES, first + ivec2(low, 0), 0);
+    vec4 b = texelFetch(WLM_LIGHTMAP_PLANES, first + ivec2(min(low + 1, {plane_columns} - 1), 0), 0);
+    return mix(a.xy, b.xy, inside - float(low));
+#else
+    vec2 at = vec2(first) + vec2(inside, 0.5);
+    return textureLod(WLM_LIGHTMAP_PLANES, at / vec2({planes_width}.0, {planes_height}.0), 0.0).xy;
+#endif
 }}
 
+vec2 wlm_lightmap_plane(int image, float place)
+{{
+    vec4 time = wlm_lightmap_entry(1);
+    vec2 early = wlm_lightmap_line(image, place, int(time.x));
+    return mix(early, wlm_lightmap_line(image, place, int(time.y)), time.z);
+}}
+"""
+
+_IMAGES = """
+// Colour of a tile of {name} in the first (1) or second (3) image of its record.
+vec3 wlm_lightmap_of_{name}(vec4 tile, int record, ivec2 inner)
+{{
+    int row = int(tile.y);
+    vec4 least = wlm_lightmap_entry(record);
+    ivec2 at = ivec2(row % {across}, row / {across}) * {TILE} + inner;
+    vec3 level = texelFetch(WLM_LIGHTMAP_{upper}, ivec3(at, int(least.w)), 0).xyz;
+    return mix(least.xyz, wlm_lightmap_entry(record + 1).xyz, level);
+}}
+"""
+
+_COLOUR = """
+// Colour of a texel of the map in gamma space, at least 0; of an empty tile 0.
+vec3 wlm_colour(ivec2 texel)
+{{
+    ivec2 place = texel / {TILE};
+    ivec2 inner = texel - place * {TILE};
+    int record = {head} + (place.y * WLM_LIGHTMAP_COLUMNS + place.x) * WLM_LIGHTMAP_RECORD;
+    vec4 tile = wlm_lightmap_entry(record);
+{kinds}    return wlm_lightmap_entry(record + 1).xyz;
+}}
+"""
+
+_MAPPED_KIND = """\
+    if (int(tile.x) == {static} || int(tile.x) == {dynamic})
+        return wlm_lightmap_mapped(tile, record, inner);
+"""
+
+_IMAGE_KIND = """\
+    if (int(tile.x) == {code}) {{
+        vec3 early = wlm_lightmap_of_{name}(tile, record + 1, inner);
+        if (tile.w == 0.0)
+            return early;
+        // Radiance is mixed, whatever networks do.
+        vec3 late = wlm_lightmap_of_{name}(tile, record + 3, inner);
+        vec3 light = mix(pow(early, {gamma}), pow(late, {gamma}), tile.w);
+        return pow(light, {inverse});
+    }}
+"""
+
+_SOURCE = """
 // The texel whose light a texel of the map shows: itself inside a chart; in a gap the nearest inside within {reach}
 // texels, in reading order of several as near; beyond that itself.
-ivec2 wlm_source(sampler2D f_valid, ivec2 texel)
+ivec2 wlm_source(ivec2 texel)
 {{
-    if (texelFetch(f_valid, texel, 0).x > 0.5)
+    if (texelFetch(WLM_LIGHTMAP_VALID, texel, 0).x > 0.5)
         return texel;
-    ivec2 size = textureSize(f_valid, 0);
     ivec2 found = texel;
     int least = {beyond};
-    for (int y = -{reach}; y <= {reach}; ++y)
-        for (int x = -{reach}; x <= {reach}; ++x) {{
-            ivec2 at = ivec2(texel.x + x, texel.y + y);
-            if (x * x + y * y < least && at.x >= 0 && at.y >= 0 && at.x < size.x && at.y < size.y
-                && texelFetch(f_valid, at, 0).x > 0.5) {{
-                least = x * x + y * y;
-                found = at;
+    for (int y = -{reach}; y <= {reach}; y++)
+        for (int x = -{reach}; x <= {reach}; x++) {{
+            ivec2 at = texel + ivec2(x, y);
+            if (x * x + y * y < least && at.x >= 0 && at.y >= 0 && at.x < {width} && at.y < {height}) {{
+                if (texelFetch(WLM_LIGHTMAP_VALID, at, 0).x > 0.5) {{
+                    least = x * x + y * y;
+                    found = at;
+                }}
             }}
         }}
     return found;
 }}
-
-{last}"""
-
-_RADIANCE = """\
-// Linear radiance of a colour in gamma space.
-vec3 wlm_radiance(vec3 colour)
-{
-    return pow(colour, vec3(WLM_GAMMA, WLM_GAMMA, WLM_GAMMA));
-}
 """
 
-_VALUES = """\
-// The values of a colour, which has no gamma here: levels from 0 to 1. They mix as radiance does.
-vec3 wlm_value(vec3 colour)
+_RADIANCE = """
+// Linear radiance of a texel of the map.
+vec3 wlm_radiance(ivec2 texel)
 {{
-    return vec3({least}, {least}, {least}) + {span} * colour;
+    return pow(wlm_colour(texel), {gamma});
+}}
+"""
+
+_VALUES = """
+// The values of a texel of the map, which has no gamma: levels from 0 to 1. They mix as radiance does.
+vec3 wlm_value(ivec2 texel)
+{{
+    return vec3({least}, {least}, {least}) + {span} * wlm_colour(texel);
 }}
 """
 
 
-_FRAME = {
-    "radiance": """\
-//   t lies between two stored times: decode each with its own "tau", "scale" and "peak" and mix their radiance (eq. 2);
-//   a cache that keeps both is decoded again only when t passes a stored time;
-//   bound    of each tile, from its "peak", if colour is to be kept in 8 bits.
-""",
-    "network": """\
-//   tau      from "tau", which belongs to "times": linear between the stored times around t;
-//   scale    of each tile, from its "scale": linear likewise; the radiance of frames is mixed likewise;
-//   bound    of each tile, from its "peak": the larger of the two, if colour is to be kept in 8 bits.
-""",
-}
+def texture_names(model: LightmapModel) -> list[str]:
+    """The textures that a model's shader reads, in the order of their declarations."""
+    has = {kind: bool((model.kind == kind).any()) for kind in TileKind}
+    needed = {
+        "networks": has[TileKind.STATIC] or has[TileKind.DYNAMIC],
+        "uvt": has[TileKind.DYNAMIC],
+        "frames": has[TileKind.FRAMES],
+        "video": has[TileKind.VIDEO],
+    }
+    needed |= {"uv": needed["networks"], "planes": needed["uvt"]}
+    return [name for name in _TEXTURES if needed.get(name, True)]
 
 
 def decode_glsl(model: LightmapModel, values: tuple[float, float] | None = None) -> str:
     """The shader text for a model: functions alone, to be included below `#version`.
 
     Args:
-        model: Its settings choose the constants, the GELU and what the time axis does at its ends.
+        model: Its settings and its tiles choose the text and the constants in it.
         values: What the levels 0 and 1 of a model without gamma stand for; None: the model is of radiance.
 
     Returns:
-        GLSL 4.30, which Vulkan's dialect takes too.
+        GLSL 3.30 and ES 3.00, which Vulkan's dialect takes too where the bindings are defined.
     """
-    profile = model.profile
-    periodic = model.axis.periodic
-    last = _RADIANCE if values is None else _VALUES.format(least=repr(values[0]), span=repr(values[1] - values[0]))
-    # repr gives the shortest decimals that are the number again, and always a point or an exponent.
-    return _TEMPLATE.format(
-        frame=_FRAME[profile.interpolation],
-        width=model.width,
-        height=model.height,
-        reach=REACH,
-        beyond=2 * REACH * REACH + 1,
-        wrap="repeats" if periodic else "clamps to the edge",
-        resolution=profile.uvt_resolution,
-        slices=profile.uvt_slices,
-        columns=profile.plane_columns,
-        rows=profile.plane_rows,
-        hidden=profile.hidden,
-        temporal_inputs=TEMPORAL_INPUTS,
-        static_inputs=STATIC_INPUTS,
-        turn="6.2831853" if periodic else "3.1415927",
-        turn_note="2 pi: the axis is a circle, midnight is no jump" if periodic else "pi, as in eq. 4",
-        gamma=repr(float(profile.gamma)),
-        gelu=_GELU["exact" if profile.gelu == "exact" else "tanh"],
-        last=last,
+    profile, names = model.profile, texture_names(model)
+    dynamic = int((model.kind == TileKind.DYNAMIC).sum())
+    side, slices = profile.uvt_resolution, profile.uvt_slices
+    across = {
+        "uv": columns(len(model.mapped), TILE, TILE),
+        "uvt": columns(dynamic * slices, side, side),
+        "planes": columns(2 * dynamic, profile.plane_rows, profile.plane_columns),
+        "frames": columns(int((model.kind == TileKind.FRAMES).sum()), TILE, TILE),
+        "video": columns(int((model.kind == TileKind.VIDEO).sum()), TILE, TILE),
+    }
+    gamma, inverse = (", ".join([repr(float(number))] * 3) for number in (profile.gamma, 1.0 / profile.gamma))
+    words = {
+        "TILE": TILE,
+        "width": model.width,
+        "height": model.height,
+        "columns": model.tile_columns,
+        "record": record(model),
+        "head": HEAD,
+        "fours": fours(model),
+        "hidden": profile.hidden,
+        "side": side,
+        "slices": slices,
+        "plane_columns": profile.plane_columns,
+        "plane_rows": profile.plane_rows,
+        "uv_columns": across["uv"],
+        "uvt_columns": across["uvt"],
+        "plane_across": across["planes"],
+        "uvt_width": across["uvt"] * side,
+        "uvt_height": -(-dynamic * slices // across["uvt"]) * side,
+        "planes_width": across["planes"] * profile.plane_columns,
+        "planes_height": -(-2 * dynamic // across["planes"]) * profile.plane_rows,
+        "reach": REACH,
+        "beyond": 2 * REACH * REACH + 1,
+        # repr gives the shortest decimals that are the number again, and always a point or an exponent.
+        "gamma": f"vec3({gamma})",
+        "inverse": f"vec3({inverse})",
+    }
+    mapped = "networks" in names
+    kinds = _MAPPED_KIND.format(static=CODES[TileKind.STATIC], dynamic=CODES[TileKind.DYNAMIC]) if mapped else ""
+    images = ""
+    for name, kind in (("frames", TileKind.FRAMES), ("video", TileKind.VIDEO)):
+        if name in names:
+            own = words | {"name": name, "upper": name.upper(), "across": across[name], "code": CODES[kind]}
+            images += _IMAGES.format(**own)
+            kinds += _IMAGE_KIND.format(**own)
+    text = _head(names, words | {"last": "wlm_radiance" if values is None else "wlm_value"})
+    if "uvt" in names:
+        text += _MAPS.format(**words)
+    if mapped:
+        sums = [
+            _SUM.format(indent=" " * (8 if i else 4), skip=f" + {4 * i} * WLM_LIGHTMAP_FOURS" if i else "")
+            for i in range(3)
+        ]
+        temporal = ""
+        if "uvt" in names:
+            code = CODES[TileKind.DYNAMIC]
+            temporal = _DYNAMIC.format(code=code, uvt_sum=sums[1], plane_sum=sums[2], **words)
+        gelu = _GELU["exact" if profile.gelu == "exact" else "tanh"]
+        text += _NETWORK.format(gelu=gelu, sum=sums[0], dynamic=temporal, **words)
+    text += images + _COLOUR.format(kinds=kinds, **words) + _SOURCE.format(**words)
+    if values is None:
+        return text + _RADIANCE.format(**words)
+    return text + _VALUES.format(least=repr(values[0]), span=repr(values[1] - values[0]))
+
+
+def _head(names: list[str], words: dict[str, object]) -> str:
+    lines = [f"//   wlm_lightmap_{name}: {_TEXTURES[name][1].format(**words)}.\n" for name in names]
+    reads = "".join(
+        _READ.format(macro=macro, function=function, texture=f"WLM_LIGHTMAP_{name.upper()}")
+        for macro, function, name in (
+            ("WLM_LIGHTMAP_HOUR_AT", "wlm_lightmap_entry", "hour"),
+            ("WLM_LIGHTMAP_NET", "wlm_lightmap_four", "networks"),
+        )
+        if name in names
+    )
+    return _HEAD.format(
+        textures="".join(lines),
+        samplers="".join(sampler(f"wlm_lightmap_{name}", _TEXTURES[name][0]) for name in names),
+        reads=reads,
+        **words,
     )

@@ -134,8 +134,8 @@ vec4 wlm_probe_outputs(vec4 inputs[WLM_PROBE_MOST_FOURS], int fours, int at)
     vec4 sum = wlm_probe_weights(at);
     for (int i = 0; i < fours; ++i) {{
         int column = at + 1 + 4 * i;
-        sum += mat4(wlm_probe_weights(column), wlm_probe_weights(column + 1), wlm_probe_weights(column + 2),
-                    wlm_probe_weights(column + 3)) * inputs[i];
+        sum += wlm_probe_weights(column) * inputs[i].x + wlm_probe_weights(column + 1) * inputs[i].y;
+        sum += wlm_probe_weights(column + 2) * inputs[i].z + wlm_probe_weights(column + 3) * inputs[i].w;
     }}
     return sum;
 }}

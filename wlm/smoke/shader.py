@@ -1,34 +1,32 @@
-"""The shader of a six-way flip book, in GLSL or HLSL: where a frame lies, and its light from a direction."""
+"""The shader of a six-way flip book: where a frame lies, and its light from a direction."""
 
-import re
-
+from wlm.shading import LANGUAGES, translate
 from wlm.smoke.camera import ALPHA, EMISSION, LAYOUTS
-
-LANGUAGES = ("glsl", "hlsl")
 
 _TEXT = """\
 // Six-way smoke of {count} frames, in {rows} x {columns} cells, in the channels of "{layout}".
 // (Neural Six-way Lightmaps for Real-time Smoke Rendering, eq. 4; lights weigh by squares, as in engines.)
-// For {language}. Both textures are linear, not sRGB; sample both at wlm_smoke_uv, clamped to their edge.
+// For GLSL 3.30, GLSL ES 3.00 and later; include it below #version.
+// Both textures are linear, not sRGB; sample both at wlm_smoke_uv, clamped to their edge.
 //
 //     light = sum over lights of irradiance / (4 pi) * wlm_smoke_light(first, second, toward)
 //     pixel = light + colour * wlm_smoke_emission(first, second) + behind * (1 - wlm_smoke_alpha(first, second))
 
 // The texture's coordinates of a frame, from 0 on, at a place on the billboard: (0, 0) its top left, (1, 1) its bottom
 // right.
-float2 wlm_smoke_uv(float2 place, float frame)
+vec2 wlm_smoke_uv(vec2 place, float frame)
 {{
     float cell = clamp(floor(frame), 0.0, {last:.1f});
     float row = floor((cell + 0.5) / {columns:.1f});
     float column = cell - {columns:.1f} * row;
     float x = column + {inset_x} + place.x * {share_x};
     float y = row + {inset_y} + place.y * {share_y};
-    return float2(x / {columns:.1f}, y / {rows:.1f});
+    return vec2(x / {columns:.1f}, y / {rows:.1f});
 }}
 
 // The light of irradiance 4 pi from a direction, of length 1, from the smoke to the light: x to the billboard's right,
 // y up, z to the viewer.
-float wlm_smoke_light(float4 first, float4 second, float3 toward)
+float wlm_smoke_light(vec4 first, vec4 second, vec3 toward)
 {{
     float x = toward.x > 0.0 ? {right} : {left};
     float y = toward.y > 0.0 ? {top} : {bottom};
@@ -36,12 +34,12 @@ float wlm_smoke_light(float4 first, float4 second, float3 toward)
     return (toward.x * toward.x * x + toward.y * toward.y * y + toward.z * toward.z * z) * {factor};
 }}
 
-float wlm_smoke_alpha(float4 first, float4 second)
+float wlm_smoke_alpha(vec4 first, vec4 second)
 {{
     return {alpha};
 }}
 
-float wlm_smoke_emission(float4 first, float4 second)
+float wlm_smoke_emission(vec4 first, vec4 second)
 {{
     return {emission};
 }}
@@ -63,7 +61,7 @@ def smoke_shader(
     """Writes the shader of a flip book.
 
     Args:
-        language: One of `LANGUAGES`: GLSL 3.30, GLSL ES 3.00, or HLSL of any shader model.
+        language: One of `wlm.shading.LANGUAGES`.
         layout: One of `wlm.smoke.camera.LAYOUTS`.
         rows, columns, count: Of cells, and of frames in them.
         size: Height and width of a frame in pixels, without padding.
@@ -85,7 +83,6 @@ def smoke_shader(
     height, width = (n + 2 * padding for n in size)
     alpha, emission = places.pop(ALPHA), places.pop(EMISSION)
     text = _TEXT.format(
-        language="GLSL" if language == "glsl" else "HLSL",
         layout=layout,
         rows=rows,
         columns=columns,
@@ -100,7 +97,7 @@ def smoke_shader(
         emission=f"{emission} * {_literal(1.0 / gain)}" if hot else "0.0",
         **places,
     )
-    return text if language == "hlsl" else re.sub(r"\bfloat([234])\b", r"vec\1", text)
+    return translate(text, language)
 
 
 def _literal(number: float) -> str:

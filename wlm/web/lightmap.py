@@ -11,6 +11,7 @@ import numpy as np
 from wlm.errors import WlmError
 from wlm.formats.geometry import read_geometry
 from wlm.formats.shared_exponent import pack_rgb9e5
+from wlm.lightmap import packed
 from wlm.lightmap.data import LightmapSet
 from wlm.lightmap.decode import Decoder
 from wlm.lightmap.evaluation import count_kinds, psnr_of
@@ -19,13 +20,14 @@ from wlm.lightmap.front import load_light
 from wlm.lightmap.layers.sheet import Sheet
 from wlm.lightmap.model import LightmapModel
 from wlm.lightmap.shader import decode_glsl
-from wlm.lightmap.tiles import TileKind, valid_texels
 from wlm.system import Meter, OnProgress
 from wlm.texels import exposure, fill_gaps
 from wlm.web.page import Page, pack_triangles
 
-_TIMES = ("times", "period", "interpolation", "time_axis", "tau", "tiles")
-_LAYERS = ("W1", "b1", "W2", "b2", "W3", "b3")
+_DESCRIBED = (
+    *("times", "period", "interpolation", "time_axis", "tau", "tiles", "textures", "slices", "record", "tile_columns"),
+    *("tile_size", "hidden", "gamma", "height"),
+)
 
 
 def lightmap_page(
@@ -52,26 +54,13 @@ def lightmap_page(
     Raises:
         WlmError: The mesh or the set can't be read, or the set is of another size.
     """
-    described = document(model)
-    networks = [
-        np.concatenate([np.ravel(tile.pop(layer)) for layer in _LAYERS]) for tile in described["tiles"] if "W1" in tile
-    ]
-    arrays: dict[str, np.ndarray] = {
-        "networks": np.concatenate(networks or [np.zeros(0)]).astype(np.float32),
-        "valid": np.packbits(model.mask),
-    }
-    dynamic = np.flatnonzero(model.kind == TileKind.DYNAMIC).tolist()
-    for place, number in enumerate(model.mapped.tolist()):
-        arrays[f"{number}_uv"] = model.uv[place]
-        if number in dynamic:
-            row = dynamic.index(number)
-            arrays |= {f"{number}_{name}": getattr(model, name)[row] for name in ("uvt", "ut", "vt")}
-    for row, number in enumerate(np.flatnonzero(model.kind == TileKind.FRAMES).tolist()):
-        arrays[f"{number}_frames"] = model.frames[row]
-    for row, number in enumerate(np.flatnonzero(model.kind == TileKind.VIDEO).tolist()):
-        # The gaps' light is that of charts: what lies there packs better as nothing.
-        arrays[f"{number}_video"] = model.video_levels[row] * valid_texels(model.mask, number)
-    profile, times = model.profile, model.times
+    nets, starts = packed.networks(model)
+    # The gaps' light is that of charts: what lies there packs better as nothing.
+    textures = packed.textures(model, bare=True)
+    described = document(model, textures, starts)
+    arrays: dict[str, np.ndarray] = {"networks": nets, "valid": np.packbits(model.mask)}
+    arrays |= {f"tiles_{name}": texture.data for name, texture in textures.items()}
+    times = model.times
     time = float(times[len(times) // 2])
     reference: dict[str, Any] | None = None
     if original is not None:
@@ -85,15 +74,7 @@ def lightmap_page(
         "shader": decode_glsl(model),
         "exposure": exposure(Decoder(model).frame(time)),
         "time": time,
-        "lightmap": {name: described[name] for name in _TIMES}
-        | {
-            "maps": {
-                "resolution": profile.uvt_resolution,
-                "slices": profile.uvt_slices,
-                "columns": profile.plane_columns,
-                "rows": profile.plane_rows,
-            }
-        },
+        "lightmap": {name: described[name] for name in _DESCRIBED},
     }
     if mesh is not None:
         triangles, box = pack_triangles(read_geometry(mesh), up)
@@ -105,7 +86,7 @@ def lightmap_page(
         ("bits per texel and hour", f"{file_bytes * 8 / (model.width * model.height * len(times)):.3f}"),
         ("lightmaps", f"{model.width} × {model.height}, {len(times)} {'hour' if len(times) == 1 else 'hours'}"),
         ("tiles", kinds),
-        ("profile", profile.name),
+        ("profile", model.profile.name),
     ]
     if reference is not None:
         manifest["reference"] = reference
@@ -113,7 +94,7 @@ def lightmap_page(
     if sheet is not None:
         rest = f", without the file's {others} other sheet{'' if others == 1 else 's'}" if others else ""
         note += f" Shown is {sheet.label}{rest}."
-    return Page("lightmap", model.name, note, figures, manifest, arrays)
+    return Page("lightmap", model.name, note, figures, manifest, arrays, [packed.table_script()])
 
 
 def _originals(

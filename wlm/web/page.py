@@ -33,6 +33,7 @@ class Page:
         figures: Names and texts of the panel's table.
         manifest: JSON values for the script.
         arrays: By name; bytes are carried as they are.
+        scripts: Texts of further scripts that the kind's own needs.
     """
 
     kind: str
@@ -41,6 +42,7 @@ class Page:
     figures: Sequence[tuple[str, str]]
     manifest: Mapping[str, Any]
     arrays: Mapping[str, np.ndarray] = field(default_factory=dict)
+    scripts: Sequence[str] = ()
 
     def write(self, path: str | os.PathLike[str]) -> int:
         """Writes the page, whole or not at all.
@@ -76,7 +78,7 @@ class Page:
             "STYLE": _asset("page.css"),
             "MANIFEST": text,
             "CONTENT": base64.b64encode(zlib.compress(bytes(content), 9)).decode(),
-            "SCRIPT": "\n".join(_asset(name) for name in (*_COMMON, f"{self.kind}.js", "main.js")),
+            "SCRIPT": "\n".join([*map(_asset, _COMMON), *self.scripts, *map(_asset, (f"{self.kind}.js", "main.js"))]),
         }
         # Cut first, then filled: what goes in may hold a mark too.
         first, *rest = _asset("page.html").split("@")

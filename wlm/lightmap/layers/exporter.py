@@ -23,7 +23,14 @@ _ABOUT = (
 )
 
 
-def export(model: LayeredModel, directory: str | os.PathLike[str], *, device: str = "cpu") -> list[Path]:
+def export(
+    model: LayeredModel,
+    directory: str | os.PathLike[str],
+    *,
+    device: str = "cpu",
+    shader: str = "glsl",
+    exact: bool = False,
+) -> list[Path]:
     """Writes a model's sheets as textures, weights and shaders, in folders `sheet_00` and so on, and `sheets.json`.
 
     An earlier export is replaced, and sheets that are no longer there are removed; other files stay. Where it is
@@ -33,6 +40,7 @@ def export(model: LayeredModel, directory: str | os.PathLike[str], *, device: st
         model: The model.
         directory: The folder; made if it isn't there.
         device: Where the frames to compare with are decoded.
+        shader, exact: As of `wlm.lightmap.exporter.export`.
 
     Returns:
         The files written.
@@ -51,7 +59,7 @@ def export(model: LayeredModel, directory: str | os.PathLike[str], *, device: st
             for number, (sheet, own) in enumerate(model.sheets.items()):
                 name = f"sheet_{number:02d}"
                 values = ENCODINGS[sheet.encoding] if sheet.linear else None
-                written += exporter.export(own, folder / name, device=device, values=values)
+                written += exporter.export(own, folder / name, device=device, values=values, shader=shader, exact=exact)
                 sheets.append(
                     {
                         "folder": name,

@@ -4,8 +4,8 @@ const HEAD = `#version 300 es
 precision highp float;
 precision highp int;
 precision highp sampler2D;
-precision highp sampler3D;
 precision highp usampler2D;
+precision highp sampler2DArray;
 `;
 
 // One triangle over the whole target.
@@ -86,16 +86,35 @@ class Graphics {
   }
 
   // Blocks of BC7, uploaded as they are where the browser takes them.
-  blocks(width, height, depth, bytes, filter, wraps) {
-    const {gl} = this, volume = depth > 1, target = volume ? gl.TEXTURE_3D : gl.TEXTURE_2D;
-    const result = this.#texture(target, filter, wraps);
-    const form = this.bptc?.COMPRESSED_RGBA_BPTC_UNORM_EXT;
-    const texels = this.bptc ? bytes : unpackBlocks(bytes, width, height * depth);
-    if (this.bptc && volume) gl.compressedTexImage3D(target, 0, form, width, height, depth, 0, texels);
-    else if (this.bptc) gl.compressedTexImage2D(target, 0, form, width, height, 0, texels);
-    else if (volume) gl.texImage3D(target, 0, gl.RGBA8, width, height, depth, 0, gl.RGBA, gl.UNSIGNED_BYTE, texels);
-    else gl.texImage2D(target, 0, gl.RGBA8, width, height, 0, gl.RGBA, gl.UNSIGNED_BYTE, texels);
-    return result;
+  blocks(width, height, bytes, filter) {
+    const {gl} = this;
+    if (!this.bptc) return this.plain(width, height, [gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE], unpackBlocks(bytes, width, height), filter);
+    const result = this.#texture(gl.TEXTURE_2D, filter), form = this.bptc.COMPRESSED_RGBA_BPTC_UNORM_EXT;
+    gl.compressedTexImage2D(gl.TEXTURE_2D, 0, form, width, height, 0, bytes);
+    return {...result, width, height};
+  }
+
+  // An array of textures to be filled layer by layer: of words of 10 bits, or blocks of BC7.
+  layers(width, height, count, words) {
+    const {gl} = this, target = gl.TEXTURE_2D_ARRAY, result = this.#texture(target, gl.NEAREST);
+    const form = words ? gl.RGB10_A2 : this.bptc?.COMPRESSED_RGBA_BPTC_UNORM_EXT ?? gl.RGBA8;
+    gl.texStorage3D(target, 1, form, width, height, count);
+    return {...result, width, height, words};
+  }
+
+  putLayer({target, texture, width, height, words}, layer, data) {
+    const {gl} = this, place = [target, 0, 0, 0, layer, width, height, 1];
+    gl.bindTexture(target, texture);
+    if (words) gl.texSubImage3D(...place, gl.RGBA, gl.UNSIGNED_INT_2_10_10_10_REV, data);
+    else if (this.bptc) gl.compressedTexSubImage3D(...place, this.bptc.COMPRESSED_RGBA_BPTC_UNORM_EXT, data);
+    else gl.texSubImage3D(...place, gl.RGBA, gl.UNSIGNED_BYTE, unpackBlocks(data, width, height));
+  }
+
+  // Floats as a texture of four each, 1,024 a row.
+  fours(values) {
+    const {gl} = this, padded = new Float32Array(4096 * Math.max(Math.ceil(values.length / 4096), 1));
+    padded.set(values);
+    return this.plain(1024, padded.length / 4096, [gl.RGBA32F, gl.RGBA, gl.FLOAT], padded, gl.NEAREST);
   }
 
   // Float32 or uint32 numbers as a texture that `fetch` reads by their index.

@@ -1,95 +1,29 @@
 // Lightmaps over the day: the exported shader decodes stored hours into textures, which are mixed between two hours.
 
-const MAIN_DYNAMIC = `
-uniform sampler2D u_uv, u_ut, u_vt;
-uniform sampler3D u_uvt;
-uniform ivec2 u_origin;
-uniform float u_tau;
-uniform int u_offset;
-uniform vec3 u_scale, u_shift, u_spread;
+const MAIN_TILE = `
 out vec4 radiance;
-void main()
-{
-    ivec2 texel = ivec2(gl_FragCoord.xy) - u_origin;
-    vec3 colour = wlm_decode_dynamic(u_uv, u_uvt, u_ut, u_vt, texel, u_tau, u_offset, u_scale, u_shift, u_spread);
-    radiance = vec4(wlm_radiance(colour), 1.0);
-}`;
-const MAIN_STATIC = `
-uniform sampler2D u_uv;
-uniform ivec2 u_origin;
-uniform int u_offset;
-uniform vec3 u_scale, u_shift, u_spread;
-out vec4 radiance;
-void main()
-{
-    ivec2 texel = ivec2(gl_FragCoord.xy) - u_origin;
-    radiance = vec4(wlm_radiance(wlm_decode_static(u_uv, texel, u_offset, u_scale, u_shift, u_spread)), 1.0);
-}`;
-// Of the two stored times around the one that is decoded: their light is mixed, whatever networks do.
-const MAIN_FRAMES = `
-uniform sampler2D u_early, u_late;
-uniform ivec2 u_origin;
-uniform vec3 u_early_least, u_early_greatest, u_late_least, u_late_greatest;
-uniform float u_share;
-out vec4 radiance;
-void main()
-{
-    ivec2 texel = ivec2(gl_FragCoord.xy) - u_origin;
-    vec3 early = wlm_radiance(wlm_decode_frame(u_early, texel, u_early_least, u_early_greatest));
-    vec3 late = wlm_radiance(wlm_decode_frame(u_late, texel, u_late_least, u_late_greatest));
-    radiance = vec4(mix(early, late, u_share), 1.0);
-}`;
+void main() { radiance = vec4(wlm_radiance(ivec2(gl_FragCoord.xy)), 1.0); }`;
 const MAIN_FILL = `
-uniform sampler2D u_map, u_valid;
+uniform sampler2D u_map;
 out vec4 radiance;
-void main() { radiance = texelFetch(u_map, wlm_source(u_valid, ivec2(gl_FragCoord.xy)), 0); }`;
-const READ_NETWORK = `
-uniform sampler2D u_network;
-#define WLM_NET(i) texelFetch(u_network, ivec2((i) & 1023, (i) >> 10), 0).r
-`;
+void main() { radiance = texelFetch(u_map, wlm_source(ivec2(gl_FragCoord.xy)), 0); }`;
 const MIXED = `
 uniform sampler2D u_early, u_late;
 uniform float u_share;
 vec3 wlm_light() { return mix(texture(u_early, v_uv).rgb, texture(u_late, v_uv).rgb, u_share); }`;
 const LONG_FRAME = 40, SHORT_FRAME = 25;  // milliseconds between two pictures
 
-// Where a time lies between the stored ones: their numbers, the share of the later one, and tau.
-function place(lightmap, time) {
-  const {times, period, tau, time_axis: axis} = lightmap, count = times.length;
-  if (period) time = ((time % period) + period) % period;
-  else time = Math.min(Math.max(time, times[0]), times[count - 1]);
-  let before = times.findLastIndex((t) => t <= time), after = before + 1, span, since;
-  if (period) {
-    [before, after] = [(before + count) % count, after % count];
-    span = (times[after] - times[before] + period) % period || period;
-    since = (time - times[before] + period) % period;
-  } else {
-    after = Math.min(after, count - 1);
-    [span, since] = [times[after] - times[before] || 1, time - times[before]];
-  }
-  const share = since / span;
-  let place = axis.rule === 'paper' && period ? time / period
-    : tau[before] + share * (axis.repeats ? 1 / count : tau[after] - tau[before]);
-  if (axis.repeats) place -= Math.floor(place);
-  return {before, after, share, tau: place};
-}
-
 class LightmapPage {
   constructor(graphics, page, panel, changed) {
     const {manifest} = page, {gl} = graphics;
     Object.assign(this, {graphics, page, manifest, lightmap: manifest.lightmap, panel});
     const {lightmap} = this;
-    this.networks = graphics.numbers(page.array('networks', Float32Array));
-    const shader = (main) => graphics.program(WHOLE, HEAD + READ_NETWORK + manifest.shader + main);
-    const kinds = new Set(lightmap.tiles.map((tile) => tile.kind));
-    this.programs = {
-      dynamic: kinds.has('dynamic') && shader(MAIN_DYNAMIC),
-      static: kinds.has('static') && shader(MAIN_STATIC),
-      images: (kinds.has('frames') || kinds.has('video')) && shader(MAIN_FRAMES),
-      fill: shader(MAIN_FILL),
-    };
-    this.valid = this.#mask(page.array('valid', Uint8Array));
-    this.tiles = lightmap.tiles.map((tile) => this.#upload(tile));
+    const shader = (main) => graphics.program(WHOLE, HEAD + manifest.shader + main);
+    this.programs = {tile: shader(MAIN_TILE), fill: shader(MAIN_FILL)};
+    this.networks = page.array('networks', Float32Array);
+    this.tiles = lightmap.tiles;
+    this.textures = this.#upload();
+    this.layers = new Set();
     const texture = () => graphics.target(manifest.width, manifest.height, graphics.half(), gl.LINEAR);
     // An hour is decoded into `next`, and kept in one of two maps when it is whole; until the first is, its tiles
     // appear one by one. What is seen are one or two of the maps, the later one by its share.
@@ -141,30 +75,32 @@ class LightmapPage {
     return `${Math.floor(minutes / 60)}:${String(minutes % 60).padStart(2, '0')}`;
   }
 
-  #upload(tile) {
-    const {graphics, page, lightmap} = this, {gl} = graphics, {resolution, slices, columns, rows} = lightmap.maps;
-    const bytes = (map) => page.array(`${tile.number}_${map}`, Uint8Array), repeats = lightmap.time_axis.repeats;
-    const textures = {};
-    if (tile.kind === 'dynamic' || tile.kind === 'static') textures.u_uv = graphics.blocks(128, 128, 1, bytes('uv'), gl.NEAREST);
-    if (tile.kind === 'dynamic') {
-      const two = [gl.RG8, gl.RG, gl.UNSIGNED_BYTE], wrap = {T: repeats};
-      textures.u_uvt = graphics.blocks(resolution, resolution, slices, bytes('uvt'), gl.LINEAR, {R: repeats});
-      textures.u_ut = graphics.plain(columns, rows, two, bytes('ut'), gl.LINEAR, wrap);
-      textures.u_vt = graphics.plain(columns, rows, two, bytes('vt'), gl.LINEAR, wrap);
+  #upload() {
+    const {graphics, page, lightmap} = this, {gl} = graphics, {textures} = lightmap;
+    const made = {
+      wlm_lightmap_networks: graphics.fours(this.networks),
+      wlm_lightmap_valid: this.#mask(page.array('valid', Uint8Array)),
+    };
+    for (const [name, {size, layers}] of Object.entries(textures)) {
+      const bytes = () => page.array(`tiles_${name}`, Uint8Array), key = `wlm_lightmap_${name}`;
+      if (name === 'uv' || name === 'uvt') made[key] = graphics.blocks(...size, bytes(), gl.LINEAR);
+      else if (name === 'planes') made[key] = graphics.plain(...size, [gl.RG8, gl.RG, gl.UNSIGNED_BYTE], bytes(), gl.LINEAR);
+      else made[key] = graphics.layers(...size, layers, name === 'video');
     }
-    // Images by their hour, uploaded when they are first seen.
-    return {...tile, textures, frames: []};
+    return made;
   }
 
-  #frame(tile, hour) {
-    const {graphics, page} = this, {gl} = graphics, size = 128 * 128;
-    if (tile.kind === 'video') {
-      const words = () => page.array(`${tile.number}_video`, Uint32Array).subarray(size * hour, size * (hour + 1));
-      const form = [gl.RGB10_A2, gl.RGBA, gl.UNSIGNED_INT_2_10_10_10_REV];
-      return tile.frames[hour] ??= graphics.plain(128, 128, form, words(), gl.NEAREST);
+  // Images of an hour, uploaded when they are first seen.
+  #show(hour) {
+    const {graphics, page, layers} = this;
+    if (layers.has(hour)) return;
+    layers.add(hour);
+    for (const name of ['frames', 'video']) {
+      const texture = this.textures[`wlm_lightmap_${name}`];
+      if (!texture) continue;
+      const kind = name === 'video' ? Uint32Array : Uint8Array, size = texture.width * texture.height;
+      graphics.putLayer(texture, hour, page.array(`tiles_${name}`, kind).subarray(size * hour, size * (hour + 1)));
     }
-    const bytes = () => page.array(`${tile.number}_frames`, Uint8Array).subarray(size * hour, size * (hour + 1));
-    return tile.frames[hour] ??= graphics.blocks(128, 128, 1, bytes(), gl.NEAREST);
   }
 
   // Valid texels from one bit each, the first the highest of its byte.
@@ -174,50 +110,30 @@ class LightmapPage {
     return graphics.plain(width, height, [gl.R8, gl.RED, gl.UNSIGNED_BYTE], texels, gl.NEAREST);
   }
 
-  #decode(tile, now) {
-    const {graphics, next} = this, {gl} = graphics, origin = [128 * tile.column, 128 * tile.row];
+  #decode(tile) {
+    const {graphics, next} = this, {gl} = graphics;
     gl.bindFramebuffer(gl.FRAMEBUFFER, next.buffer);
     gl.disable(gl.DEPTH_TEST);
-    gl.viewport(...origin, 128, 128);
-    const between = (rows) => rows[now.before].map((value, c) => mix(value, rows[now.after][c], now.share));
-    if (tile.kind === 'constant') {
-      gl.enable(gl.SCISSOR_TEST);
-      gl.scissor(...origin, 128, 128);
-      gl.clearColor(...between(tile.radiance), 1);
-      gl.clear(gl.COLOR_BUFFER_BIT);
-      gl.disable(gl.SCISSOR_TEST);
-      return;
-    }
-    if (tile.kind === 'frames' || tile.kind === 'video') {
-      const {before, after, share} = now;
-      graphics.use(this.programs.images, {
-        u_origin: origin, u_share: share, u_early: this.#frame(tile, before), u_late: this.#frame(tile, after),
-        u_early_least: tile.least[before], u_early_greatest: tile.greatest[before],
-        u_late_least: tile.least[after], u_late_greatest: tile.greatest[after],
-      });
-      graphics.draw(3);
-      return;
-    }
-    graphics.use(this.programs[tile.kind], {
-      ...tile.textures, u_network: this.networks, u_origin: origin, u_tau: now.tau, u_offset: tile.network_offset,
-      u_scale: between(tile.scale), u_shift: tile.shift, u_spread: tile.spread,
-    });
+    gl.viewport(128 * tile.column, 128 * tile.row, 128, 128);
+    graphics.use(this.programs.tile, {...this.textures, wlm_lightmap_hour: this.table});
     graphics.draw(3);
   }
 
-  // What is decoded for a time: one or two stored times, or, where the network interpolates, the time itself.
-  #reads(time) {
-    const {lightmap} = this, now = place(lightmap, time);
-    if (lightmap.interpolation === 'network') return [{...now, key: time, weight: 1}];
-    const stored = (k, weight) => ({before: k, after: k, share: 0, tau: lightmap.tau[k], key: k, weight});
-    return [stored(now.before, 1 - now.share), stored(now.after, now.share)].filter((read) => read.weight > 0);
+  // What is asked for: its table, and the images that it reads.
+  #ask(read) {
+    const {graphics, lightmap} = this, old = this.table;
+    this.asked = read;
+    this.table = graphics.fours(wlmTable(lightmap, this.networks, read));
+    if (old) graphics.discard(old);
+    this.#show(read.before);
+    this.#show(read.after);
   }
 
   #map(read) { return this.maps.find((map) => map.key === read.key); }
 
   // Decodes some tiles of a wanted hour; returns whether it did.
   work(elapsed) {
-    const reads = this.#reads(this.time), missing = reads.find((read) => !this.#map(read));
+    const reads = wlmReads(this.lightmap, this.time), missing = reads.find((read) => !this.#map(read));
     if (!this.waiting.length) {
       if (!missing) {
         const changed = this.shown !== this.time;
@@ -225,14 +141,14 @@ class LightmapPage {
         if (changed) this.#score();
         return changed;
       }
-      this.asked = missing;
+      this.#ask(missing);
       this.waiting = [...this.tiles];
       this.began = performance.now();
     }
     // As many tiles between two pictures as leave the page responsive.
     if (elapsed > LONG_FRAME) this.batch = Math.max(Math.floor(this.batch / 2), 1);
     else if (elapsed < SHORT_FRAME) this.batch = Math.min(2 * this.batch, this.tiles.length);
-    for (const tile of this.waiting.splice(0, this.batch)) this.#decode(tile, this.asked);
+    for (const tile of this.waiting.splice(0, this.batch)) this.#decode(tile);
     if (this.waiting.length) {
       this.panel.figure('decoded in', `${this.tiles.length - this.waiting.length} of ${this.tiles.length} tiles so far`);
       return true;
@@ -249,7 +165,7 @@ class LightmapPage {
     gl.bindFramebuffer(gl.FRAMEBUFFER, map.buffer);
     gl.disable(gl.DEPTH_TEST);
     gl.viewport(0, 0, manifest.width, manifest.height);
-    graphics.use(this.programs.fill, {u_map: this.next, u_valid: this.valid});
+    graphics.use(this.programs.fill, {u_map: this.next, ...this.textures});
     graphics.draw(3);
     graphics.read(map, 1, 1);
     map.key = read.key;

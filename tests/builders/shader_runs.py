@@ -1,0 +1,246 @@
+"""Runs shaders on a machine without a GPU: GLSL through Mesa's llvmpipe (moderngl), WGSL through wgpu."""
+
+import functools
+import json
+import re
+import shutil
+import struct
+import subprocess
+
+import numpy as np
+import pytest
+import texture2ddecoder
+from PIL import Image
+
+ES = "#version 300 es\nprecision highp float;\nprecision highp int;\nprecision highp sampler2D;\n"
+ES += "precision highp usampler2D;\nprecision highp sampler2DArray;\n"
+HEADS = {"glsl": "#version 330\n", "glsl-es": ES}
+_WHOLE = "void main() { gl_Position = vec4(vec2(gl_VertexID & 1, gl_VertexID >> 1) * 4.0 - 1.0, 0.0, 1.0); }"
+_FORMS = {"uint8": ("f1", 1), "uint16": ("u2", 2), "uint32": ("u4", 4), "float16": ("f2", 2), "float32": ("f4", 4)}
+
+
+@functools.cache
+def _context():
+    import moderngl
+
+    return moderngl.create_context(standalone=True, backend="egl", require=330)
+
+
+def gl():
+    """A GL context without a display; skips the test, with what to install, where there is none."""
+    pytest.importorskip("moderngl", reason="moderngl is not installed (pip, extra test)")
+    try:
+        return _context()
+    except Exception as error:  # noqa: BLE001  # moderngl has no class of its own for it
+        pytest.skip(f"no OpenGL without a display: install Mesa (libegl1, libgl1-mesa-dri): {error}")
+
+
+def run_glsl(text, main, size, textures, language="glsl", uniforms=None, version=330):
+    """Draws one picture, float32 [height, width, 4].
+
+    Args:
+        text: The functions.
+        main: What is below them, which writes `light`; `ivec2 pixel` is the place in the picture.
+        size: Height and width.
+        textures: By name: [h, w, c], uint8 for levels from 0 to 1, other integers as they are; [n, h, w, c]: an array.
+        language: A key of `HEADS`.
+        uniforms: By name.
+        version: Of "glsl".
+    """
+    # That of wgpu may be the thread's own by now.
+    with gl() as context:
+        head = HEADS[language].replace("330", str(version))
+        return _draw(context, head, text, main, size, textures, uniforms or {})
+
+
+def _draw(context, head, text, main, size, textures, uniforms):
+    vertex = head.splitlines(True)[0] + _WHOLE
+    body = f"out vec4 light;\nvoid main()\n{{\n    ivec2 pixel = ivec2(gl_FragCoord.xy);\n    {main}\n}}\n"
+    program = context.program(vertex_shader=vertex, fragment_shader=head + text + body)
+    made = []
+    for unit, (name, values) in enumerate(textures.items()):
+        if name not in program:
+            continue
+        values = np.ascontiguousarray(values)
+        shape = (values.shape[-2], values.shape[-3], *values.shape[:-3])
+        kind = _FORMS[values.dtype.name][0]
+        make = context.texture_array if values.ndim == 4 else context.texture
+        texture = make(shape, values.shape[-1], values.tobytes(), dtype=kind, alignment=1)
+        linear = kind in ("f1", "f2", "f4")
+        texture.filter = (context.LINEAR, context.LINEAR) if linear else (context.NEAREST, context.NEAREST)
+        texture.repeat_x = texture.repeat_y = False
+        texture.use(unit)
+        program[name].value = unit
+        made.append(texture)
+    for name, value in uniforms.items():
+        program[name].value = value
+    target = context.texture(size[::-1], 4, dtype="f4")
+    frame = context.framebuffer([target])
+    frame.use()
+    array = context.vertex_array(program, [])
+    array.render(context.TRIANGLES, vertices=3)
+    error = context.error
+    assert error == "GL_NO_ERROR", error
+    picture = np.frombuffer(target.read(), np.float32).reshape(*size, 4).copy()
+    for thing in made:
+        thing.release()
+    return picture
+
+
+@functools.cache
+def _device():
+    import wgpu
+
+    adapter = wgpu.gpu.request_adapter_sync()
+    return adapter.request_device_sync(required_features={"float32-filterable"} & adapter.features)
+
+
+def device():
+    """A device of wgpu; skips the test, with what to install, where there is none."""
+    pytest.importorskip("wgpu", reason="wgpu is not installed (pip, extra test)")
+    try:
+        return _device()
+    except Exception as error:  # noqa: BLE001  # whatever the driver says
+        pytest.skip(f"no GPU for wgpu, not even in software: install Mesa (libegl1, mesa-vulkan-drivers): {error}")
+
+
+_WGPU_FORMS = {
+    ("uint8", 1): "r8unorm",
+    ("uint8", 2): "rg8unorm",
+    ("uint8", 4): "rgba8unorm",
+    ("uint16", 2): "rg16uint",
+    ("uint32", 1): "r32uint",
+    ("float16", 4): "rgba16float",
+    ("float32", 2): "rg32float",
+    ("float32", 4): "rgba32float",
+}
+
+
+def run_wgsl(text, expression, size, bound):
+    """Computes one picture, float32 [height, width, 4], with WGSL.
+
+    Args:
+        text: The functions, with their bindings.
+        expression: WGSL of a `vec4f`; `pixel` is the place in the picture.
+        size: Height and width.
+        bound: Textures as of `run_glsl`, and 1D arrays of buffers and uniforms, by name.
+    """
+    code = f"""{text}
+@group(1) @binding(0) var<storage, read_write> wlm_out: array<vec4f>;
+@compute @workgroup_size(8, 8) fn main(@builtin(global_invocation_id) id: vec3u)
+{{
+    let pixel = vec2i(id.xy);
+    if (pixel.x < {size[1]} && pixel.y < {size[0]}) {{ wlm_out[pixel.y * {size[1]} + pixel.x] = {expression}; }}
+}}"""
+    bindings = {name: int(place) for place, name in re.findall(r"@binding\((\d+)\) var(?:<[^>]*>)? (\w+)", text)}
+    used = {name: place for name, place in bindings.items() if len(re.findall(rf"\b{name}\b", text + expression)) > 1}
+    return _run(code, size, {name: bound.get(name) for name in used}, used)
+
+
+def run_hlsl(text, expression, size, bound, tmp_path):
+    """The same with HLSL, which glslang compiles to SPIR-V."""
+    if shutil.which("glslangValidator") is None:
+        pytest.skip("no glslangValidator: install glslang-tools")
+    declared = r"^((?:Texture2D\w*<\w+>|StructuredBuffer<\w+>|SamplerState) (\w+);|cbuffer (\w+)_values$)"
+    names = [match[2] or match[3] for match in re.finditer(declared, text, re.MULTILINE)]
+    place = iter(range(len(names)))
+    text = re.sub(declared, lambda match: f"[[vk::binding({next(place)}, 0)]] {match[0]}", text, flags=re.MULTILINE)
+    source = f"""{text}
+[[vk::binding(0, 1)]] RWStructuredBuffer<float4> wlm_out;
+[numthreads(8, 8, 1)] void main(uint3 id : SV_DispatchThreadID)
+{{
+    int2 pixel = int2(id.xy);
+    if (pixel.x < {size[1]} && pixel.y < {size[0]}) {{ wlm_out[pixel.y * {size[1]} + pixel.x] = {expression}; }}
+}}"""
+    (tmp_path / "shader.comp").write_text(source)
+    words = ["glslangValidator", "-D", "-V", "-e", "main", "-o", "shader.spv", "shader.comp"]
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout
+    used = {name: place for place, name in enumerate(names) if len(re.findall(rf"\b{name}\b", source)) > 1}
+    code = (tmp_path / "shader.spv").read_bytes()
+    return _run(code, size, {name: bound.get(name) for name in used}, used)
+
+
+def _run(code, size, bound, places):
+    gpu = device()
+    import wgpu
+
+    usage, kinds = wgpu.BufferUsage, wgpu.TextureUsage
+    pipeline = gpu.create_compute_pipeline(
+        layout="auto", compute={"module": gpu.create_shader_module(code=code), "entry_point": "main"}
+    )
+    entries = []
+    for name, values in bound.items():
+        if values is None:  # the sampler
+            resource = gpu.create_sampler(mag_filter="linear", min_filter="linear")
+        elif values.ndim <= 2:
+            flags = usage.STORAGE | usage.UNIFORM
+            resource = {"buffer": gpu.create_buffer_with_data(data=np.ascontiguousarray(values), usage=flags)}
+        else:
+            layers = values.reshape(-1, *values.shape[-3:])
+            count, height, width, channels = layers.shape
+            if channels == 3:
+                layers = np.concatenate([layers, np.ones((count, height, width, 1), layers.dtype)], 3)
+            texture = gpu.create_texture(
+                size=(width, height, count),
+                format=_WGPU_FORMS[layers.dtype.name, layers.shape[-1]],
+                usage=kinds.TEXTURE_BINDING | kinds.COPY_DST,
+            )
+            data = np.ascontiguousarray(layers)
+            layout = {"bytes_per_row": data[0, 0].nbytes, "rows_per_image": height}
+            gpu.queue.write_texture({"texture": texture}, data, layout, (width, height, count))
+            resource = texture.create_view(dimension="2d-array" if values.ndim == 4 else "2d")
+        entries.append({"binding": places[name], "resource": resource})
+    out = gpu.create_buffer(size=16 * size[0] * size[1], usage=usage.STORAGE | usage.COPY_SRC)
+    encoder = gpu.create_command_encoder()
+    work = encoder.begin_compute_pass()
+    work.set_pipeline(pipeline)
+    if entries:
+        work.set_bind_group(0, gpu.create_bind_group(layout=pipeline.get_bind_group_layout(0), entries=entries))
+    last = [{"binding": 0, "resource": {"buffer": out}}]
+    work.set_bind_group(1, gpu.create_bind_group(layout=pipeline.get_bind_group_layout(1), entries=last))
+    work.dispatch_workgroups(-(-size[1] // 8), -(-size[0] // 8))
+    work.end()
+    gpu.queue.submit([encoder.finish()])
+    return np.frombuffer(gpu.queue.read_buffer(out), np.float32).reshape(*size, 4).copy()
+
+
+def read_dds_levels(path):
+    """A DDS file by Microsoft's description of it and another BC7 decoder: levels [layers, H, W, C] in [0, 1]."""
+    data = path.read_bytes()
+    height, width = struct.unpack_from("<2I", data, 12)
+    fmt, dimension, _, layers = struct.unpack_from("<4I", data, 128)
+    assert dimension == 3
+    payload = data[148:]
+    if fmt == 49:
+        return np.frombuffer(payload, np.uint8).reshape(layers, height, width, 2) / 255.0
+    if fmt == 24:
+        words = np.frombuffer(payload, "<u4").reshape(layers, height, width, 1)
+        return np.concatenate([words >> shift & 1023 for shift in (0, 10, 20)], 3) / 1023.0
+    assert fmt == 98
+    size = len(payload) // layers
+    slices = [texture2ddecoder.decode_bc7(payload[i * size : (i + 1) * size], width, height) for i in range(layers)]
+    bgra = np.stack([np.frombuffer(s, np.uint8).reshape(height, width, 4) for s in slices])
+    return bgra[..., [2, 1, 0, 3]] / 255.0
+
+
+def rows_of_floats(numbers):
+    """A texture of 1,024 fours a row."""
+    fours = np.asarray(numbers, np.float32).reshape(-1, 4)
+    return np.pad(fours, ((0, -len(fours) % 1024), (0, 0))).reshape(-1, 1024, 4)
+
+
+def lightmap_uniforms(folder):
+    """The textures of an exported folder, as an engine uploads them; `hour` gives the table of a stored one."""
+    made = {}
+    for path in folder.glob("*.dds"):
+        levels = read_dds_levels(path)
+        bits = np.float32(levels) if path.stem == "video" else np.uint8(np.rint(levels * 255.0))
+        made[f"wlm_lightmap_{path.stem}"] = bits if path.stem in ("frames", "video") else bits[0]
+    if (folder / "networks.bin").exists():
+        made["wlm_lightmap_networks"] = rows_of_floats(np.fromfile(folder / "networks.bin", "<f4"))
+    with Image.open(folder / "valid.png") as image:
+        made["wlm_lightmap_valid"] = np.asarray(image).astype(np.uint8)[..., None] * 255
+    document = json.loads((folder / "weights.json").read_text())
+    tables = np.fromfile(folder / "hours.bin", "<f4").reshape(len(document["times"]), document["hour_fours"], 4)
+    return made, lambda i: {"wlm_lightmap_hour": rows_of_floats(tables[i])}

@@ -1,0 +1,201 @@
+"""Folders for engines: few files, whose shaders and scripts compile or parse by what pip and Debian have."""
+
+import json
+import os
+import re
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+from builders.atlas_meshes import charts, sheet
+from builders.atlas_models import KINDS, MIXED
+from builders.atlas_models import random_model as random_atlas
+from builders.checks import error_of
+from builders.layered_sets import random_layers
+from builders.shader_runs import run_glsl
+from builders.synthetic import random_model as random_lightmap
+
+from wlm.atlas import exporter
+from wlm.atlas.exact import decode64
+from wlm.engines import ENGINES, export_atlas, export_lightmap
+from wlm.formats.light import read_light
+from wlm.lightmap.shader import texture_names
+
+ALL = (4, 3, 2, 1, 5, 0)
+
+
+def atlas_folder(folder, kind, stored="half", mesh=None):
+    mesh = sheet() if mesh is None else mesh
+    model = random_atlas(mesh, kind, stored)
+    exporter.export(model, folder, mesh)
+    return model, exporter.read_folder(folder)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_large_lightmap_has_few_files(engine, tmp_path):
+    model = random_lightmap((3, 4) * 32, columns=8, times=(0.0, 12.0))
+    paths = export_lightmap(model, tmp_path / "out", engine)
+    assert {path.name for path in paths} == set(os.listdir(tmp_path / "out")) and len(paths) <= 12
+    assert paths[-1].name == "weights.json"
+    assert 5 <= len((tmp_path / "out" / "README.md").read_text().splitlines()) <= 20
+    assert not re.search(r"@[A-Z]+@", "".join(path.read_text() for path in paths if path.suffix in TEXTS))
+
+
+TEXTS = {".md", ".js", ".glsl", ".gd", ".gdshader", ".hlsl", ".shader", ".cs", ".usf"}
+
+
+def test_one_engines_files_take_the_place_of_anothers(tmp_path):
+    folder = tmp_path / "out"
+    (folder).mkdir()
+    export_lightmap(random_lightmap(ALL), folder, "three")
+    (folder / "mine.txt").write_text("x")
+    for engine in (*ENGINES[1:], ENGINES[0]):
+        paths = export_lightmap(random_lightmap((2, 1, 2, 0)), folder, engine)
+        assert set(os.listdir(folder)) == {path.name for path in paths} | {"mine.txt"}
+    _, output = atlas_folder(tmp_path / "made", "tiles")
+    for engine in (*ENGINES, "raw"):
+        paths = export_atlas(output, tmp_path / "atlas", engine)
+        assert set(os.listdir(tmp_path / "atlas")) == {path.name for path in paths}
+        info = json.loads(paths[-1].read_text())
+        assert set(info["textures"].values()) < set(os.listdir(tmp_path / "atlas")) and info["uv_set"] == 0
+
+
+def test_what_cannot_be_exported_for_an_engine(tmp_path):
+    assert "engine: expected one of three" in error_of(export_lightmap, random_lightmap(), tmp_path / "a", "cry")
+    assert "found layers" in error_of(export_lightmap, random_layers(), tmp_path / "a", "three")
+    _, output = atlas_folder(tmp_path / "made", "plain", "astc")
+    assert "engine: expected one of raw" in error_of(export_atlas, output, tmp_path / "a", "cry")
+    assert "there is no DDS of ASTC" in error_of(export_atlas, output, tmp_path / "a", "three")
+    assert {path.name for path in export_atlas(output, tmp_path / "a", "godot")} > {"colour.exr"}
+    assert {path.name for path in export_atlas(output, tmp_path / "a", "raw")} > {"colour.ktx2"}
+    assert "another folder" in error_of(export_atlas, output, output.folder, "godot")
+    (tmp_path / "made" / "colour.exr").unlink()
+    assert "colour.exr: no such file; compress again" in error_of(export_atlas, output, tmp_path / "b", "godot")
+    assert sorted(os.listdir(tmp_path)) == ["a", "made"]
+
+
+def test_blocks_that_do_not_fill_their_texture_become_half_floats(tmp_path):
+    model, output = atlas_folder(tmp_path / "made", "plain", "bc6h")
+    assert model.texels.shape == (18, 23, 3)
+    export_atlas(output, tmp_path / "out", "unreal")
+    np.testing.assert_array_equal(read_light(tmp_path / "out" / "colour.dds")[0][..., :3], model.texels)
+    export_atlas(output, tmp_path / "out", "raw")
+    assert (tmp_path / "out" / "colour.dds").read_bytes() == (tmp_path / "made" / "colour.dds").read_bytes()
+
+
+def compiled(text, folder, *words):
+    if shutil.which("glslangValidator") is None:
+        pytest.skip("no glslangValidator: install glslang-tools")
+    (folder / "shader.comp").write_text(text)
+    words = ["glslangValidator", "-V", *words, "-o", "shader.spv", "shader.comp"]
+    done = subprocess.run(words, cwd=folder, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout
+
+
+@pytest.mark.parametrize("kinds", [ALL, (2, 1, 0, 2)], ids=str)
+def test_godots_passes_compile(kinds, tmp_path):
+    model = random_lightmap(kinds)
+    export_lightmap(model, tmp_path / "out", "godot")
+    text = (tmp_path / "out" / "lightmap.glsl").read_text()
+    versions, _, text = text.partition("#[compute]\n")
+    assert re.findall(r'(\w+) = "(.*)";', versions) == [("decode", "#define WLM_DECODE"), ("fill", "#define WLM_FILL")]
+    for name in ("WLM_DECODE", "WLM_FILL"):
+        compiled(text.strip().replace("#VERSION_DEFINES", f"#define {name}"), tmp_path)
+    script = (tmp_path / "out" / "wlm_lightmap.gd").read_text()
+    assert f"NAMES: Array[String] = {json.dumps(texture_names(model))}" in script
+    pytest.importorskip("gdtoolkit", reason="gdtoolkit is not installed (pip, extra test)")
+    from gdtoolkit.parser import parser
+
+    parser.parse(script)
+
+
+def as_glsl(text):
+    """A shader of Godot as GLSL: without its hints, its render modes and its own names."""
+    text = re.sub(r"^shader_type .*$", "", text, flags=re.MULTILINE)
+    text = re.sub(r"^(uniform [^:;]*?) : [^;=]*?( =[^;]*)?;", r"\1\2;", text, flags=re.MULTILINE)
+    names = "vec3 ALBEDO, EMISSION; vec2 UV, UV2;\n"
+    return names + text
+
+
+@pytest.mark.parametrize("kind", [*KINDS, MIXED])
+def test_godots_atlas_shows_its_light(kind, tmp_path):
+    """Run as GLSL, with the EXRs as Godot imports them: in floats."""
+    model, output = atlas_folder(tmp_path / "made", kind, mesh=charts())
+    export_atlas(output, tmp_path / "out", "godot")
+    text = as_glsl((tmp_path / "out" / "atlas.gdshader").read_text())
+    uv = np.random.default_rng(0).random((1000, 2)).astype(np.float32)
+    if model.method == "tiles":
+        place = (uv * [model.width, model.height] - 0.5) / model.profile.tile
+        uv = uv[np.abs(place - np.rint(place)).min(1) > 1e-4]
+    bound = {path.stem: read_light(path)[0] for path in (tmp_path / "out").glob("*.exr")}
+    bound = {f"wlm_atlas_{name}": np.float32(np.pad(v[..., :3], ((0, 0), (0, 0), (0, 1)))) for name, v in bound.items()}
+    bound |= {"u_points": np.pad(uv, ((0, 0), (0, 2)))[None], "albedo": np.full((1, 1, 4), 255, np.uint8)}
+    main = "UV = vec2(0.5); UV2 = texelFetch(u_points, pixel, 0).xy; fragment(); light = vec4(EMISSION, 1.0);"
+    found = run_glsl(f"uniform sampler2D u_points;\n{text}", main, (1, len(uv)), bound)[0, :, :3]
+    allowed = 3.0 / 512 * 2 * (1 + 22 * (model.method == "cascade"))
+    np.testing.assert_allclose(found, decode64(model, uv), rtol=0, atol=allowed)
+
+
+def test_godots_lit_surface_mixes_two_hours(tmp_path):
+    export_lightmap(random_lightmap(), tmp_path, "godot")
+    text = as_glsl((tmp_path / "lit.gdshader").read_text())
+    maps = {"wlm_early": np.full((1, 1, 4), 1.0, np.float32), "wlm_late": np.full((1, 1, 4), 3.0, np.float32)}
+    maps["albedo"] = np.full((1, 1, 4), 51, np.uint8)
+    main = "UV = UV2 = vec2(0.5); fragment(); light = vec4(EMISSION, 1.0);"
+    found = run_glsl(text, main, (1, 1), maps, uniforms={"wlm_share": 0.25})
+    np.testing.assert_allclose(found[0, 0, :3], 0.2 * 1.5, atol=1e-3)
+
+
+@pytest.mark.parametrize("kinds", [ALL, (2, 1, 0, 2)], ids=str)
+def test_unitys_and_unreals_passes_compile(kinds, tmp_path):
+    model = random_lightmap(kinds)
+    export_lightmap(model, tmp_path / "unity", "unity")
+    shader = (tmp_path / "unity" / "WlmLightmap.shader").read_text()
+    shared = re.search(r"HLSLINCLUDE(.*?)ENDHLSL", shader, re.DOTALL)[1]
+    included = (tmp_path / "unity" / "WlmLightmap.hlsl").read_text()
+    shared = re.sub(r"^ *#pragma.*$", "", shared, flags=re.MULTILINE).replace('#include "WlmLightmap.hlsl"', included)
+    passes = re.findall(r"HLSLPROGRAM(.*?)ENDHLSL", shader, re.DOTALL)
+    assert len(passes) == 3
+    for each in passes:
+        compiled(shared + each, tmp_path, "-D", "-S", "frag", "-e", "frag", "--auto-map-bindings")
+    compiled(shared + passes[0], tmp_path, "-D", "-S", "vert", "-e", "vert", "--auto-map-bindings")
+    export_lightmap(model, tmp_path / "unreal", "unreal")
+    text = (tmp_path / "unreal" / "WlmLightmap.usf").read_text().replace('#include "/Engine/Public/Platform.ush"', "")
+    for entry in ("DecodeCS", "FillCS"):
+        compiled(text, tmp_path, "-D", "-S", "comp", "-e", entry, "--auto-map-bindings")
+
+
+UNITY = """
+cbuffer unity { float4x4 unity_all; };
+float4 UnityObjectToClipPos(float4 p) { return mul(unity_all, p); }
+#define TRANSFORM_TEX(uv, name) (uv * name##_ST.xy + name##_ST.zw)
+Texture2D _MainTexture; SamplerState sampler_MainTexture;
+#define tex2D(s, uv) _MainTexture.Sample(sampler_MainTexture, uv)
+"""
+
+
+@pytest.mark.parametrize("kind", [*KINDS, MIXED])
+def test_unitys_surface_compiles(kind, tmp_path):
+    _, output = atlas_folder(tmp_path / "made", kind)
+    export_atlas(output, tmp_path / "out", "unity")
+    shader = (tmp_path / "out" / "WlmAtlas.shader").read_text()
+    text = re.search(r"HLSLPROGRAM(.*?)ENDHLSL", shader, re.DOTALL)[1]
+    text = re.sub(r"^ *#pragma.*$", "", text, flags=re.MULTILINE).replace("sampler2D _MainTex;", "")
+    text = text.replace('#include "WlmAtlas.hlsl"', (tmp_path / "out" / "WlmAtlas.hlsl").read_text())
+    text = UNITY + text.replace('#include "UnityCG.cginc"', "")
+    for first in ("", "#define WLM_FIRST_UV\n"):
+        for stage, entry in (("frag", "frag"), ("vert", "vert")):
+            compiled(first + text, tmp_path, "-D", "-S", stage, "-e", entry, "--auto-map-bindings")
+
+
+def test_unitys_components_parse(tmp_path):
+    sharp = pytest.importorskip("tree_sitter_c_sharp", reason="tree-sitter-c-sharp is not installed (pip, extra test)")
+    from tree_sitter import Language, Parser
+
+    export_lightmap(random_lightmap(), tmp_path / "lightmap", "unity")
+    _, output = atlas_folder(tmp_path / "made", "tiles")
+    export_atlas(output, tmp_path / "atlas", "unity")
+    for path in (tmp_path / "lightmap" / "WlmLightmap.cs", tmp_path / "atlas" / "WlmAtlas.cs"):
+        tree = Parser(Language(sharp.language())).parse(path.read_bytes())
+        assert not tree.root_node.has_error, path

@@ -1,0 +1,332 @@
+"""Every shader that we export, in every language that runs here, beside what Python decodes."""
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+import torch
+from builders.atlas_meshes import charts
+from builders.atlas_models import KINDS, MIXED
+from builders.atlas_models import random_model as random_atlas
+from builders.metal import run_metal
+from builders.probe_models import random_model as random_probes
+from builders.shader_runs import HEADS, lightmap_uniforms, run_glsl, run_hlsl, run_wgsl
+from builders.synthetic import random_model as random_lightmap
+
+from wlm import probe
+from wlm.atlas.exact import decode64
+from wlm.atlas.model import pack_entries
+from wlm.atlas.scene.decode import Decoder as SceneDecoder
+from wlm.atlas.scene.model import SceneModel, SceneProfile, SheetPlace
+from wlm.atlas.scene.shader import scene_glsl
+from wlm.atlas.shader import atlas_glsl
+from wlm.errors import WlmError
+from wlm.formats.shared_exponent import pack_rgb9e5, unpack_rgb9e5
+from wlm.lightmap.decode import Decoder as LightmapDecoder
+from wlm.lightmap.exporter import export as export_lightmap
+from wlm.probe.light import StoredLight
+from wlm.probe.shader import probe_glsl
+from wlm.probe.volume import Volume
+from wlm.probe.volume_export import export_volume
+from wlm.probe.volume_shader import volume_glsl
+from wlm.shading import LANGUAGES, translate
+from wlm.smoke.camera import LAYOUTS, Camera
+from wlm.smoke.exporter import pack
+from wlm.smoke.lightmaps import SixWay
+from wlm.smoke.shader import smoke_shader
+from wlm.smoke.shading import Light
+
+
+@dataclass
+class Subject:
+    """A shader, and what it should show.
+
+    Attributes:
+        text: The functions, in GLSL.
+        main: `vec4 shown(ivec2 pixel)`, which calls them.
+        expected: [rows, columns, 1 to 4].
+        bound: Textures and buffers by name.
+        exact: The macro that fetches rather than filters; "": there is none.
+        tolerance: Of what is fetched; None of the other: it is what the filters allow.
+        filtered: Tolerance where the sampler filters; llvmpipe's has 8 bits of a place between two texels.
+        as_textures: In GLSL, macros that read buffers from textures.
+        version: Of GLSL.
+    """
+
+    text: str
+    main: str
+    expected: np.ndarray
+    bound: dict[str, np.ndarray]
+    exact: str
+    tolerance: float
+    filtered: float | None = None
+    as_textures: str = ""
+    version: int = 330
+
+
+def points_of(values: np.ndarray) -> np.ndarray:
+    """Places as a texture of fours, one row."""
+    values = np.asarray(values, np.float32)
+    return np.pad(values, ((0, 0), (0, 4 - values.shape[1])))[None]
+
+
+POINTS = "uniform sampler2D u_points;\n"
+
+
+def lightmap(kinds, folder, **settings) -> Subject:
+    model = random_lightmap(kinds, **settings)
+    export_lightmap(model, folder)
+    uniforms, hour = lightmap_uniforms(folder)
+    expected = LightmapDecoder(model).frame(float(model.times[2]))
+    main = "vec4 shown(ivec2 pixel) { return vec4(wlm_radiance(wlm_source(pixel)), 1.0); }\n"
+    text, step = (folder / "decode.glsl").read_text(), expected.max() / 255
+    return Subject(text, main, expected, uniforms | hour(2), "WLM_LIGHTMAP_EXACT", 0.01 * step, step)
+
+
+def atlas(kind, _) -> Subject:
+    model = random_atlas(charts(), kind)
+    uv = np.random.default_rng(0).uniform(-0.1, 1.1, (1000, 2)).astype(np.float32)
+    uv = np.concatenate([uv, [[0, 0], [1, 1], [0, 1], [0.5, 1]]]).astype(np.float32)
+    if model.method == "tiles":
+        # A point on a border of tiles may be read from either.
+        place = (uv * [model.width, model.height] - 0.5) / model.profile.tile
+        uv = uv[np.abs(place - np.rint(place)).min(1) > 1e-4]
+    bound = {"u_points": points_of(uv), "wlm_atlas_colour": rgba(model.texels)}
+    if model.method != "plain":
+        tiles = model.method == "tiles"
+        bound["wlm_atlas_lut"] = model.lut.astype(np.uint16) if tiles else (model.lut / 65535).astype(np.float32)
+    if kind == MIXED:
+        bound["wlm_atlas_blocks"] = rgba(model.block_texels)
+    main = POINTS + "vec4 shown(ivec2 pixel) { return vec4(wlm_atlas(texelFetch(u_points, pixel, 0).xy), 1.0); }\n"
+    # Neighbouring texels differ by up to 3, and a 512th of a step is lost along each axis. Where a table is filtered
+    # too its own 512th is one of 65,535 steps' span, up to all 22 texels of the other texture.
+    filtered = 3.0 / 512 * 2 * (1 + 22 * (model.method == "cascade"))
+    return Subject(atlas_glsl(model), main, decode64(model, uv)[None], bound, "WLM_ATLAS_EXACT", 3e-4, filtered)
+
+
+def rgba(texels: np.ndarray) -> np.ndarray:
+    return np.pad(texels.astype(np.float16), ((0, 0), (0, 0), (0, 1)))
+
+
+def scene(_) -> Subject:
+    random = np.random.default_rng(1)
+    texels = pack_rgb9e5(random.random((4 * 20, 24, 3)).astype(np.float32)).reshape(4, 20, 24)
+    size = random.integers(1, 8, (9, 11, 2))
+    first = random.integers(0, np.array([24, 20]) - size + 1)
+    lut = pack_entries(first, size)
+    sheets = (SheetPlace("a", 29, 36, 0, 0, 5, 6, 0), SheetPlace("b", 22, 29, 5, 4, 4, 5, 1))
+    factor = random.random((3, 2, 3)).astype(np.float32)
+    model = SceneModel("s", "0" * 16, SceneProfile(name="s"), ("a", "b", "c"), sheets, factor, texels, lut)
+    decoder, number = SceneDecoder(model), random.integers(0, 2, 500)
+    uv = random.uniform(-0.05, 1.05, (500, 2)).astype(np.float32)
+    expected = decoder.read(torch.from_numpy(uv), torch.from_numpy(number), 1.25).numpy()
+    calls = [
+        f"wlm_scene(at.xy, vec2({s.width}.0, {s.height}.0), ivec2({s.column}, {s.row}), ivec2({s.columns}, {s.rows}), "
+        f"{s.page})"
+        for s in sheets
+    ]
+    main = f"""{POINTS}vec4 shown(ivec2 pixel)
+{{
+    vec4 at = texelFetch(u_points, pixel, 0);
+    if (at.z == 0.0)
+        return vec4({calls[0]}, 1.0);
+    return vec4({calls[1]}, 1.0);
+}}
+"""
+    layers = np.stack([rgba(unpack_rgb9e5(layer)) for layer in texels])
+    bound = {
+        "u_points": points_of(np.column_stack([uv, number])),
+        "wlm_scene_lut": lut,
+        "wlm_scene_colour": layers,
+        "wlm_scene_factor": np.pad(decoder.factors(1.25), ((0, 0), (0, 1))),
+    }
+    return Subject(scene_glsl(model), main, expected[None], bound, "", 2 / 255 * expected.max())
+
+
+def smoke(layout, _) -> Subject:
+    """What `shade` makes of the frames that the textures hold, and where they are."""
+    random = np.random.default_rng(5)
+    maps = torch.tensor(random.uniform(0, 1, (5, 8, 6, 9)), dtype=torch.float32)
+    frames = [SixWay(m[:6], m[6], m[7]) for m in maps]
+    camera = Camera.look_at((0, 0, 5), (0, 0, 0), extent=6.0, height=6, width=9)
+    first, second = pack(frames, layout, rows=2, columns=3, gain=0.5, padding=2)
+    text = smoke_shader("glsl", layout, rows=2, columns=3, count=5, size=(6, 9), padding=2, gain=0.5)
+    asked, way, expected = [], [], []
+    for n, frame in enumerate(frames):
+        for row, column in ((0, 0), (3, 7), (5, 8)):
+            texel = n // 3 * 10 + 2 + row, n % 3 * 13 + 2 + column
+            for toward in ((0.6, 0.0, 0.8), (-0.6, 0.8, 0.0), (0.48, -0.6, -0.64)):
+                light = replace(frame, camera=camera, emission=None).shade([Light(toward)])[row, column, 0]
+                asked.append([(column + 0.5) / 9, (row + 0.5) / 6, n])
+                way.append(toward)
+                alpha = 1 - frame.transparency[row, column]
+                expected.append([*texel[::-1], light, 2 * alpha + 4 * frame.emission[row, column]])
+    main = (
+        POINTS
+        + """uniform sampler2D u_ways;
+uniform sampler2D u_first;
+uniform sampler2D u_second;
+vec4 shown(ivec2 pixel)
+{
+    vec4 asked = texelFetch(u_points, pixel, 0);
+    vec2 at = wlm_smoke_uv(asked.xy, asked.z);
+    ivec2 texel = ivec2(floor(at * vec2(textureSize(u_first, 0))));
+    vec4 a = texelFetch(u_first, texel, 0);
+    vec4 b = texelFetch(u_second, texel, 0);
+    float light = wlm_smoke_light(a, b, texelFetch(u_ways, pixel, 0).xyz);
+    return vec4(vec2(texel), light, 2.0 * wlm_smoke_alpha(a, b) + 4.0 * wlm_smoke_emission(a, b));
+}
+"""
+    )
+    pages = {"u_first": np.float32(first), "u_second": np.float32(second)}
+    bound = {"u_points": points_of(asked), "u_ways": points_of(way), **pages}
+    return Subject(text, main, np.array(expected, np.float32)[None], bound, "", 2e-5)
+
+
+def volume(folder) -> Subject:
+    random = np.random.default_rng(0)
+    position = random.uniform(-1, 1, (400, 3)) * [9.0, 1.0, 9.0] + [4000.0, -30.0, 0.0]
+    made = Volume(position, StoredLight(random.normal(size=(400, 27))), side=8, budget=40)
+    for _ in range(6):
+        made.update([4000.3, -29.0, 0.2])
+    export_volume(made, folder)
+    reference, document = (json.loads((folder / f"{name}.json").read_text()) for name in ("reference", "volume"))
+    points = np.array(reference["position"])
+    normals = random.normal(size=points.shape)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    ahead = made.read(points, normals)
+    head, pages, pool = (np.fromfile(folder / f"{name}.bin", kind) for name, kind in KINDS_OF_BUFFERS)
+    expected = np.column_stack([ahead.weight, ahead.values[:, [0, 5, 26]] * ahead.weight[:, None]])
+    main = (
+        POINTS
+        + """uniform sampler2D u_normals;
+vec4 shown(ivec2 pixel)
+{
+    float values[27];
+    float weight = wlm_volume_read(texelFetch(u_points, pixel, 0).xyz, texelFetch(u_normals, pixel, 0).xyz, values);
+    return vec4(weight, weight * values[0], weight * values[5], weight * values[26]);
+}
+"""
+    )
+    bound = {"u_points": points_of(points - document["viewpoint"]), "u_normals": points_of(normals)}
+    bound |= {"wlm_volume_head": head, "wlm_volume_page": pages, "wlm_volume_pool": pool}
+    return Subject(volume_glsl(27), main, expected[None], bound, "", 3e-5, as_textures=VOLUME)
+
+
+KINDS_OF_BUFFERS = (("volume", "<u4"), ("pages", "<i4"), ("pool", "<f4"))
+VOLUME = "".join(
+    f"uniform {kind} u_{name};\n#define WLM_VOLUME_{name.upper()}(i) {before}texelFetch(u_{name}, ivec2((i) & 1023, "
+    f"(i) >> 10), 0).r{after}\n"
+    for name, kind, before, after in (
+        ("head", "usampler2D", "", ""),
+        ("page", "usampler2D", "int(", ")"),
+        ("pool", "sampler2D", "", ""),
+    )
+)
+
+
+def probes(folder) -> Subject:
+    model = random_probes(seed=3)
+    probe.export(model, folder)
+    position = np.array(json.loads((folder / "reference.json").read_text())["position"])
+    expected = model.decoder().decode(position)[:, [0, 13, 26]]
+    main = (
+        POINTS
+        + """vec4 shown(ivec2 pixel)
+{
+    vec3 sh[9];
+    wlm_probe_sh(texelFetch(u_points, pixel, 0).xyz, sh);
+    return vec4(sh[0].x, sh[4].y, sh[8].z, 1.0);
+}
+"""
+    )
+    bound = {"u_points": points_of(position)}
+    bound |= {f"wlm_probe_{name}": np.fromfile(folder / f"{name}.bin", "<u4") for name in ("gaussians", "network")}
+    scale = float(np.abs(expected).max())
+    return Subject(probe_glsl(model), main, expected[None], bound, "", 1e-4 * scale, as_textures=PROBES, version=430)
+
+
+PROBES = "".join(
+    f"uniform usampler2D u_{name};\n#define WLM_PROBE_{name.upper()}(i) texelFetch(u_{name}, ivec2((i) & 1023, "
+    f"(i) >> 10), 0).r\n"
+    for name in ("gaussians", "network")
+)
+
+SUBJECTS: dict[str, Callable[..., Subject]] = {
+    "lightmap": lambda folder: lightmap((4, 3, 2, 1), folder),
+    "lightmap of video": lambda folder: lightmap((5, 3, 5, 0), folder, gelu="exact", period=None, hidden=10),
+    **{f"atlas {kind}": lambda folder, kind=kind: atlas(kind, folder) for kind in (*KINDS, MIXED)},
+    "scene": scene,
+    **{f"smoke {layout}": lambda folder, layout=layout: smoke(layout, folder) for layout in LAYOUTS},
+    "volume": volume,
+    "probes": probes,
+}
+
+
+def as_texture(values: np.ndarray) -> np.ndarray:
+    """A buffer in rows of 1,024."""
+    return np.pad(values, (0, -len(values) % 1024)).reshape(-1, 1024, 1)
+
+
+def shown(subject: Subject, language: str, exact: bool, folder) -> np.ndarray:
+    defined = [subject.exact] if exact and subject.exact else []
+    size, text = subject.expected.shape[:2], subject.text + subject.main
+    if language.startswith("glsl"):
+        bound, uniforms = {}, {}
+        for name, values in subject.bound.items():
+            if values.ndim == 1:
+                kind = values if values.dtype == np.float32 else values.view(np.uint32)
+                bound["u_" + name.split("_")[-1]] = as_texture(kind)
+            elif values.ndim == 2:
+                uniforms[name] = [tuple(row[:3].tolist()) for row in values]
+            else:
+                bound[name] = values
+        head = "".join(f"#define {name}\n" for name in defined) + subject.as_textures
+        return run_glsl(head + text, "light = shown(pixel);", size, bound, language, uniforms, subject.version)
+    text = translate(text, language, defined)
+    if language == "msl":
+        return run_metal(text, "shown(pixel)", size, subject.bound, folder)
+    if language == "wgsl":
+        return run_wgsl(text, "shown(pixel)", size, subject.bound)
+    return run_hlsl(text, "shown(pixel)", size, subject.bound, folder)
+
+
+@pytest.mark.parametrize("language", [*HEADS, "hlsl", "wgsl"])
+@pytest.mark.parametrize("name", SUBJECTS)
+def test_every_shader_shows_what_python_decodes(name, language, tmp_path):
+    subject = SUBJECTS[name](tmp_path)
+    channels = subject.expected.shape[-1]
+    found = shown(subject, language, True, tmp_path)[..., :channels]
+    np.testing.assert_allclose(found, subject.expected, rtol=0, atol=subject.tolerance)
+    # WebGPU filters no 32-bit floats, and its core has no 16-bit levels: a table of coordinates is fetched there.
+    if subject.filtered is not None and (name != "atlas cascade" or language.startswith("glsl")):
+        found = shown(subject, language, False, tmp_path)[..., :channels]
+        np.testing.assert_allclose(found, subject.expected, rtol=0, atol=subject.filtered)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "name", ["lightmap", "atlas cascade", "atlas tiles mixed", "scene", "smoke unity", "volume", "probes"]
+)
+def test_metal_as_the_cpp_that_it_is(name, tmp_path):
+    subject = SUBJECTS[name](tmp_path)
+    channels = subject.expected.shape[-1]
+    found = shown(subject, "msl", False, tmp_path)[..., :channels]
+    # Filters mix in floats here.
+    np.testing.assert_allclose(found, subject.expected, rtol=0, atol=subject.tolerance)
+
+
+def test_what_is_no_shader_of_ours():
+    with pytest.raises(WlmError, match="shader: expected one of glsl, .* got 'cg'"):
+        translate("", "cg")
+    for text, words in (
+        ("#pragma once\n", "expected ifdef"),
+        ("mat4 f() { return x; }", "expected"),
+        ("float f() { return 1.0 $ 2.0; }", "expected a word"),
+        ("float f() { return ; ", "expected"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            translate(text, "wgsl")
+    assert set(LANGUAGES) == {*HEADS, "hlsl", "msl", "wgsl"}

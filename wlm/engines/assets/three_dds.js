@@ -1,0 +1,41 @@
+// A texture, or an array of them, of a DDS file with the DX10 header.
+async function readDds(url, THREE, array = false) {
+  const answer = await fetch(url);
+  if (!answer.ok) throw new Error(`${url}: ${answer.status}`);
+  const bytes = await answer.arrayBuffer(), head = new DataView(bytes, 0, 148);
+  const height = head.getUint32(12, true), width = head.getUint32(16, true);
+  const format = head.getUint32(128, true), layers = head.getUint32(140, true);
+  const levels = (Kind) => new Kind(bytes, 148);
+  const plain = (data, kind, type) => array
+    ? Object.assign(new THREE.DataArrayTexture(data, width, height, layers), {format: kind, type})
+    : new THREE.DataTexture(data, width, height, kind, type);
+  let texture, filter = THREE.LinearFilter;
+  if (format === 98 || format === 95) {
+    const kind = format === 98 ? THREE.RGBA_BPTC_Format : THREE.RGB_BPTC_UNSIGNED_Format;
+    const mipmaps = [{data: levels(Uint8Array), width, height}];
+    texture = array ? new THREE.CompressedArrayTexture(mipmaps, width, height, layers, kind)
+      : new THREE.CompressedTexture(mipmaps, width, height, kind);
+  } else if (format === 61) texture = plain(levels(Uint8Array), THREE.RedFormat, THREE.UnsignedByteType);
+  else if (format === 49) texture = plain(levels(Uint8Array), THREE.RGFormat, THREE.UnsignedByteType);
+  else if (format === 10) texture = plain(levels(Uint16Array), THREE.RGBAFormat, THREE.HalfFloatType);
+  else if (format === 67) texture = plain(levels(Uint32Array), THREE.RGBFormat, THREE.UnsignedInt5999Type);
+  else if (format === 36) {
+    texture = plain(levels(Uint16Array), THREE.RGIntegerFormat, THREE.UnsignedShortType);
+    filter = THREE.NearestFilter;
+  } else if (format === 35) {
+    texture = plain(Float32Array.from(levels(Uint16Array), (v) => v / 65535), THREE.RGFormat, THREE.FloatType);
+  } else if (format === 24) {
+    // Ten bits of three channels; three.js has no such type, and half floats hold 1,024 levels to a quarter of one.
+    const words = levels(Uint32Array), halves = new Uint16Array(4 * words.length);
+    const half = Uint16Array.from({length: 1024}, (_, v) => THREE.DataUtils.toHalfFloat(v / 1023));
+    words.forEach((word, i) => halves.set([half[word & 1023], half[word >> 10 & 1023], half[word >> 20 & 1023], 0], 4 * i));
+    texture = plain(halves, THREE.RGBAFormat, THREE.HalfFloatType);
+  } else throw new Error(`${url}: DXGI format ${format}`);
+  texture.minFilter = texture.magFilter = filter;
+  texture.generateMipmaps = false;
+  texture.colorSpace = THREE.NoColorSpace;
+  texture.flipY = false;
+  texture.unpackAlignment = 1;
+  texture.needsUpdate = true;
+  return texture;
+}

@@ -1,0 +1,54 @@
+// A surface under a compressed lightmap, for the built-in pipeline and URP: albedo times the light.
+Shader "Wlm/Atlas"
+{
+    Properties
+    {
+        _MainTex ("Albedo", 2D) = "white" {}
+        _Color ("Colour", Color) = (1, 1, 1, 1)
+        [Toggle(WLM_FIRST_UV)] _First ("Light at the first UVs", Float) = 0
+    }
+    SubShader
+    {
+        Tags { "RenderType" = "Opaque" }
+        Pass
+        {
+            HLSLPROGRAM
+            #pragma target 4.5
+            #pragma vertex vert
+            #pragma fragment frag
+            #pragma shader_feature WLM_FIRST_UV
+            #include "UnityCG.cginc"
+            #include "WlmAtlas.hlsl"
+
+            sampler2D _MainTex;
+            float4 _MainTex_ST, _Color;
+
+            struct Varying
+            {
+                float4 position : SV_Position;
+                float2 uv : TEXCOORD0;
+                float2 place : TEXCOORD1;
+            };
+
+            Varying vert(float4 position : POSITION, float2 first : TEXCOORD0, float2 second : TEXCOORD1)
+            {
+                Varying made;
+                made.position = UnityObjectToClipPos(position);
+                made.uv = TRANSFORM_TEX(first, _MainTex);
+            #ifdef WLM_FIRST_UV
+                made.place = first;
+            #else
+                made.place = second;
+            #endif
+                return made;
+            }
+
+            float4 frag(Varying at) : SV_Target
+            {
+                float4 albedo = tex2D(_MainTex, at.uv) * _Color;
+                return float4(albedo.rgb * wlm_atlas(at.place), albedo.a);
+            }
+            ENDHLSL
+        }
+    }
+}

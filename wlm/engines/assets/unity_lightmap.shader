@@ -1,0 +1,44 @@
+// Passes of WlmLightmap.cs: decode, fill the gaps, mix two hours.
+Shader "Hidden/Wlm/Lightmap"
+{
+    SubShader
+    {
+        Cull Off ZWrite Off ZTest Always
+        HLSLINCLUDE
+        #pragma target 4.5
+        #pragma vertex vert
+        #pragma fragment frag
+        #include "WlmLightmap.hlsl"
+
+        Texture2D<float4> _WlmMap, _WlmEarly, _WlmLate;
+        float _WlmShare;
+
+        float4 vert(uint id : SV_VertexID) : SV_Position
+        {
+            return float4(float2(id & 1, id >> 1) * 4.0 - 1.0, 0.0, 1.0);
+        }
+        ENDHLSL
+        Pass
+        {
+            HLSLPROGRAM
+            float4 frag(float4 at : SV_Position) : SV_Target { return float4(wlm_radiance(int2(at.xy)), 1.0); }
+            ENDHLSL
+        }
+        Pass
+        {
+            HLSLPROGRAM
+            float4 frag(float4 at : SV_Position) : SV_Target { return _WlmMap.Load(int3(wlm_source(int2(at.xy)), 0)); }
+            ENDHLSL
+        }
+        Pass
+        {
+            HLSLPROGRAM
+            float4 frag(float4 at : SV_Position) : SV_Target
+            {
+                int3 texel = int3(at.xy, 0);
+                return lerp(_WlmEarly.Load(texel), _WlmLate.Load(texel), _WlmShare);
+            }
+            ENDHLSL
+        }
+    }
+}

@@ -1,0 +1,43 @@
+"""What the folders for engines have in common."""
+
+import re
+from importlib import resources
+
+ENGINES = ("three", "godot", "unity", "unreal")
+"""Engines that folders are made for."""
+
+README_FILE = "README.md"
+
+_MARK = re.compile(r"@(\w+)@")
+_SAMPLER = re.compile(
+    r"#ifndef (\w+)\n#ifndef \1_BINDING\nuniform (\w+) (\w+);\n#else\n.*\n#endif\n#define \1 \3\n#endif\n"
+)
+
+
+def filled(asset: str, **parts: str) -> str:
+    """A file of `assets`, with what its marks, `@NAME@`, stand for.
+
+    Raises:
+        KeyError: A mark that isn't given.
+    """
+    text = (resources.files("wlm.engines") / "assets" / asset).read_text(encoding="utf-8")
+    return _MARK.sub(lambda match: parts[match[1]].rstrip("\n"), text)
+
+
+def godot_uniforms(text: str) -> str:
+    """Our GLSL as Godot's shading language has it: textures with hints, and none of whole numbers.
+
+    Of a table of whole numbers Godot has floats, which hold them exactly.
+    """
+    hints = "filter_linear, repeat_disable"
+    whole = [match[1] for match in _SAMPLER.finditer(text) if match[2] == "usampler2D"]
+
+    def declared(match: re.Match[str]) -> str:
+        hint = "filter_nearest, repeat_disable" if match[1] in whole else hints
+        kind = match[2].removeprefix("u")
+        return f"uniform {kind} {match[3]} : {hint};\n#define {match[1]} {match[3]}\n"
+
+    text = _SAMPLER.sub(declared, text)
+    for name in whole:
+        text = re.sub(rf"(texelFetch\({name}, [^;]*?, 0\)\.\w+)", r"uvec2(\1)", text)
+    return text

@@ -1,0 +1,121 @@
+"""A lightmap over the day for an engine: its decoder in the engine's own languages, and what it reads."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from wlm.engines.kit import ENGINES, README_FILE, filled
+from wlm.errors import WlmError
+from wlm.formats.dds import write_dds
+from wlm.formats.folder import make_parents, staged
+from wlm.lightmap import exporter, packed
+from wlm.lightmap.layers.model import LayeredModel
+from wlm.lightmap.model import LightmapModel
+from wlm.lightmap.shader import decode_glsl, texture_names
+from wlm.shading import translate
+
+FORMAT = "wlm-lightmap-engine"
+MASK_FILE = "valid.dds"
+
+
+def export_lightmap(model: LightmapModel | LayeredModel, directory: str | os.PathLike[str], engine: str) -> list[Path]:
+    """Writes a model for an engine: textures, floats, a component that decodes them, and a page about it.
+
+    Args:
+        model: The model, without layers.
+        directory: The folder; made if it isn't there. A new export replaces an earlier one.
+        engine: One of `wlm.engines.ENGINES`.
+
+    Returns:
+        The files written, `weights.json` last.
+
+    Raises:
+        WlmError: No such engine, a model with layers, or as `wlm.lightmap.export`.
+    """
+    if engine not in ENGINES:
+        raise WlmError(f"engine: expected one of {', '.join(ENGINES)}, got {engine!r}")
+    if isinstance(model, LayeredModel):
+        raise WlmError(f"{model.name}: cannot export for {engine}: expected one light, found layers; export it raw")
+    folder = Path(directory)
+    make_parents(folder)
+    with staged(folder, exporter.WEIGHTS_FILE, FORMAT, _is_exported) as staging:
+        parts = exporter.write_parts(model, staging, form=FORMAT)
+        (staging / exporter.VALID_FILE).unlink()
+        height, width = model.mask.shape
+        mask = model.mask.astype(np.uint8) * 255
+        write_dds(staging / MASK_FILE, mask.tobytes(), width, height, fmt="R8_UNORM")
+        parts = [MASK_FILE if name == exporter.VALID_FILE else name for name in parts]
+        if engine == "unity":
+            # Unity reads files of bytes under this ending alone.
+            for name in parts[:-1]:
+                (staging / name).rename(staging / _of_unity(name))
+            parts = [*map(_of_unity, parts[:-1]), parts[-1]]
+        texts = _TEXTS[engine](model)
+        for name, text in texts.items():
+            (staging / name).write_bytes(text.encode())
+    return [folder / name for name in (*texts, *parts)]
+
+
+def _of_unity(name: str) -> str:
+    return Path(name).with_suffix(".bytes").name
+
+
+def _three(model: LightmapModel) -> dict[str, str]:
+    script = filled("three_lightmap.js", DDS=filled("three_dds.js"), TABLE=packed.table_script())
+    return {
+        "lightmap.js": script,
+        exporter.SHADER_STEM + ".glsl": decode_glsl(model),
+        README_FILE: filled("three_lightmap.md", NAME=model.name),
+    }
+
+
+def _godot(model: LightmapModel) -> dict[str, str]:
+    names = texture_names(model)
+    bindings = "".join(f"#define WLM_LIGHTMAP_{name.upper()}_BINDING {i}\n" for i, name in enumerate(names))
+    shader = bindings + decode_glsl(model)
+    listed = ", ".join(f'"{name}"' for name in names)
+    return {
+        "lightmap.glsl": filled("godot_lightmap.glsl", SHADER=shader),
+        "wlm_lightmap.gd": filled("godot_lightmap.gd", NAMES=listed),
+        "lit.gdshader": filled("godot_lit.gdshader"),
+        README_FILE: filled("godot_lightmap.md", NAME=model.name),
+    }
+
+
+def _unity(model: LightmapModel) -> dict[str, str]:
+    return {
+        "WlmLightmap.hlsl": translate(decode_glsl(model), "hlsl"),
+        "WlmLightmap.shader": filled("unity_lightmap.shader"),
+        "WlmLightmap.cs": filled("unity_lightmap.cs", DDS=filled("unity_dds.cs")),
+        README_FILE: filled("unity_lightmap.md", NAME=model.name),
+    }
+
+
+def _unreal(model: LightmapModel) -> dict[str, str]:
+    shader = translate(decode_glsl(model), "hlsl")
+    return {
+        "WlmLightmap.usf": filled(
+            "unreal_lightmap.usf", SHADER=shader, WIDTH=str(model.width), HEIGHT=str(model.height)
+        ),
+        README_FILE: filled("unreal_lightmap.md", NAME=model.name),
+    }
+
+
+_TEXTS: dict[str, Callable[[LightmapModel], dict[str, str]]] = {
+    "three": _three,
+    "godot": _godot,
+    "unity": _unity,
+    "unreal": _unreal,
+}
+_ENDINGS = (".hlsl", ".shader", ".cs", ".usf", ".gd", ".gdshader", ".js", ".glsl")
+_STEMS = {"lightmap", "lit", "wlm_lightmap", "WlmLightmap"}
+_BYTES = {f"{name}.bytes" for name in ("uv", "uvt", "planes", "frames", "video", "networks", "hours", "valid")}
+
+
+def _is_exported(name: str) -> bool:
+    """Whether a file's name is one that an export for an engine may have."""
+    path = Path(name)
+    ours = path.stem in _STEMS and path.suffix in _ENDINGS
+    return ours or name in (README_FILE, MASK_FILE) or name in _BYTES or exporter.is_exported(name)

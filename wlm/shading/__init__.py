@@ -1,0 +1,6 @@
+"""Shader text: what the systems' GLSL has in common, and the same text in other languages."""
+
+from wlm.shading.samplers import sampler
+from wlm.shading.translation import ENDINGS, LANGUAGES, check_language, translate
+
+__all__ = ["ENDINGS", "LANGUAGES", "check_language", "sampler", "translate"]

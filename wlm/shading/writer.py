@@ -1,0 +1,222 @@
+"""What the languages that our GLSL is written in have in common."""
+
+from wlm.shading.tree import SAMPLERS, SCALARS, VECTORS, Function, Node, Shader, Statement, Variable
+
+_STRENGTH = {
+    mark: strength
+    for strength, marks in enumerate(
+        (("||",), ("&&",), ("|",), ("^",), ("&",), ("==", "!="), ("<", ">", "<=", ">="), ("<<", ">>"), ("+", "-"))
+    )
+    for mark in marks
+} | dict.fromkeys("*/%", 9)
+# Where all readers, WGSL's too, need no brackets round the weaker operator's side.
+_PLAIN = {("+", "*"), ("+", "/"), ("-", "*"), ("-", "/"), ("+", "%"), ("-", "%")}
+_COMPARED = ("<", ">", "<=", ">=", "==", "!=")
+
+
+class Writer:
+    """Writes a shader in a language of C's kind; the languages say what is different.
+
+    Attributes:
+        shader: What is written.
+        linear: Name of the sampler of all textures that are filtered.
+    """
+
+    names: dict[str, str] = {}
+    """Types and functions whose names differ."""
+
+    indent = ""
+    linear = "wlm_linear_clamp_sampler"
+
+    def __init__(self, shader: Shader) -> None:
+        self.shader, self.functions, self.bound = shader, shader.functions, shader.bound
+        self.scope: dict[str, Variable] = {}
+
+    def text(self) -> str:
+        """The whole shader."""
+        lines: list[str] = []
+        for item, blank in self.shader.items:
+            if blank and lines:
+                lines.append("")
+            if isinstance(item, str):
+                lines.append(self.indent + item)
+            elif isinstance(item, Function):
+                lines += [self.indent + line if line else line for line in self.function(item)]
+            else:
+                lines += [self.indent + line for line in self.outer(item)]
+        return "\n".join([*self.head(), *lines, *self.foot()]) + "\n"
+
+    def head(self) -> list[str]:
+        """Lines before all."""
+        return []
+
+    def foot(self) -> list[str]:
+        """Lines behind all."""
+        return []
+
+    def outer(self, variable: Variable) -> list[str]:
+        """A constant, or what is bound."""
+        raise NotImplementedError
+
+    def signature(self, function: Function) -> str:
+        """Its first line."""
+        return f"{self.kind(function.type)} {function.name}({', '.join(map(self.parameter, function.parameters))})"
+
+    def parameter(self, variable: Variable) -> str:
+        """A parameter's declaration."""
+        raise NotImplementedError
+
+    def kind(self, name: str) -> str:
+        """A type's name."""
+        return self.names.get(name, name)
+
+    def function(self, function: Function) -> list[str]:
+        """A function's lines."""
+        self.scope = {each.name: each for each in function.parameters}
+        return [self.signature(function), "{", *self.block(function.body, "    "), "}"]
+
+    def block(self, body: tuple[Statement, ...], indent: str) -> list[str]:
+        """Statements' lines."""
+        lines: list[str] = []
+        for statement in body:
+            if statement.blank and lines:
+                lines.append("")
+            lines += [indent + line for line in self.statement(statement)]
+        return lines
+
+    def statement(self, statement: Statement) -> list[str]:
+        """A statement's lines."""
+        tail = f" {statement.tail}" if statement.tail else ""
+        if statement.kind == "comment":
+            return [statement.text]
+        if statement.kind == "block":
+            return ["{", *self.block(statement.bodies[0], "    "), "}"]
+        if statement.kind == "declare":
+            assert statement.variable is not None
+            return [f"{self.local(statement.variable)};{tail}"]
+        if statement.kind == "expression":
+            return [f"{self.write(statement.parts[0])};{tail}"]
+        if statement.kind == "return":
+            return [f"return{''.join(' ' + self.write(part) for part in statement.parts)};{tail}"]
+        if statement.kind == "if":
+            lines = [f"if ({self.write(statement.parts[0])}) {{", *self.block(statement.bodies[0], "    ")]
+            if len(statement.bodies) == 2:
+                lines += ["} else {", *self.block(statement.bodies[1], "    ")]
+            return [*lines, "}"]
+        assert statement.variable is not None
+        condition, step = map(self.write, statement.parts)
+        head = f"for ({self.local(statement.variable)}; {condition}; {step}) {{"
+        return [head, *self.block(statement.bodies[0], "    "), "}"]
+
+    def local(self, variable: Variable) -> str:
+        """A declaration within a function."""
+        size = "" if variable.size is None else f"[{self.write(variable.size)}]"
+        value = "" if variable.value is None else f" = {self.write(variable.value)}"
+        return f"{self.kind(variable.type)} {variable.name}{size}{value}"
+
+    def write(self, node: Node) -> str:
+        """An expression."""
+        if node.kind in ("number", "name"):
+            return self.plain(node)
+        if node.kind == "call":
+            return self.call(node)
+        if node.kind == "member":
+            return f"{self.inside(node.parts[0])}.{node.text}"
+        if node.kind == "index":
+            return f"{self.inside(node.parts[0])}[{self.write(node.parts[1])}]"
+        if node.kind == "unary":
+            return node.text + self.inside(node.parts[0])
+        if node.kind == "step":
+            return f"{self.inside(node.parts[0])}{node.text}"
+        if node.kind == "assign":
+            return f"{self.write(node.parts[0])} {node.text} {self.write(node.parts[1])}"
+        if node.kind == "choice":
+            return " ".join(
+                [self.inside(node.parts[0]), "?", self.inside(node.parts[1]), ":", self.inside(node.parts[2])]
+            )
+        left, right = node.parts
+        return f"{self.side(node.text, left)} {node.text} {self.side(node.text, right, right=True)}"
+
+    def plain(self, node: Node) -> str:
+        """A name or a number."""
+        return node.text
+
+    def inside(self, node: Node) -> str:
+        """An expression as a part of a stronger one."""
+        text = self.write(node)
+        return f"({text})" if node.kind in ("binary", "choice", "assign", "unary", "step") else text
+
+    def side(self, mark: str, node: Node, right: bool = False) -> str:
+        """A side of an operator, in brackets where it needs them or is hard to read without."""
+        if node.kind != "binary":
+            return f"({self.write(node)})" if node.kind in ("choice", "assign") else self.write(node)
+        inner = node.text
+        alike = _STRENGTH[inner] == _STRENGTH[mark] and not right and mark not in ("<<", ">>", *_COMPARED)
+        compared = mark in _COMPARED and _STRENGTH[inner] >= _STRENGTH["+"]
+        joined = mark in ("&&", "||") and inner in _COMPARED
+        if alike or compared or joined or (mark, inner) in _PLAIN:
+            return self.write(node)
+        return f"({self.write(node)})"
+
+    def call(self, node: Node) -> str:
+        """A call, a texture's read or a constructor."""
+        arguments = node.parts
+        name = node.text
+        if name in ("texelFetch", "textureLod"):
+            texture = self.bound[arguments[0].text]
+            read = self.fetch if name == "texelFetch" else self.filtered
+            return read(texture, arguments[1])
+        if name == "textureGrad":
+            return self.graded(self.bound[arguments[0].text], *(self.write(each) for each in arguments[1:]))
+        if name == "textureSize":
+            return self.size(self.bound[arguments[0].text])
+        if name in VECTORS or name in SCALARS:
+            return self.make(name, [self.write(each) for each in arguments])
+        return f"{self.names.get(name, name)}({', '.join(self.arguments(name, arguments))})"
+
+    def arguments(self, name: str, arguments: tuple[Node, ...]) -> list[str]:
+        """A call's arguments."""
+        return [self.write(each) for each in arguments]
+
+    def make(self, name: str, values: list[str]) -> str:
+        """A vector, or a number of another type."""
+        return f"{self.kind(name)}({', '.join(values)})"
+
+    def fetch(self, texture: Variable, place: Node) -> str:
+        """A texel."""
+        raise NotImplementedError
+
+    def filtered(self, texture: Variable, place: Node) -> str:
+        """Several, mixed."""
+        raise NotImplementedError
+
+    def graded(self, texture: Variable, place: str, dx: str, dy: str) -> str:
+        """Several, mixed, of the levels that a pixel of these changes of the place asks for."""
+        raise NotImplementedError
+
+    def size(self, texture: Variable) -> str:
+        """Texels of a texture, two whole numbers."""
+        raise NotImplementedError
+
+    @property
+    def textures(self) -> list[Variable]:
+        """The textures."""
+        return [each for each in self.bound.values() if each.type in SAMPLERS]
+
+    @property
+    def filters(self) -> bool:
+        """Whether a texture is read through a filter."""
+
+        def reads(node: Node) -> bool:
+            called = node.kind == "call" and node.text in ("textureLod", "textureGrad")
+            return called or any(map(reads, node.parts))
+
+        def among(body: tuple[Statement, ...]) -> bool:
+            return any(
+                any(map(reads, each.parts))
+                or (each.variable is not None and each.variable.value is not None and reads(each.variable.value))
+                or any(map(among, each.bodies))
+                for each in body
+            )
+
+        return any(among(each.body) for each in self.functions.values())
