@@ -1,6 +1,7 @@
 """What a single file holds, told by its content and, where that doesn't tell, by its name."""
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -121,11 +122,9 @@ def _mesh(path: Path) -> Finding:
         mesh = read_geometry(path, with_uv=False)
         parts, sets, uvs = 1, "", []
         count = len(mesh.triangle)
-        try:
+        with suppress(WlmError):
             whole = read_geometry(path)
             sets, uvs = "UVs", [whole.uv[whole.triangle]]
-        except WlmError:
-            pass
     else:
         primitives = read_gltf(path)[1]
         count, parts = sum(len(each.triangle) for each in primitives), len({each.mesh for each in primitives})
