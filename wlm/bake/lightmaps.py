@@ -110,7 +110,7 @@ def bake_lightmaps(
         gathered = irradiance(
             now.scene,
             texels,
-            sun=now.sun,
+            outside=now.outside,
             sun_direct=scene.sun_direct,
             samples=scene.samples,
             bounces=scene.bounces,

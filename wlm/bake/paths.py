@@ -18,8 +18,9 @@ import numpy as np
 SUN_ANGLE = math.radians(0.5358 / 2.0)
 """Radius of the sun's disc in the sky."""
 
-# Steps of an additive sequence in three dimensions: powers of the root of x^4 = x + 1, of 2^32.
-_STEPS = tuple(int(2**32 / 1.2207440846057596**n) for n in (1, 2, 3))
+# Steps of the samples' second and third number, of 2^32: the golden ratio and the square root of 2. The first goes
+# through the samples in order: with the second a Fibonacci lattice.
+_GOLDEN, _ROOT = int(2**32 * (math.sqrt(5.0) - 1.0) / 2.0), int(2**32 * (math.sqrt(2.0) - 1.0))
 _PARTS = 8  # that samples are divided into, whose spread tells the noise
 _LANES = 1 << 20  # paths at once
 _RANDOM_BOUNCE = 3  # from which on a path ends at random
@@ -39,6 +40,19 @@ class Sun:
     irradiance: tuple[float, float, float]
 
 
+@dataclass(frozen=True)
+class Outside:
+    """Light from outside that isn't in Mitsuba's scene: it needs no choice between lights.
+
+    Attributes:
+        sun: None: none, or below the horizon.
+        ambient: Radiance from all directions where nothing is hit, R, G, B.
+    """
+
+    sun: Sun | None = None
+    ambient: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
 @dataclass(frozen=True, eq=False)
 class Gathered:
     """What arrives at N places.
@@ -55,13 +69,16 @@ class Gathered:
     back: np.ndarray
 
 
-class _Sky:
-    """The sun in Mitsuba's numbers; of these the kernels don't depend, so that all hours share them."""
+class _Outside:
+    """The sun and the ambient light in Mitsuba's numbers; kernels don't depend on them, so that hours share these."""
 
-    def __init__(self, sun: Sun) -> None:
+    def __init__(self, outside: Outside) -> None:
+        self.ambient = mi.Color3f(*outside.ambient)
+        self.has_sun = outside.sun is not None
+        sun = outside.sun or Sun((0.0, 1.0, 0.0), (0.0, 0.0, 0.0))
         self.frame = mi.Frame3f(mi.Vector3f(*sun.direction))
         self.irradiance = mi.Color3f(*sun.irradiance)
-        dr.make_opaque(self.frame, self.irradiance)
+        dr.make_opaque(self.frame, self.irradiance, self.ambient)
 
     def sample(self, rng: mi.PCG32) -> mi.Vector3f:
         """A direction to a point of the disc."""
@@ -73,7 +90,7 @@ def irradiance(
     scene: Any,
     texels: Any,
     *,
-    sun: Sun | None,
+    outside: Outside,
     sun_direct: bool,
     samples: int,
     bounces: int,
@@ -85,8 +102,8 @@ def irradiance(
     Args:
         scene: Of Mitsuba.
         texels: `wlm.bake.texels.Texels`, T of them.
-        sun: None: it is below the horizon, or there is none.
-        sun_direct: Whether its direct light counts.
+        outside: The sun and the ambient light.
+        sun_direct: Whether the sun's direct light counts.
         samples: Paths a texel, rounded up to a multiple of 8.
         bounces: Surfaces that reflect light on its way.
         seed: Of the random numbers.
@@ -98,7 +115,7 @@ def irradiance(
     places = [mi.Point3f(texels.position.T), mi.Vector3f(texels.normal.T), mi.Vector3f(texels.face.T)]
     first = mi.UInt32(texels.first[:-1].astype(np.uint32))
     count = mi.UInt32(np.diff(texels.first).astype(np.uint32))
-    sky = None if sun is None else _Sky(sun)
+    sky = _Outside(outside)
 
     def one(number: mi.UInt32, at: tuple, rng: mi.PCG32) -> tuple[list, mi.Float]:
         held = dr.gather(mi.UInt32, count, number)
@@ -116,7 +133,7 @@ def irradiance(
         ahead = (cosine > 0) & (dr.dot(ds.d, face) > 0)
         pdf = dr.select(ds.delta, 0.0, cosine * dr.inv_pi)
         total += dr.select(ahead, weight * cosine * _heuristic(ds.pdf, pdf), 0.0)
-        if sky is not None and sun_direct:
+        if sky.has_sun and sun_direct:
             toward = sky.sample(rng)
             cosine = dr.dot(toward, normal)
             ahead = (cosine > 0) & (dr.dot(toward, face) > 0)
@@ -131,7 +148,7 @@ def harmonics(
     scene: Any,
     position: np.ndarray,
     *,
-    sun: Sun | None,
+    outside: Outside,
     sun_direct: bool,
     samples: int,
     bounces: int,
@@ -143,13 +160,13 @@ def harmonics(
     Args:
         scene: Of Mitsuba.
         position: float [N, 3].
-        sun, sun_direct, samples, bounces, seed, report: As for `irradiance`.
+        outside, sun_direct, samples, bounces, seed, report: As for `irradiance`.
 
     Returns:
         Of 27 numbers, the coefficients with red, green and blue of each.
     """
     place = mi.Point3f(np.asarray(position, np.float32).T)
-    sky = None if sun is None else _Sky(sun)
+    sky = _Outside(outside)
 
     def one(number: mi.UInt32, at: tuple, rng: mi.PCG32) -> tuple[list, mi.Float]:
         it = _interaction(dr.gather(mi.Point3f, place, number), mi.Vector3f(0.0))
@@ -159,7 +176,7 @@ def harmonics(
         ds, weight = scene.sample_emitter_direction(it, mi.Point2f(rng.next_float32(), rng.next_float32()), True)
         pdf = dr.select(ds.delta, 0.0, mi.Float(dr.inv_four_pi))
         parts.append((weight * _heuristic(ds.pdf, pdf), ds.d))
-        if sky is not None and sun_direct:
+        if sky.has_sun and sun_direct:
             toward = sky.sample(rng)
             lit = ~scene.ray_test(it.spawn_ray(toward))
             parts.append((dr.select(lit, sky.irradiance, 0.0), toward))
@@ -178,23 +195,26 @@ def harmonics(
 def _gather(one: Any, count: int, channels: int, samples: int, seed: int, report: Any) -> Gathered:
     """Means over samples in parts, and what the parts' spread says of the noise."""
     each = -(-samples // _PARTS)
-    step = max(1, _LANES // each)
+    at_once = max(1, _LANES // each)
     total, square = np.zeros((2, count, channels))
     back = np.zeros(count)
     keys = np.random.SeedSequence(seed)
     for part in range(_PARTS):
         key = int(keys.spawn(1)[0].generate_state(1, np.uint64)[0])
-        for begin in range(0, count, step):
+        for begin in range(0, count, at_once):
             # A multiple of what fits, so that all but the last share a kernel's size.
-            length = min(step, count - begin)
+            length = min(at_once, count - begin)
             lane = dr.arange(mi.UInt32, length * each)
             number, sample = lane // each, lane % each
             number += dr.opaque(mi.UInt32, begin)
-            rng = mi.PCG32(size=length * each, initstate=dr.opaque(mi.UInt64, key), initseq=number * each + sample)
-            shift = mi.PCG32(size=length * each, initstate=dr.opaque(mi.UInt64, key ^ 1), initseq=number)
+            # It adds each lane's number to the first one's.
+            rng = mi.PCG32(length * each, dr.opaque(mi.UInt64, key), dr.opaque(mi.UInt64, begin * each))
+            shift = mi.sample_tea_32(number, dr.opaque(mi.UInt32, key & 0xFFFFFFFF), 8)
+            third = mi.sample_tea_32(number, dr.opaque(mi.UInt32, key >> 32), 8)[0]
             # Next to 1 it would be the square's edge, from which directions can't be told.
             at = tuple(
-                dr.minimum(mi.Float((shift.next_uint32() + sample * s) >> 8) * 2.0**-24, 1.0 - 2.0**-24) for s in _STEPS
+                dr.minimum(mi.Float((start + sample * step) >> 8) * 2.0**-24, 1.0 - 2.0**-24)
+                for start, step in zip((*shift, third), (2**32 // each, _GOLDEN, _ROOT), strict=True)
             )
             values, hidden = one(number, at, rng)
             sums = [dr.block_sum(value, each) for value in (*values, hidden)]
@@ -215,7 +235,7 @@ def _radiance(
     start: mi.Interaction3f,
     direction: mi.Vector3f,
     pdf: mi.Float,
-    sky: _Sky | None,
+    sky: _Outside,
     rng: mi.PCG32,
     bounces: int,
     active: mi.Bool,
@@ -230,6 +250,7 @@ def _radiance(
         ds = mi.DirectionSample3f(scene, si, before)
         chance = dr.select(emitter != None, scene.pdf_emitter_direction(before, ds, active), 0.0)  # noqa: E711
         light = light + dr.select(active, share * emitter.eval(si, active) * _heuristic(pdf, chance), 0.0)
+        light += dr.select(active & ~si.is_valid(), share * sky.ambient, 0.0)
         bsdf = si.bsdf(ray)
         two_sided = mi.has_flag(bsdf.flags(), mi.BSDFFlags.BackSide)
         back |= active & (depth == 0) & si.is_valid() & (si.wi.z < 0) & ~two_sided
@@ -241,7 +262,7 @@ def _radiance(
         value, chance = bsdf.eval_pdf(context, si, si.to_local(ds.d), active)
         chance = dr.select(ds.delta, 0.0, chance)
         light += dr.select(active & (ds.pdf > 0), share * value * weight * _heuristic(ds.pdf, chance), 0.0)
-        if sky is not None:
+        if sky.has_sun:
             toward = sky.sample(rng)
             value = bsdf.eval(context, si, si.to_local(toward), active)
             lit = active & (dr.max(value) > 0)

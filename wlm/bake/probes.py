@@ -115,7 +115,7 @@ def bake_probes(
         gathered = harmonics(
             now.scene,
             position,
-            sun=now.sun,
+            outside=now.outside,
             sun_direct=scene.sun_direct,
             samples=scene.samples,
             bounces=scene.bounces,

@@ -11,7 +11,7 @@ import numpy as np
 
 from wlm.bake.daylight import sun_direction
 from wlm.bake.geometry import Geometry, Surface
-from wlm.bake.paths import SUN_ANGLE, Sun
+from wlm.bake.paths import SUN_ANGLE, Outside, Sun
 from wlm.bake.settings import BakeScene, Daylight
 from wlm.errors import WlmError
 
@@ -25,12 +25,12 @@ class Hour:
     """What lights a scene at an hour.
 
     Attributes:
-        scene: Of Mitsuba, with all lights but the sun.
-        sun: None: none, or below the horizon.
+        scene: Of Mitsuba, with all other lights.
+        outside: The sun, and light that is the same from all around.
     """
 
     scene: Any
-    sun: Sun | None
+    outside: Outside
 
 
 def check_lamps(path: Path, scene: BakeScene, geometry: Geometry) -> None:
@@ -63,18 +63,17 @@ def make_hour(scene: BakeScene, geometry: Geometry, picture: np.ndarray | None, 
         if lamp.position is not None and lamp.is_lit(hour):
             colour = {"type": "rgb", "value": list(lamp.intensity)}
             content[f"lamp{i}"] = {"type": "point", "position": list(lamp.position), "intensity": colour}
-    sun, sky = None, None
+    sun, sky, ambient = None, None, (0.0, 0.0, 0.0)
     if scene.daylight is not None:
         sun, sky = daylight(scene.daylight, hour, scene.period or _DAY)
+        ambient = scene.daylight.night
+    elif scene.sky is not None and picture is not None:
+        sky = picture * np.array(scene.sky.radiance, np.float32)
     elif scene.sky is not None:
-        colour = np.array(scene.sky.radiance, np.float32)
-        sky = picture * colour if picture is not None else np.broadcast_to(colour, (2, 4, 3))
+        ambient = scene.sky.radiance
     if sky is not None and sky.any():
-        if (sky == sky[:1, :1]).all():
-            content["sky"] = {"type": "constant", "radiance": {"type": "rgb", "value": sky[0, 0].tolist()}}
-        else:
-            content["sky"] = {"type": "envmap", "bitmap": mi.Bitmap(np.ascontiguousarray(sky, np.float32))}
-    return Hour(mi.load_dict(content), sun)
+        content["sky"] = {"type": "envmap", "bitmap": mi.Bitmap(np.ascontiguousarray(sky, np.float32))}
+    return Hour(mi.load_dict(content), Outside(sun, ambient))
 
 
 def daylight(settings: Daylight, hour: float, period: float) -> tuple[Sun | None, np.ndarray]:
@@ -112,7 +111,7 @@ def daylight(settings: Daylight, hour: float, period: float) -> tuple[Sun | None
         mean = np.maximum(_eval(common | {"sky_scale": 0.0}, disc), 0.0).mean(0)
         solid = 2.0 * math.pi * (1.0 - math.cos(SUN_ANGLE))
         sun = Sun(tuple(toward.tolist()), tuple((mean.astype(float) * solid * settings.scale).tolist()))
-    return sun, sky + np.array(settings.night, np.float32)
+    return sun, sky
 
 
 def _eval(emitter: dict[str, Any], directions: np.ndarray) -> np.ndarray:
