@@ -98,7 +98,22 @@ def each_hour(
         make: Makes an hour's, and calls its second argument with the share that is done.
         progress: Called from time to time.
     """
-    meter = Meter(progress, "bake", _REPORTS * len(hours))
+    try:
+        return _hours(hours, checkpoint, table, make, Meter(progress, "bake", _REPORTS * len(hours)))
+    except KeyboardInterrupt:
+        if checkpoint is not None:
+            # Hours that come fast aren't written one by one.
+            checkpoint.flush()
+        raise
+
+
+def _hours(
+    hours: Sequence[float],
+    checkpoint: Checkpoint | None,
+    table: Mapping[str, Part],
+    make: Callable[[float, Callable[[float], None]], dict[str, np.ndarray]],
+    meter: Meter,
+) -> list[dict[str, np.ndarray]]:
     results = []
     for number, hour in enumerate(hours):
         result = None if checkpoint is None else checkpoint.finished(number, table)

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from wlm.formats.light import SUFFIXES
 from wlm.formats.limits import JSON_BYTES
 from wlm.formats.npz import read_npz
 from wlm.formats.reading import open_file, read_json_file
+from wlm.formats.unity_asset import read_lighting_data
 from wlm.inspection.finding import Finding, quoted
 from wlm.inspection.pictures import inspect_picture, picture_of, said
 from wlm.inspection.sets import inspect_set
@@ -21,9 +23,13 @@ from wlm.system import load
 
 _MAGIC = 16
 _VDB = b" BDV\0\0\0\0"
+BAKED = "lightmaps that wlm bake lightmaps made, with their noise and coverage"
+"""What is said of the folder of a bake."""
+
 # What says of itself in JSON that it is ours, and what to do with it.
 _EXPORTS = {
     "wlm-atlas": "a compressed lightmap of a mesh",
+    "wlm-bake": BAKED,
     "wlm-lightmap-export": "lightmaps over time for an engine: textures, weights and a shader",
     "wlm-lightmap-layers-export": "layered lightmaps for an engine: a folder for each sheet",
     "wlm-probe-export": "light probes for an engine: buffers and a shader",
@@ -114,7 +120,10 @@ def _volume(path: Path) -> Finding:
     problems = list(volume.warnings)
     if not bool((volume.density > 0).any()):
         problems.append("no smoke in it")
-    return Finding(path, what, f"wlm smoke bake {quoted(path)} -o DIR", tuple(problems))
+    x, y, z = volume.shape
+    if path.suffix.lower() != ".npz" and z > max(x, y):
+        problems.append("longest along z: if z is up in it, as in Blender and Unreal, add --up z")
+    return Finding(path, what, f"wlm smoke bake {quoted(path)} -o OUT.exr", tuple(problems))
 
 
 def _mesh(path: Path) -> Finding:
@@ -171,14 +180,14 @@ def _json(path: Path) -> Finding:
     return Finding(path, "JSON that is nothing known here")
 
 
-def _vdb(path: Path) -> Finding:
-    return Finding(path, "an OpenVDB volume", problems=("isn't read here: make an .nvdb of it, with nanovdb_convert",))
-
-
 def _unity_asset(path: Path) -> Finding:
-    return Finding(
-        path, "an asset of Unity", problems=("its probes and renderers' rectangles aren't read: export them in Unity",)
-    )
+    """Light probes and rectangles, where it is lighting data; reading it needs an extra."""
+    data = read_lighting_data(path)
+    places = f"{len(data.rectangles)} renderers' rectangles in lightmaps, without their names"
+    if not len(data.position):
+        return Finding(path, f"lighting data of Unity: no light probes, {places}")
+    found = _probes(path)
+    return replace(found, what=f"lighting data of Unity: {found.what}; {places}")
 
 
 _BY_MAGIC: dict[bytes, Callable[[Path], Finding]] = {
@@ -186,7 +195,7 @@ _BY_MAGIC: dict[bytes, Callable[[Path], Finding]] = {
     b"RSCC": _probes,
     b"glTF": _mesh,
     b"NanoVDB": _volume,
-    _VDB: _vdb,
+    _VDB: _volume,
 }
 _BY_SUFFIX: dict[str, Callable[[Path], Finding]] = {
     ".npz": _npz,
@@ -195,7 +204,7 @@ _BY_SUFFIX: dict[str, Callable[[Path], Finding]] = {
     ".gltf": _mesh,
     ".obj": _mesh,
     ".nvdb": _volume,
-    ".vdb": _vdb,
+    ".vdb": _volume,
     ".wlm": _model,
     ".json": _json,
     ".asset": _unity_asset,

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from wlm.errors import WlmError
 from wlm.formats.light import SUFFIXES
-from wlm.inspection.files import document_of, inspect_file
+from wlm.inspection.files import BAKED, document_of, inspect_file
 from wlm.inspection.finding import Finding, quoted
 from wlm.inspection.pictures import picture_of, said
 from wlm.inspection.sets import UNREADABLE, compress_command, inspect_set, named, together
@@ -97,6 +97,8 @@ def _documents(folder: Path, files: Sequence[Path]) -> _Found:
         if file.name == SET_FILE:
             finding = inspect_set(file)
             listed = set() if finding.what == UNREADABLE else {file, *named(file, files)}
+            if any(document_of(each) == BAKED for each in documents):
+                listed = set(files)
             return [(finding, listed | {file})]
         stated = document_of(file)
         if stated is not None:
@@ -213,8 +215,17 @@ def _pictures(folder: Path, files: Sequence[Path]) -> _Found:
     problems, alike = together(pictures, [heads[file] for file in pictures])
     if not alike:
         what = f"{count_of(pictures, 'lightmap')} of different atlases: no times of one"
-        command = "wlm atlas compress MESH.glb LIGHTMAP -o DIR, of each with its mesh"
-        return [(Finding(folder, what, command, tuple(problems)), set(pictures))]
+        command = f"wlm atlas compress MESH.glb {quoted(folder)} -o DIR"
+        meshes = [file for file in files if file.suffix.lower() in (".glb", ".gltf")]
+        if len(meshes) == 1:
+            # The charts tell which lightmap is whose.
+            command, what = command.replace("MESH.glb", quoted(meshes[0])), f"{what}, with {meshes[0].name}"
+        return [
+            (
+                Finding(folder, what, command, tuple(problems)),
+                {*pictures, *meshes} if len(meshes) == 1 else set(pictures),
+            )
+        ]
     option = ""
     if any(time_of_name(file.stem) is None for file in pictures):
         option = " --times ..."
