@@ -5,14 +5,14 @@ import math
 import shutil
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+from builders.bake_rooms import ROOM, quad
 from typer.testing import CliRunner
 
 from wlm.bake.daylight import sun_direction
-from wlm.bake.geometry import Geometry, Material, Surface, read_geometry
+from wlm.bake.geometry import Geometry, read_geometry
 from wlm.bake.lightmaps import BakedLightmaps, bake_lightmaps, write_lightmaps
 from wlm.bake.probes import BakedProbes, place_probes, write_probes
 from wlm.bake.settings import BakeScene, Lamp, LightmapSettings, ProbeSettings, load_scene
@@ -25,18 +25,6 @@ from wlm.formats.parts import Part
 from wlm.inspection import inspect
 from wlm.lightmap import load
 from wlm.probe.data import load as load_probes
-
-ROOM = Path(__file__).resolve().parents[2] / "demos" / "cornell"
-
-
-def quad(corner, along, up, uv=((0, 0), (1, 0), (1, 1), (0, 1)), material=Material()) -> Surface:
-    """A parallelogram whose front is at the end of along x up."""
-    corner, along, up = (np.array(each, float) for each in (corner, along, up))
-    position = np.array([corner, corner + along, corner + along + up, corner + up])
-    normal = np.cross(along, up)
-    normal = np.tile(normal / np.linalg.norm(normal), (4, 1))
-    triangle = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
-    return Surface(position, triangle, normal, None if uv is None else np.array(uv, float), None, material)
 
 
 @pytest.mark.parametrize(
@@ -86,7 +74,9 @@ def test_texels_lie_on_their_surface():
     row, column = np.divmod(texels.index, 8)
     middle = np.add.reduceat(texels.position, texels.first[:-1]) / 16
     u, v = (column + 0.5) / 8, (row + 0.5) / 8
-    assert middle == pytest.approx(np.stack([1 + (u - 0.25) / 0.75 * 4, 2 + 0 * u, 3 - (v - 0.25) / 0.5 * 2], 1), abs=1e-5)
+    assert middle == pytest.approx(
+        np.stack([1 + (u - 0.25) / 0.75 * 4, 2 + 0 * u, 3 - (v - 0.25) / 0.5 * 2], 1), abs=1e-5
+    )
     assert (texels.normal == [0, 1, 0]).all() and (texels.face == [0, 1, 0]).all()
     assert (texels.image(texels.coverage) > 0).sum() == 24
     # A chart that ends within a texel covers a part of it.
@@ -212,7 +202,9 @@ def test_without_the_extra_a_line_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "mitsuba", None)
     shutil.copytree(ROOM, tmp_path / "room")
     for what, output in (("lightmaps", "set"), ("probes", "p.npz")):
-        run = CliRunner().invoke(app, ["bake", what, str(tmp_path / "room" / "room.yaml"), "-o", str(tmp_path / output)])
+        run = CliRunner().invoke(
+            app, ["bake", what, str(tmp_path / "room" / "room.yaml"), "-o", str(tmp_path / output)]
+        )
         assert run.exit_code == 2 and "mitsuba is missing" in run.stderr and "pip install 'wlm[bake]'" in run.stderr
         assert run.stderr.count("\n") == 1 and not (tmp_path / output).exists()
     monkeypatch.setitem(sys.modules, "pyoidn", None)
@@ -223,4 +215,10 @@ def test_without_the_extra_a_line_says_what_to_install(tmp_path, monkeypatch):
 def test_the_demo_scene_is_of_all_parts():
     scene, geometry, picture = load_scene(ROOM / "room.yaml")
     assert isinstance(scene, BakeScene) and geometry.is_file() and picture is None
-    assert {each.material.name for each in read_geometry(geometry, None).surfaces} == {"white", "red", "green", "lamp", "box"}
+    assert {each.material.name for each in read_geometry(geometry, None).surfaces} == {
+        "white",
+        "red",
+        "green",
+        "lamp",
+        "box",
+    }

@@ -143,8 +143,7 @@ def test_the_command(tmp_path):
         f"{path}: a volume of smoke, 2x2x2 voxels of 1 -> wlm smoke"
     )
     (found,) = json.loads(run(app, ["inspect", str(path), "--json"]).output)
-    assert (
-        found["path"] == str(path) and found["problems"] == [] and found["command"] == f"wlm smoke bake '{path}' -o OUT.exr"
-    )
+    assert found["path"] == str(path) and found["problems"] == []
+    assert found["command"] == f"wlm smoke bake '{path}' -o OUT.exr"
     result = run(app, ["inspect", str(tmp_path / "absent")])
     assert result.exit_code == 2 and "no such file or folder" in result.output

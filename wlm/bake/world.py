@@ -72,7 +72,9 @@ def make_hour(scene: BakeScene, geometry: Geometry, picture: np.ndarray | None, 
     elif scene.sky is not None:
         ambient = scene.sky.radiance
     if sky is not None and sky.any():
-        content["sky"] = {"type": "envmap", "bitmap": mi.Bitmap(np.ascontiguousarray(sky, np.float32))}
+        # Mitsuba's middle column is +z, and columns to the right of it turn towards -x.
+        turned = np.roll(sky, sky.shape[1] // 2, axis=1)
+        content["sky"] = {"type": "envmap", "bitmap": mi.Bitmap(np.ascontiguousarray(turned, np.float32))}
     return Hour(mi.load_dict(content), Outside(sun, ambient))
 
 
