@@ -36,8 +36,8 @@ def compress(
         Path | None,
         typer.Argument(
             metavar="LIGHTMAP",
-            help="Its lightmap: EXR, Radiance .hdr, KTX2, DDS, or PNG. Of a scene a folder, or a .json that lists all; "
-            "none: the materials' own.",
+            help="Its lightmap: EXR, Radiance .hdr, KTX2, DDS, or PNG. Of a scene a folder, a .lmbake, or a .json that "
+            "lists all; none: the materials' own.",
         ),
     ] = None,
     mask: Annotated[
@@ -78,7 +78,7 @@ def compress(
     """
     from wlm.atlas.model import Profile
 
-    if lightmap_path is None or lightmap_path.suffix.lower() == ".json" or lightmap_path.is_dir():
+    if lightmap_path is None or lightmap_path.suffix.lower() in (".json", ".lmbake") or lightmap_path.is_dir():
         lone = {"mask": mask, "node": node, "encoding": encoding, "flip": flip, "colour": colour, "resume": resume}
         for name, value in lone.items():
             if value:

@@ -11,6 +11,7 @@ import numpy as np
 from wlm.errors import WlmError
 from wlm.formats.geometry import read_geometry
 from wlm.formats.gltf import read_gltf
+from wlm.formats.godot import read_users
 from wlm.formats.light import SUFFIXES
 from wlm.formats.limits import JSON_BYTES
 from wlm.formats.npz import read_npz
@@ -110,6 +111,21 @@ def _probes(path: Path, keys: Sequence[str] = ()) -> Finding:
     return Finding(path, what, f"wlm probe compress {quoted(path)}{option} -o OUT.wlm", tuple(problems))
 
 
+def _lmbake(path: Path) -> Finding:
+    """Godot's probes, and the lightmap that some meshes read."""
+    found = _probes(path)
+    try:
+        bake = read_users(path)
+    except WlmError as error:
+        return replace(found, problems=(*found.problems, said(error, path)))
+    if not bake.users:
+        return found
+    textures = ", ".join(each.rsplit("/", 1)[-1] for each in bake.textures[:8])
+    count = f"{len(bake.users)} mesh{'es' if len(bake.users) > 1 else ''}"
+    scene = f"wlm atlas compress SCENE.glb {quoted(path)} -o DIR takes it with its scene"
+    return replace(found, what=f"{found.what}; {count} with rectangles in {textures}: {scene}")
+
+
 def _volume(path: Path) -> Finding:
     from wlm.fluid.volume import load_volume
 
@@ -191,15 +207,15 @@ def _unity_asset(path: Path) -> Finding:
 
 
 _BY_MAGIC: dict[bytes, Callable[[Path], Finding]] = {
-    b"RSRC": _probes,
-    b"RSCC": _probes,
+    b"RSRC": _lmbake,
+    b"RSCC": _lmbake,
     b"glTF": _mesh,
     b"NanoVDB": _volume,
     _VDB: _volume,
 }
 _BY_SUFFIX: dict[str, Callable[[Path], Finding]] = {
     ".npz": _npz,
-    ".lmbake": _probes,
+    ".lmbake": _lmbake,
     ".glb": _mesh,
     ".gltf": _mesh,
     ".obj": _mesh,

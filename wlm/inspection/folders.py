@@ -7,6 +7,7 @@ from itertools import islice
 from pathlib import Path
 
 from wlm.errors import WlmError
+from wlm.formats.godot import read_users
 from wlm.formats.light import SUFFIXES
 from wlm.inspection.files import BAKED, document_of, inspect_file
 from wlm.inspection.finding import Finding, quoted
@@ -63,7 +64,7 @@ def _folder(folder: Path, most: int) -> tuple[list[Finding], list[Path]]:
     try:
         entries = _entries(folder)
         files = [entry for entry in entries if entry.is_file()]
-        for whole in (_documents, _unity, _contest, _flip_books, _pictures):
+        for whole in (_documents, _unity, _contest, _godot, _flip_books, _pictures):
             for finding, its in whole(folder, [file for file in files if file not in taken]):
                 findings.append(finding)
                 taken |= its
@@ -173,6 +174,20 @@ def _contest(folder: Path, files: Sequence[Path]) -> _Found:
     except WlmError as error:
         what, problems = "a contest's raw lightmaps", (said(error, folder / CONFIG_FILE),)
     return [(Finding(folder, what, compress_command(folder), problems), set(_entries(folder)))]
+
+
+def _godot(folder: Path, files: Sequence[Path]) -> _Found:
+    """Bakes of Godot, with the textures that their meshes read by rectangles."""
+    found: _Found = []
+    for file in files:
+        if file.suffix.lower() != ".lmbake":
+            continue
+        try:
+            textures = {texture.rsplit("/", 1)[-1] for texture in read_users(file).textures}
+        except WlmError:
+            continue  # told by itself
+        found.append((inspect_file(file), {file, *(each for each in files if each.name in textures)}))
+    return found
 
 
 def _flip_books(folder: Path, files: Sequence[Path]) -> _Found:
