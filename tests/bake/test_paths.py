@@ -22,6 +22,8 @@ try:
 except WlmError as error:
     pytest.skip(str(error), allow_module_level=True)
 
+import mitsuba as mi  # noqa: E402
+
 from wlm.bake import paths, world  # noqa: E402  (they need Mitsuba)
 
 FLOOR = quad([-1, 0, 1], [2, 0, 0], [0, 0, -2])
@@ -170,3 +172,16 @@ def test_a_lamp_of_no_material_is_refused(tmp_path):
         bake_probes(
             replace(open_task(path), scene=open_task(path).scene.model_copy(update={"probes": ProbeSettings()}))
         )
+
+
+def test_a_texture_lies_as_gltf_says():
+    # Row 0 is v = 0, which is at the quad's first edge; red there, green at the other, blue on the right of both.
+    texture = np.zeros((8, 8, 3), np.float32)
+    texture[:4, :4, 0] = texture[4:, :4, 1] = texture[:, 4:, 2] = 0.9
+    wall = quad([0, 0, 0], [1, 0, 0], [0, 1, 0], uv=None, material=Material(colour=(1, 1, 1), texture=texture))
+    wall = replace(wall, texture_uv=np.array([(0, 0), (1, 0), (1, 1), (0, 1)], np.float32))
+    scene = mi.load_dict({"type": "scene", "wall": world._mesh(wall, (0.0, 0.0, 0.0), "wall")})
+    places = np.array([[0.25, 0.25, 1], [0.25, 0.75, 1], [0.75, 0.25, 1], [0.75, 0.75, 1]], np.float32)
+    si = scene.ray_intersect(mi.Ray3f(mi.Point3f(places.T), mi.Vector3f(0, 0, -1)))
+    colour = np.array(si.bsdf().eval_diffuse_reflectance(si)).T
+    assert colour == pytest.approx(0.9 * np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, 1]]), abs=0.01)

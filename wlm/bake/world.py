@@ -138,9 +138,8 @@ def _mesh(surface: Surface, emission: tuple[float, float, float], name: str) -> 
     numbers["vertex_positions"] = surface.position.astype(np.float32).ravel()
     numbers["faces"] = surface.triangle.astype(np.uint32).ravel()
     if has_uv:
-        # Mitsuba's v runs up.
-        uv = surface.texture_uv * np.float32([1.0, -1.0]) + np.float32([0.0, 1.0])
-        numbers["vertex_texcoords"] = uv.astype(np.float32).ravel()
+        # The top row of a bitmap is v = 0, as in glTF.
+        numbers["vertex_texcoords"] = surface.texture_uv.astype(np.float32).ravel()
     numbers.update()
     return mesh
 
