@@ -11,8 +11,11 @@ _PLACES = {
     "bake_lightmaps": "wlm.bake.lightmaps",
     "bake_probes": "wlm.bake.probes",
     "bake_sixway": "wlm.bake.sixway",
-    "load_scene": "wlm.bake.settings",
     "load_sixway": "wlm.bake.sixway",
+    "open_checkpoint": "wlm.bake.work",
+    "open_task": "wlm.bake.work",
+    "write_lightmaps": "wlm.bake.lightmaps",
+    "write_probes": "wlm.bake.probes",
 }
 
 __all__ = sorted(_PLACES)

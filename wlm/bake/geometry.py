@@ -75,12 +75,14 @@ class Geometry:
         surfaces: In the order of the file.
         replacements: Of an unwrapped file: what `write_glb` needs; otherwise empty.
         uv_set: n of `TEXCOORD_n`, the lightmap's; None: it wasn't asked for.
+        usual: Whether that is the set that readers take by themselves: 1 where there is one, else 0.
     """
 
     document: GltfDocument
     surfaces: tuple[Surface, ...]
     replacements: tuple[Replacement, ...]
     uv_set: int | None = None
+    usual: bool = True
 
     @property
     def box(self) -> tuple[np.ndarray, np.ndarray]:
@@ -105,14 +107,17 @@ def read_geometry(path: Path, settings: LightmapSettings | None, trust: bool = F
         if not np.isfinite(each.position).all():
             raise WlmError(f"{path}: {each.name}: expected finite positions, found NaN or infinity")
     replacements: list[Replacement] = []
-    number: int | None = None
+    number, usual = None, True
     if settings is not None and settings.unwrap:
-        document, primitives = _without_lightmap(document, primitives)
+        with reported(document.path):
+            document, primitives = _without_lightmap(document, primitives)
         replacements = unwrap(document, primitives, settings)
         number = _UNWRAPPED
     elif settings is not None:
         sets = {each for one in primitives for each in one.uv}
-        number = settings.uv_set if settings.uv_set is not None else (1 if 1 in sets else 0)
+        own = 1 if 1 in sets else 0
+        number = own if settings.uv_set is None else settings.uv_set
+        usual = number == own
         if number not in sets:
             raise WlmError(f"{path}: expected TEXCOORD_{number}, the lightmap's UVs: lightmap.unwrap: true makes some")
     cache: dict[int | None, Material] = {}
@@ -132,7 +137,7 @@ def read_geometry(path: Path, settings: LightmapSettings | None, trust: bool = F
             surfaces.append(surface)
     if not surfaces:
         raise WlmError(f"{path}: expected triangles with area, found none")
-    return Geometry(document, tuple(surfaces), tuple(replacements), number)
+    return Geometry(document, tuple(surfaces), tuple(replacements), number, usual)
 
 
 def _surface(

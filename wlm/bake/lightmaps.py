@@ -181,7 +181,9 @@ def write_lightmaps(folder: str | os.PathLike[str], task: Task, baked: BakedLigh
     listed: dict[str, object] = {"name": task.scene.name, "width": width, "height": height}
     if task.scene.period is not None:
         listed["period_hours"] = task.scene.period
-    listed |= {"mask": _MASK, "mesh": _MESH}
+    listed["mask"] = _MASK
+    if baked.geometry.usual:  # whoever reads the set knows no other
+        listed["mesh"] = _MESH
     listed["lightmaps"] = [{"time_hours": hour, "file": file} for hour, file in zip(baked.hours, files, strict=True)]
     with staged(folder, INDEX, FORMAT, _is_ours) as made:
         for file, stamp, light, noise in zip(files, stamps, baked.light, baked.noise, strict=True):

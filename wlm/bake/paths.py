@@ -217,7 +217,8 @@ def _gather(one: Any, count: int, channels: int, samples: int, seed: int, report
                 for start, step in zip((*shift, third), (2**32 // each, _GOLDEN, _ROOT), strict=True)
             )
             values, hidden = one(number, at, rng)
-            sums = [dr.block_sum(value, each) for value in (*values, hidden)]
+            # A path that meets an edge of no width may come to no number.
+            sums = [dr.block_sum(dr.select(dr.isfinite(value), value, 0.0), each) for value in (*values, hidden)]
             dr.eval(*sums)
             block = np.stack([value.numpy() for value in sums], -1).astype(np.float64) / each
             total[begin : begin + length] += block[:, :-1]
