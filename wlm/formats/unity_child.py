@@ -12,7 +12,7 @@ from typing import Any
 MEMORY = 2 << 30
 """Bytes that it may take, where the system can say so."""
 
-SECONDS = 10
+SECONDS = 4
 """Of computing, likewise."""
 
 
