@@ -155,6 +155,19 @@ def test_a_quick_run_has_few_rivals_and_a_full_one_all(monkeypatch):
     assert calls == [FEW, usual("cpu"), ()]
 
 
+def test_qualities_of_video_are_profiles_of_their_own(monkeypatch):
+    calls = []
+    monkeypatch.setattr(bench, "load", lambda path: from_arrays(np.ones((1, 8, 8, 3)), [12.0]))
+    monkeypatch.setattr(bench, "run_rows", lambda lightmaps, profiles, **options: calls.append(profiles))
+    run(quick=False, device="cpu", qualities=(75, 50))
+    run(quick=False, device="cpu", names=["M"], qualities=(75,))
+    names = [[(p.name, p.frames, p.video_quality) for p in profiles] for profiles in calls]
+    assert names[0] == [("video 75", "video", 75), ("video 50", "video", 50)]
+    assert [name for name, *_ in names[1]] == ["M", "video 75"]
+    with pytest.raises(WlmError, match="video_quality"):
+        run(quick=False, device="cpu", qualities=(101,))
+
+
 def test_the_rivals_alone(rows, lightmaps, monkeypatch, tmp_path):
     monkeypatch.setattr(bench, "load", lambda path: lightmaps)
     monkeypatch.setattr(bench, "usual", lambda device, quick: ("bc7", "av1-75"))

@@ -80,6 +80,7 @@ def run(
     device: str,
     set_path: str | os.PathLike[str] | None = None,
     names: Sequence[str] | None = None,
+    qualities: Sequence[int] = (),
     rivals: bool = True,
     progress: Note | None = None,
 ) -> list[Row]:
@@ -90,7 +91,8 @@ def run(
             set has them): five minutes on two CPU cores for 16 tiles. Its errors are those of unfinished fits.
         device: "cpu" or "cuda:0", for fits and decodes.
         set_path: A lightmap set; None: the checkout's `demos/data/city`, two tiles of the city.
-        names: Profiles, by name or file; None: `QUICK_PROFILES` or `PROFILES`.
+        names: Profiles, by name or file; None: `QUICK_PROFILES` or `PROFILES`, or none beside `qualities`.
+        qualities: Of the profile `video`, 0 to 100: a row for each, "video 75" for example.
         rivals: With the rivals, which take minutes on the CPU and no GPU: `run_rivals` measures them elsewhere.
         progress: Called with a line before each part of the work.
 
@@ -98,10 +100,13 @@ def run(
         The rows, in the order of the module's list.
 
     Raises:
-        WlmError: The set or the device isn't there, or a fit diverged.
+        WlmError: The set or the device isn't there, a quality is out of range, or a fit diverged.
     """
+    if not names:
+        names = () if qualities else QUICK_PROFILES if quick else PROFILES
+    profiles = [Profile.load(name) for name in names]
+    profiles += [Profile.load("video").override({"name": f"video {q}", "video_quality": q}) for q in qualities]
     lightmaps = _load(set_path)
-    profiles = [Profile.load(name) for name in names or (QUICK_PROFILES if quick else PROFILES)]
     chosen = np.arange(len(lightmaps.times))
     if quick:
         steps = max(200, _QUICK_TILE_STEPS // TileGrid.of(*lightmaps.mask.shape).count)
