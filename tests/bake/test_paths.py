@@ -2,6 +2,7 @@
 
 import math
 import shutil
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -185,3 +186,11 @@ def test_a_texture_lies_as_gltf_says():
     si = scene.ray_intersect(mi.Ray3f(mi.Point3f(places.T), mi.Vector3f(0, 0, -1)))
     colour = np.array(si.bsdf().eval_diffuse_reflectance(si)).T
     assert colour == pytest.approx(0.9 * np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, 1]]), abs=0.01)
+
+
+def test_the_filter_is_named_where_it_is_missing(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pyoidn", None)
+    task = open_task(ROOM / "room.yaml")
+    assert task.scene.denoise
+    with pytest.raises(WlmError, match="pyoidn is missing"):
+        bake_lightmaps(task)

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from wlm.bake.daylight import sun_direction
 from wlm.bake.geometry import Geometry, read_geometry
-from wlm.bake.lightmaps import BakedLightmaps, bake_lightmaps, write_lightmaps
+from wlm.bake.lightmaps import BakedLightmaps, write_lightmaps
 from wlm.bake.probes import BakedProbes, place_probes, write_probes
 from wlm.bake.settings import BakeScene, Lamp, LightmapSettings, ProbeSettings, load_scene
 from wlm.bake.texels import place_texels
@@ -207,9 +207,6 @@ def test_without_the_extra_a_line_says_what_to_install(tmp_path, monkeypatch):
         )
         assert run.exit_code == 2 and "mitsuba is missing" in run.stderr and "pip install 'wlm[bake]'" in run.stderr
         assert run.stderr.count("\n") == 1 and not (tmp_path / output).exists()
-    monkeypatch.setitem(sys.modules, "pyoidn", None)
-    with pytest.raises(WlmError, match="pyoidn is missing"):
-        bake_lightmaps(replace(open_task(tmp_path / "room" / "room.yaml")))
 
 
 def test_the_demo_scene_is_of_all_parts():

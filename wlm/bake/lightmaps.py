@@ -94,8 +94,8 @@ def bake_lightmaps(
         KeyboardInterrupt: Raised by `progress`, after the checkpoint has been written.
     """
     scene = task.scene
-    denoise = need("pyoidn", "bake").denoise if scene.denoise else None
     start(device)
+    denoise = need("pyoidn", "bake").denoise if scene.denoise else None
     # Both need Mitsuba's variant to be chosen.
     from wlm.bake.paths import irradiance
     from wlm.bake.world import check_lamps, make_hour
