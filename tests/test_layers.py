@@ -13,7 +13,7 @@ FLOORS = (
     GROUND.split(),
     ["wlm.ops", "wlm.fluid"],
     ["wlm.lightmap", "wlm.atlas", "wlm.probe", "wlm.smoke"],
-    ["wlm.baselines", "wlm.engines", "wlm.inspection", "wlm.view", "wlm.web"],
+    ["wlm.bake", "wlm.baselines", "wlm.engines", "wlm.inspection", "wlm.view", "wlm.web"],
     ["wlm.bench"],
     ["wlm.cli"],
     ["wlm.__main__"],

@@ -20,6 +20,7 @@ PACKAGES = (
     "wlm.smoke",
     "wlm.fluid",
     "wlm.ops",
+    "wlm.bake",
     "wlm.inspection",
     "wlm.engines",
     "wlm.web",

@@ -129,3 +129,23 @@ def bake(writer, points, sh):
     )
     user = writer.array(*writer.of_every_kind())
     return [("uses_spherical_harmonics", writer.u32(2, 1)), ("user_data", user), ("probe_data", data)]
+
+
+def with_users(writer, points, sh, users, slices=False):
+    """The properties of a bake whose texture some meshes read: (names of the path, rectangle, slice) each."""
+    values = []
+    for names, rectangle, number in users:
+        path = b"".join(writer.text(name, 0x80000000) for name in names)
+        values += [
+            writer.u32(22) + writer.numbers("H", len(names), 0) + path,
+            writer.u32(11) + writer.reals(*rectangle),
+            writer.u32(3, number),
+            writer.u32(40) + writer.numbers("q", -1),
+        ]
+    rest = dict(bake(writer, points, sh))
+    return [
+        ("lightmap_textures", writer.array(writer.u32(24, 3, 0))),
+        ("uses_spherical_harmonics", writer.u32(2, int(slices))),
+        ("user_data", writer.array(*values)),
+        ("probe_data", rest["probe_data"]),
+    ]

@@ -7,10 +7,13 @@ import tracemalloc
 import numpy as np
 import pytest
 from builders.checks import error_of
-from builders.godot_bakes import Writer, bake, colours, probes
+from builders.godot_bakes import Writer, bake, colours, probes, with_users
 
+from wlm.atlas.scene.description import read_description
 from wlm.errors import WlmError
-from wlm.formats.godot import read_lmbake
+from wlm.formats.exr import write_exr
+from wlm.formats.godot import read_lmbake, read_users
+from wlm.inspection import inspect
 
 
 def message(tmp_path, data, name="a.lmbake"):
@@ -42,6 +45,37 @@ def test_probes_are_found_among_everything_else(tmp_path, order, double, options
     assert position.dtype == np.float64 and found.dtype == np.float32 and found.flags.c_contiguous
     np.testing.assert_array_equal(position, points if double else points.astype(np.float32))
     np.testing.assert_array_equal(found, sh)
+
+
+@pytest.mark.parametrize(("order", "double"), [("<", False), (">", True)])
+def test_who_reads_which_part_of_the_lightmap(tmp_path, order, double):
+    writer, path = Writer(order, double), tmp_path / "bake.lmbake"
+    users = [(["..", "House", "Wall"], (0.5, 0.25, 0.125, 0.375), 0), (["Floor"], (0.0, 0.0, 0.5, 0.25), 0)]
+    points, sh = probes()
+    path.write_bytes(writer.file(with_users(writer, points, np.abs(sh) * 0.1 + 1.0, users)))
+    found = read_users(path)
+    assert found.textures == ("res://bake.exr",) and not found.directional
+    assert [(user.node, user.rectangle, user.slice) for user in found.users] == [
+        ("../House/Wall", (0.5, 0.25, 0.125, 0.375), 0),
+        ("Floor", (0.0, 0.0, 0.5, 0.25), 0),
+    ]
+    scene = read_description(path)
+    assert [each.files for each in scene.sheets] == [["bake.exr"]]
+    assert [(each.node, each.scale_offset) for each in scene.objects] == [
+        ("Wall", [0.125, 0.375, 0.5, 0.25]),
+        ("Floor", [0.5, 0.25, 0.0, 0.0]),
+    ]
+    write_exr(tmp_path / "bake.exr", np.ones((8, 8, 3), np.float32))
+    (found,) = inspect(tmp_path)
+    assert "2 meshes with rectangles in bake.exr" in found.what and not found.problems
+    users[1] = (["Floor"], (0.0, 0.0, 0.5, 0.25), 1)
+    for options in ({"slices": False}, {"slices": True}):
+        path.write_bytes(writer.file(with_users(writer, points, sh, users, **options)))
+        assert "one texture of one slice without directions" in error_of(read_description, path)
+    # What stands in their place is refused, and the probes are read all the same.
+    path.write_bytes(writer.file(bake(writer, points, sh)))
+    assert "user_data" in error_of(read_users, path) and len(read_lmbake(path)[0]) == 5
+    assert "user_data" in inspect(path)[0].problems[-1]
 
 
 def test_one_probe_and_keys_that_are_string_names_or_no_text(tmp_path):

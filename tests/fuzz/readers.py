@@ -19,6 +19,8 @@ from builders.vdb_files import ACTIVE_MASK, ZIP, scaled, tree, vdb_file
 import wlm
 from wlm.atlas.exporter import geometry, read_folder
 from wlm.atlas.scene.description import read_description
+from wlm.bake.geometry import read_geometry
+from wlm.bake.settings import LightmapSettings
 from wlm.bench.rows import read_json
 from wlm.config import load_settings
 from wlm.errors import WlmError
@@ -316,6 +318,12 @@ yes
 ]
 
 
+def _surfaces(path: Path) -> None:
+    for surface in read_geometry(path, LightmapSettings()).surfaces:
+        check_finite(position=surface.position, normal=surface.normal)
+        assert len(surface.triangle) and surface.triangle.max() < len(surface.position), "accepted without triangles"
+
+
 def _settings(name: str, model: Callable[[], type], files: str, check: Callable[[Any], None] | None = None) -> Reader:
     """The reader of a settings model's YAML."""
 
@@ -384,6 +392,7 @@ _ALL = (
     Reader("tga-flipbook", "a.tga", corpus("flipbook.tga"), _tga, _flipbook),
     Reader("gltf", "a.gltf", corpus("mesh.gltf"), vary_gltf, _mesh, _light, cost=2),
     Reader("glb", "a.glb", corpus("mesh.glb"), vary_glb, _mesh, _light, cost=2),
+    Reader("gltf-bake", "a.gltf", corpus("mesh.gltf"), vary_gltf, _surfaces, _light, cost=2),
     Reader(
         "obj", "a.obj", corpus("mesh.obj"), lambda draw, data: vary_text(draw, data.decode(), ("f", "v")), _obj, _light
     ),

@@ -19,7 +19,7 @@ import typer
 from typer.core import TyperGroup
 
 from wlm import __version__
-from wlm.cli import atlas, bench, compare, doctor, inspect, lightmap, probe, smoke, view, web
+from wlm.cli import atlas, bake, bench, compare, doctor, inspect, lightmap, probe, smoke, view, web
 from wlm.cli.signals import exit_code, handled
 from wlm.errors import WlmError, one_line
 
@@ -67,6 +67,7 @@ app.add_typer(lightmap.app, name="lightmap")
 app.add_typer(atlas.app, name="atlas")
 app.add_typer(probe.app, name="probe")
 app.add_typer(smoke.app, name="smoke")
+app.add_typer(bake.app, name="bake")
 app.add_typer(bench.app, name="bench")
 app.command()(compare.compare)
 app.command()(inspect.inspect)

@@ -50,8 +50,8 @@ def compress(
         Path | None,
         typer.Argument(
             metavar="LIGHTMAP",
-            help="Its lightmap: EXR, Radiance .hdr, KTX2, DDS, or PNG. Of a scene a .json that lists all; none: the "
-            "materials' own.",
+            help="Its lightmap: EXR, Radiance .hdr, KTX2, DDS, or PNG. Of a scene a folder, a .lmbake, or a .json that "
+            "lists all; none: the materials' own.",
         ),
     ] = None,
     mask: Annotated[
@@ -95,7 +95,7 @@ def compress(
     """
     from wlm.atlas.model import Profile
 
-    if lightmap_path is None or lightmap_path.suffix.lower() == ".json":
+    if lightmap_path is None or lightmap_path.suffix.lower() in (".json", ".lmbake") or lightmap_path.is_dir():
         lone = {
             "mask": mask,
             "node": node,

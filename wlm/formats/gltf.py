@@ -269,6 +269,38 @@ def components(document: GltfDocument, number: int, kind: str) -> np.ndarray:
     return np.ascontiguousarray(elements(document, number)).view(COMPONENTS[accessor["componentType"]])
 
 
+def vertex_normals(document: GltfDocument, primitives: Sequence[GltfPrimitive]) -> list[np.ndarray | None]:
+    """The vertices' normals in the scene's space.
+
+    Returns:
+        For each primitive of the document float64 [V, 3], of unit length, or 0 where the file has none of any length;
+        None: it has no `NORMAL`.
+
+    Raises:
+        WlmError: As for `read_gltf`.
+    """
+    with reported(document.path):
+        transforms = dict(_walk(document))
+        normals: list[np.ndarray | None] = []
+        for each in primitives:
+            attributes = document.item("meshes", each.mesh)["primitives"][each.primitive]["attributes"]
+            if "NORMAL" not in attributes:
+                normals.append(None)
+                continue
+            local = _floats(document, attributes["NORMAL"], "VEC3")
+            if len(local) <= each.row.max():
+                raise WlmError(f"{document.path}: {each.name}: NORMAL: expected {each.row.max() + 1} vertices or more")
+            # By the cofactors, which are the inverse's transpose times the determinant, and exist for flat scales too.
+            a, b, c = transforms[each.node][:3, :3].T
+            side = -1.0 if a @ np.cross(b, c) < 0 else 1.0
+            turn = side * np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)])
+            turned = local[each.row].astype(np.float64) @ turn
+            length = np.linalg.norm(turned, axis=1, keepdims=True)
+            good = np.isfinite(length) & (length > 0)
+            normals.append(np.divide(turned, length, out=np.zeros_like(turned), where=good))
+        return normals
+
+
 @contextmanager
 def reported(path: str | os.PathLike[str]) -> Iterator[None]:
     """Turns what Python raises on a malformed tree into one line."""

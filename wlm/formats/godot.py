@@ -1,8 +1,9 @@
-"""Reading the light probes of a Godot 4 lightmap bake (`.lmbake`), and replacing them.
+"""Reading the light probes of a Godot 4 lightmap bake (`.lmbake`) and who uses its textures; replacing the probes.
 
 The file is Godot's binary resource (`RSRC`, or `RSCC` where it was saved compressed) of the type `LightmapGIData`.
-Its property `probe_data` is a dictionary with `points` and, for each of them, nine colours `sh`; everything else (the
-textures' names, the users, the tetrahedra and the BSP tree) is stepped over.
+Its property `probe_data` is a dictionary with `points` and, for each of them, nine colours `sh`; the tetrahedra and the
+BSP tree are stepped over. `lightmap_textures` refers to pictures, each of one or more slices; `user_data` has four
+values for each mesh that reads them: the path of its node, its rectangle, its slice, and -1 or the cell of a GridMap.
 
 Those nine are spherical harmonics L0 to L2 in the order 1; y, z, x; xy, yz, 3z2-1, xz, x2-y2, all signs plus, in the
 scene's axes (right-handed, y up, metres). They hold the incoming radiance, not convolved with the cosine, divided by
@@ -14,6 +15,7 @@ from __future__ import annotations
 import os
 import struct
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -23,7 +25,7 @@ from wlm.formats.reading import read_file
 
 COEFFICIENTS = 9
 _TYPE = "LightmapGIData"
-_PROPERTY = "probe_data"
+_PROPERTY, _TEXTURES, _USERS, _DIRECTIONAL = "probe_data", "lightmap_textures", "user_data", "uses_spherical_harmonics"
 
 # Versions of the container: 4 came with Godot 4.0, 6 with 4.3.
 _ENGINE = 4
@@ -36,6 +38,7 @@ _ZSTD = 2
 _LARGEST_BLOCK = 1 << 20
 
 # Types of values. A real has 4 bytes, or 8 in a file of a double-precision build.
+_BOOL, _INT, _RECTANGLE, _LONG = 2, 3, 11, 40
 _STRING, _STRING_NAME, _NODE_PATH, _OBJECT, _DICTIONARY, _ARRAY = 5, 44, 22, 24, 26, 30
 _BYTES, _STRINGS, _VECTOR3S, _COLOURS = 31, 34, 35, 36
 # Those of a fixed size: reals, and bytes.
@@ -85,6 +88,70 @@ _EMPTY, _EXTERNAL_PATH, _INTERNAL, _EXTERNAL = range(4)
 _DEEPEST = 32
 
 
+@dataclass(frozen=True)
+class GodotUser:
+    """A mesh that reads a lightmap.
+
+    Attributes:
+        node: The path of its node, names with "/" between them.
+        rectangle: x, y, width, height: UV2 times the last two, plus the first two, v down.
+        slice: Of the textures, counted through all of them.
+    """
+
+    node: str
+    rectangle: tuple[float, float, float, float]
+    slice: int
+
+
+@dataclass(frozen=True)
+class GodotUsers:
+    """The lightmaps of a bake and their users.
+
+    Attributes:
+        textures: Names of the pictures, as Godot has them (res://...).
+        users: In the file's order.
+        directional: Whether each slice has four: one of light and three of directions.
+    """
+
+    textures: tuple[str, ...]
+    users: tuple[GodotUser, ...]
+    directional: bool
+
+
+def read_users(path: str | os.PathLike[str]) -> GodotUsers:
+    """Reads which meshes read which part of a bake's lightmaps.
+
+    Raises:
+        WlmError: The file is missing, not a bake, damaged, or holds something else in their place.
+    """
+    reader = _reader(path)
+    names, external = _open(reader)
+    textures: list[str] = []
+    users: list[GodotUser] = []
+    directional = False
+    for _ in range(reader.u32()):
+        name = reader.name(names)
+        if name == _TEXTURES:
+            reader.expect(name, _ARRAY, "an array")
+            for _ in range(reader.u32() & 0x7FFFFFFF):
+                reader.expect(name, _OBJECT, "a texture")
+                if reader.u32() != _EXTERNAL or (index := reader.u32()) >= len(external):
+                    raise WlmError(f"{path}: {name}: expected textures in files of their own")
+                textures.append(external[index])
+        elif name == _USERS:
+            reader.expect(name, _ARRAY, "an array")
+            count = reader.u32() & 0x7FFFFFFF
+            if count % 4:
+                raise WlmError(f"{path}: {name}: expected four values for each user, found {count}")
+            users += [reader.user(names) for _ in range(count // 4)]
+        elif name == _DIRECTIONAL:
+            reader.expect(name, _BOOL, "a yes or no")
+            directional = reader.u32() != 0
+        else:
+            reader.skip()
+    return GodotUsers(tuple(textures), tuple(users), directional)
+
+
 def read_lmbake(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray]:
     """Reads the light probes of a Godot 4 lightmap bake.
 
@@ -130,16 +197,8 @@ def relit(path: str | os.PathLike[str], sh: np.ndarray) -> bytes:
 
 def _read(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray, _Reader, int]:
     """Points [N, 3], colours [9 N, 4], the bytes they are from, and where in these the colours begin."""
-    data = read_file(path, BAKE_BYTES, "the bake")
-    magic = data[:4]
-    if magic == b"RSCC":
-        # A compressed resource has no magic of its own inside, and its offsets count from there.
-        reader = _Reader(path, _decompress(_Reader(path, data, 4)), 0)
-    elif magic == b"RSRC":
-        reader = _Reader(path, data, 4)
-    else:
-        raise WlmError(f"{path}: expected a Godot binary resource (RSRC or RSCC), found {magic!r} at its start")
-    names = _open(reader)
+    reader = _reader(path)
+    names, _ = _open(reader)
     points = colours = None
     at = 0
     for _ in range(reader.u32()):
@@ -166,8 +225,19 @@ def _read(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray, _Reader
     return points, colours, reader, at
 
 
-def _open(reader: _Reader) -> list[str]:
-    """Reads the header and goes to the main resource's properties; returns the table of names."""
+def _reader(path: str | os.PathLike[str]) -> _Reader:
+    data = read_file(path, BAKE_BYTES, "the bake")
+    magic = data[:4]
+    if magic == b"RSCC":
+        # A compressed resource has no magic of its own inside, and its offsets count from there.
+        return _Reader(path, _decompress(_Reader(path, data, 4)), 0)
+    if magic == b"RSRC":
+        return _Reader(path, data, 4)
+    raise WlmError(f"{path}: expected a Godot binary resource (RSRC or RSCC), found {magic!r} at its start")
+
+
+def _open(reader: _Reader) -> tuple[list[str], list[str]]:
+    """Reads the header and goes to the main resource's properties; returns the table of names, and the files' names."""
     path = reader.path
     big = reader.u32()
     if big > 1:
@@ -191,9 +261,10 @@ def _open(reader: _Reader) -> list[str]:
         reader.string()
     reader.take(4 * _RESERVED)
     names = [reader.string() for _ in range(reader.u32())]
+    external = []
     for _ in range(reader.u32()):
         reader.string()  # type of an external resource
-        reader.string()  # and its path
+        external.append(reader.string())
         if flags & _HAS_UIDS:
             reader.take(8)
     offset = None
@@ -204,7 +275,7 @@ def _open(reader: _Reader) -> list[str]:
         raise WlmError(f"{path}: expected at least one resource inside, found none")
     reader.seek(offset)
     reader.string()  # the type once more
-    return names
+    return names, external
 
 
 class _Reader:
@@ -266,6 +337,24 @@ class _Reader:
         marker = self.u32()
         if marker != kind:
             raise WlmError(f"{self.path}: {field}: expected {text} (type {kind}), found type {marker}")
+
+    def user(self, names: list[str]) -> GodotUser:
+        """Four values of `user_data`."""
+        self.expect(_USERS, _NODE_PATH, "a path")
+        steps, below = struct.unpack(self.order + "HH", self.take(4))
+        path = [self.name(names) for _ in range(steps)]
+        self._repeat(below & 0x7FFF, self._skip_name)
+        self.expect(_USERS, _RECTANGLE, "a rectangle")
+        x, y, width, height = np.frombuffer(self.take(4 * self.real), f"{self.order}f{self.real}").tolist()
+        number = self._whole()
+        self._whole()
+        return GodotUser("/".join(path), (x, y, width, height), number)
+
+    def _whole(self) -> int:
+        kind = self.u32()
+        if kind not in (_INT, _LONG):
+            raise WlmError(f"{self.path}: {_USERS}: expected a whole number, found type {kind}")
+        return struct.unpack(self.order + ("i" if kind == _INT else "q"), self.take(4 if kind == _INT else 8))[0]
 
     def vectors(self) -> np.ndarray:
         """A packed array of Vector3, float64 [N, 3]."""

@@ -1,6 +1,8 @@
 """What a single file holds, told by its content and, where that doesn't tell, by its name."""
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,10 +11,12 @@ import numpy as np
 from wlm.errors import WlmError
 from wlm.formats.geometry import read_geometry
 from wlm.formats.gltf import read_gltf
+from wlm.formats.godot import read_users
 from wlm.formats.light import SUFFIXES
 from wlm.formats.limits import JSON_BYTES
 from wlm.formats.npz import read_npz
 from wlm.formats.reading import open_file, read_json_file
+from wlm.formats.unity_asset import read_lighting_data
 from wlm.inspection.finding import Finding, quoted
 from wlm.inspection.pictures import inspect_picture, picture_of, said
 from wlm.inspection.sets import inspect_set
@@ -20,9 +24,13 @@ from wlm.system import load
 
 _MAGIC = 16
 _VDB = b" BDV\0\0\0\0"
+BAKED = "lightmaps that wlm bake lightmaps made, with their noise and coverage"
+"""What is said of the folder of a bake."""
+
 # What says of itself in JSON that it is ours, and what to do with it.
 _EXPORTS = {
     "wlm-atlas": "a compressed lightmap of a mesh",
+    "wlm-bake": BAKED,
     "wlm-lightmap-export": "lightmaps over time for an engine: textures, weights and a shader",
     "wlm-lightmap-engine": "lightmaps over time for one engine: textures, weights and a component",
     "wlm-atlas-engine": "a compressed lightmap of a mesh for one engine: textures, the mesh and a material or a shader",
@@ -105,6 +113,21 @@ def _probes(path: Path, keys: Sequence[str] = ()) -> Finding:
     return Finding(path, what, f"wlm probe compress {quoted(path)}{option} -o OUT.wlm", tuple(problems))
 
 
+def _lmbake(path: Path) -> Finding:
+    """Godot's probes, and the lightmap that some meshes read."""
+    found = _probes(path)
+    try:
+        bake = read_users(path)
+    except WlmError as error:
+        return replace(found, problems=(*found.problems, said(error, path)))
+    if not bake.users:
+        return found
+    textures = ", ".join(each.rsplit("/", 1)[-1] for each in bake.textures[:8])
+    count = f"{len(bake.users)} mesh{'es' if len(bake.users) > 1 else ''}"
+    scene = f"wlm atlas compress SCENE.glb {quoted(path)} -o DIR takes it with its scene"
+    return replace(found, what=f"{found.what}; {count} with rectangles in {textures}: {scene}")
+
+
 def _volume(path: Path) -> Finding:
     from wlm.fluid.volume import load_volume
 
@@ -115,7 +138,10 @@ def _volume(path: Path) -> Finding:
     problems = list(volume.warnings)
     if not bool((volume.density > 0).any()):
         problems.append("no smoke in it")
-    return Finding(path, what, f"wlm smoke bake {quoted(path)} -o DIR", tuple(problems))
+    x, y, z = volume.shape
+    if path.suffix.lower() != ".npz" and z > max(x, y):
+        problems.append("longest along z: if z is up in it, as in Blender and Unreal, add --up z")
+    return Finding(path, what, f"wlm smoke bake {quoted(path)} -o OUT.exr", tuple(problems))
 
 
 def _mesh(path: Path) -> Finding:
@@ -123,11 +149,9 @@ def _mesh(path: Path) -> Finding:
         mesh = read_geometry(path, with_uv=False)
         parts, sets, uvs = 1, "", []
         count = len(mesh.triangle)
-        try:
+        with suppress(WlmError):
             whole = read_geometry(path)
             sets, uvs = "UVs", [whole.uv[whole.triangle]]
-        except WlmError:
-            pass
     else:
         primitives = read_gltf(path)[1]
         count, parts = sum(len(each.triangle) for each in primitives), len({each.mesh for each in primitives})
@@ -180,31 +204,31 @@ def _json(path: Path) -> Finding:
     return Finding(path, "JSON that is nothing known here")
 
 
-def _vdb(path: Path) -> Finding:
-    return Finding(path, "an OpenVDB volume", problems=("isn't read here: make an .nvdb of it, with nanovdb_convert",))
-
-
 def _unity_asset(path: Path) -> Finding:
-    return Finding(
-        path, "an asset of Unity", problems=("its probes and renderers' rectangles aren't read: export them in Unity",)
-    )
+    """Light probes and rectangles, where it is lighting data; reading it needs an extra."""
+    data = read_lighting_data(path)
+    places = f"{len(data.rectangles)} renderers' rectangles in lightmaps, without their names"
+    if not len(data.position):
+        return Finding(path, f"lighting data of Unity: no light probes, {places}")
+    found = _probes(path)
+    return replace(found, what=f"lighting data of Unity: {found.what}; {places}")
 
 
 _BY_MAGIC: dict[bytes, Callable[[Path], Finding]] = {
-    b"RSRC": _probes,
-    b"RSCC": _probes,
+    b"RSRC": _lmbake,
+    b"RSCC": _lmbake,
     b"glTF": _mesh,
     b"NanoVDB": _volume,
-    _VDB: _vdb,
+    _VDB: _volume,
 }
 _BY_SUFFIX: dict[str, Callable[[Path], Finding]] = {
     ".npz": _npz,
-    ".lmbake": _probes,
+    ".lmbake": _lmbake,
     ".glb": _mesh,
     ".gltf": _mesh,
     ".obj": _mesh,
     ".nvdb": _volume,
-    ".vdb": _vdb,
+    ".vdb": _volume,
     ".wlm": _model,
     ".json": _json,
     ".asset": _unity_asset,

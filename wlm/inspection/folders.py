@@ -7,8 +7,9 @@ from itertools import islice
 from pathlib import Path
 
 from wlm.errors import WlmError
+from wlm.formats.godot import read_users
 from wlm.formats.light import SUFFIXES
-from wlm.inspection.files import document_of, inspect_file
+from wlm.inspection.files import BAKED, document_of, inspect_file
 from wlm.inspection.finding import Finding, quoted
 from wlm.inspection.pictures import picture_of, said
 from wlm.inspection.sets import UNREADABLE, compress_command, inspect_set, named, together
@@ -63,7 +64,7 @@ def _folder(folder: Path, most: int) -> tuple[list[Finding], list[Path]]:
     try:
         entries = _entries(folder)
         files = [entry for entry in entries if entry.is_file()]
-        for whole in (_documents, _unity, _contest, _flip_books, _pictures):
+        for whole in (_documents, _unity, _contest, _godot, _flip_books, _pictures):
             for finding, its in whole(folder, [file for file in files if file not in taken]):
                 findings.append(finding)
                 taken |= its
@@ -97,6 +98,8 @@ def _documents(folder: Path, files: Sequence[Path]) -> _Found:
         if file.name == SET_FILE:
             finding = inspect_set(file)
             listed = set() if finding.what == UNREADABLE else {file, *named(file, files)}
+            if any(document_of(each) == BAKED for each in documents):
+                listed = set(files)
             return [(finding, listed | {file})]
         stated = document_of(file)
         if stated is not None:
@@ -173,6 +176,20 @@ def _contest(folder: Path, files: Sequence[Path]) -> _Found:
     return [(Finding(folder, what, compress_command(folder), problems), set(_entries(folder)))]
 
 
+def _godot(folder: Path, files: Sequence[Path]) -> _Found:
+    """Bakes of Godot, with the textures that their meshes read by rectangles."""
+    found: _Found = []
+    for file in files:
+        if file.suffix.lower() != ".lmbake":
+            continue
+        try:
+            textures = {texture.rsplit("/", 1)[-1] for texture in read_users(file).textures}
+        except WlmError:
+            continue  # told by itself
+        found.append((inspect_file(file), {file, *(each for each in files if each.name in textures)}))
+    return found
+
+
 def _flip_books(folder: Path, files: Sequence[Path]) -> _Found:
     """Pairs of textures of six-way lightmaps, as engines name them."""
     found: _Found = []
@@ -213,8 +230,17 @@ def _pictures(folder: Path, files: Sequence[Path]) -> _Found:
     problems, alike = together(pictures, [heads[file] for file in pictures])
     if not alike:
         what = f"{count_of(pictures, 'lightmap')} of different atlases: no times of one"
-        command = "wlm atlas compress MESH.glb LIGHTMAP -o DIR, of each with its mesh"
-        return [(Finding(folder, what, command, tuple(problems)), set(pictures))]
+        command = f"wlm atlas compress MESH.glb {quoted(folder)} -o DIR"
+        meshes = [file for file in files if file.suffix.lower() in (".glb", ".gltf")]
+        if len(meshes) == 1:
+            # The charts tell which lightmap is whose.
+            command, what = command.replace("MESH.glb", quoted(meshes[0])), f"{what}, with {meshes[0].name}"
+        return [
+            (
+                Finding(folder, what, command, tuple(problems)),
+                {*pictures, *meshes} if len(meshes) == 1 else set(pictures),
+            )
+        ]
     option = ""
     if any(time_of_name(file.stem) is None for file in pictures):
         option = " --times ..."

@@ -100,9 +100,7 @@ def inspect_picture(path: Path, picture: Picture) -> Finding:
         what = f"six-way lightmaps of smoke, {picture.size}"
         return Finding(path, what, f"wlm smoke flipbook {quoted(path)} -o OUT.png")
     if _GUIDE <= set(picture.channels):
-        return Finding(
-            path, f"a guiding map of smoke, {picture.size}", f"wlm smoke predict NETWORK.wlm {quoted(path)} -o DIR"
-        )
+        return Finding(path, f"a guiding map of smoke, {picture.size}: predict makes its own, of the volume")
     if picture.is_cube:
         return Finding(path, f"a cube's six faces, {picture.size}: a reflection probe; nothing here takes it")
     if "_comp_dir" in name or "_comp_shadowmask" in name:

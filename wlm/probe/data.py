@@ -50,6 +50,7 @@ from wlm.formats.limits import JSON_BYTES, NUMBERS, PROBES
 from wlm.formats.npz import read_npz
 from wlm.formats.reading import read_json_file
 from wlm.formats.scratch import room
+from wlm.formats.unity_asset import read_lighting_data
 from wlm.probe.conventions import CANONICAL, CONVENTIONS, THREE_GRID, from_canonical, to_canonical
 from wlm.probe.sphere import sh_count
 
@@ -120,13 +121,14 @@ def load(path: str | os.PathLike[str], *, key: str | None = None, convention: st
     - `.json`: `{"position": [[x, y, z], ...], "sh": [[[r, g, b], ...], ...]}`, or
       `{"probes": [{"position": [x, y, z], "sh": [[r, g, b], ...]}, ...]}`, and `"convention"` likewise.
     - `.lmbake`: a lightmap bake of Godot 4.
+    - `.asset`: the lighting data or light probes of Unity's editor (extra `unity`).
 
     Args:
         path: The file; its suffix tells the kind.
         key: Name of the array of values, or that name without "sh_" in front of it ("12.00" for "sh_12.00"). None
             takes the only one whose name begins with "sh".
         convention: One of `wlm.probe.conventions.CONVENTIONS`, in which the file's numbers are. None takes what the
-            file states: "godot" for `.lmbake`, else its `convention`, else the canonical one.
+            file states: "godot" for `.lmbake`, "unity" for `.asset`, else its `convention`, else the canonical one.
 
     Returns:
         The set, repaired as the module's table says.
@@ -302,7 +304,14 @@ def _read_godot(path: Path, key: str | None) -> _Raw:
     return _Raw(position, values, _choose(path, (_POSITION, _SH), key), "godot")
 
 
-_READERS = {".npz": _read_npz, ".json": _read_json, ".lmbake": _read_godot}
+def _read_unity(path: Path, key: str | None) -> _Raw:
+    data = read_lighting_data(path)
+    if not len(data.position):
+        raise WlmError(f"{path}: expected light probes, found none: the scene has no baked LightProbeGroup")
+    return _Raw(data.position, data.values, _choose(path, (_POSITION, _SH), key), "unity")
+
+
+_READERS = {".npz": _read_npz, ".json": _read_json, ".lmbake": _read_godot, ".asset": _read_unity}
 
 
 def _choose(path: Path, names: Sequence[str], key: str | None) -> str:

@@ -136,7 +136,7 @@ def load_scene(
 
     Args:
         scene_path: A `.glb` or `.gltf`.
-        lights_path: A JSON file, `description`; None: the materials' own lightmaps.
+        lights_path: A JSON file or a folder, `description`; None: the materials' own lightmaps.
         uv_set: n of `TEXCOORD_n`, the lightmaps' UVs; None: as the description says, else 1 if any primitive has it,
             else 0.
         trust: Whether the files may name files outside their folders, and draw more than their bytes account for.

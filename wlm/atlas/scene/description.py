@@ -20,7 +20,11 @@ UV * (scale x, y) + (offset x, y). Without `objects` every sheet goes to the mes
     godot    `path`, `slice_index` and `uv_scale` (x, y, width, height) of `LightmapGIData`'s users, v down; of the path
              the last name is the node's.
 
-A `set.json` of `wlm lightmap` does too: one sheet, a state for each time.
+A `.lmbake` of Godot 4 does too: its texture, an EXR beside it, and the rectangles of its users. Of several slices, or
+of directional ones, the texture is a stack that is to be cut first.
+
+A `set.json` of `wlm lightmap` does too: one sheet, a state for each time. Of a folder that has one it is read; of any
+other folder each picture of light in it is a sheet of one state, for the mesh that it fits.
 
 Without a file the materials' own lightmaps are read, `MOZ_lightmap`: each texture is a sheet, `KHR_texture_transform`
 gives the rectangle, `intensity` is a factor, and PNGs are sRGB, as that extension's writers have them.
@@ -37,11 +41,14 @@ from pydantic import BaseModel, ConfigDict, Field
 from wlm.config import check_settings
 from wlm.errors import WlmError
 from wlm.formats.gltf import GltfDocument
+from wlm.formats.godot import GodotUser, read_users
+from wlm.formats.light import SUFFIXES
 from wlm.formats.limits import INDEX_BYTES
 from wlm.formats.reading import named_file, read_json_file
 
 _Four = Annotated[list[float], Field(min_length=4, max_length=4)]
 _MOZ, _TRANSFORM = "MOZ_lightmap", "KHR_texture_transform"
+_SET_FILE = "set.json"
 
 
 class SheetFiles(BaseModel):
@@ -105,11 +112,18 @@ class Description:
 
 
 def read_description(path: str | os.PathLike[str]) -> Description:
-    """Reads the JSON file.
+    """Reads the JSON file, or lists a folder.
 
     Raises:
-        WlmError: One line that names the file and the field.
+        WlmError: One line that names the file and the field; or no picture of light is in the folder.
     """
+    if os.path.isdir(path):
+        folder = Path(path).resolve()
+        if not (folder / _SET_FILE).is_file():
+            return _from_folder(str(path), folder)
+        path = Path(path) / _SET_FILE
+    if os.fspath(path).lower().endswith(".lmbake"):
+        return _from_bake(str(path))
     content = read_json_file(path, "the list of lightmaps", INDEX_BYTES)
     if not isinstance(content, dict):
         raise WlmError(f"{path}: expected an object with sheets, found other JSON")
@@ -216,6 +230,40 @@ def _numbers(value: Any, where: str, keys: tuple[str, ...]) -> list[float]:
     ):
         raise WlmError(f"{where}: expected 4 numbers, found {json.dumps(value)[:60]}")
     return [float(each) for each in value]
+
+
+def _from_bake(path: str) -> Description:
+    """Godot's bake: one texture of one slice, and who reads which part of it."""
+    bake = read_users(path)
+    slices = {user.slice for user in bake.users}
+    if len(bake.textures) != 1 or bake.directional or slices != {0}:
+        raise WlmError(
+            f"{path}: expected one texture of one slice without directions, found {len(bake.textures)} and "
+            f"{len(slices)} slices{' with directions' if bake.directional else ''}: cut the stack, and list the "
+            "parts in JSON"
+        )
+    sheet = SheetFiles(files=[bake.textures[0].replace("\\", "/").rsplit("/", 1)[-1]])
+    objects = tuple(_godot_place(user) for user in bake.users)
+    return Description(path, ("light",), (sheet,), objects, None)
+
+
+def _godot_place(user: GodotUser) -> ObjectPlace:
+    x, y, width, height = user.rectangle
+    return ObjectPlace(node=user.node.rsplit("/", 1)[-1], sheet=0, scale_offset=[width, height, x, y])
+
+
+def _from_folder(where: str, folder: Path) -> Description:
+    """Every picture of light in a folder."""
+    try:
+        names = sorted(entry.name for entry in folder.iterdir() if entry.is_file() and entry.name[0] != ".")
+    except OSError as error:
+        raise WlmError(f"{where}: cannot read: {error.strerror or error}") from error
+    sheets = [
+        SheetFiles(files=[f"{folder.name}/{name}"], name=name) for name in names if name.lower().endswith(SUFFIXES)
+    ]
+    if not sheets:
+        raise WlmError(f"{where}: expected lightmaps ({', '.join(SUFFIXES)}), found none")
+    return Description(str(folder), ("light",), tuple(sheets), None, None)
 
 
 def _from_set(path: str, content: dict[str, Any]) -> Description:

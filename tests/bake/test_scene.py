@@ -1,0 +1,221 @@
+"""What a bake reads: scene files, surfaces, where texels and probes are, where the sun is; none of it needs Mitsuba."""
+
+import json
+import math
+import shutil
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from builders.bake_rooms import ROOM, quad
+from typer.testing import CliRunner
+
+from wlm.bake.daylight import sun_direction
+from wlm.bake.geometry import Geometry, read_geometry
+from wlm.bake.lightmaps import BakedLightmaps, write_lightmaps
+from wlm.bake.probes import BakedProbes, place_probes, write_probes
+from wlm.bake.settings import BakeScene, Lamp, LightmapSettings, ProbeSettings, load_scene
+from wlm.bake.texels import place_texels
+from wlm.bake.work import each_hour, open_checkpoint, open_task
+from wlm.cli import app
+from wlm.errors import WlmError
+from wlm.formats.gltf import read_gltf, vertex_normals
+from wlm.formats.parts import Part
+from wlm.inspection import inspect
+from wlm.lightmap import load
+from wlm.probe.data import load as load_probes
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"hours": []}, "hours"),
+        ({"hours": [3, 3]}, "each once"),
+        ({"hours": [24], "period": 24}, "below the period of 24"),
+        ({"daylight": {}, "sky": {}}, "found both"),
+        ({"lamps": [{"material": "a", "position": [0, 0, 0]}]}, "a position or of a material"),
+        ({"lamps": [{"material": "a", "intensity": [1, 1, 1]}]}, "intensity with a position"),
+        ({"sky": {"radiance": [-1, 0, 0]}}, "sky.radiance"),
+        ({"bounce": 3}, "did you mean 'bounces'"),
+        ({"geometry": "../room.gltf"}, "expected a file within"),
+    ],
+)
+def test_a_wrong_scene_is_refused_in_a_line(tmp_path, change, said):
+    (tmp_path / "a").mkdir()
+    path = tmp_path / "a" / "scene.yaml"
+    path.write_text(json.dumps({"geometry": "room.gltf"} | change))
+    with pytest.raises(WlmError, match="scene.yaml: .*" + said.replace("[", r"\[")):
+        load_scene(path)
+
+
+def test_lamps_are_lit_past_midnight():
+    late, day = (Lamp(material="a", lit=lit) for lit in ((18.0, 5.5), (6.0, 18.0)))
+    assert [late.is_lit(hour) for hour in (17.9, 18.0, 23.0, 0.0, 5.4, 5.5)] == [False, True, True, True, True, False]
+    assert [day.is_lit(hour) for hour in (5.9, 6.0, 17.9, 18.0)] == [False, True, True, False]
+
+
+def test_the_sun_rises_in_the_east_and_is_highest_at_noon():
+    equinox = 81
+    assert sun_direction(6.0, 40.0, equinox) == pytest.approx([1, 0, 0], abs=0.02)
+    noon = sun_direction(12.0, 40.0, equinox)
+    assert noon == pytest.approx([0, math.cos(math.radians(40)), math.sin(math.radians(40))], abs=0.02)
+    assert sun_direction(0.0, 40.0, equinox)[1] < 0
+    # In summer it is 23.44 degrees higher; north turned by 90 degrees from -z lies at -x, and east at -z.
+    assert math.degrees(math.asin(sun_direction(12.0, 40.0, 172)[1])) == pytest.approx(50 + 23.44, abs=0.1)
+    assert sun_direction(6.0, 40.0, equinox, north=90.0) == pytest.approx([0, 0, -1], abs=0.02)
+    assert sun_direction(5.0, 40.0, equinox, period=10.0) == pytest.approx(noon)
+
+
+def test_texels_lie_on_their_surface():
+    floor = quad([1, 2, 3], [4, 0, 0], [0, 0, -2], uv=[(0.25, 0.25), (1, 0.25), (1, 0.75), (0.25, 0.75)])
+    texels = place_texels("here", [floor], 8, 4)
+    assert len(texels.index) == 6 * 4 and (texels.coverage == 1).all() and (np.diff(texels.first) == 16).all()
+    row, column = np.divmod(texels.index, 8)
+    middle = np.add.reduceat(texels.position, texels.first[:-1]) / 16
+    u, v = (column + 0.5) / 8, (row + 0.5) / 8
+    assert middle == pytest.approx(
+        np.stack([1 + (u - 0.25) / 0.75 * 4, 2 + 0 * u, 3 - (v - 0.25) / 0.5 * 2], 1), abs=1e-5
+    )
+    assert (texels.normal == [0, 1, 0]).all() and (texels.face == [0, 1, 0]).all()
+    assert (texels.image(texels.coverage) > 0).sum() == 24
+    # A chart that ends within a texel covers a part of it.
+    part = place_texels("here", [replace(floor, uv=np.array([(0, 0), (0.1875, 0), (0.1875, 1), (0, 1)]))], 8, 4)
+    assert part.coverage.reshape(8, 2) == pytest.approx(np.tile([1.0, 0.5], (8, 1)))
+
+
+def test_normals_on_the_wrong_side_are_the_triangles_own():
+    floor = quad([0, 0, 0], [1, 0, 0], [0, 0, -1])
+    turned = replace(floor, normal=np.array([[0, 1, 0], [0, -1, 0], [0, 0, 0], [0.6, 0.8, 0]]))
+    normal = place_texels("here", [turned], 8, 1).normal
+    assert (normal[:, 1] > 0.7).all() and np.linalg.norm(normal, axis=1) == pytest.approx(1, abs=1e-5)
+
+
+def test_charts_on_each_other_are_refused():
+    floor = quad([0, 0, 0], [1, 0, 0], [0, 0, -1])
+    with pytest.raises(WlmError, match="room: lightmap UVs: 100% .* lightmap.unwrap: true"):
+        place_texels("room", [floor, quad([0, 1, 0], [1, 0, 0], [0, 0, -1])], 16, 2)
+    with pytest.raises(WlmError, match="room: expected surfaces with lightmap UVs"):
+        place_texels("room", [replace(floor, uv=None)], 16, 2)
+
+
+def test_new_uvs_are_even_and_apart(tmp_path):
+    pytest.importorskip("uvunwrap")
+    settings = LightmapSettings(resolution=128, unwrap=True)
+    geometry = read_geometry(ROOM / "room.gltf", settings)
+    texels = place_texels("room", geometry.surfaces, 128, 4)
+    scale = []
+    for surface in geometry.surfaces:
+        a, b, c = surface.position[surface.triangle].transpose(1, 0, 2)
+        world = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+        p, q, r = surface.uv[surface.triangle].transpose(1, 0, 2)
+        chart = np.abs((q - p)[:, 0] * (r - p)[:, 1] - (q - p)[:, 1] * (r - p)[:, 0])
+        scale += (chart / world).tolist()
+    assert max(scale) < 1.3 * min(scale) and texels.coverage.sum() > 0.3 * 128**2
+    with pytest.raises(WlmError, match="room.gltf: expected TEXCOORD_1|room.gltf: expected TEXCOORD_0"):
+        read_geometry(ROOM / "room.gltf", LightmapSettings())
+
+
+def test_normals_turn_with_their_node(tmp_path):
+    content = json.loads((ROOM / "room.gltf").read_text())
+    content["nodes"][0] |= {"scale": [-1, 2, 0.5], "rotation": [0, math.sin(0.4), 0, math.cos(0.4)]}
+    path = tmp_path / "room.gltf"
+    path.write_text(json.dumps(content))
+    document, primitives = read_gltf(path)
+    for primitive, normal in zip(primitives, vertex_normals(document, primitives), strict=True):
+        a, b, c = primitive.position[primitive.triangle].transpose(1, 0, 2)
+        face = np.cross(b - a, c - a)
+        face /= np.linalg.norm(face, axis=1, keepdims=True)
+        # The node mirrors: the file's winding is the other way round.
+        assert np.einsum("fk,fck->fc", face, normal[primitive.triangle]) == pytest.approx(-1, abs=1e-4)
+    surfaces = read_geometry(path, None).surfaces
+    a, b, c = surfaces[0].position[surfaces[0].triangle].transpose(1, 0, 2)
+    assert (np.einsum("fk,fk->f", np.cross(b - a, c - a), surfaces[0].normal[surfaces[0].triangle[:, 0]]) > 0).all()
+
+
+def test_probes_in_a_lattice_and_on_surfaces():
+    geometry = Geometry(None, (quad([0, 0, 0], [4, 0, 0], [0, 0, -2]), quad([0, 3, 0], [1, 0, 0], [0, 0, -1])), ())
+    lattice = place_probes(ProbeSettings(spacing=1.0), geometry)
+    assert len(lattice) == 4 * 3 * 2 and lattice.min(0).tolist() == [0.5, 0.5, -1.5]
+    on = place_probes(ProbeSettings(spacing=0.25, surfaces=True, lift=0.1), geometry)
+    low = np.isclose(on[:, 1], 0.1)
+    assert len(on) == 9 * 16 and low.sum() == 8 * 16 and np.isclose(on[~low, 1], 3.1).all()
+    with pytest.raises(WlmError, match="probes.spacing: expected at most 1,048,576"):
+        place_probes(ProbeSettings(spacing=0.001), geometry)
+
+
+def test_finished_hours_are_kept(tmp_path):
+    shutil.copytree(ROOM, tmp_path / "room")
+    task = open_task(tmp_path / "room" / "room.yaml")
+    table, made = {"light": Part(np.float32, (1,))}, []
+
+    def make(hour, report):
+        if len(made) == 2:
+            raise KeyboardInterrupt
+        made.append(hour)
+        return {"light": np.full(1, hour, np.float32)}
+
+    output = tmp_path / "set"
+    with pytest.raises(KeyboardInterrupt):
+        each_hour([6, 12, 18], open_checkpoint(output, task, "lightmaps", "cpu"), table, make, None)
+    made.clear()
+    results = each_hour([6, 12, 18], open_checkpoint(output, task, "lightmaps", "cpu", resume=True), table, make, None)
+    assert made == [18] and [float(each["light"][0]) for each in results] == [6, 12, 18]
+    changed = replace(task, scene=task.scene.model_copy(update={"samples": 8}))
+    with pytest.raises(WlmError, match="set.partial: a checkpoint of another"):
+        open_checkpoint(output, changed, "lightmaps", "cpu", resume=True)
+
+
+def test_what_is_written_is_a_set(tmp_path):
+    shutil.copytree(ROOM, tmp_path / "room")
+    task = open_task(tmp_path / "room" / "room.yaml")
+    geometry = read_geometry(task.geometry, None)
+    generator, mask = np.random.default_rng(0), np.zeros((16, 16), bool)
+    mask[:8] = True
+    light = generator.random((2, 16, 16, 3)).astype(np.float16)
+    baked = BakedLightmaps((6.5, 18.0), light, light * 0.01, mask, mask * 1.0, mask * 0.0, geometry)
+    files = write_lightmaps(tmp_path / "set", task, baked)
+    assert {path.name for path in files} == {path.name for path in (tmp_path / "set").iterdir()}
+    lightmaps = load(tmp_path / "set")
+    assert lightmaps.times.tolist() == [6.5, 18.0] and lightmaps.period == 24.0 and (lightmaps.mask == mask).all()
+    assert (lightmaps.frames == light).all() and lightmaps.mesh.is_file()
+    assert baked.error == pytest.approx([0.01, 0.01], rel=0.01)
+    told = inspect(tmp_path / "set")
+    assert len(told) == 1 and told[0].command.startswith("wlm lightmap compress")
+    # A second bake of one hour replaces it all.
+    write_lightmaps(tmp_path / "set", task, replace(baked, hours=(7.0,), light=light[:1], noise=light[:1]))
+    assert not (tmp_path / "set" / "light_18h.exr").exists()
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "mine").write_text("")
+    with pytest.raises(WlmError, match="found other files"):
+        write_lightmaps(tmp_path / "other", task, baked)
+
+
+def test_probes_of_several_hours_have_their_keys(tmp_path):
+    values = np.random.default_rng(0).random((2, 5, 9, 3)).astype(np.float32)
+    position = np.random.default_rng(1).random((5, 3)).astype(np.float32)
+    write_probes(tmp_path / "p.npz", BakedProbes((6.0, 18.5), position, values, values))
+    assert (load_probes(tmp_path / "p.npz", key="18.5").values == values[1].reshape(5, 27)).all()
+
+
+def test_without_the_extra_a_line_says_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "mitsuba", None)
+    shutil.copytree(ROOM, tmp_path / "room")
+    for what, output in (("lightmaps", "set"), ("probes", "p.npz")):
+        run = CliRunner().invoke(
+            app, ["bake", what, str(tmp_path / "room" / "room.yaml"), "-o", str(tmp_path / output)]
+        )
+        assert run.exit_code == 2 and "mitsuba is missing" in run.stderr and "pip install 'wlm[bake]'" in run.stderr
+        assert run.stderr.count("\n") == 1 and not (tmp_path / output).exists()
+
+
+def test_the_demo_scene_is_of_all_parts():
+    scene, geometry, picture = load_scene(ROOM / "room.yaml")
+    assert isinstance(scene, BakeScene) and geometry.is_file() and picture is None
+    assert {each.material.name for each in read_geometry(geometry, None).surfaces} == {
+        "white",
+        "red",
+        "green",
+        "lamp",
+        "box",
+    }

@@ -1,0 +1,127 @@
+"""Unity's lighting data: probes and rectangles by the layout that UnityPy gives, and what is said of others."""
+
+import struct
+import sys
+import tracemalloc
+from types import ModuleType
+
+import numpy as np
+import pytest
+from builders import unity_assets
+from builders.unity_assets import lighting, node, probes
+
+from wlm.errors import WlmError
+from wlm.formats import unity_asset
+from wlm.formats.unity_asset import read_lighting_data
+from wlm.inspection import inspect
+from wlm.probe.conventions import from_canonical
+from wlm.probe.data import load
+
+PLACES = np.array([[1.0, 2, 3], [4, 5, 6]])
+SH = np.arange(2 * 9 * 3, dtype=float).reshape(2, 9, 3) / 128 + 1.0
+RECTANGLE = (0.5, 0.25, 0.125, 0.0)
+
+
+@pytest.fixture
+def unity(monkeypatch, tmp_path):
+    """Writes a file in which UnityPy finds some objects."""
+    monkeypatch.setitem(sys.modules, "UnityPy", ModuleType("UnityPy"))
+
+    def give(*objects):
+        monkeypatch.setattr(unity_asset, "list_objects", lambda path, data: list(objects))
+        path = tmp_path / "LightingData.asset"
+        path.write_bytes(b"".join(each[2] for each in objects) or b"none")
+        return path
+
+    return give
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_probes(unity, order):
+    path = unity(probes(PLACES, SH, order), ("LightingDataAssetParent", None, b"", "<"))
+    data = read_lighting_data(path)
+    assert (data.values == SH).all() and (data.position == PLACES).all() and not data.rectangles
+    assert from_canonical(load(path).values.reshape(2, 9, 3), "unity") == pytest.approx(SH, rel=1e-6)
+
+
+def test_rectangles_are_counted_and_probes_have_their_command(unity):
+    path = unity(probes(PLACES, SH), lighting([(0, RECTANGLE), (65535, RECTANGLE), (1, RECTANGLE)]))
+    rectangles = read_lighting_data(path).rectangles
+    assert [(each.lightmap, each.scale_offset) for each in rectangles] == [(0, RECTANGLE), (1, RECTANGLE)]
+    found = inspect(path)[0]
+    assert "2 light probes of 9 RGB coefficients" in found.what and "2 renderers' rectangles" in found.what
+    assert found.command == f"wlm probe compress {path} -o OUT.wlm"
+
+
+def test_what_has_no_probes_says_so(unity):
+    path = unity(lighting([(0, RECTANGLE)]))
+    assert "no light probes" in inspect(path)[0].what
+    with pytest.raises(WlmError, match="LightingData.asset: expected light probes, found none"):
+        load(path)
+
+
+def cut(item, size):
+    return (item[0], item[1], item[2][:size], item[3])
+
+
+@pytest.mark.parametrize(
+    ("objects", "said"),
+    [
+        ([("Texture2D", None, b"", "<")], "found neither"),
+        ([probes(PLACES, SH[:1])], "light for each of 2 probes, found that of 1"),
+        ([cut(probes(PLACES, SH), -1)], "damaged, or of a version .*: expected 216 bytes"),
+        ([("LightProbes", node("LightProbes", "Base"), b"", "<")], "m_BakedCoefficients is missing"),
+        ([("LightProbes", None, b"", "<")], "layout of its objects isn't in the file"),
+        ([("LightingDataAsset", unity_assets.LIGHTING, struct.pack("<2i", 0, -1), "<")], "array of -1 values"),
+    ],
+)
+def test_others_are_refused(unity, objects, said):
+    path = unity(*objects)
+    with pytest.raises(WlmError, match=said):
+        read_lighting_data(path)
+
+
+def test_no_room_is_made_for_what_a_file_claims(unity):
+    kind, tree, content, order = probes(PLACES, SH)
+    many = struct.pack("<i", 2**31 - 1)
+    # So many bytes of a name; so many arrays of none, each of which takes four bytes.
+    for damaged in (many + content[4:], content[:12] + many + bytes(1 << 23)):
+        path = unity((kind, tree, damaged, order))
+        tracemalloc.start()
+        with pytest.raises(WlmError, match="damaged, or of a version"):
+            read_lighting_data(path)
+        assert tracemalloc.get_traced_memory()[1] < 5e7
+        tracemalloc.stop()
+
+
+def test_text_and_bundles_are_named(unity):
+    path = unity()
+    for head, said in ((b"%YAML 1.1\n", "found YAML"), (b"UnityFS\0", "found an asset bundle")):
+        path.write_bytes(head)
+        with pytest.raises(WlmError, match=said):
+            read_lighting_data(path)
+
+
+def test_without_the_extra(monkeypatch, tmp_path):
+    path = tmp_path / "LightingData.asset"
+    path.write_bytes(bytes(64))
+    monkeypatch.setitem(sys.modules, "UnityPy", None)
+    with pytest.raises(WlmError, match="UnityPy is missing; needs the extra: pip install 'wlm\\[unity\\]'"):
+        load(path)
+    assert inspect(path)[0].problems == ("unity: UnityPy is missing; needs the extra: pip install 'wlm[unity]'",)
+
+
+def test_a_reader_that_ends_is_told(tmp_path, monkeypatch):
+    path, child = tmp_path / "LightingData.asset", tmp_path / "child.py"
+    path.write_bytes(bytes(64))
+    monkeypatch.setitem(sys.modules, "UnityPy", ModuleType("UnityPy"))
+    monkeypatch.setattr(unity_asset.unity_child, "__file__", str(child))
+    for program, said in (
+        ("import os; os.abort()", "UnityPy crashed"),
+        ("raise EOFError('no more')", "EOFError: no more"),
+        ("print('[]')", "found neither"),
+        ('print(\'[["LightProbes", [], 60, 8, "<"]]\')', "an object of 8 bytes at 60 in a file of 64"),
+    ):
+        child.write_text(program)
+        with pytest.raises(WlmError, match=said):
+            read_lighting_data(path)

@@ -1,0 +1,23 @@
+"""Makes the inputs of the systems: lightmaps and probes over the day by Mitsuba 3, six-way lightmaps by our tracer.
+
+The extra `bake` brings Mitsuba, which on the CPU needs LLVM 16 or later. The page is docs/bake.md.
+"""
+
+from wlm._facade import facade
+
+_PLACES = {
+    "BakeScene": "wlm.bake.settings",
+    "SixWayScene": "wlm.bake.sixway",
+    "bake_lightmaps": "wlm.bake.lightmaps",
+    "bake_probes": "wlm.bake.probes",
+    "bake_sixway": "wlm.bake.sixway",
+    "load_sixway": "wlm.bake.sixway",
+    "open_checkpoint": "wlm.bake.work",
+    "open_task": "wlm.bake.work",
+    "write_lightmaps": "wlm.bake.lightmaps",
+    "write_probes": "wlm.bake.probes",
+}
+
+__all__ = sorted(_PLACES)
+
+__getattr__, __dir__ = facade(__name__, _PLACES)

@@ -1,0 +1,77 @@
+"""Mitsuba and the compiler that it needs: found, or what to install in one line."""
+
+import contextlib
+import ctypes
+import os
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+
+from wlm.errors import WlmError
+from wlm.formats.hdr_blocks import need
+
+_EXTRA = "bake"
+_VARIANTS = {"cpu": "llvm_ad_rgb", "cuda": "cuda_ad_rgb"}
+_MAPS = Path("/proc/self/maps")
+_CHATTER = (b"jit_find_library", b"jitc_llvm_")
+_STDERR = 2
+_INSTALL = "install LLVM 16 or later (apt install libllvm19, for example), or name its library in DRJIT_LIBLLVM_PATH"
+
+
+def start(device: str = "cpu") -> ModuleType:
+    """Imports Mitsuba and chooses its variant.
+
+    Args:
+        device: "cpu" or "cuda"; Mitsuba takes the first GPU.
+
+    Returns:
+        The module `mitsuba`.
+
+    Raises:
+        WlmError: A package, LLVM or a GPU is missing; the line says what to install.
+    """
+    if device not in _VARIANTS:
+        raise WlmError(f"device: expected cpu or cuda, the first GPU, for a bake, got {device}")
+    with _without_chatter():
+        mitsuba, drjit = need("mitsuba", _EXTRA), need("drjit", _EXTRA)
+        has_llvm = drjit.has_backend(drjit.JitBackend.LLVM)
+    if device == "cpu":
+        if not has_llvm:
+            raise WlmError(f"{_EXTRA}: LLVM is missing, with which Mitsuba compiles for the CPU: {_INSTALL}")
+        if (path := _old_llvm()) is not None:
+            # It would end the process where it meets an instruction that it doesn't know.
+            raise WlmError(f"{_EXTRA}: {path} is older than what Mitsuba's kernels need: {_INSTALL}")
+    elif not drjit.has_backend(drjit.JitBackend.CUDA):
+        raise WlmError(f"{_EXTRA}: Mitsuba finds no NVIDIA GPU, or no OptiX in its driver: take --device cpu")
+    mitsuba.set_variant(_VARIANTS[device])
+    return mitsuba
+
+
+@contextlib.contextmanager
+def _without_chatter() -> Iterator[None]:
+    """Drops what Dr.Jit's C library prints where it finds no LLVM; other lines are passed on."""
+    with tempfile.TemporaryFile() as sink:
+        sys.stderr.flush()
+        saved = os.dup(_STDERR)
+        os.dup2(sink.fileno(), _STDERR)
+        try:
+            yield
+        finally:
+            os.dup2(saved, _STDERR)
+            sink.seek(0)
+            for line in sink.read().splitlines(keepends=True):
+                if not line.startswith(_CHATTER):
+                    os.write(saved, line)
+            os.close(saved)
+
+
+def _old_llvm() -> str | None:
+    """The library of LLVM that is loaded, where it is older than 16: from then on it tells its version."""
+    try:
+        lines = _MAPS.read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:  # elsewhere than on Linux nothing tells which one it is
+        return None
+    paths = dict.fromkeys(line.split(maxsplit=5)[-1] for line in lines if "libLLVM" in line)
+    return next((path for path in paths if not hasattr(ctypes.CDLL(path), "LLVMGetVersion")), None)

@@ -1,0 +1,33 @@
+"""Where the sun is at an hour."""
+
+import math
+
+import numpy as np
+
+_OBLIQUITY = math.radians(23.44)
+_SOLSTICE = 10  # days from December's solstice to the year's end
+_YEAR = 365.25
+
+
+def sun_direction(hour: float, latitude: float, day: int, north: float = 0.0, period: float = 24.0) -> np.ndarray:
+    """The direction to the sun, float64 [3], of unit length, y up; y < 0 at night.
+
+    The orbit is a circle and noon is when the sun is highest: right to 2 degrees.
+
+    Args:
+        hour: Of the sun: it is highest at half the period.
+        latitude: Degrees.
+        day: Of the year.
+        north: Degrees by which north is turned from -z towards -x.
+        period: Hours of a day.
+    """
+    declination = math.asin(-math.sin(_OBLIQUITY) * math.cos(2.0 * math.pi * (day + _SOLSTICE) / _YEAR))
+    angle = 2.0 * math.pi * hour / period - math.pi  # 0 at noon, negative before it
+    phi, turn = math.radians(latitude), math.radians(north)
+    east = -math.cos(declination) * math.sin(angle)
+    up = math.sin(phi) * math.sin(declination) + math.cos(phi) * math.cos(declination) * math.cos(angle)
+    northward = math.cos(phi) * math.sin(declination) - math.sin(phi) * math.cos(declination) * math.cos(angle)
+    # Unturned, east is +x and north is -z.
+    x = east * math.cos(turn) - northward * math.sin(turn)
+    z = -east * math.sin(turn) - northward * math.cos(turn)
+    return np.array([x, up, z])

@@ -1,0 +1,306 @@
+"""A scene's surfaces: triangles in the world with normals, lightmap UVs and materials; new UVs where that is wanted."""
+
+import copy
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from wlm.bake.settings import LightmapSettings
+from wlm.errors import WlmError, one_line
+from wlm.formats.gltf import GltfDocument, GltfPrimitive, read_gltf, reported, vertex_normals
+from wlm.formats.gltf_container import local_file
+from wlm.formats.gltf_writer import Replacement
+from wlm.formats.hdr_blocks import need
+from wlm.formats.limits import MESH_BYTES
+from wlm.formats.reading import read_file
+
+_UNWRAPPED = 1  # n of the new `TEXCOORD_n`
+_MOST_IMAGE = 1 << 26  # pixels
+_BRIGHTEST = 0.99  # albedo: of more, light would stay in a closed room for ever
+
+
+@dataclass(frozen=True, eq=False)
+class Material:
+    """What a surface does with light: all that it reflects is diffuse.
+
+    Attributes:
+        name: For lamps; "" where it has none.
+        colour: Linear RGB albedo, a factor of the texture's where there is one.
+        texture: Linear RGB albedo, float32 [H, W, 3], or None.
+        uv_set: n of the texture's `TEXCOORD_n`.
+        emission: Radiance on the front, RGB.
+        double: Whether the back reflects as well; otherwise it absorbs all light.
+    """
+
+    name: str = ""
+    colour: tuple[float, float, float] = (0.8, 0.8, 0.8)
+    texture: np.ndarray | None = None
+    uv_set: int = 0
+    emission: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    double: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Triangles of one material.
+
+    Attributes:
+        position: float64 [V, 3], in the world.
+        triangle: int32 [F, 3]; counter-clockwise as seen from the front.
+        normal: float64 [V, 3], of unit length, for shading; 0 where the file has none.
+        uv: float64 [V, 2], the lightmap's, or None: it has none and isn't baked.
+        texture_uv: float32 [V, 2] of the material's texture, or None.
+        material: The material.
+    """
+
+    position: np.ndarray
+    triangle: np.ndarray
+    normal: np.ndarray
+    uv: np.ndarray | None
+    texture_uv: np.ndarray | None
+    material: Material
+
+
+@dataclass(frozen=True, eq=False)
+class Geometry:
+    """The surfaces of a glTF file.
+
+    Attributes:
+        document: The file, in which new UVs would go.
+        surfaces: In the order of the file.
+        replacements: Of an unwrapped file: what `write_glb` needs; otherwise empty.
+        uv_set: n of `TEXCOORD_n`, the lightmap's; None: it wasn't asked for.
+        usual: Whether that is the set that readers take by themselves: 1 where there is one, else 0.
+    """
+
+    document: GltfDocument
+    surfaces: tuple[Surface, ...]
+    replacements: tuple[Replacement, ...]
+    uv_set: int | None = None
+    usual: bool = True
+
+    @property
+    def box(self) -> tuple[np.ndarray, np.ndarray]:
+        """The lowest and the highest corner, float64 [3] each."""
+        used = np.concatenate([each.position[each.triangle.reshape(-1)] for each in self.surfaces])
+        return used.min(0), used.max(0)
+
+
+def read_geometry(path: Path, settings: LightmapSettings | None, trust: bool = False) -> Geometry:
+    """Reads a glTF file.
+
+    Args:
+        path: The file.
+        settings: Which lightmap UVs, or how to make them; None: none are needed.
+        trust: Whether it may name files outside its folder.
+
+    Raises:
+        WlmError: It can't be read, has no triangle with area, or lacks the lightmap's UVs.
+    """
+    document, primitives = read_gltf(path, trust)
+    for each in primitives:
+        if not np.isfinite(each.position).all():
+            raise WlmError(f"{path}: {each.name}: expected finite positions, found NaN or infinity")
+    replacements: list[Replacement] = []
+    number, usual = None, True
+    if settings is not None and settings.unwrap:
+        with reported(document.path):
+            document, primitives = _without_lightmap(document, primitives)
+        replacements = unwrap(document, primitives, settings)
+        number = _UNWRAPPED
+    elif settings is not None:
+        sets = {each for one in primitives for each in one.uv}
+        own = 1 if 1 in sets else 0
+        number = own if settings.uv_set is None else settings.uv_set
+        usual = number == own
+        if number not in sets:
+            raise WlmError(f"{path}: expected TEXCOORD_{number}, the lightmap's UVs: lightmap.unwrap: true makes some")
+    cache: dict[int | None, Material] = {}
+    surfaces = []
+    normals = vertex_normals(document, primitives)
+    new = {(each.primitive.node, each.primitive.primitive): each for each in replacements}
+    for each, normal in zip(primitives, normals, strict=True):
+        if each.material not in cache:
+            with reported(document.path):
+                cache[each.material] = _material(document, each.material)
+        made = new.get((each.node, each.primitive))
+        gather = np.arange(len(each.position)) if made is None else made.gather
+        triangle = each.triangle if made is None else made.triangle
+        uv = each.uv.get(number) if made is None and number is not None else (None if made is None else made.uv)
+        surface = _surface(each, gather, triangle, normal, uv, cache[each.material])
+        if len(surface.triangle):
+            surfaces.append(surface)
+    if not surfaces:
+        raise WlmError(f"{path}: expected triangles with area, found none")
+    return Geometry(document, tuple(surfaces), tuple(replacements), number, usual)
+
+
+def _surface(
+    primitive: GltfPrimitive,
+    gather: np.ndarray,
+    triangle: np.ndarray,
+    normal: np.ndarray | None,
+    uv: np.ndarray | None,
+    material: Material,
+) -> Surface:
+    """Triangles with area, whose front is where their normals point."""
+    position = primitive.position[gather]
+    triangle = np.asarray(triangle, np.int32)
+    a, b, c = position[triangle].transpose(1, 0, 2)
+    face = np.cross(b - a, c - a)
+    kept = np.linalg.norm(face, axis=1) > 0
+    triangle, face = triangle[kept], face[kept]
+    normal = np.zeros_like(position) if normal is None else normal[gather]
+    # A node that mirrors turns the winding round, and not the normals.
+    if len(face) and float(np.einsum("fk,fk->", face, normal[triangle].sum(1))) < 0:
+        triangle = triangle[:, [0, 2, 1]]
+    if uv is not None:
+        uv = np.asarray(uv, np.float64)
+        if not np.isfinite(uv).all():
+            raise WlmError(f"{primitive.name}: expected finite lightmap UVs, found NaN or infinity")
+    texture_uv = None
+    if material.texture is not None:
+        texture_uv = primitive.uv.get(material.uv_set)
+        texture_uv = None if texture_uv is None else texture_uv[gather]
+    return Surface(position, triangle, normal, uv, texture_uv, material)
+
+
+def unwrap(
+    document: GltfDocument, primitives: Sequence[GltfPrimitive], settings: LightmapSettings
+) -> list[Replacement]:
+    """Makes UVs of one square for all primitives together, in proportion to their size in the world.
+
+    Args:
+        document: For messages.
+        primitives: Without the UV set that is made.
+        settings: Resolution and padding.
+
+    Returns:
+        A replacement for each primitive that has a triangle with area, its UVs in [0, 1].
+
+    Raises:
+        WlmError: uvunwrap is missing, or fails.
+    """
+    uvunwrap = need("uvunwrap", "bake")
+    meshes, kept = [], []
+    for each in primitives:
+        a, b, c = each.position[each.triangle].transpose(1, 0, 2)
+        area = np.linalg.norm(np.cross(b - a, c - a), axis=1) > 0
+        if area.any():
+            kept.append((each, np.flatnonzero(area)))
+            # About their own middle: float32 has few digits far from the origin.
+            local = (each.position - each.position.mean(0)).astype(np.float32)
+            meshes.append(uvunwrap.Mesh(local, each.triangle[area].astype(np.uint32)))
+    if not meshes:
+        raise WlmError(f"{document.path}: expected triangles with area, found none")
+    try:
+        atlas = uvunwrap.generate(meshes, page_size=settings.resolution, padding=settings.padding)
+    except uvunwrap.UnwrapError as error:
+        raise WlmError(f"{document.path}: uvunwrap: {one_line(error)}") from error
+    if atlas.page_count != 1 or max(atlas.width, atlas.height) > settings.resolution:
+        raise WlmError(
+            f"{document.path}: the charts don't fit on {settings.resolution} texels: use more, or less padding"
+        )
+    scale = np.array([atlas.width, atlas.height]) / settings.resolution
+    replacements = []
+    for (primitive, numbers), mesh in zip(kept, atlas.meshes, strict=True):
+        corner = np.asarray(mesh.corner_uvs, np.float64).reshape(-1, 2) * scale
+        vertex = primitive.triangle[numbers].reshape(-1)
+        # A vertex for each place of each old one.
+        rows = np.column_stack([vertex.astype(np.float64), corner])
+        unique, index = np.unique(rows, axis=0, return_inverse=True)
+        replacements.append(
+            Replacement(
+                primitive,
+                unique[:, 0].astype(np.int64),
+                index.reshape(-1, 3).astype(np.int32),
+                unique[:, 1:],
+            )
+        )
+    return replacements
+
+
+def _without_lightmap(
+    document: GltfDocument, primitives: Sequence[GltfPrimitive]
+) -> tuple[GltfDocument, list[GltfPrimitive]]:
+    """A copy without the UV sets from 1 on: they are an old lightmap's, and in the new one's place.
+
+    Raises:
+        WlmError: A texture reads `TEXCOORD_1` or later.
+    """
+    content = copy.deepcopy(document.content)
+    for material in content.get("materials", []):
+        if used := [one for one in _texture_sets(material) if one >= _UNWRAPPED]:
+            raise WlmError(
+                f"{document.path}: a texture reads TEXCOORD_{used[0]}, where the lightmap's new UVs would go"
+            )
+    for mesh in content.get("meshes", []):
+        for primitive in mesh["primitives"]:
+            for name in [name for name in primitive["attributes"] if name.startswith("TEXCOORD_")]:
+                if name != "TEXCOORD_0":
+                    del primitive["attributes"][name]
+    uvs = [replace(each, uv={n: uv for n, uv in each.uv.items() if n < _UNWRAPPED}) for each in primitives]
+    return replace(document, content=content), uvs
+
+
+def _texture_sets(value: Any) -> list[int]:
+    """The UV sets that a material's textures read."""
+    if isinstance(value, list):
+        return [one for each in value for one in _texture_sets(each)]
+    if not isinstance(value, dict):
+        return []
+    inner = [one for each in value.values() for one in _texture_sets(each)]
+    return inner + ([value["texCoord"]] if isinstance(value.get("texCoord"), int) else [])
+
+
+def _material(document: GltfDocument, number: int | None) -> Material:
+    """A material as a diffuse one: of metal, whose base colour is that of its reflections, too."""
+    if number is None:
+        return Material()
+    content = document.item("materials", number)
+    surface = content.get("pbrMetallicRoughness", {})
+    factor = np.clip(np.array(surface.get("baseColorFactor", (1.0, 1.0, 1.0, 1.0)), np.float64)[:3], 0.0, _BRIGHTEST)
+    strength = float(
+        content.get("extensions", {}).get("KHR_materials_emissive_strength", {}).get("emissiveStrength", 1.0)
+    )
+    emission = np.array(content.get("emissiveFactor", (0.0, 0.0, 0.0)), np.float64) * strength
+    if emission.shape != (3,) or not ((emission >= 0) & np.isfinite(emission)).all() or factor.shape != (3,):
+        raise WlmError(f"{document.path}: materials[{number}]: expected colours of three numbers, not negative")
+    texture, uv_set = None, 0
+    if "baseColorTexture" in surface:
+        texture = _texture(document, surface["baseColorTexture"]["index"])
+        uv_set = surface["baseColorTexture"].get("texCoord", 0)
+    return Material(
+        str(content.get("name", "")),
+        tuple(map(float, factor)),
+        texture,
+        uv_set,
+        tuple(map(float, emission)),
+        bool(content.get("doubleSided", False)),
+    )
+
+
+def _texture(document: GltfDocument, number: int) -> np.ndarray:
+    """An image as linear light, float32 [H, W, 3]."""
+    where = f"{document.path}: textures[{number}]"
+    image = document.item("images", document.item("textures", number).get("source"))
+    if "bufferView" in image:
+        view = document.item("bufferViews", image["bufferView"])
+        start = view.get("byteOffset", 0)
+        data = bytes(document.buffers[view["buffer"]][start : start + view["byteLength"]])
+    else:
+        file = local_file(document.path, image["uri"], where, document.trust)
+        data = read_file(file, MESH_BYTES, where)
+    try:
+        with Image.open(io.BytesIO(data), formats=["PNG", "JPEG", "WEBP"]) as picture:
+            if picture.width * picture.height > _MOST_IMAGE:
+                raise WlmError(f"{where}: expected at most {_MOST_IMAGE:,} pixels")
+            pixels = np.asarray(picture.convert("RGB"), np.float32) / np.float32(255.0)
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise WlmError(f"{where}: expected a PNG, JPEG or WebP image: {one_line(error)}") from error
+    return np.where(pixels <= 0.04045, pixels / 12.92, ((pixels + 0.055) / 1.055) ** 2.4).astype(np.float32)

@@ -1,0 +1,221 @@
+"""Lightmaps over the hours of a scene: irradiance at texels, its noise, what is covered, and the set's list."""
+
+import json
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from wlm.bake.backend import start
+from wlm.bake.geometry import Geometry, read_geometry
+from wlm.bake.texels import Texels, place_texels
+from wlm.bake.work import Task, each_hour
+from wlm.errors import WlmError, one_line
+from wlm.formats.checkpoint import Checkpoint
+from wlm.formats.exr import HALF_MAX, write_exr
+from wlm.formats.exr_file import read_part, write_part
+from wlm.formats.folder import claim, compact_json, staged
+from wlm.formats.gltf_writer import write_glb
+from wlm.formats.hdr_blocks import need
+from wlm.formats.mask import write_mask
+from wlm.formats.parts import Part
+from wlm.system import OnProgress
+from wlm.texels import fill_gaps
+
+INDEX = "bake.json"
+FORMAT = "wlm-bake"
+_VERSION = 1
+SET_FILE = "set.json"
+_MESH, _MASK, _COVERAGE = "scene.glb", "mask.png", "coverage.exr"
+_NOISE = "noise"  # begins the names of pictures of the noise
+_HIDDEN = 0.5  # share of rays that hit backs: of more, the place is within an object
+_ABOUT = (
+    "set.json lists the lightmaps. noise_*.exr: the standard error of each texel before denoising, as noise.R, noise.G "
+    "and noise.B. coverage.exr: coverage, the share of a texel that is on a surface, and back, the share of "
+    "rays that hit backs: above one half the texel is within an object, and has its neighbours' light."
+)
+
+
+@dataclass(frozen=True, eq=False)
+class BakedLightmaps:
+    """Lightmaps over time.
+
+    Attributes:
+        hours: Rising.
+        light: float16 [T, H, W, 3], irradiance; texels outside the mask have the nearest valid one's.
+        noise: float16 [T, H, W, 3], its standard error, 0 outside the charts.
+        mask: bool [H, W].
+        coverage: float32 [H, W], the share of each texel that is on a surface.
+        back: float32 [H, W], the share of rays that hit backs.
+        geometry: The surfaces, with their lightmap UVs.
+    """
+
+    hours: tuple[float, ...]
+    light: np.ndarray
+    noise: np.ndarray
+    mask: np.ndarray
+    coverage: np.ndarray
+    back: np.ndarray
+    geometry: Geometry
+
+    @property
+    def error(self) -> list[float]:
+        """For each hour the root of the mean square of the noise over that of the light; 0 where all is dark."""
+        shares = []
+        for light, noise in zip(self.light, self.noise, strict=True):
+            power = float(np.square(light[self.mask].astype(np.float64)).mean())
+            shares.append(
+                (float(np.square(noise[self.mask].astype(np.float64)).mean()) / power) ** 0.5 if power else 0.0
+            )
+        return shares
+
+
+def bake_lightmaps(
+    task: Task,
+    *,
+    device: str = "cpu",
+    checkpoint: Checkpoint | None = None,
+    progress: OnProgress | None = None,
+) -> BakedLightmaps:
+    """Bakes the lightmap of a scene at each of its hours.
+
+    All hours have the same random numbers: what noise is left doesn't flicker between them.
+
+    Args:
+        task: From `wlm.bake.work.open_task`.
+        device: "cpu" or "cuda".
+        checkpoint: From `wlm.bake.work.open_checkpoint`, or None.
+        progress: Called from time to time.
+
+    Raises:
+        WlmError: Mitsuba, LLVM or a GPU is missing, the geometry can't be read, lacks lightmap UVs or they overlap, or
+            a lamp names a material that isn't there.
+        KeyboardInterrupt: Raised by `progress`, after the checkpoint has been written.
+    """
+    scene = task.scene
+    start(device)
+    denoise = need("pyoidn", "bake").denoise if scene.denoise else None
+    # Both need Mitsuba's variant to be chosen.
+    from wlm.bake.paths import irradiance
+    from wlm.bake.world import check_lamps, make_hour
+
+    geometry = read_geometry(task.geometry, scene.lightmap, task.trust)
+    check_lamps(task.path, scene, geometry)
+    texels = place_texels(str(task.geometry), geometry.surfaces, scene.lightmap.resolution, scene.lightmap.supersample)
+    hours = sorted(scene.hours)
+
+    def make(hour: float, report) -> dict[str, np.ndarray]:
+        now = make_hour(scene, geometry, task.sky, hour)
+        gathered = irradiance(
+            now.scene,
+            texels,
+            outside=now.outside,
+            sun_direct=scene.sun_direct,
+            samples=scene.samples,
+            bounces=scene.bounces,
+            seed=scene.seed,
+            report=report,
+        )
+        light, noise = (np.minimum(values, HALF_MAX) for values in (gathered.mean, gathered.noise))
+        return {"light": light, "noise": noise, "back": gathered.back}
+
+    count = len(texels.index)
+    table = {
+        "light": Part(np.float32, (count, 3), least=0.0),
+        "noise": Part(np.float32, (count, 3), least=0.0),
+        "back": Part(np.float32, (count,), least=0.0, most=1.0),
+    }
+    results = each_hour(hours, checkpoint, table, make, progress)
+    back = np.mean([each["back"] for each in results], axis=0)
+    visible = back <= _HIDDEN
+    if not visible.any():
+        raise WlmError(f"{task.geometry}: every texel is within an object: do its faces point inwards?")
+    mask = texels.image(visible.astype(np.float32)) > 0
+    light = np.stack([_finished(texels, each["light"], mask, denoise) for each in results])
+    noise = np.stack([texels.image(each["noise"]).astype(np.float16) for each in results])
+    return BakedLightmaps(
+        tuple(hours), light, noise, mask, texels.image(texels.coverage), texels.image(back.astype(np.float32)), geometry
+    )
+
+
+def _finished(texels: Texels, values: np.ndarray, mask: np.ndarray, denoise) -> np.ndarray:
+    """A picture of half floats whose gaps have the nearest light, filtered where that is wanted."""
+    picture = fill_gaps(texels.image(values), mask)
+    if denoise is not None:
+        try:
+            picture = denoise(np.ascontiguousarray(picture), filter_type="RTLightmap")
+        except RuntimeError as error:
+            raise WlmError(f"bake: Open Image Denoise: {one_line(error)}") from error
+        picture = fill_gaps(np.clip(picture, 0.0, HALF_MAX), mask)
+    return picture.astype(np.float16)
+
+
+def check_folder(folder: str | os.PathLike[str]) -> None:
+    """Checks, before long work, that lightmaps can be written to a folder.
+
+    Raises:
+        WlmError: They can't, or it holds other files.
+    """
+    claim(Path(folder), INDEX, FORMAT)
+
+
+def write_lightmaps(folder: str | os.PathLike[str], task: Task, baked: BakedLightmaps) -> list[Path]:
+    """Writes a set that `wlm lightmap compress` takes, in place of an earlier one.
+
+    Args:
+        folder: Made if it isn't there.
+        task: The scene.
+        baked: Of it.
+
+    Returns:
+        The files.
+
+    Raises:
+        WlmError: It holds other files, or can't be written.
+    """
+    folder = Path(folder)
+    height, width = baked.mask.shape
+    stamps = [f"{hour:.9g}h" for hour in baked.hours]
+    files = [f"light_{stamp}.exr" for stamp in stamps]
+    listed: dict[str, object] = {"name": task.scene.name, "width": width, "height": height}
+    if task.scene.period is not None:
+        listed["period_hours"] = task.scene.period
+    listed["mask"] = _MASK
+    if baked.geometry.usual:  # whoever reads the set knows no other
+        listed["mesh"] = _MESH
+    listed["lightmaps"] = [{"time_hours": hour, "file": file} for hour, file in zip(baked.hours, files, strict=True)]
+    with staged(folder, INDEX, FORMAT, _is_ours) as made:
+        for file, stamp, light, noise in zip(files, stamps, baked.light, baked.noise, strict=True):
+            write_exr(made / file, light)
+            _write_planes(
+                made / f"{_NOISE}_{stamp}.exr",
+                dict(zip(("noise.R", "noise.G", "noise.B"), noise.transpose(2, 0, 1), strict=True)),
+            )
+        planes = {"coverage": baked.coverage, "back": baked.back}
+        _write_planes(made / _COVERAGE, {name: plane.astype(np.float16) for name, plane in planes.items()})
+        write_mask(made / _MASK, baked.mask)
+        geometry = baked.geometry
+        write_glb(made / _MESH, geometry.document, geometry.replacements, 1)
+        (made / SET_FILE).write_text(json.dumps(listed, indent=1) + "\n", encoding="utf-8")
+        content = {
+            "format": FORMAT,
+            "version": _VERSION,
+            "about": _ABOUT,
+            "scene": task.scene.model_dump(mode="json"),
+            "uv_set": geometry.uv_set,
+            "error": baked.error,
+        }
+        (made / INDEX).write_text(compact_json(content), encoding="utf-8")
+        names = sorted(path.name for path in made.iterdir())
+    return [folder / name for name in names]
+
+
+def _write_planes(path: Path, planes: dict[str, np.ndarray]) -> None:
+    write_part(path, {name: np.ascontiguousarray(plane) for name, plane in planes.items()}, read_part)
+
+
+def _is_ours(name: str) -> bool:
+    return name in (INDEX, SET_FILE, _MESH, _MASK, _COVERAGE) or (
+        name.endswith("h.exr") and name.startswith(("light_", f"{_NOISE}_"))
+    )

@@ -1,0 +1,163 @@
+"""Light probes of a scene by the hour: radiance as L2 spherical harmonics, on surfaces or in a lattice."""
+
+import math
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from wlm.bake.backend import start
+from wlm.bake.geometry import Geometry, read_geometry
+from wlm.bake.settings import ProbeSettings
+from wlm.bake.work import Task, each_hour
+from wlm.errors import WlmError
+from wlm.formats.atomic import atomic_path
+from wlm.formats.checkpoint import Checkpoint
+from wlm.formats.parts import Part
+from wlm.probe.conventions import CANONICAL
+from wlm.system import OnProgress
+
+_MOST = 1 << 20
+_NUMBERS = 27
+_HIDDEN = 0.25  # share of rays that hit backs: of more, the probe is within an object, and dark
+
+
+@dataclass(frozen=True, eq=False)
+class BakedProbes:
+    """Probes over time.
+
+    Attributes:
+        hours: Rising.
+        position: float32 [N, 3].
+        values: float32 [T, N, 9, 3], orthonormal SH of radiance, RGB; 0 of a probe within an object.
+        noise: float32 [T, N, 9, 3], the standard errors.
+    """
+
+    hours: tuple[float, ...]
+    position: np.ndarray
+    values: np.ndarray
+    noise: np.ndarray
+
+
+def place_probes(settings: ProbeSettings, geometry: Geometry, seed: int = 0) -> np.ndarray:
+    """The probes' places, float32 [N, 3].
+
+    Args:
+        settings: How far apart, on surfaces or in a lattice.
+        geometry: The surfaces.
+        seed: Of the places on surfaces.
+
+    Raises:
+        WlmError: There would be more than a million.
+    """
+    low, high = geometry.box
+    if not settings.surfaces:
+        # In the middle of cells, as many as there is room for, and one where there is none.
+        cells = np.maximum(1.0, np.floor((high - low) / settings.spacing + 1e-6))
+        _check_count(float(np.prod(cells)))
+        axes = [
+            start + (np.arange(int(count)) + 0.5) * ((stop - start) / count)
+            for start, stop, count in zip(low, high, cells, strict=True)
+        ]
+        return np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3).astype(np.float32)
+    corner = np.concatenate([each.position[each.triangle] for each in geometry.surfaces])
+    a, b, c = corner.transpose(1, 0, 2)
+    normal = np.cross(b - a, c - a)
+    double = np.linalg.norm(normal, axis=1)
+    count = double.sum() / 2.0 / settings.spacing**2
+    _check_count(count)
+    count = max(1, round(count))
+    generator = np.random.default_rng(seed)
+    # Stratified by area, so that neighbours on the list are as far apart as they can be.
+    share = np.cumsum(double) / double.sum()
+    chosen = np.searchsorted(share, (np.arange(count) + generator.random(count)) / count).clip(max=len(share) - 1)
+    u, v = generator.random((2, count, 1))
+    root = np.sqrt(u)
+    place = (1.0 - root) * a[chosen] + root * (1.0 - v) * b[chosen] + root * v * c[chosen]
+    return (place + settings.lift * normal[chosen] / double[chosen, None]).astype(np.float32)
+
+
+def _check_count(count: float) -> None:
+    if not count <= _MOST:
+        raise WlmError(f"probes.spacing: expected at most {_MOST:,} probes, found {count:,.0f}: take a wider spacing")
+
+
+def bake_probes(
+    task: Task,
+    *,
+    device: str = "cpu",
+    checkpoint: Checkpoint | None = None,
+    progress: OnProgress | None = None,
+) -> BakedProbes:
+    """Bakes a scene's probes at each of its hours.
+
+    Args:
+        task, device, checkpoint, progress: As for `wlm.bake.bake_lightmaps`.
+
+    Raises:
+        WlmError: Mitsuba, LLVM or a GPU is missing, the geometry can't be read, there are too many probes, or a lamp
+            names a material that isn't there.
+    """
+    scene = task.scene
+    start(device)
+    # Both need Mitsuba's variant to be chosen.
+    from wlm.bake.paths import harmonics
+    from wlm.bake.world import check_lamps, make_hour
+
+    geometry = read_geometry(task.geometry, None, task.trust)
+    check_lamps(task.path, scene, geometry)
+    position = place_probes(scene.probes, geometry, scene.seed)
+    hours = sorted(scene.hours)
+
+    def make(hour: float, report) -> dict[str, np.ndarray]:
+        now = make_hour(scene, geometry, task.sky, hour)
+        gathered = harmonics(
+            now.scene,
+            position,
+            outside=now.outside,
+            sun_direct=scene.sun_direct,
+            samples=scene.samples,
+            bounces=scene.bounces,
+            seed=scene.seed,
+            report=report,
+        )
+        return {"values": gathered.mean, "noise": gathered.noise, "back": gathered.back}
+
+    count = len(position)
+    table = {
+        "values": Part(np.float32, (count, _NUMBERS)),
+        "noise": Part(np.float32, (count, _NUMBERS), least=0.0),
+        "back": Part(np.float32, (count,), least=0.0, most=1.0),
+    }
+    results = each_hour(hours, checkpoint, table, make, progress)
+    hidden = np.mean([each["back"] for each in results], axis=0) > _HIDDEN
+    shape = (len(hours), count, 9, 3)
+    values = np.stack([np.where(hidden[:, None], 0.0, each["values"]) for each in results]).astype(np.float32)
+    noise = np.stack([each["noise"] for each in results])
+    return BakedProbes(tuple(hours), position, values.reshape(shape), noise.reshape(shape))
+
+
+def write_probes(path: str | os.PathLike[str], baked: BakedProbes) -> None:
+    """Writes probes as `.npz`: `position`, `sh` of one hour or `sh_HOUR` of several, and the noise likewise.
+
+    Raises:
+        WlmError: It can't be written.
+    """
+    single = len(baked.hours) == 1
+    arrays: dict[str, np.ndarray] = {"position": baked.position, "convention": np.array(CANONICAL)}
+    for hour, values, noise in zip(baked.hours, baked.values, baked.noise, strict=True):
+        key = "" if single else f"_{hour:.9g}"
+        arrays |= {f"sh{key}": values, f"noise{key}": noise}
+    with atomic_path(Path(path)) as temporary, open(temporary, "wb") as file:
+        np.savez_compressed(file, **arrays)
+
+
+def noise_share(baked: BakedProbes) -> list[float]:
+    """For each hour the root of the mean square of the noise over that of the values; 0 where all is dark."""
+    shares = []
+    for values, noise in zip(baked.values, baked.noise, strict=True):
+        live = values.any(axis=(1, 2))
+        power = float(np.square(values[live], dtype=np.float64).mean()) if live.any() else 0.0
+        shares.append(math.sqrt(float(np.square(noise[live], dtype=np.float64).mean()) / power) if power else 0.0)
+    return shares

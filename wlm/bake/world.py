@@ -1,0 +1,152 @@
+"""A scene as Mitsuba has it: surfaces, and the lights of an hour."""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from wlm.bake.daylight import sun_direction
+from wlm.bake.geometry import Geometry, Surface
+from wlm.bake.paths import SUN_ANGLE, Outside, Sun
+from wlm.bake.settings import BakeScene, Daylight
+from wlm.errors import WlmError
+
+_SKY_ROWS = 128
+_DISC_SAMPLES = 1 << 12
+_DAY = 24.0
+
+
+@dataclass(frozen=True, eq=False)
+class Hour:
+    """What lights a scene at an hour.
+
+    Attributes:
+        scene: Of Mitsuba, with all other lights.
+        outside: The sun, and light that is the same from all around.
+    """
+
+    scene: Any
+    outside: Outside
+
+
+def check_lamps(path: Path, scene: BakeScene, geometry: Geometry) -> None:
+    """Checks that the materials that lamps name are there; `path` is the scene's, for the message.
+
+    Raises:
+        WlmError: One isn't.
+    """
+    names = sorted({each.material.name for each in geometry.surfaces})
+    for i, lamp in enumerate(scene.lamps):
+        if lamp.material is not None and lamp.material not in names:
+            raise WlmError(f"{path}: lamps.{i}.material: expected one of {', '.join(names)}, got {lamp.material!r}")
+
+
+def make_hour(scene: BakeScene, geometry: Geometry, picture: np.ndarray | None, hour: float) -> Hour:
+    """Makes a scene at an hour.
+
+    Args:
+        scene: The settings.
+        geometry: Its surfaces.
+        picture: Of the sky, float32 [H, W, 3], or None.
+        hour: The hour.
+    """
+    content: dict[str, Any] = {"type": "scene"}
+    glowing = {lamp.material: lamp.radiance if lamp.is_lit(hour) else (0.0, 0.0, 0.0) for lamp in scene.lamps}
+    for i, surface in enumerate(geometry.surfaces):
+        emission = glowing.get(surface.material.name, surface.material.emission)
+        content[f"surface{i}"] = _mesh(surface, emission, f"surface{i}")
+    for i, lamp in enumerate(scene.lamps):
+        if lamp.position is not None and lamp.is_lit(hour):
+            colour = {"type": "rgb", "value": list(lamp.intensity)}
+            content[f"lamp{i}"] = {"type": "point", "position": list(lamp.position), "intensity": colour}
+    sun, sky, ambient = None, None, (0.0, 0.0, 0.0)
+    if scene.daylight is not None:
+        sun, sky = daylight(scene.daylight, hour, scene.period or _DAY)
+        ambient = scene.daylight.night
+    elif scene.sky is not None and picture is not None:
+        sky = picture * np.array(scene.sky.radiance, np.float32)
+    elif scene.sky is not None:
+        ambient = scene.sky.radiance
+    if sky is not None and sky.any():
+        # Mitsuba's middle column is +z, and columns to the right of it turn towards -x.
+        turned = np.roll(sky, sky.shape[1] // 2, axis=1)
+        content["sky"] = {"type": "envmap", "bitmap": mi.Bitmap(np.ascontiguousarray(turned, np.float32))}
+    return Hour(mi.load_dict(content), Outside(sun, ambient))
+
+
+def daylight(settings: Daylight, hour: float, period: float) -> tuple[Sun | None, np.ndarray]:
+    """The sun, and the sky as a picture, float32 [H, W, 3]: its top row is up, its middle column -z."""
+    toward = sun_direction(hour, settings.latitude, settings.day, settings.north, period)
+    rows, columns = _SKY_ROWS, 2 * _SKY_ROWS
+    sky = np.zeros((rows, columns, 3), np.float32)
+    sun = None
+    if toward[1] > 0:
+        # Mitsuba's model has z up; x and y of it are our x and -z.
+        local = [float(toward[0]), float(-toward[2]), float(toward[1])]
+        common = {
+            "type": "sunsky",
+            "sun_direction": local,
+            "turbidity": settings.turbidity,
+            "albedo": {"type": "rgb", "value": [settings.albedo] * 3},
+        }
+        polar = (np.arange(rows) + 0.5) / rows * math.pi
+        around = ((np.arange(columns) + 0.5) / columns - 0.5) * 2.0 * math.pi  # 0 at -z, rising towards +x
+        up = np.repeat(np.cos(polar), columns)
+        level = np.repeat(np.sin(polar), columns)
+        d = np.stack([level * np.tile(np.sin(around), rows), level * np.tile(np.cos(around), rows), up])
+        above = _eval(common | {"sun_scale": 0.0}, d).reshape(rows, columns, 3)
+        sky = np.where((np.cos(polar) > 0)[:, None, None], np.maximum(above, 0.0), 0.0) * np.float32(settings.scale)
+        # The disc is darker towards its edge: its mean.
+        generator = np.random.default_rng(0)
+        cosine = 1.0 - generator.random(_DISC_SAMPLES) * (1.0 - math.cos(SUN_ANGLE))
+        turn = generator.random(_DISC_SAMPLES) * 2.0 * math.pi
+        sine = np.sqrt(1.0 - cosine**2)
+        axis = np.array(local)
+        across = np.cross(axis, [1.0, 0.0, 0.0] if abs(axis[0]) < 0.9 else [0.0, 1.0, 0.0])
+        across /= np.linalg.norm(across)
+        along = np.cross(axis, across)
+        disc = axis[:, None] * cosine + (across[:, None] * np.cos(turn) + along[:, None] * np.sin(turn)) * sine
+        mean = np.maximum(_eval(common | {"sky_scale": 0.0}, disc), 0.0).mean(0)
+        solid = 2.0 * math.pi * (1.0 - math.cos(SUN_ANGLE))
+        sun = Sun(tuple(toward.tolist()), tuple((mean.astype(float) * solid * settings.scale).tolist()))
+    return sun, sky
+
+
+def _eval(emitter: dict[str, Any], directions: np.ndarray) -> np.ndarray:
+    """Radiance of a light far off in directions [3, N], float32 [N, 3]."""
+    si = dr.zeros(mi.SurfaceInteraction3f, directions.shape[1])
+    si.wi = -mi.Vector3f(directions.astype(np.float32))
+    return np.asarray(mi.load_dict(emitter).eval(si)).T
+
+
+def _mesh(surface: Surface, emission: tuple[float, float, float], name: str) -> Any:
+    """A mesh of flat triangles; a vertex for each, since texture UVs are one to a vertex."""
+    bsdf: dict[str, Any] = {"type": "diffuse", "reflectance": _reflectance(surface)}
+    if surface.material.double:
+        bsdf = {"type": "twosided", "bsdf": bsdf}
+    properties = mi.Properties()
+    properties["bsdf"] = mi.load_dict(bsdf)
+    if any(emission):
+        properties["emitter"] = mi.load_dict({"type": "area", "radiance": {"type": "rgb", "value": list(emission)}})
+    has_uv = surface.texture_uv is not None
+    mesh = mi.Mesh(name, len(surface.position), len(surface.triangle), props=properties, has_vertex_texcoords=has_uv)
+    numbers = mi.traverse(mesh)
+    numbers["vertex_positions"] = surface.position.astype(np.float32).ravel()
+    numbers["faces"] = surface.triangle.astype(np.uint32).ravel()
+    if has_uv:
+        # The top row of a bitmap is v = 0, as in glTF.
+        numbers["vertex_texcoords"] = surface.texture_uv.astype(np.float32).ravel()
+    numbers.update()
+    return mesh
+
+
+def _reflectance(surface: Surface) -> dict[str, Any]:
+    material = surface.material
+    if material.texture is None or surface.texture_uv is None:
+        return {"type": "rgb", "value": list(material.colour)}
+    pixels = material.texture * np.float32(material.colour)
+    return {"type": "bitmap", "bitmap": mi.Bitmap(np.ascontiguousarray(pixels)), "raw": True}

@@ -1,0 +1,116 @@
+"""`wlm bake`: make lightmaps, probes and six-way lightmaps of a scene."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from wlm.cli.console import check_output, exclusive, note, quiet_warp, running, show, table
+from wlm.cli.options import Device, Resume, Trust, output_option
+
+app = typer.Typer(
+    help="Make inputs: lightmaps and probes by Mitsuba (extra `bake`), six-way lightmaps by path tracing."
+)
+
+_Scene = Annotated[Path, typer.Argument(metavar="SCENE.yaml", help="A glTF file, its lights by hour, and how finely.")]
+
+
+@app.command()
+@exclusive
+def lightmaps(
+    scene: _Scene,
+    output: Annotated[Path, output_option("DIR", "The folder of the set.")],
+    device: Device = "cpu",
+    resume: Resume = False,
+    trust: Trust = False,
+) -> None:
+    """Bake a lightmap at each hour into a set that wlm lightmap compress takes.
+
+    Finished hours are kept in DIR.partial; the same command with --resume goes on with the next one.
+    """
+    quiet_warp()
+    from wlm.bake.lightmaps import bake_lightmaps, check_folder, write_lightmaps
+    from wlm.bake.work import open_checkpoint, open_task
+
+    check_folder(output)
+    task = open_task(scene, trust)
+    checkpoint = open_checkpoint(output, task, "lightmaps", device, resume=resume)
+    if resume and not checkpoint.resumed:
+        note(f"{checkpoint.path}: there is nothing to resume; starting anew")
+    with running("bake", checkpoint.path, "percent", whole=False) as progress:
+        baked = bake_lightmaps(task, device=device, checkpoint=checkpoint, progress=progress)
+        files = write_lightmaps(output, task, baked)
+        checkpoint.remove()
+    rows = table(str(output), ["hour", "mean", "largest", "noise"])
+    for hour, light, error in zip(baked.hours, baked.light, baked.error, strict=True):
+        seen = light[baked.mask].astype("float32")
+        rows.add_row(f"{hour:g}", f"{seen.mean():.4g}", f"{seen.max():.4g}", f"{error:.2%}")
+    show(rows)
+    height, width = baked.mask.shape
+    note(f"{len(files)} files; {width}x{height} texels, {baked.mask.mean():.0%} of them in charts")
+
+
+@app.command()
+@exclusive
+def probes(
+    scene: _Scene,
+    output: Annotated[Path, output_option("OUT.npz", "The file to write.")],
+    device: Device = "cpu",
+    resume: Resume = False,
+    trust: Trust = False,
+) -> None:
+    """Bake SH probes at each hour into a file that wlm probe compress takes.
+
+    Finished hours are kept in OUT.npz.partial; the same command with --resume goes on with the next one.
+    """
+    check_output(output, ".npz")
+    quiet_warp()
+    from wlm.bake.probes import bake_probes, noise_share, write_probes
+    from wlm.bake.work import open_checkpoint, open_task
+
+    task = open_task(scene, trust)
+    checkpoint = open_checkpoint(output, task, "probes", device, resume=resume)
+    if resume and not checkpoint.resumed:
+        note(f"{checkpoint.path}: there is nothing to resume; starting anew")
+    with running("bake", checkpoint.path, "percent", whole=False) as progress:
+        baked = bake_probes(task, device=device, checkpoint=checkpoint, progress=progress)
+        write_probes(output, baked)
+        checkpoint.remove()
+    rows = table(str(output), ["hour", "probes", "lit", "mean L00", "noise"])
+    for hour, values, error in zip(baked.hours, baked.values, noise_share(baked), strict=True):
+        lit = values.any(axis=(1, 2))
+        mean = f"{values[lit, 0].mean():.4g}" if lit.any() else "–"
+        rows.add_row(f"{hour:g}", f"{len(values):,}", f"{int(lit.sum()):,}", mean, f"{error:.2%}")
+    show(rows)
+
+
+@app.command()
+@exclusive
+def sixway(
+    scene: Annotated[Path, typer.Argument(metavar="SCENE.yaml", help="Smoke, the camera, and how finely.")],
+    output: Annotated[Path, output_option("OUT", "A .exr, or for frames a folder.")],
+    device: Device = "cpu",
+    resume: Resume = False,
+    trust: Trust = False,
+) -> None:
+    """Bake six-way lightmaps with light of all orders of scattering, by path tracing; needs no extra.
+
+    wlm smoke bake makes them of light that is scattered once, without noise.
+    """
+    quiet_warp()
+    from wlm.bake.sixway import bake_sixway, load_sixway
+    from wlm.cli.smoke_options import write_lightmaps
+    from wlm.interop import check_device
+
+    settings, frames = load_sixway(scene, device=check_device(device), trust=trust)
+    errors: list[float] = []
+
+    def make(volume, camera):
+        six, error = bake_sixway(volume, camera, settings)
+        errors.append(error)
+        return six
+
+    run = settings.model_dump(mode="json")
+    write_lightmaps(frames, settings.camera, output, make, run, resume=resume)
+    if errors:
+        note(f"noise: at most {max(errors):.2%} of the light, RMS, in a frame")

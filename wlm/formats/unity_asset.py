@@ -1,0 +1,245 @@
+"""Unity's `LightingData.asset` and `LightProbes.asset`: light probes, and where renderers are in lightmaps.
+
+UnityPy (extra `unity`) reads the list of objects and how each is laid out, which the file says itself, in a process of
+its own (`unity_child`). The objects are read here: UnityPy makes room for as many values as a file claims. Only binary
+assets: Unity writes lighting data so whatever a project's serialization mode is.
+"""
+
+import json
+import os
+import struct
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from wlm.errors import WlmError, one_line
+from wlm.formats import unity_child
+from wlm.formats.hdr_blocks import need
+from wlm.formats.limits import PROBES
+from wlm.formats.reading import read_file
+
+_EXTRA = "unity"
+_BYTES = 1 << 28
+_SECONDS = 60.0  # on a busy machine; of computing it gets less
+_MOST_STEPS = 1 << 17  # values and arrays that are stepped over one by one: real files have some dozens
+_COEFFICIENTS, _CHANNELS = 9, 3
+_NO_LIGHTMAP = 65534  # from this number on the renderer has none
+_TEXT, _BUNDLE = b"%YAML", b"Unity"
+_ALIGNED = 0x4000  # flag of a value: what follows begins at a multiple of 4 bytes
+_NUMBERS = {
+    "bool": "u1",
+    "char": "u1",
+    "SInt8": "i1",
+    "UInt8": "u1",
+    "short": "i2",
+    "SInt16": "i2",
+    "unsigned short": "u2",
+    "UInt16": "u2",
+    "int": "i4",
+    "SInt32": "i4",
+    "Type*": "i4",
+    "unsigned int": "u4",
+    "UInt32": "u4",
+    "long long": "i8",
+    "SInt64": "i8",
+    "unsigned long long": "u8",
+    "UInt64": "u8",
+    "FileSize": "u8",
+    "float": "f4",
+    "double": "f8",
+}
+_POSITIONS, _LIGHT, _RENDERERS = "m_Data.m_Positions", "m_BakedCoefficients", "m_LightmappedRendererData"
+_WANTED = {"LightProbes": {_POSITIONS, _LIGHT}, "LightingDataAsset": {_RENDERERS}}
+
+
+@dataclass(frozen=True)
+class Rectangle:
+    """Where a renderer is in its lightmap.
+
+    Attributes:
+        lightmap: The number of the lightmap.
+        scale_offset: `lightmapScaleOffset`: UV times the first two, plus the last two, v up.
+    """
+
+    lightmap: int
+    scale_offset: tuple[float, float, float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class LightingData:
+    """What an asset holds.
+
+    Attributes:
+        position: float64 [N, 3], of the light probes, in Unity's axes.
+        values: float64 [N, 9, 3], numbers of `SphericalHarmonicsL2`.
+        rectangles: Of the renderers with a lightmap, in the file's order; it has no names of them.
+    """
+
+    position: np.ndarray
+    values: np.ndarray
+    rectangles: tuple[Rectangle, ...]
+
+
+def read_lighting_data(path: str | os.PathLike[str]) -> LightingData:
+    """Reads an asset.
+
+    Raises:
+        WlmError: UnityPy is missing; or the file is, or is damaged, text, a bundle or of something else.
+    """
+    need("UnityPy", _EXTRA)
+    data = read_file(path, _BYTES, "the asset")
+    if data.startswith((_TEXT, _BUNDLE)):
+        found = "YAML" if data.startswith(_TEXT) else "an asset bundle"
+        raise WlmError(f"{path}: expected a binary asset of Unity's editor, found {found}")
+    objects = _damaged(path, lambda: list_objects(path, data))
+    if not any(kind in _WANTED for kind, _, _, _ in objects):
+        raise WlmError(f"{path}: expected Unity's lighting data or light probes, found neither")
+    positions, values = [np.empty((0, 3))], [np.empty((0, _COEFFICIENTS, _CHANNELS))]
+    rectangles: list[Rectangle] = []
+    for kind, tree, content, order in objects:
+        if kind not in _WANTED:
+            continue
+        arrays = _damaged(path, lambda: _Walk(content, order, _WANTED[kind]).arrays(tree))  # noqa: B023  (called now)
+        if kind == "LightProbes":
+            place = _damaged(path, lambda: _columns(arrays[_POSITIONS], ["x", "y", "z"]))  # noqa: B023
+            light = _damaged(path, lambda: _columns(arrays[_LIGHT], _NAMES))  # noqa: B023
+            if len(place) != len(light):
+                raise WlmError(f"{path}: expected light for each of {len(place)} probes, found that of {len(light)}")
+            positions.append(place)
+            values.append(light.reshape(-1, _CHANNELS, _COEFFICIENTS).transpose(0, 2, 1))
+        else:
+            rectangles += _damaged(path, lambda: _rectangles(arrays[_RENDERERS]))  # noqa: B023
+    position = np.concatenate(positions)
+    if len(position) > PROBES:
+        raise WlmError(f"{path}: expected at most {PROBES:,} light probes, found {len(position):,}")
+    return LightingData(position, np.concatenate(values), tuple(rectangles))
+
+
+_NAMES = [f"sh[{i:2d}]" for i in range(_COEFFICIENTS * _CHANNELS)]
+
+
+def _damaged(path: str | os.PathLike[str], read: Callable[[], Any]) -> Any:
+    """Calls a function, and says in a line where it meets what it can't read."""
+    try:
+        return read()
+    except (ValueError, LookupError, TypeError, AttributeError, RecursionError, struct.error) as error:
+        reason = one_line(f"{type(error).__name__}: {error}", 120)
+        raise WlmError(f"{path}: the asset is damaged, or of a version that UnityPy can't read: {reason}") from error
+
+
+def list_objects(path: str | os.PathLike[str], data: bytes) -> list[tuple[str, Any, bytes, str]]:
+    """Of each object in a file its type, its layout, its bytes and their order; of types that aren't read the type.
+
+    Args:
+        path: The file.
+        data: What is in it.
+
+    Raises:
+        ValueError: UnityPy can't read it.
+    """
+    # With -P nothing beside the program is imported in place of a package.
+    command = [sys.executable, "-P", unity_child.__file__, os.fspath(path), *_WANTED]
+    try:
+        run = subprocess.run(command, capture_output=True, timeout=_SECONDS, check=False)
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise ValueError(str(error)) from error
+    if run.returncode:
+        lines = run.stderr.decode(errors="replace").strip().splitlines()
+        raise ValueError(lines[-1] if run.returncode > 0 and lines else "UnityPy crashed")
+    found = []
+    for kind, tree, start, size, order in json.loads(run.stdout):
+        if tree is not None and not 0 <= start <= start + size <= len(data):
+            raise ValueError(f"an object of {size} bytes at {start} in a file of {len(data)}")
+        found.append((kind, tree, data[start : start + size] if tree is not None else b"", order))
+    return found
+
+
+class _Walk:
+    """Steps through an object by its layout up to the arrays that are wanted.
+
+    No length that the file states is used to make room: it is first held against the bytes that are left.
+    """
+
+    def __init__(self, data: bytes, order: str, wanted: set[str]) -> None:
+        self._data, self._order, self._wanted = data, order, wanted
+        self._at = self._steps = 0
+        self._found: dict[str, np.ndarray] = {}
+
+    def arrays(self, tree: Any) -> dict[str, np.ndarray]:
+        """The wanted arrays by their path, structured; ValueError where one is missing."""
+        if tree is None:
+            raise ValueError("the layout of its objects isn't in the file")
+        for node in tree[3]:
+            self._step(node, node[1])
+            if len(self._found) == len(self._wanted):  # what comes after them isn't needed
+                return self._found
+        raise ValueError(f"{min(self._wanted - self._found.keys())} is missing")
+
+    def _step(self, node: Any, path: str) -> None:
+        self._steps += 1
+        if self._steps > _MOST_STEPS:
+            raise ValueError(f"more than {_MOST_STEPS:,} values before what is wanted")
+        kind, _, flags, children = node
+        if kind == "Array":
+            self._array(children[1], path)
+        elif kind == "TypelessData":
+            self._take(self._count())
+        elif kind in _NUMBERS:
+            self._take(np.dtype(_NUMBERS[kind]).itemsize)
+        else:
+            for child in children:
+                self._step(child, path if child[0] == "Array" else f"{path}.{child[1]}")
+        if flags & _ALIGNED:
+            self._at += -self._at % 4
+
+    def _array(self, element: Any, path: str) -> None:
+        count = self._count()
+        kind = self._fixed(element)
+        if kind is not None and kind.itemsize:
+            rows = self._take(count * kind.itemsize)
+            if path in self._wanted:
+                self._found[path] = np.frombuffer(rows, kind)
+            return
+        if path in self._wanted:
+            raise ValueError(f"{path}: expected an array of numbers of one size")
+        for _ in range(count):
+            self._step(element, path)
+
+    def _fixed(self, node: Any) -> np.dtype | None:
+        """The type of a value that always has the same bytes; None: it hasn't."""
+        kind, _, flags, children = node
+        if flags & _ALIGNED or kind in ("Array", "TypelessData"):
+            return None
+        if kind in _NUMBERS:
+            return np.dtype(self._order + _NUMBERS[kind])
+        kinds = [self._fixed(child) for child in children]
+        if any(kind is None for kind in kinds):
+            return None
+        return np.dtype([(child[1], kind) for child, kind in zip(children, kinds, strict=True)])
+
+    def _count(self) -> int:
+        count = struct.unpack(self._order + "i", self._take(4))[0]
+        if count < 0:
+            raise ValueError(f"an array of {count} values")
+        return count
+
+    def _take(self, size: int) -> bytes:
+        if size > len(self._data) - self._at:
+            raise ValueError(f"expected {size} bytes at {self._at}, found {len(self._data) - self._at}")
+        self._at += size
+        return self._data[self._at - size : self._at]
+
+
+def _columns(rows: np.ndarray, names: list[str]) -> np.ndarray:
+    """Fields of rows, float64 [N, fields]."""
+    return np.stack([rows[name] for name in names], 1).astype(np.float64)
+
+
+def _rectangles(rows: np.ndarray) -> list[Rectangle]:
+    rows = rows[rows["lightmapIndex"] < _NO_LIGHTMAP]
+    places = _columns(rows["lightmapST"], list("xyzw")).tolist()
+    return [Rectangle(int(n), tuple(place)) for n, place in zip(rows["lightmapIndex"], places, strict=True)]
