@@ -69,9 +69,12 @@ inline float3 cross(float3 a, float3 b) { return float3(a.y() * b.z() - a.z() * 
 template <class T, class U> T as_type(U word) { T out; static_assert(sizeof out == sizeof word, "");
     std::memcpy(&out, &word, sizeof out); return out; }
 typedef vec<_Float16, 2> half2;
-enum class filter { linear }; enum class address { clamp_to_edge };
-struct sampler { constexpr sampler(filter, address) {} };
+enum class filter { linear }; enum class mip_filter { linear }; enum class address { clamp_to_edge };
+struct sampler { constexpr sampler(filter, mip_filter, address) {} };
 struct level { level(int) {} };
+struct gradient2d { gradient2d(float2, float2) {} };
+inline float length(float2 a) { return std::sqrt(a.x() * a.x() + a.y() * a.y()); }
+inline float log2(float a) { return std::log2(a); }
 template <class T> struct texture2d_array {
     int width, height; std::vector<vec<T, 4>> texels;
     int get_width() const { return width; } int get_height() const { return height; }
@@ -83,7 +86,8 @@ template <class T> struct texture2d_array {
                    mix(read({i, l}, layer, 0), read({k, l}, layer, 0), x - i), y - j); } };
 template <class T> struct texture2d : texture2d_array<T> {
     vec<T, 4> read(uint2 p, int) const { return texture2d_array<T>::read(p, 0, 0); }
-    vec<T, 4> sample(sampler s, float2 at, level l) const { return texture2d_array<T>::sample(s, at, 0, l); } };
+    vec<T, 4> sample(sampler s, float2 at, level l) const { return texture2d_array<T>::sample(s, at, 0, l); }
+    vec<T, 4> sample(sampler s, float2 at, gradient2d) const { return sample(s, at, level(0)); } };
 }
 template <class N> void load(N& out, const char* path)
 {

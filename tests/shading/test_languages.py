@@ -106,6 +106,21 @@ def atlas(kind, _) -> Subject:
     return Subject(atlas_glsl(model), main, decode64(model, uv)[None], bound, "WLM_ATLAS_EXACT", 3e-4, filtered)
 
 
+def mips(_) -> Subject:
+    """The light of the tiles where a pixel is small, of the tail where it is large, in between of both."""
+    near = atlas(MIXED, None)
+    model = replace(random_atlas(charts(), MIXED), tail=np.zeros((1, 16), np.uint8))
+    size = np.array([[model.width // 4, model.height // 4]]) * 4
+    texels = np.array([0.0, 2.0**1.5, 8.0])[np.arange(near.expected.shape[1]) % 3]  # along a pixel
+    near.bound["u_change"] = points_of(np.stack([texels / size[0, 0], 0 * texels], 1))
+    near.bound["wlm_atlas_tail"] = np.full((model.height // 4, model.width // 4, 4), 0.5, np.float16)
+    place = "texelFetch(u_points, pixel, 0).xy, texelFetch(u_change, pixel, 0).xy, vec2(0.0)"
+    main = f"vec4 shown(ivec2 pixel) {{ return vec4(wlm_atlas_grad({place}), 1.0); }}\n"
+    share = np.clip(np.log2(np.maximum(texels, 1.0)) - 1.0, 0.0, 1.0)[:, None]
+    expected = (1.0 - share) * near.expected + share * 0.5
+    return replace(near, text=atlas_glsl(model), main=f"{POINTS}uniform sampler2D u_change;\n{main}", expected=expected)
+
+
 def rgba(texels: np.ndarray) -> np.ndarray:
     return np.pad(texels.astype(np.float16), ((0, 0), (0, 0), (0, 1)))
 
@@ -258,6 +273,7 @@ SUBJECTS: dict[str, Callable[..., Subject]] = {
     "lightmap": lambda folder: lightmap((4, 3, 2, 1), folder),
     "lightmap of video": lambda folder: lightmap((5, 3, 5, 0), folder, gelu="exact", period=None, hidden=10),
     **{f"atlas {kind}": lambda folder, kind=kind: atlas(kind, folder) for kind in (*KINDS, MIXED)},
+    "atlas mips": mips,
     "scene": scene,
     **{f"smoke {layout}": lambda folder, layout=layout: smoke(layout, folder) for layout in LAYOUTS},
     "volume": volume,
@@ -308,7 +324,7 @@ def test_every_shader_shows_what_python_decodes(name, language, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "name", ["lightmap", "atlas cascade", "atlas tiles mixed", "scene", "smoke unity", "volume", "probes"]
+    "name", ["lightmap", "atlas cascade", "atlas tiles mixed", "atlas mips", "scene", "smoke unity", "volume", "probes"]
 )
 def test_metal_as_the_cpp_that_it_is(name, tmp_path):
     subject = SUBJECTS[name](tmp_path)

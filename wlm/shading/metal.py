@@ -36,7 +36,8 @@ class MetalWriter(Writer):
         lines = [*self._top, "", "#include <metal_stdlib>", "using namespace metal;", ""]
         lines += [f"constexpr constant {self.local(each)};" for each in self._constants]
         if self.filters:
-            lines.append(f"constexpr sampler {self.linear}(filter::linear, mip_filter::linear, address::clamp_to_edge);")
+            state = "filter::linear, mip_filter::linear, address::clamp_to_edge"
+            lines.append(f"constexpr sampler {self.linear}({state});")
         return [*lines, "", f"struct {name}", "{"]
 
     def foot(self) -> list[str]:
