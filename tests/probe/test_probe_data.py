@@ -156,7 +156,7 @@ def test_godot_file(tmp_path, monkeypatch):
 
 
 def test_suffix_and_path(tmp_path):
-    assert "ends in .npz or .json or .lmbake, found .exr" in error_of(load, tmp_path / "a.exr")
+    assert "ends in .npz or .json or .lmbake or .asset, found .exr" in error_of(load, tmp_path / "a.exr")
     assert "found none" in error_of(load, tmp_path / "a")
     assert "missing.json: cannot read the probes: No such file" in error_of(load, tmp_path / "missing.json")
     (tmp_path / "folder.npz").mkdir()
