@@ -68,6 +68,10 @@ def test_a_plane_under_an_even_sky():
     )
 
 
+def test_few_samples():
+    assert lit([FLOOR], sky=Sky(), samples=4) == pytest.approx(np.full((64, 3), math.pi), rel=1e-5)
+
+
 def test_a_white_furnace():
     # Every wall glows with 1 and reflects half: 1 + 1/2 + 1/4 and so on is 2 from everywhere.
     walls = box(3.0, Material(colour=(0.5, 0.5, 0.5), emission=(1, 1, 1)))

@@ -214,7 +214,7 @@ def _gather(one: Any, count: int, channels: int, samples: int, seed: int, report
             # Next to 1 it would be the square's edge, from which directions can't be told.
             at = tuple(
                 dr.minimum(mi.Float((start + sample * step) >> 8) * 2.0**-24, 1.0 - 2.0**-24)
-                for start, step in zip((*shift, third), (2**32 // each, _GOLDEN, _ROOT), strict=True)
+                for start, step in zip((*shift, third), (2**32 // each % 2**32, _GOLDEN, _ROOT), strict=True)
             )
             values, hidden = one(number, at, rng)
             # A path that meets an edge of no width may come to no number.
