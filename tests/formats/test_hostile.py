@@ -450,7 +450,7 @@ def test_what_a_terminal_obeys_is_escaped(capsys):
     show_text(f"{text}\nsecond")
     note(text)
     out, err = capsys.readouterr()
-    assert out.count(shown) == 3 and out.endswith("\nsecond") and err == f"{shown}\n"
+    assert out.count(shown) == 3 and out.endswith("\nsecond\n") and err == f"{shown}\n"
 
 
 # Folders that others can write to.

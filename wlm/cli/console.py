@@ -104,8 +104,8 @@ def note(text: str) -> None:
 
 
 def show_text(text: str) -> None:
-    """Prints lines to stdout as they are, unwrapped and uncoloured, but for what a terminal would obey."""
-    sys.stdout.write("\n".join(map(printable, text.split("\n"))))
+    """Prints lines to stdout as they are, uncoloured, but for what a terminal would obey, and ends the last."""
+    sys.stdout.write("\n".join(map(printable, text.removesuffix("\n").split("\n"))) + "\n")
 
 
 def number(value: float | None, form: str) -> str:
