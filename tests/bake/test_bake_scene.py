@@ -32,6 +32,7 @@ from wlm.probe.data import load as load_probes
     [
         ({"hours": []}, "hours"),
         ({"hours": [3, 3]}, "each once"),
+        ({"hours": [3, 3.0000000001]}, "each once"),
         ({"hours": [24], "period": 24}, "below the period of 24"),
         ({"daylight": {}, "sky": {}}, "found both"),
         ({"lamps": [{"material": "a", "position": [0, 0, 0]}]}, "a position or of a material"),
@@ -114,6 +115,25 @@ def test_new_uvs_are_even_and_apart(tmp_path):
     assert max(scale) < 1.3 * min(scale) and texels.coverage.sum() > 0.3 * 128**2
     with pytest.raises(WlmError, match="room.gltf: expected TEXCOORD_1|room.gltf: expected TEXCOORD_0"):
         read_geometry(ROOM / "room.gltf", LightmapSettings())
+
+
+@pytest.mark.parametrize(
+    "what, number, change, said",
+    [
+        ("nodes", 0, {"translation": [1e7, 0, 0]}, "farthest coordinate, 1e.07"),
+        ("nodes", 0, {"scale": [1e-5] * 3}, "rays have no more digits"),
+        ("nodes", 0, {"scale": [1e30] * 3}, "a size of at most 1e.09"),
+        ("materials", 1, {"emissiveFactor": [1e39] * 3}, r"materials\[1\]: expected an emission"),
+        ("materials", 1, {"pbrMetallicRoughness": {"baseColorFactor": [math.nan] * 4}}, "base colour .* not NaN"),
+    ],
+)
+def test_what_float32_would_lose_is_refused_in_a_line(tmp_path, what, number, change, said):
+    content = json.loads((ROOM / "room.gltf").read_text())
+    content[what][number] |= change
+    path = tmp_path / "room.gltf"
+    path.write_text(json.dumps(content))
+    with pytest.raises(WlmError, match=said):
+        read_geometry(path, None)
 
 
 def test_normals_turn_with_their_node(tmp_path):

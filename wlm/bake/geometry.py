@@ -21,6 +21,9 @@ from wlm.formats.reading import read_file
 
 _UNWRAPPED = 1  # n of the new `TEXCOORD_n`
 _MOST_IMAGE = 1 << 26  # pixels
+_STRONGEST = 1e9  # radiance
+_LARGEST = 1e9
+_NEAREST = 0.01  # of the scene's size to its distance: Mitsuba starts rays 1e-4 of 1 + |place| off surfaces, in float32
 _BRIGHTEST = 0.99  # albedo: of more, light would stay in a closed room for ever
 
 
@@ -100,7 +103,8 @@ def read_geometry(path: Path, settings: LightmapSettings | None, trust: bool = F
         trust: Whether it may name files outside its folder.
 
     Raises:
-        WlmError: It can't be read, has no triangle with area, or lacks the lightmap's UVs.
+        WlmError: It can't be read, has no triangle with area, is too small, too large or too far from the origin for
+            rays in float32, or lacks the lightmap's UVs.
     """
     document, primitives = read_gltf(path, trust)
     for each in primitives:
@@ -137,7 +141,15 @@ def read_geometry(path: Path, settings: LightmapSettings | None, trust: bool = F
             surfaces.append(surface)
     if not surfaces:
         raise WlmError(f"{path}: expected triangles with area, found none")
-    return Geometry(document, tuple(surfaces), tuple(replacements), number, usual)
+    geometry = Geometry(document, tuple(surfaces), tuple(replacements), number, usual)
+    low, high = geometry.box
+    size, reach = float(np.linalg.norm(high - low)), float(np.maximum(-low, high).max())
+    if not _NEAREST * (1.0 + reach) <= size <= _LARGEST:
+        raise WlmError(
+            f"{path}: expected a scene of a size of at most {_LARGEST:g}, and of at least {_NEAREST:g} times 1 plus "
+            f"its farthest coordinate, {reach:.3g}, found {size:.3g}: rays have no more digits"
+        )
+    return geometry
 
 
 def _surface(
@@ -269,8 +281,12 @@ def _material(document: GltfDocument, number: int | None) -> Material:
         content.get("extensions", {}).get("KHR_materials_emissive_strength", {}).get("emissiveStrength", 1.0)
     )
     emission = np.array(content.get("emissiveFactor", (0.0, 0.0, 0.0)), np.float64) * strength
-    if emission.shape != (3,) or not ((emission >= 0) & np.isfinite(emission)).all() or factor.shape != (3,):
-        raise WlmError(f"{document.path}: materials[{number}]: expected colours of three numbers, not negative")
+    if emission.shape != (3,) or not ((emission >= 0) & (emission <= _STRONGEST)).all():
+        raise WlmError(
+            f"{document.path}: materials[{number}]: expected an emission of three numbers, 0 to {_STRONGEST:g}"
+        )
+    if factor.shape != (3,) or np.isnan(factor).any():
+        raise WlmError(f"{document.path}: materials[{number}]: expected a base colour of three numbers, not NaN")
     texture, uv_set = None, 0
     if "baseColorTexture" in surface:
         texture = _texture(document, surface["baseColorTexture"]["index"])

@@ -178,8 +178,8 @@ class BakeScene(_Settings):
     def _consistent(self) -> Self:
         if self.daylight is not None and self.sky is not None:
             raise ValueError("expected daylight or sky, found both")
-        if len(set(self.hours)) < len(self.hours):
-            raise ValueError("hours: expected each once")
+        if len({f"{hour:.9g}" for hour in self.hours}) < len(self.hours):  # as files are named
+            raise ValueError("hours: expected each once, to nine digits")
         if self.period is not None and not all(0 <= hour < self.period for hour in self.hours):
             raise ValueError(f"hours: expected 0 to below the period of {self.period:g}")
         return self
