@@ -79,6 +79,35 @@ def test_a_shader_reads_the_textures_beside_it_and_no_others(tmp_path):
     assert (tmp_path / "out" / "tail.dds").read_bytes() == (tmp_path / "made" / "tail.dds").read_bytes()
 
 
+KEY = """
+import { readFile } from "node:fs/promises";
+globalThis.document = { baseURI: import.meta.url };
+globalThis.fetch = async (url) => {
+  const bytes = await readFile(new URL(url));
+  const arrayBuffer = () => bytes.buffer.slice(bytes.byteOffset, bytes.byteOffset + bytes.length);
+  return { ok: true, arrayBuffer, text: () => bytes.toString(), json: () => JSON.parse(bytes) };
+};
+const { loadAtlas } = await import("./atlas.mjs"), material = {};
+(await loadAtlas("atlas.json", { DataTexture: class {} })).apply(material);
+console.log(material.customProgramCacheKey());
+"""
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="no node: install nodejs")
+def test_atlases_of_one_lightmap_share_no_program_of_three(tmp_path):
+    """three.js compiles once for each key: under one key one atlas would be drawn with the other's shader."""
+    keys, sources = set(), set()
+    for kind in ("tiles", "plain"):
+        folder, (_, output) = tmp_path / f"out-{kind}", atlas_folder(tmp_path / kind, kind)
+        export_atlas(output, folder, "three")
+        shutil.copy(folder / "atlas.js", folder / "atlas.mjs")
+        (folder / "key.mjs").write_text(KEY)
+        done = subprocess.run(["node", "key.mjs"], cwd=folder, capture_output=True, text=True, check=True)
+        keys.add(done.stdout)
+        sources.add(output.model.source)
+    assert len(sources) == 1 and len(keys) == 2
+
+
 def test_what_cannot_be_exported_for_an_engine(tmp_path):
     assert "engine: expected one of three" in error_of(export_lightmap, random_lightmap(), tmp_path / "a", "cry")
     assert "found layers" in error_of(export_lightmap, random_layers(), tmp_path / "a", "three")
