@@ -13,7 +13,9 @@ from PIL import Image
 from typer.testing import CliRunner
 
 import wlm
+from wlm.atlas.exporter import read_folder
 from wlm.cli.app import app
+from wlm.engines import export_atlas
 from wlm.formats.exr import write_exr
 from wlm.inspection import inspect
 from wlm.inspection.folders import MOST
@@ -82,6 +84,9 @@ def test_a_project_is_told_piece_by_piece(tmp_path):
     ):
         assert said in text, said
     assert "LICENSE" not in text and text.count("set") < 20
+    export_atlas(read_folder(tmp_path / "atlas"), tmp_path / "engine", "unity")
+    # No command takes it.
+    assert told(tmp_path / "engine").endswith("for one engine: textures, the mesh and a material or a shader -> ")
 
 
 def test_pictures_of_several_atlases_are_no_times(tmp_path):

@@ -1,5 +1,6 @@
 """Folders for engines: few files, whose shaders and scripts compile or parse by what pip and Debian have."""
 
+import dataclasses
 import json
 import os
 import re
@@ -18,6 +19,7 @@ from builders.synthetic import random_model as random_lightmap
 
 from wlm.atlas import exporter
 from wlm.atlas.exact import decode64
+from wlm.atlas.mips import make_tail
 from wlm.engines import ENGINES, export_atlas, export_lightmap
 from wlm.formats.light import read_light
 from wlm.lightmap.shader import texture_names
@@ -59,6 +61,51 @@ def test_one_engines_files_take_the_place_of_anothers(tmp_path):
         assert set(os.listdir(tmp_path / "atlas")) == {path.name for path in paths}
         info = json.loads(paths[-1].read_text())
         assert set(info["textures"].values()) < set(os.listdir(tmp_path / "atlas")) and info["uv_set"] == 0
+
+
+def test_a_shader_reads_the_textures_beside_it_and_no_others(tmp_path):
+    """Of a model with mips too: their texture goes with the shader that reads it."""
+    mesh = sheet()
+    model = random_atlas(mesh, MIXED)
+    model = dataclasses.replace(model, tail=make_tail(mesh))
+    exporter.export(model, tmp_path / "made", mesh)
+    output = exporter.read_folder(tmp_path / "made")
+    for engine in (*ENGINES, "raw"):
+        paths = export_atlas(output, tmp_path / "out", engine)
+        info = json.loads(paths[-1].read_text())
+        text = "".join(path.read_text() for path in paths if path.suffix in TEXTS - {".md", ".cs"})
+        assert set(re.findall(r"\bwlm_atlas_(colour|lut|blocks|tail)\b", text)) == set(info["textures"])
+    assert info["textures"]["tail"] == "tail.dds"
+    assert (tmp_path / "out" / "tail.dds").read_bytes() == (tmp_path / "made" / "tail.dds").read_bytes()
+
+
+KEY = """
+import { readFile } from "node:fs/promises";
+globalThis.document = { baseURI: import.meta.url };
+globalThis.fetch = async (url) => {
+  const bytes = await readFile(new URL(url));
+  const arrayBuffer = () => bytes.buffer.slice(bytes.byteOffset, bytes.byteOffset + bytes.length);
+  return { ok: true, arrayBuffer, text: () => bytes.toString(), json: () => JSON.parse(bytes) };
+};
+const { loadAtlas } = await import("./atlas.mjs"), material = {};
+(await loadAtlas("atlas.json", { DataTexture: class {} })).apply(material);
+console.log(material.customProgramCacheKey());
+"""
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="no node: install nodejs")
+def test_atlases_of_one_lightmap_share_no_program_of_three(tmp_path):
+    """three.js compiles once for each key: under one key one atlas would be drawn with the other's shader."""
+    keys, sources = set(), set()
+    for kind in ("tiles", "plain"):
+        folder, (_, output) = tmp_path / f"out-{kind}", atlas_folder(tmp_path / kind, kind)
+        export_atlas(output, folder, "three")
+        shutil.copy(folder / "atlas.js", folder / "atlas.mjs")
+        (folder / "key.mjs").write_text(KEY)
+        done = subprocess.run(["node", "key.mjs"], cwd=folder, capture_output=True, text=True, check=True)
+        keys.add(done.stdout)
+        sources.add(output.model.source)
+    assert len(sources) == 1 and len(keys) == 2
 
 
 def test_what_cannot_be_exported_for_an_engine(tmp_path):

@@ -1,5 +1,6 @@
 """A compressed lightmap for an engine: a material that reads it, and its textures."""
 
+import dataclasses
 import os
 import shutil
 from collections.abc import Callable
@@ -26,6 +27,8 @@ def export_atlas(
 ) -> list[Path]:
     """Writes what `wlm atlas compress` left for an engine: textures, the mesh, a material, and a page about it.
 
+    Engines' materials read the tiles alone: the mips of a model that has some are in "raw" only.
+
     Args:
         output: The folder of the compression.
         directory: Another folder; made if it isn't there. A new export replaces an earlier one.
@@ -48,7 +51,10 @@ def export_atlas(
         ending = ".ktx2"
     if model.colour == "astc" and ending == ".dds":
         raise WlmError(f"{output.folder}: cannot export for {engine}: there is no DDS of ASTC; compress with bc6h")
-    names = ["colour", *(["lut"] if model.method != "plain" else []), *(["blocks"] if model.colour == "mixed" else [])]
+    if engine != "raw":
+        model = dataclasses.replace(model, tail=model.tail[:0])
+    has = {"lut": model.method != "plain", "blocks": model.colour == "mixed", "tail": len(model.tail) > 0}
+    names = ["colour", *(name for name, given in has.items() if given)]
     texts = _raw(model, shader, exact) if engine == "raw" else _TEXTS[engine](model)
     files = {name: name + (".bytes" if engine == "unity" else ending) for name in names}
     folder = Path(directory)
@@ -142,7 +148,7 @@ _TEXTS: dict[str, Callable[[AtlasModel], dict[str, str]]] = {
     "unity": _unity,
     "unreal": _unreal,
 }
-_STEMS = {"atlas", "colour", "lut", "blocks", "WlmAtlas"}
+_STEMS = {"atlas", "colour", "lut", "blocks", "tail", "WlmAtlas"}
 _ENDINGS = {*ENDINGS.values(), ".dds", ".ktx2", ".exr", ".bytes", ".js", ".gdshader", ".shader", ".cs", ".usf"}
 
 

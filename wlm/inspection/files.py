@@ -26,10 +26,12 @@ _MAGIC = 16
 _VDB = b" BDV\0\0\0\0"
 BAKED = "lightmaps that wlm bake lightmaps made, with their noise and coverage"
 """What is said of the folder of a bake."""
+ATLAS = "a compressed lightmap of a mesh"
+"""What is said of the folder of an atlas."""
 
 # What says of itself in JSON that it is ours, and what to do with it.
 _EXPORTS = {
-    "wlm-atlas": "a compressed lightmap of a mesh",
+    "wlm-atlas": ATLAS,
     "wlm-bake": BAKED,
     "wlm-lightmap-export": "lightmaps over time for an engine: textures, weights and a shader",
     "wlm-lightmap-engine": "lightmaps over time for one engine: textures, weights and a component",

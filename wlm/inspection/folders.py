@@ -9,7 +9,7 @@ from pathlib import Path
 from wlm.errors import WlmError
 from wlm.formats.godot import read_users
 from wlm.formats.light import SUFFIXES
-from wlm.inspection.files import BAKED, document_of, inspect_file
+from wlm.inspection.files import ATLAS, BAKED, document_of, inspect_file
 from wlm.inspection.finding import Finding, quoted
 from wlm.inspection.pictures import picture_of, said
 from wlm.inspection.sets import UNREADABLE, compress_command, inspect_set, named, together
@@ -109,7 +109,7 @@ def _documents(folder: Path, files: Sequence[Path]) -> _Found:
 
 
 def _next(folder: Path, stated: str) -> str:
-    if "mesh" in stated:
+    if stated == ATLAS:
         return f"wlm web {quoted(folder)} -o PAGE.html"
     return f"wlm smoke bake {quoted(folder)} -o DIR" if "frames of smoke" in stated else ""
 

@@ -32,7 +32,8 @@ export async function loadAtlas(url, THREE) {
           .replaceAll('texture2D( lightMap, vLightMapUv )', 'vec4( wlm_atlas( vLightMapUv ), 1.0 )')
           .replace('void main() {', `${shader}\nvoid main() {`);
       };
-      material.customProgramCacheKey = () => `wlm-atlas ${info.source}`;
+      // Of one lightmap there may be atlases of several methods.
+      material.customProgramCacheKey = () => shader;
       material.needsUpdate = true;
     },
     dispose() {
