@@ -83,7 +83,8 @@ KEY = """
 import { readFile } from "node:fs/promises";
 globalThis.document = { baseURI: import.meta.url };
 globalThis.fetch = async (url) => {
-  const bytes = await readFile(new URL(url));
+  const bytes = await readFile(new URL(url)).catch(() => null);
+  if (bytes === null) return { ok: false, status: 404 };
   const arrayBuffer = () => bytes.buffer.slice(bytes.byteOffset, bytes.byteOffset + bytes.length);
   return { ok: true, arrayBuffer, text: () => bytes.toString(), json: () => JSON.parse(bytes) };
 };
@@ -106,6 +107,17 @@ def test_atlases_of_one_lightmap_share_no_program_of_three(tmp_path):
         keys.add(done.stdout)
         sources.add(output.model.source)
     assert len(sources) == 1 and len(keys) == 2
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="no node: install nodejs")
+def test_a_file_that_three_cannot_load_is_named(tmp_path):
+    _, output = atlas_folder(tmp_path / "made", "plain")
+    export_atlas(output, tmp_path / "out", "three")
+    (tmp_path / "out" / "atlas.js").rename(tmp_path / "out" / "atlas.mjs")
+    (tmp_path / "out" / "atlas.glsl").unlink()
+    (tmp_path / "out" / "key.mjs").write_text(KEY)
+    done = subprocess.run(["node", "key.mjs"], cwd=tmp_path / "out", capture_output=True, text=True)
+    assert done.returncode and "atlas.glsl: 404" in done.stderr
 
 
 def test_what_cannot_be_exported_for_an_engine(tmp_path):

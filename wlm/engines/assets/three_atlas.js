@@ -11,8 +11,8 @@
 
 export async function loadAtlas(url, THREE) {
   const base = new URL(url, document.baseURI), beside = (name) => new URL(name, base).href;
-  const info = await (await fetch(base)).json();
-  const shader = await (await fetch(beside(info.shader))).text();
+  const info = await (await fetched(base)).json();
+  const shader = await (await fetched(beside(info.shader))).text();
   const textures = {};
   for (const [name, file] of Object.entries(info.textures)) textures[`wlm_atlas_${name}`] = await readDds(beside(file), THREE);
   const {wlm_atlas_colour: colour} = textures;

@@ -1,8 +1,12 @@
-// A texture, or an array of them, of a DDS file with the DX10 header.
-async function readDds(url, THREE, array = false) {
+async function fetched(url) {
   const answer = await fetch(url);
   if (!answer.ok) throw new Error(`${url}: ${answer.status}`);
-  const bytes = await answer.arrayBuffer(), head = new DataView(bytes, 0, 148);
+  return answer;
+}
+
+// A texture, or an array of them, of a DDS file with the DX10 header.
+async function readDds(url, THREE, array = false) {
+  const bytes = await (await fetched(url)).arrayBuffer(), head = new DataView(bytes, 0, 148);
   const height = head.getUint32(12, true), width = head.getUint32(16, true);
   const format = head.getUint32(128, true), layers = head.getUint32(140, true);
   const levels = (Kind) => new Kind(bytes, 148);

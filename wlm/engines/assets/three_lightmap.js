@@ -29,7 +29,7 @@ void main() {
 
 export async function loadLightmap(url, renderer, THREE) {
   const base = new URL(url, document.baseURI), beside = (name) => new URL(name, base).href;
-  const read = async (name, kind) => (await fetch(beside(name)))[kind]();
+  const read = async (name, kind) => (await fetched(beside(name)))[kind]();
   const [lightmap, shader] = await Promise.all([read('weights.json', 'json'), read('decode.glsl', 'text')]);
   if (!renderer.extensions.has('EXT_texture_compression_bptc')) throw new Error('lightmap: this GPU has no BC7');
   const names = [...Object.keys(lightmap.textures), 'valid'], mapped = 'uv' in lightmap.textures;
