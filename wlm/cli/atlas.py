@@ -10,6 +10,7 @@ from wlm.cli.console import (
     escape,
     exclusive,
     note,
+    note_start,
     number,
     quiet_warp,
     running,
@@ -134,8 +135,7 @@ def compress(
         note(f"warning: {warning}")
     options = {"seed": seed, "device": device}
     checkpoint = open_checkpoint(output, mesh, settings, resume=resume, every=checkpoint_every, **options)
-    if resume and not checkpoint.resumed:
-        note(f"{checkpoint.path}: there is nothing to resume; starting at the first stage")
+    note_start(checkpoint, resume, "at the first stage")
     inputs = {"mesh": mesh_path, "lightmap": lightmap_path, "mask": mask}
     facts = {"inputs": {name: path and str(path.resolve()) for name, path in inputs.items()} | reading}
     with running("compress", checkpoint.path) as progress:

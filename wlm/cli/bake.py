@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from wlm.cli.console import check_output, exclusive, note, quiet_warp, running, show, table
+from wlm.cli.console import check_output, exclusive, note, note_start, quiet_warp, running, show, table
 from wlm.cli.options import Device, Resume, Trust, output_option
 
 app = typer.Typer(
@@ -35,8 +35,7 @@ def lightmaps(
     check_folder(output)
     task = open_task(scene, trust)
     checkpoint = open_checkpoint(output, task, "lightmaps", device, resume=resume)
-    if resume and not checkpoint.resumed:
-        note(f"{checkpoint.path}: there is nothing to resume; starting anew")
+    note_start(checkpoint, resume, "anew")
     with running("bake", checkpoint.path, "percent", whole=False) as progress:
         baked = bake_lightmaps(task, device=device, checkpoint=checkpoint, progress=progress)
         files = write_lightmaps(output, task, baked)
@@ -70,8 +69,7 @@ def probes(
 
     task = open_task(scene, trust)
     checkpoint = open_checkpoint(output, task, "probes", device, resume=resume)
-    if resume and not checkpoint.resumed:
-        note(f"{checkpoint.path}: there is nothing to resume; starting anew")
+    note_start(checkpoint, resume, "anew")
     with running("bake", checkpoint.path, "percent", whole=False) as progress:
         baked = bake_probes(task, device=device, checkpoint=checkpoint, progress=progress)
         write_probes(output, baked)

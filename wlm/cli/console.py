@@ -23,6 +23,7 @@ from wlm.errors import WlmError, printable
 from wlm.formats.lock import locked
 
 if TYPE_CHECKING:
+    from wlm.formats.checkpoint import Checkpoint
     from wlm.system import OnProgress, Progress
 
 __all__ = [
@@ -30,6 +31,7 @@ __all__ = [
     "escape",
     "exclusive",
     "note",
+    "note_start",
     "number",
     "progress_bar",
     "quiet_warp",
@@ -101,6 +103,12 @@ def _figure(value: str | float) -> str:
 def note(text: str) -> None:
     """Prints a line to stderr, as it is: paths may hold what rich takes for markup."""
     _console(stderr=True).print(printable(text), markup=False, soft_wrap=True)
+
+
+def note_start(checkpoint: "Checkpoint", resume: bool, start: str) -> None:
+    """Says where work begins, at `start`, that was to be resumed and of which nothing is kept."""
+    if resume and not checkpoint.resumed:
+        note(f"{checkpoint.path}: there is nothing to resume; starting {start}")
 
 
 def show_text(text: str) -> None:

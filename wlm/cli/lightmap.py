@@ -11,6 +11,7 @@ from wlm.cli.console import (
     escape,
     exclusive,
     note,
+    note_start,
     number,
     quiet_warp,
     running,
@@ -140,8 +141,7 @@ def compress(
         settings = _chosen(lightmaps, settings, wanted, {"seed": seed, "device": device} | places)
     options = {"seed": seed, "device": device} | ({} if layered else {"tiles": numbers})
     checkpoint = open_checkpoint(output, lightmaps, settings, resume=resume, every=checkpoint_every, **options)
-    if resume and not checkpoint.resumed:
-        note(f"{checkpoint.path}: there is nothing to resume; starting at step 0")
+    note_start(checkpoint, resume, "at step 0")
     start = clock.perf_counter()
     with running("fit", checkpoint.path) as progress:
         model = compress(lightmaps, settings, progress=progress, checkpoint=checkpoint, **places, **options)

@@ -11,6 +11,7 @@ from wlm.cli.console import (
     escape,
     exclusive,
     note,
+    note_start,
     number,
     quiet_warp,
     running,
@@ -141,8 +142,7 @@ def compress(
         probes = joined(sets, hours)
     options = {"seed": seed, "device": device}
     checkpoint = open_checkpoint(output, probes, settings, resume=resume, every=checkpoint_every, **options)
-    if resume and not checkpoint.resumed:
-        note(f"{checkpoint.path}: there is nothing to resume; starting at step 0")
+    note_start(checkpoint, resume, "at step 0")
     start = time.perf_counter()
     with running("fit", checkpoint.path) as progress:
         if hours is None:

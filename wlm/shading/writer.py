@@ -1,5 +1,7 @@
 """What the languages that our GLSL is written in have in common."""
 
+from abc import ABC, abstractmethod
+
 from wlm.shading.tree import SAMPLERS, SCALARS, VECTORS, Function, Node, Shader, Statement, Variable
 
 _STRENGTH = {
@@ -14,7 +16,7 @@ _PLAIN = {("+", "*"), ("+", "/"), ("-", "*"), ("-", "/"), ("+", "%"), ("-", "%")
 _COMPARED = ("<", ">", "<=", ">=", "==", "!=")
 
 
-class Writer:
+class Writer(ABC):
     """Writes a shader in a language of C's kind; the languages say what is different.
 
     Attributes:
@@ -54,17 +56,17 @@ class Writer:
         """Lines behind all."""
         return []
 
+    @abstractmethod
     def outer(self, variable: Variable) -> list[str]:
         """A constant, or what is bound."""
-        raise NotImplementedError
 
     def signature(self, function: Function) -> str:
         """Its first line."""
         return f"{self.kind(function.type)} {function.name}({', '.join(map(self.parameter, function.parameters))})"
 
+    @abstractmethod
     def parameter(self, variable: Variable) -> str:
         """A parameter's declaration."""
-        raise NotImplementedError
 
     def kind(self, name: str) -> str:
         """A type's name."""
@@ -182,21 +184,21 @@ class Writer:
         """A vector, or a number of another type."""
         return f"{self.kind(name)}({', '.join(values)})"
 
+    @abstractmethod
     def fetch(self, texture: Variable, place: Node) -> str:
         """A texel."""
-        raise NotImplementedError
 
+    @abstractmethod
     def filtered(self, texture: Variable, place: Node) -> str:
         """Several, mixed."""
-        raise NotImplementedError
 
+    @abstractmethod
     def graded(self, texture: Variable, place: str, dx: str, dy: str) -> str:
         """Several, mixed, of the levels that a pixel of these changes of the place asks for."""
-        raise NotImplementedError
 
+    @abstractmethod
     def size(self, texture: Variable) -> str:
         """Texels of a texture, two whole numbers."""
-        raise NotImplementedError
 
     @property
     def textures(self) -> list[Variable]:

@@ -26,7 +26,6 @@ HIGHEST = 100_000
 _PARTS = 16  # that samples are divided into, whose spread tells the noise
 _BYTES = 2**31  # at most, and a fourth of the memory, of the planes of the parts that are traced at once
 _DENSEST = 1e4  # optical depth of a voxel: of more, paths would hardly end
-_KEY = 2**64
 
 
 @dataclass(frozen=True, eq=False)
