@@ -9,11 +9,13 @@ from builders.checks import assert_same, error_of
 from builders.running import call
 from builders.small_sets import moving_light, tiny_profile, write_set
 
-from wlm.lightmap import rate
+from wlm.lightmap import rate, worker
 from wlm.lightmap.data import from_arrays
 from wlm.lightmap.evaluation import bits_per_texel, evaluate
 from wlm.lightmap.fit import Trials, compress
 from wlm.lightmap.rate import RESOLUTIONS, Choice, choose
+from wlm.lightmap.survey import Survey
+from wlm.lightmap.targets import Targets
 
 SIZES = (4, 8, 16)
 OPTIONS = {"seed": 0, "device": "cpu", "workers": 1, "cluster": None, "progress": None}
@@ -74,6 +76,24 @@ def test_a_trial_scores_what_it_holds(light):
     assert model.profile.uvt_resolution == 12
     assert_same(model, compress(light, tiny_profile(steps=200, uvt_resolution=12)))
     assert psnr == pytest.approx(evaluate(model, light, metrics=("psnr",), views=0).psnr, abs=0.5)
+
+
+def test_a_set_is_looked_at_once_for_all_fits(light, monkeypatch):
+    made = []
+    monkeypatch.setattr(worker, "Targets", lambda *args: made.append(args) or Targets(*args))
+    choice = choose(light, tiny_profile(), target_psnr=14.0)
+    model = compress(light, choice.profile, survey=choice.survey)
+    assert len(made) == 1
+    assert_same(model, compress(light, choice.profile))
+    assert len(made) == 2
+
+
+@pytest.mark.parametrize("changes", [{}, {"metric_weight": 0.3}])
+def test_what_another_set_or_setting_was_looked_at_for_is_refused(light, changes):
+    survey = Survey(light, tiny_profile())
+    other = light if changes else moving_light()
+    with pytest.raises(ValueError, match="expected a survey of all tiles"):
+        compress(other, tiny_profile(**changes), survey=survey)
 
 
 def test_a_size_comes_before_a_psnr(light):

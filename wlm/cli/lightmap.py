@@ -42,6 +42,7 @@ from wlm.errors import WlmError
 
 if TYPE_CHECKING:
     from wlm.lightmap import LayeredModel, LayeredSet, LightmapModel, LightmapSet, Profile
+    from wlm.lightmap.rate import Choice
 
 _LAYERED = "lightmap-layers"
 
@@ -138,7 +139,8 @@ def compress(
         if numbers is not None:
             raise WlmError("--tiles: expected without --target-psnr and --max-bpp, which choose for a whole set")
         wanted = {"target_psnr": target_psnr, "max_bpp": max_bpp}
-        settings = _chosen(lightmaps, settings, wanted, {"seed": seed, "device": device} | places)
+        choice = _chosen(lightmaps, settings, wanted, {"seed": seed, "device": device} | places)
+        settings, places["survey"] = choice.profile, choice.survey
     options = {"seed": seed, "device": device} | ({} if layered else {"tiles": numbers})
     checkpoint = open_checkpoint(output, lightmaps, settings, resume=resume, every=checkpoint_every, **options)
     note_start(checkpoint, resume, "at step 0")
@@ -401,7 +403,7 @@ def _chosen(
     settings: "Profile",
     wanted: dict[str, float | None],
     options: dict[str, Any],
-) -> "Profile":
+) -> "Choice":
     """Chooses the size of the maps, or the quality of video, and says what it was and why."""
     from wlm.lightmap.rate import choose
 
@@ -414,7 +416,7 @@ def _chosen(
     if choice.limited:
         psnr, bpp = wanted["target_psnr"], wanted["max_bpp"]
         note(f"warning: --max-bpp {bpp:g} holds the PSNR below the {psnr:g} dB of --target-psnr")
-    return choice.profile
+    return choice
 
 
 def _load(

@@ -4,7 +4,7 @@ import math
 import os
 from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,17 +17,15 @@ from wlm.lightmap.data import LightmapSet
 from wlm.lightmap.dispatch import Batch, Dispatch
 from wlm.lightmap.frame_packing import needed_blocks
 from wlm.lightmap.frames import choose_frames, encode_frames, missing_encoder
-from wlm.lightmap.model import LightmapModel, Profile, decode_scale, encode_scale, part_table
+from wlm.lightmap.model import LightmapModel, Profile, part_table
 from wlm.lightmap.packing import check_packable, clear_unread
 from wlm.lightmap.reads import Reads
+from wlm.lightmap.survey import Facts, Survey
 from wlm.lightmap.targets import Targets
 from wlm.lightmap.tiles import (
     TILE,
     TileGrid,
     TileKind,
-    channel_means,
-    check_index,
-    classify,
     cut,
     split,
     valid_texels,
@@ -37,12 +35,11 @@ from wlm.lightmap.video import encode_page
 from wlm.lightmap.video_packing import pages
 from wlm.lightmap.worker import Fitter, Piece
 from wlm.system import Meter, OnProgress
-from wlm.workers import Actors, Here, Processes, Workers, cores, each
+from wlm.workers import Actors, Here, Processes, Workers, cores
 
 BATCH_TEXELS = 64 * 26 * TILE * TILE  # texels times times in a batch: 64 tiles of 26 times, 330 MB of targets
 CPU_TILES = 4  # in a batch on a CPU, at most: two cores gain nothing from more, and many want many batches
 
-_LOOK = 32  # tiles that are looked at between two looks at the clock: some seconds
 _WORTHWHILE = 20_000_000  # samples that two cores take some 20 s for: a process takes 3 s to start
 
 _CONSTANT_ERROR = 0.01  # of a constant tile's radiance: half floats near their end, 6e-8, are further off
@@ -59,6 +56,7 @@ def compress(
     cluster: str | None = None,
     progress: OnProgress | None = None,
     checkpoint: Checkpoint | CheckpointRange | None = None,
+    survey: Survey | None = None,
     **overrides: Any,
 ) -> LightmapModel:
     """Compresses a lightmap set.
@@ -77,6 +75,7 @@ def compress(
         progress: Called about twice a second; of the stage "fit" the figures are the loss and "PSNR dB", of the latest
             samples, by the tiled protocol. A large set has a stage "tiles" before it.
         checkpoint: From `open_checkpoint`: where a running fit is kept, and an interrupted one resumed.
+        survey: Of all tiles of the set, from an earlier look at it (`wlm.lightmap.rate.Choice`).
         overrides: Settings in place of the profile's: `steps=500`.
 
     Returns:
@@ -86,10 +85,13 @@ def compress(
         WlmError: No such profile, setting, device, tile or cluster; a checkpoint that isn't of this fit; the fit
             diverged; workers died again and again; or the settings ask for frames or video and the extra for it is
             missing.
+        ValueError: A survey of another set, or `tiles` beside one.
         KeyboardInterrupt: Raised by `progress`, after the checkpoint, if there is one, has been written.
     """
     _devices(device, workers, cluster, 0)  # checked before the set is looked at
-    fit = _Fit(lightmaps, Profile.load(profile).override(overrides), tiles, progress)
+    if survey is not None and tiles is not None:
+        raise ValueError("expected tiles or a survey of all")
+    fit = _Fit(lightmaps, Profile.load(profile).override(overrides), tiles, progress, survey)
     fit.store_frames(progress)
     fit.store_video(progress)
     _run(fit, seed, device, workers, cluster, progress, checkpoint)
@@ -97,7 +99,11 @@ def compress(
 
 
 class Trials:
-    """Fits of one set with maps of several sizes, or of several lengths."""
+    """Fits of one set with maps of several sizes, or of several lengths.
+
+    Attributes:
+        survey: Of the set, for further fits.
+    """
 
     def __init__(
         self,
@@ -120,7 +126,7 @@ class Trials:
         _devices(device, workers, cluster, 0)
         self._lightmaps, self._profile, self._progress = lightmaps, profile.override({"frames": "never"}), progress
         self._options = seed, device, workers, cluster
-        self._facts = _Fit(lightmaps, self._profile, None, progress).facts
+        self.survey = Survey(lightmaps, self._profile, None, progress)
 
     def fit(self, **changes: Any) -> tuple[LightmapModel, float]:
         """Compresses the set.
@@ -132,7 +138,7 @@ class Trials:
             The model, and the PSNR of its dynamic tiles by the tiled protocol in the fit's last samples; NaN without
             such a tile.
         """
-        fit = _Fit(self._lightmaps, self._profile.override(changes), None, None, self._facts)
+        fit = _Fit(self._lightmaps, self._profile.override(changes), survey=self.survey)
         return fit.model, _run(fit, *self._options, self._progress, None, track=True)
 
 
@@ -260,25 +266,6 @@ def dynamic_targets(lightmaps: LightmapSet, profile: Profile) -> Targets | None:
     return fit.piece(rows).targets() if len(rows) else None
 
 
-@dataclass(frozen=True, eq=False)
-class _Facts:
-    """What is stored of a tile beside its maps and network, rounded as in the file (section 4).
-
-    Attributes:
-        kind: Its kind.
-        scale: [T, 3], of tiles that have maps: codes, of a static one half floats.
-        peak: uint8 [T], of these, codes of the largest colour.
-        affine: [2, 3], of these, shift and spread.
-        constant: float64 [T, 3], radiance of a constant tile.
-    """
-
-    kind: TileKind
-    scale: np.ndarray | None = None
-    peak: np.ndarray | None = None
-    affine: np.ndarray | None = None
-    constant: np.ndarray | None = None
-
-
 class _Fit:
     """The tiles of a set, and the model that a fit fills with them.
 
@@ -287,7 +274,6 @@ class _Fit:
     Attributes:
         profile: The settings.
         index: int [N], numbers of the tiles in their grid, rising.
-        facts: What is stored of each beside its maps.
         kinds: int [N], `TileKind` of each.
         model: Complete but for the maps and networks of the batches that have not been stored.
     """
@@ -298,13 +284,16 @@ class _Fit:
         profile: Profile,
         tiles: Sequence[int] | None = None,
         progress: OnProgress | None = None,
-        facts: "list[_Facts] | None" = None,
+        survey: Survey | None = None,
     ) -> None:
         self.profile, self._lightmaps = profile, lightmaps
         grid = TileGrid.of(*lightmaps.mask.shape)
-        self.index = np.arange(grid.count) if tiles is None else np.array(sorted(tiles), np.int64)
-        check_index(self.index, grid)
-        self.facts = facts = self._look(progress) if facts is None else facts
+        self._survey = survey
+        if survey is None:
+            survey = Survey(lightmaps, profile, tiles, progress)
+        else:
+            survey.check(lightmaps, profile)
+        self.index, facts = survey.index, survey.facts
         self.kinds = np.array([tile.kind for tile in facts])
         framed = choose_frames(self.kinds, self.index, lightmaps.mask, len(lightmaps.times), profile)
         warnings = ()
@@ -341,48 +330,6 @@ class _Fit:
         for i, row in enumerate(self._mapped):
             self.model.peak[i], self.model.affine[i] = facts[row].peak, facts[row].affine
         self._scale = self.model.scales
-
-    def _look(self, progress: OnProgress | None) -> "list[_Facts]":
-        """Looks at all tiles."""
-        meter, facts = Meter(progress, "tiles", len(self.index)), []
-        for fact in each(self._facts, self.index.tolist()):
-            facts.append(fact)
-            if len(facts) % _LOOK == 0 and meter.due(len(facts)):
-                meter.report(len(facts))
-        return facts
-
-    def _facts(self, number: int) -> "_Facts":
-        """What is stored of a tile beside its maps and network."""
-        gamma = self.profile.gamma
-        tile = split(self._lightmaps, gamma, [number])
-        peak = self.profile.peak
-        kind = TileKind(int(classify(tile, gamma, self.profile.static_budget_db, peak)[0]))
-        if kind == TileKind.EMPTY:
-            return _Facts(kind)
-        colour = tile.colour[0][:, tile.mask[0]]  # [T, K, 3], of the valid texels
-        if kind == TileKind.CONSTANT:
-            radiance = colour.astype(np.float64) ** gamma
-            # The middle of the range: at most half a step of half float off.
-            middle = 0.5 * (radiance.min(1) + radiance.max(1)) if peak is None else radiance.mean(1)
-            return _Facts(kind, constant=middle)
-        means = channel_means(tile.colour, tile.mask)[0]
-        if kind == TileKind.DYNAMIC:
-            stored = encode_scale(means, gamma)
-            scale = decode_scale(stored, gamma)
-        else:
-            stored = means.astype(np.float16)
-            scale = stored.astype(np.float32)
-        # Shift and spread, of values as the fit will see them (section 4).
-        lit = scale > 0
-        values = colour * np.divide(1.0, scale, out=np.zeros_like(scale), where=lit)[:, None]
-        affine = np.empty((2, 3))
-        for c in range(3):
-            chosen = values[lit[:, c], :, c]
-            shift, spread = (chosen.mean(), chosen.std()) if chosen.size else (0.0, 1.0)
-            # Half floats end at 6e-8; a channel that is the same everywhere has nothing left to spread.
-            affine[:, c] = shift, max(spread, 1e-4)
-        peak = encode_scale(colour.max((1, 2)).astype(np.float64), gamma, up=True)
-        return _Facts(kind, scale=stored, peak=peak, affine=affine)
 
     def store_frames(self, progress: OnProgress | None) -> None:
         """Encodes the tiles that are stored as frames, and puts them into the model."""
@@ -428,8 +375,12 @@ class _Fit:
 
     def piece(self, rows: np.ndarray) -> Piece:
         """Some tiles as they are sent to a worker."""
+        # Where other fits follow, and memory for all tiles is needed anyway.
+        kept = self._survey if len(rows) == len(self._mapped) else None
+        if kept is not None and kept.piece is not None:
+            return kept.piece
         slots = np.searchsorted(self._mapped, rows)
-        return Piece(
+        piece = Piece(
             cut(self._lightmaps, self.index[rows]),
             self._scale[slots],
             self.model.affine[slots].astype(np.float32),
@@ -437,6 +388,10 @@ class _Fit:
             self.profile.metric_weight,
             self.profile.peak,
         )
+        if kept is not None:
+            kept.piece = replace(piece, keep=True)
+            return kept.piece
+        return piece
 
     def table(self, batch: Batch) -> dict[str, Part]:
         """The parts of a batch that is finished, as the trainer gives them."""
@@ -461,7 +416,7 @@ class _Fit:
         nets[batch.first : batch.first + len(batch.rows)] = parts["net"]
 
 
-def _constants(facts: Sequence[_Facts], times: int) -> np.ndarray:
+def _constants(facts: Sequence[Facts], times: int) -> np.ndarray:
     """Radiance of the constant tiles, [N_c, T, 3]: half floats, or float32 where one would be over 1% off."""
     values = np.array([tile.constant for tile in facts if tile.kind == TileKind.CONSTANT]).reshape(-1, times, 3)
     half = values.astype(np.float16)

@@ -8,19 +8,21 @@ at equal PSNR, since a mean of decibels gains as much from doubling the bytes of
 
 import math
 from bisect import bisect_left
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any
 
 import numpy as np
 
 from wlm.errors import WlmError
+from wlm.formats.artifact import encode_artifact
 from wlm.lightmap.codec import encode
 from wlm.lightmap.data import LightmapSet
 from wlm.lightmap.evaluation import bits_per_texel, evaluate
 from wlm.lightmap.fit import Trials, compress
 from wlm.lightmap.model import LightmapModel, Profile
 from wlm.lightmap.packing import STREAMS
+from wlm.lightmap.survey import Survey
 from wlm.lightmap.tiles import TileKind
 from wlm.lightmap.video import TRIAL_SPEED
 from wlm.system import OnProgress, Progress
@@ -48,12 +50,14 @@ class Choice:
         bpp: Expected, see `Report.bpp`.
         psnr: Expected, dB, see `Report.psnr`; None where no PSNR was asked for.
         limited: Whether the largest size holds it below the wanted PSNR.
+        survey: Of the set, for `wlm.lightmap.fit.compress`, which then needn't look at it again; None of video.
     """
 
     profile: Profile
     bpp: float
     psnr: float | None = None
     limited: bool = False
+    survey: Survey | None = field(default=None, repr=False, compare=False)
 
 
 def choose(
@@ -101,14 +105,14 @@ def choose(
         least = search.bpp(RESOLUTIONS[0]) / _ROOM
         raise WlmError(f"--max-bpp: expected at least {least:.3f} for profile {profile.name}, got {max_bpp:g}")
     if target_psnr is None:
-        return Choice(profile.override({"uvt_resolution": allowed[-1]}), search.bpp(allowed[-1]))
+        return Choice(profile.override({"uvt_resolution": allowed[-1]}), search.bpp(allowed[-1]), survey=search.survey)
     curve = search.curve(target_psnr, allowed)
     chosen = curve.nearest(target_psnr, allowed)
     psnr = curve.psnr(chosen)
     short = chosen == allowed[-1] and psnr < target_psnr
     if short and max_bpp is None:
         raise WlmError(f"--target-psnr: expected at most {psnr:.1f} for profile {profile.name}, got {target_psnr:g}")
-    return Choice(profile.override({"uvt_resolution": chosen}), search.bpp(chosen), psnr, short)
+    return Choice(profile.override({"uvt_resolution": chosen}), search.bpp(chosen), psnr, short, search.survey)
 
 
 def _choose_quality(
@@ -175,11 +179,16 @@ class _Search:
         if not (model.kind == TileKind.DYNAMIC).any():
             raise WlmError(f"{lightmaps.name}: no tile changes over time, so there is no size to choose")
         # A whole fit's maps are smoother: its file is smaller by some percent.
-        sizes = encode(model)[1]["stream_sizes"].sum(0, dtype=np.float64)
-        volume = float(sizes[STREAMS.index("uvt")])
+        encoded = encode(model)
+        volume = float(encoded[1]["stream_sizes"].sum(0, dtype=np.float64)[STREAMS.index("uvt")])
         self._per_square = volume / self._first**2
-        self._others = model.file_bytes() - volume
+        self._others = sum(memoryview(part).nbytes for part in encode_artifact(model.SYSTEM, *encoded)) - volume
         self._bpp = bits_per_texel(model, lightmaps.mask, 1_000_000) / 1e6
+
+    @property
+    def survey(self) -> Survey:
+        """Of the set."""
+        return self._trials.survey
 
     def bytes(self, resolution: int) -> float:
         """Size of the file, expected."""

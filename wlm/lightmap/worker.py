@@ -1,5 +1,6 @@
 """What fits batches of tiles, in this process or in another one (`wlm.workers`)."""
 
+import functools
 import time
 from dataclasses import dataclass
 
@@ -23,6 +24,7 @@ class Piece:
     Attributes:
         tiles: As they are in their set.
         scale, affine, gamma, metric_weight, peak: As `Targets` takes them.
+        keep: Whether targets are made once and kept, for several fits in this process.
     """
 
     tiles: TileCut
@@ -31,9 +33,17 @@ class Piece:
     gamma: float
     metric_weight: float
     peak: float | None
+    keep: bool = False
 
     def targets(self) -> Targets:
         """What the tiles are fitted to."""
+        return self._targets if self.keep else self._made()
+
+    @functools.cached_property
+    def _targets(self) -> Targets:
+        return self._made()
+
+    def _made(self) -> Targets:
         tiles = self.tiles.encoded(self.gamma)
         weights = self.metric_weight, self.peak
         return Targets(tiles.index, tiles.colour, tiles.mask, self.scale, self.affine, self.gamma, *weights)
