@@ -13,7 +13,7 @@ from wlm.lightmap.data import from_arrays
 from wlm.lightmap.decode import Decoder
 from wlm.lightmap.evaluation import count_kinds, evaluate
 from wlm.lightmap.fit import compress
-from wlm.lightmap.model import TimeAxis
+from wlm.lightmap.model import Profile, TimeAxis
 
 PROFILE = tiny_profile()
 
@@ -124,6 +124,48 @@ def test_one_time_only_is_static_and_the_same_at_any_hour(tmp_path):
         for hour in (0.0, 6.0, 23.9, -5.0, 100.0):
             # Up to the rounding of (1 - share) x + share x.
             np.testing.assert_allclose(decoder.frame(hour), decoder.frame(6.0), rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("times", "slices", "rows"), [(1, 1, 1), (6, 6, 6), (17, 12, 17), (26, 12, 24), (60, 28, 55), (200, 64, 64)]
+)
+def test_maps_follow_the_number_of_times(times, slices, rows):
+    sized = Profile.load("standard").for_times(times)
+    assert (sized.uvt_slices, sized.plane_rows) == (slices, rows)
+    assert sized.for_times(times) == sized
+    assert Profile.load("M").for_times(times) == Profile.load("M")
+
+
+def test_two_hundred_times(tmp_path):
+    """Eight days: 64 slices rather than 12."""
+    days = moving_light(40, 40, np.arange(200.0), period=None)
+    errors = []
+    for follow in (False, True):
+        profile = tiny_profile(steps=300, uvt_slices=12, plane_rows=24, follow_times=follow)
+        compress(days, profile).save(tmp_path / "days.wlm")
+        decoder = wlm.load(tmp_path / "days.wlm").decoder()
+        wrong = (decoder.frame(hour) - days.frames[hour] for hour in range(0, 200, 7))
+        errors.append(np.mean([np.square(frame).mean() for frame in wrong]))
+    assert decoder.model.profile.uvt_slices == decoder.model.profile.plane_rows == 64
+    assert errors[1] < 0.85 * errors[0]
+
+
+def test_charts_of_one_texel_and_across_borders(tmp_path):
+    """Texels alone, a chart over the border of two tiles and one along the map's end, as right as one within."""
+    mask = np.zeros((128, 256), bool)
+    mask[4:124:6, 4:60:6] = True
+    within, across, along = np.s_[10:110, 70:100], np.s_[30:90, 110:150], np.s_[124:128, 160:256]
+    for chart in (within, across, along):
+        mask[chart] = True
+    lightmaps = moving_light(128, 256, mask=mask)
+    decoder = through_file(tmp_path, lightmaps, tiny_profile(steps=500, samples=512, uvt_resolution=16))
+    error = np.square(decoded(decoder) - lightmaps.frames).mean((0, -1))
+    alone = np.s_[4:124:6, 4:60:6]
+    for part in (alone, across, along, np.s_[30:90, 127:129]):
+        assert error[part].mean() < 2.0 * error[within].mean() < 5e-3
+    # What a filter reads beside a texel that is alone is that texel.
+    frame = decoder.frame(HOURS[1])
+    np.testing.assert_array_equal(frame[5:124:6, 5:60:6], frame[alone])
 
 
 @pytest.mark.parametrize(("height", "width", "tiles"), [(130, 70, 2), (1, 1, 1), (1, 300, 3)])

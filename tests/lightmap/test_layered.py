@@ -16,7 +16,7 @@ import wlm
 from wlm.formats.artifact import read_artifact
 from wlm.formats.checkpoint import Pace
 from wlm.formats.exr import read_exr
-from wlm.lightmap import fit
+from wlm.lightmap import survey
 from wlm.lightmap.layers import codec
 from wlm.lightmap.layers.data import LayerArrays, from_layers
 from wlm.lightmap.layers.model import LayeredModel
@@ -175,7 +175,7 @@ def test_a_layer_of_light_alone_is_fitted_as_without_layers(tmp_path):
 @pytest.mark.parametrize("stage", ["sheet 2 of 3, tiles", "sheet 2 of 3"])
 def test_a_stopped_fit_goes_on_in_its_sheet_to_the_same_bytes(stage, tmp_path, monkeypatch):
     report_always(monkeypatch)
-    monkeypatch.setattr(fit, "_LOOK", 1)
+    monkeypatch.setattr(survey, "_LOOK", 1)
     # Nothing is written before the fit is stopped.
     monkeypatch.setattr(Pace, "affordable", lambda self: False)
     data, profile, output = small_layers(40, 24), tiny_profile(steps=20), tmp_path / "part.wlm"

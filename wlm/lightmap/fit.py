@@ -286,6 +286,8 @@ class _Fit:
         progress: OnProgress | None = None,
         survey: Survey | None = None,
     ) -> None:
+        # What is stored as frames is told by the sizes that the profile has, so that two states stay frames.
+        named, profile = profile, profile.for_times(len(lightmaps.times))
         self.profile, self._lightmaps = profile, lightmaps
         grid = TileGrid.of(*lightmaps.mask.shape)
         self._survey = survey
@@ -295,7 +297,7 @@ class _Fit:
             survey.check(lightmaps, profile)
         self.index, facts = survey.index, survey.facts
         self.kinds = np.array([tile.kind for tile in facts])
-        framed = choose_frames(self.kinds, self.index, lightmaps.mask, len(lightmaps.times), profile)
+        framed = choose_frames(self.kinds, self.index, lightmaps.mask, len(lightmaps.times), named)
         warnings = ()
         if profile.frames == "auto" and framed.any() and (warning := missing_encoder(int(framed.sum()))):
             warnings, framed[:] = (f"{lightmaps.name}: {warning}",), False

@@ -30,6 +30,9 @@ from wlm_kernels.lightmap.features import STATIC_INPUTS, TEMPORAL_INPUTS
 
 _RANGE_BYTES = 2 * 3 * 2
 
+_MOST_ALONG_TIME = 64
+_USUAL_TIMES = 26  # of the paper's sets
+
 SCALE_SPAN = (-21.0, 16.0)  # log2 of radiance: from half float's small numbers to its largest
 
 
@@ -42,6 +45,8 @@ class Profile(Settings):
         uvt_resolution: Texels of F_uvt along u and along v.
         uvt_slices: Slices of F_uvt along time.
         plane_columns, plane_rows: Size of F_ut and F_vt: along u or v, and along time.
+        follow_times: Whether the maps' sizes along time are those of sets of 26 times, and others have others, see
+            `for_times`.
         net_bits: Bits of a network's weight in the file: 16, half floats, or 8, see `wlm.lightmap.weights`.
         map_bits: Bits of the numbers in F_ut and F_vt and of the ends of blocks: 8, all levels of BC7 mode 6; fewer,
             multiples of 2 ** (8 - bits) alone, which decode as fast and take less of the file.
@@ -81,9 +86,10 @@ class Profile(Settings):
 
     hidden: int = Field(16, ge=4, le=128)
     uvt_resolution: int = Field(32, ge=4, le=128, multiple_of=4)
-    uvt_slices: int = Field(12, ge=1, le=64)
+    uvt_slices: int = Field(12, ge=1, le=_MOST_ALONG_TIME)
     plane_columns: int = Field(64, ge=1, le=128)
-    plane_rows: int = Field(24, ge=1, le=64)
+    plane_rows: int = Field(24, ge=1, le=_MOST_ALONG_TIME)
+    follow_times: bool = False
     net_bits: Literal[8, 16] = 16
     map_bits: int = Field(8, ge=4, le=8)
     gelu: Literal["exact", "tanh"] = "tanh"
@@ -117,6 +123,20 @@ class Profile(Settings):
     def map_step(self) -> int:
         """What the numbers of maps are multiples of."""
         return 1 << (8 - self.map_bits)
+
+    def for_times(self, times: int) -> "Profile":
+        """The settings of a set of so many times.
+
+        With `follow_times` F_uvt, F_ut and F_vt have no more along time than there are stored times, each of which then
+        has a slice and a row of its own: more would be mixtures. Beyond 26 times they grow in proportion, up to 64.
+        """
+        if not self.follow_times:
+            return self
+        sizes = {
+            name: min(times, _MOST_ALONG_TIME, max(fixed, round(fixed * times / _USUAL_TIMES)))
+            for name, fixed in (("uvt_slices", self.uvt_slices), ("plane_rows", self.plane_rows))
+        }
+        return self.override(sizes | {"follow_times": False})
 
     def inputs(self, temporal: bool) -> int:
         """Inputs of the network of a tile with or without temporal maps."""
