@@ -27,6 +27,7 @@ from wlm.lightmap.tiles import (
     TileGrid,
     TileKind,
     cut,
+    shared_texels,
     split,
     valid_texels,
 )
@@ -381,7 +382,10 @@ class _Fit:
         kept = self._survey if len(rows) == len(self._mapped) else None
         if kept is not None and kept.piece is not None:
             return kept.piece
-        slots = np.searchsorted(self._mapped, rows)
+        slots, more, repeated = np.searchsorted(self._mapped, rows), self.profile.border_weight - 1, None
+        if more:
+            shared = (np.flatnonzero(shared_texels(self.model.mask, number)) for number in self.index[rows].tolist())
+            repeated = [np.repeat(texels, more) for texels in shared]
         piece = Piece(
             cut(self._lightmaps, self.index[rows]),
             self._scale[slots],
@@ -389,6 +393,7 @@ class _Fit:
             self.profile.gamma,
             self.profile.metric_weight,
             self.profile.peak,
+            repeated,
         )
         if kept is not None:
             kept.piece = replace(piece, keep=True)
