@@ -134,6 +134,17 @@ def test_errors_at_borders_of_tiles_stand_out():
     assert math.isnan(scored(flat, flat.frames).border)
 
 
+def test_a_dark_tile_is_not_blamed_for_the_error_of_a_bright_one():
+    bright = light(128, 256)
+    share = np.where(np.arange(256) < 128, np.float32(0.01), np.float32(1.0))[:, None]
+    both = from_arrays(bright.frames * share, bright.times, name="both")
+    noise = np.random.default_rng(5).normal(0.0, 0.02, (128, 256, 3)).astype(np.float32)
+    score = scored(both, [both.frames[0] + noise * share])
+    # As with tiles that are alike: a hundredth of the light, a hundredth of the error.
+    assert score.border == pytest.approx(scored(bright, [bright.frames[0] + noise]).border, rel=1e-3)
+    assert score.border == pytest.approx(1.0, abs=0.1)
+
+
 def test_half_way_between_times_a_step_is_half_a_step_off():
     """A decoder that stays until the next hour; eq. 2 is half-way. The wrong interval is the one after midnight's."""
     still = light(128, 128, (6.0, 18.0, 20.0), period=24.0)
