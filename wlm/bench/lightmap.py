@@ -405,7 +405,9 @@ class _LightmapBench(Bench):
     def _tally(self, name: str, decode: Callable[[float], np.ndarray] | None = None, views: int = VIEWS) -> Tally:
         """The scores of `wlm.lightmap.seen`, to be filled."""
         whole = len(self.chosen) == len(self.lightmaps.times)
-        seen_from, _ = views_of(self.lightmaps, views if whole else 0, device=self.device)
+        seen_from, warnings = views_of(self.lightmaps, views if whole else 0, device=self.device)
+        for warning in warnings:
+            self.note(warning)
         return Tally(self.lightmaps, self.lightmaps.mask, decode, seen_from, name)
 
     def _frame(

@@ -14,7 +14,7 @@ scores here are over the same tiles and times, relative to the same range, the t
 
       sqrt(sum n b / sum n i)     n the former's count, b and i both mean squares, summed over tiles and times
 
-  of errors that are relative to the range of the tile that a texel belongs to, before they are filtered. By the range of
+  of errors relative to the range of the tile that a texel belongs to, before they are filtered. By the range of
   the reading tile alone a dark tile beside a bright one would be blamed for the other's error: noise of an equal share
   of every tile's range would score 1.39 and 4.6 on two lightmaps of a game, where no border shows.
 
