@@ -12,7 +12,7 @@ from wlm.errors import WlmError
 from wlm.lightmap.data import from_arrays
 from wlm.lightmap.decode import Decoder
 from wlm.lightmap.evaluation import count_kinds, evaluate
-from wlm.lightmap.fit import _Fit, compress
+from wlm.lightmap.fit import compress
 from wlm.lightmap.model import Profile, TimeAxis
 
 PROFILE = tiny_profile()
@@ -255,25 +255,6 @@ def test_a_subset_of_the_tiles(tmp_path):
 def test_tiles_that_are_not_there_are_one_line(tiles):
     with pytest.raises(WlmError, match="tile"):
         compress(moving_light(130, 130), PROFILE, tiles=tiles)
-
-
-def test_texels_at_borders_count_more():
-    mask = np.ones((128, 256), bool)
-    mask[:, 250:] = False
-    wide = moving_light(128, 256, mask=mask)
-    errors = []
-    for weight in (1, 8):
-        profile = tiny_profile(steps=300, border_weight=weight)
-        fitting = _Fit(wide, profile)
-        (batch,) = fitting.batches()
-        targets = fitting.piece(batch.rows).targets()
-        assert targets.count.tolist() == [128 * (128 + weight - 1), 128 * (122 + weight - 1)]
-        for texels, count, column in zip(targets.texels, targets.count, (127, 0), strict=True):
-            drawn = np.bincount(texels[:count], minlength=128 * 128).reshape(128, 128)
-            assert (drawn[:, column] == weight).all() and drawn.max() == weight and (drawn[:, 1:120] == 1).all()
-        wrong = np.square(decoded(compress(wide, profile).decoder()) - wide.frames)
-        errors.append(wrong[:, :, 127:129].mean() / wrong[:, :, 130:250].mean())
-    assert errors[1] < 0.8 * errors[0]
 
 
 def test_one_seed_gives_one_file_and_another_seed_another(tmp_path):

@@ -15,7 +15,6 @@ from wlm.lightmap.tiles import (
     channel_means,
     classify,
     parse_tiles,
-    shared_texels,
     split,
     static_pattern,
 )
@@ -134,20 +133,6 @@ def test_assemble_fills_what_is_absent_and_keeps_the_type():
         assemble(np.zeros((2, TILE, TILE, 3)), np.array([1]), grid)
     with pytest.raises(WlmError, match="outside"):
         assemble(np.zeros((1, TILE, TILE, 3)), np.array([6]), grid)
-
-
-def test_shared_texels_touch_those_of_other_tiles():
-    mask = np.random.default_rng(4).random((200, 300)) < 0.3
-    y, x = np.nonzero(mask)
-    tile = y // 128 * 3 + x // 128
-    touch = (abs(y[:, None] - y) <= 1) & (abs(x[:, None] - x) <= 1) & (tile[:, None] != tile)
-    expected = np.zeros((256, 384), bool)
-    expected[y, x] = touch.any(1)
-    for number in range(6):
-        row, column = divmod(number, 3)
-        window = np.s_[row * 128 : row * 128 + 128, column * 128 : column * 128 + 128]
-        assert np.array_equal(shared_texels(mask, number), expected[window]), number
-    assert expected.sum() > 100
 
 
 def test_channel_means_count_valid_texels_only(lightmaps):

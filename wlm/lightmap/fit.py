@@ -27,7 +27,6 @@ from wlm.lightmap.tiles import (
     TileGrid,
     TileKind,
     cut,
-    shared_texels,
     split,
     valid_texels,
 )
@@ -382,10 +381,7 @@ class _Fit:
         kept = self._survey if len(rows) == len(self._mapped) else None
         if kept is not None and kept.piece is not None:
             return kept.piece
-        slots, more, repeated = np.searchsorted(self._mapped, rows), self.profile.border_weight - 1, None
-        if more:
-            shared = (np.flatnonzero(shared_texels(self.model.mask, number)) for number in self.index[rows].tolist())
-            repeated = [np.repeat(texels, more) for texels in shared]
+        slots = np.searchsorted(self._mapped, rows)
         piece = Piece(
             cut(self._lightmaps, self.index[rows]),
             self._scale[slots],
@@ -393,7 +389,6 @@ class _Fit:
             self.profile.gamma,
             self.profile.metric_weight,
             self.profile.peak,
-            repeated,
         )
         if kept is not None:
             kept.piece = replace(piece, keep=True)

@@ -69,8 +69,6 @@ class Profile(Settings):
         metric_weight: 0: the squared error in normalised gamma space, as the paper; 1: each texel, channel and time
             weighted so that the loss is the squared error of linear radiance over the tile's range at that time, or
             over `peak`, which is what PSNR measures; between: the geometric mean.
-        border_weight: How many times the error of a texel counts in the fit that touches a valid one of another tile: a
-            filter reads it with that one, which may be of a far darker tile.
         quantise_from: Fraction of the steps after which the maps are quantised to the exact levels of the file.
         freeze_from: Fraction of the steps after which the maps are frozen and the network alone is trained.
         peak: What an error is relative to, in all tiles at all times, of values that have a range of their own and
@@ -106,7 +104,6 @@ class Profile(Settings):
     adam_epsilon: float = Field(1e-8, gt=0.0)
     adam_decay: float = Field(0.999, ge=0.5, lt=1.0)
     metric_weight: float = Field(0.5, ge=0.0, le=1.0)
-    border_weight: int = Field(1, ge=1, le=16)
     quantise_from: float = Field(0.5, ge=0.0, le=1.0)
     freeze_from: float = Field(0.95, ge=0.0, le=1.0)
     peak: float | None = Field(None, gt=0.0)

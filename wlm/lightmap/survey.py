@@ -13,7 +13,7 @@ from wlm.system import Meter, OnProgress
 from wlm.workers import each
 
 _LOOK = 32  # tiles that are looked at between two looks at the clock: some seconds
-_SETTINGS = ("gamma", "static_budget_db", "peak", "metric_weight", "border_weight")  # that it depends on
+_SETTINGS = ("gamma", "static_budget_db", "peak", "metric_weight")  # that it depends on
 
 
 @dataclass(frozen=True, eq=False)

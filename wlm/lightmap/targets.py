@@ -1,7 +1,5 @@
 """What a batch of tiles is fitted to: normalised colour and its weights."""
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from wlm.lightmap.tiles import TILE
@@ -14,8 +12,8 @@ class Targets:
     Attributes:
         number: int [N], numbers of the tiles in their grid.
         colour: float32 [N, T, 128 * 128, 3], (colour / scale - shift) / spread.
-        texels: int32 [N, K], flat indices of valid texels, padded; some may be there several times.
-        count: int32 [N], how many there are.
+        texels: int32 [N, K], flat indices of valid texels, padded.
+        count: int32 [N], number of valid texels.
         weight, emphasis: float32 [N, T, 3] and a number, see `wlm_kernels.lightmap.features.Batch`.
         shift, spread: float32 [N, 3].
         scale: float32 [N, T, 3].
@@ -32,7 +30,6 @@ class Targets:
         gamma: float,
         metric_weight: float,
         peak: float | None = None,
-        repeated: Sequence[np.ndarray] | None = None,
     ):
         """Normalises and weights colour.
 
@@ -43,8 +40,6 @@ class Targets:
             scale: float32 [N, T, 3], as rounded for the file.
             affine: float32 [N, 2, 3], shift and spread, as rounded for the file.
             gamma, metric_weight, peak: Of the `Profile`.
-            repeated: Of each tile flat indices of valid texels that are there once more for each time that they are
-                named; None: none.
         """
         n, times = colour.shape[:2]
         self.number = number.astype(np.int32)
@@ -55,8 +50,7 @@ class Targets:
         flat = colour.reshape(n, times, TILE * TILE, 3)
         valid = mask.reshape(n, -1)
         self.colour = np.empty_like(flat)
-        repeated = [np.empty(0, np.int32)] * n if repeated is None else repeated
-        self.count = valid.sum(1).astype(np.int32) + np.array([len(texels) for texels in repeated], np.int32)
+        self.count = valid.sum(1).astype(np.int32)
         self.texels = np.zeros((n, max(int(self.count.max()), 1)), np.int32)
         self.weight = np.ones((n, times, 3), np.float32)
         self.range = np.zeros((n, times), np.float32)
@@ -65,7 +59,7 @@ class Targets:
             np.multiply(flat[i], factor[i, :, None], out=self.colour[i])
             self.colour[i] -= self.shift[i]
             self.colour[i] /= self.spread[i]
-            self.texels[i, : self.count[i]] = np.concatenate([np.flatnonzero(valid[i]), repeated[i]])
+            self.texels[i, : self.count[i]] = np.flatnonzero(valid[i])
             values = flat[i][:, valid[i]]
             span = values.max((1, 2)) ** gamma - values.min((1, 2)) ** gamma  # [T] of linear radiance
             if peak is not None:

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
-from scipy.ndimage import binary_dilation
 
 from wlm.errors import WlmError
 from wlm.lightmap.data import LightmapSet
@@ -196,23 +195,6 @@ def valid_texels(mask: np.ndarray, number: int) -> np.ndarray:
     """
     y, x = TileGrid.of(*mask.shape).origin(number)
     return _whole(mask[y : y + TILE, x : x + TILE])
-
-
-def shared_texels(mask: np.ndarray, number: int) -> np.ndarray:
-    """The valid texels of a tile that touch a valid one of another tile, corners included, bool [128, 128].
-
-    Args:
-        mask: bool [H, W], true where a texel is valid.
-        number: Of the tile in the grid.
-    """
-    y, x = TileGrid.of(*mask.shape).origin(number)
-    top, left = min(y, 1), min(x, 1)  # no texel lies above the first row, none left of the first column
-    part = mask[y - top : y + TILE + 1, x - left : x + TILE + 1]
-    around = np.zeros((TILE + 2, TILE + 2), bool)
-    around[1 - top : 1 - top + part.shape[0], 1 - left : 1 - left + part.shape[1]] = part
-    own = around[1:-1, 1:-1].copy()
-    around[1:-1, 1:-1] = False
-    return own & binary_dilation(around, np.ones((3, 3)))[1:-1, 1:-1]
 
 
 def channel_means(colour: np.ndarray, mask: np.ndarray) -> np.ndarray:

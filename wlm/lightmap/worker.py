@@ -23,7 +23,7 @@ class Piece:
 
     Attributes:
         tiles: As they are in their set.
-        scale, affine, gamma, metric_weight, peak, repeated: As `Targets` takes them.
+        scale, affine, gamma, metric_weight, peak: As `Targets` takes them.
         keep: Whether targets are made once and kept, for several fits in this process.
     """
 
@@ -33,7 +33,6 @@ class Piece:
     gamma: float
     metric_weight: float
     peak: float | None
-    repeated: list[np.ndarray] | None = None
     keep: bool = False
 
     def targets(self) -> Targets:
@@ -46,7 +45,7 @@ class Piece:
 
     def _made(self) -> Targets:
         tiles = self.tiles.encoded(self.gamma)
-        weights = self.metric_weight, self.peak, self.repeated
+        weights = self.metric_weight, self.peak
         return Targets(tiles.index, tiles.colour, tiles.mask, self.scale, self.affine, self.gamma, *weights)
 
 
