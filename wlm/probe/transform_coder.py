@@ -134,19 +134,28 @@ class Coder:
         tree, step = self._tree, stored_step(step)
         if not self._coding.predicted:
             return self.plain(step)
-        target, reach, bound = self._target(), tree.reach[:, None], _ABOVE * tree.eigenvalue
+        order, bound = tree.order, _ABOVE * tree.eigenvalue
+        target, reach = self._target()[order], tree.reach[order, None]
 
         def downhill(number: np.ndarray) -> np.ndarray:
-            return number - tree.adjoint(tree.values(number / reach) - target) / reach / bound
+            change = number / reach
+            tree.compose(change)
+            change -= target
+            tree.transpose(change)
+            change /= reach
+            change /= bound
+            return np.subtract(number, change, out=change)
 
         price = _PRICE * step / bound
 
         def shrunk(number: np.ndarray) -> np.ndarray:
-            return np.copysign(np.maximum(np.abs(number) - price, 0.0), number)
+            size = np.abs(number)
+            size -= price
+            return np.copysign(np.maximum(size, 0.0, out=size), number, out=size)
 
         # Of many probes another step begins where the last one ended.
         again = self._warm is not None and len(target) > MANY
-        start, rounds = (self._warm, _AGAIN) if again else (self._exact(), _SPARSE)
+        start, rounds = (self._warm, _AGAIN) if again else (self._exact()[order], _SPARSE)
         number = self._warm = _accelerated(start, lambda x: shrunk(downhill(x)), rounds)
         kept = number != 0.0
         number = _accelerated(number, lambda x: downhill(x) * kept, _FREE)
@@ -154,7 +163,9 @@ class Coder:
         for _ in range(_MOVES):
             moved = downhill(q * step) / step
             q = np.where((q == 0) & (np.abs(moved) < 1.0 - _ROUND), 0, _rounded(moved))
-        return self._coded(step, q)
+        back = np.empty_like(q)
+        back[order] = q
+        return self._coded(step, back)
 
     def _target(self) -> np.ndarray:
         if self._turned is None:
@@ -206,6 +217,8 @@ def _accelerated(first: np.ndarray, step: Callable[[np.ndarray], np.ndarray], ro
     for _ in range(rounds):
         before, current = current, step(ahead)
         following = 0.5 * (1.0 + math.sqrt(1.0 + 4.0 * weight * weight))
-        ahead = current + (weight - 1.0) / following * (current - before)
+        ahead = current - before
+        ahead *= (weight - 1.0) / following
+        ahead += current
         weight = following
     return current
