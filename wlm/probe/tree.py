@@ -75,6 +75,7 @@ class Tree:
             np.add.at(self.reach, parents, np.square(weight) * self.reach[level][:, None])
         self.reach = np.sqrt(self.reach)
         self._up = [matrix.T.tocsr() for matrix in self._down]
+        self._single: tuple[list[sparse.csr_matrix], list[sparse.csr_matrix]] | None = None
 
     def values(self, coefficient: np.ndarray) -> np.ndarray:
         """Values [N, D] of coefficients [N, D]."""
@@ -94,16 +95,24 @@ class Tree:
         return self._in_order(self.transpose, value)
 
     def compose(self, number: np.ndarray) -> None:
-        """`values` in place, of rows in `order`."""
-        for matrix in self._down:
+        """`values` in place, of rows in `order`, float64 or float32."""
+        for matrix in self._matrices(number.dtype)[0]:
             rows, before = matrix.shape
             number[before : before + rows] += matrix @ number[:before]
 
     def transpose(self, number: np.ndarray) -> None:
-        """`adjoint` in place, of rows in `order`."""
-        for matrix in self._up[::-1]:
+        """`adjoint` in place, of rows in `order`, float64 or float32."""
+        for matrix in self._matrices(number.dtype)[1][::-1]:
             before, rows = matrix.shape
             number[:before] += matrix @ number[before : before + rows]
+
+    def _matrices(self, dtype: np.dtype) -> tuple[list[sparse.csr_matrix], list[sparse.csr_matrix]]:
+        if dtype != np.float32:
+            return self._down, self._up
+        if self._single is None:
+            down, up = ([matrix.astype(np.float32) for matrix in matrices] for matrices in (self._down, self._up))
+            self._single = down, up
+        return self._single
 
     def _in_order(self, change: Callable[[np.ndarray], None], rows: np.ndarray) -> np.ndarray:
         ordered = rows[self.order]
