@@ -30,7 +30,7 @@ _SPARSE, _FREE, _MOVES = 25, 15, 3  # rounds with the price, without it, and of 
 # Of many probes, whose numbers depend on each other farther: rounds with the price, and from where these came to for
 # another step; and what is added, for a number that is kept is worth its bits.
 _OF_MANY, _AGAIN, _NEAR, _HALF = 45, 10, 0.1, 0.5
-_SINGLE = 2.0**13  # the largest number in steps up to which float32 will do
+_SINGLE, _LEAST_SINGLE = 2.0**13, 1e-30  # the largest number in steps up to which float32 will do, and the least step
 
 
 @dataclass(frozen=True)
@@ -140,7 +140,8 @@ class Coder:
             return self.plain(step)
         order, bound = tree.order, _ABOVE * tree.eigenvalue
         # Half the memory, which is what takes the time, where that leaves a thousandth of a step.
-        kind = np.float32 if np.abs(self._exact()).max() < _SINGLE * step else np.float64
+        single = step > _LEAST_SINGLE and np.abs(self._exact()).max() < _SINGLE * step
+        kind = np.float32 if single else np.float64
         target, reach = self._target()[order].astype(kind), tree.reach[order, None].astype(kind)
 
         def downhill(number: np.ndarray) -> np.ndarray:
