@@ -326,6 +326,14 @@ def test_grid_for_three(fitted, tmp_path):
     assert max(json.loads((tmp_path / "out" / "grid.json").read_text())["resolution"]) == 5 and "grid.ktx2" in text
 
 
+def test_shaders_in_other_languages(fitted, tmp_path):
+    for language, name in (("hlsl", "probe.hlsl"), ("wgsl", "probe.wgsl"), ("glsl", "probe.glsl")):
+        assert name in call("probe", "export", fitted, "-o", tmp_path / "out", "--shader", language)
+        assert "wlm_probe_sh(" in (tmp_path / "out" / name).read_text()
+    words = ["probe", "export", fitted, "-o", tmp_path / "no", "--engine", "three", "--shader", "hlsl"]
+    assert "--shader: means nothing" in fails(*words)
+
+
 def test_textures_for_unreal(fitted, tmp_path):
     text = call("probe", "export", fitted, "--engine", "unreal", "-o", tmp_path / "out", "--cells", 4)
     assert max(json.loads((tmp_path / "out" / "light.json").read_text())["resolution"]) == 4 and "WlmProbes.usf" in text

@@ -46,6 +46,10 @@ def export(
         Literal["x", "y", "z"] | None,
         typer.Option(help="For Unity, which is left-handed: the axis to turn round; default none."),
     ] = None,
+    shader: Annotated[
+        Literal["glsl", "glsl-es", "hlsl", "msl", "wgsl"] | None,
+        typer.Option(help="For any engine, the shader's language; default glsl."),
+    ] = None,
     time: Time = None,
     device: Device = "cpu",
 ) -> None:
@@ -57,6 +61,8 @@ def export(
         raise WlmError("--cells: means nothing without --engine three, godot or unreal")
     if mirror is not None and engine != "unity":
         raise WlmError("--mirror: means nothing without --engine unity")
+    if shader is not None and engine != "any":
+        raise WlmError("--shader: means nothing with --engine")
     quiet_warp()
     from wlm import probe
     from wlm.probe.three_grid import CELLS
@@ -64,7 +70,8 @@ def export(
 
     model = at_time(load(file, "probe"), time)
     if engine == "any":
-        paths = probe.export(model, output, device=device, position=given_positions(model, original))
+        given = given_positions(model, original)
+        paths = probe.export(model, output, device=device, position=given, shader=shader or "glsl")
     elif engine in ("three", "unreal"):
         given, size = given_positions(model, original), CELLS if cells is None else cells
         write = probe.export_grid if engine == "three" else probe.export_unreal
