@@ -14,12 +14,11 @@ from wlm.baselines.probe import (
     clustered_pca,
     global_pca,
     moving_basis,
-    pack_unreal,
-    unpack_unreal,
     unreal_packing,
     window_pca,
 )
 from wlm.errors import WlmError
+from wlm.probe.unreal import pack_unreal, unpack_unreal
 
 HALF = 2.0**-11  # relative error of a half float
 SIGNAL = functools.partial(clustered_pca, signal=True)

@@ -326,6 +326,31 @@ def test_grid_for_three(fitted, tmp_path):
     assert max(json.loads((tmp_path / "out" / "grid.json").read_text())["resolution"]) == 5 and "grid.ktx2" in text
 
 
+def test_shaders_in_other_languages(fitted, tmp_path):
+    for language, name in (("hlsl", "probe.hlsl"), ("wgsl", "probe.wgsl"), ("glsl", "probe.glsl")):
+        assert name in call("probe", "export", fitted, "-o", tmp_path / "out", "--shader", language)
+        assert "wlm_probe_sh(" in (tmp_path / "out" / name).read_text()
+    words = ["probe", "export", fitted, "-o", tmp_path / "no", "--engine", "three", "--shader", "hlsl"]
+    assert "--shader: means nothing" in fails(*words)
+
+
+def test_textures_for_unreal(fitted, tmp_path):
+    text = call("probe", "export", fitted, "--engine", "unreal", "-o", tmp_path / "out", "--cells", 4)
+    assert max(json.loads((tmp_path / "out" / "light.json").read_text())["resolution"]) == 4 and "WlmProbes.usf" in text
+    message = fails("probe", "export", fitted, "--engine", "unity", "-o", tmp_path / "no", "--cells", 4)
+    assert "--cells: means nothing without --engine three, godot or unreal" in message
+
+
+def test_a_volume_takes_the_normals_of_probes(carrying, room, tmp_path):
+    arrays = dict(np.load(room))
+    np.savez(tmp_path / "room.npz", normal=np.tile([0.0, 1.0, 0.0], (len(arrays["position"]), 1)), **arrays)
+    pools = []
+    for name, probes in (("plain", room), ("known", tmp_path / "room.npz")):
+        call("probe", "volume", carrying, probes, "-o", tmp_path / name)
+        pools.append((tmp_path / name / "pool.bin").read_bytes())
+    assert len(pools[0]) == len(pools[1]) and pools[0] != pools[1]
+
+
 def test_evaluate_scores_walks_and_pictures(fitted, room, tmp_path):
     text = call("probe", "evaluate", fitted, room, "--views", 2, "--volume", "--json", tmp_path / "r.json")
     report = json.loads((tmp_path / "r.json").read_text())

@@ -164,6 +164,10 @@ def _probe_files(folder: Path) -> None:
         save_probes(folder / name, room.position, room.values)
     points, sh = probes(4)
     each = [{"position": place, "sh": light} for place, light in zip(points.tolist(), sh.tolist(), strict=True)]
+    known = {"normal": np.eye(3)[[0, 1, 2, 0, 1, 2]], "valid": np.arange(6.0) / 5.0}
+    np.savez(folder / "probes-known.npz", position=room.position, sh=room.values, **known)
+    known = {"position": room.position, "sh": room.values.astype(float), **known}
+    (folder / "probes-known.json").write_text(json.dumps({name: array.tolist() for name, array in known.items()}))
     (folder / "probes-list.json").write_text(json.dumps({"convention": "godot", "probes": each}))
     writer = Writer()
     (folder / "probes.lmbake").write_bytes(writer.file(bake(writer, points, sh)))

@@ -397,8 +397,8 @@ _ALL = (
         "obj", "a.obj", corpus("mesh.obj"), lambda draw, data: vary_text(draw, data.decode(), ("f", "v")), _obj, _light
     ),
     Reader("atlas-lights", "lights.json", _light_lists, _json, read_description),
-    Reader("probes-npz", "a.npz", corpus("probes.npz"), vary_npz, _probes),
-    Reader("probes-json", "a.json", corpus("probes.json", "probes-list.json"), _json, _probes),
+    Reader("probes-npz", "a.npz", corpus("probes.npz", "probes-known.npz"), vary_npz, _probes),
+    Reader("probes-json", "a.json", corpus("probes.json", "probes-list.json", "probes-known.json"), _json, _probes),
     Reader("probes-lmbake", "a.lmbake", corpus("probes.lmbake"), _godot, _probes),
     Reader("probes-grid", "grid.json", corpus("grid.json"), _json, _probes, _texture),
     Reader(

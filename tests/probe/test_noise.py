@@ -51,3 +51,10 @@ def test_no_byte_is_spent_on_noise_unless_asked_to():
     assert report.noise_psnr <= report.psnr < report.noise_psnr + 0.2
     asked = wlm.probe.compress(probes, target_psnr=48)
     assert wlm.probe.evaluate(asked, probes).psnr >= 48.0 and asked.file_bytes() > 1.2 * report.bytes
+
+
+def test_each_hour_ends_at_its_own_noise():
+    noise, clean = noisy(SMOOTH[:, :6], 43), from_arrays(PLACE, SMOOTH[:, :6].astype(np.float32), name="noisy")
+    day = wlm.probe.compress_day([noise, clean], (9, 12))
+    first, second = wlm.probe.evaluate_day(day, [noise, clean])
+    assert first.noise_psnr <= first.psnr < first.noise_psnr + 0.3 and second.psnr >= 50.0

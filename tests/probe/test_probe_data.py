@@ -77,6 +77,36 @@ def test_several_arrays_need_a_key(tmp_path):
     assert "expected values named position" in error_of(load, path, key="position")
 
 
+def test_normals_and_validity(tmp_path):
+    normal, valid = np.zeros((N, 3)), np.ones(N)
+    normal[0], normal[1], valid[:3] = [0.0, 1e200, 0.0], [3.0, 0.0, 4.0], [0.0, 0.49, 0.5]
+    values = _values(N, 9, 3)
+    rows = {"position": _position(), "sh": values, "normal": normal, "valid": valid}
+    fields = {name: array.tolist() for name, array in rows.items()}
+    each = [dict(zip(fields, probe, strict=True)) for probe in zip(*fields.values(), strict=True)]
+    whole = from_arrays(_position(), values, normal=normal, valid=valid)
+    for probes in (
+        whole,
+        load(_write(tmp_path / "a.npz", **rows)),
+        load(_write(tmp_path / "b.npz", **rows | {"valid": valid >= 0.5})),
+        load(_write_json(tmp_path / "a.json", fields)),
+        load(_write_json(tmp_path / "b.json", {"probes": each})),
+    ):
+        _same(probes, whole)
+        np.testing.assert_allclose(probes.normal[:3], [[0, 1, 0], [0.6, 0, 0.8], [0, 0, 0]])
+        assert probes.live.tolist() == [False, False] + [True] * (N - 2) and not probes.values[:2].any()
+    assert from_arrays(_position(), values).normal is None
+    normal[1, 1], valid[2] = np.inf, 1.5
+    for field, array, message in (
+        ("normal", normal, "normal[1]: expected finite"),
+        ("normal", normal[:, 0], "normal: expected numbers"),
+        ("valid", valid, "valid[2]: expected true"),
+        ("valid", valid[1:], "valid: expected numbers"),
+        ("valid", np.zeros(N), "not valid"),
+    ):
+        assert message in error_of(from_arrays, _position(), values, **{field: array})
+
+
 def test_an_exact_name_goes_before_one_with_sh(tmp_path):
     path = _write(tmp_path / "a.npz", noon=_values(N, 1), sh_noon=_values(N, 2))
     assert load(path, key="noon").outputs == 1
@@ -195,7 +225,7 @@ def test_dead_probes():
 
 def test_no_live_probe_and_no_probe(tmp_path):
     for values in (np.zeros((N, 27)), np.full((N, 27), np.nan), np.full((N, 27), 1e-60)):
-        assert "array: sh: every probe is zero or not finite" in error_of(from_arrays, _position(), values)
+        assert "array: sh: every probe is zero, not finite or not valid" in error_of(from_arrays, _position(), values)
     path = _write(tmp_path / "a.npz", position=np.zeros((0, 3)), sh=np.zeros((0, 9, 3)))
     assert "a.npz: position: expected at least one, found none" in error_of(load, path)
     for content in ({"probes": []}, {"position": [], "sh": []}):

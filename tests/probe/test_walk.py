@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from wlm.errors import WlmError
+from wlm.probe.data import from_arrays
 from wlm.probe.light import StoredLight
 from wlm.probe.volume import Volume
-from wlm.probe.walk import camera_path, loop_frames, settle, summary, walk
+from wlm.probe.walk import camera_path, loop_frames, score_volume, settle, summary, walk
 
 
 def _hills(count: int = 900) -> np.ndarray:
@@ -189,3 +190,16 @@ def test_walk_refuses():
         walk(volume, _line(1, 0.0), original=np.zeros((49, 2)))
     with pytest.raises(WlmError, match="viewpoint"):
         walk(volume, np.array([[0.0, np.nan, 0.0]]))
+
+
+def test_normals_of_a_set_keep_rooms_apart():
+    """A bright room and a dark one, with a wall between that is thinner than a block."""
+    along = np.stack(np.meshgrid(np.arange(-3.0, 3.1, 0.3), np.arange(0.0, 3.1, 0.3)), -1).reshape(-1, 2)
+    side = np.repeat([-1.0, 1.0], len(along))
+    position, normal = np.column_stack([0.05 * side, np.tile(along, (2, 1))]), side[:, None] * [7.0, 0.0, 0.0]
+    values = np.where(side < 0, 1.0, 0.1)[:, None]
+    psnr = []
+    for known in (None, normal):
+        probes = from_arrays(position, values, normal=known)
+        psnr.append(score_volume(probes, StoredLight(probes.values), frames=3)["psnr"])
+    assert psnr[1] > psnr[0] + 1.5

@@ -242,33 +242,51 @@ VOLUME = "".join(
 )
 
 
-def probes(folder) -> Subject:
-    model = random_probes(seed=3)
-    probe.export(model, folder)
-    position = np.array(json.loads((folder / "reference.json").read_text())["position"])
-    expected = model.decoder().decode(position)[:, [0, 13, 26]]
-    main = (
-        POINTS
-        + """vec4 shown(ivec2 pixel)
+SH = (
+    POINTS
+    + """vec4 shown(ivec2 pixel)
 {
     vec3 sh[9];
     wlm_probe_sh(texelFetch(u_points, pixel, 0).xyz, sh);
     return vec4(sh[0].x, sh[4].y, sh[8].z, 1.0);
 }
 """
-    )
+)
+
+
+def probes(folder) -> Subject:
+    model = random_probes(seed=3)
+    probe.export(model, folder)
+    position = np.array(json.loads((folder / "reference.json").read_text())["position"])
+    expected = model.decoder().decode(position)[:, [0, 13, 26]]
     bound = {"u_points": points_of(position)}
     bound |= {f"wlm_probe_{name}": np.fromfile(folder / f"{name}.bin", "<u4") for name in ("gaussians", "network")}
     scale = float(np.abs(expected).max())
-    return Subject(probe_glsl(model), main, expected[None], bound, "", 1e-4 * scale, as_textures=PROBES, version=430)
+    return Subject(probe_glsl(model), SH, expected[None], bound, "", 1e-4 * scale, as_textures=PROBES, version=430)
+
+
+def transformed_probes(folder) -> Subject:
+    random = np.random.default_rng(5)
+    place = random.uniform(0.0, 4.0, (90, 3))
+    light = 1.0 + np.sin(place @ random.normal(size=(3, 27)))
+    model = probe.compress(probe.from_arrays(place, light), target_psnr=60, positions=True)
+    probe.export(model, folder)
+    position = np.array(json.loads((folder / "reference.json").read_text())["position"])
+    expected = model.decoder().decode(position)[:, [0, 13, 26]]
+    bound = {"u_points": points_of(position), "wlm_probe_light": np.fromfile(folder / "light.bin", "<u4")}
+    # Half floats.
+    tolerance = 2e-3 * float(np.abs(expected).max())
+    text = (folder / "probe.glsl").read_text()
+    return Subject(text, SH, expected[None], bound, "", tolerance, as_textures=PROBES, version=430)
 
 
 PROBES = "".join(
     f"uniform usampler2D u_{name};\n#define WLM_PROBE_{name.upper()}(i) texelFetch(u_{name}, ivec2((i) & 1023, "
     f"(i) >> 10), 0).r\n"
-    for name in ("gaussians", "network")
+    for name in ("gaussians", "network", "light")
 )
 
+LONG = "probes of a transform"
 SUBJECTS: dict[str, Callable[..., Subject]] = {
     "lightmap": lambda folder: lightmap((4, 3, 2, 1), folder),
     "lightmap of video": lambda folder: lightmap((5, 3, 5, 0), folder, gelu="exact", period=None, hidden=10),
@@ -278,6 +296,7 @@ SUBJECTS: dict[str, Callable[..., Subject]] = {
     **{f"smoke {layout}": lambda folder, layout=layout: smoke(layout, folder) for layout in LAYOUTS},
     "volume": volume,
     "probes": probes,
+    LONG: transformed_probes,
 }
 
 
@@ -309,8 +328,15 @@ def shown(subject: Subject, language: str, exact: bool, folder) -> np.ndarray:
     return run_hlsl(text, "shown(pixel)", size, subject.bound, folder)
 
 
-@pytest.mark.parametrize("language", [*HEADS, "hlsl", "wgsl"])
-@pytest.mark.parametrize("name", SUBJECTS)
+@pytest.mark.parametrize(
+    ("name", "language"),
+    [
+        # Its GLSL is run by the tests of its export, too.
+        pytest.param(name, language, marks=[pytest.mark.slow] * (name == LONG and language in HEADS))
+        for name in SUBJECTS
+        for language in (*HEADS, "hlsl", "wgsl")
+    ],
+)
 def test_every_shader_shows_what_python_decodes(name, language, tmp_path):
     subject = SUBJECTS[name](tmp_path)
     channels = subject.expected.shape[-1]
@@ -324,7 +350,18 @@ def test_every_shader_shows_what_python_decodes(name, language, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "name", ["lightmap", "atlas cascade", "atlas tiles mixed", "atlas mips", "scene", "smoke unity", "volume", "probes"]
+    "name",
+    [
+        "lightmap",
+        "atlas cascade",
+        "atlas tiles mixed",
+        "atlas mips",
+        "scene",
+        "smoke unity",
+        "volume",
+        "probes",
+        "probes of a transform",
+    ],
 )
 def test_metal_as_the_cpp_that_it_is(name, tmp_path):
     subject = SUBJECTS[name](tmp_path)

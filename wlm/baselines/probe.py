@@ -23,6 +23,7 @@ from wlm.baselines.rival import Rival, measure
 from wlm.errors import WlmError
 from wlm.probe.data import ProbeSet
 from wlm.probe.evaluation import Report, score
+from wlm.probe.unreal import pack_unreal, unpack_unreal
 from wlm.system import Meter, OnProgress
 
 # Bits of a weight that `at_bytes` tries; None for half floats. Below 4 the rounding is the larger error.
@@ -35,14 +36,6 @@ _PATIENCE = 2
 # Rounds of the moving basis while `at_bytes` searches: the order of the settings is clear after these.
 _SEARCH_ROUNDS = 4
 _ROUNDS = 10
-# Range of coefficients 1 to 8 over the ambient one, as the engine sets it: sqrt(3) for L1, which light reaches but
-# never passes, and twice what light can reach for L2.
-_UNREAL_RANGE = np.sqrt([3.0, 3.0, 3.0, 15.0, 15.0, 20.0, 15.0, 15.0])
-# Largest finite numbers with 6, 6 and 5 bits of mantissa and half float's exponent.
-_PACKED_MAX = np.array([65024.0, 65024.0, 64512.0])
-# Bits of a half float's mantissa that R11G11B10F has no room for.
-_DROPPED = np.array([4, 4, 5], np.uint32)
-_SHIFT = np.array([0, 11, 22], np.uint32)
 
 
 def global_pca(position: np.ndarray, values: np.ndarray, components: int, *, bits: int | None = None) -> Rival:
@@ -180,32 +173,6 @@ def unreal_packing(position: np.ndarray, values: np.ndarray, bands: int | None =
         lambda payload: unpack_unreal(payload, width, bands),
         option=lambda payload: f"L{bands - 1}",
     )
-
-
-def pack_unreal(values: np.ndarray, bands: int) -> bytes:
-    """The bytes of `unreal_packing`: uint32 [N] ambient colours, then uint8 [N, 3, bands² - 1] ratios."""
-    sh = np.asarray(values, np.float64).reshape(len(values), -1, 3)
-    colour = np.clip(sh[:, 0], 0.0, _PACKED_MAX)
-    step = np.exp2(np.maximum(np.frexp(colour)[1] - 1, -14) - 10.0 + _DROPPED)
-    code = (np.rint(colour / step) * step).astype(np.float16).view(np.uint16).astype(np.uint32) >> _DROPPED
-    ambient = np.bitwise_or.reduce(code << _SHIFT, axis=1).astype("<u4")
-    others = sh[:, 1 : bands**2].transpose(0, 2, 1)
-    unit = _ambient(ambient)[:, :, None] * _UNREAL_RANGE[: bands**2 - 1]
-    ratio = np.divide(others, unit, out=np.zeros_like(others), where=unit > 0.0)
-    level = np.rint((np.clip(ratio, -1.0, 1.0) * 0.5 + 0.5) * 255.0).astype(np.uint8)
-    return ambient.tobytes() + level.tobytes()
-
-
-def unpack_unreal(payload: bytes, width: int, bands: int) -> np.ndarray:
-    """Reads what `pack_unreal` wrote, float32 [N, D]."""
-    probes = len(payload) // (4 + 3 * (bands**2 - 1))
-    ambient = _ambient(np.frombuffer(payload, "<u4", probes))
-    level = np.frombuffer(payload, np.uint8, offset=4 * probes).reshape(probes, 3, bands**2 - 1)
-    sh = np.zeros((probes, width // 3, 3))
-    sh[:, 0] = ambient
-    others = (level / 127.5 - 1.0) * ambient[:, :, None] * _UNREAL_RANGE[: bands**2 - 1]
-    sh[:, 1 : bands**2] = others.transpose(0, 2, 1)
-    return sh.reshape(probes, width).astype(np.float32)
 
 
 def at_bytes(
@@ -401,12 +368,6 @@ def _error(values: np.ndarray, rival: Rival) -> float:
 
 def _weights(bits: int | None) -> str:
     return "half floats" if bits is None else f"{bits} bits"
-
-
-def _ambient(code: np.ndarray) -> np.ndarray:
-    """R11G11B10F to float64 [N, 3]."""
-    part = (code[:, None] >> _SHIFT) & ((1 << (15 - _DROPPED)) - 1)
-    return (part << _DROPPED).astype(np.uint16).view(np.float16).astype(np.float64)
 
 
 def _unreal_bands(width: int) -> int:

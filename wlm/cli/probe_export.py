@@ -25,10 +25,10 @@ def export(
     file: ModelFile,
     output: Annotated[Path, output_option("DIR", "The folder to write to.")],
     engine: Annotated[
-        Literal["any", "three", "godot", "unity"],
+        Literal["any", "three", "godot", "unity", "unreal"],
         typer.Option(
-            help="For three.js and Godot light on a lattice, for Godot and Unity the probes themselves too; for any "
-            "engine buffers and a shader that reads them."
+            help="For three.js, Godot and Unreal light on a lattice, for Godot and Unity the probes themselves too; "
+            "for any engine buffers and a shader that reads them."
         ),
     ] = "any",
     original: Annotated[
@@ -46,6 +46,10 @@ def export(
         Literal["x", "y", "z"] | None,
         typer.Option(help="For Unity, which is left-handed: the axis to turn round; default none."),
     ] = None,
+    shader: Annotated[
+        Literal["glsl", "glsl-es", "hlsl", "msl", "wgsl"] | None,
+        typer.Option(help="For any engine, the shader's language; default glsl."),
+    ] = None,
     time: Time = None,
     device: Device = "cpu",
 ) -> None:
@@ -53,10 +57,12 @@ def export(
 
     For any engine, reference.json is the light at some positions: what the shader should make of the rest.
     """
-    if cells is not None and engine not in ("three", "godot"):
-        raise WlmError("--cells: means nothing without --engine three or godot")
+    if cells is not None and engine not in ("three", "godot", "unreal"):
+        raise WlmError("--cells: means nothing without --engine three, godot or unreal")
     if mirror is not None and engine != "unity":
         raise WlmError("--mirror: means nothing without --engine unity")
+    if shader is not None and engine != "any":
+        raise WlmError("--shader: means nothing with --engine")
     quiet_warp()
     from wlm import probe
     from wlm.probe.three_grid import CELLS
@@ -64,10 +70,12 @@ def export(
 
     model = at_time(load(file, "probe"), time)
     if engine == "any":
-        paths = probe.export(model, output, device=device, position=given_positions(model, original))
-    elif engine == "three":
+        given = given_positions(model, original)
+        paths = probe.export(model, output, device=device, position=given, shader=shader or "glsl")
+    elif engine in ("three", "unreal"):
         given, size = given_positions(model, original), CELLS if cells is None else cells
-        paths = probe.export_grid(model, output, cells=size, position=given, device=device)
+        write = probe.export_grid if engine == "three" else probe.export_unreal
+        paths = write(model, output, cells=size, position=given, device=device)
     elif engine == "godot":
         bake = original if original is not None and original.suffix.lower() == ".lmbake" else None
         given = None if bake is not None else given_positions(model, original)

@@ -52,7 +52,7 @@ def walk(
 ) -> None:
     """Walk through the scene with a cascaded lighting volume: what a frame costs, covers and gets wrong.
 
-    With PROBES the light that is read is scored against theirs.
+    With PROBES the light that is read is scored against theirs, and walls keep light apart where PROBES have normals.
     """
     if json_path is not None:
         check_output(json_path, ".json")
@@ -142,13 +142,15 @@ def _volume(
     from wlm.probe.volume import BUDGET, Volume
 
     if probes_path is None:
-        position, original, live = model.stored_positions(), None, ~model.dead if len(model.dead) else None
+        live = ~model.dead if len(model.dead) else None
+        position, original, normal = model.stored_positions(), None, None
     else:
-        position, original, live = probes_of(model, probes_path, key)
+        position, original, live, normal = probes_of(model, probes_path, key)
     if probes_path is not None and not model.has_probes_at(position):
         raise WlmError(f"{probes_path}: expected the {model.probes} probes that {file} was made of, in their order")
     budget = BUDGET if budget is None else budget
-    return Volume(position, light_of(decoder, position), live=live, block=block, budget=budget), original
+    light = light_of(decoder, position)
+    return Volume(position, light, live=live, normal=normal, block=block, budget=budget), original
 
 
 def walk_scores(model: "ProbeModel", probes: "ProbeSet", device: str) -> dict[str, dict[str, Any]]:

@@ -12,6 +12,8 @@ from wlm.formats.atomic import atomic_write
 DXGI_FORMATS = {
     "R16G16B16A16_FLOAT": 10,
     "R10G10B10A2_UNORM": 24,
+    "R11G11B10_FLOAT": 26,
+    "R8G8B8A8_UNORM": 28,
     "R16G16_FLOAT": 34,
     "R16G16_UNORM": 35,
     "R16G16_UINT": 36,
@@ -31,6 +33,8 @@ _BLOCK_BYTES = 16
 _TEXEL_BYTES = {
     "R16G16B16A16_FLOAT": 8,
     "R10G10B10A2_UNORM": 4,
+    "R11G11B10_FLOAT": 4,
+    "R8G8B8A8_UNORM": 4,
     "R16G16_FLOAT": 4,
     "R16G16_UNORM": 4,
     "R16G16_UINT": 4,

@@ -23,6 +23,7 @@ _PLACES = {
     "export_godot": "wlm.probe.godot_bake",
     "export_grid": "wlm.probe.three_grid",
     "export_unity": "wlm.probe.unity",
+    "export_unreal": "wlm.probe.unreal",
     "export_volume": "wlm.probe.volume_export",
     "from_arrays": "wlm.probe.data",
     "load": "wlm.probe.data",

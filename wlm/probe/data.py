@@ -13,6 +13,9 @@ coincident positions                  fine; one warning with the count of those 
 NaN, Inf in a probe                   the probe is not live and all its numbers become 0; warning with
                                       the count and the first
 a probe that is all zero              not live, no warning: engines leave probes inside walls so
+a probe that `valid` has below 0.5    not live, and zero, no warning
+`valid` beyond 0 to 1, a `normal`     error that names the field and the probe
+that isn't finite
 no live probe, no probe at all        error
 negative numbers                      fine: only the light in a direction is positive, and even that only
                                       without ringing
@@ -35,10 +38,9 @@ What a probe holds: gaussian-probe-compression, eq. 1 (there 3, 12 or 27 numbers
 import hashlib
 import json
 import os
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -46,13 +48,14 @@ from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_path, atomic_write
 from wlm.formats.folder import rounded
 from wlm.formats.godot import read_lmbake
-from wlm.formats.limits import JSON_BYTES, NUMBERS, PROBES
+from wlm.formats.limits import NUMBERS, PROBES
 from wlm.formats.npz import read_npz
-from wlm.formats.reading import read_json_file
 from wlm.formats.scratch import room
 from wlm.formats.unity_asset import read_lighting_data
 from wlm.probe.conventions import CANONICAL, CONVENTIONS, THREE_GRID, from_canonical, to_canonical
+from wlm.probe.json_fields import fields_of, numbers_of, read_json, text_of
 from wlm.probe.sphere import sh_count
+from wlm.probe.surroundings import check_normal, check_valid
 
 LARGEST = float(np.sqrt(np.finfo(np.float32).max))
 """The largest number whose square float32 still holds."""
@@ -60,6 +63,7 @@ LARGEST = float(np.sqrt(np.finfo(np.float32).max))
 _ROWS = 1 << 16  # probes at once, so that float64 copies stay at some tens of MB
 _FARTHEST = 1e150  # the squares of distances are float64's too
 _POSITION, _CONVENTION, _PROBES, _SH = "position", "convention", "probes", "sh"
+_NORMAL, _VALID = _BESIDE = "normal", "valid"
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +80,7 @@ class ProbeSet:
         live: bool [N], false where the probe takes no part in the fit and decodes to zero; at least one is true.
         source: 16 hexadecimal digits of BLAKE2b over the positions, the values and which are live.
         warnings: What was repaired, one line each.
+        normal: float64 [N, 3], of the surface that each probe lies on, 0 where it lies on none; None: none is known.
     """
 
     name: str
@@ -85,6 +90,7 @@ class ProbeSet:
     live: np.ndarray
     source: str
     warnings: tuple[str, ...]
+    normal: np.ndarray | None = None
 
     @property
     def probes(self) -> int:
@@ -110,16 +116,17 @@ class _Raw:
     values: np.ndarray
     key: str
     convention: str
+    beside: Mapping[str, np.ndarray] = field(default_factory=dict)
 
 
 def load(path: str | os.PathLike[str], *, key: str | None = None, convention: str | None = None) -> ProbeSet:
     """Reads light probes from a file.
 
     - `.npz`: arrays `position` (N, 3) and `sh...` (N, C, 3) or (N, D), and a string `convention` if they aren't
-      canonical.
+      canonical; where they are known `normal` (N, 3) and `valid` (N), as for `from_arrays`.
     - `grid.json` beside `grid.ktx2`: what `wlm.probe.export_grid` writes for three.js.
     - `.json`: `{"position": [[x, y, z], ...], "sh": [[[r, g, b], ...], ...]}`, or
-      `{"probes": [{"position": [x, y, z], "sh": [[r, g, b], ...]}, ...]}`, and `"convention"` likewise.
+      `{"probes": [{"position": [x, y, z], "sh": [[r, g, b], ...]}, ...]}`, and the others likewise.
     - `.lmbake`: a lightmap bake of Godot 4.
     - `.asset`: the lighting data or light probes of Unity's editor (extra `unity`).
 
@@ -142,7 +149,7 @@ def load(path: str | os.PathLike[str], *, key: str | None = None, convention: st
         raise WlmError(f"{path}: expected a name that ends in {' or '.join(_READERS)}, found {path.suffix or 'none'}")
     raw = reader(path, key)
     stated = raw.convention if convention is None else convention
-    return _check(str(path), path.stem, raw.position, raw.values, raw.key, stated)
+    return _check(str(path), path.stem, raw.position, raw.values, raw.key, stated, raw.beside)
 
 
 def load_positions(path: str | os.PathLike[str]) -> np.ndarray:
@@ -165,11 +172,11 @@ def load_positions(path: str | os.PathLike[str]) -> np.ndarray:
     elif kind == ".lmbake":
         position = read_lmbake(path)[0]
     else:
-        content = _json(path)
+        content = read_json(path)
         if isinstance(content, list):
-            position = _numbers(path, _POSITION, content)
+            position = numbers_of(path, _POSITION, content)
         else:
-            position = _fields(path, content)[1](_POSITION)
+            position = fields_of(path, content)[1](_POSITION)
     return _check_positions(str(path), position)
 
 
@@ -180,6 +187,8 @@ def from_arrays(
     name: str = "array",
     key: str = _SH,
     convention: str = CANONICAL,
+    normal: np.ndarray | None = None,
+    valid: np.ndarray | None = None,
 ) -> ProbeSet:
     """Makes a checked set of arrays, under the same rules as `load`.
 
@@ -189,6 +198,8 @@ def from_arrays(
         name: The set's name, used in messages too.
         key: What the values are called.
         convention: One of `wlm.probe.conventions.CONVENTIONS`, in which the values are.
+        normal: [N, 3], of the surface that each probe lies on, of any length, 0 where it lies on none; copied.
+        valid: [N], true or false, or from 0 to 1: below 0.5 a probe isn't live.
 
     Returns:
         The set, repaired as the module's table says.
@@ -196,7 +207,9 @@ def from_arrays(
     Raises:
         WlmError: A shape is wrong, or an error of the module's table.
     """
-    return _check(name, name, np.asarray(position), np.asarray(values), key, convention)
+    beside = {_NORMAL: normal, _VALID: valid}
+    beside = {field: np.asarray(array) for field, array in beside.items() if array is not None}
+    return _check(name, name, np.asarray(position), np.asarray(values), key, convention, beside)
 
 
 def save_probes(
@@ -231,7 +244,7 @@ def save_probes(
     if not (np.isfinite(position).all() and np.isfinite(values).all()):
         raise ValueError("expected finite positions and values")
     # The last two are arguments of NumPy's writer.
-    if key in (_POSITION, _CONVENTION, _PROBES, "file", "allow_pickle"):
+    if key in (_POSITION, _CONVENTION, _PROBES, *_BESIDE, "file", "allow_pickle"):
         raise WlmError(f"{path}: expected another name for the values, {key!r} means something else")
     engine = _convert(str(path), values, convention, from_canonical)
     if position.dtype != np.float32:  # half the bytes, where the caller has no more digits
@@ -254,49 +267,29 @@ def _read_npz(path: Path, key: str | None) -> _Raw:
     def choose(names: Sequence[str]) -> list[str]:
         nonlocal name
         name = _choose(path, names, key)
-        return [_POSITION, name, *({_CONVENTION} & set(names))]
+        return [_POSITION, name, *({_CONVENTION, *_BESIDE} & set(names) - {name})]
 
     arrays = read_npz(path, choose, numbers=PROBES * NUMBERS)
     stated = arrays[_CONVENTION] if _CONVENTION in arrays else np.array(CANONICAL)
     if stated.dtype.kind != "U" or stated.ndim:
         raise WlmError(f"{path}: {_CONVENTION}: expected a name, got {stated.dtype} {stated.shape}")
-    return _Raw(arrays[_POSITION], arrays[name], name, str(stated))
+    beside = {field: arrays[field] for field in _BESIDE if field in arrays and field != name}
+    return _Raw(arrays[_POSITION], arrays[name], name, str(stated), beside)
 
 
 def _read_json(path: Path, key: str | None) -> _Raw:
-    content = _json(path)
+    content = read_json(path)
     if isinstance(content, dict) and content.get("format") == THREE_GRID:
         from wlm.probe.three_grid import read_grid
 
         position, values = read_grid(path, content)
         return _Raw(position, values, _choose(path, (_POSITION, _SH), key), CANONICAL)
-    names, read = _fields(path, content)
+    names, read = fields_of(path, content)
     name = _choose(path, names, key)
-    return _Raw(read(_POSITION), read(name), name, _text(path, content.get(_CONVENTION, CANONICAL)))
-
-
-def _json(path: Path) -> Any:
-    return read_json_file(path, "the probes", JSON_BYTES)
-
-
-def _fields(path: Path, content: Any) -> tuple[list[str], Callable[[str], np.ndarray]]:
-    """Names of the probes' fields in either form of JSON, and a function that reads one as an array."""
-    if not isinstance(content, dict):
-        raise WlmError(f"{path}: expected a JSON object, got {_kind(content)}")
-    if _PROBES not in content:
-        return list(content), lambda field: _numbers(path, field, _rows(path, content, field))
-    probes = _rows(path, content, _PROBES)
-    for i, probe in enumerate(probes):
-        if not isinstance(probe, dict):
-            raise WlmError(f"{path}: {_PROBES}[{i}]: expected an object (position, sh), got {_kind(probe)}")
-
-    def read(field: str) -> np.ndarray:
-        for i, probe in enumerate(probes):
-            if field not in probe:
-                raise WlmError(f"{path}: {_PROBES}[{i}].{field} is missing")
-        return _numbers(path, field, [probe[field] for probe in probes])
-
-    return list(probes[0]) if probes else [_POSITION, _SH], read
+    beside = {field: read(field) for field in _BESIDE if field in names}
+    return _Raw(
+        read(_POSITION), read(name), name, text_of(path, _CONVENTION, content.get(_CONVENTION, CANONICAL)), beside
+    )
 
 
 def _read_godot(path: Path, key: str | None) -> _Raw:
@@ -318,7 +311,7 @@ def _choose(path: Path, names: Sequence[str], key: str | None) -> str:
     """Picks the array of values by its name, with or without "sh_", or the only one that begins with "sh"."""
     if _POSITION not in names:
         raise WlmError(f"{path}: {_POSITION} is missing; found {', '.join(names) or 'nothing'}")
-    fields = [name for name in names if name not in (_POSITION, _CONVENTION)]
+    fields = [name for name in names if name not in (_POSITION, _CONVENTION, *_BESIDE)]
     listed = ", ".join(fields) or "nothing"
     if key is not None:
         for name in (key, f"{_SH}_{key}"):
@@ -331,45 +324,6 @@ def _choose(path: Path, names: Sequence[str], key: str | None) -> str:
     if len(candidates) > 1:
         raise WlmError(f"{path}: several sets of values; give the key of one: {', '.join(candidates)}")
     return candidates[0]
-
-
-def _text(path: Path, value: object) -> str:
-    if not isinstance(value, str):
-        raise WlmError(f"{path}: {_CONVENTION}: expected a name, got {_kind(value)}")
-    return value
-
-
-def _rows(path: Path, holder: dict, field: str) -> list:
-    if not isinstance(holder.get(field), list):
-        raise WlmError(f"{path}: {field}: expected a list, got {_kind(holder.get(field))}")
-    return holder[field]
-
-
-def _numbers(path: Path, field: str, rows: list) -> np.ndarray:
-    """Turns nested lists of one shape into an array."""
-    array = _array(rows)
-    if array is not None:
-        return array
-    shapes = [None if row is None else row.shape for row in map(_array, rows)]
-    odd = next((i for i, shape in enumerate(shapes) if shape is None or shape != shapes[0]), 0)
-    raise WlmError(f"{path}: {field}[{odd}]: expected numbers, as many as {field}[0] has, got {_kind(rows[odd])}")
-
-
-def _array(value: object) -> np.ndarray | None:
-    """An array of numbers; None for text, true and false, nothing, and ragged lists."""
-    try:
-        array = np.asarray(value)
-    except (ValueError, OverflowError):
-        return None
-    return array if array.dtype.kind in "iuf" else None
-
-
-def _kind(value: object) -> str:
-    """A short name of a JSON value."""
-    if isinstance(value, dict):
-        return "an object"
-    text = json.dumps(value)
-    return text if len(text) <= 60 else text[:57] + "..."
 
 
 def _convert(where: str, values: np.ndarray, name: str, change: Callable[[np.ndarray, str], np.ndarray]) -> np.ndarray:
@@ -400,6 +354,7 @@ def _check(
     values: np.ndarray,
     key: str,
     convention: str,
+    beside: Mapping[str, np.ndarray],
 ) -> ProbeSet:
     """Applies the module's table to what was read."""
     position = _check_positions(where, position)
@@ -430,9 +385,12 @@ def _check(
             )
         wide[~finite[rows]] = 0.0
         checked[rows] = wide
+    if _VALID in beside:
+        checked[~check_valid(where, _VALID, beside[_VALID], count)] = 0.0
     live = (checked != 0.0).any(axis=1)
     if not live.any():
-        raise WlmError(f"{where}: {key}: every probe is zero or not finite: there is nothing to fit")
+        raise WlmError(f"{where}: {key}: every probe is zero, not finite or not valid: there is nothing to fit")
+    normal = check_normal(where, _NORMAL, beside[_NORMAL], count) if _NORMAL in beside else None
 
     warnings = []
     broken = np.flatnonzero(~finite)
@@ -444,7 +402,7 @@ def _check(
     repeated = _repeated(position)
     if repeated:
         warnings.append(f"{name}: {_probes(repeated)} at the position of another: Gaussians decode them to one value")
-    return ProbeSet(name, position, checked, key, live, _hash(position, checked, live), tuple(warnings))
+    return ProbeSet(name, position, checked, key, live, _hash(position, checked, live), tuple(warnings), normal)
 
 
 def _check_positions(where: str, position: np.ndarray) -> np.ndarray:

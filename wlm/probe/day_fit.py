@@ -103,8 +103,10 @@ class _Fit:
         """The model of the wanted PSNR, or the wanted size."""
         psnr, limit = self._profile.target_psnr, self._profile.max_bytes
         if psnr is not None or limit is None:
-            wanted = max(map(usual_psnr, self._sets)) if psnr is None else psnr
-            model, _ = self._day(4.0 * 10.0 ** (-wanted / 20.0), lambda search, _: search.smallest(wanted))
+            # Where nothing is said each hour ends at its own noise.
+            wanted = [usual_psnr(probes) if psnr is None else psnr for probes in self._sets]
+            about = 4.0 * 10.0 ** (-float(np.mean(wanted)) / 20.0)
+            model, _ = self._day(about, lambda search, number: search.smallest(wanted[number]))
             if limit is None or model.file_bytes() <= limit:
                 return model
         return self._best(limit)

@@ -10,6 +10,7 @@ constriction (Bamler, Understanding Entropy Coding With Asymmetric Numeral Syste
 """
 
 from collections.abc import Iterator, Sequence
+from functools import cache
 from typing import NamedTuple
 
 import constriction
@@ -57,29 +58,34 @@ def pack(*blocks: tuple[np.ndarray, Shape]) -> bytes:
     steps = [step for q, shape in blocks for step in _steps(q, shape)]
     coder = AnsCoder()
     for symbols, model in reversed(steps):
-        coder.encode_reverse(np.ascontiguousarray(symbols, np.int32), model)
+        coder.encode_reverse(symbols, model)
     return coder.get_compressed().astype("<u4").tobytes().rstrip(b"\0")
 
 
 def _steps(q: np.ndarray, shape: Shape) -> Iterator[tuple[np.ndarray, object]]:
     """Symbols, and the model that they are coded with."""
+    q = np.ascontiguousarray(q[_order(shape)].T)
     size = np.abs(q)
+    symbols, extras, bits = _split(size)
     odds = _Odds(shape.columns)
-    for rows, column, classes in _batches(size, shape):
-        symbol, extra, bits = _split(size[rows, column])
-        for kind in np.unique(classes):
-            chosen = symbol[classes == kind]
-            yield chosen, odds.model(kind)
-            odds.count(kind, chosen)
-        sign = q[rows, column][size[rows, column] > 0] < 0
+    for column, rows, classes in _batches(size, shape):
+        symbol = symbols[column, rows]
+        kinds, coded = odds.of(classes)
+        for kind, model in zip(kinds, coded, strict=True):
+            yield (symbol[classes == kind] if len(kinds) > 1 else symbol), model
+        odds.count(classes, symbol)
+        sign = q[column, rows][symbol > 0] < 0
         if len(sign):
-            yield sign.astype(np.int64), odds.sign_model(column)
+            yield sign.astype(np.int32), odds.sign_model(column)
             odds.count_signs(column, sign)
-        for width in np.unique(bits[bits > 0]):
-            left = extra[bits == width]
-            for low in range(0, int(width), _CHUNK):
-                part = min(_CHUNK, int(width) - low)
-                yield (left >> low) & ((1 << part) - 1), models.Uniform(1 << part)
+        if symbol.max() < _DIRECT:
+            continue
+        width = bits[column, rows]
+        for most in _present(width[width > 0]):
+            left = extras[column, rows][width == most]
+            for low in range(0, most, _CHUNK):
+                part = min(_CHUNK, most - low)
+                yield ((left >> low) & ((1 << part) - 1)).astype(np.int32), _uniform(part)
 
 
 def unpack(data: bytes, *shapes: Shape) -> list[np.ndarray]:
@@ -98,60 +104,86 @@ def unpack(data: bytes, *shapes: Shape) -> list[np.ndarray]:
 
 def _unpack(coder: AnsCoder, shape: Shape) -> np.ndarray:
     """int64 [N, K]."""
-    count, columns = sum(len(level) for level in shape.levels), shape.columns
-    q, size = np.zeros((count, columns), np.int64), np.zeros((count, columns), np.int64)
-    odds = _Odds(columns)
-    for rows, column, classes in _batches(size, shape):
-        symbol = np.empty(len(rows), np.int64)
-        for kind in np.unique(classes):
+    order = _order(shape)
+    q, size = (np.zeros((shape.columns, len(order)), np.int64) for _ in range(2))
+    odds = _Odds(shape.columns)
+    for column, rows, classes in _batches(size, shape):
+        symbol = np.empty(len(classes), np.int64)
+        kinds, coded = odds.of(classes)
+        for kind, model in zip(kinds, coded, strict=True):
             chosen = classes == kind
-            symbol[chosen] = decoded = coder.decode(odds.model(kind), int(chosen.sum()))
-            odds.count(kind, decoded)
-        nonzero = symbol > 0
-        sign = np.zeros(len(rows), np.int64)
-        if nonzero.any():
-            sign[nonzero] = coder.decode(odds.sign_model(column), int(nonzero.sum()))
-            odds.count_signs(column, sign[nonzero] > 0)
-        low, bits = _START[symbol], _BITS[symbol]
-        for width in np.unique(bits[bits > 0]):
-            chosen = np.flatnonzero(bits == width)
-            for first in range(0, int(width), _CHUNK):
-                part = min(_CHUNK, int(width) - first)
-                low[chosen] += coder.decode(models.Uniform(1 << part), len(chosen)).astype(np.int64) << first
-        size[rows, column] = low
-        q[rows, column] = np.where(sign > 0, -low, low)
-    return q
+            symbol[chosen] = coder.decode(model, np.count_nonzero(chosen))
+        odds.count(classes, symbol)
+        nonzero = np.flatnonzero(symbol)
+        if not len(nonzero):
+            continue
+        sign = coder.decode(odds.sign_model(column), len(nonzero)) > 0
+        odds.count_signs(column, sign)
+        symbol = symbol[nonzero]
+        low, width = _START[symbol], _BITS[symbol]
+        for most in _present(width[width > 0]):
+            chosen = np.flatnonzero(width == most)
+            for first in range(0, most, _CHUNK):
+                part = min(_CHUNK, most - first)
+                low[chosen] += coder.decode(_uniform(part), len(chosen)).astype(np.int64) << first
+        size[column, rows][nonzero] = low
+        q[column, rows][nonzero] = np.where(sign, -low, low)
+    result = np.empty((len(order), shape.columns), np.int64)
+    result[order] = q.T
+    return result
 
 
-def _batches(size: np.ndarray, shape: Shape) -> Iterator[tuple[np.ndarray, int, np.ndarray]]:
-    """Rows, a column, and the class of odds of each row there; `size` is read up to the batch before."""
+def _order(shape: Shape) -> np.ndarray:
+    """The rows in their order of coding, int64 [N]."""
+    return np.concatenate(shape.levels).astype(np.int64)
+
+
+def _batches(size: np.ndarray, shape: Shape) -> Iterator[tuple[int, slice, np.ndarray]]:
+    """A column, some rows in their order of coding, and the class of odds of each there.
+
+    `size`, [K, N], is read up to the batch before.
+    """
     for rows, above in _pieces(shape):
-        for column in range(size.shape[1]):
-            expected = np.zeros(len(rows), np.int64)
-            if above is not None:
-                expected += 32 * size[above, column].sum(1) // above.shape[1]
+        # Coarser probes are coded with all of their numbers before.
+        start = np.zeros((len(size), rows.stop - rows.start), np.int64)
+        if above is not None:
+            for parent in above.T:
+                start += size[:, parent]
+            start = 32 * start // above.shape[1]
+        for column, expected in enumerate(start):
             for back, share in ((1, 22), (2, 16)):
                 if column >= back:
-                    expected += share * size[rows, column - back]
-            yield rows, column, np.searchsorted(_EDGES, expected, side="right")
+                    expected += share * size[column - back, rows]
+            yield column, rows, np.searchsorted(_EDGES, expected, side="right")
 
 
-def _pieces(shape: Shape) -> Iterator[tuple[np.ndarray, np.ndarray | None]]:
+def _pieces(shape: Shape) -> Iterator[tuple[slice, np.ndarray | None]]:
     """Rows of a level, and their parents: as many as there were before, within limits, so that the odds keep up."""
-    seen = 0
-    for number, rows in enumerate(shape.levels):
-        start = 0
-        while start < len(rows):
-            piece = slice(start, start + min(max(seen, _FEWEST), _MOST))
-            yield rows[piece], shape.parents[number - 1][piece] if number else None
-            seen += len(rows[piece])
-            start = piece.stop
+    order, seen = _order(shape), 0
+    place = np.empty_like(order)
+    place[order] = np.arange(len(order))
+    for number, level in enumerate(shape.levels):
+        start, end = seen, seen + len(level)
+        while seen < end:
+            rows = slice(seen, min(seen + min(max(seen, _FEWEST), _MOST), end))
+            yield rows, place[shape.parents[number - 1][rows.start - start : rows.stop - start]] if number else None
+            seen = rows.stop
 
 
 def _split(size: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Symbols of magnitudes, and the bits that they leave open with their number."""
+    """Symbols of magnitudes, int32, and the bits that they leave open with their number."""
     symbol = np.searchsorted(_START, size, side="right") - 1
-    return symbol, size - _START[symbol], _BITS[symbol]
+    return symbol.astype(np.int32), size - _START[symbol], _BITS[symbol]
+
+
+def _present(numbers: np.ndarray) -> list[int]:
+    """The different ones of whole numbers from 0, rising."""
+    return np.flatnonzero(np.bincount(numbers)).tolist()
+
+
+@cache
+def _uniform(bits: int) -> models.Uniform:
+    return models.Uniform(1 << bits)
 
 
 # The first magnitude of each symbol, and how many bits tell its magnitudes apart.
@@ -168,14 +200,19 @@ class _Odds:
         self._count = np.rint(_first_odds() * _PRIOR * _UNIT).astype(np.int64)
         self._signs = np.full((columns, 2), _EVEN)
 
-    def model(self, kind: int) -> models.Categorical:
-        count = self._count[kind]
-        return models.Categorical(count / count.sum(), perfect=False)
+    def of(self, classes: np.ndarray) -> tuple[list[int], list[models.Categorical]]:
+        """The classes that there are, rising, and the model of each."""
+        kinds = _present(classes)
+        count = self._count[kinds]
+        odds = count / count.sum(1, keepdims=True)
+        return kinds, [models.Categorical(each, perfect=False) for each in odds]
 
-    def count(self, kind: int, symbols: np.ndarray) -> None:
-        self._count[kind] += _UNIT * np.bincount(symbols, minlength=_SYMBOLS)
-        if self._count[kind].sum() > _HALVED * _UNIT:
-            self._count[kind] = (self._count[kind] + 1) // 2
+    def count(self, classes: np.ndarray, symbols: np.ndarray) -> None:
+        counts = np.bincount(classes * _SYMBOLS + symbols, minlength=_CLASSES * _SYMBOLS)
+        self._count += _UNIT * counts.reshape(_CLASSES, _SYMBOLS)
+        many = self._count.sum(1) > _HALVED * _UNIT
+        if many.any():
+            self._count[many] = (self._count[many] + 1) // 2
 
     def sign_model(self, column: int) -> models.Categorical:
         count = self._signs[column]

@@ -22,6 +22,7 @@ from wlm.probe.shader import HEAD_WORDS, gaussian_words, probe_glsl
 from wlm.probe.sphere import sh_count
 from wlm.probe.transform import Transform
 from wlm.probe.transform_export import LIGHT_FILE, light_bytes, transform_document, transform_glsl
+from wlm.shading import ENDINGS, check_language, translate
 
 FORMAT = "wlm-probe-export"
 _VERSION = 1
@@ -29,10 +30,10 @@ INFO_FILE = "probe.json"
 GAUSSIANS_FILE = "gaussians.bin"
 NETWORK_FILE = "network.bin"
 POSITIONS_FILE = "positions.bin"
-SHADER_FILE = "probe.glsl"
+_SHADER_FILES = {language: "probe" + ending for language, ending in ENDINGS.items()}
 REFERENCE_FILE = "reference.json"
 
-_FILES = {INFO_FILE, LIGHT_FILE, GAUSSIANS_FILE, NETWORK_FILE, POSITIONS_FILE, SHADER_FILE, REFERENCE_FILE}
+_FILES = {INFO_FILE, LIGHT_FILE, GAUSSIANS_FILE, NETWORK_FILE, POSITIONS_FILE, REFERENCE_FILE, *_SHADER_FILES.values()}
 _REFERENCES = 64  # positions in reference.json, and one outside the box
 _FOUR = 4
 
@@ -67,6 +68,7 @@ def export(
     *,
     device: str = "cpu",
     position: np.ndarray | None = None,
+    shader: str = "glsl",
 ) -> list[Path]:
     """Writes a model as buffers, numbers and a shader.
 
@@ -82,17 +84,19 @@ def export(
         directory: The folder; made if it isn't there.
         device: Where the reference is decoded.
         position: [N, 3], of a transform's own probes; None: those that are stored with it.
+        shader: One of `wlm.shading.LANGUAGES`: `probe.glsl`, `probe.hlsl`, `probe.metal` or `probe.wgsl`.
 
     Returns:
         The files written, `probe.json` last.
 
     Raises:
-        WlmError: The folder holds something other than an earlier export, or can't be written; no such device; or a
-            number of the model isn't finite.
+        WlmError: The folder holds something other than an earlier export, or can't be written; no such device or
+            language; or a number of the model isn't finite.
     """
+    check_language(shader)
     folder = Path(directory)
     if isinstance(model, Transform):
-        return _export_transform(model, folder, device, position)
+        return _export_transform(model, folder, device, position, shader)
     for part in (model.net, model.bounds, model.origin, model.size, np.array([model.extent, model.gain])):
         if not np.isfinite(part).all():
             raise WlmError(f"{model.name}: cannot export: a number is NaN or infinite")
@@ -103,14 +107,16 @@ def export(
     files = {
         GAUSSIANS_FILE: gaussian_bytes(model),
         NETWORK_FILE: network_bytes(model),
-        SHADER_FILE: probe_glsl(model).encode(),
+        _SHADER_FILES[shader]: translate(probe_glsl(model), shader).encode(),
     }
     if len(model.positions):
         files[POSITIONS_FILE] = np.ascontiguousarray(model.positions, "<u2").tobytes()
     return _write(folder, files, _document(model), position, values)
 
 
-def _export_transform(model: Transform, folder: Path, device: str, position: np.ndarray | None) -> list[Path]:
+def _export_transform(
+    model: Transform, folder: Path, device: str, position: np.ndarray | None, shader: str
+) -> list[Path]:
     own = model.stored_positions() if position is None else np.asarray(position, np.float64)
     decoder = model.decoder(device, position=None if position is None else own)
     live = live_probes(model.dead, model.probes)
@@ -120,7 +126,8 @@ def _export_transform(model: Transform, folder: Path, device: str, position: np.
     chosen = np.unique(np.linspace(0, len(place) - 1, min(len(place), _REFERENCES)).astype(int))
     between = 0.5 * (place[chosen] + place[np.minimum(chosen + 1, len(place) - 1)])
     points = np.concatenate([between, place.max(0)[None] + 0.25 * np.ptp(place, axis=0).max() + 0.25])
-    files = {LIGHT_FILE: content, SHADER_FILE: transform_glsl(len(place), model.outputs).encode()}
+    text = translate(transform_glsl(len(place), model.outputs), shader)
+    files = {LIGHT_FILE: content, _SHADER_FILES[shader]: text.encode()}
     document = transform_document(model, len(place), numbers)
     if isinstance(model, DayModel):
         document |= {"time": model.time, "times": list(model.times)}

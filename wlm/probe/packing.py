@@ -16,7 +16,6 @@ import numpy as np
 import torch
 from scipy import linalg
 from scipy.spatial.transform import Rotation
-from scipy.special import expit
 
 from wlm.probe.decode import Decoder
 from wlm.probe.entropy import LARGEST
@@ -113,9 +112,8 @@ class _Search:
 
     def __init__(self, model: ProbeModel, position: np.ndarray, values: np.ndarray, faint: float, device: str) -> None:
         self._gain, self._cut, self._sphere = model.gain, model.profile.cut, model.profile.support == "sphere"
-        self._x = model.normalise(position).astype(np.float64)
-        self._on_device = torch.from_numpy(self._x).to(device)
-        self._wanted = values.astype(np.float64) / self._gain
+        self._x = torch.from_numpy(model.normalise(position).astype(np.float64)).to(device)
+        self._wanted = self._put(values.astype(np.float64) / self._gain)
         rows = least_turned(model.rows())
         order = np.argsort(morton_keys(np.rint((rows[:, PLACE] - rows[:, PLACE].min(0)) * MOST / 4).astype(np.int64)))
         self._rows = rows = rows[order]
@@ -124,14 +122,14 @@ class _Search:
         self._inside = []  # what goes into the second layer and the third one, before it is bent
         inputs = self._inputs(self._latent)
         for layer in self._layers[:2]:
-            self._inside.append(inputs @ layer)
-            inputs = _with_one(expit(self._inside[-1]))
+            self._inside.append(inputs @ self._put(layer))
+            inputs = _with_one(self._inside[-1].sigmoid())
         self._faint = faint / self._gain**2
-        self._base = float(np.square(inputs @ self._layers[2] - self._wanted).mean()) + self._faint
+        self._base = self._error(inputs @ self._put(self._layers[2]))
         # What one unit of each latent, and of its weight, changes.
         first = self._layers[0][: self._latent.shape[1]]
         self._of_latent = 1.0 / _positive(np.linalg.norm(first, axis=1))
-        self._of_first = 1.0 / _positive(np.sqrt(np.square(self._latent).mean(0)))
+        self._of_first = 1.0 / _positive(self._latent.square().mean(0).sqrt().cpu().numpy())
 
     def within(self, growth: float) -> Packed | None:
         """The coarsest numbers found with which the error grows by at most this share; None: there are none."""
@@ -175,9 +173,7 @@ class _Search:
         sums = self._sums(whole * step[: LATENT.start])
         latent = rows[:, LATENT]
         if sums.square is not None:
-            ridge = _ridge(sums.square, _OF_LATENTS)
-            right = (sums.weight.T @ self._put(self._latent)).cpu().numpy() + ridge * latent
-            latent = linalg.solve(sums.square + ridge * np.eye(len(rows)), right, assume_a="pos")
+            latent = _fitted(sums.square, (sums.weight.T @ self._latent).cpu().numpy(), latent, _OF_LATENTS)
         latent = _fed(latent, np.tile(step[LATENT], (len(rows), 1)), sums.feed, MOST // 2)
         net_step = [steps.first * each for each in self._of_first] + [steps.near] * 4 + [steps.second, steps.third]
         net_step = np.array([stored_step(each) for each in net_step])
@@ -186,18 +182,19 @@ class _Search:
         wanted = [*self._inside, self._wanted]
         for number, layer in enumerate(self._layers):
             own = net_step[: latents + 4] if number == 0 else np.full(len(layer), net_step[latents + 3 + number])
-            square = inputs.T @ inputs
-            ridge = _ridge(square, _OF_LAYERS)
-            right = inputs.T @ wanted[number] + ridge * layer
-            fitted = linalg.solve(square + ridge * np.eye(len(layer)), right, assume_a="pos")
+            square = (inputs.T @ inputs).cpu().numpy()
+            fitted = _fitted(square, (inputs.T @ wanted[number]).cpu().numpy(), layer, _OF_LAYERS)
             net.append(_fed(fitted, np.repeat(own[:, None], layer.shape[1], 1), _feed(square, _OF_LAYERS), LARGEST))
-            result = inputs @ (net[-1] * own[:, None])
-            inputs = _with_one(expit(result))
+            result = inputs @ self._put(net[-1] * own[:, None])
+            inputs = _with_one(result.sigmoid())
         numbers = np.concatenate([whole, latent], 1).astype(np.int64)
         place = numbers[:, PLACE] - numbers[:, PLACE].min(0)
         numbers = numbers[np.argsort(morton_keys(place), kind="stable")]
         packed = Packed(numbers, step, tuple(layer.astype(np.int64) for layer in net), net_step)
-        return packed, float(np.square(result - self._wanted).mean()) + self._faint
+        return packed, self._error(result)
+
+    def _error(self, result: torch.Tensor) -> float:
+        return float((result - self._wanted).square().mean()) + self._faint
 
     def _sums(self, rows: np.ndarray) -> _Sums:
         if len(rows) > _TOGETHER:
@@ -213,22 +210,28 @@ class _Search:
         middle = self._put(np.einsum("kij,kj->ki", bent, rows[:, PLACE]))
         flat, place = self._put(bent.reshape(-1, 3).T), self._put(rows[:, PLACE])
         reach = self._put(np.square(self._cut * scale.max(1)))
-        for x in self._on_device.split(max(1, _PIECE // len(rows))):
+        for x in self._x.split(max(1, _PIECE // len(rows))):
             square = ((x @ flat).reshape(-1, len(rows), 3) - middle).square_().sum(2)
             reached = (x[:, None] - place).square_().sum(2) < reach if self._sphere else square < self._cut**2
             yield square.mul_(-0.5).exp_().mul_(reached)
 
-    def _latents(self, sums: _Sums, latent: np.ndarray) -> np.ndarray:
-        """The sum of latents at the probes, float64 [N, L]."""
+    def _latents(self, sums: _Sums, latent: np.ndarray) -> torch.Tensor:
+        """The sum of latents at the probes, float64 [N, L] on the device."""
         latents = self._put(latent)
         pieces = self._weights(sums.rows) if sums.weight is None else [sums.weight]
-        return torch.cat([weight @ latents for weight in pieces]).cpu().numpy()
+        return torch.cat([weight @ latents for weight in pieces])
 
     def _put(self, numbers: np.ndarray) -> torch.Tensor:
-        return torch.from_numpy(np.ascontiguousarray(numbers)).to(self._on_device.device)
+        return torch.from_numpy(np.ascontiguousarray(numbers)).to(self._x.device)
 
-    def _inputs(self, latent: np.ndarray) -> np.ndarray:
-        return _with_one(np.concatenate([latent, self._x], 1))
+    def _inputs(self, latent: torch.Tensor) -> torch.Tensor:
+        return _with_one(torch.cat([latent, self._x], 1))
+
+
+def _fitted(square: np.ndarray, right: np.ndarray, before: np.ndarray, share: float) -> np.ndarray:
+    """The least squares of normal equations, as near to what was there before as a share of their mean asks for."""
+    ridge = _ridge(square, share)
+    return linalg.solve(square + ridge * np.eye(len(square)), right + ridge * before, assume_a="pos")
 
 
 def _feed(square: np.ndarray, share: float) -> np.ndarray:
@@ -252,8 +255,8 @@ def _ridge(square: np.ndarray, share: float) -> float:
     return max(share * float(np.trace(square)) / len(square), np.finfo(np.float32).tiny)
 
 
-def _with_one(inputs: np.ndarray) -> np.ndarray:
-    return np.concatenate([inputs, np.ones((len(inputs), 1))], 1)
+def _with_one(inputs: torch.Tensor) -> torch.Tensor:
+    return torch.nn.functional.pad(inputs, (0, 1), value=1.0)
 
 
 def _positive(numbers: np.ndarray) -> np.ndarray:

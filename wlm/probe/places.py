@@ -1,6 +1,7 @@
 """Where a model's probes are, and how large and how bright a ball may stand for each."""
 
 import os
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -16,18 +17,29 @@ _NORMALS = 32
 _SHARE = 0.45  # of the median distance between neighbours: balls don't touch
 
 
-def probes_of(
-    model: ProbeModel | Transform, original: str | os.PathLike[str] | None, key: str | None = None
-) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
-    """The places of a model's probes, with the file that was compressed their numbers, and which of them are live.
+class Known(NamedTuple):
+    """What is known of a model's probes.
+
+    Attributes:
+        position: float64 [N, 3].
+        values: float32 [N, D], as they were; None where the file that was compressed isn't there.
+        live: bool [N].
+        normal: float64 [N, 3], as of `wlm.probe.ProbeSet`.
+    """
+
+    position: np.ndarray
+    values: np.ndarray | None
+    live: np.ndarray
+    normal: np.ndarray | None
+
+
+def probes_of(model: ProbeModel | Transform, original: str | os.PathLike[str] | None, key: str | None = None) -> Known:
+    """The places of a model's probes, and with the file that was compressed their numbers and normals.
 
     Args:
         model: The model.
         original: The file that was compressed; None: the positions stored with the model.
         key: Which of the file's arrays, as for `wlm.probe.load`.
-
-    Returns:
-        float64 [N, 3]; float32 [N, D] or None; bool [N].
 
     Raises:
         WlmError: No positions are known, or the file can't be read or is of other probes.
@@ -40,10 +52,10 @@ def probes_of(
                 f"{original}: expected {model.probes} probes of {model.outputs} numbers, found "
                 f"{len(probes.position)} of {probes.values.shape[1]}"
             )
-        return probes.position, probes.values, live
+        return Known(probes.position, probes.values, live, probes.normal)
     if not model.has_positions:
         raise WlmError(f"{model.name}: the file has no positions; expected --original, the file that was compressed")
-    return model.stored_positions(), None, live
+    return Known(model.stored_positions(), None, live, None)
 
 
 def ball_exposure(values: np.ndarray) -> float:

@@ -117,7 +117,7 @@ def score_views(
             seen, place, normal, owner = _look(mesh, eye, forward, up, resolution, device)
             if not seen.any():
                 continue
-            first, *others = (_shown(light, normal, seen, exposure) for light in scene.lights(place, owner))
+            first, *others = (_shown(light, normal, seen, exposure) for light in scene.lights(place, normal, owner))
             for kind, picture in zip(KINDS, others, strict=True):
                 errors[thing, kind].add(first, picture, seen)
         if meter.due(number + 1):
@@ -151,7 +151,11 @@ class _Scene:
         self._position, self._count = probes.position[live], count
         self._values = [probes.values[live], np.asarray(decoded, np.float32)[live]]
         self._tree = cKDTree(self._position)
-        self._volumes = [Volume(self._position, StoredLight(values, device), budget=_BUDGET) for values in self._values]
+        self._normal = None if probes.normal is None else probes.normal[live]
+        self._volumes = [
+            Volume(self._position, StoredLight(values, device), normal=self._normal, budget=_BUDGET)
+            for values in self._values
+        ]
 
     def balls(self) -> _Mesh:
         """Balls at some probes, spread evenly over their numbers, that stay apart."""
@@ -172,18 +176,22 @@ class _Scene:
         for volume in self._volumes:
             settle(volume, eye)
 
-    def lights(self, place: np.ndarray, owner: np.ndarray) -> Iterator[np.ndarray]:
+    def lights(self, place: np.ndarray, normal: np.ndarray, owner: np.ndarray) -> Iterator[np.ndarray]:
         """SH float64 [P, C, 3] at points [P, 3], or at their probes: the original's, then those of `KINDS`."""
-        at_probe = owner[0] >= 0
-        if at_probe:
+        ahead = None
+        if owner[0] >= 0:
             direct = [values[owner] for values in self._values]
             place = self._position[owner]
+            if self._normal is not None:
+                ahead = self._normal[owner]
         else:
+            if self._normal is not None:
+                ahead = normal
             away, near = self._tree.query(place, k=np.arange(1, min(_NEIGHBOURS, len(self._position)) + 1))
             weight = 1.0 / np.maximum(away, 1e-6 * ball_radius(self._position)) ** 2
             weight /= weight.sum(1, keepdims=True)
             direct = [np.einsum("pk,pkd->pd", weight, values[near]) for values in self._values]
-        for values in (*direct, *(volume.read(place).values for volume in self._volumes)):
+        for values in (*direct, *(volume.read(place, ahead).values for volume in self._volumes)):
             yield values.reshape(len(place), self._count, 3).astype(np.float64)
 
 

@@ -18,7 +18,7 @@ from wlm.probe.transform import Coding, Places, colours, make_stream, stored_ste
 from wlm.probe.tree import FIRST, RADII, Tree
 
 MANY = 4096
-"""Probes above which a fit at another step begins where the last one ended."""
+"""Probes above which a fit begins where one at a near step came to."""
 
 BIT = 0.1155
 """Squared steps that a bit is worth at fine steps: 2 ln 2 / 12."""
@@ -26,8 +26,11 @@ BIT = 0.1155
 _ABOVE = 1.05  # the largest eigenvalue of the transform: what a step downhill is divided by
 _PRICE = 0.25  # of a number that isn't zero, in steps
 _ROUND = 0.4  # what is added before rounding down: below half, a smaller number is cheaper
-_SPARSE, _AGAIN = 25, 20  # rounds with the price, and for another step
-_FREE, _MOVES = 15, 3  # rounds without the price, and of moving rounded numbers
+_SPARSE, _FREE, _MOVES = 25, 15, 3  # rounds with the price, without it, and of moving rounded numbers
+# Of many probes, whose numbers depend on each other farther: rounds with the price, and from where these came to for
+# another step; and what is added, for a number that is kept is worth its bits.
+_OF_MANY, _AGAIN, _NEAR, _HALF = 45, 10, 0.1, 0.5
+_SINGLE, _LEAST_SINGLE = 2.0**13, 1e-30  # the largest number in steps up to which float32 will do, and the least step
 
 
 @dataclass(frozen=True)
@@ -86,7 +89,8 @@ class Coder:
         self._values = values[live].astype(np.float64)
         self._code = Places.of(position).code[live]
         self._coding = Coding(True)
-        self._turned = self._warm = None
+        self._turned: np.ndarray | None = None
+        self._warm: tuple[float, np.ndarray] | None = None  # a step, and where its numbers came to
         self.plant(FIRST)
 
     def measure(self) -> Measured:
@@ -134,27 +138,49 @@ class Coder:
         tree, step = self._tree, stored_step(step)
         if not self._coding.predicted:
             return self.plain(step)
-        target, reach, bound = self._target(), tree.reach[:, None], _ABOVE * tree.eigenvalue
+        order, bound = tree.order, _ABOVE * tree.eigenvalue
+        # Half the memory, which is what takes the time, where that leaves a thousandth of a step.
+        single = step > _LEAST_SINGLE and np.abs(self._exact()).max() < _SINGLE * step
+        kind = np.float32 if single else np.float64
+        target, reach = self._target()[order].astype(kind), tree.reach[order, None].astype(kind)
 
         def downhill(number: np.ndarray) -> np.ndarray:
-            return number - tree.adjoint(tree.values(number / reach) - target) / reach / bound
+            change = number / reach
+            tree.compose(change)
+            change -= target
+            tree.transpose(change)
+            change /= reach
+            change /= bound
+            return np.subtract(number, change, out=change)
 
         price = _PRICE * step / bound
 
         def shrunk(number: np.ndarray) -> np.ndarray:
-            return np.copysign(np.maximum(np.abs(number) - price, 0.0), number)
+            size = np.abs(number)
+            size -= price
+            return np.copysign(np.maximum(size, 0.0, out=size), number, out=size)
 
-        # Of many probes another step begins where the last one ended.
-        again = self._warm is not None and len(target) > MANY
-        start, rounds = (self._warm, _AGAIN) if again else (self._exact(), _SPARSE)
-        number = self._warm = _accelerated(start, lambda x: shrunk(downhill(x)), rounds)
+        def priced(number: np.ndarray, rounds: int) -> np.ndarray:
+            return _accelerated(number, lambda x: shrunk(downhill(x)), rounds)
+
+        share = _ROUND
+        if len(target) <= MANY:
+            number = priced(self._exact()[order].astype(kind), _SPARSE)
+        elif self._warm is None or abs(math.log2(step / self._warm[0])) > _NEAR:
+            number = priced(self._exact()[order].astype(kind), _OF_MANY)
+            self._warm, share = (step, number), _HALF
+        else:
+            # All from one place: a fit that went on from the last one would keep fewer and fewer numbers.
+            number, share = priced(self._warm[1].astype(kind), _AGAIN), _HALF
         kept = number != 0.0
         number = _accelerated(number, lambda x: downhill(x) * kept, _FREE)
-        q = _rounded(number / step)
+        q = _rounded(number / step, share)
         for _ in range(_MOVES):
-            moved = downhill(q * step) / step
-            q = np.where((q == 0) & (np.abs(moved) < 1.0 - _ROUND), 0, _rounded(moved))
-        return self._coded(step, q)
+            moved = downhill((q * step).astype(kind)) / step
+            q = np.where((q == 0) & (np.abs(moved) < 1.0 - share), 0, _rounded(moved, share))
+        back = np.empty_like(q)
+        back[order] = q
+        return self._coded(step, back)
 
     def _target(self) -> np.ndarray:
         if self._turned is None:
@@ -195,8 +221,8 @@ class Coders:
         self._coders.clear()
 
 
-def _rounded(number: np.ndarray) -> np.ndarray:
-    size = np.minimum(np.floor(np.abs(number) + _ROUND), LARGEST)
+def _rounded(number: np.ndarray, share: float = _ROUND) -> np.ndarray:
+    size = np.minimum(np.floor(np.abs(number) + share), LARGEST)
     return np.copysign(size, number).astype(np.int64)
 
 
@@ -206,6 +232,8 @@ def _accelerated(first: np.ndarray, step: Callable[[np.ndarray], np.ndarray], ro
     for _ in range(rounds):
         before, current = current, step(ahead)
         following = 0.5 * (1.0 + math.sqrt(1.0 + 4.0 * weight * weight))
-        ahead = current + (weight - 1.0) / following * (current - before)
+        ahead = current - before
+        ahead *= (weight - 1.0) / following
+        ahead += current
         weight = following
     return current

@@ -91,14 +91,14 @@ void wlm_probe_look(int cell, vec3 x, inout int probe[WLM_PROBE_ASKED], inout fl
         int candidate = int(WLM_PROBE_LIGHT(int(WLM_PROBE_LIGHT(14)) + i));
         float d = wlm_probe_apart(x, wlm_probe_vec3({head} + 3 * candidate));
         if (d < away[WLM_PROBE_ASKED - 1]) {{
-            int k = WLM_PROBE_ASKED - 1;
-            while (k > 0 && away[k - 1] > d) {{
+            away[WLM_PROBE_ASKED - 1] = d;
+            probe[WLM_PROBE_ASKED - 1] = candidate;
+            for (int k = WLM_PROBE_ASKED - 1; k > 0 && away[k > 0 ? k - 1 : 0] > d; --k) {{
                 away[k] = away[k - 1];
                 probe[k] = probe[k - 1];
-                --k;
+                away[k - 1] = d;
+                probe[k - 1] = candidate;
             }}
-            away[k] = d;
-            probe[k] = candidate;
         }}
     }}
 }}

@@ -49,6 +49,7 @@ _LEAST = -133.0  # of the step's logarithm: a file has no less
 PSNR, LEAST_PSNR = 50.0, 40.0
 """That is wanted where nothing is said, and at least that where the input is noise."""
 
+_COARSER = 1.2  # about: a step over that of numbers that are rounded each for itself, at the same PSNR
 _CLOSE = 0.03  # dB above the wanted PSNR that is near enough
 FULL = 0.985
 """Of the largest size that is near enough."""
@@ -298,10 +299,11 @@ class Search:
     def smallest(self, psnr: float) -> Tried:
         """What reaches a PSNR in the fewest bytes."""
         # Of the first search the step alone is of use.
-        found = [self._for_psnr(psnr, self._uncoded, 0.5)]
+        found, coarser = [self._for_psnr(psnr, self._uncoded, 0.5)], _COARSER
         for _ in range(self._rounds):
             self._choose_basis(found[-1].step)
-            found.append(self._for_psnr(psnr, self._fitted, _CLOSE))
+            found.append(self._for_psnr(psnr, self._fitted, _CLOSE, found[-1].step * coarser))
+            coarser = 1.0
         return min(found[1:], key=lambda tried: tried.size)
 
     def _best(self, limit: int) -> Tried:
@@ -328,12 +330,12 @@ class Search:
             found += [tried for tried in tries if self._frame.file_bytes(tried) <= limit]
         return found
 
-    def _for_psnr(self, target: float, encode: Callable[[float], Tried], close: float) -> Tried:
-        start = self._peak * 10.0 ** (-target / 20.0) * 4.0
+    def _for_psnr(self, target: float, encode: Callable[[float], Tried], close: float, start: float = 0.0) -> Tried:
+        start = start or self._peak * 10.0 ** (-target / 20.0) * 4.0
         tried, excess = self._solve(
             encode,
             lambda tried: self._psnr(tried) - target,
-            -5.0,
+            -4.0,
             close,
             start,
             lambda tried: (tried.size, -tried.step),
@@ -386,7 +388,8 @@ class Search:
             enough = found >= 0
             if enough:
                 good.append((tried, found))
-            if enough not in ends or (abs(found) < abs(ends[enough][1])):
+            # Between both ends x is nearer than either, whatever was found there.
+            if len(ends) == 2 or enough not in ends or abs(found) < abs(ends[enough][1]):
                 ends[enough] = x, found, tried
             if enough and found <= close:
                 break

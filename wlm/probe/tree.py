@@ -12,6 +12,7 @@ A coefficient of a coarse probe reaches many values: `reach` is about the length
 """
 
 import math
+from collections.abc import Callable
 from functools import cached_property
 
 import numpy as np
@@ -43,6 +44,7 @@ class Tree:
         grid: The argument.
         levels: int64 [n] each, probes of a level in their order, the coarsest first.
         parents: int64 [n, K] each, of the levels but the first.
+        order: int64 [N], the probes level after level.
         reach: float64 [N], at least 1.
     """
 
@@ -59,39 +61,64 @@ class Tree:
         self.levels = _spread(whole, RADII[grid] ** 2) if grid else _levels(whole)
         self.parents: list[np.ndarray] = []
         self.reach = np.ones(len(code))
-        self._down: list[sparse.csr_matrix] = []
+        self._down: list[sparse.csr_matrix] = []  # of a level: what it takes of those before it, in their order
         known = self.levels[0]
         weights = []
         for level in self.levels[1:]:
             index, weight = _FirstOfTies(place[known], PARENTS).weights(place[level])
             self.parents.append(known[index])
             weights.append(weight)
-            self._down.append(_matrix(self.parents[-1], weight, len(code)))
+            self._down.append(_matrix(index, weight, len(known)))
             known = np.concatenate([known, level])
+        self.order = known
         for level, parents, weight in zip(self.levels[:0:-1], self.parents[::-1], weights[::-1], strict=True):
             np.add.at(self.reach, parents, np.square(weight) * self.reach[level][:, None])
         self.reach = np.sqrt(self.reach)
         self._up = [matrix.T.tocsr() for matrix in self._down]
+        self._single: tuple[list[sparse.csr_matrix], list[sparse.csr_matrix]] | None = None
 
     def values(self, coefficient: np.ndarray) -> np.ndarray:
         """Values [N, D] of coefficients [N, D]."""
-        value = coefficient.copy()
-        for level, matrix in zip(self.levels[1:], self._down, strict=True):
-            value[level] += matrix @ value
-        return value
+        return self._in_order(self.compose, coefficient)
 
     def coefficients(self, value: np.ndarray) -> np.ndarray:
         """Coefficients [N, D] of values [N, D]: undoes `values`."""
-        result = value.copy()
+        value = value[self.order]
+        result = np.empty_like(value)
+        result[self.order] = value
         for level, matrix in zip(self.levels[1:], self._down, strict=True):
-            result[level] -= matrix @ value
+            result[level] -= matrix @ value[: matrix.shape[1]]
         return result
 
     def adjoint(self, value: np.ndarray) -> np.ndarray:
         """The transpose of `values`, [N, D] to [N, D]."""
-        result = value.copy()
-        for level, matrix in zip(self.levels[:0:-1], self._up[::-1], strict=True):
-            result += matrix @ result[level]
+        return self._in_order(self.transpose, value)
+
+    def compose(self, number: np.ndarray) -> None:
+        """`values` in place, of rows in `order`, float64 or float32."""
+        for matrix in self._matrices(number.dtype)[0]:
+            rows, before = matrix.shape
+            number[before : before + rows] += matrix @ number[:before]
+
+    def transpose(self, number: np.ndarray) -> None:
+        """`adjoint` in place, of rows in `order`, float64 or float32."""
+        for matrix in self._matrices(number.dtype)[1][::-1]:
+            before, rows = matrix.shape
+            number[:before] += matrix @ number[before : before + rows]
+
+    def _matrices(self, dtype: np.dtype) -> tuple[list[sparse.csr_matrix], list[sparse.csr_matrix]]:
+        if dtype != np.float32:
+            return self._down, self._up
+        if self._single is None:
+            down, up = ([matrix.astype(np.float32) for matrix in matrices] for matrices in (self._down, self._up))
+            self._single = down, up
+        return self._single
+
+    def _in_order(self, change: Callable[[np.ndarray], None], rows: np.ndarray) -> np.ndarray:
+        ordered = rows[self.order]
+        change(ordered)
+        result = np.empty_like(ordered)
+        result[self.order] = ordered
         return result
 
     @cached_property
@@ -155,9 +182,9 @@ def flat(count: int) -> list[np.ndarray]:
     return [np.arange(count)]
 
 
-def _matrix(parents: np.ndarray, weight: np.ndarray, count: int) -> sparse.csr_matrix:
-    start = np.arange(len(parents) + 1) * parents.shape[1]
-    return sparse.csr_matrix((weight.ravel(), parents.ravel(), start), shape=(len(parents), count))
+def _matrix(index: np.ndarray, weight: np.ndarray, count: int) -> sparse.csr_matrix:
+    start = np.arange(len(index) + 1) * index.shape[1]
+    return sparse.csr_matrix((weight.ravel(), index.ravel(), start), shape=(len(index), count))
 
 
 def _levels(code: np.ndarray) -> list[np.ndarray]:

@@ -115,6 +115,7 @@ class Volume:
         light: What the probes are read from.
         position: float64 [N, 3], of all probes.
         numbers: int64 [V], which of them are live.
+        normal: float32 [N, 3], of all probes, of unit length, 0 where one lies on no surface; None: none is known.
         sizes: Sides of a block at each level.
         side: Blocks along an axis of a window.
         budget: Blocks decoded in a frame.
@@ -177,6 +178,7 @@ class Volume:
         self._viewpoint: np.ndarray | None = None
         self._base = np.zeros((len(ratios), 3), np.int64)
         self._frame = 0
+        self.normal = None if normal is None else _unit(normal, position.shape)
         self._make(rows, _unit(normal, position.shape)[self.numbers])
         self._step = interop.StepGraph(self._work, self.device)
 

@@ -69,7 +69,8 @@ def walk(
 ) -> list[FrameFigures]:
     """Moves a volume along a path, one update a frame, and reads it at probes near the viewer and far away.
 
-    The samples lie where the probes do, on surfaces for most sets, where a renderer reads.
+    The samples lie where the probes do, on surfaces for most sets, where a renderer reads; with their normals, where
+    the volume has these.
 
     Args:
         volume: In any state; it goes on from there.
@@ -95,6 +96,7 @@ def walk(
     if samples < 1 or not radius > 0.0:
         raise ValueError(f"samples, radius: expected at least 1 and above 0, got {samples} and {radius}")
     position = volume.position[volume.numbers]
+    normal = None if volume.normal is None else volume.normal[volume.numbers]
     light = at_probes(volume.light, volume.numbers).astype(np.float64)
     if original is None:
         truth = light
@@ -112,7 +114,7 @@ def walk(
         random = np.random.default_rng(seed)
         near, far = (_draw(np.flatnonzero(part), samples, random) for part in (inside, ~inside))
         start = time.perf_counter()
-        reading = volume.read(position[near])
+        reading = volume.read(position[near], None if normal is None else normal[near])
         seconds = time.perf_counter() - start
         levels = range(len(volume.sizes))
         figures.append(
@@ -128,7 +130,7 @@ def walk(
                 original_rmse=_rms(reading.values - truth[near]),
                 light_rmse=_rms(light[near] - truth[near]),
                 far=len(far),
-                far_rmse=_rms(volume.read(position[far]).values - truth[far]),
+                far_rmse=_rms(volume.read(position[far], None if normal is None else normal[far]).values - truth[far]),
             )
         )
         if meter.due(frame + 1):
@@ -172,7 +174,7 @@ def score_volume(
         The `summary`, and `block`, the side of the finest blocks; `first_ms` and `first_frames`, what the first frame
         takes and how many pass until nothing waits; `memory_bytes`.
     """
-    volume = Volume(probes.position, light, live=probes.live)
+    volume = Volume(probes.position, light, live=probes.live, normal=probes.normal)
     lit = probes.position[probes.live]
     path = camera_path(lit, frames or loop_frames(lit, STEP * volume.sizes[0], up), up=up)
     first = volume.update(path[0])

@@ -125,7 +125,7 @@ class _Request:
             from wlm.view.probe_scene import Probes
 
             self._refuse("extinction", "flat")
-            position, values, live = probes_of(model, self.original, self.key)
+            position, values, live, _ = probes_of(model, self.original, self.key)
             return self._probes(Probes.of_model(model, position, values, live, self.path.name))
         if model.SYSTEM == "atlas":
             raise WlmError(f"{self.path}: expected the folder that wlm atlas compress wrote, which has the mesh")

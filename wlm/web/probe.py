@@ -51,7 +51,7 @@ def probe_page(
     coefficients = sh_count(model.outputs)
     if coefficients is None:
         raise WlmError(f"{model.name}: expected spherical harmonics, found {model.outputs} numbers a probe")
-    position, values, live = probes_of(model, original, key)
+    position, values, live, _ = probes_of(model, original, key)
     places = position[live].astype(np.float32)
     if isinstance(model, Transform):
         decoded = model.decoder(position=None if original is None else position).decode_probes()[live]

@@ -1,0 +1,93 @@
+"""Probes in JSON: fields of all of them, or a list of probes with fields each."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from wlm.errors import WlmError
+from wlm.formats.limits import JSON_BYTES
+from wlm.formats.reading import read_json_file
+
+_PROBES = "probes"
+_FLAGS = ("valid",)  # fields that may be true or false
+
+
+def read_json(path: Path) -> Any:
+    """Reads a file.
+
+    Raises:
+        WlmError: It is missing, too long or no JSON.
+    """
+    return read_json_file(path, "the probes", JSON_BYTES)
+
+
+def fields_of(path: Path, content: Any) -> tuple[list[str], Callable[[str], np.ndarray]]:
+    """Names of the probes' fields in either form of JSON, and a function that reads one as an array.
+
+    Raises:
+        WlmError: It has neither form; of the function, a field isn't there, or is no array of numbers.
+    """
+    if not isinstance(content, dict):
+        raise WlmError(f"{path}: expected a JSON object, got {_kind(content)}")
+    if _PROBES not in content:
+        return list(content), lambda field: numbers_of(path, field, _rows(path, content, field))
+    probes = _rows(path, content, _PROBES)
+    for i, probe in enumerate(probes):
+        if not isinstance(probe, dict):
+            raise WlmError(f"{path}: {_PROBES}[{i}]: expected an object (position, sh), got {_kind(probe)}")
+
+    def read(field: str) -> np.ndarray:
+        for i, probe in enumerate(probes):
+            if field not in probe:
+                raise WlmError(f"{path}: {_PROBES}[{i}].{field} is missing")
+        return numbers_of(path, field, [probe[field] for probe in probes])
+
+    return list(probes[0]) if probes else ["position", "sh"], read
+
+
+def text_of(path: Path, field: str, value: object) -> str:
+    """A text, or a `WlmError`."""
+    if not isinstance(value, str):
+        raise WlmError(f"{path}: {field}: expected a name, got {_kind(value)}")
+    return value
+
+
+def _rows(path: Path, holder: dict, field: str) -> list:
+    if not isinstance(holder.get(field), list):
+        raise WlmError(f"{path}: {field}: expected a list, got {_kind(holder.get(field))}")
+    return holder[field]
+
+
+def numbers_of(path: Path, field: str, rows: list) -> np.ndarray:
+    """Turns nested lists of one shape into an array, of true and false where the field is one of these.
+
+    Raises:
+        WlmError: They have several shapes, or something that is no number.
+    """
+    kinds = "biuf" if field in _FLAGS else "iuf"
+    array = _array(rows, kinds)
+    if array is not None:
+        return array
+    shapes = [None if row is None else row.shape for row in (_array(row, kinds) for row in rows)]
+    odd = next((i for i, shape in enumerate(shapes) if shape is None or shape != shapes[0]), 0)
+    raise WlmError(f"{path}: {field}[{odd}]: expected numbers, as many as {field}[0] has, got {_kind(rows[odd])}")
+
+
+def _array(value: object, kinds: str) -> np.ndarray | None:
+    """An array of some of NumPy's kinds; None for text, nothing, and ragged lists."""
+    try:
+        array = np.asarray(value)
+    except (ValueError, OverflowError):
+        return None
+    return array if array.dtype.kind in kinds else None
+
+
+def _kind(value: object) -> str:
+    """A short name of a JSON value."""
+    if isinstance(value, dict):
+        return "an object"
+    text = json.dumps(value)
+    return text if len(text) <= 60 else text[:57] + "..."

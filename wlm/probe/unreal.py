@@ -1,0 +1,209 @@
+"""Light probes for Unreal, packed as the bricks of its volumetric lightmap: 28 bytes a probe of L2.
+
+A brick's texel has the ambient colour, the coefficient L00, as R11G11B10F, and each other coefficient over it and over
+the range that light can have, in 8 bits: coefficients 1 to 4 and 5 to 8 of red, green and blue in six textures of RGBA
+(VolumetricLightmapShared.ush; sky occlusion and shadowing apart). Unreal has bricks in the maps that it builds alone,
+so light is written as seven volume textures over a lattice, with functions for materials that read them.
+"""
+
+import os
+from pathlib import Path
+
+import numpy as np
+
+from wlm.errors import WlmError
+from wlm.formats.dds import write_dds
+from wlm.formats.folder import make_parents, staged, write_index
+from wlm.probe.conventions import from_canonical
+from wlm.probe.lattice import CELLS, lattice_of
+from wlm.probe.model import ProbeModel
+from wlm.probe.transform import Transform
+
+FORMAT = "wlm-unreal-light"
+_VERSION = 1
+INFO_FILE = "light.json"
+AMBIENT_FILE = "ambient.dds"
+SH_FILES = tuple(f"sh{number}.dds" for number in range(6))
+SHADER_FILE = "WlmProbes.usf"
+_FILES = {INFO_FILE, AMBIENT_FILE, SHADER_FILE, *SH_FILES}
+_MOST_CELLS = 128
+_BANDS = 3
+
+# Range of coefficients 1 to 8 over the ambient one, as the engine sets it: sqrt(3) for L1, which light reaches but
+# never passes, and twice what light can reach for L2.
+_RANGE = np.sqrt([3.0, 3.0, 3.0, 15.0, 15.0, 20.0, 15.0, 15.0])
+# Largest finite numbers with 6, 6 and 5 bits of mantissa and half float's exponent.
+_PACKED_MAX = np.array([65024.0, 65024.0, 64512.0])
+# Bits of a half float's mantissa that R11G11B10F has no room for.
+_DROPPED = np.array([4, 4, 5], np.uint32)
+_SHIFT = np.array([0, 11, 22], np.uint32)
+
+_ABOUT = (
+    "ambient.dds and sh0.dds to sh5.dds are volume textures of one size, a probe at the centre of each texel, x along "
+    "rows, then y, then z: of the coefficients of radiance the first, and the others over it and over their ranges, 1 "
+    "to 4 and 5 to 8 of red, of green and of blue. Unreal's signs, the scene's own axes and unit. WlmProbes.usf says "
+    "how to read them; corner and size are those of the box in it."
+)
+
+_SHADER = """\
+// Light of probes for Unreal, in the packing of its volumetric lightmaps.
+//
+// 1. Import ambient.dds and sh0.dds to sh5.dds as volume textures: sRGB off, no compression (ambient as half floats),
+//    no mips, clamped, bilinear filter.
+// 2. Put this file into a folder of shaders that the project maps (AddShaderSourceDirectoryMapping("/Wlm", ...)), and
+//    "/Wlm/WlmProbes.usf" under Include File Paths of a material's Custom node, with the inputs Ambient, Sh0 to Sh5
+//    (texture objects), Position and Normal, and this code:
+//
+//        return WlmProbeDiffuse(Ambient, Sh0, Sh1, Sh2, Sh3, Sh4, Sh5, AmbientSampler, Position, Normal);
+//
+// Position and Normal are in the axes and the unit of the probes. In a scene that came in as glTF, with y up and in
+// metres, they are Absolute World Position's xzy / 100 and the world normal's xzy.
+
+static const float3 WlmCorner = float3(@CORNER@);
+static const float3 WlmSize = float3(@SIZE@);
+
+// Coefficients of radiance, orthonormal, in the order 1; y, z, x; xy, yz, 3z2-1, xz, x2-y2 and with the signs of
+// FSHVector3: y, x, yz and xz have a minus.
+void WlmProbeSh(Texture3D ambient, Texture3D sh0, Texture3D sh1, Texture3D sh2, Texture3D sh3, Texture3D sh4,
+                Texture3D sh5, SamplerState state, float3 position, out float3 sh[9])
+{
+    float3 uvw = (position - WlmCorner) / WlmSize;
+    float4 low = float4(1.7320508, 1.7320508, 1.7320508, 3.8729833);
+    float4 high = float4(3.8729833, 4.4721360, 3.8729833, 3.8729833);
+    float3 mean = ambient.SampleLevel(state, uvw, 0).xyz;
+    float4 r0 = (sh0.SampleLevel(state, uvw, 0) * 2.0 - 1.0) * low * mean.x;
+    float4 r1 = (sh1.SampleLevel(state, uvw, 0) * 2.0 - 1.0) * high * mean.x;
+    float4 g0 = (sh2.SampleLevel(state, uvw, 0) * 2.0 - 1.0) * low * mean.y;
+    float4 g1 = (sh3.SampleLevel(state, uvw, 0) * 2.0 - 1.0) * high * mean.y;
+    float4 b0 = (sh4.SampleLevel(state, uvw, 0) * 2.0 - 1.0) * low * mean.z;
+    float4 b1 = (sh5.SampleLevel(state, uvw, 0) * 2.0 - 1.0) * high * mean.z;
+    sh[0] = mean;
+    sh[1] = float3(r0.x, g0.x, b0.x);
+    sh[2] = float3(r0.y, g0.y, b0.y);
+    sh[3] = float3(r0.z, g0.z, b0.z);
+    sh[4] = float3(r0.w, g0.w, b0.w);
+    sh[5] = float3(r1.x, g1.x, b1.x);
+    sh[6] = float3(r1.y, g1.y, b1.y);
+    sh[7] = float3(r1.z, g1.z, b1.z);
+    sh[8] = float3(r1.w, g1.w, b1.w);
+}
+
+// What a white diffuse surface of a normal, of unit length, shows: irradiance over pi.
+float3 WlmProbeDiffuse(Texture3D ambient, Texture3D sh0, Texture3D sh1, Texture3D sh2, Texture3D sh3, Texture3D sh4,
+                       Texture3D sh5, SamplerState state, float3 position, float3 normal)
+{
+    float3 sh[9];
+    WlmProbeSh(ambient, sh0, sh1, sh2, sh3, sh4, sh5, state, position, sh);
+    float x = normal.x;
+    float y = normal.y;
+    float z = normal.z;
+    float3 light = sh[0] * 0.2820948;
+    light += (sh[2] * z - sh[1] * y - sh[3] * x) * 0.3257350;
+    light += (sh[4] * (x * y) - sh[5] * (y * z) - sh[7] * (x * z)) * 0.2731371;
+    light += sh[6] * (0.0788479 * (3.0 * z * z - 1.0)) + sh[8] * (0.1365686 * (x * x - y * y));
+    return max(light, float3(0.0, 0.0, 0.0));
+}
+"""
+
+
+def export_unreal(
+    model: ProbeModel | Transform,
+    directory: str | os.PathLike[str],
+    *,
+    cells: int = CELLS,
+    position: np.ndarray | None = None,
+    device: str = "cpu",
+) -> list[Path]:
+    """Writes a model's light as volume textures in Unreal's packing, and `WlmProbes.usf`, which reads them.
+
+    Probes stand at the centres of cubic cells that fill the probes' box. A coefficient beyond what light that is
+    nowhere negative can have is clamped, an ambient colour below 0 becomes 0.
+
+    Args:
+        model: Of L2 in RGB.
+        directory: The folder; made if it isn't there. A new export replaces an earlier one.
+        cells: Along the longest side of the box, 1 to 128.
+        position: [N, 3], of the model's own probes, for a transform whose file has none.
+        device: Where it is decoded.
+
+    Returns:
+        The files written, `light.json` last.
+
+    Raises:
+        WlmError: Another number of coefficients, cells out of range, light beyond what 11 bits hold, no such device, or
+            the folder can't be written.
+    """
+    lattice = lattice_of(model, cells, _MOST_CELLS, position, device)
+    corner, size = lattice.low, lattice.count * lattice.size
+    sh = from_canonical(lattice.light(lattice.centres()).reshape(-1, 9, 3).astype(np.float64), "unreal")
+    if not np.abs(sh[:, 0]).max() <= _PACKED_MAX.min():
+        raise WlmError(f"{model.name}: expected light within {_PACKED_MAX.min():g}, got {np.abs(sh[:, 0]).max():.3g}")
+    width, height, depth = (int(count) for count in lattice.count)
+    ambient, level = _packed(sh, _BANDS)
+    textures = {AMBIENT_FILE: ("R11G11B10_FLOAT", ambient)}
+    textures |= {
+        name: ("R8G8B8A8_UNORM", np.ascontiguousarray(level[:, number // 2, 4 * (number % 2) :][:, :4]))
+        for number, name in enumerate(SH_FILES)
+    }
+    text = _SHADER
+    for mark, numbers in (("@CORNER@", corner), ("@SIZE@", size)):
+        text = text.replace(mark, ", ".join(f"{number:.9e}" for number in numbers))
+    document = {
+        "format": FORMAT,
+        "version": _VERSION,
+        "about": _ABOUT,
+        "name": model.name,
+        "corner": corner.tolist(),
+        "size": size.tolist(),
+        "resolution": lattice.count.tolist(),
+    }
+    folder = Path(directory)
+    make_parents(folder)
+    with staged(folder, INFO_FILE, FORMAT, _FILES.__contains__) as temporary:
+        for name, (fmt, texels) in textures.items():
+            write_dds(temporary / name, texels.tobytes(), width, height, depth, fmt, volume=True)
+        (temporary / SHADER_FILE).write_text(text, encoding="utf-8")
+        write_index(temporary / INFO_FILE, document)
+    return [folder / name for name in (*textures, SHADER_FILE, INFO_FILE)]
+
+
+def pack_unreal(values: np.ndarray, bands: int) -> bytes:
+    """Probes as the engine packs them: uint32 [N] ambient colours, then uint8 [N, 3, bands² - 1] ratios.
+
+    Args:
+        values: [N, D], coefficients from L00, of each red, green and blue.
+        bands: 1 to 3, that are kept.
+    """
+    ambient, level = _packed(np.asarray(values, np.float64).reshape(len(values), -1, 3), bands)
+    return ambient.tobytes() + level.tobytes()
+
+
+def unpack_unreal(payload: bytes, width: int, bands: int) -> np.ndarray:
+    """Reads what `pack_unreal` wrote, float32 [N, D], D = `width`; zero beyond the bands."""
+    probes = len(payload) // (4 + 3 * (bands**2 - 1))
+    ambient = _ambient(np.frombuffer(payload, "<u4", probes))
+    level = np.frombuffer(payload, np.uint8, offset=4 * probes).reshape(probes, 3, bands**2 - 1)
+    sh = np.zeros((probes, width // 3, 3))
+    sh[:, 0] = ambient
+    others = (level / 127.5 - 1.0) * ambient[:, :, None] * _RANGE[: bands**2 - 1]
+    sh[:, 1 : bands**2] = others.transpose(0, 2, 1)
+    return sh.reshape(probes, width).astype(np.float32)
+
+
+def _packed(sh: np.ndarray, bands: int) -> tuple[np.ndarray, np.ndarray]:
+    """uint32 [N] and uint8 [N, 3, bands² - 1] of coefficients [N, C, 3]."""
+    colour = np.clip(sh[:, 0], 0.0, _PACKED_MAX)
+    step = np.exp2(np.maximum(np.frexp(colour)[1] - 1, -14) - 10.0 + _DROPPED)
+    code = (np.rint(colour / step) * step).astype(np.float16).view(np.uint16).astype(np.uint32) >> _DROPPED
+    ambient = np.bitwise_or.reduce(code << _SHIFT, axis=1).astype("<u4")
+    others = sh[:, 1 : bands**2].transpose(0, 2, 1)
+    # The ratio is that to the ambient as it is decoded, which costs nothing and is closer.
+    unit = _ambient(ambient)[:, :, None] * _RANGE[: bands**2 - 1]
+    ratio = np.divide(others, unit, out=np.zeros_like(others), where=unit > 0.0)
+    return ambient, np.rint((np.clip(ratio, -1.0, 1.0) * 0.5 + 0.5) * 255.0).astype(np.uint8)
+
+
+def _ambient(code: np.ndarray) -> np.ndarray:
+    """R11G11B10F to float64 [N, 3]."""
+    part = (code[:, None] >> _SHIFT) & ((1 << (15 - _DROPPED)) - 1)
+    return (part << _DROPPED).astype(np.uint16).view(np.float16).astype(np.float64)
