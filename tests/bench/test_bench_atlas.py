@@ -222,8 +222,8 @@ def test_the_command(rows, tmp_path, monkeypatch):
 
 def test_the_rivals_alone(lightmaps, rows, tmp_path, monkeypatch):
     """At the bits that a result file has, with the scores that they have in a whole run."""
-    monkeypatch.setattr(bench, "_VIEWS", 3)
-    monkeypatch.setattr(bench, "_RESOLUTION", 64)
+    monkeypatch.setattr(bench, "VIEWS", 3)
+    monkeypatch.setattr(bench, "RESOLUTION", 64)
     write_json(tmp_path / "rows.json", rows, {})
     alone = run_rivals(tmp_path / "rows.json", lightmaps[:1])
     beside = [row for row in rows if row.scene == "sheet day" and row.method in RIVALS]

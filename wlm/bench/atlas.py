@@ -63,13 +63,15 @@ _OWN = "its own size"  # the option of those without a budget
 _SMALLER = (0.925, 0.95)  # CRs that the first profile is measured at too
 _HELD_TO = ("standard", "standard, CR 92.5%", "standard, CR 95%", "astc")  # whose bits rivals get when they run alone
 _FIRST = "downsampling"  # what everything is compared with
-_VIEWS, _RESOLUTION = 50, 512  # section 4.1.4; the paper doesn't say at which resolution it scores
-_QUICK_VIEWS, _QUICK_RESOLUTION = 8, 256
+VIEWS, RESOLUTION = 50, 512  # section 4.1.4; the paper doesn't say at which resolution it scores
+QUICK_VIEWS, QUICK_RESOLUTION = 8, 256
 _QUICK_CASCADE = {"steps": 30, "resolution": 256}
 _POINTS = 1_000_000
 _CHECKED = 1 << 17  # of them, against float64
 _SAME = 0.01  # shares of bits that differ by less are equal
-_SCORES = ("psnr", "psnr_worst", "texel_psnr", "tone_psnr", "one_minus_ssim", "flip", "seam_ratio")
+SCORES = ("psnr", "psnr_worst", "texel_psnr", "tone_psnr", "one_minus_ssim", "flip", "seam_ratio")
+"""Figures of a row that are those of a `Score`."""
+
 _RANGED = ("psnr", "texel_psnr", "tone_psnr", "one_minus_ssim", "flip", "seam_ratio")  # with their least and most
 _AVERAGED = ("bytes", "bpp", "compression_ratio", "encode_seconds", "decode_ms", *_RANGED)
 
@@ -112,8 +114,8 @@ def run(
         lightmaps,
         profiles,
         device=interop.check_device(device),
-        views=_QUICK_VIEWS if quick else _VIEWS,
-        resolution=_QUICK_RESOLUTION if quick else _RESOLUTION,
+        views=QUICK_VIEWS if quick else VIEWS,
+        resolution=QUICK_RESOLUTION if quick else RESOLUTION,
         whole=not quick,
         methods=_METHODS if rivals else (_FIRST,),
         progress=progress,
@@ -147,8 +149,8 @@ def run_rivals(
         if not shares:
             raise WlmError(f"{results}: expected a row of method ours of {lightmap.scene}")
         bench = _AtlasBench(lightmap, "cpu", progress, 1)
-        rows += bench.scored(bench.rivals(shares, _METHODS), _VIEWS, _RESOLUTION)
-    return rows + _means(rows, len(lightmaps))
+        rows += bench.scored(bench.rivals(shares, _METHODS), VIEWS, RESOLUTION)
+    return rows + means(rows, len(lightmaps))
 
 
 def run_rows(
@@ -180,7 +182,7 @@ def run_rows(
         raise ValueError("expected at least one lightmap and one profile")
     (progress or (lambda line: None))("compiling")
     for profile in profiles:
-        _warm_up(profile, device)
+        warm_up(profile, device)
     rows: list[Row] = []
     for lightmap in lightmaps:
         bench = _AtlasBench(lightmap, device, progress, points, repeats)
@@ -193,7 +195,7 @@ def run_rows(
         entries = bench.timed(entries)
         entries += bench.rivals(shares if whole else {profiles[0].name: shares[profiles[0].name]}, methods)
         rows += bench.scored(entries, views, resolution)
-    return rows + _means(rows, len(lightmaps))
+    return rows + means(rows, len(lightmaps))
 
 
 def plotted(rows: Sequence[Row]) -> list[Row]:
@@ -378,7 +380,7 @@ class _AtlasBench(Bench):
         reports = compare(self.mesh, decoders, views=views, resolution=resolution, device=self.device)
         rows = [entry.row for entry in entries]
         for i, report in reports.items():
-            rows[int(i)] = rows[int(i)].with_figures(**{name: getattr(report, name) for name in _SCORES})
+            rows[int(i)] = rows[int(i)].with_figures(**{name: getattr(report, name) for name in SCORES})
         return rows
 
     def _decode(self, model: AtlasModel) -> tuple[Callable[[], object], dict[str, float]]:
@@ -394,13 +396,19 @@ class _AtlasBench(Bench):
         return self.replay(lambda: decoder.run(points, out)), errors
 
 
-def _means(rows: Sequence[Row], lightmaps: int) -> list[Row]:
-    """A row for each method and option that was measured on more than one lightmap."""
+def means(rows: Sequence[Row], lightmaps: int, of: str = "") -> list[Row]:
+    """Makes a row for each method and option that was measured on more than one lightmap.
+
+    Args:
+        rows: Those of each lightmap.
+        lightmaps: How many there are.
+        of: What their scene says besides.
+    """
     groups: dict[tuple[str, str], list[Row]] = {}
     for row in rows:
         if row.figures and row.method != "fit":
             groups.setdefault((row.method, row.option), []).append(row)
-    means = []
+    made = []
     for (method, option), group in groups.items():
         if len(group) < 2:
             continue
@@ -412,12 +420,12 @@ def _means(rows: Sequence[Row], lightmaps: int) -> list[Row]:
                     figures |= {f"{name}_min": min(values), f"{name}_max": max(values)}
         figures["max_error"] = max((row["max_error"] for row in group if "max_error" in row.figures), default=None)
         figures["lightmaps"] = len(group)
-        means.append(Row("atlas", f"{MEAN} {lightmaps} lightmaps", method, option, figures))
-    return means
+        made.append(Row("atlas", f"{MEAN} {lightmaps} lightmaps{of}", method, option, figures))
+    return made
 
 
-def _warm_up(profile: Profile, device: str) -> None:
-    """Compiles what a compression and a decode need, on a square of 32 texels a side."""
+def warm_up(profile: Profile, device: str) -> None:
+    """Compiles what a compression by a profile and a decode need on a device, with a square of 32 texels a side."""
     side = np.linspace(0.1, 1.0, 32)
     image = np.stack([np.outer(side, side), np.outer(side, side[::-1]), np.outer(side, side) ** 2], -1)
     uv = np.array([[0, 0], [1, 0], [0, 1], [1, 1]], float)
