@@ -17,8 +17,7 @@ dynamic programming. Rows and columns are treated alike, in turns. Ours, where t
   from that of the texel behind it, linearly between. A triangle's inside follows its corners, so that the texture isn't
   what seams leave, but is drawn again after every few of them, and the last one has the least squared error where
   charts are read.
-- A seam that would turn a triangle over isn't taken: its texels there are blocked until the next drawing. Where none is
-  left, nothing fits.
+- A seam that would turn a triangle over isn't taken: its texels there are blocked until the next drawing.
 - RGB9E5, of which the texels that charts read are paid for, as for other rivals. UVs are free in eq. 9.
 """
 
@@ -63,12 +62,13 @@ def carving(mesh: LightmappedMesh, share: float) -> Rival:
     points = _Points(mesh)
     sheet = _Sheet(mesh.uv * mesh.mask.shape[::-1], mesh.mask.shape)
     while (count := read_blocks(points.places(sheet), sheet.size)) > most:
-        # Each side has about the same share of its texels left.
-        left = [(side - 1) / most for side, most in zip(sheet.size, mesh.mask.shape, strict=True)]
-        turned = left[0] > left[1]
-        seams = max(1, mesh.mask.shape[0 if turned else 1] // _ROUND)
-        carved = _carved(mesh, sheet, seams, turned)
-        if carved is None:
+        # Each side has about the same share of its texels left, where it can.
+        left = [side / most for side, most in zip(sheet.size, mesh.mask.shape, strict=True)]
+        for axis in (0, 1) if left[0] > left[1] else (1, 0):
+            carved = _carved(mesh, sheet, max(1, mesh.mask.shape[axis] // _ROUND), turned=axis == 0)
+            if carved.size != sheet.size:
+                break
+        else:
             raise ValueError(f"share: {share} of {mesh.mask.shape} texels is less than carving comes to")
         sheet = carved
     texels = quantise(points.fitted(sheet), TEXELS)["texels"]
@@ -115,7 +115,7 @@ class _Points:
         shape = tuple(_FINE * side for side in mesh.mask.shape)
         triangle, barycentric = texel_triangles(mesh, *shape, "cpu")
         inside = torch.tensor(mesh.mask.repeat(_FINE, 0).repeat(_FINE, 1)) & (triangle >= 0)
-        # Of charts that hold no point their corners stand for them.
+        # Where no chart holds a point, corners stand for all.
         if not inside.any():
             corner = mesh.triangle[mesh.active].reshape(-1)
             self._vertex, self._weight = corner[:, None].repeat(3, 1), np.full((len(corner), 3), 1 / 3)
@@ -163,17 +163,14 @@ class _Points:
         return light.clip(0.0, HALF_MAX).reshape(*sheet.size, 3).astype(np.float32)
 
 
-def _carved(mesh: LightmappedMesh, sheet: _Sheet, seams: int, turned: bool) -> _Sheet | None:
+def _carved(mesh: LightmappedMesh, sheet: _Sheet, seams: int, turned: bool) -> _Sheet:
     """Removes seams.
 
     Args:
         mesh: The mesh.
         sheet: The texture before.
-        seams: How many.
-        turned: Whether they run along the rows, and not from the top to the bottom.
-
-    Returns:
-        The texture after; None where no seam is left that turns no triangle over.
+        seams: How many, at most: fewer where none is left that turns no triangle over.
+        turned: Whether they run from the left to the right, and not from the top to the bottom.
     """
     image = _drawn(mesh, sheet)
     triangle = mesh.triangle[mesh.active]
@@ -185,15 +182,14 @@ def _carved(mesh: LightmappedMesh, sheet: _Sheet, seams: int, turned: bool) -> _
     winding = np.where(np.abs(winding) > _THIN, np.sign(winding), 0.0)
     blocked = np.zeros(image.shape[:2], bool)
     for _ in range(min(seams, image.shape[1] - 1)):
-        while True:
-            seam = _seam(np.where(blocked, np.inf, _costs(image)))
-            if seam is None:
-                return None
-            moved = _moved(place, seam)
+        while (seam := _seam(np.where(blocked, np.inf, _costs(image)))) is not None:
+            moved = _moved(place, seam, image.shape[1])
             wrong = _areas(moved[triangle]) * winding < 0.0
             if not wrong.any():
                 break
             _block(blocked, seam, place[triangle[wrong]][..., 1])
+        if seam is None:
+            break
         place = moved
         image, blocked = (_without(each, seam) for each in (image, blocked))
     height, width = image.shape[:2]
@@ -241,12 +237,13 @@ def _seam(cost: np.ndarray) -> np.ndarray | None:
     return seam
 
 
-def _moved(place: np.ndarray, seam: np.ndarray) -> np.ndarray:
-    """Places [V, 2] after a seam was removed."""
+def _moved(place: np.ndarray, seam: np.ndarray, width: int) -> np.ndarray:
+    """Places [V, 2] on a texture of so many columns after a seam was removed."""
     centre = np.interp(place[:, 1], np.arange(len(seam)) + 0.5, seam + 0.5)
-    moved = place.copy()
-    moved[:, 0] -= ((place[:, 0] - centre + 1.0) / 2.0).clip(0.0, 1.0)
-    return moved
+    # Nothing moves out at a border.
+    begin, end = np.maximum(centre - 1.0, 0.0), np.minimum(centre + 1.0, width)
+    x = place[:, 0] - ((place[:, 0] - begin) / (end - begin)).clip(0.0, 1.0)
+    return np.stack([x, place[:, 1]], 1)
 
 
 def _block(blocked: np.ndarray, seam: np.ndarray, heights: np.ndarray) -> None:
