@@ -65,7 +65,9 @@ def carving(mesh: LightmappedMesh, share: float) -> Rival:
         # Each side has about the same share of its texels left, where it can.
         left = [side / most for side, most in zip(sheet.size, mesh.mask.shape, strict=True)]
         for axis in (0, 1) if left[0] > left[1] else (1, 0):
-            carved = _carved(mesh, sheet, max(1, mesh.mask.shape[axis] // _ROUND), turned=axis == 0)
+            # No more than are needed, were all columns read alike.
+            seams = min(mesh.mask.shape[axis] // _ROUND, int(sheet.size[axis] * (1.0 - most / count)))
+            carved = _carved(mesh, sheet, max(1, seams), turned=axis == 0)
             if carved.size != sheet.size:
                 break
         else:
