@@ -22,7 +22,7 @@ dynamic programming. Rows and columns are treated alike, in turns. Ours, where t
 """
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sparse
@@ -195,9 +195,7 @@ def _carved(mesh: LightmappedMesh, sheet: _Sheet, seams: int, turned: bool) -> _
         place = moved
         image, blocked = (_without(each, seam) for each in (image, blocked))
     height, width = image.shape[:2]
-    if turned:
-        return _Sheet(np.ascontiguousarray(place[:, ::-1]), (width, height))
-    return replace(sheet, place=place, size=(height, width))
+    return _Sheet(np.ascontiguousarray(place[:, ::-1]), (width, height)) if turned else _Sheet(place, (height, width))
 
 
 def _drawn(mesh: LightmappedMesh, sheet: _Sheet) -> np.ndarray:

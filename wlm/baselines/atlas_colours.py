@@ -56,7 +56,7 @@ def single_colour(
         mesh: The mesh and its lightmap.
         threshold: How far a triangle's colours may be from their middle in any channel, see the module. A group's
             colours are within four times that of each other.
-        floor: PSNR in dB that each view has, but for rounding; -inf: no triangle is left out for it.
+        floor: PSNR in dB of each view, see the module, but for what changes as groups lose triangles; -inf: none.
         views: Number of views, as of `wlm.atlas.views.mesh_views`.
         resolution: Pixels along a side of a view.
 
