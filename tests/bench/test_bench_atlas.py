@@ -1,5 +1,7 @@
 """The atlas benchmark on two small lightmaps: every row has its figures, and they agree with what they are of."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 from builders.atlas_meshes import charts, constant, image, sheet, soft
@@ -10,6 +12,7 @@ from wlm.atlas.data import LightmappedMesh, write_mesh
 from wlm.atlas.evaluation import compare
 from wlm.atlas.fit import compress
 from wlm.atlas.model import Profile
+from wlm.baselines.atlas import single_colour
 from wlm.bench import write_json
 from wlm.bench.atlas import PANELS, plotted, run, run_rivals, run_rows
 from wlm.bench.atlas_inputs import Lightmap, load
@@ -22,9 +25,18 @@ PROFILES = [
     Profile(name="bc6h", colour="bc6h", budget=0.3, fallback=False, **FEW),
     Profile(name="paper", method="cascade", steps=6, resolution=32, fallback=False, colour_scale=0.6),
 ]
-RIVALS = ["downsampling", "downsampling bilinear", "BC6H", "BC6H, our encoder", "ASTC", "single colour"]
+RIVALS = ["downsampling", "downsampling bilinear", "BC6H", "BC6H, our encoder", "ASTC", "carving"]
+OWN = ("single colour", "its own size")
 SMALLER = ["standard, CR 92.5%", "standard, CR 95%"]
 MEAN = "mean over 2 lightmaps"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_views():
+    """50 large views for single-colour merging show nothing here that two small ones don't."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(bench.OWN_SIZE, "single colour", partial(single_colour, views=2, resolution=64))
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +56,8 @@ def test_every_row_has_its_figures(rows):
         measured = keys(row for row in rows if row.scene == scene)
         before = [*ours, *extra, ("lightmap", "half floats"), *((name, "bits of standard") for name in RIVALS)]
         assert measured[: len(before)] == before
-        rest = measured[len(before) :]
+        assert measured[-1] == OWN
+        rest = measured[len(before) : -1]
         for method in ("downsampling", "ASTC"):
             options = [option for name, option in rest if name == method]
             # One that has the whole lightmap in the bits of standard isn't measured in more.
@@ -57,6 +70,7 @@ def test_every_row_has_its_figures(rows):
         ("lightmap", "half floats"),
         *((name, "bits of standard") for name in RIVALS),
     ]
+    assert OWN in means
     for row in rows:
         assert row.system == "atlas" and "not measured" not in row.notes
         assert (row.method == "lightmap") == (row.get("psnr") is None)
@@ -127,7 +141,7 @@ def test_a_lightmap_of_one_colour_has_no_scores():
     profile = PROFILES[0].model_copy(update={"fallback": False})
     rows = run_rows([lightmap], [profile], device="cpu", views=2, resolution=32, whole=False, points=100, repeats=1)
     assert all("psnr" not in row.figures for row in rows)
-    assert [row.method for row in rows] == ["ours", "lightmap", *RIVALS]
+    assert [row.method for row in rows] == ["ours", "lightmap", *RIVALS, OWN[0]]
 
 
 def test_no_room_for_a_rival_or_a_table():
@@ -208,12 +222,13 @@ def test_the_command(rows, tmp_path, monkeypatch):
 
 def test_the_rivals_alone(lightmaps, rows, tmp_path, monkeypatch):
     """At the bits that a result file has, with the scores that they have in a whole run."""
-    monkeypatch.setattr(bench, "_VIEWS", 3)
-    monkeypatch.setattr(bench, "_RESOLUTION", 64)
+    monkeypatch.setattr(bench, "VIEWS", 3)
+    monkeypatch.setattr(bench, "RESOLUTION", 64)
     write_json(tmp_path / "rows.json", rows, {})
     alone = run_rivals(tmp_path / "rows.json", lightmaps[:1])
     beside = [row for row in rows if row.scene == "sheet day" and row.method in RIVALS]
     beside = [row for row in beside if row.option in {f"bits of {option}" for option in ("standard", *SMALLER)}]
+    beside += [row for row in rows if row.scene == "sheet day" and row.method == OWN[0]]
     assert keys(alone) == keys(beside)
     for name in ("bytes", "psnr"):
         assert [row[name] for row in alone] == [row[name] for row in beside]

@@ -23,7 +23,7 @@ On CUDA gradients are added in any order: two fits with one seed differ in the l
 """
 
 import math
-from dataclasses import astuple, dataclass, fields, replace
+from dataclasses import astuple, dataclass, fields
 
 import numpy as np
 import torch
@@ -106,7 +106,13 @@ def group_triangles(mesh: LightmappedMesh, profile: Profile, stages: Stages) -> 
 
 
 def fit_cascade(
-    mesh: LightmappedMesh, clusters: Clusters | None, profile: Profile, seed: int, stages: Stages
+    mesh: LightmappedMesh,
+    clusters: Clusters | None,
+    profile: Profile,
+    seed: int,
+    stages: Stages,
+    *,
+    repack: bool = True,
 ) -> AtlasModel:
     """Compresses a lightmap whose triangles are grouped.
 
@@ -116,33 +122,37 @@ def fit_cascade(
         profile: The settings.
         seed: Seed of the cameras or points.
         stages: Reports and times the stages.
+        repack: Whether charts are packed anew (section 3.3.1). Else the mesh keeps its UVs, the cascade begins as the
+            lightmap itself, and neither `clusters` nor the profile's `scale` counts (section 4.5.2).
 
     Returns:
-        A model of method "cascade", or "plain" where `lut_scale` is 0: T_p alone, under the new UVs.
+        A model of method "cascade", or "plain" where `lut_scale` is 0: T_p alone, under the same UVs.
 
     Raises:
         WlmError: As `pack` and `tune`; or a package for the blocks of T_p is missing.
     """
-    with stages("pack"):
-        packed = pack(mesh, clusters, profile.scale)
-        packed = replace(packed, uv=snapped(packed.uv))  # what the file holds is what is tuned
-    with stages("regenerate"):
-        start = initial(*regenerate(mesh, packed, stages.device), profile)
+    count, facts = len(mesh.triangle), {}
+    # What the file holds is what is tuned: snapped.
+    if repack:
+        with stages("pack"):
+            packed = pack(mesh, clusters, profile.scale)
+            uv = snapped(packed.uv)
+        with stages("regenerate"):
+            start = initial(*regenerate(mesh, packed, stages.device), profile)
+        shares = np.bincount(packed.source[packed.source >= 0], minlength=count)
+        facts = {
+            "groups": int(np.count_nonzero(shares)),
+            "shared": int(shares[shares > 1].sum()),
+            "charts": len(packed.to_lightmap),
+            "packed": [packed.height, packed.width],
+        }
+    else:
+        uv, start = snapped(mesh.uv[mesh.triangle].astype(np.float32)), initial(mesh.lightmap, mesh.mask, profile)
     with stages("fit"):
         options = {"device": stages.device, "progress": stages.progress, "checkpoint": stages.checkpoint}
-        textures = tune(mesh, packed.uv, start, profile, seed=seed, **options)
+        textures = tune(mesh, uv, start, profile, seed=seed, **options)
     with stages("write"):
         stored = quantise(textures.colour, profile.colour)
-    count = len(mesh.triangle)
-    shares = np.bincount(packed.source[packed.source >= 0], minlength=count)
-    report = {
-        "triangles": count,
-        "groups": int(np.count_nonzero(shares)),
-        "shared": int(shares[shares > 1].sum()),
-        "charts": len(packed.to_lightmap),
-        "packed": [packed.height, packed.width],
-        "steps": profile.steps,
-    }
     return AtlasModel(
         name=mesh.name,
         source=mesh.source,
@@ -153,8 +163,8 @@ def fit_cascade(
         width=mesh.mask.shape[1],
         **stored,
         lut=np.rint(textures.lut * LUT_STEPS).astype(np.uint16),
-        uv=packed.uv,
-        report=report,
+        uv=uv,
+        report={"triangles": count, **facts, "steps": profile.steps},
     )
 
 

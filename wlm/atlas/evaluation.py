@@ -159,7 +159,7 @@ def evaluate(
         WlmError: There is no such device.
     """
     decoder = Decoder(model, device)
-    labels = {"model": _chart_labels(model, mesh, decoder.device)} if len(model.uv) else {}
+    labels = {"model": chart_labels(model, mesh, decoder.device)} if len(model.uv) else {}
     options = {"views": views, "resolution": resolution, "device": device, "progress": progress}
     score = compare(mesh, {"model": decoder}, labels=labels, **options)["model"]
     size = model.file_bytes() if file_bytes is None else file_bytes
@@ -248,8 +248,14 @@ def compare(
     return {name: tally.score(facts, texel_errors[name], inside) for name, tally in tallies.items()}
 
 
-def _chart_labels(model: AtlasModel, mesh: LightmappedMesh, device: str) -> Sampler:
-    """Numbers of the charts of a model's new UVs."""
+def chart_labels(model: AtlasModel, mesh: LightmappedMesh, device: str) -> Sampler:
+    """Numbers of the charts of a model's own UVs, as `compare` takes labels.
+
+    Args:
+        model: A model with `uv`.
+        mesh: The mesh that was compressed.
+        device: "cpu" or "cuda:N", where the points will be.
+    """
     corner = np.arange(3 * len(model.uv)).reshape(-1, 3)
     corner = welded(mesh.position[mesh.triangle].reshape(-1, 3), model.uv.reshape(-1, 2), corner)
     number = torch.from_numpy(charts(corner)).to(device)

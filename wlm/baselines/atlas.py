@@ -14,7 +14,6 @@ reading, 1.5 dB above Lanczos and 2.0 dB above a box filter; so it is `downsampl
 """
 
 import functools
-import math
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -23,22 +22,20 @@ import numpy as np
 import torch
 
 from wlm.atlas.colour import quantise
-from wlm.atlas.coverage import touched_texels
 from wlm.atlas.data import LightmappedMesh
 from wlm.atlas.evaluation import Score, compare
 from wlm.atlas.model import COLOUR_BITS, SOURCE_BITS, TEXELS, AtlasModel
 from wlm.atlas.resize import FILTERS, resize
+from wlm.baselines.atlas_carving import carving
+from wlm.baselines.atlas_colours import single_colour
+from wlm.baselines.atlas_share import budget_bits, read_blocks
 from wlm.baselines.rival import Rival
 from wlm.formats import hdr_blocks
 from wlm.ops import raster
-from wlm.texels import fill_gaps
 
 _BLOCK_BITS = 128
 _BC6H = (4, 4)
 _EXTRA = "baselines"
-_BISECTIONS = 24
-_LEAST_LIMIT = 1e-6
-_SAMPLES_AT_ONCE = 1 << 20
 
 
 def share_of(rival: Rival, mesh: LightmappedMesh) -> float:
@@ -128,75 +125,12 @@ def best_astc(mesh: LightmappedMesh, share: float) -> Rival:
     return block_codec(mesh, share, f"astc{w}x{h}")
 
 
-def single_colour(mesh: LightmappedMesh, share: float | None = None, threshold: float = 0.01) -> Rival:
-    """Triangles of nearly one colour become one texel each, the same for all that are nearly alike; others stay.
-
-    After Luo et al. 2023, as section 4.3 describes it, with a packer better than any: a triangle that stays costs the
-    texels that it touches, without gaps or borders, and is read without any loss but rounding to half.
-
-    Args:
-        mesh: The mesh and its lightmap.
-        share: The budget, which the smallest threshold that keeps within it is searched for; None: no budget.
-        threshold: Without a budget: how far a triangle's colours may be from their middle in any channel, as a share of
-            the charts' range. A shared colour may be as far again from a triangle's own.
-
-    Raises:
-        ValueError: A negative threshold, or a share that has no room for one texel.
-    """
-    if not threshold >= 0.0:
-        raise ValueError(f"threshold: expected at least 0, got {threshold}")
-    start = time.perf_counter()
-    filled = fill_gaps(mesh.lightmap, mesh.mask)
-    low, high = _colour_range(mesh, torch.tensor(filled))
-    spread = np.where(mesh.active, ((high - low) / 2.0).max(axis=1), 0.0)
-
-    def merged(limit: float) -> tuple[np.ndarray, np.ndarray, int]:
-        """For a limit: the colour's number of each triangle, -1 for none; the colours; texels in all."""
-        flat = np.flatnonzero(mesh.active & (spread <= limit))
-        middle = (low[flat] + high[flat]) / 2.0
-        cell = np.floor(middle / (2.0 * limit)) if limit > 0.0 else middle
-        number = np.full(len(spread), -1)
-        number[flat] = np.unique(cell, axis=0, return_inverse=True)[1].reshape(-1)
-        count = int(number.max()) + 1
-        colour_low, colour_high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
-        np.minimum.at(colour_low, number[flat], middle)
-        np.maximum.at(colour_high, number[flat], middle)
-        touched = touched_texels(mesh.uv, mesh.triangle[mesh.active & (number < 0)], *mesh.mask.shape)
-        return number, (colour_low + colour_high) / 2.0, count + np.count_nonzero(touched)
-
-    if share is None:
-        merging = merged(threshold * float(np.ptp(mesh.lightmap[mesh.mask])))
-    else:
-        room = _budget(mesh, share) // SOURCE_BITS
-        if room == 0:
-            raise ValueError(f"share: {share} of {mesh.mask.size} texels has no room for one")
-        merging = _within(merged, float(spread.max()), room)
-    number, colours, texels = merging
-    image = filled.astype(np.float16).astype(np.float32)
-    palette = np.concatenate([colours.astype(np.float16), np.zeros((1, 3))]).astype(np.float32)
-
-    def sample(uv: torch.Tensor, triangle: torch.Tensor, barycentric: torch.Tensor) -> torch.Tensor:
-        device = uv.device
-        colour = torch.tensor(number, device=device)[triangle.long()]
-        read = raster.texture(torch.tensor(image, device=device), uv)
-        return torch.where(colour[:, None] >= 0, torch.tensor(palette, device=device)[colour], read)
-
-    return Rival("single colour", texels * SOURCE_BITS // 8, time.perf_counter() - start, None, sample)
-
-
-def _budget(mesh: LightmappedMesh, share: float) -> int:
-    """The bits of a share."""
-    if not 0.0 < share < math.inf:
-        raise ValueError(f"share: expected above 0, got {share}")
-    return int(share * mesh.mask.size * SOURCE_BITS)
-
-
 def _fitting_size(
     mesh: LightmappedMesh, share: float, block: tuple[int, int], bits: int
 ) -> tuple[tuple[int, int], int]:
     """A large size of the lightmap's shape, up to its own, whose blocks (width, height) that charts read are within the
     budget; and the number of these blocks."""
-    most = _budget(mesh, share) // bits
+    most = budget_bits(mesh, share) // bits
     longest = max(mesh.mask.shape)
 
     def size(side: int) -> tuple[int, int]:
@@ -219,54 +153,7 @@ def _fitting_size(
 def _read_blocks(mesh: LightmappedMesh, size: tuple[int, int], block: tuple[int, int]) -> int:
     """How many blocks (width, height) of a texture of a size are read at the centres of the charts' texels."""
     place = np.argwhere(mesh.mask) + 0.5
-    place = place * (np.array(size) / mesh.mask.shape) - 0.5
-    low = np.floor(place).astype(np.int64)
-    # At the texture's own size a place is a texel's centre, and nothing else is read.
-    near, last, side = (low, np.minimum(low + (place > low), np.array(size) - 1), np.array(block[::-1]))
-    read = np.zeros([-(-count // each) for count, each in zip(size, side, strict=True)], bool)
-    for y in (near[:, 0], last[:, 0]):
-        for x in (near[:, 1], last[:, 1]):
-            read[np.maximum(y, 0) // side[0], np.maximum(x, 0) // side[1]] = True
-    return int(np.count_nonzero(read))
-
-
-def _within(merged: Callable, spread: float, texels: int) -> tuple[np.ndarray, np.ndarray, int]:
-    """The merging at the smallest limit whose texels are few enough; at least one is."""
-    best = merged(0.0)
-    if best[2] <= texels:
-        return best
-    # Once all triangles count as flat, ever larger limits merge their colours, at last to one.
-    low, high = 0.0, max(spread, _LEAST_LIMIT)
-    while (best := merged(high))[2] > texels:
-        low, high = high, 2.0 * high
-    for _ in range(_BISECTIONS):
-        limit = (low + high) / 2.0
-        merging = merged(limit)
-        if merging[2] <= texels:
-            best, high = merging, limit
-        else:
-            low = limit
-    return best
-
-
-def _colour_range(mesh: LightmappedMesh, image: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
-    """Least and largest colours of each triangle, float64 [F, 3], read at points that are a texel or less apart."""
-    height, width = mesh.mask.shape
-    corner = mesh.uv[mesh.triangle]
-    edge = (corner - np.roll(corner, 1, axis=1)) * [width, height]
-    longest = np.hypot(edge[..., 0], edge[..., 1]).max(axis=1)
-    parts = 1 << np.ceil(np.log2(np.maximum(longest, 1.0))).astype(np.int64)
-    low, high = np.empty((len(corner), 3)), np.empty((len(corner), 3))
-    for count in np.unique(parts):
-        i, j = np.meshgrid(np.arange(count + 1), np.arange(count + 1), indexing="ij")
-        i, j = i[i + j <= count] / count, j[i + j <= count] / count
-        weight = np.stack([i, j, 1.0 - i - j], axis=1)
-        members = np.flatnonzero(parts == count)
-        for piece in np.array_split(members, math.ceil(len(members) * len(weight) / _SAMPLES_AT_ONCE)):
-            uv = torch.tensor(np.einsum("sk,fkc->fsc", weight, corner[piece]), dtype=torch.float32)
-            colour = raster.texture(image, uv).numpy()
-            low[piece], high[piece] = colour.min(axis=1), colour.max(axis=1)
-    return low, high
+    return read_blocks(place * (np.array(size) / mesh.mask.shape) - 0.5, size, block)
 
 
 def _texture(name: str, texels: np.ndarray, bytes: int, start: float) -> Rival:
@@ -287,6 +174,9 @@ RIVALS: dict[str, Callable[[LightmappedMesh, float], Rival]] = {
         for name in ("bc6h", "bc6h own", "astc4x4", "astc6x6", "astc8x8")
     },
     "astc": best_astc,
-    "single colour": single_colour,
+    "carving": carving,
 }
 """By name: a mesh and a share to the rival."""
+
+OWN_SIZE: dict[str, Callable[[LightmappedMesh], Rival]] = {"single colour": single_colour}
+"""By name, those that have no budget: a mesh to the rival."""

@@ -1,4 +1,4 @@
-"""The atlas system against smaller lightmaps, block codecs and single-colour merging: size, speed and error.
+"""The atlas system against smaller and carved lightmaps, block codecs and single-colour merging: size, speed and error.
 
 For each lightmap of each mesh these kinds of rows:
 
@@ -7,8 +7,8 @@ For each lightmap of each mesh these kinds of rows:
   bits that the paper's method came to, and at CRs of 92.5% and 95%.
 - method "lightmap": the time to read the same points from the lightmap itself, in half floats.
 - the rivals of `wlm.baselines.atlas` at the bits of the first profile; in a full run also at those of the others.
-  Bits are those of eq. 9 of lightmap-uv-clustering-cascade, which leave out UVs and headers; a rival's bytes are these
-  bits alone, it has no file.
+  Single-colour merging has a size of its own instead, as in table 1 of lightmap-uv-clustering-cascade. Bits are those
+  of its eq. 9, which leave out UVs and headers; a rival's bytes are these bits alone, it has no file.
 - method "fit", of the first lightmap alone: the cascade tuned in views, as the paper does it, and at points of the
   surface; the time is that of the tuning alone.
 
@@ -23,6 +23,7 @@ import math
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from statistics import fmean
 
 import numpy as np
@@ -37,7 +38,8 @@ from wlm.atlas.exact import decode64
 from wlm.atlas.fit import compress
 from wlm.atlas.model import SOURCE_BITS, AtlasModel, Profile
 from wlm.atlas.views import surface_points
-from wlm.baselines.atlas import RIVALS, share_of
+from wlm.baselines.atlas import OWN_SIZE, RIVALS, share_of
+from wlm.baselines.rival import Rival
 from wlm.bench.atlas_inputs import Lightmap
 from wlm.bench.plot import Panel
 from wlm.bench.rows import MEAN, Row, read_json
@@ -54,18 +56,22 @@ _RIVALS = {
     "BC6H": "bc6h",
     "BC6H, our encoder": "bc6h own",
     "ASTC": "astc",
-    "single colour": "single colour",
+    "carving": "carving",
 }
+_METHODS = (*_RIVALS, *OWN_SIZE)
+_OWN = "its own size"  # the option of those without a budget
 _SMALLER = (0.925, 0.95)  # CRs that the first profile is measured at too
 _HELD_TO = ("standard", "standard, CR 92.5%", "standard, CR 95%", "astc")  # whose bits rivals get when they run alone
 _FIRST = "downsampling"  # what everything is compared with
-_VIEWS, _RESOLUTION = 50, 512  # section 4.1.4; the paper doesn't say at which resolution it scores
-_QUICK_VIEWS, _QUICK_RESOLUTION = 8, 256
+VIEWS, RESOLUTION = 50, 512  # section 4.1.4; the paper doesn't say at which resolution it scores
+QUICK_VIEWS, QUICK_RESOLUTION = 8, 256
 _QUICK_CASCADE = {"steps": 30, "resolution": 256}
 _POINTS = 1_000_000
 _CHECKED = 1 << 17  # of them, against float64
 _SAME = 0.01  # shares of bits that differ by less are equal
-_SCORES = ("psnr", "psnr_worst", "texel_psnr", "tone_psnr", "one_minus_ssim", "flip", "seam_ratio")
+SCORES = ("psnr", "psnr_worst", "texel_psnr", "tone_psnr", "one_minus_ssim", "flip", "seam_ratio")
+"""Figures of a row that are those of a `Score`."""
+
 _RANGED = ("psnr", "texel_psnr", "tone_psnr", "one_minus_ssim", "flip", "seam_ratio")  # with their least and most
 _AVERAGED = ("bytes", "bpp", "compression_ratio", "encode_seconds", "decode_ms", *_RANGED)
 
@@ -91,8 +97,8 @@ def run(
         quick: 8 small views instead of 50, the cascade tuned for a few steps, rivals at one size: under 90 seconds on
             two CPU cores with the demo's mesh. The cascade's error is that of an unfinished fit.
         device: "cpu" or "cuda:0", for compressions, views and decodes; the rivals are compressed on the CPU.
-        rivals: With the block codecs and single-colour merging, which take minutes on the CPU: `run_rivals` has them
-            alone. Downsampling is always there.
+        rivals: With block codecs, carving and single-colour merging, which take minutes on the CPU: `run_rivals` has
+            them alone. Downsampling is always there.
         progress: Called with a line before each part of the work.
 
     Returns:
@@ -108,10 +114,10 @@ def run(
         lightmaps,
         profiles,
         device=interop.check_device(device),
-        views=_QUICK_VIEWS if quick else _VIEWS,
-        resolution=_QUICK_RESOLUTION if quick else _RESOLUTION,
+        views=QUICK_VIEWS if quick else VIEWS,
+        resolution=QUICK_RESOLUTION if quick else RESOLUTION,
         whole=not quick,
-        methods=tuple(_RIVALS) if rivals else (_FIRST,),
+        methods=_METHODS if rivals else (_FIRST,),
         progress=progress,
     )
 
@@ -143,8 +149,8 @@ def run_rivals(
         if not shares:
             raise WlmError(f"{results}: expected a row of method ours of {lightmap.scene}")
         bench = _AtlasBench(lightmap, "cpu", progress, 1)
-        rows += bench.scored(bench.rivals(shares, tuple(_RIVALS)), _VIEWS, _RESOLUTION)
-    return rows + _means(rows, len(lightmaps))
+        rows += bench.scored(bench.rivals(shares, _METHODS), VIEWS, RESOLUTION)
+    return rows + means(rows, len(lightmaps))
 
 
 def run_rows(
@@ -155,7 +161,7 @@ def run_rows(
     views: int,
     resolution: int,
     whole: bool,
-    methods: Sequence[str] = tuple(_RIVALS),
+    methods: Sequence[str] = _METHODS,
     points: int = _POINTS,
     repeats: int | None = None,
     progress: Note | None = None,
@@ -176,7 +182,7 @@ def run_rows(
         raise ValueError("expected at least one lightmap and one profile")
     (progress or (lambda line: None))("compiling")
     for profile in profiles:
-        _warm_up(profile, device)
+        warm_up(profile, device)
     rows: list[Row] = []
     for lightmap in lightmaps:
         bench = _AtlasBench(lightmap, device, progress, points, repeats)
@@ -189,7 +195,7 @@ def run_rows(
         entries = bench.timed(entries)
         entries += bench.rivals(shares if whole else {profiles[0].name: shares[profiles[0].name]}, methods)
         rows += bench.scored(entries, views, resolution)
-    return rows + _means(rows, len(lightmaps))
+    return rows + means(rows, len(lightmaps))
 
 
 def plotted(rows: Sequence[Row]) -> list[Row]:
@@ -321,7 +327,7 @@ class _AtlasBench(Bench):
         return [replace(entry, row=timed.get(id(entry), entry.row)) for entry in entries]
 
     def rivals(self, shares: dict[str, float], methods: Sequence[str]) -> list[_Entry]:
-        """The rivals at the bits of our profiles.
+        """The rivals at the bits of our profiles, and those of a size of their own.
 
         One that holds the whole lightmap in fewer bits isn't measured twice.
 
@@ -334,19 +340,22 @@ class _AtlasBench(Bench):
             if any(abs(share / other - 1.0) < _SAME for other in measured):
                 continue
             measured.append(share)
-            for method in methods:
+            for method in (name for name in methods if name in _RIVALS):
                 if enough.get(method, math.inf) > share:
-                    self.note(f"{method}, bits of {profile}")
-                    entries.append(self._rival(method, f"bits of {profile}", share))
+                    make = partial(RIVALS[_RIVALS[method]], self.mesh, share)
+                    entries.append(self._rival(method, f"bits of {profile}", make))
                     row = entries[-1].row
                     # ASTC has other blocks for other budgets.
                     if (row.get("colour_height"), row.get("colour_width")) == self.mesh.mask.shape and method != "ASTC":
                         enough[method] = _share(row)
+        for method in (name for name in methods if name in OWN_SIZE):
+            entries.append(self._rival(method, _OWN, partial(OWN_SIZE[method], self.mesh)))
         return entries
 
-    def _rival(self, method: str, option: str, share: float) -> _Entry:
+    def _rival(self, method: str, option: str, make: Callable[[], Rival]) -> _Entry:
+        self.note(f"{method}, {option}")
         try:
-            rival = RIVALS[_RIVALS[method]](self.mesh, share)
+            rival = make()
         except (WlmError, ValueError) as error:  # a package is missing, or nothing fits
             return _Entry(self.missing_row(method, option, error))
         share = share_of(rival, self.mesh)
@@ -371,7 +380,7 @@ class _AtlasBench(Bench):
         reports = compare(self.mesh, decoders, views=views, resolution=resolution, device=self.device)
         rows = [entry.row for entry in entries]
         for i, report in reports.items():
-            rows[int(i)] = rows[int(i)].with_figures(**{name: getattr(report, name) for name in _SCORES})
+            rows[int(i)] = rows[int(i)].with_figures(**{name: getattr(report, name) for name in SCORES})
         return rows
 
     def _decode(self, model: AtlasModel) -> tuple[Callable[[], object], dict[str, float]]:
@@ -387,13 +396,19 @@ class _AtlasBench(Bench):
         return self.replay(lambda: decoder.run(points, out)), errors
 
 
-def _means(rows: Sequence[Row], lightmaps: int) -> list[Row]:
-    """A row for each method and option that was measured on more than one lightmap."""
+def means(rows: Sequence[Row], lightmaps: int, of: str = "") -> list[Row]:
+    """Makes a row for each method and option that was measured on more than one lightmap.
+
+    Args:
+        rows: Those of each lightmap.
+        lightmaps: How many there are.
+        of: What their scene says besides.
+    """
     groups: dict[tuple[str, str], list[Row]] = {}
     for row in rows:
         if row.figures and row.method != "fit":
             groups.setdefault((row.method, row.option), []).append(row)
-    means = []
+    made = []
     for (method, option), group in groups.items():
         if len(group) < 2:
             continue
@@ -405,12 +420,12 @@ def _means(rows: Sequence[Row], lightmaps: int) -> list[Row]:
                     figures |= {f"{name}_min": min(values), f"{name}_max": max(values)}
         figures["max_error"] = max((row["max_error"] for row in group if "max_error" in row.figures), default=None)
         figures["lightmaps"] = len(group)
-        means.append(Row("atlas", f"{MEAN} {lightmaps} lightmaps", method, option, figures))
-    return means
+        made.append(Row("atlas", f"{MEAN} {lightmaps} lightmaps{of}", method, option, figures))
+    return made
 
 
-def _warm_up(profile: Profile, device: str) -> None:
-    """Compiles what a compression and a decode need, on a square of 32 texels a side."""
+def warm_up(profile: Profile, device: str) -> None:
+    """Compiles what a compression by a profile and a decode need on a device, with a square of 32 texels a side."""
     side = np.linspace(0.1, 1.0, 32)
     image = np.stack([np.outer(side, side), np.outer(side, side[::-1]), np.outer(side, side) ** 2], -1)
     uv = np.array([[0, 0], [1, 0], [0, 1], [1, 1]], float)

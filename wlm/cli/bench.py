@@ -47,6 +47,21 @@ _RivalsAt = Annotated[
     ),
 ]
 
+_Meshes = Annotated[
+    Path | None,
+    typer.Option(
+        "--meshes",
+        metavar="DIR",
+        help="A folder of folders, each with a .glb, its lightmaps .exr and maybe mask.png; default the demo's.",
+    ),
+]
+_Mesh = Annotated[Path | None, typer.Option("--mesh", metavar="FILE", help="Instead, one mesh: .glb, .gltf or .obj.")]
+_Lightmaps = Annotated[
+    list[Path] | None,
+    typer.Option("--lightmap", metavar="FILE.exr", help="A lightmap of it; may be given several times."),
+]
+_Mask = Annotated[Path | None, typer.Option("--mask", metavar="FILE.png", help="Their mask.")]
+
 
 @app.command()
 def lightmap(
@@ -152,22 +167,10 @@ def probe(
 def atlas(
     quick: _Quick = False,
     device: Device = "cpu",
-    meshes_path: Annotated[
-        Path | None,
-        typer.Option(
-            "--meshes",
-            metavar="DIR",
-            help="A folder of folders, each with a .glb, its lightmaps .exr and maybe mask.png; default the demo's.",
-        ),
-    ] = None,
-    mesh_path: Annotated[
-        Path | None, typer.Option("--mesh", metavar="FILE", help="Instead, one mesh: .glb, .gltf or .obj.")
-    ] = None,
-    lightmap_paths: Annotated[
-        list[Path] | None,
-        typer.Option("--lightmap", metavar="FILE.exr", help="A lightmap of it; may be given several times."),
-    ] = None,
-    mask_path: Annotated[Path | None, typer.Option("--mask", metavar="FILE.png", help="Their mask.")] = None,
+    meshes_path: _Meshes = None,
+    mesh_path: _Mesh = None,
+    lightmap_paths: _Lightmaps = None,
+    mask_path: _Mask = None,
     profiles: _Profiles = None,
     rivals: _Rivals = True,
     rivals_at: _RivalsAt = None,
@@ -193,6 +196,39 @@ def atlas(
         rows = run(lightmaps, profiles or (), quick=quick, device=device, rivals=rivals, progress=note)
         command = _command("atlas", quick=quick, no_rivals=not rivals, device=device, **files, profile=profiles)
     _finish(rows, command, device, json_path, plot_path, PANELS, [*plotted(beside), *plotted(rows)], baseline)
+
+
+@app.command("atlas-ablation")
+def atlas_ablation(
+    profile: Annotated[
+        str,
+        typer.Option(metavar="NAME", help="A profile of the cascade, or a YAML file, that is changed."),
+    ] = "paper",
+    quick: Annotated[bool, typer.Option("--quick", help="Short fits, for minutes on a CPU; else for a GPU.")] = False,
+    device: Device = "cpu",
+    meshes_path: _Meshes = None,
+    mesh_path: _Mesh = None,
+    lightmap_paths: _Lightmaps = None,
+    mask_path: _Mask = None,
+    steps: Annotated[int | None, typer.Option(min=1, help="Of each fit; default the profile's.")] = None,
+    only: Annotated[
+        list[str] | None, typer.Option("--only", metavar="ROW", help="A row by its name; default all. Several times.")
+    ] = None,
+    json_path: _RowsFile = None,
+    baseline: _Baseline = None,
+) -> None:
+    """Lightmaps of meshes: the cascade without its parts, and at other sizes of its textures."""
+    device = _prepare(device, json_path, None, baseline)
+    from wlm.bench.atlas_ablation import run
+    from wlm.bench.atlas_inputs import load
+
+    lightmaps = load(meshes_path, mesh_path, lightmap_paths or (), mask_path)
+    files = {"meshes": meshes_path, "mesh": mesh_path, "lightmap": lightmap_paths, "mask": mask_path}
+    options = {"quick": quick, "profile": Path(profile).name, "device": device, **files, "steps": steps, "only": only}
+    command = _command("atlas-ablation", **options)
+    write = _writer(device, command, json_path, bool(only))
+    rows = run(lightmaps, profile, only or (), quick=quick, device=device, steps=steps, progress=note, done=write)
+    _finish(rows, command, device, json_path, None, baseline=baseline, partial=bool(only))
 
 
 @app.command()
@@ -331,13 +367,15 @@ def _command(name: str, **options: object) -> str:
     return " ".join(words)
 
 
-def _writer(device: str, command: str, json_path: Path | None) -> "Callable[[Sequence[Row]], None]":
+def _writer(
+    device: str, command: str, json_path: Path | None, partial: bool = False
+) -> "Callable[[Sequence[Row]], None]":
     """Writes the rows so far, which take minutes each: those that are done outlive a stop."""
     from wlm.bench import describe_environment, write_json
 
     def write(rows: "Sequence[Row]") -> None:
         if json_path is not None:
-            write_json(json_path, rows, describe_environment(device, command))
+            write_json(json_path, rows, describe_environment(device, command), partial=partial)
 
     return write
 
