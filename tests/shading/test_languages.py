@@ -3,6 +3,7 @@
 import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -106,18 +107,28 @@ def atlas(kind, _) -> Subject:
     return Subject(atlas_glsl(model), main, decode64(model, uv)[None], bound, "WLM_ATLAS_EXACT", 3e-4, filtered)
 
 
-def mips(_) -> Subject:
-    """The light of the tiles where a pixel is small, of the tail where it is large, in between of both."""
-    near = atlas(MIXED, None)
-    model = replace(random_atlas(charts(), MIXED), tail=np.zeros((1, 16), np.uint8))
-    size = np.array([[model.width // 4, model.height // 4]]) * 4
+def mips(kind, _) -> Subject:
+    """The light of the model where a pixel is small, of the tail where it is large, in between of both.
+
+    The tail has a margin, and rises along u where the lightmap is.
+    """
+    near = atlas(kind, None)
+    model = replace(random_atlas(charts(), kind), tail=np.zeros((1, 16), np.uint8))
     texels = np.array([0.0, 2.0**1.5, 8.0])[np.arange(near.expected.shape[1]) % 3]  # along a pixel
-    near.bound["u_change"] = points_of(np.stack([texels / size[0, 0], 0 * texels], 1))
-    near.bound["wlm_atlas_tail"] = np.full((model.height // 4, model.width // 4, 4), 0.5, np.float16)
+    near.bound["u_change"] = points_of(np.stack([texels / model.width, 0 * texels], 1))
+    rows, columns = -(-model.height // 16) * 4 + 4, -(-model.width // 16) * 4 + 4
+    tail = np.zeros((rows, columns, 4), np.float16)
+    tail[:] = (np.arange(columns) / columns)[None, :, None]
+    near.bound["wlm_atlas_tail"] = tail
+    points = near.bound["u_points"][0, :, :2]
+    place = points[:, 0].astype(np.float64) * model.width / 4 - 0.5
+    far = (np.clip(place, 0, columns - 1) / columns)[:, None]
     place = "texelFetch(u_points, pixel, 0).xy, texelFetch(u_change, pixel, 0).xy, vec2(0.0)"
+    if len(model.uv):
+        place = f"vec2(texelFetch(u_points, pixel, 0).xy), {place}"
     main = f"vec4 shown(ivec2 pixel) {{ return vec4(wlm_atlas_grad({place}), 1.0); }}\n"
     share = np.clip(np.log2(np.maximum(texels, 1.0)) - 1.0, 0.0, 1.0)[:, None]
-    expected = (1.0 - share) * near.expected + share * 0.5
+    expected = (1.0 - share) * near.expected + share * far
     return replace(near, text=atlas_glsl(model), main=f"{POINTS}uniform sampler2D u_change;\n{main}", expected=expected)
 
 
@@ -273,7 +284,8 @@ SUBJECTS: dict[str, Callable[..., Subject]] = {
     "lightmap": lambda folder: lightmap((4, 3, 2, 1), folder),
     "lightmap of video": lambda folder: lightmap((5, 3, 5, 0), folder, gelu="exact", period=None, hidden=10),
     **{f"atlas {kind}": lambda folder, kind=kind: atlas(kind, folder) for kind in (*KINDS, MIXED)},
-    "atlas mips": mips,
+    "atlas mips": partial(mips, MIXED),
+    "cascade mips": partial(mips, "cascade"),
     "scene": scene,
     **{f"smoke {layout}": lambda folder, layout=layout: smoke(layout, folder) for layout in LAYOUTS},
     "volume": volume,
