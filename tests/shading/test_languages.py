@@ -18,9 +18,9 @@ from builders.synthetic import random_model as random_lightmap
 
 from wlm import probe
 from wlm.atlas.exact import decode64
-from wlm.atlas.model import pack_entries
 from wlm.atlas.scene.decode import Decoder as SceneDecoder
-from wlm.atlas.scene.model import SceneModel, SceneProfile, SheetPlace
+from wlm.atlas.scene.exporter import factor_texels, sheet_texels
+from wlm.atlas.scene.model import SceneModel, SceneProfile, SheetPlace, pack_tiles
 from wlm.atlas.scene.shader import scene_glsl
 from wlm.atlas.shader import atlas_glsl
 from wlm.errors import WlmError
@@ -136,37 +136,43 @@ def rgba(texels: np.ndarray) -> np.ndarray:
     return np.pad(texels.astype(np.float16), ((0, 0), (0, 0), (0, 1)))
 
 
-def scene(_) -> Subject:
+def random_scene() -> SceneModel:
+    """Two sheets, the first with two smaller levels, on two pages; tiles of up to three components, one of none."""
     random = np.random.default_rng(1)
-    texels = pack_rgb9e5(random.random((4 * 20, 24, 3)).astype(np.float32)).reshape(4, 20, 24)
-    size = random.integers(1, 8, (9, 11, 2))
-    first = random.integers(0, np.array([24, 20]) - size + 1)
-    lut = pack_entries(first, size)
-    sheets = (SheetPlace("a", 29, 36, 0, 0, 5, 6, 0), SheetPlace("b", 22, 29, 5, 4, 4, 5, 1))
-    factor = random.random((3, 2, 3)).astype(np.float32)
-    model = SceneModel("s", "0" * 16, SceneProfile(name="s"), ("a", "b", "c"), sheets, factor, texels, lut)
-    decoder, number = SceneDecoder(model), random.integers(0, 2, 500)
-    uv = random.uniform(-0.05, 1.05, (500, 2)).astype(np.float32)
-    expected = decoder.read(torch.from_numpy(uv), torch.from_numpy(number), 1.25).numpy()
-    calls = [
-        f"wlm_scene(at.xy, vec2({s.width}.0, {s.height}.0), ivec2({s.column}, {s.row}), ivec2({s.columns}, {s.rows}), "
-        f"{s.page})"
-        for s in sheets
-    ]
+    texels = pack_rgb9e5(random.random((2 * 20, 24, 3)).astype(np.float32)).reshape(2, 20, 24)
+    size = random.integers(1, 8, (13, 11, 2))
+    count = np.minimum(random.integers(0, 4, (13, 11)), 24 // size[..., 0])
+    first = random.integers(0, np.array([24, 20]) - size * np.stack([np.maximum(count, 1), np.ones_like(count)], 2) + 1)
+    lut = pack_tiles(first, size, random.integers(0, 6, (13, 11)), count, random.integers(0, 2, (13, 11)))
+    sheets = (SheetPlace("a", 29, 36, 0, 0, 5, 6, 2), SheetPlace("b", 22, 29, 5, 4, 4, 5))
+    levels = (SheetPlace("a", 8, 9, 9, 0, 2, 2, 3), SheetPlace("a", 4, 4, 11, 0, 1, 1))
+    factor = random.uniform(-0.3, 1.0, (3, 8, 3)).astype(np.float32)
+    return SceneModel("s", "0" * 16, SceneProfile(name="s"), ("a", "b", "c"), sheets, factor, texels, lut, levels)
+
+
+def scene(_) -> Subject:
+    model, random = random_scene(), np.random.default_rng(2)
+    decoder, number = SceneDecoder(model), random.integers(0, 2, 600)
+    uv = random.uniform(-0.05, 1.05, (600, 2)).astype(np.float32)
+    texels = np.array([0.0, 1.0, 2.0**1.5, 2.0**2.25, 2.0**7])[random.integers(0, 5, 600)]  # along a pixel
+    lod = torch.from_numpy(np.log2(np.maximum(texels, 1.0)).astype(np.float32))
+    points = torch.from_numpy(uv), torch.from_numpy(number)
+    expected = decoder.read(*points, 1.25, lod).numpy()
     main = f"""{POINTS}vec4 shown(ivec2 pixel)
 {{
     vec4 at = texelFetch(u_points, pixel, 0);
-    if (at.z == 0.0)
-        return vec4({calls[0]}, 1.0);
-    return vec4({calls[1]}, 1.0);
+    if (at.w == 0.0)
+        return vec4(wlm_scene(at.xy, int(at.z), 1.25), 1.0);
+    return vec4(wlm_scene_grad(at.xy, vec2(0.0, at.w), vec2(0.0, 0.0), int(at.z), 1.25), 1.0);
 }}
 """
-    layers = np.stack([rgba(unpack_rgb9e5(layer)) for layer in texels])
+    heights = np.array([each.height for each in model.sheets])[number]
     bound = {
-        "u_points": points_of(np.column_stack([uv, number])),
-        "wlm_scene_lut": lut,
-        "wlm_scene_colour": layers,
-        "wlm_scene_factor": np.pad(decoder.factors(1.25), ((0, 0), (0, 1))),
+        "u_points": points_of(np.column_stack([uv, number, texels / heights])),
+        "wlm_scene_sheets": sheet_texels(model),
+        "wlm_scene_lut": model.lut,
+        "wlm_scene_factors": factor_texels(model),
+        "wlm_scene_colour": np.stack([rgba(unpack_rgb9e5(layer)) for layer in model.texels]),
     }
     return Subject(scene_glsl(model), main, expected[None], bound, "", 2 / 255 * expected.max())
 

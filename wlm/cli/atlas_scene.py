@@ -49,7 +49,9 @@ def compress_scene(
     rows.add_row("objects", f"{len(scene.objects):,}")
     rows.add_row("sheets", f"{len(scene.sheets):,}")
     rows.add_row("states", f"{len(scene.states):,}")
-    rows.add_row("components", f"{model.factor.shape[1]}")
+    counts = model.report["components"]
+    mean = sum(int(count) * tiles for count, tiles in counts.items()) / sum(counts.values())
+    rows.add_row("components of a tile", f"{mean:.1f} of {model.report['mixtures']} mixtures")
     rows.add_row("CR of all textures", f"{model.compression_ratio:.2%}")
     rows.add_row("seconds", f"{sum(model.report['seconds'].values()):.1f}")
     show(rows)

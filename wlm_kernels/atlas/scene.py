@@ -1,7 +1,7 @@
 """Reads light of a scene: one entry of the table that all sheets share, then a bilinear read of each component.
 
 As `wlm_kernels.atlas.decode`, but that a sheet's tiles begin at a place of their own in the table, that texels are
-packed as RGB9E5, and that light is a sum of components, each a layer of the texture, by the state's factors.
+packed as RGB9E5, and that light is a sum of components, rectangles beside each other, by the state's factors.
 
 Read `wlm/atlas/scene/exact.py` first: the same in float64 NumPy.
 """
@@ -14,12 +14,16 @@ from wlm_kernels.shared_exponent import unpack_rgb9e5
 wp.set_module_options({"enable_backward": False})
 
 _NO_BLOCKS = wp.constant(16)  # more than any size's code: no entry names blocks
+_SIDE_MASK = wp.constant(15)
+_COUNT_BITS = wp.constant(8)
+_COUNT_MASK = wp.constant(255)
 
 
 @wp.func
-def _mixed(texels: wp.array3d[wp.uint32], layer: int, row: int, x: Axis) -> wp.vec3:
-    """The light of a row between two texels."""
-    return wp.lerp(unpack_rgb9e5(texels[layer, row, x.low]), unpack_rgb9e5(texels[layer, row, x.high]), x.share)
+def _mixed(texels: wp.array3d[wp.uint32], page: int, row: int, column: int, x: Axis) -> wp.vec3:
+    """The light of a row between two texels, of the rectangle that begins so many columns on."""
+    near = unpack_rgb9e5(texels[page, row, column + x.low])
+    return wp.lerp(near, unpack_rgb9e5(texels[page, row, column + x.high]), x.share)
 
 
 @wp.kernel
@@ -29,7 +33,7 @@ def _read(
     sheet: wp.array1d[int],
     sheets: wp.array2d[int],  # [S, 7]
     size: int,
-    factor: wp.array1d[wp.vec3],  # [K]
+    factor: wp.array1d[wp.vec3],  # [C]
     lut: wp.array3d[wp.uint16],
     texels: wp.array3d[wp.uint32],
     # out:
@@ -45,13 +49,20 @@ def _read(
     column = sheets[s, 3] + int(across[0])
     x = axis_at(lut[row, column, 0], across[1], _NO_BLOCKS)
     y = axis_at(lut[row, column, 1], down[1], _NO_BLOCKS)
-    total = wp.vec3(0.0, 0.0, 0.0)
-    count = factor.shape[0]
-    for k in range(count):
-        layer = sheets[s, 6] * count + k
-        top = _mixed(texels, layer, y.low, x)
-        bottom = _mixed(texels, layer, y.high, x)
-        total += wp.cw_mul(factor[k], wp.lerp(top, bottom, y.share))
+    step = (int(lut[row, column, 0]) & _SIDE_MASK) + 1
+    first = int(lut[row, column, 2])
+    last = int(lut[row, column, 3])
+    page = last >> _COUNT_BITS
+    # 0 for a place, and NaN for none, where there is no component.
+    total = wp.vec3(0.0, 0.0, 0.0) * (across[1] + down[1])
+    for k in range(last & _COUNT_MASK):
+        top = _mixed(texels, page, y.low, k * step, x)
+        bottom = _mixed(texels, page, y.high, k * step, x)
+        total += wp.cw_mul(factor[first + k], wp.lerp(top, bottom, y.share))
+    # Factors have any sign.
+    for c in range(3):
+        if total[c] < 0.0:
+            total[c] = 0.0
     out[i] = total
 
 
@@ -60,13 +71,14 @@ def read(uv, sheet, sheets, size: int, factor, lut, texels, out) -> None:
 
     Args:
         uv: vec2 [N], u right, v down; clamped to [0, 1]. NaN reads NaN.
-        sheet: int [N], the sheet of each point.
+        sheet: int [N], the sheet or level of each point.
         sheets: int [S, 7]: rows and columns of texels; first row and column in the table; rows and columns of tiles;
-            page.
+            one number that isn't read.
         size: B, texels along a tile.
-        factor: vec3 [K], of each component.
-        lut: uint16 [ty, tx, 2], for x and y: first texel of the rectangle << 4 | number of its texels - 1.
-        texels: uint32 [pages K, Hp, Wp], RGB9E5; a page's components follow each other.
+        factor: vec3 [C], of each component.
+        lut: uint16 [ty, tx, 4], for x and y: first texel of the first component's rectangle << 4 | number of its texels
+            - 1; number of its factors; page << 8 | number of components.
+        texels: uint32 [pages, Hp, Wp], RGB9E5; the components of a tile follow each other along a row.
         out: vec3 [N], written.
     """
     wp.launch(_read, uv.shape, inputs=[uv, sheet, sheets, size, factor, lut, texels], outputs=[out], device=uv.device)

@@ -2,10 +2,11 @@
 
 scene.wlm                       the model in one file, see `codec`
 scene.glb                       the scene; `extras.wlm` of a node says which sheet it reads, and its rectangle
-lut.dds                         T_c
-colour_0.dds, colour_1.dds ...  the layers of T_p, RGB9E5
+sheets.dds, lut.dds             the sheets and their levels, and T_c
+factors.dds                     the components' factors, a row for each state
+colour_0.dds, colour_1.dds ...  the pages of T_p, RGB9E5
 scene.glsl                      a function that reads them
-report.json                     sheets, factors by state, settings, warnings, and where the inputs were
+report.json                     sheets, settings, warnings, and where the inputs were
 """
 
 import copy
@@ -32,7 +33,7 @@ from wlm.system import load, plain
 FORMAT = "wlm-atlas-scene"
 MODEL_FILE, SCENE_FILE, REPORT_FILE = "scene.wlm", "scene.glb", "report.json"
 _VERSION = 1
-_NAMES = re.compile(r"scene\.(wlm|glb|glsl)|lut\.dds|colour_\d+\.dds|report\.json")
+_NAMES = re.compile(r"scene\.(wlm|glb|glsl)|(lut|sheets|factors)\.dds|colour_\d+\.dds|report\.json")
 
 
 def export_scene(
@@ -72,7 +73,10 @@ def export_scene(
             write_glb(temporary / SCENE_FILE, dataclasses.replace(scene.document, content=content), [], 1)
         rows, columns = model.lut.shape[:2]
         lut = np.ascontiguousarray(model.lut, "<u2").tobytes()
-        write_dds(temporary / "lut.dds", lut, columns, rows, fmt="R16G16_UINT")
+        write_dds(temporary / "lut.dds", lut, columns, rows, fmt="R16G16B16A16_UINT")
+        sheets, factors = sheet_texels(model), factor_texels(model)
+        write_dds(temporary / "sheets.dds", sheets.tobytes(), *sheets.shape[1::-1], fmt="R16G16B16A16_UINT")
+        write_dds(temporary / "factors.dds", factors.tobytes(), *factors.shape[1::-1], fmt="R32G32B32A32_FLOAT")
         for number, layer in enumerate(model.texels):
             texels = np.ascontiguousarray(layer, "<u4").tobytes()
             write_dds(temporary / f"colour_{number}.dds", texels, *layer.shape[::-1], fmt="R9G9B9E5_SHAREDEXP")
@@ -83,9 +87,8 @@ def export_scene(
             "name": model.name,
             "source": model.source,
             "states": list(model.states),
-            "sheets": [dataclasses.asdict(sheet) for sheet in model.sheets],
+            "sheets": [dataclasses.asdict(sheet) for sheet in (*model.sheets, *model.levels)],
             "objects": [dataclasses.asdict(each) for each in scene.objects],
-            "factors": model.factor.tolist(),
             "cr": model.compression_ratio,
             "cr_disk": 1.0 - 8 * size / scene.source_bits,
             "profile": model.profile.model_dump(mode="json"),
@@ -97,6 +100,20 @@ def export_scene(
         names = sorted(path.name for path in temporary.iterdir())
         atomic_write(temporary / REPORT_FILE, (json.dumps(report, indent=1, allow_nan=False) + "\n").encode())
     return [folder / name for name in (*names, REPORT_FILE)]
+
+
+def sheet_texels(model: SceneModel) -> np.ndarray:
+    """The texture `sheets`, uint16 [S + levels, 2, 4]: texels and first entry, x before y; tiles, smaller level, 0."""
+    table = model.table()
+    texels = np.zeros((len(table), 2, 4), "<u2")
+    texels[:, 0] = table[:, [1, 0, 3, 2]]
+    texels[:, 1, :3] = table[:, [5, 4, 6]]
+    return texels
+
+
+def factor_texels(model: SceneModel) -> np.ndarray:
+    """The texture `factors`, float32 [M, C, 4]."""
+    return np.pad(model.factor.astype("<f4"), ((0, 0), (0, 0), (0, 1)))
 
 
 def is_scene(directory: str | os.PathLike[str]) -> bool:
