@@ -330,7 +330,13 @@ def info(
     """Say what a compressed lightmap holds, without decoding it."""
     quiet_warp()
     from wlm.atlas.exporter import describe
+    from wlm.atlas.scene.exporter import is_scene
 
+    if is_scene(path):
+        from wlm.cli.atlas_scene import show_scene
+
+        show_scene(path, as_json)
+        return
     facts = describe(path)
     if as_json:
         show_json(facts)

@@ -20,10 +20,12 @@ from typing import Any
 
 import numpy as np
 
+from wlm.atlas.model import SOURCE_BITS
 from wlm.atlas.scene.data import LightmappedScene
 from wlm.atlas.scene.model import SceneModel
 from wlm.atlas.scene.shader import scene_glsl
 from wlm.errors import WlmError
+from wlm.formats.artifact import read_artifact
 from wlm.formats.atomic import atomic_write
 from wlm.formats.dds import write_dds
 from wlm.formats.folder import UNFINISHED, read_index, staged
@@ -116,10 +118,49 @@ def factor_texels(model: SceneModel) -> np.ndarray:
     return np.pad(model.factor.astype("<f4"), ((0, 0), (0, 0), (0, 1)))
 
 
-def is_scene(directory: str | os.PathLike[str]) -> bool:
-    """Whether a folder is one that `export_scene` wrote."""
-    report = Path(directory) / REPORT_FILE
+def is_scene(path: str | os.PathLike[str]) -> bool:
+    """Whether a folder is one that `export_scene` wrote, or a file a scene's model.
+
+    Raises:
+        WlmError: A file is no artifact.
+    """
+    if os.path.isfile(path):
+        return read_artifact(path).system == SceneModel.SYSTEM
+    report = Path(path) / REPORT_FILE
     return report.is_file() and read_index(report).get("format") == FORMAT
+
+
+def describe_scene(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Says what a scene's folder or model holds.
+
+    Returns:
+        JSON's own types: name, bytes, states, sheets with their sizes, how many levels, the texture's width, height and
+        pages, the table's size, factors, compression ratios by eq. 9 and on disk, source, bytes by part, the model's
+        report and the profile.
+
+    Raises:
+        WlmError: It is another folder or file, or damaged.
+    """
+    file = Path(path) / MODEL_FILE if os.path.isdir(path) else Path(path)
+    model = read_scene(path)[0] if os.path.isdir(path) else load(file, SceneModel.SYSTEM)
+    artifact = read_artifact(file, SceneModel.SYSTEM)
+    texels = sum(each.height * each.width for each in model.sheets) * len(model.states)
+    return {
+        "name": model.name,
+        "bytes": artifact.file_bytes,
+        "states": list(model.states),
+        "sheets": [{"name": each.name, "size": [each.width, each.height]} for each in model.sheets],
+        "levels": len(model.levels),
+        "colour_size": list(model.texels.shape[::-1]),
+        "lut_size": list(model.lut.shape[1::-1]),
+        "factors": model.factor.shape[1],
+        "cr": model.compression_ratio,
+        "cr_disk": 1.0 - 8 * artifact.file_bytes / (SOURCE_BITS * texels),
+        "source": model.source,
+        "parts": {"header": artifact.header_bytes} | artifact.parts,
+        "found": plain(model.report),
+        "profile": model.profile.model_dump(mode="json"),
+    }
 
 
 def read_scene(directory: str | os.PathLike[str]) -> tuple[SceneModel, dict[str, Any]]:

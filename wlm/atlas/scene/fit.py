@@ -265,34 +265,39 @@ def _candidates(
         moment.append(moments(tiles.points(texels), weight).cpu().numpy())
     row, column = random.integers(0, tiles.size + 1, (2, _SAMPLE_TEXELS))
     moment, bounds = np.concatenate(moment), tiles.texels[few][:, row, column].numpy()
-    meter, tried, before = Meter(stages.progress, "curves", len(ranks) * count), [], math.inf
+    meter, tried, before, eager = Meter(stages.progress, "curves", len(ranks) * count), [], math.inf, np.arange(count)
     for done, rank in enumerate(ranks):
         mixtures = find_mixtures(moment, bounds, rank, 1 if rank == states else min(max(many, 1), _MIXTURES), seed)
-        number, error = _curves(tiles, mixtures, sizes, meter, done * count)
+        # Where a tile isn't tried, nothing is gained.
+        error = np.repeat(tried[0].error.max(0)[None], len(sizes), 0) if tried else np.zeros((len(sizes), count))
+        number = np.zeros(count, int)
+        number[eager], error[:, eager] = _curves(tiles, eager, mixtures, sizes, meter, done * count)
         tried.append(_Tried(mixtures, number, error, 0.0))
-        left = _left(tried, sizes, bits)
+        left, chosen = _left(tried, sizes, bits)
         tried[-1] = replace(tried[-1], left=left)
-        if left > _PAYS * before:
+        # A tile that has fewer components than it may have takes no more where others may.
+        eager = np.flatnonzero(chosen == done)
+        if left > _PAYS * before or not len(eager):
             break
         before = left
     return tried
 
 
 def _curves(
-    tiles: _SceneTiles, mixtures: Mixtures, sizes: np.ndarray, meter: Meter, done: int
+    tiles: _SceneTiles, members: np.ndarray, mixtures: Mixtures, sizes: np.ndarray, meter: Meter, done: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """`number` and `error` of `_Tried`."""
+    """`number` and `error` of `_Tried`, of some tiles."""
     device, rank = tiles.device, mixtures.factor.shape[2]
     factor, take = mixtures.factor.to(device), mixtures.take.to(device)
     mixtures = Mixtures(factor, take, mixtures.kept.to(device))
     root = _roots(mixtures.factor)
-    number, error = np.zeros(len(tiles.index), int), np.zeros((len(sizes), len(tiles.index)))
+    number, error = np.zeros(len(members), int), np.zeros((len(sizes), len(members)))
     step = max(1, _AT_ONCE * 8 // rank)
-    for at in range(0, len(tiles.index), step):
+    for at in range(0, len(members), step):
         if meter.due(done + at):
             meter.report(done + at)
         part = slice(at, at + step)
-        texels, weight = tiles.light(part)
+        texels, weight = tiles.light(members[part])
         light = tiles.points(texels)
         chosen = mixtures.nearest(moments(light, weight))
         components = tiles.points(tiles.components(texels, take[chosen]))
@@ -321,11 +326,11 @@ def _costs(tried: list[_Tried], sizes: np.ndarray) -> np.ndarray:
     return np.concatenate([sizes.prod(1) * each.rank * float(TEXEL_BITS) for each in tried])
 
 
-def _left(tried: list[_Tried], sizes: np.ndarray, bits: float) -> float:
-    """The error that is left, about."""
+def _left(tried: list[_Tried], sizes: np.ndarray, bits: float) -> tuple[float, np.ndarray]:
+    """The error that is left, about; and the number in the list of what each tile takes, int [T]."""
     error = np.concatenate([each.error for each in tried])
     chosen = allocate(error, _costs(tried, sizes), bits, 0.0)
-    return float(error[chosen, np.arange(len(chosen))].sum())
+    return float(error[chosen, np.arange(len(chosen))].sum()), chosen // len(sizes)
 
 
 @dataclass(frozen=True, eq=False)
