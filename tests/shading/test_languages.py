@@ -136,8 +136,11 @@ def rgba(texels: np.ndarray) -> np.ndarray:
     return np.pad(texels.astype(np.float16), ((0, 0), (0, 0), (0, 1)))
 
 
-def random_scene() -> SceneModel:
-    """Two sheets, the first with two smaller levels, on two pages; tiles of up to three components, one of none."""
+def random_scene(short: bool) -> SceneModel:
+    """Two sheets, the first with two smaller levels.
+
+    On two pages with tiles of none to three components; short: with one page and one component.
+    """
     random = np.random.default_rng(1)
     texels = pack_rgb9e5(random.random((2 * 20, 24, 3)).astype(np.float32)).reshape(2, 20, 24)
     size = random.integers(1, 8, (13, 11, 2))
@@ -147,11 +150,13 @@ def random_scene() -> SceneModel:
     sheets = (SheetPlace("a", 29, 36, 0, 0, 5, 6, 2), SheetPlace("b", 22, 29, 5, 4, 4, 5))
     levels = (SheetPlace("a", 8, 9, 9, 0, 2, 2, 3), SheetPlace("a", 4, 4, 11, 0, 1, 1))
     factor = random.uniform(-0.3, 1.0, (3, 8, 3)).astype(np.float32)
+    if short:
+        factor, texels, lut = factor[:, :1], texels[:1], lut[..., :2]
     return SceneModel("s", "0" * 16, SceneProfile(name="s"), ("a", "b", "c"), sheets, factor, texels, lut, levels)
 
 
-def scene(_) -> Subject:
-    model, random = random_scene(), np.random.default_rng(2)
+def scene(short, _) -> Subject:
+    model, random = random_scene(short), np.random.default_rng(2)
     decoder, number = SceneDecoder(model), random.integers(0, 2, 600)
     uv = random.uniform(-0.05, 1.05, (600, 2)).astype(np.float32)
     texels = np.array([0.0, 1.0, 2.0**1.5, 2.0**2.25, 2.0**7])[random.integers(0, 5, 600)]  # along a pixel
@@ -292,7 +297,8 @@ SUBJECTS: dict[str, Callable[..., Subject]] = {
     **{f"atlas {kind}": lambda folder, kind=kind: atlas(kind, folder) for kind in (*KINDS, MIXED)},
     "atlas mips": partial(mips, MIXED),
     "cascade mips": partial(mips, "cascade"),
-    "scene": scene,
+    "scene": partial(scene, False),
+    "scene of one component": partial(scene, True),
     **{f"smoke {layout}": lambda folder, layout=layout: smoke(layout, folder) for layout in LAYOUTS},
     "volume": volume,
     "probes": probes,

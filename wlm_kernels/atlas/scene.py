@@ -50,8 +50,11 @@ def _read(
     x = axis_at(lut[row, column, 0], across[1], _NO_BLOCKS)
     y = axis_at(lut[row, column, 1], down[1], _NO_BLOCKS)
     step = (int(lut[row, column, 0]) & _SIDE_MASK) + 1
-    first = int(lut[row, column, 2])
-    last = int(lut[row, column, 3])
+    first = int(0)
+    last = int(1)
+    if lut.shape[2] == 4:
+        first = int(lut[row, column, 2])
+        last = int(lut[row, column, 3])
     page = last >> _COUNT_BITS
     # 0 for a place, and NaN for none, where there is no component.
     total = wp.vec3(0.0, 0.0, 0.0) * (across[1] + down[1])
@@ -77,7 +80,8 @@ def read(uv, sheet, sheets, size: int, factor, lut, texels, out) -> None:
         size: B, texels along a tile.
         factor: vec3 [C], of each component.
         lut: uint16 [ty, tx, 4], for x and y: first texel of the first component's rectangle << 4 | number of its texels
-            - 1; number of its factors; page << 8 | number of components.
+            - 1; number of its factors; page << 8 | number of components. Or of the first two alone, [ty, tx, 2]: one
+            component and one page.
         texels: uint32 [pages, Hp, Wp], RGB9E5; the components of a tile follow each other along a row.
         out: vec3 [N], written.
     """

@@ -1,8 +1,8 @@
 """The artifact of a scene's model: one file.
 
-Parts: `colour` (uint32 [pages, Hp, Wp], RGB9E5), `lut` (uint16 [Hc, Wc, 4]), `factor` (float32 [M, C, 3]) and
+Parts: `colour` (uint32 [pages, Hp, Wp], RGB9E5), `lut` (uint16 [Hc, Wc, 2 or 4]), `factor` (float32 [M, C, 3]) and
 `sheets` (int32 [S + levels, 7], `SceneModel.table`); each a zlib stream where that is smaller, `wlm.atlas.streams`.
-Earlier files have entries of two numbers, `wlm.atlas.scene.earlier`.
+Earlier files have entries of two numbers for any number of components and pages, `wlm.atlas.scene.earlier`.
 """
 
 from typing import Annotated, Any
@@ -12,7 +12,7 @@ from pydantic import Field, JsonValue
 
 from wlm.atlas.model import MOST_SIZE, TEXELS, check_area, tile_counts, unpack_entries
 from wlm.atlas.scene.earlier import side_by_side
-from wlm.atlas.scene.model import SceneModel, SceneProfile, SheetPlace, unpack_tiles
+from wlm.atlas.scene.model import ENTRY, SHORT_ENTRY, SceneModel, SceneProfile, SheetPlace, unpack_tiles
 from wlm.atlas.streams import deflated, inflated
 from wlm.config import check_settings
 from wlm.formats.artifact import Artifact
@@ -65,10 +65,11 @@ def decode(artifact: Artifact) -> SceneModel:
     texels, lut, factor, sheets = (parts[name] for name in table)
     if not (texels.size and lut.size and factor.size and len(sheets)):
         raise ValueError("a part is empty")
-    if max(texels.shape[1:]) > MOST_SIZE or lut.shape[2] not in (2, 4):
+    if max(texels.shape[1:]) > MOST_SIZE or lut.shape[2] not in (SHORT_ENTRY, ENTRY):
         raise ValueError(f"part colour, part lut: {texels.shape}, {lut.shape}: expected pages and entries")
-    earlier, names = lut.shape[2] == 2, list(header.sheets)
-    if earlier:
+    names = list(header.sheets)
+    # Of one component on one page they are what they were.
+    if lut.shape[2] == SHORT_ENTRY and (factor.shape[1] > 1 or len(texels) > 1):
         texels, lut, sheets = _of_earlier(texels, lut, factor.shape[1], sheets)
     first, size, component, count, page = unpack_tiles(lut)
     size[..., 0] *= np.maximum(count, 1)

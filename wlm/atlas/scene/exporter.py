@@ -27,7 +27,7 @@ from wlm.atlas.scene.shader import scene_glsl
 from wlm.errors import WlmError
 from wlm.formats.artifact import read_artifact
 from wlm.formats.atomic import atomic_write
-from wlm.formats.dds import write_dds
+from wlm.formats.dds import MOST_SIDE, write_dds
 from wlm.formats.folder import UNFINISHED, read_index, staged
 from wlm.formats.gltf_writer import write_glb
 from wlm.system import load, plain
@@ -35,6 +35,7 @@ from wlm.system import load, plain
 FORMAT = "wlm-atlas-scene"
 MODEL_FILE, SCENE_FILE, REPORT_FILE = "scene.wlm", "scene.glb", "report.json"
 _VERSION = 1
+_LUT_FORMATS = {2: "R16G16_UINT", 4: "R16G16B16A16_UINT"}
 _NAMES = re.compile(r"scene\.(wlm|glb|glsl)|(lut|sheets|factors)\.dds|colour_\d+\.dds|report\.json")
 
 
@@ -57,8 +58,12 @@ def export_scene(
 
     Raises:
         ValueError: The model is of another scene.
-        WlmError: The folder holds something other than an earlier output, or a file can't be written.
+        WlmError: The folder holds something other than an earlier output, a file can't be written, or there are more
+            sheets and levels than a texture has rows.
     """
+    rows = len(model.sheets) + len(model.levels)
+    if rows > MOST_SIDE:
+        raise WlmError(f"{model.name}: expected at most {MOST_SIDE} sheets and levels, found {rows}")
     if model.source != scene.source:
         raise ValueError(f"model of {model.source}, scene of {scene.source}: expected the scene that was compressed")
     folder = Path(directory)
@@ -75,7 +80,7 @@ def export_scene(
             write_glb(temporary / SCENE_FILE, dataclasses.replace(scene.document, content=content), [], 1)
         rows, columns = model.lut.shape[:2]
         lut = np.ascontiguousarray(model.lut, "<u2").tobytes()
-        write_dds(temporary / "lut.dds", lut, columns, rows, fmt="R16G16B16A16_UINT")
+        write_dds(temporary / "lut.dds", lut, columns, rows, fmt=_LUT_FORMATS[model.lut.shape[2]])
         sheets, factors = sheet_texels(model), factor_texels(model)
         write_dds(temporary / "sheets.dds", sheets.tobytes(), *sheets.shape[1::-1], fmt="R16G16B16A16_UINT")
         write_dds(temporary / "factors.dds", factors.tobytes(), *factors.shape[1::-1], fmt="R32G32B32A32_FLOAT")

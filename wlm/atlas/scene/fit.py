@@ -25,9 +25,11 @@ from wlm.atlas.model import TEXELS, tile_counts
 from wlm.atlas.scene.data import LightmappedScene
 from wlm.atlas.scene.mixture import Mixtures, find_mixtures, moments
 from wlm.atlas.scene.model import (
-    ENTRY_BITS,
+    ENTRY,
     FACTOR_BITS,
+    NUMBER_BITS,
     SHEET_BITS,
+    SHORT_ENTRY,
     TEXEL_BITS,
     SceneModel,
     SceneProfile,
@@ -40,13 +42,15 @@ from wlm.atlas.scene.seen import scene_weights
 from wlm.atlas.stages import Stages, one_thread
 from wlm.atlas.tiles import Tiles, errors, patches, solve, solved, tile_light, weighted
 from wlm.errors import WlmError
+from wlm.formats.dds import MOST_SIDE
 from wlm.formats.shared_exponent import pack_rgb9e5
 from wlm.system import Meter, OnProgress
 
 _RANKS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)  # components of a tile
-_MIXTURES = 48  # of one rank, at most
+_MIXTURES = 128  # of one rank, at most
 _FACTOR_SHARE = 0.15  # of the budget, that the factors of all mixtures that are tried may take
-_SAMPLES, _SAMPLE_TEXELS = 4096, 16  # tiles that mixtures are found of, and texels of each for their bounds
+# Tiles that mixtures are found of, numbers of their moments at most, and texels of each for the bounds.
+_SAMPLES, _MOMENTS, _SAMPLE_TEXELS = 8192, 1 << 24, 16
 _PAYS = 0.99  # of the error: more components leave less, or no more are tried
 _SIDES = (1, 2, 3, 4, 5, 6, 8, 10, 12, 14, 16)
 _ROUGH = 3  # rounds of conjugate gradients of a curve
@@ -167,19 +171,25 @@ def _compressed(scene: LightmappedScene, profile: SceneProfile, seed: int, stage
         peak = _peaks(scene, weights)
         planes = planes_of(scene, weights, profile.mips, device)
     layout = _laid_out(planes, profile.tile)
-    bits = profile.budget * scene.source_bits - math.prod(layout.shape) * ENTRY_BITS - len(planes) * SHEET_BITS
+    # One state has one component.
+    numbers = ENTRY if len(scene.states) > 1 else SHORT_ENTRY
+    bits = profile.budget * scene.source_bits - len(planes) * SHEET_BITS
+    room = bits - math.prod(layout.shape) * numbers * NUMBER_BITS
     with stages("tiles"):
         tiles = _tiles(planes, peak, profile.tile, device)
-    if bits < len(tiles.index) * TEXEL_BITS:
+    if room < len(tiles.index) * TEXEL_BITS:
         raise WlmError(_NO_ROOM.format(profile.budget))
     sizes = np.array([(nx, ny) for ny in _SIDES for nx in _SIDES if max(nx, ny) <= profile.tile + 1])
     with stages("curves"):
-        tried = _candidates(tiles, sizes, profile, bits, seed, stages)
+        tried = _candidates(tiles, sizes, profile, room, seed, stages)
     with stages("allocate"):
-        given = _allocated(tried, sizes, bits, profile)
+        given = _allocated(tried, sizes, room, profile)
+        if numbers == SHORT_ENTRY and given.page.any():
+            numbers = ENTRY
+            given = _allocated(tried, sizes, bits - math.prod(layout.shape) * ENTRY * NUMBER_BITS, profile)
     with stages("solve"):
         texels, scale = _texels(tiles, tried, given)
-    lut = _table(tiles, layout, given)
+    lut = np.ascontiguousarray(_table(tiles, layout, given)[..., :numbers])
     rows = [
         SheetPlace(plane.name, *plane.frames.shape[1:3], row, column, *grid, plane.smaller)
         for plane, row, column, grid in zip(planes, layout.row, layout.column, layout.grid, strict=True)
@@ -256,9 +266,10 @@ def _candidates(
     count, states = tiles.texels.shape[0], tiles.texels.shape[3]
     most = min(profile.components or states, states, _RANKS[-1])
     ranks = [*(rank for rank in _RANKS if rank < most), most]
-    many = int(_FACTOR_SHARE * bits / (states * FACTOR_BITS * sum(ranks)))
+    many = int(min(_FACTOR_SHARE * bits / (states * FACTOR_BITS), MOST_SIDE) / sum(ranks))
     random = np.random.default_rng(seed)
-    few = np.sort(random.choice(count, min(count, _SAMPLES), replace=False))
+    samples = min(count, _SAMPLES, _MOMENTS // (3 * states**2))
+    few = np.sort(random.choice(count, max(samples, 1), replace=False))
     moment = []
     for at in np.array_split(few, -(-len(few) // _AT_ONCE)):
         texels, weight = tiles.light(at)

@@ -22,8 +22,11 @@ from wlm.system import Model, Settings
 TEXEL_BITS = 32
 """Bits of a texel of T_p: RGB9E5."""
 
-ENTRY_BITS = 64
-"""Bits of an entry of T_c: four numbers."""
+NUMBER_BITS = 16
+"""Bits of each of the numbers of an entry of T_c."""
+
+ENTRY, SHORT_ENTRY = 4, 2
+"""Numbers of an entry; and where there are one component and one page alone."""
 
 FACTOR_BITS = 128
 """Bits of a component's factors in a state: three floats, in a texel of four."""
@@ -94,7 +97,8 @@ class SceneModel(Model):
         sheets: At least one.
         factor: float32 [M, C, 3], finite, of any sign; the components of all mixtures, one after another.
         texels: uint32 [pages, Hp, Wp], T_p, RGB9E5.
-        lut: uint16 [Hc, Wc, 4], T_c: `pack_tiles`.
+        lut: uint16 [Hc, Wc, 4], T_c: `pack_tiles`; [Hc, Wc, 2], its first two numbers, where there are one component
+            and one page.
         levels: With mips the smaller levels of all sheets, for each sheet a quarter, then halves.
         report: Facts about the compression, for people.
     """
@@ -115,7 +119,7 @@ class SceneModel(Model):
     @property
     def bits(self) -> int:
         """Bits of T_p, T_c, the factors and the sheets' rows."""
-        texels = self.texels.size * TEXEL_BITS + self.lut.size // 4 * ENTRY_BITS
+        texels = self.texels.size * TEXEL_BITS + self.lut.size * NUMBER_BITS
         return texels + self.factor.size // 3 * FACTOR_BITS + (len(self.sheets) + len(self.levels)) * SHEET_BITS
 
     @property
@@ -152,7 +156,10 @@ def pack_tiles(
 
 
 def unpack_tiles(lut: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Decodes `pack_tiles`, to int64."""
-    first, size, _ = unpack_entries(lut[..., :2], "rgb9e5")
+    """Decodes `pack_tiles`, to int64; of short entries, too."""
+    first, size, _ = unpack_entries(lut[..., :SHORT_ENTRY], "rgb9e5")
+    if lut.shape[-1] == SHORT_ENTRY:
+        zeros = np.zeros(lut.shape[:-1], np.int64)
+        return first, size, zeros, zeros + 1, zeros
     last = lut[..., 3].astype(np.int64)
     return first, size, lut[..., 2].astype(np.int64), last & ((1 << COUNT_BITS) - 1), last >> COUNT_BITS

@@ -1,7 +1,7 @@
 """The GLSL that reads a scene's exported lightmaps; `wlm.atlas.scene.exporter` writes it."""
 
 from wlm.atlas.model import SIDE_BITS, TAIL_OCTAVES
-from wlm.atlas.scene.model import COUNT_BITS, SceneModel
+from wlm.atlas.scene.model import COUNT_BITS, SHORT_ENTRY, SceneModel
 from wlm.shading import sampler
 
 _TEXT = """\
@@ -29,14 +29,13 @@ vec3 wlm_scene(vec2 uv, int sheet, float state)
     vec2 x = clamp(uv * size - vec2(0.5, 0.5), vec2(0.0, 0.0), size - vec2(1.0, 1.0)) / WLM_SCENE_TILE;
     ivec2 tile = min(ivec2(floor(x)), ivec2(tiles.xy) - ivec2(1, 1));
     uvec4 entry = texelFetch(WLM_SCENE_LUT, ivec2(place.zw) + tile, 0);
-    // The first texel of the tile's first rectangle, and in the low bits its texels less one; its first component's
-    // number; its page, and in the low bits its components.
+    // {entry}
     vec2 first = vec2(entry.xy >> uvec2({bits}u, {bits}u));
     vec2 steps = vec2(entry.xy & uvec2({mask}u, {mask}u));
     vec2 at = first + (x - vec2(tile)) * steps + vec2(0.5, 0.5);
-    int components = int(entry.w & {most}u);
-    int component = int(entry.z);
-    float page = float(entry.w >> {count_bits}u);
+    int components = {components};
+    int component = {component};
+    float page = {page};
     int before = min(int(state), {last});
     int after = min(before + 1, {last});
     float share = state - float(before);
@@ -50,6 +49,20 @@ vec3 wlm_scene(vec2 uv, int sheet, float state)
     return max(light, vec3(0.0, 0.0, 0.0));
 }}
 """
+
+_LONG = {
+    "entry": "The first texel of the tile's first rectangle, and in the low bits its texels less one; its first\n"
+    "    // component's number; its page, and in the low bits its components.",
+    "components": f"int(entry.w & {(1 << COUNT_BITS) - 1}u)",
+    "component": "int(entry.z)",
+    "page": f"float(entry.w >> {COUNT_BITS}u)",
+}
+_SHORT = {
+    "entry": "The first texel of the tile's rectangle, and in the low bits its texels less one.",
+    "components": "1",
+    "component": "0",
+    "page": "0.0",
+}
 
 _GRAD = """
 // Light where a pixel is large: dx and dy are dFdx(uv) and dFdy(uv). Up close it is wlm_scene(uv, sheet, state).
@@ -89,7 +102,6 @@ def scene_glsl(model: SceneModel) -> str:
         samplers="".join(sampler(f"wlm_scene_{name}", kind) for name, kind in kinds.items()),
         bits=SIDE_BITS,
         mask=(1 << SIDE_BITS) - 1,
-        count_bits=COUNT_BITS,
-        most=(1 << COUNT_BITS) - 1,
+        **(_SHORT if model.lut.shape[2] == SHORT_ENTRY else _LONG),
     )
     return text + _GRAD.format(octaves=TAIL_OCTAVES - 1) if model.levels else text
