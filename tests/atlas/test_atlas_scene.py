@@ -60,10 +60,11 @@ def test_light_of_two_sources_has_two_components():
     found = find_mixtures(moment.numpy(), texels, 2, 4, seed=0)
     number = found.nearest(moment)
     assert not set(number[:20].tolist()) & set(number[20:].tolist())
-    parts = torch.einsum("tkmc,tymc->tykc", found.take[number], light)
-    assert float(parts.min()) > -0.01 and float(parts.max()) > 0.5
-    back = torch.einsum("tmkc,tykc->tymc", found.factor[number], parts.clamp(min=0.0))
-    torch.testing.assert_close(back, light, rtol=0, atol=0.01)
+    parts = torch.einsum("tkmc,tymc->tykc", found.take[number], light) + found.offset[number][:, None]
+    assert float(parts.min()) > 0.0 and float(parts.max()) > 0.5
+    factor = torch.from_numpy(np.stack([found.factors(each) for each in number])).float()
+    back = factor[:, None, 0] + torch.einsum("tkmc,tykc->tymc", factor[:, 1:], parts)
+    torch.testing.assert_close(back, light, rtol=0, atol=1e-3)
 
 
 def test_one_table_and_one_texture_for_all(scene, model):

@@ -146,12 +146,12 @@ def random_scene(short: bool) -> SceneModel:
     size = random.integers(1, 8, (13, 11, 2))
     count = np.minimum(random.integers(0, 4, (13, 11)), 24 // size[..., 0])
     first = random.integers(0, np.array([24, 20]) - size * np.stack([np.maximum(count, 1), np.ones_like(count)], 2) + 1)
-    lut = pack_tiles(first, size, random.integers(0, 6, (13, 11)), count, random.integers(0, 2, (13, 11)))
+    lut = pack_tiles(first, size, random.integers(0, 5, (13, 11)), count, random.integers(0, 2, (13, 11)))
     sheets = (SheetPlace("a", 29, 36, 0, 0, 5, 6, 2), SheetPlace("b", 22, 29, 5, 4, 4, 5))
     levels = (SheetPlace("a", 8, 9, 9, 0, 2, 2, 3), SheetPlace("a", 4, 4, 11, 0, 1, 1))
     factor = random.uniform(-0.3, 1.0, (3, 8, 3)).astype(np.float32)
     if short:
-        factor, texels, lut = np.abs(factor[:, :1]), texels[:1], lut[..., :2]
+        factor, texels, lut = np.abs(factor[:, :2]), texels[:1], lut[..., :2]
     return SceneModel("s", "0" * 16, SceneProfile(name="s"), ("a", "b", "c"), sheets, factor, texels, lut, levels)
 
 

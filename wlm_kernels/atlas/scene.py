@@ -56,12 +56,15 @@ def _read(
         first = int(lut[row, column, 2])
         last = int(lut[row, column, 3])
     page = last >> _COUNT_BITS
-    # 0 for a place, and NaN for none, where there is no component.
+    # NaN where there is no place.
     total = wp.vec3(0.0, 0.0, 0.0) * (across[1] + down[1])
-    for k in range(last & _COUNT_MASK):
+    count = last & _COUNT_MASK
+    if count > 0:
+        total += factor[first]
+    for k in range(count):
         top = _mixed(texels, page, y.low, k * step, x)
         bottom = _mixed(texels, page, y.high, k * step, x)
-        total += wp.cw_mul(factor[first + k], wp.lerp(top, bottom, y.share))
+        total += wp.cw_mul(factor[first + 1 + k], wp.lerp(top, bottom, y.share))
     # Factors have any sign.
     for c in range(3):
         if total[c] < 0.0:
@@ -78,7 +81,7 @@ def read(uv, sheet, sheets, size: int, factor, lut, texels, out) -> None:
         sheets: int [S, 7]: rows and columns of texels; first row and column in the table; rows and columns of tiles;
             one number that isn't read.
         size: B, texels along a tile.
-        factor: vec3 [C], of each component.
+        factor: vec3 [C], of each mixture a constant and then one of each component.
         lut: uint16 [ty, tx, 4], for x and y: first texel of the first component's rectangle << 4 | number of its texels
             - 1; number of its factors; page << 8 | number of components. Or of the first two alone, [ty, tx, 2]: one
             component and one page.

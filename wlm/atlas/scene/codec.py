@@ -2,17 +2,17 @@
 
 Parts: `colour` (uint32 [pages, Hp, Wp], RGB9E5), `lut` (uint16 [Hc, Wc, 2 or 4]), `factor` (float32 [M, C, 3]) and
 `sheets` (int32 [S + levels, 7], `SceneModel.table`); each a zlib stream where that is smaller, `wlm.atlas.streams`.
-Earlier files have entries of two numbers for any number of components and pages, `wlm.atlas.scene.earlier`.
+Earlier files name no `entries`, the numbers of one, `wlm.atlas.scene.earlier`.
 """
 
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field, JsonValue
 
 from wlm.atlas.model import MOST_SIZE, TEXELS, check_area, tile_counts, unpack_entries
 from wlm.atlas.scene.earlier import side_by_side
-from wlm.atlas.scene.model import ENTRY, SHORT_ENTRY, SceneModel, SceneProfile, SheetPlace, unpack_tiles
+from wlm.atlas.scene.model import SHORT_ENTRY, SceneModel, SceneProfile, SheetPlace, unpack_tiles
 from wlm.atlas.streams import deflated, inflated
 from wlm.config import check_settings
 from wlm.formats.artifact import Artifact
@@ -30,6 +30,7 @@ def encode(model: SceneModel) -> tuple[dict[str, Any], dict[str, np.ndarray], st
         "name": model.name,
         "states": list(model.states),
         "sheets": [sheet.name for sheet in model.sheets],
+        "entries": model.lut.shape[2],
         "profile": model.profile.changes(),
         "report": {name: value for name, value in model.report.items() if name != "seconds"},
     }
@@ -42,6 +43,7 @@ class _Header(Header):
     name: Name
     states: list[Name]
     sheets: list[Name]
+    entries: Literal[2, 4] | None = None
     profile: SceneProfile
     report: dict[str, JsonValue]
     parts: dict[str, list[Annotated[int, Field(ge=0, le=_MOST_NUMBERS)]]] = {}
@@ -65,16 +67,16 @@ def decode(artifact: Artifact) -> SceneModel:
     texels, lut, factor, sheets = (parts[name] for name in table)
     if not (texels.size and lut.size and factor.size and len(sheets)):
         raise ValueError("a part is empty")
-    if max(texels.shape[1:]) > MOST_SIZE or lut.shape[2] not in (SHORT_ENTRY, ENTRY):
+    if max(texels.shape[1:]) > MOST_SIZE or lut.shape[2] != (header.entries or SHORT_ENTRY):
         raise ValueError(f"part colour, part lut: {texels.shape}, {lut.shape}: expected pages and entries")
     names = list(header.sheets)
-    # Of one component on one page they are what they were.
-    if lut.shape[2] == SHORT_ENTRY and (factor.shape[1] > 1 or len(texels) > 1):
+    if header.entries is None:
         texels, lut, sheets = _of_earlier(texels, lut, factor.shape[1], sheets)
+        factor = np.pad(factor, ((0, 0), (1, 0), (0, 0)))
     first, size, component, count, page = unpack_tiles(lut)
     size[..., 0] *= np.maximum(count, 1)
     beyond = ((first + size) > texels.shape[:0:-1]).any(-1) | (page >= len(texels))
-    if (beyond & (count > 0)).any() or (component + count > factor.shape[1]).any():
+    if (beyond & (count > 0)).any() or (component + count >= factor.shape[1]).any():
         raise ValueError("part lut: a tile reaches beyond the colour texture or the factors")
     if len(sheets) < len(names):
         raise ValueError(f"part sheets: expected {len(names)}, found {len(sheets)}")

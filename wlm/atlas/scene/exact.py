@@ -28,10 +28,10 @@ def decode64(model: SceneModel, uv: np.ndarray, sheet: np.ndarray, state: int) -
     low = np.clip(np.floor(place).astype(np.int64), first, first + count - 1)
     high = np.minimum(low + 1, first + count - 1)
     share = place - low
-    light = np.zeros((len(x), 3))
+    light = model.factor[state, component].astype(np.float64) * (components > 0)[:, None]
     for k in range(int(components.max(initial=0))):
         at = np.flatnonzero(components > k)
-        step, factor = k * count[at, 0], model.factor[state, component[at] + k].astype(np.float64)
+        step, factor = k * count[at, 0], model.factor[state, component[at] + 1 + k].astype(np.float64)
         for column, a in ((low[at, 0], 1.0 - share[at, 0]), (high[at, 0], share[at, 0])):
             for row, b in ((low[at, 1], 1.0 - share[at, 1]), (high[at, 1], share[at, 1])):
                 texel = unpack_rgb9e5(model.texels[page[at], row, column + step]).astype(np.float64)

@@ -90,9 +90,10 @@ class _SceneTiles:
         """Light at the points of tiles [T, N, 3, P] of texels [T, B + 1, B + 1, N, 3]."""
         return tile_light(texels.flatten(3)).unflatten(1, (-1, 3))
 
-    def components(self, texels: torch.Tensor, take: torch.Tensor) -> torch.Tensor:
-        """Texels [T, B + 1, B + 1, K, 3] of components, of the states' and `take` [T, K, M, 3]."""
-        return torch.einsum("tkmc,tyxmc->tyxkc", take, texels).clamp(min=0.0)
+    def components(self, texels: torch.Tensor, mixtures: Mixtures, number: torch.Tensor) -> torch.Tensor:
+        """Texels [T, B + 1, B + 1, K, 3] of components, of the states' and the tiles' mixtures."""
+        parts = torch.einsum("tkmc,tyxmc->tyxkc", mixtures.take[number], texels)
+        return (parts + mixtures.offset[number][:, None, None]).clamp(min=0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -266,7 +267,7 @@ def _candidates(
     count, states = tiles.texels.shape[0], tiles.texels.shape[3]
     most = min(profile.components or states, states, _RANKS[-1])
     ranks = [*(rank for rank in _RANKS if rank < most), most]
-    many = int(min(_FACTOR_SHARE * bits / (states * FACTOR_BITS), MOST_SIDE) / sum(ranks))
+    many = int(min(_FACTOR_SHARE * bits / (states * FACTOR_BITS), MOST_SIDE) / sum(rank + 1 for rank in ranks))
     random = np.random.default_rng(seed)
     samples = min(count, _SAMPLES, _MOMENTS // (3 * states**2))
     few = np.sort(random.choice(count, max(samples, 1), replace=False))
@@ -299,8 +300,8 @@ def _curves(
 ) -> tuple[np.ndarray, np.ndarray]:
     """`number` and `error` of `_Tried`, of some tiles."""
     device, rank = tiles.device, mixtures.factor.shape[2]
-    factor, take = mixtures.factor.to(device), mixtures.take.to(device)
-    mixtures = Mixtures(factor, take, mixtures.kept.to(device))
+    mixtures = mixtures.to(device)
+    factor, offset = mixtures.factor, mixtures.offset
     root = _roots(mixtures.factor)
     number, error = np.zeros(len(members), int), np.zeros((len(sizes), len(members)))
     step = max(1, _AT_ONCE * 8 // rank)
@@ -311,8 +312,8 @@ def _curves(
         texels, weight = tiles.light(members[part])
         light = tiles.points(texels)
         chosen = mixtures.nearest(moments(light, weight))
-        components = tiles.points(tiles.components(texels, take[chosen]))
-        rest = torch.einsum("tmkc,tkcp->tmcp", factor[chosen], components) - light
+        components = tiles.points(tiles.components(texels, mixtures, chosen))
+        rest = torch.einsum("tmkc,tkcp->tmcp", factor[chosen], components - offset[chosen][..., None]) - light
         lost = (rest.square().mean((1, 2)) * weight).double().sum(1)
         mixed = torch.einsum("tkcp,tckj->tjcp", components, root[chosen]).flatten(0, 1).contiguous()
         piece = Tiles(chosen.repeat_interleave(rank), mixed, weight.repeat_interleave(rank, 0), tiles.size)
@@ -351,8 +352,8 @@ class _Allocated:
     Attributes:
         rank: int [T], its number in the list of `_Tried`.
         count: int [T], its components.
-        component: int [T], its first in `factors`.
-        factors: float64 [C, M, 3].
+        component: int [T], its mixture's first in `factors`.
+        factors: float64 [C, M, 3], of each mixture a constant and then its components.
         size: int [T, 2], texels of a component.
         first: int64 [T, 2], place of the first component's on the page.
         page: int64 [T].
@@ -375,22 +376,22 @@ def _allocated(tried: list[_Tried], sizes: np.ndarray, bits: float, profile: Sce
     """Allocates components and sizes to the tiles of all sheets, and places them."""
     error, cost = np.concatenate([each.error for each in tried]), _costs(tried, sizes)
     states, tiles = tried[0].mixtures.factor.shape[1], np.arange(error.shape[1])
-    ranks = np.array([each.rank for each in tried])
+    ranks, number = np.array([each.rank for each in tried]), np.stack([each.number for each in tried])
     fewest, budget, found = len(tiles) * float(TEXEL_BITS), bits, None
     for _ in range(_TRIES):
         chosen = allocate(error, cost, budget, _LEAST_GAIN / TEXEL_BITS / len(tiles))
         rank = chosen // len(sizes)
-        used = sorted({(int(r), int(tried[r].number[t])) for t, r in enumerate(rank)})
-        begin = np.cumsum([0, *(ranks[r] for r, _ in used)])
+        used, mixture = np.unique(rank * _MIXTURES + number[rank, tiles], return_inverse=True)
+        begin = np.cumsum([0, *(ranks[used // _MIXTURES] + 1)])
         size = sizes[chosen % len(sizes)]
         first, page, shape = packed(size * np.stack([ranks[rank], np.ones_like(rank)], 1))
         rest = bits - int(begin[-1]) * states * FACTOR_BITS
         area = math.prod(shape) * (int(page.max()) + 1) * TEXEL_BITS
         total = float(cost[chosen].sum())
         if area <= rest:
-            numbers = {pair: start for pair, start in zip(used, begin, strict=False)}
-            component = np.array([numbers[r, int(tried[r].number[t])] for t, r in enumerate(rank.tolist())])
-            factors = np.concatenate([tried[r].mixtures.factor[g].numpy().transpose(1, 0, 2) for r, g in used])
+            component = begin[mixture.ravel()]
+            pairs = (divmod(each, _MIXTURES) for each in used.tolist())
+            factors = np.concatenate([tried[r].mixtures.factors(g) for r, g in pairs])
             left = float(error[chosen, tiles].sum())
             best = _Allocated(rank, ranks[rank], component, factors, size, first, page, shape, left)
             if found is None or left < found.error:
@@ -416,8 +417,8 @@ def _texels(tiles: _SceneTiles, tried: list[_Tried], given: _Allocated) -> tuple
         members = np.flatnonzero(given.rank == rank)
         for part in np.array_split(members, -(-len(members) // _AT_ONCE)) if len(members) else ():
             texels, weight = tiles.light(part)
-            take = each.mixtures.take[each.number[part]].to(tiles.device)
-            components = tiles.points(tiles.components(texels, take))
+            mixtures, number = each.mixtures.to(tiles.device), torch.from_numpy(each.number[part]).to(tiles.device)
+            components = tiles.points(tiles.components(texels, mixtures, number))
             sides, chosen = np.unique(given.size[part], axis=0, return_inverse=True)
             sizes = [Size(nx, ny, TEXELS) for nx, ny in sides.tolist()]
             for k in range(each.rank):
@@ -425,7 +426,7 @@ def _texels(tiles: _SceneTiles, tried: list[_Tried], given: _Allocated) -> tuple
                 for at, values, _ in solved(piece, sizes, chosen.ravel()):
                     at, (ny, nx) = part[at], values.shape[1:3]
                     row, column = texels_of(given.first[at] + [k * nx, 0], nx, ny)
-                    number = given.component[at] + k
+                    number = given.component[at] + 1 + k
                     light[given.page[at, None, None], row, column] = values
                     owner[given.page[at, None, None], row, column] = number[:, None, None]
                     np.maximum.at(largest, number, values.max((1, 2)))

@@ -10,16 +10,19 @@ least l_j a, with l_j the least ratio of all tiles'. So with
 
     c_0 = a,   c_j = b_j - l_j a,   f_0 = v_0 + sum_j l_j v_j,   f_j = v_j,   x ~ sum_k f_k c_k,
 
-no component is negative, so that textures of unsigned texels hold them, while factors have any sign.
+no component is negative, so that textures of unsigned texels hold them, while factors have any sign. Samples of least
+squares overshoot, next to shadows below 0; so to each component a constant is added, a twentieth of what most are,
+which a constant for each state takes away.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
 
 _ROUNDS = 12
-_LEAST_PERCENT = 0.02  # of the ratios: what is below is clipped
+_LEAST_PERCENT = 0.02  # of the ratios: what is below the least is clipped
+_MARGIN, _BRIGHT_PERCENT = 0.05, 99.0  # what is added to components, of what most texels stay below
 _DIM = 1e-3  # of the mean coefficient of v_0: below it a ratio says nothing
 
 
@@ -29,13 +32,25 @@ class Mixtures:
 
     Attributes:
         factor: float32 [G, M, K, 3], of the components in each state.
-        take: float32 [G, K, M, 3]: components are these times the states, clipped at 0.
+        take: float32 [G, K, M, 3]: components are these times the states, plus `offset`, clipped at 0.
+        offset: float32 [G, K, 3]: the states are `factor` times the components less this.
         kept: float32 [G, 3 M M], flat projections onto the subspaces: times a tile's moments, how much light they keep.
     """
 
     factor: torch.Tensor
     take: torch.Tensor
+    offset: torch.Tensor
     kept: torch.Tensor
+
+    def to(self, device: str) -> "Mixtures":
+        """The same on a device."""
+        return Mixtures(*(getattr(self, each.name).to(device) for each in fields(self)))
+
+    def factors(self, number: int) -> np.ndarray:
+        """Of one of them the constant that the offsets come to, and the factors: float64 [1 + K, M, 3]."""
+        factor, offset = (each[number].cpu().numpy().astype(np.float64) for each in (self.factor, self.offset))
+        constant = -np.einsum("mkc,kc->mc", factor, offset)
+        return np.concatenate([constant[None], factor.transpose(1, 0, 2)])
 
     def nearest(self, moment: torch.Tensor) -> torch.Tensor:
         """The mixture that keeps most of each tile's light, int64 [T], by `moments`."""
@@ -79,8 +94,8 @@ def find_mixtures(moment: np.ndarray, texels: np.ndarray, rank: int, count: int,
     nearest = _kept(flat, spaces).argmax(1)
     # One that lost its tiles in the last round has its own directions alone.
     made = [_positive(space, texels[nearest == g]) for g, space in enumerate(spaces)]
-    factor, take = (torch.from_numpy(np.stack(each)).float() for each in zip(*made, strict=True))
-    return Mixtures(factor, take, torch.from_numpy(np.stack([_projection(each) for each in spaces])).float())
+    parts = (torch.from_numpy(np.stack(each)).float() for each in zip(*made, strict=True))
+    return Mixtures(*parts, torch.from_numpy(np.stack([_projection(each) for each in spaces])).float())
 
 
 def _subspace(moment: np.ndarray, rank: int) -> np.ndarray:
@@ -99,10 +114,11 @@ def _kept(flat: np.ndarray, spaces: list[np.ndarray]) -> np.ndarray:
     return flat @ np.stack([_projection(each) for each in spaces]).T
 
 
-def _positive(space: np.ndarray, texels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Factors [M, K, 3] and `take` [K, M, 3] of components that aren't negative."""
+def _positive(space: np.ndarray, texels: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Factors [M, K, 3], `take` [K, M, 3] and `offset` [K, 3] of components that aren't negative."""
     channels, states, rank = space.shape
     factor, take = np.empty((states, rank, channels)), np.empty((rank, states, channels))
+    offset = np.zeros((rank, channels))
     for channel, directions in enumerate(space):
         least = np.zeros(rank)
         part = texels.reshape(-1, states, channels)[:, :, channel] @ directions
@@ -113,4 +129,7 @@ def _positive(space: np.ndarray, texels: np.ndarray) -> tuple[np.ndarray, np.nda
         factor[:, 0, channel] += directions @ least
         take[:, :, channel] = directions.T - np.outer(least, directions[:, 0])
         take[0, :, channel] = directions[:, 0]
-    return factor, take
+        if len(part):
+            components = part - part[:, :1] * least
+            offset[:, channel] = _MARGIN * np.percentile(components, _BRIGHT_PERCENT, axis=0).clip(min=0.0)
+    return factor, take, offset

@@ -3,11 +3,11 @@
 The lightmaps of a sheet share its tiles. A tile has a few components, K rectangles of one size beside each other in
 T_p, and a mixture; light at a point in state m is
 
-    C_m(u) = sum_k f[m, first + k] T_p[page](place of u by T_c, k rectangles to the right),
+    C_m(u) = f[m, first] + sum_k f[m, first + 1 + k] T_p[page](place of u by T_c, k rectangles to the right),
 
-with f a factor for each state, component and channel. Tiles whose light changes alike from state to state share a
-mixture (`mixture`). Between two states light and so f is linear. With mips a sheet is followed by smaller ones, its
-levels, that are read in the same way.
+with f a constant and a factor of each component, for each state and channel; what is negative is 0. Tiles whose light
+changes alike from state to state share a mixture (`mixture`). Between two states f is linear. With mips a sheet is
+followed by smaller ones, its levels, that are read in the same way.
 """
 
 from dataclasses import dataclass, field
@@ -95,7 +95,7 @@ class SceneModel(Model):
         profile: The settings of the compression.
         states: Names of the states, M.
         sheets: At least one.
-        factor: float32 [M, C, 3], finite, of any sign; the components of all mixtures, one after another.
+        factor: float32 [M, C, 3], finite, of any sign; of each mixture a constant, then its components' factors.
         texels: uint32 [pages, Hp, Wp], T_p, RGB9E5.
         lut: uint16 [Hc, Wc, 4], T_c: `pack_tiles`; [Hc, Wc, 2], its first two numbers, where there are one component
             and one page.

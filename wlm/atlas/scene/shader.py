@@ -39,12 +39,16 @@ vec3 wlm_scene(vec2 uv, int sheet, float state)
     int before = min(int(state), {last});
     int after = min(before + 1, {last});
     float share = state - float(before);
+    // A constant, and then a factor for each component.
     vec3 light = vec3(0.0, 0.0, 0.0);
-    for (int k = 0; k < components; k++) {{
+    for (int k = 0; k <= components; k++) {{
         vec3 factor = texelFetch(WLM_SCENE_FACTORS, ivec2(component + k, before), 0).rgb;
         factor = mix(factor, texelFetch(WLM_SCENE_FACTORS, ivec2(component + k, after), 0).rgb, share);
-        vec2 spot = (at + vec2(float(k) * (steps.x + 1.0), 0.0)) / vec2({width}.0, {height}.0);
-        light += factor * textureLod(WLM_SCENE_COLOUR, vec3(spot, page), 0.0).rgb;
+        vec2 spot = (at + vec2(float(k - 1) * (steps.x + 1.0), 0.0)) / vec2({width}.0, {height}.0);
+        if (k > 0)
+            factor = factor * textureLod(WLM_SCENE_COLOUR, vec3(spot, page), 0.0).rgb;
+        if (components > 0)
+            light += factor;
     }}
     return max(light, vec3(0.0, 0.0, 0.0));
 }}
