@@ -417,12 +417,12 @@ def _texels(tiles: _SceneTiles, tried: list[_Tried], given: _Allocated) -> tuple
         members = np.flatnonzero(given.rank == rank)
         for part in np.array_split(members, -(-len(members) // _AT_ONCE)) if len(members) else ():
             texels, weight = tiles.light(part)
-            mixtures, number = each.mixtures.to(tiles.device), torch.from_numpy(each.number[part]).to(tiles.device)
-            components = tiles.points(tiles.components(texels, mixtures, number))
+            mixtures, mixture = each.mixtures.to(tiles.device), torch.from_numpy(each.number[part]).to(tiles.device)
+            components = tiles.points(tiles.components(texels, mixtures, mixture))
             sides, chosen = np.unique(given.size[part], axis=0, return_inverse=True)
             sizes = [Size(nx, ny, TEXELS) for nx, ny in sides.tolist()]
             for k in range(each.rank):
-                piece = Tiles(torch.from_numpy(part), components[:, k].contiguous(), weight, tiles.size)
+                piece = Tiles(mixture, components[:, k].contiguous(), weight, tiles.size)
                 for at, values, _ in solved(piece, sizes, chosen.ravel()):
                     at, (ny, nx) = part[at], values.shape[1:3]
                     row, column = texels_of(given.first[at] + [k * nx, 0], nx, ny)
