@@ -189,7 +189,7 @@ def test_instances_with_a_rectangle_each(tmp_path, convention):
     paths = export_scene(model, tmp_path / "out", scene)
     assert {each.name for each in paths} == {
         *("scene.wlm", "scene.glb", "scene.glsl", "report.json"),
-        *("sheets.dds", "lut.dds", "factors.dds", "colour_0.dds"),
+        *("sheets.dds", "lut.dds", "factors.dds", "colour_0.dds", "blocks_0.dds"),
     }
     again, report = read_scene(tmp_path / "out")
     assert again.source == scene.source and report["objects"][1]["scale_offset"][2] == 0.5

@@ -5,12 +5,14 @@ Parts: `colour` (uint32 [pages, Hp, Wp], RGB9E5), `lut` (uint16 [Hc, Wc, 2 or 4]
 Earlier files name no `entries`, the numbers of one, `wlm.atlas.scene.earlier`.
 """
 
+import math
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field, JsonValue
 
-from wlm.atlas.model import MOST_SIZE, TEXELS, check_area, tile_counts, unpack_entries
+from wlm.atlas.colour import decode as decode_blocks
+from wlm.atlas.model import BLOCK_SIDE, BLOCKS, MOST_SIZE, TEXELS, check_area, tile_counts, unpack_entries
 from wlm.atlas.scene.earlier import side_by_side
 from wlm.atlas.scene.model import SHORT_ENTRY, SceneModel, SceneProfile, SheetPlace, unpack_tiles
 from wlm.atlas.streams import deflated, inflated
@@ -35,6 +37,9 @@ def encode(model: SceneModel) -> tuple[dict[str, Any], dict[str, np.ndarray], st
         "report": {name: value for name, value in model.report.items() if name != "seconds"},
     }
     parts = {"colour": model.texels, "lut": model.lut, "factor": model.factor, "sheets": model.table()}
+    if model.colour == "mixed":
+        settings["block_texels"] = list(model.block_texels.shape[1:3])
+        parts["blocks"] = model.blocks
     streams, settings["parts"] = deflated(parts)
     return settings, streams, model.source
 
@@ -43,6 +48,7 @@ class _Header(Header):
     name: Name
     states: list[Name]
     sheets: list[Name]
+    block_texels: Annotated[list[int], Field(min_length=2, max_length=2)] | None = None
     entries: Literal[2, 4] | None = None
     profile: SceneProfile
     report: dict[str, JsonValue]
@@ -62,9 +68,16 @@ def decode(artifact: Artifact) -> SceneModel:
         "lut": Part(np.uint16, (None, None, None)),
         "factor": Part(np.float32, (len(header.states), None, 3), least=-_MOST_FACTOR, most=_MOST_FACTOR),
         "sheets": Part(np.int32, (None, 7), least=0),
+        "blocks": Part(np.uint8, (None, None, 16), optional=True),
     }
     parts = check_parts(inflated(artifact.tensors, header.parts, table), table)
-    texels, lut, factor, sheets = (parts[name] for name in table)
+    texels, lut, factor, sheets, blocks = (parts[name] for name in table)
+    second = tuple(header.block_texels or (0, 0))
+    most = MOST_SIZE * BLOCK_SIDE
+    if any(side % BLOCK_SIDE or not 0 <= side <= most for side in second) or bool(len(blocks)) != all(second):
+        raise ValueError(f"setting block_texels: {second}: expected multiples of 4 beside blocks alone")
+    if len(blocks) and (header.entries is None or blocks.shape[1] != math.prod(second) // BLOCK_SIDE**2):
+        raise ValueError(f"part blocks: {blocks.shape}: expected those of {second} texels")
     if not (texels.size and lut.size and factor.size and len(sheets)):
         raise ValueError("a part is empty")
     if max(texels.shape[1:]) > MOST_SIZE or lut.shape[2] != (header.entries or SHORT_ENTRY):
@@ -73,9 +86,13 @@ def decode(artifact: Artifact) -> SceneModel:
     if header.entries is None:
         texels, lut, sheets = _of_earlier(texels, lut, factor.shape[1], sheets)
         factor = np.pad(factor, ((0, 0), (1, 0), (0, 0)))
-    first, size, component, count, page = unpack_tiles(lut)
+    colour = "mixed" if len(blocks) else TEXELS
+    first, size, component, count, page, of_blocks = unpack_tiles(lut, colour)
+    if colour == "mixed" and (unpack_entries(lut[..., :2], colour)[2][..., 1] != of_blocks).any():
+        raise ValueError("part lut: a tile is of both textures")
     size[..., 0] *= np.maximum(count, 1)
-    beyond = ((first + size) > texels.shape[:0:-1]).any(-1) | (page >= len(texels))
+    beyond = ((first + size) > np.where(of_blocks[..., None], second[::-1], texels.shape[:0:-1])).any(-1)
+    beyond |= page >= np.where(of_blocks, len(blocks), len(texels))
     if (beyond & (count > 0)).any() or (component + count >= factor.shape[1]).any():
         raise ValueError("part lut: a tile reaches beyond the colour texture or the factors")
     if len(sheets) < len(names):
@@ -108,7 +125,15 @@ def decode(artifact: Artifact) -> SceneModel:
         lut,
         tuple(places[len(header.sheets) :]),
         header.report,
+        blocks if len(blocks) else np.empty((0, 0, 16), np.uint8),
+        _decoded(blocks, second),
     )
+
+
+def _decoded(blocks: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """`SceneModel.block_texels`."""
+    pages = [decode_blocks(page, *size, BLOCKS).astype(np.float16) for page in blocks]
+    return np.stack(pages) if pages else np.empty((0, 0, 0, 3), np.float16)
 
 
 def _of_earlier(

@@ -5,7 +5,7 @@ import torch
 import warp as wp
 
 from wlm import interop
-from wlm.atlas.model import TAIL_OCTAVES
+from wlm.atlas.model import FIRST_BLOCK_CODE, SIDE_BITS, TAIL_OCTAVES
 from wlm.atlas.scene.model import SceneModel
 from wlm_kernels.atlas import scene as kernels
 
@@ -31,6 +31,10 @@ class Decoder:
         self.model, self.device = model, interop.check_device(device)
         self._texels = wp.array(np.ascontiguousarray(model.texels), dtype=wp.uint32, device=self.device)
         self._lut = wp.array(np.ascontiguousarray(model.lut), dtype=wp.uint16, device=self.device)
+        mixed = model.colour == "mixed"
+        blocks = model.block_texels if mixed else np.zeros((1, 1, 1, 3), np.float16)
+        self._blocks = wp.array(np.ascontiguousarray(blocks), dtype=wp.vec3h, device=self.device)
+        self._code = FIRST_BLOCK_CODE if mixed else 1 << SIDE_BITS
         self._sheets = wp.array(model.table(), dtype=int, device=self.device)
 
     def factors(self, state: float) -> np.ndarray:
@@ -73,7 +77,8 @@ class Decoder:
             factor = wp.array(self.factors(state), dtype=wp.vec3, device=self.device)
             points = interop.to_warp(uv, wp.vec2), interop.to_warp(sheet)
             tile, result = self.model.profile.tile, interop.to_warp(out, wp.vec3)
-            kernels.read(*points, self._sheets, tile, factor, self._lut, self._texels, result)
+            textures = self._texels, self._blocks, self._code
+            kernels.read(*points, self._sheets, tile, factor, self._lut, *textures, result)
         return out
 
     def _between(self, uv: torch.Tensor, sheet: torch.Tensor, state: float, level: torch.Tensor) -> torch.Tensor:

@@ -23,7 +23,7 @@ def decode64(model: SceneModel, uv: np.ndarray, sheet: np.ndarray, state: int) -
     x = (np.asarray(uv, np.float64).clip(0.0, 1.0) * size - 0.5).clip(0, size - 1) / model.profile.tile
     tile = np.minimum(np.floor(x), tiles - 1).astype(np.int64)
     entry = model.lut[tile[:, 1] + origin[:, 1], tile[:, 0] + origin[:, 0]]
-    first, count, component, components, page = unpack_tiles(entry)
+    first, count, component, components, page, blocks = unpack_tiles(entry, model.colour)
     place = first + (x - tile) * (count - 1)
     low = np.clip(np.floor(place).astype(np.int64), first, first + count - 1)
     high = np.minimum(low + 1, first + count - 1)
@@ -34,6 +34,10 @@ def decode64(model: SceneModel, uv: np.ndarray, sheet: np.ndarray, state: int) -
         step, factor = k * count[at, 0], model.factor[state, component[at] + 1 + k].astype(np.float64)
         for column, a in ((low[at, 0], 1.0 - share[at, 0]), (high[at, 0], share[at, 0])):
             for row, b in ((low[at, 1], 1.0 - share[at, 1]), (high[at, 1], share[at, 1])):
-                texel = unpack_rgb9e5(model.texels[page[at], row, column + step]).astype(np.float64)
+                texel = np.empty((len(at), 3))
+                for second in (False, True):
+                    part = blocks[at] == second
+                    place = page[at][part], row[part], (column + step)[part]
+                    texel[part] = model.block_texels[place] if second else unpack_rgb9e5(model.texels[place])
                 light[at] += factor * texel * (a * b)[:, None]
     return light.clip(min=0.0)

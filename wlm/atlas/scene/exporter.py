@@ -5,6 +5,7 @@ scene.glb                       the scene; `extras.wlm` of a node says which she
 sheets.dds, lut.dds             the sheets and their levels, and T_c
 factors.dds                     the components' factors, a row for each state
 colour_0.dds, colour_1.dds ...  the pages of T_p, RGB9E5
+blocks_0.dds, blocks_1.dds ...  of colour "mixed" those of its second texture, BC6H
 scene.glsl                      a function that reads them
 report.json                     sheets, settings, warnings, and where the inputs were
 """
@@ -36,7 +37,7 @@ FORMAT = "wlm-atlas-scene"
 MODEL_FILE, SCENE_FILE, REPORT_FILE = "scene.wlm", "scene.glb", "report.json"
 _VERSION = 1
 _LUT_FORMATS = {2: "R16G16_UINT", 4: "R16G16B16A16_UINT"}
-_NAMES = re.compile(r"scene\.(wlm|glb|glsl)|(lut|sheets|factors)\.dds|colour_\d+\.dds|report\.json")
+_NAMES = re.compile(r"scene\.(wlm|glb|glsl)|(lut|sheets|factors)\.dds|(colour|blocks)_\d+\.dds|report\.json")
 
 
 def export_scene(
@@ -87,6 +88,9 @@ def export_scene(
         for number, layer in enumerate(model.texels):
             texels = np.ascontiguousarray(layer, "<u4").tobytes()
             write_dds(temporary / f"colour_{number}.dds", texels, *layer.shape[::-1], fmt="R9G9B9E5_SHAREDEXP")
+        for number, blocks in enumerate(model.blocks):
+            sides = model.block_texels.shape[2:0:-1]
+            write_dds(temporary / f"blocks_{number}.dds", blocks.tobytes(), *sides, fmt="BC6H_UF16")
         atomic_write(temporary / "scene.glsl", scene_glsl(model).encode())
         report = {
             "format": FORMAT,
@@ -156,6 +160,8 @@ def describe_scene(path: str | os.PathLike[str]) -> dict[str, Any]:
         "states": list(model.states),
         "sheets": [{"name": each.name, "size": [each.width, each.height]} for each in model.sheets],
         "levels": len(model.levels),
+        "colour": model.colour,
+        "block_size": list(model.block_texels.shape[2::-1]),
         "colour_size": list(model.texels.shape[::-1]),
         "lut_size": list(model.lut.shape[1::-1]),
         "factors": model.factor.shape[1],

@@ -11,7 +11,7 @@ followed by smaller ones, its levels, that are read in the same way.
 """
 
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
@@ -43,6 +43,7 @@ class SceneProfile(Settings):
 
     Attributes:
         name: Shown in reports.
+        colour: How T_p is stored: "rgb9e5"; or "mixed": two textures, RGB9E5 and BC6H, and each tile in one of them.
         budget: Bits of T_p, T_c and the factors as a fraction of all lightmaps' at 48 bits per texel, 1 - CR of eq. 9.
         tile: Texels of a lightmap along a tile, 3 to 15.
         components: Most components of a tile; 0: as many as pay.
@@ -54,6 +55,7 @@ class SceneProfile(Settings):
 
     FILES: ClassVar[str] = "atlas-scene"
 
+    colour: Literal["rgb9e5", "mixed"] = "rgb9e5"
     budget: float = Field(0.05, gt=0.0, le=2.0)
     tile: int = Field(7, ge=3, le=15)
     components: int = Field(0, ge=0, le=64)
@@ -101,6 +103,8 @@ class SceneModel(Model):
             and one page.
         levels: With mips the smaller levels of all sheets, for each sheet a quarter, then halves.
         report: Facts about the compression, for people.
+        blocks: uint8 [pages, B, 16], the second texture of "mixed", BC6H, row by row; [0, 0, 16] for none.
+        block_texels: half [pages, Hb, Wb, 3], what they decode to, multiples of 4; [0, 0, 0, 3] for none.
     """
 
     SYSTEM: ClassVar[str] = "atlas-scene"
@@ -115,11 +119,18 @@ class SceneModel(Model):
     lut: np.ndarray
     levels: tuple[SheetPlace, ...] = ()
     report: dict[str, Any] = field(default_factory=dict)
+    blocks: np.ndarray = field(default_factory=lambda: np.empty((0, 0, 16), np.uint8))
+    block_texels: np.ndarray = field(default_factory=lambda: np.empty((0, 0, 0, 3), np.float16))
+
+    @property
+    def colour(self) -> str:
+        """How T_p is stored, as in `SceneProfile`."""
+        return "mixed" if len(self.blocks) else "rgb9e5"
 
     @property
     def bits(self) -> int:
         """Bits of T_p, T_c, the factors and the sheets' rows."""
-        texels = self.texels.size * TEXEL_BITS + self.lut.size * NUMBER_BITS
+        texels = self.texels.size * TEXEL_BITS + self.blocks.size * 8 + self.lut.size * NUMBER_BITS
         return texels + self.factor.size // 3 * FACTOR_BITS + (len(self.sheets) + len(self.levels)) * SHEET_BITS
 
     @property
@@ -138,12 +149,17 @@ class SceneModel(Model):
 
 
 def pack_tiles(
-    first: np.ndarray, size: np.ndarray, component: np.ndarray, count: np.ndarray, page: np.ndarray
+    first: np.ndarray,
+    size: np.ndarray,
+    component: np.ndarray,
+    count: np.ndarray,
+    page: np.ndarray,
+    blocks: np.ndarray | bool = False,
 ) -> np.ndarray:
     """Encodes entries of T_c.
 
     Args:
-        first, size: As of `pack_entries`: the rectangle of the first component.
+        first, size, blocks: As of `pack_entries`: the rectangle of the first component.
         component: int [...], number of the first component's factors, below 65,536.
         count: int [...], components, 0 to 255; 0: the tile is black.
         page: int [...], 0 to 255.
@@ -152,14 +168,14 @@ def pack_tiles(
         uint16 [..., 4].
     """
     rest = np.stack([component, (np.asarray(page) << COUNT_BITS) + count], -1).astype(np.uint16)
-    return np.concatenate([pack_entries(first, size), rest], -1)
+    return np.concatenate([pack_entries(first, size, blocks), rest], -1)
 
 
-def unpack_tiles(lut: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Decodes `pack_tiles`, to int64; of short entries, too."""
-    first, size, _ = unpack_entries(lut[..., :SHORT_ENTRY], "rgb9e5")
+def unpack_tiles(lut: np.ndarray, colour: str) -> tuple[np.ndarray, ...]:
+    """Decodes `pack_tiles`, to int64, and `blocks` to bool [...]; of short entries, too."""
+    first, size, blocks = unpack_entries(lut[..., :SHORT_ENTRY], colour)
     if lut.shape[-1] == SHORT_ENTRY:
         zeros = np.zeros(lut.shape[:-1], np.int64)
-        return first, size, zeros, zeros + 1, zeros
+        return first, size, zeros, zeros + 1, zeros, blocks[..., 0]
     last = lut[..., 3].astype(np.int64)
-    return first, size, lut[..., 2].astype(np.int64), last & ((1 << COUNT_BITS) - 1), last >> COUNT_BITS
+    return first, size, lut[..., 2].astype(np.int64), last & ((1 << COUNT_BITS) - 1), last >> COUNT_BITS, blocks[..., 0]

@@ -1,6 +1,6 @@
 """The GLSL that reads a scene's exported lightmaps; `wlm.atlas.scene.exporter` writes it."""
 
-from wlm.atlas.model import SIDE_BITS, TAIL_OCTAVES
+from wlm.atlas.model import BLOCK_SIDE, FIRST_BLOCK_CODE, SIDE_BITS, TAIL_OCTAVES
 from wlm.atlas.scene.model import COUNT_BITS, SHORT_ENTRY, SceneModel
 from wlm.shading import sampler
 
@@ -13,7 +13,7 @@ _TEXT = """\
 // wlm_scene_lut: lut.dds, usampler2D, filter nearest.
 // wlm_scene_factors: factors.dds, sampler2D of 32-bit floats, filter nearest.
 // wlm_scene_colour: colour_0.dds and so on as the layers of a sampler2DArray, filter linear, clamped to its edge.
-//
+{second}//
 // Call wlm_scene with the lightmap's UVs, u to the right, v down, after the object's scale and offset; the number of
 // the sheet that the object reads; and the number of the state, 1.5 for example half-way from the second to the third.
 
@@ -32,7 +32,8 @@ vec3 wlm_scene(vec2 uv, int sheet, float state)
     // {entry}
     vec2 first = vec2(entry.xy >> uvec2({bits}u, {bits}u));
     vec2 steps = vec2(entry.xy & uvec2({mask}u, {mask}u));
-    vec2 at = first + (x - vec2(tile)) * steps + vec2(0.5, 0.5);
+    vec2 extent = vec2({width}.0, {height}.0); // of a page
+{blocks}    vec2 at = first + (x - vec2(tile)) * steps + vec2(0.5, 0.5);
     int components = {components};
     int component = {component};
     float page = {page};
@@ -44,15 +45,29 @@ vec3 wlm_scene(vec2 uv, int sheet, float state)
     for (int k = 0; k <= components; k++) {{
         vec3 factor = texelFetch(WLM_SCENE_FACTORS, ivec2(component + k, before), 0).rgb;
         factor = mix(factor, texelFetch(WLM_SCENE_FACTORS, ivec2(component + k, after), 0).rgb, share);
-        vec2 spot = (at + vec2(float(k - 1) * (steps.x + 1.0), 0.0)) / vec2({width}.0, {height}.0);
+        vec2 spot = (at + vec2(float(k - 1) * (steps.x + 1.0), 0.0)) / extent;
         if (k > 0)
-            factor = factor * textureLod(WLM_SCENE_COLOUR, vec3(spot, page), 0.0).rgb;
+            {read}
         if (components > 0)
             light += factor;
     }}
     return max(light, vec3(0.0, 0.0, 0.0));
 }}
 """
+
+_BLOCKS = """\
+    bool blocks = steps.x >= {code}.0;
+    if (blocks) {{
+        // Its first block, and from {code} on its blocks less one, of {side} texels a side.
+        first *= {side}.0;
+        steps = (steps - vec2({code}.0, {code}.0)) * {side}.0 + vec2({last}.0, {last}.0);
+        extent = vec2({width}.0, {height}.0);
+    }}
+"""
+_READ = "factor = factor * textureLod(WLM_SCENE_COLOUR, vec3(spot, page), 0.0).rgb;"
+_READ_MIXED = """\
+factor = factor * (blocks ? textureLod(WLM_SCENE_BLOCKS, vec3(spot, page), 0.0).rgb
+                                     : textureLod(WLM_SCENE_COLOUR, vec3(spot, page), 0.0).rgb);"""
 
 _LONG = {
     "entry": "The first texel of the tile's first rectangle, and in the low bits its texels less one; its first\n"
@@ -98,7 +113,15 @@ def scene_glsl(model: SceneModel) -> str:
     """The shader text for a model: functions alone, to be included below `#version`."""
     height, width = model.texels.shape[1:]
     kinds = {"sheets": "usampler2D", "lut": "usampler2D", "factors": "sampler2D", "colour": "sampler2DArray"}
+    mixed = model.colour == "mixed"
+    if mixed:
+        kinds["blocks"] = "sampler2DArray"
+    rows, columns = model.block_texels.shape[1:3]
+    sizes = {"code": FIRST_BLOCK_CODE, "side": BLOCK_SIDE, "last": BLOCK_SIDE - 1, "width": columns, "height": rows}
     text = _TEXT.format(
+        blocks=_BLOCKS.format(**sizes) if mixed else "",
+        read=_READ_MIXED if mixed else _READ,
+        second="// wlm_scene_blocks: blocks_0.dds and so on, likewise.\n" if mixed else "",
         last=len(model.states) - 1,
         tile=model.profile.tile,
         width=width,
