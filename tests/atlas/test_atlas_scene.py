@@ -22,6 +22,7 @@ from wlm.atlas.scene.fit import compress_scene
 from wlm.atlas.scene.mixture import find_mixtures, moments
 from wlm.atlas.scene.model import SceneProfile
 from wlm.atlas.scene.seen import scene_weights
+from wlm.atlas.scene.shader import scene_glsl
 from wlm.formats.exr import write_exr
 
 SIDE = 48
@@ -98,6 +99,16 @@ def test_a_file_holds_all(tmp_path, scene, model):
     model.save(tmp_path / "a.wlm")
     again = wlm.load(tmp_path / "a.wlm")
     assert_same(dataclasses.replace(again, report={}), dataclasses.replace(model, report={}))
+
+
+def test_blocks_of_bc6h_or_none(scene, model, tmp_path):
+    """What blocks save goes into texels; phones have no blocks."""
+    plain = compress_scene(scene, "rgb9e5", **QUICK)
+    assert model.colour == "mixed" and model.report["tiles of blocks"] > 0
+    assert plain.colour == "rgb9e5" and not plain.block_texels.size and not plain.report["tiles of blocks"]
+    options = {"views": 2, "resolution": 48}
+    assert evaluate_scene(model, scene, **options).texel_psnr > evaluate_scene(plain, scene, **options).texel_psnr
+    assert "wlm_scene_blocks" in scene_glsl(model) and "wlm_scene_blocks" not in scene_glsl(plain)
 
 
 def test_an_earlier_file(device):

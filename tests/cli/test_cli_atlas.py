@@ -303,7 +303,9 @@ def test_a_scene_is_one_command(tmp_path):
     for place in (out, out / "scene.wlm"):
         facts = json.loads(call("atlas", "info", place, "--json"))
         assert facts["states"] == ["0", "1"] and facts["cr"] >= 0.7 and not facts["levels"]
-    words = ("atlas", "compress", path, tmp_path / "lights.json", "-o", out, "--flip")
+    words = ("atlas", "compress", path, tmp_path / "lights.json", "-o", out)
+    assert "--colour: expected 'rgb9e5' or 'mixed', got 'half'" in fails(*words, "--colour", "half")
+    words += ("--flip",)
     assert "--flip: expected with one lightmap alone" in fails(*words)
 
 

@@ -17,6 +17,7 @@ from builders.shader_runs import HEADS, lightmap_uniforms, run_glsl, run_hlsl, r
 from builders.synthetic import random_model as random_lightmap
 
 from wlm import probe
+from wlm.atlas.colour import quantise
 from wlm.atlas.exact import decode64
 from wlm.atlas.scene.decode import Decoder as SceneDecoder
 from wlm.atlas.scene.exporter import factor_texels, sheet_texels
@@ -136,27 +137,38 @@ def rgba(texels: np.ndarray) -> np.ndarray:
     return np.pad(texels.astype(np.float16), ((0, 0), (0, 0), (0, 1)))
 
 
-def random_scene(short: bool) -> SceneModel:
+def random_scene(short: bool, mixed: bool) -> SceneModel:
     """Two sheets, the first with two smaller levels.
 
-    On two pages with tiles of none to three components; short: with one page and one component.
+    On two pages with tiles of none to three components; short: one page and one component; mixed: some are in blocks.
     """
     random = np.random.default_rng(1)
     texels = pack_rgb9e5(random.random((2 * 20, 24, 3)).astype(np.float32)).reshape(2, 20, 24)
     size = random.integers(1, 8, (13, 11, 2))
     count = np.minimum(random.integers(0, 4, (13, 11)), 24 // size[..., 0])
     first = random.integers(0, np.array([24, 20]) - size * np.stack([np.maximum(count, 1), np.ones_like(count)], 2) + 1)
-    lut = pack_tiles(first, size, random.integers(0, 5, (13, 11)), count, random.integers(0, 2, (13, 11)))
+    second, blocks = {}, False
+    if mixed:
+        pages = [quantise(random.random((16, 24, 3)), "bc6h") for _ in range(2)]
+        second = {"blocks": np.stack([page["blocks"] for page in pages])}
+        second |= {"block_texels": np.stack([page["texels"] for page in pages])}
+        blocks = random.random((13, 11)) < 0.5
+        whole = random.integers(1, 3, (13, 11, 2))
+        size = np.where(blocks[..., None], 4 * whole, size)
+        most = np.array([6, 4]) - whole * np.stack([np.maximum(count, 1), np.ones_like(count)], 2)
+        first = np.where(blocks[..., None], 4 * random.integers(0, most + 1), first)
+    lut = pack_tiles(first, size, random.integers(0, 5, (13, 11)), count, random.integers(0, 2, (13, 11)), blocks)
     sheets = (SheetPlace("a", 29, 36, 0, 0, 5, 6, 2), SheetPlace("b", 22, 29, 5, 4, 4, 5))
     levels = (SheetPlace("a", 8, 9, 9, 0, 2, 2, 3), SheetPlace("a", 4, 4, 11, 0, 1, 1))
     factor = random.uniform(-0.3, 1.0, (3, 8, 3)).astype(np.float32)
     if short:
         factor, texels, lut = np.abs(factor[:, :2]), texels[:1], lut[..., :2]
-    return SceneModel("s", "0" * 16, SceneProfile(name="s"), ("a", "b", "c"), sheets, factor, texels, lut, levels)
+    parts = (sheets, factor, texels, lut, levels)
+    return SceneModel("s", "0" * 16, SceneProfile(name="s"), ("a", "b", "c"), *parts, **second)
 
 
-def scene(short, _) -> Subject:
-    model, random = random_scene(short), np.random.default_rng(2)
+def scene(short, mixed, _) -> Subject:
+    model, random = random_scene(short, mixed), np.random.default_rng(2)
     decoder, number = SceneDecoder(model), random.integers(0, 2, 600)
     uv = random.uniform(-0.05, 1.05, (600, 2)).astype(np.float32)
     texels = np.array([0.0, 1.0, 2.0**1.5, 2.0**2.25, 2.0**7])[random.integers(0, 5, 600)]  # along a pixel
@@ -180,6 +192,8 @@ def scene(short, _) -> Subject:
         # Of one layer wgpu would make no array.
         "wlm_scene_colour": np.stack([rgba(unpack_rgb9e5(layer)) for layer in (*model.texels, model.texels[0])]),
     }
+    if mixed:
+        bound["wlm_scene_blocks"] = np.stack([rgba(page) for page in model.block_texels])
     return Subject(scene_glsl(model), main, expected[None], bound, "", 2 / 255 * expected.max())
 
 
@@ -298,8 +312,9 @@ SUBJECTS: dict[str, Callable[..., Subject]] = {
     **{f"atlas {kind}": lambda folder, kind=kind: atlas(kind, folder) for kind in (*KINDS, MIXED)},
     "atlas mips": partial(mips, MIXED),
     "atlas cascade mips": partial(mips, "cascade"),
-    "scene": partial(scene, False),
-    "scene of one component": partial(scene, True),
+    "scene": partial(scene, False, False),
+    "scene of one component": partial(scene, True, False),
+    "scene mixed": partial(scene, False, True),
     **{f"smoke {layout}": lambda folder, layout=layout: smoke(layout, folder) for layout in LAYOUTS},
     "volume": volume,
     "probes": probes,

@@ -102,7 +102,6 @@ def compress(
             "node": node,
             "encoding": encoding,
             "flip": flip,
-            "colour": colour,
             "resume": resume,
         }
         for name, value in lone.items():
@@ -111,7 +110,7 @@ def compress(
         quiet_warp()
         from wlm.cli.atlas_scene import compress_scene
 
-        changes = {"budget": budget, "mips": mips or None, "views": views}
+        changes = {"budget": budget, "colour": colour, "mips": mips or None, "views": views}
         options = {"seed": seed, "device": device, "trust": trust}
         compress_scene(mesh_path, lightmap_path, output, uv_set=uv_set, profile=profile, overrides=changes, **options)
         return
