@@ -4,8 +4,7 @@ For a tile, a mixture and a size the squared error of all states is what the mix
 
     sum_m || sum_k f[m, k] r_k ||² = sum_j || sum_k L[k, j] r_k ||²,    F^T F = L L^T (Cholesky),
 
-with r_k the residual of component k. Least squares are linear, so that of single texels the curve is had by fitting K
-mixtures of components under L, not the M states; what blocks hold isn't, and there the residuals are mixed.
+with r_k what component k is off once it is stored: clipped at 0 and rounded, as texels or as blocks.
 """
 
 import math
@@ -20,7 +19,7 @@ from wlm.atlas.model import BLOCK_SIDE, BLOCKS, FIRST_BLOCK_CODE, SIDE_BITS, TEX
 from wlm.atlas.scene.mixture import Mixtures, find_mixtures, moments
 from wlm.atlas.scene.model import FACTOR_BITS, SceneProfile
 from wlm.atlas.stages import Stages
-from wlm.atlas.tiles import Tiles, errors, remainder, sample_weights, solve, tile_light
+from wlm.atlas.tiles import Tiles, remainder, sample_weights, solve, tile_light
 from wlm.formats.dds import MOST_SIDE
 from wlm.system import Meter
 
@@ -157,19 +156,14 @@ def _curves(
         components = tiles.points(tiles.components(texels, mixtures, chosen))
         rest = torch.einsum("tmkc,tkcp->tmcp", factor[chosen], components - offset[chosen][..., None]) - light
         lost = (rest.square().mean((1, 2)) * weight).double().sum(1)
-        mixed = torch.einsum("tkcp,tckj->tjcp", components, root[chosen]).flatten(0, 1).contiguous()
         whole, shares = chosen.repeat_interleave(rank), weight.repeat_interleave(rank, 0)
-        piece = Tiles(whole, mixed, shares, tiles.size)
-        single = Tiles(whole, components.flatten(0, 1).contiguous(), shares, tiles.size)
+        piece = Tiles(whole, components.flatten(0, 1).contiguous(), shares, tiles.size)
         for i, size in enumerate(sizes):
-            if size.second:  # what blocks hold isn't linear in the light
-                samples = solve(single, size.nx, size.ny, _MEDIUM).clamp(min=0.0)
-                held = stored(samples, sample_weights(single, size.nx, size.ny), size.format)
-                rest = remainder(single, held).unflatten(0, (-1, rank))
-                rest = torch.einsum("tkcp,tckj->tjcp", rest, root[chosen])
-                left = (rest.square().mean(2).sum(1) * weight).double().sum(1)
-            else:
-                left = errors(piece, solve(piece, size.nx, size.ny, _ROUGH)).reshape(-1, rank).sum(1)
+            samples = solve(piece, size.nx, size.ny, _MEDIUM if size.second else _ROUGH).clamp(min=0.0)
+            held = stored(samples, sample_weights(piece, size.nx, size.ny), size.format)
+            rest = remainder(piece, held).unflatten(0, (-1, rank))
+            rest = torch.einsum("tkcp,tckj->tjcp", rest, root[chosen])
+            left = (rest.square().mean(2).sum(1) * weight).double().sum(1)
             error[i, part] = (left + lost).cpu().numpy()
         number[part] = chosen.cpu().numpy()
     return number, error

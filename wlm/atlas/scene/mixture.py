@@ -11,7 +11,7 @@ least l_j a, with l_j the least ratio of all tiles'. So with
     c_0 = a,   c_j = b_j - l_j a,   f_0 = v_0 + sum_j l_j v_j,   f_j = v_j,   x ~ sum_k f_k c_k,
 
 no component is negative, so that textures of unsigned texels hold them, while factors have any sign. Samples of least
-squares overshoot, next to shadows below 0; so to each component a constant is added, half of what most are at most,
+squares overshoot, next to shadows below 0; so to each component a constant is added, a tenth of what most are at most,
 which a constant for each state takes away.
 """
 
@@ -22,7 +22,7 @@ import torch
 
 _ROUNDS = 12
 _LEAST_PERCENT = 0.02  # of the ratios: what is below the least is clipped
-_MARGIN, _BRIGHT_PERCENT = 0.5, 99.0  # what is added to components, of what most texels stay below
+_MARGIN, _BRIGHT_PERCENT = 0.1, 99.0  # what is added to components, of what most texels stay below
 _DIM = 1e-3  # of the mean coefficient of v_0: below it a ratio says nothing
 
 
